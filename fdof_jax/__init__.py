@@ -1,0 +1,41 @@
+"""Dynamics of planar open-chain linkages in JAX."""
+
+from . import scenes as scenes
+from .chain_dynamics import (
+    bias_force as bias_force,
+    constraint_forces as constraint_forces,
+    masked_accelerations as masked_accelerations,
+    mass_matrix as mass_matrix,
+)
+from .control import CircleTask as CircleTask, PDController as PDController
+from .dynamics import (
+    energy as energy,
+    forward_dynamics as forward_dynamics,
+    inverse_dynamics as inverse_dynamics,
+    link_energies as link_energies,
+)
+from .forces import JointDamper as JointDamper, JointEffort as JointEffort
+from .kinematics import (
+    inverse_kinematics as inverse_kinematics,
+    joint_positions as joint_positions,
+    mass_centers as mass_centers,
+    tip_jacobian as tip_jacobian,
+    tip_position as tip_position,
+)
+from .linkage import (
+    TOPOLOGIES as TOPOLOGIES,
+    Linkage as Linkage,
+    State as State,
+    existence_factors as existence_factors,
+    from_chain as from_chain,
+    to_chain as to_chain,
+)
+from .scenes import Scene as Scene
+from .simulation import (
+    Efforts as Efforts,
+    Solution as Solution,
+    joint_efforts as joint_efforts,
+    simulate as simulate,
+)
+
+__version__ = "0.1.0"

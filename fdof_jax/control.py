@@ -1,0 +1,184 @@
+"""Joint control of the third example (Fig 7): saturated PD and the circle it tracks."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from .kinematics import solve_joints, wrist_vector
+from .linkage import Linkage
+from .validation import concrete, one_of, real_array
+
+Reference = Callable[[Array, Linkage], tuple[Array, Array]]
+
+
+class PDController(eqx.Module):
+    """Saturated PD control of the joints, as in Fig 7: a force element.
+
+    The effort is kp * (q_ref - q) + kd * (qd_ref - qd), clipped to +-limit as a whole.
+    The position error is never wrapped: a start one turn away unwinds.
+
+    **Arguments:** all in joint order, one per joint or one for all.
+
+    - `kp`: proportional gains, not negative [N/m or N m/rad].
+    - `kd`: gains of the error rate, not negative [N s/m or N m s/rad].
+    - `limit`: largest effort [N or N m], may be infinite.
+    - `reference`: a pytree called as `(t, linkage) -> (q_ref, qd_ref)`.
+
+    **Raises:** ValueError for malformed or negative gains and limits, and for a
+    reference that cannot be called.
+    """
+
+    kp: Float[Array, " joint"]
+    kd: Float[Array, " joint"]
+    limit: Float[Array, " joint"]
+    reference: Reference
+
+    def __init__(
+        self,
+        kp: ArrayLike,
+        kd: ArrayLike,
+        limit: ArrayLike,
+        reference: Reference,
+    ):
+        self.kp = real_array("kp", kp, (3,), minimum=0, broadcast=True)
+        self.kd = real_array("kd", kd, (3,), minimum=0, broadcast=True)
+        self.limit = real_array(
+            "limit", limit, (3,), minimum=0, finite=False, broadcast=True
+        )
+        if not callable(reference):
+            raise ValueError(
+                "reference: expected a callable (t, linkage) -> (q, qd), for instance "
+                f"CircleTask(), got {reference!r}."
+            )
+        self.reference = reference
+
+    def demand(self, t: Array, q: Array, qd: Array, linkage: Linkage) -> Array:
+        """The effort before it is limited, (3,) [N or N m]."""
+        q_ref, qd_ref = self.reference(t, linkage)
+        return self.kp * (q_ref - q) + self.kd * (qd_ref - qd)
+
+    def __call__(self, t: Array, q: Array, qd: Array, linkage: Linkage) -> Array:
+        return jnp.clip(self.demand(t, q, qd, linkage), -self.limit, self.limit)
+
+    def check(self, linkage: Linkage, ts: Array) -> None:
+        """Pass the linkage and the times on to the reference's own check, if any."""
+        check_reference: Any = getattr(self.reference, "check", None)
+        if check_reference is not None:
+            check_reference(linkage, ts)
+
+
+class CircleTask(eqx.Module):
+    """A circle traced by the tip at constant speed, the last link keeping its angle.
+
+    Called with `(t, linkage)` it gives the joint reference: the closed-form inverse
+    kinematics and its exact rate. The reference is continuous in time, also where the
+    path crosses the negative x axis or winds around the base; at t = 0 it is that of
+    `inverse_kinematics`.
+
+    Fig 7 does not print its circle: the default is our choice. It lies inside the reach
+    of the figure's arm and starts 0.25 m from the arm's tip, because the text speaks
+    of an initial offset.
+
+    **Arguments:**
+
+    - `center`: (x, y) [m].
+    - `radius`: not negative [m].
+    - `period`: time of one turn, counter-clockwise if positive, not zero [s].
+    - `phase`: direction of the starting point as seen from the centre [rad].
+    - `orientation`: th4, the absolute angle of the last link [rad].
+    - `branch`: assembly of the arm, 1 or -1: see `inverse_kinematics`.
+
+    **Raises:** ValueError for malformed arguments; `check`, and with it `simulate`, for
+    a circle out of the linkage's reach.
+    """
+
+    center: Float[Array, " 2"]
+    radius: Float[Array, ""]
+    period: Float[Array, ""]
+    phase: Float[Array, ""]
+    orientation: Float[Array, ""]
+    branch: Float[Array, ""]
+
+    def __init__(
+        self,
+        center: ArrayLike = (-4.0, 2.0),
+        radius: ArrayLike = 0.75,
+        period: ArrayLike = 5.0,
+        phase: ArrayLike = np.pi,
+        orientation: ArrayLike = np.pi / 2,
+        branch: int = 1,
+    ):
+        self.center = real_array("center", center, (2,))
+        self.radius = real_array("radius", radius, (), minimum=0)
+        self.period = real_array("period", period, ())
+        if (given := concrete(self.period)) is not None and given == 0:
+            raise ValueError("period: expected a time other than 0 s, got 0.")
+        self.phase = real_array("phase", phase, ())
+        self.orientation = real_array("orientation", orientation, ())
+        self.branch = jnp.asarray(one_of("branch", branch, (1, -1)), dtype=float)
+
+    def _turned(self, t: Array) -> Array:
+        return self.phase + 2 * np.pi * t / self.period
+
+    def tip(self, t: ArrayLike) -> Float[Array, " 2"]:
+        """The commanded tip position at time `t` [s]: (x, y) [m]."""
+        turned = self._turned(jnp.asarray(t))
+        return self.center + self.radius * jnp.stack([jnp.cos(turned), jnp.sin(turned)])
+
+    def _positions(self, t: Array, linkage: Linkage) -> Array:
+        wrist = wrist_vector(linkage, self.tip(t), self.orientation)
+        hub = wrist_vector(linkage, self.center, self.orientation)
+        turns = jnp.round(self._bearing(jnp.zeros_like(t), hub) / (2 * np.pi))
+        bearing = self._bearing(t, hub) - 2 * np.pi * turns
+        return solve_joints(linkage, wrist, bearing, self.orientation, self.branch)
+
+    def _bearing(self, t: Array, hub: Array) -> Array:
+        """Angle of hub + radius * (cos, sin)(turned) without jumps.
+
+        The larger of the two vectors carries the angle; the smaller one adds less than
+        a quarter turn, for which the arctangent has no jump.
+        """
+        distance = jnp.hypot(hub[0], hub[1])
+        hub_angle = jnp.arctan2(hub[1], hub[0])
+        turned = self._turned(t)
+        around = self.radius > distance
+        carrier = jnp.where(around, turned, hub_angle)
+        large = jnp.maximum(self.radius, distance)
+        small = jnp.minimum(self.radius, distance)
+        lead = jnp.where(around, -1, 1) * (turned - hub_angle)
+        return carrier + jnp.arctan2(
+            small * jnp.sin(lead), large + small * jnp.cos(lead)
+        )
+
+    def __call__(
+        self, t: ArrayLike, linkage: Linkage
+    ) -> tuple[Float[Array, " joint"], Float[Array, " joint"]]:
+        """Joint positions [m or rad] and velocities [m/s or rad/s] at time `t` [s]."""
+        t = jnp.asarray(t, dtype=float)
+        return jax.jvp(lambda t: self._positions(t, linkage), (t,), (jnp.ones_like(t),))
+
+    def check(self, linkage: Linkage, ts: Array) -> None:
+        """Raise ValueError if the tip leaves the linkage's reach between the times."""
+        start, end = float(ts[0]), float(ts[-1])
+        turn = abs(float(self.period))
+        times = jnp.linspace(start, min(end, start + turn), 257)
+        if not np.isfinite(_positions_over(self, linkage, times)).all():
+            raise ValueError(
+                "reference: expected a circle within the linkage's reach at "
+                f"orientation {float(self.orientation):g} rad on branch "
+                f"{float(self.branch):+g}, got center "
+                f"{np.asarray(self.center).tolist()} and radius "
+                f"{float(self.radius):g} m."
+            )
+
+
+@eqx.filter_jit
+def _positions_over(task: CircleTask, linkage: Linkage, times: Array) -> Array:
+    return jax.vmap(lambda t: task(t, linkage)[1])(times)

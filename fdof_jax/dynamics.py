@@ -1,0 +1,358 @@
+"""Equations of motion: the reduced 3x3 form and inverse dynamics in joint coordinates.
+
+`joint_accelerations` is what simulations integrate. It works on scalars, never on
+stacked arrays: XLA on CPU computes a stacked result once per entry. The algebra is a
+composite-body recursion from the tip, S(EF)^T M S(EF) of the paper's six equations
+without ever forming them; existence factors select, per joint, between turning about
+a point and sliding along a direction.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jax.custom_batching import custom_vmap
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from .kinematics import mass_center_velocities, mass_centers
+from .linkage import Linkage, real_joints
+from .trigonometry import sincos
+from .validation import real_array
+
+Scalars = tuple[Array, Array, Array]
+Vector = tuple[Array, Array]
+
+
+class Constants(NamedTuple):
+    """What the equations need of a linkage, as scalars computed once per solve.
+
+    `m34` = m3 + m4 and so on; `(s_n, t_n)` the first moment of link n, with the mass
+    beyond it hung at the end of its vector A_n, along and across the link [kg m];
+    `j_n` second moments about the start of link n [kg m^2].
+    """
+
+    revolute: Scalars
+    locked: Scalars
+    base: Vector
+    base_angle: Array
+    gravity: Array
+    m4: Array
+    m34: Array
+    m234: Array
+    a2: Array
+    a3: Array
+    s2: Array
+    t2: Array
+    s3: Array
+    t3: Array
+    s4: Array
+    t4: Array
+    j2: Array
+    j3: Array
+    j4: Array
+
+
+def link_constants(linkage: Linkage) -> Constants:
+    """The scalars of a linkage that `joint_accelerations` works with."""
+    m2, m3, m4 = linkage.mass
+    _, a2, a3, _ = linkage.length
+    (s2, t2), (s3, t3), (s4, t4) = linkage.mass[:, None] * linkage.com
+    j2, j3, j4 = linkage.inertia + linkage.mass * jnp.sum(linkage.com**2, axis=1)
+    m34 = m3 + m4
+    sin, cos = sincos(linkage.base_angle)
+    return Constants(
+        revolute=real_joints(linkage.ef),
+        locked=tuple(linkage.locked),
+        base=(cos, sin),
+        base_angle=linkage.base_angle,
+        gravity=linkage.gravity,
+        m4=m4, m34=m34, m234=m2 + m34,
+        a2=a2, a3=a3,
+        s2=s2 + m34 * a2, t2=t2, s3=s3 + m4 * a3, t3=t3, s4=s4, t4=t4,
+        j2=j2 + m34 * a2**2, j3=j3 + m4 * a3**2, j4=j4,
+    )  # fmt: skip
+
+
+def _cross(u: Vector, v: Vector) -> Array:
+    return u[0] * v[1] - u[1] * v[0]
+
+
+def _dot(u: Vector, v: Vector) -> Array:
+    return u[0] * v[0] + u[1] * v[1]
+
+
+def _add(u: Vector, v: Vector) -> Vector:
+    return u[0] + v[0], u[1] + v[1]
+
+
+def _perp(u: Vector) -> Vector:
+    return -u[1], u[0]
+
+
+def _in_frame(along: Array, across: Array, e: Vector) -> Vector:
+    return along * e[0] - across * e[1], along * e[1] + across * e[0]
+
+
+def _select(condition: Array, u: Vector, v: Vector) -> Vector:
+    return jnp.where(condition, u[0], v[0]), jnp.where(condition, u[1], v[1])
+
+
+class _Equations(NamedTuple):
+    """M qdd + bias = tau, with M symmetric (kg m^2, kg m or kg by joint types)."""
+
+    m11: Array
+    m12: Array
+    m13: Array
+    m22: Array
+    m23: Array
+    m33: Array
+    bias: Scalars
+
+
+def _equations(c: Constants, q: Scalars, qd: Scalars) -> _Equations:
+    """The reduced equations of motion: (8)-(13) projected on the real joints."""
+    r1, r2, r3 = c.revolute
+    th2 = c.base_angle + jnp.where(r1, q[0], c.locked[0])
+    th3 = th2 + jnp.where(r2, q[1], c.locked[1])
+    th4 = th3 + jnp.where(r3, q[2], c.locked[2])
+    b2 = jnp.where(r2, c.locked[1], q[1])
+    b3 = jnp.where(r3, c.locked[2], q[2])
+    w2 = jnp.where(r1, qd[0], 0)
+    turn3 = jnp.where(r2, qd[1], 0)
+    turn4 = jnp.where(r3, qd[2], 0)
+    w3 = w2 + turn3
+    w4 = w3 + turn4
+
+    e1 = c.base
+    n1 = _perp(e1)
+    e2, e3, e4 = ((cos, sin) for sin, cos in (sincos(th2), sincos(th3), sincos(th4)))
+    n2, n3 = _perp(e2), _perp(e3)
+    d2 = _in_frame(c.a2, b2, e2)
+    d3 = _in_frame(c.a3, b3, e3)
+    # First moments of the single links (u_n) and of everything beyond a joint (c_n).
+    u4 = _in_frame(c.s4, c.t4, e4)
+    u3 = _in_frame(c.s3, c.t3 + c.m4 * b3, e3)
+    u2 = _in_frame(c.s2, c.t2 + c.m34 * b2, e2)
+    c3 = _add(u3, u4)
+    c2 = _add(u2, c3)
+    # Second moments of everything beyond a joint, about that joint.
+    k3 = c.j3 + c.m4 * b3 * b3 + 2 * _dot(d3, u4) + c.j4
+    k2 = c.j2 + c.m34 * b2 * b2 + 2 * _dot(d2, c3) + k3
+
+    # Momentum (linear, and angular about the joint) of what lies beyond a joint that
+    # moves at unit rate; each joint before it feels its share.
+    p3 = _select(r3, _perp(u4), (c.m4 * n3[0], c.m4 * n3[1]))
+    p2 = _select(r2, _perp(c3), (c.m34 * n2[0], c.m34 * n2[1]))
+    h3 = jnp.where(r3, c.j4, _cross(u4, n3))
+    h2 = jnp.where(r2, k3, _cross(c3, n2))
+    h3_at_2 = h3 + _cross(d3, p3)
+
+    # Efforts that keep all joints at constant rate, gravity included. Differences of
+    # squared angular velocities are products with the joint rates: absolute rates
+    # may be large and close.
+    slide2 = 2 * w2 * jnp.where(r2, 0, qd[1])
+    slide3 = 2 * w3 * jnp.where(r3, 0, qd[2])
+    w22, w33, w44 = w2 * w2, w3 * w3, w4 * w4
+    cross34 = _cross(d3, u4)
+    cross24 = _cross(d2, u4)
+    coriolis3 = c.m4 * slide3
+    y = (
+        w33 * u3[0] + coriolis3 * e3[0] + w44 * u4[0],
+        w33 * u3[1] + coriolis3 * e3[1] + w44 * u4[1],
+    )
+    # Moments about the joint (revolute), forces along the slide (prismatic).
+    relative3 = slide3 * (c.m4 * b3 - _cross(u4, e3)) - turn4 * (w3 + w4) * cross34
+    moment4 = (
+        u4[0] * c.gravity
+        + w22 * cross24
+        + w33 * cross34
+        - slide2 * _cross(u4, e2)
+        - slide3 * _cross(u4, e3)
+    )
+    moment3 = (
+        c3[0] * c.gravity + w22 * _cross(d2, c3) - slide2 * _cross(c3, e2) + relative3
+    )
+    moment2 = (
+        c2[0] * c.gravity
+        + relative3
+        - turn3 * (w2 + w3) * _cross(d2, u3)
+        - (turn3 + turn4) * (w2 + w4) * cross24
+        + slide2 * (c.m34 * b2 - _cross(c3, e2))
+        - coriolis3 * _cross(d2, e3)
+    )
+    start4 = c.gravity * e3[0] - w22 * _dot(n3, d2) - slide2 * _dot(n3, e2)
+    force3 = c.m4 * (start4 - w33 * b3) - w44 * _dot(n3, u4)
+    force2 = c.m34 * (c.gravity * e2[0] - w22 * b2) - _dot(n2, y)
+    force1 = (
+        c.m234 * c.gravity * e1[0]
+        - w22 * _dot(n1, u2)
+        - c.m34 * slide2 * _dot(n1, e2)
+        - _dot(n1, y)
+    )
+    return _Equations(
+        m11=jnp.where(r1, k2, c.m234),
+        m12=jnp.where(r1, h2 + _cross(d2, p2), _dot(n1, p2)),
+        m13=jnp.where(r1, h3_at_2 + _cross(d2, p3), _dot(n1, p3)),
+        m22=jnp.where(r2, k3, c.m34),
+        m23=jnp.where(r2, h3_at_2, _dot(n2, p3)),
+        m33=jnp.where(r3, c.j4, c.m4),
+        bias=(
+            jnp.where(r1, moment2, force1),
+            jnp.where(r2, moment3, force2),
+            jnp.where(r3, moment4, force3),
+        ),
+    )
+
+
+def _accelerations(c: Constants, q: Scalars, qd: Scalars, tau: Scalars) -> Scalars:
+    m = _equations(c, q, qd)
+    f1, f2, f3 = (t - b for t, b in zip(tau, m.bias))
+    # L^T D L from the tip: the pivots are the articulated inertias.
+    inverse3 = 1 / m.m33
+    l23, l13 = m.m23 * inverse3, m.m13 * inverse3
+    inverse2 = 1 / (m.m22 - l23 * m.m23)
+    rest12 = m.m12 - l13 * m.m23
+    l12 = rest12 * inverse2
+    d1 = m.m11 - l13 * m.m13 - l12 * rest12
+    y2 = f2 - l23 * f3
+    qdd1 = (f1 - l13 * f3 - l12 * y2) / d1
+    qdd2 = y2 * inverse2 - l12 * qdd1
+    return qdd1, qdd2, f3 * inverse3 - l13 * qdd1 - l23 * qdd2
+
+
+@custom_vmap
+def _trip_count(x: Array) -> Array:
+    """1, which XLA cannot know and which stays one number under vmap."""
+    return 1 + (jnp.abs(x) > 0.9 * jnp.finfo(x.dtype).max).astype(jnp.int32)
+
+
+@_trip_count.def_vmap
+def _trip_count_batched(axis_size, in_batched, x):
+    return _trip_count(x[0]), False
+
+
+def _accelerations_once(c: Constants, q: Scalars, qd: Scalars, tau: Scalars) -> Scalars:
+    """`_accelerations` behind a barrier: a loop of one trip.
+
+    XLA on CPU would otherwise repeat the evaluation in every expression that uses its
+    results, which made steps of batches 1.5 to 2 times slower. The loop is repeatable:
+    more trips would give the same result.
+    """
+    zero = jnp.zeros_like(q[0] + qd[0] + tau[0] + c.m4)
+    return jax.lax.fori_loop(
+        0,
+        _trip_count(q[0]),
+        lambda _, __: _accelerations(c, q, qd, tau),
+        (zero, zero, zero),
+    )
+
+
+@jax.custom_jvp
+def joint_accelerations(c: Constants, q: Scalars, qd: Scalars, tau: Scalars) -> Scalars:
+    """Joint accelerations from scalar joint positions, velocities and efforts."""
+    return jax.lax.platform_dependent(
+        c, q, qd, tau, cpu=_accelerations_once, default=_accelerations
+    )
+
+
+@joint_accelerations.defjvp
+def _joint_accelerations_jvp(primals, tangents):
+    return jax.jvp(_accelerations, primals, tangents)
+
+
+def forward_dynamics(
+    linkage: Linkage,
+    q: Float[ArrayLike, " joint"],
+    qd: Float[ArrayLike, " joint"],
+    tau: Float[ArrayLike, " joint"],
+) -> Float[Array, " joint"]:
+    """Joint accelerations under joint efforts: the reduced form of (14), 3x3.
+
+    Equal to the paper's masked equations (17)-(27), and regular in cases where those
+    are singular (a massless revolute tip, for instance).
+
+    **Arguments:** `q` [m or rad], `qd` [m/s or rad/s], `tau` [N or N m].
+
+    **Returns:** `qdd` [m/s^2 or rad/s^2].
+    """
+    q, qd, tau = _joint_arrays(q=q, qd=qd, tau=tau)
+    return jnp.stack(
+        joint_accelerations(link_constants(linkage), tuple(q), tuple(qd), tuple(tau))
+    )
+
+
+def inverse_dynamics(
+    linkage: Linkage,
+    q: Float[ArrayLike, " joint"],
+    qd: Float[ArrayLike, " joint"],
+    qdd: Float[ArrayLike, " joint"],
+) -> Float[Array, " joint"]:
+    """Joint efforts that produce given joint accelerations, from (14) reduced.
+
+    **Arguments:** `q` [m or rad], `qd` [m/s or rad/s], `qdd` [m/s^2 or rad/s^2].
+
+    **Returns:** `tau` [N or N m].
+    """
+    q, qd, qdd = _joint_arrays(q=q, qd=qd, qdd=qdd)
+    m = _equations(link_constants(linkage), tuple(q), tuple(qd))
+    matrix = _joint_matrix(m)
+    return matrix @ qdd + jnp.stack(m.bias)
+
+
+def joint_mass_matrix(
+    linkage: Linkage, q: Float[ArrayLike, " joint"]
+) -> Float[Array, "joint joint"]:
+    """The reduced mass matrix S(EF)^T M S(EF), symmetric and positive definite.
+
+    **Arguments:** `q` [m or rad].
+
+    **Returns:** entries [kg m^2], [kg m] or [kg], by the types of the two joints.
+    """
+    (q,) = _joint_arrays(q=q)
+    zero = jnp.zeros_like(q)
+    return _joint_matrix(_equations(link_constants(linkage), tuple(q), tuple(zero)))
+
+
+def _joint_matrix(m: _Equations) -> Array:
+    return jnp.array(
+        [[m.m11, m.m12, m.m13], [m.m12, m.m22, m.m23], [m.m13, m.m23, m.m33]]
+    )
+
+
+def _joint_arrays(**arrays: ArrayLike) -> list[Array]:
+    return [real_array(name, value, (3,)) for name, value in arrays.items()]
+
+
+def link_energies(
+    linkage: Linkage,
+    q: Float[ArrayLike, " joint"],
+    qd: Float[ArrayLike, " joint"],
+) -> tuple[Float[Array, " link"], Float[Array, " link"]]:
+    """Kinetic and potential energy of each moving link, (6) and (7).
+
+    **Arguments:** `q` [m or rad], `qd` [m/s or rad/s].
+
+    **Returns:** two arrays [J]; the potential is zero at the ground pivot's height.
+    """
+    q, qd = _joint_arrays(q=q, qd=qd)
+    velocity, rate = mass_center_velocities(linkage, q, qd)
+    kinetic = linkage.mass * jnp.sum(velocity**2, axis=1) + linkage.inertia * rate**2
+    height = mass_centers(linkage, q)[:, 1]
+    return kinetic / 2, linkage.mass * linkage.gravity * height
+
+
+def energy(
+    linkage: Linkage,
+    q: Float[ArrayLike, " joint"],
+    qd: Float[ArrayLike, " joint"],
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Kinetic and potential energy of the linkage, (6) and (7).
+
+    **Arguments:** `q` [m or rad], `qd` [m/s or rad/s].
+
+    **Returns:** two numbers [J]; the potential is zero at the ground pivot's height.
+    """
+    kinetic, potential = link_energies(linkage, q, qd)
+    return jnp.sum(kinetic), jnp.sum(potential)

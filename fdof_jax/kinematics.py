@@ -1,0 +1,262 @@
+"""Positions and velocities of points of a linkage, and inverse kinematics."""
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from .linkage import Linkage, real_joints, to_chain
+from .trigonometry import sincos
+from .validation import concrete, one_of, real_array
+
+# Vectors of the plane are complex numbers here: multiplying by exp(i th) turns them,
+# multiplying by i turns them by 90 degrees.
+
+
+def _directions(angle: Array) -> Array:
+    sin, cos = sincos(angle)
+    return jax.lax.complex(cos, sin)
+
+
+def _plane(points: Array) -> Array:
+    return jnp.stack([points.real, points.imag], axis=-1)
+
+
+def _chain(linkage: Linkage, q: Array) -> tuple[Array, Array, Array]:
+    """Slides B1..B3, directions e_1..e_4 and the starts of the moving links."""
+    x, _ = to_chain(linkage, q, jnp.zeros(3))
+    e = _directions(jnp.concatenate([linkage.base_angle[None], x[1::2]]))
+    steps = (linkage.length[:3] + 1j * x[0::2]) * e[:3]
+    return x[0::2], e, jnp.cumsum(steps)
+
+
+def joint_positions(
+    linkage: Linkage, q: Float[ArrayLike, " joint"]
+) -> Float[Array, "joint 2"]:
+    """Where each joint pair ends and the next link starts: its revolute axis.
+
+    **Arguments:** `q`: joint positions [m or rad].
+
+    **Returns:** one point (x, y) per joint [m], from the ground pivot.
+    """
+    return _plane(_chain(linkage, real_array("q", q, (3,)))[2])
+
+
+def mass_centers(
+    linkage: Linkage, q: Float[ArrayLike, " joint"]
+) -> Float[Array, "link 2"]:
+    """Mass centres of the moving links.
+
+    **Arguments:** `q`: joint positions [m or rad].
+
+    **Returns:** one point (x, y) per moving link [m], from the ground pivot.
+    """
+    _, e, start = _chain(linkage, real_array("q", q, (3,)))
+    offset = jax.lax.complex(linkage.com[:, 0], linkage.com[:, 1])
+    return _plane(start + offset * e[1:])
+
+
+def mass_center_velocities(
+    linkage: Linkage, q: Float[ArrayLike, " joint"], qd: Float[ArrayLike, " joint"]
+) -> tuple[Float[Array, "link 2"], Float[Array, " link"]]:
+    """Velocities of the mass centres and angular velocities of the moving links.
+
+    **Arguments:** `q`: joint positions [m or rad]; `qd`: rates [m/s or rad/s].
+
+    **Returns:** one velocity (x, y) [m/s] and one angular velocity [rad/s] per link.
+    """
+    q = real_array("q", q, (3,))
+    slide, e, _ = _chain(linkage, q)
+    _, xd = to_chain(linkage, q, qd)
+    rate = jnp.concatenate([jnp.zeros(1), xd[1::2]])
+    # d/dt (A + iB) e: the link turns, and the slide moves across it.
+    arm = linkage.length[:3] + 1j * slide
+    start = jnp.cumsum((1j * rate[:3] * arm + 1j * xd[0::2]) * e[:3])
+    offset = jax.lax.complex(linkage.com[:, 0], linkage.com[:, 1])
+    return _plane(start + 1j * rate[1:] * offset * e[1:]), rate[1:]
+
+
+def tip_position(linkage: Linkage, q: Float[ArrayLike, " joint"]) -> Float[Array, " 2"]:
+    """The tip: the end of the last link's vector A4.
+
+    **Arguments:** `q`: joint positions [m or rad].
+
+    **Returns:** the point (x, y) [m], from the ground pivot.
+    """
+    _, e, start = _chain(linkage, real_array("q", q, (3,)))
+    return _plane(start[2] + linkage.length[3] * e[3])
+
+
+def tip_jacobian(
+    linkage: Linkage, q: Float[ArrayLike, " joint"]
+) -> Float[Array, "3 joint"]:
+    """Derivative of the tip's x, y and orientation in the joint positions.
+
+    **Arguments:** `q`: joint positions [m or rad].
+
+    **Returns:** rows x, y [m or 1] and orientation [rad] per joint [m or rad].
+    """
+    q = real_array("q", q, (3,))
+    _, e, start = _chain(linkage, q)
+    tip = start[2] + linkage.length[3] * e[3]
+    revolute = jnp.stack(real_joints(linkage.ef))
+    columns = jnp.where(revolute, 1j * (tip - start), 1j * e[:3])
+    return jnp.stack([columns.real, columns.imag, jnp.where(revolute, 1.0, 0.0)])
+
+
+def _angle(y: Array, x: Array) -> Array:
+    """atan2 with derivative zero instead of NaN at the origin."""
+    origin = (x == 0) & (y == 0)
+    return jnp.arctan2(y, jnp.where(origin, 1, x))
+
+
+def wrist_vector(linkage: Linkage, tip: Array, orientation: Array) -> Array:
+    """From the end of the ground's vector A1 to the start of the last link, (2,)."""
+    ground = _directions(linkage.base_angle) * linkage.length[0]
+    last = _directions(orientation) * linkage.length[3]
+    return tip - _plane(ground + last)
+
+
+def solve_joints(
+    linkage: Linkage, wrist: Array, bearing: Array, orientation: Array, branch: Array
+) -> Array:
+    """Joint positions from the wrist vector, with NaN where it is out of reach.
+
+    `bearing` is the direction angle of `wrist`. It is an argument so that a path that
+    winds around the pivot may pass an angle that has no jump.
+
+    The chain up to the wrist has two free joints, of which there are four kinds: two
+    turning vectors (RRR), a turning frame in which one slide moves (RPR), one turning
+    vector and one slide of known direction (PRR, RRP), two slides (PPR, RPP, PRP).
+    All but the last need one square root, whose sign is the branch.
+    """
+    r1, r2, r3 = real_joints(linkage.ef)
+    th1 = linkage.base_angle
+    _, a2, a3, _ = linkage.length
+    lock1, lock2, lock3 = linkage.locked
+    two_turning = r1 & r2 & r3
+    framed = r1 & ~r2 & r3
+    two_slides = (r1 ^ r2) & (r2 ^ r3) & ~framed | (~r1 & ~r2) | (~r2 & ~r3)
+    turning_third = ~r1 & r2 & r3  # PRR: link 3 turns; in RRP it is link 2
+
+    # Directions that follow from the orientation or the ground, where they do.
+    th3_from_tip = orientation - lock3
+    th2_known = jnp.where(r1, th3_from_tip - lock2, th1 + lock1)
+    th3_known = jnp.where(r3, th2_known + lock2, th3_from_tip)
+    e1, e2, e3 = _directions(jnp.stack([th1, th2_known, th3_known]))
+    w = jax.lax.complex(wrist[0], wrist[1])
+
+    def dot(u: Array, v: Array) -> Array:
+        return u.real * v.real + u.imag * v.imag
+
+    def cross(u: Array, v: Array) -> Array:
+        return u.real * v.imag - u.imag * v.real
+
+    # Vectors of links 2 and 3 in their own frames; a free slide counts as 0.
+    d2 = jax.lax.complex(a2, jnp.where(r2, lock2, 0))
+    d3 = jax.lax.complex(a3, jnp.where(r3, lock3, 0))
+    reach2, reach3 = dot(d2, d2), dot(d3, d3)
+
+    # Two slides: what remains of the wrist vector, along the two directions.
+    rest = w - d2 * e2 - d3 * e3
+    first = 1j * jnp.where(r1, e2, e1)
+    second = 1j * jnp.where(r3, e2, e3)
+    span = jnp.where(two_slides, cross(first, second), 1)
+    slide_first, slide_second = cross(rest, second) / span, cross(first, rest) / span
+
+    # One turning vector, one slide along i*across: the part of the wrist vector along
+    # `across` is the turning vector's.
+    across = jnp.where(turning_third, e1, e3)
+    remainder = w - jnp.where(turning_third, d2 * e2, d3 * e3)
+    turning = jnp.where(turning_third, reach3, reach2)
+    along_turning = dot(across, remainder)
+
+    # RPR: link 3 and its vector as seen from link 2.
+    framed_d3 = d3 * _directions(lock2)
+    distance = a2 + framed_d3.real
+
+    # RRR: the law of cosines, between the vectors of links 2 and 3.
+    square = dot(w, w)
+    inner = (square - reach2 - reach3) / 2
+
+    radicand = jnp.where(
+        two_turning,
+        reach2 * reach3 - inner**2,
+        jnp.where(framed, square - distance**2, turning - along_turning**2),
+    )
+    root = branch * jnp.sqrt(jnp.where(two_slides, 1, radicand))
+    base = jnp.where(
+        two_turning, reach2 + inner, jnp.where(framed, distance, along_turning)
+    )
+    angle = _angle(root, base)
+    own2, own3 = _angle(d2.imag, d2.real), _angle(d3.imag, d3.real)
+    turned = jnp.where(turning_third, th1, th3_known) + angle
+    th2 = jnp.where(
+        two_turning,
+        bearing - angle - own2,
+        jnp.where(
+            framed, bearing - angle, jnp.where(r1 & r2, turned - own2, th2_known)
+        ),
+    )
+    th3 = jnp.where(
+        two_turning,
+        th2 + own2 + _angle(root, inner) - own3,
+        jnp.where(
+            framed, th2 + lock2, jnp.where(turning_third, turned - own3, th3_known)
+        ),
+    )
+    slide = dot(1j * across, remainder) - root
+    slide1 = jnp.where(two_slides, slide_first, slide)
+    slide2 = jnp.where(
+        framed, root - framed_d3.imag, jnp.where(r1, slide_first, slide_second)
+    )
+    slide3 = jnp.where(two_slides, slide_second, slide)
+    return jnp.stack(
+        [
+            jnp.where(r1, th2 - th1, slide1),
+            jnp.where(r2, th3 - th2, slide2),
+            jnp.where(r3, orientation - th3, slide3),
+        ]
+    )
+
+
+def inverse_kinematics(
+    linkage: Linkage,
+    tip: Float[ArrayLike, " 2"],
+    orientation: ArrayLike,
+    *,
+    branch: int = 1,
+) -> Float[Array, " joint"]:
+    """Joint positions that put the tip at a point with a given direction of A4.
+
+    Closed form for every topology, selected by the existence factors. Angles are
+    principal values.
+
+    **Arguments:**
+
+    - `tip`: the point (x, y) [m].
+    - `orientation`: th4, the absolute angle of the last link [rad].
+    - `branch`: 1 or -1, which of the two assemblies: the sign of the turn from A2 to
+      A3 (RRR), of the slide measured from the foot of the perpendicular (RPR), or of
+      the side of the turning vector (PRR, RRP). Of no effect where there is only one.
+
+    **Returns:** `q` [m or rad]; NaN where the point is out of reach and the arguments
+    are traced.
+
+    **Raises:** ValueError for malformed arguments and, where they are concrete, for a
+    point out of reach.
+    """
+    tip = real_array("tip", tip, (2,))
+    orientation = real_array("orientation", orientation, ())
+    branch = one_of("branch", branch, (1, -1))
+    wrist = wrist_vector(linkage, tip, orientation)
+    bearing = _angle(wrist[1], wrist[0])
+    q = solve_joints(linkage, wrist, bearing, orientation, jnp.asarray(float(branch)))
+    values = concrete(q)
+    if values is not None and not jnp.isfinite(values).all():
+        raise ValueError(
+            f"tip: expected a point within reach at orientation {orientation:g} rad, "
+            f"got {tip.tolist()}."
+        )
+    return q

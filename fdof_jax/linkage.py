@@ -1,0 +1,329 @@
+"""The linkage: which joints it has, its links, and its two sets of coordinates.
+
+Pair k of the chain P-R-P-R-P-R joins link k to link k + 1; its prismatic joint
+slides by B_k across link k, its revolute joint sits at the start of link k + 1.
+Link 1 is the ground. One joint of each pair is real, the other is fictitious and
+held at its initial value.
+"""
+
+import warnings
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from .validation import concrete, is_traced, real_array
+
+TOPOLOGIES = ("RRR", "RRP", "RPR", "PRR", "RPP", "PRP", "PPR")
+
+# Below this pivot ratio nothing is left of a pivot but rounding.
+_SINGULAR = 1e-14
+
+
+def _pairs_of(topology: Any) -> np.ndarray | None:
+    """(3, 2) existence factors (prismatic, revolute), or None while traced."""
+    if isinstance(topology, str):
+        if topology not in TOPOLOGIES:
+            detail = ""
+            if topology == "PPP":
+                detail = " (PPP cannot orient its last link: the paper excludes it)"
+            raise ValueError(
+                f"topology: expected one of {', '.join(TOPOLOGIES)}, "
+                f"got {topology!r}{detail}."
+            )
+        return np.array([[j == "P", j == "R"] for j in topology], dtype=float)
+    if is_traced(topology):
+        if jnp.shape(topology) != (6,):
+            raise ValueError(
+                "topology: expected a name or 6 existence factors, got shape "
+                f"{jnp.shape(topology)}."
+            )
+        return None
+    try:
+        ef = np.asarray(topology, dtype=float)
+    except (TypeError, ValueError):
+        ef = np.empty(0)
+    if ef.shape != (6,) or not np.isin(ef, (0, 1)).all():
+        raise ValueError(
+            f"topology: expected one of {', '.join(TOPOLOGIES)} or six existence "
+            f"factors of 0 or 1, got {topology!r}."
+        )
+    pairs = ef.reshape(3, 2)
+    if not (pairs.sum(axis=1) == 1).all():
+        raise ValueError(
+            "topology: expected exactly one real joint in each (prismatic, revolute) "
+            f"pair of existence factors (equation 4), got {ef.astype(int).tolist()}."
+        )
+    if pairs[:, 0].all():
+        raise ValueError(
+            "topology: expected at least one revolute joint, got PPP, which cannot "
+            "orient its last link."
+        )
+    return pairs
+
+
+def existence_factors(topology: str) -> Float[Array, " 6"]:
+    """Existence factors EF1..EF6 of a topology, equation (4).
+
+    Prismatic before revolute in each pair, 1 for a real joint and 0 for a
+    fictitious one: "RPR" gives 0, 1, 1, 0, 0, 1.
+
+    **Arguments:** `topology`: one of `TOPOLOGIES`.
+
+    **Raises:** ValueError for any other name.
+
+    >>> existence_factors("RPR").astype(int).tolist()
+    [0, 1, 1, 0, 0, 1]
+    """
+    pairs = _pairs_of(str(topology))
+    return jnp.asarray(pairs, dtype=float).reshape(6)
+
+
+class Linkage(eqx.Module):
+    """A planar chain of three moving links, as in Fig 1 of the paper.
+
+    Link n starts at its characteristic point. Its vector A_n runs along the link,
+    the slide of the next prismatic joint B_n perpendicular to it (90 degrees
+    counter-clockwise), and the mass centre lies p_n along and q_n across. Every
+    field is an array, so linkages of different topologies share one compilation and
+    can be stacked into a batch.
+
+    **Arguments:**
+
+    - `topology`: one of `TOPOLOGIES`, or six existence factors. Kept as `ef`.
+    - `length`: A1..A4 [m]; A1 belongs to the ground.
+    - `com`: (p_n, q_n) of the three moving links [m].
+    - `mass`: masses m2..m4 of the moving links [kg].
+    - `inertia`: moments of inertia I2..I4 about the mass centres [kg m^2].
+    - `locked`: position at which the fictitious joint of each pair stands still: B_k
+      [m] where the real joint is revolute, th_{k+1} - th_k [rad] where it is
+      prismatic.
+    - `base_angle`: th1, the angle of the ground's vector A1 [rad].
+    - `gravity`: acceleration along -y [m/s^2].
+
+    **Raises:** ValueError for malformed input and for linkages that can carry no
+    load at some joint in any configuration. Warns where a configuration exists in
+    which the mass matrix may be singular, and where two joints do the same thing
+    (the paper's rules (i) and (ii)).
+
+    >>> pendulum = Linkage("RRR", length=[0, 1, 1, 1], com=[[1, 0]] * 3,
+    ...                    mass=[1, 1, 1], inertia=[0, 0, 0])
+    >>> pendulum.mass.shape
+    (3,)
+    """
+
+    ef: Float[Array, " 6"]
+    length: Float[Array, " 4"]
+    com: Float[Array, "3 2"]
+    mass: Float[Array, " 3"]
+    inertia: Float[Array, " 3"]
+    locked: Float[Array, " 3"]
+    base_angle: Float[Array, ""]
+    gravity: Float[Array, ""]
+
+    def __init__(
+        self,
+        topology: str | ArrayLike,
+        *,
+        length: ArrayLike,
+        com: ArrayLike,
+        mass: ArrayLike,
+        inertia: ArrayLike,
+        locked: ArrayLike = 0.0,
+        base_angle: ArrayLike = 0.0,
+        gravity: ArrayLike = 9.81,
+    ):
+        pairs = _pairs_of(topology)
+        ef = topology if pairs is None else pairs.reshape(6)
+        self.ef = jnp.asarray(ef, dtype=float)
+        self.length = real_array("length", length, (4,))
+        self.com = real_array("com", com, (3, 2))
+        self.mass = real_array("mass", mass, (3,), minimum=0)
+        self.inertia = real_array("inertia", inertia, (3,), minimum=0)
+        self.locked = real_array("locked", locked, (3,), broadcast=True)
+        self.base_angle = real_array("base_angle", base_angle, ())
+        self.gravity = real_array("gravity", gravity, ())
+        if not is_traced(list(vars(self).values())):
+            _check_singularity(self)
+
+
+class State(NamedTuple):
+    """Joint positions and velocities; a bare pytree, checked where it is used.
+
+    `q`: the slide B_k [m] of a prismatic joint, the relative angle th_{k+1} - th_k
+    [rad] of a revolute joint, in joint order (3,). `qd`: their rates (3,).
+    """
+
+    q: ArrayLike
+    qd: ArrayLike
+
+
+def real_joints(ef: Array) -> tuple[Array, Array, Array]:
+    """Whether the real joint of each pair is the revolute one."""
+    return ef[1] > 0.5, ef[3] > 0.5, ef[5] > 0.5
+
+
+def to_chain(
+    linkage: Linkage, q: Float[ArrayLike, " 3"], qd: Float[ArrayLike, " 3"]
+) -> tuple[Float[Array, " 6"], Float[Array, " 6"]]:
+    """Chain coordinates (B1, th2, B2, th3, B3, th4) and their rates, from joint ones.
+
+    Angles are absolute, as in the paper; fictitious joints stand at `linkage.locked`.
+
+    **Arguments:** `q`, `qd`: joint positions [m or rad] and velocities.
+
+    **Returns:** `x` [m, rad] and `xd` [m/s, rad/s].
+    """
+    q, qd = real_array("q", q, (3,)), real_array("qd", qd, (3,))
+    revolute = jnp.stack(real_joints(linkage.ef))
+    slide = jnp.where(revolute, linkage.locked, q)
+    turn = jnp.where(revolute, q, linkage.locked)
+    x = jnp.stack([slide, linkage.base_angle + jnp.cumsum(turn)], axis=1)
+    xd = jnp.stack(
+        [jnp.where(revolute, 0, qd), jnp.cumsum(jnp.where(revolute, qd, 0))], axis=1
+    )
+    return x.reshape(6), xd.reshape(6)
+
+
+def from_chain(
+    topology: str | ArrayLike,
+    x: Float[ArrayLike, " 6"],
+    xd: Float[ArrayLike, " 6"],
+    base_angle: ArrayLike = 0.0,
+) -> tuple[Float[Array, " 3"], State]:
+    """Locked positions and joint state, from the paper's lists of initial conditions.
+
+    **Arguments:**
+
+    - `topology`: one of `TOPOLOGIES`, or six existence factors.
+    - `x`, `xd`: (B1, th2, B2, th3, B3, th4), absolute angles [m, rad], and rates.
+    - `base_angle`: th1 [rad].
+
+    **Returns:** `locked` for `Linkage`, and the `State`.
+
+    **Raises:** ValueError for malformed input and for velocities that would move a
+    fictitious joint (the paper's method stops accelerations only: such a start would
+    drift).
+
+    >>> locked, state = from_chain("RPR", [0, 1.5, 2.5, 2.5, 0, 2], [0] * 6)
+    >>> locked.tolist(), state.q.tolist()
+    ([0.0, 1.0, 0.0], [1.5, 2.5, -0.5])
+    """
+    pairs = _pairs_of(topology)
+    x, xd = real_array("x", x, (6,)), real_array("xd", xd, (6,))
+    base_angle = real_array("base_angle", base_angle, ())
+    revolute = (
+        jnp.asarray(topology).reshape(3, 2)[:, 1] if pairs is None else pairs[:, 1]
+    )
+    revolute = jnp.asarray(revolute) > 0.5
+    turn = jnp.diff(x[1::2], prepend=base_angle)
+    turn_rate = jnp.diff(xd[1::2], prepend=0)
+    held = concrete(jnp.where(revolute, xd[0::2], turn_rate))
+    if held is not None and pairs is not None:
+        # Differences of absolute rates carry their rounding.
+        scale = np.abs(np.asarray(xd)).max()
+        for k in np.flatnonzero(np.abs(held) > 8 * np.finfo(held.dtype).eps * scale):
+            rate = (
+                f"B{k + 1} rate 0"
+                if pairs[k, 1]
+                else (f"th{k + 2} rate equal to th{k + 1} rate" if k else "th2 rate 0")
+            )
+            raise ValueError(
+                f"xd: expected {rate}, because that joint is fictitious, got a "
+                f"difference of {held[k]:g}."
+            )
+    locked = jnp.where(revolute, x[0::2], turn)
+    return locked, State(
+        jnp.where(revolute, turn, x[0::2]), jnp.where(revolute, turn_rate, xd[0::2])
+    )
+
+
+def _pivot_ratios(linkage: Linkage, configurations: int) -> np.ndarray:
+    """Scale-free pivots D_k / M_kk of the 3x3 mass matrix, (configurations, 3).
+
+    From the tip: what is left of the inertia that joint k feels once the joints
+    further out are free. Written in NumPy because it runs at the door.
+    """
+    ef, length, com, mass, inertia, locked, base_angle = (
+        np.asarray(a, dtype=float)
+        for a in (
+            linkage.ef, linkage.length, linkage.com, linkage.mass,
+            linkage.inertia, linkage.locked, linkage.base_angle,
+        )
+    )  # fmt: skip
+    revolute = ef[1::2] > 0.5
+    ratios = np.empty((configurations, 3))
+    random = np.random.default_rng(0)
+    reach = np.abs(length).sum() + np.abs(com).sum() + np.abs(locked[revolute]).sum()
+    for row in ratios:
+        turn = np.where(revolute, random.uniform(-np.pi, np.pi, 3), locked)
+        slide = np.where(revolute, locked, (reach or 1) * random.uniform(-1, 1, 3))
+        angle = base_angle + np.concatenate([[0], np.cumsum(turn)])
+        along = np.exp(1j * angle)  # complex numbers as plane vectors
+        steps = (length[:3] + 1j * slide) * along[:3]
+        origin = np.cumsum(steps)
+        M = np.zeros((3, 3))
+        for n in range(3):
+            centre = origin[n] + (com[n, 0] + 1j * com[n, 1]) * along[n + 1]
+            J = np.where(revolute, 1j * (centre - origin), 1j * along[:3])
+            J[n + 1 :] = 0
+            turns = np.where(revolute, 1.0, 0.0)
+            turns[n + 1 :] = 0
+            M += mass[n] * np.real(np.outer(J.conj(), J)) + inertia[n] * np.outer(
+                turns, turns
+            )
+        diagonal = np.diag(M).copy()
+        for k in (2, 1, 0):
+            row[k] = M[k, k] / diagonal[k] if diagonal[k] > 0 else 0
+            if row[k] > _SINGULAR:
+                M -= np.outer(M[:, k], M[k, :]) / M[k, k]
+    return ratios
+
+
+def _check_singularity(linkage: Linkage) -> None:
+    """Refuse linkages that are always singular, warn of those that may become so."""
+    revolute = np.asarray(linkage.ef)[1::2] > 0.5
+    names = "".join("R" if r else "P" for r in revolute)
+    best = _pivot_ratios(linkage, configurations=5).max(axis=0)
+    for k in (2, 1, 0):
+        if best[k] <= _SINGULAR:
+            kind = "revolute" if revolute[k] else "prismatic"
+            raise ValueError(
+                f"mass, inertia, com: expected joint {k + 1} ({kind}) of {names} to "
+                f"move some inertia of moving link {k + 1} (m{k + 2}, I{k + 2}, p{k + 2}, "
+                f"q{k + 2}) or of the links beyond it, got none in any configuration: "
+                "its acceleration is undetermined."
+            )
+    mass, inertia = np.asarray(linkage.mass), np.asarray(linkage.inertia)
+    own = np.where(
+        revolute, inertia + mass * (np.asarray(linkage.com) ** 2).sum(axis=1), mass
+    )
+    locked, length = np.asarray(linkage.locked), np.asarray(linkage.length)
+    for k in np.flatnonzero(own == 0):
+        warnings.warn(
+            f"moving link {k + 1} carries no inertia of its own about joint {k + 1}: "
+            "the mass matrix may be singular in some configurations.",
+            stacklevel=5,
+        )
+    for k in (1, 2):
+        if revolute[k - 1] and revolute[k] and np.hypot(length[k], locked[k]) == 0:
+            warnings.warn(
+                f"revolute joints {k} and {k + 1} coincide (moving link {k} has no "
+                "length, the paper's rule (i)): one of them is redundant for "
+                "positioning.",
+                stacklevel=5,
+            )
+        if (
+            not revolute[k - 1]
+            and not revolute[k]
+            and abs(np.sin(locked[k - 1])) < 1e-12
+        ):
+            warnings.warn(
+                f"prismatic joints {k} and {k + 1} are parallel (the paper's rule "
+                "(ii)): one of them is redundant for positioning.",
+                stacklevel=5,
+            )

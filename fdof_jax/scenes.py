@@ -1,0 +1,82 @@
+"""The paper's three examples as data. Each value's source is the figure's own list."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from .control import CircleTask, PDController
+from .forces import JointDamper
+from .linkage import Linkage, State, from_chain
+from .simulation import Forces
+
+
+class Scene(NamedTuple):
+    """A linkage, where it starts, what acts on it and for how long.
+
+    - `linkage`, `state0`, `forces`: the arguments of `simulate`.
+    - `t1`: end time, the start being 0 [s].
+    """
+
+    linkage: Linkage
+    state0: State
+    forces: Forces
+    t1: ArrayLike
+
+
+def fig3() -> Scene:
+    """Figs 3 and 4: a damped triple pendulum with offset mass centres, from rest.
+
+    Gravity is not printed: 9.81 m/s^2. The damping acts on the relative rates of the
+    revolute joints.
+    """
+    linkage = Linkage(
+        "RRR",
+        length=[0, 1, 1, 1],
+        com=[[0.5, -1], [0.5, 1], [1, -1]],
+        mass=[5, 2, 1],
+        inertia=[0, 0, 0],
+    )
+    state0 = State(np.zeros(3), np.zeros(3))
+    return Scene(linkage, state0, (JointDamper(20.0),), 20.0)
+
+
+def fig5() -> Scene:
+    """Figs 5 and 6: a conservative triple pendulum of point masses, from rest.
+
+    Gravity is not printed: 9.81 m/s^2.
+    """
+    linkage = Linkage(
+        "RRR",
+        length=[0, 1, 1, 1],
+        com=[[1, 0], [1, 0], [1, 0]],
+        mass=[1, 1, 1],
+        inertia=[0, 0, 0],
+    )
+    return Scene(linkage, State(np.zeros(3), np.zeros(3)), (), 10.0)
+
+
+def fig7() -> Scene:
+    """Fig 7: an RPR arm under saturated PD control, its tip commanded along a circle.
+
+    The initial angles are absolute and the list's second "THETA 4" is theta 1; gravity
+    and the circle are not printed: 9.81 m/s^2, and `CircleTask`'s default, our choice.
+    """
+    locked, state0 = from_chain(
+        "RPR", [0, np.pi / 2, 2.5, np.pi, 0, np.pi / 2], np.zeros(6)
+    )
+    linkage = Linkage(
+        "RPR",
+        length=[0, 1, 2.5, 1],
+        com=[[1, 0], [2.5, 0], [1, 0]],
+        mass=[1, 1, 1],
+        inertia=[1, 1, 1],
+        locked=locked,
+    )
+    controller = PDController(
+        kp=[1500, 20000, 800],
+        kd=[80, 50, 50],
+        limit=[1000, 300, 400],
+        reference=CircleTask(),
+    )
+    return Scene(linkage, state0, (controller,), 10.0)

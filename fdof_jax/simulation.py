@@ -1,0 +1,223 @@
+"""Simulation: the vector field and its integration by diffrax."""
+
+import warnings
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Float
+
+from .dynamics import Constants, Scalars, joint_accelerations, link_constants
+from .linkage import Linkage, State
+from .validation import callable_tuple, concrete, is_traced, real_array
+
+Forces = tuple[Callable[..., Array], ...]
+
+
+class Solution(eqx.Module):
+    """A simulated motion.
+
+    - `ts`: output times [s].
+    - `q`, `qd`: joint positions [m or rad] and velocities at `ts`. NaN after a solve
+      that failed.
+    - `stats`: diffrax's statistics, `num_steps` among them.
+    - `result`: diffrax's result, one per trajectory; `diffrax.RESULTS.successful` or
+      the reason of the failure.
+    """
+
+    ts: Float[Array, " time"]
+    q: Float[Array, "time joint"]
+    qd: Float[Array, "time joint"]
+    stats: dict[str, Any]
+    result: diffrax.RESULTS
+
+
+class Efforts(NamedTuple):
+    """Joint efforts along a motion [N or N m]: their sum (time, 3), and those of each
+    force element (element, time, 3)."""
+
+    total: Float[Array, "time joint"]
+    elements: Float[Array, "element time joint"]
+
+
+class _Args(NamedTuple):
+    linkage: Linkage
+    constants: Constants
+    forces: Forces
+
+
+def _vector_field(t: Any, y: tuple[Scalars, Scalars], args: _Args):
+    """Rates of six scalars; arrays only for the force elements, where there are any."""
+    q, qd = y
+    zero = jnp.zeros_like(q[0])
+    tau = (zero, zero, zero)
+    if args.forces:
+        q_array, qd_array = jnp.stack(q), jnp.stack(qd)
+        for index, element in enumerate(args.forces):
+            effort = element_effort(index, element, t, q_array, qd_array, args.linkage)
+            tau = tuple(a + b for a, b in zip(tau, effort))
+    return qd, joint_accelerations(args.constants, q, qd, tau)
+
+
+def element_effort(
+    index: int, element: Any, t: Array, q: Array, qd: Array, linkage: Linkage
+) -> Array:
+    """What one force element returns, refused unless it is three real numbers."""
+    tau = jnp.asarray(element(t, q, qd, linkage))
+    if tau.shape != (3,) or not jnp.issubdtype(tau.dtype, jnp.floating):
+        raise ValueError(
+            f"forces[{index}]: expected it to return tau, an array of 3 real numbers, "
+            f"got shape {tau.shape} and dtype {tau.dtype}."
+        )
+    return tau.astype(q.dtype)
+
+
+def _default_controller() -> diffrax.PIDController:
+    # The smallest step ends solves that turn NaN, which would be rejected for ever.
+    tolerance, smallest = (1e-11, 1e-13) if jnp.result_type(float) == jnp.float64 else (
+        1e-6, 1e-8)  # fmt: skip
+    return diffrax.PIDController(
+        rtol=tolerance, atol=tolerance, dtmin=smallest, force_dtmin=False
+    )
+
+
+@eqx.filter_jit
+def _solve(linkage, state0, ts, forces, keywords) -> Solution:
+    solution = diffrax.diffeqsolve(
+        diffrax.ODETerm(_vector_field),
+        t0=ts[0],
+        t1=ts[-1],
+        y0=(tuple(state0.q), tuple(state0.qd)),
+        args=_Args(linkage, link_constants(linkage), forces),
+        saveat=diffrax.SaveAt(ts=ts),
+        **keywords,
+    )
+    # diffrax leaves infinity where it has not come to save.
+    assert solution.ys is not None  # because of saveat
+    q, qd = (jnp.stack(rows, axis=-1) for rows in solution.ys)
+    q, qd = (jnp.where(jnp.isinf(a), jnp.nan, a) for a in (q, qd))
+    return Solution(ts, q, qd, solution.stats, solution.result)
+
+
+def simulate(
+    linkage: Linkage,
+    state0: State,
+    ts: Float[Array, " time"],
+    forces: Forces = (),
+    *,
+    solver: diffrax.AbstractSolver = diffrax.Dopri8(),
+    stepsize_controller: diffrax.AbstractStepSizeController | None = None,
+    dt0: float | None = 1e-3,
+    adjoint: diffrax.AbstractAdjoint = diffrax.RecursiveCheckpointAdjoint(),
+    max_steps: int | None = 65536,
+    throw: bool = True,
+    progress_meter: diffrax.AbstractProgressMeter = diffrax.NoProgressMeter(),
+) -> Solution:
+    """The motion of a linkage from `state0` at `ts[0]`, at the times `ts`.
+
+    Pure and differentiable in every array, batched by `jax.vmap`; one compilation
+    serves all topologies. The motion is that of the paper's masked equations
+    (17)-(27), in their reduced form.
+
+    **Arguments:**
+
+    - `linkage`, `state0`: the arm, and its joint positions and velocities.
+    - `ts`: increasing times [s].
+    - `forces`: a tuple of force elements `(t, q, qd, linkage) -> tau`.
+    - `solver`, `stepsize_controller`, `dt0`, `adjoint`, `max_steps`, `throw`,
+      `progress_meter`: as in `diffrax.diffeqsolve`. By default Dopri8 at a relative
+      and absolute tolerance of 1e-11 in float64, 1e-6 in float32, for which
+      `stepsize_controller=None` stands. The first step `dt0` is 1 ms, because
+      estimates of it fail from exact rest; `None` lets the controller estimate it.
+      Reverse mode works with the default `adjoint`; for forward mode pass
+      `diffrax.ForwardMode()`.
+
+    **Returns:** a `Solution`. With `throw=False` a failed solve is told by its
+    `result`, and what it did not reach is NaN.
+
+    **Raises:** ValueError for malformed arguments; whatever the force elements' own
+    `check(linkage, ts)` raises; with `throw=True` a RuntimeError if the solve fails.
+    Warns in float32 if the tolerance cannot be met.
+    """
+    if not isinstance(linkage, Linkage):
+        raise ValueError(f"linkage: expected a Linkage, got {linkage!r}.")
+    try:
+        q0, qd0 = state0
+    except (TypeError, ValueError):
+        raise ValueError(f"state0: expected a State(q, qd), got {state0!r}.") from None
+    state0 = State(real_array("state0.q", q0, (3,)), real_array("state0.qd", qd0, (3,)))
+    ts = real_array("ts", ts, (None,))
+    if ts.size == 0:
+        raise ValueError("ts: expected at least one time, got none.")
+    times = concrete(ts)
+    if times is not None and not (np.diff(times) > 0).all():
+        raise ValueError(f"ts: expected increasing times, got {times.tolist()[:20]}.")
+    callable_tuple("forces", forces)
+    if isinstance(adjoint, diffrax.BacksolveAdjoint):
+        raise ValueError(
+            "adjoint: expected RecursiveCheckpointAdjoint (reverse mode) or "
+            "ForwardMode, got BacksolveAdjoint, whose gradients are wrong on these problems."
+        )
+    if stepsize_controller is None:
+        stepsize_controller = _default_controller()
+    _warn_of_tolerance(stepsize_controller)
+    for element in forces:
+        check = getattr(element, "check", None)
+        if check is not None and not is_traced(linkage, ts, element):
+            check(linkage, ts)
+    keywords = dict(
+        solver=solver,
+        stepsize_controller=stepsize_controller,
+        dt0=dt0,
+        adjoint=adjoint,
+        max_steps=max_steps,
+        throw=throw,
+        progress_meter=progress_meter,
+    )
+    try:
+        return _solve(linkage, state0, ts, forces, keywords)
+    except TypeError as error:
+        if "forward-mode" in str(error):
+            raise TypeError(
+                "forward-mode differentiation of simulate needs "
+                "adjoint=diffrax.ForwardMode()."
+            ) from error
+        raise
+
+
+def _warn_of_tolerance(controller: diffrax.AbstractStepSizeController) -> None:
+    dtype = jnp.result_type(float)
+    for name in ("rtol", "atol"):
+        tolerance = getattr(controller, name, None)
+        if dtype == jnp.float32 and isinstance(tolerance, float) and tolerance < 5e-7:
+            warnings.warn(
+                f"stepsize_controller: {name}={tolerance:g} cannot be met in float32 "
+                "(about 1e-6 can); switch on jax_enable_x64 for more.",
+                stacklevel=3,
+            )
+
+
+def joint_efforts(linkage: Linkage, forces: Forces, solution: Solution) -> Efforts:
+    """Joint efforts of the force elements along a motion.
+
+    **Arguments:** the linkage, the forces and the solution of one `simulate`.
+
+    **Returns:** `Efforts(total, elements)` [N or N m]: (time, 3), and per element
+    (element, time, 3).
+
+    **Raises:** ValueError if `forces` is not a tuple of force elements.
+    """
+    callable_tuple("forces", forces)
+    elements = [
+        jax.vmap(lambda t, q, qd, i=i, f=f: element_effort(i, f, t, q, qd, linkage))(
+            solution.ts, solution.q, solution.qd
+        )
+        for i, f in enumerate(forces)
+    ]
+    stacked = jnp.stack(elements) if elements else jnp.zeros((0, *solution.q.shape))
+    return Efforts(jnp.sum(stacked, axis=0), stacked)

@@ -1,0 +1,136 @@
+"""Sine and cosine from one evaluation, vectorisable by XLA on CPU.
+
+XLA calls the scalar C library for float64 `sin` and `cos` on CPU, which costs
+more than the rest of the equations of motion together. Range reduction and two
+short polynomials in plain arithmetic fuse into the surrounding loop instead.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+# pi/2 as three parts with trailing zeros, whose products with a quadrant number
+# below 2**20 (float64) or 2**10 (float32) are exact, and a remainder.
+_HALF_PI = {
+    np.dtype("float64"): (
+        1.5707963267341256,
+        6.077100506303966e-11,
+        2.0222662487111665e-21,
+        8.4784276603689e-32,
+    ),
+    np.dtype("float32"): (
+        1.5706787109375,
+        0.00011761486530303955,
+        9.920313459588215e-10,
+        6.223372171896613e-14,
+    ),
+}
+# Chebyshev fits, highest power of z = r**2 first, of (sin(r)/r - 1)/z and
+# (cos(r) - 1 + z/2)/z**2 on |r| <= pi/4: error below 0.2 ulp of the result.
+_SIN = {
+    np.dtype("float64"): (
+        1.5918129027234826e-10,
+        -2.505113184128889e-08,
+        2.7557316102534617e-06,
+        -0.0001984126983675854,
+        0.008333333333330948,
+        -0.16666666666666666,
+    ),
+    np.dtype("float32"): (
+        -0.000195878904001737,
+        0.008332748268406942,
+        -0.1666666466230294,
+    ),
+}
+_COS = {
+    np.dtype("float64"): (
+        -1.1382632258093615e-11,
+        2.087614626607931e-09,
+        -2.7557317271718644e-07,
+        2.4801587298765665e-05,
+        -0.0013888888888887398,
+        0.041666666666666664,
+    ),
+    np.dtype("float32"): (
+        2.4547941603820702e-05,
+        -0.0013888303033667549,
+        0.041666664659490746,
+    ),
+}
+# Adding 1.5 * 2**(mantissa bits) to a whole number leaves it in the low bits, which
+# is cheaper than a conversion to integer with its checks for overflow.
+_INTEGER_BITS = {
+    np.dtype("float64"): (6755399441055744.0, np.int64, 62),
+    np.dtype("float32"): (12582912.0, np.int32, 30),
+}
+
+
+def _two_sum(a: Array, b: Array) -> tuple[Array, Array]:
+    """The rounded sum of `a` and `b` and its exact error (Knuth)."""
+    total = a + b
+    b_part = total - a
+    return total, (a - (total - b_part)) + (b - b_part)
+
+
+def _horner(coefficients: tuple[float, ...], z: Array) -> Array:
+    value = jnp.full_like(z, coefficients[0])
+    for coefficient in coefficients[1:]:
+        value = value * z + coefficient
+    return value
+
+
+def _polynomial_sincos(x: Array) -> tuple[Array, Array]:
+    shift, integer, sign_shift = _INTEGER_BITS[x.dtype]
+    part1, part2, part3, tail = _HALF_PI[x.dtype]
+    quadrants = jax.lax.round(x * (2 / np.pi), jax.lax.RoundingMethod.TO_NEAREST_EVEN)
+    # Near a zero of the result all leading digits cancel: the errors of the two
+    # inexact subtractions are kept, so the remainder is right to half an ulp.
+    r, error2 = _two_sum(x - quadrants * part1, -quadrants * part2)
+    r, error3 = _two_sum(r, -quadrants * part3)
+    r = r + (error2 + error3 - quadrants * tail)
+    z = r * r
+    sin_r = r + r * (z * _horner(_SIN[x.dtype], z))
+    cos_r = (1 - 0.5 * z) + z * (z * _horner(_COS[x.dtype], z))
+    quadrant = jax.lax.bitcast_convert_type(quadrants + shift, integer)
+    swap = (quadrant & 1) == 1
+    sin = jnp.where(swap, cos_r, sin_r)
+    cos = jnp.where(swap, sin_r, cos_r)
+
+    def with_sign(value: Array, bit: Array) -> Array:
+        bits = jax.lax.bitcast_convert_type(value, integer)
+        return jax.lax.bitcast_convert_type(bits ^ (bit << sign_shift), value.dtype)
+
+    # Quadrants 2 and 3 flip the sine, 1 and 2 the cosine.
+    return with_sign(sin, quadrant & 2), with_sign(cos, (quadrant + 1) & 2)
+
+
+@jax.custom_jvp
+def _sincos(x: Array) -> tuple[Array, Array]:
+    return jax.lax.platform_dependent(
+        x,
+        cpu=_polynomial_sincos,
+        default=lambda x: (jnp.sin(x), jnp.cos(x)),
+    )
+
+
+@_sincos.defjvp
+def _sincos_jvp(primals, tangents):
+    (x,), (x_dot,) = primals, tangents
+    sin, cos = _sincos(x)
+    return (sin, cos), (cos * x_dot, -sin * x_dot)
+
+
+def sincos(x: ArrayLike) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+    """Sine and cosine of `x`, each to 2 ulp relative, also next to their zeros.
+
+    Holds for |x| <= 2**20 rad in float64 and |x| <= 1500 rad in float32. Beyond,
+    the result is that of an angle within one rounding of `x`. Infinities and NaN
+    give NaN. Derivatives of any order are exact. Accelerators use XLA's own sine
+    and cosine.
+
+    **Arguments:** `x`: angles [rad], any shape, float32 or float64.
+    """
+    return _sincos(jnp.asarray(x, dtype=jnp.result_type(float, x)))

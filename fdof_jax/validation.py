@@ -1,0 +1,100 @@
+"""Checks of arguments at the library's doors.
+
+Shapes and types are checked always, values only where they are concrete: a value
+traced by `jax.jit`, `jax.vmap` or `jax.grad` is not known yet.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.core import Tracer
+
+
+def is_traced(*trees: Any) -> bool:
+    """Whether any leaf of `trees` is being traced by a JAX transformation."""
+    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(trees))
+
+
+def concrete(value: Any) -> np.ndarray | None:
+    """`value` as a NumPy array, or None while it is traced."""
+    return None if is_traced(value) else np.asarray(value)
+
+
+def real_array(
+    name: str,
+    value: Any,
+    shape: tuple[int | None, ...],
+    *,
+    minimum: float | None = None,
+    above: float | None = None,
+    finite: bool = True,
+    broadcast: bool = False,
+) -> Array:
+    """`value` as an array of the default float dtype and the given shape.
+
+    `None` in `shape` stands for any length. `broadcast` also accepts one number for
+    all entries. Raises ValueError naming the argument, what was expected and what
+    came, for a wrong shape, a type that is not real numbers, NaN, infinities
+    (unless `finite=False`) and entries below `minimum` or not above `above`.
+    """
+    size = "x".join("n" if n is None else str(n) for n in shape)
+    expected = f"an array of {size} real numbers" if shape else "a real number"
+    if finite:
+        expected += ", all finite" if shape else ", finite"
+    if minimum is not None:
+        expected += f", at least {minimum:g}"
+    if above is not None:
+        expected += f", above {above:g}"
+    if broadcast and shape:
+        expected += " (or one number for all)"
+
+    def refuse(got: str) -> ValueError:
+        return ValueError(f"{name}: expected {expected}, got {got}.")
+
+    traced = is_traced(value)
+    try:
+        array = jnp.asarray(value) if traced else np.asarray(value)
+    except (TypeError, ValueError) as error:
+        raise refuse(repr(value)) from error
+    if array.dtype.kind not in "iuf":
+        raise refuse(repr(value))
+    fits = array.ndim == len(shape) and all(
+        want is None or want == have for want, have in zip(shape, array.shape)
+    )
+    if not fits and not (broadcast and array.ndim == 0):
+        raise refuse(f"shape {array.shape}" if array.ndim else repr(value))
+    if not traced:
+        kept = np.asarray(array, dtype=jnp.result_type(float))
+        bad = np.isnan(kept)
+        if finite:
+            bad |= np.isinf(kept)
+        if minimum is not None:
+            bad |= kept < minimum
+        if above is not None:
+            bad |= kept <= above
+        if bad.any():
+            raise refuse(np.array2string(np.asarray(array), threshold=20))
+        array = kept
+    array = jnp.asarray(array, dtype=float)
+    return jnp.broadcast_to(array, shape) if not fits else array  # type: ignore[arg-type]
+
+
+def callable_tuple(name: str, value: Any) -> tuple:
+    """`value` if it is a tuple of callables, else ValueError."""
+    if isinstance(value, tuple) and all(callable(item) for item in value):
+        return value
+    raise ValueError(
+        f"{name}: expected a tuple of callables (t, q, qd, linkage) -> tau, for "
+        f"instance (JointDamper(1.0),), got {value!r}."
+    )
+
+
+def one_of(name: str, value: Any, options: Sequence[Any]) -> Any:
+    """`value` if it is among `options`, else ValueError."""
+    if isinstance(value, str | int | float) and value in options:
+        return value
+    raise ValueError(f"{name}: expected one of {tuple(options)}, got {value!r}.")
