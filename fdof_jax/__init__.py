@@ -15,6 +15,7 @@ from .dynamics import (
     link_energies as link_energies,
 )
 from .forces import JointDamper as JointDamper, JointEffort as JointEffort
+from .interop import to_mjcf as to_mjcf
 from .kinematics import (
     inverse_kinematics as inverse_kinematics,
     joint_positions as joint_positions,

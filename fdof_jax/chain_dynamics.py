@@ -8,15 +8,14 @@ that simulations use.
 import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
-from numpy.typing import ArrayLike
 
-from .linkage import Linkage
+from .linkage import Linkage, compiled
 from .trigonometry import sincos
-from .validation import real_array
 
 
+@compiled(x=(6,))
 def mass_matrix(
-    linkage: Linkage, x: Float[ArrayLike, " chain"]
+    linkage: Linkage, x: Float[Array, " chain"]
 ) -> Float[Array, "chain chain"]:
     """The 6x6 mass matrix of the generalised chain: left sides of (8)-(13).
 
@@ -24,7 +23,7 @@ def mass_matrix(
 
     **Returns:** entries [kg], [kg m] or [kg m^2], by the coordinates.
     """
-    _, th2, B2, th3, B3, th4 = real_array("x", x, (6,))
+    _, th2, B2, th3, B3, th4 = x
     th1 = linkage.base_angle
     _, A2, A3, _ = linkage.length
     m2, m3, m4 = linkage.mass
@@ -73,8 +72,9 @@ def mass_matrix(
     )
 
 
+@compiled(x=(6,), xd=(6,))
 def bias_force(
-    linkage: Linkage, x: Float[ArrayLike, " chain"], xd: Float[ArrayLike, " chain"]
+    linkage: Linkage, x: Float[Array, " chain"], xd: Float[Array, " chain"]
 ) -> Float[Array, " chain"]:
     """phi of (14): velocity-dependent forces and gravity, right sides of (8)-(13).
 
@@ -82,8 +82,8 @@ def bias_force(
 
     **Returns:** generalised forces [N, N m], without efforts.
     """
-    _, th2, B2, th3, B3, th4 = real_array("x", x, (6,))
-    _, w2, v2, w3, v3, w4 = real_array("xd", xd, (6,))
+    _, th2, B2, th3, B3, th4 = x
+    _, w2, v2, w3, v3, w4 = xd
     th1 = linkage.base_angle
     g = linkage.gravity
     _, A2, A3, _ = linkage.length
@@ -165,11 +165,12 @@ def bias_force(
     return jnp.stack([phi_B1, phi_th2, phi_B2, phi_th3, phi_B3, phi_th4])
 
 
+@compiled(x=(6,), xd=(6,), force=(6,))
 def masked_accelerations(
     linkage: Linkage,
-    x: Float[ArrayLike, " chain"],
-    xd: Float[ArrayLike, " chain"],
-    force: Float[ArrayLike, " chain"],
+    x: Float[Array, " chain"],
+    xd: Float[Array, " chain"],
+    force: Float[Array, " chain"],
 ) -> Float[Array, " chain"]:
     """Accelerations of the six coordinates by the EF-masked rows (17)-(27).
 
@@ -185,7 +186,6 @@ def masked_accelerations(
 
     **Returns:** `xdd` [m/s^2, rad/s^2].
     """
-    xd, force = real_array("xd", xd, (6,)), real_array("force", force, (6,))
     ef1, _, ef3, _, ef5, _ = linkage.ef
     real = linkage.ef > 0.5
     M = mass_matrix(linkage, x)
@@ -203,11 +203,12 @@ def masked_accelerations(
     return jnp.linalg.solve(matrix, jnp.where(real, masked(right), 0))
 
 
+@compiled(x=(6,), xd=(6,), force=(6,))
 def constraint_forces(
     linkage: Linkage,
-    x: Float[ArrayLike, " chain"],
-    xd: Float[ArrayLike, " chain"],
-    force: Float[ArrayLike, " chain"],
+    x: Float[Array, " chain"],
+    xd: Float[Array, " chain"],
+    force: Float[Array, " chain"],
 ) -> Float[Array, " chain"]:
     """Generalised constraint forces at the fictitious joints, (16)-(26).
 
@@ -219,7 +220,6 @@ def constraint_forces(
 
     **Returns:** forces and torques [N, N m], zero at real joints.
     """
-    force = real_array("force", force, (6,))
     xdd = masked_accelerations(linkage, x, xd, force)
     effort = mass_matrix(linkage, x) @ xdd - bias_force(linkage, x, xd)
     revolute = jnp.cumsum(effort[::-2])[::-1]  # each revolute joint carries the next

@@ -14,12 +14,10 @@ import jax.numpy as jnp
 from jax import Array
 from jax.custom_batching import custom_vmap
 from jaxtyping import Float
-from numpy.typing import ArrayLike
 
 from .kinematics import mass_center_velocities, mass_centers
-from .linkage import Linkage, real_joints
+from .linkage import Linkage, compiled, real_joints
 from .trigonometry import sincos
-from .validation import real_array
 
 Scalars = tuple[Array, Array, Array]
 Vector = tuple[Array, Array]
@@ -262,11 +260,12 @@ def _joint_accelerations_jvp(primals, tangents):
     return jax.jvp(_accelerations, primals, tangents)
 
 
+@compiled(q=(3,), qd=(3,), tau=(3,))
 def forward_dynamics(
     linkage: Linkage,
-    q: Float[ArrayLike, " joint"],
-    qd: Float[ArrayLike, " joint"],
-    tau: Float[ArrayLike, " joint"],
+    q: Float[Array, " joint"],
+    qd: Float[Array, " joint"],
+    tau: Float[Array, " joint"],
 ) -> Float[Array, " joint"]:
     """Joint accelerations under joint efforts: the reduced form of (14), 3x3.
 
@@ -277,17 +276,17 @@ def forward_dynamics(
 
     **Returns:** `qdd` [m/s^2 or rad/s^2].
     """
-    q, qd, tau = _joint_arrays(q=q, qd=qd, tau=tau)
     return jnp.stack(
         joint_accelerations(link_constants(linkage), tuple(q), tuple(qd), tuple(tau))
     )
 
 
+@compiled(q=(3,), qd=(3,), qdd=(3,))
 def inverse_dynamics(
     linkage: Linkage,
-    q: Float[ArrayLike, " joint"],
-    qd: Float[ArrayLike, " joint"],
-    qdd: Float[ArrayLike, " joint"],
+    q: Float[Array, " joint"],
+    qd: Float[Array, " joint"],
+    qdd: Float[Array, " joint"],
 ) -> Float[Array, " joint"]:
     """Joint efforts that produce given joint accelerations, from (14) reduced.
 
@@ -295,14 +294,14 @@ def inverse_dynamics(
 
     **Returns:** `tau` [N or N m].
     """
-    q, qd, qdd = _joint_arrays(q=q, qd=qd, qdd=qdd)
     m = _equations(link_constants(linkage), tuple(q), tuple(qd))
     matrix = _joint_matrix(m)
     return matrix @ qdd + jnp.stack(m.bias)
 
 
+@compiled(q=(3,))
 def joint_mass_matrix(
-    linkage: Linkage, q: Float[ArrayLike, " joint"]
+    linkage: Linkage, q: Float[Array, " joint"]
 ) -> Float[Array, "joint joint"]:
     """The reduced mass matrix S(EF)^T M S(EF), symmetric and positive definite.
 
@@ -310,7 +309,6 @@ def joint_mass_matrix(
 
     **Returns:** entries [kg m^2], [kg m] or [kg], by the types of the two joints.
     """
-    (q,) = _joint_arrays(q=q)
     zero = jnp.zeros_like(q)
     return _joint_matrix(_equations(link_constants(linkage), tuple(q), tuple(zero)))
 
@@ -321,14 +319,11 @@ def _joint_matrix(m: _Equations) -> Array:
     )
 
 
-def _joint_arrays(**arrays: ArrayLike) -> list[Array]:
-    return [real_array(name, value, (3,)) for name, value in arrays.items()]
-
-
+@compiled(q=(3,), qd=(3,))
 def link_energies(
     linkage: Linkage,
-    q: Float[ArrayLike, " joint"],
-    qd: Float[ArrayLike, " joint"],
+    q: Float[Array, " joint"],
+    qd: Float[Array, " joint"],
 ) -> tuple[Float[Array, " link"], Float[Array, " link"]]:
     """Kinetic and potential energy of each moving link, (6) and (7).
 
@@ -336,17 +331,17 @@ def link_energies(
 
     **Returns:** two arrays [J]; the potential is zero at the ground pivot's height.
     """
-    q, qd = _joint_arrays(q=q, qd=qd)
     velocity, rate = mass_center_velocities(linkage, q, qd)
     kinetic = linkage.mass * jnp.sum(velocity**2, axis=1) + linkage.inertia * rate**2
     height = mass_centers(linkage, q)[:, 1]
     return kinetic / 2, linkage.mass * linkage.gravity * height
 
 
+@compiled(q=(3,), qd=(3,))
 def energy(
     linkage: Linkage,
-    q: Float[ArrayLike, " joint"],
-    qd: Float[ArrayLike, " joint"],
+    q: Float[Array, " joint"],
+    qd: Float[Array, " joint"],
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Kinetic and potential energy of the linkage, (6) and (7).
 

@@ -6,7 +6,7 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from .linkage import Linkage, real_joints, to_chain
+from .linkage import Linkage, check_linkage, compiled, real_joints, to_chain
 from .trigonometry import sincos
 from .validation import concrete, one_of, real_array
 
@@ -27,12 +27,13 @@ def _chain(linkage: Linkage, q: Array) -> tuple[Array, Array, Array]:
     """Slides B1..B3, directions e_1..e_4 and the starts of the moving links."""
     x, _ = to_chain(linkage, q, jnp.zeros(3))
     e = _directions(jnp.concatenate([linkage.base_angle[None], x[1::2]]))
-    steps = (linkage.length[:3] + 1j * x[0::2]) * e[:3]
+    steps = jax.lax.complex(linkage.length[:3], x[0::2]) * e[:3]
     return x[0::2], e, jnp.cumsum(steps)
 
 
+@compiled(q=(3,))
 def joint_positions(
-    linkage: Linkage, q: Float[ArrayLike, " joint"]
+    linkage: Linkage, q: Float[Array, " joint"]
 ) -> Float[Array, "joint 2"]:
     """Where each joint pair ends and the next link starts: its revolute axis.
 
@@ -40,25 +41,25 @@ def joint_positions(
 
     **Returns:** one point (x, y) per joint [m], from the ground pivot.
     """
-    return _plane(_chain(linkage, real_array("q", q, (3,)))[2])
+    return _plane(_chain(linkage, q)[2])
 
 
-def mass_centers(
-    linkage: Linkage, q: Float[ArrayLike, " joint"]
-) -> Float[Array, "link 2"]:
+@compiled(q=(3,))
+def mass_centers(linkage: Linkage, q: Float[Array, " joint"]) -> Float[Array, "link 2"]:
     """Mass centres of the moving links.
 
     **Arguments:** `q`: joint positions [m or rad].
 
     **Returns:** one point (x, y) per moving link [m], from the ground pivot.
     """
-    _, e, start = _chain(linkage, real_array("q", q, (3,)))
+    _, e, start = _chain(linkage, q)
     offset = jax.lax.complex(linkage.com[:, 0], linkage.com[:, 1])
     return _plane(start + offset * e[1:])
 
 
+@compiled(q=(3,), qd=(3,))
 def mass_center_velocities(
-    linkage: Linkage, q: Float[ArrayLike, " joint"], qd: Float[ArrayLike, " joint"]
+    linkage: Linkage, q: Float[Array, " joint"], qd: Float[Array, " joint"]
 ) -> tuple[Float[Array, "link 2"], Float[Array, " link"]]:
     """Velocities of the mass centres and angular velocities of the moving links.
 
@@ -66,30 +67,31 @@ def mass_center_velocities(
 
     **Returns:** one velocity (x, y) [m/s] and one angular velocity [rad/s] per link.
     """
-    q = real_array("q", q, (3,))
     slide, e, _ = _chain(linkage, q)
     _, xd = to_chain(linkage, q, qd)
     rate = jnp.concatenate([jnp.zeros(1), xd[1::2]])
     # d/dt (A + iB) e: the link turns, and the slide moves across it.
-    arm = linkage.length[:3] + 1j * slide
-    start = jnp.cumsum((1j * rate[:3] * arm + 1j * xd[0::2]) * e[:3])
+    arm = jax.lax.complex(linkage.length[:3], slide)
+    start = jnp.cumsum(1j * (rate[:3] * arm + xd[0::2]) * e[:3])
     offset = jax.lax.complex(linkage.com[:, 0], linkage.com[:, 1])
-    return _plane(start + 1j * rate[1:] * offset * e[1:]), rate[1:]
+    return _plane(start + 1j * (rate[1:] * offset * e[1:])), rate[1:]
 
 
-def tip_position(linkage: Linkage, q: Float[ArrayLike, " joint"]) -> Float[Array, " 2"]:
+@compiled(q=(3,))
+def tip_position(linkage: Linkage, q: Float[Array, " joint"]) -> Float[Array, " 2"]:
     """The tip: the end of the last link's vector A4.
 
     **Arguments:** `q`: joint positions [m or rad].
 
     **Returns:** the point (x, y) [m], from the ground pivot.
     """
-    _, e, start = _chain(linkage, real_array("q", q, (3,)))
+    _, e, start = _chain(linkage, q)
     return _plane(start[2] + linkage.length[3] * e[3])
 
 
+@compiled(q=(3,))
 def tip_jacobian(
-    linkage: Linkage, q: Float[ArrayLike, " joint"]
+    linkage: Linkage, q: Float[Array, " joint"]
 ) -> Float[Array, "3 joint"]:
     """Derivative of the tip's x, y and orientation in the joint positions.
 
@@ -97,7 +99,6 @@ def tip_jacobian(
 
     **Returns:** rows x, y [m or 1] and orientation [rad] per joint [m or rad].
     """
-    q = real_array("q", q, (3,))
     _, e, start = _chain(linkage, q)
     tip = start[2] + linkage.length[3] * e[3]
     revolute = jnp.stack(real_joints(linkage.ef))
@@ -247,6 +248,7 @@ def inverse_kinematics(
     **Raises:** ValueError for malformed arguments and, where they are concrete, for a
     point out of reach.
     """
+    check_linkage(linkage)
     tip = real_array("tip", tip, (2,))
     orientation = real_array("orientation", orientation, ())
     branch = one_of("branch", branch, (1, -1))

@@ -13,7 +13,7 @@ from jax import Array
 from jaxtyping import Float
 
 from .dynamics import Constants, Scalars, joint_accelerations, link_constants
-from .linkage import Linkage, State
+from .linkage import Linkage, State, check_linkage
 from .validation import callable_tuple, concrete, is_traced, real_array
 
 Forces = tuple[Callable[..., Array], ...]
@@ -144,8 +144,7 @@ def simulate(
     `check(linkage, ts)` raises; with `throw=True` a RuntimeError if the solve fails.
     Warns in float32 if the tolerance cannot be met.
     """
-    if not isinstance(linkage, Linkage):
-        raise ValueError(f"linkage: expected a Linkage, got {linkage!r}.")
+    check_linkage(linkage)
     try:
         q0, qd0 = state0
     except (TypeError, ValueError):
@@ -161,7 +160,8 @@ def simulate(
     if isinstance(adjoint, diffrax.BacksolveAdjoint):
         raise ValueError(
             "adjoint: expected RecursiveCheckpointAdjoint (reverse mode) or "
-            "ForwardMode, got BacksolveAdjoint, whose gradients are wrong on these problems."
+            "ForwardMode, got BacksolveAdjoint, whose gradients are wrong on these "
+            "problems."
         )
     if stepsize_controller is None:
         stepsize_controller = _default_controller()
@@ -212,6 +212,7 @@ def joint_efforts(linkage: Linkage, forces: Forces, solution: Solution) -> Effor
 
     **Raises:** ValueError if `forces` is not a tuple of force elements.
     """
+    check_linkage(linkage)
     callable_tuple("forces", forces)
     elements = [
         jax.vmap(lambda t, q, qd, i=i, f=f: element_effort(i, f, t, q, qd, linkage))(

@@ -1,0 +1,99 @@
+"""Linkages whose mass matrix is singular, always or in some configurations."""
+
+import warnings
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from .linkage import Linkage
+
+# Below this pivot ratio nothing is left of a pivot but rounding.
+_SINGULAR = 1e-14
+
+
+def _pivot_ratios(linkage: "Linkage", configurations: int) -> np.ndarray:
+    """Scale-free pivots D_k / M_kk of the 3x3 mass matrix, (configurations, 3).
+
+    From the tip: what is left of the inertia that joint k feels once the joints
+    further out are free. Written in NumPy because it runs at the door.
+    """
+    ef, length, com, mass, inertia, locked, base_angle = (
+        np.asarray(a, dtype=float)
+        for a in (
+            linkage.ef, linkage.length, linkage.com, linkage.mass,
+            linkage.inertia, linkage.locked, linkage.base_angle,
+        )
+    )  # fmt: skip
+    revolute = ef[1::2] > 0.5
+    ratios = np.empty((configurations, 3))
+    random = np.random.default_rng(0)
+    reach = np.abs(length).sum() + np.abs(com).sum() + np.abs(locked[revolute]).sum()
+    for row in ratios:
+        turn = np.where(revolute, random.uniform(-np.pi, np.pi, 3), locked)
+        slide = np.where(revolute, locked, (reach or 1) * random.uniform(-1, 1, 3))
+        angle = base_angle + np.concatenate([[0], np.cumsum(turn)])
+        along = np.exp(1j * angle)  # complex numbers as plane vectors
+        steps = (length[:3] + 1j * slide) * along[:3]
+        origin = np.cumsum(steps)
+        M = np.zeros((3, 3))
+        for n in range(3):
+            centre = origin[n] + (com[n, 0] + 1j * com[n, 1]) * along[n + 1]
+            J = np.where(revolute, 1j * (centre - origin), 1j * along[:3])
+            J[n + 1 :] = 0
+            turns = np.where(revolute, 1.0, 0.0)
+            turns[n + 1 :] = 0
+            M += mass[n] * np.real(np.outer(J.conj(), J)) + inertia[n] * np.outer(
+                turns, turns
+            )
+        diagonal = np.diag(M).copy()
+        for k in (2, 1, 0):
+            row[k] = M[k, k] / diagonal[k] if diagonal[k] > 0 else 0
+            if row[k] > _SINGULAR:
+                M -= np.outer(M[:, k], M[k, :]) / M[k, k]
+    return ratios
+
+
+def check_singularity(linkage: "Linkage") -> None:
+    """Refuse linkages that are always singular, warn of those that may become so."""
+    revolute = np.asarray(linkage.ef)[1::2] > 0.5
+    names = "".join("R" if r else "P" for r in revolute)
+    best = _pivot_ratios(linkage, configurations=5).max(axis=0)
+    for k in (2, 1, 0):
+        if best[k] <= _SINGULAR:
+            kind = "revolute" if revolute[k] else "prismatic"
+            raise ValueError(
+                f"mass, inertia, com: expected joint {k + 1} ({kind}) of {names} to "
+                f"move some inertia of moving link {k + 1} (m{k + 2}, I{k + 2}, "
+                f"p{k + 2}, q{k + 2}) or of the links beyond it, got none in any "
+                "configuration: its acceleration is undetermined."
+            )
+    mass, inertia = np.asarray(linkage.mass), np.asarray(linkage.inertia)
+    own = np.where(
+        revolute, inertia + mass * (np.asarray(linkage.com) ** 2).sum(axis=1), mass
+    )
+    locked, length = np.asarray(linkage.locked), np.asarray(linkage.length)
+    for k in np.flatnonzero(own == 0):
+        warnings.warn(
+            f"moving link {k + 1} carries no inertia of its own about joint {k + 1}: "
+            "the mass matrix may be singular in some configurations.",
+            stacklevel=5,
+        )
+    for k in (1, 2):
+        if revolute[k - 1] and revolute[k] and np.hypot(length[k], locked[k]) == 0:
+            warnings.warn(
+                f"revolute joints {k} and {k + 1} coincide (moving link {k} has no "
+                "length, the paper's rule (i)): one of them is redundant for "
+                "positioning.",
+                stacklevel=5,
+            )
+        if (
+            not revolute[k - 1]
+            and not revolute[k]
+            and abs(np.sin(locked[k - 1])) < 1e-12
+        ):
+            warnings.warn(
+                f"prismatic joints {k} and {k + 1} are parallel (the paper's rule "
+                "(ii)): one of them is redundant for positioning.",
+                stacklevel=5,
+            )

@@ -1,0 +1,81 @@
+"""Reference scenes and random linkages, shared by the tests."""
+
+import json
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+import fdof_jax as fj
+
+REFERENCE = json.loads((Path(__file__).parent / "reference.json").read_text())
+# The library refuses PPP, which the file holds for the equations only.
+SCENES = {s["id"]: s for s in REFERENCE["scenes"] if s["topology"] != "PPP"}
+
+
+class ReferenceScene(NamedTuple):
+    linkage: fj.Linkage
+    state0: fj.State
+    forces: tuple
+    x: np.ndarray
+    xd: np.ndarray
+    force: np.ndarray  # efforts and damping of all six joints
+    tau: np.ndarray  # those of the real joints
+
+
+def real_part(scene, values):
+    """The entries of a (6,) joint quantity that belong to real joints, (3,)."""
+    return np.asarray(values)[np.asarray(scene["EF"]) == 1]
+
+
+def to_joint(scene, values):
+    """Joint coordinates (relative angles) of real joints, from absolute chain ones."""
+    pairs = np.asarray(values, dtype=float).reshape(3, 2).copy()
+    pairs[:, 1] = np.diff(pairs[:, 1], prepend=0)
+    return real_part(scene, pairs.reshape(6))
+
+
+def load(name):
+    scene = SCENES[name]
+    locked, state0 = fj.from_chain(
+        scene["topology"], scene["q0"], scene["v0"], scene["theta1"]
+    )
+    linkage = fj.Linkage(
+        scene["topology"],
+        length=[*scene["A"], 1.0],
+        com=np.stack([scene["p"], scene["q"]], axis=1),
+        mass=scene["m"],
+        inertia=scene["I"],
+        locked=locked,
+        base_angle=scene["theta1"],
+        gravity=scene["g"],
+    )
+    x, xd = (np.asarray(a) for a in fj.to_chain(linkage, *state0))
+    damping = np.stack([scene["cP"], scene["cR"]], axis=1).reshape(6)
+    rates = np.stack([xd[0::2], np.diff(xd[1::2], prepend=0)], axis=1).reshape(6)
+    force = np.asarray(scene["F"]) - damping * rates
+    forces = (
+        fj.JointEffort(real_part(scene, scene["F"])),
+        fj.JointDamper(real_part(scene, damping)),
+    )
+    return ReferenceScene(
+        linkage, state0, forces, x, xd, force, real_part(scene, force)
+    )
+
+
+def relative_error(value, reference):
+    value, reference = np.asarray(value), np.asarray(reference)
+    return np.abs(value - reference).max() / (1 + np.abs(reference).max())
+
+
+def random_linkage(topology, rng):
+    return fj.Linkage(
+        topology,
+        length=rng.uniform(0, 1.5, 4),
+        com=rng.uniform(-1, 1, (3, 2)),
+        mass=rng.uniform(0.5, 3, 3),
+        inertia=rng.uniform(0.05, 1, 3),
+        locked=rng.uniform(-1, 1, 3),
+        base_angle=rng.uniform(-3, 3),
+        gravity=rng.uniform(0, 10),
+    )
