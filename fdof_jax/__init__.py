@@ -38,5 +38,6 @@ from .simulation import (
     joint_efforts as joint_efforts,
     simulate as simulate,
 )
+from .tuning import TuneResult as TuneResult, tune as tune
 
 __version__ = "0.1.0"

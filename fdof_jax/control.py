@@ -1,19 +1,22 @@
 """Joint control of the third example (Fig 7): saturated PD and the circle it tracks."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
-from .kinematics import solve_joints, wrist_vector
+from .kinematics import solve_joints, tip_position, wrist_vector
 from .linkage import Linkage
 from .validation import concrete, one_of, real_array
+
+if TYPE_CHECKING:
+    from .simulation import Solution
 
 Reference = Callable[[Array, Linkage], tuple[Array, Array]]
 
@@ -182,3 +185,27 @@ class CircleTask(eqx.Module):
 @eqx.filter_jit
 def _positions_over(task: CircleTask, linkage: Linkage, times: Array) -> Array:
     return jax.vmap(lambda t: task(t, linkage)[1])(times)
+
+
+def saturated(
+    controller: PDController, linkage: Linkage, solution: "Solution"
+) -> Bool[Array, "time joint"]:
+    """Whether each actuator is at its limit, along a motion.
+
+    **Arguments:** a controller, and a solution that it took part in.
+    """
+    demand = jax.vmap(controller.demand, in_axes=(0, 0, 0, None))(
+        solution.ts, solution.q, solution.qd, linkage
+    )
+    return jnp.abs(demand) > controller.limit
+
+
+def tip_deviation(
+    linkage: Linkage, task: CircleTask, solution: "Solution"
+) -> Float[Array, "time 2"]:
+    """From the commanded to the actual tip along a motion [m].
+
+    **Arguments:** a linkage, the task (anything with `tip(t)`), and a solution.
+    """
+    actual = jax.vmap(tip_position, in_axes=(None, 0))(linkage, solution.q)
+    return actual - jax.vmap(task.tip)(solution.ts)

@@ -1,7 +1,11 @@
 """Equations of motion: the reduced 3x3 form and inverse dynamics in joint coordinates.
 
 `joint_accelerations` is what simulations integrate. It works on scalars, never on
-stacked arrays: XLA on CPU computes a stacked result once per entry. The algebra is a
+stacked arrays: XLA on CPU computes a stacked result once per entry. Its positions are
+displacements from a reference configuration, whose directions are turned by them:
+a pendulum 1e-17 rad away from upright keeps that angle, which upright + 1e-17 would
+not, and an arm that starts after a million turns moves as it would have before. The
+algebra is a
 composite-body recursion from the tip, S(EF)^T M S(EF) of the paper's six equations
 without ever forming them; existence factors select, per joint, between turning about
 a point and sliding along a direction.
@@ -16,7 +20,7 @@ from jax.custom_batching import custom_vmap
 from jaxtyping import Float
 
 from .kinematics import mass_center_velocities, mass_centers
-from .linkage import Linkage, compiled, real_joints
+from .linkage import Linkage, compiled, real_joints, to_chain
 from .trigonometry import sincos
 
 Scalars = tuple[Array, Array, Array]
@@ -26,15 +30,19 @@ Vector = tuple[Array, Array]
 class Constants(NamedTuple):
     """What the equations need of a linkage, as scalars computed once per solve.
 
-    `m34` = m3 + m4 and so on; `(s_n, t_n)` the first moment of link n, with the mass
-    beyond it hung at the end of its vector A_n, along and across the link [kg m];
-    `j_n` second moments about the start of link n [kg m^2].
+    `e_n` and `b_n` are the directions of the links and the slides at the reference
+    configuration; `m34` = m3 + m4 and so on; `(s_n, t_n)` the first moment of link n,
+    with the mass beyond it hung at the end of its vector A_n, along and across the link
+    [kg m]; `j_n` second moments about the start of link n [kg m^2].
     """
 
     revolute: Scalars
-    locked: Scalars
-    base: Vector
-    base_angle: Array
+    e1: Vector
+    e2: Vector
+    e3: Vector
+    e4: Vector
+    b2: Array
+    b3: Array
     gravity: Array
     m4: Array
     m34: Array
@@ -52,19 +60,20 @@ class Constants(NamedTuple):
     j4: Array
 
 
-def link_constants(linkage: Linkage) -> Constants:
-    """The scalars of a linkage that `joint_accelerations` works with."""
+def link_constants(linkage: Linkage, q: Float[Array, " joint"]) -> Constants:
+    """The scalars that `joint_accelerations` needs, with `q` as reference."""
+    x, _ = to_chain(linkage, q, jnp.zeros_like(q))
+    sin, cos = sincos(jnp.concatenate([linkage.base_angle[None], x[1::2]]))
+    e1, e2, e3, e4 = zip(cos, sin)
     m2, m3, m4 = linkage.mass
     _, a2, a3, _ = linkage.length
     (s2, t2), (s3, t3), (s4, t4) = linkage.mass[:, None] * linkage.com
     j2, j3, j4 = linkage.inertia + linkage.mass * jnp.sum(linkage.com**2, axis=1)
     m34 = m3 + m4
-    sin, cos = sincos(linkage.base_angle)
     return Constants(
         revolute=real_joints(linkage.ef),
-        locked=tuple(linkage.locked),
-        base=(cos, sin),
-        base_angle=linkage.base_angle,
+        e1=e1, e2=e2, e3=e3, e4=e4,
+        b2=x[2], b3=x[4],
         gravity=linkage.gravity,
         m4=m4, m34=m34, m234=m2 + m34,
         a2=a2, a3=a3,
@@ -93,6 +102,11 @@ def _in_frame(along: Array, across: Array, e: Vector) -> Vector:
     return along * e[0] - across * e[1], along * e[1] + across * e[0]
 
 
+def _turn(e: Vector, angle: Array) -> Vector:
+    sin, cos = sincos(angle)
+    return _in_frame(cos, sin, e)
+
+
 def _select(condition: Array, u: Vector, v: Vector) -> Vector:
     return jnp.where(condition, u[0], v[0]), jnp.where(condition, u[1], v[1])
 
@@ -109,23 +123,22 @@ class _Equations(NamedTuple):
     bias: Scalars
 
 
-def _equations(c: Constants, q: Scalars, qd: Scalars) -> _Equations:
+def _equations(c: Constants, delta: Scalars, qd: Scalars) -> _Equations:
     """The reduced equations of motion: (8)-(13) projected on the real joints."""
     r1, r2, r3 = c.revolute
-    th2 = c.base_angle + jnp.where(r1, q[0], c.locked[0])
-    th3 = th2 + jnp.where(r2, q[1], c.locked[1])
-    th4 = th3 + jnp.where(r3, q[2], c.locked[2])
-    b2 = jnp.where(r2, c.locked[1], q[1])
-    b3 = jnp.where(r3, c.locked[2], q[2])
+    turned2 = jnp.where(r1, delta[0], 0)
+    turned3 = turned2 + jnp.where(r2, delta[1], 0)
+    turned4 = turned3 + jnp.where(r3, delta[2], 0)
+    b2 = c.b2 + jnp.where(r2, 0, delta[1])
+    b3 = c.b3 + jnp.where(r3, 0, delta[2])
     w2 = jnp.where(r1, qd[0], 0)
     turn3 = jnp.where(r2, qd[1], 0)
     turn4 = jnp.where(r3, qd[2], 0)
     w3 = w2 + turn3
     w4 = w3 + turn4
 
-    e1 = c.base
-    n1 = _perp(e1)
-    e2, e3, e4 = ((cos, sin) for sin, cos in (sincos(th2), sincos(th3), sincos(th4)))
+    n1 = _perp(c.e1)
+    e2, e3, e4 = _turn(c.e2, turned2), _turn(c.e3, turned3), _turn(c.e4, turned4)
     n2, n3 = _perp(e2), _perp(e3)
     d2 = _in_frame(c.a2, b2, e2)
     d3 = _in_frame(c.a3, b3, e3)
@@ -184,7 +197,7 @@ def _equations(c: Constants, q: Scalars, qd: Scalars) -> _Equations:
     force3 = c.m4 * (start4 - w33 * b3) - w44 * _dot(n3, u4)
     force2 = c.m34 * (c.gravity * e2[0] - w22 * b2) - _dot(n2, y)
     force1 = (
-        c.m234 * c.gravity * e1[0]
+        c.m234 * c.gravity * c.e1[0]
         - w22 * _dot(n1, u2)
         - c.m34 * slide2 * _dot(n1, e2)
         - _dot(n1, y)
@@ -204,8 +217,8 @@ def _equations(c: Constants, q: Scalars, qd: Scalars) -> _Equations:
     )
 
 
-def _accelerations(c: Constants, q: Scalars, qd: Scalars, tau: Scalars) -> Scalars:
-    m = _equations(c, q, qd)
+def _accelerations(c: Constants, delta: Scalars, qd: Scalars, tau: Scalars) -> Scalars:
+    m = _equations(c, delta, qd)
     f1, f2, f3 = (t - b for t, b in zip(tau, m.bias))
     # L^T D L from the tip: the pivots are the articulated inertias.
     inverse3 = 1 / m.m33
@@ -220,6 +233,12 @@ def _accelerations(c: Constants, q: Scalars, qd: Scalars, tau: Scalars) -> Scala
     return qdd1, qdd2, f3 * inverse3 - l13 * qdd1 - l23 * qdd2
 
 
+def at_reference(q: Float[Array, " joint"]) -> Scalars:
+    """No displacement, in the dtype of `q`."""
+    zero = jnp.zeros_like(q[0])
+    return zero, zero, zero
+
+
 @custom_vmap
 def _trip_count(x: Array) -> Array:
     """1, which XLA cannot know and which stays one number under vmap."""
@@ -231,27 +250,31 @@ def _trip_count_batched(axis_size, in_batched, x):
     return _trip_count(x[0]), False
 
 
-def _accelerations_once(c: Constants, q: Scalars, qd: Scalars, tau: Scalars) -> Scalars:
+def _accelerations_once(
+    c: Constants, delta: Scalars, qd: Scalars, tau: Scalars
+) -> Scalars:
     """`_accelerations` behind a barrier: a loop of one trip.
 
     XLA on CPU would otherwise repeat the evaluation in every expression that uses its
     results, which made steps of batches 1.5 to 2 times slower. The loop is repeatable:
     more trips would give the same result.
     """
-    zero = jnp.zeros_like(q[0] + qd[0] + tau[0] + c.m4)
+    zero = jnp.zeros_like(delta[0] + qd[0] + tau[0] + c.m4)
     return jax.lax.fori_loop(
         0,
-        _trip_count(q[0]),
-        lambda _, __: _accelerations(c, q, qd, tau),
+        _trip_count(delta[0]),
+        lambda _, __: _accelerations(c, delta, qd, tau),
         (zero, zero, zero),
     )
 
 
 @jax.custom_jvp
-def joint_accelerations(c: Constants, q: Scalars, qd: Scalars, tau: Scalars) -> Scalars:
-    """Joint accelerations from scalar joint positions, velocities and efforts."""
+def joint_accelerations(
+    c: Constants, delta: Scalars, qd: Scalars, tau: Scalars
+) -> Scalars:
+    """Joint accelerations at joint displacements `delta` from the reference of `c`."""
     return jax.lax.platform_dependent(
-        c, q, qd, tau, cpu=_accelerations_once, default=_accelerations
+        c, delta, qd, tau, cpu=_accelerations_once, default=_accelerations
     )
 
 
@@ -277,7 +300,9 @@ def forward_dynamics(
     **Returns:** `qdd` [m/s^2 or rad/s^2].
     """
     return jnp.stack(
-        joint_accelerations(link_constants(linkage), tuple(q), tuple(qd), tuple(tau))
+        joint_accelerations(
+            link_constants(linkage, q), at_reference(q), tuple(qd), tuple(tau)
+        )
     )
 
 
@@ -294,7 +319,7 @@ def inverse_dynamics(
 
     **Returns:** `tau` [N or N m].
     """
-    m = _equations(link_constants(linkage), tuple(q), tuple(qd))
+    m = _equations(link_constants(linkage, q), at_reference(q), tuple(qd))
     matrix = _joint_matrix(m)
     return matrix @ qdd + jnp.stack(m.bias)
 
@@ -309,8 +334,8 @@ def joint_mass_matrix(
 
     **Returns:** entries [kg m^2], [kg m] or [kg], by the types of the two joints.
     """
-    zero = jnp.zeros_like(q)
-    return _joint_matrix(_equations(link_constants(linkage), tuple(q), tuple(zero)))
+    zero = at_reference(q)
+    return _joint_matrix(_equations(link_constants(linkage, q), zero, zero))
 
 
 def _joint_matrix(m: _Equations) -> Array:

@@ -113,8 +113,10 @@ def _angle(y: Array, x: Array) -> Array:
 
 
 def wrist_vector(linkage: Linkage, tip: Array, orientation: Array) -> Array:
-    """From the end of the ground's vector A1 to the start of the last link, (2,)."""
-    ground = _directions(linkage.base_angle) * linkage.length[0]
+    """From where the first joint starts to where the last link does, (2,)."""
+    r1, _, _ = real_joints(linkage.ef)
+    fixed = jax.lax.complex(linkage.length[0], jnp.where(r1, linkage.locked[0], 0))
+    ground = _directions(linkage.base_angle) * fixed
     last = _directions(orientation) * linkage.length[3]
     return tip - _plane(ground + last)
 

@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from jax import Array
 
 from .control import CircleTask, PDController
 from .forces import JointDamper
@@ -21,7 +21,7 @@ class Scene(NamedTuple):
     linkage: Linkage
     state0: State
     forces: Forces
-    t1: ArrayLike
+    t1: float | Array
 
 
 def fig3() -> Scene:

@@ -12,7 +12,13 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
-from .dynamics import Constants, Scalars, joint_accelerations, link_constants
+from .dynamics import (
+    Constants,
+    Scalars,
+    at_reference,
+    joint_accelerations,
+    link_constants,
+)
 from .linkage import Linkage, State, check_linkage
 from .validation import callable_tuple, concrete, is_traced, real_array
 
@@ -47,21 +53,28 @@ class Efforts(NamedTuple):
 
 class _Args(NamedTuple):
     linkage: Linkage
+    q0: Array
     constants: Constants
     forces: Forces
 
 
 def _vector_field(t: Any, y: tuple[Scalars, Scalars], args: _Args):
-    """Rates of six scalars; arrays only for the force elements, where there are any."""
-    q, qd = y
-    zero = jnp.zeros_like(q[0])
-    tau = (zero, zero, zero)
+    """Rates of six scalars; arrays only for the force elements, where there are any.
+
+    The positions are displacements from the start: see `dynamics`.
+    """
+    delta, qd = y
+    tau = at_reference(args.q0)
     if args.forces:
-        q_array, qd_array = jnp.stack(q), jnp.stack(qd)
-        for index, element in enumerate(args.forces):
-            effort = element_effort(index, element, t, q_array, qd_array, args.linkage)
+        q_array, qd_array = args.q0 + jnp.stack(delta), jnp.stack(qd)
+        first, *others = (
+            element_effort(index, element, t, q_array, qd_array, args.linkage)
+            for index, element in enumerate(args.forces)
+        )
+        tau = tuple(first)
+        for effort in others:
             tau = tuple(a + b for a, b in zip(tau, effort))
-    return qd, joint_accelerations(args.constants, q, qd, tau)
+    return qd, joint_accelerations(args.constants, delta, qd, tau)
 
 
 def element_effort(
@@ -92,14 +105,15 @@ def _solve(linkage, state0, ts, forces, keywords) -> Solution:
         diffrax.ODETerm(_vector_field),
         t0=ts[0],
         t1=ts[-1],
-        y0=(tuple(state0.q), tuple(state0.qd)),
-        args=_Args(linkage, link_constants(linkage), forces),
+        y0=(at_reference(state0.q), tuple(state0.qd)),
+        args=_Args(linkage, state0.q, link_constants(linkage, state0.q), forces),
         saveat=diffrax.SaveAt(ts=ts),
         **keywords,
     )
     # diffrax leaves infinity where it has not come to save.
     assert solution.ys is not None  # because of saveat
-    q, qd = (jnp.stack(rows, axis=-1) for rows in solution.ys)
+    delta, qd = (jnp.stack(rows, axis=-1) for rows in solution.ys)
+    q = state0.q[None] + delta
     q, qd = (jnp.where(jnp.isinf(a), jnp.nan, a) for a in (q, qd))
     return Solution(ts, q, qd, solution.stats, solution.result)
 

@@ -1,0 +1,116 @@
+"""One trace serves all topologies; batches equal singles."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import fdof_jax as fj
+from fdof_jax import simulation
+
+TS = np.linspace(0, 0.5, 6)
+# A common start and links for which all topologies reach a small circle.
+START = np.array([0.1, 0.7, 0.3, 1.5, 0.2, 2.2])
+
+
+def linkage_and_state(topology):
+    locked, state = fj.from_chain(topology, START, np.zeros(6), base_angle=0.2)
+    linkage = fj.Linkage(
+        topology,
+        length=[0.1, 1.0, 0.8, 0.5],
+        com=[[0.5, 0.1], [0.4, -0.1], [0.25, 0]],
+        mass=[2, 1.5, 1],
+        inertia=[0.2, 0.1, 0.05],
+        locked=locked,
+        base_angle=0.2,
+    )
+    return linkage, state
+
+
+def circle(linkage, state):
+    """A small circle around the tip's start, on the assembly that the start has."""
+    tip = np.asarray(fj.tip_position(linkage, state.q))
+    orientation = float(fj.to_chain(linkage, state.q, np.zeros(3))[0][5])
+    for branch in (1, -1):
+        q = fj.inverse_kinematics(linkage, tip, orientation, branch=branch)
+        if np.abs(q - state.q).max() < 1e-9:
+            break
+    task = fj.CircleTask(tip, 0.05, 1.0, 0.3, orientation, branch)
+    return fj.PDController([40.0] * 3, [4.0] * 3, [200.0] * 3, task)
+
+
+FORCES = {
+    "no elements": lambda linkage, state: (),
+    "damper and effort": lambda linkage, state: (
+        fj.JointDamper([1.0, 2.0, 3.0]),
+        fj.JointEffort([0.5, -1.0, 0.2]),
+    ),
+    "PD circle": lambda linkage, state: (circle(linkage, state),),
+}
+
+
+def members(kind):
+    pairs = [linkage_and_state(topology) for topology in fj.TOPOLOGIES]
+    return [(linkage, state, FORCES[kind](linkage, state)) for linkage, state in pairs]
+
+
+@pytest.mark.parametrize("kind", FORCES)
+def test_one_trace_and_batch_equals_singles(kind):
+    traces = []
+
+    def motion(linkage, state, forces):
+        traces.append(1)
+        # Fixed steps: adaptive ones may round differently in a batch.
+        return fj.simulate(
+            linkage,
+            state,
+            TS,
+            forces,
+            stepsize_controller=diffrax.ConstantStepSize(),
+            dt0=0.005,
+        )
+
+    single = jax.jit(motion)
+    alone = [single(*member) for member in members(kind)]
+    assert len(traces) == 1
+    batched = jax.jit(jax.vmap(motion))
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *members(kind))
+    together = batched(*stacked)
+    reversed_order = batched(*jax.tree.map(lambda a: a[::-1], stacked))
+    assert len(traces) == 2
+    for i, solution in enumerate(alone):
+        for a, b in ((together.q, solution.q), (together.qd, solution.qd)):
+            np.testing.assert_allclose(a[i], b, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(reversed_order.q[::-1], together.q, atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", FORCES)
+def test_one_trace_of_the_plain_call(kind, monkeypatch):
+    """Called as a user does, without jit of their own, at adaptive steps."""
+    calls = []
+    original = simulation._vector_field
+
+    def counted(*arguments):
+        calls.append(1)
+        return original(*arguments)
+
+    monkeypatch.setattr(simulation, "_vector_field", counted)
+    traced = []
+    for linkage, state, forces in members(kind):
+        # A number of output times that no other test has: the first call compiles.
+        fj.simulate(linkage, state, np.linspace(0, 0.3, 11), forces)
+        traced.append(len(calls))
+    assert traced[0] > 0
+    assert traced == traced[:1] * 7
+
+
+def test_shared_leaves_may_stay_unbatched():
+    linkage, state = linkage_and_state("RPR")
+    starts = np.asarray(state.q) + 0.01 * np.arange(4)[:, None]
+    together = jax.vmap(
+        lambda q: fj.simulate(linkage, fj.State(q, jnp.zeros(3)), TS).q
+    )(starts)
+    for q0, q in zip(starts, together):
+        single = fj.simulate(linkage, fj.State(q0, np.zeros(3)), TS).q
+        np.testing.assert_allclose(q, single, atol=1e-9)

@@ -1,0 +1,102 @@
+"""The library against the 50-digit reference scenes."""
+
+import diffrax
+import jax
+import numpy as np
+import pytest
+from helpers import SCENES, load, real_part, relative_error, to_joint
+
+import fdof_jax as fj
+
+ALL = sorted(SCENES)
+# Condition of the accelerations or of the motion itself: mass ratio 1e6, inertias of
+# 1e-9, and angular velocities of 1e3 rad/s.
+ILL_CONDITIONED = {"hard-massratio-heavybase", "hard-I1e-9-all", "hard-spin1e3"}
+
+
+def bound(name):
+    return 5e-11 if name in ILL_CONDITIONED else 1e-11
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_accelerations(name):
+    scene, r = SCENES[name], load(name)
+    masked = fj.masked_accelerations(r.linkage, r.x, r.xd, r.force)
+    assert relative_error(masked, scene["acc0"]) <= bound(name)
+    reduced = fj.forward_dynamics(r.linkage, *r.state0, r.tau)
+    # Differences of exact accelerations, where the printed doubles would cancel.
+    exact = to_joint(scene, [float(a) for a in scene["acc0_str"]])
+    assert relative_error(reduced, exact) <= bound(name)
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_constraint_forces(name):
+    scene, r = SCENES[name], load(name)
+    constraint = fj.constraint_forces(r.linkage, r.x, r.xd, r.force)
+    assert relative_error(constraint, scene["con0"]) <= bound(name)
+    assert (real_part(scene, constraint) == 0).all()
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_energy(name):
+    scene, r = SCENES[name], load(name)
+    kinetic, potential = fj.energy(r.linkage, *r.state0)
+    assert relative_error(kinetic, scene["T0"]) <= bound(name)
+    assert relative_error(potential, scene["V0"]) <= bound(name)
+
+
+def solve(name, rtol=1e-12, atol=1e-12):
+    """Chain coordinates and rates at the scene's output times, and the energies."""
+    scene, r = SCENES[name], load(name)
+    times = [state["t"] for state in scene["states"]]
+    solution = fj.simulate(
+        r.linkage,
+        r.state0,
+        [0, *times],
+        r.forces,
+        # Landing on the output times leaves out the interpolation's own error.
+        stepsize_controller=diffrax.ClipStepSizeController(
+            diffrax.PIDController(rtol=rtol, atol=atol), step_ts=np.array(times)
+        ),
+    )
+    chain = jax.vmap(fj.to_chain, in_axes=(None, 0, 0))
+    x, xd = chain(r.linkage, solution.q, solution.qd)
+    energies = jax.vmap(fj.energy, in_axes=(None, 0, 0))
+    return x[1:], xd[1:], sum(energies(r.linkage, solution.q, solution.qd))[1:]
+
+
+@pytest.mark.parametrize("name", [n for n in ALL if n != "hard-inverted"])
+def test_states(name):
+    states = SCENES[name]["states"]
+    for state, x, xd, energy in zip(states, *solve(name)):
+        assert relative_error(x, state["q"]) <= 1e-9
+        assert relative_error(xd, state["v"]) <= 1e-9
+        assert relative_error(energy, state["E"]) <= 1e-9
+
+
+def test_inverted_pendulum_falls_at_the_right_rate():
+    """Its deviation from upright grows from the 6e-17 by which pi/2 is rounded."""
+    states = SCENES["hard-inverted"]["states"]
+    x, xd, _ = solve("hard-inverted", rtol=1e-12, atol=1e-16)
+    deviation = np.asarray(x)[:, 1::2] - np.pi / 2
+    expected = np.array([s["q"] for s in states])[:, 1::2] - np.pi / 2
+    np.testing.assert_allclose(deviation[-1], expected[-1], rtol=0.01)
+    rates = np.array([s["v"] for s in states])[:, 1::2]
+    np.testing.assert_allclose(np.asarray(xd)[:, 1::2], rates, rtol=0.01, atol=1e-20)
+
+
+@pytest.mark.parametrize("name", [n for n in ALL if n.endswith("-full")])
+def test_efforts_on_fictitious_joints_have_no_effect(name):
+    r = load(name)
+    fictitious = np.asarray(r.linkage.ef) == 0
+    with_junk = np.where(fictitious, 1e30, r.force)
+    np.testing.assert_array_equal(
+        fj.masked_accelerations(r.linkage, r.x, r.xd, with_junk),
+        fj.masked_accelerations(r.linkage, r.x, r.xd, r.force),
+    )
+    shifted = np.where(fictitious, r.force + 7.0, r.force)
+    np.testing.assert_allclose(
+        fj.constraint_forces(r.linkage, r.x, r.xd, shifted),
+        fj.constraint_forces(r.linkage, r.x, r.xd, r.force) - 7.0 * fictitious,
+        atol=1e-10,
+    )

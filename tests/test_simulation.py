@@ -1,0 +1,191 @@
+"""Simulation: the paper's figures, order of convergence, and how solves end."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import REFERENCE
+
+import fdof_jax as fj
+from fdof_jax import scenes
+
+
+def absolute_angles(linkage, solution):
+    chain = jax.vmap(fj.to_chain, in_axes=(None, 0, 0))
+    return np.asarray(chain(linkage, solution.q, solution.qd)[0])[:, 1::2]
+
+
+def energies(linkage, solution):
+    over_time = jax.vmap(fj.link_energies, in_axes=(None, 0, 0))
+    return map(np.asarray, over_time(linkage, solution.q, solution.qd))
+
+
+def test_fig3_comes_to_rest_under_the_pivot():
+    scene = scenes.fig3()
+    solution = fj.simulate(scene.linkage, scene.state0, [0, 1, 20, 100], scene.forces)
+    angles = np.degrees(absolute_angles(scene.linkage, solution))
+    np.testing.assert_allclose(
+        angles[1], [-55.609084607282, -83.365485917459, -67.239429526858], atol=1e-6
+    )
+    np.testing.assert_allclose(
+        angles[2], [-47.775941241973, -135.05395438541, -45.113147737179], atol=1e-6
+    )
+    np.testing.assert_allclose(angles[3], [-47.72631099390626, -135, -45], atol=1e-6)
+    centres = np.asarray(fj.mass_centers(scene.linkage, solution.q[-1]))
+    masses = np.asarray(scene.linkage.mass)
+    x, y = masses @ centres / masses.sum()
+    np.testing.assert_allclose([x, y], [0, -1.4594593826], atol=1e-9)
+
+
+def test_fig5_conserves_its_energy_and_passes_it_between_links():
+    scene = scenes.fig5()
+    ts = np.linspace(0, 10, 1001)
+    solution = fj.simulate(scene.linkage, scene.state0, ts)
+    kinetic, potential = energies(scene.linkage, solution)
+    assert np.abs((kinetic + potential).sum(axis=1)).max() <= 1e-8
+    total = kinetic.sum(axis=1)
+    assert total[100] == pytest.approx(54.889174791186, abs=1e-8)
+    assert total[500] == pytest.approx(12.603912358049, abs=1e-7)
+    tables = {
+        50: ([2.298234459, 12.82117469, 16.15041155],
+             [-7.712524545, -11.54151306, -12.01578309]),
+        100: ([1.72060184, 13.9524388, 39.21613415],
+              [-9.711132357, -19.38953088, -25.78851156]),
+        200: ([3.418419722, 3.345751526, 1.483116072],
+              [-2.415474222, -1.457476221, -4.374336877]),
+        500: ([0.5977764945, 5.901081903, 6.10505396],
+              [-2.283401632, -7.598600676, -2.721910049]),
+    }  # fmt: skip
+    for index, (t, v) in tables.items():
+        np.testing.assert_allclose(kinetic[index], t, rtol=3e-9, atol=3e-8)
+        np.testing.assert_allclose(potential[index], v, rtol=3e-9, atol=3e-8)
+
+
+def test_default_accuracy_to_two_seconds():
+    """1e-8 on the paper's scenes, at the times and between the steps."""
+    scene = scenes.fig5()
+    solution = fj.simulate(scene.linkage, scene.state0, np.linspace(0, 2, 5))
+    angles = absolute_angles(scene.linkage, solution)[1:]
+    rows = {row["t"]: row["th"] for row in REFERENCE["chaos"]["rows"]}
+    for t, angle in zip(solution.ts[1:], angles):
+        np.testing.assert_allclose(angle, rows[float(t)], rtol=0, atol=1e-8)
+
+
+def test_fig7_tracks_its_circle():
+    scene = scenes.fig7()
+    ts = np.arange(1001) * 0.01
+    solution = fj.simulate(scene.linkage, scene.state0, ts, scene.forces)
+    task = scene.forces[0].reference
+    tips = jax.vmap(fj.tip_position, in_axes=(None, 0))(scene.linkage, solution.q)
+    error = np.linalg.norm(tips - jax.vmap(task.tip)(ts), axis=1)
+    assert error[0] == pytest.approx(0.25, abs=1e-12)
+    assert error[50] == pytest.approx(0.409612, abs=1e-5)
+    assert error[200] == pytest.approx(0.179893, abs=1e-5)
+    assert np.sqrt(np.mean(error[500:1000] ** 2)) == pytest.approx(0.253504, abs=1e-5)
+    # States of physics at t = 2: th2, B2, th4.
+    np.testing.assert_allclose(
+        [solution.q[200, 0], solution.q[200, 1], solution.q[200].sum()
+         - solution.q[200, 1] + np.pi / 2],
+        [1.75072080229, 0.790467088356, 1.61872366706],
+        atol=1e-7,
+    )  # fmt: skip
+    efforts = fj.joint_efforts(scene.linkage, scene.forces, solution)
+    np.testing.assert_allclose(efforts.total[0], [15.873, -300, -9.921], rtol=1e-4)
+    np.testing.assert_array_equal(efforts.total, efforts.elements[0])
+
+
+@pytest.mark.parametrize(
+    ("solver", "order", "steps"),
+    [
+        (diffrax.Bosh3(), 3, [0.01, 0.005, 0.0025]),
+        (diffrax.Dopri8(), 8, [0.05, 0.04, 0.025]),
+    ],
+)
+def test_order_of_convergence(solver, order, steps):
+    scene = scenes.fig5()
+    state = fj.State([-1.0, 0.4, 0.3], [0.0, 0.0, 0.0])
+
+    def end(dt0):
+        return fj.simulate(
+            scene.linkage,
+            state,
+            [0, 1.0],
+            solver=solver,
+            stepsize_controller=diffrax.ConstantStepSize(),
+            dt0=dt0,
+        ).q[-1]
+
+    exact = end(2e-4)
+    errors = [float(np.abs(end(h) - exact).max()) for h in steps]
+    slope = np.polyfit(np.log(steps), np.log(errors), 1)[0]
+    assert slope == pytest.approx(order, abs=0.5)
+
+
+def test_a_solve_that_runs_out_of_steps_says_so_and_marks_the_rest():
+    scene = scenes.fig5()
+    ts = np.linspace(0, 2, 21)
+    solution = fj.simulate(scene.linkage, scene.state0, ts, max_steps=50, throw=False)
+    assert solution.result == diffrax.RESULTS.max_steps_reached
+    reached = np.isfinite(solution.q).all(axis=1)
+    assert reached[0] and not reached[-1]
+    assert (np.diff(reached.astype(int)) <= 0).all()
+    with pytest.raises(RuntimeError, match="max_steps"):
+        fj.simulate(scene.linkage, scene.state0, ts, max_steps=50)
+
+
+def test_a_motion_that_turns_nan_ends_early():
+    def breaks(t, q, qd, linkage):
+        return jnp.where(t > 0.5, jnp.nan, 0.0) * jnp.ones(3)
+
+    scene = scenes.fig5()
+    solution = fj.simulate(
+        scene.linkage, scene.state0, [0, 0.25, 1.0], (breaks,), throw=False
+    )
+    assert solution.result != diffrax.RESULTS.successful
+    assert solution.stats["num_steps"] < 300
+    assert np.isfinite(solution.q[1]).all() and np.isnan(solution.q[2]).all()
+
+
+def test_time_need_not_start_at_zero():
+    scene = scenes.fig5()
+    from_zero = fj.simulate(scene.linkage, scene.state0, [0.0, 1.0])
+    later = fj.simulate(scene.linkage, scene.state0, [5.0, 6.0])
+    np.testing.assert_allclose(later.q, from_zero.q, atol=1e-9)
+
+
+def test_one_time_gives_the_start():
+    scene = scenes.fig5()
+    solution = fj.simulate(scene.linkage, fj.State([1, 2, 3], [0, 0, 0]), [2.0])
+    np.testing.assert_array_equal(solution.q, [[1, 2, 3]])
+
+
+def test_a_start_after_many_turns_moves_alike():
+    """Positions are integrated as displacements: an offset costs no accuracy."""
+    scene = scenes.fig3()
+    turns = 2 * np.pi * 1e6
+    q = np.array([-0.5, 0.3, 0.2])
+    # The offset start is rounded: compare with the angle it really has.
+    offset = q + [turns, 0, 0]
+    kept = np.array([float(np.remainder(offset[0], 2 * np.pi)), 0.3, 0.2])
+    sin, cos = fj.trigonometry.sincos(offset[0])
+    kept[0] = np.arctan2(sin, cos)
+    ts = [0, 1.0, 2.0]
+    plain = fj.simulate(scene.linkage, fj.State(kept, np.zeros(3)), ts, scene.forces)
+    far = fj.simulate(scene.linkage, fj.State(offset, np.zeros(3)), ts, scene.forces)
+    np.testing.assert_allclose(
+        np.asarray(far.q) - offset, np.asarray(plain.q) - kept, atol=2e-9
+    )
+    assert far.stats["num_steps"] == plain.stats["num_steps"]
+
+
+def test_forces_add_up():
+    scene = scenes.fig3()
+    ts = [0, 0.5, 1.0]
+    one = fj.simulate(scene.linkage, scene.state0, ts, (fj.JointDamper(20.0),))
+    split = (fj.JointDamper(15.0), fj.JointEffort([0, 0, 0]), fj.JointDamper(5.0))
+    three = fj.simulate(scene.linkage, scene.state0, ts, split)
+    np.testing.assert_allclose(three.q, one.q, atol=1e-10)
+    efforts = fj.joint_efforts(scene.linkage, split, three)
+    assert efforts.elements.shape == (3, 3, 3)
+    np.testing.assert_allclose(efforts.total, -20 * three.qd, atol=1e-12)
