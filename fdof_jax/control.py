@@ -11,9 +11,15 @@ from jax import Array
 from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
-from .kinematics import solve_joints, tip_position, wrist_vector
-from .linkage import Linkage
-from .validation import concrete, one_of, real_array
+from .kinematics import (
+    plane_angle,
+    solve_joints,
+    tip_position,
+    whole_turns,
+    wrist_vector,
+)
+from .linkage import Linkage, check_linkage
+from .validation import concrete, real_array, sign
 
 if TYPE_CHECKING:
     from .simulation import Solution
@@ -55,7 +61,7 @@ class PDController(eqx.Module):
         self.limit = real_array(
             "limit", limit, (3,), minimum=0, finite=False, broadcast=True
         )
-        if not callable(reference):
+        if not callable(reference) or isinstance(reference, type):
             raise ValueError(
                 "reference: expected a callable (t, linkage) -> (q, qd), for instance "
                 f"CircleTask(), got {reference!r}."
@@ -64,7 +70,12 @@ class PDController(eqx.Module):
 
     def demand(self, t: Array, q: Array, qd: Array, linkage: Linkage) -> Array:
         """The effort before it is limited, (3,) [N or N m]."""
-        q_ref, qd_ref = self.reference(t, linkage)
+        motion = self.reference(t, linkage)
+        if not isinstance(motion, tuple) or len(motion) != 2:
+            raise ValueError(
+                f"reference: expected it to return (q_ref, qd_ref), got {motion!r}."
+            )
+        q_ref, qd_ref = (real_array("reference", m, (3,)) for m in motion)
         return self.kp * (q_ref - q) + self.kd * (qd_ref - qd)
 
     def __call__(self, t: Array, q: Array, qd: Array, linkage: Linkage) -> Array:
@@ -125,20 +136,20 @@ class CircleTask(eqx.Module):
             raise ValueError("period: expected a time other than 0 s, got 0.")
         self.phase = real_array("phase", phase, ())
         self.orientation = real_array("orientation", orientation, ())
-        self.branch = jnp.asarray(one_of("branch", branch, (1, -1)), dtype=float)
+        self.branch = sign("branch", branch)
 
     def _turned(self, t: Array) -> Array:
         return self.phase + 2 * np.pi * t / self.period
 
     def tip(self, t: ArrayLike) -> Float[Array, " 2"]:
         """The commanded tip position at time `t` [s]: (x, y) [m]."""
-        turned = self._turned(jnp.asarray(t))
+        turned = self._turned(real_array("t", t, ()))
         return self.center + self.radius * jnp.stack([jnp.cos(turned), jnp.sin(turned)])
 
     def _positions(self, t: Array, linkage: Linkage) -> Array:
         wrist = wrist_vector(linkage, self.tip(t), self.orientation)
         hub = wrist_vector(linkage, self.center, self.orientation)
-        turns = jnp.round(self._bearing(jnp.zeros_like(t), hub) / (2 * np.pi))
+        turns = whole_turns(self._bearing(jnp.zeros_like(t), hub))
         bearing = self._bearing(t, hub) - 2 * np.pi * turns
         return solve_joints(linkage, wrist, bearing, self.orientation, self.branch)
 
@@ -148,30 +159,40 @@ class CircleTask(eqx.Module):
         The larger of the two vectors carries the angle; the smaller one adds less than
         a quarter turn, for which the arctangent has no jump.
         """
-        distance = jnp.hypot(hub[0], hub[1])
-        hub_angle = jnp.arctan2(hub[1], hub[0])
         turned = self._turned(t)
-        around = self.radius > distance
-        carrier = jnp.where(around, turned, hub_angle)
-        large = jnp.maximum(self.radius, distance)
-        small = jnp.minimum(self.radius, distance)
-        lead = jnp.where(around, -1, 1) * (turned - hub_angle)
-        return carrier + jnp.arctan2(
-            small * jnp.sin(lead), large + small * jnp.cos(lead)
+        cos, sin = jnp.cos(turned), jnp.sin(turned)
+        along, across = hub[0] * cos + hub[1] * sin, hub[1] * cos - hub[0] * sin
+        square = hub[0] ** 2 + hub[1] ** 2
+        around = self.radius**2 > square
+        carrier = jnp.where(around, turned, plane_angle(hub[1], hub[0]))
+        return carrier + plane_angle(
+            jnp.where(around, across, -self.radius * across),
+            jnp.where(around, self.radius + along, square + self.radius * along),
         )
 
     def __call__(
         self, t: ArrayLike, linkage: Linkage
     ) -> tuple[Float[Array, " joint"], Float[Array, " joint"]]:
         """Joint positions [m or rad] and velocities [m/s or rad/s] at time `t` [s]."""
-        t = jnp.asarray(t, dtype=float)
+        check_linkage(linkage)
+        t = real_array("t", t, ())
         return jax.jvp(lambda t: self._positions(t, linkage), (t,), (jnp.ones_like(t),))
 
     def check(self, linkage: Linkage, ts: Array) -> None:
         """Raise ValueError if the tip leaves the linkage's reach between the times."""
         start, end = float(ts[0]), float(ts[-1])
         turn = abs(float(self.period))
-        times = jnp.linspace(start, min(end, start + turn), 257)
+        # The reach ends first where the wrist is nearest to or farthest from the base,
+        # or along a direction that the ground or the last link fixes.
+        hub = wrist_vector(linkage, self.center, self.orientation)
+        directions = np.array(
+            [np.arctan2(hub[1], hub[0]), linkage.base_angle,
+             self.orientation - linkage.locked[2]]
+        )  # fmt: skip
+        lead = np.concatenate([directions, directions + np.pi]) - float(self.phase)
+        extremes = start + (lead / (2 * np.pi) * float(self.period) - start) % turn
+        times = np.linspace(start, min(end, start + turn), 257)
+        times = np.append(times, np.minimum(extremes, end))
         if not np.isfinite(_positions_over(self, linkage, times)).all():
             raise ValueError(
                 "reference: expected a circle within the linkage's reach at "
@@ -183,10 +204,11 @@ class CircleTask(eqx.Module):
 
 
 @eqx.filter_jit
-def _positions_over(task: CircleTask, linkage: Linkage, times: Array) -> Array:
+def _positions_over(task: CircleTask, linkage: Linkage, times: ArrayLike) -> Array:
     return jax.vmap(lambda t: task(t, linkage)[1])(times)
 
 
+@eqx.filter_jit
 def saturated(
     controller: PDController, linkage: Linkage, solution: "Solution"
 ) -> Bool[Array, "time joint"]:
@@ -200,6 +222,7 @@ def saturated(
     return jnp.abs(demand) > controller.limit
 
 
+@eqx.filter_jit
 def tip_deviation(
     linkage: Linkage, task: CircleTask, solution: "Solution"
 ) -> Float[Array, "time 2"]:

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from .linkage import Linkage, check_linkage, compiled, real_joints, to_chain
 from .trigonometry import sincos
-from .validation import concrete, one_of, real_array
+from .validation import concrete, real_array, sign
 
 # Vectors of the plane are complex numbers here: multiplying by exp(i th) turns them,
 # multiplying by i turns them by 90 degrees.
@@ -106,10 +106,20 @@ def tip_jacobian(
     return jnp.stack([columns.real, columns.imag, jnp.where(revolute, 1.0, 0.0)])
 
 
-def _angle(y: Array, x: Array) -> Array:
+def plane_angle(y: Array, x: Array) -> Array:
     """atan2 with derivative zero instead of NaN at the origin."""
     origin = (x == 0) & (y == 0)
     return jnp.arctan2(y, jnp.where(origin, 1, x))
+
+
+def whole_turns(angle: Array) -> Array:
+    """How many turns to take off `angle` to leave it in (-pi, pi].
+
+    The cut lies beside the negative x axis by more than rounding, so that points on
+    that axis are at +pi whichever way they were computed.
+    """
+    margin = jnp.sqrt(jnp.finfo(angle.dtype).eps)
+    return jnp.ceil((angle - jnp.pi - margin) / (2 * jnp.pi))
 
 
 def wrist_vector(linkage: Linkage, tip: Array, orientation: Array) -> Array:
@@ -165,7 +175,9 @@ def solve_joints(
     rest = w - d2 * e2 - d3 * e3
     first = 1j * jnp.where(r1, e2, e1)
     second = 1j * jnp.where(r3, e2, e3)
-    span = jnp.where(two_slides, cross(first, second), 1)
+    span = cross(first, second)  # sine of the angle between the slides
+    parallel = jnp.abs(span) <= 16 * jnp.finfo(span.dtype).eps
+    span = jnp.where(two_slides, jnp.where(parallel, jnp.nan, span), 1)
     slide_first, slide_second = cross(rest, second) / span, cross(first, rest) / span
 
     # One turning vector, one slide along i*across: the part of the wrist vector along
@@ -192,8 +204,8 @@ def solve_joints(
     base = jnp.where(
         two_turning, reach2 + inner, jnp.where(framed, distance, along_turning)
     )
-    angle = _angle(root, base)
-    own2, own3 = _angle(d2.imag, d2.real), _angle(d3.imag, d3.real)
+    angle = plane_angle(root, base)
+    own2, own3 = plane_angle(d2.imag, d2.real), plane_angle(d3.imag, d3.real)
     turned = jnp.where(turning_third, th1, th3_known) + angle
     th2 = jnp.where(
         two_turning,
@@ -204,7 +216,7 @@ def solve_joints(
     )
     th3 = jnp.where(
         two_turning,
-        th2 + own2 + _angle(root, inner) - own3,
+        th2 + own2 + plane_angle(root, inner) - own3,
         jnp.where(
             framed, th2 + lock2, jnp.where(turning_third, turned - own3, th3_known)
         ),
@@ -233,8 +245,9 @@ def inverse_kinematics(
 ) -> Float[Array, " joint"]:
     """Joint positions that put the tip at a point with a given direction of A4.
 
-    Closed form for every topology, selected by the existence factors. Angles are
-    principal values.
+    Closed form for every topology, selected by the existence factors. The direction of
+    the last link's start as seen from the first joint is taken in (-pi, pi], from which
+    the angles follow without wrapping.
 
     **Arguments:**
 
@@ -253,10 +266,11 @@ def inverse_kinematics(
     check_linkage(linkage)
     tip = real_array("tip", tip, (2,))
     orientation = real_array("orientation", orientation, ())
-    branch = one_of("branch", branch, (1, -1))
+    side = sign("branch", branch)
     wrist = wrist_vector(linkage, tip, orientation)
-    bearing = _angle(wrist[1], wrist[0])
-    q = solve_joints(linkage, wrist, bearing, orientation, jnp.asarray(float(branch)))
+    bearing = plane_angle(wrist[1], wrist[0])
+    bearing = bearing - 2 * jnp.pi * whole_turns(bearing)
+    q = solve_joints(linkage, wrist, bearing, orientation, side)
     values = concrete(q)
     if values is not None and not jnp.isfinite(values).all():
         raise ValueError(

@@ -45,7 +45,8 @@ def _pairs_of(topology: Any) -> np.ndarray | None:
             )
         return None
     try:
-        ef = np.asarray(topology, dtype=float)
+        given = np.asarray(topology)
+        ef = given.astype(float) if given.dtype.kind in "biuf" else np.empty(0)
     except (TypeError, ValueError):
         ef = np.empty(0)
     if ef.shape != (6,) or not np.isin(ef, (0, 1)).all():

@@ -1,7 +1,6 @@
 """Simulation: the vector field and its integration by diffrax."""
 
 import warnings
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import diffrax
@@ -11,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jaxtyping import Float
+from numpy.typing import ArrayLike
 
 from .dynamics import (
     Constants,
@@ -22,7 +22,7 @@ from .dynamics import (
 from .linkage import Linkage, State, check_linkage
 from .validation import callable_tuple, concrete, is_traced, real_array
 
-Forces = tuple[Callable[..., Array], ...]
+Forces = tuple[Any, ...]  # callables (t, q, qd, linkage) -> tau
 
 
 class Solution(eqx.Module):
@@ -81,7 +81,14 @@ def element_effort(
     index: int, element: Any, t: Array, q: Array, qd: Array, linkage: Linkage
 ) -> Array:
     """What one force element returns, refused unless it is three real numbers."""
-    tau = jnp.asarray(element(t, q, qd, linkage))
+    tau = element(t, q, qd, linkage)
+    try:
+        tau = jnp.asarray(tau)
+    except (TypeError, ValueError) as error:
+        raise ValueError(
+            f"forces[{index}]: expected it to return tau, an array of 3 real numbers, "
+            f"got {tau!r}."
+        ) from error
     if tau.shape != (3,) or not jnp.issubdtype(tau.dtype, jnp.floating):
         raise ValueError(
             f"forces[{index}]: expected it to return tau, an array of 3 real numbers, "
@@ -121,7 +128,7 @@ def _solve(linkage, state0, ts, forces, keywords) -> Solution:
 def simulate(
     linkage: Linkage,
     state0: State,
-    ts: Float[Array, " time"],
+    ts: ArrayLike,
     forces: Forces = (),
     *,
     solver: diffrax.AbstractSolver = diffrax.Dopri8(),
@@ -141,7 +148,7 @@ def simulate(
     **Arguments:**
 
     - `linkage`, `state0`: the arm, and its joint positions and velocities.
-    - `ts`: increasing times [s].
+    - `ts`: increasing times, of shape (time,) [s].
     - `forces`: a tuple of force elements `(t, q, qd, linkage) -> tau`.
     - `solver`, `stepsize_controller`, `dt0`, `adjoint`, `max_steps`, `throw`,
       `progress_meter`: as in `diffrax.diffeqsolve`. By default Dopri8 at a relative
@@ -171,6 +178,8 @@ def simulate(
     if times is not None and not (np.diff(times) > 0).all():
         raise ValueError(f"ts: expected increasing times, got {times.tolist()[:20]}.")
     callable_tuple("forces", forces)
+    if dt0 is not None:
+        real_array("dt0", dt0, (), above=0)
     if isinstance(adjoint, diffrax.BacksolveAdjoint):
         raise ValueError(
             "adjoint: expected RecursiveCheckpointAdjoint (reverse mode) or "
@@ -227,7 +236,14 @@ def joint_efforts(linkage: Linkage, forces: Forces, solution: Solution) -> Effor
     **Raises:** ValueError if `forces` is not a tuple of force elements.
     """
     check_linkage(linkage)
+    if not isinstance(solution, Solution):
+        raise ValueError(f"solution: expected a Solution, got {solution!r}.")
     callable_tuple("forces", forces)
+    return _efforts(linkage, forces, solution)
+
+
+@eqx.filter_jit
+def _efforts(linkage: Linkage, forces: Forces, solution: Solution) -> Efforts:
     elements = [
         jax.vmap(lambda t, q, qd, i=i, f=f: element_effort(i, f, t, q, qd, linkage))(
             solution.ts, solution.q, solution.qd

@@ -8,15 +8,16 @@ import numpy as np
 if TYPE_CHECKING:
     from .linkage import Linkage
 
-# Below this pivot ratio nothing is left of a pivot but rounding.
+# Below this eigenvalue of a matrix with ones as diagonal there is only rounding.
 _SINGULAR = 1e-14
 
 
-def _pivot_ratios(linkage: "Linkage", configurations: int) -> np.ndarray:
-    """Scale-free pivots D_k / M_kk of the 3x3 mass matrix, (configurations, 3).
+def _least_inertia(linkage: "Linkage", configurations: int) -> np.ndarray:
+    """How far from singular the joints from k outwards are, (configurations, 3).
 
-    From the tip: what is left of the inertia that joint k feels once the joints
-    further out are free. Written in NumPy because it runs at the door.
+    The least eigenvalue of their block of the 3x3 mass matrix, scaled to a diagonal of
+    ones so that units and sizes play no part. Written in NumPy because it runs at the
+    door.
     """
     ef, length, com, mass, inertia, locked, base_angle = (
         np.asarray(a, dtype=float)
@@ -46,11 +47,11 @@ def _pivot_ratios(linkage: "Linkage", configurations: int) -> np.ndarray:
             M += mass[n] * np.real(np.outer(J.conj(), J)) + inertia[n] * np.outer(
                 turns, turns
             )
-        diagonal = np.diag(M).copy()
-        for k in (2, 1, 0):
-            row[k] = M[k, k] / diagonal[k] if diagonal[k] > 0 else 0
-            if row[k] > _SINGULAR:
-                M -= np.outer(M[:, k], M[k, :]) / M[k, k]
+        # Pivots of an elimination would lose their accuracy near singularity.
+        scale = np.sqrt(np.maximum(np.diag(M), np.finfo(float).tiny))
+        scaled = M / np.outer(scale, scale)
+        for k in range(3):
+            row[k] = np.linalg.eigvalsh(scaled[k:, k:])[0]
     return ratios
 
 
@@ -58,7 +59,7 @@ def check_singularity(linkage: "Linkage") -> None:
     """Refuse linkages that are always singular, warn of those that may become so."""
     revolute = np.asarray(linkage.ef)[1::2] > 0.5
     names = "".join("R" if r else "P" for r in revolute)
-    best = _pivot_ratios(linkage, configurations=5).max(axis=0)
+    best = _least_inertia(linkage, configurations=5).max(axis=0)
     for k in (2, 1, 0):
         if best[k] <= _SINGULAR:
             kind = "revolute" if revolute[k] else "prismatic"

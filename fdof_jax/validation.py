@@ -85,7 +85,9 @@ def real_array(
 
 def callable_tuple(name: str, value: Any) -> tuple:
     """`value` if it is a tuple of callables, else ValueError."""
-    if isinstance(value, tuple) and all(callable(item) for item in value):
+    if isinstance(value, tuple) and all(
+        callable(item) and not isinstance(item, type) for item in value
+    ):
         return value
     raise ValueError(
         f"{name}: expected a tuple of callables (t, q, qd, linkage) -> tau, for "
@@ -98,3 +100,11 @@ def one_of(name: str, value: Any, options: Sequence[Any]) -> Any:
     if isinstance(value, str | int | float) and value in options:
         return value
     raise ValueError(f"{name}: expected one of {tuple(options)}, got {value!r}.")
+
+
+def sign(name: str, value: Any) -> Array:
+    """`value` as an array if it is 1 or -1, else ValueError."""
+    array = real_array(name, value, ())
+    if (given := concrete(array)) is not None and abs(given) != 1:
+        raise ValueError(f"{name}: expected 1 or -1, got {value!r}.")
+    return array

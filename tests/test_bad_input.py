@@ -1,0 +1,388 @@
+"""Every malformed argument is refused at the door, by its name, in the user's words."""
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import fdof_jax as fj
+
+
+def make(topology="RRR", **changes):
+    arguments = dict(
+        length=[0, 1, 1, 1], com=[[0.5, 0]] * 3, mass=[1] * 3, inertia=[1] * 3
+    )
+    return fj.Linkage(topology, **{**arguments, **changes})
+
+
+LINKAGE = make()
+ZERO, CHAIN = np.zeros(3), np.zeros(6)
+STATE = fj.State(ZERO, ZERO)
+TS = [0.0, 0.01]
+SOLUTION = fj.Solution(
+    jnp.zeros(2), jnp.zeros((2, 3)), jnp.zeros((2, 3)), {}, diffrax.RESULTS.successful
+)
+
+
+def reference(t, linkage):
+    return jnp.zeros(3), jnp.zeros(3)
+
+
+def controller(kp=1, kd=1, limit=1, reference=reference):
+    return fj.PDController(kp, kd, limit, reference)
+
+
+def simulate(linkage=LINKAGE, state0=STATE, ts=TS, forces=(), **keywords):
+    return fj.simulate(linkage, state0, ts, forces, **keywords)
+
+
+def refused(name, call, *arguments):
+    """The message names the argument, what was expected and what came."""
+    with pytest.raises(ValueError, match=rf"(?s)^{name}: expected .+, got .+\.$"):
+        call(*arguments)
+
+
+# Arrays of real numbers. Per argument: its name, its shape, a call with it.
+
+ARRAYS = {
+    "Linkage length": ("length", (4,), lambda v: make(length=v)),
+    "Linkage com": ("com", (3, 2), lambda v: make(com=v)),
+    "Linkage mass": ("mass", (3,), lambda v: make(mass=v)),
+    "Linkage inertia": ("inertia", (3,), lambda v: make(inertia=v)),
+    "Linkage locked": ("locked", (3,), lambda v: make(locked=v)),
+    "Linkage base_angle": ("base_angle", (), lambda v: make(base_angle=v)),
+    "Linkage gravity": ("gravity", (), lambda v: make(gravity=v)),
+    "to_chain q": ("q", (3,), lambda v: fj.to_chain(LINKAGE, v, ZERO)),
+    "to_chain qd": ("qd", (3,), lambda v: fj.to_chain(LINKAGE, ZERO, v)),
+    "from_chain x": ("x", (6,), lambda v: fj.from_chain("RRR", v, CHAIN)),
+    "from_chain xd": ("xd", (6,), lambda v: fj.from_chain("RRR", CHAIN, v)),
+    "from_chain base_angle": (
+        "base_angle",
+        (),
+        lambda v: fj.from_chain("RRR", CHAIN, CHAIN, v),
+    ),
+    "joint_positions q": ("q", (3,), lambda v: fj.joint_positions(LINKAGE, v)),
+    "mass_centers q": ("q", (3,), lambda v: fj.mass_centers(LINKAGE, v)),
+    "tip_position q": ("q", (3,), lambda v: fj.tip_position(LINKAGE, v)),
+    "tip_jacobian q": ("q", (3,), lambda v: fj.tip_jacobian(LINKAGE, v)),
+    "inverse_kinematics tip": (
+        "tip",
+        (2,),
+        lambda v: fj.inverse_kinematics(LINKAGE, v, 0.0),
+    ),
+    "inverse_kinematics orientation": (
+        "orientation",
+        (),
+        lambda v: fj.inverse_kinematics(LINKAGE, [1, 1], v),
+    ),
+    "mass_matrix x": ("x", (6,), lambda v: fj.mass_matrix(LINKAGE, v)),
+    "bias_force x": ("x", (6,), lambda v: fj.bias_force(LINKAGE, v, CHAIN)),
+    "bias_force xd": ("xd", (6,), lambda v: fj.bias_force(LINKAGE, CHAIN, v)),
+    "JointDamper coefficient": ("coefficient", (3,), fj.JointDamper),
+    "JointEffort tau": ("tau", (3,), fj.JointEffort),
+    "PDController kp": ("kp", (3,), lambda v: controller(kp=v)),
+    "PDController kd": ("kd", (3,), lambda v: controller(kd=v)),
+    "PDController limit": ("limit", (3,), lambda v: controller(limit=v)),
+    "CircleTask center": ("center", (2,), lambda v: fj.CircleTask(center=v)),
+    "CircleTask radius": ("radius", (), lambda v: fj.CircleTask(radius=v)),
+    "CircleTask period": ("period", (), lambda v: fj.CircleTask(period=v)),
+    "CircleTask phase": ("phase", (), lambda v: fj.CircleTask(phase=v)),
+    "CircleTask orientation": (
+        "orientation",
+        (),
+        lambda v: fj.CircleTask(orientation=v),
+    ),
+    "CircleTask tip": ("t", (), lambda v: fj.CircleTask().tip(v)),
+    "CircleTask call": (
+        "t",
+        (),
+        lambda v: fj.CircleTask()(v, fj.scenes.fig7().linkage),
+    ),
+    "simulate state0.q": (
+        "state0.q",
+        (3,),
+        lambda v: simulate(state0=fj.State(v, ZERO)),
+    ),
+    "simulate state0.qd": (
+        "state0.qd",
+        (3,),
+        lambda v: simulate(state0=fj.State(ZERO, v)),
+    ),
+    "simulate ts": ("ts", (2,), lambda v: simulate(ts=v)),
+}
+for function in (fj.forward_dynamics, fj.inverse_dynamics, fj.energy, fj.link_energies):
+    names = ("q", "qd", "tau" if function is fj.forward_dynamics else "qdd")
+    names = names[:2] if function in (fj.energy, fj.link_energies) else names
+    for i, name in enumerate(names):
+        ARRAYS[f"{function.__name__} {name}"] = (
+            name,
+            (3,),
+            lambda v, f=function, i=i, n=len(names): f(
+                LINKAGE, *[ZERO] * i, v, *[ZERO] * (n - 1 - i)
+            ),
+        )
+for function in (fj.masked_accelerations, fj.constraint_forces):
+    for i, name in enumerate(("x", "xd", "force")):
+        ARRAYS[f"{function.__name__} {name}"] = (
+            name,
+            (6,),
+            lambda v, f=function, i=i: f(LINKAGE, *[CHAIN] * i, v, *[CHAIN] * (2 - i)),
+        )
+
+UNBOUNDED = {"PDController limit"}  # infinity means no limit
+
+MALFORMED = {
+    "None": lambda shape: None,
+    "text": lambda shape: "one",
+    "texts": lambda shape: np.full(shape, "1").tolist(),
+    "complex": lambda shape: np.ones(shape) * 1j,
+    "bool": lambda shape: np.ones(shape, dtype=bool),
+    "a bool": lambda shape: True,
+    "object": lambda shape: object(),
+    "dict": lambda shape: {"a": 1.0},
+    "nan": lambda shape: with_entry(shape, np.nan),
+    "minus inf": lambda shape: with_entry(shape, -np.inf),
+    "extra axis": lambda shape: np.ones((1, *shape)),
+    "too long": lambda shape: np.ones((*shape[:-1], 7)),
+    "ragged": lambda shape: [[1.0], [1.0, 2.0]],
+}
+
+
+def with_entry(shape, entry):
+    values = np.cumsum(np.ones(shape)).reshape(shape)
+    values[(0,) * len(shape)] = entry
+    return values
+
+
+@pytest.mark.parametrize("kind", MALFORMED)
+@pytest.mark.parametrize("argument", ARRAYS)
+def test_arrays_are_refused(argument, kind):
+    name, shape, call = ARRAYS[argument]
+    if name == "ts" and kind == "too long":
+        return  # any number of times will do
+    refused(name, call, MALFORMED[kind](shape))
+
+
+@pytest.mark.parametrize("argument", sorted(ARRAYS.keys() - UNBOUNDED))
+def test_infinity_is_refused(argument):
+    name, shape, call = ARRAYS[argument]
+    refused(name, call, with_entry(shape, np.inf))
+
+
+@pytest.mark.parametrize(
+    "argument",
+    [
+        "Linkage mass",
+        "Linkage inertia",
+        "JointDamper coefficient",
+        "PDController kp",
+        "PDController kd",
+        "PDController limit",
+        "CircleTask radius",
+    ],
+)
+def test_negative_values_are_refused(argument):
+    name, shape, call = ARRAYS[argument]
+    refused(name, call, with_entry(shape, -1e-9))
+    call(with_entry(shape, 1e-9))
+
+
+# Topologies
+
+
+@pytest.mark.parametrize(
+    "topology",
+    [
+        "PPP",
+        "RR",
+        "RRRR",
+        "rrr",
+        "XRR",
+        "",
+        None,
+        3,
+        [0, 1, 0, 1],
+        [0, 1, 0, 1, 1, 1],
+        [0, 1, 0, 0, 0, 1],
+        [1, 0, 1, 0, 1, 0],
+        [0, 1, 0, 1, 0, 0.5],
+        [0, 1, 0, 1, 0, np.nan],
+        [0, 1, 0, 1, 0, 1j],
+        np.array([0, 1, 0, 1, 0, 1 + 0j]),
+        ["0", "1", "0", "1", "0", "1"],
+        [[0, 1], [0, 1], [0, 1]],
+    ],
+    ids=repr,
+)
+@pytest.mark.filterwarnings("error")
+def test_unknown_topologies_are_refused(topology):
+    refused("topology", make, topology)
+    refused("topology", fj.from_chain, topology, CHAIN, CHAIN)
+    refused("topology", fj.existence_factors, topology)
+
+
+def test_the_refusal_of_ppp_says_why():
+    with pytest.raises(ValueError, match="PPP.*cannot orient its last link"):
+        make("PPP")
+    with pytest.raises(ValueError, match="PPP.*cannot orient its last link"):
+        make([1, 0] * 3)
+
+
+# Linkages
+
+OF_A_LINKAGE = {
+    "to_chain": lambda k: fj.to_chain(k, ZERO, ZERO),
+    "joint_positions": lambda k: fj.joint_positions(k, ZERO),
+    "mass_centers": lambda k: fj.mass_centers(k, ZERO),
+    "tip_position": lambda k: fj.tip_position(k, ZERO),
+    "tip_jacobian": lambda k: fj.tip_jacobian(k, ZERO),
+    "inverse_kinematics": lambda k: fj.inverse_kinematics(k, [1, 1], 0),
+    "forward_dynamics": lambda k: fj.forward_dynamics(k, ZERO, ZERO, ZERO),
+    "inverse_dynamics": lambda k: fj.inverse_dynamics(k, ZERO, ZERO, ZERO),
+    "energy": lambda k: fj.energy(k, ZERO, ZERO),
+    "link_energies": lambda k: fj.link_energies(k, ZERO, ZERO),
+    "mass_matrix": lambda k: fj.mass_matrix(k, CHAIN),
+    "bias_force": lambda k: fj.bias_force(k, CHAIN, CHAIN),
+    "masked_accelerations": lambda k: fj.masked_accelerations(k, CHAIN, CHAIN, CHAIN),
+    "constraint_forces": lambda k: fj.constraint_forces(k, CHAIN, CHAIN, CHAIN),
+    "CircleTask": lambda k: fj.CircleTask()(0.0, k),
+    "simulate": lambda k: simulate(linkage=k),
+    "joint_efforts": lambda k: fj.joint_efforts(k, (fj.JointDamper(1),), SOLUTION),
+}
+
+
+@pytest.mark.parametrize("function", OF_A_LINKAGE)
+@pytest.mark.parametrize("kind", ["name", "None", "stacked"])
+def test_what_is_not_one_linkage_is_refused(function, kind):
+    stacked = jax.tree.map(lambda a: jnp.stack([a, a]), LINKAGE)
+    value = {"name": "RRR", "None": None, "stacked": stacked}[kind]
+    refused("linkage", OF_A_LINKAGE[function], value)
+
+
+# Simulation
+
+
+@pytest.mark.parametrize(
+    "ts", [[], 0.5, [[0, 1]], [1, 0], [0, 0], [0, 2, 1], [0, np.nan]], ids=repr
+)
+def test_times_that_do_not_increase_are_refused(ts):
+    refused("ts", lambda: simulate(ts=ts))
+
+
+@pytest.mark.parametrize("state0", [None, 3, [ZERO], (ZERO, ZERO, ZERO)], ids=repr)
+def test_what_is_not_a_state_is_refused(state0):
+    refused("state0", lambda: simulate(state0=state0))
+
+
+@pytest.mark.parametrize(
+    "forces",
+    [
+        None,
+        fj.JointDamper(1.0),
+        [fj.JointDamper(1.0)],
+        (fj.JointDamper(1.0), 3.0),
+        (np.zeros(3),),
+        (fj.JointDamper,),  # the class instead of an element
+        "damper",
+    ],
+    ids=str,
+)
+def test_what_is_not_a_tuple_of_elements_is_refused(forces):
+    refused("forces", lambda: simulate(forces=forces))
+    refused("forces", lambda: fj.joint_efforts(LINKAGE, forces, SOLUTION))
+
+
+@pytest.mark.parametrize(
+    "tau",
+    [jnp.zeros(2), jnp.zeros((3, 1)), 0.0, jnp.zeros(3) * 1j, jnp.ones(3, bool)]
+    + [None, "text", (jnp.zeros(3), jnp.zeros(3))],
+    ids=str,
+)
+def test_elements_that_return_no_effort_are_refused(tau):
+    forces = (fj.JointDamper(1.0), lambda t, q, qd, linkage: tau)
+    refused(r"forces\[1\]", lambda: simulate(forces=forces))
+    refused(r"forces\[1\]", lambda: fj.joint_efforts(LINKAGE, forces, SOLUTION))
+
+
+def test_what_is_not_a_solution_is_refused():
+    refused("solution", lambda: fj.joint_efforts(LINKAGE, (), None))
+
+
+def test_backsolve_is_refused():
+    refused("adjoint", lambda: simulate(adjoint=diffrax.BacksolveAdjoint()))
+
+
+@pytest.mark.parametrize("dt0", [0.0, -1e-3, np.nan, "1e-3"])
+def test_first_steps_that_are_none_are_refused(dt0):
+    refused("dt0", lambda: simulate(dt0=dt0))
+
+
+def test_forward_mode_through_the_default_adjoint_names_the_cure():
+    def end(q):
+        return simulate(state0=fj.State(q, ZERO)).q[-1]
+
+    with pytest.raises(TypeError, match=r"adjoint=diffrax\.ForwardMode\(\)"):
+        jax.jacfwd(end)(jnp.zeros(3))
+
+
+# Control and inverse kinematics
+
+
+def test_period_zero_is_refused():
+    refused("period", lambda: fj.CircleTask(period=0))
+
+
+@pytest.mark.parametrize("branch", [0, 2, -1.5, "1", None, True, np.nan, [1]], ids=repr)
+def test_branches_other_than_plus_and_minus_one_are_refused(branch):
+    refused("branch", lambda: fj.CircleTask(branch=branch))
+    refused(
+        "branch", lambda: fj.inverse_kinematics(LINKAGE, [1, 1], 0.0, branch=branch)
+    )
+
+
+@pytest.mark.parametrize("branch", [1, -1.0, np.int64(-1), np.float32(1), jnp.array(1)])
+def test_numbers_of_any_kind_name_a_branch(branch):
+    assert fj.CircleTask(branch=branch).branch == float(branch)
+    fj.inverse_kinematics(LINKAGE, [1, 1], 0.0, branch=branch)
+
+
+@pytest.mark.parametrize("value", [None, 3.0, (ZERO, ZERO), fj.CircleTask])
+def test_references_that_cannot_be_called_are_refused(value):
+    refused("reference", lambda: controller(reference=value))
+
+
+@pytest.mark.parametrize(
+    "returned",
+    [
+        None,
+        ZERO,
+        (0.0, 0.0),
+        (np.zeros(2), np.zeros(2)),
+        (ZERO, None),
+        (ZERO * 1j, ZERO),
+    ],
+    ids=repr,
+)
+def test_references_that_return_no_motion_are_refused(returned):
+    element = controller(reference=lambda t, linkage: returned)
+    refused("reference", lambda: element(0.0, jnp.zeros(3), jnp.zeros(3), LINKAGE))
+    refused("reference", lambda: simulate(forces=(element,)))
+
+
+@pytest.mark.parametrize("circle", [dict(center=[9, 9]), dict(radius=5.0)], ids=str)
+def test_circles_out_of_reach_are_refused_at_the_door(circle):
+    scene = fj.scenes.fig7()
+    forces = eqx.tree_at(
+        lambda f: f[0].reference, scene.forces, fj.CircleTask(branch=1, **circle)
+    )
+    if "center" in circle:  # this arm's slide has no end: only too near is out of reach
+        scene = scene._replace(linkage=make("RRR"))
+    with pytest.raises(ValueError, match="^reference: expected .* reach .*, got .*"):
+        fj.simulate(scene.linkage, scene.state0, [0, 5.0], forces)
+
+
+def test_points_out_of_reach_are_refused():
+    with pytest.raises(ValueError, match=r"^tip: expected .* reach .*, got \[9"):
+        fj.inverse_kinematics(LINKAGE, [9, 9], 0.0)

@@ -1,0 +1,269 @@
+"""The saturated PD law and the circle's joint reference, continuous over many turns."""
+
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import fdof_jax as fj
+
+each_topology = pytest.mark.parametrize("topology", fj.TOPOLOGIES)
+
+
+def arm(topology, **changes):
+    arguments = dict(
+        length=[0.2, 1.1, 1.3, 0.4],
+        com=[[0.5, 0.1]] * 3,
+        mass=[1, 1, 1],
+        inertia=[1, 1, 1],
+        locked=[0.2, 0.7, -0.5],
+        base_angle=0.4,
+    )
+    return fj.Linkage(topology, **{**arguments, **changes})
+
+
+def circle_of(linkage, **changes):
+    """A circle around the tip of a bent posture, within every topology's reach."""
+    q = [0.8, 1.5, 0.4]
+    x, _ = fj.to_chain(linkage, q, [0, 0, 0])
+    task = dict(
+        center=fj.tip_position(linkage, q),
+        radius=0.1,
+        period=2.5,
+        phase=0.6,
+        orientation=x[5],
+    )
+    return fj.CircleTask(**{**task, **changes})
+
+
+@jax.jit
+def references(task, linkage, times):
+    return jax.vmap(lambda t: task(t, linkage))(times)
+
+
+# The PD law
+
+
+@pytest.mark.parametrize("limit", [[3.0, 4.0, 5.0], [1e9, 0.0, np.inf]])
+def test_the_controller_is_the_clipped_sum_of_both_errors(limit):
+    rng = np.random.default_rng(0)
+    linkage = arm("RPR")
+    q_ref, qd_ref = rng.normal(size=(2, 3))
+    kp, kd = rng.uniform(0, 10, (2, 3))
+    controller = fj.PDController(kp, kd, limit, lambda t, k: (q_ref * t, qd_ref))
+    saturated = []
+    for _ in range(50):
+        q, qd = rng.normal(size=(2, 3))
+        demand = kp * (2 * q_ref - q) + kd * (qd_ref - qd)
+        effort = controller(2.0, q, qd, linkage)
+        np.testing.assert_allclose(controller.demand(2.0, q, qd, linkage), demand)
+        np.testing.assert_allclose(
+            effort, np.maximum(-np.array(limit), np.minimum(limit, demand))
+        )
+        saturated.append(np.abs(demand) > limit)
+    assert 0 < np.mean(saturated) < 1
+
+
+def test_one_gain_serves_all_joints():
+    controller = fj.PDController(2, 3, np.inf, lambda t, k: (jnp.ones(3), jnp.ones(3)))
+    for field in (controller.kp, controller.kd, controller.limit):
+        assert field.shape == (3,) and field.dtype == jnp.result_type(float)
+    np.testing.assert_array_equal(
+        controller(0.0, jnp.zeros(3), jnp.zeros(3), arm("RRR")), [5, 5, 5]
+    )
+
+
+def test_gradients_in_the_gains_stop_where_the_effort_is_limited():
+    error, rate = jnp.array([2.0, -3.0, 0.5]), jnp.array([0.1, 0.2, -0.3])
+    linkage = arm("RRR")
+    controller = fj.PDController(
+        [100, 1, 1], [1, 1, 1], [5, 50, 50], lambda t, k: (error, rate)
+    )
+
+    def effort(controller):
+        return jnp.sum(controller(0.0, jnp.zeros(3), jnp.zeros(3), linkage))
+
+    gradient = eqx.filter_grad(effort)(controller)
+    np.testing.assert_allclose(gradient.kp, [0, -3, 0.5])
+    np.testing.assert_allclose(gradient.kd, [0, 0.2, -0.3])
+    np.testing.assert_allclose(gradient.limit, [1, 0, 0])
+
+
+# The circle
+
+
+@pytest.mark.parametrize("period", [5.0, -3.0])
+def test_the_tip_runs_round_the_circle_at_constant_speed(period):
+    center, radius, phase = np.array([1.0, -2.0]), 0.7, 0.3
+    task = fj.CircleTask(center, radius, period, phase)
+    for t in (0, 0.4, 7.3):
+        arm_vector, velocity = (
+            np.asarray(a) for a in jax.jvp(task.tip, (float(t),), (1.0,))
+        )
+        arm_vector = arm_vector - center
+        turn = 2 * np.pi / period
+        assert np.hypot(*arm_vector) == pytest.approx(radius)
+        np.testing.assert_allclose(
+            velocity, turn * np.array([-arm_vector[1], arm_vector[0]]), atol=1e-13
+        )
+    start = center + radius * np.array([np.cos(phase), np.sin(phase)])
+    np.testing.assert_allclose(task.tip(0), start)
+    np.testing.assert_allclose(task.tip(3 * period), start)
+
+
+@each_topology
+@pytest.mark.parametrize("branch", [1, -1])
+def test_the_reference_puts_the_tip_on_the_circle(topology, branch):
+    linkage = arm(topology)
+    task = circle_of(linkage, branch=branch)
+    times = jnp.linspace(-0.3, 5, 23)
+    q, qd = references(task, linkage, times)
+    tips = jax.vmap(partial(fj.tip_position, linkage))(q)
+    np.testing.assert_allclose(tips, jax.vmap(task.tip)(times), atol=1e-12)
+    x = jax.vmap(lambda q: fj.to_chain(linkage, q, jnp.zeros(3))[0])(q)
+    turns = (x[:, 5] - task.orientation) / (2 * np.pi)
+    np.testing.assert_allclose(turns, np.full(23, np.round(turns[0])), atol=1e-12)
+    # Its rate moves the tip along the circle without turning the last link.
+    rate = jnp.einsum("tij,tj->ti", jax.vmap(partial(fj.tip_jacobian, linkage))(q), qd)
+    velocity = jax.vmap(jax.jacfwd(task.tip))(times)
+    np.testing.assert_allclose(rate[:, :2], velocity, atol=1e-11)
+    np.testing.assert_allclose(rate[:, 2], np.zeros(23), atol=1e-11)
+
+
+@each_topology
+def test_the_rate_of_the_reference_is_its_central_difference(topology):
+    linkage = arm(topology)
+    task = circle_of(linkage)
+    times, h = jnp.linspace(0, 2.5, 11), 1e-5
+    (after, _), (before, _) = (references(task, linkage, times + s) for s in (h, -h))
+    _, qd = references(task, linkage, times)
+    np.testing.assert_allclose(qd, (after - before) / (2 * h), atol=1e-7)
+
+
+@each_topology
+@pytest.mark.parametrize("branch", [1, -1])
+def test_the_reference_starts_where_inverse_kinematics_says(topology, branch):
+    linkage = arm(topology)
+    task = circle_of(linkage, branch=branch)
+    start = fj.inverse_kinematics(linkage, task.tip(0), task.orientation, branch=branch)
+    first, _ = references(task, linkage, jnp.zeros(1))
+    np.testing.assert_allclose(first[0], start, atol=1e-12)
+
+
+# Continuity. The arms' wrists see the base at the origin; the hub is the circle's
+# centre as the wrist sees it: the tip runs 0.4 m to the right of the wrist.
+
+
+def wrist_arm(topology):
+    """An arm of long reach both ways; the RPR one has its slide through the base."""
+    length = [0, 2, 2.5, 0.4] if topology == "RRR" else [0, 0.1, 0.1, 0.4]
+    return arm(topology, length=length, locked=0, base_angle=0)
+
+
+def wrist_circle(hub, radius, **keywords):
+    center = np.array(hub) + [0.4, 0]
+    return fj.CircleTask(center, radius, orientation=0, **keywords)
+
+
+CIRCLES = {
+    "beside": ([1.8, 0.1], 0.7, 0),
+    "across the negative x axis": ([-1.8, 0.1], 0.7, 0),
+    "on the negative x axis": ([-1.8, 0.0], 0.7, 0),
+    "around the base": ([0.3, -0.2], 1.7, 1),
+    "centred on the base": ([0.0, 0.0], 1.7, 1),
+}
+
+
+@pytest.mark.parametrize("topology", ["RRR", "RPR"])
+@pytest.mark.parametrize("period", [2.0, -2.0])
+@pytest.mark.parametrize("phase", [0.0, 2.0, -np.pi])
+@pytest.mark.parametrize("circle", CIRCLES)
+def test_the_reference_never_jumps_and_counts_its_turns(
+    circle, phase, period, topology
+):
+    hub, radius, winding = CIRCLES[circle]
+    linkage = wrist_arm(topology)
+    task = wrist_circle(hub, radius, period=period, phase=phase)
+    step = 0.005
+    times = step * jnp.arange(1201)  # three turns
+    q, qd = references(task, linkage, times)
+    largest = 1.01 * np.abs(qd).max(axis=0) * step + 1e-12
+    assert (np.abs(np.diff(q, axis=0)).max(axis=0) <= largest).all()
+    turns = (q[-1] - q[0]) / (2 * np.pi)
+    expected = 3 * winding * np.sign(period)
+    np.testing.assert_allclose(turns, [expected, 0, -expected], atol=1e-9)
+
+
+@pytest.mark.parametrize("topology", ["RRR", "RPR"])
+@pytest.mark.parametrize("phase", [0.0, 0.2, -0.2, np.pi, -np.pi, 3 * np.pi, 20.0])
+@pytest.mark.parametrize("circle", CIRCLES)
+def test_no_arm_at_the_start_of_the_circle_is_told_to_unwind(circle, phase, topology):
+    hub, radius, _ = CIRCLES[circle]
+    linkage = wrist_arm(topology)
+    task = wrist_circle(hub, radius, phase=phase)
+    start = fj.inverse_kinematics(linkage, task.tip(0), 0)
+    np.testing.assert_allclose(
+        references(task, linkage, jnp.zeros(1))[0][0], start, atol=1e-9
+    )
+
+
+def test_a_start_one_turn_away_unwinds():
+    linkage = arm("RPR")
+    task = circle_of(linkage)
+    controller = fj.PDController(40, 40, np.inf, task)
+    q, qd = task(0, linkage)
+    turn = jnp.array([2 * np.pi, 0, 0])
+    at_rest = controller(0, q, qd, linkage)
+    np.testing.assert_allclose(at_rest, np.zeros(3), atol=1e-12)
+    for start, effort in (q + turn, -40 * turn), (q - turn, 40 * turn):
+        np.testing.assert_allclose(
+            controller(0, start, qd, linkage), effort, atol=1e-12
+        )
+
+
+@jax.jit
+def reference_derivatives(task, linkage):
+    """In the circle and in the linkage, and the tip Jacobian."""
+
+    def positions(task, linkage):
+        return task(0.7, linkage)[0]
+
+    return (
+        jax.jacrev(positions, argnums=(0, 1))(task, linkage),
+        fj.tip_jacobian(linkage, positions(task, linkage)),
+    )
+
+
+@pytest.mark.parametrize(
+    "hub, radius",
+    [
+        ([0.0, 0.0], 1.7),  # the bearing of this hub is undefined
+        ([0.3, -0.2], 1.7),
+        ([-1.8, 0.1], 0.7),
+        ([-1.8, 0.1], 0.0),  # a point
+    ],
+)
+def test_the_reference_is_differentiable_in_circle_and_linkage(hub, radius):
+    derivatives, jacobian = reference_derivatives(
+        wrist_circle(hub, radius), wrist_arm("RRR")
+    )
+    for leaf in jax.tree.leaves(derivatives):
+        assert np.isfinite(leaf).all()
+    identity = np.eye(3)[:, :2]  # the tip moves as the centre does
+    np.testing.assert_allclose(jacobian @ derivatives[0].center, identity, atol=1e-11)
+
+
+@pytest.mark.parametrize("excess, refused", [(-1e-6, False), (1e-6, True)])
+def test_circles_out_of_reach_are_refused_to_the_edge(excess, refused):
+    # The RRR arm reaches 4.5 m; the circle touches that edge at one point.
+    linkage = wrist_arm("RRR")
+    task = wrist_circle([3.0 * np.cos(1), 3.0 * np.sin(1)], 1.5 + excess, phase=0.123)
+    ts = np.array([0.0, 20.0])
+    if refused:
+        with pytest.raises(ValueError, match="^reference: expected .* reach .*, got "):
+            task.check(linkage, ts)
+    else:
+        task.check(linkage, ts)

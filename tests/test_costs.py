@@ -1,0 +1,71 @@
+"""What a scene does not use costs nothing: lowered operation counts, which are exact."""
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+import fdof_jax as fj
+from fdof_jax import scenes, simulation
+from fdof_jax.dynamics import at_reference, joint_accelerations, link_constants
+
+
+def flops(function, *arguments):
+    cost = jax.jit(function).lower(*arguments).cost_analysis()
+    return cost["flops"]
+
+
+def transcendentals(function, *arguments):
+    cost = jax.jit(function).lower(*arguments).cost_analysis()
+    return cost.get("transcendentals", 0)
+
+
+def field_arguments(forces):
+    linkage = scenes.fig7().linkage
+    q = jnp.array([0.3, 2.0, -0.4])
+    args = simulation._Args(linkage, q, link_constants(linkage, q), forces)
+    return jnp.array(0.1), (at_reference(q), tuple(q)), args
+
+
+def field_flops(*forces):
+    return flops(simulation._vector_field, *field_arguments(forces))
+
+
+def element_flops(element):
+    linkage = scenes.fig7().linkage
+    q = jnp.array([0.3, 2.0, -0.4])
+    return flops(lambda *a: element(*a), jnp.array(0.1), q, q, linkage)
+
+
+def test_a_scene_without_elements_costs_the_bare_equations():
+    _, (delta, qd), args = field_arguments(())
+    bare = flops(joint_accelerations, args.constants, delta, qd, delta)
+    assert field_flops() == bare
+
+
+@pytest.mark.parametrize(
+    "element",
+    [
+        fj.JointDamper(2.0),
+        fj.JointEffort([1.0, 2.0, 3.0]),
+        scenes.fig7().forces[0],
+    ],
+    ids=["damper", "effort", "PD circle"],
+)
+def test_an_element_adds_its_own_cost_and_three_additions(element):
+    assert field_flops(element) == field_flops() + element_flops(element) + 3
+    damper = fj.JointDamper(1.0)
+    assert field_flops(damper, element) == (
+        field_flops() + element_flops(damper) + element_flops(element) + 6
+    )
+
+
+def test_the_equations_cost_little_and_call_no_transcendental_function():
+    """On CPU sine and cosine are polynomials; a matrix factorisation would show."""
+    assert field_flops() < 450
+    assert transcendentals(simulation._vector_field, *field_arguments(())) == 0
+
+
+def test_the_dynamics_outputs_are_not_stacked():
+    """XLA on CPU would compute the equations once per entry of a stacked output."""
+    jaxpr = jax.make_jaxpr(simulation._vector_field)(*field_arguments(()))
+    assert "concatenate" not in str(jaxpr)

@@ -1,0 +1,98 @@
+"""Gradients of the tracking loss: forward, reverse and central differences agree."""
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import fdof_jax as fj
+from fdof_jax import scenes
+from fdof_jax.control import tip_deviation
+
+TS = np.linspace(0, 1.0, 21)
+
+
+def scene_at(parameters):
+    """Fig 7 as a function of log kp, log kd and log masses, (9,)."""
+    scene = scenes.fig7()
+    controller = scene.forces[0]
+    log_kp, log_kd, log_mass = parameters.reshape(3, 3)
+    controller = eqx.tree_at(
+        lambda c: (c.kp, c.kd),
+        controller,
+        (controller.kp * jnp.exp(log_kp), controller.kd * jnp.exp(log_kd)),
+    )
+    linkage = eqx.tree_at(
+        lambda x: x.mass, scene.linkage, scene.linkage.mass * jnp.exp(log_mass)
+    )
+    return linkage, scene.state0, controller
+
+
+STEPS = {
+    "fixed": dict(stepsize_controller=diffrax.ConstantStepSize(), dt0=1 / 1600),
+    "adaptive": dict(stepsize_controller=diffrax.PIDController(rtol=1e-11, atol=1e-11)),
+}
+
+
+def loss(parameters, steps, adjoint):
+    linkage, state0, controller = scene_at(parameters)
+    solution = fj.simulate(
+        linkage, state0, TS, (controller,), adjoint=adjoint, max_steps=4096, **steps
+    )
+    return jnp.mean(tip_deviation(linkage, controller.reference, solution) ** 2)
+
+
+@pytest.mark.parametrize("kind", STEPS)
+def test_forward_reverse_and_differences_agree(kind):
+    steps = STEPS[kind]
+    # Off the paper's gains: nothing is special about this point.
+    at = jnp.array([0.1, -0.2, 0.3, 0.05, 0.2, -0.1, 0.0, 0.1, -0.1])
+    forward = jax.jit(jax.jacfwd(lambda p: loss(p, steps, diffrax.ForwardMode())))(at)
+    reverse = jax.jit(
+        jax.grad(lambda p: loss(p, steps, diffrax.RecursiveCheckpointAdjoint()))
+    )(at)
+    value = jax.jit(lambda p: loss(p, steps, diffrax.ForwardMode()))
+
+    def difference(direction, h):
+        return float(value(at + h * direction) - value(at - h * direction)) / (2 * h)
+
+    # Two step lengths, extrapolated: the motion saturates, so a long step is coarse
+    # and a short one loses digits.
+    differences = np.array(
+        [(4 * difference(e, 5e-4) - difference(e, 1e-3)) / 3 for e in np.eye(at.size)]
+    )
+    scale = np.abs(forward).max()
+    assert np.abs(forward - reverse).max() <= 1e-10 * scale
+    assert np.abs(forward - differences).max() <= 1e-6 * scale
+
+
+def test_gradient_of_a_batch_is_the_sum_of_the_gradients():
+    def total(mass, starts):
+        linkage = eqx.tree_at(lambda x: x.mass, scenes.fig5().linkage, mass)
+        motion = jax.vmap(
+            lambda q: fj.simulate(linkage, fj.State(q, jnp.zeros(3)), [0, 0.5]).q[-1]
+        )
+        return jnp.sum(motion(starts) ** 2)
+
+    starts = np.array([[0.1, 0.2, 0.3], [-0.5, 0.4, 0.0], [1.0, -1.0, 0.5]])
+    mass = jnp.array([1.0, 1.2, 0.8])
+    together = jax.grad(total)(mass, starts)
+    alone = sum(jax.grad(total)(mass, start[None]) for start in starts)
+    np.testing.assert_allclose(together, alone, rtol=1e-8)
+
+
+def test_gradients_at_rest_and_at_zero_error_are_finite():
+    """Hanging still, on the circle's start, with nothing to correct."""
+    linkage = scenes.fig7().linkage
+    task = fj.CircleTask(center=(-4.0, 2.0), radius=0.5)
+    q = fj.inverse_kinematics(linkage, task.tip(0.0), task.orientation)
+
+    def end(kp, q0):
+        controller = fj.PDController(kp, [80.0, 50.0, 50.0], [jnp.inf] * 3, task)
+        state = fj.State(q0, jnp.zeros(3))
+        return jnp.sum(fj.simulate(linkage, state, [0, 0.1], (controller,)).q[-1])
+
+    gradients = jax.grad(end, argnums=(0, 1))(jnp.array([1500.0, 20000.0, 800.0]), q)
+    assert all(np.isfinite(g).all() for g in gradients)

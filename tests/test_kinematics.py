@@ -1,0 +1,243 @@
+"""Points of the chain, their derivatives, and inverse kinematics as their inverse."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import random_linkage
+
+import fdof_jax as fj
+from fdof_jax.kinematics import mass_center_velocities
+
+SAMPLES = 12
+
+each_topology = pytest.mark.parametrize("topology", fj.TOPOLOGIES)
+
+
+def stack(linkages):
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *linkages)
+
+
+def samples(topology, seed=0):
+    """Random linkages of one topology, stacked, with random motions."""
+    rng = np.random.default_rng(seed)
+    linkages = stack([random_linkage(topology, rng) for _ in range(SAMPLES)])
+    q, qd = rng.uniform(-3, 3, (2, SAMPLES, 3))
+    return linkages, jnp.asarray(q), jnp.asarray(qd)
+
+
+@jax.jit
+def pose(linkage, q):
+    """Tip and orientation, (3,)."""
+    x, _ = fj.to_chain(linkage, q, jnp.zeros(3))
+    return jnp.append(fj.tip_position(linkage, q), x[5])
+
+
+def turns(angle):
+    """Distance of an angle from the nearest whole number of turns."""
+    return np.abs(np.angle(np.exp(1j * np.asarray(angle))))
+
+
+def joint_distance(topology, q, other):
+    """Largest difference of joint positions, of angles modulo whole turns."""
+    difference = np.asarray(q) - np.asarray(other)
+    revolute = np.array([joint == "R" for joint in topology])
+    return np.where(revolute, turns(difference), np.abs(difference)).max(axis=-1)
+
+
+# Forward
+
+
+@each_topology
+def test_points_follow_the_chain_link_by_link(topology):
+    rng = np.random.default_rng(5)
+    for _ in range(3):
+        linkage = random_linkage(topology, rng)
+        q = rng.uniform(-3, 3, 3)
+        length, com, locked = (
+            np.asarray(a) for a in (linkage.length, linkage.com, linkage.locked)
+        )
+        angle, origin = float(linkage.base_angle), np.zeros(2)
+        joints, centers = [], []
+        for k, joint in enumerate(topology):
+            slide, turn = (locked[k], q[k]) if joint == "R" else (q[k], locked[k])
+            along = np.array([np.cos(angle), np.sin(angle)])
+            across = np.array([-np.sin(angle), np.cos(angle)])
+            # origin_{n+1} = origin_n + A_n e_n + B_n ep_n
+            origin = origin + length[k] * along + slide * across
+            angle = angle + turn
+            along = np.array([np.cos(angle), np.sin(angle)])
+            across = np.array([-np.sin(angle), np.cos(angle)])
+            joints.append(origin)
+            centers.append(origin + com[k, 0] * along + com[k, 1] * across)
+        tip = origin + length[3] * along
+        np.testing.assert_allclose(fj.joint_positions(linkage, q), joints, atol=1e-14)
+        np.testing.assert_allclose(fj.mass_centers(linkage, q), centers, atol=1e-14)
+        np.testing.assert_allclose(fj.tip_position(linkage, q), tip, atol=1e-14)
+
+
+@each_topology
+def test_tip_jacobian_is_the_derivative_of_the_pose(topology):
+    linkages, q, _ = samples(topology, 1)
+    jacobian = jax.vmap(fj.tip_jacobian)(linkages, q)
+    derivative = jax.vmap(jax.jacfwd(pose, argnums=1))(linkages, q)
+    np.testing.assert_allclose(jacobian, derivative, atol=1e-13)
+
+
+@each_topology
+def test_mass_center_velocities_are_the_rates_of_mass_centers(topology):
+    linkages, q, qd = samples(topology, 2)
+    velocity, rate = jax.vmap(mass_center_velocities)(linkages, q, qd)
+
+    def positions(linkage, q):
+        x, _ = fj.to_chain(linkage, q, jnp.zeros(3))
+        return fj.mass_centers(linkage, q), x[1::2]
+
+    rates = jax.vmap(lambda k, q, qd: jax.jvp(lambda q: positions(k, q), (q,), (qd,)))
+    _, (expected_velocity, expected_rate) = rates(linkages, q, qd)
+    np.testing.assert_allclose(velocity, expected_velocity, atol=1e-13)
+    np.testing.assert_allclose(rate, expected_rate, atol=1e-13)
+
+
+# Inverse
+
+
+def solution(linkage, target, branch=1):
+    return fj.inverse_kinematics(linkage, target[:2], target[2], branch=branch)
+
+
+@partial(jax.jit, static_argnums=2)
+def solutions(linkages, targets, branch):
+    return jax.vmap(partial(solution, branch=branch))(linkages, targets)
+
+
+@partial(jax.jit, static_argnums=2)
+def derivatives(linkages, targets, branch):
+    """Of the solutions in the poses, and the tip Jacobians there."""
+
+    def one(linkage, target):
+        def q(target):
+            return solution(linkage, target, branch)
+
+        jacobian = fj.tip_jacobian(linkage, q(target))
+        return jax.jacrev(q)(target), jacobian
+
+    return jax.vmap(one)(linkages, targets)
+
+
+@each_topology
+def test_both_branches_reach_the_pose_and_one_is_the_original(topology):
+    linkages, q, _ = samples(topology, 3)
+    target = jax.vmap(pose)(linkages, q)
+    distances = []
+    for branch in (1, -1):
+        found = solutions(linkages, target, branch)
+        reached = jax.vmap(pose)(linkages, found)
+        np.testing.assert_allclose(reached[:, :2], target[:, :2], atol=1e-10)
+        assert turns(reached[:, 2] - target[:, 2]).max() < 1e-10
+        distances.append(joint_distance(topology, found, q))
+    distances = np.array(distances)
+    assert distances.min(axis=0).max() < 1e-7  # a square root near its zero
+    # Two slides make the solution unique; else the branches are different assemblies.
+    two = topology.count("P") < 2
+    assert (
+        (distances.max(axis=0) > 1e-3).mean() > 0.7 if two else distances.max() < 1e-7
+    )
+
+
+@each_topology
+@pytest.mark.parametrize("branch", [1, -1])
+def test_derivatives_of_inverse_kinematics_invert_the_jacobian(topology, branch):
+    linkages, q, _ = samples(topology, 4)
+    target = jax.vmap(pose)(linkages, q)
+    inverse, jacobian = derivatives(linkages, target, branch)
+    identity = np.broadcast_to(np.eye(3), jacobian.shape)
+    np.testing.assert_allclose(jacobian @ inverse, identity, atol=1e-8)
+
+
+def test_gradients_in_the_linkage_leave_a_fixed_pose_fixed():
+    # Stacked topologies: the branches of the other topologies must not leak NaN.
+    rng = np.random.default_rng(6)
+    linkages = stack([random_linkage(t, rng) for t in fj.TOPOLOGIES])
+    q = jnp.asarray(rng.uniform(-3, 3, (7, 3)))
+    target = jax.vmap(pose)(linkages, q)
+
+    def reached(linkage, target):
+        q = solution(linkage, target)
+        return jnp.sum(pose(linkage, q) * jnp.array([1.0, 2, 3]))
+
+    gradients = jax.jit(jax.vmap(jax.grad(reached)))(linkages, target)
+    for leaf in jax.tree.leaves(gradients):
+        np.testing.assert_allclose(leaf, np.zeros_like(leaf), atol=1e-9)
+
+
+def test_inverse_kinematics_of_the_arm_of_figure_7():
+    linkage = fj.scenes.fig7().linkage
+    q = fj.inverse_kinematics(linkage, [-5, 2], np.pi / 2)
+    np.testing.assert_allclose(q, [np.pi / 2, 2.5, -np.pi / 2], atol=1e-15)
+
+
+@pytest.mark.parametrize("branch", [1, -1])
+@pytest.mark.parametrize(
+    "topology, inside, path",
+    [
+        ("RRR", -1, lambda s: [s * np.cos(1), s * np.sin(1)]),  # arm outstretched
+        ("RPR", 1, lambda s: [s * np.cos(1), s * np.sin(1)]),  # within its own offset
+        ("PRR", -1, lambda s: [s, 0.3]),  # link 3 level
+        (
+            "RRP",
+            -1,
+            lambda s: [s * np.cos(0.2), s * np.sin(0.2)],
+        ),  # link 2 along link 3
+    ],
+)
+def test_out_of_reach_is_refused_or_nan(topology, inside, path, branch):
+    linkage = fj.Linkage(
+        topology, length=[0, 1, 1, 0], com=[[0.5, 0]] * 3, mass=[1] * 3, inertia=[1] * 3
+    )
+    edge = 2  # the two lengths together
+    traced = jax.jit(
+        lambda tip: fj.inverse_kinematics(linkage, tip, 0.2, branch=branch)
+    )
+    reachable = path(edge + 1e-6 * inside)
+    q = fj.inverse_kinematics(linkage, reachable, 0.2, branch=branch)
+    np.testing.assert_allclose(fj.tip_position(linkage, q), reachable, atol=1e-12)
+    np.testing.assert_allclose(traced(jnp.asarray(reachable)), q, atol=1e-12)
+    beyond = path(edge - 1e-6 * inside)
+    with pytest.raises(ValueError, match=r"^tip: expected .* within reach .*, got \["):
+        fj.inverse_kinematics(linkage, beyond, 0.2, branch=branch)
+    assert np.isnan(traced(jnp.asarray(beyond))).any()
+
+
+@pytest.mark.parametrize("base_angle", [0.0, 0.3, np.pi])
+@pytest.mark.parametrize("lock", [0.0, np.pi])
+@pytest.mark.parametrize("topology", ["PPR", "RPP", "PRP"])
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_parallel_slides_reach_no_given_point(topology, lock, base_angle):
+    linkage = fj.Linkage(
+        topology,
+        length=[0, 1, 1, 1],
+        com=[[0.5, 0]] * 3,
+        mass=[1] * 3,
+        inertia=[1] * 3,
+        locked={"PPR": [lock, 0, 0], "RPP": [0, lock, 0.3], "PRP": [0, 0, 0]}[topology],
+        base_angle=base_angle,
+    )
+    # The slides of PRP are parallel if the tip keeps the direction of the ground.
+    orientation = base_angle + lock if topology == "PRP" else 0.2
+    with pytest.raises(ValueError, match="^tip: expected .* within reach"):
+        fj.inverse_kinematics(linkage, [0.5, 0.7], orientation)
+
+
+def test_lists_and_integers_are_accepted():
+    linkage = fj.scenes.fig5().linkage
+    for function in (fj.joint_positions, fj.mass_centers, fj.tip_position):
+        np.testing.assert_array_equal(
+            function(linkage, [0, 1, 2]), function(linkage, jnp.array([0.0, 1, 2]))
+        )
+    tip = fj.inverse_kinematics(linkage, (1, 1), 0)
+    np.testing.assert_array_equal(
+        tip, fj.inverse_kinematics(linkage, jnp.ones(2), jnp.asarray(0.0))
+    )
