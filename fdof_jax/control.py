@@ -219,7 +219,7 @@ def saturated(
     demand = jax.vmap(controller.demand, in_axes=(0, 0, 0, None))(
         solution.ts, solution.q, solution.qd, linkage
     )
-    return jnp.abs(demand) > controller.limit
+    return jnp.abs(demand) > controller.limit[None]
 
 
 @eqx.filter_jit

@@ -11,7 +11,6 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 from jaxtyping import Float
@@ -52,31 +51,22 @@ _STYLES: dict[str, dict[str, Any]] = {
 
 
 class Geometry(NamedTuple):
-    """A linkage at all samples: its points (time, link) as complex numbers.
+    """A linkage at all samples; points of the plane are complex numbers.
 
-    Link n runs from `start` along A_n to `end`; `direction` is e_n. The next link
-    starts at end + B_n ep_n. The last `end` is the tip.
+    Link n runs from where joint n - 1 puts it along A_n to its `end`; the end of link 4
+    is the tip.
     """
 
-    chain: np.ndarray  # B1, th2, B2, th3, B3, th4: (time, 6)
-    revolute: np.ndarray  # or prismatic, each real joint
-    direction: np.ndarray
-    start: np.ndarray
-    end: np.ndarray
-    foot: np.ndarray  # of each moving link's mass centre on the line of A_n
-    center: np.ndarray
+    angle: np.ndarray  # th_1 to th_4 [rad]: (time, 4)
+    slide: np.ndarray  # B_1 to B_3 [m]: (time, 3)
+    revolute: np.ndarray  # whether each real joint is: (3,)
+    end: np.ndarray  # (time, 4)
+    points: dict[str, np.ndarray]  # of all to draw, by name in that order: (time, n)
 
 
 def refuse(name: str, expected: str, got: Any) -> ValueError:
     """The error to raise for a malformed argument."""
     return ValueError(f"{name}: expected {expected}, got {got!r}.")
-
-
-def one_linkage(linkage: Any, name: str = "linkage") -> Linkage:
-    """`linkage` if it is one, not a batch, else ValueError."""
-    if not isinstance(linkage, Linkage) or np.shape(linkage.ef) != (6,):
-        raise refuse(name, "one Linkage", linkage)
-    return linkage
 
 
 def reached(solution: Any, name: str = "solution") -> list[np.ndarray]:
@@ -152,47 +142,44 @@ def legend(ax: Axes, *others: Axes) -> None:
 
 def geometry(linkage: Linkage, q: np.ndarray) -> Geometry:
     """Where a linkage is at joint positions (time, 3)."""
-    chain = jax.vmap(lambda q: to_chain(linkage, q, jnp.zeros(3))[0])
-    x = np.asarray(chain(jnp.asarray(q)))
-    base = np.full(len(x), linkage.base_angle)
-    direction = np.exp(1j * np.column_stack([base, x[:, 1::2]]))
+    x = np.asarray(jax.vmap(lambda q: to_chain(linkage, q, np.zeros(3))[0])(q))
+    angle = np.column_stack([np.full(len(x), linkage.base_angle), x[:, 1::2]])
+    slide = x[:, 0::2]
+    direction = np.exp(1j * angle)
     along = np.asarray(linkage.length) * direction
-    steps = along[:, :3] + 1j * x[:, 0::2] * direction[:, :3]
+    steps = along[:, :3] + 1j * slide * direction[:, :3]
     start = np.cumsum(np.column_stack([np.zeros(len(x)), steps]), axis=1)
+    end = start + along
     com = np.asarray(linkage.com)
-    foot = start[:, 1:] + com[:, 0] * direction[:, 1:]
+    foot = start[:, 1:] + com[:, 0] * direction[:, 1:]  # of the mass centre on A_n
     center = foot + 1j * com[:, 1] * direction[:, 1:]
     revolute = np.asarray(linkage.ef)[1::2] > 0.5
-    return Geometry(x, revolute, direction, start, start + along, foot, center)
 
-
-def _shapes(g: Geometry, i: int) -> dict[str, np.ndarray]:
-    """What is drawn of sample `i`: its points by name, in drawing order."""
-    shapes = {}
+    points = {}
     for n in range(4):
-        points = [g.start[i, n], g.end[i, n]]
-        if n < 3 and g.revolute[n]:
-            points.append(g.start[i, n + 1])  # across by the fixed B_n
+        link = [start[:, n], end[:, n]]
+        if n < 3 and revolute[n]:
+            link.append(start[:, n + 1])  # across by the fixed B_n
         elif n < 3:
-            shapes[f"rail {n + 1}"] = np.array([g.end[i, n], g.start[i, n + 1]])
-        shapes[f"link {n + 1}"] = np.array(points)
+            points[f"rail {n + 1}"] = np.column_stack([end[:, n], start[:, n + 1]])
+        points[f"link {n + 1}"] = np.column_stack(link)
     for n in range(3):
-        shapes[f"mass {n + 2}"] = np.array([g.foot[i, n], g.center[i, n]])
+        points[f"mass {n + 2}"] = np.column_stack([foot[:, n], center[:, n]])
     for n in range(3):
-        kind = "pin" if g.revolute[n] else "slider"
-        shapes[f"{kind} {n + 1}"] = g.start[i, n + 1 : n + 2]
-    return shapes | {"tip 4": g.end[i, 3:]}
+        kind = "pin" if revolute[n] else "slider"
+        points[f"{kind} {n + 1}"] = start[:, n + 1 : n + 2]
+    points["tip 4"] = end[:, 3:]
+    return Geometry(angle, slide, revolute, end, points)
 
 
 def _place(lines: dict[str, Line2D], g: Geometry, i: int) -> None:
     """Move the lines to sample `i`."""
-    for name, points in _shapes(g, i).items():
-        if name in lines:
-            lines[name].set_data(*xy(points))
-            if name.startswith("slider"):
-                across = 1j * g.direction[i, int(name[-1]) - 1]
-                marker = MarkerStyle(_CARRIAGE).rotated(rad=np.angle(across))
-                lines[name].set_marker(marker)  # type: ignore[arg-type]
+    for name, line in lines.items():
+        line.set_data(*xy(g.points[name][i]))
+        if name.startswith("slider"):
+            across = g.angle[i, int(name[-1]) - 1] + np.pi / 2
+            marker = MarkerStyle(_CARRIAGE).rotated(rad=across)
+            line.set_marker(marker)  # type: ignore[arg-type]
 
 
 def _draw(
@@ -206,12 +193,12 @@ def _draw(
 ) -> dict[str, Line2D]:
     """Lines of sample `i` by name, which is also their `gid`."""
     lines = {}
-    for name, points in _shapes(g, i).items():
+    for name, points in g.points.items():
         kind, number = name.split()
         if kind == "mass" and not mass_centers:
             continue
         own = BLACK if kind == "pin" else _LINKS[int(number) - 1]
-        (lines[name],) = ax.plot(*xy(points), alpha=alpha, gid=name)
+        (lines[name],) = ax.plot(*xy(points[i]), alpha=alpha, gid=name)
         lines[name].set(color=own if color is None else color, **_STYLES[kind])
         if name == "link 1":
             lines[name].set_linewidth(1.2)
@@ -262,8 +249,8 @@ def draw_linkage(
 
     **Raises:** ValueError for malformed arguments.
     """
-    g = geometry(one_linkage(linkage), np.asarray(real_array("q", q, (3,)))[None])
-    ax = plane_axes(ax, np.concatenate(list(_shapes(g, 0).values())))
+    g = geometry(linkage, np.asarray(real_array("q", q, (3,)))[None])
+    ax = plane_axes(ax, np.hstack(list(g.points.values())))
     _draw_ground(ax)
     _draw(ax, g, 0, mass_centers, alpha, color)
     return ax
@@ -290,7 +277,8 @@ def chrono_cyclograph(
 
     **Raises:** ValueError for malformed arguments and for an `until` before the start.
     """
-    linkage, (ts, q, _) = one_linkage(linkage), reached(solution)
+    ts, q, _ = reached(solution)
+    g = geometry(linkage, q)
     step = float(real_array("every", every, (), above=0))
     last = ts[-1]
     if until is not None:
@@ -298,7 +286,6 @@ def chrono_cyclograph(
     # The excess keeps the last step where the division falls short by rounding.
     steps = np.arange(np.floor((last - ts[0]) / step + 1e-6) + 1)
     indices = np.unique([np.abs(ts - t).argmin() for t in ts[0] + step * steps])
-    g = geometry(linkage, q)
     ax = plane_axes(ax, g.end[: indices[-1] + 1])
     _draw_motion(ax, g, indices, mass_centers)
     legend(ax)
@@ -325,11 +312,11 @@ def topology_grid(
     geometries = {}
     for title, pair in motions.items():
         name = f"motions[{title!r}]"
-        if not isinstance(pair, tuple) or len(pair) != 2:
+        fits = isinstance(pair, tuple) and len(pair) == 2
+        if not (fits and isinstance(pair[0], Linkage)):
             raise refuse(name, "(Linkage, Solution)", pair)
-        geometries[title] = geometry(
-            one_linkage(pair[0], name), reached(pair[1], name)[1]
-        )
+        _, q, _ = reached(pair[1], name)
+        geometries[title] = geometry(pair[0], q)
     columns = min(4, len(motions))
     rows = -(-len(motions) // columns)
     fig = figure_or_new(fig, 0.3 + 1.75 * columns, 0.4 + 1.9 * rows)
@@ -367,15 +354,14 @@ def animate(
 
     **Raises:** ValueError for malformed arguments.
     """
-    linkage, (ts, q, _) = one_linkage(linkage), reached(solution)
+    ts, q, _ = reached(solution)
+    g = geometry(linkage, q)
     fps = float(real_array("fps", fps, (), above=0))
     duration = (ts[-1] - ts[0]) / float(real_array("speed", speed, (), above=0))
     frames = min(_count("max_frames", max_frames, 1), int(np.ceil(duration * fps)) + 1)
     samples = [np.abs(ts - t).argmin() for t in np.linspace(ts[0], ts[-1], frames)]
 
-    g = geometry(linkage, q)
-    path = g.end[:, 3]
-    points = np.column_stack([g.start, g.end, g.center])
+    points = np.hstack(list(g.points.values()))
     given, ax = ax, plane_axes(ax, points)
     _draw_ground(ax)
     (trace,) = ax.plot(*xy(points), color=GREY, lw=1, gid="tip path")
@@ -386,7 +372,7 @@ def animate(
     def show(frame: int) -> list[Line2D]:
         i = samples[frame]
         _place(lines, g, i)
-        trace.set_data(*xy(path[: i + 1]))
+        trace.set_data(*xy(g.end[: i + 1, 3]))
         ax.set_title(f"t = {ts[i]:.2f} s", fontsize="medium")
         return [*lines.values(), trace]
 

@@ -23,7 +23,6 @@ from .drawing import (
     filled_mapping,
     geometry,
     legend,
-    one_linkage,
     plane_axes,
     reached,
     refuse,
@@ -59,14 +58,14 @@ def motion_profile(
     **Raises:** ValueError for malformed arguments.
     """
     ts, q, _ = reached(solution)
-    g = geometry(one_linkage(linkage), q)
+    g = geometry(linkage, q)
     angles, slides = [], []
     for k, revolute in enumerate(g.revolute):
         if revolute:
-            degrees = np.rad2deg(g.chain[:, 2 * k + 1])
+            degrees = np.rad2deg(g.angle[:, k + 1])
             angles.append((rf"$\theta_{k + 2}$", degrees, SERIES[k]))
         else:
-            slides.append((f"$B_{k + 1}$", g.chain[:, 2 * k], SERIES[k]))
+            slides.append((f"$B_{k + 1}$", g.slide[:, k], SERIES[k]))
     panels = [("angle [degrees]", angles), ("slide [m]", slides)][: 1 + bool(slides)]
     fig = figure_or_new(fig, 3.5, 0.6 + 1.9 * len(panels))
     for ax in _time_panels(fig, ts, panels):
@@ -83,7 +82,7 @@ def energy_profile(
 
     **Raises:** ValueError for malformed arguments.
     """
-    linkage, (ts, q, qd) = one_linkage(linkage), reached(solution)
+    ts, q, qd = reached(solution)
     energies = jax.vmap(lambda q, qd: link_energies(linkage, q, qd))(q, qd)
     kinetic, potential = (np.asarray(each) for each in energies)
     names = "link 2", "link 3", "link 4"
@@ -117,7 +116,7 @@ def effort_profile(
     **Raises:** ValueError for malformed arguments.
     """
     reached(solution)
-    efforts = joint_efforts(one_linkage(linkage), forces, solution)
+    efforts = joint_efforts(linkage, forces, solution)
     ts, total, elements = (np.asarray(a) for a in (solution.ts, *efforts))
     units = np.where(np.asarray(linkage.ef)[1::2] > 0.5, "N m", "N")
     panels = []
@@ -152,7 +151,7 @@ def _tips(linkage: Any, task: Any, solutions: Any) -> list[tuple]:
     for label, solution in filled_mapping("solutions", solutions, "Solution").items():
         ts, q, _ = reached(solution, f"solutions[{label!r}]")
         commanded = np.asarray(jax.vmap(task.tip)(jnp.asarray(ts))) @ [1, 1j]
-        actual = geometry(one_linkage(linkage), q).end[:, 3]
+        actual = geometry(linkage, q).end[:, 3]
         color = SERIES[len(curves) % len(SERIES)]
         curves.append((str(label), color, ts, commanded, actual))
     return curves

@@ -44,8 +44,11 @@ class Solution(eqx.Module):
 
 
 class Efforts(NamedTuple):
-    """Joint efforts along a motion [N or N m]: their sum (time, 3), and those of each
-    force element (element, time, 3)."""
+    """Joint efforts along a motion [N or N m].
+
+    - `total`: their sum (time, 3).
+    - `elements`: those of each force element (element, time, 3).
+    """
 
     total: Float[Array, "time joint"]
     elements: Float[Array, "element time joint"]

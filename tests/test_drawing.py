@@ -1,0 +1,216 @@
+"""Pictures show the linkage where it is, not pixels; helpers for tests of figures."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import matplotlib
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from fdof_jax import (
+    TOPOLOGIES,
+    Linkage,
+    Solution,
+    drawing,
+    joint_positions,
+    mass_centers,
+    tip_position,
+)
+
+matplotlib.use("Agg")
+
+
+@pytest.fixture(autouse=True)
+def tidy():
+    """No figure outlives its test, and no function changes global settings."""
+    before = dict(matplotlib.rcParams)
+    yield
+    plt.close("all")
+    assert dict(matplotlib.rcParams) == before
+
+
+def make_linkage(topology):
+    return Linkage(
+        topology,
+        length=[0.3, 1, 0.8, 0.6],
+        com=[[0.5, 0.1], [0.4, -0.2], [0.3, 0]],
+        mass=[2, 1, 1],
+        inertia=[0.1, 0.1, 0.1],
+        locked=[0.2 if kind == "R" else 0.7 for kind in topology],
+        base_angle=0.4,
+    )
+
+
+def made_up(ts, q, qd=None) -> Solution:
+    """A solution without a solve: a figure takes only times and joint states."""
+    q = jnp.asarray(q, dtype=float)
+    qd = jnp.zeros_like(q) if qd is None else jnp.asarray(qd, dtype=float)
+    return Solution(jnp.asarray(ts, dtype=float), q, qd, {}, None)  # type: ignore[arg-type]
+
+
+def swinging(count=101, end=1.0) -> Solution:
+    ts = np.linspace(0, end, count)
+    q = np.stack([0.3 + 0.1 * ts, 0.4 + 0.2 * np.sin(ts), 0.5 - 0.3 * ts], axis=1)
+    return made_up(ts, q, np.gradient(q, ts, axis=0))
+
+
+def lines(ax: Axes) -> dict[Any, Any]:
+    return {line.get_gid(): line for line in ax.lines if line.get_gid()}
+
+
+def labels(ax: Axes) -> list[str]:
+    legend = ax.get_legend()
+    assert legend is not None
+    return [text.get_text() for text in legend.get_texts()]
+
+
+def named(ax: Axes, name: str) -> list[Any]:
+    return [line for line in ax.lines if line.get_gid() == name]
+
+
+@pytest.mark.parametrize("topology", TOPOLOGIES)
+def test_linkage_is_drawn_where_kinematics_puts_it(topology):
+    linkage, q = make_linkage(topology), np.array([0.3, 0.4, -0.5])
+    drawn = lines(drawing.draw_linkage(linkage, q))
+    joints, centers = joint_positions(linkage, q), mass_centers(linkage, q)
+    ends = [*joints, tip_position(linkage, q)]
+    for k, kind in enumerate(topology):
+        name, other = ("pin", "slider") if kind == "R" else ("slider", "pin")
+        at = drawn[f"{name} {k + 1}"].get_xydata()
+        np.testing.assert_allclose(at, [joints[k]], atol=1e-12)
+        assert f"{other} {k + 1}" not in drawn
+        assert (f"rail {k + 1}" in drawn) == (kind == "P")
+        link, bone = drawn[f"link {k + 2}"].get_xydata(), linkage.length[k + 1]
+        np.testing.assert_allclose(link[0], joints[k], atol=1e-12)
+        np.testing.assert_allclose(np.linalg.norm(link[1] - link[0]), bone)
+        # The fixed offset belongs to the link, the slide to the rail.
+        rail = drawn.get(f"rail {k + 2}", drawn[f"link {k + 2}"])
+        np.testing.assert_allclose(rail.get_xydata()[-1], ends[k + 1], atol=1e-12)
+        dot = drawn[f"mass {k + 2}"].get_xydata()[-1]
+        np.testing.assert_allclose(dot, centers[k], atol=1e-12)
+    np.testing.assert_allclose(drawn["tip 4"].get_xydata(), [ends[-1]], atol=1e-12)
+
+
+def test_slides_stand_across_their_link():
+    drawn = lines(drawing.draw_linkage(make_linkage("RPR"), [0.3, 0.4, -0.5]))
+    along = np.diff(drawn["link 2"].get_xydata(), axis=0)[0]
+    rail = np.diff(drawn["rail 2"].get_xydata(), axis=0)[0]
+    np.testing.assert_allclose(rail, 0.4 * np.array([-along[1], along[0]]), atol=1e-12)
+    turn = drawn["slider 2"]._marker.get_user_transform().get_matrix()
+    np.testing.assert_allclose(turn[:2, 0], rail / 0.4, atol=1e-12)
+
+
+def test_linkage_options():
+    ax = plt.subplots()[1]
+    linkage = make_linkage("RRP")
+    ax.scatter([5], [9])
+    same = drawing.draw_linkage(
+        linkage, [0, 0, 0.1], ax, color="red", alpha=0.5, mass_centers=False
+    )
+    assert same is ax
+    assert ax.get_xlim()[1] > 5 and ax.get_ylim()[1] > 9  # what was there stays in view
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("x [m]", "y [m]")
+    assert ax.get_aspect() == 1
+    drawn = lines(ax)
+    assert not [name for name in drawn if name.startswith("mass")]
+    assert {drawn[f"link {n}"].get_color() for n in (2, 3, 4)} == {"red"}
+    assert drawn["link 2"].get_alpha() == 0.5
+
+
+def test_chrono_cyclograph_takes_the_nearest_samples():
+    linkage, solution = make_linkage("RPR"), swinging()
+    ax = drawing.chrono_cyclograph(linkage, solution, every=0.1, until=0.3)
+    tips = named(ax, "tip 4")
+    assert len(tips) == 4
+    for line, sample in zip(tips, (0, 10, 20, 30)):
+        expected = tip_position(linkage, solution.q[sample])
+        np.testing.assert_allclose(line.get_xydata(), [expected], atol=1e-12)
+    alphas = [line.get_alpha() for line in tips]
+    assert alphas == sorted(alphas) and alphas[-1] == 1
+    assert len(lines(ax)["tip path"].get_xydata()) == 31
+    assert labels(ax) == ["tip path", "link 2", "link 3", "link 4"]
+
+
+@pytest.mark.parametrize("until, count", [(None, 11), (5.0, 11), (0.0, 1)])
+def test_chrono_cyclograph_ends(until, count):
+    ax = drawing.chrono_cyclograph(make_linkage("RRR"), swinging(), until=until)
+    assert len(named(ax, "tip 4")) == count
+
+
+def test_what_a_failed_solve_did_not_reach_is_left_out():
+    solution = swinging()
+    solution = eqx.tree_at(lambda s: s.q, solution, solution.q.at[51:].set(jnp.nan))
+    ax = drawing.chrono_cyclograph(make_linkage("RRR"), solution)
+    assert len(named(ax, "tip 4")) == 6
+
+
+def test_topology_grid_has_a_panel_for_each():
+    motions = {name: (make_linkage(name), swinging(11)) for name in TOPOLOGIES}
+    fig = drawing.topology_grid(motions, configurations=2)
+    assert isinstance(fig, Figure)
+    assert [ax.get_title() for ax in fig.axes] == list(TOPOLOGIES)
+    assert (fig.get_supxlabel(), fig.get_supylabel()) == ("x [m]", "y [m]")
+    for ax in fig.axes:
+        assert len(named(ax, "tip 4")) == 2
+
+
+def test_animation_is_capped_and_moves(tmp_path):
+    linkage, solution = make_linkage("RPR"), swinging()
+    animation = drawing.animate(linkage, solution, max_frames=3)
+    animation.save(tmp_path / "motion.gif", writer="pillow", dpi=40)
+    assert (tmp_path / "motion.gif").stat().st_size > 0
+    assert list(animation.new_frame_seq()) == [0, 1, 2]
+    (ax,) = plt.gcf().axes
+    assert ax.get_title() == "t = 1.00 s"
+    drawn = lines(ax)
+    left, right, bottom, top = ax.axis()
+    path = drawn["tip path"].get_xydata()
+    assert ((path > [left, bottom]) & (path < [right, top])).all()
+    expected = tip_position(linkage, solution.q[-1])
+    np.testing.assert_allclose(drawn["tip 4"].get_xydata(), [expected], atol=1e-12)
+    assert len(path) == 101
+
+
+@pytest.mark.parametrize("speed, frames", [(1.0, 26), (0.5, 51), (2.0, 14)])
+def test_animation_keeps_time(speed, frames):
+    ax = plt.subplots()[1]
+    animation = drawing.animate(make_linkage("RRR"), swinging(), ax, speed=speed)
+    assert len(list(animation.new_frame_seq())) == frames
+    html = animation.to_jshtml(embed_frames=True) if speed == 2 else ""
+    assert (html.count("data:image/png") >= frames) == (speed == 2)
+    animation._draw_was_started = True  # type: ignore[attr-defined]
+
+
+LINKAGE, SOLUTION = make_linkage("RRR"), swinging(5)
+BATCH = made_up(SOLUTION.ts, jnp.stack([SOLUTION.q] * 2))
+NOWHERE = made_up(SOLUTION.ts, SOLUTION.q * jnp.nan)
+
+
+@pytest.mark.parametrize(
+    "name, call",
+    [
+        ("linkage", lambda: drawing.draw_linkage("RRR", [0, 0, 0])),  # type: ignore
+        ("q", lambda: drawing.draw_linkage(LINKAGE, [0, 0])),
+        ("ax", lambda: drawing.draw_linkage(LINKAGE, [0, 0, 0], 3)),  # type: ignore
+        ("solution", lambda: drawing.animate(LINKAGE, BATCH)),
+        ("solution", lambda: drawing.chrono_cyclograph(LINKAGE, NOWHERE)),
+        ("every", lambda: drawing.chrono_cyclograph(LINKAGE, SOLUTION, every=0)),
+        ("until", lambda: drawing.chrono_cyclograph(LINKAGE, SOLUTION, until=-1)),
+        ("motions", lambda: drawing.topology_grid({})),
+        (r"motions\['a'\]", lambda: drawing.topology_grid({"a": SOLUTION})),  # type: ignore
+        (r"motions\['a'\]", lambda: drawing.topology_grid({"a": ("RRR", SOLUTION)})),  # type: ignore
+        ("configurations", lambda: drawing.topology_grid(
+            {"a": (LINKAGE, SOLUTION)}, configurations=1)),
+        ("max_frames", lambda: drawing.animate(LINKAGE, SOLUTION, max_frames=0)),
+        ("fps", lambda: drawing.animate(LINKAGE, SOLUTION, fps=0)),
+        ("speed", lambda: drawing.animate(LINKAGE, SOLUTION, speed=-1)),
+    ],
+)  # fmt: skip
+def test_malformed_arguments_are_named(name, call):
+    with pytest.raises(ValueError, match=f"^{name}: expected"):
+        call()
+    assert not plt.get_fignums()

@@ -1,0 +1,76 @@
+"""Single precision, in a process of its own: the tests' own one has x64 on."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+PROGRAM = """
+import warnings
+import diffrax, jax, numpy as np
+import fdof_jax as fj
+from helpers import SCENES, load, relative_error, to_joint
+
+assert not jax.config.jax_enable_x64
+ordinary = [name for name in SCENES if not name.startswith("hard")]
+for name in ordinary:
+    scene, r = SCENES[name], load(name)
+    masked = fj.masked_accelerations(r.linkage, r.x, r.xd, r.force)
+    assert masked.dtype == np.float32
+    assert relative_error(masked, scene["acc0"]) <= 1e-5, name
+    exact = to_joint(scene, [float(a) for a in scene["acc0_str"]])
+    reduced = fj.forward_dynamics(r.linkage, *r.state0, r.tau)
+    assert relative_error(reduced, exact) <= 1e-5, name
+    times = [s["t"] for s in scene["states"] if s["t"] <= 2]
+    solution = fj.simulate(r.linkage, r.state0, [0, *times], r.forces)
+    assert solution.q.dtype == np.float32
+    for i, state in enumerate(scene["states"][: len(times)], start=1):
+        x, xd = fj.to_chain(r.linkage, solution.q[i], solution.qd[i])
+        assert relative_error(x, state["q"]) <= 1e-4, (name, state["t"])
+        assert relative_error(xd, state["v"]) <= 1e-4, (name, state["t"])
+
+scene = fj.scenes.fig5()
+with warnings.catch_warnings(record=True) as caught:
+    warnings.simplefilter("always")
+    controller = diffrax.PIDController(rtol=1e-8, atol=1e-6)
+    fj.simulate(
+        scene.linkage, scene.state0, [0, 0.1], stepsize_controller=controller,
+        throw=False,
+    )
+assert any("rtol=1e-08 cannot be met in float32" in str(w.message) for w in caught)
+print("float32 holds on", len(ordinary), "scenes")
+"""
+
+
+def run(program):
+    environment = os.environ | {
+        "JAX_ENABLE_X64": "0",
+        "PYTHONPATH": str(Path(__file__).parent),
+    }
+    return subprocess.run(
+        [sys.executable, "-c", program],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def test_single_precision():
+    result = run(PROGRAM)
+    assert result.returncode == 0, result.stderr[-3000:]
+    assert "holds on 17 scenes" in result.stdout
+
+
+@pytest.mark.parametrize("package", ["matplotlib", "scipy.optimize", "mujoco"])
+def test_import_has_no_side_effects(package):
+    program = f"""
+import jax, sys
+import fdof_jax
+assert not jax.config.jax_enable_x64
+assert {package!r} not in sys.modules, "imported"
+"""
+    result = run(program)
+    assert result.returncode == 0, result.stderr[-2000:]
