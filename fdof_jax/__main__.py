@@ -65,7 +65,11 @@ def _say(text: str) -> None:
 
 def _print_circle(run: showcase.CircleRun) -> None:
     before, after = run.before, run.after
-    joints = ("T2 [N m]", "F2 [N]", "T4 [N m]")
+    joints = "T2", "F2", "T4"
+    kp_units, kd_units = (
+        ("N m/rad", "N/m", "N m/rad"),
+        ("N m s/rad", "N s/m", "N m s/rad"),
+    )
     rows = [
         ("tip error, whole run: rms [mm]", 1e3 * before.rms, 1e3 * after.rms),
         ("  largest [mm]", 1e3 * before.largest, 1e3 * after.largest),
@@ -73,12 +77,12 @@ def _print_circle(run: showcase.CircleRun) -> None:
         ("  largest [mm]", 1e3 * before.largest_second, 1e3 * after.largest_second),
     ]
     for k, joint in enumerate(joints):
-        rows.append((f"kp of {joint}", before.kp[k], after.kp[k]))
+        rows.append((f"kp of {joint} [{kp_units[k]}]", before.kp[k], after.kp[k]))
     for k, joint in enumerate(joints):
-        rows.append((f"kd of {joint}", before.kd[k], after.kd[k]))
+        rows.append((f"kd of {joint} [{kd_units[k]}]", before.kd[k], after.kd[k]))
     for k, joint in enumerate(joints):
         share = 100 * before.saturated[k], 100 * after.saturated[k]
-        rows.append((f"time at the limit of {joint.split()[0]} [%]", *share))
+        rows.append((f"time at the limit of {joint} [%]", *share))
     print(f"\n{'':34}{'paper':>12}{'tuned':>12}")
     for label, first, second in rows:
         print(f"{label:34}{first:12.5g}{second:12.5g}")

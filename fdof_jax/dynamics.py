@@ -217,6 +217,8 @@ def _equations(c: Constants, delta: Scalars, qd: Scalars) -> _Equations:
     )
 
 
+# Compiled on its own so that it is traced once, not at each of a solve's uses of it.
+@jax.jit
 def _accelerations(c: Constants, delta: Scalars, qd: Scalars, tau: Scalars) -> Scalars:
     m = _equations(c, delta, qd)
     f1, f2, f3 = (t - b for t, b in zip(tau, m.bias))

@@ -80,6 +80,7 @@ def _vector_field(t: Any, y: tuple[Scalars, Scalars], args: _Args):
     return qd, joint_accelerations(args.constants, delta, qd, tau)
 
 
+@eqx.filter_jit  # traced once, not at each use by a solver
 def element_effort(
     index: int, element: Any, t: Array, q: Array, qd: Array, linkage: Linkage
 ) -> Array:

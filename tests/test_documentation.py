@@ -52,7 +52,8 @@ def test_docstring(name):
 
 def test_the_front_door_is_complete():
     names = """TOPOLOGIES existence_factors Linkage State to_chain from_chain
-    mass_matrix bias_force masked_accelerations constraint_forces forward_dynamics inverse_dynamics
+    mass_matrix bias_force masked_accelerations constraint_forces forward_dynamics
+    inverse_dynamics
     energy link_energies joint_positions mass_centers tip_position tip_jacobian
     inverse_kinematics JointDamper JointEffort PDController CircleTask simulate Solution
     joint_efforts to_mjcf Scene scenes tune TuneResult __version__""".split()
