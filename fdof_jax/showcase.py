@@ -157,11 +157,11 @@ _COMMON_BASE = np.pi / 2
 _COMMON_START = np.array([0.0, 0.6, 0.4, -0.4, 0.3, -1.3])
 
 
-def topology_scenes(t1: float = 3.0) -> dict[str, Scene]:
+def topology_scenes(t1: float = 2.0) -> dict[str, Scene]:
     """One arm in all seven topologies, starting at rest in the same configuration.
 
-    Links of 1 m, 0.8 m and 0.5 m under gravity, lightly damped; what differs is which
-    joint of each pair is real.
+    Links of 1 m, 0.8 m and 0.5 m under gravity; what differs is which joint of each
+    pair is real. Slides are damped more than turns, or they would fall out of sight.
     """
     result = {}
     for topology in TOPOLOGIES:
@@ -177,7 +177,8 @@ def topology_scenes(t1: float = 3.0) -> dict[str, Scene]:
             locked=locked,
             base_angle=_COMMON_BASE,
         )
-        result[topology] = Scene(linkage, state0, (JointDamper(3.0),), t1)
+        damper = JointDamper([{"R": 1.0, "P": 30.0}[joint] for joint in topology])
+        result[topology] = Scene(linkage, state0, (damper,), t1)
     return result
 
 
