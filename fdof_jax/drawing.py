@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 import jax
 import matplotlib.pyplot as plt
 import numpy as np
-from jaxtyping import Float
 from matplotlib.animation import FuncAnimation
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -226,7 +225,7 @@ def _draw_motion(
 
 def draw_linkage(
     linkage: Linkage,
-    q: Float[ArrayLike, " joint"],
+    q: ArrayLike,
     ax: Axes | None = None,
     *,
     color: Any = None,

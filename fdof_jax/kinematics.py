@@ -238,7 +238,7 @@ def solve_joints(
 
 def inverse_kinematics(
     linkage: Linkage,
-    tip: Float[ArrayLike, " 2"],
+    tip: ArrayLike,
     orientation: ArrayLike,
     *,
     branch: int = 1,

@@ -234,8 +234,8 @@ def to_chain(
 
 def from_chain(
     topology: str | ArrayLike,
-    x: Float[ArrayLike, " 6"],
-    xd: Float[ArrayLike, " 6"],
+    x: ArrayLike,
+    xd: ArrayLike,
     base_angle: ArrayLike = 0.0,
 ) -> tuple[Float[Array, " 3"], State]:
     """Locked positions and joint state, from the paper's lists of initial conditions.
