@@ -19,6 +19,7 @@ from .kinematics import (
     wrist_vector,
 )
 from .linkage import Linkage, check_linkage
+from .trigonometry import sincos
 from .validation import concrete, real_array, sign
 
 if TYPE_CHECKING:
@@ -138,13 +139,16 @@ class CircleTask(eqx.Module):
         self.orientation = real_array("orientation", orientation, ())
         self.branch = sign("branch", branch)
 
-    def _turned(self, t: Array) -> Array:
-        return self.phase + 2 * np.pi * t / self.period
+    def _turned(self, t: Array) -> tuple[Array, Array, Array]:
+        """Direction from the centre: its angle, cosine and sine."""
+        angle = self.phase + 2 * np.pi * t / self.period
+        sin, cos = sincos(angle)
+        return angle, cos, sin
 
     def tip(self, t: ArrayLike) -> Float[Array, " 2"]:
         """The commanded tip position at time `t` [s]: (x, y) [m]."""
-        turned = self._turned(real_array("t", t, ()))
-        return self.center + self.radius * jnp.stack([jnp.cos(turned), jnp.sin(turned)])
+        _, cos, sin = self._turned(real_array("t", t, ()))
+        return self.center + self.radius * jnp.stack([cos, sin])
 
     def _positions(self, t: Array, linkage: Linkage) -> Array:
         wrist = wrist_vector(linkage, self.tip(t), self.orientation)
@@ -159,8 +163,7 @@ class CircleTask(eqx.Module):
         The larger of the two vectors carries the angle; the smaller one adds less than
         a quarter turn, for which the arctangent has no jump.
         """
-        turned = self._turned(t)
-        cos, sin = jnp.cos(turned), jnp.sin(turned)
+        turned, cos, sin = self._turned(t)
         along, across = hub[0] * cos + hub[1] * sin, hub[1] * cos - hub[0] * sin
         square = hub[0] ** 2 + hub[1] ** 2
         around = self.radius**2 > square

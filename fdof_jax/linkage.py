@@ -20,7 +20,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from .singularity import check_singularity
-from .validation import concrete, is_traced, real_array
+from .validation import concrete, instance, is_traced, real_array
 
 TOPOLOGIES = ("RRR", "RRP", "RPR", "PRR", "RPP", "PRP", "PPR")
 
@@ -81,7 +81,8 @@ def existence_factors(topology: str) -> Float[Array, " 6"]:
     >>> existence_factors("RPR").astype(int).tolist()
     [0, 1, 1, 0, 0, 1]
     """
-    pairs = _pairs_of(str(topology))
+    instance("topology", topology, str)
+    pairs = _pairs_of(topology)
     return jnp.asarray(pairs, dtype=float).reshape(6)
 
 

@@ -15,12 +15,19 @@ from numpy.typing import ArrayLike
 from .dynamics import (
     Constants,
     Scalars,
-    at_reference,
     joint_accelerations,
     link_constants,
+    zeros,
 )
 from .linkage import Linkage, State, check_linkage
-from .validation import callable_tuple, concrete, is_traced, real_array
+from .validation import (
+    callable_tuple,
+    concrete,
+    instance,
+    is_traced,
+    real_array,
+    whole_number,
+)
 
 Forces = tuple[Any, ...]  # callables (t, q, qd, linkage) -> tau
 
@@ -67,7 +74,7 @@ def _vector_field(t: Any, y: tuple[Scalars, Scalars], args: _Args):
     The positions are displacements from the start: see `dynamics`.
     """
     delta, qd = y
-    tau = at_reference(args.q0)
+    tau = zeros(args.q0)
     if args.forces:
         q_array, qd_array = args.q0 + jnp.stack(delta), jnp.stack(qd)
         first, *others = (
@@ -93,7 +100,7 @@ def element_effort(
             f"forces[{index}]: expected it to return tau, an array of 3 real numbers, "
             f"got {tau!r}."
         ) from error
-    if tau.shape != (3,) or not jnp.issubdtype(tau.dtype, jnp.floating):
+    if tau.shape != (3,) or tau.dtype.kind not in "iuf":
         raise ValueError(
             f"forces[{index}]: expected it to return tau, an array of 3 real numbers, "
             f"got shape {tau.shape} and dtype {tau.dtype}."
@@ -101,12 +108,16 @@ def element_effort(
     return tau.astype(q.dtype)
 
 
-def _default_controller() -> diffrax.PIDController:
+def adaptive(double: float, single: float) -> diffrax.PIDController:
+    """Adaptive steps at a relative and absolute tolerance chosen by the dtype."""
+    x64 = jnp.result_type(float) == jnp.float64
+    tolerance = double if x64 else single
     # The smallest step ends solves that turn NaN, which would be rejected for ever.
-    tolerance, smallest = (1e-11, 1e-13) if jnp.result_type(float) == jnp.float64 else (
-        1e-6, 1e-8)  # fmt: skip
     return diffrax.PIDController(
-        rtol=tolerance, atol=tolerance, dtmin=smallest, force_dtmin=False
+        rtol=tolerance,
+        atol=tolerance,
+        dtmin=1e-13 if x64 else 1e-8,
+        force_dtmin=False,
     )
 
 
@@ -116,7 +127,7 @@ def _solve(linkage, state0, ts, forces, keywords) -> Solution:
         diffrax.ODETerm(_vector_field),
         t0=ts[0],
         t1=ts[-1],
-        y0=(at_reference(state0.q), tuple(state0.qd)),
+        y0=(zeros(state0.q), tuple(state0.qd)),
         args=_Args(linkage, state0.q, link_constants(linkage, state0.q), forces),
         saveat=diffrax.SaveAt(ts=ts),
         **keywords,
@@ -137,7 +148,7 @@ def simulate(
     *,
     solver: diffrax.AbstractSolver = diffrax.Dopri8(),
     stepsize_controller: diffrax.AbstractStepSizeController | None = None,
-    dt0: float | None = 1e-3,
+    dt0: ArrayLike | None = 1e-3,
     adjoint: diffrax.AbstractAdjoint = diffrax.RecursiveCheckpointAdjoint(),
     max_steps: int | None = 65536,
     throw: bool = True,
@@ -156,7 +167,7 @@ def simulate(
     - `forces`: a tuple of force elements `(t, q, qd, linkage) -> tau`.
     - `solver`, `stepsize_controller`, `dt0`, `adjoint`, `max_steps`, `throw`,
       `progress_meter`: as in `diffrax.diffeqsolve`. By default Dopri8 at a relative
-      and absolute tolerance of 1e-11 in float64, 1e-6 in float32, for which
+      and absolute tolerance of 1e-11 in float64, 1e-5 in float32, for which
       `stepsize_controller=None` stands. The first step `dt0` is 1 ms, because
       estimates of it fail from exact rest; `None` lets the controller estimate it.
       Reverse mode works with the default `adjoint`; for forward mode pass
@@ -183,15 +194,27 @@ def simulate(
         raise ValueError(f"ts: expected increasing times, got {times.tolist()[:20]}.")
     callable_tuple("forces", forces)
     if dt0 is not None:
-        real_array("dt0", dt0, (), above=0)
+        dt0 = real_array("dt0", dt0, (), above=0)  # an array: new values, no new trace
+    if max_steps is not None:
+        whole_number("max_steps", max_steps, 1)
     if isinstance(adjoint, diffrax.BacksolveAdjoint):
         raise ValueError(
             "adjoint: expected RecursiveCheckpointAdjoint (reverse mode) or "
             "ForwardMode, got BacksolveAdjoint, whose gradients are wrong on these "
             "problems."
         )
+    for name, value, kind in (
+        ("solver", solver, diffrax.AbstractSolver),
+        ("adjoint", adjoint, diffrax.AbstractAdjoint),
+        ("throw", throw, bool),
+        ("progress_meter", progress_meter, diffrax.AbstractProgressMeter),
+    ):
+        instance(name, value, kind)
     if stepsize_controller is None:
-        stepsize_controller = _default_controller()
+        stepsize_controller = adaptive(1e-11, 1e-5)
+    instance(
+        "stepsize_controller", stepsize_controller, diffrax.AbstractStepSizeController
+    )
     _warn_of_tolerance(stepsize_controller)
     for element in forces:
         check = getattr(element, "check", None)

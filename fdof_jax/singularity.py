@@ -91,7 +91,7 @@ def check_singularity(linkage: "Linkage") -> None:
         if (
             not revolute[k - 1]
             and not revolute[k]
-            and abs(np.sin(locked[k - 1])) < 1e-12
+            and abs(np.sin(locked[k - 1])) < 8 * np.finfo(locked.dtype).eps
         ):
             warnings.warn(
                 f"prismatic joints {k} and {k + 1} are parallel (the paper's rule "

@@ -15,18 +15,19 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from .control import PDController, saturated, tip_deviation
+from .linkage import check_linkage
 from .scenes import Scene
-from .simulation import Solution, simulate
-from .validation import one_of, real_array
+from .simulation import Solution, adaptive, simulate
+from .validation import callable_tuple, instance, one_of, real_array, whole_number
 
-# Enough for a gradient good to 1e-6 of its norm; an explicit step suits the gains of
-# a factor 10 around Fig 7's.
-_TOLERANCE = 1e-8
 _SAMPLES = 1001
 # Stop where the projected gradient has fallen to this part of its start, or where the
 # loss falls by less than this part of itself: its noise is that of the tolerance.
 _GRADIENT_DECREASE = 1e-5
 _LOSS_DECREASE = 1e-7
+# The part of its start that the projected gradient must have fallen to for a stop for
+# another reason to count as convergence.
+_CONVERGED = 1e-3
 
 Loss = Callable[[Scene, Solution], Array]
 
@@ -56,7 +57,7 @@ class TuneResult(eqx.Module):
     - `loss`: its loss [m^2 with the default loss].
     - `history`: the iterations, see `History`.
     - `lower`, `upper`: the bounds of kp and kd (2, 3).
-    - `converged`: False if the run ended by its number of iterations.
+    - `converged`: whether the projected gradient has fallen to a thousandth.
     - `message`: why the run stopped, in words.
     """
 
@@ -113,12 +114,14 @@ def _evaluate(
             trial.state0,
             jnp.linspace(0, trial.t1, _SAMPLES),
             trial.forces,
-            stepsize_controller=diffrax.PIDController(rtol=_TOLERANCE, atol=_TOLERANCE),
+            stepsize_controller=adaptive(1e-8, 1e-5),
             adjoint=diffrax.ForwardMode(),
             throw=False,
         )
         at_limit = saturated(_controller(trial)[1], trial.linkage, solution)
-        value = jnp.atleast_1d(loss(trial, solution)).reshape(-1)
+        value = jnp.asarray(loss(trial, solution))
+        # The square of a scalar loss's root is the loss.
+        value = value.reshape(-1) if value.ndim else jnp.sqrt(value)[None]
         return value, (value, jnp.mean(at_limit, axis=0))
 
     jacobian, (value, share) = jax.jacfwd(residuals, has_aux=True)(log_gains)
@@ -138,8 +141,9 @@ def tune(
     """Gains of a scene's PD controller that make its loss small, within bounds.
 
     The unknowns are the logarithms of kp and kd; gains of zero stay zero. The
-    derivatives are exact (forward mode through the adaptive solve at a tolerance of
-    1e-8). A second call with other numbers compiles nothing.
+    derivatives are exact (forward mode through the adaptive solve, at a tolerance of
+    1e-8 in float64 and 1e-5 in float32). A second call with other numbers compiles
+    nothing.
 
     **Arguments:**
 
@@ -147,8 +151,10 @@ def tune(
     - `factor`: the gains stay within this factor of their start, above 1.
     - `bounds`: instead of `factor`, the least and the greatest kp and kd: two arrays
       (2, 3), first row kp, second kd [N/m or N m/rad, N s/m or N m s/rad].
-    - `loss`: `(scene, solution) -> residuals`, whose sum of squares is made small. By
-      default `tip_errors`: the mean squared tip error over [0, t1].
+    - `loss`: `(scene, solution) -> residuals`, an array whose sum of squares is made
+      small, or a scalar that is made small itself and is never negative (for which
+      Gauss-Newton has little to go by). By default `tip_errors`: the mean squared tip
+      error over [0, t1].
     - `method`: "gauss-newton" (Levenberg-Marquardt with an active set for the bounds)
       or "adam" (optax, clipped to the bounds).
     - `max_steps`: the greatest number of evaluations after the first.
@@ -159,12 +165,14 @@ def tune(
     **Raises:** ValueError for malformed arguments, and if the scene cannot be simulated
     from its start.
     """
+    instance("scene", scene, Scene)
+    check_linkage(scene.linkage)
+    t1 = real_array("scene.t1", scene.t1, (), above=0)
+    callable_tuple("scene.forces", scene.forces)
     controller = _controller(scene)[1]
     one_of("method", method, ("gauss-newton", "adam"))
-    if not isinstance(max_steps, int) or max_steps < 1:
-        raise ValueError(
-            f"max_steps: expected a whole number from 1, got {max_steps!r}."
-        )
+    max_steps = whole_number("max_steps", max_steps, 1)
+    instance("progress_meter", progress_meter, diffrax.AbstractProgressMeter)
     if not callable(loss):
         raise ValueError(f"loss: expected a callable, got {loss!r}.")
     if loss is tip_errors and not hasattr(controller.reference, "tip"):
@@ -173,7 +181,7 @@ def tune(
             f"the default tip error, got {controller.reference!r}."
         )
     factor_ = float(real_array("factor", factor, (), above=1))
-    controller.check(scene.linkage, jnp.array([0.0, scene.t1]))
+    controller.check(scene.linkage, jnp.stack([jnp.zeros_like(t1), t1]))
     start = np.stack([np.asarray(controller.kp), np.asarray(controller.kd)])
     if bounds is None:
         lower, upper = start / factor_, start * factor_
@@ -196,7 +204,9 @@ def tune(
         np.log(np.where(tuned, a, 1)).ravel() for a in (lower, upper, start)
     )
 
-    scene = jax.tree.map(lambda a: jnp.asarray(a, dtype=float), scene)
+    scene = jax.tree.map(
+        lambda a: jnp.asarray(a, dtype=float) if eqx.is_array_like(a) else a, scene
+    )
     began = time.perf_counter()
     rows: list[tuple[Any, ...]] = []
 
@@ -217,7 +227,10 @@ def tune(
 
     residuals, jacobian, share, value = evaluate(z)
     if not (np.isfinite(value) and np.isfinite(jacobian).all()):
-        raise ValueError("scene: expected one that can be simulated up to t1.")
+        raise ValueError(
+            f"scene: expected one that can be simulated up to t1 = {float(t1):g} s, "
+            f"got a loss of {float(value):g} or a gradient that is not finite."
+        )
     gradient = 2 * jacobian.T @ residuals
     record(z, gradient, value, share)
 
@@ -225,11 +238,11 @@ def tune(
     optimiser = optax.adam(0.05)
     optimiser_state = optimiser.init(jnp.asarray(z))
     best = (value, z)
-    converged, message = False, f"stopped after {max_steps} evaluations"
+    reason = f"stopped after {max_steps} evaluations"
     meter_state = progress_meter.init()
     for step in range(1, max_steps + 1):
         if rows[-1][1] <= _GRADIENT_DECREASE * rows[0][1]:
-            converged, message = True, "the projected gradient vanishes"
+            reason = "the projected gradient vanishes"
             break
         if method == "adam":
             update, optimiser_state = optimiser.update(
@@ -237,18 +250,20 @@ def tune(
             )
             trial = np.clip(z + np.asarray(update), low, high)
         else:
-            trial = z + _bounded_step(
-                jacobian, gradient / 2, damping, low - z, high - z
-            )
+            step_ = _bounded_step(jacobian, gradient / 2, damping, low - z, high - z)
+            trial = z + step_
         new = evaluate(trial)
         meter_state = progress_meter.step(meter_state, jnp.asarray(step / max_steps))
-        improved = np.isfinite(new[1]).all() and new[3] < value
-        if method == "gauss-newton" and not improved:
+        finite = np.isfinite(new[1]).all() and np.isfinite(new[3])
+        if method == "gauss-newton" and not (finite and new[3] < value):
             damping *= 8
             if damping > 1e8:
-                converged, message = True, "no step decreases the loss any further"
+                reason = "no step decreases the loss any further"
                 break
             continue
+        if not finite:
+            reason = "a step led to gains with which the simulation fails"
+            break
         decrease = (value - new[3]) / value
         z, (residuals, jacobian, share, value) = trial, new
         gradient = 2 * jacobian.T @ residuals
@@ -256,7 +271,7 @@ def tune(
         record(z, gradient, value, share)
         best = min(best, (value, z), key=lambda b: b[0])
         if method == "gauss-newton" and decrease < _LOSS_DECREASE:
-            converged, message = True, "the loss decreases no further"
+            reason = "the loss decreases no further"
             break
     progress_meter.close(meter_state)
     value, z = best
@@ -267,9 +282,20 @@ def tune(
         history=History(*(np.asarray(column) for column in zip(*rows))),
         lower=lower,
         upper=upper,
-        converged=converged,
-        message=message,
+        converged=bool(0 < rows[0][1] and rows[-1][1] <= _CONVERGED * rows[0][1]),
+        message=_message(reason, rows, z, low, high, tuned.ravel()),
     )
+
+
+def _message(reason, rows, z, low, high, tuned) -> str:
+    """The reason, and what a reader might take for convergence but is not."""
+    _, norm, _, share, _ = rows[0]
+    if norm == 0 and share.min() == 1:
+        return "the gradient is zero because every actuator is at its limit throughout"
+    if norm == 0:
+        return "the gradient is zero at the start"
+    held = int(np.sum(tuned & ((z <= low) | (z >= high))))
+    return f"{reason}; {held} of {int(tuned.sum())} gains are at a bound"
 
 
 def _bounded_step(

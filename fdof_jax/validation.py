@@ -95,6 +95,22 @@ def callable_tuple(name: str, value: Any) -> tuple:
     )
 
 
+def instance(name: str, value: Any, kind: type) -> None:
+    """Raise ValueError unless `value` is an instance of `kind`."""
+    if not isinstance(value, kind):
+        raise ValueError(f"{name}: expected a {kind.__name__}, got {value!r}.")
+
+
+def whole_number(name: str, value: Any, minimum: int) -> int:
+    """`value` if it is a whole number, not a bool, of at least `minimum`."""
+    whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
+    if not whole or value < minimum:
+        raise ValueError(
+            f"{name}: expected a whole number of at least {minimum}, got {value!r}."
+        )
+    return int(value)
+
+
 def one_of(name: str, value: Any, options: Sequence[Any]) -> Any:
     """`value` if it is among `options`, else ValueError."""
     if isinstance(value, str | int | float) and value in options:

@@ -6,12 +6,12 @@ import pytest
 
 import fdof_jax as fj
 from fdof_jax import scenes, simulation
-from fdof_jax.dynamics import at_reference, joint_accelerations, link_constants
+from fdof_jax.dynamics import joint_accelerations, link_constants, zeros
 
 
 def flops(function, *arguments):
     cost = jax.jit(function).lower(*arguments).cost_analysis()
-    return cost.get("flops", 0)
+    return cost.get("flops", 0)  # left out where there are none
 
 
 def transcendentals(function, *arguments):
@@ -23,7 +23,7 @@ def field_arguments(forces):
     linkage = scenes.fig7().linkage
     q = jnp.array([0.3, 2.0, -0.4])
     args = simulation._Args(linkage, q, link_constants(linkage, q), forces)
-    return jnp.array(0.1), (at_reference(q), tuple(q)), args
+    return jnp.array(0.1), (zeros(q), tuple(q)), args
 
 
 def field_flops(*forces):
@@ -62,7 +62,7 @@ def test_an_element_adds_its_own_cost_and_three_additions(element):
 
 def test_the_equations_cost_little_and_call_no_transcendental_function():
     """On CPU sine and cosine are polynomials; a matrix factorisation would show."""
-    assert field_flops() <= 528
+    assert 0 < field_flops() <= 592
     assert transcendentals(simulation._vector_field, *field_arguments(())) == 0
 
 

@@ -10,7 +10,6 @@ from helpers import random_linkage
 from hypothesis import given, settings, strategies as st
 
 import fdof_jax as fj
-from fdof_jax.dynamics import joint_mass_matrix
 
 cases = st.tuples(st.sampled_from(fj.TOPOLOGIES), st.integers(0, 2**32 - 1))
 identities = settings(max_examples=60, deadline=None)
@@ -20,6 +19,12 @@ def draw(case):
     topology, seed = case
     rng = np.random.default_rng(seed)
     return random_linkage(topology, rng), *rng.normal(size=(3, 3)), rng
+
+
+def joint_mass_matrix(linkage, q):
+    """The reduced mass matrix, as inverse dynamics has it."""
+    at_rest = jnp.zeros(3)
+    return jax.jacfwd(lambda a: fj.inverse_dynamics(linkage, q, at_rest, a))(at_rest)
 
 
 def scatter(linkage, values):

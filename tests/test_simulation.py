@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import REFERENCE
+from helpers import SCENES, load
 
 import fdof_jax as fj
 from fdof_jax import scenes
@@ -52,6 +52,10 @@ def test_fig5_conserves_its_energy_and_passes_it_between_links():
              [-7.712524545, -11.54151306, -12.01578309]),
         100: ([1.72060184, 13.9524388, 39.21613415],
               [-9.711132357, -19.38953088, -25.78851156]),
+        150: ([2.147291502, 3.735135913, 4.36871562],
+              [-0.4291427303, -2.557089816, -7.264910488]),
+        300: ([3.073952069, 17.80795955, 14.9894397],
+              [-8.636185855, -12.79756002, -14.43760544]),
         200: ([3.418419722, 3.345751526, 1.483116072],
               [-2.415474222, -1.457476221, -4.374336877]),
         500: ([0.5977764945, 5.901081903, 6.10505396],
@@ -62,14 +66,28 @@ def test_fig5_conserves_its_energy_and_passes_it_between_links():
         np.testing.assert_allclose(potential[index], v, rtol=3e-9, atol=3e-8)
 
 
-def test_default_accuracy_to_two_seconds():
-    """1e-8 on the paper's scenes, at the times and between the steps."""
-    scene = scenes.fig5()
-    solution = fj.simulate(scene.linkage, scene.state0, np.linspace(0, 2, 5))
-    angles = absolute_angles(scene.linkage, solution)[1:]
-    rows = {row["t"]: row["th"] for row in REFERENCE["chaos"]["rows"]}
-    for t, angle in zip(solution.ts[1:], angles):
-        np.testing.assert_allclose(angle, rows[float(t)], rtol=0, atol=1e-8)
+@pytest.mark.parametrize("name", ["fig3", "fig5", "fig7-free"])
+def test_default_accuracy_to_two_seconds(name):
+    """With the default solver and tolerance, at times between the steps."""
+    states = [state for state in SCENES[name]["states"] if state["t"] <= 2]
+    r = load(name)
+    ts = [0, *(state["t"] for state in states)]
+    solution = fj.simulate(r.linkage, r.state0, ts, r.forces)
+    chain = jax.vmap(fj.to_chain, in_axes=(None, 0, 0))
+    x, _ = chain(r.linkage, solution.q, solution.qd)
+    for state, coordinates in zip(states, x[1:]):
+        np.testing.assert_allclose(coordinates, state["q"], rtol=0, atol=1e-8)
+
+
+def test_default_accuracy_under_control():
+    scene = scenes.fig7()
+    ts = [0, 1.0, 2.0]
+    solution = fj.simulate(scene.linkage, scene.state0, ts, scene.forces)
+    tight = diffrax.PIDController(rtol=1e-13, atol=1e-13)
+    exact = fj.simulate(
+        scene.linkage, scene.state0, ts, scene.forces, stepsize_controller=tight
+    )
+    np.testing.assert_allclose(solution.q, exact.q, rtol=0, atol=1e-8)
 
 
 def test_fig7_tracks_its_circle():
