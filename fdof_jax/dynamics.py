@@ -275,7 +275,7 @@ def _accelerations_in_one_loop(
     its own that computes everything anew: five evaluations of the equations for one.
     A reduction is the one operation with several results. This one takes the maximum
     of each result and itself, and a fused loop comes of it: 3 times faster in a batch
-    of 1024, 17 times for a single arm.
+    of 1024, 17 times for a single arm (one core, jax 0.10.2).
     """
     results = _accelerations(c, delta, qd, tau, _newton_reciprocal)
     lowest = tuple(jnp.full((), -jnp.inf, r.dtype) for r in results)
