@@ -6,12 +6,12 @@ The paper's Fig 5 linkage from random starts around its own, 2 s. Contestants, s
 side in one process and interleaved:
 
 - fdof_jax: `jax.vmap(simulate)`;
-- plain diffrax: the same equations written as one would at first: a stacked state, NumPy
-  sine and cosine, a mass matrix and `linalg.solve`;
+- plain diffrax: the same motion written as one would at first: a stacked state,
+  `jnp.sin` and `jnp.cos`, a mass matrix and `linalg.solve`;
 - MuJoCo: `rollout` of the exported model with its RK4, where installed.
 
-A point's error is the worst member's largest angle error at the end, against fdof_jax at
-a tolerance of 1e-13. Each point is one JSON line.
+A point's error is the worst member's largest angle error at the end, against fdof_jax
+at a tolerance of 1e-13. Each point is one JSON line.
 """
 
 import argparse
@@ -189,7 +189,8 @@ def main() -> None:
         )
     for point in points:
         print(
-            f"{point['contestant']:14} {point['setting']:7g}  error {point['error']:.1e}  "
+            f"{point['contestant']:14} {point['setting']:7g}  "
+            f"error {point['error']:.1e}  "
             f"{point['sim_seconds_per_second']:9.3g} sim s/s"
         )
     for error in (1e-6, 1e-9):
