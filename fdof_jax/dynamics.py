@@ -1,6 +1,6 @@
 """Equations of motion: the reduced 3x3 form and inverse dynamics in joint coordinates.
 
-`joint_accelerations` is what simulations integrate. It works on scalars, never on
+`rates` is what simulations integrate. It works on scalars, never on
 stacked arrays: XLA on CPU computes a stacked result once per entry. Its positions are
 displacements from a reference configuration, whose directions are turned by them:
 a pendulum 1e-17 rad away from upright keeps that angle, which upright + 1e-17 would
@@ -63,7 +63,7 @@ class Constants(NamedTuple):
 
 
 def link_constants(linkage: Linkage, q: Float[Array, " joint"]) -> Constants:
-    """The scalars that `joint_accelerations` needs, with `q` as reference."""
+    """The scalars that `rates` needs, with `q` as reference."""
     x, _ = to_chain(linkage, q, jnp.zeros_like(q))
     sin, cos = sincos(jnp.concatenate([linkage.base_angle[None], x[1::2]]))
     e1, e2, e3, e4 = zip(cos, sin)
@@ -266,40 +266,52 @@ def _newton_reciprocal(x: Array) -> Array:
     return y
 
 
-def _accelerations_in_one_loop(
+def _rates(
     c: Constants, delta: Scalars, qd: Scalars, tau: Scalars
-) -> Scalars:
-    """`_accelerations` as one loop over a batch, with three results.
+) -> tuple[Scalars, Scalars]:
+    return qd, _accelerations(c, delta, qd, tau)
+
+
+def _rates_in_one_loop(
+    c: Constants, delta: Scalars, qd: Scalars, tau: Scalars
+) -> tuple[Scalars, Scalars]:
+    """`_rates` as one loop over a batch, with six results.
 
     XLA on CPU gives each result of an expression, and each division in it, a loop of
     its own that computes everything anew: five evaluations of the equations for one.
     A reduction is the one operation with several results. This one takes the maximum
     of each result and itself, and a fused loop comes of it: 3 times faster in a batch
-    of 1024, 17 times for a single arm (one core, jax 0.10.2).
+    of 1024, 17 times for a single arm (one core, jax 0.10.2). The velocities pass
+    through it because XLA would otherwise copy the buffers of a Runge-Kutta method's
+    stages, a quarter of a step's time.
     """
-    results = _accelerations(c, delta, qd, tau, _newton_reciprocal)
+    results = (*qd, *_accelerations(c, delta, qd, tau, _newton_reciprocal))
     lowest = tuple(jnp.full((), -jnp.inf, r.dtype) for r in results)
-    return jax.lax.reduce(
+    reduced = jax.lax.reduce(
         tuple(jnp.broadcast_to(r, (2,)) for r in results),
         lowest,
         lambda a, b: tuple(map(jax.lax.max, a, b)),
         dimensions=(0,),
     )
+    return tuple(reduced[:3]), tuple(reduced[3:])
 
 
 @jax.custom_jvp
-def joint_accelerations(
+def rates(
     c: Constants, delta: Scalars, qd: Scalars, tau: Scalars
-) -> Scalars:
-    """Joint accelerations at joint displacements `delta` from the reference of `c`."""
+) -> tuple[Scalars, Scalars]:
+    """Rates of the joint displacements `delta` from the reference of `c`, and of `qd`.
+
+    The equations of motion as what an integrator takes: velocities and accelerations.
+    """
     return jax.lax.platform_dependent(
-        c, delta, qd, tau, cpu=_accelerations_in_one_loop, default=_accelerations
+        c, delta, qd, tau, cpu=_rates_in_one_loop, default=_rates
     )
 
 
-@joint_accelerations.defjvp
-def _joint_accelerations_jvp(primals, tangents):
-    return jax.jvp(_accelerations, primals, tangents)
+@rates.defjvp
+def _rates_jvp(primals, tangents):
+    return jax.jvp(_rates, primals, tangents)
 
 
 @compiled(q=(3,), qd=(3,), tau=(3,))
@@ -318,9 +330,8 @@ def forward_dynamics(
 
     **Returns:** `qdd` [m/s^2 or rad/s^2].
     """
-    return jnp.stack(
-        joint_accelerations(link_constants(linkage, q), zeros(q), tuple(qd), tuple(tau))
-    )
+    _, qdd = rates(link_constants(linkage, q), zeros(q), tuple(qd), tuple(tau))
+    return jnp.stack(qdd)
 
 
 @compiled(q=(3,), qd=(3,), qdd=(3,))

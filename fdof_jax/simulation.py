@@ -15,8 +15,8 @@ from numpy.typing import ArrayLike
 from .dynamics import (
     Constants,
     Scalars,
-    joint_accelerations,
     link_constants,
+    rates,
     zeros,
 )
 from .linkage import Linkage, State, check_linkage
@@ -84,7 +84,7 @@ def _vector_field(t: Any, y: tuple[Scalars, Scalars], args: _Args):
         tau = tuple(first)
         for effort in others:
             tau = tuple(a + b for a, b in zip(tau, effort))
-    return qd, joint_accelerations(args.constants, delta, qd, tau)
+    return rates(args.constants, delta, qd, tau)
 
 
 @eqx.filter_jit  # traced once, not at each use by a solver
