@@ -281,7 +281,7 @@ def _rates_in_one_loop(
     its own that computes everything anew: five evaluations of the equations for one.
     A reduction is the one operation with several results. This one takes the maximum
     of each result and itself, and a fused loop comes of it: 3 times faster in a batch
-    of 1024, 17 times for a single arm (one core, jax 0.10.2). The velocities pass
+    of 1024, 11 times for a single arm (one core, jax 0.10.2). The velocities pass
     through it because XLA would otherwise copy the buffers of a Runge-Kutta method's
     stages, a quarter of a step's time.
     """
