@@ -223,7 +223,7 @@ def tune(
     def record(z, gradient, value, share):
         gains = np.where(tuned, np.exp(z).reshape(2, 3), 0)
         norm = np.linalg.norm(projected(z, gradient))
-        rows.append((value, norm, gains, share, time.perf_counter() - began))
+        rows.append((value, norm, gains, share, time.perf_counter() - began, z))
 
     residuals, jacobian, share, value = evaluate(z)
     if not (np.isfinite(value) and np.isfinite(jacobian).all()):
@@ -237,7 +237,6 @@ def tune(
     damping = 1e-3
     optimiser = optax.adam(0.05)
     optimiser_state = optimiser.init(jnp.asarray(z))
-    best = (value, z)
     reason = f"stopped after {max_steps} evaluations"
     meter_state = progress_meter.init()
     for step in range(1, max_steps + 1):
@@ -269,27 +268,27 @@ def tune(
         gradient = 2 * jacobian.T @ residuals
         damping = max(damping / 4, 1e-9)
         record(z, gradient, value, share)
-        best = min(best, (value, z), key=lambda b: b[0])
         if method == "gauss-newton" and decrease < _LOSS_DECREASE:
             reason = "the loss decreases no further"
             break
     progress_meter.close(meter_state)
-    value, z = best
-    gains = jnp.asarray(np.where(tuned, np.exp(z).reshape(2, 3), 0))
+    # Adam's last iterate need not be its best: what is said is said of the best.
+    value, norm, gains, _, _, z = min(rows, key=lambda row: row[0])
+    columns = list(zip(*rows))[:5]
     return TuneResult(
-        scene=_with_gains(scene, gains),
+        scene=_with_gains(scene, jnp.asarray(gains)),
         loss=float(value),
-        history=History(*(np.asarray(column) for column in zip(*rows))),
+        history=History(*(np.asarray(column) for column in columns)),
         lower=lower,
         upper=upper,
-        converged=bool(0 < rows[0][1] and rows[-1][1] <= _CONVERGED * rows[0][1]),
+        converged=bool(0 < rows[0][1] and norm <= _CONVERGED * rows[0][1]),
         message=_message(reason, rows, z, low, high, tuned.ravel()),
     )
 
 
 def _message(reason, rows, z, low, high, tuned) -> str:
     """The reason, and what a reader might take for convergence but is not."""
-    _, norm, _, share, _ = rows[0]
+    _, norm, _, share, *_ = rows[0]
     if norm == 0 and share.min() == 1:
         return "the gradient is zero because every actuator is at its limit throughout"
     if norm == 0:

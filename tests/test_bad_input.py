@@ -386,25 +386,3 @@ def test_circles_out_of_reach_are_refused_at_the_door(circle):
 def test_points_out_of_reach_are_refused():
     with pytest.raises(ValueError, match=r"^tip: expected .* reach .*, got \[9"):
         fj.inverse_kinematics(LINKAGE, [9, 9], 0.0)
-
-
-@pytest.mark.parametrize(
-    ("keyword", "value"),
-    [
-        ("solver", "dopri"),
-        ("solver", None),
-        ("solver", diffrax.Tsit5),
-        ("adjoint", None),
-        ("stepsize_controller", 1e-6),
-        ("progress_meter", None),
-        ("max_steps", 0),
-        ("max_steps", -1),
-        ("max_steps", "a"),
-        ("max_steps", True),
-        ("throw", "no"),
-    ],
-)
-def test_keywords_of_simulate(keyword, value):
-    scene = fj.scenes.fig5()
-    with pytest.raises(ValueError, match=f"^{keyword}: expected"):
-        fj.simulate(scene.linkage, scene.state0, [0, 0.1], **{keyword: value})

@@ -207,3 +207,25 @@ def test_forces_add_up():
     efforts = fj.joint_efforts(scene.linkage, split, three)
     assert efforts.elements.shape == (3, 3, 3)
     np.testing.assert_allclose(efforts.total, -20 * three.qd, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("keyword", "value"),
+    [
+        ("solver", "dopri"),
+        ("solver", None),
+        ("solver", diffrax.Tsit5),
+        ("adjoint", None),
+        ("stepsize_controller", 1e-6),
+        ("progress_meter", None),
+        ("max_steps", 0),
+        ("max_steps", -1),
+        ("max_steps", "a"),
+        ("max_steps", True),
+        ("throw", "no"),
+    ],
+)
+def test_keywords_of_simulate(keyword, value):
+    scene = scenes.fig5()
+    with pytest.raises(ValueError, match=f"^{keyword}: expected"):
+        fj.simulate(scene.linkage, scene.state0, [0, 0.1], **{keyword: value})
