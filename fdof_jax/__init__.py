@@ -38,6 +38,7 @@ from .simulation import (
     joint_efforts as joint_efforts,
     simulate as simulate,
 )
+from .sweep import sweep as sweep
 from .tuning import TuneResult as TuneResult, tune as tune
 
 __version__ = "0.1.0"

@@ -11,6 +11,7 @@ from jax import Array
 from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
+from .forces import ScalarElement
 from .kinematics import (
     plane_angle,
     solve_joints,
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
 Reference = Callable[[Array, Linkage], tuple[Array, Array]]
 
 
-class PDController(eqx.Module):
+class PDController(ScalarElement):
     """Saturated PD control of the joints, as in Fig 7: a force element.
 
     The effort is kp * (q_ref - q) + kd * (qd_ref - qd), clipped to +-limit as a whole.
@@ -69,18 +70,33 @@ class PDController(eqx.Module):
             )
         self.reference = reference
 
-    def demand(self, t: Array, q: Array, qd: Array, linkage: Linkage) -> Array:
-        """The effort before it is limited, (3,) [N or N m]."""
+    def schedule(self, t: Array, linkage: Linkage) -> tuple[Array, Array]:
+        """The reference motion, which does not depend on the state: (q_ref, qd_ref)."""
         motion = self.reference(t, linkage)
         if not isinstance(motion, tuple) or len(motion) != 2:
             raise ValueError(
                 f"reference: expected it to return (q_ref, qd_ref), got {motion!r}."
             )
         q_ref, qd_ref = (real_array("reference", m, (3,)) for m in motion)
-        return self.kp * (q_ref - q) + self.kd * (qd_ref - qd)
+        return q_ref, qd_ref
 
-    def __call__(self, t: Array, q: Array, qd: Array, linkage: Linkage) -> Array:
-        return jnp.clip(self.demand(t, q, qd, linkage), -self.limit, self.limit)
+    def respond(self, scheduled, q, qd, linkage):
+        return tuple(
+            jnp.clip(effort, -limit, limit)
+            for effort, limit in zip(self._unlimited(scheduled, q, qd), self.limit)
+        )
+
+    def _unlimited(self, motion: Any, q: Any, qd: Any) -> list[Array]:
+        return [
+            kp * (position - q) + kd * (velocity - qd)
+            for kp, kd, position, velocity, q, qd in zip(
+                self.kp, self.kd, *motion, q, qd
+            )
+        ]
+
+    def demand(self, t: Array, q: Array, qd: Array, linkage: Linkage) -> Array:
+        """The effort before it is limited, (3,) [N or N m]."""
+        return jnp.stack(self._unlimited(self.schedule(t, linkage), q, qd))
 
     def check(self, linkage: Linkage, ts: Array) -> None:
         """Pass the linkage and the times on to the reference's own check, if any."""

@@ -3,18 +3,46 @@
 An element is any pytree called as `(t, q, qd, linkage) -> tau`, with joint positions,
 velocities and efforts of shape (3,). A scene's elements are a tuple; their efforts
 add up. The PD controller is one too: see `control`.
+
+Elements in hot loops may be `ScalarElement`s, which cost less to run and to compile.
 """
 
+from abc import abstractmethod
+from typing import Any
+
 import equinox as eqx
+import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from .linkage import Linkage
+from .reduced_equations import Scalars
 from .validation import real_array
 
 
-class JointDamper(eqx.Module):
+class ScalarElement(eqx.Module):
+    """A force element written in scalars, which fuses with the equations of motion.
+
+    A subclass implements `respond`, and `schedule` if anything in it depends on time.
+    """
+
+    def schedule(self, t: Array, linkage: Linkage) -> Any:
+        """What depends on time alone: evaluated for all stages of a step at once."""
+        return ()
+
+    @abstractmethod
+    def respond(
+        self, scheduled: Any, q: Scalars, qd: Scalars, linkage: Linkage
+    ) -> Scalars:
+        """The three efforts [N or N m], given what `schedule` returned."""
+
+    def __call__(self, t: Array, q: Array, qd: Array, linkage: Linkage) -> Array:
+        scheduled = self.schedule(t, linkage)
+        return jnp.stack(self.respond(scheduled, tuple(q), tuple(qd), linkage))
+
+
+class JointDamper(ScalarElement):
     """Viscous damping of the real joints, as in Fig 3: -coefficient * qd.
 
     On the relative rate of a revolute joint, with the reaction on the preceding link.
@@ -32,11 +60,11 @@ class JointDamper(eqx.Module):
             "coefficient", coefficient, (3,), minimum=0, broadcast=True
         )
 
-    def __call__(self, t: Array, q: Array, qd: Array, linkage: Linkage) -> Array:
-        return -self.coefficient * qd
+    def respond(self, scheduled, q, qd, linkage):
+        return tuple(-c * rate for c, rate in zip(self.coefficient, qd))
 
 
-class JointEffort(eqx.Module):
+class JointEffort(ScalarElement):
     """Constant joint efforts, the paper's F and T inputs.
 
     **Arguments:** `tau`: one per joint [N or N m].
@@ -49,5 +77,5 @@ class JointEffort(eqx.Module):
     def __init__(self, tau: ArrayLike):
         self.tau = real_array("tau", tau, (3,))
 
-    def __call__(self, t: Array, q: Array, qd: Array, linkage: Linkage) -> Array:
-        return self.tau
+    def respond(self, scheduled, q, qd, linkage):
+        return tuple(self.tau)

@@ -12,14 +12,16 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from .dynamics import (
+from .forces import ScalarElement
+from .linkage import Linkage, State, check_linkage
+from .rates import rates
+from .reduced_equations import (
     Constants,
     Scalars,
     link_constants,
-    rates,
     zeros,
 )
-from .linkage import Linkage, State, check_linkage
+from .unrolled_dopri8 import ScheduledTerm, UnrolledDopri8
 from .validation import (
     callable_tuple,
     concrete,
@@ -68,23 +70,34 @@ class _Args(NamedTuple):
     forces: Forces
 
 
-def _vector_field(t: Any, y: tuple[Scalars, Scalars], args: _Args):
-    """Rates of six scalars; arrays only for the force elements, where there are any.
+def _schedule(t: Array, args: _Args) -> tuple[Any, ...]:
+    """What the force elements take from time alone, or the time."""
+    return tuple(
+        element.schedule(t, args.linkage) if isinstance(element, ScalarElement) else t
+        for element in args.forces
+    )
 
-    The positions are displacements from the start: see `dynamics`.
+
+def _vector_field(
+    t: Any, y: tuple[Scalars, Scalars], args: _Args, schedule: tuple[Any, ...]
+):
+    """Rates of six scalars; arrays only for the force elements written in them.
+
+    The positions are displacements from the start: see `reduced_equations`.
     """
     delta, qd = y
-    tau = zeros(args.q0)
-    if args.forces:
-        q_array, qd_array = args.q0 + jnp.stack(delta), jnp.stack(qd)
-        first, *others = (
-            element_effort(index, element, t, q_array, qd_array, args.linkage)
-            for index, element in enumerate(args.forces)
-        )
-        tau = tuple(first)
-        for effort in others:
-            tau = tuple(a + b for a, b in zip(tau, effort))
-    return rates(args.constants, delta, qd, tau)
+    tau = None
+    for index, (element, scheduled) in enumerate(zip(args.forces, schedule)):
+        if isinstance(element, ScalarElement):
+            q = tuple(a + b for a, b in zip(args.q0, delta))
+            effort = element.respond(scheduled, q, qd, args.linkage)
+        else:
+            q, rate = args.q0 + jnp.stack(delta), jnp.stack(qd)
+            effort = element_effort(index, element, t, q, rate, args.linkage)
+        tau = effort if tau is None else tuple(a + b for a, b in zip(tau, effort))
+    if tau is None:
+        tau = zeros(args.q0)
+    return rates(args.constants, delta, qd, tuple(tau))
 
 
 @eqx.filter_jit  # traced once, not at each use by a solver
@@ -121,10 +134,11 @@ def adaptive(double: float, single: float) -> diffrax.PIDController:
     )
 
 
-@eqx.filter_jit
-def _solve(linkage, state0, ts, forces, keywords) -> Solution:
+def _integrate(solver, inputs, keywords) -> Solution:
+    linkage, state0, ts, forces = inputs
     solution = diffrax.diffeqsolve(
-        diffrax.ODETerm(_vector_field),
+        ScheduledTerm(_vector_field, _schedule),
+        solver,
         t0=ts[0],
         t1=ts[-1],
         y0=(zeros(state0.q), tuple(state0.qd)),
@@ -140,13 +154,57 @@ def _solve(linkage, state0, ts, forces, keywords) -> Solution:
     return Solution(ts, q, qd, solution.stats, solution.result)
 
 
+@eqx.filter_custom_vjp
+def _integrate_fast(inputs, keywords) -> Solution:
+    """The default: unrolled stages, but not where reverse mode repeats the steps.
+
+    Its replay has to come to the same bits: next to a saturation another rounding
+    leads to other steps, and to a wrong gradient. Unrolled stages are compiled
+    differently with derivatives and without; diffrax's loop over the stages is not.
+    """
+    return _integrate(UnrolledDopri8(), inputs, keywords)
+
+
+@_integrate_fast.def_fwd
+def _integrate_fast_fwd(perturbed, inputs, keywords):
+    moving, fixed = eqx.partition(inputs, perturbed)
+
+    def motion(moving):
+        solution = _integrate(diffrax.Dopri8(), eqx.combine(moving, fixed), keywords)
+        return (solution.q, solution.qd), solution
+
+    states, pull_back, solution = eqx.filter_vjp(motion, moving, has_aux=True)
+    return solution, (pull_back, states)
+
+
+@_integrate_fast.def_bwd
+def _integrate_fast_bwd(residuals, cotangent, perturbed, inputs, keywords):
+    pull_back, states = residuals
+    wanted = eqx.combine(
+        (cotangent.q, cotangent.qd), jax.tree.map(jnp.zeros_like, states)
+    )
+    (gradient,) = pull_back(wanted)
+    return gradient
+
+
+@eqx.filter_jit
+def _solve(solver, inputs, keywords) -> Solution:
+    if solver is not None:
+        return _integrate(solver, inputs, keywords)
+    if isinstance(keywords["adjoint"], diffrax.ForwardMode):
+        return _integrate(UnrolledDopri8(), inputs, keywords)
+    if isinstance(keywords["adjoint"], diffrax.RecursiveCheckpointAdjoint):
+        return _integrate_fast(inputs, keywords)
+    return _integrate(diffrax.Dopri8(), inputs, keywords)
+
+
 def simulate(
     linkage: Linkage,
     state0: State,
     ts: ArrayLike,
     forces: Forces = (),
     *,
-    solver: diffrax.AbstractSolver = diffrax.Dopri8(),
+    solver: diffrax.AbstractSolver | None = None,
     stepsize_controller: diffrax.AbstractStepSizeController | None = None,
     dt0: ArrayLike | None = 1e-3,
     adjoint: diffrax.AbstractAdjoint = diffrax.RecursiveCheckpointAdjoint(),
@@ -168,8 +226,9 @@ def simulate(
     - `solver`, `stepsize_controller`, `dt0`, `adjoint`, `max_steps`, `throw`,
       `progress_meter`: as in `diffrax.diffeqsolve`. By default Dopri8 at a relative
       and absolute tolerance of 1e-11 in float64, 1e-5 in float32, for which
-      `stepsize_controller=None` stands. The first step `dt0` is 1 ms, because
-      estimates of it fail from exact rest; `None` lets the controller estimate it.
+      `None` stands in both arguments. The first step `dt0`
+      is 1 ms, because estimates of it fail from exact rest; `None` lets the controller
+      estimate it.
       Reverse mode works with the default `adjoint`; for forward mode pass
       `diffrax.ForwardMode()`.
 
@@ -204,24 +263,24 @@ def simulate(
             "problems."
         )
     for name, value, kind in (
-        ("solver", solver, diffrax.AbstractSolver),
         ("adjoint", adjoint, diffrax.AbstractAdjoint),
         ("throw", throw, bool),
         ("progress_meter", progress_meter, diffrax.AbstractProgressMeter),
     ):
         instance(name, value, kind)
+    if solver is not None:
+        instance("solver", solver, diffrax.AbstractSolver)
     if stepsize_controller is None:
         stepsize_controller = adaptive(1e-11, 1e-5)
     instance(
         "stepsize_controller", stepsize_controller, diffrax.AbstractStepSizeController
     )
-    _warn_of_tolerance(stepsize_controller)
+    warn_of_tolerance(stepsize_controller)
     for element in forces:
         check = getattr(element, "check", None)
         if check is not None and not is_traced(linkage, ts, element):
             check(linkage, ts)
     keywords = dict(
-        solver=solver,
         stepsize_controller=stepsize_controller,
         dt0=dt0,
         adjoint=adjoint,
@@ -230,7 +289,7 @@ def simulate(
         progress_meter=progress_meter,
     )
     try:
-        return _solve(linkage, state0, ts, forces, keywords)
+        return _solve(solver, (linkage, state0, ts, forces), keywords)
     except TypeError as error:
         if "forward-mode" in str(error):
             raise TypeError(
@@ -240,7 +299,7 @@ def simulate(
         raise
 
 
-def _warn_of_tolerance(controller: diffrax.AbstractStepSizeController) -> None:
+def warn_of_tolerance(controller: diffrax.AbstractStepSizeController) -> None:
     dtype = jnp.result_type(float)
     for name in ("rtol", "atol"):
         tolerance = getattr(controller, name, None)

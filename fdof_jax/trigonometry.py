@@ -68,13 +68,6 @@ _INTEGER_BITS = {
 }
 
 
-def _two_sum(a: Array, b: Array) -> tuple[Array, Array]:
-    """The rounded sum of `a` and `b` and its exact error (Knuth)."""
-    total = a + b
-    b_part = total - a
-    return total, (a - (total - b_part)) + (b - b_part)
-
-
 def _horner(coefficients: tuple[float, ...], z: Array) -> Array:
     value = jnp.full_like(z, coefficients[0])
     for coefficient in coefficients[1:]:
@@ -86,11 +79,14 @@ def _polynomial_sincos(x: Array) -> tuple[Array, Array]:
     shift, integer, sign_shift = _INTEGER_BITS[x.dtype]
     part1, part2, part3, tail = _HALF_PI[x.dtype]
     quadrants = jax.lax.round(x * (2 / np.pi), jax.lax.RoundingMethod.TO_NEAREST_EVEN)
-    # Near a zero of the result all leading digits cancel: the errors of the two
-    # inexact subtractions are kept, so the remainder is right to half an ulp.
-    r, error2 = _two_sum(x - quadrants * part1, -quadrants * part2)
-    r, error3 = _two_sum(r, -quadrants * part3)
-    r = r + (error2 + error3 - quadrants * tail)
+    # The first three products are exact. Near a zero of the result the differences
+    # cancel and are exact too; elsewhere their roundings are kept (Dekker).
+    high = x - quadrants * part1
+    middle, low = quadrants * part2, quadrants * part3
+    difference = high - middle
+    r = difference - low
+    error = ((high - difference) - middle) + ((difference - r) - low)
+    r = r + (error - quadrants * tail)
     z = r * r
     sin_r = r + r * (z * _horner(_SIN[x.dtype], z))
     cos_r = (1 - 0.5 * z) + z * (z * _horner(_COS[x.dtype], z))

@@ -213,7 +213,6 @@ def test_forces_add_up():
     ("keyword", "value"),
     [
         ("solver", "dopri"),
-        ("solver", None),
         ("solver", diffrax.Tsit5),
         ("adjoint", None),
         ("stepsize_controller", 1e-6),

@@ -1,0 +1,276 @@
+"""fdof_jax and plain diffrax as contestants, and what all contestants have in common.
+
+Every contestant is made by a function of a `Problem`, which may hold one motion or a
+batch, and is run at a setting: a tolerance or a step.
+"""
+
+from collections.abc import Callable
+from functools import cache
+from typing import Any, NamedTuple
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import fdof_jax as fj
+
+from .measure import Case
+from .problems import Problem, controller
+
+MAX_STEPS = 65536
+DT0 = 1e-3  # estimates of the first step fail from exact rest
+
+
+class Motion(NamedTuple):
+    """What a run came to: at the output times (..., time, 3), and steps taken."""
+
+    q: Any
+    qd: Any = None
+    steps: Any = None
+    rejected: Any = None
+
+
+class Contestant(NamedTuple):
+    """A solver prepared for a problem: `run(setting)`, and `motion` of what it returns.
+
+    `motion` is not timed.
+    """
+
+    solver: str
+    kind: str
+    run: Callable[[float], Any]
+    motion: Callable[[Any], Motion]
+
+
+def cases(
+    contestant: Contestant,
+    settings: tuple,
+    exact: np.ndarray,
+    until: int | None = None,
+) -> list[Case]:
+    """One case per setting, judged by its worst position error at any output time.
+
+    `until` restricts that to the first output times; `error_end` has them all.
+    """
+
+    def judge(result: Any) -> dict:
+        motion = contestant.motion(result)
+        q = np.asarray(motion.q)
+        if q.shape[-2] < exact.shape[-2]:  # the start is not among its outputs
+            q = np.concatenate([exact[..., :1, :], q], axis=-2)
+        errors = np.abs(q - exact)
+        return {
+            "error": float(errors[..., :until, :].max()),
+            "error_end": float(errors.max()),
+            "steps": None if motion.steps is None else float(np.mean(motion.steps)),
+            "rejected": (
+                None if motion.rejected is None else float(np.mean(motion.rejected))
+            ),
+        }
+
+    return [
+        Case(
+            contestant.solver,
+            setting,
+            lambda setting=setting: contestant.run(setting),
+            judge,
+            contestant.kind,
+        )
+        for setting in settings
+    ]
+
+
+def _solution(solution: Any) -> Motion:
+    stats = solution.stats
+    return Motion(
+        solution.q,
+        solution.qd,
+        stats.get("num_accepted_steps"),
+        stats.get("num_rejected_steps"),
+    )
+
+
+@cache  # one compilation for all problems of one form
+def _simulate(
+    solver: diffrax.AbstractSolver | None, axes: tuple | None, fixed: bool, long: bool
+) -> Callable:
+    chosen: dict[str, Any] = {} if solver is None else {"solver": solver}
+    if long:
+        # No limit, and no checkpoints for a gradient that nobody takes.
+        chosen.update(max_steps=None, adjoint=diffrax.ForwardMode())
+
+    def run(linkage, state0, ts, forces, setting):
+        steps: dict[str, Any] = {"stepsize_controller": controller(setting)}
+        if fixed:
+            steps = {"stepsize_controller": diffrax.ConstantStepSize(), "dt0": setting}
+
+        def member(linkage, state0):
+            return fj.simulate(
+                linkage, state0, ts, forces, throw=False, **steps, **chosen
+            )
+
+        return _over(member, axes)(linkage, state0)
+
+    return jax.jit(run)
+
+
+def _over(member: Callable, axes: tuple | None) -> Callable:
+    return member if axes is None else jax.vmap(member, axes)
+
+
+def _arguments(problem: Problem) -> tuple:
+    return jax.tree.map(
+        jnp.asarray, (problem.linkage, problem.state0, problem.ts, problem.forces)
+    )
+
+
+def fdof_jax(
+    problem: Problem,
+    solver: diffrax.AbstractSolver | None = None,
+    fixed: bool = False,
+    long: bool = False,
+) -> Contestant:
+    """`simulate`, under `jax.vmap` for a batch; with its own default solver.
+
+    `fixed`: the setting is a fixed step; `long`: without a limit of steps.
+    """
+    run, arguments = _simulate(solver, problem.axes, fixed, long), _arguments(problem)
+    name = "fdof_jax" + ("" if solver is None else f" {type(solver).__name__}")
+    return Contestant(
+        name + (", fixed steps" if fixed else ""),
+        "step" if fixed else "tolerance",
+        lambda setting: run(*arguments, setting),
+        _solution,
+    )
+
+
+def sweep(problem: Problem) -> Contestant:
+    """`sweep` of a batch."""
+
+    def run(tolerance: float):
+        return fj.sweep(
+            problem.linkage,
+            problem.state0,
+            problem.ts,
+            problem.forces,
+            throw=False,
+            stepsize_controller=controller(tolerance),
+        )
+
+    return Contestant("fdof_jax sweep", "tolerance", run, _solution)
+
+
+class Form(NamedTuple):
+    """One way to write the equations: `field(t, y, (linkage, forces))`."""
+
+    name: str
+    field: Callable
+    start: Callable  # (linkage, state0) -> y
+    joints: Callable  # (linkage, y) -> q
+
+
+@cache
+def _plain_solve(form: Form, axes: tuple | None) -> Callable:
+    def run(linkage, state0, ts, forces, tolerance):
+        def member(linkage, state0):
+            solution = diffrax.diffeqsolve(
+                diffrax.ODETerm(form.field),
+                diffrax.Dopri8(),
+                ts[0],
+                ts[-1],
+                DT0,
+                form.start(linkage, state0),
+                (linkage, forces),
+                saveat=diffrax.SaveAt(ts=ts),
+                stepsize_controller=controller(tolerance),
+                max_steps=MAX_STEPS,
+                throw=False,
+            )
+            return Motion(
+                jax.vmap(form.joints, (None, 0))(linkage, solution.ys),
+                steps=solution.stats["num_accepted_steps"],
+                rejected=solution.stats["num_rejected_steps"],
+            )
+
+        return _over(member, axes)(linkage, state0)
+
+    return jax.jit(run)
+
+
+def _plain(problem: Problem, form: Form) -> Contestant:
+    """Dopri8 on a stacked state, under plain `jax.vmap` for a batch."""
+    run, arguments = _plain_solve(form, problem.axes), _arguments(problem)
+    return Contestant(
+        form.name,
+        "tolerance",
+        lambda tolerance: run(*arguments, tolerance),
+        lambda motion: motion,
+    )
+
+
+def _textbook_field(t, y, args):
+    """The triple pendulum of point masses in absolute angles, as in a textbook."""
+    linkage, _ = args
+    mass, length, gravity = linkage.mass, linkage.length[1:], linkage.gravity
+    angle, rate = jnp.cumsum(y[:3]), jnp.cumsum(y[3:])
+    beyond = jnp.cumsum(mass[::-1])[::-1]
+    shared = jnp.minimum(beyond[:, None], beyond[None, :])
+    inertia = shared * length[:, None] * length[None, :]
+    difference = angle[:, None] - angle[None, :]
+    matrix = inertia * jnp.cos(difference)
+    torque = -(inertia * jnp.sin(difference)) @ rate**2
+    torque -= gravity * beyond * length * jnp.cos(angle)
+    acceleration = jnp.linalg.solve(matrix, torque)
+    return jnp.concatenate([y[3:], jnp.diff(acceleration, prepend=0)])
+
+
+def _masked_field(t, y, args):
+    linkage, _ = args
+    x, xd = y[:6], y[6:]
+    return jnp.concatenate([xd, fj.masked_accelerations(linkage, x, xd, jnp.zeros(6))])
+
+
+def _masked_joints(linkage, y):
+    slide, turn = y[0:6:2], jnp.diff(y[1:6:2], prepend=linkage.base_angle)
+    return jnp.where(linkage.ef[1::2] > 0.5, turn, slide)
+
+
+def _reduced_field(t, y, args):
+    linkage, forces = args
+    q, qd = y[:3], y[3:]
+    tau = sum((element(t, q, qd, linkage) for element in forces), jnp.zeros(3))
+    return jnp.concatenate([qd, fj.forward_dynamics(linkage, q, qd, tau)])
+
+
+def _stacked(linkage, state0):
+    return jnp.concatenate([state0.q, state0.qd])
+
+
+def _first_three(linkage, y):
+    return y[:3]
+
+
+textbook_form = Form("plain diffrax", _textbook_field, _stacked, _first_three)
+masked_form = Form(
+    "plain diffrax, masked 6x6",
+    _masked_field,
+    lambda linkage, state0: jnp.concatenate(fj.to_chain(linkage, *state0)),
+    _masked_joints,
+)
+reduced_form = Form("plain diffrax, reduced", _reduced_field, _stacked, _first_three)
+
+
+def plain_textbook(problem: Problem) -> Contestant:
+    """For Fig 5's arm only: no word of the library in it."""
+    return _plain(problem, textbook_form)
+
+
+def plain_masked(problem: Problem) -> Contestant:
+    """The published form, without force elements: 12 states, the masked equations."""
+    return _plain(problem, masked_form)
+
+
+def plain_reduced(problem: Problem) -> Contestant:
+    """The library's own accelerations, stacked, with its force elements."""
+    return _plain(problem, reduced_form)

@@ -1,0 +1,85 @@
+"""Long runs: the energy drift of Fig 5 over 1000 s against the time spent.
+
+Double precision follows this chaotic motion for 25 s; beyond, energy is what can be
+judged. It is zero; the defect is the largest |E| [J] at a thousand output times.
+"""
+
+from collections.abc import Iterator
+from functools import partial
+from typing import Any
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import fdof_jax as fj
+
+from . import contestants as own, peers
+from .contestants import Contestant
+from .measure import Case, Skipped, measure, skipped
+from .problems import Problem, fig5
+
+PROTOCOL = "drift"
+TSIT5 = diffrax.Tsit5()
+DOPRI8 = diffrax.Dopri8()
+TABLE = (
+    ("fdof_jax", own.fdof_jax, (1e-11, 1e-12, 1e-13)),
+    ("fdof_jax, fixed steps", partial(own.fdof_jax, fixed=True), (5e-3, 2.5e-3)),
+    (
+        "fdof_jax Dopri8, fixed steps",
+        partial(own.fdof_jax, solver=DOPRI8, fixed=True),
+        (2.5e-3,),
+    ),
+    ("fdof_jax Tsit5", partial(own.fdof_jax, solver=TSIT5), (1e-11,)),
+    (
+        "fdof_jax Tsit5, fixed steps",
+        partial(own.fdof_jax, solver=TSIT5, fixed=True),
+        (1e-3,),
+    ),
+    ("C order 8", partial(peers.native, method="order 8"), (5e-3, 2.5e-3, 1.25e-3)),
+    ("heyoka", peers.heyoka, (1e-9, 1e-12, 1e-15)),
+    ("MuJoCo RK4", partial(peers.mujoco, integrator="RK4"), (5e-3, 2.5e-3)),
+)
+
+
+@jax.jit
+def _energy(linkage: fj.Linkage, q: jax.Array, qd: jax.Array) -> jax.Array:
+    kinetic, potential = jax.vmap(fj.energy, (None, 0, 0))(linkage, q, qd)
+    return kinetic + potential
+
+
+def _judge(problem: Problem, contestant: Contestant, result: Any) -> dict:
+    motion = contestant.motion(result)
+    q, qd = jnp.asarray(motion.q), jnp.asarray(motion.qd)
+    defect = float(jnp.max(jnp.abs(_energy(problem.linkage, q, qd))))
+    # A tenth of a joule is the failure here that a tenth of a radian is elsewhere.
+    return {"error": defect, "energy_defect": defect}
+
+
+def run(quick: bool) -> Iterator[dict]:
+    horizon = 20 if quick else 1000
+    ts = np.linspace(0, horizon, horizon + 1)
+    problem = fig5()._replace(name=f"fig5-{horizon}s", ts=ts)
+    prepared = []
+    for name, make, settings in TABLE:
+        long = {"long": True} if name.startswith("fdof_jax") else {}
+        try:
+            contestant = make(problem, **long)
+        except Skipped as reason:
+            yield skipped(PROTOCOL, name, str(reason))
+            continue
+        judge = partial(_judge, problem, contestant)
+        prepared += [
+            Case(name, s, partial(contestant.run, s), judge, contestant.kind)
+            for s in settings
+        ]
+    yield from measure(
+        PROTOCOL,
+        prepared,
+        budget=5 if quick else 60,
+        rounds=5,
+        ratio_to="fdof_jax",
+        problem=problem.name,
+        horizon=horizon,
+    )

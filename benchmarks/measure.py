@@ -1,0 +1,257 @@
+"""Interleaved timing, and the records that come of it.
+
+A `Case` is one contestant at one setting. `measure` runs all cases in turn, round after
+round, so that whatever else the machine does falls on all of them alike; ratios are
+taken within a round. A result is judged once, by its error, before anything is timed.
+"""
+
+import math
+import os
+import platform
+import subprocess
+import time
+from collections.abc import Callable, Iterator, Sequence
+from functools import cache
+from importlib import metadata
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+SAMPLE = 0.02  # least work per sample [s]
+LONG = 1.0  # calls of this length [s] are measured in fewer rounds
+ENDLESS = 30.0  # first calls of this length [s] are not repeated to learn their length
+FEWEST, FEW, MANY = 3, 5, 15  # rounds: under any budget, of long calls, of the rest
+WORST_ERROR = 0.1  # a larger error is a failure, not a result
+TARGETS = (1e-3, 1e-6, 1e-9, 1e-12)
+
+
+class Skipped(Exception):
+    """A contestant that is not at hand; the message says what is missing."""
+
+
+class Case(NamedTuple):
+    """A contestant at one setting.
+
+    - `run`: does the work once; what it returns is waited for.
+    - `judge`: from what `run` returned to what is known of it: `error`, and as it may
+      be `energy_defect`, `steps`, `rejected`, `status`.
+    - `fields`: what else its record shall say.
+    """
+
+    solver: str
+    setting: float | None
+    run: Callable[[], Any]
+    judge: Callable[[Any], dict] = lambda result: {"error": None}
+    kind: str = "tolerance"
+    fields: dict = {}
+
+
+RECORD = {
+    "protocol": None,
+    "problem": None,
+    "solver": None,
+    "kind": None,  # of the setting: tolerance or step
+    "setting": None,
+    "steps": None,
+    "rejected": None,
+    "error": None,
+    "energy_defect": None,
+    "time_min": None,
+    "time_median": None,
+    "time_quartiles": None,
+    "times": None,  # one per round
+    "ratio": None,
+    "ratio_quartiles": None,
+    "ratio_to": None,
+    "batch": 1,
+    "dtype": None,
+    "gradient_mode": None,
+    "compile_time": None,
+    "status": "ok",
+    "reason": None,
+}
+
+
+def record(**fields: Any) -> dict:
+    """A complete record: one JSON line."""
+    dtype = "float64" if jax.config.jax_enable_x64 else "float32"
+    return {**RECORD, "dtype": dtype, **environment(), **fields}
+
+
+def skipped(protocol: str, solver: str, reason: str) -> dict:
+    print(f"{protocol}: {solver} skipped: {reason}", flush=True)
+    return record(protocol=protocol, solver=solver, status="skipped", reason=reason)
+
+
+def _timed(run: Callable[[], Any]) -> tuple[float, Any]:
+    began = time.perf_counter()
+    result = jax.block_until_ready(run())
+    return time.perf_counter() - began, result
+
+
+def _verdict(case: Case, result: Any) -> dict:
+    known = case.judge(result)
+    error = known.get("error")
+    if known.get("status", "ok") == "ok" and error is not None:
+        if not error <= WORST_ERROR:  # NaN included
+            known = {**known, "status": "failed", "reason": f"error {error:.3g}"}
+    return known
+
+
+def measure(
+    protocol: str,
+    cases: Sequence[Case],
+    *,
+    budget: float,
+    rounds: int = MANY,
+    ratio_to: str | None = None,
+    equal_error: bool = True,
+    **fields: Any,
+) -> list[dict]:
+    """Records of all cases. Failed ones are not timed.
+
+    **Arguments:**
+
+    - `budget`: time after which no round begins, but for the first three [s].
+    - `ratio_to`: the solver whose time divides those of the others, in each round: at
+      the case's own error, or with `equal_error` off, its only case.
+    - `fields`: what all records have in common.
+    """
+    points, running = [], []
+    for case in cases:
+        point = record(
+            protocol=protocol,
+            solver=case.solver,
+            setting=case.setting,
+            kind=case.kind,
+            **{**fields, **case.fields},
+        )
+        points.append(point)
+        try:
+            first, result = _timed(case.run)
+            point.update(_verdict(case, result))
+            again = first if first > ENDLESS else _timed(case.run)[0]
+        except Exception as failure:  # a peer may raise anything: it has failed
+            point.update(status="failed", reason=f"{type(failure).__name__}: {failure}")
+            point["reason"] = point["reason"].split("\n")[0][:200]
+        else:
+            if again != first:
+                point["compile_time"] = max(0.0, first - again)
+        if point["status"] != "ok":
+            setting = "" if case.setting is None else f" at {case.setting:g}"
+            print(f"{protocol}: {case.solver}{setting} failed: {point['reason']}")
+            continue
+        point["times"] = []
+        calls = max(1, math.ceil(SAMPLE / again))
+        running.append((case, point, calls, min(rounds, FEW if again > LONG else MANY)))
+    began = time.perf_counter()
+    for done in range(rounds):
+        if done >= FEWEST and time.perf_counter() - began > budget:
+            break
+        for case, point, calls, most in running:
+            if done < most:
+                start = time.perf_counter()
+                for _ in range(calls):
+                    jax.block_until_ready(case.run())
+                point["times"].append((time.perf_counter() - start) / calls)
+    for point in points:
+        if point["times"]:
+            low, median, high = np.percentile(point["times"], [25, 50, 75])
+            point["time_min"] = min(point["times"])
+            point["time_median"] = median
+            point["time_quartiles"] = [low, high]
+    if ratio_to is not None:
+        _add_ratios(points, ratio_to, equal_error)
+    return points
+
+
+def _add_ratios(points: list[dict], ratio_to: str, equal_error: bool) -> None:
+    baseline = [p for p in points if p["solver"] == ratio_to and p["times"]]
+    for point in points:
+        if not point["times"] or not baseline:
+            continue
+        if equal_error:
+            against = times_at(baseline, point["error"])
+        else:
+            against = np.array(baseline[0]["times"])
+        if against is None:
+            continue
+        shared = min(len(against), len(point["times"]))
+        ratio = np.array(point["times"][:shared]) / against[:shared]
+        low, median, high = np.percentile(ratio, [25, 50, 75])
+        point.update(ratio=median, ratio_quartiles=[low, high], ratio_to=ratio_to)
+
+
+def envelope(errors: Sequence[float], times: Sequence[float], error: float) -> float:
+    """The least time for an error, between measured points on logarithmic axes.
+
+    Only points count that no other beats in both. Looser than the loosest of them, its
+    time stands, an upper bound; tighter than the tightest was not reached: NaN.
+    """
+    front: list[tuple[float, float]] = []
+    for e, t in sorted(zip(errors, times)):  # from the tightest: each must be faster
+        if not front or t < front[-1][1]:
+            front.append((e, t))
+    if not front or not error >= front[0][0]:
+        return math.nan
+    # An error of exactly zero has no logarithm; far below any target is enough.
+    e, t = np.log(np.maximum(np.array(front), 1e-300)).T
+    return float(np.exp(np.interp(np.log(max(error, 1e-300)), e, t)))
+
+
+def times_at(points: list[dict], error: float) -> np.ndarray | None:
+    """Per round, the time of one solver at an error; None where it was not reached."""
+    good = [p for p in points if p["status"] == "ok" and p["times"]]
+    if not good or error is None:
+        return None
+    rounds = min(len(p["times"]) for p in good)
+    errors = [p["error"] for p in good]
+    walls = [envelope(errors, [p["times"][i] for p in good], error)
+             for i in range(rounds)]  # fmt: skip
+    return None if np.isnan(walls).any() else np.array(walls)
+
+
+@cache
+def environment() -> dict:
+    """Where and with what: the same for all records of a process."""
+    names = ("jax", "jaxlib", "diffrax", "numpy", "scipy", "numba", "mujoco",
+             "mujoco-mjx", "heyoka")  # fmt: skip
+    versions = {"python": platform.python_version()}
+    for name in names:
+        try:
+            versions[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            versions[name] = None
+    cpu = next(_cpu_models(), platform.processor())
+    return {
+        "cores": len(os.sched_getaffinity(0)),
+        "device": jax.devices()[0].platform,
+        "device_kind": jax.devices()[0].device_kind,
+        "versions": versions,
+        "cpu": cpu,
+        "load": os.getloadavg()[0],
+        "commit": _git("describe", "--always", "--dirty"),
+    }
+
+
+def _cpu_models() -> Iterator[str]:
+    info = Path("/proc/cpuinfo")
+    for line in info.read_text().splitlines() if info.exists() else ():
+        if line.startswith("model name"):
+            yield line.split(":", 1)[1].strip()
+
+
+def _git(*arguments: str) -> str | None:
+    try:
+        output = subprocess.run(
+            ["git", *arguments],
+            capture_output=True,
+            text=True,
+            cwd=Path(__file__).parent,
+            check=True,
+        )
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return output.stdout.strip()

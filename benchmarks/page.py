@@ -1,0 +1,241 @@
+"""The tables of the results page, from the JSON lines."""
+
+import re
+from collections.abc import Callable, Iterable
+
+import numpy as np
+
+from .measure import TARGETS, times_at
+from .scaling import slope
+from .targets import targets
+
+
+def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
+    head = list(head)
+    lines = [head, ["---"] * len(head), *(list(row) for row in rows)]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def number(value: float | None, digits: int = 2) -> str:
+    """To some digits, with powers of ten only where they help."""
+    if value is None or value != value:
+        return "-"
+    if value == 0 or 1e-2 <= abs(value) < 1e4:
+        return f"{float(f'{value:.{digits}g}'):g}"
+    return f"{value:.{digits - 1}e}".replace("e-0", "e-").replace("e+0", "e")
+
+
+def _solvers(points: list[dict]) -> list[str]:
+    return list(dict.fromkeys(p["solver"] for p in points))
+
+
+def _read_off(points: list[dict], to_value: Callable, sign: str) -> list[str]:
+    """A cell per target error; `sign` marks bounds: no looser point was measured."""
+    cells = []
+    loosest = max((p["error"] for p in points if p["times"]), default=0)
+    for target in TARGETS:
+        walls = times_at(points, target)
+        if walls is None:
+            cells.append("-")
+        else:
+            bound = f"{sign} " if target > loosest else ""
+            cells.append(bound + number(to_value(float(np.median(walls)))))
+    return cells
+
+
+_ERRORS = [f"{target:g}" for target in TARGETS]
+
+
+def _by_solver(points: list[dict], to_value: Callable, sign: str) -> str:
+    rows = []
+    for solver in _solvers([p for p in points if p["status"] != "skipped"]):
+        own = [p for p in points if p["solver"] == solver]
+        first = max((p["compile_time"] or 0 for p in own), default=0)
+        failed = [f"{p['setting']:g}" for p in own if p["status"] == "failed"]
+        rows.append(
+            [solver, *_read_off(own, to_value, sign), number(first), ", ".join(failed)]
+        )
+    text = table(["", *_ERRORS, "compile [s]", "failed at"], rows)
+    skips = [p for p in points if p["status"] == "skipped"]
+    return text + "".join(f"\n\nSkipped: {p['solver']}: {p['reason']}." for p in skips)
+
+
+def batches(points: list[dict]) -> str:
+    parts = []
+    for batch in dict.fromkeys(p["batch"] for p in points if p["status"] != "skipped"):
+        own = [p for p in points if p["batch"] == batch and p["status"] != "skipped"]
+        simulated = next((p["simulated"] for p in own if "simulated" in p), None)
+        text = _by_solver(own, lambda wall, s=simulated: s / wall, "≥")
+        parts.append(
+            f"Batch of {batch}, simulated s per s at a worst error of:\n\n{text}"
+        )
+    parts += [
+        f"Skipped: {p['solver']}: {p['reason']}."
+        for p in points
+        if p["status"] == "skipped"
+    ]
+    return "\n\n".join(dict.fromkeys(parts))
+
+
+def trajectory(points: list[dict]) -> str:
+    parts = []
+    for problem in dict.fromkeys(p["problem"] for p in points):
+        own = [p for p in points if p["problem"] == problem]
+        motions = next((p["motions"] for p in own if "motions" in p), 1)
+        text = _by_solver(own, lambda wall, m=motions: 1e3 * wall / m, "≤")
+        parts.append(f"{problem}, ms per motion at an error of:\n\n{text}")
+    return "\n\n".join(parts)
+
+
+def _ratio(point: dict) -> list[str]:
+    quartiles = point["ratio_quartiles"] or [None, None]
+    return [number(point["ratio"], 3), " to ".join(number(q, 3) for q in quartiles)]
+
+
+def generality(points: list[dict]) -> str:
+    rows = [
+        [
+            p["problem"],
+            p["solver"],
+            number(1e9 * p["time_median"] / p["member_steps"], 3),
+            *_ratio(p),
+        ]
+        for p in points
+        if p["times"]
+    ]
+    head = ["problem", "equations", "ns per member and step", "ratio", "quartiles"]
+    return table(head, rows)
+
+
+def gradients(points: list[dict]) -> str:
+    rows = [
+        [
+            p["problem"],
+            str(p["parameters"]),
+            str(p["batch"]),
+            f"{p['horizon']:g}",
+            number(p["setting"]),
+            number(p["longest_step"]),
+            p["gradient_mode"],
+            number(p["time_median"] and 1e3 * p["time_median"], 3),
+            *_ratio(p),
+            number(p["error"]),
+            number(p["compile_time"]),
+            p["reason"] or "",
+        ]
+        for p in points
+    ]
+    head = [
+        "parameters", "number", "batch", "horizon [s]", "tolerance",
+        "steps up to [s]", "mode", "ms",
+        "over forward", "quartiles", "gradient error", "compile [s]", "failed",
+    ]  # fmt: skip
+    return table(head, rows)
+
+
+def compile_times(points: list[dict]) -> str:
+    rows = [
+        [p["problem"], p["solver"], number(p["time_median"]), p["reason"] or ""]
+        for p in points
+    ]
+    return table(["what", "", "s", "failed"], rows)
+
+
+def scaling(points: list[dict]) -> str:
+    rows = []
+    for series in dict.fromkeys(p["problem"] for p in points):
+        own = [p for p in points if p["problem"] == series and p["times"]]
+        exponent = slope(own)
+        spans = " to ".join(number(p["x"]) for p in (own[0], own[-1])) if own else "-"
+        rows.append(
+            ["1/error" if series == "error" else series, spans, number(exponent)]
+        )
+    return table(["time against", "from", "exponent"], rows)
+
+
+def drift(points: list[dict]) -> str:
+    rows = [
+        [
+            p["solver"],
+            f"{p['kind']} {p['setting']:g}" if p["setting"] else "",
+            number(p["time_median"], 3),
+            number(p["energy_defect"]),
+            p["reason"] or "",
+        ]
+        for p in points
+    ]
+    return table(["", "setting", "s", "largest energy error [J]", "failed"], rows)
+
+
+def lockstep(points: list[dict]) -> str:
+    rows = [
+        [
+            p["solver"],
+            number(p["time_median"] and 1e3 * p["time_median"], 3),
+            *_ratio(p),
+            number(p["steps"], 3),
+            number(p.get("steps_max"), 4),
+            number(p.get("waste")),
+            p["reason"] or "",
+        ]
+        for p in points
+    ]
+    head = [
+        "",
+        "ms",
+        "over clean",
+        "quartiles",
+        "mean steps",
+        "most",
+        "most/mean",
+        "failed",
+    ]
+    return table(head, rows)
+
+
+def _machine(points: dict[str, list[dict]]) -> str:
+    one = next(p for job in points.values() for p in job)
+    versions = ", ".join(f"{k} {v}" for k, v in one["versions"].items() if v)
+    return f"{one['cpu']}; {versions}; commit {one['commit']}."
+
+
+_NOT_MEASURED = "Not measured: no GPU was at hand."
+
+
+def _gpu(points: list[dict]) -> str:
+    measured = [p for p in points if p["status"] != "skipped"]
+    return batches(measured) if measured else _NOT_MEASURED
+
+
+def tables(points: dict[str, list[dict]]) -> dict[str, str]:
+    """Text by name, for what has been measured."""
+    makers = {
+        "batches": batches,
+        "batches-two-cores": batches,
+        "batches-float32": batches,
+        "batches-gpu": _gpu,
+        "batches-gpu-float32": _gpu,
+        "mixed": batches,
+        "trajectory": trajectory,
+        "generality": generality,
+        "gradients": gradients,
+        "compile_times": compile_times,
+        "scaling": scaling,
+        "drift": drift,
+        "lockstep": lockstep,
+    }
+    texts = {name: makers[name](own) for name, own in points.items() if own}
+    if texts:
+        rows = [[*map(str, row)] for row in targets(points, number)]
+        head = ["figure", "measured", "quartiles", "required", "aim for"]
+        texts = {"targets": table(head, rows), "machine": _machine(points), **texts}
+    return texts
+
+
+def filled(page: str, texts: dict[str, str]) -> str:
+    """The page with each text between its pair of markers."""
+    for name, text in texts.items():
+        begin, end = f"<!-- begin: {name} -->", f"<!-- end: {name} -->"
+        between = re.compile(re.escape(begin) + ".*?" + re.escape(end), re.DOTALL)
+        page = between.sub(lambda _, t=text, b=begin, e=end: f"{b}\n\n{t}\n\n{e}", page)
+    return page

@@ -1,0 +1,267 @@
+"""Other engines as contestants: SciPy, MuJoCo, MJX, heyoka and the C kernel.
+
+Each raises `Skipped` where it is not installed or cannot take the problem.
+"""
+
+import importlib
+import math
+import os
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import fdof_jax as fj
+
+from .chain import make_rates
+from .contestants import DT0, MAX_STEPS, Contestant, Motion
+from .measure import Skipped
+from .native import Kernel
+from .problems import Problem
+
+
+def _module(name: str) -> Any:
+    try:
+        return importlib.import_module(name)
+    except ImportError:
+        raise Skipped(f"{name} is not installed") from None
+
+
+def _one_free_arm(problem: Problem) -> None:
+    if problem.forces:
+        raise Skipped("no force elements")
+    if problem.batch and problem.axes[0] == 0:
+        raise Skipped("one arm only, not a batch of different ones")
+
+
+def _threads() -> int:
+    return len(os.sched_getaffinity(0))
+
+
+def _steps(problem: Problem, step: float) -> int:
+    """Steps between two output times, which must be whole."""
+    between = float(problem.ts[1] - problem.ts[0])
+    count = round(between / step)
+    if not math.isclose(count * step, between, rel_tol=1e-9):
+        raise ValueError(f"{step} s does not divide {between} s")
+    return count
+
+
+_COMPILED: dict[str, tuple] = {}
+
+
+def _scalar_rates(problem: Problem) -> tuple:
+    """The equations in plain floats, and what runs them; compiled once per problem."""
+    if problem.name not in _COMPILED:
+        rates, language = make_rates(problem.linkage, math.sin, math.cos), "Python"
+        try:
+            rates, language = importlib.import_module("numba").njit(rates), "numba"
+        except ImportError:
+            pass
+        _COMPILED[problem.name] = rates, language
+    return _COMPILED[problem.name]
+
+
+def scipy(problem: Problem, method: str) -> Contestant:
+    """`solve_ivp` on a right-hand side compiled by numba where it is installed."""
+    _one_free_arm(problem)
+    if problem.batch is not None:
+        raise Skipped("no batches")
+    integrate = _module("scipy.integrate")
+    rates, language = _scalar_rates(problem)
+
+    def run(tolerance: float) -> Any:
+        return integrate.solve_ivp(
+            lambda t, y: rates(*y),
+            (problem.ts[0], problem.ts[-1]),
+            np.concatenate([problem.state0.q, problem.state0.qd]),
+            method=method,
+            t_eval=problem.ts,
+            rtol=max(tolerance, 1e-13),
+            atol=tolerance,
+            first_step=DT0,
+        )
+
+    def motion(result: Any) -> Motion:
+        if not result.success:
+            return Motion(np.full((len(problem.ts), 3), np.nan))
+        return Motion(result.y[:3].T)
+
+    return Contestant(f"SciPy {method}, {language}", "tolerance", run, motion)
+
+
+def mujoco(problem: Problem, integrator: str) -> Contestant:
+    """MuJoCo's own rollout in C; `integrator`: Euler, implicitfast or RK4."""
+    _one_free_arm(problem)
+    mj, rollout = _module("mujoco"), _module("mujoco.rollout")
+    model = mj.MjModel.from_xml_string(fj.to_mjcf(problem.linkage))
+    kind = {"Euler": "EULER", "implicitfast": "IMPLICITFAST", "RK4": "RK4"}[integrator]
+    model.opt.integrator = getattr(mj.mjtIntegrator, f"mjINT_{kind}")
+    q, qd = (np.atleast_2d(a) for a in problem.state0)
+    # Full physics state: time, positions, velocities.
+    start = np.concatenate([np.zeros((len(q), 1)), q, qd], axis=1)
+    data = [mj.MjData(model) for _ in range(min(_threads(), len(q)))]
+    single = problem.batch is None
+
+    def run(step: float) -> Any:
+        model.opt.timestep = step
+        every = _steps(problem, step)
+        count = every * (len(problem.ts) - 1)
+        states, _ = rollout.rollout(model, data, start, nstep=count)
+        return states[:, every - 1 :: every, 1:7]
+
+    def motion(states: np.ndarray) -> Motion:
+        states = states[0] if single else states
+        return Motion(states[..., :3], states[..., 3:])
+
+    return Contestant(f"MuJoCo {integrator}", "step", run, motion)
+
+
+def mjx_rk4(problem: Problem) -> Contestant:
+    """MuJoCo's JAX port with its RK4, the step a traced number."""
+    _one_free_arm(problem)
+    mj, mjx = _module("mujoco"), _module("mujoco.mjx")
+    model = mj.MjModel.from_xml_string(fj.to_mjcf(problem.linkage))
+    model.opt.integrator = mj.mjtIntegrator.mjINT_RK4
+    model = mjx.put_model(model)
+    blank = mjx.make_data(model)
+    q, qd = (jnp.atleast_2d(jnp.asarray(a)) for a in problem.state0)
+    single, saves = problem.batch is None, len(problem.ts) - 1
+
+    @jax.jit
+    def solve(q, qd, step, every):
+        stepped = model.tree_replace({"opt.timestep": step})
+
+        def member(q, qd):
+            def save(data, _):
+                data = jax.lax.fori_loop(
+                    0, every, lambda _, d: mjx.step(stepped, d), data
+                )
+                return data, data.qpos
+
+            return jax.lax.scan(save, blank.replace(qpos=q, qvel=qd), length=saves)[1]
+
+        return member(q[0], qd[0]) if single else jax.vmap(member)(q, qd)
+
+    return Contestant(
+        "MJX RK4",
+        "step",
+        lambda step: solve(q, qd, jnp.asarray(step), _steps(problem, step)),
+        Motion,
+    )
+
+
+def _symbolic(hy: Any, problem: Problem) -> list:
+    variables = hy.make_vars("q1", "q2", "q3", "u1", "u2", "u3")
+
+    def of(symbolic: Any, number: Any) -> Any:
+        # Angles that no joint turns are plain numbers.
+        return lambda x: symbolic(x) if isinstance(x, hy.expression) else number(x)
+
+    rates = make_rates(problem.linkage, of(hy.sin, math.sin), of(hy.cos, math.cos))
+    return list(zip(variables, rates(*variables)))
+
+
+def extended(problem: Problem) -> np.ndarray:
+    """Positions at the output times by heyoka in 80-bit numbers: a reference."""
+    _one_free_arm(problem)
+    hy = _module("heyoka")
+    wide = np.longdouble
+    if np.finfo(wide).nmant < 63:
+        raise Skipped("no 80-bit numbers here")
+    start = np.concatenate([problem.state0.q, problem.state0.qd]).astype(wide)
+    integrator = hy.taylor_adaptive(
+        _symbolic(hy, problem), start, fp_type=wide, tol=wide(1e-19)
+    )
+    ts = problem.ts.astype(wide)
+    integrator.propagate_until(ts[0] + wide(DT0))
+    grid = np.concatenate([[integrator.time], ts[1:]])
+    states = integrator.propagate_grid(grid)[-1]
+    states[0] = start
+    return states[:, :3].astype(float)
+
+
+def heyoka(problem: Problem) -> Contestant:
+    """Adaptive Taylor series compiled by LLVM; a batch by several members at a time."""
+    _one_free_arm(problem)
+    hy = _module("heyoka")
+    system = _symbolic(hy, problem)
+    q, qd = (np.atleast_2d(a) for a in problem.state0)
+    start = np.concatenate([q, qd], axis=1).T
+    begin, first, ts = problem.ts[0], problem.ts[0] + DT0, problem.ts[1:]
+    single = problem.batch is None
+    lanes = 1 if single else min(8, start.shape[1])
+    if start.shape[1] % lanes:
+        raise Skipped(f"batches that {lanes} does not divide")
+    threads = _threads()
+
+    @cache
+    def prepared(tolerance: float) -> list:
+        if single:
+            return [hy.taylor_adaptive(system, start[:, 0].copy(), tol=tolerance)]
+        block = start[:, :lanes].copy()
+        one = hy.taylor_adaptive_batch(system, block, tol=tolerance)
+        return [one, *(one.__deepcopy__({}) for _ in range(threads - 1))]
+
+    def run_single(tolerance: float) -> np.ndarray:
+        (integrator,) = prepared(tolerance)
+        integrator.time = begin
+        integrator.state[:] = start[:, 0]
+        # From exact rest the estimate of the first step fails.
+        integrator.propagate_until(first)
+        grid = np.concatenate([[first], ts])
+        return integrator.propagate_grid(grid)[-1][1:]
+
+    def blocks(integrator: Any, numbers: range, ends: np.ndarray) -> None:
+        for number in numbers:
+            members = slice(number * lanes, (number + 1) * lanes)
+            integrator.set_time(begin)
+            integrator.state[:] = start[:, members]
+            integrator.propagate_until(ts[-1], max_steps=MAX_STEPS)
+            ends[members, 0] = integrator.state.T
+
+    def run_batch(tolerance: float) -> np.ndarray:
+        ends = np.empty((start.shape[1], 1, 6))
+        integrators = prepared(tolerance)
+        number = start.shape[1] // lanes
+        if threads == 1:
+            blocks(integrators[0], range(number), ends)
+        else:
+            with ThreadPoolExecutor(threads) as pool:
+                shares = [range(i, number, threads) for i in range(threads)]
+                list(pool.map(blocks, integrators, shares, [ends] * threads))
+        return ends
+
+    return Contestant(
+        "heyoka",
+        "tolerance",
+        run_single if single else run_batch,
+        lambda states: Motion(states[..., :3], states[..., 3:]),
+    )
+
+
+def native(problem: Problem, method: str) -> Contestant:
+    """The C kernel: "RK4" or "order 8"."""
+    _one_free_arm(problem)
+    kernel = Kernel(
+        method,
+        problem.linkage,
+        np.asarray(problem.state0.q),
+        np.asarray(problem.state0.qd),
+        threads=_threads(),
+    )
+    saves = len(problem.ts) - 1
+
+    def motion(saved: np.ndarray) -> Motion:
+        q, qd = kernel.joints(saved)
+        return Motion(q[0], qd[0]) if problem.batch is None else Motion(q, qd)
+
+    return Contestant(
+        f"C {method}",
+        "step",
+        lambda step: kernel(step, _steps(problem, step), saves),
+        motion,
+    )

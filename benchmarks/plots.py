@@ -1,0 +1,184 @@
+"""Plots of the results: error along x, what it costs along y."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
+
+from .measure import times_at
+
+# Okabe and Ito's colours, told apart with any colour vision; markers differ as well.
+COLORS = ("#000000", "#E69F00", "#56B4E9", "#009E73", "#D55E00", "#0072B2", "#CC79A7",
+          "#999999")  # fmt: skip
+MARKERS = "osD^v<>PX*ph"
+WIDTH = 6.3  # of a text column [inch]
+
+
+# In this order, so that a solver looks the same in all plots.
+ORDER = (
+    "fdof_jax", "fdof_jax sweep", "plain diffrax", "heyoka", "MuJoCo RK4", "C order 8",
+    "C RK4", "fdof_jax Tsit5", "fdof_jax Dopri8", "SciPy DOP853", "SciPy LSODA",
+    "MJX RK4", "MuJoCo Euler", "MuJoCo implicitfast", "fdof_jax Kvaerno5",
+    "plain diffrax, masked 6x6",
+)  # fmt: skip
+
+
+def _style(solver: str, index: int) -> dict:
+    plain = solver.split(", numba")[0].split(", reduced")[0].split(", fixed")[0]
+    if plain in ORDER:
+        index = ORDER.index(plain)
+    return {
+        "color": COLORS[index % len(COLORS)],
+        "marker": MARKERS[index % len(MARKERS)],
+        "linestyle": "--" if "fixed" in solver else "-",
+        "linewidth": 1.8 if solver.startswith("fdof_jax") else 1.0,
+        "markersize": 4,
+    }
+
+
+def _solvers(points: list[dict]) -> list[str]:
+    return list(dict.fromkeys(p["solver"] for p in points if p["status"] != "skipped"))
+
+
+def _axes(panels: int, height: float = 3.4):
+    figure = Figure(figsize=(WIDTH, height), layout="constrained")
+    return figure, figure.subplots(1, panels, squeeze=False)[0]
+
+
+def _save(figure, path: Path) -> None:
+    """With one legend for all panels, below them."""
+    entries = {}
+    for axis in figure.axes:
+        for handle, label in zip(*axis.get_legend_handles_labels()):
+            entries.setdefault(label, handle)
+    if entries:
+        figure.legend(
+            entries.values(), entries, loc="outside lower center", ncols=3, fontsize=7
+        )
+    figure.savefig(path, dpi=160)
+
+
+def _curves(axis, points: list[dict], height: Callable[[dict], float]) -> None:
+    """One line per solver; the legend names those of which every run failed."""
+    for index, solver in enumerate(_solvers(points)):
+        own = [p for p in points if p["solver"] == solver]
+        good = [p for p in own if p["times"] and p["error"]]
+        failed = sum(p["status"] == "failed" for p in own)
+        name = solver.split(", numba")[0].split(", reduced")[0]
+        label = name + (f" ({failed} failed)" if failed and not good else "")
+        good.sort(key=lambda p: p["error"])
+        axis.loglog(
+            [p["error"] for p in good],
+            [height(p) for p in good],
+            label=label,
+            **_style(solver, index),
+        )
+    axis.invert_xaxis()
+    axis.grid(alpha=0.3)
+    axis.xaxis.set_minor_formatter(NullFormatter())
+
+
+def trajectory(points: list[dict], path: Path) -> None:
+    titles = {"fig5-error-to-2s": "Fig 5, 10 s", "random": "random arms, 2 s"}
+    figure, axes = _axes(2, height=4.4)
+    for axis, (problem, title) in zip(axes, titles.items()):
+        own = [p for p in points if p["problem"] == problem]
+        _curves(axis, own, lambda p: 1e3 * p["time_median"] / p["motions"])
+        axis.set_title(title, fontsize=9)
+        axis.set_xlabel("largest joint error [rad or m]")
+    axes[0].set_xlabel("largest joint error up to 2 s [rad]")
+    axes[0].set_ylabel("time per motion [ms]")
+    _save(figure, path)
+
+
+def batches(points: list[dict], path: Path) -> None:
+    """Throughput against error at one size, and against the size at one error."""
+    figure, (left, right) = _axes(2, height=4.2)
+    sizes = sorted({p["batch"] for p in points if p["status"] != "skipped"})
+    size = 1024 if 1024 in sizes else sizes[-1]
+    own = [p for p in points if p["batch"] == size]
+    _curves(left, own, lambda p: p["simulated"] / p["time_median"])
+    left.set_title(f"batch of {size}", fontsize=9)
+    left.set_xlabel("worst member's error [rad]")
+    left.set_ylabel("simulated s per s")
+    for index, solver in enumerate(_solvers(own)):
+        rates = []
+        for batch in sizes:
+            mine = [p for p in points if p["solver"] == solver and p["batch"] == batch]
+            walls = times_at(mine, 1e-6)
+            rates.append(
+                np.nan if walls is None else mine[0]["simulated"] / np.median(walls)
+            )
+        right.loglog(sizes, rates, **_style(solver, index))
+    right.set_title("at a worst error of 1e-6", fontsize=9)
+    right.set_xlabel("batch")
+    right.grid(alpha=0.3)
+    _save(figure, path)
+
+
+def generality(points: list[dict], path: Path) -> None:
+    figure, (axis,) = _axes(1, height=2.4)
+    own = [p for p in points if p["problem"] == "RRR-rk4" and p["times"]]
+    names = [p["solver"] for p in own]
+    nanoseconds = [1e9 * p["time_median"] / p["member_steps"] for p in own]
+    bars = axis.barh(names, nanoseconds, color=COLORS[5])
+    axis.bar_label(bars, fmt="%.0f", fontsize=7, padding=2)
+    axis.set_xscale("log")
+    axis.margins(x=0.15)
+    axis.invert_yaxis()
+    axis.tick_params(labelsize=7)
+    axis.set_xlabel("one RK4 step of one member [ns]")
+    _save(figure, path)
+
+
+def gradients(points: list[dict], path: Path) -> None:
+    """Error of six gains' gradient against its cost, along tolerances."""
+    figure, axes = _axes(2)
+    for axis, problem in zip(axes, ("gains", "gains, limited")):
+        own = [
+            p
+            for p in points
+            if p["problem"] == problem
+            and (p["batch"], p["horizon"]) == (1, 4.0)
+            and p["gradient_mode"] != "none"
+        ]
+        _curves(axis, own, lambda p: 1e3 * p["time_median"])
+        axis.set_title(problem.replace("limited", "with limited efforts"), fontsize=9)
+        axis.set_xlabel("gradient error, relative to its norm")
+    axes[0].set_ylabel("value and gradient [ms]")
+    _save(figure, path)
+
+
+def drift(points: list[dict], path: Path) -> None:
+    figure, (axis,) = _axes(1)
+    _curves(axis, points, lambda p: p["time_median"])
+    axis.set_xlabel("largest energy error [J]")
+    axis.set_ylabel("time [s]")
+    axis.set_title(next((p["problem"] for p in points if p["problem"]), ""), fontsize=9)
+    _save(figure, path)
+
+
+PLOTS = {
+    "trajectory": trajectory,
+    "batches": batches,
+    "batches-two-cores": batches,
+    "batches-float32": batches,
+    "batches-gpu": batches,
+    "batches-gpu-float32": batches,
+    "mixed": batches,
+    "generality": generality,
+    "gradients": gradients,
+    "drift": drift,
+}
+
+
+def draw(points: dict[str, list[dict]], folder: Path) -> None:
+    """A PNG for each job that has been measured and has a plot."""
+    matplotlib.rcParams["font.size"] = 8
+    for name, plot in PLOTS.items():
+        own = points.get(name, [])
+        if any(p["times"] for p in own):
+            plot(own, folder / f"{name}.png")

@@ -1,0 +1,147 @@
+"""What is to be reached, read off the measured points: ratios taken round by round."""
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from .measure import times_at
+
+
+def _points(points: list[dict], solver: str, **fields) -> list[dict]:
+    return [
+        p
+        for p in points
+        if p["solver"] == solver and all(p.get(k) == v for k, v in fields.items())
+    ]
+
+
+def _per_round(above, below) -> np.ndarray | None:
+    if above is None or below is None:
+        return None
+    rounds = min(len(above), len(below))
+    return np.asarray(above)[:rounds] / np.asarray(below)[:rounds]
+
+
+def ratio_at(points: list[dict], above: str, below: str, error: float, **fields):
+    """Per round, the time of one solver at an error over that of another."""
+    return _per_round(
+        times_at(_points(points, above, **fields), error),
+        times_at(_points(points, below, **fields), error),
+    )
+
+
+def _ratio_of(points: list[dict], above: dict, below: dict):
+    """The same for two single points; None where one is missing or has failed."""
+    found = []
+    for wanted in (above, below):
+        match = [p for p in points if all(p.get(k) == v for k, v in wanted.items())]
+        found.append(match[0]["times"] if match and match[0]["times"] else None)
+    return _per_round(*found)
+
+
+def _quartiles(ratio, number: Callable) -> tuple[str, str]:
+    if ratio is None:
+        return "not reached", ""
+    low, median, high = np.percentile(ratio, [25, 50, 75])
+    return number(median, 3), f"{number(low, 3)} to {number(high, 3)}"
+
+
+def targets(points: dict[str, list[dict]], number: Callable) -> Iterator[tuple]:
+    """(figure, measured, quartiles, required, aim) for what has been measured."""
+
+    def row(figure: str, ratio, required: str, aim: str) -> tuple:
+        return figure, *_quartiles(ratio, number), required, aim
+
+    if job := points.get("batches"):
+        for name in ("fdof_jax", "fdof_jax sweep"):
+            yield row(
+                f"batch 1024, worst error 1e-6: {name} over MuJoCo RK4 rollout",
+                ratio_at(job, "MuJoCo RK4", name, 1e-6, batch=1024),
+                "≥ 150",
+                "≥ 500",
+            )
+            yield row(
+                f"batch 1024, worst error 1e-9: {name} over plain diffrax",
+                ratio_at(job, "plain diffrax", name, 1e-9, batch=1024),
+                "≥ 10",
+                "≥ 45",
+            )
+    if job := points.get("generality"):
+        here = {"problem": "RRR-rk4"}
+        arrays = {"solver": "EF as arrays", **here}
+        for figure, above, below, required, aim in (
+            ("RK4 step, batch 1000: published form over fdof_jax",
+             {"solver": "published: 12 states, 6x6", **here}, arrays, "≥ 20", "≥ 60"),
+            ("RK4 step, batch 1000: fdof_jax over C",
+             arrays, {"solver": "C RK4", **here}, "≤ 4", "≤ 1.5"),
+            ("RK4 step, batch 1000: EF as arrays over known topology",
+             arrays, {"solver": "topology known at compile time", **here},
+             "≤ 1.2", "≤ 1.05"),
+        ):  # fmt: skip
+            yield row(figure, _ratio_of(job, above, below), required, aim)
+    if job := points.get("mixed"):
+        for plain in ("plain diffrax, reduced", "plain diffrax, masked 6x6"):
+            yield row(
+                f"mixed batch, worst error 1e-8: sweep over {plain}",
+                ratio_at(job, plain, "fdof_jax sweep", 1e-8),
+                "≥ 3",
+                "≥ 6",
+            )
+    if job := points.get("lockstep"):
+        for name in ("fdof_jax", "fdof_jax sweep"):
+            for scene, required, aim in (
+                ("one fast", "≤ 3", "≤ 1.5"),
+                ("one NaN at the start", "≤ 1.5", "≤ 1.1"),
+                ("one NaN mid-run", "≤ 1.5", "≤ 1.1"),
+            ):
+                clean = {"solver": f"{name}, clean"}
+                other = {"solver": f"{name}, {scene}"}
+                figure = f"{scene} in a batch of 256 over the clean batch: {name}"
+                yield row(figure, _ratio_of(job, other, clean), required, aim)
+    if job := points.get("trajectory"):
+        yield row(
+            "Fig 5, 10 s, error 1e-9 at 2 s: fdof_jax over heyoka",
+            ratio_at(job, "fdof_jax", "heyoka", 1e-9, problem="fig5-error-to-2s"),
+            "≤ 10",
+            "≤ 3",
+        )
+    if job := points.get("gradients"):
+        yield from _gradient_targets(job, number)
+    if job := points.get("compile_times"):
+        for name, required, aim in (
+            ("simulate", "≤ 3", "≤ 1"),
+            ("value and gradient, forward", "≤ 8", "≤ 3"),
+            ("value and gradient, reverse", "≤ 8", "≤ 3"),
+        ):
+            times = next(
+                (p["times"] for p in job
+                 if p["problem"] == name and "cold" in p["solver"]), None
+            )  # fmt: skip
+            yield row(f"cold compile [s]: {name}", times, required, aim)
+    if job := points.get("drift"):
+        dopri8 = [p for p in job if p["solver"].startswith("fdof_jax") and p["times"]]
+        best = min(dopri8, key=lambda p: p["energy_defect"], default=None)
+        if best:
+            figure = (
+                f"{best['problem']}, energy drift [J]: {best['solver']}, "
+                f"{best['kind']} {best['setting']:g}, "
+                f"{number(best['time_median'], 3)} s"
+            )
+            yield figure, number(best["energy_defect"]), "", "≤ 1e-10", "≤ 1e-12"
+
+
+def _gradient_targets(job: list[dict], number: Callable) -> Iterator[tuple]:
+    for batch, required, aim in ((1, "≤ 4", "≤ 2.5"), (256, "≤ 8", "≤ 4")):
+        for mode in ("forward", "reverse"):
+            same = {"problem": "gains", "batch": batch, "horizon": 4.0, "setting": 1e-8}
+            this = {**same, "gradient_mode": mode}
+            ratio = _ratio_of(job, this, {**same, "gradient_mode": "none"})
+            found = [p for p in job if all(p.get(k) == v for k, v in this.items())]
+            error = number(found[0]["error"]) if found else "-"
+            yield (
+                f"6-gain value and gradient over forward, {mode} mode, batch {batch}, "
+                f"gradient error {error}",
+                *_quartiles(ratio, number),
+                f"{required}, error ≤ 1e-6",
+                aim,
+            )

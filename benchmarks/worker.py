@@ -1,0 +1,87 @@
+"""One protocol in a process of its own: pinned to cores before JAX starts threads."""
+
+import argparse
+import importlib
+import json
+import math
+import os
+import warnings
+from pathlib import Path
+from typing import Any, NamedTuple
+
+
+class Job(NamedTuple):
+    """What a process measures: a function of a module, on how many cores."""
+
+    name: str
+    module: str
+    function: str = "run"
+    cores: int = 1
+    x64: bool = True
+    cpu: bool = True
+
+
+JOBS = (
+    Job("batches", "batches"),
+    Job("batches-two-cores", "batches", "run_two_cores", cores=2),
+    Job("batches-float32", "batches", "run_float32", x64=False),
+    Job("batches-gpu", "batches", "run_accelerator", cpu=False),
+    Job("batches-gpu-float32", "batches", "run_accelerator", x64=False, cpu=False),
+    Job("mixed", "mixed"),
+    Job("trajectory", "trajectory"),
+    Job("generality", "generality"),
+    Job("gradients", "gradients"),
+    Job("compile_times", "compile_times"),
+    Job("scaling", "scaling"),
+    Job("drift", "drift"),
+    Job("lockstep", "lockstep"),
+)
+
+
+def _plain(value: Any) -> Any:
+    """Valid JSON: NumPy numbers as numbers, NaN and infinity as null."""
+    if isinstance(value, dict):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    if hasattr(value, "tolist"):
+        return _plain(value.tolist())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("job", choices=[job.name for job in JOBS])
+    parser.add_argument("output", type=Path, help="JSON lines")
+    parser.add_argument("--quick", action="store_true")
+    options = parser.parse_args()
+    job = next(job for job in JOBS if job.name == options.job)
+    available = sorted(os.sched_getaffinity(0))
+    # A GPU's host threads are not what is measured: they keep their cores.
+    if job.cpu:
+        os.sched_setaffinity(0, available[: job.cores])
+        os.environ["JAX_PLATFORMS"] = "cpu"
+    import jax
+
+    jax.config.update("jax_enable_x64", job.x64)
+    # Masses at an arm's own joints, as Fig 5 has them, are warned of at each export.
+    warnings.filterwarnings("ignore", module="fdof_jax")
+    from .measure import skipped
+
+    if job.cpu and len(available) < job.cores:
+        points = [skipped(job.module, job.name, f"needs {job.cores} cores")]
+    else:
+        module = importlib.import_module(f"benchmarks.{job.module}")
+        points = getattr(module, job.function)(options.quick)
+    options.output.parent.mkdir(parents=True, exist_ok=True)
+    with options.output.open("w") as file:
+        for point in points:
+            point = {"job": job.name, **point}
+            file.write(json.dumps(_plain(point), allow_nan=False) + "\n")
+            file.flush()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,213 @@
+"""What integrators take: the rates of a linkage's state, and their derivatives.
+
+XLA on CPU gives each result of an expression, and each division in it, a loop of its
+own over the batch that computes everything anew: five evaluations of the equations for
+one. Here they are one fused loop, in forward and in derivative computations.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.custom_derivatives import SymbolicZero
+
+from .reduced_equations import Constants, Equations, Scalars, equations
+
+Matrix = tuple[Scalars, Scalars, Scalars]  # by columns
+
+# A first guess of 1/x, good to 12 %: these bits less those of x.
+_RECIPROCAL_BITS = {
+    np.dtype("float64"): (np.int64(0x7FDE623822FC16E6), 5),
+    np.dtype("float32"): (np.int32(0x7EF311C3), 4),
+}
+
+
+def _newton_reciprocal(x: Array) -> Array:
+    """1/x to an ulp or two, without a division, which XLA keeps out of fused loops."""
+    bits, iterations = _RECIPROCAL_BITS[x.dtype]
+    guess = bits - jax.lax.bitcast_convert_type(x, bits.dtype)
+    y = jax.lax.bitcast_convert_type(guess, x.dtype)
+    for _ in range(iterations):
+        y = y + y * (1 - x * y)
+    return y
+
+
+def _divided(x: Array) -> Array:
+    return 1 / x
+
+
+def _in_one_loop(tree: Any) -> Any:
+    """The same results, computed by a single loop over the batch.
+
+    A reduction is the one operation of XLA with several results. This one takes the
+    maximum of each result and itself, and a fused loop comes of it: 3 times faster in
+    a batch of 1024, 11 times for a single arm (one core, jax 0.10.2).
+    """
+    leaves, structure = jax.tree.flatten(tree)
+    reduced = jax.lax.reduce(
+        tuple(jnp.broadcast_to(leaf, (2, *leaf.shape)) for leaf in leaves),
+        tuple(jnp.full((), -jnp.inf, leaf.dtype) for leaf in leaves),
+        lambda a, b: tuple(map(jax.lax.max, a, b)),
+        dimensions=(0,),
+    )
+    return jax.tree.unflatten(structure, reduced)
+
+
+def _one_loop(function: Callable) -> Callable:
+    """`function(reciprocal, *arguments)` by the means of the platform."""
+
+    def on_platform(*arguments):
+        return jax.lax.platform_dependent(
+            *arguments,
+            cpu=lambda *a: _in_one_loop(function(_newton_reciprocal, *a)),
+            default=lambda *a: function(_divided, *a),
+        )
+
+    return on_platform
+
+
+def _solver(
+    m: Equations, reciprocal: Callable[[Array], Array]
+) -> Callable[[Scalars], Scalars]:
+    """Solves M x = f, by L^T D L from the tip: the pivots are articulated inertias."""
+    inverse3 = reciprocal(m.m33)
+    l23, l13 = m.m23 * inverse3, m.m13 * inverse3
+    inverse2 = reciprocal(m.m22 - l23 * m.m23)
+    rest12 = m.m12 - l13 * m.m23
+    l12 = rest12 * inverse2
+    inverse1 = reciprocal(m.m11 - l13 * m.m13 - l12 * rest12)
+
+    def solve(f: Scalars) -> Scalars:
+        y2 = f[1] - l23 * f[2]
+        x1 = (f[0] - l13 * f[2] - l12 * y2) * inverse1
+        x2 = y2 * inverse2 - l12 * x1
+        return x1, x2, f[2] * inverse3 - l13 * x1 - l23 * x2
+
+    return solve
+
+
+def _subtract(a: Scalars, b: Scalars) -> Scalars:
+    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
+
+
+def _rates(
+    reciprocal: Callable, c: Constants, delta: Scalars, qd: Scalars, tau: Scalars
+) -> tuple[Scalars, Scalars]:
+    m = equations(c, delta, qd)
+    # The velocities pass through the loop because XLA would otherwise copy the buffers
+    # of a Runge-Kutta method's stages.
+    return qd, _solver(m, reciprocal)(_subtract(tau, m.bias))
+
+
+@jax.jit
+def _efforts(c: Constants, delta: Scalars, qd: Scalars, qdd: Scalars) -> Scalars:
+    m = equations(c, delta, qd)
+    a1, a2, a3 = qdd
+    return (
+        m.m11 * a1 + m.m12 * a2 + m.m13 * a3 + m.bias[0],
+        m.m12 * a1 + m.m22 * a2 + m.m23 * a3 + m.bias[1],
+        m.m13 * a1 + m.m23 * a2 + m.m33 * a3 + m.bias[2],
+    )
+
+
+def _change(
+    reciprocal: Callable,
+    c: Constants,
+    delta: Scalars,
+    qd: Scalars,
+    tau: Scalars,
+    direction: tuple[Scalars, Scalars],
+) -> Scalars:
+    """Derivative of the accelerations in a direction of (delta, qd).
+
+    From the inverse dynamics: no derivative goes through the solution of the equations.
+    """
+    m = equations(c, delta, qd)
+    solve = _solver(m, reciprocal)
+    qdd = solve(_subtract(tau, m.bias))
+    _, change = jax.jvp(lambda *y: _efforts(c, *y, qdd), (delta, qd), direction)
+    x1, x2, x3 = solve(change)
+    return -x1, -x2, -x3
+
+
+def _inverse_inertia(reciprocal: Callable, c: Constants, delta: Scalars) -> Matrix:
+    zero, one = jnp.zeros_like(delta[0]), jnp.ones_like(delta[0])
+    solve = _solver(equations(c, delta, (zero, zero, zero)), reciprocal)
+    unit = (one, zero, zero), (zero, one, zero), (zero, zero, one)
+    return solve(unit[0]), solve(unit[1]), solve(unit[2])
+
+
+def _directions(dtype: Any) -> tuple[Scalars, Scalars]:
+    rows = tuple(jnp.eye(6, dtype=dtype))
+    return rows[:3], rows[3:]
+
+
+def _plain_sensitivities(c, delta, qd, tau):
+    by_state = jax.vmap(lambda d: _change(_divided, c, delta, qd, tau, d))(
+        _directions(delta[0].dtype)
+    )
+    return by_state, _inverse_inertia(_divided, c, delta)
+
+
+@jax.jit  # traced once, not at each use of a derivative
+@jax.custom_jvp
+def _sensitivities(
+    c: Constants, delta: Scalars, qd: Scalars, tau: Scalars
+) -> tuple[Scalars, Matrix]:
+    """Derivatives of the accelerations: three rows in (delta, qd), columns in tau.
+
+    The six directions are lanes of one loop, whose code has then the size of one.
+    """
+    by_state = jax.vmap(lambda d: _one_loop(_change)(c, delta, qd, tau, d))(
+        _directions(delta[0].dtype)
+    )
+    return by_state, _one_loop(_inverse_inertia)(c, delta)
+
+
+_sensitivities.__wrapped__.defjvp(
+    lambda primals, tangents: jax.jvp(_plain_sensitivities, primals, tangents)
+)
+
+
+@jax.custom_jvp
+def rates(
+    c: Constants, delta: Scalars, qd: Scalars, tau: Scalars
+) -> tuple[Scalars, Scalars]:
+    """Rates of the joint displacements `delta` from the reference of `c`, and of `qd`.
+
+    The equations of motion as what an integrator takes: velocities and accelerations.
+    """
+    return _one_loop(_rates)(c, delta, qd, tau)
+
+
+def _rates_jvp(primals, tangents):
+    c, delta, qd, tau = primals
+    values = rates(*primals)
+    by_state, by_tau = _sensitivities(*primals)
+    c_dot = tangents[0]
+    delta_dot, qd_dot, efforts_dot = map(_dense, tangents[1:])
+    moved = jnp.stack((*delta_dot, *qd_dot))
+    change = tuple(row @ moved for row in by_state)
+    if not all(isinstance(step, SymbolicZero) for step in jax.tree.leaves(c_dot)):
+        _, demanded = jax.jvp(
+            lambda c: _efforts(c, delta, qd, values[1]), (c,), (_dense(c_dot),)
+        )
+        efforts_dot = _subtract(efforts_dot, demanded)
+    for column, effort in zip(by_tau, efforts_dot):
+        change = tuple(a + b * effort for a, b in zip(change, column))
+    return values, (qd_dot, change)
+
+
+def _dense(tangents: Any) -> Any:
+    return jax.tree.map(
+        lambda step: (
+            np.zeros(step.shape, step.dtype) if isinstance(step, SymbolicZero) else step
+        ),
+        tangents,
+    )
+
+
+rates.defjvp(_rates_jvp, symbolic_zeros=True)

@@ -1,0 +1,391 @@
+"""Many motions at once: the results of `jax.vmap(simulate)`, sooner and in less memory.
+
+A vectorised adaptive solve runs until its slowest member is done. Here members are
+ordered by the work they are expected to take and cut into chunks of one shape. A member
+that takes many more steps than its neighbours is stopped and solved again later, in a
+smaller batch of its kind.
+"""
+
+import hashlib
+import os
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.experimental import multihost_utils
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from numpy.typing import ArrayLike
+
+from .dynamics import forward_dynamics
+from .linkage import Linkage, State, real_joints
+from .simulation import Forces, Solution, adaptive, simulate, warn_of_tolerance
+from .validation import callable_tuple, instance, is_traced, real_array, whole_number
+
+# Dimensions of a single linkage's leaves: one more is a batch axis.
+_LINKAGE_RANKS = dict(
+    ef=1, length=1, com=2, mass=1, inertia=1, locked=1, base_angle=0, gravity=0
+)
+_FIRST_LIMIT = 256  # steps, before anything is known
+_SLACK = 2.0  # a member may take this many times the steps of most others
+_SMALL = 8  # lanes for the few that take more
+
+
+class _Limited(diffrax.AbstractStepSizeController):
+    """A step-size controller that gives up after a number of steps known at run time.
+
+    diffrax's own `max_steps` is part of the compiled program.
+    """
+
+    controller: diffrax.AbstractStepSizeController
+    limit: Array
+
+    def wrap(self, direction):
+        return _Limited(self.controller.wrap(direction), self.limit)
+
+    def init(self, *arguments):
+        t1, state = self.controller.init(*arguments)
+        return t1, (state, jnp.zeros_like(self.limit))
+
+    def adapt_step_size(self, t0, t1, y0, y1, args, y_error, error_order, state):
+        inner, count = state
+        *step, inner, result = self.controller.adapt_step_size(
+            t0, t1, y0, y1, args, y_error, error_order, inner
+        )
+        count = count + 1
+        spent = (count >= self.limit) & (result == diffrax.RESULTS.successful)
+        result = diffrax.RESULTS.where(spent, diffrax.RESULTS.max_steps_reached, result)
+        return *step, (inner, count), result
+
+
+class _Batch(NamedTuple):
+    """The members' inputs, and the axis that counts them per leaf (None: shared)."""
+
+    inputs: tuple[Linkage, State, Forces]
+    axes: Any
+    size: int
+
+    def split(self) -> tuple[Any, Any]:
+        return eqx.partition(
+            self.inputs, jax.tree.map(lambda axis: axis == 0, self.axes)
+        )
+
+
+def _batch(linkage: Linkage, state0: State, forces: Forces, forces_axes: Any) -> _Batch:
+    linkage_axes = []
+    for name, rank in _LINKAGE_RANKS.items():
+        extra = getattr(linkage, name).ndim - rank
+        if extra not in (0, 1):
+            raise ValueError(
+                f"linkage.{name}: expected {rank} dimensions or a batch axis before "
+                f"them, got shape {getattr(linkage, name).shape}."
+            )
+        linkage_axes.append(0 if extra else -1)
+    state_axes = []
+    for name, value in zip(("q", "qd"), state0):
+        if value.ndim not in (1, 2) or value.shape[-1] != 3:
+            raise ValueError(
+                f"state0.{name}: expected shape (3,) or (batch, 3), got {value.shape}."
+            )
+        state_axes.append(0 if value.ndim == 2 else -1)
+    expanded = jax.tree.map(
+        lambda axis, part: jax.tree.map(lambda _: -1 if axis is None else axis, part),
+        forces_axes,
+        forces,
+        is_leaf=lambda axis: axis is None,
+    )
+    inputs = (linkage, state0, forces)
+    by_name = eqx.tree_at(
+        lambda x: [getattr(x, name) for name in _LINKAGE_RANKS], linkage, linkage_axes
+    )
+    axes = (by_name, State(*state_axes), expanded)
+    leaves = zip(jax.tree.leaves(inputs), jax.tree.leaves(axes))
+    sizes = {np.shape(leaf)[:1] for leaf, axis in leaves if axis == 0}
+    if len(sizes) != 1 or () in sizes:
+        raise ValueError(
+            "linkage, state0, forces: expected a leading batch axis of one size on at "
+            f"least one array, got sizes {sorted(s[0] if s else None for s in sizes)}."
+        )
+    return _Batch(inputs, axes, sizes.pop()[0])
+
+
+def _motion(settings: dict, ts: Array, moving: Any, shared: Any, limit: Array | None):
+    """One member's solution, without what all have in common."""
+    linkage, state0, forces = eqx.combine(moving, shared)
+    controller = settings["stepsize_controller"]
+    if limit is not None:
+        controller = _Limited(controller, limit)
+    solution = simulate(
+        linkage,
+        state0,
+        ts,
+        forces,
+        throw=False,
+        **{**settings, "stepsize_controller": controller},
+    )
+    return solution.q, solution.qd, solution.stats, solution.result
+
+
+@eqx.filter_jit
+def _solve_chunk(settings, mesh, ts, moving, shared, limit):
+    arrays, static = eqx.partition((ts, shared, limit), eqx.is_array)
+
+    def run(moving, arrays):
+        ts, shared, limit = eqx.combine(arrays, static)
+        return jax.vmap(lambda m: _motion(settings, ts, m, shared, limit))(moving)
+
+    if mesh is not None:
+        lanes, same = PartitionSpec("member"), PartitionSpec()
+        # Each device runs its own loop, until its own slowest member is done.
+        run = jax.shard_map(
+            run,
+            mesh=mesh,
+            in_specs=(lanes, same),
+            out_specs=lanes,
+            check_vma=False,
+        )
+    return run(moving, arrays)
+
+
+@eqx.filter_jit
+def _expected_work(t0: Array, moving: Any, shared: Any) -> tuple[Array, Array]:
+    """Topology, and a rate that goes with the number of steps [1/s], per member.
+
+    The rate is that of the joints now, and what their accelerations make of it.
+    """
+
+    def member(moving):
+        linkage, (q, qd), forces = eqx.combine(moving, shared)
+        tau = jnp.zeros(3)
+        for element in forces:
+            tau = tau + element(t0, q, qd, linkage)
+        # Turning makes work, sliding hardly any.
+        turning = jnp.stack(real_joints(linkage.ef))
+        rate = jnp.where(turning, qd, 0)
+        acceleration = jnp.where(turning, forward_dynamics(linkage, q, qd, tau), 0)
+        topology = jnp.sum(jnp.where(turning, jnp.array([4, 2, 1]), 0))
+        norm = jnp.linalg.norm
+        return topology, norm(rate) + jnp.sqrt(norm(acceleration))
+
+    return jax.vmap(member)(moving)
+
+
+class _Chunks:
+    """Solves chunks and keeps their results, in memory and, if asked, in a folder."""
+
+    def __init__(self, batch: _Batch, ts: Array, settings: dict, folder: Path | None):
+        moving, self.shared = batch.split()
+        self.leaves, self.structure = jax.tree.flatten(moving)
+        self.leaves = [np.asarray(leaf) for leaf in self.leaves]
+        self.ts, self.settings, self.folder = ts, settings, folder
+        devices = jax.devices()
+        self.devices = len(devices)
+        self.mesh = Mesh(np.array(devices), ("member",)) if len(devices) > 1 else None
+        self.size, self.count = batch.size, 0
+        self.results: list[np.ndarray] = []
+        self.result_structure: Any = None
+        if folder is not None:
+            folder.mkdir(parents=True, exist_ok=True)
+            digest = hashlib.sha256(repr((settings, batch.axes)).encode())
+            for leaf in (*jax.tree.leaves(batch.inputs), ts):
+                leaf = np.asarray(leaf)
+                digest.update(repr((leaf.shape, leaf.dtype)).encode() + leaf.tobytes())
+            self.name = digest.hexdigest()[:16]
+
+    def solve(self, members: np.ndarray, lanes: int, limit: int) -> np.ndarray:
+        """Solve these members, at most `lanes` per device. Their numbers of steps."""
+        padded = np.full(lanes * self.devices, members[0])
+        padded[: len(members)] = members
+        moving = jax.tree.unflatten(
+            self.structure, [self._place(leaf[padded]) for leaf in self.leaves]
+        )
+        path = None
+        if self.folder is not None:
+            path = self.folder / f"{self.name}-{self.count:06d}.npz"
+        self.count += 1
+        limit_array = np.asarray(limit, np.int32)
+        arguments = (
+            self.settings, self.mesh, self.ts, moving, self.shared, limit_array
+        )  # fmt: skip
+        if path is not None and path.exists():
+            with np.load(path) as saved:
+                values = [saved[f"leaf{i}"] for i in range(len(saved.files))]
+            if self.result_structure is None:
+                self.result_structure = jax.tree.structure(
+                    eqx.filter_eval_shape(_solve_chunk, *arguments)
+                )
+        else:
+            solved, self.result_structure = jax.tree.flatten(_solve_chunk(*arguments))
+            if jax.process_count() > 1:
+                solved = multihost_utils.process_allgather(solved, tiled=True)
+            values = [np.asarray(leaf)[: len(members)] for leaf in solved]
+            if path is not None and jax.process_index() == 0:
+                unfinished = path.with_suffix(".part")
+                with unfinished.open("wb") as file:
+                    np.savez(file, **{f"leaf{i}": v for i, v in enumerate(values)})
+                os.replace(unfinished, path)
+        if not self.results:
+            self.results = [
+                np.empty((self.size, *v.shape[1:]), v.dtype) for v in values
+            ]
+        for kept, value in zip(self.results, values):
+            kept[members] = value
+        _, _, stats, _ = jax.tree.unflatten(self.result_structure, values)
+        return stats["num_steps"]
+
+    def _place(self, rows: np.ndarray) -> np.ndarray | Array:
+        if jax.process_count() == 1:
+            return rows
+        sharding = NamedSharding(self.mesh, PartitionSpec("member"))
+        return jax.make_array_from_callback(rows.shape, sharding, lambda i: rows[i])
+
+    def solution(self) -> Solution:
+        leaves = [jnp.asarray(leaf) for leaf in self.results]
+        q, qd, stats, result = jax.tree.unflatten(self.result_structure, leaves)
+        ts = jnp.broadcast_to(self.ts, (self.size, *self.ts.shape))
+        return Solution(ts, q, qd, stats, result)
+
+
+def _in_chunks(
+    batch: _Batch,
+    ts: Array,
+    settings: dict,
+    chunk: int,
+    folder: Path | None,
+    meter: diffrax.AbstractProgressMeter,
+) -> Solution:
+    topology, work = map(np.asarray, _expected_work(ts[0], *batch.split()))
+    waiting = np.lexsort((work, topology))  # NaN comes last
+    chunks = _Chunks(batch, ts, settings, folder)
+    max_steps = settings["max_steps"] or np.iinfo(np.int32).max
+    # Small batches are cut too, so that a slow member holds up few others.
+    share = -(-batch.size // (8 * chunks.devices))
+    lanes, limit = min(chunk, max(share, 8 * _SMALL)), _FIRST_LIMIT
+    done, progress = 0, meter.init()
+    while len(waiting):
+        late = []
+        for start in range(0, len(waiting), lanes * chunks.devices):
+            members = waiting[start : start + lanes * chunks.devices]
+            while True:
+                limit = min(limit, max_steps)
+                steps = chunks.solve(members, lanes, limit)
+                out_of_steps = (steps >= limit) & (limit < max_steps)
+                if out_of_steps.sum() <= len(members) // 2:
+                    break
+                limit *= 4  # it was too low for most
+            late.append(members[out_of_steps])
+            done += len(members) - out_of_steps.sum()
+            progress = meter.step(progress, jnp.asarray(done / batch.size))
+            typical = np.percentile(steps[~out_of_steps], 90)
+            limit = max(int(_SLACK * typical), _FIRST_LIMIT // 4)
+        waiting = np.concatenate(late)
+        limit = 8 * limit
+        if len(waiting) <= lanes // 2:
+            lanes = _SMALL if len(waiting) > 1 else 1
+    meter.close(progress)
+    return chunks.solution()
+
+
+def _traced(batch: _Batch, ts: Array, settings: dict, chunk: int) -> Solution:
+    """Under a transformation: in chunks, and no failed member enters a derivative."""
+    moving, shared = batch.split()
+    order = jnp.lexsort(_expected_work(ts[0], moving, shared)[::-1])
+
+    def in_chunks(moving, shared):
+        return jax.lax.map(
+            lambda member: _motion(settings, ts, member, shared, None),
+            moving,
+            batch_size=chunk,
+        )
+
+    moving = jax.tree.map(lambda leaf: leaf[order], moving)
+    # Which members fail is found out first. In the differentiated solve the first good
+    # member stands in for them: whatever is NaN there would spoil shared parameters.
+    frozen = jax.lax.stop_gradient(in_chunks(*jax.lax.stop_gradient((moving, shared))))
+    good = frozen[3] == diffrax.RESULTS.successful
+    source = jnp.where(good, jnp.arange(batch.size), jnp.argmax(good))
+    q, qd, *_ = in_chunks(jax.tree.map(lambda leaf: leaf[source], moving), shared)
+    shown = good[:, None, None]
+    q, qd = jnp.where(shown, q, frozen[0]), jnp.where(shown, qd, frozen[1])
+    back = jnp.argsort(order)
+    q, qd, stats, result = jax.tree.map(lambda leaf: leaf[back], (q, qd, *frozen[2:]))
+    return Solution(jnp.broadcast_to(ts, (batch.size, *ts.shape)), q, qd, stats, result)
+
+
+def sweep(
+    linkage: Linkage,
+    state0: State,
+    ts: ArrayLike,
+    forces: Forces = (),
+    *,
+    forces_axes: Any = None,
+    chunk: int = 256,
+    throw: bool = False,
+    checkpoint: str | os.PathLike | None = None,
+    progress_meter: diffrax.AbstractProgressMeter = diffrax.NoProgressMeter(),
+    stepsize_controller: diffrax.AbstractStepSizeController | None = None,
+    max_steps: int | None = 65536,
+    **keywords: Any,
+) -> Solution:
+    """Many motions, as `jax.vmap(simulate)` would give them, faster.
+
+    A member that fails ends early with a result of its own, and a fast one delays no
+    others. Runs on all devices that JAX sees; with `jax.distributed`, call it with the
+    same arguments in every process, and each returns everything.
+
+    **Arguments:**
+
+    - `linkage`, `state0`: as in `simulate`, any of their arrays with a leading batch
+      axis; arrays without it are shared by all members.
+    - `ts`: increasing output times, common to all members, of shape (time,) [s].
+    - `forces`: force elements; which of their arrays carry the batch axis is said by
+      `forces_axes`, as `in_axes` of `jax.vmap`: 0 for all, None (the default) for
+      none, or a tuple of these with one entry per element.
+    - `chunk`: how many members are solved together at most, per device.
+    - `throw`: whether any failed member raises.
+    - `checkpoint`: a folder for the results of finished chunks. The same call goes on
+      from there.
+    - `progress_meter`, `stepsize_controller`, `max_steps` and other keywords: as in
+      `simulate`.
+
+    **Returns:** a `Solution` with a leading batch axis everywhere; `result` tells each
+    member's end. Under `jax.grad` or another transformation a failed member adds
+    nothing to any derivative, and `solution.result == diffrax.RESULTS.successful`
+    says which ones counted; it takes one more solve, without derivatives, to find out.
+
+    **Raises:** ValueError for malformed arguments; RuntimeError, with `throw=True`, if
+    a member fails.
+    """
+    instance("linkage", linkage, Linkage)
+    try:
+        state0 = State(*map(jnp.asarray, state0))
+    except (TypeError, ValueError):
+        raise ValueError(f"state0: expected a State(q, qd), got {state0!r}.") from None
+    ts = real_array("ts", ts, (None,))
+    callable_tuple("forces", forces)
+    whole_number("chunk", chunk, 1)
+    instance("throw", throw, bool)
+    instance("progress_meter", progress_meter, diffrax.AbstractProgressMeter)
+    batch = _batch(linkage, state0, forces, forces_axes)
+    controller = stepsize_controller or adaptive(1e-11, 1e-5)
+    warn_of_tolerance(controller)
+    settings = dict(keywords, stepsize_controller=controller, max_steps=max_steps)
+    if is_traced(batch.inputs, ts):
+        if throw or checkpoint is not None:
+            raise ValueError(
+                "throw, checkpoint: expected their defaults under jit, grad or vmap."
+            )
+        return _traced(batch, ts, settings, chunk)
+    folder = None if checkpoint is None else Path(checkpoint)
+    solution = _in_chunks(batch, ts, settings, chunk, folder, progress_meter)
+    failed = np.flatnonzero(np.asarray(solution.result != diffrax.RESULTS.successful))
+    if throw and len(failed):
+        raise RuntimeError(
+            f"sweep: {len(failed)} of {batch.size} members failed, the first of them "
+            f"member {failed[0]}."
+        )
+    return solution

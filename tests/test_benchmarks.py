@@ -1,0 +1,137 @@
+"""The benchmark suite: how it reads times off, what counts as failed, and one run."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks import page, targets
+from benchmarks.measure import RECORD, Case, envelope, measure, times_at
+from benchmarks.native import Kernel
+from benchmarks.problems import Problem, random_linkage, reference
+from fdof_jax import State
+
+ROOT = Path(__file__).parent.parent
+
+
+def test_envelope_between_points_is_a_line_on_logarithmic_axes():
+    errors, times = [1e-2, 1e-6], [1.0, 100.0]
+    assert envelope(errors, times, 1e-4) == pytest.approx(10.0)
+    assert envelope(errors, times, 1e-6) == pytest.approx(100.0)
+
+
+def test_envelope_ignores_points_that_another_beats_in_both():
+    errors, times = [1e-2, 1e-4, 1e-6], [1.0, 500.0, 100.0]
+    assert envelope(errors, times, 1e-4) == pytest.approx(10.0)
+
+
+def test_envelope_does_not_extrapolate():
+    errors, times = [1e-3, 1e-6], [1.0, 2.0]
+    assert envelope(errors, times, 1e-1) == pytest.approx(1.0)  # a bound
+    assert np.isnan(envelope(errors, times, 1e-7))
+    assert np.isnan(envelope([], [], 1e-3))
+
+
+def _case(solver, error, **known):
+    return Case(solver, 1e-3, lambda: None, lambda result: {"error": error, **known})
+
+
+@pytest.mark.parametrize("error", [np.nan, np.inf, 0.2])
+def test_a_failed_run_is_never_a_win(error):
+    good, bad = measure(
+        "test", [_case("good", 1e-3), _case("bad", error)], budget=0, rounds=3
+    )
+    assert good["status"] == "ok" and len(good["times"]) == 3
+    assert bad["status"] == "failed" and bad["times"] is None
+    assert times_at([bad], 0.5) is None
+
+
+def test_a_contestant_that_raises_has_failed_and_the_others_go_on():
+    def fall():
+        raise RuntimeError("no")
+
+    bad, good = measure(
+        "test", [Case("bad", 1.0, fall), _case("good", 0.0)], budget=0, rounds=3
+    )
+    assert bad["status"] == "failed" and "no" in bad["reason"]
+    assert good["status"] == "ok"
+
+
+def test_ratios_are_taken_at_equal_error():
+    slow = _case("slow", 1e-3)
+    points = measure(
+        "test",
+        [_case("fast", 1e-3), slow, _case("unreachable", 1e-9)],
+        budget=0,
+        rounds=3,
+        ratio_to="fast",
+    )
+    assert points[0]["ratio"] == pytest.approx(1.0)
+    assert points[1]["ratio_to"] == "fast" and points[2]["ratio"] is None
+
+
+@pytest.mark.skipif(shutil.which("gcc") is None, reason="gcc is not installed")
+@pytest.mark.parametrize("method, step", [("RK4", 2e-4), ("order 8", 5e-3)])
+@pytest.mark.parametrize("batch", [1, 3])
+def test_the_c_kernel_agrees_with_the_library(method, step, batch):
+    rng = np.random.default_rng(0)
+    linkage = random_linkage("RRR", rng)
+    state0 = State(rng.uniform(-1, 1, (batch, 3)), rng.uniform(-1, 1, (batch, 3)))
+    problem = Problem("test", linkage, state0, (), np.array([0.0, 0.5, 1.0]), "RRR")
+    kernel = Kernel(method, linkage, *state0)
+    q, _ = kernel.joints(kernel(step, round(0.5 / step), saves=2))
+    np.testing.assert_allclose(q, reference(problem)[:, 1:], atol=1e-9)
+
+
+@pytest.fixture(scope="module")
+def quick_run(tmp_path_factory):
+    output = tmp_path_factory.mktemp("benchmarks")
+    command = [sys.executable, "-m", "benchmarks", "--quick", "--only", "generality"]
+    result = subprocess.run(
+        [*command, "--output", str(output)],
+        cwd=ROOT,
+        env={**os.environ, "JAX_PLATFORMS": "cpu"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert result.returncode == 0, result.stdout + result.stderr
+    return output
+
+
+def _valid(text):
+    def refuse(constant):
+        raise ValueError(f"not JSON: {constant}")
+
+    return json.loads(text, parse_constant=refuse)
+
+
+def test_the_smallest_protocol_runs_end_to_end(quick_run):
+    points = [_valid(line) for line in (quick_run / "generality.jsonl").open()]
+    assert points
+    for point in points:
+        assert set(RECORD) <= set(point)
+        assert {"job", "versions", "cpu", "cores", "load", "commit"} <= set(point)
+    measured = [p for p in points if p["status"] == "ok"]
+    assert {"EF as arrays", "published: 12 states, 6x6"} <= {
+        p["solver"] for p in measured
+    }
+    assert all(p["error"] < 1e-9 and p["time_min"] > 0 for p in measured)
+    assert (quick_run / "generality.png").stat().st_size > 1000
+
+
+def test_tables_go_between_their_markers(quick_run):
+    points = [_valid(line) for line in (quick_run / "generality.jsonl").open()]
+    texts = page.tables({"generality": points})
+    text = "before\n<!-- begin: generality -->old<!-- end: generality -->\nafter"
+    filled = page.filled(text, texts)
+    assert "EF as arrays" in filled and "old" not in filled
+    assert filled.startswith("before") and filled.endswith("after")
+    assert page.filled(filled, texts) == filled
+    rows = list(targets.targets({"generality": points}, page.number))
+    assert len(rows) == 3 and all(len(row) == 5 for row in rows)
