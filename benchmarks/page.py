@@ -193,6 +193,28 @@ def lockstep(points: list[dict]) -> str:
     return table(head, rows)
 
 
+def many(points: list[dict]) -> str:
+    rows = [
+        [
+            p["problem"],
+            number(p["time_median"], 3),
+            number(p["steps"], 3),
+            str(p["steps_max"]),
+            str(p["successful"]),
+            number(p["against_singles"]),
+            f"{p['memory_before_mb']:.0f}",
+            f"{p['memory_peak_mb']:.0f}",
+            f"{p['saved_mb']:.0f}",
+        ]
+        for p in points
+    ]
+    head = [
+        "scenes", "s", "mean steps", "most", "successful", "off single motions by",
+        "memory before [MB]", "at most [MB]", "of it results [MB]",
+    ]  # fmt: skip
+    return table(head, rows)
+
+
 def _machine(points: dict[str, list[dict]]) -> str:
     one = next(p for job in points.values() for p in job)
     versions = ", ".join(f"{k} {v}" for k, v in one["versions"].items() if v)
@@ -216,6 +238,7 @@ def tables(points: dict[str, list[dict]]) -> dict[str, str]:
         "batches-gpu": _gpu,
         "batches-gpu-float32": _gpu,
         "mixed": batches,
+        "many": many,
         "trajectory": trajectory,
         "generality": generality,
         "gradients": gradients,

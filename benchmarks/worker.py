@@ -28,6 +28,7 @@ JOBS = (
     Job("batches-gpu", "batches", "run_accelerator", cpu=False),
     Job("batches-gpu-float32", "batches", "run_accelerator", x64=False, cpu=False),
     Job("mixed", "mixed"),
+    Job("many", "many"),
     Job("trajectory", "trajectory"),
     Job("generality", "generality"),
     Job("gradients", "gradients"),

@@ -34,7 +34,7 @@ class ScalarElement(eqx.Module):
     @abstractmethod
     def respond(
         self, scheduled: Any, q: Scalars, qd: Scalars, linkage: Linkage
-    ) -> Scalars:
+    ) -> tuple[Array, ...]:
         """The three efforts [N or N m], given what `schedule` returned."""
 
     def __call__(self, t: Array, q: Array, qd: Array, linkage: Linkage) -> Array:

@@ -152,9 +152,8 @@ def _plain_sensitivities(c, delta, qd, tau):
     return by_state, _inverse_inertia(_divided, c, delta)
 
 
-@jax.jit  # traced once, not at each use of a derivative
 @jax.custom_jvp
-def _sensitivities(
+def _one_loop_sensitivities(
     c: Constants, delta: Scalars, qd: Scalars, tau: Scalars
 ) -> tuple[Scalars, Matrix]:
     """Derivatives of the accelerations: three rows in (delta, qd), columns in tau.
@@ -167,9 +166,12 @@ def _sensitivities(
     return by_state, _one_loop(_inverse_inertia)(c, delta)
 
 
-_sensitivities.__wrapped__.defjvp(
-    lambda primals, tangents: jax.jvp(_plain_sensitivities, primals, tangents)
-)
+@_one_loop_sensitivities.defjvp
+def _sensitivities_jvp(primals, tangents):
+    return jax.jvp(_plain_sensitivities, primals, tangents)
+
+
+_sensitivities = jax.jit(_one_loop_sensitivities)  # traced once, not at each use
 
 
 @jax.custom_jvp
@@ -202,12 +204,14 @@ def _rates_jvp(primals, tangents):
 
 
 def _dense(tangents: Any) -> Any:
-    return jax.tree.map(
-        lambda step: (
-            np.zeros(step.shape, step.dtype) if isinstance(step, SymbolicZero) else step
-        ),
-        tangents,
-    )
+    def filled(step: Any) -> Any:
+        if type(step) is not SymbolicZero:
+            return step
+        shape: Any = step.shape
+        dtype: Any = step.dtype
+        return np.zeros(shape, dtype)
+
+    return jax.tree.map(filled, tangents)
 
 
 rates.defjvp(_rates_jvp, symbolic_zeros=True)

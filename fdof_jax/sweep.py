@@ -23,8 +23,22 @@ from numpy.typing import ArrayLike
 
 from .dynamics import forward_dynamics
 from .linkage import Linkage, State, real_joints
-from .simulation import Forces, Solution, adaptive, simulate, warn_of_tolerance
-from .validation import callable_tuple, instance, is_traced, real_array, whole_number
+from .simulation import (
+    Forces,
+    Solution,
+    adaptive,
+    element_effort,
+    simulate,
+    warn_of_tolerance,
+)
+from .validation import (
+    callable_tuple,
+    concrete,
+    instance,
+    is_traced,
+    real_array,
+    whole_number,
+)
 
 # Dimensions of a single linkage's leaves: one more is a batch axis.
 _LINKAGE_RANKS = dict(
@@ -47,19 +61,24 @@ class _Limited(diffrax.AbstractStepSizeController):
     def wrap(self, direction):
         return _Limited(self.controller.wrap(direction), self.limit)
 
-    def init(self, *arguments):
-        t1, state = self.controller.init(*arguments)
-        return t1, (state, jnp.zeros_like(self.limit))
+    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
+        first, state = self.controller.init(
+            terms, t0, t1, y0, dt0, args, func, error_order
+        )
+        return first, (state, jnp.zeros_like(self.limit))
 
-    def adapt_step_size(self, t0, t1, y0, y1, args, y_error, error_order, state):
-        inner, count = state
+    def adapt_step_size(  # pyright: ignore[reportIncompatibleMethodOverride]
+        self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state
+    ):
+        inner, count = controller_state
         *step, inner, result = self.controller.adapt_step_size(
-            t0, t1, y0, y1, args, y_error, error_order, inner
+            t0, t1, y0, y1_candidate, args, y_error, error_order, inner
         )
         count = count + 1
         spent = (count >= self.limit) & (result == diffrax.RESULTS.successful)
         result = diffrax.RESULTS.where(spent, diffrax.RESULTS.max_steps_reached, result)
-        return *step, (inner, count), result
+        keep, next_t0, next_t1, jump = step
+        return keep, next_t0, next_t1, jump, (inner, count), result
 
 
 class _Batch(NamedTuple):
@@ -75,7 +94,16 @@ class _Batch(NamedTuple):
         )
 
 
-def _batch(linkage: Linkage, state0: State, forces: Forces, forces_axes: Any) -> _Batch:
+def _expanded(axis: Any, part: Any) -> Any:
+    """One axis per leaf of a part of the forces; what is no array has none."""
+    if axis is not None and (type(axis) is not int or axis != 0):
+        raise ValueError
+    return jax.tree.map(
+        lambda leaf: 0 if axis == 0 and eqx.is_array_like(leaf) else -1, part
+    )
+
+
+def _batch(linkage: Linkage, state0: Any, forces: Forces, forces_axes: Any) -> _Batch:
     linkage_axes = []
     for name, rank in _LINKAGE_RANKS.items():
         extra = getattr(linkage, name).ndim - rank
@@ -87,17 +115,22 @@ def _batch(linkage: Linkage, state0: State, forces: Forces, forces_axes: Any) ->
         linkage_axes.append(0 if extra else -1)
     state_axes = []
     for name, value in zip(("q", "qd"), state0):
-        if value.ndim not in (1, 2) or value.shape[-1] != 3:
+        real = value.dtype.kind in "iuf"
+        if not real or value.ndim not in (1, 2) or value.shape[-1] != 3:
             raise ValueError(
-                f"state0.{name}: expected shape (3,) or (batch, 3), got {value.shape}."
+                f"state0.{name}: expected real numbers of shape (3,) or (batch, 3), "
+                f"got {value.dtype} of shape {value.shape}."
             )
         state_axes.append(0 if value.ndim == 2 else -1)
-    expanded = jax.tree.map(
-        lambda axis, part: jax.tree.map(lambda _: -1 if axis is None else axis, part),
-        forces_axes,
-        forces,
-        is_leaf=lambda axis: axis is None,
-    )
+    try:
+        expanded = jax.tree.map(
+            _expanded, forces_axes, forces, is_leaf=lambda axis: axis is None
+        )
+    except ValueError:
+        raise ValueError(
+            "forces_axes: expected 0, None or a tuple of these with one entry per "
+            f"element, got {forces_axes!r}."
+        ) from None
     inputs = (linkage, state0, forces)
     by_name = eqx.tree_at(
         lambda x: [getattr(x, name) for name in _LINKAGE_RANKS], linkage, linkage_axes
@@ -105,10 +138,11 @@ def _batch(linkage: Linkage, state0: State, forces: Forces, forces_axes: Any) ->
     axes = (by_name, State(*state_axes), expanded)
     leaves = zip(jax.tree.leaves(inputs), jax.tree.leaves(axes))
     sizes = {np.shape(leaf)[:1] for leaf, axis in leaves if axis == 0}
-    if len(sizes) != 1 or () in sizes:
+    if len(sizes) != 1 or () in sizes or (0,) in sizes:
+        got = [s[0] if s else "none" for s in sorted(sizes)]
         raise ValueError(
             "linkage, state0, forces: expected a leading batch axis of one size on at "
-            f"least one array, got sizes {sorted(s[0] if s else None for s in sizes)}."
+            f"least one array, got sizes {got}."
         )
     return _Batch(inputs, axes, sizes.pop()[0])
 
@@ -161,8 +195,8 @@ def _expected_work(t0: Array, moving: Any, shared: Any) -> tuple[Array, Array]:
     def member(moving):
         linkage, (q, qd), forces = eqx.combine(moving, shared)
         tau = jnp.zeros(3)
-        for element in forces:
-            tau = tau + element(t0, q, qd, linkage)
+        for index, element in enumerate(forces):
+            tau = tau + element_effort(index, element, t0, q, qd, linkage)
         # Turning makes work, sliding hardly any.
         turning = jnp.stack(real_joints(linkage.ef))
         rate = jnp.where(turning, qd, 0)
@@ -185,16 +219,18 @@ class _Chunks:
         devices = jax.devices()
         self.devices = len(devices)
         self.mesh = Mesh(np.array(devices), ("member",)) if len(devices) > 1 else None
-        self.size, self.count = batch.size, 0
+        self.size = batch.size
         self.results: list[np.ndarray] = []
         self.result_structure: Any = None
         if folder is not None:
             folder.mkdir(parents=True, exist_ok=True)
-            digest = hashlib.sha256(repr((settings, batch.axes)).encode())
-            for leaf in (*jax.tree.leaves(batch.inputs), ts):
+            self.digest = hashlib.sha256(repr((settings, batch.axes)).encode())
+            # The representation of settings leaves out the values of arrays.
+            arrays = eqx.filter(settings, eqx.is_array)
+            for leaf in jax.tree.leaves((batch.inputs, ts, arrays)):
                 leaf = np.asarray(leaf)
-                digest.update(repr((leaf.shape, leaf.dtype)).encode() + leaf.tobytes())
-            self.name = digest.hexdigest()[:16]
+                self.digest.update(repr((leaf.shape, leaf.dtype)).encode())
+                self.digest.update(leaf.tobytes())
 
     def solve(self, members: np.ndarray, lanes: int, limit: int) -> np.ndarray:
         """Solve these members, at most `lanes` per device. Their numbers of steps."""
@@ -205,15 +241,17 @@ class _Chunks:
         )
         path = None
         if self.folder is not None:
-            path = self.folder / f"{self.name}-{self.count:06d}.npz"
-        self.count += 1
+            # Chunks of another size hold other members.
+            digest = self.digest.copy()
+            digest.update(repr((members.tolist(), limit)).encode())
+            path = self.folder / f"{digest.hexdigest()[:32]}.npz"
         limit_array = np.asarray(limit, np.int32)
         arguments = (
             self.settings, self.mesh, self.ts, moving, self.shared, limit_array
         )  # fmt: skip
         if path is not None and path.exists():
             with np.load(path) as saved:
-                values = [saved[f"leaf{i}"] for i in range(len(saved.files))]
+                values = [saved[f"arr_{i}"] for i in range(len(saved.files))]
             if self.result_structure is None:
                 self.result_structure = jax.tree.structure(
                     eqx.filter_eval_shape(_solve_chunk, *arguments)
@@ -226,7 +264,7 @@ class _Chunks:
             if path is not None and jax.process_index() == 0:
                 unfinished = path.with_suffix(".part")
                 with unfinished.open("wb") as file:
-                    np.savez(file, **{f"leaf{i}": v for i, v in enumerate(values)})
+                    np.savez(file, *values)
                 os.replace(unfinished, path)
         if not self.results:
             self.results = [
@@ -240,6 +278,7 @@ class _Chunks:
     def _place(self, rows: np.ndarray) -> np.ndarray | Array:
         if jax.process_count() == 1:
             return rows
+        assert self.mesh is not None  # as there are several processes
         sharding = NamedSharding(self.mesh, PartitionSpec("member"))
         return jax.make_array_from_callback(rows.shape, sharding, lambda i: rows[i])
 
@@ -272,7 +311,9 @@ def _in_chunks(
             members = waiting[start : start + lanes * chunks.devices]
             while True:
                 limit = min(limit, max_steps)
-                steps = chunks.solve(members, lanes, limit)
+                # At the end diffrax's own limit, which spares who ends at that step.
+                own = limit if limit < max_steps else np.iinfo(np.int32).max
+                steps = chunks.solve(members, lanes, int(own))
                 out_of_steps = (steps >= limit) & (limit < max_steps)
                 if out_of_steps.sum() <= len(members) // 2:
                     break
@@ -285,7 +326,7 @@ def _in_chunks(
         waiting = np.concatenate(late)
         limit = 8 * limit
         if len(waiting) <= lanes // 2:
-            lanes = _SMALL if len(waiting) > 1 else 1
+            lanes = min(lanes, _SMALL) if len(waiting) > 1 else 1
     meter.close(progress)
     return chunks.solution()
 
@@ -366,12 +407,22 @@ def sweep(
     except (TypeError, ValueError):
         raise ValueError(f"state0: expected a State(q, qd), got {state0!r}.") from None
     ts = real_array("ts", ts, (None,))
+    times = concrete(ts)
+    if times is not None and not (times.size and (np.diff(times) > 0).all()):
+        raise ValueError(f"ts: expected increasing times, got {times.tolist()[:20]}.")
     callable_tuple("forces", forces)
     whole_number("chunk", chunk, 1)
     instance("throw", throw, bool)
     instance("progress_meter", progress_meter, diffrax.AbstractProgressMeter)
     batch = _batch(linkage, state0, forces, forces_axes)
-    controller = stepsize_controller or adaptive(1e-11, 1e-5)
+    if checkpoint is not None and not isinstance(checkpoint, str | os.PathLike):
+        raise ValueError(f"checkpoint: expected a folder, got {checkpoint!r}.")
+    if max_steps is not None:
+        whole_number("max_steps", max_steps, 1)
+    controller = stepsize_controller
+    if controller is None:
+        controller = adaptive(1e-11, 1e-5)
+    instance("stepsize_controller", controller, diffrax.AbstractStepSizeController)
     warn_of_tolerance(controller)
     settings = dict(keywords, stepsize_controller=controller, max_steps=max_steps)
     if is_traced(batch.inputs, ts):

@@ -27,7 +27,8 @@ _LOWER = np.zeros((_STAGES - 1, _STAGES))
 for _row, _entries in enumerate(_TABLEAU.a_lower):
     _LOWER[_row, : len(_entries)] = _entries
 _NODES = np.concatenate([[0.0], _TABLEAU.c])
-_DENSE = diffrax.Dopri8.interpolation_cls.eval_coeffs  # (stage, power), highest first
+_INTERPOLATION: Any = diffrax.Dopri8.interpolation_cls
+_DENSE = _INTERPOLATION.eval_coeffs  # (stage, power), highest first
 
 State = PyTree  # of scalars
 Rates = Sequence[State]  # one per stage
@@ -40,13 +41,14 @@ class ScheduledTerm(diffrax.ODETerm):
     once, where the vector field would call it at each.
     """
 
-    schedule: Callable[[Array, Any], PyTree] = eqx.field(static=True)
+    vector_field: Callable[..., PyTree] = eqx.field(static=True)
+    schedule: Callable[[Any, Any], PyTree] = eqx.field(static=True)
 
     def vf(self, t, y, args):
         return self.vector_field(t, y, args, self.schedule(t, args))
 
 
-def _combine(coefficients: Sequence[Any], rates: Rates) -> PyTree:
+def _combine(coefficients: Sequence[Any] | np.ndarray, rates: Rates) -> PyTree:
     """The sum of coefficient times rate, without the terms that are known to be 0."""
     known = isinstance(coefficients, np.ndarray)
     terms = [
@@ -162,8 +164,8 @@ def _interpolate(y0: State, h: Array, rates: Rates, theta: Array) -> State:
 class _Interpolation(diffrax.AbstractLocalInterpolation):
     """diffrax's dense output for this method, on unstacked rates."""
 
-    t0: Array
-    t1: Array
+    t0: Any  # pyright: ignore[reportIncompatibleVariableOverride]
+    t1: Any  # pyright: ignore[reportIncompatibleVariableOverride]
     y0: State
     step: Array
     rates: Rates
