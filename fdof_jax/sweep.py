@@ -343,12 +343,23 @@ def _traced(batch: _Batch, ts: Array, settings: dict, chunk: int) -> Solution:
             batch_size=chunk,
         )
 
-    moving = jax.tree.map(lambda leaf: leaf[order], moving)
+    def where(condition, tree):
+        """The tree, constant for derivatives where the condition does not hold."""
+
+        def guarded(leaf):
+            if not eqx.is_inexact_array(leaf):
+                return leaf
+            return jnp.where(condition, leaf, jax.lax.stop_gradient(leaf))
+
+        return jax.tree.map(guarded, tree)
+
+    moving = jax.tree.map(lambda leaf: jnp.asarray(leaf)[order], moving)
     # Which members fail is found out first. In the differentiated solve the first good
     # member stands in for them: whatever is NaN there would spoil shared parameters.
-    frozen = jax.lax.stop_gradient(in_chunks(*jax.lax.stop_gradient((moving, shared))))
+    frozen = in_chunks(*where(False, (moving, shared)))
     good = frozen[3] == diffrax.RESULTS.successful
     source = jnp.where(good, jnp.arange(batch.size), jnp.argmax(good))
+    moving, shared = where(jnp.any(good), (moving, shared))
     q, qd, *_ = in_chunks(jax.tree.map(lambda leaf: leaf[source], moving), shared)
     shown = good[:, None, None]
     q, qd = jnp.where(shown, q, frozen[0]), jnp.where(shown, qd, frozen[1])
