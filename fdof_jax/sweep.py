@@ -9,7 +9,7 @@ smaller batch of its kind.
 import hashlib
 import os
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import diffrax
 import equinox as eqx
@@ -21,6 +21,7 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from numpy.typing import ArrayLike
 
+from .batch_axes import Batch, batch_of
 from .dynamics import forward_dynamics
 from .linkage import Linkage, State, real_joints
 from .simulation import (
@@ -40,10 +41,6 @@ from .validation import (
     whole_number,
 )
 
-# Dimensions of a single linkage's leaves: one more is a batch axis.
-_LINKAGE_RANKS = dict(
-    ef=1, length=1, com=2, mass=1, inertia=1, locked=1, base_angle=0, gravity=0
-)
 _FIRST_LIMIT = 256  # steps, before anything is known
 _SLACK = 2.0  # a member may take this many times the steps of most others
 _SMALL = 8  # lanes for the few that take more
@@ -79,72 +76,6 @@ class _Limited(diffrax.AbstractStepSizeController):
         result = diffrax.RESULTS.where(spent, diffrax.RESULTS.max_steps_reached, result)
         keep, next_t0, next_t1, jump = step
         return keep, next_t0, next_t1, jump, (inner, count), result
-
-
-class _Batch(NamedTuple):
-    """The members' inputs, and the axis that counts them per leaf (None: shared)."""
-
-    inputs: tuple[Linkage, State, Forces]
-    axes: Any
-    size: int
-
-    def split(self) -> tuple[Any, Any]:
-        return eqx.partition(
-            self.inputs, jax.tree.map(lambda axis: axis == 0, self.axes)
-        )
-
-
-def _expanded(axis: Any, part: Any) -> Any:
-    """One axis per leaf of a part of the forces; what is no array has none."""
-    if axis is not None and (type(axis) is not int or axis != 0):
-        raise ValueError
-    return jax.tree.map(
-        lambda leaf: 0 if axis == 0 and eqx.is_array_like(leaf) else -1, part
-    )
-
-
-def _batch(linkage: Linkage, state0: Any, forces: Forces, forces_axes: Any) -> _Batch:
-    linkage_axes = []
-    for name, rank in _LINKAGE_RANKS.items():
-        extra = getattr(linkage, name).ndim - rank
-        if extra not in (0, 1):
-            raise ValueError(
-                f"linkage.{name}: expected {rank} dimensions or a batch axis before "
-                f"them, got shape {getattr(linkage, name).shape}."
-            )
-        linkage_axes.append(0 if extra else -1)
-    state_axes = []
-    for name, value in zip(("q", "qd"), state0):
-        real = value.dtype.kind in "iuf"
-        if not real or value.ndim not in (1, 2) or value.shape[-1] != 3:
-            raise ValueError(
-                f"state0.{name}: expected real numbers of shape (3,) or (batch, 3), "
-                f"got {value.dtype} of shape {value.shape}."
-            )
-        state_axes.append(0 if value.ndim == 2 else -1)
-    try:
-        expanded = jax.tree.map(
-            _expanded, forces_axes, forces, is_leaf=lambda axis: axis is None
-        )
-    except ValueError:
-        raise ValueError(
-            "forces_axes: expected 0, None or a tuple of these with one entry per "
-            f"element, got {forces_axes!r}."
-        ) from None
-    inputs = (linkage, state0, forces)
-    by_name = eqx.tree_at(
-        lambda x: [getattr(x, name) for name in _LINKAGE_RANKS], linkage, linkage_axes
-    )
-    axes = (by_name, State(*state_axes), expanded)
-    leaves = zip(jax.tree.leaves(inputs), jax.tree.leaves(axes))
-    sizes = {np.shape(leaf)[:1] for leaf, axis in leaves if axis == 0}
-    if len(sizes) != 1 or () in sizes or (0,) in sizes:
-        got = [s[0] if s else "none" for s in sorted(sizes)]
-        raise ValueError(
-            "linkage, state0, forces: expected a leading batch axis of one size on at "
-            f"least one array, got sizes {got}."
-        )
-    return _Batch(inputs, axes, sizes.pop()[0])
 
 
 def _motion(settings: dict, ts: Array, moving: Any, shared: Any, limit: Array | None):
@@ -211,7 +142,7 @@ def _expected_work(t0: Array, moving: Any, shared: Any) -> tuple[Array, Array]:
 class _Chunks:
     """Solves chunks and keeps their results, in memory and, if asked, in a folder."""
 
-    def __init__(self, batch: _Batch, ts: Array, settings: dict, folder: Path | None):
+    def __init__(self, batch: Batch, ts: Array, settings: dict, folder: Path | None):
         moving, self.shared = batch.split()
         self.leaves, self.structure = jax.tree.flatten(moving)
         self.leaves = [np.asarray(leaf) for leaf in self.leaves]
@@ -290,7 +221,7 @@ class _Chunks:
 
 
 def _in_chunks(
-    batch: _Batch,
+    batch: Batch,
     ts: Array,
     settings: dict,
     chunk: int,
@@ -331,7 +262,7 @@ def _in_chunks(
     return chunks.solution()
 
 
-def _traced(batch: _Batch, ts: Array, settings: dict, chunk: int) -> Solution:
+def _traced(batch: Batch, ts: Array, settings: dict, chunk: int) -> Solution:
     """Under a transformation: in chunks, and no failed member enters a derivative."""
     moving, shared = batch.split()
     order = jnp.lexsort(_expected_work(ts[0], moving, shared)[::-1])
@@ -425,7 +356,7 @@ def sweep(
     whole_number("chunk", chunk, 1)
     instance("throw", throw, bool)
     instance("progress_meter", progress_meter, diffrax.AbstractProgressMeter)
-    batch = _batch(linkage, state0, forces, forces_axes)
+    batch = batch_of(linkage, state0, forces, forces_axes)
     if checkpoint is not None and not isinstance(checkpoint, str | os.PathLike):
         raise ValueError(f"checkpoint: expected a folder, got {checkpoint!r}.")
     if max_steps is not None:

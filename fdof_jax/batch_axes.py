@@ -1,0 +1,82 @@
+"""Which arrays of a linkage, a state and force elements carry a batch axis."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from .linkage import Linkage, State
+from .simulation import Forces
+
+# Dimensions of a single linkage's leaves: one more is a batch axis.
+_LINKAGE_RANKS = dict(
+    ef=1, length=1, com=2, mass=1, inertia=1, locked=1, base_angle=0, gravity=0
+)
+
+
+class Batch(NamedTuple):
+    """The members' inputs, and the axis that counts them per leaf (-1: shared)."""
+
+    inputs: tuple[Linkage, State, Forces]
+    axes: Any
+    size: int
+
+    def split(self) -> tuple[Any, Any]:
+        return eqx.partition(
+            self.inputs, jax.tree.map(lambda axis: axis == 0, self.axes)
+        )
+
+
+def _expanded(axis: Any, part: Any) -> Any:
+    """One axis per leaf of a part of the forces; what is no array has none."""
+    if axis is not None and (type(axis) is not int or axis != 0):
+        raise ValueError
+    return jax.tree.map(
+        lambda leaf: 0 if axis == 0 and eqx.is_array_like(leaf) else -1, part
+    )
+
+
+def batch_of(linkage: Linkage, state0: Any, forces: Forces, forces_axes: Any) -> Batch:
+    """The batch that these are, refused if their shapes are not those of one."""
+    linkage_axes = []
+    for name, rank in _LINKAGE_RANKS.items():
+        extra = getattr(linkage, name).ndim - rank
+        if extra not in (0, 1):
+            raise ValueError(
+                f"linkage.{name}: expected {rank} dimensions or a batch axis before "
+                f"them, got shape {getattr(linkage, name).shape}."
+            )
+        linkage_axes.append(0 if extra else -1)
+    state_axes = []
+    for name, value in zip(("q", "qd"), state0):
+        real = value.dtype.kind in "iuf"
+        if not real or value.ndim not in (1, 2) or value.shape[-1] != 3:
+            raise ValueError(
+                f"state0.{name}: expected real numbers of shape (3,) or (batch, 3), "
+                f"got {value.dtype} of shape {value.shape}."
+            )
+        state_axes.append(0 if value.ndim == 2 else -1)
+    try:
+        expanded = jax.tree.map(
+            _expanded, forces_axes, forces, is_leaf=lambda axis: axis is None
+        )
+    except ValueError:
+        raise ValueError(
+            "forces_axes: expected 0, None or a tuple of these with one entry per "
+            f"element, got {forces_axes!r}."
+        ) from None
+    inputs = (linkage, state0, forces)
+    by_name = eqx.tree_at(
+        lambda x: [getattr(x, name) for name in _LINKAGE_RANKS], linkage, linkage_axes
+    )
+    axes = (by_name, State(*state_axes), expanded)
+    leaves = zip(jax.tree.leaves(inputs), jax.tree.leaves(axes))
+    sizes = {np.shape(leaf)[:1] for leaf, axis in leaves if axis == 0}
+    if len(sizes) != 1 or () in sizes or (0,) in sizes:
+        got = [s[0] if s else "none" for s in sorted(sizes)]
+        raise ValueError(
+            "linkage, state0, forces: expected a leading batch axis of one size on at "
+            f"least one array, got sizes {got}."
+        )
+    return Batch(inputs, axes, sizes.pop()[0])
