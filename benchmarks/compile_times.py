@@ -15,6 +15,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -23,6 +24,7 @@ import fdof_jax as fj
 
 from .measure import FEWEST, record
 from .problems import fig5, fig5_batch
+from .worker import XLA_FLAGS
 
 PROTOCOL = "compile_times"
 SAMPLES = 3
@@ -55,12 +57,30 @@ def gradient_reverse() -> Callable:
     return _gradient("reverse")
 
 
+def simulate_dopri8() -> Callable:
+    problem = fig5()
+    solver = diffrax.Dopri8()
+    return lambda: fj.simulate(
+        problem.linkage, problem.state0, problem.ts, solver=solver
+    )
+
+
+# The environment of a case follows its name.
+ENVIRONMENTS = {
+    "EQX_ON_ERROR=nan": {"EQX_ON_ERROR": "nan"},
+    "XLA_FLAGS": {"XLA_FLAGS": XLA_FLAGS},
+}
 CASES = {
     "simulate": simulate,
     "simulate, EQX_ON_ERROR=nan": simulate,
+    "simulate, XLA_FLAGS": simulate,
+    "simulate by diffrax.Dopri8": simulate_dopri8,
+    "simulate by diffrax.Dopri8, XLA_FLAGS": simulate_dopri8,
     "sweep of 256": sweep,
     "value and gradient, forward": gradient_forward,
+    "value and gradient, forward, XLA_FLAGS": gradient_forward,
     "value and gradient, reverse": gradient_reverse,
+    "value and gradient, reverse, XLA_FLAGS": gradient_reverse,
 }
 
 
@@ -82,7 +102,7 @@ def _ask(name: str, folder: str) -> float:
         env={
             **os.environ,
             "JAX_ENABLE_X64": "1",
-            **({"EQX_ON_ERROR": "nan"} if name.endswith("=nan") else {}),
+            **ENVIRONMENTS.get(name.rsplit(", ", 1)[-1], {}),
             "JAX_COMPILATION_CACHE_DIR": folder,
             "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
             "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",

@@ -233,6 +233,7 @@ def tables(points: dict[str, list[dict]]) -> dict[str, str]:
     """Text by name, for what has been measured."""
     makers = {
         "batches": batches,
+        "batches-xla-flags": batches,
         "batches-two-cores": batches,
         "batches-float32": batches,
         "batches-gpu": _gpu,

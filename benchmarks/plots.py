@@ -62,19 +62,26 @@ def _save(figure, path: Path) -> None:
 
 
 def _curves(axis, points: list[dict], height: Callable[[dict], float]) -> None:
-    """One line per solver; the legend names those of which every run failed."""
+    """One line per solver, and a cross at the bottom for each run that failed."""
     for index, solver in enumerate(_solvers(points)):
         own = [p for p in points if p["solver"] == solver]
         good = [p for p in own if p["times"] and p["error"]]
-        failed = sum(p["status"] == "failed" for p in own)
+        failed = [p["error"] for p in own if p["status"] == "failed"]
         name = solver.split(", numba")[0].split(", reduced")[0]
-        label = name + (f" ({failed} failed)" if failed and not good else "")
+        label = name + (f" ({len(failed)} failed)" if not good else "")
         good.sort(key=lambda p: p["error"])
         axis.loglog(
             [p["error"] for p in good],
             [height(p) for p in good],
             label=label,
             **_style(solver, index),
+        )
+        axis.plot(
+            [min(error or 1.0, 1.0) for error in failed],
+            [0.02 + 0.03 * (index % 5)] * len(failed),
+            "x",
+            color=_style(solver, index)["color"],
+            transform=axis.get_xaxis_transform(),
         )
     axis.invert_xaxis()
     axis.grid(alpha=0.3)
@@ -164,6 +171,7 @@ def drift(points: list[dict], path: Path) -> None:
 PLOTS = {
     "trajectory": trajectory,
     "batches": batches,
+    "batches-xla-flags": batches,
     "batches-two-cores": batches,
     "batches-float32": batches,
     "batches-gpu": batches,

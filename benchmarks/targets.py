@@ -52,16 +52,17 @@ def targets(points: dict[str, list[dict]], number: Callable) -> Iterator[tuple]:
     def row(figure: str, ratio, required: str, aim: str) -> tuple:
         return figure, *_quartiles(ratio, number), required, aim
 
-    if job := points.get("batches"):
-        for name in ("fdof_jax", "fdof_jax sweep"):
+    for protocol, how in (("batches", ""), ("batches-xla-flags", ", XLA_FLAGS")):
+        job = points.get(protocol, ())
+        for name in ("fdof_jax", "fdof_jax sweep") if job else ():
             yield row(
-                f"batch 1024, worst error 1e-6: {name} over MuJoCo RK4 rollout",
+                f"batch 1024, worst error 1e-6: {name} over MuJoCo RK4 rollout{how}",
                 ratio_at(job, "MuJoCo RK4", name, 1e-6, batch=1024),
                 "≥ 150",
                 "≥ 500",
             )
             yield row(
-                f"batch 1024, worst error 1e-9: {name} over plain diffrax",
+                f"batch 1024, worst error 1e-9: {name} over plain diffrax{how}",
                 ratio_at(job, "plain diffrax", name, 1e-9, batch=1024),
                 "≥ 10",
                 "≥ 45",
@@ -110,8 +111,13 @@ def targets(points: dict[str, list[dict]], number: Callable) -> Iterator[tuple]:
     if job := points.get("compile_times"):
         for name, required, aim in (
             ("simulate", "≤ 3", "≤ 1"),
+            ("simulate, XLA_FLAGS", "≤ 3", "≤ 1"),
+            ("simulate by diffrax.Dopri8", "≤ 3", "≤ 1"),
+            ("simulate by diffrax.Dopri8, XLA_FLAGS", "≤ 3", "≤ 1"),
             ("value and gradient, forward", "≤ 8", "≤ 3"),
+            ("value and gradient, forward, XLA_FLAGS", "≤ 8", "≤ 3"),
             ("value and gradient, reverse", "≤ 8", "≤ 3"),
+            ("value and gradient, reverse, XLA_FLAGS", "≤ 8", "≤ 3"),
         ):
             times = next(
                 (p["times"] for p in job

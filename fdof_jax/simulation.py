@@ -162,6 +162,8 @@ def _integrate_fast(inputs, keywords) -> Solution:
     leads to other steps, and to a wrong gradient. Unrolled stages are compiled
     differently with derivatives and without; diffrax's loop over the stages is not.
     """
+    # Nothing is differentiated here, and loops made for that take longer to compile.
+    keywords = keywords | {"adjoint": diffrax.ForwardMode()}
     return _integrate(UnrolledDopri8(), inputs, keywords)
 
 

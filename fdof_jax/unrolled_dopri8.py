@@ -9,7 +9,7 @@ vector field is linearised at all stages at once, by one piece of compiled code.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -19,6 +19,8 @@ import jax.tree_util as jtu
 import numpy as np
 from jax import Array
 from jaxtyping import PyTree
+
+from .one_loop import in_one_loop
 
 _TABLEAU = diffrax.Dopri8.tableau
 _STAGES = len(_TABLEAU.b_sol)
@@ -63,37 +65,63 @@ def _combine(coefficients: Sequence[Any] | np.ndarray, rates: Rates) -> PyTree:
     )
 
 
-def _advance(y: PyTree, h: Array, rate: PyTree) -> PyTree:
-    return jtu.tree_map(lambda a, b: a + h * b, y, rate)
+def _scaled(h: Array, rate: PyTree) -> PyTree:
+    return jtu.tree_map(lambda k: h * k, rate)
+
+
+def _sum(a: PyTree, b: PyTree) -> PyTree:
+    return jtu.tree_map(lambda a, b: a + b, a, b)
 
 
 def _at(stage: int, tree: PyTree) -> PyTree:
     return jtu.tree_map(lambda leaf: leaf[stage], tree)
 
 
-def _unrolled(field, times, h, y0, args, schedule, f0) -> tuple[Rates, Rates]:
-    """States and rates at the stages; the last is the end of the step."""
-    states, rates = [y0], [f0]
-    for stage, row in enumerate(_LOWER):
-        y = _advance(y0, h, _combine(row, rates))
-        states.append(y)
-        rates.append(field(times[stage + 1], y, args, _at(stage + 1, schedule)))
-    return states, rates
+class _Step(NamedTuple):
+    """The end of a step, and what only the next step and the step control need.
+
+    `lost` is what the rounding of `y` took away. The next step adds it (Kahan): over
+    1000 s of Fig 5 in steps of 2.5 ms the energy drifts by 3e-11 J, not 1.5e-10 J.
+    """
+
+    y: State
+    error: State
+    lost: State
+
+
+def _unrolled(field, times, h, y0, lost, args, schedule, f0) -> tuple[_Step, Rates]:
+    rates = [f0]
+    for stage, row in enumerate(_LOWER[:-1], 1):
+        y = _sum(y0, _scaled(h, _combine(row, rates)))
+        rates.append(field(times[stage], y, args, _at(stage, schedule)))
+    increment = _sum(_scaled(h, _combine(_LOWER[-1], rates)), lost)
+    y = _sum(y0, increment)
+    lost = jtu.tree_map(lambda a, b, c: c - (b - a), y0, y, increment)
+    error = _scaled(h, _combine(_TABLEAU.b_error, rates))
+    step = in_one_loop(_Step(y, error, lost))
+    rates.append(field(times[-1], step.y, args, _at(-1, schedule)))
+    return step, rates
 
 
 @eqx.filter_custom_jvp
-def _stages(field, times, h, y0, args, schedule, f0) -> tuple[State, Rates]:
-    """The state after a step of length `h`, and the rates at all stages."""
-    states, rates = _unrolled(field, times, h, y0, args, schedule, f0)
-    return states[-1], rates
+def _stages(field, times, h, y0, lost, args, schedule, f0) -> tuple[_Step, Rates]:
+    """A step of length `h`, and the rates at all stages, the last at its end."""
+    return _unrolled(field, times, h, y0, lost, args, schedule, f0)
+
+
+def _times(matrix: Array, vector: Array) -> Array:
+    # XLA calls a library for products of matrices, at more than such a small one costs.
+    return jnp.sum(matrix * vector[None], axis=-1)
 
 
 @_stages.def_jvp
 def _stages_jvp(primals, tangents):
     """All stages are linearised at once, then their tangents follow one another."""
-    field, times, h, y0, args, schedule, f0 = primals
-    _, times_dot, h_dot, y0_dot, args_dot, schedule_dot, _ = tangents
-    states, rates = _unrolled(*primals)
+    field, times, h, y0, _, args, schedule, _ = primals
+    _, times_dot, h_dot, y0_dot, _, args_dot, schedule_dot, _ = tangents
+    step, rates = _unrolled(*primals)
+    increments = [_combine(row, rates) for row in _LOWER[:-1]]
+    states = [y0, *(_sum(y0, _scaled(h, k)) for k in increments), step.y]
 
     def vector(tree):
         return jnp.stack(jtu.tree_leaves(tree))
@@ -129,25 +157,26 @@ def _stages_jvp(primals, tangents):
     # Vectors, not scalars: a product with a matrix is computed once, where XLA would
     # compute a chain of scalar expressions anew for each of its results.
     y_dot = start
-    rates_dot = [jacobians[0] @ start + drives[0]]
+    rates_dot = [_times(jacobians[0], start) + drives[0]]
     for row, jacobian, drive in zip(_LOWER, jacobians[1:], drives[1:]):
         y_dot = start + h * _combine(row, rates_dot)
         if h_dot is not None:
             y_dot = y_dot + h_dot * vector(_combine(row, rates))
-        rates_dot.append(jacobian @ y_dot + drive)
-    return (states[-1], rates), (state(y_dot), [state(r) for r in rates_dot])
+        rates_dot.append(_times(jacobian, y_dot) + drive)
+    # The step control is not differentiated.
+    unmoved = jtu.tree_map(jnp.zeros_like, (step.error, step.lost))
+    step_dot = _Step(state(y_dot), *unmoved)
+    return (step, rates), (step_dot, [state(r) for r in rates_dot])
 
 
 @eqx.filter_jit  # traced once, not at each of a solve's uses of it
-def _step(term, t0, t1, y0, args, f0):
+def _step(term, t0, t1, y0, lost, args, f0) -> tuple[_Step, Rates, Array]:
     # diffrax wraps the term, to integrate backward in time too.
     inner, h = term.term, term.contr(t0, t1)
     times = (t0 + (t1 - t0) * jnp.asarray(_NODES, t0.dtype)) * term.direction
     schedule = jax.vmap(inner.schedule, in_axes=(0, None))(times, args)
     field = eqx.filter_jit(inner.vector_field)
-    y1, rates = _stages(field, times, h, y0, args, schedule, f0)
-    error = jtu.tree_map(lambda e: h * e, _combine(_TABLEAU.b_error, rates))
-    return y1, error, rates, h
+    return *_stages(field, times, h, y0, lost, args, schedule, f0), h
 
 
 @eqx.filter_jit
@@ -158,7 +187,7 @@ def _interpolate(y0: State, h: Array, rates: Rates, theta: Array) -> State:
         weights = (weights + coefficients) * theta
     used = [stage for stage, row in enumerate(_DENSE) if row.any()]
     rate = _combine([weights[i] for i in used], [rates[i] for i in used])
-    return _advance(y0, h, rate)
+    return _sum(y0, _scaled(h, rate))
 
 
 class _Interpolation(diffrax.AbstractLocalInterpolation):
@@ -192,19 +221,22 @@ class UnrolledDopri8(diffrax.AbstractAdaptiveSolver):
         return 8
 
     def init(self, terms, t0, t1, y0, args):
+        return self._rate(terms, t0, y0, args), jtu.tree_map(jnp.zeros_like, y0)
+
+    def _rate(self, terms, t0, y0, args):
         # Derivatives do not use this rate: see `_stages_jvp`.
         return jax.lax.stop_gradient(terms.vf(t0, y0, args))
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         # A jump has changed the rates at the start of the step.
-        f0 = solver_state
+        f0, lost = solver_state
         if made_jump is not False:
-            fresh = self.init(terms, t0, t1, y0, args)
+            fresh = self._rate(terms, t0, y0, args)
             f0 = jtu.tree_map(lambda a, b: jnp.where(made_jump, a, b), fresh, f0)
-        y1, error, rates, h = _step(terms, t0, t1, y0, args, f0)
+        end, rates, h = _step(terms, t0, t1, y0, lost, args, f0)
         dense_info = dict(y0=y0, step=h, rates=rates)
-        last = jax.lax.stop_gradient(rates[-1])
-        return y1, error, dense_info, last, diffrax.RESULTS.successful
+        state = jax.lax.stop_gradient((rates[-1], end.lost))
+        return end.y, end.error, dense_info, state, diffrax.RESULTS.successful
 
     def func(self, terms, t0, y0, args):
         return terms.vf(t0, y0, args)
