@@ -13,6 +13,7 @@ from .dynamics import (
     forward_dynamics as forward_dynamics,
     inverse_dynamics as inverse_dynamics,
     link_energies as link_energies,
+    pivot_ratios as pivot_ratios,
 )
 from .forces import JointDamper as JointDamper, JointEffort as JointEffort
 from .interop import to_mjcf as to_mjcf
@@ -38,6 +39,7 @@ from .simulation import (
     joint_efforts as joint_efforts,
     simulate as simulate,
 )
+from .step_control import scale_tolerances as scale_tolerances
 from .sweep import sweep as sweep
 from .tuning import TuneResult as TuneResult, tune as tune
 

@@ -98,6 +98,11 @@ class PDController(ScalarElement):
         """The effort before it is limited, (3,) [N or N m]."""
         return jnp.stack(self._unlimited(self.schedule(t, linkage), q, qd))
 
+    @property
+    def jump_ts(self) -> Array | None:
+        """The times at which the reference says that it jumps, if it does."""
+        return getattr(self.reference, "jump_ts", None)
+
     def check(self, linkage: Linkage, ts: Array) -> None:
         """Pass the linkage and the times on to the reference's own check, if any."""
         check_reference: Any = getattr(self.reference, "check", None)

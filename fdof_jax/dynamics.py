@@ -30,6 +30,25 @@ def forward_dynamics(
     return jnp.stack(qdd)
 
 
+@compiled(q=(3,))
+def pivot_ratios(linkage: Linkage, q: Float[Array, " joint"]) -> Float[Array, " joint"]:
+    """How well the accelerations are determined: in (0, 1] per joint, free of units.
+
+    The inertia that each joint feels while the joints beyond it are free to move, over
+    what it would feel if they were locked: the pivots of the 3x3 mass matrix over its
+    diagonal. The accelerations lose about -log10 of the least ratio in digits; below
+    1e-9 in float64, 1e-5 in float32, `simulate` gives up and says so. NaN where the
+    matrix is singular.
+
+    **Arguments:** `q` [m or rad].
+    """
+    m = equations(link_constants(linkage, q), zeros(q), zeros(q))
+    pivot2 = m.m22 - m.m23**2 / m.m33
+    rest12 = m.m12 - m.m13 * m.m23 / m.m33
+    pivot1 = m.m11 - m.m13**2 / m.m33 - rest12**2 / pivot2
+    return jnp.stack([pivot1 / m.m11, pivot2 / m.m22, m.m33 / m.m33])
+
+
 @compiled(q=(3,), qd=(3,), qdd=(3,))
 def inverse_dynamics(
     linkage: Linkage,

@@ -4,6 +4,10 @@ An element is any pytree called as `(t, q, qd, linkage) -> tau`, with joint posi
 velocities and efforts of shape (3,). A scene's elements are a tuple; their efforts
 add up. The PD controller is one too: see `control`.
 
+An element, or a controller's reference, whose efforts jump at known times may have them
+as an attribute `jump_ts`, an array [s]: steps then end there. One with a method
+`check(linkage, ts)` is asked at the door of `simulate`.
+
 Elements in hot loops may be `ScalarElement`s, which cost less to run and to compile.
 """
 

@@ -55,14 +55,19 @@ def _one_loop(function: Callable) -> Callable:
 
 def _solver(
     m: Equations, reciprocal: Callable[[Array], Array]
-) -> Callable[[Scalars], Scalars]:
-    """Solves M x = f, by L^T D L from the tip: the pivots are articulated inertias."""
+) -> tuple[Callable[[Scalars], Scalars], tuple[Array, Array]]:
+    """Solves M x = f, by L^T D L from the tip; the first two pivots.
+
+    The pivots are articulated inertias, the third is m33.
+    """
     inverse3 = reciprocal(m.m33)
     l23, l13 = m.m23 * inverse3, m.m13 * inverse3
-    inverse2 = reciprocal(m.m22 - l23 * m.m23)
+    pivot2 = m.m22 - l23 * m.m23
+    inverse2 = reciprocal(pivot2)
     rest12 = m.m12 - l13 * m.m23
     l12 = rest12 * inverse2
-    inverse1 = reciprocal(m.m11 - l13 * m.m13 - l12 * rest12)
+    pivot1 = m.m11 - l13 * m.m13 - l12 * rest12
+    inverse1 = reciprocal(pivot1)
 
     def solve(f: Scalars) -> Scalars:
         y2 = f[1] - l23 * f[2]
@@ -70,7 +75,7 @@ def _solver(
         x2 = y2 * inverse2 - l12 * x1
         return x1, x2, f[2] * inverse3 - l13 * x1 - l23 * x2
 
-    return solve
+    return solve, (pivot1, pivot2)
 
 
 def _subtract(a: Scalars, b: Scalars) -> Scalars:
@@ -81,9 +86,21 @@ def _rates(
     reciprocal: Callable, c: Constants, delta: Scalars, qd: Scalars, tau: Scalars
 ) -> tuple[Scalars, Scalars]:
     m = equations(c, delta, qd)
+    solve, _ = _solver(m, reciprocal)
     # The velocities pass through the loop because XLA would otherwise copy the buffers
     # of a Runge-Kutta method's stages.
-    return qd, _solver(m, reciprocal)(_subtract(tau, m.bias))
+    return qd, solve(_subtract(tau, m.bias))
+
+
+def _rates_and_conditioning(
+    reciprocal: Callable, c: Constants, delta: Scalars, qd: Scalars, tau: Scalars
+) -> tuple[Scalars, Scalars, Array]:
+    m = equations(c, delta, qd)
+    solve, (pivot1, pivot2) = _solver(m, reciprocal)
+    rho = jnp.minimum(pivot2 * reciprocal(m.m22), pivot1 * reciprocal(m.m11))
+    # The pivots after one that is not positive are not numbers.
+    singular = (m.m33 <= 0) | (pivot2 <= 0) | (pivot1 <= 0)
+    return qd, solve(_subtract(tau, m.bias)), jnp.where(singular, 0, rho)
 
 
 @jax.jit
@@ -110,7 +127,7 @@ def _change(
     From the inverse dynamics: no derivative goes through the solution of the equations.
     """
     m = equations(c, delta, qd)
-    solve = _solver(m, reciprocal)
+    solve, _ = _solver(m, reciprocal)
     qdd = solve(_subtract(tau, m.bias))
     _, change = jax.jvp(lambda *y: _efforts(c, *y, qdd), (delta, qd), direction)
     x1, x2, x3 = solve(change)
@@ -119,7 +136,7 @@ def _change(
 
 def _inverse_inertia(reciprocal: Callable, c: Constants, delta: Scalars) -> Matrix:
     zero, one = jnp.zeros_like(delta[0]), jnp.ones_like(delta[0])
-    solve = _solver(equations(c, delta, (zero, zero, zero)), reciprocal)
+    solve, _ = _solver(equations(c, delta, (zero, zero, zero)), reciprocal)
     unit = (one, zero, zero), (zero, one, zero), (zero, zero, one)
     return solve(unit[0]), solve(unit[1]), solve(unit[2])
 
@@ -199,3 +216,22 @@ def _dense(tangents: Any) -> Any:
 
 
 rates.defjvp(_rates_jvp, symbolic_zeros=True)
+
+
+@jax.custom_jvp
+def rates_and_conditioning(
+    c: Constants, delta: Scalars, qd: Scalars, tau: Scalars
+) -> tuple[tuple[Scalars, Scalars], Array]:
+    """`rates`, and the smallest pivot ratio of the mass matrix: see `pivot_ratios`.
+
+    Zero where a pivot is not positive. Derivatives take the ratio for a constant.
+    """
+    qd, qdd, rho = _one_loop(_rates_and_conditioning)(c, delta, qd, tau)
+    return (qd, qdd), rho
+
+
+@rates_and_conditioning.defjvp
+def _rates_and_conditioning_jvp(primals, tangents):
+    values, rho = rates_and_conditioning(*primals)
+    _, change = jax.jvp(rates, primals, tangents)
+    return (values, rho), (change, jnp.zeros_like(rho))

@@ -1,6 +1,5 @@
 """Simulation: the vector field and its integration by diffrax."""
 
-import warnings
 from typing import Any, NamedTuple
 
 import diffrax
@@ -14,13 +13,14 @@ from numpy.typing import ArrayLike
 
 from .forces import ScalarElement
 from .linkage import Linkage, State, check_linkage
-from .rates import rates
+from .rates import rates, rates_and_conditioning
 from .reduced_equations import (
     Constants,
     Scalars,
     link_constants,
     zeros,
 )
+from .step_control import bounded, default_controller, landing_on, within_reach
 from .unrolled_dopri8 import ScheduledTerm, UnrolledDopri8
 from .validation import (
     callable_tuple,
@@ -33,6 +33,13 @@ from .validation import (
 
 Forces = tuple[Any, ...]  # callables (t, q, qd, linkage) -> tau
 
+# Steps of Dopri8, over the time scale of a mode, that keep its tangents to 1e-7.
+_OF_TIME_SCALE = 0.7
+
+# Below this the accelerations are right to six digits (float64) or two at best, and
+# adaptive steps are chosen by rounding.
+LEAST_PIVOT_RATIO = {np.dtype("float64"): 1e-9, np.dtype("float32"): 1e-5}
+
 
 class Solution(eqx.Module):
     """A simulated motion.
@@ -40,9 +47,9 @@ class Solution(eqx.Module):
     - `ts`: output times [s].
     - `q`, `qd`: joint positions [m or rad] and velocities at `ts`. NaN after a solve
       that failed.
-    - `stats`: diffrax's statistics, `num_steps` among them.
+    - `stats`: diffrax's statistics, `num_steps` among them, and `time_reached` [s].
     - `result`: diffrax's result, one per trajectory; `diffrax.RESULTS.successful` or
-      the reason of the failure.
+      the reason of the failure, which `outcome` says in a word or two.
     """
 
     ts: Float[Array, " time"]
@@ -50,6 +57,29 @@ class Solution(eqx.Module):
     qd: Float[Array, "time joint"]
     stats: dict[str, Any]
     result: diffrax.RESULTS
+
+    @property
+    def outcome(self) -> np.ndarray:
+        """How each trajectory ended, in words, in the shape of the batch.
+
+        `"successful"`; `"ill-conditioned"`: the mass matrix is singular or nearly so
+        (see `pivot_ratios`); `"not finite"`: the accelerations are not; `"out of
+        steps"`; `"tolerance out of reach"`: rounding keeps even the shortest step from
+        it; or `"solver failed"`.
+        """
+        results: Any = diffrax.RESULTS
+        words = {
+            "successful": results.successful,
+            "ill-conditioned": results.singular,
+            "not finite": results.nonfinite,
+            "out of steps": results.max_steps_reached,
+            "tolerance out of reach": results.dt_min_reached,
+        }
+        return np.select(
+            [np.asarray(self.result == result) for result in words.values()],
+            list(words),
+            default="solver failed",
+        )
 
 
 class Efforts(NamedTuple):
@@ -78,13 +108,10 @@ def _schedule(t: Array, args: _Args) -> tuple[Any, ...]:
     )
 
 
-def _vector_field(
+def _applied(
     t: Any, y: tuple[Scalars, Scalars], args: _Args, schedule: tuple[Any, ...]
-):
-    """Rates of six scalars; arrays only for the force elements written in them.
-
-    The positions are displacements from the start: see `reduced_equations`.
-    """
+) -> Scalars:
+    """The efforts of the force elements; arrays only for those written in them."""
     delta, qd = y
     tau = None
     for index, (element, scheduled) in enumerate(zip(args.forces, schedule)):
@@ -95,9 +122,24 @@ def _vector_field(
             q, rate = args.q0 + jnp.stack(delta), jnp.stack(qd)
             effort = element_effort(index, element, t, q, rate, args.linkage)
         tau = effort if tau is None else tuple(a + b for a, b in zip(tau, effort))
-    if tau is None:
-        tau = zeros(args.q0)
-    return rates(args.constants, delta, qd, tuple(tau))
+    return zeros(args.q0) if tau is None else tuple(tau)
+
+
+def _vector_field(t, y, args, schedule) -> tuple[Scalars, Scalars]:
+    """Rates of six scalars; the positions are displacements from the start."""
+    delta, qd = y
+    return rates(args.constants, delta, qd, _applied(t, y, args, schedule))
+
+
+def _watched_field(t, y, args, schedule) -> tuple[tuple[Scalars, Scalars], Array]:
+    """The same, and the health of the accelerations: see `ScheduledTerm`."""
+    tau = _applied(t, y, args, schedule)
+    delta, qd = y
+    (qd, qdd), rho = rates_and_conditioning(args.constants, delta, qd, tau)
+    finite = jnp.isfinite(qdd[0] + qdd[1] + qdd[2])
+    health = jnp.where(rho < LEAST_PIVOT_RATIO[rho.dtype], 0, rho)
+    # A singular matrix makes accelerations that are not finite.
+    return (qd, qdd), jnp.where(finite | (health == 0), health, jnp.nan)
 
 
 @eqx.filter_jit  # traced once, not at each use by a solver
@@ -121,37 +163,61 @@ def element_effort(
     return tau.astype(q.dtype)
 
 
-def adaptive(double: float, single: float) -> diffrax.PIDController:
-    """Adaptive steps at a relative and absolute tolerance chosen by the dtype."""
-    x64 = jnp.result_type(float) == jnp.float64
-    tolerance = double if x64 else single
-    # The smallest step ends solves that turn NaN, which would be rejected for ever.
-    return diffrax.PIDController(
-        rtol=tolerance,
-        atol=tolerance,
-        dtmin=1e-13 if x64 else 1e-8,
-        force_dtmin=False,
-    )
+def _step_for_tangents(t0: Array, args: _Args) -> Array:
+    """A step short enough for derivatives [s], where the motion would allow more.
+
+    A fraction of the time scale 1/omega of the fastest mode about the start: a step's
+    length is chosen by the error of the motion alone, and an arm that hangs at rest has
+    none. The trace of the squared linearisation bounds omega^2 free of units.
+    """
+    still = zeros(args.q0)
+    scheduled = _schedule(t0, args)
+
+    def accelerations(delta):
+        return jnp.stack(_vector_field(t0, (tuple(delta), still), args, scheduled)[1])
+
+    linearised = jax.jacfwd(accelerations)(jnp.zeros_like(args.q0))
+    omega2 = jnp.sqrt(jnp.abs(jnp.sum(linearised * linearised.T)))
+    step = _OF_TIME_SCALE / jnp.sqrt(omega2)
+    return jax.lax.stop_gradient(jnp.where(step > 0, step, jnp.inf))
 
 
-def _integrate(solver, inputs, keywords) -> Solution:
+def _integrate(solver, inputs, keywords, derivatives: bool = False) -> Solution:
+    """`derivatives`: whether they are wanted, to the accuracy of the default steps."""
     linkage, state0, ts, forces = inputs
+    args = _Args(linkage, state0.q, link_constants(linkage, state0.q), forces)
+    controller = keywords["stepsize_controller"]
+    if controller is None:
+        controller = default_controller()
+        if derivatives:
+            controller = bounded(controller, _step_for_tangents(ts[0], args))
+    jumps = [f.jump_ts for f in forces if getattr(f, "jump_ts", None) is not None]
+    if jumps:
+        times = jnp.concatenate([jnp.asarray(j, ts.dtype) for j in jumps])
+        controller = landing_on(controller, times)
     solution = diffrax.diffeqsolve(
-        ScheduledTerm(_vector_field, _schedule),
+        ScheduledTerm(_vector_field, _watched_field, _schedule),
         solver,
         t0=ts[0],
         t1=ts[-1],
         y0=(zeros(state0.q), tuple(state0.qd)),
-        args=_Args(linkage, state0.q, link_constants(linkage, state0.q), forces),
-        saveat=diffrax.SaveAt(ts=ts),
-        **keywords,
+        args=args,
+        saveat=diffrax.SaveAt(
+            subs=(
+                diffrax.SubSaveAt(ts=ts),
+                diffrax.SubSaveAt(t1=True, fn=lambda t, y, args: t),
+            )
+        ),
+        **keywords | {"stepsize_controller": controller},
     )
-    # diffrax leaves infinity where it has not come to save.
     assert solution.ys is not None  # because of saveat
-    delta, qd = (jnp.stack(rows, axis=-1) for rows in solution.ys)
+    motion, (reached,) = solution.ys
+    delta, qd = (jnp.stack(rows, axis=-1) for rows in motion)
     q = state0.q[None] + delta
+    # diffrax leaves infinity where it has not come to save.
     q, qd = (jnp.where(jnp.isinf(a), jnp.nan, a) for a in (q, qd))
-    return Solution(ts, q, qd, solution.stats, solution.result)
+    stats = solution.stats | {"time_reached": reached}
+    return Solution(ts, q, qd, stats, solution.result)
 
 
 @eqx.filter_custom_vjp
@@ -172,7 +238,8 @@ def _integrate_fast_fwd(perturbed, inputs, keywords):
     moving, fixed = eqx.partition(inputs, perturbed)
 
     def motion(moving):
-        solution = _integrate(diffrax.Dopri8(), eqx.combine(moving, fixed), keywords)
+        inputs = eqx.combine(moving, fixed)
+        solution = _integrate(diffrax.Dopri8(), inputs, keywords, derivatives=True)
         return (solution.q, solution.qd), solution
 
     states, pull_back, solution = eqx.filter_vjp(motion, moving, has_aux=True)
@@ -194,10 +261,10 @@ def _solve(solver, inputs, keywords) -> Solution:
     if solver is not None:
         return _integrate(solver, inputs, keywords)
     if isinstance(keywords["adjoint"], diffrax.ForwardMode):
-        return _integrate(UnrolledDopri8(), inputs, keywords)
+        return _integrate(UnrolledDopri8(), inputs, keywords, derivatives=True)
     if isinstance(keywords["adjoint"], diffrax.RecursiveCheckpointAdjoint):
         return _integrate_fast(inputs, keywords)
-    return _integrate(diffrax.Dopri8(), inputs, keywords)
+    return _integrate(diffrax.Dopri8(), inputs, keywords, derivatives=True)
 
 
 def simulate(
@@ -272,13 +339,13 @@ def simulate(
         instance(name, value, kind)
     if solver is not None:
         instance("solver", solver, diffrax.AbstractSolver)
-    if stepsize_controller is None:
-        stepsize_controller = adaptive(1e-11, 1e-5)
-    instance(
-        "stepsize_controller", stepsize_controller, diffrax.AbstractStepSizeController
-    )
-    warn_of_tolerance(stepsize_controller)
-    for element in forces:
+    if stepsize_controller is not None:
+        kind = diffrax.AbstractStepSizeController
+        instance("stepsize_controller", stepsize_controller, kind)
+        stepsize_controller = within_reach(stepsize_controller)
+    for index, element in enumerate(forces):
+        if getattr(element, "jump_ts", None) is not None:
+            real_array(f"forces[{index}].jump_ts", element.jump_ts, (None,))
         check = getattr(element, "check", None)
         if check is not None and not is_traced(linkage, ts, element):
             check(linkage, ts)
@@ -299,18 +366,6 @@ def simulate(
                 "adjoint=diffrax.ForwardMode()."
             ) from error
         raise
-
-
-def warn_of_tolerance(controller: diffrax.AbstractStepSizeController) -> None:
-    dtype = jnp.result_type(float)
-    for name in ("rtol", "atol"):
-        tolerance = getattr(controller, name, None)
-        if dtype == jnp.float32 and isinstance(tolerance, float) and tolerance < 5e-7:
-            warnings.warn(
-                f"stepsize_controller: {name}={tolerance:g} cannot be met in float32 "
-                "(about 1e-6 can); switch on jax_enable_x64 for more.",
-                stacklevel=3,
-            )
 
 
 def joint_efforts(linkage: Linkage, forces: Forces, solution: Solution) -> Efforts:

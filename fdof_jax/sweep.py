@@ -27,11 +27,10 @@ from .linkage import Linkage, State, real_joints
 from .simulation import (
     Forces,
     Solution,
-    adaptive,
     element_effort,
     simulate,
-    warn_of_tolerance,
 )
+from .step_control import Limited, default_controller, within_reach
 from .validation import (
     callable_tuple,
     concrete,
@@ -46,44 +45,13 @@ _SLACK = 2.0  # a member may take this many times the steps of most others
 _SMALL = 8  # lanes for the few that take more
 
 
-class _Limited(diffrax.AbstractStepSizeController):
-    """A step-size controller that gives up after a number of steps known at run time.
-
-    diffrax's own `max_steps` is part of the compiled program.
-    """
-
-    controller: diffrax.AbstractStepSizeController
-    limit: Array
-
-    def wrap(self, direction):
-        return _Limited(self.controller.wrap(direction), self.limit)
-
-    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
-        first, state = self.controller.init(
-            terms, t0, t1, y0, dt0, args, func, error_order
-        )
-        return first, (state, jnp.zeros_like(self.limit))
-
-    def adapt_step_size(  # pyright: ignore[reportIncompatibleMethodOverride]
-        self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state
-    ):
-        inner, count = controller_state
-        *step, inner, result = self.controller.adapt_step_size(
-            t0, t1, y0, y1_candidate, args, y_error, error_order, inner
-        )
-        count = count + 1
-        spent = (count >= self.limit) & (result == diffrax.RESULTS.successful)
-        result = diffrax.RESULTS.where(spent, diffrax.RESULTS.max_steps_reached, result)
-        keep, next_t0, next_t1, jump = step
-        return keep, next_t0, next_t1, jump, (inner, count), result
-
-
 def _motion(settings: dict, ts: Array, moving: Any, shared: Any, limit: Array | None):
     """One member's solution, without what all have in common."""
     linkage, state0, forces = eqx.combine(moving, shared)
     controller = settings["stepsize_controller"]
     if limit is not None:
-        controller = _Limited(controller, limit)
+        inner = default_controller() if controller is None else controller
+        controller = Limited(inner, limit)
     solution = simulate(
         linkage,
         state0,
@@ -361,12 +329,13 @@ def sweep(
         raise ValueError(f"checkpoint: expected a folder, got {checkpoint!r}.")
     if max_steps is not None:
         whole_number("max_steps", max_steps, 1)
-    controller = stepsize_controller
-    if controller is None:
-        controller = adaptive(1e-11, 1e-5)
-    instance("stepsize_controller", controller, diffrax.AbstractStepSizeController)
-    warn_of_tolerance(controller)
-    settings = dict(keywords, stepsize_controller=controller, max_steps=max_steps)
+    if stepsize_controller is not None:
+        kind = diffrax.AbstractStepSizeController
+        instance("stepsize_controller", stepsize_controller, kind)
+        stepsize_controller = within_reach(stepsize_controller)
+    settings = dict(
+        keywords, stepsize_controller=stepsize_controller, max_steps=max_steps
+    )
     if is_traced(batch.inputs, ts):
         if throw or checkpoint is not None:
             raise ValueError(

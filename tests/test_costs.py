@@ -95,10 +95,19 @@ def compiled_solve():
     return solve_of(jnp.linspace(0, 1, 12))
 
 
-def test_each_stage_is_one_loop_with_six_results(compiled_solve):
-    """13 stages of a step and the rates at the start, none computed more than once."""
-    six = r"= \(f64\[16\](\{0\})?(, (/\*index=5\*/)?f64\[16\](\{0\})?){5}\) fusion\("
-    assert len(re.findall(six, compiled_solve)) == 14
+def test_each_stage_is_one_loop(compiled_solve):
+    """None of the rates is computed more than once, nor is the end of a step.
+
+    Six rates at twelve stages, and their conditioning where steps begin and end.
+    """
+
+    def loops(results):
+        array = r"f64\[16\](\{0\})?"
+        more = rf"(, (/\*index=\d+\*/)?{array}){{{results - 1}}}"
+        return len(re.findall(rf"= \({array}{more}\) fusion\(", compiled_solve))
+
+    assert (loops(6), loops(7)) == (12, 2)
+    assert loops(18) == 1  # state, error and rounding at the end of a step
     # The polynomial's leading coefficient: another evaluation would repeat it.
     assert compiled_solve.count("1.5918129027234826e-10") <= 3 * 14 + 4
 

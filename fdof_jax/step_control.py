@@ -1,0 +1,220 @@
+"""What decides on the steps: tolerances and their scales, jumps, limits.
+
+Around diffrax's step-size controllers, which do the rest.
+"""
+
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from .linkage import Linkage, State, check_linkage, real_joints
+from .validation import instance, is_traced, real_array
+
+# Float32 meets no tighter relative or absolute tolerance: it fights its own rounding.
+_TIGHTEST_SINGLE = 1e-6
+
+
+def adaptive(double: float, single: float) -> diffrax.PIDController:
+    """Adaptive steps at a relative and absolute tolerance chosen by the dtype."""
+    x64 = jnp.result_type(float) == jnp.float64
+    tolerance = double if x64 else single
+    # The smallest step ends solves that rounding keeps from their tolerance.
+    return diffrax.PIDController(
+        rtol=tolerance,
+        atol=tolerance,
+        dtmin=1e-13 if x64 else 1e-8,
+        force_dtmin=False,
+    )
+
+
+def default_controller() -> diffrax.PIDController:
+    """That of `simulate` and `sweep`."""
+    return adaptive(1e-11, 1e-5)
+
+
+def _with_pid(change: Callable[[diffrax.PIDController], Any], controller: Any) -> Any:
+    """A controller with `change` made to the one that adapts the steps within."""
+
+    def is_pid(node: Any) -> bool:
+        return isinstance(node, diffrax.PIDController)
+
+    return jax.tree.map(
+        lambda node: change(node) if is_pid(node) else node, controller, is_leaf=is_pid
+    )
+
+
+def within_reach(
+    controller: diffrax.AbstractStepSizeController,
+) -> diffrax.AbstractStepSizeController:
+    """The controller, in float32 with tolerances that can be met, and a warning."""
+    if jnp.result_type(float) != jnp.float32:
+        return controller
+
+    def loosened(pid: diffrax.PIDController) -> diffrax.PIDController:
+        return eqx.tree_at(
+            lambda p: (p.rtol, p.atol),
+            pid,
+            (met(pid.rtol, "rtol"), met(pid.atol, "atol")),
+        )
+
+    def met(tolerance: Any, name: str) -> Any:
+        if not isinstance(tolerance, float) or tolerance >= _TIGHTEST_SINGLE / 2:
+            return tolerance
+        warnings.warn(
+            f"stepsize_controller: {name}={tolerance:g} cannot be met in float32, "
+            f"{_TIGHTEST_SINGLE:g} is used; switch on jax_enable_x64 for more.",
+            stacklevel=7,
+        )
+        return _TIGHTEST_SINGLE
+
+    return _with_pid(loosened, controller)
+
+
+def bounded(controller: diffrax.PIDController, longest: Array) -> diffrax.PIDController:
+    """The controller with a longest step."""
+    return eqx.tree_at(lambda c: c.dtmax, controller, longest, is_leaf=_is_none)
+
+
+def _is_none(node: Any) -> bool:
+    return node is None
+
+
+def landing_on(
+    controller: diffrax.AbstractStepSizeController, jump_ts: Array
+) -> diffrax.AbstractStepSizeController:
+    """The controller with steps that end at these times, where efforts jump.
+
+    Raises ValueError for a controller whose steps are not adaptive.
+    """
+    if isinstance(controller, Limited):
+        return Limited(landing_on(controller.controller, jump_ts), controller.limit)
+    if not isinstance(controller, diffrax.AbstractAdaptiveStepSizeController):
+        raise ValueError(
+            "stepsize_controller: expected an adaptive one, as forces declare times "
+            f"at which they jump (jump_ts), got {controller!r}."
+        )
+    return diffrax.ClipStepSizeController(controller, jump_ts=jump_ts)
+
+
+class _Wrapped(diffrax.AbstractStepSizeController):
+    """What wrappers of a controller have in common."""
+
+    controller: eqx.AbstractVar[Any]
+
+    def wrap(self, direction):
+        inner = self.controller.wrap(direction)
+        return eqx.tree_at(lambda c: c.controller, self, inner)
+
+
+class Limited(_Wrapped):
+    """A step-size controller that gives up after a number of steps known at run time.
+
+    diffrax's own `max_steps` is part of the compiled program.
+    """
+
+    controller: diffrax.AbstractStepSizeController
+    limit: Array
+
+    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
+        first, state = self.controller.init(
+            terms, t0, t1, y0, dt0, args, func, error_order
+        )
+        return first, (state, jnp.zeros_like(self.limit))
+
+    def adapt_step_size(  # pyright: ignore[reportIncompatibleMethodOverride]
+        self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state
+    ):
+        inner, count = controller_state
+        *step, inner, result = self.controller.adapt_step_size(
+            t0, t1, y0, y1_candidate, args, y_error, error_order, inner
+        )
+        count = count + 1
+        spent = (count >= self.limit) & (result == diffrax.RESULTS.successful)
+        result = diffrax.RESULTS.where(spent, diffrax.RESULTS.max_steps_reached, result)
+        keep, next_t0, next_t1, jump = step
+        return keep, next_t0, next_t1, jump, (inner, count), result
+
+
+class _Scaled(_Wrapped, diffrax.AbstractAdaptiveStepSizeController):
+    """A controller that sees the state in units of its own per coordinate."""
+
+    controller: Any
+    unit: tuple[tuple[Array, ...], tuple[Array, ...]]  # as the state: q, qd
+    # Where an implicit solver looks for tolerances of its own.
+    rtol: Any  # pyright: ignore[reportIncompatibleVariableOverride]
+    atol: Any  # pyright: ignore[reportIncompatibleVariableOverride]
+    norm: Any  # pyright: ignore[reportIncompatibleVariableOverride]
+
+    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
+        if dt0 is None:
+            raise ValueError(
+                "dt0: expected a first step [s] with scaled tolerances, got None."
+            )
+        return self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
+
+    def adapt_step_size(  # pyright: ignore[reportIncompatibleMethodOverride]
+        self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state
+    ):
+        y0, y1_candidate, y_error = (
+            jax.tree.map(lambda a, unit: a / unit, state, self.unit)
+            for state in (y0, y1_candidate, y_error)
+        )
+        return self.controller.adapt_step_size(
+            t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state
+        )
+
+
+def scale_tolerances(
+    linkage: Linkage,
+    controller: diffrax.AbstractAdaptiveStepSizeController | None = None,
+    *,
+    scale: State | None = None,
+) -> diffrax.AbstractAdaptiveStepSizeController:
+    """A controller whose absolute tolerance is measured in sizes of the linkage.
+
+    An absolute tolerance of 1e-11 means metres, radians and their rates. For an arm of
+    millimetres or kilometres, pass the result as `stepsize_controller`: slides are then
+    measured in the size of the arm L [m], rates in the time sqrt(L/g) [s], angles in
+    radians.
+
+    **Arguments:**
+
+    - `controller`: whose tolerances are meant; by default that of `simulate`.
+    - `scale`: other units, per coordinate: a State of two arrays (3,), all positive
+      [m or rad, m/s or rad/s].
+
+    **Raises:** ValueError for a controller that is not adaptive, a scale that is not
+    positive, or a linkage of no size without `scale`.
+    """
+    check_linkage(linkage)
+    controller = default_controller() if controller is None else controller
+    instance("controller", controller, diffrax.AbstractAdaptiveStepSizeController)
+    if scale is not None:
+        instance("scale", scale, State)
+        q, qd = (
+            real_array(f"scale.{name}", getattr(scale, name), (3,), above=0)
+            for name in ("q", "qd")
+        )
+    else:
+        size = jnp.sum(jnp.abs(linkage.length)) + jnp.sum(jnp.abs(linkage.com))
+        if not is_traced(size) and size == 0:
+            raise ValueError("scale: expected one, as the linkage has no size.")
+        time = jnp.where(
+            linkage.gravity == 0, 1, jnp.sqrt(size / jnp.abs(linkage.gravity))
+        )
+        q = jnp.where(jnp.stack(real_joints(linkage.ef)), 1, size)
+        qd = q / time
+    unit = tuple(q), tuple(qd)
+    return _Scaled(
+        controller=controller,
+        unit=unit,
+        rtol=controller.rtol,
+        atol=controller.atol,
+        norm=controller.norm,
+    )

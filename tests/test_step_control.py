@@ -1,0 +1,149 @@
+"""What stops a solve, what steps land on, in which units tolerances are meant."""
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import fdof_jax as fj
+
+LINKS = dict(com=[[0.5, 0]] * 3, mass=[1, 1, 1], inertia=[1 / 12] * 3)
+ARM = fj.Linkage("RRR", length=[0, 1, 1, 1], **LINKS)
+START = fj.State([-0.5, 0.3, 0.2], [0, 0, 0])
+TS = np.linspace(0, 1, 5)
+
+
+class Switched(eqx.Module):
+    """An effort that is on between two times."""
+
+    jump_ts: jax.Array
+    effort: float | jax.Array = 50.0
+
+    def __call__(self, t, q, qd, linkage):
+        on = (t > self.jump_ts[0]) & (t < self.jump_ts[1])
+        return jnp.where(on, self.effort, 0.0) * jnp.array([1.0, 0, 0])
+
+
+def test_outcome_and_time_reached_of_each_member():
+    class Breaking(eqx.Module):
+        at: jax.Array
+
+        def __call__(self, t, q, qd, linkage):
+            return jnp.where(t > self.at, jnp.nan, 0.0) * jnp.ones(3)
+
+    def motion(at, q):
+        start = fj.State(q, jnp.zeros(3))
+        return fj.simulate(ARM, start, TS, (Breaking(at),), throw=False)
+
+    q = jnp.stack([jnp.asarray(START.q)] * 3).at[2].set(jnp.inf)
+    many = jax.vmap(motion)(jnp.array([2.0, 0.6, 2.0]), q)
+    assert many.outcome.tolist() == ["successful", "not finite", "not finite"]
+    np.testing.assert_allclose(many.stats["time_reached"], [1, 0.6, 0], atol=1e-9)
+    assert np.isfinite(many.q).all(axis=2).sum(axis=1).tolist() == [5, 3, 0]
+    # 46 bisections by 5 lead from a millisecond to the shortest step.
+    assert (many.stats["num_steps"][1:] < 120).all()
+
+
+def test_a_mass_matrix_that_turns_singular_is_named():
+    """A link without inertia of its own: singular where the others line up."""
+    arm = eqx.tree_at(lambda a: a.inertia, ARM, jnp.array([1 / 12, 0, 0]))
+    arm = eqx.tree_at(lambda a: (a.mass, a.com), arm,
+                      (jnp.array([1.0, 0, 1]), arm.com.at[2, 0].set(1.0)))  # fmt: skip
+    bent, straight = jnp.array([0.0, 0.3, 0.5]), jnp.array([0.0, 0.3, 0.0])
+    assert fj.pivot_ratios(arm, bent).min() > 1e-2
+    assert not fj.pivot_ratios(arm, straight).min() > 1e-15
+    for q, outcome in ((bent, "successful"), (straight, "ill-conditioned")):
+        start = fj.State(q, jnp.zeros(3))
+        solution = fj.simulate(arm, start, [0, 1e-3], throw=False)
+        assert solution.outcome == outcome
+
+
+def test_out_of_steps():
+    solution = fj.simulate(ARM, START, TS, max_steps=20, throw=False)
+    assert solution.outcome == "out of steps"
+    reached = solution.stats["time_reached"]
+    assert 0 < reached < 1
+    assert np.isfinite(solution.q).all(axis=1).tolist() == (TS <= reached).tolist()
+
+
+def test_steps_land_on_declared_jumps():
+    """A pulse between two steps is missed unless it is declared."""
+    pulse = Switched(jnp.array([0.5, 0.5 + 1e-6]), 1e6)
+
+    def end(forces):
+        return fj.simulate(ARM, START, [0, 1.0], forces).q[-1]
+
+    hit = end((pulse,)) - end(())
+    # An impulse of 1 N m s changes the first joint's rate at once.
+    halfway = fj.simulate(ARM, START, [0, 0.5])
+    kick = jnp.array([1.0, 0, 0])
+    still = fj.forward_dynamics(ARM, halfway.q[-1], halfway.qd[-1], jnp.zeros(3))
+    change = fj.forward_dynamics(ARM, halfway.q[-1], halfway.qd[-1], kick) - still
+    after = fj.State(halfway.q[-1], halfway.qd[-1] + change)
+    kicked = fj.simulate(ARM, after, [0.5, 1.0]).q[-1]
+    np.testing.assert_allclose(hit, kicked - end(()), atol=1e-5)
+    assert np.abs(hit).max() > 0.01
+
+
+def test_a_sweep_lands_on_each_members_jumps():
+    jumps = jnp.array([[0.2, 0.4], [0.6, 0.8]])
+    together = fj.sweep(
+        ARM, START, TS, (Switched(jumps),), forces_axes=(Switched(0, None),)
+    )
+    for i in range(2):
+        alone = fj.simulate(ARM, START, TS, (Switched(jumps[i]),))
+        np.testing.assert_allclose(together.q[i], alone.q, atol=1e-9)
+
+
+def test_jumps_need_adaptive_steps():
+    with pytest.raises(ValueError, match="stepsize_controller: expected an adaptive"):
+        fj.simulate(
+            ARM, START, TS, (Switched(jnp.array([0.5, 0.6])),),
+            stepsize_controller=diffrax.ConstantStepSize(),
+        )  # fmt: skip
+    with pytest.raises(ValueError, match=r"forces\[0\]\.jump_ts: expected"):
+        fj.simulate(ARM, START, TS, (Switched(jnp.array([[0.5, jnp.nan]])),))
+
+
+def test_tolerances_in_sizes_of_the_arm():
+    """An arm of 1 mm moves as one of 1 m, in 0.03 of the time."""
+    size = 1e-3
+    small = fj.Linkage(
+        "RPR", length=[0, size, size, size], com=[[0.5 * size, 0]] * 3, mass=[1] * 3,
+        inertia=[size**2 / 12] * 3,
+    )  # fmt: skip
+    large = fj.Linkage("RPR", length=[0, 1, 1, 1], **LINKS)
+    unit, time = np.array([1, size, 1]), np.sqrt(size)
+    expected = fj.simulate(large, START, TS).q
+    scaled = fj.simulate(
+        small, fj.State(START.q * unit, [0, 0, 0]), TS * time, dt0=1e-3 * time,
+        stepsize_controller=fj.scale_tolerances(small),
+    )  # fmt: skip
+    np.testing.assert_allclose(scaled.q / unit[None], expected, atol=1e-8)
+
+
+def test_a_scale_of_ones_changes_nothing():
+    ones = fj.State([1, 1, 1], [1, 1, 1])
+    scaled = fj.scale_tolerances(ARM, scale=ones)
+    solutions = [
+        fj.simulate(ARM, START, TS, stepsize_controller=c) for c in (None, scaled)
+    ]
+    assert solutions[0].stats["num_steps"] == solutions[1].stats["num_steps"]
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        ((ARM, diffrax.ConstantStepSize()), "controller: expected"),
+        (("RRR",), "linkage: expected"),
+        ((ARM, None, fj.State([1, 0, 1], [1, 1, 1])), "scale.q: expected"),
+        ((ARM, None, fj.State([1, 1, 1], [1, 1])), "scale.qd: expected"),
+        ((ARM, None, 3.0), "scale: expected"),
+    ],
+)
+def test_bad_scales_are_refused(arguments, message):
+    linkage, controller, scale = (*arguments, None, None)[:3]
+    with pytest.raises(ValueError, match=message):
+        fj.scale_tolerances(linkage, controller, scale=scale)
