@@ -11,9 +11,9 @@ from .control import CircleTask as CircleTask, PDController as PDController
 from .dynamics import (
     energy as energy,
     forward_dynamics as forward_dynamics,
+    inertia_ratios as inertia_ratios,
     inverse_dynamics as inverse_dynamics,
     link_energies as link_energies,
-    pivot_ratios as pivot_ratios,
 )
 from .forces import JointDamper as JointDamper, JointEffort as JointEffort
 from .interop import to_mjcf as to_mjcf

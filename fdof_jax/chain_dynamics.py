@@ -198,9 +198,19 @@ def masked_accelerations(
         th2 = rows[1] + ef3 * th3
         return jnp.stack([rows[0], th2, rows[2], th3, rows[4], th4])
 
-    still = jnp.eye(6) - jnp.diag(jnp.array([0.0, 1, 0, 1]), -2)
-    matrix = jnp.where(real[:, None], masked(M), still)
-    return jnp.linalg.solve(matrix, jnp.where(real, masked(right), 0))
+    # With the columns of fictitious joints added up likewise, their rows are those of
+    # the identity and nothing but a copy is left to do for them. The real ones are
+    # scaled: metres and radians may be worlds apart.
+    both = jnp.where(jnp.outer(real, real), masked(masked(M).T), jnp.eye(6))
+    diagonal = jnp.diag(both)
+    size = jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1))
+    scaled = jnp.where(real, masked(right), 0) / size
+    xdd = jnp.linalg.solve(both / jnp.outer(size, size), scaled) / size
+    xdd = jnp.where(real, xdd, 0)  # which elimination leaves to rounding
+    th2 = xdd[1]
+    th3 = jnp.where(real[3], xdd[3], th2)
+    th4 = jnp.where(real[5], xdd[5], th3)
+    return jnp.stack([xdd[0], th2, xdd[2], th3, xdd[4], th4])
 
 
 @compiled(x=(6,), xd=(6,), force=(6,))

@@ -33,7 +33,8 @@ class PDController(ScalarElement):
     """Saturated PD control of the joints, as in Fig 7: a force element.
 
     The effort is kp * (q_ref - q) + kd * (qd_ref - qd), clipped to +-limit as a whole.
-    The position error is never wrapped: a start one turn away unwinds.
+    The position error is never wrapped: a start one turn away unwinds. The derivative
+    of an effort beyond its limit is zero, and that of one just at it is not.
 
     **Arguments:** all in joint order, one per joint or one for all.
 
@@ -81,8 +82,9 @@ class PDController(ScalarElement):
         return q_ref, qd_ref
 
     def respond(self, scheduled, q, qd, linkage):
+        # Not jnp.clip, whose derivative at the limit is the mean of both sides'.
         return tuple(
-            jnp.clip(effort, -limit, limit)
+            jnp.where(effort > limit, limit, jnp.where(effort < -limit, -limit, effort))
             for effort, limit in zip(self._unlimited(scheduled, q, qd), self.limit)
         )
 

@@ -6,7 +6,7 @@ from jaxtyping import Float
 
 from .kinematics import mass_center_velocities, mass_centers
 from .linkage import Linkage, compiled
-from .rates import rates
+from .rates import inverse_inertia_diagonal, rates
 from .reduced_equations import equations, link_constants, zeros
 
 
@@ -31,22 +31,23 @@ def forward_dynamics(
 
 
 @compiled(q=(3,))
-def pivot_ratios(linkage: Linkage, q: Float[Array, " joint"]) -> Float[Array, " joint"]:
+def inertia_ratios(
+    linkage: Linkage, q: Float[Array, " joint"]
+) -> Float[Array, " joint"]:
     """How well the accelerations are determined: in (0, 1] per joint, free of units.
 
-    The inertia that each joint feels while the joints beyond it are free to move, over
-    what it would feel if they were locked: the pivots of the 3x3 mass matrix over its
-    diagonal. The accelerations lose about -log10 of the least ratio in digits; below
-    1e-9 in float64, 1e-5 in float32, `simulate` gives up and says so. NaN where the
-    matrix is singular.
+    The inertia [kg or kg m^2] that each joint feels while the others are free to move,
+    over what it feels while they are locked: 1 / (M_kk (M^-1)_kk) of the 3x3 mass
+    matrix. The accelerations lose about -log10 of the least ratio in digits; below
+    1e-9 in float64, 1e-5 in float32, `simulate` gives up and says so. Zero where the
+    matrix is not positive definite.
 
     **Arguments:** `q` [m or rad].
     """
     m = equations(link_constants(linkage, q), zeros(q), zeros(q))
-    pivot2 = m.m22 - m.m23**2 / m.m33
-    rest12 = m.m12 - m.m13 * m.m23 / m.m33
-    pivot1 = m.m11 - m.m13**2 / m.m33 - rest12**2 / pivot2
-    return jnp.stack([pivot1 / m.m11, pivot2 / m.m22, m.m33 / m.m33])
+    i11, i22, i33 = inverse_inertia_diagonal(m)
+    # Divided twice, as a product of zero and infinity is not a number.
+    return jnp.stack([1 / i11 / m.m11, 1 / i22 / m.m22, 1 / i33 / m.m33])
 
 
 @compiled(q=(3,), qd=(3,), qdd=(3,))

@@ -55,10 +55,11 @@ def _one_loop(function: Callable) -> Callable:
 
 def _solver(
     m: Equations, reciprocal: Callable[[Array], Array]
-) -> tuple[Callable[[Scalars], Scalars], tuple[Array, Array]]:
-    """Solves M x = f, by L^T D L from the tip; the first two pivots.
+) -> tuple[Callable[[Scalars], Scalars], Callable[[], Scalars]]:
+    """Solves M x = f, by L^T D L from the tip: the pivots are articulated inertias.
 
-    The pivots are articulated inertias, the third is m33.
+    The second function returns the diagonal of the inverse of M, infinite where a pivot
+    is not positive.
     """
     inverse3 = reciprocal(m.m33)
     l23, l13 = m.m23 * inverse3, m.m13 * inverse3
@@ -75,7 +76,18 @@ def _solver(
         x2 = y2 * inverse2 - l12 * x1
         return x1, x2, f[2] * inverse3 - l13 * x1 - l23 * x2
 
-    return solve, (pivot1, pivot2)
+    def inverse_diagonal() -> Scalars:
+        from1 = l13 - l12 * l23
+        second = inverse2 + l12 * l12 * inverse1
+        third = inverse3 + l23 * l23 * inverse2 + from1 * from1 * inverse1
+        # The pivots after one that is not positive are not numbers.
+        singular = (m.m33 <= 0) | (pivot2 <= 0) | (pivot1 <= 0)
+        first, second, third = (
+            jnp.where(singular, jnp.inf, i) for i in (inverse1, second, third)
+        )
+        return first, second, third
+
+    return solve, inverse_diagonal
 
 
 def _subtract(a: Scalars, b: Scalars) -> Scalars:
@@ -96,11 +108,12 @@ def _rates_and_conditioning(
     reciprocal: Callable, c: Constants, delta: Scalars, qd: Scalars, tau: Scalars
 ) -> tuple[Scalars, Scalars, Array]:
     m = equations(c, delta, qd)
-    solve, (pivot1, pivot2) = _solver(m, reciprocal)
-    rho = jnp.minimum(pivot2 * reciprocal(m.m22), pivot1 * reciprocal(m.m11))
-    # The pivots after one that is not positive are not numbers.
-    singular = (m.m33 <= 0) | (pivot2 <= 0) | (pivot1 <= 0)
-    return qd, solve(_subtract(tau, m.bias)), jnp.where(singular, 0, rho)
+    solve, inverse_diagonal = _solver(m, reciprocal)
+    i11, i22, i33 = inverse_diagonal()
+    loss = jnp.maximum(m.m11 * i11, jnp.maximum(m.m22 * i22, m.m33 * i33))
+    # An infinite inverse times a mass of zero.
+    loss = jnp.where(i11 == jnp.inf, jnp.inf, loss)
+    return qd, solve(_subtract(tau, m.bias)), loss
 
 
 @jax.jit
@@ -222,16 +235,23 @@ rates.defjvp(_rates_jvp, symbolic_zeros=True)
 def rates_and_conditioning(
     c: Constants, delta: Scalars, qd: Scalars, tau: Scalars
 ) -> tuple[tuple[Scalars, Scalars], Array]:
-    """`rates`, and the smallest pivot ratio of the mass matrix: see `pivot_ratios`.
+    """`rates`, and what rounding is multiplied by: 1 over the least inertia ratio.
 
-    Zero where a pivot is not positive. Derivatives take the ratio for a constant.
+    See `inertia_ratios`. Infinite where the mass matrix is not positive definite.
+    Derivatives take it for a constant.
     """
-    qd, qdd, rho = _one_loop(_rates_and_conditioning)(c, delta, qd, tau)
-    return (qd, qdd), rho
+    qd, qdd, loss = _one_loop(_rates_and_conditioning)(c, delta, qd, tau)
+    return (qd, qdd), loss
 
 
 @rates_and_conditioning.defjvp
 def _rates_and_conditioning_jvp(primals, tangents):
-    values, rho = rates_and_conditioning(*primals)
+    values, loss = rates_and_conditioning(*primals)
     _, change = jax.jvp(rates, primals, tangents)
-    return (values, rho), (change, jnp.zeros_like(rho))
+    return (values, loss), (change, jnp.zeros_like(loss))
+
+
+def inverse_inertia_diagonal(m: Equations) -> Scalars:
+    """The diagonal of the inverse mass matrix; infinite where there is none."""
+    _, inverse_diagonal = _solver(m, _divided)
+    return inverse_diagonal()

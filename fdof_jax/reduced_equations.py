@@ -9,6 +9,7 @@ S(EF)^T M S(EF) of the paper's six equations without ever forming them; existenc
 factors select, per joint, between turning about a point and sliding along a direction.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -55,11 +56,24 @@ class Constants(NamedTuple):
     j4: Array
 
 
-def link_constants(linkage: Linkage, q: Float[Array, " joint"]) -> Constants:
-    """The scalars that `rates` needs, with `q` as reference."""
+def link_constants(
+    linkage: Linkage,
+    q: Float[Array, " joint"],
+    sincos: Callable[[Array], tuple[Array, Array]] = sincos,
+) -> Constants:
+    """The scalars that `rates` needs, with `q` as reference.
+
+    `sincos` may be one for larger angles, which are not added up before their
+    directions are known: the sum of large ones is rounded.
+    """
     x, _ = to_chain(linkage, q, jnp.zeros_like(q))
-    sin, cos = sincos(jnp.concatenate([linkage.base_angle[None], x[1::2]]))
-    e1, e2, e3, e4 = zip(cos, sin)
+    revolute = jnp.stack(real_joints(linkage.ef))
+    turns = jnp.where(revolute, q, linkage.locked)
+    sin, cos = sincos(jnp.concatenate([linkage.base_angle[None], turns]))
+    e1, *turned = zip(cos, sin)
+    e2 = _in_frame(*turned[0], e1)
+    e3 = _in_frame(*turned[1], e2)
+    e4 = _in_frame(*turned[2], e3)
     m2, m3, m4 = linkage.mass
     _, a2, a3, _ = linkage.length
     (s2, t2), (s3, t3), (s4, t4) = linkage.mass[:, None] * linkage.com

@@ -33,12 +33,13 @@ from .validation import (
 
 Forces = tuple[Any, ...]  # callables (t, q, qd, linkage) -> tau
 
-# Steps of Dopri8, over the time scale of a mode, that keep its tangents to 1e-7.
-_OF_TIME_SCALE = 0.7
+# Steps over the time scale of a mode that keep its tangents to 1e-7 over 10 s: those of
+# methods of order 8, and of lower ones down to 5.
+_OF_TIME_SCALE = 0.7, 0.1
 
-# Below this the accelerations are right to six digits (float64) or two at best, and
-# adaptive steps are chosen by rounding.
-LEAST_PIVOT_RATIO = {np.dtype("float64"): 1e-9, np.dtype("float32"): 1e-5}
+# With inertia ratios below this the accelerations are right to six digits (float64) or
+# two at best, and adaptive steps are chosen by rounding.
+_LEAST_INERTIA_RATIO = {np.dtype("float64"): 1e-9, np.dtype("float32"): 1e-5}
 
 
 class Solution(eqx.Module):
@@ -63,7 +64,7 @@ class Solution(eqx.Module):
         """How each trajectory ended, in words, in the shape of the batch.
 
         `"successful"`; `"ill-conditioned"`: the mass matrix is singular or nearly so
-        (see `pivot_ratios`); `"not finite"`: the accelerations are not; `"out of
+        (see `inertia_ratios`); `"not finite"`: the accelerations are not; `"out of
         steps"`; `"tolerance out of reach"`: rounding keeps even the shortest step from
         it; or `"solver failed"`.
         """
@@ -135,9 +136,9 @@ def _watched_field(t, y, args, schedule) -> tuple[tuple[Scalars, Scalars], Array
     """The same, and the health of the accelerations: see `ScheduledTerm`."""
     tau = _applied(t, y, args, schedule)
     delta, qd = y
-    (qd, qdd), rho = rates_and_conditioning(args.constants, delta, qd, tau)
+    (qd, qdd), loss = rates_and_conditioning(args.constants, delta, qd, tau)
     finite = jnp.isfinite(qdd[0] + qdd[1] + qdd[2])
-    health = jnp.where(rho < LEAST_PIVOT_RATIO[rho.dtype], 0, rho)
+    health = jnp.where(loss * _LEAST_INERTIA_RATIO[loss.dtype] > 1, 0, loss)
     # A singular matrix makes accelerations that are not finite.
     return (qd, qdd), jnp.where(finite | (health == 0), health, jnp.nan)
 
@@ -163,7 +164,7 @@ def element_effort(
     return tau.astype(q.dtype)
 
 
-def _step_for_tangents(t0: Array, args: _Args) -> Array:
+def _step_for_tangents(t0: Array, args: _Args, fraction: float) -> Array:
     """A step short enough for derivatives [s], where the motion would allow more.
 
     A fraction of the time scale 1/omega of the fastest mode about the start: a step's
@@ -178,25 +179,29 @@ def _step_for_tangents(t0: Array, args: _Args) -> Array:
 
     linearised = jax.jacfwd(accelerations)(jnp.zeros_like(args.q0))
     omega2 = jnp.sqrt(jnp.abs(jnp.sum(linearised * linearised.T)))
-    step = _OF_TIME_SCALE / jnp.sqrt(omega2)
+    step = fraction / jnp.sqrt(omega2)
     return jax.lax.stop_gradient(jnp.where(step > 0, step, jnp.inf))
 
 
 def _integrate(solver, inputs, keywords, derivatives: bool = False) -> Solution:
     """`derivatives`: whether they are wanted, to the accuracy of the default steps."""
     linkage, state0, ts, forces = inputs
-    args = _Args(linkage, state0.q, link_constants(linkage, state0.q), forces)
+    # Once per solve: the start may be any number of turns away.
+    constants = link_constants(linkage, state0.q, lambda x: (jnp.sin(x), jnp.cos(x)))
+    args = _Args(linkage, state0.q, constants, forces)
+    term = ScheduledTerm(_vector_field, _watched_field, _schedule)
     controller = keywords["stepsize_controller"]
     if controller is None:
         controller = default_controller()
         if derivatives:
-            controller = bounded(controller, _step_for_tangents(ts[0], args))
+            fraction = _OF_TIME_SCALE[0 if solver.order(term) >= 8 else 1]
+            controller = bounded(controller, _step_for_tangents(ts[0], args, fraction))
     jumps = [f.jump_ts for f in forces if getattr(f, "jump_ts", None) is not None]
     if jumps:
         times = jnp.concatenate([jnp.asarray(j, ts.dtype) for j in jumps])
         controller = landing_on(controller, times)
     solution = diffrax.diffeqsolve(
-        ScheduledTerm(_vector_field, _watched_field, _schedule),
+        term,
         solver,
         t0=ts[0],
         t1=ts[-1],
@@ -214,40 +219,47 @@ def _integrate(solver, inputs, keywords, derivatives: bool = False) -> Solution:
     motion, (reached,) = solution.ys
     delta, qd = (jnp.stack(rows, axis=-1) for rows in motion)
     q = state0.q[None] + delta
-    # diffrax leaves infinity where it has not come to save.
+    # diffrax saves the start with the first step, and leaves infinity where it has not
+    # come to save.
+    q, qd = q.at[0].set(state0.q), qd.at[0].set(state0.qd)
     q, qd = (jnp.where(jnp.isinf(a), jnp.nan, a) for a in (q, qd))
     stats = solution.stats | {"time_reached": reached}
     return Solution(ts, q, qd, stats, solution.result)
 
 
 @eqx.filter_custom_vjp
-def _integrate_fast(inputs, keywords) -> Solution:
-    """The default: unrolled stages, but not where reverse mode repeats the steps.
+def _integrate_reversibly(inputs, solver, keywords) -> Solution:
+    """A motion whose derivatives are taken in reverse mode, if any are.
 
-    Its replay has to come to the same bits: next to a saturation another rounding
-    leads to other steps, and to a wrong gradient. Unrolled stages are compiled
-    differently with derivatives and without; diffrax's loop over the stages is not.
+    The default solver's unrolled stages are not for that. The replay has to come to
+    the same bits: next to a saturation another rounding leads to other steps, and to a
+    wrong gradient. Unrolled stages are compiled differently with derivatives and
+    without; diffrax's loop over the stages is not.
     """
     # Nothing is differentiated here, and loops made for that take longer to compile.
     keywords = keywords | {"adjoint": diffrax.ForwardMode()}
-    return _integrate(UnrolledDopri8(), inputs, keywords)
+    return _integrate(solver or UnrolledDopri8(), inputs, keywords)
 
 
-@_integrate_fast.def_fwd
-def _integrate_fast_fwd(perturbed, inputs, keywords):
+@_integrate_reversibly.def_fwd
+def _integrate_reversibly_fwd(perturbed, inputs, solver, keywords):
     moving, fixed = eqx.partition(inputs, perturbed)
 
     def motion(moving):
         inputs = eqx.combine(moving, fixed)
-        solution = _integrate(diffrax.Dopri8(), inputs, keywords, derivatives=True)
+        solution = _integrate(
+            solver or diffrax.Dopri8(), inputs, keywords, derivatives=True
+        )
         return (solution.q, solution.qd), solution
 
     states, pull_back, solution = eqx.filter_vjp(motion, moving, has_aux=True)
     return solution, (pull_back, states)
 
 
-@_integrate_fast.def_bwd
-def _integrate_fast_bwd(residuals, cotangent, perturbed, inputs, keywords):
+@_integrate_reversibly.def_bwd
+def _integrate_reversibly_bwd(
+    residuals, cotangent, perturbed, inputs, solver, keywords
+):
     pull_back, states = residuals
     wanted = eqx.combine(
         (cotangent.q, cotangent.qd), jax.tree.map(jnp.zeros_like, states)
@@ -258,13 +270,56 @@ def _integrate_fast_bwd(residuals, cotangent, perturbed, inputs, keywords):
 
 @eqx.filter_jit
 def _solve(solver, inputs, keywords) -> Solution:
+    adjoint = keywords["adjoint"]
+    if isinstance(adjoint, diffrax.RecursiveCheckpointAdjoint):
+        return _integrate_reversibly(inputs, solver, keywords)
+    if solver is None:
+        forward = isinstance(adjoint, diffrax.ForwardMode)
+        solver = UnrolledDopri8() if forward else diffrax.Dopri8()
+    return _integrate(solver, inputs, keywords, derivatives=True)
+
+
+def solve_options(
+    solver: diffrax.AbstractSolver | None = None,
+    *,
+    stepsize_controller: diffrax.AbstractStepSizeController | None = None,
+    dt0: ArrayLike | None = 1e-3,
+    adjoint: diffrax.AbstractAdjoint = diffrax.RecursiveCheckpointAdjoint(),
+    max_steps: int | None = 65536,
+    throw: bool = True,
+    progress_meter: diffrax.AbstractProgressMeter = diffrax.NoProgressMeter(),
+) -> tuple[diffrax.AbstractSolver | None, dict[str, Any]]:
+    """The keywords of `simulate`, checked: the solver, and those of diffeqsolve."""
+    if dt0 is not None:
+        dt0 = real_array("dt0", dt0, (), above=0)  # an array: new values, no new trace
+    if max_steps is not None:
+        whole_number("max_steps", max_steps, 1)
+    if isinstance(adjoint, diffrax.BacksolveAdjoint):
+        raise ValueError(
+            "adjoint: expected RecursiveCheckpointAdjoint (reverse mode) or "
+            "ForwardMode, got BacksolveAdjoint, whose gradients are wrong on these "
+            "problems."
+        )
+    for name, value, kind in (
+        ("adjoint", adjoint, diffrax.AbstractAdjoint),
+        ("throw", throw, bool),
+        ("progress_meter", progress_meter, diffrax.AbstractProgressMeter),
+    ):
+        instance(name, value, kind)
     if solver is not None:
-        return _integrate(solver, inputs, keywords)
-    if isinstance(keywords["adjoint"], diffrax.ForwardMode):
-        return _integrate(UnrolledDopri8(), inputs, keywords, derivatives=True)
-    if isinstance(keywords["adjoint"], diffrax.RecursiveCheckpointAdjoint):
-        return _integrate_fast(inputs, keywords)
-    return _integrate(diffrax.Dopri8(), inputs, keywords, derivatives=True)
+        instance("solver", solver, diffrax.AbstractSolver)
+    if stepsize_controller is not None:
+        kind = diffrax.AbstractStepSizeController
+        instance("stepsize_controller", stepsize_controller, kind)
+        stepsize_controller = within_reach(stepsize_controller)
+    return solver, dict(
+        stepsize_controller=stepsize_controller,
+        dt0=dt0,
+        adjoint=adjoint,
+        max_steps=max_steps,
+        throw=throw,
+        progress_meter=progress_meter,
+    )
 
 
 def simulate(
@@ -321,35 +376,8 @@ def simulate(
     if times is not None and not (np.diff(times) > 0).all():
         raise ValueError(f"ts: expected increasing times, got {times.tolist()[:20]}.")
     callable_tuple("forces", forces)
-    if dt0 is not None:
-        dt0 = real_array("dt0", dt0, (), above=0)  # an array: new values, no new trace
-    if max_steps is not None:
-        whole_number("max_steps", max_steps, 1)
-    if isinstance(adjoint, diffrax.BacksolveAdjoint):
-        raise ValueError(
-            "adjoint: expected RecursiveCheckpointAdjoint (reverse mode) or "
-            "ForwardMode, got BacksolveAdjoint, whose gradients are wrong on these "
-            "problems."
-        )
-    for name, value, kind in (
-        ("adjoint", adjoint, diffrax.AbstractAdjoint),
-        ("throw", throw, bool),
-        ("progress_meter", progress_meter, diffrax.AbstractProgressMeter),
-    ):
-        instance(name, value, kind)
-    if solver is not None:
-        instance("solver", solver, diffrax.AbstractSolver)
-    if stepsize_controller is not None:
-        kind = diffrax.AbstractStepSizeController
-        instance("stepsize_controller", stepsize_controller, kind)
-        stepsize_controller = within_reach(stepsize_controller)
-    for index, element in enumerate(forces):
-        if getattr(element, "jump_ts", None) is not None:
-            real_array(f"forces[{index}].jump_ts", element.jump_ts, (None,))
-        check = getattr(element, "check", None)
-        if check is not None and not is_traced(linkage, ts, element):
-            check(linkage, ts)
-    keywords = dict(
+    solver, keywords = solve_options(
+        solver,
         stepsize_controller=stepsize_controller,
         dt0=dt0,
         adjoint=adjoint,
@@ -357,6 +385,12 @@ def simulate(
         throw=throw,
         progress_meter=progress_meter,
     )
+    for index, element in enumerate(forces):
+        if getattr(element, "jump_ts", None) is not None:
+            real_array(f"forces[{index}].jump_ts", element.jump_ts, (None,))
+        check = getattr(element, "check", None)
+        if check is not None and not is_traced(linkage, ts, element):
+            check(linkage, ts)
     try:
         return _solve(solver, (linkage, state0, ts, forces), keywords)
     except TypeError as error:

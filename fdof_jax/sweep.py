@@ -29,8 +29,9 @@ from .simulation import (
     Solution,
     element_effort,
     simulate,
+    solve_options,
 )
-from .step_control import Limited, default_controller, within_reach
+from .step_control import Limited, default_controller
 from .validation import (
     callable_tuple,
     concrete,
@@ -322,20 +323,20 @@ def sweep(
         raise ValueError(f"ts: expected increasing times, got {times.tolist()[:20]}.")
     callable_tuple("forces", forces)
     whole_number("chunk", chunk, 1)
-    instance("throw", throw, bool)
-    instance("progress_meter", progress_meter, diffrax.AbstractProgressMeter)
+    solver, options = solve_options(
+        stepsize_controller=stepsize_controller,
+        max_steps=max_steps,
+        throw=throw,
+        progress_meter=progress_meter,
+        **keywords,
+    )
+    settings = {
+        name: options[name]
+        for name in ("stepsize_controller", "dt0", "adjoint", "max_steps")
+    } | {"solver": solver}
     batch = batch_of(linkage, state0, forces, forces_axes)
     if checkpoint is not None and not isinstance(checkpoint, str | os.PathLike):
         raise ValueError(f"checkpoint: expected a folder, got {checkpoint!r}.")
-    if max_steps is not None:
-        whole_number("max_steps", max_steps, 1)
-    if stepsize_controller is not None:
-        kind = diffrax.AbstractStepSizeController
-        instance("stepsize_controller", stepsize_controller, kind)
-        stepsize_controller = within_reach(stepsize_controller)
-    settings = dict(
-        keywords, stepsize_controller=stepsize_controller, max_steps=max_steps
-    )
     if is_traced(batch.inputs, ts):
         if throw or checkpoint is not None:
             raise ValueError(

@@ -45,7 +45,7 @@ class ScheduledTerm(diffrax.ODETerm):
     once, where the vector field would call it at each. `watched_field` takes the same
     as the vector field and returns the rates and their health: positive, 0 where the
     equations are singular, NaN where the rates are not finite. The solver calls it
-    where steps end, and gives up where a step begins in bad health.
+    where steps begin and end.
     """
 
     vector_field: Callable[..., PyTree] = eqx.field(static=True)
@@ -106,6 +106,9 @@ def _unrolled(fields, times, h, y0, lost, args, schedule, f0) -> tuple[_Step, Ra
     y = _sum(y0, increment)
     lost = jtu.tree_map(lambda a, b, c: c - (b - a), y0, y, increment)
     error = _scaled(h, _combine(_TABLEAU.b_error, rates))
+    # An infinity beside a NaN would get past diffrax, and leave no step length.
+    poison = 0 * sum(jtu.tree_leaves(y))
+    y = jtu.tree_map(lambda a: a + poison, y)
     y, error, lost = in_one_loop((y, error, lost))
     last, health = watched(times[-1], y, args, _at(-1, schedule))
     return _Step(y, error, lost, health), [*rates, last]
@@ -252,12 +255,15 @@ class UnrolledDopri8(diffrax.AbstractAdaptiveSolver):
         end, rates, h = _step(terms, t0, t1, y0, lost, args, f0)
         dense_info = dict(y0=y0, step=h, rates=rates)
         state = jax.lax.stop_gradient(((rates[-1], end.health), end.lost))
-        stuck = jnp.isnan(end.health) & (jnp.abs(h) < _SHORTEST[h.dtype])
-        # The result of a step that is rejected does not count.
-        error = jtu.tree_map(lambda e: jnp.where(stuck, 0, e), end.error)
+        # A step in bad health is rejected until it is short. The result of a rejected
+        # one would not count, so that one is kept.
+        bad = jnp.isnan(end.health) | (health == 0)
+        short = jnp.abs(h) < _SHORTEST[h.dtype]
+        imposed = jnp.where(short, 0, jnp.inf)
+        error = jtu.tree_map(lambda e: jnp.where(bad, imposed, e), end.error)
         results: Any = diffrax.RESULTS
-        result = results.where(stuck, results.nonfinite, results.successful)
-        result = results.where(health == 0, results.singular, result)
+        kind = results.where(health == 0, results.singular, results.nonfinite)
+        result = results.where(bad & short, kind, results.successful)
         return end.y, error, dense_info, state, result
 
     def func(self, terms, t0, y0, args):

@@ -58,7 +58,7 @@ def real_array(
     traced = is_traced(value)
     try:
         array = jnp.asarray(value) if traced else np.asarray(value)
-    except (TypeError, ValueError) as error:
+    except Exception as error:  # whatever a value's own conversion raises
         raise refuse(repr(value)) from error
     if array.dtype.kind not in "iuf":
         raise refuse(repr(value))

@@ -1,0 +1,262 @@
+"""Makes reference.json: the hard scenes that tests/reference.json does not hold.
+
+Needs heyoka (the extra `benchmark`); a minute or so on one core:
+
+    python tests/hard/make_reference.py
+
+The equations come from the velocities of the mass centres per unit of each joint's
+rate, not from the paper's formulas; heyoka integrates them by Taylor series in 200 bits
+(60 digits). Derivatives are differences over 1e-20. All is computed again in 160 bits,
+which has to agree. All parameters are the doubles as which JSON prints them.
+"""
+
+import json
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+TIMES = 21  # outputs of each scene, the start among them
+
+# Unless a scene says otherwise.
+USUAL = dict(
+    topology="RRR",
+    length=[0.0, 1.0, 1.0, 1.0],
+    com=[[0.5, 0.0]] * 3,
+    mass=[1.0, 1.0, 1.0],
+    inertia=[1 / 12] * 3,
+    locked=[0.0, 0.0, 0.0],
+    base_angle=0.0,
+    gravity=9.81,
+    effort=[0.0, 0.0, 0.0],
+    damping=[0.0, 0.0, 0.0],
+    q0=[-0.5, 0.3, 0.2],
+    qd0=[0.0, 0.0, 0.0],
+    t1=5.0,
+)
+FIG5 = dict(com=[[1.0, 0.0]] * 3, inertia=[0.0] * 3, q0=[0.0, 0.0, 0.0], t1=10.0)
+
+
+def heavy_tip(mass):
+    return dict(mass=[1.0, 1.0, mass], t1=2.0)
+
+
+def light_tip(mass):
+    return dict(mass=[1.0, 1.0, mass], inertia=[1 / 12, 1 / 12, mass / 12], t1=2.0)
+
+
+SCENES = {
+    "heavy-tip-1e3": heavy_tip(1e3),
+    "heavy-tip-1e6": heavy_tip(1e6),
+    "light-tip-1e-6": light_tip(1e-6),
+    "light-tip-1e-9": light_tip(1e-9),
+    "two-links": dict(
+        topology="RR",
+        length=[0.0, 1.0, 1.0],
+        com=[[0.5, 0.0]] * 2,
+        mass=[1.0, 1.0],
+        inertia=[1 / 12] * 2,
+        locked=[0.0, 0.0],
+        effort=[0.0, 0.0],
+        damping=[0.0, 0.0],
+        q0=[-0.5, 0.3],
+        qd0=[0.0, 0.0],
+        t1=2.0,
+    ),
+    "turn-slide-RPR": dict(
+        topology="RPR",
+        length=[0.0, 1.0, 0.0, 1.0],
+        com=[[0.5, 0.0], [0.0, 0.0], [0.5, 0.0]],
+        inertia=[1 / 12, 0.0, 1 / 12],
+    ),
+    # At rest these two would just fall.
+    "parallel-axes-PPR": dict(topology="PPR", qd0=[0.2, -0.3, 0.5]),
+    "parallel-axes-RPP": dict(topology="RPP"),
+    "near-parallel-PPR": dict(
+        topology="PPR",
+        mass=[1e-6, 1.0, 1.0],
+        locked=[1e-3, 0.0, 0.0],
+        qd0=[0.2, -0.3, 0.5],
+    ),
+    "near-parallel-RPP": dict(
+        topology="RPP", mass=[1.0, 1e-6, 1.0], locked=[0.0, 1e-3, 0.0]
+    ),
+    "driven-through-0-RPR": dict(
+        topology="RPR",
+        # tau = 1000 (-2 - B2') pushes the slide at 2 m/s.
+        effort=[0.0, -2000.0, 0.0],
+        damping=[0.0, 1000.0, 0.0],
+        q0=[-0.5, 1.0, 0.2],
+        qd0=[0.0, -2.0, 0.0],
+        t1=1.0,
+    ),
+    "spin": dict(qd0=[1e3, 0.0, 0.0], t1=0.5),
+    "spin-of-the-tip": dict(qd0=[0.0, 0.0, 1e3], t1=0.5),
+    "fig5": FIG5,
+}
+# Derivatives of q at the end in these arguments.
+DERIVATIVES = {"driven-through-0-RPR": ("q0",), "fig5": ("q0", "mass", "length")}
+# The accelerations along the motion are wanted of these.
+ACCELERATIONS = {"turn-slide-RPR", "near-parallel-PPR", "near-parallel-RPP"}
+PARAMETERS = (
+    "length", "com", "mass", "inertia", "locked", "base_angle", "gravity", "effort",
+    "damping",
+)  # fmt: skip
+
+
+def lagrange(topology):
+    """The parameters, the state and its rates, as heyoka's expressions."""
+    import heyoka as hy
+
+    n = len(topology)
+    sizes = dict.fromkeys(PARAMETERS, n)
+    sizes |= dict(length=n + 1, com=2 * n, base_angle=1, gravity=1)
+    offsets = np.cumsum([0, *sizes.values()])
+    par = {
+        name: [hy.par[int(i)] for i in range(start, start + sizes[name])]
+        for name, start in zip(PARAMETERS, offsets)
+    }
+    q = hy.make_vars(*(f"q{k}" for k in range(n)))
+    qd = hy.make_vars(*(f"u{k}" for k in range(n)))
+    (angle,), (gravity,) = par["base_angle"], par["gravity"]
+    zero = hy.expression(0.0)
+    M = [[zero] * n for _ in range(n)]
+    rest = [f - c * u for f, c, u in zip(par["effort"], par["damping"], qd)]
+    # Where a link starts, its angular velocity, and the acceleration of its start while
+    # the joints keep their rates.
+    x, y, rate, ax, ay = zero, zero, zero, zero, zero
+    pivots, axes = [], []
+    c, s = hy.cos(angle), hy.sin(angle)
+    for k, joint in enumerate(topology):
+        turns = joint == "R"
+        length, locked = par["length"][k], par["locked"][k]
+        slide = locked if turns else q[k]
+        x, y = x + length * c - slide * s, y + length * s + slide * c
+        inward = length * rate**2 + (zero if turns else 2 * rate * qd[k])
+        aside = slide * rate**2
+        ax, ay = ax - inward * c + aside * s, ay - inward * s - aside * c
+        pivots.append((x, y))
+        axes.append((-s, c))
+        angle = angle + (q[k] if turns else locked)
+        rate = rate + qd[k] if turns else rate
+        c, s = hy.cos(angle), hy.sin(angle)
+        along, across = par["com"][2 * k : 2 * k + 2]
+        rx, ry = along * c - across * s, along * s + across * c
+        pull = ax - rate**2 * rx, ay - rate**2 * ry + gravity
+        # Velocities of the mass centre, and of the angle, per unit of a joint's rate.
+        columns = [
+            (py - y - ry, x + rx - px, 1.0) if other == "R" else (*axis, 0.0)
+            for other, (px, py), axis in zip(topology, pivots, axes)
+        ]
+        mass, inertia = par["mass"][k], par["inertia"][k]
+        for i, (vx, vy, turn) in enumerate(columns):
+            rest[i] -= mass * (vx * pull[0] + vy * pull[1])
+            for j, (wx, wy, also) in enumerate(columns):
+                M[i][j] += mass * (vx * wx + vy * wy) + inertia * (turn * also)
+    for k in reversed(range(n)):  # elimination from the tip
+        for i in range(k):
+            factor = M[i][k] / M[k][k]
+            rest[i] -= factor * rest[k]
+            M[i] = [M[i][j] - factor * M[k][j] for j in range(k)]
+    qdd = []
+    for k in range(n):
+        known = sum((M[k][j] * qdd[j] for j in range(k)), zero)
+        qdd.append((rest[k] - known) / M[k][k])
+    return int(offsets[-1]), [*q, *qd], [*qd, *qdd]
+
+
+@cache
+def integrator(topology, bits):
+    import heyoka as hy
+
+    count, state, rates = lagrange(topology)
+    zero = hy.real(0.0, prec=bits)
+    return hy.taylor_adaptive(
+        list(zip(state, rates)),
+        [zero] * len(state),
+        pars=[zero] * count,
+        fp_type=hy.real,
+        prec=bits,
+        compact_mode=True,
+    )
+
+
+def motion(scene, changed=None, by=None, *, bits):
+    """States at the output times; `changed`: (argument, index) moved by `by`."""
+    import heyoka as hy
+
+    real = lambda x: hy.real(x, prec=bits)
+    values = {
+        name: [real(float(x)) for x in np.ravel(scene[name])]
+        for name in (*PARAMETERS, "q0", "qd0")
+    }
+    if changed is not None:
+        name, index = changed
+        values[name][index] += by
+    solver = integrator(scene["topology"], bits)
+    solver.pars[:] = sum((values[name] for name in PARAMETERS), [])
+    solver.state[:] = values["q0"] + values["qd0"]
+    solver.time = real(0.0)
+    start = solver.state.copy()
+    # From Fig 5's start the estimate of the first step fails.
+    solver.propagate_until(real(1e-3))
+    ts = np.linspace(0, scene["t1"], TIMES)[1:].tolist()
+    outcome = solver.propagate_grid([solver.time, *map(real, ts)])
+    return np.stack([start, *outcome[-1][1:]])
+
+
+def accelerations(scene, states, *, bits):
+    import heyoka as hy
+
+    real = lambda values: np.array([hy.real(float(x), prec=bits) for x in values])
+    _, state, rates = lagrange(scene["topology"])
+    function = hy.cfunc(
+        rates[len(rates) // 2 :], state, fp_type=hy.real, prec=bits, compact_mode=True
+    )
+    pars = real(np.concatenate([np.ravel(scene[name]) for name in PARAMETERS]))
+    return np.stack([function(real(row), pars=pars) for row in states])
+
+
+def derivative(scene, name, *, bits):
+    """Of q at the end, (3, size of the argument)."""
+    import heyoka as hy
+
+    step = hy.real("1e-20", prec=bits)
+    n = len(scene["topology"])
+    columns = []
+    for index in range(np.size(scene[name])):
+        above, below = (
+            motion(scene, (name, index), by, bits=bits)[-1, :n] for by in (step, -step)
+        )
+        columns.append((above - below) / (2 * step))
+    return np.stack(columns, axis=1)
+
+
+def agreed(compute, *arguments):
+    """As doubles, if fewer bits give the same to 1e-20."""
+    value, less = compute(*arguments, bits=200), compute(*arguments, bits=160)
+    gap = np.abs(value - less).astype(float) / (1 + np.abs(value.astype(float)))
+    assert gap.max() < 1e-20, gap.max()
+    return value.astype(float)
+
+
+def main():
+    made = {}
+    for name, changes in SCENES.items():
+        print(name, flush=True)
+        scene = USUAL | changes
+        states = agreed(motion, scene)
+        q, qd = np.split(states, 2, axis=1)
+        made[name] = scene | dict(q=q.tolist())
+        if name in ACCELERATIONS:
+            qdd = agreed(accelerations, scene, states)
+            made[name] |= dict(qd=qd.tolist(), qdd=qdd.tolist())
+        for argument in DERIVATIVES.get(name, ()):
+            slopes = agreed(derivative, scene, argument)
+            made[name][f"dq_d{argument}"] = slopes.tolist()
+    text = json.dumps(made, indent=1)
+    Path(__file__).with_name("reference.json").write_text(text + "\n")
+
+
+if __name__ == "__main__":
+    main()

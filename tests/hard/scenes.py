@@ -1,0 +1,181 @@
+"""The hard scenes as arguments of `simulate`, and how their errors are measured."""
+
+import json
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import helpers
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import fdof_jax as fj
+
+# Made by make_reference.py.
+REFERENCE = json.loads((Path(__file__).parent / "reference.json").read_text())
+OUTPUTS = 21  # of every simulation here: one compilation serves all
+
+
+class Scene(NamedTuple):
+    """What `simulate` takes, and the reference `q` at the times `ts[rows]`."""
+
+    linkage: fj.Linkage
+    state0: fj.State
+    forces: tuple
+    ts: np.ndarray
+    rows: Any = ...
+    q: Any = None
+
+
+def arm(topology="RRR", **changes):
+    """The arm of all scenes that do not say otherwise."""
+    usual: dict[str, Any] = dict(
+        length=[0, 1, 1, 1], com=[[0.5, 0]] * 3, mass=[1, 1, 1], inertia=[1 / 12] * 3
+    )
+    return fj.Linkage(topology, **(usual | changes))
+
+
+def free(linkage, q0, ts, **reference):
+    """From rest; without efforts, but compiled for them as the other scenes are."""
+    state0 = fj.State(np.array(q0, dtype=float), np.zeros(3))
+    forces = fj.JointEffort(np.zeros(3)), fj.JointDamper(np.zeros(3))
+    return Scene(linkage, state0, forces, ts, **reference)
+
+
+def load(name):
+    """A scene of reference.json in this folder."""
+    scene = REFERENCE[name]
+    links = ("length", "com", "mass", "inertia", "locked", "base_angle", "gravity")
+    return Scene(
+        fj.Linkage(scene["topology"], **{key: scene[key] for key in links}),
+        fj.State(np.array(scene["q0"]), np.array(scene["qd0"])),
+        (
+            fj.JointEffort(np.array(scene["effort"])),
+            fj.JointDamper(np.array(scene["damping"])),
+        ),
+        np.linspace(0, scene["t1"], OUTPUTS),
+        q=np.array(scene["q"]),
+    )
+
+
+def load_common(name):
+    """A scene of tests/reference.json, which holds fewer times."""
+    scene, r = helpers.SCENES[name], helpers.load(name)
+    times = [state["t"] for state in scene["states"]]
+    ts = np.linspace(0, times[-1], OUTPUTS)
+    rows = [int(np.flatnonzero(ts == t)[0]) for t in times]
+    q = np.array([helpers.to_joint(scene, state["q"]) for state in scene["states"]])
+    return Scene(r.linkage, r.state0, r.forces, ts, rows, q)
+
+
+def fig5(times):
+    """Fig 5 at some of 0, 0.5 .. 60 s, from tests/reference.json."""
+    rows = {row["t"]: row["th"] for row in helpers.REFERENCE["chaos"]["rows"]}
+    angles = np.array([rows.get(t, [0.0] * 3) for t in times])
+    linkage = fj.scenes.fig5().linkage
+    q = np.diff(angles, axis=1, prepend=0)
+    return free(linkage, np.zeros(3), np.asarray(times), q=q)
+
+
+def controller(tolerance, **keywords):
+    # An array, so that another tolerance is not another compilation.
+    tolerance = jnp.asarray(tolerance)
+    return diffrax.PIDController(rtol=tolerance, atol=tolerance, **keywords)
+
+
+TIGHT = controller(1e-12)
+DEFAULT = None  # what `simulate` does by itself
+
+
+def simulate(scene, steps, **keywords):
+    return fj.simulate(
+        scene.linkage,
+        scene.state0,
+        scene.ts,
+        scene.forces,
+        stepsize_controller=steps,
+        max_steps=10_000_000,
+        **keywords,
+    )
+
+
+def error(motion, scene):
+    """The largest of all joints and output times [m or rad]."""
+    return np.abs(np.asarray(motion.q)[scene.rows] - scene.q).max()
+
+
+def drift(linkage, motion):
+    """The largest change of energy over the largest kinetic energy."""
+    energies = jax.vmap(fj.energy, in_axes=(None, 0, 0))
+    kinetic, potential = energies(linkage, motion.q, motion.qd)
+    total = np.asarray(kinetic + potential)
+    return np.abs(total - total[0]).max() / np.max(kinetic)
+
+
+def slopes(scene, steps):
+    """Derivatives of q at the end in q0, masses and lengths, by forward mode."""
+    return _slopes(
+        scene._replace(rows=None, q=None), steps
+    )  # one form, one compilation
+
+
+@eqx.filter_jit
+def _slopes(scene, steps):
+
+    def end(q0, mass, length):
+        linkage = eqx.tree_at(
+            lambda x: (x.mass, x.length), scene.linkage, (mass, length)
+        )
+        motion = fj.simulate(
+            linkage,
+            fj.State(q0, scene.state0.qd),
+            scene.ts[jnp.array([0, -1])],
+            scene.forces,
+            stepsize_controller=steps,
+            adjoint=diffrax.ForwardMode(),
+        )
+        return motion.q[-1]
+
+    return jax.jacfwd(end, argnums=(0, 1, 2))(
+        jnp.asarray(scene.state0.q), scene.linkage.mass, scene.linkage.length
+    )
+
+
+def pulled_back(scene, weights):
+    """Derivative of weights . q at the end in q0, by reverse mode and default steps."""
+    return _pulled_back(scene._replace(rows=None, q=None), weights)
+
+
+@eqx.filter_jit
+def _pulled_back(scene, weights):
+
+    def end(q0):
+        start = fj.State(q0, scene.state0.qd)
+        ts = scene.ts[jnp.array([0, -1])]
+        return weights @ fj.simulate(scene.linkage, start, ts, scene.forces).q[-1]
+
+    return jax.grad(end)(jnp.asarray(scene.state0.q))
+
+
+def largest_error(value, exact):
+    """Of a derivative, over its largest entry."""
+    value, exact = np.asarray(value), np.asarray(exact)
+    return np.abs(value - exact).max() / np.abs(exact).max()
+
+
+def linear_motion(t, upright=False):
+    """Derivative of q(t) in q0 for the usual arm hanging at rest, or upright.
+
+    In absolute angles the energies are sums of M_ij th_i' th_j' / 2 and K_i th_i^2 / 2.
+    """
+    n = np.arange(3)
+    beyond = 2 - n  # links that hang on this one
+    M = 0.5 + beyond[np.maximum.outer(n, n)]
+    M[n, n] = 1 / 12 + 0.25 + beyond
+    K = np.diag(9.81 * (0.5 + beyond)) * (-1 if upright else 1)
+    squares, modes = np.linalg.eig(np.linalg.solve(M, K))
+    grown = modes * np.cos(np.sqrt(squares.astype(complex)) * t) @ np.linalg.inv(modes)
+    absolute = np.tril(np.ones((3, 3)))  # from relative angles
+    return np.linalg.solve(absolute, grown.real @ absolute)

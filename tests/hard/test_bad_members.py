@@ -1,0 +1,141 @@
+"""Members of a batch that fail, and steps that run out.
+
+More on members that fail is in tests/test_sweep.py.
+"""
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hard.arms import START, arm
+
+import fdof_jax as fj
+
+SIZE, TS = 256, np.linspace(0, 0.5, 6)
+NAN_START, NAN_LATER, FAST = 17, 101, 200
+BAD = np.array([NAN_START, NAN_LATER, FAST])
+OTHERS = np.delete(np.arange(SIZE), BAD)
+
+
+class Breaking(eqx.Module):
+    """No effort until a time, then none that is a number."""
+
+    at: jax.Array
+
+    def __call__(self, t, q, qd, linkage):
+        return jnp.where(t > self.at, jnp.nan, 0.0) * jnp.ones(3)
+
+
+def batch(bad):
+    rng = np.random.default_rng(0)
+    q = START.q + rng.uniform(-0.3, 0.3, (SIZE, 3))
+    qd = rng.uniform(-1, 1, (SIZE, 3))
+    at = np.full(SIZE, 1e9)
+    if bad:
+        q[NAN_START, 1], at[NAN_LATER], qd[FAST] = np.nan, 0.32, [300, 0, 0]
+    return jnp.asarray(q), jnp.asarray(qd), jnp.asarray(at)
+
+
+@jax.jit
+def by_vmap(q, qd, at):
+    return jax.vmap(
+        lambda q, qd, at: fj.simulate(
+            arm(), fj.State(q, qd), TS, (Breaking(at),), throw=False
+        )
+    )(q, qd, at)
+
+
+def by_sweep(q, qd, at):
+    return fj.sweep(arm(), fj.State(q, qd), TS, (Breaking(at),), forces_axes=0)
+
+
+@pytest.mark.parametrize("motions", [by_vmap, by_sweep])
+def test_members_that_fail_harm_no_other(motions):
+    """All lanes of a batch go through the same loop, the last one's end is its end."""
+    clean, mixed = motions(*batch(False)), motions(*batch(True))
+    assert (clean.outcome == "successful").all()
+    expected = np.full(SIZE, "successful")
+    expected[[NAN_START, NAN_LATER]] = "not finite"
+    np.testing.assert_array_equal(mixed.outcome, expected)
+    for a, b in ((mixed.q, clean.q), (mixed.qd, clean.qd)):
+        difference = np.abs(np.asarray(a - b)[OTHERS]).max()
+        # A sweep puts members into other chunks, whose shape is the same.
+        assert difference == 0 if motions is by_vmap else difference <= 1e-9
+    assert np.isnan(mixed.q[NAN_START]).any(axis=1).all()
+    # TS[3] is 0.3 s; no step ends at 0.32 s itself.
+    np.testing.assert_allclose(
+        mixed.q[NAN_LATER, :4], clean.q[NAN_LATER, :4], atol=1e-9
+    )
+    assert np.isnan(mixed.q[NAN_LATER, 4:]).all()
+    assert mixed.stats["time_reached"][NAN_LATER] == pytest.approx(0.32, abs=1e-6)
+    # Neither takes thousands of steps to fail.
+    assert (mixed.stats["num_steps"][BAD[:2]] < 200).all()
+    alone = fj.simulate(arm(), fj.State(*(a[FAST] for a in batch(True)[:2])), TS)
+    np.testing.assert_allclose(mixed.q[FAST], alone.q, atol=1e-7)
+
+
+def test_members_that_fail_add_nothing_to_a_shared_gradient():
+    """0 x NaN: in reverse mode every member's cotangent is added to the shared mass."""
+
+    @jax.jit
+    def gradient(mass, q, qd, at, wanted):
+        def loss(mass):
+            linkage = eqx.tree_at(lambda a: a.mass, arm(), mass)
+            motions = fj.sweep(
+                linkage, fj.State(q, qd), TS, (Breaking(at),), forces_axes=0
+            )
+            counted = (motions.result == diffrax.RESULTS.successful) & wanted
+            end = jnp.where(counted[:, None], motions.q[:, -1], 0)
+            return jnp.sum(end**2) / jnp.sum(counted), jnp.sum(counted)
+
+        return jax.grad(loss, has_aux=True)(mass)
+
+    wanted = jnp.ones(SIZE, bool)
+    mixed, counted = gradient(jnp.ones(3), *batch(True), wanted.at[FAST].set(False))
+    assert counted == SIZE - 3
+    clean, _ = gradient(jnp.ones(3), *batch(False), wanted.at[BAD].set(False))
+    assert np.abs(clean).max() > 1e-3
+    np.testing.assert_allclose(mixed, clean, rtol=1e-9)
+    full, counted = gradient(jnp.ones(3), *batch(True), wanted)
+    assert counted == SIZE - 2 and np.isfinite(full).all()
+
+
+LONG = np.linspace(0, 5, 26)
+
+
+def out_of_steps(q0, **keywords):
+    return fj.simulate(
+        arm(), fj.State(q0, START.qd), LONG, max_steps=50, throw=False, **keywords
+    )
+
+
+def test_running_out_of_steps_is_told():
+    """The state that was reached looks like any other."""
+    solution = out_of_steps(START.q)
+    assert solution.outcome == "out of steps"
+    reached = solution.stats["time_reached"]
+    assert 0 < reached < LONG[-1]
+    finite = np.isfinite(solution.q).all(axis=1) & np.isfinite(solution.qd).all(axis=1)
+    np.testing.assert_array_equal(finite, LONG <= reached)
+    exact = fj.simulate(arm(), START, LONG)
+    np.testing.assert_allclose(solution.q[finite], exact.q[finite], atol=1e-8)
+    with pytest.raises(RuntimeError, match="max_steps|maximum number of solver steps"):
+        fj.simulate(arm(), START, LONG, max_steps=50)
+
+
+def test_a_gradient_of_what_was_not_reached_is_marked():
+    """An output filled with NaN has a derivative of 0: an optimum, it seems.
+
+    A derivative of NaN would spoil that of a sum in which failed members are left out.
+    The value and the outcome tell instead.
+    """
+
+    def end(q0):
+        solution = out_of_steps(q0)
+        return solution.q[-1, 0], solution.result
+
+    (value, result), slope = jax.value_and_grad(end, has_aux=True)(START.q)
+    assert np.isnan(value) and result == diffrax.RESULTS.max_steps_reached
+    assert not np.any(slope)

@@ -1,0 +1,103 @@
+"""Derivatives of losses at their very minimum, and second ones of a batch."""
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hard.arms import START, Hold, arm
+
+import fdof_jax as fj
+from fdof_jax.control import tip_deviation
+from fdof_jax.trigonometry import sincos
+
+STILL = np.zeros(3)
+
+
+def test_losses_at_zero_error():
+    """An arm that is where it should be: the norm of nothing has no slope."""
+    upright = fj.CircleTask(center=(0.4, 1.0), radius=0.3)
+    q = fj.inverse_kinematics(arm(), upright.tip(0.0), upright.orientation)
+
+    def losses(kp, q0, center):
+        task = eqx.tree_at(lambda t: t.center, upright, center)
+        controller = fj.PDController(kp, 5.0, jnp.inf, task)
+        forces = (controller, fj.JointDamper(0.0))
+        motion = fj.simulate(arm(), fj.State(q0, STILL), [0, 0.1], forces)
+        deviation = tip_deviation(arm(), task, motion)
+        squares = jnp.sum(deviation[0] ** 2)
+        return jnp.stack([squares, jnp.mean(deviation**2), jnp.sum(motion.q)])
+
+    arguments = jnp.full(3, 100.0), q, upright.center
+    assert abs(losses(*arguments)[0]) < 1e-28
+    for slope in jax.jit(jax.jacrev(losses, (0, 1, 2)))(*arguments):
+        assert np.isfinite(slope).all()
+
+
+@pytest.mark.parametrize("topology", fj.TOPOLOGIES)
+def test_kinematics_where_everything_is_zero(topology):
+    """Straight along the x axis from the origin: atan2, roots and norms of 0."""
+    linkage = arm(topology)
+
+    def everything(q, qd):
+        tip = fj.tip_position(linkage, q)
+        return dict(
+            tip=tip,
+            x=fj.to_chain(linkage, q, qd),
+            centres=fj.mass_centers(linkage, q),
+            energy=fj.energy(linkage, q, qd),
+            qdd=fj.forward_dynamics(linkage, q, qd, STILL),
+            conditioning=fj.inertia_ratios(linkage, q),
+            angles=sincos(q),
+        )
+
+    first, second = (
+        jax.jit(f(everything, (0, 1)))(jnp.zeros(3), jnp.zeros(3))
+        for f in (jax.jacrev, lambda f, a: jax.jacfwd(jax.jacrev(f, a), a))
+    )
+    for leaf in jax.tree.leaves((first, second)):
+        assert np.isfinite(leaf).all()
+
+
+def test_a_circle_of_no_radius():
+    """The bearing from the centre to itself is atan2(0, 0)."""
+    still = fj.CircleTask(center=(0.4, 1.0), radius=0.0)
+
+    def reference(task):
+        return task(0.3, arm())
+
+    for leaf in jax.tree.leaves(jax.jit(jax.jacfwd(reference))(still)):
+        assert np.isfinite(leaf).all()
+
+
+def curvature(log_kp, target):
+    """Hessian in the gains of the mean squared error of a held arm, (3, 3)."""
+
+    def loss(log_kp):
+        controller = fj.PDController(100 * jnp.exp(log_kp), 20.0, jnp.inf, Hold(target))
+        motion = fj.simulate(
+            arm(),
+            START,
+            np.linspace(0, 0.5, 6),
+            (controller,),
+            adjoint=diffrax.ForwardMode(),
+            throw=False,
+        )
+        return jnp.mean((motion.q - target[None]) ** 2)
+
+    return jax.jacfwd(jax.jacfwd(loss))(log_kp)
+
+
+@pytest.mark.slow
+def test_hessians_of_a_batch():
+    """Second derivatives of a loop whose number of turns depends on the member."""
+    rng = np.random.default_rng(3)
+    log_kp, target = rng.uniform(-0.5, 0.5, (2, 4, 3))
+    together = jax.jit(jax.vmap(curvature))(log_kp, target)
+    single = jax.jit(curvature)
+    alone = np.stack([single(*member) for member in zip(log_kp, target)])
+    scale = np.abs(alone).max()
+    assert scale > 1e-3
+    assert np.abs(together - alone).max() <= 1e-8 * scale
+    np.testing.assert_allclose(together, together.transpose(0, 2, 1), atol=1e-8 * scale)

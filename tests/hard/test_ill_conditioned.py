@@ -1,0 +1,74 @@
+"""Mass matrices close to singular, and singular ones."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hard.arms import REFERENCE, START, TIGHT, arm
+
+import fdof_jax as fj
+
+TS = np.linspace(0, 2, 21)
+
+
+@pytest.mark.parametrize("steps", [None, TIGHT], ids=["default", "tight"])
+def test_a_tip_of_a_million_tonnes(steps):
+    """A condition of 2e11 leaves five digits: rounding, not the method, sets the error
+    estimate, and tolerances fight it."""
+    solution = fj.simulate(
+        arm(mass=[1, 1, 1e9]),
+        START,
+        TS,
+        stepsize_controller=steps,
+        max_steps=10_000,
+        throw=False,
+    )
+    assert solution.stats["num_steps"] < 10_000
+    if solution.outcome == "successful":
+        error = np.abs(solution.q - np.array(REFERENCE["heavy-tip-1e9"]["q"])).max()
+        assert error <= 1e-3
+    else:
+        assert solution.outcome == "ill-conditioned"
+        reached = TS <= solution.stats["time_reached"]
+        np.testing.assert_array_equal(np.isfinite(solution.q).all(axis=1), reached)
+
+
+@pytest.mark.parametrize("topology", ["RRR", "RPR", "PRR", "PPR"])
+def test_a_last_link_without_inertia_is_refused(topology):
+    """Its joint's acceleration is undetermined in every configuration."""
+    with pytest.raises(ValueError, match=r"joint 3 \(revolute\).*moving link 3.*m4"):
+        arm(topology, com=[[0.5, 0], [0.5, 0], [0, 0]], inertia=[1 / 12, 1 / 12, 0])
+
+
+@pytest.mark.parametrize("chunked", [False, True], ids=["vmap", "sweep"])
+def test_a_singular_member_is_named_and_harms_no_other(chunked):
+    """Under a transformation no door sees that member's values."""
+    usual = arm()
+    com = jnp.stack([usual.com] * 3).at[1, 2].set(0)
+    inertia = jnp.stack([usual.inertia] * 3).at[1, 2].set(0)
+    q = START.q + np.array([[0.0], [0.1], [0.2]])
+
+    @jax.jit
+    def motions(com, inertia):
+        def linkage(com, inertia):
+            return eqx.tree_at(lambda a: (a.com, a.inertia), usual, (com, inertia))
+
+        if chunked:
+            many = eqx.tree_at(lambda a: (a.com, a.inertia), usual, (com, inertia))
+            return fj.sweep(many, fj.State(q, START.qd), TS)
+        return jax.vmap(
+            lambda com, inertia, q: fj.simulate(
+                linkage(com, inertia), fj.State(q, START.qd), TS, throw=False
+            )
+        )(com, inertia, q)
+
+    broken = motions(com, inertia)
+    clean = motions(com.at[1].set(usual.com), inertia.at[1].set(usual.inertia))
+    assert clean.outcome.tolist() == ["successful"] * 3
+    assert broken.outcome.tolist() == ["successful", "ill-conditioned", "successful"]
+    assert broken.stats["num_steps"][1] < 100
+    assert np.isnan(broken.q[1, 1:]).all()
+    for member in (0, 2):
+        np.testing.assert_array_equal(broken.q[member], clean.q[member])
+        np.testing.assert_array_equal(broken.qd[member], clean.qd[member])

@@ -1,0 +1,115 @@
+"""Malformed input behind the doors: where no constructor and no call sees the values.
+
+What doors refuse, at every function and argument, is in tests/test_bad_input.py and
+tests/test_sweep_input.py; locked velocities are in tests/test_linkage.py.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hard.arms import START, TARGET, arm
+
+import fdof_jax as fj
+
+NAN, INF = np.nan, np.inf
+GOOD = dict(
+    ef=fj.existence_factors("RRR"),
+    mass=jnp.ones(3),
+    length=jnp.array([0.0, 1, 1, 1]),
+    q=jnp.asarray(START.q),
+    qd=jnp.zeros(3),
+    ts=jnp.linspace(0, 1, 5),
+    kp=jnp.full(3, 10.0),
+    limit=jnp.full(3, 10.0),
+)
+
+
+def simulate(ef, mass, length, q, qd, ts, kp, limit):
+    linkage = eqx.tree_at(lambda a: (a.ef, a.mass, a.length), arm(), (ef, mass, length))
+    controller = fj.PDController(1.0, 1.0, 1.0, TARGET)
+    forces = (eqx.tree_at(lambda c: (c.kp, c.limit), controller, (kp, limit)),)
+    start = fj.State(q, qd)
+    return fj.simulate(linkage, start, ts, forces, throw=False, max_steps=2000)
+
+
+traced = jax.jit(simulate)
+
+
+def fails(reason):
+    return pytest.mark.xfail(strict=True, reason=reason)
+
+
+UNTOLD = fails("'successful', and numbers that look like any others")
+ENDLESS = fails("all steps are rejected until max_steps: 'out of steps'")
+RAISES = fails("raises diffrax's 'saveat.ts must be increasing', also with throw=False")
+CASES = {
+    "q nan": ("q", [NAN, 0, 0], ()),
+    "q inf": ("q", [0, INF, 0], ()),
+    "qd nan": ("qd", [NAN, 0, 0], ENDLESS),
+    "qd inf": ("qd", [0, INF, 0], ENDLESS),
+    "mass nan": ("mass", [1, 1, NAN], ()),
+    "mass of the tip negative": ("mass", [1, 1, -1], ()),
+    "mass of the base negative": ("mass", [-1, 1, 1], UNTOLD),
+    "length nan": ("length", [0, NAN, 1, 1], ()),
+    "length inf": ("length", [0, 1, INF, 1], ()),
+    "kp nan": ("kp", [1, NAN, 1], ()),
+    "kp negative": ("kp", [1, -1, 1], UNTOLD),
+    "limit nan": ("limit", [10, NAN, 10], UNTOLD),
+    "limit negative": ("limit", [10, -10, 10], UNTOLD),
+    "both joints of a pair": ("ef", [0, 1, 1, 1, 0, 1], UNTOLD),
+    "no joint of a pair": ("ef", [0, 1, 0, 0, 0, 1], UNTOLD),
+    "ef nan": ("ef", [0, 1, NAN, NAN, 0, 1], UNTOLD),
+    "PPP": ("ef", [1, 0, 1, 0, 1, 0], UNTOLD),
+    "ts not increasing": ("ts", [0, 0.5, 0.2, 0.7, 1], RAISES),
+    "ts decreasing": ("ts", [1, 0.7, 0.5, 0.2, 0], RAISES),
+    "ts equal": ("ts", [0, 0, 0, 0, 0], UNTOLD),
+    "ts nan": ("ts", [0, 0.2, NAN, 0.7, 1], UNTOLD),
+    "ts inf": ("ts", [0, 0.2, 0.5, 0.7, INF], ()),
+}
+
+
+@pytest.mark.parametrize(
+    "name, value",
+    [
+        pytest.param(name, value, marks=mark, id=case)
+        for case, (name, value, mark) in CASES.items()
+    ],
+)
+def test_traced_values_that_no_door_sees(name, value):
+    """Nothing can be raised for one member of a batch: its result has to say it."""
+    solution = traced(**GOOD | {name: jnp.asarray(value, float)})
+    expected = ["not finite", "ill-conditioned"]
+    if name == "ts":
+        expected += ["out of steps", "tolerance out of reach", "solver failed"]
+    assert solution.outcome in expected
+    assert np.isnan(solution.q[-1]).all()
+
+
+def test_the_good_ones_do_not_fail():
+    solution = traced(**GOOD)
+    assert solution.outcome == "successful"
+    exact = simulate(**GOOD)
+    np.testing.assert_array_equal(solution.q, exact.q)
+
+
+INSIDE = {
+    "mass": [[-1, 1, 1], [1, NAN, 1], [1, 1, INF]],
+    "length": [[0, NAN, 1, 1], [0, 1, INF, 1]],
+    "ef": [[0, 1, 1, 1, 0, 1], [1, 0, 1, 0, 1, 0], [0, 1, NAN, NAN, 0, 1]],
+    "kp": [[1, NAN, 1], [1, -1, 1]],
+    "limit": [[1, NAN, 1], [1, -1, 1]],
+}
+
+
+@pytest.mark.xfail(
+    strict=True,
+    reason="what is inside of a linkage or an element is looked at when it is made",
+)
+@pytest.mark.parametrize("name", INSIDE)
+def test_modules_changed_after_their_door(name):
+    """`eqx.tree_at` asks no constructor: the values are there to be seen by a call."""
+    for value in INSIDE[name]:
+        with pytest.raises(ValueError, match=rf"{name}.*: expected .*, got "):
+            simulate(**GOOD | {name: jnp.asarray(value, float)})

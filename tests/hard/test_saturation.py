@@ -1,0 +1,68 @@
+"""Derivatives at the limits of the actuators, and beyond them.
+
+That a tuner says so is in tests/test_tuning.py.
+"""
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hard.arms import START, TARGET, Hold, arm
+
+import fdof_jax as fj
+from fdof_jax.control import saturated
+
+STILL = np.zeros(3)
+KP = 128.0
+
+
+def test_the_derivative_at_the_limit_is_that_of_one_side():
+    """Demand and limit are equal: the effort has two derivatives, 0 and that of the
+    demand, and their mean is that of no motion."""
+    controller = fj.PDController(KP, 0.0, 32.0, Hold(jnp.full(3, 0.25)))
+
+    def effort(kp):
+        changed = eqx.tree_at(lambda c: c.kp, controller, kp)
+        return changed(0.0, jnp.zeros(3), jnp.zeros(3), arm())
+
+    slope = jax.jacfwd(effort)(controller.kp)
+    np.testing.assert_array_equal(effort(controller.kp), controller.limit)
+    share = np.diag(slope) / 0.25
+    assert (share == 1).all() or (share == 0).all()
+
+
+def end(log_kp, limit, reference, adjoint):
+    """The sum of the joint positions after 0.2 s, and the share at the limit."""
+    controller = fj.PDController(KP * jnp.exp(log_kp), 0.0, limit, reference)
+    ts = np.linspace(0, 0.2, 11)
+    solution = fj.simulate(arm(), START, ts, (controller,), adjoint=adjoint)
+    share = jnp.mean(saturated(controller, arm(), solution), axis=0)
+    return jnp.sum(solution.q[-1]), share
+
+
+@pytest.mark.parametrize("mode", ["forward", "reverse"])
+def test_gradients_at_and_beyond_saturation(mode):
+    """A derivative that jumps at the start, or is 0 because nothing can be changed."""
+    if mode == "forward":
+        adjoint, derive = diffrax.ForwardMode(), jax.jacfwd
+    else:
+        adjoint, derive = diffrax.RecursiveCheckpointAdjoint(), jax.jacrev
+    gradient = jax.jit(
+        derive(lambda *arguments: end(*arguments, adjoint), has_aux=True)
+    )
+    # The efforts that gravity asks for, and a reference that demands exactly them: the
+    # arm rests at its limits.
+    load = fj.inverse_dynamics(arm(), START.q, STILL, STILL)
+    resting = Hold(START.q + load / KP)
+    demand = fj.PDController(KP, 0.0, jnp.inf, resting).demand(
+        0.0, START.q, STILL, arm()
+    )
+    at_limit, _ = gradient(0.0, jnp.abs(demand), resting)
+    assert np.isfinite(at_limit)
+    # Weak actuators: the gains do nothing, and the share says so.
+    weak, share = gradient(0.0, jnp.full(3, 1e-3), TARGET)
+    assert weak == 0 and (share == 1).all()
+    strong, share = gradient(0.0, jnp.full(3, 1e9), TARGET)
+    assert abs(strong) > 1e-3 and (share == 0).all()

@@ -1,0 +1,76 @@
+"""Arms of other sizes than a metre, in other units, and after many turns."""
+
+import equinox as eqx
+import mpmath
+import numpy as np
+import pytest
+from hard.arms import START, USUAL, arm
+from mpmath import mpf
+
+import fdof_jax as fj
+
+TS = np.linspace(0, 5, 11)
+
+
+@eqx.filter_jit
+def scaled_motion(linkage, state0, ts, dt0):
+    steps = fj.scale_tolerances(linkage)
+    return fj.simulate(linkage, state0, ts, stepsize_controller=steps, dt0=dt0)
+
+
+def scaled(topology, size, mass, gravity=9.81):
+    """The usual arm in other units, and the factors of its joints and of time."""
+    linkage = arm(
+        topology,
+        length=np.array(USUAL["length"]) * size,
+        com=np.array(USUAL["com"]) * size,
+        mass=[mass] * 3,
+        inertia=[mass * size**2 / 12] * 3,
+        gravity=gravity,
+    )
+    unit = np.array([1 if joint == "R" else size for joint in topology])
+    return linkage, unit, np.sqrt(size * 9.81 / gravity)
+
+
+@pytest.mark.parametrize("topology", ["RRR", "RPR"])
+def test_sizes_and_units_do_not_matter(topology):
+    """An absolute tolerance of 1e-11 m is 1e-8 of an arm of 1 mm, and near rounding for
+    one of 1 km."""
+    worlds = {
+        "1 mm": scaled(topology, 1e-3, 1e-3),
+        "1 km, 1e9 kg": scaled(topology, 1e3, 1e9),
+        "mm, g": scaled(topology, 1e3, 1e3, gravity=9810.0),
+    }
+    usual = fj.simulate(arm(topology), START, TS)
+    for name, (linkage, unit, time) in worlds.items():
+        start = fj.State(START.q * unit, START.qd)
+        motion = scaled_motion(linkage, start, TS * time, 1e-3 * time)
+        assert np.abs(motion.q / unit[None] - usual.q).max() <= 1e-7, name
+        steps = motion.stats["num_steps"] / usual.stats["num_steps"]
+        assert 0.5 < steps < 2, name
+
+
+def without_turns(q):
+    """The angles that are left, for these angles as they are rounded."""
+    with mpmath.workdps(50):
+        turn = 2 * mpmath.pi
+        return np.array([float(a - turn * mpmath.nint(a / turn)) for a in map(mpf, q)])
+
+
+@pytest.mark.parametrize("joints", [[1, 0, 0], [1, 1, 1]], ids=["first", "all"])
+@pytest.mark.parametrize("turns", [1e6, 1e8])
+def test_turns_do_not_matter(turns, joints):
+    """The arguments of sine and cosine lose ten digits, sums of angles as many, and a
+    tolerance relative to the angle means nothing.
+
+    The result keeps the turns, so that a position in it is rounded by up to 6e-8 rad
+    after 1e8 turns: the bound is 1e-9 or an ulp of it.
+    """
+    offset = START.q + 2 * np.pi * turns * np.array(joints)
+    kept = without_turns(offset)
+    plain = fj.simulate(arm(), fj.State(kept, START.qd), TS)
+    far = fj.simulate(arm(), fj.State(offset, START.qd), TS)
+    error = np.abs((far.q - offset[None]) - (plain.q - kept[None])).max(axis=0)
+    assert (error <= np.maximum(1e-9, np.spacing(np.abs(offset)))).all()
+    assert np.abs(far.qd - plain.qd).max() <= 1e-9 * np.abs(plain.qd).max()
+    assert abs(far.stats["num_steps"] - plain.stats["num_steps"]) <= 2

@@ -1,0 +1,134 @@
+"""Stiff controllers and dampers, and one that chatters at its limit."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import mpmath
+import numpy as np
+import pytest
+from hard import oracle
+from hard.arms import REFERENCE, START, TARGET, USUAL, arm
+
+import fdof_jax as fj
+
+STIFFNESSES = [1e4, 1e6, 1e8]
+# 1e-9 is one digit more than smooth motions need: at 1e-8 derivatives at kp = 1e6 are
+# wrong by 7e-4 while the transient dies, and the chattering motion by 2e-6. The first
+# step, tried before anything is known of the rates, has to be short: from 1 ms Newton's
+# method diverges at kp = 1e8.
+IMPLICIT = dict(
+    solver=diffrax.Kvaerno5(),
+    dt0=1e-6,
+    stepsize_controller=diffrax.PIDController(
+        rtol=1e-9, atol=1e-9, dtmin=1e-13, force_dtmin=False
+    ),
+    throw=False,
+)
+
+
+def held(log_kp, dt0, adjoint):
+    """The motion under kp, and kd = 2 sqrt(kp)."""
+    kp = jnp.exp(log_kp)
+    controller = fj.PDController(kp, 2 * jnp.sqrt(kp), jnp.inf, TARGET)
+    ts = np.linspace(0, 1, 11)
+    keywords = IMPLICIT | dict(dt0=dt0)
+    solution = fj.simulate(arm(), START, ts, (controller,), adjoint=adjoint, **keywords)
+    return solution.q[1:], solution
+
+
+@jax.jit
+def motion_and_derivative(kp, dt0=1e-6):
+    adjoint = diffrax.ForwardMode()
+    slope, solution = jax.jacfwd(held, has_aux=True)(jnp.log(kp), dt0, adjoint)
+    return solution, slope
+
+
+def test_stiffness_does_not_cost_steps_or_accuracy():
+    """Rates grow from 500 to 1e6 per second, explicit steps shrink with them."""
+    steps = []
+    for kp in STIFFNESSES:
+        exact = REFERENCE[f"stiff-{kp:.0e}"]
+        solution, slope = motion_and_derivative(kp)
+        assert solution.outcome == "successful"
+        assert np.abs(solution.q[1:] - np.array(exact["q"])).max() <= 1e-6
+        right = np.array(exact["dq_dlogkp"])
+        assert np.abs(slope - right).max() <= 1e-4 * np.abs(right).max()
+        steps.append(int(solution.stats["num_steps"]))
+    assert max(steps) <= 2 * min(steps)
+
+
+@pytest.mark.xfail(
+    strict=True,
+    reason="raises 'a linear solver received non-finite input' at kp = 1e8: the first "
+    "step diverges, and Optimistix differentiates the root it did not find",
+)
+def test_no_first_step_raises():
+    """The default first step of 1 ms is 1000 times too long: a derivative of the
+    stages that it tries and rejects must not end the program."""
+    solution, slope = motion_and_derivative(STIFFNESSES[-1], 1e-3)
+    assert solution.outcome == "successful"
+    right = np.array(REFERENCE["stiff-1e+08"]["dq_dlogkp"])
+    assert np.abs(slope - right).max() <= 1e-4 * np.abs(right).max()
+
+
+@pytest.mark.slow
+def test_the_gradient_in_reverse_mode():
+    """Reverse mode goes back through every stage's implicit equations."""
+
+    @jax.jit
+    @jax.grad
+    def gradient(log_kp):
+        return jnp.sum(held(log_kp, 1e-6, diffrax.RecursiveCheckpointAdjoint())[0])
+
+    for kp in STIFFNESSES:
+        right = np.sum(REFERENCE[f"stiff-{kp:.0e}"]["dq_dlogkp"])
+        assert abs(gradient(jnp.log(kp)) - right) <= 1e-4 * abs(right)
+
+
+def test_creep_under_heavy_damping():
+    """Velocities die at rates of 1e6 to 1e8 per second; what is left is the balance of
+    damping and gravity, 1e-5 rad/s."""
+    damping = 1e6
+
+    @jax.jit
+    def motion(log_damping):
+        def end(log_damping):
+            solution = fj.simulate(
+                arm(),
+                START,
+                np.linspace(0, 1, 11),
+                (fj.JointDamper(jnp.exp(log_damping)),),
+                adjoint=diffrax.ForwardMode(),
+                **IMPLICIT,
+            )
+            return solution.qd[1:], solution
+
+        slope, solution = jax.jacfwd(end, has_aux=True)(log_damping)
+        return solution, slope
+
+    solution, slope = motion(jnp.log(damping))
+    assert solution.outcome == "successful"
+    assert solution.stats["num_steps"] <= 1000
+    usual = oracle.Arm("RRR", **USUAL, locked=(0,) * 3, base_angle=0, gravity=9.81)
+    for q, qd, change in zip(solution.q[1:], solution.qd[1:], slope):
+        # Inertia is left out: it makes 1e-11 of a difference.
+        with mpmath.workdps(30):
+            at_rest = oracle.chain(usual, q.tolist(), [0] * 3)
+            _, load, _ = oracle.equations(usual, *at_rest)
+            creep = np.array([-float(f) / damping for f in load])
+        assert np.abs(qd - creep).max() <= 1e-6 * np.abs(creep).max()
+        assert np.abs(change + creep).max() <= 1e-4 * np.abs(creep).max()
+
+
+def test_chattering_at_a_limit():
+    """Efforts leave their limit for microseconds: stiff there, and each corner is a
+    jump of the derivative inside some step."""
+    controller = fj.PDController(1e6, 2e3, 50.0, TARGET)
+    ts = np.linspace(0, 2, 2001)
+    solution = fj.simulate(arm(), START, ts, (controller,), **IMPLICIT)
+    assert solution.outcome == "successful"
+    assert solution.stats["num_steps"] <= 10_000
+    square = np.sum((solution.q - TARGET.target[None]) ** 2, axis=1)
+    # By SciPy's DOP853 at 1e-12: 1e-13 gives the same to 2e-11.
+    exact = REFERENCE["saturated"]["mean_square"]
+    assert np.mean(square) == pytest.approx(exact, rel=1e-6)
