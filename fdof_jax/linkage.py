@@ -206,6 +206,22 @@ def check_linkage(linkage: Any) -> None:
         )
 
 
+def possible(linkage: Linkage) -> Array:
+    """Whether the values are ones that the constructor takes, also if traced.
+
+    All but a singular mass matrix: existence factors of 0 and 1, complementary in each
+    pair, one revolute joint at least, masses and inertias not negative.
+    """
+    pairs = linkage.ef.reshape(3, 2)
+    factors = ((pairs == 0) | (pairs == 1)).all() & (pairs.sum(axis=1) == 1).all()
+    return (
+        factors
+        & pairs[:, 1].any()
+        & (linkage.mass >= 0).all()
+        & (linkage.inertia >= 0).all()
+    )
+
+
 def real_joints(ef: Array) -> tuple[Array, Array, Array]:
     """Whether the real joint of each pair is the revolute one."""
     return ef[1] > 0.5, ef[3] > 0.5, ef[5] > 0.5

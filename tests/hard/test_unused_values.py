@@ -98,7 +98,7 @@ def test_parameters_that_a_topology_does_not_use(topology, junk):
         dirty, solution = motion(
             eqx.tree_at(lambda a, name=name: getattr(a, name), linkage, spoilt)
         )
-        if np.isnan(junk) and solution.outcome == "not finite":
+        if np.isnan(junk) and solution.outcome != "successful":
             continue
         for a, b in zip(*map(jax.tree.leaves, (dirty, clean))):
             np.testing.assert_array_equal(a, b, err_msg=name)
