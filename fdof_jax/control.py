@@ -82,9 +82,9 @@ class PDController(ScalarElement):
         return q_ref, qd_ref
 
     def respond(self, scheduled, q, qd, linkage):
-        # Not jnp.clip, whose derivative at the limit is the mean of both sides'.
+        # The derivative of jnp.clip at the limit is the mean of both sides'.
         return tuple(
-            jnp.where(effort > limit, limit, jnp.where(effort < -limit, -limit, effort))
+            jnp.where(jnp.abs(effort) <= limit, effort, jnp.clip(effort, -limit, limit))
             for effort, limit in zip(self._unlimited(scheduled, q, qd), self.limit)
         )
 

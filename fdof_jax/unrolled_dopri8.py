@@ -130,7 +130,7 @@ def _stages_jvp(primals, tangents):
     """All stages are linearised at once, then their tangents follow one another."""
     (field, _), times, h, y0, _, args, schedule, _ = primals
     _, times_dot, h_dot, y0_dot, _, args_dot, schedule_dot, _ = tangents
-    step, rates = _unrolled(*primals)
+    step, rates = _stages(*primals)  # itself, for derivatives of derivatives
     increments = [_combine(row, rates) for row in _LOWER[:-1]]
     states = [y0, *(_sum(y0, _scaled(h, k)) for k in increments), step.y]
 
