@@ -4,10 +4,10 @@ import warnings
 
 import numpy as np
 import pytest
-from hard import scenes as hard
 from helpers import SCENES, load, relative_error
 
 import fdof_jax as fj
+from hard import scenes as hard
 
 PAPER_SINGULAR = ("hard-masslesstip-RRR", "hard-pointtip-RRP")
 
