@@ -42,6 +42,11 @@ def test_two_ulp(dtype):
             worst = 0
             for xi, value in zip(x, values):
                 truth = exact(mpf(float(xi)))
+                if truth == 0:
+                    assert (
+                        value == 0
+                    )  # its ulp is denormal: flushed to 0 after some kernels
+                    continue
                 ulp = mpf(float(np.spacing(abs(dtype(float(truth))))))
                 worst = max(worst, abs(mpf(float(value)) - truth) / ulp)
             assert worst <= 2
