@@ -106,10 +106,17 @@ class PDController(ScalarElement):
         return getattr(self.reference, "jump_ts", None)
 
     def check(self, linkage: Linkage, ts: Array) -> None:
-        """Pass the linkage and the times on to the reference's own check, if any."""
+        """The constructor's check again, then the reference's own, if it has one."""
+        # `equinox.tree_at` asks no constructor.
+        PDController(self.kp, self.kd, self.limit, self.reference)
         check_reference: Any = getattr(self.reference, "check", None)
         if check_reference is not None:
             check_reference(linkage, ts)
+
+    def possible(self) -> Array:
+        """Whether gains and limits are not negative."""
+        lowest = jnp.minimum(jnp.minimum(self.kp, self.kd), self.limit)
+        return (lowest >= 0).all()
 
 
 class CircleTask(eqx.Module):
@@ -205,7 +212,14 @@ class CircleTask(eqx.Module):
         return jax.jvp(lambda t: self._positions(t, linkage), (t,), (jnp.ones_like(t),))
 
     def check(self, linkage: Linkage, ts: Array) -> None:
-        """Raise ValueError if the tip leaves the linkage's reach between the times."""
+        """Raise ValueError if the tip leaves the linkage's reach between the times.
+
+        Or for values that the constructor refuses.
+        """
+        CircleTask(
+            self.center, self.radius, self.period, self.phase, self.orientation,
+            int(self.branch),
+        )  # fmt: skip
         start, end = float(ts[0]), float(ts[-1])
         turn = abs(float(self.period))
         # The reach ends first where the wrist is nearest to or farthest from the base,

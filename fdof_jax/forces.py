@@ -6,7 +6,9 @@ add up. The PD controller is one too: see `control`.
 
 An element, or a controller's reference, whose efforts jump at known times may have them
 as an attribute `jump_ts`, an array [s]: steps then end there. One with a method
-`check(linkage, ts)` is asked at the door of `simulate`.
+`check(linkage, ts)` is asked at the door of `simulate` where values are concrete; one
+with `possible()`, also where they are traced: motions under an element for which that
+is not true end as not finite.
 
 Elements in hot loops may be `ScalarElement`s, which cost less to run and to compile.
 """
@@ -67,6 +69,14 @@ class JointDamper(ScalarElement):
     def respond(self, scheduled, q, qd, linkage):
         return tuple(-c * rate for c, rate in zip(self.coefficient, qd))
 
+    def check(self, linkage: Linkage, ts: Array) -> None:
+        """The constructor's check again: `equinox.tree_at` asks no constructor."""
+        JointDamper(self.coefficient)
+
+    def possible(self) -> Array:
+        """Whether the coefficients are not negative."""
+        return (self.coefficient >= 0).all()
+
 
 class JointEffort(ScalarElement):
     """Constant joint efforts, the paper's F and T inputs.
@@ -83,3 +93,7 @@ class JointEffort(ScalarElement):
 
     def respond(self, scheduled, q, qd, linkage):
         return tuple(self.tau)
+
+    def check(self, linkage: Linkage, ts: Array) -> None:
+        """The constructor's check again: `equinox.tree_at` asks no constructor."""
+        JointEffort(self.tau)

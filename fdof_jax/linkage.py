@@ -196,7 +196,10 @@ def compiled(
 
 
 def check_linkage(linkage: Any) -> None:
-    """Raise ValueError unless the argument is one linkage, not a batch."""
+    """Raise ValueError unless the argument is one linkage, not a batch.
+
+    Its values are looked at again: `equinox.tree_at` asks no constructor.
+    """
     if not isinstance(linkage, Linkage):
         raise ValueError(f"linkage: expected a Linkage, got {linkage!r}.")
     if jnp.shape(linkage.ef) != (6,):
@@ -204,6 +207,17 @@ def check_linkage(linkage: Any) -> None:
             "linkage: expected one linkage (use jax.vmap for a batch), got existence "
             f"factors of shape {jnp.shape(linkage.ef)}."
         )
+    if is_traced(linkage):
+        return
+    values = jax.tree.map(np.asarray, linkage)
+    if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(values)) or not (
+        possible(values)
+    ):
+        fields = vars(linkage)
+        try:
+            Linkage(fields["ef"], **{k: fields[k] for k in fields if k != "ef"})
+        except ValueError as error:
+            raise ValueError(f"linkage.{error}") from None
 
 
 def possible(linkage: Linkage) -> Array:

@@ -192,6 +192,9 @@ def _integrate(solver, inputs, keywords, derivatives: bool = False) -> Solution:
     ts = jnp.where(increasing, asked, jnp.arange(len(asked), dtype=asked.dtype))
     finite = jnp.isfinite(state0.qd)
     valid = possible(linkage) & increasing & finite.all()
+    for element in forces:
+        if hasattr(element, "possible"):
+            valid = valid & element.possible()
     qd0 = jnp.where(finite, state0.qd, 0)
     # Once per solve: the start may be any number of turns away.
     constants = link_constants(linkage, state0.q, lambda x: (jnp.sin(x), jnp.cos(x)))

@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hard.arms import START, arm
 
 import fdof_jax as fj
+from hard.arms import START, arm
 
 SIZE, TS = 256, np.linspace(0, 0.5, 6)
 NAN_START, NAN_LATER, FAST = 17, 101, 200

@@ -1,6 +1,7 @@
 """Scenes 13 to 15: Fig 5, whose errors grow by e each 0.7 s."""
 
 import numpy as np
+
 from hard import scenes as hard
 
 

@@ -6,11 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hard.arms import START, Hold, arm
 
 import fdof_jax as fj
 from fdof_jax.control import tip_deviation
 from fdof_jax.trigonometry import sincos
+from hard.arms import START, Hold, arm
 
 STILL = np.zeros(3)
 

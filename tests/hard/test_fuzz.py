@@ -5,6 +5,7 @@ import math
 import jax.numpy as jnp
 import numpy as np
 import pytest
+
 from hard import fuzz
 from hard.fuzz import Scene
 from hard.garbage import Case, Hostile

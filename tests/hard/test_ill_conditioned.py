@@ -5,9 +5,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hard.arms import REFERENCE, START, TIGHT, arm
 
 import fdof_jax as fj
+from hard.arms import REFERENCE, START, TIGHT, arm
 
 TS = np.linspace(0, 2, 21)
 

@@ -4,9 +4,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from hard.arms import REFERENCE, START, TIGHT, arm
 
 import fdof_jax as fj
+from hard.arms import REFERENCE, START, TIGHT, arm
 
 
 class Staircase(eqx.Module):

@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hard.arms import START, TARGET, arm
 
 import fdof_jax as fj
+from hard.arms import START, TARGET, arm
 
 NAN, INF = np.nan, np.inf
 GOOD = dict(
@@ -37,44 +37,33 @@ def simulate(ef, mass, length, q, qd, ts, kp, limit):
 traced = jax.jit(simulate)
 
 
-def fails(reason):
-    return pytest.mark.xfail(strict=True, reason=reason)
-
-
-UNTOLD = fails("'successful', and numbers that look like any others")
 CASES = {
-    "q nan": ("q", [NAN, 0, 0], ()),
-    "q inf": ("q", [0, INF, 0], ()),
-    "qd nan": ("qd", [NAN, 0, 0], ()),
-    "qd inf": ("qd", [0, INF, 0], ()),
-    "mass nan": ("mass", [1, 1, NAN], ()),
-    "mass of the tip negative": ("mass", [1, 1, -1], ()),
-    "mass of the base negative": ("mass", [-1, 1, 1], ()),
-    "length nan": ("length", [0, NAN, 1, 1], ()),
-    "length inf": ("length", [0, 1, INF, 1], ()),
-    "kp nan": ("kp", [1, NAN, 1], ()),
-    "kp negative": ("kp", [1, -1, 1], UNTOLD),
-    "limit nan": ("limit", [10, NAN, 10], ()),
-    "limit negative": ("limit", [10, -10, 10], UNTOLD),
-    "both joints of a pair": ("ef", [0, 1, 1, 1, 0, 1], ()),
-    "no joint of a pair": ("ef", [0, 1, 0, 0, 0, 1], ()),
-    "ef nan": ("ef", [0, 1, NAN, NAN, 0, 1], ()),
-    "PPP": ("ef", [1, 0, 1, 0, 1, 0], ()),
-    "ts not increasing": ("ts", [0, 0.5, 0.2, 0.7, 1], ()),
-    "ts decreasing": ("ts", [1, 0.7, 0.5, 0.2, 0], ()),
-    "ts equal": ("ts", [0, 0, 0, 0, 0], ()),
-    "ts nan": ("ts", [0, 0.2, NAN, 0.7, 1], ()),
-    "ts inf": ("ts", [0, 0.2, 0.5, 0.7, INF], ()),
+    "q nan": ("q", [NAN, 0, 0]),
+    "q inf": ("q", [0, INF, 0]),
+    "qd nan": ("qd", [NAN, 0, 0]),
+    "qd inf": ("qd", [0, INF, 0]),
+    "mass nan": ("mass", [1, 1, NAN]),
+    "mass of the tip negative": ("mass", [1, 1, -1]),
+    "mass of the base negative": ("mass", [-1, 1, 1]),
+    "length nan": ("length", [0, NAN, 1, 1]),
+    "length inf": ("length", [0, 1, INF, 1]),
+    "kp nan": ("kp", [1, NAN, 1]),
+    "kp negative": ("kp", [1, -1, 1]),
+    "limit nan": ("limit", [10, NAN, 10]),
+    "limit negative": ("limit", [10, -10, 10]),
+    "both joints of a pair": ("ef", [0, 1, 1, 1, 0, 1]),
+    "no joint of a pair": ("ef", [0, 1, 0, 0, 0, 1]),
+    "ef nan": ("ef", [0, 1, NAN, NAN, 0, 1]),
+    "PPP": ("ef", [1, 0, 1, 0, 1, 0]),
+    "ts not increasing": ("ts", [0, 0.5, 0.2, 0.7, 1]),
+    "ts decreasing": ("ts", [1, 0.7, 0.5, 0.2, 0]),
+    "ts equal": ("ts", [0, 0, 0, 0, 0]),
+    "ts nan": ("ts", [0, 0.2, NAN, 0.7, 1]),
+    "ts inf": ("ts", [0, 0.2, 0.5, 0.7, INF]),
 }
 
 
-@pytest.mark.parametrize(
-    "name, value",
-    [
-        pytest.param(name, value, marks=mark, id=case)
-        for case, (name, value, mark) in CASES.items()
-    ],
-)
+@pytest.mark.parametrize("name, value", CASES.values(), ids=CASES)
 def test_traced_values_that_no_door_sees(name, value):
     """Nothing can be raised for one member of a batch: its result has to say it."""
     solution = traced(**GOOD | {name: jnp.asarray(value, float)})
@@ -101,13 +90,10 @@ INSIDE = {
 }
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="what is inside of a linkage or an element is looked at when it is made",
-)
 @pytest.mark.parametrize("name", INSIDE)
 def test_modules_changed_after_their_door(name):
     """`eqx.tree_at` asks no constructor: the values are there to be seen by a call."""
+    argument = "topology" if name == "ef" else name
     for value in INSIDE[name]:
-        with pytest.raises(ValueError, match=rf"{name}.*: expected .*, got "):
+        with pytest.raises(ValueError, match=rf"{argument}: expected .*, got "):
             simulate(**GOOD | {name: jnp.asarray(value, float)})

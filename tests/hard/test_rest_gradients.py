@@ -4,10 +4,10 @@ import diffrax
 import jax
 import numpy as np
 import pytest
-from hard.arms import arm
 from scipy.linalg import expm
 
 import fdof_jax as fj
+from hard.arms import arm
 
 HANGING, END = np.array([-np.pi / 2, 0.0, 0.0]), 10.0
 STILL = np.zeros(3)

@@ -9,10 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hard.arms import START, TARGET, Hold, arm
 
 import fdof_jax as fj
 from fdof_jax.control import saturated
+from hard.arms import START, TARGET, Hold, arm
 
 STILL = np.zeros(3)
 KP = 128.0

@@ -4,10 +4,10 @@ import equinox as eqx
 import mpmath
 import numpy as np
 import pytest
-from hard.arms import START, USUAL, arm
 from mpmath import mpf
 
 import fdof_jax as fj
+from hard.arms import START, USUAL, arm
 
 TS = np.linspace(0, 5, 11)
 

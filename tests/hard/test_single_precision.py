@@ -8,9 +8,9 @@ from pathlib import Path
 import diffrax
 import numpy as np
 import pytest
-from hard.arms import REFERENCE, arm
 
 import fdof_jax as fj
+from hard.arms import REFERENCE, arm
 
 SWING = REFERENCE["swing"]
 TS = np.linspace(0, SWING["t1"], 21)

@@ -51,19 +51,7 @@ def test_two_joints_that_do_the_same(name):
     assert hard.error(motion, scene) <= 1e-9
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "near-parallel-PPR",
-        pytest.param(
-            "near-parallel-RPP",
-            marks=pytest.mark.xfail(
-                strict=True,
-                reason="1.15e-9: the pivot m22 - m23^2/m33 cancels ten digits",
-            ),
-        ),
-    ],
-)
+@pytest.mark.parametrize("name", ["near-parallel-PPR", "near-parallel-RPP"])
 def test_accelerations_of_nearly_parallel_axes(name):
     """Between slides 1e-3 rad apart a link of 1e-6 kg is left by cancellation."""
     scene, reference = hard.load(name), hard.REFERENCE[name]
@@ -73,22 +61,19 @@ def test_accelerations_of_nearly_parallel_axes(name):
 
 
 @pytest.mark.parametrize(
-    "name",
-    [
-        "near-parallel-PPR",
-        pytest.param(
-            "near-parallel-RPP",
-            marks=pytest.mark.xfail(
-                strict=True, reason="4.6e-8 m of 890 m: as accelerations"
-            ),
-        ),
-    ],
+    "name, bound", [("near-parallel-PPR", 1e-8), ("near-parallel-RPP", 1e-6)]
 )
-def test_nearly_parallel_axes(name):
-    """The step control sees rounding, enlarged by the condition of 4e6, as an error."""
+def test_nearly_parallel_axes(name, bound):
+    """The step control sees rounding, enlarged by the condition of 4e6, as an error.
+
+    In 5 s the light link of the second arm gets 890 m away, turning at up to 2.6 rad/s.
+    The slides move by 1.5e7 m per newton (computed with 60 digits): to round the tip's
+    weight of 9.81 N moves them by up to 1.4e-8 m, and to round the centrifugal forces
+    along them, of up to 6 kN, by 7e-6 m.
+    """
     scene = hard.load(name)
     motion = hard.simulate(scene, hard.TIGHT)
-    assert hard.error(motion, scene) <= 1e-8
+    assert hard.error(motion, scene) <= bound
     assert motion.stats["num_steps"] <= 10_000
 
 

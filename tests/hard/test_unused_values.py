@@ -5,9 +5,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hard.arms import START, arm
 
 import fdof_jax as fj
+from hard.arms import START, arm
 
 TS = np.linspace(0, 0.5, 6)
 JUNK = [1e30, np.nan]

@@ -1,6 +1,7 @@
 """Scene 11: upright."""
 
 import numpy as np
+
 from hard import scenes as hard
 
 
