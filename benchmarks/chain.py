@@ -6,14 +6,25 @@ it means something.
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 import fdof_jax as fj
 
 
-def make_rates(linkage: fj.Linkage, sin: Callable, cos: Callable) -> Callable:
+class Drive(NamedTuple):
+    """Joint efforts: effort + stiffness * (target - q) - damping * qd, all (3,)."""
+
+    effort: Any = (0.0, 0.0, 0.0)
+    stiffness: Any = (0.0, 0.0, 0.0)
+    target: Any = (0.0, 0.0, 0.0)
+    damping: Any = (0.0, 0.0, 0.0)
+
+
+def make_rates(
+    linkage: fj.Linkage, sin: Callable, cos: Callable, drive: Drive | None = None
+) -> Callable:
     """Rates of (q1, q2, q3, qd1, qd2, qd3), as a function of these six."""
     ef = np.asarray(linkage.ef)
     r1, r2, r3 = (bool(e) for e in ef[1::2] > 0.5)
@@ -27,6 +38,8 @@ def make_rates(linkage: fj.Linkage, sin: Callable, cos: Callable) -> Callable:
     # A revolute joint turns (1) and does not slide (0), a prismatic one the reverse.
     t1, t2, t3 = float(r1), float(r2), float(r3)
     p1, p2, p3 = 1 - t1, 1 - t2, 1 - t3
+    driven = drive is not None
+    (f1, f2, f3), (k1, k2, k3), (g1, g2, g3), (d1, d2, d3) = drive or Drive()
 
     def rates(q1: Any, q2: Any, q3: Any, u1: Any, u2: Any, u3: Any) -> tuple:
         th2 = base + (q1 if r1 else l1)
@@ -92,13 +105,17 @@ def make_rates(linkage: fj.Linkage, sin: Callable, cos: Callable) -> Callable:
         )
         h2 = -(m3 * (j32x * z3x + j32y * z3y) + m4 * (j42x * z4x + j42y * z4y))
         h3 = -m4 * (j43x * z4x + j43y * z4y)
+        if driven:
+            h1 = h1 + f1 + k1 * (g1 - q1) - d1 * u1
+            h2 = h2 + f2 + k2 * (g2 - q2) - d2 * u2
+            h3 = h3 + f3 + k3 * (g3 - q3) - d3 * u3
         # Elimination from the last joint.
-        k1, k2 = m13 / m33, m23 / m33
-        n22, n12 = m22 - k2 * m23, m12 - k1 * m23
+        n13, n23 = m13 / m33, m23 / m33
+        n22, n12 = m22 - n23 * m23, m12 - n13 * m23
         k12 = n12 / n22
-        r2nd = h2 - k2 * h3
-        acc1 = (h1 - k1 * h3 - k12 * r2nd) / (m11 - k1 * m13 - k12 * n12)
+        r2nd = h2 - n23 * h3
+        acc1 = (h1 - n13 * h3 - k12 * r2nd) / (m11 - n13 * m13 - k12 * n12)
         acc2 = r2nd / n22 - k12 * acc1
-        return u1, u2, u3, acc1, acc2, h3 / m33 - k1 * acc1 - k2 * acc2
+        return u1, u2, u3, acc1, acc2, h3 / m33 - n13 * acc1 - n23 * acc2
 
     return rates

@@ -16,14 +16,15 @@ import numpy as np
 
 import fdof_jax as fj
 
-from .chain import make_rates
+from .chain import Drive, make_rates
 from .contestants import DT0, MAX_STEPS, Contestant, Motion
 from .measure import Skipped
 from .native import Kernel
 from .problems import Problem
 
 
-def _module(name: str) -> Any:
+def module(name: str) -> Any:
+    """An installed peer."""
     try:
         return importlib.import_module(name)
     except ImportError:
@@ -70,7 +71,7 @@ def scipy(problem: Problem, method: str) -> Contestant:
     _one_free_arm(problem)
     if problem.batch is not None:
         raise Skipped("no batches")
-    integrate = _module("scipy.integrate")
+    integrate = module("scipy.integrate")
     rates, language = _scalar_rates(problem)
 
     def run(tolerance: float) -> Any:
@@ -96,7 +97,7 @@ def scipy(problem: Problem, method: str) -> Contestant:
 def mujoco(problem: Problem, integrator: str) -> Contestant:
     """MuJoCo's own rollout in C; `integrator`: Euler, implicitfast or RK4."""
     _one_free_arm(problem)
-    mj, rollout = _module("mujoco"), _module("mujoco.rollout")
+    mj, rollout = module("mujoco"), module("mujoco.rollout")
     model = mj.MjModel.from_xml_string(fj.to_mjcf(problem.linkage))
     kind = {"Euler": "EULER", "implicitfast": "IMPLICITFAST", "RK4": "RK4"}[integrator]
     model.opt.integrator = getattr(mj.mjtIntegrator, f"mjINT_{kind}")
@@ -123,7 +124,7 @@ def mujoco(problem: Problem, integrator: str) -> Contestant:
 def mjx_rk4(problem: Problem) -> Contestant:
     """MuJoCo's JAX port with its RK4, the step a traced number."""
     _one_free_arm(problem)
-    mj, mjx = _module("mujoco"), _module("mujoco.mjx")
+    mj, mjx = module("mujoco"), module("mujoco.mjx")
     model = mj.MjModel.from_xml_string(fj.to_mjcf(problem.linkage))
     model.opt.integrator = mj.mjtIntegrator.mjINT_RK4
     model = mjx.put_model(model)
@@ -154,27 +155,28 @@ def mjx_rk4(problem: Problem) -> Contestant:
     )
 
 
-def _symbolic(hy: Any, problem: Problem) -> list:
+def symbolic(hy: Any, linkage: fj.Linkage, drive: Drive | None = None) -> list:
+    """The equations as heyoka takes them."""
     variables = hy.make_vars("q1", "q2", "q3", "u1", "u2", "u3")
 
     def of(symbolic: Any, number: Any) -> Any:
         # Angles that no joint turns are plain numbers.
         return lambda x: symbolic(x) if isinstance(x, hy.expression) else number(x)
 
-    rates = make_rates(problem.linkage, of(hy.sin, math.sin), of(hy.cos, math.cos))
+    rates = make_rates(linkage, of(hy.sin, math.sin), of(hy.cos, math.cos), drive)
     return list(zip(variables, rates(*variables)))
 
 
 def extended(problem: Problem) -> np.ndarray:
     """Positions at the output times by heyoka in 80-bit numbers: a reference."""
     _one_free_arm(problem)
-    hy = _module("heyoka")
+    hy = module("heyoka")
     wide = np.longdouble
     if np.finfo(wide).nmant < 63:
         raise Skipped("no 80-bit numbers here")
     start = np.concatenate([problem.state0.q, problem.state0.qd]).astype(wide)
     integrator = hy.taylor_adaptive(
-        _symbolic(hy, problem), start, fp_type=wide, tol=wide(1e-19)
+        symbolic(hy, problem.linkage), start, fp_type=wide, tol=wide(1e-19)
     )
     ts = problem.ts.astype(wide)
     integrator.propagate_until(ts[0] + wide(DT0))
@@ -187,8 +189,8 @@ def extended(problem: Problem) -> np.ndarray:
 def heyoka(problem: Problem) -> Contestant:
     """Adaptive Taylor series compiled by LLVM; a batch by several members at a time."""
     _one_free_arm(problem)
-    hy = _module("heyoka")
-    system = _symbolic(hy, problem)
+    hy = module("heyoka")
+    system = symbolic(hy, problem.linkage)
     q, qd = (np.atleast_2d(a) for a in problem.state0)
     start = np.concatenate([q, qd], axis=1).T
     begin, first, ts = problem.ts[0], problem.ts[0] + DT0, problem.ts[1:]

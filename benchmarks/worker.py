@@ -42,6 +42,7 @@ JOBS = (
     Job("scaling", "scaling"),
     Job("drift", "drift"),
     Job("lockstep", "lockstep"),
+    Job("hard_cases", "hard_cases"),
 )
 
 

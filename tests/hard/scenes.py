@@ -1,4 +1,7 @@
-"""The hard scenes as arguments of `simulate`, and how their errors are measured."""
+"""The hard scenes as arguments of `simulate`, and how their errors are measured.
+
+Unless a scene says otherwise: `arm()` from `START`.
+"""
 
 import json
 from pathlib import Path
@@ -9,12 +12,20 @@ import equinox as eqx
 import helpers
 import jax
 import jax.numpy as jnp
+import mpmath
 import numpy as np
 
 import fdof_jax as fj
 
-# Made by make_reference.py.
-REFERENCE = json.loads((Path(__file__).parent / "reference.json").read_text())
+# Made by make_reference.py and make_driven_reference.py.
+REFERENCE, DRIVEN = (
+    json.loads((Path(__file__).parent / name).read_text())
+    for name in ("reference.json", "driven_reference.json")
+)
+USUAL: dict[str, Any] = dict(
+    length=[0, 1, 1, 1], com=[[0.5, 0]] * 3, mass=[1, 1, 1], inertia=[1 / 12] * 3
+)
+START = fj.State(np.array([-0.5, 0.3, 0.2]), np.zeros(3))
 OUTPUTS = 21  # of every simulation here: one compilation serves all
 
 
@@ -30,11 +41,21 @@ class Scene(NamedTuple):
 
 
 def arm(topology="RRR", **changes):
-    """The arm of all scenes that do not say otherwise."""
-    usual: dict[str, Any] = dict(
-        length=[0, 1, 1, 1], com=[[0.5, 0]] * 3, mass=[1, 1, 1], inertia=[1 / 12] * 3
-    )
-    return fj.Linkage(topology, **(usual | changes))
+    """Links of 1 m and 1 kg, unless a scene says otherwise."""
+    return fj.Linkage(topology, **(USUAL | changes))
+
+
+class Hold(eqx.Module):
+    """A reference that stands still."""
+
+    target: jax.Array
+
+    def __call__(self, t, linkage):
+        return self.target, jnp.zeros(3)
+
+
+# Where the controllers of the scenes hold the arm [rad], as in driven_reference.json.
+TARGET = Hold(jnp.array([-0.4, 0.2, 0.3]))
 
 
 def free(linkage, q0, ts, **reference):
@@ -45,8 +66,8 @@ def free(linkage, q0, ts, **reference):
 
 
 def load(name):
-    """A scene of reference.json in this folder."""
-    scene = REFERENCE[name]
+    """A scene of the files in this folder."""
+    scene = (REFERENCE | DRIVEN)[name]
     links = ("length", "com", "mass", "inertia", "locked", "base_angle", "gravity")
     return Scene(
         fj.Linkage(scene["topology"], **{key: scene[key] for key in links}),
@@ -163,6 +184,15 @@ def largest_error(value, exact):
     """Of a derivative, over its largest entry."""
     value, exact = np.asarray(value), np.asarray(exact)
     return np.abs(value - exact).max() / np.abs(exact).max()
+
+
+def without_turns(q):
+    """The angles that are left, for these angles as they are rounded."""
+    with mpmath.workdps(50):
+        turn = 2 * mpmath.pi
+        return np.array(
+            [float(a - turn * mpmath.nint(a / turn)) for a in map(mpmath.mpf, q)]
+        )
 
 
 def linear_motion(t, upright=False):

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import fdof_jax as fj
-from hard.arms import START, arm
+from hard.scenes import START, arm
 
 SIZE, TS = 256, np.linspace(0, 0.5, 6)
 NAN_START, NAN_LATER, FAST = 17, 101, 200

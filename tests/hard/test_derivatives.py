@@ -10,7 +10,7 @@ import pytest
 import fdof_jax as fj
 from fdof_jax.control import tip_deviation
 from fdof_jax.trigonometry import sincos
-from hard.arms import START, Hold, arm
+from hard.scenes import START, Hold, arm
 
 STILL = np.zeros(3)
 

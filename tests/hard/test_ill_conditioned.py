@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import fdof_jax as fj
-from hard.arms import REFERENCE, START, TIGHT, arm
+from hard.scenes import DRIVEN, START, TIGHT, arm
 
 TS = np.linspace(0, 2, 21)
 
@@ -26,7 +26,7 @@ def test_a_tip_of_a_million_tonnes(steps):
     )
     assert solution.stats["num_steps"] < 10_000
     if solution.outcome == "successful":
-        error = np.abs(solution.q - np.array(REFERENCE["heavy-tip-1e9"]["q"])).max()
+        error = np.abs(solution.q - np.array(DRIVEN["heavy-tip-1e9"]["q"])).max()
         assert error <= 1e-3
     else:
         assert solution.outcome == "ill-conditioned"

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import fdof_jax as fj
-from hard.arms import REFERENCE, START, TIGHT, arm
+from hard.scenes import DRIVEN, START, TIGHT, arm
 
 
 class Staircase(eqx.Module):
@@ -33,7 +33,7 @@ def test_a_reference_that_steps():
     """No formula of high order holds across a jump, and rejections halve the steps down
     to it; declared, it costs nothing."""
     jumps = jnp.array([1.0, 2.0, 3.0])
-    exact = REFERENCE["stepping"]
+    exact = DRIVEN["stepping"]
     controller = fj.PDController(200.0, 30.0, jnp.inf, Staircase(jumps))
     solution = fj.simulate(
         arm(), START, [0, *exact["ts"]], (controller,), stepsize_controller=TIGHT
@@ -43,7 +43,7 @@ def test_a_reference_that_steps():
 
 def test_a_pulse_of_a_microsecond():
     """It lies between the stages of any step that does not know of it."""
-    exact = REFERENCE["pulse"]
+    exact = DRIVEN["pulse"]
     pulse = Pulse(jnp.array([7.3, 7.3 + 1e-6]), jnp.array(1e5))
 
     @eqx.filter_jit

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import fdof_jax as fj
-from hard.arms import START, TARGET, arm
+from hard.scenes import START, TARGET, arm
 
 NAN, INF = np.nan, np.inf
 GOOD = dict(

@@ -7,7 +7,7 @@ import pytest
 from scipy.linalg import expm
 
 import fdof_jax as fj
-from hard.arms import arm
+from hard.scenes import arm
 
 HANGING, END = np.array([-np.pi / 2, 0.0, 0.0]), 10.0
 STILL = np.zeros(3)

@@ -12,7 +12,7 @@ import pytest
 
 import fdof_jax as fj
 from fdof_jax.control import saturated
-from hard.arms import START, TARGET, Hold, arm
+from hard.scenes import START, TARGET, Hold, arm
 
 STILL = np.zeros(3)
 KP = 128.0

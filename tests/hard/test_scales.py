@@ -1,13 +1,11 @@
 """Arms of other sizes than a metre, in other units, and after many turns."""
 
 import equinox as eqx
-import mpmath
 import numpy as np
 import pytest
-from mpmath import mpf
 
 import fdof_jax as fj
-from hard.arms import START, USUAL, arm
+from hard.scenes import START, USUAL, arm, without_turns
 
 TS = np.linspace(0, 5, 11)
 
@@ -48,13 +46,6 @@ def test_sizes_and_units_do_not_matter(topology):
         assert np.abs(motion.q / unit[None] - usual.q).max() <= 1e-7, name
         steps = motion.stats["num_steps"] / usual.stats["num_steps"]
         assert 0.5 < steps < 2, name
-
-
-def without_turns(q):
-    """The angles that are left, for these angles as they are rounded."""
-    with mpmath.workdps(50):
-        turn = 2 * mpmath.pi
-        return np.array([float(a - turn * mpmath.nint(a / turn)) for a in map(mpf, q)])
 
 
 @pytest.mark.parametrize("joints", [[1, 0, 0], [1, 1, 1]], ids=["first", "all"])

@@ -10,19 +10,19 @@ import numpy as np
 import pytest
 
 import fdof_jax as fj
-from hard.arms import REFERENCE, arm
+from hard.scenes import DRIVEN, arm
 
-SWING = REFERENCE["swing"]
+SWING = DRIVEN["swing"]
 TS = np.linspace(0, SWING["t1"], 21)
 
 PREAMBLE = """
 import warnings
 import diffrax, jax, jax.numpy as jnp, numpy as np
 import fdof_jax as fj
-from hard.arms import REFERENCE, arm
+from hard.scenes import DRIVEN, arm
 
 assert not jax.config.jax_enable_x64
-swing = REFERENCE["swing"]
+swing = DRIVEN["swing"]
 start = fj.State(swing["q0"], swing["qd0"])
 ts = np.linspace(0, swing["t1"], 21)
 """

@@ -9,7 +9,7 @@ import pytest
 
 import fdof_jax as fj
 from hard import oracle
-from hard.arms import REFERENCE, START, TARGET, USUAL, arm
+from hard.scenes import DRIVEN, START, TARGET, USUAL, arm
 
 STIFFNESSES = [1e4, 1e6, 1e8]
 # 1e-9 is one digit more than smooth motions need: at 1e-8 derivatives at kp = 1e6 are
@@ -46,7 +46,7 @@ def test_stiffness_does_not_cost_steps_or_accuracy():
     """Rates grow from 500 to 1e6 per second, explicit steps shrink with them."""
     steps = []
     for kp in STIFFNESSES:
-        exact = REFERENCE[f"stiff-{kp:.0e}"]
+        exact = DRIVEN[f"stiff-{kp:.0e}"]
         solution, slope = motion_and_derivative(kp)
         assert solution.outcome == "successful"
         assert np.abs(solution.q[1:] - np.array(exact["q"])).max() <= 1e-6
@@ -66,7 +66,7 @@ def test_the_gradient_in_reverse_mode():
         return jnp.sum(held(log_kp, diffrax.RecursiveCheckpointAdjoint())[0])
 
     for kp in STIFFNESSES:
-        right = np.sum(REFERENCE[f"stiff-{kp:.0e}"]["dq_dlogkp"])
+        right = np.sum(DRIVEN[f"stiff-{kp:.0e}"]["dq_dlogkp"])
         assert abs(gradient(jnp.log(kp)) - right) <= 1e-4 * abs(right)
 
 
@@ -115,5 +115,5 @@ def test_chattering_at_a_limit():
     assert solution.stats["num_steps"] <= 10_000
     square = np.sum((solution.q - TARGET.target[None]) ** 2, axis=1)
     # By SciPy's DOP853 at 1e-12: 1e-13 gives the same to 2e-11.
-    exact = REFERENCE["saturated"]["mean_square"]
+    exact = DRIVEN["saturated"]["mean_square"]
     assert np.mean(square) == pytest.approx(exact, rel=1e-6)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import fdof_jax as fj
-from hard.arms import START, arm
+from hard.scenes import START, arm
 
 TS = np.linspace(0, 0.5, 6)
 JUNK = [1e30, np.nan]
