@@ -43,6 +43,7 @@ JOBS = (
     Job("drift", "drift"),
     Job("lockstep", "lockstep"),
     Job("hard_cases", "hard_cases"),
+    Job("hard_cases-float32", "hard_cases", "run_float32", x64=False),
 )
 
 
