@@ -103,7 +103,7 @@ def generality(points: list[dict]) -> str:
         for p in points
         if p["times"]
     ]
-    head = ["problem", "equations", "ns per member and step", "ratio", "quartiles"]
+    head = ["problem", "", "ns per member and step", "ratio", "quartiles"]
     return table(head, rows)
 
 
@@ -299,6 +299,7 @@ def tables(points: dict[str, list[dict]]) -> dict[str, str]:
         "many": many,
         "trajectory": trajectory,
         "generality": generality,
+        "checks": generality,
         "gradients": gradients,
         "compile_times": compile_times,
         "scaling": scaling,

@@ -37,6 +37,7 @@ JOBS = (
     Job("many", "many"),
     Job("trajectory", "trajectory"),
     Job("generality", "generality"),
+    Job("checks", "checks"),
     Job("gradients", "gradients"),
     Job("compile_times", "compile_times"),
     Job("scaling", "scaling"),
