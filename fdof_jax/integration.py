@@ -156,6 +156,7 @@ def _integrate(solver, inputs, keywords, derivatives: bool = False) -> Solution:
                 diffrax.SubSaveAt(t1=True, fn=lambda t, y, args: t),
             )
         ),
+        throw=False,
         **keywords | {"stepsize_controller": controller},
     )
     assert solution.ys is not None  # because of saveat

@@ -34,7 +34,10 @@ def solve_options(
     throw: bool = True,
     progress_meter: diffrax.AbstractProgressMeter = diffrax.NoProgressMeter(),
 ) -> tuple[diffrax.AbstractSolver | None, dict[str, Any]]:
-    """The keywords of `simulate`, checked: the solver, and those of diffeqsolve."""
+    """The keywords of `simulate`, checked: the solver, and those of diffeqsolve.
+
+    But for `throw`, which callers see to themselves.
+    """
     if dt0 is not None:
         dt0 = real_array("dt0", dt0, (), above=0)  # an array: new values, no new trace
     if max_steps is not None:
@@ -62,7 +65,6 @@ def solve_options(
         dt0=dt0,
         adjoint=adjoint,
         max_steps=max_steps,
-        throw=throw,
         progress_meter=progress_meter,
     )
 
@@ -137,7 +139,7 @@ def simulate(
         if check is not None and not is_traced(linkage, ts, element):
             check(linkage, ts)
     try:
-        return solve(solver, (linkage, state0, ts, forces), keywords)
+        solution = solve(solver, (linkage, state0, ts, forces), keywords)
     except TypeError as error:
         if "forward-mode" in str(error):
             raise TypeError(
@@ -145,6 +147,25 @@ def simulate(
                 "adjoint=diffrax.ForwardMode()."
             ) from error
         raise
+    return _raised(solution) if throw else solution
+
+
+def _raised(solution: Solution) -> Solution:
+    """The solution, with an error if it failed.
+
+    Where it is known by now, Python raises: a program that calls back to Python to
+    raise is not kept by JAX's compilation cache.
+    """
+    failed = solution.result != diffrax.RESULTS.successful
+    if is_traced(failed):
+        return solution.result.error_if(solution, failed)
+    if failed:
+        raise RuntimeError(
+            f"simulate: {solution.outcome} at t = "
+            f"{float(solution.stats['time_reached']):g} s. "
+            f"{diffrax.RESULTS[solution.result].strip()}"
+        )
+    return solution
 
 
 def joint_efforts(linkage: Linkage, forces: Forces, solution: Solution) -> Efforts:
