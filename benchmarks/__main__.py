@@ -49,7 +49,8 @@ def main() -> None:
     output.mkdir(parents=True, exist_ok=True)
     failed = []
     for job in () if options.render else JOBS:
-        if names and job.name not in names:
+        wanted = job.name in names if names else not job.asked
+        if not wanted:
             continue
         began = time.perf_counter()
         command = [sys.executable, "-m", "benchmarks.worker", job.name]

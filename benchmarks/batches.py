@@ -97,7 +97,7 @@ def first_members(motion: own.Motion, count: int) -> own.Motion:
 def run(quick: bool) -> Iterator[dict]:
     """One core: all contestants, all sizes."""
     sizes = (
-        {1: 10, 64: 20} if quick else {1: 10, 64: 20, 1024: 150, 16384: 40, 131072: 30}
+        {1: 10, 64: 20} if quick else {1: 10, 64: 20, 1024: 80, 16384: 30, 131072: 20}
     )
     for batch, budget in sizes.items():
         problem = fig5_batch(batch)
@@ -106,14 +106,14 @@ def run(quick: bool) -> Iterator[dict]:
 
 def run_xla_flags(quick: bool) -> Iterator[dict]:
     """One core, XLA told to compile faster and to use wide vectors."""
-    for batch, budget in ({64: 10} if quick else {1: 10, 1024: 90}).items():
+    for batch, budget in ({64: 10} if quick else {1: 10, 1024: 50}).items():
         problem = fig5_batch(batch)
         contestants = [row for row in table(batch) if not row[0].startswith("MJX")]
         yield from measure_batch(problem, reference(problem), contestants, budget)
 
 
 def run_two_cores(quick: bool) -> Iterator[dict]:
-    sizes = {64: 10} if quick else {1024: 40, 16384: 40}
+    sizes = {64: 10} if quick else {1024: 25, 16384: 25}
     for batch, budget in sizes.items():
         problem = fig5_batch(batch)
         contestants = [row for row in table(batch) if not row[0].startswith("MJX")]

@@ -77,7 +77,7 @@ def run(quick: bool) -> Iterator[dict]:
     yield from measure(
         PROTOCOL,
         prepared,
-        budget=5 if quick else 60,
+        budget=5 if quick else 30,
         rounds=5,
         ratio_to="fdof_jax",
         problem=problem.name,

@@ -64,7 +64,8 @@ def _scalars(problem: Problem, name: str, revolute: tuple | None, axes) -> Conte
     def member(linkage, state0, step, steps):
         constants = link_constants(linkage, state0.q)
         if revolute is not None:
-            constants = constants._replace(revolute=revolute)
+            slides = ~(revolute[1] | revolute[2])
+            constants = constants._replace(revolute=revolute, slide_on_slide=slides)
         none = zeros(state0.q)
 
         def field(y):

@@ -225,7 +225,8 @@ def _grid(problem: Problem, batch: int) -> list[tuple[float, float, float]]:
         if problem.parameters == SAMPLES:
             # A step across several samples sees few of them, and nothing of the motion
             # tells: the gradient is wrong by tenths unless the steps are bounded.
-            points.append((1.0, TOLERANCE, 1.0 / SAMPLES))
+            bounded = (1.0, TOLERANCE, 1.0 / SAMPLES)
+            points = [*points, bounded] if batch == 1 else [bounded]
         return points
     points = [(HORIZON, TOLERANCE, np.inf)]
     if batch == 1:

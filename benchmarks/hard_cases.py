@@ -22,7 +22,7 @@ import fdof_jax as fj
 
 from .chain import make_rates
 from .hard_scenes import HardScene, hard, motions
-from .measure import Skipped, record
+from .measure import OUTCOMES, Skipped, record
 from .peers import module, symbolic
 
 PROTOCOL = "hard_cases"
@@ -33,10 +33,7 @@ ROUNDS = 3
 
 LONGEST = 20.0  # no run is repeated after this time [s]
 
-# What can come of a scene, best first.
-OUTCOMES = SOLVED, REFUSED, BY_NAME, SILENTLY = (
-    "solved", "refused as asked", "failed by name", "failed silently"
-)  # fmt: skip
+SOLVED, REFUSED, BY_NAME, SILENTLY = OUTCOMES
 
 
 class Refused(Exception):
@@ -61,7 +58,10 @@ def fdof_jax(scene: HardScene) -> Callable[[], Run]:
             controller = fj.PDController(stiffness, damping, np.inf, held)
             forces = (controller, fj.JointEffort(effort))
     steps: Any = diffrax.PIDController(
-        rtol=scene.tolerance, atol=scene.tolerance, dtmin=1e-13, force_dtmin=False
+        rtol=scene.tolerance,
+        atol=scene.tolerance,
+        dtmin=1e-13 if jax.config.jax_enable_x64 else 1e-8,
+        force_dtmin=False,
     )
     if scene.scaled:
         steps = fj.scale_tolerances(scene.linkage, steps)
@@ -398,6 +398,26 @@ def run(quick: bool) -> Iterator[dict]:
             probe, bound = PLAIN[number]
             found = probed(probe, bound)
             yield _record(number, name, "plain diffrax", bound, found)
+
+
+SINGLE = 1e-4, 1e-5, 1e-6  # tolerances
+SINGLE_BOUND = 1e-3  # of errors, where float64 is held to less
+
+
+def run_float32(quick: bool) -> Iterator[dict]:
+    """The motions on fdof_jax in float32: which hold, at which tolerance."""
+    for scene in motions():
+        if quick and scene.number > 3:
+            return
+        bound = max(scene.bound, SINGLE_BOUND)
+        for tolerance in SINGLE:
+            asked = scene._replace(tolerance=tolerance, bound=bound)
+            found = outcome(asked, fdof_jax)
+            yield {
+                **_record(scene.number, scene.name, "fdof_jax", bound, found),
+                "kind": "tolerance",
+                "setting": tolerance,
+            }
 
 
 def _record(number: int, name: str, engine: str, bound: Any, found: dict) -> dict:

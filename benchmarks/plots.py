@@ -6,9 +6,10 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.patches import Patch
 from matplotlib.ticker import NullFormatter
 
-from .measure import times_at
+from .measure import OUTCOMES, times_at
 
 # Okabe and Ito's colours, told apart with any colour vision; markers differ as well.
 COLORS = ("#000000", "#E69F00", "#56B4E9", "#009E73", "#D55E00", "#0072B2", "#CC79A7",
@@ -168,6 +169,34 @@ def drift(points: list[dict], path: Path) -> None:
     _save(figure, path)
 
 
+def hard_cases(points: list[dict], path: Path) -> None:
+    """One cell per scene and engine: what came of it, and error over bound."""
+    rows = list(dict.fromkeys((p["number"], p["problem"]) for p in points))
+    engines = _solvers(points)
+    colors = dict(zip(OUTCOMES, (COLORS[3], COLORS[2], COLORS[1], COLORS[4])))
+    figure = Figure(figsize=(WIDTH, 0.17 * len(rows) + 1), layout="constrained")
+    axis = figure.subplots()
+    for p in points:
+        if p["status"] not in OUTCOMES:
+            continue
+        x, y = engines.index(p["solver"]), rows.index((p["number"], p["problem"]))
+        axis.barh(y, 0.96, left=x - 0.48, height=0.9, color=colors[p["status"]])
+        text = p["status"] if p["status"] != OUTCOMES[0] else ""
+        if p["error"] is not None and p["bound"]:
+            text = f"{p['error'] / p['bound']:.0e} of bound"
+        axis.text(x, y, text, ha="center", va="center", fontsize=6)
+    axis.set_xticks(range(len(engines)), engines, fontsize=8)
+    axis.set_yticks(range(len(rows)), [f"{n}  {name}" for n, name in rows], fontsize=6)
+    axis.xaxis.tick_top()
+    axis.set_xlim(-0.5, len(engines) - 0.5)
+    axis.set_ylim(len(rows) - 0.5, -0.5)
+    axis.tick_params(length=0)
+    axis.spines[:].set_visible(False)
+    handles = [Patch(color=color, label=name) for name, color in colors.items()]
+    figure.legend(handles=handles, loc="outside lower center", ncols=4, fontsize=7)
+    figure.savefig(path, dpi=160)
+
+
 PLOTS = {
     "trajectory": trajectory,
     "batches": batches,
@@ -180,6 +209,7 @@ PLOTS = {
     "generality": generality,
     "gradients": gradients,
     "drift": drift,
+    "hard_cases": hard_cases,
 }
 
 

@@ -67,6 +67,17 @@ def targets(points: dict[str, list[dict]], number: Callable) -> Iterator[tuple]:
                 "≥ 10",
                 "≥ 45",
             )
+    for problem in dict.fromkeys(p["problem"] for p in points.get("checks", ())):
+        yield row(
+            f"{problem}: watched for ill-conditioning over not watched",
+            _ratio_of(
+                points["checks"],
+                {"solver": "watched", "problem": problem},
+                {"solver": "not watched", "problem": problem},
+            ),
+            "≤ 1.03",
+            "",
+        )
     if job := points.get("generality"):
         here = {"problem": "RRR-rk4"}
         arrays = {"solver": "EF as arrays", **here}

@@ -176,7 +176,7 @@ def measure_random(count: int, budget: float) -> Iterator[dict]:
 
 
 def run(quick: bool) -> Iterator[dict]:
-    budget = 5 if quick else 30
+    budget = 5 if quick else 20
     yield from measure_fig5(budget)
     if not quick:
         for problem in (

@@ -24,6 +24,7 @@ class Job(NamedTuple):
     x64: bool = True
     cpu: bool = True
     flags: str = ""  # for XLA
+    asked: bool = False  # whether it runs only if named
 
 
 JOBS = (
@@ -37,12 +38,15 @@ JOBS = (
     Job("many", "many"),
     Job("trajectory", "trajectory"),
     Job("generality", "generality"),
+    Job("checks", "checks"),
     Job("gradients", "gradients"),
     Job("compile_times", "compile_times"),
     Job("scaling", "scaling"),
     Job("drift", "drift"),
     Job("lockstep", "lockstep"),
-    Job("hard_cases", "hard_cases"),
+    # A quarter of an hour, for outcomes more than for times: only when asked for.
+    Job("hard_cases", "hard_cases", asked=True),
+    Job("hard_cases-float32", "hard_cases", "run_float32", x64=False, asked=True),
 )
 
 

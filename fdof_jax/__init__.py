@@ -33,12 +33,8 @@ from .linkage import (
     to_chain as to_chain,
 )
 from .scenes import Scene as Scene
-from .simulation import (
-    Efforts as Efforts,
-    Solution as Solution,
-    joint_efforts as joint_efforts,
-    simulate as simulate,
-)
+from .simulation import joint_efforts as joint_efforts, simulate as simulate
+from .solution import Efforts as Efforts, Solution as Solution
 from .step_control import scale_tolerances as scale_tolerances
 from .sweep import sweep as sweep
 from .tuning import TuneResult as TuneResult, tune as tune

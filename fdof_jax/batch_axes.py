@@ -6,8 +6,8 @@ import equinox as eqx
 import jax
 import numpy as np
 
+from .forces import Forces
 from .linkage import Linkage, State
-from .simulation import Forces
 
 # Dimensions of a single linkage's leaves: one more is a batch axis.
 _LINKAGE_RANKS = dict(

@@ -24,7 +24,7 @@ from .trigonometry import sincos
 from .validation import concrete, real_array, sign
 
 if TYPE_CHECKING:
-    from .simulation import Solution
+    from .solution import Solution
 
 Reference = Callable[[Array, Linkage], tuple[Array, Array]]
 

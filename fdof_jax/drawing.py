@@ -22,7 +22,7 @@ from matplotlib.path import Path
 from numpy.typing import ArrayLike
 
 from .linkage import Linkage, to_chain
-from .simulation import Solution
+from .solution import Solution
 from .validation import real_array
 
 # Okabe and Ito's colours, which the common kinds of colour blindness tell apart.

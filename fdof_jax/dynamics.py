@@ -44,8 +44,9 @@ def inertia_ratios(
 
     **Arguments:** `q` [m or rad].
     """
-    m = equations(link_constants(linkage, q), zeros(q), zeros(q))
-    i11, i22, i33 = inverse_inertia_diagonal(m)
+    constants = link_constants(linkage, q)
+    m = equations(constants, zeros(q), zeros(q))
+    i11, i22, i33 = inverse_inertia_diagonal(constants, m)
     # Divided twice, as a product of zero and infinity is not a number.
     return jnp.stack([1 / i11 / m.m11, 1 / i22 / m.m22, 1 / i33 / m.m33])
 

@@ -26,6 +26,8 @@ from .linkage import Linkage
 from .reduced_equations import Scalars
 from .validation import real_array
 
+Forces = tuple[Any, ...]  # callables (t, q, qd, linkage) -> tau
+
 
 class ScalarElement(eqx.Module):
     """A force element written in scalars, which fuses with the equations of motion.

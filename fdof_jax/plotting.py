@@ -29,8 +29,10 @@ from .drawing import (
     xy,
 )
 from .dynamics import link_energies
+from .forces import Forces
 from .linkage import Linkage
-from .simulation import Forces, Solution, joint_efforts
+from .simulation import joint_efforts
+from .solution import Solution
 
 
 def _time_panels(fig: Figure, ts: np.ndarray, panels: list) -> list[Axes]:

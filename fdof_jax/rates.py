@@ -54,7 +54,7 @@ def _one_loop(function: Callable) -> Callable:
 
 
 def _solver(
-    m: Equations, reciprocal: Callable[[Array], Array]
+    c: Constants, m: Equations, reciprocal: Callable[[Array], Array]
 ) -> tuple[Callable[[Scalars], Scalars], Callable[[], Scalars]]:
     """Solves M x = f, by L^T D L from the tip: the pivots are articulated inertias.
 
@@ -63,7 +63,7 @@ def _solver(
     """
     inverse3 = reciprocal(m.m33)
     l23, l13 = m.m23 * inverse3, m.m13 * inverse3
-    pivot2 = m.m22 - l23 * m.m23
+    pivot2 = jnp.where(c.slide_on_slide, c.slide2, m.m22 - l23 * m.m23)
     inverse2 = reciprocal(pivot2)
     rest12 = m.m12 - l13 * m.m23
     l12 = rest12 * inverse2
@@ -98,7 +98,7 @@ def _rates(
     reciprocal: Callable, c: Constants, delta: Scalars, qd: Scalars, tau: Scalars
 ) -> tuple[Scalars, Scalars]:
     m = equations(c, delta, qd)
-    solve, _ = _solver(m, reciprocal)
+    solve, _ = _solver(c, m, reciprocal)
     # The velocities pass through the loop because XLA would otherwise copy the buffers
     # of a Runge-Kutta method's stages.
     return qd, solve(_subtract(tau, m.bias))
@@ -108,7 +108,7 @@ def _rates_and_conditioning(
     reciprocal: Callable, c: Constants, delta: Scalars, qd: Scalars, tau: Scalars
 ) -> tuple[Scalars, Scalars, Array]:
     m = equations(c, delta, qd)
-    solve, inverse_diagonal = _solver(m, reciprocal)
+    solve, inverse_diagonal = _solver(c, m, reciprocal)
     i11, i22, i33 = inverse_diagonal()
     loss = jnp.maximum(m.m11 * i11, jnp.maximum(m.m22 * i22, m.m33 * i33))
     # An infinite inverse times a mass of zero.
@@ -140,7 +140,7 @@ def _change(
     From the inverse dynamics: no derivative goes through the solution of the equations.
     """
     m = equations(c, delta, qd)
-    solve, _ = _solver(m, reciprocal)
+    solve, _ = _solver(c, m, reciprocal)
     qdd = solve(_subtract(tau, m.bias))
     _, change = jax.jvp(lambda *y: _efforts(c, *y, qdd), (delta, qd), direction)
     x1, x2, x3 = solve(change)
@@ -149,7 +149,7 @@ def _change(
 
 def _inverse_inertia(reciprocal: Callable, c: Constants, delta: Scalars) -> Matrix:
     zero, one = jnp.zeros_like(delta[0]), jnp.ones_like(delta[0])
-    solve, _ = _solver(equations(c, delta, (zero, zero, zero)), reciprocal)
+    solve, _ = _solver(c, equations(c, delta, (zero, zero, zero)), reciprocal)
     unit = (one, zero, zero), (zero, one, zero), (zero, zero, one)
     return solve(unit[0]), solve(unit[1]), solve(unit[2])
 
@@ -251,7 +251,7 @@ def _rates_and_conditioning_jvp(primals, tangents):
     return (values, loss), (change, jnp.zeros_like(loss))
 
 
-def inverse_inertia_diagonal(m: Equations) -> Scalars:
+def inverse_inertia_diagonal(c: Constants, m: Equations) -> Scalars:
     """The diagonal of the inverse mass matrix; infinite where there is none."""
-    _, inverse_diagonal = _solver(m, _divided)
+    _, inverse_diagonal = _solver(c, m, _divided)
     return inverse_diagonal()

@@ -29,7 +29,10 @@ class Constants(NamedTuple):
     `e_n` and `b_n` are the directions of the links and the slides at the reference
     configuration; `m34` = m3 + m4 and so on; `(s_n, t_n)` the first moment of link n,
     with the mass beyond it hung at the end of its vector A_n, along and across the link
-    [kg m]; `j_n` second moments about the start of link n [kg m^2].
+    [kg m]; `j_n` second moments about the start of link n [kg m^2], `j34` = j3 + j4.
+    `slide_on_slide`: whether the last two joints are prismatic, and `slide2` [kg] what
+    the first of them then feels while the other is free: m3 + m4 sin^2 of the angle
+    between them, where m34 - m4 cos^2 would cancel if that is small.
     """
 
     revolute: Scalars
@@ -52,8 +55,10 @@ class Constants(NamedTuple):
     s4: Array
     t4: Array
     j2: Array
-    j3: Array
+    j34: Array
     j4: Array
+    slide_on_slide: Array
+    slide2: Array
 
 
 def link_constants(
@@ -67,8 +72,8 @@ def link_constants(
     directions are known: the sum of large ones is rounded.
     """
     x, _ = to_chain(linkage, q, jnp.zeros_like(q))
-    revolute = jnp.stack(real_joints(linkage.ef))
-    turns = jnp.where(revolute, q, linkage.locked)
+    r1, r2, r3 = real_joints(linkage.ef)
+    turns = jnp.where(jnp.stack([r1, r2, r3]), q, linkage.locked)
     sin, cos = sincos(jnp.concatenate([linkage.base_angle[None], turns]))
     e1, *turned = zip(cos, sin)
     e2 = _in_frame(*turned[0], e1)
@@ -80,14 +85,15 @@ def link_constants(
     j2, j3, j4 = linkage.inertia + linkage.mass * jnp.sum(linkage.com**2, axis=1)
     m34 = m3 + m4
     return Constants(
-        revolute=real_joints(linkage.ef),
+        revolute=(r1, r2, r3),
         e1=e1, e2=e2, e3=e3, e4=e4,
         b2=x[2], b3=x[4],
         gravity=linkage.gravity,
         m4=m4, m34=m34, m234=m2 + m34,
         a2=a2, a3=a3,
         s2=s2 + m34 * a2, t2=t2, s3=s3 + m4 * a3, t3=t3, s4=s4, t4=t4,
-        j2=j2 + m34 * a2**2, j3=j3 + m4 * a3**2, j4=j4,
+        j2=j2 + m34 * a2**2, j34=j3 + m4 * a3**2 + j4, j4=j4,
+        slide_on_slide=~(r2 | r3), slide2=m3 + m4 * turned[1][1] ** 2,
     )  # fmt: skip
 
 
@@ -158,7 +164,7 @@ def equations(c: Constants, delta: Scalars, qd: Scalars) -> Equations:
     c3 = _add(u3, u4)
     c2 = _add(u2, c3)
     # Second moments of everything beyond a joint, about that joint.
-    k3 = c.j3 + c.m4 * b3 * b3 + 2 * _dot(d3, u4) + c.j4
+    k3 = c.j34 + c.m4 * b3 * b3 + 2 * _dot(d3, u4)
     k2 = c.j2 + c.m34 * b2 * b2 + 2 * _dot(d2, c3) + k3
 
     # Momentum (linear, and angular about the joint) of what lies beyond a joint that

@@ -6,9 +6,8 @@ import numpy as np
 from jax import Array
 
 from .control import CircleTask, PDController
-from .forces import JointDamper
+from .forces import Forces, JointDamper
 from .linkage import Linkage, State, from_chain
-from .simulation import Forces
 
 
 class Scene(NamedTuple):

@@ -19,7 +19,8 @@ from .control import saturated, tip_deviation
 from .forces import JointDamper
 from .linkage import TOPOLOGIES, Linkage, State, from_chain
 from .scenes import Scene
-from .simulation import Solution, simulate
+from .simulation import simulate
+from .solution import Solution
 from .tuning import TuneResult, tune
 
 _SAMPLE = 0.01  # output times [s]

@@ -1,27 +1,19 @@
-"""Simulation: the vector field and its integration by diffrax."""
+"""Simulation: motions of a linkage, and the efforts along them."""
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
-from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from .forces import ScalarElement
-from .linkage import Linkage, State, check_linkage, possible
-from .rates import rates, rates_and_conditioning
-from .reduced_equations import (
-    Constants,
-    Scalars,
-    link_constants,
-    zeros,
-)
-from .step_control import bounded, default_controller, landing_on, within_reach
-from .unrolled_dopri8 import ScheduledTerm, UnrolledDopri8
+from .forces import Forces
+from .integration import element_effort, solve
+from .linkage import Linkage, State, check_linkage
+from .solution import Efforts, Solution
+from .step_control import within_reach
 from .validation import (
     callable_tuple,
     concrete,
@@ -30,264 +22,6 @@ from .validation import (
     real_array,
     whole_number,
 )
-
-Forces = tuple[Any, ...]  # callables (t, q, qd, linkage) -> tau
-
-# Steps over the time scale of a mode that keep its tangents to 1e-7 over 10 s: those of
-# methods of order 8, and of lower ones down to 5.
-_OF_TIME_SCALE = 0.7, 0.1
-
-# With inertia ratios below this the accelerations are right to six digits (float64) or
-# two at best, and adaptive steps are chosen by rounding.
-_LEAST_INERTIA_RATIO = {np.dtype("float64"): 1e-9, np.dtype("float32"): 1e-5}
-
-
-class Solution(eqx.Module):
-    """A simulated motion.
-
-    - `ts`: output times [s].
-    - `q`, `qd`: joint positions [m or rad] and velocities at `ts`. NaN after a solve
-      that failed.
-    - `stats`: diffrax's statistics, `num_steps` among them, and `time_reached` [s].
-    - `result`: diffrax's result, one per trajectory; `diffrax.RESULTS.successful` or
-      the reason of the failure, which `outcome` says in a word or two.
-    """
-
-    ts: Float[Array, " time"]
-    q: Float[Array, "time joint"]
-    qd: Float[Array, "time joint"]
-    stats: dict[str, Any]
-    result: diffrax.RESULTS
-
-    @property
-    def outcome(self) -> np.ndarray:
-        """How each trajectory ended, in words, in the shape of the batch.
-
-        `"successful"`; `"ill-conditioned"`: the mass matrix is singular or nearly so
-        (see `inertia_ratios`); `"not finite"`: the accelerations are not; `"out of
-        steps"`; `"tolerance out of reach"`: rounding keeps even the shortest step from
-        it; or `"solver failed"`.
-        """
-        results: Any = diffrax.RESULTS
-        words = {
-            "successful": results.successful,
-            "ill-conditioned": results.singular,
-            "not finite": results.nonfinite,
-            "out of steps": results.max_steps_reached,
-            "tolerance out of reach": results.dt_min_reached,
-        }
-        return np.select(
-            [np.asarray(self.result == result) for result in words.values()],
-            list(words),
-            default="solver failed",
-        )
-
-
-class Efforts(NamedTuple):
-    """Joint efforts along a motion [N or N m].
-
-    - `total`: their sum (time, 3).
-    - `elements`: those of each force element (element, time, 3).
-    """
-
-    total: Float[Array, "time joint"]
-    elements: Float[Array, "element time joint"]
-
-
-class _Args(NamedTuple):
-    linkage: Linkage
-    q0: Array
-    constants: Constants
-    forces: Forces
-
-
-def _schedule(t: Array, args: _Args) -> tuple[Any, ...]:
-    """What the force elements take from time alone, or the time."""
-    return tuple(
-        element.schedule(t, args.linkage) if isinstance(element, ScalarElement) else t
-        for element in args.forces
-    )
-
-
-def _applied(
-    t: Any, y: tuple[Scalars, Scalars], args: _Args, schedule: tuple[Any, ...]
-) -> Scalars:
-    """The efforts of the force elements; arrays only for those written in them."""
-    delta, qd = y
-    tau = None
-    for index, (element, scheduled) in enumerate(zip(args.forces, schedule)):
-        if isinstance(element, ScalarElement):
-            q = tuple(a + b for a, b in zip(args.q0, delta))
-            effort = element.respond(scheduled, q, qd, args.linkage)
-        else:
-            q, rate = args.q0 + jnp.stack(delta), jnp.stack(qd)
-            effort = element_effort(index, element, t, q, rate, args.linkage)
-        tau = effort if tau is None else tuple(a + b for a, b in zip(tau, effort))
-    return zeros(args.q0) if tau is None else tuple(tau)
-
-
-def _vector_field(t, y, args, schedule) -> tuple[Scalars, Scalars]:
-    """Rates of six scalars; the positions are displacements from the start."""
-    delta, qd = y
-    return rates(args.constants, delta, qd, _applied(t, y, args, schedule))
-
-
-def _watched_field(t, y, args, schedule) -> tuple[tuple[Scalars, Scalars], Array]:
-    """The same, and the health of the accelerations: see `ScheduledTerm`."""
-    tau = _applied(t, y, args, schedule)
-    delta, qd = y
-    (qd, qdd), loss = rates_and_conditioning(args.constants, delta, qd, tau)
-    finite = jnp.isfinite(qdd[0] + qdd[1] + qdd[2])
-    health = jnp.where(loss * _LEAST_INERTIA_RATIO[loss.dtype] > 1, 0, loss)
-    # A singular matrix makes accelerations that are not finite.
-    return (qd, qdd), jnp.where(finite | (health == 0), health, jnp.nan)
-
-
-@eqx.filter_jit  # traced once, not at each use by a solver
-def element_effort(
-    index: int, element: Any, t: Array, q: Array, qd: Array, linkage: Linkage
-) -> Array:
-    """What one force element returns, refused unless it is three real numbers."""
-    tau = element(t, q, qd, linkage)
-    try:
-        tau = jnp.asarray(tau)
-    except (TypeError, ValueError) as error:
-        raise ValueError(
-            f"forces[{index}]: expected it to return tau, an array of 3 real numbers, "
-            f"got {tau!r}."
-        ) from error
-    if tau.shape != (3,) or tau.dtype.kind not in "iuf":
-        raise ValueError(
-            f"forces[{index}]: expected it to return tau, an array of 3 real numbers, "
-            f"got shape {tau.shape} and dtype {tau.dtype}."
-        )
-    return tau.astype(q.dtype)
-
-
-def _step_for_tangents(t0: Array, args: _Args, fraction: float) -> Array:
-    """A step short enough for derivatives [s], where the motion would allow more.
-
-    A fraction of the time scale 1/omega of the fastest mode about the start: a step's
-    length is chosen by the error of the motion alone, and an arm that hangs at rest has
-    none. The trace of the squared linearisation bounds omega^2 free of units.
-    """
-    still = zeros(args.q0)
-    scheduled = _schedule(t0, args)
-
-    def accelerations(delta):
-        return jnp.stack(_vector_field(t0, (tuple(delta), still), args, scheduled)[1])
-
-    linearised = jax.jacfwd(accelerations)(jnp.zeros_like(args.q0))
-    omega2 = jnp.sqrt(jnp.abs(jnp.sum(linearised * linearised.T)))
-    step = fraction / jnp.sqrt(omega2)
-    return jax.lax.stop_gradient(jnp.where(step > 0, step, jnp.inf))
-
-
-def _integrate(solver, inputs, keywords, derivatives: bool = False) -> Solution:
-    """`derivatives`: whether they are wanted, to the accuracy of the default steps."""
-    linkage, state0, asked, forces = inputs
-    # What no door has seen is told by the result: rates of NaN at the start. diffrax
-    # raises where times do not increase, and never ends where the state is NaN.
-    increasing = (jnp.diff(asked) > 0).all()
-    ts = jnp.where(increasing, asked, jnp.arange(len(asked), dtype=asked.dtype))
-    finite = jnp.isfinite(state0.qd)
-    valid = possible(linkage) & increasing & finite.all()
-    for element in forces:
-        if hasattr(element, "possible"):
-            valid = valid & element.possible()
-    qd0 = jnp.where(finite, state0.qd, 0)
-    # Once per solve: the start may be any number of turns away.
-    constants = link_constants(linkage, state0.q, lambda x: (jnp.sin(x), jnp.cos(x)))
-    gravity = jnp.where(valid, constants.gravity, jnp.nan)
-    args = _Args(linkage, state0.q, constants._replace(gravity=gravity), forces)
-    term = ScheduledTerm(_vector_field, _watched_field, _schedule)
-    controller = keywords["stepsize_controller"]
-    if controller is None:
-        controller = default_controller()
-        if derivatives:
-            fraction = _OF_TIME_SCALE[0 if solver.order(term) >= 8 else 1]
-            controller = bounded(controller, _step_for_tangents(ts[0], args, fraction))
-    jumps = [f.jump_ts for f in forces if getattr(f, "jump_ts", None) is not None]
-    if jumps:
-        times = jnp.concatenate([jnp.asarray(j, ts.dtype) for j in jumps])
-        controller = landing_on(controller, times)
-    solution = diffrax.diffeqsolve(
-        term,
-        solver,
-        t0=ts[0],
-        t1=ts[-1],
-        y0=(zeros(state0.q), tuple(qd0)),
-        args=args,
-        saveat=diffrax.SaveAt(
-            subs=(
-                diffrax.SubSaveAt(ts=ts),
-                diffrax.SubSaveAt(t1=True, fn=lambda t, y, args: t),
-            )
-        ),
-        **keywords | {"stepsize_controller": controller},
-    )
-    assert solution.ys is not None  # because of saveat
-    motion, (reached,) = solution.ys
-    delta, qd = (jnp.stack(rows, axis=-1) for rows in motion)
-    q = state0.q[None] + delta
-    # diffrax saves the start with the first step, and leaves infinity where it has not
-    # come to save.
-    q, qd = q.at[0].set(state0.q), qd.at[0].set(state0.qd)
-    q, qd = (jnp.where(jnp.isinf(a), jnp.nan, a) for a in (q, qd))
-    stats = solution.stats | {"time_reached": reached}
-    return Solution(asked, q, qd, stats, solution.result)
-
-
-@eqx.filter_custom_vjp
-def _integrate_reversibly(inputs, solver, keywords) -> Solution:
-    """A motion whose derivatives are taken in reverse mode, if any are.
-
-    The default solver's unrolled stages are not for that. The replay has to come to
-    the same bits: next to a saturation another rounding leads to other steps, and to a
-    wrong gradient. Unrolled stages are compiled differently with derivatives and
-    without; diffrax's loop over the stages is not.
-    """
-    # Nothing is differentiated here, and loops made for that take longer to compile.
-    keywords = keywords | {"adjoint": diffrax.ForwardMode()}
-    return _integrate(solver or UnrolledDopri8(), inputs, keywords)
-
-
-@_integrate_reversibly.def_fwd
-def _integrate_reversibly_fwd(perturbed, inputs, solver, keywords):
-    moving, fixed = eqx.partition(inputs, perturbed)
-
-    def motion(moving):
-        inputs = eqx.combine(moving, fixed)
-        solution = _integrate(
-            solver or diffrax.Dopri8(), inputs, keywords, derivatives=True
-        )
-        return (solution.q, solution.qd), solution
-
-    states, pull_back, solution = eqx.filter_vjp(motion, moving, has_aux=True)
-    return solution, (pull_back, states)
-
-
-@_integrate_reversibly.def_bwd
-def _integrate_reversibly_bwd(
-    residuals, cotangent, perturbed, inputs, solver, keywords
-):
-    pull_back, states = residuals
-    wanted = eqx.combine(
-        (cotangent.q, cotangent.qd), jax.tree.map(jnp.zeros_like, states)
-    )
-    (gradient,) = pull_back(wanted)
-    return gradient
-
-
-@eqx.filter_jit
-def _solve(solver, inputs, keywords) -> Solution:
-    adjoint = keywords["adjoint"]
-    if isinstance(adjoint, diffrax.RecursiveCheckpointAdjoint):
-        return _integrate_reversibly(inputs, solver, keywords)
-    if solver is None:
-        forward = isinstance(adjoint, diffrax.ForwardMode)
-        solver = UnrolledDopri8() if forward else diffrax.Dopri8()
-    return _integrate(solver, inputs, keywords, derivatives=True)
 
 
 def solve_options(
@@ -300,7 +34,10 @@ def solve_options(
     throw: bool = True,
     progress_meter: diffrax.AbstractProgressMeter = diffrax.NoProgressMeter(),
 ) -> tuple[diffrax.AbstractSolver | None, dict[str, Any]]:
-    """The keywords of `simulate`, checked: the solver, and those of diffeqsolve."""
+    """The keywords of `simulate`, checked: the solver, and those of diffeqsolve.
+
+    But for `throw`, which callers see to themselves.
+    """
     if dt0 is not None:
         dt0 = real_array("dt0", dt0, (), above=0)  # an array: new values, no new trace
     if max_steps is not None:
@@ -328,7 +65,6 @@ def solve_options(
         dt0=dt0,
         adjoint=adjoint,
         max_steps=max_steps,
-        throw=throw,
         progress_meter=progress_meter,
     )
 
@@ -403,7 +139,7 @@ def simulate(
         if check is not None and not is_traced(linkage, ts, element):
             check(linkage, ts)
     try:
-        return _solve(solver, (linkage, state0, ts, forces), keywords)
+        solution = solve(solver, (linkage, state0, ts, forces), keywords)
     except TypeError as error:
         if "forward-mode" in str(error):
             raise TypeError(
@@ -411,6 +147,25 @@ def simulate(
                 "adjoint=diffrax.ForwardMode()."
             ) from error
         raise
+    return _raised(solution) if throw else solution
+
+
+def _raised(solution: Solution) -> Solution:
+    """The solution, with an error if it failed.
+
+    Where it is known by now, Python raises: a program that calls back to Python to
+    raise is not kept by JAX's compilation cache.
+    """
+    failed = solution.result != diffrax.RESULTS.successful
+    if is_traced(failed):
+        return solution.result.error_if(solution, failed)
+    if failed:
+        raise RuntimeError(
+            f"simulate: {solution.outcome} at t = "
+            f"{float(solution.stats['time_reached']):g} s. "
+            f"{diffrax.RESULTS[solution.result].strip()}"
+        )
+    return solution
 
 
 def joint_efforts(linkage: Linkage, forces: Forces, solution: Solution) -> Efforts:

@@ -23,14 +23,11 @@ from numpy.typing import ArrayLike
 
 from .batch_axes import Batch, batch_of
 from .dynamics import forward_dynamics
+from .forces import Forces
+from .integration import element_effort
 from .linkage import Linkage, State, real_joints
-from .simulation import (
-    Forces,
-    Solution,
-    element_effort,
-    simulate,
-    solve_options,
-)
+from .simulation import simulate, solve_options
+from .solution import Solution
 from .step_control import Limited, default_controller
 from .validation import (
     callable_tuple,

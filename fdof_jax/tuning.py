@@ -17,7 +17,8 @@ from numpy.typing import ArrayLike
 from .control import PDController, saturated, tip_deviation
 from .linkage import check_linkage
 from .scenes import Scene
-from .simulation import Solution, simulate
+from .simulation import simulate
+from .solution import Solution
 from .step_control import adaptive
 from .validation import callable_tuple, instance, one_of, real_array, whole_number
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import pytest
 
 import fdof_jax as fj
-from fdof_jax import scenes, simulation
+from fdof_jax import integration, scenes
 from fdof_jax.rates import rates
 from fdof_jax.reduced_equations import link_constants, zeros
 
@@ -25,12 +25,12 @@ def transcendentals(function, *arguments):
 def field_arguments(forces):
     linkage = scenes.fig7().linkage
     q = jnp.array([0.3, 2.0, -0.4])
-    args = simulation._Args(linkage, q, link_constants(linkage, q), forces)
+    args = integration._Args(linkage, q, link_constants(linkage, q), forces)
     return jnp.array(0.1), (zeros(q), tuple(q)), args
 
 
 def field(t, y, args):
-    return simulation._vector_field(t, y, args, simulation._schedule(t, args))
+    return integration._vector_field(t, y, args, integration._schedule(t, args))
 
 
 def field_flops(*forces):

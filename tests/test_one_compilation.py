@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import fdof_jax as fj
-from fdof_jax import simulation
+from fdof_jax import integration
 
 TS = np.linspace(0, 0.5, 6)
 # A common start and links for which all topologies reach a small circle.
@@ -89,13 +89,13 @@ def test_one_trace_and_batch_equals_singles(kind):
 def test_one_trace_of_the_plain_call(kind, monkeypatch):
     """Called as a user does, without jit of their own, at adaptive steps."""
     calls = []
-    original = simulation._vector_field
+    original = integration._vector_field
 
     def counted(*arguments):
         calls.append(1)
         return original(*arguments)
 
-    monkeypatch.setattr(simulation, "_vector_field", counted)
+    monkeypatch.setattr(integration, "_vector_field", counted)
     traced = []
     for linkage, state, forces in members(kind):
         # A number of output times that no other test has: the first call compiles.

@@ -1,0 +1,61 @@
+"""What a simulation returns."""
+
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import numpy as np
+from jax import Array
+from jaxtyping import Float
+
+
+class Solution(eqx.Module):
+    """A simulated motion.
+
+    - `ts`: output times [s].
+    - `q`, `qd`: joint positions [m or rad] and velocities at `ts`. NaN after a solve
+      that failed.
+    - `stats`: diffrax's statistics, `num_steps` among them, and `time_reached` [s].
+    - `result`: diffrax's result, one per trajectory; `diffrax.RESULTS.successful` or
+      the reason of the failure, which `outcome` says in a word or two.
+    """
+
+    ts: Float[Array, " time"]
+    q: Float[Array, "time joint"]
+    qd: Float[Array, "time joint"]
+    stats: dict[str, Any]
+    result: diffrax.RESULTS
+
+    @property
+    def outcome(self) -> np.ndarray:
+        """How each trajectory ended, in words, in the shape of the batch.
+
+        `"successful"`; `"ill-conditioned"`: the mass matrix is singular or nearly so
+        (see `inertia_ratios`); `"not finite"`: the accelerations are not; `"out of
+        steps"`; `"tolerance out of reach"`: rounding keeps even the shortest step from
+        it; or `"solver failed"`.
+        """
+        results: Any = diffrax.RESULTS
+        words = {
+            "successful": results.successful,
+            "ill-conditioned": results.singular,
+            "not finite": results.nonfinite,
+            "out of steps": results.max_steps_reached,
+            "tolerance out of reach": results.dt_min_reached,
+        }
+        return np.select(
+            [np.asarray(self.result == result) for result in words.values()],
+            list(words),
+            default="solver failed",
+        )
+
+
+class Efforts(NamedTuple):
+    """Joint efforts along a motion [N or N m].
+
+    - `total`: their sum (time, 3).
+    - `elements`: those of each force element (element, time, 3).
+    """
+
+    total: Float[Array, "time joint"]
+    elements: Float[Array, "element time joint"]
