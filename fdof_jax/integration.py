@@ -14,7 +14,7 @@ from .linkage import Linkage, possible
 from .rates import rates, rates_and_conditioning
 from .reduced_equations import Constants, Scalars, link_constants, zeros
 from .solution import Solution
-from .step_control import bounded, default_controller, landing_on
+from .step_control import Watched, bounded, default_controller, landing_on
 from .unrolled_dopri8 import ScheduledTerm, UnrolledDopri8
 
 # Steps over the time scale of a mode that keep its tangents to 1e-7 over 10 s: those of
@@ -75,6 +75,11 @@ def _watched_field(t, y, args, schedule) -> tuple[tuple[Scalars, Scalars], Array
     return (qd, qdd), jnp.where(finite | (health == 0), health, jnp.nan)
 
 
+def _health(t, y, args) -> Array:
+    _, health = _watched_field(t, y, args, _schedule(t, args))
+    return health
+
+
 @eqx.filter_jit  # traced once, not at each use by a solver
 def element_effort(
     index: int, element: Any, t: Array, q: Array, qd: Array, linkage: Linkage
@@ -118,37 +123,41 @@ def _step_for_tangents(t0: Array, args: _Args, fraction: float) -> Array:
 def _integrate(solver, inputs, keywords, derivatives: bool = False) -> Solution:
     """`derivatives`: whether they are wanted, to the accuracy of the default steps."""
     linkage, state0, asked, forces = inputs
-    # What no door has seen is told by the result: rates of NaN at the start. diffrax
-    # raises where times do not increase, and never ends where the state is NaN.
+    # What no door has seen is told by the result. Something harmless is integrated in
+    # its place: derivatives of NaN would spoil those in what is shared with others.
     increasing = (jnp.diff(asked) > 0).all()
-    ts = jnp.where(increasing, asked, jnp.arange(len(asked), dtype=asked.dtype))
-    finite = jnp.isfinite(state0.qd)
-    valid = possible(linkage) & increasing & finite.all()
+    harmless = 1e-3 * jnp.arange(len(asked), dtype=asked.dtype)
+    ts = jnp.where(increasing, asked, harmless)
+    finite = (jnp.isfinite(state0.q) & jnp.isfinite(state0.qd)).all()
+    valid = possible(linkage) & increasing & finite
     for element in forces:
         if hasattr(element, "possible"):
             valid = valid & element.possible()
-    qd0 = jnp.where(finite, state0.qd, 0)
+    q0, qd0 = (jnp.where(finite, a, 0) for a in state0)
     # Once per solve: the start may be any number of turns away.
-    constants = link_constants(linkage, state0.q, lambda x: (jnp.sin(x), jnp.cos(x)))
-    gravity = jnp.where(valid, constants.gravity, jnp.nan)
-    args = _Args(linkage, state0.q, constants._replace(gravity=gravity), forces)
+    constants = link_constants(linkage, q0, lambda x: (jnp.sin(x), jnp.cos(x)))
+    args = _Args(linkage, q0, constants, forces)
     term = ScheduledTerm(_vector_field, _watched_field, _schedule)
     controller = keywords["stepsize_controller"]
     if controller is None:
         controller = default_controller()
-        if derivatives:
-            fraction = _OF_TIME_SCALE[0 if solver.order(term) >= 8 else 1]
-            controller = bounded(controller, _step_for_tangents(ts[0], args, fraction))
+    if derivatives:
+        fraction = _OF_TIME_SCALE[0 if (solver.order(term) or 0) >= 8 else 1]
+        longest = lambda: _step_for_tangents(ts[0], args, fraction)
+        controller = bounded(controller, longest)
     jumps = [f.jump_ts for f in forces if getattr(f, "jump_ts", None) is not None]
     if jumps:
         times = jnp.concatenate([jnp.asarray(j, ts.dtype) for j in jumps])
         controller = landing_on(controller, times)
+    adaptive = isinstance(controller, diffrax.AbstractAdaptiveStepSizeController)
+    if adaptive and not isinstance(solver, UnrolledDopri8):
+        controller = Watched(controller, _health)  # pyright: ignore[reportCallIssue]
     solution = diffrax.diffeqsolve(
         term,
         solver,
         t0=ts[0],
         t1=ts[-1],
-        y0=(zeros(state0.q), tuple(qd0)),
+        y0=(zeros(q0), tuple(qd0)),
         args=args,
         saveat=diffrax.SaveAt(
             subs=(
@@ -156,19 +165,20 @@ def _integrate(solver, inputs, keywords, derivatives: bool = False) -> Solution:
                 diffrax.SubSaveAt(t1=True, fn=lambda t, y, args: t),
             )
         ),
-        throw=False,
         **keywords | {"stepsize_controller": controller},
     )
     assert solution.ys is not None  # because of saveat
     motion, (reached,) = solution.ys
     delta, qd = (jnp.stack(rows, axis=-1) for rows in motion)
-    q = state0.q[None] + delta
+    q = q0[None] + delta
     # diffrax saves the start with the first step, and leaves infinity where it has not
     # come to save.
+    q, qd = (jnp.where(jnp.isinf(a) | ~valid, jnp.nan, a) for a in (q, qd))
     q, qd = q.at[0].set(state0.q), qd.at[0].set(state0.qd)
-    q, qd = (jnp.where(jnp.isinf(a), jnp.nan, a) for a in (q, qd))
-    stats = solution.stats | {"time_reached": reached}
-    return Solution(asked, q, qd, stats, solution.result)
+    reached = jnp.where(valid, reached, asked[0])
+    results: Any = diffrax.RESULTS
+    result = results.where(valid, solution.result, results.nonfinite)
+    return Solution(asked, q, qd, solution.stats | {"time_reached": reached}, result)
 
 
 @eqx.filter_custom_vjp

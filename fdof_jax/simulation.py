@@ -138,8 +138,12 @@ def simulate(
         check = getattr(element, "check", None)
         if check is not None and not is_traced(linkage, ts, element):
             check(linkage, ts)
+    inputs = linkage, state0, ts, forces
+    # A program that calls back to Python to raise is not kept by JAX's compilation
+    # cache: where values are known in the end, that is where errors are raised.
+    inside = is_traced(inputs, jnp.zeros(()))
     try:
-        solution = solve(solver, (linkage, state0, ts, forces), keywords)
+        solution = solve(solver, inputs, keywords | {"throw": throw and inside})
     except TypeError as error:
         if "forward-mode" in str(error):
             raise TypeError(
@@ -147,17 +151,15 @@ def simulate(
                 "adjoint=diffrax.ForwardMode()."
             ) from error
         raise
-    return _raised(solution) if throw else solution
+    # Of the times themselves, for derivatives in them.
+    solution = eqx.tree_at(lambda s: s.ts, solution, ts)
+    return solution if inside or not throw else _raised(solution)
 
 
 def _raised(solution: Solution) -> Solution:
-    """The solution, with an error if it failed.
-
-    Where it is known by now, Python raises: a program that calls back to Python to
-    raise is not kept by JAX's compilation cache.
-    """
+    """The solution, with an error if it failed."""
     failed = solution.result != diffrax.RESULTS.successful
-    if is_traced(failed):
+    if is_traced(failed):  # by a force element that holds a traced value
         return solution.result.error_if(solution, failed)
     if failed:
         raise RuntimeError(

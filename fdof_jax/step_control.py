@@ -3,6 +3,7 @@
 Around diffrax's step-size controllers, which do the rest.
 """
 
+import dataclasses
 import warnings
 from collections.abc import Callable
 from typing import Any
@@ -14,7 +15,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from .linkage import Linkage, State, check_linkage, real_joints
-from .validation import instance, is_traced, real_array
+from .unrolled_dopri8 import SHORTEST
+from .validation import concrete, instance, is_traced, real_array
 
 # Float32 meets no tighter relative or absolute tolerance: it fights its own rounding.
 _TIGHTEST_SINGLE = 1e-6
@@ -28,9 +30,13 @@ def adaptive(double: float, single: float) -> diffrax.PIDController:
     return diffrax.PIDController(
         rtol=tolerance,
         atol=tolerance,
-        dtmin=1e-13 if x64 else 1e-8,
+        dtmin=_shortest_step(),
         force_dtmin=False,
     )
+
+
+def _shortest_step() -> float:
+    return 1e-13 if jnp.result_type(float) == jnp.float64 else 1e-8
 
 
 def default_controller() -> diffrax.PIDController:
@@ -52,33 +58,43 @@ def _with_pid(change: Callable[[diffrax.PIDController], Any], controller: Any) -
 def within_reach(
     controller: diffrax.AbstractStepSizeController,
 ) -> diffrax.AbstractStepSizeController:
-    """The controller, in float32 with tolerances that can be met, and a warning."""
-    if jnp.result_type(float) != jnp.float32:
-        return controller
+    """The controller, with a shortest step, at which solves that cannot go on end.
 
-    def loosened(pid: diffrax.PIDController) -> diffrax.PIDController:
-        return eqx.tree_at(
-            lambda p: (p.rtol, p.atol),
-            pid,
-            (met(pid.rtol, "rtol"), met(pid.atol, "atol")),
-        )
+    In float32 with tolerances that can be met, and a warning.
+    """
+    x64 = jnp.result_type(float) == jnp.float64
+
+    def mended(pid: diffrax.PIDController) -> diffrax.PIDController:
+        if pid.dtmin is None:
+            pid = dataclasses.replace(pid, dtmin=_shortest_step(), force_dtmin=False)
+        if x64:
+            return pid
+        tolerances = met(pid.rtol, "rtol"), met(pid.atol, "atol")
+        return eqx.tree_at(lambda p: (p.rtol, p.atol), pid, tolerances)
 
     def met(tolerance: Any, name: str) -> Any:
-        if not isinstance(tolerance, float) or tolerance >= _TIGHTEST_SINGLE / 2:
+        known = concrete(tolerance)
+        if known is None or known >= _TIGHTEST_SINGLE / 2:
             return tolerance
         warnings.warn(
-            f"stepsize_controller: {name}={tolerance:g} cannot be met in float32, "
+            f"stepsize_controller: {name}={known:g} cannot be met in float32, "
             f"{_TIGHTEST_SINGLE:g} is used; switch on jax_enable_x64 for more.",
             stacklevel=7,
         )
         return _TIGHTEST_SINGLE
 
-    return _with_pid(loosened, controller)
+    return _with_pid(mended, controller)
 
 
-def bounded(controller: diffrax.PIDController, longest: Array) -> diffrax.PIDController:
-    """The controller with a longest step."""
-    return eqx.tree_at(lambda c: c.dtmax, controller, longest, is_leaf=_is_none)
+def bounded(controller: Any, longest: Callable[[], Array]) -> Any:
+    """The controller with a longest step, unless it has one."""
+
+    def limited(pid: diffrax.PIDController) -> diffrax.PIDController:
+        if pid.dtmax is not None:
+            return pid
+        return eqx.tree_at(lambda c: c.dtmax, pid, longest(), is_leaf=_is_none)
+
+    return _with_pid(limited, controller)
 
 
 def _is_none(node: Any) -> bool:
@@ -93,7 +109,7 @@ def landing_on(
     Raises ValueError for a controller whose steps are not adaptive.
     """
     if isinstance(controller, Limited):
-        return Limited(landing_on(controller.controller, jump_ts), controller.limit)
+        return limited(landing_on(controller.controller, jump_ts), controller.limit)
     if not isinstance(controller, diffrax.AbstractAdaptiveStepSizeController):
         raise ValueError(
             "stepsize_controller: expected an adaptive one, as forces declare times "
@@ -110,6 +126,64 @@ class _Wrapped(diffrax.AbstractStepSizeController):
     def wrap(self, direction):
         inner = self.controller.wrap(direction)
         return eqx.tree_at(lambda c: c.controller, self, inner)
+
+
+class _Adaptive(_Wrapped, diffrax.AbstractAdaptiveStepSizeController):
+    """A wrapper of an adaptive one, where an implicit solver looks for tolerances."""
+
+    # pyright takes what the base class wants for arguments of the constructor.
+    @property
+    def rtol(self):  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.controller.rtol
+
+    @property
+    def atol(self):  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.controller.atol
+
+    @property
+    def norm(self):  # pyright: ignore[reportIncompatibleMethodOverride]
+        return self.controller.norm
+
+
+class Watched(_Adaptive):
+    """A controller that shortens steps which end in bad health, and then gives up.
+
+    For solvers that do not look themselves: see `ScheduledTerm.watched_field`.
+    """
+
+    controller: Any
+    health: Callable[[Any, Any, Any], Array] = eqx.field(static=True)  # of t, y, args
+
+    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
+        return self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
+
+    def adapt_step_size(  # pyright: ignore[reportIncompatibleMethodOverride]
+        self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state
+    ):
+        inputs = jax.tree.map(
+            lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x,
+            (t1, y1_candidate, args),
+        )
+        health = self.health(*inputs)
+        bad = jnp.isnan(health) | (health == 0)
+        short = jnp.abs(t1 - t0) < SHORTEST[health.dtype]
+        imposed = jnp.where(short, 0, jnp.inf)
+        y_error = jax.tree.map(lambda e: jnp.where(bad, imposed, e), y_error)
+        # Errors are measured by the state, which may not be finite.
+        end = jax.tree.map(lambda a, b: jnp.where(bad, a, b), y0, y1_candidate)
+        *step, result = self.controller.adapt_step_size(
+            t0, t1, y0, end, args, y_error, error_order, controller_state
+        )
+        results: Any = diffrax.RESULTS
+        kind = results.where(health == 0, results.singular, results.nonfinite)
+        return *step, results.where(bad & short, kind, result)
+
+
+def limited(controller: diffrax.AbstractStepSizeController, limit: Array) -> "Limited":
+    """A controller that gives up after a number of steps known at run time."""
+    if isinstance(controller, diffrax.AbstractAdaptiveStepSizeController):
+        return _AdaptiveLimited(controller, limit)  # pyright: ignore[reportCallIssue]
+    return Limited(controller, limit)
 
 
 class Limited(_Wrapped):
@@ -141,15 +215,15 @@ class Limited(_Wrapped):
         return keep, next_t0, next_t1, jump, (inner, count), result
 
 
-class _Scaled(_Wrapped, diffrax.AbstractAdaptiveStepSizeController):
+class _AdaptiveLimited(Limited, _Adaptive):  # pyright: ignore[reportIncompatibleMethodOverride]
+    pass
+
+
+class _Scaled(_Adaptive):
     """A controller that sees the state in units of its own per coordinate."""
 
     controller: Any
     unit: tuple[tuple[Array, ...], tuple[Array, ...]]  # as the state: q, qd
-    # Where an implicit solver looks for tolerances of its own.
-    rtol: Any  # pyright: ignore[reportIncompatibleVariableOverride]
-    atol: Any  # pyright: ignore[reportIncompatibleVariableOverride]
-    norm: Any  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
         if dt0 is None:
@@ -211,10 +285,4 @@ def scale_tolerances(
         q = jnp.where(jnp.stack(real_joints(linkage.ef)), 1, size)
         qd = q / time
     unit = tuple(q), tuple(qd)
-    return _Scaled(
-        controller=controller,
-        unit=unit,
-        rtol=controller.rtol,
-        atol=controller.atol,
-        norm=controller.norm,
-    )
+    return _Scaled(controller, unit)  # pyright: ignore[reportCallIssue]

@@ -28,7 +28,7 @@ from .integration import element_effort
 from .linkage import Linkage, State, real_joints
 from .simulation import simulate, solve_options
 from .solution import Solution
-from .step_control import Limited, default_controller
+from .step_control import default_controller, limited
 from .validation import (
     callable_tuple,
     concrete,
@@ -49,7 +49,7 @@ def _motion(settings: dict, ts: Array, moving: Any, shared: Any, limit: Array | 
     controller = settings["stepsize_controller"]
     if limit is not None:
         inner = default_controller() if controller is None else controller
-        controller = Limited(inner, limit)
+        controller = limited(inner, limit)
     solution = simulate(
         linkage,
         state0,

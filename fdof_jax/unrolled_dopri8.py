@@ -25,7 +25,7 @@ from .one_loop import in_one_loop
 _TABLEAU = diffrax.Dopri8.tableau
 _STAGES = len(_TABLEAU.b_sol)
 # Rates that are not finite even after so short a step [s] do not lack accuracy.
-_SHORTEST = {np.dtype("float64"): 1e-10, np.dtype("float32"): 1e-6}
+SHORTEST = {np.dtype("float64"): 1e-10, np.dtype("float32"): 1e-6}
 # Row i gives the increment before stage i + 1; the last is the step itself.
 _LOWER = np.zeros((_STAGES - 1, _STAGES))
 for _row, _entries in enumerate(_TABLEAU.a_lower):
@@ -258,7 +258,7 @@ class UnrolledDopri8(diffrax.AbstractAdaptiveSolver):
         # A step in bad health is rejected until it is short. The result of a rejected
         # one would not count, so that one is kept.
         bad = jnp.isnan(end.health) | (health == 0)
-        short = jnp.abs(h) < _SHORTEST[h.dtype]
+        short = jnp.abs(h) < SHORTEST[h.dtype]
         imposed = jnp.where(short, 0, jnp.inf)
         error = jtu.tree_map(lambda e: jnp.where(bad, imposed, e), end.error)
         results: Any = diffrax.RESULTS

@@ -64,16 +64,18 @@ def test_forward_reverse_and_differences_agree(kind):
 
     if kind == "fixed":
         # Free of noise, but with a kink wherever a switching meets a step.
+        bound = 1e-6
         differences = [difference(e, 1e-6) for e in np.eye(at.size)]
     else:
         # Noise of the tolerance: long steps, extrapolated.
+        bound = 2e-6
         differences = [
             (4 * difference(e, 5e-4) - difference(e, 1e-3)) / 3 for e in np.eye(at.size)
         ]
     scale = np.abs(forward).max()
     assert np.abs(twin - reverse).max() <= 1e-10 * scale
     assert np.abs(forward - reverse).max() <= 2e-6 * scale
-    assert np.abs(forward - np.array(differences)).max() <= 1e-6 * scale
+    assert np.abs(forward - np.array(differences)).max() <= bound * scale
 
 
 def test_gradient_of_a_batch_is_the_sum_of_the_gradients():
@@ -133,3 +135,15 @@ def test_bounded_steps_control_the_tangents_of_a_hanging_arm():
     scale = np.abs(exact).max()
     assert np.abs(gradient(hanging, 0.1) - exact).max() <= 1e-6 * scale
     assert np.abs(gradient(hanging, 10.0) - exact).max() > scale
+
+
+def test_derivatives_in_the_times_themselves():
+    scene = fj.scenes.fig5()
+
+    def loss(factor):
+        ts = factor * jnp.array([0.0, 0.1, 0.3])
+        motion = fj.simulate(scene.linkage, scene.state0, ts)
+        return jnp.sum(motion.ts**2) + jnp.sum(motion.q[-1])
+
+    difference = (loss(1 + 1e-5) - loss(1 - 1e-5)) / 2e-5
+    np.testing.assert_allclose(jax.grad(loss)(1.0), difference, rtol=1e-7)

@@ -422,3 +422,14 @@ def test_other_values_need_no_new_trace(batch, clean, monkeypatch):
     ts = np.linspace(0, 1, 37)
     jax.eval_shape(lambda q: fj.simulate(linkage, fj.State(q, q), ts), state0.q)
     assert calls
+
+
+def test_an_implicit_solver_finds_its_tolerances():
+    linkage = fj.scenes.fig5().linkage
+    start = fj.State(np.zeros((2, 3)) + [[0.0], [0.1]], np.zeros(3))
+    steps = diffrax.PIDController(rtol=1e-8, atol=1e-8)
+    solution = fj.sweep(
+        linkage, start, [0, 0.2], solver=diffrax.Kvaerno5(), stepsize_controller=steps
+    )
+    alone = fj.simulate(linkage, fj.State(start.q[1], start.qd), [0, 0.2])
+    np.testing.assert_allclose(solution.q[1], alone.q, atol=1e-6)

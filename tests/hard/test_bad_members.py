@@ -102,6 +102,37 @@ def test_members_that_fail_add_nothing_to_a_shared_gradient():
     assert counted == SIZE - 2 and np.isfinite(full).all()
 
 
+def test_a_member_that_starts_nan_adds_nothing_under_vmap():
+    """Whatever is NaN in a member would be so in the sum over all."""
+
+    def loss(mass, q0):
+        def end(q0):
+            linkage = eqx.tree_at(lambda a: a.mass, arm(), mass)
+            motion = fj.simulate(linkage, fj.State(q0, START.qd), TS, throw=False)
+            good = motion.result == diffrax.RESULTS.successful
+            return jnp.where(good, jnp.sum(motion.q[-1]), 0.0)
+
+        return jnp.sum(jax.vmap(end)(q0))
+
+    slope = jax.jit(jax.grad(loss))
+    q0 = START.q + np.array([[0.0], [0.1]])
+    alone = slope(jnp.ones(3), q0[:1])
+    spoilt = slope(jnp.ones(3), np.where([[False], [True]], np.nan, q0))
+    np.testing.assert_allclose(spoilt, alone, rtol=1e-9)
+
+
+@pytest.mark.parametrize("solver", [None, diffrax.Dopri8()])
+def test_a_controller_of_one_s_own_does_not_reject_for_ever(solver):
+    """diffrax's shortest step is 0: NaN is rejected until there are no steps left."""
+    steps = diffrax.PIDController(rtol=1e-8, atol=1e-8)
+    motion = fj.simulate(
+        arm(), START, TS, (Breaking(0.32),), solver=solver, throw=False,
+        stepsize_controller=steps,
+    )  # fmt: skip
+    assert motion.outcome == "not finite"
+    assert motion.stats["num_steps"] < 200
+
+
 LONG = np.linspace(0, 5, 26)
 
 
@@ -125,7 +156,7 @@ def test_running_out_of_steps_is_told():
         fj.simulate(arm(), START, LONG, max_steps=50)
 
 
-def test_a_gradient_of_what_was_not_reached_is_marked():
+def test_a_gradient_of_what_was_not_reached_is_zero_and_the_value_tells():
     """An output filled with NaN has a derivative of 0: an optimum, it seems.
 
     A derivative of NaN would spoil that of a sum in which failed members are left out.

@@ -1,5 +1,6 @@
 """Mass matrices close to singular, and singular ones."""
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -32,6 +33,25 @@ def test_a_tip_of_a_million_tonnes(steps):
         assert solution.outcome == "ill-conditioned"
         reached = TS <= solution.stats["time_reached"]
         np.testing.assert_array_equal(np.isfinite(solution.q).all(axis=1), reached)
+
+
+@pytest.mark.parametrize("how", ["gradient", "Dopri8", "Kvaerno5"])
+def test_other_solvers_are_stopped_too(how):
+    """Only the default one looks at the conditioning itself."""
+    heavy = arm(mass=[1, 1, 1e9])
+    solver = None if how == "gradient" else getattr(diffrax, how)()
+
+    def end(q0):
+        start = fj.State(q0, START.qd)
+        motion = fj.simulate(heavy, start, TS, solver=solver, throw=False)
+        return jnp.sum(motion.q[-1]), motion
+
+    if how == "gradient":
+        (_, motion), _ = jax.value_and_grad(end, has_aux=True)(jnp.asarray(START.q))
+    else:
+        _, motion = end(START.q)
+    assert motion.outcome == "ill-conditioned"
+    assert motion.stats["num_steps"] < 100
 
 
 @pytest.mark.parametrize("topology", ["RRR", "RPR", "PRR", "PPR"])

@@ -4,29 +4,12 @@ import diffrax
 import jax
 import numpy as np
 import pytest
-from scipy.linalg import expm
 
 import fdof_jax as fj
-from hard.scenes import arm
+from hard.scenes import arm, linear_motion
 
 HANGING, END = np.array([-np.pi / 2, 0.0, 0.0]), 10.0
 STILL = np.zeros(3)
-
-
-def linear_theory():
-    """Of q at the end in q0: the exponential of the equations linearised at rest.
-
-    M and the Hessian of the potential by hand: uniform links of 1 m and 1 kg.
-    """
-    mass = np.array(
-        [[7 / 3, 3 / 2, 1 / 2], [3 / 2, 4 / 3, 1 / 2], [1 / 2, 1 / 2, 1 / 3]]
-    )
-    absolute = np.tril(np.ones((3, 3)))  # angles from joint angles
-    stiffness = absolute.T @ np.diag([2.5, 1.5, 0.5]) @ absolute * 9.81
-    inertia = absolute.T @ mass @ absolute
-    zero, one = np.zeros((3, 3)), np.eye(3)
-    rates = np.block([[zero, one], [-np.linalg.solve(inertia, stiffness), zero]])
-    return expm(rates * END)[:3, :3]
 
 
 def final(q0, adjoint=diffrax.RecursiveCheckpointAdjoint()):
@@ -42,8 +25,27 @@ def test_the_gradient_is_that_of_linear_theory(mode):
         gradient = jax.jacfwd(lambda q0: final(q0, diffrax.ForwardMode()))
     else:
         gradient = jax.jacrev(final)
-    exact = linear_theory()
+    exact = linear_motion(END)
     error = np.abs(jax.jit(gradient)(HANGING) - exact).max()
+    assert error <= 1e-6 * np.abs(exact).max()
+
+
+@pytest.mark.parametrize("steps", ["scaled", "own"])
+def test_other_tolerances_do_not_make_it_wrong(steps):
+    """Only a longest step that is set, `dtmax`, is left as it is."""
+    controller = {
+        "scaled": fj.scale_tolerances(arm()),
+        "own": diffrax.PIDController(rtol=1e-8, atol=1e-8),
+    }[steps]
+
+    def end(q0):
+        return fj.simulate(
+            arm(), fj.State(q0, STILL), [0, END], stepsize_controller=controller,
+            adjoint=diffrax.ForwardMode(),
+        ).q[-1]  # fmt: skip
+
+    exact = linear_motion(END)
+    error = np.abs(jax.jit(jax.jacfwd(end))(HANGING) - exact).max()
     assert error <= 1e-6 * np.abs(exact).max()
 
 
@@ -62,6 +64,6 @@ def test_another_solver_does_not_make_it_wrong(solver):
             arm(), fj.State(q0, STILL), [0, END], solver=solver, adjoint=adjoint
         ).q[-1]
 
-    exact = linear_theory()
+    exact = linear_motion(END)
     error = np.abs(jax.jit(jax.jacfwd(end))(HANGING) - exact).max()
     assert error <= 1e-6 * np.abs(exact).max()

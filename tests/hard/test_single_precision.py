@@ -57,7 +57,7 @@ for controller in (None, steps):
 def test_a_tolerance_out_of_reach_warns_and_does_not_fight_rounding():
     """Below an ulp of the state the error estimate is noise."""
     steps = run("""
-steps = diffrax.PIDController(rtol=1e-8, atol=1e-8)
+steps = diffrax.PIDController(rtol=1e-8, atol=jnp.asarray(1e-8))
 with warnings.catch_warnings(record=True) as caught:
     warnings.simplefilter("always")
     motion = fj.simulate(arm(), start, ts, stepsize_controller=steps)
