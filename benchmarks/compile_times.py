@@ -1,7 +1,8 @@
 """Compile times: cold, and with JAX's persistent compilation cache warm.
 
 Every sample is a process of its own, which fills a fresh cache folder or reads a full
-one. A first call less a second one is what counts; imports are apart.
+one. A first call less a second one is what counts; imports are apart. JAX keeps nothing
+that calls back to Python, which checks that raise do: EQX_ON_ERROR=nan does without.
 
     python -m benchmarks.compile_times CASE    (one sample: prints seconds)
 """
@@ -66,10 +67,12 @@ def simulate_dopri8() -> Callable:
 
 # The environment of a case follows its name.
 ENVIRONMENTS = {
+    "EQX_ON_ERROR=nan": {"EQX_ON_ERROR": "nan"},
     "XLA_FLAGS": {"XLA_FLAGS": XLA_FLAGS},
 }
 CASES = {
     "simulate": simulate,
+    "simulate, EQX_ON_ERROR=nan": simulate,
     "simulate, XLA_FLAGS": simulate,
     "simulate by diffrax.Dopri8": simulate_dopri8,
     "sweep of 256": sweep,

@@ -124,7 +124,6 @@ def targets(points: dict[str, list[dict]], number: Callable) -> Iterator[tuple]:
             ("simulate", "≤ 3", "≤ 1"),
             ("simulate, XLA_FLAGS", "≤ 3", "≤ 1"),
             ("simulate by diffrax.Dopri8", "≤ 3", "≤ 1"),
-            ("simulate by diffrax.Dopri8, XLA_FLAGS", "≤ 3", "≤ 1"),
             ("value and gradient, forward", "≤ 8", "≤ 3"),
             ("value and gradient, forward, XLA_FLAGS", "≤ 8", "≤ 3"),
             ("value and gradient, reverse", "≤ 8", "≤ 3"),

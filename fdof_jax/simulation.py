@@ -139,8 +139,7 @@ def simulate(
         if check is not None and not is_traced(linkage, ts, element):
             check(linkage, ts)
     inputs = linkage, state0, ts, forces
-    # A program that calls back to Python to raise is not kept by JAX's compilation
-    # cache: where values are known in the end, that is where errors are raised.
+    # Where the values are known in the end, errors are raised there: they can say more.
     inside = is_traced(inputs, jnp.zeros(()))
     try:
         solution = solve(solver, inputs, keywords | {"throw": throw and inside})
