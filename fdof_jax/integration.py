@@ -139,9 +139,11 @@ def _integrate(solver, inputs, keywords, derivatives: bool = False) -> Solution:
     args = _Args(linkage, q0, constants, forces)
     term = ScheduledTerm(_vector_field, _watched_field, _schedule)
     controller = keywords["stepsize_controller"]
+    # Stiff modes, which implicit solvers are taken for, would make the steps too short.
+    own = controller is not None and isinstance(solver, diffrax.AbstractImplicitSolver)
     if controller is None:
         controller = default_controller()
-    if derivatives:
+    if derivatives and not own:
         fraction = _OF_TIME_SCALE[0 if (solver.order(term) or 0) >= 8 else 1]
         longest = lambda: _step_for_tangents(ts[0], args, fraction)
         controller = bounded(controller, longest)
