@@ -87,27 +87,7 @@ def _of(number: int, name: str, scene: hard.Scene, bound: float, **more) -> Hard
 
 
 def _energy_change(linkage: fj.Linkage) -> Judge:
-    """Largest change of energy over the largest kinetic energy."""
-
-    def judge(q, qd):
-        values = [fj.energy(linkage, *row) for row in zip(q, qd)]
-        kinetic, potential = np.array(values).T
-        total = kinetic + potential
-        return float(np.abs(total - total[0]).max() / kinetic.max())
-
-    return judge
-
-
-def _growth(q, qd):
-    """Error of the growth rate beside the upright equilibrium, relative."""
-    upright, moved = np.array([np.pi / 2, 0, 0]), np.array([1e-6, 0, 0])
-    times = np.linspace(0, 1, hard.OUTPUTS)
-    away = q - upright
-    exact = [hard.linear_motion(t, upright=True) @ moved for t in times]
-    size, exact_size = (np.linalg.norm(a, axis=1) for a in (away, exact))
-    small = size < 1e-3
-    rate, exact_rate = (np.diff(np.log(a[small])) for a in (size, exact_size))
-    return float(np.abs(rate / exact_rate - 1).max())
+    return lambda q, qd: float(hard.drift(linkage, q, qd))
 
 
 def _stiff(kp: float) -> HardScene:
@@ -212,10 +192,8 @@ def motions() -> Iterator[HardScene]:
     yield _of(10, "1000 rad/s, all links", load("spin"), 1e-6, **fast)
     tip = load("spin-of-the-tip")
     yield _of(10, "1000 rad/s, the tip", tip, 1e-6, tolerance=1e-14, **fast)
-    upright = hard.free(
-        hard.arm(), [np.pi / 2 + 1e-6, 0, 0], np.linspace(0, 1, hard.OUTPUTS)
-    )
-    yield _of(11, "growth beside upright", upright, 0.01, judge=_growth)
+    growth = lambda q, qd: hard.growth_error(q)
+    yield _of(11, "growth beside upright", hard.beside_upright(), 0.01, judge=growth)
     hanging = np.array([-np.pi / 2, 0, 0])
     rest = hard.free(hard.arm(), hanging, np.array([0.0, 10.0]), q=hanging)
     resting = _of(12, "hanging at rest", rest, 1e-12, tolerance=1e-11)

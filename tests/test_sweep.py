@@ -1,12 +1,5 @@
 """A sweep gives what jax.vmap(simulate) gives, member by member."""
 
-import importlib
-import os
-import socket
-import subprocess
-import sys
-from pathlib import Path
-
 import diffrax
 import equinox as eqx
 import jax
@@ -14,62 +7,26 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import random_linkage
+from sweep_batch import (
+    FAILED,
+    FAST,
+    NAN_LATER,
+    NAN_START,
+    SETTINGS,
+    SPENT,
+    TS,
+    alone,
+    members,
+    run,
+    successful,
+    with_failures,
+)  # fmt: skip
 
 import fdof_jax as fj
-
-# The package's attribute of this name is the function.
-module = importlib.import_module("fdof_jax.sweep")
-
-# Compilations dominate: nearly all tests share these shapes and settings.
-TS = np.linspace(0, 1.5, 7)
-CHUNK = 8  # also what the last few members are solved in
-SETTINGS = dict(
-    stepsize_controller=diffrax.PIDController(
-        rtol=1e-10, atol=1e-10, dtmin=1e-13, force_dtmin=False
-    ),
-    max_steps=1500,
-)
-
-
-class Push(eqx.Module):
-    """A smooth effort; `broken` joins it after 1 s."""
-
-    tau: jax.Array
-    broken: jax.Array
-
-    def __call__(self, t, q, qd, linkage):
-        return self.tau * jnp.sin(3 * t) + jnp.where(t > 1, self.broken, 0.0)
-
-
-def members():
-    """A batch of all topologies: linkages, starts and forces."""
-    rng = np.random.default_rng(5)
-    linkages = [
-        random_linkage(topology, rng) for _ in range(6) for topology in fj.TOPOLOGIES
-    ]
-    size = len(linkages)
-    state0 = fj.State(rng.uniform(-1, 1, (size, 3)), rng.uniform(-1, 1, (size, 3)))
-    push = Push(jnp.asarray(rng.uniform(-1, 1, (size, 3))), jnp.zeros(size))
-    return jax.tree.map(lambda *a: jnp.stack(a), *linkages), state0, (push,)
-
-
-def run(batch, **keywords):
-    linkage, state0, forces = batch
-    arguments = dict(SETTINGS, chunk=CHUNK, forces_axes=0)
-    return fj.sweep(linkage, state0, TS, forces, **{**arguments, **keywords})
-
-
-def alone(batch, member):
-    linkage, state0, forces = jax.tree.map(lambda a: a[member], batch)
-    return fj.simulate(linkage, state0, TS, forces, throw=False, **SETTINGS)
 
 
 def reason(solution, member):
     return jax.tree.map(lambda a: a[member], solution.result)
-
-
-def successful(solution):
-    return np.asarray(solution.result == diffrax.RESULTS.successful)
 
 
 def assert_equal(solution, other, tolerance=1e-9):
@@ -85,6 +42,16 @@ def batch():
 @pytest.fixture(scope="module")
 def clean(batch):
     return run(batch)
+
+
+@pytest.fixture(scope="module")
+def mixed(batch):
+    return with_failures(batch)
+
+
+@pytest.fixture(scope="module")
+def swept(mixed):
+    return run(mixed)
 
 
 def test_members_equal_those_of_vmap(batch, clean):
@@ -112,25 +79,6 @@ def test_members_equal_single_simulations(batch, clean):
 
 
 # Members that differ from the others
-
-NAN_START, NAN_LATER, SPENT, FAST = 3, 12, 21, 0
-FAILED = [NAN_START, NAN_LATER, SPENT]
-
-
-@pytest.fixture(scope="module")
-def mixed(batch):
-    """A batch with members that fail, each in its own way, and a fast one."""
-    linkage, (q, qd), (push,) = batch
-    q, qd = q.copy(), qd.copy()
-    q[NAN_START, 1] = np.nan
-    qd[SPENT], qd[FAST] = [1000, 0, 0], [70, 0, 0]
-    push = eqx.tree_at(lambda p: p.broken, push, push.broken.at[NAN_LATER].set(jnp.nan))
-    return linkage, fj.State(q, qd), (push,)
-
-
-@pytest.fixture(scope="module")
-def swept(mixed):
-    return run(mixed)
 
 
 def test_failed_members_have_their_own_results(mixed, swept):
@@ -259,169 +207,6 @@ def test_arrays_without_the_axis_are_shared(shared):
             linkage, fj.State(q, np.zeros(3)), TS, each[member], **SETTINGS
         )
         np.testing.assert_allclose(solution.q[member], single.q, rtol=1e-8, atol=1e-8)
-
-
-# Checkpoints
-
-
-@pytest.fixture
-def solved(monkeypatch):
-    """The chunks solved from here on; a trace alone is none."""
-    chunks = []
-    original = module._solve_chunk
-
-    def recorded(*arguments):
-        if not fj.validation.is_traced(arguments):
-            chunks.append(arguments)
-        return original(*arguments)
-
-    monkeypatch.setattr(module, "_solve_chunk", recorded)
-    return chunks
-
-
-def test_a_checkpoint_spares_finished_chunks(mixed, swept, solved, tmp_path):
-    folder = tmp_path / "new" / "folder"
-    first = run(mixed, checkpoint=folder)
-    saved = sorted(folder.iterdir())
-    assert len(saved) == len(solved) > len(first.q) // CHUNK
-    assert {file.suffix for file in saved} == {".npz"}
-    solved.clear()
-
-    again = run(mixed, checkpoint=str(folder))
-    assert not solved
-    assert jax.tree.structure(again) == jax.tree.structure(first)
-    for a, b, c in zip(*map(jax.tree.leaves, (again, first, swept))):
-        np.testing.assert_array_equal(a, b)
-        np.testing.assert_array_equal(a, c)
-
-    saved[2].unlink()
-    again = run(mixed, checkpoint=folder)
-    assert len(solved) == 1
-    assert sorted(folder.iterdir()) == saved
-    np.testing.assert_array_equal(again.q, first.q)
-
-
-def test_a_checkpoint_serves_no_other_sweep(batch, clean, solved, tmp_path):
-    linkage, (q, qd), (push,) = batch
-    run(batch, checkpoint=tmp_path)
-    chunks = len(solved)
-    solved.clear()
-    moved = linkage, fj.State(q, qd + 1e-9), (push,)
-    other = run(moved, checkpoint=tmp_path)
-    assert len(solved) == chunks
-    assert not np.array_equal(other.q, clean.q)
-
-
-def test_a_checkpoint_may_be_of_another_chunk(batch, clean, solved, tmp_path):
-    """The chunks of 8 do not take up those of one member that were there before."""
-    tiny = jax.tree.map(lambda a: a[:CHUNK], batch)
-    ones = run(tiny, checkpoint=tmp_path, chunk=1)
-    solved.clear()
-    eights = run(tiny, checkpoint=tmp_path)
-    assert solved
-    assert_equal(ones, eights, 1e-7)
-    np.testing.assert_allclose(eights.q, clean.q[:CHUNK], rtol=1e-8, atol=1e-8)
-
-
-# Progress, devices, compilations
-
-
-class Recorder(diffrax.NoProgressMeter):
-    seen: list
-
-    def step(self, state, progress):
-        self.seen.append(float(progress))
-        return state
-
-
-def test_progress_rises_to_one(mixed):
-    recorder = Recorder([])
-    run(mixed, progress_meter=recorder)
-    assert len(recorder.seen) >= len(mixed[1].q) // CHUNK
-    assert 0 <= recorder.seen[0] < 1 and recorder.seen[-1] == 1
-    assert (np.diff(recorder.seen) >= 0).all()
-
-
-WORKER = """
-import sys
-import jax
-jax.config.update("jax_enable_x64", True)
-address, processes, index, devices, path = sys.argv[1:]
-if int(processes) > 1:
-    jax.distributed.initialize(address, int(processes), int(index))
-import numpy as np
-import test_sweep
-assert jax.device_count() == int(devices)
-solution = test_sweep.run(test_sweep.members(), chunk=4)
-steps = solution.stats["num_steps"]
-good = test_sweep.successful(solution)
-np.savez(path, q=solution.q, qd=solution.qd, steps=steps, good=good)
-"""
-
-
-def workers(folder, processes, devices):
-    """What each of some processes returns, all devices seen by all of them."""
-    with socket.socket() as port:
-        port.bind(("127.0.0.1", 0))
-        address = f"127.0.0.1:{port.getsockname()[1]}"
-    here = Path(__file__).parent
-    flag = f"--xla_force_host_platform_device_count={devices // processes}"
-    env = dict(
-        os.environ,
-        JAX_PLATFORMS="cpu",
-        XLA_FLAGS=flag,
-        PYTHONPATH=os.pathsep.join([str(here), str(here.parent)]),
-    )
-    started, answers = [], []
-    try:
-        for index in range(processes):
-            path = folder / f"{index}.npz"
-            arguments = [address, processes, index, devices, path]
-            command = [sys.executable, "-c", WORKER, *map(str, arguments)]
-            started.append(
-                (path, subprocess.Popen(command, env=env, stderr=subprocess.PIPE))
-            )
-        for path, process in started:
-            _, errors = process.communicate(timeout=300)
-            assert process.returncode == 0, errors.decode()[-3000:]
-            answers.append(np.load(path))
-    finally:
-        for _, process in started:
-            process.kill()
-    return answers
-
-
-@pytest.mark.parametrize("processes, devices", [(1, 4), (2, 2)])
-def test_more_devices_and_processes_change_nothing(processes, devices, clean, tmp_path):
-    for answer in workers(tmp_path, processes, devices):
-        assert answer["good"].all()
-        np.testing.assert_allclose(answer["q"], clean.q, rtol=1e-8, atol=1e-8)
-        np.testing.assert_allclose(answer["qd"], clean.qd, rtol=1e-7, atol=1e-7)
-        np.testing.assert_allclose(
-            answer["steps"], clean.stats["num_steps"], rtol=0, atol=5
-        )
-
-
-def test_other_values_need_no_new_trace(batch, clean, monkeypatch):
-    calls = []
-    original = fj.integration._vector_field
-
-    def counted(*arguments):
-        calls.append(1)
-        return original(*arguments)
-
-    monkeypatch.setattr(fj.integration, "_vector_field", counted)
-    linkage, (q, qd), forces = batch
-    other = run((linkage, fj.State(q + 0.1, qd), forces))
-    assert not calls
-    assert not np.array_equal(other.q, clean.q)
-    # Fewer members need none either, and a new number of times shows the counting.
-    run(jax.tree.map(lambda a: a[:11], batch))
-    assert not calls
-    linkage, state0, forces = jax.tree.map(lambda a: a[0], batch)
-    ts = np.linspace(0, 1, 37)
-    jax.eval_shape(lambda q: fj.simulate(linkage, fj.State(q, q), ts), state0.q)
-    assert calls
 
 
 def test_an_implicit_solver_finds_its_tolerances():

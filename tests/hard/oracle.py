@@ -7,12 +7,16 @@ the README: link n = 2, 3, 4 starts at its characteristic point, A_n along it, B
 across it.
 """
 
+import sys
 from typing import Any, NamedTuple
 
 import mpmath
 from mpmath import mp
 
 DIGITS = 50
+EPS = sys.float_info.epsilon
+# Roundings in the longest chain of operations from the inputs to an acceleration.
+ROUNDINGS = 8
 
 
 class Arm(NamedTuple):

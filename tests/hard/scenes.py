@@ -127,10 +127,9 @@ def error(motion, scene):
     return np.abs(np.asarray(motion.q)[scene.rows] - scene.q).max()
 
 
-def drift(linkage, motion):
+def drift(linkage, q, qd):
     """The largest change of energy over the largest kinetic energy."""
-    energies = jax.vmap(fj.energy, in_axes=(None, 0, 0))
-    kinetic, potential = energies(linkage, motion.q, motion.qd)
+    kinetic, potential = jax.vmap(fj.energy, in_axes=(None, 0, 0))(linkage, q, qd)
     total = np.asarray(kinetic + potential)
     return np.abs(total - total[0]).max() / np.max(kinetic)
 
@@ -209,3 +208,24 @@ def linear_motion(t, upright=False):
     grown = modes * np.cos(np.sqrt(squares.astype(complex)) * t) @ np.linalg.inv(modes)
     absolute = np.tril(np.ones((3, 3)))  # from relative angles
     return np.linalg.solve(absolute, grown.real @ absolute)
+
+
+_UPRIGHT, _MOVED = np.array([np.pi / 2, 0, 0]), np.array([1e-6, 0, 0])
+
+
+def beside_upright():
+    """From a microradian beside the upright equilibrium."""
+    return free(arm(), _UPRIGHT + _MOVED, np.linspace(0, 1, OUTPUTS))
+
+
+def growth_error(q):
+    """Of the rate at which a motion of that scene grows while it is small, relative."""
+    scene = beside_upright()
+    exact = [linear_motion(t, upright=True) @ _MOVED for t in scene.ts]
+    away = np.asarray(q) - _UPRIGHT
+    size, exact_size = (np.linalg.norm(a, axis=1) for a in (away, exact))
+    small = size < 1e-3
+    if not 5 < small.sum() < OUTPUTS:
+        return np.inf
+    rate, exact_rate = (np.diff(np.log(a[small])) for a in (size, exact_size))
+    return np.abs(rate / exact_rate - 1).max()

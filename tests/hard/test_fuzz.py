@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 
 from hard import fuzz
-from hard.fuzz import Scene
+from hard.fuzz_motions import check_sample
+from hard.fuzz_report import Report
 from hard.garbage import Case, Hostile
 from hard.oracle import Arm
+from hard.random_scenes import Scene
 
 ZERO = (0.0, 0.0, 0.0)
 POINTS = ((0.0, 0.0),) * 3
@@ -24,9 +26,9 @@ def scene(arm, q, **changes):
     "kind, cases", {"accelerations": 120, "motions": 100, "arguments": 80}.items()
 )
 def test_whatever_is_drawn_has_a_named_outcome(kind, cases):
-    report = fuzz.Report()
+    report = Report()
     fuzz.run(kind, cases, report)
-    fuzz.check_sample(report, 2)
+    check_sample(report, 2)
     assert not report.failures
     assert report.outcomes.total() >= cases
 
@@ -135,4 +137,4 @@ FOUND = {
 
 @pytest.mark.parametrize("case", FOUND)
 def test_what_was_found_has_a_named_outcome(case):
-    fuzz.check(*FOUND[case], fuzz.Report())
+    fuzz.check(*FOUND[case], Report())

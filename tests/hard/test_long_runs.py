@@ -15,4 +15,4 @@ def test_energy_of_a_small_swing(seconds, bound):
         hard.arm(), [0.1 - np.pi / 2, 0, 0], np.linspace(0, seconds, hard.OUTPUTS)
     )
     motion = hard.simulate(scene, hard.TIGHT)
-    assert hard.drift(scene.linkage, motion) <= bound
+    assert hard.drift(scene.linkage, motion.q, motion.qd) <= bound

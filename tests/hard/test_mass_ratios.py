@@ -11,7 +11,7 @@ def test_point_masses():
     scene = hard.fig5(np.linspace(0, 10, hard.OUTPUTS))
     motion = hard.simulate(scene, hard.controller(1e-10))
     assert hard.error(motion, scene) <= 1e-6
-    assert hard.drift(scene.linkage, motion) <= 1e-8
+    assert hard.drift(scene.linkage, motion.q, motion.qd) <= 1e-8
 
 
 def test_gradients_of_point_masses():

@@ -1,0 +1,140 @@
+"""Hard cases that are no motion of one arm: what comes of them.
+
+fdof_jax has to pass the tests of `tests/hard`. What of it can be asked of plain diffrax
+is one number each, which has to stay below a bound.
+"""
+
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import fdof_jax as fj
+
+from .chain import Drive, make_rates
+from .hard_engines import MAX_STEPS
+from .hard_scenes import hard
+from .measure import OUTCOMES
+
+SOLVED, _, BY_NAME, SILENTLY = OUTCOMES
+
+# By number of the scene: its name, and the tests of it.
+TESTS = {
+    18: ("chattering at a limit", "test_stiff_control.py", "chattering"),
+    19: ("derivatives at a limit", "test_saturation.py", ""),
+    23: ("float32", "test_single_precision.py", ""),
+    24: ("jumps, a pulse of 1 us", "test_jumps.py", ""),
+    25: ("odd members of a batch", "test_bad_members.py", "members"),
+    26: ("out of steps", "test_bad_members.py", "steps or reached"),
+    27: ("junk in unused values", "test_unused_values.py", ""),
+    28: ("losses at zero error", "test_derivatives.py", "zero or radius"),
+    29: ("Hessians of a batch", "test_derivatives.py", "hessians"),
+    30: ("malformed input", "test_malformed.py", ""),
+}
+
+
+def tested(file: str, which: str) -> dict:
+    """Whether the tests of a scene pass."""
+    root = Path(__file__).parent.parent
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-m"]
+    command += ["slow or not slow", f"tests/hard/{file}", "-k", which]
+    done = subprocess.run(
+        command, cwd=root, capture_output=True, text=True, check=False
+    )
+    last = done.stdout.strip().split("\n")[-1]
+    return {"status": SILENTLY if done.returncode else SOLVED, "reason": last}
+
+
+def _clipped() -> float:
+    """Scene 19: the derivative of an effort just at its limit, to one side or other."""
+    slope = jax.grad(lambda kp: jnp.clip(kp * 0.25, -32.0, 32.0))(128.0) / 0.25
+    return min(abs(float(slope)), abs(float(slope) - 1))
+
+
+def _steps_in_float32() -> float:
+    """Scene 23: steps at a tolerance of 1e-8 in float32, over those in float64."""
+    steps = []
+    for x64 in (False, True):
+        with jax.enable_x64(x64):
+            steps.append(_plain(hard.load("swing"), 1e-8).stats["num_steps"])
+    return float(steps[0] / steps[1])
+
+
+def _pulse() -> float:
+    """Scene 24: the error after a pulse of 1 us."""
+
+    def effort(t):
+        return jnp.where((t >= 7.3) & (t < 7.3 + 1e-6), 1e5, 0.0)
+
+    exact = hard.DRIVEN["pulse"]
+    scene = hard.free(hard.arm(), hard.START.q, np.array([0, *exact["ts"]]))
+    q = _plain(scene, 1e-12, effort).ys[1:, :3]
+    return float(np.abs(q - np.array(exact["q"])).max())
+
+
+def _spoilt() -> float:
+    """Scene 25: the derivative in an effort that all share, one member being NaN."""
+    q0 = jnp.asarray(hard.START.q) + jnp.zeros((8, 3))
+    scene = hard.free(hard.arm(), hard.START.q, np.array([0.0, 0.5]))
+
+    def loss(effort, q0):
+        def end(q0):
+            moved = scene._replace(state0=fj.State(q0, scene.state0.qd))
+            solution = _plain(moved, 1e-9, lambda t: effort, throw=False)
+            good = solution.result == diffrax.RESULTS.successful
+            return jnp.where(good, solution.ys[-1, 0], 0.0)
+
+        return jnp.sum(jax.vmap(end)(q0))
+
+    slope = jax.jit(jax.grad(loss))
+    spoilt, clean = slope(0.0, q0.at[3, 1].set(jnp.nan)), slope(0.0, q0)
+    return float(abs(spoilt - clean * 7 / 8) / abs(clean))
+
+
+def _negative_mass() -> float:
+    """Scene 30: whether a tip of -1 kg goes through."""
+    scene = hard.free(hard.arm(), hard.START.q, np.array([0.0, 1.0]))
+    linkage = eqx.tree_at(lambda a: a.mass, scene.linkage, jnp.array([1.0, 1.0, -1.0]))
+    solution = _plain(scene._replace(linkage=linkage), 1e-9, throw=False)
+    return float(solution.result == diffrax.RESULTS.successful)
+
+
+def _plain(scene: Any, tolerance: float, effort: Any = None, throw: bool = True) -> Any:
+    """The motion under `effort(t)` at the first joint."""
+
+    def field(t, y, args):
+        drive = None if effort is None else Drive(effort=(effort(t), 0.0, 0.0))
+        return jnp.stack(make_rates(scene.linkage, jnp.sin, jnp.cos, drive)(*y))
+
+    return diffrax.diffeqsolve(
+        diffrax.ODETerm(field),
+        diffrax.Dopri8(),
+        scene.ts[0],
+        scene.ts[-1],
+        1e-3,
+        jnp.concatenate([jnp.asarray(part, dtype=float) for part in scene.state0]),
+        saveat=diffrax.SaveAt(ts=jnp.asarray(scene.ts)),
+        stepsize_controller=diffrax.PIDController(rtol=tolerance, atol=tolerance),
+        max_steps=MAX_STEPS,
+        throw=throw,
+    )
+
+
+PLAIN = {19: (_clipped, 0.0), 23: (_steps_in_float32, 2.0), 24: (_pulse, 1e-8),
+         25: (_spoilt, 1e-9), 30: (_negative_mass, 0.0)}  # fmt: skip
+
+
+def probed(probe: Callable[[], float], bound: float) -> dict:
+    """What came of a probe of plain diffrax."""
+    try:
+        error = probe()
+    except Exception as failure:
+        return {"status": BY_NAME, "reason": f"{failure}".split("\n")[0][:200]}
+    return {"status": SOLVED if error <= bound else SILENTLY, "error": error}

@@ -1,0 +1,231 @@
+"""Motions of random arms: their ends, energies, states at 30 digits; sweeps of them."""
+
+import math
+import random
+import warnings
+from typing import Any
+
+import diffrax
+import jax
+import numpy as np
+
+import fdof_jax as fj
+
+from . import oracle
+from .fuzz_report import Failure, Report
+from .oracle import EPS, ROUNDINGS
+from .random_scenes import Scene
+from .refusals import linkage_of, refusal
+
+TOLERANCE = 1e-11  # of simulate's default, relative and absolute
+MAX_STEPS = 4096
+RESULTS = "successful max_steps_reached dt_min_reached singular nonfinite".split()
+
+
+def duration(scene: Scene, a: oracle.Acceleration) -> float:
+    rate = max(map(abs, scene.qd))
+    if a.qdd is not None:
+        rate += math.sqrt(max(abs(float(x)) for x in a.qdd))
+    return min(max(scene.pace / (rate or 1), 1e-8), 1e2)
+
+
+def forces_of(scene: Scene) -> tuple:
+    return (fj.JointEffort(scene.tau), fj.JointDamper(scene.damping))
+
+
+def check_motion(scene: Scene, report: Report) -> str:
+    linkage = linkage_of(scene.arm)
+    if linkage is None:
+        return refusal(scene.arm)
+    start = oracle.acceleration(scene.arm, scene.q, scene.qd, scene.tau)
+    ts = scene.t0 + duration(scene, start) * np.linspace(0, 1, 5)
+    solution = fj.simulate(
+        linkage,
+        fj.State(scene.q, scene.qd),
+        ts,
+        forces_of(scene),
+        max_steps=MAX_STEPS,
+        throw=False,
+    )
+    name = result_name(solution.result)
+    q, qd = np.asarray(solution.q), np.asarray(solution.qd)
+    steps = int(solution.stats["num_steps"])
+    report.motions.append((scene, ts, name, q, qd))
+    finite = np.isfinite(np.concatenate([q, qd], axis=1)).all(axis=1)
+    # From 1 ms in steps of a fifth, nothing takes so many to begin with.
+    if steps > 100 and not int(solution.stats["num_accepted_steps"]):
+        raise Failure(f"{name}: {steps} steps and none accepted")
+    if name != "successful":
+        nan = np.isnan(np.concatenate([q, qd], axis=1)).all(axis=1)
+        if (
+            not (finite | nan).all()
+            or nan[0]
+            or (np.diff(finite.astype(int)) > 0).any()
+        ):
+            raise Failure(f"{name}, and states {q.tolist()}")
+        if "time_reached" in solution.stats:
+            reached = float(solution.stats["time_reached"])
+            if not (finite == (ts <= reached)).all():
+                raise Failure(f"{name}, reached {reached} of {ts.tolist()}: {finite}")
+        elif nan.sum() == 0:
+            raise Failure(f"{name}, and no state is NaN")
+    elif not finite.all():
+        raise Failure(f"successful, and states {q.tolist()}")
+    # Processors that flush subnormal numbers to zero may do so.
+    off = np.abs(np.concatenate([q[0] - scene.q, qd[0] - scene.qd]))
+    if (off > np.finfo(float).tiny).any():
+        raise Failure(f"starts at {q[0]}, {qd[0]}")
+    good = int(finite.sum())
+    _check_energy(scene, ts[:good], q[:good], qd[:good], steps, report)
+    return name
+
+
+def result_name(result: Any) -> str:
+    names = [n for n in RESULTS if bool(result == getattr(diffrax.RESULTS, n))]
+    if len(names) != 1:
+        raise Failure(f"a result of no known name: {result}")
+    return names[0]
+
+
+def _check_energy(scene: Scene, ts, q, qd, steps: int, report: Report) -> None:
+    """Energy less the work of constant efforts: kept, or lost where there is damping.
+
+    The bound lets each step be wrong by the tolerance in every coordinate, and each
+    evaluation by its roundings: what that does to the energy is given by its
+    derivatives, of which `levers` and `efforts` hold the sizes.
+    """
+    first = oracle.energy(scene.arm, scene.q, scene.qd)
+    bound, last = 0.0, 0.0
+    for k in range(1, len(ts)):
+        state = q[k].tolist(), qd[k].tolist()
+        a = oracle.acceleration(scene.arm, *state, scene.tau, digits=30)
+        momentum = sum(s * abs(v) for s, v in zip(a.levers, state[1]))
+        qdd = a.qdd or (0.0,) * 3
+        carried = sum(s * abs(float(x)) for s, x in zip(a.levers, qdd))
+        by_tolerance = by_rounding = 0.0
+        for s, effort, position, begin, rate in zip(
+            a.levers, a.efforts, state[0], scene.q, state[1]
+        ):
+            moved = abs(position - begin)
+            by_tolerance += s * momentum * (1 + abs(rate)) + effort * (1 + moved)
+            by_rounding += effort * abs(position) + s * momentum * abs(rate)
+            by_rounding += abs(rate) * (effort + s * carried) * (ts[-1] - ts[0])
+        rounding = ROUNDINGS * EPS * (1 + a.angles) * by_rounding
+        bound = max(bound, TOLERANCE * steps * by_tolerance + rounding)
+        with oracle.mpmath.workdps(30):
+            work = sum(f * (x - y) for f, x, y in zip(scene.tau, q[k], scene.q))
+            change = float(oracle.energy(scene.arm, *state) - first - work)
+        gain = change - last if any(scene.damping) else abs(change)
+        last = change
+        report.note("energy / bound", gain / (bound + 1e-300), scene)
+        if gain > bound + 1e-300:
+            raise Failure(
+                f"energy changes by {gain:.3g} J at {ts[k]}, bound {bound:.3g} J, "
+                f"{steps} steps"
+            )
+
+
+def check_state(scene: Scene, ts, q, qd, report: Report) -> str:
+    """States against a run at 30 digits; the bound is what small changes would do.
+
+    Two more runs start as far off as the tolerance allows, with parameters wrong in
+    their last digits, all with random signs.
+    """
+
+    def states(arm, q, qd):
+        rows = oracle.motion(arm, q, qd, scene.tau, scene.damping, ts.tolist())
+        return [[oracle.mp.mpf(x) for x in row] for row in rows]
+
+    rng = random.Random(0)
+
+    def off(values, share, floor=0.0):
+        return tuple(v + rng.choice([-1, 1]) * share * (floor + abs(v)) for v in values)
+
+    try:
+        exact = states(scene.arm, scene.q, scene.qd)
+        bound = TOLERANCE * (1 + np.abs(np.array(exact, dtype=float)))
+        for _ in range(2):
+            arm = scene.arm
+            other = states(
+                arm._replace(
+                    length=off(arm.length, ROUNDINGS * EPS),
+                    com=tuple(off(pair, ROUNDINGS * EPS) for pair in arm.com),
+                    mass=off(arm.mass, ROUNDINGS * EPS),
+                    inertia=off(arm.inertia, ROUNDINGS * EPS),
+                    locked=off(arm.locked, EPS),
+                    base_angle=off([arm.base_angle], EPS)[0],
+                ),
+                [
+                    oracle.mp.mpf(a) + b
+                    for a, b in zip(scene.q, off((0,) * 3, TOLERANCE, 1))
+                ],
+                off(scene.qd, TOLERANCE, 1.0),
+            )
+            bound += [
+                [float(abs(a - b)) for a, b in zip(*rows)] for rows in zip(exact, other)
+            ]
+    except oracle.MotionTooLong:
+        return "state: reference too long"
+    bound = 10 * np.maximum.accumulate(bound)
+    got = np.concatenate([q, qd], axis=1)
+    error = np.array(
+        [
+            [float(abs(oracle.mp.mpf(float(a)) - b)) for a, b in zip(*rows)]
+            for rows in zip(got, exact)
+        ]
+    )
+    report.note("state / bound", (error / bound).max(), scene)
+    if (error > bound).any():
+        raise Failure(f"states wrong by {error.max(0)}, bound {bound.max(0)}")
+    return "state: right"
+
+
+def check_sample(report: Report, sample: int) -> None:
+    """States of the first motions that are short enough, against the reference."""
+    for scene, ts, name, q, qd in report.motions:
+        if sample == 0:
+            break
+        if name != "successful" or scene.pace > 3:
+            continue
+        sample -= 1
+        try:
+            outcome = check_state(scene, ts, q, qd, report)
+        except Failure as failure:
+            outcome = "FAILED"
+            report.failures.append(("motions", failure, scene))
+        report.outcomes["motions", outcome] += 1
+
+
+def check_sweep(report: Report) -> None:
+    """The same arms in one `sweep`, each as if it were alone."""
+    found = [scene for scene, *_ in report.motions]
+    if not found:
+        return
+
+    def stack(items):
+        return jax.tree.map(lambda *leaves: np.stack(leaves), *items)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        members = [
+            (linkage_of(s.arm), fj.State(np.array(s.q), np.array(s.qd)), forces_of(s))
+            for s in found
+        ]
+    ts = np.linspace(0, 0.01, 5)
+    settings = dict(max_steps=MAX_STEPS, throw=False)
+    linkages, states, forces = map(stack, zip(*members))
+    together = fj.sweep(linkages, states, ts, forces, forces_axes=0, **settings)
+    rows = np.concatenate([together.q, together.qd], axis=2)
+    for k, (linkage, state, force) in enumerate(members):
+        alone = fj.simulate(linkage, state, ts, force, **settings)
+        name = jax.tree.map(lambda leaf, k=k: leaf[k], together.result)
+        names = result_name(alone.result), result_name(name)
+        row = np.concatenate([alone.q, alone.qd], axis=1)
+        outcome = f"sweep: {names[1]}, as alone"
+        if names[0] != names[1]:
+            # Rounding differs between the two programs, and so may the last step.
+            outcome = f"sweep: {names[1]}, alone {names[0]}"
+        elif names[0] == "successful":
+            difference = np.abs(rows[k] - row) / (1 + np.abs(row))
+            report.note("sweep / alone", difference.max(), found[k])
+        report.outcomes["motions", outcome] += 1

@@ -1,0 +1,65 @@
+"""Which arms `Linkage` is right to refuse."""
+
+import math
+import random
+
+import fdof_jax as fj
+
+from . import oracle
+from .fuzz_report import Failure
+
+
+def linkage_of(arm: oracle.Arm) -> fj.Linkage | None:
+    """The library's own, None if it refuses and is right to."""
+    try:
+        linkage = fj.Linkage(
+            arm.topology,
+            length=arm.length,
+            com=arm.com,
+            mass=arm.mass,
+            inertia=arm.inertia,
+            locked=arm.locked,
+            base_angle=arm.base_angle,
+            gravity=arm.gravity,
+        )
+    except ValueError as error:
+        if not str(error).startswith("mass, inertia, com: expected joint"):
+            raise Failure(f"refused for another reason: {error}") from error
+        return None
+    return linkage
+
+
+def never_determined(arm: oracle.Arm) -> str | None:
+    """Whether some joint moves no inertia in any configuration: why refusing is right.
+
+    Or not to 13 digits: the door works in float64.
+    """
+    rng = random.Random(0)
+    reach = sum(map(abs, arm.length)) + sum(abs(c) for pair in arm.com for c in pair)
+    found = []
+    for _ in range(6):
+        q = [
+            rng.uniform(-3, 3) if j == "R" else rng.uniform(-1, 1) * (reach or 1)
+            for j in arm.topology
+        ]
+        a = oracle.acceleration(arm, q, (0.0,) * 3, (0.0,) * 3)
+        found.append(a)
+    if all(a.qdd is None for a in found):
+        return "refused: always singular"
+    if all(a.qdd is None or _scaled_inverse(a) > 1e13 for a in found):
+        return "refused: singular to 13 digits"
+    return None
+
+
+def _scaled_inverse(a: oracle.Acceleration) -> float:
+    size = [math.sqrt(a.matrix[k][k]) for k in range(3)]
+    return max(
+        abs(a.inverse[i][j]) * size[i] * size[j] for i in range(3) for j in range(3)
+    )
+
+
+def refusal(arm: oracle.Arm) -> str:
+    reason = never_determined(arm)
+    if reason is None:
+        raise Failure("refused, though every joint moves inertia somewhere")
+    return reason

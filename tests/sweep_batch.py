@@ -1,0 +1,72 @@
+"""A batch of all topologies to sweep, and members of it that fail."""
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from helpers import random_linkage
+
+import fdof_jax as fj
+
+# Compilations dominate: nearly all tests share these shapes and settings.
+TS = np.linspace(0, 1.5, 7)
+CHUNK = 8  # also what the last few members are solved in
+SETTINGS = dict(
+    stepsize_controller=diffrax.PIDController(
+        rtol=1e-10, atol=1e-10, dtmin=1e-13, force_dtmin=False
+    ),
+    max_steps=1500,
+)
+
+
+class Push(eqx.Module):
+    """A smooth effort; `broken` joins it after 1 s."""
+
+    tau: jax.Array
+    broken: jax.Array
+
+    def __call__(self, t, q, qd, linkage):
+        return self.tau * jnp.sin(3 * t) + jnp.where(t > 1, self.broken, 0.0)
+
+
+def members():
+    """A batch of all topologies: linkages, starts and forces."""
+    rng = np.random.default_rng(5)
+    linkages = [
+        random_linkage(topology, rng) for _ in range(6) for topology in fj.TOPOLOGIES
+    ]
+    size = len(linkages)
+    state0 = fj.State(rng.uniform(-1, 1, (size, 3)), rng.uniform(-1, 1, (size, 3)))
+    push = Push(jnp.asarray(rng.uniform(-1, 1, (size, 3))), jnp.zeros(size))
+    return jax.tree.map(lambda *a: jnp.stack(a), *linkages), state0, (push,)
+
+
+def run(batch, **keywords):
+    linkage, state0, forces = batch
+    arguments = dict(SETTINGS, chunk=CHUNK, forces_axes=0)
+    return fj.sweep(linkage, state0, TS, forces, **{**arguments, **keywords})
+
+
+def alone(batch, member):
+    linkage, state0, forces = jax.tree.map(lambda a: a[member], batch)
+    return fj.simulate(linkage, state0, TS, forces, throw=False, **SETTINGS)
+
+
+def successful(solution):
+    return np.asarray(solution.result == diffrax.RESULTS.successful)
+
+
+# Members that differ from the others
+NAN_START, NAN_LATER, SPENT, FAST = 3, 12, 21, 0
+FAILED = [NAN_START, NAN_LATER, SPENT]
+
+
+def with_failures(batch):
+    """A batch with members that fail, each in its own way, and a fast one."""
+    linkage, (q, qd), (push,) = batch
+    q, qd = q.copy(), qd.copy()
+    q[NAN_START, 1] = np.nan
+    qd[SPENT], qd[FAST] = [1000, 0, 0], [70, 0, 0]
+    push = eqx.tree_at(lambda p: p.broken, push, push.broken.at[NAN_LATER].set(jnp.nan))
+    return linkage, fj.State(q, qd), (push,)
