@@ -37,6 +37,11 @@ def _expanded(axis: Any, part: Any) -> Any:
     )
 
 
+def _name(part: Any, *rest: Any) -> str:
+    """Of a leaf of the inputs, from its path."""
+    return ("linkage", "state0", "forces")[part.idx] + jax.tree_util.keystr(rest)
+
+
 def batch_of(linkage: Linkage, state0: Any, forces: Forces, forces_axes: Any) -> Batch:
     """The batch that these are, refused if their shapes are not those of one."""
     linkage_axes = []
@@ -71,12 +76,19 @@ def batch_of(linkage: Linkage, state0: Any, forces: Forces, forces_axes: Any) ->
         lambda x: [getattr(x, name) for name in _LINKAGE_RANKS], linkage, linkage_axes
     )
     axes = (by_name, State(*state_axes), expanded)
-    leaves = zip(jax.tree.leaves(inputs), jax.tree.leaves(axes))
-    sizes = {np.shape(leaf)[:1] for leaf, axis in leaves if axis == 0}
-    if len(sizes) != 1 or () in sizes or (0,) in sizes:
-        got = [s[0] if s else "none" for s in sorted(sizes)]
+    paths, _ = jax.tree_util.tree_flatten_with_path(inputs)
+    sizes = {
+        _name(*path): np.shape(leaf)[:1]
+        for (path, leaf), axis in zip(paths, jax.tree.leaves(axes))
+        if axis == 0
+    }
+    different = set(sizes.values())
+    if len(different) != 1 or different <= {(), (0,)}:
+        got = [
+            f"{name}: {size[0] if size else 'no axis'}" for name, size in sizes.items()
+        ]
         raise ValueError(
             "linkage, state0, forces: expected a leading batch axis of one size on at "
-            f"least one array, got sizes {got}."
+            f"least one array, got {', '.join(got) or 'none on any'}."
         )
-    return Batch(inputs, axes, sizes.pop()[0])
+    return Batch(inputs, axes, different.pop()[0])

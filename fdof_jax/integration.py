@@ -1,5 +1,6 @@
 """The vector field of a linkage with force elements, integrated by diffrax."""
 
+import inspect
 from typing import Any, NamedTuple
 
 import diffrax
@@ -224,11 +225,24 @@ def _integrate_reversibly_bwd(
     return gradient
 
 
+def _opened(inputs):
+    """The inputs, with what plain functions among the forces close over as leaves."""
+    linkage, state0, ts, forces = inputs
+    arguments = ts[0], *state0, linkage
+    opened = tuple(
+        eqx.filter_closure_convert(element, *arguments)
+        if inspect.isfunction(element)
+        else element
+        for element in forces
+    )
+    return linkage, state0, ts, opened
+
+
 @eqx.filter_jit
 def solve(solver, inputs, keywords) -> Solution:
     adjoint = keywords["adjoint"]
     if isinstance(adjoint, diffrax.RecursiveCheckpointAdjoint):
-        return _integrate_reversibly(inputs, solver, keywords)
+        return _integrate_reversibly(_opened(inputs), solver, keywords)
     if solver is None:
         forward = isinstance(adjoint, diffrax.ForwardMode)
         solver = UnrolledDopri8() if forward else diffrax.Dopri8()

@@ -25,14 +25,14 @@ from .validation import (
 
 
 def solve_options(
-    solver: diffrax.AbstractSolver | None = None,
+    solver: diffrax.AbstractSolver | None,
     *,
-    stepsize_controller: diffrax.AbstractStepSizeController | None = None,
-    dt0: ArrayLike | None = 1e-3,
-    adjoint: diffrax.AbstractAdjoint = diffrax.RecursiveCheckpointAdjoint(),
-    max_steps: int | None = 65536,
-    throw: bool = True,
-    progress_meter: diffrax.AbstractProgressMeter = diffrax.NoProgressMeter(),
+    stepsize_controller: diffrax.AbstractStepSizeController | None,
+    dt0: ArrayLike | None,
+    adjoint: diffrax.AbstractAdjoint,
+    max_steps: int | None,
+    throw: bool,
+    progress_meter: diffrax.AbstractProgressMeter,
 ) -> tuple[diffrax.AbstractSolver | None, dict[str, Any]]:
     """The keywords of `simulate`, checked: the solver, and those of diffeqsolve.
 
@@ -148,6 +148,14 @@ def simulate(
             raise TypeError(
                 "forward-mode differentiation of simulate needs "
                 "adjoint=diffrax.ForwardMode()."
+            ) from error
+        raise
+    except Exception as error:
+        if "closed-over value" in str(error):
+            raise TypeError(
+                "forces: expected what is differentiated to be an array of an element "
+                "or closed over by a plain function, got an element that holds a "
+                "function that closes over it."
             ) from error
         raise
     # Of the times themselves, for derivatives in them.

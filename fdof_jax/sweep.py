@@ -275,10 +275,12 @@ def sweep(
     chunk: int = 256,
     throw: bool = False,
     checkpoint: str | os.PathLike | None = None,
-    progress_meter: diffrax.AbstractProgressMeter = diffrax.NoProgressMeter(),
+    solver: diffrax.AbstractSolver | None = None,
     stepsize_controller: diffrax.AbstractStepSizeController | None = None,
+    dt0: ArrayLike | None = 1e-3,
+    adjoint: diffrax.AbstractAdjoint = diffrax.RecursiveCheckpointAdjoint(),
     max_steps: int | None = 65536,
-    **keywords: Any,
+    progress_meter: diffrax.AbstractProgressMeter = diffrax.NoProgressMeter(),
 ) -> Solution:
     """Many motions, as `jax.vmap(simulate)` would give them, faster.
 
@@ -298,8 +300,8 @@ def sweep(
     - `throw`: whether any failed member raises.
     - `checkpoint`: a folder for the results of finished chunks. The same call goes on
       from there.
-    - `progress_meter`, `stepsize_controller`, `max_steps` and other keywords: as in
-      `simulate`.
+    - `solver`, `stepsize_controller`, `dt0`, `adjoint`, `max_steps`,
+      `progress_meter`: as in `simulate`.
 
     **Returns:** a `Solution` with a leading batch axis everywhere; `result` tells each
     member's end. Under `jax.grad` or another transformation a failed member adds
@@ -320,20 +322,27 @@ def sweep(
         raise ValueError(f"ts: expected increasing times, got {times.tolist()[:20]}.")
     callable_tuple("forces", forces)
     whole_number("chunk", chunk, 1)
-    solver, options = solve_options(
+    solver, settings = solve_options(
+        solver,
         stepsize_controller=stepsize_controller,
+        dt0=dt0,
+        adjoint=adjoint,
         max_steps=max_steps,
         throw=throw,
         progress_meter=progress_meter,
-        **keywords,
     )
-    settings = {
-        name: options[name]
-        for name in ("stepsize_controller", "dt0", "adjoint", "max_steps")
-    } | {"solver": solver}
+    del settings["progress_meter"]  # it is for members done, not for times
+    settings["solver"] = solver
     batch = batch_of(linkage, state0, forces, forces_axes)
     if checkpoint is not None and not isinstance(checkpoint, str | os.PathLike):
         raise ValueError(f"checkpoint: expected a folder, got {checkpoint!r}.")
+    try:
+        eqx.filter_eval_shape(_expected_work, ts[0], *batch.split())
+    except TypeError as error:
+        raise TypeError(
+            "forces, forces_axes: one member's force elements, with the arrays that "
+            f"are its own as forces_axes={forces_axes!r} says, raised: {error}"
+        ) from error
     if is_traced(batch.inputs, ts):
         if throw or checkpoint is not None:
             raise ValueError(

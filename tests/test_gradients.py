@@ -12,6 +12,7 @@ from fdof_jax import scenes
 from fdof_jax.control import tip_deviation
 
 TS = np.linspace(0, 1.0, 21)
+ZERO = jnp.zeros(3)
 
 
 def scene_at(parameters):
@@ -147,3 +148,21 @@ def test_derivatives_in_the_times_themselves():
 
     difference = (loss(1 + 1e-5) - loss(1 - 1e-5)) / 2e-5
     np.testing.assert_allclose(jax.grad(loss)(1.0), difference, rtol=1e-7)
+
+
+def test_a_function_may_close_over_what_is_differentiated():
+    scene = scenes.fig5()
+
+    def end(damping, make):
+        forces = (make(damping),)
+        return fj.simulate(scene.linkage, scene.state0, [0, 0.3], forces).q[-1, 0]
+
+    closed = jax.value_and_grad(end)(0.5, lambda c: lambda t, q, qd, linkage: -c * qd)
+    held = jax.value_and_grad(end)(0.5, fj.JointDamper)
+    np.testing.assert_allclose(closed, held, rtol=1e-8)
+
+    def controller(c):
+        return fj.PDController(1.0, 1.0, 9.0, lambda t, linkage: (c * ZERO, ZERO))
+
+    with pytest.raises(TypeError, match="^forces: expected what is differentiated"):
+        jax.grad(end)(0.5, controller)

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_sweep import SETTINGS, TS, members
+from sweep_batch import SETTINGS, TS, members
 
 import fdof_jax as fj
 
@@ -41,6 +41,12 @@ def test_one_size_is_expected():
     refused(INPUTS, state0=three, forces=())
     refused(INPUTS, linkage=ONE, state0=three)
     refused(INPUTS, linkage=ONE, state0=fj.State(three.q, np.zeros((2, 3))), forces=())
+    damper = (fj.JointDamper([1.0, 2.0, 3.0]),)  # one for all, not one per member
+    sizes = r"state0\.q: 2, .*forces\[0\]\.coefficient: 3\.$"
+    with pytest.raises(ValueError, match=sizes):
+        fj.sweep(TWO, STATES, TS, damper, forces_axes=0)
+    with pytest.raises(TypeError, match="^forces, forces_axes: .*forces_axes=0"):
+        fj.sweep(ONE, three, TS, damper, forces_axes=0)
 
 
 @pytest.mark.parametrize("field", ["ef", "com", "mass", "gravity"])
@@ -108,6 +114,11 @@ def test_other_axes_are_refused(axes):
 def test_malformed_options_are_refused(name, values):
     for value in values:
         refused(name, **{name: value})
+
+
+def test_a_misspelt_keyword_is_refused():
+    with pytest.raises(TypeError, match=r"sweep\(\) got an unexpected .*'rtol'"):
+        fj.sweep(TWO, STATES, TS, rtol=1e-6)
 
 
 def test_what_a_transformation_cannot_do_is_refused(tmp_path):

@@ -1,4 +1,4 @@
-"""Members of a batch that fail, and steps that run out.
+"""Scenes 25 and 26: members of a batch that fail, and steps that run out.
 
 More on members that fail is in tests/test_sweep.py.
 """

@@ -1,4 +1,4 @@
-"""Derivatives of losses at their very minimum, and second ones of a batch."""
+"""Scenes 28 and 29: derivatives of losses at their minimum, Hessians of a batch."""
 
 import diffrax
 import equinox as eqx

@@ -1,4 +1,4 @@
-"""Mass matrices close to singular, and singular ones."""
+"""Scenes 3 and 5: mass matrices close to singular, and singular ones."""
 
 import diffrax
 import equinox as eqx

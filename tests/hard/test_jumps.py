@@ -1,4 +1,4 @@
-"""Efforts that jump at times known beforehand."""
+"""Scene 24: efforts that jump at times known beforehand."""
 
 import equinox as eqx
 import jax

@@ -1,4 +1,4 @@
-"""Malformed input behind the doors: where no constructor and no call sees the values.
+"""Scene 30: malformed input behind the doors, where no call sees the values.
 
 What doors refuse, at every function and argument, is in tests/test_bad_input.py and
 tests/test_sweep_input.py; locked velocities are in tests/test_linkage.py.

@@ -1,4 +1,4 @@
-"""Derivatives of an arm that hangs at rest."""
+"""Scene 12: derivatives of an arm that hangs at rest."""
 
 import diffrax
 import jax

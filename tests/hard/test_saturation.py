@@ -1,4 +1,4 @@
-"""Derivatives at the limits of the actuators, and beyond them.
+"""Scene 19: derivatives at the limits of the actuators, and beyond them.
 
 That a tuner says so is in tests/test_tuning.py.
 """

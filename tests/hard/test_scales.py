@@ -1,4 +1,4 @@
-"""Arms of other sizes than a metre, in other units, and after many turns."""
+"""Scenes 21 and 22: other sizes than a metre, other units, and many turns away."""
 
 import equinox as eqx
 import numpy as np

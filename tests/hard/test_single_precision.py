@@ -1,4 +1,4 @@
-"""Single precision, in a process of its own as x64 is on here: an ulp is 1.2e-7."""
+"""Scene 23: single precision, whose ulp is 1.2e-7, in a process of its own."""
 
 import os
 import subprocess

@@ -1,4 +1,4 @@
-"""Stiff controllers and dampers, and one that chatters at its limit."""
+"""Scenes 17, 18 and 20: stiff controllers and dampers, one chatters at its limit."""
 
 import diffrax
 import jax
