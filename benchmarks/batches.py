@@ -77,7 +77,7 @@ def measure_batch(
         contestant = contestant._replace(
             motion=lambda r, motion=motion: first_members(motion(r), judged)
         )
-        prepared += cases(contestant, settings, exact)
+        prepared += cases(contestant, settings, exact, problem)
     yield from measure(
         PROTOCOL,
         prepared,

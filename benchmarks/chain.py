@@ -23,9 +23,16 @@ class Drive(NamedTuple):
 
 
 def make_rates(
-    linkage: fj.Linkage, sin: Callable, cos: Callable, drive: Drive | None = None
+    linkage: fj.Linkage,
+    sin: Callable,
+    cos: Callable,
+    drive: Drive | None = None,
+    control: Callable | None = None,
 ) -> Callable:
-    """Rates of (q1, q2, q3, qd1, qd2, qd3), as a function of these six."""
+    """Rates of (q1, q2, q3, qd1, qd2, qd3), as a function of these six and the time.
+
+    `control` returns three more joint efforts, from the time and the six.
+    """
     ef = np.asarray(linkage.ef)
     r1, r2, r3 = (bool(e) for e in ef[1::2] > 0.5)
     l1, l2, l3 = (float(x) for x in linkage.locked)
@@ -38,10 +45,12 @@ def make_rates(
     # A revolute joint turns (1) and does not slide (0), a prismatic one the reverse.
     t1, t2, t3 = float(r1), float(r2), float(r3)
     p1, p2, p3 = 1 - t1, 1 - t2, 1 - t3
-    driven = drive is not None
+    driven, controlled = drive is not None, control is not None
     (f1, f2, f3), (k1, k2, k3), (g1, g2, g3), (d1, d2, d3) = drive or Drive()
 
-    def rates(q1: Any, q2: Any, q3: Any, u1: Any, u2: Any, u3: Any) -> tuple:
+    def rates(
+        q1: Any, q2: Any, q3: Any, u1: Any, u2: Any, u3: Any, t: Any = 0.0
+    ) -> tuple:
         th2 = base + (q1 if r1 else l1)
         th3 = th2 + (q2 if r2 else l2)
         th4 = th3 + (q3 if r3 else l3)
@@ -109,6 +118,9 @@ def make_rates(
             h1 = h1 + f1 + k1 * (g1 - q1) - d1 * u1
             h2 = h2 + f2 + k2 * (g2 - q2) - d2 * u2
             h3 = h3 + f3 + k3 * (g3 - q3) - d3 * u3
+        if controlled:
+            c1st, c2nd, c3rd = control(t, q1, q2, q3, u1, u2, u3)
+            h1, h2, h3 = h1 + c1st, h2 + c2nd, h3 + c3rd
         # Elimination from the last joint.
         n13, n23 = m13 / m33, m23 / m33
         n22, n12 = m22 - n23 * m23, m12 - n13 * m23

@@ -47,7 +47,7 @@ def run(quick: bool) -> Iterator[dict]:
         exact, prepared = reference(problem), []
         for name, solver in ((WATCHED, UnrolledDopri8()), (UNWATCHED, _Unwatched())):
             contestant = fdof_jax(problem, solver)._replace(solver=name)
-            prepared += cases(contestant, (TOLERANCE,), exact)
+            prepared += cases(contestant, (TOLERANCE,), exact, problem)
         batch = problem.batch or 1
         for point in measure(
             PROTOCOL,

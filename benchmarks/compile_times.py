@@ -79,7 +79,6 @@ CASES = {
     "value and gradient, forward": gradient_forward,
     "value and gradient, forward, XLA_FLAGS": gradient_forward,
     "value and gradient, reverse": gradient_reverse,
-    "value and gradient, reverse, XLA_FLAGS": gradient_reverse,
 }
 
 

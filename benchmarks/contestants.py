@@ -43,10 +43,27 @@ class Contestant(NamedTuple):
     motion: Callable[[Any], Motion]
 
 
+@jax.jit
+def energy(linkage: fj.Linkage, q: jax.Array, qd: jax.Array) -> jax.Array:
+    """Total energy at each of some states of one arm [J]."""
+    kinetic, potential = jax.vmap(fj.energy, (None, 0, 0))(linkage, q, qd)
+    return kinetic + potential
+
+
+def _energy_defect(problem: Problem, motion: Motion) -> float | None:
+    """The largest change of energy [J], where nothing but gravity does work."""
+    if problem.forces or problem.batch is not None or motion.qd is None:
+        return None
+    start = fj.energy(problem.linkage, *problem.state0)
+    values = energy(problem.linkage, jnp.asarray(motion.q), jnp.asarray(motion.qd))
+    return float(jnp.max(jnp.abs(values - sum(start))))
+
+
 def cases(
     contestant: Contestant,
     settings: tuple,
     exact: np.ndarray,
+    problem: Problem,
     until: int | None = None,
 ) -> list[Case]:
     """One case per setting, judged by its worst position error at any output time.
@@ -63,6 +80,7 @@ def cases(
         return {
             "error": float(errors[..., :until, :].max()),
             "error_end": float(errors.max()),
+            "energy_defect": _energy_defect(problem, motion),
             "steps": None if motion.steps is None else float(np.mean(motion.steps)),
             "rejected": (
                 None if motion.rejected is None else float(np.mean(motion.rejected))
@@ -167,7 +185,7 @@ class Form(NamedTuple):
     name: str
     field: Callable
     start: Callable  # (linkage, state0) -> y
-    joints: Callable  # (linkage, y) -> q
+    joints: Callable  # (linkage, y) -> q, qd
 
 
 @cache
@@ -188,7 +206,7 @@ def _plain_solve(form: Form, axes: tuple | None) -> Callable:
                 throw=False,
             )
             return Motion(
-                jax.vmap(form.joints, (None, 0))(linkage, solution.ys),
+                *jax.vmap(form.joints, (None, 0))(linkage, solution.ys),
                 steps=solution.stats["num_accepted_steps"],
                 rejected=solution.stats["num_rejected_steps"],
             )
@@ -232,8 +250,9 @@ def _masked_field(t, y, args):
 
 
 def _masked_joints(linkage, y):
-    slide, turn = y[0:6:2], jnp.diff(y[1:6:2], prepend=linkage.base_angle)
-    return jnp.where(linkage.ef[1::2] > 0.5, turn, slide)
+    revolute = linkage.ef[1::2] > 0.5
+    q = jnp.where(revolute, jnp.diff(y[1:6:2], prepend=linkage.base_angle), y[0:6:2])
+    return q, jnp.where(revolute, jnp.diff(y[7::2], prepend=0), y[6::2])
 
 
 def _reduced_field(t, y, args):
@@ -247,18 +266,18 @@ def _stacked(linkage, state0):
     return jnp.concatenate([state0.q, state0.qd])
 
 
-def _first_three(linkage, y):
-    return y[:3]
+def _halves(linkage, y):
+    return y[:3], y[3:]
 
 
-textbook_form = Form("plain diffrax", _textbook_field, _stacked, _first_three)
+textbook_form = Form("plain diffrax", _textbook_field, _stacked, _halves)
 masked_form = Form(
     "plain diffrax, masked 6x6",
     _masked_field,
     lambda linkage, state0: jnp.concatenate(fj.to_chain(linkage, *state0)),
     _masked_joints,
 )
-reduced_form = Form("plain diffrax, reduced", _reduced_field, _stacked, _first_three)
+reduced_form = Form("plain diffrax, reduced", _reduced_field, _stacked, _halves)
 
 
 def plain_textbook(problem: Problem) -> Contestant:

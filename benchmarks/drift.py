@@ -9,11 +9,8 @@ from functools import partial
 from typing import Any
 
 import diffrax
-import jax
 import jax.numpy as jnp
 import numpy as np
-
-import fdof_jax as fj
 
 from . import contestants as own, peers
 from .contestants import Contestant
@@ -43,16 +40,10 @@ TABLE = (
 )
 
 
-@jax.jit
-def _energy(linkage: fj.Linkage, q: jax.Array, qd: jax.Array) -> jax.Array:
-    kinetic, potential = jax.vmap(fj.energy, (None, 0, 0))(linkage, q, qd)
-    return kinetic + potential
-
-
 def _judge(problem: Problem, contestant: Contestant, result: Any) -> dict:
     motion = contestant.motion(result)
     q, qd = jnp.asarray(motion.q), jnp.asarray(motion.qd)
-    defect = float(jnp.max(jnp.abs(_energy(problem.linkage, q, qd))))
+    defect = float(jnp.max(jnp.abs(own.energy(problem.linkage, q, qd))))
     # A tenth of a joule is the failure here that a tenth of a radian is elsewhere.
     return {"error": defect, "energy_defect": defect}
 

@@ -83,7 +83,7 @@ def _stacked(problem: Problem, name: str, form, axes) -> Contestant:
             return form.field(0.0, y, (linkage, ()))
 
         y = _rk4(field, form.start(linkage, state0), step, steps)
-        return form.joints(linkage, y)
+        return form.joints(linkage, y)[0]
 
     return _contestant(problem, name, member, axes)
 
@@ -126,7 +126,7 @@ def run(quick: bool) -> Iterator[dict]:
         exact, prepared = reference(problem), []
         for contestant in _contestants(problem):
             if isinstance(contestant, Contestant):
-                prepared += cases(contestant, (STEP,), exact)
+                prepared += cases(contestant, (STEP,), exact, problem)
             else:
                 yield skipped(PROTOCOL, *contestant)
         yield from measure(

@@ -185,16 +185,22 @@ def mujoco(scene: HardScene) -> Callable[[], Run]:
         states = np.array(rows)
         return Run(states[:, 1:4], states[:, 4:7], every * (len(scene.ts) - 1))
 
-    def run() -> Run:
-        for step in MUJOCO_STEPS:
+    refusal: Exception = Refused("no step of these")
+    chosen = None
+    for step in MUJOCO_STEPS:
+        if (scene.ts[-1] - scene.ts[0]) / step > MUJOCO_MOST:
+            break
+        try:
             result = once(step)
-            solved = error_of(scene, result) <= scene.bound
-            longer = 10 * result.steps
-            if solved or longer > MUJOCO_MOST:
-                break
-        return result
-
-    return run
+        except Refused as failure:
+            refusal = failure  # of too long a step, perhaps
+            continue
+        chosen = step
+        if error_of(scene, result) <= scene.bound:
+            break
+    if chosen is None:
+        raise refusal
+    return lambda: once(chosen)
 
 
 def error_of(scene: HardScene, run: Run) -> float:

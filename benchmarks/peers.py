@@ -9,6 +9,7 @@ import os
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from typing import Any
+from xml.etree import ElementTree
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +18,7 @@ import numpy as np
 import fdof_jax as fj
 
 from .chain import Drive, make_rates
+from .circle import make_control, make_reference
 from .contestants import DT0, MAX_STEPS, Contestant, Motion
 from .measure import Skipped
 from .native import Kernel
@@ -33,7 +35,11 @@ def module(name: str) -> Any:
 
 def _one_free_arm(problem: Problem) -> None:
     if problem.forces:
-        raise Skipped("no force elements")
+        raise Skipped("no controllers with limits")
+    _one_arm(problem)
+
+
+def _one_arm(problem: Problem) -> None:
     if problem.batch and problem.axes[0] == 0:
         raise Skipped("one arm only, not a batch of different ones")
 
@@ -57,18 +63,20 @@ _COMPILED: dict[str, tuple] = {}
 def _scalar_rates(problem: Problem) -> tuple:
     """The equations in plain floats, and what runs them; compiled once per problem."""
     if problem.name not in _COMPILED:
-        rates, language = make_rates(problem.linkage, math.sin, math.cos), "Python"
+        compiled, language = (lambda f: f), "Python"
         try:
-            rates, language = importlib.import_module("numba").njit(rates), "numba"
+            compiled, language = importlib.import_module("numba").njit, "numba"
         except ImportError:
             pass
-        _COMPILED[problem.name] = rates, language
+        control = make_control(problem, compiled) if problem.forces else None
+        rates = make_rates(problem.linkage, math.sin, math.cos, control=control)
+        _COMPILED[problem.name] = compiled(rates), language
     return _COMPILED[problem.name]
 
 
 def scipy(problem: Problem, method: str) -> Contestant:
     """`solve_ivp` on a right-hand side compiled by numba where it is installed."""
-    _one_free_arm(problem)
+    _one_arm(problem)
     if problem.batch is not None:
         raise Skipped("no batches")
     integrate = module("scipy.integrate")
@@ -76,7 +84,7 @@ def scipy(problem: Problem, method: str) -> Contestant:
 
     def run(tolerance: float) -> Any:
         return integrate.solve_ivp(
-            lambda t, y: rates(*y),
+            lambda t, y: rates(*y, t),
             (problem.ts[0], problem.ts[-1]),
             np.concatenate([problem.state0.q, problem.state0.qd]),
             method=method,
@@ -89,16 +97,41 @@ def scipy(problem: Problem, method: str) -> Contestant:
     def motion(result: Any) -> Motion:
         if not result.success:
             return Motion(np.full((len(problem.ts), 3), np.nan))
-        return Motion(result.y[:3].T)
+        return Motion(result.y[:3].T, result.y[3:].T)
 
     return Contestant(f"SciPy {method}, {language}", "tolerance", run, motion)
 
 
+def _with_servos(problem: Problem) -> str:
+    """The arm as MJCF, its controller, if it has one, as actuators."""
+    text = fj.to_mjcf(problem.linkage)
+    if not problem.forces:
+        return text
+    root, (controller,) = ElementTree.fromstring(text), problem.forces
+    actuators = ElementTree.SubElement(root, "actuator")
+    values = zip(
+        *(np.asarray(x) for x in (controller.kp, controller.kd, controller.limit))
+    )
+    for joint, (kp, kd, limit) in zip(root.iter("joint"), values):
+        ElementTree.SubElement(
+            actuators,
+            "position",
+            joint=joint.attrib["name"],
+            kp=repr(float(kp)),
+            kv=repr(float(kd)),
+            forcerange=f"{-float(limit)!r} {float(limit)!r}",
+        )
+    return ElementTree.tostring(root, encoding="unicode")
+
+
 def mujoco(problem: Problem, integrator: str) -> Contestant:
-    """MuJoCo's own rollout in C; `integrator`: Euler, implicitfast or RK4."""
-    _one_free_arm(problem)
+    """MuJoCo's own rollout in C; `integrator`: Euler, implicitfast or RK4.
+
+    A controller becomes its position servos, whose set points are held over a step.
+    """
+    _one_arm(problem)
     mj, rollout = module("mujoco"), module("mujoco.rollout")
-    model = mj.MjModel.from_xml_string(fj.to_mjcf(problem.linkage))
+    model = mj.MjModel.from_xml_string(_with_servos(problem))
     kind = {"Euler": "EULER", "implicitfast": "IMPLICITFAST", "RK4": "RK4"}[integrator]
     model.opt.integrator = getattr(mj.mjtIntegrator, f"mjINT_{kind}")
     q, qd = (np.atleast_2d(a) for a in problem.state0)
@@ -107,11 +140,19 @@ def mujoco(problem: Problem, integrator: str) -> Contestant:
     data = [mj.MjData(model) for _ in range(min(_threads(), len(q)))]
     single = problem.batch is None
 
+    @cache
+    def set_points(step: float, count: int) -> np.ndarray:
+        reference, (controller,) = make_reference(problem), problem.forces
+        rows = np.array([reference(k * step) for k in range(count)])
+        lead = np.asarray(controller.kd / controller.kp)  # for the velocities
+        return (rows[:, :3] + lead * rows[:, 3:])[None]
+
     def run(step: float) -> Any:
         model.opt.timestep = step
         every = _steps(problem, step)
         count = every * (len(problem.ts) - 1)
-        states, _ = rollout.rollout(model, data, start, nstep=count)
+        chosen = {"control": set_points(step, count)} if problem.forces else {}
+        states, _ = rollout.rollout(model, data, start, nstep=count, **chosen)
         return states[:, every - 1 :: every, 1:7]
 
     def motion(states: np.ndarray) -> Motion:

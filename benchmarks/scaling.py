@@ -60,7 +60,7 @@ def run(quick: bool) -> Iterator[dict]:
         prepared: list[Case] = []
         for x, problem, tolerance in members(quick):
             contestant = own.fdof_jax(problem)
-            (case,) = cases(contestant, (tolerance,), reference(problem))
+            (case,) = cases(contestant, (tolerance,), reference(problem), problem)
             prepared.append(case._replace(fields={"x": x, "batch": problem.batch or 1}))
         points = measure(PROTOCOL, prepared, budget=3 if quick else 8, problem=series)
         if series == "error":

@@ -94,7 +94,7 @@ def _prepared(problem: Problem, exact: np.ndarray, table: list[Row]) -> Iterator
             continue
         chosen = _settings(contestant, problem, settings)
         until = 21 if problem.name == "fig5" else None
-        yield from cases(contestant, chosen, exact, until)
+        yield from cases(contestant, chosen, exact, problem, until)
 
 
 def measure_one(

@@ -47,8 +47,9 @@ def inertia_ratios(
     constants = link_constants(linkage, q)
     m = equations(constants, zeros(q), zeros(q))
     i11, i22, i33 = inverse_inertia_diagonal(constants, m)
+    pairs = (i11, m.m11), (i22, m.m22), (i33, m.m33)
     # Divided twice, as a product of zero and infinity is not a number.
-    return jnp.stack([1 / i11 / m.m11, 1 / i22 / m.m22, 1 / i33 / m.m33])
+    return jnp.stack([jnp.where(own > 0, 1 / i / own, 0) for i, own in pairs])
 
 
 @compiled(q=(3,), qd=(3,), qdd=(3,))

@@ -245,5 +245,5 @@ def solve(solver, inputs, keywords) -> Solution:
         return _integrate_reversibly(_opened(inputs), solver, keywords)
     if solver is None:
         forward = isinstance(adjoint, diffrax.ForwardMode)
-        solver = UnrolledDopri8() if forward else diffrax.Dopri8()
+        solver = UnrolledDopri8(for_tangents=True) if forward else diffrax.Dopri8()
     return _integrate(solver, inputs, keywords, derivatives=True)

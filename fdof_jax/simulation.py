@@ -92,7 +92,9 @@ def simulate(
     **Arguments:**
 
     - `linkage`, `state0`: the arm, and its joint positions and velocities.
-    - `ts`: increasing times, of shape (time,) [s].
+    - `ts`: increasing times, of shape (time,) [s]. Between steps states are
+      interpolated, where they may be a hundred times less exact than at the last time,
+      which a step ends at; `diffrax.ClipStepSizeController` makes others end at `ts`.
     - `forces`: a tuple of force elements `(t, q, qd, linkage) -> tau`.
     - `solver`, `stepsize_controller`, `dt0`, `adjoint`, `max_steps`, `throw`,
       `progress_meter`: as in `diffrax.diffeqsolve`. By default Dopri8 at a relative

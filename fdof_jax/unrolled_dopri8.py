@@ -33,6 +33,7 @@ for _row, _entries in enumerate(_TABLEAU.a_lower):
 _NODES = np.concatenate([[0.0], _TABLEAU.c])
 _INTERPOLATION: Any = diffrax.Dopri8.interpolation_cls
 _DENSE = _INTERPOLATION.eval_coeffs  # (stage, power), highest first
+_USED = [stage for stage, row in enumerate(_DENSE) if row.any()]
 
 State = PyTree  # of scalars
 Rates = Sequence[State]  # one per stage
@@ -86,14 +87,20 @@ def _at(stage: int, tree: PyTree) -> PyTree:
 class _Step(NamedTuple):
     """The end of a step, the step's error and what the next one needs.
 
-    `lost` is what the rounding of `y` took away. The next step adds it (Kahan): over
-    1000 s of Fig 5 in steps of 2.5 ms the energy drifts by 3e-11 J, not 1.5e-10 J.
+    `rate` is the one at the end, with its `health`; `lost` is what the rounding of `y`
+    took away. The next step adds it (Kahan): over 1000 s of Fig 5 in steps of 2.5 ms
+    the energy drifts by 3e-11 J, not 1.5e-10 J.
     """
 
     y: State
     error: State
     lost: State
+    rate: State
     health: Array
+
+
+def _vector(tree: State) -> Array:
+    return jnp.stack(jtu.tree_leaves(tree))
 
 
 def _unrolled(fields, times, h, y0, lost, args, schedule, f0) -> tuple[_Step, Rates]:
@@ -111,13 +118,22 @@ def _unrolled(fields, times, h, y0, lost, args, schedule, f0) -> tuple[_Step, Ra
     y = jtu.tree_map(lambda a: a + poison, y)
     y, error, lost = in_one_loop((y, error, lost))
     last, health = watched(times[-1], y, args, _at(-1, schedule))
-    return _Step(y, error, lost, health), [*rates, last]
+    return _Step(y, error, lost, last, health), [*rates, last]
+
+
+def _stacked(rates: Sequence[Array]) -> Array:
+    return jnp.stack([rates[stage] for stage in _USED])
 
 
 @eqx.filter_custom_jvp
-def _stages(fields, times, h, y0, lost, args, schedule, f0) -> tuple[_Step, Rates]:
-    """A step of length `h`, and the rates at all stages, the last at its end."""
-    return _unrolled(fields, times, h, y0, lost, args, schedule, f0)
+def _stages(fields, stack, times, h, y0, lost, args, schedule, f0) -> tuple[_Step, Any]:
+    """A step of length `h`, and the rates at all stages, the last at its end.
+
+    With `stack` one array (stage, rate) of those that interpolation uses: tangents of
+    so many scalars would each be a loop of its own.
+    """
+    step, rates = _unrolled(fields, times, h, y0, lost, args, schedule, f0)
+    return step, _stacked([_vector(rate) for rate in rates]) if stack else rates
 
 
 def _times(matrix: Array, vector: Array) -> Array:
@@ -128,14 +144,12 @@ def _times(matrix: Array, vector: Array) -> Array:
 @_stages.def_jvp
 def _stages_jvp(primals, tangents):
     """All stages are linearised at once, then their tangents follow one another."""
-    (field, _), times, h, y0, _, args, schedule, _ = primals
-    _, times_dot, h_dot, y0_dot, _, args_dot, schedule_dot, _ = tangents
-    step, rates = _stages(*primals)  # itself, for derivatives of derivatives
+    (field, watched), stack, times, h, y0, _, args, schedule, _ = primals
+    _, _, times_dot, h_dot, y0_dot, _, args_dot, schedule_dot, _ = tangents
+    # Itself, for derivatives of derivatives.
+    step, rates = _stages((field, watched), False, *primals[2:])
     increments = [_combine(row, rates) for row in _LOWER[:-1]]
     states = [y0, *(_sum(y0, _scaled(h, k)) for k in increments), step.y]
-
-    def vector(tree):
-        return jnp.stack(jtu.tree_leaves(tree))
 
     def state(vector):
         return jtu.tree_unflatten(jtu.tree_structure(y0), list(vector))
@@ -152,7 +166,7 @@ def _stages_jvp(primals, tangents):
 
         def rate_of(y, moving):
             t, args, scheduled = eqx.combine(moving, fixed)
-            return vector(field(t, state(y), args, scheduled))
+            return _vector(field(t, state(y), args, scheduled))
 
         _, tangent = jax.linearize(rate_of, y, moving)
         still = jtu.tree_map(jnp.zeros_like, moving)
@@ -162,9 +176,13 @@ def _stages_jvp(primals, tangents):
 
     # The rate at the start is linearised too: no tangent comes with it.
     jacobians, drives = jax.vmap(linearised)(
-        jnp.stack([vector(y) for y in states]), times, times_dot, schedule, schedule_dot
+        jnp.stack([_vector(y) for y in states]),
+        times,
+        times_dot,
+        schedule,
+        schedule_dot,
     )
-    start = vector(eqx.combine(y0_dot, jtu.tree_map(jnp.zeros_like, y0)))
+    start = _vector(eqx.combine(y0_dot, jtu.tree_map(jnp.zeros_like, y0)))
     # Vectors, not scalars: a product with a matrix is computed once, where XLA would
     # compute a chain of scalar expressions anew for each of its results.
     y_dot = start
@@ -172,43 +190,49 @@ def _stages_jvp(primals, tangents):
     for row, jacobian, drive in zip(_LOWER, jacobians[1:], drives[1:]):
         y_dot = start + h * _combine(row, rates_dot)
         if h_dot is not None:
-            y_dot = y_dot + h_dot * vector(_combine(row, rates))
+            y_dot = y_dot + h_dot * _vector(_combine(row, rates))
         rates_dot.append(_times(jacobian, y_dot) + drive)
     # The step control is not differentiated.
     unmoved = jtu.tree_map(jnp.zeros_like, step[1:])
     step_dot = _Step(state(y_dot), *unmoved)
-    return (step, rates), (step_dot, [state(r) for r in rates_dot])
+    if stack:
+        found = _stacked([_vector(rate) for rate in rates])
+        return (step, found), (step_dot, _stacked(rates_dot))
+    return (step, rates), (step_dot, [state(rate) for rate in rates_dot])
 
 
 @eqx.filter_jit  # traced once, not at each of a solve's uses of it
-def _step(term, t0, t1, y0, lost, args, f0) -> tuple[_Step, Rates, Array]:
+def _step(term, stack, t0, t1, y0, lost, args, f0) -> tuple[_Step, Any, Array]:
     # diffrax wraps the term, to integrate backward in time too.
     inner, h = term.term, term.contr(t0, t1)
     times = (t0 + (t1 - t0) * jnp.asarray(_NODES, t0.dtype)) * term.direction
     schedule = jax.vmap(inner.schedule, in_axes=(0, None))(times, args)
     fields = eqx.filter_jit(inner.vector_field), inner.watched_field
-    return *_stages(fields, times, h, y0, lost, args, schedule, f0), h
+    return *_stages(fields, stack, times, h, y0, lost, args, schedule, f0), h
 
 
 @eqx.filter_jit
-def _interpolate(y0: State, h: Array, rates: Rates, theta: Array) -> State:
+def _interpolate(y0: State, h: Array, rates: Rates | Array, theta: Array) -> State:
     # Horner's rule for the weights of all stages at once.
     weights = jnp.zeros(_STAGES, theta.dtype)
     for coefficients in _DENSE.T:
         weights = (weights + coefficients) * theta
-    used = [stage for stage, row in enumerate(_DENSE) if row.any()]
-    rate = _combine([weights[i] for i in used], [rates[i] for i in used])
+    weights = [weights[stage] for stage in _USED]
+    if isinstance(rates, Array):
+        change = h * jnp.sum(jnp.stack(weights)[:, None] * rates, axis=0)
+        return _sum(y0, jtu.tree_unflatten(jtu.tree_structure(y0), list(change)))
+    rate = _combine(weights, [rates[stage] for stage in _USED])
     return _sum(y0, _scaled(h, rate))
 
 
 class _Interpolation(diffrax.AbstractLocalInterpolation):
-    """diffrax's dense output for this method, on unstacked rates."""
+    """diffrax's dense output for this method."""
 
     t0: Any  # pyright: ignore[reportIncompatibleVariableOverride]
     t1: Any  # pyright: ignore[reportIncompatibleVariableOverride]
     y0: State
     step: Array
-    rates: Rates
+    rates: Any
 
     def evaluate(self, t0, t1=None, left=True):
         del left
@@ -223,7 +247,13 @@ class _Interpolation(diffrax.AbstractLocalInterpolation):
 
 
 class UnrolledDopri8(diffrax.AbstractAdaptiveSolver):
-    """The method of `diffrax.Dopri8`, equal to rounding: the default of `simulate`."""
+    """The method of `diffrax.Dopri8`, equal to rounding: the default of `simulate`.
+
+    `for_tangents`: whether forward-mode derivatives are wanted, which it is then made
+    for.
+    """
+
+    for_tangents: bool = eqx.field(static=True, default=False)
 
     term_structure: ClassVar = ScheduledTerm
     interpolation_cls: ClassVar = _Interpolation
@@ -252,9 +282,9 @@ class UnrolledDopri8(diffrax.AbstractAdaptiveSolver):
             fresh = self._start(terms, t0, y0, args)
             start = jtu.tree_map(lambda a, b: jnp.where(made_jump, a, b), fresh, start)
         f0, health = start
-        end, rates, h = _step(terms, t0, t1, y0, lost, args, f0)
+        end, rates, h = _step(terms, self.for_tangents, t0, t1, y0, lost, args, f0)
         dense_info = dict(y0=y0, step=h, rates=rates)
-        state = jax.lax.stop_gradient(((rates[-1], end.health), end.lost))
+        state = jax.lax.stop_gradient(((end.rate, end.health), end.lost))
         # A step in bad health is rejected until it is short. The result of a rejected
         # one would not count, so that one is kept.
         bad = jnp.isnan(end.health) | (health == 0)

@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 
 from benchmarks import page, targets
+from benchmarks.circle import make_control, make_reference
 from benchmarks.measure import RECORD, Case, envelope, measure, times_at
 from benchmarks.native import Kernel
-from benchmarks.problems import Problem, random_linkage, reference
+from benchmarks.problems import Problem, fig7, random_linkage, reference as solved
 from fdof_jax import State
 
 ROOT = Path(__file__).parent.parent
@@ -85,7 +86,20 @@ def test_the_c_kernel_agrees_with_the_library(method, step, batch):
     problem = Problem("test", linkage, state0, (), np.array([0.0, 0.5, 1.0]), "RRR")
     kernel = Kernel(method, linkage, *state0)
     q, _ = kernel.joints(kernel(step, round(0.5 / step), saves=2))
-    np.testing.assert_allclose(q, reference(problem)[:, 1:], atol=1e-9)
+    np.testing.assert_allclose(q, solved(problem)[:, 1:], atol=1e-9)
+
+
+def test_the_circle_in_scalars_is_that_of_the_library():
+    problem = fig7()
+    (controller,) = problem.forces
+    reference, control = make_reference(problem), make_control(problem)
+    rng = np.random.default_rng(0)
+    for t in np.linspace(0, 10, 9):
+        q, qd = controller.reference(t, problem.linkage)
+        np.testing.assert_allclose(reference(t), [*q, *qd], rtol=1e-12, atol=1e-12)
+        state = np.concatenate([q, qd]) + rng.uniform(-0.3, 0.3, 6)
+        effort = controller(t, state[:3], state[3:], problem.linkage)
+        np.testing.assert_allclose(control(t, *state), effort, rtol=1e-9, atol=1e-9)
 
 
 @pytest.fixture(scope="module")

@@ -18,6 +18,7 @@ from .random_scenes import Scene
 from .refusals import linkage_of, refusal
 
 TOLERANCE = 1e-11  # of simulate's default, relative and absolute
+INTERPOLATED = 30  # times the error of steps, at most, between them
 MAX_STEPS = 4096
 RESULTS = "successful max_steps_reached dt_min_reached singular nonfinite".split()
 
@@ -50,7 +51,7 @@ def check_motion(scene: Scene, report: Report) -> str:
     name = result_name(solution.result)
     q, qd = np.asarray(solution.q), np.asarray(solution.qd)
     steps = int(solution.stats["num_steps"])
-    report.motions.append((scene, ts, name, q, qd))
+    report.motions.append((scene, ts, name, q, qd, steps))
     finite = np.isfinite(np.concatenate([q, qd], axis=1)).all(axis=1)
     # From 1 ms in steps of a fifth, nothing takes so many to begin with.
     if steps > 100 and not int(solution.stats["num_accepted_steps"]):
@@ -125,11 +126,13 @@ def _check_energy(scene: Scene, ts, q, qd, steps: int, report: Report) -> None:
             )
 
 
-def check_state(scene: Scene, ts, q, qd, report: Report) -> str:
+def check_state(scene: Scene, ts, q, qd, steps: int, report: Report) -> str:
     """States against a run at 30 digits; the bound is what small changes would do.
 
-    Two more runs start as far off as the tolerance allows, with parameters wrong in
-    their last digits, all with random signs.
+    And each step may be wrong by the tolerance; what is interpolated between steps,
+    all but the end, by `INTERPOLATED` times that. Two more runs start as far off as
+    the tolerance allows, with parameters wrong in their last digits, all with random
+    signs.
     """
 
     def states(arm, q, qd):
@@ -143,7 +146,7 @@ def check_state(scene: Scene, ts, q, qd, report: Report) -> str:
 
     try:
         exact = states(scene.arm, scene.q, scene.qd)
-        bound = TOLERANCE * (1 + np.abs(np.array(exact, dtype=float)))
+        bound = np.zeros((len(ts), 6))
         for _ in range(2):
             arm = scene.arm
             other = states(
@@ -166,7 +169,9 @@ def check_state(scene: Scene, ts, q, qd, report: Report) -> str:
             ]
     except oracle.MotionTooLong:
         return "state: reference too long"
-    bound = 10 * np.maximum.accumulate(bound)
+    size = TOLERANCE * (1 + np.abs(np.array(exact, dtype=float)))
+    size[1:-1] *= INTERPOLATED
+    bound = 10 * np.maximum.accumulate(bound) + (10 + steps) * size
     got = np.concatenate([q, qd], axis=1)
     error = np.array(
         [
@@ -182,14 +187,14 @@ def check_state(scene: Scene, ts, q, qd, report: Report) -> str:
 
 def check_sample(report: Report, sample: int) -> None:
     """States of the first motions that are short enough, against the reference."""
-    for scene, ts, name, q, qd in report.motions:
+    for scene, ts, name, q, qd, steps in report.motions:
         if sample == 0:
             break
         if name != "successful" or scene.pace > 3:
             continue
         sample -= 1
         try:
-            outcome = check_state(scene, ts, q, qd, report)
+            outcome = check_state(scene, ts, q, qd, steps, report)
         except Failure as failure:
             outcome = "FAILED"
             report.failures.append(("motions", failure, scene))

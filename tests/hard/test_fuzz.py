@@ -86,6 +86,23 @@ FOUND = {
             tau=(1.0, 2.0, 3.0),
         ),
     ),
+    # A joint with no inertia at all: its ratio was 0 / 0, and nobody was told.
+    "a mass at the joint": (
+        "accelerations",
+        scene(
+            Arm(
+                "RRP",
+                length=(-53.251838798845725, 1.0, 0.0, 1.0000000001399305),
+                com=((0.0, -1.0), (1.0, -1.0), (1.0, 0.0)),
+                mass=(1.0, 0.0, 1.0),
+                inertia=(1.0, 0.0, 0.0),
+                locked=(0.0, 0.0, -1.5707963267948966),
+                base_angle=-3.141592653589793,
+                gravity=1.0,
+            ),
+            q=(-79.43282347242814, -1e-12, 1.0),
+        ),
+    ),
     # Singular where it starts: that is a state reached, and its name is not the step.
     "singular at the start": (
         "motions",
