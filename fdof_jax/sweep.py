@@ -272,7 +272,7 @@ def sweep(
     forces: Forces = (),
     *,
     forces_axes: Any = None,
-    chunk: int = 256,
+    chunk: int = 512,
     throw: bool = False,
     checkpoint: str | os.PathLike | None = None,
     solver: diffrax.AbstractSolver | None = None,
