@@ -18,7 +18,7 @@ import numpy as np
 
 import fdof_jax as fj
 
-from .chain import Drive, make_rates
+from .chain import make_rates
 from .hard_engines import MAX_STEPS
 from .hard_scenes import hard
 from .measure import OUTCOMES
@@ -109,12 +109,11 @@ def _negative_mass() -> float:
 def _plain(scene: Any, tolerance: float, effort: Any = None, throw: bool = True) -> Any:
     """The motion under `effort(t)` at the first joint."""
 
-    def field(t, y, args):
-        drive = None if effort is None else Drive(effort=(effort(t), 0.0, 0.0))
-        return jnp.stack(make_rates(scene.linkage, jnp.sin, jnp.cos, drive)(*y))
+    control = None if effort is None else lambda t, *y: (effort(t), 0.0, 0.0)
+    rates = make_rates(scene.linkage, jnp.sin, jnp.cos, control=control)
 
     return diffrax.diffeqsolve(
-        diffrax.ODETerm(field),
+        diffrax.ODETerm(lambda t, y, args: jnp.stack(rates(*y, t))),
         diffrax.Dopri8(),
         scene.ts[0],
         scene.ts[-1],
