@@ -35,11 +35,11 @@ def make_rates(
     """
     ef = np.asarray(linkage.ef)
     r1, r2, r3 = (bool(e) for e in ef[1::2] > 0.5)
-    l1, l2, l3 = (float(x) for x in linkage.locked)
-    a2, a3 = (float(x) for x in linkage.length[1:3])
+    l1, l2, l3 = np.asarray(linkage.locked).tolist()
+    _, a2, a3, _ = np.asarray(linkage.length).tolist()
     (x2, y2), (x3, y3), (x4, y4) = np.asarray(linkage.com).tolist()
-    m2, m3, m4 = (float(x) for x in linkage.mass)
-    i2, i3, i4 = (float(x) for x in linkage.inertia)
+    m2, m3, m4 = np.asarray(linkage.mass).tolist()
+    i2, i3, i4 = np.asarray(linkage.inertia).tolist()
     base, g = float(linkage.base_angle), float(linkage.gravity)
     c1, s1 = float(np.cos(base)), float(np.sin(base))
     # A revolute joint turns (1) and does not slide (0), a prismatic one the reverse.

@@ -19,7 +19,6 @@ import numpy as np
 import fdof_jax as fj
 
 from .chain import make_rates
-from .hard_engines import MAX_STEPS
 from .hard_scenes import hard
 from .measure import OUTCOMES
 
@@ -121,7 +120,7 @@ def _plain(scene: Any, tolerance: float, effort: Any = None, throw: bool = True)
         jnp.concatenate([jnp.asarray(part, dtype=float) for part in scene.state0]),
         saveat=diffrax.SaveAt(ts=jnp.asarray(scene.ts)),
         stepsize_controller=diffrax.PIDController(rtol=tolerance, atol=tolerance),
-        max_steps=MAX_STEPS,
+        max_steps=65536,
         throw=throw,
     )
 
