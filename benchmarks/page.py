@@ -275,7 +275,16 @@ def hard_cases_float32(points: list[dict]) -> str:
 def _machine(points: dict[str, list[dict]]) -> str:
     one = next(p for job in points.values() for p in job)
     versions = ", ".join(f"{k} {v}" for k, v in one["versions"].items() if v)
-    return f"{one['cpu']}; {versions}; commit {one['commit']}."
+    jobs: dict[str, set[str]] = {}
+    for name, job in points.items():
+        for point in job:
+            # Results of the jobs before are changes that are not committed yet.
+            jobs.setdefault(point["commit"].removesuffix("-dirty"), set()).add(name)
+    commits = "; ".join(
+        f"{', '.join(sorted(names))} at commit {commit}"
+        for commit, names in sorted(jobs.items(), key=lambda item: -len(item[1]))
+    )
+    return f"{one['cpu']}; {versions}; {commits}."
 
 
 _NOT_MEASURED = "Not measured: no GPU was at hand."
