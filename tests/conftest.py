@@ -2,6 +2,7 @@ from pathlib import Path
 
 import jax
 import pytest
+import sweep_batch
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
@@ -9,6 +10,29 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 HARD = Path(__file__).parent / "hard"
 # Scripts that need more than the tests do.
 collect_ignore_glob = ["hard/make_*.py"]
+
+
+# Sweeps that several files look at.
+
+
+@pytest.fixture(scope="session")
+def batch():
+    return sweep_batch.members()
+
+
+@pytest.fixture(scope="session")
+def clean(batch):
+    return sweep_batch.run(batch)
+
+
+@pytest.fixture(scope="session")
+def mixed(batch):
+    return sweep_batch.with_failures(batch)
+
+
+@pytest.fixture(scope="session")
+def swept(mixed):
+    return sweep_batch.run(mixed)
 
 
 def pytest_collection_modifyitems(items):

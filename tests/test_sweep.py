@@ -16,10 +16,8 @@ from sweep_batch import (
     SPENT,
     TS,
     alone,
-    members,
     run,
     successful,
-    with_failures,
 )  # fmt: skip
 
 import fdof_jax as fj
@@ -32,26 +30,6 @@ def reason(solution, member):
 def assert_equal(solution, other, tolerance=1e-9):
     for a, b in ((solution.q, other.q), (solution.qd, other.qd)):
         np.testing.assert_allclose(a, b, rtol=tolerance, atol=tolerance)
-
-
-@pytest.fixture(scope="module")
-def batch():
-    return members()
-
-
-@pytest.fixture(scope="module")
-def clean(batch):
-    return run(batch)
-
-
-@pytest.fixture(scope="module")
-def mixed(batch):
-    return with_failures(batch)
-
-
-@pytest.fixture(scope="module")
-def swept(mixed):
-    return run(mixed)
 
 
 def test_members_equal_those_of_vmap(batch, clean):

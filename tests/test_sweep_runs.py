@@ -11,32 +11,12 @@ import diffrax
 import jax
 import numpy as np
 import pytest
-from sweep_batch import CHUNK, members, run, with_failures
+from sweep_batch import CHUNK, run
 
 import fdof_jax as fj
 
 # The package's attribute of this name is the function.
 module = importlib.import_module("fdof_jax.sweep")
-
-
-@pytest.fixture(scope="module")
-def batch():
-    return members()
-
-
-@pytest.fixture(scope="module")
-def clean(batch):
-    return run(batch)
-
-
-@pytest.fixture(scope="module")
-def mixed(batch):
-    return with_failures(batch)
-
-
-@pytest.fixture(scope="module")
-def swept(mixed):
-    return run(mixed)
 
 
 # Checkpoints

@@ -51,7 +51,7 @@ def check_motion(scene: Scene, report: Report) -> str:
     name = result_name(solution.result)
     q, qd = np.asarray(solution.q), np.asarray(solution.qd)
     steps = int(solution.stats["num_steps"])
-    report.motions.append((scene, ts, name, q, qd, steps))
+    report.motions.append((scene, ts, name, q, qd))
     finite = np.isfinite(np.concatenate([q, qd], axis=1)).all(axis=1)
     # From 1 ms in steps of a fifth, nothing takes so many to begin with.
     if steps > 100 and not int(solution.stats["num_accepted_steps"]):
@@ -126,13 +126,12 @@ def _check_energy(scene: Scene, ts, q, qd, steps: int, report: Report) -> None:
             )
 
 
-def check_state(scene: Scene, ts, q, qd, steps: int, report: Report) -> str:
+def check_state(scene: Scene, ts, q, qd, report: Report) -> str:
     """States against a run at 30 digits; the bound is what small changes would do.
 
-    And each step may be wrong by the tolerance; what is interpolated between steps,
-    all but the end, by `INTERPOLATED` times that. Two more runs start as far off as
-    the tolerance allows, with parameters wrong in their last digits, all with random
-    signs.
+    What is interpolated between steps, all but the end, may be wrong by `INTERPOLATED`
+    times the tolerance besides. Two more runs start as far off as the tolerance allows,
+    with parameters wrong in their last digits, all with random signs.
     """
 
     def states(arm, q, qd):
@@ -171,7 +170,7 @@ def check_state(scene: Scene, ts, q, qd, steps: int, report: Report) -> str:
         return "state: reference too long"
     size = TOLERANCE * (1 + np.abs(np.array(exact, dtype=float)))
     size[1:-1] *= INTERPOLATED
-    bound = 10 * np.maximum.accumulate(bound) + (10 + steps) * size
+    bound = 10 * (np.maximum.accumulate(bound) + size)
     got = np.concatenate([q, qd], axis=1)
     error = np.array(
         [
@@ -187,14 +186,14 @@ def check_state(scene: Scene, ts, q, qd, steps: int, report: Report) -> str:
 
 def check_sample(report: Report, sample: int) -> None:
     """States of the first motions that are short enough, against the reference."""
-    for scene, ts, name, q, qd, steps in report.motions:
+    for scene, ts, name, q, qd in report.motions:
         if sample == 0:
             break
         if name != "successful" or scene.pace > 3:
             continue
         sample -= 1
         try:
-            outcome = check_state(scene, ts, q, qd, steps, report)
+            outcome = check_state(scene, ts, q, qd, report)
         except Failure as failure:
             outcome = "FAILED"
             report.failures.append(("motions", failure, scene))
