@@ -120,6 +120,14 @@ def run_two_cores(quick: bool) -> Iterator[dict]:
         yield from measure_batch(problem, reference(problem), contestants, budget)
 
 
+def run_two_devices(quick: bool) -> Iterator[dict]:
+    """Every core a device of JAX's: a sweep uses both, plain vmap one."""
+    for batch, budget in ({64: 10} if quick else {1024: 10, 16384: 10}).items():
+        problem = fig5_batch(batch)
+        rows = [row for row in table(batch) if row[0].startswith("fdof_jax")]
+        yield from measure_batch(problem, reference(problem), rows, budget)
+
+
 def run_float32(quick: bool) -> Iterator[dict]:
     """Without x64: the library, against the C kernel in float64 as reference."""
     for batch, budget in ({64: 10} if quick else {1024: 15, 16384: 20}).items():

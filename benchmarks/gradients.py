@@ -243,5 +243,5 @@ def run(quick: bool) -> Iterator[dict]:
             modes = MODES if few else ("none", "reverse")
             runs = {mode: compiled(problem, mode) for mode in modes}
             for point in _grid(problem, batch):
-                budget = 1 if quick else 5
+                budget = 1 if quick else 3
                 yield from measure_modes(problem, runs, batch, budget, *point)

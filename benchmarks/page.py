@@ -301,6 +301,7 @@ def tables(points: dict[str, list[dict]]) -> dict[str, str]:
         "batches": batches,
         "batches-xla-flags": batches,
         "batches-two-cores": batches,
+        "batches-two-devices": batches,
         "batches-float32": batches,
         "batches-gpu": _gpu,
         "batches-gpu-float32": _gpu,

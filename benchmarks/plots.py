@@ -202,6 +202,7 @@ PLOTS = {
     "batches": batches,
     "batches-xla-flags": batches,
     "batches-two-cores": batches,
+    "batches-two-devices": batches,
     "batches-float32": batches,
     "batches-gpu": batches,
     "batches-gpu-float32": batches,
