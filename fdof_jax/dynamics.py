@@ -4,35 +4,42 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
+from .added_inertia import added_energy, added_inertia, inertial
+from .forces import Forces
 from .kinematics import mass_center_velocities, mass_centers
 from .linkage import Linkage, compiled
-from .rates import inverse_inertia_diagonal, rates
+from .rates import inertia_diagonals, rates, times
 from .reduced_equations import equations, link_constants, zeros
 
 
-@compiled(q=(3,), qd=(3,), tau=(3,))
+@compiled(q=(3,), qd=(3,), tau=(3,), forces=inertial)
 def forward_dynamics(
     linkage: Linkage,
     q: Float[Array, " joint"],
     qd: Float[Array, " joint"],
     tau: Float[Array, " joint"],
+    forces: Forces = (),
 ) -> Float[Array, " joint"]:
     """Joint accelerations under joint efforts: the reduced form of (14), 3x3.
 
     Equal to the paper's masked equations (17)-(27), and regular in cases where those
     are singular (a massless revolute tip, for instance).
 
-    **Arguments:** `q` [m or rad], `qd` [m/s or rad/s], `tau` [N or N m].
+    **Arguments:** `q` [m or rad], `qd` [m/s or rad/s], `tau` [N or N m]; `forces`:
+    force elements whose masses count. Their efforts do not: `tau` has all.
 
     **Returns:** `qdd` [m/s^2 or rad/s^2].
     """
-    _, qdd = rates(link_constants(linkage, q), zeros(q), tuple(qd), tuple(tau))
+    more = added_inertia(linkage, forces, q, qd)
+    matrix, bias = (None, 0) if more is None else more
+    constants = link_constants(linkage, q)
+    _, qdd = rates(constants, zeros(q), tuple(qd), tuple(tau - bias), matrix)
     return jnp.stack(qdd)
 
 
-@compiled(q=(3,))
+@compiled(q=(3,), forces=inertial)
 def inertia_ratios(
-    linkage: Linkage, q: Float[Array, " joint"]
+    linkage: Linkage, q: Float[Array, " joint"], forces: Forces = ()
 ) -> Float[Array, " joint"]:
     """How well the accelerations are determined: in (0, 1] per joint, free of units.
 
@@ -42,26 +49,27 @@ def inertia_ratios(
     1e-9 in float64, 1e-5 in float32, `simulate` gives up and says so. Zero where the
     matrix is not positive definite.
 
-    **Arguments:** `q` [m or rad].
+    **Arguments:** `q` [m or rad]; `forces`: force elements whose masses count.
     """
-    constants = link_constants(linkage, q)
-    m = equations(constants, zeros(q), zeros(q))
-    i11, i22, i33 = inverse_inertia_diagonal(constants, m)
-    pairs = (i11, m.m11), (i22, m.m22), (i33, m.m33)
+    more = added_inertia(linkage, forces, q, jnp.zeros_like(q))
+    matrix = None if more is None else more[0]
+    pairs = zip(*inertia_diagonals(link_constants(linkage, q), zeros(q), matrix))
     # Divided twice, as a product of zero and infinity is not a number.
-    return jnp.stack([jnp.where(own > 0, 1 / i / own, 0) for i, own in pairs])
+    return jnp.stack([jnp.where(own > 0, 1 / i / own, 0) for own, i in pairs])
 
 
-@compiled(q=(3,), qd=(3,), qdd=(3,))
+@compiled(q=(3,), qd=(3,), qdd=(3,), forces=inertial)
 def inverse_dynamics(
     linkage: Linkage,
     q: Float[Array, " joint"],
     qd: Float[Array, " joint"],
     qdd: Float[Array, " joint"],
+    forces: Forces = (),
 ) -> Float[Array, " joint"]:
     """Joint efforts that produce given joint accelerations, from (14) reduced.
 
-    **Arguments:** `q` [m or rad], `qd` [m/s or rad/s], `qdd` [m/s^2 or rad/s^2].
+    **Arguments:** `q` [m or rad], `qd` [m/s or rad/s], `qdd` [m/s^2 or rad/s^2];
+    `forces`: force elements whose masses count. Their efforts do not.
 
     **Returns:** `tau` [N or N m].
     """
@@ -69,7 +77,11 @@ def inverse_dynamics(
     matrix = jnp.array(
         [[m.m11, m.m12, m.m13], [m.m12, m.m22, m.m23], [m.m13, m.m23, m.m33]]
     )
-    return matrix @ qdd + jnp.stack(m.bias)
+    tau = matrix @ qdd + jnp.stack(m.bias)
+    if (more := added_inertia(linkage, forces, q, qd)) is not None:
+        added, bias = more
+        tau = tau + jnp.stack(times(added, tuple(qdd))) + bias
+    return tau
 
 
 @compiled(q=(3,), qd=(3,))
@@ -90,17 +102,20 @@ def link_energies(
     return kinetic / 2, linkage.mass * linkage.gravity * height
 
 
-@compiled(q=(3,), qd=(3,))
+@compiled(q=(3,), qd=(3,), forces=inertial)
 def energy(
     linkage: Linkage,
     q: Float[Array, " joint"],
     qd: Float[Array, " joint"],
+    forces: Forces = (),
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Kinetic and potential energy of the linkage, (6) and (7).
 
-    **Arguments:** `q` [m or rad], `qd` [m/s or rad/s].
+    **Arguments:** `q` [m or rad], `qd` [m/s or rad/s]; `forces`: force elements whose
+    masses count. Springs keep their energy to themselves.
 
     **Returns:** two numbers [J]; the potential is zero at the ground pivot's height.
     """
     kinetic, potential = link_energies(linkage, q, qd)
-    return jnp.sum(kinetic), jnp.sum(potential)
+    more_kinetic, more_potential = added_energy(linkage, forces, q, qd)
+    return jnp.sum(kinetic) + more_kinetic, jnp.sum(potential) + more_potential

@@ -2,7 +2,8 @@
 
 An element is any pytree called as `(t, q, qd, linkage) -> tau`, with joint positions,
 velocities and efforts of shape (3,). A scene's elements are a tuple; their efforts
-add up. The PD controller is one too: see `control`.
+add up. The PD controller is one too: see `control`. A `StatefulElement` has a state of
+its own, which `simulate` integrates along; an `InertialElement` moves masses.
 
 An element, or a controller's reference, whose efforts jump at known times may have them
 as an attribute `jump_ts`, an array [s]: steps then end there. One with a method
@@ -48,6 +49,43 @@ class ScalarElement(eqx.Module):
     def __call__(self, t: Array, q: Array, qd: Array, linkage: Linkage) -> Array:
         scheduled = self.schedule(t, linkage)
         return jnp.stack(self.respond(scheduled, tuple(q), tuple(qd), linkage))
+
+
+class StatefulElement(eqx.Module):
+    """A force element with a state of its own: an integral, a current, a lag.
+
+    A subclass implements both methods.
+    """
+
+    @abstractmethod
+    def initial_state(self, linkage: Linkage) -> Any:
+        """The state at the start: an array, or a pytree of arrays."""
+
+    @abstractmethod
+    def __call__(
+        self, t: Array, q: Array, qd: Array, linkage: Linkage, state: Any
+    ) -> tuple[Array, Any]:
+        """The efforts (3,) [N or N m], and the rate of the state, a pytree like it."""
+
+
+class InertialElement(eqx.Module):
+    """A force element that moves masses: they add to the equations of motion.
+
+    A subclass implements `kinetic_energy`, a quadratic form in the velocities, and
+    what else it has. The equations come from it by Lagrange's.
+    """
+
+    @abstractmethod
+    def kinetic_energy(self, q: Array, qd: Array, linkage: Linkage) -> Array:
+        """The kinetic energy of its masses, () [J]."""
+
+    def potential_energy(self, q: Array, linkage: Linkage) -> Array:
+        """Their potential energy, () [J]; 0 unless a subclass says otherwise."""
+        return jnp.zeros(())
+
+    def __call__(self, t: Array, q: Array, qd: Array, linkage: Linkage) -> Array:
+        """The efforts besides, (3,) [N or N m]; 0 unless a subclass says otherwise."""
+        return jnp.zeros(3)
 
 
 class JointDamper(ScalarElement):

@@ -10,10 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from .forces import Forces, ScalarElement
+from .added_inertia import added_inertia, inertial
+from .forces import Forces, ScalarElement, StatefulElement
 from .linkage import Linkage, possible
-from .rates import rates, rates_and_conditioning
-from .reduced_equations import Constants, Scalars, link_constants, zeros
+from .rates import Added, rates, rates_and_conditioning
+from .reduced_equations import Constants, link_constants, zeros
 from .solution import Solution
 from .step_control import Watched, bounded, default_controller, landing_on
 from .unrolled_dopri8 import ScheduledTerm, UnrolledDopri8
@@ -42,38 +43,87 @@ def _schedule(t: Array, args: _Args) -> tuple[Any, ...]:
     )
 
 
-def _applied(
-    t: Any, y: tuple[Scalars, Scalars], args: _Args, schedule: tuple[Any, ...]
-) -> Scalars:
-    """The efforts of the force elements; arrays only for those written in them."""
-    delta, qd = y
-    tau = None
+def stateful(forces: Forces) -> list[StatefulElement]:
+    """Those of the elements that have a state of their own."""
+    return [element for element in forces if isinstance(element, StatefulElement)]
+
+
+def _own_states(args: _Args, scalars: tuple[Array, ...]) -> list[Any]:
+    """The states of the stateful elements, of the scalars that are integrated."""
+    states, place = [], 0
+    for element in stateful(args.forces):
+        shapes = jax.eval_shape(element.initial_state, args.linkage)
+        leaves, structure = jax.tree.flatten(shapes)
+        arrays = []
+        for leaf in leaves:
+            own = scalars[place : place + leaf.size]
+            arrays.append(jnp.stack(own).reshape(leaf.shape))
+            place += leaf.size
+        states.append(jax.tree.unflatten(structure, arrays))
+    return states
+
+
+def _scalars(tree: Any, dtype: Any) -> tuple[Array, ...]:
+    leaves = [jnp.asarray(leaf, dtype).ravel() for leaf in jax.tree.leaves(tree)]
+    return tuple(jnp.concatenate(leaves)) if leaves else ()
+
+
+class _Load(NamedTuple):
+    """What the force elements do: efforts, rates of their own states, inertia."""
+
+    tau: tuple[Array, ...]
+    own_rates: tuple[Array, ...]
+    added: Added | None
+
+
+def _load(t: Any, y: Any, args: _Args, schedule: tuple[Any, ...]) -> _Load:
+    """Arrays are made only for elements that are written in them."""
+    delta, qd, *own = y
+    states = iter(_own_states(args, *own) if own else ())
+    tau, own_rates = None, []
+    arrays = lambda: (args.q0 + jnp.stack(delta), jnp.stack(qd))
     for index, (element, scheduled) in enumerate(zip(args.forces, schedule)):
         if isinstance(element, ScalarElement):
             q = tuple(a + b for a, b in zip(args.q0, delta))
             effort = element.respond(scheduled, q, qd, args.linkage)
         else:
-            q, rate = args.q0 + jnp.stack(delta), jnp.stack(qd)
-            effort = element_effort(index, element, t, q, rate, args.linkage)
+            state = next(states) if isinstance(element, StatefulElement) else None
+            effort, rate = element_effort(
+                index, element, t, *arrays(), args.linkage, state
+            )
+            own_rates += _scalars(rate, args.q0.dtype)
         tau = effort if tau is None else tuple(a + b for a, b in zip(tau, effort))
-    return zeros(args.q0) if tau is None else tuple(tau)
+    tau = zeros(args.q0) if tau is None else tuple(tau)
+    if not inertial(args.forces):
+        return _Load(tau, tuple(own_rates), None)
+    added, bias = _added(args.linkage, inertial(args.forces), *arrays())
+    tau = tuple(a - b for a, b in zip(tau, bias))
+    return _Load(tau, tuple(own_rates), added)
 
 
-def _vector_field(t, y, args, schedule) -> tuple[Scalars, Scalars]:
-    """Rates of six scalars; the positions are displacements from the start."""
-    delta, qd = y
-    return rates(args.constants, delta, qd, _applied(t, y, args, schedule))
+_added: Any = eqx.filter_jit(added_inertia)  # traced once, not at each use by a solver
 
 
-def _watched_field(t, y, args, schedule) -> tuple[tuple[Scalars, Scalars], Array]:
+def _vector_field(t, y, args, schedule) -> tuple[Any, ...]:
+    """Rates of six scalars and the elements' own; positions are displacements."""
+    delta, qd, *own = y
+    load = _load(t, y, args, schedule)
+    moving = rates(args.constants, delta, qd, load.tau, load.added)
+    return (*moving, load.own_rates) if own else moving
+
+
+def _watched_field(t, y, args, schedule) -> tuple[tuple[Any, ...], Array]:
     """The same, and the health of the accelerations: see `ScheduledTerm`."""
-    tau = _applied(t, y, args, schedule)
-    delta, qd = y
-    (qd, qdd), loss = rates_and_conditioning(args.constants, delta, qd, tau)
-    finite = jnp.isfinite(qdd[0] + qdd[1] + qdd[2])
+    delta, qd, *own = y
+    load = _load(t, y, args, schedule)
+    (qd, qdd), loss = rates_and_conditioning(
+        args.constants, delta, qd, load.tau, load.added
+    )
+    finite = jnp.isfinite(qdd[0] + qdd[1] + qdd[2] + sum(load.own_rates))
     health = jnp.where(loss * _LEAST_INERTIA_RATIO[loss.dtype] > 1, 0, loss)
     # A singular matrix makes accelerations that are not finite.
-    return (qd, qdd), jnp.where(finite | (health == 0), health, jnp.nan)
+    health = jnp.where(finite | (health == 0), health, jnp.nan)
+    return ((qd, qdd, load.own_rates) if own else (qd, qdd)), health
 
 
 def _health(t, y, args) -> Array:
@@ -83,23 +133,44 @@ def _health(t, y, args) -> Array:
 
 @eqx.filter_jit  # traced once, not at each use by a solver
 def element_effort(
-    index: int, element: Any, t: Array, q: Array, qd: Array, linkage: Linkage
-) -> Array:
-    """What one force element returns, refused unless it is three real numbers."""
-    tau = element(t, q, qd, linkage)
+    index: int,
+    element: Any,
+    t: Array,
+    q: Array,
+    qd: Array,
+    linkage: Linkage,
+    state: Any = None,
+) -> tuple[Array, Any]:
+    """What one force element returns, refused unless it is three real numbers.
+
+    And the rate of its state, None for an element without one.
+    """
+    expected = f"forces[{index}]: expected it to return tau, an array of 3 real numbers"
+    if isinstance(element, StatefulElement):
+        found = element(t, q, qd, linkage, state)
+        if not isinstance(found, tuple) or len(found) != 2:
+            raise ValueError(f"{expected}, and the rate of its state, got {found!r}.")
+        tau, rate = found
+        if jax.tree.map(jnp.shape, rate) != jax.tree.map(jnp.shape, state):
+            raise ValueError(
+                f"forces[{index}]: expected the rate of its state to be like the "
+                f"state, {state!r}, got {rate!r}."
+            )
+    else:
+        tau, rate = element(t, q, qd, linkage), None
     try:
         tau = jnp.asarray(tau)
     except (TypeError, ValueError) as error:
-        raise ValueError(
-            f"forces[{index}]: expected it to return tau, an array of 3 real numbers, "
-            f"got {tau!r}."
-        ) from error
+        raise ValueError(f"{expected}, got {tau!r}.") from error
     if tau.shape != (3,) or tau.dtype.kind not in "iuf":
-        raise ValueError(
-            f"forces[{index}]: expected it to return tau, an array of 3 real numbers, "
-            f"got shape {tau.shape} and dtype {tau.dtype}."
-        )
-    return tau.astype(q.dtype)
+        raise ValueError(f"{expected}, got shape {tau.shape} and dtype {tau.dtype}.")
+    return tau.astype(q.dtype), rate
+
+
+def _initial_own(args: _Args) -> tuple[tuple[Array, ...], ...]:
+    """The elements' own states at the start, where there are any."""
+    initial = [e.initial_state(args.linkage) for e in stateful(args.forces)]
+    return (_scalars(initial, args.q0.dtype),) if initial else ()
 
 
 def _step_for_tangents(t0: Array, args: _Args, fraction: float) -> Array:
@@ -111,9 +182,11 @@ def _step_for_tangents(t0: Array, args: _Args, fraction: float) -> Array:
     """
     still = zeros(args.q0)
     scheduled = _schedule(t0, args)
+    own = _initial_own(args)
 
     def accelerations(delta):
-        return jnp.stack(_vector_field(t0, (tuple(delta), still), args, scheduled)[1])
+        y = (tuple(delta), still, *own)
+        return jnp.stack(_vector_field(t0, y, args, scheduled)[1])
 
     linearised = jax.jacfwd(accelerations)(jnp.zeros_like(args.q0))
     omega2 = jnp.sqrt(jnp.abs(jnp.sum(linearised * linearised.T)))
@@ -160,7 +233,7 @@ def _integrate(solver, inputs, keywords, derivatives: bool = False) -> Solution:
         solver,
         t0=ts[0],
         t1=ts[-1],
-        y0=(zeros(q0), tuple(qd0)),
+        y0=(zeros(q0), tuple(qd0), *_initial_own(args)),
         args=args,
         saveat=diffrax.SaveAt(
             subs=(
@@ -172,16 +245,22 @@ def _integrate(solver, inputs, keywords, derivatives: bool = False) -> Solution:
     )
     assert solution.ys is not None  # because of saveat
     motion, (reached,) = solution.ys
-    delta, qd = (jnp.stack(rows, axis=-1) for rows in motion)
+    delta, qd = (jnp.stack(rows, axis=-1) for rows in motion[:2])
+    own = [jax.vmap(lambda rows: _own_states(args, rows))(o) for o in motion[2:]]
     q = q0[None] + delta
-    # diffrax saves the start with the first step, and leaves infinity where it has not
-    # come to save.
-    q, qd = (jnp.where(jnp.isinf(a) | ~valid, jnp.nan, a) for a in (q, qd))
-    q, qd = q.at[0].set(state0.q), qd.at[0].set(state0.qd)
+
+    def shown(a):
+        """NaN where diffrax has not come to save: it leaves infinity."""
+        return jnp.where(jnp.isinf(a) | ~valid, jnp.nan, a)
+
+    # diffrax saves the start with the first step.
+    q, qd = shown(q).at[0].set(state0.q), shown(qd).at[0].set(state0.qd)
+    own = tuple(jax.tree.map(shown, own[0])) if own else ()
     reached = jnp.where(valid, reached, asked[0])
     results: Any = diffrax.RESULTS
     result = results.where(valid, solution.result, results.nonfinite)
-    return Solution(asked, q, qd, solution.stats | {"time_reached": reached}, result)
+    stats = solution.stats | {"time_reached": reached}
+    return Solution(asked, q, qd, stats, result, own)
 
 
 @eqx.filter_custom_vjp
@@ -207,7 +286,7 @@ def _integrate_reversibly_fwd(perturbed, inputs, solver, keywords):
         solution = _integrate(
             solver or diffrax.Dopri8(), inputs, keywords, derivatives=True
         )
-        return (solution.q, solution.qd), solution
+        return (solution.q, solution.qd, solution.own), solution
 
     states, pull_back, solution = eqx.filter_vjp(motion, moving, has_aux=True)
     return solution, (pull_back, states)
@@ -219,7 +298,8 @@ def _integrate_reversibly_bwd(
 ):
     pull_back, states = residuals
     wanted = eqx.combine(
-        (cotangent.q, cotangent.qd), jax.tree.map(jnp.zeros_like, states)
+        (cotangent.q, cotangent.qd, cotangent.own),
+        jax.tree.map(jnp.zeros_like, states),
     )
     (gradient,) = pull_back(wanted)
     return gradient

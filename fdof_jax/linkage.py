@@ -169,12 +169,13 @@ _T = TypeVar("_T")
 
 
 def compiled(
-    **shapes: tuple[int, ...],
+    **doors: tuple[int, ...] | Callable[[Any], Any],
 ) -> Callable[[Callable[..., _T]], Callable[..., _T]]:
     """Decorate a function of a linkage and arrays: check at the door, compile inside.
 
-    Each keyword names an array argument and its shape; the decorated function takes
-    anything that converts to such an array. Without the compilation a call
+    Each keyword names an array argument and its shape, and the decorated function takes
+    anything that converts to such an array; or an argument and a function that checks
+    and converts it. Without the compilation a call
     outside of `jax.jit` would dispatch hundreds of single operations.
     """
 
@@ -183,14 +184,18 @@ def compiled(
         signature = inspect.signature(function)
 
         @functools.wraps(function)
-        def door(*args: Any, **kwargs: Any) -> _T:
+        def checked(*args: Any, **kwargs: Any) -> _T:
             arguments = signature.bind(*args, **kwargs).arguments
             check_linkage(arguments["linkage"])
-            for name, shape in shapes.items():
-                arguments[name] = real_array(name, arguments[name], shape)
+            for name, door in doors.items():
+                if callable(door):
+                    if name in arguments:
+                        arguments[name] = door(arguments[name])
+                else:
+                    arguments[name] = real_array(name, arguments[name], door)
             return inner(**arguments)
 
-        return door
+        return checked
 
     return decorate
 

@@ -18,6 +18,8 @@ from .one_loop import one_loop_on_cpu
 from .reduced_equations import Constants, Equations, Scalars, equations
 
 Matrix = tuple[Scalars, Scalars, Scalars]  # by columns
+# What force elements add to the mass matrix: m11, m12, m13, m22, m23, m33.
+Added = tuple[Array, Array, Array, Array, Array, Array]
 
 # A first guess of 1/x, good to 12 %: these bits less those of x.
 _RECIPROCAL_BITS = {
@@ -54,16 +56,21 @@ def _one_loop(function: Callable) -> Callable:
 
 
 def _solver(
-    c: Constants, m: Equations, reciprocal: Callable[[Array], Array]
+    c: Constants,
+    m: Equations,
+    added: Added | None,
+    reciprocal: Callable[[Array], Array],
 ) -> tuple[Callable[[Scalars], Scalars], Callable[[], Scalars]]:
     """Solves M x = f, by L^T D L from the tip: the pivots are articulated inertias.
 
-    The second function returns the diagonal of the inverse of M, infinite where a pivot
-    is not positive.
+    `m` has what is `added` in it. The second function returns the diagonal of the
+    inverse of M, infinite where a pivot is not positive.
     """
     inverse3 = reciprocal(m.m33)
     l23, l13 = m.m23 * inverse3, m.m13 * inverse3
-    pivot2 = jnp.where(c.slide_on_slide, c.slide2, m.m22 - l23 * m.m23)
+    pivot2 = m.m22 - l23 * m.m23
+    if added is None:
+        pivot2 = jnp.where(c.slide_on_slide, c.slide2, pivot2)
     inverse2 = reciprocal(pivot2)
     rest12 = m.m12 - l13 * m.m23
     l12 = rest12 * inverse2
@@ -94,21 +101,50 @@ def _subtract(a: Scalars, b: Scalars) -> Scalars:
     return a[0] - b[0], a[1] - b[1], a[2] - b[2]
 
 
+def _with(added: Added | None, m: Equations) -> Equations:
+    if added is None:
+        return m
+    m11, m12, m13, m22, m23, m33 = added
+    return Equations(
+        m.m11 + m11, m.m12 + m12, m.m13 + m13, m.m22 + m22, m.m23 + m23, m.m33 + m33,
+        m.bias,
+    )  # fmt: skip
+
+
+def times(m: Added, x: Scalars) -> Scalars:
+    m11, m12, m13, m22, m23, m33 = m
+    return (
+        m11 * x[0] + m12 * x[1] + m13 * x[2],
+        m12 * x[0] + m22 * x[1] + m23 * x[2],
+        m13 * x[0] + m23 * x[1] + m33 * x[2],
+    )
+
+
 def _rates(
-    reciprocal: Callable, c: Constants, delta: Scalars, qd: Scalars, tau: Scalars
+    reciprocal: Callable,
+    c: Constants,
+    delta: Scalars,
+    qd: Scalars,
+    tau: Scalars,
+    added: Added | None,
 ) -> tuple[Scalars, Scalars]:
-    m = equations(c, delta, qd)
-    solve, _ = _solver(c, m, reciprocal)
+    m = _with(added, equations(c, delta, qd))
+    solve, _ = _solver(c, m, added, reciprocal)
     # The velocities pass through the loop because XLA would otherwise copy the buffers
     # of a Runge-Kutta method's stages.
     return qd, solve(_subtract(tau, m.bias))
 
 
 def _rates_and_conditioning(
-    reciprocal: Callable, c: Constants, delta: Scalars, qd: Scalars, tau: Scalars
+    reciprocal: Callable,
+    c: Constants,
+    delta: Scalars,
+    qd: Scalars,
+    tau: Scalars,
+    added: Added | None,
 ) -> tuple[Scalars, Scalars, Array]:
-    m = equations(c, delta, qd)
-    solve, inverse_diagonal = _solver(c, m, reciprocal)
+    m = _with(added, equations(c, delta, qd))
+    solve, inverse_diagonal = _solver(c, m, added, reciprocal)
     i11, i22, i33 = inverse_diagonal()
     loss = jnp.maximum(m.m11 * i11, jnp.maximum(m.m22 * i22, m.m33 * i33))
     # An infinite inverse times a mass of zero.
@@ -119,12 +155,9 @@ def _rates_and_conditioning(
 @jax.jit
 def _efforts(c: Constants, delta: Scalars, qd: Scalars, qdd: Scalars) -> Scalars:
     m = equations(c, delta, qd)
-    a1, a2, a3 = qdd
-    return (
-        m.m11 * a1 + m.m12 * a2 + m.m13 * a3 + m.bias[0],
-        m.m12 * a1 + m.m22 * a2 + m.m23 * a3 + m.bias[1],
-        m.m13 * a1 + m.m23 * a2 + m.m33 * a3 + m.bias[2],
-    )
+    y1, y2, y3 = times((m.m11, m.m12, m.m13, m.m22, m.m23, m.m33), qdd)
+    b1, b2, b3 = m.bias
+    return y1 + b1, y2 + b2, y3 + b3
 
 
 def _change(
@@ -133,23 +166,27 @@ def _change(
     delta: Scalars,
     qd: Scalars,
     tau: Scalars,
+    added: Added | None,
     direction: tuple[Scalars, Scalars],
 ) -> Scalars:
     """Derivative of the accelerations in a direction of (delta, qd).
 
     From the inverse dynamics: no derivative goes through the solution of the equations.
     """
-    m = equations(c, delta, qd)
-    solve, _ = _solver(c, m, reciprocal)
+    m = _with(added, equations(c, delta, qd))
+    solve, _ = _solver(c, m, added, reciprocal)
     qdd = solve(_subtract(tau, m.bias))
     _, change = jax.jvp(lambda *y: _efforts(c, *y, qdd), (delta, qd), direction)
     x1, x2, x3 = solve(change)
     return -x1, -x2, -x3
 
 
-def _inverse_inertia(reciprocal: Callable, c: Constants, delta: Scalars) -> Matrix:
+def _inverse_inertia(
+    reciprocal: Callable, c: Constants, delta: Scalars, added: Added | None
+) -> Matrix:
     zero, one = jnp.zeros_like(delta[0]), jnp.ones_like(delta[0])
-    solve, _ = _solver(c, equations(c, delta, (zero, zero, zero)), reciprocal)
+    m = _with(added, equations(c, delta, (zero, zero, zero)))
+    solve, _ = _solver(c, m, added, reciprocal)
     unit = (one, zero, zero), (zero, one, zero), (zero, zero, one)
     return solve(unit[0]), solve(unit[1]), solve(unit[2])
 
@@ -159,25 +196,25 @@ def _directions(dtype: Any) -> tuple[Scalars, Scalars]:
     return rows[:3], rows[3:]
 
 
-def _plain_sensitivities(c, delta, qd, tau):
-    by_state = jax.vmap(lambda d: _change(_divided, c, delta, qd, tau, d))(
+def _plain_sensitivities(c, delta, qd, tau, added):
+    by_state = jax.vmap(lambda d: _change(_divided, c, delta, qd, tau, added, d))(
         _directions(delta[0].dtype)
     )
-    return by_state, _inverse_inertia(_divided, c, delta)
+    return by_state, _inverse_inertia(_divided, c, delta, added)
 
 
 @jax.custom_jvp
 def _one_loop_sensitivities(
-    c: Constants, delta: Scalars, qd: Scalars, tau: Scalars
+    c: Constants, delta: Scalars, qd: Scalars, tau: Scalars, added: Added | None
 ) -> tuple[Scalars, Matrix]:
     """Derivatives of the accelerations: three rows in (delta, qd), columns in tau.
 
     The six directions are lanes of one loop, whose code has then the size of one.
     """
-    by_state = jax.vmap(lambda d: _one_loop(_change)(c, delta, qd, tau, d))(
+    by_state = jax.vmap(lambda d: _one_loop(_change)(c, delta, qd, tau, added, d))(
         _directions(delta[0].dtype)
     )
-    return by_state, _one_loop(_inverse_inertia)(c, delta)
+    return by_state, _one_loop(_inverse_inertia)(c, delta, added)
 
 
 @_one_loop_sensitivities.defjvp
@@ -190,27 +227,34 @@ _sensitivities = jax.jit(_one_loop_sensitivities)  # traced once, not at each us
 
 @jax.custom_jvp
 def rates(
-    c: Constants, delta: Scalars, qd: Scalars, tau: Scalars
+    c: Constants,
+    delta: Scalars,
+    qd: Scalars,
+    tau: Scalars,
+    added: Added | None = None,
 ) -> tuple[Scalars, Scalars]:
     """Rates of the joint displacements `delta` from the reference of `c`, and of `qd`.
 
     The equations of motion as what an integrator takes: velocities and accelerations.
     """
-    return _one_loop(_rates)(c, delta, qd, tau)
+    return _one_loop(_rates)(c, delta, qd, tau, added)
 
 
 def _rates_jvp(primals, tangents):
-    c, delta, qd, tau = primals
+    c, delta, qd, _, added = primals
     values = rates(*primals)
     by_state, by_tau = _sensitivities(*primals)
-    c_dot = tangents[0]
-    delta_dot, qd_dot, efforts_dot = map(_dense, tangents[1:])
+    c_dot, *others, added_dot = tangents
+    delta_dot, qd_dot, efforts_dot = map(_dense, others)
     moved = jnp.stack((*delta_dot, *qd_dot))
     change = tuple(row @ moved for row in by_state)
     if not all(isinstance(step, SymbolicZero) for step in jax.tree.leaves(c_dot)):
         _, demanded = jax.jvp(
             lambda c: _efforts(c, delta, qd, values[1]), (c,), (_dense(c_dot),)
         )
+        efforts_dot = _subtract(efforts_dot, demanded)
+    if added is not None:
+        demanded = times(_dense(added_dot), values[1])
         efforts_dot = _subtract(efforts_dot, demanded)
     for column, effort in zip(by_tau, efforts_dot):
         change = tuple(a + b * effort for a, b in zip(change, column))
@@ -233,14 +277,18 @@ rates.defjvp(_rates_jvp, symbolic_zeros=True)
 
 @jax.custom_jvp
 def rates_and_conditioning(
-    c: Constants, delta: Scalars, qd: Scalars, tau: Scalars
+    c: Constants,
+    delta: Scalars,
+    qd: Scalars,
+    tau: Scalars,
+    added: Added | None = None,
 ) -> tuple[tuple[Scalars, Scalars], Array]:
     """`rates`, and what rounding is multiplied by: 1 over the least inertia ratio.
 
     See `inertia_ratios`. Infinite where the mass matrix is not positive definite.
     Derivatives take it for a constant.
     """
-    qd, qdd, loss = _one_loop(_rates_and_conditioning)(c, delta, qd, tau)
+    qd, qdd, loss = _one_loop(_rates_and_conditioning)(c, delta, qd, tau, added)
     return (qd, qdd), loss
 
 
@@ -251,7 +299,11 @@ def _rates_and_conditioning_jvp(primals, tangents):
     return (values, loss), (change, jnp.zeros_like(loss))
 
 
-def inverse_inertia_diagonal(c: Constants, m: Equations) -> Scalars:
-    """The diagonal of the inverse mass matrix; infinite where there is none."""
-    _, inverse_diagonal = _solver(c, m, _divided)
-    return inverse_diagonal()
+def inertia_diagonals(
+    c: Constants, delta: Scalars, added: Added | None = None
+) -> tuple[Scalars, Scalars]:
+    """The diagonals of the mass matrix and of its inverse, infinite if it has none."""
+    zero = jnp.zeros_like(delta[0])
+    m = _with(added, equations(c, delta, (zero, zero, zero)))
+    _, inverse_diagonal = _solver(c, m, added, _divided)
+    return (m.m11, m.m22, m.m33), inverse_diagonal()

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .forces import Forces
+from .forces import Forces, StatefulElement
 from .integration import element_effort, solve
 from .linkage import Linkage, State, check_linkage
 from .solution import Efforts, Solution
@@ -198,11 +198,14 @@ def joint_efforts(linkage: Linkage, forces: Forces, solution: Solution) -> Effor
 
 @eqx.filter_jit
 def _efforts(linkage: Linkage, forces: Forces, solution: Solution) -> Efforts:
-    elements = [
-        jax.vmap(lambda t, q, qd, i=i, f=f: element_effort(i, f, t, q, qd, linkage))(
-            solution.ts, solution.q, solution.qd
-        )
-        for i, f in enumerate(forces)
-    ]
+    motion, own = (solution.ts, solution.q, solution.qd), iter(solution.own)
+    elements = []
+    for index, element in enumerate(forces):
+
+        def effort(t, q, qd, state, index=index, element=element):
+            return element_effort(index, element, t, q, qd, linkage, state)[0]
+
+        state = next(own) if isinstance(element, StatefulElement) else None
+        elements.append(jax.vmap(effort)(*motion, state))
     stacked = jnp.stack(elements) if elements else jnp.zeros((0, *solution.q.shape))
     return Efforts(jnp.sum(stacked, axis=0), stacked)

@@ -18,6 +18,8 @@ class Solution(eqx.Module):
     - `stats`: diffrax's statistics, `num_steps` among them, and `time_reached` [s].
     - `result`: diffrax's result, one per trajectory; `diffrax.RESULTS.successful` or
       the reason of the failure, which `outcome` says in a word or two.
+    - `own`: the states of the `StatefulElement`s at `ts`, in their order; each as its
+      `initial_state`, with time as first axis.
     """
 
     ts: Float[Array, " time"]
@@ -25,6 +27,7 @@ class Solution(eqx.Module):
     qd: Float[Array, "time joint"]
     stats: dict[str, Any]
     result: diffrax.RESULTS
+    own: tuple[Any, ...] = ()
 
     @property
     def outcome(self) -> np.ndarray:

@@ -235,10 +235,12 @@ class _Scaled(_Adaptive):
     def adapt_step_size(  # pyright: ignore[reportIncompatibleMethodOverride]
         self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state
     ):
-        y0, y1_candidate, y_error = (
-            jax.tree.map(lambda a, unit: a / unit, state, self.unit)
-            for state in (y0, y1_candidate, y_error)
-        )
+        def scaled(state: Any) -> Any:
+            # What elements have of their own comes last, in units of its own.
+            motion = jax.tree.map(lambda a, unit: a / unit, state[:2], self.unit)
+            return (*motion, *state[2:])
+
+        y0, y1_candidate, y_error = map(scaled, (y0, y1_candidate, y_error))
         return self.controller.adapt_step_size(
             t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state
         )

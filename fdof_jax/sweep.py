@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike
 
 from .batch_axes import Batch, batch_of
 from .dynamics import forward_dynamics
-from .forces import Forces
+from .forces import Forces, StatefulElement
 from .integration import element_effort
 from .linkage import Linkage, State, real_joints
 from .simulation import simulate, solve_options
@@ -58,7 +58,7 @@ def _motion(settings: dict, ts: Array, moving: Any, shared: Any, limit: Array | 
         throw=False,
         **{**settings, "stepsize_controller": controller},
     )
-    return solution.q, solution.qd, solution.stats, solution.result
+    return solution.q, solution.qd, solution.own, solution.stats, solution.result
 
 
 @eqx.filter_jit
@@ -93,11 +93,15 @@ def _expected_work(t0: Array, moving: Any, shared: Any) -> tuple[Array, Array]:
         linkage, (q, qd), forces = eqx.combine(moving, shared)
         tau = jnp.zeros(3)
         for index, element in enumerate(forces):
-            tau = tau + element_effort(index, element, t0, q, qd, linkage)
+            state = None
+            if isinstance(element, StatefulElement):
+                state = element.initial_state(linkage)
+            tau = tau + element_effort(index, element, t0, q, qd, linkage, state)[0]
         # Turning makes work, sliding hardly any.
         turning = jnp.stack(real_joints(linkage.ef))
         rate = jnp.where(turning, qd, 0)
-        acceleration = jnp.where(turning, forward_dynamics(linkage, q, qd, tau), 0)
+        qdd = forward_dynamics(linkage, q, qd, tau, forces)
+        acceleration = jnp.where(turning, qdd, 0)
         topology = jnp.sum(jnp.where(turning, jnp.array([4, 2, 1]), 0))
         norm = jnp.linalg.norm
         return topology, norm(rate) + jnp.sqrt(norm(acceleration))
@@ -169,7 +173,7 @@ class _Chunks:
             ]
         for kept, value in zip(self.results, values):
             kept[members] = value
-        _, _, stats, _ = jax.tree.unflatten(self.result_structure, values)
+        *_, stats, _ = jax.tree.unflatten(self.result_structure, values)
         return stats["num_steps"]
 
     def _place(self, rows: np.ndarray) -> np.ndarray | Array:
@@ -181,9 +185,9 @@ class _Chunks:
 
     def solution(self) -> Solution:
         leaves = [jnp.asarray(leaf) for leaf in self.results]
-        q, qd, stats, result = jax.tree.unflatten(self.result_structure, leaves)
+        q, qd, own, stats, result = jax.tree.unflatten(self.result_structure, leaves)
         ts = jnp.broadcast_to(self.ts, (self.size, *self.ts.shape))
-        return Solution(ts, q, qd, stats, result)
+        return Solution(ts, q, qd, stats, result, own)
 
 
 def _in_chunks(
@@ -254,15 +258,20 @@ def _traced(batch: Batch, ts: Array, settings: dict, chunk: int) -> Solution:
     # Which members fail is found out first. In the differentiated solve the first good
     # member stands in for them: whatever is NaN there would spoil shared parameters.
     frozen = in_chunks(*where(False, (moving, shared)))
-    good = frozen[3] == diffrax.RESULTS.successful
+    good = frozen[-1] == diffrax.RESULTS.successful
     source = jnp.where(good, jnp.arange(batch.size), jnp.argmax(good))
     moving, shared = where(jnp.any(good), (moving, shared))
-    q, qd, *_ = in_chunks(jax.tree.map(lambda leaf: leaf[source], moving), shared)
-    shown = good[:, None, None]
-    q, qd = jnp.where(shown, q, frozen[0]), jnp.where(shown, qd, frozen[1])
+    *states, _, _ = in_chunks(jax.tree.map(lambda leaf: leaf[source], moving), shared)
+    states = jax.tree.map(
+        lambda a, b: jnp.where(good.reshape(-1, *[1] * (a.ndim - 1)), a, b),
+        tuple(states),
+        frozen[:3],
+    )
     back = jnp.argsort(order)
-    q, qd, stats, result = jax.tree.map(lambda leaf: leaf[back], (q, qd, *frozen[2:]))
-    return Solution(jnp.broadcast_to(ts, (batch.size, *ts.shape)), q, qd, stats, result)
+    everything = (*states, *frozen[3:])
+    q, qd, own, stats, result = jax.tree.map(lambda leaf: leaf[back], everything)
+    ts = jnp.broadcast_to(ts, (batch.size, *ts.shape))
+    return Solution(ts, q, qd, stats, result, own)
 
 
 def sweep(
