@@ -1,6 +1,7 @@
 """Dynamics of planar open-chain linkages in JAX."""
 
 from . import scenes as scenes
+from .actuators import Armature as Armature, LinearActuator as LinearActuator
 from .chain_dynamics import (
     bias_force as bias_force,
     constraint_forces as constraint_forces,
@@ -8,6 +9,12 @@ from .chain_dynamics import (
     mass_matrix as mass_matrix,
 )
 from .control import CircleTask as CircleTask, PDController as PDController
+from .drives import (
+    DCMotor as DCMotor,
+    FirstOrderLag as FirstOrderLag,
+    PIDController as PIDController,
+    SpeedLimit as SpeedLimit,
+)
 from .dynamics import (
     energy as energy,
     forward_dynamics as forward_dynamics,
@@ -15,8 +22,14 @@ from .dynamics import (
     inverse_dynamics as inverse_dynamics,
     link_energies as link_energies,
 )
-from .forces import JointDamper as JointDamper, JointEffort as JointEffort
+from .forces import (
+    InertialElement as InertialElement,
+    JointDamper as JointDamper,
+    JointEffort as JointEffort,
+    StatefulElement as StatefulElement,
+)
 from .interop import to_mjcf as to_mjcf
+from .joint_limits import JointFriction as JointFriction, JointStops as JointStops
 from .kinematics import (
     inverse_kinematics as inverse_kinematics,
     joint_positions as joint_positions,
@@ -31,6 +44,12 @@ from .linkage import (
     existence_factors as existence_factors,
     from_chain as from_chain,
     to_chain as to_chain,
+)
+from .points import (
+    Point as Point,
+    SpringDamper as SpringDamper,
+    Tension as Tension,
+    Wrench as Wrench,
 )
 from .scenes import Scene as Scene
 from .simulation import joint_efforts as joint_efforts, simulate as simulate

@@ -1,0 +1,160 @@
+"""Elements with inertia: an independent Lagrangian, energy, and inverse dynamics."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import random_linkage
+
+import fdof_jax as fj
+
+PINS = fj.Point(0, -0.6, -0.8), fj.Point(2, 0.4, 0.3)
+ACTUATOR = fj.LinearActuator(
+    *PINS, force=5.0, mass=[1.2, 0.7], com=[0.2, 0.3], inertia=[0.05, 0.03]
+)
+ARMATURE = fj.Armature([0.3, 0.2, 0.1])
+ELEMENTS = {"armature": ARMATURE, "actuator": ACTUATOR}
+
+
+def motion(topology, seed=0):
+    rng = np.random.default_rng(seed)
+    return random_linkage(topology, rng), *rng.uniform(-1, 1, (2, 3))
+
+
+def pins(linkage, q):
+    """The two pins as complex numbers, written out."""
+    x, _ = fj.to_chain(linkage, q, np.zeros(3))
+    x = np.asarray(x)
+    turn = np.exp(1j * np.array([linkage.base_angle, *x[1::2]]))
+    start = np.cumsum((np.asarray(linkage.length)[:3] + 1j * x[0::2]) * turn[:3])
+    return (-0.6 - 0.8j) * turn[0], start[1] + (0.4 + 0.3j) * turn[2]
+
+
+def bodies(linkage, q):
+    """Mass centres and angle of cylinder and piston."""
+    a, b = pins(linkage, q)
+    unit = (b - a) / abs(b - a)
+    return a + 0.2 * unit, b - 0.3 * unit, np.angle(unit)
+
+
+def lagrange(linkage, q, qd, qdd, h=1e-4):
+    """Generalised forces of the two bodies, by differences along the motion."""
+    jacobian = []
+    for e in np.eye(3):
+        ahead, behind = bodies(linkage, q + h * e), bodies(linkage, q - h * e)
+        jacobian.append([(x - y) / (2 * h) for x, y in zip(ahead, behind)])
+    positions = [bodies(linkage, q + qd * t + qdd * t**2 / 2) for t in (-h, 0.0, h)]
+    second = [(x - 2 * y + z) / h**2 for x, y, z in zip(*positions)]
+    weight = 1j * float(linkage.gravity)
+    pulls = [1.2 * (second[0] + weight), 0.7 * (second[1] + weight), 0.08 * second[2]]
+    return np.array(
+        [sum((np.conj(c) * p).real for c, p in zip(row, pulls)) for row in jacobian]
+    )
+
+
+@pytest.mark.parametrize("topology", fj.TOPOLOGIES)
+def test_the_actuator_s_bodies_by_another_lagrangian(topology):
+    linkage, q, qd = motion(topology)
+    qdd = np.array([0.3, -0.7, 1.1])
+    bare = fj.inverse_dynamics(linkage, q, qd, qdd)
+    full = fj.inverse_dynamics(linkage, q, qd, qdd, (ACTUATOR,))
+    exact = lagrange(linkage, q, qd, qdd)
+    assert np.abs(exact).max() > 1
+    np.testing.assert_allclose(full - bare, exact, atol=1e-6 * np.abs(exact).max())
+
+
+@pytest.mark.parametrize("topology", fj.TOPOLOGIES)
+def test_the_actuator_s_force_does_its_power(topology):
+    linkage, q, qd = motion(topology)
+    a, b = (np.array(pins(linkage, q + h * qd)) for h in (1e-6, -1e-6))
+    rate = (abs(a[1] - a[0]) - abs(b[1] - b[0])) / 2e-6
+    power = ACTUATOR(0.0, q, qd, linkage) @ qd
+    np.testing.assert_allclose(power, 5.0 * rate, atol=1e-8)
+
+
+def test_the_actuator_s_force_may_depend_on_its_length():
+    linkage, q, qd = motion("RRR")
+    spring = fj.LinearActuator(*PINS, force=lambda t, length, rate: -30 * length - rate)
+    same = fj.SpringDamper(*PINS, stiffness=30.0, damping=1.0)
+    np.testing.assert_allclose(
+        spring(0.0, q, qd, linkage), same(0.0, q, qd, linkage), rtol=1e-12
+    )
+
+
+def test_armature_adds_to_the_diagonal():
+    linkage, q, qd = motion("RPR")
+    qdd = np.array([0.3, -0.7, 1.1])
+    bare = fj.inverse_dynamics(linkage, q, qd, qdd)
+    full = fj.inverse_dynamics(linkage, q, qd, qdd, (ARMATURE,))
+    np.testing.assert_allclose(full - bare, [0.09, -0.14, 0.11], rtol=1e-10)
+
+
+@pytest.mark.parametrize("topology", fj.TOPOLOGIES)
+@pytest.mark.parametrize("name", ELEMENTS)
+def test_inverse_after_forward(topology, name):
+    linkage, q, qd = motion(topology)
+    tau, forces = np.array([1.0, -2.0, 0.5]), (ELEMENTS[name],)
+    qdd = fj.forward_dynamics(linkage, q, qd, tau, forces)
+    back = fj.inverse_dynamics(linkage, q, qd, qdd, forces)
+    np.testing.assert_allclose(back, tau, rtol=1e-10)
+
+
+@pytest.mark.parametrize("topology", fj.TOPOLOGIES)
+def test_energy_and_work(topology):
+    """The constant force between the pins works by the change of their distance."""
+    linkage, q, qd = motion(topology)
+    forces, ts = (ACTUATOR, ARMATURE), np.linspace(0, 0.5, 11)
+    solution = fj.simulate(linkage, fj.State(q, qd), ts, forces)
+    kinetic, potential = jax.vmap(lambda q, qd: fj.energy(linkage, q, qd, forces))(
+        solution.q, solution.qd
+    )
+    apart = [np.abs(np.subtract(*pins(linkage, row))) for row in solution.q]
+    constant = np.asarray(kinetic + potential) - 5.0 * np.array(apart)
+    assert np.ptp(kinetic) > 1e-2
+    np.testing.assert_allclose(constant, constant[0], atol=1e-8 * np.max(kinetic))
+
+
+def test_the_conditioning_sees_the_armature():
+    """A light tip on a heavy arm gets well-conditioned by a heavy rotor."""
+    linkage = fj.Linkage(
+        "RRR", length=[0, 1, 1, 1], com=[[0.5, 0]] * 3, mass=[1, 1, 1e6],
+        inertia=[1 / 12] * 3,
+    )  # fmt: skip
+    q = np.array([0.1, 0.2, 0.3])
+    assert fj.inertia_ratios(linkage, q).min() < 1e-4
+    assert fj.inertia_ratios(linkage, q, (fj.Armature(1e9),)).min() > 0.9
+
+
+@pytest.mark.parametrize("mode", ["forward", "reverse"])
+def test_gradients_equal_differences(mode):
+    import diffrax
+
+    linkage, q, qd = motion("RPR")
+
+    def end(p, adjoint):
+        actuator = fj.LinearActuator(*PINS, force=p[0], mass=p[1:], com=[0.2, 0.3])
+        forces = actuator, fj.Armature(0.1)
+        state0 = fj.State(q, qd)
+        return fj.simulate(linkage, state0, [0, 0.5], forces, adjoint=adjoint).q[-1]
+
+    p = jnp.array([5.0, 1.2, 0.7])
+    reverse = diffrax.RecursiveCheckpointAdjoint()
+    if mode == "forward":
+        slope = jax.jacfwd(lambda p: end(p, diffrax.ForwardMode()))(p)
+    else:
+        slope = jax.jacrev(lambda p: end(p, reverse))(p)
+    columns = [
+        (end(p + h, reverse) - end(p - h, reverse)) / 2e-3 for h in 1e-3 * np.eye(3)
+    ]
+    difference = np.stack(columns, axis=1)
+    np.testing.assert_allclose(slope, difference, atol=1e-6 * np.abs(slope).max())
+
+
+def test_a_scene_with_them_is_batched_like_any_other():
+    linkage, q, qd = motion("RPR")
+    many = fj.State(q + np.linspace(-0.1, 0.1, 5)[:, None], qd)
+    ts, forces = [0, 0.2], (ACTUATOR, ARMATURE)
+    swept = fj.sweep(linkage, many, ts, forces)
+    for member, q0 in enumerate(many.q):
+        alone = fj.simulate(linkage, fj.State(q0, qd), ts, forces)
+        np.testing.assert_allclose(swept.q[member], alone.q, atol=1e-9)

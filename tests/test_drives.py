@@ -1,0 +1,171 @@
+"""Servo drives: closed forms, limits, and the states they integrate."""
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import fdof_jax as fj
+
+# Joints that feel nothing of each other: slides at right angles carry point masses.
+STILL = fj.State(np.zeros(3), np.zeros(3))
+
+
+class Hold(eqx.Module):
+    target: jax.Array
+
+    def __call__(self, t, linkage):
+        return self.target, jnp.zeros(3)
+
+
+def single(inertia=2.0):
+    """An arm whose last joint turns a balanced wheel: I qdd = tau, gravity or not."""
+    return fj.Linkage(
+        "RRR", length=[0, 1, 1, 0], com=[[0, 0]] * 3, mass=[1, 1, 1],
+        inertia=[1e6, 1e6, inertia], gravity=0.0,
+    )  # fmt: skip
+
+
+def only_last(value):
+    return jnp.array([0.0, 0.0, value])
+
+
+def test_a_lag_is_an_exponential():
+    lag = fj.FirstOrderLag(fj.JointEffort([0, 0, 3.0]), 0.2)
+    ts = np.linspace(0, 1, 11)
+    solution = fj.simulate(single(), STILL, ts, (lag,))
+    (effort,) = solution.own
+    np.testing.assert_allclose(effort[:, 2], 3 * (1 - np.exp(-ts / 0.2)), atol=1e-9)
+    # tau = 3 (1 - e^(-t/T)) on an inertia of 2 that the rest of the arm hardly feels.
+    rate = 1.5 * (ts - 0.2 * (1 - np.exp(-ts / 0.2)))
+    np.testing.assert_allclose(solution.qd[:, 2], rate, rtol=3e-6, atol=1e-9)
+    found = fj.joint_efforts(single(), (lag,), solution)
+    np.testing.assert_array_equal(found.total, effort)
+
+
+def test_a_motor_reaches_its_current_and_its_speed():
+    motor = fj.DCMotor(
+        fj.JointEffort([0, 0, 12.0]), resistance=2.0, inductance=0.5, constant=0.1,
+        gear=3.0,
+    )  # fmt: skip
+    wheel = single()
+    # L di/dt = v - R i - k n w, J dw/dt = k n i.
+    rates = np.array([[-2 / 0.5, -0.3 / 0.5], [0.3 / 2, 0]])
+    ts = np.linspace(0, 5, 21)
+    from scipy.linalg import expm
+
+    steady = np.linalg.solve(rates, [-12 / 0.5, 0])
+    exact = np.array([steady - expm(rates * t) @ steady for t in ts])
+    solution = fj.simulate(wheel, STILL, ts, (motor,))
+    np.testing.assert_allclose(solution.own[0][:, 2], exact[:, 0], rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(solution.qd[:, 2], exact[:, 1], rtol=1e-5, atol=1e-5)
+
+
+def test_a_motor_s_limits():
+    command = fj.JointEffort([0, 0, 100.0])
+    options = dict(resistance=2.0, inductance=0.01, constant=0.1)
+    ts = np.linspace(0, 0.2, 21)
+    low = fj.DCMotor(command, voltage_limit=4.0, **options)
+    current = fj.simulate(single(), STILL, ts, (low,)).own[0][:, 2]
+    assert current.max() == pytest.approx(2.0, rel=1e-2)  # V / R, less the back-EMF
+    weak = fj.DCMotor(command, current_limit=3.0, **options)
+    current = fj.simulate(single(), STILL, ts, (weak,)).own[0][:, 2]
+    assert current[-1] == pytest.approx(3.0, rel=1e-3)
+    assert current.max() <= 3.01
+
+
+def test_a_speed_limit_is_a_line():
+    drive = fj.SpeedLimit(fj.JointEffort([9.0, 9.0, -9.0]), stall=6.0, no_load=2.0)
+    q = np.zeros(3)
+    for qd, expected in (
+        ([0, 0, 0], [6, 6, -6]),
+        ([1, -1, 1], [3, 6, -6]),
+        ([3, -3, -1], [0, 6, -3]),
+    ):
+        tau = drive(0.0, q, np.array(qd, float), single())
+        np.testing.assert_allclose(tau, expected)
+
+
+def test_an_integral_removes_the_sag():
+    arm = fj.Linkage(
+        "RRR", length=[0, 1, 1, 1], com=[[0.5, 0]] * 3, mass=[1, 1, 1],
+        inertia=[1 / 12] * 3,
+    )  # fmt: skip
+    hold = Hold(jnp.array([0.3, 0.2, 0.1]))
+    start = fj.State(np.zeros(3), np.zeros(3))
+    pd = fj.PDController(200.0, 40.0, jnp.inf, hold)
+    pid = fj.PIDController(200.0, 300.0, 40.0, jnp.inf, hold)
+    ends = [
+        np.abs(fj.simulate(arm, start, [0, 15], (f,)).q[-1] - hold.target).max()
+        for f in (pd, pid)
+    ]
+    assert ends[0] > 0.05 and ends[1] < 1e-4
+    solution = fj.simulate(arm, start, [0, 15], (pid,))
+    load = fj.inverse_dynamics(arm, hold.target, np.zeros(3), np.zeros(3))
+    np.testing.assert_allclose(solution.own[0][-1], load, atol=0.05)
+
+
+def test_anti_windup_keeps_the_overshoot_small():
+    """A step that saturates for long: a plain integral would wind up."""
+    hold = Hold(only_last(1.0))
+    overshoot = []
+    for unwind in (1e9, 0.05):
+        pid = fj.PIDController(8.0, 8.0, 6.0, 1.0, hold, unwind=unwind)
+        solution = fj.simulate(single(), STILL, np.linspace(0, 20, 201), (pid,))
+        overshoot.append(float(solution.q[:, 2].max() - 1))
+    assert overshoot[0] > 0.3 and overshoot[1] < 0.5 * overshoot[0]
+
+
+@pytest.mark.parametrize("mode", ["forward", "reverse"])
+def test_gradients_equal_differences(mode):
+    def end(p, adjoint):
+        pid = fj.PIDController(8.0, p[0], 6.0, jnp.inf, Hold(only_last(1.0)))
+        lag = fj.FirstOrderLag(fj.JointEffort([0, 0, 0.3]), p[1])
+        solution = fj.simulate(single(), STILL, [0, 1], (pid, lag), adjoint=adjoint)
+        return jnp.stack([solution.q[-1, 2], solution.own[0][-1, 2]])
+
+    p = jnp.array([5.0, 0.2])
+    reverse = diffrax.RecursiveCheckpointAdjoint()
+    if mode == "forward":
+        slope = jax.jacfwd(lambda p: end(p, diffrax.ForwardMode()))(p)
+    else:
+        slope = jax.jacrev(lambda p: end(p, reverse))(p)
+    columns = [
+        (end(p + h, reverse) - end(p - h, reverse)) / 2e-4 for h in 1e-4 * np.eye(2)
+    ]
+    np.testing.assert_allclose(slope, np.stack(columns, axis=1), atol=1e-7)
+
+
+def test_states_of_elements_are_swept():
+    lag = fj.FirstOrderLag(fj.JointEffort([0, 0, 3.0]), 0.2)
+    q = np.linspace(0, 1, 5)[:, None] * np.ones(3)
+    solution = fj.sweep(single(), fj.State(q, np.zeros(3)), [0, 0.2, 0.4], (lag,))
+    (effort,) = solution.own
+    exact = 3 * (1 - np.exp(-np.array([0, 1, 2])))
+    np.testing.assert_allclose(effort[..., 2], np.tile(exact, (5, 1)), atol=1e-9)
+
+
+class Wrong(fj.StatefulElement):
+    """Whose rate is not like its state."""
+
+    def initial_state(self, linkage):
+        return jnp.zeros(3)
+
+    def __call__(self, t, q, qd, linkage, state):
+        return jnp.zeros(3), jnp.zeros(2)
+
+
+def test_malformed_elements_are_refused():
+    with pytest.raises(
+        ValueError, match=r"forces\[0\]: expected the rate of its state"
+    ):
+        fj.simulate(single(), STILL, [0, 1], (Wrong(),))
+    lag = fj.FirstOrderLag(fj.JointEffort(1.0 * np.ones(3)), 0.1)
+    with pytest.raises(ValueError, match="command: expected a force element without"):
+        fj.FirstOrderLag(lag, 0.1)
+    with pytest.raises(ValueError, match="time_constant: expected .* above 0"):
+        fj.FirstOrderLag(fj.JointEffort(np.ones(3)), 0.0)
+    with pytest.raises(ValueError, match="resistance: expected"):
+        fj.DCMotor(fj.JointEffort(np.ones(3)), resistance=-1, inductance=1, constant=1)

@@ -1,0 +1,200 @@
+"""Springs, forces and wrenches at points of links: power, energy and MuJoCo."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from helpers import random_linkage
+
+import fdof_jax as fj
+
+A, B = fj.Point(0, 0.3, -0.4), fj.Point(3, 0.5, 0.2)
+ELEMENTS = {
+    "spring": fj.SpringDamper(A, B, stiffness=30.0, rest_length=0.4),
+    "cable": fj.SpringDamper(A, B, stiffness=30.0, rest_length=0.4, one_sided="cable"),
+    "spring of no length": fj.SpringDamper(fj.Point(1), B, stiffness=30.0),
+    "tension": fj.Tension(A, B, 7.0),
+}
+
+
+def motion(topology, seed=0):
+    rng = np.random.default_rng(seed)
+    return random_linkage(topology, rng), *rng.uniform(-1, 1, (2, 3))
+
+
+@pytest.mark.parametrize("topology", fj.TOPOLOGIES)
+@pytest.mark.parametrize("link", range(4))
+def test_a_point_lies_where_the_links_are(topology, link):
+    linkage, q, _ = motion(topology)
+    point = fj.Point(link, 0.3, -0.2)
+    x, _ = fj.to_chain(linkage, q, np.zeros(3))
+    angle = [linkage.base_angle, *x[1::2]][link]
+    start = [np.zeros(2), *fj.joint_positions(linkage, q)][link]
+    along = np.array([np.cos(angle), np.sin(angle)])
+    expected = start + 0.3 * along - 0.2 * np.array([-along[1], along[0]])
+    np.testing.assert_allclose(point.position(linkage, q), expected, atol=1e-14)
+
+
+@pytest.mark.parametrize("topology", fj.TOPOLOGIES)
+@pytest.mark.parametrize("follows", [False, True])
+def test_a_wrench_does_the_power_of_force_and_moment(topology, follows):
+    linkage, q, qd = motion(topology)
+    tip = fj.Point(3, linkage.length[3])
+    wrench = fj.Wrench(tip, [3.0, -2.0], 1.5, follows=follows)
+    force = np.array([3.0, -2.0])
+    if follows:
+        angle = fj.to_chain(linkage, q, qd)[0][5]
+        turn = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+        force = np.array(turn) @ force
+    exact = np.asarray(fj.tip_jacobian(linkage, q)).T @ [*force, 1.5]
+    np.testing.assert_allclose(wrench(0.0, q, qd, linkage), exact, atol=1e-13)
+
+
+def test_a_wrench_on_the_ground_does_nothing():
+    linkage, q, qd = motion("RPR")
+    wrench = fj.Wrench(fj.Point(0, 1.0), [3.0, -2.0], 1.5)
+    np.testing.assert_array_equal(wrench(0.0, q, qd, linkage), 0)
+
+
+def test_a_wrench_may_depend_on_time():
+    linkage, q, qd = motion("RRR")
+    moving = fj.Wrench(B, lambda t: jnp.array([t, 2 * t]), lambda t: 3 * t)
+    still = fj.Wrench(B, [0.5, 1.0], 1.5)
+    np.testing.assert_allclose(
+        moving(0.5, q, qd, linkage), still(0.5, q, qd, linkage), atol=1e-14
+    )
+
+
+@pytest.mark.parametrize("topology", fj.TOPOLOGIES)
+@pytest.mark.parametrize("name", ELEMENTS)
+def test_power_is_what_potential_energy_loses(topology, name):
+    element = ELEMENTS[name]
+    linkage, q, qd = motion(topology)
+    _, gained = jax.jvp(lambda q: element.potential_energy(q, linkage), (q,), (qd,))
+    power = element(0.0, q, qd, linkage) @ qd
+    assert abs(gained) > 1e-3
+    np.testing.assert_allclose(power, -gained, atol=1e-12)
+
+
+def test_a_damper_takes_the_square_of_the_rate():
+    linkage, q, qd = motion("RPR")
+    damper = fj.SpringDamper(A, B, damping=4.0)
+    _, rate = jax.jvp(lambda q: damper.ends.length(linkage, q), (q,), (qd,))
+    power = damper(0.0, q, qd, linkage) @ qd
+    np.testing.assert_allclose(power, -4 * rate**2, rtol=1e-12)
+
+
+@pytest.mark.parametrize("side, sign", [("cable", 1), ("bumper", -1)])
+def test_one_sided_springs(side, sign):
+    linkage, q, qd = motion("RRR")
+    length = fj.SpringDamper(A, B).ends.length(linkage, q)
+    for shift in (-0.1, 0.1):
+        options = dict(stiffness=30.0, damping=0.1, rest_length=length - shift)
+        both = fj.SpringDamper(A, B, **options)(0.0, q, qd, linkage)
+        one = fj.SpringDamper(A, B, one_sided=side, **options)(0.0, q, qd, linkage)
+        assert np.abs(both).max() > 0.1
+        np.testing.assert_array_equal(one, both if shift * sign > 0 else 0 * both)
+    # A damper alone would push a slack cable and hold a leaving bumper back.
+    fast = -20.0 * sign * np.sign(both @ qd) * qd
+    held = fj.SpringDamper(
+        A, B, damping=9.0, stiffness=1e-9, rest_length=length - 0.1 * sign,
+        one_sided=side,
+    )  # fmt: skip
+    _, rate = jax.jvp(lambda q: held.ends.length(linkage, q), (q,), (fast,))
+    free = held(0.0, q, fast, linkage)
+    assert (sign * rate < 0) == (np.abs(free).max() == 0)
+
+
+@pytest.mark.parametrize("topology", fj.TOPOLOGIES)
+@pytest.mark.parametrize("name", ["spring", "tension"])
+def test_energy_is_conserved(topology, name):
+    element = ELEMENTS[name]
+    linkage, q, qd = motion(topology)
+    ts = np.linspace(0, 1, 11)
+    solution = fj.simulate(linkage, fj.State(q, qd), ts, (element,))
+    energies = jax.vmap(lambda q, qd: fj.energy(linkage, q, qd, (element,)))
+    kinetic, potential = energies(solution.q, solution.qd)
+    total = np.asarray(kinetic + potential)
+    assert np.ptp(kinetic) > 1e-2
+    np.testing.assert_allclose(total, total[0], atol=1e-9 * np.max(kinetic))
+
+
+@pytest.mark.parametrize("topology", fj.TOPOLOGIES)
+def test_accelerations_of_mujoco_with_a_tendon(topology):
+    linkage, q, qd = motion(topology)
+    element = fj.SpringDamper(A, B, stiffness=30.0, damping=4.0, rest_length=0.4)
+    text = fj.to_mjcf(linkage)
+    site = '<site name="{}" pos="{} {} 0"/>'
+    text = text.replace(
+        '<site name="tip"', site.format("b", 0.5, 0.2) + '<site name="tip"'
+    )
+    ground = text.index(">", text.index('<body name="ground"')) + 1
+    text = text[:ground] + site.format("a", 0.3, -0.4) + text[ground:]
+    tendon = (
+        '<tendon><spatial stiffness="30" damping="4" springlength="0.4">'
+        '<site site="a"/><site site="b"/></spatial></tendon></mujoco>'
+    )
+    model = mujoco.MjModel.from_xml_string(text.replace("</mujoco>", tendon))
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = q, qd
+    mujoco.mj_forward(model, data)
+    tau = element(0.0, q, qd, linkage)
+    own = fj.forward_dynamics(linkage, q, qd, tau)
+    np.testing.assert_allclose(own, data.qacc, rtol=1e-11, atol=1e-11)
+
+
+def test_where_points_meet_forces_and_derivatives_are_finite():
+    linkage = random_linkage("RRR", np.random.default_rng(1))
+    same = fj.SpringDamper(
+        fj.Point(1), fj.Point(1), stiffness=3.0, damping=1.0, rest_length=0.5
+    )
+    q, qd = np.array([0.1, 0.2, 0.3]), np.ones(3)
+    np.testing.assert_array_equal(same(0.0, q, qd, linkage), 0)
+    slope = jax.jacfwd(lambda q: same(0.0, q, qd, linkage))(q)
+    assert np.isfinite(slope).all()
+
+
+@pytest.mark.parametrize("mode", ["forward", "reverse"])
+def test_gradients_equal_differences(mode):
+    linkage, q, qd = motion("RPR")
+
+    def end(stiffness, adjoint):
+        forces = (
+            fj.SpringDamper(A, B, stiffness=stiffness, damping=0.5, rest_length=0.4),
+        )
+        state0 = fj.State(q, qd)
+        return fj.simulate(linkage, state0, [0, 0.5], forces, adjoint=adjoint).q[-1]
+
+    import diffrax
+
+    if mode == "forward":
+        slope = jax.jacfwd(lambda k: end(k, diffrax.ForwardMode()))(30.0)
+    else:
+        slope = jax.jacrev(lambda k: end(k, diffrax.RecursiveCheckpointAdjoint()))(30.0)
+    plain = diffrax.RecursiveCheckpointAdjoint()
+    difference = (end(30.01, plain) - end(29.99, plain)) / 0.02
+    np.testing.assert_allclose(slope, difference, atol=1e-7 * np.abs(slope).max())
+
+
+@pytest.mark.parametrize(
+    "make, message",
+    [
+        (lambda: fj.Point(4), "link: expected 0"),
+        (lambda: fj.Point(1.5), "link: expected a whole number"),
+        (lambda: fj.Point(1, np.nan), "along: expected a real number, finite"),
+        (lambda: fj.SpringDamper(A, 3), "b: expected a Point"),
+        (
+            lambda: fj.SpringDamper(A, B, stiffness=-1),
+            "stiffness: expected .* at least",
+        ),
+        (lambda: fj.SpringDamper(A, B, one_sided="rope"), "one_sided: expected False"),
+        (lambda: fj.SpringDamper(A, B, one_sided=True), "one_sided: expected False"),
+        (lambda: fj.Tension(A, B, "x"), "tension: expected a real number"),
+        (lambda: fj.Wrench(A, [1, 2, 3]), "force: expected an array of 2"),
+        (lambda: fj.Wrench(A, follows=1), "follows: expected a bool"),
+    ],
+)
+def test_malformed_arguments_are_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
