@@ -16,14 +16,21 @@ def inertial(forces: Forces) -> Forces:
     return tuple(e for e in forces if isinstance(e, InertialElement))
 
 
+def energetic(forces: Forces) -> Forces:
+    """Those of the elements that have energy: springs too."""
+    callable_tuple("forces", forces)
+    return tuple(e for e in forces if hasattr(e, "potential_energy"))
+
+
 def added_energy(
     linkage: Linkage, forces: Forces, q: Array, qd: Array
 ) -> tuple[Array, Array]:
-    """Kinetic and potential energy of the elements' masses [J]."""
+    """Kinetic and potential energy of the elements [J]."""
     kinetic, potential = jnp.zeros(()), jnp.zeros(())
-    for element in inertial(forces):
-        kinetic = kinetic + element.kinetic_energy(q, qd, linkage)
+    for element in energetic(forces):
         potential = potential + element.potential_energy(q, linkage)
+        if isinstance(element, InertialElement):
+            kinetic = kinetic + element.kinetic_energy(q, qd, linkage)
     return kinetic, potential
 
 

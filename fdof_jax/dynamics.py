@@ -4,7 +4,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
-from .added_inertia import added_energy, added_inertia, inertial
+from .added_inertia import added_energy, added_inertia, energetic, inertial
 from .forces import Forces
 from .kinematics import mass_center_velocities, mass_centers
 from .linkage import Linkage, compiled
@@ -102,7 +102,7 @@ def link_energies(
     return kinetic / 2, linkage.mass * linkage.gravity * height
 
 
-@compiled(q=(3,), qd=(3,), forces=inertial)
+@compiled(q=(3,), qd=(3,), forces=energetic)
 def energy(
     linkage: Linkage,
     q: Float[Array, " joint"],
@@ -112,7 +112,7 @@ def energy(
     """Kinetic and potential energy of the linkage, (6) and (7).
 
     **Arguments:** `q` [m or rad], `qd` [m/s or rad/s]; `forces`: force elements whose
-    masses count. Springs keep their energy to themselves.
+    energy counts, that of their masses and springs.
 
     **Returns:** two numbers [J]; the potential is zero at the ground pivot's height.
     """

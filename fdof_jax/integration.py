@@ -194,6 +194,11 @@ def _step_for_tangents(t0: Array, args: _Args, fraction: float) -> Array:
     return jax.lax.stop_gradient(jnp.where(step > 0, step, jnp.inf))
 
 
+def _default_solver(forces: Forces, for_tangents=False) -> diffrax.AbstractSolver:
+    # Thirteen copies of equations that are differentiated anew take minutes to compile.
+    return diffrax.Dopri8() if inertial(forces) else UnrolledDopri8(for_tangents)
+
+
 def _integrate(solver, inputs, keywords, derivatives: bool = False) -> Solution:
     """`derivatives`: whether they are wanted, to the accuracy of the default steps."""
     linkage, state0, asked, forces = inputs
@@ -274,7 +279,7 @@ def _integrate_reversibly(inputs, solver, keywords) -> Solution:
     """
     # Nothing is differentiated here, and loops made for that take longer to compile.
     keywords = keywords | {"adjoint": diffrax.ForwardMode()}
-    return _integrate(solver or UnrolledDopri8(), inputs, keywords)
+    return _integrate(solver or _default_solver(inputs[-1]), inputs, keywords)
 
 
 @_integrate_reversibly.def_fwd
@@ -325,5 +330,9 @@ def solve(solver, inputs, keywords) -> Solution:
         return _integrate_reversibly(_opened(inputs), solver, keywords)
     if solver is None:
         forward = isinstance(adjoint, diffrax.ForwardMode)
-        solver = UnrolledDopri8(for_tangents=True) if forward else diffrax.Dopri8()
+        solver = (
+            _default_solver(inputs[-1], for_tangents=True)
+            if forward
+            else diffrax.Dopri8()
+        )
     return _integrate(solver, inputs, keywords, derivatives=True)

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.linalg import expm
 
 import fdof_jax as fj
 
@@ -54,8 +55,6 @@ def test_a_motor_reaches_its_current_and_its_speed():
     # L di/dt = v - R i - k n w, J dw/dt = k n i.
     rates = np.array([[-2 / 0.5, -0.3 / 0.5], [0.3 / 2, 0]])
     ts = np.linspace(0, 5, 21)
-    from scipy.linalg import expm
-
     steady = np.linalg.solve(rates, [-12 / 0.5, 0])
     exact = np.array([steady - expm(rates * t) @ steady for t in ts])
     solution = fj.simulate(wheel, STILL, ts, (motor,))

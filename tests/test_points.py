@@ -1,5 +1,6 @@
 """Springs, forces and wrenches at points of links: power, energy and MuJoCo."""
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -165,8 +166,6 @@ def test_gradients_equal_differences(mode):
         )
         state0 = fj.State(q, qd)
         return fj.simulate(linkage, state0, [0, 0.5], forces, adjoint=adjoint).q[-1]
-
-    import diffrax
 
     if mode == "forward":
         slope = jax.jacfwd(lambda k: end(k, diffrax.ForwardMode()))(30.0)
