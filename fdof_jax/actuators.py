@@ -29,8 +29,11 @@ class Armature(InertialElement):
     def __init__(self, inertia: ArrayLike):
         self.inertia = real_array("inertia", inertia, (3,), minimum=0, broadcast=True)
 
-    def kinetic_energy(self, q, qd, linkage):
-        return jnp.sum(self.inertia * qd**2) / 2
+    def coordinates(self, q, linkage):
+        return q
+
+    def weights(self, linkage):
+        return self.inertia
 
 
 class LinearActuator(InertialElement):
@@ -81,12 +84,12 @@ class LinearActuator(InertialElement):
         unit = (b - a) / jnp.sqrt(jnp.sum((b - a) ** 2))
         return jnp.stack([a + self.com[0] * unit, b - self.com[1] * unit])
 
-    def kinetic_energy(self, q, qd, linkage):
-        _, velocity = jax.jvp(lambda q: self._centers(linkage, q), (q,), (qd,))
-        (x, y), (vx, vy) = jax.jvp(lambda q: self.ends.vector(linkage, q), (q,), (qd,))
-        spin = (x * vy - y * vx) / (x**2 + y**2)
-        moving = self.mass * jnp.sum(velocity**2, axis=1)
-        return jnp.sum(moving + self.inertia * spin**2) / 2
+    def coordinates(self, q, linkage):
+        x, y = self.ends.vector(linkage, q)
+        return jnp.append(self._centers(linkage, q).ravel(), jnp.arctan2(y, x))
+
+    def weights(self, linkage):
+        return jnp.append(jnp.repeat(self.mass, 2), jnp.sum(self.inertia))
 
     def potential_energy(self, q, linkage):
         height = self._centers(linkage, q)[:, 1]

@@ -30,7 +30,9 @@ def added_energy(
     for element in energetic(forces):
         potential = potential + element.potential_energy(q, linkage)
         if isinstance(element, InertialElement):
-            kinetic = kinetic + element.kinetic_energy(q, qd, linkage)
+            coordinates = lambda q, e=element: e.coordinates(q, linkage)
+            _, rates = jax.jvp(coordinates, (q,), (qd,))
+            kinetic = kinetic + jnp.sum(element.weights(linkage) * rates**2) / 2
     return kinetic, potential
 
 
@@ -39,22 +41,22 @@ def added_inertia(
 ) -> tuple[Added, Array] | None:
     """The elements' share of the mass matrix and of the bias (3,), if they have one.
 
-    By Lagrange's equations: the derivative of the momenta along the motion, less that
-    of the energies in the positions.
+    M = J^T W J and bias = J^T W (dJ/dt) qd + dV/dq, J being the derivative of the
+    coordinates: by forward mode alone, whose code is small in derivatives too.
     """
     if not inertial(forces):
         return None
-
-    def momenta(q: Array, qd: Array) -> Array:
-        kinetic = lambda qd: added_energy(linkage, forces, q, qd)[0]
-        return jax.grad(kinetic)(qd)
-
-    def lagrangian(q: Array) -> Array:
-        kinetic, potential = added_energy(linkage, forces, q, qd)
-        return kinetic - potential
-
-    matrix = jax.jacfwd(momenta, 1)(q, qd)
-    _, along = jax.jvp(lambda q: momenta(q, qd), (q,), (qd,))
+    columns, efforts = [], []
+    for element in inertial(forces):
+        coordinates = lambda q, e=element: e.coordinates(q, linkage)
+        along = lambda q, c=coordinates: jax.jvp(c, (q,), (qd,))[1]
+        _, turning = jax.jvp(along, (q,), (qd,))
+        jacobian, weights = jax.jacfwd(coordinates)(q), element.weights(linkage)
+        weighted = weights[:, None] * jacobian
+        columns.append(jnp.sum(weighted[:, :, None] * jacobian[:, None, :], axis=0))
+        slope = jax.jacfwd(lambda q, e=element: e.potential_energy(q, linkage))(q)
+        efforts.append(jnp.sum(weighted * turning[:, None], axis=0) + slope)
+    matrix = sum(columns)
     upper = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
     m11, m12, m13, m22, m23, m33 = (matrix[place] for place in upper)
-    return (m11, m12, m13, m22, m23, m33), along - jax.grad(lagrangian)(q)
+    return (m11, m12, m13, m22, m23, m33), sum(efforts)

@@ -71,16 +71,21 @@ class StatefulElement(eqx.Module):
 class InertialElement(eqx.Module):
     """A force element that moves masses: they add to the equations of motion.
 
-    A subclass implements `kinetic_energy`, a quadratic form in the velocities, and
-    what else it has. The equations come from it by Lagrange's.
+    Its kinetic energy is the sum of weight * (d coordinate/dt)^2 / 2. A body, for
+    instance, has the coordinates of its mass centre, whose weights are its mass, and
+    its angle, whose weight is its inertia. A subclass implements both methods.
     """
 
     @abstractmethod
-    def kinetic_energy(self, q: Array, qd: Array, linkage: Linkage) -> Array:
-        """The kinetic energy of its masses, () [J]."""
+    def coordinates(self, q: Array, linkage: Linkage) -> Array:
+        """Places and angles that follow from the joint positions, (n,)."""
+
+    @abstractmethod
+    def weights(self, linkage: Linkage) -> Array:
+        """Masses and inertias that go with them, (n,)."""
 
     def potential_energy(self, q: Array, linkage: Linkage) -> Array:
-        """Their potential energy, () [J]; 0 unless a subclass says otherwise."""
+        """The potential energy, () [J]; 0 unless a subclass says otherwise."""
         return jnp.zeros(())
 
     def __call__(self, t: Array, q: Array, qd: Array, linkage: Linkage) -> Array:
