@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from .forces import InertialElement
 from .linkage import Linkage
-from .points import Point, Separation
+from .points import Load, Point, Separation
 from .validation import real_array
 
 
@@ -98,7 +98,34 @@ class LinearActuator(InertialElement):
     def __call__(self, t, q, qd, linkage):
         length = lambda q: self.ends.length(linkage, q)
         now, slope = jax.value_and_grad(length)(q)
-        force = self.force
-        if callable(force):
-            force = real_array("force", force(t, now, slope @ qd), ())
-        return force * slope
+        return self._push(t, now, slope @ qd) * slope
+
+    def _push(self, t: Array, length: Array, rate: Array) -> Array:
+        if callable(self.force):
+            return real_array("force", self.force(t, length, rate), ())
+        return self.force
+
+    def loads(
+        self, t: Array, q: Array, qd: Array, qdd: Array, linkage: Linkage
+    ) -> tuple[Load, Load]:
+        """What its pins do to the links, while the joints accelerate by `qdd`.
+
+        Besides the force between them: the weight and the inertia of the two bodies,
+        whose sideways part both pins share as the moments about the first one demand.
+        """
+        along = lambda q, qd: jax.jvp(
+            lambda q: self.coordinates(q, linkage), (q,), (qd,)
+        )[1]
+        _, acceleration = jax.jvp(along, (q, qd), (qd, qdd))
+        weight = self.mass[:, None] * jnp.array([0.0, 1.0]) * linkage.gravity
+        needed = self.mass[:, None] * acceleration[:4].reshape(2, 2) + weight
+        length, rate = jax.jvp(lambda q: self.ends.length(linkage, q), (q,), (qd,))
+        unit = self.ends.vector(linkage, q) / length
+        sideways = jnp.stack([-unit[1], unit[0]])
+        turning = jnp.sum(self.inertia) * acceleration[4]
+        arms = jnp.stack([self.com[0], length - self.com[1]])
+        across = (turning + jnp.sum(arms * (needed @ sideways))) / length
+        held = needed[1] @ unit - self._push(t, length, rate)
+        on_b = held * unit + across * sideways  # by the link, on the piston
+        on_a = needed[0] + needed[1] - on_b
+        return Load(self.ends.a, -on_a), Load(self.ends.b, -on_b)

@@ -1,7 +1,8 @@
 """Points of links, and what pulls or pushes at them."""
 
+from abc import abstractmethod
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -49,6 +50,43 @@ class Point(eqx.Module):
         return jnp.stack([place.real, place.imag])
 
 
+class Load(NamedTuple):
+    """A force and a moment on a point.
+
+    - `force`: (x, y) [N]; `moment`: counter-clockwise [N m].
+    """
+
+    point: Point
+    force: Array
+    moment: Any = 0.0
+
+    def efforts(self, linkage: Linkage, q: Array) -> Array:
+        """The joint efforts that do the same work, (3,) [N or N m]."""
+        _, pull_back = jax.vjp(lambda q: self.point.position(linkage, q), q)
+        (tau,) = pull_back(self.force)
+        return tau + self.moment * _angle_slopes(linkage, self.point.link)
+
+
+class PointElement(eqx.Module):
+    """A force element that acts on points of links or of the ground.
+
+    A subclass implements `loads`. Unlike efforts in the joints, which pass through
+    them, these loads are carried by the bearings: see `joint_reactions`.
+    """
+
+    @abstractmethod
+    def loads(
+        self, t: Array, q: Array, qd: Array, linkage: Linkage
+    ) -> tuple[Load, ...]:
+        """What it does to the points."""
+
+    def __call__(self, t: Array, q: Array, qd: Array, linkage: Linkage) -> Array:
+        return sum(
+            (load.efforts(linkage, q) for load in self.loads(t, q, qd, linkage)),
+            jnp.zeros(3),
+        )
+
+
 def _turned(linkage: Linkage, q: Array, link: Array, vector: Array) -> Array:
     """A vector given in a link's frame."""
     _, direction = link_frames(linkage, q)
@@ -84,7 +122,7 @@ class Separation(eqx.Module):
         return jnp.where(apart, jnp.sqrt(jnp.where(apart, square, 1)), 0)
 
 
-class SpringDamper(eqx.Module):
+class SpringDamper(PointElement):
     """A spring and a damper between two points, along the line that joins them.
 
     The tension is stiffness * (length - rest_length) + damping * d(length)/dt. With a
@@ -127,19 +165,17 @@ class SpringDamper(eqx.Module):
             )
         self.side = jnp.asarray(sides[one_sided])
 
-    def __call__(self, t, q, qd, linkage):
-        vector, pull_back = jax.vjp(lambda q: self.ends.vector(linkage, q), q)
+    def loads(self, t, q, qd, linkage):
         length, rate = jax.jvp(lambda q: self.ends.length(linkage, q), (q,), (qd,))
         tension = self.stiffness * (length - self.rest_length) + self.damping * rate
         # Of the whole, what remains when the smooth pull of a spring is taken off.
         other = self.damping * rate - self.stiffness * self.rest_length
         beyond = self.side * (length - self.rest_length) > 0
         works = (self.side == 0) | (beyond & (self.side * tension > 0))
-        force = self.stiffness * vector + other * vector / jnp.where(
-            length > 0, length, 1
-        )
-        (tau,) = pull_back(jnp.where(works, -force, 0))
-        return tau
+        vector = self.ends.vector(linkage, q)
+        unit = vector / jnp.where(length > 0, length, 1)
+        pull = jnp.where(works, self.stiffness * vector + other * unit, 0)
+        return Load(self.ends.a, pull), Load(self.ends.b, -pull)
 
     def potential_energy(self, q: Array, linkage: Linkage) -> Array:
         """The energy of the spring [J]."""
@@ -148,7 +184,7 @@ class SpringDamper(eqx.Module):
         return jnp.where(works, self.stiffness * stretch**2 / 2, 0)
 
 
-class Tension(eqx.Module):
+class Tension(PointElement):
     """A constant force between two points, along the line that joins them.
 
     **Arguments:** `a`, `b`: the two `Point`s; `tension`: positive pulls them
@@ -164,15 +200,17 @@ class Tension(eqx.Module):
         self.ends = Separation(a, b)
         self.tension = real_array("tension", tension, ())
 
-    def __call__(self, t, q, qd, linkage):
-        return -jax.grad(self.potential_energy)(q, linkage)
+    def loads(self, t, q, qd, linkage):
+        vector, length = (f(linkage, q) for f in (self.ends.vector, self.ends.length))
+        pull = self.tension * vector / jnp.where(length > 0, length, 1)
+        return Load(self.ends.a, pull), Load(self.ends.b, -pull)
 
     def potential_energy(self, q: Array, linkage: Linkage) -> Array:
         """Of which the force is the slope: 0 where the points meet [J]."""
         return self.tension * self.ends.length(linkage, q)
 
 
-class Wrench(eqx.Module):
+class Wrench(PointElement):
     """A force and a moment from outside, on a point of a link.
 
     **Arguments:**
@@ -205,13 +243,11 @@ class Wrench(eqx.Module):
         instance("follows", follows, bool)
         self.follows = jnp.asarray(follows)
 
-    def __call__(self, t, q, qd, linkage):
+    def loads(self, t, q, qd, linkage):
         force, moment = self.force, self.moment
         if callable(force):
             force = real_array("force", force(t), (2,))
         if callable(moment):
             moment = real_array("moment", moment(t), ())
         turned = _turned(linkage, q, self.point.link, force)
-        _, pull_back = jax.vjp(lambda q: self.point.position(linkage, q), q)
-        (tau,) = pull_back(jnp.where(self.follows, turned, force))
-        return tau + moment * _angle_slopes(linkage, self.point.link)
+        return (Load(self.point, jnp.where(self.follows, turned, force), moment),)

@@ -1,0 +1,277 @@
+"""References for controllers and prescribed motions: in joint space and of the tip."""
+
+from abc import abstractmethod
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from .kinematics import plane_angle, solve_joints, whole_turns, wrist_vector
+from .linkage import Linkage
+from .travel import Laps, Travel
+from .trigonometry import sincos
+from .validation import instance, real_array, sign
+
+
+class JointMove(eqx.Module):
+    """All joints from one position to another, in step.
+
+    **Arguments:** `start`, `end`: joint positions [m or rad]; `travel`: a `Travel`.
+
+    **Raises:** ValueError for malformed arguments.
+    """
+
+    start: Float[Array, " joint"]
+    end: Float[Array, " joint"]
+    travel: Travel
+
+    def __init__(self, start: ArrayLike, end: ArrayLike, travel: Travel):
+        self.start = real_array("start", start, (3,))
+        self.end = real_array("end", end, (3,))
+        instance("travel", travel, Travel)
+        self.travel = travel
+
+    def __call__(
+        self, t: ArrayLike, linkage: Linkage
+    ) -> tuple[Float[Array, " joint"], Float[Array, " joint"]]:
+        """Joint positions [m or rad] and velocities [m/s or rad/s] at time `t` [s]."""
+        t = real_array("t", t, ())
+        share, rate = jax.jvp(self.travel, (t,), (jnp.ones_like(t),))
+        way = self.end - self.start
+        return self.start + share * way, rate * way
+
+    @property
+    def jump_ts(self) -> Array:
+        """When velocity or acceleration jump [s]."""
+        return self.travel.jump_ts
+
+
+class Path(eqx.Module):
+    """A curve of the plane. A subclass implements `point`, and says its `middle`."""
+
+    middle: eqx.AbstractVar[Array]  # (x, y), somewhere in the midst of it [m]
+
+    @abstractmethod
+    def point(self, share: Array) -> Array:
+        """The point (x, y) at a share of the way, from 0 to 1 or per lap [m]."""
+
+
+class Line(Path):
+    """A straight line.
+
+    **Arguments:** `start`, `end`: points (x, y) [m].
+
+    **Raises:** ValueError for malformed points.
+    """
+
+    start: Float[Array, " 2"]
+    end: Float[Array, " 2"]
+
+    def __init__(self, start: ArrayLike, end: ArrayLike):
+        self.start = real_array("start", start, (2,))
+        self.end = real_array("end", end, (2,))
+
+    @property
+    def middle(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return (self.start + self.end) / 2
+
+    def point(self, share):
+        return self.start + share * (self.end - self.start)
+
+
+class _Closed(Path):
+    """A closed curve around a middle, of two sizes, turned by an angle."""
+
+    middle: Float[Array, " 2"]
+    sizes: Float[Array, " 2"]
+    tilt: Float[Array, ""]
+
+    def __init__(self, middle: ArrayLike, sizes: ArrayLike, *, tilt: ArrayLike = 0.0):
+        self.middle = real_array("middle", middle, (2,))
+        self.sizes = real_array("sizes", sizes, (2,), minimum=0)
+        self.tilt = real_array("tilt", tilt, ())
+
+    def _placed(self, along: Array, across: Array) -> Array:
+        sin, cos = sincos(self.tilt)
+        a, b = self.sizes[0] * along, self.sizes[1] * across
+        return self.middle + jnp.stack([a * cos - b * sin, a * sin + b * cos])
+
+
+class Ellipse(_Closed):
+    """An ellipse, counter-clockwise from the end of its first axis.
+
+    **Arguments:** `middle`: (x, y) [m]; `sizes`: its half axes, not negative [m];
+    `tilt`: of the first axis [rad].
+
+    **Raises:** ValueError for malformed arguments.
+    """
+
+    def point(self, share):
+        sin, cos = sincos(2 * jnp.pi * share)
+        return self._placed(cos, sin)
+
+
+class FigureEight(_Closed):
+    """An eight lying on its side, from its crossing.
+
+    **Arguments:** `middle`: its crossing (x, y) [m]; `sizes`: half of its length, and
+    half of its height, not negative [m]; `tilt`: of its length [rad].
+
+    **Raises:** ValueError for malformed arguments.
+    """
+
+    def point(self, share):
+        sin, cos = sincos(2 * jnp.pi * share)
+        return self._placed(sin, 2 * sin * cos)
+
+
+class Spline(Path):
+    """A cubic spline through points, equally spaced in the share of the way.
+
+    **Arguments:** `points`: three or more (x, y) [m]; `closed`: whether it leads from
+    the last back to the first. An open one is straight at its ends.
+
+    **Raises:** ValueError for malformed arguments.
+    """
+
+    points: Float[Array, "n 2"]
+    bends: Float[Array, "n 2"]  # second derivatives per interval squared
+    closed: bool = eqx.field(static=True)
+
+    def __init__(self, points: ArrayLike, *, closed: bool = False):
+        self.points = real_array("points", points, (None, 2))
+        instance("closed", closed, bool)
+        self.closed = closed
+        count = len(self.points)
+        if count < 3:
+            raise ValueError(f"points: expected three or more, got {count}.")
+        # The slopes of neighbouring cubics meet: b[k-1] + 4 b[k] + b[k+1] = 6 d2[k].
+        rows = jnp.eye(count)
+        matrix = 4 * rows + jnp.roll(rows, 1, axis=1) + jnp.roll(rows, -1, axis=1)
+        p = self.points
+        right = 6 * (jnp.roll(p, 1, axis=0) - 2 * p + jnp.roll(p, -1, axis=0))
+        if not closed:
+            ends = jnp.array([0, count - 1])
+            matrix = matrix.at[ends].set(rows[ends])
+            right = right.at[ends].set(0)
+        self.bends = jnp.linalg.solve(matrix, right)
+
+    @property
+    def middle(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return jnp.mean(self.points, axis=0)
+
+    def point(self, share):
+        count = len(self.points)
+        if self.closed:
+            place = jnp.mod(share, 1) * count
+            first = jnp.minimum(jnp.floor(place), count - 1)
+        else:
+            place = share * (count - 1)
+            first = jnp.clip(jnp.floor(place), 0, count - 2)
+        b, k = place - first, first.astype(int)
+        a, after = 1 - b, (k + 1) % count
+        bend = (a**3 - a) * self.bends[k] + (b**3 - b) * self.bends[after]
+        return a * self.points[k] + b * self.points[after] + bend / 6
+
+
+class TipTask(eqx.Module):
+    """A path of the tip, the last link keeping its angle.
+
+    Called with `(t, linkage)` it gives the joint reference: the closed-form inverse
+    kinematics and its exact rate. The wrist (where the last link starts) must not cross
+    the half-line from the ground pivot away from the path's middle, where the angle of
+    a turning arm would jump: `simulate` checks it.
+
+    **Arguments:**
+
+    - `path`: a `Path`: `Line`, `Ellipse`, `FigureEight`, `Spline` or one's own.
+    - `timing`: a `Travel` or `Laps`, or any function of time to the share of the way.
+    - `orientation`: th4, the absolute angle of the last link [rad].
+    - `branch`: assembly of the arm, 1 or -1: see `inverse_kinematics`.
+
+    **Raises:** ValueError for malformed arguments; `check`, and with it `simulate`, for
+    a path out of the linkage's reach.
+    """
+
+    path: Path
+    timing: Any
+    orientation: Float[Array, ""]
+    branch: Float[Array, ""]
+
+    def __init__(
+        self,
+        path: Path,
+        timing: Travel | Laps | Any,
+        *,
+        orientation: ArrayLike = 0.0,
+        branch: int = 1,
+    ):
+        instance("path", path, Path)
+        if not callable(timing) or isinstance(timing, type):
+            raise ValueError(f"timing: expected a Travel or Laps, got {timing!r}.")
+        self.path, self.timing = path, timing
+        self.orientation = real_array("orientation", orientation, ())
+        self.branch = sign("branch", branch)
+
+    def tip(self, t: ArrayLike) -> Float[Array, " 2"]:
+        """The commanded tip position at time `t` [s]: (x, y) [m]."""
+        return self.path.point(self.timing(real_array("t", t, ())))
+
+    def _angles(self, t: Array, linkage: Linkage) -> tuple[Array, Array, Array]:
+        """The wrist, the direction of the middle, and the wrist's angle from there."""
+        wrist = wrist_vector(linkage, self.tip(t), self.orientation)
+        hub = wrist_vector(linkage, self.path.middle, self.orientation)
+        across = hub[0] * wrist[1] - hub[1] * wrist[0]
+        beside = plane_angle(across, hub @ wrist)
+        bearing = plane_angle(hub[1], hub[0])
+        return wrist, bearing - 2 * jnp.pi * whole_turns(bearing), beside
+
+    def _positions(self, t: Array, linkage: Linkage) -> Array:
+        wrist, bearing, beside = self._angles(t, linkage)
+        return solve_joints(
+            linkage, wrist, bearing + beside, self.orientation, self.branch
+        )
+
+    def __call__(
+        self, t: ArrayLike, linkage: Linkage
+    ) -> tuple[Float[Array, " joint"], Float[Array, " joint"]]:
+        """Joint positions [m or rad] and velocities [m/s or rad/s] at time `t` [s]."""
+        t = real_array("t", t, ())
+        return jax.jvp(lambda t: self._positions(t, linkage), (t,), (jnp.ones_like(t),))
+
+    @property
+    def jump_ts(self) -> Array | None:
+        """When the timing says that velocity or acceleration jump [s]."""
+        return getattr(self.timing, "jump_ts", None)
+
+    def check(self, linkage: Linkage, ts: Array) -> None:
+        """Raise ValueError where the tip leaves the reach between the times.
+
+        Looked at at 1000 times; or where the wrist's angle jumps between two of them.
+        """
+        times = jnp.linspace(ts[0], ts[-1], 1000)
+        q, beside = _checked(self, linkage, times)
+        if not jnp.isfinite(q).all():
+            first = float(times[jnp.argmin(jnp.isfinite(q).all(axis=1))])
+            raise ValueError(
+                "reference: expected a path within the linkage's reach at orientation "
+                f"{float(self.orientation):g} rad on branch {float(self.branch):+g}, "
+                f"got one that leaves it at {first:g} s."
+            )
+        if (jnp.abs(jnp.diff(beside)) > jnp.pi).any():
+            raise ValueError(
+                "reference: expected a path that does not pass behind the ground "
+                "pivot as seen from its middle, got one that does."
+            )
+
+
+@eqx.filter_jit
+def _checked(task: TipTask, linkage: Linkage, times: Array) -> tuple[Array, Array]:
+    def at(t):
+        return task._positions(t, linkage), task._angles(t, linkage)[2]
+
+    return jax.vmap(at)(times)
