@@ -28,6 +28,7 @@ from .forces import (
     JointEffort as JointEffort,
     StatefulElement as StatefulElement,
 )
+from .hybrid_dynamics import PrescribedMotion as PrescribedMotion
 from .interop import to_mjcf as to_mjcf
 from .joint_limits import JointFriction as JointFriction, JointStops as JointStops
 from .kinematics import (
@@ -46,16 +47,34 @@ from .linkage import (
     to_chain as to_chain,
 )
 from .points import (
+    Load as Load,
     Point as Point,
+    PointElement as PointElement,
     SpringDamper as SpringDamper,
     Tension as Tension,
     Wrench as Wrench,
+)
+from .reactions import joint_reactions as joint_reactions
+from .references import (
+    Ellipse as Ellipse,
+    FigureEight as FigureEight,
+    JointMove as JointMove,
+    Line as Line,
+    Path as Path,
+    Spline as Spline,
+    TipTask as TipTask,
+)
+from .sampled_control import (
+    SampledMotion as SampledMotion,
+    simulate_sampled as simulate_sampled,
+    step as step,
 )
 from .scenes import Scene as Scene
 from .simulation import joint_efforts as joint_efforts, simulate as simulate
 from .solution import Efforts as Efforts, Solution as Solution
 from .step_control import scale_tolerances as scale_tolerances
 from .sweep import sweep as sweep
+from .travel import Laps as Laps, Travel as Travel, shock_against as shock_against
 from .tuning import TuneResult as TuneResult, tune as tune
 
 __version__ = "0.1.0"

@@ -1,179 +1,45 @@
 """The vector field of a linkage with force elements, integrated by diffrax."""
 
 import inspect
-from typing import Any, NamedTuple
+from typing import Any
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 
-from .added_inertia import added_inertia, inertial
-from .forces import Forces, ScalarElement, StatefulElement
-from .linkage import Linkage, possible
-from .rates import Added, rates, rates_and_conditioning
-from .reduced_equations import Constants, link_constants, zeros
+from .added_inertia import inertial
+from .forces import Forces
+from .hybrid_dynamics import (
+    health_of_hybrid,
+    hybrid_field,
+    motion_at,
+    prescribed,
+    start_of,
+    watched_hybrid_field,
+)
+from .linkage import possible
+from .reduced_equations import link_constants, zeros
 from .solution import Solution
 from .step_control import Watched, bounded, default_controller, landing_on
 from .unrolled_dopri8 import ScheduledTerm, UnrolledDopri8
+from .vector_field import (
+    Args,
+    health_of,
+    initial_own,
+    own_states,
+    schedule_of,
+    vector_field,
+    watched_field,
+)
 
 # Steps over the time scale of a mode that keep its tangents to 1e-7 over 10 s: those of
 # methods of order 8, and of lower ones down to 5.
 _OF_TIME_SCALE = 0.7, 0.1
 
-# With inertia ratios below this the accelerations are right to six digits (float64) or
-# two at best, and adaptive steps are chosen by rounding.
-_LEAST_INERTIA_RATIO = {np.dtype("float64"): 1e-9, np.dtype("float32"): 1e-5}
 
-
-class _Args(NamedTuple):
-    linkage: Linkage
-    q0: Array
-    constants: Constants
-    forces: Forces
-
-
-def _schedule(t: Array, args: _Args) -> tuple[Any, ...]:
-    """What the force elements take from time alone, or the time."""
-    return tuple(
-        element.schedule(t, args.linkage) if isinstance(element, ScalarElement) else t
-        for element in args.forces
-    )
-
-
-def stateful(forces: Forces) -> list[StatefulElement]:
-    """Those of the elements that have a state of their own."""
-    return [element for element in forces if isinstance(element, StatefulElement)]
-
-
-def _own_states(args: _Args, scalars: tuple[Array, ...]) -> list[Any]:
-    """The states of the stateful elements, of the scalars that are integrated."""
-    states, place = [], 0
-    for element in stateful(args.forces):
-        shapes = jax.eval_shape(element.initial_state, args.linkage)
-        leaves, structure = jax.tree.flatten(shapes)
-        arrays = []
-        for leaf in leaves:
-            own = scalars[place : place + leaf.size]
-            arrays.append(jnp.stack(own).reshape(leaf.shape))
-            place += leaf.size
-        states.append(jax.tree.unflatten(structure, arrays))
-    return states
-
-
-def _scalars(tree: Any, dtype: Any) -> tuple[Array, ...]:
-    leaves = [jnp.asarray(leaf, dtype).ravel() for leaf in jax.tree.leaves(tree)]
-    return tuple(jnp.concatenate(leaves)) if leaves else ()
-
-
-class _Load(NamedTuple):
-    """What the force elements do: efforts, rates of their own states, inertia."""
-
-    tau: tuple[Array, ...]
-    own_rates: tuple[Array, ...]
-    added: Added | None
-
-
-def _load(t: Any, y: Any, args: _Args, schedule: tuple[Any, ...]) -> _Load:
-    """Arrays are made only for elements that are written in them."""
-    delta, qd, *own = y
-    states = iter(_own_states(args, *own) if own else ())
-    tau, own_rates = None, []
-    arrays = lambda: (args.q0 + jnp.stack(delta), jnp.stack(qd))
-    for index, (element, scheduled) in enumerate(zip(args.forces, schedule)):
-        if isinstance(element, ScalarElement):
-            q = tuple(a + b for a, b in zip(args.q0, delta))
-            effort = element.respond(scheduled, q, qd, args.linkage)
-        else:
-            state = next(states) if isinstance(element, StatefulElement) else None
-            effort, rate = element_effort(
-                index, element, t, *arrays(), args.linkage, state
-            )
-            own_rates += _scalars(rate, args.q0.dtype)
-        tau = effort if tau is None else tuple(a + b for a, b in zip(tau, effort))
-    tau = zeros(args.q0) if tau is None else tuple(tau)
-    if not inertial(args.forces):
-        return _Load(tau, tuple(own_rates), None)
-    added, bias = _added(args.linkage, inertial(args.forces), *arrays())
-    tau = tuple(a - b for a, b in zip(tau, bias))
-    return _Load(tau, tuple(own_rates), added)
-
-
-_added: Any = eqx.filter_jit(added_inertia)  # traced once, not at each use by a solver
-
-
-def _vector_field(t, y, args, schedule) -> tuple[Any, ...]:
-    """Rates of six scalars and the elements' own; positions are displacements."""
-    delta, qd, *own = y
-    load = _load(t, y, args, schedule)
-    moving = rates(args.constants, delta, qd, load.tau, load.added)
-    return (*moving, load.own_rates) if own else moving
-
-
-def _watched_field(t, y, args, schedule) -> tuple[tuple[Any, ...], Array]:
-    """The same, and the health of the accelerations: see `ScheduledTerm`."""
-    delta, qd, *own = y
-    load = _load(t, y, args, schedule)
-    (qd, qdd), loss = rates_and_conditioning(
-        args.constants, delta, qd, load.tau, load.added
-    )
-    finite = jnp.isfinite(qdd[0] + qdd[1] + qdd[2] + sum(load.own_rates))
-    health = jnp.where(loss * _LEAST_INERTIA_RATIO[loss.dtype] > 1, 0, loss)
-    # A singular matrix makes accelerations that are not finite.
-    health = jnp.where(finite | (health == 0), health, jnp.nan)
-    return ((qd, qdd, load.own_rates) if own else (qd, qdd)), health
-
-
-def _health(t, y, args) -> Array:
-    _, health = _watched_field(t, y, args, _schedule(t, args))
-    return health
-
-
-@eqx.filter_jit  # traced once, not at each use by a solver
-def element_effort(
-    index: int,
-    element: Any,
-    t: Array,
-    q: Array,
-    qd: Array,
-    linkage: Linkage,
-    state: Any = None,
-) -> tuple[Array, Any]:
-    """What one force element returns, refused unless it is three real numbers.
-
-    And the rate of its state, None for an element without one.
-    """
-    expected = f"forces[{index}]: expected it to return tau, an array of 3 real numbers"
-    if isinstance(element, StatefulElement):
-        found = element(t, q, qd, linkage, state)
-        if not isinstance(found, tuple) or len(found) != 2:
-            raise ValueError(f"{expected}, and the rate of its state, got {found!r}.")
-        tau, rate = found
-        if jax.tree.map(jnp.shape, rate) != jax.tree.map(jnp.shape, state):
-            raise ValueError(
-                f"forces[{index}]: expected the rate of its state to be like the "
-                f"state, {state!r}, got {rate!r}."
-            )
-    else:
-        tau, rate = element(t, q, qd, linkage), None
-    try:
-        tau = jnp.asarray(tau)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{expected}, got {tau!r}.") from error
-    if tau.shape != (3,) or tau.dtype.kind not in "iuf":
-        raise ValueError(f"{expected}, got shape {tau.shape} and dtype {tau.dtype}.")
-    return tau.astype(q.dtype), rate
-
-
-def _initial_own(args: _Args) -> tuple[tuple[Array, ...], ...]:
-    """The elements' own states at the start, where there are any."""
-    initial = [e.initial_state(args.linkage) for e in stateful(args.forces)]
-    return (_scalars(initial, args.q0.dtype),) if initial else ()
-
-
-def _step_for_tangents(t0: Array, args: _Args, fraction: float) -> Array:
+def _step_for_tangents(t0: Array, args: Args, fraction: float) -> Array:
     """A step short enough for derivatives [s], where the motion would allow more.
 
     A fraction of the time scale 1/omega of the fastest mode about the start: a step's
@@ -181,12 +47,12 @@ def _step_for_tangents(t0: Array, args: _Args, fraction: float) -> Array:
     none. The trace of the squared linearisation bounds omega^2 free of units.
     """
     still = zeros(args.q0)
-    scheduled = _schedule(t0, args)
-    own = _initial_own(args)
+    scheduled = schedule_of(t0, args)
+    own = initial_own(args)
 
     def accelerations(delta):
         y = (tuple(delta), still, *own)
-        return jnp.stack(_vector_field(t0, y, args, scheduled)[1])
+        return jnp.stack(vector_field(t0, y, args, scheduled)[1])
 
     linearised = jax.jacfwd(accelerations)(jnp.zeros_like(args.q0))
     omega2 = jnp.sqrt(jnp.abs(jnp.sum(linearised * linearised.T)))
@@ -194,9 +60,12 @@ def _step_for_tangents(t0: Array, args: _Args, fraction: float) -> Array:
     return jax.lax.stop_gradient(jnp.where(step > 0, step, jnp.inf))
 
 
-def _default_solver(forces: Forces, for_tangents=False) -> diffrax.AbstractSolver:
-    # Thirteen copies of equations that are differentiated anew take minutes to compile.
-    return diffrax.Dopri8() if inertial(forces) else UnrolledDopri8(for_tangents)
+def _default_solver(
+    forces: Forces, for_tangents: bool = False
+) -> diffrax.AbstractSolver:
+    # Thirteen copies of such equations take minutes to compile.
+    many = inertial(forces) or prescribed(forces)
+    return diffrax.Dopri8() if many else UnrolledDopri8(for_tangents)
 
 
 def _integrate(solver, inputs, keywords, derivatives: bool = False) -> Solution:
@@ -215,8 +84,17 @@ def _integrate(solver, inputs, keywords, derivatives: bool = False) -> Solution:
     q0, qd0 = (jnp.where(finite, a, 0) for a in state0)
     # Once per solve: the start may be any number of turns away.
     constants = link_constants(linkage, q0, lambda x: (jnp.sin(x), jnp.cos(x)))
-    args = _Args(linkage, q0, constants, forces)
-    term = ScheduledTerm(_vector_field, _watched_field, _schedule)
+    args = Args(linkage, q0, constants, forces)
+    motion = prescribed(forces)
+    if motion is None:
+        term, health = (
+            ScheduledTerm(vector_field, watched_field, schedule_of),
+            health_of,
+        )
+        start = zeros(q0), tuple(qd0)
+    else:
+        term = ScheduledTerm(hybrid_field, watched_hybrid_field, schedule_of)
+        health, start = health_of_hybrid, start_of(motion, args, qd0)
     controller = keywords["stepsize_controller"]
     # Stiff modes, which implicit solvers are taken for, would make the steps too short.
     own = controller is not None and isinstance(solver, diffrax.AbstractImplicitSolver)
@@ -232,13 +110,13 @@ def _integrate(solver, inputs, keywords, derivatives: bool = False) -> Solution:
         controller = landing_on(controller, times)
     adaptive = isinstance(controller, diffrax.AbstractAdaptiveStepSizeController)
     if adaptive and not isinstance(solver, UnrolledDopri8):
-        controller = Watched(controller, _health)  # pyright: ignore[reportCallIssue]
+        controller = Watched(controller, health)  # pyright: ignore[reportCallIssue]
     solution = diffrax.diffeqsolve(
         term,
         solver,
         t0=ts[0],
         t1=ts[-1],
-        y0=(zeros(q0), tuple(qd0), *_initial_own(args)),
+        y0=(*start, *initial_own(args)),
         args=args,
         saveat=diffrax.SaveAt(
             subs=(
@@ -249,10 +127,13 @@ def _integrate(solver, inputs, keywords, derivatives: bool = False) -> Solution:
         **keywords | {"stepsize_controller": controller},
     )
     assert solution.ys is not None  # because of saveat
-    motion, (reached,) = solution.ys
-    delta, qd = (jnp.stack(rows, axis=-1) for rows in motion[:2])
-    own = [jax.vmap(lambda rows: _own_states(args, rows))(o) for o in motion[2:]]
-    q = q0[None] + delta
+    states, (reached,) = solution.ys
+    own_rows = [jax.vmap(lambda rows: own_states(args, rows))(o) for o in states[2:]]
+    if motion is None:
+        delta, qd = (jnp.stack(rows, axis=-1) for rows in states[:2])
+        q = q0[None] + delta
+    else:
+        q, qd = jax.vmap(lambda t, y: motion_at(motion, args, t, y))(ts, states[:2])
 
     def shown(a):
         """NaN where diffrax has not come to save: it leaves infinity."""
@@ -260,12 +141,12 @@ def _integrate(solver, inputs, keywords, derivatives: bool = False) -> Solution:
 
     # diffrax saves the start with the first step.
     q, qd = shown(q).at[0].set(state0.q), shown(qd).at[0].set(state0.qd)
-    own = tuple(jax.tree.map(shown, own[0])) if own else ()
+    own_states_shown = tuple(jax.tree.map(shown, own_rows[0])) if own_rows else ()
     reached = jnp.where(valid, reached, asked[0])
     results: Any = diffrax.RESULTS
     result = results.where(valid, solution.result, results.nonfinite)
     stats = solution.stats | {"time_reached": reached}
-    return Solution(asked, q, qd, stats, result, own)
+    return Solution(asked, q, qd, stats, result, own_states_shown)
 
 
 @eqx.filter_custom_vjp
@@ -330,9 +211,6 @@ def solve(solver, inputs, keywords) -> Solution:
         return _integrate_reversibly(_opened(inputs), solver, keywords)
     if solver is None:
         forward = isinstance(adjoint, diffrax.ForwardMode)
-        solver = (
-            _default_solver(inputs[-1], for_tangents=True)
-            if forward
-            else diffrax.Dopri8()
-        )
+        tangents = _default_solver(inputs[-1], for_tangents=True)
+        solver = tangents if forward else diffrax.Dopri8()
     return _integrate(solver, inputs, keywords, derivatives=True)

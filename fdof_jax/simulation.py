@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .forces import Forces, StatefulElement
-from .integration import element_effort, solve
+from .hybrid_dynamics import prescribed, prescribed_effort
+from .integration import solve
 from .linkage import Linkage, State, check_linkage
 from .solution import Efforts, Solution
 from .step_control import within_reach
@@ -22,6 +23,7 @@ from .validation import (
     real_array,
     whole_number,
 )
+from .vector_field import element_effort
 
 
 def solve_options(
@@ -140,6 +142,15 @@ def simulate(
         check = getattr(element, "check", None)
         if check is not None and not is_traced(linkage, ts, element):
             check(linkage, ts)
+    motion = prescribed(forces)
+    if motion is not None and not is_traced(linkage, state0, ts, motion):
+        begin, _ = motion.reference(ts[0], linkage)
+        apart = np.where(motion.moved, np.abs(state0.q - begin), 0)
+        if not (apart <= 1e-6 * (1 + np.abs(begin))).all():
+            raise ValueError(
+                f"state0.q: expected {np.asarray(begin).tolist()} at the joints whose "
+                f"motion is prescribed, got {np.asarray(state0.q).tolist()}."
+            )
     inputs = linkage, state0, ts, forces
     # Where the values are known in the end, errors are raised there: they can say more.
     inside = is_traced(inputs, jnp.zeros(()))
@@ -198,7 +209,7 @@ def joint_efforts(linkage: Linkage, forces: Forces, solution: Solution) -> Effor
 
 @eqx.filter_jit
 def _efforts(linkage: Linkage, forces: Forces, solution: Solution) -> Efforts:
-    motion, own = (solution.ts, solution.q, solution.qd), iter(solution.own)
+    motion_rows, own = (solution.ts, solution.q, solution.qd), iter(solution.own)
     elements = []
     for index, element in enumerate(forces):
 
@@ -206,6 +217,11 @@ def _efforts(linkage: Linkage, forces: Forces, solution: Solution) -> Efforts:
             return element_effort(index, element, t, q, qd, linkage, state)[0]
 
         state = next(own) if isinstance(element, StatefulElement) else None
-        elements.append(jax.vmap(effort)(*motion, state))
+        elements.append(jax.vmap(effort)(*motion_rows, state))
     stacked = jnp.stack(elements) if elements else jnp.zeros((0, *solution.q.shape))
+    if (motion := prescribed(forces)) is not None:
+        effort = lambda *row: prescribed_effort(linkage, forces, *row)
+        demanded = jax.vmap(effort)(*motion_rows, jnp.sum(stacked, axis=0))
+        place = [element is motion for element in forces].index(True)
+        stacked = stacked.at[place].set(demanded)
     return Efforts(jnp.sum(stacked, axis=0), stacked)

@@ -24,7 +24,6 @@ from numpy.typing import ArrayLike
 from .batch_axes import Batch, batch_of
 from .dynamics import forward_dynamics
 from .forces import Forces, StatefulElement
-from .integration import element_effort
 from .linkage import Linkage, State, real_joints
 from .simulation import simulate, solve_options
 from .solution import Solution
@@ -37,6 +36,7 @@ from .validation import (
     real_array,
     whole_number,
 )
+from .vector_field import element_effort
 
 _FIRST_LIMIT = 256  # steps, before anything is known
 _SLACK = 2.0  # a member may take this many times the steps of most others

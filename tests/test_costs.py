@@ -9,7 +9,7 @@ import pytest
 from jax.extend.core import jaxprs_in_params
 
 import fdof_jax as fj
-from fdof_jax import integration, scenes
+from fdof_jax import scenes, vector_field
 from fdof_jax.rates import rates
 from fdof_jax.reduced_equations import link_constants, zeros
 
@@ -27,12 +27,12 @@ transcendentals = functools.partial(cost, "transcendentals")
 def field_arguments(forces):
     linkage = scenes.fig7().linkage
     q = jnp.array([0.3, 2.0, -0.4])
-    args = integration._Args(linkage, q, link_constants(linkage, q), forces)
+    args = vector_field.Args(linkage, q, link_constants(linkage, q), forces)
     return jnp.array(0.1), (zeros(q), tuple(q)), args
 
 
 def field(t, y, args):
-    return integration._vector_field(t, y, args, integration._schedule(t, args))
+    return vector_field.vector_field(t, y, args, vector_field.schedule_of(t, args))
 
 
 def field_flops(*forces):

@@ -89,13 +89,13 @@ def test_one_trace_and_batch_equals_singles(kind):
 def test_one_trace_of_the_plain_call(kind, monkeypatch):
     """Called as a user does, without jit of their own, at adaptive steps."""
     calls = []
-    original = integration._vector_field
+    original = integration.vector_field
 
     def counted(*arguments):
         calls.append(1)
         return original(*arguments)
 
-    monkeypatch.setattr(integration, "_vector_field", counted)
+    monkeypatch.setattr(integration, "vector_field", counted)
     traced = []
     for linkage, state, forces in members(kind):
         # A number of output times that no other test has: the first call compiles.

@@ -162,13 +162,13 @@ def test_more_devices_and_processes_change_nothing(processes, devices, clean, tm
 
 def test_other_values_need_no_new_trace(batch, clean, monkeypatch):
     calls = []
-    original = fj.integration._vector_field
+    original = fj.integration.vector_field
 
     def counted(*arguments):
         calls.append(1)
         return original(*arguments)
 
-    monkeypatch.setattr(fj.integration, "_vector_field", counted)
+    monkeypatch.setattr(fj.integration, "vector_field", counted)
     linkage, (q, qd), forces = batch
     other = run((linkage, fj.State(q + 0.1, qd), forces))
     assert not calls

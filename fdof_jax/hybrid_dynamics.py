@@ -1,0 +1,167 @@
+"""Hybrid dynamics: some joints move as prescribed, the others as they are driven.
+
+The state has the momenta of the driven joints in place of their velocities: they stay
+as they are where a prescribed velocity jumps.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Bool, Float
+
+from .added_inertia import added_inertia
+from .control import Reference
+from .forces import Forces
+from .linkage import Linkage
+from .reduced_equations import equations, link_constants, zeros
+from .validation import whole_number
+from .vector_field import LEAST_INERTIA_RATIO, Args, load_of, schedule_of
+
+
+class PrescribedMotion(eqx.Module):
+    """Joints that follow a reference exactly, whatever effort that takes.
+
+    At a jump of the reference's velocity the velocities of the other joints jump too,
+    as the impulse demands. `joint_efforts` returns the effort, but for such impulses.
+
+    **Arguments:**
+
+    - `joints`: numbers of the joints that it moves, of 1 to 3; one, or a tuple.
+    - `reference`: `(t, linkage) -> (q, qd)`, as for a `PDController`; what it says of
+      other joints does not count. Its positions must be continuous, and at the start of
+      a simulation those of `state0`.
+
+    **Raises:** ValueError for malformed arguments.
+    """
+
+    moved: Bool[Array, " joint"]
+    reference: Reference
+
+    def __init__(self, joints: int | tuple[int, ...], reference: Reference):
+        numbers = joints if isinstance(joints, tuple) else (joints,)
+        for number in numbers:
+            if whole_number("joints", number, 1) > 3:
+                raise ValueError(f"joints: expected numbers of 1 to 3, got {joints!r}.")
+        if not callable(reference) or isinstance(reference, type):
+            raise ValueError(
+                f"reference: expected a callable (t, linkage) -> (q, qd), got "
+                f"{reference!r}."
+            )
+        self.moved = jnp.array([k in numbers for k in (1, 2, 3)])
+        self.reference = reference
+
+    def __call__(self, t: Array, q: Array, qd: Array, linkage: Linkage) -> Array:
+        """Nothing: what it takes depends on all other elements."""
+        return jnp.zeros(3)
+
+    @property
+    def jump_ts(self) -> Array | None:
+        """The times at which the reference says that it jumps, if it does."""
+        return getattr(self.reference, "jump_ts", None)
+
+    def check(self, linkage: Linkage, ts: Array) -> None:
+        """The reference's own check, if it has one."""
+        check_reference: Any = getattr(self.reference, "check", None)
+        if check_reference is not None:
+            check_reference(linkage, ts)
+
+
+def prescribed(forces: Forces) -> PrescribedMotion | None:
+    """The one among the elements that prescribes a motion, if there is one."""
+    found = [e for e in forces if isinstance(e, PrescribedMotion)]
+    if len(found) > 1:
+        raise ValueError(
+            f"forces: expected one PrescribedMotion at most, got {len(found)}."
+        )
+    return found[0] if found else None
+
+
+def _mass_and_bias(args: Args, q: Array, qd: Array) -> tuple[Array, Array]:
+    """Of the linkage and the elements that move masses: (3, 3) and (3,)."""
+    m = equations(args.constants, tuple(q - args.q0), tuple(qd))
+    six, bias = (m.m11, m.m12, m.m13, m.m22, m.m23, m.m33), jnp.stack(m.bias)
+    more = added_inertia(args.linkage, args.forces, q, qd)
+    if more is not None:
+        six = tuple(a + b for a, b in zip(six, more[0]))
+        bias = bias + more[1]
+    m11, m12, m13, m22, m23, m33 = six
+    return jnp.array([[m11, m12, m13], [m12, m22, m23], [m13, m23, m33]]), bias
+
+
+def _split(moved: Array, matrix: Array, known: Array, right: Array) -> Array:
+    """What solves the rows of the driven joints, the prescribed ones being known."""
+    free = jnp.where(jnp.outer(~moved, ~moved), matrix, jnp.eye(3))
+    known = jnp.where(moved, known, 0)
+    return jnp.linalg.solve(free, jnp.where(moved, known, right - matrix @ known))
+
+
+def motion_at(
+    motion: PrescribedMotion, args: Args, t: Any, y: Any
+) -> tuple[Array, Array]:
+    """Joint positions and velocities of a state of displacements and momenta."""
+    delta, momenta, *_ = y
+    position, velocity = motion.reference(t, args.linkage)
+    q = jnp.where(motion.moved, position, args.q0 + jnp.stack(delta))
+    matrix, _ = _mass_and_bias(args, q, jnp.zeros(3))
+    return q, _split(motion.moved, matrix, velocity, jnp.stack(momenta))
+
+
+def start_of(motion: PrescribedMotion, args: Args, qd: Array) -> tuple[Any, Any]:
+    """Displacements and momenta at the start, before any jump there."""
+    matrix, _ = _mass_and_bias(args, args.q0, jnp.zeros(3))
+    return zeros(args.q0), tuple(jnp.where(motion.moved, 0, matrix @ qd))
+
+
+def hybrid_field(t, y, args, schedule) -> tuple[Any, ...]:
+    """Rates of displacements and momenta: those of prescribed joints stand still.
+
+    The momenta change by M' qd - bias + tau, where M' is the mass matrix's own rate.
+    """
+    motion = prescribed(args.forces)
+    assert motion is not None  # or this were not the field
+    own = y[2:]
+    q, qd = motion_at(motion, args, t, y)
+    load = load_of(t, (tuple(q - args.q0), tuple(qd), *own), args, schedule)
+    # The bias of masses that elements move is in the load already.
+    bias = jnp.stack(equations(args.constants, tuple(q - args.q0), tuple(qd)).bias)
+    momenta = lambda q: _mass_and_bias(args, q, jnp.zeros(3))[0] @ qd
+    _, change = jax.jvp(momenta, (q,), (qd,))
+    driven = jnp.where(motion.moved, 0, change - bias + jnp.stack(load.tau))
+    moving = tuple(jnp.where(motion.moved, 0, qd)), tuple(driven)
+    return (*moving, load.own_rates) if own else moving
+
+
+def watched_hybrid_field(t, y, args, schedule) -> tuple[tuple[Any, ...], Array]:
+    """The same, and the health of the driven joints' equations."""
+    motion = prescribed(args.forces)
+    assert motion is not None
+    rates = hybrid_field(t, y, args, schedule)
+    q, _ = motion_at(motion, args, t, y)
+    matrix, _ = _mass_and_bias(args, q, jnp.zeros(3))
+    free = jnp.where(jnp.outer(~motion.moved, ~motion.moved), matrix, jnp.eye(3))
+    loss = jnp.max(jnp.diag(free) * jnp.diag(jnp.linalg.inv(free)))
+    singular = ~(loss * LEAST_INERTIA_RATIO[loss.dtype] <= 1)
+    finite = jnp.isfinite(jnp.stack(jax.tree.leaves(rates))).all()
+    return rates, jnp.where(finite, jnp.where(singular, 0, loss), jnp.nan)
+
+
+def health_of_hybrid(t, y, args) -> Array:
+    _, health = watched_hybrid_field(t, y, args, schedule_of(t, args))
+    return health
+
+
+def prescribed_effort(
+    linkage: Linkage, forces: Forces, t: Array, q: Array, qd: Array, tau: Array
+) -> Float[Array, " joint"]:
+    """What the prescribed motion takes, the other elements' efforts being `tau`."""
+    motion = prescribed(forces)
+    assert motion is not None
+    args = Args(linkage, q, link_constants(linkage, q), forces)
+    matrix, bias = _mass_and_bias(args, q, qd)
+    velocity = lambda t: motion.reference(t, linkage)[1]
+    _, demanded = jax.jvp(velocity, (t,), (jnp.ones_like(t),))
+    qdd = _split(motion.moved, matrix, demanded, tau - bias)
+    return jnp.where(motion.moved, matrix @ qdd + bias - tau, 0)

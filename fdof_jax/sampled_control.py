@@ -1,0 +1,189 @@
+"""Control in discrete time: efforts that are held from one sample to the next."""
+
+from typing import Any, NamedTuple
+
+import diffrax
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from .forces import Forces, JointEffort, ScalarElement, StatefulElement
+from .linkage import Linkage, State, check_linkage
+from .simulation import simulate
+from .validation import callable_tuple, concrete, real_array, whole_number
+
+
+class _Switched(ScalarElement):
+    """One effort before a time, another from it on."""
+
+    before: Float[Array, " joint"]
+    after: Float[Array, " joint"]
+    switch: Float[Array, ""]
+
+    def schedule(self, t, linkage):
+        return tuple(jnp.where(t < self.switch, self.before, self.after))
+
+    def respond(self, scheduled, q, qd, linkage):
+        return scheduled
+
+    @property
+    def jump_ts(self) -> Array:
+        return self.switch[None]
+
+
+def _without_states(forces: Any) -> None:
+    callable_tuple("forces", forces)
+    if any(isinstance(e, StatefulElement) for e in forces):
+        raise ValueError(
+            "forces: expected elements without a state of their own, which would be "
+            f"lost between samples, got {forces!r}."
+        )
+
+
+def step(
+    linkage: Linkage,
+    state: State,
+    tau: ArrayLike,
+    dt: ArrayLike,
+    forces: Forces = (),
+    *,
+    t: ArrayLike = 0.0,
+    **options: Any,
+) -> State:
+    """The state after a time, under efforts that are constant until then.
+
+    The transition of a discrete-time model, for reinforcement learning and predictive
+    control: pure, batched by `jax.vmap`, differentiable in everything.
+
+    **Arguments:**
+
+    - `linkage`, `state`: the arm, and its joint positions and velocities.
+    - `tau`: joint efforts, (3,) [N or N m]; `dt`: how long they are held [s].
+    - `forces`: what else acts, elements without a state of their own; `t`: the time at
+      the start, which they are given [s].
+    - `options`: keywords of `simulate`.
+
+    **Returns:** the `State` at the end; NaN if the solve failed.
+
+    **Raises:** ValueError for malformed arguments.
+    """
+    _without_states(forces)
+    dt, t = real_array("dt", dt, (), above=0), real_array("t", t, ())
+    ts = jnp.stack([t, t + dt])
+    effort = JointEffort(tau)
+    options = dict(throw=False) | options
+    solution = simulate(linkage, state, ts, (*forces, effort), **options)
+    return State(solution.q[-1], solution.qd[-1])
+
+
+class SampledMotion(NamedTuple):
+    """A motion under sampled control.
+
+    - `ts`: sampling times, the end included (samples + 1,) [s].
+    - `q`, `qd`: joint positions and velocities there, NaN after a failure.
+    - `tau`: what was commanded at each sample (samples, 3) [N or N m].
+    - `result`: diffrax's, `successful` or that of the first period that failed.
+    """
+
+    ts: Float[Array, " time"]
+    q: Float[Array, "time joint"]
+    qd: Float[Array, "time joint"]
+    tau: Float[Array, "sample joint"]
+    result: diffrax.RESULTS
+
+
+def simulate_sampled(
+    linkage: Linkage,
+    state0: State,
+    control: Any,
+    period: ArrayLike,
+    samples: int,
+    forces: Forces = (),
+    *,
+    t0: ArrayLike = 0.0,
+    delay: ArrayLike = 0.0,
+    noise: tuple[ArrayLike, ArrayLike] | None = None,
+    key: Array | None = None,
+    **options: Any,
+) -> SampledMotion:
+    """The motion under a controller that looks once per period and holds its effort.
+
+    **Arguments:**
+
+    - `linkage`, `state0`: the arm, and its joint positions and velocities.
+    - `control`: `(t, q, qd, linkage) -> tau`, a `PDController` for instance.
+    - `period`: of sampling [s]; `samples`: how many.
+    - `forces`: what acts besides, elements without a state of their own.
+    - `t0`: the first sample [s].
+    - `delay`: from measuring to acting, less than a period [s]. No effort acts before
+      the first command does.
+    - `noise`: standard deviations of what is measured, of positions and of velocities
+      (each (3,) or one for all), with a `jax.random` `key`.
+    - `options`: keywords of `simulate`.
+
+    **Returns:** a `SampledMotion`.
+
+    **Raises:** ValueError for malformed arguments.
+    """
+    check_linkage(linkage)
+    _without_states(forces)
+    if not callable(control) or isinstance(control, type | StatefulElement):
+        raise ValueError(
+            "control: expected a callable (t, q, qd, linkage) -> tau without a state "
+            f"of its own, got {control!r}."
+        )
+    period = real_array("period", period, (), above=0)
+    t0 = real_array("t0", t0, ())
+    whole_number("samples", samples, 1)
+    delay = real_array("delay", delay, (), minimum=0)
+    known, longest = concrete(delay), concrete(period)
+    if known is not None and longest is not None and not known < longest:
+        raise ValueError(
+            f"delay: expected less than the period of {longest} s, got {known} s."
+        )
+    if (noise is None) != (key is None):
+        raise ValueError("noise, key: expected both or none of them, got one.")
+    spread = None
+    if noise is not None:
+        names = ("noise[0]", "noise[1]")
+        spread = [
+            real_array(name, value, (3,), minimum=0, broadcast=True)
+            for name, value in zip(names, noise)
+        ]
+    q0, qd0 = state0
+    state0 = State(real_array("state0.q", q0, (3,)), real_array("state0.qd", qd0, (3,)))
+    at_once = known is not None and known == 0
+    options = dict(throw=False) | options
+    times = t0 + period * jnp.arange(samples + 1)
+
+    def one(carry, inputs):
+        state, held, result = carry
+        begin, end, key = inputs
+        seen = state
+        if spread is not None:
+            seen = State(
+                *(
+                    value + size * jax.random.normal(k, (3,))
+                    for value, size, k in zip(state, spread, jax.random.split(key))
+                )
+            )
+        tau = jnp.asarray(control(begin, *seen, linkage), held.dtype)
+        effort = _Switched(held, tau, begin + delay)
+        element = JointEffort(tau) if at_once else effort
+        solution = simulate(
+            linkage, state, jnp.stack([begin, end]), (*forces, element), **options
+        )
+        state = State(solution.q[-1], solution.qd[-1])
+        good = result == diffrax.RESULTS.successful
+        result = diffrax.RESULTS.where(good, solution.result, result)
+        return (state, tau, result), (state, tau)
+
+    keys = None if key is None else jax.random.split(key, samples)
+    start = state0, jnp.zeros(3), diffrax.RESULTS.successful
+    (_, _, result), (states, tau) = jax.lax.scan(
+        one, start, (times[:-1], times[1:], keys)
+    )
+    q, qd = (jnp.concatenate([a[None], b]) for a, b in zip(state0, states))
+    return SampledMotion(times, q, qd, tau, result)

@@ -1,0 +1,201 @@
+"""Prescribed motion: closed forms, balances, jumps of the velocity, residual swings."""
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import random_linkage
+from scipy.integrate import simpson, solve_ivp
+
+import fdof_jax as fj
+
+# A cart that slides along x and carries a pendulum: link 3 turns with link 4.
+LENGTH, MASS, INERTIA, G = 0.8, 1.5, 0.2, 9.81
+CART = fj.Linkage(
+    "PRR", length=[0, 0, 0, LENGTH], com=[[0, 0], [0, 0], [LENGTH, 0]],
+    mass=[2, 0, MASS], inertia=[1, INERTIA, 0], locked=[0, 0, 0], base_angle=-np.pi / 2,
+    gravity=G,
+)  # fmt: skip
+ROTOR = MASS * LENGTH**2 + INERTIA
+FREQUENCY = np.sqrt(MASS * G * LENGTH / ROTOR)
+REST = fj.State(np.zeros(3), np.zeros(3))
+
+
+class Push(eqx.Module):
+    """The cart accelerates at a constant rate from a velocity."""
+
+    velocity: jax.Array
+    acceleration: jax.Array
+
+    def __call__(self, t, linkage):
+        x = self.velocity * t + self.acceleration * t**2 / 2
+        zero = jnp.zeros_like(x)
+        rate = self.velocity + self.acceleration * t
+        return jnp.stack([x, zero, zero]), jnp.stack([rate, zero, zero])
+
+
+class Swing(eqx.Module):
+    """All joints swing; any of them may follow it."""
+
+    amplitude: jax.Array
+
+    def __call__(self, t, linkage):
+        phase = jnp.array([0.0, 1.0, 2.0])
+        rate = 3 * jnp.cos(3 * t + phase)
+        return self.amplitude * jnp.sin(3 * t + phase), self.amplitude * rate
+
+
+def pendulum(angle, rate, acceleration, ts):
+    """Of a pendulum whose pivot accelerates along x."""
+
+    def field(t, y):
+        drive = G * np.sin(y[0]) + acceleration * np.cos(y[0])
+        return y[1], -MASS * LENGTH * drive / ROTOR
+
+    options = dict(rtol=1e-12, atol=1e-13)
+    return solve_ivp(field, (0, ts[-1]), [angle, rate], "DOP853", ts, **options).y
+
+
+@pytest.mark.parametrize("acceleration", [0.0, 4.0])
+def test_a_pendulum_on_a_cart_that_accelerates(acceleration):
+    moving = fj.PrescribedMotion((1, 3), Push(jnp.array(0.0), jnp.array(acceleration)))
+    ts = np.linspace(0, 3, 13)
+    solution = fj.simulate(CART, fj.State([0, 0.7, 0], np.zeros(3)), ts, (moving,))
+    angle, rate = pendulum(0.7, 0.0, acceleration, ts)
+    np.testing.assert_allclose(solution.q[:, 1], angle, atol=1e-9)
+    np.testing.assert_allclose(solution.qd[:, 1], rate, atol=1e-9)
+    np.testing.assert_allclose(solution.q[:, 0], acceleration * ts**2 / 2, atol=1e-12)
+    np.testing.assert_array_equal(solution.q[:, 2], 0)
+
+
+def test_a_jump_of_the_velocity_is_a_blow():
+    """The momentum of the pendulum about its pivot stays as it is."""
+    moving = fj.PrescribedMotion((1, 3), Push(jnp.array(0.6), jnp.array(0.0)))
+    ts = np.linspace(0, 1, 6)
+    start = fj.State([0, 0.4, 0], [0, 0.2, 0])
+    solution = fj.simulate(CART, start, ts, (moving,))
+    after = 0.2 - MASS * LENGTH * np.cos(0.4) * 0.6 / ROTOR
+    angle, rate = pendulum(0.4, after, 0.0, ts)
+    np.testing.assert_allclose(solution.q[:, 1], angle, atol=1e-9)
+    np.testing.assert_allclose(solution.qd[1:, 1], rate[1:], atol=1e-9)
+
+
+def swinging(topology, joints, forces=()):
+    rng = np.random.default_rng(3)
+    linkage = random_linkage(topology, rng)
+    motion = fj.PrescribedMotion(joints, Swing(jnp.array([0.3, 0.2, 0.4])))
+    q, qd = motion.reference(0.0, linkage)
+    forces = (motion, fj.JointDamper(0.5), fj.JointEffort([1.0, -2.0, 0.7]), *forces)
+    return linkage, fj.State(q, qd), forces
+
+
+@pytest.mark.parametrize("joints", [1, 2, 3, (1, 2), (1, 2, 3)], ids=str)
+@pytest.mark.parametrize("topology", ["RRR", "RPR", "PRP"])
+def test_efforts_make_the_motion_and_do_its_work(topology, joints):
+    armature = fj.Armature(0.3)
+    linkage, start, forces = swinging(topology, joints, (armature,))
+    ts = np.linspace(0, 1, 101)
+    solution = fj.simulate(linkage, start, ts, forces)
+    efforts = fj.joint_efforts(linkage, forces, solution)
+    moved = np.asarray(forces[0].moved)
+    assert (np.asarray(efforts.elements[0])[:, ~moved] == 0).all()
+    # Under these efforts the prescribed joints accelerate as they should.
+    q, qd = solution.q, solution.qd
+    forward = lambda q, qd, tau: fj.forward_dynamics(linkage, q, qd, tau, forces)
+    qdd = jax.vmap(forward)(q, qd, efforts.total)
+    demanded = jax.vmap(jax.jacfwd(lambda t: forces[0].reference(t, linkage)[1]))(ts)
+    np.testing.assert_allclose(qdd[:, moved], demanded[:, moved], atol=1e-9)
+    # And the energy changes by their work.
+    energy = jax.vmap(lambda q, qd: sum(fj.energy(linkage, q, qd, forces)))(q, qd)
+    power = np.sum(np.asarray(efforts.total) * np.asarray(qd), axis=1)
+    work = simpson(power, x=ts)
+    np.testing.assert_allclose(energy[-1] - energy[0], work, atol=1e-6 * np.ptp(power))
+
+
+def test_a_motion_prescribed_as_it_is_takes_no_effort():
+    """Joint 1 follows what it does by itself: a falling cart."""
+    falling = fj.Linkage(
+        "PRR", length=[0, 0, 1, 1], com=[[0, 0], [0.5, 0], [0.5, 0]], mass=[1, 1, 1],
+        inertia=[1, 1, 1],
+    )  # fmt: skip
+    motion = fj.PrescribedMotion(1, Push(jnp.array(0.0), jnp.array(-9.81)))
+    ts = np.linspace(0, 1, 5)
+    start = fj.State([0, 0.3, 0.2], [0, 1.0, -0.4])
+    bound = fj.simulate(falling, start, ts, (motion,))
+    free = fj.simulate(falling, start, ts)
+    # All links fall alike: what turns does not push the cart only if it is balanced.
+    effort = fj.joint_efforts(falling, (motion,), bound).total[:, 0]
+    assert np.abs(effort).max() > 0.1
+    np.testing.assert_allclose(free.q[0], bound.q[0])
+    centres = jax.vmap(lambda q: fj.mass_centers(falling, q))(bound.q)
+    np.testing.assert_allclose(centres[:, 0, 1], -9.81 * ts**2 / 2, atol=1e-9)
+
+
+@pytest.mark.parametrize("mode", ["forward", "reverse"])
+def test_gradients_equal_differences(mode):
+    linkage, start, (motion, *others) = swinging("RPR", 1)
+
+    def end(p, adjoint):
+        reference = Swing(jnp.array([0.3, 0.2, 0.4]) * p[0])
+        q, qd = reference(0.0, linkage)
+        state0 = fj.State(jnp.where(motion.moved, q, start.q), start.qd)
+        forces = fj.PrescribedMotion(1, reference), fj.JointDamper(p[1])
+        return fj.simulate(linkage, state0, [0, 0.5], forces, adjoint=adjoint).q[-1]
+
+    p = jnp.array([1.0, 0.5])
+    reverse = diffrax.RecursiveCheckpointAdjoint()
+    if mode == "forward":
+        slope = jax.jacfwd(lambda p: end(p, diffrax.ForwardMode()))(p)
+    else:
+        slope = jax.jacrev(lambda p: end(p, reverse))(p)
+    columns = [
+        (end(p + h, reverse) - end(p - h, reverse)) / 2e-4 for h in 1e-4 * np.eye(2)
+    ]
+    np.testing.assert_allclose(
+        slope, np.stack(columns, axis=1), atol=1e-6 * np.abs(slope).max()
+    )
+
+
+def test_topologies_are_batched():
+    members = [swinging(topology, 2) for topology in fj.TOPOLOGIES]
+    stack = lambda trees: jax.tree.map(lambda *a: jnp.stack(a), *trees)
+    linkages, starts, forces = map(stack, zip(*members))
+    ts = [0, 0.3]
+    swept = fj.sweep(linkages, starts, ts, forces, forces_axes=0)
+    for k, (linkage, start, forces) in enumerate(members):
+        alone = fj.simulate(linkage, start, ts, forces)
+        np.testing.assert_allclose(swept.q[k], alone.q, atol=1e-9)
+
+
+def residual(travel, stroke=0.05):
+    """The load's swing after the travel, over the stroke."""
+    move = fj.JointMove(np.zeros(3), [stroke, 0, 0], travel)
+    motion = fj.PrescribedMotion((1, 3), move)
+    ts = np.append(0.0, travel.duration + np.linspace(0.01, 2.5, 200))
+    swing = fj.simulate(CART, REST, ts, (motion,)).q[1:, 1]
+    reach = ROTOR / (MASS * LENGTH)  # of the equivalent simple pendulum
+    return float(np.abs(swing).max() * reach / stroke)
+
+
+def test_the_shock_removes_residual_vibration():
+    plain = fj.Travel(1.6, profile="harmonic")
+    shock = fj.shock_against(plain, FREQUENCY)
+    shocked = fj.Travel(1.6, profile="harmonic", shock=shock)
+    before, after = residual(plain), residual(shocked)
+    assert before >= 0.1 and after <= before / 20
+
+
+def test_malformed_motions_are_refused():
+    hold = Push(jnp.array(0.0), jnp.array(0.0))
+    for joints in (0, 4, (1, 0), 1.0):
+        with pytest.raises(ValueError, match="joints: expected"):
+            fj.PrescribedMotion(joints, hold)
+    with pytest.raises(ValueError, match="reference: expected a callable"):
+        fj.PrescribedMotion(1, 3.0)
+    motion = fj.PrescribedMotion(1, hold)
+    with pytest.raises(ValueError, match="forces: expected one PrescribedMotion"):
+        fj.simulate(CART, REST, [0, 1], (motion, motion))
+    with pytest.raises(ValueError, match=r"state0\.q: expected \[0.0, .*prescribed"):
+        fj.simulate(CART, fj.State([0.1, 0, 0], np.zeros(3)), [0, 1], (motion,))

@@ -1,0 +1,159 @@
+"""Bearing reactions: each link's balance, MuJoCo, and the paper's constraint forces."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from helpers import random_linkage
+
+import fdof_jax as fj
+
+GROUND, TIP = fj.Point(0, 0.3, -0.8), fj.Point(3, 0.5, 0.2)
+SPRING = fj.SpringDamper(GROUND, TIP, stiffness=30.0, damping=2.0, rest_length=0.4)
+ACROSS = fj.Tension(fj.Point(1, 0.2), fj.Point(3, 0.1, 0.3), 7.0)
+PUSH = fj.Wrench(fj.Point(2, 0.4), [3.0, -2.0], 1.5, follows=True)
+ACTUATOR = fj.LinearActuator(
+    fj.Point(0, -0.6, -0.8), fj.Point(2, 0.4, 0.3),
+    force=5.0, mass=[1.2, 0.7], com=[0.2, 0.3], inertia=[0.05, 0.03],
+)  # fmt: skip
+JOINTS = fj.JointDamper(0.5), fj.JointEffort([1.0, -2.0, 0.7])
+
+
+def motion(topology, seed=0):
+    rng = np.random.default_rng(seed)
+    return random_linkage(topology, rng), *rng.uniform(-1, 1, (2, 3))
+
+
+def instant(linkage, q, qd, forces):
+    """The reactions at one moment, and the accelerations then."""
+    result = fj.simulate(linkage, fj.State(q, qd), [0.0, 1e-3], forces)
+    reactions = fj.joint_reactions(linkage, forces, result)[0]
+    tau = fj.joint_efforts(linkage, forces, result).total[0]
+    return np.asarray(reactions), fj.forward_dynamics(linkage, q, qd, tau, forces)
+
+
+def second(function, q, qd, qdd):
+    """The second derivative in time of a function of the positions."""
+    rate = lambda q, qd: jax.jvp(function, (q,), (qd,))[1]
+    arrays = map(jnp.asarray, (q, qd, qdd))
+    q, qd, qdd = arrays
+    return np.asarray(jax.jvp(rate, (q, qd), (qd, qdd))[1])
+
+
+def cross(a, b):
+    return a[0] * b[1] - a[1] * b[0]
+
+
+@pytest.mark.parametrize("topology", fj.TOPOLOGIES)
+def test_each_link_is_in_balance(topology):
+    """m a and I alpha are what bearings, loads and weight do, link by link."""
+    linkage, q, qd = motion(topology)
+    forces = SPRING, ACROSS, PUSH, *JOINTS
+    reactions, qdd = instant(linkage, q, qd, forces)
+    accelerations = second(lambda q: fj.mass_centers(linkage, q), q, qd, qdd)
+    angle = lambda q: fj.to_chain(linkage, q, jnp.zeros(3))[0][1::2]
+    spins = second(angle, q, qd, qdd)
+    centers, starts = fj.mass_centers(linkage, q), fj.joint_positions(linkage, q)
+    loads = [
+        load for e in (SPRING, ACROSS, PUSH) for load in e.loads(0.0, q, qd, linkage)
+    ]
+    weight = np.array([0, -float(linkage.gravity)])
+    for k in range(3):
+        force = linkage.mass[k] * weight + reactions[k, :2]
+        moment = reactions[k, 2] + cross(starts[k] - centers[k], reactions[k, :2])
+        if k < 2:
+            force = force - reactions[k + 1, :2]
+            arm = starts[k + 1] - centers[k]
+            moment = moment - reactions[k + 1, 2] - cross(arm, reactions[k + 1, :2])
+        for load in loads:
+            if load.point.link == k + 1:
+                place = load.point.position(linkage, q)
+                force = force + load.force
+                moment = moment + load.moment + cross(place - centers[k], load.force)
+        size = np.abs(reactions).max()
+        np.testing.assert_allclose(
+            force, linkage.mass[k] * accelerations[k], atol=1e-10 * size
+        )
+        np.testing.assert_allclose(
+            moment, linkage.inertia[k] * spins[k], atol=1e-10 * size
+        )
+
+
+@pytest.mark.parametrize("topology", fj.TOPOLOGIES)
+def test_the_free_component_is_the_joint_s_effort(topology):
+    linkage, q, qd = motion(topology)
+    forces = SPRING, ACTUATOR, fj.Armature(0.3), *JOINTS
+    reactions, qdd = instant(linkage, q, qd, forces)
+    x, _ = fj.to_chain(linkage, q, qd)
+    before = np.array([linkage.base_angle, *x[1:5:2]])
+    across = np.stack([-np.sin(before), np.cos(before)], axis=1)
+    slide = np.sum(across * reactions[:, :2], axis=1)
+    real = np.where([j == "R" for j in topology], reactions[:, 2], slide)
+    effort = sum(e(0.0, q, qd, linkage) for e in JOINTS) - 0.3 * qdd
+    np.testing.assert_allclose(real, effort, atol=1e-10 * np.abs(reactions).max())
+
+
+@pytest.mark.parametrize("topology", fj.TOPOLOGIES)
+def test_fictitious_components_are_the_paper_s_constraint_forces(topology):
+    linkage, q, qd = motion(topology)
+    reactions, _ = instant(linkage, q, qd, JOINTS)
+    x, xd = fj.to_chain(linkage, q, qd)
+    effort = sum(e(0.0, q, qd, linkage) for e in JOINTS)
+    force = np.zeros(6)
+    real = np.asarray(linkage.ef) > 0.5
+    force[real] = effort
+    exact = np.asarray(fj.constraint_forces(linkage, x, xd, force))
+    before = np.array([linkage.base_angle, *x[1:5:2]])
+    across = np.stack([-np.sin(before), np.cos(before)], axis=1)
+    found = np.stack([np.sum(across * reactions[:, :2], axis=1), reactions[:, 2]], 1)
+    assert np.abs(exact).max() > 0.1
+    np.testing.assert_allclose(
+        found.ravel()[~real], exact[~real], atol=1e-10 * np.abs(reactions).max()
+    )
+
+
+@pytest.mark.parametrize("topology", fj.TOPOLOGIES)
+def test_mujoco_has_the_same_reactions(topology):
+    linkage, q, qd = motion(topology)
+    reactions, _ = instant(linkage, q, qd, JOINTS)
+    model = mujoco.MjModel.from_xml_string(fj.to_mjcf(linkage))
+    data = mujoco.MjData(model)
+    data.qpos, data.qvel = q, qd
+    data.qfrc_applied = sum(e(0.0, q, qd, linkage) for e in JOINTS)
+    mujoco.mj_forward(model, data)
+    mujoco.mj_rnePostConstraint(model, data)
+    starts = np.asarray(fj.joint_positions(linkage, q))
+    for k in range(3):
+        body = model.body(f"link{k + 1}").id
+        moment, force = data.cfrc_int[body, 2], data.cfrc_int[body, 3:5]
+        center = data.subtree_com[model.body_rootid[body], :2]
+        moment = moment + cross(center - starts[k], force)
+        size = np.abs(reactions).max()
+        np.testing.assert_allclose(reactions[k], [*force, moment], atol=1e-9 * size)
+
+
+@pytest.mark.parametrize("topology", fj.TOPOLOGIES)
+def test_pins_carry_the_actuator(topology):
+    """The loads of its pins are what it does to the equations of motion."""
+    linkage, q, qd = motion(topology)
+    tau = fj.JointEffort([1.0, -2.0, 0.7])(0.0, q, qd, linkage)
+    total = tau + ACTUATOR(0.0, q, qd, linkage)
+    qdd = fj.forward_dynamics(linkage, q, qd, total, (ACTUATOR,))
+    loads = ACTUATOR.loads(0.0, q, qd, qdd, linkage)
+    by_loads = sum(load.efforts(linkage, q) for load in loads)
+    alone = fj.forward_dynamics(linkage, q, qd, tau + by_loads)
+    np.testing.assert_allclose(alone, qdd, rtol=1e-9, atol=1e-9 * np.abs(qdd).max())
+
+
+def test_a_hanging_arm_weighs_on_its_bearings():
+    arm = fj.Linkage(
+        "RRR", length=[0, 1, 1, 1], com=[[0.5, 0]] * 3, mass=[1, 2, 3],
+        inertia=[1 / 12] * 3,
+    )  # fmt: skip
+    hanging = fj.State(np.array([-np.pi / 2, 0, 0]), np.zeros(3))
+    solution = fj.simulate(arm, hanging, [0, 0.1])
+    expected = [[0, 6 * 9.81, 0], [0, 5 * 9.81, 0], [0, 3 * 9.81, 0]]
+    np.testing.assert_allclose(
+        fj.joint_reactions(arm, (), solution)[-1], expected, atol=1e-9
+    )

@@ -1,0 +1,93 @@
+"""References: tip paths through the inverse kinematics, moves in joint space."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.interpolate import CubicSpline
+
+import fdof_jax as fj
+
+ARM = fj.Linkage(
+    "RRR", length=[0, 1, 1, 0.3], com=[[0.5, 0]] * 3, mass=[1] * 3, inertia=[0.1] * 3
+)
+SLIDING = fj.scenes.fig7().linkage
+POINTS = np.array([[1.2, 0.3], [1.4, 0.6], [1.1, 0.9], [0.8, 0.5]])
+PATHS = {
+    "line": fj.Line([1.2, -0.4], [0.9, 0.8]),
+    "ellipse": fj.Ellipse([1.1, 0.4], [0.4, 0.2], tilt=0.3),
+    "eight": fj.FigureEight([1.1, 0.4], [0.4, 0.2], tilt=-0.2),
+    "spline": fj.Spline(POINTS),
+    "closed spline": fj.Spline(POINTS, closed=True),
+}
+TIMINGS = {"travel": fj.Travel(2.0), "laps": fj.Laps(2.0)}
+
+
+@pytest.mark.parametrize("timing", TIMINGS)
+@pytest.mark.parametrize("path", PATHS)
+@pytest.mark.parametrize("branch", [1, -1])
+def test_the_tip_is_on_the_path(path, timing, branch):
+    task = fj.TipTask(PATHS[path], TIMINGS[timing], orientation=0.2, branch=branch)
+    for t in np.linspace(0.05, 1.95, 8):
+        q, qd = task(t, ARM)
+        share = TIMINGS[timing](jnp.asarray(t))
+        np.testing.assert_allclose(
+            fj.tip_position(ARM, q), PATHS[path].point(share), atol=1e-12
+        )
+        assert jnp.sum(q) == pytest.approx(0.2)
+        ahead, behind = task(t + 1e-6, ARM)[0], task(t - 1e-6, ARM)[0]
+        np.testing.assert_allclose(qd, (ahead - behind) / 2e-6, atol=1e-6)
+
+
+def test_the_circle_as_an_ellipse_is_fig_7_s():
+    circle = fj.CircleTask()
+    ellipse = fj.Ellipse([-4, 2], [0.75, 0.75])
+    task = fj.TipTask(ellipse, fj.Laps(5.0, phase=0.5), orientation=np.pi / 2)
+    for t in (0.0, 1.3, 4.0, 11.0):
+        for a, b in zip(task(t, SLIDING), circle(t, SLIDING)):
+            np.testing.assert_allclose(a, b, atol=1e-12)
+
+
+@pytest.mark.parametrize("closed", [False, True])
+def test_a_spline_is_scipy_s(closed):
+    path = fj.Spline(POINTS, closed=closed)
+    knots = np.linspace(0, 1, 5 if closed else 4)
+    points = np.vstack([POINTS, POINTS[:1]]) if closed else POINTS
+    exact = CubicSpline(knots, points, bc_type="periodic" if closed else "natural")
+    shares = np.linspace(0, 1, 41)
+    np.testing.assert_allclose(jax.vmap(path.point)(shares), exact(shares), atol=1e-13)
+
+
+def test_a_joint_move():
+    move = fj.JointMove([0, 1, 2], [1, 1, 0], fj.Travel(2.0, profile="cycloidal"))
+    q, qd = move(1.0, ARM)
+    np.testing.assert_allclose(q, [0.5, 1, 1], atol=1e-15)
+    np.testing.assert_allclose(qd, [1, 0, -2], atol=1e-14)
+    np.testing.assert_allclose(move.jump_ts, [0, 2])
+
+
+def test_a_path_out_of_reach_is_refused_where_it_is_simulated():
+    task = fj.TipTask(fj.Line([1, 0], [4, 0]), fj.Travel(2.0))
+    forces = (fj.PDController(10.0, 1.0, 100.0, task),)
+    start = fj.State(np.zeros(3), np.zeros(3))
+    with pytest.raises(ValueError, match="reference: expected a path within"):
+        fj.simulate(ARM, start, [0, 2], forces)
+
+
+def test_a_path_behind_the_pivot_is_refused_where_it_is_simulated():
+    ring = fj.TipTask(fj.Ellipse([0.3, 0], [1.2, 1.2]), fj.Laps(2.0))
+    forces = (fj.PDController(10.0, 1.0, 100.0, ring),)
+    start = fj.State(np.zeros(3), np.zeros(3))
+    with pytest.raises(ValueError, match="reference: expected a path that does not"):
+        fj.simulate(ARM, start, [0, 2], forces)
+
+
+def test_malformed_references_are_refused():
+    with pytest.raises(ValueError, match="points: expected three or more"):
+        fj.Spline(POINTS[:2])
+    with pytest.raises(ValueError, match="path: expected a Path"):
+        fj.TipTask("line", fj.Travel(1.0))
+    with pytest.raises(ValueError, match="timing: expected"):
+        fj.TipTask(PATHS["line"], 3.0)
+    with pytest.raises(ValueError, match="travel: expected a Travel"):
+        fj.JointMove(np.zeros(3), np.ones(3), 2.0)

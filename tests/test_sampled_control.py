@@ -1,0 +1,119 @@
+"""Sampled control: first order in the period, delay, noise; and the discrete step."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import fdof_jax as fj
+
+ARM = fj.Linkage(
+    "RRR", length=[0, 1, 1, 1], com=[[0.5, 0]] * 3, mass=[1] * 3, inertia=[1 / 12] * 3
+)
+# I qdd = tau, joint by joint, for the last one.
+WHEEL = fj.Linkage(
+    "RRR", length=[0, 1, 1, 0], com=[[0, 0]] * 3, mass=[1, 1, 1],
+    inertia=[1e9, 1e9, 2.0], gravity=0.0,
+)  # fmt: skip
+REST = fj.State(np.zeros(3), np.zeros(3))
+START = fj.State(np.array([-0.5, 0.3, 0.2]), np.array([0.3, -0.2, 0.1]))
+MOVE = fj.JointMove([-0.5, 0.3, 0.2], [0.5, 0.6, -0.4], fj.Travel(1.0))
+CONTROL = fj.PDController(200.0, 30.0, np.inf, MOVE)
+
+
+def test_sampled_control_converges_at_first_order():
+    exact = fj.simulate(ARM, START, [0, 0.4], (CONTROL,)).q[-1]
+    periods = np.array([4e-3, 2e-3, 1e-3, 5e-4])
+    errors = [
+        np.abs(
+            fj.simulate_sampled(ARM, START, CONTROL, p, round(0.4 / p)).q[-1] - exact
+        ).max()
+        for p in periods
+    ]
+    slopes = np.diff(np.log(errors)) / np.diff(np.log(periods))
+    np.testing.assert_allclose(slopes, 1, atol=0.1)
+
+
+def ramp(t, q, qd, linkage):
+    return jnp.stack([0 * t, 0 * t, 1 + t])
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.03])
+def test_efforts_are_held_and_come_late(delay):
+    motion = fj.simulate_sampled(WHEEL, REST, ramp, 0.1, 5, delay=delay)
+    np.testing.assert_allclose(motion.ts, np.arange(6) * 0.1, atol=1e-15)
+    commanded = 1 + motion.ts[:-1]
+    np.testing.assert_allclose(motion.tau[:, 2], commanded, rtol=1e-12)
+    held = np.append(0, commanded)
+    gained = ((0.1 - delay) * held[1:] + delay * held[:-1]) / 2
+    np.testing.assert_allclose(motion.qd[1:, 2], np.cumsum(gained), rtol=1e-7)
+
+
+def test_noise_is_what_the_key_says():
+    seen = lambda t, q, qd, linkage: q + 10 * qd
+    run = lambda seed: fj.simulate_sampled(
+        WHEEL, REST, seen, 1e-6, 400, noise=(0.1, [0.02, 0.0, 0.0]),
+        key=jax.random.key(seed),
+    )  # fmt: skip
+    first, same, other = run(1), run(1), run(2)
+    np.testing.assert_array_equal(first.tau, same.tau)
+    assert not np.array_equal(first.tau, other.tau)
+    np.testing.assert_allclose(
+        np.std(first.tau, axis=0), [np.hypot(0.1, 0.2), 0.1, 0.1], rtol=0.15
+    )
+
+
+def test_a_step_is_a_simulation_under_a_held_effort():
+    tau = np.array([1.0, -2.0, 0.5])
+    after = fj.step(ARM, START, tau, 0.1, (fj.JointDamper(0.3),))
+    forces = fj.JointDamper(0.3), fj.JointEffort(tau)
+    motion = fj.simulate(ARM, START, [0, 0.1], forces)
+    np.testing.assert_allclose(after.q, motion.q[-1], rtol=1e-12)
+    np.testing.assert_allclose(after.qd, motion.qd[-1], rtol=1e-12)
+
+
+def test_a_step_is_differentiable_and_batched():
+    """As a predictive controller linearises it."""
+    tau = jnp.array([1.0, -2.0, 0.5])
+    step = lambda tau: fj.step(ARM, START, tau, 0.1).qd
+    slope = jax.jacrev(step)(tau)
+    differences = [(step(tau + h) - step(tau - h)) / 2e-4 for h in 1e-4 * np.eye(3)]
+    np.testing.assert_allclose(slope, np.stack(differences, axis=1), atol=1e-8)
+    many = jax.vmap(step)(jnp.stack([tau, 2 * tau]))
+    np.testing.assert_allclose(many[0], step(tau), atol=1e-12)
+
+
+def test_gains_of_sampled_control_have_gradients():
+    def end(kp):
+        control = fj.PDController(kp, 30.0, np.inf, MOVE)
+        return fj.simulate_sampled(ARM, START, control, 0.05, 6).q[-1, 0]
+
+    slope = jax.grad(end)(200.0)
+    difference = (end(200.1) - end(199.9)) / 0.2
+    np.testing.assert_allclose(slope, difference, rtol=1e-6)
+
+
+def test_a_failure_is_named():
+    broken = lambda t, q, qd, linkage: jnp.where(t > 0.15, jnp.nan, 0.0) * q
+    motion = fj.simulate_sampled(ARM, START, broken, 0.1, 4)
+    assert bool(motion.result != 0) and np.isfinite(motion.q[2]).all()
+    assert np.isnan(motion.q[3:]).all()
+
+
+def test_malformed_arguments_are_refused():
+    lag = fj.FirstOrderLag(fj.JointEffort(np.ones(3)), 0.1)
+    for name, changes in {
+        "period": dict(period=0.0),
+        "samples": dict(samples=0),
+        "delay": dict(delay=0.1),
+        "control": dict(control=lag),
+        "forces": dict(forces=(lag,)),
+        "noise, key": dict(noise=(0.1, 0.1)),
+    }.items():
+        arguments = dict(control=CONTROL, period=0.1, samples=2) | changes
+        with pytest.raises(ValueError, match=f"^{name}: expected"):
+            fj.simulate_sampled(ARM, START, **arguments)
+    with pytest.raises(ValueError, match="dt: expected"):
+        fj.step(ARM, START, np.zeros(3), 0.0)
+    with pytest.raises(ValueError, match="forces: expected elements without"):
+        fj.step(ARM, START, np.zeros(3), 0.1, (lag,))

@@ -1,0 +1,87 @@
+"""Profiles of point-to-point motions, and the shock against residual vibration."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import fdof_jax as fj
+from fdof_jax.travel import PROFILES
+
+TIMES = np.linspace(0, 2, 201)
+
+
+def derivatives(travel, times=TIMES):
+    rate = jax.grad(travel)
+    return [np.asarray(jax.vmap(f)(times)) for f in (travel, rate, jax.grad(rate))]
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+def test_a_profile_leads_from_start_to_end_and_rests_there(profile):
+    travel = fj.Travel(2.0, begin=0.5, profile=profile)
+    way, rate, _ = derivatives(travel, np.linspace(0, 3, 301))
+    assert (way[:51] == 0).all() and (way[-50:] == 1).all()
+    assert (rate[:51] == 0).all() and (rate[-50:] == 0).all()
+    assert (np.diff(way[50:251]) > 0).all()
+    np.testing.assert_allclose(way[50:251] + way[250:49:-1], 1, atol=1e-14)
+
+
+@pytest.mark.parametrize(
+    "profile, speed, acceleration",
+    [
+        # In ways per duration, and per duration squared.
+        ("harmonic", np.pi / 2, np.pi**2 / 2),
+        ("cycloidal", 2.0, 2 * np.pi),
+        ("quintic", 15 / 8, 10 / np.sqrt(3)),
+        ("trapezoidal", 4 / 3, 16 / 3),
+    ],
+)
+def test_largest_speed_and_acceleration(profile, speed, acceleration):
+    _, rate, second = derivatives(fj.Travel(2.0, profile=profile))
+    assert rate.max() == pytest.approx(speed / 2, rel=1e-3)
+    assert np.abs(second).max() == pytest.approx(acceleration / 4, rel=1e-2)
+
+
+def test_a_shock_is_a_jump_of_the_velocity_at_both_ends():
+    travel = fj.Travel(2.0, begin=1.0, profile="harmonic", shock=0.3)
+    rate = jax.grad(travel)
+    assert rate(1.0 - 1e-9) == 0 and rate(1.0) == pytest.approx(0.15)
+    assert rate(3.0 - 1e-9) == pytest.approx(0.15) and rate(3.0) == 0
+    assert travel(3.0) == 1
+    np.testing.assert_allclose(travel.jump_ts, [1, 3])
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+@pytest.mark.parametrize("frequency", [2.0, 7.0])
+def test_the_shock_takes_the_load_s_frequency_out(profile, frequency):
+    """A load on a spring, x'' + w^2 x = -a, by its closed integral."""
+    plain = fj.Travel(1.5, profile=profile)
+    shock = float(fj.shock_against(plain, frequency))
+    shocked = fj.Travel(1.5, profile=profile, shock=shock)
+    times = (np.arange(200_000) + 0.5) * 1.5 / 200_000
+    residual = [
+        abs(
+            np.mean(
+                np.asarray(jax.vmap(jax.grad(t))(times))
+                * np.exp(1j * frequency * times)
+            )
+        )
+        for t in (plain, shocked)
+    ]
+    assert residual[0] > 1e-3 and residual[1] < 1e-8
+
+
+def test_malformed_travels_are_refused():
+    with pytest.raises(ValueError, match="duration: expected .* above 0"):
+        fj.Travel(0.0)
+    with pytest.raises(ValueError, match="profile: expected one of"):
+        fj.Travel(1.0, profile="linear")
+    with pytest.raises(ValueError, match="frequency: expected .* above 0"):
+        fj.shock_against(fj.Travel(1.0), -1.0)
+    with pytest.raises(ValueError, match="travel: expected a Travel"):
+        fj.shock_against(1.0, 1.0)
+
+
+def test_laps_go_on():
+    laps = fj.Laps(4.0, phase=0.25)
+    assert laps(jnp.array(10.0)) == 2.75
