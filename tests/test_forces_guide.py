@@ -1,0 +1,22 @@
+"""The examples of docs/forces.md run, in order, as written."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+GUIDE = Path(__file__).parents[1] / "docs" / "forces.md"
+
+
+def test_examples():
+    blocks = re.findall(r"```python\n(.*?)```", GUIDE.read_text(), re.DOTALL)
+    namespace = {}
+    for block in blocks:
+        exec(compile(block, "forces.md", "exec"), namespace)
+        if "motion" in namespace:
+            assert np.isfinite(namespace["motion"].q).all()
+    assert namespace["reactions"].shape == (101, 3, 3)
+    assert namespace["torque"].shape == (101, 3)
+    assert np.isfinite(namespace["effort"]).all()
+    assert np.isfinite(namespace["sampled"].q).all()
+    assert np.isfinite(namespace["after"].q).all()
