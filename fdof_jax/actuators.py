@@ -117,7 +117,7 @@ class LinearActuator(InertialElement):
             lambda q: self.coordinates(q, linkage), (q,), (qd,)
         )[1]
         _, acceleration = jax.jvp(along, (q, qd), (qd, qdd))
-        weight = self.mass[:, None] * jnp.array([0.0, 1.0]) * linkage.gravity
+        weight = self.mass[:, None] * jnp.array([[0.0, 1.0]]) * linkage.gravity
         needed = self.mass[:, None] * acceleration[:4].reshape(2, 2) + weight
         length, rate = jax.jvp(lambda q: self.ends.length(linkage, q), (q,), (qd,))
         unit = self.ends.vector(linkage, q) / length

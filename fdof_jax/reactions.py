@@ -46,7 +46,7 @@ def _reactions(
     qdd = forward_dynamics(linkage, q, qd, tau, forces)
     motion = lambda q, qd: mass_center_velocities(linkage, q, qd)
     _, (acceleration, spin_up) = jax.jvp(motion, (q, qd), (qd, qdd))
-    weight = jnp.array([0.0, 1.0]) * linkage.gravity
+    weight = jnp.array([[0.0, 1.0]]) * linkage.gravity
     needed = linkage.mass[:, None] * (acceleration + weight)
     turning = linkage.inertia * spin_up + _cross(mass_centers(linkage, q), needed)
     force, moment = _loads(linkage, forces, t, q, qd, qdd)

@@ -262,7 +262,9 @@ class TipTask(eqx.Module):
                 f"{float(self.orientation):g} rad on branch {float(self.branch):+g}, "
                 f"got one that leaves it at {first:g} s."
             )
-        if (jnp.abs(jnp.diff(beside)) > jnp.pi).any():
+        hub = wrist_vector(linkage, self.path.middle, self.orientation)
+        behind = (jnp.abs(jnp.diff(beside)) > jnp.pi).any()
+        if behind or not hub.any():
             raise ValueError(
                 "reference: expected a path that does not pass behind the ground "
                 "pivot as seen from its middle, got one that does."

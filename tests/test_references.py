@@ -74,8 +74,9 @@ def test_a_path_out_of_reach_is_refused_where_it_is_simulated():
         fj.simulate(ARM, start, [0, 2], forces)
 
 
-def test_a_path_behind_the_pivot_is_refused_where_it_is_simulated():
-    ring = fj.TipTask(fj.Ellipse([0.3, 0], [1.2, 1.2]), fj.Laps(2.0))
+@pytest.mark.parametrize("x", [0.3, 0.5])
+def test_a_path_behind_the_pivot_is_refused_where_it_is_simulated(x):
+    ring = fj.TipTask(fj.Ellipse([x, 0], [1.2, 1.2]), fj.Laps(2.0))
     forces = (fj.PDController(10.0, 1.0, 100.0, ring),)
     start = fj.State(np.zeros(3), np.zeros(3))
     with pytest.raises(ValueError, match="reference: expected a path that does not"):
