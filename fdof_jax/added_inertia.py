@@ -1,5 +1,8 @@
 """What force elements that move masses add to the equations of motion."""
 
+from functools import reduce
+from operator import add
+
 import jax
 import jax.numpy as jnp
 from jax import Array
@@ -46,17 +49,17 @@ def added_inertia(
     """
     if not inertial(forces):
         return None
-    columns, efforts = [], []
+    matrices, biases = [], []
     for element in inertial(forces):
         coordinates = lambda q, e=element: e.coordinates(q, linkage)
         along = lambda q, c=coordinates: jax.jvp(c, (q,), (qd,))[1]
         _, turning = jax.jvp(along, (q,), (qd,))
         jacobian, weights = jax.jacfwd(coordinates)(q), element.weights(linkage)
         weighted = weights[:, None] * jacobian
-        columns.append(jnp.sum(weighted[:, :, None] * jacobian[:, None, :], axis=0))
+        matrices.append(jnp.sum(weighted[:, :, None] * jacobian[:, None, :], axis=0))
         slope = jax.jacfwd(lambda q, e=element: e.potential_energy(q, linkage))(q)
-        efforts.append(jnp.sum(weighted * turning[:, None], axis=0) + slope)
-    matrix = sum(columns)
+        biases.append(jnp.sum(weighted * turning[:, None], axis=0) + slope)
+    matrix, bias = (reduce(add, rows) for rows in (matrices, biases))
     upper = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
     m11, m12, m13, m22, m23, m33 = (matrix[place] for place in upper)
-    return (m11, m12, m13, m22, m23, m33), sum(efforts)
+    return (m11, m12, m13, m22, m23, m33), bias

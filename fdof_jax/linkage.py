@@ -165,6 +165,15 @@ class State(NamedTuple):
     qd: ArrayLike
 
 
+def real_state(name: str, value: Any) -> State:
+    """`value` as a state of arrays (3,), else ValueError."""
+    try:
+        q, qd = value
+    except (TypeError, ValueError):
+        raise ValueError(f"{name}: expected a State(q, qd), got {value!r}.") from None
+    return State(real_array(f"{name}.q", q, (3,)), real_array(f"{name}.qd", qd, (3,)))
+
+
 _T = TypeVar("_T")
 
 
@@ -180,7 +189,7 @@ def compiled(
     """
 
     def decorate(function: Callable[..., _T]) -> Callable[..., _T]:
-        inner = jax.jit(function)
+        inner = eqx.filter_jit(function)  # elements may hold functions
         signature = inspect.signature(function)
 
         @functools.wraps(function)

@@ -3,6 +3,7 @@
 from typing import Any, NamedTuple
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import Array
@@ -10,7 +11,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from .forces import Forces, JointEffort, ScalarElement, StatefulElement
-from .linkage import Linkage, State, check_linkage
+from .linkage import Linkage, State, check_linkage, real_state
 from .simulation import simulate
 from .validation import callable_tuple, concrete, real_array, whole_number
 
@@ -147,16 +148,28 @@ def simulate_sampled(
         raise ValueError("noise, key: expected both or none of them, got one.")
     spread = None
     if noise is not None:
-        names = ("noise[0]", "noise[1]")
+        if not isinstance(noise, tuple) or len(noise) != 2:
+            raise ValueError(
+                "noise: expected a pair of standard deviations, of positions and of "
+                f"velocities, got {noise!r}."
+            )
         spread = [
-            real_array(name, value, (3,), minimum=0, broadcast=True)
-            for name, value in zip(names, noise)
+            real_array(f"noise[{k}]", value, (3,), minimum=0, broadcast=True)
+            for k, value in enumerate(noise)
         ]
-    q0, qd0 = state0
-    state0 = State(real_array("state0.q", q0, (3,)), real_array("state0.qd", qd0, (3,)))
-    at_once = known is not None and known == 0
-    options = dict(throw=False) | options
+    state0 = real_state("state0", state0)
     times = t0 + period * jnp.arange(samples + 1)
+    late = None if known is not None and known == 0 else delay
+    keys = None if key is None else jax.random.split(key, samples)
+    options = dict(throw=False) | options
+    return _motion(linkage, state0, control, times, forces, late, spread, keys, options)
+
+
+@eqx.filter_jit  # not traced anew at each call
+def _motion(
+    linkage, state0, control, times, forces, delay, spread, keys, options
+) -> SampledMotion:
+    """`delay`: None where an effort acts at once; `spread`: of noise, None or two."""
 
     def one(carry, inputs):
         state, held, result = carry
@@ -170,20 +183,19 @@ def simulate_sampled(
                 )
             )
         tau = jnp.asarray(control(begin, *seen, linkage), held.dtype)
-        effort = _Switched(held, tau, begin + delay)
-        element = JointEffort(tau) if at_once else effort
-        solution = simulate(
-            linkage, state, jnp.stack([begin, end]), (*forces, element), **options
+        effort = (
+            JointEffort(tau) if delay is None else _Switched(held, tau, begin + delay)
         )
-        state = State(solution.q[-1], solution.qd[-1])
+        solution = simulate(
+            linkage, state, jnp.stack([begin, end]), (*forces, effort), **options
+        )
+        q, qd = solution.q[-1], solution.qd[-1]
         good = result == diffrax.RESULTS.successful
         result = diffrax.RESULTS.where(good, solution.result, result)
-        return (state, tau, result), (state, tau)
+        return (State(q, qd), tau, result), (q, qd, tau)
 
-    keys = None if key is None else jax.random.split(key, samples)
-    start = state0, jnp.zeros(3), diffrax.RESULTS.successful
-    (_, _, result), (states, tau) = jax.lax.scan(
-        one, start, (times[:-1], times[1:], keys)
-    )
-    q, qd = (jnp.concatenate([a[None], b]) for a, b in zip(state0, states))
+    q0, qd0 = jnp.asarray(state0.q), jnp.asarray(state0.qd)
+    start = State(q0, qd0), jnp.zeros(3), diffrax.RESULTS.successful
+    (*_, result), (q, qd, tau) = jax.lax.scan(one, start, (times[:-1], times[1:], keys))
+    q, qd = jnp.vstack([q0, q]), jnp.vstack([qd0, qd])
     return SampledMotion(times, q, qd, tau, result)

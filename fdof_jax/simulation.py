@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from .forces import Forces, StatefulElement
 from .hybrid_dynamics import prescribed, prescribed_effort
 from .integration import solve
-from .linkage import Linkage, State, check_linkage
+from .linkage import Linkage, State, check_linkage, real_state
 from .solution import Efforts, Solution
 from .step_control import within_reach
 from .validation import (
@@ -115,11 +115,7 @@ def simulate(
     Warns in float32 if the tolerance cannot be met.
     """
     check_linkage(linkage)
-    try:
-        q0, qd0 = state0
-    except (TypeError, ValueError):
-        raise ValueError(f"state0: expected a State(q, qd), got {state0!r}.") from None
-    state0 = State(real_array("state0.q", q0, (3,)), real_array("state0.qd", qd0, (3,)))
+    state0 = real_state("state0", state0)
     ts = real_array("ts", ts, (None,))
     if ts.size == 0:
         raise ValueError("ts: expected at least one time, got none.")
@@ -145,7 +141,7 @@ def simulate(
     motion = prescribed(forces)
     if motion is not None and not is_traced(linkage, state0, ts, motion):
         begin, _ = motion.reference(ts[0], linkage)
-        apart = np.where(motion.moved, np.abs(state0.q - begin), 0)
+        apart = np.where(motion.moved, np.abs(jnp.asarray(state0.q) - begin), 0)
         if not (apart <= 1e-6 * (1 + np.abs(begin))).all():
             raise ValueError(
                 f"state0.q: expected {np.asarray(begin).tolist()} at the joints whose "
@@ -220,8 +216,8 @@ def _efforts(linkage: Linkage, forces: Forces, solution: Solution) -> Efforts:
         elements.append(jax.vmap(effort)(*motion_rows, state))
     stacked = jnp.stack(elements) if elements else jnp.zeros((0, *solution.q.shape))
     if (motion := prescribed(forces)) is not None:
-        effort = lambda *row: prescribed_effort(linkage, forces, *row)
-        demanded = jax.vmap(effort)(*motion_rows, jnp.sum(stacked, axis=0))
+        demand = lambda *row: prescribed_effort(linkage, forces, *row)
+        demanded = jax.vmap(demand)(*motion_rows, jnp.sum(stacked, axis=0))
         place = [element is motion for element in forces].index(True)
         stacked = stacked.at[place].set(demanded)
     return Efforts(jnp.sum(stacked, axis=0), stacked)
