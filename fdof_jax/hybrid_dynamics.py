@@ -18,7 +18,7 @@ from .forces import Forces
 from .linkage import Linkage
 from .reduced_equations import equations, link_constants, zeros
 from .validation import whole_number
-from .vector_field import LEAST_INERTIA_RATIO, Args, load_of, schedule_of
+from .vector_field import LEAST_INERTIA_RATIO, Args, applied, schedule_of
 
 
 class PrescribedMotion(eqx.Module):
@@ -124,14 +124,14 @@ def hybrid_field(t, y, args, schedule) -> tuple[Any, ...]:
     assert motion is not None  # or this were not the field
     own = y[2:]
     q, qd = motion_at(motion, args, t, y)
-    load = load_of(t, (tuple(q - args.q0), tuple(qd), *own), args, schedule)
-    # The bias of masses that elements move is in the load already.
+    acting = applied(t, (tuple(q - args.q0), tuple(qd), *own), args, schedule)
+    # The bias of masses that elements move is in the efforts already.
     bias = jnp.stack(equations(args.constants, tuple(q - args.q0), tuple(qd)).bias)
     momenta = lambda q: _mass_and_bias(args, q, jnp.zeros(3))[0] @ qd
     _, change = jax.jvp(momenta, (q,), (qd,))
-    driven = jnp.where(motion.moved, 0, change - bias + jnp.stack(load.tau))
+    driven = jnp.where(motion.moved, 0, change - bias + jnp.stack(acting.tau))
     moving = tuple(jnp.where(motion.moved, 0, qd)), tuple(driven)
-    return (*moving, load.own_rates) if own else moving
+    return (*moving, acting.own_rates) if own else moving
 
 
 def watched_hybrid_field(t, y, args, schedule) -> tuple[tuple[Any, ...], Array]:

@@ -59,7 +59,7 @@ def _scalars(tree: Any, dtype: Any) -> tuple[Array, ...]:
     return tuple(jnp.concatenate(leaves)) if leaves else ()
 
 
-class Load(NamedTuple):
+class Applied(NamedTuple):
     """What the force elements do: efforts, rates of their own states, inertia."""
 
     tau: tuple[Array, ...]
@@ -67,7 +67,7 @@ class Load(NamedTuple):
     added: Added | None
 
 
-def load_of(t: Any, y: Any, args: Args, schedule: tuple[Any, ...]) -> Load:
+def applied(t: Any, y: Any, args: Args, schedule: tuple[Any, ...]) -> Applied:
     """Arrays are made only for elements that are written in them."""
     delta, qd, *own = y
     states = iter(own_states(args, *own) if own else ())
@@ -86,10 +86,10 @@ def load_of(t: Any, y: Any, args: Args, schedule: tuple[Any, ...]) -> Load:
         tau = effort if tau is None else tuple(a + b for a, b in zip(tau, effort))
     tau = zeros(args.q0) if tau is None else tuple(tau)
     if not inertial(args.forces):
-        return Load(tau, tuple(own_rates), None)
+        return Applied(tau, tuple(own_rates), None)
     added, bias = _added(args.linkage, inertial(args.forces), *arrays())
     tau = tuple(a - b for a, b in zip(tau, bias))
-    return Load(tau, tuple(own_rates), added)
+    return Applied(tau, tuple(own_rates), added)
 
 
 _added: Any = eqx.filter_jit(added_inertia)  # traced once, not at each use by a solver
@@ -98,23 +98,23 @@ _added: Any = eqx.filter_jit(added_inertia)  # traced once, not at each use by a
 def vector_field(t, y, args, schedule) -> tuple[Any, ...]:
     """Rates of six scalars and the elements' own; positions are displacements."""
     delta, qd, *own = y
-    load = load_of(t, y, args, schedule)
-    moving = rates(args.constants, delta, qd, load.tau, load.added)
-    return (*moving, load.own_rates) if own else moving
+    acting = applied(t, y, args, schedule)
+    moving = rates(args.constants, delta, qd, acting.tau, acting.added)
+    return (*moving, acting.own_rates) if own else moving
 
 
 def watched_field(t, y, args, schedule) -> tuple[tuple[Any, ...], Array]:
     """The same, and the health of the accelerations: see `ScheduledTerm`."""
     delta, qd, *own = y
-    load = load_of(t, y, args, schedule)
+    acting = applied(t, y, args, schedule)
     (qd, qdd), loss = rates_and_conditioning(
-        args.constants, delta, qd, load.tau, load.added
+        args.constants, delta, qd, acting.tau, acting.added
     )
-    finite = jnp.isfinite(qdd[0] + qdd[1] + qdd[2] + sum(load.own_rates))
+    finite = jnp.isfinite(qdd[0] + qdd[1] + qdd[2] + sum(acting.own_rates))
     health = jnp.where(loss * LEAST_INERTIA_RATIO[loss.dtype] > 1, 0, loss)
     # A singular matrix makes accelerations that are not finite.
     health = jnp.where(finite | (health == 0), health, jnp.nan)
-    return ((qd, qdd, load.own_rates) if own else (qd, qdd)), health
+    return ((qd, qdd, acting.own_rates) if own else (qd, qdd)), health
 
 
 def health_of(t, y, args) -> Array:

@@ -1,0 +1,74 @@
+"""One of each force element of the library, at work on a small arm."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import fdof_jax as fj
+
+HOOK, ELBOW, TIP = fj.Point(0, 0.3, -0.4), fj.Point(2, 0.5, 0.2), fj.Point(3, 0.4)
+
+
+class Swing(eqx.Module):
+    """A reference without jumps, which any step size controller takes."""
+
+    amplitude: jax.Array
+
+    def __call__(self, t, linkage):
+        phase = jnp.array([0.0, 1.0, 2.0])
+        rate = 3 * jnp.cos(3 * t + phase)
+        return self.amplitude * jnp.sin(3 * t + phase), self.amplitude * rate
+
+
+MOVE = Swing(jnp.array([0.3, 0.5, 0.2]))
+PD = fj.PDController([9.0, 7.0, 5.0], [3.0, 2.0, 1.0], [4.0, 2.0, 9.0], MOVE)
+
+# Efforts in the joints, between points and from outside
+PLAIN = {
+    "damper": fj.JointDamper([0.3, 0.2, 0.1]),
+    "effort": fj.JointEffort([1.0, -0.5, 0.3]),
+    "PD": PD,
+    "spring": fj.SpringDamper(
+        HOOK, ELBOW, stiffness=30.0, damping=2.0, rest_length=0.4
+    ),
+    "cable": fj.SpringDamper(
+        HOOK, ELBOW, stiffness=20.0, rest_length=0.3, one_sided="cable"
+    ),
+    "bumper": fj.SpringDamper(
+        HOOK, TIP, stiffness=25.0, rest_length=3.0, one_sided="bumper"
+    ),
+    "tension": fj.Tension(HOOK, TIP, 2.5),
+    "wrench": fj.Wrench(TIP, [3.0, -2.0], 0.7),
+    "following wrench": fj.Wrench(ELBOW, [1.0, 2.0], follows=True),
+    "stops": fj.JointStops(
+        [-1.0, -0.1, -np.inf], [0.2, 2.0, 0.4], stiffness=40.0, damping=0.5,
+        smoothing=0.1,
+    ),
+    "friction": fj.JointFriction([0.4, 0.3, 0.2], 0.5),
+    "speed limit": fj.SpeedLimit(PD, stall=3.0, no_load=4.0),
+}  # fmt: skip
+WITH_STATE = {
+    "PID": fj.PIDController(8.0, [4.0, 3.0, 2.0], 2.0, [3.0, 9.0, 1.0], MOVE),
+    "lag": fj.FirstOrderLag(PD, 0.2, initial=[0.5, 0.0, 0.0]),
+    "motor": fj.DCMotor(
+        PD, resistance=2.0, inductance=0.3, constant=0.4, gear=3.0, voltage_limit=5.0
+    ),
+}
+WITH_INERTIA = {
+    "armature": fj.Armature([0.3, 0.2, 0.1]),
+    "actuator": fj.LinearActuator(
+        HOOK, ELBOW, force=5.0, mass=[1.2, 0.7], com=[0.2, 0.3], inertia=[0.05, 0.03]
+    ),
+}
+ALL = PLAIN | WITH_STATE | WITH_INERTIA
+
+ARM = dict(
+    length=[0.1, 1.0, 0.8, 0.6], com=[[0.5, 0.1], [0.4, 0.0], [0.3, 0.05]],
+    mass=[2.0, 1.5, 1.0], inertia=[0.3, 0.2, 0.1],
+)  # fmt: skip
+START = fj.State(jnp.array([0.3, -0.2, 0.5]), jnp.array([0.5, -0.7, 0.9]))
+
+
+def arm(topology):
+    return fj.Linkage(topology, locked=[0.3, -0.2, 0.4], base_angle=0.2, **ARM)

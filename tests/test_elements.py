@@ -1,0 +1,137 @@
+"""What all force elements of the library have in common: gradients, batches, costs."""
+
+import diffrax
+import elements
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_costs import flops
+
+import fdof_jax as fj
+from fdof_jax import vector_field
+from fdof_jax.added_inertia import added_inertia
+from fdof_jax.reduced_equations import link_constants, zeros
+
+ARM = elements.arm("RPR")
+NUMBERS = eqx.is_inexact_array
+
+
+def scaled(forces, factors):
+    """Every number multiplied by a factor of its array's, or moved if it is zero."""
+    leaves, structure = jax.tree.flatten(forces)
+    factors = iter(factors)
+    moved = []
+    for leaf in leaves:
+        if NUMBERS(leaf):
+            factor = next(factors)
+            leaf = jnp.where(leaf == 0, factor - 1, leaf * factor)
+        moved.append(leaf)
+    return jax.tree.unflatten(structure, moved)
+
+
+def end(forces, factors, adjoint=diffrax.ForwardMode()):
+    """Of a short motion in fixed steps, which makes differences exact."""
+    solution = fj.simulate(
+        ARM,
+        elements.START,
+        [0, 0.15],
+        scaled(forces, factors),
+        solver=diffrax.Bosh3(),
+        stepsize_controller=diffrax.ConstantStepSize(),
+        dt0=5e-3,
+        adjoint=adjoint,
+    )
+    return jnp.concatenate([solution.q[-1], solution.qd[-1]])
+
+
+@pytest.mark.parametrize(
+    "mode", ["forward", pytest.param("reverse", marks=pytest.mark.slow)]
+)
+@pytest.mark.parametrize("kind", ["PLAIN", "WITH_STATE", "WITH_INERTIA"])
+def test_gradients_in_all_parameters_equal_differences(kind, mode):
+    forces = tuple(getattr(elements, kind).values())
+    ones = jnp.ones(len(jax.tree.leaves(eqx.filter(forces, NUMBERS))))
+    if mode == "forward":
+        slope = jax.jit(jax.jacfwd(lambda p: end(forces, p)))(ones)
+    else:
+        adjoint = diffrax.RecursiveCheckpointAdjoint()
+        slope = jax.jit(jax.jacrev(lambda p: end(forces, p, adjoint)))(ones)
+    motion, h = jax.jit(lambda p: end(forces, p)), 1e-5
+    columns = [
+        (motion(ones + h * e) - motion(ones - h * e)) / (2 * h)
+        for e in np.eye(len(ones))
+    ]
+    differences = np.stack(columns, axis=1)
+    # Most parameters are at work, each to its own size.
+    size = np.abs(differences).max(axis=0)
+    assert (size > 1e-6).mean() > 0.6
+    assert (np.abs(slope - differences) <= 1e-6 * size + 1e-8).all()
+
+
+def test_one_program_for_all_topologies():
+    forces = tuple(elements.ALL.values())
+    arms = [elements.arm(topology) for topology in fj.TOPOLOGIES]
+
+    def end(linkage):
+        solution = fj.simulate(
+            linkage,
+            elements.START,
+            [0, 0.1],
+            forces,
+            solver=diffrax.Bosh3(),
+            stepsize_controller=diffrax.ConstantStepSize(),
+            dt0=5e-3,
+        )
+        return solution.q[-1], solution.own
+
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *arms)
+    alone, together = jax.jit(end), jax.jit(jax.vmap(end))(stacked)
+    for member, linkage in enumerate(arms):
+        row = jax.tree.map(lambda a, member=member: a[member], together)
+        for a, b in zip(jax.tree.leaves(row), jax.tree.leaves(alone(linkage))):
+            np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9)
+
+
+# Costs
+
+
+def field(t, y, args):
+    return vector_field.vector_field(t, y, args, vector_field.schedule_of(t, args))
+
+
+def field_flops(*forces):
+    q, t = elements.START.q, jnp.array(0.1)
+    args = vector_field.Args(ARM, q, link_constants(ARM, q), forces)
+    y = zeros(q), tuple(elements.START.qd), *vector_field.initial_own(args)
+    return flops(field, t, y, args)
+
+
+BARE = field_flops()
+
+
+@pytest.mark.parametrize("name", elements.PLAIN)
+def test_a_plain_element_costs_its_own(name):
+    element = elements.PLAIN[name]
+    own = flops(lambda e, *a: e(*a), element, jnp.array(0.1), *elements.START, ARM)
+    assert 0 <= field_flops(element) - BARE <= own + 6
+
+
+@pytest.mark.parametrize("name", elements.WITH_STATE)
+def test_an_element_with_state_costs_its_own(name):
+    element = elements.WITH_STATE[name]
+    state = element.initial_state(ARM)
+    own = flops(
+        lambda e, *a: e(*a), element, jnp.array(0.1), *elements.START, ARM, state
+    )
+    assert 0 < field_flops(element) - BARE <= own + 6
+
+
+@pytest.mark.parametrize("name", elements.WITH_INERTIA)
+def test_an_element_with_inertia_costs_its_own(name):
+    """Six sums of the mass matrix's entries besides."""
+    element = elements.WITH_INERTIA[name]
+    own = flops(lambda e, *a: e(*a), element, jnp.array(0.1), *elements.START, ARM)
+    own += flops(lambda e, *a: added_inertia(ARM, (e,), *a), element, *elements.START)
+    assert 0 < field_flops(element) - BARE <= own + 15

@@ -1,0 +1,119 @@
+"""Stops and friction: closed forms, energy, power, finite derivatives."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import random_linkage
+
+import fdof_jax as fj
+
+# The last joint slides a point mass of 2 kg along x; nothing else moves much.
+SLIDE = fj.Linkage(
+    "RRP", length=[0, 0, 0, 0], com=[[0, 0]] * 3, mass=[1, 1, 2], inertia=[1, 1, 1],
+    gravity=0.0,
+)  # fmt: skip
+STILL = np.zeros(3)
+
+
+def last(value):
+    return np.array([0.0, 0.0, value])
+
+
+def test_a_bounce_keeps_the_energy():
+    """The potential is stiffness (d^2 + d r + w^2 asinh(d/w)) / 4, r^2 = d^2 + w^2."""
+    k, w, end = 300.0, 0.02, 1.0
+    stops = fj.JointStops(-np.inf, [np.inf, np.inf, end], stiffness=k, smoothing=w)
+    ts = np.linspace(0, 1, 101)
+    solution = fj.simulate(SLIDE, fj.State(last(0.5), last(3.0)), ts, (stops,))
+    x, v = np.asarray(solution.q[:, 2]), np.asarray(solution.qd[:, 2])
+    d = x - end
+    potential = k / 4 * (d**2 + d * np.hypot(d, w) + w**2 * np.arcsinh(d / w))
+    energy = v**2 + potential  # of 2 kg
+    assert d.max() > 0.1 and v[-1] < -2.9
+    np.testing.assert_allclose(energy, energy[0], rtol=1e-9)
+
+
+def test_deep_in_a_stop_the_spring_is_linear():
+    """Half a period of sqrt(k/m), when the rounding is small."""
+    k, speed = 800.0, 2.0
+    stops = fj.JointStops(-1.0, np.inf, stiffness=k, smoothing=1e-7)
+    half = np.pi / np.sqrt(k / 2)
+    motion = fj.simulate(
+        SLIDE, fj.State(last(-1.0), last(-speed)), [0, half / 2, half], (stops,)
+    )
+    depth = speed / np.sqrt(k / 2)
+    np.testing.assert_allclose(motion.q[:, 2], [-1, -1 - depth, -1], atol=1e-6)
+    np.testing.assert_allclose(motion.qd[:, 2], [-speed, 0, speed], atol=1e-5)
+
+
+def test_damping_takes_energy_and_never_pulls():
+    stops = fj.JointStops(-np.inf, 1.0, stiffness=300.0, damping=0.3, smoothing=1e-3)
+    start = fj.State(last(0.9), last(3.0))
+    solution = fj.simulate(SLIDE, start, np.linspace(0, 1, 201), (stops,))
+    assert 0.3 < -solution.qd[-1, 2] / 3 < 0.9
+    efforts = fj.joint_efforts(SLIDE, (stops,), solution).total[:, 2]
+    assert efforts.min() < -50 and efforts.max() <= 0
+    fast = stops(0.0, last(1.1), last(-50.0), SLIDE)
+    np.testing.assert_array_equal(fast, 0)
+
+
+@pytest.mark.parametrize("topology", fj.TOPOLOGIES)
+def test_within_the_range_stops_do_nothing_and_outside_they_push_back(topology):
+    linkage = random_linkage(topology, np.random.default_rng(0))
+    stops = fj.JointStops([-1, -np.inf, -2], [1, 2, np.inf], smoothing=1e-9)
+    inside = stops(0.0, np.array([0.5, -1e30, 1e30]), STILL, linkage)
+    assert np.abs(inside).max() < 1e-12
+    outside = stops(0.0, np.array([-1.5, 3.0, -2.5]), STILL, linkage)
+    np.testing.assert_allclose(outside, [5e3, -1e4, 5e3], rtol=1e-9)
+
+
+def test_stops_have_finite_derivatives_everywhere():
+    def push(q, qd, stops):
+        return stops(0.0, q, qd, SLIDE)
+
+    stops = fj.JointStops(-1.0, [1.0, np.inf, 1e300], damping=0.5)
+    for x in (-1e30, -1.0, 0.0, 1.0, 1e12):
+        q = jnp.full(3, x)
+        slopes = jax.jacrev(push, argnums=(0, 1))(q, jnp.ones(3), stops)
+        assert all(np.isfinite(s).all() for s in slopes)
+    finite = eqx.tree_at(lambda s: s.upper, stops, jnp.ones(3))
+    for k in range(5):
+        q, h = jnp.full(3, 0.9995 + 2.5e-4 * k), 1e-7
+        slope = jax.jacfwd(push)(q, jnp.ones(3), finite)
+        difference = (
+            push(q + h, jnp.ones(3), finite) - push(q - h, jnp.ones(3), finite)
+        ) / (2 * h)
+        np.testing.assert_allclose(np.diag(slope), difference, rtol=1e-5, atol=1e-3)
+
+
+def test_friction_stops_a_slide():
+    """2 dv/dt = -F tanh(v/s), so sinh(v/s) falls exponentially."""
+    level, speed, v0 = 4.0, 0.05, 1.5
+    friction = fj.JointFriction(level, speed)
+    ts = np.linspace(0, 1.2, 25)
+    solution = fj.simulate(SLIDE, fj.State(STILL, last(v0)), ts, (friction,))
+    exact = speed * np.arcsinh(np.sinh(v0 / speed) * np.exp(-level / 2 * ts / speed))
+    np.testing.assert_allclose(solution.qd[:, 2], exact, rtol=1e-7, atol=1e-10)
+    power = fj.joint_efforts(SLIDE, (friction,), solution).total[:, 2] * exact
+    np.testing.assert_allclose(
+        power, -level * exact * np.tanh(exact / speed), rtol=1e-6, atol=1e-9
+    )
+
+
+@pytest.mark.parametrize(
+    "make, message",
+    [
+        (lambda: fj.JointStops(1, 1), "lower: expected less than upper"),
+        (lambda: fj.JointStops(np.nan, 1), "lower: expected"),
+        (lambda: fj.JointStops(0, 1, stiffness=0), "stiffness: expected .* above 0"),
+        (lambda: fj.JointStops(0, 1, smoothing=0), "smoothing: expected .* above 0"),
+        (lambda: fj.JointStops(0, 1, damping=-1), "damping: expected .* at least 0"),
+        (lambda: fj.JointFriction(-1), "level: expected .* at least 0"),
+        (lambda: fj.JointFriction(1, 0), "speed: expected .* above 0"),
+    ],
+)
+def test_malformed_arguments_are_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
