@@ -1,6 +1,5 @@
 """Servo drives: closed forms, limits, and the states they integrate."""
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -115,26 +114,6 @@ def test_anti_windup_keeps_the_overshoot_small():
         solution = fj.simulate(single(), STILL, np.linspace(0, 20, 201), (pid,))
         overshoot.append(float(solution.q[:, 2].max() - 1))
     assert overshoot[0] > 0.3 and overshoot[1] < 0.5 * overshoot[0]
-
-
-@pytest.mark.parametrize("mode", ["forward", "reverse"])
-def test_gradients_equal_differences(mode):
-    def end(p, adjoint):
-        pid = fj.PIDController(8.0, p[0], 6.0, jnp.inf, Hold(only_last(1.0)))
-        lag = fj.FirstOrderLag(fj.JointEffort([0, 0, 0.3]), p[1])
-        solution = fj.simulate(single(), STILL, [0, 1], (pid, lag), adjoint=adjoint)
-        return jnp.stack([solution.q[-1, 2], solution.own[0][-1, 2]])
-
-    p = jnp.array([5.0, 0.2])
-    reverse = diffrax.RecursiveCheckpointAdjoint()
-    if mode == "forward":
-        slope = jax.jacfwd(lambda p: end(p, diffrax.ForwardMode()))(p)
-    else:
-        slope = jax.jacrev(lambda p: end(p, reverse))(p)
-    columns = [
-        (end(p + h, reverse) - end(p - h, reverse)) / 2e-4 for h in 1e-4 * np.eye(2)
-    ]
-    np.testing.assert_allclose(slope, np.stack(columns, axis=1), atol=1e-7)
 
 
 def test_states_of_elements_are_swept():

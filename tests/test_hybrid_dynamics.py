@@ -133,7 +133,9 @@ def test_a_motion_prescribed_as_it_is_takes_no_effort():
     np.testing.assert_allclose(centres[:, 0, 1], -9.81 * ts**2 / 2, atol=1e-9)
 
 
-@pytest.mark.parametrize("mode", ["forward", "reverse"])
+@pytest.mark.parametrize(
+    "mode", ["forward", pytest.param("reverse", marks=pytest.mark.slow)]
+)
 def test_gradients_equal_differences(mode):
     linkage, start, (motion, *others) = swinging("RPR", 1)
 

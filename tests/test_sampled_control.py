@@ -75,6 +75,7 @@ def test_a_step_is_a_simulation_under_a_held_effort():
     np.testing.assert_allclose(after.qd, motion.qd[-1], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_step_is_differentiable_and_batched():
     """As a predictive controller linearises it."""
     tau = jnp.array([1.0, -2.0, 0.5])
@@ -86,6 +87,7 @@ def test_a_step_is_differentiable_and_batched():
     np.testing.assert_allclose(many[0], step(tau), atol=1e-12)
 
 
+@pytest.mark.slow
 def test_gains_of_sampled_control_have_gradients():
     def end(factor):
         control = fj.PDController(factor * KP, KD, np.inf, MOVE)
