@@ -11,7 +11,16 @@ from numpy.typing import ArrayLike
 
 from .forces import InertialElement
 from .linkage import Linkage
-from .points import Load, Point, Separation
+from .points import (
+    Load,
+    Point,
+    Separation,
+    cross,
+    dot,
+    frames_of,
+    length_of,
+    over,
+)
 from .validation import real_array
 
 
@@ -78,27 +87,34 @@ class LinearActuator(InertialElement):
         self.com = real_array("com", com, (2,))
         self.inertia = real_array("inertia", inertia, (2,), minimum=0)
 
-    def _centers(self, linkage: Linkage, q: Array) -> Array:
-        """The mass centres of the cylinder and the piston, (2, 2)."""
-        a, b = (p.position(linkage, q) for p in (self.ends.a, self.ends.b))
-        unit = (b - a) / jnp.sqrt(jnp.sum((b - a) ** 2))
-        return jnp.stack([a + self.com[0] * unit, b - self.com[1] * unit])
+    def _bodies(self, linkage: Linkage, q: Array) -> tuple[Array, Array, Array]:
+        """The mass centres of cylinder and piston, and the vector between the pins."""
+        frames = frames_of(linkage, tuple(q))
+        vector = self.ends.vector(frames)
+        unit = vector * over(length_of(vector))
+        cylinder = self.ends.a.place(frames) + self.com[0] * unit
+        return cylinder, self.ends.b.place(frames) - self.com[1] * unit, vector
 
     def coordinates(self, q, linkage):
-        x, y = self.ends.vector(linkage, q)
-        return jnp.append(self._centers(linkage, q).ravel(), jnp.arctan2(y, x))
+        cylinder, piston, vector = self._bodies(linkage, q)
+        angle = jnp.arctan2(vector.imag, vector.real)
+        places = cylinder.real, cylinder.imag, piston.real, piston.imag
+        return jnp.stack([*places, angle])
 
     def weights(self, linkage):
         return jnp.append(jnp.repeat(self.mass, 2), jnp.sum(self.inertia))
 
     def potential_energy(self, q, linkage):
-        height = self._centers(linkage, q)[:, 1]
+        cylinder, piston, _ = self._bodies(linkage, q)
+        height = jnp.stack([cylinder.imag, piston.imag])
         return linkage.gravity * jnp.sum(self.mass * height)
 
     def __call__(self, t, q, qd, linkage):
-        length = lambda q: self.ends.length(linkage, q)
-        now, slope = jax.value_and_grad(length)(q)
-        return self._push(t, now, slope @ qd) * slope
+        frames = frames_of(linkage, tuple(q))
+        vector = self.ends.vector(frames)
+        length = length_of(vector)
+        slopes = jnp.stack(self.ends.slopes(frames, vector)) * over(length)
+        return self._push(t, length, slopes @ qd) * slopes
 
     def _push(self, t: Array, length: Array, rate: Array) -> Array:
         if callable(self.force):
@@ -116,16 +132,19 @@ class LinearActuator(InertialElement):
         along = lambda q, qd: jax.jvp(
             lambda q: self.coordinates(q, linkage), (q,), (qd,)
         )[1]
-        _, acceleration = jax.jvp(along, (q, qd), (qd, qdd))
-        weight = self.mass[:, None] * jnp.array([[0.0, 1.0]]) * linkage.gravity
-        needed = self.mass[:, None] * acceleration[:4].reshape(2, 2) + weight
-        length, rate = jax.jvp(lambda q: self.ends.length(linkage, q), (q,), (qd,))
-        unit = self.ends.vector(linkage, q) / length
-        sideways = jnp.stack([-unit[1], unit[0]])
-        turning = jnp.sum(self.inertia) * acceleration[4]
-        arms = jnp.stack([self.com[0], length - self.com[1]])
-        across = (turning + jnp.sum(arms * (needed @ sideways))) / length
-        held = needed[1] @ unit - self._push(t, length, rate)
-        on_b = held * unit + across * sideways  # by the link, on the piston
-        on_a = needed[0] + needed[1] - on_b
+        _, (x1, y1, x2, y2, turning) = jax.jvp(along, (q, qd), (qd, qdd))
+        weight = 1j * linkage.gravity
+        cylinder = self.mass[0] * (jax.lax.complex(x1, y1) + weight)
+        piston = self.mass[1] * (jax.lax.complex(x2, y2) + weight)
+        vector, rate = jax.jvp(lambda q: self._bodies(linkage, q)[2], (q,), (qd,))
+        length = length_of(vector)
+        unit = vector / length
+        about_a = (
+            jnp.sum(self.inertia) * turning
+            + self.com[0] * cross(unit, cylinder)
+            + (length - self.com[1]) * cross(unit, piston)
+        )
+        held = dot(unit, piston) - self._push(t, length, dot(unit, rate))
+        on_b = (held + 1j * about_a / length) * unit  # by the link, on the piston
+        on_a = cylinder + piston - on_b
         return Load(self.ends.a, -on_a), Load(self.ends.b, -on_b)

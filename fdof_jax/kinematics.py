@@ -44,12 +44,6 @@ def joint_positions(
     return _plane(_chain(linkage, q)[2])
 
 
-def link_frames(linkage: Linkage, q: Array) -> tuple[Array, Array]:
-    """Starts and directions of the ground and the moving links, (4,) complex each."""
-    _, e, start = _chain(linkage, q)
-    return jnp.concatenate([jnp.zeros_like(start[:1]), start]), e
-
-
 @compiled(q=(3,))
 def mass_centers(linkage: Linkage, q: Float[Array, " joint"]) -> Float[Array, "link 2"]:
     """Mass centres of the moving links.

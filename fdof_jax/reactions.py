@@ -13,31 +13,32 @@ from .dynamics import forward_dynamics
 from .forces import Forces
 from .kinematics import joint_positions, mass_center_velocities, mass_centers
 from .linkage import Linkage
-from .points import PointElement
+from .points import PointElement, cross, frames_of
 from .simulation import joint_efforts
 from .solution import Solution
-
-
-def _cross(a: Array, b: Array) -> Array:
-    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
 
 def _loads(
     linkage: Linkage, forces: Forces, t: Any, q: Array, qd: Array, qdd: Array
 ) -> tuple[Array, Array]:
     """On the ground and the links: forces, and moments about the ground pivot."""
-    force, moment = jnp.zeros((4, 2)), jnp.zeros(4)
+    frames = frames_of(linkage, tuple(q))
+    force, moment = jnp.zeros(4, complex), jnp.zeros(4)
     for element in forces:
         loads = ()
         if isinstance(element, PointElement):
-            loads = element.loads(t, q, qd, linkage)
+            loads = element.loads(element.schedule(t, linkage), frames, tuple(qd))
         elif isinstance(element, LinearActuator):
             loads = element.loads(t, q, qd, qdd, linkage)
         for point, push, turn in loads:
-            place = point.position(linkage, q)
+            about_pivot = turn + cross(point.place(frames), push)
             force = force.at[point.link].add(push)
-            moment = moment.at[point.link].add(turn + _cross(place, push))
+            moment = moment.at[point.link].add(about_pivot)
     return force, moment
+
+
+def _complex(vectors: Array) -> Array:
+    return jax.lax.complex(vectors[:, 0], vectors[:, 1])
 
 
 def _reactions(
@@ -46,15 +47,15 @@ def _reactions(
     qdd = forward_dynamics(linkage, q, qd, tau, forces)
     motion = lambda q, qd: mass_center_velocities(linkage, q, qd)
     _, (acceleration, spin_up) = jax.jvp(motion, (q, qd), (qd, qdd))
-    weight = jnp.array([[0.0, 1.0]]) * linkage.gravity
-    needed = linkage.mass[:, None] * (acceleration + weight)
-    turning = linkage.inertia * spin_up + _cross(mass_centers(linkage, q), needed)
+    needed = linkage.mass * (_complex(acceleration) + 1j * linkage.gravity)
+    center, joint = (_complex(f(linkage, q)) for f in (mass_centers, joint_positions))
+    turning = linkage.inertia * spin_up + cross(center, needed)
     force, moment = _loads(linkage, forces, t, q, qd, qdd)
     # Each joint carries all links beyond it.
-    beyond = lambda rows: jnp.cumsum(rows[::-1], axis=0)[::-1]
+    beyond = lambda rows: jnp.cumsum(rows[::-1])[::-1]
     carried, about_pivot = beyond(needed - force[1:]), beyond(turning - moment[1:])
-    about = about_pivot - _cross(joint_positions(linkage, q), carried)
-    return jnp.concatenate([carried, about[:, None]], axis=1)
+    about = about_pivot - cross(joint, carried)
+    return jnp.stack([carried.real, carried.imag, about], axis=1)
 
 
 def joint_reactions(

@@ -8,6 +8,7 @@ import pytest
 from helpers import random_linkage
 
 import fdof_jax as fj
+from fdof_jax.points import frames_of
 
 GROUND, TIP = fj.Point(0, 0.3, -0.8), fj.Point(3, 0.5, 0.2)
 SPRING = fj.SpringDamper(GROUND, TIP, stiffness=30.0, damping=2.0, rest_length=0.4)
@@ -56,7 +57,11 @@ def test_each_link_is_in_balance(topology):
     spins = second(angle, q, qd, qdd)
     centers, starts = fj.mass_centers(linkage, q), fj.joint_positions(linkage, q)
     loads = [
-        load for e in (SPRING, ACROSS, PUSH) for load in e.loads(0.0, q, qd, linkage)
+        load
+        for element in (SPRING, ACROSS, PUSH)
+        for load in element.loads(
+            element.schedule(0.0, linkage), frames_of(linkage, q), qd
+        )
     ]
     weight = np.array([0, -float(linkage.gravity)])
     for k in range(3):
@@ -69,8 +74,9 @@ def test_each_link_is_in_balance(topology):
         for load in loads:
             if load.point.link == k + 1:
                 place = load.point.position(linkage, q)
-                force = force + load.force
-                moment = moment + load.moment + cross(place - centers[k], load.force)
+                push = np.array([load.force.real, load.force.imag])
+                force = force + push
+                moment = moment + load.moment + cross(place - centers[k], push)
         size = np.abs(reactions).max()
         np.testing.assert_allclose(
             force, linkage.mass[k] * accelerations[k], atol=1e-10 * size
@@ -141,7 +147,8 @@ def test_pins_carry_the_actuator(topology):
     total = tau + ACTUATOR(0.0, q, qd, linkage)
     qdd = fj.forward_dynamics(linkage, q, qd, total, (ACTUATOR,))
     loads = ACTUATOR.loads(0.0, q, qd, qdd, linkage)
-    by_loads = sum(load.efforts(linkage, q) for load in loads)
+    frames = frames_of(linkage, q)
+    by_loads = sum(np.array(load.efforts(frames)) for load in loads)
     alone = fj.forward_dynamics(linkage, q, qd, tau + by_loads)
     np.testing.assert_allclose(alone, qdd, rtol=1e-9, atol=1e-9 * np.abs(qdd).max())
 
