@@ -9,7 +9,7 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from .forces import InertialElement
+from .forces import InertialElement, jumps_of
 from .linkage import Linkage
 from .points import (
     Load,
@@ -43,6 +43,10 @@ class Armature(InertialElement):
 
     def weights(self, linkage):
         return self.inertia
+
+    def loads(self, t, q, qd, qdd, linkage):
+        """None but in the joints themselves."""
+        return ()
 
 
 class LinearActuator(InertialElement):
@@ -86,6 +90,11 @@ class LinearActuator(InertialElement):
         self.mass = real_array("mass", mass, (2,), minimum=0)
         self.com = real_array("com", com, (2,))
         self.inertia = real_array("inertia", inertia, (2,), minimum=0)
+
+    @property
+    def jump_ts(self) -> Array | None:
+        """The times at which the force's function says that it jumps, if it does."""
+        return jumps_of(self.force)
 
     def _bodies(self, linkage: Linkage, q: Array) -> tuple[Array, Array, Array]:
         """The mass centres of cylinder and piston, and the vector between the pins."""

@@ -29,6 +29,29 @@ if TYPE_CHECKING:
 Reference = Callable[[Array, Linkage], tuple[Array, Array]]
 
 
+def checked_reference(value: Any) -> Any:
+    """`value` if it can be called as a reference, else ValueError."""
+    if not callable(value) or isinstance(value, type):
+        raise ValueError(
+            "reference: expected a callable (t, linkage) -> (q, qd), for instance "
+            f"CircleTask(), got {value!r}."
+        )
+    return value
+
+
+def reference_motion(
+    reference: Reference, t: Array, linkage: Linkage
+) -> tuple[Array, Array]:
+    """What a reference returns, refused unless it is positions and velocities (3,)."""
+    motion = reference(t, linkage)
+    if not isinstance(motion, tuple) or len(motion) != 2:
+        raise ValueError(
+            f"reference: expected it to return (q_ref, qd_ref), got {motion!r}."
+        )
+    q_ref, qd_ref = (real_array("reference", m, (3,)) for m in motion)
+    return q_ref, qd_ref
+
+
 class PDController(ScalarElement):
     """Saturated PD control of the joints, as in Fig 7: a force element.
 
@@ -64,22 +87,11 @@ class PDController(ScalarElement):
         self.limit = real_array(
             "limit", limit, (3,), minimum=0, finite=False, broadcast=True
         )
-        if not callable(reference) or isinstance(reference, type):
-            raise ValueError(
-                "reference: expected a callable (t, linkage) -> (q, qd), for instance "
-                f"CircleTask(), got {reference!r}."
-            )
-        self.reference = reference
+        self.reference = checked_reference(reference)
 
     def schedule(self, t: Array, linkage: Linkage) -> tuple[Array, Array]:
         """The reference motion, which does not depend on the state: (q_ref, qd_ref)."""
-        motion = self.reference(t, linkage)
-        if not isinstance(motion, tuple) or len(motion) != 2:
-            raise ValueError(
-                f"reference: expected it to return (q_ref, qd_ref), got {motion!r}."
-            )
-        q_ref, qd_ref = (real_array("reference", m, (3,)) for m in motion)
-        return q_ref, qd_ref
+        return reference_motion(self.reference, t, linkage)
 
     def respond(self, scheduled, q, qd, linkage):
         # The derivative of jnp.clip at the limit is the mean of both sides'.

@@ -1,11 +1,12 @@
 """Servo drives: what stands between a controller's command and a joint's effort.
 
-All work joint by joint. A command is a force element `(t, q, qd, linkage) -> (3,)`
-without a state of its own, a `PDController` for instance; what it returns is an effort,
-or for a motor a voltage.
+All work joint by joint. A command is a force element, a `PDController`, a
+`PIDController` or another drive for instance; what it returns is an effort, or for a
+motor a voltage.
 """
 
-from typing import Any
+from abc import abstractmethod
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -16,23 +17,107 @@ from numpy.typing import ArrayLike
 from .control import PDController, Reference
 from .forces import StatefulElement
 from .linkage import Linkage
-from .validation import real_array
+from .validation import is_traced, real_array
 
 
-def _command(value: Any) -> Any:
-    plain = callable(value) and not isinstance(value, type | StatefulElement)
-    if not plain:
-        raise ValueError(
-            "command: expected a force element without a state, a PDController for "
-            f"instance, got {value!r}."
-        )
-    return value
+class PIDController(StatefulElement):
+    """PD control with an integral of the position error, and limits.
+
+    The effort is that of a `PDController` plus ki times the integral, clipped to
+    +-limit as a whole. Anti-windup by back-calculation: what the limit takes away flows
+    out of the integral, with the time constant kp / ki.
+
+    **Arguments:** one per joint or one for all.
+
+    - `kp`, `kd`, `limit`, `reference`: as in `PDController`.
+    - `ki`: gains of the integral, not negative; 0 where kp is [N/(m s) or N m/(rad s)].
+
+    **Raises:** ValueError for malformed arguments.
+    """
+
+    pd: PDController
+    ki: Float[Array, " joint"]
+
+    def __init__(
+        self,
+        kp: ArrayLike,
+        ki: ArrayLike,
+        kd: ArrayLike,
+        limit: ArrayLike,
+        reference: Reference,
+    ):
+        self.pd = PDController(kp, kd, limit, reference)
+        self.ki = real_array("ki", ki, (3,), minimum=0, broadcast=True)
+        if not is_traced(self) and not self.possible():
+            raise ValueError(
+                f"ki: expected 0 where kp is, got {self.ki.tolist()} and "
+                f"{self.pd.kp.tolist()}."
+            )
+
+    def initial_state(self, linkage):
+        """The integral's share of the effort, (3,) [N or N m]."""
+        return jnp.zeros(3)
+
+    def __call__(self, t, q, qd, linkage, state):
+        position, velocity = self.pd.schedule(t, linkage)
+        proportional = self.pd.kp * (position - q)
+        demand = proportional + self.pd.kd * (velocity - qd) + state
+        effort = jnp.clip(demand, -self.pd.limit, self.pd.limit)
+        per_time = self.ki / jnp.where(self.pd.kp > 0, self.pd.kp, 1)
+        return effort, per_time * (proportional + effort - demand)
+
+    @property
+    def jump_ts(self) -> Array | None:
+        """The times at which the reference says that it jumps, if it does."""
+        return self.pd.jump_ts
+
+    def check(self, linkage: Linkage, ts: Array) -> None:
+        """The reference's own check, if it has one."""
+        self.pd.check(linkage, ts)
+
+    def possible(self) -> Array:
+        """Whether no gain or limit is negative, and none is an integral's alone."""
+        lone = (self.ki > 0) & ~(self.pd.kp > 0)
+        return self.pd.possible() & ((self.ki >= 0) & ~lone).all()
 
 
-class _Commanded(eqx.Module):
-    """What has a command passes its jumps and its checks on."""
+class DriveState(NamedTuple):
+    """State of a drive: its `own`, and that of the `command`; () for none."""
+
+    own: Any
+    command: Any
+
+
+class _Drive(StatefulElement):
+    """A command and what a drive makes of it.
+
+    A subclass implements `respond`, and `initial` if it has a state of its own.
+    """
 
     command: eqx.AbstractVar[Any]
+
+    def initial(self) -> Any:
+        """The drive's own state at the start."""
+        return ()
+
+    @abstractmethod
+    def respond(self, command: Array, qd: Array, own: Any) -> tuple[Array, Any]:
+        """The efforts (3,), and the rate of the drive's own state."""
+
+    def initial_state(self, linkage):
+        """A `DriveState`."""
+        stateful = isinstance(self.command, StatefulElement)
+        inner = self.command.initial_state(linkage) if stateful else ()
+        return DriveState(self.initial(), inner)
+
+    def __call__(self, t, q, qd, linkage, state):
+        own, inner = state
+        if isinstance(self.command, StatefulElement):
+            command, inner_rate = self.command(t, q, qd, linkage, inner)
+        else:
+            command, inner_rate = self.command(t, q, qd, linkage), ()
+        effort, rate = self.respond(real_array("command", command, (3,)), qd, own)
+        return effort, DriveState(rate, inner_rate)
 
     @property
     def jump_ts(self) -> Array | None:
@@ -45,94 +130,52 @@ class _Commanded(eqx.Module):
         if check is not None:
             check(linkage, ts)
 
-
-class PIDController(StatefulElement):
-    """PD control with an integral of the position error, and limits.
-
-    The effort is that of a `PDController` plus ki times the integral, clipped to
-    +-limit as a whole. Anti-windup by back-calculation: what the limit takes away
-    drains the integral, at the rate 1 / `unwind`.
-
-    **Arguments:** one per joint or one for all.
-
-    - `kp`, `kd`, `limit`, `reference`: as in `PDController`.
-    - `ki`: gains of the integral, not negative [N/(m s) or N m/(rad s)].
-    - `unwind`: time in which an integral that the limit cuts off drains, positive [s].
-
-    **Raises:** ValueError for malformed arguments.
-    """
-
-    pd: PDController
-    ki: Float[Array, " joint"]
-    unwind: Float[Array, " joint"]
-
-    def __init__(
-        self,
-        kp: ArrayLike,
-        ki: ArrayLike,
-        kd: ArrayLike,
-        limit: ArrayLike,
-        reference: Reference,
-        *,
-        unwind: ArrayLike = 0.1,
-    ):
-        self.pd = PDController(kp, kd, limit, reference)
-        self.ki = real_array("ki", ki, (3,), minimum=0, broadcast=True)
-        self.unwind = real_array("unwind", unwind, (3,), above=0, broadcast=True)
-
-    def initial_state(self, linkage):
-        """The integral's share of the effort, (3,) [N or N m]."""
-        return jnp.zeros(3)
-
-    def __call__(self, t, q, qd, linkage, state):
-        demand = self.pd.demand(t, q, qd, linkage) + state
-        effort = jnp.clip(demand, -self.pd.limit, self.pd.limit)
-        position, _ = self.pd.reference(t, linkage)
-        rate = self.ki * (position - q) + (effort - demand) / self.unwind
-        return effort, rate
-
-    @property
-    def jump_ts(self) -> Array | None:
-        """The times at which the reference says that it jumps, if it does."""
-        return self.pd.jump_ts
-
-    def check(self, linkage: Linkage, ts: Array) -> None:
-        """The reference's own check, if it has one."""
-        self.pd.check(linkage, ts)
+    def possible(self) -> Any:
+        """What the command says of its values, if it says anything."""
+        possible: Any = getattr(self.command, "possible", None)
+        return True if possible is None else possible()
 
 
-class FirstOrderLag(_Commanded, StatefulElement):
+def _command(value: Any) -> Any:
+    if not callable(value) or isinstance(value, type):
+        raise ValueError(
+            "command: expected a force element, a PDController for instance, got "
+            f"{value!r}."
+        )
+    return value
+
+
+class FirstOrderLag(_Drive):
     """An effort that follows its command with a lag: its rate is the gap over a time.
 
     **Arguments:** `command`: a force element; `time_constant`: one per joint or one for
-    all, positive [s]; `initial`: the effort at the start [N or N m].
+    all, positive [s]; `start`: the effort at the start [N or N m].
 
     **Raises:** ValueError for malformed arguments.
     """
 
     command: Any
     time_constant: Float[Array, " joint"]
-    initial: Float[Array, " joint"]
+    start: Float[Array, " joint"]
 
     def __init__(
-        self, command: Any, time_constant: ArrayLike, *, initial: ArrayLike = 0.0
+        self, command: Any, time_constant: ArrayLike, *, start: ArrayLike = 0.0
     ):
         self.command = _command(command)
         self.time_constant = real_array(
             "time_constant", time_constant, (3,), above=0, broadcast=True
         )
-        self.initial = real_array("initial", initial, (3,), broadcast=True)
+        self.start = real_array("start", start, (3,), broadcast=True)
 
-    def initial_state(self, linkage):
+    def initial(self):
         """The effort, (3,) [N or N m]."""
-        return self.initial
+        return self.start
 
-    def __call__(self, t, q, qd, linkage, state):
-        gap = self.command(t, q, qd, linkage) - state
-        return state, gap / self.time_constant
+    def respond(self, command, qd, own):
+        return own, (command - own) / self.time_constant
 
 
-class SpeedLimit(_Commanded):
+class SpeedLimit(_Drive):
     """An effort whose limit falls with speed: a straight torque-speed curve.
 
     In the direction of motion at most stall * (1 - |qd| / no_load), and not below 0;
@@ -153,20 +196,20 @@ class SpeedLimit(_Commanded):
         self.stall = real_array("stall", stall, (3,), above=0, broadcast=True)
         self.no_load = real_array("no_load", no_load, (3,), above=0, broadcast=True)
 
-    def __call__(self, t, q, qd, linkage):
+    def respond(self, command, qd, own):
         left = jnp.clip(1 - qd / self.no_load, 0, 1)  # of the positive limit
         right = jnp.clip(1 + qd / self.no_load, 0, 1)
-        wanted = self.command(t, q, qd, linkage)
-        return jnp.clip(wanted, -self.stall * right, self.stall * left)
+        return jnp.clip(command, -self.stall * right, self.stall * left), ()
 
 
-class DCMotor(_Commanded, StatefulElement):
+class DCMotor(_Drive):
     """Brushed motors on geared joints: winding, back-EMF, limited voltage and current.
 
     inductance * di/dt = v - resistance * i - constant * gear * qd, and the effort is
-    constant * gear * i. The command gives the voltages v, clipped to +-voltage_limit;
-    where a current is at its limit, the drive lets it grow no further. Rotors are an
-    `Armature` beside it.
+    constant * gear * i. The command gives the voltages v. They are clipped to those
+    that lead to a current within its limit, then to +-voltage_limit: at speeds whose
+    back-EMF exceeds that, the back-EMF drives the current. Rotors are an `Armature`
+    beside it.
 
     **Arguments:** one per joint or one for all, positive.
 
@@ -209,14 +252,18 @@ class DCMotor(_Commanded, StatefulElement):
         self.voltage_limit = positive("voltage_limit", voltage_limit, finite=False)
         self.current_limit = positive("current_limit", current_limit, finite=False)
 
-    def initial_state(self, linkage):
+    def initial(self):
         """The currents, (3,) [A]."""
         return jnp.zeros(3)
 
-    def __call__(self, t, q, qd, linkage, state):
-        wanted = self.command(t, q, qd, linkage)
-        voltage = jnp.clip(wanted, -self.voltage_limit, self.voltage_limit)
+    def respond(self, command, qd, own):
         per_joint = self.constant * self.gear
-        rate = (voltage - self.resistance * state - per_joint * qd) / self.inductance
-        outwards = (jnp.abs(state) >= self.current_limit) & (rate * state > 0)
-        return per_joint * state, jnp.where(outwards, 0, rate)
+        back_emf = per_joint * qd
+        # Infinity times a tangent of 0 would not be a number.
+        unlimited = jnp.isinf(self.current_limit)
+        most = self.resistance * jnp.where(unlimited, 0, self.current_limit)
+        most = jnp.where(unlimited, jnp.inf, most)
+        voltage = jnp.clip(command, back_emf - most, back_emf + most)
+        voltage = jnp.clip(voltage, -self.voltage_limit, self.voltage_limit)
+        rate = (voltage - self.resistance * own - back_emf) / self.inductance
+        return per_joint * own, rate

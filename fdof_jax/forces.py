@@ -54,7 +54,7 @@ class ScalarElement(eqx.Module):
 class StatefulElement(eqx.Module):
     """A force element with a state of its own: an integral, a current, a lag.
 
-    A subclass implements both methods.
+    A subclass implements both methods; what it returns are efforts [N or N m].
     """
 
     @abstractmethod
@@ -71,7 +71,7 @@ class StatefulElement(eqx.Module):
 class InertialElement(eqx.Module):
     """A force element that moves masses: they add to the equations of motion.
 
-    Its kinetic energy is the sum of weight * (d coordinate/dt)^2 / 2. A body, for
+    Its kinetic energy is the sum of weight * (d coordinate/dt)^2 / 2 [J]. A body, for
     instance, has the coordinates of its mass centre, whose weights are its mass, and
     its angle, whose weight is its inertia. A subclass implements both methods.
     """
@@ -91,6 +91,22 @@ class InertialElement(eqx.Module):
     def __call__(self, t: Array, q: Array, qd: Array, linkage: Linkage) -> Array:
         """The efforts besides, (3,) [N or N m]; 0 unless a subclass says otherwise."""
         return jnp.zeros(3)
+
+    def loads(
+        self, t: Array, q: Array, qd: Array, qdd: Array, linkage: Linkage
+    ) -> tuple[Any, ...] | None:
+        """What it does to points of links, a tuple of `points.Load`.
+
+        Only `joint_reactions` asks, which refuses elements that do not say: None.
+        """
+        return None
+
+
+def jumps_of(*parts: Any) -> Array | None:
+    """The times at which any of these says that it jumps, if one does."""
+    found = [getattr(part, "jump_ts", None) for part in parts]
+    times = [jnp.asarray(jumps) for jumps in found if jumps is not None]
+    return jnp.concatenate(times) if times else None
 
 
 class JointDamper(ScalarElement):

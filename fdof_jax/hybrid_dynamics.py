@@ -13,11 +13,10 @@ from jax import Array
 from jaxtyping import Bool, Float
 
 from .added_inertia import added_inertia
-from .control import Reference
+from .control import Reference, checked_reference, reference_motion
 from .forces import Forces
 from .linkage import Linkage
 from .reduced_equations import equations, link_constants, zeros
-from .validation import whole_number
 from .vector_field import LEAST_INERTIA_RATIO, Args, applied, schedule_of
 
 
@@ -25,14 +24,19 @@ class PrescribedMotion(eqx.Module):
     """Joints that follow a reference exactly, whatever effort that takes.
 
     At a jump of the reference's velocity the velocities of the other joints jump too,
-    as the impulse demands. `joint_efforts` returns the effort, but for such impulses.
+    as the impulse demands. `joint_efforts` returns the effort [N or N m], but for such
+    impulses.
+
+    The velocities of a `state0` are those before the first time: where they are not the
+    reference's, the motion starts with a blow. Adaptive steps look at the displacements
+    of the other joints and at their momenta.
 
     **Arguments:**
 
     - `joints`: numbers of the joints that it moves, of 1 to 3; one, or a tuple.
     - `reference`: `(t, linkage) -> (q, qd)`, as for a `PDController`; what it says of
       other joints does not count. Its positions must be continuous, and at the start of
-      a simulation those of `state0`.
+      a simulation those of `state0`; its velocities must be their rates.
 
     **Raises:** ValueError for malformed arguments.
     """
@@ -42,16 +46,26 @@ class PrescribedMotion(eqx.Module):
 
     def __init__(self, joints: int | tuple[int, ...], reference: Reference):
         numbers = joints if isinstance(joints, tuple) else (joints,)
-        for number in numbers:
-            if whole_number("joints", number, 1) > 3:
-                raise ValueError(f"joints: expected numbers of 1 to 3, got {joints!r}.")
-        if not callable(reference) or isinstance(reference, type):
+        if not numbers or any(
+            isinstance(n, bool) or not isinstance(n, int) or n not in (1, 2, 3)
+            for n in numbers
+        ):
             raise ValueError(
-                f"reference: expected a callable (t, linkage) -> (q, qd), got "
-                f"{reference!r}."
+                f"joints: expected a number of 1 to 3, or a tuple of such, got "
+                f"{joints!r}."
             )
         self.moved = jnp.array([k in numbers for k in (1, 2, 3)])
-        self.reference = reference
+        self.reference = checked_reference(reference)
+
+    def motion(self, t: Array, linkage: Linkage) -> tuple[Array, Array]:
+        """Positions and velocities of the reference at a time, checked."""
+        return reference_motion(self.reference, t, linkage)
+
+    def agrees(self, t: Array, q: Array, linkage: Linkage) -> Array:
+        """Whether joint positions are those of the reference, to one in a million."""
+        begin, _ = self.motion(t, linkage)
+        near = jnp.abs(q - begin) <= 1e-6 * (1 + jnp.abs(begin))
+        return (near | ~self.moved).all()
 
     def __call__(self, t: Array, q: Array, qd: Array, linkage: Linkage) -> Array:
         """Nothing: what it takes depends on all other elements."""
@@ -103,7 +117,7 @@ def motion_at(
 ) -> tuple[Array, Array]:
     """Joint positions and velocities of a state of displacements and momenta."""
     delta, momenta, *_ = y
-    position, velocity = motion.reference(t, args.linkage)
+    position, velocity = motion.motion(t, args.linkage)
     q = jnp.where(motion.moved, position, args.q0 + jnp.stack(delta))
     matrix, _ = _mass_and_bias(args, q, jnp.zeros(3))
     return q, _split(motion.moved, matrix, velocity, jnp.stack(momenta))
@@ -161,7 +175,7 @@ def prescribed_effort(
     assert motion is not None
     args = Args(linkage, q, link_constants(linkage, q), forces)
     matrix, bias = _mass_and_bias(args, q, qd)
-    velocity = lambda t: motion.reference(t, linkage)[1]
+    velocity = lambda t: motion.motion(t, linkage)[1]
     _, demanded = jax.jvp(velocity, (t,), (jnp.ones_like(t),))
     qdd = _split(motion.moved, matrix, demanded, tau - bias)
     return jnp.where(motion.moved, matrix @ qdd + bias - tau, 0)

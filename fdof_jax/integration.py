@@ -39,7 +39,7 @@ from .vector_field import (
 _OF_TIME_SCALE = 0.7, 0.1
 
 
-def _step_for_tangents(t0: Array, args: Args, fraction: float) -> Array:
+def _step_for_tangents(t0: Array, args: Args, own: tuple, fraction: float) -> Array:
     """A step short enough for derivatives [s], where the motion would allow more.
 
     A fraction of the time scale 1/omega of the fastest mode about the start: a step's
@@ -48,7 +48,6 @@ def _step_for_tangents(t0: Array, args: Args, fraction: float) -> Array:
     """
     still = zeros(args.q0)
     scheduled = schedule_of(t0, args)
-    own = initial_own(args)
 
     def accelerations(delta):
         y = (tuple(delta), still, *own)
@@ -70,7 +69,7 @@ def _default_solver(
 
 def _integrate(solver, inputs, keywords, derivatives: bool = False) -> Solution:
     """`derivatives`: whether they are wanted, to the accuracy of the default steps."""
-    linkage, state0, asked, forces = inputs
+    linkage, state0, asked, own0, forces = inputs
     # What no door has seen is told by the result. Something harmless is integrated in
     # its place: derivatives of NaN would spoil those in what is shared with others.
     increasing = (jnp.diff(asked) > 0).all()
@@ -81,11 +80,17 @@ def _integrate(solver, inputs, keywords, derivatives: bool = False) -> Solution:
     for element in forces:
         if hasattr(element, "possible"):
             valid = valid & element.possible()
+    motion = prescribed(forces)
+    if motion is not None:
+        valid = valid & motion.agrees(ts[0], jnp.asarray(state0.q), linkage)
     q0, qd0 = (jnp.where(finite, a, 0) for a in state0)
     # Once per solve: the start may be any number of turns away.
     constants = link_constants(linkage, q0, lambda x: (jnp.sin(x), jnp.cos(x)))
     args = Args(linkage, q0, constants, forces)
-    motion = prescribed(forces)
+    own = initial_own(args, own0)
+    for state in own:
+        known = jnp.isfinite(jnp.array(state)).all()
+        valid, own = valid & known, (tuple(jnp.where(known, x, 0) for x in state),)
     if motion is None:
         term, health = (
             ScheduledTerm(vector_field, watched_field, schedule_of),
@@ -97,12 +102,13 @@ def _integrate(solver, inputs, keywords, derivatives: bool = False) -> Solution:
         health, start = health_of_hybrid, start_of(motion, args, qd0)
     controller = keywords["stepsize_controller"]
     # Stiff modes, which implicit solvers are taken for, would make the steps too short.
-    own = controller is not None and isinstance(solver, diffrax.AbstractImplicitSolver)
+    implicit = isinstance(solver, diffrax.AbstractImplicitSolver)
+    trusted = controller is not None and implicit
     if controller is None:
         controller = default_controller()
-    if derivatives and not own:
+    if derivatives and not trusted:
         fraction = _OF_TIME_SCALE[0 if (solver.order(term) or 0) >= 8 else 1]
-        longest = lambda: _step_for_tangents(ts[0], args, fraction)
+        longest = lambda: _step_for_tangents(ts[0], args, own, fraction)
         controller = bounded(controller, longest)
     jumps = [f.jump_ts for f in forces if getattr(f, "jump_ts", None) is not None]
     if jumps:
@@ -116,7 +122,7 @@ def _integrate(solver, inputs, keywords, derivatives: bool = False) -> Solution:
         solver,
         t0=ts[0],
         t1=ts[-1],
-        y0=(*start, *initial_own(args)),
+        y0=(*start, *own),
         args=args,
         saveat=diffrax.SaveAt(
             subs=(
@@ -193,7 +199,7 @@ def _integrate_reversibly_bwd(
 
 def _opened(inputs):
     """The inputs, with what plain functions among the forces close over as leaves."""
-    linkage, state0, ts, forces = inputs
+    linkage, state0, ts, own0, forces = inputs
     arguments = ts[0], *state0, linkage
     opened = tuple(
         eqx.filter_closure_convert(element, *arguments)
@@ -201,7 +207,7 @@ def _opened(inputs):
         else element
         for element in forces
     )
-    return linkage, state0, ts, opened
+    return linkage, state0, ts, own0, opened
 
 
 @eqx.filter_jit

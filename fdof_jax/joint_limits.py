@@ -8,6 +8,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from .forces import ScalarElement
+from .linkage import Linkage
 from .validation import concrete, real_array
 
 
@@ -16,8 +17,8 @@ class JointStops(ScalarElement):
 
     The force grows smoothly from nothing, and with the speed of the impact: it is
     stiffness * p * (1 + damping * dp/dt) at a penetration p, never less than 0. The
-    penetration is rounded off over `smoothing`: at the end of the range itself it is
-    half of that.
+    penetration is rounded off, to a parabola, from `smoothing` before the end of the
+    range to as much behind it; at the end itself it is a quarter of that.
 
     **Arguments:** all in joint order, one per joint or one for all.
 
@@ -67,19 +68,37 @@ class JointStops(ScalarElement):
             for x, rate, low, high, k, d, width in rows
         )
 
+    def potential_energy(self, q: Array, linkage: Linkage) -> Array:
+        """The energy of the springs [J]."""
+        below = _stored(self.lower - q, self.smoothing)
+        above = _stored(q - self.upper, self.smoothing)
+        return jnp.sum(self.stiffness * (below + above))
+
 
 def _push(depth, rate, stiffness, damping, width):
     """Of a stop that is penetrated to a depth, negative outside of it."""
-    far = depth < -1e6 * width  # a range without an end, among others
-    near = jnp.where(far, 0, depth)
-    root = jnp.sqrt(near**2 + width**2)
-    # Rounded: width / 2 at depth 0, and less than width^2 / |depth| outside.
-    deep, shallow = (root + near) / 2, width**2 / (2 * (root + jnp.abs(near)))
-    rounded = jnp.where(near >= 0, deep, shallow)
-    # d(rounded)/d(depth) times the rate.
-    closing = rate * (1 + near / root) / 2
-    force = stiffness * rounded * jnp.maximum(1 + damping * closing, 0)
-    return jnp.where(far, 0, force)
+    penetration, slope = _penetration(depth, width)
+    return stiffness * penetration * jnp.maximum(1 + damping * slope * rate, 0)
+
+
+def _penetration(depth, width):
+    """The rounded depth and its derivative: 0 before the parabola, 1 behind it."""
+    near, beyond = _parts(depth, width)
+    return near**2 / (4 * width) + beyond, near / (2 * width)
+
+
+def _parts(depth, width):
+    """Of the way: within the parabola, from its begin, and behind it."""
+    # jnp.clip would multiply the derivative of a range without an end by 0.
+    deep = depth > width
+    near = jnp.where(deep, 2 * width, jnp.where(depth < -width, 0, depth + width))
+    return near, jnp.where(deep, depth - width, 0)
+
+
+def _stored(depth, width):
+    """The integral of the rounded depth."""
+    near, beyond = _parts(depth, width)
+    return near**3 / (12 * width) + beyond * (beyond / 2 + width)
 
 
 class JointFriction(ScalarElement):

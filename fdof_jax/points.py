@@ -16,7 +16,7 @@ from jax import Array
 from jaxtyping import Bool, Complex, Float, Int
 from numpy.typing import ArrayLike
 
-from .forces import ScalarElement
+from .forces import ScalarElement, jumps_of
 from .linkage import Linkage, real_joints
 from .reduced_equations import Scalars
 from .trigonometry import sincos
@@ -145,8 +145,8 @@ def _work(frames: Frames, force: Array, about_origin: Array) -> tuple[Array, ...
 class PointElement(ScalarElement):
     """A force element that acts on points of links or of the ground.
 
-    A subclass implements `loads`. Unlike efforts in the joints, which pass through
-    them, these loads are carried by the bearings: see `joint_reactions`.
+    A subclass implements `loads` [N and N m]. Unlike efforts in the joints, which pass
+    through them, these loads are carried by the bearings: see `joint_reactions`.
     """
 
     @abstractmethod
@@ -342,6 +342,11 @@ class Wrench(PointElement):
         self.moment = moment if callable(moment) else real_array("moment", moment, ())
         instance("follows", follows, bool)
         self.follows = jnp.asarray(follows)
+
+    @property
+    def jump_ts(self) -> Array | None:
+        """The times at which the functions say that they jump, if they do."""
+        return jumps_of(self.force, self.moment)
 
     def schedule(self, t, linkage):
         """Force and moment at a time."""

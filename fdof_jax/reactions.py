@@ -8,9 +8,8 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
-from .actuators import LinearActuator
 from .dynamics import forward_dynamics
-from .forces import Forces
+from .forces import Forces, InertialElement
 from .kinematics import joint_positions, mass_center_velocities, mass_centers
 from .linkage import Linkage
 from .points import PointElement, cross, frames_of
@@ -24,12 +23,18 @@ def _loads(
     """On the ground and the links: forces, and moments about the ground pivot."""
     frames = frames_of(linkage, tuple(q))
     force, moment = jnp.zeros(4, complex), jnp.zeros(4)
-    for element in forces:
+    for index, element in enumerate(forces):
         loads = ()
         if isinstance(element, PointElement):
             loads = element.loads(element.schedule(t, linkage), frames, tuple(qd))
-        elif isinstance(element, LinearActuator):
+        elif isinstance(element, InertialElement):
             loads = element.loads(t, q, qd, qdd, linkage)
+            if loads is None:
+                raise ValueError(
+                    f"forces[{index}]: expected an element that moves masses to have "
+                    "a method `loads` that says which points of links carry them, got "
+                    f"{element!r}."
+                )
         for point, push, turn in loads:
             about_pivot = turn + cross(point.place(frames), push)
             force = force.at[point.link].add(push)

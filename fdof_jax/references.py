@@ -51,7 +51,7 @@ class JointMove(eqx.Module):
 
 
 class Path(eqx.Module):
-    """A curve of the plane. A subclass implements `point`, and says its `middle`."""
+    """A curve of the plane [m]: a subclass has `point`, and says its `middle`."""
 
     middle: eqx.AbstractVar[Array]  # (x, y), somewhere in the midst of it [m]
 
@@ -251,9 +251,13 @@ class TipTask(eqx.Module):
     def check(self, linkage: Linkage, ts: Array) -> None:
         """Raise ValueError where the tip leaves the reach between the times.
 
-        Looked at at 1000 times; or where the wrist's angle jumps between two of them.
+        Looked at at 1000 times, or 1000 of one lap; or where the wrist's angle jumps
+        between two of them.
         """
-        times = jnp.linspace(ts[0], ts[-1], 1000)
+        end = ts[-1]
+        if isinstance(self.timing, Laps):  # of which all are alike
+            end = jnp.minimum(end, ts[0] + jnp.abs(self.timing.period))
+        times = jnp.linspace(ts[0], end, 1000)
         q, beside = _checked(self, linkage, times)
         if not jnp.isfinite(q).all():
             first = float(times[jnp.argmin(jnp.isfinite(q).all(axis=1))])

@@ -12,8 +12,9 @@ from numpy.typing import ArrayLike
 
 from .forces import Forces, JointEffort, ScalarElement, StatefulElement
 from .linkage import Linkage, State, check_linkage, real_state
-from .simulation import simulate
+from .simulation import check_elements, simulate
 from .validation import callable_tuple, concrete, real_array, whole_number
+from .vector_field import stateful
 
 
 class _Switched(ScalarElement):
@@ -39,7 +40,8 @@ def _without_states(forces: Any) -> None:
     if any(isinstance(e, StatefulElement) for e in forces):
         raise ValueError(
             "forces: expected elements without a state of their own, which would be "
-            f"lost between samples, got {forces!r}."
+            "lost (simulate takes such states as own0 and returns them), got "
+            f"{forces!r}."
         )
 
 
@@ -86,6 +88,7 @@ class SampledMotion(NamedTuple):
     - `q`, `qd`: joint positions and velocities there, NaN after a failure.
     - `tau`: what was commanded at each sample (samples, 3) [N or N m].
     - `result`: diffrax's, `successful` or that of the first period that failed.
+    - `own`: the states of the forces' `StatefulElement`s at `ts`.
     """
 
     ts: Float[Array, " time"]
@@ -93,6 +96,7 @@ class SampledMotion(NamedTuple):
     qd: Float[Array, "time joint"]
     tau: Float[Array, "sample joint"]
     result: diffrax.RESULTS
+    own: tuple[Any, ...]
 
 
 def simulate_sampled(
@@ -114,12 +118,13 @@ def simulate_sampled(
     **Arguments:**
 
     - `linkage`, `state0`: the arm, and its joint positions and velocities.
-    - `control`: `(t, q, qd, linkage) -> tau`, a `PDController` for instance.
+    - `control`: a force element, a `PDController` for instance. The state of one that
+      has one, a `PIDController`'s, takes a step of Euler's at each sample.
     - `period`: of sampling [s]; `samples`: how many.
-    - `forces`: what acts besides, elements without a state of their own.
+    - `forces`: what acts besides.
     - `t0`: the first sample [s].
     - `delay`: from measuring to acting, less than a period [s]. No effort acts before
-      the first command does.
+      the first command does. One that is traced and too long ends as not finite.
     - `noise`: standard deviations of what is measured, of positions and of velocities
       (each (3,) or one for all), with a `jax.random` `key`.
     - `options`: keywords of `simulate`.
@@ -129,11 +134,10 @@ def simulate_sampled(
     **Raises:** ValueError for malformed arguments.
     """
     check_linkage(linkage)
-    _without_states(forces)
-    if not callable(control) or isinstance(control, type | StatefulElement):
+    callable_tuple("forces", forces)
+    if not callable(control) or isinstance(control, type):
         raise ValueError(
-            "control: expected a callable (t, q, qd, linkage) -> tau without a state "
-            f"of its own, got {control!r}."
+            f"control: expected a callable (t, q, qd, linkage) -> tau, got {control!r}."
         )
     period = real_array("period", period, (), above=0)
     t0 = real_array("t0", t0, ())
@@ -148,7 +152,7 @@ def simulate_sampled(
         raise ValueError("noise, key: expected both or none of them, got one.")
     spread = None
     if noise is not None:
-        if not isinstance(noise, tuple) or len(noise) != 2:
+        if not isinstance(noise, tuple | list) or len(noise) != 2:
             raise ValueError(
                 "noise: expected a pair of standard deviations, of positions and of "
                 f"velocities, got {noise!r}."
@@ -159,6 +163,7 @@ def simulate_sampled(
         ]
     state0 = real_state("state0", state0)
     times = t0 + period * jnp.arange(samples + 1)
+    check_elements((control, *forces), linkage, times)
     late = None if known is not None and known == 0 else delay
     keys = None if key is None else jax.random.split(key, samples)
     options = dict(throw=False) | options
@@ -171,8 +176,16 @@ def _motion(
 ) -> SampledMotion:
     """`delay`: None where an effort acts at once; `spread`: of noise, None or two."""
 
+    def command(t, seen, memory):
+        if not memory:
+            return real_array("control", control(t, *seen, linkage), (3,)), memory
+        tau, rates = control(t, *seen, linkage, *memory)
+        step = times[1] - times[0]
+        later = jax.tree.map(lambda m, rate: m + step * rate, *memory, rates)
+        return real_array("control", tau, (3,)), (later,)
+
     def one(carry, inputs):
-        state, held, result = carry
+        state, own, memory, held, result = carry
         begin, end, key = inputs
         seen = state
         if spread is not None:
@@ -182,20 +195,31 @@ def _motion(
                     for value, size, k in zip(state, spread, jax.random.split(key))
                 )
             )
-        tau = jnp.asarray(control(begin, *seen, linkage), held.dtype)
+        tau, memory = command(begin, seen, memory)
         effort = (
             JointEffort(tau) if delay is None else _Switched(held, tau, begin + delay)
         )
-        solution = simulate(
-            linkage, state, jnp.stack([begin, end]), (*forces, effort), **options
-        )
+        acting, two = (*forces, effort), jnp.stack([begin, end])
+        solution = simulate(linkage, state, two, acting, own0=own, **options)
         q, qd = solution.q[-1], solution.qd[-1]
+        own = jax.tree.map(lambda rows: rows[-1], solution.own)
         good = result == diffrax.RESULTS.successful
         result = diffrax.RESULTS.where(good, solution.result, result)
-        return (State(q, qd), tau, result), (q, qd, tau)
+        return (State(q, qd), own, memory, tau, result), (q, qd, own, tau)
+
+    def initial(elements):
+        states = [element.initial_state(linkage) for element in stateful(elements)]
+        return tuple(jax.tree.map(lambda leaf: jnp.asarray(leaf, float), states))
 
     q0, qd0 = jnp.asarray(state0.q), jnp.asarray(state0.qd)
-    start = State(q0, qd0), jnp.zeros(3), diffrax.RESULTS.successful
-    (*_, result), (q, qd, tau) = jax.lax.scan(one, start, (times[:-1], times[1:], keys))
+    own0, memory0 = initial(forces), initial((control,))
+    held = jnp.zeros(3)
+    if delay is not None:
+        held = jnp.where(delay < times[1] - times[0], held, jnp.nan)
+    start = State(q0, qd0), own0, memory0, held, diffrax.RESULTS.successful
+    (*_, result), (q, qd, own, tau) = jax.lax.scan(
+        one, start, (times[:-1], times[1:], keys)
+    )
     q, qd = jnp.vstack([q0, q]), jnp.vstack([qd0, qd])
-    return SampledMotion(times, q, qd, tau, result)
+    rows = lambda first, later: jnp.concatenate([first[None], later])
+    return SampledMotion(times, q, qd, tau, result, jax.tree.map(rows, own0, own))

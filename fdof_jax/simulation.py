@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 from numpy.typing import ArrayLike
 
 from .forces import Forces, StatefulElement
@@ -23,7 +24,7 @@ from .validation import (
     real_array,
     whole_number,
 )
-from .vector_field import element_effort
+from .vector_field import element_effort, stateful
 
 
 def solve_options(
@@ -71,12 +72,23 @@ def solve_options(
     )
 
 
+def check_elements(forces: Forces, linkage: Linkage, ts: Array) -> None:
+    """The elements' own checks at the door, where values are known."""
+    for index, element in enumerate(forces):
+        if getattr(element, "jump_ts", None) is not None:
+            real_array(f"forces[{index}].jump_ts", element.jump_ts, (None,))
+        check = getattr(element, "check", None)
+        if check is not None and not is_traced(linkage, ts, element):
+            check(linkage, ts)
+
+
 def simulate(
     linkage: Linkage,
     state0: State,
     ts: ArrayLike,
     forces: Forces = (),
     *,
+    own0: tuple[Any, ...] | None = None,
     solver: diffrax.AbstractSolver | None = None,
     stepsize_controller: diffrax.AbstractStepSizeController | None = None,
     dt0: ArrayLike | None = 1e-3,
@@ -98,6 +110,8 @@ def simulate(
       interpolated, where they may be a hundred times less exact than at the last time,
       which a step ends at; `diffrax.ClipStepSizeController` makes others end at `ts`.
     - `forces`: a tuple of force elements `(t, q, qd, linkage) -> tau`.
+    - `own0`: the states of the `StatefulElement`s among them at the start, one row of a
+      `Solution.own`; by default what the elements say.
     - `solver`, `stepsize_controller`, `dt0`, `adjoint`, `max_steps`, `throw`,
       `progress_meter`: as in `diffrax.diffeqsolve`. By default Dopri8 at a relative
       and absolute tolerance of 1e-11 in float64, 1e-5 in float32, for which
@@ -132,22 +146,18 @@ def simulate(
         throw=throw,
         progress_meter=progress_meter,
     )
-    for index, element in enumerate(forces):
-        if getattr(element, "jump_ts", None) is not None:
-            real_array(f"forces[{index}].jump_ts", element.jump_ts, (None,))
-        check = getattr(element, "check", None)
-        if check is not None and not is_traced(linkage, ts, element):
-            check(linkage, ts)
+    check_elements(forces, linkage, ts)
     motion = prescribed(forces)
     if motion is not None and not is_traced(linkage, state0, ts, motion):
-        begin, _ = motion.reference(ts[0], linkage)
-        apart = np.where(motion.moved, np.abs(jnp.asarray(state0.q) - begin), 0)
-        if not (apart <= 1e-6 * (1 + np.abs(begin))).all():
+        if not motion.agrees(ts[0], jnp.asarray(state0.q), linkage):
+            begin, _ = motion.motion(ts[0], linkage)
             raise ValueError(
-                f"state0.q: expected {np.asarray(begin).tolist()} at the joints whose "
-                f"motion is prescribed, got {np.asarray(state0.q).tolist()}."
+                f"state0.q: expected {begin.tolist()} at the joints whose motion is "
+                f"prescribed, got {np.asarray(state0.q).tolist()}."
             )
-    inputs = linkage, state0, ts, forces
+    if own0 is not None:
+        _check_own("own0", own0, forces, linkage, ())
+    inputs = linkage, state0, ts, own0, forces
     # Where the values are known in the end, errors are raised there: they can say more.
     inside = is_traced(inputs, jnp.zeros(()))
     try:
@@ -170,6 +180,20 @@ def simulate(
     # Of the times themselves, for derivatives in them.
     solution = eqx.tree_at(lambda s: s.ts, solution, ts)
     return solution if inside or not throw else _raised(solution)
+
+
+def _check_own(name, own, forces: Forces, linkage: Linkage, rows: tuple) -> None:
+    """Raise ValueError unless these are states of the forces' elements, in rows."""
+    expected = [
+        jax.eval_shape(element.initial_state, linkage) for element in stateful(forces)
+    ]
+    shapes = jax.tree.map(lambda leaf: (*rows, *leaf.shape), tuple(expected))
+    found = jax.tree.map(jnp.shape, own)
+    if found != shapes:
+        raise ValueError(
+            f"{name}: expected the states of the forces' elements, of shapes {shapes}, "
+            f"got {found}."
+        )
 
 
 def _raised(solution: Solution) -> Solution:
@@ -200,6 +224,12 @@ def joint_efforts(linkage: Linkage, forces: Forces, solution: Solution) -> Effor
     if not isinstance(solution, Solution):
         raise ValueError(f"solution: expected a Solution, got {solution!r}.")
     callable_tuple("forces", forces)
+    if solution.q.ndim != 2:
+        raise ValueError(
+            "solution: expected one motion (use jax.vmap for a batch), got positions "
+            f"of shape {solution.q.shape}."
+        )
+    _check_own("solution.own", solution.own, forces, linkage, solution.ts.shape)
     return _efforts(linkage, forces, solution)
 
 

@@ -43,6 +43,11 @@ _SLACK = 2.0  # a member may take this many times the steps of most others
 _SMALL = 8  # lanes for the few that take more
 
 
+def _floats(value: ArrayLike) -> Array:
+    array = jnp.asarray(value)
+    return array.astype(float) if array.dtype.kind in "iu" else array
+
+
 def _motion(settings: dict, ts: Array, moving: Any, shared: Any, limit: Array | None):
     """One member's solution, without what all have in common."""
     linkage, state0, forces = eqx.combine(moving, shared)
@@ -322,7 +327,7 @@ def sweep(
     """
     instance("linkage", linkage, Linkage)
     try:
-        state0 = State(*map(jnp.asarray, state0))
+        state0 = State(*map(_floats, state0))
     except (TypeError, ValueError):
         raise ValueError(f"state0: expected a State(q, qd), got {state0!r}.") from None
     ts = real_array("ts", ts, (None,))

@@ -10,8 +10,9 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from .validation import one_of, real_array
+from .validation import concrete, one_of, real_array
 
+_MOST_TURN = 250  # that 48 nodes per piece resolve [rad]
 RAMP = 0.25  # of a trapezoidal profile: the share of its time in which it speeds up
 
 
@@ -96,6 +97,8 @@ class Laps(eqx.Module):
 
     def __init__(self, period: ArrayLike, *, phase: ArrayLike = 0.0):
         self.period = real_array("period", period, ())
+        if concrete(self.period) == 0:
+            raise ValueError(f"period: expected not zero, got {period!r}.")
         self.phase = real_array("phase", phase, ())
 
     def __call__(self, t: Array) -> Array:
@@ -114,12 +117,17 @@ def shock_against(travel: Travel, frequency: ArrayLike) -> Float[Array, ""]:
 
     **Returns:** the `shock` of a `Travel` that is otherwise the same.
 
-    **Raises:** ValueError for malformed arguments.
+    **Raises:** ValueError for malformed arguments, and for more than 250 rad of the
+    load's own motion in a travel; NaN if that is traced.
     """
     if not isinstance(travel, Travel):
         raise ValueError(f"travel: expected a Travel, got {travel!r}.")
     frequency = real_array("frequency", frequency, (), above=0)
     turn = frequency * travel.duration
+    if (angle := concrete(turn)) is not None and angle > _MOST_TURN:
+        raise ValueError(
+            f"frequency: expected at most {_MOST_TURN} rad per travel, got {angle:g}."
+        )
     # The content of a velocity: its integral times cos(turn (x - 1/2)).
     nodes, weights = np.polynomial.legendre.leggauss(48)
     ends = np.array([0, RAMP, 1 - RAMP, 1])
@@ -129,4 +137,5 @@ def shock_against(travel: Travel, frequency: ArrayLike) -> Float[Array, ""]:
     velocity = jax.vmap(jax.grad(PROFILES[travel.profile]))(jnp.asarray(x))
     of_profile = jnp.sum(weight * velocity * jnp.cos(turn * (x - 0.5)))
     of_constant = jnp.sinc(turn / (2 * jnp.pi))
-    return of_profile / (of_profile - of_constant)
+    shock = of_profile / (of_profile - of_constant)
+    return jnp.where(turn <= _MOST_TURN, shock, jnp.nan)

@@ -48,7 +48,7 @@ def own_states(args: Args, scalars: tuple[Array, ...]) -> list[Any]:
         arrays = []
         for leaf in leaves:
             own = scalars[place : place + leaf.size]
-            arrays.append(jnp.stack(own).reshape(leaf.shape))
+            arrays.append(jnp.array(own).reshape(leaf.shape))
             place += leaf.size
         states.append(jax.tree.unflatten(structure, arrays))
     return states
@@ -158,7 +158,8 @@ def element_effort(
     return tau.astype(q.dtype), rate
 
 
-def initial_own(args: Args) -> tuple[tuple[Array, ...], ...]:
-    """The elements' own states at the start, where there are any."""
-    initial = [e.initial_state(args.linkage) for e in stateful(args.forces)]
-    return (_scalars(initial, args.q0.dtype),) if initial else ()
+def initial_own(args: Args, own0: Any = None) -> tuple[tuple[Array, ...], ...]:
+    """The elements' own states at the start, given or theirs, where there are any."""
+    if own0 is None:
+        own0 = [e.initial_state(args.linkage) for e in stateful(args.forces)]
+    return (_scalars(own0, args.q0.dtype),) if own0 else ()

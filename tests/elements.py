@@ -42,19 +42,22 @@ PLAIN = {
     "wrench": fj.Wrench(TIP, [3.0, -2.0], 0.7),
     "following wrench": fj.Wrench(ELBOW, [1.0, 2.0], follows=True),
     "stops": fj.JointStops(
-        [-1.0, -0.1, -np.inf], [0.2, 2.0, 0.4], stiffness=40.0, damping=0.5,
+        [-1.0, -0.12, -np.inf], [0.22, 2.0, 0.35], stiffness=40.0, damping=0.5,
         smoothing=0.1,
     ),
     "friction": fj.JointFriction([0.4, 0.3, 0.2], 0.5),
-    "speed limit": fj.SpeedLimit(PD, stall=3.0, no_load=4.0),
 }  # fmt: skip
 WITH_STATE = {
+    "speed limit": fj.SpeedLimit(PD, stall=3.0, no_load=4.0),
     "PID": fj.PIDController(8.0, [4.0, 3.0, 2.0], 2.0, [3.0, 9.0, 1.0], MOVE),
-    "lag": fj.FirstOrderLag(PD, 0.2, initial=[0.5, 0.0, 0.0]),
+    "lag": fj.FirstOrderLag(PD, 0.2, start=[0.5, 0.0, 0.0]),
     "motor": fj.DCMotor(
-        PD, resistance=2.0, inductance=0.3, constant=0.4, gear=3.0, voltage_limit=5.0
+        PD, resistance=2.0, inductance=0.3, constant=0.4, gear=3.0,
+        voltage_limit=[5.0, 0.2, 5.0],
+        current_limit=[0.3, 9.0, 0.1],
     ),
-}
+}  # fmt: skip
+WITH_STATE["motor with PID"] = fj.FirstOrderLag(WITH_STATE["PID"], 0.1)
 WITH_INERTIA = {
     "armature": fj.Armature([0.3, 0.2, 0.1]),
     "actuator": fj.LinearActuator(

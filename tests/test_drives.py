@@ -36,7 +36,7 @@ def test_a_lag_is_an_exponential():
     lag = fj.FirstOrderLag(fj.JointEffort([0, 0, 3.0]), 0.2)
     ts = np.linspace(0, 1, 11)
     solution = fj.simulate(single(), STILL, ts, (lag,))
-    (effort,) = solution.own
+    effort = solution.own[0].own
     np.testing.assert_allclose(effort[:, 2], 3 * (1 - np.exp(-ts / 0.2)), atol=1e-9)
     # tau = 3 (1 - e^(-t/T)) on an inertia of 2 that the rest of the arm hardly feels.
     rate = 1.5 * (ts - 0.2 * (1 - np.exp(-ts / 0.2)))
@@ -57,7 +57,9 @@ def test_a_motor_reaches_its_current_and_its_speed():
     steady = np.linalg.solve(rates, [-12 / 0.5, 0])
     exact = np.array([steady - expm(rates * t) @ steady for t in ts])
     solution = fj.simulate(wheel, STILL, ts, (motor,))
-    np.testing.assert_allclose(solution.own[0][:, 2], exact[:, 0], rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(
+        solution.own[0].own[:, 2], exact[:, 0], rtol=1e-5, atol=1e-5
+    )
     np.testing.assert_allclose(solution.qd[:, 2], exact[:, 1], rtol=1e-5, atol=1e-5)
 
 
@@ -66,12 +68,32 @@ def test_a_motor_s_limits():
     options = dict(resistance=2.0, inductance=0.01, constant=0.1)
     ts = np.linspace(0, 0.2, 21)
     low = fj.DCMotor(command, voltage_limit=4.0, **options)
-    current = fj.simulate(single(), STILL, ts, (low,)).own[0][:, 2]
+    current = fj.simulate(single(), STILL, ts, (low,)).own[0].own[:, 2]
     assert current.max() == pytest.approx(2.0, rel=1e-2)  # V / R, less the back-EMF
-    weak = fj.DCMotor(command, current_limit=3.0, **options)
-    current = fj.simulate(single(), STILL, ts, (weak,)).own[0][:, 2]
-    assert current[-1] == pytest.approx(3.0, rel=1e-3)
-    assert current.max() <= 3.01
+
+
+def test_currents_stay_within_their_limit():
+    """Whatever the winding, also when the command turns round: i' = (limit - i) R/L."""
+    turning = lambda t, q, qd, linkage: only_last(jnp.where(t < 0.1, 100.0, -100.0))
+    ts = np.linspace(0, 0.2, 41)
+
+    def current(resistance, limit):
+        motor = fj.DCMotor(
+            turning, resistance=resistance, inductance=0.01, constant=0.1,
+            current_limit=limit,
+        )  # fmt: skip
+        return fj.simulate(single(), STILL, ts, (motor,)).own[0].own[:, 2]
+
+    resistances = np.linspace(1.5, 2.5, 21)
+    currents = jax.vmap(current, (0, None))(resistances, 3.0)
+    assert np.abs(currents).max() <= 3 + 1e-9
+    for row, resistance in zip(currents, resistances):
+        exact = 3 * (1 - np.exp(-resistance / 0.01 * ts[:20]))
+        np.testing.assert_allclose(row[:20], exact, atol=1e-8)
+        assert row[-1] < -2.99
+    forward = lambda limit: current(2.0, limit)[19]
+    slope = (forward(3.001) - forward(2.999)) / 0.002
+    np.testing.assert_allclose(slope, 1 - np.exp(-200 * ts[19]), rtol=1e-6)
 
 
 def test_a_speed_limit_is_a_line():
@@ -82,7 +104,8 @@ def test_a_speed_limit_is_a_line():
         ([1, -1, 1], [3, 6, -6]),
         ([3, -3, -1], [0, 6, -3]),
     ):
-        tau = drive(0.0, q, np.array(qd, float), single())
+        state = drive.initial_state(single())
+        tau, _ = drive(0.0, q, np.array(qd, float), single(), state)
         np.testing.assert_allclose(tau, expected)
 
 
@@ -107,20 +130,74 @@ def test_an_integral_removes_the_sag():
 
 def test_anti_windup_keeps_the_overshoot_small():
     """A step that saturates for long: a plain integral would wind up."""
+
+    class WindsUp(fj.StatefulElement):
+        """The same without anti-windup."""
+
+        pid: fj.PIDController
+
+        def initial_state(self, linkage):
+            return self.pid.initial_state(linkage)
+
+        def __call__(self, t, q, qd, linkage, state):
+            effort, _ = self.pid(t, q, qd, linkage, state)
+            return effort, self.pid.ki * (self.pid.pd.reference(t, linkage)[0] - q)
+
+    pid = fj.PIDController(8.0, 2.0, 6.0, 1.0, Hold(only_last(3.0)))
+    ts = np.linspace(0, 30, 301)
+    motions = [fj.simulate(single(), STILL, ts, (f,)) for f in (WindsUp(pid), pid)]
+    wild, calm = (float(m.q[:, 2].max() - 3) for m in motions)
+    assert wild > 0.3 and calm < 0.3 * wild
+    np.testing.assert_allclose(motions[1].q[-1, 2], 3, atol=1e-2)
+
+
+def test_without_an_integral_it_is_the_pd_controller():
     hold = Hold(only_last(1.0))
-    overshoot = []
-    for unwind in (1e9, 0.05):
-        pid = fj.PIDController(8.0, 8.0, 6.0, 1.0, hold, unwind=unwind)
-        solution = fj.simulate(single(), STILL, np.linspace(0, 20, 201), (pid,))
-        overshoot.append(float(solution.q[:, 2].max() - 1))
-    assert overshoot[0] > 0.3 and overshoot[1] < 0.5 * overshoot[0]
+    ts = np.linspace(0, 10, 11)
+    plain = fj.simulate(single(), STILL, ts, (fj.PDController(8, 6, 1, hold),))
+    pid = fj.PIDController(8.0, 0.0, 6.0, 1.0, hold)
+    same = fj.simulate(single(), STILL, ts, (pid,))
+    np.testing.assert_allclose(same.q, plain.q, atol=1e-9)
+    np.testing.assert_array_equal(same.own[0], 0)
+
+
+def test_drives_in_a_row():
+    """A PID controller's torque through a lag and a speed limit, with all states."""
+    pid = fj.PIDController(8.0, 2.0, 6.0, 10.0, Hold(only_last(1.0)))
+    drive = fj.SpeedLimit(fj.FirstOrderLag(pid, 0.05), stall=5.0, no_load=3.0)
+    solution = fj.simulate(single(), STILL, np.linspace(0, 20, 21), (drive,))
+    state = solution.own[0]
+    assert state.own == () and state.command.own.shape == (21, 3)
+    assert np.abs(state.command.command[:, 2]).max() > 0.1
+    np.testing.assert_allclose(solution.q[-1, 2], 1, atol=1e-2)
+
+
+def test_a_motion_goes_on_from_its_states():
+    lag = fj.FirstOrderLag(fj.JointEffort([0, 0, 3.0]), 0.2)
+    whole = fj.simulate(single(), STILL, [0, 0.5, 1.0], (lag,))
+    half = fj.State(whole.q[1], whole.qd[1])
+    own = jax.tree.map(lambda rows: rows[1], whole.own)
+    rest = fj.simulate(single(), half, [0.5, 1.0], (lag,), own0=own)
+    np.testing.assert_allclose(rest.q[-1], whole.q[-1], atol=1e-9)
+    with pytest.raises(ValueError, match="own0: expected the states of"):
+        fj.simulate(single(), half, [0.5, 1.0], (), own0=own)
+    with pytest.raises(ValueError, match="solution.own: expected the states of"):
+        fj.joint_efforts(single(), (), whole)
+
+
+def test_a_state_that_is_not_a_number_is_told():
+    lag = fj.FirstOrderLag(fj.JointEffort([0, 0, 3.0]), 0.2)
+    broken = eqx.tree_at(lambda x: x.start, lag, jnp.full(3, jnp.nan))
+    solution = fj.simulate(single(), STILL, [0, 1.0], (broken,), throw=False)
+    assert str(solution.outcome) == "not finite"
+    assert int(solution.stats["num_steps"]) < 100
 
 
 def test_states_of_elements_are_swept():
     lag = fj.FirstOrderLag(fj.JointEffort([0, 0, 3.0]), 0.2)
     q = np.linspace(0, 1, 5)[:, None] * np.ones(3)
     solution = fj.sweep(single(), fj.State(q, np.zeros(3)), [0, 0.2, 0.4], (lag,))
-    (effort,) = solution.own
+    effort = solution.own[0].own
     exact = 3 * (1 - np.exp(-np.array([0, 1, 2])))
     np.testing.assert_allclose(effort[..., 2], np.tile(exact, (5, 1)), atol=1e-9)
 
@@ -140,9 +217,13 @@ def test_malformed_elements_are_refused():
         ValueError, match=r"forces\[0\]: expected the rate of its state"
     ):
         fj.simulate(single(), STILL, [0, 1], (Wrong(),))
-    lag = fj.FirstOrderLag(fj.JointEffort(1.0 * np.ones(3)), 0.1)
-    with pytest.raises(ValueError, match="command: expected a force element without"):
-        fj.FirstOrderLag(lag, 0.1)
+    with pytest.raises(ValueError, match="command: expected a force element"):
+        fj.FirstOrderLag(3.0, 0.1)
+    short = fj.FirstOrderLag(lambda t, q, qd, linkage: 5.0, 0.1)
+    with pytest.raises(ValueError, match="command: expected an array of 3"):
+        fj.simulate(single(), STILL, [0, 1], (short,))
+    with pytest.raises(ValueError, match="ki: expected 0 where kp is"):
+        fj.PIDController(0.0, 1.0, 1.0, 1.0, Hold(only_last(1.0)))
     with pytest.raises(ValueError, match="time_constant: expected .* above 0"):
         fj.FirstOrderLag(fj.JointEffort(np.ones(3)), 0.0)
     with pytest.raises(ValueError, match="resistance: expected"):

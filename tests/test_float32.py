@@ -1,11 +1,16 @@
 """Single precision, in a process of its own: the tests' own one has x64 on."""
 
+import json
 import os
 import subprocess
 import sys
 from pathlib import Path
 
+import elements
+import numpy as np
 import pytest
+
+import fdof_jax as fj
 
 PROGRAM = """
 import warnings
@@ -75,6 +80,30 @@ def test_tuning_in_single_precision():
     result = run(TUNING)
     assert result.returncode == 0, result.stderr[-3000:]
     assert "tuned" in result.stdout
+
+
+ELEMENTS = """
+import json
+import elements
+import fdof_jax as fj
+
+forces, arm = tuple(elements.ALL.values()), elements.arm("RPR")
+motion = fj.simulate(arm, elements.START, [0, 0.3], forces)
+assert motion.q.dtype == motion.own[0].dtype == "float32"
+reactions = fj.joint_reactions(arm, forces, motion)
+print(json.dumps([motion.q[-1].tolist(), reactions[-1].tolist()]))
+"""
+
+
+def test_force_elements_in_single_precision():
+    result = run(ELEMENTS)
+    assert result.returncode == 0, result.stderr[-3000:]
+    q, reactions = json.loads(result.stdout)
+    forces, arm = tuple(elements.ALL.values()), elements.arm("RPR")
+    motion = fj.simulate(arm, elements.START, [0, 0.3], forces)
+    np.testing.assert_allclose(q, motion.q[-1], atol=1e-4)
+    exact = fj.joint_reactions(arm, forces, motion)[-1]
+    np.testing.assert_allclose(reactions, exact, atol=1e-3 * np.abs(exact).max())
 
 
 def test_single_precision():

@@ -114,23 +114,54 @@ def test_efforts_make_the_motion_and_do_its_work(topology, joints):
     np.testing.assert_allclose(energy[-1] - energy[0], work, atol=1e-6 * np.ptp(power))
 
 
+class Fall(eqx.Module):
+    """The cart falls along its rail, which is upright."""
+
+    def __call__(self, t, linkage):
+        up, rate = -G * t**2 / 2, -G * t
+        zero = jnp.zeros_like(t)
+        return jnp.stack([up, zero, zero]), jnp.stack([rate, zero, zero])
+
+
 def test_a_motion_prescribed_as_it_is_takes_no_effort():
-    """Joint 1 follows what it does by itself: a falling cart."""
+    """A cart that falls together with a pendulum that hangs on it, weightless."""
     falling = fj.Linkage(
         "PRR", length=[0, 0, 1, 1], com=[[0, 0], [0.5, 0], [0.5, 0]], mass=[1, 1, 1],
-        inertia=[1, 1, 1],
+        inertia=[1, 1, 1], gravity=G,
     )  # fmt: skip
-    motion = fj.PrescribedMotion(1, Push(jnp.array(0.0), jnp.array(-9.81)))
+    motion = fj.PrescribedMotion(1, Fall())
     ts = np.linspace(0, 1, 5)
-    start = fj.State([0, 0.3, 0.2], [0, 1.0, -0.4])
+    start = fj.State([0, 0.3, 0.2], np.zeros(3))
     bound = fj.simulate(falling, start, ts, (motion,))
     free = fj.simulate(falling, start, ts)
-    # All links fall alike: what turns does not push the cart only if it is balanced.
-    effort = fj.joint_efforts(falling, (motion,), bound).total[:, 0]
+    np.testing.assert_allclose(bound.q, free.q, atol=1e-9)
+    np.testing.assert_allclose(free.q[:, 1:], np.tile([0.3, 0.2], (5, 1)), atol=1e-9)
+    effort = fj.joint_efforts(falling, (motion,), bound).total
+    np.testing.assert_allclose(effort, 0, atol=1e-9)
+    # A turning pendulum pulls at the cart.
+    turning = fj.State([0, 0.3, 0.2], [0, 1.0, -0.4])
+    pulled = fj.simulate(falling, turning, ts, (motion,))
+    effort = fj.joint_efforts(falling, (motion,), pulled).total[:, 0]
     assert np.abs(effort).max() > 0.1
-    np.testing.assert_allclose(free.q[0], bound.q[0])
-    centres = jax.vmap(lambda q: fj.mass_centers(falling, q))(bound.q)
-    np.testing.assert_allclose(centres[:, 0, 1], -9.81 * ts**2 / 2, atol=1e-9)
+
+
+def test_starts_beside_the_reference_and_singular_equations_are_told():
+    hold = Push(jnp.array(0.0), jnp.array(0.0))
+    motion = fj.PrescribedMotion((1, 3), hold)
+    starts = fj.State(np.array([[0.0, 0.1, 0], [0.2, 0.1, 0]]), np.zeros((2, 3)))
+    with pytest.raises(ValueError, match="state0.q: expected"):
+        fj.simulate(CART, fj.State(starts.q[1], np.zeros(3)), [0, 1], (motion,))
+    swept = fj.sweep(CART, starts, [0, 0.1], (motion,))
+    assert swept.outcome.tolist() == ["successful", "not finite"]
+    # Two stretched links with a heavy tip; the slide, which is held, is well.
+    heavy = fj.Linkage(
+        "PRR", length=[0, 0, 1, 1], com=[[0, 0], [0.5, 0], [1, 0]], mass=[1, 1, 1e11],
+        inertia=[1, 0.1, 0],
+    )  # fmt: skip
+    moving = fj.PrescribedMotion(1, hold)
+    start = fj.State(np.array([0, 0.3, 0.0]), np.zeros(3))
+    ended = fj.simulate(heavy, start, [0, 0.1], (moving,), throw=False)
+    assert str(ended.outcome) == "ill-conditioned"
 
 
 @pytest.mark.parametrize(
@@ -191,11 +222,14 @@ def test_the_shock_removes_residual_vibration():
 
 def test_malformed_motions_are_refused():
     hold = Push(jnp.array(0.0), jnp.array(0.0))
-    for joints in (0, 4, (1, 0), 1.0):
+    for joints in (0, 4, (1, 0), 1.0, (), [1, 2], True):
         with pytest.raises(ValueError, match="joints: expected"):
             fj.PrescribedMotion(joints, hold)
     with pytest.raises(ValueError, match="reference: expected a callable"):
         fj.PrescribedMotion(1, 3.0)
+    motion = fj.PrescribedMotion(1, lambda t, linkage: (0.0, 0.0))
+    with pytest.raises(ValueError, match="reference: expected an array of 3"):
+        fj.simulate(CART, REST, [0, 1], (motion,))
     motion = fj.PrescribedMotion(1, hold)
     with pytest.raises(ValueError, match="forces: expected one PrescribedMotion"):
         fj.simulate(CART, REST, [0, 1], (motion, motion))

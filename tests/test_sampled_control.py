@@ -1,6 +1,7 @@
 """Sampled control: first order in the period, delay, noise; and the discrete step."""
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -98,6 +99,37 @@ def test_gains_of_sampled_control_have_gradients():
     np.testing.assert_allclose(slope, difference, rtol=1e-6)
 
 
+def test_a_digital_pid_controller_of_motors():
+    """Its integral by Euler's steps, and the motors' currents go on between samples."""
+    pid = fj.PIDController(8.0, 2.0, 6.0, 50.0, Hold(jnp.array([0.0, 0.0, 1.0])))
+    motion = fj.simulate_sampled(WHEEL, REST, pid, 0.05, 100)
+    integral = 0.0
+    for k in range(100):
+        demand = 8 * (1 - motion.q[k, 2]) - 6 * motion.qd[k, 2] + integral
+        np.testing.assert_allclose(motion.tau[k, 2], demand, atol=1e-9)
+        integral += 0.05 * 2 * (1 - motion.q[k, 2])
+    motor = fj.DCMotor(
+        fj.JointEffort([0, 0, 12.0]), resistance=2.0, inductance=0.5, constant=0.3
+    )
+    idle = fj.JointEffort(np.zeros(3))
+    sampled = fj.simulate_sampled(WHEEL, REST, idle, 0.1, 5, (motor,))
+    whole = fj.simulate(WHEEL, REST, sampled.ts, (motor,))
+    np.testing.assert_allclose(sampled.own[0].own, whole.own[0].own, atol=1e-8)
+
+
+class Hold(eqx.Module):
+    target: jax.Array
+
+    def __call__(self, t, linkage):
+        return self.target, jnp.zeros(3)
+
+
+def test_a_delay_that_is_too_long_is_told():
+    end = lambda delay: fj.simulate_sampled(WHEEL, REST, ramp, 0.1, 2, delay=delay)
+    motions = jax.vmap(end)(jnp.array([0.05, 0.12]))
+    assert np.isfinite(motions.q[0]).all() and np.isnan(motions.q[1, -1]).all()
+
+
 def test_a_failure_is_named():
     broken = lambda t, q, qd, linkage: jnp.where(t > 0.15, jnp.nan, 0.0) * q
     motion = fj.simulate_sampled(ARM, START, broken, 0.1, 4)
@@ -114,8 +146,8 @@ def test_malformed_arguments_are_refused():
         "period": dict(period=0.0),
         "samples": dict(samples=0),
         "delay": dict(delay=0.1),
-        "control": dict(control=lag),
-        "forces": dict(forces=(lag,)),
+        "control": dict(control=3.0),
+        "forces": dict(forces=[lag]),
         "noise, key": dict(noise=(0.1, 0.1)),
     }.items():
         arguments = dict(control=CONTROL, period=0.1, samples=2) | changes

@@ -78,6 +78,10 @@ def test_malformed_travels_are_refused():
         fj.Travel(1.0, profile="linear")
     with pytest.raises(ValueError, match="frequency: expected .* above 0"):
         fj.shock_against(fj.Travel(1.0), -1.0)
+    with pytest.raises(ValueError, match="frequency: expected at most 250 rad"):
+        fj.shock_against(fj.Travel(1.0), 300.0)
+    with pytest.raises(ValueError, match="period: expected not zero"):
+        fj.Laps(0.0)
     with pytest.raises(ValueError, match="travel: expected a Travel"):
         fj.shock_against(1.0, 1.0)
 
