@@ -84,12 +84,14 @@ def test_tuning_in_single_precision():
 
 ELEMENTS = """
 import json
+import jax
 import elements
 import fdof_jax as fj
 
 forces, arm = tuple(elements.ALL.values()), elements.arm("RPR")
 motion = fj.simulate(arm, elements.START, [0, 0.3], forces)
-assert motion.q.dtype == motion.own[0].dtype == "float32"
+states = jax.tree.leaves((motion.q, motion.own))
+assert {leaf.dtype.name for leaf in states} == {"float32"}
 reactions = fj.joint_reactions(arm, forces, motion)
 print(json.dumps([motion.q[-1].tolist(), reactions[-1].tolist()]))
 """

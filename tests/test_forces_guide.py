@@ -4,10 +4,12 @@ import re
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 GUIDE = Path(__file__).parents[1] / "docs" / "forces.md"
 
 
+@pytest.mark.slow
 def test_examples():
     blocks = re.findall(r"```python\n(.*?)```", GUIDE.read_text(), re.DOTALL)
     namespace = {}
