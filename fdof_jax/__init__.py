@@ -46,14 +46,12 @@ from .linkage import (
     from_chain as from_chain,
     to_chain as to_chain,
 )
-from .points import (
-    Load as Load,
-    Point as Point,
-    PointElement as PointElement,
+from .point_elements import (
     SpringDamper as SpringDamper,
     Tension as Tension,
     Wrench as Wrench,
 )
+from .points import Load as Load, Point as Point, PointElement as PointElement
 from .reactions import joint_reactions as joint_reactions
 from .references import (
     Ellipse as Ellipse,

@@ -38,6 +38,10 @@ class Armature(InertialElement):
     def __init__(self, inertia: ArrayLike):
         self.inertia = real_array("inertia", inertia, (3,), minimum=0, broadcast=True)
 
+    def possible(self) -> Array:
+        """Whether the inertias are not negative."""
+        return (self.inertia >= 0).all()
+
     def coordinates(self, q, linkage):
         return q
 
@@ -103,6 +107,10 @@ class LinearActuator(InertialElement):
         unit = vector * over(length_of(vector))
         cylinder = self.ends.a.place(frames) + self.com[0] * unit
         return cylinder, self.ends.b.place(frames) - self.com[1] * unit, vector
+
+    def possible(self) -> Array:
+        """Whether masses and inertias are not negative."""
+        return ((self.mass >= 0) & (self.inertia >= 0)).all()
 
     def coordinates(self, q, linkage):
         cylinder, piston, vector = self._bodies(linkage, q)

@@ -130,10 +130,15 @@ class _Drive(StatefulElement):
         if check is not None:
             check(linkage, ts)
 
-    def possible(self) -> Any:
-        """What the command says of its values, if it says anything."""
+    @abstractmethod
+    def positive(self) -> list[Array]:
+        """The parameters that must be positive."""
+
+    def possible(self) -> Array:
+        """Whether they are, and what the command says of its own values."""
+        own = jnp.stack([(value > 0).all() for value in self.positive()]).all()
         possible: Any = getattr(self.command, "possible", None)
-        return True if possible is None else possible()
+        return own if possible is None else own & possible()
 
 
 def _command(value: Any) -> Any:
@@ -167,6 +172,9 @@ class FirstOrderLag(_Drive):
         )
         self.start = real_array("start", start, (3,), broadcast=True)
 
+    def positive(self):
+        return [self.time_constant]
+
     def initial(self):
         """The effort, (3,) [N or N m]."""
         return self.start
@@ -195,6 +203,9 @@ class SpeedLimit(_Drive):
         self.command = _command(command)
         self.stall = real_array("stall", stall, (3,), above=0, broadcast=True)
         self.no_load = real_array("no_load", no_load, (3,), above=0, broadcast=True)
+
+    def positive(self):
+        return [self.stall, self.no_load]
 
     def respond(self, command, qd, own):
         left = jnp.clip(1 - qd / self.no_load, 0, 1)  # of the positive limit
@@ -251,6 +262,10 @@ class DCMotor(_Drive):
         self.gear = positive("gear", gear)
         self.voltage_limit = positive("voltage_limit", voltage_limit, finite=False)
         self.current_limit = positive("current_limit", current_limit, finite=False)
+
+    def positive(self):
+        winding = [self.resistance, self.inductance, self.constant, self.gear]
+        return [*winding, self.voltage_limit, self.current_limit]
 
     def initial(self):
         """The currents, (3,) [A]."""

@@ -59,6 +59,11 @@ class JointStops(ScalarElement):
         self.damping = real_array("damping", damping, (3,), minimum=0, broadcast=True)
         self.smoothing = real_array("smoothing", smoothing, (3,), **positive)
 
+    def possible(self) -> Array:
+        """Whether the ranges are not empty, and nothing is negative."""
+        ranges = (self.lower < self.upper) & (self.damping >= 0)
+        return (ranges & (self.stiffness > 0) & (self.smoothing > 0)).all()
+
     def respond(self, scheduled, q, qd, linkage):
         rows = zip(
             q, qd, self.lower, self.upper, self.stiffness, self.damping, self.smoothing
@@ -121,6 +126,10 @@ class JointFriction(ScalarElement):
     def __init__(self, level: ArrayLike, speed: ArrayLike = 1e-2):
         self.level = real_array("level", level, (3,), minimum=0, broadcast=True)
         self.speed = real_array("speed", speed, (3,), above=0, broadcast=True)
+
+    def possible(self) -> Array:
+        """Whether levels are not negative, and speeds positive."""
+        return ((self.level >= 0) & (self.speed > 0)).all()
 
     def respond(self, scheduled, q, qd, linkage):
         return tuple(

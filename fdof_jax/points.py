@@ -1,10 +1,9 @@
-"""Points of links, and what pulls or pushes at them.
+"""Points of links, and the efforts of loads on them.
 
 Written in scalars, which fuse with the equations of motion; vectors are complex.
 """
 
 from abc import abstractmethod
-from collections.abc import Callable
 from functools import reduce
 from operator import add
 from typing import Any, NamedTuple
@@ -13,10 +12,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import Array
-from jaxtyping import Bool, Complex, Float, Int
+from jaxtyping import Complex, Float, Int
 from numpy.typing import ArrayLike
 
-from .forces import ScalarElement, jumps_of
+from .forces import ScalarElement
 from .linkage import Linkage, real_joints
 from .reduced_equations import Scalars
 from .trigonometry import sincos
@@ -64,7 +63,7 @@ def cross(a: Array, b: Array) -> Array:
     return a.real * b.imag - a.imag * b.real
 
 
-def _pick(link: Array, choices: list[Array]) -> Array:
+def pick(link: Array, choices: list[Array]) -> Array:
     """The one of the ground and three links."""
     chosen = choices[0]
     for k in (1, 2, 3):
@@ -106,7 +105,7 @@ class Point(eqx.Module):
     def place(self, frames: Frames) -> Complex[Array, ""]:
         """Where it is, x + iy [m]."""
         offset = jax.lax.complex(self.along, self.across)
-        start, direction = (_pick(self.link, rows) for rows in frames[:2])
+        start, direction = (pick(self.link, rows) for rows in frames[:2])
         return start + offset * direction
 
 
@@ -125,19 +124,20 @@ class Load(NamedTuple):
 
         A joint turns what lies beyond it, or slides it across the link before.
         """
-        about_origin = cross(self.point.place(frames), self.force) + self.moment
-        efforts = _work(frames, self.force, about_origin)
+        efforts = work(frames, self.point.place(frames), self.force, self.moment)
         return tuple(
             jnp.where(k < self.point.link, effort, 0)
             for k, effort in enumerate(efforts)
         )
 
 
-def _work(frames: Frames, force: Array, about_origin: Array) -> tuple[Array, ...]:
-    """Of a force and its moment about the origin, per unit of each joint's rate."""
+def work(
+    frames: Frames, place: Array, force: Array, moment: Any = 0.0
+) -> tuple[Array, ...]:
+    """Of a load beyond all joints, per unit of each joint's rate."""
     rows = zip(frames.turning, frames.start[1:], frames.direction)
     return tuple(
-        jnp.where(turns, about_origin - cross(pivot, force), cross(link, force))
+        jnp.where(turns, cross(place - pivot, force) + moment, cross(link, force))
         for turns, pivot, link in rows
     )
 
@@ -180,7 +180,7 @@ class Separation(eqx.Module):
 
     def slopes(self, frames: Frames, vector: Array) -> tuple[Array, ...]:
         """Derivatives of half of the square of the length: of the length, times it."""
-        works = _work(frames, vector, cross(self.a.place(frames), vector))
+        works = work(frames, self.a.place(frames), vector)
         beyond = lambda k, point: jnp.where(k < point.link, 1, 0)
         return tuple(
             (beyond(k, self.b) - beyond(k, self.a)) * work
@@ -198,168 +198,3 @@ def length_of(vector: Array) -> Array:
 def over(length: Array) -> Array:
     """The reciprocal; 1 where points meet and have no line."""
     return 1 / jnp.where(length > 0, length, 1)
-
-
-class LineElement(PointElement):
-    """A force element that pulls two points together along the line that joins them.
-
-    A subclass implements `pull`.
-    """
-
-    ends: eqx.AbstractVar[Separation]
-
-    @abstractmethod
-    def pull(self, scheduled: Any, length: Array, rate: Array) -> Array:
-        """The tension over the length [N/m], given that [m] and its rate [m/s]."""
-
-    def _pull(self, scheduled, frames, qd) -> tuple[Array, tuple[Array, ...], Array]:
-        vector = self.ends.vector(frames)
-        slopes = self.ends.slopes(frames, vector)
-        length = length_of(vector)
-        rate = reduce(add, (slope * v for slope, v in zip(slopes, qd)))
-        return vector, slopes, self.pull(scheduled, length, rate * over(length))
-
-    def loads(self, scheduled, frames, qd):
-        vector, _, pull = self._pull(scheduled, frames, qd)
-        return Load(self.ends.a, pull * vector), Load(self.ends.b, -pull * vector)
-
-    def respond(self, scheduled, q, qd, linkage):
-        _, slopes, pull = self._pull(scheduled, frames_of(linkage, q), qd)
-        return tuple(-pull * slope for slope in slopes)
-
-
-class SpringDamper(LineElement):
-    """A spring and a damper between two points, along the line that joins them.
-
-    The tension is stiffness * (length - rest_length) + damping * d(length)/dt. With a
-    rest length, points that meet have no line: the force is then 0.
-
-    **Arguments:**
-
-    - `a`, `b`: the two `Point`s.
-    - `stiffness` [N/m], `damping` [N s/m], `rest_length` [m]: not negative.
-    - `one_sided`: "cable" pulls and never pushes, "bumper" pushes and never pulls, and
-      neither does anything on the other side of the rest length. False: both.
-
-    **Raises:** ValueError for malformed arguments.
-    """
-
-    ends: Separation
-    stiffness: Float[Array, ""]
-    damping: Float[Array, ""]
-    rest_length: Float[Array, ""]
-    side: Int[Array, ""]  # 1: cable, -1: bumper, 0: both
-
-    def __init__(
-        self,
-        a: Point,
-        b: Point,
-        *,
-        stiffness: ArrayLike = 0.0,
-        damping: ArrayLike = 0.0,
-        rest_length: ArrayLike = 0.0,
-        one_sided: str | bool = False,
-    ):
-        self.ends = Separation(a, b)
-        self.stiffness = real_array("stiffness", stiffness, (), minimum=0)
-        self.damping = real_array("damping", damping, (), minimum=0)
-        self.rest_length = real_array("rest_length", rest_length, (), minimum=0)
-        sides = {False: 0, "cable": 1, "bumper": -1}
-        if not isinstance(one_sided, str | bool) or one_sided not in sides:
-            raise ValueError(
-                f"one_sided: expected False, 'cable' or 'bumper', got {one_sided!r}."
-            )
-        self.side = jnp.asarray(sides[one_sided])
-
-    def pull(self, scheduled, length, rate):
-        tension = self.stiffness * (length - self.rest_length) + self.damping * rate
-        beyond = self.side * (length - self.rest_length) > 0
-        works = (self.side == 0) | (beyond & (self.side * tension > 0))
-        # The pull of a spring of no rest length is smooth also where the points meet.
-        other = self.damping * rate - self.stiffness * self.rest_length
-        return jnp.where(works, self.stiffness + other * over(length), 0)
-
-    def potential_energy(self, q: Array, linkage: Linkage) -> Array:
-        """The energy of the spring [J]."""
-        stretch = self.ends.length(linkage, q) - self.rest_length
-        works = (self.side == 0) | (self.side * stretch > 0)
-        return jnp.where(works, self.stiffness * stretch**2 / 2, 0)
-
-
-class Tension(LineElement):
-    """A constant force between two points, along the line that joins them.
-
-    **Arguments:** `a`, `b`: the two `Point`s; `tension`: positive pulls them
-    together [N].
-
-    **Raises:** ValueError for malformed arguments.
-    """
-
-    ends: Separation
-    tension: Float[Array, ""]
-
-    def __init__(self, a: Point, b: Point, tension: ArrayLike):
-        self.ends = Separation(a, b)
-        self.tension = real_array("tension", tension, ())
-
-    def pull(self, scheduled, length, rate):
-        return self.tension * over(length)
-
-    def potential_energy(self, q: Array, linkage: Linkage) -> Array:
-        """Of which the force is the slope: 0 where the points meet [J]."""
-        return self.tension * self.ends.length(linkage, q)
-
-
-class Wrench(PointElement):
-    """A force and a moment from outside, on a point of a link.
-
-    **Arguments:**
-
-    - `point`: where.
-    - `force`: (x, y) [N], or a function of time that returns it.
-    - `moment`: counter-clockwise [N m], or a function of time that returns it.
-    - `follows`: whether the force turns with the link: it is then (along, across).
-
-    **Raises:** ValueError for malformed arguments.
-    """
-
-    point: Point
-    force: Any
-    moment: Any
-    follows: Bool[Array, ""]
-
-    def __init__(
-        self,
-        point: Point,
-        force: ArrayLike | Callable[[Array], ArrayLike] = (0.0, 0.0),
-        moment: ArrayLike | Callable[[Array], ArrayLike] = 0.0,
-        *,
-        follows: bool = False,
-    ):
-        instance("point", point, Point)
-        self.point = point
-        self.force = force if callable(force) else real_array("force", force, (2,))
-        self.moment = moment if callable(moment) else real_array("moment", moment, ())
-        instance("follows", follows, bool)
-        self.follows = jnp.asarray(follows)
-
-    @property
-    def jump_ts(self) -> Array | None:
-        """The times at which the functions say that they jump, if they do."""
-        return jumps_of(self.force, self.moment)
-
-    def schedule(self, t, linkage):
-        """Force and moment at a time."""
-        force, moment = self.force, self.moment
-        if callable(force):
-            force = real_array("force", force(t), (2,))
-        if callable(moment):
-            moment = real_array("moment", moment(t), ())
-        return jax.lax.complex(force[0], force[1]), moment
-
-    def loads(self, scheduled, frames, qd):
-        force, moment = scheduled
-        along = _pick(self.point.link, frames.direction)
-        return (
-            Load(self.point, jnp.where(self.follows, force * along, force), moment),
-        )

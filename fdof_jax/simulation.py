@@ -78,8 +78,16 @@ def check_elements(forces: Forces, linkage: Linkage, ts: Array) -> None:
         if getattr(element, "jump_ts", None) is not None:
             real_array(f"forces[{index}].jump_ts", element.jump_ts, (None,))
         check = getattr(element, "check", None)
-        if check is not None and not is_traced(linkage, ts, element):
+        if is_traced(linkage, ts, element):
+            continue
+        if check is not None:
             check(linkage, ts)
+        # `equinox.tree_at` asks no constructor.
+        if hasattr(element, "possible") and not element.possible():
+            raise ValueError(
+                f"forces[{index}]: expected values that its constructor takes, got "
+                f"{eqx.tree_pformat(element, short_arrays=False)}."
+            )
 
 
 def simulate(

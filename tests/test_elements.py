@@ -112,6 +112,28 @@ def test_one_program_for_all_topologies():
             np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9)
 
 
+SPOILT = {
+    "spring": lambda e: e.stiffness,
+    "stops": lambda e: e.smoothing,
+    "friction": lambda e: e.level,
+    "PID": lambda e: e.ki,
+    "lag": lambda e: e.time_constant,
+    "motor": lambda e: e.command.kp,
+    "speed limit": lambda e: e.stall,
+    "armature": lambda e: e.inertia,
+    "actuator": lambda e: e.mass,
+}
+
+
+@pytest.mark.parametrize("name", SPOILT)
+def test_negative_values_that_no_constructor_saw_are_told(name):
+    element = elements.ALL[name]
+    spoilt = eqx.tree_at(SPOILT[name], element, -1 - SPOILT[name](element))
+    with pytest.raises(ValueError, match=r"forces\[0\]: expected values|at least 0"):
+        fj.simulate(ARM, elements.START, [0, 0.1], (spoilt,))
+    assert element.possible() and not jax.jit(lambda e: e.possible())(spoilt)
+
+
 # Costs
 
 
