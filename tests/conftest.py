@@ -1,3 +1,4 @@
+import os
 from pathlib import Path
 
 import jax
@@ -33,6 +34,16 @@ def mixed(batch):
 @pytest.fixture(scope="session")
 def swept(mixed):
     return sweep_batch.run(mixed)
+
+
+def pytest_configure(config):
+    """XLA's older code generator for quick tests: three quarters of the time.
+
+    Most of it is compilation. The slow tests are compiled as XLA does by default.
+    """
+    if config.option.markexpr == "not slow":
+        flags = os.environ.get("XLA_FLAGS", "")
+        os.environ["XLA_FLAGS"] = f"{flags} --xla_cpu_use_fusion_emitters=false".strip()
 
 
 def pytest_collection_modifyitems(items):

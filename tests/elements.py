@@ -33,10 +33,10 @@ PLAIN = {
         HOOK, ELBOW, stiffness=30.0, damping=2.0, rest_length=0.4
     ),
     "cable": fj.SpringDamper(
-        HOOK, ELBOW, stiffness=20.0, rest_length=0.3, one_sided="cable"
+        HOOK, ELBOW, stiffness=20.0, damping=0.1, rest_length=0.3, one_sided="cable"
     ),
     "bumper": fj.SpringDamper(
-        HOOK, TIP, stiffness=25.0, rest_length=3.0, one_sided="bumper"
+        HOOK, TIP, stiffness=25.0, damping=0.1, rest_length=3.0, one_sided="bumper"
     ),
     "tension": fj.Tension(HOOK, TIP, 2.5),
     "wrench": fj.Wrench(TIP, [3.0, -2.0], 0.7),

@@ -185,6 +185,7 @@ def test_the_conditioning_sees_the_armature():
     assert fj.inertia_ratios(linkage, q, (fj.Armature(1e9),)).min() > 0.9
 
 
+@pytest.mark.slow
 def test_a_scene_with_them_is_batched_like_any_other():
     linkage, q, qd = motion("RPR")
     many = fj.State(q + np.linspace(-0.1, 0.1, 5)[:, None], qd)

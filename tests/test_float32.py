@@ -97,6 +97,7 @@ print(json.dumps([motion.q[-1].tolist(), reactions[-1].tolist()]))
 """
 
 
+@pytest.mark.slow
 def test_force_elements_in_single_precision():
     result = run(ELEMENTS)
     assert result.returncode == 0, result.stderr[-3000:]

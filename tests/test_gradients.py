@@ -80,6 +80,7 @@ def test_forward_reverse_and_differences_agree(kind):
     assert np.abs(forward - np.array(differences)).max() <= 1e-6 * scale
 
 
+@pytest.mark.slow
 def test_gradient_of_a_batch_is_the_sum_of_the_gradients():
     def total(mass, starts):
         linkage = eqx.tree_at(lambda x: x.mass, scenes.fig5().linkage, mass)
@@ -139,6 +140,7 @@ def test_bounded_steps_control_the_tangents_of_a_hanging_arm():
     assert np.abs(gradient(hanging, 10.0) - exact).max() > scale
 
 
+@pytest.mark.slow
 def test_derivatives_in_the_times_themselves():
     scene = fj.scenes.fig5()
 
@@ -151,6 +153,7 @@ def test_derivatives_in_the_times_themselves():
     np.testing.assert_allclose(jax.grad(loss)(1.0), difference, rtol=1e-7)
 
 
+@pytest.mark.slow
 def test_a_function_may_close_over_what_is_differentiated():
     scene = scenes.fig5()
 

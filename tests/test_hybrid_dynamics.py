@@ -164,9 +164,8 @@ def test_starts_beside_the_reference_and_singular_equations_are_told():
     assert str(ended.outcome) == "ill-conditioned"
 
 
-@pytest.mark.parametrize(
-    "mode", ["forward", pytest.param("reverse", marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", ["forward", "reverse"])
 def test_gradients_equal_differences(mode):
     linkage, start, (motion, *others) = swinging("RPR", 1)
 
@@ -191,6 +190,7 @@ def test_gradients_equal_differences(mode):
     )
 
 
+@pytest.mark.slow
 def test_topologies_are_batched():
     members = [swinging(topology, 2) for topology in fj.TOPOLOGIES]
     stack = lambda trees: jax.tree.map(lambda *a: jnp.stack(a), *trees)

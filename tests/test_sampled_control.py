@@ -99,6 +99,7 @@ def test_gains_of_sampled_control_have_gradients():
     np.testing.assert_allclose(slope, difference, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_digital_pid_controller_of_motors():
     """Its integral by Euler's steps, and the motors' currents go on between samples."""
     pid = fj.PIDController(8.0, 2.0, 6.0, 50.0, Hold(jnp.array([0.0, 0.0, 1.0])))
@@ -124,6 +125,7 @@ class Hold(eqx.Module):
         return self.target, jnp.zeros(3)
 
 
+@pytest.mark.slow
 def test_a_delay_that_is_too_long_is_told():
     end = lambda delay: fj.simulate_sampled(WHEEL, REST, ramp, 0.1, 2, delay=delay)
     motions = jax.vmap(end)(jnp.array([0.05, 0.12]))

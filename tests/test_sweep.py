@@ -109,6 +109,7 @@ def test_throw_tells_how_many_failed(mixed):
 # Derivatives
 
 
+@pytest.mark.slow
 def test_failed_members_add_nothing_to_a_gradient():
     linkage = random_linkage("RRP", np.random.default_rng(1))
     rng = np.random.default_rng(2)
@@ -187,6 +188,7 @@ def test_arrays_without_the_axis_are_shared(shared):
         np.testing.assert_allclose(solution.q[member], single.q, rtol=1e-8, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_an_implicit_solver_finds_its_tolerances():
     linkage = fj.scenes.fig5().linkage
     start = fj.State(np.zeros((2, 3)) + [[0.0], [0.1]], np.zeros(3))
