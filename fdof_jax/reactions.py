@@ -77,7 +77,8 @@ def joint_reactions(
     **Returns:** force (x, y) [N] and moment [N m] on the moving link, at its
     characteristic point (see `joint_positions`). The link before takes the opposite.
 
-    **Raises:** ValueError if `forces` is not a tuple of force elements.
+    **Raises:** ValueError if `forces` is not a tuple of force elements, and for an
+    element that moves masses without saying by which `loads`.
     """
     efforts = joint_efforts(linkage, forces, solution)
     return _along(linkage, forces, solution, efforts.total)

@@ -164,3 +164,50 @@ def test_a_hanging_arm_weighs_on_its_bearings():
     np.testing.assert_allclose(
         fj.joint_reactions(arm, (), solution)[-1], expected, atol=1e-9
     )
+
+
+class TipLoad(fj.InertialElement):
+    """A point mass at the tip, which says or does not say what carries it."""
+
+    mass: float = 2.0
+
+    def coordinates(self, q, linkage):
+        return fj.tip_position(linkage, q)
+
+    def weights(self, linkage):
+        return jnp.full(2, self.mass)
+
+    def potential_energy(self, q, linkage):
+        return self.mass * linkage.gravity * fj.tip_position(linkage, q)[1]
+
+
+class CarriedTipLoad(TipLoad):
+    def loads(self, t, q, qd, qdd, linkage):
+        place = lambda q: fj.tip_position(linkage, q)
+        rate = lambda q, qd: jax.jvp(place, (q,), (qd,))[1]
+        _, (x, y) = jax.jvp(rate, (q, qd), (qd, qdd))
+        push = -self.mass * jax.lax.complex(x, y + linkage.gravity)
+        return (fj.Load(fj.Point(3, 1.0), push),)
+
+
+def test_an_element_of_one_s_own_is_carried_or_refused():
+    arm = fj.Linkage(
+        "RRR", length=[0, 1, 1, 1], com=[[0.5, 0]] * 3, mass=[1, 1, 1],
+        inertia=[1 / 12] * 3,
+    )  # fmt: skip
+    tip = fj.Linkage(
+        "RRR", length=[0, 1, 1, 1], com=[[0.5, 0], [0.5, 0], [2.5 / 3, 0]],
+        mass=[1, 1, 3], inertia=[1 / 12, 1 / 12, 1 / 12 + 1 / 6],
+    )  # fmt: skip
+    start = fj.State(np.array([-0.3, 0.4, 0.2]), np.array([0.5, -0.3, 0.7]))
+    forces = (CarriedTipLoad(),)
+    solution = fj.simulate(arm, start, [0, 0.1], forces)
+    same = fj.simulate(tip, start, [0, 0.1])
+    np.testing.assert_allclose(solution.q, same.q, atol=1e-10)
+    np.testing.assert_allclose(
+        fj.joint_reactions(arm, forces, solution),
+        fj.joint_reactions(tip, (), same),
+        atol=1e-8,
+    )
+    with pytest.raises(ValueError, match=r"forces\[0\]: expected .* `loads`"):
+        fj.joint_reactions(arm, (TipLoad(),), solution)
