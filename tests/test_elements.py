@@ -30,7 +30,11 @@ def scaled(forces, factors):
     for leaf in leaves:
         if NUMBERS(leaf):
             factor = next(factors)
-            leaf = jnp.where(leaf == 0, factor - 1, leaf * factor)
+            # Infinity, of no end, stays: its derivative times 0 is not a number.
+            finite = jnp.isfinite(leaf)
+            number = jnp.where(finite, leaf, 1)
+            changed = jnp.where(number == 0, factor - 1, number * factor)
+            leaf = jnp.where(finite, changed, leaf)
         moved.append(leaf)
     return jax.tree.unflatten(structure, moved)
 

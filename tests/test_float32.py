@@ -54,6 +54,7 @@ def run(program):
     environment = os.environ | {
         "JAX_ENABLE_X64": "0",
         "PYTHONPATH": str(Path(__file__).parent),
+        "XLA_FLAGS": "",
     }
     return subprocess.run(
         [sys.executable, "-c", program],
