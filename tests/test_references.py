@@ -83,6 +83,28 @@ def test_a_path_behind_the_pivot_is_refused_where_it_is_simulated(x):
         fj.simulate(ARM, start, [0, 2], forces)
 
 
+class Swinging(fj.Path):
+    """To and fro along a wide arc, which is looked at lap by lap."""
+
+    @property
+    def middle(self):
+        return jnp.array([0.4, 0.0])
+
+    def point(self, share):
+        angle = 2 * jnp.sin(2 * jnp.pi * share)
+        return self.middle + 1.2 * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
+
+
+def test_many_laps_are_as_good_as_one():
+    arm = fj.Linkage(
+        "RRR", length=[0, 1, 1, 0.3], com=[[0.5, 0]] * 3, mass=[1] * 3,
+        inertia=[0.1] * 3,
+    )  # fmt: skip
+    task = fj.TipTask(Swinging(), fj.Laps(1.0))
+    for end in (1.0, 400.0):
+        task.check(arm, jnp.array([0.0, end]))
+
+
 def test_malformed_references_are_refused():
     with pytest.raises(ValueError, match="points: expected three or more"):
         fj.Spline(POINTS[:2])

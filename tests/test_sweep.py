@@ -198,3 +198,12 @@ def test_an_implicit_solver_finds_its_tolerances():
     )
     alone = fj.simulate(linkage, fj.State(start.q[1], start.qd), [0, 0.2])
     np.testing.assert_allclose(solution.q[1], alone.q, atol=1e-6)
+
+
+def test_whole_numbers_are_velocities_too():
+    arm = random_linkage("RRR", np.random.default_rng(2))
+    spring = fj.SpringDamper(fj.Point(0, 1.0), fj.Point(3), damping=1.0)
+    q = np.linspace(0, 0.2, 3)[:, None] * np.ones(3)
+    solution = fj.sweep(arm, fj.State(q, [0, 0, 0]), [0, 0.1], (spring,))
+    alone = fj.simulate(arm, fj.State(q[2], [0, 0, 0]), [0, 0.1], (spring,))
+    np.testing.assert_allclose(solution.q[2], alone.q, atol=1e-9)
