@@ -57,13 +57,13 @@ class PrescribedMotion(eqx.Module):
         self.moved = jnp.array([k in numbers for k in (1, 2, 3)])
         self.reference = checked_reference(reference)
 
-    def motion(self, t: Array, linkage: Linkage) -> tuple[Array, Array]:
+    def at(self, t: Array, linkage: Linkage) -> tuple[Array, Array]:
         """Positions and velocities of the reference at a time, checked."""
         return reference_motion(self.reference, t, linkage)
 
     def agrees(self, t: Array, q: Array, linkage: Linkage) -> Array:
         """Whether joint positions are those of the reference, to one in a million."""
-        begin, _ = self.motion(t, linkage)
+        begin, _ = self.at(t, linkage)
         near = jnp.abs(q - begin) <= 1e-6 * (1 + jnp.abs(begin))
         return (near | ~self.moved).all()
 
@@ -117,7 +117,7 @@ def motion_at(
 ) -> tuple[Array, Array]:
     """Joint positions and velocities of a state of displacements and momenta."""
     delta, momenta, *_ = y
-    position, velocity = motion.motion(t, args.linkage)
+    position, velocity = motion.at(t, args.linkage)
     q = jnp.where(motion.moved, position, args.q0 + jnp.stack(delta))
     matrix, _ = _mass_and_bias(args, q, jnp.zeros(3))
     return q, _split(motion.moved, matrix, velocity, jnp.stack(momenta))
@@ -175,7 +175,7 @@ def prescribed_effort(
     assert motion is not None
     args = Args(linkage, q, link_constants(linkage, q), forces)
     matrix, bias = _mass_and_bias(args, q, qd)
-    velocity = lambda t: motion.motion(t, linkage)[1]
+    velocity = lambda t: motion.at(t, linkage)[1]
     _, demanded = jax.jvp(velocity, (t,), (jnp.ones_like(t),))
     qdd = _split(motion.moved, matrix, demanded, tau - bias)
     return jnp.where(motion.moved, matrix @ qdd + bias - tau, 0)

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from .added_inertia import inertial
-from .forces import Forces
+from .forces import Forces, jumps_of
 from .hybrid_dynamics import (
     health_of_hybrid,
     hybrid_field,
@@ -110,10 +110,8 @@ def _integrate(solver, inputs, keywords, derivatives: bool = False) -> Solution:
         fraction = _OF_TIME_SCALE[0 if (solver.order(term) or 0) >= 8 else 1]
         longest = lambda: _step_for_tangents(ts[0], args, own, fraction)
         controller = bounded(controller, longest)
-    jumps = [f.jump_ts for f in forces if getattr(f, "jump_ts", None) is not None]
-    if jumps:
-        times = jnp.concatenate([jnp.asarray(j, ts.dtype) for j in jumps])
-        controller = landing_on(controller, times)
+    if (jumps := jumps_of(*forces)) is not None:
+        controller = landing_on(controller, jumps.astype(ts.dtype))
     adaptive = isinstance(controller, diffrax.AbstractAdaptiveStepSizeController)
     if adaptive and not isinstance(solver, UnrolledDopri8):
         controller = Watched(controller, health)  # pyright: ignore[reportCallIssue]

@@ -184,8 +184,8 @@ def compiled(
 
     Each keyword names an array argument and its shape, and the decorated function takes
     anything that converts to such an array; or an argument and a function that checks
-    and converts it. Without the compilation a call
-    outside of `jax.jit` would dispatch hundreds of single operations.
+    and converts it. Without the compilation a call outside of `jax.jit` would dispatch
+    hundreds of single operations.
     """
 
     def decorate(function: Callable[..., _T]) -> Callable[..., _T]:

@@ -73,6 +73,7 @@ def step(
     **Raises:** ValueError for malformed arguments.
     """
     _without_states(forces)
+    state = real_state("state", state)
     dt, t = real_array("dt", dt, (), above=0), real_array("t", t, ())
     ts = jnp.stack([t, t + dt])
     effort = JointEffort(tau)

@@ -158,7 +158,7 @@ def simulate(
     motion = prescribed(forces)
     if motion is not None and not is_traced(linkage, state0, ts, motion):
         if not motion.agrees(ts[0], jnp.asarray(state0.q), linkage):
-            begin, _ = motion.motion(ts[0], linkage)
+            begin, _ = motion.at(ts[0], linkage)
             raise ValueError(
                 f"state0.q: expected {begin.tolist()} at the joints whose motion is "
                 f"prescribed, got {np.asarray(state0.q).tolist()}."

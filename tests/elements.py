@@ -21,6 +21,15 @@ class Swing(eqx.Module):
         return self.amplitude * jnp.sin(3 * t + phase), self.amplitude * rate
 
 
+class Hold(eqx.Module):
+    """A reference that stands still."""
+
+    target: jax.Array
+
+    def __call__(self, t, linkage):
+        return self.target, jnp.zeros(3)
+
+
 MOVE = Swing(jnp.array([0.3, 0.5, 0.2]))
 PD = fj.PDController([9.0, 7.0, 5.0], [3.0, 2.0, 1.0], [4.0, 2.0, 9.0], MOVE)
 

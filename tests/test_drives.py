@@ -5,19 +5,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from elements import Hold
 from scipy.linalg import expm
 
 import fdof_jax as fj
 
 # Joints that feel nothing of each other: slides at right angles carry point masses.
 STILL = fj.State(np.zeros(3), np.zeros(3))
-
-
-class Hold(eqx.Module):
-    target: jax.Array
-
-    def __call__(self, t, linkage):
-        return self.target, jnp.zeros(3)
 
 
 def single(inertia=2.0):

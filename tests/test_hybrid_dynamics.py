@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from elements import Swing
 from helpers import random_linkage
 from scipy.integrate import simpson, solve_ivp
 
@@ -34,17 +35,6 @@ class Push(eqx.Module):
         zero = jnp.zeros_like(x)
         rate = self.velocity + self.acceleration * t
         return jnp.stack([x, zero, zero]), jnp.stack([rate, zero, zero])
-
-
-class Swing(eqx.Module):
-    """All joints swing; any of them may follow it."""
-
-    amplitude: jax.Array
-
-    def __call__(self, t, linkage):
-        phase = jnp.array([0.0, 1.0, 2.0])
-        rate = 3 * jnp.cos(3 * t + phase)
-        return self.amplitude * jnp.sin(3 * t + phase), self.amplitude * rate
 
 
 def pendulum(angle, rate, acceleration, ts):

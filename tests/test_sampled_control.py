@@ -1,11 +1,11 @@
 """Sampled control: first order in the period, delay, noise; and the discrete step."""
 
 import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from elements import Hold
 
 import fdof_jax as fj
 
@@ -118,13 +118,6 @@ def test_a_digital_pid_controller_of_motors():
     np.testing.assert_allclose(sampled.own[0].own, whole.own[0].own, atol=1e-8)
 
 
-class Hold(eqx.Module):
-    target: jax.Array
-
-    def __call__(self, t, linkage):
-        return self.target, jnp.zeros(3)
-
-
 @pytest.mark.slow
 def test_a_delay_that_is_too_long_is_told():
     end = lambda delay: fj.simulate_sampled(WHEEL, REST, ramp, 0.1, 2, delay=delay)
@@ -155,6 +148,8 @@ def test_malformed_arguments_are_refused():
         arguments = dict(control=CONTROL, period=0.1, samples=2) | changes
         with pytest.raises(ValueError, match=f"^{name}: expected"):
             fj.simulate_sampled(ARM, START, **arguments)
+    with pytest.raises(ValueError, match="^state: expected a State"):
+        fj.step(ARM, 3.0, np.zeros(3), 0.1)
     with pytest.raises(ValueError, match="dt: expected"):
         fj.step(ARM, START, np.zeros(3), 0.0)
     with pytest.raises(ValueError, match="forces: expected elements without"):
