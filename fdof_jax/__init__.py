@@ -22,6 +22,7 @@ from .dynamics import (
     inverse_dynamics as inverse_dynamics,
     link_energies as link_energies,
 )
+from .files import load as load, save as save
 from .forces import (
     InertialElement as InertialElement,
     JointDamper as JointDamper,

@@ -16,7 +16,7 @@ PUBLIC = {
 }
 # Names whose arguments or results carry no unit.
 UNITLESS = {
-    "existence_factors", "to_mjcf", "fig3", "fig5", "fig7",
+    "existence_factors", "to_mjcf", "fig3", "fig5", "fig7", "load", "save",
 }  # fmt: skip
 # Names that implement something printed in the paper.
 SOURCES = {
