@@ -38,6 +38,16 @@ from .kinematics import (
     tip_jacobian as tip_jacobian,
     tip_position as tip_position,
 )
+from .linearization import (
+    Linearization as Linearization,
+    Modes as Modes,
+    closed_loop_modes as closed_loop_modes,
+    equilibrium as equilibrium,
+    holding_efforts as holding_efforts,
+    inertial_parameters as inertial_parameters,
+    linearize as linearize,
+    regressor as regressor,
+)
 from .linkage import (
     TOPOLOGIES as TOPOLOGIES,
     Linkage as Linkage,
