@@ -56,6 +56,10 @@ from .linkage import (
     from_chain as from_chain,
     to_chain as to_chain,
 )
+from .model_based_control import (
+    ComputedTorque as ComputedTorque,
+    GravityFeedforward as GravityFeedforward,
+)
 from .point_elements import (
     SpringDamper as SpringDamper,
     Tension as Tension,
