@@ -23,6 +23,7 @@ from .dynamics import (
     link_energies as link_energies,
 )
 from .forces import (
+    EffortHistory as EffortHistory,
     InertialElement as InertialElement,
     JointDamper as JointDamper,
     JointEffort as JointEffort,
