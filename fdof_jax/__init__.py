@@ -24,6 +24,7 @@ from .dynamics import (
 )
 from .files import load as load, save as save
 from .forces import (
+    EffortHistory as EffortHistory,
     InertialElement as InertialElement,
     JointDamper as JointDamper,
     JointEffort as JointEffort,
@@ -39,6 +40,16 @@ from .kinematics import (
     tip_jacobian as tip_jacobian,
     tip_position as tip_position,
 )
+from .linearization import (
+    Linearization as Linearization,
+    Modes as Modes,
+    closed_loop_modes as closed_loop_modes,
+    equilibrium as equilibrium,
+    holding_efforts as holding_efforts,
+    inertial_parameters as inertial_parameters,
+    linearize as linearize,
+    regressor as regressor,
+)
 from .linkage import (
     TOPOLOGIES as TOPOLOGIES,
     Linkage as Linkage,
@@ -46,6 +57,10 @@ from .linkage import (
     existence_factors as existence_factors,
     from_chain as from_chain,
     to_chain as to_chain,
+)
+from .model_based_control import (
+    ComputedTorque as ComputedTorque,
+    GravityFeedforward as GravityFeedforward,
 )
 from .point_elements import (
     SpringDamper as SpringDamper,

@@ -89,7 +89,7 @@ class PDController(ScalarElement):
         )
         self.reference = checked_reference(reference)
 
-    def schedule(self, t: Array, linkage: Linkage) -> tuple[Array, Array]:
+    def schedule(self, t: Array, linkage: Linkage) -> tuple[Any, ...]:
         """The reference motion, which does not depend on the state: (q_ref, qd_ref)."""
         return reference_motion(self.reference, t, linkage)
 
@@ -97,20 +97,25 @@ class PDController(ScalarElement):
         # The derivative of jnp.clip at the limit is the mean of both sides'.
         return tuple(
             jnp.where(jnp.abs(effort) <= limit, effort, jnp.clip(effort, -limit, limit))
-            for effort, limit in zip(self._unlimited(scheduled, q, qd), self.limit)
+            for effort, limit in zip(
+                self.unlimited(scheduled, q, qd, linkage), self.limit
+            )
         )
 
-    def _unlimited(self, motion: Any, q: Any, qd: Any) -> list[Array]:
-        return [
+    def unlimited(
+        self, scheduled: Any, q: Any, qd: Any, linkage: Linkage
+    ) -> tuple[Array, ...]:
+        """The efforts before they are limited; a subclass adds to them."""
+        return tuple(
             kp * (position - q) + kd * (velocity - qd)
             for kp, kd, position, velocity, q, qd in zip(
-                self.kp, self.kd, *motion, q, qd
+                self.kp, self.kd, *scheduled, q, qd
             )
-        ]
+        )
 
     def demand(self, t: Array, q: Array, qd: Array, linkage: Linkage) -> Array:
         """The effort before it is limited, (3,) [N or N m]."""
-        return jnp.stack(self._unlimited(self.schedule(t, linkage), q, qd))
+        return jnp.stack(self.unlimited(self.schedule(t, linkage), q, qd, linkage))
 
     @property
     def jump_ts(self) -> Array | None:

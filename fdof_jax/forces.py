@@ -18,14 +18,16 @@ from abc import abstractmethod
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from .linkage import Linkage
 from .reduced_equations import Scalars
-from .validation import real_array
+from .validation import concrete, real_array
 
 Forces = tuple[Any, ...]  # callables (t, q, qd, linkage) -> tau
 
@@ -158,3 +160,43 @@ class JointEffort(ScalarElement):
     def check(self, linkage: Linkage, ts: Array) -> None:
         """The constructor's check again: `equinox.tree_at` asks no constructor."""
         JointEffort(self.tau)
+
+
+class EffortHistory(ScalarElement):
+    """Joint efforts given at times: linear between them, held before and after.
+
+    Steps need not end at the times. Adaptive steps see the efforts where they look at
+    them, and their derivatives not at all: for gradients in `tau`, bound the steps to
+    the distance of two samples (`diffrax.PIDController(..., dtmax=...)`).
+
+    **Arguments:** `ts`: increasing times, one or more [s]; `tau`: the efforts at them,
+    (time, 3) [N or N m].
+
+    **Raises:** ValueError for malformed arguments.
+    """
+
+    ts: Float[Array, " time"]
+    tau: Float[Array, "time joint"]
+
+    def __init__(self, ts: ArrayLike, tau: ArrayLike):
+        self.ts = real_array("ts", ts, (None,))
+        times = concrete(self.ts)
+        if self.ts.size == 0 or times is not None and not (np.diff(times) > 0).all():
+            raise ValueError(f"ts: expected increasing times, got {ts!r}.")
+        self.tau = real_array("tau", tau, (self.ts.size, 3))
+
+    def schedule(self, t, linkage):
+        """The efforts."""
+        columns = jax.vmap(lambda tau: jnp.interp(t, self.ts, tau), in_axes=1)(self.tau)
+        return tuple(columns)
+
+    def respond(self, scheduled, q, qd, linkage):
+        return scheduled
+
+    def check(self, linkage: Linkage, ts: Array) -> None:
+        """The constructor's check again: `equinox.tree_at` asks no constructor."""
+        EffortHistory(self.ts, self.tau)
+
+    def possible(self) -> Array:
+        """Whether the times increase."""
+        return (jnp.diff(self.ts) > 0).all()

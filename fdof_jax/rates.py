@@ -153,7 +153,10 @@ def _rates_and_conditioning(
 
 
 @jax.jit
-def _efforts(c: Constants, delta: Scalars, qd: Scalars, qdd: Scalars) -> Scalars:
+def required_efforts(
+    c: Constants, delta: Scalars, qd: Scalars, qdd: Scalars
+) -> Scalars:
+    """The inverse dynamics: M qdd + bias."""
     m = equations(c, delta, qd)
     y1, y2, y3 = times((m.m11, m.m12, m.m13, m.m22, m.m23, m.m33), qdd)
     b1, b2, b3 = m.bias
@@ -176,7 +179,7 @@ def _change(
     m = _with(added, equations(c, delta, qd))
     solve, _ = _solver(c, m, added, reciprocal)
     qdd = solve(_subtract(tau, m.bias))
-    _, change = jax.jvp(lambda *y: _efforts(c, *y, qdd), (delta, qd), direction)
+    _, change = jax.jvp(lambda *y: required_efforts(c, *y, qdd), (delta, qd), direction)
     x1, x2, x3 = solve(change)
     return -x1, -x2, -x3
 
@@ -250,7 +253,7 @@ def _rates_jvp(primals, tangents):
     change = tuple(row @ moved for row in by_state)
     if not all(isinstance(step, SymbolicZero) for step in jax.tree.leaves(c_dot)):
         _, demanded = jax.jvp(
-            lambda c: _efforts(c, delta, qd, values[1]), (c,), (_dense(c_dot),)
+            lambda c: required_efforts(c, delta, qd, values[1]), (c,), (_dense(c_dot),)
         )
         efforts_dot = _subtract(efforts_dot, demanded)
     if added is not None:

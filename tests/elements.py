@@ -7,6 +7,17 @@ import numpy as np
 
 import fdof_jax as fj
 
+ARM = dict(
+    length=[0.1, 1.0, 0.8, 0.6], com=[[0.5, 0.1], [0.4, 0.0], [0.3, 0.05]],
+    mass=[2.0, 1.5, 1.0], inertia=[0.3, 0.2, 0.1],
+)  # fmt: skip
+START = fj.State(jnp.array([0.3, -0.2, 0.5]), jnp.array([0.5, -0.7, 0.9]))
+
+
+def arm(topology):
+    return fj.Linkage(topology, locked=[0.3, -0.2, 0.4], base_angle=0.2, **ARM)
+
+
 HOOK, ELBOW, TIP = fj.Point(0, 0.3, -0.4), fj.Point(2, 0.5, 0.2), fj.Point(3, 0.4)
 
 
@@ -38,6 +49,15 @@ PLAIN = {
     "damper": fj.JointDamper([0.3, 0.2, 0.1]),
     "effort": fj.JointEffort([1.0, -0.5, 0.3]),
     "PD": PD,
+    "history": fj.EffortHistory(
+        [0.013, 0.0519, 0.0873, 0.3], [[2, 0, 1], [-1, 3, 0], [0, 1, 2], [1, 1, -3]]
+    ),
+    "gravity": fj.GravityFeedforward(
+        [9.0, 7.0, 5.0], [3.0, 2.0, 1.0], [4.0, 50.0, 9.0], MOVE
+    ),
+    "computed torque": fj.ComputedTorque(
+        [9.0, 7.0, 5.0], [3.0, 2.0, 1.0], [90.0, 2.0, 60.0], MOVE, arm("RPR")
+    ),
     "spring": fj.SpringDamper(
         HOOK, ELBOW, stiffness=30.0, damping=2.0, rest_length=0.4
     ),
@@ -74,13 +94,3 @@ WITH_INERTIA = {
     ),
 }
 ALL = PLAIN | WITH_STATE | WITH_INERTIA
-
-ARM = dict(
-    length=[0.1, 1.0, 0.8, 0.6], com=[[0.5, 0.1], [0.4, 0.0], [0.3, 0.05]],
-    mass=[2.0, 1.5, 1.0], inertia=[0.3, 0.2, 0.1],
-)  # fmt: skip
-START = fj.State(jnp.array([0.3, -0.2, 0.5]), jnp.array([0.5, -0.7, 0.9]))
-
-
-def arm(topology):
-    return fj.Linkage(topology, locked=[0.3, -0.2, 0.4], base_angle=0.2, **ARM)

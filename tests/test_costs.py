@@ -6,6 +6,7 @@ import re
 import jax
 import jax.numpy as jnp
 import pytest
+from elements import Hold
 from jax.extend.core import jaxprs_in_params
 
 import fdof_jax as fj
@@ -56,9 +57,10 @@ def test_a_scene_without_elements_costs_the_bare_equations():
     [
         fj.JointDamper(2.0),
         fj.JointEffort([1.0, 2.0, 3.0]),
+        fj.EffortHistory([0.0, 0.2], [[1, 2, 3], [3, 2, 1]]),
         scenes.fig7().forces[0],
     ],
-    ids=["damper", "effort", "PD circle"],
+    ids=["damper", "effort", "history", "PD circle"],
 )
 def test_an_element_adds_its_own_cost_and_three_additions(element):
     """At most: what it does not read, the positions for instance, is not computed."""
@@ -67,6 +69,16 @@ def test_an_element_adds_its_own_cost_and_three_additions(element):
     damper = fj.JointDamper(1.0)
     both = field_flops(damper, element) - field_flops()
     assert both <= element_flops(damper) + own + 6
+
+
+def test_a_model_costs_only_the_controllers_that_have_one():
+    """Of PD control: two errors, their gains and sum, and the limit, at each joint."""
+    gains = 9.0, 3.0, 10.0, Hold(jnp.ones(3))
+    plain, held, computed = (
+        element_flops(kind(*gains))
+        for kind in (fj.PDController, fj.GravityFeedforward, fj.ComputedTorque)
+    )
+    assert plain == 33 < held <= 350 and computed <= 850
 
 
 def test_the_equations_cost_little_and_call_no_transcendental_function():

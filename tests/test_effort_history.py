@@ -1,0 +1,61 @@
+"""Efforts given at times: interpolated, and held beyond them."""
+
+import equinox as eqx
+import jax
+import numpy as np
+import pytest
+from elements import START, arm
+
+import fdof_jax as fj
+
+TS = np.array([0.1, 0.25, 0.3, 0.62])
+TAU = np.random.default_rng(0).normal(size=(4, 3))
+
+
+def test_efforts_are_linear_between_the_times_and_held_beyond():
+    history, zero = fj.EffortHistory(TS, TAU), np.zeros(3)
+    times = np.array([-1, 0.1, 0.17, 0.25, 0.299, 0.5, 0.62, 3])
+    found = jax.vmap(lambda t: history(t, zero, zero, None))(times)
+    expected = np.stack([np.interp(times, TS, column) for column in TAU.T], axis=1)
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
+    constant = fj.EffortHistory([0.5], TAU[:1])
+    np.testing.assert_array_equal(constant(0.7, zero, zero, None), TAU[0])
+
+
+def momentum(linkage, q, qd):
+    """Of the slide on the ground, which an effort in it changes if gravity does not."""
+    zero = np.zeros(3)
+    return fj.inverse_dynamics(linkage, q, zero, qd)[0]
+
+
+@pytest.mark.slow
+def test_the_momentum_gained_is_the_integral_of_the_efforts():
+    linkage = eqx.tree_at(lambda k: k.gravity, arm("PRR"), 0.0)
+    forces = (fj.EffortHistory(TS, TAU),)
+    solution = fj.simulate(linkage, START, [0, 0.7], forces)
+    end = momentum(linkage, solution.q[-1], solution.qd[-1])
+    # Trapezia, and what is held before and after.
+    weights = np.array([0.1 + 0.075, 0.1, 0.025 + 0.16, 0.16 + 0.08])
+    gained = end - momentum(linkage, *START)
+    np.testing.assert_allclose(gained, weights @ TAU[:, 0], atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    "ts, tau, name",
+    [
+        ([0, 0], TAU[:2], "ts: expected increasing"),
+        ([], np.zeros((0, 3)), "ts: expected increasing"),
+        (TS, TAU[:3], "tau: expected"),
+        (TS, TAU[:, 0], "tau: expected"),
+    ],
+)
+def test_malformed_histories_are_refused(ts, tau, name):
+    with pytest.raises(ValueError, match=name):
+        fj.EffortHistory(ts, tau)
+
+
+def test_times_that_no_constructor_saw_are_checked():
+    spoilt = eqx.tree_at(lambda h: h.ts, fj.EffortHistory(TS, TAU), -TS)
+    with pytest.raises(ValueError, match="ts: expected increasing times"):
+        fj.simulate(arm("RRR"), START, [0, 0.1], (spoilt,))
+    assert not jax.jit(lambda h: h.possible())(spoilt)

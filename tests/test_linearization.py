@@ -1,0 +1,242 @@
+"""Linear analysis: differences, known modes, small motions, rest, the regressor."""
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from elements import WITH_INERTIA, Hold
+from helpers import random_linkage
+
+import fdof_jax as fj
+from fdof_jax import scenes
+
+each_topology = pytest.mark.parametrize("topology", fj.TOPOLOGIES)
+STILL = np.zeros(3)
+ROD = fj.Linkage(
+    "RRR",
+    length=[0, 1, 1, 1],
+    com=[[0.5, 0]] * 3,
+    mass=[1] * 3,
+    inertia=[1 / 12] * 3,
+)
+
+
+def motion(topology, seed=0):
+    rng = np.random.default_rng(seed)
+    return random_linkage(topology, rng), *rng.uniform(-1, 1, (3, 3))
+
+
+def modes_at(linkage, forces, *states, ts=0.0):
+    q, qd = (jnp.array(rows) for rows in zip(*states))
+    ts = jnp.broadcast_to(ts, len(q))
+    motion = fj.Solution(ts, q, qd, {}, diffrax.RESULTS.successful)
+    return fj.closed_loop_modes(linkage, forces, motion)
+
+
+def held(linkage, q, kp, kd, others=()):
+    """A PD controller that sags to `q`."""
+    load = fj.holding_efforts(linkage, q, others)
+    load = load - sum(element(0.0, q, jnp.zeros(3), linkage) for element in others)
+    return fj.PDController(kp, kd, jnp.inf, Hold(q + load / np.array(kp)))
+
+
+def slopes(function, y, h=1e-6):
+    columns = [
+        (function(y + h * e) - function(y - h * e)) / (2 * h) for e in np.eye(len(y))
+    ]
+    return np.stack(columns, axis=1)
+
+
+# A and B
+
+
+@each_topology
+def test_a_and_b_are_slopes(topology):
+    linkage, q, qd, tau = motion(topology)
+    forces = fj.JointDamper(0.3), fj.JointEffort(tau), fj.Armature(0.2)
+    A, B = fj.linearize(linkage, forces, fj.State(q, qd))
+
+    def rates(y, effort):
+        total = tau - 0.3 * y[3:] + effort
+        qdd = fj.forward_dynamics(linkage, y[:3], y[3:], total, forces)
+        return np.concatenate([y[3:], qdd])
+
+    y = np.concatenate([q, qd])
+    by_y = slopes(lambda y: rates(y, STILL), y)
+    by_u = slopes(lambda u: rates(y, u), STILL)
+    np.testing.assert_allclose(A, by_y, atol=1e-7 * np.abs(A).max())
+    np.testing.assert_allclose(B, by_u, atol=1e-7 * np.abs(B).max())
+
+
+def test_small_deviations_follow_the_exponential_of_a():
+    linkage, q, *_ = motion("RPR")
+    forces = (held(linkage, q, [60.0, 90.0, 40.0], [5.0, 3.0, 2.0]),)
+    np.testing.assert_allclose(fj.equilibrium(linkage, forces, q + 0.05), q, atol=1e-8)
+    A, _ = fj.linearize(linkage, forces, fj.State(q, STILL))
+    deviation = 1e-5 * np.array([1, -2, 3, 4, -5, 6])
+    start = fj.State(q + deviation[:3], deviation[3:])
+    solution = fj.simulate(linkage, start, [0, 0.5], forces)
+    found = np.concatenate([solution.q[-1] - q, solution.qd[-1]])
+    expected = jax.scipy.linalg.expm(0.5 * A) @ deviation
+    # The square of the deviations is left.
+    np.testing.assert_allclose(found, expected, atol=1e-8)
+    assert np.abs(expected).max() > 1e-5
+
+
+# Modes
+
+
+def test_a_hanging_chain_of_point_masses_swings_as_is_known():
+    """Equal lengths and masses: squares in g/l are the zeros of Laguerre's L3."""
+    linkage = scenes.fig5().linkage
+    hanging, failed = ([-np.pi / 2, 0.0, 0.0], STILL), ([0.3, np.nan, 0.0], STILL)
+    modes = modes_at(linkage, (), hanging, failed)
+    zeros = np.polynomial.laguerre.lagroots([0, 0, 0, 1])
+    expected = np.repeat(np.sqrt(9.81 * zeros), 2)
+    np.testing.assert_allclose(modes.frequency[0], expected, rtol=1e-9)
+    np.testing.assert_allclose(modes.damping[0], 0, atol=1e-9)
+    assert np.isnan(modes.eigenvalues[1]).all() and np.isnan(modes.longest_step[1])
+    weightless = eqx.tree_at(lambda k: k.gravity, linkage, 0.0)
+    free = modes_at(weightless, (), (STILL + 0.3, STILL), (STILL + 0.3, STILL))
+    assert (free.longest_step > 10).all()  # nothing to be stable against
+
+
+def test_the_modes_of_fig_3_at_rest():
+    scene = scenes.fig3()
+    absolute = np.array([-47.72631099390626, -135, -45]) * np.pi / 180
+    q = np.diff(absolute, prepend=0)
+    modes = modes_at(scene.linkage, scene.forces, (q, STILL))
+    # From an independent computation, to four digits.
+    known = [-0.4033, -1.645, -0.3471 - 2.1239j, -0.3471 + 2.1239j, -6.161, -31.36]
+    found = modes.eigenvalues[0]
+    found[2:4] = found[2:4][np.argsort(found[2:4].imag)]
+    np.testing.assert_allclose(found, known, rtol=2e-4)
+    np.testing.assert_allclose(modes.damping[0, [0, 5]], 1)
+    np.testing.assert_allclose(modes.damping[0, 2], 0.3471 / abs(known[2]), rtol=2e-4)
+
+
+@pytest.mark.parametrize("kd", [0.5, 10.0, 40.0])
+def test_longer_steps_than_the_longest_are_unstable(kd):
+    forces = (held(ROD, STILL, [400.0, 300.0, 200.0], [kd] * 3),)
+    modes = modes_at(ROD, forces, (STILL, STILL), (STILL, STILL))
+    z = modes.longest_step[0] * modes.eigenvalues[0]
+    growth = lambda z: np.abs(1 + z + z**2 / 2 + z**3 / 6 + z**4 / 24).max()
+    assert (modes.damping > 0).all()
+    assert growth(z) < 1 < growth(1.15 * z)
+
+
+def test_a_saturated_joint_has_no_gains():
+    kp, kd = np.array([400.0, 300.0, 200.0]), np.array([10.0, 8.0, 6.0])
+    target = jnp.array([0.3, -0.2, 0.1])
+    controller = fj.PDController(kp, kd, [1e3, 30.0, 1e3], Hold(target))
+    q = np.array([0.2, 0.4, 0.3])  # the second joint is off by 180 N m
+    modes = modes_at(ROD, (controller,), (q, STILL), (np.array(target), STILL))
+
+    def rates(y):
+        efforts = kp * (target - y[:3]) - kd * y[3:]
+        efforts = efforts.at[1].set(-30.0)
+        return np.concatenate([y[3:], fj.forward_dynamics(ROD, y[:3], y[3:], efforts)])
+
+    A = slopes(rates, np.concatenate([q, STILL]))
+    expected = np.sort(np.abs(np.linalg.eigvals(A)))
+    np.testing.assert_allclose(modes.frequency[0], expected, rtol=1e-6)
+    assert modes.frequency[1, 0] > 1.3 * modes.frequency[0, 0]
+    np.testing.assert_allclose(modes.longest_step, 2.6 / modes.frequency[:, -1])
+
+
+# Equilibria
+
+
+@each_topology
+def test_equilibria_are_where_the_efforts_hold_the_arm(topology):
+    linkage, q, *_ = motion(topology)
+    tau = fj.holding_efforts(linkage, q)
+    qdd = fj.forward_dynamics(linkage, q, STILL, tau)
+    np.testing.assert_allclose(qdd, 0, atol=1e-9)
+    forces = (held(linkage, q, [300.0, 200.0, 100.0], np.ones(3)),)
+    np.testing.assert_allclose(fj.equilibrium(linkage, forces, q + 0.05), q, atol=1e-8)
+
+
+@pytest.mark.slow
+def test_masses_of_elements_are_held_too():
+    linkage, q, *_ = motion("PRR")
+    actuator = WITH_INERTIA["actuator"]
+    controller = held(linkage, q, [300.0, 200.0, 100.0], np.ones(3), (actuator,))
+    found = fj.equilibrium(linkage, (controller, actuator), q + 0.05)
+    np.testing.assert_allclose(found, q, atol=1e-8)
+
+
+@pytest.mark.parametrize("share, found", [(0.95, True), (1.05, False)])
+def test_loads_that_nothing_holds_have_no_equilibrium(share, found):
+    """The motor of a shoulder can be too weak or too strong for any posture."""
+    tau = share * fj.holding_efforts(ROD, STILL)
+    q = fj.equilibrium(ROD, (fj.JointEffort(tau),), [0.4, 0.1, -0.1])
+    assert np.isfinite(q).all() == found
+    if found:
+        np.testing.assert_allclose(fj.holding_efforts(ROD, q), tau, atol=1e-9)
+
+
+# The regressor
+
+
+@each_topology
+def test_the_regressor_times_the_parameters_is_the_inverse_dynamics(topology):
+    linkage, q, qd, qdd = motion(topology)
+    matrix = fj.regressor(linkage, q, qd, qdd)
+    tau = jnp.einsum("jlp,lp->j", matrix, fj.inertial_parameters(linkage))
+    exact = fj.inverse_dynamics(linkage, q, qd, qdd)
+    np.testing.assert_allclose(tau, exact, rtol=1e-10, atol=1e-10)
+
+
+def test_nine_combinations_of_the_parameters_of_an_rpr_arm_are_identified():
+    """Three are lost.
+
+    The first link's mass is not felt, the second's inertia adds to the first's, with
+    which it turns, and the third's mass to the second's, to which it is hinged.
+    """
+    linkage, *_ = motion("RPR")
+    samples = np.random.default_rng(1).uniform(-2, 2, (3, 40, 3))
+    stacked = jax.vmap(lambda *row: fj.regressor(linkage, *row))(*samples)
+    matrix = np.asarray(stacked).reshape(120, 12)
+    values = np.linalg.svd(matrix, compute_uv=False)
+    assert values[8] > 1e-3 * values[0] and values[9] < 1e-12 * values[0]
+    np.testing.assert_allclose(matrix[:, 0], 0, atol=1e-12)
+    # What is found serves for other motions, though the parameters are not unique.
+    efforts = jax.vmap(lambda *row: fj.inverse_dynamics(linkage, *row))
+    seen = np.asarray(efforts(*samples)).ravel()
+    found, *_ = np.linalg.lstsq(matrix[:60], seen[:60], rcond=1e-10)
+    np.testing.assert_allclose(matrix[60:] @ found, seen[60:], atol=1e-8)
+
+
+# At the door
+
+
+@pytest.mark.parametrize(
+    "element",
+    [
+        fj.FirstOrderLag(fj.JointEffort(np.ones(3)), 0.1),
+        fj.PrescribedMotion(1, Hold(jnp.zeros(3))),
+    ],
+    ids=["state", "prescribed"],
+)
+def test_elements_that_are_no_function_of_the_state_are_refused(element):
+    state = fj.State(STILL, STILL)
+    for call in (
+        lambda: fj.linearize(ROD, (element,), state),
+        lambda: fj.equilibrium(ROD, (element,), STILL),
+        lambda: modes_at(ROD, (element,), (STILL, STILL)),
+    ):
+        with pytest.raises(ValueError, match="forces: expected elements without"):
+            call()
+
+
+def test_modes_are_refused_of_what_is_traced_or_stacked():
+    def of(q):
+        rows = fj.Solution(jnp.zeros(1), q, q, {}, diffrax.RESULTS.successful)
+        return fj.closed_loop_modes(ROD, (), rows).frequency
+
+    for call in jax.jit(of), lambda q: of(q[None]):
+        with pytest.raises(ValueError, match="solution: expected one motion"):
+            call(jnp.zeros((1, 3)))
