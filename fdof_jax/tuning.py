@@ -1,151 +1,227 @@
 """Tuning of PD gains by gradients through the simulation."""
 
-import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
-import diffrax
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 from jax import Array
-from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from .control import PDController, saturated, tip_deviation
+from .bounded_search import METHODS, Evaluation, Run, minimise
+from .ensembles import unstacked
+from .lanes import Lanes
 from .linkage import check_linkage
+from .losses import Tracking, controller_of, relative_demands, tip_errors
 from .scenes import Scene
-from .simulation import simulate
+from .sensitivities import TOLERANCE, sensitivities
+from .simulation import check_elements
 from .solution import Solution
-from .step_control import adaptive
-from .validation import callable_tuple, instance, one_of, real_array, whole_number
-
-_SAMPLES = 1001
-# Stop where the projected gradient has fallen to this part of its start, or where the
-# loss falls by less than this part of itself: its noise is that of the tolerance.
-_GRADIENT_DECREASE = 1e-5
-_LOSS_DECREASE = 1e-7
-# The part of its start that the projected gradient must have fallen to for a stop for
-# another reason to count as convergence.
-_CONVERGED = 1e-3
+from .tune_result import TradeOff, TuneResult, result_of
+from .validation import (
+    callable_tuple,
+    instance,
+    one_of,
+    real_array,
+    whole_number,
+)
 
 Loss = Callable[[Scene, Solution], Array]
 
-
-class History(eqx.Module):
-    """What a tuning run did; entry 0 is the start, one more per accepted iteration.
-
-    - `loss`: mean squared tip error [m^2] with the default loss.
-    - `gradient_norm`: norm of the gradient in the logarithms of the gains, without the
-      components that a bound holds back.
-    - `gains`: kp and kd, in joint order [N/m or N m/rad, N s/m or N m s/rad].
-    - `saturated`: share of the time that each actuator spends at its limit.
-    - `wall_time`: since the start of the run, compilation included [s].
-    """
-
-    loss: Float[np.ndarray, " iteration"]
-    gradient_norm: Float[np.ndarray, " iteration"]
-    gains: Float[np.ndarray, "iteration 2 joint"]
-    saturated: Float[np.ndarray, "iteration joint"]
-    wall_time: Float[np.ndarray, " iteration"]
+_SAMPLES = 1001
+# The worst of an ensemble is smoothed to a power mean of this order: of n members it is
+# at most a factor of n^(1/32) below the worst.
+_WORST = 32
 
 
-class TuneResult(eqx.Module):
-    """A tuned scene and how it was reached.
-
-    - `scene`: the scene with its tuned gains.
-    - `loss`: its loss [m^2 with the default loss].
-    - `history`: the iterations, see `History`.
-    - `lower`, `upper`: the bounds of kp and kd (2, 3).
-    - `converged`: whether the projected gradient has fallen to a thousandth.
-    - `message`: why the run stopped, in words.
-    """
-
-    scene: Scene
-    loss: float
-    history: History
-    lower: Float[np.ndarray, "2 joint"]
-    upper: Float[np.ndarray, "2 joint"]
-    converged: bool
-    message: str
-
-
-def tip_errors(scene: Scene, solution: Solution) -> Float[Array, " residual"]:
-    """Tip error at each output time, scaled so that the squares add up to their mean.
-
-    **Arguments:** a scene whose PD controller tracks a task with a `tip`, and its
-    solution.
-
-    **Returns:** x and y components [m], each over the root of the number of times.
-    """
-    task: Any = _controller(scene)[1].reference
-    deviation = tip_deviation(scene.linkage, task, solution)
-    return deviation.reshape(-1) / solution.ts.size**0.5
-
-
-def _controller(scene: Scene) -> tuple[int, PDController]:
-    found = [(i, f) for i, f in enumerate(scene.forces) if isinstance(f, PDController)]
-    if len(found) != 1:
-        raise ValueError(
-            "scene: expected exactly one PDController among its forces, got "
-            f"{len(found)}."
-        )
-    return found[0]
-
-
-def _with_gains(scene: Scene, gains: Array) -> Scene:
-    index, controller = _controller(scene)
+def with_gains(scene: Scene, gains: Array) -> Scene:
+    """The scene with other kp and kd, the rows of `gains`."""
+    controller = controller_of(scene)
+    index = [force is controller for force in scene.forces].index(True)
     controller = eqx.tree_at(lambda c: (c.kp, c.kd), controller, (gains[0], gains[1]))
     forces = (*scene.forces[:index], controller, *scene.forces[index + 1 :])
     return scene._replace(forces=forces)
 
 
-@eqx.filter_jit
-def _evaluate(
-    log_gains: Array, tuned: Array, scene: Scene, loss: Loss
-) -> tuple[Array, Array, Array, Array]:
-    """Residuals, their Jacobian in the log-gains, saturated shares, and the result."""
+def _lane(z: Array, problem: tuple[Scene, Loss, Array]) -> Evaluation:
+    """One member's loss and its derivatives in the log-gains `z`.
 
-    def residuals(log_gains):
+    `problem`: the scene, the loss, and which gains are tuned.
+    """
+    scene, loss, tuned = problem
+
+    def scene_at(z):
         # A gain of zero has no logarithm: it stays zero.
-        trial = _with_gains(scene, jnp.where(tuned, jnp.exp(log_gains), 0))
-        solution = simulate(
-            trial.linkage,
-            trial.state0,
-            jnp.linspace(0, trial.t1, _SAMPLES),
-            trial.forces,
-            stepsize_controller=adaptive(1e-8, 1e-5),
-            adjoint=diffrax.ForwardMode(),
-            throw=False,
-        )
-        at_limit = saturated(_controller(trial)[1], trial.linkage, solution)
-        value = jnp.asarray(loss(trial, solution))
-        # The square of a scalar loss's root is the loss.
-        value = value.reshape(-1) if value.ndim else jnp.sqrt(value)[None]
-        return value, (value, jnp.mean(at_limit, axis=0))
+        return with_gains(scene, jnp.where(tuned, jnp.exp(z.reshape(2, 3)), 0))
 
-    jacobian, (value, share) = jax.jacfwd(residuals, has_aux=True)(log_gains)
-    return value, jacobian.reshape(value.size, -1), share, jnp.sum(value**2)
+    def residuals(scene, solution):
+        value = jnp.asarray(loss(scene, solution))
+        # The square of a scalar loss's root is the loss.
+        return value.reshape(-1) if value.ndim else jnp.sqrt(value)[None]
+
+    ts = jnp.linspace(0, scene.t1, _SAMPLES)
+    value, jacobian, trial, solution = sensitivities(scene_at, residuals, z, ts)
+    demands = jnp.abs(relative_demands(trial, solution))
+    facts = dict(
+        saturated=jnp.mean(demands > 1, axis=0),
+        effort=jnp.sqrt(jnp.mean(jnp.minimum(demands, 1) ** 2, axis=0)),
+        steps=solution.stats["num_steps"],
+    )
+    if hasattr(controller_of(trial).reference, "tip"):
+        facts["tip_error"] = jnp.sqrt(jnp.sum(tip_errors(trial, solution) ** 2))
+    return Evaluation(
+        jnp.sum(value**2), 2 * jacobian.T @ value, 2 * jacobian.T @ jacobian, facts
+    )  # type: ignore[arg-type]
+
+
+def _check(name: str, scene: Any, loss: Any) -> None:
+    instance(name, scene, Scene)
+    check_linkage(scene.linkage)
+    t1 = real_array(f"{name}.t1", scene.t1, (), above=0)
+    callable_tuple(f"{name}.forces", scene.forces)
+    controller = controller_of(scene)
+    check_elements(scene.forces, scene.linkage, jnp.stack([jnp.zeros_like(t1), t1]))
+    if isinstance(loss, Tracking):
+        loss.check(scene)
+    if isinstance(loss, Tracking) or loss is tip_errors:
+        if not hasattr(controller.reference, "tip"):
+            raise ValueError(
+                "loss: expected one of your own, because the reference has no `tip` "
+                f"for the tip error, got {controller.reference!r}."
+            )
+
+
+def _bounds(scene: Scene, factor: Any, bounds: Any) -> tuple[np.ndarray, ...]:
+    """Of kp and kd: the start, the least, the greatest; (2, 3) each."""
+    controller = controller_of(scene)
+    start = np.stack([np.asarray(controller.kp), np.asarray(controller.kd)])
+    if bounds is None:
+        factor = float(real_array("factor", factor, (), above=1))
+        return start, start / factor, start * factor
+    if not isinstance(bounds, tuple | list) or len(bounds) != 2:
+        raise ValueError(f"bounds: expected (lower, upper), got {bounds!r}.")
+    lower, upper = (
+        np.asarray(real_array(f"bounds[{i}]", b, (2, 3), minimum=0))
+        for i, b in enumerate(bounds)
+    )
+    if not ((lower <= start) & (start <= upper)).all():
+        raise ValueError(
+            "bounds: expected the scene's gains between them, got "
+            f"{lower.tolist()} and {upper.tolist()} around {start.tolist()}."
+        )
+    if (lower[start > 0] == 0).any():
+        raise ValueError("bounds: expected positive least gains, got 0.")
+    # Gains of zero stay zero.
+    return start, np.where(start > 0, lower, 0), np.where(start > 0, upper, 0)
+
+
+def _started(box, starts: int, draw: np.random.Generator) -> tuple[np.ndarray, ...]:
+    """Starts and bounds in the log-gains, (start, 6) each."""
+    real = (box[0] > 0).ravel()
+    here, least, most = (np.log(np.where(real, b.ravel(), 1)) for b in box)
+    others = draw.uniform(least, most, (starts - 1, 6))
+    same = (np.broadcast_to(a, (starts, 6)) for a in (least, most))
+    return np.concatenate([here[None], others]), *same
+
+
+def _search(
+    scenes: Sequence[Scene],
+    losses: Sequence[Any],
+    *,
+    factor: ArrayLike = 4.0,
+    bounds: tuple[ArrayLike, ArrayLike] | None = None,
+    ensemble: Scene | None = None,
+    over: str = "mean",
+    method: str = "levenberg-marquardt",
+    starts: int = 1,
+    seed: int = 0,
+    max_steps: int = 50,
+    report: Callable[[str], Any] | None = None,
+) -> list[TuneResult]:
+    """One result per scene and loss; the keywords are those of `tune`."""
+    one_of("method", method, tuple(METHODS))
+    one_of("over", over, ("mean", "worst"))
+    starts = whole_number("starts", starts, 1)
+    draw = np.random.default_rng(whole_number("seed", seed, 0))
+    max_steps = whole_number("max_steps", max_steps, 1)
+    if not (report is None or callable(report)):
+        raise ValueError(f"report: expected a callable or None, got {report!r}.")
+    for scene, loss in zip(scenes, losses):
+        _check("scene", scene, loss)
+    boxes = [_bounds(scene, factor, bounds) for scene in scenes]
+    if ensemble is None:
+        members = [[scene] for scene in scenes]
+    else:
+        members = [unstacked("ensemble", ensemble)] * len(losses)
+        for i, member in enumerate(members[0]):
+            _check(f"ensemble[{i}]", member, losses[0])
+    problems = [
+        [(member, loss, lower > 0) for member in row]
+        for row, loss, (_, lower, _) in zip(members, losses, boxes)
+    ]
+    lanes = Lanes(_lane, problems, starts, {"mean": 1, "worst": _WORST}[over])
+    columns = zip(*(_started(box, starts, draw) for box in boxes))
+    z, low, high = map(np.concatenate, columns)
+    runs = minimise(
+        lanes, z, low, high, method=method, max_steps=max_steps,
+        report=_reporter(report),
+    )  # fmt: skip
+    settings = dict(
+        method=method,
+        over=over if ensemble is not None else "one scene",
+        solver="Tsit5",
+        tolerance=TOLERANCE,
+        samples=_SAMPLES,
+        dtype=str(jnp.result_type(float)),
+    )
+    results = []
+    for i, (scene, (_, lower, upper)) in enumerate(zip(scenes, boxes)):
+        mine = runs[i * starts : (i + 1) * starts]
+        results.append(result_of(scene, mine, lower, upper, settings, with_gains))
+    return results
+
+
+def _reporter(report: Callable[[str], Any] | None) -> Callable[[int, list[Run]], None]:
+    def told(number: int, runs: list[Run]) -> None:
+        if report is None:
+            return
+        best = min(runs, key=lambda run: run.best.loss).best
+        error = best.facts.get("tip_error")
+        what = (
+            f"loss {best.loss:.6g}"
+            if error is None
+            else f"rms tip error {1e3 * np.sqrt(np.mean(error**2)):.5g} mm"
+        )
+        going = sum(run.reason is None for run in runs)
+        report(
+            f"{number:4d}  {what}, projected gradient {best.gradient_norm:.2g}, "
+            f"{going} of {len(runs)} runs going on"
+        )
+
+    return told
 
 
 def tune(
     scene: Scene,
     *,
-    factor: float = 4.0,
+    factor: ArrayLike = 4.0,
     bounds: tuple[ArrayLike, ArrayLike] | None = None,
     loss: Loss = tip_errors,
-    method: str = "gauss-newton",
+    ensemble: Scene | None = None,
+    over: str = "mean",
+    method: str = "levenberg-marquardt",
+    starts: int = 1,
+    seed: int = 0,
     max_steps: int = 50,
-    progress_meter: diffrax.AbstractProgressMeter = diffrax.NoProgressMeter(),
+    report: Callable[[str], Any] | None = None,
 ) -> TuneResult:
     """Gains of a scene's PD controller that make its loss small, within bounds.
 
     The unknowns are the logarithms of kp and kd; gains of zero stay zero. The
     derivatives are exact (forward mode through the adaptive solve, at a tolerance of
     1e-8 in float64 and 1e-5 in float32). A second call with other numbers compiles
-    nothing.
+    nothing, nor does one with another method.
 
     **Arguments:**
 
@@ -155,172 +231,67 @@ def tune(
       (2, 3), first row kp, second kd [N/m or N m/rad, N s/m or N m s/rad].
     - `loss`: `(scene, solution) -> residuals`, an array whose sum of squares is made
       small, or a scalar that is made small itself and is never negative (for which
-      Gauss-Newton has little to go by). By default `tip_errors`: the mean squared tip
-      error over [0, t1].
-    - `method`: "gauss-newton" (Levenberg-Marquardt with an active set for the bounds)
-      or "adam" (optax, clipped to the bounds).
-    - `max_steps`: the greatest number of evaluations after the first.
-    - `progress_meter`: one of diffrax's, for instance `diffrax.TextProgressMeter()`.
+      Levenberg-Marquardt has little to go by). By default `tip_errors`: the mean
+      squared tip error over [0, t1]. `Tracking` puts a price on effort.
+    - `ensemble`: scenes like `scene` stacked along a leading axis (`stacked`,
+      `perturbed`). The gains, which are the same for all and start from those of
+      `scene`, are judged by them instead.
+    - `over`: "mean", the mean loss of the ensemble, or "worst", its worst as a power
+      mean of order 32.
+    - `method`: "levenberg-marquardt", "l-bfgs" or "adam" (the latter two by optax).
+    - `starts`: how many runs: one from the scene's gains, the others from random ones
+      within the bounds. The best counts.
+    - `seed`: of the random starts.
+    - `max_steps`: the greatest number of evaluations of a run after the first.
+    - `report`: is given a line of progress after each step, `print` for instance.
 
     **Returns:** a `TuneResult`, which says why it stopped.
 
     **Raises:** ValueError for malformed arguments, and if the scene cannot be simulated
     from its start.
     """
-    instance("scene", scene, Scene)
-    check_linkage(scene.linkage)
-    t1 = real_array("scene.t1", scene.t1, (), above=0)
-    callable_tuple("scene.forces", scene.forces)
-    controller = _controller(scene)[1]
-    one_of("method", method, ("gauss-newton", "adam"))
-    max_steps = whole_number("max_steps", max_steps, 1)
-    instance("progress_meter", progress_meter, diffrax.AbstractProgressMeter)
-    if not callable(loss):
-        raise ValueError(f"loss: expected a callable, got {loss!r}.")
-    if loss is tip_errors and not hasattr(controller.reference, "tip"):
-        raise ValueError(
-            "loss: expected one of your own, because the reference has no `tip` for "
-            f"the default tip error, got {controller.reference!r}."
-        )
-    factor_ = float(real_array("factor", factor, (), above=1))
-    controller.check(scene.linkage, jnp.stack([jnp.zeros_like(t1), t1]))
-    start = np.stack([np.asarray(controller.kp), np.asarray(controller.kd)])
-    if bounds is None:
-        lower, upper = start / factor_, start * factor_
-    else:
-        if not isinstance(bounds, tuple | list) or len(bounds) != 2:
-            raise ValueError(f"bounds: expected (lower, upper), got {bounds!r}.")
-        lower, upper = (
-            np.asarray(real_array(f"bounds[{i}]", b, (2, 3), minimum=0))
-            for i, b in enumerate(bounds)
-        )
-        if not ((lower <= start) & (start <= upper)).all():
-            raise ValueError(
-                "bounds: expected the scene's gains between them, got "
-                f"{lower.tolist()} and {upper.tolist()} around {start.tolist()}."
-            )
-    tuned = start > 0
-    if (lower[tuned] == 0).any():
-        raise ValueError("bounds: expected positive least gains, got 0.")
-    low, high, z = (
-        np.log(np.where(tuned, a, 1)).ravel() for a in (lower, upper, start)
-    )
-
-    scene = jax.tree.map(
-        lambda a: jnp.asarray(a, dtype=float) if eqx.is_array_like(a) else a, scene
-    )
-    began = time.perf_counter()
-    rows: list[tuple[Any, ...]] = []
-
-    def evaluate(z: np.ndarray):
-        values = _evaluate(
-            jnp.asarray(z).reshape(2, 3), jnp.asarray(tuned), scene, loss
-        )
-        return tuple(np.asarray(v) for v in values)
-
-    def projected(z: np.ndarray, gradient: np.ndarray) -> np.ndarray:
-        held = ((z <= low) & (gradient > 0)) | ((z >= high) & (gradient < 0))
-        return np.where(held | ~tuned.ravel(), 0, gradient)
-
-    def record(z, gradient, value, share):
-        gains = np.where(tuned, np.exp(z).reshape(2, 3), 0)
-        norm = np.linalg.norm(projected(z, gradient))
-        rows.append((value, norm, gains, share, time.perf_counter() - began, z))
-
-    residuals, jacobian, share, value = evaluate(z)
-    if not (np.isfinite(value) and np.isfinite(jacobian).all()):
-        raise ValueError(
-            f"scene: expected one that can be simulated up to t1 = {float(t1):g} s, "
-            f"got a loss of {float(value):g} or a gradient that is not finite."
-        )
-    gradient = 2 * jacobian.T @ residuals
-    record(z, gradient, value, share)
-
-    damping = 1e-3
-    optimiser = optax.adam(0.05)
-    optimiser_state = optimiser.init(jnp.asarray(z))
-    reason = f"stopped after {max_steps} evaluations"
-    meter_state = progress_meter.init()
-    for step in range(1, max_steps + 1):
-        if rows[-1][1] <= _GRADIENT_DECREASE * rows[0][1]:
-            reason = "the projected gradient vanishes"
-            break
-        if method == "adam":
-            update, optimiser_state = optimiser.update(
-                jnp.asarray(gradient), optimiser_state
-            )
-            trial = np.clip(z + np.asarray(update), low, high)
-        else:
-            step_ = _bounded_step(jacobian, gradient / 2, damping, low - z, high - z)
-            trial = z + step_
-        new = evaluate(trial)
-        meter_state = progress_meter.step(meter_state, jnp.asarray(step / max_steps))
-        finite = np.isfinite(new[1]).all() and np.isfinite(new[3])
-        if method == "gauss-newton" and not (finite and new[3] < value):
-            damping *= 8
-            if damping > 1e8:
-                reason = "no step decreases the loss any further"
-                break
-            continue
-        if not finite:
-            reason = "a step led to gains with which the simulation fails"
-            break
-        decrease = (value - new[3]) / value
-        z, (residuals, jacobian, share, value) = trial, new
-        gradient = 2 * jacobian.T @ residuals
-        damping = max(damping / 4, 1e-9)
-        record(z, gradient, value, share)
-        if method == "gauss-newton" and decrease < _LOSS_DECREASE:
-            reason = "the loss decreases no further"
-            break
-    progress_meter.close(meter_state)
-    # Adam's last iterate need not be its best: what is said is said of the best.
-    value, norm, gains, _, _, z = min(rows, key=lambda row: row[0])
-    columns = list(zip(*rows))[:5]
-    return TuneResult(
-        scene=_with_gains(scene, jnp.asarray(gains)),
-        loss=float(value),
-        history=History(*(np.asarray(column) for column in columns)),
-        lower=lower,
-        upper=upper,
-        converged=bool(0 < rows[0][1] and norm <= _CONVERGED * rows[0][1]),
-        message=_message(reason, rows, z, low, high, tuned.ravel()),
-    )
+    keywords = {k: v for k, v in locals().items() if k not in ("scene", "loss")}
+    return _search([scene], [loss], **keywords)[0]
 
 
-def _message(reason, rows, z, low, high, tuned) -> str:
-    """The reason, and what a reader might take for convergence but is not."""
-    _, norm, _, share, *_ = rows[0]
-    if norm == 0 and share.min() == 1:
-        return "the gradient is zero because every actuator is at its limit throughout"
-    if norm == 0:
-        return "the gradient is zero at the start"
-    held = int(np.sum(tuned & ((z <= low) | (z >= high))))
-    return f"{reason}; {held} of {int(tuned.sum())} gains are at a bound"
+def tune_each(
+    scenes: Sequence[Scene], *, loss: Loss = tip_errors, **keywords: Any
+) -> list[TuneResult]:
+    """`tune` for several scenes of one structure, in one compiled program.
 
+    The topologies may differ.
 
-def _bounded_step(
-    jacobian: np.ndarray,
-    half_gradient: np.ndarray,
-    damping: float,
-    low: np.ndarray,
-    high: np.ndarray,
-) -> np.ndarray:
-    """The Levenberg-Marquardt step inside a box.
+    **Arguments:** `scenes`: a list or tuple; the others as in `tune`, but without an
+    `ensemble`.
 
-    Components that leave the box are set to its side one round at a time, the others
-    solved anew; a component that starts on a side and is drawn outwards stays there.
+    **Returns:** a list of `TuneResult`s.
+
+    **Raises:** ValueError as `tune`, and for scenes of different structure.
     """
-    normal = jacobian.T @ jacobian
-    normal += damping * np.diag(np.diag(normal) + 1e-12 * np.trace(normal) + 1e-300)
-    step = np.zeros_like(low)
-    free = ~(((low >= 0) & (half_gradient > 0)) | ((high <= 0) & (half_gradient < 0)))
-    while free.any():
-        fixed = half_gradient + normal[:, ~free] @ step[~free]
-        step[free] = -np.linalg.solve(normal[np.ix_(free, free)], fixed[free])
-        outside = free & ((step < low) | (step > high))
-        if not outside.any():
-            break
-        step[outside] = np.clip(step, low, high)[outside]
-        free &= ~outside
-    return step
+    if not isinstance(scenes, list | tuple) or isinstance(scenes, Scene) or not scenes:
+        raise ValueError(f"scenes: expected a list of scenes, got {scenes!r}.")
+    if keywords.get("ensemble") is not None:
+        raise ValueError("ensemble: expected none, as each scene is tuned for itself.")
+    return _search(scenes, [loss] * len(scenes), **keywords)
+
+
+def trade_off(scene: Scene, prices: ArrayLike, **keywords: Any) -> TradeOff:
+    """The least tip errors for their efforts: `tune` for each price, in one program.
+
+    **Arguments:** `scene`; `prices` of effort (price,), see `Tracking` [m^2]; the
+    others as in `tune`, but for `loss`.
+
+    **Returns:** a `TradeOff`, in the order of the prices.
+
+    **Raises:** ValueError as `tune`.
+    """
+    prices = np.asarray(real_array("prices", prices, (None,), minimum=0))
+    if prices.size == 0:
+        raise ValueError("prices: expected at least one, got none.")
+    losses = [Tracking(effort=price) for price in prices]
+    results = _search([scene] * len(prices), losses, **keywords)
+    last = [np.argmin(r.history.loss) for r in results]
+    effort = [np.linalg.norm(r.history.effort[i]) for r, i in zip(results, last)]
+    return TradeOff(
+        prices, np.array([r.tip_error for r in results]), np.array(effort), results
+    )

@@ -1,0 +1,256 @@
+"""Minimisation within bounds by derivatives, many runs at once.
+
+The functions are evaluated for all runs that still go on together; what comes here is
+the little that follows an evaluation, on the host.
+"""
+
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from scipy.linalg import cholesky, solve_triangular
+from scipy.optimize import lsq_linear
+
+# Stop where a change of the unknowns by 1 would hardly change the loss, to first order,
+# or where it falls by less than this part of itself.
+_GRADIENT_OF_LOSS = 1e-6
+_LOSS_DECREASE = 1e-5
+# Where the loss itself can vanish, its gradient is compared with that at the start.
+_GRADIENT_DECREASE = 1e-10
+# What the projected gradient must have fallen to for a stop for another reason to count
+# as convergence: part of the loss.
+_CONVERGED = 1e-3
+# No step changes an unknown by more: a factor of 7 where unknowns are logarithms.
+_LONGEST_STEP = 2.0
+
+
+class Evaluation(NamedTuple):
+    """A function at one point per run.
+
+    - `loss` (run,); `gradient` (run, n); `curvature` (run, n, n): semidefinite, Gauss
+      and Newton's for instance.
+    - `facts`: arrays (run, ...) to be kept with the point.
+    """
+
+    loss: np.ndarray
+    gradient: np.ndarray
+    curvature: np.ndarray
+    facts: dict[str, np.ndarray]
+
+    def row(self, index: int) -> "Evaluation":
+        return jax.tree.map(lambda a: a[index], self)
+
+
+class Row(NamedTuple):
+    """An accepted point of a run: `gradient_norm` without what bounds hold back."""
+
+    z: np.ndarray
+    loss: float
+    gradient_norm: float
+    facts: dict[str, np.ndarray]
+    wall_time: float
+
+
+class LevenbergMarquardt:
+    """Steps of the damped quadratic model in the box, which only ever go down."""
+
+    def __init__(self, z: np.ndarray):
+        self.damping, self.growth = 1e-3, 4
+
+    def step(self, z, here: Evaluation, low, high) -> np.ndarray:
+        normal = here.curvature.copy()
+        scale = np.diag(normal)
+        normal += np.diag(self.damping * scale + 1e-12 * scale.sum() + 1e-300)
+        return box_minimum(normal, here.gradient, low - z, high - z)
+
+    def accepted(self) -> None:
+        self.damping, self.growth = max(self.damping / 4, 1e-9), 4
+
+    def refused(self) -> bool:
+        """Whether there is anything left to try."""
+        self.damping *= self.growth
+        self.growth *= 2
+        return self.damping <= 1e8
+
+
+class LBFGS:
+    """optax's L-BFGS directions, within the box by projection, halved until down."""
+
+    def __init__(self, z: np.ndarray):
+        self.optimiser = optax.scale_by_lbfgs()
+        self.update = jax.jit(self.optimiser.update)
+        self.state: Any = self.optimiser.init(jnp.asarray(z))
+        self.direction: np.ndarray | None = None
+        self.share = 1.0
+
+    def step(self, z, here: Evaluation, low, high) -> np.ndarray:
+        held = _held(z, here.gradient, low, high)
+        if self.direction is None:
+            update, self.state = self.update(
+                jnp.asarray(here.gradient), self.state, jnp.asarray(z)
+            )
+            self.direction = -np.asarray(update)
+        direction = np.where(held, 0, self.direction)
+        if direction @ here.gradient >= 0:
+            direction = np.where(held, 0, -here.gradient)
+        # The first direction is the gradient itself, whose length says nothing.
+        if int(self.state.count) == 1:
+            direction = 0.3 * direction / np.abs(direction).max()
+        return np.clip(z + self.share * direction, low, high) - z
+
+    def accepted(self) -> None:
+        self.direction, self.share = None, 1.0
+
+    def refused(self) -> bool:
+        self.share /= 4
+        return self.share > 1e-8
+
+
+class Adam:
+    """optax's Adam, clipped to the box; its loss may rise on the way."""
+
+    def __init__(self, z: np.ndarray):
+        self.optimiser = optax.adam(0.05)
+        self.state: Any = self.optimiser.init(jnp.asarray(z))
+
+    def step(self, z, here: Evaluation, low, high) -> np.ndarray:
+        update, self.state = self.optimiser.update(
+            jnp.asarray(here.gradient), self.state
+        )
+        return np.clip(z + np.asarray(update), low, high) - z
+
+    def accepted(self) -> None:
+        pass
+
+
+METHODS: dict[str, Any] = {
+    "levenberg-marquardt": LevenbergMarquardt,
+    "l-bfgs": LBFGS,
+    "adam": Adam,
+}
+
+
+def box_minimum(
+    matrix: np.ndarray, slope: np.ndarray, low: np.ndarray, high: np.ndarray
+) -> np.ndarray:
+    """Where slope @ x + x @ matrix @ x / 2 is least in a box, of a definite matrix.
+
+    Unknowns without room are 0.
+    """
+    result = np.zeros_like(slope)
+    room = low < high
+    if not room.any():
+        return result
+    # Of unit diagonal: unknowns of any size are alike to the factorisation.
+    scale = 1 / np.sqrt(np.diag(matrix)[room])
+    factor = cholesky(matrix[np.ix_(room, room)] * scale[:, None] * scale)
+    target = -solve_triangular(factor, slope[room] * scale, trans="T")
+    bounds = low[room] / scale, high[room] / scale
+    found = lsq_linear(factor, target, bounds, method="bvls", tol=1e-12)
+    result[room] = np.clip(found.x * scale, low[room], high[room])
+    return result
+
+
+def _held(z, gradient, low, high) -> np.ndarray:
+    return ((z <= low) & (gradient > 0)) | ((z >= high) & (gradient < 0))
+
+
+class Run:
+    """One run: where it is, what it has passed, and why it has stopped, if it has."""
+
+    def __init__(self, method: Any, z: np.ndarray, low: np.ndarray, high: np.ndarray):
+        self.method = method(z)
+        self.z, self.low, self.high = z, low, high
+        self.rows: list[Row] = []
+        self.reason: str | None = None
+        self.at: Evaluation | None = None
+
+    def arrive(self, z: np.ndarray, here: Evaluation, began: float) -> None:
+        """Take the result of an evaluation: accept the point or refuse it."""
+        finite = np.isfinite(here.loss) and np.isfinite(here.gradient).all()
+        finite = finite and np.isfinite(here.curvature).all()
+        adam = isinstance(self.method, Adam)
+        if self.at is not None and not (finite and (adam or here.loss < self.at.loss)):
+            if adam:
+                self.reason = "a step led to where the simulation fails"
+            elif not self.method.refused():
+                self.reason = "no step decreases the loss any further"
+            return
+        if not finite:
+            self.reason = "the simulation or its derivative fails at the start"
+        held = _held(z, here.gradient, self.low, self.high) | (self.low >= self.high)
+        norm = float(np.linalg.norm(np.where(held, 0, here.gradient)))
+        before, self.at, self.z = self.at, here, z
+        self.rows.append(
+            Row(z, float(here.loss), norm, here.facts, time.perf_counter() - began)
+        )
+        if self.reason is not None:
+            return
+        if before is not None:
+            self.method.accepted()
+        if self._small(norm, here.loss, _GRADIENT_OF_LOSS):
+            self.reason = "the projected gradient vanishes"
+        elif before is not None and not adam:
+            if before.loss - here.loss < _LOSS_DECREASE * before.loss:
+                self.reason = "the loss decreases no further"
+
+    def _small(self, norm: float, loss: float, of_loss: float) -> bool:
+        return norm <= max(
+            _GRADIENT_DECREASE * self.rows[0].gradient_norm, of_loss * loss
+        )
+
+    def next(self) -> np.ndarray:
+        assert self.at is not None
+        low = np.maximum(self.low, self.z - _LONGEST_STEP)
+        high = np.minimum(self.high, self.z + _LONGEST_STEP)
+        step = self.method.step(self.z, self.at, low, high)
+        # z + (high - z) may be beyond high by rounding.
+        return np.clip(self.z + step, low, high)
+
+    @property
+    def best(self) -> Row:
+        """Adam's last point need not be its best: what is said is said of the best."""
+        return min(self.rows, key=lambda row: row.loss)
+
+    @property
+    def converged(self) -> bool:
+        best = self.best
+        moved = self.rows[0].gradient_norm > 0
+        small = self._small(best.gradient_norm, best.loss, _CONVERGED)
+        return bool(moved and np.isfinite(best.loss) and small)
+
+
+def minimise(
+    evaluate: Callable[[np.ndarray, np.ndarray], Evaluation],
+    start: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
+    *,
+    method: str,
+    max_steps: int,
+    report: Callable[[int, list[Run]], None],
+) -> list[Run]:
+    """Minimise a function per run, from (run, n) starts within (run, n) bounds.
+
+    **Arguments:** `evaluate`: `(z, runs)`, points of the runs with these indices, to
+    their `Evaluation`; `method`: one of `METHODS`; `max_steps`: evaluations after the
+    first; `report`: told the number of the step and the runs after each.
+    """
+    began = time.perf_counter()
+    runs = [Run(METHODS[method], *row) for row in zip(start, low, high)]
+    for number in range(max_steps + 1):
+        going = [i for i, run in enumerate(runs) if run.reason is None]
+        if not going:
+            break
+        trials = [runs[i].next() if number else runs[i].z for i in going]
+        found = evaluate(np.stack(trials), np.array(going))
+        for place, (i, trial) in enumerate(zip(going, trials)):
+            runs[i].arrive(trial, found.row(place), began)
+        report(number, runs)
+    for run in runs:
+        run.reason = run.reason or f"stopped after {max_steps} evaluations"
+    return runs

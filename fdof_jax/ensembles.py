@@ -1,0 +1,170 @@
+"""Ensembles: scenes that differ in numbers, stacked along a leading axis."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import ArrayLike
+
+from .kinematics import tip_jacobian, tip_position
+from .linkage import Linkage, State, check_linkage
+from .losses import controller_of
+from .scenes import Scene
+from .validation import instance, real_array, whole_number
+
+
+def stacked(scenes: Sequence[Any], name: str = "scenes") -> Any:
+    """Scenes of one structure as one, with a leading axis on every array.
+
+    **Raises:** ValueError for scenes of different structure.
+    """
+    if not isinstance(scenes, list | tuple) or isinstance(scenes, Scene) or not scenes:
+        raise ValueError(f"{name}: expected a list of scenes, got {scenes!r}.")
+    dtype = jnp.result_type(float)
+    first, *others = (eqx.partition(scene, eqx.is_array_like) for scene in scenes)
+    for index, other in enumerate(others, start=1):
+        if not eqx.tree_equal(other[1], first[1]) or jax.tree.map(
+            np.shape, other[0]
+        ) != jax.tree.map(np.shape, first[0]):
+            raise ValueError(
+                f"{name}[{index}]: expected one like {name}[0] but for numbers, got "
+                f"{scenes[index]!r} and {scenes[0]!r}."
+            )
+    rows = [first[0], *(other[0] for other in others)]
+    return eqx.combine(
+        jax.tree.map(lambda *a: np.stack([np.asarray(x, dtype) for x in a]), *rows),
+        first[1],
+    )
+
+
+def unstacked(name: str, scenes: Scene) -> list[Scene]:
+    """The members of stacked scenes."""
+    instance(name, scenes, Scene)
+    arrays, rest = eqx.partition(scenes, eqx.is_array_like)
+    sizes = {np.shape(leaf)[:1] for leaf in jax.tree.leaves(arrays)}
+    if len(sizes) != 1 or sizes <= {(), (0,)}:
+        raise ValueError(
+            f"{name}: expected scenes stacked along a leading axis of one size (see "
+            f"`stacked`), got axes {sorted(sizes)}."
+        )
+    leaves, structure = jax.tree.flatten(arrays)
+    return [
+        eqx.combine(jax.tree.unflatten(structure, row), rest)
+        for row in zip(*(np.asarray(leaf) for leaf in leaves))
+    ]
+
+
+def with_payload(linkage: Linkage, mass: ArrayLike) -> Linkage:
+    """The linkage with a point mass at its tip, as part of its last link.
+
+    **Arguments:** `mass` [kg], not negative.
+
+    **Raises:** ValueError for malformed arguments.
+    """
+    check_linkage(linkage)
+    mass = real_array("mass", mass, (), minimum=0)
+    tip = jnp.stack([linkage.length[3], jnp.zeros(())])
+    own, center = linkage.mass[2], linkage.com[2]
+    total = own + mass
+    # Of two masses about their common centre: the reduced mass at their distance.
+    reduced = own * mass / jnp.where(total > 0, total, 1)
+    shift = mass / jnp.where(total > 0, total, 1) * (tip - center)
+    inertia = linkage.inertia[2] + reduced * jnp.sum((tip - center) ** 2)
+    return eqx.tree_at(
+        lambda arm: (arm.mass, arm.com, arm.inertia),
+        linkage,
+        (
+            linkage.mass.at[2].set(total),
+            linkage.com.at[2].set(center + shift),
+            linkage.inertia.at[2].set(inertia),
+        ),
+    )
+
+
+def _displaced(linkage: Linkage, q: np.ndarray, offset: np.ndarray) -> np.ndarray:
+    """Joint positions with the tip moved by `offset`, the last link's angle kept."""
+    aim, there = np.asarray(tip_position(linkage, q)) + offset, q
+    for _ in range(50):
+        missing = np.append(aim - np.asarray(tip_position(linkage, there)), 0.0)
+        slopes = np.asarray(tip_jacobian(linkage, there))
+        there = there + np.linalg.solve(slopes, missing)
+        if np.linalg.norm(missing) < 1e-9:
+            return there
+    raise ValueError(
+        "start_offset: expected one within the linkage's reach, got "
+        f"{np.linalg.norm(offset):g} m."
+    )
+
+
+def perturbed(
+    scene: Scene,
+    members: int,
+    *,
+    payload: ArrayLike = (0.0, 0.0),
+    link_error: ArrayLike = 0.0,
+    start_offset: ArrayLike = 0.0,
+    speed: ArrayLike = (1.0, 1.0),
+    seed: int = 0,
+) -> Scene:
+    """Random variations of a scene, stacked: an ensemble for robust tuning.
+
+    All are drawn uniformly and independently.
+
+    **Arguments:**
+
+    - `scene`: its controller tracks a reference with a `period`, if `speed` varies.
+    - `members`: how many.
+    - `payload`: least and greatest point mass at the tip [kg].
+    - `link_error`: greatest relative error of each mass, mass centre and inertia.
+    - `start_offset`: greatest distance of the tip from its start [m], in any direction.
+    - `speed`: least and greatest speed of the reference over its own.
+    - `seed`: of the draw.
+
+    **Raises:** ValueError for malformed arguments, and for a start out of reach.
+    """
+    instance("scene", scene, Scene)
+    members = whole_number("members", members, 1)
+    draw = np.random.default_rng(whole_number("seed", seed, 0))
+    ranges = {
+        name: np.asarray(real_array(name, value, (2,), minimum=least))
+        for name, value, least in (("payload", payload, 0), ("speed", speed, 1e-3))
+    }
+    error = float(real_array("link_error", link_error, (), minimum=0))
+    reach = float(real_array("start_offset", start_offset, (), minimum=0))
+    task: Any = controller_of(scene).reference
+    varied = bool((ranges["speed"] != 1).any())
+    if varied and not hasattr(task, "period"):
+        raise ValueError(
+            f"speed: expected (1, 1) for a reference without a `period`, got {speed!r}."
+        )
+    linkage, found = scene.linkage, []
+    for _ in range(members):
+        factors = [
+            1 + draw.uniform(-error, error, leaf.shape)
+            for leaf in (linkage.mass, linkage.com, linkage.inertia)
+        ]
+        arm = eqx.tree_at(
+            lambda arm: (arm.mass, arm.com, arm.inertia),
+            linkage,
+            (linkage.mass * factors[0], linkage.com * factors[1],
+             linkage.inertia * factors[2]),
+        )  # fmt: skip
+        arm = with_payload(arm, draw.uniform(*ranges["payload"]))
+        distance, angle = reach * draw.uniform(), draw.uniform(0, 2 * np.pi)
+        offset = distance * np.array([np.cos(angle), np.sin(angle)])
+        rate = draw.uniform(*ranges["speed"])
+        q = np.asarray(scene.state0.q)
+        if reach > 0:
+            q = _displaced(linkage, q, offset)
+        forces = scene.forces
+        if varied:
+            forces = eqx.tree_at(
+                lambda f: controller_of(scene._replace(forces=f)).reference.period,
+                forces,
+                task.period / rate,
+            )
+        found.append(Scene(arm, State(q, scene.state0.qd), forces, scene.t1))
+    return stacked(found)

@@ -1,0 +1,236 @@
+"""What gain tuning returns, and how it prints itself."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+
+from .bounded_search import Run
+from .losses import controller_of
+from .scenes import Scene
+
+
+class History(eqx.Module):
+    """What a run did; entry 0 is its start, one more per accepted point.
+
+    - `loss`: mean squared tip error [m^2] with the default loss.
+    - `gradient_norm`: norm of the gradient in the logarithms of the gains, without the
+      components that a bound holds back.
+    - `gains`: kp and kd, in joint order [N/m or N m/rad, N s/m or N m s/rad].
+    - `saturated`: share of the time that each actuator spends at its limit.
+    - `effort`: root mean square of each effort over its limit.
+    - `tip_error`: rms tip error [m]; NaN for a reference without a `tip`.
+    - `wall_time`: since the start of the search, compilation included [s].
+
+    Of an ensemble: the last three but `wall_time` are means over its members, the tip
+    error the root of the mean square.
+    """
+
+    loss: Float[np.ndarray, " iteration"]
+    gradient_norm: Float[np.ndarray, " iteration"]
+    gains: Float[np.ndarray, "iteration 2 joint"]
+    saturated: Float[np.ndarray, "iteration joint"]
+    effort: Float[np.ndarray, "iteration joint"]
+    tip_error: Float[np.ndarray, " iteration"]
+    wall_time: Float[np.ndarray, " iteration"]
+
+
+class TuneResult(eqx.Module):
+    """A tuned scene and how it was reached; it prints itself as a table.
+
+    - `scene`: the scene with its tuned gains.
+    - `loss`: its loss [m^2 with the default loss].
+    - `history`: that of the best run, see `History`.
+    - `lower`, `upper`: the bounds of kp and kd (2, 3).
+    - `converged`: whether the projected gradient has fallen to a thousandth of its
+      start, or to a ten-thousandth of the loss.
+    - `message`: why the run stopped, in words, and what to beware of.
+    - `start_loss`, `start_gains`: what each start has come to (start,), (start, 2, 3).
+    - `member_loss`: loss of each member of the ensemble with the tuned gains (member,).
+    - `settings`: method, solver, tolerance and dtype of the run.
+    """
+
+    scene: Scene
+    loss: float
+    history: History
+    lower: Float[np.ndarray, "2 joint"]
+    upper: Float[np.ndarray, "2 joint"]
+    converged: bool
+    message: str
+    start_loss: Float[np.ndarray, " start"]
+    start_gains: Float[np.ndarray, "start 2 joint"]
+    member_loss: Float[np.ndarray, " member"]
+    settings: dict[str, Any]
+
+    @property
+    def gains(self) -> Float[np.ndarray, "2 joint"]:
+        """The tuned kp and kd."""
+        return self.history.gains[_best(self.history)]
+
+    @property
+    def at_bound(self) -> Bool[np.ndarray, "2 joint"]:
+        """Which gains a bound holds."""
+        return _at_bound(self.gains, self.lower, self.upper)
+
+    @property
+    def tip_error(self) -> float:
+        """Rms tip error [m]; NaN for a reference without a `tip`."""
+        return float(self.history.tip_error[_best(self.history)])
+
+    def __str__(self) -> str:
+        history, best = self.history, _best(self.history)
+        rows = [f"{'':24}{'start':>12}{'tuned':>12}{'least':>12}{'greatest':>12}"]
+        names = joint_names(self.scene)
+        for kind, name in enumerate(("kp", "kd")):
+            for joint in range(3):
+                values = (
+                    a[kind, joint]
+                    for a in (history.gains[0], self.gains, self.lower, self.upper)
+                )
+                units = _UNITS[names[joint][0]][kind]
+                label = f"{name} of {names[joint]} [{units}]"
+                mark = "  at its bound" if self.at_bound[kind, joint] else ""
+                cells = "".join(f"{value:12.5g}" for value in values)
+                rows.append(f"{label:24}{cells}{mark}")
+        compared = [("loss", history.loss, 1.0)]
+        if np.isfinite(history.tip_error[best]):
+            compared.append(("rms tip error [mm]", history.tip_error, 1e3))
+        for joint in range(3):
+            label = f"{names[joint]} at its limit [%]"
+            compared.append((label, history.saturated[:, joint], 1e2))
+        for label, values, scale in compared:
+            first, last = scale * values[0], scale * values[best]
+            rows.append(f"{label:24}{first:12.5g}{last:12.5g}")
+        if len(self.start_loss) > 1:
+            spread = np.sum(self.start_loss <= 1.02 * self.start_loss.min())
+            rows.append(
+                f"{spread} of {len(self.start_loss)} starts within 1 % of the best "
+                "(in the root of the loss)"
+            )
+        if len(self.member_loss) > 1:
+            low, high = np.sqrt([self.member_loss.min(), self.member_loss.max()])
+            rows.append(
+                f"root of the loss over {len(self.member_loss)} members: {low:.4g} to "
+                f"{high:.4g}"
+            )
+        verdict = "converged" if self.converged else "not converged"
+        rows.append(f"{verdict}, {len(history.loss) - 1} iterations: {self.message}")
+        return "\n".join(rows)
+
+
+# Of kp and kd, by the kind of joint.
+_UNITS = {"R": ("N m/rad", "N m s/rad"), "P": ("N/m", "N s/m")}
+
+
+def joint_names(scene: Scene) -> list[str]:
+    """Of the real joints in order, for instance R1, P2, R3."""
+    ef = np.asarray(scene.linkage.ef).reshape(3, 2)
+    return [f"{'P' if pair[0] else 'R'}{i + 1}" for i, pair in enumerate(ef)]
+
+
+class TradeOff(eqx.Module):
+    """The best tip errors for their efforts: one tuning run per price of effort.
+
+    - `prices`: of effort, see `Tracking` (price,) [m^2].
+    - `tip_error`: rms tip error (price,) [m].
+    - `effort`: root mean square of efforts over limits, over all joints (price,).
+    - `results`: the `TuneResult` of each price.
+    """
+
+    prices: Float[np.ndarray, " price"]
+    tip_error: Float[np.ndarray, " price"]
+    effort: Float[np.ndarray, " price"]
+    results: list[TuneResult]
+
+    def __str__(self) -> str:
+        rows = [f"{'price [m^2]':>12}{'tip error [mm]':>16}{'effort [%]':>12}"]
+        for price, error, effort in zip(self.prices, self.tip_error, self.effort):
+            rows.append(f"{price:12.3g}{1e3 * error:16.4g}{1e2 * effort:12.4g}")
+        return "\n".join(rows)
+
+
+def _best(history: History) -> int:
+    return int(np.argmin(history.loss))
+
+
+def _at_bound(gains, lower, upper) -> np.ndarray:
+    # Gains are kept as logarithms: their exponentials miss the bounds by rounding.
+    return (gains > 0) & ((gains <= lower * (1 + 1e-9)) | (gains >= upper * (1 - 1e-9)))
+
+
+def result_of(
+    scene: Scene,
+    runs: list[Run],
+    lower: np.ndarray,
+    upper: np.ndarray,
+    settings: dict[str, Any],
+    with_gains: Callable,
+) -> TuneResult:
+    """The result of the runs of one scene, of which the best counts."""
+    tuned = lower > 0
+
+    def gains_of(z):
+        return np.where(tuned, np.exp(z).reshape(2, 3), 0)
+
+    run = min(runs, key=lambda run: run.best.loss)
+
+    def column(fact: str, default: Any = np.nan) -> np.ndarray:
+        return np.array(
+            [np.mean(row.facts.get(fact, default), axis=0) for row in run.rows]
+        )
+
+    def squared(fact: str) -> np.ndarray:
+        values = [np.mean(row.facts.get(fact, np.nan) ** 2) for row in run.rows]
+        return np.sqrt(np.array(values))
+
+    history = History(
+        loss=np.array([row.loss for row in run.rows]),
+        gradient_norm=np.array([row.gradient_norm for row in run.rows]),
+        gains=np.stack([gains_of(row.z) for row in run.rows]),
+        saturated=column("saturated"),
+        effort=column("effort"),
+        tip_error=squared("tip_error"),
+        wall_time=np.array([row.wall_time for row in run.rows]),
+    )
+    best = run.best
+    assert run.reason is not None
+    return TuneResult(
+        scene=with_gains(scene, jnp.asarray(gains_of(best.z))),
+        loss=best.loss,
+        history=history,
+        lower=lower,
+        upper=upper,
+        converged=run.converged,
+        message=_message(scene, run.reason, history, lower, upper),
+        start_loss=np.array([r.best.loss for r in runs]),
+        start_gains=np.stack([gains_of(r.best.z) for r in runs]),
+        member_loss=best.facts["member_loss"],
+        settings=settings,
+    )
+
+
+def _message(scene, reason, history, lower, upper) -> str:
+    """The reason, and what a reader might take for convergence but is not."""
+    names, share = joint_names(scene), history.saturated[_best(history)]
+    tuned = controller_gains(scene) > 0
+    if history.gradient_norm[0] == 0:
+        at_limit = history.saturated[0].min() == 1
+        reason = "the gradient is zero at the start" + (
+            ", because every actuator is at its limit throughout" if at_limit else ""
+        )
+    held = int(np.sum(_at_bound(history.gains[_best(history)], lower, upper)))
+    parts = [reason, f"{held} of {int(tuned.sum())} gains are at a bound"]
+    for joint in np.flatnonzero(share == 1):
+        parts.append(
+            f"{names[joint]} is at its limit throughout, so its gains had no effect"
+        )
+    return "; ".join(parts)
+
+
+def controller_gains(scene: Scene) -> np.ndarray:
+    """kp and kd of a scene's controller (2, 3)."""
+    controller = controller_of(scene)
+    return np.stack([np.asarray(controller.kp), np.asarray(controller.kd)])
