@@ -15,10 +15,8 @@ import optax
 from scipy.linalg import cholesky, solve_triangular
 from scipy.optimize import lsq_linear
 
-# Stop where a change of the unknowns by 1 would hardly change the loss, to first order,
-# or where it falls by less than this part of itself.
+# Stop where a change of the unknowns by 1 would hardly change the loss, to first order.
 _GRADIENT_OF_LOSS = 1e-6
-_LOSS_DECREASE = 1e-5
 # Where the loss itself can vanish, its gradient is compared with that at the start.
 _GRADIENT_DECREASE = 1e-10
 # What the projected gradient must have fallen to for a stop for another reason to count
@@ -56,22 +54,34 @@ class Row(NamedTuple):
 
 
 class LevenbergMarquardt:
-    """Steps of the damped quadratic model in the box, which only ever go down."""
+    """Steps of the damped quadratic model in the box, which only ever go down.
+
+    Along a flat valley whose floor the model takes for curved, steps come out short
+    again and again: after one that brings more than it promised the next is stretched.
+    """
 
     def __init__(self, z: np.ndarray):
-        self.damping, self.growth = 1e-3, 4
+        self.damping, self.growth, self.stretch = 1e-3, 4, 1
+        self.promised = 0.0
 
     def step(self, z, here: Evaluation, low, high) -> np.ndarray:
         normal = here.curvature.copy()
         scale = np.diag(normal)
         normal += np.diag(self.damping * scale + 1e-12 * scale.sum() + 1e-300)
-        return box_minimum(normal, here.gradient, low - z, high - z)
+        step = box_minimum(normal, here.gradient, low - z, high - z)
+        self.promised = -(here.gradient @ step + step @ here.curvature @ step / 2)
+        return np.clip(self.stretch * step, low - z, high - z)
 
-    def accepted(self) -> None:
+    def accepted(self, decrease: float) -> None:
+        more = decrease > 1.2 * self.promised
+        self.stretch = min(2 * self.stretch, 4) if more else 1
         self.damping, self.growth = max(self.damping / 4, 1e-9), 4
 
     def refused(self) -> bool:
         """Whether there is anything left to try."""
+        if self.stretch > 1:
+            self.stretch = 1
+            return True
         self.damping *= self.growth
         self.growth *= 2
         return self.damping <= 1e8
@@ -102,7 +112,7 @@ class LBFGS:
             direction = 0.3 * direction / np.abs(direction).max()
         return np.clip(z + self.share * direction, low, high) - z
 
-    def accepted(self) -> None:
+    def accepted(self, decrease: float) -> None:
         self.direction, self.share = None, 1.0
 
     def refused(self) -> bool:
@@ -123,7 +133,7 @@ class Adam:
         )
         return np.clip(z + np.asarray(update), low, high) - z
 
-    def accepted(self) -> None:
+    def accepted(self, decrease: float) -> None:
         pass
 
 
@@ -162,8 +172,8 @@ def _held(z, gradient, low, high) -> np.ndarray:
 class Run:
     """One run: where it is, what it has passed, and why it has stopped, if it has."""
 
-    def __init__(self, method: Any, z: np.ndarray, low: np.ndarray, high: np.ndarray):
-        self.method = method(z)
+    def __init__(self, method: Any, enough: float, z, low, high):
+        self.method, self.enough = method(z), enough
         self.z, self.low, self.high = z, low, high
         self.rows: list[Row] = []
         self.reason: str | None = None
@@ -191,11 +201,11 @@ class Run:
         if self.reason is not None:
             return
         if before is not None:
-            self.method.accepted()
+            self.method.accepted(before.loss - here.loss)
         if self._small(norm, here.loss, _GRADIENT_OF_LOSS):
             self.reason = "the projected gradient vanishes"
         elif before is not None and not adam:
-            if before.loss - here.loss < _LOSS_DECREASE * before.loss:
+            if before.loss - here.loss < self.enough * before.loss:
                 self.reason = "the loss decreases no further"
 
     def _small(self, norm: float, loss: float, of_loss: float) -> bool:
@@ -232,16 +242,18 @@ def minimise(
     *,
     method: str,
     max_steps: int,
+    enough: float,
     report: Callable[[int, list[Run]], None],
 ) -> list[Run]:
     """Minimise a function per run, from (run, n) starts within (run, n) bounds.
 
     **Arguments:** `evaluate`: `(z, runs)`, points of the runs with these indices, to
     their `Evaluation`; `method`: one of `METHODS`; `max_steps`: evaluations after the
-    first; `report`: told the number of the step and the runs after each.
+    first; `enough`: a run stops where its loss falls by less than this part of itself;
+    `report`: told the number of the step and the runs after each.
     """
     began = time.perf_counter()
-    runs = [Run(METHODS[method], *row) for row in zip(start, low, high)]
+    runs = [Run(METHODS[method], enough, *row) for row in zip(start, low, high)]
     for number in range(max_steps + 1):
         going = [i for i, run in enumerate(runs) if run.reason is None]
         if not going:

@@ -30,6 +30,7 @@ from .validation import (
 Loss = Callable[[Scene, Solution], Array]
 
 _SAMPLES = 1001
+_ENOUGH = 1e-4  # half of it in the rms
 # The worst of an ensemble is smoothed to a power mean of this order: of n members it is
 # at most a factor of n^(1/32) below the worst.
 _WORST = 32
@@ -165,7 +166,7 @@ def _search(
     z, low, high = map(np.concatenate, columns)
     runs = minimise(
         lanes, z, low, high, method=method, max_steps=max_steps,
-        report=_reporter(report),
+        enough=_ENOUGH, report=_reporter(report),
     )  # fmt: skip
     settings = dict(
         method=method,
