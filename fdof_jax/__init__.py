@@ -22,6 +22,11 @@ from .dynamics import (
     inverse_dynamics as inverse_dynamics,
     link_energies as link_energies,
 )
+from .ensembles import (
+    perturbed as perturbed,
+    stacked as stacked,
+    with_payload as with_payload,
+)
 from .files import load as load, save as save
 from .forces import (
     EffortHistory as EffortHistory,
@@ -58,6 +63,7 @@ from .linkage import (
     from_chain as from_chain,
     to_chain as to_chain,
 )
+from .losses import Tracking as Tracking
 from .model_based_control import (
     ComputedTorque as ComputedTorque,
     GravityFeedforward as GravityFeedforward,
@@ -89,6 +95,7 @@ from .solution import Efforts as Efforts, Solution as Solution
 from .step_control import scale_tolerances as scale_tolerances
 from .sweep import sweep as sweep
 from .travel import Laps as Laps, Travel as Travel, shock_against as shock_against
-from .tuning import TuneResult as TuneResult, tune as tune
+from .tune_result import TradeOff as TradeOff, TuneResult as TuneResult
+from .tuning import trade_off as trade_off, tune as tune, tune_each as tune_each
 
 __version__ = "0.1.0"

@@ -3,7 +3,6 @@
 import argparse
 from pathlib import Path
 
-import diffrax
 import jax
 import matplotlib
 
@@ -43,7 +42,7 @@ def main(arguments: list[str] | None = None) -> None:
             print(f"  {topology}: {int(solution.stats['num_steps'])} steps")
         pictures = [picture]
     else:
-        run = showcase.run_circle(options.output, _say, diffrax.TextProgressMeter())
+        run = showcase.run_circle(options.output, _say, print)
         _print_circle(run)
         pictures = run.pictures
     print(f"\npictures in {options.output}/: {', '.join(p.name for p in pictures)}")

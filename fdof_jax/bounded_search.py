@@ -21,7 +21,7 @@ _GRADIENT_OF_LOSS = 1e-6
 _GRADIENT_DECREASE = 1e-10
 # What the projected gradient must have fallen to for a stop for another reason to count
 # as convergence: part of the loss.
-_CONVERGED = 1e-3
+_CONVERGED = 1e-2
 # No step changes an unknown by more: a factor of 7 where unknowns are logarithms.
 _LONGEST_STEP = 2.0
 
@@ -34,10 +34,10 @@ class Evaluation(NamedTuple):
     - `facts`: arrays (run, ...) to be kept with the point.
     """
 
-    loss: np.ndarray
-    gradient: np.ndarray
-    curvature: np.ndarray
-    facts: dict[str, np.ndarray]
+    loss: Any
+    gradient: Any
+    curvature: Any
+    facts: dict[str, Any]
 
     def row(self, index: int) -> "Evaluation":
         return jax.tree.map(lambda a: a[index], self)
@@ -158,7 +158,7 @@ def box_minimum(
     # Of unit diagonal: unknowns of any size are alike to the factorisation.
     scale = 1 / np.sqrt(np.diag(matrix)[room])
     factor = cholesky(matrix[np.ix_(room, room)] * scale[:, None] * scale)
-    target = -solve_triangular(factor, slope[room] * scale, trans="T")
+    target = -solve_triangular(factor, slope[room] * scale, trans=1)
     bounds = low[room] / scale, high[room] / scale
     found = lsq_linear(factor, target, bounds, method="bvls", tol=1e-12)
     result[room] = np.clip(found.x * scale, low[room], high[room])
@@ -190,8 +190,9 @@ class Run:
             elif not self.method.refused():
                 self.reason = "no step decreases the loss any further"
             return
-        if not finite:
+        if not finite:  # at the start
             self.reason = "the simulation or its derivative fails at the start"
+            here = here._replace(gradient=np.full_like(z, np.nan))
         held = _held(z, here.gradient, self.low, self.high) | (self.low >= self.high)
         norm = float(np.linalg.norm(np.where(held, 0, here.gradient)))
         before, self.at, self.z = self.at, here, z
@@ -227,11 +228,16 @@ class Run:
         return min(self.rows, key=lambda row: row.loss)
 
     @property
+    def failed(self) -> bool:
+        """Whether the function could not be evaluated at the start."""
+        return not np.isfinite(self.rows[0].gradient_norm)
+
+    @property
     def converged(self) -> bool:
         best = self.best
         moved = self.rows[0].gradient_norm > 0
         small = self._small(best.gradient_norm, best.loss, _CONVERGED)
-        return bool(moved and np.isfinite(best.loss) and small)
+        return bool(moved and not self.failed and small)
 
 
 def minimise(

@@ -90,13 +90,19 @@ def _displaced(linkage: Linkage, q: np.ndarray, offset: np.ndarray) -> np.ndarra
     for _ in range(50):
         missing = np.append(aim - np.asarray(tip_position(linkage, there)), 0.0)
         slopes = np.asarray(tip_jacobian(linkage, there))
-        there = there + np.linalg.solve(slopes, missing)
+        there = there + np.linalg.lstsq(slopes, missing)[0]
         if np.linalg.norm(missing) < 1e-9:
             return there
     raise ValueError(
         "start_offset: expected one within the linkage's reach, got "
         f"{np.linalg.norm(offset):g} m."
     )
+
+
+def _hastened(controller: Any, rate: float) -> Any:
+    """The controller with a reference that goes faster by this factor."""
+    period = controller.reference.period / rate
+    return eqx.tree_at(lambda c: c.reference.period, controller, period)
 
 
 def perturbed(
@@ -134,9 +140,9 @@ def perturbed(
     }
     error = float(real_array("link_error", link_error, (), minimum=0))
     reach = float(real_array("start_offset", start_offset, (), minimum=0))
-    task: Any = controller_of(scene).reference
+    controller = controller_of(scene)
     varied = bool((ranges["speed"] != 1).any())
-    if varied and not hasattr(task, "period"):
+    if varied and not hasattr(controller.reference, "period"):
         raise ValueError(
             f"speed: expected (1, 1) for a reference without a `period`, got {speed!r}."
         )
@@ -161,10 +167,9 @@ def perturbed(
             q = _displaced(linkage, q, offset)
         forces = scene.forces
         if varied:
-            forces = eqx.tree_at(
-                lambda f: controller_of(scene._replace(forces=f)).reference.period,
-                forces,
-                task.period / rate,
+            forces = tuple(
+                _hastened(force, rate) if force is controller else force
+                for force in forces
             )
         found.append(Scene(arm, State(q, scene.state0.qd), forces, scene.t1))
     return stacked(found)

@@ -8,7 +8,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-import diffrax
 import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
@@ -54,7 +53,7 @@ class CircleRun(NamedTuple):
 
 
 def run_circle(
-    output: Path, say: Callable[[str], None], meter: diffrax.AbstractProgressMeter
+    output: Path, say: Callable[[str], None], report: Callable[[str], None]
 ) -> CircleRun:
     """Fig 7's circle with the paper's gains, tuned by gradients, and again."""
     wall_times = {}
@@ -68,7 +67,7 @@ def run_circle(
 
     scene = scenes.fig7()
     first = timed("simulate with the paper's gains", _simulate, scene)
-    tuned = timed("tune by gradients", tune, scene, progress_meter=meter)
+    tuned = timed("tune by gradients", tune, scene, report=report)
     second = timed("simulate with the tuned gains", _simulate, tuned.scene)
     say("draw")
     began = time.perf_counter()

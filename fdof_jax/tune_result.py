@@ -45,10 +45,11 @@ class TuneResult(eqx.Module):
     - `loss`: its loss [m^2 with the default loss].
     - `history`: that of the best run, see `History`.
     - `lower`, `upper`: the bounds of kp and kd (2, 3).
-    - `converged`: whether the projected gradient has fallen to a thousandth of its
-      start, or to a ten-thousandth of the loss.
+    - `converged`: whether a change of the gains by 1 % would change the loss by less
+      than 1e-4 of it, to first order and within the bounds.
     - `message`: why the run stopped, in words, and what to beware of.
-    - `start_loss`, `start_gains`: what each start has come to (start,), (start, 2, 3).
+    - `start_loss`, `start_gains`: what each start has come to (start,), (start, 2, 3);
+      NaN where it could not be simulated.
     - `member_loss`: loss of each member of the ensemble with the tuned gains (member,).
     - `settings`: method, solver, tolerance and dtype of the run.
     """
@@ -105,10 +106,10 @@ class TuneResult(eqx.Module):
             first, last = scale * values[0], scale * values[best]
             rows.append(f"{label:24}{first:12.5g}{last:12.5g}")
         if len(self.start_loss) > 1:
-            spread = np.sum(self.start_loss <= 1.02 * self.start_loss.min())
+            near = np.sum(self.start_loss**0.5 <= 1.01 * self.loss**0.5)
             rows.append(
-                f"{spread} of {len(self.start_loss)} starts within 1 % of the best "
-                "(in the root of the loss)"
+                f"{near} of {len(self.start_loss)} starts within 1 % of the best in "
+                "the root of the loss"
             )
         if len(self.member_loss) > 1:
             low, high = np.sqrt([self.member_loss.min(), self.member_loss.max()])
@@ -175,24 +176,19 @@ def result_of(
     def gains_of(z):
         return np.where(tuned, np.exp(z).reshape(2, 3), 0)
 
-    run = min(runs, key=lambda run: run.best.loss)
+    run = min(runs, key=lambda run: (run.failed, run.best.loss))
 
-    def column(fact: str, default: Any = np.nan) -> np.ndarray:
-        return np.array(
-            [np.mean(row.facts.get(fact, default), axis=0) for row in run.rows]
-        )
-
-    def squared(fact: str) -> np.ndarray:
-        values = [np.mean(row.facts.get(fact, np.nan) ** 2) for row in run.rows]
-        return np.sqrt(np.array(values))
+    def mean(fact: str) -> np.ndarray:
+        """Over the members."""
+        return np.array([np.mean(row.facts[fact], axis=0) for row in run.rows])
 
     history = History(
         loss=np.array([row.loss for row in run.rows]),
         gradient_norm=np.array([row.gradient_norm for row in run.rows]),
         gains=np.stack([gains_of(row.z) for row in run.rows]),
-        saturated=column("saturated"),
-        effort=column("effort"),
-        tip_error=squared("tip_error"),
+        saturated=mean("saturated"),
+        effort=mean("effort"),
+        tip_error=np.sqrt(mean("square_error")),
         wall_time=np.array([row.wall_time for row in run.rows]),
     )
     best = run.best
@@ -205,7 +201,7 @@ def result_of(
         upper=upper,
         converged=run.converged,
         message=_message(scene, run.reason, history, lower, upper),
-        start_loss=np.array([r.best.loss for r in runs]),
+        start_loss=np.array([np.nan if r.failed else r.best.loss for r in runs]),
         start_gains=np.stack([gains_of(r.best.z) for r in runs]),
         member_loss=best.facts["member_loss"],
         settings=settings,

@@ -64,16 +64,18 @@ def _lane(z: Array, problem: tuple[Scene, Loss, Array]) -> Evaluation:
     ts = jnp.linspace(0, scene.t1, _SAMPLES)
     value, jacobian, trial, solution = sensitivities(scene_at, residuals, z, ts)
     demands = jnp.abs(relative_demands(trial, solution))
+    square_error = jnp.full((), jnp.nan)
+    if hasattr(controller_of(trial).reference, "tip"):
+        square_error = jnp.sum(tip_errors(trial, solution) ** 2)
     facts = dict(
         saturated=jnp.mean(demands > 1, axis=0),
         effort=jnp.sqrt(jnp.mean(jnp.minimum(demands, 1) ** 2, axis=0)),
+        square_error=square_error,
         steps=solution.stats["num_steps"],
     )
-    if hasattr(controller_of(trial).reference, "tip"):
-        facts["tip_error"] = jnp.sqrt(jnp.sum(tip_errors(trial, solution) ** 2))
     return Evaluation(
         jnp.sum(value**2), 2 * jacobian.T @ value, 2 * jacobian.T @ jacobian, facts
-    )  # type: ignore[arg-type]
+    )
 
 
 def _check(name: str, scene: Any, loss: Any) -> None:
@@ -149,6 +151,8 @@ def _search(
     if not (report is None or callable(report)):
         raise ValueError(f"report: expected a callable or None, got {report!r}.")
     for scene, loss in zip(scenes, losses):
+        if not callable(loss):
+            raise ValueError(f"loss: expected a callable, got {loss!r}.")
         _check("scene", scene, loss)
     boxes = [_bounds(scene, factor, bounds) for scene in scenes]
     if ensemble is None:
@@ -179,6 +183,12 @@ def _search(
     results = []
     for i, (scene, (_, lower, upper)) in enumerate(zip(scenes, boxes)):
         mine = runs[i * starts : (i + 1) * starts]
+        if all(run.failed for run in mine):
+            raise ValueError(
+                f"scene: expected one that can be simulated up to t1 = "
+                f"{float(scene.t1):g} s, got a loss of {mine[0].rows[0].loss:g} or a "
+                "gradient that is not finite."
+            )
         results.append(result_of(scene, mine, lower, upper, settings, with_gains))
     return results
 
@@ -187,13 +197,11 @@ def _reporter(report: Callable[[str], Any] | None) -> Callable[[int, list[Run]],
     def told(number: int, runs: list[Run]) -> None:
         if report is None:
             return
-        best = min(runs, key=lambda run: run.best.loss).best
-        error = best.facts.get("tip_error")
-        what = (
-            f"loss {best.loss:.6g}"
-            if error is None
-            else f"rms tip error {1e3 * np.sqrt(np.mean(error**2)):.5g} mm"
-        )
+        best = min(runs, key=lambda run: (run.failed, run.best.loss)).best
+        error = 1e3 * np.sqrt(np.mean(best.facts["square_error"]))
+        what = f"loss {best.loss:.6g}"
+        if np.isfinite(error):
+            what += f", rms tip error {error:.5g} mm"
         going = sum(run.reason is None for run in runs)
         report(
             f"{number:4d}  {what}, projected gradient {best.gradient_norm:.2g}, "
