@@ -35,6 +35,10 @@ from .forces import (
     JointEffort as JointEffort,
     StatefulElement as StatefulElement,
 )
+from .gradient_quality import (
+    GradientReport as GradientReport,
+    gradient_report as gradient_report,
+)
 from .hybrid_dynamics import PrescribedMotion as PrescribedMotion
 from .interop import to_mjcf as to_mjcf
 from .joint_limits import JointFriction as JointFriction, JointStops as JointStops

@@ -78,7 +78,8 @@ def _lane(z: Array, problem: tuple[Scene, Loss, Array]) -> Evaluation:
     )
 
 
-def _check(name: str, scene: Any, loss: Any) -> None:
+def check_tuned(name: str, scene: Any, loss: Any) -> None:
+    """Raise ValueError unless this scene can be tuned by this loss."""
     instance(name, scene, Scene)
     check_linkage(scene.linkage)
     t1 = real_array(f"{name}.t1", scene.t1, (), above=0)
@@ -153,14 +154,14 @@ def _search(
     for scene, loss in zip(scenes, losses):
         if not callable(loss):
             raise ValueError(f"loss: expected a callable, got {loss!r}.")
-        _check("scene", scene, loss)
+        check_tuned("scene", scene, loss)
     boxes = [_bounds(scene, factor, bounds) for scene in scenes]
     if ensemble is None:
         members = [[scene] for scene in scenes]
     else:
         members = [unstacked("ensemble", ensemble)] * len(losses)
         for i, member in enumerate(members[0]):
-            _check(f"ensemble[{i}]", member, losses[0])
+            check_tuned(f"ensemble[{i}]", member, losses[0])
     problems = [
         [(member, loss, lower > 0) for member in row]
         for row, loss, (_, lower, _) in zip(members, losses, boxes)

@@ -1,0 +1,142 @@
+"""The gradients that tuning follows, against differences and other modes."""
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import fdof_jax as fj
+from fdof_jax import scenes
+from fdof_jax.losses import controller_of, tip_errors
+from fdof_jax.sensitivities import sensitivities
+from fdof_jax.tuning import with_gains
+
+TUNED = [[6000, 11700, 3200], [320, 200, 200]]  # within a factor of 4
+
+
+def with_limit(limit):
+    scene = scenes.fig7()
+    controller = eqx.tree_at(lambda c: c.limit, scene.forces[0], jnp.asarray(limit))
+    return scene._replace(forces=(controller,))
+
+
+# At the paper's gains, at tuned ones, and with a slide at its limit half of the time.
+POINTS = {
+    "start": scenes.fig7(),
+    "end": with_gains(scenes.fig7(), jnp.asarray(TUNED, float)),
+    "saturated": with_limit([1000.0, 12.0, 400.0]),
+}
+
+
+def gains_of(scene):
+    controller = controller_of(scene)
+    return jnp.stack([controller.kp, controller.kd])
+
+
+@eqx.filter_jit
+def tangents(scene, tolerance, ts):
+    at = lambda z: with_gains(scene, gains_of(scene) * jnp.exp(z).reshape(2, 3))
+    found = sensitivities(at, tip_errors, jnp.zeros(6), ts, tolerance)
+    return found.residuals, 2 * found.jacobian.T @ found.residuals
+
+
+@eqx.filter_jit
+def loss(scene, z, ts, tolerance=1e-13, adjoint=diffrax.ForwardMode()):
+    trial = with_gains(scene, gains_of(scene) * jnp.exp(z).reshape(2, 3))
+    solution = fj.simulate(
+        trial.linkage,
+        trial.state0,
+        ts,
+        trial.forces,
+        solver=diffrax.Dopri8(),
+        stepsize_controller=diffrax.PIDController(rtol=tolerance, atol=tolerance),
+        adjoint=adjoint,
+        throw=False,
+    )
+    return jnp.sum(tip_errors(trial, solution) ** 2)
+
+
+@pytest.mark.parametrize("point", POINTS)
+def test_tangents_are_those_of_differences(point):
+    scene, ts = POINTS[point], np.linspace(0, 3, 301)
+    residuals, gradient = tangents(scene, 1e-10, ts)
+
+    def difference(e, h):
+        return float(loss(scene, h * e, ts) - loss(scene, -h * e, ts)) / (2 * h)
+
+    h = 4e-4
+    wanted = [(4 * difference(e, h / 2) - difference(e, h)) / 3 for e in np.eye(6)]
+    size = np.linalg.norm(wanted)
+    assert np.linalg.norm(gradient - np.array(wanted)) < 1e-6 * size
+    value = float(loss(scene, jnp.zeros(6), ts))
+    assert float(residuals @ residuals) == pytest.approx(value, rel=1e-8)
+    # As tuning takes them.
+    _, coarse = tangents(scene, 1e-5, ts)
+    assert np.linalg.norm(coarse - gradient) < 1e-3 * size
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("point", POINTS)
+def test_forward_and_reverse_mode_are_the_tangents(point):
+    scene, ts = POINTS[point], np.linspace(0, 1, 101)
+    _, gradient = tangents(scene, 1e-11, ts)
+    size, z = np.linalg.norm(gradient), jnp.zeros(6)
+    forward = jax.jit(jax.jacfwd(lambda z: loss(scene, z, ts)))(z)
+    adjoint = diffrax.RecursiveCheckpointAdjoint()
+    reverse = jax.jit(jax.grad(lambda z: loss(scene, z, ts, adjoint=adjoint)))(z)
+    assert np.linalg.norm(forward - gradient) < 1e-6 * size
+    assert np.linalg.norm(reverse - gradient) < 1e-6 * size
+
+
+def test_nothing_is_nan_at_rest_at_zero_error_or_at_saturation():
+    scene, ts = scenes.fig7(), np.linspace(0, 0.3, 301)
+    hold = lambda t, linkage: (jnp.asarray(scene.state0.q), jnp.zeros(3))
+    controller = scene.forces[0]
+
+    class At(eqx.Module):  # where the arm is
+        def __call__(self, t, linkage):
+            return hold(t, linkage)
+
+        def tip(self, t):
+            return fj.tip_position(scene.linkage, jnp.asarray(scene.state0.q))
+
+    for gravity in (0.0, 9.81):
+        for limit in (0.0, 1e-9, 300.0, np.inf):
+            held = fj.PDController(controller.kp, controller.kd, limit, At())
+            arm = eqx.tree_at(lambda a: a.gravity, scene.linkage, jnp.asarray(gravity))
+            still = scene._replace(linkage=arm, forces=(held,))
+            residuals, gradient = tangents(still, 1e-5, ts)
+            assert np.isfinite(residuals).all() and np.isfinite(gradient).all()
+            if gravity == 0:
+                assert not residuals.any() and not gradient.any()
+
+
+@pytest.fixture(scope="module")
+def report():
+    return fj.gradient_report(scenes.fig7()._replace(t1=2.0))
+
+
+def test_the_report_is_what_it_says(report):
+    scene, ts = scenes.fig7(), np.linspace(0, 2, 1001)
+    _, exact = tangents(scene, 1e-10, ts)
+    size = np.linalg.norm(exact)
+    for found in (report.gradient, report.differences):
+        assert np.linalg.norm(found.ravel() - exact) < 1e-5 * size
+    # One sample of the horizon apart.
+    assert report.gradient_norm[-1] == pytest.approx(size, rel=1e-3)
+    _, halfway = tangents(scene, 1e-10, ts[:501])
+    assert report.gradient_norm[4] == pytest.approx(np.linalg.norm(halfway), rel=1e-3)
+    assert report.horizons[4] == pytest.approx(1.0)
+    assert 0.1 < report.saturated[1] < 0.13
+    assert "P2 is at its limit for" in str(report)
+    assert f"{report.error:.1e} of its norm" in str(report)
+    assert report.modes.eigenvalues.shape == (101, 6)
+
+
+def test_a_report_says_where_gains_have_no_effect():
+    scene = with_limit([1000.0, 1e-6, 400.0])._replace(t1=0.5)
+    found = fj.gradient_report(scene)
+    assert not found.gradient[:, 1].any() and found.saturated[1] == 1
+    assert "P2 is at its limit throughout" in found.warnings[0]
