@@ -8,7 +8,11 @@ from .chain_dynamics import (
     masked_accelerations as masked_accelerations,
     mass_matrix as mass_matrix,
 )
-from .control import CircleTask as CircleTask, PDController as PDController
+from .control import (
+    CircleTask as CircleTask,
+    PDController as PDController,
+    reachable as reachable,
+)
 from .drives import (
     DCMotor as DCMotor,
     FirstOrderLag as FirstOrderLag,
@@ -49,6 +53,7 @@ from .kinematics import (
     tip_jacobian as tip_jacobian,
     tip_position as tip_position,
 )
+from .league import circle_scenes as circle_scenes, league_table as league_table
 from .linearization import (
     Linearization as Linearization,
     Modes as Modes,

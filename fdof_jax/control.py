@@ -250,7 +250,7 @@ class CircleTask(eqx.Module):
         extremes = start + (lead / (2 * np.pi) * float(self.period) - start) % turn
         times = np.linspace(start, min(end, start + turn), 257)
         times = np.append(times, np.minimum(extremes, end))
-        if not np.isfinite(_positions_over(self, linkage, times)).all():
+        if not reachable(linkage, self, times).all():
             raise ValueError(
                 "reference: expected a circle within the linkage's reach at "
                 f"orientation {float(self.orientation):g} rad on branch "
@@ -261,8 +261,26 @@ class CircleTask(eqx.Module):
 
 
 @eqx.filter_jit
-def _positions_over(task: CircleTask, linkage: Linkage, times: ArrayLike) -> Array:
-    return jax.vmap(lambda t: task(t, linkage)[1])(times)
+def _motion_over(
+    reference: Reference, linkage: Linkage, times: ArrayLike
+) -> tuple[Array, Array]:
+    return jax.vmap(lambda t: reference(t, linkage))(times)
+
+
+def reachable(
+    linkage: Linkage, reference: Reference, ts: ArrayLike
+) -> Bool[Array, " time"]:
+    """Whether a linkage can be where a reference wants it, at each time.
+
+    **Arguments:** the linkage; `reference`: a `CircleTask` or `TipTask` for instance;
+    `ts`: times (time,) [s].
+
+    **Raises:** ValueError for malformed arguments.
+    """
+    check_linkage(linkage)
+    ts = real_array("ts", ts, (None,))
+    motion = _motion_over(checked_reference(reference), linkage, ts)
+    return jnp.isfinite(jnp.concatenate(motion, axis=1)).all(axis=1)
 
 
 @eqx.filter_jit

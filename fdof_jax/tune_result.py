@@ -81,6 +81,11 @@ class TuneResult(eqx.Module):
         """Rms tip error [m]; NaN for a reference without a `tip`."""
         return float(self.history.tip_error[_best(self.history)])
 
+    @property
+    def effort(self) -> float:
+        """Root mean square of the efforts over their limits, over time and joints."""
+        return float(np.sqrt(np.mean(self.history.effort[_best(self.history)] ** 2)))
+
     def __str__(self) -> str:
         history, best = self.history, _best(self.history)
         rows = [f"{'':24}{'start':>12}{'tuned':>12}{'least':>12}{'greatest':>12}"]
@@ -137,7 +142,7 @@ class TradeOff(eqx.Module):
 
     - `prices`: of effort, see `Tracking` (price,) [m^2].
     - `tip_error`: rms tip error (price,) [m].
-    - `effort`: root mean square of efforts over limits, over all joints (price,).
+    - `effort`: root mean square of the efforts over their limits (price,).
     - `results`: the `TuneResult` of each price.
     """
 

@@ -300,8 +300,5 @@ def trade_off(scene: Scene, prices: ArrayLike, **keywords: Any) -> TradeOff:
         raise ValueError("prices: expected at least one, got none.")
     losses = [Tracking(effort=price) for price in prices]
     results = _search([scene] * len(prices), losses, **keywords)
-    last = [np.argmin(r.history.loss) for r in results]
-    effort = [np.linalg.norm(r.history.effort[i]) for r, i in zip(results, last)]
-    return TradeOff(
-        prices, np.array([r.tip_error for r in results]), np.array(effort), results
-    )
+    error, effort = np.array([(r.tip_error, r.effort) for r in results]).T
+    return TradeOff(prices, error, effort, results)
