@@ -1,12 +1,17 @@
 """The command line: `fdof-jax` or `python -m fdof_jax`."""
 
 import argparse
+import dataclasses
 from pathlib import Path
+from typing import Any
 
 import jax
 import matplotlib
 
-from . import __version__, showcase
+from . import __version__, showcase, tuning_run
+from .bounded_search import METHODS
+from .league import circle_scenes, league_table
+from .tuning import tune_each
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -24,12 +29,16 @@ def main(arguments: list[str] | None = None) -> None:
         ("circle", "track the circle, tune the gains, track it again (the default)"),
         ("figures", "reproduce the paper's Figs 3 to 7"),
         ("topologies", "simulate all seven topologies in one compiled batched call"),
+        ("league", "tune the gains of all seven topologies on one circle"),
+        ("tune", "tune the gains of Fig 7's arm: circle, bounds, method, robustness"),
     ):
         command = commands.add_parser(
             name, help=text, description=f"{text[0].upper()}{text[1:]}."
         )
         # No default here: it would override an --output given before the command.
         _add_output(command, argparse.SUPPRESS)
+        if name == "tune":
+            _add_tuning(command)
     options = parser.parse_args(arguments)
 
     matplotlib.use("agg")  # pictures are written, never shown
@@ -41,6 +50,11 @@ def main(arguments: list[str] | None = None) -> None:
         for topology, (_, solution) in solutions.items():
             print(f"  {topology}: {int(solution.stats['num_steps'])} steps")
         pictures = [picture]
+    elif options.command == "league":
+        _run_league()
+        return
+    elif options.command == "tune":
+        pictures = _run_tuning(parser, options)
     else:
         run = showcase.run_circle(options.output, _say, print)
         _print_circle(run)
@@ -56,6 +70,92 @@ def _add_output(parser: argparse.ArgumentParser, default: Path | str) -> None:
         metavar="FOLDER",
         help="where to write the pictures (PNG); fdof-output by default",
     )
+
+
+def _add_tuning(command: argparse.ArgumentParser) -> None:
+    job = command.add_argument_group("the circle, and by what gains are judged")
+    for name, count, kind, text in (
+        ("center", 2, float, "middle of the circle, x y [m]"),
+        ("radius", None, float, "of the circle [m]"),
+        ("period", None, float, "time of one turn; two are simulated [s]"),
+        ("factor", None, float, "the gains stay within this factor of the paper's"),
+        ("price", None, float, "of full effort of one joint all the time [m^2]"),
+        ("members", None, int, "size of the ensemble"),
+        (
+            "payload",
+            2,
+            float,
+            "of the ensemble: least and greatest mass at the tip [kg]",
+        ),
+        ("start-offset", None, float, "of the ensemble: of the tip at the start [m]"),
+        ("speed", 2, float, "of the ensemble: least and greatest speed, 1 as said"),
+        ("link-error", None, float, "of the ensemble: relative error of masses"),
+    ):
+        default = getattr(tuning_run.Job, name.replace("-", "_"))
+        shown = " ".join(map(str, default)) if count else default
+        job.add_argument(
+            f"--{name}", nargs=count, type=kind, help=f"{text}; {shown} by default"
+        )
+    job.add_argument(
+        "--over",
+        choices=("nominal", "mean", "worst"),
+        help="judge gains by the nominal scene, or by the mean or the worst of an "
+        "ensemble; nominal by default",
+    )
+    search = command.add_argument_group("the search")
+    search.add_argument(
+        "--method", choices=tuple(METHODS), default="levenberg-marquardt"
+    )
+    search.add_argument("--starts", type=int, default=1, help="runs; 1 by default")
+    search.add_argument("--seed", type=int, default=0, help="of the random starts")
+    search.add_argument("--max-steps", type=int, default=50, help="50 by default")
+    search.add_argument("--save", type=Path, metavar="FILE", help="keep the result")
+    search.add_argument(
+        "--resume",
+        type=Path,
+        metavar="FILE",
+        help="go on with what --save has kept: its circle, bounds and ensemble",
+    )
+
+
+def _run_league() -> None:
+    arms = circle_scenes()
+    _say("tune all seven topologies in one compiled program")
+    results = tune_each(list(arms.values()), report=print)
+    print(f"\n{league_table(dict(zip(arms, results)))}")
+
+
+def _run_tuning(parser: argparse.ArgumentParser, options: Any) -> list[Path]:
+    names = [field.name for field in dataclasses.fields(tuning_run.Job)]
+    given = {n: v for n in names if (v := getattr(options, n)) is not None}
+    if given and options.resume is not None:
+        parser.error(
+            f"--resume: the file says what is tuned, also given: {', '.join(given)}"
+        )
+    of_ensemble = {"members", "payload", "start_offset", "speed", "link_error"}
+    if options.over in (None, "nominal") and of_ensemble & set(given):
+        parser.error(
+            f"--over: mean or worst is needed for {', '.join(of_ensemble & set(given))}"
+        )
+    try:
+        run = tuning_run.run_tuning(
+            options.output,
+            _say,
+            print,
+            job=tuning_run.Job(**given),
+            resume=options.resume,
+            save_to=options.save,
+            method=options.method,
+            starts=options.starts,
+            seed=options.seed,
+            max_steps=options.max_steps,
+        )
+    except (ValueError, OSError) as error:
+        parser.error(str(error))
+    print(f"\n{run.result}")
+    for when, report in zip(("before", "after"), run.reports):
+        print(f"\n{when} tuning: {report}")
+    return run.pictures
 
 
 def _say(text: str) -> None:

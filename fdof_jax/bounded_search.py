@@ -192,7 +192,7 @@ class Run:
             return
         if not finite:  # at the start
             self.reason = "the simulation or its derivative fails at the start"
-            here = here._replace(gradient=np.full_like(z, np.nan))
+            here = here._replace(loss=np.nan, gradient=np.full_like(z, np.nan))
         held = _held(z, here.gradient, self.low, self.high) | (self.low >= self.high)
         norm = float(np.linalg.norm(np.where(held, 0, here.gradient)))
         before, self.at, self.z = self.at, here, z

@@ -115,7 +115,8 @@ def gradient_report(scene: Scene) -> GradientReport:
     gradient = along[-1].reshape(2, 3)
     steps = np.eye(6).reshape(6, 1, 2, 3)
     sides = np.array([_STEP, -_STEP, _STEP / 2, -_STEP / 2])[:, None, None]
-    loss = np.asarray(_losses(scene, np.exp(sides * steps).reshape(24, 2, 3)))
+    factors = jnp.asarray(np.exp(sides * steps).reshape(24, 2, 3))
+    loss = np.asarray(_losses(scene, factors))
     far, near = (
         (loss.reshape(6, 4)[:, k] - loss.reshape(6, 4)[:, k + 1]) / width
         for k, width in ((0, 2 * _STEP), (2, _STEP))

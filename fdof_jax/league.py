@@ -67,9 +67,10 @@ def league_table(results: Mapping[str, TuneResult]) -> str:
         f"{'':4}" + 2 * f"{'start':>12}{'tuned':>12}" + f"{'at bounds':>10}",
     ]
     for name, result in sorted(results.items(), key=lambda item: item[1].tip_error):
-        effort = 1e2 * np.sqrt(np.mean(result.history.effort**2, axis=1))
-        error = 1e3 * result.history.tip_error
-        cells = error[0], 1e3 * result.tip_error, effort[0], result.effort * 1e2
+        first = result.histories[0]
+        effort = np.sqrt(np.mean(first.effort[0] ** 2)), result.effort
+        error = first.tip_error[0], result.tip_error
+        cells = *(1e3 * e for e in error), *(1e2 * e for e in effort)
         rows.append(
             f"{name:4}"
             + "".join(f"{cell:12.4g}" for cell in cells)

@@ -66,12 +66,12 @@ def run_circle(
         return result
 
     scene = scenes.fig7()
-    first = timed("simulate with the paper's gains", _simulate, scene)
+    first = timed("simulate with the paper's gains", simulate_finely, scene)
     tuned = timed("tune by gradients", tune, scene, report=report)
-    second = timed("simulate with the tuned gains", _simulate, tuned.scene)
+    second = timed("simulate with the tuned gains", simulate_finely, tuned.scene)
     say("draw")
     began = time.perf_counter()
-    pictures = _draw_circle(output, scene, first, tuned, second)
+    pictures = draw_circle(output, scene, first, tuned, second)
     wall_times["draw"] = time.perf_counter() - began
     return CircleRun(
         _tracking(scene, first),
@@ -82,7 +82,8 @@ def run_circle(
     )
 
 
-def _simulate(scene: Scene) -> Solution:
+def simulate_finely(scene: Scene) -> Solution:
+    """A scene's motion at every hundredth of a second."""
     ts = np.arange(round(float(scene.t1) / _SAMPLE) + 1) * _SAMPLE
     return simulate(scene.linkage, scene.state0, ts, scene.forces)
 
@@ -105,9 +106,10 @@ def _tracking(scene: Scene, solution: Solution) -> Tracking:
     )
 
 
-def _draw_circle(
+def draw_circle(
     output: Path, scene: Scene, first: Solution, tuned: TuneResult, second: Solution
 ) -> list[Path]:
+    """Path, errors, motion and efforts of a circle before and after tuning."""
     linkage, task = scene.linkage, scene.forces[0].reference
     both = {"paper's gains": first, "tuned gains": second}
     pictures = {
@@ -128,7 +130,7 @@ def run_figures(output: Path, say: Callable[[str], None]) -> list[Path]:
     pictures = {}
     say("Figs 3 and 4: damped triple pendulum")
     scene = scenes.fig3()
-    solution = _simulate(scene)
+    solution = simulate_finely(scene)
     cyclograph = drawing.chrono_cyclograph(
         scene.linkage, solution, until=1.5, mass_centers=True
     )
@@ -136,14 +138,14 @@ def run_figures(output: Path, say: Callable[[str], None]) -> list[Path]:
     pictures["fig4"] = plotting.motion_profile(scene.linkage, solution)
     say("Figs 5 and 6: conservative triple pendulum")
     scene = scenes.fig5()
-    solution = _simulate(scene)
+    solution = simulate_finely(scene)
     cyclograph = drawing.chrono_cyclograph(scene.linkage, solution, until=1.5)
     pictures["fig5"] = cyclograph.figure
     pictures["fig6-angles"] = plotting.motion_profile(scene.linkage, solution)
     pictures["fig6-energies"] = plotting.energy_profile(scene.linkage, solution)
     say("Fig 7: RPR arm under PD control")
     scene = scenes.fig7()
-    solution = _simulate(scene)
+    solution = simulate_finely(scene)
     axes = drawing.chrono_cyclograph(scene.linkage, solution, until=0.5)
     task = scene.forces[0].reference
     plotting.tracking(scene.linkage, task, {"tip": solution}, axes)

@@ -43,28 +43,34 @@ class TuneResult(eqx.Module):
 
     - `scene`: the scene with its tuned gains.
     - `loss`: its loss [m^2 with the default loss].
-    - `history`: that of the best run, see `History`.
+    - `histories`: of each run, the first from the scene's own gains, see `History`.
     - `lower`, `upper`: the bounds of kp and kd (2, 3).
     - `converged`: whether a change of the gains by 1 % would change the loss by less
       than 1e-4 of it, to first order and within the bounds.
     - `message`: why the run stopped, in words, and what to beware of.
-    - `start_loss`, `start_gains`: what each start has come to (start,), (start, 2, 3);
-      NaN where it could not be simulated.
     - `member_loss`: loss of each member of the ensemble with the tuned gains (member,).
     - `settings`: method, solver, tolerance and dtype of the run.
     """
 
     scene: Scene
     loss: float
-    history: History
+    histories: list[History]
     lower: Float[np.ndarray, "2 joint"]
     upper: Float[np.ndarray, "2 joint"]
     converged: bool
     message: str
-    start_loss: Float[np.ndarray, " start"]
-    start_gains: Float[np.ndarray, "start 2 joint"]
     member_loss: Float[np.ndarray, " member"]
     settings: dict[str, Any]
+
+    @property
+    def history(self) -> History:
+        """That of the best run."""
+        return self.histories[int(np.nanargmin(self.start_loss))]
+
+    @property
+    def start_loss(self) -> Float[np.ndarray, " start"]:
+        """What each run has come to; NaN where its start could not be simulated."""
+        return np.array([history.loss.min() for history in self.histories])
 
     @property
     def gains(self) -> Float[np.ndarray, "2 joint"]:
@@ -87,29 +93,29 @@ class TuneResult(eqx.Module):
         return float(np.sqrt(np.mean(self.history.effort[_best(self.history)] ** 2)))
 
     def __str__(self) -> str:
-        history, best = self.history, _best(self.history)
+        history, best, first = self.history, _best(self.history), self.histories[0]
         rows = [f"{'':24}{'start':>12}{'tuned':>12}{'least':>12}{'greatest':>12}"]
         names = joint_names(self.scene)
         for kind, name in enumerate(("kp", "kd")):
             for joint in range(3):
                 values = (
                     a[kind, joint]
-                    for a in (history.gains[0], self.gains, self.lower, self.upper)
+                    for a in (first.gains[0], self.gains, self.lower, self.upper)
                 )
                 units = _UNITS[names[joint][0]][kind]
                 label = f"{name} of {names[joint]} [{units}]"
                 mark = "  at its bound" if self.at_bound[kind, joint] else ""
                 cells = "".join(f"{value:12.5g}" for value in values)
                 rows.append(f"{label:24}{cells}{mark}")
-        compared = [("loss", history.loss, 1.0)]
-        if np.isfinite(history.tip_error[best]):
-            compared.append(("rms tip error [mm]", history.tip_error, 1e3))
+        compared = [("loss", lambda h: h.loss, 1.0)]
+        if np.isfinite(self.tip_error):
+            compared.append(("rms tip error [mm]", lambda h: h.tip_error, 1e3))
         for joint in range(3):
-            label = f"{names[joint]} at its limit [%]"
-            compared.append((label, history.saturated[:, joint], 1e2))
+            share = lambda h, joint=joint: h.saturated[:, joint]
+            compared.append((f"{names[joint]} at its limit [%]", share, 1e2))
         for label, values, scale in compared:
-            first, last = scale * values[0], scale * values[best]
-            rows.append(f"{label:24}{first:12.5g}{last:12.5g}")
+            before, after = scale * values(first)[0], scale * values(history)[best]
+            rows.append(f"{label:24}{before:12.5g}{after:12.5g}")
         if len(self.start_loss) > 1:
             near = np.sum(self.start_loss**0.5 <= 1.01 * self.loss**0.5)
             rows.append(
@@ -163,8 +169,10 @@ def _best(history: History) -> int:
 
 
 def _at_bound(gains, lower, upper) -> np.ndarray:
-    # Gains are kept as logarithms: their exponentials miss the bounds by rounding.
-    return (gains > 0) & ((gains <= lower * (1 + 1e-9)) | (gains >= upper * (1 - 1e-9)))
+    # A hair: the exponential of a bound's logarithm may fall short of it by rounding.
+    return (gains > 0) & (
+        (gains <= lower * (1 + 1e-12)) | (gains >= upper * (1 - 1e-12))
+    )
 
 
 def result_of(
@@ -179,35 +187,35 @@ def result_of(
     tuned = lower > 0
 
     def gains_of(z):
-        return np.where(tuned, np.exp(z).reshape(2, 3), 0)
+        return np.where(tuned, np.clip(np.exp(z).reshape(2, 3), lower, upper), 0)
+
+    def history_of(run: Run) -> History:
+        def mean(fact: str) -> np.ndarray:
+            """Over the members."""
+            return np.array([np.mean(row.facts[fact], axis=0) for row in run.rows])
+
+        return History(
+            loss=np.array([row.loss for row in run.rows]),
+            gradient_norm=np.array([row.gradient_norm for row in run.rows]),
+            gains=np.stack([gains_of(row.z) for row in run.rows]),
+            saturated=mean("saturated"),
+            effort=mean("effort"),
+            tip_error=np.sqrt(mean("square_error")),
+            wall_time=np.array([row.wall_time for row in run.rows]),
+        )
 
     run = min(runs, key=lambda run: (run.failed, run.best.loss))
-
-    def mean(fact: str) -> np.ndarray:
-        """Over the members."""
-        return np.array([np.mean(row.facts[fact], axis=0) for row in run.rows])
-
-    history = History(
-        loss=np.array([row.loss for row in run.rows]),
-        gradient_norm=np.array([row.gradient_norm for row in run.rows]),
-        gains=np.stack([gains_of(row.z) for row in run.rows]),
-        saturated=mean("saturated"),
-        effort=mean("effort"),
-        tip_error=np.sqrt(mean("square_error")),
-        wall_time=np.array([row.wall_time for row in run.rows]),
-    )
+    history = history_of(run)
     best = run.best
     assert run.reason is not None
     return TuneResult(
         scene=with_gains(scene, jnp.asarray(gains_of(best.z))),
         loss=best.loss,
-        history=history,
+        histories=[history_of(run) for run in runs],
         lower=lower,
         upper=upper,
         converged=run.converged,
         message=_message(scene, run.reason, history, lower, upper),
-        start_loss=np.array([np.nan if r.failed else r.best.loss for r in runs]),
-        start_gains=np.stack([gains_of(r.best.z) for r in runs]),
         member_loss=best.facts["member_loss"],
         settings=settings,
     )

@@ -1,0 +1,116 @@
+"""The run behind `fdof-jax tune`: set up or go on, tune, save, draw."""
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import equinox as eqx
+from numpy.typing import ArrayLike
+
+from . import scenes
+from .control import CircleTask
+from .ensembles import perturbed
+from .files import load, save
+from .gradient_quality import gradient_report
+from .losses import Tracking, tip_errors
+from .scenes import Scene
+from .showcase import draw_circle, simulate_finely
+from .tune_result import TuneResult
+from .tuning import tune
+
+
+@dataclasses.dataclass(frozen=True)
+class Job:
+    """What is tuned: Fig 7's arm on a circle, and by what it is judged.
+
+    `over`: "nominal", or "mean" or "worst" of an ensemble of `members`.
+    """
+
+    center: ArrayLike = (-4.0, 2.0)  # [m]
+    radius: float = 0.75  # [m]
+    period: float = 5.0  # [s]
+    factor: float = 4.0  # of the paper's gains
+    price: float = 0.0  # of effort [m^2]
+    over: str = "nominal"
+    members: int = 16
+    payload: ArrayLike = (0.0, 2.0)  # [kg]
+    start_offset: float = 0.3  # [m]
+    speed: ArrayLike = (1.0, 2.0)
+    link_error: float = 0.0
+
+    def scene(self) -> Scene:
+        scene = scenes.fig7()
+        task = CircleTask(center=self.center, radius=self.radius, period=self.period)
+        controller = eqx.tree_at(lambda c: c.reference, scene.forces[0], task)
+        return scene._replace(forces=(controller,), t1=2 * abs(self.period))
+
+    def ensemble(self, scene: Scene) -> Scene | None:
+        if self.over == "nominal":
+            return None
+        return perturbed(
+            scene,
+            self.members,
+            payload=self.payload,
+            start_offset=self.start_offset,
+            speed=self.speed,
+            link_error=self.link_error,
+        )
+
+
+class TuningRun(NamedTuple):
+    """A finished run: its result, the gradient reports before and after, pictures."""
+
+    result: TuneResult
+    reports: tuple[Any, Any]
+    pictures: list[Path]
+
+
+def run_tuning(
+    output: Path,
+    say: Callable[[str], None],
+    report: Callable[[str], None],
+    *,
+    job: Job,
+    resume: Path | None = None,
+    save_to: Path | None = None,
+    **search: Any,
+) -> TuningRun:
+    """Tune the gains of a job, or go on from where a saved one has come to.
+
+    **Arguments:** `search`: method, starts, seed and max_steps of `tune`.
+
+    **Raises:** ValueError as `tune` and `load`.
+    """
+    bounds = None
+    scene = job.scene()
+    start = scene
+    if resume is not None:
+        say(f"go on from {resume}")
+        saved = load(resume)
+        if not isinstance(saved, dict) or set(saved) != {"job", "result"}:
+            raise ValueError(
+                f"{resume}: expected a file written by `fdof-jax tune --save`, got one "
+                f"that holds a {type(saved).__name__}."
+            )
+        job, before = saved["job"], saved["result"]
+        scene, start, bounds = job.scene(), before.scene, (before.lower, before.upper)
+    say("tune the gains")
+    result = tune(
+        start,
+        factor=job.factor,
+        bounds=bounds,
+        loss=Tracking(effort=job.price) if job.price else tip_errors,
+        ensemble=job.ensemble(scene),
+        over="mean" if job.over == "nominal" else job.over,
+        report=report,
+        **search,
+    )
+    if save_to is not None:
+        save(save_to, {"job": job, "result": result})
+    say("compare the gradients with differences")
+    reports = gradient_report(start), gradient_report(result.scene)
+    say("draw")
+    first, second = simulate_finely(scene), simulate_finely(result.scene)
+    pictures = draw_circle(output, scene, first, result, second)
+    return TuningRun(result, reports, pictures)
