@@ -193,6 +193,35 @@ def lockstep(points: list[dict]) -> str:
     return table(head, rows)
 
 
+def tuning(points: list[dict]) -> str:
+    timed = [
+        [
+            p["problem"],
+            number(p["compile_time"]),
+            number(p["time_median"], 3),
+            number(p["time_median"] / p["batch"], 3),
+            f"{100 * p['near']:.0f} %",
+        ]
+        for p in points
+        if p["kind"] == "time"
+    ]
+    races = [p for p in points if p["kind"] == "race"]
+    limits = list(races[0]["best"]) if races else []
+    raced = [
+        [p["problem"], p["solver"], *(number(p["best"][limit], 4) for limit in limits)]
+        for p in races
+    ]
+    head = ["", "compile [s]", "s", "s per start", "starts within 1 % of the best"]
+    seconds = [f"{limit} s" for limit in limits]
+    return "\n\n".join(
+        [
+            table(head, timed),
+            "Best rms tip error [mm] after so many seconds, median of the starts:",
+            table(["", "optimiser", *seconds], raced),
+        ]
+    )
+
+
 def many(points: list[dict]) -> str:
     rows = [
         [
@@ -315,6 +344,7 @@ def tables(points: dict[str, list[dict]]) -> dict[str, str]:
         "scaling": scaling,
         "drift": drift,
         "lockstep": lockstep,
+        "tuning": tuning,
         "hard_cases": hard_cases,
         "hard_cases-float32": hard_cases_float32,
     }

@@ -48,6 +48,7 @@ JOBS = (
     Job("scaling", "scaling"),
     Job("drift", "drift"),
     Job("lockstep", "lockstep"),
+    Job("tuning", "tuning"),
     # A quarter of an hour, for outcomes more than for times: only when asked for.
     Job("hard_cases", "hard_cases", asked=True),
     Job("hard_cases-float32", "hard_cases", "run_float32", x64=False, asked=True),

@@ -45,7 +45,7 @@ def with_gains(scene: Scene, gains: Array) -> Scene:
     return scene._replace(forces=forces)
 
 
-def _lane(z: Array, problem: tuple[Scene, Loss, Array]) -> Evaluation:
+def evaluate_gains(z: Array, problem: tuple[Scene, Loss, Array]) -> Evaluation:
     """One member's loss and its derivatives in the log-gains `z`.
 
     `problem`: the scene, the loss, and which gains are tuned.
@@ -166,7 +166,7 @@ def _search(
         [(member, loss, lower > 0) for member in row]
         for row, loss, (_, lower, _) in zip(members, losses, boxes)
     ]
-    lanes = Lanes(_lane, problems, starts, {"mean": 1, "worst": _WORST}[over])
+    lanes = Lanes(evaluate_gains, problems, starts, {"mean": 1, "worst": _WORST}[over])
     columns = zip(*(_started(box, starts, draw) for box in boxes))
     z, low, high = map(np.concatenate, columns)
     runs = minimise(

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+import fdof_jax as fj
 from fdof_jax import showcase
 from fdof_jax.__main__ import main
 
@@ -69,3 +70,64 @@ def test_unknown_command(capsys):
     with pytest.raises(SystemExit) as stop:
         main(["square"])
     assert stop.value.code == 2
+
+
+def kept_gains(printed):
+    """Tuned kp and kd of a printed table."""
+    lines = [
+        line.split() for line in printed.splitlines() if line[:4] in ("kp o", "kd o")
+    ]
+    return [[float(cell) for cell in line[line.index(unit) + 1 :][:2]]
+            for line in lines for unit in line if unit.endswith("]")]  # fmt: skip
+
+
+def test_tuning_goes_on_where_it_was_saved(tmp_path, capsys):
+    file, folder = tmp_path / "run.fdof", ["--output", str(tmp_path)]
+    circle = ["--radius", "0.5", "--period", "1", "--factor", "3"]
+    ensemble = ["--over", "worst", "--members", "2", "--payload", "0", "1"]
+    search = ["--max-steps", "2"]
+    main(["tune", *folder, *circle, *ensemble, *search, "--save", str(file)])
+    first = capsys.readouterr().out
+    assert "before tuning: gradient against differences" in first
+    assert "circle-path.png" in pictures(tmp_path)
+    saved = fj.load(file)
+    assert saved["job"].radius == 0.5 and saved["job"].over == "worst"
+    main(["tune", *folder, *search, "--resume", str(file), "--save", str(file)])
+    second = capsys.readouterr().out
+    again = fj.load(file)["result"]
+    assert again.loss < saved["result"].loss
+    # The same members and bounds, from where the first run has come to.
+    assert again.history.loss[0] == pytest.approx(saved["result"].loss, rel=1e-9)
+    np.testing.assert_array_equal(again.upper, saved["result"].upper)
+    before, after = kept_gains(first), kept_gains(second)
+    assert [row[1] for row in before] == [row[0] for row in after]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--resume", "x.fdof", "--radius", "1"], "--resume: the file says"),
+        (["--resume", "x.fdof"], "x.fdof"),
+        (["--payload", "0", "1"], "--over: mean or worst is needed for payload"),
+        (["--radius", "-1"], "radius"),
+        (["--factor", "0.5"], "factor"),
+        (["--starts", "0"], "starts"),
+        (["--method", "newton"], "--method"),
+    ],
+)
+def test_tuning_refuses(options, message, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as stop:
+        main(["tune", *options])
+    assert stop.value.code == 2
+    assert message in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_league(capsys):
+    main(["league"])
+    table = capsys.readouterr().out.split("\n\n")[-1].splitlines()[2:]
+    names = [row.split()[0] for row in table]
+    errors = [float(row.split()[2]) for row in table]
+    assert sorted(names) == sorted(fj.TOPOLOGIES) and errors == sorted(errors)
+    assert errors[0] < 5 and errors[-1] < 60

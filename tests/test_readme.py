@@ -8,7 +8,8 @@ import numpy as np
 README = Path(__file__).parents[1] / "README.md"
 
 
-def test_python_examples():
+def test_python_examples(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     blocks = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
     assert len(blocks) >= 4
     namespace = {}

@@ -1,0 +1,67 @@
+"""One circle for all seven topologies."""
+
+import jax
+import numpy as np
+import pytest
+
+import fdof_jax as fj
+
+SCENES = fj.circle_scenes()
+TS = np.linspace(0, 4, 201)
+
+
+@pytest.mark.parametrize("topology", fj.TOPOLOGIES)
+def test_the_circle_is_reachable_from_where_the_arm_is(topology):
+    scene = SCENES[topology]
+    task = scene.forces[0].reference
+    assert fj.reachable(scene.linkage, task, TS).all()
+    motion = jax.vmap(lambda t: task(t, scene.linkage)[0])
+    q = np.asarray(motion(TS))
+    # Within reach of the start, without a jump, and away from singularities.
+    assert np.abs(q[0] - np.asarray(scene.state0.q)).max() < 0.1
+    assert np.abs(np.diff(q, axis=0)).max() < 0.05
+    jacobians = jax.vmap(lambda q: fj.tip_jacobian(scene.linkage, q))(q)
+    assert np.abs(np.linalg.det(jacobians)).min() > 0.5
+    tips = jax.vmap(lambda q: fj.tip_position(scene.linkage, q))(q)
+    distance = np.linalg.norm(np.asarray(tips) - np.asarray(task.center), axis=1)
+    np.testing.assert_allclose(distance, 0.25, atol=1e-12)
+
+
+def test_all_start_with_the_tip_at_the_same_place():
+    tips = [fj.tip_position(s.linkage, s.state0.q) for s in SCENES.values()]
+    np.testing.assert_allclose(tips, np.tile(tips[0], (7, 1)), atol=1e-12)
+    start = SCENES["RRR"].forces[0].reference.tip(0.0)
+    assert 0.04 < np.linalg.norm(np.asarray(start) - np.asarray(tips[0])) < 0.06
+
+
+def test_reachable_says_when():
+    scene = SCENES["RRR"]
+    task = fj.CircleTask(
+        center=(1.99, 0.95), radius=0.75, period=4.0, orientation=0.8, branch=-1
+    )
+    found = np.asarray(fj.reachable(scene.linkage, task, TS))
+    assert found.any() and not found.all()
+    for t, there in zip(TS[::25], found[::25]):
+        try:
+            fj.inverse_kinematics(scene.linkage, task.tip(t), 0.8, branch=-1)
+            assert there
+        except ValueError:
+            assert not there
+
+
+def test_all_are_tuned_in_one_program_and_as_they_are_alone():
+    few = {name: SCENES[name]._replace(t1=1.0) for name in ("RPR", "PPR")}
+    together = fj.tune_each(list(few.values()), max_steps=4)
+    alone = fj.tune(few["PPR"], max_steps=4)
+    np.testing.assert_allclose(together[1].gains, alone.gains, rtol=1e-3)
+    assert together[1].loss == pytest.approx(alone.loss, rel=1e-4)
+    table = fj.league_table(dict(zip(few, together))).splitlines()
+    assert [row.split()[0] for row in table[2:]] == ["PPR", "RPR"]
+    assert f"{1e3 * together[0].tip_error:.4g}" in table[3]
+
+
+def test_scenes_that_cannot_be_tuned_together():
+    with pytest.raises(ValueError, match="scenes: expected a list"):
+        fj.tune_each(SCENES["RRR"])
+    with pytest.raises(ValueError, match="ensemble: expected none"):
+        fj.tune_each([SCENES["RRR"]], ensemble=SCENES["RRR"])
