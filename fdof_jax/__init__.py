@@ -23,6 +23,7 @@ from .dynamics import (
     link_energies as link_energies,
 )
 from .files import load as load, save as save
+from .fit_result import FitResult as FitResult
 from .forces import (
     EffortHistory as EffortHistory,
     InertialElement as InertialElement,
@@ -31,6 +32,7 @@ from .forces import (
     StatefulElement as StatefulElement,
 )
 from .hybrid_dynamics import PrescribedMotion as PrescribedMotion
+from .identification import fit as fit, fit_each as fit_each
 from .interop import to_mjcf as to_mjcf
 from .joint_limits import JointFriction as JointFriction, JointStops as JointStops
 from .kinematics import (
