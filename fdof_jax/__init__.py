@@ -32,7 +32,7 @@ from .forces import (
     StatefulElement as StatefulElement,
 )
 from .hybrid_dynamics import PrescribedMotion as PrescribedMotion
-from .identification import fit as fit, fit_each as fit_each
+from .identification import fit as fit, fit_each as fit_each, link_ends as link_ends
 from .interop import to_mjcf as to_mjcf
 from .joint_limits import JointFriction as JointFriction, JointStops as JointStops
 from .kinematics import (

@@ -109,7 +109,7 @@ def _together(labels: tuple[str, ...], direction: np.ndarray, least: float) -> s
     kept = np.flatnonzero(np.abs(parts) > least)
     if len(kept) == 1:
         return labels[kept[0]]
-    changes = [f"{labels[i]} by {100 * parts[i]:+.3g} %" for i in kept]
+    changes = [f"{labels[i]} by {parts[i]:+.3g} %" for i in kept]
     return f"{', '.join(changes[:-1])} and {changes[-1]} together"
 
 

@@ -258,7 +258,7 @@ def fit(
     - `observed`: the recording, of the shape that `observe` returns; of several scenes,
       stacked along a leading axis. NaN where a sample is missing.
     - `observe`: `(scene, solution) -> readings`, an array with time as first axis. By
-      default `identification.link_ends`, markers (time, 3, 2) at the ends of the
+      default `link_ends`, markers (time, 3, 2) at the ends of the
       moving links [m]; `lambda scene, solution: solution.q` for joint encoders.
     - `noise`: the standard deviation of a reading, one number or an array that
       broadcasts to a recording [its unit]. If None, all readings weigh the same and

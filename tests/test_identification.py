@@ -8,7 +8,6 @@ import pytest
 
 import fdof_jax as fj
 from fdof_jax import fit_result, lanes
-from fdof_jax.identification import link_ends
 
 TS = np.linspace(0, 2, 201)
 LENGTH, MASS = np.array([0, 1, 0.8, 0.6]), np.array([3.0, 2.0, 1.0])
@@ -27,7 +26,7 @@ class Sines(eqx.Module):
 SINES = Sines(jnp.array([20.0, 8.0, 3.0]), jnp.array([5.0, 7.0, 9.0]))
 
 
-def recorded(scene, ts=TS, observe=link_ends):
+def recorded(scene, ts=TS, observe=fj.link_ends):
     """What would be seen without noise, by `simulate` at its own tolerance."""
     # As arrays of one structure, for one compilation.
     scene = jax.tree.map(jnp.asarray, scene)
@@ -35,7 +34,7 @@ def recorded(scene, ts=TS, observe=link_ends):
     return np.asarray(observe(scene, solution))
 
 
-def jacobian(scene_at, parameters, observe=link_ends):
+def jacobian(scene_at, parameters, observe=fj.link_ends):
     """By central differences of `simulate`, over single numbers: (reading, n)."""
     columns = []
     for name, value in parameters.items():
