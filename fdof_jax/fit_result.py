@@ -42,8 +42,8 @@ class FitResult(eqx.Module):
     - `converged`: whether a further step would change the parameters by less than 3 %
       of their standard errors, or a millionth of their sizes.
     - `message`: why the search stopped, and what to beware of.
-    - `history`: the weighted sum of squares over all of the recording, from where its
-      first half has led to and at each accepted point.
+    - `history`: the weighted sum of squares over all of the recording, from where the
+      search over three quarters of it has led to, and at each accepted point.
     """
 
     parameters: dict[str, Any]

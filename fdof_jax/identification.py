@@ -32,7 +32,8 @@ _ENOUGH = 1e-8
 # Parts of the recording that are looked at in turn, each from where the one before has
 # led to: over a short time a motion follows its parameters nearly linearly, while from
 # the start over all of it a search may end in a local minimum.
-_EARLY = ((0.25, 1e-3), (0.5, 1e-3))
+_SHARES = (0.25, 0.5, 0.75, 1.0)
+_ENOUGH_EARLY = 1e-3  # as only a start for the next is wanted
 
 
 def link_ends(scene: Scene, solution: Solution) -> Float[Array, "time link 2"]:
@@ -124,9 +125,28 @@ def _check_scene(scene: Any, ts: Array) -> None:
     if not isinstance(scene, Scene):
         raise ValueError(f"scene_at: expected it to return a Scene, got {scene!r}.")
     check_linkage(scene.linkage)
-    real_state("state0", scene.state0)
-    callable_tuple("forces", scene.forces)
+    real_state("scene_at(...).state0", scene.state0)
+    callable_tuple("scene_at(...).forces", scene.forces)
     check_elements(scene.forces, scene.linkage, ts)
+
+
+def _longer_and_longer(
+    until: Callable[[float], Lanes],
+    z: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
+    **keywords: Any,
+) -> list[Run]:
+    """The runs over all of the time; `until` judges the motion up to a part of it."""
+    keywords = dict(method="levenberg-marquardt") | keywords
+    for share, longer in zip(_SHARES, _SHARES[1:]):
+        runs = minimise(until(share), z, low, high, enough=_ENOUGH_EARLY, **keywords)
+        # A short time may tell so little that noise leads astray.
+        better = until(longer)
+        found, every = np.stack([run.z for run in runs]), np.arange(len(z))
+        gain = better(found, every).loss < better(z, every).loss
+        z = np.where(gain[:, None], found, z)
+    return minimise(until(1), z, low, high, enough=_ENOUGH, **keywords)
 
 
 def _search(
@@ -160,7 +180,7 @@ def _search(
             f"observed: expected a row for each of the {ts.size} times, got shape "
             f"{readings.shape[1:]}."
         )
-    for name, value in (("scene_at", scenes_at[0]), ("observe", observe)):
+    for name, value in (*(("scene_at", s) for s in scenes_at), ("observe", observe)):
         if not callable(value):
             raise ValueError(f"{name}: expected a callable, got {value!r}.")
     for scene_at in scenes_at:
@@ -191,17 +211,9 @@ def _search(
     z, low, high = (
         np.broadcast_to(a / unknowns.flat_scale, (len(rows), a.size)) for a in box
     )
-    keywords: dict[str, Any] = dict(
-        method="levenberg-marquardt", max_steps=max_steps, report=_reporter(report)
+    runs = _longer_and_longer(
+        until, z, low, high, max_steps=max_steps, report=_reporter(report)
     )
-    for share, enough in _EARLY:
-        runs = minimise(until(share), z, low, high, enough=enough, **keywords)
-        # A short time may tell so little that noise leads astray.
-        better = until(2 * share)
-        found, every = np.stack([run.z for run in runs]), np.arange(len(rows))
-        gain = better(found, every).loss < better(z, every).loss
-        z = np.where(gain[:, None], found, z)
-    runs = minimise(until(1), z, low, high, enough=_ENOUGH, **keywords)
     if any(not np.isfinite(run.best.loss) for run in runs):
         raise ValueError(
             "start: expected parameters at which the scene can be simulated over ts, "
@@ -243,7 +255,7 @@ def fit(
     """The parameters of a scene with which it moves as it was observed to.
 
     Least squares by Levenberg and Marquardt's method, with exact derivatives: over the
-    first quarter of the time, from there over the first half, and then over all.
+    first quarter of the time, from there over the first half, and so on, to all of it.
     Masses, inertias, offsets, damping, starting positions: whatever a scene is made of.
     A second call with other numbers compiles nothing, if `scene_at` and `observe` are
     the same functions or Equinox modules of the same structure.
