@@ -32,6 +32,7 @@ from .ensembles import (
     with_payload as with_payload,
 )
 from .files import load as load, save as save
+from .fit_result import FitResult as FitResult
 from .forces import (
     EffortHistory as EffortHistory,
     InertialElement as InertialElement,
@@ -44,6 +45,7 @@ from .gradient_quality import (
     gradient_report as gradient_report,
 )
 from .hybrid_dynamics import PrescribedMotion as PrescribedMotion
+from .identification import fit as fit, fit_each as fit_each, link_ends as link_ends
 from .interop import to_mjcf as to_mjcf
 from .joint_limits import JointFriction as JointFriction, JointStops as JointStops
 from .kinematics import (

@@ -17,6 +17,7 @@ def test_python_examples(tmp_path, monkeypatch):
         exec(compile(block, "README.md", "exec"), namespace)
     assert np.isfinite(namespace["motions"].q).all()
     assert namespace["result"].loss ** 0.5 < 0.07
+    assert namespace["found"].converged
 
 
 def test_the_first_two_shell_blocks_stand_alone():
