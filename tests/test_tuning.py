@@ -38,9 +38,9 @@ def within(result):
 @pytest.mark.parametrize("factor", [4.0, 10.0])
 def test_all_starts_agree_and_no_random_gains_do_better(factor):
     scene = scenes.fig7()
-    result = fj.tune(scene, factor=factor, starts=20)
+    result = fj.tune(scene, factor=factor, starts=6)  # 20 in the benchmarks
     rms = np.sqrt(result.start_loss)
-    assert rms.shape == (20,) and (rms <= 1.01 * rms.min()).all()
+    assert rms.shape == (6,) and (rms <= 1.01 * rms.min()).all()
     assert result.converged and within(result)
     low, high = np.log(result.lower), np.log(result.upper)
     random = np.exp(np.random.default_rng(5).uniform(low, high, (64, 2, 3)))
