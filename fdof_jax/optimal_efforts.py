@@ -12,7 +12,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from .bounded_search import Evaluation, Run, minimise
-from .control import tip_deviation
+from .control import PDController, tip_deviation
 from .forces import EffortHistory
 from .lanes import Lanes
 from .linkage import check_linkage
@@ -140,12 +140,12 @@ def _lane(z: Array, problem: tuple[Scene, Any, Array, Array, Array]) -> Evaluati
         scene_at, residuals, z, ts, _TOLERANCE
     )
     bent = jax.jacfwd(rates)(z)
-    return Evaluation(
+    return Evaluation(  # pyright: ignore[reportArgumentType]
         jnp.sum(errors**2) + price * jnp.sum(rates(z) ** 2),
         2 * (errors @ jacobian + price * rates(z) @ bent),
         2 * (jacobian.T @ jacobian + price * bent.T @ bent),
         dict(tip_error=jnp.sqrt(jnp.sum(errors**2)), steps=solution.stats["num_steps"]),
-    )  # type: ignore[arg-type]
+    )
 
 
 def _check(scene: Any, horizon: Any) -> float:
@@ -237,8 +237,8 @@ def optimal_efforts(
     def error_of(scene: Scene, solution: Solution) -> float:
         return float(np.linalg.norm(_deviations(scene, task, solution)))
 
-    known = ComputedTorque(_BANDWIDTH**2, 2 * _BANDWIDTH, limit, task)
-    guides = [scene, _with(scene, type(controller), known)]
+    known = ComputedTorque(_BANDWIDTH**2, 2 * _BANDWIDTH, limit, task, None)
+    guides = [scene, _with(scene, PDController, known)]
     solutions = [moved(guide) for guide in guides]
     guesses = [
         _efforts_at(times, guide, solution)
@@ -248,7 +248,7 @@ def optimal_efforts(
     bound = np.tile(np.where(limit > 0, 1.0, 0.0), knots)
     start = np.stack([(tau / np.where(limit > 0, limit, 1)).ravel() for tau in guesses])
     start = np.clip(np.nan_to_num(start), -bound, bound)
-    free = _with(scene, type(controller), _Knots(times, np.zeros((knots, 3))))
+    free = _with(scene, PDController, _Knots(jnp.asarray(times), jnp.zeros((knots, 3))))
     lanes = Lanes(_lane, [[(free, task, limit, price, ts)]], starts=len(start))
     bounds = np.broadcast_to(bound, start.shape)
     runs = minimise(
@@ -263,10 +263,9 @@ def optimal_efforts(
         )
     run = min(runs, key=lambda run: run.best.loss)
     efforts = limit * run.best.z.reshape(-1, 3)
-    found = _with(scene, type(controller), EffortHistory(times, efforts))
+    found = _with(scene, PDController, EffortHistory(times, efforts))
     found = found._replace(t1=horizon)
     solution = moved(found)
-    assert run.reason is not None
     return OptimalMotion(
         scene=found,
         ts=times,
@@ -276,7 +275,7 @@ def optimal_efforts(
         solution=solution,
         guess_errors=np.array([_tip_error(run) for run in runs]),
         converged=run.best.gradient_norm <= _SMALL_GRADIENT * run.best.loss,
-        message=run.reason,
+        message=str(run.reason),
     )
 
 
@@ -284,7 +283,9 @@ def _efforts_at(times: np.ndarray, scene: Scene, solution: Solution) -> np.ndarr
     """Those of a scene's controller along its motion, (time, 3)."""
     controller = controller_of(scene)
     efforts = joint_efforts(scene.linkage, scene.forces, solution).elements
-    mine = np.asarray(efforts[[force is controller for force in scene.forces].index(1)])
+    mine = np.asarray(
+        efforts[[force is controller for force in scene.forces].index(True)]
+    )
     return np.stack([np.interp(times, solution.ts, column) for column in mine.T], 1)
 
 

@@ -44,7 +44,7 @@ def test_no_controller_with_these_limits_does_better(best):
     assert rms_tip_error(best.scene, task) == pytest.approx(best.tip_error, rel=2e-3)
     own = rms_tip_error(scene, task)
     assert best.controller_error == pytest.approx(own, rel=2e-3)
-    torque = fj.ComputedTorque(100.0, 20.0, limit, task)
+    torque = fj.ComputedTorque(100.0, 20.0, limit, task, None)
     known = rms_tip_error(scene._replace(forces=(torque,)), task)
     assert best.tip_error < 0.6 * known < 0.6 * own
     assert best.bound(2.0) == pytest.approx(best.tip_error / 2)
