@@ -79,6 +79,10 @@ from .model_based_control import (
     ComputedTorque as ComputedTorque,
     GravityFeedforward as GravityFeedforward,
 )
+from .optimal_efforts import (
+    OptimalMotion as OptimalMotion,
+    optimal_efforts as optimal_efforts,
+)
 from .point_elements import (
     SpringDamper as SpringDamper,
     Tension as Tension,

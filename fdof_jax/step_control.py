@@ -115,7 +115,7 @@ def landing_on(
             "stepsize_controller: expected an adaptive one, as forces declare times "
             f"at which they jump (jump_ts), got {controller!r}."
         )
-    return diffrax.ClipStepSizeController(controller, jump_ts=jump_ts)
+    return diffrax.ClipStepSizeController(_Longer(controller), jump_ts=jump_ts)  # pyright: ignore[reportCallIssue]
 
 
 class _Wrapped(diffrax.AbstractStepSizeController):
@@ -143,6 +143,28 @@ class _Adaptive(_Wrapped, diffrax.AbstractAdaptiveStepSizeController):
     @property
     def norm(self):  # pyright: ignore[reportIncompatibleMethodOverride]
         return self.controller.norm
+
+
+class _Longer(_Adaptive):
+    """A controller whose steps come out longer, by the root of the rounding error.
+
+    A step as long as the distance of two jumps would else end a rounding error short of
+    the second, and the next be too short to go on.
+    """
+
+    controller: Any
+
+    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
+        return self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
+
+    def adapt_step_size(  # pyright: ignore[reportIncompatibleMethodOverride]
+        self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state
+    ):
+        keep, next_t0, next_t1, *rest = self.controller.adapt_step_size(
+            t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state
+        )
+        stretch = 1 + jnp.finfo(next_t1.dtype).eps ** 0.5
+        return keep, next_t0, next_t0 + stretch * (next_t1 - next_t0), *rest
 
 
 class Watched(_Adaptive):

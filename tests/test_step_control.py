@@ -87,6 +87,15 @@ def test_steps_land_on_declared_jumps():
     assert np.abs(hit).max() > 0.01
 
 
+def test_steps_as_long_as_the_distance_of_jumps_do_not_fall_short_of_them():
+    jumps = jnp.linspace(0, 1, 101)
+    steps = diffrax.PIDController(rtol=1e-6, atol=1e-6, dtmax=0.01)
+    solution = fj.simulate(
+        ARM, START, TS, (Switched(jumps, 0.0),), dt0=0.01, stepsize_controller=steps
+    )
+    assert solution.stats["num_steps"] <= 102
+
+
 def test_a_sweep_lands_on_each_members_jumps():
     jumps = jnp.array([[0.2, 0.4], [0.6, 0.8]])
     together = fj.sweep(

@@ -1,0 +1,167 @@
+"""The best open-loop efforts: Fuller's control of a slide, and no controller better."""
+
+import sys
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+import fdof_jax as fj
+from fdof_jax import scenes
+from fdof_jax.lanes import Lanes
+
+module = sys.modules["fdof_jax.optimal_efforts"]
+
+# The same for all, so that they share programs.
+HORIZON, KNOTS = 0.5, 26
+CONTROLLER = scenes.fig7().forces[0]
+
+
+def rms_tip_error(scene, task):
+    """By the trapezium rule, of a motion of its own."""
+    ts = np.linspace(0, HORIZON, 501)
+    solution = fj.simulate(scene.linkage, scene.state0, ts, scene.forces)
+    q, times = np.asarray(solution.q), np.asarray(solution.ts)
+    tips = np.array([fj.tip_position(scene.linkage, row) for row in q[::5]])
+    aims = np.array([task.tip(t) for t in times[::5]])
+    squares = np.sum((tips - aims) ** 2, axis=1)
+    return np.sqrt(np.trapezoid(squares, times[::5]) / HORIZON)
+
+
+@pytest.fixture(scope="module")
+def best():
+    return fj.optimal_efforts(scenes.fig7(), horizon=HORIZON, knots=KNOTS)
+
+
+def test_no_controller_with_these_limits_does_better(best):
+    scene = scenes.fig7()
+    task, limit = CONTROLLER.reference, np.asarray(CONTROLLER.limit)
+    assert best.converged
+    assert (np.abs(best.efforts) <= limit).all()
+    assert (np.abs(best.efforts) == limit).any()
+    # Both guesses come to the same place.
+    np.testing.assert_allclose(best.guess_errors, best.tip_error, rtol=1e-3)
+    assert rms_tip_error(best.scene, task) == pytest.approx(best.tip_error, rel=2e-3)
+    own = rms_tip_error(scene, task)
+    assert best.controller_error == pytest.approx(own, rel=2e-3)
+    torque = fj.ComputedTorque(100.0, 20.0, limit, task, None)
+    known = rms_tip_error(scene._replace(forces=(torque,)), task)
+    assert best.tip_error < 0.6 * known < 0.6 * own
+    assert best.bound(2.0) == pytest.approx(best.tip_error / 2)
+    assert f"{1e3 * best.tip_error:.5g} mm" in str(best)
+
+
+def test_derivatives_against_differences(best):
+    limit = np.asarray(CONTROLLER.limit)
+    free = best.scene._replace(forces=(module._Knots(best.ts, best.efforts),))
+    problem = free, CONTROLLER.reference, limit, np.array(1e-9), best.solution.ts
+    lanes = Lanes(module._lane, [[problem]], starts=2)
+    draw = np.random.default_rng(0)
+    z = 0.9 * (best.efforts / limit).ravel()
+    for _ in range(3):
+        change = 1e-5 * draw.normal(size=z.size)
+        after, before = lanes(np.stack([z + change, z - change]), np.arange(2)).loss
+        here = lanes(np.stack([z, z]), np.arange(2))
+        slope = here.gradient[0] @ change
+        assert (after - before) / 2 == pytest.approx(slope, rel=1e-4)
+
+
+def fuller(offset, push):
+    """The least integral of x^2 from x = `offset` at rest, where |x''| <= `push`.
+
+    And the time it takes. Fuller's problem: the best control switches where
+    x = -c v |v| / push, ever faster.
+    """
+    c = np.sqrt((np.sqrt(33) - 1) / 24)
+    x, v, integral, time = offset, 0.0, 0.0, 0.0
+    for _ in range(30):
+        # Pushed back until the switch, at which the signs are turned.
+        curve = [-(0.5 + c) * push, (1 + 2 * c) * v, x - c * v**2 / push]
+        lasting = max(np.roots(curve))
+        path = np.polynomial.Polynomial([x, v, -push / 2])
+        integral += (path**2).integ()(lasting)
+        time += lasting
+        x, v = -path(lasting), -(v - push * lasting)
+    return integral, time
+
+
+def two_slides():
+    """Across each other, without gravity; the last joint turns nothing and is held."""
+    linkage = fj.Linkage(
+        "PPR",
+        length=[0, 1, 1, 1],
+        com=[[0, 0], [0, 0], [0, 0]],
+        mass=[1, 2, 3],
+        inertia=[1, 1, 1],
+        locked=[np.pi / 2, 0, 0],
+        gravity=0,
+    )
+    start = fj.inverse_kinematics(linkage, [-2.0, 3.0], np.pi / 2)
+    task = fj.CircleTask(center=(-2.3, 3.2), radius=0.0)
+    controller = fj.PDController(100.0, 10.0, [120.0, 80.0, 0.0], task)
+    state0 = fj.State(start, np.zeros(3))
+    return fj.Scene(linkage, state0, (controller,), 1.0)
+
+
+def test_slides_are_controlled_as_fuller_found():
+    scene = two_slides()
+    found = fj.optimal_efforts(scene, horizon=HORIZON, knots=KNOTS)
+    # The first slide carries everything up, the second all but the first link left.
+    (up, t_up), (left, t_left) = fuller(0.2, 120 / 6), fuller(0.3, 80 / 5)
+    assert max(t_up, t_left) < HORIZON
+    least = np.sqrt((up + left) / HORIZON)
+    print(least, found)
+    assert least < found.tip_error < 1.01 * least
+    assert (found.efforts[:, 2] == 0).all()
+
+
+@pytest.mark.slow
+def test_scipy_finds_no_better_efforts():
+    scene, limit = scenes.fig7(), np.asarray(CONTROLLER.limit)
+    knots = np.linspace(0, 0.4, 6)
+    found = fj.optimal_efforts(scene, horizon=0.4, knots=6, effort_rate=0)
+    ts = np.linspace(0, 0.4, 501)
+    weights = np.sqrt(np.convolve(np.full(500, 1 / 500), [0.5, 0.5]))
+
+    def residuals(z):
+        forces = (fj.EffortHistory(knots, limit * z.reshape(-1, 3)),)
+        solution = fj.simulate(scene.linkage, scene.state0, ts, forces)
+        deviation = fj.control.tip_deviation(
+            scene.linkage, CONTROLLER.reference, solution
+        )
+        return np.asarray(weights[:, None] * deviation).ravel()
+
+    other = least_squares(residuals, np.zeros(18), bounds=(-1, 1), diff_step=1e-6)
+    assert found.tip_error == pytest.approx(np.sqrt(2 * other.cost), rel=1e-3)
+
+
+def changed(**fields):
+    values = {name: getattr(CONTROLLER, name) for name in ("kp", "kd", "limit")}
+    values = values | dict(reference=CONTROLLER.reference) | fields
+    return scenes.fig7()._replace(forces=(fj.PDController(**values),))
+
+
+@pytest.mark.parametrize(
+    "scene, keywords, message",
+    [
+        (5, {}, "scene: expected a Scene"),
+        (scenes.fig5(), {}, "scene: expected exactly one PDController"),
+        (changed(limit=[1, np.inf, 1]), {}, "scene: expected finite limits"),
+        (changed(reference=lambda t, linkage: None), {}, "scene: expected its contr"),
+        (scenes.fig7(), dict(horizon=0), "horizon: expected"),
+        (scenes.fig7(), dict(horizon=11), "horizon: expected at most"),
+        (scenes.fig7(), dict(knots=1), "knots: expected"),
+        (scenes.fig7(), dict(knots=20.0), "knots: expected"),
+        (scenes.fig7(), dict(effort_rate=-1), "effort_rate: expected"),
+        (scenes.fig7(), dict(max_steps=0), "max_steps: expected"),
+        (scenes.fig7(), dict(report=3), "report: expected"),
+    ],
+)
+def test_malformed_arguments(scene, keywords, message):
+    with pytest.raises(ValueError, match=message):
+        fj.optimal_efforts(scene, **keywords)
+
+
+def test_the_bound_is_for_longer_runs(best):
+    with pytest.raises(ValueError, match="t1: expected"):
+        best.bound(0.3)
