@@ -237,7 +237,8 @@ def optimal_efforts(
     def error_of(scene: Scene, solution: Solution) -> float:
         return float(np.linalg.norm(_deviations(scene, task, solution)))
 
-    known = ComputedTorque(_BANDWIDTH**2, 2 * _BANDWIDTH, limit, task, None)
+    kp, kd = jnp.full(3, _BANDWIDTH**2), jnp.full(3, 2 * _BANDWIDTH)
+    known = ComputedTorque(kp, kd, jnp.asarray(limit), task, None)
     guides = [scene, _with(scene, PDController, known)]
     solutions = [moved(guide) for guide in guides]
     guesses = [
