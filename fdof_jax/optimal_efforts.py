@@ -140,7 +140,8 @@ def _lane(z: Array, problem: tuple[Scene, Any, Array, Array, Array]) -> Evaluati
         scene_at, residuals, z, ts, _TOLERANCE
     )
     bent = jax.jacfwd(rates)(z)
-    return Evaluation(  # pyright: ignore[reportArgumentType]
+    evaluation: Any = Evaluation  # of JAX arrays, which become NumPy's
+    return evaluation(
         jnp.sum(errors**2) + price * jnp.sum(rates(z) ** 2),
         2 * (errors @ jacobian + price * rates(z) @ bent),
         2 * (jacobian.T @ jacobian + price * bent.T @ bent),
@@ -237,7 +238,8 @@ def optimal_efforts(
     def error_of(scene: Scene, solution: Solution) -> float:
         return float(np.linalg.norm(_deviations(scene, task, solution)))
 
-    known = ComputedTorque(_BANDWIDTH**2, 2 * _BANDWIDTH, limit, task, None)
+    make: Any = ComputedTorque
+    known = make(_BANDWIDTH**2, 2 * _BANDWIDTH, limit, task)
     guides = [scene, _with(scene, PDController, known)]
     solutions = [moved(guide) for guide in guides]
     guesses = [
