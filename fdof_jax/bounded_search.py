@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from scipy.linalg import cholesky, solve_triangular
+from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
 from scipy.optimize import lsq_linear
 
 # Stop where a change of the unknowns by 1 would hardly change the loss, to first order.
@@ -157,12 +157,44 @@ def box_minimum(
         return result
     # Of unit diagonal: unknowns of any size are alike to the factorisation.
     scale = 1 / np.sqrt(np.diag(matrix)[room])
-    factor = cholesky(matrix[np.ix_(room, room)] * scale[:, None] * scale)
-    target = -solve_triangular(factor, slope[room] * scale, trans=1)
-    bounds = low[room] / scale, high[room] / scale
-    found = lsq_linear(factor, target, bounds, method="bvls", tol=1e-12)
-    result[room] = np.clip(found.x * scale, low[room], high[room])
+    normal = matrix[np.ix_(room, room)] * scale[:, None] * scale
+    problem = normal, slope[room] * scale, low[room] / scale, high[room] / scale
+    found = _by_sets(*problem)
+    if found is None:
+        found = _by_bvls(*problem)
+    # Bounds that hold are met exactly, whatever the scaling rounds.
+    _, _, lowest, highest = problem
+    inside = np.clip(found * scale, low[room], high[room])
+    result[room] = np.where(
+        found <= lowest, low[room], np.where(found >= highest, high[room], inside)
+    )
     return result
+
+
+def _by_sets(normal, slope, low, high) -> np.ndarray | None:
+    """By guesses of which bounds hold, each from the last, until one proves right.
+
+    That takes few factorisations, where BVLS takes one per bound. None if it takes
+    many: then it may never end.
+    """
+    below = above = np.zeros(slope.shape, bool)
+    for _ in range(20):
+        x = np.where(below, low, np.where(above, high, 0.0))
+        free = ~(below | above)
+        factor = cho_factor(normal[np.ix_(free, free)])
+        x[free] = cho_solve(factor, -(slope + normal @ x)[free])
+        rise = slope + normal @ x
+        sets = (x < low) | below & (rise > 0), (x > high) | above & (rise < 0)
+        if (sets[0] == below).all() and (sets[1] == above).all():
+            return x
+        below, above = sets
+    return None
+
+
+def _by_bvls(normal, slope, low, high) -> np.ndarray:
+    factor = cholesky(normal)
+    target = -solve_triangular(factor, slope, trans="T")
+    return lsq_linear(factor, target, (low, high), method="bvls", tol=1e-12).x
 
 
 def _held(z, gradient, low, high) -> np.ndarray:

@@ -140,7 +140,8 @@ def _lane(z: Array, problem: tuple[Scene, Any, Array, Array, Array]) -> Evaluati
         scene_at, residuals, z, ts, _TOLERANCE
     )
     bent = jax.jacfwd(rates)(z)
-    return Evaluation(  # pyright: ignore[reportArgumentType]
+    evaluation: Any = Evaluation  # of JAX arrays, which become NumPy's
+    return evaluation(
         jnp.sum(errors**2) + price * jnp.sum(rates(z) ** 2),
         2 * (errors @ jacobian + price * rates(z) @ bent),
         2 * (jacobian.T @ jacobian + price * bent.T @ bent),

@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import least_squares
 
 import fdof_jax as fj
-from fdof_jax import scenes
+from fdof_jax import bounded_search, scenes
 from fdof_jax.lanes import Lanes
 
 module = sys.modules["fdof_jax.optimal_efforts"]
@@ -110,7 +110,6 @@ def test_slides_are_controlled_as_fuller_found():
     (up, t_up), (left, t_left) = fuller(0.2, 120 / 6), fuller(0.3, 80 / 5)
     assert max(t_up, t_left) < HORIZON
     least = np.sqrt((up + left) / HORIZON)
-    print(least, found)
     assert least < found.tip_error < 1.01 * least
     assert (found.efforts[:, 2] == 0).all()
 
@@ -133,6 +132,37 @@ def test_scipy_finds_no_better_efforts():
 
     other = least_squares(residuals, np.zeros(18), bounds=(-1, 1), diff_step=1e-6)
     assert found.tip_error == pytest.approx(np.sqrt(2 * other.cost), rel=1e-3)
+
+
+@pytest.mark.parametrize("size", [3, 200])
+def test_steps_within_a_box_are_the_least(size):
+    """What makes a step the least: no slope inside, and none into the box at bounds."""
+    draw = np.random.default_rng(size)
+    for damping in (1e-6, 1e-3, 1.0):
+        root = draw.normal(size=(2 * size, size)) * draw.uniform(0.01, 10, size)
+        matrix = root.T @ root
+        matrix += damping * np.diag(np.diag(matrix))
+        slope = root.T @ draw.normal(size=2 * size)
+        low, high = -draw.uniform(0, 0.02, size), draw.uniform(0, 0.02, size)
+        high[0] = low[0]  # without room
+        x = bounded_search.box_minimum(matrix, slope, low, high)
+        assert x[0] == 0
+        inside = (low < x) & (x < high)
+        rise = slope + matrix @ x
+        size_of = np.abs(slope).max()
+        assert np.abs(rise[inside]).max(initial=0) < 1e-10 * size_of
+        assert (rise[1:][x[1:] == low[1:]] > 0).all()
+        assert (rise[1:][x[1:] == high[1:]] < 0).all()
+        assert (x[1:] >= low[1:]).all() and (x[1:] <= high[1:]).all()
+
+
+def test_both_ways_to_a_step_agree():
+    draw = np.random.default_rng(0)
+    root = draw.normal(size=(40, 20))
+    problem = root.T @ root, 20 * draw.normal(size=20), np.full(20, -0.3), np.ones(20)
+    by_sets = bounded_search._by_sets(*problem)
+    assert by_sets is not None
+    np.testing.assert_allclose(by_sets, bounded_search._by_bvls(*problem), atol=1e-10)
 
 
 def changed(**fields):
