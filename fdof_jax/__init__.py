@@ -74,7 +74,7 @@ from .linkage import (
     from_chain as from_chain,
     to_chain as to_chain,
 )
-from .losses import Tracking as Tracking
+from .losses import Tracking as Tracking, tip_errors as tip_errors
 from .model_based_control import (
     ComputedTorque as ComputedTorque,
     GravityFeedforward as GravityFeedforward,

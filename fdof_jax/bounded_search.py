@@ -181,8 +181,9 @@ def _by_sets(normal, slope, low, high) -> np.ndarray | None:
     for _ in range(20):
         x = np.where(below, low, np.where(above, high, 0.0))
         free = ~(below | above)
-        factor = cho_factor(normal[np.ix_(free, free)])
-        x[free] = cho_solve(factor, -(slope + normal @ x)[free])
+        if free.any():
+            factor = cho_factor(normal[np.ix_(free, free)])
+            x[free] = cho_solve(factor, -(slope + normal @ x)[free])
         rise = slope + normal @ x
         sets = (x < low) | below & (rise > 0), (x > high) | above & (rise < 0)
         if (sets[0] == below).all() and (sets[1] == above).all():
@@ -193,7 +194,7 @@ def _by_sets(normal, slope, low, high) -> np.ndarray | None:
 
 def _by_bvls(normal, slope, low, high) -> np.ndarray:
     factor = cholesky(normal)
-    target = -solve_triangular(factor, slope, trans="T")
+    target = -solve_triangular(factor, slope, trans=1)
     return lsq_linear(factor, target, (low, high), method="bvls", tol=1e-12).x
 
 
@@ -209,6 +210,7 @@ class Run:
         self.z, self.low, self.high = z, low, high
         self.rows: list[Row] = []
         self.reason: str | None = None
+        self.exhausted = False  # out of steps, before any other reason
         self.at: Evaluation | None = None
 
     def arrive(self, z: np.ndarray, here: Evaluation, began: float) -> None:
@@ -269,7 +271,7 @@ class Run:
         best = self.best
         moved = self.rows[0].gradient_norm > 0
         small = self._small(best.gradient_norm, best.loss, _CONVERGED)
-        return bool(moved and not self.failed and small)
+        return bool(moved and not self.failed and not self.exhausted and small)
 
 
 def minimise(
@@ -302,5 +304,6 @@ def minimise(
             runs[i].arrive(trial, found.row(place), began)
         report(number, runs)
     for run in runs:
-        run.reason = run.reason or f"stopped after {max_steps} evaluations"
+        if run.reason is None:
+            run.exhausted, run.reason = True, f"stopped after {max_steps} evaluations"
     return runs

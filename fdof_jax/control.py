@@ -1,7 +1,7 @@
 """Joint control of the third example (Fig 7): saturated PD and the circle it tracks."""
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -74,6 +74,9 @@ class PDController(ScalarElement):
     kd: Float[Array, " joint"]
     limit: Float[Array, " joint"]
     reference: Reference
+
+    # Units of kp and kd by the kind of joint.
+    gain_units: ClassVar = {"R": ("N m/rad", "N m s/rad"), "P": ("N/m", "N s/m")}
 
     def __init__(
         self,

@@ -16,6 +16,29 @@ from .scenes import Scene
 from .validation import instance, real_array, whole_number
 
 
+def is_number(leaf: Any) -> bool:
+    """Whether a leaf of a scene is data: an array, or a float.
+
+    Python's integers and truth values, an element's index for instance, are not.
+    """
+    return eqx.is_array_like(leaf) and not isinstance(leaf, bool | int)
+
+
+def _as_array(leaf: Any) -> np.ndarray:
+    array = np.asarray(leaf)
+    floating = array.dtype.kind == "f"
+    return array.astype(jnp.result_type(float)) if floating else array
+
+
+def _plain(scene: Any) -> Any:
+    """A scene's end time may be given as an integer."""
+    return scene._replace(t1=_float(scene.t1)) if isinstance(scene, Scene) else scene
+
+
+def _float(value: Any) -> np.ndarray:
+    return np.asarray(value, jnp.result_type(float))
+
+
 def stacked(scenes: Sequence[Any], name: str = "scenes") -> Any:
     """Scenes of one structure as one, with a leading axis on every array.
 
@@ -23,8 +46,7 @@ def stacked(scenes: Sequence[Any], name: str = "scenes") -> Any:
     """
     if not isinstance(scenes, list | tuple) or isinstance(scenes, Scene) or not scenes:
         raise ValueError(f"{name}: expected a list of scenes, got {scenes!r}.")
-    dtype = jnp.result_type(float)
-    first, *others = (eqx.partition(scene, eqx.is_array_like) for scene in scenes)
+    first, *others = (eqx.partition(_plain(scene), is_number) for scene in scenes)
     for index, other in enumerate(others, start=1):
         if not eqx.tree_equal(other[1], first[1]) or jax.tree.map(
             np.shape, other[0]
@@ -34,16 +56,14 @@ def stacked(scenes: Sequence[Any], name: str = "scenes") -> Any:
                 f"{scenes[index]!r} and {scenes[0]!r}."
             )
     rows = [first[0], *(other[0] for other in others)]
-    return eqx.combine(
-        jax.tree.map(lambda *a: np.stack([np.asarray(x, dtype) for x in a]), *rows),
-        first[1],
-    )
+    arrays = jax.tree.map(lambda *a: np.stack([_as_array(x) for x in a]), *rows)
+    return eqx.combine(arrays, first[1])
 
 
 def unstacked(name: str, scenes: Scene) -> list[Scene]:
     """The members of stacked scenes."""
     instance(name, scenes, Scene)
-    arrays, rest = eqx.partition(scenes, eqx.is_array_like)
+    arrays, rest = eqx.partition(scenes, is_number)
     sizes = {np.shape(leaf)[:1] for leaf in jax.tree.leaves(arrays)}
     if len(sizes) != 1 or sizes <= {(), (0,)}:
         raise ValueError(
@@ -105,6 +125,17 @@ def _hastened(controller: Any, rate: float) -> Any:
     return eqx.tree_at(lambda c: c.reference.period, controller, period)
 
 
+def _believing(controller: Any, linkage: Linkage) -> Any:
+    """The controller with this linkage as its model, if it has none yet."""
+    if getattr(controller, "model", linkage) is not None:
+        return controller
+    return eqx.tree_at(lambda c: c.model, controller, linkage, is_leaf=_is_none)
+
+
+def _is_none(node: Any) -> bool:
+    return node is None
+
+
 def perturbed(
     scene: Scene,
     members: int,
@@ -117,7 +148,8 @@ def perturbed(
 ) -> Scene:
     """Random variations of a scene, stacked: an ensemble for robust tuning.
 
-    All are drawn uniformly and independently.
+    All are drawn uniformly and independently. A model-based controller without a model
+    of its own is given the nominal linkage, which does not know the variations.
 
     **Arguments:**
 
@@ -147,6 +179,9 @@ def perturbed(
             f"speed: expected (1, 1) for a reference without a `period`, got {speed!r}."
         )
     linkage, found = scene.linkage, []
+    nominal = _believing(controller, linkage)
+    forces = tuple(nominal if f is controller else f for f in scene.forces)
+    scene, controller = scene._replace(forces=forces), nominal
     for _ in range(members):
         factors = [
             1 + draw.uniform(-error, error, leaf.shape)

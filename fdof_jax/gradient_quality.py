@@ -9,6 +9,8 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
+from .ensembles import is_number
+from .hybrid_dynamics import prescribed
 from .linearization import Modes, closed_loop_modes
 from .losses import controller_of, relative_demands, tip_errors
 from .scenes import Scene
@@ -16,6 +18,7 @@ from .sensitivities import sensitivities
 from .simulation import simulate
 from .tune_result import joint_names
 from .tuning import check_tuned, with_gains
+from .vector_field import stateful
 
 _SAMPLES = 1001
 _HORIZONS = 10
@@ -34,7 +37,8 @@ class GradientReport(eqx.Module):
     - `error`: the norm of what they differ by, over the norm of the differences.
     - `horizons`, `gradient_norm`: norm of the gradient of the error up to that time.
     - `saturated`: share of the time that each actuator spends at its limit (3,).
-    - `modes`: closed-loop eigenvalues along the path, at 101 times.
+    - `modes`: closed-loop eigenvalues along the path, at 101 times; None with elements
+      that have a state of their own or prescribe a motion.
     - `warnings`: in words, what to beware of.
     """
 
@@ -44,7 +48,7 @@ class GradientReport(eqx.Module):
     horizons: Float[np.ndarray, " horizon"]
     gradient_norm: Float[np.ndarray, " horizon"]
     saturated: Float[np.ndarray, " joint"]
-    modes: Modes
+    modes: Modes | None
     warnings: list[str]
 
     def __str__(self) -> str:
@@ -52,16 +56,19 @@ class GradientReport(eqx.Module):
             f"{t:.3g} s: {norm:.2g}"
             for t, norm in zip(self.horizons, self.gradient_norm)
         )
-        frequency = self.modes.frequency
         lines = [
             f"gradient against differences: {self.error:.1e} of its norm "
             f"{np.linalg.norm(self.gradient):.3g}",
             f"norm by horizon: {along}",
-            f"natural frequencies along the path: {frequency.min():.3g} to "
-            f"{frequency.max():.3g} rad/s, least damping ratio "
-            f"{np.nanmin(self.modes.damping):.2g}, steps of an explicit method up to "
-            f"{1e3 * self.modes.longest_step.min():.3g} ms",
         ]
+        if self.modes is not None:
+            frequency = self.modes.frequency
+            lines.append(
+                f"natural frequencies along the path: {frequency.min():.3g} to "
+                f"{frequency.max():.3g} rad/s, least damping ratio "
+                f"{np.nanmin(self.modes.damping):.2g}, steps of an explicit method up "
+                f"to {1e3 * self.modes.longest_step.min():.3g} ms"
+            )
         return "\n".join(lines + self.warnings)
 
 
@@ -108,7 +115,8 @@ def gradient_report(scene: Scene) -> GradientReport:
     """
     check_tuned("scene", scene, tip_errors)
     scene = jax.tree.map(
-        lambda a: jnp.asarray(a, float) if eqx.is_array_like(a) else a, scene
+        lambda a: jnp.asarray(a) if is_number(a) else a,
+        scene._replace(t1=float(scene.t1)),
     )
     residuals, jacobian, demands, solution = map(_numpy, _tangents(scene))
     along = 2 * np.cumsum(residuals[:, None] * jacobian, axis=0)
@@ -130,6 +138,9 @@ def gradient_report(scene: Scene) -> GradientReport:
     norms = np.linalg.norm(along[2 * times + 1], axis=1) / shares
     few = jax.tree.map(lambda a: a[::10] if np.ndim(a) else a, solution)
     saturated = np.mean(np.abs(demands) > 1, axis=0)
+    modes = None
+    if not stateful(scene.forces) and prescribed(scene.forces) is None:
+        modes = closed_loop_modes(scene.linkage, scene.forces, few)
     return GradientReport(
         gradient=gradient,
         differences=differences,
@@ -137,7 +148,7 @@ def gradient_report(scene: Scene) -> GradientReport:
         horizons=np.asarray(solution.ts)[times],
         gradient_norm=norms,
         saturated=saturated,
-        modes=closed_loop_modes(scene.linkage, scene.forces, few),
+        modes=modes,
         warnings=_warnings(scene, gradient, saturated, error),
     )
 

@@ -41,12 +41,17 @@ def tip_errors(scene: Scene, solution: Solution) -> Float[Array, " residual"]:
 
 
 def relative_demands(scene: Scene, solution: Solution) -> Float[Array, "time joint"]:
-    """What the controller asks for over what its limits allow; 0 where none limits."""
+    """What the controller asks for over what its limits allow; 0 where none limits.
+
+    Infinite, or 0, where a limit of 0 allows nothing.
+    """
     controller = controller_of(scene)
     demands = jax.vmap(controller.demand, in_axes=(0, 0, 0, None))(
         solution.ts, solution.q, solution.qd, scene.linkage
     )
-    return demands / controller.limit[None]
+    limit = controller.limit[None]
+    beyond = jnp.where(demands == 0, 0, jnp.sign(demands) * jnp.inf)
+    return jnp.where(limit > 0, demands / jnp.where(limit > 0, limit, 1), beyond)
 
 
 class Tracking(eqx.Module):
@@ -85,8 +90,9 @@ class Tracking(eqx.Module):
     def check(self, scene: Scene) -> None:
         """Raise ValueError if efforts have a price but no limit."""
         limit = np.asarray(controller_of(scene).limit)
-        if self.effort + self.effort_rate > 0 and not np.isfinite(limit).all():
+        possible = (np.isfinite(limit) & (limit > 0)).all()
+        if self.effort + self.effort_rate > 0 and not possible:
             raise ValueError(
-                "loss: expected finite limits of the controller where effort has a "
-                f"price, got {limit.tolist()}."
+                "loss: expected finite limits of the controller, above 0, where effort "
+                f"has a price, got {limit.tolist()}."
             )

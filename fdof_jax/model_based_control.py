@@ -1,5 +1,7 @@
 """Controllers that know the arm: PD control with gravity held, and computed torque."""
 
+from typing import ClassVar
+
 import jax
 import jax.numpy as jnp
 from jax import Array
@@ -120,6 +122,8 @@ class ComputedTorque(_ModelBased):
 
     **Raises:** ValueError for malformed arguments.
     """
+
+    gain_units: ClassVar = dict.fromkeys("RP", ("1/s^2", "1/s"))
 
     def schedule(self, t, linkage):
         """The reference motion and its accelerations: (q_ref, qd_ref, qdd_ref)."""

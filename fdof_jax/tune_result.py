@@ -12,6 +12,9 @@ from .bounded_search import Run
 from .losses import controller_of
 from .scenes import Scene
 
+# Actuators at their limits for a larger share of the time are hardly controlled.
+_MOSTLY = 0.9
+
 
 class History(eqx.Module):
     """What a run did; entry 0 is its start, one more per accepted point.
@@ -45,7 +48,8 @@ class TuneResult(eqx.Module):
     - `loss`: its loss [m^2 with the default loss].
     - `histories`: of each run, the first from the scene's own gains, see `History`.
     - `lower`, `upper`: the bounds of kp and kd (2, 3).
-    - `converged`: whether a change of the gains by 1 % would change the loss by less
+    - `converged`: whether the run stopped by itself, no actuator was at its limit most
+      of the time, and a change of the gains by 1 % would change the loss by less
       than 1e-4 of it, to first order and within the bounds.
     - `message`: why the run stopped, in words, and what to beware of.
     - `member_loss`: loss of each member of the ensemble with the tuned gains (member,).
@@ -102,7 +106,7 @@ class TuneResult(eqx.Module):
                     a[kind, joint]
                     for a in (first.gains[0], self.gains, self.lower, self.upper)
                 )
-                units = _UNITS[names[joint][0]][kind]
+                units = controller_of(self.scene).gain_units[names[joint][0]][kind]
                 label = f"{name} of {names[joint]} [{units}]"
                 mark = "  at its bound" if self.at_bound[kind, joint] else ""
                 cells = "".join(f"{value:12.5g}" for value in values)
@@ -117,6 +121,11 @@ class TuneResult(eqx.Module):
             before, after = scale * values(first)[0], scale * values(history)[best]
             rows.append(f"{label:24}{before:12.5g}{after:12.5g}")
         if len(self.start_loss) > 1:
+            failed = np.isnan(self.start_loss).sum()
+            if failed:
+                rows.append(
+                    f"{failed} of {len(self.start_loss)} starts could not be simulated"
+                )
             near = np.sum(self.start_loss**0.5 <= 1.01 * self.loss**0.5)
             rows.append(
                 f"{near} of {len(self.start_loss)} starts within 1 % of the best in "
@@ -131,10 +140,6 @@ class TuneResult(eqx.Module):
         verdict = "converged" if self.converged else "not converged"
         rows.append(f"{verdict}, {len(history.loss) - 1} iterations: {self.message}")
         return "\n".join(rows)
-
-
-# Of kp and kd, by the kind of joint.
-_UNITS = {"R": ("N m/rad", "N m s/rad"), "P": ("N/m", "N s/m")}
 
 
 def joint_names(scene: Scene) -> list[str]:
@@ -170,9 +175,8 @@ def _best(history: History) -> int:
 
 def _at_bound(gains, lower, upper) -> np.ndarray:
     # A hair: the exponential of a bound's logarithm may fall short of it by rounding.
-    return (gains > 0) & (
-        (gains <= lower * (1 + 1e-12)) | (gains >= upper * (1 - 1e-12))
-    )
+    hair = 100 * np.finfo(jnp.result_type(float)).eps
+    return (gains > 0) & ((gains <= lower * (1 + hair)) | (gains >= upper * (1 - hair)))
 
 
 def result_of(
@@ -206,7 +210,7 @@ def result_of(
 
     run = min(runs, key=lambda run: (run.failed, run.best.loss))
     history = history_of(run)
-    best = run.best
+    best, share = run.best, history.saturated[_best(history)]
     assert run.reason is not None
     return TuneResult(
         scene=with_gains(scene, jnp.asarray(gains_of(best.z))),
@@ -214,7 +218,7 @@ def result_of(
         histories=[history_of(run) for run in runs],
         lower=lower,
         upper=upper,
-        converged=run.converged,
+        converged=run.converged and share.max() <= _MOSTLY,
         message=_message(scene, run.reason, history, lower, upper),
         member_loss=best.facts["member_loss"],
         settings=settings,
@@ -232,9 +236,10 @@ def _message(scene, reason, history, lower, upper) -> str:
         )
     held = int(np.sum(_at_bound(history.gains[_best(history)], lower, upper)))
     parts = [reason, f"{held} of {int(tuned.sum())} gains are at a bound"]
-    for joint in np.flatnonzero(share == 1):
+    for joint in np.flatnonzero(share > _MOSTLY):
         parts.append(
-            f"{names[joint]} is at its limit throughout, so its gains had no effect"
+            f"{names[joint]} is at its limit for {100 * share[joint]:.4g} % of the "
+            "time, so its gains have next to no effect"
         )
     return "; ".join(parts)
 

@@ -64,12 +64,14 @@ def evaluate_gains(z: Array, problem: tuple[Scene, Loss, Array]) -> Evaluation:
     ts = jnp.linspace(0, scene.t1, _SAMPLES)
     value, jacobian, trial, solution = sensitivities(scene_at, residuals, z, ts)
     demands = jnp.abs(relative_demands(trial, solution))
+    # An actuator without effort makes none, whatever is asked of it.
+    limited = jnp.where(controller_of(trial).limit > 0, 1, 0)[None]
     square_error = jnp.full((), jnp.nan)
     if hasattr(controller_of(trial).reference, "tip"):
         square_error = jnp.sum(tip_errors(trial, solution) ** 2)
     facts = dict(
         saturated=jnp.mean(demands > 1, axis=0),
-        effort=jnp.sqrt(jnp.mean(jnp.minimum(demands, 1) ** 2, axis=0)),
+        effort=jnp.sqrt(jnp.mean(jnp.minimum(demands, limited) ** 2, axis=0)),
         square_error=square_error,
         steps=solution.stats["num_steps"],
     )
@@ -101,9 +103,12 @@ def _bounds(scene: Scene, factor: Any, bounds: Any) -> tuple[np.ndarray, ...]:
     controller = controller_of(scene)
     start = np.stack([np.asarray(controller.kp), np.asarray(controller.kd)])
     if bounds is None:
+        factor = 4.0 if factor is None else factor
         factor = float(real_array("factor", factor, (), above=1))
         return start, start / factor, start * factor
-    if not isinstance(bounds, tuple | list) or len(bounds) != 2:
+    if factor is not None:
+        raise ValueError(f"factor: expected none beside bounds, got {factor!r}.")
+    if not isinstance(bounds, tuple | list | np.ndarray) or len(bounds) != 2:
         raise ValueError(f"bounds: expected (lower, upper), got {bounds!r}.")
     lower, upper = (
         np.asarray(real_array(f"bounds[{i}]", b, (2, 3), minimum=0))
@@ -133,7 +138,7 @@ def _search(
     scenes: Sequence[Scene],
     losses: Sequence[Any],
     *,
-    factor: ArrayLike = 4.0,
+    factor: ArrayLike | None = None,
     bounds: tuple[ArrayLike, ArrayLike] | None = None,
     ensemble: Scene | None = None,
     over: str = "mean",
@@ -146,6 +151,8 @@ def _search(
     """One result per scene and loss; the keywords are those of `tune`."""
     one_of("method", method, tuple(METHODS))
     one_of("over", over, ("mean", "worst"))
+    if over == "worst" and ensemble is None:
+        raise ValueError("over: expected an ensemble to take the worst of, got none.")
     starts = whole_number("starts", starts, 1)
     draw = np.random.default_rng(whole_number("seed", seed, 0))
     max_steps = whole_number("max_steps", max_steps, 1)
@@ -215,7 +222,7 @@ def _reporter(report: Callable[[str], Any] | None) -> Callable[[int, list[Run]],
 def tune(
     scene: Scene,
     *,
-    factor: ArrayLike = 4.0,
+    factor: ArrayLike | None = None,
     bounds: tuple[ArrayLike, ArrayLike] | None = None,
     loss: Loss = tip_errors,
     ensemble: Scene | None = None,
@@ -228,16 +235,17 @@ def tune(
 ) -> TuneResult:
     """Gains of a scene's PD controller that make its loss small, within bounds.
 
-    The unknowns are the logarithms of kp and kd; gains of zero stay zero. The
-    derivatives are exact (forward mode through the adaptive solve, at a tolerance of
-    1e-8 in float64 and 1e-5 in float32). A second call with other numbers compiles
-    nothing, nor does one with another method.
+    The unknowns are the logarithms of kp and kd; gains of zero stay zero. Derivatives
+    are integrated beside the motion at a tolerance of 1e-5: good to a millionth of
+    their norm, to some ten thousandths where actuators are at their limits for long,
+    which `gradient_report` measures. A second call with other numbers compiles nothing,
+    nor does one with another method; one with another function for a loss does.
 
     **Arguments:**
 
     - `scene`: holds exactly one `PDController`.
-    - `factor`: the gains stay within this factor of their start, above 1.
-    - `bounds`: instead of `factor`, the least and the greatest kp and kd: two arrays
+    - `factor`: the gains stay within this factor of their start, above 1; by default 4.
+    - `bounds`: instead of a factor, the least and the greatest kp and kd: two arrays
       (2, 3), first row kp, second kd [N/m or N m/rad, N s/m or N m s/rad].
     - `loss`: `(scene, solution) -> residuals`, an array whose sum of squares is made
       small, or a scalar that is made small itself and is never negative (for which

@@ -82,6 +82,12 @@ def run_tuning(
 
     **Raises:** ValueError as `tune` and `load`.
     """
+    # Before the work, not after it.
+    if save_to is not None and not save_to.absolute().parent.is_dir():
+        raise ValueError(
+            f"--save: expected a file in a folder that is there, got {save_to}."
+        )
+    output.mkdir(parents=True, exist_ok=True)
     bounds = None
     scene = job.scene()
     start = scene
@@ -98,7 +104,7 @@ def run_tuning(
     say("tune the gains")
     result = tune(
         start,
-        factor=job.factor,
+        factor=job.factor if bounds is None else None,
         bounds=bounds,
         loss=Tracking(effort=job.price) if job.price else tip_errors,
         ensemble=job.ensemble(scene),

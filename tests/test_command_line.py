@@ -112,6 +112,7 @@ def test_tuning_goes_on_where_it_was_saved(tmp_path, capsys):
         (["--radius", "-1"], "radius"),
         (["--factor", "0.5"], "factor"),
         (["--starts", "0"], "starts"),
+        (["--save", "nowhere/x.fdof"], "--save: expected a file in a folder"),
         (["--method", "newton"], "--method"),
     ],
 )

@@ -140,3 +140,12 @@ def test_a_report_says_where_gains_have_no_effect():
     found = fj.gradient_report(scene)
     assert not found.gradient[:, 1].any() and found.saturated[1] == 1
     assert "P2 is at its limit throughout" in found.warnings[0]
+
+
+def test_a_report_without_modes_for_elements_with_a_state():
+    scene = scenes.fig7()._replace(t1=0.2)
+    lag = fj.FirstOrderLag(fj.JointEffort(np.ones(3)), 0.1)
+    found = fj.gradient_report(scene._replace(forces=(*scene.forces, lag)))
+    # P2 is at its limit throughout: the gradient is small, and most of it noise.
+    assert found.modes is None and found.error < 1e-2
+    assert "natural frequencies" not in str(found)
