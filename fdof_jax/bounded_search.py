@@ -13,7 +13,6 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
-from scipy.optimize import lsq_linear
 
 # Stop where a change of the unknowns by 1 would hardly change the loss, to first order.
 _GRADIENT_OF_LOSS = 1e-6
@@ -193,6 +192,8 @@ def _by_sets(normal, slope, low, high) -> np.ndarray | None:
 
 
 def _by_bvls(normal, slope, low, high) -> np.ndarray:
+    from scipy.optimize import lsq_linear  # hardly ever needed, and slow to import
+
     factor = cholesky(normal)
     target = -solve_triangular(factor, slope, trans=1)
     return lsq_linear(factor, target, (low, high), method="bvls", tol=1e-12).x

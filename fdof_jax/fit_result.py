@@ -105,7 +105,9 @@ def _sparse(columns: np.ndarray) -> np.ndarray:
 
 def _together(labels: tuple[str, ...], direction: np.ndarray, least: float) -> str:
     """A direction in words, of parts above `least` of its greatest."""
-    parts = direction / direction[np.argmax(np.abs(direction))]
+    # Of equally large ones the first, or rounding would choose the signs.
+    leading = np.argmax(np.abs(direction) > 0.99 * np.abs(direction).max())
+    parts = direction / direction[leading]
     kept = np.flatnonzero(np.abs(parts) > least)
     if len(kept) == 1:
         return labels[kept[0]]
