@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from .control import CircleTask, PDController
-from .linkage import TOPOLOGIES, Linkage, from_chain
+from .linkage import TOPOLOGIES, Linkage, State, from_chain
 from .scenes import Scene
 from .tune_result import TuneResult
 
@@ -23,6 +23,21 @@ _KP, _KD, _LIMIT = (
 )
 
 
+def arm_at(topology: str, x: np.ndarray) -> tuple[Linkage, State]:
+    """An arm with links of 1 m, 0.8 m and 0.5 m, at rest at chain coordinates `x`."""
+    locked, state0 = from_chain(topology, x, np.zeros(6), base_angle=_BASE)
+    linkage = Linkage(
+        topology,
+        length=[0.3, 1.0, 0.8, 0.5],
+        com=[[0.5, 0], [0.4, 0], [0.25, 0]],
+        mass=[2, 1.5, 1],
+        inertia=[0.2, 0.1, 0.05],
+        locked=locked,
+        base_angle=_BASE,
+    )
+    return linkage, state0
+
+
 def circle_scenes() -> dict[str, Scene]:
     """The same circle for an arm of each topology, under PD control and gravity.
 
@@ -33,16 +48,7 @@ def circle_scenes() -> dict[str, Scene]:
     """
     found = {}
     for topology in TOPOLOGIES:
-        locked, state0 = from_chain(topology, _START, np.zeros(6), base_angle=_BASE)
-        linkage = Linkage(
-            topology,
-            length=[0.3, 1.0, 0.8, 0.5],
-            com=[[0.5, 0], [0.4, 0], [0.25, 0]],
-            mass=[2, 1.5, 1],
-            inertia=[0.2, 0.1, 0.05],
-            locked=locked,
-            base_angle=_BASE,
-        )
+        linkage, state0 = arm_at(topology, _START)
         task = CircleTask(
             center=_CENTER,
             radius=0.25,

@@ -16,7 +16,8 @@ import numpy as np
 from . import drawing, plotting, scenes
 from .control import saturated, tip_deviation
 from .forces import JointDamper
-from .linkage import TOPOLOGIES, Linkage, State, from_chain
+from .league import arm_at
+from .linkage import TOPOLOGIES, Linkage, State
 from .scenes import Scene
 from .simulation import simulate
 from .solution import Solution
@@ -153,9 +154,7 @@ def run_figures(output: Path, say: Callable[[str], None]) -> list[Path]:
     return _save(output, pictures)
 
 
-# One start for all topologies, as chain coordinates B1, th2, B2, th3, B3, th4. The base
-# points up, so that a slide on the ground is level.
-_COMMON_BASE = np.pi / 2
+# One start for all topologies, as chain coordinates B1, th2, B2, th3, B3, th4.
 _COMMON_START = np.array([0.0, 0.6, 0.4, -0.4, 0.3, -1.3])
 
 
@@ -167,18 +166,7 @@ def topology_scenes(t1: float = 2.0) -> dict[str, Scene]:
     """
     result = {}
     for topology in TOPOLOGIES:
-        locked, state0 = from_chain(
-            topology, _COMMON_START, np.zeros(6), base_angle=_COMMON_BASE
-        )
-        linkage = Linkage(
-            topology,
-            length=[0.3, 1.0, 0.8, 0.5],
-            com=[[0.5, 0], [0.4, 0], [0.25, 0]],
-            mass=[2, 1.5, 1],
-            inertia=[0.2, 0.1, 0.05],
-            locked=locked,
-            base_angle=_COMMON_BASE,
-        )
+        linkage, state0 = arm_at(topology, _COMMON_START)
         damper = JointDamper([{"R": 1.0, "P": 30.0}[joint] for joint in topology])
         result[topology] = Scene(linkage, state0, (damper,), t1)
     return result

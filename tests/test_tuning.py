@@ -5,10 +5,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import scipy.optimize
 
 import fdof_jax as fj
-from fdof_jax import bounded_search, lanes, scenes, tuning
+from fdof_jax import lanes, scenes, tuning
 from fdof_jax.losses import controller_of, tip_errors
 
 
@@ -259,40 +258,6 @@ class TestEnsembles:
             fj.perturbed(self.scene, 2, speed=(2.0, 0.0))
 
 
-def test_power_mean_has_the_derivatives_of_its_own_formula():
-    rng = np.random.default_rng(0)
-    coefficients = rng.normal(size=(1, 4, 5, 3))  # residuals of four members, linear
-
-    def members(z):
-        jacobian = coefficients
-        residual = jacobian @ z + np.arange(1, 6)
-        return bounded_search.Evaluation(
-            np.sum(residual**2, -1),
-            2 * np.einsum("rmkn,rmk->rmn", jacobian, residual),
-            2 * np.einsum("rmki,rmkj->rmij", jacobian, jacobian),
-            {},
-        )
-
-    z, h = rng.normal(size=3), 1e-5
-    for order in (1, 32):
-        here = lanes.power_mean(members(z), order)
-        loss = members(z).loss[0]
-        assert here.loss[0] == pytest.approx(np.mean(loss**order) ** (1 / order))
-        sides = [
-            [lanes.power_mean(members(z + s * h * e), order) for s in (1, -1)]
-            for e in np.eye(3)
-        ]
-        slopes = [(a.loss[0] - b.loss[0]) / (2 * h) for a, b in sides]
-        np.testing.assert_allclose(here.gradient[0], slopes, rtol=1e-6)
-        # Of linear residuals Gauss and Newton's curvature is the second derivative.
-        bends = [(a.gradient[0] - b.gradient[0]) / (2 * h) for a, b in sides]
-        np.testing.assert_allclose(here.curvature[0], bends, rtol=1e-5, atol=1e-5)
-    nothing = bounded_search.Evaluation(
-        np.zeros((1, 2)), np.zeros((1, 2, 3)), np.zeros((1, 2, 3, 3)), {}
-    )
-    assert all(np.isfinite(a).all() for a in lanes.power_mean(nothing, 32)[:3])
-
-
 def test_own_loss():
     def twice(scene, solution):
         return 2 * tip_errors(scene, solution)
@@ -413,92 +378,3 @@ def test_a_scene_that_fails_is_refused():
     massless = eqx.tree_at(lambda arm: arm.inertia, massless, jnp.zeros(3))
     with pytest.raises(ValueError, match="scene: expected one that can be simulated"):
         fj.tune(scene._replace(linkage=massless))
-
-
-def test_box_minimum_is_that_of_scipy():
-    rng = np.random.default_rng(1)
-    for _ in range(20):
-        jacobian = rng.normal(size=(20, 3)) * [1, 1e4, 1e-3]
-        matrix, slope = jacobian.T @ jacobian, jacobian.T @ rng.normal(size=20)
-        scale = 1 / np.sqrt(np.diag(matrix))
-        low, high = -rng.uniform(0, 0.3, 3) * scale, rng.uniform(0, 0.3, 3) * scale
-        low[2] = high[2] = 0 if rng.uniform() < 0.3 else high[2]
-        low[2] = min(low[2], 0)
-
-        def model(u, slope=slope, scale=scale, matrix=matrix):
-            return slope @ (scale * u) + u * scale @ matrix @ (scale * u) / 2
-
-        found = bounded_search.box_minimum(matrix, slope, low, high)
-        assert (found >= low).all() and (found <= high).all()
-        bounds = list(zip(low / scale, high / scale))
-        best = scipy.optimize.minimize(model, np.zeros(3), bounds=bounds, tol=1e-14)
-        assert model(found / scale) <= best.fun + 1e-9 * abs(best.fun)
-
-
-@pytest.mark.parametrize("method", bounded_search.METHODS)
-def test_minimise_finds_what_scipy_finds_within_bounds(method):
-    """Rosenbrock's function and an exponential fit, in boxes that cut them off."""
-    t = np.linspace(0, 1, 12)
-    data = 2 * np.exp(-1.5 * t) + 0.05 * np.cos(40 * t)
-    problems = [
-        (
-            lambda z: np.array([1 - z[0], 10 * (z[1] - z[0] ** 2)]),
-            lambda z: np.array([[-1, 0], [-20 * z[0], 10.0]]),
-        ),
-        (
-            lambda z: z[0] * np.exp(-z[1] * t) - data,
-            lambda z: (
-                np.exp(-z[1] * t)[:, None]
-                * np.stack([np.ones_like(t), -z[0] * t], axis=1)
-            ),
-        ),
-    ]
-    starts = np.array([[-1.2, 1.0], [0.5, 0.5]] * 2)
-    low = np.array([[-2.0, -2.0], [0.1, 0.1], [-2.0, -2.0], [0.1, 0.1]])
-    high = np.array([[0.7, 2.0], [1.9, 5.0], [2.0, 2.0], [5.0, 5.0]])
-
-    def evaluate(z, runs):
-        found = []
-        for point, run in zip(z, runs):
-            residual, jacobian = (f(point) for f in problems[run % 2])
-            found.append(
-                bounded_search.Evaluation(
-                    np.sum(residual**2), 2 * jacobian.T @ residual,
-                    2 * jacobian.T @ jacobian, {},
-                )
-            )  # fmt: skip
-        return jax.tree.map(lambda *rows: np.stack(rows), *found)
-
-    steps = 3000 if method == "adam" else 200
-    runs = bounded_search.minimise(
-        evaluate, starts, low, high, method=method, max_steps=steps, enough=1e-12,
-        report=lambda number, runs: None,
-    )  # fmt: skip
-    for i, run in enumerate(runs):
-        residual, jacobian = problems[i % 2]
-        best = scipy.optimize.least_squares(
-            residual, starts[i], jacobian, bounds=(low[i], high[i]), xtol=1e-14,
-            ftol=1e-14, gtol=1e-14,
-        )  # fmt: skip
-        near = 1e-3 if method == "adam" else 1e-6
-        assert run.best.loss <= 2 * best.cost * (1 + near) + near * 1e-3, (
-            i,
-            run.reason,
-        )
-        assert ((run.best.z >= low[i]) & (run.best.z <= high[i])).all()
-
-
-def test_one_failing_start_does_not_spoil_the_others():
-    def evaluate(z, runs):
-        loss = np.where(runs == 1, np.nan, np.sum(z**2, axis=1))
-        return bounded_search.Evaluation(
-            loss, 2 * z, np.broadcast_to(2 * np.eye(2), (len(z), 2, 2)), {}
-        )
-
-    box = np.ones((3, 2))
-    runs = bounded_search.minimise(
-        evaluate, box.copy(), -9 * box, 9 * box, method="levenberg-marquardt",
-        max_steps=20, enough=1e-6, report=lambda number, runs: None,
-    )  # fmt: skip
-    assert [run.failed for run in runs] == [False, True, False]
-    assert runs[0].converged and not runs[1].converged and runs[2].best.loss < 1e-10
