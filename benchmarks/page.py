@@ -205,6 +205,11 @@ def tuning(points: list[dict]) -> str:
         for p in points
         if p["kind"] == "time"
     ]
+    robust = [
+        [p["problem"], p["solver"], *(number(v, 4) for v in p["worst"].values())]
+        for p in points
+        if p["kind"] == "robust"
+    ]
     races = [p for p in points if p["kind"] == "race"]
     limits = list(races[0]["best"]) if races else []
     raced = [
@@ -216,6 +221,9 @@ def tuning(points: list[dict]) -> str:
     return "\n\n".join(
         [
             table(head, timed),
+            "Worst rms tip error [mm] over 64 members, of gains tuned for the nominal "
+            "scene, for 16 other members, and for these:",
+            table(["", "controller", "nominal", "robust", "these"], robust),
             "Best rms tip error [mm] after so many seconds, median of the starts:",
             table(["", "optimiser", *seconds], raced),
         ]
