@@ -103,31 +103,35 @@ def _add_tuning(command: argparse.ArgumentParser) -> None:
         "ensemble; nominal by default",
     )
     search = command.add_argument_group("the search")
+    # No defaults here: they would override what --resume has read.
     search.add_argument(
-        "--method", choices=tuple(METHODS), default="levenberg-marquardt"
+        "--method", choices=tuple(METHODS), help="levenberg-marquardt by default"
     )
-    search.add_argument("--starts", type=int, default=1, help="runs; 1 by default")
-    search.add_argument("--seed", type=int, default=0, help="of the random starts")
-    search.add_argument("--max-steps", type=int, default=50, help="50 by default")
+    search.add_argument("--starts", type=int, help="runs; 1 by default")
+    search.add_argument("--seed", type=int, help="of the random starts; 0 by default")
+    search.add_argument("--max-steps", type=int, help="50 by default")
     search.add_argument("--save", type=Path, metavar="FILE", help="keep the result")
     search.add_argument(
         "--resume",
         type=Path,
         metavar="FILE",
-        help="go on with what --save has kept: its circle, bounds and ensemble",
+        help="go on with what --save has kept: its circle, bounds, ensemble and search "
+        "(with other random starts)",
     )
 
 
 def _run_league() -> None:
-    arms = circle_scenes()
     _say("tune all seven topologies in one compiled program")
-    results = tune_each(list(arms.values()), report=print)
-    print(f"\n{league_table(dict(zip(arms, results)))}")
+    results = tune_each(circle_scenes(), report=print)
+    print(f"\n{league_table(results)}")
 
 
 def _run_tuning(parser: argparse.ArgumentParser, options: Any) -> list[Path]:
-    names = [field.name for field in dataclasses.fields(tuning_run.Job)]
-    given = {n: v for n in names if (v := getattr(options, n)) is not None}
+    def of(names):
+        return {n: v for n in names if (v := getattr(options, n)) is not None}
+
+    given = of(field.name for field in dataclasses.fields(tuning_run.Job))
+    search = of(("method", "starts", "seed", "max_steps"))
     if given and options.resume is not None:
         parser.error(
             f"--resume: the file says what is tuned, also given: {', '.join(given)}"
@@ -145,10 +149,7 @@ def _run_tuning(parser: argparse.ArgumentParser, options: Any) -> list[Path]:
             job=tuning_run.Job(**given),
             resume=options.resume,
             save_to=options.save,
-            method=options.method,
-            starts=options.starts,
-            seed=options.seed,
-            max_steps=options.max_steps,
+            **search,
         )
     except (ValueError, OSError) as error:
         parser.error(str(error))

@@ -14,6 +14,8 @@ import numpy as np
 import optax
 from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
 
+from .validation import whole_number
+
 # Stop where a change of the unknowns by 1 would hardly change the loss, to first order.
 _GRADIENT_OF_LOSS = 1e-6
 # Where the loss itself can vanish, its gradient is compared with that at the start.
@@ -275,6 +277,26 @@ class Run:
         return bool(moved and not self.failed and not self.exhausted and small)
 
 
+def reporting(
+    report: Any, describe: Callable[[list[Run]], str]
+) -> Callable[[int, list[Run]], None]:
+    """What `minimise` tells of each step, as a line for the argument `report`.
+
+    Raise ValueError if that is neither callable nor None.
+    """
+    if not (report is None or callable(report)):
+        raise ValueError(f"report: expected a callable or None, got {report!r}.")
+
+    def told(number: int, runs: list[Run]) -> None:
+        if report is not None:
+            going = sum(run.reason is None for run in runs)
+            report(
+                f"{number:4d}  {describe(runs)}, {going} of {len(runs)} runs going on"
+            )
+
+    return told
+
+
 def minimise(
     evaluate: Callable[[np.ndarray, np.ndarray], Evaluation],
     start: np.ndarray,
@@ -288,11 +310,14 @@ def minimise(
 ) -> list[Run]:
     """Minimise a function per run, from (run, n) starts within (run, n) bounds.
 
+    Raise ValueError unless `max_steps` is a whole number of at least 1.
+
     **Arguments:** `evaluate`: `(z, runs)`, points of the runs with these indices, to
     their `Evaluation`; `method`: one of `METHODS`; `max_steps`: evaluations after the
     first; `enough`: a run stops where its loss falls by less than this part of itself;
     `report`: told the number of the step and the runs after each.
     """
+    max_steps = whole_number("max_steps", max_steps, 1)
     began = time.perf_counter()
     runs = [Run(METHODS[method], enough, *row) for row in zip(start, low, high)]
     for number in range(max_steps + 1):

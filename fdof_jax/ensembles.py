@@ -171,6 +171,11 @@ def perturbed(
         for name, value, least in (("payload", payload, 0), ("speed", speed, 1e-3))
     }
     error = float(real_array("link_error", link_error, (), minimum=0))
+    if error >= 1:
+        raise ValueError(
+            "link_error: expected less than 1, as masses and inertias stay positive, "
+            f"got {error:g}."
+        )
     reach = float(real_array("start_offset", start_offset, (), minimum=0))
     controller = controller_of(scene)
     varied = bool((ranges["speed"] != 1).any())

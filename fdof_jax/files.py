@@ -1,19 +1,13 @@
 """Saving the library's pytrees in a file, and reading them back without a skeleton.
 
 A file is a zip archive. Its `description.json` holds the tree and says which versions
-wrote it; arrays are members of their own, in NumPy's `.npy` format. Nothing in a file
-is executed: classes are looked up, in the library and among those of the caller.
+wrote it; arrays are members of their own, in NumPy's `.npy` format.
 """
 
-import dataclasses
-import importlib
 import io
 import json
 import os
-import pkgutil
 import secrets
-import struct
-import types
 import zipfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -24,307 +18,40 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
 
-from .validation import is_traced
+from .tree_description import Restorer, Unreadable, described
 
 _FORMAT, _VERSION = "fdof_jax", 1
 _DESCRIPTION = "description.json"
-_RESULT: Any = diffrax.RESULTS.successful
-_Item, _EnumerationMeta = type(_RESULT), type(diffrax.RESULTS)
-
-
-class _Unreadable(Exception):
-    """What is wrong with a file, in words that lack its name."""
-
-
-# Names of classes and functions
-
-
-def _name(thing: Any) -> str:
-    # The module in which diffrax keeps an enumeration may change.
-    if getattr(diffrax, thing.__qualname__, None) is thing:
-        return f"diffrax:{thing.__qualname__}"
-    return f"{thing.__module__}:{thing.__qualname__}"
-
-
-def _of_the_library(name: str) -> Any:
-    """The class or function of the library with this name, or None."""
-    module, _, qualname = name.partition(":")
-    package, _, submodule = module.partition(".")
-    # Only what is a file of the library is imported, whatever the name says.
-    if package != __package__ or submodule not in _submodules():
-        return None
-    found = vars(importlib.import_module(module)).get(qualname)
-    plain = isinstance(found, type | types.FunctionType)
-    return found if plain and _name(found) == name else None
-
-
-def _submodules() -> set[str]:
-    folder = os.path.dirname(__file__)
-    return {module.name for module in pkgutil.iter_modules([folder])}
-
-
-def _class(name: str, classes: Sequence[type]) -> Any:
-    """The class with this name, of the library, of diffrax or of the caller."""
-    module, _, qualname = name.partition(":")
-    if module == "diffrax":
-        found = vars(diffrax).get(qualname)
-        if isinstance(found, _EnumerationMeta):
-            return found
-    found = _of_the_library(name)
-    if isinstance(found, type):
-        return found
-    same = [c for c in classes if _name(c) == name]
-    # A class is elsewhere when the script that defines it is imported.
-    moved = [
-        c
-        for c in classes
-        if c.__qualname__ == qualname and "__main__" in (module, c.__module__)
-    ]
-    for candidates in (same, moved):
-        if len(candidates) == 1:
-            return candidates[0]
-    raise _Unreadable(
-        f"expected classes of the library or of `classes`, got {name}: import that "
-        "class and pass it, as in load(path, classes=(MyElement,))"
-    )
-
-
-def _fields(kind: Any) -> list[str] | None:
-    """Names of the fields of a NamedTuple or dataclass, None for other classes."""
-    if issubclass(kind, tuple):
-        names = getattr(kind, "_fields", None)
-        return None if names is None else list(names)
-    if dataclasses.is_dataclass(kind):
-        return [field.name for field in dataclasses.fields(kind)]
-    return None
-
-
-def _members(enumeration: Any) -> dict[str, int]:
-    return {name: int(i._value) for name, i in enumeration._name_to_item.items()}
-
-
-# From a tree to its description
-
-
-def _described(place: str, value: Any, arrays: list[np.ndarray]) -> Any:
-    """A tree as JSON has it, its arrays appended to `arrays`."""
-    kind = type(value)
-    if value is None or kind in (bool, int, str):
-        return value
-    if kind is float:
-        if np.isfinite(value):
-            return value
-        return {"kind": "float", "bits": struct.pack(">d", value).hex()}
-    if kind in (list, tuple):
-        items = [_described(f"{place}[{i}]", v, arrays) for i, v in enumerate(value)]
-        return items if kind is list else {"kind": "tuple", "items": items}
-    if kind is dict:
-        if not all(type(key) is str for key in value):
-            raise ValueError(
-                f"{place}: expected strings as keys, got {list(value)[:20]!r}."
-            )
-        items = {k: _described(f"{place}[{k!r}]", v, arrays) for k, v in value.items()}
-        return {"kind": "dict", "items": items}
-    if isinstance(value, Array) or kind is np.ndarray or isinstance(value, np.generic):
-        return _described_array(place, value, arrays)
-    if kind is _Item and isinstance(value._value, Array | np.ndarray):
-        return {
-            "kind": "enumeration",
-            "class": _name(value._enumeration),
-            "members": _members(value._enumeration),
-            "value": _described_array(place, value._value, arrays),
-        }
-    if isinstance(value, types.FunctionType):
-        if _of_the_library(_name(value)) is value:
-            return {"kind": "function", "name": _name(value)}
-        raise ValueError(
-            f"{place}: expected an equinox.Module with a __call__, which can be saved "
-            f"in place of a function of one's own, got {value!r}."
-        )
-    if (names := _fields(kind)) is not None:
-        fields = {}
-        for name in names:
-            if not hasattr(value, name):
-                raise ValueError(f"{place}.{name}: expected a value, got none.")
-            item = getattr(value, name)
-            fields[name] = _described(f"{place}.{name}", item, arrays)
-        return {"kind": "object", "class": _name(kind), "fields": fields}
-    raise ValueError(
-        f"{place}: expected arrays, numbers, strings, or lists, tuples, dicts, "
-        f"NamedTuples, dataclasses and modules of such, got {value!r}."
-    )
-
-
-def _described_array(place: str, value: Any, arrays: list[np.ndarray]) -> dict:
-    if is_traced(value):
-        raise ValueError(
-            f"{place}: expected a known value, got {value!r}: save outside of jit, "
-            "vmap and grad."
-        )
-    if jnp.issubdtype(value.dtype, jax.dtypes.prng_key):
-        node = {"kind": "key", "implementation": str(jax.random.key_impl(value))}
-        value = jax.random.key_data(value)
-    elif isinstance(value, Array):
-        node = {"kind": "jax", "weak": value.weak_type}
-    else:
-        node = {"kind": "scalar" if isinstance(value, np.generic) else "numpy"}
-    try:
-        array = np.asarray(value)
-    except RuntimeError as error:  # deleted, or on devices of other processes
-        raise ValueError(f"{place}: expected an array at hand, got {error}.") from error
-    extended = jnp.issubdtype(array.dtype, np.number)  # bfloat16 for instance
-    if array.dtype.kind not in "biufcmMSU" and not extended:
-        raise ValueError(
-            f"{place}: expected an array of numbers, got one of {array.dtype}."
-        )
-    arrays.append(array)
-    shape = list(array.shape)
-    return node | {"array": len(arrays) - 1, "dtype": array.dtype.name, "shape": shape}
-
-
-# From a description to its tree
-
-
-class _Archive:
-    """An open file, and the classes that its description may name."""
-
-    def __init__(self, archive: zipfile.ZipFile, classes: Sequence[type]):
-        self.archive, self.classes = archive, classes
-
-    def tree(self, node: Any) -> Any:
-        if isinstance(node, list):
-            return [self.tree(item) for item in node]
-        if not isinstance(node, dict):
-            return node
-        kind = node["kind"]
-        if kind == "float":
-            return struct.unpack(">d", bytes.fromhex(node["bits"]))[0]
-        if kind == "tuple":
-            return tuple(self.tree(item) for item in node["items"])
-        if kind == "dict":
-            return {key: self.tree(item) for key, item in node["items"].items()}
-        if kind == "function":
-            found = _of_the_library(node["name"])
-            if not isinstance(found, types.FunctionType):
-                raise _Unreadable(
-                    f"expected a function of the library, got {node['name']}"
-                )
-            return found
-        if kind == "enumeration":
-            return self.item(node)
-        if kind == "object":
-            return self.instance(node)
-        return self.placed(node, self.array(node))
-
-    def instance(self, node: dict) -> Any:
-        cls = _class(node["class"], self.classes)
-        names, fields = _fields(cls), node["fields"]
-        if names is None or set(names) != set(fields):
-            raise _Unreadable(
-                f"expected {node['class']} with the fields {names} that this version "
-                f"of it has, got {list(fields)}"
-            )
-        values = {name: self.tree(fields[name]) for name in names}
-        if issubclass(cls, tuple):
-            return tuple.__new__(cls, values.values())
-        # No constructor: it might compute or refuse.
-        made = object.__new__(cls)
-        for name, value in values.items():
-            object.__setattr__(made, name, value)
-        return made
-
-    def item(self, node: dict) -> Any:
-        enumeration = _class(node["class"], self.classes)
-        if not isinstance(enumeration, _EnumerationMeta):
-            raise _Unreadable(f"expected an enumeration, got {node['class']}")
-        numbers = self.array(node["value"])
-        names = {number: name for name, number in node["members"].items()}
-        # Another version may count its members differently.
-        here, value = _members(enumeration), numbers.copy()
-        for number in np.unique(numbers).tolist():
-            if names[number] not in here:
-                raise _Unreadable(
-                    f"expected a member that {node['class']} has, got {names[number]}"
-                )
-            value[numbers == number] = here[names[number]]
-        item = object.__new__(_Item)
-        object.__setattr__(item, "_value", self.placed(node["value"], value))
-        object.__setattr__(item, "_enumeration", enumeration)
-        return item
-
-    def array(self, node: dict) -> np.ndarray:
-        # Read whole, as only then its checksum is compared.
-        member = io.BytesIO(self.archive.read(f"arrays/{node['array']}.npy"))
-        array = np.lib.format.read_array(member, allow_pickle=False)
-        if array.dtype.name != node["dtype"]:
-            # NumPy's format knows no dtypes but NumPy's.
-            extended = jnp.dtype(node["dtype"])
-            if array.dtype.kind != "V" or array.dtype.itemsize != extended.itemsize:
-                raise _Unreadable(
-                    f"expected array {node['array']} to be of {node['dtype']}, got "
-                    f"{array.dtype}"
-                )
-            array = array.view(extended)
-        if list(array.shape) != node["shape"]:
-            raise _Unreadable(
-                f"expected array {node['array']} to have shape {node['shape']}, got "
-                f"{list(array.shape)}"
-            )
-        return array
-
-    def placed(self, node: dict, array: np.ndarray) -> Any:
-        """The array as the kind of value that it was."""
-        kind = node["kind"]
-        if kind == "numpy":
-            return array
-        if kind == "scalar":
-            return array[()]
-        if kind == "key":
-            return jax.random.wrap_key_data(
-                jnp.asarray(array), impl=node["implementation"]
-            )
-        if kind != "jax":
-            raise KeyError(kind)
-        # JAX would round without a word.
-        if jax.dtypes.canonicalize_dtype(array.dtype) != array.dtype:
-            raise _Unreadable(
-                f"expected arrays that JAX takes as it is configured, got {array.dtype}"
-                ': jax.config.update("jax_enable_x64", True) enables it'
-            )
-        if node["weak"]:
-            # Without it what was compiled for the array that was saved is not found.
-            weak = jnp.full(array.shape, array.dtype.type(0).item())
-            if weak.dtype == array.dtype:
-                return weak.at[...].set(array)
-        return jnp.asarray(array)
 
 
 def _read(file: Any, classes: Sequence[type]) -> Any:
     if file.read(2) != b"PK":
-        raise _Unreadable("expected a file that fdof_jax.save has written, got another")
+        raise Unreadable("expected a file that fdof_jax.save has written, got another")
     with zipfile.ZipFile(file) as archive:
         if _DESCRIPTION not in archive.namelist():
-            raise _Unreadable(
+            raise Unreadable(
                 "expected a file that fdof_jax.save has written, got another archive"
             )
         description = json.loads(archive.read(_DESCRIPTION))
         if description["format"] != _FORMAT:
-            raise _Unreadable(
+            raise Unreadable(
                 f"expected the format {_FORMAT}, got {description['format']}"
             )
         if description["version"] > _VERSION:
             writer = description["written by"][_FORMAT]
-            raise _Unreadable(
+            raise Unreadable(
                 f"expected version {_VERSION} of the format, got "
                 f"{description['version']}: fdof_jax {writer}, which has written it, "
                 "or a newer one reads it"
             )
-        return _Archive(archive, classes).tree(description["tree"])
 
+        def array(index: int) -> np.ndarray:
+            # Read whole, as only then its checksum is compared.
+            member = io.BytesIO(archive.read(f"arrays/{index}.npy"))
+            return np.lib.format.read_array(member, allow_pickle=False)
 
-# The two functions
+        return Restorer(array, classes).tree(description["tree"])
 
 
 def _checked(path: Any) -> Path:
@@ -354,7 +81,7 @@ def save(path: str | os.PathLike, tree: Any) -> None:
     path = _checked(path)
     arrays: list[np.ndarray] = []
     try:
-        described = _described("tree", tree, arrays)
+        tree_node = described("tree", tree, arrays)
     except RecursionError:
         raise ValueError(
             "tree: expected one without itself in it, got one nested without end."
@@ -368,7 +95,7 @@ def save(path: str | os.PathLike, tree: Any) -> None:
         "written by": {_FORMAT: __version__}
         | {module.__name__: module.__version__ for module in modules},
         "default dtype": jnp.result_type(float).name,
-        "tree": described,
+        "tree": tree_node,
     }
     text = json.dumps(description, allow_nan=False, indent=1)
     unfinished = path.with_name(f"{path.name}.{secrets.token_hex(4)}.part")
@@ -413,7 +140,7 @@ def load(path: str | os.PathLike, classes: Sequence[type] = ()) -> Any:
     with path.open("rb") as file:
         try:
             return _read(file, classes)
-        except _Unreadable as problem:
+        except Unreadable as problem:
             raise ValueError(f"{path}: {problem}.") from None
         except Exception as error:  # zipfile, NumPy and JSON raise many kinds
             raise ValueError(

@@ -10,7 +10,8 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from .bounded_search import Evaluation, Run, minimise
+from .bounded_search import Evaluation, Run, minimise, reporting
+from .ensembles import stacked
 from .fit_result import FitResult, fit_result
 from .kinematics import joint_positions, tip_position
 from .lanes import Lanes
@@ -20,7 +21,7 @@ from .sensitivities import sensitivities
 from .simulation import check_elements
 from .solution import Solution
 from .unknowns import unknowns_of
-from .validation import callable_tuple, real_array, whole_number
+from .validation import callable_tuple, keywords_as, real_array
 
 SceneAt = Callable[[dict[str, Array]], Scene]
 Observe = Callable[[Scene, Solution], Array]
@@ -130,6 +131,16 @@ def _check_scene(scene: Any, ts: Array) -> None:
     check_elements(scene.forces, scene.linkage, ts)
 
 
+def _called(scene_at: SceneAt, parameters: dict[str, Array]) -> Any:
+    try:
+        return scene_at(parameters)
+    except KeyError as error:
+        raise ValueError(
+            f"start: expected a value for {error}, which scene_at may have asked for, "
+            f"got {list(parameters)}."
+        ) from error
+
+
 def _longer_and_longer(
     until: Callable[[float], Lanes],
     z: np.ndarray,
@@ -156,21 +167,19 @@ def _search(
     observed: Any,
     together: bool,
     *,
-    observe: Observe = link_ends,
-    noise: ArrayLike | None = None,
-    bounds: Mapping[str, Any] | None = None,
-    scale: Mapping[str, Any] | None = None,
-    max_steps: int = 50,
-    report: Callable[[str], Any] | None = None,
+    observe: Observe,
+    noise: ArrayLike | None,
+    bounds: Mapping[str, Any] | None,
+    scale: Mapping[str, Any] | None,
+    max_steps: int,
+    report: Callable[[str], Any] | None,
 ) -> list[FitResult]:
     """The keywords are those of `fit`; `observed` has recordings as first axis.
 
     One result for all recordings `together`, or one for each.
     """
     unknowns = unknowns_of(start, bounds, scale)
-    max_steps = whole_number("max_steps", max_steps, 1)
-    if not (report is None or callable(report)):
-        raise ValueError(f"report: expected a callable or None, got {report!r}.")
+    told = reporting(report, _squares_so_far)
     ts = real_array("ts", ts, (None,))
     if ts.size < 2 or not (np.diff(ts) > 0).all():
         raise ValueError(f"ts: expected two or more increasing times, got {ts}.")
@@ -183,9 +192,10 @@ def _search(
     for name, value in (*(("scene_at", s) for s in scenes_at), ("observe", observe)):
         if not callable(value):
             raise ValueError(f"{name}: expected a callable, got {value!r}.")
+    stacked(scenes_at, "scene_at")  # refuses what is not alike
+    first = dict(zip(unknowns.names, map(jnp.asarray, unknowns.start)))
     for scene_at in scenes_at:
-        scene = scene_at(dict(zip(unknowns.names, map(jnp.asarray, unknowns.start))))
-        _check_scene(scene, ts)
+        _check_scene(_called(scene_at, first), ts)
     problems = [
         _Problem(scene_at, observe, unknowns.names, unknowns.scale, ts, *row)
         for scene_at, *row in zip(scenes_at, readings, weights)
@@ -211,9 +221,7 @@ def _search(
     z, low, high = (
         np.broadcast_to(a / unknowns.flat_scale, (len(rows), a.size)) for a in box
     )
-    runs = _longer_and_longer(
-        until, z, low, high, max_steps=max_steps, report=_reporter(report)
-    )
+    runs = _longer_and_longer(until, z, low, high, max_steps=max_steps, report=told)
     if any(not np.isfinite(run.best.loss) for run in runs):
         raise ValueError(
             "start: expected parameters at which the scene can be simulated over ts, "
@@ -225,18 +233,9 @@ def _search(
     ]
 
 
-def _reporter(report: Any) -> Callable[[int, list[Run]], None]:
-    def told(number: int, runs: list[Run]) -> None:
-        if report is None:
-            return
-        squares = sum(run.best.facts["squares"].sum() for run in runs)
-        going = sum(run.reason is None for run in runs)
-        report(
-            f"{number:4d}  sum of squares {squares:.6g}, "
-            f"{going} of {len(runs)} runs going on"
-        )
-
-    return told
+def _squares_so_far(runs: list[Run]) -> str:
+    squares = sum(run.best.facts["squares"].sum() for run in runs)
+    return f"sum of squares {squares:.6g}"
 
 
 def fit(
@@ -286,19 +285,19 @@ def fit(
     **Raises:** ValueError for malformed arguments, and if the scene cannot be simulated
     from the start.
     """
-    keywords = {
-        k: v
-        for k, v in locals().items()
-        if k not in ("scene_at", "start", "ts", "observed")
-    }
-    if not isinstance(scene_at, list | tuple):
-        return _search([scene_at], start, ts, [observed], True, **keywords)[0]
-    if not scene_at or np.shape(observed)[:1] != (len(scene_at),):
-        raise ValueError(
-            "observed: expected a recording for each of the scenes (one at least), got "
-            f"shape {np.shape(observed)} for {len(scene_at)}."
-        )
-    return _search(scene_at, start, ts, observed, True, **keywords)[0]
+    if isinstance(scene_at, list | tuple):
+        scenes_at = scene_at
+        if not scene_at or np.shape(observed)[:1] != (len(scene_at),):
+            raise ValueError(
+                "observed: expected a recording for each of the scenes (one at least), "
+                f"got shape {np.shape(observed)} for {len(scene_at)}."
+            )
+    else:
+        scenes_at, observed = [scene_at], np.asarray(observed)[None]
+    return _search(
+        scenes_at, start, ts, observed, True, observe=observe, noise=noise,
+        bounds=bounds, scale=scale, max_steps=max_steps, report=report,
+    )[0]  # fmt: skip
 
 
 def fit_each(
@@ -315,7 +314,7 @@ def fit_each(
 
     **Returns:** a list of `FitResult`s.
 
-    **Raises:** ValueError as `fit`.
+    **Raises:** ValueError as `fit`; TypeError for unknown keywords.
     """
     recordings = np.shape(observed)[:1]
     if not recordings or recordings[0] == 0:
@@ -323,4 +322,5 @@ def fit_each(
             "observed: expected recordings along a leading axis, got shape "
             f"{np.shape(observed)}."
         )
+    keywords = keywords_as(fit, keywords)
     return _search([scene_at] * recordings[0], start, ts, observed, False, **keywords)

@@ -21,8 +21,8 @@ def controller_of(scene: Scene) -> PDController:
     found = [force for force in scene.forces if isinstance(force, PDController)]
     if len(found) != 1:
         raise ValueError(
-            "scene: expected exactly one PDController among its forces, got "
-            f"{len(found)}."
+            "scene: expected exactly one PDController among its forces (not one within "
+            f"a drive), got {len(found)} in {scene.forces!r}."
         )
     return found[0]
 

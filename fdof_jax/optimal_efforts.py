@@ -11,7 +11,7 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from .bounded_search import Evaluation, Run, minimise
+from .bounded_search import Evaluation, Run, minimise, reporting
 from .control import PDController, tip_deviation
 from .forces import EffortHistory
 from .lanes import Lanes
@@ -225,9 +225,7 @@ def optimal_efforts(
     horizon = _check(scene, horizon)
     knots = whole_number("knots", knots, 2)
     price = real_array("effort_rate", effort_rate, (), minimum=0)
-    max_steps = whole_number("max_steps", max_steps, 1)
-    if not (report is None or callable(report)):
-        raise ValueError(f"report: expected a callable or None, got {report!r}.")
+    told = reporting(report, _errors_so_far)
     controller = controller_of(scene)
     task, limit = controller.reference, np.asarray(controller.limit)
     ts, times = np.linspace(0, horizon, _SAMPLES), np.linspace(0, horizon, knots)
@@ -255,7 +253,7 @@ def optimal_efforts(
     bounds = np.broadcast_to(bound, start.shape)
     runs = minimise(
         lanes, start, -bounds, bounds, method="levenberg-marquardt",
-        max_steps=max_steps, enough=_ENOUGH, report=_reporter(report),
+        max_steps=max_steps, enough=_ENOUGH, report=told,
     )  # fmt: skip
     runs = [run for run in runs if np.isfinite(run.best.loss)]
     if not runs:
@@ -295,10 +293,6 @@ def _tip_error(run: Run) -> float:
     return float(run.best.facts["tip_error"][0])
 
 
-def _reporter(report: Callable[[str], Any] | None) -> Callable[[int, list[Run]], None]:
-    def told(number: int, runs: list[Run]) -> None:
-        if report is not None:
-            errors = ", ".join(f"{1e3 * _tip_error(run):.5g}" for run in runs)
-            report(f"{number:4d}  rms tip error from each first guess: {errors} mm")
-
-    return told
+def _errors_so_far(runs: list[Run]) -> str:
+    errors = ", ".join(f"{1e3 * _tip_error(run):.5g}" for run in runs)
+    return f"rms tip error from each first guess: {errors} mm"

@@ -176,7 +176,8 @@ def _best(history: History) -> int:
 def _at_bound(gains, lower, upper) -> np.ndarray:
     # A hair: the exponential of a bound's logarithm may fall short of it by rounding.
     hair = 100 * np.finfo(jnp.result_type(float)).eps
-    return (gains > 0) & ((gains <= lower * (1 + hair)) | (gains >= upper * (1 - hair)))
+    free = (gains > 0) & (lower < upper)
+    return free & ((gains <= lower * (1 + hair)) | (gains >= upper * (1 - hair)))
 
 
 def result_of(
@@ -228,7 +229,7 @@ def result_of(
 def _message(scene, reason, history, lower, upper) -> str:
     """The reason, and what a reader might take for convergence but is not."""
     names, share = joint_names(scene), history.saturated[_best(history)]
-    tuned = controller_gains(scene) > 0
+    tuned = (controller_gains(scene) > 0) & (lower < upper)
     if history.gradient_norm[0] == 0:
         at_limit = history.saturated[0].min() == 1
         reason = "the gradient is zero at the start" + (

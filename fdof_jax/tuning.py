@@ -1,7 +1,7 @@
 """Tuning of PD gains by gradients through the simulation."""
 
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, overload
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -9,8 +9,8 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
-from .bounded_search import METHODS, Evaluation, Run, minimise
-from .ensembles import unstacked
+from .bounded_search import METHODS, Evaluation, Row, Run, minimise, reporting
+from .ensembles import stacked, unstacked
 from .lanes import Lanes
 from .linkage import check_linkage
 from .losses import Tracking, controller_of, relative_demands, tip_errors
@@ -22,6 +22,7 @@ from .tune_result import TradeOff, TuneResult, result_of
 from .validation import (
     callable_tuple,
     instance,
+    keywords_as,
     one_of,
     real_array,
     whole_number,
@@ -57,7 +58,9 @@ def evaluate_gains(z: Array, problem: tuple[Scene, Loss, Array]) -> Evaluation:
         return with_gains(scene, jnp.where(tuned, jnp.exp(z.reshape(2, 3)), 0))
 
     def residuals(scene, solution):
-        value = jnp.asarray(loss(scene, solution))
+        value = loss(scene, solution)
+        size = np.shape(value) if eqx.is_array_like(value) else ()
+        value = real_array("loss(scene, solution)", value, size)
         # The square of a scalar loss's root is the loss.
         return value.reshape(-1) if value.ndim else jnp.sqrt(value)[None]
 
@@ -73,6 +76,7 @@ def evaluate_gains(z: Array, problem: tuple[Scene, Loss, Array]) -> Evaluation:
         saturated=jnp.mean(demands > 1, axis=0),
         effort=jnp.sqrt(jnp.mean(jnp.minimum(demands, limited) ** 2, axis=0)),
         square_error=square_error,
+        simulated=jnp.isfinite(solution.q[-1]).all(),
         steps=solution.stats["num_steps"],
     )
     return Evaluation(
@@ -114,6 +118,11 @@ def _bounds(scene: Scene, factor: Any, bounds: Any) -> tuple[np.ndarray, ...]:
         np.asarray(real_array(f"bounds[{i}]", b, (2, 3), minimum=0))
         for i, b in enumerate(bounds)
     )
+    if not (lower <= upper).all():
+        raise ValueError(
+            "bounds: expected the least gains before the greatest, got "
+            f"{lower.tolist()} and {upper.tolist()}."
+        )
     if not ((lower <= start) & (start <= upper)).all():
         raise ValueError(
             "bounds: expected the scene's gains between them, got "
@@ -138,15 +147,15 @@ def _search(
     scenes: Sequence[Scene],
     losses: Sequence[Any],
     *,
-    factor: ArrayLike | None = None,
-    bounds: tuple[ArrayLike, ArrayLike] | None = None,
-    ensemble: Scene | None = None,
-    over: str = "mean",
-    method: str = "levenberg-marquardt",
-    starts: int = 1,
-    seed: int = 0,
-    max_steps: int = 50,
-    report: Callable[[str], Any] | None = None,
+    factor: ArrayLike | None,
+    bounds: tuple[ArrayLike, ArrayLike] | None,
+    ensemble: Scene | None,
+    over: str,
+    method: str,
+    starts: int,
+    seed: int,
+    max_steps: int,
+    report: Callable[[str], Any] | None,
 ) -> list[TuneResult]:
     """One result per scene and loss; the keywords are those of `tune`."""
     one_of("method", method, tuple(METHODS))
@@ -155,9 +164,7 @@ def _search(
         raise ValueError("over: expected an ensemble to take the worst of, got none.")
     starts = whole_number("starts", starts, 1)
     draw = np.random.default_rng(whole_number("seed", seed, 0))
-    max_steps = whole_number("max_steps", max_steps, 1)
-    if not (report is None or callable(report)):
-        raise ValueError(f"report: expected a callable or None, got {report!r}.")
+    told = reporting(report, _best_so_far)
     for scene, loss in zip(scenes, losses):
         if not callable(loss):
             raise ValueError(f"loss: expected a callable, got {loss!r}.")
@@ -178,7 +185,7 @@ def _search(
     z, low, high = map(np.concatenate, columns)
     runs = minimise(
         lanes, z, low, high, method=method, max_steps=max_steps,
-        enough=_ENOUGH, report=_reporter(report),
+        enough=_ENOUGH, report=told,
     )  # fmt: skip
     settings = dict(
         method=method,
@@ -192,31 +199,35 @@ def _search(
     for i, (scene, (_, lower, upper)) in enumerate(zip(scenes, boxes)):
         mine = runs[i * starts : (i + 1) * starts]
         if all(run.failed for run in mine):
-            raise ValueError(
-                f"scene: expected one that can be simulated up to t1 = "
-                f"{float(scene.t1):g} s, got a loss of {mine[0].rows[0].loss:g} or a "
-                "gradient that is not finite."
-            )
+            raise _failure(members[i], mine[0].rows[0], ensemble is not None)
         results.append(result_of(scene, mine, lower, upper, settings, with_gains))
     return results
 
 
-def _reporter(report: Callable[[str], Any] | None) -> Callable[[int, list[Run]], None]:
-    def told(number: int, runs: list[Run]) -> None:
-        if report is None:
-            return
-        best = min(runs, key=lambda run: (run.failed, run.best.loss)).best
-        error = 1e3 * np.sqrt(np.mean(best.facts["square_error"]))
-        what = f"loss {best.loss:.6g}"
-        if np.isfinite(error):
-            what += f", rms tip error {error:.5g} mm"
-        going = sum(run.reason is None for run in runs)
-        report(
-            f"{number:4d}  {what}, projected gradient {best.gradient_norm:.2g}, "
-            f"{going} of {len(runs)} runs going on"
+def _failure(members: list[Scene], first: Row, ensemble: bool) -> ValueError:
+    """What is wrong if no start can be evaluated, judged by the first of them."""
+    failing = np.flatnonzero(~first.facts["simulated"])
+    if failing.size == 0:
+        return ValueError(
+            "loss: expected finite numbers, not negative if only one, with finite "
+            "derivatives, got a loss that is not so at the scene's own gains."
         )
+    index = int(failing[0])
+    name = f"ensemble[{index}]" if ensemble else "scene"
+    return ValueError(
+        f"{name}: expected one that can be simulated up to t1 = "
+        f"{float(members[index].t1):g} s with the scene's own gains, got one that "
+        "fails before."
+    )
 
-    return told
+
+def _best_so_far(runs: list[Run]) -> str:
+    best = min(runs, key=lambda run: (run.failed, run.best.loss)).best
+    error = 1e3 * np.sqrt(np.mean(best.facts["square_error"]))
+    what = f"loss {best.loss:.6g}"
+    if np.isfinite(error):
+        what += f", rms tip error {error:.5g} mm"
+    return f"{what}, projected gradient {best.gradient_norm:.2g}"
 
 
 def tune(
@@ -268,28 +279,39 @@ def tune(
     **Raises:** ValueError for malformed arguments, and if the scene cannot be simulated
     from its start.
     """
-    keywords = {k: v for k, v in locals().items() if k not in ("scene", "loss")}
-    return _search([scene], [loss], **keywords)[0]
+    return _search(
+        [scene], [loss], factor=factor, bounds=bounds, ensemble=ensemble, over=over,
+        method=method, starts=starts, seed=seed, max_steps=max_steps, report=report,
+    )[0]  # fmt: skip
 
 
+@overload
 def tune_each(
-    scenes: Sequence[Scene], *, loss: Loss = tip_errors, **keywords: Any
-) -> list[TuneResult]:
+    scenes: Mapping[str, Scene], *, loss: Loss = ..., **keywords: Any
+) -> dict[str, TuneResult]: ...
+@overload
+def tune_each(
+    scenes: Sequence[Scene], *, loss: Loss = ..., **keywords: Any
+) -> list[TuneResult]: ...
+def tune_each(scenes: Any, *, loss: Loss = tip_errors, **keywords: Any) -> Any:
     """`tune` for several scenes of one structure, in one compiled program.
 
     The topologies may differ.
 
-    **Arguments:** `scenes`: a list or tuple; the others as in `tune`, but without an
-    `ensemble`.
+    **Arguments:** `scenes`: a list or a dict by name, as `circle_scenes` gives; the
+    others as in `tune`, but without an `ensemble`.
 
-    **Returns:** a list of `TuneResult`s.
+    **Returns:** a list of `TuneResult`s, or a dict by the same names.
 
-    **Raises:** ValueError as `tune`, and for scenes of different structure.
+    **Raises:** ValueError as `tune`, and for scenes of different structure; TypeError
+    for unknown keywords.
     """
-    if not isinstance(scenes, list | tuple) or isinstance(scenes, Scene) or not scenes:
-        raise ValueError(f"scenes: expected a list of scenes, got {scenes!r}.")
-    if keywords.get("ensemble") is not None:
-        raise ValueError("ensemble: expected none, as each scene is tuned for itself.")
+    if isinstance(scenes, Mapping):
+        results = tune_each(list(scenes.values()), loss=loss, **keywords)
+        return dict(zip(scenes, results))
+    keywords = keywords_as(tune, keywords, without=("loss", "ensemble", "over"))
+    stacked(scenes)  # refuses what is not alike
+    keywords |= dict(ensemble=None, over="mean")
     return _search(scenes, [loss] * len(scenes), **keywords)
 
 
@@ -301,8 +323,9 @@ def trade_off(scene: Scene, prices: ArrayLike, **keywords: Any) -> TradeOff:
 
     **Returns:** a `TradeOff`, in the order of the prices.
 
-    **Raises:** ValueError as `tune`.
+    **Raises:** ValueError as `tune`; TypeError for unknown keywords.
     """
+    keywords = keywords_as(tune, keywords, without=("loss",))
     prices = np.asarray(real_array("prices", prices, (None,), minimum=0))
     if prices.size == 0:
         raise ValueError("prices: expected at least one, got none.")

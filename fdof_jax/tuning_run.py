@@ -18,6 +18,7 @@ from .scenes import Scene
 from .showcase import draw_circle, simulate_finely
 from .tune_result import TuneResult
 from .tuning import tune
+from .validation import real_array
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,7 +79,9 @@ def run_tuning(
 ) -> TuningRun:
     """Tune the gains of a job, or go on from where a saved one has come to.
 
-    **Arguments:** `search`: method, starts, seed and max_steps of `tune`.
+    **Arguments:** `search`: method, starts, seed and max_steps of `tune`. Those not
+    given are as they were in the run that goes on, but for the seed, which is one more:
+    other random starts are tried.
 
     **Raises:** ValueError as `tune` and `load`.
     """
@@ -87,33 +90,38 @@ def run_tuning(
         raise ValueError(
             f"--save: expected a file in a folder that is there, got {save_to}."
         )
-    output.mkdir(parents=True, exist_ok=True)
-    bounds = None
-    scene = job.scene()
-    start = scene
+    earlier: list[TuneResult] = []
     if resume is not None:
         say(f"go on from {resume}")
         saved = load(resume)
-        if not isinstance(saved, dict) or set(saved) != {"job", "result"}:
+        if not isinstance(saved, dict) or set(saved) != {"job", "search", "results"}:
             raise ValueError(
                 f"{resume}: expected a file written by `fdof-jax tune --save`, got one "
                 f"that holds a {type(saved).__name__}."
             )
-        job, before = saved["job"], saved["result"]
-        scene, start, bounds = job.scene(), before.scene, (before.lower, before.upper)
+        job, earlier = saved["job"], saved["results"]
+        search = {**saved["search"], "seed": saved["search"]["seed"] + 1, **search}
+    else:
+        search = {"seed": 0, **search}
+    price = real_array("price", job.price, (), minimum=0)
+    scene = job.scene()
+    output.mkdir(parents=True, exist_ok=True)
     say("tune the gains")
+    last = earlier[-1] if earlier else None
+    start = last.scene if last else scene
     result = tune(
         start,
-        factor=job.factor if bounds is None else None,
-        bounds=bounds,
-        loss=Tracking(effort=job.price) if job.price else tip_errors,
+        factor=None if last else job.factor,
+        bounds=(last.lower, last.upper) if last else None,
+        loss=Tracking(effort=price) if price > 0 else tip_errors,
         ensemble=job.ensemble(scene),
         over="mean" if job.over == "nominal" else job.over,
         report=report,
         **search,
     )
     if save_to is not None:
-        save(save_to, {"job": job, "result": result})
+        results = [*earlier, result]
+        save(save_to, {"job": job, "search": search, "results": results})
     say("compare the gradients with differences")
     reports = gradient_report(start), gradient_report(result.scene)
     say("draw")

@@ -4,7 +4,8 @@ Shapes and types are checked always, values only where they are concrete: a valu
 traced by `jax.jit`, `jax.vmap` or `jax.grad` is not known yet.
 """
 
-from collections.abc import Sequence
+import inspect
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -116,6 +117,26 @@ def one_of(name: str, value: Any, options: Sequence[Any]) -> Any:
     if isinstance(value, str | int | float) and value in options:
         return value
     raise ValueError(f"{name}: expected one of {tuple(options)}, got {value!r}.")
+
+
+def keywords_as(
+    function: Callable, given: dict[str, Any], without: Sequence[str] = ()
+) -> dict[str, Any]:
+    """The keyword-only arguments of a function, by default unless given.
+
+    Raises TypeError for others, and for those of `without`, which are not returned.
+    """
+    known = {
+        name: parameter.default
+        for name, parameter in inspect.signature(function).parameters.items()
+        if parameter.kind is parameter.KEYWORD_ONLY and name not in without
+    }
+    for name in given:
+        if name not in known:
+            raise TypeError(
+                f"{name}: expected a keyword among {', '.join(known)}, got another."
+            )
+    return known | given
 
 
 def sign(name: str, value: Any) -> Array:

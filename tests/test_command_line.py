@@ -94,11 +94,15 @@ def test_tuning_goes_on_where_it_was_saved(tmp_path, capsys):
     assert saved["job"].radius == 0.5 and saved["job"].over == "worst"
     main(["tune", *folder, *search, "--resume", str(file), "--save", str(file)])
     second = capsys.readouterr().out
-    again = fj.load(file)["result"]
-    assert again.loss < saved["result"].loss
+    kept = fj.load(file)
+    earlier, again = kept["results"]
+    assert again.loss < earlier.loss
+    np.testing.assert_array_equal(earlier.gains, saved["results"][0].gains)
     # The same members and bounds, from where the first run has come to.
-    assert again.history.loss[0] == pytest.approx(saved["result"].loss, rel=1e-9)
-    np.testing.assert_array_equal(again.upper, saved["result"].upper)
+    assert again.history.loss[0] == pytest.approx(earlier.loss, rel=1e-9)
+    np.testing.assert_array_equal(again.upper, earlier.upper)
+    # And the same search, but for the random starts.
+    assert kept["search"] == saved["search"] | {"seed": 1}
     before, after = kept_gains(first), kept_gains(second)
     assert [row[1] for row in before] == [row[0] for row in after]
 
@@ -110,6 +114,7 @@ def test_tuning_goes_on_where_it_was_saved(tmp_path, capsys):
         (["--resume", "x.fdof"], "x.fdof"),
         (["--payload", "0", "1"], "--over: mean or worst is needed for payload"),
         (["--radius", "-1"], "radius"),
+        (["--price", "-1"], "price"),
         (["--factor", "0.5"], "factor"),
         (["--starts", "0"], "starts"),
         (["--save", "nowhere/x.fdof"], "--save: expected a file in a folder"),

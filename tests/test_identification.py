@@ -294,6 +294,7 @@ SEEN = np.zeros((201, 3, 2))
     [
         (dict(scene_at=3), "scene_at: expected a callable"),
         (dict(scene_at=lambda p: p["mass"]), "scene_at: expected it to return a Scene"),
+        (dict(scene_at=lambda p: p["weight"]), "start: expected a value for 'weight'"),
         (dict(start=[1.0]), "start: expected a dict"),
         (dict(start={}), "start: expected a dict"),
         (dict(start={1: 2.0}), "start: expected names"),
@@ -332,6 +333,8 @@ def test_malformed_arguments(changes, message):
 def test_malformed_batches():
     with pytest.raises(ValueError, match="observed: expected recordings"):
         fj.fit_each(MIXED, FIRST, TS, 3.0)
+    with pytest.raises(TypeError, match="tolerance: expected a keyword among observe,"):
+        fj.fit_each(MIXED, FIRST, TS, SEEN[None], tolerance=1e-3)
 
 
 def test_progress_is_reported_and_nothing_compiles_twice(seen):

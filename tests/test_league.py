@@ -51,17 +51,18 @@ def test_reachable_says_when():
 
 def test_all_are_tuned_in_one_program_and_as_they_are_alone():
     few = {name: SCENES[name]._replace(t1=1.0) for name in ("RPR", "PPR")}
-    together = fj.tune_each(list(few.values()), max_steps=4)
+    together = fj.tune_each(few, max_steps=4)
     alone = fj.tune(few["PPR"], max_steps=4)
-    np.testing.assert_allclose(together[1].gains, alone.gains, rtol=1e-3)
-    assert together[1].loss == pytest.approx(alone.loss, rel=1e-4)
-    table = fj.league_table(dict(zip(few, together))).splitlines()
+    np.testing.assert_allclose(together["PPR"].gains, alone.gains, rtol=1e-3)
+    assert together["PPR"].loss == pytest.approx(alone.loss, rel=1e-4)
+    table = fj.league_table(together).splitlines()
     assert [row.split()[0] for row in table[2:]] == ["PPR", "RPR"]
-    assert f"{1e3 * together[0].tip_error:.4g}" in table[3]
+    assert f"{1e3 * together['RPR'].tip_error:.4g}" in table[3]
 
 
 def test_scenes_that_cannot_be_tuned_together():
     with pytest.raises(ValueError, match="scenes: expected a list"):
         fj.tune_each(SCENES["RRR"])
-    with pytest.raises(ValueError, match="ensemble: expected none"):
-        fj.tune_each([SCENES["RRR"]], ensemble=SCENES["RRR"])
+    other = SCENES["RRR"]._replace(forces=(*SCENES["RRR"].forces, fj.JointDamper(1.0)))
+    with pytest.raises(ValueError, match=r"scenes\[1\]: expected one like scenes\[0\]"):
+        fj.tune_each([SCENES["RRR"], other])

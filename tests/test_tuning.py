@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import fdof_jax as fj
-from fdof_jax import lanes, scenes, tuning
+from fdof_jax import lanes, losses, scenes, tuning
 from fdof_jax.losses import controller_of, tip_errors
 
 
@@ -254,6 +254,8 @@ class TestEnsembles:
         short = scenes.fig5()._replace(forces=(still,))
         with pytest.raises(ValueError, match="start_offset: expected one within"):
             fj.perturbed(short, 2, start_offset=100.0)
+        with pytest.raises(ValueError, match="link_error: expected less than 1"):
+            fj.perturbed(self.scene, 2, link_error=1.5)
         with pytest.raises(ValueError, match="speed"):
             fj.perturbed(self.scene, 2, speed=(2.0, 0.0))
 
@@ -344,6 +346,7 @@ def test_elements_with_indices_and_prescribed_motion_may_act_beside_the_controll
         (dict(loss=3), "loss"),
         (dict(bounds=(1, 2, 3)), "bounds"),
         (dict(bounds=(np.ones((2, 3)), np.ones((2, 2)))), "bounds"),
+        (dict(bounds=(np.full((2, 3), 9), np.ones((2, 3)))), "bounds: expected the le"),
         (dict(bounds=(np.ones((2, 3)), 2 * np.ones((2, 3)))), "bounds"),
         (dict(bounds=(np.zeros((2, 3)), np.full((2, 3), 1e9))), "bounds"),
     ],
@@ -372,9 +375,44 @@ def test_malformed_scenes(scene):
         fj.tune(scene)
 
 
-def test_a_scene_that_fails_is_refused():
+def test_a_member_that_fails_is_named():
     scene = scenes.fig7()._replace(t1=0.2)
     massless = eqx.tree_at(lambda arm: arm.mass, scene.linkage, jnp.zeros(3))
     massless = eqx.tree_at(lambda arm: arm.inertia, massless, jnp.zeros(3))
-    with pytest.raises(ValueError, match="scene: expected one that can be simulated"):
-        fj.tune(scene._replace(linkage=massless))
+    ensemble = fj.stacked([scene, scene._replace(linkage=massless)])
+    message = r"ensemble\[1\]: expected one that can be simulated"
+    with pytest.raises(ValueError, match=message):
+        fj.tune(scene, ensemble=ensemble)
+
+
+def test_a_loss_that_is_negative_is_refused_as_such():
+    scene = scenes.fig7()._replace(t1=0.2)
+    with pytest.raises(ValueError, match="loss: expected finite numbers, not negative"):
+        fj.tune(scene, loss=lambda scene, solution: -jnp.sum(solution.q**2))
+
+
+@pytest.mark.parametrize("value", ["a", None, 1j, (1.0, 2.0, "b")])
+def test_a_loss_that_is_no_number_is_refused(value):
+    with pytest.raises(ValueError, match=r"loss\(scene, solution\): expected a"):
+        fj.tune(scenes.fig7(), loss=lambda scene, solution: value)
+
+
+def test_keywords_of_tune_are_those_of_its_relatives():
+    scene = scenes.fig7()
+    with pytest.raises(TypeError, match="step: expected a keyword among factor, "):
+        fj.tune_each([scene], step=3)
+    with pytest.raises(TypeError, match="ensemble: expected a keyword"):
+        fj.tune_each([scene], ensemble=scene)
+    with pytest.raises(TypeError, match="loss: expected a keyword"):
+        fj.trade_off(scene, [0.0], loss=losses.tip_errors)
+
+
+def test_fixed_gains_are_not_held():
+    scene = scenes.fig7()._replace(t1=0.2)
+    controller = scene.forces[0]
+    gains = np.stack([controller.kp, controller.kd])
+    room = np.array([[4.0], [1.0]])
+    result = fj.tune(scene, bounds=(gains / room, gains * room), max_steps=1)
+    assert not result.at_bound[1].any()
+    np.testing.assert_allclose(result.gains[1], gains[1])
+    assert "of 3 gains are at a bound" in result.message

@@ -1,0 +1,382 @@
+"""What is no tree of the library's is not saved, what is not whole is not loaded."""
+
+import contextlib
+import json
+import os
+import sys
+import zipfile
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from saved_trees import (
+    OWN,
+    SCENES,
+    Colour,
+    Nothing,
+    Pair,
+    Plain,
+    Push,
+    archived,
+    describe,
+    refused,
+    same,
+    saved_and_loaded,
+)
+
+import fdof_jax as fj
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "tree.fdof"
+
+
+# What cannot be saved
+
+
+def cyclic():
+    items = []
+    items.append(items)
+    return items
+
+
+deleted = jnp.ones(3) + 1
+deleted.delete()
+
+UNSAVED = {
+    "lambda": (lambda t, linkage: (t, t), "equinox.Module.*<lambda>"),
+    "function of one's own": (describe, "equinox.Module.*describe"),
+    "lambda of the library": (
+        fj.travel.PROFILES["quintic"],
+        "equinox.Module.*<lambda>",
+    ),
+    "function of another library": (jnp.linalg.norm, "norm"),
+    "method": (Push(1.0, "").__call__, "bound method"),
+    "class": (Push, "class .*Push"),
+    "object": (object(), "object"),
+    "bytes": (b"abc", "b'abc'"),
+    "keys": ({1: 2}, r"strings as keys, got \[1\]"),
+    "objects": (np.array([None]), "numbers, got one of object"),
+    "structured": (np.zeros(2, [("a", "f8")]), "numbers, got one of"),
+    "masked": (np.ma.zeros(2), "masked_array"),
+    "deleted": (deleted, "deleted"),
+}
+
+
+@pytest.mark.parametrize("name", UNSAVED)
+def test_what_cannot_be_saved(name, path):
+    value, words = UNSAVED[name]
+    fj.save(path, "older")
+    before = path.read_bytes()
+    scene = SCENES["fig7"]
+    controller = eqx.tree_at(lambda c: c.reference, scene.forces[0], value)
+    forces = (fj.JointDamper(1.0), controller)
+    place = r"^tree\.forces\[1\]\.reference: expected"
+    with pytest.raises(ValueError, match=rf"(?s){place} .*{words}.*\.$"):
+        fj.save(path, scene._replace(forces=forces))
+    with pytest.raises(ValueError, match=r"^tree\['a'\]\[0\]\['b'\]: expected"):
+        fj.save(path, {"a": [{"b": value}]})
+    assert path.read_bytes() == before
+    assert os.listdir(path.parent) == [path.name]
+
+
+def test_an_open_file_cannot_be_saved(path):
+    with open(__file__) as file:
+        with pytest.raises(ValueError, match=r"^tree\[0\]: expected .*TextIOWrapper"):
+            fj.save(path, (file,))
+
+
+def test_a_field_without_a_value_cannot_be_saved(path):
+    with pytest.raises(ValueError, match=r"^tree\.number: expected a value, got none"):
+        fj.save(path, object.__new__(Plain))
+
+
+def test_a_tree_without_end_cannot_be_saved(path):
+    with pytest.raises(ValueError, match="^tree: expected .*without end"):
+        fj.save(path, cyclic())
+
+
+def test_a_traced_value_cannot_be_saved(path):
+    with pytest.raises(ValueError, match=r"^tree\[0\]: expected .*outside of jit"):
+        jax.jit(lambda x: fj.save(path, [x]))(1.0)
+    assert not path.exists()
+
+
+@pytest.mark.parametrize("broken", ["write_array", "replace"])
+def test_a_failed_save_leaves_the_older_file(broken, path, monkeypatch):
+    fj.save(path, SCENES["fig3"])
+    before = path.read_bytes()
+
+    def full(*arguments, **keywords):
+        raise OSError("No space left on device")
+
+    where = {"write_array": np.lib.format, "replace": os}[broken]
+    monkeypatch.setattr(where, broken, full)
+    with pytest.raises(OSError, match="No space left"):
+        fj.save(path, SCENES["fig7"])
+    assert path.read_bytes() == before
+    assert os.listdir(path.parent) == [path.name]
+
+
+def test_a_file_is_replaced(path):
+    saved_and_loaded(str(path), SCENES["fig7"])
+    saved_and_loaded(path, 1)
+    assert os.listdir(path.parent) == [path.name]
+
+
+# What cannot be read
+
+
+@pytest.mark.parametrize("value", [None, 3, ["a"], b"a"])
+def test_paths(value):
+    for call in (lambda: fj.save(value, 1), lambda: fj.load(value)):
+        with pytest.raises(ValueError, match="^path: expected a path, got "):
+            call()
+
+
+def test_a_missing_file(path):
+    with pytest.raises(FileNotFoundError):
+        fj.load(path)
+    with pytest.raises(FileNotFoundError):
+        fj.save(path / "none" / "none", 1)
+
+
+@pytest.mark.parametrize("value", [Push, "Push", (3,), None])
+def test_classes_that_are_none(value, path):
+    fj.save(path, 1)
+    with pytest.raises(ValueError, match="^classes: expected a tuple of classes, got"):
+        fj.load(path, value)
+
+
+def test_other_files(path):
+    path.write_text("q,qd\n1,2\n")
+    refused(path, "fdof_jax.save has written, got another")
+    path.write_bytes(b"")
+    refused(path, "fdof_jax.save has written, got another")
+    with path.open("wb") as file:
+        np.savez(file, q=np.ones(3))
+    refused(path, "fdof_jax.save has written, got another archive")
+    archived(path, {"description.json": '{"format": "gltf"}'})
+    refused(path, "format fdof_jax, got gltf")
+
+
+DAMAGES = {
+    "no JSON": {"description.json": b"{'a': 1}"},
+    "no object": {"description.json": b"[]"},
+    "nesting": {"description.json": b"[" * 100_000},
+    "no text": {"description.json": b"\xff\xfe"},
+    "no array": {"arrays/0.npy": b""},
+    "half an array": {"arrays/0.npy": None},
+}
+
+
+@pytest.mark.parametrize("name", DAMAGES)
+def test_damaged_members(name, path):
+    """The archive's checksums are right."""
+    fj.save(path, np.arange(9.0))
+    with zipfile.ZipFile(path) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    half = {"arrays/0.npy": members["arrays/0.npy"][:-8]}
+    archived(path, members | (DAMAGES[name] if name != "half an array" else half))
+    refused(path, "damaged or cut short")
+
+
+def test_a_missing_array(path):
+    fj.save(path, np.arange(9.0))
+    with zipfile.ZipFile(path) as archive:
+        text = archive.read("description.json")
+    archived(path, {"description.json": text})
+    refused(path, "damaged or cut short .*arrays/0.npy")
+
+
+NODES = {
+    "shape": (dict(shape=[4]), r"shape \[4\], got \[3\]"),
+    "order of axes": (dict(shape=[3, 1]), r"shape \[3, 1\], got \[3\]"),
+    "dtype": (dict(dtype="float32"), "float32, got float64"),
+    "extended dtype": (dict(dtype="bfloat16"), "bfloat16, got float64"),
+    "no dtype": (dict(dtype="float65"), "damaged"),
+    "another array": (dict(array=1), "damaged .*arrays/1.npy"),
+    "outside": (dict(array="../../0"), "damaged"),
+    "kind": (dict(kind="pickle"), "damaged .*pickle"),
+    "no kind": (dict(kind=None), "damaged"),
+    "bits": (dict(kind="float", bits="00"), "damaged"),
+    "items": (dict(kind="tuple", items=3), "damaged"),
+    "no items": (dict(kind="dict"), "damaged"),
+    "key": (dict(kind="key", implementation="none"), "damaged"),
+    "function": (dict(kind="function", name="os:system"), "function .* os:system"),
+    "class as function": (
+        dict(kind="function", name="fdof_jax.scenes:Scene"),
+        "function .* fdof_jax.scenes:Scene",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", NODES)
+def test_descriptions_that_do_not_fit(name, path):
+    fj.save(path, np.arange(3.0))
+    node, words = NODES[name]
+    describe(path, lambda d: d["tree"].update(node))
+    refused(path, words)
+
+
+def test_a_newer_format(path):
+    fj.save(path, SCENES["fig3"])
+
+    def later(description):
+        description["version"] = 2
+        description["written by"]["fdof_jax"] = "7.8.9"
+        description["tree"] = {"kind": "unheard of"}
+
+    describe(path, later)
+    refused(path, "version 1 of the format, got 2: fdof_jax 7.8.9")
+
+
+def test_the_description_is_strict_json_and_says_who_wrote_it(path):
+    fj.save(path, [np.nan, -np.inf])
+    with zipfile.ZipFile(path) as archive:
+        text = archive.read("description.json")
+
+    def constant(name):
+        raise AssertionError(name)
+
+    description = json.loads(text, parse_constant=constant)
+    assert description["format"] == "fdof_jax" and description["version"] == 1
+    assert description["default dtype"] == "float64"
+    writers = ["diffrax", "equinox", "fdof_jax", "jax", "numpy"]
+    assert sorted(description["written by"]) == writers
+    assert description["written by"]["jax"] == jax.__version__
+
+
+def test_unknown_classes(path):
+    fj.save(path, (Push(1.0, ""),))
+    refused(path, "test_files:Push.*classes=")
+    refused(path, "test_files:Push.*classes=", (Pair,))
+    fj.save(path, Colour.red)
+    refused(path, "test_files:Colour.*classes=")
+    # A class that is no record, nor an enumeration
+    describe(path, lambda d: d["tree"].update({"class": "fdof_jax.scenes:Scene"}))
+    refused(path, "enumeration, got fdof_jax.scenes:Scene")
+    fj.save(path, Nothing())
+    describe(path, lambda d: d["tree"].update({"class": "diffrax:RESULTS"}))
+    refused(path, "diffrax:RESULTS with the fields None")
+
+
+FORGED = """os:system subprocess:Popen builtins:object forged:Element
+fdof_jax.files:os fdof_jax.files:eqx fdof_jax.files:Path
+fdof_jax.files:_Unreadable.__class__ fdof_jax.forged:Element fdof_jax_forged:Element
+fdof_jax:Array diffrax:Solution diffrax:ODETerm
+fdof_jax: : fdof_jax.scenes fdof_jax..scenes:Scene""".split()
+
+
+@pytest.mark.parametrize("name", FORGED)
+def test_nothing_else_is_imported(name, path, tmp_path, monkeypatch):
+    for module in ("forged", "fdof_jax_forged"):
+        text = "class Element: pass"
+        (tmp_path / f"{module}.py").write_text(text)
+    monkeypatch.syspath_prepend(tmp_path)
+    fj.save(path, Nothing())
+    describe(path, lambda d: d["tree"].update({"class": name}))
+    refused(path, f"got {name}: import")
+    assert not {"forged", "fdof_jax_forged", "fdof_jax.forged"} & set(sys.modules)
+
+
+def version(*fields):
+    class Element(eqx.Module):
+        __annotations__ = dict.fromkeys(fields, Any)
+
+    return Element
+
+
+def test_a_class_with_other_fields(path):
+    old, new = version("gain", "limit"), version("gain", "reference")
+    fj.save(path, [old(1, 2)])
+    refused(path, r"Element .*'reference'.* got \['gain', 'limit'\]", (new,))
+    refused(path, r"\['gain'\].* got \['gain', 'limit'\]", (version("gain"),))
+    # Their order means nothing.
+    turned = fj.load(path, (version("limit", "gain"),))[0]
+    assert (turned.gain, turned.limit) == (1, 2)
+
+
+def test_two_classes_of_one_name_are_refused(path):
+    fj.save(path, [version("a")(1)])
+    refused(path, "Element", (version("a"), version("a")))
+
+
+@contextlib.contextmanager
+def without_x64():
+    jax.config.update("jax_enable_x64", False)
+    try:
+        yield
+    finally:
+        jax.config.update("jax_enable_x64", True)
+
+
+def test_double_precision_where_it_is_off(path):
+    fj.save(path, {"jax": jnp.ones(3), "numpy": np.ones(3)})
+    with without_x64():
+        refused(path, "got float64: .*jax_enable_x64")
+    fj.save(path, [jnp.array([1, 2])])
+    with without_x64():
+        refused(path, "got int64: .*jax_enable_x64")
+    fj.save(path, np.ones(3))
+    with without_x64():
+        same(fj.load(path), np.ones(3))
+
+
+def test_single_precision_where_double_is_on(path):
+    with without_x64():
+        tree = [jnp.ones(3), jnp.asarray(1.5)]
+        fj.save(path, tree)
+    single, weak = fj.load(path)
+    same(single, tree[0])
+    assert weak.dtype == np.float32 and weak == 1.5
+
+
+# Damage anywhere
+
+
+@pytest.fixture
+def whole(path):
+    tree = Pair(
+        fj.JointDamper([1, 2, 3]), {"a": np.arange(2), "b": diffrax.RESULTS.successful}
+    )
+    fj.save(path, tree)
+    return tree, path.read_bytes()
+
+
+def unharmed(path, tree):
+    """Whether the file is read; if not, it is refused in the way that it should be."""
+    try:
+        loaded = fj.load(path, OWN)
+    except ValueError as error:
+        assert str(error).startswith(f"{path}: expected ")
+        return False
+    same(loaded, tree)
+    return True
+
+
+def test_a_file_cut_anywhere(whole, path):
+    tree, content = whole
+    for length in range(len(content)):
+        path.write_bytes(content[:length])
+        assert not unharmed(path, tree), length
+    path.write_bytes(content)
+    assert unharmed(path, tree)
+
+
+@pytest.mark.parametrize("flip", [0x01, 0xFF])
+def test_a_byte_flipped_anywhere(flip, whole, path):
+    tree, content = whole
+    read = 0
+    for place in range(len(content)):
+        flipped = bytearray(content)
+        flipped[place] ^= flip
+        path.write_bytes(flipped)
+        read += unharmed(path, tree)
+    # Few bytes mean nothing: dates, for instance.
+    assert read < len(content) / 4
