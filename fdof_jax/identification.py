@@ -285,17 +285,17 @@ def fit(
     **Raises:** ValueError for malformed arguments, and if the scene cannot be simulated
     from the start.
     """
-    if isinstance(scene_at, list | tuple):
-        scenes_at = scene_at
-        if not scene_at or np.shape(observed)[:1] != (len(scene_at),):
-            raise ValueError(
-                "observed: expected a recording for each of the scenes (one at least), "
-                f"got shape {np.shape(observed)} for {len(scene_at)}."
-            )
-    else:
-        scenes_at, observed = [scene_at], np.asarray(observed)[None]
+    scenes_at: Any = scene_at
+    recordings: Any = observed
+    if not isinstance(scene_at, list | tuple):
+        scenes_at, recordings = [scene_at], [observed]
+    elif not scene_at or np.shape(observed)[:1] != (len(scene_at),):
+        raise ValueError(
+            "observed: expected a recording for each of the scenes (one at least), got "
+            f"shape {np.shape(observed)} for {len(scene_at)}."
+        )
     return _search(
-        scenes_at, start, ts, observed, True, observe=observe, noise=noise,
+        scenes_at, start, ts, recordings, True, observe=observe, noise=noise,
         bounds=bounds, scale=scale, max_steps=max_steps, report=report,
     )[0]  # fmt: skip
 
