@@ -214,6 +214,7 @@ class Run:
         self.rows: list[Row] = []
         self.reason: str | None = None
         self.exhausted = False  # out of steps, before any other reason
+        self.flat = False  # whether the gradient is zero at the start, bounds or not
         self.at: Evaluation | None = None
 
     def arrive(self, z: np.ndarray, here: Evaluation, began: float) -> None:
@@ -233,6 +234,8 @@ class Run:
         held = _held(z, here.gradient, self.low, self.high) | (self.low >= self.high)
         norm = float(np.linalg.norm(np.where(held, 0, here.gradient)))
         before, self.at, self.z = self.at, here, z
+        if before is None:
+            self.flat = not here.gradient.any()
         self.rows.append(
             Row(z, float(here.loss), norm, here.facts, time.perf_counter() - began)
         )
@@ -272,9 +275,8 @@ class Run:
     @property
     def converged(self) -> bool:
         best = self.best
-        moved = self.rows[0].gradient_norm > 0
         small = self._small(best.gradient_norm, best.loss, _CONVERGED)
-        return bool(moved and not self.failed and not self.exhausted and small)
+        return bool(not self.flat and not self.failed and not self.exhausted and small)
 
 
 def reporting(

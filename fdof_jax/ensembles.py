@@ -170,6 +170,12 @@ def perturbed(
         name: np.asarray(real_array(name, value, (2,), minimum=least))
         for name, value, least in (("payload", payload, 0), ("speed", speed, 1e-3))
     }
+    for name, (least, greatest) in ranges.items():
+        if least > greatest:
+            raise ValueError(
+                f"{name}: expected the least before the greatest, got {least:g} and "
+                f"{greatest:g}."
+            )
     error = float(real_array("link_error", link_error, (), minimum=0))
     if error >= 1:
         raise ValueError(

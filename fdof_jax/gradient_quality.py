@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from .ensembles import is_number
 from .hybrid_dynamics import prescribed
@@ -17,6 +17,7 @@ from .losses import controller_of, relative_demands, tip_errors
 from .scenes import Scene
 from .sensitivities import sensitivities
 from .simulation import simulate
+from .soon_compiled import soon_compiled
 from .tuning import check_tuned, with_gains
 from .vector_field import stateful
 
@@ -30,6 +31,8 @@ _STEP = 1e-2
 class GradientReport(eqx.Module):
     """The gradient of the mean squared tip error [m^2] at a scene's gains.
 
+    Of this scene alone, and without prices of effort, whatever it has been tuned for.
+
     In the logarithms of kp and kd (2, 3); it prints itself in words.
 
     - `gradient`: as `tune` computes it.
@@ -39,6 +42,8 @@ class GradientReport(eqx.Module):
     - `saturated`: share of the time that each actuator spends at its limit (3,).
     - `modes`: closed-loop eigenvalues along the path, at 101 times; None with elements
       that have a state of their own or prescribe a motion.
+    - `at_limit`: whether any actuator is at its limit at these times, which then does
+      not control its joint (101,).
     - `warnings`: in words, what to beware of.
     """
 
@@ -49,6 +54,7 @@ class GradientReport(eqx.Module):
     gradient_norm: Float[np.ndarray, " horizon"]
     saturated: Float[np.ndarray, " joint"]
     modes: Modes | None
+    at_limit: Bool[np.ndarray, " time"]
     warnings: list[str]
 
     def __str__(self) -> str:
@@ -62,17 +68,21 @@ class GradientReport(eqx.Module):
             f"norm by horizon: {along}",
         ]
         if self.modes is not None:
-            frequency = self.modes.frequency
+            frequency, damping = self.modes.frequency, self.modes.damping
             lines.append(
                 f"natural frequencies along the path: {frequency.min():.3g} to "
-                f"{frequency.max():.3g} rad/s, least damping ratio "
-                f"{np.nanmin(self.modes.damping):.2g}, steps of an explicit method up "
-                f"to {1e3 * self.modes.longest_step.min():.3g} ms"
+                f"{frequency.max():.3g} rad/s, steps of an explicit method up to "
+                f"{1e3 * self.modes.longest_step.min():.3g} ms"
             )
+            for when, times in (("within", ~self.at_limit), ("at", self.at_limit)):
+                if times.any():
+                    lines.append(
+                        f"least damping ratio while actuators are {when} their limits: "
+                        f"{np.nanmin(damping[times]):.2g}"
+                    )
         return "\n".join(lines + self.warnings)
 
 
-@eqx.filter_jit
 def _tangents(scene: Scene) -> tuple[Array, Array, Array, Any]:
     """Residuals, their Jacobian in the log-gains, demands over limits, the motion."""
     controller = controller_of(scene)
@@ -88,7 +98,6 @@ def _tangents(scene: Scene) -> tuple[Array, Array, Array, Any]:
     return found.residuals, found.jacobian, demands, found.solution
 
 
-@eqx.filter_jit
 def _losses(scene: Scene, factors: Array) -> Array:
     """The mean squared tip error with the gains changed by factors (n, 2, 3)."""
     controller = controller_of(scene)
@@ -118,13 +127,15 @@ def gradient_report(scene: Scene) -> GradientReport:
         lambda a: jnp.asarray(a) if is_number(a) else a,
         scene._replace(t1=float(scene.t1)),
     )
-    residuals, jacobian, demands, solution = map(_numpy, _tangents(scene))
+    residuals, jacobian, demands, solution = map(
+        _numpy, soon_compiled(_tangents)(scene)
+    )
     along = 2 * np.cumsum(residuals[:, None] * jacobian, axis=0)
     gradient = along[-1].reshape(2, 3)
     steps = np.eye(6).reshape(6, 1, 2, 3)
     sides = np.array([_STEP, -_STEP, _STEP / 2, -_STEP / 2])[:, None, None]
     factors = jnp.asarray(np.exp(sides * steps).reshape(24, 2, 3))
-    loss = np.asarray(_losses(scene, factors))
+    loss = np.asarray(soon_compiled(_losses)(scene, factors))
     far, near = (
         (loss.reshape(6, 4)[:, k] - loss.reshape(6, 4)[:, k + 1]) / width
         for k, width in ((0, 2 * _STEP), (2, _STEP))
@@ -149,6 +160,7 @@ def gradient_report(scene: Scene) -> GradientReport:
         gradient_norm=norms,
         saturated=saturated,
         modes=modes,
+        at_limit=(np.abs(demands) > 1).any(axis=1)[::10],
         warnings=_warnings(scene, gradient, saturated, error),
     )
 

@@ -159,8 +159,9 @@ def equilibrium(
     **Arguments:** the linkage; force elements without a state of their own; `q`: a
     first guess [m or rad]; `t`: the time that the elements are given [s].
 
-    **Returns:** positions (3,); NaN where Levenberg and Marquardt's method finds none.
-    It need not be stable: see `linearize`.
+    **Returns:** positions (3,); NaN where Levenberg and Marquardt's method finds none,
+    from a guess at which actuators are at their limits for instance. It need not be
+    stable: see `linearize`.
 
     **Raises:** ValueError for malformed arguments.
     """
@@ -178,11 +179,18 @@ def _rest(linkage: Linkage, forces: Forces, q: Array, t: Array) -> Array:
             total = total + element(t, q, still, linkage)
         return total
 
+    # Efforts over what rounds them: stiff controllers are as exact as soft springs.
+    slopes = jnp.abs(jax.jacfwd(efforts)(q, None))
+    size = jax.lax.stop_gradient(
+        slopes @ (1 + jnp.abs(q)) + jnp.abs(efforts(q, None)) + 1
+    )
     tight = 1e3 * float(jnp.finfo(q.dtype).eps)
     solver = optimistix.LevenbergMarquardt(rtol=tight, atol=tight)
-    found = optimistix.root_find(efforts, solver, q, throw=False)
+    relative = lambda q, _: efforts(q, None) / size
+    found = optimistix.root_find(relative, solver, q, throw=False)
     good = found.result == optimistix.RESULTS.successful
-    return jnp.where(good, found.value, jnp.nan)
+    # Not by `where`: where none is found the derivative is NaN too.
+    return found.value * jnp.where(good, 1, jnp.nan)
 
 
 def holding_efforts(

@@ -58,7 +58,8 @@ class TuneResult(eqx.Module):
       of the time, and a change of the gains by 1 % would change the loss by less
       than 1e-4 of it, to first order and within the bounds.
     - `message`: why the run stopped, in words, and what to beware of.
-    - `member_loss`: loss of each member of the ensemble with the tuned gains (member,).
+    - `member_loss`, `member_tip_error`: of each member of the ensemble with the tuned
+      gains: its loss (member,) and rms tip error (member,) [m].
     - `settings`: method, solver, tolerance and dtype of the run.
     """
 
@@ -70,6 +71,7 @@ class TuneResult(eqx.Module):
     converged: bool
     message: str
     member_loss: Float[np.ndarray, " member"]
+    member_tip_error: Float[np.ndarray, " member"]
     settings: dict[str, Any]
 
     @property
@@ -158,10 +160,12 @@ class TuneResult(eqx.Module):
                 "the root of the loss"
             )
         if len(self.member_loss) > 1:
-            low, high = np.sqrt([self.member_loss.min(), self.member_loss.max()])
+            what, values = "root of the loss", np.sqrt(self.member_loss)
+            if np.isfinite(self.tip_error):
+                what, values = "rms tip error [mm]", 1e3 * self.member_tip_error
             rows.append(
-                f"root of the loss over {len(self.member_loss)} members: {low:.4g} to "
-                f"{high:.4g}"
+                f"{what} over {len(values)} members: {values.min():.5g} to "
+                f"{values.max():.5g}"
             )
         iterations = len(self.history.loss) - 1
         rows.append(f"{self._verdict}, {iterations} iterations: {self.message}")
@@ -210,8 +214,10 @@ class TradeOff(eqx.Module):
 
     def __str__(self) -> str:
         rows = [f"{'price [m^2]':>12}{'tip error [mm]':>16}{'effort [%]':>12}"]
-        for price, error, effort in zip(self.prices, self.tip_error, self.effort):
-            rows.append(f"{price:12.3g}{1e3 * error:16.4g}{1e2 * effort:12.4g}")
+        columns = self.prices, self.tip_error, self.effort, self.results
+        for price, error, effort, result in zip(*columns):
+            mark = "" if result.converged else "  not converged"
+            rows.append(f"{price:12.3g}{1e3 * error:16.4g}{1e2 * effort:12.4g}{mark}")
         return "\n".join(rows)
 
 
@@ -266,17 +272,19 @@ def result_of(
         lower=lower,
         upper=upper,
         converged=run.converged and share.max() <= _MOSTLY,
-        message=_message(scene, run.reason, history, lower, upper),
+        message=_message(scene, run, history, lower, upper),
         member_loss=best.facts["member_loss"],
+        member_tip_error=np.sqrt(best.facts["square_error"]),
         settings=settings,
     )
 
 
-def _message(scene, reason, history, lower, upper) -> str:
+def _message(scene, run, history, lower, upper) -> str:
     """The reason, and what a reader might take for convergence but is not."""
     names, share = joint_names(scene.linkage), history.saturated[_best(history)]
     tuned = (controller_gains(scene) > 0) & (lower < upper)
-    if history.gradient_norm[0] == 0:
+    reason = run.reason
+    if run.flat:
         at_limit = history.saturated[0].min() == 1
         reason = "the gradient is zero at the start" + (
             ", because every actuator is at its limit throughout" if at_limit else ""

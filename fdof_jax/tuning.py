@@ -22,6 +22,7 @@ from .tune_result import TradeOff, TuneResult, result_of
 from .validation import (
     callable_tuple,
     instance,
+    is_traced,
     keywords_as,
     one_of,
     real_array,
@@ -61,8 +62,10 @@ def evaluate_gains(z: Array, problem: tuple[Scene, Loss, Array]) -> Evaluation:
         value = loss(scene, solution)
         size = np.shape(value) if eqx.is_array_like(value) else ()
         value = real_array("loss(scene, solution)", value, size)
-        # The square of a scalar loss's root is the loss.
-        return value.reshape(-1) if value.ndim else jnp.sqrt(value)[None]
+        if value.ndim:
+            return value.reshape(-1)
+        # The square of a scalar loss's root is the loss; at 0 it has no derivative.
+        return jnp.where(value == 0, 0, jnp.sqrt(jnp.where(value == 0, 1, value)))[None]
 
     ts = jnp.linspace(0, scene.t1, _SAMPLES)
     value, jacobian, trial, solution = sensitivities(scene_at, residuals, z, ts)
@@ -87,6 +90,11 @@ def evaluate_gains(z: Array, problem: tuple[Scene, Loss, Array]) -> Evaluation:
 def check_tuned(name: str, scene: Any, loss: Any) -> None:
     """Raise ValueError unless this scene can be tuned by this loss."""
     instance(name, scene, Scene)
+    if is_traced(scene):
+        raise ValueError(
+            f"{name}: expected known values, got {scene!r}: gains are tuned outside of "
+            "JAX's transformations."
+        )
     check_linkage(scene.linkage)
     t1 = real_array(f"{name}.t1", scene.t1, (), above=0)
     callable_tuple(f"{name}.forces", scene.forces)
@@ -166,7 +174,7 @@ def _search(
     draw = np.random.default_rng(whole_number("seed", seed, 0))
     told = reporting(report, _best_so_far)
     for scene, loss in zip(scenes, losses):
-        if not callable(loss):
+        if not callable(loss) or isinstance(loss, type):
             raise ValueError(f"loss: expected a callable, got {loss!r}.")
         check_tuned("scene", scene, loss)
     boxes = [_bounds(scene, factor, bounds) for scene in scenes]
@@ -174,6 +182,12 @@ def _search(
         members = [[scene] for scene in scenes]
     else:
         members = [unstacked("ensemble", ensemble)] * len(losses)
+        like = stacked([scenes[0], members[0][0]], "ensemble")
+        if (like.linkage.ef[0] != like.linkage.ef[1]).any():
+            raise ValueError(
+                "ensemble: expected scenes of the scene's own topology, existence "
+                f"factors {like.linkage.ef[0]}, got {like.linkage.ef[1]}."
+            )
         for i, member in enumerate(members[0]):
             check_tuned(f"ensemble[{i}]", member, losses[0])
     problems = [
@@ -273,6 +287,8 @@ def tune(
     - `seed`: of the random starts.
     - `max_steps`: the greatest number of evaluations of a run after the first.
     - `report`: is given a line of progress after each step, `print` for instance.
+
+    Not for use within JAX's transformations, as steps are decided by NumPy.
 
     **Returns:** a `TuneResult`, which says why it stopped.
 

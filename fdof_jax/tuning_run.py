@@ -125,6 +125,6 @@ def run_tuning(
     say("compare the gradients with differences")
     reports = gradient_report(start), gradient_report(result.scene)
     say("draw")
-    first, second = simulate_finely(scene), simulate_finely(result.scene)
-    pictures = draw_circle(output, scene, first, result, second)
+    first, second = simulate_finely(start), simulate_finely(result.scene)
+    pictures = draw_circle(output, start, first, result, second)
     return TuningRun(result, reports, pictures)

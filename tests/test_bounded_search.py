@@ -95,3 +95,22 @@ def test_one_failing_start_does_not_spoil_the_others():
     )  # fmt: skip
     assert [run.failed for run in runs] == [False, True, False]
     assert runs[0].converged and not runs[1].converged and runs[2].best.loss < 1e-10
+
+
+def test_a_start_held_by_all_bounds_has_converged_and_a_flat_one_has_not():
+    starts = np.array([[1.0, 1.0], [0.0, 0.0]])
+
+    def evaluate(z, runs):
+        # Downwards beyond both bounds; flat in the second run.
+        slopes = np.where(runs[:, None] == 0, -1.0, 0.0) * np.ones(2)
+        loss = 5 + np.sum(slopes * z, axis=1)
+        return bounded_search.Evaluation(loss, slopes, np.stack([np.eye(2)] * 2), {})
+
+    corner, flat = bounded_search.minimise(
+        evaluate, starts, np.zeros((2, 2)), np.ones((2, 2)),
+        method="levenberg-marquardt", max_steps=3, enough=1e-4,
+        report=lambda number, runs: None,
+    )  # fmt: skip
+    assert len(corner.rows) == len(flat.rows) == 1
+    assert corner.converged and not corner.flat
+    assert flat.flat and not flat.converged

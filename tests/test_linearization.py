@@ -85,6 +85,21 @@ def test_small_deviations_follow_the_exponential_of_a():
     assert np.abs(expected).max() > 1e-5
 
 
+def test_a_stiff_controller_of_limited_efforts_has_an_equilibrium():
+    scene = scenes.fig7()
+    controller = scene.forces[0]
+    reference, _ = controller.reference(0.0, scene.linkage)
+    q = fj.equilibrium(scene.linkage, scene.forces, reference)
+    efforts = controller(0.0, q, STILL, scene.linkage)
+    held = fj.holding_efforts(scene.linkage, q)
+    np.testing.assert_allclose(efforts, held, rtol=1e-9)
+    assert 0.01 < np.abs(q - reference).max() < 0.3
+    # From a guess at which the slide is at its limit none is found.
+    lost = lambda q: fj.equilibrium(scene.linkage, scene.forces, q)
+    assert np.isnan(lost(scene.state0.q)).all()
+    assert np.isnan(jax.jacfwd(lost)(scene.state0.q)).all()
+
+
 # Modes
 
 

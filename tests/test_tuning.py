@@ -9,6 +9,7 @@ import pytest
 import fdof_jax as fj
 from fdof_jax import lanes, losses, scenes, tuning
 from fdof_jax.losses import controller_of, tip_errors
+from fdof_jax.soon_compiled import soon_compiled
 
 
 def losses_of(scene, gains):
@@ -84,14 +85,14 @@ def test_history_describes_each_iteration_and_a_second_call_compiles_nothing():
     # The slide's actuator starts saturated, the others never are.
     assert history.saturated[0, 1] > 0
     assert (history.saturated[0, [0, 2]] == 0).all()
-    compiled = lanes._compiled()._cached._cache_size()
+    compiled = soon_compiled(lanes._evaluate)._cached._cache_size()
     task = fj.CircleTask(center=(-3.9, 2.1), radius=0.6)
     other = scenes.fig7().forces[0]
     other = fj.PDController(other.kp * 1.1, other.kd, other.limit, task)
     fj.tune(
         scene._replace(forces=(other,), t1=0.9), factor=3.0, max_steps=1, method="adam"
     )
-    assert lanes._compiled()._cached._cache_size() == compiled
+    assert soon_compiled(lanes._evaluate)._cached._cache_size() == compiled
 
 
 def test_gains_of_computed_torque_have_units_of_their_own():
@@ -254,6 +255,15 @@ class TestEnsembles:
         short = scenes.fig5()._replace(forces=(still,))
         with pytest.raises(ValueError, match="start_offset: expected one within"):
             fj.perturbed(short, 2, start_offset=100.0)
+        other = fj.stacked([fj.circle_scenes()["RRR"]])
+        with pytest.raises(
+            ValueError, match="ensemble: expected scenes of the scene's"
+        ):
+            fj.tune(self.scene, ensemble=other)
+        with pytest.raises(ValueError, match=r"ensemble\[1\]: expected one like"):
+            fj.tune(self.scene, ensemble=fj.stacked([scenes.fig5()]))
+        with pytest.raises(ValueError, match="payload: expected the least before"):
+            fj.perturbed(self.scene, 2, payload=(2.0, 0.0))
         with pytest.raises(ValueError, match="link_error: expected less than 1"):
             fj.perturbed(self.scene, 2, link_error=1.5)
         with pytest.raises(ValueError, match="speed"):
@@ -344,6 +354,7 @@ def test_elements_with_indices_and_prescribed_motion_may_act_beside_the_controll
         (dict(report=3), "report"),
         (dict(ensemble=3), "ensemble"),
         (dict(loss=3), "loss"),
+        (dict(loss=losses.Tracking), "loss: expected a callable"),
         (dict(bounds=(1, 2, 3)), "bounds"),
         (dict(bounds=(np.ones((2, 3)), np.ones((2, 2)))), "bounds"),
         (dict(bounds=(np.full((2, 3), 9), np.ones((2, 3)))), "bounds: expected the le"),
@@ -373,6 +384,12 @@ def test_malformed_scenes(scene):
     """Without exactly one controller, or not a scene at all."""
     with pytest.raises(ValueError, match="scene|linkage"):
         fj.tune(scene)
+
+
+def test_tuning_is_not_for_transformations():
+    scene = scenes.fig7()
+    with pytest.raises(ValueError, match="scene: expected known values"):
+        jax.jit(lambda t1: fj.tune(scene._replace(t1=t1)).gains)(1.0)
 
 
 def test_a_member_that_fails_is_named():
