@@ -21,16 +21,18 @@ def on_config(config):
 
 @event_priority(50)  # before the plugins, one of which takes the notebooks
 def on_files(files, config):
-    def add(path, uri):
-        files.append(File.generated(config, uri, abs_src_path=str(path)))
-
     pages = ["README.md", "benchmarks/README.md", *NOTEBOOKS]
-    for path in [*map(ROOT.joinpath, pages), *ROOT.glob("benchmarks/results/*.png")]:
-        add(path, path.relative_to(ROOT).as_posix())
+    pictures = [
+        path.relative_to(ROOT).as_posix()
+        for path in ROOT.glob("benchmarks/results/*.png")
+    ]
     mathjax = Path(str(package_files("jupyter_server_mathjax"))) / "static"
+    for uri in [*pages, *pictures]:
+        files.append(File(uri, str(ROOT), config.site_dir, config.use_directory_urls))
     for path in mathjax.rglob("*"):
         if path.is_file() and "a11y" not in path.parts:
-            add(path, f"mathjax/{path.relative_to(mathjax).as_posix()}")
+            uri = f"mathjax/{path.relative_to(mathjax).as_posix()}"
+            files.append(File.generated(config, uri, abs_src_path=str(path)))
 
 
 def on_page_markdown(markdown, page, **_):
