@@ -66,7 +66,10 @@ def test_the_front_door_is_complete():
 
 # Every name that a user may import: with its module, where that is not `fdof_jax`.
 NAMES = [
-    *(name for name in vars(fj) if name[0] != "_" and not inspect.ismodule(vars(fj)[name])),
+    *(
+        name for name, value in vars(fj).items()
+        if name[0] != "_" and not inspect.ismodule(value)
+    ),
     *(f"scenes.{name}" for name in ("fig3", "fig5", "fig7")),
     *(
         f"{module.__name__.split('.')[1]}.{name}"
@@ -96,8 +99,10 @@ RETURNED_BY = {
 def examples():
     """All code that tests run as examples: doctests, and the blocks of the guides."""
     sources = (ROOT / "fdof_jax").glob("*.py")
-    lines = [re.findall(r"^ *(?:>>>|\.\.\.) (.*)", p.read_text(), re.M) for p in sources]
-    guides = [ROOT / "README.md", ROOT / "docs" / "forces.md"]
+    lines = [
+        re.findall(r"^ *(?:>>>|\.\.\.) (.*)", p.read_text(), re.M) for p in sources
+    ]
+    guides = [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]
     blocks = [re.findall(r"```python\n(.*?)```", p.read_text(), re.S) for p in guides]
     return "\n".join(line for group in lines + blocks for line in group)
 
@@ -114,5 +119,7 @@ def test_every_name_has_an_example():
 
 def test_every_name_has_a_place_in_the_reference():
     pages = (ROOT / "docs" / "api").glob("*.md")
-    listed = re.findall(r"^::: fdof_jax\.(\S+)$", "\n".join(map(Path.read_text, pages)), re.M)
+    listed = re.findall(
+        r"^::: fdof_jax\.(\S+)$", "\n".join(map(Path.read_text, pages)), re.M
+    )
     assert sorted(listed) == sorted(NAMES)
