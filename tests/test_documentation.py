@@ -89,8 +89,10 @@ RETURNED_BY = {
     "GradientReport": "gradient_report",
     "Efforts": "joint_efforts",
     "Linearization": "linearize",
+    "Modes": "closed_loop_modes",
     "OptimalMotion": "optimal_efforts",
     "SampledMotion": "simulate_sampled",
+    "Solution": "simulate",
     "TradeOff": "trade_off",
     "TuneResult": "tune",
 }
