@@ -120,8 +120,8 @@ def test_every_name_has_an_example():
 
 
 def test_every_name_has_a_place_in_the_reference():
-    pages = (ROOT / "docs" / "api").glob("*.md")
-    listed = re.findall(
-        r"^::: fdof_jax\.(\S+)$", "\n".join(map(Path.read_text, pages)), re.M
-    )
+    pages = "".join(path.read_text() for path in (ROOT / "docs" / "api").glob("*.md"))
+    listed = re.findall(r"^::: fdof_jax\.(\S+)$", pages, re.M)
+    # The site's tool takes `fdof_jax.sweep` for the module of that name.
+    listed[listed.index("sweep.sweep")] = "sweep"
     assert sorted(listed) == sorted(NAMES)
