@@ -240,7 +240,7 @@ def test_classes_of_a_script(path, monkeypatch):
     monkeypatch.setattr(Push, "__module__", "__main__")
     same(fj.load(path, [Push]), push)
     monkeypatch.setattr(Push, "__module__", "elsewhere")
-    refused(path, "test_files:Push", [Push])
+    refused(path, "saved_trees:Push", [Push])
 
 
 READER = """

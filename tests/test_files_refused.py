@@ -254,10 +254,10 @@ def test_the_description_is_strict_json_and_says_who_wrote_it(path):
 
 def test_unknown_classes(path):
     fj.save(path, (Push(1.0, ""),))
-    refused(path, "test_files:Push.*classes=")
-    refused(path, "test_files:Push.*classes=", (Pair,))
+    refused(path, "saved_trees:Push.*classes=")
+    refused(path, "saved_trees:Push.*classes=", (Pair,))
     fj.save(path, Colour.red)
-    refused(path, "test_files:Colour.*classes=")
+    refused(path, "saved_trees:Colour.*classes=")
     # A class that is no record, nor an enumeration
     describe(path, lambda d: d["tree"].update({"class": "fdof_jax.scenes:Scene"}))
     refused(path, "enumeration, got fdof_jax.scenes:Scene")

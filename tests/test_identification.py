@@ -341,7 +341,7 @@ def test_progress_is_reported_and_nothing_compiles_twice(seen):
     lines = []
     fj.fit(MIXED, FIRST, TS, seen, report=lines.append, max_steps=1)
     assert len(lines) >= 3 and "sum of squares" in lines[-1]
-    compiled = lanes._evaluate._cached
+    compiled = lanes._compiled()._cached
     before = compiled._cache_size()
     other = Mixed(fj.State(jnp.array([-0.9, 0.2, 0.2]), jnp.zeros(3)))
     fj.fit(other, TRUE, TS, 1.01 * seen, noise=0.1, max_steps=1)
