@@ -4,7 +4,12 @@ window.MathJax = {
     inlineMath: [["\\(", "\\)"]],
     displayMath: [["$$", "$$"], ["\\[", "\\]"]],
   },
-  "HTML-CSS": { availableFonts: [], webFont: "STIX-Web", imageFont: null },
+  "HTML-CSS": {
+    availableFonts: [],
+    webFont: "STIX-Web",
+    imageFont: null,
+    linebreaks: { automatic: true },
+  },
   messageStyle: "none",
   showMathMenu: false,
 };
