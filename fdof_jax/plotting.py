@@ -121,7 +121,7 @@ def _powers(linkage: Linkage, forces: Forces, solution: Solution) -> np.ndarray:
     Without what only moves to and from its own potential energy, that of a spring.
     """
     efforts = joint_efforts(linkage, forces, solution).elements
-    powers = jnp.sum(efforts * solution.qd, axis=-1)
+    powers = jnp.einsum("etj,tj->et", efforts, solution.qd)
     for k, element in enumerate(forces):
         # The efforts of one that moves masses are without those of its energy.
         if isinstance(element, InertialElement) or not hasattr(
@@ -183,7 +183,8 @@ def energy_stack(
     ax = axes_or_new(ax, 2.6)
     colors = [*SERIES[3:5], _LIGHT_GREY]
     ax.stackplot(ts, list(bands.values()), labels=list(bands), colors=colors)
-    label = "start + put in" if put_in.any() else "at the start"
+    driven = put_in.max() > 1e-5 * line.max()  # by more than rounding
+    label = "start + put in" if driven else "at the start"
     ax.plot(ts, line, "--", color=BLACK, lw=1.2, label=label)
     ax.set(xlabel="time [s]", ylabel="energy [J]", xlim=(ts[0], ts[-1]))
     legend(ax)

@@ -78,7 +78,8 @@ class Solution(eqx.Module):
         *batch, count, _ = self.q.shape
         motions = " x ".join(map(str, batch)) if batch else "1"
         facts = {"motions": motions, "times": f"{count}"}
-        if not known(self.ts, self.result, self.stats):
+        result = isinstance(self.result, diffrax.RESULTS)
+        if not result or not known(self.ts, self.result, self.stats):
             return facts
         ts = np.asarray(self.ts)
         facts["times"] += f", {ts.min():g} to {ts.max():g} s"

@@ -1,5 +1,6 @@
 """Pictures show the linkage where it is, not pixels; helpers for tests of figures."""
 
+import subprocess
 from typing import Any
 
 import equinox as eqx
@@ -8,8 +9,10 @@ import matplotlib
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from matplotlib.animation import writers
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from PIL import Image
 
 from fdof_jax import (
     TOPOLOGIES,
@@ -158,11 +161,17 @@ def test_topology_grid_has_a_panel_for_each():
         assert len(named(ax, "tip 4")) == 2
 
 
-def test_animation_is_capped_and_moves(tmp_path):
+@pytest.mark.parametrize(
+    "kind, writer", [("gif", "pillow"), ("mp4", "ffmpeg"), ("html", "html")]
+)
+def test_animation_is_capped_and_moves(kind, writer, tmp_path):
+    if not writers.is_available(writer):
+        pytest.skip(f"no {writer}")
     linkage, solution = make_linkage("RPR"), swinging()
     animation = drawing.animate(linkage, solution, max_frames=3)
-    animation.save(tmp_path / "motion.gif", writer="pillow", dpi=40)
-    assert (tmp_path / "motion.gif").stat().st_size > 0
+    path = tmp_path / f"motion.{kind}"
+    animation.save(path, writer=writer, dpi=40)
+    assert frames_in(path) == 3
     assert list(animation.new_frame_seq()) == [0, 1, 2]
     (ax,) = plt.gcf().axes
     assert ax.get_title() == "t = 1.00 s"
@@ -173,6 +182,53 @@ def test_animation_is_capped_and_moves(tmp_path):
     expected = tip_position(linkage, solution.q[-1])
     np.testing.assert_allclose(drawn["tip 4"].get_xydata(), [expected], atol=1e-12)
     assert len(path) == 101
+
+
+def frames_in(path) -> int:
+    if path.suffix == ".gif":
+        return Image.open(path).n_frames  # type: ignore[attr-defined]
+    if path.suffix == ".html":
+        assert "motion_frames/frame" in path.read_text()
+        return len(list((path.parent / "motion_frames").glob("frame*.png")))
+    command = ["ffmpeg", "-loglevel", "error", "-i", path, path.parent / "%d.png"]
+    subprocess.run(command, check=True, timeout=60)
+    return len(list(path.parent.glob("*.png")))
+
+
+def test_grid_of_animations_moves_together():
+    first, second = (
+        (make_linkage("RRR"), swinging()),
+        (make_linkage("PRR"), swinging(51, 0.5)),
+    )
+    animation = drawing.animate_grid({"long": first, "short": second}, max_frames=5)
+    assert list(animation.new_frame_seq()) == [0, 1, 2, 3, 4]
+    figure = plt.gcf()
+    long, short = figure.axes
+    assert [long.get_title(), short.get_title()] == ["long", "short"]
+    for frame, sample, other in ((1, 25, 25), (4, 100, 50)):  # the short one has ended
+        animation._func(frame)  # type: ignore[attr-defined]
+        assert figure.get_suptitle() == f"t = {frame / 4:.2f} s"
+        for ax, (linkage, solution), i in (
+            (long, first, sample),
+            (short, second, other),
+        ):
+            expected = tip_position(linkage, solution.q[i])
+            tip, path = lines(ax)["tip 4"], lines(ax)["tip path"]
+            np.testing.assert_allclose(tip.get_xydata(), [expected], atol=1e-12)
+            assert len(path.get_xydata()) == i + 1
+    animation._draw_was_started = True  # type: ignore[attr-defined]
+    given = plt.figure()
+    other = drawing.animate_grid({"long": first}, given, max_frames=1)
+    assert len(given.axes) == 1
+    other._draw_was_started = True  # type: ignore[attr-defined]
+
+
+def test_a_notebook_plays_an_animation_once():
+    """And does not show its figure again, as it does with all that are open."""
+    animation = drawing.animate(make_linkage("RRR"), swinging(), max_frames=2)
+    html = animation._repr_html_()  # type: ignore[attr-defined]
+    assert html.count("data:image/png") == 2 and "<script" in html
+    assert not plt.get_fignums()
 
 
 @pytest.mark.parametrize("speed, frames", [(1.0, 26), (0.5, 51), (2.0, 14)])
@@ -219,6 +275,8 @@ def test_animated_panels_keep_their_limits_silently(caplog):
         ("max_frames", lambda: drawing.animate(LINKAGE, SOLUTION, max_frames=0)),
         ("fps", lambda: drawing.animate(LINKAGE, SOLUTION, fps=0)),
         ("speed", lambda: drawing.animate(LINKAGE, SOLUTION, speed=-1)),
+        ("motions", lambda: drawing.animate_grid({})),
+        ("fps", lambda: drawing.animate_grid({"a": (LINKAGE, SOLUTION)}, fps=-1)),
     ],
 )  # fmt: skip
 def test_malformed_arguments_are_named(name, call):

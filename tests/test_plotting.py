@@ -1,10 +1,13 @@
 """Curves show the right numbers, labels and units, not pixels."""
 
+import elements
+import equinox as eqx
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
 from test_drawing import (
     BATCH,
     LINKAGE,
@@ -18,7 +21,19 @@ from test_drawing import (
     tidy as tidy,
 )
 
-from fdof_jax import CircleTask, JointDamper, PDController, plotting, tip_position
+from fdof_jax import (
+    CircleTask,
+    JointDamper,
+    JointEffort,
+    JointStops,
+    PDController,
+    PrescribedMotion,
+    Solution,
+    State,
+    plotting,
+    simulate,
+    tip_position,
+)
 
 
 def values(ax: Axes) -> list[np.ndarray]:
@@ -52,6 +67,99 @@ def test_energy_profile_adds_up():
     sums = [sum(values(ax)) for ax in (kinetic, potential)]
     for total, expected in zip(values(whole), (*sums, sums[0] + sums[1])):
         np.testing.assert_allclose(total, expected, atol=1e-12)
+
+
+def tops(ax: Axes, ts) -> dict[str, np.ndarray]:
+    """The upper edge of each band of a stack."""
+    found = {}
+    for band in ax.collections:
+        x, y = band.get_paths()[0].vertices.T
+        found[band.get_label()] = np.array([y[x == t].max() for t in ts])
+    return found
+
+
+LIFT = make_linkage("PPR")
+MASS, DAMPING, STIFFNESS = 4.0, 3.0, 50.0
+
+
+def lifted(effort: float, count: int = 401) -> tuple[tuple, Solution]:
+    """The first slide swings on a stop, damped and under a constant effort: exactly.
+
+    The others stand still. All masses move with it.
+    """
+    damper = JointDamper([DAMPING, 0, 0])
+    stops = JointStops([0, -np.inf, -np.inf], np.inf, stiffness=STIFFNESS)
+    weight = MASS * 9.81 * np.cos(0.4)
+    rest = (effort - weight) / STIFFNESS
+    rate = np.roots([MASS, DAMPING, STIFFNESS])[0]
+    swing = 0.2 * (1 + 1j * rate.real / rate.imag)  # starts with no speed
+    ts = np.linspace(0, 2, count)
+    q, qd = np.zeros((2, count, 3))
+    q[:, 0] = rest + np.real(swing * np.exp(rate * ts))
+    qd[:, 0] = np.real(rate * swing * np.exp(rate * ts))
+    return (damper, stops, JointEffort([effort, 0, 0])), made_up(ts, q, qd)
+
+
+def test_energy_stack_keeps_its_top_where_energy_is_only_taken_out():
+    forces, solution = lifted(0.0)
+    ax = plotting.energy_stack(LIFT, forces, solution)
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("time [s]", "energy [J]")
+    assert labels(ax) == ["kinetic", "potential", "taken out", "at the start"]
+    stack = tops(ax, solution.ts)
+    top, (line,) = stack["taken out"], values(ax)
+    np.testing.assert_allclose(line, line[0], rtol=1e-12)
+    np.testing.assert_allclose(top, line, rtol=1e-7)
+    kinetic = MASS * np.asarray(solution.qd)[:, 0] ** 2 / 2
+    np.testing.assert_allclose(stack["kinetic"], kinetic, atol=1e-12)
+    potential = stack["potential"] - stack["kinetic"]
+    assert potential.min() == 0 and potential.max() > 0.5
+    taken = top - stack["potential"]
+    assert taken[0] == 0 and taken[-1] > 0.5 and np.diff(taken).min() > -1e-9
+    # Of the third order at least, Simpson's.
+    forces, few = lifted(0.0, 51)
+    coarse = tops(plotting.energy_stack(LIFT, forces, few), few.ts)["taken out"]
+    worse = np.abs(coarse - line[0]).max() / np.abs(top - line[0]).max()
+    assert worse > 8**3
+
+
+def test_energy_stack_rises_by_what_is_put_in():
+    forces, solution = lifted(20.0)
+    ax = plotting.energy_stack(LIFT, forces, solution)
+    assert labels(ax)[-1] == "start + put in"
+    top, (line,) = tops(ax, solution.ts)["taken out"], values(ax)
+    np.testing.assert_allclose(top, line, rtol=1e-6)
+    steps = np.diff(solution.q[:, 0])
+    assert steps.min() < 0 < steps.max()  # it drives and brakes
+    put_in = 20 * np.maximum(steps, 0).sum()
+    np.testing.assert_allclose(line[-1] - line[0], put_in, rtol=1e-3)
+    with pytest.warns(UserWarning, match="energy_stack: the balance is off by"):
+        plotting.energy_stack(LIFT, forces[:2], solution)
+
+
+def test_energy_stack_of_a_free_arm_and_of_what_was_reached():
+    solution = swinging(21)
+    solution = eqx.tree_at(lambda s: s.q, solution, solution.q.at[11:].set(jnp.nan))
+    with pytest.warns(UserWarning, match="the balance is off by"):  # a made-up motion
+        ax = plotting.energy_stack(LINKAGE, (), solution)
+    assert labels(ax) == ["kinetic", "potential", "at the start"]
+    assert ax.get_xlim() == (0, 0.5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("prescribed", [False, True])
+def test_energy_stack_balances_for_all_elements(prescribed):
+    arm, start = elements.arm("RPR"), elements.START
+    forces = tuple(elements.ALL.values())
+    if prescribed:
+        q, qd = elements.MOVE(jnp.zeros(()), arm)
+        start = State(
+            *(jnp.where(jnp.arange(3) == 1, a, b) for a, b in zip((q, qd), start))
+        )
+        forces = (*forces, PrescribedMotion(2, elements.MOVE))
+    solution = simulate(arm, start, np.linspace(0, 0.3, 2001), forces)
+    ax = plotting.energy_stack(arm, forces, solution)
+    top, (line,) = tops(ax, solution.ts)["taken out"], values(ax)
+    np.testing.assert_allclose(top, line, rtol=1e-5)
 
 
 def hold(t, linkage):
@@ -108,6 +216,46 @@ def test_tracking_and_its_error():
     assert len({line.get_color() for line in error.lines}) == 2
 
 
+def test_tracking_by_error_colours_the_path():
+    linkage, task, solution = (
+        make_linkage("RRR"),
+        CircleTask([1, 1], 0.5, 2.0),
+        swinging(),
+    )
+    given = plt.subplots()[1]
+    ax = plotting.tracking_by_error(linkage, task, solution, given)
+    assert ax is given and (ax.get_xlabel(), ax.get_ylabel()) == ("x [m]", "y [m]")
+    (path,) = (c for c in ax.collections if isinstance(c, LineCollection))
+    tips = [tip_position(linkage, q) for q in solution.q]
+    pieces = np.stack([tips[:-1], tips[1:]], axis=1)
+    np.testing.assert_allclose(path.get_segments(), pieces, atol=1e-12)
+    errors = values(plotting.tracking_error(linkage, task, {"a": solution}))[0]
+    shown = path.get_array()
+    np.testing.assert_allclose(shown, 500 * (errors[:-1] + errors[1:]))
+    assert path.get_clim() == (0, 1000 * errors.max())
+    (bar,) = ax.child_axes
+    assert bar.get_ylabel() == "tip error [mm]"
+    assert bar.get_ylim() == path.get_clim()
+    left, right, bottom, top = ax.axis()
+    assert ((pieces > [left, bottom]) & (pieces < [right, top])).all()
+    assert labels(ax) == ["commanded"]
+    lightest = path.cmap(1.0)[:3] @ np.array([0.2126, 0.7152, 0.0722])
+    assert lightest < 0.75  # seen on white
+
+
+def test_work_precision_is_logarithmic_and_sorted():
+    measured = {"a": ([1e-3, 1e-9, 1e-6], [1.0, 3.0, 2.0]), "b": ([1e-4], [0.5])}
+    ax = plotting.work_precision(measured)
+    assert (ax.get_xscale(), ax.get_yscale()) == ("log", "log")
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("error", "time [s]")
+    first, second = ax.lines
+    assert first.get_xydata().tolist() == [[1e-9, 3.0], [1e-6, 2.0], [1e-3, 1.0]]
+    assert second.get_xydata().tolist() == [[1e-4, 0.5]]
+    assert first.get_marker() != second.get_marker()
+    assert first.get_color() != second.get_color()
+    assert labels(ax) == ["a", "b"]
+
+
 TASK = CircleTask()
 
 
@@ -125,6 +273,14 @@ TASK = CircleTask()
         ("solutions", lambda: plotting.tracking(LINKAGE, TASK, {})),
         ("solutions", lambda: plotting.tracking_error(LINKAGE, TASK, SOLUTION)),  # type: ignore
         (r"solutions\['a'\]", lambda: plotting.tracking(LINKAGE, TASK, {"a": BATCH})),
+        ("task", lambda: plotting.tracking_by_error(LINKAGE, None, SOLUTION)),  # type: ignore
+        ("solution", lambda: plotting.tracking_by_error(LINKAGE, TASK, BATCH)),
+        ("solution", lambda: plotting.energy_stack(LINKAGE, (), NOWHERE)),
+        ("forces", lambda: plotting.energy_stack(LINKAGE, [], SOLUTION)),  # type: ignore
+        ("measured", lambda: plotting.work_precision({})),
+        (r"measured\['a'\]", lambda: plotting.work_precision({"a": [1, 2]})),  # type: ignore
+        (r"measured\['a'\]", lambda: plotting.work_precision({"a": ([1, 2], [1])})),
+        (r"measured\['a'\]", lambda: plotting.work_precision({"a": ([0], [1])})),
     ],
 )  # fmt: skip
 def test_malformed_arguments_are_named(name, call):
