@@ -212,9 +212,7 @@ def _draw_ground(ax: Axes) -> None:
     ground.set(mfc="white", mec=GREY, mew=0.8, clip_on=False)
 
 
-def _draw_motion(
-    ax: Axes, g: Geometry, indices: np.ndarray, mass_centers: bool
-) -> None:
+def draw_motion(ax: Axes, g: Geometry, indices: np.ndarray, mass_centers: bool) -> None:
     """The path of the tip to the last of the samples, and these from faint to full."""
     _draw_ground(ax)
     path = g.end[: indices[-1] + 1, 3]
@@ -286,7 +284,7 @@ def chrono_cyclograph(
     steps = np.arange(np.floor((last - ts[0]) / step + 1e-6) + 1)
     indices = np.unique([np.abs(ts - t).argmin() for t in ts[0] + step * steps])
     ax = plane_axes(ax, g.end[: indices[-1] + 1])
-    _draw_motion(ax, g, indices, mass_centers)
+    draw_motion(ax, g, indices, mass_centers)
     legend(ax)
     return ax
 
@@ -323,7 +321,7 @@ def topology_grid(
         last = len(g.end) - 1
         indices = np.linspace(0, last, configurations).round().astype(int)
         ax = plane_axes(fig.add_subplot(rows, columns, position + 1), g.end)
-        _draw_motion(ax, g, np.unique(indices), mass_centers=False)
+        draw_motion(ax, g, np.unique(indices), mass_centers=False)
         ax.set_aspect("equal", adjustable="datalim")
         ax.set(title=title, xlabel="", ylabel="")
         ax.tick_params(labelsize="small")
