@@ -109,6 +109,7 @@ from .simulation import joint_efforts as joint_efforts, simulate as simulate
 from .solution import Efforts as Efforts, Solution as Solution
 from .step_control import scale_tolerances as scale_tolerances
 from .sweep import sweep as sweep
+from .tables import to_pandas as to_pandas, to_xarray as to_xarray
 from .travel import Laps as Laps, Travel as Travel, shock_against as shock_against
 from .tune_result import TradeOff as TradeOff, TuneResult as TuneResult
 from .tuning import trade_off as trade_off, tune as tune, tune_each as tune_each

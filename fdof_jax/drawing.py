@@ -1,16 +1,15 @@
 """Pictures and animations of linkages in the plane, with matplotlib.
 
 Every function draws into the axes (`ax`) or figure (`fig`) it is given, or into a new
-one, and returns it; `animate` returns its animation. Nothing is shown or saved, and no
-global setting changes. A `solution` is that of one `simulate`; what a failed one did
-not reach is left out. Links are numbered as in the paper: the ground is link 1, the
-moving ones are 2 to 4. Curves over time are in `plotting`.
+one, and returns it; `animate` and `animate_grid` return their animation. Nothing is
+shown or saved, and no global setting changes. A `solution` is that of one `simulate`;
+what a failed one did not reach is left out. Links are numbered as in the paper: the
+ground is link 1, the moving ones are 2 to 4. Curves over time are in `plotting`.
 """
 
-from collections.abc import Mapping
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping
+from typing import Any
 
-import jax
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.animation import FuncAnimation
@@ -21,13 +20,23 @@ from matplotlib.markers import MarkerStyle
 from matplotlib.path import Path
 from numpy.typing import ArrayLike
 
-from .linkage import Linkage, to_chain
+from .axes import (
+    BLACK,
+    GREY,
+    SERIES,
+    figure_or_new,
+    filled_mapping,
+    legend,
+    plane_axes,
+    reached,
+    refuse,
+    xy,
+)
+from .geometry import Geometry, geometry
+from .linkage import Linkage
 from .solution import Solution
-from .validation import real_array
+from .validation import real_array, whole_number
 
-# Okabe and Ito's colours, which the common kinds of colour blindness tell apart.
-BLACK, GREY = "#000000", "#808080"
-SERIES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 _LINKS = (BLACK, *SERIES[:3])
 
 # Markers, in points: a carriage on a piece of its rail, a bearing on hatched ground.
@@ -47,128 +56,6 @@ _STYLES: dict[str, dict[str, Any]] = {
     "slider": dict(markersize=15, mfc="white", mew=0.9),
     "tip": dict(marker="s", markersize=3.5),
 }
-
-
-class Geometry(NamedTuple):
-    """A linkage at all samples; points of the plane are complex numbers.
-
-    Link n runs from where joint n - 1 puts it along A_n to its `end`; the end of link 4
-    is the tip.
-    """
-
-    angle: np.ndarray  # th_1 to th_4 [rad]: (time, 4)
-    slide: np.ndarray  # B_1 to B_3 [m]: (time, 3)
-    revolute: np.ndarray  # whether each real joint is: (3,)
-    end: np.ndarray  # (time, 4)
-    points: dict[str, np.ndarray]  # of all to draw, by name in that order: (time, n)
-
-
-def refuse(name: str, expected: str, got: Any) -> ValueError:
-    """The error to raise for a malformed argument."""
-    return ValueError(f"{name}: expected {expected}, got {got!r}.")
-
-
-def reached(solution: Any, name: str = "solution") -> list[np.ndarray]:
-    """`ts`, `q` and `qd` of one solution, without what it did not reach."""
-    if not isinstance(solution, Solution) or np.ndim(solution.q) != 2:
-        expected = "the Solution of one simulate (of a batch, pass one member)"
-        raise refuse(name, expected, solution)
-    arrays = [np.asarray(a) for a in (solution.ts, solution.q, solution.qd)]
-    finite = np.isfinite(arrays[1]).all(axis=1)
-    if not finite.any():
-        raise refuse(name, "at least one finite sample", solution)
-    return [array[finite] for array in arrays]
-
-
-def filled_mapping(name: str, value: Any, kind: str) -> Mapping:
-    """`value` if it is a dictionary with something in it, else ValueError."""
-    if not isinstance(value, Mapping) or not value:
-        raise refuse(name, f"a dictionary, not empty, of label: {kind}", value)
-    return value
-
-
-def _count(name: str, value: Any, least: int) -> int:
-    if not isinstance(value, int | np.integer) or value < least:
-        raise refuse(name, f"an integer of at least {least}", value)
-    return int(value)
-
-
-def figure_or_new(fig: Any, width: float, height: float) -> Figure:
-    """`fig`, or a new figure of that size [inches]."""
-    if fig is None:
-        return plt.figure(figsize=(width, height), layout="constrained")
-    if not isinstance(fig, Figure):
-        raise refuse("fig", "a matplotlib Figure or None", fig)
-    return fig
-
-
-def axes_or_new(ax: Any, height: float) -> Axes:
-    """`ax`, or those of a new figure of that height [inches]."""
-    if ax is None:
-        return figure_or_new(None, 3.5, height).subplots()
-    if not isinstance(ax, Axes):
-        raise refuse("ax", "matplotlib Axes or None", ax)
-    return ax
-
-
-def xy(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Coordinates of complex points."""
-    return np.real(points).ravel(), np.imag(points).ravel()
-
-
-def plane_axes(ax: Any, points: np.ndarray) -> Axes:
-    """Axes of equal scales; new ones have the proportions of what they will show."""
-    width, height = (max(np.ptp(part), 1e-9) for part in xy(points))
-    ax = axes_or_new(ax, 0.9 + np.clip(2.9 * height / width, 1.6, 3.6))
-    ax.set_aspect("equal")
-    ax.margins(0.1, 0.16)  # below, the ground needs room
-    ax.set(xlabel="x [m]", ylabel="y [m]")
-    return ax
-
-
-def legend(ax: Axes, *others: Axes) -> None:
-    """A legend above the axes, where it hides nothing, of all that has a label."""
-    found = {}
-    for handles, labels in (a.get_legend_handles_labels() for a in (ax, *others)):
-        found |= dict(zip(labels, handles))
-    columns = max(1, 48 // (4 + max(map(len, found))))
-    ax.legend(
-        list(found.values()), list(found), ncols=columns, fontsize="small",
-        frameon=False, handlelength=1.2, columnspacing=1,
-        loc="lower left", bbox_to_anchor=(0, 1), borderaxespad=0.2,
-    )  # fmt: skip
-
-
-def geometry(linkage: Linkage, q: np.ndarray) -> Geometry:
-    """Where a linkage is at joint positions (time, 3)."""
-    x = np.asarray(jax.vmap(lambda q: to_chain(linkage, q, np.zeros(3))[0])(q))
-    angle = np.column_stack([np.full(len(x), linkage.base_angle), x[:, 1::2]])
-    slide = x[:, 0::2]
-    direction = np.exp(1j * angle)
-    along = np.asarray(linkage.length) * direction
-    steps = along[:, :3] + 1j * slide * direction[:, :3]
-    start = np.cumsum(np.column_stack([np.zeros(len(x)), steps]), axis=1)
-    end = start + along
-    com = np.asarray(linkage.com)
-    foot = start[:, 1:] + com[:, 0] * direction[:, 1:]  # of the mass centre on A_n
-    center = foot + 1j * com[:, 1] * direction[:, 1:]
-    revolute = np.asarray(linkage.ef)[1::2] > 0.5
-
-    points = {}
-    for n in range(4):
-        link = [start[:, n], end[:, n]]
-        if n < 3 and revolute[n]:
-            link.append(start[:, n + 1])  # across by the fixed B_n
-        elif n < 3:
-            points[f"rail {n + 1}"] = np.column_stack([end[:, n], start[:, n + 1]])
-        points[f"link {n + 1}"] = np.column_stack(link)
-    for n in range(3):
-        points[f"mass {n + 2}"] = np.column_stack([foot[:, n], center[:, n]])
-    for n in range(3):
-        kind = "pin" if revolute[n] else "slider"
-        points[f"{kind} {n + 1}"] = start[:, n + 1 : n + 2]
-    points["tip 4"] = end[:, 3:]
-    return Geometry(angle, slide, revolute, end, points)
 
 
 def _place(lines: dict[str, Line2D], g: Geometry, i: int) -> None:
@@ -289,6 +176,39 @@ def chrono_cyclograph(
     return ax
 
 
+def _geometries(motions: Any) -> dict[str, tuple[np.ndarray, Geometry]]:
+    """Per title the times and the geometry of a motion."""
+    filled_mapping("motions", motions, "(Linkage, Solution)")
+    found = {}
+    for title, pair in motions.items():
+        name = f"motions[{title!r}]"
+        fits = isinstance(pair, tuple) and len(pair) == 2
+        if not (fits and isinstance(pair[0], Linkage)):
+            raise refuse(name, "(Linkage, Solution)", pair)
+        ts, q, _ = reached(pair[1], name)
+        found[title] = ts, geometry(pair[0], q)
+    return found
+
+
+def _panels(
+    geometries: dict[str, tuple[np.ndarray, Geometry]], fig: Figure | None
+) -> tuple[Figure, list[Axes]]:
+    """A grid of axes, one per motion."""
+    columns = min(4, len(geometries))
+    rows = -(-len(geometries) // columns)
+    fig = figure_or_new(fig, 0.3 + 1.75 * columns, 0.4 + 1.9 * rows)
+    panels = []
+    for position, (title, (_, g)) in enumerate(geometries.items()):
+        ax = plane_axes(fig.add_subplot(rows, columns, position + 1), g.end)
+        ax.set_aspect("equal", adjustable="datalim")
+        ax.set(title=title, xlabel="", ylabel="")
+        ax.tick_params(labelsize="small")
+        panels.append(ax)
+    fig.supxlabel("x [m]", fontsize="medium")
+    fig.supylabel("y [m]", fontsize="medium")
+    return fig, panels
+
+
 def topology_grid(
     motions: Mapping[str, tuple[Linkage, Solution]],
     fig: Figure | None = None,
@@ -304,30 +224,83 @@ def topology_grid(
 
     **Raises:** ValueError for malformed arguments.
     """
-    filled_mapping("motions", motions, "(Linkage, Solution)")
-    configurations = _count("configurations", configurations, 2)
-    geometries = {}
-    for title, pair in motions.items():
-        name = f"motions[{title!r}]"
-        fits = isinstance(pair, tuple) and len(pair) == 2
-        if not (fits and isinstance(pair[0], Linkage)):
-            raise refuse(name, "(Linkage, Solution)", pair)
-        _, q, _ = reached(pair[1], name)
-        geometries[title] = geometry(pair[0], q)
-    columns = min(4, len(motions))
-    rows = -(-len(motions) // columns)
-    fig = figure_or_new(fig, 0.3 + 1.75 * columns, 0.4 + 1.9 * rows)
-    for position, (title, g) in enumerate(geometries.items()):
-        last = len(g.end) - 1
-        indices = np.linspace(0, last, configurations).round().astype(int)
-        ax = plane_axes(fig.add_subplot(rows, columns, position + 1), g.end)
+    whole_number("configurations", configurations, 2)
+    geometries = _geometries(motions)
+    fig, panels = _panels(geometries, fig)
+    for ax, (ts, g) in zip(panels, geometries.values()):
+        indices = np.linspace(0, len(ts) - 1, configurations).round().astype(int)
         draw_motion(ax, g, np.unique(indices), mass_centers=False)
-        ax.set_aspect("equal", adjustable="datalim")
-        ax.set(title=title, xlabel="", ylabel="")
-        ax.tick_params(labelsize="small")
-    fig.supxlabel("x [m]", fontsize="medium")
-    fig.supylabel("y [m]", fontsize="medium")
     return fig
+
+
+class _Animation(FuncAnimation):
+    """One that a notebook plays where it is the last line of a cell."""
+
+    def __init__(self, figure: Figure, *args: Any, **kwargs: Any):
+        super().__init__(figure, *args, **kwargs)
+        self._figure = figure
+
+    def to_jshtml(self, *args: Any, **kwargs: Any) -> str:
+        plt.close(
+            self._figure
+        )  # else a notebook shows it a second time, standing still
+        return super().to_jshtml(*args, **kwargs)
+
+    def _repr_html_(self) -> str:
+        return self.to_jshtml()
+
+
+def _frame_times(
+    timelines: list[np.ndarray], fps: ArrayLike, speed: ArrayLike, max_frames: int
+) -> tuple[np.ndarray, float]:
+    """The times that frames show, and the pause between two of them [ms]."""
+    fps = float(real_array("fps", fps, (), above=0))
+    speed = float(real_array("speed", speed, (), above=0))
+    begin, end = min(ts[0] for ts in timelines), max(ts[-1] for ts in timelines)
+    duration = (end - begin) / speed
+    most = whole_number("max_frames", max_frames, 1)
+    frames = min(most, int(np.ceil(duration * fps)) + 1)
+    pause = duration / (frames - 1) if frames > 1 else 1 / fps
+    return np.linspace(begin, end, frames), 1000 * pause
+
+
+def _animation(
+    panels: list[Axes],
+    motions: list[tuple[np.ndarray, Geometry]],
+    times: np.ndarray,
+    pause: float,
+    say: Callable[..., Any],
+    new: bool,
+) -> FuncAnimation:
+    """The motions in the panels of a figure, `new` or given; `say` writes the time."""
+    moving = []
+    for ax, (ts, g) in zip(panels, motions):
+        _draw_ground(ax)
+        points = np.hstack(list(g.points.values()))
+        (trace,) = ax.plot(*xy(points), color=GREY, lw=1, gid="tip path")
+        lines = _draw(ax, g, 0, mass_centers=True)
+        ax.autoscale_view()
+        ax.autoscale(False)  # at limits that hold all samples
+        samples = [np.abs(ts - t).argmin() for t in times]
+        moving.append((g, trace, lines, samples))
+
+    def show(frame: int) -> list[Line2D]:
+        for g, trace, lines, samples in moving:
+            i = samples[frame]
+            _place(lines, g, i)
+            trace.set_data(*xy(g.end[: i + 1, 3]))
+        say(f"t = {times[frame]:.2f} s", fontsize="medium")
+        return [
+            line for _, trace, lines, _ in moving for line in (trace, *lines.values())
+        ]
+
+    show(0)
+    figure = panels[0].get_figure(root=True)
+    assert figure is not None  # axes are always in a figure
+    if new:
+        figure.draw_without_rendering()
+        figure.set_layout_engine("none")  # a layout per frame takes half the time
+    return _Animation(figure, show, len(times), interval=pause, cache_frame_data=False)
 
 
 def animate(
@@ -346,38 +319,38 @@ def animate(
 
     **Arguments:** `fps`: frames a second; `speed`: 2 shows the motion twice as fast.
 
-    **Returns:** the animation. Keep it until it is shown; `.save("motion.gif")` writes
-    it and `.to_jshtml()` is a player for notebooks.
+    **Returns:** the animation, which a notebook plays where it ends a cell. Keep it
+    until it is shown. `.save("motion.gif")` and `.save("motion.mp4")` write it, the
+    latter with ffmpeg; `.to_jshtml()` is a player as text, to be put in a web page.
 
     **Raises:** ValueError for malformed arguments.
     """
     ts, q, _ = reached(solution)
+    times, pause = _frame_times([ts], fps, speed, max_frames)
     g = geometry(linkage, q)
-    fps = float(real_array("fps", fps, (), above=0))
-    duration = (ts[-1] - ts[0]) / float(real_array("speed", speed, (), above=0))
-    frames = min(_count("max_frames", max_frames, 1), int(np.ceil(duration * fps)) + 1)
-    samples = [np.abs(ts - t).argmin() for t in np.linspace(ts[0], ts[-1], frames)]
+    panel = plane_axes(ax, np.hstack(list(g.points.values())))
+    return _animation([panel], [(ts, g)], times, pause, panel.set_title, ax is None)
 
-    points = np.hstack(list(g.points.values()))
-    given, ax = ax, plane_axes(ax, points)
-    _draw_ground(ax)
-    (trace,) = ax.plot(*xy(points), color=GREY, lw=1, gid="tip path")
-    lines = _draw(ax, g, 0, mass_centers=True)
-    ax.autoscale_view()
-    ax.autoscale(False)  # at limits that hold all samples
 
-    def show(frame: int) -> list[Line2D]:
-        i = samples[frame]
-        _place(lines, g, i)
-        trace.set_data(*xy(g.end[: i + 1, 3]))
-        ax.set_title(f"t = {ts[i]:.2f} s", fontsize="medium")
-        return [*lines.values(), trace]
+def animate_grid(
+    motions: Mapping[str, tuple[Linkage, Solution]],
+    fig: Figure | None = None,
+    *,
+    fps: float = 25,
+    speed: float = 1.0,
+    max_frames: int = 250,
+) -> FuncAnimation:
+    """Linkages side by side, moving at the same time; one that has ended stands still.
 
-    show(0)
-    figure = ax.get_figure(root=True)
-    assert figure is not None  # axes are always in a figure
-    if given is None:
-        figure.draw_without_rendering()
-        figure.set_layout_engine("none")  # a layout per frame takes half the time
-    pause = 1000 * duration / (frames - 1) if frames > 1 else 1000 / fps  # ms
-    return FuncAnimation(figure, show, frames, interval=pause, cache_frame_data=False)
+    **Arguments:** `motions`: title -> (linkage, its solution); the others as in
+    `animate`.
+
+    **Returns:** the animation, as of `animate`.
+
+    **Raises:** ValueError for malformed arguments.
+    """
+    geometries = _geometries(motions)
+    shown = list(geometries.values())
+    times, pause = _frame_times([ts for ts, _ in shown], fps, speed, max_frames)
+    figure, panels = _panels(geometries, fig)
+    return _animation(panels, shown, times, pause, figure.suptitle, fig is None)

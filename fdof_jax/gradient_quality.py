@@ -12,11 +12,11 @@ from jaxtyping import Float
 from .ensembles import is_number
 from .hybrid_dynamics import prescribed
 from .linearization import Modes, closed_loop_modes
+from .linkage import joint_names
 from .losses import controller_of, relative_demands, tip_errors
 from .scenes import Scene
 from .sensitivities import sensitivities
 from .simulation import simulate
-from .tune_result import joint_names
 from .tuning import check_tuned, with_gains
 from .vector_field import stateful
 
@@ -158,7 +158,7 @@ def _numpy(tree: Any) -> Any:
 
 
 def _warnings(scene: Scene, gradient, saturated, error) -> list[str]:
-    names, words = joint_names(scene), []
+    names, words = joint_names(scene.linkage), []
     for joint, share in enumerate(saturated):
         if share == 1 and not gradient[:, joint].any():
             words.append(

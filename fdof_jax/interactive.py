@@ -14,17 +14,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.image import imsave
 
-from .drawing import (
-    BLACK,
-    SERIES,
-    draw_motion,
-    filled_mapping,
-    geometry,
-    legend,
-    reached,
-    refuse,
-    xy,
-)
+from .axes import BLACK, SERIES, filled_mapping, legend, reached, refuse, xy
+from .drawing import draw_motion
+from .geometry import geometry
 from .league import circle_scenes
 from .losses import controller_of
 from .scenes import Scene

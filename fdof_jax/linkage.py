@@ -20,7 +20,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from .singularity import check_singularity
-from .validation import concrete, instance, is_traced, real_array
+from .validation import concrete, instance, is_traced, known, real_array
 
 TOPOLOGIES = ("RRR", "RRP", "RPR", "PRR", "RPP", "PRP", "PPR")
 
@@ -152,6 +152,31 @@ class Linkage(eqx.Module):
         self.gravity = real_array("gravity", gravity, ())
         if not is_traced(list(vars(self).values())):
             check_singularity(self)
+
+    def __repr__(self) -> str:
+        """With the values of one linkage; with the shapes of a batch."""
+        if np.size(self.ef) != 6 or not known(self):
+            return super().__repr__()
+        topology = "".join(name[0] for name in joint_names(self))
+        values = {name: _short(value) for name, value in vars(self).items()}
+        del values["ef"]
+        fields = (f"{name}={value}" for name, value in values.items())
+        return f"Linkage({topology!r}, {', '.join(fields)})"
+
+
+def _short(value: Array) -> str:
+    """The numbers in brackets, on one line."""
+    number: Any = {"float_kind": lambda value: f"{value:.6g}"}
+    text = np.array2string(
+        np.asarray(value), separator=", ", threshold=12, formatter=number
+    )
+    return " ".join(text.split())
+
+
+def joint_names(linkage: Linkage) -> list[str]:
+    """Of the real joints in order, for instance R1, P2, R3."""
+    kinds = np.where(np.asarray(linkage.ef)[1::2] > 0.5, "R", "P")
+    return [f"{kind}{k + 1}" for k, kind in enumerate(kinds)]
 
 
 class State(NamedTuple):

@@ -8,6 +8,9 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
+from .html_table import html_table
+from .validation import known
+
 
 class Solution(eqx.Module):
     """A simulated motion.
@@ -51,6 +54,36 @@ class Solution(eqx.Module):
             list(words),
             default="solver failed",
         )
+
+    def __repr__(self) -> str:
+        """In words; of traced values only their shape."""
+        facts = "; ".join(f"{name}: {value}" for name, value in self._facts().items())
+        return f"Solution({facts})" if facts else super().__repr__()
+
+    def _repr_html_(self) -> str | None:
+        facts = self._facts()
+        return html_table(facts.items()) if facts else None
+
+    def _facts(self) -> dict[str, str]:
+        """What there is to say; nothing of what has but the structure of a solution."""
+        if len(getattr(self.q, "shape", ())) < 2:
+            return {}
+        *batch, count, _ = self.q.shape
+        motions = " x ".join(map(str, batch)) if batch else "1"
+        facts = {"motions": motions, "times": f"{count}"}
+        if not known(self.ts, self.result, self.stats):
+            return facts
+        ts = np.asarray(self.ts)
+        facts["times"] += f", {ts.min():g} to {ts.max():g} s"
+        outcomes = zip(*np.unique(self.outcome, return_counts=True))
+        facts["outcome"] = ", ".join(
+            f"{number} {word}" if batch else word for word, number in outcomes
+        )
+        if "num_steps" in self.stats:
+            steps = np.asarray(self.stats["num_steps"])
+            least, most = steps.min(), steps.max()
+            facts["steps"] = f"{least}" if least == most else f"{least} to {most}"
+        return facts
 
 
 class Efforts(NamedTuple):

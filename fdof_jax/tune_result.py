@@ -1,6 +1,7 @@
 """What gain tuning returns, and how it prints itself."""
 
 from collections.abc import Callable
+from html import escape
 from typing import Any
 
 import equinox as eqx
@@ -9,11 +10,16 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from .bounded_search import Run
+from .html_table import html_table
+from .linkage import joint_names
 from .losses import controller_of
 from .scenes import Scene
+from .validation import known
 
 # Actuators at their limits for a larger share of the time are hardly controlled.
 _MOSTLY = 0.9
+# Of the numbers in a printed table.
+_COLUMNS = ("start", "tuned", "least", "greatest")
 
 
 class History(eqx.Module):
@@ -96,30 +102,50 @@ class TuneResult(eqx.Module):
         """Root mean square of the efforts over their limits, over time and joints."""
         return float(np.sqrt(np.mean(self.history.effort[_best(self.history)] ** 2)))
 
-    def __str__(self) -> str:
+    @property
+    def table(self) -> dict[str, list]:
+        """The gains in columns, a row for each: `pandas.DataFrame(result.table)`.
+
+        `gain` and `joint`, for instance kp and R1; `unit`; `start`, `tuned`, `least`
+        and `greatest`: its values and bounds; `at_bound`: whether one holds it.
+        """
+        names = joint_names(self.scene.linkage)
+        units = controller_of(self.scene).gain_units
+        values = {
+            "start": self.histories[0].gains[0],
+            "tuned": self.gains,
+            "least": self.lower,
+            "greatest": self.upper,
+            "at_bound": self.at_bound,
+        }
+        return {
+            "gain": ["kp"] * 3 + ["kd"] * 3,
+            "joint": names * 2,
+            "unit": [units[name[0]][kind] for kind in range(2) for name in names],
+        } | {name: np.ravel(value).tolist() for name, value in values.items()}
+
+    def _rows(self) -> list[list[str]]:
+        """Of what is printed: a label, up to four numbers, and a remark."""
+        rows = []
+        for gain, joint, unit, *values, held in zip(*self.table.values()):
+            cells = [f"{value:.5g}" for value in values]
+            mark = "at its bound" if held else ""
+            rows.append([f"{gain} of {joint} [{unit}]", *cells, mark])
         history, best, first = self.history, _best(self.history), self.histories[0]
-        rows = [f"{'':24}{'start':>12}{'tuned':>12}{'least':>12}{'greatest':>12}"]
-        names = joint_names(self.scene)
-        for kind, name in enumerate(("kp", "kd")):
-            for joint in range(3):
-                values = (
-                    a[kind, joint]
-                    for a in (first.gains[0], self.gains, self.lower, self.upper)
-                )
-                units = controller_of(self.scene).gain_units[names[joint][0]][kind]
-                label = f"{name} of {names[joint]} [{units}]"
-                mark = "  at its bound" if self.at_bound[kind, joint] else ""
-                cells = "".join(f"{value:12.5g}" for value in values)
-                rows.append(f"{label:24}{cells}{mark}")
         compared = [("loss", lambda h: h.loss, 1.0)]
         if np.isfinite(self.tip_error):
             compared.append(("rms tip error [mm]", lambda h: h.tip_error, 1e3))
-        for joint in range(3):
+        for joint, name in enumerate(joint_names(self.scene.linkage)):
             share = lambda h, joint=joint: h.saturated[:, joint]
-            compared.append((f"{names[joint]} at its limit [%]", share, 1e2))
+            compared.append((f"{name} at its limit [%]", share, 1e2))
         for label, values, scale in compared:
             before, after = scale * values(first)[0], scale * values(history)[best]
-            rows.append(f"{label:24}{before:12.5g}{after:12.5g}")
+            rows.append([label, f"{before:.5g}", f"{after:.5g}", "", "", ""])
+        return rows
+
+    def _remarks(self) -> list[str]:
+        """What stands below the table."""
+        rows = []
         if len(self.start_loss) > 1:
             failed = np.isnan(self.start_loss).sum()
             if failed:
@@ -137,15 +163,35 @@ class TuneResult(eqx.Module):
                 f"root of the loss over {len(self.member_loss)} members: {low:.4g} to "
                 f"{high:.4g}"
             )
-        verdict = "converged" if self.converged else "not converged"
-        rows.append(f"{verdict}, {len(history.loss) - 1} iterations: {self.message}")
-        return "\n".join(rows)
+        iterations = len(self.history.loss) - 1
+        rows.append(f"{self._verdict}, {iterations} iterations: {self.message}")
+        return rows
 
+    @property
+    def _verdict(self) -> str:
+        return "converged" if self.converged else "not converged"
 
-def joint_names(scene: Scene) -> list[str]:
-    """Of the real joints in order, for instance R1, P2, R3."""
-    ef = np.asarray(scene.linkage.ef).reshape(3, 2)
-    return [f"{'P' if pair[0] else 'R'}{i + 1}" for i, pair in enumerate(ef)]
+    def __str__(self) -> str:
+        lines = [
+            f"{label:24}" + "".join(f"{cell:>12}" for cell in cells) + f"  {mark}"
+            for label, *cells, mark in [["", *_COLUMNS, ""], *self._rows()]
+        ]
+        return "\n".join([*map(str.rstrip, lines), *self._remarks()])
+
+    def __repr__(self) -> str:
+        """In a line; of traced values, their shapes."""
+        if not known(self.histories) or not isinstance(self.loss, float):
+            return super().__repr__()
+        topology = "".join(name[0] for name in joint_names(self.scene.linkage))
+        first, held = self.histories[0], int(self.at_bound.sum())
+        return (
+            f"TuneResult({topology}, loss {first.loss[0]:.5g} to {self.loss:.5g}, "
+            f"{held} of 6 gains at a bound, {self._verdict})"
+        )
+
+    def _repr_html_(self) -> str:
+        remarks = "".join(f"<p>{escape(remark)}</p>" for remark in self._remarks())
+        return html_table(self._rows(), ["", *_COLUMNS, ""]) + remarks
 
 
 class TradeOff(eqx.Module):
@@ -228,7 +274,7 @@ def result_of(
 
 def _message(scene, reason, history, lower, upper) -> str:
     """The reason, and what a reader might take for convergence but is not."""
-    names, share = joint_names(scene), history.saturated[_best(history)]
+    names, share = joint_names(scene.linkage), history.saturated[_best(history)]
     tuned = (controller_gains(scene) > 0) & (lower < upper)
     if history.gradient_norm[0] == 0:
         at_limit = history.saturated[0].min() == 1

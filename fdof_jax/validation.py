@@ -8,6 +8,7 @@ import inspect
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,6 +19,12 @@ from jax.core import Tracer
 def is_traced(*trees: Any) -> bool:
     """Whether any leaf of `trees` is being traced by a JAX transformation."""
     return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(trees))
+
+
+def known(*trees: Any) -> bool:
+    """Whether all leaves are numbers that can be looked at."""
+    numbers = all(map(eqx.is_array_like, jax.tree.leaves(trees)))
+    return numbers and not is_traced(*trees)
 
 
 def concrete(value: Any) -> np.ndarray | None:

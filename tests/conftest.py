@@ -2,8 +2,12 @@ import os
 from pathlib import Path
 
 import jax
+import numpy as np
 import pytest
 import sweep_batch
+
+import fdof_jax as fj
+from fdof_jax.tune_result import History
 
 # Most of the tests' time is compilation, which XLA's older code generator shortens by a
 # quarter. Programs of `test_float32` are compiled as XLA does by default.
@@ -39,6 +43,35 @@ def mixed(batch):
 @pytest.fixture(scope="session")
 def swept(mixed):
     return sweep_batch.run(mixed)
+
+
+@pytest.fixture
+def tuned():
+    """A tuning result without a search: one of Fig 7's gains has gone to its bound."""
+    scene = fj.scenes.fig7()
+    start = np.array([[1500.0, 20000.0, 800.0], [80.0, 50.0, 50.0]])
+    gains = start + [[4500, 0, 0], [0, 0, 10]]
+    controller = fj.PDController(*gains, [1000, 300, 400], fj.CircleTask())
+    history = History(
+        loss=np.array([0.04, 0.01]),
+        gradient_norm=np.ones(2),
+        gains=np.stack([start, gains]),
+        saturated=np.full((2, 3), 0.25),
+        effort=np.full((2, 3), 0.5),
+        tip_error=np.array([0.2, 0.1]),
+        wall_time=np.arange(2.0),
+    )
+    return fj.TuneResult(
+        scene=scene._replace(forces=(controller,)),
+        loss=0.01,
+        histories=[history],
+        lower=start / 4,
+        upper=start * 4,
+        converged=False,
+        message="stopped where a < b",
+        member_loss=np.array([0.01]),
+        settings={},
+    )
 
 
 def pytest_collection_modifyitems(items):

@@ -1,0 +1,91 @@
+"""What a notebook or a prompt shows of an object: few words, no traced values."""
+
+import xml.etree.ElementTree as xml
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from test_drawing import make_linkage
+from test_tables import solution
+
+import fdof_jax as fj
+
+
+def cells(html: str) -> list[list[str | None]]:
+    """Of the tables in it."""
+    return [[cell.text for cell in row] for row in xml.fromstring(html).iter("tr")]
+
+
+def test_a_solution_is_told_in_a_line():
+    one = "Solution(motions: 1; times: 5, 0 to 2 s; outcome: successful; steps: 7)"
+    assert repr(solution()) == str(solution()) == one
+    batch = solution(4, failed=[2])
+    batch.stats["num_steps"][1] = 30
+    assert repr(batch) == (
+        "Solution(motions: 4; times: 5, 0 to 2 s; "
+        "outcome: 1 ill-conditioned, 3 successful; steps: 7 to 30)"
+    )
+    assert "motions: 3 x 2;" in repr(solution(3, 2))
+
+
+def test_a_solution_is_a_table_in_notebooks():
+    assert cells(solution(4, failed=[2])._repr_html_()) == [
+        ["motions", "4"],
+        ["times", "5, 0 to 2 s"],
+        ["outcome", "1 ill-conditioned, 3 successful"],
+        ["steps", "7"],
+    ]
+
+
+def test_displays_read_no_traced_values():
+    seen = []
+
+    @jax.jit
+    def traced(motion, arm):
+        seen.extend([repr(motion), repr(arm), motion._repr_html_()])
+
+    traced(solution(4), make_linkage("RPR"))
+    assert seen[0] == "Solution(motions: 4; times: 5)"
+    assert "ef=f64[6]" in seen[1]
+    assert cells(seen[2]) == [["motions", "4"], ["times", "5"]]
+    assert repr(jax.eval_shape(solution)) == "Solution(motions: 1; times: 5)"
+    # What has only the structure of a solution, axes for instance.
+    axes = jax.tree.map(lambda _: 0, solution())
+    assert "q=0" in repr(axes) and axes._repr_html_() is None
+
+
+def test_a_linkage_shows_its_values():
+    arm = make_linkage("RPR")
+    again = eval(repr(arm), {"Linkage": fj.Linkage})
+    for old, new in zip(jax.tree.leaves(arm), jax.tree.leaves(again)):
+        np.testing.assert_allclose(new, old, rtol=1e-5)
+    assert "\n" not in repr(arm)
+    assert "ef=f64[2,6]" in repr(jax.tree.map(lambda a: jnp.stack([a, a]), arm))
+    assert "ef=None" in repr(jax.tree.map(lambda _: None, arm))
+
+
+def test_a_tuning_result_is_told_in_a_line_and_in_a_table(tuned):
+    line = "TuneResult(RPR, loss 0.04 to 0.01, 1 of 6 gains at a bound, not converged)"
+    assert repr(tuned) == line
+    rows = cells(f"<div>{tuned._repr_html_()}</div>")
+    assert rows[0] == [None, "start", "tuned", "least", "greatest", None]
+    assert rows[1] == [
+        "kp of R1 [N m/rad]",
+        "1500",
+        "6000",
+        "375",
+        "6000",
+        "at its bound",
+    ]
+    assert rows[6] == ["kd of R3 [N m s/rad]", "50", "60", "12.5", "200", None]
+    assert ["rms tip error [mm]", "200", "100", None, None, None] in rows
+    assert "a &lt; b" in tuned._repr_html_()
+    lines = str(tuned).split("\n")
+    assert len(lines) == len(rows) + 1
+    for line, row in zip(lines, rows):
+        assert " ".join(line.split()) == " ".join(filter(None, row))
+    assert lines[-1] == "not converged, 1 iterations: stopped where a < b"
+    seen = []
+    eqx.filter_jit(lambda result: seen.append(repr(result)))(tuned)
+    assert "gains=f64[2,2,3]" in seen[0]

@@ -1,0 +1,129 @@
+"""Solutions as labelled arrays: the same numbers, with names, units and outcomes."""
+
+import sys
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+import pytest
+from test_drawing import make_linkage
+
+import fdof_jax as fj
+
+TS = np.linspace(0, 2, 5)
+
+
+def solution(*batch, failed=()) -> fj.Solution:
+    """Without a solve; of a batch, which motions have failed."""
+    q = np.random.default_rng(0).normal(size=(2, *batch, len(TS), 3))
+    good = np.ones(batch, bool)
+    for place in failed:
+        q[:, place, 1:] = np.nan
+        good[place] = False
+    results = diffrax.RESULTS.successful, diffrax.RESULTS.singular
+    chosen = lambda good: diffrax.RESULTS.where(good, *results)
+    for _ in batch:
+        chosen = jax.vmap(chosen)
+    stats = {"num_steps": np.full(batch, 7), "time_reached": np.where(good, 2.0, 0.1)}
+    ts = jnp.broadcast_to(TS, (*batch, len(TS)))
+    return fj.Solution(ts, jnp.asarray(q[0]), jnp.asarray(q[1]), stats, chosen(good))
+
+
+def test_a_motion_has_named_joints_with_units():
+    motion, arm = solution(), make_linkage("RPR")
+    found = fj.to_xarray(motion, arm)
+    assert dict(found.sizes) == {"time": 5, "joint": 3}
+    assert found.joint.values.tolist() == ["R1", "P2", "R3"]
+    assert found.unit.values.tolist() == ["rad", "m", "rad"]
+    assert found.q.units == "m or rad" and found.qd.units == "m/s or rad/s"
+    assert found.time.units == found.time_reached.units == "s"
+    np.testing.assert_array_equal(found.q.sel(joint="P2"), motion.q[:, 1])
+    np.testing.assert_array_equal(found.qd.sel(time=1.0), motion.qd[2])
+    assert (found.outcome, found.num_steps) == ("successful", 7)
+    assert fj.to_xarray(motion, make_linkage("RRR")).qd.units == "rad/s"
+
+
+def test_a_batch_has_axes_and_says_what_failed():
+    motion = solution(4, failed=[2])
+    found = fj.to_xarray(motion, make_linkage("RRP"))
+    assert found.q.dims == ("batch", "time", "joint")
+    np.testing.assert_array_equal(found.q, motion.q)
+    good = ["successful", "successful", "ill-conditioned", "successful"]
+    assert found.outcome.values.tolist() == good
+    assert found.time_reached.values.tolist() == [2, 2, 0.1, 2]
+    named = found.rename(batch="payload").assign_coords(payload=[0, 1, 2, 3])
+    assert named.outcome.sel(payload=2) == "ill-conditioned"
+    two = fj.to_xarray(solution(4, 2), make_linkage("RRP"))
+    assert two.q.dims == ("batch_1", "batch_2", "time", "joint")
+    assert two.outcome.dims == ("batch_1", "batch_2")
+
+
+def test_joints_of_two_kinds_are_numbers():
+    arms = jax.tree.map(
+        lambda *a: jnp.stack(a), make_linkage("RRP"), make_linkage("RPP")
+    )
+    found = fj.to_xarray(solution(2), arms)
+    assert found.joint.values.tolist() == ["R1", "2", "P3"]
+    assert found.unit.values.tolist() == ["rad", "m or rad", "m"]
+    assert "2 [m/s or rad/s]" in fj.to_pandas(solution(2), arms)
+
+
+def test_a_table_of_a_motion():
+    motion = solution()
+    found = fj.to_pandas(motion, make_linkage("PRR"))
+    assert list(found) == [
+        "P1 [m]", "R2 [rad]", "R3 [rad]", "P1 [m/s]", "R2 [rad/s]", "R3 [rad/s]",
+        "outcome",
+    ]  # fmt: skip
+    assert found.index.name == "time [s]" and found.index.tolist() == TS.tolist()
+    np.testing.assert_array_equal(found["R2 [rad]"], motion.q[:, 1])
+    np.testing.assert_array_equal(found["P1 [m/s]"], motion.qd[:, 0])
+    assert set(found.outcome) == {"successful"}
+
+
+def test_a_table_of_a_batch():
+    motion = solution(3, 2, failed=[(1, 0)])
+    found = fj.to_pandas(motion, make_linkage("PRR"))
+    assert found.index.names == ["batch_1", "batch_2", "time [s]"]
+    row = found.loc[2, 1, TS[3]]
+    assert row["R3 [rad]"] == motion.q[2, 1, 3, 2]
+    assert row["P1 [m/s]"] == motion.qd[2, 1, 3, 0]
+    failed = found[found.outcome != "successful"]
+    assert set(failed.index.droplevel("time [s]")) == {(1, 0)}
+    assert list(fj.to_pandas(solution(2), make_linkage("PRR")).index.names) == [
+        "batch",
+        "time [s]",
+    ]
+
+
+@pytest.mark.parametrize("convert", [fj.to_xarray, fj.to_pandas])
+def test_malformed_arguments_are_named(convert):
+    arm = make_linkage("RRR")
+    with pytest.raises(ValueError, match="^solution: expected a Solution"):
+        convert(solution().q, arm)
+    with pytest.raises(ValueError, match="^linkage: expected a Linkage"):
+        convert(solution(), "RRR")
+    other = solution(2)
+    other = fj.Solution(
+        other.ts.at[1].add(1.0), other.q, other.qd, other.stats, other.result
+    )
+    with pytest.raises(ValueError, match="^solution.ts: expected the same times"):
+        convert(other, arm)
+    with pytest.raises(ValueError, match="traced"):
+        jax.jit(lambda arm: convert(solution(), arm))(arm)
+
+
+@pytest.mark.parametrize("name", ["xarray", "pandas"])
+def test_a_package_that_is_missing_is_named_with_the_extra(name, monkeypatch):
+    monkeypatch.setitem(sys.modules, name, None)
+    with pytest.raises(ImportError, match=rf"{name} .*fdof_jax\[data\]"):
+        getattr(fj, f"to_{name}")(solution(), make_linkage("RRR"))
+
+
+def test_the_table_of_tuned_gains_is_a_frame(tuned):
+    found = pd.DataFrame(tuned.table).set_index(["gain", "joint"])
+    assert found.tuned["kp", "P2"] == tuned.gains[0, 1]
+    assert found.unit["kd", "R1"] == "N m s/rad" and found.unit["kp", "P2"] == "N/m"
+    assert found.at_bound.sum() == 1
