@@ -99,9 +99,7 @@ def _draw_ground(ax: Axes) -> None:
     ground.set(mfc="white", mec=GREY, mew=0.8, clip_on=False)
 
 
-def _draw_motion(
-    ax: Axes, g: Geometry, indices: np.ndarray, mass_centers: bool
-) -> None:
+def draw_motion(ax: Axes, g: Geometry, indices: np.ndarray, mass_centers: bool) -> None:
     """The path of the tip to the last of the samples, and these from faint to full."""
     _draw_ground(ax)
     path = g.end[: indices[-1] + 1, 3]
@@ -173,7 +171,7 @@ def chrono_cyclograph(
     steps = np.arange(np.floor((last - ts[0]) / step + 1e-6) + 1)
     indices = np.unique([np.abs(ts - t).argmin() for t in ts[0] + step * steps])
     ax = plane_axes(ax, g.end[: indices[-1] + 1])
-    _draw_motion(ax, g, indices, mass_centers)
+    draw_motion(ax, g, indices, mass_centers)
     legend(ax)
     return ax
 
@@ -231,7 +229,7 @@ def topology_grid(
     fig, panels = _panels(geometries, fig)
     for ax, (ts, g) in zip(panels, geometries.values()):
         indices = np.linspace(0, len(ts) - 1, configurations).round().astype(int)
-        _draw_motion(ax, g, np.unique(indices), mass_centers=False)
+        draw_motion(ax, g, np.unique(indices), mass_centers=False)
     return fig
 
 
