@@ -71,6 +71,7 @@ NAMES = [
         if name[0] != "_" and not inspect.ismodule(value)
     ),
     *(f"scenes.{name}" for name in ("fig3", "fig5", "fig7")),
+    "interactive.sliders",
     *(
         f"{module.__name__.split('.')[1]}.{name}"
         for module in (drawing, plotting)
@@ -114,7 +115,9 @@ def test_every_name_has_an_example():
     for name in NAMES:
         short = name.split(".")[-1]
         maker = RETURNED_BY.get(name, short)
-        assert re.search(rf"\b(fj|scenes|drawing|plotting)\.{maker}\b", ran), name
+        assert re.search(
+            rf"\b(fj|scenes|drawing|plotting|interactive)\.{maker}\b", ran
+        ), name
         if name in RETURNED_BY:
             assert name in inspect.signature(vars(fj)[maker]).return_annotation.__name__
 

@@ -10,6 +10,7 @@ GUIDE = Path(__file__).parents[1] / "docs" / "pictures.md"
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("error")
 def test_examples(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     namespace = {}
@@ -19,4 +20,4 @@ def test_examples(tmp_path, monkeypatch):
         assert (tmp_path / name).stat().st_size > 1000
     table, motion = namespace["table"], namespace["motion"]
     np.testing.assert_array_equal(table["P2 [m]"], motion.q[:, 1])
-    assert namespace["data"].sizes["time"] == 201
+    assert namespace["data"].sizes["time"] == 2001
