@@ -1,6 +1,6 @@
 """The notebooks: short cells, small files, committed outputs; and they run."""
 
-import time
+import os
 from pathlib import Path
 
 import nbformat
@@ -11,7 +11,7 @@ FOLDER = Path(__file__).parents[1] / "notebooks"
 INSTALL = '%pip install -q "..[notebook]"'
 LONGEST = 25  # lines of a cell: a screen
 LARGEST = 1_000_000  # bytes of a notebook
-SLOWEST = 120  # seconds of a run, on two cores
+SLOWEST = 120  # seconds of a run
 
 each_notebook = pytest.mark.parametrize(
     "path", sorted(FOLDER.glob("*.ipynb")), ids=lambda path: path.stem
@@ -42,6 +42,12 @@ def pictures(notebook):
         for output in cell.outputs
     ]
     return sum(bool(kind & {"image/png", "text/html"}) for kind in kinds)
+
+
+def processor_seconds():
+    """Of ended child processes. Unlike wall time it does not tell what else runs."""
+    times = os.times()
+    return times.children_user + times.children_system
 
 
 def test_there_are_notebooks():
@@ -83,14 +89,12 @@ def test_it_runs(path):
     committed = pictures(notebook)
     client = NotebookClient(
         notebook,
-        timeout=SLOWEST,
+        timeout=600,  # of a cell
         skip_cells_with_tag="install",
         resources={"metadata": {"path": FOLDER}},
     )
-    began = time.perf_counter()
+    before = processor_seconds()
     client.execute()
-    seconds = time.perf_counter() - began
-    print(f"{path.name}: {seconds:.0f} s")
     assert unwanted(notebook) == []
     assert pictures(notebook) == committed
-    assert seconds < SLOWEST
+    assert 1 < processor_seconds() - before < SLOWEST
