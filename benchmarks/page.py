@@ -317,6 +317,22 @@ def hard_cases_float32(points: list[dict]) -> str:
     return table(["", "scene", "bound", *head], body)
 
 
+def sliders(points: list[dict]) -> str:
+    rows = [
+        [
+            p["problem"],
+            str(len(p["times"])),
+            number(1e3 * p["time_median"], 3),
+            number(1e3 * p["time_95"], 3),
+            f"{100 * p['under_100_ms']:.1f} %",
+        ]
+        for p in points
+        if p["times"]
+    ]
+    head = ["", "pictures", "median [ms]", "95 % within [ms]", "under 100 ms"]
+    return table(head, rows)
+
+
 def _machine(points: dict[str, list[dict]]) -> str:
     one = next(p for job in points.values() for p in job)
     versions = ", ".join(f"{k} {v}" for k, v in one["versions"].items() if v)
@@ -363,6 +379,7 @@ def tables(points: dict[str, list[dict]]) -> dict[str, str]:
         "tuning": tuning,
         "hard_cases": hard_cases,
         "hard_cases-float32": hard_cases_float32,
+        "sliders": sliders,
     }
     texts = {name: makers[name](own) for name, own in points.items() if own}
     if texts:

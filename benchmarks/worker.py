@@ -52,6 +52,8 @@ JOBS = (
     # A quarter of an hour, for outcomes more than for times: only when asked for.
     Job("hard_cases", "hard_cases", asked=True),
     Job("hard_cases-float32", "hard_cases", "run_float32", x64=False, asked=True),
+    # Needs a browser.
+    Job("sliders", "sliders", cores=2, asked=True),
 )
 
 

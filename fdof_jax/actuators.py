@@ -31,6 +31,12 @@ class Armature(InertialElement):
     times the square of the gear ratio [kg m^2; kg for a prismatic joint].
 
     **Raises:** ValueError for malformed or negative inertias.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig5().linkage
+    >>> rotors, zero = (fj.Armature(0.5),), [0, 0, 0]
+    >>> fj.forward_dynamics(arm, zero, zero, zero, rotors).tolist()  # slower than -g
+    [-5.664, 2.225, 1.82]
     """
 
     inertia: Float[Array, " joint"]
@@ -71,6 +77,13 @@ class LinearActuator(InertialElement):
 
     **Raises:** ValueError for malformed arguments. Where the pins meet, a line has no
     direction, and motions end as not finite.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig5().linkage
+    >>> import jax.numpy as jnp
+    >>> lift = fj.LinearActuator(fj.Point(0, 0, -1), fj.Point(1, 1), force=100)
+    >>> lift(0.0, jnp.zeros(3), jnp.zeros(3), arm).tolist()  # lever sqrt(1/2) m
+    [70.711, 0.0, 0.0]
     """
 
     ends: Separation

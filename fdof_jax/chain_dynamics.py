@@ -22,6 +22,11 @@ def mass_matrix(
     **Arguments:** `x`: (B1, th2, B2, th3, B3, th4), absolute angles [m, rad].
 
     **Returns:** entries [kg], [kg m] or [kg m^2], by the coordinates.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig5().linkage
+    >>> fj.mass_matrix(arm, [0.0] * 6)[0].tolist()  # of a push on the ground
+    [3.0, 3.0, 2.0, 2.0, 1.0, 1.0]
     """
     _, th2, B2, th3, B3, th4 = x
     th1 = linkage.base_angle
@@ -81,6 +86,11 @@ def bias_force(
     **Arguments:** `x`, `xd`: chain coordinates and rates [m, rad, m/s, rad/s].
 
     **Returns:** generalised forces [N, N m], without efforts.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig5().linkage
+    >>> fj.bias_force(arm, [0.0] * 6, [0.0] * 6).tolist()  # weights of a level arm
+    [-29.43, -29.43, -19.62, -19.62, -9.81, -9.81]
     """
     _, th2, B2, th3, B3, th4 = x
     _, w2, v2, w3, v3, w4 = xd
@@ -185,6 +195,12 @@ def masked_accelerations(
     reacting on the preceding link. Those of fictitious joints have no effect.
 
     **Returns:** `xdd` [m/s^2, rad/s^2].
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig5().linkage
+    >>> level, rest = [0.0] * 6, [0.0] * 6
+    >>> fj.masked_accelerations(arm, level, rest, [0.0] * 6).tolist()  # it falls
+    [0.0, -9.81, 0.0, 0.0, 0.0, 0.0]
     """
     ef1, _, ef3, _, ef5, _ = linkage.ef
     real = linkage.ef > 0.5
@@ -229,6 +245,12 @@ def constraint_forces(
     **Arguments:** as for `masked_accelerations`.
 
     **Returns:** forces and torques [N, N m], zero at real joints.
+
+    >>> import fdof_jax as fj
+    >>> arm, start, *_ = fj.scenes.fig7()
+    >>> x, xd = fj.to_chain(arm, *start)
+    >>> fj.constraint_forces(arm, x, xd, [0.0] * 6).tolist()  # the guide's: 4th
+    [10.921, 0.0, 0.0, -0.925, -0.555, 0.0]
     """
     xdd = masked_accelerations(linkage, x, xd, force)
     effort = mass_matrix(linkage, x) @ xdd - bias_force(linkage, x, xd)

@@ -68,6 +68,14 @@ class PDController(ScalarElement):
 
     **Raises:** ValueError for malformed or negative gains and limits, and for a
     reference that cannot be called.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig7().linkage
+    >>> task = fj.CircleTask()
+    >>> pd = fj.PDController(kp=100, kd=10, limit=30, reference=task)
+    >>> q, qd = task(0.0, arm)
+    >>> pd(0.0, q - 0.2, qd, arm).tolist(), pd(0.0, q - 0.5, qd, arm).tolist()
+    ([20.0, 20.0, 20.0], [30.0, 30.0, 30.0])
     """
 
     kp: Float[Array, " joint"]
@@ -162,6 +170,13 @@ class CircleTask(eqx.Module):
 
     **Raises:** ValueError for malformed arguments; `check`, and with it `simulate`, for
     a circle out of the linkage's reach.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig7().linkage
+    >>> circle = fj.CircleTask(center=[-4, 2], radius=0.75, period=5)
+    >>> q, qd = circle(0.0, arm)
+    >>> circle.tip(0.0).tolist(), fj.tip_position(arm, q).tolist()
+    ([-4.75, 2.0], [-4.75, 2.0])
     """
 
     center: Float[Array, " 2"]
@@ -279,6 +294,12 @@ def reachable(
     `ts`: times (time,) [s].
 
     **Raises:** ValueError for malformed arguments.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig7().linkage
+    >>> circle = fj.CircleTask(center=[-1, 2], radius=0.75)  # too near the base
+    >>> fj.reachable(arm, circle, [0.0, 1.875, 2.5]).tolist()
+    [True, False, True]
     """
     check_linkage(linkage)
     ts = real_array("ts", ts, (None,))

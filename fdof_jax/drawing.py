@@ -99,9 +99,7 @@ def _draw_ground(ax: Axes) -> None:
     ground.set(mfc="white", mec=GREY, mew=0.8, clip_on=False)
 
 
-def _draw_motion(
-    ax: Axes, g: Geometry, indices: np.ndarray, mass_centers: bool
-) -> None:
+def draw_motion(ax: Axes, g: Geometry, indices: np.ndarray, mass_centers: bool) -> None:
     """The path of the tip to the last of the samples, and these from faint to full."""
     _draw_ground(ax)
     path = g.end[: indices[-1] + 1, 3]
@@ -173,7 +171,7 @@ def chrono_cyclograph(
     steps = np.arange(np.floor((last - ts[0]) / step + 1e-6) + 1)
     indices = np.unique([np.abs(ts - t).argmin() for t in ts[0] + step * steps])
     ax = plane_axes(ax, g.end[: indices[-1] + 1])
-    _draw_motion(ax, g, indices, mass_centers)
+    draw_motion(ax, g, indices, mass_centers)
     legend(ax)
     return ax
 
@@ -231,7 +229,7 @@ def topology_grid(
     fig, panels = _panels(geometries, fig)
     for ax, (ts, g) in zip(panels, geometries.values()):
         indices = np.linspace(0, len(ts) - 1, configurations).round().astype(int)
-        _draw_motion(ax, g, np.unique(indices), mass_centers=False)
+        draw_motion(ax, g, np.unique(indices), mass_centers=False)
     return fig
 
 
@@ -281,8 +279,7 @@ def _animation(
         points = np.hstack(list(g.points.values()))
         (trace,) = ax.plot(*xy(points), color=GREY, lw=1, gid="tip path")
         lines = _draw(ax, g, 0, mass_centers=True)
-        ax.autoscale_view()
-        ax.autoscale(False)  # at limits that hold all samples
+        ax.autoscale_view()  # to limits that hold all samples
         samples = [np.abs(ts - t).argmin() for t in times]
         moving.append((g, trace, lines, samples))
 
@@ -299,8 +296,11 @@ def _animation(
     show(0)
     figure = panels[0].get_figure(root=True)
     assert figure is not None  # axes are always in a figure
+    figure.draw_without_rendering()
+    for ax in panels:  # which have found their limits, and are to keep them
+        ax.autoscale(False)
+        ax.set_adjustable("box")
     if new:
-        figure.draw_without_rendering()
         figure.set_layout_engine("none")  # a layout per frame takes half the time
     return _Animation(figure, show, len(times), interval=pause, cache_frame_data=False)
 

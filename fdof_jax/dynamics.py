@@ -29,6 +29,11 @@ def forward_dynamics(
     force elements whose masses count. Their efforts do not: `tau` has all.
 
     **Returns:** `qdd` [m/s^2 or rad/s^2].
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig5().linkage
+    >>> fj.forward_dynamics(arm, [0, 0, 0], [0, 0, 0], tau=[0, 0, 0]).tolist()  # let go
+    [-9.81, 9.81, 0.0]
     """
     more = added_inertia(linkage, forces, q, qd)
     matrix, bias = (None, 0) if more is None else more
@@ -50,6 +55,11 @@ def inertia_ratios(
     matrix is not positive definite.
 
     **Arguments:** `q` [m or rad]; `forces`: force elements whose masses count.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig5().linkage
+    >>> float(fj.inertia_ratios(arm, [0, 0, 0]).min())  # a digit is lost
+    0.04
     """
     more = added_inertia(linkage, forces, q, jnp.zeros_like(q))
     matrix = None if more is None else more[0]
@@ -72,6 +82,11 @@ def inverse_dynamics(
     `forces`: force elements whose masses count. Their efforts do not.
 
     **Returns:** `tau` [N or N m].
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig5().linkage
+    >>> fj.inverse_dynamics(arm, [0, 0, 0], [0, 0, 0], [0, 0, 0]).tolist()  # held level
+    [58.86, 29.43, 9.81]
     """
     m = equations(link_constants(linkage, q), zeros(q), tuple(qd))
     matrix = jnp.array(
@@ -95,6 +110,12 @@ def link_energies(
     **Arguments:** `q` [m or rad], `qd` [m/s or rad/s].
 
     **Returns:** two arrays [J]; the potential is zero at the ground pivot's height.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig5().linkage
+    >>> kinetic, potential = fj.link_energies(arm, [0, 0, 0], [1.0, 0, 0])
+    >>> kinetic.tolist(), potential.tolist()
+    ([0.5, 2.0, 4.5], [0.0, 0.0, 0.0])
     """
     velocity, rate = mass_center_velocities(linkage, q, qd)
     kinetic = linkage.mass * jnp.sum(velocity**2, axis=1) + linkage.inertia * rate**2
@@ -115,6 +136,12 @@ def energy(
     energy counts, that of their masses and springs.
 
     **Returns:** two numbers [J]; the potential is zero at the ground pivot's height.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig5().linkage
+    >>> kinetic, potential = fj.energy(arm, [-1.5707963, 0, 0], [0, 0, 0])
+    >>> float(potential)  # 1 kg each hangs at 1, 2 and 3 m
+    -58.86
     """
     kinetic, potential = link_energies(linkage, q, qd)
     more_kinetic, more_potential = added_energy(linkage, forces, q, qd)

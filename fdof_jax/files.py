@@ -77,6 +77,13 @@ def save(path: str | os.PathLike, tree: Any) -> None:
     **Raises:** ValueError, which names the place in the tree, for what cannot be saved:
     a lambda or another function of one's own, a traced value, an object of another
     kind. It leaves no file, and an older one as it is.
+
+    >>> import fdof_jax as fj
+    >>> import os, tempfile
+    >>> path = os.path.join(tempfile.mkdtemp(), "fig7.fdof")
+    >>> fj.save(path, fj.scenes.fig7())
+    >>> fj.load(path).linkage.length.tolist()
+    [0.0, 1.0, 2.5, 1.0]
     """
     path = _checked(path)
     arrays: list[np.ndarray] = []

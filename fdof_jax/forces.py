@@ -120,6 +120,11 @@ class JointDamper(ScalarElement):
     [N s/m or N m s/rad].
 
     **Raises:** ValueError for malformed or negative coefficients.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig5().linkage
+    >>> fj.JointDamper([1, 2, 3])(0.0, [0, 0, 0], [1.0, 1.0, 1.0], arm).tolist()
+    [-1.0, -2.0, -3.0]
     """
 
     coefficient: Float[Array, " joint"]
@@ -147,6 +152,12 @@ class JointEffort(ScalarElement):
     **Arguments:** `tau`: one per joint [N or N m].
 
     **Raises:** ValueError for malformed efforts.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig5().linkage
+    >>> hold = fj.JointEffort(fj.holding_efforts(arm, [0, 0, 0]))
+    >>> hold(0.0, [0, 0, 0], [0, 0, 0], arm).tolist()
+    [58.86, 29.43, 9.81]
     """
 
     tau: Float[Array, " joint"]
@@ -173,6 +184,12 @@ class EffortHistory(ScalarElement):
     (time, 3) [N or N m].
 
     **Raises:** ValueError for malformed arguments.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig5().linkage
+    >>> history = fj.EffortHistory([0, 1], [[0, 0, 0], [2, 4, 6]])
+    >>> history(0.5, [0, 0, 0], [0, 0, 0], arm).tolist()
+    [1.0, 2.0, 3.0]
     """
 
     ts: Float[Array, " time"]

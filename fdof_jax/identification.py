@@ -43,6 +43,13 @@ def link_ends(scene: Scene, solution: Solution) -> Float[Array, "time link 2"]:
     **Arguments:** a scene and its solution.
 
     **Returns:** points (x, y) from the ground pivot [m].
+
+    >>> import fdof_jax as fj
+    >>> import numpy as np
+    >>> arm, start, *_ = fj.scenes.fig5()
+    >>> motion = fj.simulate(arm, start, np.linspace(0, 1, 101))
+    >>> fj.link_ends(fj.scenes.fig5(), motion)[0].tolist()
+    [[1.0, 0.0], [2.0, 0.0], [3.0, 0.0]]
     """
 
     def ends(q):
@@ -315,6 +322,19 @@ def fit_each(
     **Returns:** a list of `FitResult`s.
 
     **Raises:** ValueError as `fit`; TypeError for unknown keywords.
+
+    >>> import fdof_jax as fj
+    >>> import numpy as np
+    >>> arm, start, *_ = fj.scenes.fig3()
+    >>> def damped(p):
+    ...     return fj.Scene(arm, start, (fj.JointDamper(p["damping"]),), 1.0)
+    >>> ts = np.linspace(0, 1, 51)
+    >>> dampers = fj.JointDamper(15.0), fj.JointDamper(25.0)
+    >>> motions = [fj.simulate(arm, start, ts, (damper,)) for damper in dampers]
+    >>> markers = np.stack([fj.link_ends(damped({"damping": 1.0}), m) for m in motions])
+    >>> found = fj.fit_each(damped, {"damping": 20.0}, ts, markers)
+    >>> [float(each.parameters["damping"]) for each in found]
+    [15.0, 25.0]
     """
     recordings = np.shape(observed)[:1]
     if not recordings or recordings[0] == 0:

@@ -24,6 +24,12 @@ def to_mjcf(linkage: Linkage) -> str:
     **Returns:** the XML text.
 
     **Raises:** ValueError for a traced or batched linkage.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig7().linkage
+    >>> text = fj.to_mjcf(arm)
+    >>> text.count('type="hinge"'), text.count('type="slide"')
+    (2, 1)
     """
     check_linkage(linkage)
     if is_traced(linkage):

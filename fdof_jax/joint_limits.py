@@ -28,6 +28,12 @@ class JointStops(ScalarElement):
     - `smoothing`: positive [m or rad].
 
     **Raises:** ValueError for malformed arguments, and unless lower < upper.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig5().linkage
+    >>> stops = fj.JointStops(-1.0, 1.0, stiffness=1e4)
+    >>> stops(0.0, [0.0, 1.01, -1.01], [0, 0, 0], arm).tolist()
+    [0.0, -100.0, 100.0]
     """
 
     lower: Float[Array, " joint"]
@@ -118,6 +124,11 @@ class JointFriction(ScalarElement):
     - `speed`: positive [m/s or rad/s].
 
     **Raises:** ValueError for malformed arguments.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig5().linkage
+    >>> fj.JointFriction(5)(0.0, [0, 0, 0], [0.0, 0.01, -1.0], arm).tolist()
+    [0.0, -3.808, 5.0]
     """
 
     level: Float[Array, " joint"]

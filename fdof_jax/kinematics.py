@@ -40,6 +40,11 @@ def joint_positions(
     **Arguments:** `q`: joint positions [m or rad].
 
     **Returns:** one point (x, y) per joint [m], from the ground pivot.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig5().linkage
+    >>> fj.joint_positions(arm, [0.0, 1.5707963, 0.0]).tolist()
+    [[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]]
     """
     return _plane(_chain(linkage, q)[2])
 
@@ -51,6 +56,11 @@ def mass_centers(linkage: Linkage, q: Float[Array, " joint"]) -> Float[Array, "l
     **Arguments:** `q`: joint positions [m or rad].
 
     **Returns:** one point (x, y) per moving link [m], from the ground pivot.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig5().linkage
+    >>> fj.mass_centers(arm, [0.0, 1.5707963, 0.0]).tolist()
+    [[1.0, 0.0], [1.0, 1.0], [1.0, 2.0]]
     """
     _, e, start = _chain(linkage, q)
     offset = jax.lax.complex(linkage.com[:, 0], linkage.com[:, 1])
@@ -84,6 +94,11 @@ def tip_position(linkage: Linkage, q: Float[Array, " joint"]) -> Float[Array, " 
     **Arguments:** `q`: joint positions [m or rad].
 
     **Returns:** the point (x, y) [m], from the ground pivot.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig5().linkage
+    >>> fj.tip_position(arm, [0.0, 1.5707963, 0.0]).tolist()
+    [1.0, 2.0]
     """
     _, e, start = _chain(linkage, q)
     return _plane(start[2] + linkage.length[3] * e[3])
@@ -98,6 +113,11 @@ def tip_jacobian(
     **Arguments:** `q`: joint positions [m or rad].
 
     **Returns:** rows x, y [m or 1] and orientation [rad] per joint [m or rad].
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig5().linkage
+    >>> fj.tip_jacobian(arm, [0.0, 0.0, 0.0]).tolist()  # stretched: no motion along x
+    [[0.0, 0.0, 0.0], [3.0, 2.0, 1.0], [1.0, 1.0, 1.0]]
     """
     _, e, start = _chain(linkage, q)
     tip = start[2] + linkage.length[3] * e[3]
@@ -262,6 +282,12 @@ def inverse_kinematics(
 
     **Raises:** ValueError for malformed arguments and, where they are concrete, for a
     point out of reach.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig7().linkage
+    >>> q = fj.inverse_kinematics(arm, tip=[-5, 2], orientation=1.5707963)
+    >>> q.tolist(), fj.tip_position(arm, q).tolist()
+    ([1.571, 2.5, -1.571], [-5.0, 2.0])
     """
     check_linkage(linkage)
     tip = real_array("tip", tip, (2,))

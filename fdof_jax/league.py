@@ -45,6 +45,12 @@ def circle_scenes() -> dict[str, Scene]:
     at rest in the same configuration, their tip 5 cm inside the circle of 0.25 m, and
     keep the angle of their last link. What differs is which joint of each pair is real.
     Gains and limits (150 N m or N) are the same for all joints of a kind.
+
+    >>> import fdof_jax as fj
+    >>> scenes = fj.circle_scenes()
+    >>> starts = [fj.tip_position(s.linkage, s.state0.q) for s in scenes.values()]
+    >>> starts[0].tolist(), starts[-1].tolist()  # the same for all
+    ([1.994, 1.151], [1.994, 1.151])
     """
     found = {}
     for topology in TOPOLOGIES:
@@ -67,6 +73,15 @@ def league_table(results: Mapping[str, TuneResult]) -> str:
     """Tip errors and efforts before and after tuning, the best first.
 
     **Arguments:** `results` by name, those of `tune_each` for instance.
+
+    >>> import fdof_jax as fj
+    >>> scenes = fj.circle_scenes()
+    >>> pair = {name: scenes[name]._replace(t1=1.0) for name in ("PPR", "RRR")}
+    >>> print(fj.league_table(fj.tune_each(pair, max_steps=2)))
+           rms tip error [mm]     effort [% of limit]        gains
+               start       tuned       start       tuned at bounds
+    PPR         15.2       7.671       6.762       14.51       2/6
+    RRR        147.9       29.32          13       13.15       6/6
     """
     rows = [
         f"{'':4}{'rms tip error [mm]':^24}{'effort [% of limit]':^24}{'gains':>10}",

@@ -66,6 +66,14 @@ def linearize(
     kinks the slope where it is: a controller at its limit has no gains.
 
     **Raises:** ValueError for malformed arguments.
+
+    >>> import fdof_jax as fj
+    >>> import numpy as np
+    >>> arm, start, *_ = fj.scenes.fig5()
+    >>> hanging = start._replace(q=np.array([-np.pi / 2, 0, 0]))
+    >>> linear = fj.linearize(arm, (), hanging)
+    >>> np.sort(abs(np.linalg.eigvals(linear.A)))[::2].tolist()  # modes [rad/s]
+    [2.02, 4.744, 7.855]
     """
     _check(linkage, forces)
     q, qd = map(jnp.asarray, real_state("state", state))
@@ -88,6 +96,14 @@ class Modes(eqx.Module):
     """The eigenvalues of A along a motion, the fastest last.
 
     - `eigenvalues`: (time, 6) [1/s]; NaN where the motion is.
+
+    >>> import fdof_jax as fj
+    >>> import numpy as np
+    >>> arm, start, forces, _ = fj.scenes.fig7()
+    >>> motion = fj.simulate(arm, start, np.linspace(0, 1, 101), forces)
+    >>> modes = fj.closed_loop_modes(arm, forces, motion)
+    >>> modes.eigenvalues.shape, float(modes.longest_step[-1])  # [s]
+    ((101, 6), 0.022)
     """
 
     eigenvalues: Complex[np.ndarray, "time 6"]
@@ -130,6 +146,14 @@ def closed_loop_modes(linkage: Linkage, forces: Forces, solution: Solution) -> M
     longest step of an explicit method [s].
 
     **Raises:** ValueError for malformed arguments.
+
+    >>> import fdof_jax as fj
+    >>> import numpy as np
+    >>> arm, start, forces, _ = fj.scenes.fig7()
+    >>> motion = fj.simulate(arm, start, np.linspace(0, 1, 101), forces)
+    >>> modes = fj.closed_loop_modes(arm, forces, motion)
+    >>> modes.frequency[-1].tolist()  # [rad/s]
+    [5.943, 5.943, 20.677, 20.677, 118.149, 118.149]
     """
     _check(linkage, forces)
     instance("solution", solution, Solution)
@@ -164,6 +188,11 @@ def equilibrium(
     stable: see `linearize`.
 
     **Raises:** ValueError for malformed arguments.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig5().linkage
+    >>> fj.equilibrium(arm, (), [-1.0, 0.1, 0.1]).tolist()  # it hangs
+    [-1.571, 0.0, 0.0]
     """
     _check(linkage, forces)
     return _rest(linkage, forces, real_array("q", q, (3,)), real_array("t", t, ()))
@@ -202,6 +231,11 @@ def holding_efforts(
     whose masses are held too.
 
     **Raises:** ValueError for malformed arguments.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig5().linkage
+    >>> fj.holding_efforts(arm, [0, 0, 0]).tolist()
+    [58.86, 29.43, 9.81]
     """
     still = jnp.zeros(3)
     return inverse_dynamics(linkage, q, still, still, forces)
@@ -214,6 +248,11 @@ def inertial_parameters(linkage: Linkage) -> Float[Array, "link 4"]:
     characteristic point of the link.
 
     **Raises:** ValueError for what is not a linkage.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig3().linkage
+    >>> fj.inertial_parameters(arm)[0].tolist()  # m, m p, m q, I about the pivot
+    [5.0, 2.5, -5.0, 6.25]
     """
     check_linkage(linkage)
     m, (p, q) = linkage.mass, linkage.com.T
@@ -240,6 +279,15 @@ def regressor(
     accelerations (3,) [m or rad, and per s and s^2].
 
     **Raises:** ValueError for malformed arguments.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig5().linkage
+    >>> import numpy as np
+    >>> state = [0.1, 0.2, 0.3], [1, 0, -1], [0.5, 0.5, 0.5]
+    >>> np.tensordot(fj.regressor(arm, *state), fj.inertial_parameters(arm), 2).tolist()
+    [68.982, 35.32, 11.766]
+    >>> fj.inverse_dynamics(arm, *state).tolist()
+    [68.982, 35.32, 11.766]
     """
 
     def parts(q):

@@ -78,8 +78,9 @@ def existence_factors(topology: str) -> Float[Array, " 6"]:
 
     **Raises:** ValueError for any other name.
 
-    >>> existence_factors("RPR").astype(int).tolist()
-    [0, 1, 1, 0, 0, 1]
+    >>> import fdof_jax as fj
+    >>> fj.existence_factors("RPR").tolist()
+    [0.0, 1.0, 1.0, 0.0, 0.0, 1.0]
     """
     instance("topology", topology, str)
     pairs = _pairs_of(topology)
@@ -113,8 +114,9 @@ class Linkage(eqx.Module):
     which the mass matrix may be singular, and where two joints do the same thing
     (the paper's rules (i) and (ii)).
 
-    >>> pendulum = Linkage("RRR", length=[0, 1, 1, 1], com=[[1, 0]] * 3,
-    ...                    mass=[1, 1, 1], inertia=[0, 0, 0])
+    >>> import fdof_jax as fj
+    >>> pendulum = fj.Linkage("RRR", length=[0, 1, 1, 1], com=[[1, 0]] * 3,
+    ...                       mass=[1, 1, 1], inertia=[0, 0, 0])
     >>> pendulum.mass.shape
     (3,)
     """
@@ -184,6 +186,12 @@ class State(NamedTuple):
 
     `q`: the slide B_k [m] of a prismatic joint, the relative angle th_{k+1} - th_k
     [rad] of a revolute joint, in joint order (3,). `qd`: their rates (3,).
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig5().linkage
+    >>> start = fj.State(q=[0.5, 0, 0], qd=[0, 0, 0])
+    >>> fj.tip_position(arm, start.q).tolist()
+    [2.633, 1.438]
     """
 
     q: ArrayLike
@@ -291,6 +299,12 @@ def to_chain(
     **Arguments:** `q`, `qd`: joint positions [m or rad] and velocities.
 
     **Returns:** `x` [m, rad] and `xd` [m/s, rad/s].
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig7().linkage
+    >>> x, xd = fj.to_chain(arm, [0.5, 2.5, 0.0], [1.0, 0.0, 0.0])
+    >>> x.tolist(), xd.tolist()  # a slide keeps its angle
+    ([0.0, 0.5, 2.5, 2.071, 0.0, 2.071], [0.0, 1.0, 0.0, 1.0, 0.0, 1.0])
     """
     revolute = jnp.stack(real_joints(linkage.ef))
     slide = jnp.where(revolute, linkage.locked, q)
@@ -322,7 +336,8 @@ def from_chain(
     fictitious joint (the paper's method stops accelerations only: such a start would
     drift).
 
-    >>> locked, state = from_chain("RPR", [0, 1.5, 2.5, 2.5, 0, 2], [0] * 6)
+    >>> import fdof_jax as fj
+    >>> locked, state = fj.from_chain("RPR", [0, 1.5, 2.5, 2.5, 0, 2], [0] * 6)
     >>> locked.tolist(), state.q.tolist()
     ([0.0, 1.0, 0.0], [1.5, 2.5, -0.5])
     """

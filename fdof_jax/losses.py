@@ -34,6 +34,14 @@ def tip_errors(scene: Scene, solution: Solution) -> Float[Array, " residual"]:
     solution.
 
     **Returns:** x and y components [m], each over the root of the number of times.
+
+    >>> import fdof_jax as fj
+    >>> import numpy as np
+    >>> arm, start, forces, _ = fj.scenes.fig7()
+    >>> motion = fj.simulate(arm, start, np.linspace(0, 1, 101), forces)
+    >>> errors = fj.tip_errors(fj.scenes.fig7(), motion)
+    >>> float((errors**2).sum() ** 0.5)  # rms over the first second [m]
+    0.351
     """
     task: Any = controller_of(scene).reference
     deviation = tip_deviation(scene.linkage, task, solution)
@@ -67,6 +75,14 @@ class Tracking(eqx.Module):
     - `effort_rate`: what a change by the full effort per second is worth [m^2 s^2].
 
     **Raises:** ValueError for malformed or negative prices.
+
+    >>> import fdof_jax as fj
+    >>> import numpy as np
+    >>> arm, start, forces, _ = fj.scenes.fig7()
+    >>> motion = fj.simulate(arm, start, np.linspace(0, 1, 101), forces)
+    >>> residuals = fj.Tracking(effort=0.1)(fj.scenes.fig7(), motion)
+    >>> float((residuals**2).sum())  # [m^2]
+    0.15
     """
 
     effort: Float[Array, ""]

@@ -74,6 +74,15 @@ class GravityFeedforward(_ModelBased):
       other force elements, of a load for instance, are unknown to it.
 
     **Raises:** ValueError for malformed arguments.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig7().linkage
+    >>> task = fj.CircleTask()
+    >>> q, qd = task(0.0, arm)  # no error is left to correct
+    >>> fj.GravityFeedforward(500, 50, 500, task)(0.0, q, qd, arm).tolist()
+    [-93.195, 0.0, 0.0]
+    >>> fj.holding_efforts(arm, q).tolist()
+    [-93.195, 0.0, 0.0]
     """
 
     def unlimited(self, scheduled, q, qd, linkage):
@@ -121,6 +130,14 @@ class ComputedTorque(_ModelBased):
       it.
 
     **Raises:** ValueError for malformed arguments.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig7().linkage
+    >>> stand = fj.JointMove([1, 2, 0], [1, 2, 0], fj.Travel(1.0))
+    >>> control = fj.ComputedTorque(kp=25, kd=10, limit=500, reference=stand)
+    >>> tau = control(0.0, stand.end - 0.1, stand.end * 0, arm)
+    >>> fj.forward_dynamics(arm, stand.end - 0.1, [0, 0, 0], tau).tolist()  # kp / 10
+    [2.5, 2.5, 2.5]
     """
 
     gain_units: ClassVar = dict.fromkeys("RP", ("1/s^2", "1/s"))

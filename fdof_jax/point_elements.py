@@ -70,6 +70,12 @@ class SpringDamper(LineElement):
       neither does anything on the other side of the rest length. False: both.
 
     **Raises:** ValueError for malformed arguments.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig5().linkage
+    >>> spring = fj.SpringDamper(fj.Point(0, 0, 2), fj.Point(1, 1), stiffness=20)
+    >>> float(spring.potential_energy([0, 0, 0], arm))  # stretched to sqrt(5) m
+    50.0
     """
 
     ends: Separation
@@ -128,6 +134,12 @@ class Tension(LineElement):
     together [N].
 
     **Raises:** ValueError for malformed arguments.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig5().linkage
+    >>> rope = fj.Tension(fj.Point(0, 1, 2), fj.Point(1, 1), tension=10)
+    >>> rope(0.0, [0.0, 0.0, 0.0], [0.0, 0.0, 0.0], arm).tolist()  # straight up
+    [10.0, 0.0, 0.0]
     """
 
     ends: Separation
@@ -156,6 +168,12 @@ class Wrench(PointElement):
     - `follows`: whether the force turns with the link: it is then (along, across).
 
     **Raises:** ValueError for malformed arguments.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig5().linkage
+    >>> push = fj.Wrench(fj.Point(3, 1), force=[0, 10], moment=1)
+    >>> push(0.0, [0.0, 0.0, 0.0], [0.0, 0.0, 0.0], arm).tolist()  # levers 3, 2, 1 m
+    [31.0, 21.0, 11.0]
     """
 
     point: Point

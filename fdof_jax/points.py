@@ -82,6 +82,12 @@ class Point(eqx.Module):
       its vector A (the ground's: the base angle) [m].
 
     **Raises:** ValueError for another link or malformed numbers.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig5().linkage
+    >>> import jax.numpy as jnp
+    >>> fj.Point(1, along=1, across=0.5).position(arm, jnp.zeros(3)).tolist()
+    [1.0, 0.5]
     """
 
     link: Int[Array, ""]
@@ -147,6 +153,14 @@ class PointElement(ScalarElement):
 
     A subclass implements `loads` [N and N m]. Unlike efforts in the joints, which pass
     through them, these loads are carried by the bearings: see `joint_reactions`.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig5().linkage
+    >>> class Weight(fj.PointElement):
+    ...     def loads(self, scheduled, frames, qd):
+    ...         return (fj.Load(fj.Point(3, 1.0), force=-10j),)  # downwards at the tip
+    >>> Weight()(0.0, [0.0, 0.0, 0.0], [0.0, 0.0, 0.0], arm).tolist()
+    [-30.0, -20.0, -10.0]
     """
 
     @abstractmethod

@@ -79,6 +79,13 @@ def joint_reactions(
 
     **Raises:** ValueError if `forces` is not a tuple of force elements, and for an
     element that moves masses without saying by which `loads`.
+
+    >>> import fdof_jax as fj
+    >>> import numpy as np
+    >>> arm, start, *_ = fj.scenes.fig5()
+    >>> motion = fj.simulate(arm, start, np.linspace(0, 1, 101))
+    >>> fj.joint_reactions(arm, (), motion)[:2, 0, :2].tolist()  # in free fall at first
+    [[0.0, 0.0], [-0.043, 0.0]]
     """
     efforts = joint_efforts(linkage, forces, solution)
     return _along(linkage, forces, solution, efforts.total)

@@ -23,6 +23,13 @@ class JointMove(eqx.Module):
     **Arguments:** `start`, `end`: joint positions [m or rad]; `travel`: a `Travel`.
 
     **Raises:** ValueError for malformed arguments.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig5().linkage
+    >>> move = fj.JointMove([0, 0, 0], [1, 2, 3], fj.Travel(2.0))
+    >>> q, qd = move(1.0, arm)
+    >>> q.tolist(), qd.tolist()  # halfway, at 15/8 of the mean speed
+    ([0.5, 1.0, 1.5], [0.938, 1.875, 2.812])
     """
 
     start: Float[Array, " joint"]
@@ -51,7 +58,17 @@ class JointMove(eqx.Module):
 
 
 class Path(eqx.Module):
-    """A curve of the plane [m]: a subclass has `point`, and says its `middle`."""
+    """A curve of the plane [m]: a subclass has `point`, and says its `middle`.
+
+    >>> import fdof_jax as fj
+    >>> import jax.numpy as jnp
+    >>> class Parabola(fj.Path):
+    ...     middle = jnp.array([-4.0, 2.0])
+    ...     def point(self, share):
+    ...         return jnp.stack([share - 4.5, 2 + share**2])
+    >>> fj.TipTask(Parabola(), fj.Travel(1.0)).tip(0.5).tolist()
+    [-4.0, 2.25]
+    """
 
     middle: eqx.AbstractVar[Array]  # (x, y), somewhere in the midst of it [m]
 
@@ -66,6 +83,10 @@ class Line(Path):
     **Arguments:** `start`, `end`: points (x, y) [m].
 
     **Raises:** ValueError for malformed points.
+
+    >>> import fdof_jax as fj
+    >>> fj.Line([0, 0], [2, 4]).point(0.25).tolist()
+    [0.5, 1.0]
     """
 
     start: Float[Array, " 2"]
@@ -108,6 +129,10 @@ class Ellipse(_Closed):
     `tilt`: of the first axis [rad].
 
     **Raises:** ValueError for malformed arguments.
+
+    >>> import fdof_jax as fj
+    >>> fj.Ellipse([1, 0], [2, 1]).point(0.25).tolist()  # a quarter of the way round
+    [1.0, 1.0]
     """
 
     def point(self, share):
@@ -122,6 +147,11 @@ class FigureEight(_Closed):
     half of its height, not negative [m]; `tilt`: of its length [rad].
 
     **Raises:** ValueError for malformed arguments.
+
+    >>> import fdof_jax as fj
+    >>> eight = fj.FigureEight([0, 0], [2, 1])
+    >>> [eight.point(share).tolist() for share in (0, 0.25, 0.5)]
+    [[0.0, 0.0], [2.0, 0.0], [0.0, 0.0]]
     """
 
     def point(self, share):
@@ -136,6 +166,10 @@ class Spline(Path):
     the last back to the first. An open one is straight at its ends.
 
     **Raises:** ValueError for malformed arguments.
+
+    >>> import fdof_jax as fj
+    >>> fj.Spline([[0, 0], [1, 1], [2, 0]]).point(0.5).tolist()
+    [1.0, 1.0]
     """
 
     points: Float[Array, "n 2"]
@@ -195,6 +229,14 @@ class TipTask(eqx.Module):
 
     **Raises:** ValueError for malformed arguments; `check`, and with it `simulate`, for
     a path out of the linkage's reach.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig7().linkage
+    >>> line = fj.Line([-4, 2], [-3, 2])
+    >>> task = fj.TipTask(line, fj.Travel(1.0), orientation=1.5707963)
+    >>> q, qd = task(0.5, arm)
+    >>> fj.tip_position(arm, q).tolist()
+    [-3.5, 2.0]
     """
 
     path: Path

@@ -15,6 +15,11 @@ class Scene(NamedTuple):
 
     - `linkage`, `state0`, `forces`: the arguments of `simulate`.
     - `t1`: end time, the start being 0 [s].
+
+    >>> import fdof_jax as fj
+    >>> scene = fj.scenes.fig7()
+    >>> scene.t1, type(scene.forces[0]).__name__
+    (10.0, 'PDController')
     """
 
     linkage: Linkage
@@ -28,6 +33,11 @@ def fig3() -> Scene:
 
     Gravity is not printed: 9.81 m/s^2. The damping acts on the relative rates of the
     revolute joints.
+
+    >>> import fdof_jax as fj
+    >>> scene = fj.scenes.fig3()
+    >>> scene.t1, scene.linkage.mass.tolist(), scene.forces[0].coefficient.tolist()
+    (20.0, [5.0, 2.0, 1.0], [20.0, 20.0, 20.0])
     """
     linkage = Linkage(
         "RRR",
@@ -44,6 +54,11 @@ def fig5() -> Scene:
     """Figs 5 and 6: a conservative triple pendulum of point masses, from rest.
 
     Gravity is not printed: 9.81 m/s^2.
+
+    >>> import fdof_jax as fj
+    >>> arm, start, forces, t1 = fj.scenes.fig5()
+    >>> sum(map(float, fj.energy(arm, *start))), forces  # conservative, from rest
+    (0.0, ())
     """
     linkage = Linkage(
         "RRR",
@@ -60,6 +75,11 @@ def fig7() -> Scene:
 
     The initial angles are absolute and the list's second "THETA 4" is theta 1; gravity
     and the circle are not printed: 9.81 m/s^2, and `CircleTask`'s default, our choice.
+
+    >>> import fdof_jax as fj
+    >>> arm, start, (control,), t1 = fj.scenes.fig7()
+    >>> control(0.0, *start, arm).tolist()  # the slide's force is at its limit
+    [15.873, -300.0, -9.921]
     """
     locked, state0 = from_chain(
         "RPR", [0, np.pi / 2, 2.5, np.pi, 0, np.pi / 2], np.zeros(6)

@@ -23,6 +23,13 @@ class Solution(eqx.Module):
       the reason of the failure, which `outcome` says in a word or two.
     - `own`: the states of the `StatefulElement`s at `ts`, in their order; each as its
       `initial_state`, with time as first axis.
+
+    >>> import fdof_jax as fj
+    >>> import numpy as np
+    >>> arm, start, *_ = fj.scenes.fig5()
+    >>> motion = fj.simulate(arm, start, np.linspace(0, 1, 101))
+    >>> motion.outcome.item(), motion.q.shape, float(motion.stats["time_reached"])
+    ('successful', (101, 3), 1.0)
     """
 
     ts: Float[Array, " time"]

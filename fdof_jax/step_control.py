@@ -289,6 +289,12 @@ def scale_tolerances(
 
     **Raises:** ValueError for a controller that is not adaptive, a scale that is not
     positive, or a linkage of no size without `scale`.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig5().linkage
+    >>> controller = fj.scale_tolerances(arm)
+    >>> [float(unit) for unit in controller.unit[1]]  # of rates: 1 / sqrt(L/g) [1/s]
+    [1.279, 1.279, 1.279]
     """
     check_linkage(linkage)
     controller = default_controller() if controller is None else controller

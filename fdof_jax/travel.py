@@ -47,6 +47,11 @@ class Travel(eqx.Module):
       both ends; see `shock_against`.
 
     **Raises:** ValueError for malformed arguments.
+
+    >>> import fdof_jax as fj
+    >>> harmonic = fj.Travel(2.0, profile="harmonic")
+    >>> [float(harmonic(t)) for t in (0, 0.5, 1, 3)]
+    [0.0, 0.146, 0.5, 1.0]
     """
 
     duration: Float[Array, ""]
@@ -90,6 +95,10 @@ class Laps(eqx.Module):
     where it starts, as a share of a lap.
 
     **Raises:** ValueError for malformed arguments.
+
+    >>> import fdof_jax as fj
+    >>> [float(fj.Laps(period=4)(t)) for t in (1, 4, 10)]
+    [0.25, 1.0, 2.5]
     """
 
     period: Float[Array, ""]
@@ -119,6 +128,11 @@ def shock_against(travel: Travel, frequency: ArrayLike) -> Float[Array, ""]:
 
     **Raises:** ValueError for malformed arguments, and for more than 250 rad of the
     load's own motion in a travel; NaN if that is traced.
+
+    >>> import fdof_jax as fj
+    >>> travel = fj.Travel(1.5, profile="harmonic")
+    >>> float(fj.shock_against(travel, frequency=8.0))
+    2.934
     """
     if not isinstance(travel, Travel):
         raise ValueError(f"travel: expected a Travel, got {travel!r}.")

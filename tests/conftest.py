@@ -18,6 +18,13 @@ jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
 HARD = Path(__file__).parent / "hard"
+# Doctests that compile searches.
+SEARCHES = {
+    "fdof_jax.identification.fit_each",
+    "fdof_jax.league.league_table",
+    "fdof_jax.optimal_efforts.optimal_efforts",
+    "fdof_jax.tuning.tune_each",
+}
 # Scripts that need more than the tests do.
 collect_ignore_glob = ["hard/make_*.py"]
 
@@ -77,5 +84,6 @@ def tuned():
 def pytest_collection_modifyitems(items):
     """The hard scenes are slow, as most compile programs of their own."""
     for item in items:
-        if item.path.parent == HARD and item.path.stem != "test_fuzz":
+        hard = item.path.parent == HARD and item.path.stem != "test_fuzz"
+        if hard or item.name in SEARCHES:
             item.add_marker(pytest.mark.slow)

@@ -2,11 +2,14 @@
 
 import inspect
 import re
+from pathlib import Path
 
 import pytest
 
 import fdof_jax as fj
-from fdof_jax import scenes
+from fdof_jax import drawing, plotting, scenes
+
+ROOT = Path(__file__).parents[1]
 
 PUBLIC = {
     name: value
@@ -59,3 +62,69 @@ def test_the_front_door_is_complete():
     inverse_kinematics JointDamper JointEffort PDController CircleTask simulate Solution
     joint_efforts to_mjcf Scene scenes tune TuneResult __version__""".split()
     assert not [name for name in names if not hasattr(fj, name)]
+
+
+# Every name that a user may import: with its module, where that is not `fdof_jax`.
+NAMES = [
+    *(
+        name for name, value in vars(fj).items()
+        if name[0] != "_" and not inspect.ismodule(value)
+    ),
+    *(f"scenes.{name}" for name in ("fig3", "fig5", "fig7")),
+    "interactive.sliders",
+    *(
+        f"{module.__name__.split('.')[1]}.{name}"
+        for module in (drawing, plotting)
+        for name, value in inspect.getmembers(module, inspect.isfunction)
+        if value.__module__ == module.__name__
+        # Pictures draw into what they are given, or into something new.
+        and {"ax", "fig"} & {
+            p.name for p in inspect.signature(value).parameters.values()
+            if p.default is None
+        }
+    ),
+]  # fmt: skip
+# What the users of these functions do not make themselves.
+RETURNED_BY = {
+    "FitResult": "fit",
+    "GradientReport": "gradient_report",
+    "Efforts": "joint_efforts",
+    "Linearization": "linearize",
+    "Modes": "closed_loop_modes",
+    "OptimalMotion": "optimal_efforts",
+    "SampledMotion": "simulate_sampled",
+    "Solution": "simulate",
+    "TradeOff": "trade_off",
+    "TuneResult": "tune",
+}
+
+
+def examples():
+    """All code that tests run as examples: doctests, and the blocks of the guides."""
+    sources = (ROOT / "fdof_jax").glob("*.py")
+    lines = [
+        re.findall(r"^ *(?:>>>|\.\.\.) (.*)", p.read_text(), re.M) for p in sources
+    ]
+    guides = [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]
+    blocks = [re.findall(r"```python\n(.*?)```", p.read_text(), re.S) for p in guides]
+    return "\n".join(line for group in lines + blocks for line in group)
+
+
+def test_every_name_has_an_example():
+    ran = examples()
+    for name in NAMES:
+        short = name.split(".")[-1]
+        maker = RETURNED_BY.get(name, short)
+        assert re.search(
+            rf"\b(fj|scenes|drawing|plotting|interactive)\.{maker}\b", ran
+        ), name
+        if name in RETURNED_BY:
+            assert name in inspect.signature(vars(fj)[maker]).return_annotation.__name__
+
+
+def test_every_name_has_a_place_in_the_reference():
+    pages = "".join(path.read_text() for path in (ROOT / "docs" / "api").glob("*.md"))
+    listed = re.findall(r"^::: fdof_jax\.(\S+)$", pages, re.M)
+    # The site's tool takes `fdof_jax.sweep` for the module of that name.
+    listed[listed.index("sweep.sweep")] = "sweep"
+    assert sorted(listed) == sorted(NAMES)

@@ -246,6 +246,17 @@ BATCH = made_up(SOLUTION.ts, jnp.stack([SOLUTION.q] * 2))
 NOWHERE = made_up(SOLUTION.ts, SOLUTION.q * jnp.nan)
 
 
+def test_animated_panels_keep_their_limits_silently(caplog):
+    solution = swinging()
+    pairs = {t: (make_linkage(t), solution) for t in ("RRR", "PRR", "PPR")}
+    animation = drawing.animate_grid(pairs, fps=2)
+    axes = plt.gcf().axes
+    before = [(ax.get_xlim(), ax.get_ylim()) for ax in axes]
+    animation.to_jshtml()
+    assert [(ax.get_xlim(), ax.get_ylim()) for ax in axes] == before
+    assert caplog.text == ""  # matplotlib complains of limits that it cannot keep
+
+
 @pytest.mark.parametrize(
     "name, call",
     [

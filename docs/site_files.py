@@ -1,0 +1,49 @@
+"""Brings into the site what lies outside of docs/: a hook of MkDocs."""
+
+import re
+from importlib.resources import files as package_files
+from pathlib import Path
+
+from mkdocs.plugins import event_priority
+from mkdocs.structure.files import File
+
+ROOT = Path(__file__).parents[1]
+NOTEBOOKS = ["notebooks/README.md", *sorted(
+    path.relative_to(ROOT).as_posix() for path in ROOT.glob("notebooks/*.ipynb")
+)]  # fmt: skip
+
+
+def on_config(config):
+    for entry in config.nav:
+        if "Notebooks" in entry:
+            entry["Notebooks"] = NOTEBOOKS
+
+
+@event_priority(50)  # before the plugins, one of which takes the notebooks
+def on_files(files, config):
+    pages = ["README.md", "benchmarks/README.md", *NOTEBOOKS]
+    pictures = [
+        path.relative_to(ROOT).as_posix()
+        for path in ROOT.glob("benchmarks/results/*.png")
+    ]
+    mathjax = Path(str(package_files("jupyter_server_mathjax"))) / "static"
+    for uri in [*pages, *pictures]:
+        files.append(File(uri, str(ROOT), config.site_dir, config.use_directory_urls))
+    for path in mathjax.rglob("*"):
+        if path.is_file() and "a11y" not in path.parts:
+            uri = f"mathjax/{path.relative_to(mathjax).as_posix()}"
+            files.append(File.generated(config, uri, abs_src_path=str(path)))
+
+
+def on_page_markdown(markdown, page, **_):
+    """What lies in docs/ is at the top of the site."""
+    return re.sub(r"(\]\((?:\.\./)*)docs/", r"\1", markdown)
+
+
+def on_page_content(html, page, **_):
+    """Links of notebooks to files lead to their pages."""
+    if page.file.src_uri.endswith(".ipynb"):
+        html = re.sub(r'(href="(?:\.\./)*)docs/', r"\1", html)
+        html = re.sub(r'(href="(?!https?:)[^"]*?)README\.md', r"\1index.html", html)
+        html = re.sub(r'(href="(?!https?:)[^"]*?)\.(?:md|ipynb)\b', r"\1.html", html)
+    return html

@@ -1,0 +1,147 @@
+"""Sliders: what a move changes, that it compiles nothing, and how failures are told."""
+
+import subprocess
+import sys
+from io import BytesIO
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+
+import fdof_jax as fj
+from fdof_jax import integration, scenes
+from fdof_jax.interactive import sliders
+from fdof_jax.tuning import with_gains
+
+CIRCLES = fj.circle_scenes()
+CONTROLLER = CIRCLES["RRR"].forces[0]
+STIFF = with_gains(CIRCLES["RRR"], np.full((2, 3), 1e9))
+
+
+class Box:
+    """The box with its parts by what is written beside them."""
+
+    def __init__(self, *arguments):
+        controls, (self.image, self.words) = [
+            part.children for part in sliders(*arguments).children
+        ]
+        named = {getattr(part, "description", ""): part for part in controls}
+        self.parts = {name: part for name, part in named.items() if name}
+
+    def move(self, **values):
+        for name, value in values.items():
+            self.parts[name.replace("_", " ")].value = value
+        return self.pixels
+
+    @property
+    def pixels(self):
+        return plt.imread(BytesIO(self.image.value), format="png")
+
+
+@pytest.fixture(scope="module")
+def all_arms():
+    return Box({**CIRCLES, "stiff": STIFF})
+
+
+@pytest.fixture
+def box(all_arms):
+    """The same in each test: only its first motion is compiled."""
+    for part in all_arms.parts.values():
+        if hasattr(part, "min"):
+            part.value = 1.0
+    all_arms.move(arm="RRR")
+    return all_arms
+
+
+def test_every_slider_changes_picture_and_words(box):
+    for name in ("A2", "A3", "A4", "kp 1", "kp 2", "kp 3", "kd 1", "kd 2", "kd 3"):
+        before, words = box.pixels, box.words.value
+        after = box.move(**{name: 1.2})
+        assert after.shape == before.shape
+        assert np.abs(after - before).max() > 0.5, name
+        assert box.words.value != words, name
+    assert "600 N m/rad" in box.words.value and "A3 = 0.96 m" in box.words.value
+
+
+@pytest.mark.slow
+def test_the_error_is_that_of_a_simulation(box):
+    box.move(kp_1=2.0)
+    gains = np.stack([CONTROLLER.kp, CONTROLLER.kd])
+    gains[0, 0] *= 2
+    scene = with_gains(CIRCLES["RRR"], gains)
+    ts = np.linspace(0, 4, 201)
+    solution = fj.simulate(scene.linkage, scene.state0, ts, scene.forces)
+    rms = np.sqrt((np.asarray(fj.tip_errors(scene, solution)) ** 2).sum())
+    assert f"rms {1e3 * rms:.3g} mm" in box.words.value
+
+
+def test_nothing_is_compiled_after_the_first_picture(box, monkeypatch):
+    monkeypatch.setattr(integration, "vector_field", None)  # no second trace
+    shown = {name: box.move(arm=name, A2=1.1).tobytes() for name in fj.TOPOLOGIES}
+    assert len(set(shown.values())) == 7
+
+
+def test_choosing_an_arm_keeps_the_sliders(box):
+    box.move(A2=1.1, kp_1=2.0, arm="PPR")
+    assert "A2 = 1.1 m" in box.words.value and "4000 N/m" in box.words.value
+
+
+def test_the_way_of_the_sliders_does_not_matter(box):
+    """Axes that are kept as pixels leave no trace of what was shown before."""
+    there = box.move(arm="PRR", A3=1.3)
+    back = box.move(A3=1.0)
+    assert np.abs(there - back).max() > 0.5
+    box.move(arm="RRR")
+    np.testing.assert_array_equal(box.move(arm="PRR"), box.move(arm="PRR"))
+    fresh = box.pixels
+    box.move(kd_1=1.05)
+    np.testing.assert_array_equal(box.move(kd_1=1.0), fresh)
+
+
+def test_a_circle_out_of_reach_is_told_and_the_arm_still_drawn(box):
+    before = box.pixels
+    after = box.move(A2=0.5, A3=0.5)
+    assert "out of the arm's reach</b> from 0.00 s" in box.words.value
+    assert np.abs(after - before).max() > 0.5
+    box.move(A2=1.0, A3=1.0)
+    assert "Tip error: rms" in box.words.value
+
+
+def test_a_motion_that_fails_is_told(box):
+    box.move(arm="stiff")
+    assert "out of steps" in box.words.value and "Ended at 0" in box.words.value
+
+
+def test_no_figure_is_left_to_be_shown_twice(box):
+    assert not plt.get_fignums()
+
+
+@pytest.mark.parametrize(
+    "given, message",
+    [
+        ({}, "^scenes: expected"),
+        (CIRCLES["RRR"], "^scenes: expected"),
+        ({"a": 3}, r"^scenes\['a'\]: expected a Scene"),
+        ({"a": scenes.fig5()}, "^scene: expected exactly one PDController"),
+        (
+            {"a": CIRCLES["RRR"]._replace(
+                forces=(fj.PDController(1, 1, 1, lambda t, linkage: None),)
+            )},
+            r"^scenes\['a'\]: expected a controller of a task with a tip",
+        ),
+    ],
+)  # fmt: skip
+def test_malformed_scenes_are_named(given, message):
+    with pytest.raises(ValueError, match=message):
+        sliders(given)
+
+
+def test_without_ipywidgets_the_extra_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "ipywidgets", None)
+    with pytest.raises(ImportError, match=r"fdof_jax\[notebook\]"):
+        sliders()
+
+
+def test_importing_the_module_imports_no_ipywidgets():
+    code = "import fdof_jax.interactive, sys; assert 'ipywidgets' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True)

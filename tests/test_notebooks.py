@@ -1,0 +1,100 @@
+"""The notebooks: short cells, small files, committed outputs; and they run."""
+
+import os
+from pathlib import Path
+
+import nbformat
+import pytest
+from nbclient import NotebookClient
+
+FOLDER = Path(__file__).parents[1] / "notebooks"
+INSTALL = '%pip install -q "..[notebook]"'
+LONGEST = 25  # lines of a cell: a screen
+LARGEST = 1_000_000  # bytes of a notebook
+SLOWEST = 120  # seconds of a run
+
+each_notebook = pytest.mark.parametrize(
+    "path", sorted(FOLDER.glob("*.ipynb")), ids=lambda path: path.stem
+)
+
+
+def code_cells(notebook):
+    """All but the one that installs."""
+    cells = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    return [cell for cell in cells if "install" not in cell.metadata.get("tags", [])]
+
+
+def unwanted(notebook):
+    """What was printed to stderr, warnings among it, or raised."""
+    return [
+        output.get("text") or output.get("evalue")
+        for cell in code_cells(notebook)
+        for output in cell.outputs
+        if output.output_type == "error" or output.get("name") == "stderr"
+    ]
+
+
+def pictures(notebook):
+    """How many outputs are more than text."""
+    kinds = [
+        set(output.get("data", {}))
+        for cell in code_cells(notebook)
+        for output in cell.outputs
+    ]
+    return sum(bool(kind & {"image/png", "text/html"}) for kind in kinds)
+
+
+def processor_seconds():
+    """Of ended child processes. Unlike wall time it does not tell what else runs."""
+    times = os.times()
+    return times.children_user + times.children_system
+
+
+def test_there_are_notebooks():
+    assert list(FOLDER.glob("*.ipynb"))
+
+
+@each_notebook
+def test_cells_are_short_and_begin_with_the_install_line(path):
+    notebook = nbformat.read(path, as_version=4)
+    nbformat.validate(notebook)
+    for cell in notebook.cells:
+        assert cell.source.count("\n") < LONGEST, cell.source
+    install, *others = (cell for cell in notebook.cells if cell.cell_type == "code")
+    assert install.source == INSTALL and install.metadata.tags == ["install"]
+    assert others == code_cells(notebook)
+    assert "jax_enable_x64" in others[0].source
+    assert any("assert " in cell.source for cell in others)
+
+
+@each_notebook
+def test_committed_outputs_are_there_clean_and_small(path):
+    assert path.stat().st_size <= LARGEST
+    notebook = nbformat.read(path, as_version=4)
+    counts = [cell.execution_count for cell in code_cells(notebook)]
+    assert counts == list(range(1, len(counts) + 1))  # one run from top to bottom
+    assert pictures(notebook) >= 1
+    assert unwanted(notebook) == []
+
+
+@each_notebook
+def test_the_table_of_notebooks_lists_it(path):
+    assert f"({path.name})" in (FOLDER / "README.md").read_text()
+
+
+@pytest.mark.slow
+@each_notebook
+def test_it_runs(path):
+    notebook = nbformat.read(path, as_version=4)
+    committed = pictures(notebook)
+    client = NotebookClient(
+        notebook,
+        timeout=600,  # of a cell
+        skip_cells_with_tag="install",
+        resources={"metadata": {"path": FOLDER}},
+    )
+    before = processor_seconds()
+    client.execute()
+    assert unwanted(notebook) == []
+    assert pictures(notebook) == committed
+    assert 1 < processor_seconds() - before < SLOWEST

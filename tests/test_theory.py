@@ -1,0 +1,95 @@
+"""The formulas of docs/theory.md, in vectors, equal the equations as printed."""
+
+import jax
+import numpy as np
+
+import fdof_jax as fj
+
+
+def random_case(seed):
+    rng = np.random.default_rng(seed)
+    linkage = fj.Linkage(
+        "RPR", length=rng.uniform(0.3, 2, 4), com=rng.normal(size=(3, 2)),
+        mass=rng.uniform(0.5, 2, 3), inertia=rng.uniform(0.1, 1, 3), base_angle=0.4,
+    )  # fmt: skip
+    return linkage, rng.normal(size=6), rng.normal(size=6)
+
+
+def vectors(linkage, x):
+    """e, c and d as complex numbers, mu, s and J; the index is the link's number."""
+    angle = np.array([0, linkage.base_angle, *x[1::2]])
+    slide = np.array([0, *x[0::2], 0])
+    e = np.exp(1j * angle)
+    d = np.array([0, *(np.asarray(linkage.length) + 1j * slide[1:])]) * e
+    c = np.array([0, 0, *(np.asarray(linkage.com) @ [1, 1j])]) * e
+    m = np.array([0, 0, *linkage.mass])
+    mu = np.array([m[n:].sum() for n in range(6)])
+    s = m * c + mu[1:] * d
+    J = np.array([0, 0, *linkage.inertia]) + m * abs(c) ** 2 + mu[1:] * abs(d) ** 2
+    return e, c, d, m, mu, s, J
+
+
+def dot(a, b):
+    return (a * np.conj(b)).real
+
+
+def test_the_mass_matrix():
+    linkage, x, _ = random_case(0)
+    e, _, d, _, mu, s, J = vectors(linkage, x)
+    B, th = {1: 0, 2: 2, 3: 4}, {2: 1, 3: 3, 4: 5}
+    M = np.zeros((6, 6))
+    for n in (1, 2, 3):
+        M[B[n], B[n]] = mu[n + 1]
+        for k in range(n + 1, 5):
+            M[B[n], th[k]] = dot(e[n], s[k])
+            if k < 4:
+                M[B[n], B[k]] = mu[k + 1] * dot(e[n], e[k])
+    for n in (2, 3, 4):
+        M[th[n], th[n]] = J[n]
+        for k in range(n + 1, 5):
+            M[th[n], th[k]] = dot(d[n], s[k])
+            if k < 4:
+                M[th[n], B[k]] = mu[k + 1] * dot(d[n], e[k])
+    for n in (2, 3):
+        M[th[n], B[n]] = mu[n + 1] * linkage.length[n - 1]
+    M = M + M.T - np.diag(np.diag(M))
+    np.testing.assert_allclose(fj.mass_matrix(linkage, x), M, rtol=1e-13)
+
+
+def test_velocities_and_gravity():
+    linkage, x, xd = random_case(1)
+    e, c, d, m, *_ = vectors(linkage, x)
+    w, v = np.array([0, 0, *xd[1::2]]), np.array([0, *xd[0::2]])
+    carried = lambda n: w[n] ** 2 * d[n] + 2 * w[n] * v[n] * e[n]
+    f = np.zeros(5, complex)
+    for k in (2, 3, 4):
+        before = sum(carried(n) for n in range(2, k))
+        f[k] = m[k] * (w[k] ** 2 * c[k] + before - 1j * linkage.gravity)
+    beyond = [f[n + 1 :].sum() for n in range(5)]
+    phi = []
+    for n in (1, 2, 3):
+        phi.append(dot(1j * e[n], beyond[n]))
+        own = dot(1j * c[n + 1], f[n + 1])
+        phi.append(own + dot(1j * d[n + 1], beyond[n + 1]))
+    np.testing.assert_allclose(fj.bias_force(linkage, x, xd), phi, rtol=1e-12)
+
+
+def test_the_reduced_equations():
+    linkage, x, xd = random_case(2)
+    x, xd = fj.to_chain(linkage, x[:3], xd[:3])
+    S = jax.jacobian(lambda qd: fj.to_chain(linkage, np.zeros(3), qd)[1])(np.zeros(3))
+    assert set(np.unique(S)) == {0.0, 1.0}
+    tau = np.array([1.0, -2.0, 3.0])
+    M, phi = fj.mass_matrix(linkage, x), fj.bias_force(linkage, x, xd)
+    qdd = np.linalg.solve(S.T @ M @ S, tau + S.T @ phi)
+    force = np.where(linkage.ef > 0.5, np.repeat(tau, 2), 0)
+    masked = fj.masked_accelerations(linkage, x, xd, force)
+    np.testing.assert_allclose(masked, S @ qdd, rtol=1e-11, atol=1e-12)
+    # Efforts from the tip inwards; real joints carry their commands.
+    rho = M @ masked - phi
+    T4 = rho[5]
+    T3 = rho[3] + T4
+    efforts = np.array([rho[0], rho[1] + T3, rho[2], T3, rho[4], T4])
+    constraint = efforts - force
+    known = fj.constraint_forces(linkage, x, xd, force)
+    np.testing.assert_allclose(known, constraint, rtol=1e-11, atol=1e-11)
