@@ -279,7 +279,6 @@ def _animation(
         points = np.hstack(list(g.points.values()))
         (trace,) = ax.plot(*xy(points), color=GREY, lw=1, gid="tip path")
         lines = _draw(ax, g, 0, mass_centers=True)
-        ax.autoscale_view()  # to limits that hold all samples
         samples = [np.abs(ts - t).argmin() for t in times]
         moving.append((g, trace, lines, samples))
 
@@ -293,15 +292,16 @@ def _animation(
             line for _, trace, lines, _ in moving for line in (trace, *lines.values())
         ]
 
-    show(0)
     figure = panels[0].get_figure(root=True)
     assert figure is not None  # axes are always in a figure
+    say("t = 0 s", fontsize="medium")
     figure.draw_without_rendering()
-    for ax in panels:  # which have found their limits, and are to keep them
-        ax.autoscale(False)
+    for ax in panels:
+        ax.autoscale(False)  # at limits that hold all samples
         ax.set_adjustable("box")
     if new:
         figure.set_layout_engine("none")  # a layout per frame takes half the time
+    show(0)
     return _Animation(figure, show, len(times), interval=pause, cache_frame_data=False)
 
 
