@@ -90,12 +90,13 @@ def _told(moved: _Moved, error: np.ndarray) -> str:
                 (controller.kp, controller.kd), controller.gain_units[kind]
             )
         )
-        rows += (
-            f"<tr><td>{kind}{k + 1}</td><td>{kp}</td><td>{kd}</td>"
-            f"<td>A{k + 2} = {float(linkage.length[k + 1]):.3g} m</td></tr>"
-        )
+        length = f"A{k + 2} = {float(linkage.length[k + 1]):.3g} m"
+        rows += "<tr>"
+        for cell in (f"{kind}{k + 1}", kp, kd, length):
+            rows += f"<td style='padding-right: 1.5em'>{cell}</td>"
+        rows += "</tr>"
     head = "<tr><th>joint</th><th>kp</th><th>kd</th><th>link after it</th></tr>"
-    return f"{text}<table>{head}{rows}</table>"
+    return f"{text}<table style='text-align: left'>{head}{rows}</table>"
 
 
 class _Picture:
@@ -209,8 +210,10 @@ def sliders(scenes: Mapping[str, Scene] | None = None) -> Any:
         widgets.FloatSlider(1.0, min=0.5, max=1.5, step=0.01, description=f"A{n}")
         for n in (2, 3, 4)
     ]
-    # A factor of 4, as in `tune`.
-    span = dict(min=-np.log10(4), max=np.log10(4), step=0.02)
+    # A factor of 4, as in `tune`. The browser shows only whole steps from the least
+    # value: 1 has to be one.
+    most = np.log10(4)
+    span = dict(min=-most, max=most, step=most / 30, readout_format=".2f")
     gains = [
         widgets.FloatLogSlider(1.0, description=f"{gain} {k}", **span)
         for gain in ("kp", "kd")

@@ -112,6 +112,18 @@ def test_a_motion_that_fails_is_told(box):
     assert "out of steps" in box.words.value and "Ended at 0" in box.words.value
 
 
+def test_a_slider_starts_on_one_of_its_steps(box):
+    """Else the browser moves it."""
+    for name, part in box.parts.items():
+        if name.startswith("k"):
+            steps = np.array([0 - part.min, part.max]) / part.step
+        elif name.startswith("A"):
+            steps = np.array([1 - part.min, part.max - 1]) / part.step
+        else:
+            continue
+        np.testing.assert_allclose(steps, steps.round(), atol=1e-9)
+
+
 def test_no_figure_is_left_to_be_shown_twice(box):
     assert not plt.get_fignums()
 
