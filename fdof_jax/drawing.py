@@ -241,9 +241,7 @@ class _Animation(FuncAnimation):
         self._figure = figure
 
     def to_jshtml(self, *args: Any, **kwargs: Any) -> str:
-        plt.close(
-            self._figure
-        )  # else a notebook shows it a second time, standing still
+        plt.close(self._figure)  # or a notebook shows it again, standing still
         return super().to_jshtml(*args, **kwargs)
 
     def _repr_html_(self) -> str:
