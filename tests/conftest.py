@@ -76,6 +76,7 @@ def tuned():
         upper=start * 4,
         converged=False,
         message="stopped where a < b",
+        member_tip_error=np.array([0.06]),
         member_loss=np.array([0.01]),
         settings={},
     )
