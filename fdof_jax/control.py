@@ -20,8 +20,9 @@ from .kinematics import (
     wrist_vector,
 )
 from .linkage import Linkage, check_linkage
+from .soon_compiled import soon_compiled
 from .trigonometry import sincos
-from .validation import concrete, real_array, sign
+from .validation import concrete, is_traced, real_array, sign
 
 if TYPE_CHECKING:
     from .solution import Solution
@@ -278,7 +279,6 @@ class CircleTask(eqx.Module):
             )
 
 
-@eqx.filter_jit
 def _motion_over(
     reference: Reference, linkage: Linkage, times: ArrayLike
 ) -> tuple[Array, Array]:
@@ -303,7 +303,12 @@ def reachable(
     """
     check_linkage(linkage)
     ts = real_array("ts", ts, (None,))
-    motion = _motion_over(checked_reference(reference), linkage, ts)
+    arguments = checked_reference(reference), linkage, ts
+    if is_traced(arguments):
+        motion = _motion_over(*arguments)
+    else:
+        with jax.ensure_compile_time_eval():  # also where others are traced
+            motion = soon_compiled(_motion_over)(*arguments)
     return jnp.isfinite(jnp.concatenate(motion, axis=1)).all(axis=1)
 
 

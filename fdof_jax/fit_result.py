@@ -181,6 +181,9 @@ def fit_result(
             "as observed with any such parameters"
         )
     parameters = unknowns.named(values)
+    # Parts of the values are what a reader expects, where they are not nearly zero.
+    parts_of = np.where(np.abs(values) > 1e-3 * sizes, values, sizes)
+    untold = untold * (sizes / parts_of)[:, None]
     try:
         scene_at(jax.tree.map(jnp.asarray, parameters))
     except ValueError as error:

@@ -148,7 +148,10 @@ def _integrate(solver, inputs, keywords, derivatives: bool = False) -> Solution:
     own_states_shown = tuple(jax.tree.map(shown, own_rows[0])) if own_rows else ()
     reached = jnp.where(valid, reached, asked[0])
     results: Any = diffrax.RESULTS
-    result = results.where(valid, solution.result, results.nonfinite)
+    # Steps of constant size, too long for instance, end with NaN as their success.
+    lost = ~(jnp.isfinite(q[-1]) & jnp.isfinite(qd[-1])).all()
+    lost = lost & (solution.result == results.successful)
+    result = results.where(valid & ~lost, solution.result, results.nonfinite)
     stats = solution.stats | {"time_reached": reached}
     return Solution(asked, q, qd, stats, result, own_states_shown)
 

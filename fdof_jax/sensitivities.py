@@ -58,7 +58,7 @@ def sensitivities(
 
     def motion_of(z):
         scene = scene_at(z)
-        q0, qd0 = (jnp.asarray(a) for a in scene.state0)
+        q0, qd0 = (jnp.asarray(a, dtype=float) for a in scene.state0)
         constants = link_constants(
             scene.linkage, q0, lambda x: (jnp.sin(x), jnp.cos(x))
         )

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from .bounded_search import METHODS, Evaluation, Row, Run, minimise, reporting
 from .ensembles import stacked, unstacked
 from .lanes import Lanes
-from .linkage import check_linkage
+from .linkage import check_linkage, real_state
 from .losses import Tracking, controller_of, relative_demands, tip_errors
 from .scenes import Scene
 from .sensitivities import TOLERANCE, sensitivities
@@ -96,6 +96,7 @@ def check_tuned(name: str, scene: Any, loss: Any) -> None:
             "JAX's transformations."
         )
     check_linkage(scene.linkage)
+    real_state(f"{name}.state0", scene.state0)
     t1 = real_array(f"{name}.t1", scene.t1, (), above=0)
     callable_tuple(f"{name}.forces", scene.forces)
     controller = controller_of(scene)

@@ -131,6 +131,11 @@ def test_the_report_is_what_it_says(report):
     assert report.horizons[4] == pytest.approx(1.0)
     assert 0.1 < report.saturated[1] < 0.13
     assert "P2 is at its limit for" in str(report)
+    # The slide that is at its limit is not damped, within it all joints are.
+    assert report.at_limit.shape == (101,) and 0.1 < report.at_limit.mean() < 0.13
+    damping = report.modes.damping
+    assert np.nanmin(damping[report.at_limit]) < 0.01 < damping[~report.at_limit].min()
+    assert "while actuators are at their limits:" in str(report)
     assert f"{report.error:.1e} of its norm" in str(report)
     assert report.modes.eigenvalues.shape == (101, 6)
 
@@ -144,6 +149,8 @@ def test_a_report_says_where_gains_have_no_effect():
 
 def test_a_report_without_modes_for_elements_with_a_state():
     scene = scenes.fig7()._replace(t1=0.2)
+    # Whole numbers in lists are a state too.
+    scene = scene._replace(state0=fj.State([2, 3, -2], [0, 0, 0]))
     lag = fj.FirstOrderLag(fj.JointEffort(np.ones(3)), 0.1)
     found = fj.gradient_report(scene._replace(forces=(*scene.forces, lag)))
     # P2 is at its limit throughout: the gradient is small, and most of it noise.

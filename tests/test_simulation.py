@@ -140,6 +140,22 @@ def test_order_of_convergence(solver, order, steps):
     assert slope == pytest.approx(order, abs=0.5)
 
 
+def test_constant_steps_that_are_too_long_do_not_succeed():
+    scene = scenes.fig5()
+    stiff = (fj.JointDamper(1e5),)
+    keywords = dict(
+        solver=diffrax.Tsit5(),
+        stepsize_controller=diffrax.ConstantStepSize(),
+        dt0=0.01,
+    )
+    ts = np.linspace(0, 2, 3)
+    still = scene.state0._replace(qd=np.ones(3))
+    solution = fj.simulate(scene.linkage, still, ts, stiff, throw=False, **keywords)
+    assert solution.outcome == "not finite" and np.isnan(solution.q[-1]).all()
+    with pytest.raises(RuntimeError, match="not finite"):
+        fj.simulate(scene.linkage, still, ts, stiff, **keywords)
+
+
 def test_a_solve_that_runs_out_of_steps_says_so_and_marks_the_rest():
     scene = scenes.fig5()
     ts = np.linspace(0, 2, 21)
