@@ -193,7 +193,7 @@ def _timed(what: str, times: int, tuned: Callable, starts: int) -> Iterator[dict
         result = tuned()
         walls.append(time.perf_counter() - began)
     results = result if isinstance(result, list) else [result]
-    rms = np.array([np.sqrt(r.start_loss) for r in results])
+    rms = np.array([np.sqrt(r.losses) for r in results])
     near = rms <= 1.01 * rms.min(axis=1, keepdims=True)
     yield record(
         protocol=PROTOCOL, problem=what, solver="levenberg-marquardt", kind="time",

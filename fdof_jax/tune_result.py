@@ -77,10 +77,10 @@ class TuneResult(eqx.Module):
     @property
     def history(self) -> History:
         """That of the best run."""
-        return self.histories[int(np.nanargmin(self.start_loss))]
+        return self.histories[int(np.nanargmin(self.losses))]
 
     @property
-    def start_loss(self) -> Float[np.ndarray, " start"]:
+    def losses(self) -> Float[np.ndarray, " start"]:
         """What each run has come to; NaN where its start could not be simulated."""
         return np.array([history.loss.min() for history in self.histories])
 
@@ -148,15 +148,15 @@ class TuneResult(eqx.Module):
     def _remarks(self) -> list[str]:
         """What stands below the table."""
         rows = []
-        if len(self.start_loss) > 1:
-            failed = np.isnan(self.start_loss).sum()
+        if len(self.losses) > 1:
+            failed = np.isnan(self.losses).sum()
             if failed:
                 rows.append(
-                    f"{failed} of {len(self.start_loss)} starts could not be simulated"
+                    f"{failed} of {len(self.losses)} starts could not be simulated"
                 )
-            near = np.sum(self.start_loss**0.5 <= 1.01 * self.loss**0.5)
+            near = np.sum(self.losses**0.5 <= 1.01 * self.loss**0.5)
             rows.append(
-                f"{near} of {len(self.start_loss)} starts within 1 % of the best in "
+                f"{near} of {len(self.losses)} starts within 1 % of the best in "
                 "the root of the loss"
             )
         if len(self.member_loss) > 1:

@@ -8,7 +8,7 @@ import pytest
 from nbclient import NotebookClient
 
 FOLDER = Path(__file__).parents[1] / "notebooks"
-INSTALL = '%pip install -q "..[notebook]"'
+INSTALL = '%pip install -q -e "..[notebook]"'
 LONGEST = 25  # lines of a cell: a screen
 LARGEST = 1_000_000  # bytes of a notebook
 SLOWEST = 120  # seconds of a run

@@ -36,7 +36,7 @@ def gains_of(scene):
 def test_all_starts_agree_and_no_random_gains_do_better(factor):
     scene = scenes.fig7()
     result = fj.tune(scene, factor=factor, starts=6)  # 20 in the benchmarks
-    rms = np.sqrt(result.start_loss)
+    rms = np.sqrt(result.losses)
     assert rms.shape == (6,) and (rms <= 1.01 * rms.min()).all()
     assert result.converged
     low, high = np.log(result.lower), np.log(result.upper)
@@ -108,8 +108,8 @@ def test_starts_that_fail_are_counted():
     gains = gains_of(scene)
     bounds = (gains, gains * 1e12)
     result = fj.tune(scene, bounds=bounds, starts=3, max_steps=1)
-    assert np.isnan(result.start_loss).sum() >= 1
-    failed = np.isnan(result.start_loss).sum()
+    assert np.isnan(result.losses).sum() >= 1
+    failed = np.isnan(result.losses).sum()
     assert f"{failed} of 3 starts could not be simulated" in str(result)
     assert np.isfinite(result.loss)
 
