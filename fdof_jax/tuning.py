@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from .bounded_search import METHODS, Evaluation, Row, Run, minimise, reporting
 from .ensembles import stacked, unstacked
 from .lanes import Lanes
-from .linkage import check_linkage, real_state
+from .linkage import check_linkage, joint_names, real_state
 from .losses import Tracking, controller_of, relative_demands, tip_errors
 from .scenes import Scene
 from .sensitivities import TOLERANCE, sensitivities
@@ -111,6 +111,19 @@ def check_tuned(name: str, scene: Any, loss: Any) -> None:
             )
 
 
+def _check_alike(name: str, member: Scene, scene: Scene) -> None:
+    """Raise ValueError unless the gains of both are of one meaning."""
+    kinds = [
+        (joint_names(s.linkage), type(controller_of(s)).__name__)
+        for s in (member, scene)
+    ]
+    if kinds[0] != kinds[1]:
+        raise ValueError(
+            f"{name}: expected joints and a controller like the scene's, {kinds[1]}, "
+            f"got {kinds[0]}."
+        )
+
+
 def _bounds(scene: Scene, factor: Any, bounds: Any) -> tuple[np.ndarray, ...]:
     """Of kp and kd: the start, the least, the greatest; (2, 3) each."""
     controller = controller_of(scene)
@@ -183,14 +196,9 @@ def _search(
         members = [[scene] for scene in scenes]
     else:
         members = [unstacked("ensemble", ensemble)] * len(losses)
-        like = stacked([scenes[0], members[0][0]], "ensemble")
-        if (like.linkage.ef[0] != like.linkage.ef[1]).any():
-            raise ValueError(
-                "ensemble: expected scenes of the scene's own topology, existence "
-                f"factors {like.linkage.ef[0]}, got {like.linkage.ef[1]}."
-            )
         for i, member in enumerate(members[0]):
             check_tuned(f"ensemble[{i}]", member, losses[0])
+            _check_alike(f"ensemble[{i}]", member, scenes[0])
     problems = [
         [(member, loss, lower > 0) for member in row]
         for row, loss, (_, lower, _) in zip(members, losses, boxes)

@@ -106,7 +106,7 @@ def run_tuning(
     price = real_array("price", job.price, (), minimum=0)
     scene = job.scene()
     output.mkdir(parents=True, exist_ok=True)
-    say("tune the gains")
+    say("tune the gains (compiling first, some ten seconds)")
     last = earlier[-1] if earlier else None
     start = last.scene if last else scene
     result = tune(
@@ -122,7 +122,7 @@ def run_tuning(
     if save_to is not None:
         results = [*earlier, result]
         save(save_to, {"job": job, "search": search, "results": results})
-    say("compare the gradients with differences")
+    say("compare the gradients with differences (compiling again)")
     reports = gradient_report(start), gradient_report(result.scene)
     say("draw")
     first, second = simulate_finely(start), simulate_finely(result.scene)
