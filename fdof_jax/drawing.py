@@ -8,7 +8,7 @@ ground is link 1, the moving ones are 2 to 4. Curves over time are in `plotting`
 """
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -99,13 +99,31 @@ def _draw_ground(ax: Axes) -> None:
     ground.set(mfc="white", mec=GREY, mew=0.8, clip_on=False)
 
 
-def draw_motion(ax: Axes, g: Geometry, indices: np.ndarray, mass_centers: bool) -> None:
+class DrawnMotion(NamedTuple):
+    """The lines of `draw_motion`."""
+
+    path: Line2D
+    arms: list[dict[str, Line2D]]
+
+    def move(self, g: Geometry, indices: np.ndarray) -> None:
+        """To another motion of an arm of the same topology, as many samples of it."""
+        self.path.set_data(*xy(g.end[: indices[-1] + 1, 3]))
+        for lines, i in zip(self.arms, indices):
+            _place(lines, g, i)
+
+
+def draw_motion(
+    ax: Axes, g: Geometry, indices: np.ndarray, mass_centers: bool
+) -> DrawnMotion:
     """The path of the tip to the last of the samples, and these from faint to full."""
     _draw_ground(ax)
     path = g.end[: indices[-1] + 1, 3]
-    ax.plot(*xy(path), color=GREY, lw=1, label="tip path", gid="tip path")
-    for i, alpha in zip(indices, np.linspace(1, 0.15, len(indices))[::-1]):
+    (path,) = ax.plot(*xy(path), color=GREY, lw=1, label="tip path", gid="tip path")
+    arms = [
         _draw(ax, g, i, mass_centers, float(alpha), label=i == indices[-1])
+        for i, alpha in zip(indices, np.linspace(1, 0.15, len(indices))[::-1])
+    ]
+    return DrawnMotion(path, arms)
 
 
 def draw_linkage(

@@ -103,7 +103,7 @@ class _Picture:
     """An arm with the path of its tip, and the tip's error over time.
 
     Axes, numbers and legend take most of the time to draw: they are kept as pixels for
-    as long as the motion fits into them.
+    as long as the motion fits into them. So are the lines, which are moved.
     """
 
     def __init__(self):
@@ -118,21 +118,26 @@ class _Picture:
         for ax in self._figure.axes:
             ax.locator_params(nbins=5)
         self._background: Any = None
+        self._lines: Any = None
 
-    def draw(self, moved: _Moved, fresh: bool) -> tuple[bytes, np.ndarray]:
-        """The picture as PNG, and the tip's error [m]; `fresh`: of another arm."""
+    def draw(self, moved: _Moved) -> tuple[bytes, np.ndarray]:
+        """The picture as PNG, and the tip's error [m]; always of the same topology."""
         ts, q, _ = reached(moved.solution)
         path = geometry(moved.scene.linkage, q)
         commanded = np.asarray(moved.commanded) @ [1, 1j]
         error = np.abs(path.end[:, 3] - commanded[: len(ts)])
         shown = np.linspace(0, len(ts) - 1, _CONFIGURATIONS).round().astype(int)
 
-        for line in [*self._plane.lines, *self._time.lines]:
-            line.remove()
-        self._plane.plot(*xy(commanded), "--", color=BLACK, lw=1, label="commanded")
-        draw_motion(self._plane, path, np.unique(shown), mass_centers=False)
-        self._time.plot(ts, 1e3 * error, color=SERIES[0], lw=1.2)
-        if fresh or not self._fits():
+        if self._lines is None:
+            (task,) = self._plane.plot([], "--", color=BLACK, lw=1, label="commanded")
+            arms = draw_motion(self._plane, path, shown, mass_centers=False)
+            (errors,) = self._time.plot([], color=SERIES[0], lw=1.2)
+            self._lines = task, arms, errors
+        task, arms, errors = self._lines
+        task.set_data(*xy(commanded))
+        arms.move(path, shown)
+        errors.set_data(ts, 1e3 * error)
+        if self._background is None or not self._fits():
             self._draw_background(float(moved.solution.ts[-1]))
         self._canvas.restore_region(self._background)
         for ax in self._figure.axes:
@@ -151,7 +156,8 @@ class _Picture:
         most, top = self._time.dataLim.y1, self._time.viewLim.y1
         inside = plane.x0 < motion.x0 and motion.x1 < plane.x1
         inside &= plane.y0 < motion.y0 and motion.y1 < plane.y1
-        return inside and 0.3 * top < most < top
+        filled = max(motion.width / plane.width, motion.height / plane.height)
+        return inside and filled > 0.5 and 0.3 * top < most < top
 
     def _draw_background(self, t1: float) -> None:
         for ax in self._figure.axes:
@@ -220,14 +226,13 @@ def sliders(scenes: Mapping[str, Scene] | None = None) -> Any:
         for k in (1, 2, 3)
     ]
     image, words = widgets.Image(format="png"), widgets.HTML()
-    picture = _Picture()
+    pictures = {name: _Picture() for name in known}
 
     def redraw(change: Any = None) -> None:
         stretch = jnp.array([slider.value for slider in lengths])
         factor = jnp.array([slider.value for slider in gains]).reshape(2, 3)
         moved = _moved(known[arm.value], stretch, factor)
-        fresh = change is None or change["owner"] is arm
-        image.value, error = picture.draw(moved, fresh)
+        image.value, error = pictures[arm.value].draw(moved)
         words.value = _told(moved, error)
 
     redraw()
