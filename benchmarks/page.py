@@ -329,6 +329,12 @@ def sliders(points: list[dict]) -> str:
         for p in points
         if p["times"]
     ]
+    moves = [t for p in points if not p["problem"].startswith("between")
+             for t in p["times"]]  # fmt: skip
+    if moves:
+        median, most = (number(1e3 * np.quantile(moves, q), 3) for q in (0.5, 0.95))
+        share = f"{100 * np.mean(np.array(moves) < 0.1):.1f} %"
+        rows.append(["all moves", str(len(moves)), median, most, share])
     head = ["", "pictures", "median [ms]", "95 % within [ms]", "under 100 ms"]
     return table(head, rows)
 

@@ -262,6 +262,9 @@ class _Animation(FuncAnimation):
         plt.close(self._figure)  # or a notebook shows it again, standing still
         return super().to_jshtml(*args, **kwargs)
 
+    def __repr__(self) -> str:
+        return "an animation"  # an address would differ in each run of a notebook
+
     def _repr_html_(self) -> str:
         return self.to_jshtml()
 

@@ -229,6 +229,7 @@ def effort_profile(
                     low, high = min(low, -1.1 * limit), max(high, 1.1 * limit)
                 text = ax.text(0.98, 0.08, f"limit ±{limit:g} {unit}", ha="right")
                 text.set(fontsize="small", transform=ax.transAxes)
+                text.set_bbox({"fc": "white", "alpha": 0.7, "lw": 0, "pad": 1})
         ax.set_ylim(low, high)
     legend(axes[0], *axes)
     return fig
