@@ -81,6 +81,7 @@ def kept_gains(printed):
             for line in lines for unit in line if unit.endswith("]")]  # fmt: skip
 
 
+@pytest.mark.slow
 def test_tuning_goes_on_where_it_was_saved(tmp_path, capsys):
     file, folder = tmp_path / "run.fdof", ["--output", str(tmp_path)]
     circle = ["--radius", "0.5", "--period", "1", "--factor", "3"]

@@ -322,6 +322,7 @@ class Indexed(eqx.Module):
         return jnp.zeros(3).at[self.table[self.joint]].set(-5.0 if self.on else 0.0)
 
 
+@pytest.mark.slow
 def test_elements_with_indices_and_prescribed_motion_may_act_beside_the_controller():
     scene = scenes.fig7()._replace(t1=1)
     controller = scene.forces[0]
