@@ -166,7 +166,7 @@ def test_topology_grid_has_a_panel_for_each():
 )
 def test_animation_is_capped_and_moves(kind, writer, tmp_path):
     if not writers.is_available(writer):
-        pytest.skip(f"no {writer}")
+        pytest.skip(f"{kind} needs {writer}, a program that is not installed here")
     linkage, solution = make_linkage("RPR"), swinging()
     animation = drawing.animate(linkage, solution, max_frames=3)
     path = tmp_path / f"motion.{kind}"

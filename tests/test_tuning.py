@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import fdof_jax as fj
-from fdof_jax import lanes, losses, scenes, tuning
+from fdof_jax import lanes, scenes, tuning
 from fdof_jax.losses import controller_of, tip_errors
 from fdof_jax.soon_compiled import soon_compiled
 
@@ -335,93 +335,6 @@ def test_elements_with_indices_and_prescribed_motion_may_act_beside_the_controll
         loss = losses_of(trial, gains_of(trial)[None])[0]
         assert result.history.loss[0] == pytest.approx(loss, rel=1e-6)
         assert result.loss < loss
-
-
-@pytest.mark.parametrize(
-    ("keywords", "message"),
-    [
-        (dict(factor=1.0), "factor"),
-        (dict(factor="4"), "factor"),
-        (dict(method="newton"), "method"),
-        (dict(max_steps=0), "max_steps"),
-        (dict(max_steps=2.5), "max_steps"),
-        (dict(max_steps=True), "max_steps"),
-        (dict(starts=0), "starts"),
-        (dict(seed=-1), "seed"),
-        (dict(over="best"), "over"),
-        (dict(over="worst"), "over: expected an ensemble"),
-        (dict(factor=2.0, bounds=(np.ones((2, 3)), np.ones((2, 3)))), "factor"),
-        (dict(report=3), "report"),
-        (dict(ensemble=3), "ensemble"),
-        (dict(loss=3), "loss"),
-        (dict(loss=losses.Tracking), "loss: expected a callable"),
-        (dict(bounds=(1, 2, 3)), "bounds"),
-        (dict(bounds=(np.ones((2, 3)), np.ones((2, 2)))), "bounds"),
-        (dict(bounds=(np.full((2, 3), 9), np.ones((2, 3)))), "bounds: expected the le"),
-        (dict(bounds=(np.ones((2, 3)), 2 * np.ones((2, 3)))), "bounds"),
-        (dict(bounds=(np.zeros((2, 3)), np.full((2, 3), 1e9))), "bounds"),
-    ],
-)
-def test_malformed_arguments(keywords, message):
-    with pytest.raises(ValueError, match=message):
-        fj.tune(scenes.fig7(), **keywords)
-
-
-@pytest.mark.parametrize(
-    "scene",
-    [
-        scenes.fig5(),
-        5,
-        None,
-        scenes.fig7()._replace(t1=-1.0),
-        scenes.fig7()._replace(t1=np.nan),
-        scenes.fig7()._replace(t1="a"),
-        scenes.fig7()._replace(linkage=None),
-        scenes.fig7()._replace(forces=scenes.fig7().forces[0]),
-    ],
-)
-def test_malformed_scenes(scene):
-    """Without exactly one controller, or not a scene at all."""
-    with pytest.raises(ValueError, match="scene|linkage"):
-        fj.tune(scene)
-
-
-def test_tuning_is_not_for_transformations():
-    scene = scenes.fig7()
-    with pytest.raises(ValueError, match="scene: expected known values"):
-        jax.jit(lambda t1: fj.tune(scene._replace(t1=t1)).gains)(1.0)
-
-
-def test_a_member_that_fails_is_named():
-    scene = scenes.fig7()._replace(t1=0.2)
-    massless = eqx.tree_at(lambda arm: arm.mass, scene.linkage, jnp.zeros(3))
-    massless = eqx.tree_at(lambda arm: arm.inertia, massless, jnp.zeros(3))
-    ensemble = fj.stacked([scene, scene._replace(linkage=massless)])
-    message = r"ensemble\[1\]: expected one that can be simulated"
-    with pytest.raises(ValueError, match=message):
-        fj.tune(scene, ensemble=ensemble)
-
-
-def test_a_loss_that_is_negative_is_refused_as_such():
-    scene = scenes.fig7()._replace(t1=0.2)
-    with pytest.raises(ValueError, match="loss: expected finite numbers, not negative"):
-        fj.tune(scene, loss=lambda scene, solution: -jnp.sum(solution.q**2))
-
-
-@pytest.mark.parametrize("value", ["a", None, 1j, (1.0, 2.0, "b")])
-def test_a_loss_that_is_no_number_is_refused(value):
-    with pytest.raises(ValueError, match=r"loss\(scene, solution\): expected a"):
-        fj.tune(scenes.fig7(), loss=lambda scene, solution: value)
-
-
-def test_keywords_of_tune_are_those_of_its_relatives():
-    scene = scenes.fig7()
-    with pytest.raises(TypeError, match="step: expected a keyword among factor, "):
-        fj.tune_each([scene], step=3)
-    with pytest.raises(TypeError, match="ensemble: expected a keyword"):
-        fj.tune_each([scene], ensemble=scene)
-    with pytest.raises(TypeError, match="loss: expected a keyword"):
-        fj.trade_off(scene, [0.0], loss=losses.tip_errors)
 
 
 def test_fixed_gains_are_not_held():
