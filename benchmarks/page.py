@@ -1,28 +1,15 @@
 """The tables of the results page, from the JSON lines."""
 
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 
 import numpy as np
 
-from .measure import OUTCOMES, TARGETS, times_at
+from .hard_tables import hard_cases, hard_cases_float32
+from .markdown import number, table
+from .measure import TARGETS, times_at
 from .scaling import slope
 from .targets import targets
-
-
-def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
-    head = list(head)
-    lines = [head, ["---"] * len(head), *(list(row) for row in rows)]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
-
-
-def number(value: float | None, digits: int = 2) -> str:
-    """To some digits, with powers of ten only where they help."""
-    if value is None or value != value:
-        return "-"
-    if value == 0 or 1e-2 <= abs(value) < 1e4:
-        return f"{float(f'{value:.{digits}g}'):g}"
-    return f"{value:.{digits - 1}e}".replace("e-0", "e-").replace("e+0", "e")
 
 
 def _solvers(points: list[dict]) -> list[str]:
@@ -258,63 +245,6 @@ def many(points: list[dict]) -> str:
         "memory before [MB]", "at most [MB]", "of it results [MB]",
     ]  # fmt: skip
     return table(head, rows)
-
-
-def by_scene(points: list[dict]) -> dict[str, dict[int, str]]:
-    """Per engine, the worst outcome of each hard case that could be asked of it."""
-    worst: dict[str, dict[int, str]] = {}
-    for point in points:
-        if point["status"] != "skipped":
-            own = worst.setdefault(point["solver"], {})
-            both = [point["status"], own.get(point["number"], OUTCOMES[0])]
-            own[point["number"]] = max(both, key=OUTCOMES.index)
-    return worst
-
-
-def hard_cases(points: list[dict]) -> str:
-    worst = by_scene(points)
-    numbers = {p["number"] for p in points}
-    counts = [
-        [engine, *(str(list(own.values()).count(o)) for o in OUTCOMES),
-         str(len(numbers) - len(own))]
-        for engine, own in worst.items()
-    ]  # fmt: skip
-    rows: dict[tuple, dict[str, str]] = {}
-    bounds = {}
-    for p in points:
-        found = [p["status"]]
-        if p["error"] is not None:
-            found.append(f"error {number(p['error'])}")
-        if p["steps"]:
-            found.append(f"{p['steps']} steps")
-        if p["time_median"]:
-            found.append(f"{number(1e3 * p['time_median'])} ms")
-        key = p["number"], p["problem"]
-        rows.setdefault(key, {})[p["solver"]] = "; ".join(found)
-        bounds.setdefault(key, number(p["bound"]))
-    body = [
-        [*map(str, key), bounds[key], *(own.get(engine, "-") for engine in worst)]
-        for key, own in rows.items()
-    ]
-    return "\n\n".join(
-        [
-            table(["", *OUTCOMES, "not asked"], counts),
-            table(["", "scene", "bound", *worst], body),
-        ]
-    )
-
-
-def hard_cases_float32(points: list[dict]) -> str:
-    rows: dict[tuple, list[str]] = {}
-    tolerances = list(dict.fromkeys(p["setting"] for p in points))
-    for p in points:
-        found = p["reason"] if p["error"] is None else number(p["error"])
-        if p["status"] not in (OUTCOMES[0], OUTCOMES[1]):
-            found = f"({found})"
-        rows.setdefault((p["number"], p["problem"], p["bound"]), []).append(found)
-    body = [[str(n), name, number(b), *cells] for (n, name, b), cells in rows.items()]
-    head = [f"at {tolerance:g}" for tolerance in tolerances]
-    return table(["", "scene", "bound", *head], body)
 
 
 def sliders(points: list[dict]) -> str:
