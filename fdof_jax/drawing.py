@@ -298,17 +298,15 @@ def _animation(
         points = np.hstack(list(g.points.values()))
         (trace,) = ax.plot(*xy(points), color=GREY, lw=1, gid="tip path")
         lines = _draw(ax, g, 0, mass_centers=True)
-        samples = [np.abs(ts - t).argmin() for t in times]
-        moving.append((g, trace, lines, samples))
+        samples = np.array([np.abs(ts - t).argmin() for t in times])
+        moving.append((g, DrawnMotion(trace, [lines]), samples))
 
     def show(frame: int) -> list[Line2D]:
-        for g, trace, lines, samples in moving:
-            i = samples[frame]
-            _place(lines, g, i)
-            trace.set_data(*xy(g.end[: i + 1, 3]))
+        for g, drawn, samples in moving:
+            drawn.move(g, samples[frame : frame + 1])
         say(f"t = {times[frame]:.2f} s", fontsize="medium")
         return [
-            line for _, trace, lines, _ in moving for line in (trace, *lines.values())
+            line for _, (path, (arm,)), _ in moving for line in (path, *arm.values())
         ]
 
     figure = panels[0].get_figure(root=True)

@@ -133,17 +133,17 @@ def keywords_as(
 
     Raises TypeError for others, and for those of `without`, which are not returned.
     """
-    known = {
+    allowed = {
         name: parameter.default
         for name, parameter in inspect.signature(function).parameters.items()
         if parameter.kind is parameter.KEYWORD_ONLY and name not in without
     }
     for name in given:
-        if name not in known:
+        if name not in allowed:
             raise TypeError(
-                f"{name}: expected a keyword among {', '.join(known)}, got another."
+                f"{name}: expected a keyword among {', '.join(allowed)}, got another."
             )
-    return known | given
+    return allowed | given
 
 
 def sign(name: str, value: Any) -> Array:
