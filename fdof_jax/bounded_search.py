@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
 
 from .validation import whole_number
@@ -92,6 +91,8 @@ class LBFGS:
     """optax's L-BFGS directions, within the box by projection, halved until down."""
 
     def __init__(self, z: np.ndarray):
+        import optax  # slow to import, and not needed by the default method
+
         self.optimiser = optax.scale_by_lbfgs()
         self.update = jax.jit(self.optimiser.update)
         self.state: Any = self.optimiser.init(jnp.asarray(z))
@@ -125,6 +126,8 @@ class Adam:
     """optax's Adam, clipped to the box; its loss may rise on the way."""
 
     def __init__(self, z: np.ndarray):
+        import optax
+
         self.optimiser = optax.adam(0.05)
         self.state: Any = self.optimiser.init(jnp.asarray(z))
 

@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from . import __version__
 from .tree_description import Restorer, Unreadable, described
 
 _FORMAT, _VERSION = "fdof_jax", 1
@@ -93,8 +94,6 @@ def save(path: str | os.PathLike, tree: Any) -> None:
         raise ValueError(
             "tree: expected one without itself in it, got one nested without end."
         ) from None
-    from . import __version__  # the package is complete only when this is called
-
     modules = (jax, diffrax, eqx, np)
     description = {
         "format": _FORMAT,

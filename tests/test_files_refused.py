@@ -29,6 +29,7 @@ from saved_trees import (
 )
 
 import fdof_jax as fj
+from fdof_jax.travel import PROFILES
 
 
 @pytest.fixture
@@ -52,7 +53,7 @@ UNSAVED = {
     "lambda": (lambda t, linkage: (t, t), "equinox.Module.*<lambda>"),
     "function of one's own": (describe, "equinox.Module.*describe"),
     "lambda of the library": (
-        fj.travel.PROFILES["quintic"],
+        PROFILES["quintic"],
         "equinox.Module.*<lambda>",
     ),
     "function of another library": (jnp.linalg.norm, "norm"),

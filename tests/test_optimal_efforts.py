@@ -1,16 +1,13 @@
 """The best open-loop efforts: Fuller's control of a slide, and no controller better."""
 
-import sys
-
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
 import fdof_jax as fj
-from fdof_jax import bounded_search, scenes
+from fdof_jax import bounded_search, optimal_motion, scenes
+from fdof_jax.control import tip_deviation
 from fdof_jax.lanes import Lanes
-
-module = sys.modules["fdof_jax.optimal_efforts"]
 
 # The same for all, so that they share programs.
 HORIZON, KNOTS = 0.5, 26
@@ -53,9 +50,9 @@ def test_no_controller_with_these_limits_does_better(best):
 
 def test_derivatives_against_differences(best):
     limit = np.asarray(CONTROLLER.limit)
-    free = best.scene._replace(forces=(module._Knots(best.ts, best.efforts),))
+    free = best.scene._replace(forces=(optimal_motion._Knots(best.ts, best.efforts),))
     problem = free, CONTROLLER.reference, limit, np.array(1e-9), best.solution.ts
-    lanes = Lanes(module._lane, [[problem]], starts=2)
+    lanes = Lanes(optimal_motion._lane, [[problem]], starts=2)
     draw = np.random.default_rng(0)
     z = 0.9 * (best.efforts / limit).ravel()
     for _ in range(3):
@@ -125,9 +122,7 @@ def test_scipy_finds_no_better_efforts():
     def residuals(z):
         forces = (fj.EffortHistory(knots, limit * z.reshape(-1, 3)),)
         solution = fj.simulate(scene.linkage, scene.state0, ts, forces)
-        deviation = fj.control.tip_deviation(
-            scene.linkage, CONTROLLER.reference, solution
-        )
+        deviation = tip_deviation(scene.linkage, CONTROLLER.reference, solution)
         return np.asarray(weights[:, None] * deviation).ravel()
 
     other = least_squares(residuals, np.zeros(18), bounds=(-1, 1), diff_step=1e-6)

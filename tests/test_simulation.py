@@ -9,6 +9,7 @@ from helpers import SCENES, load
 
 import fdof_jax as fj
 from fdof_jax import scenes
+from fdof_jax.trigonometry import sincos
 
 
 def absolute_angles(linkage, solution):
@@ -202,7 +203,7 @@ def test_a_start_after_many_turns_moves_alike():
     # The offset start is rounded: compare with the angle it really has.
     offset = q + [turns, 0, 0]
     kept = np.array([float(np.remainder(offset[0], 2 * np.pi)), 0.3, 0.2])
-    sin, cos = fj.trigonometry.sincos(offset[0])
+    sin, cos = sincos(offset[0])
     kept[0] = np.arctan2(sin, cos)
     ts = [0, 1.0, 2.0]
     plain = fj.simulate(scene.linkage, fj.State(kept, np.zeros(3)), ts, scene.forces)

@@ -1,6 +1,5 @@
 """How a sweep runs: checkpoints, progress, devices, processes, compilations."""
 
-import importlib
 import os
 import socket
 import subprocess
@@ -14,10 +13,8 @@ import pytest
 from sweep_batch import CHUNK, run
 
 import fdof_jax as fj
-
-# The package's attribute of this name is the function.
-module = importlib.import_module("fdof_jax.sweep")
-
+from fdof_jax import batched, integration
+from fdof_jax.validation import is_traced
 
 # Checkpoints
 
@@ -26,14 +23,14 @@ module = importlib.import_module("fdof_jax.sweep")
 def solved(monkeypatch):
     """The chunks solved from here on; a trace alone is none."""
     chunks = []
-    original = module._solve_chunk
+    original = batched._solve_chunk
 
     def recorded(*arguments):
-        if not fj.validation.is_traced(arguments):
+        if not is_traced(arguments):
             chunks.append(arguments)
         return original(*arguments)
 
-    monkeypatch.setattr(module, "_solve_chunk", recorded)
+    monkeypatch.setattr(batched, "_solve_chunk", recorded)
     return chunks
 
 
@@ -162,13 +159,13 @@ def test_more_devices_and_processes_change_nothing(processes, devices, clean, tm
 
 def test_other_values_need_no_new_trace(batch, clean, monkeypatch):
     calls = []
-    original = fj.integration.vector_field
+    original = integration.vector_field
 
     def counted(*arguments):
         calls.append(1)
         return original(*arguments)
 
-    monkeypatch.setattr(fj.integration, "vector_field", counted)
+    monkeypatch.setattr(integration, "vector_field", counted)
     linkage, (q, qd), forces = batch
     other = run((linkage, fj.State(q + 0.1, qd), forces))
     assert not calls

@@ -1,0 +1,51 @@
+"""The package as users import it: every name is there, and costs nothing until used."""
+
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import fdof_jax as fj
+
+FOLDER = Path(fj.__file__).parent
+
+
+def test_names():
+    for name in fj.__all__:
+        value = getattr(fj, name)
+        assert vars(fj)[name] is value  # found once
+    assert dir(fj) == sorted([*fj.__all__, "__version__"])
+    starred = {}
+    exec("from fdof_jax import *", starred)
+    assert set(fj.__all__) <= set(starred)
+    assert pickle.loads(pickle.dumps(fj.simulate)) is fj.simulate
+    with pytest.raises(AttributeError, match="'fdof_jax' has no attribute 'simulat'"):
+        getattr(fj, "simulat")  # noqa: B009
+    with pytest.raises(ImportError, match="cannot import name 'simulat'"):
+        from fdof_jax import simulat  # noqa: F401
+
+
+def test_no_name_is_hidden_by_a_module():
+    """An imported submodule becomes an attribute of the package."""
+    modules = {path.stem for path in FOLDER.glob("*.py")}
+    assert modules & set(fj.__all__) == {"scenes"}
+
+
+def imported(code):
+    """The names of all modules that a new process has imported after `code`."""
+    command = [sys.executable, "-c", f"{code}; import sys; print(*sys.modules)"]
+    run = subprocess.run(command, capture_output=True, text=True, check=True)
+    return set(run.stdout.split())
+
+
+def test_the_package_imports_no_jax():
+    assert not imported("import fdof_jax; fdof_jax.__version__") & {"jax", "numpy"}
+
+
+def test_simulation_imports_neither_pictures_nor_searches():
+    # Whatever JAX and diffrax need: neither imports one of these today.
+    modules = imported("import fdof_jax as fj; fj.simulate, fj.sweep, fj.scenes")
+    assert "diffrax" in modules
+    assert not modules & {"matplotlib", "optax", "scipy"}
