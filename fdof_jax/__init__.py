@@ -16,7 +16,7 @@ _MODULE_OF = {
     if isinstance(statement, ast.ImportFrom)
     for name in statement.names
 }
-__all__ = [*_MODULE_OF]
+__all__ = list(_MODULE_OF)  # pyright: ignore[reportUnsupportedDunderAll]
 
 
 def __getattr__(name: str) -> Any:

@@ -1,21 +1,63 @@
-"""The command line: `fdof-jax` or `python -m fdof_jax`."""
+"""The command line: `fdof-jax` or `python -m fdof_jax`.
+
+Arguments are parsed and checked before JAX is imported, which takes a second.
+"""
 
 import argparse
 import dataclasses
+import math
+import tempfile
+import zipfile
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import jax
-import matplotlib
+from . import __version__
+from .tuning_run import METHODS, Job
 
-from . import __version__, showcase, tuning_run
-from .bounded_search import METHODS
-from .league import circle_scenes, league_table
-from .tuning import tune_each
+_OF_JOB = tuple(field.name for field in dataclasses.fields(Job))
+_OF_ENSEMBLE = "members", "payload", "start_offset", "speed", "link_error"
+_OF_SEARCH = "method", "starts", "seed", "max_steps"
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Parse the command line, run what it names, print the results."""
+    """Parse the command line, run the command, print its results."""
+    parser = _parser()
+    options = parser.parse_args(arguments)
+    if options.command == "tune":
+        _check_tuning(parser, options)
+    if options.command != "league":
+        _check_folder(parser, "--output", options.output, make=True)
+    if options.command == "tune" and options.save is not None:
+        _check_folder(parser, "--save", options.save.parent)
+
+    from . import commands
+
+    commands.set_up()
+    if options.command == "league":
+        commands.run_league()
+        return
+    if options.command == "figures":
+        pictures = commands.run_figures(options.output)
+    elif options.command == "topologies":
+        pictures = commands.run_topologies(options.output)
+    elif options.command == "tune":
+        try:
+            pictures = commands.run_tuning(
+                options.output,
+                Job(**_given(options, _OF_JOB)),
+                options.resume,
+                options.save,
+                _given(options, _OF_SEARCH),
+            )
+        except (ValueError, OSError) as error:
+            parser.error(str(error))
+    else:
+        pictures = commands.run_circle(options.output)
+    print(f"\npictures in {options.output}/: {', '.join(p.name for p in pictures)}")
+
+
+def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="fdof-jax",
         description="Dynamics of planar open-chain linkages. Without a command, the "
@@ -39,27 +81,7 @@ def main(arguments: list[str] | None = None) -> None:
         _add_output(command, argparse.SUPPRESS)
         if name == "tune":
             _add_tuning(command)
-    options = parser.parse_args(arguments)
-
-    matplotlib.use("agg")  # pictures are written, never shown
-    jax.config.update("jax_enable_x64", True)
-    if options.command == "figures":
-        pictures = showcase.run_figures(options.output, _say)
-    elif options.command == "topologies":
-        solutions, picture = showcase.run_topologies(options.output, _say)
-        for topology, (_, solution) in solutions.items():
-            print(f"  {topology}: {int(solution.stats['num_steps'])} steps")
-        pictures = [picture]
-    elif options.command == "league":
-        _run_league()
-        return
-    elif options.command == "tune":
-        pictures = _run_tuning(parser, options)
-    else:
-        run = showcase.run_circle(options.output, _say, print)
-        _print_circle(run)
-        pictures = run.pictures
-    print(f"\npictures in {options.output}/: {', '.join(p.name for p in pictures)}")
+    return parser
 
 
 def _add_output(parser: argparse.ArgumentParser, default: Path | str) -> None:
@@ -73,28 +95,41 @@ def _add_output(parser: argparse.ArgumentParser, default: Path | str) -> None:
 
 
 def _add_tuning(command: argparse.ArgumentParser) -> None:
+    real = _number(float, "a finite number", lambda x: True)
+    not_negative = _number(float, "a finite number of at least 0", lambda x: x >= 0)
+    not_zero = _number(float, "a finite number other than 0", lambda x: x != 0)
+    above_one = _number(float, "a finite number above 1", lambda x: x > 1)
+    speed = _number(float, "a finite number of at least 0.001", lambda x: x >= 1e-3)
+    share = _number(float, "a number from 0 to below 1", lambda x: 0 <= x < 1)
+    count = _number(int, "a whole number of at least 1", lambda n: n >= 1)
+    seed = _number(int, "a whole number of at least 0", lambda n: n >= 0)
     job = command.add_argument_group("the circle, and by what gains are judged")
-    for name, count, kind, text in (
-        ("center", 2, float, "middle of the circle, x y [m]"),
-        ("radius", None, float, "of the circle [m]"),
-        ("period", None, float, "time of one turn; two are simulated [s]"),
-        ("factor", None, float, "the gains stay within this factor of the paper's"),
-        ("price", None, float, "of full effort of one joint all the time [m^2]"),
-        ("members", None, int, "size of the ensemble"),
+    for name, numbers, kind, text in (
+        ("center", 2, real, "middle of the circle, x y [m]"),
+        ("radius", None, not_negative, "of the circle [m]"),
+        ("period", None, not_zero, "time of one turn; two are simulated [s]"),
+        ("factor", None, above_one, "the gains stay within this factor of the paper's"),
+        ("price", None, not_negative, "of full effort of one joint all the time [m^2]"),
+        ("members", None, count, "size of the ensemble"),
         (
             "payload",
             2,
-            float,
+            not_negative,
             "of the ensemble: least and greatest mass at the tip [kg]",
         ),
-        ("start-offset", None, float, "of the ensemble: of the tip at the start [m]"),
-        ("speed", 2, float, "of the ensemble: least and greatest speed, 1 as said"),
-        ("link-error", None, float, "of the ensemble: relative error of masses"),
+        (
+            "start-offset",
+            None,
+            not_negative,
+            "of the ensemble: of the tip at the start [m]",
+        ),
+        ("speed", 2, speed, "of the ensemble: least and greatest speed, 1 as said"),
+        ("link-error", None, share, "of the ensemble: relative error of masses"),
     ):
-        default = getattr(tuning_run.Job, name.replace("-", "_"))
-        shown = " ".join(map(str, default)) if count else default
+        default = getattr(Job, name.replace("-", "_"))
+        shown = " ".join(map(str, default)) if numbers else default
         job.add_argument(
-            f"--{name}", nargs=count, type=kind, help=f"{text}; {shown} by default"
+            f"--{name}", nargs=numbers, type=kind, help=f"{text}; {shown} by default"
         )
     job.add_argument(
         "--over",
@@ -105,96 +140,101 @@ def _add_tuning(command: argparse.ArgumentParser) -> None:
     search = command.add_argument_group("the search")
     # No defaults here: they would override what --resume has read.
     search.add_argument(
-        "--method", choices=tuple(METHODS), help="levenberg-marquardt by default"
+        "--method", choices=METHODS, help="levenberg-marquardt by default"
     )
-    search.add_argument("--starts", type=int, help="runs; 1 by default")
-    search.add_argument("--seed", type=int, help="of the random starts; 0 by default")
-    search.add_argument("--max-steps", type=int, help="50 by default")
-    search.add_argument("--save", type=Path, metavar="FILE", help="keep the result")
+    search.add_argument("--starts", type=count, help="runs; 1 by default")
+    search.add_argument("--seed", type=seed, help="of the random starts; 0 by default")
+    search.add_argument("--max-steps", type=count, help="50 by default")
+    search.add_argument(
+        "--save", type=_new_file, metavar="FILE", help="keep the result"
+    )
     search.add_argument(
         "--resume",
-        type=Path,
+        type=_saved_run,
         metavar="FILE",
         help="go on with what --save has kept: its circle, bounds, ensemble and search "
         "(with other random starts)",
     )
 
 
-def _run_league() -> None:
-    _say("tune all seven topologies in one compiled program")
-    results = tune_each(circle_scenes(), report=print)
-    print(f"\n{league_table(results)}")
+# Converters of arguments; argparse prints the error with the name of the option.
 
 
-def _run_tuning(parser: argparse.ArgumentParser, options: Any) -> list[Path]:
-    def of(names):
-        return {n: v for n in names if (v := getattr(options, n)) is not None}
+def _number(
+    kind: type[int] | type[float], expected: str, fits: Callable[[Any], bool]
+) -> Callable[[str], int | float]:
+    def converted(text: str) -> int | float:
+        try:
+            value = kind(text)
+        except ValueError:
+            value = math.nan
+        # Of NaN, the comparison is false.
+        if abs(value) < math.inf and fits(value):
+            return value
+        raise argparse.ArgumentTypeError(f"expected {expected}, got {text!r}.")
 
-    given = of(field.name for field in dataclasses.fields(tuning_run.Job))
-    search = of(("method", "starts", "seed", "max_steps"))
+    return converted
+
+
+def _new_file(text: str) -> Path:
+    path = Path(text)
+    if path.is_dir():
+        raise argparse.ArgumentTypeError(f"expected a file, got the folder {text!r}.")
+    return path
+
+
+def _saved_run(text: str) -> Path:
+    try:
+        with open(text, "rb") as file:
+            archive = zipfile.is_zipfile(file)  # as `fdof_jax.save` writes
+    except OSError as error:
+        raise argparse.ArgumentTypeError(
+            f"cannot read {text!r}: {error.strerror}."
+        ) from error
+    if not archive:
+        raise argparse.ArgumentTypeError(
+            f"expected a file written by `fdof-jax tune --save`, got {text!r}."
+        )
+    return Path(text)
+
+
+# Checks of several arguments together, and of folders
+
+
+def _given(options: argparse.Namespace, names: Sequence[str]) -> dict[str, Any]:
+    """The options with these names that are on the command line."""
+    return {n: v for n in names if (v := getattr(options, n)) is not None}
+
+
+def _check_tuning(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
+    """Exit with status 2 if options of `tune` contradict each other."""
+    given = _given(options, _OF_JOB)
     if given and options.resume is not None:
         parser.error(
             f"--resume: the file says what is tuned, also given: {', '.join(given)}"
         )
-    of_ensemble = {"members", "payload", "start_offset", "speed", "link_error"}
-    if options.over in (None, "nominal") and of_ensemble & set(given):
-        parser.error(
-            f"--over: mean or worst is needed for {', '.join(of_ensemble & set(given))}"
-        )
+    ensemble = _given(options, _OF_ENSEMBLE)
+    if ensemble and options.over in (None, "nominal"):
+        parser.error(f"--over: mean or worst is needed for {', '.join(ensemble)}")
+    for name in ("payload", "speed"):
+        least, greatest = given.get(name, (0, 0))
+        if least > greatest:
+            parser.error(
+                f"--{name}: expected the least before the greatest, got {least:g} and "
+                f"{greatest:g}."
+            )
+
+
+def _check_folder(
+    parser: argparse.ArgumentParser, option: str, folder: Path, make: bool = False
+) -> None:
+    """Exit with status 2 unless files can be written into the folder."""
     try:
-        run = tuning_run.run_tuning(
-            options.output,
-            _say,
-            print,
-            job=tuning_run.Job(**given),
-            resume=options.resume,
-            save_to=options.save,
-            **search,
-        )
-    except (ValueError, OSError) as error:
-        parser.error(str(error))
-    print(f"\n{run.result}")
-    for when, report in zip(("before", "after"), run.reports):
-        print(f"\n{when} tuning: {report}")
-    return run.pictures
-
-
-def _say(text: str) -> None:
-    print(f"{text} ...", flush=True)
-
-
-def _print_circle(run: showcase.CircleRun) -> None:
-    before, after = run.before, run.after
-    joints = "T2", "F2", "T4"
-    kp_units, kd_units = (
-        ("N m/rad", "N/m", "N m/rad"),
-        ("N m s/rad", "N s/m", "N m s/rad"),
-    )
-    rows = [
-        ("tip error, whole run: rms [mm]", 1e3 * before.rms, 1e3 * after.rms),
-        ("  largest [mm]", 1e3 * before.largest, 1e3 * after.largest),
-        ("second period: rms [mm]", 1e3 * before.rms_second, 1e3 * after.rms_second),
-        ("  largest [mm]", 1e3 * before.largest_second, 1e3 * after.largest_second),
-    ]
-    for k, joint in enumerate(joints):
-        rows.append((f"kp of {joint} [{kp_units[k]}]", before.kp[k], after.kp[k]))
-    for k, joint in enumerate(joints):
-        rows.append((f"kd of {joint} [{kd_units[k]}]", before.kd[k], after.kd[k]))
-    for k, joint in enumerate(joints):
-        share = 100 * before.saturated[k], 100 * after.saturated[k]
-        rows.append((f"time at the limit of {joint} [%]", *share))
-    print(f"\n{'':34}{'paper':>12}{'tuned':>12}")
-    for label, first, second in rows:
-        print(f"{label:34}{first:12.5g}{second:12.5g}")
-    history = run.tuned.history
-    print(
-        f"\ntuning: {len(history.loss) - 1} iterations, {run.tuned.message}; projected "
-        f"gradient {history.gradient_norm[0]:.2g} -> {history.gradient_norm[-1]:.2g}"
-    )
-    times = ", ".join(
-        f"{what} {seconds:.1f} s" for what, seconds in run.wall_times.items()
-    )
-    print(f"time, compilation included: {times}")
+        if make:
+            folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        parser.error(f"{option}: cannot write into {str(folder)!r}: {error.strerror}.")
 
 
 if __name__ == "__main__":

@@ -1,11 +1,17 @@
 """The commands run as a user would call them, and write what they say."""
 
+import json
+import os
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
 import fdof_jax as fj
-from fdof_jax import showcase
+from fdof_jax import bounded_search, showcase
 from fdof_jax.__main__ import main
+from fdof_jax.tuning_run import METHODS
 
 
 def pictures(folder):
@@ -58,20 +64,6 @@ def test_topologies_start_alike():
     np.testing.assert_allclose(chains, np.tile(chains[0], (7, 1)), atol=1e-14)
 
 
-@pytest.mark.parametrize("arguments", [["--help"], ["figures", "--help"]])
-def test_help(arguments, capsys):
-    with pytest.raises(SystemExit) as stop:
-        main(arguments)
-    assert stop.value.code == 0
-    assert "--output" in capsys.readouterr().out
-
-
-def test_unknown_command(capsys):
-    with pytest.raises(SystemExit) as stop:
-        main(["square"])
-    assert stop.value.code == 2
-
-
 def kept_gains(printed):
     """Tuned kp and kd of a printed table."""
     lines = [
@@ -108,26 +100,99 @@ def test_tuning_goes_on_where_it_was_saved(tmp_path, capsys):
     assert [row[1] for row in before] == [row[0] for row in after]
 
 
+# What is answered without JAX: the arguments, the exit status and part of the message.
+AT_ONCE = [
+    ("--version", 0, fj.__version__),
+    ("--help", 0, "--output"),
+    ("figures --help", 0, "--output"),
+    ("tune --help", 0, "-4.0 2.0 by default"),
+    ("square", 2, "invalid choice: 'square'"),
+    ("--output", 2, "expected one argument"),
+    ("--output file", 2, "--output: cannot write into 'file': File exists"),
+    ("figures --output file/in/it", 2, "cannot write into 'file/in/it': Not a dir"),
+    ("tune --center 0 inf", 2, "--center: expected a finite number, got 'inf'"),
+    ("tune --radius -1", 2, "--radius: expected a finite number of at least 0"),
+    ("tune --period 0", 2, "--period: expected a finite number other than 0"),
+    ("tune --price nan", 2, "--price: expected a finite number of at least 0"),
+    ("tune --factor 1", 2, "--factor: expected a finite number above 1"),
+    ("tune --speed 0 1", 2, "--speed: expected a finite number of at least 0.001"),
+    ("tune --link-error 1", 2, "--link-error: expected a number from 0 to below 1"),
+    ("tune --starts 0", 2, "--starts: expected a whole number of at least 1"),
+    ("tune --seed 1.5", 2, "--seed: expected a whole number of at least 0, got '1.5'"),
+    ("tune --method newton", 2, "--method: invalid choice: 'newton'"),
+    ("tune --payload 0 1", 2, "--over: mean or worst is needed for payload"),
+    ("tune --over mean --payload 2 1", 2, "--payload: expected the least before"),
+    ("tune --save nowhere/x", 2, "--save: cannot write into 'nowhere': No such file"),
+    ("tune --save file/x", 2, "--save: cannot write into 'file': Not a directory"),
+    ("tune --save .", 2, "--save: expected a file, got the folder '.'"),
+    ("tune --resume nothing", 2, "--resume: cannot read 'nothing': No such file"),
+    ("tune --resume file", 2, "--resume: expected a file written by `fdof-jax tune"),
+    ("tune --resume saved --radius 1", 2, "--resume: the file says what is tuned"),
+]
+if os.geteuid() != 0:  # root may write everywhere
+    AT_ONCE += [
+        ("--output sealed", 2, "cannot write into 'sealed': Permission denied"),
+        ("--output sealed/in/it", 2, "write into 'sealed/in/it': Permission denied"),
+        ("tune --save sealed/x", 2, "--save: cannot write into 'sealed': Permission"),
+    ]
+ANSWERS = """
+import contextlib, io, json, sys
+from fdof_jax.__main__ import main
+
+def answer(arguments):
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
+        try:
+            main(arguments.split())
+            status = None
+        except SystemExit as stop:
+            status = stop.code
+    imported = [name for name in ("jax", "numpy") if name in sys.modules]
+    return status, printed.getvalue(), imported
+
+print(json.dumps({asked: answer(asked) for asked in json.loads(sys.argv[1])}))
+"""
+
+
+@pytest.fixture(scope="module")
+def answers(tmp_path_factory):
+    """All answers of one process: what one of them imports, the next ones show too."""
+    folder = tmp_path_factory.mktemp("command_line")
+    (folder / "file").write_text("not a folder")
+    (folder / "sealed").mkdir(mode=0o555)
+    fj.save(folder / "saved", {"of": "another kind"})
+    asked = json.dumps([arguments for arguments, _, _ in AT_ONCE])
+    run = subprocess.run(
+        [sys.executable, "-c", ANSWERS, asked],
+        cwd=folder, env=os.environ | {"COLUMNS": "200"},
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    return json.loads(run.stdout)
+
+
+@pytest.mark.parametrize(("arguments", "status", "message"), AT_ONCE)
+def test_answers_without_jax(arguments, status, message, answers):
+    code, printed, imported = answers[arguments]
+    assert code == status and message in printed and imported == []
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--resume", "x.fdof", "--radius", "1"], "--resume: the file says"),
-        (["--resume", "x.fdof"], "x.fdof"),
-        (["--payload", "0", "1"], "--over: mean or worst is needed for payload"),
-        (["--radius", "-1"], "radius"),
-        (["--price", "-1"], "price"),
-        (["--factor", "0.5"], "factor"),
-        (["--starts", "0"], "starts"),
-        (["--save", "nowhere/x.fdof"], "--save: expected a file in a folder"),
-        (["--method", "newton"], "--method"),
+        (["--center", "-1", "2"], "expected a circle within the linkage's reach"),
+        (["--resume", "saved"], "saved: expected a file written by `fdof-jax tune"),
     ],
 )
-def test_tuning_refuses(options, message, tmp_path, capsys, monkeypatch):
+def test_refusals_that_need_jax(options, message, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    fj.save("saved", {"of": "another kind"})
     with pytest.raises(SystemExit) as stop:
         main(["tune", *options])
-    assert stop.value.code == 2
-    assert message in capsys.readouterr().err
+    assert stop.value.code == 2 and message in capsys.readouterr().err
+
+
+def test_methods_have_their_names():
+    assert METHODS == tuple(bounded_search.METHODS)
 
 
 @pytest.mark.slow
