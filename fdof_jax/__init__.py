@@ -2,14 +2,14 @@
 
 import ast
 import importlib
-from pathlib import Path
+import pathlib
 from typing import Any
 
 __version__ = "0.1.0"
 
 # A name is imported at its first use, so that what needs no JAX starts at once. The
 # stub beside this file lists the names; editors and type checkers read it too.
-_STUB = ast.parse(Path(__file__).with_suffix(".pyi").read_text())
+_STUB = ast.parse(pathlib.Path(__file__).with_suffix(".pyi").read_text())
 _MODULE_OF = {
     name.name: statement.module or name.name
     for statement in _STUB.body
