@@ -7,6 +7,7 @@ from .chain_dynamics import (
     masked_accelerations as masked_accelerations,
     mass_matrix as mass_matrix,
 )
+from .configuration import configure as configure
 from .control import (
     CircleTask as CircleTask,
     PDController as PDController,

@@ -17,7 +17,7 @@ from .control import Reference, checked_reference, reference_motion
 from .forces import Forces
 from .linkage import Linkage
 from .reduced_equations import equations, link_constants, zeros
-from .vector_field import LEAST_INERTIA_RATIO, Args, applied, schedule_of
+from .vector_field import LEAST_INERTIA_RATIO, Args, applied
 
 
 class PrescribedMotion(eqx.Module):
@@ -148,23 +148,15 @@ def hybrid_field(t, y, args, schedule) -> tuple[Any, ...]:
     return (*moving, acting.own_rates) if own else moving
 
 
-def watched_hybrid_field(t, y, args, schedule) -> tuple[tuple[Any, ...], Array]:
-    """The same, and the health of the driven joints' equations."""
+def health_of_hybrid(t, y, args) -> Array:
+    """The health of the driven joints' equations: see `vector_field.health_of`."""
     motion = prescribed(args.forces)
     assert motion is not None
-    rates = hybrid_field(t, y, args, schedule)
     q, _ = motion_at(motion, args, t, y)
     matrix, _ = _mass_and_bias(args, q, jnp.zeros(3))
     free = jnp.where(jnp.outer(~motion.moved, ~motion.moved), matrix, jnp.eye(3))
     loss = jnp.max(jnp.diag(free) * jnp.diag(jnp.linalg.inv(free)))
-    singular = ~(loss * LEAST_INERTIA_RATIO[loss.dtype] <= 1)
-    finite = jnp.isfinite(jnp.stack(jax.tree.leaves(rates))).all()
-    return rates, jnp.where(finite, jnp.where(singular, 0, loss), jnp.nan)
-
-
-def health_of_hybrid(t, y, args) -> Array:
-    _, health = watched_hybrid_field(t, y, args, schedule_of(t, args))
-    return health
+    return jnp.where(loss * LEAST_INERTIA_RATIO[loss.dtype] <= 1, loss, 0)
 
 
 def prescribed_effort(

@@ -7,23 +7,34 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from .added_inertia import inertial
 from .forces import Forces, jumps_of
+from .callbacks import without_checks
+from .configuration import small_loops_are_kernels
+from .dopri8 import ScheduledTerm
 from .hybrid_dynamics import (
     health_of_hybrid,
     hybrid_field,
     motion_at,
     prescribed,
     start_of,
-    watched_hybrid_field,
 )
 from .linkage import possible
 from .reduced_equations import link_constants, zeros
 from .solution import Solution
-from .step_control import Watched, bounded, default_controller, landing_on
-from .unrolled_dopri8 import ScheduledTerm, UnrolledDopri8
+from .looped_dopri8 import LoopedDopri8
+from .step_control import (
+    Watched,
+    bounded,
+    default_controller,
+    landing_on,
+    undifferentiated,
+)
+from .unrolled_dopri8 import UnrolledDopri8
+from .validation import is_traced
 from .vector_field import (
     Args,
     health_of,
@@ -59,20 +70,33 @@ def _step_for_tangents(t0: Array, args: Args, own: tuple, fraction: float) -> Ar
     return jax.lax.stop_gradient(jnp.where(step > 0, step, jnp.inf))
 
 
-def _default_solver(
-    forces: Forces, for_tangents: bool = False
-) -> diffrax.AbstractSolver:
+def _batch_solver(forces: Forces) -> diffrax.AbstractSolver:
+    """What solves large batches fastest."""
     # Thirteen copies of such equations take minutes to compile.
     many = inertial(forces) or prescribed(forces)
-    return diffrax.Dopri8() if many else UnrolledDopri8(for_tangents)
+    return diffrax.Dopri8() if many else UnrolledDopri8()
 
 
-def _integrate(solver, inputs, keywords, derivatives: bool = False) -> Solution:
-    """`derivatives`: whether they are wanted, to the accuracy of the default steps."""
+def _tangent_solver(forces: Forces) -> diffrax.AbstractSolver:
+    """What solves fastest with derivatives in forward mode."""
+    many = inertial(forces) or prescribed(forces)
+    if many or small_loops_are_kernels():
+        return LoopedDopri8()
+    return UnrolledDopri8(for_tangents=True)
+
+
+def _integrate(
+    solver, inputs, keywords, derivatives: bool = False, padded: bool = False
+) -> Solution:
+    """`derivatives`: whether they are wanted, to the accuracy of the default steps.
+
+    `padded`: whether the last time stands there more than once.
+    """
     linkage, state0, asked, own0, forces = inputs
     # What no door has seen is told by the result. Something harmless is integrated in
     # its place: derivatives of NaN would spoil those in what is shared with others.
-    increasing = (jnp.diff(asked) > 0).all()
+    growth = jnp.diff(asked)
+    increasing = ((growth >= 0) if padded else (growth > 0)).all()
     harmless = 1e-3 * jnp.arange(len(asked), dtype=asked.dtype)
     ts = jnp.where(increasing, asked, harmless)
     finite = (jnp.isfinite(state0.q) & jnp.isfinite(state0.qd)).all()
@@ -92,14 +116,11 @@ def _integrate(solver, inputs, keywords, derivatives: bool = False) -> Solution:
         known = jnp.isfinite(jnp.array(state)).all()
         valid, own = valid & known, (tuple(jnp.where(known, x, 0) for x in state),)
     if motion is None:
-        term, health = (
-            ScheduledTerm(vector_field, watched_field, schedule_of),
-            health_of,
-        )
+        term = ScheduledTerm(vector_field, schedule_of, health_of, watched_field)
         start = zeros(q0), tuple(qd0)
     else:
-        term = ScheduledTerm(hybrid_field, watched_hybrid_field, schedule_of)
-        health, start = health_of_hybrid, start_of(motion, args, qd0)
+        term = ScheduledTerm(hybrid_field, schedule_of, health_of_hybrid)
+        start = start_of(motion, args, qd0)
     controller = keywords["stepsize_controller"]
     # Stiff modes, which implicit solvers are taken for, would make the steps too short.
     implicit = isinstance(solver, diffrax.AbstractImplicitSolver)
@@ -110,26 +131,29 @@ def _integrate(solver, inputs, keywords, derivatives: bool = False) -> Solution:
         fraction = _OF_TIME_SCALE[0 if (solver.order(term) or 0) >= 8 else 1]
         longest = lambda: _step_for_tangents(ts[0], args, own, fraction)
         controller = bounded(controller, longest)
+    controller = undifferentiated(controller)
     if (jumps := jumps_of(*forces)) is not None:
         controller = landing_on(controller, jumps.astype(ts.dtype))
     adaptive = isinstance(controller, diffrax.AbstractAdaptiveStepSizeController)
-    if adaptive and not isinstance(solver, UnrolledDopri8):
-        controller = Watched(controller, health)  # pyright: ignore[reportCallIssue]
-    solution = diffrax.diffeqsolve(
-        term,
-        solver,
-        t0=ts[0],
-        t1=ts[-1],
-        y0=(*start, *own),
-        args=args,
-        saveat=diffrax.SaveAt(
-            subs=(
-                diffrax.SubSaveAt(ts=ts),
-                diffrax.SubSaveAt(t1=True, fn=lambda t, y, args: t),
-            )
-        ),
-        **keywords | {"stepsize_controller": controller},
-    )
+    if adaptive and not isinstance(solver, UnrolledDopri8 | LoopedDopri8):
+        controller = Watched(controller, term.health)  # pyright: ignore[reportCallIssue]
+    with without_checks():
+        solution = diffrax.diffeqsolve(
+            term,
+            solver,
+            t0=ts[0],
+            t1=ts[-1],
+            y0=(*start, *own),
+            args=args,
+            saveat=diffrax.SaveAt(
+                subs=(
+                    diffrax.SubSaveAt(ts=ts),
+                    diffrax.SubSaveAt(t1=True, fn=lambda t, y, args: t),
+                )
+            ),
+            throw=False,
+            **keywords | {"stepsize_controller": controller},
+        )
     assert solution.ys is not None  # because of saveat
     states, (reached,) = solution.ys
     own_rows = [jax.vmap(lambda rows: own_states(args, rows))(o) for o in states[2:]]
@@ -160,14 +184,13 @@ def _integrate(solver, inputs, keywords, derivatives: bool = False) -> Solution:
 def _integrate_reversibly(inputs, solver, keywords) -> Solution:
     """A motion whose derivatives are taken in reverse mode, if any are.
 
-    The default solver's unrolled stages are not for that. The replay has to come to
-    the same bits: next to a saturation another rounding leads to other steps, and to a
-    wrong gradient. Unrolled stages are compiled differently with derivatives and
-    without; diffrax's loop over the stages is not.
+    The replay has to come to the same bits: next to a saturation another rounding leads
+    to other steps, and to a wrong gradient. Unrolled stages are compiled differently
+    with derivatives and without; a loop over the stages is not.
     """
     # Nothing is differentiated here, and loops made for that take longer to compile.
     keywords = keywords | {"adjoint": diffrax.ForwardMode()}
-    return _integrate(solver or _default_solver(inputs[-1]), inputs, keywords)
+    return _integrate(solver or _batch_solver(inputs[-1]), inputs, keywords)
 
 
 @_integrate_reversibly.def_fwd
@@ -177,7 +200,7 @@ def _integrate_reversibly_fwd(perturbed, inputs, solver, keywords):
     def motion(moving):
         inputs = eqx.combine(moving, fixed)
         solution = _integrate(
-            solver or diffrax.Dopri8(), inputs, keywords, derivatives=True
+            solver or LoopedDopri8(), inputs, keywords, derivatives=True
         )
         return (solution.q, solution.qd, solution.own), solution
 
@@ -213,11 +236,53 @@ def _opened(inputs):
 
 @eqx.filter_jit
 def solve(solver, inputs, keywords) -> Solution:
+    """The motion, by a program for values that JAX traces: a batch's, a derivative's."""
     adjoint = keywords["adjoint"]
     if isinstance(adjoint, diffrax.RecursiveCheckpointAdjoint):
         return _integrate_reversibly(_opened(inputs), solver, keywords)
     if solver is None:
         forward = isinstance(adjoint, diffrax.ForwardMode)
-        tangents = _default_solver(inputs[-1], for_tangents=True)
-        solver = tangents if forward else diffrax.Dopri8()
+        solver = _tangent_solver(inputs[-1]) if forward else LoopedDopri8()
     return _integrate(solver, inputs, keywords, derivatives=True)
+
+
+# Fewer output times than this share a program.
+_FEWEST_TIMES = 512
+
+
+def solve_one(solver, inputs, keywords) -> tuple[Solution, bool] | None:
+    """The motion of one arm and whether it succeeded, by a short program.
+
+    Other numbers of output times need no other program: they are filled up with the
+    last one to a power of two. For known values only: None if a force element turns
+    out to hold a traced one.
+    """
+    linkage, state0, ts, own0, forces = inputs
+    times = np.asarray(ts)
+    count = len(times)
+    size = max(_FEWEST_TIMES, 1 << (count - 1).bit_length())
+    filled = np.pad(times, (0, size - count), mode="edge")
+    solution, succeeded = _solve_padded(
+        solver, (linkage, state0, filled, own0, forces), keywords
+    )
+
+    if is_traced(solution):
+        return None
+
+    def cut(rows: Array) -> Array:
+        return jnp.asarray(np.asarray(rows)[:count])  # slices by JAX are compiled
+
+    rows = cut(solution.q), cut(solution.qd), jax.tree.map(cut, solution.own)
+    return Solution(
+        ts, *rows[:2], solution.stats, solution.result, rows[2]
+    ), bool(succeeded)
+
+
+@eqx.filter_jit
+def _solve_padded(solver, inputs, keywords) -> tuple[Solution, Array]:
+    # Steps are bounded as they would be with derivatives of this kind.
+    derivatives = isinstance(keywords["adjoint"], diffrax.ForwardMode)
+    keywords = keywords | {"adjoint": diffrax.ForwardMode()}
+    solver = LoopedDopri8() if solver is None else solver
+    solution = _integrate(solver, inputs, keywords, derivatives, padded=True)
+    return solution, solution.result == diffrax.RESULTS.successful

@@ -5,6 +5,7 @@ own over the batch: five evaluations of the equations for one. Here they are one
 loop, in forward and in derivative computations.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -15,7 +16,15 @@ from jax import Array
 from jax.custom_derivatives import SymbolicZero
 
 from .one_loop import one_loop_on_cpu
-from .reduced_equations import Constants, Equations, Scalars, equations
+from .reduced_equations import (
+    Constants,
+    Directions,
+    Equations,
+    Scalars,
+    directions,
+    equations,
+    turns,
+)
 
 Matrix = tuple[Scalars, Scalars, Scalars]  # by columns
 # What force elements add to the mass matrix: m11, m12, m13, m22, m23, m33.
@@ -42,9 +51,11 @@ def _divided(x: Array) -> Array:
     return 1 / x
 
 
+@functools.cache
 def _one_loop(function: Callable) -> Callable:
     """`function(reciprocal, *arguments)` by the means of the platform."""
 
+    @jax.jit  # traced once, not at each use
     def on_platform(*arguments):
         return jax.lax.platform_dependent(
             *arguments,
@@ -145,79 +156,119 @@ def _rates_and_conditioning(
 ) -> tuple[Scalars, Scalars, Array]:
     m = _with(added, equations(c, delta, qd))
     solve, inverse_diagonal = _solver(c, m, added, reciprocal)
-    i11, i22, i33 = inverse_diagonal()
+    return qd, solve(_subtract(tau, m.bias)), _loss(m, inverse_diagonal())
+
+
+def _loss(m: Equations, inverse: Scalars) -> Array:
+    """What rounding is multiplied by in the accelerations."""
+    i11, i22, i33 = inverse
     loss = jnp.maximum(m.m11 * i11, jnp.maximum(m.m22 * i22, m.m33 * i33))
     # An infinite inverse times a mass of zero.
-    loss = jnp.where(i11 == jnp.inf, jnp.inf, loss)
-    return qd, solve(_subtract(tau, m.bias)), loss
+    return jnp.where(i11 == jnp.inf, jnp.inf, loss)
+
+
+def _conditioning(
+    reciprocal: Callable, c: Constants, delta: Scalars, added: Added | None
+) -> Array:
+    zero = jnp.zeros_like(delta[0])
+    m = _with(added, equations(c, delta, (zero, zero, zero)))
+    _, inverse_diagonal = _solver(c, m, added, reciprocal)
+    return _loss(m, inverse_diagonal())
+
+
+def conditioning(c: Constants, delta: Scalars, added: Added | None = None) -> Array:
+    """What rounding is multiplied by, as `rates_and_conditioning` returns it."""
+    return _one_loop(_conditioning)(c, delta, added)
 
 
 @jax.jit
 def required_efforts(
-    c: Constants, delta: Scalars, qd: Scalars, qdd: Scalars
+    c: Constants,
+    delta: Scalars,
+    qd: Scalars,
+    qdd: Scalars,
+    turned: Directions | None = None,
 ) -> Scalars:
     """The inverse dynamics: M qdd + bias."""
-    m = equations(c, delta, qd)
+    m = equations(c, delta, qd, turned)
     y1, y2, y3 = times((m.m11, m.m12, m.m13, m.m22, m.m23, m.m33), qdd)
     b1, b2, b3 = m.bias
     return y1 + b1, y2 + b2, y3 + b3
 
 
-def _change(
+def _directions_and_inverse(
+    reciprocal: Callable, c: Constants, delta: Scalars, added: Added | None
+) -> tuple[Directions, Matrix]:
+    """The directions of the links, and the inverse of the mass matrix by columns."""
+    turned = directions(c, delta)
+    zero, one = jnp.zeros_like(delta[0]), jnp.ones_like(delta[0])
+    m = _with(added, equations(c, delta, (zero, zero, zero), turned))
+    solve, _ = _solver(c, m, added, reciprocal)
+    unit = (one, zero, zero), (zero, one, zero), (zero, zero, one)
+    return turned, (solve(unit[0]), solve(unit[1]), solve(unit[2]))
+
+
+def _demanded_change(
     reciprocal: Callable,
     c: Constants,
     delta: Scalars,
     qd: Scalars,
-    tau: Scalars,
-    added: Added | None,
+    qdd: Scalars,
+    turned: Directions,
     direction: tuple[Scalars, Scalars],
 ) -> Scalars:
-    """Derivative of the accelerations in a direction of (delta, qd).
-
-    From the inverse dynamics: no derivative goes through the solution of the equations.
-    """
-    m = _with(added, equations(c, delta, qd))
-    solve, _ = _solver(c, m, added, reciprocal)
-    qdd = solve(_subtract(tau, m.bias))
-    _, change = jax.jvp(lambda *y: required_efforts(c, *y, qdd), (delta, qd), direction)
-    x1, x2, x3 = solve(change)
-    return -x1, -x2, -x3
-
-
-def _inverse_inertia(
-    reciprocal: Callable, c: Constants, delta: Scalars, added: Added | None
-) -> Matrix:
-    zero, one = jnp.zeros_like(delta[0]), jnp.ones_like(delta[0])
-    m = _with(added, equations(c, delta, (zero, zero, zero)))
-    solve, _ = _solver(c, m, added, reciprocal)
-    unit = (one, zero, zero), (zero, one, zero), (zero, zero, one)
-    return solve(unit[0]), solve(unit[1]), solve(unit[2])
+    """Derivative of the efforts that `qdd` takes, in a direction of (delta, qd)."""
+    del reciprocal  # nothing is divided
+    delta_dot, qd_dot = direction
+    turned_dot = tuple(
+        (-e[1] * angle, e[0] * angle) for e, angle in zip(turned, turns(c, delta_dot))
+    )
+    _, change = jax.jvp(
+        lambda delta, qd, turned: required_efforts(c, delta, qd, qdd, turned),
+        (delta, qd, turned),
+        (delta_dot, qd_dot, turned_dot),
+    )
+    return change
 
 
-def _directions(dtype: Any) -> tuple[Scalars, Scalars]:
+def _unit_directions(dtype: Any) -> tuple[Scalars, Scalars]:
     rows = tuple(jnp.eye(6, dtype=dtype))
     return rows[:3], rows[3:]
 
 
-def _plain_sensitivities(c, delta, qd, tau, added):
-    by_state = jax.vmap(lambda d: _change(_divided, c, delta, qd, tau, added, d))(
-        _directions(delta[0].dtype)
+def _derivatives(
+    evaluated: Callable,
+    c: Constants,
+    delta: Scalars,
+    qd: Scalars,
+    qdd: Scalars,
+    added: Added | None,
+) -> tuple[Scalars, Matrix]:
+    # Sines and cosines first, and only once: XLA would compute them anew for each of
+    # the results that follow. A single arm's derivatives are 1.7 times faster so.
+    turned, inverse = evaluated(_directions_and_inverse)(c, delta, added)
+    # The six directions are lanes of one loop, whose code has then the size of one.
+    demanded = jax.vmap(
+        lambda d: evaluated(_demanded_change)(c, delta, qd, qdd, turned, d)
+    )(_unit_directions(delta[0].dtype))
+    # No derivative goes through the solution of the equations.
+    by_state = tuple(
+        -sum(column[row] * change for column, change in zip(inverse, demanded))
+        for row in range(3)
     )
-    return by_state, _inverse_inertia(_divided, c, delta, added)
+    return by_state, inverse
+
+
+def _plain_sensitivities(*arguments):
+    return _derivatives(lambda function: functools.partial(function, _divided), *arguments)
 
 
 @jax.custom_jvp
 def _one_loop_sensitivities(
-    c: Constants, delta: Scalars, qd: Scalars, tau: Scalars, added: Added | None
+    c: Constants, delta: Scalars, qd: Scalars, qdd: Scalars, added: Added | None
 ) -> tuple[Scalars, Matrix]:
-    """Derivatives of the accelerations: three rows in (delta, qd), columns in tau.
-
-    The six directions are lanes of one loop, whose code has then the size of one.
-    """
-    by_state = jax.vmap(lambda d: _one_loop(_change)(c, delta, qd, tau, added, d))(
-        _directions(delta[0].dtype)
-    )
-    return by_state, _one_loop(_inverse_inertia)(c, delta, added)
+    """Derivatives of the accelerations: three rows in (delta, qd), columns in tau."""
+    return _derivatives(_one_loop, c, delta, qd, qdd, added)
 
 
 @_one_loop_sensitivities.defjvp
@@ -246,7 +297,7 @@ def rates(
 def _rates_jvp(primals, tangents):
     c, delta, qd, _, added = primals
     values = rates(*primals)
-    by_state, by_tau = _sensitivities(*primals)
+    by_state, by_tau = _sensitivities(c, delta, qd, values[1], added)
     c_dot, *others, added_dot = tangents
     delta_dot, qd_dot, efforts_dot = map(_dense, others)
     moved = jnp.stack((*delta_dot, *qd_dot))
@@ -310,3 +361,4 @@ def inertia_diagonals(
     m = _with(added, equations(c, delta, (zero, zero, zero)))
     _, inverse_diagonal = _solver(c, m, added, _divided)
     return (m.m11, m.m22, m.m33), inverse_diagonal()
+

@@ -21,6 +21,7 @@ from .trigonometry import sincos
 
 Scalars = tuple[Array, Array, Array]
 Vector = tuple[Array, Array]
+Directions = tuple[Vector, Vector, Vector]
 
 
 class Constants(NamedTuple):
@@ -138,12 +139,28 @@ class Equations(NamedTuple):
     bias: Scalars
 
 
-def equations(c: Constants, delta: Scalars, qd: Scalars) -> Equations:
-    """The reduced equations of motion: (8)-(13) projected on the real joints."""
+def turns(c: Constants, delta: Scalars) -> Scalars:
+    """The angles by which displacements turn the three links [rad]."""
     r1, r2, r3 = c.revolute
     turned2 = jnp.where(r1, delta[0], 0)
     turned3 = turned2 + jnp.where(r2, delta[1], 0)
-    turned4 = turned3 + jnp.where(r3, delta[2], 0)
+    return turned2, turned3, turned3 + jnp.where(r3, delta[2], 0)
+
+
+def directions(c: Constants, delta: Scalars) -> Directions:
+    """The unit vectors along the three links, turned by displacements."""
+    e2, e3, e4 = map(_turn, (c.e2, c.e3, c.e4), turns(c, delta))
+    return e2, e3, e4
+
+
+def equations(
+    c: Constants, delta: Scalars, qd: Scalars, turned: Directions | None = None
+) -> Equations:
+    """The reduced equations of motion: (8)-(13) projected on the real joints.
+
+    `turned`: the `directions` at `delta`, where the caller has them.
+    """
+    r1, r2, r3 = c.revolute
     b2 = c.b2 + jnp.where(r2, 0, delta[1])
     b3 = c.b3 + jnp.where(r3, 0, delta[2])
     w2 = jnp.where(r1, qd[0], 0)
@@ -153,7 +170,7 @@ def equations(c: Constants, delta: Scalars, qd: Scalars) -> Equations:
     w4 = w3 + turn4
 
     n1 = _perp(c.e1)
-    e2, e3, e4 = _turn(c.e2, turned2), _turn(c.e3, turned3), _turn(c.e4, turned4)
+    e2, e3, e4 = directions(c, delta) if turned is None else turned
     n2, n3 = _perp(e2), _perp(e3)
     d2 = _in_frame(c.a2, b2, e2)
     d3 = _in_frame(c.a3, b3, e3)

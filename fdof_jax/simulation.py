@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from .forces import Forces, StatefulElement
 from .hybrid_dynamics import prescribed, prescribed_effort
-from .integration import solve
+from .integration import solve, solve_one
 from .linkage import Linkage, State, check_linkage, real_state
 from .solution import Efforts, Solution
 from .step_control import within_reach
@@ -174,15 +174,23 @@ def simulate(
     if own0 is not None:
         _check_own("own0", own0, forces, linkage, ())
     inputs = linkage, state0, ts, own0, forces
-    # Where the values are known in the end, errors are raised there: they can say more.
-    inside = is_traced(inputs, jnp.zeros(()))
     try:
-        solution = solve(solver, inputs, keywords | {"throw": throw and inside})
+        # Within `jax.jit` even a constant is traced.
+        if is_traced(inputs, solver, keywords, jax.device_put(np.zeros(()))):
+            one = None
+        else:
+            one = solve_one(solver, inputs, keywords)
+        if one is None:
+            solution = solve(solver, inputs, keywords)
+            # Of the times themselves, for derivatives in them.
+            solution = eqx.tree_at(lambda s: s.ts, solution, ts)
+            return _raising(solution, state0) if throw else solution
     except TypeError as error:
         if "forward-mode" in str(error):
             raise TypeError(
                 "forward-mode differentiation of simulate needs "
-                "adjoint=diffrax.ForwardMode()."
+                "adjoint=diffrax.ForwardMode(); for second derivatives take "
+                "jax.jacfwd(jax.jacfwd(...)) with it, not jax.hessian."
             ) from error
         raise
     except Exception as error:
@@ -193,9 +201,27 @@ def simulate(
                 "function that closes over it."
             ) from error
         raise
-    # Of the times themselves, for derivatives in them.
-    solution = eqx.tree_at(lambda s: s.ts, solution, ts)
-    return solution if inside or not throw else _raised(solution)
+    solution, succeeded = one
+    if throw and not succeeded:
+        raise RuntimeError(
+            f"simulate: {solution.outcome} at t = "
+            f"{float(solution.stats['time_reached']):g} s. "
+            f"{diffrax.RESULTS[solution.result].strip()}"
+        )
+    return solution
+
+
+def _raising(solution: Solution, state0: State) -> Solution:
+    """The solution of a traced call, which raises an error where it fails."""
+    late = jnp.diff(solution.ts) <= 0
+    unknown = ~jnp.isfinite(jnp.stack(state0))
+    for failed, message in (
+        (late, "ts: expected increasing times, got others."),
+        (unknown, "state0: expected finite numbers, got others."),
+    ):
+        solution = eqx.error_if(solution, failed, f"simulate: {message}")
+    failed = solution.result != diffrax.RESULTS.successful
+    return solution.result.error_if(solution, failed)
 
 
 def _check_own(name, own, forces: Forces, linkage: Linkage, rows: tuple) -> None:
@@ -210,20 +236,6 @@ def _check_own(name, own, forces: Forces, linkage: Linkage, rows: tuple) -> None
             f"{name}: expected the states of the forces' elements, of shapes {shapes}, "
             f"got {found}."
         )
-
-
-def _raised(solution: Solution) -> Solution:
-    """The solution, with an error if it failed."""
-    failed = solution.result != diffrax.RESULTS.successful
-    if is_traced(failed):  # by a force element that holds a traced value
-        return solution.result.error_if(solution, failed)
-    if failed:
-        raise RuntimeError(
-            f"simulate: {solution.outcome} at t = "
-            f"{float(solution.stats['time_reached']):g} s. "
-            f"{diffrax.RESULTS[solution.result].strip()}"
-        )
-    return solution
 
 
 def joint_efforts(linkage: Linkage, forces: Forces, solution: Solution) -> Efforts:

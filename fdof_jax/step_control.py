@@ -14,8 +14,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from .dopri8 import verdict
 from .linkage import Linkage, State, check_linkage, real_joints
-from .unrolled_dopri8 import SHORTEST
 from .validation import concrete, instance, is_traced, real_array
 
 # Float32 meets no tighter relative or absolute tolerance: it fights its own rounding.
@@ -167,10 +167,41 @@ class _Longer(_Adaptive):
         return keep, next_t0, next_t0 + stretch * (next_t1 - next_t0), *rest
 
 
+def undifferentiated(controller: Any) -> Any:
+    """The controller, whose choice of steps derivatives take as given.
+
+    The motion does not depend on where its steps end, to their tolerance: derivatives
+    of the steps are left out, which makes those of the motion cheaper.
+    """
+    return _with_pid(_Undifferentiated, controller)
+
+
+def _constant(tree: Any) -> Any:
+    return jax.tree.map(
+        lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, tree
+    )
+
+
+class _Undifferentiated(_Adaptive):
+    controller: Any
+
+    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
+        return _constant(
+            self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
+        )
+
+    def adapt_step_size(  # pyright: ignore[reportIncompatibleMethodOverride]
+        self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state
+    ):
+        inputs = _constant((t0, t1, y0, y1_candidate, args, y_error))
+        step = self.controller.adapt_step_size(*inputs, error_order, controller_state)
+        return _constant(step)
+
+
 class Watched(_Adaptive):
     """A controller that shortens steps which end in bad health, and then gives up.
 
-    For solvers that do not look themselves: see `ScheduledTerm.watched_field`.
+    For solvers that do not look themselves: see `ScheduledTerm.health`.
     """
 
     controller: Any
@@ -182,23 +213,22 @@ class Watched(_Adaptive):
     def adapt_step_size(  # pyright: ignore[reportIncompatibleMethodOverride]
         self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state
     ):
-        inputs = jax.tree.map(
-            lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x,
-            (t1, y1_candidate, args),
-        )
-        health = self.health(*inputs)
-        bad = jnp.isnan(health) | (health == 0)
-        short = jnp.abs(t1 - t0) < SHORTEST[health.dtype]
-        imposed = jnp.where(short, 0, jnp.inf)
+        # Rates that are not finite make such an error.
+        leaves = jax.tree.leaves((y1_candidate, y_error))
+        finite = jnp.isfinite(sum(map(jnp.sum, leaves)))
+        # Where a step led nowhere its start tells why.
+        judged = jax.tree.map(lambda a, b: jnp.where(finite, a, b), y1_candidate, y0)
+        health = self.health(*_constant((t1, judged, args)))
+        bad = ~finite | (health == 0)
+        imposed, failure = verdict(health == 0, bad, t1 - t0)
         y_error = jax.tree.map(lambda e: jnp.where(bad, imposed, e), y_error)
         # Errors are measured by the state, which may not be finite.
         end = jax.tree.map(lambda a, b: jnp.where(bad, a, b), y0, y1_candidate)
         *step, result = self.controller.adapt_step_size(
             t0, t1, y0, end, args, y_error, error_order, controller_state
         )
-        results: Any = diffrax.RESULTS
-        kind = results.where(health == 0, results.singular, results.nonfinite)
-        return *step, results.where(bad & short, kind, result)
+        failed = failure != diffrax.RESULTS.successful
+        return *step, diffrax.RESULTS.where(failed, failure, result)
 
 
 def limited(controller: diffrax.AbstractStepSizeController, limit: Array) -> "Limited":

@@ -20,41 +20,22 @@ import numpy as np
 from jax import Array
 from jaxtyping import PyTree
 
+from .dopri8 import (
+    DENSE,
+    LOWER,
+    NODES,
+    STAGES,
+    TABLEAU,
+    ScheduledTerm,
+    interpolation_weights,
+    verdict,
+)
 from .one_loop import in_one_loop
 
-_TABLEAU = diffrax.Dopri8.tableau
-_STAGES = len(_TABLEAU.b_sol)
-# Rates that are not finite even after so short a step [s] do not lack accuracy.
-SHORTEST = {np.dtype("float64"): 1e-10, np.dtype("float32"): 1e-6}
-# Row i gives the increment before stage i + 1; the last is the step itself.
-_LOWER = np.zeros((_STAGES - 1, _STAGES))
-for _row, _entries in enumerate(_TABLEAU.a_lower):
-    _LOWER[_row, : len(_entries)] = _entries
-_NODES = np.concatenate([[0.0], _TABLEAU.c])
-_INTERPOLATION: Any = diffrax.Dopri8.interpolation_cls
-_DENSE = _INTERPOLATION.eval_coeffs  # (stage, power), highest first
-_USED = [stage for stage, row in enumerate(_DENSE) if row.any()]
+_USED = [stage for stage, row in enumerate(DENSE) if row.any()]
 
 State = PyTree  # of scalars
 Rates = Sequence[State]  # one per stage
-
-
-class ScheduledTerm(diffrax.ODETerm):
-    """A term whose vector field takes a fourth argument: what depends on time alone.
-
-    `schedule(t, args)` returns it. The solver calls it for all stages of a step at
-    once, where the vector field would call it at each. `watched_field` takes the same
-    as the vector field and returns the rates and their health: positive, 0 where the
-    equations are singular, NaN where the rates are not finite. The solver calls it
-    where steps begin and end.
-    """
-
-    vector_field: Callable[..., PyTree] = eqx.field(static=True)
-    watched_field: Callable[..., tuple[PyTree, Array]] = eqx.field(static=True)
-    schedule: Callable[[Any, Any], PyTree] = eqx.field(static=True)
-
-    def vf(self, t, y, args):
-        return self.vector_field(t, y, args, self.schedule(t, args))
 
 
 def _combine(coefficients: Sequence[Any] | np.ndarray, rates: Rates) -> PyTree:
@@ -106,13 +87,13 @@ def _vector(tree: State) -> Array:
 def _unrolled(fields, times, h, y0, lost, args, schedule, f0) -> tuple[_Step, Rates]:
     field, watched = fields
     rates = [f0]
-    for stage, row in enumerate(_LOWER[:-1], 1):
+    for stage, row in enumerate(LOWER[:-1], 1):
         y = _sum(y0, _scaled(h, _combine(row, rates)))
         rates.append(field(times[stage], y, args, _at(stage, schedule)))
-    increment = _sum(_scaled(h, _combine(_LOWER[-1], rates)), lost)
+    increment = _sum(_scaled(h, _combine(LOWER[-1], rates)), lost)
     y = _sum(y0, increment)
     lost = jtu.tree_map(lambda a, b, c: c - (b - a), y0, y, increment)
-    error = _scaled(h, _combine(_TABLEAU.b_error, rates))
+    error = _scaled(h, _combine(TABLEAU.b_error, rates))
     # An infinity beside a NaN would get past diffrax, and leave no step length.
     poison = 0 * sum(jtu.tree_leaves(y))
     y = jtu.tree_map(lambda a: a + poison, y)
@@ -148,7 +129,7 @@ def _stages_jvp(primals, tangents):
     _, _, times_dot, h_dot, y0_dot, _, args_dot, schedule_dot, _ = tangents
     # Itself, for derivatives of derivatives.
     step, rates = _stages((field, watched), False, *primals[2:])
-    increments = [_combine(row, rates) for row in _LOWER[:-1]]
+    increments = [_combine(row, rates) for row in LOWER[:-1]]
     states = [y0, *(_sum(y0, _scaled(h, k)) for k in increments), step.y]
 
     def state(vector):
@@ -187,7 +168,7 @@ def _stages_jvp(primals, tangents):
     # compute a chain of scalar expressions anew for each of its results.
     y_dot = start
     rates_dot = [_times(jacobians[0], start) + drives[0]]
-    for row, jacobian, drive in zip(_LOWER, jacobians[1:], drives[1:]):
+    for row, jacobian, drive in zip(LOWER, jacobians[1:], drives[1:]):
         y_dot = start + h * _combine(row, rates_dot)
         if h_dot is not None:
             y_dot = y_dot + h_dot * _vector(_combine(row, rates))
@@ -205,7 +186,7 @@ def _stages_jvp(primals, tangents):
 def _step(term, stack, t0, t1, y0, lost, args, f0) -> tuple[_Step, Any, Array]:
     # diffrax wraps the term, to integrate backward in time too.
     inner, h = term.term, term.contr(t0, t1)
-    times = (t0 + (t1 - t0) * jnp.asarray(_NODES, t0.dtype)) * term.direction
+    times = (t0 + (t1 - t0) * jnp.asarray(NODES, t0.dtype)) * term.direction
     schedule = jax.vmap(inner.schedule, in_axes=(0, None))(times, args)
     fields = eqx.filter_jit(inner.vector_field), inner.watched_field
     return *_stages(fields, stack, times, h, y0, lost, args, schedule, f0), h
@@ -213,11 +194,8 @@ def _step(term, stack, t0, t1, y0, lost, args, f0) -> tuple[_Step, Any, Array]:
 
 @eqx.filter_jit
 def _interpolate(y0: State, h: Array, rates: Rates | Array, theta: Array) -> State:
-    # Horner's rule for the weights of all stages at once.
-    weights = jnp.zeros(_STAGES, theta.dtype)
-    for coefficients in _DENSE.T:
-        weights = (weights + coefficients) * theta
-    weights = [weights[stage] for stage in _USED]
+    every = interpolation_weights(theta)
+    weights = [every[stage] for stage in _USED]
     if isinstance(rates, Array):
         change = h * jnp.sum(jnp.stack(weights)[:, None] * rates, axis=0)
         return _sum(y0, jtu.tree_unflatten(jtu.tree_structure(y0), list(change)))
@@ -285,15 +263,9 @@ class UnrolledDopri8(diffrax.AbstractAdaptiveSolver):
         end, rates, h = _step(terms, self.for_tangents, t0, t1, y0, lost, args, f0)
         dense_info = dict(y0=y0, step=h, rates=rates)
         state = jax.lax.stop_gradient(((end.rate, end.health), end.lost))
-        # A step in bad health is rejected until it is short. The result of a rejected
-        # one would not count, so that one is kept.
         bad = jnp.isnan(end.health) | (health == 0)
-        short = jnp.abs(h) < SHORTEST[h.dtype]
-        imposed = jnp.where(short, 0, jnp.inf)
+        imposed, result = verdict(health == 0, bad, h)
         error = jtu.tree_map(lambda e: jnp.where(bad, imposed, e), end.error)
-        results: Any = diffrax.RESULTS
-        kind = results.where(health == 0, results.singular, results.nonfinite)
-        result = results.where(bad & short, kind, results.successful)
         return end.y, error, dense_info, state, result
 
     def func(self, terms, t0, y0, args):

@@ -11,7 +11,7 @@ from jax import Array
 from .added_inertia import added_inertia, inertial
 from .forces import Forces, ScalarElement, StatefulElement
 from .linkage import Linkage
-from .rates import Added, rates, rates_and_conditioning
+from .rates import Added, conditioning, rates, rates_and_conditioning
 from .reduced_equations import Constants, zeros
 
 # With inertia ratios below this the accelerations are right to six digits (float64) or
@@ -118,8 +118,15 @@ def watched_field(t, y, args, schedule) -> tuple[tuple[Any, ...], Array]:
 
 
 def health_of(t, y, args) -> Array:
-    _, health = watched_field(t, y, args, schedule_of(t, args))
-    return health
+    """The health of the equations alone: positive, or 0 where they are singular."""
+    delta, *_ = y
+    added = None
+    if inertial(args.forces):
+        q = args.q0 + jnp.stack(delta)
+        still = jnp.zeros_like(q)
+        added, _ = _added(args.linkage, inertial(args.forces), q, still)
+    loss = conditioning(args.constants, delta, added)
+    return jnp.where(loss * LEAST_INERTIA_RATIO[loss.dtype] > 1, 0, loss)
 
 
 @eqx.filter_jit  # traced once, not at each use by a solver

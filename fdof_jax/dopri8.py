@@ -1,0 +1,67 @@
+"""Dormand and Prince's method of order 8(7): what its two solvers have in common.
+
+`LoopedDopri8` compiles sooner and `UnrolledDopri8` runs faster in large batches. Both
+are `diffrax.Dopri8` to rounding.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import PyTree
+
+TABLEAU = diffrax.Dopri8.tableau
+STAGES = len(TABLEAU.b_sol)
+# Rates that are not finite even after so short a step [s] do not lack accuracy.
+SHORTEST = {np.dtype("float64"): 1e-10, np.dtype("float32"): 1e-6}
+# Row i gives the increment before stage i + 1; the last is the step itself.
+LOWER = np.zeros((STAGES - 1, STAGES))
+for _row, _entries in enumerate(TABLEAU.a_lower):
+    LOWER[_row, : len(_entries)] = _entries
+NODES = np.concatenate([[0.0], TABLEAU.c])
+_INTERPOLATION: Any = diffrax.Dopri8.interpolation_cls
+DENSE = _INTERPOLATION.eval_coeffs  # (stage, power), highest first
+
+
+class ScheduledTerm(diffrax.ODETerm):
+    """A term whose vector field takes a fourth argument: what depends on time alone.
+
+    `schedule(t, args)` returns it. The solver calls it for all stages of a step at
+    once, where the vector field would call it at each. `health(t, y, args)` says
+    whether the equations have a solution: positive, or 0 where they are singular.
+    `watched_field` takes the same as the vector field and returns the rates and their
+    health, NaN where the rates are not finite. Only `UnrolledDopri8` needs it.
+    """
+
+    vector_field: Callable[..., PyTree] = eqx.field(static=True)
+    schedule: Callable[[Any, Any], PyTree] = eqx.field(static=True)
+    health: Callable[..., Array] = eqx.field(static=True)
+    watched_field: Any = eqx.field(static=True, default=None)
+
+    def vf(self, t, y, args):
+        return self.vector_field(t, y, args, self.schedule(t, args))
+
+
+def interpolation_weights(theta: Array) -> Array:
+    """The weights (stage,) of the rates at a share `theta` of a step: its change."""
+    weights = jnp.zeros(STAGES, theta.dtype)
+    for coefficients in DENSE.T:  # Horner's rule for all stages at once
+        weights = (weights + coefficients) * theta
+    return weights
+
+
+def verdict(singular: Array, bad: Array, h: Array) -> tuple[Array, Any]:
+    """What a step in bad health is given for an error, and the step's result.
+
+    Such a step is rejected until it is short. The result of a rejected one would not
+    count, so the last one is kept.
+    """
+    short = jnp.abs(h) < SHORTEST[h.dtype]
+    results: Any = diffrax.RESULTS
+    kind = results.where(singular, results.singular, results.nonfinite)
+    result = results.where(bad & short, kind, results.successful)
+    return jnp.where(short, 0, jnp.inf), result
