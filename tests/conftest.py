@@ -1,4 +1,3 @@
-import os
 from pathlib import Path
 
 import jax
@@ -8,11 +7,6 @@ import sweep_batch
 
 import fdof_jax as fj
 from fdof_jax.tune_result import History
-
-# Most of the tests' time is compilation, which XLA's older code generator shortens by a
-# quarter. Programs of `test_float32` are compiled as XLA does by default.
-FLAGS = os.environ.get("XLA_FLAGS", "")
-os.environ["XLA_FLAGS"] = f"{FLAGS} --xla_cpu_use_fusion_emitters=false".strip()
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
