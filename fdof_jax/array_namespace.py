@@ -9,9 +9,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 from .trigonometry import sincos
-from .validation import is_traced
 
 
 def in_numpy(tree: Any) -> Any:
@@ -20,7 +20,7 @@ def in_numpy(tree: Any) -> Any:
     def converted(leaf: Any) -> Any:
         # Random keys are JAX arrays that NumPy has no type for.
         numbers = isinstance(leaf, jax.Array) and isinstance(leaf.dtype, np.dtype)
-        return np.asarray(leaf) if numbers and not is_traced(leaf) else leaf
+        return np.asarray(leaf) if numbers and not isinstance(leaf, Tracer) else leaf
 
     return jax.tree.map(converted, tree)
 
