@@ -11,17 +11,17 @@ from jax import Array
 from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
+from .array_namespace import in_numpy, namespace, sine_and_cosine
 from .forces import ScalarElement
 from .kinematics import (
     plane_angle,
     solve_joints,
     tip_position,
+    unmoved_part,
     whole_turns,
-    wrist_vector,
 )
 from .linkage import Linkage, check_linkage
 from .soon_compiled import soon_compiled
-from .trigonometry import sincos
 from .validation import concrete, is_traced, real_array, sign
 
 if TYPE_CHECKING:
@@ -144,8 +144,7 @@ class PDController(ScalarElement):
 
     def possible(self) -> Array:
         """Whether gains and limits are not negative."""
-        lowest = jnp.minimum(jnp.minimum(self.kp, self.kd), self.limit)
-        return (lowest >= 0).all()
+        return ((self.kp >= 0) & (self.kd >= 0) & (self.limit >= 0)).all()
 
 
 class CircleTask(eqx.Module):
@@ -205,39 +204,22 @@ class CircleTask(eqx.Module):
         self.orientation = real_array("orientation", orientation, ())
         self.branch = sign("branch", branch)
 
-    def _turned(self, t: Array) -> tuple[Array, Array, Array]:
-        """Direction from the centre: its angle, cosine and sine."""
-        angle = self.phase + 2 * np.pi * t / self.period
-        sin, cos = sincos(angle)
-        return angle, cos, sin
+    @property
+    def evaluates_in_numpy(self) -> bool:
+        """Whether `assembly` does; a subclass may move along another curve."""
+        return type(self) is CircleTask
 
     def tip(self, t: ArrayLike) -> Float[Array, " 2"]:
         """The commanded tip position at time `t` [s]: (x, y) [m]."""
-        _, cos, sin = self._turned(real_array("t", t, ()))
-        return self.center + self.radius * jnp.stack([cos, sin])
+        return _on_circle(self, real_array("t", t, ()))
 
-    def _positions(self, t: Array, linkage: Linkage) -> Array:
-        wrist = wrist_vector(linkage, self.tip(t), self.orientation)
-        hub = wrist_vector(linkage, self.center, self.orientation)
-        turns = whole_turns(self._bearing(jnp.zeros_like(t), hub))
-        bearing = self._bearing(t, hub) - 2 * np.pi * turns
+    def assembly(self, t: Array, linkage: Linkage) -> tuple[Array, Array]:
+        """Joint positions, and the root that is 0 at the edge of the reach."""
+        unmoved = unmoved_part(linkage, self.orientation)
+        wrist, hub = _on_circle(self, t) - unmoved, self.center - unmoved
+        turns = whole_turns(_bearing(self, 0.0, hub))
+        bearing = _bearing(self, t, hub) - 2 * np.pi * turns
         return solve_joints(linkage, wrist, bearing, self.orientation, self.branch)
-
-    def _bearing(self, t: Array, hub: Array) -> Array:
-        """Angle of hub + radius * (cos, sin)(turned) without jumps.
-
-        The larger of the two vectors carries the angle; the smaller one adds less than
-        a quarter turn, for which the arctangent has no jump.
-        """
-        turned, cos, sin = self._turned(t)
-        along, across = hub[0] * cos + hub[1] * sin, hub[1] * cos - hub[0] * sin
-        square = hub[0] ** 2 + hub[1] ** 2
-        around = self.radius**2 > square
-        carrier = jnp.where(around, turned, plane_angle(hub[1], hub[0]))
-        return carrier + plane_angle(
-            jnp.where(around, across, -self.radius * across),
-            jnp.where(around, self.radius + along, square + self.radius * along),
-        )
 
     def __call__(
         self, t: ArrayLike, linkage: Linkage
@@ -245,7 +227,8 @@ class CircleTask(eqx.Module):
         """Joint positions [m or rad] and velocities [m/s or rad/s] at time `t` [s]."""
         check_linkage(linkage)
         t = real_array("t", t, ())
-        return jax.jvp(lambda t: self._positions(t, linkage), (t,), (jnp.ones_like(t),))
+        positions = lambda t: self.assembly(t, linkage)[0]
+        return jax.jvp(positions, (t,), (jnp.ones_like(t),))
 
     def check(self, linkage: Linkage, ts: Array) -> None:
         """Raise ValueError if the tip leaves the linkage's reach between the times.
@@ -256,33 +239,90 @@ class CircleTask(eqx.Module):
             self.center, self.radius, self.period, self.phase, self.orientation,
             int(self.branch),
         )  # fmt: skip
-        start, end = float(ts[0]), float(ts[-1])
-        turn = abs(float(self.period))
+        task, arm, ts = in_numpy((self, linkage, ts))
+        start, end, period = float(ts[0]), float(ts[-1]), float(task.period)
+        turn = abs(period)
         # The reach ends first where the wrist is nearest to or farthest from the base,
         # or along a direction that the ground or the last link fixes.
-        hub = wrist_vector(linkage, self.center, self.orientation)
+        hub = task.center - unmoved_part(arm, task.orientation)
         directions = np.array(
-            [np.arctan2(hub[1], hub[0]), linkage.base_angle,
-             self.orientation - linkage.locked[2]]
+            [np.arctan2(hub[1], hub[0]), arm.base_angle,
+             task.orientation - arm.locked[2]]
         )  # fmt: skip
-        lead = np.concatenate([directions, directions + np.pi]) - float(self.phase)
-        extremes = start + (lead / (2 * np.pi) * float(self.period) - start) % turn
+        lead = np.concatenate([directions, directions + np.pi]) - task.phase
+        extremes = start + (lead / (2 * np.pi) * period - start) % turn
         times = np.linspace(start, min(end, start + turn), 257)
         times = np.append(times, np.minimum(extremes, end))
-        if not reachable(linkage, self, times).all():
+        if not _known_reach(self, linkage, times.astype(ts.dtype)).all():
             raise ValueError(
                 "reference: expected a circle within the linkage's reach at "
-                f"orientation {float(self.orientation):g} rad on branch "
-                f"{float(self.branch):+g}, got center "
-                f"{np.asarray(self.center).tolist()} and radius "
-                f"{float(self.radius):g} m."
+                f"orientation {task.orientation:g} rad on branch {task.branch:+g}, got "
+                f"center {task.center.tolist()} and radius {task.radius:g} m."
             )
 
 
-def _motion_over(
-    reference: Reference, linkage: Linkage, times: ArrayLike
-) -> tuple[Array, Array]:
-    return jax.vmap(lambda t: reference(t, linkage))(times)
+# Functions, because a call of a module's method makes an object each time.
+
+
+def _turned(circle: CircleTask, t: Array | float) -> tuple[Array, Array, Array]:
+    """Direction from the centre: its angle, cosine and sine."""
+    angle = circle.phase + 2 * np.pi * t / circle.period
+    sin, cos = sine_and_cosine(angle)
+    return angle, cos, sin
+
+
+def _on_circle(circle: CircleTask, t: Array) -> Array:
+    """Points of the circle, (..., 2)."""
+    _, cos, sin = _turned(circle, t)
+    return circle.center + circle.radius * namespace(cos).stack([cos, sin], axis=-1)
+
+
+def _bearing(circle: CircleTask, t: Array | float, hub: Array) -> Array:
+    """Angle of hub + radius * (cos, sin)(turned) without jumps.
+
+    The larger of the two vectors carries the angle; the smaller one adds less than
+    a quarter turn, for which the arctangent has no jump.
+    """
+    turned, cos, sin = _turned(circle, t)
+    xp, radius = namespace(turned, hub), circle.radius
+    along, across = hub[0] * cos + hub[1] * sin, hub[1] * cos - hub[0] * sin
+    square = hub[0] ** 2 + hub[1] ** 2
+    around = radius**2 > square
+    carrier = xp.where(around, turned, plane_angle(hub[1], hub[0]))
+    return carrier + plane_angle(
+        xp.where(around, across, -radius * across),
+        xp.where(around, radius + along, square + radius * along),
+    )
+
+
+def known_assembly(
+    reference: Any, linkage: Linkage, times: ArrayLike
+) -> tuple[np.ndarray, np.ndarray]:
+    """The `assembly` of a reference that evaluates in NumPy, at known times."""
+    reference, linkage = in_numpy((reference, linkage))
+    return reference.assembly(np.asarray(times), linkage)
+
+
+def positions_at(reference: Any, t: Array, linkage: Linkage) -> Any:
+    """Positions of a reference: by NumPy if they are known and it can."""
+    numpy = getattr(reference, "evaluates_in_numpy", False)
+    if numpy and not is_traced(reference, t, linkage):
+        return known_assembly(reference, linkage, t)[0]
+    return reference_motion(reference, t, linkage)[0]
+
+
+def _known_reach(reference: Any, linkage: Linkage, times: ArrayLike) -> np.ndarray:
+    """`reachable` of known values."""
+    if getattr(reference, "evaluates_in_numpy", False):
+        q, root = known_assembly(reference, linkage, times)
+        return np.isfinite(q).all(axis=1) & (root != 0)
+    with jax.ensure_compile_time_eval():  # also where others are traced
+        return np.asarray(soon_compiled(_finite)(reference, linkage, times))
+
+
+def _finite(reference: Reference, linkage: Linkage, times: ArrayLike) -> Array:
+    motion = jax.vmap(lambda t: reference(t, linkage))(times)
+    return jnp.isfinite(jnp.concatenate(motion, axis=1)).all(axis=1)
 
 
 def reachable(
@@ -305,11 +345,8 @@ def reachable(
     ts = real_array("ts", ts, (None,))
     arguments = checked_reference(reference), linkage, ts
     if is_traced(arguments):
-        motion = _motion_over(*arguments)
-    else:
-        with jax.ensure_compile_time_eval():  # also where others are traced
-            motion = soon_compiled(_motion_over)(*arguments)
-    return jnp.isfinite(jnp.concatenate(motion, axis=1)).all(axis=1)
+        return _finite(*arguments)
+    return jax.device_put(_known_reach(*arguments))
 
 
 @eqx.filter_jit

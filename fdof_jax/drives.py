@@ -6,6 +6,8 @@ motor a voltage.
 """
 
 from abc import abstractmethod
+from functools import reduce
+from operator import and_
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -14,6 +16,7 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from .array_namespace import in_numpy
 from .control import PDController, Reference
 from .forces import StatefulElement
 from .linkage import Linkage
@@ -57,7 +60,7 @@ class PIDController(StatefulElement):
     ):
         self.pd = PDController(kp, kd, limit, reference)
         self.ki = real_array("ki", ki, (3,), minimum=0, broadcast=True)
-        if not is_traced(self) and not self.possible():
+        if not is_traced(self) and not in_numpy(self).possible():
             raise ValueError(
                 f"ki: expected 0 where kp is, got {self.ki.tolist()} and "
                 f"{self.pd.kp.tolist()}."
@@ -145,7 +148,7 @@ class _Drive(StatefulElement):
 
     def possible(self) -> Array:
         """Whether they are, and what the command says of its own values."""
-        own = jnp.stack([(value > 0).all() for value in self.positive()]).all()
+        own = reduce(and_, [(value > 0).all() for value in self.positive()])
         possible: Any = getattr(self.command, "possible", None)
         return own if possible is None else own & possible()
 

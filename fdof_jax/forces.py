@@ -9,7 +9,8 @@ An element, or a controller's reference, whose efforts jump at known times may h
 as an attribute `jump_ts`, an array [s]: steps then end there. One with a method
 `check(linkage, ts)` is asked at the door of `simulate` where values are concrete; one
 with `possible()`, also where they are traced: motions under an element for which that
-is not true end as not finite.
+is not true end as not finite. At the door `jump_ts` and `possible()` are those of an
+element's copy with NumPy arrays, for which JAX compiles nothing.
 
 Elements in hot loops may be `ScalarElement`s, which cost less to run and to compile.
 """
@@ -216,4 +217,4 @@ class EffortHistory(ScalarElement):
 
     def possible(self) -> Array:
         """Whether the times increase."""
-        return (jnp.diff(self.ts) > 0).all()
+        return (self.ts[1:] > self.ts[:-1]).all()

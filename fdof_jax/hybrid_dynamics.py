@@ -9,11 +9,13 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float
 
 from .added_inertia import added_inertia
-from .control import Reference, checked_reference, reference_motion
+from .array_namespace import in_numpy
+from .control import Reference, checked_reference, positions_at, reference_motion
 from .forces import Forces
 from .linkage import Linkage
 from .reduced_equations import equations, link_constants, zeros
@@ -54,7 +56,7 @@ class PrescribedMotion(eqx.Module):
                 f"joints: expected a number of 1 to 3, or a tuple of such, got "
                 f"{joints!r}."
             )
-        self.moved = jnp.array([k in numbers for k in (1, 2, 3)])
+        self.moved = jax.device_put(np.isin([1, 2, 3], numbers))
         self.reference = checked_reference(reference)
 
     def at(self, t: Array, linkage: Linkage) -> tuple[Array, Array]:
@@ -63,9 +65,10 @@ class PrescribedMotion(eqx.Module):
 
     def agrees(self, t: Array, q: Array, linkage: Linkage) -> Array:
         """Whether joint positions are those of the reference, to one in a million."""
-        begin, _ = self.at(t, linkage)
-        near = jnp.abs(q - begin) <= 1e-6 * (1 + jnp.abs(begin))
-        return (near | ~self.moved).all()
+        begin = positions_at(self.reference, t, linkage)
+        q, moved = in_numpy((q, self.moved))
+        near = abs(q - begin) <= 1e-6 * (1 + abs(begin))
+        return (near | ~moved).all()
 
     def __call__(self, t: Array, q: Array, qd: Array, linkage: Linkage) -> Array:
         """Nothing: what it takes depends on all other elements."""

@@ -2,25 +2,27 @@
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from .array_namespace import in_numpy, namespace, plane_vector, sine_and_cosine
 from .linkage import Linkage, check_linkage, compiled, real_joints, to_chain
-from .trigonometry import sincos
 from .validation import concrete, real_array, sign
 
 # Vectors of the plane are complex numbers here: multiplying by exp(i th) turns them,
-# multiplying by i turns them by 90 degrees.
+# multiplying by i turns them by 90 degrees. Inverse kinematics evaluates in NumPy too,
+# and there at many points at once: of arrays (..., 2) for instance.
 
 
 def _directions(angle: Array) -> Array:
-    sin, cos = sincos(angle)
-    return jax.lax.complex(cos, sin)
+    sin, cos = sine_and_cosine(angle)
+    return plane_vector(cos, sin)
 
 
 def _plane(points: Array) -> Array:
-    return jnp.stack([points.real, points.imag], axis=-1)
+    return namespace(points).stack([points.real, points.imag], axis=-1)
 
 
 def _chain(linkage: Linkage, q: Array) -> tuple[Array, Array, Array]:
@@ -128,8 +130,9 @@ def tip_jacobian(
 
 def plane_angle(y: Array, x: Array) -> Array:
     """atan2 with derivative zero instead of NaN at the origin."""
+    xp = namespace(y, x)
     origin = (x == 0) & (y == 0)
-    return jnp.arctan2(y, jnp.where(origin, 1, x))
+    return xp.arctan2(y, xp.where(origin, 1, x))
 
 
 def whole_turns(angle: Array) -> Array:
@@ -138,23 +141,30 @@ def whole_turns(angle: Array) -> Array:
     The cut lies beside the negative x axis by more than rounding, so that points on
     that axis are at +pi whichever way they were computed.
     """
-    margin = jnp.sqrt(jnp.finfo(angle.dtype).eps)
-    return jnp.ceil((angle - jnp.pi - margin) / (2 * jnp.pi))
+    margin = float(np.sqrt(np.finfo(angle.dtype).eps))
+    return namespace(angle).ceil((angle - np.pi - margin) / (2 * np.pi))
 
 
-def wrist_vector(linkage: Linkage, tip: Array, orientation: Array) -> Array:
-    """From where the first joint starts to where the last link does, (2,)."""
+def unmoved_part(linkage: Linkage, orientation: Array) -> Array:
+    """What the tip's position has from no joint: the ground's and last link's vectors.
+
+    The rest is the wrist vector, from the first joint's start to the last link's, (2,).
+    """
+    xp = namespace(linkage, orientation)
     r1, _, _ = real_joints(linkage.ef)
-    fixed = jax.lax.complex(linkage.length[0], jnp.where(r1, linkage.locked[0], 0))
+    fixed = plane_vector(linkage.length[0], xp.where(r1, linkage.locked[0], 0))
     ground = _directions(linkage.base_angle) * fixed
     last = _directions(orientation) * linkage.length[3]
-    return tip - _plane(ground + last)
+    return _plane(ground + last)
 
 
 def solve_joints(
     linkage: Linkage, wrist: Array, bearing: Array, orientation: Array, branch: Array
-) -> Array:
-    """Joint positions from the wrist vector, with NaN where it is out of reach.
+) -> tuple[Array, Array]:
+    """Joint positions (..., 3) from the wrist vector, NaN where it is out of reach.
+
+    The second result is a root that is 0 just at the edge of the reach, where
+    velocities are infinite.
 
     `bearing` is the direction angle of `wrist`. It is an argument so that a path that
     winds around the pivot may pass an angle that has no jump.
@@ -164,6 +174,7 @@ def solve_joints(
     vector and one slide of known direction (PRR, RRP), two slides (PPR, RPP, PRP).
     All but the last need one square root, whose sign is the branch.
     """
+    xp = namespace(linkage, wrist, bearing, orientation, branch)
     r1, r2, r3 = real_joints(linkage.ef)
     th1 = linkage.base_angle
     _, a2, a3, _ = linkage.length
@@ -175,10 +186,10 @@ def solve_joints(
 
     # Directions that follow from the orientation or the ground, where they do.
     th3_from_tip = orientation - lock3
-    th2_known = jnp.where(r1, th3_from_tip - lock2, th1 + lock1)
-    th3_known = jnp.where(r3, th2_known + lock2, th3_from_tip)
-    e1, e2, e3 = _directions(jnp.stack([th1, th2_known, th3_known]))
-    w = jax.lax.complex(wrist[0], wrist[1])
+    th2_known = xp.where(r1, th3_from_tip - lock2, th1 + lock1)
+    th3_known = xp.where(r3, th2_known + lock2, th3_from_tip)
+    e1, e2, e3 = _directions(xp.stack([th1, th2_known, th3_known]))
+    w = plane_vector(wrist[..., 0], wrist[..., 1])
 
     def dot(u: Array, v: Array) -> Array:
         return u.real * v.real + u.imag * v.imag
@@ -187,24 +198,24 @@ def solve_joints(
         return u.real * v.imag - u.imag * v.real
 
     # Vectors of links 2 and 3 in their own frames; a free slide counts as 0.
-    d2 = jax.lax.complex(a2, jnp.where(r2, lock2, 0))
-    d3 = jax.lax.complex(a3, jnp.where(r3, lock3, 0))
+    d2 = plane_vector(a2, xp.where(r2, lock2, 0))
+    d3 = plane_vector(a3, xp.where(r3, lock3, 0))
     reach2, reach3 = dot(d2, d2), dot(d3, d3)
 
     # Two slides: what remains of the wrist vector, along the two directions.
     rest = w - d2 * e2 - d3 * e3
-    first = 1j * jnp.where(r1, e2, e1)
-    second = 1j * jnp.where(r3, e2, e3)
+    first = 1j * xp.where(r1, e2, e1)
+    second = 1j * xp.where(r3, e2, e3)
     span = cross(first, second)  # sine of the angle between the slides
-    parallel = jnp.abs(span) <= 16 * jnp.finfo(span.dtype).eps
-    span = jnp.where(two_slides, jnp.where(parallel, jnp.nan, span), 1)
+    parallel = xp.abs(span) <= 16 * np.finfo(span.dtype).eps
+    span = xp.where(two_slides, xp.where(parallel, xp.nan, span), 1)
     slide_first, slide_second = cross(rest, second) / span, cross(first, rest) / span
 
     # One turning vector, one slide along i*across: the part of the wrist vector along
     # `across` is the turning vector's.
-    across = jnp.where(turning_third, e1, e3)
-    remainder = w - jnp.where(turning_third, d2 * e2, d3 * e3)
-    turning = jnp.where(turning_third, reach3, reach2)
+    across = xp.where(turning_third, e1, e3)
+    remainder = w - xp.where(turning_third, d2 * e2, d3 * e3)
+    turning = xp.where(turning_third, reach3, reach2)
     along_turning = dot(across, remainder)
 
     # RPR: link 3 and its vector as seen from link 2.
@@ -215,45 +226,41 @@ def solve_joints(
     square = dot(w, w)
     inner = (square - reach2 - reach3) / 2
 
-    radicand = jnp.where(
+    radicand = xp.where(
         two_turning,
         reach2 * reach3 - inner**2,
-        jnp.where(framed, square - distance**2, turning - along_turning**2),
+        xp.where(framed, square - distance**2, turning - along_turning**2),
     )
-    root = branch * jnp.sqrt(jnp.where(two_slides, 1, radicand))
-    base = jnp.where(
-        two_turning, reach2 + inner, jnp.where(framed, distance, along_turning)
+    with np.errstate(invalid="ignore"):  # NaN is the answer out of reach
+        root = branch * xp.sqrt(xp.where(two_slides, 1, radicand))
+    base = xp.where(
+        two_turning, reach2 + inner, xp.where(framed, distance, along_turning)
     )
     angle = plane_angle(root, base)
     own2, own3 = plane_angle(d2.imag, d2.real), plane_angle(d3.imag, d3.real)
-    turned = jnp.where(turning_third, th1, th3_known) + angle
-    th2 = jnp.where(
+    turned = xp.where(turning_third, th1, th3_known) + angle
+    th2 = xp.where(
         two_turning,
         bearing - angle - own2,
-        jnp.where(
-            framed, bearing - angle, jnp.where(r1 & r2, turned - own2, th2_known)
-        ),
+        xp.where(framed, bearing - angle, xp.where(r1 & r2, turned - own2, th2_known)),
     )
-    th3 = jnp.where(
+    th3 = xp.where(
         two_turning,
         th2 + own2 + plane_angle(root, inner) - own3,
-        jnp.where(
-            framed, th2 + lock2, jnp.where(turning_third, turned - own3, th3_known)
+        xp.where(
+            framed, th2 + lock2, xp.where(turning_third, turned - own3, th3_known)
         ),
     )
     slide = dot(1j * across, remainder) - root
-    slide1 = jnp.where(two_slides, slide_first, slide)
-    slide2 = jnp.where(
-        framed, root - framed_d3.imag, jnp.where(r1, slide_first, slide_second)
+    slide1 = xp.where(two_slides, slide_first, slide)
+    slide2 = xp.where(
+        framed, root - framed_d3.imag, xp.where(r1, slide_first, slide_second)
     )
-    slide3 = jnp.where(two_slides, slide_second, slide)
-    return jnp.stack(
-        [
-            jnp.where(r1, th2 - th1, slide1),
-            jnp.where(r2, th3 - th2, slide2),
-            jnp.where(r3, orientation - th3, slide3),
-        ]
-    )
+    slide3 = xp.where(two_slides, slide_second, slide)
+    q1 = xp.where(r1, th2 - th1, slide1)
+    q2 = xp.where(r2, th3 - th2, slide2)
+    q3 = xp.where(r3, orientation - th3, slide3)
+    return xp.stack([q1, q2, q3], axis=-1), root
 
 
 def inverse_kinematics(
@@ -293,14 +300,16 @@ def inverse_kinematics(
     tip = real_array("tip", tip, (2,))
     orientation = real_array("orientation", orientation, ())
     side = sign("branch", branch)
-    wrist = wrist_vector(linkage, tip, orientation)
+    # Of known values by NumPy, because single operations of JAX are compiled.
+    arm, point, angle, side = in_numpy((linkage, tip, orientation, side))
+    wrist = point - unmoved_part(arm, angle)
     bearing = plane_angle(wrist[1], wrist[0])
-    bearing = bearing - 2 * jnp.pi * whole_turns(bearing)
-    q = solve_joints(linkage, wrist, bearing, orientation, side)
+    bearing = bearing - 2 * np.pi * whole_turns(bearing)
+    q, _ = solve_joints(arm, wrist, bearing, angle, side)
     values = concrete(q)
-    if values is not None and not jnp.isfinite(values).all():
+    if values is not None and not np.isfinite(values).all():
         raise ValueError(
-            f"tip: expected a point within reach at orientation {orientation:g} rad, "
+            f"tip: expected a point within reach at orientation {angle:g} rad, "
             f"got {tip.tolist()}."
         )
-    return q
+    return jnp.asarray(q, dtype=float)

@@ -19,6 +19,7 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from .array_namespace import in_numpy, namespace
 from .singularity import check_singularity
 from .validation import concrete, instance, is_traced, known, real_array
 
@@ -84,7 +85,8 @@ def existence_factors(topology: str) -> Float[Array, " 6"]:
     """
     instance("topology", topology, str)
     pairs = _pairs_of(topology)
-    return jnp.asarray(pairs, dtype=float).reshape(6)
+    assert pairs is not None  # a name is not traced
+    return jnp.asarray(pairs.reshape(6), dtype=float)
 
 
 class Linkage(eqx.Module):
@@ -342,18 +344,21 @@ def from_chain(
     ([0.0, 1.0, 0.0], [1.5, 2.5, -0.5])
     """
     pairs = _pairs_of(topology)
-    x, xd = real_array("x", x, (6,)), real_array("xd", xd, (6,))
-    base_angle = real_array("base_angle", base_angle, ())
-    revolute = (
-        jnp.asarray(topology).reshape(3, 2)[:, 1] if pairs is None else pairs[:, 1]
+    given = (
+        real_array("x", x, (6,)),
+        real_array("xd", xd, (6,)),
+        real_array("base_angle", base_angle, ()),
     )
-    revolute = jnp.asarray(revolute) > 0.5
-    turn = jnp.diff(x[1::2], prepend=base_angle)
-    turn_rate = jnp.diff(xd[1::2], prepend=0)
-    held = concrete(jnp.where(revolute, xd[0::2], turn_rate))
+    chain, chain_rate, ground = in_numpy(given)
+    ef = jnp.asarray(topology) if pairs is None else pairs
+    xp = namespace(ef, chain, chain_rate, ground)
+    revolute = ef.reshape(3, 2)[:, 1] > 0.5
+    slide, turn = chain[0::2], xp.diff(chain[1::2], prepend=ground)
+    slide_rate, turn_rate = chain_rate[0::2], xp.diff(chain_rate[1::2], prepend=0)
+    held = concrete(xp.where(revolute, slide_rate, turn_rate))
     if held is not None and pairs is not None:
         # Differences of absolute rates carry their rounding.
-        scale = np.abs(np.asarray(xd)).max()
+        scale = np.abs(np.asarray(chain_rate)).max()
         for k in np.flatnonzero(np.abs(held) > 8 * np.finfo(held.dtype).eps * scale):
             rate = (
                 f"B{k + 1} rate 0"
@@ -364,7 +369,7 @@ def from_chain(
                 f"xd: expected {rate}, because that joint is fictitious, got a "
                 f"difference of {held[k]:g}."
             )
-    locked = jnp.where(revolute, x[0::2], turn)
-    return locked, State(
-        jnp.where(revolute, turn, x[0::2]), jnp.where(revolute, turn_rate, xd[0::2])
-    )
+    locked = jnp.asarray(xp.where(revolute, slide, turn), dtype=float)
+    q = jnp.asarray(xp.where(revolute, turn, slide), dtype=float)
+    qd = jnp.asarray(xp.where(revolute, turn_rate, slide_rate), dtype=float)
+    return locked, State(q, qd)

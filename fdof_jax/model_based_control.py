@@ -4,6 +4,7 @@ from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
@@ -47,7 +48,7 @@ class _ModelBased(PDController):
         """As of a PD controller; and the model's values, and its topology."""
         super().check(linkage, ts)
         self._check_model()
-        if self.model is not None and (self.model.ef != linkage.ef).any():
+        if self.model is not None and not np.array_equal(self.model.ef, linkage.ef):
             raise ValueError(
                 "model: expected the arm's own topology, existence factors "
                 f"{linkage.ef.tolist()}, got {self.model.ef.tolist()}."

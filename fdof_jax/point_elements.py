@@ -9,6 +9,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
@@ -103,14 +104,12 @@ class SpringDamper(LineElement):
             raise ValueError(
                 f"one_sided: expected False, 'cable' or 'bumper', got {one_sided!r}."
             )
-        self.side = jnp.asarray(sides[one_sided])
+        self.side = jax.device_put(np.array(sides[one_sided]))
 
     def possible(self) -> Array:
         """Whether nothing is negative that must not be."""
-        lowest = jnp.minimum(
-            jnp.minimum(self.stiffness, self.damping), self.rest_length
-        )
-        return lowest >= 0
+        elastic = (self.stiffness >= 0) & (self.rest_length >= 0)
+        return elastic & (self.damping >= 0)
 
     def pull(self, scheduled, length, rate):
         tension = self.stiffness * (length - self.rest_length) + self.damping * rate
@@ -194,7 +193,7 @@ class Wrench(PointElement):
         self.force = force if callable(force) else real_array("force", force, (2,))
         self.moment = moment if callable(moment) else real_array("moment", moment, ())
         instance("follows", follows, bool)
-        self.follows = jnp.asarray(follows)
+        self.follows = jax.device_put(np.array(follows))
 
     @property
     def jump_ts(self) -> Array | None:

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jaxtyping import Complex, Float, Int
 from numpy.typing import ArrayLike
@@ -99,7 +100,7 @@ class Point(eqx.Module):
             raise ValueError(
                 f"link: expected 0 (the ground) or a moving link, 1 to 3, got {link!r}."
             )
-        self.link = jnp.asarray(link)
+        self.link = jax.device_put(np.array(link))
         self.along = real_array("along", along, ())
         self.across = real_array("across", across, ())
 

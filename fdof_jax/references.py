@@ -6,14 +6,15 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from .kinematics import plane_angle, solve_joints, whole_turns, wrist_vector
+from .array_namespace import in_numpy, namespace, sine_and_cosine
+from .kinematics import plane_angle, solve_joints, unmoved_part, whole_turns
 from .linkage import Linkage
 from .travel import Laps, Travel
-from .trigonometry import sincos
 from .validation import instance, real_array, sign
 
 
@@ -42,14 +43,23 @@ class JointMove(eqx.Module):
         instance("travel", travel, Travel)
         self.travel = travel
 
+    @property
+    def evaluates_in_numpy(self) -> bool:
+        """Whether `assembly` does; a subclass may move in another way."""
+        return type(self) is JointMove
+
+    def assembly(self, t: Array, linkage: Linkage) -> tuple[Array, float]:
+        """Joint positions, and 1 for a root: no edge of a reach is near."""
+        share = self.travel(t)[..., None]
+        return self.start + share * (self.end - self.start), 1.0
+
     def __call__(
         self, t: ArrayLike, linkage: Linkage
     ) -> tuple[Float[Array, " joint"], Float[Array, " joint"]]:
         """Joint positions [m or rad] and velocities [m/s or rad/s] at time `t` [s]."""
         t = real_array("t", t, ())
-        share, rate = jax.jvp(self.travel, (t,), (jnp.ones_like(t),))
-        way = self.end - self.start
-        return self.start + share * way, rate * way
+        positions = lambda t: self.assembly(t, linkage)[0]
+        return jax.jvp(positions, (t,), (jnp.ones_like(t),))
 
     @property
     def jump_ts(self) -> Array:
@@ -101,7 +111,8 @@ class Line(Path):
         return (self.start + self.end) / 2
 
     def point(self, share):
-        return self.start + share * (self.end - self.start)
+        share = namespace(self.start, share).asarray(share)
+        return self.start + share[..., None] * (self.end - self.start)
 
 
 class _Closed(Path):
@@ -117,9 +128,10 @@ class _Closed(Path):
         self.tilt = real_array("tilt", tilt, ())
 
     def _placed(self, along: Array, across: Array) -> Array:
-        sin, cos = sincos(self.tilt)
+        sin, cos = sine_and_cosine(self.tilt)
         a, b = self.sizes[0] * along, self.sizes[1] * across
-        return self.middle + jnp.stack([a * cos - b * sin, a * sin + b * cos])
+        turned = [a * cos - b * sin, a * sin + b * cos]
+        return self.middle + namespace(*turned).stack(turned, axis=-1)
 
 
 class Ellipse(_Closed):
@@ -136,7 +148,7 @@ class Ellipse(_Closed):
     """
 
     def point(self, share):
-        sin, cos = sincos(2 * jnp.pi * share)
+        sin, cos = sine_and_cosine(2 * np.pi * share)
         return self._placed(cos, sin)
 
 
@@ -155,7 +167,7 @@ class FigureEight(_Closed):
     """
 
     def point(self, share):
-        sin, cos = sincos(2 * jnp.pi * share)
+        sin, cos = sine_and_cosine(2 * np.pi * share)
         return self._placed(sin, 2 * sin * cos)
 
 
@@ -184,29 +196,31 @@ class Spline(Path):
         if count < 3:
             raise ValueError(f"points: expected three or more, got {count}.")
         # The slopes of neighbouring cubics meet: b[k-1] + 4 b[k] + b[k+1] = 6 d2[k].
-        rows = jnp.eye(count)
-        matrix = 4 * rows + jnp.roll(rows, 1, axis=1) + jnp.roll(rows, -1, axis=1)
-        p = self.points
-        right = 6 * (jnp.roll(p, 1, axis=0) - 2 * p + jnp.roll(p, -1, axis=0))
+        rows = np.eye(count)
+        matrix = 4 * rows + np.roll(rows, 1, axis=1) + np.roll(rows, -1, axis=1)
+        p = in_numpy(self.points)
+        xp = namespace(p)
+        right = 6 * (xp.roll(p, 1, axis=0) - 2 * p + xp.roll(p, -1, axis=0))
         if not closed:
-            ends = jnp.array([0, count - 1])
-            matrix = matrix.at[ends].set(rows[ends])
-            right = right.at[ends].set(0)
-        self.bends = jnp.linalg.solve(matrix, right)
+            ends = np.isin(np.arange(count), [0, count - 1])[:, None]
+            matrix = np.where(ends, rows, matrix)
+            right = xp.where(ends, 0, right)
+        self.bends = jnp.asarray(xp.linalg.solve(matrix, right), dtype=float)
 
     @property
     def middle(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return jnp.mean(self.points, axis=0)
+        return self.points.mean(axis=0)
 
     def point(self, share):
-        count = len(self.points)
+        xp, count = namespace(self.points, share), len(self.points)
+        share = xp.asarray(share)[..., None]
         if self.closed:
-            place = jnp.mod(share, 1) * count
-            first = jnp.minimum(jnp.floor(place), count - 1)
+            place = xp.mod(share, 1) * count
+            first = xp.minimum(xp.floor(place), count - 1)
         else:
             place = share * (count - 1)
-            first = jnp.clip(jnp.floor(place), 0, count - 2)
-        b, k = place - first, first.astype(int)
+            first = xp.clip(xp.floor(place), 0, count - 2)
+        b, k = place - first, first[..., 0].astype(int)
         a, after = 1 - b, (k + 1) % count
         bend = (a**3 - a) * self.bends[k] + (b**3 - b) * self.bends[after]
         return a * self.points[k] + b * self.points[after] + bend / 6
@@ -263,27 +277,41 @@ class TipTask(eqx.Module):
         """The commanded tip position at time `t` [s]: (x, y) [m]."""
         return self.path.point(self.timing(real_array("t", t, ())))
 
-    def _angles(self, t: Array, linkage: Linkage) -> tuple[Array, Array, Array]:
-        """The wrist, the direction of the middle, and the wrist's angle from there."""
-        wrist = wrist_vector(linkage, self.tip(t), self.orientation)
-        hub = wrist_vector(linkage, self.path.middle, self.orientation)
-        across = hub[0] * wrist[1] - hub[1] * wrist[0]
-        beside = plane_angle(across, hub @ wrist)
-        bearing = plane_angle(hub[1], hub[0])
-        return wrist, bearing - 2 * jnp.pi * whole_turns(bearing), beside
+    @property
+    def evaluates_in_numpy(self) -> bool:
+        """Whether `assembly` does; a subclass may move in another way."""
+        return type(self) is TipTask
 
-    def _positions(self, t: Array, linkage: Linkage) -> Array:
-        wrist, bearing, beside = self._angles(t, linkage)
-        return solve_joints(
-            linkage, wrist, bearing + beside, self.orientation, self.branch
-        )
+    def assembly(self, t: Array, linkage: Linkage) -> tuple[Array, Array]:
+        """Joint positions, and the root that is 0 at the edge of the reach."""
+        q, root, _ = self._solved(t, linkage)
+        return q, root
+
+    def _solved(self, t: Array, linkage: Linkage) -> tuple[Array, Array, Array]:
+        """The `assembly`, and the wrist's angle from the direction of the middle."""
+        own = not {type(self.path), type(self.timing)} <= _IN_NUMPY
+        if own and namespace(t) is np:
+            with jax.ensure_compile_time_eval():  # also where others are traced
+                points = _points_at(self.path, self.timing, jax.device_put(np.ravel(t)))
+            tip: Any = np.asarray(points).reshape(*np.shape(t), 2)
+        else:
+            tip = self.path.point(self.timing(t))
+        unmoved = unmoved_part(linkage, self.orientation)
+        wrist, hub = tip - unmoved, in_numpy(self.path.middle) - unmoved
+        across = hub[0] * wrist[..., 1] - hub[1] * wrist[..., 0]
+        beside = plane_angle(across, wrist @ hub)
+        middle = plane_angle(hub[1], hub[0])
+        bearing = middle - 2 * np.pi * whole_turns(middle) + beside
+        q, root = solve_joints(linkage, wrist, bearing, self.orientation, self.branch)
+        return q, root, beside
 
     def __call__(
         self, t: ArrayLike, linkage: Linkage
     ) -> tuple[Float[Array, " joint"], Float[Array, " joint"]]:
         """Joint positions [m or rad] and velocities [m/s or rad/s] at time `t` [s]."""
         t = real_array("t", t, ())
-        return jax.jvp(lambda t: self._positions(t, linkage), (t,), (jnp.ones_like(t),))
+        positions = lambda t: self.assembly(t, linkage)[0]
+        return jax.jvp(positions, (t,), (jnp.ones_like(t),))
 
     @property
     def jump_ts(self) -> Array | None:
@@ -296,20 +324,21 @@ class TipTask(eqx.Module):
         Looked at at 1000 times, or 1000 of one lap; or where the wrist's angle jumps
         between two of them.
         """
+        task, arm, ts = in_numpy((self, linkage, ts))
         end = ts[-1]
         if isinstance(self.timing, Laps):  # of which all are alike
-            end = jnp.minimum(end, ts[0] + jnp.abs(self.timing.period))
-        times = jnp.linspace(ts[0], end, 1000)
-        q, beside = _checked(self, linkage, times)
-        if not jnp.isfinite(q).all():
-            first = float(times[jnp.argmin(jnp.isfinite(q).all(axis=1))])
+            end = min(end, ts[0] + abs(task.timing.period))
+        times = np.linspace(ts[0], end, 1000, dtype=ts.dtype)
+        q, _, beside = task._solved(times, arm)
+        inside = np.isfinite(q).all(axis=1)
+        if not inside.all():
             raise ValueError(
                 "reference: expected a path within the linkage's reach at orientation "
-                f"{float(self.orientation):g} rad on branch {float(self.branch):+g}, "
-                f"got one that leaves it at {first:g} s."
+                f"{task.orientation:g} rad on branch {task.branch:+g}, got one that "
+                f"leaves it at {times[inside.argmin()]:g} s."
             )
-        hub = wrist_vector(linkage, self.path.middle, self.orientation)
-        behind = (jnp.abs(jnp.diff(beside)) > jnp.pi).any()
+        hub = in_numpy(task.path.middle) - unmoved_part(arm, task.orientation)
+        behind = (np.abs(np.diff(beside)) > np.pi).any()
         if behind or not hub.any():
             raise ValueError(
                 "reference: expected a path that does not pass behind the ground "
@@ -317,9 +346,10 @@ class TipTask(eqx.Module):
             )
 
 
-@eqx.filter_jit
-def _checked(task: TipTask, linkage: Linkage, times: Array) -> tuple[Array, Array]:
-    def at(t):
-        return task._positions(t, linkage), task._angles(t, linkage)[2]
+# The paths and timings that NumPy evaluates.
+_IN_NUMPY = {Line, Ellipse, FigureEight, Spline, Travel, Laps}
 
-    return jax.vmap(at)(times)
+
+@eqx.filter_jit
+def _points_at(path: Path, timing: Any, times: Array) -> Array:
+    return jax.vmap(lambda t: path.point(timing(t)))(times)

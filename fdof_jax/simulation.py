@@ -10,6 +10,7 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
+from .array_namespace import in_numpy
 from .forces import Forces, StatefulElement
 from .hybrid_dynamics import prescribed, prescribed_effort
 from .integration import solve, solve_one
@@ -75,15 +76,17 @@ def solve_options(
 def check_elements(forces: Forces, linkage: Linkage, ts: Array) -> None:
     """The elements' own checks at the door, where values are known."""
     for index, element in enumerate(forces):
-        if getattr(element, "jump_ts", None) is not None:
-            real_array(f"forces[{index}].jump_ts", element.jump_ts, (None,))
+        values = in_numpy(element)
+        jumps = getattr(values, "jump_ts", None)
+        if jumps is not None:
+            real_array(f"forces[{index}].jump_ts", jumps, (None,))
         check = getattr(element, "check", None)
         if is_traced(linkage, ts, element):
             continue
         if check is not None:
             check(linkage, ts)
         # `equinox.tree_at` asks no constructor.
-        if hasattr(element, "possible") and not element.possible():
+        if hasattr(values, "possible") and not values.possible():
             raise ValueError(
                 f"forces[{index}]: expected values that its constructor takes, got "
                 f"{eqx.tree_pformat(element, short_arrays=False)}."
@@ -165,7 +168,7 @@ def simulate(
     check_elements(forces, linkage, ts)
     motion = prescribed(forces)
     if motion is not None and not is_traced(linkage, state0, ts, motion):
-        if not motion.agrees(ts[0], jnp.asarray(state0.q), linkage):
+        if not motion.agrees(np.asarray(ts)[0], jnp.asarray(state0.q), linkage):
             begin, _ = motion.at(ts[0], linkage)
             raise ValueError(
                 f"state0.q: expected {begin.tolist()} at the joints whose motion is "

@@ -10,6 +10,7 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from .array_namespace import namespace
 from .validation import concrete, one_of, real_array
 
 _MOST_TURN = 250  # that 48 nodes per piece resolve [rad]
@@ -17,17 +18,18 @@ RAMP = 0.25  # of a trapezoidal profile: the share of its time in which it speed
 
 
 def _trapezoidal(x: Array) -> Array:
+    xp = namespace(x)
     scale = 2 * RAMP * (1 - RAMP)
-    cruising = jnp.where(
+    cruising = xp.where(
         x > 1 - RAMP, 1 - (1 - x) ** 2 / scale, (x - RAMP / 2) / (1 - RAMP)
     )
-    return jnp.where(x < RAMP, x**2 / scale, cruising)
+    return xp.where(x < RAMP, x**2 / scale, cruising)
 
 
 # The share of the way done at a share of the time, both from 0 to 1.
 PROFILES: dict[str, Callable[[Array], Array]] = {
-    "harmonic": lambda x: (1 - jnp.cos(jnp.pi * x)) / 2,
-    "cycloidal": lambda x: x - jnp.sin(2 * jnp.pi * x) / (2 * jnp.pi),
+    "harmonic": lambda x: (1 - namespace(x).cos(np.pi * x)) / 2,
+    "cycloidal": lambda x: x - namespace(x).sin(2 * np.pi * x) / (2 * np.pi),
     "quintic": lambda x: x**3 * (10 - 15 * x + 6 * x**2),
     "trapezoidal": _trapezoidal,
 }
@@ -76,7 +78,8 @@ class Travel(eqx.Module):
         """The share of the way at a time, from 0 to 1."""
         x = (t - self.begin) / self.duration
         # At a jump what comes after it counts: the derivative of jnp.clip is the mean.
-        x = jnp.where(x < 0, 0, jnp.where(x < 1, x, 1))
+        xp = namespace(x)
+        x = xp.where(x < 0, 0, xp.where(x < 1, x, 1))
         return (1 - self.shock) * PROFILES[self.profile](x) + self.shock * x
 
     @property
@@ -85,7 +88,7 @@ class Travel(eqx.Module):
         shares = [0.0, 1.0]
         if self.profile == "trapezoidal":
             shares = [0.0, RAMP, 1 - RAMP, 1.0]
-        return self.begin + self.duration * jnp.array(shares)
+        return self.begin + self.duration * np.array(shares, self.duration.dtype)
 
 
 class Laps(eqx.Module):

@@ -49,18 +49,18 @@ def real_array(
     came, for a wrong shape, a type that is not real numbers, NaN, infinities
     (unless `finite=False`) and entries below `minimum` or not above `above`.
     """
-    size = "x".join("n" if n is None else str(n) for n in shape)
-    expected = f"an array of {size} real numbers" if shape else "a real number"
-    if finite:
-        expected += ", all finite" if shape else ", finite"
-    if minimum is not None:
-        expected += f", at least {minimum:g}"
-    if above is not None:
-        expected += f", above {above:g}"
-    if broadcast and shape:
-        expected += " (or one number for all)"
 
     def refuse(got: str) -> ValueError:
+        size = "x".join("n" if n is None else str(n) for n in shape)
+        expected = f"an array of {size} real numbers" if shape else "a real number"
+        if finite:
+            expected += ", all finite" if shape else ", finite"
+        if minimum is not None:
+            expected += f", at least {minimum:g}"
+        if above is not None:
+            expected += f", above {above:g}"
+        if broadcast and shape:
+            expected += " (or one number for all)"
         return ValueError(f"{name}: expected {expected}, got {got}.")
 
     traced = is_traced(value)
@@ -86,9 +86,14 @@ def real_array(
             bad |= kept <= above
         if bad.any():
             raise refuse(np.array2string(np.asarray(array), threshold=20))
+        ready = isinstance(value, Array) and value.dtype == kept.dtype
+        if ready and fits and not value.weak_type:
+            return value
         array = kept
-    array = jnp.asarray(array, dtype=float)
-    return jnp.broadcast_to(array, shape) if not fits else array  # type: ignore[arg-type]
+    # NumPy spreads what is known without a program to compile.
+    if not fits:
+        array = (jnp if traced else np).broadcast_to(array, shape)  # type: ignore[arg-type]
+    return jnp.asarray(array, dtype=float)
 
 
 def callable_tuple(name: str, value: Any) -> tuple:

@@ -9,7 +9,7 @@ import pytest
 from helpers import random_linkage
 
 import fdof_jax as fj
-from fdof_jax.kinematics import mass_center_velocities
+from fdof_jax.kinematics import mass_center_velocities, plane_angle, solve_joints
 
 SAMPLES = 12
 
@@ -229,6 +229,33 @@ def test_parallel_slides_reach_no_given_point(topology, lock, base_angle):
     orientation = base_angle + lock if topology == "PRP" else 0.2
     with pytest.raises(ValueError, match="^tip: expected .* within reach"):
         fj.inverse_kinematics(linkage, [0.5, 0.7], orientation)
+
+
+@jax.jit
+def wrists_solved(linkage, wrists, orientation, branch):
+    one = lambda w, bearing: solve_joints(linkage, w, bearing, orientation, branch)
+    return jax.vmap(one)(wrists, plane_angle(wrists[:, 1], wrists[:, 0]))
+
+
+@each_topology
+@pytest.mark.parametrize("branch", [1, -1])
+def test_numpy_solves_the_joints_as_jax_does(topology, branch):
+    rng = np.random.default_rng(7)
+    unreached = 0
+    for _ in range(4):
+        linkage = random_linkage(topology, rng)
+        wrists, orientation = rng.uniform(-2.5, 2.5, (1000, 2)), rng.uniform(-3, 3)
+        known, sides = jax.tree.map(np.asarray, linkage), np.asarray(float(branch))
+        bearing = plane_angle(wrists[:, 1], wrists[:, 0])
+        angle = np.asarray(orientation)
+        q, root = solve_joints(known, wrists, bearing, angle, sides)
+        expected, _ = wrists_solved(linkage, wrists, angle, sides)
+        assert isinstance(q, np.ndarray) and isinstance(root, np.ndarray)
+        # Next to the edge of the reach a root takes rounding to its square root.
+        off_edge = ~(np.abs(root) < 1e-6)
+        np.testing.assert_allclose(q[off_edge], expected[off_edge], atol=1e-8)
+        unreached += np.isnan(q).any(axis=1).sum()
+    assert unreached or topology.count("P") == 2
 
 
 def test_lists_and_integers_are_accepted():
