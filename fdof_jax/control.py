@@ -21,7 +21,6 @@ from .kinematics import (
     whole_turns,
 )
 from .linkage import Linkage, check_linkage
-from .soon_compiled import soon_compiled
 from .validation import concrete, is_traced, real_array, sign
 
 if TYPE_CHECKING:
@@ -317,9 +316,10 @@ def _known_reach(reference: Any, linkage: Linkage, times: ArrayLike) -> np.ndarr
         q, root = known_assembly(reference, linkage, times)
         return np.isfinite(q).all(axis=1) & (root != 0)
     with jax.ensure_compile_time_eval():  # also where others are traced
-        return np.asarray(soon_compiled(_finite)(reference, linkage, times))
+        return np.asarray(_finite(reference, linkage, times))
 
 
+@eqx.filter_jit
 def _finite(reference: Reference, linkage: Linkage, times: ArrayLike) -> Array:
     motion = jax.vmap(lambda t: reference(t, linkage))(times)
     return jnp.isfinite(jnp.concatenate(motion, axis=1)).all(axis=1)

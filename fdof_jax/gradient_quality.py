@@ -17,7 +17,6 @@ from .losses import controller_of, relative_demands, tip_errors
 from .scenes import Scene
 from .sensitivities import sensitivities
 from .simulation import simulate
-from .soon_compiled import soon_compiled
 from .tuning import check_tuned, with_gains
 from .vector_field import stateful
 
@@ -83,6 +82,7 @@ class GradientReport(eqx.Module):
         return "\n".join(lines + self.warnings)
 
 
+@eqx.filter_jit
 def _tangents(scene: Scene) -> tuple[Array, Array, Array, Any]:
     """Residuals, their Jacobian in the log-gains, demands over limits, the motion."""
     controller = controller_of(scene)
@@ -98,6 +98,7 @@ def _tangents(scene: Scene) -> tuple[Array, Array, Array, Any]:
     return found.residuals, found.jacobian, demands, found.solution
 
 
+@eqx.filter_jit
 def _losses(scene: Scene, factors: Array) -> Array:
     """The mean squared tip error with the gains changed by factors (n, 2, 3)."""
     controller = controller_of(scene)
@@ -127,15 +128,13 @@ def gradient_report(scene: Scene) -> GradientReport:
         lambda a: jnp.asarray(a) if is_number(a) else a,
         scene._replace(t1=float(scene.t1)),
     )
-    residuals, jacobian, demands, solution = map(
-        _numpy, soon_compiled(_tangents)(scene)
-    )
+    residuals, jacobian, demands, solution = map(_numpy, _tangents(scene))
     along = 2 * np.cumsum(residuals[:, None] * jacobian, axis=0)
     gradient = along[-1].reshape(2, 3)
     steps = np.eye(6).reshape(6, 1, 2, 3)
     sides = np.array([_STEP, -_STEP, _STEP / 2, -_STEP / 2])[:, None, None]
     factors = jnp.asarray(np.exp(sides * steps).reshape(24, 2, 3))
-    loss = np.asarray(soon_compiled(_losses)(scene, factors))
+    loss = np.asarray(_losses(scene, factors))
     far, near = (
         (loss.reshape(6, 4)[:, k] - loss.reshape(6, 4)[:, k + 1]) / width
         for k, width in ((0, 2 * _STEP), (2, _STEP))

@@ -11,7 +11,6 @@ from jax import Array
 
 from .bounded_search import Evaluation
 from .ensembles import stacked
-from .soon_compiled import soon_compiled
 
 # Lanes of a compiled batch at most: fewer do not fill the processor, and more wait for
 # each other.
@@ -20,6 +19,7 @@ _LANES = 8
 Evaluate = Callable[[Array, Any], Evaluation]  # of one lane, given z and its problem
 
 
+@eqx.filter_jit
 def _evaluate(evaluate: Evaluate, z: Array, moving: Any, shared: Any) -> Evaluation:
     """Of one lane or, with a leading axis of all but what is shared, of several."""
 
@@ -80,7 +80,7 @@ class Lanes:
             arrays = [jnp.asarray(leaf[run, member]) for leaf in self.leaves]
             moving = jax.tree.unflatten(self.structure, arrays)
             at = jnp.asarray(rows[group])
-            values = soon_compiled(_evaluate)(self.evaluate, at, moving, self.shared)
+            values = _evaluate(self.evaluate, at, moving, self.shared)
             values = jax.tree.map(np.asarray, values)
             for place, lane in enumerate(np.atleast_1d(group)):
                 found[lane] = values.row(place) if group.ndim else values

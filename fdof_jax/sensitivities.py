@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from .callbacks import without_checks
 from .forces import jumps_of
 from .hybrid_dynamics import hybrid_field, motion_at, prescribed, start_of
 from .reduced_equations import link_constants, zeros
@@ -107,21 +108,22 @@ def sensitivities(
     )
     if (jumps := jumps_of(*scene_at(z).forces)) is not None:
         controller = landing_on(controller, jumps.astype(ts.dtype))
-    found = diffrax.diffeqsolve(
-        diffrax.ODETerm(field),  # pyright: ignore[reportArgumentType]
-        # Few stages: much of the work is that around them.
-        diffrax.Tsit5(),
-        t0=ts[0],
-        t1=ts[-1],
-        dt0=1e-3,
-        y0=jnp.concatenate([start[None], jax.vmap(along)(directions)]),
-        args=z,
-        saveat=diffrax.SaveAt(ts=ts),
-        stepsize_controller=controller,
-        adjoint=diffrax.ForwardMode(),
-        max_steps=65536,
-        throw=False,
-    )
+    with without_checks():
+        found = diffrax.diffeqsolve(
+            diffrax.ODETerm(field),  # pyright: ignore[reportArgumentType]
+            # Few stages: much of the work is that around them.
+            diffrax.Tsit5(),
+            t0=ts[0],
+            t1=ts[-1],
+            dt0=1e-3,
+            y0=jnp.concatenate([start[None], jax.vmap(along)(directions)]),
+            args=z,
+            saveat=diffrax.SaveAt(ts=ts),
+            stepsize_controller=controller,
+            adjoint=diffrax.ForwardMode(),
+            max_steps=65536,
+            throw=False,
+        )
     assert found.ys is not None  # because of saveat
     # diffrax leaves infinity where it has not come to.
     states = jnp.where(jnp.isinf(found.ys), jnp.nan, found.ys)

@@ -8,7 +8,6 @@ import pytest
 
 import fdof_jax as fj
 from fdof_jax import fit_result, lanes
-from fdof_jax.soon_compiled import soon_compiled
 
 TS = np.linspace(0, 2, 201)
 LENGTH, MASS = np.array([0, 1, 0.8, 0.6]), np.array([3.0, 2.0, 1.0])
@@ -342,7 +341,7 @@ def test_progress_is_reported_and_nothing_compiles_twice(seen):
     lines = []
     fj.fit(MIXED, FIRST, TS, seen, report=lines.append, max_steps=1)
     assert len(lines) >= 3 and "sum of squares" in lines[-1]
-    compiled = soon_compiled(lanes._evaluate)._cached
+    compiled = lanes._evaluate._cached
     before = compiled._cache_size()
     other = Mixed(fj.State(jnp.array([-0.9, 0.2, 0.2]), jnp.zeros(3)))
     fj.fit(other, TRUE, TS, 1.01 * seen, noise=0.1, max_steps=1)

@@ -9,7 +9,6 @@ import pytest
 import fdof_jax as fj
 from fdof_jax import lanes, scenes, tuning
 from fdof_jax.losses import controller_of, tip_errors
-from fdof_jax.soon_compiled import soon_compiled
 
 
 def losses_of(scene, gains):
@@ -85,14 +84,14 @@ def test_history_describes_each_iteration_and_a_second_call_compiles_nothing():
     # The slide's actuator starts saturated, the others never are.
     assert history.saturated[0, 1] > 0
     assert (history.saturated[0, [0, 2]] == 0).all()
-    compiled = soon_compiled(lanes._evaluate)._cached._cache_size()
+    compiled = lanes._evaluate._cached._cache_size()
     task = fj.CircleTask(center=(-3.9, 2.1), radius=0.6)
     other = scenes.fig7().forces[0]
     other = fj.PDController(other.kp * 1.1, other.kd, other.limit, task)
     fj.tune(
         scene._replace(forces=(other,), t1=0.9), factor=3.0, max_steps=1, method="adam"
     )
-    assert soon_compiled(lanes._evaluate)._cached._cache_size() == compiled
+    assert lanes._evaluate._cached._cache_size() == compiled
 
 
 def test_gains_of_computed_torque_have_units_of_their_own():
