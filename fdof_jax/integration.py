@@ -184,9 +184,8 @@ def _integrate(
 def _integrate_reversibly(inputs, solver, keywords) -> Solution:
     """A motion whose derivatives are taken in reverse mode, if any are.
 
-    The replay has to come to the same bits: next to a saturation another rounding leads
-    to other steps, and to a wrong gradient. Unrolled stages are compiled differently
-    with derivatives and without; a loop over the stages is not.
+    The default solver's unrolled stages are not for that: they would compile for
+    minutes.
     """
     # Nothing is differentiated here, and loops made for that take longer to compile.
     keywords = keywords | {"adjoint": diffrax.ForwardMode()}

@@ -53,7 +53,10 @@ class _Step(NamedTuple):
     health: Array
 
 
+# In reverse mode steps are replayed, by the very code that took them: next to a
+# saturation another rounding leads to other steps, and to a wrong gradient.
 @eqx.filter_jit  # traced once, not at each of a solve's uses of it
+@eqx.filter_checkpoint
 def _step(term: Any, t0, t1, y0, lost, args, f0) -> tuple[_Step, Array]:
     # diffrax wraps the term, to integrate backward in time too.
     inner, h = term.term, term.contr(t0, t1)

@@ -8,7 +8,8 @@ import sweep_batch
 import fdof_jax as fj
 from fdof_jax.tune_result import History
 
-jax.config.update("jax_enable_x64", True)
+# As an application sets JAX up: the laws hold for what users run.
+fj.configure(x64=True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
 HARD = Path(__file__).parent / "hard"
@@ -73,6 +74,26 @@ def tuned():
         member_tip_error=np.array([0.06]),
         member_loss=np.array([0.01]),
         settings={},
+    )
+
+
+def pytest_configure(config):
+    """Most of the tests' time is compilation: programs are kept beside pytest's own."""
+    if hasattr(config, "cache"):  # not with -p no:cacheprovider
+        fj.configure(cache=config.cache.mkdir("programs"))
+
+
+def pytest_report_header(config):
+    kept = hasattr(config, "cache") and any(
+        config.cache.mkdir("programs").glob("*/*-cache")
+    )
+    return (
+        f"jax {jax.__version__}, {jax.default_backend()}, float64. "
+        + (
+            "Compiled programs of an earlier run are taken from .pytest_cache."
+            if kept
+            else "This first run compiles for some minutes; later ones take half of it."
+        )
     )
 
 

