@@ -24,8 +24,8 @@ from .measure import record, skipped
 PROTOCOL = "sliders"
 MOVES, QUICK_MOVES = 200, 20
 PATIENCE = 180.0  # for a server, a page or the first compilation [s]
-CELL = """import jax
-jax.config.update("jax_enable_x64", True)
+CELL = """import fdof_jax as fj
+fj.configure(x64=True)
 from fdof_jax.interactive import sliders
 sliders()"""
 

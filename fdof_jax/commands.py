@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import equinox as eqx
-import jax
 import matplotlib
 
 from . import scenes, showcase
+from .configuration import configure
 from .control import CircleTask
 from .ensembles import perturbed
 from .files import load, save
@@ -27,7 +27,7 @@ from .tuning_run import Job
 def set_up() -> None:
     """Set up JAX and matplotlib for a process that only runs commands."""
     matplotlib.use("agg")  # pictures are written, never shown
-    jax.config.update("jax_enable_x64", True)
+    configure(x64=True)
 
 
 def run_circle(output: Path) -> list[Path]:

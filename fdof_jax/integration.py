@@ -269,7 +269,8 @@ def solve_one(solver, inputs, keywords) -> tuple[Solution, bool] | None:
         return None
 
     def cut(rows: Array) -> Array:
-        return jnp.asarray(np.asarray(rows)[:count])  # slices by JAX are compiled
+        # Slices by JAX are compiled, as is jnp.asarray for each new shape.
+        return jax.device_put(np.asarray(rows)[:count])
 
     rows = cut(solution.q), cut(solution.qd), jax.tree.map(cut, solution.own)
     return Solution(

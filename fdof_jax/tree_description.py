@@ -31,6 +31,9 @@ class Unreadable(Exception):
 
 # Names of classes and functions
 
+# Modules that files written by version 0.1 know by an earlier name.
+_RENAMED = {"optimal_efforts": "optimal_motion", "sweep": "batched"}
+
 
 def _name(thing: Any) -> str:
     # The module in which diffrax keeps an enumeration may change.
@@ -43,12 +46,14 @@ def _of_the_library(name: str) -> Any:
     """The class or function of the library with this name, or None."""
     module, _, qualname = name.partition(":")
     package, _, submodule = module.partition(".")
+    submodule = _RENAMED.get(submodule, submodule)
     # Only what is a file of the library is imported, whatever the name says.
     if package != __package__ or submodule not in _submodules():
         return None
+    module = f"{package}.{submodule}"
     found = vars(importlib.import_module(module)).get(qualname)
     plain = isinstance(found, type | types.FunctionType)
-    return found if plain and _name(found) == name else None
+    return found if plain and _name(found) == f"{module}:{qualname}" else None
 
 
 def _submodules() -> set[str]:

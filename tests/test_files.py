@@ -1,6 +1,7 @@
 """Saved trees come back as they were."""
 
 import dataclasses
+import json
 import os
 import struct
 import subprocess
@@ -29,7 +30,7 @@ from saved_trees import (
 )
 
 import fdof_jax as fj
-from fdof_jax import integration, scenes, tuning
+from fdof_jax import integration, optimal_motion, scenes, tuning
 
 TS = np.linspace(0, 0.1, 4)
 
@@ -279,3 +280,22 @@ def test_members_that_another_version_counts_differently(path):
     same(fj.load(path, OWN), [Colour.green, Colour.red])
     describe(path, lambda d: d["tree"][0].update(members={"red": 1, "blue": 0}))
     refused(path, "Colour.*blue", OWN)
+
+
+def test_modules_that_had_another_name_in_version_0_1(path):
+    knots = optimal_motion._Knots([0.0, 1.0], np.ones((2, 3)))
+    fields = [field.name for field in dataclasses.fields(fj.OptimalMotion)]
+    motion = fj.OptimalMotion(**dict.fromkeys(fields, 1.0) | {"scene": (knots,)})
+    fj.save(path, (motion, fj.sweep))
+
+    def as_before(description):
+        text = json.dumps(description["tree"])
+        for new, old in (("optimal_motion", "optimal_efforts"), ("batched", "sweep")):
+            assert f"fdof_jax.{new}:" in text
+            text = text.replace(f"fdof_jax.{new}:", f"fdof_jax.{old}:")
+        description["tree"] = json.loads(text)
+
+    describe(path, as_before)
+    loaded, function = fj.load(path)
+    same(loaded, motion)
+    assert function is fj.sweep

@@ -55,7 +55,7 @@ def test_cells_are_short_and_begin_with_the_install_line(path):
     install, *others = (cell for cell in notebook.cells if cell.cell_type == "code")
     assert install.source == INSTALL and install.metadata.tags == ["install"]
     assert others == code_cells(notebook)
-    assert "jax_enable_x64" in others[0].source
+    assert "fj.configure(x64=True)" in others[0].source
     assert any("assert " in cell.source for cell in others)
 
 

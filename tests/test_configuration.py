@@ -1,0 +1,186 @@
+"""What `configure` sets, refuses and warns of."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import jaxlib
+import pytest
+from jax.experimental.compilation_cache import compilation_cache
+
+import fdof_jax as fj
+from fdof_jax import configuration
+
+NEEDS_OPTION = jaxlib.version.__version_info__ < (0, 12)
+
+# Imports whatever a user may import before, computes, then configures again: too late.
+APPLICATION = """
+import collections, json, os, sys, warnings
+import jax
+import jax.numpy as jnp
+import fdof_jax as fj
+fj.simulate, fj.tune, fj.fit
+with warnings.catch_warnings(record=True) as early:
+    warnings.simplefilter("always")
+    fj.configure(x64=True, cache=sys.argv[1])
+flags = os.environ["XLA_FLAGS"]
+
+events = collections.Counter()
+jax.monitoring.register_event_listener(lambda event, **_: events.update([event]))
+arm, start, *_ = fj.scenes.fig5()
+motion = fj.simulate(arm, start, [0, 0.01])
+hits = events["/jax/compilation_cache/cache_hits"]
+misses = events["/jax/compilation_cache/cache_misses"]
+
+loop = jax.jit(lambda x: jax.lax.fori_loop(0, 9, lambda i, y: y * i + x, x))
+kernel = "xla_cpu_small_call" in loop.lower(jnp.ones(1000)).compile().as_text()
+os.environ["XLA_FLAGS"] = ""
+with warnings.catch_warnings(record=True) as late:
+    warnings.simplefilter("always")
+    fj.configure()
+print(json.dumps(dict(
+    dtype=str(motion.q.dtype), flags=flags, kernel=kernel, hits=hits, misses=misses,
+    early=[str(w.message) for w in early],
+    late=[(str(w.message), w.filename) for w in late],
+)))
+"""
+
+
+def run_application(cache, flags=""):
+    done = subprocess.run(
+        [sys.executable, "-c", APPLICATION, cache],
+        env={**os.environ, "JAX_PLATFORMS": "cpu", "XLA_FLAGS": flags},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+def test_an_application(tmp_path):
+    cache, own = tmp_path / "not" / "yet", "--xla_backend_extra_options=xla_unknown=1"
+    first = run_application(cache, own)
+    assert first["dtype"] == "float64"
+    assert first["early"] == [] and first["kernel"]
+    # Options add up.
+    expected = f"{own} {configuration._FLAG}" if NEEDS_OPTION else own
+    assert first["flags"] == expected
+    if NEEDS_OPTION:
+        ((message, file),) = first["late"]
+        assert "configure: " in message and "JAX had started" in message
+        assert file == "<string>"  # the line that calls it
+    else:
+        assert first["late"] == []
+
+    (folder,) = cache.iterdir()
+    assert folder.name == configuration._processor()
+    programs = {path.name for path in folder.iterdir() if "atime" not in path.name}
+    assert first["misses"] > 0 and any("_solve_padded" in name for name in programs)
+    # All of them are found again.
+    second = run_application(cache, own)
+    assert second["hits"] >= first["misses"] and second["misses"] == 0
+    kept = {path.name for path in folder.iterdir() if "atime" not in path.name}
+    assert kept == programs
+
+
+# In this process, whose own settings come back
+
+
+NAMES = (
+    "jax_compilation_cache_dir",
+    "jax_persistent_cache_min_compile_time_secs",
+    "jax_persistent_cache_min_entry_size_bytes",
+    "jax_enable_x64",
+)
+
+
+def settings():
+    return {name: getattr(jax.config, name) for name in NAMES}
+
+
+@pytest.fixture(autouse=True)
+def restored(monkeypatch):
+    monkeypatch.setenv("XLA_FLAGS", configuration._FLAG)  # nothing to be warned of
+    before = settings()
+    yield before
+    for name, value in before.items():
+        jax.config.update(name, value)
+    compilation_cache.reset_cache()
+
+
+def test_what_is_not_given_stays(restored):
+    fj.configure()
+    assert settings() == restored
+
+
+def test_double_precision():
+    fj.configure(x64=False)
+    assert not jax.config.jax_enable_x64
+    fj.configure(x64=True)
+    assert jax.config.jax_enable_x64
+
+
+@pytest.mark.parametrize("value", [1, 0, "yes", 64, [True]])
+def test_precision_refused(value, restored, tmp_path):
+    with pytest.raises(ValueError, match=r"^x64: expected True or False, got .*\.$"):
+        fj.configure(x64=value, cache=tmp_path)
+    assert settings() == restored
+
+
+@pytest.mark.parametrize("value", ["", 0, 1, 2.5, b"folder", ["folder"]])
+def test_cache_refused(value, restored):
+    words = r"^cache: expected a folder, True or False, got .*\.$"
+    with pytest.raises(ValueError, match=words):
+        fj.configure(cache=value, x64=False)
+    assert settings() == restored
+
+
+def test_cache_that_cannot_be_written(restored, tmp_path):
+    words = r"^cache: expected a folder that can be written, got .*\.$"
+    file = tmp_path / "file"
+    file.touch()
+    for value in (file, str(file / "below"), "~no-such-user/cache"):
+        with pytest.raises(ValueError, match=words):
+            fj.configure(cache=value)
+    closed = tmp_path / "closed"
+    (closed / configuration._processor()).mkdir(parents=True)
+    (closed / configuration._processor()).chmod(0o500)
+    if not os.access(closed / configuration._processor(), os.W_OK):  # root may
+        with pytest.raises(ValueError, match=words):
+            fj.configure(cache=closed)
+    assert settings() == restored
+
+
+@pytest.mark.parametrize(
+    "system, variables, expected",
+    [
+        ("linux", {"XDG_CACHE_HOME": ""}, ".cache"),
+        ("linux", {"XDG_CACHE_HOME": "~/other"}, "other"),
+        ("darwin", {}, "Library/Caches"),
+        ("win32", {"LOCALAPPDATA": ""}, "AppData/Local"),
+        ("win32", {"LOCALAPPDATA": "~/Local"}, "Local"),
+    ],
+)
+def test_the_users_cache_folder(system, variables, expected, monkeypatch, tmp_path):
+    monkeypatch.setattr(sys, "platform", system)
+    for name, value in {"HOME": str(tmp_path), **variables}.items():
+        monkeypatch.setenv(name, value)
+    fj.configure(cache=True)
+    expected = tmp_path / expected / "fdof_jax" / configuration._processor()
+    assert Path(jax.config.jax_compilation_cache_dir) == expected.resolve()
+    assert expected.is_dir()
+    fj.configure(cache=False)
+    assert jax.config.jax_compilation_cache_dir is None
+
+
+@pytest.mark.skipif(not NEEDS_OPTION, reason="this version of XLA needs no option")
+def test_flags_in_a_file_are_left_alone(monkeypatch):
+    monkeypatch.setattr(configuration.xla_bridge, "backends_are_initialized", bool)
+    monkeypatch.setenv("XLA_FLAGS", "flags.txt")
+    with pytest.warns(UserWarning, match="XLA_FLAGS names a file; add --xla_"):
+        fj.configure()
+    assert os.environ["XLA_FLAGS"] == "flags.txt"
