@@ -11,10 +11,10 @@ import numpy as np
 from jax import Array
 
 from .added_inertia import inertial
-from .forces import Forces, jumps_of
 from .callbacks import without_checks
 from .configuration import small_loops_are_kernels
 from .dopri8 import ScheduledTerm
+from .forces import Forces, jumps_of
 from .hybrid_dynamics import (
     health_of_hybrid,
     hybrid_field,
@@ -23,9 +23,9 @@ from .hybrid_dynamics import (
     start_of,
 )
 from .linkage import possible
+from .looped_dopri8 import LoopedDopri8
 from .reduced_equations import link_constants, zeros
 from .solution import Solution
-from .looped_dopri8 import LoopedDopri8
 from .step_control import (
     Watched,
     bounded,
@@ -235,7 +235,7 @@ def _opened(inputs):
 
 @eqx.filter_jit
 def solve(solver, inputs, keywords) -> Solution:
-    """The motion, by a program for values that JAX traces: a batch's, a derivative's."""
+    """The motion, by a program for traced values: of a batch or of a derivative."""
     adjoint = keywords["adjoint"]
     if isinstance(adjoint, diffrax.RecursiveCheckpointAdjoint):
         return _integrate_reversibly(_opened(inputs), solver, keywords)
@@ -272,10 +272,9 @@ def solve_one(solver, inputs, keywords) -> tuple[Solution, bool] | None:
         # Slices by JAX are compiled, as is jnp.asarray for each new shape.
         return jax.device_put(np.asarray(rows)[:count])
 
-    rows = cut(solution.q), cut(solution.qd), jax.tree.map(cut, solution.own)
-    return Solution(
-        ts, *rows[:2], solution.stats, solution.result, rows[2]
-    ), bool(succeeded)
+    q, qd, own = cut(solution.q), cut(solution.qd), jax.tree.map(cut, solution.own)
+    whole = Solution(ts, q, qd, solution.stats, solution.result, own)
+    return whole, bool(succeeded)
 
 
 @eqx.filter_jit

@@ -260,7 +260,9 @@ def _derivatives(
 
 
 def _plain_sensitivities(*arguments):
-    return _derivatives(lambda function: functools.partial(function, _divided), *arguments)
+    return _derivatives(
+        lambda function: functools.partial(function, _divided), *arguments
+    )
 
 
 @jax.custom_jvp
@@ -361,4 +363,3 @@ def inertia_diagonals(
     m = _with(added, equations(c, delta, (zero, zero, zero)))
     _, inverse_diagonal = _solver(c, m, added, _divided)
     return (m.m11, m.m22, m.m33), inverse_diagonal()
-

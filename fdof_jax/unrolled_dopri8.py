@@ -8,7 +8,7 @@ single arm, for 2 s more of compilation (one core, jax 0.10.2). For derivatives 
 vector field is linearised at all stages at once, by one piece of compiled code.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import diffrax
@@ -24,7 +24,6 @@ from .dopri8 import (
     DENSE,
     LOWER,
     NODES,
-    STAGES,
     TABLEAU,
     ScheduledTerm,
     interpolation_weights,
