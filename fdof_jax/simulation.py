@@ -216,7 +216,7 @@ def simulate(
 
 def _raising(solution: Solution, state0: State) -> Solution:
     """The solution of a traced call, which raises an error where it fails."""
-    late = jnp.diff(solution.ts) <= 0
+    late = ~(jnp.diff(solution.ts) > 0)  # NaN included
     unknown = ~jnp.isfinite(jnp.stack(state0))
     for failed, message in (
         (late, "ts: expected increasing times, got others."),

@@ -1,0 +1,168 @@
+"""Compiled programs: what needs another one, what fails in one, and where they go."""
+
+import functools
+import json
+import subprocess
+import sys
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.experimental import serialize_executable
+from jax.experimental.compilation_cache import compilation_cache
+
+import fdof_jax as fj
+
+ARM, START, FORCES, _ = fj.scenes.fig5()
+TS = np.linspace(0, 0.1, 4)
+
+
+# Exported and serialised
+
+
+def states(q0, mass, ts):
+    linkage = eqx.tree_at(lambda arm: arm.mass, ARM, mass)
+    motion = fj.simulate(linkage, fj.State(q0, START.qd), ts, throw=False)
+    return motion.q, motion.qd
+
+
+ARGUMENTS = START.q, ARM.mass, jnp.asarray(TS)
+
+
+@functools.cache
+def lowered():
+    return jax.jit(states).lower(*ARGUMENTS)
+
+
+def same_bits(found, expected):
+    for a, b in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_a_program_that_raises_nothing_calls_nothing():
+    text = lowered().as_text()
+    assert "while" in text and "callback" not in text
+
+
+@pytest.fixture
+def uncached():
+    """JAX cannot serialise again what comes out of its persistent cache."""
+    before = jax.config.jax_compilation_cache_dir
+    jax.config.update("jax_compilation_cache_dir", None)
+    compilation_cache.reset_cache()
+    yield
+    jax.config.update("jax_compilation_cache_dir", before)
+    compilation_cache.reset_cache()
+
+
+def test_a_program_is_exported_and_serialised(uncached):
+    compiled = lowered().compile()
+    expected = compiled(*ARGUMENTS)
+    assert np.isfinite(expected).all()
+
+    exported = jax.export.export(jax.jit(states))(*ARGUMENTS)
+    there = jax.export.deserialize(exported.serialize())
+    same_bits(there.call(*ARGUMENTS), expected)
+
+    parts = serialize_executable.serialize(compiled)
+    loaded = serialize_executable.deserialize_and_load(*parts)
+    same_bits(loaded(*ARGUMENTS), expected)
+
+
+# Errors within a user's own jit
+
+
+@functools.cache
+def raising():
+    def ends(q0, ts):
+        # Another solver than by default, because it compiles sooner.
+        solver = diffrax.Dopri8()
+        start = fj.State(q0, START.qd)
+        return fj.simulate(ARM, start, ts, solver=solver, max_steps=32).q[-1]
+
+    return jax.jit(ends)
+
+
+def test_what_succeeds_under_jit_raises_nothing():
+    assert np.isfinite(raising()(START.q, TS)).all()
+
+
+@pytest.mark.parametrize(
+    "q0, ts, words",
+    [
+        (START.q, [0, 0.1, 0.05, 0.2], "ts: expected increasing times"),
+        (START.q, [0, 0.1, 0.1, 0.2], "ts: expected increasing times"),
+        (START.q, [0, 0.1, np.nan, 0.2], "ts: expected increasing times"),
+        ([0, np.nan, 0], TS, "state0: expected finite numbers"),
+        ([np.inf, 0, 0], TS, "state0: expected finite numbers"),
+        (START.q, [0, 1, 2, 50], "max_steps"),
+    ],
+)
+def test_failures_under_jit_name_the_argument(q0, ts, words):
+    with pytest.raises(Exception, match=words):
+        raising()(jnp.asarray(q0, float), jnp.asarray(ts, float)).block_until_ready()
+
+
+# New numbers, no new program
+
+
+SCRIPT = """
+import json
+import jax
+import numpy as np
+import equinox as eqx
+import fdof_jax as fj
+
+fj.configure(x64=True)
+programs = []
+def listen(event, duration, **details):
+    if event == "/jax/core/compile/backend_compile_duration":
+        programs.append(details.get("fun_name"))
+jax.monitoring.register_event_duration_secs_listener(listen)
+
+arm, start, forces, _ = fj.scenes.fig7()
+(pd,) = forces
+more = eqx.tree_at(lambda pd: (pd.kp, pd.kd), pd, (pd.kp * 2, pd.kd * 2))
+heavy = eqx.tree_at(lambda arm: arm.mass, arm, arm.mass * 2)
+scenes = fj.circle_scenes().values()
+programs.clear()
+
+def compiled(linkage, state0, ts, forces):
+    before = len(programs)
+    motion = fj.simulate(linkage, state0, ts, forces)
+    assert motion.q.shape == (len(ts), 3) and motion.outcome == "successful"
+    return programs[before:]
+
+print(json.dumps({
+    "first": compiled(arm, start, np.linspace(0, 0.1, 101), forces),
+    "times": [compiled(arm, start, np.linspace(0, 0.1, n), forces)
+              for n in (2, 3, 50, 500, 512)],
+    "durations": [compiled(arm, start, np.linspace(0, t1, 7), forces)
+                  for t1 in (0.05, 0.2)],
+    "gains": compiled(arm, start, np.linspace(0, 0.1, 5), (more,)),
+    "masses": compiled(heavy, start, np.linspace(0, 0.1, 5), forces),
+    "topologies": [compiled(scene.linkage, scene.state0, [0, 0.1], scene.forces)
+                   for scene in scenes],
+}))
+"""
+
+
+def test_new_numbers_compile_nothing():
+    """In a process of its own: in this one the programs may be compiled already."""
+    done = subprocess.run(
+        [sys.executable, "-c", SCRIPT], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    programs = json.loads(done.stdout)
+    # Without the event the test would see nothing.
+    assert any("_solve_padded" in name for name in programs.pop("first"))
+    assert programs == {
+        "times": [[]] * 5,
+        "durations": [[]] * 2,
+        "gains": [],
+        "masses": [],
+        "topologies": [[]] * 7,
+    }
