@@ -21,8 +21,9 @@ TS = np.linspace(0, 2, 201)
 
 
 def _simulate(scene: fj.Scene) -> Callable:
+    simulate = fj.simulate  # imported here, not with the first motion
     linkage, state0, forces, _ = scene
-    return lambda scale: fj.simulate(linkage, state0, scale * TS, forces)
+    return lambda scale: simulate(linkage, state0, scale * TS, forces)
 
 
 def fig5() -> Callable:
@@ -35,22 +36,29 @@ def fig7() -> Callable:
 
 def elements() -> Callable:
     """PD control along a figure eight, beside a spring and stops."""
-    path = fj.FigureEight([1.1, 0.4], [0.4, 0.2])
-    task = fj.TipTask(path, fj.Laps(2.0), orientation=0.0)
+    linkage = fj.Linkage(
+        "RRR",
+        length=[0, 1, 1, 0.3],
+        com=[[0.5, 0]] * 3,
+        mass=[1] * 3,
+        inertia=[0.1] * 3,
+    )
+    start = fj.State([0.0, 1.0, 0.5], [0, 0, 0])
+    task = fj.TipTask(fj.FigureEight([1.1, 0.4], [0.4, 0.2]), fj.Laps(2.0))
     forces = (
         fj.PDController(400.0, 40.0, 1000.0, task),
-        fj.SpringDamper(fj.Point(0, [0, 1]), fj.Point(2, [0.5, 0]), 50.0, 1.0),
-        fj.JointStops([-3.0] * 3, [3.0] * 3, stiffness=1e4, damping=10.0),
+        fj.SpringDamper(fj.Point(0, 0, 1), fj.Point(2, 0.5), stiffness=50, damping=1),
+        fj.JointStops(-3.0, 3.0),
     )
-    return _simulate(fj.scenes.fig5()._replace(forces=forces))
+    return _simulate(fj.Scene(linkage, start, forces, 2.0))
 
 
 def sweep() -> Callable:
+    run = fj.sweep
     linkage, state0, forces, _ = fj.scenes.fig5()
     starts = np.asarray(state0.q) + np.linspace(-0.1, 0.1, 256)[:, None]
-    return lambda scale: fj.sweep(
-        linkage, fj.State(starts, state0.qd), scale * TS, forces
-    )
+    members = fj.State(starts, state0.qd)
+    return lambda scale: run(linkage, members, scale * TS, forces)
 
 
 def _gradient(mode: str) -> Callable:
@@ -71,8 +79,8 @@ def gradient_reverse() -> Callable:
 
 
 def tune() -> Callable:
-    scene = fj.scenes.fig7()
-    return lambda scale: fj.tune(scene._replace(t1=scale * scene.t1))
+    run, scene = fj.tune, fj.scenes.fig7()
+    return lambda scale: run(scene._replace(t1=scale * scene.t1))
 
 
 CASES = {

@@ -121,11 +121,14 @@ def gradients(points: list[dict]) -> str:
 
 
 def compile_times(points: list[dict]) -> str:
-    rows = [
-        [p["problem"], p["solver"], number(p["time_median"]), p["reason"] or ""]
-        for p in points
-    ]
-    return table(["what", "", "s", "failed"], rows)
+    rows = []
+    for p in points:
+        again = 1e3 * np.median(p["again"]) if p["times"] else None
+        seconds = number(p["time_median"], 3), number(p["compile_time"], 3)
+        rows.append([p["problem"], p["solver"], *seconds, number(again, 3)])
+        rows[-1].append(p["reason"] or "")
+    head = "of a process [s]", "of the first call [s]", "second call [ms]", "failed"
+    return table(["", "", *head], rows)
 
 
 def scaling(points: list[dict]) -> str:
@@ -270,18 +273,22 @@ def sliders(points: list[dict]) -> str:
 
 
 def _machine(points: dict[str, list[dict]]) -> str:
-    one = next(p for job in points.values() for p in job)
-    versions = ", ".join(f"{k} {v}" for k, v in one["versions"].items() if v)
-    jobs: dict[str, set[str]] = {}
+    """A line per machine and set of versions: which jobs ran there, at which commit."""
+    jobs: dict[str, dict[str, set[str]]] = {}
     for name, job in points.items():
         for point in job:
+            versions = [f"{k} {v}" for k, v in point["versions"].items() if v]
+            commits = jobs.setdefault(", ".join([point["cpu"], *versions]), {})
             # Results of the jobs before are changes that are not committed yet.
-            jobs.setdefault(point["commit"].removesuffix("-dirty"), set()).add(name)
-    commits = "; ".join(
-        f"{', '.join(sorted(names))} at commit {commit}"
-        for commit, names in sorted(jobs.items(), key=lambda item: -len(item[1]))
-    )
-    return f"{one['cpu']}; {versions}; {commits}."
+            commits.setdefault(point["commit"].removesuffix("-dirty"), set()).add(name)
+    lines = []
+    for machine, commits in jobs.items():
+        runs = "; ".join(
+            f"{', '.join(sorted(names))} at commit {commit}"
+            for commit, names in sorted(commits.items(), key=lambda item: -len(item[1]))
+        )
+        lines.append(f"- {machine}: {runs}.")
+    return "\n".join(lines)
 
 
 _NOT_MEASURED = "Not measured: no GPU was at hand."
