@@ -120,6 +120,24 @@ def gradients(points: list[dict]) -> str:
     return table(head, rows)
 
 
+def single_arms(points: list[dict]) -> str:
+    rows = [
+        [
+            p["problem"],
+            p["solver"],
+            number(p["setting"]),
+            number(p["time_median"] and 1e3 * p["time_median"], 3),
+            *_ratio(p),
+            p["ratio_to"] or "",
+            number(p["error"]),
+            p["reason"] or "",
+        ]
+        for p in points
+    ]
+    head = ["", "", "tolerance", "ms", "ratio", "quartiles", "to", "error", "failed"]
+    return table(head, rows)
+
+
 def compile_times(points: list[dict]) -> str:
     rows = []
     for p in points:
@@ -315,6 +333,7 @@ def tables(points: dict[str, list[dict]]) -> dict[str, str]:
         "generality": generality,
         "checks": generality,
         "gradients": gradients,
+        "single_arms": single_arms,
         "compile_times": compile_times,
         "scaling": scaling,
         "drift": drift,

@@ -118,17 +118,21 @@ def measure_one(
     )
 
 
+def exact(problem: Problem) -> np.ndarray:
+    """The motion in extended precision, or in double where that is not at hand."""
+    try:
+        return peers.extended(problem)
+    except Skipped:
+        return reference(problem)
+
+
 def measure_fig5(budget: float) -> Iterator[dict]:
     """Fig 5, twice from the same runs: the error up to 2 s, and up to the end.
 
     The motion is chaotic: errors grow ten-thousandfold from 2 s to 10 s.
     """
     problem = problems.fig5()
-    try:
-        exact = peers.extended(problem)
-    except Skipped:
-        exact = reference(problem)
-    for point in measure_one(problem, exact, budget, rows(problem)):
+    for point in measure_one(problem, exact(problem), budget, rows(problem)):
         yield {**point, "problem": "fig5-error-to-2s"}
         if point["times"]:
             late = {"error": point["error_end"], "problem": "fig5"}

@@ -40,6 +40,7 @@ JOBS = (
     Job("mixed", "mixed"),
     Job("many", "many"),
     Job("trajectory", "trajectory"),
+    Job("single_arms", "single_arms"),
     Job("generality", "generality"),
     Job("checks", "checks"),
     Job("gradients", "gradients"),

@@ -87,13 +87,10 @@ def pytest_report_header(config):
     kept = hasattr(config, "cache") and any(
         config.cache.mkdir("programs").glob("*/*-cache")
     )
-    return (
-        f"jax {jax.__version__}, {jax.default_backend()}, float64. "
-        + (
-            "Compiled programs of an earlier run are taken from .pytest_cache."
-            if kept
-            else "This first run compiles for some minutes; later ones take half of it."
-        )
+    return f"jax {jax.__version__}, {jax.default_backend()}, float64. " + (
+        "Compiled programs of an earlier run are taken from .pytest_cache."
+        if kept
+        else "This first run compiles for some minutes; later ones take half of it."
     )
 
 
