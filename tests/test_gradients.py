@@ -15,52 +15,75 @@ TS = np.linspace(0, 1.0, 21)
 ZERO = jnp.zeros(3)
 
 
-def scene_at(parameters):
-    """Fig 7 as a function of log kp, log kd and log masses, (9,)."""
-    scene = scenes.fig7()
-    controller = scene.forces[0]
-    log_kp, log_kd, log_mass = parameters.reshape(3, 3)
+def outcome(problem, parameters, adjoint=diffrax.ForwardMode()):
+    """Mean squared tip deviation and last positions.
+
+    Functions of log kp, log kd, log masses and a shift of the start, (12,). The problem
+    (arm, start, controller, times, steps) is values only: one program in forward and
+    one in reverse mode serve all tests.
+    """
+    linkage, state0, controller, ts, (steps, dt0) = problem
+    log_kp, log_kd, log_mass, shift = parameters.reshape(4, 3)
     controller = eqx.tree_at(
         lambda c: (c.kp, c.kd),
         controller,
         (controller.kp * jnp.exp(log_kp), controller.kd * jnp.exp(log_kd)),
     )
-    linkage = eqx.tree_at(
-        lambda x: x.mass, scene.linkage, scene.linkage.mass * jnp.exp(log_mass)
+    linkage = eqx.tree_at(lambda x: x.mass, linkage, linkage.mass * jnp.exp(log_mass))
+    solution = fj.simulate(
+        linkage,
+        state0._replace(q=state0.q + shift),
+        ts,
+        (controller,),
+        stepsize_controller=steps,
+        dt0=dt0,
+        adjoint=adjoint,
+        max_steps=4096,
     )
-    return linkage, scene.state0, controller
+    deviation = tip_deviation(linkage, controller.reference, solution)
+    return jnp.mean(deviation**2), solution.q[-1]
+
+
+forward = eqx.filter_jit(lambda problem, at: jax.jacfwd(outcome, 1)(problem, at))
+
+
+@eqx.filter_jit
+def reverse(problem, at, weights):
+    """The gradient of the weighted sum of the deviation and of the positions."""
+
+    def weighed(at):
+        loss, q = outcome(problem, at, diffrax.RecursiveCheckpointAdjoint())
+        return weights[0] * loss + weights[1] * jnp.sum(q)
+
+    return jax.grad(weighed)(at)
+
+
+def steps(tolerance, dt0=1e-3, growth=10.0):
+    """Steps of `dt0` if none may grow: of one structure with adaptive ones."""
+    values = dict(rtol=tolerance, atol=tolerance, factormin=0.2, factormax=growth)
+    values = {name: np.asarray(value) for name, value in values.items()}
+    return diffrax.PIDController(**values), np.asarray(dt0)
 
 
 # A step over the end of a saturation is as short as the kink there demands, about the
 # square root of the tolerance, and leaves tangents wrong by its length: 1.4e-6 of the
 # gradient at 1e-11, 8e-7 at 1e-12, 1.4e-7 at 1e-13.
-STEPS = {
-    "fixed": dict(stepsize_controller=diffrax.ConstantStepSize(), dt0=1 / 1600),
-    "adaptive": dict(stepsize_controller=diffrax.PIDController(rtol=1e-13, atol=1e-13)),
-}
-
-
-def loss(parameters, steps, adjoint):
-    linkage, state0, controller = scene_at(parameters)
-    solution = fj.simulate(
-        linkage, state0, TS, (controller,), adjoint=adjoint, max_steps=4096, **steps
-    )
-    return jnp.mean(tip_deviation(linkage, controller.reference, solution) ** 2)
+STEPS = {"fixed": steps(1e9, 1 / 1024, growth=1.0), "adaptive": steps(1e-13)}
 
 
 @pytest.mark.parametrize("kind", STEPS)
 def test_forward_reverse_and_differences_agree(kind):
-    steps = STEPS[kind]
+    scene = jax.tree.map(jnp.asarray, scenes.fig7())
+    problem = scene.linkage, scene.state0, scene.forces[0], TS, STEPS[kind]
     # Off the paper's gains: nothing is special about this point.
-    at = jnp.array([0.1, -0.2, 0.3, 0.05, 0.2, -0.1, 0.0, 0.1, -0.1])
-    forward = jax.jit(jax.jacfwd(lambda p: loss(p, steps, diffrax.ForwardMode())))(at)
-    reverse = jax.jit(
-        jax.grad(lambda p: loss(p, steps, diffrax.RecursiveCheckpointAdjoint()))
-    )(at)
-    value = jax.jit(lambda p: loss(p, steps, diffrax.ForwardMode()))
+    at = [0.1, -0.2, 0.3, 0.05, 0.2, -0.1, 0.0, 0.1, -0.1, 0.02, 0.1, -0.03]
+    at = jnp.array(at)
+    tangents, _ = forward(problem, at)
+    gradient = reverse(problem, at, jnp.array([1.0, 0.0]))
 
     def difference(direction, h):
-        return float(value(at + h * direction) - value(at - h * direction)) / (2 * h)
+        after, before = (outcome(problem, at + s * h * direction)[0] for s in (1, -1))
+        return float(after - before) / (2 * h)
 
     if kind == "fixed":
         # Free of noise, but with a kink wherever a switching meets a step.
@@ -70,11 +93,11 @@ def test_forward_reverse_and_differences_agree(kind):
         differences = [
             (4 * difference(e, 5e-4) - difference(e, 1e-3)) / 3 for e in np.eye(at.size)
         ]
-    scale = np.abs(forward).max()
+    scale = np.abs(tangents).max()
     # Both round differently: beside a saturation that leads to other adaptive steps.
     same = {"fixed": 1e-10, "adaptive": 1e-6}[kind]
-    assert np.abs(forward - reverse).max() <= same * scale
-    assert np.abs(forward - np.array(differences)).max() <= 1e-6 * scale
+    assert np.abs(tangents - gradient).max() <= same * scale
+    assert np.abs(tangents - np.array(differences)).max() <= 1e-6 * scale
 
 
 @pytest.mark.slow
@@ -98,43 +121,55 @@ def test_gradients_at_rest_and_at_zero_error_are_finite():
     linkage = scenes.fig7().linkage
     task = fj.CircleTask(center=(-4.0, 2.0), radius=0.5)
     q = fj.inverse_kinematics(linkage, task.tip(0.0), task.orientation)
-
-    def end(kp, q0):
-        controller = fj.PDController(kp, [80.0, 50.0, 50.0], [jnp.inf] * 3, task)
-        state = fj.State(q0, jnp.zeros(3))
-        return jnp.sum(fj.simulate(linkage, state, [0, 0.1], (controller,)).q[-1])
-
-    gradients = jax.grad(end, argnums=(0, 1))(jnp.array([1500.0, 20000.0, 800.0]), q)
-    assert all(np.isfinite(g).all() for g in gradients)
+    gains = [1500.0, 20000.0, 800.0], [80.0, 50.0, 50.0]
+    controller = fj.PDController(*gains, [np.inf] * 3, task)
+    ts = np.linspace(0, 0.1, 21)
+    problem = linkage, fj.State(q, ZERO), controller, ts, steps(1e-11)
+    gradient = reverse(problem, jnp.zeros(12), jnp.array([0.0, 1.0]))
+    assert np.isfinite(gradient).all() and gradient.any()
 
 
-def test_bounded_steps_control_the_tangents_of_a_hanging_arm():
-    """At rest there is no error to see: unbounded steps leave a wrong gradient."""
-    linkage = eqx.tree_at(
-        lambda x: x.inertia, scenes.fig5().linkage, jnp.full(3, 1 / 12)
-    )
-    hanging, still, end = jnp.array([-jnp.pi / 2, 0.0, 0.0]), jnp.zeros(3), 10.0
+HANGING = jnp.array([-jnp.pi / 2, 0.0, 0.0])
+CHAIN = eqx.tree_at(lambda x: x.inertia, scenes.fig5().linkage, np.full(3, 1 / 12))
+
+
+def linear_motion(end):
+    """The exact derivative of the position in that at the start, of the hanging arm."""
+    stiffness = jax.jacfwd(lambda q: fj.forward_dynamics(CHAIN, q, ZERO, ZERO))(HANGING)
+    rates = jnp.block([[jnp.zeros((3, 3)), jnp.eye(3)], [stiffness, jnp.zeros((3, 3))]])
+    return jax.scipy.linalg.expm(rates * end, max_squarings=32)[:3, :3]
+
+
+def test_tangents_of_a_hanging_arm_are_controlled():
+    """At rest there is no error to see: steps are bounded by the time scale."""
+    # In the circle's reach, with a controller that does nothing.
+    task = fj.CircleTask(center=(1.0, 1.0), radius=0.2)
+    idle = fj.PDController(ZERO, ZERO, [np.inf] * 3, task)
+    ts = np.linspace(0, 10.0, 21)
+    problem = CHAIN, fj.State(HANGING, ZERO), idle, ts, steps(1e-11)
+    _, slopes = forward(problem, jnp.zeros(12))
+    exact = linear_motion(10.0)
+    assert np.abs(slopes[:, 9:] - exact).max() <= 1e-6 * np.abs(exact).max()
+
+
+@pytest.mark.slow
+def test_without_a_bound_tangents_of_a_hanging_arm_are_wrong():
+    end = 10.0
 
     def final(q0, dtmax):
         steps = diffrax.PIDController(rtol=1e-11, atol=1e-11, dtmax=dtmax)
         return fj.simulate(
-            linkage,
-            fj.State(q0, still),
+            CHAIN,
+            fj.State(q0, ZERO),
             [0, end],
             stepsize_controller=steps,
             adjoint=diffrax.ForwardMode(),
         ).q[-1]
 
-    # The linear motion about the equilibrium.
-    stiffness = jax.jacfwd(lambda q: fj.forward_dynamics(linkage, q, still, still))(
-        hanging
-    )
-    rates = jnp.block([[jnp.zeros((3, 3)), jnp.eye(3)], [stiffness, jnp.zeros((3, 3))]])
-    exact = jax.scipy.linalg.expm(rates * end, max_squarings=32)[:3, :3]
-    gradient = jax.jit(jax.jacfwd(final))
+    exact, gradient = linear_motion(end), jax.jit(jax.jacfwd(final))
     scale = np.abs(exact).max()
-    assert np.abs(gradient(hanging, 0.1) - exact).max() <= 1e-6 * scale
-    assert np.abs(gradient(hanging, 10.0) - exact).max() > scale
+    assert np.abs(gradient(HANGING, 0.1) - exact).max() <= 1e-6 * scale
+    assert np.abs(gradient(HANGING, 10.0) - exact).max() > scale
 
 
 @pytest.mark.slow

@@ -13,16 +13,15 @@ from fdof_jax.losses import controller_of, tip_errors
 
 def losses_of(scene, gains):
     """Mean squared tip errors, one per row of gains (n, 2, 3)."""
+    return np.array([np.sum(residuals_of(scene, row) ** 2) for row in gains])
 
-    @jax.jit
-    @jax.vmap
-    def loss(gains):
-        trial = tuning.with_gains(scene, gains)
-        ts = jnp.linspace(0, trial.t1, 1001)
-        solution = fj.simulate(trial.linkage, trial.state0, ts, trial.forces)
-        return jnp.sum(tip_errors(trial, solution) ** 2)
 
-    return np.asarray(loss(jnp.asarray(gains)))
+def residuals_of(scene, gains, loss=tip_errors):
+    """By a plain simulation, whose program is the same for all."""
+    trial = tuning.with_gains(scene, jnp.asarray(gains))
+    ts = np.linspace(0, trial.t1, 1001)
+    solution = fj.simulate(trial.linkage, trial.state0, ts, trial.forces)
+    return np.asarray(loss(trial, solution))
 
 
 def gains_of(scene):
@@ -94,14 +93,6 @@ def test_history_describes_each_iteration_and_a_second_call_compiles_nothing():
     assert lanes._evaluate._cached._cache_size() == compiled
 
 
-def test_gains_of_computed_torque_have_units_of_their_own():
-    scene = scenes.fig7()._replace(t1=0.2)
-    controller = scene.forces[0]
-    torque = fj.ComputedTorque(100, 20, controller.limit, controller.reference)
-    result = fj.tune(scene._replace(forces=(torque,)), max_steps=1)
-    assert "kp of P2 [1/s^2]" in str(result) and "kd of R1 [1/s]" in str(result)
-
-
 def test_starts_that_fail_are_counted():
     scene = scenes.fig7()._replace(t1=0.2)
     gains = gains_of(scene)
@@ -158,9 +149,17 @@ class TestTracking:
         assert (np.diff(front.effort) < 0).all() and (
             np.diff(front.tip_error) > 0
         ).all()
+        for price, result in zip(front.prices, front.results):
+            loss = fj.Tracking(effort=price)
+            residuals = residuals_of(self.scene, result.gains, loss)
+            assert result.loss == pytest.approx(residuals @ residuals, rel=1e-5)
+        assert f"{1e3 * front.tip_error[1]:.4g}" in str(front)
+
+    @pytest.mark.slow
+    def test_a_price_among_others_gives_what_it_gives_alone(self):
+        front = fj.trade_off(self.scene, [0.0, 1e-2, 1.0], max_steps=15)
         alone = fj.tune(self.scene, loss=fj.Tracking(effort=1e-2), max_steps=15)
         assert front.results[1].loss == pytest.approx(alone.loss, rel=1e-4)
-        assert f"{1e3 * front.tip_error[1]:.4g}" in str(front)
 
     def test_efforts_without_limits_have_no_price(self):
         controller = self.scene.forces[0]
@@ -174,6 +173,15 @@ class TestTracking:
             with pytest.raises(ValueError, match="loss: expected finite limits"):
                 scene = self.scene._replace(forces=(other,))
                 fj.tune(scene, loss=fj.Tracking(effort=1.0))
+
+
+def model_based(scene, kind):
+    controller = scene.forces[0]
+    gains = (
+        (100.0, 20.0) if kind is fj.ComputedTorque else (controller.kp, controller.kd)
+    )
+    replaced = kind(*gains, controller.limit, controller.reference)
+    return scene._replace(forces=(replaced,))
 
 
 class TestEnsembles:
@@ -234,19 +242,30 @@ class TestEnsembles:
                 loss, rel=1e-5
             )
 
-    def test_model_based_controllers_do_not_know_the_payload(self):
-        controller, arm = self.scene.forces[0], self.scene.linkage
-        gravity = fj.GravityFeedforward(
-            controller.kp, controller.kd, controller.limit, controller.reference
-        )
-        scene = self.scene._replace(forces=(gravity,))
-        many = fj.perturbed(scene, 4, payload=(1, 2))
-        model = many.forces[0].model
+    @pytest.mark.parametrize("kind", [fj.GravityFeedforward, fj.ComputedTorque])
+    def test_model_based_controllers_do_not_know_the_payload(self, kind):
+        many = fj.perturbed(model_based(self.scene, kind), 4, payload=(1, 2))
+        model, arm = many.forces[0].model, self.scene.linkage
         np.testing.assert_array_equal(model.mass, np.tile(arm.mass, (4, 1)))
         assert (np.asarray(many.linkage.mass)[:, 2] >= arm.mass[2] + 1).all()
-        short = many._replace(t1=np.full(4, 0.2))
-        result = fj.tune(scene._replace(t1=0.2), ensemble=short, max_steps=1)
+
+    def test_computed_torque_is_tuned_for_payloads_in_units_of_its_own(self):
+        scene = model_based(self.scene._replace(t1=0.2), fj.ComputedTorque)
+        many = fj.perturbed(scene, 4, payload=(1, 2))
+        result = fj.tune(scene, ensemble=many, max_steps=1)
         assert result.loss < result.history.loss[0] and len(result.member_loss) == 4
+        assert "kp of P2 [1/s^2]" in str(result) and "kd of R1 [1/s]" in str(result)
+
+    def test_a_member_that_fails_is_named(self):
+        ensemble = self.ensemble()
+        masses = lambda many: (many.linkage.mass, many.linkage.inertia)
+        none_in_second = np.array([[1.0], [0.0], [1.0]])
+        ensemble = eqx.tree_at(
+            masses, ensemble, [none_in_second * a for a in masses(ensemble)]
+        )
+        message = r"ensemble\[1\]: expected one that can be simulated"
+        with pytest.raises(ValueError, match=message):
+            fj.tune(self.scene, ensemble=ensemble)
 
     def test_what_is_no_ensemble_is_refused(self):
         with pytest.raises(ValueError, match="ensemble: expected scenes stacked"):
@@ -268,27 +287,23 @@ class TestEnsembles:
             fj.perturbed(self.scene, 2, speed=(2.0, 0.0))
 
 
-def test_own_loss():
-    def twice(scene, solution):
-        return 2 * tip_errors(scene, solution)
+class MeanSquare(eqx.Module):
+    """A scalar loss."""
 
-    scene = scenes.fig7()._replace(t1=0.5)
-    result = fj.tune(scene, loss=twice, max_steps=1)
-    assert result.history.loss[0] == pytest.approx(4 * result.history.tip_error[0] ** 2)
+    factor: jax.Array
+
+    def __call__(self, scene, solution):
+        return self.factor * jnp.mean(solution.q**2)
 
 
 def test_a_scalar_loss_is_the_loss_itself():
-    def mean_square(scene, solution):
-        return jnp.mean(solution.q**2)
-
     scene = scenes.fig7()._replace(t1=0.2)
-    result = fj.tune(scene, loss=mean_square, method="adam", max_steps=1)
-    solution = fj.simulate(
-        scene.linkage, scene.state0, np.linspace(0, 0.2, 1001), scene.forces
-    )
-    assert result.history.loss[0] == pytest.approx(
-        np.mean(np.asarray(solution.q) ** 2), rel=1e-6
-    )
+    loss = MeanSquare(jnp.array(1.0))
+    result = fj.tune(scene, loss=loss, method="adam", max_steps=1)
+    found = residuals_of(scene, gains_of(scene), loss)
+    assert result.history.loss[0] == pytest.approx(found, rel=1e-6)
+    with pytest.raises(ValueError, match="loss: expected finite numbers, not negative"):
+        fj.tune(scene, loss=MeanSquare(jnp.array(-1.0)))
 
 
 def test_a_gradient_of_zero_is_not_taken_for_convergence():
@@ -302,12 +317,17 @@ def test_a_gradient_of_zero_is_not_taken_for_convergence():
     assert (result.history.saturated[0] == 1).all()
 
 
-def test_a_plain_function_may_act_beside_the_controller():
+def test_own_loss_and_a_plain_function_beside_the_controller():
+    def twice(scene, solution):
+        return 2 * tip_errors(scene, solution)
+
     scene = scenes.fig7()._replace(t1=0.2)
     wind = lambda t, q, qd, linkage: [0, 100, 0]
-    result = fj.tune(scene._replace(forces=(*scene.forces, wind)), max_steps=1)
+    windy = scene._replace(forces=(*scene.forces, wind))
+    history = fj.tune(windy, loss=twice, max_steps=1).history
+    assert history.loss[0] == pytest.approx(4 * history.tip_error[0] ** 2)
     calm = losses_of(scene, gains_of(scene)[None])[0]
-    assert abs(result.history.loss[0] - calm) > 1e-3 * calm
+    assert abs(history.tip_error[0] ** 2 - calm) > 1e-3 * calm
 
 
 class Indexed(eqx.Module):
