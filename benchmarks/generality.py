@@ -132,7 +132,7 @@ def run(quick: bool) -> Iterator[dict]:
         yield from measure(
             PROTOCOL,
             prepared,
-            budget=5 if quick else 30,
+            budget=1 if quick else 30,
             ratio_to=BASELINE,
             equal_error=False,
             problem=problem.name,

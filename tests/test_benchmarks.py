@@ -76,17 +76,24 @@ def test_ratios_are_taken_at_equal_error():
     assert points[1]["ratio_to"] == "fast" and points[2]["ratio"] is None
 
 
+@pytest.fixture(scope="module")
+def three_motions():
+    rng = np.random.default_rng(0)
+    linkage = random_linkage("RRR", rng)
+    state0 = State(rng.uniform(-1, 1, (3, 3)), rng.uniform(-1, 1, (3, 3)))
+    problem = Problem("test", linkage, state0, (), np.array([0.0, 0.5, 1.0]), "RRR")
+    return problem, solved(problem)[:, 1:]
+
+
 @pytest.mark.skipif(shutil.which("gcc") is None, reason="gcc is not installed")
 @pytest.mark.parametrize("method, step", [("RK4", 2e-4), ("order 8", 5e-3)])
 @pytest.mark.parametrize("batch", [1, 3])
-def test_the_c_kernel_agrees_with_the_library(method, step, batch):
-    rng = np.random.default_rng(0)
-    linkage = random_linkage("RRR", rng)
-    state0 = State(rng.uniform(-1, 1, (batch, 3)), rng.uniform(-1, 1, (batch, 3)))
-    problem = Problem("test", linkage, state0, (), np.array([0.0, 0.5, 1.0]), "RRR")
-    kernel = Kernel(method, linkage, *state0)
+def test_the_c_kernel_agrees_with_the_library(method, step, batch, three_motions):
+    problem, exact = three_motions
+    q0, qd0 = (rows[:batch] for rows in problem.state0)
+    kernel = Kernel(method, problem.linkage, q0, qd0)
     q, _ = kernel.joints(kernel(step, round(0.5 / step), saves=2))
-    np.testing.assert_allclose(q, solved(problem)[:, 1:], atol=1e-9)
+    np.testing.assert_allclose(q, exact[:batch], atol=1e-9)
 
 
 def test_the_circle_in_scalars_is_that_of_the_library():

@@ -104,22 +104,14 @@ def test_efforts_make_the_motion_and_do_its_work(topology, joints):
     np.testing.assert_allclose(energy[-1] - energy[0], work, atol=1e-6 * np.ptp(power))
 
 
-class Fall(eqx.Module):
-    """The cart falls along its rail, which is upright."""
-
-    def __call__(self, t, linkage):
-        up, rate = -G * t**2 / 2, -G * t
-        zero = jnp.zeros_like(t)
-        return jnp.stack([up, zero, zero]), jnp.stack([rate, zero, zero])
-
-
 def test_a_motion_prescribed_as_it_is_takes_no_effort():
     """A cart that falls together with a pendulum that hangs on it, weightless."""
     falling = fj.Linkage(
         "PRR", length=[0, 0, 1, 1], com=[[0, 0], [0.5, 0], [0.5, 0]], mass=[1, 1, 1],
         inertia=[1, 1, 1], gravity=G,
     )  # fmt: skip
-    motion = fj.PrescribedMotion(1, Fall())
+    # Its rail is upright.
+    motion = fj.PrescribedMotion(1, Push(jnp.array(0.0), jnp.array(-G)))
     ts = np.linspace(0, 1, 5)
     start = fj.State([0, 0.3, 0.2], np.zeros(3))
     bound = fj.simulate(falling, start, ts, (motion,))

@@ -28,7 +28,7 @@ def motion(topology, seed=0):
 
 def instant(linkage, q, qd, forces):
     """The reactions at one moment, and the accelerations then."""
-    result = fj.simulate(linkage, fj.State(q, qd), [0.0, 1e-3], forces)
+    result = fj.simulate(linkage, fj.State(q, qd), [0.0])  # the start alone
     reactions = fj.joint_reactions(linkage, forces, result)[0]
     tau = fj.joint_efforts(linkage, forces, result).total[0]
     return np.asarray(reactions), fj.forward_dynamics(linkage, q, qd, tau, forces)

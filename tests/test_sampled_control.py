@@ -8,6 +8,7 @@ import pytest
 from elements import Hold
 
 import fdof_jax as fj
+from fdof_jax.looped_dopri8 import LoopedDopri8
 
 ARM = fj.Linkage(
     "RRR", length=[0, 1, 1, 1], com=[[0.5, 0]] * 3, mass=[1] * 3, inertia=[1 / 12] * 3
@@ -23,17 +24,16 @@ MOVE = fj.JointMove([-0.5, 0.3, 0.2], [0.5, 0.6, -0.4], fj.Travel(1.0))
 # Soft enough for the longest period: the last link is light.
 KP, KD = np.array([100.0, 50.0, 10.0]), np.array([20.0, 10.0, 1.0])
 CONTROL = fj.PDController(KP, KD, np.inf, MOVE)
+# A program that is compiled sooner than that of the default.
+SHORT = dict(solver=LoopedDopri8())
 
 
 def test_sampled_control_converges_at_first_order():
     exact = fj.simulate(ARM, START, [0, 0.4], (CONTROL,)).q[-1]
     periods = np.array([4e-3, 2e-3, 1e-3, 5e-4])
-    errors = [
-        np.abs(
-            fj.simulate_sampled(ARM, START, CONTROL, p, round(0.4 / p)).q[-1] - exact
-        ).max()
-        for p in periods
-    ]
+    # As many samples of each period: one program.
+    sampled = lambda p: fj.simulate_sampled(ARM, START, CONTROL, p, 800, **SHORT).q
+    errors = [np.abs(sampled(p)[round(0.4 / p)] - exact).max() for p in periods]
     slopes = np.diff(np.log(errors)) / np.diff(np.log(periods))
     np.testing.assert_allclose(slopes, 1, atol=0.1)
 
@@ -44,7 +44,9 @@ def ramp(t, q, qd, linkage):
 
 @pytest.mark.parametrize("delay", [0.0, 0.03])
 def test_efforts_are_held_and_come_late(delay):
-    motion = fj.simulate_sampled(WHEEL, REST, ramp, 0.1, 5, delay=delay)
+    # Once by the default solver, which takes longer to compile.
+    options = {} if delay else SHORT
+    motion = fj.simulate_sampled(WHEEL, REST, ramp, 0.1, 5, delay=delay, **options)
     np.testing.assert_allclose(motion.ts, np.arange(6) * 0.1, atol=1e-15)
     commanded = 1 + motion.ts[:-1]
     np.testing.assert_allclose(motion.tau[:, 2], commanded, rtol=1e-12)
@@ -57,7 +59,7 @@ def test_noise_is_what_the_key_says():
     seen = lambda t, q, qd, linkage: q + 10 * qd
     run = lambda seed: fj.simulate_sampled(
         WHEEL, REST, seen, 1e-6, 400, noise=(0.1, [0.02, 0.0, 0.0]),
-        key=jax.random.key(seed),
+        key=jax.random.key(seed), **SHORT,
     )  # fmt: skip
     first, same, other = run(1), run(1), run(2)
     np.testing.assert_array_equal(first.tau, same.tau)
@@ -127,7 +129,7 @@ def test_a_delay_that_is_too_long_is_told():
 
 def test_a_failure_is_named():
     broken = lambda t, q, qd, linkage: jnp.where(t > 0.15, jnp.nan, 0.0) * q
-    motion = fj.simulate_sampled(ARM, START, broken, 0.1, 4)
+    motion = fj.simulate_sampled(ARM, START, broken, 0.1, 4, **SHORT)
     assert (
         bool(motion.result == diffrax.RESULTS.nonfinite)
         and np.isfinite(motion.q[2]).all()

@@ -41,25 +41,25 @@ def test_fig3_comes_to_rest_under_the_pivot():
 
 def test_fig5_conserves_its_energy_and_passes_it_between_links():
     scene = scenes.fig5()
-    ts = np.linspace(0, 10, 1001)
+    ts = np.linspace(0, 10, 501)
     solution = fj.simulate(scene.linkage, scene.state0, ts)
     kinetic, potential = energies(scene.linkage, solution)
     assert np.abs((kinetic + potential).sum(axis=1)).max() <= 1e-8
     total = kinetic.sum(axis=1)
-    assert total[100] == pytest.approx(54.889174791186, abs=1e-8)
-    assert total[500] == pytest.approx(12.603912358049, abs=1e-7)
+    assert total[50] == pytest.approx(54.889174791186, abs=1e-8)
+    assert total[250] == pytest.approx(12.603912358049, abs=1e-7)
     tables = {
-        50: ([2.298234459, 12.82117469, 16.15041155],
+        25: ([2.298234459, 12.82117469, 16.15041155],
              [-7.712524545, -11.54151306, -12.01578309]),
-        100: ([1.72060184, 13.9524388, 39.21613415],
+        50: ([1.72060184, 13.9524388, 39.21613415],
               [-9.711132357, -19.38953088, -25.78851156]),
-        150: ([2.147291502, 3.735135913, 4.36871562],
+        75: ([2.147291502, 3.735135913, 4.36871562],
               [-0.4291427303, -2.557089816, -7.264910488]),
-        300: ([3.073952069, 17.80795955, 14.9894397],
+        150: ([3.073952069, 17.80795955, 14.9894397],
               [-8.636185855, -12.79756002, -14.43760544]),
-        200: ([3.418419722, 3.345751526, 1.483116072],
+        100: ([3.418419722, 3.345751526, 1.483116072],
               [-2.415474222, -1.457476221, -4.374336877]),
-        500: ([0.5977764945, 5.901081903, 6.10505396],
+        250: ([0.5977764945, 5.901081903, 6.10505396],
               [-2.283401632, -7.598600676, -2.721910049]),
     }  # fmt: skip
     for index, (t, v) in tables.items():
@@ -93,19 +93,19 @@ def test_default_accuracy_under_control():
 
 def test_fig7_tracks_its_circle():
     scene = scenes.fig7()
-    ts = np.arange(1001) * 0.01
+    ts = np.concatenate([[0, 0.5, 2], np.arange(500, 1000) * 0.01])
     solution = fj.simulate(scene.linkage, scene.state0, ts, scene.forces)
     task = scene.forces[0].reference
     tips = jax.vmap(fj.tip_position, in_axes=(None, 0))(scene.linkage, solution.q)
     error = np.linalg.norm(tips - jax.vmap(task.tip)(ts), axis=1)
     assert error[0] == pytest.approx(0.25, abs=1e-12)
-    assert error[50] == pytest.approx(0.409612, abs=1e-5)
-    assert error[200] == pytest.approx(0.179893, abs=1e-5)
-    assert np.sqrt(np.mean(error[500:1000] ** 2)) == pytest.approx(0.253504, abs=1e-5)
+    assert error[1] == pytest.approx(0.409612, abs=1e-5)
+    assert error[2] == pytest.approx(0.179893, abs=1e-5)
+    assert np.sqrt(np.mean(error[3:] ** 2)) == pytest.approx(0.253504, abs=1e-5)
     # States of physics at t = 2: th2, B2, th4.
     np.testing.assert_allclose(
-        [solution.q[200, 0], solution.q[200, 1], solution.q[200].sum()
-         - solution.q[200, 1] + np.pi / 2],
+        [solution.q[2, 0], solution.q[2, 1], solution.q[2].sum()
+         - solution.q[2, 1] + np.pi / 2],
         [1.75072080229, 0.790467088356, 1.61872366706],
         atol=1e-7,
     )  # fmt: skip
@@ -130,6 +130,7 @@ def test_order_of_convergence(solver, order, steps):
             scene.linkage,
             state,
             [0, 1.0],
+            (fj.JointDamper(0.0),),  # one program with what follows
             solver=solver,
             stepsize_controller=diffrax.ConstantStepSize(),
             dt0=dt0,
@@ -145,7 +146,7 @@ def test_constant_steps_that_are_too_long_do_not_succeed():
     scene = scenes.fig5()
     stiff = (fj.JointDamper(1e5),)
     keywords = dict(
-        solver=diffrax.Tsit5(),
+        solver=diffrax.Dopri8(),
         stepsize_controller=diffrax.ConstantStepSize(),
         dt0=0.01,
     )

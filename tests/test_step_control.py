@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import fdof_jax as fj
+from fdof_jax.looped_dopri8 import LoopedDopri8
 
 LINKS = dict(com=[[0.5, 0]] * 3, mass=[1, 1, 1], inertia=[1 / 12] * 3)
 ARM = fj.Linkage("RRR", length=[0, 1, 1, 1], **LINKS)
@@ -99,8 +100,9 @@ def test_steps_as_long_as_the_distance_of_jumps_do_not_fall_short_of_them():
 def test_a_sweep_lands_on_each_members_jumps():
     jumps = jnp.array([[0.2, 0.4], [0.6, 0.8]])
     together = fj.sweep(
-        ARM, START, TS, (Switched(jumps),), forces_axes=(Switched(0, None),)
-    )
+        ARM, START, TS, (Switched(jumps),), forces_axes=(Switched(0, None),),
+        solver=LoopedDopri8(),
+    )  # fmt: skip
     for i in range(2):
         alone = fj.simulate(ARM, START, TS, (Switched(jumps[i]),))
         np.testing.assert_allclose(together.q[i], alone.q, atol=1e-9)

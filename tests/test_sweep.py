@@ -21,6 +21,7 @@ from sweep_batch import (
 )  # fmt: skip
 
 import fdof_jax as fj
+from fdof_jax.looped_dopri8 import LoopedDopri8
 
 
 def reason(solution, member):
@@ -32,28 +33,32 @@ def assert_equal(solution, other, tolerance=1e-9):
         np.testing.assert_allclose(a, b, rtol=tolerance, atol=tolerance)
 
 
-def test_members_equal_those_of_vmap(batch, clean):
-    plain = jax.vmap(
-        lambda *member: fj.simulate(*member[:2], TS, member[2], throw=False, **SETTINGS)
-    )(*batch)
+def test_a_solution_is_made_as_that_of_vmap(batch, clean):
+    plain = jax.eval_shape(
+        jax.vmap(
+            lambda linkage, state0, forces: fj.simulate(
+                linkage, state0, TS, forces, throw=False, **SETTINGS
+            )
+        ),
+        *batch,
+    )
     assert jax.tree.structure(clean) == jax.tree.structure(plain)
     for a, b in zip(jax.tree.leaves(clean), jax.tree.leaves(plain)):
         assert (a.shape, a.dtype) == (b.shape, b.dtype)
-    assert successful(clean).all() and successful(plain).all()
-    np.testing.assert_array_equal(clean.ts, plain.ts)
-    np.testing.assert_allclose(clean.q, plain.q, rtol=1e-8, atol=1e-8)
-    np.testing.assert_allclose(clean.qd, plain.qd, rtol=1e-7, atol=1e-7)
-    # Another width of the batch rounds differently, which may tip a step or two.
-    np.testing.assert_allclose(
-        clean.stats["num_steps"], plain.stats["num_steps"], rtol=0, atol=5
-    )
 
 
 def test_members_equal_single_simulations(batch, clean):
-    for member in (0, 8, 23, 41):
+    """Which are those of vmap too: test_one_compilation.py."""
+    assert successful(clean).all()
+    for member in range(len(clean.q)):
         single = alone(batch, member)
+        np.testing.assert_array_equal(clean.ts[member], single.ts)
         np.testing.assert_allclose(clean.q[member], single.q, rtol=1e-8, atol=1e-8)
         np.testing.assert_allclose(clean.qd[member], single.qd, rtol=1e-7, atol=1e-7)
+        # A batch rounds differently, which may tip a step or two.
+        np.testing.assert_allclose(
+            clean.stats["num_steps"][member], single.stats["num_steps"], rtol=0, atol=5
+        )
 
 
 # Members that differ from the others
@@ -148,43 +153,28 @@ def ramp(t, linkage):
     return jnp.ones(3) * t, jnp.ones(3)
 
 
-@pytest.mark.parametrize("shared", ["damper", "controller"])
-def test_arrays_without_the_axis_are_shared(shared):
+def test_arrays_without_the_axis_are_shared():
+    """Among them starting velocities, which are whole numbers here."""
     linkage = random_linkage("RPR", np.random.default_rng(3))
     rng = np.random.default_rng(4)
     starts = rng.uniform(-1, 1, (3, 3))
-
-    def forces(coefficient, kp):
-        return (
-            fj.JointDamper(coefficient),
-            fj.PDController(kp, 4.0, 50.0, ramp),
-        )
-
-    each = [forces(*rng.uniform(0.5, [3, 40])) for _ in starts]
+    damper, shared = fj.JointDamper(1.3), fj.PDController(9.0, 4.0, 50.0, ramp)
+    own = [fj.PDController(kp, 4.0, 50.0, ramp) for kp in rng.uniform(0.5, 40, 3)]
     # A function among the arrays, such as this reference, has no axis.
-    stacked = jax.tree.map(
-        lambda *a: np.stack(a) if eqx.is_array(a[0]) else a[0], *each
-    )
-    first = each[0]
-    if shared == "damper":
-        together, axes = (first[0], stacked[1]), (None, 0)
-        each = [(first[0], element[1]) for element in each]
-    else:
-        together, axes = (stacked[0], first[1]), (0, None)
-        each = [(element[0], first[1]) for element in each]
+    stacked = jax.tree.map(lambda *a: np.stack(a) if eqx.is_array(a[0]) else a[0], *own)
     solution = fj.sweep(
         linkage,
-        fj.State(starts, np.zeros(3)),
+        fj.State(starts, [0, 0, 1]),
         TS,
-        together,
-        forces_axes=axes,
+        (damper, stacked, shared),
+        forces_axes=(None, 0, None),
+        solver=LoopedDopri8(),
         **SETTINGS,
     )
     assert solution.q.shape == (3, len(TS), 3)
     for member, q in enumerate(starts):
-        single = fj.simulate(
-            linkage, fj.State(q, np.zeros(3)), TS, each[member], **SETTINGS
-        )
+        start, forces = fj.State(q, [0, 0, 1]), (damper, own[member], shared)
+        single = fj.simulate(linkage, start, TS, forces, **SETTINGS)
         np.testing.assert_allclose(solution.q[member], single.q, rtol=1e-8, atol=1e-8)
 
 
@@ -198,12 +188,3 @@ def test_an_implicit_solver_finds_its_tolerances():
     )
     alone = fj.simulate(linkage, fj.State(start.q[1], start.qd), [0, 0.2])
     np.testing.assert_allclose(solution.q[1], alone.q, atol=1e-6)
-
-
-def test_whole_numbers_are_velocities_too():
-    arm = random_linkage("RRR", np.random.default_rng(2))
-    spring = fj.SpringDamper(fj.Point(0, 1.0), fj.Point(3), damping=1.0)
-    q = np.linspace(0, 0.2, 3)[:, None] * np.ones(3)
-    solution = fj.sweep(arm, fj.State(q, [0, 0, 0]), [0, 0.1], (spring,))
-    alone = fj.simulate(arm, fj.State(q[2], [0, 0, 0]), [0, 0.1], (spring,))
-    np.testing.assert_allclose(solution.q[2], alone.q, atol=1e-9)
