@@ -21,7 +21,7 @@ PUBLIC = {
 # Names whose arguments or results carry no unit.
 UNITLESS = {
     "existence_factors", "to_mjcf", "fig3", "fig5", "fig7", "load", "save", "stacked",
-    "tune_each", "gradient_report", "league_table", "circle_scenes",
+    "tune_each", "gradient_report", "league_table", "circle_scenes", "configure",
 }  # fmt: skip
 # Names that implement something printed in the paper.
 SOURCES = {
