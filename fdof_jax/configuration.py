@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jaxlib
 from jax._src import xla_bridge
 from jax.experimental.compilation_cache import compilation_cache
+from jaxlib import version
 
 # XLA on CPU compiles a loop as one kernel if its state has fewer bytes than this option
 # says, and otherwise starts a kernel for each operation. XLA reads it when JAX starts.
@@ -28,8 +28,8 @@ _BY_ITSELF = (0, 12)
 
 def small_loops_are_kernels() -> bool:
     """Whether XLA compiles the loops of a single arm's motion as one kernel."""
-    version = tuple(map(int, jaxlib.__version__.split(".")[:2]))
-    return version >= _BY_ITSELF or _SMALL_LOOPS in os.environ.get("XLA_FLAGS", "")
+    by_itself = version.__version_info__ >= _BY_ITSELF
+    return by_itself or _SMALL_LOOPS in os.environ.get("XLA_FLAGS", "")
 
 
 def configure(

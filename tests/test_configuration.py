@@ -7,14 +7,14 @@ import sys
 from pathlib import Path
 
 import jax
-import jaxlib
 import pytest
 from jax.experimental.compilation_cache import compilation_cache
+from jaxlib import version
 
 import fdof_jax as fj
 from fdof_jax import configuration
 
-NEEDS_OPTION = jaxlib.version.__version_info__ < (0, 12)
+NEEDS_OPTION = version.__version_info__ < (0, 12)
 
 # Imports whatever a user may import before, computes, then configures again: too late.
 APPLICATION = """

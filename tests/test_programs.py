@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax import export
 from jax.experimental import serialize_executable
 from jax.experimental.compilation_cache import compilation_cache
 
@@ -63,8 +64,8 @@ def test_a_program_is_exported_and_serialised(uncached):
     expected = compiled(*ARGUMENTS)
     assert np.isfinite(expected).all()
 
-    exported = jax.export.export(jax.jit(states))(*ARGUMENTS)
-    there = jax.export.deserialize(exported.serialize())
+    exported = export.export(jax.jit(states))(*ARGUMENTS)
+    there = export.deserialize(exported.serialize())
     same_bits(there.call(*ARGUMENTS), expected)
 
     parts = serialize_executable.serialize(compiled)
