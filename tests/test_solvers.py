@@ -1,0 +1,55 @@
+"""One method, three solvers: those of single arms, of batches, and diffrax's own."""
+
+import diffrax
+import jax
+import numpy as np
+import pytest
+from elements import START, WITH_STATE, arm
+
+import fdof_jax as fj
+from fdof_jax.looped_dopri8 import LoopedDopri8
+from fdof_jax.unrolled_dopri8 import UnrolledDopri8
+
+# Elements written in scalars and in arrays, one with a state, one that jumps.
+FORCES = (
+    fj.JointDamper([0.3, 0.2, 0.1]),
+    WITH_STATE["lag"],
+    lambda t, q, qd, linkage: -0.1 * q,
+)
+TS = np.linspace(0, 0.3, 7)
+STEPS = dict(stepsize_controller=diffrax.ConstantStepSize(), dt0=0.01)
+
+
+@pytest.mark.slow
+def test_all_take_the_same_steps():
+    looped, unrolled, theirs = (
+        fj.simulate(arm("RPR"), START, TS, FORCES, solver=solver, **STEPS)
+        for solver in (LoopedDopri8(), UnrolledDopri8(), diffrax.Dopri8())
+    )
+    for motion in (looped, unrolled):
+        assert motion.stats["num_steps"] == theirs.stats["num_steps"]
+        np.testing.assert_allclose(motion.q, theirs.q, atol=1e-14)
+        np.testing.assert_allclose(motion.qd, theirs.qd, atol=1e-13)
+        jax.tree.map(
+            lambda a, b: np.testing.assert_allclose(a, b, atol=1e-13),
+            motion.own,
+            theirs.own,
+        )
+
+
+@pytest.mark.slow
+def test_a_batch_moves_as_its_members_across_jumps_and_saturation():
+    task = fj.JointMove(START.q, START.q + 0.3, fj.Travel(0.2, begin=0.05))
+    pd = fj.PDController(90.0, 8.0, [9.0, 4.0, 2.0], task)
+    forces = (pd, *FORCES[:2])
+    linkages = [arm(topology) for topology in ("RPR", "PRR")]
+    batch = jax.tree.map(lambda *leaves: np.stack(leaves), *linkages)
+    together = jax.vmap(lambda linkage: fj.simulate(linkage, START, TS, forces))(batch)
+    for row, linkage in enumerate(linkages):
+        alone = fj.simulate(linkage, START, TS, forces)
+        np.testing.assert_allclose(together.q[row], alone.q, atol=1e-9)
+        jax.tree.map(
+            lambda a, b: np.testing.assert_allclose(a[row], b, atol=1e-8),
+            together.own,
+            alone.own,
+        )
