@@ -8,6 +8,7 @@ them so before, or its result says that they are not.
 
 import contextlib
 from collections.abc import Iterator
+from typing import Any
 
 import equinox
 
@@ -19,7 +20,7 @@ def without_checks() -> Iterator[None]:
     Equinox has a switch for a whole process only, the environment variable
     EQX_ON_ERROR. Where a future version keeps it elsewhere, the checks stay in.
     """
-    errors = equinox._errors
+    errors: Any = equinox._errors
     before = getattr(errors, "EQX_ON_ERROR", None)
     if before is None:
         yield

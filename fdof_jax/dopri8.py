@@ -54,7 +54,7 @@ def interpolation_weights(theta: Array) -> Array:
     return weights
 
 
-def verdict(singular: Array, bad: Array, h: Array) -> tuple[Array, Any]:
+def verdict(singular: Array, bad: Array, h: Any) -> tuple[Array, Any]:
     """What a step in bad health is given for an error, and the step's result.
 
     Such a step is rejected until it is short. The result of a rejected one would not

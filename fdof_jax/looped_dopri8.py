@@ -86,7 +86,8 @@ def _step(term: Any, t0, t1, y0, lost, args, f0) -> tuple[_Step, Array]:
     health = inner.health(times[-1], *_constant((judged, args)))
     health = jnp.where(finite | (health == 0), health, jnp.nan)
     y = jtu.tree_map(lambda a: jnp.where(finite, a, jnp.nan), y)
-    return _Step(y, *_constant((error, lost)), rates, health), h
+    error, lost = _constant((error, lost))
+    return _Step(y, error, lost, rates, health), h
 
 
 class _Interpolation(diffrax.AbstractLocalInterpolation):

@@ -252,7 +252,7 @@ def _derivatives(
         lambda d: evaluated(_demanded_change)(c, delta, qd, qdd, turned, d)
     )(_unit_directions(delta[0].dtype))
     # No derivative goes through the solution of the equations.
-    by_state = tuple(
+    by_state: Any = tuple(
         -sum(column[row] * change for column, change in zip(inverse, demanded))
         for row in range(3)
     )

@@ -19,7 +19,7 @@ from jaxtyping import Float
 from .linkage import Linkage, real_joints, to_chain
 from .trigonometry import sincos
 
-Scalars = tuple[Array, Array, Array]
+Scalars = tuple[Array, ...]
 Vector = tuple[Array, Array]
 Directions = tuple[Vector, Vector, Vector]
 

@@ -217,7 +217,7 @@ def simulate(
 def _raising(solution: Solution, state0: State) -> Solution:
     """The solution of a traced call, which raises an error where it fails."""
     late = ~(jnp.diff(solution.ts) > 0)  # NaN included
-    unknown = ~jnp.isfinite(jnp.stack(tuple(state0)))
+    unknown = ~jnp.isfinite(jnp.stack(jax.tree.leaves(state0)))
     for failed, message in (
         (late, "ts: expected increasing times, got others."),
         (unknown, "state0: expected finite numbers, got others."),

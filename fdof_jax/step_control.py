@@ -173,7 +173,7 @@ def undifferentiated(controller: Any) -> Any:
     The motion does not depend on where its steps end, to their tolerance: derivatives
     of the steps are left out, which makes those of the motion cheaper.
     """
-    return _with_pid(_Undifferentiated, controller)
+    return _with_pid(_Undifferentiated, controller)  # pyright: ignore[reportArgumentType]
 
 
 def _constant(tree: Any) -> Any:
