@@ -52,37 +52,51 @@ def names(forces):
     ]
 
 
-def end(forces, factors, adjoint=diffrax.ForwardMode()):
+def end(linkage, forces, adjoint=diffrax.ForwardMode()):
     """Of a short motion in fixed steps, which makes differences exact."""
-    solution = fj.simulate(
-        ARM,
+    return fj.simulate(
+        linkage,
         elements.START,
         [0, 0.15],
-        scaled(forces, factors),
+        forces,
         solver=diffrax.Bosh3(),
         stepsize_controller=diffrax.ConstantStepSize(),
         dt0=5e-3,
         adjoint=adjoint,
     )
+
+
+def state_of(solution):
     return jnp.concatenate([solution.q[-1], solution.qd[-1]])
 
 
 @pytest.mark.parametrize(
-    "mode", ["forward", pytest.param("reverse", marks=pytest.mark.slow)]
+    ("kind", "mode"),
+    [
+        ("ALL", "forward"),  # at once: one program instead of three
+        *(
+            pytest.param(kind, "reverse", marks=pytest.mark.slow)
+            for kind in ("PLAIN", "WITH_STATE", "WITH_INERTIA")
+        ),
+    ],
 )
-@pytest.mark.parametrize("kind", ["PLAIN", "WITH_STATE", "WITH_INERTIA"])
 def test_gradients_in_all_parameters_equal_differences(kind, mode):
-    forces = tuple(getattr(elements, kind).values())
+    chosen = getattr(elements, kind)
+    if kind == "ALL":  # all together move more slowly
+        limited = fj.SpeedLimit(elements.PD, stall=[1.0, 3.0, 0.5], no_load=4.0)
+        chosen = chosen | {"speed limit": limited}
+    forces = tuple(chosen.values())
     ones = jnp.ones(len(names(forces)))
     if mode == "forward":
-        slope = jax.jit(jax.jacfwd(lambda p: end(forces, p)))(ones)
+        adjoint, derivative = diffrax.ForwardMode(), jax.jacfwd
     else:
-        adjoint = diffrax.RecursiveCheckpointAdjoint()
-        slope = jax.jit(jax.jacrev(lambda p: end(forces, p, adjoint)))(ones)
-    motion, h = jax.jit(lambda p: end(forces, p)), 1e-5
+        adjoint, derivative = diffrax.RecursiveCheckpointAdjoint(), jax.jacrev
+    motion = lambda p: state_of(end(ARM, scaled(forces, p), adjoint))
+    slope, h = jax.jit(derivative(motion))(ones), 1e-5
+    changed = eqx.filter_jit(lambda p: scaled(forces, p))
+    found = lambda p: np.asarray(state_of(end(ARM, changed(p))))
     columns = [
-        (motion(ones + h * e) - motion(ones - h * e)) / (2 * h)
-        for e in np.eye(len(ones))
+        (found(ones + h * e) - found(ones - h * e)) / (2 * h) for e in np.eye(len(ones))
     ]
     differences = np.stack(columns, axis=1)
     # All parameters are at work but those that a limit puts out of it.
@@ -97,26 +111,21 @@ def test_gradients_in_all_parameters_equal_differences(kind, mode):
 
 
 def test_one_program_for_all_topologies():
-    forces = tuple(elements.ALL.values())
+    place = list(elements.ALL).index("computed torque")
     arms = [elements.arm(topology) for topology in fj.TOPOLOGIES]
 
-    def end(linkage):
-        solution = fj.simulate(
-            linkage,
-            elements.START,
-            [0, 0.1],
-            forces,
-            solver=diffrax.Bosh3(),
-            stepsize_controller=diffrax.ConstantStepSize(),
-            dt0=5e-3,
-        )
+    def states(linkage):
+        # A model of another topology would be refused.
+        forces = tuple(elements.ALL.values())
+        forces = eqx.tree_at(lambda f: f[place].model, forces, linkage)
+        solution = end(linkage, forces)
         return solution.q[-1], solution.own
 
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *arms)
-    alone, together = jax.jit(end), jax.jit(jax.vmap(end))(stacked)
+    together = jax.jit(jax.vmap(states))(stacked)
     for member, linkage in enumerate(arms):
         row = jax.tree.map(lambda a, member=member: a[member], together)
-        for a, b in zip(jax.tree.leaves(row), jax.tree.leaves(alone(linkage))):
+        for a, b in zip(jax.tree.leaves(row), jax.tree.leaves(states(linkage))):
             np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9)
 
 

@@ -16,12 +16,18 @@ def losses_of(scene, gains):
     return np.array([np.sum(residuals_of(scene, row) ** 2) for row in gains])
 
 
+@eqx.filter_jit
+def judged(loss, scene, solution):
+    return loss(scene, solution)
+
+
 def residuals_of(scene, gains, loss=tip_errors):
     """By a plain simulation, whose program is the same for all."""
     trial = tuning.with_gains(scene, jnp.asarray(gains))
     ts = np.linspace(0, trial.t1, 1001)
     solution = fj.simulate(trial.linkage, trial.state0, ts, trial.forces)
-    return np.asarray(loss(trial, solution))
+    # The time is that of the solution.
+    return np.asarray(judged(loss, trial._replace(t1=0.0), solution))
 
 
 def gains_of(scene):
@@ -137,11 +143,12 @@ class TestTracking:
         relative = np.asarray(efforts) / np.asarray(scene.forces[0].limit)
         rates = np.diff(relative, axis=0) / 1e-3
         expected = (
-            np.sum(tip_errors(scene, solution) ** 2)
+            losses_of(scene, gains_of(scene)[None])[0]
             + 0.1 * np.mean(np.sum(relative**2, axis=1))
             + 1e-4 * np.mean(np.sum(rates**2, axis=1))
         )
-        residuals = fj.Tracking(effort=0.1, effort_rate=1e-4)(scene, solution)
+        loss = fj.Tracking(effort=0.1, effort_rate=1e-4)
+        residuals = residuals_of(scene, gains_of(scene), loss)
         assert float(residuals @ residuals) == pytest.approx(float(expected), rel=1e-10)
 
     def test_a_higher_price_buys_less_effort_in_one_program(self):
