@@ -78,7 +78,8 @@ def test_the_good_ones_do_not_fail():
     solution = traced(**GOOD)
     assert solution.outcome == "successful"
     exact = simulate(**GOOD)
-    np.testing.assert_array_equal(solution.q, exact.q)
+    # The plain call has a program of its own, which rounds differently.
+    np.testing.assert_allclose(solution.q, exact.q, rtol=0, atol=1e-11)
 
 
 INSIDE = {

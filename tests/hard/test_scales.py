@@ -64,4 +64,5 @@ def test_turns_do_not_matter(turns, joints):
     error = np.abs((far.q - offset[None]) - (plain.q - kept[None])).max(axis=0)
     assert (error <= np.maximum(1e-9, np.spacing(np.abs(offset)))).all()
     assert np.abs(far.qd - plain.qd).max() <= 1e-9 * np.abs(plain.qd).max()
-    assert abs(far.stats["num_steps"] - plain.stats["num_steps"]) <= 2
+    steps = int(plain.stats["num_steps"])
+    assert abs(int(far.stats["num_steps"]) - steps) <= 0.01 * steps
