@@ -4,12 +4,15 @@
 are `diffrax.Dopri8` to rounding.
 """
 
+from abc import abstractmethod
 from collections.abc import Callable
 from typing import Any
 
 import diffrax
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+import jax.tree_util as jtu
 import numpy as np
 from jax import Array
 from jaxtyping import PyTree
@@ -52,6 +55,36 @@ def interpolation_weights(theta: Array) -> Array:
     for coefficients in DENSE.T:  # Horner's rule for all stages at once
         weights = (weights + coefficients) * theta
     return weights
+
+
+class DenseOutput(diffrax.AbstractLocalInterpolation):
+    """diffrax's dense output for this method; a subclass adds up the rates."""
+
+    t0: Any  # pyright: ignore[reportIncompatibleVariableOverride]
+    t1: Any  # pyright: ignore[reportIncompatibleVariableOverride]
+    y0: PyTree
+    step: Array
+    rates: Any
+
+    @abstractmethod
+    def at(self, theta: Array) -> PyTree:
+        """The state at a share `theta` of the step."""
+
+    def evaluate(self, t0, t1=None, left=True):
+        del left
+        if t1 is not None:
+            end, start = self.evaluate(t1), self.evaluate(t0)
+            return jtu.tree_map(lambda a, b: a - b, end, start)
+        length = self.t1 - self.t0
+        safe = jnp.where(length == 0, 1, length)
+        return self.at(jnp.where(length == 0, 0, (t0 - self.t0) / safe))
+
+
+def constant(tree: PyTree) -> PyTree:
+    """The tree, whose arrays derivatives take for constants."""
+    return jtu.tree_map(
+        lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, tree
+    )
 
 
 def verdict(singular: Array, bad: Array, h: Any) -> tuple[Array, Any]:

@@ -184,8 +184,8 @@ def _integrate(
 def _integrate_reversibly(inputs, solver, keywords) -> Solution:
     """A motion whose derivatives are taken in reverse mode, if any are.
 
-    The default solver's unrolled stages are not for that: they would compile for
-    minutes.
+    The default solver's unrolled stages are not for that: they are compiled differently
+    with derivatives and without, and a replay has to come to the same bits.
     """
     # Nothing is differentiated here, and loops made for that take longer to compile.
     keywords = keywords | {"adjoint": diffrax.ForwardMode()}
@@ -264,7 +264,6 @@ def solve_one(solver, inputs, keywords) -> tuple[Solution, bool] | None:
     solution, succeeded = _solve_padded(
         solver, (linkage, state0, filled, own0, forces), keywords
     )
-
     if is_traced(solution):
         return None
 

@@ -178,10 +178,9 @@ def simulate(
         _check_own("own0", own0, forces, linkage, ())
     inputs = linkage, state0, ts, own0, forces
     try:
+        one = None
         # Within `jax.jit` even a constant is traced.
-        if is_traced(inputs, solver, keywords, jax.device_put(np.zeros(()))):
-            one = None
-        else:
+        if not is_traced(inputs, solver, keywords, jax.device_put(np.zeros(()))):
             one = solve_one(solver, inputs, keywords)
         if one is None:
             solution = solve(solver, inputs, keywords)

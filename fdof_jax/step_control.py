@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from .dopri8 import verdict
+from .dopri8 import constant, verdict
 from .linkage import Linkage, State, check_linkage, real_joints
 from .validation import concrete, instance, is_traced, real_array
 
@@ -176,26 +176,20 @@ def undifferentiated(controller: Any) -> Any:
     return _with_pid(_Undifferentiated, controller)  # pyright: ignore[reportArgumentType]
 
 
-def _constant(tree: Any) -> Any:
-    return jax.tree.map(
-        lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, tree
-    )
-
-
 class _Undifferentiated(_Adaptive):
     controller: Any
 
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
-        return _constant(
+        return constant(
             self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
         )
 
     def adapt_step_size(  # pyright: ignore[reportIncompatibleMethodOverride]
         self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state
     ):
-        inputs = _constant((t0, t1, y0, y1_candidate, args, y_error))
+        inputs = constant((t0, t1, y0, y1_candidate, args, y_error))
         step = self.controller.adapt_step_size(*inputs, error_order, controller_state)
-        return _constant(step)
+        return constant(step)
 
 
 class Watched(_Adaptive):
@@ -218,7 +212,7 @@ class Watched(_Adaptive):
         finite = jnp.isfinite(sum(map(jnp.sum, leaves)))
         # Where a step led nowhere its start tells why.
         judged = jax.tree.map(lambda a, b: jnp.where(finite, a, b), y1_candidate, y0)
-        health = self.health(*_constant((t1, judged, args)))
+        health = self.health(*constant((t1, judged, args)))
         bad = ~finite | (health == 0)
         imposed, failure = verdict(health == 0, bad, t1 - t0)
         y_error = jax.tree.map(lambda e: jnp.where(bad, imposed, e), y_error)

@@ -25,7 +25,9 @@ from .dopri8 import (
     LOWER,
     NODES,
     TABLEAU,
+    DenseOutput,
     ScheduledTerm,
+    constant,
     interpolation_weights,
     verdict,
 )
@@ -202,24 +204,8 @@ def _interpolate(y0: State, h: Array, rates: Rates | Array, theta: Array) -> Sta
     return _sum(y0, _scaled(h, rate))
 
 
-class _Interpolation(diffrax.AbstractLocalInterpolation):
-    """diffrax's dense output for this method."""
-
-    t0: Any  # pyright: ignore[reportIncompatibleVariableOverride]
-    t1: Any  # pyright: ignore[reportIncompatibleVariableOverride]
-    y0: State
-    step: Array
-    rates: Any
-
-    def evaluate(self, t0, t1=None, left=True):
-        del left
-        if t1 is not None:
-            end, start = self.evaluate(t1), self.evaluate(t0)
-            return jtu.tree_map(lambda a, b: a - b, end, start)
-        length = self.t1 - self.t0
-        theta = jnp.where(
-            length == 0, 0, (t0 - self.t0) / jnp.where(length == 0, 1, length)
-        )
+class _Interpolation(DenseOutput):
+    def at(self, theta):
         return _interpolate(self.y0, self.step, self.rates, theta)
 
 
@@ -247,9 +233,7 @@ class UnrolledDopri8(diffrax.AbstractAdaptiveSolver):
         Derivatives do not use these rates: see `_stages_jvp`.
         """
         term, t = terms.term, t0 * terms.direction
-        t, y0, args = jtu.tree_map(
-            lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, (t, y0, args)
-        )
+        t, y0, args = constant((t, y0, args))
         return term.watched_field(t, y0, args, term.schedule(t, args))
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
