@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float
 
 from .added_inertia import added_inertia
 from .array_namespace import in_numpy
+from .callbacks import with_checks
 from .control import Reference, checked_reference, positions_at, reference_motion
 from .forces import Forces
 from .linkage import Linkage
@@ -59,6 +60,7 @@ class PrescribedMotion(eqx.Module):
         self.moved = jax.device_put(np.isin([1, 2, 3], numbers))
         self.reference = checked_reference(reference)
 
+    @with_checks
     def at(self, t: Array, linkage: Linkage) -> tuple[Array, Array]:
         """Positions and velocities of the reference at a time, checked."""
         return reference_motion(self.reference, t, linkage)

@@ -9,6 +9,7 @@ import numpy as np
 from jax import Array
 
 from .added_inertia import added_inertia, inertial
+from .callbacks import with_checks
 from .forces import Forces, ScalarElement, StatefulElement
 from .linkage import Linkage
 from .rates import Added, conditioning, rates, rates_and_conditioning
@@ -26,6 +27,7 @@ class Args(NamedTuple):
     forces: Forces
 
 
+@with_checks
 def schedule_of(t: Array, args: Args) -> tuple[Any, ...]:
     """What the force elements take from time alone, or the time."""
     return tuple(
@@ -67,6 +69,7 @@ class Applied(NamedTuple):
     added: Added | None
 
 
+@with_checks
 def applied(t: Any, y: Any, args: Args, schedule: tuple[Any, ...]) -> Applied:
     """Arrays are made only for elements that are written in them."""
     delta, qd, *own = y

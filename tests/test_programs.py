@@ -107,6 +107,26 @@ def test_failures_under_jit_name_the_argument(q0, ts, words):
         raising()(jnp.asarray(q0, float), jnp.asarray(ts, float)).block_until_ready()
 
 
+class Fragile(eqx.Module):
+    """A user's own element, with a check that its values are asked for at run time."""
+
+    strength: jax.Array
+
+    def __call__(self, t, q, qd, linkage):
+        tau = -self.strength * qd
+        return eqx.error_if(tau, abs(qd[0]) > 1e-3, "it broke")
+
+
+def broken(strength):
+    return fj.simulate(ARM, START, TS, (Fragile(strength),)).q
+
+
+@pytest.mark.parametrize("call", [broken, jax.jit(broken)], ids=["plain", "jit"])
+def test_run_time_checks_of_an_own_element_stay(call):
+    with pytest.raises(Exception, match="it broke"):
+        jax.block_until_ready(call(jnp.array(1.0)))
+
+
 # New numbers, no new program
 
 
