@@ -6,8 +6,6 @@ among those of the caller.
 
 import dataclasses
 import importlib
-import os
-import pkgutil
 import struct
 import types
 from collections.abc import Callable, Sequence
@@ -19,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from . import _MODULE_OF
 from .validation import is_traced
 
 _RESULT: Any = diffrax.RESULTS.successful
@@ -31,34 +30,41 @@ class Unreadable(Exception):
 
 # Names of classes and functions
 
-# Modules that files written by version 0.1 know by an earlier name.
-_RENAMED = {"optimal_efforts": "optimal_motion", "sweep": "batched"}
+# Classes of the library that saved trees hold and that the top does not name.
+_WITHIN = {
+    "CircleRun": "showcase",
+    "DriveState": "drives",
+    "History": "tune_result",
+    "Separation": "points",
+    "_Knots": "optimal_motion",
+}
 
 
 def _name(thing: Any) -> str:
+    """The name that a file holds: a public one, whatever module defines the thing."""
+    name = thing.__qualname__
     # The module in which diffrax keeps an enumeration may change.
-    if getattr(diffrax, thing.__qualname__, None) is thing:
-        return f"diffrax:{thing.__qualname__}"
-    return f"{thing.__module__}:{thing.__qualname__}"
+    for package, found in (
+        ("diffrax", getattr(diffrax, name, None)),
+        (__package__, _of_the_library(name)),
+    ):
+        if found is thing:
+            return f"{package}:{name}"
+    return f"{thing.__module__}:{name}"
 
 
 def _of_the_library(name: str) -> Any:
     """The class or function of the library with this name, or None."""
-    module, _, qualname = name.partition(":")
-    package, _, submodule = module.partition(".")
-    submodule = _RENAMED.get(submodule, submodule)
-    # Only what is a file of the library is imported, whatever the name says.
-    if package != __package__ or submodule not in _submodules():
+    module = (_MODULE_OF | _WITHIN).get(name)
+    if module is None:
         return None
-    module = f"{package}.{submodule}"
-    found = vars(importlib.import_module(module)).get(qualname)
-    plain = isinstance(found, type | types.FunctionType)
-    return found if plain and _name(found) == f"{module}:{qualname}" else None
+    found = vars(importlib.import_module(f".{module}", __package__)).get(name)
+    return found if isinstance(found, type | types.FunctionType) else None
 
 
-def _submodules() -> set[str]:
-    folder = os.path.dirname(__file__)
-    return {module.name for module in pkgutil.iter_modules([folder])}
+def _is_ours(module: str) -> bool:
+    """Whether a file means the library: version 0.1 wrote the module of each class."""
+    return module.partition(".")[0] == __package__
 
 
 def _class(name: str, classes: Sequence[type]) -> Any:
@@ -68,8 +74,7 @@ def _class(name: str, classes: Sequence[type]) -> Any:
         found = vars(diffrax).get(qualname)
         if isinstance(found, _EnumerationMeta):
             return found
-    found = _of_the_library(name)
-    if isinstance(found, type):
+    if _is_ours(module) and isinstance(found := _of_the_library(qualname), type):
         return found
     same = [c for c in classes if _name(c) == name]
     # A class is elsewhere when the script that defines it is imported.
@@ -133,13 +138,14 @@ def described(place: str, value: Any, arrays: list[np.ndarray]) -> Any:
             "value": _described_array(place, value._value, arrays),
         }
     if isinstance(value, types.FunctionType):
-        if _of_the_library(_name(value)) is value:
+        if _of_the_library(value.__qualname__) is value:
             return {"kind": "function", "name": _name(value)}
         raise ValueError(
             f"{place}: expected an equinox.Module with a __call__, which can be saved "
             f"in place of a function of one's own, got {value!r}."
         )
-    if (names := _fields(kind)) is not None:
+    unnamed = _is_ours(kind.__module__) and _of_the_library(kind.__qualname__) != kind
+    if not unnamed and (names := _fields(kind)) is not None:
         fields = {}
         for name in names:
             if not hasattr(value, name):
@@ -202,7 +208,8 @@ class Restorer:
         if kind == "dict":
             return {key: self.tree(item) for key, item in node["items"].items()}
         if kind == "function":
-            found = _of_the_library(node["name"])
+            module, _, qualname = node["name"].partition(":")
+            found = _of_the_library(qualname) if _is_ours(module) else None
             if not isinstance(found, types.FunctionType):
                 raise Unreadable(
                     f"expected a function of the library, got {node['name']}"
