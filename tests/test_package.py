@@ -1,6 +1,8 @@
 """The package as users import it: every name is there, and costs nothing until used."""
 
 import importlib
+import inspect
+import json
 import pickle
 import subprocess
 import sys
@@ -28,6 +30,32 @@ def test_names():
         getattr(fj, "simulat")  # noqa: B009
     with pytest.raises(ImportError, match="cannot import name 'simulat'"):
         from fdof_jax import simulat  # noqa: F401
+
+
+OF_0_1 = json.loads((Path(__file__).parent / "names_of_0.1.json").read_text())
+
+
+@pytest.mark.parametrize("name", OF_0_1)
+def test_what_calls_version_0_1_calls_this_one(name):
+    """The same names, and arguments in the same places; what is new is optional."""
+    *module, name_there = name.split(".")
+    found = getattr(
+        importlib.import_module(".".join(["fdof_jax", *module])), name_there
+    )
+    if OF_0_1[name] is None:
+        return
+    before = [word for word in OF_0_1[name].split(", ") if word not in ("", "*")]
+    keyword_only = OF_0_1[name].partition("*, ")[2].split(", ")
+    now = inspect.signature(found).parameters
+    for place, word in enumerate(before):
+        parameter = now[word.strip("*=")]
+        if word.endswith("="):
+            assert parameter.default is not inspect.Parameter.empty, word
+        if word not in keyword_only and not word.startswith("**"):
+            assert list(now).index(parameter.name) == place
+            assert parameter.kind is inspect.Parameter.POSITIONAL_OR_KEYWORD, word
+    for parameter in list(now.values())[len(before) :]:
+        assert parameter.default is not inspect.Parameter.empty, parameter
 
 
 def test_no_name_is_hidden_by_a_module():
