@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import fdof_jax as fj
-from fdof_jax.rates import rates
-from fdof_jax.reduced_equations import link_constants, zeros
+from fdof_jax.mechanics.equations import link_constants, zeros
+from fdof_jax.mechanics.rates import rates
 
 from . import problems
 from .contestants import Contestant, Motion, cases, masked_form, reduced_form

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from . import __version__
-from .tuning_run import METHODS, Job
+from .shell.tuning_run import METHODS, Job
 
 _OF_JOB = tuple(field.name for field in dataclasses.fields(Job))
 _OF_ENSEMBLE = "members", "payload", "start_offset", "speed", "link_error"
@@ -31,7 +31,7 @@ def main(arguments: list[str] | None = None) -> None:
     if options.command == "tune" and options.save is not None:
         _check_folder(parser, "--save", options.save.parent)
 
-    from . import commands
+    from .shell import commands
 
     commands.set_up()
     if options.command == "league":

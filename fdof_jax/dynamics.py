@@ -4,12 +4,12 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
-from .added_inertia import added_energy, added_inertia, energetic, inertial
-from .forces import Forces
-from .kinematics import mass_center_velocities, mass_centers
-from .linkage import Linkage, compiled
-from .rates import inertia_diagonals, rates, times
-from .reduced_equations import equations, link_constants, zeros
+from .forces.added_inertia import added_energy, added_inertia, energetic, inertial
+from .forces.element import Forces
+from .linkage.linkage import Linkage, compiled
+from .mechanics.equations import equations, link_constants, zeros
+from .mechanics.kinematics import mass_center_velocities, mass_centers
+from .mechanics.rates import inertia_diagonals, rates, times
 
 
 @compiled(q=(3,), qd=(3,), tau=(3,), forces=inertial)

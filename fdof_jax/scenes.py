@@ -1,31 +1,11 @@
 """The paper's three examples as data. Each value's source is the figure's own list."""
 
-from typing import NamedTuple
-
 import numpy as np
-from jax import Array
 
-from .control import CircleTask, PDController
-from .forces import Forces, JointDamper
-from .linkage import Linkage, State, from_chain
-
-
-class Scene(NamedTuple):
-    """A linkage, where it starts, what acts on it and for how long.
-
-    - `linkage`, `state0`, `forces`: the arguments of `simulate`.
-    - `t1`: end time, the start being 0 [s].
-
-    >>> import fdof_jax as fj
-    >>> scene = fj.scenes.fig7()
-    >>> scene.t1, type(scene.forces[0]).__name__
-    (10.0, 'PDController')
-    """
-
-    linkage: Linkage
-    state0: State
-    forces: Forces
-    t1: float | Array
+from .control.pd import CircleTask, PDController
+from .forces.joints import JointDamper
+from .linkage.linkage import Linkage, State, from_chain
+from .simulation.scene import Scene as Scene
 
 
 def fig3() -> Scene:

@@ -6,7 +6,7 @@ import pytest
 import sweep_batch
 
 import fdof_jax as fj
-from fdof_jax.tune_result import History
+from fdof_jax.tuning.result import History
 
 # As an application sets JAX up: the laws hold for what users run.
 fj.configure(x64=True)
@@ -15,10 +15,10 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 HARD = Path(__file__).parent / "hard"
 # Doctests that compile searches.
 SEARCHES = {
-    "fdof_jax.identification.fit_each",
-    "fdof_jax.league.league_table",
-    "fdof_jax.optimal_motion.optimal_efforts",
-    "fdof_jax.tuning.tune_each",
+    "fdof_jax.identification.fit.fit_each",
+    "fdof_jax.tuning.league.league_table",
+    "fdof_jax.tuning.optimal_motion.optimal_efforts",
+    "fdof_jax.tuning.tune.tune_each",
 }
 # Scripts that need more than the tests do.
 collect_ignore_glob = ["hard/make_*.py"]

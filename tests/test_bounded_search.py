@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 
-from fdof_jax import bounded_search
+from fdof_jax.search import bounded
 
 
 def test_box_minimum_is_that_of_scipy():
@@ -21,14 +21,14 @@ def test_box_minimum_is_that_of_scipy():
         def model(u, slope=slope, scale=scale, matrix=matrix):
             return slope @ (scale * u) + u * scale @ matrix @ (scale * u) / 2
 
-        found = bounded_search.box_minimum(matrix, slope, low, high)
+        found = bounded.box_minimum(matrix, slope, low, high)
         assert (found >= low).all() and (found <= high).all()
         bounds = list(zip(low / scale, high / scale))
         best = scipy.optimize.minimize(model, np.zeros(3), bounds=bounds, tol=1e-14)
         assert model(found / scale) <= best.fun + 1e-9 * abs(best.fun)
 
 
-@pytest.mark.parametrize("method", bounded_search.METHODS)
+@pytest.mark.parametrize("method", bounded.METHODS)
 def test_minimise_finds_what_scipy_finds_within_bounds(method):
     """Rosenbrock's function and an exponential fit, in boxes that cut them off."""
     t = np.linspace(0, 1, 12)
@@ -55,7 +55,7 @@ def test_minimise_finds_what_scipy_finds_within_bounds(method):
         for point, run in zip(z, runs):
             residual, jacobian = (f(point) for f in problems[run % 2])
             found.append(
-                bounded_search.Evaluation(
+                bounded.Evaluation(
                     np.sum(residual**2), 2 * jacobian.T @ residual,
                     2 * jacobian.T @ jacobian, {},
                 )
@@ -63,7 +63,7 @@ def test_minimise_finds_what_scipy_finds_within_bounds(method):
         return jax.tree.map(lambda *rows: np.stack(rows), *found)
 
     steps = 3000 if method == "adam" else 200
-    runs = bounded_search.minimise(
+    runs = bounded.minimise(
         evaluate, starts, low, high, method=method, max_steps=steps, enough=1e-12,
         report=lambda number, runs: None,
     )  # fmt: skip
@@ -84,12 +84,12 @@ def test_minimise_finds_what_scipy_finds_within_bounds(method):
 def test_one_failing_start_does_not_spoil_the_others():
     def evaluate(z, runs):
         loss = np.where(runs == 1, np.nan, np.sum(z**2, axis=1))
-        return bounded_search.Evaluation(
+        return bounded.Evaluation(
             loss, 2 * z, np.broadcast_to(2 * np.eye(2), (len(z), 2, 2)), {}
         )
 
     box = np.ones((3, 2))
-    runs = bounded_search.minimise(
+    runs = bounded.minimise(
         evaluate, box.copy(), -9 * box, 9 * box, method="levenberg-marquardt",
         max_steps=20, enough=1e-6, report=lambda number, runs: None,
     )  # fmt: skip
@@ -104,9 +104,9 @@ def test_a_start_held_by_all_bounds_has_converged_and_a_flat_one_has_not():
         # Downwards beyond both bounds; flat in the second run.
         slopes = np.where(runs[:, None] == 0, -1.0, 0.0) * np.ones(2)
         loss = 5 + np.sum(slopes * z, axis=1)
-        return bounded_search.Evaluation(loss, slopes, np.stack([np.eye(2)] * 2), {})
+        return bounded.Evaluation(loss, slopes, np.stack([np.eye(2)] * 2), {})
 
-    corner, flat = bounded_search.minimise(
+    corner, flat = bounded.minimise(
         evaluate, starts, np.zeros((2, 2)), np.ones((2, 2)),
         method="levenberg-marquardt", max_steps=3, enough=1e-4,
         report=lambda number, runs: None,

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 import fdof_jax as fj
-from fdof_jax import bounded_search, showcase
 from fdof_jax.__main__ import main
-from fdof_jax.tuning_run import METHODS
+from fdof_jax.search import bounded
+from fdof_jax.shell import showcase
+from fdof_jax.shell.tuning_run import METHODS
 
 
 def pictures(folder):
@@ -192,7 +193,7 @@ def test_refusals_that_need_jax(options, message, tmp_path, capsys, monkeypatch)
 
 
 def test_methods_have_their_names():
-    assert METHODS == tuple(bounded_search.METHODS)
+    assert METHODS == tuple(bounded.METHODS)
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ from jax.experimental.compilation_cache import compilation_cache
 from jaxlib import version
 
 import fdof_jax as fj
-from fdof_jax import configuration
+from fdof_jax.xla import configuration
 
 NEEDS_OPTION = version.__version_info__ < (0, 12)
 

@@ -10,9 +10,10 @@ from elements import Hold
 from jax.extend.core import jaxprs_in_params
 
 import fdof_jax as fj
-from fdof_jax import scenes, vector_field
-from fdof_jax.rates import rates
-from fdof_jax.reduced_equations import link_constants, zeros
+from fdof_jax import scenes
+from fdof_jax.mechanics.equations import link_constants, zeros
+from fdof_jax.mechanics.rates import rates
+from fdof_jax.simulation.field import Args, schedule_of, vector_field
 
 
 def cost(kind, function, *arguments):
@@ -28,12 +29,12 @@ transcendentals = functools.partial(cost, "transcendentals")
 def field_arguments(forces):
     linkage = scenes.fig7().linkage
     q = jnp.array([0.3, 2.0, -0.4])
-    args = vector_field.Args(linkage, q, link_constants(linkage, q), forces)
+    args = Args(linkage, q, link_constants(linkage, q), forces)
     return jnp.array(0.1), (zeros(q), tuple(q)), args
 
 
 def field(t, y, args):
-    return vector_field.vector_field(t, y, args, vector_field.schedule_of(t, args))
+    return vector_field(t, y, args, schedule_of(t, args))
 
 
 def field_flops(*forces):

@@ -71,7 +71,7 @@ NAMES = [
     *(f"scenes.{name}" for name in ("fig3", "fig5", "fig7")),
     "interactive.sliders",
     *(
-        f"{module.__name__.split('.')[1]}.{name}"
+        f"{module.__name__.split('.')[-1]}.{name}"
         for module in (drawing, plotting)
         for name, value in inspect.getmembers(module, inspect.isfunction)
         if value.__module__ == module.__name__
@@ -99,7 +99,7 @@ RETURNED_BY = {
 
 def examples():
     """All code that tests run as examples: doctests, and the blocks of the guides."""
-    sources = (ROOT / "fdof_jax").glob("*.py")
+    sources = (ROOT / "fdof_jax").rglob("*.py")
     lines = [
         re.findall(r"^ *(?:>>>|\.\.\.) (.*)", p.read_text(), re.M) for p in sources
     ]

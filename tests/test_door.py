@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 import fdof_jax as fj
-from fdof_jax.control import known_assembly
-from fdof_jax.simulation import check_elements
+from fdof_jax.control.pd import known_assembly
+from fdof_jax.control.timing import PROFILES
+from fdof_jax.simulation.simulate import check_elements
 
 ARM = dict(
     length=[0, 1, 1, 0.3], com=[[0.5, 0]] * 3, mass=[1] * 3, inertia=[0.1] * 3
@@ -33,7 +34,7 @@ def references():
     }
     timings = {
         profile: fj.Travel(2.0, begin=0.5, profile=profile, shock=0.2)
-        for profile in fj.travel.PROFILES
+        for profile in PROFILES
     }
     timings["laps"] = fj.Laps(2.0, phase=0.1)
     return {

@@ -9,7 +9,7 @@ from elements import Hold
 from scipy.linalg import expm
 
 import fdof_jax as fj
-from fdof_jax.looped_dopri8 import LoopedDopri8
+from fdof_jax.simulation.looped_dopri8 import LoopedDopri8
 
 # Joints that feel nothing of each other: slides at right angles carry point masses.
 STILL = fj.State(np.zeros(3), np.zeros(3))

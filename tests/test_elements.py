@@ -10,9 +10,9 @@ import pytest
 from test_costs import flops
 
 import fdof_jax as fj
-from fdof_jax import vector_field
-from fdof_jax.added_inertia import added_inertia
-from fdof_jax.reduced_equations import link_constants, zeros
+from fdof_jax.forces.added_inertia import added_inertia
+from fdof_jax.mechanics.equations import link_constants, zeros
+from fdof_jax.simulation.field import Args, initial_own, schedule_of, vector_field
 
 ARM = elements.arm("RPR")
 
@@ -157,13 +157,13 @@ def test_negative_values_that_no_constructor_saw_are_told(name):
 
 
 def field(t, y, args):
-    return vector_field.vector_field(t, y, args, vector_field.schedule_of(t, args))
+    return vector_field(t, y, args, schedule_of(t, args))
 
 
 def field_flops(*forces):
     q, t = elements.START.q, jnp.array(0.1)
-    args = vector_field.Args(ARM, q, link_constants(ARM, q), forces)
-    y = zeros(q), tuple(elements.START.qd), *vector_field.initial_own(args)
+    args = Args(ARM, q, link_constants(ARM, q), forces)
+    y = zeros(q), tuple(elements.START.qd), *initial_own(args)
     return flops(field, t, y, args)
 
 

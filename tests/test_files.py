@@ -32,8 +32,10 @@ from saved_trees import (
 )
 
 import fdof_jax as fj
-from fdof_jax import integration, scenes, tuning
-from fdof_jax.looped_dopri8 import LoopedDopri8
+from fdof_jax import scenes
+from fdof_jax.simulation import integrate
+from fdof_jax.simulation.looped_dopri8 import LoopedDopri8
+from fdof_jax.tuning import tune as tuning
 
 TS = np.linspace(0, 0.1, 4)
 
@@ -120,13 +122,13 @@ def test_a_loaded_scene_simulates_the_same_without_a_compilation(
     path, solved, monkeypatch
 ):
     calls = []
-    original = integration.vector_field
+    original = integrate.vector_field
 
     def counted(*arguments):
         calls.append(1)
         return original(*arguments)
 
-    monkeypatch.setattr(integration, "vector_field", counted)
+    monkeypatch.setattr(integrate, "vector_field", counted)
     call, solution = solved
     loaded = saved_and_loaded(path, call, OWN)
     same(fj.simulate(*loaded), solution)
@@ -253,16 +255,16 @@ import sys
 import jax
 jax.config.update("jax_enable_x64", True)
 import fdof_jax as fj
-assert "fdof_jax.showcase" not in sys.modules
+assert "fdof_jax.shell.showcase" not in sys.modules
 run, scene = fj.load(sys.argv[1])
 fj.save(sys.argv[2], (run, scene))
-assert type(run).__module__ == "fdof_jax.showcase"
+assert type(run).__module__ == "fdof_jax.shell.showcase"
 """
 
 
 def test_another_process_reads_it(path, tmp_path):
     """And imports modules of the library's that are not there yet."""
-    from fdof_jax.showcase import CircleRun
+    from fdof_jax.shell.showcase import CircleRun
 
     run = CircleRun(*range(len(CircleRun._fields)))
     fj.save(path, (run, SCENES["fig7"]))

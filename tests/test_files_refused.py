@@ -29,8 +29,8 @@ from saved_trees import (
 )
 
 import fdof_jax as fj
-from fdof_jax.looped_dopri8 import LoopedDopri8
-from fdof_jax.travel import PROFILES
+from fdof_jax.control.timing import PROFILES
+from fdof_jax.simulation.looped_dopri8 import LoopedDopri8
 
 
 @pytest.fixture

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 import fdof_jax as fj
-from fdof_jax import fit_result, lanes
+from fdof_jax.identification import result as fit_result
+from fdof_jax.search import lanes
 
 TS = np.linspace(0, 2, 201)
 LENGTH, MASS = np.array([0, 1, 0.8, 0.6]), np.array([3.0, 2.0, 1.0])

@@ -7,11 +7,12 @@ from io import BytesIO
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from fdof_jax.interactive import sliders
 
 import fdof_jax as fj
-from fdof_jax import integration, scenes
-from fdof_jax.interactive import sliders
-from fdof_jax.tuning import with_gains
+from fdof_jax import scenes
+from fdof_jax.simulation import integrate
+from fdof_jax.tuning.tune import with_gains
 
 CIRCLES = fj.circle_scenes()
 CONTROLLER = CIRCLES["RRR"].forces[0]
@@ -76,7 +77,7 @@ def test_the_error_is_that_of_a_simulation(box):
 
 
 def test_nothing_is_compiled_after_the_first_picture(box, monkeypatch):
-    monkeypatch.setattr(integration, "vector_field", None)  # no second trace
+    monkeypatch.setattr(integrate, "vector_field", None)  # no second trace
     shown = {name: box.move(arm=name, A2=1.1).tobytes() for name in fj.TOPOLOGIES}
     assert len(set(shown.values())) == 7
 

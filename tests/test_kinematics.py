@@ -9,7 +9,11 @@ import pytest
 from helpers import random_linkage
 
 import fdof_jax as fj
-from fdof_jax.kinematics import mass_center_velocities, plane_angle, solve_joints
+from fdof_jax.mechanics.kinematics import (
+    mass_center_velocities,
+    plane_angle,
+    solve_joints,
+)
 
 SAMPLES = 12
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import fdof_jax as fj
-from fdof_jax import integration
-from fdof_jax.looped_dopri8 import LoopedDopri8
+from fdof_jax.simulation import integrate
+from fdof_jax.simulation.looped_dopri8 import LoopedDopri8
 
 TS = np.linspace(0, 0.5, 6)
 # A common start and links for which all topologies reach a small circle.
@@ -94,13 +94,13 @@ def test_one_trace_and_batch_equals_singles(kind):
 def test_one_trace_of_the_plain_call(kind, monkeypatch):
     """Called as a user does, without jit of their own, at adaptive steps."""
     calls = []
-    original = integration.vector_field
+    original = integrate.vector_field
 
     def counted(*arguments):
         calls.append(1)
         return original(*arguments)
 
-    monkeypatch.setattr(integration, "vector_field", counted)
+    monkeypatch.setattr(integrate, "vector_field", counted)
     traced = []
     for linkage, state, forces in members(kind):
         # More output times than any other test has: the first call compiles.

@@ -8,7 +8,7 @@ import pytest
 from helpers import random_linkage
 
 import fdof_jax as fj
-from fdof_jax.points import frames_of
+from fdof_jax.forces.points import frames_of
 
 GROUND, TIP = fj.Point(0, 0.3, -0.8), fj.Point(3, 0.5, 0.2)
 SPRING = fj.SpringDamper(GROUND, TIP, stiffness=30.0, damping=2.0, rest_length=0.4)

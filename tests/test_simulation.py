@@ -9,7 +9,7 @@ from helpers import SCENES, load
 
 import fdof_jax as fj
 from fdof_jax import scenes
-from fdof_jax.trigonometry import sincos
+from fdof_jax.xla.trigonometry import sincos
 
 
 def absolute_angles(linkage, solution):

@@ -7,8 +7,8 @@ import pytest
 from elements import START, WITH_STATE, arm
 
 import fdof_jax as fj
-from fdof_jax.looped_dopri8 import LoopedDopri8
-from fdof_jax.unrolled_dopri8 import UnrolledDopri8
+from fdof_jax.simulation.looped_dopri8 import LoopedDopri8
+from fdof_jax.simulation.unrolled_dopri8 import UnrolledDopri8
 
 # Elements written in scalars and in arrays, one with a state, one that jumps.
 FORCES = (

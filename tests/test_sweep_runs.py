@@ -13,8 +13,8 @@ import pytest
 from sweep_batch import CHUNK, run
 
 import fdof_jax as fj
-from fdof_jax import batched, integration
-from fdof_jax.validation import is_traced
+from fdof_jax.checks import is_traced
+from fdof_jax.simulation import integrate, sweep as batched
 
 # Checkpoints
 
@@ -107,7 +107,7 @@ if int(processes) > 1:
 import numpy as np
 import sweep_batch
 assert jax.device_count() == int(devices)
-from fdof_jax.looped_dopri8 import LoopedDopri8
+from fdof_jax.simulation.looped_dopri8 import LoopedDopri8
 # As exact as the default, and compiled sooner.
 members = sweep_batch.members()
 solution = sweep_batch.run(members, chunk=4, solver=LoopedDopri8())
@@ -162,13 +162,13 @@ def test_more_devices_and_processes_change_nothing(processes, devices, clean, tm
 
 def test_other_values_need_no_new_trace(batch, clean, monkeypatch):
     calls = []
-    original = integration.vector_field
+    original = integrate.vector_field
 
     def counted(*arguments):
         calls.append(1)
         return original(*arguments)
 
-    monkeypatch.setattr(integration, "vector_field", counted)
+    monkeypatch.setattr(integrate, "vector_field", counted)
     linkage, (q, qd), forces = batch
     other = run((linkage, fj.State(q + 0.1, qd), forces))
     assert not calls

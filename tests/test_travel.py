@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import fdof_jax as fj
-from fdof_jax.travel import PROFILES
+from fdof_jax.control.timing import PROFILES
 
 TIMES = np.linspace(0, 2, 201)
 

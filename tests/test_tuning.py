@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 
 import fdof_jax as fj
-from fdof_jax import lanes, scenes, tuning
-from fdof_jax.losses import controller_of, tip_errors
+from fdof_jax import scenes
+from fdof_jax.search import lanes
+from fdof_jax.tuning import tune as tuning
+from fdof_jax.tuning.losses import controller_of, tip_errors
 
 
 def losses_of(scene, gains):

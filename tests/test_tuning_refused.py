@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 import fdof_jax as fj
-from fdof_jax import losses, scenes
+from fdof_jax import scenes
+from fdof_jax.tuning import losses
 
 
 @pytest.mark.parametrize(

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import fdof_jax as fj
-from fdof_jax.control import tip_deviation
-from fdof_jax.trigonometry import sincos
+from fdof_jax.control.pd import tip_deviation
+from fdof_jax.xla.trigonometry import sincos
 from hard.scenes import START, Hold, arm
 
 STILL = np.zeros(3)

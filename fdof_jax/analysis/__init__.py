@@ -1,0 +1,1 @@
+"""What one asks of a motion or a configuration: reactions, linearisation."""

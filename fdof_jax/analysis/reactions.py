@@ -1,0 +1,97 @@
+"""Bearing reactions: what the links do to one another in the joints."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float
+
+from ..dynamics import forward_dynamics
+from ..forces.element import Forces, InertialElement
+from ..forces.points import PointElement, cross, frames_of
+from ..linkage.linkage import Linkage
+from ..mechanics.kinematics import joint_positions, mass_center_velocities, mass_centers
+from ..simulation.simulate import joint_efforts
+from ..simulation.solution import Solution
+
+
+def _loads(
+    linkage: Linkage, forces: Forces, t: Any, q: Array, qd: Array, qdd: Array
+) -> tuple[Array, Array]:
+    """On the ground and the links: forces, and moments about the ground pivot."""
+    frames = frames_of(linkage, tuple(q))
+    force, moment = jnp.zeros(4, complex), jnp.zeros(4)
+    for index, element in enumerate(forces):
+        loads = ()
+        if isinstance(element, PointElement):
+            loads = element.loads(element.schedule(t, linkage), frames, tuple(qd))
+        elif isinstance(element, InertialElement):
+            loads = element.loads(t, q, qd, qdd, linkage)
+            if loads is None:
+                raise ValueError(
+                    f"forces[{index}]: expected an element that moves masses to have "
+                    "a method `loads` that says which points of links carry them, got "
+                    f"{element!r}."
+                )
+        for point, push, turn in loads:
+            about_pivot = turn + cross(point.place(frames), push)
+            force = force.at[point.link].add(push)
+            moment = moment.at[point.link].add(about_pivot)
+    return force, moment
+
+
+def _complex(vectors: Array) -> Array:
+    return jax.lax.complex(vectors[:, 0], vectors[:, 1])
+
+
+def _reactions(
+    linkage: Linkage, forces: Forces, t: Array, q: Array, qd: Array, tau: Array
+) -> Array:
+    qdd = forward_dynamics(linkage, q, qd, tau, forces)
+    motion = lambda q, qd: mass_center_velocities(linkage, q, qd)
+    _, (acceleration, spin_up) = jax.jvp(motion, (q, qd), (qd, qdd))
+    needed = linkage.mass * (_complex(acceleration) + 1j * linkage.gravity)
+    center, joint = (_complex(f(linkage, q)) for f in (mass_centers, joint_positions))
+    turning = linkage.inertia * spin_up + cross(center, needed)
+    force, moment = _loads(linkage, forces, t, q, qd, qdd)
+    # Each joint carries all links beyond it.
+    beyond = lambda rows: jnp.cumsum(rows[::-1])[::-1]
+    carried, about_pivot = beyond(needed - force[1:]), beyond(turning - moment[1:])
+    about = about_pivot - cross(joint, carried)
+    return jnp.stack([carried.real, carried.imag, about], axis=1)
+
+
+def joint_reactions(
+    linkage: Linkage, forces: Forces, solution: Solution
+) -> Float[Array, "time joint 3"]:
+    """What each joint's bearing does to the link beyond it, along a motion.
+
+    From the balances of Newton and Euler, link by link from the tip. Where a joint is
+    free to move, this is the effort that passes through it: of dampers, controllers,
+    drives and armatures; loads on points act on the links themselves.
+
+    **Arguments:** the linkage, the forces and the solution of one `simulate`.
+
+    **Returns:** force (x, y) [N] and moment [N m] on the moving link, at its
+    characteristic point (see `joint_positions`). The link before takes the opposite.
+
+    **Raises:** ValueError if `forces` is not a tuple of force elements, and for an
+    element that moves masses without saying by which `loads`.
+
+    >>> import fdof_jax as fj
+    >>> import numpy as np
+    >>> arm, start, *_ = fj.scenes.fig5()
+    >>> motion = fj.simulate(arm, start, np.linspace(0, 1, 101))
+    >>> fj.joint_reactions(arm, (), motion)[:2, 0, :2].tolist()  # in free fall at first
+    [[0.0, 0.0], [-0.043, 0.0]]
+    """
+    efforts = joint_efforts(linkage, forces, solution)
+    return _along(linkage, forces, solution, efforts.total)
+
+
+@eqx.filter_jit
+def _along(linkage, forces, solution, total) -> Array:
+    motion = solution.ts, solution.q, solution.qd, total
+    return jax.vmap(lambda *m: _reactions(linkage, forces, *m))(*motion)

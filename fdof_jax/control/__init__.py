@@ -1,0 +1,1 @@
+"""What is commanded: controllers, drives, paths and their timing."""

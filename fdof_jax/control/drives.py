@@ -1,0 +1,320 @@
+"""Servo drives: what stands between a controller's command and a joint's effort.
+
+All work joint by joint. A command is a force element, a `PDController`, a
+`PIDController` or another drive for instance; what it returns is an effort, or for a
+motor a voltage.
+"""
+
+from abc import abstractmethod
+from functools import reduce
+from operator import and_
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from ..checks import is_traced, real_array
+from ..forces.element import StatefulElement
+from ..linkage.linkage import Linkage
+from ..xla.array_namespace import in_numpy
+from .pd import PDController, Reference
+
+
+class PIDController(StatefulElement):
+    """PD control with an integral of the position error, and limits.
+
+    The effort is that of a `PDController` plus ki times the integral, clipped to
+    +-limit as a whole. Anti-windup by back-calculation: what the limit takes away flows
+    out of the integral, with the time constant kp / ki.
+
+    **Arguments:** one per joint or one for all.
+
+    - `kp`, `kd`, `limit`, `reference`: as in `PDController`.
+    - `ki`: gains of the integral, not negative; 0 where kp is [N/(m s) or N m/(rad s)].
+
+    **Raises:** ValueError for malformed arguments.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig7().linkage
+    >>> task = fj.CircleTask()
+    >>> pid = fj.PIDController(kp=100, ki=50, kd=0, limit=30, reference=task)
+    >>> q, qd = task(0.0, arm)
+    >>> effort, rate = pid(0.0, q - 0.1, qd, arm, pid.initial_state(arm))
+    >>> effort.tolist(), rate.tolist()  # the integral's share grows
+    ([10.0, 10.0, 10.0], [5.0, 5.0, 5.0])
+    """
+
+    pd: PDController
+    ki: Float[Array, " joint"]
+
+    def __init__(
+        self,
+        kp: ArrayLike,
+        ki: ArrayLike,
+        kd: ArrayLike,
+        limit: ArrayLike,
+        reference: Reference,
+    ):
+        self.pd = PDController(kp, kd, limit, reference)
+        self.ki = real_array("ki", ki, (3,), minimum=0, broadcast=True)
+        if not is_traced(self) and not in_numpy(self).possible():
+            raise ValueError(
+                f"ki: expected 0 where kp is, got {self.ki.tolist()} and "
+                f"{self.pd.kp.tolist()}."
+            )
+
+    def initial_state(self, linkage):
+        """The integral's share of the effort, (3,) [N or N m]."""
+        return jnp.zeros(3)
+
+    def __call__(self, t, q, qd, linkage, state):
+        position, velocity = self.pd.schedule(t, linkage)
+        proportional = self.pd.kp * (position - q)
+        demand = proportional + self.pd.kd * (velocity - qd) + state
+        effort = jnp.clip(demand, -self.pd.limit, self.pd.limit)
+        per_time = self.ki / jnp.where(self.pd.kp > 0, self.pd.kp, 1)
+        return effort, per_time * (proportional + effort - demand)
+
+    @property
+    def jump_ts(self) -> Array | None:
+        """The times at which the reference says that it jumps, if it does."""
+        return self.pd.jump_ts
+
+    def check(self, linkage: Linkage, ts: Array) -> None:
+        """The reference's own check, if it has one."""
+        self.pd.check(linkage, ts)
+
+    def possible(self) -> Array:
+        """Whether no gain or limit is negative, and none is an integral's alone."""
+        lone = (self.ki > 0) & ~(self.pd.kp > 0)
+        return self.pd.possible() & ((self.ki >= 0) & ~lone).all()
+
+
+class DriveState(NamedTuple):
+    """State of a drive: its `own`, and that of the `command`; () for none."""
+
+    own: Any
+    command: Any
+
+
+class _Drive(StatefulElement):
+    """A command and what a drive makes of it.
+
+    A subclass implements `respond`, and `initial` if it has a state of its own.
+    """
+
+    command: eqx.AbstractVar[Any]
+
+    def initial(self) -> Any:
+        """The drive's own state at the start."""
+        return ()
+
+    @abstractmethod
+    def respond(self, command: Array, qd: Array, own: Any) -> tuple[Array, Any]:
+        """The efforts (3,), and the rate of the drive's own state."""
+
+    def initial_state(self, linkage):
+        """A `DriveState`."""
+        stateful = isinstance(self.command, StatefulElement)
+        inner = self.command.initial_state(linkage) if stateful else ()
+        return DriveState(self.initial(), inner)
+
+    def __call__(self, t, q, qd, linkage, state):
+        own, inner = state
+        if isinstance(self.command, StatefulElement):
+            command, inner_rate = self.command(t, q, qd, linkage, inner)
+        else:
+            command, inner_rate = self.command(t, q, qd, linkage), ()
+        effort, rate = self.respond(real_array("command", command, (3,)), qd, own)
+        return effort, DriveState(rate, inner_rate)
+
+    @property
+    def jump_ts(self) -> Array | None:
+        """The times at which the command says that it jumps, if it does."""
+        return getattr(self.command, "jump_ts", None)
+
+    def check(self, linkage: Linkage, ts: Array) -> None:
+        """The command's own check, if it has one."""
+        check: Any = getattr(self.command, "check", None)
+        if check is not None:
+            check(linkage, ts)
+
+    @abstractmethod
+    def positive(self) -> list[Array]:
+        """The parameters that must be positive."""
+
+    def possible(self) -> Array:
+        """Whether they are, and what the command says of its own values."""
+        own = reduce(and_, [(value > 0).all() for value in self.positive()])
+        possible: Any = getattr(self.command, "possible", None)
+        return own if possible is None else own & possible()
+
+
+def _command(value: Any) -> Any:
+    if not callable(value) or isinstance(value, type):
+        raise ValueError(
+            "command: expected a force element, a PDController for instance, got "
+            f"{value!r}."
+        )
+    return value
+
+
+class FirstOrderLag(_Drive):
+    """An effort that follows its command with a lag: its rate is the gap over a time.
+
+    **Arguments:** `command`: a force element; `time_constant`: one per joint or one for
+    all, positive [s]; `start`: the effort at the start [N or N m].
+
+    **Raises:** ValueError for malformed arguments.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig5().linkage
+    >>> lag = fj.FirstOrderLag(fj.JointEffort([10, 0, 0]), time_constant=0.1)
+    >>> effort, rate = lag(0.0, [0, 0, 0], [0, 0, 0], arm, lag.initial_state(arm))
+    >>> effort.tolist(), rate.own.tolist()  # towards 10 N m, in 0.1 s at this rate
+    ([0.0, 0.0, 0.0], [100.0, 0.0, 0.0])
+    """
+
+    command: Any
+    time_constant: Float[Array, " joint"]
+    start: Float[Array, " joint"]
+
+    def __init__(
+        self, command: Any, time_constant: ArrayLike, *, start: ArrayLike = 0.0
+    ):
+        self.command = _command(command)
+        self.time_constant = real_array(
+            "time_constant", time_constant, (3,), above=0, broadcast=True
+        )
+        self.start = real_array("start", start, (3,), broadcast=True)
+
+    def positive(self):
+        return [self.time_constant]
+
+    def initial(self):
+        """The effort, (3,) [N or N m]."""
+        return self.start
+
+    def respond(self, command, qd, own):
+        return own, (command - own) / self.time_constant
+
+
+class SpeedLimit(_Drive):
+    """An effort whose limit falls with speed: a straight torque-speed curve.
+
+    In the direction of motion at most stall * (1 - |qd| / no_load), and not below 0;
+    against it, at most stall.
+
+    **Arguments:** `command`: a force element; one per joint or one for all, positive:
+    `stall` [N or N m], `no_load` [m/s or rad/s].
+
+    **Raises:** ValueError for malformed arguments.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig5().linkage
+    >>> import jax.numpy as jnp
+    >>> limited = fj.SpeedLimit(fj.JointEffort([9, 9, 9]), stall=8, no_load=4)
+    >>> speeds, state = jnp.array([0.0, 2.0, 5.0]), limited.initial_state(arm)
+    >>> limited(0.0, [0, 0, 0], speeds, arm, state)[0].tolist()
+    [8.0, 4.0, 0.0]
+    """
+
+    command: Any
+    stall: Float[Array, " joint"]
+    no_load: Float[Array, " joint"]
+
+    def __init__(self, command: Any, stall: ArrayLike, no_load: ArrayLike):
+        self.command = _command(command)
+        self.stall = real_array("stall", stall, (3,), above=0, broadcast=True)
+        self.no_load = real_array("no_load", no_load, (3,), above=0, broadcast=True)
+
+    def positive(self):
+        return [self.stall, self.no_load]
+
+    def respond(self, command, qd, own):
+        left = jnp.clip(1 - qd / self.no_load, 0, 1)  # of the positive limit
+        right = jnp.clip(1 + qd / self.no_load, 0, 1)
+        return jnp.clip(command, -self.stall * right, self.stall * left), ()
+
+
+class DCMotor(_Drive):
+    """Brushed motors on geared joints: winding, back-EMF, limited voltage and current.
+
+    inductance * di/dt = v - resistance * i - constant * gear * qd, and the effort is
+    constant * gear * i. The command gives the voltages v. They are clipped to those
+    that lead to a current within its limit, then to +-voltage_limit: at speeds whose
+    back-EMF exceeds that, the back-EMF drives the current. Rotors are an `Armature`
+    beside it.
+
+    **Arguments:** one per joint or one for all, positive.
+
+    - `command`: a force element, read as voltages [V].
+    - `resistance` [ohm], `inductance` [H]: of the winding.
+    - `constant`: of torque and back-EMF [N m/A = V s/rad; N/A for a slide].
+    - `gear`: turns of the motor per turn of the joint (per metre of a slide).
+    - `voltage_limit` [V], `current_limit` [A]: may be infinite.
+
+    **Raises:** ValueError for malformed arguments.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig5().linkage
+    >>> import jax.numpy as jnp
+    >>> volts = fj.JointEffort([24, 24, 24])
+    >>> motor = fj.DCMotor(volts, resistance=2, inductance=0.01, constant=0.1)
+    >>> speeds, state = jnp.array([0.0, 120, 240]), motor.initial_state(arm)
+    >>> motor(0.0, [0, 0, 0], speeds, arm, state)[1].own.tolist()  # rates [A/s]
+    [2400.0, 1200.0, 0.0]
+    """
+
+    command: Any
+    resistance: Float[Array, " joint"]
+    inductance: Float[Array, " joint"]
+    constant: Float[Array, " joint"]
+    gear: Float[Array, " joint"]
+    voltage_limit: Float[Array, " joint"]
+    current_limit: Float[Array, " joint"]
+
+    def __init__(
+        self,
+        command: Any,
+        *,
+        resistance: ArrayLike,
+        inductance: ArrayLike,
+        constant: ArrayLike,
+        gear: ArrayLike = 1.0,
+        voltage_limit: ArrayLike = jnp.inf,
+        current_limit: ArrayLike = jnp.inf,
+    ):
+        def positive(name: str, value: ArrayLike, finite: bool = True) -> Array:
+            return real_array(name, value, (3,), above=0, finite=finite, broadcast=True)
+
+        self.command = _command(command)
+        self.resistance = positive("resistance", resistance)
+        self.inductance = positive("inductance", inductance)
+        self.constant = positive("constant", constant)
+        self.gear = positive("gear", gear)
+        self.voltage_limit = positive("voltage_limit", voltage_limit, finite=False)
+        self.current_limit = positive("current_limit", current_limit, finite=False)
+
+    def positive(self):
+        winding = [self.resistance, self.inductance, self.constant, self.gear]
+        return [*winding, self.voltage_limit, self.current_limit]
+
+    def initial(self):
+        """The currents, (3,) [A]."""
+        return jnp.zeros(3)
+
+    def respond(self, command, qd, own):
+        per_joint = self.constant * self.gear
+        back_emf = per_joint * qd
+        # Infinity times a tangent of 0 would not be a number.
+        unlimited = jnp.isinf(self.current_limit)
+        most = self.resistance * jnp.where(unlimited, 0, self.current_limit)
+        most = jnp.where(unlimited, jnp.inf, most)
+        voltage = jnp.clip(command, back_emf - most, back_emf + most)
+        voltage = jnp.clip(voltage, -self.voltage_limit, self.voltage_limit)
+        rate = (voltage - self.resistance * own - back_emf) / self.inductance
+        return per_joint * own, rate

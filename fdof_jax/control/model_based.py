@@ -1,0 +1,158 @@
+"""Controllers that know the arm: PD control with gravity held, and computed torque."""
+
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import ArrayLike
+
+from ..checks import real_array
+from ..forces.points import frames_of
+from ..linkage.linkage import Linkage, check_linkage, possible
+from ..mechanics.equations import Scalars, link_constants
+from ..mechanics.rates import required_efforts
+from .pd import PDController, Reference, reference_motion
+
+
+class _ModelBased(PDController):
+    """A PD controller with a model of the arm."""
+
+    model: Linkage | None
+
+    def __init__(
+        self,
+        kp: ArrayLike,
+        kd: ArrayLike,
+        limit: ArrayLike,
+        reference: Reference,
+        model: Linkage | None = None,
+    ):
+        super().__init__(kp, kd, limit, reference)
+        self.model = model
+        self._check_model()
+
+    def _check_model(self) -> None:
+        if self.model is None:
+            return
+        try:
+            check_linkage(self.model)
+        except ValueError as error:
+            raise ValueError(f"model{str(error).removeprefix('linkage')}") from None
+
+    def _believed(self, linkage: Linkage) -> Linkage:
+        return linkage if self.model is None else self.model
+
+    def check(self, linkage: Linkage, ts: Array) -> None:
+        """As of a PD controller; and the model's values, and its topology."""
+        super().check(linkage, ts)
+        self._check_model()
+        if self.model is not None and not np.array_equal(self.model.ef, linkage.ef):
+            raise ValueError(
+                "model: expected the arm's own topology, existence factors "
+                f"{linkage.ef.tolist()}, got {self.model.ef.tolist()}."
+            )
+
+    def possible(self) -> Array:
+        """Whether gains and limits are not negative, and the model can be."""
+        own = super().possible()
+        return own if self.model is None else own & possible(self.model)
+
+
+class GravityFeedforward(_ModelBased):
+    """PD control that holds the arm's weight besides: a force element.
+
+    The effort is that of a `PDController` plus the one that holds the arm at rest
+    against gravity where it is (not where it should be), clipped to +-limit as a whole.
+    Without it PD control sags, in Fig 7 by a quarter of a metre.
+
+    **Arguments:**
+
+    - `kp`, `kd`, `limit`, `reference`: as in `PDController` [N/m or N m/rad, N s/m or
+      N m s/rad, N or N m].
+    - `model`: the arm that the controller believes in; None: the arm itself. Masses of
+      other force elements, of a load for instance, are unknown to it.
+
+    **Raises:** ValueError for malformed arguments.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig7().linkage
+    >>> task = fj.CircleTask()
+    >>> q, qd = task(0.0, arm)  # no error is left to correct
+    >>> fj.GravityFeedforward(500, 50, 500, task)(0.0, q, qd, arm).tolist()
+    [-93.195, 0.0, 0.0]
+    >>> fj.holding_efforts(arm, q).tolist()
+    [-93.195, 0.0, 0.0]
+    """
+
+    def unlimited(self, scheduled, q, qd, linkage):
+        errors = super().unlimited(scheduled, q, qd, linkage)
+        held = _held(self._believed(linkage), q)
+        return tuple(a + b for a, b in zip(errors, held))
+
+
+def _held(linkage: Linkage, q: Scalars) -> tuple[Array, ...]:
+    """The efforts that hold the arm at rest, from its tip to its base."""
+    start, direction, turning = frames_of(linkage, q)
+    mass, moment = jnp.zeros(()), jnp.zeros(())  # beyond a joint; about the pivot
+    efforts = []
+    for k in (2, 1, 0):
+        along, across = linkage.com[k]
+        e = direction[k + 1]
+        center = start[k + 1].real + along * e.real - across * e.imag
+        mass = mass + linkage.mass[k]
+        moment = moment + linkage.mass[k] * center
+        # A slide runs across the link before: up as much as that link runs along x.
+        arm = jnp.where(
+            turning[k], moment - mass * start[k + 1].real, mass * direction[k].real
+        )
+        efforts.append(linkage.gravity * arm)
+    return tuple(reversed(efforts))
+
+
+class ComputedTorque(_ModelBased):
+    """Control through the inverse dynamics: a force element.
+
+    The effort is M(q) (qdd_ref + kp e + kd de/dt) + bias(q, qd), clipped to +-limit as
+    a whole, e being q_ref - q. With an exact model and within the limits the errors of
+    all joints obey d2e/dt2 + kd de/dt + kp e = 0, each for itself.
+
+    The acceleration qdd_ref is the derivative of the reference's velocities in time:
+    where those jump it has no impulse.
+
+    **Arguments:** one per joint or one for all.
+
+    - `kp` [1/s^2], `kd` [1/s]: gains of accelerations, not negative.
+    - `limit`: largest effort [N or N m], may be infinite.
+    - `reference`: as in `PDController`; differentiable in time.
+    - `model`: the arm that the controller believes in; None: the arm itself. Masses of
+      other force elements, of a load for instance, and all their efforts are unknown to
+      it.
+
+    **Raises:** ValueError for malformed arguments.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig7().linkage
+    >>> stand = fj.JointMove([1, 2, 0], [1, 2, 0], fj.Travel(1.0))
+    >>> control = fj.ComputedTorque(kp=25, kd=10, limit=500, reference=stand)
+    >>> tau = control(0.0, stand.end - 0.1, stand.end * 0, arm)
+    >>> fj.forward_dynamics(arm, stand.end - 0.1, [0, 0, 0], tau).tolist()  # kp / 10
+    [2.5, 2.5, 2.5]
+    """
+
+    gain_units: ClassVar = dict.fromkeys("RP", ("1/s^2", "1/s"))
+
+    def schedule(self, t, linkage):
+        """The reference motion and its accelerations: (q_ref, qd_ref, qdd_ref)."""
+        t = real_array("t", t, ())
+        motion = lambda t: reference_motion(self.reference, t, linkage)
+        (q_ref, qd_ref), (_, qdd_ref) = jax.jvp(motion, (t,), (jnp.ones_like(t),))
+        return q_ref, qd_ref, qdd_ref
+
+    def unlimited(self, scheduled, q, qd, linkage):
+        *motion, qdd_ref = scheduled
+        errors = super().unlimited(motion, q, qd, linkage)
+        constants = link_constants(self._believed(linkage), jnp.zeros(3))
+        demanded = tuple(a + b for a, b in zip(qdd_ref, errors))
+        return required_efforts(constants, tuple(q), tuple(qd), demanded)

@@ -1,0 +1,1 @@
+"""Motions as tables, trees in files, arms for other engines."""

@@ -1,0 +1,126 @@
+"""Motions as labelled arrays of xarray and as tables of pandas, optional packages."""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..checks import instance, known
+from ..linkage.linkage import Linkage
+from ..simulation.solution import Solution
+
+if TYPE_CHECKING:
+    import pandas
+    import xarray
+
+
+def _package(name: str) -> Any:
+    try:
+        return import_module(name)
+    except ImportError as error:
+        raise ImportError(
+            f"{name} is not installed: pip install 'fdof_jax[data]' brings it."
+        ) from error
+
+
+def _joints(linkage: Linkage) -> tuple[list[str], list[str]]:
+    """Names and units of the joints; of one that a batch has both kinds of, neither."""
+    names, units = [], []
+    for k, revolute in enumerate(np.asarray(linkage.ef).reshape(-1, 6).T[1::2] > 0.5):
+        mixed = revolute.any() and not revolute.all()
+        kind, unit = ("R", "rad") if revolute.any() else ("P", "m")
+        names.append(f"{k + 1}" if mixed else f"{kind}{k + 1}")
+        units.append("m or rad" if mixed else unit)
+    return names, units
+
+
+def _rate(unit: str) -> str:
+    return " or ".join(f"{one}/s" for one in unit.split(" or "))
+
+
+def _checked(solution: Any, linkage: Any) -> tuple[np.ndarray, list[str]]:
+    """The times that all motions have in common, and the names of the batch's axes."""
+    instance("solution", solution, Solution)
+    instance("linkage", linkage, Linkage)
+    if not known(solution, linkage):
+        raise ValueError("solution, linkage: expected numbers, got traced values.")
+    ts = np.asarray(solution.ts).reshape((-1, solution.q.shape[-2]))
+    if (ts != ts[0]).any():
+        raise ValueError(
+            "solution.ts: expected the same times for all motions, got different ones."
+        )
+    axes = solution.q.ndim - 2
+    return ts[0], ["batch"] if axes == 1 else [f"batch_{k + 1}" for k in range(axes)]
+
+
+def to_xarray(solution: Solution, linkage: Linkage) -> "xarray.Dataset":
+    """A solution as an xarray Dataset, with names and units.
+
+    Joint positions `q` and velocities `qd` over `time` and `joint`; the joints are R1,
+    P2 and so on, and beside them is the `unit` of each. How each trajectory ended is
+    `outcome`, as of the solution, with `num_steps` and `time_reached`. The axes of a
+    batch come first, as `batch` (of several, `batch_1` and so on); give it a name and
+    values by `.rename(batch="payload").assign_coords(payload=masses)`. A joint that a
+    batch has both kinds of is named by its number.
+
+    **Arguments:** `solution`: of `simulate`, of a batch of it or of `sweep`; all at the
+    same times [s]. `linkage`: that of the solution, one or a batch.
+
+    **Returns:** the Dataset; the attributes `units` of its variables are SI.
+
+    **Raises:** ImportError without xarray, which `fdof_jax[data]` brings; ValueError
+    for malformed arguments.
+    """
+    xarray = _package("xarray")
+    times, batch = _checked(solution, linkage)
+    names, units = _joints(linkage)
+    common = units[0] if len(set(units)) == 1 else "m or rad"
+    rows, steps = [*batch, "time", "joint"], solution.stats["num_steps"]
+    variables = {
+        "q": (rows, solution.q, "joint position", common),
+        "qd": (rows, solution.qd, "joint velocity", _rate(common)),
+        "outcome": (batch, solution.outcome, "how the trajectory ended", ""),
+        "num_steps": (batch, steps, "number of steps", "1"),
+        "time_reached": (batch, solution.stats["time_reached"], "time reached", "s"),
+    }
+    coordinates = {
+        "time": (["time"], times, "time", "s"),
+        "joint": (["joint"], names, "joint", ""),
+        "unit": (["joint"], units, "unit of the joint's position", ""),
+    }
+
+    def labelled(found: dict[str, tuple]) -> dict[str, tuple]:
+        return {
+            name: (dims, np.asarray(values), {"long_name": label, "units": unit})
+            for name, (dims, values, label, unit) in found.items()
+        }
+
+    return xarray.Dataset(labelled(variables), labelled(coordinates))
+
+
+def to_pandas(solution: Solution, linkage: Linkage) -> "pandas.DataFrame":
+    """A solution as a pandas DataFrame: a row per time, a column per joint and rate.
+
+    The columns are called `R1 [rad]`, `P2 [m/s]` and so on; the last is the `outcome`
+    of the row's trajectory. The index is the time, `time [s]`, and before it the place
+    in the batch, if it is one: `batch` (of several axes, `batch_1` and so on).
+
+    **Arguments:** as of `to_xarray`.
+
+    **Returns:** the DataFrame.
+
+    **Raises:** ImportError without pandas, which `fdof_jax[data]` brings; ValueError
+    for malformed arguments.
+    """
+    pandas = _package("pandas")
+    times, batch = _checked(solution, linkage)
+    columns = {}
+    for values, unit_of in ((solution.q, str), (solution.qd, _rate)):
+        for k, (name, unit) in enumerate(zip(*_joints(linkage))):
+            columns[f"{name} [{unit_of(unit)}]"] = np.asarray(values)[..., k].ravel()
+    columns["outcome"] = np.repeat(solution.outcome, len(times))
+    index = pandas.Index(times, name="time [s]")
+    if batch:
+        levels = [*map(range, solution.q.shape[:-2]), times]
+        index = pandas.MultiIndex.from_product(levels, names=[*batch, "time [s]"])
+    return pandas.DataFrame(columns, index)

@@ -1,0 +1,302 @@
+"""A pytree of the library's as JSON and arrays, and back without a skeleton.
+
+Nothing that a description says is executed: classes are looked up, in the library and
+among those of the caller.
+"""
+
+import dataclasses
+import importlib
+import struct
+import types
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from .. import __all__ as _NAMES, __name__ as _PACKAGE
+from ..checks import is_traced
+
+_RESULT: Any = diffrax.RESULTS.successful
+_Item, _EnumerationMeta = type(_RESULT), type(diffrax.RESULTS)
+
+
+class Unreadable(Exception):
+    """What is wrong with a file, in words that lack its name."""
+
+
+# Names of classes and functions
+
+# Classes of the library that saved trees hold and that the top does not name.
+_WITHIN = {
+    "CircleRun": "shell.showcase",
+    "DriveState": "control.drives",
+    "History": "tuning.result",
+    "Separation": "forces.points",
+    "_Knots": "tuning.optimal_motion",
+}
+
+
+def _name(thing: Any) -> str:
+    """The name that a file holds: a public one, whatever module defines the thing."""
+    name = thing.__qualname__
+    # The module in which diffrax keeps an enumeration may change.
+    for package, found in (
+        ("diffrax", getattr(diffrax, name, None)),
+        (_PACKAGE, _of_the_library(name)),
+    ):
+        if found is thing:
+            return f"{package}:{name}"
+    return f"{thing.__module__}:{name}"
+
+
+def _of_the_library(name: str) -> Any:
+    """The class or function of the library with this name, or None."""
+    if name not in (*_NAMES, *_WITHIN):
+        return None
+    place = f"{_PACKAGE}.{_WITHIN[name]}" if name in _WITHIN else _PACKAGE
+    found = getattr(importlib.import_module(place), name)
+    return found if isinstance(found, type | types.FunctionType) else None
+
+
+def _is_ours(module: str) -> bool:
+    """Whether a file means the library: version 0.1 wrote the module of each class."""
+    return module.partition(".")[0] == _PACKAGE
+
+
+def _class(name: str, classes: Sequence[type]) -> Any:
+    """The class with this name, of the library, of diffrax or of the caller."""
+    module, _, qualname = name.partition(":")
+    if module == "diffrax":
+        found = vars(diffrax).get(qualname)
+        if isinstance(found, _EnumerationMeta):
+            return found
+    if _is_ours(module) and isinstance(found := _of_the_library(qualname), type):
+        return found
+    same = [c for c in classes if _name(c) == name]
+    # A class is elsewhere when the script that defines it is imported.
+    moved = [
+        c
+        for c in classes
+        if c.__qualname__ == qualname and "__main__" in (module, c.__module__)
+    ]
+    for candidates in (same, moved):
+        if len(candidates) == 1:
+            return candidates[0]
+    raise Unreadable(
+        f"expected classes of the library or of `classes`, got {name}: import that "
+        "class and pass it, as in load(path, classes=(MyElement,))"
+    )
+
+
+def _fields(kind: Any) -> list[str] | None:
+    """Names of the fields of a NamedTuple or dataclass, None for other classes."""
+    if issubclass(kind, tuple):
+        names = getattr(kind, "_fields", None)
+        return None if names is None else list(names)
+    if dataclasses.is_dataclass(kind):
+        return [field.name for field in dataclasses.fields(kind)]
+    return None
+
+
+def _members(enumeration: Any) -> dict[str, int]:
+    return {name: int(i._value) for name, i in enumeration._name_to_item.items()}
+
+
+# From a tree to its description
+
+
+def described(place: str, value: Any, arrays: list[np.ndarray]) -> Any:
+    """A tree as JSON has it, its arrays appended to `arrays`."""
+    kind = type(value)
+    if value is None or kind in (bool, int, str):
+        return value
+    if kind is float:
+        if np.isfinite(value):
+            return value
+        return {"kind": "float", "bits": struct.pack(">d", value).hex()}
+    if kind in (list, tuple):
+        items = [described(f"{place}[{i}]", v, arrays) for i, v in enumerate(value)]
+        return items if kind is list else {"kind": "tuple", "items": items}
+    if kind is dict:
+        if not all(type(key) is str for key in value):
+            raise ValueError(
+                f"{place}: expected strings as keys, got {list(value)[:20]!r}."
+            )
+        items = {k: described(f"{place}[{k!r}]", v, arrays) for k, v in value.items()}
+        return {"kind": "dict", "items": items}
+    if isinstance(value, Array) or kind is np.ndarray or isinstance(value, np.generic):
+        return _described_array(place, value, arrays)
+    if kind is _Item and isinstance(value._value, Array | np.ndarray):
+        return {
+            "kind": "enumeration",
+            "class": _name(value._enumeration),
+            "members": _members(value._enumeration),
+            "value": _described_array(place, value._value, arrays),
+        }
+    if isinstance(value, types.FunctionType):
+        if _of_the_library(value.__qualname__) is value:
+            return {"kind": "function", "name": _name(value)}
+        raise ValueError(
+            f"{place}: expected an equinox.Module with a __call__, which can be saved "
+            f"in place of a function of one's own, got {value!r}."
+        )
+    unnamed = _is_ours(kind.__module__) and _of_the_library(kind.__qualname__) != kind
+    if not unnamed and (names := _fields(kind)) is not None:
+        fields = {}
+        for name in names:
+            if not hasattr(value, name):
+                raise ValueError(f"{place}.{name}: expected a value, got none.")
+            item = getattr(value, name)
+            fields[name] = described(f"{place}.{name}", item, arrays)
+        return {"kind": "object", "class": _name(kind), "fields": fields}
+    raise ValueError(
+        f"{place}: expected arrays, numbers, strings, or lists, tuples, dicts, "
+        f"NamedTuples, dataclasses and modules of such, got {value!r}."
+    )
+
+
+def _described_array(place: str, value: Any, arrays: list[np.ndarray]) -> dict:
+    if is_traced(value):
+        raise ValueError(
+            f"{place}: expected a known value, got {value!r}: save outside of jit, "
+            "vmap and grad."
+        )
+    if jnp.issubdtype(value.dtype, jax.dtypes.prng_key):
+        node = {"kind": "key", "implementation": str(jax.random.key_impl(value))}
+        value = jax.random.key_data(value)
+    elif isinstance(value, Array):
+        node = {"kind": "jax", "weak": value.weak_type}
+    else:
+        node = {"kind": "scalar" if isinstance(value, np.generic) else "numpy"}
+    try:
+        array = np.asarray(value)
+    except RuntimeError as error:  # deleted, or on devices of other processes
+        raise ValueError(f"{place}: expected an array at hand, got {error}.") from error
+    extended = jnp.issubdtype(array.dtype, np.number)  # bfloat16 for instance
+    if array.dtype.kind not in "biufcmMSU" and not extended:
+        raise ValueError(
+            f"{place}: expected an array of numbers, got one of {array.dtype}."
+        )
+    arrays.append(array)
+    shape = list(array.shape)
+    return node | {"array": len(arrays) - 1, "dtype": array.dtype.name, "shape": shape}
+
+
+# From a description to its tree
+
+
+class Restorer:
+    """Makes trees from descriptions, given the arrays and the caller's classes."""
+
+    def __init__(self, array: Callable[[int], np.ndarray], classes: Sequence[type]):
+        self.stored, self.classes = array, classes
+
+    def tree(self, node: Any) -> Any:
+        if isinstance(node, list):
+            return [self.tree(item) for item in node]
+        if not isinstance(node, dict):
+            return node
+        kind = node["kind"]
+        if kind == "float":
+            return struct.unpack(">d", bytes.fromhex(node["bits"]))[0]
+        if kind == "tuple":
+            return tuple(self.tree(item) for item in node["items"])
+        if kind == "dict":
+            return {key: self.tree(item) for key, item in node["items"].items()}
+        if kind == "function":
+            module, _, qualname = node["name"].partition(":")
+            found = _of_the_library(qualname) if _is_ours(module) else None
+            if not isinstance(found, types.FunctionType):
+                raise Unreadable(
+                    f"expected a function of the library, got {node['name']}"
+                )
+            return found
+        if kind == "enumeration":
+            return self.item(node)
+        if kind == "object":
+            return self.instance(node)
+        return self.placed(node, self.array(node))
+
+    def instance(self, node: dict) -> Any:
+        cls = _class(node["class"], self.classes)
+        names, fields = _fields(cls), node["fields"]
+        if names is None or set(names) != set(fields):
+            raise Unreadable(
+                f"expected {node['class']} with the fields {names} that this version "
+                f"of it has, got {list(fields)}"
+            )
+        values = {name: self.tree(fields[name]) for name in names}
+        if issubclass(cls, tuple):
+            return tuple.__new__(cls, values.values())
+        # No constructor: it might compute or refuse.
+        made = object.__new__(cls)
+        for name, value in values.items():
+            object.__setattr__(made, name, value)
+        return made
+
+    def item(self, node: dict) -> Any:
+        enumeration = _class(node["class"], self.classes)
+        if not isinstance(enumeration, _EnumerationMeta):
+            raise Unreadable(f"expected an enumeration, got {node['class']}")
+        numbers = self.array(node["value"])
+        names = {number: name for name, number in node["members"].items()}
+        # Another version may count its members differently.
+        here, value = _members(enumeration), numbers.copy()
+        for number in np.unique(numbers).tolist():
+            if names[number] not in here:
+                raise Unreadable(
+                    f"expected a member that {node['class']} has, got {names[number]}"
+                )
+            value[numbers == number] = here[names[number]]
+        item = object.__new__(_Item)
+        object.__setattr__(item, "_value", self.placed(node["value"], value))
+        object.__setattr__(item, "_enumeration", enumeration)
+        return item
+
+    def array(self, node: dict) -> np.ndarray:
+        array = self.stored(node["array"])
+        if array.dtype.name != node["dtype"]:
+            # NumPy's format knows no dtypes but NumPy's.
+            extended = jnp.dtype(node["dtype"])
+            if array.dtype.kind != "V" or array.dtype.itemsize != extended.itemsize:
+                raise Unreadable(
+                    f"expected array {node['array']} to be of {node['dtype']}, got "
+                    f"{array.dtype}"
+                )
+            array = array.view(extended)
+        if list(array.shape) != node["shape"]:
+            raise Unreadable(
+                f"expected array {node['array']} to have shape {node['shape']}, got "
+                f"{list(array.shape)}"
+            )
+        return array
+
+    def placed(self, node: dict, array: np.ndarray) -> Any:
+        """The array as the kind of value that it was."""
+        kind = node["kind"]
+        if kind == "numpy":
+            return array
+        if kind == "scalar":
+            return array[()]
+        if kind == "key":
+            return jax.random.wrap_key_data(
+                jnp.asarray(array), impl=node["implementation"]
+            )
+        if kind != "jax":
+            raise KeyError(kind)
+        # JAX would round without a word.
+        if jax.dtypes.canonicalize_dtype(array.dtype) != array.dtype:
+            raise Unreadable(
+                f"expected arrays that JAX takes as it is configured, got {array.dtype}"
+                ': jax.config.update("jax_enable_x64", True) enables it'
+            )
+        if node["weak"]:
+            # Without it what was compiled for the array that was saved is not found.
+            weak = jnp.full(array.shape, array.dtype.type(0).item())
+            if weak.dtype == array.dtype:
+                return weak.at[...].set(array)
+        return jnp.asarray(array)

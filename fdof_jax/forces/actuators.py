@@ -1,0 +1,180 @@
+"""Actuators with masses of their own."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from ..checks import real_array
+from ..linkage.linkage import Linkage
+from .element import InertialElement, jumps_of
+from .points import (
+    Load,
+    Point,
+    Separation,
+    cross,
+    dot,
+    frames_of,
+    length_of,
+    over,
+)
+
+
+class Armature(InertialElement):
+    """Rotors geared to the joints: inertia that turns with a joint's relative rate.
+
+    **Arguments:** `inertia`: one per joint or one for all, not negative; of the rotor
+    times the square of the gear ratio [kg m^2; kg for a prismatic joint].
+
+    **Raises:** ValueError for malformed or negative inertias.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig5().linkage
+    >>> rotors, zero = (fj.Armature(0.5),), [0, 0, 0]
+    >>> fj.forward_dynamics(arm, zero, zero, zero, rotors).tolist()  # slower than -g
+    [-5.664, 2.225, 1.82]
+    """
+
+    inertia: Float[Array, " joint"]
+
+    def __init__(self, inertia: ArrayLike):
+        self.inertia = real_array("inertia", inertia, (3,), minimum=0, broadcast=True)
+
+    def possible(self) -> Array:
+        """Whether the inertias are not negative."""
+        return (self.inertia >= 0).all()
+
+    def coordinates(self, q, linkage):
+        return q
+
+    def weights(self, linkage):
+        return self.inertia
+
+    def loads(self, t, q, qd, qdd, linkage):
+        """None but in the joints themselves."""
+        return ()
+
+
+class LinearActuator(InertialElement):
+    """A cylinder and a piston between two points, and the force between them.
+
+    Both are bodies that lie along the line of the two pins: where the pins go, they
+    follow, exactly and without a degree of freedom of their own.
+
+    **Arguments:**
+
+    - `a`, `b`: the `Point`s of the pins, the cylinder's and the piston's.
+    - `force`: what pushes the pins apart [N], or a function of (t, length, rate) that
+      returns it [s, m, m/s].
+    - `mass`: of the cylinder and the piston, not negative [kg].
+    - `com`: distances of their mass centres, the cylinder's from `a` towards `b`, the
+      piston's from `b` towards `a` [m].
+    - `inertia`: about their mass centres, not negative [kg m^2].
+
+    **Raises:** ValueError for malformed arguments. Where the pins meet, a line has no
+    direction, and motions end as not finite.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig5().linkage
+    >>> import jax.numpy as jnp
+    >>> lift = fj.LinearActuator(fj.Point(0, 0, -1), fj.Point(1, 1), force=100)
+    >>> lift(0.0, jnp.zeros(3), jnp.zeros(3), arm).tolist()  # lever sqrt(1/2) m
+    [70.711, 0.0, 0.0]
+    """
+
+    ends: Separation
+    force: Any
+    mass: Float[Array, " 2"]
+    com: Float[Array, " 2"]
+    inertia: Float[Array, " 2"]
+
+    def __init__(
+        self,
+        a: Point,
+        b: Point,
+        *,
+        force: ArrayLike | Callable[[Array, Array, Array], ArrayLike] = 0.0,
+        mass: ArrayLike = (0.0, 0.0),
+        com: ArrayLike = (0.0, 0.0),
+        inertia: ArrayLike = (0.0, 0.0),
+    ):
+        self.ends = Separation(a, b)
+        self.force = force if callable(force) else real_array("force", force, ())
+        self.mass = real_array("mass", mass, (2,), minimum=0)
+        self.com = real_array("com", com, (2,))
+        self.inertia = real_array("inertia", inertia, (2,), minimum=0)
+
+    @property
+    def jump_ts(self) -> Array | None:
+        """The times at which the force's function says that it jumps, if it does."""
+        return jumps_of(self.force)
+
+    def _bodies(self, linkage: Linkage, q: Array) -> tuple[Array, Array, Array]:
+        """The mass centres of cylinder and piston, and the vector between the pins."""
+        frames = frames_of(linkage, tuple(q))
+        vector = self.ends.vector(frames)
+        unit = vector * over(length_of(vector))
+        cylinder = self.ends.a.place(frames) + self.com[0] * unit
+        return cylinder, self.ends.b.place(frames) - self.com[1] * unit, vector
+
+    def possible(self) -> Array:
+        """Whether masses and inertias are not negative."""
+        return ((self.mass >= 0) & (self.inertia >= 0)).all()
+
+    def coordinates(self, q, linkage):
+        cylinder, piston, vector = self._bodies(linkage, q)
+        angle = jnp.arctan2(vector.imag, vector.real)
+        places = cylinder.real, cylinder.imag, piston.real, piston.imag
+        return jnp.stack([*places, angle])
+
+    def weights(self, linkage):
+        return jnp.append(jnp.repeat(self.mass, 2), jnp.sum(self.inertia))
+
+    def potential_energy(self, q, linkage):
+        cylinder, piston, _ = self._bodies(linkage, q)
+        height = jnp.stack([cylinder.imag, piston.imag])
+        return linkage.gravity * jnp.sum(self.mass * height)
+
+    def __call__(self, t, q, qd, linkage):
+        frames = frames_of(linkage, tuple(q))
+        vector = self.ends.vector(frames)
+        length = length_of(vector)
+        slopes = jnp.stack(self.ends.slopes(frames, vector)) * over(length)
+        return self._push(t, length, slopes @ qd) * slopes
+
+    def _push(self, t: Array, length: Array, rate: Array) -> Array:
+        if callable(self.force):
+            return real_array("force", self.force(t, length, rate), ())
+        return self.force
+
+    def loads(
+        self, t: Array, q: Array, qd: Array, qdd: Array, linkage: Linkage
+    ) -> tuple[Load, Load]:
+        """What its pins do to the links, while the joints accelerate by `qdd`.
+
+        Besides the force between them: the weight and the inertia of the two bodies,
+        whose sideways part both pins share as the moments about the first one demand.
+        """
+        along = lambda q, qd: jax.jvp(
+            lambda q: self.coordinates(q, linkage), (q,), (qd,)
+        )[1]
+        _, (x1, y1, x2, y2, turning) = jax.jvp(along, (q, qd), (qd, qdd))
+        weight = 1j * linkage.gravity
+        cylinder = self.mass[0] * (jax.lax.complex(x1, y1) + weight)
+        piston = self.mass[1] * (jax.lax.complex(x2, y2) + weight)
+        vector, rate = jax.jvp(lambda q: self._bodies(linkage, q)[2], (q,), (qd,))
+        length = length_of(vector)
+        unit = vector / length
+        about_a = (
+            jnp.sum(self.inertia) * turning
+            + self.com[0] * cross(unit, cylinder)
+            + (length - self.com[1]) * cross(unit, piston)
+        )
+        held = dot(unit, piston) - self._push(t, length, dot(unit, rate))
+        on_b = (held + 1j * about_a / length) * unit  # by the link, on the piston
+        on_a = cylinder + piston - on_b
+        return Load(self.ends.a, -on_a), Load(self.ends.b, -on_b)

@@ -1,0 +1,65 @@
+"""What force elements that move masses add to the equations of motion."""
+
+from functools import reduce
+from operator import add
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from ..checks import callable_tuple
+from ..linkage.linkage import Linkage
+from ..mechanics.rates import Added
+from .element import Forces, InertialElement
+
+
+def inertial(forces: Forces) -> Forces:
+    """Those of the elements that move masses, refused unless it is such a tuple."""
+    callable_tuple("forces", forces)
+    return tuple(e for e in forces if isinstance(e, InertialElement))
+
+
+def energetic(forces: Forces) -> Forces:
+    """Those of the elements that have energy: springs too."""
+    callable_tuple("forces", forces)
+    return tuple(e for e in forces if hasattr(e, "potential_energy"))
+
+
+def added_energy(
+    linkage: Linkage, forces: Forces, q: Array, qd: Array
+) -> tuple[Array, Array]:
+    """Kinetic and potential energy of the elements [J]."""
+    kinetic, potential = jnp.zeros(()), jnp.zeros(())
+    for element in energetic(forces):
+        potential = potential + element.potential_energy(q, linkage)
+        if isinstance(element, InertialElement):
+            coordinates = lambda q, e=element: e.coordinates(q, linkage)
+            _, rates = jax.jvp(coordinates, (q,), (qd,))
+            kinetic = kinetic + jnp.sum(element.weights(linkage) * rates**2) / 2
+    return kinetic, potential
+
+
+def added_inertia(
+    linkage: Linkage, forces: Forces, q: Array, qd: Array
+) -> tuple[Added, Array] | None:
+    """The elements' share of the mass matrix and of the bias (3,), if they have one.
+
+    M = J^T W J and bias = J^T W (dJ/dt) qd + dV/dq, J being the derivative of the
+    coordinates: by forward mode alone, whose code is small in derivatives too.
+    """
+    if not inertial(forces):
+        return None
+    matrices, biases = [], []
+    for element in inertial(forces):
+        coordinates = lambda q, e=element: e.coordinates(q, linkage)
+        along = lambda q, c=coordinates: jax.jvp(c, (q,), (qd,))[1]
+        _, turning = jax.jvp(along, (q,), (qd,))
+        jacobian, weights = jax.jacfwd(coordinates)(q), element.weights(linkage)
+        weighted = weights[:, None] * jacobian
+        matrices.append(jnp.sum(weighted[:, :, None] * jacobian[:, None, :], axis=0))
+        slope = jax.jacfwd(lambda q, e=element: e.potential_energy(q, linkage))(q)
+        biases.append(jnp.sum(weighted * turning[:, None], axis=0) + slope)
+    matrix, bias = (reduce(add, rows) for rows in (matrices, biases))
+    upper = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+    m11, m12, m13, m22, m23, m33 = (matrix[place] for place in upper)
+    return (m11, m12, m13, m22, m23, m33), bias

@@ -1,0 +1,217 @@
+"""What pulls or pushes at points of links: springs, constant forces, wrenches."""
+
+from abc import abstractmethod
+from collections.abc import Callable
+from functools import reduce
+from operator import add
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Bool, Float, Int
+from numpy.typing import ArrayLike
+
+from ..checks import instance, real_array
+from ..linkage.linkage import Linkage
+from .element import jumps_of
+from .points import (
+    Load,
+    Point,
+    PointElement,
+    Separation,
+    frames_of,
+    length_of,
+    over,
+    pick,
+)
+
+
+class LineElement(PointElement):
+    """A force element that pulls two points together along the line that joins them.
+
+    A subclass implements `pull`.
+    """
+
+    ends: eqx.AbstractVar[Separation]
+
+    @abstractmethod
+    def pull(self, scheduled: Any, length: Array, rate: Array) -> Array:
+        """The tension over the length [N/m], given that [m] and its rate [m/s]."""
+
+    def _pull(self, scheduled, frames, qd) -> tuple[Array, tuple[Array, ...], Array]:
+        vector = self.ends.vector(frames)
+        slopes = self.ends.slopes(frames, vector)
+        length = length_of(vector)
+        rate = reduce(add, (slope * v for slope, v in zip(slopes, qd)))
+        return vector, slopes, self.pull(scheduled, length, rate * over(length))
+
+    def loads(self, scheduled, frames, qd):
+        vector, _, pull = self._pull(scheduled, frames, qd)
+        return Load(self.ends.a, pull * vector), Load(self.ends.b, -pull * vector)
+
+    def respond(self, scheduled, q, qd, linkage):
+        _, slopes, pull = self._pull(scheduled, frames_of(linkage, q), qd)
+        return tuple(-pull * slope for slope in slopes)
+
+
+class SpringDamper(LineElement):
+    """A spring and a damper between two points, along the line that joins them.
+
+    The tension is stiffness * (length - rest_length) + damping * d(length)/dt. With a
+    rest length, points that meet have no line: the force is then 0.
+
+    **Arguments:**
+
+    - `a`, `b`: the two `Point`s.
+    - `stiffness` [N/m], `damping` [N s/m], `rest_length` [m]: not negative.
+    - `one_sided`: "cable" pulls and never pushes, "bumper" pushes and never pulls, and
+      neither does anything on the other side of the rest length. False: both.
+
+    **Raises:** ValueError for malformed arguments.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig5().linkage
+    >>> spring = fj.SpringDamper(fj.Point(0, 0, 2), fj.Point(1, 1), stiffness=20)
+    >>> float(spring.potential_energy([0, 0, 0], arm))  # stretched to sqrt(5) m
+    50.0
+    """
+
+    ends: Separation
+    stiffness: Float[Array, ""]
+    damping: Float[Array, ""]
+    rest_length: Float[Array, ""]
+    side: Int[Array, ""]  # 1: cable, -1: bumper, 0: both
+
+    def __init__(
+        self,
+        a: Point,
+        b: Point,
+        *,
+        stiffness: ArrayLike = 0.0,
+        damping: ArrayLike = 0.0,
+        rest_length: ArrayLike = 0.0,
+        one_sided: str | bool = False,
+    ):
+        self.ends = Separation(a, b)
+        self.stiffness = real_array("stiffness", stiffness, (), minimum=0)
+        self.damping = real_array("damping", damping, (), minimum=0)
+        self.rest_length = real_array("rest_length", rest_length, (), minimum=0)
+        sides = {False: 0, "cable": 1, "bumper": -1}
+        if not isinstance(one_sided, str | bool) or one_sided not in sides:
+            raise ValueError(
+                f"one_sided: expected False, 'cable' or 'bumper', got {one_sided!r}."
+            )
+        self.side = jax.device_put(np.array(sides[one_sided]))
+
+    def possible(self) -> Array:
+        """Whether nothing is negative that must not be."""
+        elastic = (self.stiffness >= 0) & (self.rest_length >= 0)
+        return elastic & (self.damping >= 0)
+
+    def pull(self, scheduled, length, rate):
+        tension = self.stiffness * (length - self.rest_length) + self.damping * rate
+        beyond = self.side * (length - self.rest_length) > 0
+        works = (self.side == 0) | (beyond & (self.side * tension > 0))
+        # The pull of a spring of no rest length is smooth also where the points meet.
+        other = self.damping * rate - self.stiffness * self.rest_length
+        return jnp.where(works, self.stiffness + other * over(length), 0)
+
+    def potential_energy(self, q: Array, linkage: Linkage) -> Array:
+        """The energy of the spring [J]."""
+        stretch = self.ends.length(linkage, q) - self.rest_length
+        works = (self.side == 0) | (self.side * stretch > 0)
+        return jnp.where(works, self.stiffness * stretch**2 / 2, 0)
+
+
+class Tension(LineElement):
+    """A constant force between two points, along the line that joins them.
+
+    **Arguments:** `a`, `b`: the two `Point`s; `tension`: positive pulls them
+    together [N].
+
+    **Raises:** ValueError for malformed arguments.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig5().linkage
+    >>> rope = fj.Tension(fj.Point(0, 1, 2), fj.Point(1, 1), tension=10)
+    >>> rope(0.0, [0.0, 0.0, 0.0], [0.0, 0.0, 0.0], arm).tolist()  # straight up
+    [10.0, 0.0, 0.0]
+    """
+
+    ends: Separation
+    tension: Float[Array, ""]
+
+    def __init__(self, a: Point, b: Point, tension: ArrayLike):
+        self.ends = Separation(a, b)
+        self.tension = real_array("tension", tension, ())
+
+    def pull(self, scheduled, length, rate):
+        return self.tension * over(length)
+
+    def potential_energy(self, q: Array, linkage: Linkage) -> Array:
+        """Of which the force is the slope: 0 where the points meet [J]."""
+        return self.tension * self.ends.length(linkage, q)
+
+
+class Wrench(PointElement):
+    """A force and a moment from outside, on a point of a link.
+
+    **Arguments:**
+
+    - `point`: where.
+    - `force`: (x, y) [N], or a function of time that returns it.
+    - `moment`: counter-clockwise [N m], or a function of time that returns it.
+    - `follows`: whether the force turns with the link: it is then (along, across).
+
+    **Raises:** ValueError for malformed arguments.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig5().linkage
+    >>> push = fj.Wrench(fj.Point(3, 1), force=[0, 10], moment=1)
+    >>> push(0.0, [0.0, 0.0, 0.0], [0.0, 0.0, 0.0], arm).tolist()  # levers 3, 2, 1 m
+    [31.0, 21.0, 11.0]
+    """
+
+    point: Point
+    force: Any
+    moment: Any
+    follows: Bool[Array, ""]
+
+    def __init__(
+        self,
+        point: Point,
+        force: ArrayLike | Callable[[Array], ArrayLike] = (0.0, 0.0),
+        moment: ArrayLike | Callable[[Array], ArrayLike] = 0.0,
+        *,
+        follows: bool = False,
+    ):
+        instance("point", point, Point)
+        self.point = point
+        self.force = force if callable(force) else real_array("force", force, (2,))
+        self.moment = moment if callable(moment) else real_array("moment", moment, ())
+        instance("follows", follows, bool)
+        self.follows = jax.device_put(np.array(follows))
+
+    @property
+    def jump_ts(self) -> Array | None:
+        """The times at which the functions say that they jump, if they do."""
+        return jumps_of(self.force, self.moment)
+
+    def schedule(self, t, linkage):
+        """Force and moment at a time."""
+        force, moment = self.force, self.moment
+        if callable(force):
+            force = real_array("force", force(t), (2,))
+        if callable(moment):
+            moment = real_array("moment", moment(t), ())
+        return jax.lax.complex(force[0], force[1]), moment
+
+    def loads(self, scheduled, frames, qd):
+        force, moment = scheduled
+        along = pick(self.point.link, frames.direction)
+        return (
+            Load(self.point, jnp.where(self.follows, force * along, force), moment),
+        )

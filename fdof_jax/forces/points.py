@@ -1,0 +1,215 @@
+"""Points of links, and the efforts of loads on them.
+
+Written in scalars, which fuse with the equations of motion; vectors are complex.
+"""
+
+from abc import abstractmethod
+from functools import reduce
+from operator import add
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Complex, Float, Int
+from numpy.typing import ArrayLike
+
+from ..checks import instance, real_array, whole_number
+from ..linkage.linkage import Linkage, real_joints
+from ..mechanics.equations import Scalars
+from ..xla.trigonometry import sincos
+from .element import ScalarElement
+
+
+class Frames(NamedTuple):
+    """Starts and directions of the ground and the moving links: four scalars each.
+
+    `turning`: whether the joint before each moving link is revolute.
+    """
+
+    start: list[Array]
+    direction: list[Array]
+    turning: Scalars
+
+
+def frames_of(linkage: Linkage, q: Scalars) -> Frames:
+    """The frames at joint positions."""
+    turning = real_joints(linkage.ef)
+    angle, start = linkage.base_angle, [jnp.zeros((), complex)]
+    direction = []
+    for k, turns in enumerate(turning):
+        direction.append(_direction(angle))
+        # The length A runs along a link, the slide B across it.
+        slide = jnp.where(turns, linkage.locked[k], q[k])
+        step = jax.lax.complex(linkage.length[k], slide)
+        start.append(start[k] + step * direction[k])
+        angle = angle + jnp.where(turns, q[k], linkage.locked[k])
+    return Frames(start, [*direction, _direction(angle)], turning)
+
+
+def _direction(angle: Array) -> Array:
+    sin, cos = sincos(angle)
+    return jax.lax.complex(cos, sin)
+
+
+def dot(a: Array, b: Array) -> Array:
+    """The dot product of two vectors of the plane."""
+    return a.real * b.real + a.imag * b.imag
+
+
+def cross(a: Array, b: Array) -> Array:
+    """The cross product of two vectors of the plane."""
+    return a.real * b.imag - a.imag * b.real
+
+
+def pick(link: Array, choices: list[Array]) -> Array:
+    """The one of the ground and three links."""
+    chosen = choices[0]
+    for k in (1, 2, 3):
+        chosen = jnp.where(link == k, choices[k], chosen)
+    return chosen
+
+
+class Point(eqx.Module):
+    """A point of a link or of the ground.
+
+    **Arguments:**
+
+    - `link`: 0 is the ground, 1 to 3 are the moving links.
+    - `along`, `across`: place in the link's own frame, whose origin is its
+      characteristic point (the ground's is the ground pivot) and whose first axis is
+      its vector A (the ground's: the base angle) [m].
+
+    **Raises:** ValueError for another link or malformed numbers.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig5().linkage
+    >>> import jax.numpy as jnp
+    >>> fj.Point(1, along=1, across=0.5).position(arm, jnp.zeros(3)).tolist()
+    [1.0, 0.5]
+    """
+
+    link: Int[Array, ""]
+    along: Float[Array, ""]
+    across: Float[Array, ""]
+
+    def __init__(self, link: int, along: ArrayLike = 0.0, across: ArrayLike = 0.0):
+        if whole_number("link", link, 0) > 3:
+            raise ValueError(
+                f"link: expected 0 (the ground) or a moving link, 1 to 3, got {link!r}."
+            )
+        self.link = jax.device_put(np.array(link))
+        self.along = real_array("along", along, ())
+        self.across = real_array("across", across, ())
+
+    def position(self, linkage: Linkage, q: ArrayLike) -> Float[Array, " 2"]:
+        """Where it is: (x, y), from the ground pivot [m]."""
+        place = self.place(frames_of(linkage, tuple(real_array("q", q, (3,)))))
+        return jnp.stack([place.real, place.imag])
+
+    def place(self, frames: Frames) -> Complex[Array, ""]:
+        """Where it is, x + iy [m]."""
+        offset = jax.lax.complex(self.along, self.across)
+        start, direction = (pick(self.link, rows) for rows in frames[:2])
+        return start + offset * direction
+
+
+class Load(NamedTuple):
+    """A force and a moment on a point.
+
+    - `force`: x + iy, a complex number [N]; `moment`: counter-clockwise [N m].
+    """
+
+    point: Point
+    force: Array
+    moment: Any = 0.0
+
+    def efforts(self, frames: Frames) -> tuple[Array, ...]:
+        """The joint efforts that do the same work [N or N m].
+
+        A joint turns what lies beyond it, or slides it across the link before.
+        """
+        efforts = work(frames, self.point.place(frames), self.force, self.moment)
+        return tuple(
+            jnp.where(k < self.point.link, effort, 0)
+            for k, effort in enumerate(efforts)
+        )
+
+
+def work(
+    frames: Frames, place: Array, force: Array, moment: Any = 0.0
+) -> tuple[Array, ...]:
+    """Of a load beyond all joints, per unit of each joint's rate."""
+    rows = zip(frames.turning, frames.start[1:], frames.direction)
+    return tuple(
+        jnp.where(turns, cross(place - pivot, force) + moment, cross(link, force))
+        for turns, pivot, link in rows
+    )
+
+
+class PointElement(ScalarElement):
+    """A force element that acts on points of links or of the ground.
+
+    A subclass implements `loads` [N and N m]. Unlike efforts in the joints, which pass
+    through them, these loads are carried by the bearings: see `joint_reactions`.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig5().linkage
+    >>> class Weight(fj.PointElement):
+    ...     def loads(self, scheduled, frames, qd):
+    ...         return (fj.Load(fj.Point(3, 1.0), force=-10j),)  # downwards at the tip
+    >>> Weight()(0.0, [0.0, 0.0, 0.0], [0.0, 0.0, 0.0], arm).tolist()
+    [-30.0, -20.0, -10.0]
+    """
+
+    @abstractmethod
+    def loads(self, scheduled: Any, frames: Frames, qd: Scalars) -> tuple[Load, ...]:
+        """What it does to the points, given what `schedule` returned."""
+
+    def respond(self, scheduled, q, qd, linkage):
+        frames = frames_of(linkage, q)
+        efforts = [load.efforts(frames) for load in self.loads(scheduled, frames, qd)]
+        return tuple(reduce(add, rows) for rows in zip(*efforts))
+
+
+class Separation(eqx.Module):
+    """Two points, and the line between them."""
+
+    a: Point
+    b: Point
+
+    def __init__(self, a: Point, b: Point):
+        instance("a", a, Point)
+        instance("b", b, Point)
+        self.a, self.b = a, b
+
+    def vector(self, frames: Frames) -> Complex[Array, ""]:
+        """From `a` to `b` [m]."""
+        return self.b.place(frames) - self.a.place(frames)
+
+    def length(self, linkage: Linkage, q: Array) -> Array:
+        """Their distance [m]; its derivative is 0 where it is 0."""
+        return length_of(self.vector(frames_of(linkage, tuple(q))))
+
+    def slopes(self, frames: Frames, vector: Array) -> tuple[Array, ...]:
+        """Derivatives of half of the square of the length: of the length, times it."""
+        works = work(frames, self.a.place(frames), vector)
+        beyond = lambda k, point: jnp.where(k < point.link, 1, 0)
+        return tuple(
+            (beyond(k, self.b) - beyond(k, self.a)) * work
+            for k, work in enumerate(works)
+        )
+
+
+def length_of(vector: Array) -> Array:
+    """Its length; 0 with derivative 0 if it has none."""
+    square = vector.real**2 + vector.imag**2
+    apart = square > 0
+    return jnp.where(apart, jnp.sqrt(jnp.where(apart, square, 1)), 0)
+
+
+def over(length: Array) -> Array:
+    """The reciprocal; 1 where points meet and have no line."""
+    return 1 / jnp.where(length > 0, length, 1)

@@ -1,0 +1,204 @@
+"""What identification returns: parameters, their errors, and what cannot be told."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from ..search.bounded import Run
+from ..simulation.scene import Scene
+from .unknowns import Unknowns, flat
+
+# A combination is weak if its standard error exceeds this part of its size.
+_WEAK = 1.0
+# The scene is doubted where the residuals exceed the given noise by this factor.
+_DOUBTED = 1.5
+# Converged: what a further step would bring, in standard errors, or in sizes.
+_REMAINING = 0.03
+_REMAINING_PART = 1e-6
+# Part of an untold direction above which a parameter belongs to it.
+_SHARED = 1e-6
+
+
+class FitResult(eqx.Module):
+    """Identified parameters and how sure they are; it prints itself as a table.
+
+    - `parameters`: by name, in the unit of each, as in `start`.
+    - `standard_errors`: by name, likewise; infinite for what the motion does not tell.
+    - `names`: of each number in order, for instance `damping` or `mass[0]`.
+    - `covariance`: of the numbers in that order (n, n), the inverse of Gauss and
+      Newton's matrix over the variance of the noise. Infinite between parameters
+      that only a combination is known of.
+    - `weak`: what the motion does not tell, in words: combinations of parameters with
+      no effect on it, and those whose standard error exceeds their size (of each
+      parameter the greater of its value and its scale).
+    - `rms`: root mean square of the residuals, missing samples apart [as observed].
+    - `noise`: over that given, or as estimated from the residuals: the root of their
+      weighted sum of squares over the degrees of freedom [1, or as observed].
+    - `converged`: whether a further step would change the parameters by less than 3 %
+      of their standard errors, or a millionth of their sizes.
+    - `message`: why the search stopped, and what to beware of.
+    - `history`: the weighted sum of squares over all of the recording, from where the
+      search over three quarters of it has led to, and at each accepted point.
+    """
+
+    parameters: dict[str, Any]
+    standard_errors: dict[str, Any]
+    names: tuple[str, ...]
+    covariance: Float[np.ndarray, "n n"]
+    weak: tuple[str, ...]
+    rms: float
+    noise: float
+    converged: bool
+    message: str
+    history: Float[np.ndarray, " iteration"]
+
+    def __str__(self) -> str:
+        values = flat(self.parameters.values())
+        errors = np.sqrt(np.diag(self.covariance))
+        width = max(12, *(len(name) + 2 for name in self.names))
+        rows = [f"{'':{width}}{'value':>12}{'std error':>12}{'relative':>12}"]
+        for name, value, error in zip(self.names, values, errors):
+            share = f"{100 * error / abs(value):.3g} %" if value else ""
+            rows.append(f"{name:{width}}{value:12.5g}{error:12.3g}{share:>12}")
+        rows.append(f"rms residual {self.rms:.4g}")
+        verdict = "converged" if self.converged else "not converged"
+        rows.append(f"{verdict}, {len(self.history) - 1} iterations: {self.message}")
+        return "\n".join([*rows, *self.weak])
+
+
+def told_and_untold(normal: np.ndarray, eps: float) -> tuple[np.ndarray, np.ndarray]:
+    """Of a semidefinite matrix the inverse where it has one, and where it vanishes.
+
+    The latter as directions in columns. Judged with unit diagonal, by a curvature of a
+    thousand times `eps`.
+    """
+    limit = 1e3 * eps
+    diagonal = np.diag(normal)
+    # What has no effect at all has one by rounding.
+    silent = diagonal <= limit**2 * diagonal.max()
+    unit = np.where(silent, 0, 1 / np.sqrt(np.where(silent, 1, diagonal)))
+    values, vectors = np.linalg.eigh(unit[:, None] * normal * unit)
+    told = values > limit * max(values[-1], 1e-300)
+    some = vectors[:, told] * unit[:, None]
+    # Unknowns without effect stand for themselves.
+    untold = vectors[:, ~told] * np.where(silent, 1, unit)[:, None]
+    return (some / values[told]) @ some.T, untold / np.linalg.norm(untold, axis=0)
+
+
+def _sparse(columns: np.ndarray) -> np.ndarray:
+    """Directions that span the same, each of few numbers: rows in echelon form."""
+    rows = columns.T.copy()
+    for index in range(len(rows)):
+        rest = np.abs(rows[index:])
+        row, pivot = np.unravel_index(rest.argmax(), rest.shape)
+        rows[[index, index + row]] = rows[[index + row, index]]
+        rows[index] /= rows[index, pivot]
+        others = np.arange(len(rows)) != index
+        rows[others] -= np.outer(rows[others, pivot], rows[index])
+    return rows
+
+
+def _together(labels: tuple[str, ...], direction: np.ndarray, least: float) -> str:
+    """A direction in words, of parts above `least` of its greatest."""
+    # Of equally large ones the first, or rounding would choose the signs.
+    leading = np.argmax(np.abs(direction) > 0.99 * np.abs(direction).max())
+    parts = direction / direction[leading]
+    kept = np.flatnonzero(np.abs(parts) > least)
+    if len(kept) == 1:
+        return labels[kept[0]]
+    changes = [f"{labels[i]} by {parts[i]:+.3g} %" for i in kept]
+    return f"{', '.join(changes[:-1])} and {changes[-1]} together"
+
+
+def _in_words(labels, untold, covariance) -> tuple[str, ...]:
+    """Of directions and a covariance relative to the parameters' sizes."""
+    words = [
+        "Cannot be told from this motion, which does not change with: "
+        f"{_together(labels, row, 1e-3)}."
+        for row in _sparse(untold)
+    ]
+    variances, vectors = np.linalg.eigh(covariance)
+    for variance, vector in zip(variances[::-1], vectors.T[::-1]):
+        if variance > _WEAK**2:
+            words.append(
+                f"Hardly told from this motion, to {100 * variance**0.5:.3g} % of its "
+                f"size: {_together(labels, vector, 0.05)}."
+            )
+    return tuple(words)
+
+
+def fit_result(
+    run: Run,
+    scene_at: Callable[[dict[str, Any]], Scene],
+    unknowns: Unknowns,
+    noise_given: bool,
+    count: int,
+) -> FitResult:
+    """The result of a run over `count` readings."""
+    assert run.at is not None and run.reason is not None
+    scale = unknowns.flat_scale
+    low, high = unknowns.flat_low, unknowns.flat_high
+    values = np.clip(run.z * scale, low, high)
+    sizes = np.maximum(np.abs(values), scale)
+    # The loss is a mean over recordings, and the parameters relative to their sizes.
+    members = len(run.at.facts["squares"])
+    loss = members * run.at.loss
+    normal = (
+        members * run.at.curvature / 2 * np.outer(sizes, sizes) / np.outer(scale, scale)
+    )
+    slope = members * run.at.gradient / 2 * sizes / scale
+    eps = float(jnp.finfo(float).eps)
+    degrees = count - len(values)
+    variance = 1.0 if noise_given else loss / degrees
+    inverse, untold = told_and_untold(normal, eps)
+    relative = variance * inverse
+    # Infinite along untold directions, with one sign: infinities must not be added up.
+    basis, _ = np.linalg.qr(untold)
+    shared = basis @ basis.T
+    unknown = np.copysign(np.inf, shared)
+    covariance = np.where(np.abs(shared) > _SHARED, unknown, relative)
+    covariance *= np.outer(sizes, sizes)
+    free = (values > low) | (slope < 0)
+    free &= (values < high) | (slope > 0)
+    step = np.zeros_like(slope)
+    if free.any():
+        within, _ = told_and_untold(normal[np.ix_(free, free)], eps)
+        step[free] = within @ slope[free]
+    small = step @ slope <= _REMAINING**2 * variance
+    noise = float(np.sqrt(loss / degrees))
+    parts = [run.reason]
+    for name, value, least, most in zip(unknowns.labels, values, low, high):
+        if value in (least, most):
+            parts.append(f"{name} is at its bound")
+    if noise_given and noise > _DOUBTED:
+        parts.append(
+            f"the residuals are {noise:.3g} times the noise: this scene does not move "
+            "as observed with any such parameters"
+        )
+    parameters = unknowns.named(values)
+    # Parts of the values are what a reader expects, where they are not nearly zero.
+    parts_of = np.where(np.abs(values) > 1e-3 * sizes, values, sizes)
+    untold = untold * (sizes / parts_of)[:, None]
+    try:
+        scene_at(jax.tree.map(jnp.asarray, parameters))
+    except ValueError as error:
+        # Traced values were not refused on the way.
+        parts.append(f"no scene has these parameters ({error}); set bounds")
+    errors = np.sqrt(np.diag(covariance))
+    return FitResult(
+        parameters=parameters,
+        standard_errors=unknowns.named(errors),
+        names=unknowns.labels,
+        covariance=covariance,
+        weak=_in_words(unknowns.labels, untold, relative),
+        rms=float(np.sqrt(np.sum(run.best.facts["squares"]) / count)),
+        noise=noise,
+        converged=bool(small or np.abs(step).max() <= _REMAINING_PART),
+        message="; ".join(parts),
+        history=members * np.array([row.loss for row in run.rows]),
+    )

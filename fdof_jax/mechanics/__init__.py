@@ -1,0 +1,1 @@
+"""The equations at one instant, without forces and without time."""

@@ -1,0 +1,265 @@
+"""The paper's own equations in its six chain coordinates, masked by existence factors.
+
+x = (B1, th2, B2, th3, B3, th4) with absolute angles. Faithful to equations (8)-(27)
+with the printed mistakes corrected where marked; `dynamics` holds the reduced form
+that simulations use.
+"""
+
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float
+
+from ..linkage.linkage import Linkage, compiled
+from ..xla.trigonometry import sincos
+
+
+@compiled(x=(6,))
+def mass_matrix(
+    linkage: Linkage, x: Float[Array, " chain"]
+) -> Float[Array, "chain chain"]:
+    """The 6x6 mass matrix of the generalised chain: left sides of (8)-(13).
+
+    **Arguments:** `x`: (B1, th2, B2, th3, B3, th4), absolute angles [m, rad].
+
+    **Returns:** entries [kg], [kg m] or [kg m^2], by the coordinates.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig5().linkage
+    >>> fj.mass_matrix(arm, [0.0] * 6)[0].tolist()  # of a push on the ground
+    [3.0, 3.0, 2.0, 2.0, 1.0, 1.0]
+    """
+    _, th2, B2, th3, B3, th4 = x
+    th1 = linkage.base_angle
+    _, A2, A3, _ = linkage.length
+    m2, m3, m4 = linkage.mass
+    I2, I3, I4 = linkage.inertia
+    (p2, q2), (p3, q3), (p4, q4) = linkage.com
+    s12, c12 = sincos(th1 - th2)
+    s13, c13 = sincos(th1 - th3)
+    s14, c14 = sincos(th1 - th4)
+    s23, c23 = sincos(th2 - th3)
+    s24, c24 = sincos(th2 - th4)
+    s34, c34 = sincos(th3 - th4)
+    M11 = m2 + m3 + m4
+    M12 = (m2 * q2 + B2 * (m3 + m4)) * s12 + (m2 * p2 + A2 * (m3 + m4)) * c12
+    M13 = (m3 + m4) * c12
+    M14 = (m3 * q3 + m4 * B3) * s13 + (m3 * p3 + m4 * A3) * c13
+    M15 = m4 * c13
+    M16 = m4 * (q4 * s14 + p4 * c14)
+    M22 = I2 + m2 * (p2**2 + q2**2) + (m3 + m4) * (A2**2 + B2**2)
+    M23 = A2 * (m3 + m4)
+    # (11) prints this coefficient with a brace that leaves the cosine term outside.
+    M24 = (m3 * (A2 * q3 - B2 * p3) + m4 * (A2 * B3 - B2 * A3)) * s23 + (
+        m3 * (A2 * p3 + B2 * q3) + m4 * (A2 * A3 + B2 * B3)
+    ) * c23
+    M25 = m4 * (A2 * c23 - B2 * s23)
+    M26 = m4 * ((A2 * q4 - B2 * p4) * s24 + (A2 * p4 + B2 * q4) * c24)
+    M33 = m3 + m4
+    M34 = (m3 * q3 + m4 * B3) * s23 + (m3 * p3 + m4 * A3) * c23
+    M35 = m4 * c23
+    M36 = m4 * (q4 * s24 + p4 * c24)
+    M44 = I3 + m3 * (p3**2 + q3**2) + m4 * (A3**2 + B3**2)
+    M45 = m4 * A3
+    M46 = m4 * ((A3 * q4 - B3 * p4) * s34 + (A3 * p4 + B3 * q4) * c34)
+    M55 = m4
+    M56 = m4 * (q4 * s34 + p4 * c34)
+    # (13) prints L4 for I4.
+    M66 = I4 + m4 * (p4**2 + q4**2)
+    return jnp.array(
+        [
+            [M11, M12, M13, M14, M15, M16],
+            [M12, M22, M23, M24, M25, M26],
+            [M13, M23, M33, M34, M35, M36],
+            [M14, M24, M34, M44, M45, M46],
+            [M15, M25, M35, M45, M55, M56],
+            [M16, M26, M36, M46, M56, M66],
+        ]
+    )
+
+
+@compiled(x=(6,), xd=(6,))
+def bias_force(
+    linkage: Linkage, x: Float[Array, " chain"], xd: Float[Array, " chain"]
+) -> Float[Array, " chain"]:
+    """phi of (14): velocity-dependent forces and gravity, right sides of (8)-(13).
+
+    **Arguments:** `x`, `xd`: chain coordinates and rates [m, rad, m/s, rad/s].
+
+    **Returns:** generalised forces [N, N m], without efforts.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig5().linkage
+    >>> fj.bias_force(arm, [0.0] * 6, [0.0] * 6).tolist()  # weights of a level arm
+    [-29.43, -29.43, -19.62, -19.62, -9.81, -9.81]
+    """
+    _, th2, B2, th3, B3, th4 = x
+    _, w2, v2, w3, v3, w4 = xd
+    th1 = linkage.base_angle
+    g = linkage.gravity
+    _, A2, A3, _ = linkage.length
+    m2, m3, m4 = linkage.mass
+    (p2, q2), (p3, q3), (p4, q4) = linkage.com
+    _, c1 = sincos(th1)
+    s2, c2 = sincos(th2)
+    s3, c3 = sincos(th3)
+    s4, c4 = sincos(th4)
+    s12, c12 = sincos(th1 - th2)
+    s13, c13 = sincos(th1 - th3)
+    s14, c14 = sincos(th1 - th4)
+    s23, c23 = sincos(th2 - th3)
+    s24, c24 = sincos(th2 - th4)
+    s34, c34 = sincos(th3 - th4)
+    phi_B1 = (
+        -(m2 + m3 + m4) * g * c1
+        - (m2 * p2 * w2**2 + w2 * (A2 * w2 + 2 * v2) * (m3 + m4)) * s12
+        + (m2 * q2 * w2**2 + B2 * w2**2 * (m3 + m4)) * c12
+        - (m3 * p3 * w3**2 + m4 * w3 * (A3 * w3 + 2 * v3)) * s13
+        + w3**2 * (m3 * q3 + m4 * B3) * c13
+        - m4 * p4 * w4**2 * s14
+        + m4 * q4 * w4**2 * c14
+    )
+    phi_th2 = (
+        -(m3 + m4) * (2 * B2 * v2 * w2 + g * (A2 * c2 - B2 * s2))
+        - m2 * g * (p2 * c2 - q2 * s2)
+        - (
+            m3 * w3**2 * (A2 * p3 + B2 * q3)
+            + m4 * (2 * A2 * v3 * w3 + w3**2 * (A2 * A3 + B2 * B3))
+        )
+        * s23
+        - (
+            -m3 * w3**2 * (A2 * q3 - B2 * p3)
+            + m4 * (2 * B2 * v3 * w3 - w3**2 * (A2 * B3 - B2 * A3))
+        )
+        * c23
+        - w4**2 * m4 * (A2 * p4 + B2 * q4) * s24
+        + w4**2 * m4 * (A2 * q4 - B2 * p4) * c24
+    )
+    # (10) prints A2 for A3 in the second group, wrong wherever they differ.
+    phi_B2 = (
+        (m3 + m4) * (B2 * w2**2 - g * c2)
+        - (m3 * p3 * w3**2 + m4 * w3 * (A3 * w3 + 2 * v3)) * s23
+        + w3**2 * (m3 * q3 + m4 * B3) * c23
+        - m4 * p4 * w4**2 * s24
+        + m4 * q4 * w4**2 * c24
+    )
+    phi_th3 = (
+        -m3 * g * (p3 * c3 - q3 * s3)
+        - m4 * (2 * B3 * v3 * w3 + g * (A3 * c3 - B3 * s3))
+        + (
+            m3 * (2 * p3 * v2 * w2 + w2**2 * (A2 * p3 + B2 * q3))
+            + m4 * (2 * A3 * v2 * w2 + w2**2 * (A2 * A3 + B2 * B3))
+        )
+        * s23
+        - (
+            m3 * (2 * q3 * v2 * w2 + w2**2 * (A2 * q3 - B2 * p3))
+            + m4 * (2 * B3 * v2 * w2 + w2**2 * (A2 * B3 - B2 * A3))
+        )
+        * c23
+        - m4 * w4**2 * (A3 * p4 + B3 * q4) * s34
+        + m4 * w4**2 * (A3 * q4 - B3 * p4) * c34
+    )
+    phi_B3 = (
+        m4 * (B3 * w3**2 - g * c3)
+        + m4 * w2 * (A2 * w2 + 2 * v2) * s23
+        + m4 * B2 * w2**2 * c23
+        - m4 * p4 * w4**2 * s34
+        + m4 * q4 * w4**2 * c34
+    )
+    phi_th4 = (
+        -m4 * g * (p4 * c4 - q4 * s4)
+        + m4 * (2 * p4 * v2 * w2 + w2**2 * (A2 * p4 + B2 * q4)) * s24
+        - m4 * (2 * q4 * v2 * w2 + w2**2 * (A2 * q4 - B2 * p4)) * c24
+        + m4 * (2 * p4 * v3 * w3 + w3**2 * (A3 * p4 + B3 * q4)) * s34
+        - m4 * (2 * q4 * v3 * w3 + w3**2 * (A3 * q4 - B3 * p4)) * c34
+    )
+    return jnp.stack([phi_B1, phi_th2, phi_B2, phi_th3, phi_B3, phi_th4])
+
+
+@compiled(x=(6,), xd=(6,), force=(6,))
+def masked_accelerations(
+    linkage: Linkage,
+    x: Float[Array, " chain"],
+    xd: Float[Array, " chain"],
+    force: Float[Array, " chain"],
+) -> Float[Array, " chain"]:
+    """Accelerations of the six coordinates by the EF-masked rows (17)-(27).
+
+    The row of a real joint is its row of (15) plus those of the fictitious revolute
+    joints beyond it. The row of a fictitious joint says that it stands still: Bdd = 0,
+    or the same angular acceleration as the link before. The paper gives those rows a
+    mass as coefficient, which may vanish; here it is 1. ((19) prints a minus sign
+    before B3dd M(5,5), wrong wherever the last joint is prismatic.)
+
+    **Arguments:** `x`, `xd`: chain coordinates and rates [m, rad, m/s, rad/s];
+    `force`: joint efforts (F_B1, tau_th2, ..., tau_th4) [N, N m], each revolute one
+    reacting on the preceding link. Those of fictitious joints have no effect.
+
+    **Returns:** `xdd` [m/s^2, rad/s^2].
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig5().linkage
+    >>> level, rest = [0.0] * 6, [0.0] * 6
+    >>> fj.masked_accelerations(arm, level, rest, [0.0] * 6).tolist()  # it falls
+    [0.0, -9.81, 0.0, 0.0, 0.0, 0.0]
+    """
+    ef1, _, ef3, _, ef5, _ = linkage.ef
+    real = linkage.ef > 0.5
+    M = mass_matrix(linkage, x)
+    # Right side of (15) without constraint efforts.
+    right = _generalised(jnp.where(real, force, 0)) + bias_force(linkage, x, xd)
+
+    def masked(rows: Array) -> Array:
+        th4 = rows[5]
+        th3 = rows[3] + ef5 * th4
+        th2 = rows[1] + ef3 * th3
+        return jnp.stack([rows[0], th2, rows[2], th3, rows[4], th4])
+
+    # With the columns of fictitious joints added up likewise, their rows are those of
+    # the identity and nothing but a copy is left to do for them. The real ones are
+    # scaled: metres and radians may be worlds apart.
+    both = jnp.where(jnp.outer(real, real), masked(masked(M).T), jnp.eye(6))
+    diagonal = jnp.diag(both)
+    size = jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1))
+    scaled = jnp.where(real, masked(right), 0) / size
+    xdd = jnp.linalg.solve(both / jnp.outer(size, size), scaled) / size
+    xdd = jnp.where(real, xdd, 0)  # which elimination leaves to rounding
+    th2 = xdd[1]
+    th3 = jnp.where(real[3], xdd[3], th2)
+    th4 = jnp.where(real[5], xdd[5], th3)
+    return jnp.stack([xdd[0], th2, xdd[2], th3, xdd[4], th4])
+
+
+@compiled(x=(6,), xd=(6,), force=(6,))
+def constraint_forces(
+    linkage: Linkage,
+    x: Float[Array, " chain"],
+    xd: Float[Array, " chain"],
+    force: Float[Array, " chain"],
+) -> Float[Array, " chain"]:
+    """Generalised constraint forces at the fictitious joints, (16)-(26).
+
+    What each fictitious joint adds to its command in `force` to stand still. Computed
+    from the accelerations by the balance (15) from the tip inwards, which equals the
+    printed forms ((24) prints an equals sign for a plus).
+
+    **Arguments:** as for `masked_accelerations`.
+
+    **Returns:** forces and torques [N, N m], zero at real joints.
+
+    >>> import fdof_jax as fj
+    >>> arm, start, *_ = fj.scenes.fig7()
+    >>> x, xd = fj.to_chain(arm, *start)
+    >>> fj.constraint_forces(arm, x, xd, [0.0] * 6).tolist()  # the guide's: 4th
+    [10.921, 0.0, 0.0, -0.925, -0.555, 0.0]
+    """
+    xdd = masked_accelerations(linkage, x, xd, force)
+    effort = mass_matrix(linkage, x) @ xdd - bias_force(linkage, x, xd)
+    revolute = jnp.cumsum(effort[::-2])[::-1]  # each revolute joint carries the next
+    total = jnp.stack([effort[0::2], revolute], axis=1).reshape(6)
+    return jnp.where(linkage.ef > 0.5, 0, total - force)
+
+
+def _generalised(force: Array) -> Array:
+    """Generalised forces of joint efforts: a revolute one reacts on the link before."""
+    reaction = jnp.concatenate([force[3::2], jnp.zeros_like(force[:1])])
+    return force.at[1::2].add(-reaction)

@@ -1,0 +1,89 @@
+"""What all pictures share: colours, figures, axes, legends, and checks of arguments."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from ..simulation.solution import Solution
+
+# Okabe and Ito's colours, which the common kinds of colour blindness tell apart.
+BLACK, GREY = "#000000", "#808080"
+SERIES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+
+
+def refuse(name: str, expected: str, got: Any) -> ValueError:
+    """The error to raise for a malformed argument."""
+    return ValueError(f"{name}: expected {expected}, got {got!r}.")
+
+
+def reached(solution: Any, name: str = "solution") -> list[np.ndarray]:
+    """`ts`, `q` and `qd` of one solution, without what it did not reach."""
+    if not isinstance(solution, Solution) or np.ndim(solution.q) != 2:
+        expected = "the Solution of one simulate (of a batch, pass one member)"
+        raise refuse(name, expected, solution)
+    arrays = [np.asarray(a) for a in (solution.ts, solution.q, solution.qd)]
+    finite = np.isfinite(arrays[1]).all(axis=1)
+    if not finite.any():
+        raise refuse(name, "at least one finite sample", solution)
+    return [array[finite] for array in arrays]
+
+
+def filled_mapping(name: str, value: Any, kind: str) -> Mapping:
+    """`value` if it is a dictionary with something in it, else ValueError."""
+    if not isinstance(value, Mapping) or not value:
+        raise refuse(name, f"a dictionary, not empty, of label: {kind}", value)
+    return value
+
+
+def figure_or_new(fig: Any, width: float, height: float) -> Figure:
+    """`fig`, or a new figure of that size [inches]."""
+    if fig is None:
+        return plt.figure(figsize=(width, height), layout="constrained")
+    if not isinstance(fig, Figure):
+        raise refuse("fig", "a matplotlib Figure or None", fig)
+    return fig
+
+
+def axes_or_new(ax: Any, height: float) -> Axes:
+    """`ax`, or those of a new figure of that height [inches]."""
+    if ax is None:
+        return figure_or_new(None, 3.5, height).subplots()
+    if not isinstance(ax, Axes):
+        raise refuse("ax", "matplotlib Axes or None", ax)
+    return ax
+
+
+def xy(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Coordinates of complex points."""
+    return np.real(points).ravel(), np.imag(points).ravel()
+
+
+def plane_axes(ax: Any, points: np.ndarray, *, beside: float = 0.0) -> Axes:
+    """Axes of equal scales; new ones have the proportions of what they will show.
+
+    `beside`: the width of what will stand beside them [inches].
+    """
+    width, height = (max(np.ptp(part), 1e-9) for part in xy(points))
+    ax = axes_or_new(ax, 0.9 + np.clip((2.9 - beside) * height / width, 1.6, 3.6))
+    ax.set_aspect("equal")
+    ax.margins(0.1, 0.16)  # below, the ground needs room
+    ax.set(xlabel="x [m]", ylabel="y [m]")
+    return ax
+
+
+def legend(ax: Axes, *others: Axes) -> None:
+    """A legend above the axes, where it hides nothing, of all that has a label."""
+    found = {}
+    for handles, labels in (a.get_legend_handles_labels() for a in (ax, *others)):
+        found |= dict(zip(labels, handles))
+    columns = max(1, 48 // (4 + max(map(len, found))))
+    columns = -(-len(found) // -(-len(found) // columns))  # as even as the rows allow
+    ax.legend(
+        list(found.values()), list(found), ncols=columns, fontsize="small",
+        frameon=False, handlelength=1.2, columnspacing=1,
+        loc="lower left", bbox_to_anchor=(0, 1), borderaxespad=0.2,
+    )  # fmt: skip

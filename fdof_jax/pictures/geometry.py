@@ -1,0 +1,54 @@
+"""Where the parts of a linkage are during a motion, as pictures draw them."""
+
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from ..linkage.linkage import Linkage, to_chain
+
+
+class Geometry(NamedTuple):
+    """A linkage at all samples; points of the plane are complex numbers.
+
+    Link n runs from where joint n - 1 puts it along A_n to its `end`; the end of link 4
+    is the tip.
+    """
+
+    angle: np.ndarray  # th_1 to th_4 [rad]: (time, 4)
+    slide: np.ndarray  # B_1 to B_3 [m]: (time, 3)
+    revolute: np.ndarray  # whether each real joint is: (3,)
+    end: np.ndarray  # (time, 4)
+    points: dict[str, np.ndarray]  # of all to draw, by name in that order: (time, n)
+
+
+def geometry(linkage: Linkage, q: np.ndarray) -> Geometry:
+    """Where a linkage is at joint positions (time, 3)."""
+    x = np.asarray(jax.vmap(lambda q: to_chain(linkage, q, np.zeros(3))[0])(q))
+    angle = np.column_stack([np.full(len(x), linkage.base_angle), x[:, 1::2]])
+    slide = x[:, 0::2]
+    direction = np.exp(1j * angle)
+    along = np.asarray(linkage.length) * direction
+    steps = along[:, :3] + 1j * slide * direction[:, :3]
+    start = np.cumsum(np.column_stack([np.zeros(len(x)), steps]), axis=1)
+    end = start + along
+    com = np.asarray(linkage.com)
+    foot = start[:, 1:] + com[:, 0] * direction[:, 1:]  # of the mass centre on A_n
+    center = foot + 1j * com[:, 1] * direction[:, 1:]
+    revolute = np.asarray(linkage.ef)[1::2] > 0.5
+
+    points = {}
+    for n in range(4):
+        link = [start[:, n], end[:, n]]
+        if n < 3 and revolute[n]:
+            link.append(start[:, n + 1])  # across by the fixed B_n
+        elif n < 3:
+            points[f"rail {n + 1}"] = np.column_stack([end[:, n], start[:, n + 1]])
+        points[f"link {n + 1}"] = np.column_stack(link)
+    for n in range(3):
+        points[f"mass {n + 2}"] = np.column_stack([foot[:, n], center[:, n]])
+    for n in range(3):
+        kind = "pin" if revolute[n] else "slider"
+        points[f"{kind} {n + 1}"] = start[:, n + 1 : n + 2]
+    points["tip 4"] = end[:, 3:]
+    return Geometry(angle, slide, revolute, end, points)

@@ -1,0 +1,253 @@
+"""Sliders for a notebook, and what is drawn anew while they are moved."""
+
+from collections.abc import Mapping
+from io import BytesIO
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.image import imsave
+
+from ..simulation.scene import Scene
+from ..simulation.simulate import simulate
+from ..simulation.solution import Solution
+from ..simulation.steps import adaptive
+from ..tuning.league import circle_scenes
+from ..tuning.losses import controller_of
+from ..tuning.tune import with_gains
+from .axes import BLACK, SERIES, filled_mapping, legend, reached, refuse, xy
+from .drawing import draw_motion
+from .geometry import geometry
+
+_SAMPLES = 201
+_CONFIGURATIONS = 5  # drawn of each motion
+# What a picture can show, in a time that a hand on a slider does not notice.
+_TOLERANCE, _MAX_STEPS = 1e-5, 4096
+
+
+class _Moved(NamedTuple):
+    """A scene as the sliders have it, and its motion."""
+
+    scene: Scene
+    solution: Solution
+    commanded: Array  # path (time, 2) [m]
+    possible: Array  # whether the arm reaches that: (time,)
+
+
+@eqx.filter_jit
+def _moved(scene: Scene, stretch: Array, factor: Array) -> _Moved:
+    """`stretch`: of the moving links (3,); `factor`: of kp and kd (2, 3)."""
+    linkage = eqx.tree_at(
+        lambda linkage: (linkage.length, linkage.com),
+        scene.linkage,
+        (
+            scene.linkage.length.at[1:].multiply(stretch),
+            scene.linkage.com.at[:, 0].multiply(stretch),
+        ),
+    )
+    controller = controller_of(scene)
+    gains = factor * jnp.stack([controller.kp, controller.kd])
+    scene = with_gains(scene._replace(linkage=linkage), gains)
+    ts = jnp.linspace(0, scene.t1, _SAMPLES)
+    solution = simulate(
+        linkage,
+        scene.state0,
+        ts,
+        scene.forces,
+        stepsize_controller=adaptive(_TOLERANCE, _TOLERANCE),
+        max_steps=_MAX_STEPS,
+        throw=False,
+    )
+    task: Any = controller.reference
+    positions, _ = jax.vmap(lambda t: task(t, linkage))(ts)
+    commanded = jax.vmap(task.tip)(ts)
+    return _Moved(scene, solution, commanded, jnp.isfinite(positions).all(axis=1))
+
+
+def _told(moved: _Moved, error: np.ndarray) -> str:
+    """How the motion ended and what was moved, as HTML; `error`: of the tip [m]."""
+    solution = moved.solution
+    time = float(solution.stats["time_reached"])
+    if not np.all(moved.possible):
+        from_time = float(solution.ts[np.argmin(moved.possible)])
+        text = f"<b>The path is out of the arm's reach</b> from {from_time:.2f} s on."
+    elif str(solution.outcome) != "successful":
+        text = f"<b>Ended at {time:.2f} s: {solution.outcome}.</b>"
+    else:
+        text = f"Tip error: rms {1e3 * np.sqrt(np.mean(error**2)):.3g} mm."
+    linkage, controller = moved.scene.linkage, controller_of(moved.scene)
+    rows = ""
+    for k, revolute in enumerate(np.asarray(linkage.ef)[1::2] > 0.5):
+        kind = "R" if revolute else "P"
+        kp, kd = (
+            f"{float(gain[k]):.4g} {unit}"
+            for gain, unit in zip(
+                (controller.kp, controller.kd), controller.gain_units[kind]
+            )
+        )
+        length = f"A{k + 2} = {float(linkage.length[k + 1]):.3g} m"
+        rows += "<tr>"
+        for cell in (f"{kind}{k + 1}", kp, kd, length):
+            rows += f"<td style='padding-right: 1.5em'>{cell}</td>"
+        rows += "</tr>"
+    head = "<tr><th>joint</th><th>kp</th><th>kd</th><th>link after it</th></tr>"
+    return f"{text}<table style='text-align: left'>{head}{rows}</table>"
+
+
+class _Picture:
+    """An arm with the path of its tip, and the tip's error over time.
+
+    Axes, numbers and legend take most of the time to draw: they are kept as pixels for
+    as long as the motion fits into them. So are the lines, which are moved.
+    """
+
+    def __init__(self):
+        self._figure = Figure(figsize=(7, 3.2), dpi=100)
+        self._canvas = FigureCanvasAgg(self._figure)
+        self._plane = self._figure.add_axes((0.1, 0.16, 0.43, 0.66))
+        self._plane.set_aspect("equal", adjustable="datalim")
+        self._plane.margins(0.1, 0.16)  # below, the ground needs room
+        self._plane.set(xlabel="x [m]", ylabel="y [m]")
+        self._time = self._figure.add_axes((0.64, 0.16, 0.34, 0.66))
+        self._time.set(xlabel="time [s]", ylabel="tip error [mm]")
+        for ax in self._figure.axes:
+            ax.locator_params(nbins=5)
+        self._background: Any = None
+        self._lines: Any = None
+
+    def draw(self, moved: _Moved) -> tuple[bytes, np.ndarray]:
+        """The picture as PNG, and the tip's error [m]; always of the same topology."""
+        ts, q, _ = reached(moved.solution)
+        path = geometry(moved.scene.linkage, q)
+        commanded = np.asarray(moved.commanded) @ [1, 1j]
+        error = np.abs(path.end[:, 3] - commanded[: len(ts)])
+        shown = np.linspace(0, len(ts) - 1, _CONFIGURATIONS).round().astype(int)
+
+        if self._lines is None:
+            (task,) = self._plane.plot([], "--", color=BLACK, lw=1, label="commanded")
+            arms = draw_motion(self._plane, path, shown, mass_centers=False)
+            (errors,) = self._time.plot([], color=SERIES[0], lw=1.2)
+            self._lines = task, arms, errors
+        task, arms, errors = self._lines
+        task.set_data(*xy(commanded))
+        arms.move(path, shown)
+        errors.set_data(ts, 1e3 * error)
+        if self._background is None or not self._fits():
+            self._draw_background(float(moved.solution.ts[-1]))
+        self._canvas.restore_region(self._background)
+        for ax in self._figure.axes:
+            for line in ax.lines:
+                ax.draw_artist(line)
+        png = BytesIO()
+        # Stronger compression costs more time than it saves on the way to the screen.
+        pixels, fast = self._canvas.buffer_rgba(), {"compress_level": 1}
+        imsave(png, pixels, format="png", pil_kwargs=fast)
+        return png.getvalue(), error
+
+    def _fits(self) -> bool:
+        for ax in self._figure.axes:
+            ax.relim()
+        motion, plane = self._plane.dataLim, self._plane.viewLim
+        most, top = self._time.dataLim.y1, self._time.viewLim.y1
+        inside = plane.x0 < motion.x0 and motion.x1 < plane.x1
+        inside &= plane.y0 < motion.y0 and motion.y1 < plane.y1
+        filled = max(motion.width / plane.width, motion.height / plane.height)
+        return inside and filled > 0.5 and 0.3 * top < most < top
+
+    def _draw_background(self, t1: float) -> None:
+        for ax in self._figure.axes:
+            ax.relim()
+            for line in ax.lines:
+                line.set_animated(True)  # left out of the background
+        self._plane.autoscale()
+        self._time.set(xlim=(0, t1), ylim=(0, 1.2 * self._time.dataLim.y1))
+        legend(self._plane)
+        self._canvas.draw()
+        self._plane.autoscale(False)  # new lines would move the view, not the numbers
+        self._background = self._canvas.copy_from_bbox(self._figure.bbox)
+
+
+def sliders(scenes: Mapping[str, Scene] | None = None) -> Any:
+    """A box of sliders for a notebook: a controlled arm is simulated as they are moved.
+
+    A drop-down chooses among the scenes. Sliders stretch the moving links, with their
+    mass centres along them, to 0.5 to 1.5 of their length, and multiply the gains of
+    the PD controller by 1/4 to 4. The arm is drawn at five equal parts of its motion,
+    with the path of its tip and the path that was commanded; beside it is the tip's
+    error over time [mm]. Below stand gains and lengths in their units, and how the
+    motion ended: one that fails or is out of reach is told there, and shown as far as
+    it went.
+
+    The first motion is compiled, for some seconds. Scenes that differ in numbers only,
+    as all topologies do, share that. Motions are right to about 1e-5 m and rad.
+
+    **Arguments:** `scenes`: name -> a scene with exactly one PD controller, which
+    tracks a task with a `tip`; by default `circle_scenes()`, one arm per topology.
+
+    **Returns:** an ipywidgets `Box`; as the last line of a cell it is shown.
+
+    **Raises:** ImportError without ipywidgets; ValueError for malformed arguments.
+    """
+    try:
+        import ipywidgets as widgets
+    except ImportError as error:
+        raise ImportError(
+            "sliders: expected ipywidgets, which pip install 'fdof_jax[notebook]' "
+            "brings."
+        ) from error
+    known = {}
+    scenes = circle_scenes() if scenes is None else scenes
+    for name, scene in filled_mapping("scenes", scenes, "Scene").items():
+        if not isinstance(scene, Scene):
+            raise refuse(f"scenes[{name!r}]", "a Scene", scene)
+        if not callable(getattr(controller_of(scene).reference, "tip", None)):
+            task = controller_of(scene).reference
+            raise refuse(f"scenes[{name!r}]", "a controller of a task with a tip", task)
+        # As an array, so that other times are not compiled anew.
+        known[name] = scene._replace(t1=jnp.asarray(scene.t1, float))
+
+    arm = widgets.Dropdown(options=list(known), description="arm")
+    lengths = [
+        widgets.FloatSlider(1.0, min=0.5, max=1.5, step=0.01, description=f"A{n}")
+        for n in (2, 3, 4)
+    ]
+    # A factor of 4, as in `tune`. The browser shows only whole steps from the least
+    # value: 1 has to be one.
+    most = np.log10(4)
+    span = dict(min=-most, max=most, step=most / 30, readout_format=".2f")
+    gains = [
+        widgets.FloatLogSlider(1.0, description=f"{gain} {k}", **span)
+        for gain in ("kp", "kd")
+        for k in (1, 2, 3)
+    ]
+    image, words = widgets.Image(format="png"), widgets.HTML()
+    pictures = {name: _Picture() for name in known}
+
+    def redraw(change: Any = None) -> None:
+        stretch = jnp.array([slider.value for slider in lengths])
+        factor = jnp.array([slider.value for slider in gains]).reshape(2, 3)
+        moved = _moved(known[arm.value], stretch, factor)
+        image.value, error = pictures[arm.value].draw(moved)
+        words.value = _told(moved, error)
+
+    redraw()
+    # The browser holds back what is moved while a picture is drawn, but for the newest
+    # value: no queue grows.
+    for control in (arm, *lengths, *gains):
+        control.observe(redraw, "value")
+    controls = widgets.VBox(
+        [
+            arm,
+            widgets.HTML("Lengths of the links, times the scene's:"),
+            *lengths,
+            widgets.HTML("Gains of the joints, times the scene's:"),
+            *gains,
+        ]
+    )
+    layout = widgets.Layout(flex_flow="row wrap")
+    return widgets.Box([controls, widgets.VBox([image, words])], layout=layout)

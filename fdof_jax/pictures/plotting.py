@@ -1,0 +1,391 @@
+"""Curves of motions over time and of the tip's path, with matplotlib.
+
+Joint motion, energies, efforts, how a controlled tip tracks its task, and what accuracy
+costs. Arguments and results are as in `drawing`, which holds the pictures of the
+linkage itself.
+"""
+
+import warnings
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.colors import ListedColormap
+from matplotlib.figure import Figure
+from numpy.typing import ArrayLike
+from scipy.integrate import cumulative_simpson
+
+from ..checks import real_array
+from ..control.pd import CircleTask, PDController, saturated
+from ..dynamics import energy, link_energies
+from ..forces.element import Forces, InertialElement
+from ..linkage.linkage import Linkage
+from ..simulation.simulate import joint_efforts
+from ..simulation.solution import Solution
+from .axes import (
+    BLACK,
+    GREY,
+    SERIES,
+    axes_or_new,
+    figure_or_new,
+    filled_mapping,
+    legend,
+    plane_axes,
+    reached,
+    refuse,
+    xy,
+)
+from .geometry import geometry
+
+_LIGHT_GREY = "#BBBBBB"
+# Without the lightest colours, which are hard to see on white.
+_DARK_TO_LIGHT = ListedColormap(colormaps["plasma"](np.linspace(0, 0.85, 256)))
+
+
+def _time_panels(fig: Figure, ts: np.ndarray, panels: list) -> list[Axes]:
+    """Axes above each other: (y label, [(label, values, colour), ...]) over time."""
+    axes = list(fig.subplots(len(panels), squeeze=False, sharex=True)[:, 0])
+    for ax, (ylabel, curves) in zip(axes, panels):
+        for label, values, color in curves:
+            ax.plot(ts, values, color=color, lw=1.2, label=label)
+        ax.set_ylabel(ylabel)
+    axes[-1].set_xlabel("time [s]")
+    fig.align_ylabels(axes)
+    return axes
+
+
+def motion_profile(
+    linkage: Linkage, solution: Solution, fig: Figure | None = None
+) -> Figure:
+    """Motion of the real joints over time, as in the paper's Figs 4 and 6.
+
+    Absolute angles th_n of the links that turn on a revolute joint [degrees], and in
+    axes of their own the slides B_n of the prismatic joints [m].
+
+    **Returns:** the figure.
+
+    **Raises:** ValueError for malformed arguments.
+    """
+    ts, q, _ = reached(solution)
+    g = geometry(linkage, q)
+    angles, slides = [], []
+    for k, revolute in enumerate(g.revolute):
+        if revolute:
+            degrees = np.rad2deg(g.angle[:, k + 1])
+            angles.append((rf"$\theta_{k + 2}$", degrees, SERIES[k]))
+        else:
+            slides.append((f"$B_{k + 1}$", g.slide[:, k], SERIES[k]))
+    panels = [("angle [degrees]", angles), ("slide [m]", slides)][: 1 + bool(slides)]
+    fig = figure_or_new(fig, 3.5, 0.6 + 1.9 * len(panels))
+    for ax in _time_panels(fig, ts, panels):
+        legend(ax)
+    return fig
+
+
+def energy_profile(
+    linkage: Linkage, solution: Solution, fig: Figure | None = None
+) -> Figure:
+    """Kinetic and potential energy of each link, and of all together, over time [J].
+
+    **Returns:** the figure.
+
+    **Raises:** ValueError for malformed arguments.
+    """
+    ts, q, qd = reached(solution)
+    energies = jax.vmap(lambda q, qd: link_energies(linkage, q, qd))(q, qd)
+    kinetic, potential = (np.asarray(each) for each in energies)
+    names = "link 2", "link 3", "link 4"
+    sums = kinetic.sum(axis=1), potential.sum(axis=1), (kinetic + potential).sum(axis=1)
+    whole = zip(("kinetic", "potential", "total"), sums, (*SERIES[3:5], BLACK))
+    panels = [
+        ("kinetic energy [J]", list(zip(names, kinetic.T, SERIES))),
+        ("potential energy [J]", list(zip(names, potential.T, SERIES))),
+        ("of all links [J]", list(whole)),
+    ]
+    fig = figure_or_new(fig, 3.5, 6.0)
+    top, _, bottom = _time_panels(fig, ts, panels)
+    legend(top)
+    legend(bottom)
+    return fig
+
+
+def _powers(linkage: Linkage, forces: Forces, solution: Solution) -> np.ndarray:
+    """What each element does to the arm's energy (element, time) [W].
+
+    Without what only moves to and from its own potential energy, that of a spring.
+    """
+    efforts = joint_efforts(linkage, forces, solution).elements
+    powers = jnp.einsum("etj,tj->et", efforts, solution.qd)
+    for k, element in enumerate(forces):
+        # The efforts of one that moves masses are without those of its energy.
+        if isinstance(element, InertialElement) or not hasattr(
+            element, "potential_energy"
+        ):
+            continue
+
+        def stored(q: Array, qd: Array, element: Any = element) -> Array:
+            energy = lambda q: element.potential_energy(q, linkage)
+            return jax.jvp(energy, (q,), (qd,))[1]
+
+        powers = powers.at[k].add(jax.vmap(stored)(solution.q, solution.qd))
+    return np.asarray(powers)
+
+
+def energy_stack(
+    linkage: Linkage, forces: Forces, solution: Solution, ax: Axes | None = None
+) -> Axes:
+    """Where the energy is over time, stacked [J].
+
+    Kinetic energy, potential energy above its least (springs and masses of force
+    elements included), and what the forces have taken out since the start. The dashed
+    line is the energy at the start and what the forces have put in. It is level where
+    they only take out, and the top of the stack lies on it, but for the errors of the
+    motion and of the integrals of power over its samples (Simpson's rule).
+
+    A force element that drives at times and brakes at others, a motor for instance,
+    does both: it puts in while its power is positive and takes out while it is
+    negative.
+
+    **Arguments:** `forces`: those of the solution.
+
+    **Returns:** the axes.
+
+    **Raises:** ValueError for malformed arguments. Warns where top and line are more
+    than a hundredth of the energy apart: the samples are then too far apart, or the
+    forces are not those of the solution.
+    """
+    ts, q, qd = reached(solution)
+    powers = _powers(linkage, forces, solution)[:, : len(ts)]
+    both = jax.vmap(lambda q, qd: energy(linkage, q, qd, forces))(q, qd)
+    kinetic, potential = (np.asarray(each) for each in both)
+    potential = potential - potential.min()
+    put_in, taken_out = (
+        cumulative_simpson(part.sum(axis=0), x=ts, initial=0)
+        for part in (np.maximum(powers, 0), np.maximum(-powers, 0))
+    )
+    bands = {"kinetic": kinetic, "potential": potential}
+    if forces:
+        bands["taken out"] = taken_out
+    line = kinetic[0] + potential[0] + put_in
+    gap = np.abs(line - sum(bands.values())).max()
+    if gap > 0.01 * line.max():
+        warnings.warn(
+            f"energy_stack: the balance is off by {gap:.3g} J of {line.max():.3g} J: "
+            "expected the forces of the solution, and samples closer in time.",
+            stacklevel=2,
+        )
+    ax = axes_or_new(ax, 2.6)
+    colors = [*SERIES[3:5], _LIGHT_GREY]
+    ax.stackplot(ts, list(bands.values()), labels=list(bands), colors=colors)
+    driven = put_in.max() > 1e-5 * line.max()  # by more than rounding
+    label = "start + put in" if driven else "at the start"
+    ax.plot(ts, line, "--", color=BLACK, lw=1.2, label=label)
+    ax.set(xlabel="time [s]", ylabel="energy [J]", xlim=(ts[0], ts[-1]))
+    legend(ax)
+    return ax
+
+
+def effort_profile(
+    linkage: Linkage, forces: Forces, solution: Solution, fig: Figure | None = None
+) -> Figure:
+    """Total joint efforts over time, one panel per joint [N or N m], with their limits.
+
+    Grey is the band within the finite limits of a `PDController`; where the efforts
+    stay far from them it fills the panel. Orange dots mark the samples at which the
+    controller is saturated.
+
+    **Arguments:** `forces`: those of the solution.
+
+    **Returns:** the figure.
+
+    **Raises:** ValueError for malformed arguments.
+    """
+    reached(solution)
+    efforts = joint_efforts(linkage, forces, solution)
+    ts, total, elements = (np.asarray(a) for a in (solution.ts, *efforts))
+    units = np.where(np.asarray(linkage.ef)[1::2] > 0.5, "N m", "N")
+    panels = []
+    for k, unit in enumerate(units):
+        symbol = f"$T_{k + 2}$" if unit == "N m" else f"$F_{k + 1}$"
+        panels.append((f"{symbol} [{unit}]", [("total", total[:, k], SERIES[0])]))
+    fig = figure_or_new(fig, 3.5, 5.2)
+    axes = _time_panels(fig, ts, panels)
+    for k, (ax, unit) in enumerate(zip(axes, units)):
+        low, high = ax.get_ylim()  # not those of the bands, which may be far wider
+        for element, effort in zip(forces, elements):
+            if isinstance(element, PDController) and np.isfinite(element.limit[k]):
+                limit = float(element.limit[k])
+                ax.axhspan(-limit, limit, color=GREY, alpha=0.15, lw=0, label="limits")
+                at = np.asarray(saturated(element, linkage, solution))[:, k]
+                dots = ax.plot(ts[at], effort[at, k], ".", color=SERIES[1], zorder=3)
+                dots[0].set(label="saturated", gid=f"saturated {k + 1}")
+                if at.any():
+                    low, high = min(low, -1.1 * limit), max(high, 1.1 * limit)
+                text = ax.text(0.98, 0.08, f"limit ±{limit:g} {unit}", ha="right")
+                text.set(fontsize="small", transform=ax.transAxes)
+                text.set_bbox({"fc": "white", "alpha": 0.7, "lw": 0, "pad": 1})
+        ax.set_ylim(low, high)
+    legend(axes[0], *axes)
+    return fig
+
+
+def _tip(
+    linkage: Any, task: Any, solution: Any, name: str = "solution"
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Times of a solution, and the commanded and actual tip positions."""
+    if not callable(getattr(task, "tip", None)):
+        raise refuse("task", "a CircleTask", task)
+    ts, q, _ = reached(solution, name)
+    commanded = np.asarray(jax.vmap(task.tip)(jnp.asarray(ts))) @ [1, 1j]
+    return ts, commanded, geometry(linkage, q).end[:, 3]
+
+
+def _one_turn(task: Any, ts: np.ndarray, path: np.ndarray) -> np.ndarray:
+    """Of the commanded path: dashes drawn over each other become a solid line."""
+    turn = abs(float(getattr(task, "period", np.inf)))
+    return path[ts - ts[0] <= turn * (1 + 1e-6)]
+
+
+def _tips(linkage: Any, task: Any, solutions: Any) -> list[tuple]:
+    """Per solution its label, colour, times, and commanded and actual tip positions."""
+    filled_mapping("solutions", solutions, "Solution")
+    return [
+        (str(label), SERIES[k % len(SERIES)])
+        + _tip(linkage, task, solution, f"solutions[{label!r}]")
+        for k, (label, solution) in enumerate(solutions.items())
+    ]
+
+
+def tracking(
+    linkage: Linkage,
+    task: CircleTask,
+    solutions: Mapping[str, Solution],
+    ax: Axes | None = None,
+) -> Axes:
+    """Paths of the tip and the path it was commanded to follow; dots are the starts.
+
+    Into the axes of `chrono_cyclograph` it adds the path of the paper's Fig 7.
+
+    **Arguments:** `task`: what was commanded, the tip's set point being `task.tip(t)`;
+    `solutions`: one curve per label.
+
+    **Returns:** the axes.
+
+    **Raises:** ValueError for malformed arguments.
+    """
+    curves = _tips(linkage, task, solutions)
+    _, _, ts, longest, _ = max(curves, key=lambda curve: len(curve[2]))
+    longest = _one_turn(task, ts, longest)
+    paths = [(label, color, "-", actual) for label, color, _, _, actual in curves]
+    paths.append(("commanded", BLACK, "--", longest))
+    ax = plane_axes(ax, np.concatenate([path for *_, path in paths]))
+    for label, color, style, path in paths:
+        ax.plot(*xy(path), style, color=color, lw=1.2, label=label)
+        ax.plot(*xy(path[:1]), "o", color=color, markersize=4)
+    legend(ax)
+    return ax
+
+
+def tracking_by_error(
+    linkage: Linkage, task: CircleTask, solution: Solution, ax: Axes | None = None
+) -> Axes:
+    """The path of the tip, coloured by its distance from its set point [mm].
+
+    Dashed is the path it was commanded to follow; the dot is its start. Later turns lie
+    on earlier ones.
+
+    **Arguments:** `task`: what was commanded, the tip's set point being `task.tip(t)`.
+
+    **Returns:** the axes, with a colour bar beside them.
+
+    **Raises:** ValueError for malformed arguments.
+    """
+    ts, commanded, actual = _tip(linkage, task, solution)
+    error = 1000 * np.abs(actual - commanded)
+    commanded = _one_turn(task, ts, commanded)
+    ax = plane_axes(ax, np.concatenate([commanded, actual]), beside=0.8)
+    ax.plot(*xy(commanded), "--", color=BLACK, lw=0.8, label="commanded")
+    corners = np.column_stack(xy(actual))
+    pieces = LineCollection(
+        list(np.stack([corners[:-1], corners[1:]], axis=1)),
+        array=(error[:-1] + error[1:]) / 2,
+        cmap=_DARK_TO_LIGHT,
+        lw=2,
+        capstyle="round",
+    )
+    pieces.set_clim(0, error.max())
+    ax.add_collection(pieces)
+    ax.autoscale_view()
+    ax.plot(*corners[0], "o", color=_DARK_TO_LIGHT(pieces.norm(error[0])), ms=4)
+    # As high as the axes, which equal scales may make lower than their place.
+    bar = ax.inset_axes((1.04, 0, 0.05, 1))
+    ax.figure.colorbar(pieces, cax=bar, label="tip error [mm]")
+    legend(ax)
+    return ax
+
+
+def tracking_error(
+    linkage: Linkage,
+    task: CircleTask,
+    solutions: Mapping[str, Solution],
+    ax: Axes | None = None,
+) -> Axes:
+    """Distance of the tip from its set point over time [m].
+
+    **Arguments:** as of `tracking`.
+
+    **Returns:** the axes.
+
+    **Raises:** ValueError for malformed arguments.
+    """
+    curves = _tips(linkage, task, solutions)
+    ax = axes_or_new(ax, 2.6)
+    for label, color, ts, commanded, actual in curves:
+        ax.plot(ts, np.abs(actual - commanded), color=color, lw=1.2, label=label)
+    ax.set(xlabel="time [s]", ylabel="tip error [m]")
+    ax.set_ylim(bottom=0)
+    legend(ax)
+    return ax
+
+
+def work_precision(
+    measured: Mapping[str, tuple[ArrayLike, ArrayLike]], ax: Axes | None = None
+) -> Axes:
+    """What accuracy costs: times over errors, both on logarithmic axes.
+
+    The errors are yours, and so is their unit: the label of the axis is "error".
+
+    **Arguments:** `measured`: label -> (errors, times [s]), as many of each, all above
+    0; in any order.
+
+    **Returns:** the axes.
+
+    **Raises:** ValueError for malformed arguments.
+    """
+    curves = {}
+    for label, pair in filled_mapping("measured", measured, "(errors, times)").items():
+        name = f"measured[{label!r}]"
+        if not isinstance(pair, tuple) or len(pair) != 2:
+            raise refuse(name, "(errors, times)", pair)
+        errors, times = (
+            np.asarray(real_array(name, p, (None,), above=0)) for p in pair
+        )
+        if len(errors) != len(times):
+            got = f"{len(errors)} errors and {len(times)} times"
+            raise ValueError(f"{name}: expected as many errors as times, got {got}.")
+        order = np.argsort(errors)
+        curves[str(label)] = errors[order], times[order]
+    ax = axes_or_new(ax, 2.8)
+    for k, (label, curve) in enumerate(curves.items()):
+        style = dict(color=SERIES[k % len(SERIES)], marker="osD^v<"[k % 6])
+        ax.loglog(*curve, lw=1.2, ms=4, label=label, **style)
+    ax.set(xlabel="error", ylabel="time [s]")
+    ax.grid(which="major", lw=0.4, color=_LIGHT_GREY)
+    legend(ax)
+    return ax

@@ -1,0 +1,1 @@
+"""Bounded minimisation of many functions at once."""

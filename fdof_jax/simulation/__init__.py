@@ -1,0 +1,1 @@
+"""Motion in time: integration, its steps, and batches of motions."""

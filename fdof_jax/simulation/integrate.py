@@ -1,0 +1,286 @@
+"""The vector field of a linkage with force elements, integrated by diffrax."""
+
+import inspect
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from ..checks import is_traced
+from ..forces.added_inertia import inertial
+from ..forces.element import Forces, jumps_of
+from ..linkage.linkage import possible
+from ..mechanics.equations import link_constants, zeros
+from ..xla.callbacks import without_checks
+from ..xla.configuration import small_loops_are_kernels
+from .dopri8 import ScheduledTerm
+from .field import (
+    Args,
+    health_of,
+    initial_own,
+    own_states,
+    schedule_of,
+    vector_field,
+    watched_field,
+)
+from .looped_dopri8 import LoopedDopri8
+from .prescribed import (
+    health_of_hybrid,
+    hybrid_field,
+    motion_at,
+    prescribed,
+    start_of,
+)
+from .solution import Solution
+from .steps import (
+    Watched,
+    bounded,
+    default_controller,
+    landing_on,
+    undifferentiated,
+)
+from .unrolled_dopri8 import UnrolledDopri8
+
+# Steps over the time scale of a mode that keep its tangents to 1e-7 over 10 s: those of
+# methods of order 8, and of lower ones down to 5.
+_OF_TIME_SCALE = 0.7, 0.1
+
+
+def _step_for_tangents(t0: Array, args: Args, own: tuple, fraction: float) -> Array:
+    """A step short enough for derivatives [s], where the motion would allow more.
+
+    A fraction of the time scale 1/omega of the fastest mode about the start: a step's
+    length is chosen by the error of the motion alone, and an arm that hangs at rest has
+    none. The trace of the squared linearisation bounds omega^2 free of units.
+    """
+    still = zeros(args.q0)
+    scheduled = schedule_of(t0, args)
+
+    def accelerations(delta):
+        y = (tuple(delta), still, *own)
+        return jnp.stack(vector_field(t0, y, args, scheduled)[1])
+
+    linearised = jax.jacfwd(accelerations)(jnp.zeros_like(args.q0))
+    omega2 = jnp.sqrt(jnp.abs(jnp.sum(linearised * linearised.T)))
+    step = fraction / jnp.sqrt(omega2)
+    return jax.lax.stop_gradient(jnp.where(step > 0, step, jnp.inf))
+
+
+def _batch_solver(forces: Forces) -> diffrax.AbstractSolver:
+    """What solves large batches fastest."""
+    # Thirteen copies of such equations take minutes to compile.
+    many = inertial(forces) or prescribed(forces)
+    return diffrax.Dopri8() if many else UnrolledDopri8()
+
+
+def _tangent_solver(forces: Forces) -> diffrax.AbstractSolver:
+    """What solves fastest with derivatives in forward mode."""
+    many = inertial(forces) or prescribed(forces)
+    if many or small_loops_are_kernels():
+        return LoopedDopri8()
+    return UnrolledDopri8(for_tangents=True)
+
+
+def _integrate(
+    solver, inputs, keywords, derivatives: bool = False, padded: bool = False
+) -> Solution:
+    """`derivatives`: whether they are wanted, to the accuracy of the default steps.
+
+    `padded`: whether the last time stands there more than once.
+    """
+    linkage, state0, asked, own0, forces = inputs
+    # What no door has seen is told by the result. Something harmless is integrated in
+    # its place: derivatives of NaN would spoil those in what is shared with others.
+    growth = jnp.diff(asked)
+    increasing = ((growth >= 0) if padded else (growth > 0)).all()
+    harmless = 1e-3 * jnp.arange(len(asked), dtype=asked.dtype)
+    ts = jnp.where(increasing, asked, harmless)
+    finite = (jnp.isfinite(state0.q) & jnp.isfinite(state0.qd)).all()
+    valid = possible(linkage) & increasing & finite
+    for element in forces:
+        if hasattr(element, "possible"):
+            valid = valid & element.possible()
+    motion = prescribed(forces)
+    if motion is not None:
+        valid = valid & motion.agrees(ts[0], jnp.asarray(state0.q), linkage)
+    q0, qd0 = (jnp.where(finite, a, 0) for a in state0)
+    # Once per solve: the start may be any number of turns away.
+    constants = link_constants(linkage, q0, lambda x: (jnp.sin(x), jnp.cos(x)))
+    args = Args(linkage, q0, constants, forces)
+    own = initial_own(args, own0)
+    for state in own:
+        known = jnp.isfinite(jnp.array(state)).all()
+        valid, own = valid & known, (tuple(jnp.where(known, x, 0) for x in state),)
+    if motion is None:
+        term = ScheduledTerm(vector_field, schedule_of, health_of, watched_field)
+        start = zeros(q0), tuple(qd0)
+    else:
+        term = ScheduledTerm(hybrid_field, schedule_of, health_of_hybrid)
+        start = start_of(motion, args, qd0)
+    controller = keywords["stepsize_controller"]
+    # Stiff modes, which implicit solvers are taken for, would make the steps too short.
+    implicit = isinstance(solver, diffrax.AbstractImplicitSolver)
+    trusted = controller is not None and implicit
+    if controller is None:
+        controller = default_controller()
+    if derivatives and not trusted:
+        fraction = _OF_TIME_SCALE[0 if (solver.order(term) or 0) >= 8 else 1]
+        longest = lambda: _step_for_tangents(ts[0], args, own, fraction)
+        controller = bounded(controller, longest)
+    controller = undifferentiated(controller)
+    if (jumps := jumps_of(*forces)) is not None:
+        controller = landing_on(controller, jumps.astype(ts.dtype))
+    adaptive = isinstance(controller, diffrax.AbstractAdaptiveStepSizeController)
+    if adaptive and not isinstance(solver, UnrolledDopri8 | LoopedDopri8):
+        controller = Watched(controller, term.health)  # pyright: ignore[reportCallIssue]
+    with without_checks():
+        solution = diffrax.diffeqsolve(
+            term,
+            solver,
+            t0=ts[0],
+            t1=ts[-1],
+            y0=(*start, *own),
+            args=args,
+            saveat=diffrax.SaveAt(
+                subs=(
+                    diffrax.SubSaveAt(ts=ts),
+                    diffrax.SubSaveAt(t1=True, fn=lambda t, y, args: t),
+                )
+            ),
+            throw=False,
+            **keywords | {"stepsize_controller": controller},
+        )
+    assert solution.ys is not None  # because of saveat
+    states, (reached,) = solution.ys
+    own_rows = [jax.vmap(lambda rows: own_states(args, rows))(o) for o in states[2:]]
+    if motion is None:
+        delta, qd = (jnp.stack(rows, axis=-1) for rows in states[:2])
+        q = q0[None] + delta
+    else:
+        q, qd = jax.vmap(lambda t, y: motion_at(motion, args, t, y))(ts, states[:2])
+
+    def shown(a):
+        """NaN where diffrax has not come to save: it leaves infinity."""
+        return jnp.where(jnp.isinf(a) | ~valid, jnp.nan, a)
+
+    # diffrax saves the start with the first step.
+    q, qd = shown(q).at[0].set(state0.q), shown(qd).at[0].set(state0.qd)
+    own_states_shown = tuple(jax.tree.map(shown, own_rows[0])) if own_rows else ()
+    reached = jnp.where(valid, reached, asked[0])
+    results: Any = diffrax.RESULTS
+    # Steps of constant size, too long for instance, end with NaN as their success.
+    lost = ~(jnp.isfinite(q[-1]) & jnp.isfinite(qd[-1])).all()
+    lost = lost & (solution.result == results.successful)
+    result = results.where(valid & ~lost, solution.result, results.nonfinite)
+    stats = solution.stats | {"time_reached": reached}
+    return Solution(asked, q, qd, stats, result, own_states_shown)
+
+
+@eqx.filter_custom_vjp
+def _integrate_reversibly(inputs, solver, keywords) -> Solution:
+    """A motion whose derivatives are taken in reverse mode, if any are.
+
+    The default solver's unrolled stages are not for that: they are compiled differently
+    with derivatives and without, and a replay has to come to the same bits.
+    """
+    # Nothing is differentiated here, and loops made for that take longer to compile.
+    keywords = keywords | {"adjoint": diffrax.ForwardMode()}
+    return _integrate(solver or _batch_solver(inputs[-1]), inputs, keywords)
+
+
+@_integrate_reversibly.def_fwd
+def _integrate_reversibly_fwd(perturbed, inputs, solver, keywords):
+    moving, fixed = eqx.partition(inputs, perturbed)
+
+    def motion(moving):
+        inputs = eqx.combine(moving, fixed)
+        solution = _integrate(
+            solver or LoopedDopri8(), inputs, keywords, derivatives=True
+        )
+        return (solution.q, solution.qd, solution.own), solution
+
+    states, pull_back, solution = eqx.filter_vjp(motion, moving, has_aux=True)
+    return solution, (pull_back, states)
+
+
+@_integrate_reversibly.def_bwd
+def _integrate_reversibly_bwd(
+    residuals, cotangent, perturbed, inputs, solver, keywords
+):
+    pull_back, states = residuals
+    wanted = eqx.combine(
+        (cotangent.q, cotangent.qd, cotangent.own),
+        jax.tree.map(jnp.zeros_like, states),
+    )
+    (gradient,) = pull_back(wanted)
+    return gradient
+
+
+def _opened(inputs):
+    """The inputs, with what plain functions among the forces close over as leaves."""
+    linkage, state0, ts, own0, forces = inputs
+    arguments = ts[0], *state0, linkage
+    opened = tuple(
+        eqx.filter_closure_convert(element, *arguments)
+        if inspect.isfunction(element)
+        else element
+        for element in forces
+    )
+    return linkage, state0, ts, own0, opened
+
+
+@eqx.filter_jit
+def solve(solver, inputs, keywords) -> Solution:
+    """The motion, by a program for traced values: of a batch or of a derivative."""
+    adjoint = keywords["adjoint"]
+    if isinstance(adjoint, diffrax.RecursiveCheckpointAdjoint):
+        return _integrate_reversibly(_opened(inputs), solver, keywords)
+    if solver is None:
+        forward = isinstance(adjoint, diffrax.ForwardMode)
+        solver = _tangent_solver(inputs[-1]) if forward else LoopedDopri8()
+    return _integrate(solver, inputs, keywords, derivatives=True)
+
+
+# Fewer output times than this share a program.
+_FEWEST_TIMES = 512
+
+
+def solve_one(solver, inputs, keywords) -> tuple[Solution, bool] | None:
+    """The motion of one arm and whether it succeeded, by a short program.
+
+    Other numbers of output times need no other program: they are filled up with the
+    last one to a power of two. For known values only: None if a force element turns
+    out to hold a traced one.
+    """
+    linkage, state0, ts, own0, forces = inputs
+    times = np.asarray(ts)
+    count = len(times)
+    size = max(_FEWEST_TIMES, 1 << (count - 1).bit_length())
+    filled = np.pad(times, (0, size - count), mode="edge")
+    solution, succeeded = _solve_padded(
+        solver, (linkage, state0, filled, own0, forces), keywords
+    )
+    if is_traced(solution):
+        return None
+
+    def cut(rows: Array) -> Array:
+        # Slices by JAX are compiled, as is jnp.asarray for each new shape.
+        return jax.device_put(np.asarray(rows)[:count])
+
+    q, qd, own = cut(solution.q), cut(solution.qd), jax.tree.map(cut, solution.own)
+    whole = Solution(ts, q, qd, solution.stats, solution.result, own)
+    return whole, bool(succeeded)
+
+
+@eqx.filter_jit
+def _solve_padded(solver, inputs, keywords) -> tuple[Solution, Array]:
+    # Steps are bounded as they would be with derivatives of this kind.
+    derivatives = isinstance(keywords["adjoint"], diffrax.ForwardMode)
+    keywords = keywords | {"adjoint": diffrax.ForwardMode()}
+    solver = LoopedDopri8() if solver is None else solver
+    solution = _integrate(solver, inputs, keywords, derivatives, padded=True)
+    return solution, solution.result == diffrax.RESULTS.successful

@@ -1,0 +1,178 @@
+"""Hybrid dynamics: some joints move as prescribed, the others as they are driven.
+
+The state has the momenta of the driven joints in place of their velocities: they stay
+as they are where a prescribed velocity jumps.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Bool, Float
+
+from ..control.pd import Reference, checked_reference, positions_at, reference_motion
+from ..forces.added_inertia import added_inertia
+from ..forces.element import Forces
+from ..linkage.linkage import Linkage
+from ..mechanics.equations import equations, link_constants, zeros
+from ..xla.array_namespace import in_numpy
+from ..xla.callbacks import with_checks
+from .field import LEAST_INERTIA_RATIO, Args, applied
+
+
+class PrescribedMotion(eqx.Module):
+    """Joints that follow a reference exactly, whatever effort that takes.
+
+    At a jump of the reference's velocity the velocities of the other joints jump too,
+    as the impulse demands. `joint_efforts` returns the effort [N or N m], but for such
+    impulses.
+
+    The velocities of a `state0` are those before the first time: where they are not the
+    reference's, the motion starts with a blow. Adaptive steps look at the displacements
+    of the other joints and at their momenta.
+
+    **Arguments:**
+
+    - `joints`: numbers of the joints that it moves, of 1 to 3; one, or a tuple.
+    - `reference`: `(t, linkage) -> (q, qd)`, as for a `PDController`; what it says of
+      other joints does not count. Its positions must be continuous, and at the start of
+      a simulation those of `state0`; its velocities must be their rates.
+
+    **Raises:** ValueError for malformed arguments.
+    """
+
+    moved: Bool[Array, " joint"]
+    reference: Reference
+
+    def __init__(self, joints: int | tuple[int, ...], reference: Reference):
+        numbers = joints if isinstance(joints, tuple) else (joints,)
+        if not numbers or any(
+            isinstance(n, bool) or not isinstance(n, int) or n not in (1, 2, 3)
+            for n in numbers
+        ):
+            raise ValueError(
+                f"joints: expected a number of 1 to 3, or a tuple of such, got "
+                f"{joints!r}."
+            )
+        self.moved = jax.device_put(np.isin([1, 2, 3], numbers))
+        self.reference = checked_reference(reference)
+
+    @with_checks
+    def at(self, t: Array, linkage: Linkage) -> tuple[Array, Array]:
+        """Positions and velocities of the reference at a time, checked."""
+        return reference_motion(self.reference, t, linkage)
+
+    def agrees(self, t: Array, q: Array, linkage: Linkage) -> Array:
+        """Whether joint positions are those of the reference, to one in a million."""
+        begin = positions_at(self.reference, t, linkage)
+        q, moved = in_numpy((q, self.moved))
+        near = abs(q - begin) <= 1e-6 * (1 + abs(begin))
+        return (near | ~moved).all()
+
+    def __call__(self, t: Array, q: Array, qd: Array, linkage: Linkage) -> Array:
+        """Nothing: what it takes depends on all other elements."""
+        return jnp.zeros(3)
+
+    @property
+    def jump_ts(self) -> Array | None:
+        """The times at which the reference says that it jumps, if it does."""
+        return getattr(self.reference, "jump_ts", None)
+
+    def check(self, linkage: Linkage, ts: Array) -> None:
+        """The reference's own check, if it has one."""
+        check_reference: Any = getattr(self.reference, "check", None)
+        if check_reference is not None:
+            check_reference(linkage, ts)
+
+
+def prescribed(forces: Forces) -> PrescribedMotion | None:
+    """The one among the elements that prescribes a motion, if there is one."""
+    found = [e for e in forces if isinstance(e, PrescribedMotion)]
+    if len(found) > 1:
+        raise ValueError(
+            f"forces: expected one PrescribedMotion at most, got {len(found)}."
+        )
+    return found[0] if found else None
+
+
+def _mass_and_bias(args: Args, q: Array, qd: Array) -> tuple[Array, Array]:
+    """Of the linkage and the elements that move masses: (3, 3) and (3,)."""
+    m = equations(args.constants, tuple(q - args.q0), tuple(qd))
+    six, bias = (m.m11, m.m12, m.m13, m.m22, m.m23, m.m33), jnp.stack(m.bias)
+    more = added_inertia(args.linkage, args.forces, q, qd)
+    if more is not None:
+        six = tuple(a + b for a, b in zip(six, more[0]))
+        bias = bias + more[1]
+    m11, m12, m13, m22, m23, m33 = six
+    return jnp.array([[m11, m12, m13], [m12, m22, m23], [m13, m23, m33]]), bias
+
+
+def _split(moved: Array, matrix: Array, known: Array, right: Array) -> Array:
+    """What solves the rows of the driven joints, the prescribed ones being known."""
+    free = jnp.where(jnp.outer(~moved, ~moved), matrix, jnp.eye(3))
+    known = jnp.where(moved, known, 0)
+    return jnp.linalg.solve(free, jnp.where(moved, known, right - matrix @ known))
+
+
+def motion_at(
+    motion: PrescribedMotion, args: Args, t: Any, y: Any
+) -> tuple[Array, Array]:
+    """Joint positions and velocities of a state of displacements and momenta."""
+    delta, momenta, *_ = y
+    position, velocity = motion.at(t, args.linkage)
+    q = jnp.where(motion.moved, position, args.q0 + jnp.stack(delta))
+    matrix, _ = _mass_and_bias(args, q, jnp.zeros(3))
+    return q, _split(motion.moved, matrix, velocity, jnp.stack(momenta))
+
+
+def start_of(motion: PrescribedMotion, args: Args, qd: Array) -> tuple[Any, Any]:
+    """Displacements and momenta at the start, before any jump there."""
+    matrix, _ = _mass_and_bias(args, args.q0, jnp.zeros(3))
+    return zeros(args.q0), tuple(jnp.where(motion.moved, 0, matrix @ qd))
+
+
+def hybrid_field(t, y, args, schedule) -> tuple[Any, ...]:
+    """Rates of displacements and momenta: those of prescribed joints stand still.
+
+    The momenta change by M' qd - bias + tau, where M' is the mass matrix's own rate.
+    """
+    motion = prescribed(args.forces)
+    assert motion is not None  # or this were not the field
+    own = y[2:]
+    q, qd = motion_at(motion, args, t, y)
+    acting = applied(t, (tuple(q - args.q0), tuple(qd), *own), args, schedule)
+    # The bias of masses that elements move is in the efforts already.
+    bias = jnp.stack(equations(args.constants, tuple(q - args.q0), tuple(qd)).bias)
+    momenta = lambda q: _mass_and_bias(args, q, jnp.zeros(3))[0] @ qd
+    _, change = jax.jvp(momenta, (q,), (qd,))
+    driven = jnp.where(motion.moved, 0, change - bias + jnp.stack(acting.tau))
+    moving = tuple(jnp.where(motion.moved, 0, qd)), tuple(driven)
+    return (*moving, acting.own_rates) if own else moving
+
+
+def health_of_hybrid(t, y, args) -> Array:
+    """The health of the driven joints' equations: see `vector_field.health_of`."""
+    motion = prescribed(args.forces)
+    assert motion is not None
+    q, _ = motion_at(motion, args, t, y)
+    matrix, _ = _mass_and_bias(args, q, jnp.zeros(3))
+    free = jnp.where(jnp.outer(~motion.moved, ~motion.moved), matrix, jnp.eye(3))
+    loss = jnp.max(jnp.diag(free) * jnp.diag(jnp.linalg.inv(free)))
+    return jnp.where(loss * LEAST_INERTIA_RATIO[loss.dtype] <= 1, loss, 0)
+
+
+def prescribed_effort(
+    linkage: Linkage, forces: Forces, t: Array, q: Array, qd: Array, tau: Array
+) -> Float[Array, " joint"]:
+    """What the prescribed motion takes, the other elements' efforts being `tau`."""
+    motion = prescribed(forces)
+    assert motion is not None
+    args = Args(linkage, q, link_constants(linkage, q), forces)
+    matrix, bias = _mass_and_bias(args, q, qd)
+    velocity = lambda t: motion.at(t, linkage)[1]
+    _, demanded = jax.jvp(velocity, (t,), (jnp.ones_like(t),))
+    qdd = _split(motion.moved, matrix, demanded, tau - bias)
+    return jnp.where(motion.moved, matrix @ qdd + bias - tau, 0)

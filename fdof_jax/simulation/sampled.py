@@ -1,0 +1,227 @@
+"""Control in discrete time: efforts that are held from one sample to the next."""
+
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from ..checks import callable_tuple, concrete, real_array, whole_number
+from ..forces.element import Forces, ScalarElement, StatefulElement
+from ..forces.joints import JointEffort
+from ..linkage.linkage import Linkage, State, check_linkage, real_state
+from .field import stateful
+from .simulate import check_elements, simulate
+
+
+class _Switched(ScalarElement):
+    """One effort before a time, another from it on."""
+
+    before: Float[Array, " joint"]
+    after: Float[Array, " joint"]
+    switch: Float[Array, ""]
+
+    def schedule(self, t, linkage):
+        return tuple(jnp.where(t < self.switch, self.before, self.after))
+
+    def respond(self, scheduled, q, qd, linkage):
+        return scheduled
+
+    @property
+    def jump_ts(self) -> Array:
+        return self.switch[None]
+
+
+def _without_states(forces: Any) -> None:
+    callable_tuple("forces", forces)
+    if any(isinstance(e, StatefulElement) for e in forces):
+        raise ValueError(
+            "forces: expected elements without a state of their own, which would be "
+            "lost (simulate takes such states as own0 and returns them), got "
+            f"{forces!r}."
+        )
+
+
+def step(
+    linkage: Linkage,
+    state: State,
+    tau: ArrayLike,
+    dt: ArrayLike,
+    forces: Forces = (),
+    *,
+    t: ArrayLike = 0.0,
+    **options: Any,
+) -> State:
+    """The state after a time, under efforts that are constant until then.
+
+    The transition of a discrete-time model, for reinforcement learning and predictive
+    control: pure, batched by `jax.vmap`, differentiable in everything.
+
+    **Arguments:**
+
+    - `linkage`, `state`: the arm, and its joint positions and velocities.
+    - `tau`: joint efforts, (3,) [N or N m]; `dt`: how long they are held [s].
+    - `forces`: what else acts, elements without a state of their own; `t`: the time at
+      the start, which they are given [s].
+    - `options`: keywords of `simulate`.
+
+    **Returns:** the `State` at the end; NaN if the solve failed.
+
+    **Raises:** ValueError for malformed arguments.
+    """
+    _without_states(forces)
+    state = real_state("state", state)
+    dt, t = real_array("dt", dt, (), above=0), real_array("t", t, ())
+    ts = jnp.stack([t, t + dt])
+    effort = JointEffort(tau)
+    options = dict(throw=False) | options
+    solution = simulate(linkage, state, ts, (*forces, effort), **options)
+    return State(solution.q[-1], solution.qd[-1])
+
+
+class SampledMotion(NamedTuple):
+    """A motion under sampled control.
+
+    - `ts`: sampling times, the end included (samples + 1,) [s].
+    - `q`, `qd`: joint positions and velocities there, NaN after a failure.
+    - `tau`: what was commanded at each sample (samples, 3) [N or N m].
+    - `result`: diffrax's, `successful` or that of the first period that failed.
+    - `own`: the states of the forces' `StatefulElement`s at `ts`.
+    """
+
+    ts: Float[Array, " time"]
+    q: Float[Array, "time joint"]
+    qd: Float[Array, "time joint"]
+    tau: Float[Array, "sample joint"]
+    result: diffrax.RESULTS
+    own: tuple[Any, ...]
+
+
+def simulate_sampled(
+    linkage: Linkage,
+    state0: State,
+    control: Any,
+    period: ArrayLike,
+    samples: int,
+    forces: Forces = (),
+    *,
+    t0: ArrayLike = 0.0,
+    delay: ArrayLike = 0.0,
+    noise: tuple[ArrayLike, ArrayLike] | None = None,
+    key: Array | None = None,
+    **options: Any,
+) -> SampledMotion:
+    """The motion under a controller that looks once per period and holds its effort.
+
+    **Arguments:**
+
+    - `linkage`, `state0`: the arm, and its joint positions and velocities.
+    - `control`: a force element, a `PDController` for instance. The state of one that
+      has one, a `PIDController`'s, takes a step of Euler's at each sample.
+    - `period`: of sampling [s]; `samples`: how many.
+    - `forces`: what acts besides.
+    - `t0`: the first sample [s].
+    - `delay`: from measuring to acting, less than a period [s]. No effort acts before
+      the first command does. One that is traced and too long ends as not finite.
+    - `noise`: standard deviations of what is measured, of positions and of velocities
+      (each (3,) or one for all), with a `jax.random` `key`.
+    - `options`: keywords of `simulate`.
+
+    **Returns:** a `SampledMotion`.
+
+    **Raises:** ValueError for malformed arguments.
+    """
+    check_linkage(linkage)
+    callable_tuple("forces", forces)
+    if not callable(control) or isinstance(control, type):
+        raise ValueError(
+            f"control: expected a callable (t, q, qd, linkage) -> tau, got {control!r}."
+        )
+    period = real_array("period", period, (), above=0)
+    t0 = real_array("t0", t0, ())
+    whole_number("samples", samples, 1)
+    delay = real_array("delay", delay, (), minimum=0)
+    known, longest = concrete(delay), concrete(period)
+    if known is not None and longest is not None and not known < longest:
+        raise ValueError(
+            f"delay: expected less than the period of {longest} s, got {known} s."
+        )
+    if (noise is None) != (key is None):
+        raise ValueError("noise, key: expected both or none of them, got one.")
+    spread = None
+    if noise is not None:
+        if not isinstance(noise, tuple | list) or len(noise) != 2:
+            raise ValueError(
+                "noise: expected a pair of standard deviations, of positions and of "
+                f"velocities, got {noise!r}."
+            )
+        spread = [
+            real_array(f"noise[{k}]", value, (3,), minimum=0, broadcast=True)
+            for k, value in enumerate(noise)
+        ]
+    state0 = real_state("state0", state0)
+    times = t0 + period * jnp.arange(samples + 1)
+    check_elements((control, *forces), linkage, times)
+    late = None if known is not None and known == 0 else delay
+    keys = None if key is None else jax.random.split(key, samples)
+    options = dict(throw=False) | options
+    return _motion(linkage, state0, control, times, forces, late, spread, keys, options)
+
+
+@eqx.filter_jit  # not traced anew at each call
+def _motion(
+    linkage, state0, control, times, forces, delay, spread, keys, options
+) -> SampledMotion:
+    """`delay`: None where an effort acts at once; `spread`: of noise, None or two."""
+
+    def command(t, seen, memory):
+        if not memory:
+            return real_array("control", control(t, *seen, linkage), (3,)), memory
+        tau, rates = control(t, *seen, linkage, *memory)
+        step = times[1] - times[0]
+        later = jax.tree.map(lambda m, rate: m + step * rate, *memory, rates)
+        return real_array("control", tau, (3,)), (later,)
+
+    def one(carry, inputs):
+        state, own, memory, held, result = carry
+        begin, end, key = inputs
+        seen = state
+        if spread is not None:
+            seen = State(
+                *(
+                    value + size * jax.random.normal(k, (3,))
+                    for value, size, k in zip(state, spread, jax.random.split(key))
+                )
+            )
+        tau, memory = command(begin, seen, memory)
+        effort = (
+            JointEffort(tau) if delay is None else _Switched(held, tau, begin + delay)
+        )
+        acting, two = (*forces, effort), jnp.stack([begin, end])
+        solution = simulate(linkage, state, two, acting, own0=own, **options)
+        q, qd = solution.q[-1], solution.qd[-1]
+        own = jax.tree.map(lambda rows: rows[-1], solution.own)
+        good = result == diffrax.RESULTS.successful
+        result = diffrax.RESULTS.where(good, solution.result, result)
+        return (State(q, qd), own, memory, tau, result), (q, qd, own, tau)
+
+    def initial(elements):
+        states = [element.initial_state(linkage) for element in stateful(elements)]
+        return tuple(jax.tree.map(lambda leaf: jnp.asarray(leaf, float), states))
+
+    q0, qd0 = jnp.asarray(state0.q), jnp.asarray(state0.qd)
+    own0, memory0 = initial(forces), initial((control,))
+    held = jnp.zeros(3)
+    if delay is not None:
+        held = jnp.where(delay < times[1] - times[0], held, jnp.nan)
+    start = State(q0, qd0), own0, memory0, held, diffrax.RESULTS.successful
+    (*_, result), (q, qd, own, tau) = jax.lax.scan(
+        one, start, (times[:-1], times[1:], keys)
+    )
+    q, qd = jnp.vstack([q0, q]), jnp.vstack([qd0, qd])
+    rows = lambda first, later: jnp.concatenate([first[None], later])
+    return SampledMotion(times, q, qd, tau, result, jax.tree.map(rows, own0, own))

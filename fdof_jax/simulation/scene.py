@@ -1,0 +1,98 @@
+"""A scene: an arm, its start, what acts on it, for how long; and stacks of scenes."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from ..checks import instance
+from ..forces.element import Forces
+from ..linkage.linkage import Linkage, State
+
+
+class Scene(NamedTuple):
+    """A linkage, where it starts, what acts on it and for how long.
+
+    - `linkage`, `state0`, `forces`: the arguments of `simulate`.
+    - `t1`: end time, the start being 0 [s].
+
+    >>> import fdof_jax as fj
+    >>> scene = fj.scenes.fig7()
+    >>> scene.t1, type(scene.forces[0]).__name__
+    (10.0, 'PDController')
+    """
+
+    linkage: Linkage
+    state0: State
+    forces: Forces
+    t1: float | Array
+
+
+def is_number(leaf: Any) -> bool:
+    """Whether a leaf of a scene is data: an array, or a float.
+
+    Python's integers and truth values, an element's index for instance, are not.
+    """
+    return eqx.is_array_like(leaf) and not isinstance(leaf, bool | int)
+
+
+def _as_array(leaf: Any) -> np.ndarray:
+    array = np.asarray(leaf)
+    floating = array.dtype.kind == "f"
+    return array.astype(jnp.result_type(float)) if floating else array
+
+
+def _plain(scene: Any) -> Any:
+    """A scene's end time may be given as an integer."""
+    return scene._replace(t1=_float(scene.t1)) if isinstance(scene, Scene) else scene
+
+
+def _float(value: Any) -> np.ndarray:
+    return np.asarray(value, jnp.result_type(float))
+
+
+def stacked(scenes: Sequence[Any], name: str = "scenes") -> Any:
+    """Scenes of one structure as one, with a leading axis on every array.
+
+    **Raises:** ValueError for scenes of different structure.
+
+    >>> import fdof_jax as fj
+    >>> short = fj.scenes.fig7()._replace(t1=2.0)
+    >>> fj.stacked([short, short]).linkage.mass.shape
+    (2, 3)
+    """
+    if not isinstance(scenes, list | tuple) or isinstance(scenes, Scene) or not scenes:
+        raise ValueError(f"{name}: expected a list of scenes, got {scenes!r}.")
+    first, *others = (eqx.partition(_plain(scene), is_number) for scene in scenes)
+    for index, other in enumerate(others, start=1):
+        if not eqx.tree_equal(other[1], first[1]) or jax.tree.map(
+            np.shape, other[0]
+        ) != jax.tree.map(np.shape, first[0]):
+            raise ValueError(
+                f"{name}[{index}]: expected one like {name}[0] but for numbers, got "
+                f"{scenes[index]!r} and {scenes[0]!r}."
+            )
+    rows = [first[0], *(other[0] for other in others)]
+    arrays = jax.tree.map(lambda *a: np.stack([_as_array(x) for x in a]), *rows)
+    return eqx.combine(arrays, first[1])
+
+
+def unstacked(name: str, scenes: Scene) -> list[Scene]:
+    """The members of stacked scenes."""
+    instance(name, scenes, Scene)
+    arrays, rest = eqx.partition(scenes, is_number)
+    sizes = {np.shape(leaf)[:1] for leaf in jax.tree.leaves(arrays)}
+    if len(sizes) != 1 or sizes <= {(), (0,)}:
+        raise ValueError(
+            f"{name}: expected scenes stacked along a leading axis of one size (see "
+            f"`stacked`), got axes {sorted(sizes)}."
+        )
+    leaves, structure = jax.tree.flatten(arrays)
+    return [
+        eqx.combine(jax.tree.unflatten(structure, row), rest)
+        for row in zip(*(np.asarray(leaf) for leaf in leaves))
+    ]

@@ -1,0 +1,142 @@
+"""A motion with its derivatives in a few parameters, integrated side by side.
+
+The derivatives obey differential equations of their own (the variational ones). As part
+of the state they are controlled in error like the motion itself, and nothing has to be
+differentiated through the integrator, which takes twice as long to compile.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import diffrax
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from ..forces.element import jumps_of
+from ..mechanics.equations import link_constants, zeros
+from ..xla.callbacks import without_checks
+from .field import Args, initial_own, own_states, schedule_of, vector_field
+from .prescribed import hybrid_field, motion_at, prescribed, start_of
+from .scene import Scene
+from .solution import Solution
+from .steps import adaptive, landing_on
+
+# Of the motion and its derivatives, whichever are larger: with steps that these need,
+# the loss on Fig 7's circle is right to 1e-8.
+TOLERANCE = 1e-5
+
+
+class Sensitivities(NamedTuple):
+    """Residuals (m,) at a point and their Jacobian (m, n); the scene and its motion."""
+
+    residuals: Array
+    jacobian: Array
+    scene: Scene
+    solution: Solution
+
+
+def _largest(state: Array) -> Array:
+    """Of the rms of the motion and those of its derivatives."""
+    return jnp.sqrt(jnp.max(jnp.mean(state**2, axis=1)))
+
+
+def sensitivities(
+    scene_at: Callable[[Array], Scene],
+    residuals: Callable[[Scene, Solution], Array],
+    z: Array,
+    ts: Array,
+    tolerance: float = TOLERANCE,
+) -> Sensitivities:
+    """Residuals of a simulated scene that depends on parameters `z` (n,).
+
+    A pure function of arrays. A motion that fails is NaN from there on.
+
+    **Arguments:** `scene_at`: the scene, given the parameters; `residuals`: an array,
+    given the scene and its motion at the times `ts`; `tolerance`: of each step in
+    float64, relative and absolute.
+    """
+
+    def motion_of(z):
+        scene = scene_at(z)
+        q0, qd0 = (jnp.asarray(a, dtype=float) for a in scene.state0)
+        constants = link_constants(
+            scene.linkage, q0, lambda x: (jnp.sin(x), jnp.cos(x))
+        )
+        args = Args(scene.linkage, q0, constants, scene.forces)
+        motion = prescribed(scene.forces)
+        start = (
+            (zeros(q0), tuple(qd0)) if motion is None else start_of(motion, args, qd0)
+        )
+        return args, (*start, *initial_own(args))
+
+    # One array, whose first row is the motion and the others its derivatives: fewer and
+    # larger operations for the integrator.
+    start, along = jax.linearize(
+        lambda z: jnp.stack(jax.tree.leaves(motion_of(z)[1])), z
+    )
+    structure = jax.tree.structure(motion_of(z)[1])
+    directions = jnp.eye(z.size, dtype=z.dtype)
+
+    def field(t, state, z):
+        def rates(row, z):
+            args, _ = motion_of(z)
+            chosen = vector_field if prescribed(args.forces) is None else hybrid_field
+            y = jax.tree.unflatten(structure, tuple(row))
+            rates = chosen(t, y, args, schedule_of(t, args))
+            return jnp.stack(jax.tree.leaves(rates))
+
+        value, along = jax.linearize(rates, state[0], z)
+        return jnp.concatenate([value[None], jax.vmap(along)(state[1:], directions)])
+
+    def observed(z, t, row):
+        args, _ = motion_of(z)
+        y = jax.tree.unflatten(structure, tuple(row))
+        motion = prescribed(args.forces)
+        own = tuple(own_states(args, *y[2:])) if len(y) > 2 else ()
+        if motion is None:
+            return args.q0 + jnp.stack(y[0]), jnp.stack(y[1]), own
+        return *motion_at(motion, args, t, y), own
+
+    controller: Any = adaptive(tolerance, max(tolerance, TOLERANCE))
+    controller = diffrax.PIDController(
+        rtol=controller.rtol,
+        atol=controller.atol,
+        dtmin=controller.dtmin,
+        force_dtmin=False,
+        norm=_largest,
+    )
+    if (jumps := jumps_of(*scene_at(z).forces)) is not None:
+        controller = landing_on(controller, jumps.astype(ts.dtype))
+    with without_checks():
+        found = diffrax.diffeqsolve(
+            diffrax.ODETerm(field),  # pyright: ignore[reportArgumentType]
+            # Few stages: much of the work is that around them.
+            diffrax.Tsit5(),
+            t0=ts[0],
+            t1=ts[-1],
+            dt0=1e-3,
+            y0=jnp.concatenate([start[None], jax.vmap(along)(directions)]),
+            args=z,
+            saveat=diffrax.SaveAt(ts=ts),
+            stepsize_controller=controller,
+            adjoint=diffrax.ForwardMode(),
+            max_steps=65536,
+            throw=False,
+        )
+    assert found.ys is not None  # because of saveat
+    # diffrax leaves infinity where it has not come to.
+    states = jnp.where(jnp.isinf(found.ys), jnp.nan, found.ys)
+
+    def judged(z, rows):
+        scene = scene_at(z)
+        q, qd, own = jax.vmap(observed, in_axes=(None, 0, 0))(z, ts, rows)
+        solution = Solution(ts, q, qd, found.stats, found.result, own)
+        return residuals(scene, solution), (scene, solution)
+
+    value, change, (scene, solution) = jax.linearize(
+        judged, z, states[:, 0], has_aux=True
+    )
+    slopes = jnp.moveaxis(states[:, 1:], 1, 0)
+    jacobian = jax.vmap(change, out_axes=1)(directions, slopes)
+    return Sensitivities(value, jacobian, scene, solution)

@@ -1,0 +1,291 @@
+"""Simulation: motions of a linkage, and the efforts along them."""
+
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import ArrayLike
+
+from ..checks import (
+    callable_tuple,
+    concrete,
+    instance,
+    is_traced,
+    real_array,
+    whole_number,
+)
+from ..forces.element import Forces, StatefulElement
+from ..linkage.linkage import Linkage, State, check_linkage, real_state
+from ..xla.array_namespace import in_numpy
+from .field import element_effort, stateful
+from .integrate import solve, solve_one
+from .prescribed import prescribed, prescribed_effort
+from .solution import Efforts, Solution
+from .steps import within_reach
+
+
+def solve_options(
+    solver: diffrax.AbstractSolver | None,
+    *,
+    stepsize_controller: diffrax.AbstractStepSizeController | None,
+    dt0: ArrayLike | None,
+    adjoint: diffrax.AbstractAdjoint,
+    max_steps: int | None,
+    throw: bool,
+    progress_meter: diffrax.AbstractProgressMeter,
+) -> tuple[diffrax.AbstractSolver | None, dict[str, Any]]:
+    """The keywords of `simulate`, checked: the solver, and those of diffeqsolve.
+
+    But for `throw`, which callers see to themselves.
+    """
+    if dt0 is not None:
+        dt0 = real_array("dt0", dt0, (), above=0)  # an array: new values, no new trace
+    if max_steps is not None:
+        whole_number("max_steps", max_steps, 1)
+    if isinstance(adjoint, diffrax.BacksolveAdjoint):
+        raise ValueError(
+            "adjoint: expected RecursiveCheckpointAdjoint (reverse mode) or "
+            "ForwardMode, got BacksolveAdjoint, whose gradients are wrong on these "
+            "problems."
+        )
+    for name, value, kind in (
+        ("adjoint", adjoint, diffrax.AbstractAdjoint),
+        ("throw", throw, bool),
+        ("progress_meter", progress_meter, diffrax.AbstractProgressMeter),
+    ):
+        instance(name, value, kind)
+    if solver is not None:
+        instance("solver", solver, diffrax.AbstractSolver)
+    if stepsize_controller is not None:
+        kind = diffrax.AbstractStepSizeController
+        instance("stepsize_controller", stepsize_controller, kind)
+        stepsize_controller = within_reach(stepsize_controller)
+    return solver, dict(
+        stepsize_controller=stepsize_controller,
+        dt0=dt0,
+        adjoint=adjoint,
+        max_steps=max_steps,
+        progress_meter=progress_meter,
+    )
+
+
+def check_elements(forces: Forces, linkage: Linkage, ts: Array) -> None:
+    """The elements' own checks at the door, where values are known."""
+    for index, element in enumerate(forces):
+        values = in_numpy(element)
+        jumps = getattr(values, "jump_ts", None)
+        if jumps is not None:
+            real_array(f"forces[{index}].jump_ts", jumps, (None,))
+        check = getattr(element, "check", None)
+        if is_traced(linkage, ts, element):
+            continue
+        if check is not None:
+            check(linkage, ts)
+        # `equinox.tree_at` asks no constructor.
+        if hasattr(values, "possible") and not values.possible():
+            raise ValueError(
+                f"forces[{index}]: expected values that its constructor takes, got "
+                f"{eqx.tree_pformat(element, short_arrays=False)}."
+            )
+
+
+def simulate(
+    linkage: Linkage,
+    state0: State,
+    ts: ArrayLike,
+    forces: Forces = (),
+    *,
+    own0: tuple[Any, ...] | None = None,
+    solver: diffrax.AbstractSolver | None = None,
+    stepsize_controller: diffrax.AbstractStepSizeController | None = None,
+    dt0: ArrayLike | None = 1e-3,
+    adjoint: diffrax.AbstractAdjoint = diffrax.RecursiveCheckpointAdjoint(),
+    max_steps: int | None = 65536,
+    throw: bool = True,
+    progress_meter: diffrax.AbstractProgressMeter = diffrax.NoProgressMeter(),
+) -> Solution:
+    """The motion of a linkage from `state0` at `ts[0]`, at the times `ts`.
+
+    Pure and differentiable in every array, batched by `jax.vmap`; one compilation
+    serves all topologies. The motion is that of the paper's masked equations
+    (17)-(27), in their reduced form.
+
+    **Arguments:**
+
+    - `linkage`, `state0`: the arm, and its joint positions and velocities.
+    - `ts`: increasing times, of shape (time,) [s]. Between steps states are
+      interpolated, where they may be a hundred times less exact than at the last time,
+      which a step ends at; `diffrax.ClipStepSizeController` makes others end at `ts`.
+    - `forces`: a tuple of force elements `(t, q, qd, linkage) -> tau`.
+    - `own0`: the states of the `StatefulElement`s among them at the start, one row of a
+      `Solution.own`; by default what the elements say.
+    - `solver`, `stepsize_controller`, `dt0`, `adjoint`, `max_steps`, `throw`,
+      `progress_meter`: as in `diffrax.diffeqsolve`. By default Dopri8 at a relative
+      and absolute tolerance of 1e-11 in float64, 1e-5 in float32, for which
+      `None` stands in both arguments. The first step `dt0`
+      is 1 ms, because estimates of it fail from exact rest; `None` lets the controller
+      estimate it.
+      Reverse mode works with the default `adjoint`; for forward mode pass
+      `diffrax.ForwardMode()`.
+
+    **Returns:** a `Solution`. With `throw=False` a failed solve is told by its
+    `result`, and what it did not reach is NaN.
+
+    **Raises:** ValueError for malformed arguments; whatever the force elements' own
+    `check(linkage, ts)` raises; with `throw=True` a RuntimeError if the solve fails.
+    Warns in float32 if the tolerance cannot be met.
+
+    >>> import fdof_jax as fj
+    >>> import numpy as np
+    >>> arm, start, *_ = fj.scenes.fig5()
+    >>> motion = fj.simulate(arm, start, np.linspace(0, 1, 101))
+    >>> kinetic, potential = fj.energy(arm, motion.q[-1], motion.qd[-1])
+    >>> float(kinetic), float(potential)  # of 0 J at the start
+    (54.889, -54.889)
+    """
+    check_linkage(linkage)
+    state0 = real_state("state0", state0)
+    ts = real_array("ts", ts, (None,))
+    if ts.size == 0:
+        raise ValueError("ts: expected at least one time, got none.")
+    times = concrete(ts)
+    if times is not None and not (np.diff(times) > 0).all():
+        raise ValueError(f"ts: expected increasing times, got {times.tolist()[:20]}.")
+    callable_tuple("forces", forces)
+    solver, keywords = solve_options(
+        solver,
+        stepsize_controller=stepsize_controller,
+        dt0=dt0,
+        adjoint=adjoint,
+        max_steps=max_steps,
+        throw=throw,
+        progress_meter=progress_meter,
+    )
+    check_elements(forces, linkage, ts)
+    motion = prescribed(forces)
+    if motion is not None and not is_traced(linkage, state0, ts, motion):
+        if not motion.agrees(np.asarray(ts)[0], jnp.asarray(state0.q), linkage):
+            begin, _ = motion.at(ts[0], linkage)
+            raise ValueError(
+                f"state0.q: expected {begin.tolist()} at the joints whose motion is "
+                f"prescribed, got {np.asarray(state0.q).tolist()}."
+            )
+    if own0 is not None:
+        _check_own("own0", own0, forces, linkage, ())
+    inputs = linkage, state0, ts, own0, forces
+    try:
+        one = None
+        # Within `jax.jit` even a constant is traced.
+        if not is_traced(inputs, solver, keywords, jax.device_put(np.zeros(()))):
+            one = solve_one(solver, inputs, keywords)
+        if one is None:
+            solution = solve(solver, inputs, keywords)
+            # Of the times themselves, for derivatives in them.
+            solution = eqx.tree_at(lambda s: s.ts, solution, ts)
+            return _raising(solution, state0) if throw else solution
+    except TypeError as error:
+        if "forward-mode" in str(error):
+            raise TypeError(
+                "forward-mode differentiation of simulate needs "
+                "adjoint=diffrax.ForwardMode(); for second derivatives take "
+                "jax.jacfwd(jax.jacfwd(...)) with it, not jax.hessian."
+            ) from error
+        raise
+    except Exception as error:
+        if "closed-over value" in str(error):
+            raise TypeError(
+                "forces: expected what is differentiated to be an array of an element "
+                "or closed over by a plain function, got an element that holds a "
+                "function that closes over it."
+            ) from error
+        raise
+    solution, succeeded = one
+    if throw and not succeeded:
+        raise RuntimeError(
+            f"simulate: {solution.outcome} at t = "
+            f"{float(solution.stats['time_reached']):g} s. "
+            f"{diffrax.RESULTS[solution.result].strip()}"
+        )
+    return solution
+
+
+def _raising(solution: Solution, state0: State) -> Solution:
+    """The solution of a traced call, which raises an error where it fails."""
+    late = ~(jnp.diff(solution.ts) > 0)  # NaN included
+    unknown = ~jnp.isfinite(jnp.stack(jax.tree.leaves(state0)))
+    for failed, message in (
+        (late, "ts: expected increasing times, got others."),
+        (unknown, "state0: expected finite numbers, got others."),
+    ):
+        solution = eqx.error_if(solution, failed, f"simulate: {message}")
+    failed = solution.result != diffrax.RESULTS.successful
+    return solution.result.error_if(solution, failed)
+
+
+def _check_own(name, own, forces: Forces, linkage: Linkage, rows: tuple) -> None:
+    """Raise ValueError unless these are states of the forces' elements, in rows."""
+    expected = [
+        jax.eval_shape(element.initial_state, linkage) for element in stateful(forces)
+    ]
+    shapes = jax.tree.map(lambda leaf: (*rows, *leaf.shape), tuple(expected))
+    found = jax.tree.map(jnp.shape, own)
+    if found != shapes:
+        raise ValueError(
+            f"{name}: expected the states of the forces' elements, of shapes {shapes}, "
+            f"got {found}."
+        )
+
+
+def joint_efforts(linkage: Linkage, forces: Forces, solution: Solution) -> Efforts:
+    """Joint efforts of the force elements along a motion.
+
+    **Arguments:** the linkage, the forces and the solution of one `simulate`.
+
+    **Returns:** `Efforts(total, elements)` [N or N m]: (time, 3), and per element
+    (element, time, 3).
+
+    **Raises:** ValueError if `forces` is not a tuple of force elements.
+
+    >>> import fdof_jax as fj
+    >>> import numpy as np
+    >>> arm, start, forces, _ = fj.scenes.fig7()
+    >>> motion = fj.simulate(arm, start, np.linspace(0, 1, 101), forces)
+    >>> total, elements = fj.joint_efforts(arm, forces, motion)
+    >>> total[0].tolist(), elements.shape
+    ([15.873, -300.0, -9.921], (1, 101, 3))
+    """
+    check_linkage(linkage)
+    if not isinstance(solution, Solution):
+        raise ValueError(f"solution: expected a Solution, got {solution!r}.")
+    callable_tuple("forces", forces)
+    if solution.q.ndim != 2:
+        raise ValueError(
+            "solution: expected one motion (use jax.vmap for a batch), got positions "
+            f"of shape {solution.q.shape}."
+        )
+    _check_own("solution.own", solution.own, forces, linkage, solution.ts.shape)
+    return _efforts(linkage, forces, solution)
+
+
+@eqx.filter_jit
+def _efforts(linkage: Linkage, forces: Forces, solution: Solution) -> Efforts:
+    motion_rows, own = (solution.ts, solution.q, solution.qd), iter(solution.own)
+    elements = []
+    for index, element in enumerate(forces):
+
+        def effort(t, q, qd, state, index=index, element=element):
+            return element_effort(index, element, t, q, qd, linkage, state)[0]
+
+        state = next(own) if isinstance(element, StatefulElement) else None
+        elements.append(jax.vmap(effort)(*motion_rows, state))
+    stacked = jnp.stack(elements) if elements else jnp.zeros((0, *solution.q.shape))
+    if (motion := prescribed(forces)) is not None:
+        demand = lambda *row: prescribed_effort(linkage, forces, *row)
+        demanded = jax.vmap(demand)(*motion_rows, jnp.sum(stacked, axis=0))
+        place = [element is motion for element in forces].index(True)
+        stacked = stacked.at[place].set(demanded)
+    return Efforts(jnp.sum(stacked, axis=0), stacked)

@@ -1,0 +1,105 @@
+"""What a simulation returns."""
+
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import numpy as np
+from jax import Array
+from jaxtyping import Float
+
+from ..checks import known
+from .html_table import html_table
+
+
+class Solution(eqx.Module):
+    """A simulated motion.
+
+    - `ts`: output times [s].
+    - `q`, `qd`: joint positions [m or rad] and velocities at `ts`. NaN after a solve
+      that failed.
+    - `stats`: diffrax's statistics, `num_steps` among them, and `time_reached` [s].
+    - `result`: diffrax's result, one per trajectory; `diffrax.RESULTS.successful` or
+      the reason of the failure, which `outcome` says in a word or two.
+    - `own`: the states of the `StatefulElement`s at `ts`, in their order; each as its
+      `initial_state`, with time as first axis.
+
+    >>> import fdof_jax as fj
+    >>> import numpy as np
+    >>> arm, start, *_ = fj.scenes.fig5()
+    >>> motion = fj.simulate(arm, start, np.linspace(0, 1, 101))
+    >>> motion.outcome.item(), motion.q.shape, float(motion.stats["time_reached"])
+    ('successful', (101, 3), 1.0)
+    """
+
+    ts: Float[Array, " time"]
+    q: Float[Array, "time joint"]
+    qd: Float[Array, "time joint"]
+    stats: dict[str, Any]
+    result: diffrax.RESULTS
+    own: tuple[Any, ...] = ()
+
+    @property
+    def outcome(self) -> np.ndarray:
+        """How each trajectory ended, in words, in the shape of the batch.
+
+        `"successful"`; `"ill-conditioned"`: the mass matrix is singular or nearly so
+        (see `inertia_ratios`); `"not finite"`: the accelerations are not; `"out of
+        steps"`; `"tolerance out of reach"`: rounding keeps even the shortest step from
+        it; or `"solver failed"`.
+        """
+        results: Any = diffrax.RESULTS
+        words = {
+            "successful": results.successful,
+            "ill-conditioned": results.singular,
+            "not finite": results.nonfinite,
+            "out of steps": results.max_steps_reached,
+            "tolerance out of reach": results.dt_min_reached,
+        }
+        return np.select(
+            [np.asarray(self.result == result) for result in words.values()],
+            list(words),
+            default="solver failed",
+        )
+
+    def __repr__(self) -> str:
+        """In words; of traced values only their shape."""
+        facts = "; ".join(f"{name}: {value}" for name, value in self._facts().items())
+        return f"Solution({facts})" if facts else super().__repr__()
+
+    def _repr_html_(self) -> str | None:
+        facts = self._facts()
+        return html_table(facts.items()) if facts else None
+
+    def _facts(self) -> dict[str, str]:
+        """What there is to say; nothing of what has but the structure of a solution."""
+        if len(getattr(self.q, "shape", ())) < 2:
+            return {}
+        *batch, count, _ = self.q.shape
+        motions = " x ".join(map(str, batch)) if batch else "1"
+        facts = {"motions": motions, "times": f"{count}"}
+        result = isinstance(self.result, diffrax.RESULTS)
+        if not result or not known(self.ts, self.result, self.stats):
+            return facts
+        ts = np.asarray(self.ts)
+        facts["times"] += f", {ts.min():g} to {ts.max():g} s"
+        outcomes = zip(*np.unique(self.outcome, return_counts=True))
+        facts["outcome"] = ", ".join(
+            f"{number} {word}" if batch else word for word, number in outcomes
+        )
+        if "num_steps" in self.stats:
+            steps = np.asarray(self.stats["num_steps"])
+            least, most = steps.min(), steps.max()
+            facts["steps"] = f"{least}" if least == most else f"{least} to {most}"
+        return facts
+
+
+class Efforts(NamedTuple):
+    """Joint efforts along a motion [N or N m].
+
+    - `total`: their sum (time, 3).
+    - `elements`: those of each force element (element, time, 3).
+    """
+
+    total: Float[Array, "time joint"]
+    elements: Float[Array, "element time joint"]

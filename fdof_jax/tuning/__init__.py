@@ -1,0 +1,1 @@
+"""Gains that minimise a loss, and how far their gradients can be trusted."""

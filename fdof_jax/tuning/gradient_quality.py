@@ -1,0 +1,183 @@
+"""How far the gradient that gain tuning follows can be trusted, measured."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Bool, Float
+
+from ..analysis.linearization import Modes, closed_loop_modes
+from ..linkage.linkage import joint_names
+from ..simulation.field import stateful
+from ..simulation.prescribed import prescribed
+from ..simulation.scene import Scene, is_number
+from ..simulation.sensitivities import sensitivities
+from ..simulation.simulate import simulate
+from .losses import controller_of, relative_demands, tip_errors
+from .tune import check_tuned, with_gains
+
+_SAMPLES = 1001
+_HORIZONS = 10
+# In the logarithms of the gains: the error of the extrapolated differences is of fourth
+# order in it, their noise is that of the loss over it.
+_STEP = 1e-2
+
+
+class GradientReport(eqx.Module):
+    """The gradient of the mean squared tip error [m^2] at a scene's gains.
+
+    Of this scene alone, and without prices of effort, whatever it has been tuned for.
+
+    In the logarithms of kp and kd (2, 3); it prints itself in words.
+
+    - `gradient`: as `tune` computes it.
+    - `differences`: central differences of `simulate` at its default tolerance.
+    - `error`: the norm of what they differ by, over the norm of the differences.
+    - `horizons`, `gradient_norm`: norm of the gradient of the error up to that time.
+    - `saturated`: share of the time that each actuator spends at its limit (3,).
+    - `modes`: closed-loop eigenvalues along the path, at 101 times; None with elements
+      that have a state of their own or prescribe a motion.
+    - `at_limit`: whether any actuator is at its limit at these times, which then does
+      not control its joint (101,).
+    - `warnings`: in words, what to beware of.
+    """
+
+    gradient: Float[np.ndarray, "2 joint"]
+    differences: Float[np.ndarray, "2 joint"]
+    error: float
+    horizons: Float[np.ndarray, " horizon"]
+    gradient_norm: Float[np.ndarray, " horizon"]
+    saturated: Float[np.ndarray, " joint"]
+    modes: Modes | None
+    at_limit: Bool[np.ndarray, " time"]
+    warnings: list[str]
+
+    def __str__(self) -> str:
+        along = "  ".join(
+            f"{t:.3g} s: {norm:.2g}"
+            for t, norm in zip(self.horizons, self.gradient_norm)
+        )
+        lines = [
+            f"gradient against differences: {self.error:.1e} of its norm "
+            f"{np.linalg.norm(self.gradient):.3g}",
+            f"norm by horizon: {along}",
+        ]
+        if self.modes is not None:
+            frequency, damping = self.modes.frequency, self.modes.damping
+            lines.append(
+                f"natural frequencies along the path: {frequency.min():.3g} to "
+                f"{frequency.max():.3g} rad/s, steps of an explicit method up to "
+                f"{1e3 * self.modes.longest_step.min():.3g} ms"
+            )
+            for when, times in (("within", ~self.at_limit), ("at", self.at_limit)):
+                if times.any():
+                    lines.append(
+                        f"least damping ratio while actuators are {when} their limits: "
+                        f"{np.nanmin(damping[times]):.2g}"
+                    )
+        return "\n".join(lines + self.warnings)
+
+
+@eqx.filter_jit
+def _tangents(scene: Scene) -> tuple[Array, Array, Array, Any]:
+    """Residuals, their Jacobian in the log-gains, demands over limits, the motion."""
+    controller = controller_of(scene)
+    gains = jnp.stack([controller.kp, controller.kd])
+
+    def scene_at(z):
+        # Factors, of which a gain of zero makes nothing.
+        return with_gains(scene, gains * jnp.exp(z).reshape(2, 3))
+
+    ts = jnp.linspace(0, scene.t1, _SAMPLES)
+    found = sensitivities(scene_at, tip_errors, jnp.zeros(6), ts)
+    demands = relative_demands(found.scene, found.solution)
+    return found.residuals, found.jacobian, demands, found.solution
+
+
+def _loss(scene: Scene, gains: np.ndarray) -> float:
+    """The mean squared tip error with other gains, by the program of plain calls."""
+    trial = with_gains(scene, jnp.asarray(gains))
+    ts = np.linspace(0, float(trial.t1), _SAMPLES)
+    solution = simulate(trial.linkage, trial.state0, ts, trial.forces, throw=False)
+    return float(np.sum(np.square(tip_errors(trial, solution))))
+
+
+def gradient_report(scene: Scene) -> GradientReport:
+    """The quality of the gradient of the tip error in the PD gains, measured.
+
+    **Arguments:** `scene`: holds exactly one `PDController`, which tracks a task with a
+    `tip`.
+
+    **Returns:** a `GradientReport`.
+
+    **Raises:** ValueError as `tune`.
+    """
+    check_tuned("scene", scene, tip_errors)
+    scene = jax.tree.map(
+        lambda a: jnp.asarray(a) if is_number(a) else a,
+        scene._replace(t1=float(scene.t1)),
+    )
+    residuals, jacobian, demands, solution = map(_numpy, _tangents(scene))
+    along = 2 * np.cumsum(residuals[:, None] * jacobian, axis=0)
+    gradient = along[-1].reshape(2, 3)
+    steps = np.eye(6).reshape(6, 1, 2, 3)
+    sides = np.array([_STEP, -_STEP, _STEP / 2, -_STEP / 2])[:, None, None]
+    controller = controller_of(scene)
+    gains = np.stack([controller.kp, controller.kd])
+    changed = gains * np.exp(sides * steps).reshape(24, 2, 3)
+    loss = np.array([_loss(scene, trial) for trial in changed])
+    far, near = (
+        (loss.reshape(6, 4)[:, k] - loss.reshape(6, 4)[:, k + 1]) / width
+        for k, width in ((0, 2 * _STEP), (2, _STEP))
+    )
+    differences = ((4 * near - far) / 3).reshape(2, 3)
+    size = np.linalg.norm(differences)
+    error = np.linalg.norm(gradient - differences) / size if size > 0 else 0.0
+    # Of the error up to a time, which is a mean over that time.
+    times = np.linspace(0, _SAMPLES - 1, _HORIZONS + 1).astype(int)[1:]
+    shares = (times + 1) / _SAMPLES
+    norms = np.linalg.norm(along[2 * times + 1], axis=1) / shares
+    few = jax.tree.map(lambda a: a[::10] if np.ndim(a) else a, solution)
+    saturated = np.mean(np.abs(demands) > 1, axis=0)
+    modes = None
+    if not stateful(scene.forces) and prescribed(scene.forces) is None:
+        modes = closed_loop_modes(scene.linkage, scene.forces, few)
+    return GradientReport(
+        gradient=gradient,
+        differences=differences,
+        error=float(error),
+        horizons=np.asarray(solution.ts)[times],
+        gradient_norm=norms,
+        saturated=saturated,
+        modes=modes,
+        at_limit=(np.abs(demands) > 1).any(axis=1)[::10],
+        warnings=_warnings(scene, gradient, saturated, error),
+    )
+
+
+def _numpy(tree: Any) -> Any:
+    return jax.tree.map(lambda a: np.asarray(a) if eqx.is_array(a) else a, tree)
+
+
+def _warnings(scene: Scene, gradient, saturated, error) -> list[str]:
+    names, words = joint_names(scene.linkage), []
+    for joint, share in enumerate(saturated):
+        if share == 1 and not gradient[:, joint].any():
+            words.append(
+                f"{names[joint]} is at its limit throughout: the gradient in its gains "
+                "is zero, and tuning cannot change them"
+            )
+        elif share > 0:
+            words.append(
+                f"{names[joint]} is at its limit for {100 * share:.3g} % of the time, "
+                "in which its gains have no effect"
+            )
+    if not error < 1e-3:
+        words.append(
+            "gradient and differences disagree: the loss may not be smooth here, or "
+            "chaotic over this horizon"
+        )
+    return words

@@ -1,0 +1,114 @@
+"""What gains are judged by: tip error, effort, rate of effort."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from ..checks import real_array
+from ..control.pd import PDController, tip_deviation
+from ..simulation.scene import Scene
+from ..simulation.solution import Solution
+
+
+def controller_of(scene: Scene) -> PDController:
+    """The PD controller among a scene's forces, refused unless it is the only one."""
+    found = [force for force in scene.forces if isinstance(force, PDController)]
+    if len(found) != 1:
+        raise ValueError(
+            "scene: expected exactly one PDController among its forces (not one within "
+            f"a drive), got {len(found)} in {scene.forces!r}."
+        )
+    return found[0]
+
+
+def tip_errors(scene: Scene, solution: Solution) -> Float[Array, " residual"]:
+    """Tip error at each output time, scaled so that the squares add up to their mean.
+
+    **Arguments:** a scene whose PD controller tracks a task with a `tip`, and its
+    solution.
+
+    **Returns:** x and y components [m], each over the root of the number of times.
+
+    >>> import fdof_jax as fj
+    >>> import numpy as np
+    >>> arm, start, forces, _ = fj.scenes.fig7()
+    >>> motion = fj.simulate(arm, start, np.linspace(0, 1, 101), forces)
+    >>> errors = fj.tip_errors(fj.scenes.fig7(), motion)
+    >>> float((errors**2).sum() ** 0.5)  # rms over the first second [m]
+    0.351
+    """
+    task: Any = controller_of(scene).reference
+    deviation = tip_deviation(scene.linkage, task, solution)
+    return deviation.reshape(-1) / solution.ts.size**0.5
+
+
+def relative_demands(scene: Scene, solution: Solution) -> Float[Array, "time joint"]:
+    """What the controller asks for over what its limits allow; 0 where none limits.
+
+    Infinite, or 0, where a limit of 0 allows nothing.
+    """
+    controller = controller_of(scene)
+    demands = jax.vmap(controller.demand, in_axes=(0, 0, 0, None))(
+        solution.ts, solution.q, solution.qd, scene.linkage
+    )
+    limit = controller.limit[None]
+    beyond = jnp.where(demands == 0, 0, jnp.sign(demands) * jnp.inf)
+    return jnp.where(limit > 0, demands / jnp.where(limit > 0, limit, 1), beyond)
+
+
+class Tracking(eqx.Module):
+    """Mean squared tip error, and prices of effort: the loss of `tune`.
+
+    effort * mean((tau / limit)^2) and effort_rate * mean((d(tau / limit)/dt)^2), each
+    summed over the joints, are added. Rates are differences between output times, a
+    thousandth of the run apart.
+
+    **Arguments:**
+
+    - `effort`: what full effort of one joint all the time is worth [m^2].
+    - `effort_rate`: what a change by the full effort per second is worth [m^2 s^2].
+
+    **Raises:** ValueError for malformed or negative prices.
+
+    >>> import fdof_jax as fj
+    >>> import numpy as np
+    >>> arm, start, forces, _ = fj.scenes.fig7()
+    >>> motion = fj.simulate(arm, start, np.linspace(0, 1, 101), forces)
+    >>> residuals = fj.Tracking(effort=0.1)(fj.scenes.fig7(), motion)
+    >>> float((residuals**2).sum())  # [m^2]
+    0.15
+    """
+
+    effort: Float[Array, ""]
+    effort_rate: Float[Array, ""]
+
+    def __init__(self, effort: ArrayLike = 0.0, effort_rate: ArrayLike = 0.0):
+        self.effort = real_array("effort", effort, (), minimum=0)
+        self.effort_rate = real_array("effort_rate", effort_rate, (), minimum=0)
+
+    def __call__(self, scene: Scene, solution: Solution) -> Float[Array, " residual"]:
+        efforts = jnp.clip(relative_demands(scene, solution), -1, 1)
+        rates = jnp.diff(efforts, axis=0) / jnp.diff(solution.ts)[:, None]
+        parts = [tip_errors(scene, solution)]
+        for price, values in ((self.effort, efforts), (self.effort_rate, rates)):
+            # The root of a price of zero has no derivative.
+            share = jnp.where(price > 0, price, 1) / values.shape[0]
+            scaled = jnp.where(price > 0, jnp.sqrt(share), 0) * values
+            parts.append(scaled.reshape(-1))
+        return jnp.concatenate(parts)
+
+    def check(self, scene: Scene) -> None:
+        """Raise ValueError if efforts have a price but no limit."""
+        limit = np.asarray(controller_of(scene).limit)
+        possible = (np.isfinite(limit) & (limit > 0)).all()
+        if self.effort + self.effort_rate > 0 and not possible:
+            raise ValueError(
+                "loss: expected finite limits of the controller, above 0, where effort "
+                f"has a price, got {limit.tolist()}."
+            )

@@ -1,0 +1,305 @@
+"""What gain tuning returns, and how it prints itself."""
+
+from collections.abc import Callable
+from html import escape
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ..checks import known
+from ..linkage.linkage import joint_names
+from ..search.bounded import Run
+from ..simulation.html_table import html_table
+from ..simulation.scene import Scene
+from .losses import controller_of
+
+# Actuators at their limits for a larger share of the time are hardly controlled.
+_MOSTLY = 0.9
+# Of the numbers in a printed table.
+_COLUMNS = ("start", "tuned", "least", "greatest")
+
+
+class History(eqx.Module):
+    """What a run did; entry 0 is its start, one more per accepted point.
+
+    - `loss`: mean squared tip error [m^2] with the default loss.
+    - `gradient_norm`: norm of the gradient in the logarithms of the gains, without the
+      components that a bound holds back.
+    - `gains`: kp and kd, in joint order [N/m or N m/rad, N s/m or N m s/rad].
+    - `saturated`: share of the time that each actuator spends at its limit.
+    - `effort`: root mean square of each effort over its limit.
+    - `tip_error`: rms tip error [m]; NaN for a reference without a `tip`.
+    - `wall_time`: since the start of the search, compilation included [s].
+
+    Of an ensemble: the last three but `wall_time` are means over its members, the tip
+    error the root of the mean square.
+    """
+
+    loss: Float[np.ndarray, " iteration"]
+    gradient_norm: Float[np.ndarray, " iteration"]
+    gains: Float[np.ndarray, "iteration 2 joint"]
+    saturated: Float[np.ndarray, "iteration joint"]
+    effort: Float[np.ndarray, "iteration joint"]
+    tip_error: Float[np.ndarray, " iteration"]
+    wall_time: Float[np.ndarray, " iteration"]
+
+
+class TuneResult(eqx.Module):
+    """A tuned scene and how it was reached; it prints itself as a table.
+
+    - `scene`: the scene with its tuned gains.
+    - `loss`: its loss [m^2 with the default loss].
+    - `histories`: of each run, the first from the scene's own gains, see `History`.
+    - `lower`, `upper`: the bounds of kp and kd (2, 3).
+    - `converged`: whether the run stopped by itself, no actuator was at its limit most
+      of the time, and a change of the gains by 1 % would change the loss by less
+      than 1e-4 of it, to first order and within the bounds.
+    - `message`: why the run stopped, in words, and what to beware of.
+    - `member_loss`, `member_tip_error`: of each member of the ensemble with the tuned
+      gains: its loss (member,) and rms tip error (member,) [m].
+    - `settings`: method, solver, tolerance and dtype of the run.
+    """
+
+    scene: Scene
+    loss: float
+    histories: list[History]
+    lower: Float[np.ndarray, "2 joint"]
+    upper: Float[np.ndarray, "2 joint"]
+    converged: bool
+    message: str
+    member_loss: Float[np.ndarray, " member"]
+    member_tip_error: Float[np.ndarray, " member"]
+    settings: dict[str, Any]
+
+    @property
+    def history(self) -> History:
+        """That of the best run."""
+        return self.histories[int(np.nanargmin(self.losses))]
+
+    @property
+    def losses(self) -> Float[np.ndarray, " start"]:
+        """What each run has come to; NaN where its start could not be simulated."""
+        return np.array([history.loss.min() for history in self.histories])
+
+    @property
+    def gains(self) -> Float[np.ndarray, "2 joint"]:
+        """The tuned kp and kd."""
+        return self.history.gains[_best(self.history)]
+
+    @property
+    def at_bound(self) -> Bool[np.ndarray, "2 joint"]:
+        """Which gains a bound holds."""
+        return _at_bound(self.gains, self.lower, self.upper)
+
+    @property
+    def tip_error(self) -> float:
+        """Rms tip error [m]; NaN for a reference without a `tip`."""
+        return float(self.history.tip_error[_best(self.history)])
+
+    @property
+    def effort(self) -> float:
+        """Root mean square of the efforts over their limits, over time and joints."""
+        return float(np.sqrt(np.mean(self.history.effort[_best(self.history)] ** 2)))
+
+    @property
+    def table(self) -> dict[str, list]:
+        """The gains in columns, a row for each: `pandas.DataFrame(result.table)`.
+
+        `gain` and `joint`, for instance kp and R1; `unit`; `start`, `tuned`, `least`
+        and `greatest`: its values and bounds; `at_bound`: whether one holds it.
+        """
+        names = joint_names(self.scene.linkage)
+        units = controller_of(self.scene).gain_units
+        values = {
+            "start": self.histories[0].gains[0],
+            "tuned": self.gains,
+            "least": self.lower,
+            "greatest": self.upper,
+            "at_bound": self.at_bound,
+        }
+        return {
+            "gain": ["kp"] * 3 + ["kd"] * 3,
+            "joint": names * 2,
+            "unit": [units[name[0]][kind] for kind in range(2) for name in names],
+        } | {name: np.ravel(value).tolist() for name, value in values.items()}
+
+    def _rows(self) -> list[list[str]]:
+        """Of what is printed: a label, up to four numbers, and a remark."""
+        rows = []
+        for gain, joint, unit, *values, held in zip(*self.table.values()):
+            cells = [f"{value:.5g}" for value in values]
+            mark = "at its bound" if held else ""
+            rows.append([f"{gain} of {joint} [{unit}]", *cells, mark])
+        history, best, first = self.history, _best(self.history), self.histories[0]
+        compared = [("loss", lambda h: h.loss, 1.0)]
+        if np.isfinite(self.tip_error):
+            compared.append(("rms tip error [mm]", lambda h: h.tip_error, 1e3))
+        for joint, name in enumerate(joint_names(self.scene.linkage)):
+            share = lambda h, joint=joint: h.saturated[:, joint]
+            compared.append((f"{name} at its limit [%]", share, 1e2))
+        for label, values, scale in compared:
+            before, after = scale * values(first)[0], scale * values(history)[best]
+            rows.append([label, f"{before:.5g}", f"{after:.5g}", "", "", ""])
+        return rows
+
+    def _remarks(self) -> list[str]:
+        """What stands below the table."""
+        rows = []
+        if len(self.losses) > 1:
+            failed = np.isnan(self.losses).sum()
+            if failed:
+                rows.append(
+                    f"{failed} of {len(self.losses)} starts could not be simulated"
+                )
+            near = np.sum(self.losses**0.5 <= 1.01 * self.loss**0.5)
+            rows.append(
+                f"{near} of {len(self.losses)} starts within 1 % of the best in "
+                "the root of the loss"
+            )
+        if len(self.member_loss) > 1:
+            what, values = "root of the loss", np.sqrt(self.member_loss)
+            if np.isfinite(self.tip_error):
+                what, values = "rms tip error [mm]", 1e3 * self.member_tip_error
+            rows.append(
+                f"{what} over {len(values)} members: {values.min():.5g} to "
+                f"{values.max():.5g}"
+            )
+        iterations = len(self.history.loss) - 1
+        rows.append(f"{self._verdict}, {iterations} iterations: {self.message}")
+        return rows
+
+    @property
+    def _verdict(self) -> str:
+        return "converged" if self.converged else "not converged"
+
+    def __str__(self) -> str:
+        lines = [
+            f"{label:24}" + "".join(f"{cell:>12}" for cell in cells) + f"  {mark}"
+            for label, *cells, mark in [["", *_COLUMNS, ""], *self._rows()]
+        ]
+        return "\n".join([*map(str.rstrip, lines), *self._remarks()])
+
+    def __repr__(self) -> str:
+        """In a line; of traced values, their shapes."""
+        if not known(self.histories) or not isinstance(self.loss, float):
+            return super().__repr__()
+        topology = "".join(name[0] for name in joint_names(self.scene.linkage))
+        first, held = self.histories[0], int(self.at_bound.sum())
+        return (
+            f"TuneResult({topology}, loss {first.loss[0]:.5g} to {self.loss:.5g}, "
+            f"{held} of 6 gains at a bound, {self._verdict})"
+        )
+
+    def _repr_html_(self) -> str:
+        remarks = "".join(f"<p>{escape(remark)}</p>" for remark in self._remarks())
+        return html_table(self._rows(), ["", *_COLUMNS, ""]) + remarks
+
+
+class TradeOff(eqx.Module):
+    """The best tip errors for their efforts: one tuning run per price of effort.
+
+    - `prices`: of effort, see `Tracking` (price,) [m^2].
+    - `tip_error`: rms tip error (price,) [m].
+    - `effort`: root mean square of the efforts over their limits (price,).
+    - `results`: the `TuneResult` of each price.
+    """
+
+    prices: Float[np.ndarray, " price"]
+    tip_error: Float[np.ndarray, " price"]
+    effort: Float[np.ndarray, " price"]
+    results: list[TuneResult]
+
+    def __str__(self) -> str:
+        rows = [f"{'price [m^2]':>12}{'tip error [mm]':>16}{'effort [%]':>12}"]
+        columns = self.prices, self.tip_error, self.effort, self.results
+        for price, error, effort, result in zip(*columns):
+            mark = "" if result.converged else "  not converged"
+            rows.append(f"{price:12.3g}{1e3 * error:16.4g}{1e2 * effort:12.4g}{mark}")
+        return "\n".join(rows)
+
+
+def _best(history: History) -> int:
+    return int(np.argmin(history.loss))
+
+
+def _at_bound(gains, lower, upper) -> np.ndarray:
+    # A hair: the exponential of a bound's logarithm may fall short of it by rounding.
+    hair = 100 * np.finfo(jnp.result_type(float)).eps
+    free = (gains > 0) & (lower < upper)
+    return free & ((gains <= lower * (1 + hair)) | (gains >= upper * (1 - hair)))
+
+
+def result_of(
+    scene: Scene,
+    runs: list[Run],
+    lower: np.ndarray,
+    upper: np.ndarray,
+    settings: dict[str, Any],
+    with_gains: Callable,
+) -> TuneResult:
+    """The result of the runs of one scene, of which the best counts."""
+    tuned = lower > 0
+
+    def gains_of(z):
+        return np.where(tuned, np.clip(np.exp(z).reshape(2, 3), lower, upper), 0)
+
+    def history_of(run: Run) -> History:
+        def mean(fact: str) -> np.ndarray:
+            """Over the members."""
+            return np.array([np.mean(row.facts[fact], axis=0) for row in run.rows])
+
+        return History(
+            loss=np.array([row.loss for row in run.rows]),
+            gradient_norm=np.array([row.gradient_norm for row in run.rows]),
+            gains=np.stack([gains_of(row.z) for row in run.rows]),
+            saturated=mean("saturated"),
+            effort=mean("effort"),
+            tip_error=np.sqrt(mean("square_error")),
+            wall_time=np.array([row.wall_time for row in run.rows]),
+        )
+
+    run = min(runs, key=lambda run: (run.failed, run.best.loss))
+    history = history_of(run)
+    best, share = run.best, history.saturated[_best(history)]
+    assert run.reason is not None
+    return TuneResult(
+        scene=with_gains(scene, jnp.asarray(gains_of(best.z))),
+        loss=best.loss,
+        histories=[history_of(run) for run in runs],
+        lower=lower,
+        upper=upper,
+        converged=run.converged and share.max() <= _MOSTLY,
+        message=_message(scene, run, history, lower, upper),
+        member_loss=best.facts["member_loss"],
+        member_tip_error=np.sqrt(best.facts["square_error"]),
+        settings=settings,
+    )
+
+
+def _message(scene, run, history, lower, upper) -> str:
+    """The reason, and what a reader might take for convergence but is not."""
+    names, share = joint_names(scene.linkage), history.saturated[_best(history)]
+    tuned = (controller_gains(scene) > 0) & (lower < upper)
+    reason = run.reason
+    if run.flat:
+        at_limit = history.saturated[0].min() == 1
+        reason = "the gradient is zero at the start" + (
+            ", because every actuator is at its limit throughout" if at_limit else ""
+        )
+    held = int(np.sum(_at_bound(history.gains[_best(history)], lower, upper)))
+    parts = [reason, f"{held} of {int(tuned.sum())} gains are at a bound"]
+    for joint in np.flatnonzero(share > _MOSTLY):
+        parts.append(
+            f"{names[joint]} is at its limit for {100 * share[joint]:.4g} % of the "
+            "time, so its gains have next to no effect"
+        )
+    return "; ".join(parts)
+
+
+def controller_gains(scene: Scene) -> np.ndarray:
+    """kp and kd of a scene's controller (2, 3)."""
+    controller = controller_of(scene)
+    return np.stack([np.asarray(controller.kp), np.asarray(controller.kd)])

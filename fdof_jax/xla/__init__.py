@@ -1,0 +1,1 @@
+"""What XLA needs, and nothing about arms: precision, sines, loops, checks."""
