@@ -18,11 +18,12 @@ import scipy.optimize
 
 import fdof_jax as fj
 from fdof_jax import scenes
-from fdof_jax.search.bounded import METHODS, minimise
+from fdof_jax.search.bounded import minimise
 from fdof_jax.search.lanes import Lanes
+from fdof_jax.search.methods import METHODS
 from fdof_jax.simulation.steps import adaptive
+from fdof_jax.tuning.gains import evaluate_gains, with_gains
 from fdof_jax.tuning.losses import tip_errors
-from fdof_jax.tuning.tune import evaluate_gains, with_gains
 
 from .measure import record, skipped
 

@@ -1,15 +1,20 @@
 from . import scenes as scenes
+from .analysis.equilibrium import (
+    equilibrium as equilibrium,
+    holding_efforts as holding_efforts,
+)
 from .analysis.linearization import (
     Linearization as Linearization,
     Modes as Modes,
     closed_loop_modes as closed_loop_modes,
-    equilibrium as equilibrium,
-    holding_efforts as holding_efforts,
-    inertial_parameters as inertial_parameters,
     linearize as linearize,
-    regressor as regressor,
 )
 from .analysis.reactions import joint_reactions as joint_reactions
+from .analysis.regressor import (
+    inertial_parameters as inertial_parameters,
+    regressor as regressor,
+)
+from .control.circle import CircleTask as CircleTask
 from .control.drives import (
     DCMotor as DCMotor,
     FirstOrderLag as FirstOrderLag,
@@ -23,17 +28,13 @@ from .control.model_based import (
 from .control.paths import (
     Ellipse as Ellipse,
     FigureEight as FigureEight,
-    JointMove as JointMove,
     Line as Line,
     Path as Path,
     Spline as Spline,
-    TipTask as TipTask,
 )
-from .control.pd import (
-    CircleTask as CircleTask,
-    PDController as PDController,
-    reachable as reachable,
-)
+from .control.pd import PDController as PDController
+from .control.reference import reachable as reachable
+from .control.task import JointMove as JointMove, TipTask as TipTask
 from .control.timing import (
     Laps as Laps,
     Travel as Travel,
@@ -71,16 +72,18 @@ from .forces.joints import (
 from .forces.points import Load as Load, Point as Point, PointElement as PointElement
 from .identification.fit import fit as fit, fit_each as fit_each, link_ends as link_ends
 from .identification.result import FitResult as FitResult
-from .linkage.linkage import (
-    TOPOLOGIES as TOPOLOGIES,
-    Linkage as Linkage,
+from .linkage.coordinates import (
     State as State,
-    existence_factors as existence_factors,
     from_chain as from_chain,
     to_chain as to_chain,
 )
+from .linkage.linkage import Linkage as Linkage
+from .linkage.topology import (
+    TOPOLOGIES as TOPOLOGIES,
+    existence_factors as existence_factors,
+)
+from .mechanics.inverse_kinematics import inverse_kinematics as inverse_kinematics
 from .mechanics.kinematics import (
-    inverse_kinematics as inverse_kinematics,
     joint_positions as joint_positions,
     mass_centers as mass_centers,
     tip_jacobian as tip_jacobian,

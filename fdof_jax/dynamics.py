@@ -9,7 +9,8 @@ from .forces.element import Forces
 from .linkage.linkage import Linkage, compiled
 from .mechanics.equations import equations, link_constants, zeros
 from .mechanics.kinematics import mass_center_velocities, mass_centers
-from .mechanics.rates import inertia_diagonals, rates, times
+from .mechanics.rates import inertia_diagonals, rates
+from .mechanics.solve import times
 
 
 @compiled(q=(3,), qd=(3,), tau=(3,), forces=inertial)

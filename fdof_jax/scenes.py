@@ -2,9 +2,11 @@
 
 import numpy as np
 
-from .control.pd import CircleTask, PDController
+from .control.circle import CircleTask
+from .control.pd import PDController
 from .forces.joints import JointDamper
-from .linkage.linkage import Linkage, State, from_chain
+from .linkage.coordinates import State, from_chain
+from .linkage.linkage import Linkage
 from .simulation.scene import Scene as Scene
 
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 
-from fdof_jax.search import bounded
+from fdof_jax.search import bounded, methods
 
 
 def test_box_minimum_is_that_of_scipy():
@@ -21,14 +21,14 @@ def test_box_minimum_is_that_of_scipy():
         def model(u, slope=slope, scale=scale, matrix=matrix):
             return slope @ (scale * u) + u * scale @ matrix @ (scale * u) / 2
 
-        found = bounded.box_minimum(matrix, slope, low, high)
+        found = methods.box_minimum(matrix, slope, low, high)
         assert (found >= low).all() and (found <= high).all()
         bounds = list(zip(low / scale, high / scale))
         best = scipy.optimize.minimize(model, np.zeros(3), bounds=bounds, tol=1e-14)
         assert model(found / scale) <= best.fun + 1e-9 * abs(best.fun)
 
 
-@pytest.mark.parametrize("method", bounded.METHODS)
+@pytest.mark.parametrize("method", methods.METHODS)
 def test_minimise_finds_what_scipy_finds_within_bounds(method):
     """Rosenbrock's function and an exponential fit, in boxes that cut them off."""
     t = np.linspace(0, 1, 12)
@@ -55,7 +55,7 @@ def test_minimise_finds_what_scipy_finds_within_bounds(method):
         for point, run in zip(z, runs):
             residual, jacobian = (f(point) for f in problems[run % 2])
             found.append(
-                bounded.Evaluation(
+                methods.Evaluation(
                     np.sum(residual**2), 2 * jacobian.T @ residual,
                     2 * jacobian.T @ jacobian, {},
                 )
@@ -84,7 +84,7 @@ def test_minimise_finds_what_scipy_finds_within_bounds(method):
 def test_one_failing_start_does_not_spoil_the_others():
     def evaluate(z, runs):
         loss = np.where(runs == 1, np.nan, np.sum(z**2, axis=1))
-        return bounded.Evaluation(
+        return methods.Evaluation(
             loss, 2 * z, np.broadcast_to(2 * np.eye(2), (len(z), 2, 2)), {}
         )
 
@@ -104,7 +104,7 @@ def test_a_start_held_by_all_bounds_has_converged_and_a_flat_one_has_not():
         # Downwards beyond both bounds; flat in the second run.
         slopes = np.where(runs[:, None] == 0, -1.0, 0.0) * np.ones(2)
         loss = 5 + np.sum(slopes * z, axis=1)
-        return bounded.Evaluation(loss, slopes, np.stack([np.eye(2)] * 2), {})
+        return methods.Evaluation(loss, slopes, np.stack([np.eye(2)] * 2), {})
 
     corner, flat = bounded.minimise(
         evaluate, starts, np.zeros((2, 2)), np.ones((2, 2)),

@@ -10,7 +10,7 @@ import pytest
 
 import fdof_jax as fj
 from fdof_jax.__main__ import main
-from fdof_jax.search import bounded
+from fdof_jax.search import methods
 from fdof_jax.shell import showcase
 from fdof_jax.shell.tuning_run import METHODS
 
@@ -193,7 +193,7 @@ def test_refusals_that_need_jax(options, message, tmp_path, capsys, monkeypatch)
 
 
 def test_methods_have_their_names():
-    assert METHODS == tuple(bounded.METHODS)
+    assert METHODS == tuple(methods.METHODS)
 
 
 @pytest.mark.slow

@@ -74,7 +74,7 @@ NAMES = [
         f"{module.__name__.split('.')[-1]}.{name}"
         for module in (drawing, plotting)
         for name, value in inspect.getmembers(module, inspect.isfunction)
-        if value.__module__ == module.__name__
+        if value.__module__.startswith("fdof_jax.pictures")
         # Pictures draw into what they are given, or into something new.
         and {"ax", "fig"} & {
             p.name for p in inspect.signature(value).parameters.values()

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import fdof_jax as fj
-from fdof_jax.control.pd import known_assembly
+from fdof_jax.control.reference import known_assembly
 from fdof_jax.control.timing import PROFILES
 from fdof_jax.simulation.simulate import check_elements
 

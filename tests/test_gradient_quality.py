@@ -11,8 +11,8 @@ import fdof_jax as fj
 from fdof_jax import scenes
 from fdof_jax.simulation.sensitivities import sensitivities
 from fdof_jax.tuning import gradient_quality
+from fdof_jax.tuning.gains import with_gains
 from fdof_jax.tuning.losses import controller_of, tip_errors
-from fdof_jax.tuning.tune import with_gains
 
 TUNED = [[6000, 11700, 3200], [320, 200, 200]]  # within a factor of 4
 

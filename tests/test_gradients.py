@@ -9,7 +9,7 @@ import pytest
 
 import fdof_jax as fj
 from fdof_jax import scenes
-from fdof_jax.control.pd import tip_deviation
+from fdof_jax.analysis.tracking import tip_deviation
 
 TS = np.linspace(0, 1.0, 21)
 ZERO = jnp.zeros(3)

@@ -12,7 +12,7 @@ from fdof_jax.interactive import sliders
 import fdof_jax as fj
 from fdof_jax import scenes
 from fdof_jax.simulation import integrate
-from fdof_jax.tuning.tune import with_gains
+from fdof_jax.tuning.gains import with_gains
 
 CIRCLES = fj.circle_scenes()
 CONTROLLER = CIRCLES["RRR"].forces[0]

@@ -9,11 +9,8 @@ import pytest
 from helpers import random_linkage
 
 import fdof_jax as fj
-from fdof_jax.mechanics.kinematics import (
-    mass_center_velocities,
-    plane_angle,
-    solve_joints,
-)
+from fdof_jax.mechanics.inverse_kinematics import plane_angle, solve_joints
+from fdof_jax.mechanics.kinematics import mass_center_velocities
 
 SAMPLES = 12
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fdof_jax.search import bounded, lanes
+from fdof_jax.search import lanes, methods
 
 
 def test_power_mean_has_the_derivatives_of_its_own_formula():
@@ -13,7 +13,7 @@ def test_power_mean_has_the_derivatives_of_its_own_formula():
     def members(z):
         jacobian = coefficients
         residual = jacobian @ z + np.arange(1, 6)
-        return bounded.Evaluation(
+        return methods.Evaluation(
             np.sum(residual**2, -1),
             2 * np.einsum("rmkn,rmk->rmn", jacobian, residual),
             2 * np.einsum("rmki,rmkj->rmij", jacobian, jacobian),
@@ -34,7 +34,7 @@ def test_power_mean_has_the_derivatives_of_its_own_formula():
         # Of linear residuals Gauss and Newton's curvature is the second derivative.
         bends = [(a.gradient[0] - b.gradient[0]) / (2 * h) for a, b in sides]
         np.testing.assert_allclose(here.curvature[0], bends, rtol=1e-5, atol=1e-5)
-    nothing = bounded.Evaluation(
+    nothing = methods.Evaluation(
         np.zeros((1, 2)), np.zeros((1, 2, 3)), np.zeros((1, 2, 3, 3)), {}
     )
     assert all(np.isfinite(a).all() for a in lanes.power_mean(nothing, 32)[:3])

@@ -11,7 +11,7 @@ from helpers import random_linkage
 
 import fdof_jax as fj
 from fdof_jax import scenes
-from fdof_jax.control.pd import saturated, tip_deviation
+from fdof_jax.analysis.tracking import saturated, tip_deviation
 
 each_topology = pytest.mark.parametrize("topology", fj.TOPOLOGIES)
 FREE = (8.0, 5.0, jnp.inf, MOVE)  # gains, limit and reference

@@ -6,8 +6,8 @@ from scipy.optimize import least_squares
 
 import fdof_jax as fj
 from fdof_jax import scenes
-from fdof_jax.control.pd import tip_deviation
-from fdof_jax.search import bounded
+from fdof_jax.analysis.tracking import tip_deviation
+from fdof_jax.search import methods
 from fdof_jax.search.lanes import Lanes
 from fdof_jax.tuning import optimal_motion
 
@@ -142,7 +142,7 @@ def test_steps_within_a_box_are_the_least(size):
         slope = root.T @ draw.normal(size=2 * size)
         low, high = -draw.uniform(0, 0.02, size), draw.uniform(0, 0.02, size)
         high[0] = low[0]  # without room
-        x = bounded.box_minimum(matrix, slope, low, high)
+        x = methods.box_minimum(matrix, slope, low, high)
         assert x[0] == 0
         inside = (low < x) & (x < high)
         rise = slope + matrix @ x
@@ -157,9 +157,9 @@ def test_both_ways_to_a_step_agree():
     draw = np.random.default_rng(0)
     root = draw.normal(size=(40, 20))
     problem = root.T @ root, 20 * draw.normal(size=20), np.full(20, -0.3), np.ones(20)
-    by_sets = bounded._by_sets(*problem)
+    by_sets = methods._by_sets(*problem)
     assert by_sets is not None
-    np.testing.assert_allclose(by_sets, bounded._by_bvls(*problem), atol=1e-10)
+    np.testing.assert_allclose(by_sets, methods._by_bvls(*problem), atol=1e-10)
 
 
 def changed(**fields):

@@ -14,7 +14,7 @@ from sweep_batch import CHUNK, run
 
 import fdof_jax as fj
 from fdof_jax.checks import is_traced
-from fdof_jax.simulation import integrate, sweep as batched
+from fdof_jax.simulation import chunks, integrate
 
 # Checkpoints
 
@@ -22,16 +22,16 @@ from fdof_jax.simulation import integrate, sweep as batched
 @pytest.fixture
 def solved(monkeypatch):
     """The chunks solved from here on; a trace alone is none."""
-    chunks = []
-    original = batched._solve_chunk
+    found = []
+    original = chunks._solve_chunk
 
     def recorded(*arguments):
         if not is_traced(arguments):
-            chunks.append(arguments)
+            found.append(arguments)
         return original(*arguments)
 
-    monkeypatch.setattr(batched, "_solve_chunk", recorded)
-    return chunks
+    monkeypatch.setattr(chunks, "_solve_chunk", recorded)
+    return found
 
 
 def test_a_checkpoint_spares_finished_chunks(mixed, swept, solved, tmp_path):

@@ -6,16 +6,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix
 from jax import Array
 from jaxtyping import Complex, Float
 from numpy.typing import ArrayLike
 
 from ..checks import callable_tuple, instance, is_traced, real_array
-from ..dynamics import forward_dynamics, inverse_dynamics
+from ..dynamics import forward_dynamics
 from ..forces.element import Forces, StatefulElement
-from ..forces.points import dot, frames_of
-from ..linkage.linkage import Linkage, State, check_linkage, compiled, real_state
+from ..linkage.coordinates import State, real_state
+from ..linkage.linkage import Linkage, check_linkage
 from ..simulation.prescribed import prescribed
 from ..simulation.solution import Solution
 
@@ -42,7 +41,7 @@ def _accelerations(
     return forward_dynamics(linkage, q, qd, tau, forces)
 
 
-def _check(linkage: Linkage, forces: Forces) -> None:
+def checked(linkage: Linkage, forces: Forces) -> None:
     check_linkage(linkage)
     callable_tuple("forces", forces)
     stateful = any(isinstance(element, StatefulElement) for element in forces)
@@ -75,7 +74,7 @@ def linearize(
     >>> np.sort(abs(np.linalg.eigvals(linear.A)))[::2].tolist()  # modes [rad/s]
     [2.02, 4.744, 7.855]
     """
-    _check(linkage, forces)
+    checked(linkage, forces)
     q, qd = map(jnp.asarray, real_state("state", state))
     return _linearized(linkage, forces, q, qd, real_array("t", t, ()))
 
@@ -155,7 +154,7 @@ def closed_loop_modes(linkage: Linkage, forces: Forces, solution: Solution) -> M
     >>> modes.frequency[-1].tolist()  # [rad/s]
     [5.943, 5.943, 20.677, 20.677, 118.149, 118.149]
     """
-    _check(linkage, forces)
+    checked(linkage, forces)
     instance("solution", solution, Solution)
     if is_traced(linkage, forces, solution) or solution.q.ndim != 2:
         raise ValueError(
@@ -170,148 +169,3 @@ def closed_loop_modes(linkage: Linkage, forces: Forces, solution: Solution) -> M
     values[known] = np.linalg.eigvals(A[known])
     order = np.argsort(np.abs(values), axis=1)
     return Modes(np.take_along_axis(values, order, axis=1))
-
-
-def equilibrium(
-    linkage: Linkage, forces: Forces, q: ArrayLike, t: ArrayLike = 0.0
-) -> Float[Array, " joint"]:
-    """Joint positions near `q` at which the arm stays at rest under its forces.
-
-    An operating point for `linearize`: under a PD controller, the position that it
-    holds while the reference stands still, its sag included.
-
-    **Arguments:** the linkage; force elements without a state of their own; `q`: a
-    first guess [m or rad]; `t`: the time that the elements are given [s].
-
-    **Returns:** positions (3,); NaN where Levenberg and Marquardt's method finds none,
-    from a guess at which actuators are at their limits for instance. It need not be
-    stable: see `linearize`.
-
-    **Raises:** ValueError for malformed arguments.
-
-    >>> import fdof_jax as fj
-    >>> arm = fj.scenes.fig5().linkage
-    >>> fj.equilibrium(arm, (), [-1.0, 0.1, 0.1]).tolist()  # it hangs
-    [-1.571, 0.0, 0.0]
-    """
-    _check(linkage, forces)
-    return _rest(linkage, forces, real_array("q", q, (3,)), real_array("t", t, ()))
-
-
-@eqx.filter_jit
-def _rest(linkage: Linkage, forces: Forces, q: Array, t: Array) -> Array:
-    still = jnp.zeros(3)
-
-    def efforts(q, _):
-        total = -inverse_dynamics(linkage, q, still, still, forces)
-        for element in forces:
-            total = total + element(t, q, still, linkage)
-        return total
-
-    # Efforts over what rounds them: stiff controllers are as exact as soft springs.
-    slopes = jnp.abs(jax.jacfwd(efforts)(q, None))
-    size = jax.lax.stop_gradient(
-        slopes @ (1 + jnp.abs(q)) + jnp.abs(efforts(q, None)) + 1
-    )
-    tight = 1e3 * float(jnp.finfo(q.dtype).eps)
-    solver = optimistix.LevenbergMarquardt(rtol=tight, atol=tight)
-    relative = lambda q, _: efforts(q, None) / size
-    found = optimistix.root_find(relative, solver, q, throw=False)
-    good = found.result == optimistix.RESULTS.successful
-    # Not by `where`: where none is found the derivative is NaN too.
-    return found.value * jnp.where(good, 1, jnp.nan)
-
-
-def holding_efforts(
-    linkage: Linkage, q: ArrayLike, forces: Forces = ()
-) -> Float[Array, " joint"]:
-    """The joint efforts that hold the arm at rest against gravity [N or N m].
-
-    **Arguments:** the linkage; `q`: joint positions [m or rad]; `forces`: elements
-    whose masses are held too.
-
-    **Raises:** ValueError for malformed arguments.
-
-    >>> import fdof_jax as fj
-    >>> arm = fj.scenes.fig5().linkage
-    >>> fj.holding_efforts(arm, [0, 0, 0]).tolist()
-    [58.86, 29.43, 9.81]
-    """
-    still = jnp.zeros(3)
-    return inverse_dynamics(linkage, q, still, still, forces)
-
-
-def inertial_parameters(linkage: Linkage) -> Float[Array, "link 4"]:
-    """Per link: mass [kg], its moments m p, m q [kg m], and inertia about the start.
-
-    In these the dynamics are linear: see `regressor`. The inertia [kg m^2] is about the
-    characteristic point of the link.
-
-    **Raises:** ValueError for what is not a linkage.
-
-    >>> import fdof_jax as fj
-    >>> arm = fj.scenes.fig3().linkage
-    >>> fj.inertial_parameters(arm)[0].tolist()  # m, m p, m q, I about the pivot
-    [5.0, 2.5, -5.0, 6.25]
-    """
-    check_linkage(linkage)
-    m, (p, q) = linkage.mass, linkage.com.T
-    return jnp.stack([m, m * p, m * q, linkage.inertia + m * (p**2 + q**2)], axis=1)
-
-
-@compiled(q=(3,), qd=(3,), qdd=(3,))
-def regressor(
-    linkage: Linkage,
-    q: Float[Array, " joint"],
-    qd: Float[Array, " joint"],
-    qdd: Float[Array, " joint"],
-) -> Float[Array, "joint link 4"]:
-    """What multiplies the inertial parameters in the inverse dynamics.
-
-    tau = regressor : `inertial_parameters(linkage)`, summed over links and parameters;
-    the masses and inertias of the linkage do not count. By Lagrange's equations for one
-    parameter at a time.
-
-    Stacked over a motion its rank tells how many combinations of the parameters can be
-    identified: nine of the twelve for an RPR arm.
-
-    **Arguments:** the linkage; `q`, `qd`, `qdd`: joint positions, velocities and
-    accelerations (3,) [m or rad, and per s and s^2].
-
-    **Raises:** ValueError for malformed arguments.
-
-    >>> import fdof_jax as fj
-    >>> arm = fj.scenes.fig5().linkage
-    >>> import numpy as np
-    >>> state = [0.1, 0.2, 0.3], [1, 0, -1], [0.5, 0.5, 0.5]
-    >>> np.tensordot(fj.regressor(arm, *state), fj.inertial_parameters(arm), 2).tolist()
-    [68.982, 35.32, 11.766]
-    >>> fj.inverse_dynamics(arm, *state).tolist()
-    [68.982, 35.32, 11.766]
-    """
-
-    def parts(q):
-        frames = frames_of(linkage, tuple(q))
-        start, direction = (jnp.stack(rows[1:]) for rows in frames[:2])
-        return start, direction
-
-    def lagrangians(q, qd):
-        """Of unit parameters, (3, 4)."""
-        (start, along), (velocity, turning) = jax.jvp(parts, (q,), (qd,))
-        # d(direction)/dt = i rate direction.
-        rate = jnp.imag(turning * jnp.conj(along))
-        g = linkage.gravity
-        return jnp.stack(
-            [
-                dot(velocity, velocity) / 2 - g * start.imag,
-                dot(velocity, turning) - g * along.imag,
-                dot(velocity, 1j * turning) - g * (1j * along).imag,
-                rate**2 / 2,
-            ],
-            axis=1,
-        )
-
-    momenta = lambda q, qd: jax.jacfwd(lagrangians, argnums=1)(q, qd)
-    _, change = jax.jvp(momenta, (q, qd), (qd, qdd))
-    slopes = jax.jacfwd(lagrangians, argnums=0)(q, qd)
-    return jnp.moveaxis(change - slopes, -1, 0)

@@ -20,7 +20,8 @@ from ..checks import is_traced, real_array
 from ..forces.element import StatefulElement
 from ..linkage.linkage import Linkage
 from ..xla.array_namespace import in_numpy
-from .pd import PDController, Reference
+from .pd import PDController
+from .reference import Reference
 
 
 class PIDController(StatefulElement):

@@ -13,7 +13,8 @@ from ..forces.points import frames_of
 from ..linkage.linkage import Linkage, check_linkage, possible
 from ..mechanics.equations import Scalars, link_constants
 from ..mechanics.rates import required_efforts
-from .pd import PDController, Reference, reference_motion
+from .pd import PDController
+from .reference import Reference, reference_motion
 
 
 class _ModelBased(PDController):

@@ -11,60 +11,9 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from ..checks import instance, real_array, sign
-from ..linkage.linkage import Linkage
-from ..mechanics.kinematics import plane_angle, solve_joints, unmoved_part, whole_turns
+from ..checks import instance, real_array
 from ..xla.array_namespace import in_numpy, namespace, sine_and_cosine
 from .timing import Laps, Travel
-
-
-class JointMove(eqx.Module):
-    """All joints from one position to another, in step.
-
-    **Arguments:** `start`, `end`: joint positions [m or rad]; `travel`: a `Travel`.
-
-    **Raises:** ValueError for malformed arguments.
-
-    >>> import fdof_jax as fj
-    >>> arm = fj.scenes.fig5().linkage
-    >>> move = fj.JointMove([0, 0, 0], [1, 2, 3], fj.Travel(2.0))
-    >>> q, qd = move(1.0, arm)
-    >>> q.tolist(), qd.tolist()  # halfway, at 15/8 of the mean speed
-    ([0.5, 1.0, 1.5], [0.938, 1.875, 2.812])
-    """
-
-    start: Float[Array, " joint"]
-    end: Float[Array, " joint"]
-    travel: Travel
-
-    def __init__(self, start: ArrayLike, end: ArrayLike, travel: Travel):
-        self.start = real_array("start", start, (3,))
-        self.end = real_array("end", end, (3,))
-        instance("travel", travel, Travel)
-        self.travel = travel
-
-    @property
-    def evaluates_in_numpy(self) -> bool:
-        """Whether `assembly` does; a subclass may move in another way."""
-        return type(self) is JointMove
-
-    def assembly(self, t: Array, linkage: Linkage) -> tuple[Array, float]:
-        """Joint positions, and 1 for a root: no edge of a reach is near."""
-        share = self.travel(t)[..., None]
-        return self.start + share * (self.end - self.start), 1.0
-
-    def __call__(
-        self, t: ArrayLike, linkage: Linkage
-    ) -> tuple[Float[Array, " joint"], Float[Array, " joint"]]:
-        """Joint positions [m or rad] and velocities [m/s or rad/s] at time `t` [s]."""
-        t = real_array("t", t, ())
-        positions = lambda t: self.assembly(t, linkage)[0]
-        return jax.jvp(positions, (t,), (jnp.ones_like(t),))
-
-    @property
-    def jump_ts(self) -> Array:
-        """When velocity or acceleration jump [s]."""
-        return self.travel.jump_ts
 
 
 class Path(eqx.Module):
@@ -226,130 +175,10 @@ class Spline(Path):
         return a * self.points[k] + b * self.points[after] + bend / 6
 
 
-class TipTask(eqx.Module):
-    """A path of the tip, the last link keeping its angle.
-
-    Called with `(t, linkage)` it gives the joint reference: the closed-form inverse
-    kinematics and its exact rate. The wrist (where the last link starts) must not cross
-    the half-line from the ground pivot away from the path's middle, where the angle of
-    a turning arm would jump: `simulate` checks it.
-
-    **Arguments:**
-
-    - `path`: a `Path`: `Line`, `Ellipse`, `FigureEight`, `Spline` or one's own.
-    - `timing`: a `Travel` or `Laps`, or any function of time to the share of the way.
-    - `orientation`: th4, the absolute angle of the last link [rad].
-    - `branch`: assembly of the arm, 1 or -1: see `inverse_kinematics`.
-
-    **Raises:** ValueError for malformed arguments; `check`, and with it `simulate`, for
-    a path out of the linkage's reach.
-
-    >>> import fdof_jax as fj
-    >>> arm = fj.scenes.fig7().linkage
-    >>> line = fj.Line([-4, 2], [-3, 2])
-    >>> task = fj.TipTask(line, fj.Travel(1.0), orientation=1.5707963)
-    >>> q, qd = task(0.5, arm)
-    >>> fj.tip_position(arm, q).tolist()
-    [-3.5, 2.0]
-    """
-
-    path: Path
-    timing: Any
-    orientation: Float[Array, ""]
-    branch: Float[Array, ""]
-
-    def __init__(
-        self,
-        path: Path,
-        timing: Travel | Laps | Any,
-        *,
-        orientation: ArrayLike = 0.0,
-        branch: int = 1,
-    ):
-        instance("path", path, Path)
-        if not callable(timing) or isinstance(timing, type):
-            raise ValueError(f"timing: expected a Travel or Laps, got {timing!r}.")
-        self.path, self.timing = path, timing
-        self.orientation = real_array("orientation", orientation, ())
-        self.branch = sign("branch", branch)
-
-    def tip(self, t: ArrayLike) -> Float[Array, " 2"]:
-        """The commanded tip position at time `t` [s]: (x, y) [m]."""
-        return self.path.point(self.timing(real_array("t", t, ())))
-
-    @property
-    def evaluates_in_numpy(self) -> bool:
-        """Whether `assembly` does; a subclass may move in another way."""
-        return type(self) is TipTask
-
-    def assembly(self, t: Array, linkage: Linkage) -> tuple[Array, Array]:
-        """Joint positions, and the root that is 0 at the edge of the reach."""
-        q, root, _ = self._solved(t, linkage)
-        return q, root
-
-    def _solved(self, t: Array, linkage: Linkage) -> tuple[Array, Array, Array]:
-        """The `assembly`, and the wrist's angle from the direction of the middle."""
-        own = not {type(self.path), type(self.timing)} <= _IN_NUMPY
-        if own and namespace(t) is np:
-            with jax.ensure_compile_time_eval():  # also where others are traced
-                points = _points_at(self.path, self.timing, jax.device_put(np.ravel(t)))
-            tip: Any = np.asarray(points).reshape(*np.shape(t), 2)
-        else:
-            tip = self.path.point(self.timing(t))
-        unmoved = unmoved_part(linkage, self.orientation)
-        wrist, hub = tip - unmoved, in_numpy(self.path.middle) - unmoved
-        across = hub[0] * wrist[..., 1] - hub[1] * wrist[..., 0]
-        beside = plane_angle(across, wrist @ hub)
-        middle = plane_angle(hub[1], hub[0])
-        bearing = middle - 2 * np.pi * whole_turns(middle) + beside
-        q, root = solve_joints(linkage, wrist, bearing, self.orientation, self.branch)
-        return q, root, beside
-
-    def __call__(
-        self, t: ArrayLike, linkage: Linkage
-    ) -> tuple[Float[Array, " joint"], Float[Array, " joint"]]:
-        """Joint positions [m or rad] and velocities [m/s or rad/s] at time `t` [s]."""
-        t = real_array("t", t, ())
-        positions = lambda t: self.assembly(t, linkage)[0]
-        return jax.jvp(positions, (t,), (jnp.ones_like(t),))
-
-    @property
-    def jump_ts(self) -> Array | None:
-        """When the timing says that velocity or acceleration jump [s]."""
-        return getattr(self.timing, "jump_ts", None)
-
-    def check(self, linkage: Linkage, ts: Array) -> None:
-        """Raise ValueError where the tip leaves the reach between the times.
-
-        Looked at at 1000 times, or 1000 of one lap; or where the wrist's angle jumps
-        between two of them.
-        """
-        task, arm, ts = in_numpy((self, linkage, ts))
-        end = ts[-1]
-        if isinstance(self.timing, Laps):  # of which all are alike
-            end = min(end, ts[0] + abs(task.timing.period))
-        times = np.linspace(ts[0], end, 1000, dtype=ts.dtype)
-        q, _, beside = task._solved(times, arm)
-        inside = np.isfinite(q).all(axis=1)
-        if not inside.all():
-            raise ValueError(
-                "reference: expected a path within the linkage's reach at orientation "
-                f"{task.orientation:g} rad on branch {task.branch:+g}, got one that "
-                f"leaves it at {times[inside.argmin()]:g} s."
-            )
-        hub = in_numpy(task.path.middle) - unmoved_part(arm, task.orientation)
-        behind = (np.abs(np.diff(beside)) > np.pi).any()
-        if behind or not hub.any():
-            raise ValueError(
-                "reference: expected a path that does not pass behind the ground "
-                "pivot as seen from its middle, got one that does."
-            )
-
-
 # The paths and timings that NumPy evaluates.
-_IN_NUMPY = {Line, Ellipse, FigureEight, Spline, Travel, Laps}
+IN_NUMPY = {Line, Ellipse, FigureEight, Spline, Travel, Laps}
 
 
 @eqx.filter_jit
-def _points_at(path: Path, timing: Any, times: Array) -> Array:
+def points_at(path: Path, timing: Any, times: Array) -> Array:
     return jax.vmap(lambda t: path.point(timing(t)))(times)

@@ -9,7 +9,7 @@ from jax import Array
 
 from ..checks import callable_tuple
 from ..linkage.linkage import Linkage
-from ..mechanics.rates import Added
+from ..mechanics.solve import Added
 from .element import Forces, InertialElement
 
 

@@ -17,7 +17,8 @@ from jaxtyping import Complex, Float, Int
 from numpy.typing import ArrayLike
 
 from ..checks import instance, real_array, whole_number
-from ..linkage.linkage import Linkage, real_joints
+from ..linkage.coordinates import real_joints
+from ..linkage.linkage import Linkage
 from ..mechanics.equations import Scalars
 from ..xla.trigonometry import sincos
 from .element import ScalarElement

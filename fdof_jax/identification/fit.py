@@ -11,10 +11,12 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from ..checks import callable_tuple, keywords_as, real_array
-from ..linkage.linkage import check_linkage, real_state
+from ..linkage.coordinates import real_state
+from ..linkage.linkage import check_linkage
 from ..mechanics.kinematics import joint_positions, tip_position
-from ..search.bounded import Evaluation, Run, minimise, reporting
+from ..search.bounded import Run, minimise, reporting
 from ..search.lanes import Lanes
+from ..search.methods import Evaluation
 from ..simulation.scene import Scene, stacked
 from ..simulation.sensitivities import sensitivities
 from ..simulation.simulate import check_elements

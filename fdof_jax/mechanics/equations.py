@@ -16,7 +16,8 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
-from ..linkage.linkage import Linkage, real_joints, to_chain
+from ..linkage.coordinates import real_joints, to_chain
+from ..linkage.linkage import Linkage
 from ..xla.trigonometry import sincos
 
 Scalars = tuple[Array, ...]

@@ -5,7 +5,8 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from ..linkage.linkage import Linkage, to_chain
+from ..linkage.coordinates import to_chain
+from ..linkage.linkage import Linkage
 
 
 class Geometry(NamedTuple):

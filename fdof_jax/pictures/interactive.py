@@ -17,11 +17,11 @@ from ..simulation.scene import Scene
 from ..simulation.simulate import simulate
 from ..simulation.solution import Solution
 from ..simulation.steps import adaptive
+from ..tuning.gains import with_gains
 from ..tuning.league import circle_scenes
 from ..tuning.losses import controller_of
-from ..tuning.tune import with_gains
+from .arms import draw_motion
 from .axes import BLACK, SERIES, filled_mapping, legend, reached, refuse, xy
-from .drawing import draw_motion
 from .geometry import geometry
 
 _SAMPLES = 201

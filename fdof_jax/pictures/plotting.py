@@ -13,16 +13,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from matplotlib import colormaps
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
-from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 from scipy.integrate import cumulative_simpson
 
+from ..analysis.tracking import saturated
 from ..checks import real_array
-from ..control.pd import CircleTask, PDController, saturated
+from ..control.pd import PDController
 from ..dynamics import energy, link_energies
 from ..forces.element import Forces, InertialElement
 from ..linkage.linkage import Linkage
@@ -36,16 +34,17 @@ from .axes import (
     figure_or_new,
     filled_mapping,
     legend,
-    plane_axes,
     reached,
     refuse,
-    xy,
 )
 from .geometry import geometry
+from .tracking import (
+    tracking as tracking,
+    tracking_by_error as tracking_by_error,
+    tracking_error as tracking_error,
+)
 
 _LIGHT_GREY = "#BBBBBB"
-# Without the lightest colours, which are hard to see on white.
-_DARK_TO_LIGHT = ListedColormap(colormaps["plasma"](np.linspace(0, 0.85, 256)))
 
 
 def _time_panels(fig: Figure, ts: np.ndarray, panels: list) -> list[Axes]:
@@ -233,125 +232,6 @@ def effort_profile(
         ax.set_ylim(low, high)
     legend(axes[0], *axes)
     return fig
-
-
-def _tip(
-    linkage: Any, task: Any, solution: Any, name: str = "solution"
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Times of a solution, and the commanded and actual tip positions."""
-    if not callable(getattr(task, "tip", None)):
-        raise refuse("task", "a CircleTask", task)
-    ts, q, _ = reached(solution, name)
-    commanded = np.asarray(jax.vmap(task.tip)(jnp.asarray(ts))) @ [1, 1j]
-    return ts, commanded, geometry(linkage, q).end[:, 3]
-
-
-def _one_turn(task: Any, ts: np.ndarray, path: np.ndarray) -> np.ndarray:
-    """Of the commanded path: dashes drawn over each other become a solid line."""
-    turn = abs(float(getattr(task, "period", np.inf)))
-    return path[ts - ts[0] <= turn * (1 + 1e-6)]
-
-
-def _tips(linkage: Any, task: Any, solutions: Any) -> list[tuple]:
-    """Per solution its label, colour, times, and commanded and actual tip positions."""
-    filled_mapping("solutions", solutions, "Solution")
-    return [
-        (str(label), SERIES[k % len(SERIES)])
-        + _tip(linkage, task, solution, f"solutions[{label!r}]")
-        for k, (label, solution) in enumerate(solutions.items())
-    ]
-
-
-def tracking(
-    linkage: Linkage,
-    task: CircleTask,
-    solutions: Mapping[str, Solution],
-    ax: Axes | None = None,
-) -> Axes:
-    """Paths of the tip and the path it was commanded to follow; dots are the starts.
-
-    Into the axes of `chrono_cyclograph` it adds the path of the paper's Fig 7.
-
-    **Arguments:** `task`: what was commanded, the tip's set point being `task.tip(t)`;
-    `solutions`: one curve per label.
-
-    **Returns:** the axes.
-
-    **Raises:** ValueError for malformed arguments.
-    """
-    curves = _tips(linkage, task, solutions)
-    _, _, ts, longest, _ = max(curves, key=lambda curve: len(curve[2]))
-    longest = _one_turn(task, ts, longest)
-    paths = [(label, color, "-", actual) for label, color, _, _, actual in curves]
-    paths.append(("commanded", BLACK, "--", longest))
-    ax = plane_axes(ax, np.concatenate([path for *_, path in paths]))
-    for label, color, style, path in paths:
-        ax.plot(*xy(path), style, color=color, lw=1.2, label=label)
-        ax.plot(*xy(path[:1]), "o", color=color, markersize=4)
-    legend(ax)
-    return ax
-
-
-def tracking_by_error(
-    linkage: Linkage, task: CircleTask, solution: Solution, ax: Axes | None = None
-) -> Axes:
-    """The path of the tip, coloured by its distance from its set point [mm].
-
-    Dashed is the path it was commanded to follow; the dot is its start. Later turns lie
-    on earlier ones.
-
-    **Arguments:** `task`: what was commanded, the tip's set point being `task.tip(t)`.
-
-    **Returns:** the axes, with a colour bar beside them.
-
-    **Raises:** ValueError for malformed arguments.
-    """
-    ts, commanded, actual = _tip(linkage, task, solution)
-    error = 1000 * np.abs(actual - commanded)
-    commanded = _one_turn(task, ts, commanded)
-    ax = plane_axes(ax, np.concatenate([commanded, actual]), beside=0.8)
-    ax.plot(*xy(commanded), "--", color=BLACK, lw=0.8, label="commanded")
-    corners = np.column_stack(xy(actual))
-    pieces = LineCollection(
-        list(np.stack([corners[:-1], corners[1:]], axis=1)),
-        array=(error[:-1] + error[1:]) / 2,
-        cmap=_DARK_TO_LIGHT,
-        lw=2,
-        capstyle="round",
-    )
-    pieces.set_clim(0, error.max())
-    ax.add_collection(pieces)
-    ax.autoscale_view()
-    ax.plot(*corners[0], "o", color=_DARK_TO_LIGHT(pieces.norm(error[0])), ms=4)
-    # As high as the axes, which equal scales may make lower than their place.
-    bar = ax.inset_axes((1.04, 0, 0.05, 1))
-    ax.figure.colorbar(pieces, cax=bar, label="tip error [mm]")
-    legend(ax)
-    return ax
-
-
-def tracking_error(
-    linkage: Linkage,
-    task: CircleTask,
-    solutions: Mapping[str, Solution],
-    ax: Axes | None = None,
-) -> Axes:
-    """Distance of the tip from its set point over time [m].
-
-    **Arguments:** as of `tracking`.
-
-    **Returns:** the axes.
-
-    **Raises:** ValueError for malformed arguments.
-    """
-    curves = _tips(linkage, task, solutions)
-    ax = axes_or_new(ax, 2.6)
-    for label, color, ts, commanded, actual in curves:
-        ax.plot(ts, np.abs(actual - commanded), color=color, lw=1.2, label=label)
-    ax.set(xlabel="time [s]", ylabel="tip error [m]")
-    ax.set_ylim(bottom=0)
-    legend(ax)
-    return ax
 
 
 def work_precision(

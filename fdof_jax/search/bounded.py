@@ -8,39 +8,25 @@ import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
 
 from ..checks import whole_number
+from .methods import (
+    GRADIENT_OF_LOSS,
+    LONGEST_STEP,
+    METHODS,
+    Adam,
+    Evaluation,
+    held_at_bounds,
+)
 
-# Stop where a change of the unknowns by 1 would hardly change the loss, to first order.
-_GRADIENT_OF_LOSS = 1e-6
 # Where the loss itself can vanish, its gradient is compared with that at the start.
 _GRADIENT_DECREASE = 1e-10
+
+
 # What the projected gradient must have fallen to for a stop for another reason to count
 # as convergence: part of the loss.
 _CONVERGED = 1e-2
-# No step changes an unknown by more: a factor of 7 where unknowns are logarithms.
-_LONGEST_STEP = 2.0
-
-
-class Evaluation(NamedTuple):
-    """A function at one point per run.
-
-    - `loss` (run,); `gradient` (run, n); `curvature` (run, n, n): semidefinite, Gauss
-      and Newton's for instance.
-    - `facts`: arrays (run, ...) to be kept with the point.
-    """
-
-    loss: Any
-    gradient: Any
-    curvature: Any
-    facts: dict[str, Any]
-
-    def row(self, index: int) -> "Evaluation":
-        return jax.tree.map(lambda a: a[index], self)
 
 
 class Row(NamedTuple):
@@ -51,161 +37,6 @@ class Row(NamedTuple):
     gradient_norm: float
     facts: dict[str, np.ndarray]
     wall_time: float
-
-
-class LevenbergMarquardt:
-    """Steps of the damped quadratic model in the box, which only ever go down.
-
-    Along a flat valley whose floor the model takes for curved, steps come out short
-    again and again: after one that brings more than it promised the next is stretched.
-    """
-
-    def __init__(self, z: np.ndarray):
-        self.damping, self.growth, self.stretch = 1e-3, 4, 1
-        self.promised = 0.0
-
-    def step(self, z, here: Evaluation, low, high) -> np.ndarray:
-        normal = here.curvature.copy()
-        scale = np.diag(normal)
-        normal += np.diag(self.damping * scale + 1e-12 * scale.sum() + 1e-300)
-        step = box_minimum(normal, here.gradient, low - z, high - z)
-        self.promised = -(here.gradient @ step + step @ here.curvature @ step / 2)
-        return np.clip(self.stretch * step, low - z, high - z)
-
-    def accepted(self, decrease: float) -> None:
-        more = decrease > 1.2 * self.promised
-        self.stretch = min(2 * self.stretch, 4) if more else 1
-        self.damping, self.growth = max(self.damping / 4, 1e-9), 4
-
-    def refused(self) -> bool:
-        """Whether there is anything left to try."""
-        if self.stretch > 1:
-            self.stretch = 1
-            return True
-        self.damping *= self.growth
-        self.growth *= 2
-        return self.damping <= 1e8
-
-
-class LBFGS:
-    """optax's L-BFGS directions, within the box by projection, halved until down."""
-
-    def __init__(self, z: np.ndarray):
-        import optax  # slow to import, and not needed by the default method
-
-        self.optimiser = optax.scale_by_lbfgs()
-        self.update = jax.jit(self.optimiser.update)
-        self.state: Any = self.optimiser.init(jnp.asarray(z))
-        self.direction: np.ndarray | None = None
-        self.share = 1.0
-
-    def step(self, z, here: Evaluation, low, high) -> np.ndarray:
-        held = _held(z, here.gradient, low, high)
-        if self.direction is None:
-            update, self.state = self.update(
-                jnp.asarray(here.gradient), self.state, jnp.asarray(z)
-            )
-            self.direction = -np.asarray(update)
-        direction = np.where(held, 0, self.direction)
-        if direction @ here.gradient >= 0:
-            direction = np.where(held, 0, -here.gradient)
-        # The first direction is the gradient itself, whose length says nothing.
-        if int(self.state.count) == 1:
-            direction = 0.3 * direction / np.abs(direction).max()
-        return np.clip(z + self.share * direction, low, high) - z
-
-    def accepted(self, decrease: float) -> None:
-        self.direction, self.share = None, 1.0
-
-    def refused(self) -> bool:
-        self.share /= 4
-        return self.share > 1e-8
-
-
-class Adam:
-    """optax's Adam, clipped to the box; its loss may rise on the way."""
-
-    def __init__(self, z: np.ndarray):
-        import optax
-
-        self.optimiser = optax.adam(0.05)
-        self.state: Any = self.optimiser.init(jnp.asarray(z))
-
-    def step(self, z, here: Evaluation, low, high) -> np.ndarray:
-        update, self.state = self.optimiser.update(
-            jnp.asarray(here.gradient), self.state
-        )
-        return np.clip(z + np.asarray(update), low, high) - z
-
-    def accepted(self, decrease: float) -> None:
-        pass
-
-
-METHODS: dict[str, Any] = {
-    "levenberg-marquardt": LevenbergMarquardt,
-    "l-bfgs": LBFGS,
-    "adam": Adam,
-}
-
-
-def box_minimum(
-    matrix: np.ndarray, slope: np.ndarray, low: np.ndarray, high: np.ndarray
-) -> np.ndarray:
-    """Where slope @ x + x @ matrix @ x / 2 is least in a box, of a definite matrix.
-
-    Unknowns without room are 0.
-    """
-    result = np.zeros_like(slope)
-    room = low < high
-    if not room.any():
-        return result
-    # Of unit diagonal: unknowns of any size are alike to the factorisation.
-    scale = 1 / np.sqrt(np.diag(matrix)[room])
-    normal = matrix[np.ix_(room, room)] * scale[:, None] * scale
-    problem = normal, slope[room] * scale, low[room] / scale, high[room] / scale
-    found = _by_sets(*problem)
-    if found is None:
-        found = _by_bvls(*problem)
-    # Bounds that hold are met exactly, whatever the scaling rounds.
-    _, _, lowest, highest = problem
-    inside = np.clip(found * scale, low[room], high[room])
-    result[room] = np.where(
-        found <= lowest, low[room], np.where(found >= highest, high[room], inside)
-    )
-    return result
-
-
-def _by_sets(normal, slope, low, high) -> np.ndarray | None:
-    """By guesses of which bounds hold, each from the last, until one proves right.
-
-    That takes few factorisations, where BVLS takes one per bound. None if it takes
-    many: then it may never end.
-    """
-    below = above = np.zeros(slope.shape, bool)
-    for _ in range(20):
-        x = np.where(below, low, np.where(above, high, 0.0))
-        free = ~(below | above)
-        if free.any():
-            factor = cho_factor(normal[np.ix_(free, free)])
-            x[free] = cho_solve(factor, -(slope + normal @ x)[free])
-        rise = slope + normal @ x
-        sets = (x < low) | below & (rise > 0), (x > high) | above & (rise < 0)
-        if (sets[0] == below).all() and (sets[1] == above).all():
-            return x
-        below, above = sets
-    return None
-
-
-def _by_bvls(normal, slope, low, high) -> np.ndarray:
-    from scipy.optimize import lsq_linear  # hardly ever needed, and slow to import
-
-    factor = cholesky(normal)
-    target = -solve_triangular(factor, slope, trans=1)
-    return lsq_linear(factor, target, (low, high), method="bvls", tol=1e-12).x
-
-
-def _held(z, gradient, low, high) -> np.ndarray:
-    return ((z <= low) & (gradient > 0)) | ((z >= high) & (gradient < 0))
 
 
 class Run:
@@ -234,7 +65,8 @@ class Run:
         if not finite:  # at the start
             self.reason = "the simulation or its derivative fails at the start"
             here = here._replace(loss=np.nan, gradient=np.full_like(z, np.nan))
-        held = _held(z, here.gradient, self.low, self.high) | (self.low >= self.high)
+        held = held_at_bounds(z, here.gradient, self.low, self.high)
+        held |= self.low >= self.high
         norm = float(np.linalg.norm(np.where(held, 0, here.gradient)))
         before, self.at, self.z = self.at, here, z
         if before is None:
@@ -246,7 +78,7 @@ class Run:
             return
         if before is not None:
             self.method.accepted(before.loss - here.loss)
-        if self._small(norm, here.loss, _GRADIENT_OF_LOSS):
+        if self._small(norm, here.loss, GRADIENT_OF_LOSS):
             self.reason = "the projected gradient vanishes"
         elif before is not None and not adam:
             if before.loss - here.loss < self.enough * before.loss:
@@ -259,8 +91,8 @@ class Run:
 
     def next(self) -> np.ndarray:
         assert self.at is not None
-        low = np.maximum(self.low, self.z - _LONGEST_STEP)
-        high = np.minimum(self.high, self.z + _LONGEST_STEP)
+        low = np.maximum(self.low, self.z - LONGEST_STEP)
+        high = np.minimum(self.high, self.z + LONGEST_STEP)
         step = self.method.step(self.z, self.at, low, high)
         # z + (high - z) may be beyond high by rounding.
         return np.clip(self.z + step, low, high)

@@ -10,7 +10,7 @@ import numpy as np
 from jax import Array
 
 from ..simulation.scene import stacked
-from .bounded import Evaluation
+from .methods import Evaluation
 
 # Lanes of a compiled batch at most: fewer do not fill the processor, and more wait for
 # each other.

@@ -11,7 +11,7 @@ import equinox as eqx
 import matplotlib
 
 from .. import scenes
-from ..control.pd import CircleTask
+from ..control.circle import CircleTask
 from ..data.files import load, save
 from ..simulation.scene import Scene
 from ..tuning.ensembles import perturbed

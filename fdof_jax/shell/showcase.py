@@ -14,9 +14,11 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from .. import scenes
-from ..control.pd import saturated, tip_deviation
+from ..analysis.tracking import saturated, tip_deviation
 from ..forces.joints import JointDamper
-from ..linkage.linkage import TOPOLOGIES, Linkage, State
+from ..linkage.coordinates import State
+from ..linkage.linkage import Linkage
+from ..linkage.topology import TOPOLOGIES
 from ..pictures import drawing, plotting
 from ..simulation.scene import Scene
 from ..simulation.simulate import simulate

@@ -7,7 +7,8 @@ import jax
 import numpy as np
 
 from ..forces.element import Forces
-from ..linkage.linkage import Linkage, State
+from ..linkage.coordinates import State
+from ..linkage.linkage import Linkage
 
 # Dimensions of a single linkage's leaves: one more is a batch axis.
 _LINKAGE_RANKS = dict(

@@ -12,7 +12,8 @@ from ..forces.added_inertia import added_inertia, inertial
 from ..forces.element import Forces, ScalarElement, StatefulElement
 from ..linkage.linkage import Linkage
 from ..mechanics.equations import Constants, zeros
-from ..mechanics.rates import Added, conditioning, rates, rates_and_conditioning
+from ..mechanics.rates import conditioning, rates, rates_and_conditioning
+from ..mechanics.solve import Added
 from ..xla.callbacks import with_checks
 
 # With inertia ratios below this the accelerations are right to six digits (float64) or

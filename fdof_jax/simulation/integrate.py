@@ -36,13 +36,8 @@ from .prescribed import (
     start_of,
 )
 from .solution import Solution
-from .steps import (
-    Watched,
-    bounded,
-    default_controller,
-    landing_on,
-    undifferentiated,
-)
+from .step_wrappers import Watched, bounded, landing_on, undifferentiated
+from .steps import default_controller
 from .unrolled_dopri8 import UnrolledDopri8
 
 # Steps over the time scale of a mode that keep its tangents to 1e-7 over 10 s: those of

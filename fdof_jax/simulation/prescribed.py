@@ -13,7 +13,12 @@ import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float
 
-from ..control.pd import Reference, checked_reference, positions_at, reference_motion
+from ..control.reference import (
+    Reference,
+    checked_reference,
+    positions_at,
+    reference_motion,
+)
 from ..forces.added_inertia import added_inertia
 from ..forces.element import Forces
 from ..linkage.linkage import Linkage

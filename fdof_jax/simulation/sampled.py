@@ -13,7 +13,8 @@ from numpy.typing import ArrayLike
 from ..checks import callable_tuple, concrete, real_array, whole_number
 from ..forces.element import Forces, ScalarElement, StatefulElement
 from ..forces.joints import JointEffort
-from ..linkage.linkage import Linkage, State, check_linkage, real_state
+from ..linkage.coordinates import State, real_state
+from ..linkage.linkage import Linkage, check_linkage
 from .field import stateful
 from .simulate import check_elements, simulate
 

@@ -11,7 +11,8 @@ from jax import Array
 
 from ..checks import instance
 from ..forces.element import Forces
-from ..linkage.linkage import Linkage, State
+from ..linkage.coordinates import State
+from ..linkage.linkage import Linkage
 
 
 class Scene(NamedTuple):

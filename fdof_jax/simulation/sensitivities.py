@@ -20,7 +20,8 @@ from .field import Args, initial_own, own_states, schedule_of, vector_field
 from .prescribed import hybrid_field, motion_at, prescribed, start_of
 from .scene import Scene
 from .solution import Solution
-from .steps import adaptive, landing_on
+from .step_wrappers import landing_on
+from .steps import adaptive
 
 # Of the motion and its derivatives, whichever are larger: with steps that these need,
 # the loss on Fig 7's circle is right to 1e-8.

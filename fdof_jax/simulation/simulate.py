@@ -19,7 +19,8 @@ from ..checks import (
     whole_number,
 )
 from ..forces.element import Forces, StatefulElement
-from ..linkage.linkage import Linkage, State, check_linkage, real_state
+from ..linkage.coordinates import State, real_state
+from ..linkage.linkage import Linkage, check_linkage
 from ..xla.array_namespace import in_numpy
 from .field import element_effort, stateful
 from .integrate import solve, solve_one

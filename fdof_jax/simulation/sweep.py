@@ -6,7 +6,6 @@ that takes many more steps than its neighbours is stopped and solved again later
 smaller batch of its kind.
 """
 
-import hashlib
 import os
 from pathlib import Path
 from typing import Any
@@ -17,8 +16,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.experimental import multihost_utils
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from numpy.typing import ArrayLike
 
 from ..checks import (
@@ -29,222 +26,23 @@ from ..checks import (
     real_array,
     whole_number,
 )
-from ..dynamics import forward_dynamics
-from ..forces.element import Forces, StatefulElement
-from ..linkage.linkage import Linkage, State, real_joints
+from ..forces.element import Forces
+from ..linkage.coordinates import State
+from ..linkage.linkage import Linkage
 from .batch_axes import Batch, batch_of
-from .field import element_effort
-from .simulate import simulate, solve_options
+from .chunks import expected_work, floats_of, in_chunks, motion_of
+from .simulate import solve_options
 from .solution import Solution
-from .steps import default_controller, limited
-
-_FIRST_LIMIT = 256  # steps, before anything is known
-_SLACK = 2.0  # a member may take this many times the steps of most others
-_SMALL = 8  # lanes for the few that take more
-
-
-def _floats(value: ArrayLike) -> Array:
-    array = jnp.asarray(value)
-    return array.astype(float) if array.dtype.kind in "iu" else array
-
-
-def _motion(settings: dict, ts: Array, moving: Any, shared: Any, limit: Array | None):
-    """One member's solution, without what all have in common."""
-    linkage, state0, forces = eqx.combine(moving, shared)
-    controller = settings["stepsize_controller"]
-    if limit is not None:
-        inner = default_controller() if controller is None else controller
-        controller = limited(inner, limit)
-    solution = simulate(
-        linkage,
-        state0,
-        ts,
-        forces,
-        throw=False,
-        **{**settings, "stepsize_controller": controller},
-    )
-    return solution.q, solution.qd, solution.own, solution.stats, solution.result
-
-
-@eqx.filter_jit
-def _solve_chunk(settings, mesh, ts, moving, shared, limit):
-    arrays, static = eqx.partition((ts, shared, limit), eqx.is_array)
-
-    def run(moving, arrays):
-        ts, shared, limit = eqx.combine(arrays, static)
-        return jax.vmap(lambda m: _motion(settings, ts, m, shared, limit))(moving)
-
-    if mesh is not None:
-        lanes, same = PartitionSpec("member"), PartitionSpec()
-        # Each device runs its own loop, until its own slowest member is done.
-        run = jax.shard_map(
-            run,
-            mesh=mesh,
-            in_specs=(lanes, same),
-            out_specs=lanes,
-            check_vma=False,
-        )
-    return run(moving, arrays)
-
-
-@eqx.filter_jit
-def _expected_work(t0: Array, moving: Any, shared: Any) -> tuple[Array, Array]:
-    """Topology, and a rate that goes with the number of steps [1/s], per member.
-
-    The rate is that of the joints now, and what their accelerations make of it.
-    """
-
-    def member(moving):
-        linkage, (q, qd), forces = eqx.combine(moving, shared)
-        tau = jnp.zeros(3)
-        for index, element in enumerate(forces):
-            state = None
-            if isinstance(element, StatefulElement):
-                state = element.initial_state(linkage)
-            tau = tau + element_effort(index, element, t0, q, qd, linkage, state)[0]
-        # Turning makes work, sliding hardly any.
-        turning = jnp.stack(real_joints(linkage.ef))
-        rate = jnp.where(turning, qd, 0)
-        qdd = forward_dynamics(linkage, q, qd, tau, forces)
-        acceleration = jnp.where(turning, qdd, 0)
-        topology = jnp.sum(jnp.where(turning, jnp.array([4, 2, 1]), 0))
-        norm = jnp.linalg.norm
-        return topology, norm(rate) + jnp.sqrt(norm(acceleration))
-
-    return jax.vmap(member)(moving)
-
-
-class _Chunks:
-    """Solves chunks and keeps their results, in memory and, if asked, in a folder."""
-
-    def __init__(self, batch: Batch, ts: Array, settings: dict, folder: Path | None):
-        moving, self.shared = batch.split()
-        self.leaves, self.structure = jax.tree.flatten(moving)
-        self.leaves = [np.asarray(leaf) for leaf in self.leaves]
-        self.ts, self.settings, self.folder = ts, settings, folder
-        devices = jax.devices()
-        self.devices = len(devices)
-        self.mesh = Mesh(np.array(devices), ("member",)) if len(devices) > 1 else None
-        self.size = batch.size
-        self.results: list[np.ndarray] = []
-        self.result_structure: Any = None
-        if folder is not None:
-            folder.mkdir(parents=True, exist_ok=True)
-            self.digest = hashlib.sha256(repr((settings, batch.axes)).encode())
-            # The representation of settings leaves out the values of arrays.
-            arrays = eqx.filter(settings, eqx.is_array)
-            for leaf in jax.tree.leaves((batch.inputs, ts, arrays)):
-                leaf = np.asarray(leaf)
-                self.digest.update(repr((leaf.shape, leaf.dtype)).encode())
-                self.digest.update(leaf.tobytes())
-
-    def solve(self, members: np.ndarray, lanes: int, limit: int) -> np.ndarray:
-        """Solve these members, at most `lanes` per device. Their numbers of steps."""
-        padded = np.full(lanes * self.devices, members[0])
-        padded[: len(members)] = members
-        moving = jax.tree.unflatten(
-            self.structure, [self._place(leaf[padded]) for leaf in self.leaves]
-        )
-        path = None
-        if self.folder is not None:
-            # Chunks of another size hold other members.
-            digest = self.digest.copy()
-            digest.update(repr((members.tolist(), limit)).encode())
-            path = self.folder / f"{digest.hexdigest()[:32]}.npz"
-        limit_array = np.asarray(limit, np.int32)
-        arguments = (
-            self.settings, self.mesh, self.ts, moving, self.shared, limit_array
-        )  # fmt: skip
-        if path is not None and path.exists():
-            with np.load(path) as saved:
-                values = [saved[f"arr_{i}"] for i in range(len(saved.files))]
-            if self.result_structure is None:
-                self.result_structure = jax.tree.structure(
-                    eqx.filter_eval_shape(_solve_chunk, *arguments)
-                )
-        else:
-            solved, self.result_structure = jax.tree.flatten(_solve_chunk(*arguments))
-            if jax.process_count() > 1:
-                solved = multihost_utils.process_allgather(solved, tiled=True)
-            values = [np.asarray(leaf)[: len(members)] for leaf in solved]
-            if path is not None and jax.process_index() == 0:
-                unfinished = path.with_suffix(".part")
-                with unfinished.open("wb") as file:
-                    np.savez(file, *values)
-                os.replace(unfinished, path)
-        if not self.results:
-            self.results = [
-                np.empty((self.size, *v.shape[1:]), v.dtype) for v in values
-            ]
-        for kept, value in zip(self.results, values):
-            kept[members] = value
-        *_, stats, _ = jax.tree.unflatten(self.result_structure, values)
-        return stats["num_steps"]
-
-    def _place(self, rows: np.ndarray) -> np.ndarray | Array:
-        if jax.process_count() == 1:
-            return rows
-        assert self.mesh is not None  # as there are several processes
-        sharding = NamedSharding(self.mesh, PartitionSpec("member"))
-        return jax.make_array_from_callback(rows.shape, sharding, lambda i: rows[i])
-
-    def solution(self) -> Solution:
-        leaves = [jnp.asarray(leaf) for leaf in self.results]
-        q, qd, own, stats, result = jax.tree.unflatten(self.result_structure, leaves)
-        ts = jnp.broadcast_to(self.ts, (self.size, *self.ts.shape))
-        return Solution(ts, q, qd, stats, result, own)
-
-
-def _in_chunks(
-    batch: Batch,
-    ts: Array,
-    settings: dict,
-    chunk: int,
-    folder: Path | None,
-    meter: diffrax.AbstractProgressMeter,
-) -> Solution:
-    topology, work = map(np.asarray, _expected_work(ts[0], *batch.split()))
-    waiting = np.lexsort((work, topology))  # NaN comes last
-    chunks = _Chunks(batch, ts, settings, folder)
-    max_steps = settings["max_steps"] or np.iinfo(np.int32).max
-    # Small batches are cut too, so that a slow member holds up few others.
-    share = -(-batch.size // (8 * chunks.devices))
-    lanes, limit = min(chunk, max(share, 8 * _SMALL)), _FIRST_LIMIT
-    done, progress = 0, meter.init()
-    while len(waiting):
-        late = []
-        for start in range(0, len(waiting), lanes * chunks.devices):
-            members = waiting[start : start + lanes * chunks.devices]
-            while True:
-                limit = min(limit, max_steps)
-                # At the end diffrax's own limit, which spares who ends at that step.
-                own = limit if limit < max_steps else np.iinfo(np.int32).max
-                steps = chunks.solve(members, lanes, int(own))
-                out_of_steps = (steps >= limit) & (limit < max_steps)
-                if out_of_steps.sum() <= len(members) // 2:
-                    break
-                limit *= 4  # it was too low for most
-            late.append(members[out_of_steps])
-            done += len(members) - out_of_steps.sum()
-            progress = meter.step(progress, jnp.asarray(done / batch.size))
-            typical = np.percentile(steps[~out_of_steps], 90)
-            limit = max(int(_SLACK * typical), _FIRST_LIMIT // 4)
-        waiting = np.concatenate(late)
-        limit = 8 * limit
-        if len(waiting) <= lanes // 2:
-            lanes = min(lanes, _SMALL) if len(waiting) > 1 else 1
-    meter.close(progress)
-    return chunks.solution()
 
 
 def _traced(batch: Batch, ts: Array, settings: dict, chunk: int) -> Solution:
     """Under a transformation: in chunks, and no failed member enters a derivative."""
     moving, shared = batch.split()
-    order = jnp.lexsort(_expected_work(ts[0], moving, shared)[::-1])
+    order = jnp.lexsort(expected_work(ts[0], moving, shared)[::-1])
 
     def in_chunks(moving, shared):
         return jax.lax.map(
-            lambda member: _motion(settings, ts, member, shared, None),
+            lambda member: motion_of(settings, ts, member, shared, None),
             moving,
             batch_size=chunk,
         )
@@ -327,7 +125,7 @@ def sweep(
     """
     instance("linkage", linkage, Linkage)
     try:
-        state0 = State(*map(_floats, state0))
+        state0 = State(*map(floats_of, state0))
     except (TypeError, ValueError):
         raise ValueError(f"state0: expected a State(q, qd), got {state0!r}.") from None
     ts = real_array("ts", ts, (None,))
@@ -351,7 +149,7 @@ def sweep(
     if checkpoint is not None and not isinstance(checkpoint, str | os.PathLike):
         raise ValueError(f"checkpoint: expected a folder, got {checkpoint!r}.")
     try:
-        eqx.filter_eval_shape(_expected_work, ts[0], *batch.split())
+        eqx.filter_eval_shape(expected_work, ts[0], *batch.split())
     except TypeError as error:
         raise TypeError(
             "forces, forces_axes: one member's force elements, with the arrays that "
@@ -364,7 +162,7 @@ def sweep(
             )
         return _traced(batch, ts, settings, chunk)
     folder = None if checkpoint is None else Path(checkpoint)
-    solution = _in_chunks(batch, ts, settings, chunk, folder, progress_meter)
+    solution = in_chunks(batch, ts, settings, chunk, folder, progress_meter)
     failed = np.flatnonzero(np.asarray(solution.result != diffrax.RESULTS.successful))
     if throw and len(failed):
         raise RuntimeError(

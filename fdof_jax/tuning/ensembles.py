@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..checks import instance, real_array, whole_number
-from ..linkage.linkage import Linkage, State, check_linkage
+from ..linkage.coordinates import State
+from ..linkage.linkage import Linkage, check_linkage
 from ..mechanics.kinematics import tip_jacobian, tip_position
 from ..simulation.scene import Scene, stacked
 from .losses import controller_of

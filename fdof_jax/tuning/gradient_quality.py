@@ -16,8 +16,8 @@ from ..simulation.prescribed import prescribed
 from ..simulation.scene import Scene, is_number
 from ..simulation.sensitivities import sensitivities
 from ..simulation.simulate import simulate
+from .gains import check_tuned, with_gains
 from .losses import controller_of, relative_demands, tip_errors
-from .tune import check_tuned, with_gains
 
 _SAMPLES = 1001
 _HORIZONS = 10

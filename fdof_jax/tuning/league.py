@@ -4,8 +4,11 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ..control.pd import CircleTask, PDController
-from ..linkage.linkage import TOPOLOGIES, Linkage, State, from_chain
+from ..control.circle import CircleTask
+from ..control.pd import PDController
+from ..linkage.coordinates import State, from_chain
+from ..linkage.linkage import Linkage
+from ..linkage.topology import TOPOLOGIES
 from ..simulation.scene import Scene
 from .result import TuneResult
 

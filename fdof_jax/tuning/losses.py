@@ -10,8 +10,9 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from ..analysis.tracking import tip_deviation
 from ..checks import real_array
-from ..control.pd import PDController, tip_deviation
+from ..control.pd import PDController
 from ..simulation.scene import Scene
 from ..simulation.solution import Solution
 

@@ -11,13 +11,15 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from ..analysis.tracking import tip_deviation
 from ..checks import callable_tuple, instance, real_array, whole_number
 from ..control.model_based import ComputedTorque
-from ..control.pd import PDController, tip_deviation
+from ..control.pd import PDController
 from ..forces.joints import EffortHistory
 from ..linkage.linkage import check_linkage
-from ..search.bounded import Evaluation, Run, minimise, reporting
+from ..search.bounded import Run, minimise, reporting
 from ..search.lanes import Lanes
+from ..search.methods import Evaluation
 from ..simulation.scene import Scene
 from ..simulation.sensitivities import sensitivities
 from ..simulation.simulate import check_elements, joint_efforts, simulate

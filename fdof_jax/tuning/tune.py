@@ -3,156 +3,39 @@
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, overload
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
 from numpy.typing import ArrayLike
 
 from ..checks import (
-    callable_tuple,
-    instance,
-    is_traced,
     keywords_as,
     one_of,
     real_array,
     whole_number,
 )
-from ..linkage.linkage import check_linkage, joint_names, real_state
-from ..search.bounded import METHODS, Evaluation, Row, Run, minimise, reporting
+from ..search.bounded import Row, Run, minimise, reporting
 from ..search.lanes import Lanes
+from ..search.methods import METHODS
 from ..simulation.scene import Scene, stacked, unstacked
-from ..simulation.sensitivities import TOLERANCE, sensitivities
-from ..simulation.simulate import check_elements
-from ..simulation.solution import Solution
-from .losses import Tracking, controller_of, relative_demands, tip_errors
+from ..simulation.sensitivities import TOLERANCE
+from .gains import (
+    SAMPLES,
+    Loss,
+    bounds_of,
+    check_alike,
+    check_tuned,
+    evaluate_gains,
+    with_gains,
+)
+from .losses import Tracking, tip_errors
 from .result import TradeOff, TuneResult, result_of
 
-Loss = Callable[[Scene, Solution], Array]
-
-_SAMPLES = 1001
 _ENOUGH = 1e-4  # half of it in the rms
+
+
 # The worst of an ensemble is smoothed to a power mean of this order: of n members it is
 # at most a factor of n^(1/32) below the worst.
 _WORST = 32
-
-
-def with_gains(scene: Scene, gains: Array) -> Scene:
-    """The scene with other kp and kd, the rows of `gains`."""
-    controller = controller_of(scene)
-    index = [force is controller for force in scene.forces].index(True)
-    controller = eqx.tree_at(lambda c: (c.kp, c.kd), controller, (gains[0], gains[1]))
-    forces = (*scene.forces[:index], controller, *scene.forces[index + 1 :])
-    return scene._replace(forces=forces)
-
-
-def evaluate_gains(z: Array, problem: tuple[Scene, Loss, Array]) -> Evaluation:
-    """One member's loss and its derivatives in the log-gains `z`.
-
-    `problem`: the scene, the loss, and which gains are tuned.
-    """
-    scene, loss, tuned = problem
-
-    def scene_at(z):
-        # A gain of zero has no logarithm: it stays zero.
-        return with_gains(scene, jnp.where(tuned, jnp.exp(z.reshape(2, 3)), 0))
-
-    def residuals(scene, solution):
-        value = loss(scene, solution)
-        size = np.shape(value) if eqx.is_array_like(value) else ()
-        value = real_array("loss(scene, solution)", value, size)
-        if value.ndim:
-            return value.reshape(-1)
-        # The square of a scalar loss's root is the loss; at 0 it has no derivative.
-        return jnp.where(value == 0, 0, jnp.sqrt(jnp.where(value == 0, 1, value)))[None]
-
-    ts = jnp.linspace(0, scene.t1, _SAMPLES)
-    value, jacobian, trial, solution = sensitivities(scene_at, residuals, z, ts)
-    demands = jnp.abs(relative_demands(trial, solution))
-    # An actuator without effort makes none, whatever is asked of it.
-    limited = jnp.where(controller_of(trial).limit > 0, 1, 0)[None]
-    square_error = jnp.full((), jnp.nan)
-    if hasattr(controller_of(trial).reference, "tip"):
-        square_error = jnp.sum(tip_errors(trial, solution) ** 2)
-    facts = dict(
-        saturated=jnp.mean(demands > 1, axis=0),
-        effort=jnp.sqrt(jnp.mean(jnp.minimum(demands, limited) ** 2, axis=0)),
-        square_error=square_error,
-        simulated=jnp.isfinite(solution.q[-1]).all(),
-        steps=solution.stats["num_steps"],
-    )
-    return Evaluation(
-        jnp.sum(value**2), 2 * jacobian.T @ value, 2 * jacobian.T @ jacobian, facts
-    )
-
-
-def check_tuned(name: str, scene: Any, loss: Any) -> None:
-    """Raise ValueError unless this scene can be tuned by this loss."""
-    instance(name, scene, Scene)
-    if is_traced(scene):
-        raise ValueError(
-            f"{name}: expected known values, got {scene!r}: gains are tuned outside of "
-            "JAX's transformations."
-        )
-    check_linkage(scene.linkage)
-    real_state(f"{name}.state0", scene.state0)
-    t1 = real_array(f"{name}.t1", scene.t1, (), above=0)
-    callable_tuple(f"{name}.forces", scene.forces)
-    controller = controller_of(scene)
-    check_elements(scene.forces, scene.linkage, jnp.stack([jnp.zeros_like(t1), t1]))
-    if isinstance(loss, Tracking):
-        loss.check(scene)
-    if isinstance(loss, Tracking) or loss is tip_errors:
-        if not hasattr(controller.reference, "tip"):
-            raise ValueError(
-                "loss: expected one of your own, because the reference has no `tip` "
-                f"for the tip error, got {controller.reference!r}."
-            )
-
-
-def _check_alike(name: str, member: Scene, scene: Scene) -> None:
-    """Raise ValueError unless the gains of both are of one meaning."""
-    kinds = [
-        (joint_names(s.linkage), type(controller_of(s)).__name__)
-        for s in (member, scene)
-    ]
-    if kinds[0] != kinds[1]:
-        raise ValueError(
-            f"{name}: expected joints and a controller like the scene's, {kinds[1]}, "
-            f"got {kinds[0]}."
-        )
-
-
-def _bounds(scene: Scene, factor: Any, bounds: Any) -> tuple[np.ndarray, ...]:
-    """Of kp and kd: the start, the least, the greatest; (2, 3) each."""
-    controller = controller_of(scene)
-    start = np.stack([np.asarray(controller.kp), np.asarray(controller.kd)])
-    if bounds is None:
-        factor = 4.0 if factor is None else factor
-        factor = float(real_array("factor", factor, (), above=1))
-        return start, start / factor, start * factor
-    if factor is not None:
-        raise ValueError(f"factor: expected none beside bounds, got {factor!r}.")
-    if not isinstance(bounds, tuple | list | np.ndarray) or len(bounds) != 2:
-        raise ValueError(f"bounds: expected (lower, upper), got {bounds!r}.")
-    lower, upper = (
-        np.asarray(real_array(f"bounds[{i}]", b, (2, 3), minimum=0))
-        for i, b in enumerate(bounds)
-    )
-    if not (lower <= upper).all():
-        raise ValueError(
-            "bounds: expected the least gains before the greatest, got "
-            f"{lower.tolist()} and {upper.tolist()}."
-        )
-    if not ((lower <= start) & (start <= upper)).all():
-        raise ValueError(
-            "bounds: expected the scene's gains between them, got "
-            f"{lower.tolist()} and {upper.tolist()} around {start.tolist()}."
-        )
-    if (lower[start > 0] == 0).any():
-        raise ValueError("bounds: expected positive least gains, got 0.")
-    # Gains of zero stay zero.
-    return start, np.where(start > 0, lower, 0), np.where(start > 0, upper, 0)
 
 
 def _started(box, starts: int, draw: np.random.Generator) -> tuple[np.ndarray, ...]:
@@ -190,14 +73,14 @@ def _search(
         if not callable(loss) or isinstance(loss, type):
             raise ValueError(f"loss: expected a callable, got {loss!r}.")
         check_tuned("scene", scene, loss)
-    boxes = [_bounds(scene, factor, bounds) for scene in scenes]
+    boxes = [bounds_of(scene, factor, bounds) for scene in scenes]
     if ensemble is None:
         members = [[scene] for scene in scenes]
     else:
         members = [unstacked("ensemble", ensemble)] * len(losses)
         for i, member in enumerate(members[0]):
             check_tuned(f"ensemble[{i}]", member, losses[0])
-            _check_alike(f"ensemble[{i}]", member, scenes[0])
+            check_alike(f"ensemble[{i}]", member, scenes[0])
     problems = [
         [(member, loss, lower > 0) for member in row]
         for row, loss, (_, lower, _) in zip(members, losses, boxes)
@@ -214,7 +97,7 @@ def _search(
         over=over if ensemble is not None else "one scene",
         solver="Tsit5",
         tolerance=TOLERANCE,
-        samples=_SAMPLES,
+        samples=SAMPLES,
         dtype=str(jnp.result_type(float)),
     )
     results = []
@@ -313,10 +196,14 @@ def tune(
 def tune_each(
     scenes: Mapping[str, Scene], *, loss: Loss = ..., **keywords: Any
 ) -> dict[str, TuneResult]: ...
+
+
 @overload
 def tune_each(
     scenes: Sequence[Scene], *, loss: Loss = ..., **keywords: Any
 ) -> list[TuneResult]: ...
+
+
 def tune_each(scenes: Any, *, loss: Loss = tip_errors, **keywords: Any) -> Any:
     """`tune` for several scenes of one structure, in one compiled program.
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import fdof_jax as fj
-from fdof_jax.control.pd import tip_deviation
+from fdof_jax.analysis.tracking import tip_deviation
 from fdof_jax.xla.trigonometry import sincos
 from hard.scenes import START, Hold, arm
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import fdof_jax as fj
-from fdof_jax.control.pd import saturated
+from fdof_jax.analysis.tracking import saturated
 from hard.scenes import START, TARGET, Hold, arm
 
 STILL = np.zeros(3)

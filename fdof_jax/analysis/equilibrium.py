@@ -1,0 +1,84 @@
+"""Configurations at rest, and the efforts that hold an arm."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix
+from jax import Array
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from ..checks import real_array
+from ..dynamics import inverse_dynamics
+from ..forces.element import Forces
+from ..linkage.linkage import Linkage
+from .linearization import checked
+
+
+def equilibrium(
+    linkage: Linkage, forces: Forces, q: ArrayLike, t: ArrayLike = 0.0
+) -> Float[Array, " joint"]:
+    """Joint positions near `q` at which the arm stays at rest under its forces.
+
+    An operating point for `linearize`: under a PD controller, the position that it
+    holds while the reference stands still, its sag included.
+
+    **Arguments:** the linkage; force elements without a state of their own; `q`: a
+    first guess [m or rad]; `t`: the time that the elements are given [s].
+
+    **Returns:** positions (3,); NaN where Levenberg and Marquardt's method finds none,
+    from a guess at which actuators are at their limits for instance. It need not be
+    stable: see `linearize`.
+
+    **Raises:** ValueError for malformed arguments.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig5().linkage
+    >>> fj.equilibrium(arm, (), [-1.0, 0.1, 0.1]).tolist()  # it hangs
+    [-1.571, 0.0, 0.0]
+    """
+    checked(linkage, forces)
+    return _rest(linkage, forces, real_array("q", q, (3,)), real_array("t", t, ()))
+
+
+@eqx.filter_jit
+def _rest(linkage: Linkage, forces: Forces, q: Array, t: Array) -> Array:
+    still = jnp.zeros(3)
+
+    def efforts(q, _):
+        total = -inverse_dynamics(linkage, q, still, still, forces)
+        for element in forces:
+            total = total + element(t, q, still, linkage)
+        return total
+
+    # Efforts over what rounds them: stiff controllers are as exact as soft springs.
+    slopes = jnp.abs(jax.jacfwd(efforts)(q, None))
+    size = jax.lax.stop_gradient(
+        slopes @ (1 + jnp.abs(q)) + jnp.abs(efforts(q, None)) + 1
+    )
+    tight = 1e3 * float(jnp.finfo(q.dtype).eps)
+    solver = optimistix.LevenbergMarquardt(rtol=tight, atol=tight)
+    relative = lambda q, _: efforts(q, None) / size
+    found = optimistix.root_find(relative, solver, q, throw=False)
+    good = found.result == optimistix.RESULTS.successful
+    # Not by `where`: where none is found the derivative is NaN too.
+    return found.value * jnp.where(good, 1, jnp.nan)
+
+
+def holding_efforts(
+    linkage: Linkage, q: ArrayLike, forces: Forces = ()
+) -> Float[Array, " joint"]:
+    """The joint efforts that hold the arm at rest against gravity [N or N m].
+
+    **Arguments:** the linkage; `q`: joint positions [m or rad]; `forces`: elements
+    whose masses are held too.
+
+    **Raises:** ValueError for malformed arguments.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig5().linkage
+    >>> fj.holding_efforts(arm, [0, 0, 0]).tolist()
+    [58.86, 29.43, 9.81]
+    """
+    still = jnp.zeros(3)
+    return inverse_dynamics(linkage, q, still, still, forces)

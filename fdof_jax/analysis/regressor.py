@@ -1,0 +1,85 @@
+"""Inertial parameters, in which inverse dynamics is linear."""
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float
+
+from ..forces.points import dot, frames_of
+from ..linkage.linkage import Linkage, check_linkage, compiled
+
+
+def inertial_parameters(linkage: Linkage) -> Float[Array, "link 4"]:
+    """Per link: mass [kg], its moments m p, m q [kg m], and inertia about the start.
+
+    In these the dynamics are linear: see `regressor`. The inertia [kg m^2] is about the
+    characteristic point of the link.
+
+    **Raises:** ValueError for what is not a linkage.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig3().linkage
+    >>> fj.inertial_parameters(arm)[0].tolist()  # m, m p, m q, I about the pivot
+    [5.0, 2.5, -5.0, 6.25]
+    """
+    check_linkage(linkage)
+    m, (p, q) = linkage.mass, linkage.com.T
+    return jnp.stack([m, m * p, m * q, linkage.inertia + m * (p**2 + q**2)], axis=1)
+
+
+@compiled(q=(3,), qd=(3,), qdd=(3,))
+def regressor(
+    linkage: Linkage,
+    q: Float[Array, " joint"],
+    qd: Float[Array, " joint"],
+    qdd: Float[Array, " joint"],
+) -> Float[Array, "joint link 4"]:
+    """What multiplies the inertial parameters in the inverse dynamics.
+
+    tau = regressor : `inertial_parameters(linkage)`, summed over links and parameters;
+    the masses and inertias of the linkage do not count. By Lagrange's equations for one
+    parameter at a time.
+
+    Stacked over a motion its rank tells how many combinations of the parameters can be
+    identified: nine of the twelve for an RPR arm.
+
+    **Arguments:** the linkage; `q`, `qd`, `qdd`: joint positions, velocities and
+    accelerations (3,) [m or rad, and per s and s^2].
+
+    **Raises:** ValueError for malformed arguments.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig5().linkage
+    >>> import numpy as np
+    >>> state = [0.1, 0.2, 0.3], [1, 0, -1], [0.5, 0.5, 0.5]
+    >>> np.tensordot(fj.regressor(arm, *state), fj.inertial_parameters(arm), 2).tolist()
+    [68.982, 35.32, 11.766]
+    >>> fj.inverse_dynamics(arm, *state).tolist()
+    [68.982, 35.32, 11.766]
+    """
+
+    def parts(q):
+        frames = frames_of(linkage, tuple(q))
+        start, direction = (jnp.stack(rows[1:]) for rows in frames[:2])
+        return start, direction
+
+    def lagrangians(q, qd):
+        """Of unit parameters, (3, 4)."""
+        (start, along), (velocity, turning) = jax.jvp(parts, (q,), (qd,))
+        # d(direction)/dt = i rate direction.
+        rate = jnp.imag(turning * jnp.conj(along))
+        g = linkage.gravity
+        return jnp.stack(
+            [
+                dot(velocity, velocity) / 2 - g * start.imag,
+                dot(velocity, turning) - g * along.imag,
+                dot(velocity, 1j * turning) - g * (1j * along).imag,
+                rate**2 / 2,
+            ],
+            axis=1,
+        )
+
+    momenta = lambda q, qd: jax.jacfwd(lagrangians, argnums=1)(q, qd)
+    _, change = jax.jvp(momenta, (q, qd), (qd, qdd))
+    slopes = jax.jacfwd(lagrangians, argnums=0)(q, qd)
+    return jnp.moveaxis(change - slopes, -1, 0)

@@ -1,0 +1,39 @@
+"""How well a controller tracks: saturation and the tip's deviation."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Bool, Float
+
+from ..control.circle import CircleTask
+from ..control.pd import PDController
+from ..linkage.linkage import Linkage
+from ..mechanics.kinematics import tip_position
+from ..simulation.solution import Solution
+
+
+@eqx.filter_jit
+def saturated(
+    controller: PDController, linkage: Linkage, solution: Solution
+) -> Bool[Array, "time joint"]:
+    """Whether each actuator is at its limit, along a motion.
+
+    **Arguments:** a controller, and a solution that it took part in.
+    """
+    demand = jax.vmap(controller.demand, in_axes=(0, 0, 0, None))(
+        solution.ts, solution.q, solution.qd, linkage
+    )
+    return jnp.abs(demand) > controller.limit[None]
+
+
+@eqx.filter_jit
+def tip_deviation(
+    linkage: Linkage, task: CircleTask, solution: Solution
+) -> Float[Array, "time 2"]:
+    """From the commanded to the actual tip along a motion [m].
+
+    **Arguments:** a linkage, the task (anything with `tip(t)`), and a solution.
+    """
+    actual = jax.vmap(tip_position, in_axes=(None, 0))(linkage, solution.q)
+    return actual - jax.vmap(task.tip)(solution.ts)

@@ -1,0 +1,168 @@
+"""The circle of Fig 7."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from ..checks import concrete, real_array, sign
+from ..linkage.linkage import Linkage, check_linkage
+from ..mechanics.inverse_kinematics import (
+    plane_angle,
+    solve_joints,
+    unmoved_part,
+    whole_turns,
+)
+from ..xla.array_namespace import in_numpy, namespace, sine_and_cosine
+from .reference import known_reach
+
+
+class CircleTask(eqx.Module):
+    """A circle traced by the tip at constant speed, the last link keeping its angle.
+
+    Called with `(t, linkage)` it gives the joint reference: the closed-form inverse
+    kinematics and its exact rate. The reference is continuous in time, also where the
+    path crosses the negative x axis or winds around the base; at t = 0 it is that of
+    `inverse_kinematics`.
+
+    Fig 7 does not print its circle: the default is our choice. It lies inside the reach
+    of the figure's arm and starts 0.25 m from the arm's tip, because the text speaks
+    of an initial offset.
+
+    **Arguments:**
+
+    - `center`: (x, y) [m].
+    - `radius`: not negative [m].
+    - `period`: time of one turn, counter-clockwise if positive, not zero [s].
+    - `phase`: direction of the starting point as seen from the centre [rad].
+    - `orientation`: th4, the absolute angle of the last link [rad].
+    - `branch`: assembly of the arm, 1 or -1: see `inverse_kinematics`.
+
+    **Raises:** ValueError for malformed arguments; `check`, and with it `simulate`, for
+    a circle out of the linkage's reach.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig7().linkage
+    >>> circle = fj.CircleTask(center=[-4, 2], radius=0.75, period=5)
+    >>> q, qd = circle(0.0, arm)
+    >>> circle.tip(0.0).tolist(), fj.tip_position(arm, q).tolist()
+    ([-4.75, 2.0], [-4.75, 2.0])
+    """
+
+    center: Float[Array, " 2"]
+    radius: Float[Array, ""]
+    period: Float[Array, ""]
+    phase: Float[Array, ""]
+    orientation: Float[Array, ""]
+    branch: Float[Array, ""]
+
+    def __init__(
+        self,
+        center: ArrayLike = (-4.0, 2.0),
+        radius: ArrayLike = 0.75,
+        period: ArrayLike = 5.0,
+        phase: ArrayLike = np.pi,
+        orientation: ArrayLike = np.pi / 2,
+        branch: int = 1,
+    ):
+        self.center = real_array("center", center, (2,))
+        self.radius = real_array("radius", radius, (), minimum=0)
+        self.period = real_array("period", period, ())
+        if (given := concrete(self.period)) is not None and given == 0:
+            raise ValueError("period: expected a time other than 0 s, got 0.")
+        self.phase = real_array("phase", phase, ())
+        self.orientation = real_array("orientation", orientation, ())
+        self.branch = sign("branch", branch)
+
+    @property
+    def evaluates_in_numpy(self) -> bool:
+        """Whether `assembly` does; a subclass may move along another curve."""
+        return type(self) is CircleTask
+
+    def tip(self, t: ArrayLike) -> Float[Array, " 2"]:
+        """The commanded tip position at time `t` [s]: (x, y) [m]."""
+        return _on_circle(self, real_array("t", t, ()))
+
+    def assembly(self, t: Array, linkage: Linkage) -> tuple[Array, Array]:
+        """Joint positions, and the root that is 0 at the edge of the reach."""
+        unmoved = unmoved_part(linkage, self.orientation)
+        wrist, hub = _on_circle(self, t) - unmoved, self.center - unmoved
+        turns = whole_turns(_bearing(self, 0.0, hub))
+        bearing = _bearing(self, t, hub) - 2 * np.pi * turns
+        return solve_joints(linkage, wrist, bearing, self.orientation, self.branch)
+
+    def __call__(
+        self, t: ArrayLike, linkage: Linkage
+    ) -> tuple[Float[Array, " joint"], Float[Array, " joint"]]:
+        """Joint positions [m or rad] and velocities [m/s or rad/s] at time `t` [s]."""
+        check_linkage(linkage)
+        t = real_array("t", t, ())
+        positions = lambda t: self.assembly(t, linkage)[0]
+        return jax.jvp(positions, (t,), (jnp.ones_like(t),))
+
+    def check(self, linkage: Linkage, ts: Array) -> None:
+        """Raise ValueError if the tip leaves the linkage's reach between the times.
+
+        Or for values that the constructor refuses.
+        """
+        CircleTask(
+            self.center, self.radius, self.period, self.phase, self.orientation,
+            int(self.branch),
+        )  # fmt: skip
+        task, arm, ts = in_numpy((self, linkage, ts))
+        start, end, period = float(ts[0]), float(ts[-1]), float(task.period)
+        turn = abs(period)
+        # The reach ends first where the wrist is nearest to or farthest from the base,
+        # or along a direction that the ground or the last link fixes.
+        hub = task.center - unmoved_part(arm, task.orientation)
+        directions = np.array(
+            [np.arctan2(hub[1], hub[0]), arm.base_angle,
+             task.orientation - arm.locked[2]]
+        )  # fmt: skip
+        lead = np.concatenate([directions, directions + np.pi]) - task.phase
+        extremes = start + (lead / (2 * np.pi) * period - start) % turn
+        times = np.linspace(start, min(end, start + turn), 257)
+        times = np.append(times, np.minimum(extremes, end))
+        if not known_reach(self, linkage, times.astype(ts.dtype)).all():
+            raise ValueError(
+                "reference: expected a circle within the linkage's reach at "
+                f"orientation {task.orientation:g} rad on branch {task.branch:+g}, got "
+                f"center {task.center.tolist()} and radius {task.radius:g} m."
+            )
+
+
+# Functions, because a call of a module's method makes an object each time.
+
+
+def _turned(circle: CircleTask, t: Array | float) -> tuple[Array, Array, Array]:
+    """Direction from the centre: its angle, cosine and sine."""
+    angle = circle.phase + 2 * np.pi * t / circle.period
+    sin, cos = sine_and_cosine(angle)
+    return angle, cos, sin
+
+
+def _on_circle(circle: CircleTask, t: Array) -> Array:
+    """Points of the circle, (..., 2)."""
+    _, cos, sin = _turned(circle, t)
+    return circle.center + circle.radius * namespace(cos).stack([cos, sin], axis=-1)
+
+
+def _bearing(circle: CircleTask, t: Array | float, hub: Array) -> Array:
+    """Angle of hub + radius * (cos, sin)(turned) without jumps.
+
+    The larger of the two vectors carries the angle; the smaller one adds less than
+    a quarter turn, for which the arctangent has no jump.
+    """
+    turned, cos, sin = _turned(circle, t)
+    xp, radius = namespace(turned, hub), circle.radius
+    along, across = hub[0] * cos + hub[1] * sin, hub[1] * cos - hub[0] * sin
+    square = hub[0] ** 2 + hub[1] ** 2
+    around = radius**2 > square
+    carrier = xp.where(around, turned, plane_angle(hub[1], hub[0]))
+    return carrier + plane_angle(
+        xp.where(around, across, -radius * across),
+        xp.where(around, radius + along, square + radius * along),
+    )

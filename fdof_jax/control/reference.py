@@ -1,0 +1,96 @@
+"""What a controller follows, and whether an arm can."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Bool
+from numpy.typing import ArrayLike
+
+from ..checks import is_traced, real_array
+from ..linkage.linkage import Linkage, check_linkage
+from ..xla.array_namespace import in_numpy
+
+Reference = Callable[[Array, Linkage], tuple[Array, Array]]
+
+
+def checked_reference(value: Any) -> Any:
+    """`value` if it can be called as a reference, else ValueError."""
+    if not callable(value) or isinstance(value, type):
+        raise ValueError(
+            "reference: expected a callable (t, linkage) -> (q, qd), for instance "
+            f"CircleTask(), got {value!r}."
+        )
+    return value
+
+
+def reference_motion(
+    reference: Reference, t: Array, linkage: Linkage
+) -> tuple[Array, Array]:
+    """What a reference returns, refused unless it is positions and velocities (3,)."""
+    motion = reference(t, linkage)
+    if not isinstance(motion, tuple) or len(motion) != 2:
+        raise ValueError(
+            f"reference: expected it to return (q_ref, qd_ref), got {motion!r}."
+        )
+    q_ref, qd_ref = (real_array("reference", m, (3,)) for m in motion)
+    return q_ref, qd_ref
+
+
+def known_assembly(
+    reference: Any, linkage: Linkage, times: ArrayLike
+) -> tuple[np.ndarray, np.ndarray]:
+    """The `assembly` of a reference that evaluates in NumPy, at known times."""
+    reference, linkage = in_numpy((reference, linkage))
+    return reference.assembly(np.asarray(times), linkage)
+
+
+def positions_at(reference: Any, t: Array, linkage: Linkage) -> Any:
+    """Positions of a reference: by NumPy if they are known and it can."""
+    numpy = getattr(reference, "evaluates_in_numpy", False)
+    if numpy and not is_traced(reference, t, linkage):
+        return known_assembly(reference, linkage, t)[0]
+    return reference_motion(reference, t, linkage)[0]
+
+
+def known_reach(reference: Any, linkage: Linkage, times: ArrayLike) -> np.ndarray:
+    """`reachable` of known values."""
+    if getattr(reference, "evaluates_in_numpy", False):
+        q, root = known_assembly(reference, linkage, times)
+        return np.isfinite(q).all(axis=1) & (root != 0)
+    with jax.ensure_compile_time_eval():  # also where others are traced
+        return np.asarray(_finite(reference, linkage, times))
+
+
+@eqx.filter_jit
+def _finite(reference: Reference, linkage: Linkage, times: ArrayLike) -> Array:
+    motion = jax.vmap(lambda t: reference(t, linkage))(times)
+    return jnp.isfinite(jnp.concatenate(motion, axis=1)).all(axis=1)
+
+
+def reachable(
+    linkage: Linkage, reference: Reference, ts: ArrayLike
+) -> Bool[Array, " time"]:
+    """Whether a linkage can be where a reference wants it, at each time.
+
+    **Arguments:** the linkage; `reference`: a `CircleTask` or `TipTask` for instance;
+    `ts`: times (time,) [s].
+
+    **Raises:** ValueError for malformed arguments.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig7().linkage
+    >>> circle = fj.CircleTask(center=[-1, 2], radius=0.75)  # too near the base
+    >>> fj.reachable(arm, circle, [0.0, 1.875, 2.5]).tolist()
+    [True, False, True]
+    """
+    check_linkage(linkage)
+    ts = real_array("ts", ts, (None,))
+    arguments = checked_reference(reference), linkage, ts
+    if is_traced(arguments):
+        return _finite(*arguments)
+    return jax.device_put(known_reach(*arguments))

@@ -1,0 +1,148 @@
+"""Animations of one arm or of several."""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.animation import FuncAnimation
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from numpy.typing import ArrayLike
+
+from ..checks import real_array, whole_number
+from ..linkage.linkage import Linkage
+from ..simulation.solution import Solution
+from .arms import DrawnMotion, draw_arm, draw_ground, geometries_of, panels_of
+from .axes import (
+    GREY,
+    plane_axes,
+    reached,
+    xy,
+)
+from .geometry import Geometry, geometry
+
+
+class _Animation(FuncAnimation):
+    """One that a notebook plays where it is the last line of a cell."""
+
+    def __init__(self, figure: Figure, *args: Any, **kwargs: Any):
+        super().__init__(figure, *args, **kwargs)
+        self._figure = figure
+
+    def to_jshtml(self, *args: Any, **kwargs: Any) -> str:
+        plt.close(self._figure)  # or a notebook shows it again, standing still
+        return super().to_jshtml(*args, **kwargs)
+
+    def __repr__(self) -> str:
+        return "an animation"  # an address would differ in each run of a notebook
+
+    def _repr_html_(self) -> str:
+        return self.to_jshtml()
+
+
+def _frame_times(
+    timelines: list[np.ndarray], fps: ArrayLike, speed: ArrayLike, max_frames: int
+) -> tuple[np.ndarray, float]:
+    """The times that frames show, and the pause between two of them [ms]."""
+    fps = float(real_array("fps", fps, (), above=0))
+    speed = float(real_array("speed", speed, (), above=0))
+    begin, end = min(ts[0] for ts in timelines), max(ts[-1] for ts in timelines)
+    duration = (end - begin) / speed
+    most = whole_number("max_frames", max_frames, 1)
+    frames = min(most, int(np.ceil(duration * fps)) + 1)
+    pause = duration / (frames - 1) if frames > 1 else 1 / fps
+    return np.linspace(begin, end, frames), 1000 * pause
+
+
+def _animation(
+    panels: list[Axes],
+    motions: list[tuple[np.ndarray, Geometry]],
+    times: np.ndarray,
+    pause: float,
+    say: Callable[..., Any],
+    new: bool,
+) -> FuncAnimation:
+    """The motions in the panels of a figure, `new` or given; `say` writes the time."""
+    moving = []
+    for ax, (ts, g) in zip(panels, motions):
+        draw_ground(ax)
+        points = np.hstack(list(g.points.values()))
+        (trace,) = ax.plot(*xy(points), color=GREY, lw=1, gid="tip path")
+        lines = draw_arm(ax, g, 0, mass_centers=True)
+        samples = np.array([np.abs(ts - t).argmin() for t in times])
+        moving.append((g, DrawnMotion(trace, [lines]), samples))
+
+    def show(frame: int) -> list[Line2D]:
+        for g, drawn, samples in moving:
+            drawn.move(g, samples[frame : frame + 1])
+        say(f"t = {times[frame]:.2f} s", fontsize="medium")
+        return [
+            line for _, (path, (arm,)), _ in moving for line in (path, *arm.values())
+        ]
+
+    figure = panels[0].get_figure(root=True)
+    assert figure is not None  # axes are always in a figure
+    say("t = 0 s", fontsize="medium")
+    figure.draw_without_rendering()
+    for ax in panels:
+        ax.autoscale(False)  # at limits that hold all samples
+        ax.set_adjustable("box")
+    if new:
+        figure.set_layout_engine("none")  # a layout per frame takes half the time
+    show(0)
+    return _Animation(figure, show, len(times), interval=pause, cache_frame_data=False)
+
+
+def animate(
+    linkage: Linkage,
+    solution: Solution,
+    ax: Axes | None = None,
+    *,
+    fps: float = 25,
+    speed: float = 1.0,
+    max_frames: int = 250,
+) -> FuncAnimation:
+    """The motion as an animation, with the path of the tip so far.
+
+    A frame shows the nearest sample. A motion that would need more than `max_frames` is
+    shown in fewer frames a second.
+
+    **Arguments:** `fps`: frames a second; `speed`: 2 shows the motion twice as fast.
+
+    **Returns:** the animation, which a notebook plays where it ends a cell. Keep it
+    until it is shown. `.save("motion.gif")` and `.save("motion.mp4")` write it, the
+    latter with ffmpeg; `.to_jshtml()` is a player as text, to be put in a web page.
+
+    **Raises:** ValueError for malformed arguments.
+    """
+    ts, q, _ = reached(solution)
+    times, pause = _frame_times([ts], fps, speed, max_frames)
+    g = geometry(linkage, q)
+    panel = plane_axes(ax, np.hstack(list(g.points.values())))
+    return _animation([panel], [(ts, g)], times, pause, panel.set_title, ax is None)
+
+
+def animate_grid(
+    motions: Mapping[str, tuple[Linkage, Solution]],
+    fig: Figure | None = None,
+    *,
+    fps: float = 25,
+    speed: float = 1.0,
+    max_frames: int = 250,
+) -> FuncAnimation:
+    """Linkages side by side, moving at the same time; one that has ended stands still.
+
+    **Arguments:** `motions`: title -> (linkage, its solution); the others as in
+    `animate`.
+
+    **Returns:** the animation, as of `animate`.
+
+    **Raises:** ValueError for malformed arguments.
+    """
+    geometries = geometries_of(motions)
+    shown = list(geometries.values())
+    times, pause = _frame_times([ts for ts, _ in shown], fps, speed, max_frames)
+    figure, panels = panels_of(geometries, fig)
+    return _animation(panels, shown, times, pause, figure.suptitle, fig is None)

@@ -1,0 +1,154 @@
+"""How an arm is drawn: its links, joints and ground."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.markers import MarkerStyle
+from matplotlib.path import Path
+
+from ..linkage.linkage import Linkage
+from .axes import (
+    BLACK,
+    GREY,
+    SERIES,
+    figure_or_new,
+    filled_mapping,
+    plane_axes,
+    reached,
+    refuse,
+    xy,
+)
+from .geometry import Geometry, geometry
+
+_LINKS = (BLACK, *SERIES[:3])
+
+
+# Markers, in points: a carriage on a piece of its rail, a bearing on hatched ground.
+# Path codes: 1 moves the pen, 2 draws a line, 79 closes the outline.
+_BOX = [(-0.55, -0.35), (0.55, -0.35), (0.55, 0.35), (-0.55, 0.35), (0, 0)]
+
+
+_CARRIAGE = Path([(-1, 0), (1, 0), *_BOX], [1, 2, 1, 2, 2, 2, 79])
+
+
+_HATCH = [p for x in (-0.9, -0.45, 0, 0.45) for p in ((x, -1), (x + 0.3, -0.7))]
+
+
+_BEARING = Path(
+    [(0, 0), (-0.5, -0.7), (0.5, -0.7), (0, 0), (-0.9, -0.7), (0.9, -0.7), *_HATCH],
+    [1, 2, 2, 79] + [1, 2] * 5,
+)
+
+
+_STYLES: dict[str, dict[str, Any]] = {
+    "link": dict(lw=2.2, solid_capstyle="round", solid_joinstyle="round"),
+    "rail": dict(lw=0.9),
+    "mass": dict(lw=0.6, marker="o", markersize=4, markevery=[1]),
+    "pin": dict(marker="o", markersize=4.5, mfc="white"),
+    "slider": dict(markersize=15, mfc="white", mew=0.9),
+    "tip": dict(marker="s", markersize=3.5),
+}
+
+
+def _place(lines: dict[str, Line2D], g: Geometry, i: int) -> None:
+    """Move the lines to sample `i`."""
+    for name, line in lines.items():
+        line.set_data(*xy(g.points[name][i]))
+        if name.startswith("slider"):
+            across = g.angle[i, int(name[-1]) - 1] + np.pi / 2
+            marker = MarkerStyle(_CARRIAGE).rotated(rad=across)
+            line.set_marker(marker)  # type: ignore[arg-type]
+
+
+def draw_arm(
+    ax: Axes,
+    g: Geometry,
+    i: int,
+    mass_centers: bool,
+    alpha: float = 1.0,
+    color: Any = None,
+    label: bool = True,
+) -> dict[str, Line2D]:
+    """Lines of sample `i` by name, which is also their `gid`."""
+    lines = {}
+    for name, points in g.points.items():
+        kind, number = name.split()
+        if kind == "mass" and not mass_centers:
+            continue
+        own = BLACK if kind == "pin" else _LINKS[int(number) - 1]
+        (lines[name],) = ax.plot(*xy(points[i]), alpha=alpha, gid=name)
+        lines[name].set(color=own if color is None else color, **_STYLES[kind])
+        if name == "link 1":
+            lines[name].set_linewidth(1.2)
+        elif kind == "link" and label:
+            lines[name].set_label(name)
+    _place(lines, g, i)
+    return lines
+
+
+def draw_ground(ax: Axes) -> None:
+    ground = ax.plot(0, 0, marker=_BEARING, markersize=18, zorder=1, gid="ground")[0]
+    ground.set(mfc="white", mec=GREY, mew=0.8, clip_on=False)
+
+
+class DrawnMotion(NamedTuple):
+    """The lines of `draw_motion`."""
+
+    path: Line2D
+    arms: list[dict[str, Line2D]]
+
+    def move(self, g: Geometry, indices: np.ndarray) -> None:
+        """To another motion of an arm of the same topology, as many samples of it."""
+        self.path.set_data(*xy(g.end[: indices[-1] + 1, 3]))
+        for lines, i in zip(self.arms, indices):
+            _place(lines, g, i)
+
+
+def draw_motion(
+    ax: Axes, g: Geometry, indices: np.ndarray, mass_centers: bool
+) -> DrawnMotion:
+    """The path of the tip to the last of the samples, and these from faint to full."""
+    draw_ground(ax)
+    path = g.end[: indices[-1] + 1, 3]
+    (path,) = ax.plot(*xy(path), color=GREY, lw=1, label="tip path", gid="tip path")
+    arms = [
+        draw_arm(ax, g, i, mass_centers, float(alpha), label=i == indices[-1])
+        for i, alpha in zip(indices, np.linspace(1, 0.15, len(indices))[::-1])
+    ]
+    return DrawnMotion(path, arms)
+
+
+def geometries_of(motions: Any) -> dict[str, tuple[np.ndarray, Geometry]]:
+    """Per title the times and the geometry of a motion."""
+    filled_mapping("motions", motions, "(Linkage, Solution)")
+    found = {}
+    for title, pair in motions.items():
+        name = f"motions[{title!r}]"
+        fits = isinstance(pair, tuple) and len(pair) == 2
+        if not (fits and isinstance(pair[0], Linkage)):
+            raise refuse(name, "(Linkage, Solution)", pair)
+        ts, q, _ = reached(pair[1], name)
+        found[title] = ts, geometry(pair[0], q)
+    return found
+
+
+def panels_of(
+    geometries: dict[str, tuple[np.ndarray, Geometry]], fig: Figure | None
+) -> tuple[Figure, list[Axes]]:
+    """A grid of axes, one per motion."""
+    columns = min(4, len(geometries))
+    rows = -(-len(geometries) // columns)
+    fig = figure_or_new(fig, 0.3 + 1.75 * columns, 0.4 + 1.9 * rows)
+    panels = []
+    for position, (title, (_, g)) in enumerate(geometries.items()):
+        ax = plane_axes(fig.add_subplot(rows, columns, position + 1), g.end)
+        ax.set_aspect("equal", adjustable="datalim")
+        ax.set(title=title, xlabel="", ylabel="")
+        ax.tick_params(labelsize="small")
+        panels.append(ax)
+    fig.supxlabel("x [m]", fontsize="medium")
+    fig.supylabel("y [m]", fontsize="medium")
+    return fig, panels
