@@ -1,5 +1,6 @@
 """One of each force element of the library, at work on a small arm."""
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -46,6 +47,13 @@ class Hold(eqx.Module):
 
 MOVE = Swing(jax.device_put(np.array([0.3, 0.5, 0.2])))
 PD = fj.PDController([9.0, 7.0, 5.0], [3.0, 2.0, 1.0], [4.0, 2.0, 9.0], MOVE)
+
+# For laws of any solver: compiled sooner than the default, and differences are exact.
+SHORT = dict(
+    solver=diffrax.Midpoint(),
+    stepsize_controller=diffrax.ConstantStepSize(),
+    dt0=0.01,
+)
 
 # Efforts in the joints, between points and from outside
 PLAIN = {

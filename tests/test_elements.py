@@ -70,29 +70,13 @@ def state_of(solution):
     return jnp.concatenate([solution.q[-1], solution.qd[-1]])
 
 
-@pytest.mark.parametrize(
-    ("kind", "mode"),
-    [
-        ("ALL", "forward"),  # at once: one program instead of three
-        *(
-            pytest.param(kind, "reverse", marks=pytest.mark.slow)
-            for kind in ("PLAIN", "WITH_STATE", "WITH_INERTIA")
-        ),
-    ],
-)
-def test_gradients_in_all_parameters_equal_differences(kind, mode):
-    chosen = getattr(elements, kind)
-    if kind == "ALL":  # all together move more slowly
-        limited = fj.SpeedLimit(elements.PD, stall=[1.0, 3.0, 0.5], no_load=4.0)
-        chosen = chosen | {"speed limit": limited}
-    forces = tuple(chosen.values())
+def test_gradients_in_all_parameters_equal_differences():
+    # At once: one program instead of three. All together move more slowly.
+    limited = fj.SpeedLimit(elements.PD, stall=[1.0, 3.0, 0.5], no_load=4.0)
+    forces = tuple((elements.ALL | {"speed limit": limited}).values())
     ones = jnp.ones(len(names(forces)))
-    if mode == "forward":
-        adjoint, derivative = diffrax.ForwardMode(), jax.jacfwd
-    else:
-        adjoint, derivative = diffrax.RecursiveCheckpointAdjoint(), jax.jacrev
-    motion = lambda p: state_of(end(ARM, scaled(forces, p), adjoint))
-    slope, h = jax.jit(derivative(motion))(ones), 1e-5
+    motion = lambda p: state_of(end(ARM, scaled(forces, p)))
+    slope, h = jax.jit(jax.jacfwd(motion))(ones), 1e-5
     changed = eqx.filter_jit(lambda p: scaled(forces, p))
     found = lambda p: np.asarray(state_of(end(ARM, changed(p))))
     columns = [
@@ -108,6 +92,69 @@ def test_gradients_in_all_parameters_equal_differences(kind, mode):
         n for n, e, s in zip(names(forces), error, size) if not e <= 1e-6 * s + 1e-8
     }
     assert not wrong
+
+
+@pytest.mark.slow
+def test_reverse_mode_at_an_instant_equals_differences():
+    """In all parameters, positions, velocities and own states, of what is integrated.
+
+    A motion's reverse mode is made of these: see the next test.
+    """
+    forces = tuple(elements.ALL.values())
+    (own0,) = initial_own(arguments(forces))
+    labels = names(forces)
+    ends = np.cumsum([len(labels), 3, 3, len(own0)])
+
+    @jax.jit
+    def found(t, x):
+        factors, delta, qd, own = jnp.split(x, ends[:-1])
+        args = arguments(scaled(forces, factors))
+        y = tuple(delta), tuple(qd), tuple(own)
+        return jnp.stack(
+            jax.tree.leaves((field(t, y, args), initial_own(args)))
+        )
+
+    slope = jax.jit(jax.grad(lambda x, t, weights: weights @ found(t, x)))
+    rng, h, size = np.random.default_rng(0), 1e-5, 0
+    for t in (0.02, 0.07, 0.15, 0.25):  # between the times of the history
+        moving = rng.uniform(-0.3, 0.3, ends[-1] - len(labels))
+        x = np.concatenate([np.ones(len(labels)), moving])
+        columns = [
+            (found(t, x + h * e) - found(t, x - h * e)) / (2 * h)
+            for e in np.eye(x.size)
+        ]
+        differences = np.stack(columns, axis=1)
+        weights = rng.normal(size=len(differences))
+        error = np.abs(slope(x, t, weights) - weights @ differences)
+        largest = np.abs(differences).max(axis=0)
+        wrong = np.flatnonzero(~(error <= 1e-6 * largest + 1e-7))
+        assert not wrong.size, [(*labels, *ends)[min(i, len(labels))] for i in wrong]
+        size = np.maximum(size, largest)
+    # All are at work but those that a limit puts out of it.
+    idle = {n for n, s in zip(labels, size) if s < 1e-6}
+    assert idle <= IDLE, idle - IDLE
+
+
+@pytest.mark.slow
+def test_reverse_mode_of_a_motion_equals_differences():
+    """One element in scalars, one in arrays, one with a state and one with inertia."""
+    kinds = ("PD", "spring", "lag", "armature")
+    forces = tuple(elements.ALL[kind] for kind in kinds)
+    ones, h = jnp.ones(len(names(forces))), 1e-5
+    weights = jnp.array([1.0, -2.0, 3.0, 0.5, -0.7, 0.3])
+    adjoint = diffrax.RecursiveCheckpointAdjoint()
+    motion = lambda p: weights @ state_of(end(ARM, scaled(forces, p), adjoint))
+    both = jax.jit(jax.value_and_grad(motion))
+    value = lambda p: float(both(p)[0])
+    _, slope = both(ones)
+    differences = np.array(
+        [
+            (value(ones + h * e) - value(ones - h * e)) / (2 * h)
+            for e in np.eye(len(ones))
+        ]
+    )
+    assert (np.abs(differences) > 1e-6).all()
+    np.testing.assert_allclose(slope, differences, rtol=1e-6, atol=1e-8)
 
 
 def test_one_program_for_all_topologies():
@@ -160,9 +207,14 @@ def field(t, y, args):
     return vector_field(t, y, args, schedule_of(t, args))
 
 
+def arguments(forces):
+    q = elements.START.q
+    return Args(ARM, q, link_constants(ARM, q), forces)
+
+
 def field_flops(*forces):
     q, t = elements.START.q, jnp.array(0.1)
-    args = Args(ARM, q, link_constants(ARM, q), forces)
+    args = arguments(forces)
     y = zeros(q), tuple(elements.START.qd), *initial_own(args)
     return flops(field, t, y, args)
 

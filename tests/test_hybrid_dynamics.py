@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from elements import Swing
+from elements import SHORT, Swing
 from helpers import random_linkage
 from scipy.integrate import simpson, solve_ivp
 
@@ -149,6 +149,7 @@ def test_starts_beside_the_reference_and_singular_equations_are_told():
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", ["forward", "reverse"])
 def test_gradients_equal_differences(mode):
+    """Of steps of one size, which make differences exact and programs short."""
     linkage, start, (motion, *others) = swinging("RPR", 1)
 
     def end(p, adjoint):
@@ -156,17 +157,23 @@ def test_gradients_equal_differences(mode):
         q, qd = reference(0.0, linkage)
         state0 = fj.State(jnp.where(motion.moved, q, start.q), start.qd)
         forces = fj.PrescribedMotion(1, reference), fj.JointDamper(p[1])
-        return fj.simulate(linkage, state0, [0, 0.5], forces, adjoint=adjoint).q[-1]
+        options = dict(SHORT, adjoint=adjoint)
+        return fj.simulate(linkage, state0, [0, 0.5], forces, **options).q[-1]
 
     p = jnp.array([1.0, 0.5])
-    reverse = diffrax.RecursiveCheckpointAdjoint()
-    if mode == "forward":
-        slope = jax.jacfwd(lambda p: end(p, diffrax.ForwardMode()))(p)
-    else:
-        slope = jax.jacrev(lambda p: end(p, reverse))(p)
-    columns = [
-        (end(p + h, reverse) - end(p - h, reverse)) / 2e-4 for h in 1e-4 * np.eye(2)
-    ]
+    adjoint, derivative = {
+        "forward": (diffrax.ForwardMode(), jax.jacfwd),
+        "reverse": (diffrax.RecursiveCheckpointAdjoint(), jax.jacrev),
+    }[mode]
+
+    @jax.jit
+    @lambda f: derivative(f, has_aux=True)
+    def both(p):
+        q = end(p, adjoint)
+        return q, q
+
+    slope, _ = both(p)
+    columns = [(both(p + h)[1] - both(p - h)[1]) / 2e-4 for h in 1e-4 * np.eye(2)]
     np.testing.assert_allclose(
         slope, np.stack(columns, axis=1), atol=1e-6 * np.abs(slope).max()
     )
@@ -178,9 +185,9 @@ def test_topologies_are_batched():
     stack = lambda trees: jax.tree.map(lambda *a: jnp.stack(a), *trees)
     linkages, starts, forces = map(stack, zip(*members))
     ts = [0, 0.3]
-    swept = fj.sweep(linkages, starts, ts, forces, forces_axes=0)
+    swept = fj.sweep(linkages, starts, ts, forces, forces_axes=0, **SHORT)
     for k, (linkage, start, forces) in enumerate(members):
-        alone = fj.simulate(linkage, start, ts, forces)
+        alone = fj.simulate(linkage, start, ts, forces, **SHORT)
         np.testing.assert_allclose(swept.q[k], alone.q, atol=1e-9)
 
 

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from elements import Hold
+from elements import SHORT as STEPS, Hold
 
 import fdof_jax as fj
 from fdof_jax.simulation.looped_dopri8 import LoopedDopri8
@@ -82,19 +82,20 @@ def test_a_step_is_a_simulation_under_a_held_effort():
 def test_a_step_is_differentiable_and_batched():
     """As a predictive controller linearises it."""
     tau = jnp.array([1.0, -2.0, 0.5])
-    step = lambda tau: fj.step(ARM, START, tau, 0.1).qd
-    slope = jax.jacrev(step)(tau)
-    differences = [(step(tau + h) - step(tau - h)) / 2e-4 for h in 1e-4 * np.eye(3)]
+    step = lambda tau: fj.step(ARM, START, tau, 0.1, **STEPS).qd
+    known = lambda tau: step(np.asarray(tau))  # by the program of plain calls
+    slope = jax.jit(jax.jacrev(step))(tau)
+    differences = [(known(tau + h) - known(tau - h)) / 2e-4 for h in 1e-4 * np.eye(3)]
     np.testing.assert_allclose(slope, np.stack(differences, axis=1), atol=1e-8)
-    many = jax.vmap(step)(jnp.stack([tau, 2 * tau]))
-    np.testing.assert_allclose(many[0], step(tau), atol=1e-12)
+    many = jax.jit(jax.vmap(step))(jnp.stack([tau, 2 * tau]))
+    np.testing.assert_allclose(many[0], known(tau), atol=1e-12)
 
 
 @pytest.mark.slow
 def test_gains_of_sampled_control_have_gradients():
     def end(factor):
         control = fj.PDController(factor * KP, KD, np.inf, MOVE)
-        return fj.simulate_sampled(ARM, START, control, 0.02, 10).q[-1, 0]
+        return fj.simulate_sampled(ARM, START, control, 0.02, 10, **STEPS).q[-1, 0]
 
     slope = jax.grad(end)(1.0)
     difference = (end(1.001) - end(0.999)) / 0.002
@@ -105,7 +106,7 @@ def test_gains_of_sampled_control_have_gradients():
 def test_a_digital_pid_controller_of_motors():
     """Its integral by Euler's steps, and the motors' currents go on between samples."""
     pid = fj.PIDController(8.0, 2.0, 6.0, 50.0, Hold(jnp.array([0.0, 0.0, 1.0])))
-    motion = fj.simulate_sampled(WHEEL, REST, pid, 0.05, 100)
+    motion = fj.simulate_sampled(WHEEL, REST, pid, 0.05, 100, **STEPS)
     integral = 0.0
     for k in range(100):
         demand = 8 * (1 - motion.q[k, 2]) - 6 * motion.qd[k, 2] + integral
@@ -115,15 +116,17 @@ def test_a_digital_pid_controller_of_motors():
         fj.JointEffort([0, 0, 12.0]), resistance=2.0, inductance=0.5, constant=0.3
     )
     idle = fj.JointEffort(np.zeros(3))
-    sampled = fj.simulate_sampled(WHEEL, REST, idle, 0.1, 5, (motor,))
-    whole = fj.simulate(WHEEL, REST, sampled.ts, (motor,))
+    sampled = fj.simulate_sampled(WHEEL, REST, idle, 0.1, 5, (motor,), **STEPS)
+    whole = fj.simulate(WHEEL, REST, sampled.ts, (motor,), **STEPS)
     np.testing.assert_allclose(sampled.own[0].own, whole.own[0].own, atol=1e-8)
 
 
 @pytest.mark.slow
 def test_a_delay_that_is_too_long_is_told():
-    end = lambda delay: fj.simulate_sampled(WHEEL, REST, ramp, 0.1, 2, delay=delay)
-    motions = jax.vmap(end)(jnp.array([0.05, 0.12]))
+    end = lambda delay: fj.simulate_sampled(
+        WHEEL, REST, ramp, 0.1, 2, delay=delay, **SHORT
+    )
+    motions = jax.jit(jax.vmap(end))(jnp.array([0.05, 0.12]))
     assert np.isfinite(motions.q[0]).all() and np.isnan(motions.q[1, -1]).all()
 
 
