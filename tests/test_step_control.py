@@ -61,14 +61,6 @@ def test_a_mass_matrix_that_turns_singular_is_named():
         assert solution.outcome == outcome
 
 
-def test_out_of_steps():
-    solution = fj.simulate(ARM, START, TS, max_steps=20, throw=False)
-    assert solution.outcome == "out of steps"
-    reached = solution.stats["time_reached"]
-    assert 0 < reached < 1
-    assert np.isfinite(solution.q).all(axis=1).tolist() == (TS <= reached).tolist()
-
-
 def test_steps_land_on_declared_jumps():
     """A pulse between two steps is missed unless it is declared."""
     pulse = Switched(jnp.array([0.5, 0.5 + 1e-6]), 1e6)
