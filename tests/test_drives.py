@@ -111,7 +111,7 @@ def test_an_integral_removes_the_sag():
     )  # fmt: skip
     hold = Hold(jnp.array([0.3, 0.2, 0.1]))
     start = fj.State(np.zeros(3), np.zeros(3))
-    pd = fj.PDController(200.0, 40.0, jnp.inf, hold)
+    pd = fj.PIDController(200.0, 0.0, 40.0, jnp.inf, hold)  # see below
     pid = fj.PIDController(200.0, 300.0, 40.0, jnp.inf, hold)
     ends = [
         np.abs(fj.simulate(arm, start, [0, 15], (f,)).q[-1] - hold.target).max()
@@ -147,13 +147,16 @@ def test_anti_windup_keeps_the_overshoot_small():
 
 
 def test_without_an_integral_it_is_the_pd_controller():
+    """At its limits, too; and an integral of zero stays zero."""
     hold = Hold(only_last(1.0))
-    ts = np.linspace(0, 10, 11)
-    plain = fj.simulate(single(), STILL, ts, (fj.PDController(8, 6, 1, hold),))
+    pd = fj.PDController(8.0, 6.0, 1.0, hold)
     pid = fj.PIDController(8.0, 0.0, 6.0, 1.0, hold)
-    same = fj.simulate(single(), STILL, ts, (pid,))
-    np.testing.assert_allclose(same.q, plain.q, atol=1e-9)
-    np.testing.assert_array_equal(same.own[0], 0)
+    state = pid.initial_state(single())
+    assert not np.any(state)
+    for at in 0.1 * np.random.default_rng(0).normal(size=(9, 2, 3)):
+        effort, rate = pid(0.0, *at, single(), state)
+        np.testing.assert_allclose(effort, pd(0.0, *at, single()), atol=1e-12)
+        assert not np.any(rate)
 
 
 def test_drives_in_a_row():

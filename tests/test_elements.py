@@ -12,7 +12,13 @@ from test_costs import flops
 import fdof_jax as fj
 from fdof_jax.forces.added_inertia import added_inertia
 from fdof_jax.mechanics.equations import link_constants, zeros
-from fdof_jax.simulation.field import Args, initial_own, schedule_of, vector_field
+from fdof_jax.simulation.field import (
+    Args,
+    applied,
+    initial_own,
+    schedule_of,
+    vector_field,
+)
 
 ARM = elements.arm("RPR")
 
@@ -70,28 +76,67 @@ def state_of(solution):
     return jnp.concatenate([solution.q[-1], solution.qd[-1]])
 
 
-def test_gradients_in_all_parameters_equal_differences():
-    # At once: one program instead of three. All together move more slowly.
-    limited = fj.SpeedLimit(elements.PD, stall=[1.0, 3.0, 0.5], no_load=4.0)
-    forces = tuple((elements.ALL | {"speed limit": limited}).values())
-    ones = jnp.ones(len(names(forces)))
-    motion = lambda p: state_of(end(ARM, scaled(forces, p)))
-    slope, h = jax.jit(jax.jacfwd(motion))(ones), 1e-5
-    changed = eqx.filter_jit(lambda p: scaled(forces, p))
-    found = lambda p: np.asarray(state_of(end(ARM, changed(p))))
-    columns = [
-        (found(ones + h * e) - found(ones - h * e)) / (2 * h) for e in np.eye(len(ones))
-    ]
-    differences = np.stack(columns, axis=1)
-    # All parameters are at work but those that a limit puts out of it.
+def all_acts(linkage, forces, t, q, qd, grown):
+    """All that elements do at a moment, in states that have grown, and their first."""
+    args = Args(linkage, q, None, forces)
+    own = jnp.stack(*initial_own(args))
+    y = zeros(q), tuple(qd), tuple(own + grown * jnp.cos(jnp.arange(own.size)))
+    found = applied(t, y, args, schedule_of(t, args))
+    leaves = jax.tree.leaves((found, own))
+    return jnp.concatenate([jnp.ravel(leaf) for leaf in leaves])
+
+
+def slopes_and_differences(both, ones):
+    """By columns, of a program for a value and its derivative in a direction."""
+    h, still = 1e-5, jnp.zeros_like(ones)
+    slopes, differences = [], []
+    for e in np.eye(len(ones)):
+        slopes.append(both(ones, e)[1])
+        ends = [np.asarray(both(ones + s * h * e, still)[0]) for s in (1, -1)]
+        differences.append((ends[0] - ends[1]) / (2 * h))
+    return np.stack(slopes, axis=1), np.stack(differences, axis=1)
+
+
+def check_slopes(forces, slopes, differences):
+    """All parameters are at work but those that a limit puts out of it."""
     size = np.abs(differences).max(axis=0)
     idle = {n for n, s in zip(names(forces), size) if s < 1e-6}
     assert idle <= IDLE, idle - IDLE
-    error = np.abs(slope - differences).max(axis=0)
+    error = np.abs(slopes - differences).max(axis=0)
     wrong = {
         n for n, e, s in zip(names(forces), error, size) if not e <= 1e-6 * s + 1e-8
     }
     assert not wrong
+
+
+def test_slopes_in_all_parameters_equal_differences():
+    limited = fj.SpeedLimit(elements.PD, stall=[1.0, 3.0, 0.5], no_load=4.0)
+    forces = tuple((elements.ALL | {"speed limit": limited}).values())
+
+    def acting(p, *at):
+        return all_acts(ARM, scaled(forces, p), *at)
+
+    # One direction at a time: many at once take longer to compile than to run.
+    both = jax.jit(lambda p, e, *at: jax.jvp(lambda p: acting(p, *at), (p,), (e,)))
+    rng = np.random.default_rng(0)
+    found = []
+    # In each interval of the history, and for most limits on both sides.
+    for t in (0.03, 0.07, 0.15, 0.4):
+        q = np.asarray(elements.START.q) + rng.uniform(-0.3, 0.3, 3)
+        at = np.array(t), q, rng.uniform(-1, 1, 3), np.array(t)
+        ones = jnp.ones(len(names(forces)))
+        found.append(slopes_and_differences(lambda *a, at=at: both(*a, *at), ones))
+    check_slopes(forces, *(np.concatenate(rows) for rows in zip(*found)))
+
+
+def test_gradients_of_a_motion_equal_differences():
+    """In forward mode, of states and masses, which motions carry along."""
+    chosen = ("motor with PID", "actuator")
+    forces = tuple(elements.ALL[name] for name in chosen)
+    motion = lambda p: state_of(end(ARM, scaled(forces, p)))
+    both = jax.jit(lambda p, e: jax.jvp(motion, (p,), (e,)))
+    ones = jnp.ones(len(names(forces)))
+    check_slopes(forces, *slopes_and_differences(both, ones))
 
 
 @pytest.mark.slow
@@ -110,9 +155,7 @@ def test_reverse_mode_at_an_instant_equals_differences():
         factors, delta, qd, own = jnp.split(x, ends[:-1])
         args = arguments(scaled(forces, factors))
         y = tuple(delta), tuple(qd), tuple(own)
-        return jnp.stack(
-            jax.tree.leaves((field(t, y, args), initial_own(args)))
-        )
+        return jnp.stack(jax.tree.leaves((field(t, y, args), initial_own(args))))
 
     slope = jax.jit(jax.grad(lambda x, t, weights: weights @ found(t, x)))
     rng, h, size = np.random.default_rng(0), 1e-5, 0
@@ -158,22 +201,29 @@ def test_reverse_mode_of_a_motion_equals_differences():
 
 
 def test_one_program_for_all_topologies():
+    """What elements do in a batch of all arms is what they do on each alone.
+
+    Motions in a batch, states of elements included: test_one_compilation.py and
+    test_drives.py.
+    """
     place = list(elements.ALL).index("computed torque")
     arms = [elements.arm(topology) for topology in fj.TOPOLOGIES]
+    traces = []
 
-    def states(linkage):
+    def acting(linkage):
+        traces.append(1)
         # A model of another topology would be refused.
         forces = tuple(elements.ALL.values())
         forces = eqx.tree_at(lambda f: f[place].model, forces, linkage)
-        solution = end(linkage, forces)
-        return solution.q[-1], solution.own
+        return all_acts(linkage, forces, jnp.array(0.1), *elements.START, 0.1)
 
-    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *arms)
-    together = jax.jit(jax.vmap(states))(stacked)
-    for member, linkage in enumerate(arms):
-        row = jax.tree.map(lambda a, member=member: a[member], together)
-        for a, b in zip(jax.tree.leaves(row), jax.tree.leaves(states(linkage))):
-            np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9)
+    stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *arms)
+    together, single = jax.jit(jax.vmap(acting))(stacked), jax.jit(acting)
+    alone = [single(linkage) for linkage in arms]
+    np.testing.assert_allclose(together, alone, rtol=1e-9, atol=1e-9)
+    assert len(traces) == 2
+    # Arms of other topologies feel other efforts.
+    assert len({row.tobytes() for row in np.asarray(alone).round(6)}) == len(arms)
 
 
 SPOILT = {

@@ -12,7 +12,17 @@ import pytest
 
 import fdof_jax as fj
 
-PROGRAM = """
+# One process for all, because each would import the same for seconds.
+OPTIONAL = {"matplotlib", "scipy.optimize", "mujoco", "pandas", "xarray", "ipywidgets"}
+PROGRAM = f"""
+import jax, sys
+import fdof_jax
+assert not jax.config.jax_enable_x64
+found = {OPTIONAL} & set(sys.modules)
+assert not found, found
+print("imported without side effects", flush=True)
+"""
+PROGRAM += """
 import warnings
 import diffrax, jax, numpy as np
 import fdof_jax as fj
@@ -46,7 +56,13 @@ with warnings.catch_warnings(record=True) as caught:
         throw=False,
     )
 assert any("rtol=1e-08 cannot be met in float32" in str(w.message) for w in caught)
-print("float32 holds on", len(ordinary), "scenes")
+print("float32 holds on", len(ordinary), "scenes", flush=True)
+
+result = fj.tune(fj.scenes.fig7()._replace(t1=2.0), max_steps=15)
+norms = result.history.gradient_norm
+assert norms[-1] < 1e-2 * norms[0], norms
+assert result.loss < 0.5 * result.history.loss[0]
+print("tuned")
 """
 
 
@@ -65,22 +81,16 @@ def run(program):
     )
 
 
-TUNING = """
-import numpy as np
-import fdof_jax as fj
-
-result = fj.tune(fj.scenes.fig7()._replace(t1=2.0), max_steps=15)
-norms = result.history.gradient_norm
-assert norms[-1] < 1e-2 * norms[0], norms
-assert result.loss < 0.5 * result.history.loss[0]
-print("tuned")
-"""
+@pytest.fixture(scope="module")
+def done():
+    return run(PROGRAM)
 
 
-def test_tuning_in_single_precision():
-    result = run(TUNING)
-    assert result.returncode == 0, result.stderr[-3000:]
-    assert "tuned" in result.stdout
+@pytest.mark.parametrize(
+    "words", ["imported without side effects", "holds on 17 scenes", "tuned"]
+)
+def test_single_precision(words, done):
+    assert words in done.stdout, done.stderr[-3000:]
 
 
 ELEMENTS = """
@@ -108,24 +118,3 @@ def test_force_elements_in_single_precision():
     np.testing.assert_allclose(q, motion.q[-1], atol=1e-4)
     exact = fj.joint_reactions(arm, forces, motion)[-1]
     np.testing.assert_allclose(reactions, exact, atol=1e-3 * np.abs(exact).max())
-
-
-def test_single_precision():
-    result = run(PROGRAM)
-    assert result.returncode == 0, result.stderr[-3000:]
-    assert "holds on 17 scenes" in result.stdout
-
-
-OPTIONAL = {"matplotlib", "scipy.optimize", "mujoco", "pandas", "xarray", "ipywidgets"}
-
-
-def test_import_has_no_side_effects():
-    program = f"""
-import jax, sys
-import fdof_jax
-assert not jax.config.jax_enable_x64
-found = {OPTIONAL} & set(sys.modules)
-assert not found, found
-"""
-    result = run(program)
-    assert result.returncode == 0, result.stderr[-2000:]

@@ -44,7 +44,15 @@ def outcome(problem, parameters, adjoint=diffrax.ForwardMode()):
     return jnp.mean(deviation**2), solution.q[-1]
 
 
-forward = eqx.filter_jit(lambda problem, at: jax.jacfwd(outcome, 1)(problem, at))
+@eqx.filter_jit
+def forward(problem, at):
+    """Slopes and values: one program for both."""
+
+    def twice(at):
+        found = outcome(problem, at)
+        return found, found
+
+    return jax.jacfwd(twice, has_aux=True)(at)
 
 
 @eqx.filter_jit
@@ -78,11 +86,12 @@ def test_forward_reverse_and_differences_agree(kind):
     # Off the paper's gains: nothing is special about this point.
     at = [0.1, -0.2, 0.3, 0.05, 0.2, -0.1, 0.0, 0.1, -0.1, 0.02, 0.1, -0.03]
     at = jnp.array(at)
-    tangents, _ = forward(problem, at)
+    (tangents, _), _ = forward(problem, at)
     gradient = reverse(problem, at, jnp.array([1.0, 0.0]))
 
     def difference(direction, h):
-        after, before = (outcome(problem, at + s * h * direction)[0] for s in (1, -1))
+        ends = [forward(problem, at + s * h * direction) for s in (1, -1)]
+        after, before = (loss for _, (loss, _) in ends)
         return float(after - before) / (2 * h)
 
     if kind == "fixed":
@@ -147,7 +156,7 @@ def test_tangents_of_a_hanging_arm_are_controlled():
     idle = fj.PDController(ZERO, ZERO, [np.inf] * 3, task)
     ts = np.linspace(0, 10.0, 21)
     problem = CHAIN, fj.State(HANGING, ZERO), idle, ts, steps(1e-11)
-    _, slopes = forward(problem, jnp.zeros(12))
+    (_, slopes), _ = forward(problem, jnp.zeros(12))
     exact = linear_motion(10.0)
     assert np.abs(slopes[:, 9:] - exact).max() <= 1e-6 * np.abs(exact).max()
 

@@ -81,6 +81,18 @@ def swinging(topology, joints, forces=()):
     return linkage, fj.State(q, qd), forces
 
 
+@eqx.filter_jit
+def along(linkage, forces, solution, efforts):
+    """Accelerations under efforts, those that are prescribed, and the energy."""
+
+    def at(t, q, qd, tau):
+        qdd = fj.forward_dynamics(linkage, q, qd, tau, forces)
+        demanded = jax.jacfwd(lambda t: forces[0].reference(t, linkage)[1])(t)
+        return qdd, demanded, sum(fj.energy(linkage, q, qd, forces))
+
+    return jax.vmap(at)(solution.ts, solution.q, solution.qd, efforts)
+
+
 @pytest.mark.parametrize("joints", [1, 2, 3, (1, 2), (1, 2, 3)], ids=str)
 @pytest.mark.parametrize("topology", ["RRR", "RPR", "PRP"])
 def test_efforts_make_the_motion_and_do_its_work(topology, joints):
@@ -92,14 +104,10 @@ def test_efforts_make_the_motion_and_do_its_work(topology, joints):
     moved = np.asarray(forces[0].moved)
     assert (np.asarray(efforts.elements[0])[:, ~moved] == 0).all()
     # Under these efforts the prescribed joints accelerate as they should.
-    q, qd = solution.q, solution.qd
-    forward = lambda q, qd, tau: fj.forward_dynamics(linkage, q, qd, tau, forces)
-    qdd = jax.vmap(forward)(q, qd, efforts.total)
-    demanded = jax.vmap(jax.jacfwd(lambda t: forces[0].reference(t, linkage)[1]))(ts)
+    qdd, demanded, energy = along(linkage, forces, solution, efforts.total)
     np.testing.assert_allclose(qdd[:, moved], demanded[:, moved], atol=1e-9)
     # And the energy changes by their work.
-    energy = jax.vmap(lambda q, qd: sum(fj.energy(linkage, q, qd, forces)))(q, qd)
-    power = np.sum(np.asarray(efforts.total) * np.asarray(qd), axis=1)
+    power = np.sum(np.asarray(efforts.total) * np.asarray(solution.qd), axis=1)
     work = simpson(power, x=ts)
     np.testing.assert_allclose(energy[-1] - energy[0], work, atol=1e-6 * np.ptp(power))
 

@@ -1,4 +1,9 @@
-"""One trace serves all topologies; batches equal singles."""
+"""One trace serves all topologies; batches equal singles.
+
+Plain calls need no other program for another topology: test_programs.py.
+"""
+
+import functools
 
 import diffrax
 import jax
@@ -7,7 +12,6 @@ import numpy as np
 import pytest
 
 import fdof_jax as fj
-from fdof_jax.simulation import integrate
 from fdof_jax.simulation.looped_dopri8 import LoopedDopri8
 
 TS = np.linspace(0, 0.5, 6)
@@ -43,11 +47,11 @@ def circle(linkage, state):
 
 FORCES = {
     "no elements": lambda linkage, state: (),
-    "damper and effort": lambda linkage, state: (
+    "PD circle, damper and effort": lambda linkage, state: (
+        circle(linkage, state),
         fj.JointDamper([1.0, 2.0, 3.0]),
         fj.JointEffort([0.5, -1.0, 0.2]),
     ),
-    "PD circle": lambda linkage, state: (circle(linkage, state),),
 }
 
 
@@ -60,10 +64,11 @@ def members(kind):
 def test_one_trace_and_batch_equals_singles(kind):
     traces = []
 
-    # The default solver takes long to compile: once is enough.
-    solver = None if kind == "no elements" else LoopedDopri8()
+    # The default solver of batches takes long to compile: once is enough. It takes the
+    # same steps.
+    default = None if kind == "no elements" else LoopedDopri8()
 
-    def motion(linkage, state, forces):
+    def motion(linkage, state, forces, solver=LoopedDopri8()):
         traces.append(1)
         # Fixed steps: adaptive ones may round differently in a batch.
         return fj.simulate(
@@ -79,7 +84,7 @@ def test_one_trace_and_batch_equals_singles(kind):
     single = jax.jit(motion)
     alone = [single(*member) for member in members(kind)]
     assert len(traces) == 1
-    batched = jax.jit(jax.vmap(motion))
+    batched = jax.jit(jax.vmap(functools.partial(motion, solver=default)))
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *members(kind))
     together = batched(*stacked)
     reversed_order = batched(*jax.tree.map(lambda a: a[::-1], stacked))
@@ -88,35 +93,3 @@ def test_one_trace_and_batch_equals_singles(kind):
         for a, b in ((together.q, solution.q), (together.qd, solution.qd)):
             np.testing.assert_allclose(a[i], b, rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(reversed_order.q[::-1], together.q, atol=1e-12)
-
-
-@pytest.mark.parametrize("kind", FORCES)
-def test_one_trace_of_the_plain_call(kind, monkeypatch):
-    """Called as a user does, without jit of their own, at adaptive steps."""
-    calls = []
-    original = integrate.vector_field
-
-    def counted(*arguments):
-        calls.append(1)
-        return original(*arguments)
-
-    monkeypatch.setattr(integrate, "vector_field", counted)
-    traced = []
-    for linkage, state, forces in members(kind):
-        # More output times than any other test has: the first call compiles.
-        fj.simulate(linkage, state, np.linspace(0, 0.3, 5000), forces)
-        traced.append(len(calls))
-    assert traced[0] > 0
-    assert traced == traced[:1] * 7
-
-
-def test_shared_leaves_may_stay_unbatched():
-    linkage, state = linkage_and_state("RPR")
-    starts = np.asarray(state.q) + 0.01 * np.arange(4)[:, None]
-    still, solver = jnp.zeros(3), LoopedDopri8()
-    together = jax.vmap(
-        lambda q: fj.simulate(linkage, fj.State(q, still), TS, solver=solver).q
-    )(starts)
-    for q0, q in zip(starts, together):
-        single = fj.simulate(linkage, fj.State(q0, np.zeros(3)), TS).q
-        np.testing.assert_allclose(q, single, atol=1e-9)

@@ -1,5 +1,6 @@
 """References: tip paths through the inverse kinematics, moves in joint space."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -23,20 +24,29 @@ PATHS = {
 TIMINGS = {"travel": fj.Travel(2.0), "laps": fj.Laps(2.0)}
 
 
+@eqx.filter_jit
+def seen(path, timing, branch, ts):
+    """What a task asks for, and where that puts the tip: one program per path."""
+    task = fj.TipTask(path, timing, orientation=0.2, branch=branch)
+
+    def at(t):
+        q, qd = task(t, ARM)
+        return (q, qd), fj.tip_position(ARM, q), path.point(timing(t))
+
+    return jax.vmap(at)(ts)
+
+
 @pytest.mark.parametrize("timing", TIMINGS)
 @pytest.mark.parametrize("path", PATHS)
 @pytest.mark.parametrize("branch", [1, -1])
 def test_the_tip_is_on_the_path(path, timing, branch):
-    task = fj.TipTask(PATHS[path], TIMINGS[timing], orientation=0.2, branch=branch)
-    for t in np.linspace(0.05, 1.95, 8):
-        q, qd = task(t, ARM)
-        share = TIMINGS[timing](jnp.asarray(t))
-        np.testing.assert_allclose(
-            fj.tip_position(ARM, q), PATHS[path].point(share), atol=1e-12
-        )
-        assert jnp.sum(q) == pytest.approx(0.2)
-        ahead, behind = task(t + 1e-6, ARM)[0], task(t - 1e-6, ARM)[0]
-        np.testing.assert_allclose(qd, (ahead - behind) / 2e-6, atol=1e-6)
+    ts = np.linspace(0.05, 1.95, 8)
+    at = lambda ts: seen(PATHS[path], TIMINGS[timing], np.array(branch), ts)
+    (q, qd), tip, point = at(ts)
+    np.testing.assert_allclose(tip, point, atol=1e-12)
+    np.testing.assert_allclose(np.sum(q, axis=1), 0.2, rtol=1e-6)
+    ahead, behind = (np.asarray(at(ts + h)[0][0]) for h in (1e-6, -1e-6))
+    np.testing.assert_allclose(qd, (ahead - behind) / 2e-6, atol=1e-6)
 
 
 def test_the_circle_as_an_ellipse_is_fig_7_s():

@@ -2,7 +2,6 @@
 
 import diffrax
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import SCENES, load
@@ -163,24 +162,12 @@ def test_a_solve_that_runs_out_of_steps_says_so_and_marks_the_rest():
     ts = np.linspace(0, 2, 21)
     solution = fj.simulate(scene.linkage, scene.state0, ts, max_steps=50, throw=False)
     assert solution.result == diffrax.RESULTS.max_steps_reached
-    reached = np.isfinite(solution.q).all(axis=1)
-    assert reached[0] and not reached[-1]
-    assert (np.diff(reached.astype(int)) <= 0).all()
+    assert solution.outcome == "out of steps"
+    reached = solution.stats["time_reached"]
+    assert 0 < reached < 2
+    assert np.isfinite(solution.q).all(axis=1).tolist() == (ts <= reached).tolist()
     with pytest.raises(RuntimeError, match="max_steps"):
         fj.simulate(scene.linkage, scene.state0, ts, max_steps=50)
-
-
-def test_a_motion_that_turns_nan_ends_early():
-    def breaks(t, q, qd, linkage):
-        return jnp.where(t > 0.5, jnp.nan, 0.0) * jnp.ones(3)
-
-    scene = scenes.fig5()
-    solution = fj.simulate(
-        scene.linkage, scene.state0, [0, 0.25, 1.0], (breaks,), throw=False
-    )
-    assert solution.result != diffrax.RESULTS.successful
-    assert solution.stats["num_steps"] < 300
-    assert np.isfinite(solution.q[1]).all() and np.isnan(solution.q[2]).all()
 
 
 def test_time_need_not_start_at_zero():

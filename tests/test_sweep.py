@@ -21,7 +21,6 @@ from sweep_batch import (
 )  # fmt: skip
 
 import fdof_jax as fj
-from fdof_jax.simulation.looped_dopri8 import LoopedDopri8
 
 
 def reason(solution, member):
@@ -168,7 +167,6 @@ def test_arrays_without_the_axis_are_shared():
         TS,
         (damper, stacked, shared),
         forces_axes=(None, 0, None),
-        solver=LoopedDopri8(),
         **SETTINGS,
     )
     assert solution.q.shape == (3, len(TS), 3)
