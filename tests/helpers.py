@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 from typing import NamedTuple
 
+import jax
 import numpy as np
 
 import fdof_jax as fj
@@ -11,6 +12,17 @@ import fdof_jax as fj
 REFERENCE = json.loads((Path(__file__).parent / "reference.json").read_text())
 # The library refuses PPP, which the file holds for the equations only.
 SCENES = {s["id"]: s for s in REFERENCE["scenes"] if s["topology"] != "PPP"}
+
+
+def programs():
+    """An environment in which another process takes and keeps the tests' programs."""
+    folder = jax.config.jax_compilation_cache_dir
+    if folder is None:
+        return {}
+    return {
+        "JAX_COMPILATION_CACHE_DIR": folder,
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+    }
 
 
 class ReferenceScene(NamedTuple):

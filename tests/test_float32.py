@@ -9,6 +9,7 @@ from pathlib import Path
 import elements
 import numpy as np
 import pytest
+from helpers import programs
 
 import fdof_jax as fj
 
@@ -71,6 +72,7 @@ def run(program):
         "JAX_ENABLE_X64": "0",
         "PYTHONPATH": str(Path(__file__).parent),
         "XLA_FLAGS": "",
+        **programs(),
     }
     return subprocess.run(
         [sys.executable, "-c", program],

@@ -193,9 +193,9 @@ def test_topologies_are_batched():
     stack = lambda trees: jax.tree.map(lambda *a: jnp.stack(a), *trees)
     linkages, starts, forces = map(stack, zip(*members))
     ts = [0, 0.3]
-    swept = fj.sweep(linkages, starts, ts, forces, forces_axes=0, **SHORT)
+    swept = fj.sweep(linkages, starts, ts, forces, forces_axes=0)
     for k, (linkage, start, forces) in enumerate(members):
-        alone = fj.simulate(linkage, start, ts, forces, **SHORT)
+        alone = fj.simulate(linkage, start, ts, forces)
         np.testing.assert_allclose(swept.q[k], alone.q, atol=1e-9)
 
 

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import nbformat
 import pytest
+from helpers import programs
 from nbclient import NotebookClient
 
 FOLDER = Path(__file__).parents[1] / "notebooks"
@@ -76,7 +77,9 @@ def test_the_table_of_notebooks_lists_it(path):
 
 @pytest.mark.slow
 @each_notebook
-def test_it_runs(path):
+def test_it_runs(path, monkeypatch):
+    for name, value in programs().items():
+        monkeypatch.setenv(name, value)
     notebook = nbformat.read(path, as_version=4)
     committed = pictures(notebook)
     client = NotebookClient(

@@ -116,8 +116,8 @@ def test_a_digital_pid_controller_of_motors():
         fj.JointEffort([0, 0, 12.0]), resistance=2.0, inductance=0.5, constant=0.3
     )
     idle = fj.JointEffort(np.zeros(3))
-    sampled = fj.simulate_sampled(WHEEL, REST, idle, 0.1, 5, (motor,), **STEPS)
-    whole = fj.simulate(WHEEL, REST, sampled.ts, (motor,), **STEPS)
+    sampled = fj.simulate_sampled(WHEEL, REST, idle, 0.1, 5, (motor,), **SHORT)
+    whole = fj.simulate(WHEEL, REST, sampled.ts, (motor,))
     np.testing.assert_allclose(sampled.own[0].own, whole.own[0].own, atol=1e-8)
 
 

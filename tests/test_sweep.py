@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from elements import SHORT
 from helpers import random_linkage
 from sweep_batch import (
     FAILED,
@@ -124,9 +125,7 @@ def test_failed_members_add_nothing_to_a_gradient():
         return eqx.tree_at(lambda k: k.mass, linkage, mass)
 
     def distance(mass):
-        solution = fj.sweep(
-            with_mass(mass), fj.State(q, qd), TS[:3], chunk=4, **SETTINGS
-        )
+        solution = fj.sweep(with_mass(mass), fj.State(q, qd), TS[:3], chunk=4, **SHORT)
         counted = solution.result == diffrax.RESULTS.successful
         end = jnp.where(counted[:, None], solution.q[:, -1], 0)
         return jnp.sum(end**2), solution
@@ -134,7 +133,7 @@ def test_failed_members_add_nothing_to_a_gradient():
     @jax.jit
     @jax.grad
     def single(mass, q, qd):
-        end = fj.simulate(with_mass(mass), fj.State(q, qd), TS[:3], **SETTINGS).q[-1]
+        end = fj.simulate(with_mass(mass), fj.State(q, qd), TS[:3], **SHORT).q[-1]
         return jnp.sum(end**2)
 
     gradient, solution = jax.jit(jax.grad(distance, has_aux=True))(linkage.mass)

@@ -8,6 +8,7 @@ from pathlib import Path
 import diffrax
 import numpy as np
 import pytest
+from helpers import programs
 
 import fdof_jax as fj
 from hard.scenes import DRIVEN, arm
@@ -31,6 +32,7 @@ ts = np.linspace(0, swing["t1"], 21)
 def run(program):
     tests = Path(__file__).parents[1]
     environment = os.environ | {"JAX_ENABLE_X64": "0", "PYTHONPATH": str(tests)}
+    environment |= programs()
     finished = subprocess.run(
         [sys.executable, "-c", PREAMBLE + program],
         env=environment,
