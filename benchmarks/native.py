@@ -44,7 +44,7 @@ def _library(method: str, lanes: int) -> ctypes.CDLL:
     )
     folder = Path(tempfile.mkdtemp(prefix="fdof-native-"))
     (folder / "tableau.h").write_text(header)
-    output = folder / "native.so"
+    compiled, output = folder / "native.o", folder / "native.so"
     subprocess.run(
         [
             "gcc",
@@ -52,16 +52,19 @@ def _library(method: str, lanes: int) -> ctypes.CDLL:
             "-march=native",
             "-mprefer-vector-width=512",
             "-ffast-math",
-            "-shared",
             "-fPIC",
             f"-DLANES={lanes}",
             f"-I{folder}",
+            "-c",
             str(Path(__file__).with_name("native.c")),
             "-o",
-            str(output),
+            str(compiled),
         ],
         check=True,
     )
+    # Linked with -ffast-math too, it would flush subnormal numbers to zero in all of
+    # the process that loads it.
+    subprocess.run(["gcc", "-shared", str(compiled), "-o", str(output)], check=True)
     library = ctypes.CDLL(str(output))
     shutil.rmtree(folder)  # once loaded, the file is not needed
     library.integrate.restype = None
