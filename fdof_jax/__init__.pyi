@@ -48,6 +48,8 @@ from .dynamics import (
     forward_dynamics as forward_dynamics,
     inertia_ratios as inertia_ratios,
     inverse_dynamics as inverse_dynamics,
+    joint_bias as joint_bias,
+    joint_mass_matrix as joint_mass_matrix,
     link_energies as link_energies,
 )
 from .forces.actuators import Armature as Armature, LinearActuator as LinearActuator

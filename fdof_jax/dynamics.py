@@ -7,10 +7,9 @@ from jaxtyping import Float
 from .forces.added_inertia import added_energy, added_inertia, energetic, inertial
 from .forces.element import Forces
 from .linkage.linkage import Linkage, compiled
-from .mechanics.equations import equations, link_constants, zeros
+from .mechanics.equations import Constants, equations, link_constants, zeros
 from .mechanics.kinematics import mass_center_velocities, mass_centers
 from .mechanics.rates import inertia_diagonals, rates
-from .mechanics.solve import times
 
 
 @compiled(q=(3,), qd=(3,), tau=(3,), forces=inertial)
@@ -89,15 +88,76 @@ def inverse_dynamics(
     >>> fj.inverse_dynamics(arm, [0, 0, 0], [0, 0, 0], [0, 0, 0]).tolist()  # held level
     [58.86, 29.43, 9.81]
     """
-    m = equations(link_constants(linkage, q), zeros(q), tuple(qd))
-    matrix = jnp.array(
-        [[m.m11, m.m12, m.m13], [m.m12, m.m22, m.m23], [m.m13, m.m23, m.m33]]
-    )
-    tau = matrix @ qdd + jnp.stack(m.bias)
+    matrix, bias = mass_and_bias(linkage, forces, q, qd)
+    return matrix @ qdd + bias
+
+
+@compiled(q=(3,), forces=inertial)
+def joint_mass_matrix(
+    linkage: Linkage, q: Float[Array, " joint"], forces: Forces = ()
+) -> Float[Array, "joint joint"]:
+    """The mass matrix M in joint coordinates, in M qdd + bias = tau.
+
+    It is (8)-(13) projected on the real joints: symmetric, and positive definite unless
+    the arm is singular.
+
+    **Arguments:** `q` [m or rad]; `forces`: force elements whose masses count.
+
+    **Returns:** M [kg, kg m or kg m^2].
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig5().linkage
+    >>> fj.joint_mass_matrix(arm, [0, 0, 0]).tolist()  # 1 kg each at 1, 2 and 3 m
+    [[14.0, 8.0, 3.0], [8.0, 5.0, 2.0], [3.0, 2.0, 1.0]]
+    """
+    return mass_and_bias(linkage, forces, q, jnp.zeros_like(q))[0]
+
+
+@compiled(q=(3,), qd=(3,), forces=inertial)
+def joint_bias(
+    linkage: Linkage,
+    q: Float[Array, " joint"],
+    qd: Float[Array, " joint"],
+    forces: Forces = (),
+) -> Float[Array, " joint"]:
+    """The joint efforts of zero acceleration: gravity, centrifugal and Coriolis forces.
+
+    The `bias` of M qdd + bias = tau. The paper's phi (`bias_force`) has the other sign,
+    and is in chain coordinates.
+
+    **Arguments:** `q` [m or rad], `qd` [m/s or rad/s]; `forces`: force elements whose
+    masses count.
+
+    **Returns:** the bias [N or N m].
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig5().linkage
+    >>> fj.joint_bias(arm, [0, 0, 0], [0, 0, 0]).tolist()  # at rest: gravity
+    [58.86, 29.43, 9.81]
+    """
+    return mass_and_bias(linkage, forces, q, qd)[1]
+
+
+def mass_and_bias(
+    linkage: Linkage,
+    forces: Forces,
+    q: Array,
+    qd: Array,
+    start: tuple[Array, Constants] | None = None,
+) -> tuple[Array, Array]:
+    """Mass matrix and bias of the linkage and of the elements that move masses.
+
+    `start`: the positions of a configuration and the constants of the equations there,
+    if they are known.
+    """
+    q0, constants = start or (q, link_constants(linkage, q))
+    m = equations(constants, tuple(q - q0), tuple(qd))
+    six, bias = (m.m11, m.m12, m.m13, m.m22, m.m23, m.m33), jnp.stack(m.bias)
     if (more := added_inertia(linkage, forces, q, qd)) is not None:
-        added, bias = more
-        tau = tau + jnp.stack(times(added, tuple(qdd))) + bias
-    return tau
+        six = tuple(a + b for a, b in zip(six, more[0]))
+        bias = bias + more[1]
+    m11, m12, m13, m22, m23, m33 = six
+    return jnp.array([[m11, m12, m13], [m12, m22, m23], [m13, m23, m33]]), bias
 
 
 @compiled(q=(3,), qd=(3,))

@@ -9,7 +9,11 @@ import pytest
 from helpers import random_linkage
 
 import fdof_jax as fj
-from fdof_jax.mechanics.inverse_kinematics import plane_angle, solve_joints
+from fdof_jax.mechanics.inverse_kinematics import (
+    known_directions,
+    plane_angle,
+    solve_joints,
+)
 from fdof_jax.mechanics.kinematics import mass_center_velocities
 
 SAMPLES = 12
@@ -234,7 +238,10 @@ def test_parallel_slides_reach_no_given_point(topology, lock, base_angle):
 
 @jax.jit
 def wrists_solved(linkage, wrists, orientation, branch):
-    one = lambda w, bearing: solve_joints(linkage, w, bearing, orientation, branch)
+    directions = known_directions(linkage, orientation)
+    one = lambda w, bearing: solve_joints(
+        linkage, directions, w, bearing, orientation, branch
+    )
     return jax.vmap(one)(wrists, plane_angle(wrists[:, 1], wrists[:, 0]))
 
 
@@ -249,7 +256,8 @@ def test_numpy_solves_the_joints_as_jax_does(topology, branch):
         known, sides = jax.tree.map(np.asarray, linkage), np.asarray(float(branch))
         bearing = plane_angle(wrists[:, 1], wrists[:, 0])
         angle = np.asarray(orientation)
-        q, root = solve_joints(known, wrists, bearing, angle, sides)
+        directions = known_directions(known, angle)
+        q, root = solve_joints(known, directions, wrists, bearing, angle, sides)
         expected, _ = wrists_solved(linkage, wrists, angle, sides)
         assert isinstance(q, np.ndarray) and isinstance(root, np.ndarray)
         # Next to the edge of the reach a root takes rounding to its square root.

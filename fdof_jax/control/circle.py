@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from ..checks import concrete, real_array, sign
 from ..linkage.linkage import Linkage, check_linkage
 from ..mechanics.inverse_kinematics import (
+    known_directions,
     plane_angle,
     solve_joints,
     unmoved_part,
@@ -84,15 +85,23 @@ class CircleTask(eqx.Module):
 
     def tip(self, t: ArrayLike) -> Float[Array, " 2"]:
         """The commanded tip position at time `t` [s]: (x, y) [m]."""
-        return _on_circle(self, real_array("t", t, ()))
+        _, cos, sin = _turned(self, real_array("t", t, ()))
+        return _on_circle(self, cos, sin)
 
     def assembly(self, t: Array, linkage: Linkage) -> tuple[Array, Array]:
         """Joint positions, and the root that is 0 at the edge of the reach."""
-        unmoved = unmoved_part(linkage, self.orientation)
-        wrist, hub = _on_circle(self, t) - unmoved, self.center - unmoved
-        turns = whole_turns(_bearing(self, 0.0, hub))
-        bearing = _bearing(self, t, hub) - 2 * np.pi * turns
-        return solve_joints(linkage, wrist, bearing, self.orientation, self.branch)
+        directions = known_directions(linkage, self.orientation)
+        unmoved = unmoved_part(linkage, directions)
+        hub = self.center - unmoved
+        xp = namespace(t, self.phase)
+        turned = _turned(self, xp.stack([t, xp.zeros_like(t)]))
+        bearing, at_start = _bearing(self, turned, hub)
+        bearing = bearing - 2 * np.pi * whole_turns(at_start)
+        _, cos, sin = (values[0] for values in turned)
+        wrist = _on_circle(self, cos, sin) - unmoved
+        return solve_joints(
+            linkage, directions, wrist, bearing, self.orientation, self.branch
+        )
 
     def __call__(
         self, t: ArrayLike, linkage: Linkage
@@ -117,7 +126,7 @@ class CircleTask(eqx.Module):
         turn = abs(period)
         # The reach ends first where the wrist is nearest to or farthest from the base,
         # or along a direction that the ground or the last link fixes.
-        hub = task.center - unmoved_part(arm, task.orientation)
+        hub = task.center - unmoved_part(arm, known_directions(arm, task.orientation))
         directions = np.array(
             [np.arctan2(hub[1], hub[0]), arm.base_angle,
              task.orientation - arm.locked[2]]
@@ -137,31 +146,30 @@ class CircleTask(eqx.Module):
 # Functions, because a call of a module's method makes an object each time.
 
 
-def _turned(circle: CircleTask, t: Array | float) -> tuple[Array, Array, Array]:
+def _turned(circle: CircleTask, t: Array) -> tuple[Array, Array, Array]:
     """Direction from the centre: its angle, cosine and sine."""
     angle = circle.phase + 2 * np.pi * t / circle.period
     sin, cos = sine_and_cosine(angle)
     return angle, cos, sin
 
 
-def _on_circle(circle: CircleTask, t: Array) -> Array:
+def _on_circle(circle: CircleTask, cos: Array, sin: Array) -> Array:
     """Points of the circle, (..., 2)."""
-    _, cos, sin = _turned(circle, t)
     return circle.center + circle.radius * namespace(cos).stack([cos, sin], axis=-1)
 
 
-def _bearing(circle: CircleTask, t: Array | float, hub: Array) -> Array:
-    """Angle of hub + radius * (cos, sin)(turned) without jumps.
+def _bearing(circle: CircleTask, turned: tuple, hub: Array) -> Array:
+    """Angle of hub + radius * (cos, sin) without jumps.
 
     The larger of the two vectors carries the angle; the smaller one adds less than
     a quarter turn, for which the arctangent has no jump.
     """
-    turned, cos, sin = _turned(circle, t)
-    xp, radius = namespace(turned, hub), circle.radius
+    angle, cos, sin = turned
+    xp, radius = namespace(angle, hub), circle.radius
     along, across = hub[0] * cos + hub[1] * sin, hub[1] * cos - hub[0] * sin
     square = hub[0] ** 2 + hub[1] ** 2
     around = radius**2 > square
-    carrier = xp.where(around, turned, plane_angle(hub[1], hub[0]))
+    carrier = xp.where(around, angle, plane_angle(hub[1], hub[0]))
     return carrier + plane_angle(
         xp.where(around, across, -radius * across),
         xp.where(around, radius + along, square + radius * along),

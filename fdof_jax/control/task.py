@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from ..checks import instance, real_array, sign
 from ..linkage.linkage import Linkage
 from ..mechanics.inverse_kinematics import (
+    known_directions,
     plane_angle,
     solve_joints,
     unmoved_part,
@@ -142,13 +143,16 @@ class TipTask(eqx.Module):
             tip: Any = np.asarray(points).reshape(*np.shape(t), 2)
         else:
             tip = self.path.point(self.timing(t))
-        unmoved = unmoved_part(linkage, self.orientation)
+        directions = known_directions(linkage, self.orientation)
+        unmoved = unmoved_part(linkage, directions)
         wrist, hub = tip - unmoved, in_numpy(self.path.middle) - unmoved
         across = hub[0] * wrist[..., 1] - hub[1] * wrist[..., 0]
         beside = plane_angle(across, wrist @ hub)
         middle = plane_angle(hub[1], hub[0])
         bearing = middle - 2 * np.pi * whole_turns(middle) + beside
-        q, root = solve_joints(linkage, wrist, bearing, self.orientation, self.branch)
+        q, root = solve_joints(
+            linkage, directions, wrist, bearing, self.orientation, self.branch
+        )
         return q, root, beside
 
     def __call__(
@@ -183,7 +187,8 @@ class TipTask(eqx.Module):
                 f"{task.orientation:g} rad on branch {task.branch:+g}, got one that "
                 f"leaves it at {times[inside.argmin()]:g} s."
             )
-        hub = in_numpy(task.path.middle) - unmoved_part(arm, task.orientation)
+        directions = known_directions(arm, task.orientation)
+        hub = in_numpy(task.path.middle) - unmoved_part(arm, directions)
         behind = (np.abs(np.diff(beside)) > np.pi).any()
         if behind or not hub.any():
             raise ValueError(

@@ -1,5 +1,7 @@
 """Joint positions of a commanded tip."""
 
+from typing import NamedTuple
+
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -30,21 +32,56 @@ def whole_turns(angle: Array) -> Array:
     return namespace(angle).ceil((angle - np.pi - margin) / (2 * np.pi))
 
 
-def unmoved_part(linkage: Linkage, orientation: Array) -> Array:
+class Directions(NamedTuple):
+    """What is known of the links before the tip's position is.
+
+    - `th2`, `th3`: angles of links 2 and 3 where they follow from the ground or from
+      the last link's orientation; otherwise any [rad].
+    - `e1`, `e2`, `e3`, `e4`: unit vectors of the links' angles.
+    - `turn`: the unit vector of `locked[1]`, by which link 3 is turned from link 2 in
+      an RPR arm.
+    """
+
+    th2: Array
+    th3: Array
+    e1: Array
+    e2: Array
+    e3: Array
+    e4: Array
+    turn: Array
+
+
+def known_directions(linkage: Linkage, orientation: Array) -> Directions:
+    """Directions that follow from the ground or from the last link's angle."""
+    xp = namespace(linkage, orientation)
+    r1, _, r3 = real_joints(linkage.ef)
+    lock1, lock2, lock3 = linkage.locked
+    th3_from_tip = orientation - lock3
+    th2 = xp.where(r1, th3_from_tip - lock2, linkage.base_angle + lock1)
+    th3 = xp.where(r3, th2 + lock2, th3_from_tip)
+    # At once: sine and cosine are most of what is compiled here.
+    angles = xp.stack([linkage.base_angle, th2, th3, orientation, lock2])
+    return Directions(th2, th3, *unit_vectors(angles))
+
+
+def unmoved_part(linkage: Linkage, directions: Directions) -> Array:
     """What the tip's position has from no joint: the ground's and last link's vectors.
 
     The rest is the wrist vector, from the first joint's start to the last link's, (2,).
     """
-    xp = namespace(linkage, orientation)
+    xp = namespace(linkage, directions)
     r1, _, _ = real_joints(linkage.ef)
     fixed = plane_vector(linkage.length[0], xp.where(r1, linkage.locked[0], 0))
-    ground = unit_vectors(linkage.base_angle) * fixed
-    last = unit_vectors(orientation) * linkage.length[3]
-    return as_points(ground + last)
+    return as_points(directions.e1 * fixed + directions.e4 * linkage.length[3])
 
 
 def solve_joints(
-    linkage: Linkage, wrist: Array, bearing: Array, orientation: Array, branch: Array
+    linkage: Linkage,
+    directions: Directions,
+    wrist: Array,
+    bearing: Array,
+    orientation: Array,
+    branch: Array,
 ) -> tuple[Array, Array]:
     """Joint positions (..., 3) from the wrist vector, NaN where it is out of reach.
 
@@ -62,18 +99,14 @@ def solve_joints(
     xp = namespace(linkage, wrist, bearing, orientation, branch)
     r1, r2, r3 = real_joints(linkage.ef)
     th1 = linkage.base_angle
+    th2_known, th3_known, e1, e2, e3, _, turn = directions
     _, a2, a3, _ = linkage.length
-    lock1, lock2, lock3 = linkage.locked
+    _, lock2, lock3 = linkage.locked
     two_turning = r1 & r2 & r3
     framed = r1 & ~r2 & r3
     two_slides = (r1 ^ r2) & (r2 ^ r3) & ~framed | (~r1 & ~r2) | (~r2 & ~r3)
     turning_third = ~r1 & r2 & r3  # PRR: link 3 turns; in RRP it is link 2
 
-    # Directions that follow from the orientation or the ground, where they do.
-    th3_from_tip = orientation - lock3
-    th2_known = xp.where(r1, th3_from_tip - lock2, th1 + lock1)
-    th3_known = xp.where(r3, th2_known + lock2, th3_from_tip)
-    e1, e2, e3 = unit_vectors(xp.stack([th1, th2_known, th3_known]))
     w = plane_vector(wrist[..., 0], wrist[..., 1])
 
     def dot(u: Array, v: Array) -> Array:
@@ -104,7 +137,7 @@ def solve_joints(
     along_turning = dot(across, remainder)
 
     # RPR: link 3 and its vector as seen from link 2.
-    framed_d3 = d3 * unit_vectors(lock2)
+    framed_d3 = d3 * turn
     distance = a2 + framed_d3.real
 
     # RRR: the law of cosines, between the vectors of links 2 and 3.
@@ -187,10 +220,11 @@ def inverse_kinematics(
     side = sign("branch", branch)
     # Of known values by NumPy, because single operations of JAX are compiled.
     arm, point, angle, side = in_numpy((linkage, tip, orientation, side))
-    wrist = point - unmoved_part(arm, angle)
+    directions = known_directions(arm, angle)
+    wrist = point - unmoved_part(arm, directions)
     bearing = plane_angle(wrist[1], wrist[0])
     bearing = bearing - 2 * np.pi * whole_turns(bearing)
-    q, _ = solve_joints(arm, wrist, bearing, angle, side)
+    q, _ = solve_joints(arm, directions, wrist, bearing, angle, side)
     values = concrete(q)
     if values is not None and not np.isfinite(values).all():
         raise ValueError(

@@ -19,10 +19,10 @@ from ..control.reference import (
     positions_at,
     reference_motion,
 )
-from ..forces.added_inertia import added_inertia
+from ..dynamics import mass_and_bias
 from ..forces.element import Forces
 from ..linkage.linkage import Linkage
-from ..mechanics.equations import equations, link_constants, zeros
+from ..mechanics.equations import equations, zeros
 from ..xla.array_namespace import in_numpy
 from ..xla.callbacks import with_checks
 from .field import LEAST_INERTIA_RATIO, Args, applied
@@ -104,15 +104,8 @@ def prescribed(forces: Forces) -> PrescribedMotion | None:
 
 
 def _mass_and_bias(args: Args, q: Array, qd: Array) -> tuple[Array, Array]:
-    """Of the linkage and the elements that move masses: (3, 3) and (3,)."""
-    m = equations(args.constants, tuple(q - args.q0), tuple(qd))
-    six, bias = (m.m11, m.m12, m.m13, m.m22, m.m23, m.m33), jnp.stack(m.bias)
-    more = added_inertia(args.linkage, args.forces, q, qd)
-    if more is not None:
-        six = tuple(a + b for a, b in zip(six, more[0]))
-        bias = bias + more[1]
-    m11, m12, m13, m22, m23, m33 = six
-    return jnp.array([[m11, m12, m13], [m12, m22, m23], [m13, m23, m33]]), bias
+    start = args.q0, args.constants
+    return mass_and_bias(args.linkage, args.forces, q, qd, start)
 
 
 def _split(moved: Array, matrix: Array, known: Array, right: Array) -> Array:
@@ -175,8 +168,7 @@ def prescribed_effort(
     """What the prescribed motion takes, the other elements' efforts being `tau`."""
     motion = prescribed(forces)
     assert motion is not None
-    args = Args(linkage, q, link_constants(linkage, q), forces)
-    matrix, bias = _mass_and_bias(args, q, qd)
+    matrix, bias = mass_and_bias(linkage, forces, q, qd)
     velocity = lambda t: motion.at(t, linkage)[1]
     _, demanded = jax.jvp(velocity, (t,), (jnp.ones_like(t),))
     qdd = _split(motion.moved, matrix, demanded, tau - bias)
