@@ -111,15 +111,19 @@ def targets(points: dict[str, list[dict]], number: Callable) -> Iterator[tuple]:
                 other = {"solver": f"{name}, {scene}"}
                 figure = f"{scene} in a batch of 256 over the clean batch: {name}"
                 yield row(figure, _ratio_of(job, other, clean), required, aim)
-    if job := points.get("trajectory"):
+    if job := points.get("single_arms"):
+        problem = "Fig 5, 10 s, error up to 2 s"
         yield row(
             "Fig 5, 10 s, error 1e-9 at 2 s: fdof_jax over heyoka",
-            ratio_at(job, "fdof_jax", "heyoka", 1e-9, problem="fig5-error-to-2s"),
+            ratio_at(job, "fdof_jax", "heyoka", 1e-9, problem=problem),
             "≤ 2",
             "≤ 1.3",
         )
+        limits = {"forward": ("≤ 6", "≤ 3"), "reverse": ("≤ 12", "≤ 6")}
+        yield from _gradient_targets(job, number, "Fig 7, 4 s, six gains", 1, limits)
     if job := points.get("gradients"):
-        yield from _gradient_targets(job, number)
+        limits = dict.fromkeys(("forward", "reverse"), ("≤ 8", "≤ 4"))
+        yield from _gradient_targets(job, number, "gains", 256, limits)
     if job := points.get("compile_times"):
         for figure, case, how, seconds, required, aim in (
             ("first motion [s of CPU]", "Fig 5", PLAIN, "times", "≤ 3.5", ""),
@@ -150,14 +154,15 @@ def targets(points: dict[str, list[dict]], number: Callable) -> Iterator[tuple]:
             yield figure, number(best["energy_defect"]), "", "≤ 1e-10", "≤ 1e-12"
 
 
-def _gradient_targets(job: list[dict], number: Callable) -> Iterator[tuple]:
-    for batch, mode, required, aim in (
-        (1, "forward", "≤ 6", "≤ 3"),
-        (1, "reverse", "≤ 12", "≤ 6"),
-        (256, "forward", "≤ 8", "≤ 4"),
-        (256, "reverse", "≤ 8", "≤ 4"),
-    ):
-        same = {"problem": "gains", "batch": batch, "horizon": 4.0, "setting": 1e-8}
+def _gradient_targets(
+    job: list[dict],
+    number: Callable,
+    problem: str,
+    batch: int,
+    limits: dict[str, tuple[str, str]],
+) -> Iterator[tuple]:
+    for mode, (required, aim) in limits.items():
+        same = {"problem": problem, "batch": batch, "horizon": 4.0, "setting": 1e-8}
         this = {**same, "gradient_mode": mode}
         ratio = _ratio_of(job, this, {**same, "gradient_mode": "none"})
         found = [p for p in job if all(p.get(k) == v for k, v in this.items())]

@@ -60,6 +60,7 @@ def loss(scene, z, ts, adjoint=diffrax.ForwardMode()):
     return jnp.sum(tip_errors(trial, solution) ** 2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("point", POINTS)
 def test_tangents_are_those_of_differences(point):
     scene, ts = POINTS[point], np.linspace(0, 3, 1001)

@@ -80,6 +80,7 @@ def steps(tolerance, dt0=1e-3, growth=10.0):
 STEPS = {"fixed": steps(1e9, 1 / 1024, growth=1.0), "adaptive": steps(1e-13)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", STEPS)
 def test_forward_reverse_and_differences_agree(kind):
     scene = jax.tree.map(jnp.asarray, scenes.fig7())
@@ -110,6 +111,33 @@ def test_forward_reverse_and_differences_agree(kind):
     assert np.abs(tangents - np.array(differences)).max() <= 1e-6 * scale
 
 
+def test_both_modes_of_a_damped_arm_equal_differences():
+    """Of steps of one size, in its masses, damping and start."""
+    arm, (damper,) = scenes.fig3().linkage, scenes.fig3().forces
+
+    def end(at, adjoint):
+        mass, coefficient, q = at.reshape(3, 3)
+        linkage = eqx.tree_at(lambda x: x.mass, arm, mass)
+        forces = (eqx.tree_at(lambda d: d.coefficient, damper, coefficient),)
+        start, steps = fj.State(q, ZERO), diffrax.ConstantStepSize()
+        motion = fj.simulate(
+            linkage, start, [0, 0.5], forces,
+            stepsize_controller=steps, dt0=1 / 64, adjoint=adjoint,
+        )  # fmt: skip
+        return jnp.sum(motion.q[-1] * jnp.array([1.0, -2.0, 0.5]))
+
+    at = jnp.array([5.0, 2.0, 1.0, 20.0, 10.0, 5.0, 0.3, -0.2, 0.5])
+    backward = diffrax.RecursiveCheckpointAdjoint()
+    both = jax.jit(jax.value_and_grad(lambda at: end(at, backward)))
+    forward = jax.jit(jax.jacfwd(lambda at: end(at, diffrax.ForwardMode())))(at)
+    value = lambda change: float(both(at + change)[0])
+    h = 1e-5
+    differences = [(value(h * e) - value(-h * e)) / (2 * h) for e in np.eye(at.size)]
+    np.testing.assert_allclose(both(at)[1], forward, rtol=1e-9, atol=1e-11)
+    np.testing.assert_allclose(forward, differences, rtol=1e-6, atol=1e-8)
+    assert (np.abs(forward) > 1e-6).all()
+
+
 @pytest.mark.slow
 def test_gradient_of_a_batch_is_the_sum_of_the_gradients():
     def total(mass, starts):
@@ -129,6 +157,7 @@ def test_gradient_of_a_batch_is_the_sum_of_the_gradients():
     np.testing.assert_allclose(together, alone, rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_gradients_at_rest_and_at_zero_error_are_finite():
     """Hanging still, on the circle's start, with nothing to correct."""
     linkage = scenes.fig7().linkage
@@ -153,6 +182,7 @@ def linear_motion(end):
     return jax.scipy.linalg.expm(rates * end, max_squarings=32)[:3, :3]
 
 
+@pytest.mark.slow
 def test_tangents_of_a_hanging_arm_are_controlled():
     """At rest there is no error to see: steps are bounded by the time scale."""
     # In the circle's reach, with a controller that does nothing.

@@ -311,3 +311,28 @@ def test_traced_shapes_are_checked(name):
 def test_a_concrete_field_is_checked_next_to_a_traced_one():
     with pytest.raises(ValueError, match="^mass: expected .*, got"):
         jax.jit(lambda length: make(length=length, mass=[1, -1, 1]))(jnp.ones(4))
+
+
+# Other values
+
+
+def test_a_copy_with_other_values():
+    arm = fj.scenes.fig7().linkage
+    heavy = arm.replace(mass=[1, 2, 3], topology="RRP")
+    np.testing.assert_array_equal(heavy.mass, [1, 2, 3])
+    np.testing.assert_array_equal(heavy.ef, fj.existence_factors("RRP"))
+    np.testing.assert_array_equal(heavy.length, arm.length)
+    assert jax.tree.structure(heavy) == jax.tree.structure(arm)
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"masses": 1}, "^masses: expected one of topology, length, .*, gravity, got"),
+        ({"mass": [-1, 1, 1]}, "^mass: expected .* at least 0, got"),
+        ({"topology": "RRQ"}, "^topology: expected"),
+    ],
+)
+def test_a_copy_is_checked_as_a_new_one(values, words):
+    with pytest.raises(ValueError, match=words):
+        fj.scenes.fig7().linkage.replace(**values)

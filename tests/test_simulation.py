@@ -233,3 +233,36 @@ def test_keywords_of_simulate(keyword, value):
     scene = scenes.fig5()
     with pytest.raises(ValueError, match=f"^{keyword}: expected"):
         fj.simulate(scene.linkage, scene.state0, [0, 0.1], **{keyword: value})
+
+
+# Tolerances
+
+
+def test_tolerances_are_those_of_a_controller_of_ones_own():
+    arm, start, forces, _ = fj.scenes.fig5()
+    ts = np.linspace(0, 0.5, 3)
+    by_name = fj.simulate(arm, start, ts, forces, rtol=1e-6, atol=1e-7)
+    pid = diffrax.PIDController(rtol=1e-6, atol=1e-7, dtmin=1e-13, force_dtmin=False)
+    controlled = fj.simulate(arm, start, ts, forces, stepsize_controller=pid)
+    np.testing.assert_allclose(by_name.q, controlled.q, atol=1e-12)
+    default = fj.simulate(arm, start, ts, forces)
+    finer = fj.simulate(arm, start, ts, forces, atol=1e-7)  # rtol as by default
+    steps = [int(m.stats["num_steps"]) for m in (by_name, finer, default)]
+    assert steps == sorted(steps) and steps[0] < steps[-1]
+
+
+@pytest.mark.parametrize(
+    ("keywords", "words"),
+    [
+        ({"rtol": 0}, "^rtol: expected a real number, finite, above 0, got 0"),
+        ({"atol": [1e-6]}, "^atol: expected a real number"),
+        (
+            {"rtol": 1e-6, "stepsize_controller": diffrax.ConstantStepSize()},
+            "^rtol, atol: expected none beside a stepsize_controller",
+        ),
+    ],
+)
+def test_malformed_tolerances_are_refused(keywords, words):
+    arm, start, forces, _ = fj.scenes.fig5()
+    with pytest.raises(ValueError, match=words):
+        fj.simulate(arm, start, [0, 1], forces, **keywords)

@@ -92,6 +92,26 @@ class Linkage(eqx.Module):
         if not is_traced(list(vars(self).values())):
             check_singularity(self)
 
+    def replace(self, **values: Any) -> "Linkage":
+        """A copy with other values of some fields, checked as new ones are.
+
+        **Arguments:** those of the constructor.
+
+        **Raises:** ValueError for malformed values, and for names of no argument.
+
+        >>> import fdof_jax as fj
+        >>> fj.scenes.fig5().linkage.replace(mass=[1, 1, 5]).mass.tolist()  # [kg]
+        [1.0, 1.0, 5.0]
+        """
+        fields = vars(self)
+        now = {"topology": fields["ef"]} | {k: fields[k] for k in fields if k != "ef"}
+        for name in values:
+            if name not in now:
+                raise ValueError(
+                    f"{name}: expected one of {', '.join(now)}, got another name."
+                )
+        return Linkage(**now | values)
+
     def __repr__(self) -> str:
         """With the values of one linkage; with the shapes of a batch."""
         if np.size(self.ef) != 6 or not known(self):
@@ -171,9 +191,8 @@ def check_linkage(linkage: Any) -> None:
     if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(values)) or not (
         possible(values)
     ):
-        fields = vars(linkage)
         try:
-            Linkage(fields["ef"], **{k: fields[k] for k in fields if k != "ef"})
+            linkage.replace()
         except ValueError as error:
             raise ValueError(f"linkage.{error}") from None
 

@@ -26,12 +26,14 @@ from .field import element_effort, stateful
 from .integrate import solve, solve_one
 from .prescribed import prescribed, prescribed_effort
 from .solution import Efforts, Solution
-from .steps import within_reach
+from .steps import at_tolerances, within_reach
 
 
 def solve_options(
     solver: diffrax.AbstractSolver | None,
     *,
+    rtol: ArrayLike | None,
+    atol: ArrayLike | None,
     stepsize_controller: diffrax.AbstractStepSizeController | None,
     dt0: ArrayLike | None,
     adjoint: diffrax.AbstractAdjoint,
@@ -61,6 +63,13 @@ def solve_options(
         instance(name, value, kind)
     if solver is not None:
         instance("solver", solver, diffrax.AbstractSolver)
+    if rtol is not None or atol is not None:
+        if stepsize_controller is not None:
+            raise ValueError(
+                "rtol, atol: expected none beside a stepsize_controller, which has "
+                f"its own tolerances, got rtol={rtol!r} and atol={atol!r}."
+            )
+        stepsize_controller = at_tolerances(rtol, atol)
     if stepsize_controller is not None:
         kind = diffrax.AbstractStepSizeController
         instance("stepsize_controller", stepsize_controller, kind)
@@ -102,6 +111,8 @@ def simulate(
     *,
     own0: tuple[Any, ...] | None = None,
     solver: diffrax.AbstractSolver | None = None,
+    rtol: ArrayLike | None = None,
+    atol: ArrayLike | None = None,
     stepsize_controller: diffrax.AbstractStepSizeController | None = None,
     dt0: ArrayLike | None = 1e-3,
     adjoint: diffrax.AbstractAdjoint = diffrax.RecursiveCheckpointAdjoint(),
@@ -124,12 +135,13 @@ def simulate(
     - `forces`: a tuple of force elements `(t, q, qd, linkage) -> tau`.
     - `own0`: the states of the `StatefulElement`s among them at the start, one row of a
       `Solution.own`; by default what the elements say.
+    - `rtol`, `atol`: relative and absolute tolerance of a step, 1e-11 in float64 and
+      1e-5 in float32 by default; not beside a `stepsize_controller`.
     - `solver`, `stepsize_controller`, `dt0`, `adjoint`, `max_steps`, `throw`,
-      `progress_meter`: as in `diffrax.diffeqsolve`. By default Dopri8 at a relative
-      and absolute tolerance of 1e-11 in float64, 1e-5 in float32, for which
-      `None` stands in both arguments. The first step `dt0`
-      is 1 ms, because estimates of it fail from exact rest; `None` lets the controller
-      estimate it.
+      `progress_meter`: as in `diffrax.diffeqsolve`. By default, which `None` stands
+      for, the solver is Dopri8 and steps are adaptive. The first step `dt0` is 1 ms,
+      because estimates of it fail from exact rest; `None` lets the controller estimate
+      it.
       Reverse mode works with the default `adjoint`; for forward mode pass
       `diffrax.ForwardMode()`.
 
@@ -159,6 +171,8 @@ def simulate(
     callable_tuple("forces", forces)
     solver, keywords = solve_options(
         solver,
+        rtol=rtol,
+        atol=atol,
         stepsize_controller=stepsize_controller,
         dt0=dt0,
         adjoint=adjoint,

@@ -12,6 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import Array
+from numpy.typing import ArrayLike
 
 from ..checks import concrete, instance, is_traced, real_array
 from ..linkage.coordinates import State, real_joints
@@ -42,6 +43,19 @@ def _shortest_step() -> float:
 def default_controller() -> diffrax.PIDController:
     """That of `simulate` and `sweep`."""
     return adaptive(1e-11, 1e-5)
+
+
+def at_tolerances(
+    rtol: ArrayLike | None, atol: ArrayLike | None
+) -> diffrax.PIDController:
+    """The default steps at other tolerances; None leaves one as it is."""
+    controller = default_controller()
+    rtol = controller.rtol if rtol is None else rtol
+    atol = controller.atol if atol is None else atol
+    # Arrays: new values need no new trace.
+    rtol = real_array("rtol", rtol, (), above=0)
+    atol = real_array("atol", atol, (), above=0)
+    return dataclasses.replace(controller, rtol=rtol, atol=atol)
 
 
 def within_reach(

@@ -88,6 +88,8 @@ def sweep(
     throw: bool = False,
     checkpoint: str | os.PathLike | None = None,
     solver: diffrax.AbstractSolver | None = None,
+    rtol: ArrayLike | None = None,
+    atol: ArrayLike | None = None,
     stepsize_controller: diffrax.AbstractStepSizeController | None = None,
     dt0: ArrayLike | None = 1e-3,
     adjoint: diffrax.AbstractAdjoint = diffrax.RecursiveCheckpointAdjoint(),
@@ -112,7 +114,7 @@ def sweep(
     - `throw`: whether any failed member raises.
     - `checkpoint`: a folder for the results of finished chunks. The same call goes on
       from there.
-    - `solver`, `stepsize_controller`, `dt0`, `adjoint`, `max_steps`,
+    - `solver`, `rtol`, `atol`, `stepsize_controller`, `dt0`, `adjoint`, `max_steps`,
       `progress_meter`: as in `simulate`.
 
     **Returns:** a `Solution` with a leading batch axis everywhere; `result` tells each
@@ -136,6 +138,8 @@ def sweep(
     whole_number("chunk", chunk, 1)
     solver, settings = solve_options(
         solver,
+        rtol=rtol,
+        atol=atol,
         stepsize_controller=stepsize_controller,
         dt0=dt0,
         adjoint=adjoint,
