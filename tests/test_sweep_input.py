@@ -117,8 +117,8 @@ def test_malformed_options_are_refused(name, values):
 
 
 def test_a_misspelt_keyword_is_refused():
-    with pytest.raises(TypeError, match=r"sweep\(\) got an unexpected .*'rtol'"):
-        fj.sweep(TWO, STATES, TS, rtol=1e-6)
+    with pytest.raises(TypeError, match=r"sweep\(\) got an unexpected .*'rtoll'"):
+        fj.sweep(TWO, STATES, TS, rtoll=1e-6)
 
 
 def test_what_a_transformation_cannot_do_is_refused(tmp_path):
