@@ -33,6 +33,7 @@ from saved_trees import (
 
 import fdof_jax as fj
 from fdof_jax import scenes
+from fdof_jax.shell.tuning_run import Job
 from fdof_jax.simulation import integrate
 from fdof_jax.simulation.looped_dopri8 import LoopedDopri8
 from fdof_jax.tuning import tune as tuning
@@ -309,6 +310,10 @@ def test_a_file_of_version_0_1():
     travel = fj.Travel(2.0, begin=0.5, profile="trapezoidal")
     spline = fj.Spline([[0, 0], [1, 0], [1, 1], [0, 1]], closed=True)
     equal(tree["references"][7], fj.TipTask(spline, travel, orientation=0.1))
+
+
+def test_what_the_command_line_saves(path):
+    saved_and_loaded(path, {"job": Job(), "search": {"seed": 1}, "results": []})
 
 
 def test_files_name_no_module(path):

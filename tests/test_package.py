@@ -69,6 +69,10 @@ ROOMS = {
 }  # fmt: skip
 
 
+def test_colours_are_found_beside_the_functions_that_draw():
+    assert fj.drawing.SERIES[0] != fj.drawing.BLACK != fj.drawing.GREY
+
+
 def test_rooms_import_from_those_below_them_only():
     for path in FOLDER.rglob("*.py"):
         module = path.relative_to(FOLDER).with_suffix("").parts

@@ -35,6 +35,7 @@ _WITHIN = {
     "CircleRun": "shell.showcase",
     "DriveState": "control.drives",
     "History": "tuning.result",
+    "Job": "shell.tuning_run",
     "Separation": "forces.points",
     "_Knots": "tuning.optimal_motion",
 }

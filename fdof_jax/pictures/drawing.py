@@ -21,6 +21,9 @@ from ..simulation.solution import Solution
 from .animation import animate as animate, animate_grid as animate_grid
 from .arms import draw_arm, draw_ground, draw_motion, geometries_of, panels_of
 from .axes import (
+    BLACK as BLACK,
+    GREY as GREY,
+    SERIES as SERIES,
     legend,
     plane_axes,
     reached,
