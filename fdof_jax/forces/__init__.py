@@ -1,4 +1,4 @@
-"""What acts on an arm: efforts, springs, dampers, stops, actuators."""
+"""Force elements: joint efforts, springs, dampers, stops, actuators."""
 
 from .actuators import Armature as Armature, LinearActuator as LinearActuator
 from .between_points import (

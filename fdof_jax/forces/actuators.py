@@ -27,8 +27,8 @@ from .points import (
 class Armature(InertialElement):
     """Rotors geared to the joints: inertia that turns with a joint's relative rate.
 
-    **Arguments:** `inertia`: one per joint or one for all, not negative; of the rotor
-    times the square of the gear ratio [kg m^2; kg for a prismatic joint].
+    **Arguments:** `inertia`: the rotor's inertia times the square of the gear ratio,
+    one per joint or one for all, not negative [kg m^2; kg for a prismatic joint].
 
     **Raises:** ValueError for malformed or negative inertias.
 
@@ -45,7 +45,7 @@ class Armature(InertialElement):
         self.inertia = real_array("inertia", inertia, (3,), minimum=0, broadcast=True)
 
     def possible(self) -> Array:
-        """Whether the inertias are not negative."""
+        """Returns whether the inertias are not negative."""
         return (self.inertia >= 0).all()
 
     def coordinates(self, q, linkage):
@@ -55,27 +55,27 @@ class Armature(InertialElement):
         return self.inertia
 
     def loads(self, t, q, qd, qdd, linkage):
-        """None but in the joints themselves."""
+        """Returns no loads: the rotors act in the joints themselves."""
         return ()
 
 
 class LinearActuator(InertialElement):
     """A cylinder and a piston between two points, and the force between them.
 
-    Both are bodies that lie along the line of the two pins: where the pins go, they
-    follow, exactly and without a degree of freedom of their own.
+    Both bodies lie along the line between their pins. They follow the pins exactly and
+    add no degree of freedom.
 
     **Arguments:**
 
     - `a`, `b`: the `Point`s of the pins, the cylinder's and the piston's.
-    - `force`: what pushes the pins apart [N], or a function of (t, length, rate) that
-      returns it [s, m, m/s].
-    - `mass`: of the cylinder and the piston, not negative [kg].
+    - `force`: the force that pushes the pins apart [N], or a function of (t, length,
+      rate) that returns it [s, m, m/s].
+    - `mass`: masses of the cylinder and the piston, not negative [kg].
     - `com`: distances of their mass centres, the cylinder's from `a` towards `b`, the
       piston's from `b` towards `a` [m].
-    - `inertia`: about their mass centres, not negative [kg m^2].
+    - `inertia`: inertias about their mass centres, not negative [kg m^2].
 
-    **Raises:** ValueError for malformed arguments. Where the pins meet, a line has no
+    **Raises:** ValueError for malformed arguments. Where the pins meet, the line has no
     direction, and motions end as not finite.
 
     >>> import fdof_jax as fj
@@ -110,11 +110,11 @@ class LinearActuator(InertialElement):
 
     @property
     def jump_ts(self) -> Array | None:
-        """The times at which the force's function says that it jumps, if it does."""
+        """Times at which the force jumps, if its function declares any."""
         return jumps_of(self.force)
 
     def _bodies(self, linkage: Linkage, q: Array) -> tuple[Array, Array, Array]:
-        """The mass centres of cylinder and piston, and the vector between the pins."""
+        """Mass centres of cylinder and piston, and the vector between the pins."""
         frames = frames_of(linkage, tuple(q))
         vector = self.ends.vector(frames)
         unit = vector * over(length_of(vector))
@@ -122,7 +122,7 @@ class LinearActuator(InertialElement):
         return cylinder, self.ends.b.place(frames) - self.com[1] * unit, vector
 
     def possible(self) -> Array:
-        """Whether masses and inertias are not negative."""
+        """Returns whether masses and inertias are not negative."""
         return ((self.mass >= 0) & (self.inertia >= 0)).all()
 
     def coordinates(self, q, linkage):
@@ -154,10 +154,10 @@ class LinearActuator(InertialElement):
     def loads(
         self, t: Array, q: Array, qd: Array, qdd: Array, linkage: Linkage
     ) -> tuple[Load, Load]:
-        """What its pins do to the links, while the joints accelerate by `qdd`.
+        """Loads of the pins on the links while the joints accelerate by `qdd`.
 
-        Besides the force between them: the weight and the inertia of the two bodies,
-        whose sideways part both pins share as the moments about the first one demand.
+        The loads hold the force between the pins and the weight and inertia of the two
+        bodies. The moments about the first pin determine each pin's sideways share.
         """
         along = lambda q, qd: jax.jvp(
             lambda q: self.coordinates(q, linkage), (q,), (qd,)
@@ -175,6 +175,6 @@ class LinearActuator(InertialElement):
             + (length - self.com[1]) * cross(unit, piston)
         )
         held = dot(unit, piston) - self._push(t, length, dot(unit, rate))
-        on_b = (held + 1j * about_a / length) * unit  # by the link, on the piston
+        on_b = (held + 1j * about_a / length) * unit  # by the link on the piston
         on_a = cylinder + piston - on_b
         return Load(self.ends.a, -on_a), Load(self.ends.b, -on_b)

@@ -1,4 +1,4 @@
-"""What force elements that move masses add to the equations of motion."""
+"""Terms that force elements with masses add to the equations of motion."""
 
 from functools import reduce
 from operator import add
@@ -14,13 +14,13 @@ from .element import Forces, InertialElement
 
 
 def inertial(forces: Forces) -> Forces:
-    """Those of the elements that move masses, refused unless it is such a tuple."""
+    """Returns the elements that move masses; raises ValueError for no such tuple."""
     callable_tuple("forces", forces)
     return tuple(e for e in forces if isinstance(e, InertialElement))
 
 
 def energetic(forces: Forces) -> Forces:
-    """Those of the elements that have energy: springs too."""
+    """Returns the elements that have energy, springs included."""
     callable_tuple("forces", forces)
     return tuple(e for e in forces if hasattr(e, "potential_energy"))
 
@@ -28,7 +28,7 @@ def energetic(forces: Forces) -> Forces:
 def added_energy(
     linkage: Linkage, forces: Forces, q: Array, qd: Array
 ) -> tuple[Array, Array]:
-    """Kinetic and potential energy of the elements [J]."""
+    """Computes the kinetic and the potential energy of the elements [J]."""
     kinetic, potential = jnp.zeros(()), jnp.zeros(())
     for element in energetic(forces):
         potential = potential + element.potential_energy(q, linkage)
@@ -42,10 +42,10 @@ def added_energy(
 def added_inertia(
     linkage: Linkage, forces: Forces, q: Array, qd: Array
 ) -> tuple[Added, Array] | None:
-    """The elements' share of the mass matrix and of the bias (3,), if they have one.
+    """Computes what elements add to the mass matrix and the bias (3,), if anything.
 
-    M = J^T W J and bias = J^T W (dJ/dt) qd + dV/dq, J being the derivative of the
-    coordinates: by forward mode alone, whose code is small in derivatives too.
+    M = J^T W J and bias = J^T W (dJ/dt) qd + dV/dq, where J is the derivative of the
+    coordinates. Forward mode alone keeps the code of further derivatives small.
     """
     if not inertial(forces):
         return None

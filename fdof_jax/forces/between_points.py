@@ -1,4 +1,4 @@
-"""What pulls or pushes at points of links: springs, constant forces, wrenches."""
+"""Force elements at points of links: springs, constant forces, wrenches."""
 
 from abc import abstractmethod
 from collections.abc import Callable
@@ -39,7 +39,7 @@ class LineElement(PointElement):
 
     @abstractmethod
     def pull(self, scheduled: Any, length: Array, rate: Array) -> Array:
-        """The tension over the length [N/m], given that [m] and its rate [m/s]."""
+        """Returns tension / length [N/m], given the length [m] and its rate [m/s]."""
 
     def _pull(self, scheduled, frames, qd) -> tuple[Array, tuple[Array, ...], Array]:
         vector = self.ends.vector(frames)
@@ -61,14 +61,14 @@ class SpringDamper(LineElement):
     """A spring and a damper between two points, along the line that joins them.
 
     The tension is stiffness * (length - rest_length) + damping * d(length)/dt. With a
-    rest length, points that meet have no line: the force is then 0.
+    rest length, points that meet have no line, and the force is 0 there.
 
     **Arguments:**
 
     - `a`, `b`: the two `Point`s.
     - `stiffness` [N/m], `damping` [N s/m], `rest_length` [m]: not negative.
-    - `one_sided`: "cable" pulls and never pushes, "bumper" pushes and never pulls, and
-      neither does anything on the other side of the rest length. False: both.
+    - `one_sided`: "cable" only pulls and "bumper" only pushes; neither acts on the
+      other side of the rest length. False: the element pulls and pushes.
 
     **Raises:** ValueError for malformed arguments.
 
@@ -107,7 +107,7 @@ class SpringDamper(LineElement):
         self.side = jax.device_put(np.array(sides[one_sided]))
 
     def possible(self) -> Array:
-        """Whether nothing is negative that must not be."""
+        """Returns whether stiffness, damping and rest length are not negative."""
         elastic = (self.stiffness >= 0) & (self.rest_length >= 0)
         return elastic & (self.damping >= 0)
 
@@ -115,12 +115,12 @@ class SpringDamper(LineElement):
         tension = self.stiffness * (length - self.rest_length) + self.damping * rate
         beyond = self.side * (length - self.rest_length) > 0
         works = (self.side == 0) | (beyond & (self.side * tension > 0))
-        # The pull of a spring of no rest length is smooth also where the points meet.
+        # Without a rest length the pull is smooth even where the points meet.
         other = self.damping * rate - self.stiffness * self.rest_length
         return jnp.where(works, self.stiffness + other * over(length), 0)
 
     def potential_energy(self, q: Array, linkage: Linkage) -> Array:
-        """The energy of the spring [J]."""
+        """Computes the energy of the spring [J]."""
         stretch = self.ends.length(linkage, q) - self.rest_length
         works = (self.side == 0) | (self.side * stretch > 0)
         return jnp.where(works, self.stiffness * stretch**2 / 2, 0)
@@ -152,19 +152,19 @@ class Tension(LineElement):
         return self.tension * over(length)
 
     def potential_energy(self, q: Array, linkage: Linkage) -> Array:
-        """Of which the force is the slope: 0 where the points meet [J]."""
+        """Computes tension times length [J], whose slope is the force."""
         return self.tension * self.ends.length(linkage, q)
 
 
 class Wrench(PointElement):
-    """A force and a moment from outside, on a point of a link.
+    """An external force and moment on a point of a link.
 
     **Arguments:**
 
-    - `point`: where.
+    - `point`: the `Point` of application.
     - `force`: (x, y) [N], or a function of time that returns it.
     - `moment`: counter-clockwise [N m], or a function of time that returns it.
-    - `follows`: whether the force turns with the link: it is then (along, across).
+    - `follows`: whether the force is (along, across) and turns with the link.
 
     **Raises:** ValueError for malformed arguments.
 
@@ -197,11 +197,11 @@ class Wrench(PointElement):
 
     @property
     def jump_ts(self) -> Array | None:
-        """The times at which the functions say that they jump, if they do."""
+        """Times at which force or moment jump, if their functions declare any."""
         return jumps_of(self.force, self.moment)
 
     def schedule(self, t, linkage):
-        """Force and moment at a time."""
+        """Returns the force and the moment at a time."""
         force, moment = self.force, self.moment
         if callable(force):
             force = real_array("force", force(t), (2,))

@@ -1,18 +1,21 @@
-"""Force elements: what acts on the joints besides gravity.
+"""Force elements: forces and torques on the joints besides gravity.
 
 An element is any pytree called as `(t, q, qd, linkage) -> tau`, with joint positions,
-velocities and efforts of shape (3,). A scene's elements are a tuple; their efforts
-add up. The PD controller is one too: see `control`. A `StatefulElement` has a state of
-its own, which `simulate` integrates along; an `InertialElement` moves masses.
+velocities and efforts of shape (3,). A scene holds a tuple of elements; their efforts
+add up. The PD controller is an element too: see `control`. `simulate` also integrates
+the state of a `StatefulElement`. An `InertialElement` moves masses.
 
-An element, or a controller's reference, whose efforts jump at known times may have them
-as an attribute `jump_ts`, an array [s]: steps then end there. One with a method
-`check(linkage, ts)` is asked at the door of `simulate` where values are concrete; one
-with `possible()`, also where they are traced: motions under an element for which that
-is not true end as not finite. At the door `jump_ts` and `possible()` are those of an
-element's copy with NumPy arrays, for which JAX compiles nothing.
+Optional attributes of an element, or of a controller's reference:
 
-Elements in hot loops may be `ScalarElement`s, which cost less to run and to compile.
+- `jump_ts`: an array of the times at which its efforts jump [s]; steps end there.
+- `check(linkage, ts)`: `simulate` calls it where values are concrete.
+- `possible()`: returns whether the values are valid. If not, `simulate` raises
+  ValueError; where they are traced, the motion ends as not finite.
+
+Where values are concrete, `simulate` reads `jump_ts` and `possible()` from a copy of
+the element with NumPy arrays, for which JAX compiles nothing.
+
+Elements in hot loops may be `ScalarElement`s, which run and compile faster.
 """
 
 from abc import abstractmethod
@@ -35,14 +38,14 @@ class ScalarElement(eqx.Module):
     """
 
     def schedule(self, t: Array, linkage: Linkage) -> Any:
-        """What depends on time alone: evaluated for all stages of a step at once."""
+        """Computes what depends on time alone, for all stages of a step at once."""
         return ()
 
     @abstractmethod
     def respond(
         self, scheduled: Any, q: Scalars, qd: Scalars, linkage: Linkage
     ) -> tuple[Array, ...]:
-        """The three efforts [N or N m], given what `schedule` returned."""
+        """Computes the three efforts [N or N m] from the result of `schedule`."""
 
     def __call__(self, t: Array, q: Array, qd: Array, linkage: Linkage) -> Array:
         scheduled = self.schedule(t, linkage)
@@ -52,56 +55,56 @@ class ScalarElement(eqx.Module):
 class StatefulElement(eqx.Module):
     """A force element with a state of its own: an integral, a current, a lag.
 
-    A subclass implements both methods; what it returns are efforts [N or N m].
+    A subclass implements both methods; its efforts are in [N or N m].
     """
 
     @abstractmethod
     def initial_state(self, linkage: Linkage) -> Any:
-        """The state at the start: an array, or a pytree of arrays."""
+        """Returns the state at the start: an array or a pytree of arrays."""
 
     @abstractmethod
     def __call__(
         self, t: Array, q: Array, qd: Array, linkage: Linkage, state: Any
     ) -> tuple[Array, Any]:
-        """The efforts (3,) [N or N m], and the rate of the state, a pytree like it."""
+        """Returns the efforts (3,) [N or N m] and the rate of the state."""
 
 
 class InertialElement(eqx.Module):
-    """A force element that moves masses: they add to the equations of motion.
+    """A force element with masses, which add to the equations of motion.
 
-    Its kinetic energy is the sum of weight * (d coordinate/dt)^2 / 2 [J]. A body, for
-    instance, has the coordinates of its mass centre, whose weights are its mass, and
-    its angle, whose weight is its inertia. A subclass implements both methods.
+    Its kinetic energy is the sum of weight * (d coordinate/dt)^2 / 2 [J]. For a body,
+    the coordinates of the mass centre have the mass as weight, and the angle has the
+    inertia. A subclass implements `coordinates` and `weights`.
     """
 
     @abstractmethod
     def coordinates(self, q: Array, linkage: Linkage) -> Array:
-        """Places and angles that follow from the joint positions, (n,)."""
+        """Computes places and angles from the joint positions, (n,)."""
 
     @abstractmethod
     def weights(self, linkage: Linkage) -> Array:
-        """Masses and inertias that go with them, (n,)."""
+        """Returns the masses and inertias of the coordinates, (n,)."""
 
     def potential_energy(self, q: Array, linkage: Linkage) -> Array:
-        """The potential energy, () [J]; 0 unless a subclass says otherwise."""
+        """Computes the potential energy, () [J]; 0 unless overridden."""
         return jnp.zeros(())
 
     def __call__(self, t: Array, q: Array, qd: Array, linkage: Linkage) -> Array:
-        """The efforts besides, (3,) [N or N m]; 0 unless a subclass says otherwise."""
+        """Computes further efforts, (3,) [N or N m]; 0 unless overridden."""
         return jnp.zeros(3)
 
     def loads(
         self, t: Array, q: Array, qd: Array, qdd: Array, linkage: Linkage
     ) -> tuple[Any, ...] | None:
-        """What it does to points of links, a tuple of `points.Load`.
+        """Returns the loads on points of links, a tuple of `points.Load`.
 
-        Only `joint_reactions` asks, which refuses elements that do not say: None.
+        Only `joint_reactions` calls it, and rejects elements that return None.
         """
         return None
 
 
 def jumps_of(*parts: Any) -> Array | None:
-    """The times at which any of these says that it jumps, if one does."""
+    """Returns all times at which the parts declare jumps, or None."""
     found = [getattr(part, "jump_ts", None) for part in parts]
     times = [jnp.asarray(jumps) for jumps in found if jumps is not None]
     return jnp.concatenate(times) if times else None

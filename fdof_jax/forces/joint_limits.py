@@ -1,4 +1,4 @@
-"""Ranges of motion and friction of joints: outside the paper's model."""
+"""Stops and friction of joints, which the paper's model does not have."""
 
 from typing import Any
 
@@ -15,10 +15,9 @@ from .element import ScalarElement
 class JointStops(ScalarElement):
     """Stops at the ends of the joints' ranges: stiff springs that push one way.
 
-    The force grows smoothly from nothing, and with the speed of the impact: it is
-    stiffness * p * (1 + damping * dp/dt) at a penetration p, never less than 0. The
-    penetration is rounded off, to a parabola, from `smoothing` before the end of the
-    range to as much behind it; at the end itself it is a quarter of that.
+    At a penetration p the force is stiffness * p * (1 + damping * dp/dt), and never
+    less than 0. Within `smoothing` of the end of the range, on both sides, p is rounded
+    off to a parabola; at the end itself p is a quarter of `smoothing`.
 
     **Arguments:** all in joint order, one per joint or one for all.
 
@@ -66,7 +65,7 @@ class JointStops(ScalarElement):
         self.smoothing = real_array("smoothing", smoothing, (3,), **positive)
 
     def possible(self) -> Array:
-        """Whether the ranges are not empty, and nothing is negative."""
+        """Returns whether ranges are not empty and values have the right sign."""
         ranges = (self.lower < self.upper) & (self.damping >= 0)
         return (ranges & (self.stiffness > 0) & (self.smoothing > 0)).all()
 
@@ -80,34 +79,34 @@ class JointStops(ScalarElement):
         )
 
     def potential_energy(self, q: Array, linkage: Linkage) -> Array:
-        """The energy of the springs [J]."""
+        """Computes the energy of the springs [J]."""
         below = _stored(self.lower - q, self.smoothing)
         above = _stored(q - self.upper, self.smoothing)
         return jnp.sum(self.stiffness * (below + above))
 
 
 def _push(depth, rate, stiffness, damping, width):
-    """Of a stop that is penetrated to a depth, negative outside of it."""
+    """Force of a stop at a depth, which is negative outside of the stop."""
     penetration, slope = _penetration(depth, width)
     return stiffness * penetration * jnp.maximum(1 + damping * slope * rate, 0)
 
 
 def _penetration(depth, width):
-    """The rounded depth and its derivative: 0 before the parabola, 1 behind it."""
+    """Rounded depth and its derivative, 0 before the parabola and 1 beyond it."""
     near, beyond = _parts(depth, width)
     return near**2 / (4 * width) + beyond, near / (2 * width)
 
 
 def _parts(depth, width):
-    """Of the way: within the parabola, from its begin, and behind it."""
-    # jnp.clip would multiply the derivative of a range without an end by 0.
+    """Splits the depth into the parts within the parabola and beyond it."""
+    # jnp.clip would multiply the derivative in an infinite end of a range by 0.
     deep = depth > width
     near = jnp.where(deep, 2 * width, jnp.where(depth < -width, 0, depth + width))
     return near, jnp.where(deep, depth - width, 0)
 
 
 def _stored(depth, width):
-    """The integral of the rounded depth."""
+    """Integral of the rounded depth."""
     near, beyond = _parts(depth, width)
     return near**3 / (12 * width) + beyond * (beyond / 2 + width)
 
@@ -115,8 +114,8 @@ def _stored(depth, width):
 class JointFriction(ScalarElement):
     """Coulomb friction of the joints, rounded off around standstill.
 
-    The effort is -level * tanh(qd / speed): joints creep under loads below the level,
-    at a fraction of `speed`. The smaller that is, the stiffer the equations.
+    The effort is -level * tanh(qd / speed). Under loads below the level, joints creep
+    at a fraction of `speed`. The smaller `speed`, the stiffer the equations.
 
     **Arguments:** one per joint or one for all.
 
@@ -139,7 +138,7 @@ class JointFriction(ScalarElement):
         self.speed = real_array("speed", speed, (3,), above=0, broadcast=True)
 
     def possible(self) -> Array:
-        """Whether levels are not negative, and speeds positive."""
+        """Returns whether levels are not negative and speeds positive."""
         return ((self.level >= 0) & (self.speed > 0)).all()
 
     def respond(self, scheduled, q, qd, linkage):

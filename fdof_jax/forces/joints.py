@@ -1,4 +1,4 @@
-"""Efforts in the joints themselves: damping, given efforts, and their history."""
+"""Efforts in the joints themselves: damping, constant efforts, histories."""
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,8 @@ from .element import ScalarElement
 class JointDamper(ScalarElement):
     """Viscous damping of the real joints, as in Fig 3: -coefficient * qd.
 
-    On the relative rate of a revolute joint, with the reaction on the preceding link.
+    At a revolute joint, `qd` is the relative rate, and the preceding link takes the
+    reaction.
 
     **Arguments:** `coefficient`: one for all joints or one per joint, not negative
     [N s/m or N m s/rad].
@@ -39,11 +40,11 @@ class JointDamper(ScalarElement):
         return tuple(-c * rate for c, rate in zip(self.coefficient, qd))
 
     def check(self, linkage: Linkage, ts: Array) -> None:
-        """The constructor's check again: `equinox.tree_at` asks no constructor."""
+        """Repeats the constructor's checks, which `equinox.tree_at` bypasses."""
         JointDamper(self.coefficient)
 
     def possible(self) -> Array:
-        """Whether the coefficients are not negative."""
+        """Returns whether the coefficients are not negative."""
         return (self.coefficient >= 0).all()
 
 
@@ -70,18 +71,18 @@ class JointEffort(ScalarElement):
         return tuple(self.tau)
 
     def check(self, linkage: Linkage, ts: Array) -> None:
-        """The constructor's check again: `equinox.tree_at` asks no constructor."""
+        """Repeats the constructor's checks, which `equinox.tree_at` bypasses."""
         JointEffort(self.tau)
 
 
 class EffortHistory(ScalarElement):
-    """Joint efforts given at times: linear between them, held before and after.
+    """Joint efforts given at times: linear in between, constant before and after.
 
-    Steps need not end at the times. Adaptive steps see the efforts where they look at
-    them, and their derivatives not at all: for gradients in `tau`, bound the steps to
-    the distance of two samples (`diffrax.PIDController(..., dtmax=...)`).
+    Steps need not end at the times. Adaptive steps sample the efforts only at their
+    stages, and do not control the error of derivatives. For gradients in `tau`, bound
+    the steps to the distance of two samples (`diffrax.PIDController(..., dtmax=...)`).
 
-    **Arguments:** `ts`: increasing times, one or more [s]; `tau`: the efforts at them,
+    **Arguments:** `ts`: increasing times, one or more [s]; `tau`: the efforts at `ts`,
     (time, 3) [N or N m].
 
     **Raises:** ValueError for malformed arguments.
@@ -104,7 +105,7 @@ class EffortHistory(ScalarElement):
         self.tau = real_array("tau", tau, (self.ts.size, 3))
 
     def schedule(self, t, linkage):
-        """The efforts."""
+        """Returns the efforts at a time."""
         columns = jax.vmap(lambda tau: jnp.interp(t, self.ts, tau), in_axes=1)(self.tau)
         return tuple(columns)
 
@@ -112,9 +113,9 @@ class EffortHistory(ScalarElement):
         return scheduled
 
     def check(self, linkage: Linkage, ts: Array) -> None:
-        """The constructor's check again: `equinox.tree_at` asks no constructor."""
+        """Repeats the constructor's checks, which `equinox.tree_at` bypasses."""
         EffortHistory(self.ts, self.tau)
 
     def possible(self) -> Array:
-        """Whether the times increase."""
+        """Returns whether the times increase."""
         return (self.ts[1:] > self.ts[:-1]).all()

@@ -1,6 +1,7 @@
-"""Points of links, and the efforts of loads on them.
+"""Points of links, and the joint efforts of loads on points.
 
-Written in scalars, which fuse with the equations of motion; vectors are complex.
+The code uses scalars, which fuse with the equations of motion, and complex numbers as
+vectors of the plane.
 """
 
 from abc import abstractmethod
@@ -36,7 +37,7 @@ class Frames(NamedTuple):
 
 
 def frames_of(linkage: Linkage, q: Scalars) -> Frames:
-    """The frames at joint positions."""
+    """Computes the frames at joint positions."""
     turning = real_joints(linkage.ef)
     angle, start = linkage.base_angle, [jnp.zeros((), complex)]
     direction = []
@@ -66,7 +67,7 @@ def cross(a: Array, b: Array) -> Array:
 
 
 def pick(link: Array, choices: list[Array]) -> Array:
-    """The one of the ground and three links."""
+    """Selects a link's value from those of the ground and the three links."""
     chosen = choices[0]
     for k in (1, 2, 3):
         chosen = jnp.where(link == k, choices[k], chosen)
@@ -79,9 +80,9 @@ class Point(eqx.Module):
     **Arguments:**
 
     - `link`: 0 is the ground, 1 to 3 are the moving links.
-    - `along`, `across`: place in the link's own frame, whose origin is its
-      characteristic point (the ground's is the ground pivot) and whose first axis is
-      its vector A (the ground's: the base angle) [m].
+    - `along`, `across`: coordinates in the link's own frame [m]. Its origin is the
+      link's characteristic point, or the ground pivot. Its first axis is the link's
+      vector A; the ground's first axis is at the base angle.
 
     **Raises:** ValueError for another link or malformed numbers.
 
@@ -106,12 +107,12 @@ class Point(eqx.Module):
         self.across = real_array("across", across, ())
 
     def position(self, linkage: Linkage, q: ArrayLike) -> Float[Array, " 2"]:
-        """Where it is: (x, y), from the ground pivot [m]."""
+        """Computes the point's position (x, y) from the ground pivot [m]."""
         place = self.place(frames_of(linkage, tuple(real_array("q", q, (3,)))))
         return jnp.stack([place.real, place.imag])
 
     def place(self, frames: Frames) -> Complex[Array, ""]:
-        """Where it is, x + iy [m]."""
+        """Computes the point's position x + iy [m]."""
         offset = jax.lax.complex(self.along, self.across)
         start, direction = (pick(self.link, rows) for rows in frames[:2])
         return start + offset * direction
@@ -128,9 +129,9 @@ class Load(NamedTuple):
     moment: Any = 0.0
 
     def efforts(self, frames: Frames) -> tuple[Array, ...]:
-        """The joint efforts that do the same work [N or N m].
+        """Computes the joint efforts that do the same work [N or N m].
 
-        A joint turns what lies beyond it, or slides it across the link before.
+        A joint moves only the links beyond it.
         """
         efforts = work(frames, self.point.place(frames), self.force, self.moment)
         return tuple(
@@ -142,7 +143,7 @@ class Load(NamedTuple):
 def work(
     frames: Frames, place: Array, force: Array, moment: Any = 0.0
 ) -> tuple[Array, ...]:
-    """Of a load beyond all joints, per unit of each joint's rate."""
+    """Power of a load beyond all joints, per unit of each joint's rate."""
     rows = zip(frames.turning, frames.start[1:], frames.direction)
     return tuple(
         jnp.where(turns, cross(place - pivot, force) + moment, cross(link, force))
@@ -153,8 +154,8 @@ def work(
 class PointElement(ScalarElement):
     """A force element that acts on points of links or of the ground.
 
-    A subclass implements `loads` [N and N m]. Unlike efforts in the joints, which pass
-    through them, these loads are carried by the bearings: see `joint_reactions`.
+    A subclass implements `loads` [N and N m]. The bearings carry these loads, unlike
+    efforts in the joints: see `joint_reactions`.
 
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig5().linkage
@@ -167,7 +168,7 @@ class PointElement(ScalarElement):
 
     @abstractmethod
     def loads(self, scheduled: Any, frames: Frames, qd: Scalars) -> tuple[Load, ...]:
-        """What it does to the points, given what `schedule` returned."""
+        """Returns the loads on points, given the result of `schedule`."""
 
     def respond(self, scheduled, q, qd, linkage):
         frames = frames_of(linkage, q)
@@ -176,7 +177,7 @@ class PointElement(ScalarElement):
 
 
 class Separation(eqx.Module):
-    """Two points, and the line between them."""
+    """Two points and the line between them."""
 
     a: Point
     b: Point
@@ -187,15 +188,15 @@ class Separation(eqx.Module):
         self.a, self.b = a, b
 
     def vector(self, frames: Frames) -> Complex[Array, ""]:
-        """From `a` to `b` [m]."""
+        """Returns the vector from `a` to `b` [m]."""
         return self.b.place(frames) - self.a.place(frames)
 
     def length(self, linkage: Linkage, q: Array) -> Array:
-        """Their distance [m]; its derivative is 0 where it is 0."""
+        """Computes the points' distance [m], with derivative 0 where they meet."""
         return length_of(self.vector(frames_of(linkage, tuple(q))))
 
     def slopes(self, frames: Frames, vector: Array) -> tuple[Array, ...]:
-        """Derivatives of half of the square of the length: of the length, times it."""
+        """Derivatives of length^2 / 2 in the joint positions."""
         works = work(frames, self.a.place(frames), vector)
         beyond = lambda k, point: jnp.where(k < point.link, 1, 0)
         return tuple(
@@ -205,12 +206,12 @@ class Separation(eqx.Module):
 
 
 def length_of(vector: Array) -> Array:
-    """Its length; 0 with derivative 0 if it has none."""
+    """Length of a vector; 0 with derivative 0 for the zero vector."""
     square = vector.real**2 + vector.imag**2
     apart = square > 0
     return jnp.where(apart, jnp.sqrt(jnp.where(apart, square, 1)), 0)
 
 
 def over(length: Array) -> Array:
-    """The reciprocal; 1 where points meet and have no line."""
+    """Reciprocal of a length; 1 where points meet and have no line."""
     return 1 / jnp.where(length > 0, length, 1)

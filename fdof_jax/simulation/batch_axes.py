@@ -1,4 +1,4 @@
-"""Which arrays of a linkage, a state and force elements carry a batch axis."""
+"""Finds the arrays of a linkage, a state and forces that carry a batch axis."""
 
 from typing import Any, NamedTuple
 
@@ -10,14 +10,14 @@ from ..forces.element import Forces
 from ..linkage.coordinates import State
 from ..linkage.linkage import Linkage
 
-# Dimensions of a single linkage's leaves: one more is a batch axis.
+# Dimensions of a single linkage's fields; one more is a batch axis.
 _LINKAGE_RANKS = dict(
     ef=1, length=1, com=2, mass=1, inertia=1, locked=1, base_angle=0, gravity=0
 )
 
 
 class Batch(NamedTuple):
-    """The members' inputs, and the axis that counts them per leaf (-1: shared)."""
+    """Inputs of all members, and each leaf's batch axis (-1: shared)."""
 
     inputs: tuple[Linkage, State, Forces]
     axes: Any
@@ -30,7 +30,7 @@ class Batch(NamedTuple):
 
 
 def _expanded(axis: Any, part: Any) -> Any:
-    """One axis per leaf of a part of the forces; what is no array has none."""
+    """Returns one axis per leaf of a part of the forces; -1 if it is no array."""
     if axis is not None and (type(axis) is not int or axis != 0):
         raise ValueError
     return jax.tree.map(
@@ -39,12 +39,12 @@ def _expanded(axis: Any, part: Any) -> Any:
 
 
 def _name(part: Any, *rest: Any) -> str:
-    """Of a leaf of the inputs, from its path."""
+    """Returns the name of a leaf of the inputs from its path."""
     return ("linkage", "state0", "forces")[part.idx] + jax.tree_util.keystr(rest)
 
 
 def batch_of(linkage: Linkage, state0: Any, forces: Forces, forces_axes: Any) -> Batch:
-    """The batch that these are, refused if their shapes are not those of one."""
+    """Returns the inputs as a batch; raises ValueError if their shapes do not fit."""
     linkage_axes = []
     for name, rank in _LINKAGE_RANKS.items():
         extra = getattr(linkage, name).ndim - rank

@@ -1,4 +1,4 @@
-"""A batch solved in chunks of members that take about as long."""
+"""Solves a batch in chunks of members that take about equally long."""
 
 import hashlib
 import os
@@ -25,13 +25,9 @@ from .solution import Solution
 from .step_wrappers import limited
 from .steps import default_controller
 
-_FIRST_LIMIT = 256  # steps, before anything is known
-
-
+_FIRST_LIMIT = 256  # limit of steps in the first chunk
 _SLACK = 2.0  # a member may take this many times the steps of most others
-
-
-_SMALL = 8  # lanes for the few that take more
+_SMALL = 8  # lanes of the chunks for a few slow members
 
 
 def floats_of(value: ArrayLike) -> Array:
@@ -40,7 +36,7 @@ def floats_of(value: ArrayLike) -> Array:
 
 
 def motion_of(settings: dict, ts: Array, moving: Any, shared: Any, limit: Array | None):
-    """One member's solution, without what all have in common."""
+    """Computes one member's solution, without the times that all share."""
     linkage, state0, forces = eqx.combine(moving, shared)
     controller = settings["stepsize_controller"]
     if limit is not None:
@@ -67,7 +63,7 @@ def _solve_chunk(settings, mesh, ts, moving, shared, limit):
 
     if mesh is not None:
         lanes, same = PartitionSpec("member"), PartitionSpec()
-        # Each device runs its own loop, until its own slowest member is done.
+        # Each device loops only until its own slowest member is done.
         run = jax.shard_map(
             run,
             mesh=mesh,
@@ -80,9 +76,9 @@ def _solve_chunk(settings, mesh, ts, moving, shared, limit):
 
 @eqx.filter_jit
 def expected_work(t0: Array, moving: Any, shared: Any) -> tuple[Array, Array]:
-    """Topology, and a rate that goes with the number of steps [1/s], per member.
+    """Computes each member's topology and a rate [1/s] that grows with its steps.
 
-    The rate is that of the joints now, and what their accelerations make of it.
+    The rate combines the joints' initial rates and accelerations.
     """
 
     def member(moving):
@@ -93,7 +89,7 @@ def expected_work(t0: Array, moving: Any, shared: Any) -> tuple[Array, Array]:
             if isinstance(element, StatefulElement):
                 state = element.initial_state(linkage)
             tau = tau + element_effort(index, element, t0, q, qd, linkage, state)[0]
-        # Turning makes work, sliding hardly any.
+        # Revolute joints cause most of the steps, slides hardly any.
         turning = jnp.stack(real_joints(linkage.ef))
         rate = jnp.where(turning, qd, 0)
         qdd = forward_dynamics(linkage, q, qd, tau, forces)
@@ -106,7 +102,7 @@ def expected_work(t0: Array, moving: Any, shared: Any) -> tuple[Array, Array]:
 
 
 class _Chunks:
-    """Solves chunks and keeps their results, in memory and, if asked, in a folder."""
+    """Solves chunks and keeps their results in memory and optionally in a folder."""
 
     def __init__(self, batch: Batch, ts: Array, settings: dict, folder: Path | None):
         moving, self.shared = batch.split()
@@ -122,7 +118,7 @@ class _Chunks:
         if folder is not None:
             folder.mkdir(parents=True, exist_ok=True)
             self.digest = hashlib.sha256(repr((settings, batch.axes)).encode())
-            # The representation of settings leaves out the values of arrays.
+            # The repr of the settings leaves out the values of arrays.
             arrays = eqx.filter(settings, eqx.is_array)
             for leaf in jax.tree.leaves((batch.inputs, ts, arrays)):
                 leaf = np.asarray(leaf)
@@ -130,7 +126,7 @@ class _Chunks:
                 self.digest.update(leaf.tobytes())
 
     def solve(self, members: np.ndarray, lanes: int, limit: int) -> np.ndarray:
-        """Solve these members, at most `lanes` per device. Their numbers of steps."""
+        """Solves members, at most `lanes` per device; returns their step counts."""
         padded = np.full(lanes * self.devices, members[0])
         padded[: len(members)] = members
         moving = jax.tree.unflatten(
@@ -138,7 +134,7 @@ class _Chunks:
         )
         path = None
         if self.folder is not None:
-            # Chunks of another size hold other members.
+            # Another chunk size groups other members.
             digest = self.digest.copy()
             digest.update(repr((members.tolist(), limit)).encode())
             path = self.folder / f"{digest.hexdigest()[:32]}.npz"
@@ -175,7 +171,7 @@ class _Chunks:
     def _place(self, rows: np.ndarray) -> np.ndarray | Array:
         if jax.process_count() == 1:
             return rows
-        assert self.mesh is not None  # as there are several processes
+        assert self.mesh is not None  # several processes have several devices
         sharding = NamedSharding(self.mesh, PartitionSpec("member"))
         return jax.make_array_from_callback(rows.shape, sharding, lambda i: rows[i])
 
@@ -198,7 +194,7 @@ def in_chunks(
     waiting = np.lexsort((work, topology))  # NaN comes last
     chunks = _Chunks(batch, ts, settings, folder)
     max_steps = settings["max_steps"] or np.iinfo(np.int32).max
-    # Small batches are cut too, so that a slow member holds up few others.
+    # Small batches are cut too, so that a slow member delays few others.
     share = -(-batch.size // (8 * chunks.devices))
     lanes, limit = min(chunk, max(share, 8 * _SMALL)), _FIRST_LIMIT
     done, progress = 0, meter.init()
@@ -208,13 +204,13 @@ def in_chunks(
             members = waiting[start : start + lanes * chunks.devices]
             while True:
                 limit = min(limit, max_steps)
-                # At the end diffrax's own limit, which spares who ends at that step.
+                # At max_steps diffrax's own limit lets the last step finish.
                 own = limit if limit < max_steps else np.iinfo(np.int32).max
                 steps = chunks.solve(members, lanes, int(own))
                 out_of_steps = (steps >= limit) & (limit < max_steps)
                 if out_of_steps.sum() <= len(members) // 2:
                     break
-                limit *= 4  # it was too low for most
+                limit *= 4  # too low for most members
             late.append(members[out_of_steps])
             done += len(members) - out_of_steps.sum()
             progress = meter.step(progress, jnp.asarray(done / batch.size))

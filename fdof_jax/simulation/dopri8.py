@@ -1,7 +1,7 @@
-"""Dormand and Prince's method of order 8(7): what its two solvers have in common.
+"""Dormand and Prince's method of order 8(7): the common parts of its two solvers.
 
-`LoopedDopri8` compiles sooner and `UnrolledDopri8` runs faster in large batches. Both
-are `diffrax.Dopri8` to rounding.
+`LoopedDopri8` compiles faster and `UnrolledDopri8` runs faster in large batches. Both
+agree with `diffrax.Dopri8` up to rounding.
 """
 
 from abc import abstractmethod
@@ -19,9 +19,9 @@ from jaxtyping import PyTree
 
 TABLEAU = diffrax.Dopri8.tableau
 STAGES = len(TABLEAU.b_sol)
-# Rates that are not finite even after so short a step [s] do not lack accuracy.
+# Below this step size [s], rates that are not finite are not due to inaccuracy.
 SHORTEST = {np.dtype("float64"): 1e-10, np.dtype("float32"): 1e-6}
-# Row i gives the increment before stage i + 1; the last is the step itself.
+# Row i gives the increment before stage i + 1; the last row gives the whole step.
 LOWER = np.zeros((STAGES - 1, STAGES))
 for _row, _entries in enumerate(TABLEAU.a_lower):
     LOWER[_row, : len(_entries)] = _entries
@@ -31,13 +31,13 @@ DENSE = _INTERPOLATION.eval_coeffs  # (stage, power), highest first
 
 
 class ScheduledTerm(diffrax.ODETerm):
-    """A term whose vector field takes a fourth argument: what depends on time alone.
+    """A term whose vector field takes a fourth argument, which depends on time alone.
 
-    `schedule(t, args)` returns it. The solver calls it for all stages of a step at
-    once, where the vector field would call it at each. `health(t, y, args)` says
-    whether the equations have a solution: positive, or 0 where they are singular.
-    `watched_field` takes the same as the vector field and returns the rates and their
-    health, NaN where the rates are not finite. Only `UnrolledDopri8` needs it.
+    `schedule(t, args)` computes this argument, for all stages of a step at once.
+    `health(t, y, args)` is positive where the equations have a solution and 0 where
+    they are singular. `watched_field` takes the arguments of the vector field and
+    returns the rates and their health, NaN where the rates are not finite. Only
+    `UnrolledDopri8` needs `watched_field`.
     """
 
     vector_field: Callable[..., PyTree] = eqx.field(static=True)
@@ -50,7 +50,7 @@ class ScheduledTerm(diffrax.ODETerm):
 
 
 def interpolation_weights(theta: Array) -> Array:
-    """The weights (stage,) of the rates at a share `theta` of a step: its change."""
+    """Weights (stage,) of the rates in the change over a fraction `theta` of a step."""
     weights = jnp.zeros(STAGES, theta.dtype)
     for coefficients in DENSE.T:  # Horner's rule for all stages at once
         weights = (weights + coefficients) * theta
@@ -58,7 +58,7 @@ def interpolation_weights(theta: Array) -> Array:
 
 
 class DenseOutput(diffrax.AbstractLocalInterpolation):
-    """diffrax's dense output for this method; a subclass adds up the rates."""
+    """Dense output as in diffrax; a subclass sums the weighted rates."""
 
     t0: Any  # pyright: ignore[reportIncompatibleVariableOverride]
     t1: Any  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -68,7 +68,7 @@ class DenseOutput(diffrax.AbstractLocalInterpolation):
 
     @abstractmethod
     def at(self, theta: Array) -> PyTree:
-        """The state at a share `theta` of the step."""
+        """Returns the state at a fraction `theta` of the step."""
 
     def evaluate(self, t0, t1=None, left=True):
         del left
@@ -81,17 +81,17 @@ class DenseOutput(diffrax.AbstractLocalInterpolation):
 
 
 def constant(tree: PyTree) -> PyTree:
-    """The tree, whose arrays derivatives take for constants."""
+    """Returns the tree with its arrays constant for derivatives."""
     return jtu.tree_map(
         lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, tree
     )
 
 
 def verdict(singular: Array, bad: Array, h: Any) -> tuple[Array, Any]:
-    """What a step in bad health is given for an error, and the step's result.
+    """Returns the error to impose on a step in bad health, and the step's result.
 
-    Such a step is rejected until it is short. The result of a rejected one would not
-    count, so the last one is kept.
+    An infinite error rejects the step until it is short. diffrax ignores the results of
+    rejected steps, so the short step is accepted, with error 0.
     """
     short = jnp.abs(h) < SHORTEST[h.dtype]
     results: Any = diffrax.RESULTS

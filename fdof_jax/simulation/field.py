@@ -1,4 +1,4 @@
-"""The vector field of a linkage with force elements: what integrators take."""
+"""The vector field of a linkage with force elements, as integrators call it."""
 
 from typing import Any, NamedTuple
 
@@ -16,8 +16,8 @@ from ..mechanics.rates import conditioning, rates, rates_and_conditioning
 from ..mechanics.solve import Added
 from ..xla.callbacks import with_checks
 
-# With inertia ratios below this the accelerations are right to six digits (float64) or
-# two at best, and adaptive steps are chosen by rounding.
+# Below this inertia ratio the accelerations have six correct digits at best (float64)
+# or two (float32), and rounding determines the adaptive steps.
 LEAST_INERTIA_RATIO = {np.dtype("float64"): 1e-9, np.dtype("float32"): 1e-5}
 
 
@@ -30,7 +30,7 @@ class Args(NamedTuple):
 
 @with_checks
 def schedule_of(t: Array, args: Args) -> tuple[Any, ...]:
-    """What the force elements take from time alone, or the time."""
+    """Returns each element's schedule, or the time for elements without one."""
     return tuple(
         element.schedule(t, args.linkage) if isinstance(element, ScalarElement) else t
         for element in args.forces
@@ -38,12 +38,12 @@ def schedule_of(t: Array, args: Args) -> tuple[Any, ...]:
 
 
 def stateful(forces: Forces) -> list[StatefulElement]:
-    """Those of the elements that have a state of their own."""
+    """Returns the elements that have a state of their own."""
     return [element for element in forces if isinstance(element, StatefulElement)]
 
 
 def own_states(args: Args, scalars: tuple[Array, ...]) -> list[Any]:
-    """The states of the stateful elements, of the scalars that are integrated."""
+    """Rebuilds the states of the stateful elements from the integrated scalars."""
     states, place = [], 0
     for element in stateful(args.forces):
         shapes = jax.eval_shape(element.initial_state, args.linkage)
@@ -63,7 +63,7 @@ def _scalars(tree: Any, dtype: Any) -> tuple[Array, ...]:
 
 
 class Applied(NamedTuple):
-    """What the force elements do: efforts, rates of their own states, inertia."""
+    """Efforts of the force elements, rates of their states, and inertia they add."""
 
     tau: tuple[Array, ...]
     own_rates: tuple[Array, ...]
@@ -72,7 +72,7 @@ class Applied(NamedTuple):
 
 @with_checks
 def applied(t: Any, y: Any, args: Args, schedule: tuple[Any, ...]) -> Applied:
-    """Arrays are made only for elements that are written in them."""
+    """Evaluates the force elements; builds arrays only where an element needs them."""
     delta, qd, *own = y
     states = iter(own_states(args, *own) if own else ())
     tau, own_rates = None, []
@@ -100,7 +100,7 @@ _added: Any = eqx.filter_jit(added_inertia)  # traced once, not at each use by a
 
 
 def vector_field(t, y, args, schedule) -> tuple[Any, ...]:
-    """Rates of six scalars and the elements' own; positions are displacements."""
+    """Rates of joint displacements, of velocities and of the elements' own states."""
     delta, qd, *own = y
     acting = applied(t, y, args, schedule)
     moving = rates(args.constants, delta, qd, acting.tau, acting.added)
@@ -108,7 +108,7 @@ def vector_field(t, y, args, schedule) -> tuple[Any, ...]:
 
 
 def watched_field(t, y, args, schedule) -> tuple[tuple[Any, ...], Array]:
-    """The same, and the health of the accelerations: see `ScheduledTerm`."""
+    """Rates of `vector_field` and their health, which `ScheduledTerm` defines."""
     delta, qd, *own = y
     acting = applied(t, y, args, schedule)
     (qd, qdd), loss = rates_and_conditioning(
@@ -116,13 +116,13 @@ def watched_field(t, y, args, schedule) -> tuple[tuple[Any, ...], Array]:
     )
     finite = jnp.isfinite(qdd[0] + qdd[1] + qdd[2] + sum(acting.own_rates))
     health = jnp.where(loss * LEAST_INERTIA_RATIO[loss.dtype] > 1, 0, loss)
-    # A singular matrix makes accelerations that are not finite.
+    # A singular matrix also makes accelerations not finite; health 0 prevails.
     health = jnp.where(finite | (health == 0), health, jnp.nan)
     return ((qd, qdd, acting.own_rates) if own else (qd, qdd)), health
 
 
 def health_of(t, y, args) -> Array:
-    """The health of the equations alone: positive, or 0 where they are singular."""
+    """Health of the equations: positive, or 0 where they are singular."""
     delta, *_ = y
     added = None
     if inertial(args.forces):
@@ -143,9 +143,9 @@ def element_effort(
     linkage: Linkage,
     state: Any = None,
 ) -> tuple[Array, Any]:
-    """What one force element returns, refused unless it is three real numbers.
+    """Returns an element's effort and the rate of its state, None without a state.
 
-    And the rate of its state, None for an element without one.
+    Raises ValueError unless the effort is three real numbers.
     """
     expected = f"forces[{index}]: expected it to return tau, an array of 3 real numbers"
     if isinstance(element, StatefulElement):
@@ -170,7 +170,7 @@ def element_effort(
 
 
 def initial_own(args: Args, own0: Any = None) -> tuple[tuple[Array, ...], ...]:
-    """The elements' own states at the start, given or theirs, where there are any."""
+    """Returns the elements' initial states as scalars: `own0`, or their defaults."""
     if own0 is None:
         own0 = [e.initial_state(args.linkage) for e in stateful(args.forces)]
     return (_scalars(own0, args.q0.dtype),) if own0 else ()

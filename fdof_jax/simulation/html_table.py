@@ -5,7 +5,7 @@ from html import escape
 
 
 def html_table(rows: Iterable[Iterable[str]], header: Iterable[str] = ()) -> str:
-    """An HTML table; the first cell of a row says what the others are."""
+    """Returns an HTML table; the first cell of each row is its heading."""
     head = "".join(f"<th>{escape(cell)}</th>" for cell in header)
     body = ""
     for first, *cells in rows:

@@ -1,4 +1,4 @@
-"""The vector field of a linkage with force elements, integrated by diffrax."""
+"""Integrates the equations of motion with diffrax."""
 
 import inspect
 from typing import Any
@@ -40,17 +40,17 @@ from .step_wrappers import Watched, bounded, landing_on, undifferentiated
 from .steps import default_controller
 from .unrolled_dopri8 import UnrolledDopri8
 
-# Steps over the time scale of a mode that keep its tangents to 1e-7 over 10 s: those of
-# methods of order 8, and of lower ones down to 5.
+# Longest steps, over the time scale of a mode, that keep its tangents right to 1e-7
+# over 10 s: for methods of order 8, and for lower orders down to 5.
 _OF_TIME_SCALE = 0.7, 0.1
 
 
 def _step_for_tangents(t0: Array, args: Args, own: tuple, fraction: float) -> Array:
-    """A step short enough for derivatives [s], where the motion would allow more.
+    """Returns a longest step size [s] that keeps derivatives accurate.
 
-    A fraction of the time scale 1/omega of the fastest mode about the start: a step's
-    length is chosen by the error of the motion alone, and an arm that hangs at rest has
-    none. The trace of the squared linearisation bounds omega^2 free of units.
+    Adaptive steps control the error of the motion alone, which is zero for an arm that
+    hangs at rest. The bound is a fraction of the time scale 1/omega of the fastest mode
+    about the start. The trace of the squared linearisation bounds omega^2 in any units.
     """
     still = zeros(args.q0)
     scheduled = schedule_of(t0, args)
@@ -66,14 +66,14 @@ def _step_for_tangents(t0: Array, args: Args, own: tuple, fraction: float) -> Ar
 
 
 def _batch_solver(forces: Forces) -> diffrax.AbstractSolver:
-    """What solves large batches fastest."""
-    # Thirteen copies of such equations take minutes to compile.
+    """Returns the fastest solver for large batches."""
+    # Thirteen unrolled copies of these equations would take minutes to compile.
     many = inertial(forces) or prescribed(forces)
     return diffrax.Dopri8() if many else UnrolledDopri8()
 
 
 def _tangent_solver(forces: Forces) -> diffrax.AbstractSolver:
-    """What solves fastest with derivatives in forward mode."""
+    """Returns the fastest solver for forward-mode derivatives."""
     many = inertial(forces) or prescribed(forces)
     if many or small_loops_are_kernels():
         return LoopedDopri8()
@@ -83,13 +83,15 @@ def _tangent_solver(forces: Forces) -> diffrax.AbstractSolver:
 def _integrate(
     solver, inputs, keywords, derivatives: bool = False, padded: bool = False
 ) -> Solution:
-    """`derivatives`: whether they are wanted, to the accuracy of the default steps.
+    """Integrates one motion.
 
-    `padded`: whether the last time stands there more than once.
+    `derivatives`: whether to bound the steps so that derivatives are accurate too.
+    `padded`: whether the last time may be repeated.
     """
     linkage, state0, asked, own0, forces = inputs
-    # What no door has seen is told by the result. Something harmless is integrated in
-    # its place: derivatives of NaN would spoil those in what is shared with others.
+    # Traced values were not checked before, so the result reports invalid ones. They
+    # are replaced by harmless values, because derivatives of NaN would spoil those of
+    # arrays that other lanes share.
     growth = jnp.diff(asked)
     increasing = ((growth >= 0) if padded else (growth > 0)).all()
     harmless = 1e-3 * jnp.arange(len(asked), dtype=asked.dtype)
@@ -103,7 +105,7 @@ def _integrate(
     if motion is not None:
         valid = valid & motion.agrees(ts[0], jnp.asarray(state0.q), linkage)
     q0, qd0 = (jnp.where(finite, a, 0) for a in state0)
-    # Once per solve: the start may be any number of turns away.
+    # XLA's own sine and cosine, once per solve, as start angles may be large.
     constants = link_constants(linkage, q0, lambda x: (jnp.sin(x), jnp.cos(x)))
     args = Args(linkage, q0, constants, forces)
     own = initial_own(args, own0)
@@ -117,7 +119,7 @@ def _integrate(
         term = ScheduledTerm(hybrid_field, schedule_of, health_of_hybrid)
         start = start_of(motion, args, qd0)
     controller = keywords["stepsize_controller"]
-    # Stiff modes, which implicit solvers are taken for, would make the steps too short.
+    # Implicit solvers are chosen for stiff modes, which would bound steps too tightly.
     implicit = isinstance(solver, diffrax.AbstractImplicitSolver)
     trusted = controller is not None and implicit
     if controller is None:
@@ -159,15 +161,15 @@ def _integrate(
         q, qd = jax.vmap(lambda t, y: motion_at(motion, args, t, y))(ts, states[:2])
 
     def shown(a):
-        """NaN where diffrax has not come to save: it leaves infinity."""
+        """Replaces the infinity that diffrax leaves at times not reached by NaN."""
         return jnp.where(jnp.isinf(a) | ~valid, jnp.nan, a)
 
-    # diffrax saves the start with the first step.
+    # diffrax saves the start only with the first step.
     q, qd = shown(q).at[0].set(state0.q), shown(qd).at[0].set(state0.qd)
     own_states_shown = tuple(jax.tree.map(shown, own_rows[0])) if own_rows else ()
     reached = jnp.where(valid, reached, asked[0])
     results: Any = diffrax.RESULTS
-    # Steps of constant size, too long for instance, end with NaN as their success.
+    # Constant steps, if too long, end in NaN and still report success.
     lost = ~(jnp.isfinite(q[-1]) & jnp.isfinite(qd[-1])).all()
     lost = lost & (solution.result == results.successful)
     result = results.where(valid & ~lost, solution.result, results.nonfinite)
@@ -177,12 +179,12 @@ def _integrate(
 
 @eqx.filter_custom_vjp
 def _integrate_reversibly(inputs, solver, keywords) -> Solution:
-    """A motion whose derivatives are taken in reverse mode, if any are.
+    """Integrates a motion that may be differentiated in reverse mode.
 
-    The default solver's unrolled stages are not for that: they are compiled differently
-    with derivatives and without, and a replay has to come to the same bits.
+    Unrolled stages compile differently with and without derivatives, and the replay of
+    the backward pass must reproduce the same bits: they serve the plain solve alone.
     """
-    # Nothing is differentiated here, and loops made for that take longer to compile.
+    # The plain solve needs no loops for reverse mode, which take longer to compile.
     keywords = keywords | {"adjoint": diffrax.ForwardMode()}
     return _integrate(solver or _batch_solver(inputs[-1]), inputs, keywords)
 
@@ -216,7 +218,7 @@ def _integrate_reversibly_bwd(
 
 
 def _opened(inputs):
-    """The inputs, with what plain functions among the forces close over as leaves."""
+    """Returns the inputs, with the closures of plain functions as leaves."""
     linkage, state0, ts, own0, forces = inputs
     arguments = ts[0], *state0, linkage
     opened = tuple(
@@ -230,7 +232,7 @@ def _opened(inputs):
 
 @eqx.filter_jit
 def solve(solver, inputs, keywords) -> Solution:
-    """The motion, by a program for traced values: of a batch or of a derivative."""
+    """Computes the motion for traced inputs: a batch, or with derivatives."""
     adjoint = keywords["adjoint"]
     if isinstance(adjoint, diffrax.RecursiveCheckpointAdjoint):
         return _integrate_reversibly(_opened(inputs), solver, keywords)
@@ -240,16 +242,15 @@ def solve(solver, inputs, keywords) -> Solution:
     return _integrate(solver, inputs, keywords, derivatives=True)
 
 
-# Fewer output times than this share a program.
+# All calls with at most this many output times share one program.
 _FEWEST_TIMES = 512
 
 
 def solve_one(solver, inputs, keywords) -> tuple[Solution, bool] | None:
-    """The motion of one arm and whether it succeeded, by a short program.
+    """Computes the motion of one arm from concrete inputs, and whether it succeeded.
 
-    Other numbers of output times need no other program: they are filled up with the
-    last one to a power of two. For known values only: None if a force element turns
-    out to hold a traced one.
+    Output times are padded with the last one to a power of two, so that few programs
+    serve all numbers of them. Returns None if a force element holds a traced value.
     """
     linkage, state0, ts, own0, forces = inputs
     times = np.asarray(ts)
@@ -263,7 +264,7 @@ def solve_one(solver, inputs, keywords) -> tuple[Solution, bool] | None:
         return None
 
     def cut(rows: Array) -> Array:
-        # Slices by JAX are compiled, as is jnp.asarray for each new shape.
+        # JAX slices and jnp.asarray would compile a program for each new shape.
         return jax.device_put(np.asarray(rows)[:count])
 
     q, qd, own = cut(solution.q), cut(solution.qd), jax.tree.map(cut, solution.own)
@@ -273,7 +274,7 @@ def solve_one(solver, inputs, keywords) -> tuple[Solution, bool] | None:
 
 @eqx.filter_jit
 def _solve_padded(solver, inputs, keywords) -> tuple[Solution, Array]:
-    # Steps are bounded as they would be with derivatives of this kind.
+    # The steps are those of the same call with forward-mode derivatives.
     derivatives = isinstance(keywords["adjoint"], diffrax.ForwardMode)
     keywords = keywords | {"adjoint": diffrax.ForwardMode()}
     solver = LoopedDopri8() if solver is None else solver

@@ -1,9 +1,9 @@
 """Dormand-Prince 8(7) with a loop over its stages: one copy of the equations.
 
 Where XLA compiles the loop as one kernel, a single arm is solved about as fast as with
-unrolled stages, after less than half the time of compilation. diffrax's own Dopri8 is
-such a loop too. This one is compiled a tenth sooner, and its derivatives in two thirds
-of the time: it is traced once and does without what other methods need.
+unrolled stages, at less than half the compile time. diffrax's own Dopri8 is such a loop
+too. This solver compiles a tenth faster, and its derivatives in two thirds of the time:
+it is traced once and leaves out what only other methods need.
 """
 
 from typing import Any, ClassVar, NamedTuple
@@ -30,15 +30,15 @@ from .dopri8 import (
 
 
 def _weighted(weights: Array, rates: PyTree) -> PyTree:
-    """The sum of the rates at all stages, each times its weight."""
-    # XLA would call a library for products of matrices: too much for so small ones.
+    """Sums the rates of all stages, each times its weight."""
+    # For a matrix product XLA would call a library, which costs more at this size.
     return jtu.tree_map(lambda k: jnp.sum(weights * k), rates)
 
 
 class _Step(NamedTuple):
-    """The end of a step and its error; the rates at all stages; its health.
+    """The end of a step, its error and health, and the rates of all stages.
 
-    `lost` is what the rounding of `y` took away. The next step adds it (Kahan).
+    `lost` is the rounding error of `y`, which the next step adds (Kahan).
     """
 
     y: PyTree
@@ -48,12 +48,12 @@ class _Step(NamedTuple):
     health: Array
 
 
-# In reverse mode steps are replayed, by the very code that took them: next to a
-# saturation another rounding leads to other steps, and to a wrong gradient.
-@eqx.filter_jit  # traced once, not at each of a solve's uses of it
+# Reverse mode replays steps with the very code that took them: near a saturation,
+# different rounding leads to different steps and to a wrong gradient.
+@eqx.filter_jit  # traced once, not at each use in a solve
 @eqx.filter_checkpoint
 def _step(term: Any, t0, t1, y0, lost, args, f0) -> tuple[_Step, Array]:
-    # diffrax wraps the term, to integrate backward in time too.
+    # diffrax wraps the term to integrate backward in time too.
     inner, h = term.term, term.contr(t0, t1)
     times = (t0 + (t1 - t0) * jnp.asarray(NODES, t0.dtype)) * term.direction
     schedule = jax.vmap(inner.schedule, in_axes=(0, None))(times[1:], args)
@@ -73,10 +73,10 @@ def _step(term: Any, t0, t1, y0, lost, args, f0) -> tuple[_Step, Array]:
     lost = jtu.tree_map(lambda a, b, c: c - (b - a), y0, y, change)
     weights = jnp.asarray(TABLEAU.b_error, h.dtype)
     error = jtu.tree_map(lambda k: h * k, _weighted(weights, rates))
-    # An infinity beside a NaN would get past diffrax, and leave no step length.
+    # diffrax overlooks an infinity beside a NaN and finds no next step size.
     last = jtu.tree_map(lambda k: k[-1], rates)
     finite = jnp.isfinite(sum(jtu.tree_leaves((y, last))))
-    # Where a step led nowhere its start tells why.
+    # If the end is not finite, the health at the start shows why.
     judged = jtu.tree_map(lambda a, b: jnp.where(finite, a, b), y, y0)
     health = inner.health(times[-1], *constant((judged, args)))
     health = jnp.where(finite | (health == 0), health, jnp.nan)
@@ -92,7 +92,7 @@ class _Interpolation(DenseOutput):
 
 
 class LoopedDopri8(diffrax.AbstractAdaptiveSolver):
-    """The method of `diffrax.Dopri8`, equal to rounding, for a single arm."""
+    """The method of `diffrax.Dopri8` up to rounding, for a single arm."""
 
     term_structure: ClassVar = ScheduledTerm
     interpolation_cls: ClassVar = _Interpolation
@@ -104,7 +104,7 @@ class LoopedDopri8(diffrax.AbstractAdaptiveSolver):
         return self.func(terms, t0, y0, args), jtu.tree_map(jnp.zeros_like, y0)
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        # A jump has changed the rates at the start of the step.
+        # After a jump the stored rates are outdated.
         f0, lost = solver_state
         if made_jump is not False:
             fresh = self.func(terms, t0, y0, args)

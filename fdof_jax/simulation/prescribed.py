@@ -1,7 +1,7 @@
-"""Hybrid dynamics: some joints move as prescribed, the others as they are driven.
+"""Hybrid dynamics: some joints follow a prescribed motion, the others are driven.
 
-The state has the momenta of the driven joints in place of their velocities: they stay
-as they are where a prescribed velocity jumps.
+The state holds the momenta of the driven joints instead of their velocities, because
+momenta are continuous where a prescribed velocity jumps.
 """
 
 from typing import Any
@@ -31,20 +31,19 @@ from .field import LEAST_INERTIA_RATIO, Args, applied
 class PrescribedMotion(eqx.Module):
     """Joints that follow a reference exactly, whatever effort that takes.
 
-    At a jump of the reference's velocity the velocities of the other joints jump too,
-    as the impulse demands. `joint_efforts` returns the effort [N or N m], but for such
-    impulses.
+    Where the reference's velocity jumps, an impulse makes the velocities of the other
+    joints jump too. `joint_efforts` returns the effort [N or N m] without impulses.
 
-    The velocities of a `state0` are those before the first time: where they are not the
-    reference's, the motion starts with a blow. Adaptive steps look at the displacements
-    of the other joints and at their momenta.
+    The velocities of `state0` are those before the first time. If they differ from the
+    reference's, the motion starts with an impulse. Adaptive steps control the errors of
+    the other joints' displacements and momenta.
 
     **Arguments:**
 
-    - `joints`: numbers of the joints that it moves, of 1 to 3; one, or a tuple.
-    - `reference`: `(t, linkage) -> (q, qd)`, as for a `PDController`; what it says of
-      other joints does not count. Its positions must be continuous, and at the start of
-      a simulation those of `state0`; its velocities must be their rates.
+    - `joints`: the number of a prescribed joint, 1 to 3, or a tuple of such numbers.
+    - `reference`: `(t, linkage) -> (q, qd)`, as for a `PDController`; values for other
+      joints are ignored. The positions must be continuous and equal those of `state0`
+      at the start of a simulation; the velocities must be their rates.
 
     **Raises:** ValueError for malformed arguments.
     """
@@ -67,34 +66,34 @@ class PrescribedMotion(eqx.Module):
 
     @with_checks
     def at(self, t: Array, linkage: Linkage) -> tuple[Array, Array]:
-        """Positions and velocities of the reference at a time, checked."""
+        """Returns the checked positions and velocities of the reference at a time."""
         return reference_motion(self.reference, t, linkage)
 
     def agrees(self, t: Array, q: Array, linkage: Linkage) -> Array:
-        """Whether joint positions are those of the reference, to one in a million."""
+        """Returns whether prescribed joints are at the reference, to 1 in a million."""
         begin = positions_at(self.reference, t, linkage)
         q, moved = in_numpy((q, self.moved))
         near = abs(q - begin) <= 1e-6 * (1 + abs(begin))
         return (near | ~moved).all()
 
     def __call__(self, t: Array, q: Array, qd: Array, linkage: Linkage) -> Array:
-        """Nothing: what it takes depends on all other elements."""
+        """Returns zero efforts: the real ones depend on all other elements."""
         return jnp.zeros(3)
 
     @property
     def jump_ts(self) -> Array | None:
-        """The times at which the reference says that it jumps, if it does."""
+        """Times at which the reference jumps, if it declares any."""
         return getattr(self.reference, "jump_ts", None)
 
     def check(self, linkage: Linkage, ts: Array) -> None:
-        """The reference's own check, if it has one."""
+        """Runs the reference's own check, if it has one."""
         check_reference: Any = getattr(self.reference, "check", None)
         if check_reference is not None:
             check_reference(linkage, ts)
 
 
 def prescribed(forces: Forces) -> PrescribedMotion | None:
-    """The one among the elements that prescribes a motion, if there is one."""
+    """Returns the `PrescribedMotion` among the elements, or None."""
     found = [e for e in forces if isinstance(e, PrescribedMotion)]
     if len(found) > 1:
         raise ValueError(
@@ -109,7 +108,7 @@ def _mass_and_bias(args: Args, q: Array, qd: Array) -> tuple[Array, Array]:
 
 
 def _split(moved: Array, matrix: Array, known: Array, right: Array) -> Array:
-    """What solves the rows of the driven joints, the prescribed ones being known."""
+    """Solves the rows of the driven joints, given those of the prescribed ones."""
     free = jnp.where(jnp.outer(~moved, ~moved), matrix, jnp.eye(3))
     known = jnp.where(moved, known, 0)
     return jnp.linalg.solve(free, jnp.where(moved, known, right - matrix @ known))
@@ -118,7 +117,7 @@ def _split(moved: Array, matrix: Array, known: Array, right: Array) -> Array:
 def motion_at(
     motion: PrescribedMotion, args: Args, t: Any, y: Any
 ) -> tuple[Array, Array]:
-    """Joint positions and velocities of a state of displacements and momenta."""
+    """Joint positions and velocities at a state of displacements and momenta."""
     delta, momenta, *_ = y
     position, velocity = motion.at(t, args.linkage)
     q = jnp.where(motion.moved, position, args.q0 + jnp.stack(delta))
@@ -133,16 +132,16 @@ def start_of(motion: PrescribedMotion, args: Args, qd: Array) -> tuple[Any, Any]
 
 
 def hybrid_field(t, y, args, schedule) -> tuple[Any, ...]:
-    """Rates of displacements and momenta: those of prescribed joints stand still.
+    """Rates of displacements and momenta, 0 at prescribed joints.
 
-    The momenta change by M' qd - bias + tau, where M' is the mass matrix's own rate.
+    The rate of the momenta is M' qd - bias + tau, where M' is the mass matrix's rate.
     """
     motion = prescribed(args.forces)
-    assert motion is not None  # or this were not the field
+    assert motion is not None  # `integrate` chose this field for it
     own = y[2:]
     q, qd = motion_at(motion, args, t, y)
     acting = applied(t, (tuple(q - args.q0), tuple(qd), *own), args, schedule)
-    # The bias of masses that elements move is in the efforts already.
+    # The efforts already include the bias of masses that elements move.
     bias = jnp.stack(equations(args.constants, tuple(q - args.q0), tuple(qd)).bias)
     momenta = lambda q: _mass_and_bias(args, q, jnp.zeros(3))[0] @ qd
     _, change = jax.jvp(momenta, (q,), (qd,))
@@ -152,7 +151,7 @@ def hybrid_field(t, y, args, schedule) -> tuple[Any, ...]:
 
 
 def health_of_hybrid(t, y, args) -> Array:
-    """The health of the driven joints' equations: see `vector_field.health_of`."""
+    """Health of the driven joints' equations, as in `field.health_of`."""
     motion = prescribed(args.forces)
     assert motion is not None
     q, _ = motion_at(motion, args, t, y)
@@ -165,7 +164,7 @@ def health_of_hybrid(t, y, args) -> Array:
 def prescribed_effort(
     linkage: Linkage, forces: Forces, t: Array, q: Array, qd: Array, tau: Array
 ) -> Float[Array, " joint"]:
-    """What the prescribed motion takes, the other elements' efforts being `tau`."""
+    """Computes the effort of the prescribed motion beside other efforts `tau`."""
     motion = prescribed(forces)
     assert motion is not None
     matrix, bias = mass_and_bias(linkage, forces, q, qd)

@@ -1,4 +1,4 @@
-"""Control in discrete time: efforts that are held from one sample to the next."""
+"""Control in discrete time, with efforts held constant between samples."""
 
 from typing import Any, NamedTuple
 
@@ -20,7 +20,7 @@ from .simulate import check_elements, simulate
 
 
 class _Switched(ScalarElement):
-    """One effort before a time, another from it on."""
+    """Efforts that switch from one constant to another at a time."""
 
     before: Float[Array, " joint"]
     after: Float[Array, " joint"]
@@ -57,17 +57,17 @@ def step(
     t: ArrayLike = 0.0,
     **options: Any,
 ) -> State:
-    """The state after a time, under efforts that are constant until then.
+    """Computes the state after a time `dt` under constant efforts `tau`.
 
-    The transition of a discrete-time model, for reinforcement learning and predictive
-    control: pure, batched by `jax.vmap`, differentiable in everything.
+    This is the transition of a discrete-time model, for reinforcement learning and
+    predictive control: pure, batched by `jax.vmap`, differentiable in everything.
 
     **Arguments:**
 
     - `linkage`, `state`: the arm, and its joint positions and velocities.
     - `tau`: joint efforts, (3,) [N or N m]; `dt`: how long they are held [s].
-    - `forces`: what else acts, elements without a state of their own; `t`: the time at
-      the start, which they are given [s].
+    - `forces`: other force elements, without states of their own; `t`: the time at the
+      start, which the elements receive [s].
     - `options`: keywords of `simulate`.
 
     **Returns:** the `State` at the end; NaN if the solve failed.
@@ -87,10 +87,10 @@ def step(
 class SampledMotion(NamedTuple):
     """A motion under sampled control.
 
-    - `ts`: sampling times, the end included (samples + 1,) [s].
-    - `q`, `qd`: joint positions and velocities there, NaN after a failure.
-    - `tau`: what was commanded at each sample (samples, 3) [N or N m].
-    - `result`: diffrax's, `successful` or that of the first period that failed.
+    - `ts`: sampling times, including the end (samples + 1,) [s].
+    - `q`, `qd`: joint positions and velocities at `ts`; NaN after a failure.
+    - `tau`: efforts commanded at each sample (samples, 3) [N or N m].
+    - `result`: diffrax's result: `successful`, or that of the first failed period.
     - `own`: the states of the forces' `StatefulElement`s at `ts`.
     """
 
@@ -116,20 +116,22 @@ def simulate_sampled(
     key: Array | None = None,
     **options: Any,
 ) -> SampledMotion:
-    """The motion under a controller that looks once per period and holds its effort.
+    """Computes a motion under a controller that samples once per period.
 
     **Arguments:**
 
     - `linkage`, `state0`: the arm, and its joint positions and velocities.
-    - `control`: a force element, a `PDController` for instance. The state of one that
-      has one, a `PIDController`'s, takes a step of Euler's at each sample.
-    - `period`: of sampling [s]; `samples`: how many.
-    - `forces`: what acts besides.
-    - `t0`: the first sample [s].
-    - `delay`: from measuring to acting, less than a period [s]. No effort acts before
-      the first command does. One that is traced and too long ends as not finite.
-    - `noise`: standard deviations of what is measured, of positions and of velocities
-      (each (3,) or one for all), with a `jax.random` `key`.
+    - `control`: a force element such as a `PDController`, whose effort is held until
+      the next sample. A state, such as a `PIDController`'s, takes one Euler step per
+      sample.
+    - `period`: time between samples [s]; `samples`: number of samples.
+    - `forces`: other force elements.
+    - `t0`: time of the first sample [s].
+    - `delay`: time from measurement to action, less than a period [s]. The effort is
+      zero until the first command acts. A traced delay that is too long ends the motion
+      as not finite.
+    - `noise`: standard deviations of the measured positions and velocities (each (3,)
+      or one for all), with a `jax.random` `key`.
     - `options`: keywords of `simulate`.
 
     **Returns:** a `SampledMotion`.
@@ -177,7 +179,7 @@ def simulate_sampled(
 def _motion(
     linkage, state0, control, times, forces, delay, spread, keys, options
 ) -> SampledMotion:
-    """`delay`: None where an effort acts at once; `spread`: of noise, None or two."""
+    """Simulates period by period; `delay` and the noise's `spread` may be None."""
 
     def command(t, seen, memory):
         if not memory:

@@ -1,4 +1,4 @@
-"""A scene: an arm, its start, what acts on it, for how long; and stacks of scenes."""
+"""Scenes: a linkage, its initial state, its forces and its end time; stacks of them."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -16,10 +16,10 @@ from ..linkage.linkage import Linkage
 
 
 class Scene(NamedTuple):
-    """A linkage, where it starts, what acts on it and for how long.
+    """A linkage, its initial state, the forces on it and the end time.
 
     - `linkage`, `state0`, `forces`: the arguments of `simulate`.
-    - `t1`: end time, the start being 0 [s].
+    - `t1`: end time [s]; a scene starts at 0.
 
     >>> import fdof_jax as fj
     >>> scene = fj.scenes.fig7()
@@ -34,9 +34,9 @@ class Scene(NamedTuple):
 
 
 def is_number(leaf: Any) -> bool:
-    """Whether a leaf of a scene is data: an array, or a float.
+    """Returns whether a leaf of a scene is data: an array or a float.
 
-    Python's integers and truth values, an element's index for instance, are not.
+    Python's integers and booleans, such as an element's index, are not data.
     """
     return eqx.is_array_like(leaf) and not isinstance(leaf, bool | int)
 
@@ -48,7 +48,7 @@ def _as_array(leaf: Any) -> np.ndarray:
 
 
 def _plain(scene: Any) -> Any:
-    """A scene's end time may be given as an integer."""
+    """Returns the scene with an end time that may be an integer as a float."""
     return scene._replace(t1=_float(scene.t1)) if isinstance(scene, Scene) else scene
 
 
@@ -57,7 +57,7 @@ def _float(value: Any) -> np.ndarray:
 
 
 def stacked(scenes: Sequence[Any], name: str = "scenes") -> Any:
-    """Scenes of one structure as one, with a leading axis on every array.
+    """Stacks scenes of one structure into one, with a leading axis on every array.
 
     **Raises:** ValueError for scenes of different structure.
 
@@ -83,7 +83,7 @@ def stacked(scenes: Sequence[Any], name: str = "scenes") -> Any:
 
 
 def unstacked(name: str, scenes: Scene) -> list[Scene]:
-    """The members of stacked scenes."""
+    """Splits stacked scenes into their members."""
     instance(name, scenes, Scene)
     arrays, rest = eqx.partition(scenes, is_number)
     sizes = {np.shape(leaf)[:1] for leaf in jax.tree.leaves(arrays)}

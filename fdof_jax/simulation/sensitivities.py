@@ -1,8 +1,8 @@
-"""A motion with its derivatives in a few parameters, integrated side by side.
+"""Integrates a motion together with its derivatives in a few parameters.
 
-The derivatives obey differential equations of their own (the variational ones). As part
-of the state they are controlled in error like the motion itself, and nothing has to be
-differentiated through the integrator, which takes twice as long to compile.
+The derivatives obey the variational equations. As part of the state they are under the
+same error control as the motion. Differentiation through the integrator, which takes
+twice as long to compile, is not needed.
 """
 
 from collections.abc import Callable
@@ -23,13 +23,13 @@ from .solution import Solution
 from .step_wrappers import landing_on
 from .steps import adaptive
 
-# Of the motion and its derivatives, whichever are larger: with steps that these need,
-# the loss on Fig 7's circle is right to 1e-8.
+# Tolerance of the motion and its derivatives, whichever are larger. The steps that the
+# derivatives need make the loss on Fig 7's circle right to 1e-8.
 TOLERANCE = 1e-5
 
 
 class Sensitivities(NamedTuple):
-    """Residuals (m,) at a point and their Jacobian (m, n); the scene and its motion."""
+    """Residuals (m,) and their Jacobian (m, n), with the scene and its motion."""
 
     residuals: Array
     jacobian: Array
@@ -38,7 +38,7 @@ class Sensitivities(NamedTuple):
 
 
 def _largest(state: Array) -> Array:
-    """Of the rms of the motion and those of its derivatives."""
+    """Returns the largest rms among the motion and its derivatives."""
     return jnp.sqrt(jnp.max(jnp.mean(state**2, axis=1)))
 
 
@@ -49,13 +49,13 @@ def sensitivities(
     ts: Array,
     tolerance: float = TOLERANCE,
 ) -> Sensitivities:
-    """Residuals of a simulated scene that depends on parameters `z` (n,).
+    """Computes residuals of a simulated scene and their Jacobian in `z` (n,).
 
-    A pure function of arrays. A motion that fails is NaN from there on.
+    The function is pure. A motion that fails is NaN from then on.
 
-    **Arguments:** `scene_at`: the scene, given the parameters; `residuals`: an array,
-    given the scene and its motion at the times `ts`; `tolerance`: of each step in
-    float64, relative and absolute.
+    **Arguments:** `scene_at`: maps the parameters `z` to a scene; `residuals`: maps the
+    scene and its motion at the times `ts` to an array; `tolerance`: relative and
+    absolute tolerance of each step in float64.
     """
 
     def motion_of(z):
@@ -71,8 +71,8 @@ def sensitivities(
         )
         return args, (*start, *initial_own(args))
 
-    # One array, whose first row is the motion and the others its derivatives: fewer and
-    # larger operations for the integrator.
+    # One array, with the motion as first row and the derivatives below, gives the
+    # integrator fewer and larger operations.
     start, along = jax.linearize(
         lambda z: jnp.stack(jax.tree.leaves(motion_of(z)[1])), z
     )
@@ -112,7 +112,7 @@ def sensitivities(
     with without_checks():
         found = diffrax.diffeqsolve(
             diffrax.ODETerm(field),  # pyright: ignore[reportArgumentType]
-            # Few stages: much of the work is that around them.
+            # A method of few stages, because much of the work lies outside of them.
             diffrax.Tsit5(),
             t0=ts[0],
             t1=ts[-1],
@@ -126,7 +126,7 @@ def sensitivities(
             throw=False,
         )
     assert found.ys is not None  # because of saveat
-    # diffrax leaves infinity where it has not come to.
+    # diffrax leaves infinity at times that it did not reach.
     states = jnp.where(jnp.isinf(found.ys), jnp.nan, found.ys)
 
     def judged(z, rows):

@@ -1,4 +1,4 @@
-"""Simulation: motions of a linkage, and the efforts along them."""
+"""Simulates motions of a linkage and computes the efforts along them."""
 
 from typing import Any
 
@@ -41,9 +41,9 @@ def solve_options(
     throw: bool,
     progress_meter: diffrax.AbstractProgressMeter,
 ) -> tuple[diffrax.AbstractSolver | None, dict[str, Any]]:
-    """The keywords of `simulate`, checked: the solver, and those of diffeqsolve.
+    """Checks `simulate`'s keywords; returns the solver and diffeqsolve's keywords.
 
-    But for `throw`, which callers see to themselves.
+    The result leaves out `throw`, which callers handle.
     """
     if dt0 is not None:
         dt0 = real_array("dt0", dt0, (), above=0)  # an array: new values, no new trace
@@ -84,7 +84,7 @@ def solve_options(
 
 
 def check_elements(forces: Forces, linkage: Linkage, ts: Array) -> None:
-    """The elements' own checks at the door, where values are known."""
+    """Runs the elements' own checks on concrete values."""
     for index, element in enumerate(forces):
         values = in_numpy(element)
         jumps = getattr(values, "jump_ts", None)
@@ -95,7 +95,7 @@ def check_elements(forces: Forces, linkage: Linkage, ts: Array) -> None:
             continue
         if check is not None:
             check(linkage, ts)
-        # `equinox.tree_at` asks no constructor.
+        # `equinox.tree_at` bypasses the constructor.
         if hasattr(values, "possible") and not values.possible():
             raise ValueError(
                 f"forces[{index}]: expected values that its constructor takes, got "
@@ -120,33 +120,32 @@ def simulate(
     throw: bool = True,
     progress_meter: diffrax.AbstractProgressMeter = diffrax.NoProgressMeter(),
 ) -> Solution:
-    """The motion of a linkage from `state0` at `ts[0]`, at the times `ts`.
+    """Computes the motion of a linkage from `state0` at `ts[0]`, at the times `ts`.
 
-    Pure and differentiable in every array, batched by `jax.vmap`; one compilation
-    serves all topologies. The motion is that of the paper's masked equations
-    (17)-(27), in their reduced form.
+    The motion follows the paper's masked equations (17)-(27) in their reduced form. It
+    is a pure function, differentiable in every array and batched by `jax.vmap`; one
+    compilation serves all topologies.
 
     **Arguments:**
 
     - `linkage`, `state0`: the arm, and its joint positions and velocities.
-    - `ts`: increasing times, of shape (time,) [s]. Between steps states are
-      interpolated, where they may be a hundred times less exact than at the last time,
-      which a step ends at; `diffrax.ClipStepSizeController` makes others end at `ts`.
+    - `ts`: increasing output times, of shape (time,) [s]. A step ends at the last time.
+      States at the other times are interpolated and may be a hundred times less exact;
+      `diffrax.ClipStepSizeController` makes steps end at all of `ts`.
     - `forces`: a tuple of force elements `(t, q, qd, linkage) -> tau`.
-    - `own0`: the states of the `StatefulElement`s among them at the start, one row of a
-      `Solution.own`; by default what the elements say.
-    - `rtol`, `atol`: relative and absolute tolerance of a step, 1e-11 in float64 and
-      1e-5 in float32 by default; not beside a `stepsize_controller`.
+    - `own0`: initial states of the `StatefulElement`s among the forces, one row of a
+      `Solution.own`; by default each element's `initial_state`.
+    - `rtol`, `atol`: relative and absolute tolerance of a step, by default 1e-11 in
+      float64 and 1e-5 in float32; not allowed beside a `stepsize_controller`.
     - `solver`, `stepsize_controller`, `dt0`, `adjoint`, `max_steps`, `throw`,
-      `progress_meter`: as in `diffrax.diffeqsolve`. By default, which `None` stands
-      for, the solver is Dopri8 and steps are adaptive. The first step `dt0` is 1 ms,
-      because estimates of it fail from exact rest; `None` lets the controller estimate
-      it.
-      Reverse mode works with the default `adjoint`; for forward mode pass
+      `progress_meter`: as in `diffrax.diffeqsolve`. The default solver and controller,
+      also selected by `None`, are Dopri8 and adaptive steps. The first step `dt0` is
+      1 ms, because estimates of it fail from exact rest; `None` lets the controller
+      estimate it. Reverse mode works with the default `adjoint`; for forward mode pass
       `diffrax.ForwardMode()`.
 
-    **Returns:** a `Solution`. With `throw=False` a failed solve is told by its
-    `result`, and what it did not reach is NaN.
+    **Returns:** a `Solution`. With `throw=False` its `result` reports a failed solve,
+    and states that were not reached are NaN.
 
     **Raises:** ValueError for malformed arguments; whatever the force elements' own
     `check(linkage, ts)` raises; with `throw=True` a RuntimeError if the solve fails.
@@ -194,12 +193,12 @@ def simulate(
     inputs = linkage, state0, ts, own0, forces
     try:
         one = None
-        # Within `jax.jit` even a constant is traced.
+        # A new constant is traced only if this call is inside `jax.jit`.
         if not is_traced(inputs, solver, keywords, jax.device_put(np.zeros(()))):
             one = solve_one(solver, inputs, keywords)
         if one is None:
             solution = solve(solver, inputs, keywords)
-            # Of the times themselves, for derivatives in them.
+            # The caller's `ts` itself keeps derivatives in the times.
             solution = eqx.tree_at(lambda s: s.ts, solution, ts)
             return _raising(solution, state0) if throw else solution
     except TypeError as error:
@@ -229,8 +228,8 @@ def simulate(
 
 
 def _raising(solution: Solution, state0: State) -> Solution:
-    """The solution of a traced call, which raises an error where it fails."""
-    late = ~(jnp.diff(solution.ts) > 0)  # NaN included
+    """Adds run-time errors for bad values and failures to a traced solution."""
+    late = ~(jnp.diff(solution.ts) > 0)  # also true for NaN
     unknown = ~jnp.isfinite(jnp.stack(jax.tree.leaves(state0)))
     for failed, message in (
         (late, "ts: expected increasing times, got others."),
@@ -242,7 +241,7 @@ def _raising(solution: Solution, state0: State) -> Solution:
 
 
 def _check_own(name, own, forces: Forces, linkage: Linkage, rows: tuple) -> None:
-    """Raise ValueError unless these are states of the forces' elements, in rows."""
+    """Raises ValueError unless `own` holds rows of the stateful elements' states."""
     expected = [
         jax.eval_shape(element.initial_state, linkage) for element in stateful(forces)
     ]
@@ -256,11 +255,11 @@ def _check_own(name, own, forces: Forces, linkage: Linkage, rows: tuple) -> None
 
 
 def joint_efforts(linkage: Linkage, forces: Forces, solution: Solution) -> Efforts:
-    """Joint efforts of the force elements along a motion.
+    """Computes the joint efforts of the force elements along a motion.
 
     **Arguments:** the linkage, the forces and the solution of one `simulate`.
 
-    **Returns:** `Efforts(total, elements)` [N or N m]: (time, 3), and per element
+    **Returns:** `Efforts(total, elements)` [N or N m], of shapes (time, 3) and
     (element, time, 3).
 
     **Raises:** ValueError if `forces` is not a tuple of force elements.

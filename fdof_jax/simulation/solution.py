@@ -1,4 +1,4 @@
-"""What a simulation returns."""
+"""The results of a simulation."""
 
 from typing import Any, NamedTuple
 
@@ -13,16 +13,15 @@ from .html_table import html_table
 
 
 class Solution(eqx.Module):
-    """A simulated motion.
+    """A simulated motion, with its statistics and outcome.
 
     - `ts`: output times [s].
-    - `q`, `qd`: joint positions [m or rad] and velocities at `ts`. NaN after a solve
-      that failed.
+    - `q`, `qd`: joint positions [m or rad] and velocities at `ts`; NaN after a failure.
     - `stats`: diffrax's statistics, `num_steps` among them, and `time_reached` [s].
-    - `result`: diffrax's result, one per trajectory; `diffrax.RESULTS.successful` or
-      the reason of the failure, which `outcome` says in a word or two.
-    - `own`: the states of the `StatefulElement`s at `ts`, in their order; each as its
-      `initial_state`, with time as first axis.
+    - `result`: diffrax's result, one per trajectory: `diffrax.RESULTS.successful` or
+      the reason for the failure. `outcome` states it in words.
+    - `own`: the states of the `StatefulElement`s at `ts`, in the order of the forces;
+      each like its `initial_state`, with a leading time axis.
 
     >>> import fdof_jax as fj
     >>> import numpy as np
@@ -41,12 +40,12 @@ class Solution(eqx.Module):
 
     @property
     def outcome(self) -> np.ndarray:
-        """How each trajectory ended, in words, in the shape of the batch.
+        """Outcome of each trajectory in words, an array of the batch's shape.
 
         `"successful"`; `"ill-conditioned"`: the mass matrix is singular or nearly so
-        (see `inertia_ratios`); `"not finite"`: the accelerations are not; `"out of
-        steps"`; `"tolerance out of reach"`: rounding keeps even the shortest step from
-        it; or `"solver failed"`.
+        (see `inertia_ratios`); `"not finite"`: the accelerations are not finite;
+        `"out of steps"`; `"tolerance out of reach"`: rounding keeps even the shortest
+        step from meeting it; or `"solver failed"`.
         """
         results: Any = diffrax.RESULTS
         words = {
@@ -63,7 +62,7 @@ class Solution(eqx.Module):
         )
 
     def __repr__(self) -> str:
-        """In words; of traced values only their shape."""
+        """Summarises the motion in words; traced values show only their shape."""
         facts = "; ".join(f"{name}: {value}" for name, value in self._facts().items())
         return f"Solution({facts})" if facts else super().__repr__()
 
@@ -72,7 +71,7 @@ class Solution(eqx.Module):
         return html_table(facts.items()) if facts else None
 
     def _facts(self) -> dict[str, str]:
-        """What there is to say; nothing of what has but the structure of a solution."""
+        """Returns the known facts; none if the leaves are not arrays of a motion."""
         if len(getattr(self.q, "shape", ())) < 2:
             return {}
         *batch, count, _ = self.q.shape
@@ -97,8 +96,8 @@ class Solution(eqx.Module):
 class Efforts(NamedTuple):
     """Joint efforts along a motion [N or N m].
 
-    - `total`: their sum (time, 3).
-    - `elements`: those of each force element (element, time, 3).
+    - `total`: sum over all force elements (time, 3).
+    - `elements`: efforts of each force element (element, time, 3).
     """
 
     total: Float[Array, "time joint"]

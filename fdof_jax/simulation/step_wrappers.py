@@ -1,4 +1,4 @@
-"""Step size controllers around others: jumps, bounds, health."""
+"""Wrappers of step size controllers, for jumps, bounds and health."""
 
 from collections.abc import Callable
 from typing import Any
@@ -13,7 +13,7 @@ from .dopri8 import constant, verdict
 
 
 def with_pid(change: Callable[[diffrax.PIDController], Any], controller: Any) -> Any:
-    """A controller with `change` made to the one that adapts the steps within."""
+    """Returns a controller with `change` applied to the PID controllers in it."""
 
     def is_pid(node: Any) -> bool:
         return isinstance(node, diffrax.PIDController)
@@ -24,7 +24,7 @@ def with_pid(change: Callable[[diffrax.PIDController], Any], controller: Any) ->
 
 
 def bounded(controller: Any, longest: Callable[[], Array]) -> Any:
-    """The controller with a longest step, unless it has one."""
+    """Returns the controller with a longest step, unless it has one."""
 
     def limited(pid: diffrax.PIDController) -> diffrax.PIDController:
         if pid.dtmax is not None:
@@ -41,7 +41,7 @@ def _is_none(node: Any) -> bool:
 def landing_on(
     controller: diffrax.AbstractStepSizeController, jump_ts: Array
 ) -> diffrax.AbstractStepSizeController:
-    """The controller with steps that end at these times, where efforts jump.
+    """Returns the controller with steps that end at the times where efforts jump.
 
     Raises ValueError for a controller whose steps are not adaptive.
     """
@@ -56,7 +56,7 @@ def landing_on(
 
 
 class _Wrapped(diffrax.AbstractStepSizeController):
-    """What wrappers of a controller have in common."""
+    """Base class of controllers that wrap another."""
 
     controller: eqx.AbstractVar[Any]
 
@@ -66,9 +66,9 @@ class _Wrapped(diffrax.AbstractStepSizeController):
 
 
 class Adaptive(_Wrapped, diffrax.AbstractAdaptiveStepSizeController):
-    """A wrapper of an adaptive one, where an implicit solver looks for tolerances."""
+    """Wrapper of an adaptive controller; implicit solvers read its tolerances."""
 
-    # pyright takes what the base class wants for arguments of the constructor.
+    # pyright takes the attributes of the base class for constructor arguments.
     @property
     def rtol(self):  # pyright: ignore[reportIncompatibleVariableOverride]
         return self.controller.rtol
@@ -83,10 +83,10 @@ class Adaptive(_Wrapped, diffrax.AbstractAdaptiveStepSizeController):
 
 
 class _Longer(Adaptive):
-    """A controller whose steps come out longer, by the root of the rounding error.
+    """A controller that lengthens each step by a factor 1 + sqrt(eps).
 
-    A step as long as the distance of two jumps would else end a rounding error short of
-    the second, and the next be too short to go on.
+    A step over the distance between two jumps would otherwise end a rounding error
+    before the second jump, and the next step would be too short to go on.
     """
 
     controller: Any
@@ -105,10 +105,10 @@ class _Longer(Adaptive):
 
 
 def undifferentiated(controller: Any) -> Any:
-    """The controller, whose choice of steps derivatives take as given.
+    """Returns the controller with steps that are constant for derivatives.
 
-    The motion does not depend on where its steps end, to their tolerance: derivatives
-    of the steps are left out, which makes those of the motion cheaper.
+    Up to the tolerance, the motion does not depend on where its steps end. Leaving out
+    derivatives of the step sizes makes those of the motion cheaper.
     """
     return with_pid(_Undifferentiated, controller)  # pyright: ignore[reportArgumentType]
 
@@ -130,13 +130,13 @@ class _Undifferentiated(Adaptive):
 
 
 class Watched(Adaptive):
-    """A controller that shortens steps which end in bad health, and then gives up.
+    """A controller that shortens steps that end in bad health, then gives up.
 
-    For solvers that do not look themselves: see `ScheduledTerm.health`.
+    It serves solvers that do not check `ScheduledTerm.health` themselves.
     """
 
     controller: Any
-    health: Callable[[Any, Any, Any], Array] = eqx.field(static=True)  # of t, y, args
+    health: Callable[[Any, Any, Any], Array] = eqx.field(static=True)  # (t, y, args)
 
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
         return self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
@@ -144,16 +144,16 @@ class Watched(Adaptive):
     def adapt_step_size(  # pyright: ignore[reportIncompatibleMethodOverride]
         self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state
     ):
-        # Rates that are not finite make such an error.
+        # Rates that are not finite make the error not finite.
         leaves = jax.tree.leaves((y1_candidate, y_error))
         finite = jnp.isfinite(sum(map(jnp.sum, leaves)))
-        # Where a step led nowhere its start tells why.
+        # If the end is not finite, the health at the start shows why.
         judged = jax.tree.map(lambda a, b: jnp.where(finite, a, b), y1_candidate, y0)
         health = self.health(*constant((t1, judged, args)))
         bad = ~finite | (health == 0)
         imposed, failure = verdict(health == 0, bad, t1 - t0)
         y_error = jax.tree.map(lambda e: jnp.where(bad, imposed, e), y_error)
-        # Errors are measured by the state, which may not be finite.
+        # The error is scaled by the state, which must be finite for that.
         end = jax.tree.map(lambda a, b: jnp.where(bad, a, b), y0, y1_candidate)
         *step, result = self.controller.adapt_step_size(
             t0, t1, y0, end, args, y_error, error_order, controller_state
@@ -163,14 +163,14 @@ class Watched(Adaptive):
 
 
 def limited(controller: diffrax.AbstractStepSizeController, limit: Array) -> "Limited":
-    """A controller that gives up after a number of steps known at run time."""
+    """Returns a `Limited` controller, adaptive if the given one is."""
     if isinstance(controller, diffrax.AbstractAdaptiveStepSizeController):
         return _AdaptiveLimited(controller, limit)  # pyright: ignore[reportCallIssue]
     return Limited(controller, limit)
 
 
 class Limited(_Wrapped):
-    """A step-size controller that gives up after a number of steps known at run time.
+    """A step size controller that gives up after a number of steps set at run time.
 
     diffrax's own `max_steps` is part of the compiled program.
     """

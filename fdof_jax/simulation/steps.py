@@ -1,7 +1,4 @@
-"""What decides on the steps: tolerances and their scales, jumps, limits.
-
-Around diffrax's step-size controllers, which do the rest.
-"""
+"""Tolerances of diffrax's step size controllers: defaults, limits and scales."""
 
 import dataclasses
 import warnings
@@ -19,15 +16,15 @@ from ..linkage.coordinates import State, real_joints
 from ..linkage.linkage import Linkage, check_linkage
 from .step_wrappers import Adaptive, with_pid
 
-# Float32 meets no tighter relative or absolute tolerance: it fights its own rounding.
+# Rounding keeps float32 from meeting a tighter relative or absolute tolerance.
 _TIGHTEST_SINGLE = 1e-6
 
 
 def adaptive(double: float, single: float) -> diffrax.PIDController:
-    """Adaptive steps at a relative and absolute tolerance chosen by the dtype."""
+    """Returns a controller with the relative and absolute tolerance of the dtype."""
     x64 = jnp.result_type(float) == jnp.float64
     tolerance = double if x64 else single
-    # The smallest step ends solves that rounding keeps from their tolerance.
+    # The shortest step ends solves that rounding keeps from meeting the tolerance.
     return diffrax.PIDController(
         rtol=tolerance,
         atol=tolerance,
@@ -41,18 +38,18 @@ def _shortest_step() -> float:
 
 
 def default_controller() -> diffrax.PIDController:
-    """That of `simulate` and `sweep`."""
+    """Returns the default controller of `simulate` and `sweep`."""
     return adaptive(1e-11, 1e-5)
 
 
 def at_tolerances(
     rtol: ArrayLike | None, atol: ArrayLike | None
 ) -> diffrax.PIDController:
-    """The default steps at other tolerances; None leaves one as it is."""
+    """Returns the default controller with other tolerances; None keeps one."""
     controller = default_controller()
     rtol = controller.rtol if rtol is None else rtol
     atol = controller.atol if atol is None else atol
-    # Arrays: new values need no new trace.
+    # As arrays, new values need no new trace.
     rtol = real_array("rtol", rtol, (), above=0)
     atol = real_array("atol", atol, (), above=0)
     return dataclasses.replace(controller, rtol=rtol, atol=atol)
@@ -61,9 +58,9 @@ def at_tolerances(
 def within_reach(
     controller: diffrax.AbstractStepSizeController,
 ) -> diffrax.AbstractStepSizeController:
-    """The controller, with a shortest step, at which solves that cannot go on end.
+    """Returns the controller with a shortest step, which ends solves that are stuck.
 
-    In float32 with tolerances that can be met, and a warning.
+    In float32, tolerances that cannot be met are raised, with a warning.
     """
     x64 = jnp.result_type(float) == jnp.float64
 
@@ -90,10 +87,10 @@ def within_reach(
 
 
 class _Scaled(Adaptive):
-    """A controller that sees the state in units of its own per coordinate."""
+    """A controller that measures each coordinate in a unit of its own."""
 
     controller: Any
-    unit: tuple[tuple[Array, ...], tuple[Array, ...]]  # as the state: q, qd
+    unit: tuple[tuple[Array, ...], tuple[Array, ...]]  # of q and of qd
 
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
         if dt0 is None:
@@ -106,7 +103,7 @@ class _Scaled(Adaptive):
         self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state
     ):
         def scaled(state: Any) -> Any:
-            # What elements have of their own comes last, in units of its own.
+            # The elements' own states come last and keep their units.
             motion = jax.tree.map(lambda a, unit: a / unit, state[:2], self.unit)
             return (*motion, *state[2:])
 
@@ -122,17 +119,17 @@ def scale_tolerances(
     *,
     scale: State | None = None,
 ) -> diffrax.AbstractAdaptiveStepSizeController:
-    """A controller whose absolute tolerance is measured in sizes of the linkage.
+    """Returns a controller whose absolute tolerance scales with the linkage.
 
-    An absolute tolerance of 1e-11 means metres, radians and their rates. For an arm of
-    millimetres or kilometres, pass the result as `stepsize_controller`: slides are then
-    measured in the size of the arm L [m], rates in the time sqrt(L/g) [s], angles in
-    radians.
+    By default an absolute tolerance of 1e-11 is in metres, radians and their rates. For
+    an arm of millimetres or kilometres, pass the result as `stepsize_controller`. Its
+    unit of slides is the size L of the arm [m], its unit of time is sqrt(L/g) [s], and
+    angles stay in radians.
 
     **Arguments:**
 
-    - `controller`: whose tolerances are meant; by default that of `simulate`.
-    - `scale`: other units, per coordinate: a State of two arrays (3,), all positive
+    - `controller`: the controller to scale; by default that of `simulate`.
+    - `scale`: other units per coordinate, a State of two positive arrays (3,)
       [m or rad, m/s or rad/s].
 
     **Raises:** ValueError for a controller that is not adaptive, a scale that is not

@@ -1,9 +1,9 @@
-"""Many motions at once: the results of `jax.vmap(simulate)`, sooner and in less memory.
+"""Many motions at once: as `jax.vmap(simulate)`, but faster and in less memory.
 
-A vectorised adaptive solve runs until its slowest member is done. Here members are
-ordered by the work they are expected to take and cut into chunks of one shape. A member
-that takes many more steps than its neighbours is stopped and solved again later, in a
-smaller batch of its kind.
+A vectorised adaptive solve runs until its slowest member is done. `sweep` orders the
+members by expected work and cuts them into chunks of one shape. A member that takes
+many more steps than its neighbours is stopped and solved again later, in a smaller
+batch of slow members.
 """
 
 import os
@@ -36,7 +36,7 @@ from .solution import Solution
 
 
 def _traced(batch: Batch, ts: Array, settings: dict, chunk: int) -> Solution:
-    """Under a transformation: in chunks, and no failed member enters a derivative."""
+    """Solves a traced batch in chunks; failed members enter no derivative."""
     moving, shared = batch.split()
     order = jnp.lexsort(expected_work(ts[0], moving, shared)[::-1])
 
@@ -48,7 +48,7 @@ def _traced(batch: Batch, ts: Array, settings: dict, chunk: int) -> Solution:
         )
 
     def where(condition, tree):
-        """The tree, constant for derivatives where the condition does not hold."""
+        """Returns the tree, constant for derivatives where `condition` is false."""
 
         def guarded(leaf):
             if not eqx.is_inexact_array(leaf):
@@ -58,8 +58,8 @@ def _traced(batch: Batch, ts: Array, settings: dict, chunk: int) -> Solution:
         return jax.tree.map(guarded, tree)
 
     moving = jax.tree.map(lambda leaf: jnp.asarray(leaf)[order], moving)
-    # Which members fail is found out first. In the differentiated solve the first good
-    # member stands in for them: whatever is NaN there would spoil shared parameters.
+    # A first solve finds the members that fail. In the differentiated solve the first
+    # good member replaces them, because NaN would spoil derivatives of shared arrays.
     frozen = in_chunks(*where(False, (moving, shared)))
     good = frozen[-1] == diffrax.RESULTS.successful
     source = jnp.where(good, jnp.arange(batch.size), jnp.argmax(good))
@@ -96,31 +96,32 @@ def sweep(
     max_steps: int | None = 65536,
     progress_meter: diffrax.AbstractProgressMeter = diffrax.NoProgressMeter(),
 ) -> Solution:
-    """Many motions, as `jax.vmap(simulate)` would give them, faster.
+    """Computes many motions, as `jax.vmap(simulate)` does, but faster.
 
-    A member that fails ends early with a result of its own, and a fast one delays no
-    others. Runs on all devices that JAX sees; with `jax.distributed`, call it with the
-    same arguments in every process, and each returns everything.
+    A member that fails ends early with a result of its own, and slow members delay few
+    others. Runs on all devices that JAX sees. With `jax.distributed`, call `sweep` with
+    the same arguments in every process; each returns the whole solution.
 
     **Arguments:**
 
     - `linkage`, `state0`: as in `simulate`, any of their arrays with a leading batch
       axis; arrays without it are shared by all members.
     - `ts`: increasing output times, common to all members, of shape (time,) [s].
-    - `forces`: force elements; which of their arrays carry the batch axis is said by
-      `forces_axes`, as `in_axes` of `jax.vmap`: 0 for all, None (the default) for
-      none, or a tuple of these with one entry per element.
-    - `chunk`: how many members are solved together at most, per device.
-    - `throw`: whether any failed member raises.
-    - `checkpoint`: a folder for the results of finished chunks. The same call goes on
-      from there.
+    - `forces`: force elements; `forces_axes`: which of their arrays carry the batch
+      axis, as `in_axes` of `jax.vmap`: 0 for all, None (the default) for none, or a
+      tuple of these with one entry per element.
+    - `chunk`: largest number of members to solve together, per device.
+    - `throw`: whether to raise an error if any member fails.
+    - `checkpoint`: a folder for the results of finished chunks. A repeated call resumes
+      from them.
     - `solver`, `rtol`, `atol`, `stepsize_controller`, `dt0`, `adjoint`, `max_steps`,
       `progress_meter`: as in `simulate`.
 
-    **Returns:** a `Solution` with a leading batch axis everywhere; `result` tells each
-    member's end. Under `jax.grad` or another transformation a failed member adds
+    **Returns:** a `Solution` with a leading batch axis everywhere; `result` reports how
+    each member ended. Under `jax.grad` or another transformation a failed member adds
     nothing to any derivative, and `solution.result == diffrax.RESULTS.successful`
-    says which ones counted; it takes one more solve, without derivatives, to find out.
+    selects the members that count. Finding them takes one more solve, without
+    derivatives.
 
     **Raises:** ValueError for malformed arguments; RuntimeError, with `throw=True`, if
     a member fails.
@@ -147,7 +148,7 @@ def sweep(
         throw=throw,
         progress_meter=progress_meter,
     )
-    del settings["progress_meter"]  # it is for members done, not for times
+    del settings["progress_meter"]  # it counts finished members, not time
     settings["solver"] = solver
     batch = batch_of(linkage, state0, forces, forces_axes)
     if checkpoint is not None and not isinstance(checkpoint, str | os.PathLike):

@@ -1,11 +1,11 @@
 """Dormand-Prince 8(7) with its stages unrolled, as a diffrax solver.
 
-diffrax runs the stages of a Runge-Kutta method as a loop that writes to buffers, which
-compiles fast. With equations as cheap as those of a linkage, the buffers cost more
-than the equations. Unrolled, each stage becomes one fused loop over the batch, and
-zeros of the tableau cost nothing: 2 times faster in a batch of 1024, 3.5 times for a
-single arm, for 2 s more of compilation (one core, jax 0.10.2). For derivatives the
-vector field is linearised at all stages at once, by one piece of compiled code.
+diffrax runs the stages of a Runge-Kutta method as a loop that writes to buffers. Such a
+loop compiles fast, but the buffers cost more than the cheap equations of a linkage.
+Unrolled, each stage becomes one fused loop over the batch, and zeros of the tableau
+cost nothing: 2 times faster in a batch of 1024, 3.5 times for a single arm, for 2 s
+more of compilation (one core, jax 0.10.2). For derivatives, one piece of compiled code
+linearises the vector field at all stages at once.
 """
 
 from collections.abc import Sequence
@@ -40,7 +40,7 @@ Rates = Sequence[State]  # one per stage
 
 
 def _combine(coefficients: Sequence[Any] | np.ndarray, rates: Rates) -> PyTree:
-    """The sum of coefficient times rate, without the terms that are known to be 0."""
+    """Sums coefficients times rates, without terms that are known to be 0."""
     known = isinstance(coefficients, np.ndarray)
     terms = [
         (float(c) if known else c, rate)
@@ -67,11 +67,11 @@ def _at(stage: int, tree: PyTree) -> PyTree:
 
 
 class _Step(NamedTuple):
-    """The end of a step, the step's error and what the next one needs.
+    """The end of a step, the step's error and what the next step needs.
 
-    `rate` is the one at the end, with its `health`; `lost` is what the rounding of `y`
-    took away. The next step adds it (Kahan): over 1000 s of Fig 5 in steps of 2.5 ms
-    the energy drifts by 3e-11 J, not 1.5e-10 J.
+    `rate` and its `health` are those at the end. `lost` is the rounding error of `y`,
+    which the next step adds (Kahan): over 1000 s of Fig 5 in steps of 2.5 ms the energy
+    drifts by 3e-11 J, not 1.5e-10 J.
     """
 
     y: State
@@ -95,7 +95,7 @@ def _unrolled(fields, times, h, y0, lost, args, schedule, f0) -> tuple[_Step, Ra
     y = _sum(y0, increment)
     lost = jtu.tree_map(lambda a, b, c: c - (b - a), y0, y, increment)
     error = _scaled(h, _combine(TABLEAU.b_error, rates))
-    # An infinity beside a NaN would get past diffrax, and leave no step length.
+    # diffrax overlooks an infinity beside a NaN and finds no next step size.
     poison = 0 * sum(jtu.tree_leaves(y))
     y = jtu.tree_map(lambda a: a + poison, y)
     y, error, lost = in_one_loop((y, error, lost))
@@ -109,26 +109,26 @@ def _stacked(rates: Sequence[Array]) -> Array:
 
 @eqx.filter_custom_jvp
 def _stages(fields, stack, times, h, y0, lost, args, schedule, f0) -> tuple[_Step, Any]:
-    """A step of length `h`, and the rates at all stages, the last at its end.
+    """Takes a step of length `h`; returns its end and the rates of all stages.
 
-    With `stack` one array (stage, rate) of those that interpolation uses: tangents of
-    so many scalars would each be a loop of its own.
+    With `stack` the rates are one array (stage, rate) of those that interpolation uses:
+    as scalars, each of their tangents would be a loop of its own.
     """
     step, rates = _unrolled(fields, times, h, y0, lost, args, schedule, f0)
     return step, _stacked([_vector(rate) for rate in rates]) if stack else rates
 
 
 def _times(matrix: Array, vector: Array) -> Array:
-    # XLA calls a library for products of matrices, at more than such a small one costs.
+    # For a matrix product XLA would call a library, which costs more at this size.
     return jnp.sum(matrix * vector[None], axis=-1)
 
 
 @_stages.def_jvp
 def _stages_jvp(primals, tangents):
-    """All stages are linearised at once, then their tangents follow one another."""
+    """Linearises all stages at once, then computes their tangents one by one."""
     (field, watched), stack, times, h, y0, _, args, schedule, _ = primals
     _, _, times_dot, h_dot, y0_dot, _, args_dot, schedule_dot, _ = tangents
-    # Itself, for derivatives of derivatives.
+    # `_stages` itself, so that this rule also serves higher derivatives.
     step, rates = _stages((field, watched), False, *primals[2:])
     increments = [_combine(row, rates) for row in LOWER[:-1]]
     states = [y0, *(_sum(y0, _scaled(h, k)) for k in increments), step.y]
@@ -137,7 +137,7 @@ def _stages_jvp(primals, tangents):
         return jtu.tree_unflatten(jtu.tree_structure(y0), list(vector))
 
     def linearised(y, t, t_dot, scheduled, scheduled_dot):
-        """A stage's rate: its Jacobian in the state, its tangent at a fixed state."""
+        """Returns a stage's Jacobian in the state and its tangent at a fixed state."""
         inputs, inputs_dot = (t, args, scheduled), (t_dot, args_dot, scheduled_dot)
         moves = jtu.tree_map(
             lambda x, x_dot: x_dot is not None,
@@ -156,7 +156,7 @@ def _stages_jvp(primals, tangents):
         jacobian = jax.vmap(tangent, in_axes=(0, None), out_axes=1)(basis, still)
         return jacobian, tangent(jnp.zeros_like(y), inputs_dot)
 
-    # The rate at the start is linearised too: no tangent comes with it.
+    # The rate at the start is linearised too, because it comes without a tangent.
     jacobians, drives = jax.vmap(linearised)(
         jnp.stack([_vector(y) for y in states]),
         times,
@@ -165,8 +165,8 @@ def _stages_jvp(primals, tangents):
         schedule_dot,
     )
     start = _vector(eqx.combine(y0_dot, jtu.tree_map(jnp.zeros_like, y0)))
-    # Vectors, not scalars: a product with a matrix is computed once, where XLA would
-    # compute a chain of scalar expressions anew for each of its results.
+    # Vectors, not scalars: XLA computes a product with a matrix once, but a chain of
+    # scalar expressions anew for each of its results.
     y_dot = start
     rates_dot = [_times(jacobians[0], start) + drives[0]]
     for row, jacobian, drive in zip(LOWER, jacobians[1:], drives[1:]):
@@ -174,7 +174,7 @@ def _stages_jvp(primals, tangents):
         if h_dot is not None:
             y_dot = y_dot + h_dot * _vector(_combine(row, rates))
         rates_dot.append(_times(jacobian, y_dot) + drive)
-    # The step control is not differentiated.
+    # Step size control is not differentiated.
     unmoved = jtu.tree_map(jnp.zeros_like, step[1:])
     step_dot = _Step(state(y_dot), *unmoved)
     if stack:
@@ -183,9 +183,9 @@ def _stages_jvp(primals, tangents):
     return (step, rates), (step_dot, [state(rate) for rate in rates_dot])
 
 
-@eqx.filter_jit  # traced once, not at each of a solve's uses of it
+@eqx.filter_jit  # traced once, not at each use in a solve
 def _step(term, stack, t0, t1, y0, lost, args, f0) -> tuple[_Step, Any, Array]:
-    # diffrax wraps the term, to integrate backward in time too.
+    # diffrax wraps the term to integrate backward in time too.
     inner, h = term.term, term.contr(t0, t1)
     times = (t0 + (t1 - t0) * jnp.asarray(NODES, t0.dtype)) * term.direction
     schedule = jax.vmap(inner.schedule, in_axes=(0, None))(times, args)
@@ -210,10 +210,9 @@ class _Interpolation(DenseOutput):
 
 
 class UnrolledDopri8(diffrax.AbstractAdaptiveSolver):
-    """The method of `diffrax.Dopri8`, equal to rounding: the default of `simulate`.
+    """The method of `diffrax.Dopri8` up to rounding, for large batches.
 
-    `for_tangents`: whether forward-mode derivatives are wanted, which it is then made
-    for.
+    `for_tangents`: whether to compile for forward-mode derivatives.
     """
 
     for_tangents: bool = eqx.field(static=True, default=False)
@@ -228,7 +227,7 @@ class UnrolledDopri8(diffrax.AbstractAdaptiveSolver):
         return self._start(terms, t0, y0, args), jtu.tree_map(jnp.zeros_like, y0)
 
     def _start(self, terms, t0, y0, args):
-        """Rates and their health where a step begins.
+        """Returns the rates and their health at the start of a step.
 
         Derivatives do not use these rates: see `_stages_jvp`.
         """
@@ -237,7 +236,7 @@ class UnrolledDopri8(diffrax.AbstractAdaptiveSolver):
         return term.watched_field(t, y0, args, term.schedule(t, args))
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        # A jump has changed the rates at the start of the step.
+        # After a jump the stored rates are outdated.
         start, lost = solver_state
         if made_jump is not False:
             fresh = self._start(terms, t0, y0, args)
