@@ -13,8 +13,8 @@ from .simulation.scene import Scene as Scene
 def fig3() -> Scene:
     """Figs 3 and 4: a damped triple pendulum with offset mass centres, from rest.
 
-    Gravity is not printed; we choose 9.81 m/s^2. The damping acts on the relative rates of the
-    revolute joints.
+    Gravity is not printed; we choose 9.81 m/s^2. The damping acts on the relative rates
+    of the revolute joints.
 
     >>> import fdof_jax as fj
     >>> scene = fj.scenes.fig3()
