@@ -19,8 +19,7 @@ from ..simulation.prescribed import prescribed
 from ..simulation.solution import Solution
 
 # Explicit Runge-Kutta methods of order 4 in 4 stages damp every damped mode if the step
-# size times |eigenvalue| is below this limit; for undamped and overdamped modes it is
-# 2.8.
+# size times |eigenvalue| is below this (2.8 for undamped and overdamped modes).
 _STABLE = 2.6
 
 

@@ -75,8 +75,7 @@ def joint_reactions(
     **Arguments:** `linkage`, `forces` and `solution` of one `simulate`.
 
     **Returns:** force (x, y) [N] and moment [N m] on the moving link, at its
-    characteristic point (see `joint_positions`). The opposite acts on the previous
-    link.
+    characteristic point (see `joint_positions`). The previous link gets the opposite.
 
     **Raises:** ValueError if `forces` is not a tuple of force elements, and for an
     element that moves masses but has no method `loads`.

@@ -143,8 +143,7 @@ class CircleTask(eqx.Module):
             )
 
 
-# These are functions, because each access to an equinox module's method creates an
-# object.
+# Functions, because each access to a method of an equinox module creates an object.
 
 
 def _turned(circle: CircleTask, t: Array) -> tuple[Array, Array, Array]:

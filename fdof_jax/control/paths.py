@@ -124,8 +124,7 @@ class Spline(Path):
     """A cubic spline through points, equally spaced in the share of the way.
 
     **Arguments:** `points`: three or more (x, y) [m]; `closed`: whether the spline
-    leads from the last point back to the first. An open spline has no curvature at its
-    ends.
+    returns from the last point to the first. An open one is straight at its ends.
 
     **Raises:** ValueError for malformed arguments.
 

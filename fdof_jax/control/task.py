@@ -83,8 +83,7 @@ class TipTask(eqx.Module):
 
     **Arguments:**
 
-    - `path`: a `Path`: `Line`, `Ellipse`, `FigureEight`, `Spline` or a subclass of
-      your own.
+    - `path`: a `Path`: `Line`, `Ellipse`, `FigureEight`, `Spline` or your own subclass.
     - `timing`: a `Travel` or `Laps`, or any function from time to the share of the way.
     - `orientation`: th4, the absolute angle of the last link [rad].
     - `branch`: assembly of the arm, 1 or -1: see `inverse_kinematics`.

@@ -156,10 +156,7 @@ def _longer_and_longer(
     high: np.ndarray,
     **keywords: Any,
 ) -> list[Run]:
-    """Runs searches over growing parts of the time, and returns those over all of it.
-
-    `until`: evaluates the motion up to a share of the time.
-    """
+    """Runs over growing shares of the time; `until(share)` evaluates up to a share."""
     keywords = dict(method="levenberg-marquardt") | keywords
     for share, longer in zip(_SHARES, _SHARES[1:]):
         runs = minimise(until(share), z, low, high, enough=_ENOUGH_EARLY, **keywords)

@@ -15,12 +15,7 @@ from ..checks import real_array, whole_number
 from ..linkage.linkage import Linkage
 from ..simulation.solution import Solution
 from .arms import DrawnMotion, draw_arm, draw_ground, geometries_of, panels_of
-from .axes import (
-    GREY,
-    plane_axes,
-    reached,
-    xy,
-)
+from .axes import GREY, plane_axes, reached, xy
 from .geometry import Geometry, geometry
 
 
@@ -64,10 +59,7 @@ def _animation(
     say: Callable[..., Any],
     new: bool,
 ) -> FuncAnimation:
-    """Animates motions in the panels of a `new` or given figure.
-
-    `say` writes the time.
-    """
+    """Animates motions in panels of a `new` or given figure; `say` writes the time."""
     moving = []
     for ax, (ts, g) in zip(panels, motions):
         draw_ground(ax)
@@ -115,9 +107,8 @@ def animate(
     **Arguments:** `fps`: frames per second; `speed`: 2 shows the motion twice as fast.
 
     **Returns:** the animation; a notebook plays it if it is the last line of a cell.
-    Keep a reference to it until it is shown. `.save("motion.gif")` and
-    `.save("motion.mp4")` write it, the latter with ffmpeg; `.to_jshtml()` returns a
-    player as text, for a web page.
+    Keep it until it is shown. `.save("motion.gif")` and `.save("motion.mp4")` write it,
+    the latter with ffmpeg; `.to_jshtml()` returns a player as text, for a web page.
 
     **Raises:** ValueError for malformed arguments.
     """

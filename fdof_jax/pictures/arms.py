@@ -25,23 +25,15 @@ from .geometry import Geometry, geometry
 
 _LINKS = (BLACK, *SERIES[:3])
 
-
 # Markers, in points: a carriage on a piece of its rail, a bearing on hatched ground.
 # Path codes: 1 moves the pen, 2 draws a line, 79 closes the outline.
 _BOX = [(-0.55, -0.35), (0.55, -0.35), (0.55, 0.35), (-0.55, 0.35), (0, 0)]
-
-
 _CARRIAGE = Path([(-1, 0), (1, 0), *_BOX], [1, 2, 1, 2, 2, 2, 79])
-
-
 _HATCH = [p for x in (-0.9, -0.45, 0, 0.45) for p in ((x, -1), (x + 0.3, -0.7))]
-
-
 _BEARING = Path(
     [(0, 0), (-0.5, -0.7), (0.5, -0.7), (0, 0), (-0.9, -0.7), (0.9, -0.7), *_HATCH],
     [1, 2, 2, 79] + [1, 2] * 5,
 )
-
 
 _STYLES: dict[str, dict[str, Any]] = {
     "link": dict(lw=2.2, solid_capstyle="round", solid_joinstyle="round"),

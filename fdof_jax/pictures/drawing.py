@@ -20,11 +20,7 @@ from ..linkage.linkage import Linkage
 from ..simulation.solution import Solution
 from .animation import animate as animate, animate_grid as animate_grid
 from .arms import draw_arm, draw_ground, draw_motion, geometries_of, panels_of
-from .axes import (
-    legend,
-    plane_axes,
-    reached,
-)
+from .axes import legend, plane_axes, reached
 from .geometry import geometry
 
 
@@ -105,8 +101,7 @@ def topology_grid(
     """Draws linkages side by side, each with a few configurations and its tip's path.
 
     **Arguments:** `motions`: title -> (linkage, its solution); `configurations`: number
-    of configurations of each, evenly spaced in samples from the first (faint) to the
-    last.
+    for each, evenly spaced in samples from the first (faint) to the last.
 
     **Returns:** the figure.
 

@@ -33,8 +33,7 @@ def geometry(linkage: Linkage, q: np.ndarray) -> Geometry:
     start = np.cumsum(np.column_stack([np.zeros(len(x)), steps]), axis=1)
     end = start + along
     com = np.asarray(linkage.com)
-    # The foot of the perpendicular from the mass centre to A_n.
-    foot = start[:, 1:] + com[:, 0] * direction[:, 1:]
+    foot = start[:, 1:] + com[:, 0] * direction[:, 1:]  # mass centre projected on A_n
     center = foot + 1j * com[:, 1] * direction[:, 1:]
     revolute = np.asarray(linkage.ef)[1::2] > 0.5
 

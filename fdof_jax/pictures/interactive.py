@@ -41,10 +41,7 @@ class _Moved(NamedTuple):
 
 @eqx.filter_jit
 def _moved(scene: Scene, stretch: Array, factor: Array) -> _Moved:
-    """Simulates a scene with its links stretched and its gains multiplied.
-
-    `stretch`: factors of the moving links (3,); `factor`: factors of kp and kd (2, 3).
-    """
+    """Simulates links `stretch` (3,) times as long, and gains times `factor` (2, 3)."""
     linkage = eqx.tree_at(
         lambda linkage: (linkage.length, linkage.com),
         scene.linkage,
@@ -73,10 +70,7 @@ def _moved(scene: Scene, stretch: Array, factor: Array) -> _Moved:
 
 
 def _told(moved: _Moved, error: np.ndarray) -> str:
-    """HTML text on how the motion ended, with gains and lengths.
-
-    `error`: tip errors [m].
-    """
+    """HTML text on the motion's end, gains and lengths; `error`: tip errors [m]."""
     solution = moved.solution
     time = float(solution.stats["time_reached"])
     if not np.all(moved.possible):
@@ -190,8 +184,7 @@ def sliders(scenes: Mapping[str, Scene] | None = None) -> Any:
     reports how the motion ended. A motion that fails is drawn as far as it went.
 
     The first motion takes some seconds to compile. Scenes that differ in numbers only,
-    as all topologies do, share the program. Motions are accurate to about 1e-5 m and
-    rad.
+    as all topologies do, share the program. Motions are accurate to some 1e-5 m or rad.
 
     **Arguments:** `scenes`: name -> a scene with exactly one PD controller, tracking a
     task with a `tip`; by default `circle_scenes()`, one arm per topology.

@@ -117,8 +117,7 @@ def energy_profile(
 def _powers(linkage: Linkage, forces: Forces, solution: Solution) -> np.ndarray:
     """Power of each element on the arm (element, time) [W].
 
-    Exchange with an element's own potential energy, for instance a spring's, does not
-    count.
+    Exchange with an element's own potential energy (of a spring) does not count.
     """
     efforts = joint_efforts(linkage, forces, solution).elements
     powers = jnp.einsum("etj,tj->et", efforts, solution.qd)

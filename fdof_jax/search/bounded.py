@@ -22,8 +22,6 @@ from .methods import (
 
 # The loss may vanish, so its gradient is also compared with that at the start.
 _GRADIENT_DECREASE = 1e-10
-
-
 # A stop for another reason counts as convergence if the projected gradient is at most
 # this part of the loss.
 _CONVERGED = 1e-2

@@ -47,10 +47,8 @@ class Lanes:
         starts: int = 1,
         order: int = 1,
     ):
-        """Stacks the problems.
-
-        **Arguments:** `problems`: a row of equally many members for each run; `starts`:
-        number of runs per row; `order`: order of the power mean over the members.
+        """`problems`: rows of equally many members, for as many runs as `starts` each;
+        `order`: order of the power mean over the members.
         """
         self.evaluate, self.order = evaluate, order
         every = stacked([stacked(members) for members in problems])

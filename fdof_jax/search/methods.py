@@ -9,8 +9,6 @@ from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
 
 # A run stops if, to first order, changing the unknowns by 1 hardly changes the loss.
 GRADIENT_OF_LOSS = 1e-6
-
-
 # Greatest change of an unknown in a step: a factor of 7 if unknowns are logarithms.
 LONGEST_STEP = 2.0
 

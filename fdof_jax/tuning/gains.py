@@ -8,12 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ..checks import (
-    callable_tuple,
-    instance,
-    is_traced,
-    real_array,
-)
+from ..checks import callable_tuple, instance, is_traced, real_array
 from ..linkage.coordinates import real_state
 from ..linkage.linkage import check_linkage, joint_names
 from ..search.methods import Evaluation
@@ -24,8 +19,6 @@ from ..simulation.solution import Solution
 from .losses import Tracking, controller_of, relative_demands, tip_errors
 
 Loss = Callable[[Scene, Solution], Array]
-
-
 SAMPLES = 1001
 
 

@@ -47,8 +47,8 @@ def circle_scenes() -> dict[str, Scene]:
     All arms have links of 1 m, 0.8 m and 0.5 m with masses of 2 kg, 1.5 kg and 1 kg.
     They start at rest in the same configuration, with their tip 5 cm inside the circle
     of 0.25 m radius, and keep the angle of their last link. Only the choice of the real
-    joint of each pair differs. Gains and limits (150 N m or N) are the same for all
-    joints of a kind.
+    joint of each pair differs. All joints of a kind have the same gains and limits
+    (150 N m or N).
 
     >>> import fdof_jax as fj
     >>> scenes = fj.circle_scenes()

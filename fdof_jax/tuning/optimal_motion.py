@@ -195,10 +195,10 @@ def optimal_efforts(
 
     Over a longer run [0, t1], any controller's mean squared tip error is at least the
     minimum times horizon / t1, reached if the tip is exactly on its path after the
-    horizon (`OptimalMotion.bound`). This bound is strict only if the minimum is global,
-    which is not proved: it is the best found from two first guesses, the efforts of the
-    scene's own controller and those of computed torque. Efforts that jump between the
-    knots may do slightly better; double the number of knots to see by how much.
+    horizon (`OptimalMotion.bound`). This bound is rigorous only if the minimum is
+    global. That is not proved: it is the best found from two first guesses, the efforts
+    of the scene's own controller and those of computed torque. Efforts that jump
+    between the knots may do slightly better; double the knots to see by how much.
 
     A short horizon suffices, because most of the error arises on the way to the path.
     If the arm tumbles by itself, a longer horizon makes the efforts harder to find.

@@ -7,12 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..checks import (
-    keywords_as,
-    one_of,
-    real_array,
-    whole_number,
-)
+from ..checks import keywords_as, one_of, real_array, whole_number
 from ..search.bounded import Row, Run, minimise, reporting
 from ..search.lanes import Lanes
 from ..search.methods import METHODS
@@ -31,8 +26,6 @@ from .losses import Tracking, tip_errors
 from .result import TradeOff, TuneResult, result_of
 
 _ENOUGH = 1e-4  # half of it in the rms
-
-
 # The worst of an ensemble is smoothed to a power mean of this order. With n members it
 # is at most a factor of n^(1/32) below the worst.
 _WORST = 32
