@@ -21,7 +21,7 @@ _OF_SEARCH = "method", "starts", "seed", "max_steps"
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Parse the command line, run the command, print its results."""
+    """Parses the command line, runs the command, and prints its results."""
     parser = _parser()
     options = parser.parse_args(arguments)
     if options.command == "tune":
@@ -103,13 +103,13 @@ def _add_tuning(command: argparse.ArgumentParser) -> None:
     share = _number(float, "a number from 0 to below 1", lambda x: 0 <= x < 1)
     count = _number(int, "a whole number of at least 1", lambda n: n >= 1)
     seed = _number(int, "a whole number of at least 0", lambda n: n >= 0)
-    job = command.add_argument_group("the circle, and by what gains are judged")
+    job = command.add_argument_group("the circle and the loss")
     for name, numbers, kind, text in (
         ("center", 2, real, "middle of the circle, x y [m]"),
-        ("radius", None, not_negative, "of the circle [m]"),
+        ("radius", None, not_negative, "radius of the circle [m]"),
         ("period", None, not_zero, "time of one turn; two are simulated [s]"),
         ("factor", None, above_one, "the gains stay within this factor of the paper's"),
-        ("price", None, not_negative, "of full effort of one joint all the time [m^2]"),
+        ("price", None, not_negative, "price of a joint's constant full effort [m^2]"),
         ("members", None, count, "size of the ensemble"),
         (
             "payload",
@@ -121,9 +121,9 @@ def _add_tuning(command: argparse.ArgumentParser) -> None:
             "start-offset",
             None,
             not_negative,
-            "of the ensemble: of the tip at the start [m]",
+            "of the ensemble: offset of the tip at the start [m]",
         ),
-        ("speed", 2, speed, "of the ensemble: least and greatest speed, 1 as said"),
+        ("speed", 2, speed, "of the ensemble: least and greatest factor on the speed"),
         ("link-error", None, share, "of the ensemble: relative error of masses"),
     ):
         default = getattr(Job, name.replace("-", "_"))
@@ -138,22 +138,22 @@ def _add_tuning(command: argparse.ArgumentParser) -> None:
         "ensemble; nominal by default",
     )
     search = command.add_argument_group("the search")
-    # No defaults here: they would override what --resume has read.
+    # No defaults here: they would override those read by --resume.
     search.add_argument(
         "--method", choices=METHODS, help="levenberg-marquardt by default"
     )
     search.add_argument("--starts", type=count, help="runs; 1 by default")
-    search.add_argument("--seed", type=seed, help="of the random starts; 0 by default")
+    search.add_argument("--seed", type=seed, help="of random starts; 0 by default")
     search.add_argument("--max-steps", type=count, help="50 by default")
     search.add_argument(
-        "--save", type=_new_file, metavar="FILE", help="keep the result"
+        "--save", type=_new_file, metavar="FILE", help="save the result"
     )
     search.add_argument(
         "--resume",
         type=_saved_run,
         metavar="FILE",
-        help="go on with what --save has kept: its circle, bounds, ensemble and search "
-        "(with other random starts)",
+        help="continue a run saved by --save with its circle, bounds, ensemble and "
+        "search (with other random starts)",
     )
 
 
@@ -168,7 +168,7 @@ def _number(
             value = kind(text)
         except ValueError:
             value = math.nan
-        # Of NaN, the comparison is false.
+        # Comparisons with NaN are false.
         if abs(value) < math.inf and fits(value):
             return value
         raise argparse.ArgumentTypeError(f"expected {expected}, got {text!r}.")
@@ -202,12 +202,12 @@ def _saved_run(text: str) -> Path:
 
 
 def _given(options: argparse.Namespace, names: Sequence[str]) -> dict[str, Any]:
-    """The options with these names that are on the command line."""
+    """Options among `names` that are given on the command line."""
     return {n: v for n in names if (v := getattr(options, n)) is not None}
 
 
 def _check_tuning(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
-    """Exit with status 2 if options of `tune` contradict each other."""
+    """Exits with status 2 if options of `tune` contradict each other."""
     given = _given(options, _OF_JOB)
     if given and options.resume is not None:
         parser.error(
@@ -228,7 +228,7 @@ def _check_tuning(parser: argparse.ArgumentParser, options: argparse.Namespace) 
 def _check_folder(
     parser: argparse.ArgumentParser, option: str, folder: Path, make: bool = False
 ) -> None:
-    """Exit with status 2 unless files can be written into the folder."""
+    """Exits with status 2 unless files can be written into the folder."""
     try:
         if make:
             folder.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""The paper's three examples as data. Each value's source is the figure's own list."""
+"""The paper's three examples as data; each value is from the figure's own list."""
 
 import numpy as np
 
@@ -13,8 +13,8 @@ from .simulation.scene import Scene as Scene
 def fig3() -> Scene:
     """Figs 3 and 4: a damped triple pendulum with offset mass centres, from rest.
 
-    Gravity is not printed: 9.81 m/s^2. The damping acts on the relative rates of the
-    revolute joints.
+    Gravity is not printed; we choose 9.81 m/s^2. The damping acts on the relative rates
+    of the revolute joints.
 
     >>> import fdof_jax as fj
     >>> scene = fj.scenes.fig3()
@@ -35,7 +35,7 @@ def fig3() -> Scene:
 def fig5() -> Scene:
     """Figs 5 and 6: a conservative triple pendulum of point masses, from rest.
 
-    Gravity is not printed: 9.81 m/s^2.
+    Gravity is not printed; we choose 9.81 m/s^2.
 
     >>> import fdof_jax as fj
     >>> arm, start, forces, t1 = fj.scenes.fig5()
@@ -53,10 +53,10 @@ def fig5() -> Scene:
 
 
 def fig7() -> Scene:
-    """Fig 7: an RPR arm under saturated PD control, its tip commanded along a circle.
+    """Fig 7: an RPR arm under saturated PD control whose tip tracks a circle.
 
-    The initial angles are absolute and the list's second "THETA 4" is theta 1; gravity
-    and the circle are not printed: 9.81 m/s^2, and `CircleTask`'s default, our choice.
+    The initial angles are absolute, and the list's second "THETA 4" is theta 1. Gravity
+    and the circle are not printed: we choose 9.81 m/s^2 and the default `CircleTask`.
 
     >>> import fdof_jax as fj
     >>> arm, start, (control,), t1 = fj.scenes.fig7()

@@ -1,1 +1,1 @@
-"""What one asks of a motion or a configuration: reactions, linearisation."""
+"""Analysis of configurations and motions: equilibria, linearisation, reactions."""

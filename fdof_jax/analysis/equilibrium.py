@@ -20,15 +20,15 @@ def equilibrium(
 ) -> Float[Array, " joint"]:
     """Joint positions near `q` at which the arm stays at rest under its forces.
 
-    An operating point for `linearize`: under a PD controller, the position that it
-    holds while the reference stands still, its sag included.
+    An equilibrium is an operating point for `linearize`. Under a PD controller it is
+    the position held while the reference stands still, including the sag.
 
-    **Arguments:** the linkage; force elements without a state of their own; `q`: a
-    first guess [m or rad]; `t`: the time that the elements are given [s].
+    **Arguments:** `linkage`; `forces`: elements without a state of their own; `q`:
+    first guess [m or rad]; `t`: time at which the elements are evaluated [s].
 
-    **Returns:** positions (3,); NaN where Levenberg and Marquardt's method finds none,
-    from a guess at which actuators are at their limits for instance. It need not be
-    stable: see `linearize`.
+    **Returns:** positions (3,); NaN if the Levenberg-Marquardt method finds none, for
+    instance from a guess at which actuators are at their limits. The equilibrium need
+    not be stable: see `linearize`.
 
     **Raises:** ValueError for malformed arguments.
 
@@ -51,7 +51,8 @@ def _rest(linkage: Linkage, forces: Forces, q: Array, t: Array) -> Array:
             total = total + element(t, q, still, linkage)
         return total
 
-    # Efforts over what rounds them: stiff controllers are as exact as soft springs.
+    # Efforts relative to their rounding errors' scale: stiff controllers converge as
+    # exactly as soft springs.
     slopes = jnp.abs(jax.jacfwd(efforts)(q, None))
     size = jax.lax.stop_gradient(
         slopes @ (1 + jnp.abs(q)) + jnp.abs(efforts(q, None)) + 1
@@ -61,7 +62,7 @@ def _rest(linkage: Linkage, forces: Forces, q: Array, t: Array) -> Array:
     relative = lambda q, _: efforts(q, None) / size
     found = optimistix.root_find(relative, solver, q, throw=False)
     good = found.result == optimistix.RESULTS.successful
-    # Not by `where`: where none is found the derivative is NaN too.
+    # A product, unlike `where`, makes the derivative NaN too if none is found.
     return found.value * jnp.where(good, 1, jnp.nan)
 
 
@@ -70,8 +71,8 @@ def holding_efforts(
 ) -> Float[Array, " joint"]:
     """The joint efforts that hold the arm at rest against gravity [N or N m].
 
-    **Arguments:** the linkage; `q`: joint positions [m or rad]; `forces`: elements
-    whose masses are held too.
+    **Arguments:** `linkage`; `q`: joint positions [m or rad]; `forces`: elements whose
+    masses are held too.
 
     **Raises:** ValueError for malformed arguments.
 

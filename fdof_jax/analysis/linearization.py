@@ -1,4 +1,4 @@
-"""Linear analysis for control: A and B, modes, equilibria, the regressor."""
+"""Linear analysis for control: the matrices A and B, and modes along a motion."""
 
 from typing import NamedTuple
 
@@ -18,15 +18,16 @@ from ..linkage.linkage import Linkage, check_linkage
 from ..simulation.prescribed import prescribed
 from ..simulation.solution import Solution
 
-# Explicit Runge-Kutta methods of order 4 in 4 stages damp every mode that is damped if
-# the step times |eigenvalue| is below this; undamped and overdamped ones up to 2.8.
+# Explicit Runge-Kutta methods of order 4 in 4 stages damp every damped mode if the step
+# size times |eigenvalue| is below this (2.8 for undamped and overdamped modes).
 _STABLE = 2.6
 
 
 class Linearization(NamedTuple):
-    """d(q, qd)/dt = A (q, qd) + B tau, about a state: (6, 6) and (6, 3).
+    """Matrices of d(q, qd)/dt = A (q, qd) + B tau about a state, (6, 6) and (6, 3).
 
-    For small changes of positions [m or rad], velocities and efforts [N or N m].
+    They hold for small changes of positions [m or rad], velocities and efforts
+    [N or N m].
     """
 
     A: Float[Array, "6 6"]
@@ -55,14 +56,14 @@ def checked(linkage: Linkage, forces: Forces) -> None:
 def linearize(
     linkage: Linkage, forces: Forces, state: State, t: ArrayLike = 0.0
 ) -> Linearization:
-    """The equations of motion to first order about a state, at a time.
+    """Linearises the equations of motion about a state, at a time.
 
-    **Arguments:** the linkage; force elements without a state of their own; `state`:
-    joint positions and velocities; `t`: the time that the elements are given [s].
+    **Arguments:** `linkage`; `forces`: elements without a state of their own; `state`:
+    joint positions and velocities; `t`: time at which the elements are evaluated [s].
 
-    **Returns:** `A` and `B` of d(q, qd)/dt = A (q, qd) + B tau, for small changes; tau
-    are efforts in the joints besides those of the forces [N or N m]. Of a force with
-    kinks the slope where it is: a controller at its limit has no gains.
+    **Returns:** `A` and `B` of d(q, qd)/dt = A (q, qd) + B tau, for small changes. The
+    efforts tau act in the joints in addition to the forces [N or N m]. For a force with
+    kinks, the slope at the state counts: a controller at its limit has no gains.
 
     **Raises:** ValueError for malformed arguments.
 
@@ -92,9 +93,9 @@ def _linearized(
 
 
 class Modes(eqx.Module):
-    """The eigenvalues of A along a motion, the fastest last.
+    """Eigenvalues of the matrix A along a motion, the fastest last.
 
-    - `eigenvalues`: (time, 6) [1/s]; NaN where the motion is.
+    - `eigenvalues`: (time, 6) [1/s]; NaN where the motion is NaN.
 
     >>> import fdof_jax as fj
     >>> import numpy as np
@@ -114,35 +115,35 @@ class Modes(eqx.Module):
 
     @property
     def damping(self) -> Float[np.ndarray, "time 6"]:
-        """Damping ratios: 1 or -1 for real eigenvalues, NaN for one of 0."""
+        """Damping ratios: 1 or -1 for real eigenvalues, NaN for zero."""
         with np.errstate(invalid="ignore"):
             return -np.real(self.eigenvalues) / self.frequency
 
     @property
     def longest_step(self) -> Float[np.ndarray, " time"]:
-        """The longest steps at which a method of Runge-Kutta of order 4 is stable [s].
+        """Longest step sizes at which a Runge-Kutta method of order 4 is stable [s].
 
-        By a rule for any damping: 2.6 over the fastest frequency.
+        The rule holds for any damping: 2.6 over the fastest frequency.
         """
         with np.errstate(divide="ignore"):
             return _STABLE / self.frequency.max(axis=1)
 
 
 def closed_loop_modes(linkage: Linkage, forces: Forces, solution: Solution) -> Modes:
-    """Eigenvalues of the linearised equations, at each time of a motion.
+    """Computes the eigenvalues of the linearised equations at each time of a motion.
 
-    A local picture, of an arm that stays as it is at that time: along a path that
-    changes as fast as the modes do, stable eigenvalues do not prove stability. A
-    joint whose controller is at its limit shows as one whose gains do not act.
+    Each time is analysed as if the arm stayed there. Along a path that changes as fast
+    as the modes, stable eigenvalues do not prove stability. While a controller is at
+    its limit, the gains of that joint do not act.
 
-    Computed on the CPU, by NumPy, as XLA has eigenvalues of general matrices there
-    only: not for use within JAX's transformations.
+    NumPy computes the eigenvalues on the CPU, as XLA has those of general matrices only
+    there. The function cannot be used within JAX's transformations.
 
-    **Arguments:** the linkage; force elements without a state of their own; a solution
-    that they took part in.
+    **Arguments:** `linkage`; `forces`: elements without a state of their own;
+    `solution`: a motion under these forces.
 
     **Returns:** `Modes`, with natural frequencies [rad/s], damping ratios and the
-    longest step of an explicit method [s].
+    longest step size of an explicit method [s].
 
     **Raises:** ValueError for malformed arguments.
 

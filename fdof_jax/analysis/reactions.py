@@ -1,4 +1,4 @@
-"""Bearing reactions: what the links do to one another in the joints."""
+"""Bearing reactions: forces and moments between links in the joints."""
 
 from typing import Any
 
@@ -20,7 +20,7 @@ from ..simulation.solution import Solution
 def _loads(
     linkage: Linkage, forces: Forces, t: Any, q: Array, qd: Array, qdd: Array
 ) -> tuple[Array, Array]:
-    """On the ground and the links: forces, and moments about the ground pivot."""
+    """Forces on the ground and the links, and moments about the ground pivot."""
     frames = frames_of(linkage, tuple(q))
     force, moment = jnp.zeros(4, complex), jnp.zeros(4)
     for index, element in enumerate(forces):
@@ -66,19 +66,19 @@ def _reactions(
 def joint_reactions(
     linkage: Linkage, forces: Forces, solution: Solution
 ) -> Float[Array, "time joint 3"]:
-    """What each joint's bearing does to the link beyond it, along a motion.
+    """Force and moment of each joint's bearing on the next link, along a motion.
 
-    From the balances of Newton and Euler, link by link from the tip. Where a joint is
-    free to move, this is the effort that passes through it: of dampers, controllers,
-    drives and armatures; loads on points act on the links themselves.
+    They follow from the balances of Newton and Euler, link by link from the tip. In a
+    joint's free direction, the reaction is the effort of dampers, controllers, drives
+    and armatures. Loads on points act on the links themselves.
 
-    **Arguments:** the linkage, the forces and the solution of one `simulate`.
+    **Arguments:** `linkage`, `forces` and `solution` of one `simulate`.
 
     **Returns:** force (x, y) [N] and moment [N m] on the moving link, at its
-    characteristic point (see `joint_positions`). The link before takes the opposite.
+    characteristic point (see `joint_positions`). The previous link gets the opposite.
 
     **Raises:** ValueError if `forces` is not a tuple of force elements, and for an
-    element that moves masses without saying by which `loads`.
+    element that moves masses but has no method `loads`.
 
     >>> import fdof_jax as fj
     >>> import numpy as np

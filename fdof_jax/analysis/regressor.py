@@ -1,4 +1,4 @@
-"""Inertial parameters, in which inverse dynamics is linear."""
+"""Inertial parameters, and the regressor of the inverse dynamics."""
 
 import jax
 import jax.numpy as jnp
@@ -10,12 +10,12 @@ from ..linkage.linkage import Linkage, check_linkage, compiled
 
 
 def inertial_parameters(linkage: Linkage) -> Float[Array, "link 4"]:
-    """Per link: mass [kg], its moments m p, m q [kg m], and inertia about the start.
+    """Mass [kg], moments m p, m q [kg m] and inertia [kg m^2] of each link.
 
-    In these the dynamics are linear: see `regressor`. The inertia [kg m^2] is about the
-    characteristic point of the link.
+    The inertia is about the characteristic point of the link. The dynamics are linear
+    in these parameters: see `regressor`.
 
-    **Raises:** ValueError for what is not a linkage.
+    **Raises:** ValueError if `linkage` is not a linkage.
 
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig3().linkage
@@ -34,16 +34,16 @@ def regressor(
     qd: Float[Array, " joint"],
     qdd: Float[Array, " joint"],
 ) -> Float[Array, "joint link 4"]:
-    """What multiplies the inertial parameters in the inverse dynamics.
+    """Coefficients of the inertial parameters in the inverse dynamics.
 
-    tau = regressor : `inertial_parameters(linkage)`, summed over links and parameters;
-    the masses and inertias of the linkage do not count. By Lagrange's equations for one
-    parameter at a time.
+    The efforts are tau = regressor : `inertial_parameters(linkage)`, summed over links
+    and parameters. The regressor itself does not depend on the linkage's masses and
+    inertias. It is computed by Lagrange's equations for one parameter at a time.
 
-    Stacked over a motion its rank tells how many combinations of the parameters can be
-    identified: nine of the twelve for an RPR arm.
+    The rank of regressors stacked over a motion is the number of combinations of
+    parameters that can be identified: nine of the twelve for an RPR arm.
 
-    **Arguments:** the linkage; `q`, `qd`, `qdd`: joint positions, velocities and
+    **Arguments:** `linkage`; `q`, `qd`, `qdd`: joint positions, velocities and
     accelerations (3,) [m or rad, and per s and s^2].
 
     **Raises:** ValueError for malformed arguments.
@@ -64,9 +64,9 @@ def regressor(
         return start, direction
 
     def lagrangians(q, qd):
-        """Of unit parameters, (3, 4)."""
+        """Lagrangians of unit parameters, (3, 4)."""
         (start, along), (velocity, turning) = jax.jvp(parts, (q,), (qd,))
-        # d(direction)/dt = i rate direction.
+        # d(direction)/dt = i * rate * direction.
         rate = jnp.imag(turning * jnp.conj(along))
         g = linkage.gravity
         return jnp.stack(

@@ -1,4 +1,4 @@
-"""How well a controller tracks: saturation and the tip's deviation."""
+"""Measures of tracking: saturation and the tip's deviation."""
 
 import equinox as eqx
 import jax
@@ -19,7 +19,7 @@ def saturated(
 ) -> Bool[Array, "time joint"]:
     """Whether each actuator is at its limit, along a motion.
 
-    **Arguments:** a controller, and a solution that it took part in.
+    **Arguments:** `controller`; `linkage`; `solution`: a motion under the controller.
     """
     demand = jax.vmap(controller.demand, in_axes=(0, 0, 0, None))(
         solution.ts, solution.q, solution.qd, linkage
@@ -31,9 +31,9 @@ def saturated(
 def tip_deviation(
     linkage: Linkage, task: CircleTask, solution: Solution
 ) -> Float[Array, "time 2"]:
-    """From the commanded to the actual tip along a motion [m].
+    """Vectors from the commanded to the actual tip along a motion [m].
 
-    **Arguments:** a linkage, the task (anything with `tip(t)`), and a solution.
+    **Arguments:** `linkage`; `task`: anything with `tip(t)`; `solution`.
     """
     actual = jax.vmap(tip_position, in_axes=(None, 0))(linkage, solution.q)
     return actual - jax.vmap(task.tip)(solution.ts)

@@ -1,1 +1,1 @@
-"""What is commanded: controllers, drives, paths and their timing."""
+"""Controllers, drives, and reference motions along paths."""

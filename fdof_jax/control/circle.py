@@ -22,16 +22,16 @@ from .reference import known_reach
 
 
 class CircleTask(eqx.Module):
-    """A circle traced by the tip at constant speed, the last link keeping its angle.
+    """A circle traced by the tip at constant speed; the last link keeps its angle.
 
-    Called with `(t, linkage)` it gives the joint reference: the closed-form inverse
-    kinematics and its exact rate. The reference is continuous in time, also where the
-    path crosses the negative x axis or winds around the base; at t = 0 it is that of
-    `inverse_kinematics`.
+    A call with `(t, linkage)` returns the joint reference, computed by the closed-form
+    inverse kinematics and its exact rate. The reference is continuous in time, also
+    where the path crosses the negative x axis or winds around the base. At t = 0 it
+    equals that of `inverse_kinematics`.
 
-    Fig 7 does not print its circle: the default is our choice. It lies inside the reach
-    of the figure's arm and starts 0.25 m from the arm's tip, because the text speaks
-    of an initial offset.
+    The circle of Fig 7 is not printed in the paper: the default is our choice. It lies
+    inside the reach of the figure's arm and starts 0.25 m from the arm's tip, because
+    the text mentions an initial offset.
 
     **Arguments:**
 
@@ -42,8 +42,8 @@ class CircleTask(eqx.Module):
     - `orientation`: th4, the absolute angle of the last link [rad].
     - `branch`: assembly of the arm, 1 or -1: see `inverse_kinematics`.
 
-    **Raises:** ValueError for malformed arguments; `check`, and with it `simulate`, for
-    a circle out of the linkage's reach.
+    **Raises:** ValueError for malformed arguments. `check`, and so `simulate`, raises
+    it for a circle out of the linkage's reach.
 
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig7().linkage
@@ -80,7 +80,7 @@ class CircleTask(eqx.Module):
 
     @property
     def evaluates_in_numpy(self) -> bool:
-        """Whether `assembly` does; a subclass may move along another curve."""
+        """Whether `assembly` runs in NumPy; a subclass may move on another curve."""
         return type(self) is CircleTask
 
     def tip(self, t: ArrayLike) -> Float[Array, " 2"]:
@@ -113,9 +113,9 @@ class CircleTask(eqx.Module):
         return jax.jvp(positions, (t,), (jnp.ones_like(t),))
 
     def check(self, linkage: Linkage, ts: Array) -> None:
-        """Raise ValueError if the tip leaves the linkage's reach between the times.
+        """Raises ValueError if the tip leaves the linkage's reach between the times.
 
-        Or for values that the constructor refuses.
+        The constructor's checks are repeated first.
         """
         CircleTask(
             self.center, self.radius, self.period, self.phase, self.orientation,
@@ -143,11 +143,11 @@ class CircleTask(eqx.Module):
             )
 
 
-# Functions, because a call of a module's method makes an object each time.
+# Functions, because each access to a method of an equinox module creates an object.
 
 
 def _turned(circle: CircleTask, t: Array) -> tuple[Array, Array, Array]:
-    """Direction from the centre: its angle, cosine and sine."""
+    """Angle, cosine and sine of the direction from the centre at times `t`."""
     angle = circle.phase + 2 * np.pi * t / circle.period
     sin, cos = sine_and_cosine(angle)
     return angle, cos, sin
@@ -159,10 +159,10 @@ def _on_circle(circle: CircleTask, cos: Array, sin: Array) -> Array:
 
 
 def _bearing(circle: CircleTask, turned: tuple, hub: Array) -> Array:
-    """Angle of hub + radius * (cos, sin) without jumps.
+    """Angle of hub + radius * (cos, sin), without jumps.
 
-    The larger of the two vectors carries the angle; the smaller one adds less than
-    a quarter turn, for which the arctangent has no jump.
+    The angle of the larger of the two vectors is continuous. The smaller one adds at
+    most a quarter turn, over which the arctangent does not jump.
     """
     angle, cos, sin = turned
     xp, radius = namespace(angle, hub), circle.radius

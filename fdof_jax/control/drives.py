@@ -1,8 +1,8 @@
-"""Servo drives: what stands between a controller's command and a joint's effort.
+"""Servo drives, which turn a controller's command into a joint's effort.
 
-All work joint by joint. A command is a force element, a `PDController`, a
-`PIDController` or another drive for instance; what it returns is an effort, or for a
-motor a voltage.
+All drives work joint by joint. A command is a force element, for instance a
+`PDController`, a `PIDController` or another drive. It returns efforts, or voltages for
+a motor.
 """
 
 from abc import abstractmethod
@@ -25,13 +25,13 @@ from .reference import Reference
 
 
 class PIDController(StatefulElement):
-    """PD control with an integral of the position error, and limits.
+    """Saturated PID control of the joints, with anti-windup: a force element.
 
-    The effort is that of a `PDController` plus ki times the integral, clipped to
-    +-limit as a whole. Anti-windup by back-calculation: what the limit takes away flows
-    out of the integral, with the time constant kp / ki.
+    The effort is that of a `PDController` plus ki times the integral of the position
+    error, clipped to +-limit as a whole. Anti-windup is by back-calculation: the
+    clipped part of the effort drains the integral with the time constant kp / ki.
 
-    **Arguments:** one per joint or one for all.
+    **Arguments:** one value per joint or one for all.
 
     - `kp`, `kd`, `limit`, `reference`: as in `PDController`.
     - `ki`: gains of the integral, not negative; 0 where kp is [N/(m s) or N m/(rad s)].
@@ -68,7 +68,7 @@ class PIDController(StatefulElement):
             )
 
     def initial_state(self, linkage):
-        """The integral's share of the effort, (3,) [N or N m]."""
+        """The integral's share of the effort at the start, zeros (3,) [N or N m]."""
         return jnp.zeros(3)
 
     def __call__(self, t, q, qd, linkage, state):
@@ -81,31 +81,28 @@ class PIDController(StatefulElement):
 
     @property
     def jump_ts(self) -> Array | None:
-        """The times at which the reference says that it jumps, if it does."""
+        """Times at which the reference jumps [s], or None."""
         return self.pd.jump_ts
 
     def check(self, linkage: Linkage, ts: Array) -> None:
-        """The reference's own check, if it has one."""
+        """Repeats the PD controller's checks, its reference's included."""
         self.pd.check(linkage, ts)
 
     def possible(self) -> Array:
-        """Whether no gain or limit is negative, and none is an integral's alone."""
+        """Whether no gain or limit is negative, and ki is 0 where kp is 0."""
         lone = (self.ki > 0) & ~(self.pd.kp > 0)
         return self.pd.possible() & ((self.ki >= 0) & ~lone).all()
 
 
 class DriveState(NamedTuple):
-    """State of a drive: its `own`, and that of the `command`; () for none."""
+    """State of a drive: its `own` and its `command`'s state, () where there is none."""
 
     own: Any
     command: Any
 
 
 class _Drive(StatefulElement):
-    """A command and what a drive makes of it.
-
-    A subclass implements `respond`, and `initial` if it has a state of its own.
-    """
+    """A drive: a subclass implements `respond`, and `initial` if it has a state."""
 
     command: eqx.AbstractVar[Any]
 
@@ -115,10 +112,10 @@ class _Drive(StatefulElement):
 
     @abstractmethod
     def respond(self, command: Array, qd: Array, own: Any) -> tuple[Array, Any]:
-        """The efforts (3,), and the rate of the drive's own state."""
+        """The efforts (3,) and the rate of the drive's own state."""
 
     def initial_state(self, linkage):
-        """A `DriveState`."""
+        """The `DriveState` at the start."""
         stateful = isinstance(self.command, StatefulElement)
         inner = self.command.initial_state(linkage) if stateful else ()
         return DriveState(self.initial(), inner)
@@ -134,11 +131,11 @@ class _Drive(StatefulElement):
 
     @property
     def jump_ts(self) -> Array | None:
-        """The times at which the command says that it jumps, if it does."""
+        """Times at which the command jumps [s], or None."""
         return getattr(self.command, "jump_ts", None)
 
     def check(self, linkage: Linkage, ts: Array) -> None:
-        """The command's own check, if it has one."""
+        """Runs the command's own check, if it has one."""
         check: Any = getattr(self.command, "check", None)
         if check is not None:
             check(linkage, ts)
@@ -148,7 +145,7 @@ class _Drive(StatefulElement):
         """The parameters that must be positive."""
 
     def possible(self) -> Array:
-        """Whether they are, and what the command says of its own values."""
+        """Whether these parameters are positive and the command's values possible."""
         own = reduce(and_, [(value > 0).all() for value in self.positive()])
         possible: Any = getattr(self.command, "possible", None)
         return own if possible is None else own & possible()
@@ -164,10 +161,12 @@ def _command(value: Any) -> Any:
 
 
 class FirstOrderLag(_Drive):
-    """An effort that follows its command with a lag: its rate is the gap over a time.
+    """A drive whose effort follows its command with a first-order lag.
+
+    The rate of the effort is (command - effort) / time_constant.
 
     **Arguments:** `command`: a force element; `time_constant`: one per joint or one for
-    all, positive [s]; `start`: the effort at the start [N or N m].
+    all, positive [s]; `start`: initial effort [N or N m].
 
     **Raises:** ValueError for malformed arguments.
 
@@ -196,7 +195,7 @@ class FirstOrderLag(_Drive):
         return [self.time_constant]
 
     def initial(self):
-        """The effort, (3,) [N or N m]."""
+        """The initial effort, (3,) [N or N m]."""
         return self.start
 
     def respond(self, command, qd, own):
@@ -204,13 +203,13 @@ class FirstOrderLag(_Drive):
 
 
 class SpeedLimit(_Drive):
-    """An effort whose limit falls with speed: a straight torque-speed curve.
+    """A drive whose effort limit falls with speed: a straight torque-speed curve.
 
-    In the direction of motion at most stall * (1 - |qd| / no_load), and not below 0;
-    against it, at most stall.
+    In the direction of motion the effort is at most stall * (1 - |qd| / no_load), not
+    below 0. Against the motion it is at most stall.
 
-    **Arguments:** `command`: a force element; one per joint or one for all, positive:
-    `stall` [N or N m], `no_load` [m/s or rad/s].
+    **Arguments:** `command`: a force element; `stall` [N or N m] and `no_load` [m/s or
+    rad/s]: one per joint or one for all, positive.
 
     **Raises:** ValueError for malformed arguments.
 
@@ -236,7 +235,7 @@ class SpeedLimit(_Drive):
         return [self.stall, self.no_load]
 
     def respond(self, command, qd, own):
-        left = jnp.clip(1 - qd / self.no_load, 0, 1)  # of the positive limit
+        left = jnp.clip(1 - qd / self.no_load, 0, 1)  # share of the positive limit
         right = jnp.clip(1 + qd / self.no_load, 0, 1)
         return jnp.clip(command, -self.stall * right, self.stall * left), ()
 
@@ -244,17 +243,17 @@ class SpeedLimit(_Drive):
 class DCMotor(_Drive):
     """Brushed motors on geared joints: winding, back-EMF, limited voltage and current.
 
-    inductance * di/dt = v - resistance * i - constant * gear * qd, and the effort is
-    constant * gear * i. The command gives the voltages v. They are clipped to those
-    that lead to a current within its limit, then to +-voltage_limit: at speeds whose
-    back-EMF exceeds that, the back-EMF drives the current. Rotors are an `Armature`
-    beside it.
+    The current i obeys inductance * di/dt = v - resistance * i - constant * gear * qd,
+    and the effort is constant * gear * i. The command returns the voltages v. They are
+    clipped such that the current stays within its limit, then to +-voltage_limit. At
+    speeds whose back-EMF exceeds that limit, the back-EMF drives the current. The
+    inertia of the rotors is a separate `Armature`.
 
-    **Arguments:** one per joint or one for all, positive.
+    **Arguments:** one value per joint or one for all, positive.
 
     - `command`: a force element, read as voltages [V].
-    - `resistance` [ohm], `inductance` [H]: of the winding.
-    - `constant`: of torque and back-EMF [N m/A = V s/rad; N/A for a slide].
+    - `resistance` [ohm], `inductance` [H]: values of the winding.
+    - `constant`: torque and back-EMF constant [N m/A = V s/rad; N/A for a slide].
     - `gear`: turns of the motor per turn of the joint (per metre of a slide).
     - `voltage_limit` [V], `current_limit` [A]: may be infinite.
 
@@ -305,13 +304,13 @@ class DCMotor(_Drive):
         return [*winding, self.voltage_limit, self.current_limit]
 
     def initial(self):
-        """The currents, (3,) [A]."""
+        """The initial currents, zeros (3,) [A]."""
         return jnp.zeros(3)
 
     def respond(self, command, qd, own):
         per_joint = self.constant * self.gear
         back_emf = per_joint * qd
-        # Infinity times a tangent of 0 would not be a number.
+        # Infinity times a tangent of 0 would be NaN.
         unlimited = jnp.isinf(self.current_limit)
         most = self.resistance * jnp.where(unlimited, 0, self.current_limit)
         most = jnp.where(unlimited, jnp.inf, most)

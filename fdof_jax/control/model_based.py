@@ -1,4 +1,4 @@
-"""Controllers that know the arm: PD control with gravity held, and computed torque."""
+"""Controllers with a model of the arm: gravity feedforward and computed torque."""
 
 from typing import ClassVar
 
@@ -46,7 +46,7 @@ class _ModelBased(PDController):
         return linkage if self.model is None else self.model
 
     def check(self, linkage: Linkage, ts: Array) -> None:
-        """As of a PD controller; and the model's values, and its topology."""
+        """Runs the checks of a PD controller, and checks the model and its topology."""
         super().check(linkage, ts)
         self._check_model()
         if self.model is not None and not np.array_equal(self.model.ef, linkage.ef):
@@ -56,24 +56,24 @@ class _ModelBased(PDController):
             )
 
     def possible(self) -> Array:
-        """Whether gains and limits are not negative, and the model can be."""
+        """Whether gains and limits are not negative, and the model is possible."""
         own = super().possible()
         return own if self.model is None else own & possible(self.model)
 
 
 class GravityFeedforward(_ModelBased):
-    """PD control that holds the arm's weight besides: a force element.
+    """PD control plus the efforts that hold the arm's weight: a force element.
 
-    The effort is that of a `PDController` plus the one that holds the arm at rest
-    against gravity where it is (not where it should be), clipped to +-limit as a whole.
-    Without it PD control sags, in Fig 7 by a quarter of a metre.
+    The effort of a `PDController` and the effort that holds the arm at rest at its
+    actual position (not at the reference) are added and clipped to +-limit as a whole.
+    Plain PD control sags under gravity, in Fig 7 by a quarter of a metre.
 
     **Arguments:**
 
     - `kp`, `kd`, `limit`, `reference`: as in `PDController` [N/m or N m/rad, N s/m or
       N m s/rad, N or N m].
-    - `model`: the arm that the controller believes in; None: the arm itself. Masses of
-      other force elements, of a load for instance, are unknown to it.
+    - `model`: the controller's model of the arm; None: the arm itself. It does not
+      include masses of other force elements, for instance of a load.
 
     **Raises:** ValueError for malformed arguments.
 
@@ -94,9 +94,10 @@ class GravityFeedforward(_ModelBased):
 
 
 def _held(linkage: Linkage, q: Scalars) -> tuple[Array, ...]:
-    """The efforts that hold the arm at rest, from its tip to its base."""
+    """The efforts that hold the arm at rest against gravity, in joint order."""
     start, direction, turning = frames_of(linkage, q)
-    mass, moment = jnp.zeros(()), jnp.zeros(())  # beyond a joint; about the pivot
+    # The mass beyond a joint, and its first moment in x about the ground pivot.
+    mass, moment = jnp.zeros(()), jnp.zeros(())
     efforts = []
     for k in (2, 1, 0):
         along, across = linkage.com[k]
@@ -104,7 +105,7 @@ def _held(linkage: Linkage, q: Scalars) -> tuple[Array, ...]:
         center = start[k + 1].real + along * e.real - across * e.imag
         mass = mass + linkage.mass[k]
         moment = moment + linkage.mass[k] * center
-        # A slide runs across the link before: up as much as that link runs along x.
+        # A slide runs across the previous link: it rises as that link runs along x.
         arm = jnp.where(
             turning[k], moment - mass * start[k + 1].real, mass * direction[k].real
         )
@@ -113,23 +114,22 @@ def _held(linkage: Linkage, q: Scalars) -> tuple[Array, ...]:
 
 
 class ComputedTorque(_ModelBased):
-    """Control through the inverse dynamics: a force element.
+    """Computed-torque control, by the inverse dynamics: a force element.
 
-    The effort is M(q) (qdd_ref + kp e + kd de/dt) + bias(q, qd), clipped to +-limit as
-    a whole, e being q_ref - q. With an exact model and within the limits the errors of
-    all joints obey d2e/dt2 + kd de/dt + kp e = 0, each for itself.
+    The effort is M(q) (qdd_ref + kp e + kd de/dt) + bias(q, qd) with e = q_ref - q,
+    clipped to +-limit as a whole. With an exact model and within the limits, the error
+    of each joint obeys d2e/dt2 + kd de/dt + kp e = 0.
 
-    The acceleration qdd_ref is the derivative of the reference's velocities in time:
-    where those jump it has no impulse.
+    The acceleration qdd_ref is the time derivative of the reference's velocities. It
+    has no impulse where the velocities jump.
 
-    **Arguments:** one per joint or one for all.
+    **Arguments:** one value per joint or one for all.
 
-    - `kp` [1/s^2], `kd` [1/s]: gains of accelerations, not negative.
+    - `kp` [1/s^2], `kd` [1/s]: gains from errors to accelerations, not negative.
     - `limit`: largest effort [N or N m], may be infinite.
     - `reference`: as in `PDController`; differentiable in time.
-    - `model`: the arm that the controller believes in; None: the arm itself. Masses of
-      other force elements, of a load for instance, and all their efforts are unknown to
-      it.
+    - `model`: the controller's model of the arm; None: the arm itself. It does not
+      include masses of other force elements, for instance of a load, nor their efforts.
 
     **Raises:** ValueError for malformed arguments.
 

@@ -1,4 +1,4 @@
-"""References for controllers and prescribed motions: in joint space and of the tip."""
+"""Paths of the tip."""
 
 from abc import abstractmethod
 from typing import Any
@@ -17,7 +17,7 @@ from .timing import Laps, Travel
 
 
 class Path(eqx.Module):
-    """A curve of the plane [m]: a subclass has `point`, and says its `middle`.
+    """A curve in the plane [m]; a subclass defines `point` and `middle`.
 
     >>> import fdof_jax as fj
     >>> import jax.numpy as jnp
@@ -29,7 +29,7 @@ class Path(eqx.Module):
     [-4.0, 2.25]
     """
 
-    middle: eqx.AbstractVar[Array]  # (x, y), somewhere in the midst of it [m]
+    middle: eqx.AbstractVar[Array]  # a point (x, y) amid the curve [m]
 
     @abstractmethod
     def point(self, share: Array) -> Array:
@@ -65,7 +65,7 @@ class Line(Path):
 
 
 class _Closed(Path):
-    """A closed curve around a middle, of two sizes, turned by an angle."""
+    """A closed curve around `middle` with two `sizes`, turned by the angle `tilt`."""
 
     middle: Float[Array, " 2"]
     sizes: Float[Array, " 2"]
@@ -86,8 +86,8 @@ class _Closed(Path):
 class Ellipse(_Closed):
     """An ellipse, counter-clockwise from the end of its first axis.
 
-    **Arguments:** `middle`: (x, y) [m]; `sizes`: its half axes, not negative [m];
-    `tilt`: of the first axis [rad].
+    **Arguments:** `middle`: (x, y) [m]; `sizes`: the half axes, not negative [m];
+    `tilt`: angle of the first axis [rad].
 
     **Raises:** ValueError for malformed arguments.
 
@@ -102,10 +102,10 @@ class Ellipse(_Closed):
 
 
 class FigureEight(_Closed):
-    """An eight lying on its side, from its crossing.
+    """A figure eight lying on its side, starting at its crossing.
 
-    **Arguments:** `middle`: its crossing (x, y) [m]; `sizes`: half of its length, and
-    half of its height, not negative [m]; `tilt`: of its length [rad].
+    **Arguments:** `middle`: the crossing (x, y) [m]; `sizes`: half the length and half
+    the height, not negative [m]; `tilt`: angle of the long axis [rad].
 
     **Raises:** ValueError for malformed arguments.
 
@@ -123,8 +123,8 @@ class FigureEight(_Closed):
 class Spline(Path):
     """A cubic spline through points, equally spaced in the share of the way.
 
-    **Arguments:** `points`: three or more (x, y) [m]; `closed`: whether it leads from
-    the last back to the first. An open one is straight at its ends.
+    **Arguments:** `points`: three or more (x, y) [m]; `closed`: whether the spline
+    returns from the last point to the first. An open one is straight at its ends.
 
     **Raises:** ValueError for malformed arguments.
 
@@ -175,7 +175,7 @@ class Spline(Path):
         return a * self.points[k] + b * self.points[after] + bend / 6
 
 
-# The paths and timings that NumPy evaluates.
+# The paths and timings whose formulas also run in NumPy.
 IN_NUMPY = {Line, Ellipse, FigureEight, Spline, Travel, Laps}
 
 

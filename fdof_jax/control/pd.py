@@ -1,4 +1,4 @@
-"""Joint control of the third example (Fig 7): saturated PD and the circle it tracks."""
+"""Joint control of the third example (Fig 7): saturated PD."""
 
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -21,17 +21,17 @@ class PDController(ScalarElement):
 
     The effort is kp * (q_ref - q) + kd * (qd_ref - qd), clipped to +-limit as a whole.
     The position error is never wrapped: a start one turn away unwinds. The derivative
-    of an effort beyond its limit is zero, and that of one just at it is not.
+    is zero for a demand beyond the limit, but not for a demand just at the limit.
 
-    **Arguments:** all in joint order, one per joint or one for all.
+    **Arguments:** one value per joint, in joint order, or one for all.
 
     - `kp`: proportional gains, not negative [N/m or N m/rad].
     - `kd`: gains of the error rate, not negative [N s/m or N m s/rad].
     - `limit`: largest effort [N or N m], may be infinite.
-    - `reference`: a pytree called as `(t, linkage) -> (q_ref, qd_ref)`.
+    - `reference`: a callable pytree, `(t, linkage) -> (q_ref, qd_ref)`.
 
     **Raises:** ValueError for malformed or negative gains and limits, and for a
-    reference that cannot be called.
+    reference that is not callable.
 
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig7().linkage
@@ -47,7 +47,7 @@ class PDController(ScalarElement):
     limit: Float[Array, " joint"]
     reference: Reference
 
-    # Units of kp and kd by the kind of joint.
+    # Units of (kp, kd) by the kind of joint.
     gain_units: ClassVar = {"R": ("N m/rad", "N m s/rad"), "P": ("N/m", "N s/m")}
 
     def __init__(
@@ -65,11 +65,11 @@ class PDController(ScalarElement):
         self.reference = checked_reference(reference)
 
     def schedule(self, t: Array, linkage: Linkage) -> tuple[Any, ...]:
-        """The reference motion, which does not depend on the state: (q_ref, qd_ref)."""
+        """The reference motion (q_ref, qd_ref), independent of the state."""
         return reference_motion(self.reference, t, linkage)
 
     def respond(self, scheduled, q, qd, linkage):
-        # The derivative of jnp.clip at the limit is the mean of both sides'.
+        # At the limit, jnp.clip's derivative would be the mean of both sides.
         return tuple(
             jnp.where(jnp.abs(effort) <= limit, effort, jnp.clip(effort, -limit, limit))
             for effort, limit in zip(
@@ -80,7 +80,7 @@ class PDController(ScalarElement):
     def unlimited(
         self, scheduled: Any, q: Any, qd: Any, linkage: Linkage
     ) -> tuple[Array, ...]:
-        """The efforts before they are limited; a subclass adds to them."""
+        """The efforts before clipping; a subclass adds to them."""
         return tuple(
             kp * (position - q) + kd * (velocity - qd)
             for kp, kd, position, velocity, q, qd in zip(
@@ -89,17 +89,17 @@ class PDController(ScalarElement):
         )
 
     def demand(self, t: Array, q: Array, qd: Array, linkage: Linkage) -> Array:
-        """The effort before it is limited, (3,) [N or N m]."""
+        """The efforts before clipping, (3,) [N or N m]."""
         return jnp.stack(self.unlimited(self.schedule(t, linkage), q, qd, linkage))
 
     @property
     def jump_ts(self) -> Array | None:
-        """The times at which the reference says that it jumps, if it does."""
+        """Times at which the reference jumps [s], or None."""
         return getattr(self.reference, "jump_ts", None)
 
     def check(self, linkage: Linkage, ts: Array) -> None:
-        """The constructor's check again, then the reference's own, if it has one."""
-        # `equinox.tree_at` asks no constructor.
+        """Repeats the constructor's checks, then runs the reference's check, if any."""
+        # `equinox.tree_at` changes values without calling the constructor.
         PDController(self.kp, self.kd, self.limit, self.reference)
         check_reference: Any = getattr(self.reference, "check", None)
         if check_reference is not None:

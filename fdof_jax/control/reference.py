@@ -1,4 +1,4 @@
-"""What a controller follows, and whether an arm can."""
+"""References of controllers, and whether an arm can reach them."""
 
 from collections.abc import Callable
 from typing import Any
@@ -19,7 +19,7 @@ Reference = Callable[[Array, Linkage], tuple[Array, Array]]
 
 
 def checked_reference(value: Any) -> Any:
-    """`value` if it can be called as a reference, else ValueError."""
+    """Returns `value` if it is callable as a reference, else raises ValueError."""
     if not callable(value) or isinstance(value, type):
         raise ValueError(
             "reference: expected a callable (t, linkage) -> (q, qd), for instance "
@@ -31,7 +31,7 @@ def checked_reference(value: Any) -> Any:
 def reference_motion(
     reference: Reference, t: Array, linkage: Linkage
 ) -> tuple[Array, Array]:
-    """What a reference returns, refused unless it is positions and velocities (3,)."""
+    """Positions and velocities of a reference, checked to be two arrays (3,)."""
     motion = reference(t, linkage)
     if not isinstance(motion, tuple) or len(motion) != 2:
         raise ValueError(
@@ -44,13 +44,13 @@ def reference_motion(
 def known_assembly(
     reference: Any, linkage: Linkage, times: ArrayLike
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The `assembly` of a reference that evaluates in NumPy, at known times."""
+    """Evaluates the `assembly` of a reference in NumPy, at known times."""
     reference, linkage = in_numpy((reference, linkage))
     return reference.assembly(np.asarray(times), linkage)
 
 
 def positions_at(reference: Any, t: Array, linkage: Linkage) -> Any:
-    """Positions of a reference: by NumPy if they are known and it can."""
+    """Positions of a reference, by NumPy if it can and nothing is traced."""
     numpy = getattr(reference, "evaluates_in_numpy", False)
     if numpy and not is_traced(reference, t, linkage):
         return known_assembly(reference, linkage, t)[0]
@@ -58,11 +58,11 @@ def positions_at(reference: Any, t: Array, linkage: Linkage) -> Any:
 
 
 def known_reach(reference: Any, linkage: Linkage, times: ArrayLike) -> np.ndarray:
-    """`reachable` of known values."""
+    """Computes `reachable` for known values."""
     if getattr(reference, "evaluates_in_numpy", False):
         q, root = known_assembly(reference, linkage, times)
         return np.isfinite(q).all(axis=1) & (root != 0)
-    with jax.ensure_compile_time_eval():  # also where others are traced
+    with jax.ensure_compile_time_eval():  # also within transformations
         return np.asarray(_finite(reference, linkage, times))
 
 
@@ -75,9 +75,9 @@ def _finite(reference: Reference, linkage: Linkage, times: ArrayLike) -> Array:
 def reachable(
     linkage: Linkage, reference: Reference, ts: ArrayLike
 ) -> Bool[Array, " time"]:
-    """Whether a linkage can be where a reference wants it, at each time.
+    """Whether a linkage can reach the reference at each time.
 
-    **Arguments:** the linkage; `reference`: a `CircleTask` or `TipTask` for instance;
+    **Arguments:** `linkage`; `reference`: for instance a `CircleTask` or `TipTask`;
     `ts`: times (time,) [s].
 
     **Raises:** ValueError for malformed arguments.

@@ -1,4 +1,4 @@
-"""Paths followed by the tip, and moves of the joints."""
+"""References along paths of the tip, and moves of the joints."""
 
 from typing import Any
 
@@ -25,7 +25,7 @@ from .timing import Laps, Travel
 
 
 class JointMove(eqx.Module):
-    """All joints from one position to another, in step.
+    """A move of all joints from one position to another, in step.
 
     **Arguments:** `start`, `end`: joint positions [m or rad]; `travel`: a `Travel`.
 
@@ -51,11 +51,11 @@ class JointMove(eqx.Module):
 
     @property
     def evaluates_in_numpy(self) -> bool:
-        """Whether `assembly` does; a subclass may move in another way."""
+        """Whether `assembly` runs in NumPy; a subclass may move in another way."""
         return type(self) is JointMove
 
     def assembly(self, t: Array, linkage: Linkage) -> tuple[Array, float]:
-        """Joint positions, and 1 for a root: no edge of a reach is near."""
+        """Joint positions, and 1 as the root: a joint move has no edge of a reach."""
         share = self.travel(t)[..., None]
         return self.start + share * (self.end - self.start), 1.0
 
@@ -69,27 +69,27 @@ class JointMove(eqx.Module):
 
     @property
     def jump_ts(self) -> Array:
-        """When velocity or acceleration jump [s]."""
+        """Times at which velocity or acceleration jump [s]."""
         return self.travel.jump_ts
 
 
 class TipTask(eqx.Module):
-    """A path of the tip, the last link keeping its angle.
+    """A path of the tip on which the last link keeps its angle.
 
-    Called with `(t, linkage)` it gives the joint reference: the closed-form inverse
-    kinematics and its exact rate. The wrist (where the last link starts) must not cross
-    the half-line from the ground pivot away from the path's middle, where the angle of
-    a turning arm would jump: `simulate` checks it.
+    A call with `(t, linkage)` returns the joint reference, computed by the closed-form
+    inverse kinematics and its exact rate. The wrist (where the last link starts) must
+    not cross the half-line from the ground pivot away from the path's middle, where the
+    angle of a turning arm would jump; `simulate` checks this.
 
     **Arguments:**
 
-    - `path`: a `Path`: `Line`, `Ellipse`, `FigureEight`, `Spline` or one's own.
-    - `timing`: a `Travel` or `Laps`, or any function of time to the share of the way.
+    - `path`: a `Path`: `Line`, `Ellipse`, `FigureEight`, `Spline` or your own subclass.
+    - `timing`: a `Travel` or `Laps`, or any function from time to the share of the way.
     - `orientation`: th4, the absolute angle of the last link [rad].
     - `branch`: assembly of the arm, 1 or -1: see `inverse_kinematics`.
 
-    **Raises:** ValueError for malformed arguments; `check`, and with it `simulate`, for
-    a path out of the linkage's reach.
+    **Raises:** ValueError for malformed arguments. `check`, and so `simulate`, raises
+    it for a path out of the linkage's reach.
 
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig7().linkage
@@ -126,7 +126,7 @@ class TipTask(eqx.Module):
 
     @property
     def evaluates_in_numpy(self) -> bool:
-        """Whether `assembly` does; a subclass may move in another way."""
+        """Whether `assembly` runs in NumPy; a subclass may move in another way."""
         return type(self) is TipTask
 
     def assembly(self, t: Array, linkage: Linkage) -> tuple[Array, Array]:
@@ -138,7 +138,7 @@ class TipTask(eqx.Module):
         """The `assembly`, and the wrist's angle from the direction of the middle."""
         own = not {type(self.path), type(self.timing)} <= IN_NUMPY
         if own and namespace(t) is np:
-            with jax.ensure_compile_time_eval():  # also where others are traced
+            with jax.ensure_compile_time_eval():  # also within transformations
                 points = points_at(self.path, self.timing, jax.device_put(np.ravel(t)))
             tip: Any = np.asarray(points).reshape(*np.shape(t), 2)
         else:
@@ -165,18 +165,17 @@ class TipTask(eqx.Module):
 
     @property
     def jump_ts(self) -> Array | None:
-        """When the timing says that velocity or acceleration jump [s]."""
+        """Times at which velocity or acceleration jump by the timing [s]."""
         return getattr(self.timing, "jump_ts", None)
 
     def check(self, linkage: Linkage, ts: Array) -> None:
-        """Raise ValueError where the tip leaves the reach between the times.
+        """Raises ValueError if the tip leaves the reach or the wrist's angle jumps.
 
-        Looked at at 1000 times, or 1000 of one lap; or where the wrist's angle jumps
-        between two of them.
+        Both are checked at 1000 times between `ts[0]` and `ts[-1]`, at most one lap.
         """
         task, arm, ts = in_numpy((self, linkage, ts))
         end = ts[-1]
-        if isinstance(self.timing, Laps):  # of which all are alike
+        if isinstance(self.timing, Laps):  # all laps are alike
             end = min(end, ts[0] + abs(task.timing.period))
         times = np.linspace(ts[0], end, 1000, dtype=ts.dtype)
         q, _, beside = task._solved(times, arm)

@@ -1,4 +1,4 @@
-"""How far along a path, and when: profiles of point-to-point motions, and laps."""
+"""Timing along a path: profiles of point-to-point motions, and laps."""
 
 from collections.abc import Callable
 
@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike
 from ..checks import concrete, one_of, real_array
 from ..xla.array_namespace import namespace
 
-_MOST_TURN = 250  # that 48 nodes per piece resolve [rad]
-RAMP = 0.25  # of a trapezoidal profile: the share of its time in which it speeds up
+_MOST_TURN = 250  # [rad], as far as 48 nodes per piece resolve
+RAMP = 0.25  # share of its time in which a trapezoidal profile speeds up
 
 
 def _trapezoidal(x: Array) -> Array:
@@ -26,7 +26,7 @@ def _trapezoidal(x: Array) -> Array:
     return xp.where(x < RAMP, x**2 / scale, cruising)
 
 
-# The share of the way done at a share of the time, both from 0 to 1.
+# The share of the way as a function of the share of the time, both from 0 to 1.
 PROFILES: dict[str, Callable[[Array], Array]] = {
     "harmonic": lambda x: (1 - namespace(x).cos(np.pi * x)) / 2,
     "cycloidal": lambda x: x - namespace(x).sin(2 * np.pi * x) / (2 * np.pi),
@@ -36,15 +36,15 @@ PROFILES: dict[str, Callable[[Array], Array]] = {
 
 
 class Travel(eqx.Module):
-    """From the start of a path to its end in a given time: the share of the way.
+    """The timing of a travel from the start of a path to its end in a given time.
 
     **Arguments:**
 
     - `duration`: positive [s].
-    - `begin`: when it starts [s]. Before, it stands at the start.
-    - `profile`: "harmonic" (cosine of the way), "cycloidal" (sine of the acceleration),
-      "quintic" (no acceleration at both ends) or "trapezoidal" (of the velocity, a
-      quarter of the time each speeding up and slowing down).
+    - `begin`: time at which the travel starts [s]; it rests before.
+    - `profile`: "harmonic" (the way is a cosine), "cycloidal" (the acceleration is a
+      sine), "quintic" (no acceleration at both ends) or "trapezoidal" (the velocity is
+      a trapezium, speeding up and slowing down in a quarter of the time each).
     - `shock`: share of the way done at constant velocity. The velocity then jumps at
       both ends; see `shock_against`.
 
@@ -75,16 +75,16 @@ class Travel(eqx.Module):
         self.profile = one_of("profile", profile, tuple(PROFILES))
 
     def __call__(self, t: Array) -> Array:
-        """The share of the way at a time, from 0 to 1."""
+        """The share of the way at time `t` [s], from 0 to 1."""
         x = (t - self.begin) / self.duration
-        # At a jump what comes after it counts: the derivative of jnp.clip is the mean.
+        # At a jump the derivative is that after it; jnp.clip's would be the mean.
         xp = namespace(x)
         x = xp.where(x < 0, 0, xp.where(x < 1, x, 1))
         return (1 - self.shock) * PROFILES[self.profile](x) + self.shock * x
 
     @property
     def jump_ts(self) -> Array:
-        """When velocity or acceleration jump [s]."""
+        """Times at which velocity or acceleration jump [s]."""
         shares = [0.0, 1.0]
         if self.profile == "trapezoidal":
             shares = [0.0, RAMP, 1 - RAMP, 1.0]
@@ -92,10 +92,10 @@ class Travel(eqx.Module):
 
 
 class Laps(eqx.Module):
-    """Around a closed path at constant speed of its parameter, for ever.
+    """The timing of endless laps of a closed path, at constant rate of its parameter.
 
-    **Arguments:** `period`: of one lap, backwards if negative, not zero [s]; `phase`:
-    where it starts, as a share of a lap.
+    **Arguments:** `period`: time of one lap, backwards if negative, not zero [s];
+    `phase`: starting point as a share of a lap.
 
     **Raises:** ValueError for malformed arguments.
 
@@ -118,19 +118,19 @@ class Laps(eqx.Module):
 
 
 def shock_against(travel: Travel, frequency: ArrayLike) -> Float[Array, ""]:
-    """The shock that leaves a carried load of a natural frequency at rest.
+    """Computes the shock that leaves a carried load of a natural frequency at rest.
 
-    An undamped load, a hanging one for instance, swings on by what the acceleration of
-    its support has in it of its own frequency. With a jump of the velocity at both ends
-    that can be made zero.
+    After the travel, an undamped load (for instance a hanging one) swings as much as
+    its support's acceleration contains its natural frequency. Jumps of the velocity at
+    both ends can make this content zero.
 
-    **Arguments:** `travel`: its `duration` and `profile` count; `frequency`: angular,
-    positive [rad/s].
+    **Arguments:** `travel`: its `duration` and `profile` are used; `frequency`: natural
+    angular frequency of the load, positive [rad/s].
 
     **Returns:** the `shock` of a `Travel` that is otherwise the same.
 
-    **Raises:** ValueError for malformed arguments, and for more than 250 rad of the
-    load's own motion in a travel; NaN if that is traced.
+    **Raises:** ValueError for malformed arguments, and if `frequency * duration`
+    exceeds 250 rad (the result is NaN if that product is traced).
 
     >>> import fdof_jax as fj
     >>> travel = fj.Travel(1.5, profile="harmonic")
@@ -145,7 +145,7 @@ def shock_against(travel: Travel, frequency: ArrayLike) -> Float[Array, ""]:
         raise ValueError(
             f"frequency: expected at most {_MOST_TURN} rad per travel, got {angle:g}."
         )
-    # The content of a velocity: its integral times cos(turn (x - 1/2)).
+    # A velocity's content of the frequency is the integral of v(x) cos(turn (x - 1/2)).
     nodes, weights = np.polynomial.legendre.leggauss(48)
     ends = np.array([0, RAMP, 1 - RAMP, 1])
     half = np.diff(ends)[:, None] / 2

@@ -1,1 +1,1 @@
-"""Motions as tables, trees in files, arms for other engines."""
+"""Tables of motions, files of pytrees, and export to other engines."""

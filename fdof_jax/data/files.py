@@ -1,7 +1,7 @@
-"""Saving the library's pytrees in a file, and reading them back without a skeleton.
+"""Saving the library's pytrees in a file, and loading them without a template.
 
-A file is a zip archive. Its `description.json` holds the tree and says which versions
-wrote it; arrays are members of their own, in NumPy's `.npy` format.
+A file is a zip archive. Its `description.json` holds the tree and the versions that
+wrote it; each array is a member in NumPy's `.npy` format.
 """
 
 import io
@@ -48,7 +48,7 @@ def _read(file: Any, classes: Sequence[type]) -> Any:
             )
 
         def array(index: int) -> np.ndarray:
-            # Read whole, as only then its checksum is compared.
+            # zipfile checks the checksum only if the member is read to its end.
             member = io.BytesIO(archive.read(f"arrays/{index}.npy"))
             return np.lib.format.read_array(member, allow_pickle=False)
 
@@ -63,21 +63,21 @@ def _checked(path: Any) -> Path:
 
 
 def save(path: str | os.PathLike, tree: Any) -> None:
-    """Write a pytree of the library's to a file, from which `load` reads it back.
+    """Writes a pytree of the library to a file, for `load`.
 
-    A file that is there already is replaced at once, when the new one is complete.
+    An existing file is replaced atomically, when the new one is complete.
 
     **Arguments:**
 
-    - `path`: of the file; no suffix is added.
+    - `path`: path of the file; no suffix is added.
     - `tree`: a `Scene`, a `Linkage`, force elements, a `Solution`, a `TuneResult`, an
-      `equinox.Module` of one's own, or nested lists, tuples, dicts with strings as
-      keys, NamedTuples and dataclasses of such; with arrays of NumPy and JAX, numbers,
+      `equinox.Module` of your own, or nested lists, tuples, dicts with strings as keys,
+      NamedTuples and dataclasses of these. Leaves are arrays of NumPy and JAX, numbers,
       strings, None, random keys and functions of the library.
 
-    **Raises:** ValueError, which names the place in the tree, for what cannot be saved:
-    a lambda or another function of one's own, a traced value, an object of another
-    kind. It leaves no file, and an older one as it is.
+    **Raises:** ValueError for parts that cannot be saved, with their place in the tree:
+    a lambda or another function of your own, a traced value, an object of another kind.
+    No file is then written, and an existing one is kept.
 
     >>> import fdof_jax as fj
     >>> import os, tempfile
@@ -121,22 +121,22 @@ def save(path: str | os.PathLike, tree: Any) -> None:
 
 
 def load(path: str | os.PathLike, classes: Sequence[type] = ()) -> Any:
-    """The pytree that `save` wrote to a file, equal to the last bit.
+    """Loads the pytree that `save` wrote to a file, equal to the last bit.
 
-    Its structure is the same too, so that what was compiled for the one serves the
-    other. Nothing that the file holds is executed, and no constructor is called.
+    Its structure is also equal, so that programs compiled for the saved tree serve the
+    loaded one. Nothing in the file is executed, and no constructor is called.
 
     **Arguments:**
 
-    - `path`: of the file.
-    - `classes`: those of one's own of which instances were saved, in a tuple.
+    - `path`: path of the file.
+    - `classes`: a tuple of your own classes with saved instances.
 
     **Returns:** the tree; its JAX arrays are on the default device.
 
-    **Raises:** FileNotFoundError if there is no file. ValueError, which names the file
-    and what is wrong with it: it is no file of `save`'s, is damaged or cut short, was
-    written in a newer format, holds a class that is unknown or has other fields, or
-    arrays in double precision where JAX has it disabled.
+    **Raises:** FileNotFoundError if there is no file. ValueError if the file was not
+    written by `save`, is damaged or cut short, has a newer format, holds a class that
+    is unknown or has other fields, or holds arrays in double precision while JAX has it
+    disabled; the message names the file and the reason.
     """
     path = _checked(path)
     if not isinstance(classes, tuple | list) or not all(

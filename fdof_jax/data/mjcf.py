@@ -7,17 +7,17 @@ import numpy as np
 from ..checks import is_traced
 from ..linkage.linkage import Linkage, check_linkage
 
-# MuJoCo refuses smaller masses and inertias of moving bodies (its mjMINVAL).
+# MuJoCo rejects smaller masses and inertias of moving bodies (its mjMINVAL).
 _SMALLEST = 1e-15
 
 
 def to_mjcf(linkage: Linkage) -> str:
-    """The linkage as a MuJoCo model (MJCF): three bodies, three joints.
+    """Exports a linkage as a MuJoCo model (MJCF) of three bodies and three joints.
 
     Joints `joint1`..`joint3` are hinges about z and slides in the plane z = 0, with
     `qpos` equal to this library's `q`; a site `tip` marks the tip. Nothing collides.
-    Masses and moments of inertia below 1e-15, in particular zero ones, are passed as
-    1e-15, the smallest that MuJoCo takes.
+    Masses and moments of inertia below 1e-15, in particular zero, become 1e-15, the
+    smallest that MuJoCo accepts.
 
     **Arguments:** `linkage`: one linkage with concrete values.
 

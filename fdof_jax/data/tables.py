@@ -1,4 +1,4 @@
-"""Motions as labelled arrays of xarray and as tables of pandas, optional packages."""
+"""Motions as xarray Datasets and pandas DataFrames (optional packages)."""
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
@@ -24,7 +24,7 @@ def _package(name: str) -> Any:
 
 
 def _joints(linkage: Linkage) -> tuple[list[str], list[str]]:
-    """Names and units of the joints; of one that a batch has both kinds of, neither."""
+    """Names and units of the joints; both are neutral if a batch mixes the kinds."""
     names, units = [], []
     for k, revolute in enumerate(np.asarray(linkage.ef).reshape(-1, 6).T[1::2] > 0.5):
         mixed = revolute.any() and not revolute.all()
@@ -39,7 +39,7 @@ def _rate(unit: str) -> str:
 
 
 def _checked(solution: Any, linkage: Any) -> tuple[np.ndarray, list[str]]:
-    """The times that all motions have in common, and the names of the batch's axes."""
+    """The common times of all motions, and the names of the batch axes."""
     instance("solution", solution, Solution)
     instance("linkage", linkage, Linkage)
     if not known(solution, linkage):
@@ -54,17 +54,17 @@ def _checked(solution: Any, linkage: Any) -> tuple[np.ndarray, list[str]]:
 
 
 def to_xarray(solution: Solution, linkage: Linkage) -> "xarray.Dataset":
-    """A solution as an xarray Dataset, with names and units.
+    """Converts a solution to an xarray Dataset, with names and units.
 
-    Joint positions `q` and velocities `qd` over `time` and `joint`; the joints are R1,
-    P2 and so on, and beside them is the `unit` of each. How each trajectory ended is
-    `outcome`, as of the solution, with `num_steps` and `time_reached`. The axes of a
-    batch come first, as `batch` (of several, `batch_1` and so on); give it a name and
-    values by `.rename(batch="payload").assign_coords(payload=masses)`. A joint that a
-    batch has both kinds of is named by its number.
+    The Dataset holds joint positions `q` and velocities `qd` over `time` and `joint`,
+    and the solution's `outcome`, `num_steps` and `time_reached` for each trajectory.
+    The joints are named R1, P2 and so on, with the coordinate `unit`; a joint of both
+    kinds within a batch is named by its number. Batch axes come first, as `batch` (or
+    `batch_1`, `batch_2` and so on). To name an axis and give it values, use
+    `.rename(batch="payload").assign_coords(payload=masses)`.
 
-    **Arguments:** `solution`: of `simulate`, of a batch of it or of `sweep`; all at the
-    same times [s]. `linkage`: that of the solution, one or a batch.
+    **Arguments:** `solution`: result of `simulate`, of a batch of it, or of `sweep`,
+    all at the same times [s]; `linkage`: that of the solution, one or a batch.
 
     **Returns:** the Dataset; the attributes `units` of its variables are SI.
 
@@ -99,13 +99,14 @@ def to_xarray(solution: Solution, linkage: Linkage) -> "xarray.Dataset":
 
 
 def to_pandas(solution: Solution, linkage: Linkage) -> "pandas.DataFrame":
-    """A solution as a pandas DataFrame: a row per time, a column per joint and rate.
+    """Converts a solution to a pandas DataFrame with a row per time.
 
-    The columns are called `R1 [rad]`, `P2 [m/s]` and so on; the last is the `outcome`
-    of the row's trajectory. The index is the time, `time [s]`, and before it the place
-    in the batch, if it is one: `batch` (of several axes, `batch_1` and so on).
+    There is a column per joint position and velocity, named `R1 [rad]`, `P2 [m/s]` and
+    so on; the last column is the `outcome` of the row's trajectory. The index is the
+    time, `time [s]`. For a batch, the levels before it are `batch` (or `batch_1`,
+    `batch_2` and so on).
 
-    **Arguments:** as of `to_xarray`.
+    **Arguments:** as in `to_xarray`.
 
     **Returns:** the DataFrame.
 

@@ -1,7 +1,7 @@
-"""A pytree of the library's as JSON and arrays, and back without a skeleton.
+"""Conversion of the library's pytrees to JSON and arrays, and back without a template.
 
-Nothing that a description says is executed: classes are looked up, in the library and
-among those of the caller.
+Nothing in a description is executed: classes are looked up, in the library and among
+those of the caller.
 """
 
 import dataclasses
@@ -25,12 +25,12 @@ _Item, _EnumerationMeta = type(_RESULT), type(diffrax.RESULTS)
 
 
 class Unreadable(Exception):
-    """What is wrong with a file, in words that lack its name."""
+    """An error that describes what is wrong with a file, without the file's name."""
 
 
 # Names of classes and functions
 
-# Classes of the library that saved trees hold and that the top does not name.
+# Classes in saved trees that are not in the library's top namespace.
 _WITHIN = {
     "CircleRun": "shell.showcase",
     "DriveState": "control.drives",
@@ -42,9 +42,9 @@ _WITHIN = {
 
 
 def _name(thing: Any) -> str:
-    """The name that a file holds: a public one, whatever module defines the thing."""
+    """The name to store: the public one, independent of the defining module."""
     name = thing.__qualname__
-    # The module in which diffrax keeps an enumeration may change.
+    # The module that defines an enumeration of diffrax may change.
     for package, found in (
         ("diffrax", getattr(diffrax, name, None)),
         (_PACKAGE, _of_the_library(name)),
@@ -55,7 +55,7 @@ def _name(thing: Any) -> str:
 
 
 def _of_the_library(name: str) -> Any:
-    """The class or function of the library with this name, or None."""
+    """Returns the class or function of the library with the given name, or None."""
     if name not in (*_NAMES, *_WITHIN):
         return None
     place = f"{_PACKAGE}.{_WITHIN[name]}" if name in _WITHIN else _PACKAGE
@@ -64,12 +64,12 @@ def _of_the_library(name: str) -> Any:
 
 
 def _is_ours(module: str) -> bool:
-    """Whether a file means the library: version 0.1 wrote the module of each class."""
+    """Whether a stored module is the library's; version 0.1 stored submodules."""
     return module.partition(".")[0] == _PACKAGE
 
 
 def _class(name: str, classes: Sequence[type]) -> Any:
-    """The class with this name, of the library, of diffrax or of the caller."""
+    """Returns the class named `name`, of the library, diffrax or the caller."""
     module, _, qualname = name.partition(":")
     if module == "diffrax":
         found = vars(diffrax).get(qualname)
@@ -78,7 +78,7 @@ def _class(name: str, classes: Sequence[type]) -> Any:
     if _is_ours(module) and isinstance(found := _of_the_library(qualname), type):
         return found
     same = [c for c in classes if _name(c) == name]
-    # A class is elsewhere when the script that defines it is imported.
+    # The module of a class is __main__ only while the script that defines it runs.
     moved = [
         c
         for c in classes
@@ -94,7 +94,7 @@ def _class(name: str, classes: Sequence[type]) -> Any:
 
 
 def _fields(kind: Any) -> list[str] | None:
-    """Names of the fields of a NamedTuple or dataclass, None for other classes."""
+    """Field names of a NamedTuple or dataclass, None for other classes."""
     if issubclass(kind, tuple):
         names = getattr(kind, "_fields", None)
         return None if names is None else list(names)
@@ -111,7 +111,7 @@ def _members(enumeration: Any) -> dict[str, int]:
 
 
 def described(place: str, value: Any, arrays: list[np.ndarray]) -> Any:
-    """A tree as JSON has it, its arrays appended to `arrays`."""
+    """Converts a tree to values of JSON, and appends its arrays to `arrays`."""
     kind = type(value)
     if value is None or kind in (bool, int, str):
         return value
@@ -177,7 +177,7 @@ def _described_array(place: str, value: Any, arrays: list[np.ndarray]) -> dict:
         array = np.asarray(value)
     except RuntimeError as error:  # deleted, or on devices of other processes
         raise ValueError(f"{place}: expected an array at hand, got {error}.") from error
-    extended = jnp.issubdtype(array.dtype, np.number)  # bfloat16 for instance
+    extended = jnp.issubdtype(array.dtype, np.number)  # for instance bfloat16
     if array.dtype.kind not in "biufcmMSU" and not extended:
         raise ValueError(
             f"{place}: expected an array of numbers, got one of {array.dtype}."
@@ -191,7 +191,7 @@ def _described_array(place: str, value: Any, arrays: list[np.ndarray]) -> dict:
 
 
 class Restorer:
-    """Makes trees from descriptions, given the arrays and the caller's classes."""
+    """Restores trees from descriptions, given the arrays and the caller's classes."""
 
     def __init__(self, array: Callable[[int], np.ndarray], classes: Sequence[type]):
         self.stored, self.classes = array, classes
@@ -233,7 +233,7 @@ class Restorer:
         values = {name: self.tree(fields[name]) for name in names}
         if issubclass(cls, tuple):
             return tuple.__new__(cls, values.values())
-        # No constructor: it might compute or refuse.
+        # The constructor is bypassed, as it might compute or raise.
         made = object.__new__(cls)
         for name, value in values.items():
             object.__setattr__(made, name, value)
@@ -245,7 +245,7 @@ class Restorer:
             raise Unreadable(f"expected an enumeration, got {node['class']}")
         numbers = self.array(node["value"])
         names = {number: name for name, number in node["members"].items()}
-        # Another version may count its members differently.
+        # Another version of diffrax may number its members differently.
         here, value = _members(enumeration), numbers.copy()
         for number in np.unique(numbers).tolist():
             if names[number] not in here:
@@ -261,7 +261,7 @@ class Restorer:
     def array(self, node: dict) -> np.ndarray:
         array = self.stored(node["array"])
         if array.dtype.name != node["dtype"]:
-            # NumPy's format knows no dtypes but NumPy's.
+            # NumPy's format stores other packages' dtypes as raw bytes.
             extended = jnp.dtype(node["dtype"])
             if array.dtype.kind != "V" or array.dtype.itemsize != extended.itemsize:
                 raise Unreadable(
@@ -277,7 +277,7 @@ class Restorer:
         return array
 
     def placed(self, node: dict, array: np.ndarray) -> Any:
-        """The array as the kind of value that it was."""
+        """Converts the array to the kind of value that was saved."""
         kind = node["kind"]
         if kind == "numpy":
             return array
@@ -289,14 +289,14 @@ class Restorer:
             )
         if kind != "jax":
             raise KeyError(kind)
-        # JAX would round without a word.
+        # Otherwise JAX would round silently.
         if jax.dtypes.canonicalize_dtype(array.dtype) != array.dtype:
             raise Unreadable(
                 f"expected arrays that JAX takes as it is configured, got {array.dtype}"
                 ': jax.config.update("jax_enable_x64", True) enables it'
             )
         if node["weak"]:
-            # Without it what was compiled for the array that was saved is not found.
+            # A weak type is restored, so that compiled programs are found again.
             weak = jnp.full(array.shape, array.dtype.type(0).item())
             if weak.dtype == array.dtype:
                 return weak.at[...].set(array)

@@ -1,1 +1,1 @@
-"""Parameters of an arm from recorded motions."""
+"""Identification of an arm's parameters from recorded motions."""

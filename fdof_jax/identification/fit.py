@@ -27,21 +27,21 @@ from .unknowns import unknowns_of
 SceneAt = Callable[[dict[str, Array]], Scene]
 Observe = Callable[[Scene, Solution], Array]
 
-_TOLERANCE = 1e-7  # of the derivatives, and of the motion at the times between steps
-# The loss of noise alone has far larger steps than this to fall to its least: one
-# standard error of a parameter changes it by one part in as many as there are readings.
+_TOLERANCE = 1e-7  # of the derivatives, and of the dense output
+# A search stops when the loss falls by less than this part. One standard error of a
+# parameter changes the loss by about one part in the number of readings, far more.
 _ENOUGH = 1e-8
-# Parts of the recording that are looked at in turn, each from where the one before has
-# led to: over a short time a motion follows its parameters nearly linearly, while from
-# the start over all of it a search may end in a local minimum.
+# Parts of the recording that are fitted in turn, each starting from the previous
+# result. Over a short time a motion is nearly linear in its parameters; a search over
+# all of the time from the start may end in a local minimum.
 _SHARES = (0.25, 0.5, 0.75, 1.0)
-_ENOUGH_EARLY = 1e-3  # as only a start for the next is wanted
+_ENOUGH_EARLY = 1e-3  # only a start for the next part is needed
 
 
 def link_ends(scene: Scene, solution: Solution) -> Float[Array, "time link 2"]:
-    """Where links 2 and 3 hand over to the next ones, and the tip: three markers.
+    """Positions of three markers: the joints at the ends of links 2 and 3, and the tip.
 
-    **Arguments:** a scene and its solution.
+    **Arguments:** `scene`; `solution`: its motion.
 
     **Returns:** points (x, y) from the ground pivot [m].
 
@@ -61,7 +61,7 @@ def link_ends(scene: Scene, solution: Solution) -> Float[Array, "time link 2"]:
 
 
 class _Problem(NamedTuple):
-    """A recording and what it is compared with; `weight` is 0 where it has no sample.
+    """A recording, its scene and observation; `weight` is 0 where a sample is missing.
 
     The parameters are `scale` times the unknowns.
     """
@@ -76,7 +76,7 @@ class _Problem(NamedTuple):
 
 
 def _lane(z: Array, problem: _Problem) -> Evaluation:
-    """The weighted sum of squares over a recording, and its derivatives in `z`."""
+    """Evaluates a recording's weighted sum of squares and its derivatives in `z`."""
 
     def scene_at(z):
         splits = np.cumsum([scale.size for scale in problem.scale])[:-1]
@@ -108,7 +108,7 @@ def _lane(z: Array, problem: _Problem) -> Evaluation:
 
 
 def _observations(observed: Any, noise: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Of (recording, time, ...): readings, 0 where missing, and their weights."""
+    """Readings (recording, time, ...), 0 where missing, and their weights."""
     try:
         readings = np.asarray(observed, dtype=jnp.result_type(float))
     except (TypeError, ValueError) as error:
@@ -156,11 +156,11 @@ def _longer_and_longer(
     high: np.ndarray,
     **keywords: Any,
 ) -> list[Run]:
-    """The runs over all of the time; `until` judges the motion up to a part of it."""
+    """Runs over growing shares of the time; `until(share)` evaluates up to a share."""
     keywords = dict(method="levenberg-marquardt") | keywords
     for share, longer in zip(_SHARES, _SHARES[1:]):
         runs = minimise(until(share), z, low, high, enough=_ENOUGH_EARLY, **keywords)
-        # A short time may tell so little that noise leads astray.
+        # Over a short time, noise may lead away from the parameters.
         better = until(longer)
         found, every = np.stack([run.z for run in runs]), np.arange(len(z))
         gain = better(found, every).loss < better(z, every).loss
@@ -182,9 +182,9 @@ def _search(
     max_steps: int,
     report: Callable[[str], Any] | None,
 ) -> list[FitResult]:
-    """The keywords are those of `fit`; `observed` has recordings as first axis.
+    """Fits all recordings `together` in one result, or returns one result for each.
 
-    One result for all recordings `together`, or one for each.
+    The keywords are those of `fit`; `observed` has recordings as first axis.
     """
     unknowns = unknowns_of(start, bounds, scale)
     told = reporting(report, _squares_so_far)
@@ -200,7 +200,7 @@ def _search(
     for name, value in (*(("scene_at", s) for s in scenes_at), ("observe", observe)):
         if not callable(value):
             raise ValueError(f"{name}: expected a callable, got {value!r}.")
-    stacked(scenes_at, "scene_at")  # refuses what is not alike
+    stacked(scenes_at, "scene_at")  # raises unless all are alike
     first = dict(zip(unknowns.names, map(jnp.asarray, unknowns.start)))
     for scene_at in scenes_at:
         _check_scene(_called(scene_at, first), ts)
@@ -213,7 +213,7 @@ def _search(
     passed = passed.reshape(-1, *[1] * (readings.ndim - 2))
 
     def until(share: float) -> Lanes:
-        """Of the readings up to this part of the time."""
+        """The lanes with weights for readings up to this share of the time only."""
         early = passed <= share
         return Lanes(
             _lane, [[p._replace(weight=p.weight * early) for p in row] for row in rows]
@@ -259,36 +259,37 @@ def fit(
     max_steps: int = 50,
     report: Callable[[str], Any] | None = None,
 ) -> FitResult:
-    """The parameters of a scene with which it moves as it was observed to.
+    """Fits parameters of a scene to recordings of its motion, by least squares.
 
-    Least squares by Levenberg and Marquardt's method, with exact derivatives: over the
-    first quarter of the time, from there over the first half, and so on, to all of it.
-    Masses, inertias, offsets, damping, starting positions: whatever a scene is made of.
-    A second call with other numbers compiles nothing, if `scene_at` and `observe` are
-    the same functions or Equinox modules of the same structure.
+    Parameters may be masses, inertias, offsets, damping, starting positions: anything
+    in a scene. The fit uses the Levenberg-Marquardt method with exact derivatives. It
+    fits the first quarter of the time, continues with the first half, and so on, up to
+    all of it. A second call with other numbers compiles nothing, if `scene_at` and
+    `observe` are the same functions or Equinox modules of the same structure.
 
     **Arguments:**
 
-    - `scene_at`: the scene, given a dict of named parameters, numbers or arrays; its
-      `t1` does not count. Or several, Equinox modules that differ in numbers, whose
-      recordings are judged together.
-    - `start`: a first guess of each parameter, in its own SI unit.
+    - `scene_at`: returns the scene for a dict of named parameters (numbers or arrays);
+      the scene's `t1` is ignored. A list of several, Equinox modules that differ in
+      numbers, is fitted together, with one recording each.
+    - `start`: first guess of each parameter, in its own SI unit.
     - `ts`: increasing times (time,), from the start of the motion [s].
-    - `observed`: the recording, of the shape that `observe` returns; of several scenes,
-      stacked along a leading axis. NaN where a sample is missing.
+    - `observed`: the recording, of the shape that `observe` returns; recordings of
+      several scenes are stacked along a leading axis. NaN marks a missing sample.
     - `observe`: `(scene, solution) -> readings`, an array with time as first axis. By
-      default `link_ends`, markers (time, 3, 2) at the ends of the
-      moving links [m]; `lambda scene, solution: solution.q` for joint encoders.
-    - `noise`: the standard deviation of a reading, one number or an array that
-      broadcasts to a recording [its unit]. If None, all readings weigh the same and
-      it is estimated from the residuals.
+      default `link_ends`, markers (time, 3, 2) at the ends of the moving links [m]; use
+      `lambda scene, solution: solution.q` for joint encoders.
+    - `noise`: standard deviation of a reading [its unit], one number or an array that
+      broadcasts to a recording. If None, all readings have the same weight, and the
+      noise is estimated from the residuals.
     - `bounds`: (least, greatest) of parameters by name.
-    - `scale`: the sizes of parameters by name, in which steps are measured, at most
-      two at a time. By default the magnitudes of the start, which must not be 0 then.
-    - `max_steps`: the greatest number of evaluations after the first, of each search.
-    - `report`: is given a line of progress after each step, `print` for instance.
+    - `scale`: sizes of parameters by name; a step changes a parameter by at most two
+      sizes. By default the magnitudes of the start, which then must not be 0.
+    - `max_steps`: greatest number of evaluations after the first, of each search.
+    - `report`: called with a line of progress after each step, for instance `print`.
 
-    **Returns:** a `FitResult`, with standard errors and what the motion does not tell.
+    **Returns:** a `FitResult`, with standard errors and the combinations of parameters
+    that the motion does not determine.
 
     **Raises:** ValueError for malformed arguments, and if the scene cannot be simulated
     from the start.
@@ -315,7 +316,7 @@ def fit_each(
     observed: ArrayLike,
     **keywords: Any,
 ) -> list[FitResult]:
-    """`fit` for each of several recordings, in one compiled program.
+    """Fits each of several recordings, in one compiled program.
 
     **Arguments:** `observed`: with recordings as leading axis, for instance markers
     (recording, time, 3, 2) [m]; the others as in `fit`.

@@ -1,4 +1,4 @@
-"""What identification returns: parameters, their errors, and what cannot be told."""
+"""Results of identification: parameters, their errors, and undetermined directions."""
 
 from collections.abc import Callable
 from typing import Any
@@ -15,35 +15,37 @@ from .unknowns import Unknowns, flat
 
 # A combination is weak if its standard error exceeds this part of its size.
 _WEAK = 1.0
-# The scene is doubted where the residuals exceed the given noise by this factor.
+# The message doubts the scene if the residuals exceed the given noise by this factor.
 _DOUBTED = 1.5
-# Converged: what a further step would bring, in standard errors, or in sizes.
+# Converged: largest change by a further step, in standard errors or in sizes.
 _REMAINING = 0.03
 _REMAINING_PART = 1e-6
-# Part of an untold direction above which a parameter belongs to it.
+# Part of an undetermined direction above which a parameter belongs to it.
 _SHARED = 1e-6
 
 
 class FitResult(eqx.Module):
-    """Identified parameters and how sure they are; it prints itself as a table.
+    """Identified parameters and their standard errors; prints itself as a table.
 
-    - `parameters`: by name, in the unit of each, as in `start`.
-    - `standard_errors`: by name, likewise; infinite for what the motion does not tell.
-    - `names`: of each number in order, for instance `damping` or `mass[0]`.
-    - `covariance`: of the numbers in that order (n, n), the inverse of Gauss and
-      Newton's matrix over the variance of the noise. Infinite between parameters
-      that only a combination is known of.
-    - `weak`: what the motion does not tell, in words: combinations of parameters with
-      no effect on it, and those whose standard error exceeds their size (of each
-      parameter the greater of its value and its scale).
-    - `rms`: root mean square of the residuals, missing samples apart [as observed].
-    - `noise`: over that given, or as estimated from the residuals: the root of their
-      weighted sum of squares over the degrees of freedom [1, or as observed].
+    - `parameters`: values by name, in the unit of each, as in `start`.
+    - `standard_errors`: standard errors by name; infinite for parameters that the
+      motion does not determine.
+    - `names`: name of each number in order, for instance `damping` or `mass[0]`.
+    - `covariance`: covariance of the numbers in that order (n, n): the variance of the
+      noise times the inverse of the Gauss-Newton matrix. Infinite between parameters of
+      which only a combination is determined.
+    - `weak`: combinations of parameters that the motion does not determine, in words:
+      those without effect on it, and those whose standard error exceeds their size (a
+      parameter's size is the greater of its value and its scale).
+    - `rms`: root mean square of the residuals without missing samples [as observed].
+    - `noise`: root of the residuals' weighted sum of squares over the degrees of
+      freedom. This is relative to the given noise [1], or estimates the noise if none
+      is given [as observed].
     - `converged`: whether a further step would change the parameters by less than 3 %
       of their standard errors, or a millionth of their sizes.
     - `message`: why the search stopped, and what to beware of.
-    - `history`: the weighted sum of squares over all of the recording, from where the
-      search over three quarters of it has led to, and at each accepted point.
+    - `history`: weighted sum of squares over all of the recording, at the start of the
+      last search (the result over three quarters of it) and at each accepted point.
     """
 
     parameters: dict[str, Any]
@@ -72,26 +74,26 @@ class FitResult(eqx.Module):
 
 
 def told_and_untold(normal: np.ndarray, eps: float) -> tuple[np.ndarray, np.ndarray]:
-    """Of a semidefinite matrix the inverse where it has one, and where it vanishes.
+    """A generalised inverse of a semidefinite matrix, and its null space in columns.
 
-    The latter as directions in columns. Judged with unit diagonal, by a curvature of a
-    thousand times `eps`.
+    Directions are null if, with the diagonal scaled to 1, their curvature is below a
+    thousand times `eps` of the greatest.
     """
     limit = 1e3 * eps
     diagonal = np.diag(normal)
-    # What has no effect at all has one by rounding.
+    # By rounding, unknowns without any effect have a small one.
     silent = diagonal <= limit**2 * diagonal.max()
     unit = np.where(silent, 0, 1 / np.sqrt(np.where(silent, 1, diagonal)))
     values, vectors = np.linalg.eigh(unit[:, None] * normal * unit)
     told = values > limit * max(values[-1], 1e-300)
     some = vectors[:, told] * unit[:, None]
-    # Unknowns without effect stand for themselves.
+    # Unknowns without effect are directions by themselves.
     untold = vectors[:, ~told] * np.where(silent, 1, unit)[:, None]
     return (some / values[told]) @ some.T, untold / np.linalg.norm(untold, axis=0)
 
 
 def _sparse(columns: np.ndarray) -> np.ndarray:
-    """Directions that span the same, each of few numbers: rows in echelon form."""
+    """Directions that span the same space, in echelon form: few numbers in each row."""
     rows = columns.T.copy()
     for index in range(len(rows)):
         rest = np.abs(rows[index:])
@@ -104,8 +106,8 @@ def _sparse(columns: np.ndarray) -> np.ndarray:
 
 
 def _together(labels: tuple[str, ...], direction: np.ndarray, least: float) -> str:
-    """A direction in words, of parts above `least` of its greatest."""
-    # Of equally large ones the first, or rounding would choose the signs.
+    """A direction in words: its parts above `least` times the greatest."""
+    # The first of equally large parts leads; otherwise rounding would choose the signs.
     leading = np.argmax(np.abs(direction) > 0.99 * np.abs(direction).max())
     parts = direction / direction[leading]
     kept = np.flatnonzero(np.abs(parts) > least)
@@ -116,7 +118,7 @@ def _together(labels: tuple[str, ...], direction: np.ndarray, least: float) -> s
 
 
 def _in_words(labels, untold, covariance) -> tuple[str, ...]:
-    """Of directions and a covariance relative to the parameters' sizes."""
+    """Undetermined directions in words, and weak ones by the relative covariance."""
     words = [
         "Cannot be told from this motion, which does not change with: "
         f"{_together(labels, row, 1e-3)}."
@@ -145,7 +147,8 @@ def fit_result(
     low, high = unknowns.flat_low, unknowns.flat_high
     values = np.clip(run.z * scale, low, high)
     sizes = np.maximum(np.abs(values), scale)
-    # The loss is a mean over recordings, and the parameters relative to their sizes.
+    # The loss is a mean over recordings, but a sum is needed. From here on, parameters
+    # are relative to their sizes.
     members = len(run.at.facts["squares"])
     loss = members * run.at.loss
     normal = (
@@ -157,7 +160,8 @@ def fit_result(
     variance = 1.0 if noise_given else loss / degrees
     inverse, untold = told_and_untold(normal, eps)
     relative = variance * inverse
-    # Infinite along untold directions, with one sign: infinities must not be added up.
+    # Infinite along undetermined directions. As infinities of both signs must not be
+    # added up, one projection decides the sign.
     basis, _ = np.linalg.qr(untold)
     shared = basis @ basis.T
     unknown = np.copysign(np.inf, shared)
@@ -181,13 +185,13 @@ def fit_result(
             "as observed with any such parameters"
         )
     parameters = unknowns.named(values)
-    # Parts of the values are what a reader expects, where they are not nearly zero.
+    # Print directions in parts of the values, unless these are nearly zero.
     parts_of = np.where(np.abs(values) > 1e-3 * sizes, values, sizes)
     untold = untold * (sizes / parts_of)[:, None]
     try:
         scene_at(jax.tree.map(jnp.asarray, parameters))
     except ValueError as error:
-        # Traced values were not refused on the way.
+        # During the search values were traced, so constructors could not check them.
         parts.append(f"no scene has these parameters ({error}); set bounds")
     errors = np.sqrt(np.diag(covariance))
     return FitResult(

@@ -1,4 +1,4 @@
-"""Named parameters that are to be found: first guesses, sizes and bounds."""
+"""Named parameters to identify: first guesses, sizes and bounds."""
 
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
@@ -9,12 +9,12 @@ from ..checks import real_array
 
 
 def flat(arrays: Iterable[Any]) -> np.ndarray:
-    """All their numbers in one row."""
+    """All numbers of the arrays in one row."""
     return np.concatenate([np.ravel(a) for a in arrays])
 
 
 class Unknowns(NamedTuple):
-    """Per name: the first guess, the size in which steps are measured, the bounds."""
+    """First guess, size (the unit of steps) and bounds of each named parameter."""
 
     names: tuple[str, ...]
     start: tuple[np.ndarray, ...]
@@ -40,7 +40,7 @@ class Unknowns(NamedTuple):
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """A name for each number: `mass[0]` for an entry of an array."""
+        """The name of each number; `mass[0]` for an entry of an array."""
         return tuple(
             name + (str(list(index)) if index else "")
             for name, value in zip(self.names, self.start)
@@ -48,7 +48,7 @@ class Unknowns(NamedTuple):
         )
 
     def named(self, flat: np.ndarray) -> dict[str, Any]:
-        """One number each as arrays by name."""
+        """Arrays by name from all numbers in one row."""
         parts = np.split(flat, np.cumsum([value.size for value in self.start])[:-1])
         return {
             name: part.reshape(value.shape)[()]
@@ -67,7 +67,7 @@ def _named(name: str, value: Any, start: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def unknowns_of(start: Any, bounds: Any, scale: Any) -> Unknowns:
-    """The arguments of `fit` with these names, checked and completed."""
+    """Checks and completes the arguments `start`, `bounds` and `scale` of `fit`."""
     if not isinstance(start, Mapping) or not start:
         raise ValueError(
             "start: expected a dict of named parameters to find, for instance "

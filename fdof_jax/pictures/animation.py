@@ -15,28 +15,23 @@ from ..checks import real_array, whole_number
 from ..linkage.linkage import Linkage
 from ..simulation.solution import Solution
 from .arms import DrawnMotion, draw_arm, draw_ground, geometries_of, panels_of
-from .axes import (
-    GREY,
-    plane_axes,
-    reached,
-    xy,
-)
+from .axes import GREY, plane_axes, reached, xy
 from .geometry import Geometry, geometry
 
 
 class _Animation(FuncAnimation):
-    """One that a notebook plays where it is the last line of a cell."""
+    """An animation that a notebook plays if it is the last line of a cell."""
 
     def __init__(self, figure: Figure, *args: Any, **kwargs: Any):
         super().__init__(figure, *args, **kwargs)
         self._figure = figure
 
     def to_jshtml(self, *args: Any, **kwargs: Any) -> str:
-        plt.close(self._figure)  # or a notebook shows it again, standing still
+        plt.close(self._figure)  # otherwise a notebook also shows the still figure
         return super().to_jshtml(*args, **kwargs)
 
     def __repr__(self) -> str:
-        return "an animation"  # an address would differ in each run of a notebook
+        return "an animation"  # without an address, the same in each run of a notebook
 
     def _repr_html_(self) -> str:
         return self.to_jshtml()
@@ -45,7 +40,7 @@ class _Animation(FuncAnimation):
 def _frame_times(
     timelines: list[np.ndarray], fps: ArrayLike, speed: ArrayLike, max_frames: int
 ) -> tuple[np.ndarray, float]:
-    """The times that frames show, and the pause between two of them [ms]."""
+    """Times of the frames, and the pause between two frames [ms]."""
     fps = float(real_array("fps", fps, (), above=0))
     speed = float(real_array("speed", speed, (), above=0))
     begin, end = min(ts[0] for ts in timelines), max(ts[-1] for ts in timelines)
@@ -64,7 +59,7 @@ def _animation(
     say: Callable[..., Any],
     new: bool,
 ) -> FuncAnimation:
-    """The motions in the panels of a figure, `new` or given; `say` writes the time."""
+    """Animates motions in panels of a `new` or given figure; `say` writes the time."""
     moving = []
     for ax, (ts, g) in zip(panels, motions):
         draw_ground(ax)
@@ -87,7 +82,7 @@ def _animation(
     say("t = 0 s", fontsize="medium")
     figure.draw_without_rendering()
     for ax in panels:
-        ax.autoscale(False)  # at limits that hold all samples
+        ax.autoscale(False)  # the limits already hold all samples
         ax.set_adjustable("box")
     if new:
         figure.set_layout_engine("none")  # a layout per frame takes half the time
@@ -104,16 +99,16 @@ def animate(
     speed: float = 1.0,
     max_frames: int = 250,
 ) -> FuncAnimation:
-    """The motion as an animation, with the path of the tip so far.
+    """Animates a motion, with the path of the tip so far.
 
-    A frame shows the nearest sample. A motion that would need more than `max_frames` is
-    shown in fewer frames a second.
+    Each frame shows the nearest sample. If a motion needs more than `max_frames`, it is
+    shown with fewer frames per second.
 
-    **Arguments:** `fps`: frames a second; `speed`: 2 shows the motion twice as fast.
+    **Arguments:** `fps`: frames per second; `speed`: 2 shows the motion twice as fast.
 
-    **Returns:** the animation, which a notebook plays where it ends a cell. Keep it
-    until it is shown. `.save("motion.gif")` and `.save("motion.mp4")` write it, the
-    latter with ffmpeg; `.to_jshtml()` is a player as text, to be put in a web page.
+    **Returns:** the animation; a notebook plays it if it is the last line of a cell.
+    Keep it until it is shown. `.save("motion.gif")` and `.save("motion.mp4")` write it,
+    the latter with ffmpeg; `.to_jshtml()` returns a player as text, for a web page.
 
     **Raises:** ValueError for malformed arguments.
     """
@@ -132,12 +127,12 @@ def animate_grid(
     speed: float = 1.0,
     max_frames: int = 250,
 ) -> FuncAnimation:
-    """Linkages side by side, moving at the same time; one that has ended stands still.
+    """Animates linkages side by side; a linkage whose motion has ended stands still.
 
     **Arguments:** `motions`: title -> (linkage, its solution); the others as in
     `animate`.
 
-    **Returns:** the animation, as of `animate`.
+    **Returns:** the animation, as in `animate`.
 
     **Raises:** ValueError for malformed arguments.
     """

@@ -1,4 +1,4 @@
-"""How an arm is drawn: its links, joints and ground."""
+"""Lines and markers of an arm: its links, joints and ground."""
 
 from typing import Any, NamedTuple
 
@@ -25,23 +25,15 @@ from .geometry import Geometry, geometry
 
 _LINKS = (BLACK, *SERIES[:3])
 
-
 # Markers, in points: a carriage on a piece of its rail, a bearing on hatched ground.
 # Path codes: 1 moves the pen, 2 draws a line, 79 closes the outline.
 _BOX = [(-0.55, -0.35), (0.55, -0.35), (0.55, 0.35), (-0.55, 0.35), (0, 0)]
-
-
 _CARRIAGE = Path([(-1, 0), (1, 0), *_BOX], [1, 2, 1, 2, 2, 2, 79])
-
-
 _HATCH = [p for x in (-0.9, -0.45, 0, 0.45) for p in ((x, -1), (x + 0.3, -0.7))]
-
-
 _BEARING = Path(
     [(0, 0), (-0.5, -0.7), (0.5, -0.7), (0, 0), (-0.9, -0.7), (0.9, -0.7), *_HATCH],
     [1, 2, 2, 79] + [1, 2] * 5,
 )
-
 
 _STYLES: dict[str, dict[str, Any]] = {
     "link": dict(lw=2.2, solid_capstyle="round", solid_joinstyle="round"),
@@ -54,7 +46,7 @@ _STYLES: dict[str, dict[str, Any]] = {
 
 
 def _place(lines: dict[str, Line2D], g: Geometry, i: int) -> None:
-    """Move the lines to sample `i`."""
+    """Moves the lines to sample `i`."""
     for name, line in lines.items():
         line.set_data(*xy(g.points[name][i]))
         if name.startswith("slider"):
@@ -72,7 +64,7 @@ def draw_arm(
     color: Any = None,
     label: bool = True,
 ) -> dict[str, Line2D]:
-    """Lines of sample `i` by name, which is also their `gid`."""
+    """Draws sample `i` and returns its lines by name; the name is also the `gid`."""
     lines = {}
     for name, points in g.points.items():
         kind, number = name.split()
@@ -95,13 +87,13 @@ def draw_ground(ax: Axes) -> None:
 
 
 class DrawnMotion(NamedTuple):
-    """The lines of `draw_motion`."""
+    """The lines drawn by `draw_motion`."""
 
     path: Line2D
     arms: list[dict[str, Line2D]]
 
     def move(self, g: Geometry, indices: np.ndarray) -> None:
-        """To another motion of an arm of the same topology, as many samples of it."""
+        """Moves the lines to a motion of the same topology, at as many samples."""
         self.path.set_data(*xy(g.end[: indices[-1] + 1, 3]))
         for lines, i in zip(self.arms, indices):
             _place(lines, g, i)
@@ -110,7 +102,7 @@ class DrawnMotion(NamedTuple):
 def draw_motion(
     ax: Axes, g: Geometry, indices: np.ndarray, mass_centers: bool
 ) -> DrawnMotion:
-    """The path of the tip to the last of the samples, and these from faint to full."""
+    """Draws the samples `indices` from faint to full, and the tip's path up to them."""
     draw_ground(ax)
     path = g.end[: indices[-1] + 1, 3]
     (path,) = ax.plot(*xy(path), color=GREY, lw=1, label="tip path", gid="tip path")
@@ -122,7 +114,7 @@ def draw_motion(
 
 
 def geometries_of(motions: Any) -> dict[str, tuple[np.ndarray, Geometry]]:
-    """Per title the times and the geometry of a motion."""
+    """Times and geometry of each motion, by title."""
     filled_mapping("motions", motions, "(Linkage, Solution)")
     found = {}
     for title, pair in motions.items():
@@ -138,7 +130,7 @@ def geometries_of(motions: Any) -> dict[str, tuple[np.ndarray, Geometry]]:
 def panels_of(
     geometries: dict[str, tuple[np.ndarray, Geometry]], fig: Figure | None
 ) -> tuple[Figure, list[Axes]]:
-    """A grid of axes, one per motion."""
+    """A figure with a grid of axes, one per motion."""
     columns = min(4, len(geometries))
     rows = -(-len(geometries) // columns)
     fig = figure_or_new(fig, 0.3 + 1.75 * columns, 0.4 + 1.9 * rows)

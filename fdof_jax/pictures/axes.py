@@ -1,4 +1,4 @@
-"""What all pictures share: colours, figures, axes, legends, and checks of arguments."""
+"""Colours, figures, axes, legends and argument checks shared by all pictures."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from ..simulation.solution import Solution
 
-# Okabe and Ito's colours, which the common kinds of colour blindness tell apart.
+# Okabe and Ito's colours, distinct under the common kinds of colour blindness.
 BLACK, GREY = "#000000", "#808080"
 SERIES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 
@@ -21,7 +21,7 @@ def refuse(name: str, expected: str, got: Any) -> ValueError:
 
 
 def reached(solution: Any, name: str = "solution") -> list[np.ndarray]:
-    """`ts`, `q` and `qd` of one solution, without what it did not reach."""
+    """Arrays `ts`, `q` and `qd` of one solution, up to the last time reached."""
     if not isinstance(solution, Solution) or np.ndim(solution.q) != 2:
         expected = "the Solution of one simulate (of a batch, pass one member)"
         raise refuse(name, expected, solution)
@@ -33,14 +33,14 @@ def reached(solution: Any, name: str = "solution") -> list[np.ndarray]:
 
 
 def filled_mapping(name: str, value: Any, kind: str) -> Mapping:
-    """`value` if it is a dictionary with something in it, else ValueError."""
+    """Returns `value` if it is a nonempty dictionary, else raises ValueError."""
     if not isinstance(value, Mapping) or not value:
         raise refuse(name, f"a dictionary, not empty, of label: {kind}", value)
     return value
 
 
 def figure_or_new(fig: Any, width: float, height: float) -> Figure:
-    """`fig`, or a new figure of that size [inches]."""
+    """Returns `fig`, or a new figure of the given size [inches]."""
     if fig is None:
         return plt.figure(figsize=(width, height), layout="constrained")
     if not isinstance(fig, Figure):
@@ -49,7 +49,7 @@ def figure_or_new(fig: Any, width: float, height: float) -> Figure:
 
 
 def axes_or_new(ax: Any, height: float) -> Axes:
-    """`ax`, or those of a new figure of that height [inches]."""
+    """Returns `ax`, or the axes of a new figure of the given height [inches]."""
     if ax is None:
         return figure_or_new(None, 3.5, height).subplots()
     if not isinstance(ax, Axes):
@@ -58,14 +58,14 @@ def axes_or_new(ax: Any, height: float) -> Axes:
 
 
 def xy(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Coordinates of complex points."""
+    """Coordinates x and y of complex points."""
     return np.real(points).ravel(), np.imag(points).ravel()
 
 
 def plane_axes(ax: Any, points: np.ndarray, *, beside: float = 0.0) -> Axes:
-    """Axes of equal scales; new ones have the proportions of what they will show.
+    """Axes of equal scales; new axes get the proportions of the points.
 
-    `beside`: the width of what will stand beside them [inches].
+    `beside`: width to reserve beside the axes [inches].
     """
     width, height = (max(np.ptp(part), 1e-9) for part in xy(points))
     ax = axes_or_new(ax, 0.9 + np.clip((2.9 - beside) * height / width, 1.6, 3.6))
@@ -76,12 +76,12 @@ def plane_axes(ax: Any, points: np.ndarray, *, beside: float = 0.0) -> Axes:
 
 
 def legend(ax: Axes, *others: Axes) -> None:
-    """A legend above the axes, where it hides nothing, of all that has a label."""
+    """Adds a legend of all labels above the axes, where it hides nothing."""
     found = {}
     for handles, labels in (a.get_legend_handles_labels() for a in (ax, *others)):
         found |= dict(zip(labels, handles))
     columns = max(1, 48 // (4 + max(map(len, found))))
-    columns = -(-len(found) // -(-len(found) // columns))  # as even as the rows allow
+    columns = -(-len(found) // -(-len(found) // columns))  # makes rows of even length
     ax.legend(
         list(found.values()), list(found), ncols=columns, fontsize="small",
         frameon=False, handlelength=1.2, columnspacing=1,

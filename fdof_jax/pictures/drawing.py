@@ -1,10 +1,10 @@
 """Pictures and animations of linkages in the plane, with matplotlib.
 
-Every function draws into the axes (`ax`) or figure (`fig`) it is given, or into a new
-one, and returns it; `animate` and `animate_grid` return their animation. Nothing is
-shown or saved, and no global setting changes. A `solution` is that of one `simulate`;
-what a failed one did not reach is left out. Links are numbered as in the paper: the
-ground is link 1, the moving ones are 2 to 4. Curves over time are in `plotting`.
+Every function draws into the given axes (`ax`) or figure (`fig`), or into a new one,
+and returns it; `animate` and `animate_grid` return an animation. Nothing is shown or
+saved, and no global setting changes. A `solution` is that of one `simulate`; of a
+failed one, the samples reached are drawn. Links are numbered as in the paper: the
+ground is link 1, the moving links are 2 to 4. Curves over time are in `plotting`.
 """
 
 from collections.abc import Mapping
@@ -40,18 +40,18 @@ def draw_linkage(
     alpha: float = 1.0,
     mass_centers: bool = True,
 ) -> Axes:
-    """One configuration, to scale.
+    """Draws one configuration, to scale.
 
     A link is a line along its vector A_n, bent by the fixed B_n where the next joint is
     revolute. Real revolute joints are pins; real prismatic joints are carriages on a
-    rail of length B_n. Fictitious joints are not drawn. The tip is a square, a mass
+    rail of length B_n. Fictitious joints are not drawn. The tip is a square. A mass
     centre is a dot, joined to its link if it lies beside it.
 
-    **Arguments:** `q`: joint positions [m or rad]; `color`: one for all links, by
-    default each has its own; `alpha`: opacity, 0 to 1; `mass_centers`: whether to draw
+    **Arguments:** `q`: joint positions [m or rad]; `color`: common colour of all links,
+    by default one per link; `alpha`: opacity, 0 to 1; `mass_centers`: whether to draw
     them.
 
-    **Returns:** the axes. The `gid` of a line says what it is: "link 2", "pin 1",
+    **Returns:** the axes. The `gid` of a line names its part: "link 2", "pin 1",
     "rail 2", "slider 2", "mass 3", "tip 4", "ground".
 
     **Raises:** ValueError for malformed arguments.
@@ -72,11 +72,11 @@ def chrono_cyclograph(
     until: float | None = None,
     mass_centers: bool = False,
 ) -> Axes:
-    """Configurations at equal time steps, from faint to full, and the path of the tip.
+    """Draws configurations at equal time steps, from faint to full, and the tip's path.
 
-    As in the paper's Figs 3, 5 and 7.
+    The picture is that of the paper's Figs 3, 5 and 7.
 
-    **Arguments:** `every`: time step, of which the nearest samples are drawn [s];
+    **Arguments:** `every`: time step [s], at which the nearest samples are drawn;
     `until`: last time, by default the solution's [s]; `mass_centers`: whether to draw
     them.
 
@@ -90,7 +90,7 @@ def chrono_cyclograph(
     last = ts[-1]
     if until is not None:
         last = min(last, float(real_array("until", until, (), minimum=float(ts[0]))))
-    # The excess keeps the last step where the division falls short by rounding.
+    # The added 1e-6 keeps the last step if the division falls short by rounding.
     steps = np.arange(np.floor((last - ts[0]) / step + 1e-6) + 1)
     indices = np.unique([np.abs(ts - t).argmin() for t in ts[0] + step * steps])
     ax = plane_axes(ax, g.end[: indices[-1] + 1])
@@ -105,10 +105,10 @@ def topology_grid(
     *,
     configurations: int = 3,
 ) -> Figure:
-    """Linkages side by side, each with a few configurations and the path of its tip.
+    """Draws linkages side by side, each with a few configurations and its tip's path.
 
-    **Arguments:** `motions`: title -> (linkage, its solution); `configurations`: how
-    many of each, evenly spaced in samples from the first (faint) to the last.
+    **Arguments:** `motions`: title -> (linkage, its solution); `configurations`: number
+    for each, evenly spaced in samples from the first (faint) to the last.
 
     **Returns:** the figure.
 

@@ -1,4 +1,4 @@
-"""Where the parts of a linkage are during a motion, as pictures draw them."""
+"""Positions of a linkage's parts during a motion, as pictures draw them."""
 
 from typing import NamedTuple
 
@@ -12,19 +12,18 @@ from ..linkage.linkage import Linkage
 class Geometry(NamedTuple):
     """A linkage at all samples; points of the plane are complex numbers.
 
-    Link n runs from where joint n - 1 puts it along A_n to its `end`; the end of link 4
-    is the tip.
+    Link n runs from joint n - 1 along A_n to its `end`. The end of link 4 is the tip.
     """
 
     angle: np.ndarray  # th_1 to th_4 [rad]: (time, 4)
     slide: np.ndarray  # B_1 to B_3 [m]: (time, 3)
-    revolute: np.ndarray  # whether each real joint is: (3,)
+    revolute: np.ndarray  # whether each real joint is revolute: (3,)
     end: np.ndarray  # (time, 4)
-    points: dict[str, np.ndarray]  # of all to draw, by name in that order: (time, n)
+    points: dict[str, np.ndarray]  # by name of the part, in drawing order: (time, n)
 
 
 def geometry(linkage: Linkage, q: np.ndarray) -> Geometry:
-    """Where a linkage is at joint positions (time, 3)."""
+    """The `Geometry` of a linkage at joint positions (time, 3)."""
     x = np.asarray(jax.vmap(lambda q: to_chain(linkage, q, np.zeros(3))[0])(q))
     angle = np.column_stack([np.full(len(x), linkage.base_angle), x[:, 1::2]])
     slide = x[:, 0::2]
@@ -34,7 +33,7 @@ def geometry(linkage: Linkage, q: np.ndarray) -> Geometry:
     start = np.cumsum(np.column_stack([np.zeros(len(x)), steps]), axis=1)
     end = start + along
     com = np.asarray(linkage.com)
-    foot = start[:, 1:] + com[:, 0] * direction[:, 1:]  # of the mass centre on A_n
+    foot = start[:, 1:] + com[:, 0] * direction[:, 1:]  # mass centre projected on A_n
     center = foot + 1j * com[:, 1] * direction[:, 1:]
     revolute = np.asarray(linkage.ef)[1::2] > 0.5
 

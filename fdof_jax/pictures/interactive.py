@@ -1,4 +1,4 @@
-"""Sliders for a notebook, and what is drawn anew while they are moved."""
+"""Sliders for a notebook, and the picture they redraw."""
 
 from collections.abc import Mapping
 from io import BytesIO
@@ -26,22 +26,22 @@ from .geometry import geometry
 
 _SAMPLES = 201
 _CONFIGURATIONS = 5  # drawn of each motion
-# What a picture can show, in a time that a hand on a slider does not notice.
+# As accurate as a picture can show, and fast enough for a moving slider.
 _TOLERANCE, _MAX_STEPS = 1e-5, 4096
 
 
 class _Moved(NamedTuple):
-    """A scene as the sliders have it, and its motion."""
+    """A scene as set by the sliders, and its motion."""
 
     scene: Scene
     solution: Solution
     commanded: Array  # path (time, 2) [m]
-    possible: Array  # whether the arm reaches that: (time,)
+    possible: Array  # whether the arm reaches the commanded path: (time,)
 
 
 @eqx.filter_jit
 def _moved(scene: Scene, stretch: Array, factor: Array) -> _Moved:
-    """`stretch`: of the moving links (3,); `factor`: of kp and kd (2, 3)."""
+    """Simulates links `stretch` (3,) times as long, and gains times `factor` (2, 3)."""
     linkage = eqx.tree_at(
         lambda linkage: (linkage.length, linkage.com),
         scene.linkage,
@@ -70,7 +70,7 @@ def _moved(scene: Scene, stretch: Array, factor: Array) -> _Moved:
 
 
 def _told(moved: _Moved, error: np.ndarray) -> str:
-    """How the motion ended and what was moved, as HTML; `error`: of the tip [m]."""
+    """HTML text on the motion's end, gains and lengths; `error`: tip errors [m]."""
     solution = moved.solution
     time = float(solution.stats["time_reached"])
     if not np.all(moved.possible):
@@ -100,10 +100,10 @@ def _told(moved: _Moved, error: np.ndarray) -> str:
 
 
 class _Picture:
-    """An arm with the path of its tip, and the tip's error over time.
+    """A picture of an arm with the path of its tip, and the tip's error over time.
 
-    Axes, numbers and legend take most of the time to draw: they are kept as pixels for
-    as long as the motion fits into them. So are the lines, which are moved.
+    Axes, numbers and legend take most of the time to draw. They are kept as pixels as
+    long as the motion fits into them, and the lines are moved, not drawn anew.
     """
 
     def __init__(self):
@@ -121,7 +121,7 @@ class _Picture:
         self._lines: Any = None
 
     def draw(self, moved: _Moved) -> tuple[bytes, np.ndarray]:
-        """The picture as PNG, and the tip's error [m]; always of the same topology."""
+        """The picture as PNG, and the tip's error [m]; all calls need one topology."""
         ts, q, _ = reached(moved.solution)
         path = geometry(moved.scene.linkage, q)
         commanded = np.asarray(moved.commanded) @ [1, 1j]
@@ -144,7 +144,7 @@ class _Picture:
             for line in ax.lines:
                 ax.draw_artist(line)
         png = BytesIO()
-        # Stronger compression costs more time than it saves on the way to the screen.
+        # Stronger compression costs more time than it saves in transfer.
         pixels, fast = self._canvas.buffer_rgba(), {"compress_level": 1}
         imsave(png, pixels, format="png", pil_kwargs=fast)
         return png.getvalue(), error
@@ -168,28 +168,28 @@ class _Picture:
         self._time.set(xlim=(0, t1), ylim=(0, 1.2 * self._time.dataLim.y1))
         legend(self._plane)
         self._canvas.draw()
-        self._plane.autoscale(False)  # new lines would move the view, not the numbers
+        # New lines would move the view, but not the numbers in the background.
+        self._plane.autoscale(False)
         self._background = self._canvas.copy_from_bbox(self._figure.bbox)
 
 
 def sliders(scenes: Mapping[str, Scene] | None = None) -> Any:
-    """A box of sliders for a notebook: a controlled arm is simulated as they are moved.
+    """A box of sliders for a notebook, which simulate a controlled arm as they move.
 
     A drop-down chooses among the scenes. Sliders stretch the moving links, with their
-    mass centres along them, to 0.5 to 1.5 of their length, and multiply the gains of
-    the PD controller by 1/4 to 4. The arm is drawn at five equal parts of its motion,
-    with the path of its tip and the path that was commanded; beside it is the tip's
-    error over time [mm]. Below stand gains and lengths in their units, and how the
-    motion ended: one that fails or is out of reach is told there, and shown as far as
-    it went.
+    mass centres, to 0.5 to 1.5 of their length, and multiply the gains of the PD
+    controller by 1/4 to 4. The left panel shows the arm at five times of its motion,
+    with the path of its tip and the commanded path; the right panel shows the tip's
+    error over time [mm]. The text below lists gains and lengths in their units, and
+    reports how the motion ended. A motion that fails is drawn as far as it went.
 
-    The first motion is compiled, for some seconds. Scenes that differ in numbers only,
-    as all topologies do, share that. Motions are right to about 1e-5 m and rad.
+    The first motion takes some seconds to compile. Scenes that differ in numbers only,
+    as all topologies do, share the program. Motions are accurate to some 1e-5 m or rad.
 
-    **Arguments:** `scenes`: name -> a scene with exactly one PD controller, which
-    tracks a task with a `tip`; by default `circle_scenes()`, one arm per topology.
+    **Arguments:** `scenes`: name -> a scene with exactly one PD controller, tracking a
+    task with a `tip`; by default `circle_scenes()`, one arm per topology.
 
-    **Returns:** an ipywidgets `Box`; as the last line of a cell it is shown.
+    **Returns:** an ipywidgets `Box`, shown if it is the last line of a cell.
 
     **Raises:** ImportError without ipywidgets; ValueError for malformed arguments.
     """
@@ -208,7 +208,7 @@ def sliders(scenes: Mapping[str, Scene] | None = None) -> Any:
         if not callable(getattr(controller_of(scene).reference, "tip", None)):
             task = controller_of(scene).reference
             raise refuse(f"scenes[{name!r}]", "a controller of a task with a tip", task)
-        # As an array, so that other times are not compiled anew.
+        # As an array, so that other times do not compile again.
         known[name] = scene._replace(t1=jnp.asarray(scene.t1, float))
 
     arm = widgets.Dropdown(options=list(known), description="arm")
@@ -217,7 +217,7 @@ def sliders(scenes: Mapping[str, Scene] | None = None) -> Any:
         for n in (2, 3, 4)
     ]
     # A factor of 4, as in `tune`. The browser shows only whole steps from the least
-    # value: 1 has to be one.
+    # value, so the factor 1 must lie on a step.
     most = np.log10(4)
     span = dict(min=-most, max=most, step=most / 30, readout_format=".2f")
     gains = [
@@ -236,8 +236,7 @@ def sliders(scenes: Mapping[str, Scene] | None = None) -> Any:
         words.value = _told(moved, error)
 
     redraw()
-    # The browser holds back what is moved while a picture is drawn, but for the newest
-    # value: no queue grows.
+    # While a picture is drawn, the browser keeps only the newest value: no queue grows.
     for control in (arm, *lengths, *gains):
         control.observe(redraw, "value")
     controls = widgets.VBox(

@@ -1,7 +1,7 @@
 """Curves of motions over time and of the tip's path, with matplotlib.
 
-Joint motion, energies, efforts, how a controlled tip tracks its task, and what accuracy
-costs. Arguments and results are as in `drawing`, which holds the pictures of the
+The curves show joint motion, energies, efforts, tracking of a task, and the cost of
+accuracy. Arguments and results are as in `drawing`, which holds the pictures of the
 linkage itself.
 """
 
@@ -48,7 +48,7 @@ _LIGHT_GREY = "#BBBBBB"
 
 
 def _time_panels(fig: Figure, ts: np.ndarray, panels: list) -> list[Axes]:
-    """Axes above each other: (y label, [(label, values, colour), ...]) over time."""
+    """Plots panels (y label, [(label, values, colour), ...]) over time, stacked."""
     axes = list(fig.subplots(len(panels), squeeze=False, sharex=True)[:, 0])
     for ax, (ylabel, curves) in zip(axes, panels):
         for label, values, color in curves:
@@ -62,10 +62,10 @@ def _time_panels(fig: Figure, ts: np.ndarray, panels: list) -> list[Axes]:
 def motion_profile(
     linkage: Linkage, solution: Solution, fig: Figure | None = None
 ) -> Figure:
-    """Motion of the real joints over time, as in the paper's Figs 4 and 6.
+    """Plots the motion of the real joints over time, as in the paper's Figs 4 and 6.
 
-    Absolute angles th_n of the links that turn on a revolute joint [degrees], and in
-    axes of their own the slides B_n of the prismatic joints [m].
+    One panel shows the absolute angles th_n of links on revolute joints [degrees],
+    another the slides B_n of prismatic joints [m].
 
     **Returns:** the figure.
 
@@ -90,7 +90,7 @@ def motion_profile(
 def energy_profile(
     linkage: Linkage, solution: Solution, fig: Figure | None = None
 ) -> Figure:
-    """Kinetic and potential energy of each link, and of all together, over time [J].
+    """Plots kinetic and potential energy of each link, and their sums, over time [J].
 
     **Returns:** the figure.
 
@@ -115,14 +115,14 @@ def energy_profile(
 
 
 def _powers(linkage: Linkage, forces: Forces, solution: Solution) -> np.ndarray:
-    """What each element does to the arm's energy (element, time) [W].
+    """Power of each element on the arm (element, time) [W].
 
-    Without what only moves to and from its own potential energy, that of a spring.
+    Exchange with an element's own potential energy (of a spring) does not count.
     """
     efforts = joint_efforts(linkage, forces, solution).elements
     powers = jnp.einsum("etj,tj->et", efforts, solution.qd)
     for k, element in enumerate(forces):
-        # The efforts of one that moves masses are without those of its energy.
+        # The efforts of an inertial element exclude those of its potential energy.
         if isinstance(element, InertialElement) or not hasattr(
             element, "potential_energy"
         ):
@@ -139,25 +139,24 @@ def _powers(linkage: Linkage, forces: Forces, solution: Solution) -> np.ndarray:
 def energy_stack(
     linkage: Linkage, forces: Forces, solution: Solution, ax: Axes | None = None
 ) -> Axes:
-    """Where the energy is over time, stacked [J].
+    """Plots the energy balance over time, stacked [J].
 
-    Kinetic energy, potential energy above its least (springs and masses of force
-    elements included), and what the forces have taken out since the start. The dashed
-    line is the energy at the start and what the forces have put in. It is level where
-    they only take out, and the top of the stack lies on it, but for the errors of the
-    motion and of the integrals of power over its samples (Simpson's rule).
+    The stack is kinetic energy, potential energy above its least (springs and masses of
+    force elements included), and the energy taken out by the forces since the start.
+    The dashed line is the energy at the start plus the energy put in by the forces; it
+    is level if none is put in. The top of the stack lies on this line up to errors of
+    the motion and of the integrals of power over its samples (Simpson's rule).
 
-    A force element that drives at times and brakes at others, a motor for instance,
-    does both: it puts in while its power is positive and takes out while it is
-    negative.
+    A force element puts energy in while its power is positive, and takes it out while
+    its power is negative. A motor may do both.
 
     **Arguments:** `forces`: those of the solution.
 
     **Returns:** the axes.
 
-    **Raises:** ValueError for malformed arguments. Warns where top and line are more
-    than a hundredth of the energy apart: the samples are then too far apart, or the
-    forces are not those of the solution.
+    **Raises:** ValueError for malformed arguments. Warns if top and line differ by more
+    than a hundredth of the energy: the samples are then too far apart, or the forces
+    are not those of the solution.
     """
     ts, q, qd = reached(solution)
     powers = _powers(linkage, forces, solution)[:, : len(ts)]
@@ -182,7 +181,7 @@ def energy_stack(
     ax = axes_or_new(ax, 2.6)
     colors = [*SERIES[3:5], _LIGHT_GREY]
     ax.stackplot(ts, list(bands.values()), labels=list(bands), colors=colors)
-    driven = put_in.max() > 1e-5 * line.max()  # by more than rounding
+    driven = put_in.max() > 1e-5 * line.max()  # more than rounding errors
     label = "start + put in" if driven else "at the start"
     ax.plot(ts, line, "--", color=BLACK, lw=1.2, label=label)
     ax.set(xlabel="time [s]", ylabel="energy [J]", xlim=(ts[0], ts[-1]))
@@ -193,11 +192,11 @@ def energy_stack(
 def effort_profile(
     linkage: Linkage, forces: Forces, solution: Solution, fig: Figure | None = None
 ) -> Figure:
-    """Total joint efforts over time, one panel per joint [N or N m], with their limits.
+    """Plots joint efforts over time with their limits, a panel per joint [N or N m].
 
-    Grey is the band within the finite limits of a `PDController`; where the efforts
-    stay far from them it fills the panel. Orange dots mark the samples at which the
-    controller is saturated.
+    The curves are total efforts. The grey band lies within the finite limits of a
+    `PDController`; it fills the panel where the efforts stay far from the limits.
+    Orange dots mark samples at which the controller is saturated.
 
     **Arguments:** `forces`: those of the solution.
 
@@ -216,7 +215,7 @@ def effort_profile(
     fig = figure_or_new(fig, 3.5, 5.2)
     axes = _time_panels(fig, ts, panels)
     for k, (ax, unit) in enumerate(zip(axes, units)):
-        low, high = ax.get_ylim()  # not those of the bands, which may be far wider
+        low, high = ax.get_ylim()  # before the bands, which may be far wider
         for element, effort in zip(forces, elements):
             if isinstance(element, PDController) and np.isfinite(element.limit[k]):
                 limit = float(element.limit[k])
@@ -237,12 +236,12 @@ def effort_profile(
 def work_precision(
     measured: Mapping[str, tuple[ArrayLike, ArrayLike]], ax: Axes | None = None
 ) -> Axes:
-    """What accuracy costs: times over errors, both on logarithmic axes.
+    """Plots times over errors, both on logarithmic axes: the cost of accuracy.
 
-    The errors are yours, and so is their unit: the label of the axis is "error".
+    The unit of the errors is yours; the axis is labelled "error".
 
-    **Arguments:** `measured`: label -> (errors, times [s]), as many of each, all above
-    0; in any order.
+    **Arguments:** `measured`: label -> (errors, times [s]), equally many, all above 0,
+    in any order.
 
     **Returns:** the axes.
 

@@ -1,4 +1,4 @@
-"""Pictures of how well the tip follows its path."""
+"""Plots of how well the tip tracks its path."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -43,13 +43,13 @@ def _tip(
 
 
 def _one_turn(task: Any, ts: np.ndarray, path: np.ndarray) -> np.ndarray:
-    """Of the commanded path: dashes drawn over each other become a solid line."""
+    """One turn of the commanded path, as overlapping dashes make a solid line."""
     turn = abs(float(getattr(task, "period", np.inf)))
     return path[ts - ts[0] <= turn * (1 + 1e-6)]
 
 
 def _tips(linkage: Any, task: Any, solutions: Any) -> list[tuple]:
-    """Per solution its label, colour, times, and commanded and actual tip positions."""
+    """Label, colour, times, commanded and actual tip positions of each solution."""
     filled_mapping("solutions", solutions, "Solution")
     return [
         (str(label), SERIES[k % len(SERIES)])
@@ -64,12 +64,12 @@ def tracking(
     solutions: Mapping[str, Solution],
     ax: Axes | None = None,
 ) -> Axes:
-    """Paths of the tip and the path it was commanded to follow; dots are the starts.
+    """Plots paths of the tip and the commanded path; dots are the starts.
 
-    Into the axes of `chrono_cyclograph` it adds the path of the paper's Fig 7.
+    Drawn into the axes of `chrono_cyclograph`, it adds the path of the paper's Fig 7.
 
-    **Arguments:** `task`: what was commanded, the tip's set point being `task.tip(t)`;
-    `solutions`: one curve per label.
+    **Arguments:** `task`: `task.tip(t)` is the commanded tip position [m]; `solutions`:
+    one curve per label.
 
     **Returns:** the axes.
 
@@ -91,12 +91,12 @@ def tracking(
 def tracking_by_error(
     linkage: Linkage, task: CircleTask, solution: Solution, ax: Axes | None = None
 ) -> Axes:
-    """The path of the tip, coloured by its distance from its set point [mm].
+    """Plots the path of the tip, coloured by its distance from its set point [mm].
 
-    Dashed is the path it was commanded to follow; the dot is its start. Later turns lie
-    on earlier ones.
+    The dashed line is the commanded path; the dot is the tip's start. Later turns cover
+    earlier ones.
 
-    **Arguments:** `task`: what was commanded, the tip's set point being `task.tip(t)`.
+    **Arguments:** `task`: `task.tip(t)` is the commanded tip position [m].
 
     **Returns:** the axes, with a colour bar beside them.
 
@@ -119,7 +119,7 @@ def tracking_by_error(
     ax.add_collection(pieces)
     ax.autoscale_view()
     ax.plot(*corners[0], "o", color=_DARK_TO_LIGHT(pieces.norm(error[0])), ms=4)
-    # As high as the axes, which equal scales may make lower than their place.
+    # An inset is as high as the axes, which equal scales may shrink.
     bar = ax.inset_axes((1.04, 0, 0.05, 1))
     ax.figure.colorbar(pieces, cax=bar, label="tip error [mm]")
     legend(ax)
@@ -132,9 +132,9 @@ def tracking_error(
     solutions: Mapping[str, Solution],
     ax: Axes | None = None,
 ) -> Axes:
-    """Distance of the tip from its set point over time [m].
+    """Plots the distance of the tip from its set point over time [m].
 
-    **Arguments:** as of `tracking`.
+    **Arguments:** as in `tracking`.
 
     **Returns:** the axes.
 

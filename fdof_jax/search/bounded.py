@@ -1,7 +1,7 @@
 """Minimisation within bounds by derivatives, many runs at once.
 
-The functions are evaluated for all runs that still go on together; what comes here is
-the little that follows an evaluation, on the host.
+All running functions are evaluated together. This module does the little work after an
+evaluation, on the host.
 """
 
 import time
@@ -20,17 +20,15 @@ from .methods import (
     held_at_bounds,
 )
 
-# Where the loss itself can vanish, its gradient is compared with that at the start.
+# The loss may vanish, so its gradient is also compared with that at the start.
 _GRADIENT_DECREASE = 1e-10
-
-
-# What the projected gradient must have fallen to for a stop for another reason to count
-# as convergence: part of the loss.
+# A stop for another reason counts as convergence if the projected gradient is at most
+# this part of the loss.
 _CONVERGED = 1e-2
 
 
 class Row(NamedTuple):
-    """An accepted point of a run: `gradient_norm` without what bounds hold back."""
+    """An accepted point of a run; `gradient_norm` is that of the projected gradient."""
 
     z: np.ndarray
     loss: float
@@ -40,19 +38,19 @@ class Row(NamedTuple):
 
 
 class Run:
-    """One run: where it is, what it has passed, and why it has stopped, if it has."""
+    """A run: its point `z`, its accepted points `rows`, and its `reason` to stop."""
 
     def __init__(self, method: Any, enough: float, z, low, high):
         self.method, self.enough = method(z), enough
         self.z, self.low, self.high = z, low, high
         self.rows: list[Row] = []
         self.reason: str | None = None
-        self.exhausted = False  # out of steps, before any other reason
-        self.flat = False  # whether the gradient is zero at the start, bounds or not
+        self.exhausted = False  # whether it stopped only for lack of steps
+        self.flat = False  # whether the gradient at the start is zero, also at bounds
         self.at: Evaluation | None = None
 
     def arrive(self, z: np.ndarray, here: Evaluation, began: float) -> None:
-        """Take the result of an evaluation: accept the point or refuse it."""
+        """Accepts or rejects the point `z` by its evaluation `here`."""
         finite = np.isfinite(here.loss) and np.isfinite(here.gradient).all()
         finite = finite and np.isfinite(here.curvature).all()
         adam = isinstance(self.method, Adam)
@@ -94,12 +92,12 @@ class Run:
         low = np.maximum(self.low, self.z - LONGEST_STEP)
         high = np.minimum(self.high, self.z + LONGEST_STEP)
         step = self.method.step(self.z, self.at, low, high)
-        # z + (high - z) may be beyond high by rounding.
+        # By rounding, z + (high - z) may exceed high.
         return np.clip(self.z + step, low, high)
 
     @property
     def best(self) -> Row:
-        """Adam's last point need not be its best: what is said is said of the best."""
+        """The point of least loss, which need not be Adam's last."""
         return min(self.rows, key=lambda row: row.loss)
 
     @property
@@ -117,9 +115,9 @@ class Run:
 def reporting(
     report: Any, describe: Callable[[list[Run]], str]
 ) -> Callable[[int, list[Run]], None]:
-    """What `minimise` tells of each step, as a line for the argument `report`.
+    """Returns a callback for `minimise` that passes a line per step to `report`.
 
-    Raise ValueError if that is neither callable nor None.
+    Raises ValueError if `report` is neither callable nor None.
     """
     if not (report is None or callable(report)):
         raise ValueError(f"report: expected a callable or None, got {report!r}.")
@@ -145,14 +143,14 @@ def minimise(
     enough: float,
     report: Callable[[int, list[Run]], None],
 ) -> list[Run]:
-    """Minimise a function per run, from (run, n) starts within (run, n) bounds.
+    """Minimises a function per run, from (run, n) starts within (run, n) bounds.
 
-    Raise ValueError unless `max_steps` is a whole number of at least 1.
+    **Arguments:** `evaluate`: `(z, runs) -> Evaluation`, for points `z` of the runs
+    with indices `runs`; `method`: one of `METHODS`; `max_steps`: evaluations after the
+    first; `enough`: a run stops when its loss falls by less than this part; `report`:
+    called after each step with its number and the runs.
 
-    **Arguments:** `evaluate`: `(z, runs)`, points of the runs with these indices, to
-    their `Evaluation`; `method`: one of `METHODS`; `max_steps`: evaluations after the
-    first; `enough`: a run stops where its loss falls by less than this part of itself;
-    `report`: told the number of the step and the runs after each.
+    **Raises:** ValueError unless `max_steps` is a whole number of at least 1.
     """
     max_steps = whole_number("max_steps", max_steps, 1)
     began = time.perf_counter()

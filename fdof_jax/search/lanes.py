@@ -1,4 +1,4 @@
-"""One compiled evaluation for many runs, each judged by one problem or by several."""
+"""One compiled evaluation for many runs, each of one problem or several."""
 
 from collections.abc import Callable
 from typing import Any
@@ -12,16 +12,16 @@ from jax import Array
 from ..simulation.scene import stacked
 from .methods import Evaluation
 
-# Lanes of a compiled batch at most: fewer do not fill the processor, and more wait for
-# each other.
+# Greatest number of lanes in a compiled batch: fewer do not fill the processor, and
+# more wait for each other.
 _LANES = 8
 
-Evaluate = Callable[[Array, Any], Evaluation]  # of one lane, given z and its problem
+Evaluate = Callable[[Array, Any], Evaluation]  # (z, problem) of one lane
 
 
 @eqx.filter_jit
 def _evaluate(evaluate: Evaluate, z: Array, moving: Any, shared: Any) -> Evaluation:
-    """Of one lane or, with a leading axis of all but what is shared, of several."""
+    """Evaluates one lane, or several if `z` and `moving` have a leading axis."""
 
     def lane(z, moving):
         return evaluate(z, eqx.combine(moving, shared))
@@ -30,14 +30,14 @@ def _evaluate(evaluate: Evaluate, z: Array, moving: Any, shared: Any) -> Evaluat
 
 
 def _moves(leaf: Any) -> bool:
-    """Whether an array with axes (run, member) differs between them."""
+    """Whether an array with leading axes (run, member) differs along them."""
     return isinstance(leaf, np.ndarray) and bool((leaf != leaf[:1, :1]).any())
 
 
 class Lanes:
-    """Evaluates runs, whose problems go through one program in groups of like work.
+    """Evaluates runs by one compiled program, in groups of lanes with similar work.
 
-    The facts of an evaluation include the `steps` that it took.
+    Work is measured by `steps`, which the facts of an evaluation must include.
     """
 
     def __init__(
@@ -47,13 +47,12 @@ class Lanes:
         starts: int = 1,
         order: int = 1,
     ):
-        """`problems`: of each run the same number, for each of its `starts`.
-
-        `order`: of the power mean that is taken over the problems of a run.
+        """`problems`: rows of equally many members, for as many runs as `starts` each;
+        `order`: order of the power mean over the members.
         """
         self.evaluate, self.order = evaluate, order
         every = stacked([stacked(members) for members in problems])
-        # What all have in common is computed once for all lanes.
+        # Values common to all lanes are not batched, so XLA computes with them once.
         moving, shared = eqx.partition(every, _moves)
         self.shared = jax.tree.map(
             lambda a: jnp.asarray(a[0, 0]) if isinstance(a, np.ndarray) else a, shared
@@ -72,7 +71,7 @@ class Lanes:
             groups: Any = [np.array(0)]
         else:
             work = np.argsort([-self.steps[lane] for lane in lanes], kind="stable")
-            # The last group is filled up with copies.
+            # Copies fill the last group.
             groups = np.resize(work, (-(-len(lanes) // self.size), self.size))
         found: list[Any] = [None] * len(lanes)
         for group in groups:
@@ -94,15 +93,15 @@ class Lanes:
 
 
 def power_mean(members: Evaluation, order: int) -> Evaluation:
-    """Over the axis of members: mean(loss^order)^(1/order), 1 being the mean.
+    """The power mean over the axis of members, mean(loss^order)^(1/order).
 
-    Its curvature takes the members' for theirs, and that of the mean as it is.
+    Its curvature combines the members' curvatures with the exact one of the mean.
     """
     loss, gradient, curvature, facts = members
     largest = np.max(loss, axis=1, keepdims=True)
     part = loss / np.where(largest > 0, largest, 1)
     mean = np.mean(part**order, axis=1, keepdims=True) ** (1 / order)
-    # Loss over mean to the order less one; both vanish together.
+    # The weight (loss / mean)^(order - 1) / members; loss and mean vanish together.
     weight = (part / np.where(mean > 0, mean, 1)) ** (order - 1) / loss.shape[1]
     total = np.einsum("rm,rmn->rn", weight, gradient)
     bent = np.einsum("rm,rmij->rij", weight, curvature)

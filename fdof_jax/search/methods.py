@@ -1,4 +1,4 @@
-"""Methods of minimisation within bounds: one iteration of each."""
+"""Iterations of methods for minimisation within bounds."""
 
 from typing import Any, NamedTuple
 
@@ -7,20 +7,18 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
 
-# Stop where a change of the unknowns by 1 would hardly change the loss, to first order.
+# A run stops if, to first order, changing the unknowns by 1 hardly changes the loss.
 GRADIENT_OF_LOSS = 1e-6
-
-
-# No step changes an unknown by more: a factor of 7 where unknowns are logarithms.
+# Greatest change of an unknown in a step: a factor of 7 if unknowns are logarithms.
 LONGEST_STEP = 2.0
 
 
 class Evaluation(NamedTuple):
-    """A function at one point per run.
+    """A function and its derivatives at one point per run.
 
-    - `loss` (run,); `gradient` (run, n); `curvature` (run, n, n): semidefinite, Gauss
-      and Newton's for instance.
-    - `facts`: arrays (run, ...) to be kept with the point.
+    - `loss` (run,); `gradient` (run, n); `curvature` (run, n, n): semidefinite, for
+      instance Gauss-Newton.
+    - `facts`: arrays (run, ...) kept with the point.
     """
 
     loss: Any
@@ -33,10 +31,11 @@ class Evaluation(NamedTuple):
 
 
 class LevenbergMarquardt:
-    """Steps of the damped quadratic model in the box, which only ever go down.
+    """The Levenberg-Marquardt method: steps to the damped model's minimum in the box.
 
-    Along a flat valley whose floor the model takes for curved, steps come out short
-    again and again: after one that brings more than it promised the next is stretched.
+    Along a valley whose floor is flatter than the model, steps are repeatedly too
+    short. After a step that decreases the loss more than predicted, the next one is
+    stretched.
     """
 
     def __init__(self, z: np.ndarray):
@@ -57,7 +56,7 @@ class LevenbergMarquardt:
         self.damping, self.growth = max(self.damping / 4, 1e-9), 4
 
     def refused(self) -> bool:
-        """Whether there is anything left to try."""
+        """Shortens the next step, and returns whether one is left to try."""
         if self.stretch > 1:
             self.stretch = 1
             return True
@@ -67,7 +66,7 @@ class LevenbergMarquardt:
 
 
 class LBFGS:
-    """optax's L-BFGS directions, within the box by projection, halved until down."""
+    """optax's L-BFGS directions, projected into the box, shortened until descent."""
 
     def __init__(self, z: np.ndarray):
         import optax  # slow to import, and not needed by the default method
@@ -88,7 +87,7 @@ class LBFGS:
         direction = np.where(held, 0, self.direction)
         if direction @ here.gradient >= 0:
             direction = np.where(held, 0, -here.gradient)
-        # The first direction is the gradient itself, whose length says nothing.
+        # The first direction is the gradient itself, whose length is arbitrary.
         if int(self.state.count) == 1:
             direction = 0.3 * direction / np.abs(direction).max()
         return np.clip(z + self.share * direction, low, high) - z
@@ -102,7 +101,7 @@ class LBFGS:
 
 
 class Adam:
-    """optax's Adam, clipped to the box; its loss may rise on the way."""
+    """optax's Adam, clipped to the box; the loss may rise on the way."""
 
     def __init__(self, z: np.ndarray):
         import optax
@@ -130,22 +129,22 @@ METHODS: dict[str, Any] = {
 def box_minimum(
     matrix: np.ndarray, slope: np.ndarray, low: np.ndarray, high: np.ndarray
 ) -> np.ndarray:
-    """Where slope @ x + x @ matrix @ x / 2 is least in a box, of a definite matrix.
+    """Minimises slope @ x + x @ matrix @ x / 2 in a box, for a definite matrix.
 
-    Unknowns without room are 0.
+    Unknowns with equal bounds are 0.
     """
     result = np.zeros_like(slope)
     room = low < high
     if not room.any():
         return result
-    # Of unit diagonal: unknowns of any size are alike to the factorisation.
+    # A unit diagonal makes the factorisation independent of the unknowns' sizes.
     scale = 1 / np.sqrt(np.diag(matrix)[room])
     normal = matrix[np.ix_(room, room)] * scale[:, None] * scale
     problem = normal, slope[room] * scale, low[room] / scale, high[room] / scale
     found = _by_sets(*problem)
     if found is None:
         found = _by_bvls(*problem)
-    # Bounds that hold are met exactly, whatever the scaling rounds.
+    # Active bounds are met exactly, without rounding by the scaling.
     _, _, lowest, highest = problem
     inside = np.clip(found * scale, low[room], high[room])
     result[room] = np.where(
@@ -155,10 +154,10 @@ def box_minimum(
 
 
 def _by_sets(normal, slope, low, high) -> np.ndarray | None:
-    """By guesses of which bounds hold, each from the last, until one proves right.
+    """Minimises by updating guesses of the active bounds until one proves right.
 
-    That takes few factorisations, where BVLS takes one per bound. None if it takes
-    many: then it may never end.
+    This takes few factorisations; BVLS takes one per bound. Returns None after 20
+    guesses, as they may cycle.
     """
     below = above = np.zeros(slope.shape, bool)
     for _ in range(20):
@@ -176,7 +175,7 @@ def _by_sets(normal, slope, low, high) -> np.ndarray | None:
 
 
 def _by_bvls(normal, slope, low, high) -> np.ndarray:
-    from scipy.optimize import lsq_linear  # hardly ever needed, and slow to import
+    from scipy.optimize import lsq_linear  # rarely needed, and slow to import
 
     factor = cholesky(normal)
     target = -solve_triangular(factor, slope, trans=1)

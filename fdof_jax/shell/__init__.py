@@ -1,1 +1,1 @@
-"""What the command line runs."""
+"""The runs behind the command line."""

@@ -1,7 +1,7 @@
-"""The commands of `fdof-jax`: they run, print their results and return their pictures.
+"""The commands of `fdof-jax`, which print results and return the pictures' paths.
 
-Pictures are written into an existing folder; the arguments have been checked as far as
-that is possible without JAX.
+Pictures are written into an existing folder. Arguments have already been checked as far
+as possible without JAX.
 """
 
 from pathlib import Path
@@ -26,25 +26,25 @@ from .tuning_run import Job
 
 
 def set_up() -> None:
-    """Set up JAX and matplotlib for a process that only runs commands."""
+    """Sets up JAX and matplotlib for a process that only runs commands."""
     matplotlib.use("agg")  # pictures are written, never shown
     configure(x64=True)
 
 
 def run_circle(output: Path) -> list[Path]:
-    """Track Fig 7's circle, tune the gains, track it again."""
+    """Tracks Fig 7's circle, tunes the gains, and tracks the circle again."""
     run = showcase.run_circle(output, _say, print)
     _print_circle(run)
     return run.pictures
 
 
 def run_figures(output: Path) -> list[Path]:
-    """Reproduce the paper's Figs 3 to 7."""
+    """Reproduces the paper's Figs 3 to 7."""
     return showcase.run_figures(output, _say)
 
 
 def run_topologies(output: Path) -> list[Path]:
-    """Simulate all seven topologies in one compiled call."""
+    """Simulates all seven topologies in one compiled call."""
     solutions, picture = showcase.run_topologies(output, _say)
     for topology, (_, solution) in solutions.items():
         print(f"  {topology}: {int(solution.stats['num_steps'])} steps")
@@ -52,7 +52,7 @@ def run_topologies(output: Path) -> list[Path]:
 
 
 def run_league() -> None:
-    """Tune the gains of all seven topologies on one circle."""
+    """Tunes the gains of all seven topologies on one circle."""
     _say("tune all seven topologies in one compiled program")
     results = tune_each(circle_scenes(), report=print)
     print(f"\n{league_table(results)}")
@@ -65,11 +65,11 @@ def run_tuning(
     save_to: Path | None,
     search: dict[str, Any],
 ) -> list[Path]:
-    """Tune the gains of a job, or resume a saved run where it stopped.
+    """Tunes the gains of a job, or resumes a saved run where it stopped.
 
     **Arguments:** `search`: method, starts, seed and max_steps of `tune`. A resumed run
-    keeps its settings where none are given, except for the seed: that is one more, so
-    that other random starts are tried.
+    keeps settings that are not given, except the seed, which is increased by one for
+    other random starts.
 
     **Raises:** ValueError as `tune` and `load`.
     """
@@ -115,7 +115,7 @@ def run_tuning(
 
 
 def _scene(job: Job) -> Scene:
-    """The nominal scene: Fig 7's arm on the circle of the job, for two turns."""
+    """The nominal scene: Fig 7's arm on the job's circle, for two turns."""
     scene = scenes.fig7()
     task = CircleTask(center=job.center, radius=job.radius, period=job.period)
     controller = eqx.tree_at(lambda c: c.reference, scene.forces[0], task)
@@ -123,7 +123,7 @@ def _scene(job: Job) -> Scene:
 
 
 def _ensemble(job: Job, scene: Scene) -> Scene | None:
-    """The variations of the nominal scene by which gains are judged, if any."""
+    """The ensemble of the job's variations of the nominal scene, or None."""
     if job.over == "nominal":
         return None
     return perturbed(

@@ -1,6 +1,6 @@
-"""The runs behind the command line: the circle, the paper's figures, all topologies.
+"""The runs of the commands: the circle, the paper's figures, all topologies.
 
-Each simulates, writes its pictures into a folder and returns its numbers.
+Each run simulates, writes pictures into a folder and returns its results.
 """
 
 import time
@@ -30,10 +30,10 @@ _SAMPLE = 0.01  # output times [s]
 
 
 class Tracking(NamedTuple):
-    """How well a controlled scene tracks its circle.
+    """Measures of how well a controlled scene tracks its circle.
 
     - `rms`, `largest`: tip error over the whole run [m].
-    - `rms_second`, `largest_second`: over its second period [m].
+    - `rms_second`, `largest_second`: tip error over the second period [m].
     - `kp`, `kd`: gains (3,); `saturated`: share of the time at the limit (3,).
     """
 
@@ -47,7 +47,7 @@ class Tracking(NamedTuple):
 
 
 class CircleRun(NamedTuple):
-    """The circle before and after tuning, the tuning itself, and wall times [s]."""
+    """Tracking before and after tuning, the tuning itself, and wall times [s]."""
 
     before: Tracking
     after: Tracking
@@ -59,7 +59,7 @@ class CircleRun(NamedTuple):
 def run_circle(
     output: Path, say: Callable[[str], None], report: Callable[[str], None]
 ) -> CircleRun:
-    """Fig 7's circle with the paper's gains, tuned by gradients, and again."""
+    """Tracks Fig 7's circle with the paper's gains, and with tuned gains."""
     wall_times = {}
 
     def timed(what: str, function, *arguments, **keywords):
@@ -87,7 +87,7 @@ def run_circle(
 
 
 def simulate_finely(scene: Scene) -> Solution:
-    """A scene's motion at every hundredth of a second."""
+    """Simulates a scene, with output times every hundredth of a second."""
     ts = np.arange(round(float(scene.t1) / _SAMPLE) + 1) * _SAMPLE
     return simulate(scene.linkage, scene.state0, ts, scene.forces)
 
@@ -113,7 +113,7 @@ def _tracking(scene: Scene, solution: Solution) -> Tracking:
 def draw_circle(
     output: Path, scene: Scene, first: Solution, tuned: TuneResult, second: Solution
 ) -> list[Path]:
-    """Path, errors, motion and efforts of a circle before and after tuning."""
+    """Draws path, errors, motion and efforts of a circle before and after tuning."""
     linkage, task = scene.linkage, scene.forces[0].reference
     both = {"paper's gains": first, "tuned gains": second}
     pictures = {
@@ -130,7 +130,7 @@ def draw_circle(
 
 
 def run_figures(output: Path, say: Callable[[str], None]) -> list[Path]:
-    """The paper's Figs 3 to 7 as pictures."""
+    """Draws the paper's Figs 3 to 7."""
     pictures = {}
     say("Figs 3 and 4: damped triple pendulum")
     scene = scenes.fig3()
@@ -157,15 +157,16 @@ def run_figures(output: Path, say: Callable[[str], None]) -> list[Path]:
     return _save(output, pictures)
 
 
-# One start for all topologies, as chain coordinates B1, th2, B2, th3, B3, th4.
+# The common start in chain coordinates B1, th2, B2, th3, B3, th4.
 _COMMON_START = np.array([0.0, 0.6, 0.4, -0.4, 0.3, -1.3])
 
 
 def topology_scenes(t1: float = 2.0) -> dict[str, Scene]:
-    """One arm in all seven topologies, starting at rest in the same configuration.
+    """Scenes of one arm in all seven topologies, at rest in the same configuration.
 
-    Links of 1 m, 0.8 m and 0.5 m under gravity; what differs is which joint of each
-    pair is real. Slides are damped more than turns, or they would fall out of sight.
+    The links of 1 m, 0.8 m and 0.5 m move under gravity. Only the choice of the real
+    joint of each pair differs. Slides are damped more than revolute joints, as they
+    would otherwise fall out of sight.
     """
     result = {}
     for topology in TOPOLOGIES:
@@ -178,7 +179,7 @@ def topology_scenes(t1: float = 2.0) -> dict[str, Scene]:
 def run_topologies(
     output: Path, say: Callable[[str], None]
 ) -> tuple[dict[str, tuple[Linkage, Solution]], Path]:
-    """All seven topologies in one compiled, batched call, and their picture."""
+    """Simulates and draws all seven topologies in one compiled, batched call."""
     members = topology_scenes()
     say("simulate all seven topologies in one compiled call")
     batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *members.values())

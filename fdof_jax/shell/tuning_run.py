@@ -1,17 +1,15 @@
-"""The choices of `fdof-jax tune`, as plain data: the command line shows them at once,
-without JAX.
-"""
+"""The options of `fdof-jax tune` as plain data, which need no import of JAX."""
 
 import dataclasses
 from collections.abc import Sequence
 
-# The names of `bounded_search.METHODS`.
+# The names in `search.methods.METHODS`, copied so that JAX need not be imported.
 METHODS = ("levenberg-marquardt", "l-bfgs", "adam")
 
 
 @dataclasses.dataclass(frozen=True)
 class Job:
-    """The task of Fig 7's arm on a circle, and the loss by which its gains are tuned.
+    """The circle of Fig 7's arm, and the loss that its gains minimise.
 
     `over`: "nominal", or "mean" or "worst" of an ensemble of `members`.
     """
@@ -19,7 +17,7 @@ class Job:
     center: Sequence[float] = (-4.0, 2.0)  # [m]
     radius: float = 0.75  # [m]
     period: float = 5.0  # [s]
-    factor: float = 4.0  # of the paper's gains
+    factor: float = 4.0  # bounds of the gains, relative to the paper's
     price: float = 0.0  # of effort [m^2]
     over: str = "nominal"
     members: int = 16

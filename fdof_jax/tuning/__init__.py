@@ -1,1 +1,1 @@
-"""Gains that minimise a loss, and how far their gradients can be trusted."""
+"""Gain tuning by gradients, optimal efforts, and checks of the gradients."""

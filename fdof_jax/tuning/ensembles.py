@@ -16,7 +16,7 @@ from .losses import controller_of
 
 
 def with_payload(linkage: Linkage, mass: ArrayLike) -> Linkage:
-    """The linkage with a point mass at its tip, as part of its last link.
+    """Adds a point mass at the tip to a linkage's last link.
 
     **Arguments:** `mass` [kg], not negative.
 
@@ -32,7 +32,7 @@ def with_payload(linkage: Linkage, mass: ArrayLike) -> Linkage:
     tip = jnp.stack([linkage.length[3], jnp.zeros(())])
     own, center = linkage.mass[2], linkage.com[2]
     total = own + mass
-    # Of two masses about their common centre: the reduced mass at their distance.
+    # The inertia of two masses about their common centre: reduced mass * distance^2.
     reduced = own * mass / jnp.where(total > 0, total, 1)
     shift = mass / jnp.where(total > 0, total, 1) * (tip - center)
     inertia = linkage.inertia[2] + reduced * jnp.sum((tip - center) ** 2)
@@ -48,7 +48,7 @@ def with_payload(linkage: Linkage, mass: ArrayLike) -> Linkage:
 
 
 def _displaced(linkage: Linkage, q: np.ndarray, offset: np.ndarray) -> np.ndarray:
-    """Joint positions with the tip moved by `offset`, the last link's angle kept."""
+    """Joint positions with the tip moved by `offset` and the last link's angle kept."""
     aim, there = np.asarray(tip_position(linkage, q)) + offset, q
     for _ in range(50):
         missing = np.append(aim - np.asarray(tip_position(linkage, there)), 0.0)
@@ -63,13 +63,13 @@ def _displaced(linkage: Linkage, q: np.ndarray, offset: np.ndarray) -> np.ndarra
 
 
 def _hastened(controller: Any, rate: float) -> Any:
-    """The controller with a reference that goes faster by this factor."""
+    """The controller with its reference faster by the factor `rate`."""
     period = controller.reference.period / rate
     return eqx.tree_at(lambda c: c.reference.period, controller, period)
 
 
 def _believing(controller: Any, linkage: Linkage) -> Any:
-    """The controller with this linkage as its model, if it has none yet."""
+    """The controller, with this linkage as its model if it has none."""
     if getattr(controller, "model", linkage) is not None:
         return controller
     return eqx.tree_at(lambda c: c.model, controller, linkage, is_leaf=_is_none)
@@ -89,20 +89,20 @@ def perturbed(
     speed: ArrayLike = (1.0, 1.0),
     seed: int = 0,
 ) -> Scene:
-    """Random variations of a scene, stacked: an ensemble for robust tuning.
+    """Stacks random variations of a scene: an ensemble for robust tuning.
 
-    All are drawn uniformly and independently. A model-based controller without a model
-    of its own is given the nominal linkage, which does not know the variations.
+    All variations are drawn uniformly and independently. A model-based controller
+    without a model of its own gets the nominal linkage, without the variations.
 
     **Arguments:**
 
-    - `scene`: its controller tracks a reference with a `period`, if `speed` varies.
-    - `members`: how many.
+    - `scene`: if `speed` varies, its controller's reference must have a `period`.
+    - `members`: number of variations.
     - `payload`: least and greatest point mass at the tip [kg].
     - `link_error`: greatest relative error of each mass, mass centre and inertia.
     - `start_offset`: greatest distance of the tip from its start [m], in any direction.
-    - `speed`: least and greatest speed of the reference over its own.
-    - `seed`: of the draw.
+    - `speed`: least and greatest factor on the speed of the reference.
+    - `seed`: seed of the random numbers.
 
     **Raises:** ValueError for malformed arguments, and for a start out of reach.
 

@@ -1,4 +1,4 @@
-"""Gains of a scene's controller: their bounds, and losses of them."""
+"""The gains of a scene's controller: bounds, checks, and derivatives of the loss."""
 
 from collections.abc import Callable
 from typing import Any
@@ -8,12 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ..checks import (
-    callable_tuple,
-    instance,
-    is_traced,
-    real_array,
-)
+from ..checks import callable_tuple, instance, is_traced, real_array
 from ..linkage.coordinates import real_state
 from ..linkage.linkage import check_linkage, joint_names
 from ..search.methods import Evaluation
@@ -24,13 +19,11 @@ from ..simulation.solution import Solution
 from .losses import Tracking, controller_of, relative_demands, tip_errors
 
 Loss = Callable[[Scene, Solution], Array]
-
-
 SAMPLES = 1001
 
 
 def with_gains(scene: Scene, gains: Array) -> Scene:
-    """The scene with other kp and kd, the rows of `gains`."""
+    """The scene with the rows of `gains` as its controller's kp and kd."""
     controller = controller_of(scene)
     index = [force is controller for force in scene.forces].index(True)
     controller = eqx.tree_at(lambda c: (c.kp, c.kd), controller, (gains[0], gains[1]))
@@ -39,9 +32,9 @@ def with_gains(scene: Scene, gains: Array) -> Scene:
 
 
 def evaluate_gains(z: Array, problem: tuple[Scene, Loss, Array]) -> Evaluation:
-    """One member's loss and its derivatives in the log-gains `z`.
+    """Evaluates one member's loss and its derivatives in the log-gains `z`.
 
-    `problem`: the scene, the loss, and which gains are tuned.
+    `problem`: the scene, the loss, and a mask of the tuned gains.
     """
     scene, loss, tuned = problem
 
@@ -55,13 +48,14 @@ def evaluate_gains(z: Array, problem: tuple[Scene, Loss, Array]) -> Evaluation:
         value = real_array("loss(scene, solution)", value, size)
         if value.ndim:
             return value.reshape(-1)
-        # The square of a scalar loss's root is the loss; at 0 it has no derivative.
+        # Residuals are squared, so a scalar loss enters as its square root, whose
+        # derivative at 0 does not exist.
         return jnp.where(value == 0, 0, jnp.sqrt(jnp.where(value == 0, 1, value)))[None]
 
     ts = jnp.linspace(0, scene.t1, SAMPLES)
     value, jacobian, trial, solution = sensitivities(scene_at, residuals, z, ts)
     demands = jnp.abs(relative_demands(trial, solution))
-    # An actuator without effort makes none, whatever is asked of it.
+    # An actuator with a limit of 0 makes no effort, whatever its demand.
     limited = jnp.where(controller_of(trial).limit > 0, 1, 0)[None]
     square_error = jnp.full((), jnp.nan)
     if hasattr(controller_of(trial).reference, "tip"):
@@ -79,7 +73,7 @@ def evaluate_gains(z: Array, problem: tuple[Scene, Loss, Array]) -> Evaluation:
 
 
 def check_tuned(name: str, scene: Any, loss: Any) -> None:
-    """Raise ValueError unless this scene can be tuned by this loss."""
+    """Raises ValueError unless the scene can be tuned by the loss."""
     instance(name, scene, Scene)
     if is_traced(scene):
         raise ValueError(
@@ -103,7 +97,7 @@ def check_tuned(name: str, scene: Any, loss: Any) -> None:
 
 
 def check_alike(name: str, member: Scene, scene: Scene) -> None:
-    """Raise ValueError unless the gains of both are of one meaning."""
+    """Raises ValueError unless both scenes' gains have the same meaning."""
     kinds = [
         (joint_names(s.linkage), type(controller_of(s)).__name__)
         for s in (member, scene)
@@ -116,7 +110,7 @@ def check_alike(name: str, member: Scene, scene: Scene) -> None:
 
 
 def bounds_of(scene: Scene, factor: Any, bounds: Any) -> tuple[np.ndarray, ...]:
-    """Of kp and kd: the start, the least, the greatest; (2, 3) each."""
+    """The start, least and greatest values of kp and kd, (2, 3) each."""
     controller = controller_of(scene)
     start = np.stack([np.asarray(controller.kp), np.asarray(controller.kd)])
     if bounds is None:
@@ -143,5 +137,4 @@ def bounds_of(scene: Scene, factor: Any, bounds: Any) -> tuple[np.ndarray, ...]:
         )
     if (lower[start > 0] == 0).any():
         raise ValueError("bounds: expected positive least gains, got 0.")
-    # Gains of zero stay zero.
     return start, np.where(start > 0, lower, 0), np.where(start > 0, upper, 0)

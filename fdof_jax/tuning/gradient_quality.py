@@ -1,4 +1,4 @@
-"""How far the gradient that gain tuning follows can be trusted, measured."""
+"""Checks of the gradient that gain tuning follows."""
 
 from typing import Any
 
@@ -21,28 +21,29 @@ from .losses import controller_of, relative_demands, tip_errors
 
 _SAMPLES = 1001
 _HORIZONS = 10
-# In the logarithms of the gains: the error of the extrapolated differences is of fourth
-# order in it, their noise is that of the loss over it.
+# The step of the differences in the log-gains. The error of the extrapolated
+# differences is of fourth order in it; their noise is that of the loss over the step.
 _STEP = 1e-2
 
 
 class GradientReport(eqx.Module):
     """The gradient of the mean squared tip error [m^2] at a scene's gains.
 
-    Of this scene alone, and without prices of effort, whatever it has been tuned for.
+    Derivatives are in the logarithms of kp and kd (2, 3). The error is that of this
+    scene alone, without prices of effort, even if it was tuned for an ensemble or with
+    prices. A report prints itself in words.
 
-    In the logarithms of kp and kd (2, 3); it prints itself in words.
-
-    - `gradient`: as `tune` computes it.
+    - `gradient`: the gradient as `tune` computes it.
     - `differences`: central differences of `simulate` at its default tolerance.
-    - `error`: the norm of what they differ by, over the norm of the differences.
-    - `horizons`, `gradient_norm`: norm of the gradient of the error up to that time.
+    - `error`: norm of `gradient - differences` over the norm of `differences`.
+    - `horizons`, `gradient_norm`: times [s], and the norm of the gradient of the error
+      over the run up to each of them.
     - `saturated`: share of the time that each actuator spends at its limit (3,).
     - `modes`: closed-loop eigenvalues along the path, at 101 times; None with elements
       that have a state of their own or prescribe a motion.
-    - `at_limit`: whether any actuator is at its limit at these times, which then does
-      not control its joint (101,).
-    - `warnings`: in words, what to beware of.
+    - `at_limit`: whether any actuator is at its limit, and so does not control its
+      joint, at each of these times (101,).
+    - `warnings`: what to beware of, in words.
     """
 
     gradient: Float[np.ndarray, "2 joint"]
@@ -83,12 +84,12 @@ class GradientReport(eqx.Module):
 
 @eqx.filter_jit
 def _tangents(scene: Scene) -> tuple[Array, Array, Array, Any]:
-    """Residuals, their Jacobian in the log-gains, demands over limits, the motion."""
+    """Residuals, their Jacobian in the log-gains, relative demands, and the motion."""
     controller = controller_of(scene)
     gains = jnp.stack([controller.kp, controller.kd])
 
     def scene_at(z):
-        # Factors, of which a gain of zero makes nothing.
+        # Factors on the gains keep a gain of zero at zero.
         return with_gains(scene, gains * jnp.exp(z).reshape(2, 3))
 
     ts = jnp.linspace(0, scene.t1, _SAMPLES)
@@ -98,7 +99,7 @@ def _tangents(scene: Scene) -> tuple[Array, Array, Array, Any]:
 
 
 def _loss(scene: Scene, gains: np.ndarray) -> float:
-    """The mean squared tip error with other gains, by the program of plain calls."""
+    """The mean squared tip error with other gains, by a plain call of `simulate`."""
     trial = with_gains(scene, jnp.asarray(gains))
     ts = np.linspace(0, float(trial.t1), _SAMPLES)
     solution = simulate(trial.linkage, trial.state0, ts, trial.forces, throw=False)
@@ -106,9 +107,9 @@ def _loss(scene: Scene, gains: np.ndarray) -> float:
 
 
 def gradient_report(scene: Scene) -> GradientReport:
-    """The quality of the gradient of the tip error in the PD gains, measured.
+    """Compares the gradient of the tip error in the PD gains with differences.
 
-    **Arguments:** `scene`: holds exactly one `PDController`, which tracks a task with a
+    **Arguments:** `scene`: must hold exactly one `PDController`, tracking a task with a
     `tip`.
 
     **Returns:** a `GradientReport`.
@@ -136,7 +137,7 @@ def gradient_report(scene: Scene) -> GradientReport:
     differences = ((4 * near - far) / 3).reshape(2, 3)
     size = np.linalg.norm(differences)
     error = np.linalg.norm(gradient - differences) / size if size > 0 else 0.0
-    # Of the error up to a time, which is a mean over that time.
+    # The error up to a time is the mean over that time, not over the whole run.
     times = np.linspace(0, _SAMPLES - 1, _HORIZONS + 1).astype(int)[1:]
     shares = (times + 1) / _SAMPLES
     norms = np.linalg.norm(along[2 * times + 1], axis=1) / shares

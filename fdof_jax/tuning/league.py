@@ -1,4 +1,4 @@
-"""One circle for all seven topologies, and what each of them makes of it."""
+"""The same circle for all seven topologies, and a table of their tuned errors."""
 
 from collections.abc import Mapping
 
@@ -12,12 +12,12 @@ from ..linkage.topology import TOPOLOGIES
 from ..simulation.scene import Scene
 from .result import TuneResult
 
-# Where all start, as chain coordinates B1, th2, B2, th3, B3, th4: over the circle every
-# topology stays away from its singularities.
+# The common start in chain coordinates B1, th2, B2, th3, B3, th4. From here every
+# topology follows the circle away from its singularities.
 _START = np.array([0.0, 1.0, -0.1, -1.0, 0.7, 0.8])
 _BASE = np.pi / 2  # a slide on the ground is level
 _CENTER = [1.99, 0.95]
-# Of the two assemblies, the one that the arm starts in.
+# The assembly (of two) that each arm starts in.
 _BRANCH = dict(zip(TOPOLOGIES, (-1, 1, -1, -1, 1, 1, 1)))
 _KP, _KD, _LIMIT = (
     {"R": 500.0, "P": 2000.0},
@@ -44,10 +44,11 @@ def arm_at(topology: str, x: np.ndarray) -> tuple[Linkage, State]:
 def circle_scenes() -> dict[str, Scene]:
     """The same circle for an arm of each topology, under PD control and gravity.
 
-    All have links of 1 m, 0.8 m and 0.5 m with masses of 2 kg, 1.5 kg and 1 kg, start
-    at rest in the same configuration, their tip 5 cm inside the circle of 0.25 m, and
-    keep the angle of their last link. What differs is which joint of each pair is real.
-    Gains and limits (150 N m or N) are the same for all joints of a kind.
+    All arms have links of 1 m, 0.8 m and 0.5 m with masses of 2 kg, 1.5 kg and 1 kg.
+    They start at rest in the same configuration, with their tip 5 cm inside the circle
+    of 0.25 m radius, and keep the angle of their last link. Only the choice of the real
+    joint of each pair differs. All joints of a kind have the same gains and limits
+    (150 N m or N).
 
     >>> import fdof_jax as fj
     >>> scenes = fj.circle_scenes()
@@ -73,9 +74,9 @@ def circle_scenes() -> dict[str, Scene]:
 
 
 def league_table(results: Mapping[str, TuneResult]) -> str:
-    """Tip errors and efforts before and after tuning, the best first.
+    """A table of tip errors and efforts before and after tuning, best first.
 
-    **Arguments:** `results` by name, those of `tune_each` for instance.
+    **Arguments:** `results`: by name, for instance those of `tune_each`.
 
     >>> import fdof_jax as fj
     >>> scenes = fj.circle_scenes()

@@ -1,4 +1,4 @@
-"""What gains are judged by: tip error, effort, rate of effort."""
+"""Losses for gain tuning: tip error, effort, rate of effort."""
 
 from typing import Any
 
@@ -18,7 +18,7 @@ from ..simulation.solution import Solution
 
 
 def controller_of(scene: Scene) -> PDController:
-    """The PD controller among a scene's forces, refused unless it is the only one."""
+    """The only PD controller of a scene; raises ValueError unless there is just one."""
     found = [force for force in scene.forces if isinstance(force, PDController)]
     if len(found) != 1:
         raise ValueError(
@@ -29,12 +29,14 @@ def controller_of(scene: Scene) -> PDController:
 
 
 def tip_errors(scene: Scene, solution: Solution) -> Float[Array, " residual"]:
-    """Tip error at each output time, scaled so that the squares add up to their mean.
+    """Tip errors at the output times, scaled so that their squares sum to the mean.
 
-    **Arguments:** a scene whose PD controller tracks a task with a `tip`, and its
-    solution.
+    **Arguments:**
 
-    **Returns:** x and y components [m], each over the root of the number of times.
+    - `scene`: its PD controller must track a task with a `tip`.
+    - `solution`: the scene's motion.
+
+    **Returns:** x and y components [m], divided by the root of the number of times.
 
     >>> import fdof_jax as fj
     >>> import numpy as np
@@ -50,9 +52,9 @@ def tip_errors(scene: Scene, solution: Solution) -> Float[Array, " residual"]:
 
 
 def relative_demands(scene: Scene, solution: Solution) -> Float[Array, "time joint"]:
-    """What the controller asks for over what its limits allow; 0 where none limits.
+    """The controller's demands over its limits; 0 where a limit is infinite.
 
-    Infinite, or 0, where a limit of 0 allows nothing.
+    Where a limit is 0, a demand other than 0 gives an infinity of its sign.
     """
     controller = controller_of(scene)
     demands = jax.vmap(controller.demand, in_axes=(0, 0, 0, None))(
@@ -64,16 +66,16 @@ def relative_demands(scene: Scene, solution: Solution) -> Float[Array, "time joi
 
 
 class Tracking(eqx.Module):
-    """Mean squared tip error, and prices of effort: the loss of `tune`.
+    """Mean squared tip error plus prices of effort, a loss for `tune`.
 
-    effort * mean((tau / limit)^2) and effort_rate * mean((d(tau / limit)/dt)^2), each
-    summed over the joints, are added. Rates are differences between output times, a
-    thousandth of the run apart.
+    The loss adds effort * mean((tau / limit)^2) and
+    effort_rate * mean((d(tau / limit)/dt)^2), each summed over the joints. Rates are
+    differences between output times, a thousandth of the run apart.
 
     **Arguments:**
 
-    - `effort`: what full effort of one joint all the time is worth [m^2].
-    - `effort_rate`: what a change by the full effort per second is worth [m^2 s^2].
+    - `effort`: price of full effort of one joint all the time [m^2].
+    - `effort_rate`: price of a change by the full effort per second [m^2 s^2].
 
     **Raises:** ValueError for malformed or negative prices.
 
@@ -98,14 +100,14 @@ class Tracking(eqx.Module):
         rates = jnp.diff(efforts, axis=0) / jnp.diff(solution.ts)[:, None]
         parts = [tip_errors(scene, solution)]
         for price, values in ((self.effort, efforts), (self.effort_rate, rates)):
-            # The root of a price of zero has no derivative.
+            # The root of a price has no derivative at zero.
             share = jnp.where(price > 0, price, 1) / values.shape[0]
             scaled = jnp.where(price > 0, jnp.sqrt(share), 0) * values
             parts.append(scaled.reshape(-1))
         return jnp.concatenate(parts)
 
     def check(self, scene: Scene) -> None:
-        """Raise ValueError if efforts have a price but no limit."""
+        """Raises ValueError if efforts have a price but no limit."""
         limit = np.asarray(controller_of(scene).limit)
         possible = (np.isfinite(limit) & (limit > 0)).all()
         if self.effort + self.effort_rate > 0 and not possible:

@@ -1,4 +1,4 @@
-"""Open-loop efforts that track a task best: what any controller can be measured by."""
+"""Open-loop efforts that track a task best: a bound for any controller."""
 
 from collections.abc import Callable
 from typing import Any
@@ -27,20 +27,20 @@ from ..simulation.solution import Solution
 from .losses import controller_of
 
 _SAMPLES = 501
-# Of the derivatives and of the motion, whose errors would make the loss uneven: at 1e-5
+# The tolerance of derivatives and motion. Their errors make the loss uneven: at 1e-5,
 # searches from different guesses end at different places.
 _TOLERANCE = 1e-8
 _ENOUGH = 1e-7
 # Converged: to first order, an effort changed by its limit changes the loss by less
 # than this part.
 _SMALL_GRADIENT = 1e-2
-# Of the computed torque that makes one of the first guesses [1/s]: what it corrects has
-# decayed after half a second.
+# The bandwidth of the computed torque that makes one of the first guesses [1/s]: its
+# tracking error decays within half a second.
 _BANDWIDTH = 10.0
 
 
 class _Knots(EffortHistory):
-    """Efforts whose kinks steps end at, as derivatives in efforts need it."""
+    """An effort history at whose kinks steps end, as derivatives in efforts need it."""
 
     @property
     def jump_ts(self) -> Array:
@@ -48,19 +48,19 @@ class _Knots(EffortHistory):
 
 
 class OptimalMotion(eqx.Module):
-    """The best open-loop motion that was found; it prints itself in a few lines.
+    """The best open-loop motion found; prints itself in a few lines.
 
     - `scene`: the scene with an `EffortHistory` in place of its controller, up to the
       horizon.
     - `ts`, `efforts`: the knots (knot,) [s] and the efforts there (knot, 3)
       [N or N m].
     - `tip_error`: rms tip error over the horizon [m], without the price of effort.
-    - `controller_error`: the same of the scene's own controller [m].
+    - `controller_error`: rms tip error of the scene's own controller [m].
     - `solution`: the motion, at 501 times.
-    - `guess_errors`: what the search has come to from each first guess (guess,) [m].
-      Where they differ, the function has several minima, of which the best counts.
+    - `guess_errors`: rms tip error found from each first guess (guess,) [m]. If they
+      differ, the objective has several minima, and the best counts.
     - `converged`: whether, to first order, no change of the efforts by their limits
-      would decrease what is made small by more than a hundredth of it.
+      would decrease the objective by more than a hundredth.
     - `message`: why the best run stopped, in words.
     """
 
@@ -75,11 +75,11 @@ class OptimalMotion(eqx.Module):
     message: str
 
     def bound(self, t1: ArrayLike) -> float:
-        """What the rms tip error over [0, t1] is at least [m]: see `optimal_efforts`.
+        """Lower bound of the rms tip error over [0, t1] [m]: see `optimal_efforts`.
 
         **Arguments:** `t1`: not before the horizon [s].
 
-        **Raises:** ValueError for another time.
+        **Raises:** ValueError for an earlier `t1`.
         """
         horizon = float(self.ts[-1])
         t1 = float(real_array("t1", t1, (), minimum=horizon))
@@ -99,7 +99,7 @@ class OptimalMotion(eqx.Module):
 
 
 def _roots_of_weights(ts: Array) -> Array:
-    """So that squares add up to their mean over time, by the trapezium rule."""
+    """Roots of the trapezium weights: scaled squares sum to their mean over time."""
     gaps = jnp.diff(ts)
     shares = jnp.concatenate([gaps[:1], gaps[1:] + gaps[:-1], gaps[-1:]]) / 2
     return jnp.sqrt(shares / (ts[-1] - ts[0]))
@@ -107,22 +107,22 @@ def _roots_of_weights(ts: Array) -> Array:
 
 @eqx.filter_jit
 def _deviations(scene: Scene, task: Any, solution: Solution) -> Array:
-    """Tip errors at the output times, whose squares add up to their mean over time."""
+    """Tip errors at the output times, scaled so that their squares sum to the mean."""
     roots = _roots_of_weights(solution.ts)
     return (roots[:, None] * tip_deviation(scene.linkage, task, solution)).reshape(-1)
 
 
 def _with(scene: Scene, replaced: type, element: Any) -> Scene:
-    """The scene with another element in place of the one of this class."""
+    """The scene with `element` in place of the element of class `replaced`."""
     forces = (element if isinstance(f, replaced) else f for f in scene.forces)
     return scene._replace(forces=tuple(forces))
 
 
 def _lane(z: Array, problem: tuple[Scene, Any, Array, Array, Array]) -> Evaluation:
-    """Mean squared tip error, the price, and their derivatives in efforts over limits.
+    """Evaluates mean squared tip error plus price, in efforts over limits `z`.
 
     `problem`: the scene with `_Knots`, the task, the controller's limits, the price,
-    and the times at which the tip is looked at.
+    and the times of the tip errors.
     """
     scene, task, limit, price, ts = problem
     (knots,) = (force.ts for force in scene.forces if isinstance(force, _Knots))
@@ -152,7 +152,7 @@ def _lane(z: Array, problem: tuple[Scene, Any, Array, Array, Array]) -> Evaluati
 
 
 def _check(scene: Any, horizon: Any) -> float:
-    """The horizon as a number, if it and the scene are as they must be."""
+    """Checks scene and horizon, and returns the horizon as a number."""
     instance("scene", scene, Scene)
     check_linkage(scene.linkage)
     t1 = float(real_array("scene.t1", scene.t1, (), above=0))
@@ -187,37 +187,34 @@ def optimal_efforts(
     max_steps: int = 400,
     report: Callable[[str], Any] | None = None,
 ) -> OptimalMotion:
-    """The efforts within a controller's limits that bring the tip closest to its path.
+    """Computes the efforts within a controller's limits that track its path best.
 
-    They replace the controller, see nothing of the motion, and know all of it: what
-    they reach is what a controller with these limits can be measured by. They make the
-    mean squared tip error over [0, horizon] least, from the scene's start, among
-    efforts that are linear between knots.
+    The open-loop efforts replace the controller. They minimise the mean squared tip
+    error over [0, horizon] from the scene's start, among efforts that are linear
+    between knots. The result is a benchmark for any controller with the same limits.
 
-    Over a longer run [0, t1] any controller's mean squared tip error is at least that
-    of the horizon times horizon / t1, as if the tip were exactly on its path from then
-    on (`OptimalMotion.bound`). That is a strict bound if the minimum is the global one,
-    of which there is no proof: it is the best that was found from two first guesses,
-    the efforts of the scene's own controller and those of computed torque. Efforts that
-    jump between the knots may do slightly better: double their number to see by how
-    much.
+    Over a longer run [0, t1], any controller's mean squared tip error is at least the
+    minimum times horizon / t1, reached if the tip is exactly on its path after the
+    horizon (`OptimalMotion.bound`). This bound is rigorous only if the minimum is
+    global. That is not proved: it is the best found from two first guesses, the efforts
+    of the scene's own controller and those of computed torque. Efforts that jump
+    between the knots may do slightly better; double the knots to see by how much.
 
-    The horizon need not be long, as what costs is the way to the path; the efforts of
-    an arm that tumbles by itself are the harder to find the longer it is.
+    A short horizon suffices, because most of the error arises on the way to the path.
+    If the arm tumbles by itself, a longer horizon makes the efforts harder to find.
 
     **Arguments:**
 
-    - `scene`: holds exactly one `PDController`, of finite limits, whose reference has a
-      `tip`. Other elements remain.
+    - `scene`: must hold exactly one `PDController`, with finite limits and a reference
+      with a `tip`. Other elements remain.
     - `horizon`: at most the scene's `t1` [s].
-    - `knots`: how many times, equally spaced from 0 to the horizon, the efforts are
-      free at, two or more.
+    - `knots`: number of knots, equally spaced from 0 to the horizon, two or more.
     - `effort_rate`: price of mean((d(tau / limit)/dt)^2), summed over the joints
       [m^2 s^2]. With three joints for two coordinates of the tip many efforts are
-      equally good: the price picks smooth ones. For arms of other sizes it goes with
+      equally good: the price picks smooth ones. For arms of other sizes, scale it with
       the square of the tip error.
-    - `max_steps`: the greatest number of evaluations of a run after the first.
-    - `report`: is given a line of progress after each step, `print` for instance.
+    - `max_steps`: greatest number of evaluations of a run after the first.
+    - `report`: called with a line of progress after each step, for instance `print`.
 
     **Returns:** an `OptimalMotion`.
 
@@ -287,7 +284,7 @@ def optimal_efforts(
 
 
 def _efforts_at(times: np.ndarray, scene: Scene, solution: Solution) -> np.ndarray:
-    """Those of a scene's controller along its motion, (time, 3)."""
+    """Efforts of a scene's controller along its motion, (time, 3)."""
     controller = controller_of(scene)
     efforts = joint_efforts(scene.linkage, scene.forces, solution).elements
     mine = np.asarray(

@@ -1,4 +1,4 @@
-"""What gain tuning returns, and how it prints itself."""
+"""Results of gain tuning, and their tables."""
 
 from collections.abc import Callable
 from html import escape
@@ -16,26 +16,26 @@ from ..simulation.html_table import html_table
 from ..simulation.scene import Scene
 from .losses import controller_of
 
-# Actuators at their limits for a larger share of the time are hardly controlled.
+# Joints with actuators at their limits for a larger share of the time are hardly
+# controlled.
 _MOSTLY = 0.9
-# Of the numbers in a printed table.
 _COLUMNS = ("start", "tuned", "least", "greatest")
 
 
 class History(eqx.Module):
-    """What a run did; entry 0 is its start, one more per accepted point.
+    """The history of a run: entry 0 is its start, then one entry per accepted point.
 
     - `loss`: mean squared tip error [m^2] with the default loss.
-    - `gradient_norm`: norm of the gradient in the logarithms of the gains, without the
-      components that a bound holds back.
+    - `gradient_norm`: norm of the gradient in the logarithms of the gains, without
+      components held back by a bound.
     - `gains`: kp and kd, in joint order [N/m or N m/rad, N s/m or N m s/rad].
     - `saturated`: share of the time that each actuator spends at its limit.
     - `effort`: root mean square of each effort over its limit.
     - `tip_error`: rms tip error [m]; NaN for a reference without a `tip`.
     - `wall_time`: since the start of the search, compilation included [s].
 
-    Of an ensemble: the last three but `wall_time` are means over its members, the tip
-    error the root of the mean square.
+    For an ensemble, `saturated` and `effort` are means over the members, and
+    `tip_error` is the root of the mean square.
     """
 
     loss: Float[np.ndarray, " iteration"]
@@ -48,18 +48,18 @@ class History(eqx.Module):
 
 
 class TuneResult(eqx.Module):
-    """A tuned scene and how it was reached; it prints itself as a table.
+    """A tuned scene and how it was reached; prints itself as a table.
 
     - `scene`: the scene with its tuned gains.
-    - `loss`: its loss [m^2 with the default loss].
-    - `histories`: of each run, the first from the scene's own gains, see `History`.
+    - `loss`: loss with the tuned gains [m^2 with the default loss].
+    - `histories`: `History` of each run, the first from the scene's own gains.
     - `lower`, `upper`: the bounds of kp and kd (2, 3).
     - `converged`: whether the run stopped by itself, no actuator was at its limit most
       of the time, and a change of the gains by 1 % would change the loss by less
       than 1e-4 of it, to first order and within the bounds.
     - `message`: why the run stopped, in words, and what to beware of.
-    - `member_loss`, `member_tip_error`: of each member of the ensemble with the tuned
-      gains: its loss (member,) and rms tip error (member,) [m].
+    - `member_loss`, `member_tip_error`: loss (member,) and rms tip error (member,) [m]
+      of each member of the ensemble with the tuned gains.
     - `settings`: method, solver, tolerance and dtype of the run.
     """
 
@@ -76,12 +76,12 @@ class TuneResult(eqx.Module):
 
     @property
     def history(self) -> History:
-        """That of the best run."""
+        """The history of the best run."""
         return self.histories[int(np.nanargmin(self.losses))]
 
     @property
     def losses(self) -> Float[np.ndarray, " start"]:
-        """What each run has come to; NaN where its start could not be simulated."""
+        """Least loss of each run; NaN where its start could not be simulated."""
         return np.array([history.loss.min() for history in self.histories])
 
     @property
@@ -91,7 +91,7 @@ class TuneResult(eqx.Module):
 
     @property
     def at_bound(self) -> Bool[np.ndarray, "2 joint"]:
-        """Which gains a bound holds."""
+        """Whether each gain is held by a bound."""
         return _at_bound(self.gains, self.lower, self.upper)
 
     @property
@@ -106,10 +106,10 @@ class TuneResult(eqx.Module):
 
     @property
     def table(self) -> dict[str, list]:
-        """The gains in columns, a row for each: `pandas.DataFrame(result.table)`.
+        """Columns with one row per gain: `pandas.DataFrame(result.table)`.
 
-        `gain` and `joint`, for instance kp and R1; `unit`; `start`, `tuned`, `least`
-        and `greatest`: its values and bounds; `at_bound`: whether one holds it.
+        The columns are `gain` and `joint`, for instance kp and R1; `unit`; the values
+        `start` and `tuned`; the bounds `least` and `greatest`; and `at_bound`.
         """
         names = joint_names(self.scene.linkage)
         units = controller_of(self.scene).gain_units
@@ -127,7 +127,7 @@ class TuneResult(eqx.Module):
         } | {name: np.ravel(value).tolist() for name, value in values.items()}
 
     def _rows(self) -> list[list[str]]:
-        """Of what is printed: a label, up to four numbers, and a remark."""
+        """Rows of the printed table: a label, up to four numbers, and a remark."""
         rows = []
         for gain, joint, unit, *values, held in zip(*self.table.values()):
             cells = [f"{value:.5g}" for value in values]
@@ -146,7 +146,7 @@ class TuneResult(eqx.Module):
         return rows
 
     def _remarks(self) -> list[str]:
-        """What stands below the table."""
+        """Lines below the table."""
         rows = []
         if len(self.losses) > 1:
             failed = np.isnan(self.losses).sum()
@@ -183,7 +183,7 @@ class TuneResult(eqx.Module):
         return "\n".join([*map(str.rstrip, lines), *self._remarks()])
 
     def __repr__(self) -> str:
-        """In a line; of traced values, their shapes."""
+        """One line, or shapes if values are traced."""
         if not known(self.histories) or not isinstance(self.loss, float):
             return super().__repr__()
         topology = "".join(name[0] for name in joint_names(self.scene.linkage))
@@ -199,9 +199,9 @@ class TuneResult(eqx.Module):
 
 
 class TradeOff(eqx.Module):
-    """The best tip errors for their efforts: one tuning run per price of effort.
+    """The least tip errors for given efforts: one tuning run per price of effort.
 
-    - `prices`: of effort, see `Tracking` (price,) [m^2].
+    - `prices`: prices of effort, see `Tracking` (price,) [m^2].
     - `tip_error`: rms tip error (price,) [m].
     - `effort`: root mean square of the efforts over their limits (price,).
     - `results`: the `TuneResult` of each price.
@@ -226,7 +226,7 @@ def _best(history: History) -> int:
 
 
 def _at_bound(gains, lower, upper) -> np.ndarray:
-    # A hair: the exponential of a bound's logarithm may fall short of it by rounding.
+    # By rounding, exp(log(bound)) may lie just inside the bound.
     hair = 100 * np.finfo(jnp.result_type(float)).eps
     free = (gains > 0) & (lower < upper)
     return free & ((gains <= lower * (1 + hair)) | (gains >= upper * (1 - hair)))
@@ -240,7 +240,7 @@ def result_of(
     settings: dict[str, Any],
     with_gains: Callable,
 ) -> TuneResult:
-    """The result of the runs of one scene, of which the best counts."""
+    """The result of one scene's runs, taken from the best."""
     tuned = lower > 0
 
     def gains_of(z):
@@ -248,7 +248,7 @@ def result_of(
 
     def history_of(run: Run) -> History:
         def mean(fact: str) -> np.ndarray:
-            """Over the members."""
+            """The mean over the members."""
             return np.array([np.mean(row.facts[fact], axis=0) for row in run.rows])
 
         return History(
@@ -280,7 +280,7 @@ def result_of(
 
 
 def _message(scene, run, history, lower, upper) -> str:
-    """The reason, and what a reader might take for convergence but is not."""
+    """The reason for stopping, and what may look like convergence but is not."""
     names, share = joint_names(scene.linkage), history.saturated[_best(history)]
     tuned = (controller_gains(scene) > 0) & (lower < upper)
     reason = run.reason

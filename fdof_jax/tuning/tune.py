@@ -7,12 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..checks import (
-    keywords_as,
-    one_of,
-    real_array,
-    whole_number,
-)
+from ..checks import keywords_as, one_of, real_array, whole_number
 from ..search.bounded import Row, Run, minimise, reporting
 from ..search.lanes import Lanes
 from ..search.methods import METHODS
@@ -31,15 +26,13 @@ from .losses import Tracking, tip_errors
 from .result import TradeOff, TuneResult, result_of
 
 _ENOUGH = 1e-4  # half of it in the rms
-
-
-# The worst of an ensemble is smoothed to a power mean of this order: of n members it is
-# at most a factor of n^(1/32) below the worst.
+# The worst of an ensemble is smoothed to a power mean of this order. With n members it
+# is at most a factor of n^(1/32) below the worst.
 _WORST = 32
 
 
 def _started(box, starts: int, draw: np.random.Generator) -> tuple[np.ndarray, ...]:
-    """Starts and bounds in the log-gains, (start, 6) each."""
+    """Starts, lower and upper bounds in the log-gains, (start, 6) each."""
     real = (box[0] > 0).ravel()
     here, least, most = (np.log(np.where(real, b.ravel(), 1)) for b in box)
     others = draw.uniform(least, most, (starts - 1, 6))
@@ -110,7 +103,7 @@ def _search(
 
 
 def _failure(members: list[Scene], first: Row, ensemble: bool) -> ValueError:
-    """What is wrong if no start can be evaluated, judged by the first of them."""
+    """The error to raise if no start can be evaluated, judged by the first start."""
     failing = np.flatnonzero(~first.facts["simulated"])
     if failing.size == 0:
         return ValueError(
@@ -149,39 +142,39 @@ def tune(
     max_steps: int = 50,
     report: Callable[[str], Any] | None = None,
 ) -> TuneResult:
-    """Gains of a scene's PD controller that make its loss small, within bounds.
+    """Minimises a scene's loss in the gains of its PD controller, within bounds.
 
     The unknowns are the logarithms of kp and kd; gains of zero stay zero. Derivatives
-    are integrated beside the motion at a tolerance of 1e-5: good to a millionth of
-    their norm, to some ten thousandths where actuators are at their limits for long,
-    which `gradient_report` measures. A second call with other numbers compiles nothing,
-    nor does one with another method; one with another function for a loss does.
+    are integrated beside the motion at a tolerance of 1e-5. Their relative error is
+    about 1e-6, and some 1e-4 where actuators are at their limits for long;
+    `gradient_report` measures it. A second call with other numbers or another method
+    compiles nothing; a call with another loss function does.
 
     **Arguments:**
 
-    - `scene`: holds exactly one `PDController`.
+    - `scene`: must hold exactly one `PDController`.
     - `factor`: the gains stay within this factor of their start, above 1; by default 4.
     - `bounds`: instead of a factor, the least and the greatest kp and kd: two arrays
       (2, 3), first row kp, second kd [N/m or N m/rad, N s/m or N m s/rad].
-    - `loss`: `(scene, solution) -> residuals`, an array whose sum of squares is made
-      small, or a scalar that is made small itself and is never negative (for which
-      Levenberg-Marquardt has little to go by). By default `tip_errors`: the mean
-      squared tip error over [0, t1]. `Tracking` puts a price on effort.
-    - `ensemble`: scenes like `scene` stacked along a leading axis (`stacked`,
-      `perturbed`). The gains, which are the same for all and start from those of
-      `scene`, are judged by them instead.
+    - `loss`: `(scene, solution) -> residuals`. The sum of squares of an array is
+      minimised; a scalar, never negative, is minimised itself, which gives
+      Levenberg-Marquardt little to go by. By default `tip_errors`: the mean squared tip
+      error over [0, t1]. `Tracking` puts a price on effort.
+    - `ensemble`: scenes like `scene`, stacked along a leading axis (`stacked`,
+      `perturbed`). The loss is then that of the ensemble with common gains, which
+      start from those of `scene`.
     - `over`: "mean", the mean loss of the ensemble, or "worst", its worst as a power
       mean of order 32.
     - `method`: "levenberg-marquardt", "l-bfgs" or "adam" (the latter two by optax).
-    - `starts`: how many runs: one from the scene's gains, the others from random ones
+    - `starts`: number of runs: one from the scene's gains, the others from random gains
       within the bounds. The best counts.
-    - `seed`: of the random starts.
-    - `max_steps`: the greatest number of evaluations of a run after the first.
-    - `report`: is given a line of progress after each step, `print` for instance.
+    - `seed`: seed of the random starts.
+    - `max_steps`: greatest number of evaluations of a run after the first.
+    - `report`: called with a line of progress after each step, for instance `print`.
 
-    Not for use within JAX's transformations, as steps are decided by NumPy.
+    `tune` cannot be used within JAX's transformations, as NumPy decides its steps.
 
-    **Returns:** a `TuneResult`, which says why it stopped.
+    **Returns:** a `TuneResult`, whose `message` says why the search stopped.
 
     **Raises:** ValueError for malformed arguments, and if the scene cannot be simulated
     from its start.
@@ -205,12 +198,12 @@ def tune_each(
 
 
 def tune_each(scenes: Any, *, loss: Loss = tip_errors, **keywords: Any) -> Any:
-    """`tune` for several scenes of one structure, in one compiled program.
+    """Tunes several scenes of one structure in one compiled program.
 
     The topologies may differ.
 
-    **Arguments:** `scenes`: a list or a dict by name, as `circle_scenes` gives; the
-    others as in `tune`, but without an `ensemble`.
+    **Arguments:** `scenes`: a list, or a dict by name as `circle_scenes` returns. The
+    other arguments are those of `tune` without `ensemble` and `over`.
 
     **Returns:** a list of `TuneResult`s, or a dict by the same names.
 
@@ -228,16 +221,16 @@ def tune_each(scenes: Any, *, loss: Loss = tip_errors, **keywords: Any) -> Any:
         results = tune_each(list(scenes.values()), loss=loss, **keywords)
         return dict(zip(scenes, results))
     keywords = keywords_as(tune, keywords, without=("loss", "ensemble", "over"))
-    stacked(scenes)  # refuses what is not alike
+    stacked(scenes)  # raises unless the scenes are alike
     keywords |= dict(ensemble=None, over="mean")
     return _search(scenes, [loss] * len(scenes), **keywords)
 
 
 def trade_off(scene: Scene, prices: ArrayLike, **keywords: Any) -> TradeOff:
-    """The least tip errors for their efforts: `tune` for each price, in one program.
+    """Tunes a scene for each price of effort, in one compiled program.
 
-    **Arguments:** `scene`; `prices` of effort (price,), see `Tracking` [m^2]; the
-    others as in `tune`, but for `loss`.
+    **Arguments:** `scene`; `prices`: prices of effort (price,), see `Tracking` [m^2].
+    The other arguments are those of `tune` without `loss`.
 
     **Returns:** a `TradeOff`, in the order of the prices.
 
