@@ -132,7 +132,7 @@ class Modes(eqx.Module):
 def closed_loop_modes(linkage: Linkage, forces: Forces, solution: Solution) -> Modes:
     """Computes the eigenvalues of the linearised equations at each time of a motion.
 
-    Each time is analysed as if the arm stayed there. Along a path that changes as fast
+    Each state is analysed as if the arm stayed in it. Along a path that changes as fast
     as the modes, stable eigenvalues do not prove stability. While a controller is at
     its limit, the gains of that joint do not act.
 

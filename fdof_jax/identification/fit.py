@@ -156,7 +156,7 @@ def _longer_and_longer(
     high: np.ndarray,
     **keywords: Any,
 ) -> list[Run]:
-    """Runs over growing shares of the time; `until(share)` evaluates up to a share."""
+    """Searches over growing shares of the time; returns the runs over all of it."""
     keywords = dict(method="levenberg-marquardt") | keywords
     for share, longer in zip(_SHARES, _SHARES[1:]):
         runs = minimise(until(share), z, low, high, enough=_ENOUGH_EARLY, **keywords)

@@ -34,7 +34,7 @@ class FitResult(eqx.Module):
     - `covariance`: covariance of the numbers in that order (n, n): the variance of the
       noise times the inverse of the Gauss-Newton matrix. Infinite between parameters of
       which only a combination is determined.
-    - `weak`: combinations of parameters that the motion does not determine, in words:
+    - `weak`: combinations of parameters that the motion hardly determines, in words:
       those without effect on it, and those whose standard error exceeds their size (a
       parameter's size is the greater of its value and its scale).
     - `rms`: root mean square of the residuals without missing samples [as observed].

@@ -41,7 +41,7 @@ class _Moved(NamedTuple):
 
 @eqx.filter_jit
 def _moved(scene: Scene, stretch: Array, factor: Array) -> _Moved:
-    """Simulates links `stretch` (3,) times as long, and gains times `factor` (2, 3)."""
+    """Simulates a scene with lengths * `stretch` (3,) and gains * `factor` (2, 3)."""
     linkage = eqx.tree_at(
         lambda linkage: (linkage.length, linkage.com),
         scene.linkage,

@@ -18,7 +18,7 @@ from ..simulation.solution import Solution
 
 
 def controller_of(scene: Scene) -> PDController:
-    """The only PD controller of a scene; raises ValueError unless there is just one."""
+    """The PD controller of a scene; raises ValueError unless there is exactly one."""
     found = [force for force in scene.forces if isinstance(force, PDController)]
     if len(found) != 1:
         raise ValueError(

@@ -25,7 +25,7 @@ from .gains import (
 from .losses import Tracking, tip_errors
 from .result import TradeOff, TuneResult, result_of
 
-_ENOUGH = 1e-4  # half of it in the rms
+_ENOUGH = 1e-4  # relative decrease of the loss; half of it in the rms error
 # The worst of an ensemble is smoothed to a power mean of this order. With n members it
 # is at most a factor of n^(1/32) below the worst.
 _WORST = 32
