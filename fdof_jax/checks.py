@@ -1,7 +1,7 @@
-"""Checks of arguments at the library's doors.
+"""Checks of the arguments of public functions.
 
-Shapes and types are checked always, values only where they are concrete: a value
-traced by `jax.jit`, `jax.vmap` or `jax.grad` is not known yet.
+Shapes and types are always checked, values only where they are concrete: a value traced
+by `jax.jit`, `jax.vmap` or `jax.grad` is not known yet.
 """
 
 import inspect
@@ -17,18 +17,18 @@ from jax.core import Tracer
 
 
 def is_traced(*trees: Any) -> bool:
-    """Whether any leaf of `trees` is being traced by a JAX transformation."""
+    """Returns whether a JAX transformation traces any leaf of `trees`."""
     return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(trees))
 
 
 def known(*trees: Any) -> bool:
-    """Whether all leaves are numbers that can be looked at."""
+    """Returns whether all leaves are concrete numbers."""
     numbers = all(map(eqx.is_array_like, jax.tree.leaves(trees)))
     return numbers and not is_traced(*trees)
 
 
 def concrete(value: Any) -> np.ndarray | None:
-    """`value` as a NumPy array, or None while it is traced."""
+    """Returns `value` as a NumPy array, or None while it is traced."""
     return None if is_traced(value) else np.asarray(value)
 
 
@@ -42,12 +42,11 @@ def real_array(
     finite: bool = True,
     broadcast: bool = False,
 ) -> Array:
-    """`value` as an array of the default float dtype and the given shape.
+    """Returns `value` as an array of the default float dtype and the given shape.
 
-    `None` in `shape` stands for any length. `broadcast` also accepts one number for
-    all entries. Raises ValueError naming the argument, what was expected and what
-    came, for a wrong shape, a type that is not real numbers, NaN, infinities
-    (unless `finite=False`) and entries below `minimum` or not above `above`.
+    `None` in `shape` stands for any length. `broadcast` also accepts one number for all
+    entries. Raises ValueError for a wrong shape, a type that is not real numbers, NaN,
+    infinities (unless `finite=False`) and entries below `minimum` or not above `above`.
     """
 
     def refuse(got: str) -> ValueError:
@@ -90,14 +89,14 @@ def real_array(
         if ready and fits and not value.weak_type:
             return value
         array = kept
-    # NumPy spreads what is known without a program to compile.
+    # NumPy broadcasts concrete values without compiling a program.
     if not fits:
         array = (jnp if traced else np).broadcast_to(array, shape)  # type: ignore[arg-type]
     return jnp.asarray(array, dtype=float)
 
 
 def callable_tuple(name: str, value: Any) -> tuple:
-    """`value` if it is a tuple of callables, else ValueError."""
+    """Returns `value` if it is a tuple of callables, or raises ValueError."""
     if isinstance(value, tuple) and all(
         callable(item) and not isinstance(item, type) for item in value
     ):
@@ -109,13 +108,13 @@ def callable_tuple(name: str, value: Any) -> tuple:
 
 
 def instance(name: str, value: Any, kind: type) -> None:
-    """Raise ValueError unless `value` is an instance of `kind`."""
+    """Raises ValueError unless `value` is an instance of `kind`."""
     if not isinstance(value, kind):
         raise ValueError(f"{name}: expected a {kind.__name__}, got {value!r}.")
 
 
 def whole_number(name: str, value: Any, minimum: int) -> int:
-    """`value` if it is a whole number, not a bool, of at least `minimum`."""
+    """Returns `value` if it is an integer of at least `minimum`, not a bool."""
     whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
     if not whole or value < minimum:
         raise ValueError(
@@ -125,7 +124,7 @@ def whole_number(name: str, value: Any, minimum: int) -> int:
 
 
 def one_of(name: str, value: Any, options: Sequence[Any]) -> Any:
-    """`value` if it is among `options`, else ValueError."""
+    """Returns `value` if it is among `options`, or raises ValueError."""
     if isinstance(value, str | int | float) and value in options:
         return value
     raise ValueError(f"{name}: expected one of {tuple(options)}, got {value!r}.")
@@ -134,9 +133,9 @@ def one_of(name: str, value: Any, options: Sequence[Any]) -> Any:
 def keywords_as(
     function: Callable, given: dict[str, Any], without: Sequence[str] = ()
 ) -> dict[str, Any]:
-    """The keyword-only arguments of a function, by default unless given.
+    """Returns a function's keyword-only arguments: those given, else the defaults.
 
-    Raises TypeError for others, and for those of `without`, which are not returned.
+    Arguments named in `without` are left out. Raises TypeError for any other keyword.
     """
     allowed = {
         name: parameter.default
@@ -152,7 +151,7 @@ def keywords_as(
 
 
 def sign(name: str, value: Any) -> Array:
-    """`value` as an array if it is 1 or -1, else ValueError."""
+    """Returns `value` as an array if it is 1 or -1, or raises ValueError."""
     array = real_array(name, value, ())
     if (given := concrete(array)) is not None and abs(given) != 1:
         raise ValueError(f"{name}: expected 1 or -1, got {value!r}.")

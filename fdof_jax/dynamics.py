@@ -1,4 +1,4 @@
-"""Forward and inverse dynamics and energies in joint coordinates, of arrays."""
+"""Forward and inverse dynamics and energies in joint coordinates."""
 
 import jax.numpy as jnp
 from jax import Array
@@ -20,13 +20,13 @@ def forward_dynamics(
     tau: Float[Array, " joint"],
     forces: Forces = (),
 ) -> Float[Array, " joint"]:
-    """Joint accelerations under joint efforts: the reduced form of (14), 3x3.
+    """Computes joint accelerations under joint efforts: (14) reduced to 3x3.
 
-    Equal to the paper's masked equations (17)-(27), and regular in cases where those
-    are singular (a massless revolute tip, for instance).
+    The result equals that of the paper's masked equations (17)-(27). It is regular in
+    some cases where those are singular, such as a massless revolute tip.
 
     **Arguments:** `q` [m or rad], `qd` [m/s or rad/s], `tau` [N or N m]; `forces`:
-    force elements whose masses count. Their efforts do not: `tau` has all.
+    force elements that add masses; their efforts count only if `tau` includes them.
 
     **Returns:** `qdd` [m/s^2 or rad/s^2].
 
@@ -46,15 +46,15 @@ def forward_dynamics(
 def inertia_ratios(
     linkage: Linkage, q: Float[Array, " joint"], forces: Forces = ()
 ) -> Float[Array, " joint"]:
-    """How well the accelerations are determined: in (0, 1] per joint, free of units.
+    """Computes how well the accelerations are determined, in (0, 1] per joint.
 
-    The inertia [kg or kg m^2] that each joint feels while the others are free to move,
-    over what it feels while they are locked: 1 / (M_kk (M^-1)_kk) of the 3x3 mass
-    matrix. The accelerations lose about -log10 of the least ratio in digits; below
-    1e-9 in float64, 1e-5 in float32, `simulate` gives up and says so. Zero where the
-    matrix is not positive definite.
+    The ratio 1 / (M_kk (M^-1)_kk) of the 3x3 mass matrix has no unit. It divides the
+    inertia [kg or kg m^2] of a joint while the others are free to move by its inertia
+    while they are locked. The accelerations lose about -log10 of the least ratio in
+    digits. Below 1e-9 in float64 or 1e-5 in float32, `simulate` stops and reports it.
+    The ratio is zero where the matrix is not positive definite.
 
-    **Arguments:** `q` [m or rad]; `forces`: force elements whose masses count.
+    **Arguments:** `q` [m or rad]; `forces`: force elements that add masses.
 
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig5().linkage
@@ -64,7 +64,7 @@ def inertia_ratios(
     more = added_inertia(linkage, forces, q, jnp.zeros_like(q))
     matrix = None if more is None else more[0]
     pairs = zip(*inertia_diagonals(link_constants(linkage, q), zeros(q), matrix))
-    # Divided twice, as a product of zero and infinity is not a number.
+    # Divided twice, as a product of zero and infinity would be NaN.
     return jnp.stack([jnp.where(own > 0, 1 / i / own, 0) for own, i in pairs])
 
 
@@ -76,10 +76,10 @@ def inverse_dynamics(
     qdd: Float[Array, " joint"],
     forces: Forces = (),
 ) -> Float[Array, " joint"]:
-    """Joint efforts that produce given joint accelerations, from (14) reduced.
+    """Computes joint efforts for given joint accelerations, from (14) reduced.
 
     **Arguments:** `q` [m or rad], `qd` [m/s or rad/s], `qdd` [m/s^2 or rad/s^2];
-    `forces`: force elements whose masses count. Their efforts do not.
+    `forces`: force elements that add masses; their efforts are ignored.
 
     **Returns:** `tau` [N or N m].
 
@@ -96,12 +96,12 @@ def inverse_dynamics(
 def joint_mass_matrix(
     linkage: Linkage, q: Float[Array, " joint"], forces: Forces = ()
 ) -> Float[Array, "joint joint"]:
-    """The mass matrix M in joint coordinates, in M qdd + bias = tau.
+    """Computes the mass matrix M in joint coordinates, in M qdd + bias = tau.
 
-    It is (8)-(13) projected on the real joints: symmetric, and positive definite unless
+    M is (8)-(13) projected on the real joints: symmetric, and positive definite unless
     the arm is singular.
 
-    **Arguments:** `q` [m or rad]; `forces`: force elements whose masses count.
+    **Arguments:** `q` [m or rad]; `forces`: force elements that add masses.
 
     **Returns:** M [kg, kg m or kg m^2].
 
@@ -120,13 +120,13 @@ def joint_bias(
     qd: Float[Array, " joint"],
     forces: Forces = (),
 ) -> Float[Array, " joint"]:
-    """The joint efforts of zero acceleration: gravity, centrifugal and Coriolis forces.
+    """Computes the bias: gravity, centrifugal and Coriolis forces on the joints.
 
-    The `bias` of M qdd + bias = tau. The paper's phi (`bias_force`) has the other sign,
-    and is in chain coordinates.
+    In M qdd + bias = tau, the bias is the effort of zero acceleration. The paper's phi
+    (`bias_force`) has the other sign and is in chain coordinates.
 
-    **Arguments:** `q` [m or rad], `qd` [m/s or rad/s]; `forces`: force elements whose
-    masses count.
+    **Arguments:** `q` [m or rad], `qd` [m/s or rad/s]; `forces`: force elements that
+    add masses.
 
     **Returns:** the bias [N or N m].
 
@@ -145,10 +145,9 @@ def mass_and_bias(
     qd: Array,
     start: tuple[Array, Constants] | None = None,
 ) -> tuple[Array, Array]:
-    """Mass matrix and bias of the linkage and of the elements that move masses.
+    """Computes mass matrix and bias of the linkage and of elements that add masses.
 
-    `start`: the positions of a configuration and the constants of the equations there,
-    if they are known.
+    `start`: joint positions and the constants of the equations there, if known.
     """
     q0, constants = start or (q, link_constants(linkage, q))
     m = equations(constants, tuple(q - q0), tuple(qd))
@@ -166,7 +165,7 @@ def link_energies(
     q: Float[Array, " joint"],
     qd: Float[Array, " joint"],
 ) -> tuple[Float[Array, " link"], Float[Array, " link"]]:
-    """Kinetic and potential energy of each moving link, (6) and (7).
+    """Computes the kinetic and potential energy of each moving link, (6) and (7).
 
     **Arguments:** `q` [m or rad], `qd` [m/s or rad/s].
 
@@ -191,10 +190,10 @@ def energy(
     qd: Float[Array, " joint"],
     forces: Forces = (),
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Kinetic and potential energy of the linkage, (6) and (7).
+    """Computes the kinetic and potential energy of the linkage, (6) and (7).
 
-    **Arguments:** `q` [m or rad], `qd` [m/s or rad/s]; `forces`: force elements whose
-    energy counts, that of their masses and springs.
+    **Arguments:** `q` [m or rad], `qd` [m/s or rad/s]; `forces`: force elements, whose
+    masses and springs add energy.
 
     **Returns:** two numbers [J]; the potential is zero at the ground pivot's height.
 

@@ -1,1 +1,1 @@
-"""What an arm is: its links and joints, its coordinates, and where it is singular."""
+"""Linkages: their links and joints, coordinates and singularities."""

@@ -15,10 +15,11 @@ from .topology import pairs_of
 
 
 class State(NamedTuple):
-    """Joint positions and velocities; a bare pytree, checked where it is used.
+    """Joint positions and velocities; a bare pytree that functions check on use.
 
-    `q`: the slide B_k [m] of a prismatic joint, the relative angle th_{k+1} - th_k
-    [rad] of a revolute joint, in joint order (3,). `qd`: their rates (3,).
+    - `q`: the slide B_k [m] of a prismatic joint or the relative angle th_{k+1} - th_k
+      [rad] of a revolute joint, in joint order (3,).
+    - `qd`: the rates of `q` (3,).
 
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig5().linkage
@@ -32,7 +33,7 @@ class State(NamedTuple):
 
 
 def real_state(name: str, value: Any) -> State:
-    """`value` as a state of arrays (3,), else ValueError."""
+    """Returns `value` as a state of arrays (3,) or raises ValueError."""
     try:
         q, qd = value
     except (TypeError, ValueError):
@@ -41,7 +42,7 @@ def real_state(name: str, value: Any) -> State:
 
 
 def real_joints(ef: Array) -> tuple[Array, Array, Array]:
-    """Whether the real joint of each pair is the revolute one."""
+    """Returns whether the real joint of each pair is revolute."""
     return ef[1] > 0.5, ef[3] > 0.5, ef[5] > 0.5
 
 
@@ -49,7 +50,7 @@ def real_joints(ef: Array) -> tuple[Array, Array, Array]:
 def to_chain(
     linkage: Linkage, q: Float[Array, " joint"], qd: Float[Array, " joint"]
 ) -> tuple[Float[Array, " 6"], Float[Array, " 6"]]:
-    """Chain coordinates (B1, th2, B2, th3, B3, th4) and their rates, from joint ones.
+    """Computes chain coordinates (B1, th2, B2, th3, B3, th4) and their rates.
 
     Angles are absolute, as in the paper; fictitious joints stand at `linkage.locked`.
 
@@ -79,7 +80,7 @@ def from_chain(
     xd: ArrayLike,
     base_angle: ArrayLike = 0.0,
 ) -> tuple[Float[Array, " 3"], State]:
-    """Locked positions and joint state, from the paper's lists of initial conditions.
+    """Computes locked positions and joint state from the paper's chain coordinates.
 
     **Arguments:**
 
@@ -90,8 +91,8 @@ def from_chain(
     **Returns:** `locked` for `Linkage`, and the `State`.
 
     **Raises:** ValueError for malformed input and for velocities that would move a
-    fictitious joint (the paper's method stops accelerations only: such a start would
-    drift).
+    fictitious joint. The paper's method stops only accelerations, so the joint would
+    drift.
 
     >>> import fdof_jax as fj
     >>> locked, state = fj.from_chain("RPR", [0, 1.5, 2.5, 2.5, 0, 2], [0] * 6)
@@ -112,7 +113,7 @@ def from_chain(
     slide_rate, turn_rate = chain_rate[0::2], xp.diff(chain_rate[1::2], prepend=0)
     held = concrete(xp.where(revolute, slide_rate, turn_rate))
     if held is not None and pairs is not None:
-        # Differences of absolute rates carry their rounding.
+        # Differences of absolute rates carry rounding errors.
         scale = np.abs(np.asarray(chain_rate)).max()
         for k in np.flatnonzero(np.abs(held) > 8 * np.finfo(held.dtype).eps * scale):
             rate = (

@@ -1,9 +1,9 @@
-"""The linkage: which joints it has, its links, and its two sets of coordinates.
+"""The linkage: its joints and its links.
 
-Pair k of the chain P-R-P-R-P-R joins link k to link k + 1; its prismatic joint
-slides by B_k across link k, its revolute joint sits at the start of link k + 1.
-Link 1 is the ground. One joint of each pair is real, the other is fictitious and
-held at its initial value.
+Pair k of the chain P-R-P-R-P-R joins link k to link k + 1. Its prismatic joint slides
+by B_k across link k; its revolute joint is at the start of link k + 1. Link 1 is the
+ground. One joint of each pair is real; the other is fictitious and held at its initial
+value.
 """
 
 import functools
@@ -27,29 +27,28 @@ from .topology import pairs_of
 class Linkage(eqx.Module):
     """A planar chain of three moving links, as in Fig 1 of the paper.
 
-    Link n starts at its characteristic point. Its vector A_n runs along the link,
-    the slide of the next prismatic joint B_n perpendicular to it (90 degrees
-    counter-clockwise), and the mass centre lies p_n along and q_n across. Every
-    field is an array, so linkages of different topologies share one compilation and
-    can be stacked into a batch.
+    Link n starts at its characteristic point. Its vector A_n runs along the link. The
+    slide B_n of the next prismatic joint is perpendicular to A_n (90 degrees
+    counter-clockwise). The mass centre lies p_n along and q_n across the link. Every
+    field is an array, so linkages of different topologies share one compilation and can
+    be stacked into a batch.
 
     **Arguments:**
 
-    - `topology`: one of `TOPOLOGIES`, or six existence factors. Kept as `ef`.
+    - `topology`: one of `TOPOLOGIES`, or six existence factors; stored as `ef`.
     - `length`: A1..A4 [m]; A1 belongs to the ground.
     - `com`: (p_n, q_n) of the three moving links [m].
     - `mass`: masses m2..m4 of the moving links [kg].
     - `inertia`: moments of inertia I2..I4 about the mass centres [kg m^2].
-    - `locked`: position at which the fictitious joint of each pair stands still: B_k
-      [m] where the real joint is revolute, th_{k+1} - th_k [rad] where it is
-      prismatic.
+    - `locked`: position of the fictitious joint of each pair: B_k [m] where the real
+      joint is revolute, th_{k+1} - th_k [rad] where it is prismatic.
     - `base_angle`: th1, the angle of the ground's vector A1 [rad].
     - `gravity`: acceleration along -y [m/s^2].
 
-    **Raises:** ValueError for malformed input and for linkages that can carry no
-    load at some joint in any configuration. Warns where a configuration exists in
-    which the mass matrix may be singular, and where two joints do the same thing
-    (the paper's rules (i) and (ii)).
+    **Raises:** ValueError for malformed input and for linkages in which some joint
+    moves no inertia in any configuration. Warns if the mass matrix may be singular in
+    some configuration, and if one of two joints is redundant (the paper's rules (i) and
+    (ii)).
 
     >>> import fdof_jax as fj
     >>> pendulum = fj.Linkage("RRR", length=[0, 1, 1, 1], com=[[1, 0]] * 3,
@@ -93,11 +92,11 @@ class Linkage(eqx.Module):
             check_singularity(self)
 
     def replace(self, **values: Any) -> "Linkage":
-        """A copy with other values of some fields, checked as new ones are.
+        """Returns a copy with other values of some fields, checked as a new linkage.
 
         **Arguments:** those of the constructor.
 
-        **Raises:** ValueError for malformed values, and for names of no argument.
+        **Raises:** ValueError for malformed values and for unknown names.
 
         >>> import fdof_jax as fj
         >>> fj.scenes.fig5().linkage.replace(mass=[1, 1, 5]).mass.tolist()  # [kg]
@@ -113,7 +112,7 @@ class Linkage(eqx.Module):
         return Linkage(**now | values)
 
     def __repr__(self) -> str:
-        """With the values of one linkage; with the shapes of a batch."""
+        """Shows the values of a single linkage, or the shapes of a batch."""
         if np.size(self.ef) != 6 or not known(self):
             return super().__repr__()
         topology = "".join(name[0] for name in joint_names(self))
@@ -124,7 +123,7 @@ class Linkage(eqx.Module):
 
 
 def _short(value: Array) -> str:
-    """The numbers in brackets, on one line."""
+    """Formats the numbers on one line."""
     number: Any = {"float_kind": lambda value: f"{value:.6g}"}
     text = np.array2string(
         np.asarray(value), separator=", ", threshold=12, formatter=number
@@ -133,7 +132,7 @@ def _short(value: Array) -> str:
 
 
 def joint_names(linkage: Linkage) -> list[str]:
-    """Of the real joints in order, for instance R1, P2, R3."""
+    """Returns the names of the real joints in order, for instance R1, P2, R3."""
     kinds = np.where(np.asarray(linkage.ef)[1::2] > 0.5, "R", "P")
     return [f"{kind}{k + 1}" for k, kind in enumerate(kinds)]
 
@@ -144,16 +143,16 @@ _T = TypeVar("_T")
 def compiled(
     **doors: tuple[int, ...] | Callable[[Any], Any],
 ) -> Callable[[Callable[..., _T]], Callable[..., _T]]:
-    """Decorate a function of a linkage and arrays: check at the door, compile inside.
+    """Decorates a function of a linkage and arrays: checks arguments, then compiles.
 
-    Each keyword names an array argument and its shape, and the decorated function takes
-    anything that converts to such an array; or an argument and a function that checks
-    and converts it. Without the compilation a call outside of `jax.jit` would dispatch
+    Each keyword names an argument and gives the shape of its array, or a function that
+    checks and converts it. The decorated function accepts anything that converts to
+    such an array. Without compilation, a call outside of `jax.jit` would dispatch
     hundreds of single operations.
     """
 
     def decorate(function: Callable[..., _T]) -> Callable[..., _T]:
-        inner = eqx.filter_jit(function)  # elements may hold functions
+        inner = eqx.filter_jit(function)  # force elements may hold functions
         signature = inspect.signature(function)
 
         @functools.wraps(function)
@@ -174,9 +173,9 @@ def compiled(
 
 
 def check_linkage(linkage: Any) -> None:
-    """Raise ValueError unless the argument is one linkage, not a batch.
+    """Raises ValueError unless the argument is one linkage, not a batch.
 
-    Its values are looked at again: `equinox.tree_at` asks no constructor.
+    Values are checked again, because `equinox.tree_at` bypasses the constructor.
     """
     if not isinstance(linkage, Linkage):
         raise ValueError(f"linkage: expected a Linkage, got {linkage!r}.")
@@ -198,10 +197,11 @@ def check_linkage(linkage: Any) -> None:
 
 
 def possible(linkage: Linkage) -> Array:
-    """Whether the values are ones that the constructor takes, also if traced.
+    """Returns whether the constructor would accept the values; works on traced ones.
 
-    All but a singular mass matrix: existence factors of 0 and 1, complementary in each
-    pair, one revolute joint at least, masses and inertias not negative.
+    Checks that existence factors are 0 or 1 and complementary in each pair, that one
+    joint at least is revolute, and that masses and inertias are not negative. Singular
+    mass matrices are not checked.
     """
     pairs = linkage.ef.reshape(3, 2)
     factors = ((pairs == 0) | (pairs == 1)).all() & (pairs.sum(axis=1) == 1).all()

@@ -1,4 +1,4 @@
-"""Linkages whose mass matrix is singular, always or in some configurations."""
+"""Detects mass matrices that are singular, always or in some configurations."""
 
 import warnings
 from typing import TYPE_CHECKING
@@ -8,16 +8,16 @@ import numpy as np
 if TYPE_CHECKING:
     from .linkage import Linkage
 
-# Below this eigenvalue of a matrix with ones as diagonal there is only rounding.
+# Below this, eigenvalues of a matrix with a diagonal of ones are rounding errors.
 _SINGULAR = 1e-14
 
 
 def _least_inertia(linkage: "Linkage", configurations: int) -> np.ndarray:
-    """How far from singular the joints from k outwards are, (configurations, 3).
+    """Measures how far from singular the joints from k outwards are.
 
-    The least eigenvalue of their block of the 3x3 mass matrix, scaled to a diagonal of
-    ones so that units and sizes play no part. Written in NumPy because it runs at the
-    door.
+    Returns, at random configurations, the least eigenvalue of the joints' block of the
+    3x3 mass matrix (configurations, 3). Scaling to a diagonal of ones makes it free of
+    units and sizes. NumPy avoids compilation in the constructor.
     """
     ef, length, com, mass, inertia, locked, base_angle = (
         np.asarray(a, dtype=float)
@@ -47,7 +47,7 @@ def _least_inertia(linkage: "Linkage", configurations: int) -> np.ndarray:
             M += mass[n] * np.real(np.outer(J.conj(), J)) + inertia[n] * np.outer(
                 turns, turns
             )
-        # Pivots of an elimination would lose their accuracy near singularity.
+        # Eigenvalues, because pivots of an elimination lose accuracy near singularity.
         scale = np.sqrt(np.maximum(np.diag(M), np.finfo(float).tiny))
         scaled = M / np.outer(scale, scale)
         for k in range(3):
@@ -56,7 +56,7 @@ def _least_inertia(linkage: "Linkage", configurations: int) -> np.ndarray:
 
 
 def check_singularity(linkage: "Linkage") -> None:
-    """Refuse linkages that are always singular, warn of those that may become so."""
+    """Rejects linkages that are always singular; warns of those that may become so."""
     revolute = np.asarray(linkage.ef)[1::2] > 0.5
     names = "".join("R" if r else "P" for r in revolute)
     best = _least_inertia(linkage, configurations=5).max(axis=0)

@@ -1,4 +1,4 @@
-"""The seven topologies, and their existence factors."""
+"""The seven topologies and their existence factors."""
 
 from typing import Any
 
@@ -13,7 +13,7 @@ TOPOLOGIES = ("RRR", "RRP", "RPR", "PRR", "RPP", "PRP", "PPR")
 
 
 def pairs_of(topology: Any) -> np.ndarray | None:
-    """(3, 2) existence factors (prismatic, revolute), or None while traced."""
+    """Returns (3, 2) existence factors (prismatic, revolute), or None while traced."""
     if isinstance(topology, str):
         if topology not in TOPOLOGIES:
             detail = ""
@@ -56,10 +56,10 @@ def pairs_of(topology: Any) -> np.ndarray | None:
 
 
 def existence_factors(topology: str) -> Float[Array, " 6"]:
-    """Existence factors EF1..EF6 of a topology, equation (4).
+    """Returns the existence factors EF1..EF6 of a topology, equation (4).
 
-    Prismatic before revolute in each pair, 1 for a real joint and 0 for a
-    fictitious one: "RPR" gives 0, 1, 1, 0, 0, 1.
+    Each pair is (prismatic, revolute), with 1 for a real joint and 0 for a fictitious
+    one: "RPR" gives 0, 1, 1, 0, 0, 1.
 
     **Arguments:** `topology`: one of `TOPOLOGIES`.
 

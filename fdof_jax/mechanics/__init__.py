@@ -1,1 +1,1 @@
-"""The equations at one instant, without forces and without time."""
+"""Kinematics and equations of motion at one instant, without force elements."""

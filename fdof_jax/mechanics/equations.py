@@ -1,12 +1,12 @@
 """The reduced 3x3 equations of motion, in scalars.
 
-They work on scalars, never on stacked arrays: XLA on CPU computes a stacked result once
-per entry. Positions are displacements from a reference configuration, whose
-directions are turned by them: a pendulum 1e-17 rad away from upright keeps that angle,
-which upright + 1e-17 would not, and an arm that starts after a million turns moves as
-it would have before. The algebra is a composite-body recursion from the tip,
-S(EF)^T M S(EF) of the paper's six equations without ever forming them; existence
-factors select, per joint, between turning about a point and sliding along a direction.
+The equations use scalars, never stacked arrays, because XLA on CPU computes a stacked
+result once per entry. Positions are displacements from a reference configuration, which
+turn the reference's directions. A pendulum 1e-17 rad away from upright therefore keeps
+that angle, which upright + 1e-17 would lose, and an arm that starts after a million
+turns moves as it would have before. The algebra is a composite-body recursion from the
+tip: S(EF)^T M S(EF) of the paper's six equations, without forming them. Per joint, the
+existence factor selects between turning about a point and sliding along a direction.
 """
 
 from collections.abc import Callable
@@ -26,15 +26,16 @@ Directions = tuple[Vector, Vector, Vector]
 
 
 class Constants(NamedTuple):
-    """What the equations need of a linkage, as scalars computed once per solve.
+    """Scalars of a linkage for the equations, computed once per solve.
 
-    `e_n` and `b_n` are the directions of the links and the slides at the reference
-    configuration; `m34` = m3 + m4 and so on; `(s_n, t_n)` the first moment of link n,
-    with the mass beyond it hung at the end of its vector A_n, along and across the link
-    [kg m]; `j_n` second moments about the start of link n [kg m^2], `j34` = j3 + j4.
-    `slide_on_slide`: whether the last two joints are prismatic, and `slide2` [kg] what
-    the first of them then feels while the other is free: m3 + m4 sin^2 of the angle
-    between them, where m34 - m4 cos^2 would cancel if that is small.
+    - `e_n`, `b_n`: directions of the links and slides B_n [m] at the reference.
+    - `m34` = m3 + m4, and so on.
+    - `(s_n, t_n)`: first moment of link n along and across the link [kg m], with the
+      mass beyond it at the end of its vector A_n.
+    - `j_n`: second moments about the start of link n [kg m^2]; `j34` = j3 + j4.
+    - `slide_on_slide`: whether the last two joints are prismatic.
+    - `slide2`: the inertia [kg] of the first of these while the other is free, m3 + m4
+      sin^2 of the angle between them; m34 - m4 cos^2 would cancel at small angles.
     """
 
     revolute: Scalars
@@ -68,10 +69,10 @@ def link_constants(
     q: Float[Array, " joint"],
     sincos: Callable[[Array], tuple[Array, Array]] = sincos,
 ) -> Constants:
-    """The scalars that `rates` needs, with `q` as reference.
+    """Computes the scalars that `rates` needs, with `q` as reference.
 
-    `sincos` may be one for larger angles, which are not added up before their
-    directions are known: the sum of large ones is rounded.
+    `sincos` may be one for large angles. Directions are combined instead of angles,
+    because the sum of large angles is rounded.
     """
     x, _ = to_chain(linkage, q, jnp.zeros_like(q))
     r1, r2, r3 = real_joints(linkage.ef)
@@ -141,7 +142,7 @@ class Equations(NamedTuple):
 
 
 def turns(c: Constants, delta: Scalars) -> Scalars:
-    """The angles by which displacements turn the three links [rad]."""
+    """Computes the angles by which displacements turn the three links [rad]."""
     r1, r2, r3 = c.revolute
     turned2 = jnp.where(r1, delta[0], 0)
     turned3 = turned2 + jnp.where(r2, delta[1], 0)
@@ -149,7 +150,7 @@ def turns(c: Constants, delta: Scalars) -> Scalars:
 
 
 def directions(c: Constants, delta: Scalars) -> Directions:
-    """The unit vectors along the three links, turned by displacements."""
+    """Computes the unit vectors along the three links, turned by displacements."""
     e2, e3, e4 = map(_turn, (c.e2, c.e3, c.e4), turns(c, delta))
     return e2, e3, e4
 
@@ -157,9 +158,9 @@ def directions(c: Constants, delta: Scalars) -> Directions:
 def equations(
     c: Constants, delta: Scalars, qd: Scalars, turned: Directions | None = None
 ) -> Equations:
-    """The reduced equations of motion: (8)-(13) projected on the real joints.
+    """Computes the equations of motion: (8)-(13) projected on the real joints.
 
-    `turned`: the `directions` at `delta`, where the caller has them.
+    `turned`: the `directions` at `delta`, if the caller has them.
     """
     r1, r2, r3 = c.revolute
     b2 = c.b2 + jnp.where(r2, 0, delta[1])
@@ -185,8 +186,8 @@ def equations(
     k3 = c.j34 + c.m4 * b3 * b3 + 2 * _dot(d3, u4)
     k2 = c.j2 + c.m34 * b2 * b2 + 2 * _dot(d2, c3) + k3
 
-    # Momentum (linear, and angular about the joint) of what lies beyond a joint that
-    # moves at unit rate; each joint before it feels its share.
+    # Linear momentum, and angular momentum about the joint, of the links beyond a joint
+    # that moves at unit rate; each joint before it takes a share.
     p3 = _select(r3, _perp(u4), (c.m4 * n3[0], c.m4 * n3[1]))
     p2 = _select(r2, _perp(c3), (c.m34 * n2[0], c.m34 * n2[1]))
     h3 = jnp.where(r3, c.j4, _cross(u4, n3))
@@ -194,8 +195,8 @@ def equations(
     h3_at_2 = h3 + _cross(d3, p3)
 
     # Efforts that keep all joints at constant rate, gravity included. Differences of
-    # squared angular velocities are products with the joint rates: absolute rates
-    # may be large and close.
+    # squared angular velocities are written as products with the joint rates, because
+    # absolute rates may be large and nearly equal.
     slide2 = 2 * w2 * jnp.where(r2, 0, qd[1])
     slide3 = 2 * w3 * jnp.where(r3, 0, qd[2])
     w22, w33, w44 = w2 * w2, w3 * w3, w4 * w4
@@ -251,6 +252,6 @@ def equations(
 
 
 def zeros(q: Float[Array, " joint"]) -> Scalars:
-    """Zero displacements, rates or efforts, in the dtype of `q`."""
+    """Returns zero displacements, rates or efforts in the dtype of `q`."""
     zero = jnp.zeros_like(q[0])
     return zero, zero, zero

@@ -1,4 +1,4 @@
-"""Joint positions of a commanded tip."""
+"""Inverse kinematics: joint positions for a commanded tip."""
 
 from typing import NamedTuple
 
@@ -16,30 +16,29 @@ from .kinematics import as_points, unit_vectors
 
 
 def plane_angle(y: Array, x: Array) -> Array:
-    """atan2 with derivative zero instead of NaN at the origin."""
+    """Computes atan2 with derivative zero instead of NaN at the origin."""
     xp = namespace(y, x)
     origin = (x == 0) & (y == 0)
     return xp.arctan2(y, xp.where(origin, 1, x))
 
 
 def whole_turns(angle: Array) -> Array:
-    """How many turns to take off `angle` to leave it in (-pi, pi].
+    """Returns the number of turns to subtract from `angle` for a value in (-pi, pi].
 
     The cut lies beside the negative x axis by more than rounding, so that points on
-    that axis are at +pi whichever way they were computed.
+    that axis are always at +pi.
     """
     margin = float(np.sqrt(np.finfo(angle.dtype).eps))
     return namespace(angle).ceil((angle - np.pi - margin) / (2 * np.pi))
 
 
 class Directions(NamedTuple):
-    """What is known of the links before the tip's position is.
+    """Directions of the links that do not depend on the tip's position.
 
     - `th2`, `th3`: angles of links 2 and 3 where they follow from the ground or from
-      the last link's orientation; otherwise any [rad].
+      the last link's orientation; arbitrary otherwise [rad].
     - `e1`, `e2`, `e3`, `e4`: unit vectors of the links' angles.
-    - `turn`: the unit vector of `locked[1]`, by which link 3 is turned from link 2 in
-      an RPR arm.
+    - `turn`: unit vector of `locked[1]`, the angle from link 2 to link 3 in RPR arms.
     """
 
     th2: Array
@@ -52,22 +51,23 @@ class Directions(NamedTuple):
 
 
 def known_directions(linkage: Linkage, orientation: Array) -> Directions:
-    """Directions that follow from the ground or from the last link's angle."""
+    """Computes directions that follow from the ground or the last link's angle."""
     xp = namespace(linkage, orientation)
     r1, _, r3 = real_joints(linkage.ef)
     lock1, lock2, lock3 = linkage.locked
     th3_from_tip = orientation - lock3
     th2 = xp.where(r1, th3_from_tip - lock2, linkage.base_angle + lock1)
     th3 = xp.where(r3, th2 + lock2, th3_from_tip)
-    # At once: sine and cosine are most of what is compiled here.
+    # One call for all: sine and cosine are most of the compiled code here.
     angles = xp.stack([linkage.base_angle, th2, th3, orientation, lock2])
     return Directions(th2, th3, *unit_vectors(angles))
 
 
 def unmoved_part(linkage: Linkage, directions: Directions) -> Array:
-    """What the tip's position has from no joint: the ground's and last link's vectors.
+    """Computes the sum of the ground's and the last link's vectors, (2,).
 
-    The rest is the wrist vector, from the first joint's start to the last link's, (2,).
+    No joint moves this part of the tip's position. The rest is the wrist vector, from
+    the first joint's start to the last link's start.
     """
     xp = namespace(linkage, directions)
     r1, _, _ = real_joints(linkage.ef)
@@ -83,18 +83,18 @@ def solve_joints(
     orientation: Array,
     branch: Array,
 ) -> tuple[Array, Array]:
-    """Joint positions (..., 3) from the wrist vector, NaN where it is out of reach.
+    """Computes joint positions (..., 3) from the wrist vector, NaN if out of reach.
 
     The second result is a root that is 0 just at the edge of the reach, where
     velocities are infinite.
 
-    `bearing` is the direction angle of `wrist`. It is an argument so that a path that
-    winds around the pivot may pass an angle that has no jump.
+    `bearing` is the direction angle of `wrist`. As an argument it can be continuous
+    along a path that winds around the pivot.
 
-    The chain up to the wrist has two free joints, of which there are four kinds: two
-    turning vectors (RRR), a turning frame in which one slide moves (RPR), one turning
-    vector and one slide of known direction (PRR, RRP), two slides (PPR, RPP, PRP).
-    All but the last need one square root, whose sign is the branch.
+    The chain up to the wrist has two free joints, in four kinds: two turning vectors
+    (RRR), a turning frame in which one slide moves (RPR), one turning vector and one
+    slide of known direction (PRR, RRP), two slides (PPR, RPP, PRP). All kinds but the
+    last need one square root, whose sign is the branch.
     """
     xp = namespace(linkage, wrist, bearing, orientation, branch)
     r1, r2, r3 = real_joints(linkage.ef)
@@ -120,7 +120,7 @@ def solve_joints(
     d3 = plane_vector(a3, xp.where(r3, lock3, 0))
     reach2, reach3 = dot(d2, d2), dot(d3, d3)
 
-    # Two slides: what remains of the wrist vector, along the two directions.
+    # Two slides: the rest of the wrist vector is resolved along their directions.
     rest = w - d2 * e2 - d3 * e3
     first = 1j * xp.where(r1, e2, e1)
     second = 1j * xp.where(r3, e2, e3)
@@ -129,8 +129,8 @@ def solve_joints(
     span = xp.where(two_slides, xp.where(parallel, xp.nan, span), 1)
     slide_first, slide_second = cross(rest, second) / span, cross(first, rest) / span
 
-    # One turning vector, one slide along i*across: the part of the wrist vector along
-    # `across` is the turning vector's.
+    # One turning vector, one slide along i*across: only the turning vector contributes
+    # to the wrist vector's component along `across`.
     across = xp.where(turning_third, e1, e3)
     remainder = w - xp.where(turning_third, d2 * e2, d3 * e3)
     turning = xp.where(turning_third, reach3, reach2)
@@ -149,7 +149,7 @@ def solve_joints(
         reach2 * reach3 - inner**2,
         xp.where(framed, square - distance**2, turning - along_turning**2),
     )
-    with np.errstate(invalid="ignore"):  # NaN is the answer out of reach
+    with np.errstate(invalid="ignore"):  # NaN out of reach is intended
         root = branch * xp.sqrt(xp.where(two_slides, 1, radicand))
     base = xp.where(
         two_turning, reach2 + inner, xp.where(framed, distance, along_turning)
@@ -188,25 +188,24 @@ def inverse_kinematics(
     *,
     branch: int = 1,
 ) -> Float[Array, " joint"]:
-    """Joint positions that put the tip at a point with a given direction of A4.
+    """Computes joint positions for a tip position and a direction of A4.
 
-    Closed form for every topology, selected by the existence factors. The direction of
-    the last link's start as seen from the first joint is taken in (-pi, pi], from which
-    the angles follow without wrapping.
+    The solution is in closed form for every topology, selected by the existence
+    factors. The direction from the first joint to the last link's start is in
+    (-pi, pi]; the angles follow from it without wrapping.
 
     **Arguments:**
 
     - `tip`: the point (x, y) [m].
     - `orientation`: th4, the absolute angle of the last link [rad].
-    - `branch`: 1 or -1, which of the two assemblies: the sign of the turn from A2 to
-      A3 (RRR), of the slide measured from the foot of the perpendicular (RPR), or of
-      the side of the turning vector (PRR, RRP). Of no effect where there is only one.
+    - `branch`: 1 or -1, the choice between two assemblies: the sign of the turn from
+      A2 to A3 (RRR), of the slide measured from the foot of the perpendicular (RPR), or
+      of the side of the turning vector (PRR, RRP). Ignored where there is only one.
 
-    **Returns:** `q` [m or rad]; NaN where the point is out of reach and the arguments
-    are traced.
+    **Returns:** `q` [m or rad]; NaN for traced arguments if the point is out of reach.
 
-    **Raises:** ValueError for malformed arguments and, where they are concrete, for a
-    point out of reach.
+    **Raises:** ValueError for malformed arguments, and for concrete arguments if the
+    point is out of reach.
 
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig7().linkage
@@ -218,7 +217,7 @@ def inverse_kinematics(
     tip = real_array("tip", tip, (2,))
     orientation = real_array("orientation", orientation, ())
     side = sign("branch", branch)
-    # Of known values by NumPy, because single operations of JAX are compiled.
+    # NumPy computes concrete values, as JAX would compile each single operation.
     arm, point, angle, side = in_numpy((linkage, tip, orientation, side))
     directions = known_directions(arm, angle)
     wrist = point - unmoved_part(arm, directions)

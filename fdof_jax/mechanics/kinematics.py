@@ -1,4 +1,4 @@
-"""Positions and velocities of points of a linkage, and inverse kinematics."""
+"""Forward kinematics: positions and velocities of points of a linkage."""
 
 import jax
 import jax.numpy as jnp
@@ -10,8 +10,8 @@ from ..linkage.linkage import Linkage, compiled
 from ..xla.array_namespace import namespace, plane_vector, sine_and_cosine
 
 # Vectors of the plane are complex numbers here: multiplying by exp(i th) turns them,
-# multiplying by i turns them by 90 degrees. Inverse kinematics evaluates in NumPy too,
-# and there at many points at once: of arrays (..., 2) for instance.
+# multiplying by i turns them by 90 degrees. Inverse kinematics also calls these helpers
+# with NumPy arrays, and for many points at once, with shapes such as (..., 2).
 
 
 def unit_vectors(angle: Array) -> Array:
@@ -24,7 +24,7 @@ def as_points(points: Array) -> Array:
 
 
 def _chain(linkage: Linkage, q: Array) -> tuple[Array, Array, Array]:
-    """Slides B1..B3, directions e_1..e_4 and the starts of the moving links."""
+    """Computes slides B1..B3, directions e_1..e_4 and starts of the moving links."""
     x, _ = to_chain(linkage, q, jnp.zeros(3))
     e = unit_vectors(jnp.concatenate([linkage.base_angle[None], x[1::2]]))
     steps = jax.lax.complex(linkage.length[:3], x[0::2]) * e[:3]
@@ -35,7 +35,7 @@ def _chain(linkage: Linkage, q: Array) -> tuple[Array, Array, Array]:
 def joint_positions(
     linkage: Linkage, q: Float[Array, " joint"]
 ) -> Float[Array, "joint 2"]:
-    """Where each joint pair ends and the next link starts: its revolute axis.
+    """Computes the revolute axis of each joint pair, where the next link starts.
 
     **Arguments:** `q`: joint positions [m or rad].
 
@@ -51,7 +51,7 @@ def joint_positions(
 
 @compiled(q=(3,))
 def mass_centers(linkage: Linkage, q: Float[Array, " joint"]) -> Float[Array, "link 2"]:
-    """Mass centres of the moving links.
+    """Computes the mass centres of the moving links.
 
     **Arguments:** `q`: joint positions [m or rad].
 
@@ -71,7 +71,7 @@ def mass_centers(linkage: Linkage, q: Float[Array, " joint"]) -> Float[Array, "l
 def mass_center_velocities(
     linkage: Linkage, q: Float[Array, " joint"], qd: Float[Array, " joint"]
 ) -> tuple[Float[Array, "link 2"], Float[Array, " link"]]:
-    """Velocities of the mass centres and angular velocities of the moving links.
+    """Computes velocities of the mass centres and angular velocities of the links.
 
     **Arguments:** `q`: joint positions [m or rad]; `qd`: rates [m/s or rad/s].
 
@@ -89,7 +89,7 @@ def mass_center_velocities(
 
 @compiled(q=(3,))
 def tip_position(linkage: Linkage, q: Float[Array, " joint"]) -> Float[Array, " 2"]:
-    """The tip: the end of the last link's vector A4.
+    """Computes the tip's position: the end of the last link's vector A4.
 
     **Arguments:** `q`: joint positions [m or rad].
 
@@ -108,7 +108,7 @@ def tip_position(linkage: Linkage, q: Float[Array, " joint"]) -> Float[Array, " 
 def tip_jacobian(
     linkage: Linkage, q: Float[Array, " joint"]
 ) -> Float[Array, "3 joint"]:
-    """Derivative of the tip's x, y and orientation in the joint positions.
+    """Computes the derivative of the tip's x, y and orientation in `q`.
 
     **Arguments:** `q`: joint positions [m or rad].
 

@@ -1,8 +1,8 @@
 """The paper's own equations in its six chain coordinates, masked by existence factors.
 
-x = (B1, th2, B2, th3, B3, th4) with absolute angles. Faithful to equations (8)-(27)
-with the printed mistakes corrected where marked; `dynamics` holds the reduced form
-that simulations use.
+x = (B1, th2, B2, th3, B3, th4) with absolute angles. The code follows equations
+(8)-(27), with misprints corrected where marked. `dynamics` holds the reduced form that
+simulations use.
 """
 
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ from ..xla.trigonometry import sincos
 def mass_matrix(
     linkage: Linkage, x: Float[Array, " chain"]
 ) -> Float[Array, "chain chain"]:
-    """The 6x6 mass matrix of the generalised chain: left sides of (8)-(13).
+    """Computes the 6x6 mass matrix of the chain: left sides of (8)-(13).
 
     **Arguments:** `x`: (B1, th2, B2, th3, B3, th4), absolute angles [m, rad].
 
@@ -81,7 +81,7 @@ def mass_matrix(
 def bias_force(
     linkage: Linkage, x: Float[Array, " chain"], xd: Float[Array, " chain"]
 ) -> Float[Array, " chain"]:
-    """phi of (14): velocity-dependent forces and gravity, right sides of (8)-(13).
+    """Computes phi of (14): velocity-dependent forces and gravity in (8)-(13).
 
     **Arguments:** `x`, `xd`: chain coordinates and rates [m, rad, m/s, rad/s].
 
@@ -182,13 +182,13 @@ def masked_accelerations(
     xd: Float[Array, " chain"],
     force: Float[Array, " chain"],
 ) -> Float[Array, " chain"]:
-    """Accelerations of the six coordinates by the EF-masked rows (17)-(27).
+    """Computes the six accelerations by the EF-masked rows (17)-(27).
 
-    The row of a real joint is its row of (15) plus those of the fictitious revolute
-    joints beyond it. The row of a fictitious joint says that it stands still: Bdd = 0,
-    or the same angular acceleration as the link before. The paper gives those rows a
-    mass as coefficient, which may vanish; here it is 1. ((19) prints a minus sign
-    before B3dd M(5,5), wrong wherever the last joint is prismatic.)
+    The row of a real joint is its row of (15) plus the rows of the fictitious revolute
+    joints beyond it. The row of a fictitious joint keeps it still: Bdd = 0, or the same
+    angular acceleration as the link before. The paper multiplies these rows by a mass,
+    which may vanish; here the coefficient is 1. (The minus sign before B3dd M(5,5) in
+    (19) is wrong wherever the last joint is prismatic.)
 
     **Arguments:** `x`, `xd`: chain coordinates and rates [m, rad, m/s, rad/s];
     `force`: joint efforts (F_B1, tau_th2, ..., tau_th4) [N, N m], each revolute one
@@ -214,15 +214,15 @@ def masked_accelerations(
         th2 = rows[1] + ef3 * th3
         return jnp.stack([rows[0], th2, rows[2], th3, rows[4], th4])
 
-    # With the columns of fictitious joints added up likewise, their rows are those of
-    # the identity and nothing but a copy is left to do for them. The real ones are
-    # scaled: metres and radians may be worlds apart.
+    # Columns of fictitious joints are added up likewise: their rows become those of the
+    # identity. Rows of real joints are scaled, because metres and radians may differ by
+    # many orders of magnitude.
     both = jnp.where(jnp.outer(real, real), masked(masked(M).T), jnp.eye(6))
     diagonal = jnp.diag(both)
     size = jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1))
     scaled = jnp.where(real, masked(right), 0) / size
     xdd = jnp.linalg.solve(both / jnp.outer(size, size), scaled) / size
-    xdd = jnp.where(real, xdd, 0)  # which elimination leaves to rounding
+    xdd = jnp.where(real, xdd, 0)  # elimination leaves rounding errors there
     th2 = xdd[1]
     th3 = jnp.where(real[3], xdd[3], th2)
     th4 = jnp.where(real[5], xdd[5], th3)
@@ -236,10 +236,10 @@ def constraint_forces(
     xd: Float[Array, " chain"],
     force: Float[Array, " chain"],
 ) -> Float[Array, " chain"]:
-    """Generalised constraint forces at the fictitious joints, (16)-(26).
+    """Computes the generalised constraint forces at fictitious joints, (16)-(26).
 
-    What each fictitious joint adds to its command in `force` to stand still. Computed
-    from the accelerations by the balance (15) from the tip inwards, which equals the
+    Each fictitious joint adds this force to its command in `force` to stand still. The
+    balance (15) gives it from the accelerations, from the tip inwards. This equals the
     printed forms ((24) prints an equals sign for a plus).
 
     **Arguments:** as for `masked_accelerations`.
@@ -260,6 +260,6 @@ def constraint_forces(
 
 
 def _generalised(force: Array) -> Array:
-    """Generalised forces of joint efforts: a revolute one reacts on the link before."""
+    """Generalised forces of joint efforts; revolute ones react on the link before."""
     reaction = jnp.concatenate([force[3::2], jnp.zeros_like(force[:1])])
     return force.at[1::2].add(-reaction)

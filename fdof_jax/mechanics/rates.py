@@ -1,8 +1,8 @@
-"""What integrators take: the rates of a linkage's state, and their derivatives.
+"""The rates of a linkage's state for integrators, and their derivatives.
 
-XLA on CPU gives each result of an expression, and each division in it, a loop of its
-own over the batch: five evaluations of the equations for one. Here they are one fused
-loop, in forward and in derivative computations.
+XLA on CPU gives each result of an expression, and each division in it, its own loop
+over the batch, which evaluates the equations five times. Here one fused loop computes
+all results, also of derivatives.
 """
 
 import functools
@@ -56,10 +56,10 @@ def _rates_and_conditioning(
 
 
 def _loss(m: Equations, inverse: Scalars) -> Array:
-    """What rounding is multiplied by in the accelerations."""
+    """Computes the amplification of rounding errors in the accelerations."""
     i11, i22, i33 = inverse
     loss = jnp.maximum(m.m11 * i11, jnp.maximum(m.m22 * i22, m.m33 * i33))
-    # An infinite inverse times a mass of zero.
+    # An infinite inverse times a mass of zero would be NaN.
     return jnp.where(i11 == jnp.inf, jnp.inf, loss)
 
 
@@ -73,7 +73,7 @@ def _conditioning(
 
 
 def conditioning(c: Constants, delta: Scalars, added: Added | None = None) -> Array:
-    """What rounding is multiplied by, as `rates_and_conditioning` returns it."""
+    """Computes the amplification of rounding errors, see `rates_and_conditioning`."""
     return fused(_conditioning)(c, delta, added)
 
 
@@ -85,7 +85,7 @@ def required_efforts(
     qdd: Scalars,
     turned: Directions | None = None,
 ) -> Scalars:
-    """The inverse dynamics: M qdd + bias."""
+    """Computes the inverse dynamics, M qdd + bias."""
     m = equations(c, delta, qd, turned)
     y1, y2, y3 = times((m.m11, m.m12, m.m13, m.m22, m.m23, m.m33), qdd)
     b1, b2, b3 = m.bias
@@ -95,7 +95,7 @@ def required_efforts(
 def _directions_and_inverse(
     reciprocal: Callable, c: Constants, delta: Scalars, added: Added | None
 ) -> tuple[Directions, Matrix]:
-    """The directions of the links, and the inverse of the mass matrix by columns."""
+    """Computes the links' directions and the columns of the inverse mass matrix."""
     turned = directions(c, delta)
     zero, one = jnp.zeros_like(delta[0]), jnp.ones_like(delta[0])
     m = with_added(added, equations(c, delta, (zero, zero, zero), turned))
@@ -113,7 +113,7 @@ def _demanded_change(
     turned: Directions,
     direction: tuple[Scalars, Scalars],
 ) -> Scalars:
-    """Derivative of the efforts that `qdd` takes, in a direction of (delta, qd)."""
+    """Derivative of the efforts for given `qdd`, in a direction of (delta, qd)."""
     del reciprocal  # nothing is divided
     delta_dot, qd_dot = direction
     turned_dot = tuple(
@@ -140,14 +140,14 @@ def _derivatives(
     qdd: Scalars,
     added: Added | None,
 ) -> tuple[Scalars, Matrix]:
-    # Sines and cosines first, and only once: XLA would compute them anew for each of
-    # the results that follow. A single arm's derivatives are 1.7 times faster so.
+    # Sines and cosines come first, as XLA would otherwise compute them anew for each of
+    # the following results. This makes a single arm's derivatives 1.7 times faster.
     turned, inverse = evaluated(_directions_and_inverse)(c, delta, added)
-    # The six directions are lanes of one loop, whose code has then the size of one.
+    # As lanes of one loop, the six directions need the code of only one.
     demanded = jax.vmap(
         lambda d: evaluated(_demanded_change)(c, delta, qd, qdd, turned, d)
     )(_unit_directions(delta[0].dtype))
-    # No derivative goes through the solution of the equations.
+    # The linear solve itself is not differentiated: qdd' = -M^-1 (change of efforts).
     by_state: Any = tuple(
         -sum(column[row] * change for column, change in zip(inverse, demanded))
         for row in range(3)
@@ -185,9 +185,9 @@ def rates(
     tau: Scalars,
     added: Added | None = None,
 ) -> tuple[Scalars, Scalars]:
-    """Rates of the joint displacements `delta` from the reference of `c`, and of `qd`.
+    """Computes the rates of `delta` and `qd`: velocities and accelerations.
 
-    The equations of motion as what an integrator takes: velocities and accelerations.
+    `delta` are the joint displacements from the reference of `c`.
     """
     return fused(_rates)(c, delta, qd, tau, added)
 
@@ -235,10 +235,10 @@ def rates_and_conditioning(
     tau: Scalars,
     added: Added | None = None,
 ) -> tuple[tuple[Scalars, Scalars], Array]:
-    """`rates`, and what rounding is multiplied by: 1 over the least inertia ratio.
+    """Computes `rates` and the amplification of rounding errors in them.
 
-    See `inertia_ratios`. Infinite where the mass matrix is not positive definite.
-    Derivatives take it for a constant.
+    The amplification is 1 over the least of the `inertia_ratios`, infinite where the
+    mass matrix is not positive definite, and constant for derivatives.
     """
     qd, qdd, loss = fused(_rates_and_conditioning)(c, delta, qd, tau, added)
     return (qd, qdd), loss
@@ -254,7 +254,7 @@ def _rates_and_conditioning_jvp(primals, tangents):
 def inertia_diagonals(
     c: Constants, delta: Scalars, added: Added | None = None
 ) -> tuple[Scalars, Scalars]:
-    """The diagonals of the mass matrix and of its inverse, infinite if it has none."""
+    """Diagonals of the mass matrix and its inverse, which is infinite if singular."""
     zero = jnp.zeros_like(delta[0])
     m = with_added(added, equations(c, delta, (zero, zero, zero)))
     _, inverse_diagonal = solver_of(c, m, added, divided)

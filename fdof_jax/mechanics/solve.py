@@ -16,13 +16,11 @@ from .equations import (
 )
 
 Matrix = tuple[Scalars, Scalars, Scalars]  # by columns
-
-
-# What force elements add to the mass matrix: m11, m12, m13, m22, m23, m33.
+# The force elements' share of the mass matrix: m11, m12, m13, m22, m23, m33.
 Added = tuple[Array, Array, Array, Array, Array, Array]
 
-
-# A first guess of 1/x, good to 12 %: these bits less those of x.
+# These bits minus those of x are a first guess of 1/x, good to 12 %; then the number of
+# Newton iterations.
 _RECIPROCAL_BITS = {
     np.dtype("float64"): (np.int64(0x7FDE623822FC16E6), 5),
     np.dtype("float32"): (np.int32(0x7EF311C3), 4),
@@ -30,7 +28,7 @@ _RECIPROCAL_BITS = {
 
 
 def _newton_reciprocal(x: Array) -> Array:
-    """1/x to an ulp or two, without a division, which XLA keeps out of fused loops."""
+    """Computes 1/x to an ulp or two; XLA keeps real divisions out of fused loops."""
     bits, iterations = _RECIPROCAL_BITS[x.dtype]
     guess = bits - jax.lax.bitcast_convert_type(x, bits.dtype)
     y = jax.lax.bitcast_convert_type(guess, x.dtype)
@@ -45,7 +43,7 @@ def divided(x: Array) -> Array:
 
 @functools.cache
 def fused(function: Callable) -> Callable:
-    """`function(reciprocal, *arguments)` by the means of the platform."""
+    """Returns `function` with a reciprocal and a loop that suit the platform."""
 
     @jax.jit  # traced once, not at each use
     def on_platform(*arguments):
@@ -64,10 +62,10 @@ def solver_of(
     added: Added | None,
     reciprocal: Callable[[Array], Array],
 ) -> tuple[Callable[[Scalars], Scalars], Callable[[], Scalars]]:
-    """Solves M x = f, by L^T D L from the tip: the pivots are articulated inertias.
+    """Returns a function that solves M x = f, and one for the diagonal of M^-1.
 
-    `m` has what is `added` in it. The second function returns the diagonal of the
-    inverse of M, infinite where a pivot is not positive.
+    The factorisation is L^T D L from the tip, whose pivots are articulated inertias.
+    `m` already includes `added`. The diagonal is infinite if a pivot is not positive.
     """
     inverse3 = reciprocal(m.m33)
     l23, l13 = m.m23 * inverse3, m.m13 * inverse3
@@ -90,7 +88,7 @@ def solver_of(
         from1 = l13 - l12 * l23
         second = inverse2 + l12 * l12 * inverse1
         third = inverse3 + l23 * l23 * inverse2 + from1 * from1 * inverse1
-        # The pivots after one that is not positive are not numbers.
+        # After a pivot that is not positive, the others may be NaN.
         singular = (m.m33 <= 0) | (pivot2 <= 0) | (pivot1 <= 0)
         first, second, third = (
             jnp.where(singular, jnp.inf, i) for i in (inverse1, second, third)

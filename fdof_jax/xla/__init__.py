@@ -1,1 +1,1 @@
-"""What XLA needs, and nothing about arms: precision, sines, loops, checks."""
+"""Helpers for XLA that know nothing of arms: settings, sines, loops, checks."""

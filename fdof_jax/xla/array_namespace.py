@@ -1,7 +1,7 @@
-"""Lines that evaluate in NumPy as well as in JAX.
+"""Helpers for code that runs in NumPy as well as in JAX.
 
-At the door of `simulate` a few numbers are looked at once. NumPy does that in less than
-a millisecond; JAX would first compile a program, for a hundred times as long.
+`simulate` checks a few concrete numbers once per call. NumPy does so in less than a
+millisecond; JAX would first compile a program, which takes a hundred times as long.
 """
 
 from typing import Any
@@ -15,10 +15,10 @@ from .trigonometry import sincos
 
 
 def in_numpy(tree: Any) -> Any:
-    """`tree` with NumPy arrays for its JAX arrays, except for traced ones."""
+    """Returns `tree` with its concrete JAX arrays as NumPy arrays."""
 
     def converted(leaf: Any) -> Any:
-        # Random keys are JAX arrays that NumPy has no type for.
+        # NumPy has no dtype for random keys.
         numbers = isinstance(leaf, jax.Array) and isinstance(leaf.dtype, np.dtype)
         return np.asarray(leaf) if numbers and not isinstance(leaf, Tracer) else leaf
 
@@ -26,19 +26,19 @@ def in_numpy(tree: Any) -> Any:
 
 
 def namespace(*trees: Any) -> Any:
-    """`jax.numpy` if any leaf of `trees` is a JAX array, else `numpy`."""
+    """Returns `jax.numpy` if any leaf of `trees` is a JAX array, else `numpy`."""
     leaves = jax.tree.leaves(trees)
     return jnp if any(isinstance(leaf, jax.Array) for leaf in leaves) else np
 
 
 def sine_and_cosine(angle: Any) -> tuple[Any, Any]:
-    """Sine and cosine of `angle`, by `sincos` for a JAX array."""
+    """Computes sine and cosine of `angle`, with `sincos` for a JAX array."""
     if namespace(angle) is jnp:
         return sincos(angle)
     return np.sin(angle), np.cos(angle)
 
 
 def plane_vector(x: Any, y: Any) -> Any:
-    """x + iy."""
-    # In JAX a product with 1j would be computed, and differentiated.
+    """Returns x + iy."""
+    # JAX would compute and differentiate a product with 1j.
     return jax.lax.complex(x, y) if namespace(x, y) is jnp else x + 1j * y

@@ -1,12 +1,12 @@
-"""Programs without calls back into Python.
+"""Compiles programs without calls back into Python.
 
-JAX 0.10 keeps no program in its persistent cache that calls back into Python, and no
-version can export one. diffrax's run-time checks do: that output times increase, that
-they lie within the solve, that the first step has the right sign. `simulate` has made
-them so before, or its result says that they are not.
+JAX 0.10 keeps no program with calls back into Python in its persistent cache, and no
+version can export one. diffrax's run-time checks make such calls: that output times
+increase, that they lie within the solve, that the first step has the right sign.
+`simulate` makes these checks itself or reports violations in its result.
 
-Equinox has one switch for such checks, for a whole process: the environment variable
-EQX_ON_ERROR. Where a future version keeps it elsewhere, the checks stay in.
+Equinox has one switch for such checks in the whole process, the environment variable
+EQX_ON_ERROR. If a future version moves the switch, the checks stay in.
 """
 
 import contextlib
@@ -20,7 +20,7 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 _ERRORS: Any = equinox._errors
-_CHOSEN = getattr(_ERRORS, "EQX_ON_ERROR", None)  # by whoever started the process
+_CHOSEN = getattr(_ERRORS, "EQX_ON_ERROR", None)  # by the user's environment
 
 
 @contextlib.contextmanager
@@ -37,12 +37,12 @@ def _set_to(choice: Any) -> Iterator[None]:
 
 
 def without_checks():
-    """Leave Equinox's run-time checks out of what is traced in this context."""
+    """Omits Equinox's run-time checks from code traced in this context."""
     return _set_to("off")
 
 
 def with_checks(function: Callable[P, T]) -> Callable[P, T]:
-    """Keep them in what this function traces: a user's own force elements, say."""
+    """Keeps run-time checks in code that `function` traces, such as user elements."""
 
     @functools.wraps(function)
     def checked(*args: P.args, **keywords: P.kwargs) -> T:

@@ -1,6 +1,6 @@
-"""Settings that an application makes once, at its start: `configure`.
+"""Settings that an application makes once, at its start, with `configure`.
 
-The library itself sets nothing when it is imported.
+Importing the library sets nothing.
 """
 
 import hashlib
@@ -17,17 +17,17 @@ from jax._src import xla_bridge
 from jax.experimental.compilation_cache import compilation_cache
 from jaxlib import version
 
-# XLA on CPU compiles a loop as one kernel if its state has fewer bytes than this option
-# says, and otherwise starts a kernel for each operation. XLA reads it when JAX starts.
-# A version that does not know this option ignores it; unknown flags end the process.
+# XLA on CPU compiles a loop as one kernel if its state has fewer bytes than this sets;
+# otherwise it starts a kernel for each operation. XLA reads the option when JAX starts.
+# Versions that do not know it ignore it, whereas unknown flags end the process.
 _SMALL_LOOPS = "xla_cpu_small_while_loop_byte_threshold"
 _FLAG = f"--xla_backend_extra_options={_SMALL_LOOPS}=100000"
-# From this version on XLA does so by itself.
+# From this version of jaxlib on, XLA compiles such loops as one kernel by itself.
 _BY_ITSELF = (0, 12)
 
 
 def small_loops_are_kernels() -> bool:
-    """Whether XLA compiles the loops of a single arm's motion as one kernel."""
+    """Returns whether XLA compiles the loops of a single arm's motion as one kernel."""
     by_itself = version.__version_info__ >= _BY_ITSELF
     return by_itself or _SMALL_LOOPS in os.environ.get("XLA_FLAGS", "")
 
@@ -35,22 +35,22 @@ def small_loops_are_kernels() -> bool:
 def configure(
     *, x64: bool | None = None, cache: bool | str | os.PathLike[str] | None = None
 ) -> None:
-    """Set up JAX for an application: call it once, before anything is computed.
+    """Sets up JAX for an application; call it once, before anything is computed.
 
-    Besides what the arguments say, `configure` lets XLA compile small loops as one
-    kernel where the installed version has to be told so (JAX before 0.12). Single arms
-    are then simulated up to ten times as fast, and gradients take a third of the time.
+    Whatever the arguments, `configure` makes XLA compile small loops as one kernel if
+    the installed version needs an option for it (JAX before 0.12). Single arms are then
+    simulated up to ten times as fast, and gradients take a third of the time.
 
     **Arguments:** None leaves a setting as it is.
 
     - `x64`: whether numbers have double precision.
     - `cache`: a folder that keeps compiled programs for later processes; True for a
       folder in the user's cache directory, False for no folder. Each kind of processor
-      has a subfolder of its own. Nothing is ever deleted there unless
-      `jax_compilation_cache_max_size` says so.
+      has its own subfolder. Programs are deleted only if
+      `jax_compilation_cache_max_size` is set.
 
     **Raises:** ValueError for malformed arguments and for a folder that cannot be
-    written. Warns if XLA cannot be told any more, because JAX has started.
+    written. Warns if the option comes too late, because JAX has started.
 
     >>> import fdof_jax as fj
     >>> fj.configure(x64=True)
@@ -86,17 +86,17 @@ def _keep_programs(cache: Any) -> None:
         folder = None
     elif cache is True or (isinstance(cache, str | os.PathLike) and os.fspath(cache)):
         folder = _writable_folder(cache)
-        # JAX's own defaults leave out what compiles in less than a second.
+        # By default JAX does not keep programs that compile in less than a second.
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
         jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
     else:
         raise ValueError(f"cache: expected a folder, True or False, got {cache!r}.")
     jax.config.update("jax_compilation_cache_dir", folder)
-    compilation_cache.reset_cache()  # JAX opens it once, with the first program
+    compilation_cache.reset_cache()  # JAX opens it only once, with the first program
 
 
 def _writable_folder(cache: Any) -> str:
-    """The subfolder of this processor, made where it is missing."""
+    """Returns the subfolder of this kind of processor, created if missing."""
     try:
         folder = _user_cache() if cache is True else Path(cache).expanduser()
         folder = folder.resolve() / _processor()
@@ -121,7 +121,7 @@ def _user_cache() -> Path:
 
 
 def _processor() -> str:
-    """A name for this kind of processor: compiled programs run on no other kind."""
+    """Names this kind of processor, as compiled programs run on no other kind."""
     facts = [platform.machine(), platform.processor()]
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.exists():  # on Linux

@@ -1,7 +1,7 @@
 """Several results from one fused loop.
 
-XLA on CPU gives each result a loop of its own over the batch, which computes anew what
-the results share.
+XLA on CPU gives each result its own loop over the batch, which computes the results'
+common parts anew.
 """
 
 from typing import Any
@@ -11,12 +11,12 @@ import jax.numpy as jnp
 
 
 def one_loop_on_cpu(tree: Any) -> Any:
-    """The same arrays, computed by a single loop over the batch.
+    """Returns the same arrays, computed by a single loop over the batch.
 
-    A reduction is the one operation of XLA with several results. This one takes the
-    maximum of each result and itself, and a fused loop comes of it: the equations of
-    motion are 3 times faster in a batch of 1024, 11 times for a single arm (one core,
-    jax 0.10.2).
+    Reductions are the only operation of XLA with several results. This reduction takes
+    the maximum of each result and itself, and XLA fuses it into one loop. The equations
+    of motion are then 3 times faster in a batch of 1024, 11 times for a single arm (one
+    core, jax 0.10.2).
     """
     leaves, structure = jax.tree.flatten(tree)
     reduced = jax.lax.reduce(
@@ -30,7 +30,7 @@ def one_loop_on_cpu(tree: Any) -> Any:
 
 @jax.custom_jvp
 def in_one_loop(tree: Any) -> Any:
-    """The same arrays, by the means of the platform; derivatives pass through."""
+    """Returns the same arrays, on CPU by a single loop; derivatives pass through."""
     return jax.lax.platform_dependent(
         tree, cpu=one_loop_on_cpu, default=lambda tree: tree
     )

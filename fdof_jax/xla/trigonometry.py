@@ -1,8 +1,8 @@
 """Sine and cosine from one evaluation, vectorisable by XLA on CPU.
 
-XLA calls the scalar C library for float64 `sin` and `cos` on CPU, which costs
-more than the rest of the equations of motion together. Range reduction and two
-short polynomials in plain arithmetic fuse into the surrounding loop instead.
+XLA on CPU calls the scalar C library for float64 `sin` and `cos`, which costs more than
+the rest of the equations of motion together. Range reduction and two short polynomials
+in plain arithmetic instead fuse into the surrounding loop.
 """
 
 import jax
@@ -80,7 +80,7 @@ def _polynomial_sincos(x: Array) -> tuple[Array, Array]:
     part1, part2, part3, tail = _HALF_PI[x.dtype]
     quadrants = jax.lax.round(x * (2 / np.pi), jax.lax.RoundingMethod.TO_NEAREST_EVEN)
     # The first three products are exact. Near a zero of the result the differences
-    # cancel and are exact too; elsewhere their roundings are kept (Dekker).
+    # are exact too; elsewhere their rounding errors are kept (Dekker).
     high = x - quadrants * part1
     middle, low = quadrants * part2, quadrants * part3
     difference = high - middle
@@ -120,11 +120,11 @@ def _sincos_jvp(primals, tangents):
 
 
 def sincos(x: ArrayLike) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-    """Sine and cosine of `x`, each to 2 ulp relative, also next to their zeros.
+    """Computes sine and cosine of `x`, each to 2 ulp relative, also near their zeros.
 
-    Holds for |x| <= 2**20 rad in float64 and |x| <= 1500 rad in float32. Beyond,
-    the result is that of an angle within one rounding of `x`. Infinities and NaN
-    give NaN. Derivatives of any order are exact. Accelerators use XLA's own sine
+    This accuracy holds for |x| <= 2**20 rad in float64 and |x| <= 1500 rad in float32.
+    Beyond, the result is that of an angle within one rounding of `x`. Infinities and
+    NaN give NaN. Derivatives of any order are exact. Accelerators use XLA's own sine
     and cosine.
 
     **Arguments:** `x`: angles [rad], any shape, float32 or float64.
