@@ -256,18 +256,18 @@ import sys
 import jax
 jax.config.update("jax_enable_x64", True)
 import fdof_jax as fj
-assert "fdof_jax.shell.showcase" not in sys.modules
+assert "fdof_jax.tuning.result" not in sys.modules
 run, scene = fj.load(sys.argv[1])
 fj.save(sys.argv[2], (run, scene))
-assert type(run).__module__ == "fdof_jax.shell.showcase"
+assert type(run).__module__ == "fdof_jax.tuning.result"
 """
 
 
 def test_another_process_reads_it(path, tmp_path):
     """And imports modules of the library's that are not there yet."""
-    from fdof_jax.shell.showcase import CircleRun
+    from fdof_jax.tuning.result import History
 
-    run = CircleRun(*range(len(CircleRun._fields)))
+    run = History(*range(len(History._fields)))
     fj.save(path, (run, SCENES["fig7"]))
     other = tmp_path / "other"
     arguments = [sys.executable, "-c", READER, path, other]

@@ -1,6 +1,6 @@
 """Joint control of the third example (Fig 7): saturated PD."""
 
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import jax.numpy as jnp
 from jax import Array
@@ -11,9 +11,6 @@ from ..checks import real_array
 from ..forces.element import ScalarElement
 from ..linkage.linkage import Linkage
 from .reference import Reference, checked_reference, reference_motion
-
-if TYPE_CHECKING:
-    pass
 
 
 class PDController(ScalarElement):

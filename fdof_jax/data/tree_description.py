@@ -32,7 +32,6 @@ class Unreadable(Exception):
 
 # Classes in saved trees that are not in the library's top namespace.
 _WITHIN = {
-    "CircleRun": "shell.showcase",
     "DriveState": "control.drives",
     "History": "tuning.result",
     "Job": "shell.tuning_run",

@@ -16,10 +16,9 @@ from ..simulation.prescribed import prescribed
 from ..simulation.scene import Scene, is_number
 from ..simulation.sensitivities import sensitivities
 from ..simulation.simulate import simulate
-from .gains import check_tuned, with_gains
+from .gains import SAMPLES, check_tuned, with_gains
 from .losses import controller_of, relative_demands, tip_errors
 
-_SAMPLES = 1001
 _HORIZONS = 10
 # The step of the differences in the log-gains. The error of the extrapolated
 # differences is of fourth order in it; their noise is that of the loss over the step.
@@ -92,7 +91,7 @@ def _tangents(scene: Scene) -> tuple[Array, Array, Array, Any]:
         # Factors on the gains keep a gain of zero at zero.
         return with_gains(scene, gains * jnp.exp(z).reshape(2, 3))
 
-    ts = jnp.linspace(0, scene.t1, _SAMPLES)
+    ts = jnp.linspace(0, scene.t1, SAMPLES)
     found = sensitivities(scene_at, tip_errors, jnp.zeros(6), ts)
     demands = relative_demands(found.scene, found.solution)
     return found.residuals, found.jacobian, demands, found.solution
@@ -101,7 +100,7 @@ def _tangents(scene: Scene) -> tuple[Array, Array, Array, Any]:
 def _loss(scene: Scene, gains: np.ndarray) -> float:
     """The mean squared tip error with other gains, by a plain call of `simulate`."""
     trial = with_gains(scene, jnp.asarray(gains))
-    ts = np.linspace(0, float(trial.t1), _SAMPLES)
+    ts = np.linspace(0, float(trial.t1), SAMPLES)
     solution = simulate(trial.linkage, trial.state0, ts, trial.forces, throw=False)
     return float(np.sum(np.square(tip_errors(trial, solution))))
 
@@ -138,8 +137,8 @@ def gradient_report(scene: Scene) -> GradientReport:
     size = np.linalg.norm(differences)
     error = np.linalg.norm(gradient - differences) / size if size > 0 else 0.0
     # The error up to a time is the mean over that time, not over the whole run.
-    times = np.linspace(0, _SAMPLES - 1, _HORIZONS + 1).astype(int)[1:]
-    shares = (times + 1) / _SAMPLES
+    times = np.linspace(0, SAMPLES - 1, _HORIZONS + 1).astype(int)[1:]
+    shares = (times + 1) / SAMPLES
     norms = np.linalg.norm(along[2 * times + 1], axis=1) / shares
     few = jax.tree.map(lambda a: a[::10] if np.ndim(a) else a, solution)
     saturated = np.mean(np.abs(demands) > 1, axis=0)

@@ -72,7 +72,8 @@ def _search(
     else:
         members = [unstacked("ensemble", ensemble)] * len(losses)
         for i, member in enumerate(members[0]):
-            check_tuned(f"ensemble[{i}]", member, losses[0])
+            for loss in losses:
+                check_tuned(f"ensemble[{i}]", member, loss)
             check_alike(f"ensemble[{i}]", member, scenes[0])
     problems = [
         [(member, loss, lower > 0) for member in row]
