@@ -246,5 +246,5 @@ def test_a_function_may_close_over_what_is_differentiated():
     def controller(c):
         return fj.PDController(1.0, 1.0, 9.0, lambda t, linkage: (c * ZERO, ZERO))
 
-    with pytest.raises(TypeError, match="^forces: expected what is differentiated"):
+    with pytest.raises(TypeError, match="^forces: expected differentiated arrays"):
         jax.grad(end)(0.5, controller)

@@ -14,13 +14,13 @@ from .element import Forces, InertialElement
 
 
 def inertial(forces: Forces) -> Forces:
-    """Returns the elements that move masses; raises ValueError for no such tuple."""
+    """Checks the tuple of elements and returns those that move masses."""
     callable_tuple("forces", forces)
     return tuple(e for e in forces if isinstance(e, InertialElement))
 
 
 def energetic(forces: Forces) -> Forces:
-    """Returns the elements that have energy, springs included."""
+    """Checks the tuple of elements and returns those with energy, springs included."""
     callable_tuple("forces", forces)
     return tuple(e for e in forces if hasattr(e, "potential_energy"))
 

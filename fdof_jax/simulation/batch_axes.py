@@ -30,7 +30,7 @@ class Batch(NamedTuple):
 
 
 def _expanded(axis: Any, part: Any) -> Any:
-    """Returns one axis per leaf of a part of the forces; -1 if it is no array."""
+    """Returns the batch axis of each leaf of a part of the forces, or -1."""
     if axis is not None and (type(axis) is not int or axis != 0):
         raise ValueError
     return jax.tree.map(

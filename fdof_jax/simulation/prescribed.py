@@ -137,7 +137,7 @@ def hybrid_field(t, y, args, schedule) -> tuple[Any, ...]:
     The rate of the momenta is M' qd - bias + tau, where M' is the mass matrix's rate.
     """
     motion = prescribed(args.forces)
-    assert motion is not None  # `integrate` chose this field for it
+    assert motion is not None  # this field serves prescribed motions only
     own = y[2:]
     q, qd = motion_at(motion, args, t, y)
     acting = applied(t, (tuple(q - args.q0), tuple(qd), *own), args, schedule)

@@ -48,7 +48,7 @@ def _as_array(leaf: Any) -> np.ndarray:
 
 
 def _plain(scene: Any) -> Any:
-    """Returns the scene with an end time that may be an integer as a float."""
+    """Returns a scene with its end time, which may be an integer, as a float."""
     return scene._replace(t1=_float(scene.t1)) if isinstance(scene, Scene) else scene
 
 

@@ -98,7 +98,7 @@ def check_elements(forces: Forces, linkage: Linkage, ts: Array) -> None:
         # `equinox.tree_at` bypasses the constructor.
         if hasattr(values, "possible") and not values.possible():
             raise ValueError(
-                f"forces[{index}]: expected values that its constructor takes, got "
+                f"forces[{index}]: expected values that its constructor accepts, got "
                 f"{eqx.tree_pformat(element, short_arrays=False)}."
             )
 
@@ -212,9 +212,9 @@ def simulate(
     except Exception as error:
         if "closed-over value" in str(error):
             raise TypeError(
-                "forces: expected what is differentiated to be an array of an element "
-                "or closed over by a plain function, got an element that holds a "
-                "function that closes over it."
+                "forces: expected differentiated arrays as fields of an element or in "
+                "the closure of a plain function, got one in the closure of a function "
+                "that an element holds."
             ) from error
         raise
     solution, succeeded = one

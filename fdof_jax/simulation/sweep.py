@@ -157,8 +157,8 @@ def sweep(
         eqx.filter_eval_shape(expected_work, ts[0], *batch.split())
     except TypeError as error:
         raise TypeError(
-            "forces, forces_axes: one member's force elements, with the arrays that "
-            f"are its own as forces_axes={forces_axes!r} says, raised: {error}"
+            "forces, forces_axes: expected force elements that work for one member, "
+            f"got an error with forces_axes={forces_axes!r}: {error}"
         ) from error
     if is_traced(batch.inputs, ts):
         if throw or checkpoint is not None:
