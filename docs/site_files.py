@@ -21,7 +21,7 @@ def on_config(config):
 
 @event_priority(50)  # before the plugins, one of which takes the notebooks
 def on_files(files, config):
-    pages = ["README.md", "benchmarks/README.md", *NOTEBOOKS]
+    pages = ["README.md", "CONTRIBUTING.md", "benchmarks/README.md", *NOTEBOOKS]
     pictures = [
         path.relative_to(ROOT).as_posix()
         for path in ROOT.glob("benchmarks/results/*.png")

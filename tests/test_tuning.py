@@ -183,6 +183,13 @@ class TestTracking:
                 scene = self.scene._replace(forces=(other,))
                 fj.tune(scene, loss=fj.Tracking(effort=1.0))
 
+    def test_all_prices_are_judged_with_all_members(self):
+        limit = lambda scene: scene.forces[0].limit
+        free = eqx.tree_at(limit, self.scene, jnp.full(3, jnp.inf))
+        ensemble = fj.stacked([self.scene, free])
+        with pytest.raises(ValueError, match="loss: expected finite limits"):
+            fj.trade_off(self.scene, [0.0, 0.1], ensemble=ensemble)
+
 
 def model_based(scene, kind):
     controller = scene.forces[0]
