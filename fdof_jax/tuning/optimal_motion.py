@@ -75,7 +75,7 @@ class OptimalMotion(eqx.Module):
     message: str
 
     def bound(self, t1: ArrayLike) -> float:
-        """Lower bound of the rms tip error over [0, t1] [m]: see `optimal_efforts`.
+        """Lower bound of the rms tip error [m] from 0 to `t1`: see `optimal_efforts`.
 
         **Arguments:** `t1`: not before the horizon [s].
 
