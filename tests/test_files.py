@@ -267,7 +267,7 @@ def test_another_process_reads_it(path, tmp_path):
     """And imports modules of the library's that are not there yet."""
     from fdof_jax.tuning.result import History
 
-    run = History(*range(len(History._fields)))
+    run = History(*range(len(dataclasses.fields(History))))
     fj.save(path, (run, SCENES["fig7"]))
     other = tmp_path / "other"
     arguments = [sys.executable, "-c", READER, path, other]
