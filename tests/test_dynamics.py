@@ -1,5 +1,6 @@
 """Identities that hold for every linkage, state and effort."""
 
+import elements
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -140,3 +141,17 @@ def test_vmap_over_topologies_equals_singles():
     for i, linkage in enumerate(linkages):
         single = fj.forward_dynamics(linkage, q[i], qd[i], tau[i])
         np.testing.assert_allclose(together[i], single, rtol=1e-12, atol=1e-12)
+
+
+def test_mass_matrix_and_bias_are_those_of_the_accelerations():
+    rng = np.random.default_rng(4)
+    for topology in fj.TOPOLOGIES:
+        arm = elements.arm(topology)
+        forces = tuple(elements.WITH_INERTIA.values())
+        q, qd, tau = rng.uniform(-1, 1, (3, 3))
+        matrix = np.asarray(fj.joint_mass_matrix(arm, q, forces))
+        qdd = fj.forward_dynamics(arm, q, qd, tau, forces)
+        bias = fj.joint_bias(arm, q, qd, forces)
+        np.testing.assert_allclose(matrix @ qdd + bias, tau, atol=1e-11)
+        np.testing.assert_array_equal(matrix, matrix.T)
+        assert np.linalg.eigvalsh(matrix).min() > 0
