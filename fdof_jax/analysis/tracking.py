@@ -17,7 +17,7 @@ from ..simulation.solution import Solution
 def saturated(
     controller: PDController, linkage: Linkage, solution: Solution
 ) -> Bool[Array, "time joint"]:
-    """Whether each actuator is at its limit, along a motion.
+    """Returns whether each actuator is at its limit, along a motion.
 
     **Arguments:** `controller`; `linkage`; `solution`: a motion under the controller.
     """

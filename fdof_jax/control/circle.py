@@ -80,7 +80,7 @@ class CircleTask(eqx.Module):
 
     @property
     def evaluates_in_numpy(self) -> bool:
-        """Whether `assembly` runs in NumPy; a subclass may move on another curve."""
+        """Returns whether `assembly` runs in NumPy; a subclass may not."""
         return type(self) is CircleTask
 
     def tip(self, t: ArrayLike) -> Float[Array, " 2"]:

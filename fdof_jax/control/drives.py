@@ -89,7 +89,7 @@ class PIDController(StatefulElement):
         self.pd.check(linkage, ts)
 
     def possible(self) -> Array:
-        """Whether no gain or limit is negative, and ki is 0 where kp is 0."""
+        """Returns whether no gain or limit is negative, and ki is 0 where kp is 0."""
         lone = (self.ki > 0) & ~(self.pd.kp > 0)
         return self.pd.possible() & ((self.ki >= 0) & ~lone).all()
 
@@ -145,7 +145,7 @@ class _Drive(StatefulElement):
         """The parameters that must be positive."""
 
     def possible(self) -> Array:
-        """Whether these parameters are positive and the command's values possible."""
+        """Returns whether the parameters are positive and the command is possible."""
         own = reduce(and_, [(value > 0).all() for value in self.positive()])
         possible: Any = getattr(self.command, "possible", None)
         return own if possible is None else own & possible()

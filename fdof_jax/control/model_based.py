@@ -56,7 +56,7 @@ class _ModelBased(PDController):
             )
 
     def possible(self) -> Array:
-        """Whether gains and limits are not negative, and the model is possible."""
+        """Returns whether no gain or limit is negative and the model is possible."""
         own = super().possible()
         return own if self.model is None else own & possible(self.model)
 

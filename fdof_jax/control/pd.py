@@ -103,5 +103,5 @@ class PDController(ScalarElement):
             check_reference(linkage, ts)
 
     def possible(self) -> Array:
-        """Whether gains and limits are not negative."""
+        """Returns whether gains and limits are not negative."""
         return ((self.kp >= 0) & (self.kd >= 0) & (self.limit >= 0)).all()

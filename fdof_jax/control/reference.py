@@ -75,7 +75,7 @@ def _finite(reference: Reference, linkage: Linkage, times: ArrayLike) -> Array:
 def reachable(
     linkage: Linkage, reference: Reference, ts: ArrayLike
 ) -> Bool[Array, " time"]:
-    """Whether a linkage can reach the reference at each time.
+    """Returns whether a linkage can reach the reference at each time.
 
     **Arguments:** `linkage`; `reference`: for instance a `CircleTask` or `TipTask`;
     `ts`: times (time,) [s].

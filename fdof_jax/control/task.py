@@ -51,7 +51,7 @@ class JointMove(eqx.Module):
 
     @property
     def evaluates_in_numpy(self) -> bool:
-        """Whether `assembly` runs in NumPy; a subclass may move in another way."""
+        """Returns whether `assembly` runs in NumPy; a subclass may not."""
         return type(self) is JointMove
 
     def assembly(self, t: Array, linkage: Linkage) -> tuple[Array, float]:
@@ -126,7 +126,7 @@ class TipTask(eqx.Module):
 
     @property
     def evaluates_in_numpy(self) -> bool:
-        """Whether `assembly` runs in NumPy; a subclass may move in another way."""
+        """Returns whether `assembly` runs in NumPy; a subclass may not."""
         return type(self) is TipTask
 
     def assembly(self, t: Array, linkage: Linkage) -> tuple[Array, Array]:

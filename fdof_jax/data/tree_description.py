@@ -63,7 +63,7 @@ def _of_the_library(name: str) -> Any:
 
 
 def _is_ours(module: str) -> bool:
-    """Whether a stored module is the library's; version 0.1 stored submodules."""
+    """Returns whether a module is the library's; version 0.1 stored submodules."""
     return module.partition(".")[0] == _PACKAGE
 
 

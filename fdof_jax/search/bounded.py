@@ -102,7 +102,7 @@ class Run:
 
     @property
     def failed(self) -> bool:
-        """Whether the function could not be evaluated at the start."""
+        """Returns whether the function could not be evaluated at the start."""
         return not np.isfinite(self.rows[0].gradient_norm)
 
     @property

@@ -30,7 +30,7 @@ def _evaluate(evaluate: Evaluate, z: Array, moving: Any, shared: Any) -> Evaluat
 
 
 def _moves(leaf: Any) -> bool:
-    """Whether an array with leading axes (run, member) differs along them."""
+    """Returns whether an array with leading axes (run, member) differs along them."""
     return isinstance(leaf, np.ndarray) and bool((leaf != leaf[:1, :1]).any())
 
 

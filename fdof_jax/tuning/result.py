@@ -91,7 +91,7 @@ class TuneResult(eqx.Module):
 
     @property
     def at_bound(self) -> Bool[np.ndarray, "2 joint"]:
-        """Whether each gain is held by a bound."""
+        """Returns whether each gain is held by a bound."""
         return _at_bound(self.gains, self.lower, self.upper)
 
     @property
