@@ -33,7 +33,7 @@ from .control.paths import (
     Spline as Spline,
 )
 from .control.pd import PDController as PDController
-from .control.reference import reachable as reachable
+from .control.reference import Reference as Reference, reachable as reachable
 from .control.task import JointMove as JointMove, TipTask as TipTask
 from .control.timing import (
     Laps as Laps,
@@ -59,6 +59,7 @@ from .forces.between_points import (
     Wrench as Wrench,
 )
 from .forces.element import (
+    Element as Element,
     InertialElement as InertialElement,
     StatefulElement as StatefulElement,
 )
@@ -70,6 +71,11 @@ from .forces.joints import (
     EffortHistory as EffortHistory,
     JointDamper as JointDamper,
     JointEffort as JointEffort,
+)
+from .forces.part import (
+    Condition as Condition,
+    Values as Values,
+    field as field,
 )
 from .forces.points import Load as Load, Point as Point, PointElement as PointElement
 from .identification.fit import fit as fit, fit_each as fit_each, link_ends as link_ends

@@ -126,7 +126,7 @@ def _add_tuning(command: argparse.ArgumentParser) -> None:
         ("speed", 2, speed, "of the ensemble: least and greatest factor on the speed"),
         ("link-error", None, share, "of the ensemble: relative error of masses"),
     ):
-        default = getattr(Job, name.replace("-", "_"))
+        default = vars(Job)[name.replace("-", "_")]
         shown = " ".join(map(str, default)) if numbers else default
         job.add_argument(
             f"--{name}", nargs=numbers, type=kind, help=f"{text}; {shown} by default"
@@ -203,7 +203,7 @@ def _saved_run(text: str) -> Path:
 
 def _given(options: argparse.Namespace, names: Sequence[str]) -> dict[str, Any]:
     """Options among `names` that are given on the command line."""
-    return {n: v for n in names if (v := getattr(options, n)) is not None}
+    return {n: v for n in names if (v := vars(options)[n]) is not None}
 
 
 def _check_tuning(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:

@@ -41,17 +41,21 @@ def real_array(
     above: float | None = None,
     finite: bool = True,
     broadcast: bool = False,
+    unit: str = "",
 ) -> Array:
     """Returns `value` as an array of the default float dtype and the given shape.
 
     `None` in `shape` stands for any length. `broadcast` also accepts one number for all
     entries. Raises ValueError for a wrong shape, a type that is not real numbers, NaN,
-    infinities (unless `finite=False`) and entries below `minimum` or not above `above`.
+    infinities (unless `finite=False`) and entries below `minimum` or not above `above`;
+    the message names the `unit`.
     """
 
     def refuse(got: str) -> ValueError:
         size = "x".join("n" if n is None else str(n) for n in shape)
         expected = f"an array of {size} real numbers" if shape else "a real number"
+        if unit:
+            expected += f" [{unit}]"
         if finite:
             expected += ", all finite" if shape else ", finite"
         if minimum is not None:
@@ -95,16 +99,11 @@ def real_array(
     return jnp.asarray(array, dtype=float)
 
 
-def callable_tuple(name: str, value: Any) -> tuple:
-    """Returns `value` if it is a tuple of callables, or raises ValueError."""
-    if isinstance(value, tuple) and all(
-        callable(item) and not isinstance(item, type) for item in value
-    ):
+def called_as(name: str, value: Any, expected: str, kind: type = object) -> Any:
+    """Returns `value` if it can be called and is of a kind, or raises ValueError."""
+    if callable(value) and isinstance(value, kind) and not isinstance(value, type):
         return value
-    raise ValueError(
-        f"{name}: expected a tuple of callables (t, q, qd, linkage) -> tau, for "
-        f"instance (JointDamper(1.0),), got {value!r}."
-    )
+    raise ValueError(f"{name}: expected {expected}, got {value!r}.")
 
 
 def instance(name: str, value: Any, kind: type) -> None:

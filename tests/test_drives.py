@@ -185,10 +185,13 @@ def test_a_motion_goes_on_from_its_states():
 
 def test_a_state_that_is_not_a_number_is_told():
     lag = fj.FirstOrderLag(fj.JointEffort([0, 0, 3.0]), 0.2)
-    broken = eqx.tree_at(lambda x: x.start, lag, jnp.full(3, jnp.nan))
-    solution = fj.simulate(single(), STILL, [0, 1.0], (broken,), throw=False)
+    own0 = jax.tree.map(lambda x: jnp.nan * x, (lag.initial_state(single()),))
+    solution = fj.simulate(single(), STILL, [0, 1.0], (lag,), own0=own0, throw=False)
     assert str(solution.outcome) == "not finite"
     assert int(solution.stats["num_steps"]) < 100
+    broken = eqx.tree_at(lambda x: x.start, lag, jnp.full(3, jnp.nan))
+    with pytest.raises(ValueError, match=r"forces\[0\]\.start: expected .* finite"):
+        fj.simulate(single(), STILL, [0, 1.0], (broken,), throw=False)
 
 
 def test_states_of_elements_are_swept():

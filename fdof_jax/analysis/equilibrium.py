@@ -37,7 +37,7 @@ def equilibrium(
     >>> fj.equilibrium(arm, (), [-1.0, 0.1, 0.1]).tolist()  # it hangs
     [-1.571, 0.0, 0.0]
     """
-    checked(linkage, forces)
+    forces = checked(linkage, forces)
     return _rest(linkage, forces, real_array("q", q, (3,)), real_array("t", t, ()))
 
 

@@ -10,11 +10,12 @@ from jax import Array
 from jaxtyping import Complex, Float
 from numpy.typing import ArrayLike
 
-from ..checks import callable_tuple, instance, is_traced, real_array
+from ..checks import instance, is_traced, real_array
 from ..dynamics import forward_dynamics
-from ..forces.element import Forces, StatefulElement
+from ..forces.element import Element, Forces, elements
 from ..linkage.coordinates import State, real_state
 from ..linkage.linkage import Linkage, check_linkage
+from ..simulation.field import stateful
 from ..simulation.prescribed import prescribed
 from ..simulation.solution import Solution
 
@@ -35,22 +36,28 @@ class Linearization(NamedTuple):
 
 
 def _accelerations(
-    linkage: Linkage, forces: Forces, q: Array, qd: Array, tau: Array, t: Array
+    linkage: Linkage,
+    forces: tuple[Element, ...],
+    q: Array,
+    qd: Array,
+    tau: Array,
+    t: Array,
 ) -> Array:
     for element in forces:
         tau = tau + element(t, q, qd, linkage)
     return forward_dynamics(linkage, q, qd, tau, forces)
 
 
-def checked(linkage: Linkage, forces: Forces) -> None:
+def checked(linkage: Linkage, forces: Forces) -> tuple[Element, ...]:
+    """Returns the forces as elements, which may have no state."""
     check_linkage(linkage)
-    callable_tuple("forces", forces)
-    stateful = any(isinstance(element, StatefulElement) for element in forces)
-    if stateful or prescribed(forces) is not None:
+    found = elements("forces", forces)
+    if stateful(found) or prescribed(found) is not None:
         raise ValueError(
             "forces: expected elements without a state of their own and no "
             f"PrescribedMotion, got {forces!r}."
         )
+    return found
 
 
 def linearize(
@@ -75,7 +82,7 @@ def linearize(
     >>> np.sort(abs(np.linalg.eigvals(linear.A)))[::2].tolist()  # modes [rad/s]
     [2.02, 4.744, 7.855]
     """
-    checked(linkage, forces)
+    forces = checked(linkage, forces)
     q, qd = map(jnp.asarray, real_state("state", state))
     return _linearized(linkage, forces, q, qd, real_array("t", t, ()))
 
@@ -155,7 +162,7 @@ def closed_loop_modes(linkage: Linkage, forces: Forces, solution: Solution) -> M
     >>> modes.frequency[-1].tolist()  # [rad/s]
     [5.943, 5.943, 20.677, 20.677, 118.149, 118.149]
     """
-    checked(linkage, forces)
+    forces = checked(linkage, forces)
     instance("solution", solution, Solution)
     if is_traced(linkage, forces, solution) or solution.q.ndim != 2:
         raise ValueError(

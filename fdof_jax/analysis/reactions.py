@@ -9,8 +9,8 @@ from jax import Array
 from jaxtyping import Float
 
 from ..dynamics import forward_dynamics
-from ..forces.element import Forces, InertialElement
-from ..forces.points import PointElement, cross, frames_of
+from ..forces.element import Forces, elements
+from ..forces.points import cross, frames_of
 from ..linkage.linkage import Linkage
 from ..mechanics.kinematics import joint_positions, mass_center_velocities, mass_centers
 from ..simulation.simulate import joint_efforts
@@ -24,17 +24,13 @@ def _loads(
     frames = frames_of(linkage, tuple(q))
     force, moment = jnp.zeros(4, complex), jnp.zeros(4)
     for index, element in enumerate(forces):
-        loads = ()
-        if isinstance(element, PointElement):
-            loads = element.loads(element.schedule(t, linkage), frames, tuple(qd))
-        elif isinstance(element, InertialElement):
-            loads = element.loads(t, q, qd, qdd, linkage)
-            if loads is None:
-                raise ValueError(
-                    f"forces[{index}]: expected an element that moves masses to have "
-                    "a method `loads` that says which points of links carry them, got "
-                    f"{element!r}."
-                )
+        loads = element.loads_on_points(t, q, qd, qdd, linkage)
+        if loads is None:
+            raise ValueError(
+                f"forces[{index}]: expected an element that moves masses to have a "
+                "method `loads` that says which points of links carry them, got "
+                f"{element!r}."
+            )
         for point, push, turn in loads:
             about_pivot = turn + cross(point.place(frames), push)
             force = force.at[point.link].add(push)
@@ -87,6 +83,7 @@ def joint_reactions(
     >>> fj.joint_reactions(arm, (), motion)[:2, 0, :2].tolist()  # in free fall at first
     [[0.0, 0.0], [-0.043, 0.0]]
     """
+    forces = elements("forces", forces)
     efforts = joint_efforts(linkage, forces, solution)
     return _along(linkage, forces, solution, efforts.total)
 

@@ -1,6 +1,5 @@
 """The circle of Fig 7."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,10 +17,10 @@ from ..mechanics.inverse_kinematics import (
     whole_turns,
 )
 from ..xla.array_namespace import in_numpy, namespace, sine_and_cosine
-from .reference import known_reach
+from .reference import Reference, known_reach
 
 
-class CircleTask(eqx.Module):
+class CircleTask(Reference):
     """A circle traced by the tip at constant speed; the last link keeps its angle.
 
     A call with `(t, linkage)` returns the joint reference, computed by the closed-form

@@ -6,22 +6,16 @@ a motor.
 """
 
 from abc import abstractmethod
-from functools import reduce
-from operator import and_
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax.numpy as jnp
 from jax import Array
-from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from ..checks import is_traced, real_array
-from ..forces.element import StatefulElement
-from ..linkage.linkage import Linkage
-from ..xla.array_namespace import in_numpy
+from ..checks import real_array
+from ..forces.element import Element, StatefulElement, elements
+from ..forces.part import Condition, Values, called, field
 from .pd import PDController
-from .reference import Reference
 
 
 class PIDController(StatefulElement):
@@ -49,7 +43,7 @@ class PIDController(StatefulElement):
     """
 
     pd: PDController
-    ki: Float[Array, " joint"]
+    ki: Values = field(unit="N/(m s) or N m/(rad s)", minimum=0)
 
     def __init__(
         self,
@@ -57,15 +51,14 @@ class PIDController(StatefulElement):
         ki: ArrayLike,
         kd: ArrayLike,
         limit: ArrayLike,
-        reference: Reference,
+        reference: Any,
     ):
         self.pd = PDController(kp, kd, limit, reference)
-        self.ki = real_array("ki", ki, (3,), minimum=0, broadcast=True)
-        if not is_traced(self) and not in_numpy(self).possible():
-            raise ValueError(
-                f"ki: expected 0 where kp is, got {self.ki.tolist()} and "
-                f"{self.pd.kp.tolist()}."
-            )
+        self.ki = ki
+
+    def conditions(self):
+        paired = ((self.ki <= 0) | (self.pd.kp > 0)).all()
+        yield Condition(paired, "ki", "0 where kp is", (self.ki, self.pd.kp))
 
     def initial_state(self, linkage):
         """The integral's share of the effort at the start, zeros (3,) [N or N m]."""
@@ -79,20 +72,6 @@ class PIDController(StatefulElement):
         per_time = self.ki / jnp.where(self.pd.kp > 0, self.pd.kp, 1)
         return effort, per_time * (proportional + effort - demand)
 
-    @property
-    def jump_ts(self) -> Array | None:
-        """Times at which the reference jumps [s], or None."""
-        return self.pd.jump_ts
-
-    def check(self, linkage: Linkage, ts: Array) -> None:
-        """Repeats the PD controller's checks, its reference's included."""
-        self.pd.check(linkage, ts)
-
-    def possible(self) -> Array:
-        """Returns whether no gain or limit is negative, and ki is 0 where kp is 0."""
-        lone = (self.ki > 0) & ~(self.pd.kp > 0)
-        return self.pd.possible() & ((self.ki >= 0) & ~lone).all()
-
 
 class DriveState(NamedTuple):
     """State of a drive: its `own` and its `command`'s state, () where there is none."""
@@ -104,7 +83,7 @@ class DriveState(NamedTuple):
 class _Drive(StatefulElement):
     """A drive: a subclass implements `respond`, and `initial` if it has a state."""
 
-    command: eqx.AbstractVar[Any]
+    command: Any = called("a force element, a PDController for instance")
 
     def initial(self) -> Any:
         """The drive's own state at the start."""
@@ -116,48 +95,16 @@ class _Drive(StatefulElement):
 
     def initial_state(self, linkage):
         """The `DriveState` at the start."""
-        stateful = isinstance(self.command, StatefulElement)
-        inner = self.command.initial_state(linkage) if stateful else ()
-        return DriveState(self.initial(), inner)
+        return DriveState(self.initial(), self._commander().initial_state(linkage))
 
     def __call__(self, t, q, qd, linkage, state):
-        own, inner = state
-        if isinstance(self.command, StatefulElement):
-            command, inner_rate = self.command(t, q, qd, linkage, inner)
-        else:
-            command, inner_rate = self.command(t, q, qd, linkage), ()
-        effort, rate = self.respond(real_array("command", command, (3,)), qd, own)
+        command, inner_rate = self._commander().act(t, q, qd, linkage, state.command)
+        command = real_array("command", command, (3,))
+        effort, rate = self.respond(command, qd, state.own)
         return effort, DriveState(rate, inner_rate)
 
-    @property
-    def jump_ts(self) -> Array | None:
-        """Times at which the command jumps [s], or None."""
-        return getattr(self.command, "jump_ts", None)
-
-    def check(self, linkage: Linkage, ts: Array) -> None:
-        """Runs the command's own check, if it has one."""
-        check: Any = getattr(self.command, "check", None)
-        if check is not None:
-            check(linkage, ts)
-
-    @abstractmethod
-    def positive(self) -> list[Array]:
-        """The parameters that must be positive."""
-
-    def possible(self) -> Array:
-        """Returns whether the parameters are positive and the command is possible."""
-        own = reduce(and_, [(value > 0).all() for value in self.positive()])
-        possible: Any = getattr(self.command, "possible", None)
-        return own if possible is None else own & possible()
-
-
-def _command(value: Any) -> Any:
-    if not callable(value) or isinstance(value, type):
-        raise ValueError(
-            "command: expected a force element, a PDController for instance, got "
-            f"{value!r}."
-        )
-    return value
+    def _commander(self) -> Element:
+        return elements("command", (self.command,))[0]
 
 
 class FirstOrderLag(_Drive):
@@ -178,21 +125,8 @@ class FirstOrderLag(_Drive):
     ([0.0, 0.0, 0.0], [100.0, 0.0, 0.0])
     """
 
-    command: Any
-    time_constant: Float[Array, " joint"]
-    start: Float[Array, " joint"]
-
-    def __init__(
-        self, command: Any, time_constant: ArrayLike, *, start: ArrayLike = 0.0
-    ):
-        self.command = _command(command)
-        self.time_constant = real_array(
-            "time_constant", time_constant, (3,), above=0, broadcast=True
-        )
-        self.start = real_array("start", start, (3,), broadcast=True)
-
-    def positive(self):
-        return [self.time_constant]
+    time_constant: Values = field(unit="s", above=0)
+    start: Values = field(unit="N or N m", default=0.0, kw_only=True)
 
     def initial(self):
         """The initial effort, (3,) [N or N m]."""
@@ -222,17 +156,8 @@ class SpeedLimit(_Drive):
     [8.0, 4.0, 0.0]
     """
 
-    command: Any
-    stall: Float[Array, " joint"]
-    no_load: Float[Array, " joint"]
-
-    def __init__(self, command: Any, stall: ArrayLike, no_load: ArrayLike):
-        self.command = _command(command)
-        self.stall = real_array("stall", stall, (3,), above=0, broadcast=True)
-        self.no_load = real_array("no_load", no_load, (3,), above=0, broadcast=True)
-
-    def positive(self):
-        return [self.stall, self.no_load]
+    stall: Values = field(unit="N or N m", above=0)
+    no_load: Values = field(unit="m/s or rad/s", above=0)
 
     def respond(self, command, qd, own):
         left = jnp.clip(1 - qd / self.no_load, 0, 1)  # share of the positive limit
@@ -269,39 +194,16 @@ class DCMotor(_Drive):
     [2400.0, 1200.0, 0.0]
     """
 
-    command: Any
-    resistance: Float[Array, " joint"]
-    inductance: Float[Array, " joint"]
-    constant: Float[Array, " joint"]
-    gear: Float[Array, " joint"]
-    voltage_limit: Float[Array, " joint"]
-    current_limit: Float[Array, " joint"]
-
-    def __init__(
-        self,
-        command: Any,
-        *,
-        resistance: ArrayLike,
-        inductance: ArrayLike,
-        constant: ArrayLike,
-        gear: ArrayLike = 1.0,
-        voltage_limit: ArrayLike = jnp.inf,
-        current_limit: ArrayLike = jnp.inf,
-    ):
-        def positive(name: str, value: ArrayLike, finite: bool = True) -> Array:
-            return real_array(name, value, (3,), above=0, finite=finite, broadcast=True)
-
-        self.command = _command(command)
-        self.resistance = positive("resistance", resistance)
-        self.inductance = positive("inductance", inductance)
-        self.constant = positive("constant", constant)
-        self.gear = positive("gear", gear)
-        self.voltage_limit = positive("voltage_limit", voltage_limit, finite=False)
-        self.current_limit = positive("current_limit", current_limit, finite=False)
-
-    def positive(self):
-        winding = [self.resistance, self.inductance, self.constant, self.gear]
-        return [*winding, self.voltage_limit, self.current_limit]
+    resistance: Values = field(unit="ohm", above=0, kw_only=True)
+    inductance: Values = field(unit="H", above=0, kw_only=True)
+    constant: Values = field(unit="N m/A or N/A", above=0, kw_only=True)
+    gear: Values = field(unit="1 or 1/m", above=0, default=1.0, kw_only=True)
+    voltage_limit: Values = field(
+        unit="V", above=0, finite=False, default=jnp.inf, kw_only=True
+    )
+    current_limit: Values = field(
+        unit="A", above=0, finite=False, default=jnp.inf, kw_only=True
+    )
 
     def initial(self):
         """The initial currents, zeros (3,) [A]."""

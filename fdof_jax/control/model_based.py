@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from numpy.typing import ArrayLike
 
 from ..checks import real_array
 from ..forces.points import frames_of
@@ -14,24 +13,15 @@ from ..linkage.linkage import Linkage, check_linkage, possible
 from ..mechanics.equations import Scalars, link_constants
 from ..mechanics.rates import required_efforts
 from .pd import PDController
-from .reference import Reference, reference_motion
+from .reference import reference_motion
 
 
-class _ModelBased(PDController):
+class ModelBased(PDController):
     """A PD controller with a model of the arm."""
 
-    model: Linkage | None
+    model: Linkage | None = None
 
-    def __init__(
-        self,
-        kp: ArrayLike,
-        kd: ArrayLike,
-        limit: ArrayLike,
-        reference: Reference,
-        model: Linkage | None = None,
-    ):
-        super().__init__(kp, kd, limit, reference)
-        self.model = model
+    def __check_init__(self):
         self._check_model()
 
     def _check_model(self) -> None:
@@ -61,7 +51,7 @@ class _ModelBased(PDController):
         return own if self.model is None else own & possible(self.model)
 
 
-class GravityFeedforward(_ModelBased):
+class GravityFeedforward(ModelBased):
     """PD control plus the efforts that hold the arm's weight: a force element.
 
     The effort of a `PDController` and the effort that holds the arm at rest at its
@@ -113,7 +103,7 @@ def _held(linkage: Linkage, q: Scalars) -> tuple[Array, ...]:
     return tuple(reversed(efforts))
 
 
-class ComputedTorque(_ModelBased):
+class ComputedTorque(ModelBased):
     """Computed-torque control, by the inverse dynamics: a force element.
 
     The effort is M(q) (qdd_ref + kp e + kd de/dt) + bias(q, qd) with e = q_ref - q,

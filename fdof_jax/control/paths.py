@@ -12,11 +12,12 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from ..checks import instance, real_array
+from ..forces.part import Part, Values, field
 from ..xla.array_namespace import in_numpy, namespace, sine_and_cosine
 from .timing import Laps, Travel
 
 
-class Path(eqx.Module):
+class Path(Part):
     """A curve in the plane [m]; a subclass defines `point` and `middle`.
 
     >>> import fdof_jax as fj
@@ -48,12 +49,8 @@ class Line(Path):
     [0.5, 1.0]
     """
 
-    start: Float[Array, " 2"]
-    end: Float[Array, " 2"]
-
-    def __init__(self, start: ArrayLike, end: ArrayLike):
-        self.start = real_array("start", start, (2,))
-        self.end = real_array("end", end, (2,))
+    start: Values = field((2,), unit="m")
+    end: Values = field((2,), unit="m")
 
     @property
     def middle(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -67,14 +64,9 @@ class Line(Path):
 class _Closed(Path):
     """A closed curve around `middle` with two `sizes`, turned by the angle `tilt`."""
 
-    middle: Float[Array, " 2"]
-    sizes: Float[Array, " 2"]
-    tilt: Float[Array, ""]
-
-    def __init__(self, middle: ArrayLike, sizes: ArrayLike, *, tilt: ArrayLike = 0.0):
-        self.middle = real_array("middle", middle, (2,))
-        self.sizes = real_array("sizes", sizes, (2,), minimum=0)
-        self.tilt = real_array("tilt", tilt, ())
+    middle: Values = field((2,), unit="m")  # pyright: ignore
+    sizes: Values = field((2,), unit="m", minimum=0)
+    tilt: Values = field((), unit="rad", default=0.0, kw_only=True)
 
     def _placed(self, along: Array, across: Array) -> Array:
         sin, cos = sine_and_cosine(self.tilt)

@@ -4,13 +4,11 @@ from typing import Any, ClassVar
 
 import jax.numpy as jnp
 from jax import Array
-from jaxtyping import Float
-from numpy.typing import ArrayLike
 
-from ..checks import real_array
 from ..forces.element import ScalarElement
+from ..forces.part import Values, field
 from ..linkage.linkage import Linkage
-from .reference import Reference, checked_reference, reference_motion
+from .reference import follows, reference_motion
 
 
 class PDController(ScalarElement):
@@ -39,27 +37,13 @@ class PDController(ScalarElement):
     ([20.0, 20.0, 20.0], [30.0, 30.0, 30.0])
     """
 
-    kp: Float[Array, " joint"]
-    kd: Float[Array, " joint"]
-    limit: Float[Array, " joint"]
-    reference: Reference
+    kp: Values = field(unit="N/m or N m/rad", minimum=0)
+    kd: Values = field(unit="N s/m or N m s/rad", minimum=0)
+    limit: Values = field(unit="N or N m", minimum=0, finite=False)
+    reference: Any = follows()
 
     # Units of (kp, kd) by the kind of joint.
     gain_units: ClassVar = {"R": ("N m/rad", "N m s/rad"), "P": ("N/m", "N s/m")}
-
-    def __init__(
-        self,
-        kp: ArrayLike,
-        kd: ArrayLike,
-        limit: ArrayLike,
-        reference: Reference,
-    ):
-        self.kp = real_array("kp", kp, (3,), minimum=0, broadcast=True)
-        self.kd = real_array("kd", kd, (3,), minimum=0, broadcast=True)
-        self.limit = real_array(
-            "limit", limit, (3,), minimum=0, finite=False, broadcast=True
-        )
-        self.reference = checked_reference(reference)
 
     def schedule(self, t: Array, linkage: Linkage) -> tuple[Any, ...]:
         """The reference motion (q_ref, qd_ref), independent of the state."""
@@ -88,20 +72,3 @@ class PDController(ScalarElement):
     def demand(self, t: Array, q: Array, qd: Array, linkage: Linkage) -> Array:
         """The efforts before clipping, (3,) [N or N m]."""
         return jnp.stack(self.unlimited(self.schedule(t, linkage), q, qd, linkage))
-
-    @property
-    def jump_ts(self) -> Array | None:
-        """Times at which the reference jumps [s], or None."""
-        return getattr(self.reference, "jump_ts", None)
-
-    def check(self, linkage: Linkage, ts: Array) -> None:
-        """Repeats the constructor's checks, then runs the reference's check, if any."""
-        # `equinox.tree_at` changes values without calling the constructor.
-        PDController(self.kp, self.kd, self.limit, self.reference)
-        check_reference: Any = getattr(self.reference, "check", None)
-        if check_reference is not None:
-            check_reference(linkage, ts)
-
-    def possible(self) -> Array:
-        """Returns whether gains and limits are not negative."""
-        return ((self.kp >= 0) & (self.kd >= 0) & (self.limit >= 0)).all()

@@ -1,6 +1,6 @@
 """References of controllers, and whether an arm can reach them."""
 
-from collections.abc import Callable
+from abc import abstractmethod
 from typing import Any
 
 import equinox as eqx
@@ -11,26 +11,72 @@ from jax import Array
 from jaxtyping import Bool
 from numpy.typing import ArrayLike
 
-from ..checks import is_traced, real_array
+from ..checks import called_as, is_traced, real_array
+from ..forces.part import Foreign, Part, called, default, optional
 from ..linkage.linkage import Linkage, check_linkage
 from ..xla.array_namespace import in_numpy
 
-Reference = Callable[[Array, Linkage], tuple[Array, Array]]
+_EXPECTED = "a callable (t, linkage) -> (q, qd), for instance CircleTask()"
 
 
-def checked_reference(value: Any) -> Any:
-    """Returns `value` if it is callable as a reference, else raises ValueError."""
-    if not callable(value) or isinstance(value, type):
-        raise ValueError(
-            "reference: expected a callable (t, linkage) -> (q, qd), for instance "
-            f"CircleTask(), got {value!r}."
-        )
-    return value
+class Reference(Part):
+    """A motion of the joints to follow: called as `(t, linkage) -> (q, qd)`.
+
+    Positions and velocities have shape (3,) [m or rad; m/s or rad/s]. Wherever a
+    reference is expected, other callables are accepted, such as plain functions. A
+    subclass implements `__call__`; all else has a default:
+
+    - `jump_ts`: times at which the motion jumps; steps end there [s].
+    - `check(linkage, ts)`: raises ValueError if the arm cannot follow.
+    - `tip(t)`: the commanded position of the tip (2,) [m]; by default None.
+    - `period`: the time of one turn [s]; by default None.
+
+    >>> import fdof_jax as fj
+    >>> import jax.numpy as jnp
+    >>> class Stand(fj.Reference):
+    ...     target: fj.Values = fj.field(unit="m or rad")
+    ...     def __call__(self, t, linkage):
+    ...         return self.target, jnp.zeros(3)
+    >>> stand = fj.PDController(kp=100, kd=10, limit=30, reference=Stand(0.5))
+    """
+
+    @abstractmethod
+    def __call__(self, t: Array, linkage: Linkage) -> tuple[Array, Array]:
+        """Joint positions [m or rad] and velocities [m/s or rad/s] at time `t` [s]."""
+
+    tip = default(lambda self: None)
+    period = default(lambda self: None)
+
+    @property
+    def evaluates_in_numpy(self) -> bool:
+        """Returns whether `assembly` runs in NumPy; a subclass may not."""
+        return False
+
+    def assembly(self, t: Any, linkage: Linkage) -> tuple[Any, Any]:
+        """Joint positions, and a root that is 0 at the edge of the reach."""
+        raise NotImplementedError  # only called if it `evaluates_in_numpy`
 
 
-def reference_motion(
-    reference: Reference, t: Array, linkage: Linkage
-) -> tuple[Array, Array]:
+class ForeignReference(Foreign, Reference):
+    """A callable `(t, linkage) -> (q, qd)` of another kind, as a reference."""
+
+    tip = optional("tip")
+    period = optional("period")
+
+
+def follows() -> Any:
+    """Declares the field of a reference."""
+    return called(_EXPECTED)
+
+
+def reference_of(value: Any) -> Reference:
+    """Returns a callable as a reference, or raises ValueError."""
+    if isinstance(value, Reference):
+        return value
+    return ForeignReference(called_as("reference", value, _EXPECTED))
+
+
+def reference_motion(reference: Any, t: Array, linkage: Linkage) -> tuple[Array, Array]:
     """Positions and velocities of a reference, checked to be two arrays (3,)."""
     motion = reference(t, linkage)
     if not isinstance(motion, tuple) or len(motion) != 2:
@@ -51,7 +97,7 @@ def known_assembly(
 
 def positions_at(reference: Any, t: Array, linkage: Linkage) -> Any:
     """Positions of a reference, by NumPy if it can and nothing is traced."""
-    numpy = getattr(reference, "evaluates_in_numpy", False)
+    numpy = reference_of(reference).evaluates_in_numpy
     if numpy and not is_traced(reference, t, linkage):
         return known_assembly(reference, linkage, t)[0]
     return reference_motion(reference, t, linkage)[0]
@@ -59,7 +105,7 @@ def positions_at(reference: Any, t: Array, linkage: Linkage) -> Any:
 
 def known_reach(reference: Any, linkage: Linkage, times: ArrayLike) -> np.ndarray:
     """Computes `reachable` for known values."""
-    if getattr(reference, "evaluates_in_numpy", False):
+    if reference_of(reference).evaluates_in_numpy:
         q, root = known_assembly(reference, linkage, times)
         return np.isfinite(q).all(axis=1) & (root != 0)
     with jax.ensure_compile_time_eval():  # also within transformations
@@ -67,14 +113,12 @@ def known_reach(reference: Any, linkage: Linkage, times: ArrayLike) -> np.ndarra
 
 
 @eqx.filter_jit
-def _finite(reference: Reference, linkage: Linkage, times: ArrayLike) -> Array:
+def _finite(reference: Any, linkage: Linkage, times: ArrayLike) -> Array:
     motion = jax.vmap(lambda t: reference(t, linkage))(times)
     return jnp.isfinite(jnp.concatenate(motion, axis=1)).all(axis=1)
 
 
-def reachable(
-    linkage: Linkage, reference: Reference, ts: ArrayLike
-) -> Bool[Array, " time"]:
+def reachable(linkage: Linkage, reference: Any, ts: ArrayLike) -> Bool[Array, " time"]:
     """Returns whether a linkage can reach the reference at each time.
 
     **Arguments:** `linkage`; `reference`: for instance a `CircleTask` or `TipTask`;
@@ -90,7 +134,7 @@ def reachable(
     """
     check_linkage(linkage)
     ts = real_array("ts", ts, (None,))
-    arguments = checked_reference(reference), linkage, ts
+    arguments = reference_of(reference), linkage, ts
     if is_traced(arguments):
         return _finite(*arguments)
     return jax.device_put(known_reach(*arguments))

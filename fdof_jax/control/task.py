@@ -2,7 +2,6 @@
 
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,7 +9,8 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from ..checks import instance, real_array, sign
+from ..checks import instance, real_array
+from ..forces.part import Condition, Values, called, field
 from ..linkage.linkage import Linkage
 from ..mechanics.inverse_kinematics import (
     known_directions,
@@ -21,10 +21,11 @@ from ..mechanics.inverse_kinematics import (
 )
 from ..xla.array_namespace import in_numpy, namespace
 from .paths import IN_NUMPY, Path, points_at
+from .reference import Reference
 from .timing import Laps, Travel
 
 
-class JointMove(eqx.Module):
+class JointMove(Reference):
     """A move of all joints from one position to another, in step.
 
     **Arguments:** `start`, `end`: joint positions [m or rad]; `travel`: a `Travel`.
@@ -39,15 +40,9 @@ class JointMove(eqx.Module):
     ([0.5, 1.0, 1.5], [0.938, 1.875, 2.812])
     """
 
-    start: Float[Array, " joint"]
-    end: Float[Array, " joint"]
-    travel: Travel
-
-    def __init__(self, start: ArrayLike, end: ArrayLike, travel: Travel):
-        self.start = real_array("start", start, (3,))
-        self.end = real_array("end", end, (3,))
-        instance("travel", travel, Travel)
-        self.travel = travel
+    start: Values = field(unit="m or rad", broadcast=False)
+    end: Values = field(unit="m or rad", broadcast=False)
+    travel: Travel = called("a Travel", Travel)
 
     @property
     def evaluates_in_numpy(self) -> bool:
@@ -67,13 +62,8 @@ class JointMove(eqx.Module):
         positions = lambda t: self.assembly(t, linkage)[0]
         return jax.jvp(positions, (t,), (jnp.ones_like(t),))
 
-    @property
-    def jump_ts(self) -> Array:
-        """Times at which velocity or acceleration jump [s]."""
-        return self.travel.jump_ts
 
-
-class TipTask(eqx.Module):
+class TipTask(Reference):
     """A path of the tip on which the last link keeps its angle.
 
     A call with `(t, linkage)` returns the joint reference, computed by the closed-form
@@ -101,24 +91,15 @@ class TipTask(eqx.Module):
     """
 
     path: Path
-    timing: Any
-    orientation: Float[Array, ""]
-    branch: Float[Array, ""]
+    timing: Any = called("a Travel or Laps")
+    orientation: Values = field((), unit="rad", default=0.0, kw_only=True)
+    branch: Values = field((), unit="", default=1, kw_only=True)
 
-    def __init__(
-        self,
-        path: Path,
-        timing: Travel | Laps | Any,
-        *,
-        orientation: ArrayLike = 0.0,
-        branch: int = 1,
-    ):
-        instance("path", path, Path)
-        if not callable(timing) or isinstance(timing, type):
-            raise ValueError(f"timing: expected a Travel or Laps, got {timing!r}.")
-        self.path, self.timing = path, timing
-        self.orientation = real_array("orientation", orientation, ())
-        self.branch = sign("branch", branch)
+    def __check_init__(self):
+        instance("path", self.path, Path)
+
+    def conditions(self):
+        yield Condition(abs(self.branch) == 1, "branch", "1 or -1", (self.branch,))
 
     def tip(self, t: ArrayLike) -> Float[Array, " 2"]:
         """The commanded tip position at time `t` [s]: (x, y) [m]."""
@@ -163,16 +144,12 @@ class TipTask(eqx.Module):
         positions = lambda t: self.assembly(t, linkage)[0]
         return jax.jvp(positions, (t,), (jnp.ones_like(t),))
 
-    @property
-    def jump_ts(self) -> Array | None:
-        """Times at which velocity or acceleration jump by the timing [s]."""
-        return getattr(self.timing, "jump_ts", None)
-
     def check(self, linkage: Linkage, ts: Array) -> None:
         """Raises ValueError if the tip leaves the reach or the wrist's angle jumps.
 
         Both are checked at 1000 times between `ts[0]` and `ts[-1]`, at most one lap.
         """
+        super().check(linkage, ts)
         task, arm, ts = in_numpy((self, linkage, ts))
         end = ts[-1]
         if isinstance(self.timing, Laps):  # all laps are alike

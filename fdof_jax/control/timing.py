@@ -11,6 +11,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from ..checks import concrete, one_of, real_array
+from ..forces.part import Condition, Part, Values, field
 from ..xla.array_namespace import namespace
 
 _MOST_TURN = 250  # [rad], as far as 48 nodes per piece resolve
@@ -35,7 +36,7 @@ PROFILES: dict[str, Callable[[Array], Array]] = {
 }
 
 
-class Travel(eqx.Module):
+class Travel(Part):
     """The timing of a travel from the start of a path to its end in a given time.
 
     **Arguments:**
@@ -56,23 +57,13 @@ class Travel(eqx.Module):
     [0.0, 0.146, 0.5, 1.0]
     """
 
-    duration: Float[Array, ""]
-    begin: Float[Array, ""]
-    shock: Float[Array, ""]
-    profile: str = eqx.field(static=True)
+    duration: Values = field((), unit="s", above=0)
+    begin: Values = field((), unit="s", default=0.0, kw_only=True)
+    profile: str = eqx.field(static=True, default="quintic", kw_only=True)
+    shock: Values = field((), unit="", default=0.0, kw_only=True)
 
-    def __init__(
-        self,
-        duration: ArrayLike,
-        *,
-        begin: ArrayLike = 0.0,
-        profile: str = "quintic",
-        shock: ArrayLike = 0.0,
-    ):
-        self.duration = real_array("duration", duration, (), above=0)
-        self.begin = real_array("begin", begin, ())
-        self.shock = real_array("shock", shock, ())
-        self.profile = one_of("profile", profile, tuple(PROFILES))
+    def __check_init__(self):
+        one_of("profile", self.profile, tuple(PROFILES))
 
     def __call__(self, t: Array) -> Array:
         """The share of the way at time `t` [s], from 0 to 1."""
@@ -91,7 +82,7 @@ class Travel(eqx.Module):
         return self.begin + self.duration * np.array(shares, self.duration.dtype)
 
 
-class Laps(eqx.Module):
+class Laps(Part):
     """The timing of endless laps of a closed path, at constant rate of its parameter.
 
     **Arguments:** `period`: time of one lap, backwards if negative, not zero [s];
@@ -104,14 +95,11 @@ class Laps(eqx.Module):
     [0.25, 1.0, 2.5]
     """
 
-    period: Float[Array, ""]
-    phase: Float[Array, ""]
+    period: Values = field((), unit="s")
+    phase: Values = field((), unit="", default=0.0, kw_only=True)
 
-    def __init__(self, period: ArrayLike, *, phase: ArrayLike = 0.0):
-        self.period = real_array("period", period, ())
-        if concrete(self.period) == 0:
-            raise ValueError(f"period: expected not zero, got {period!r}.")
-        self.phase = real_array("phase", phase, ())
+    def conditions(self):
+        yield Condition(self.period != 0, "period", "not zero", (self.period,))
 
     def __call__(self, t: Array) -> Array:
         return self.phase + t / self.period

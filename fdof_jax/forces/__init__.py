@@ -7,7 +7,9 @@ from .between_points import (
     Wrench as Wrench,
 )
 from .element import (
+    Element as Element,
     InertialElement as InertialElement,
+    ScalarElement as ScalarElement,
     StatefulElement as StatefulElement,
 )
 from .joint_limits import JointFriction as JointFriction, JointStops as JointStops

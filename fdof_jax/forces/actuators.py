@@ -6,12 +6,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax import Array
-from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from ..checks import real_array
 from ..linkage.linkage import Linkage
-from .element import InertialElement, jumps_of
+from .element import InertialElement
+from .part import Values, field, value_of
 from .points import (
     Load,
     Point,
@@ -39,14 +38,7 @@ class Armature(InertialElement):
     [-5.664, 2.225, 1.82]
     """
 
-    inertia: Float[Array, " joint"]
-
-    def __init__(self, inertia: ArrayLike):
-        self.inertia = real_array("inertia", inertia, (3,), minimum=0, broadcast=True)
-
-    def possible(self) -> Array:
-        """Returns whether the inertias are not negative."""
-        return (self.inertia >= 0).all()
+    inertia: Values = field(unit="kg m^2 or kg", minimum=0)
 
     def coordinates(self, q, linkage):
         return q
@@ -87,10 +79,10 @@ class LinearActuator(InertialElement):
     """
 
     ends: Separation
-    force: Any
-    mass: Float[Array, " 2"]
-    com: Float[Array, " 2"]
-    inertia: Float[Array, " 2"]
+    force: Any = field((), unit="N", function=True)
+    mass: Values = field((2,), unit="kg", minimum=0)
+    com: Values = field((2,), unit="m")
+    inertia: Values = field((2,), unit="kg m^2", minimum=0)
 
     def __init__(
         self,
@@ -103,15 +95,7 @@ class LinearActuator(InertialElement):
         inertia: ArrayLike = (0.0, 0.0),
     ):
         self.ends = Separation(a, b)
-        self.force = force if callable(force) else real_array("force", force, ())
-        self.mass = real_array("mass", mass, (2,), minimum=0)
-        self.com = real_array("com", com, (2,))
-        self.inertia = real_array("inertia", inertia, (2,), minimum=0)
-
-    @property
-    def jump_ts(self) -> Array | None:
-        """Times at which the force jumps, if its function declares any."""
-        return jumps_of(self.force)
+        self.force, self.mass, self.com, self.inertia = force, mass, com, inertia
 
     def _bodies(self, linkage: Linkage, q: Array) -> tuple[Array, Array, Array]:
         """Mass centres of cylinder and piston, and the vector between the pins."""
@@ -120,10 +104,6 @@ class LinearActuator(InertialElement):
         unit = vector * over(length_of(vector))
         cylinder = self.ends.a.place(frames) + self.com[0] * unit
         return cylinder, self.ends.b.place(frames) - self.com[1] * unit, vector
-
-    def possible(self) -> Array:
-        """Returns whether masses and inertias are not negative."""
-        return ((self.mass >= 0) & (self.inertia >= 0)).all()
 
     def coordinates(self, q, linkage):
         cylinder, piston, vector = self._bodies(linkage, q)
@@ -144,12 +124,7 @@ class LinearActuator(InertialElement):
         vector = self.ends.vector(frames)
         length = length_of(vector)
         slopes = jnp.stack(self.ends.slopes(frames, vector)) * over(length)
-        return self._push(t, length, slopes @ qd) * slopes
-
-    def _push(self, t: Array, length: Array, rate: Array) -> Array:
-        if callable(self.force):
-            return real_array("force", self.force(t, length, rate), ())
-        return self.force
+        return value_of(self, "force", t, length, slopes @ qd) * slopes
 
     def loads(
         self, t: Array, q: Array, qd: Array, qdd: Array, linkage: Linkage
@@ -174,7 +149,8 @@ class LinearActuator(InertialElement):
             + self.com[0] * cross(unit, cylinder)
             + (length - self.com[1]) * cross(unit, piston)
         )
-        held = dot(unit, piston) - self._push(t, length, dot(unit, rate))
+        push = value_of(self, "force", t, length, dot(unit, rate))
+        held = dot(unit, piston) - push
         on_b = (held + 1j * about_a / length) * unit  # by the link on the piston
         on_a = cylinder + piston - on_b
         return Load(self.ends.a, -on_a), Load(self.ends.b, -on_b)

@@ -7,22 +7,21 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from ..checks import callable_tuple
 from ..linkage.linkage import Linkage
 from ..mechanics.solve import Added
-from .element import Forces, InertialElement
+from .element import Element, Forces, InertialElement, elements
 
 
-def inertial(forces: Forces) -> Forces:
+def inertial(forces: Forces) -> tuple[InertialElement, ...]:
     """Checks the tuple of elements and returns those that move masses."""
-    callable_tuple("forces", forces)
-    return tuple(e for e in forces if isinstance(e, InertialElement))
+    found = elements("forces", forces)
+    return tuple(e for e in found if isinstance(e, InertialElement))
 
 
-def energetic(forces: Forces) -> Forces:
+def energetic(forces: Forces) -> tuple[Element, ...]:
     """Checks the tuple of elements and returns those with energy, springs included."""
-    callable_tuple("forces", forces)
-    return tuple(e for e in forces if hasattr(e, "potential_energy"))
+    found = elements("forces", forces)
+    return tuple(e for e in found if e.potential_energy is not None)
 
 
 def added_energy(

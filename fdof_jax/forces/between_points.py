@@ -11,12 +11,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 from numpy.typing import ArrayLike
 
-from ..checks import instance, real_array
+from ..checks import instance
 from ..linkage.linkage import Linkage
-from .element import jumps_of
+from .part import Values, field, value_of
 from .points import (
     Load,
     Point,
@@ -80,10 +80,10 @@ class SpringDamper(LineElement):
     """
 
     ends: Separation
-    stiffness: Float[Array, ""]
-    damping: Float[Array, ""]
-    rest_length: Float[Array, ""]
     side: Int[Array, ""]  # 1: cable, -1: bumper, 0: both
+    stiffness: Values = field((), unit="N/m", minimum=0)
+    damping: Values = field((), unit="N s/m", minimum=0)
+    rest_length: Values = field((), unit="m", minimum=0)
 
     def __init__(
         self,
@@ -96,20 +96,14 @@ class SpringDamper(LineElement):
         one_sided: str | bool = False,
     ):
         self.ends = Separation(a, b)
-        self.stiffness = real_array("stiffness", stiffness, (), minimum=0)
-        self.damping = real_array("damping", damping, (), minimum=0)
-        self.rest_length = real_array("rest_length", rest_length, (), minimum=0)
+        self.stiffness, self.damping = stiffness, damping
+        self.rest_length = rest_length
         sides = {False: 0, "cable": 1, "bumper": -1}
         if not isinstance(one_sided, str | bool) or one_sided not in sides:
             raise ValueError(
                 f"one_sided: expected False, 'cable' or 'bumper', got {one_sided!r}."
             )
         self.side = jax.device_put(np.array(sides[one_sided]))
-
-    def possible(self) -> Array:
-        """Returns whether stiffness, damping and rest length are not negative."""
-        elastic = (self.stiffness >= 0) & (self.rest_length >= 0)
-        return elastic & (self.damping >= 0)
 
     def pull(self, scheduled, length, rate):
         tension = self.stiffness * (length - self.rest_length) + self.damping * rate
@@ -142,11 +136,11 @@ class Tension(LineElement):
     """
 
     ends: Separation
-    tension: Float[Array, ""]
+    tension: Values = field((), unit="N")
 
     def __init__(self, a: Point, b: Point, tension: ArrayLike):
         self.ends = Separation(a, b)
-        self.tension = real_array("tension", tension, ())
+        self.tension = tension
 
     def pull(self, scheduled, length, rate):
         return self.tension * over(length)
@@ -176,9 +170,9 @@ class Wrench(PointElement):
     """
 
     point: Point
-    force: Any
-    moment: Any
     follows: Bool[Array, ""]
+    force: Any = field((2,), unit="N", function=True)
+    moment: Any = field((), unit="N m", function=True)
 
     def __init__(
         self,
@@ -190,23 +184,13 @@ class Wrench(PointElement):
     ):
         instance("point", point, Point)
         self.point = point
-        self.force = force if callable(force) else real_array("force", force, (2,))
-        self.moment = moment if callable(moment) else real_array("moment", moment, ())
+        self.force, self.moment = force, moment
         instance("follows", follows, bool)
         self.follows = jax.device_put(np.array(follows))
 
-    @property
-    def jump_ts(self) -> Array | None:
-        """Times at which force or moment jump, if their functions declare any."""
-        return jumps_of(self.force, self.moment)
-
     def schedule(self, t, linkage):
         """Returns the force and the moment at a time."""
-        force, moment = self.force, self.moment
-        if callable(force):
-            force = real_array("force", force(t), (2,))
-        if callable(moment):
-            moment = real_array("moment", moment(t), ())
+        force, moment = value_of(self, "force", t), value_of(self, "moment", t)
         return jax.lax.complex(force[0], force[1]), moment
 
     def loads(self, scheduled, frames, qd):

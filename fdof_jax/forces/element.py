@@ -1,23 +1,14 @@
 """Force elements: forces and torques on the joints besides gravity.
 
-An element is any pytree called as `(t, q, qd, linkage) -> tau`, with joint positions,
-velocities and efforts of shape (3,). A scene holds a tuple of elements; their efforts
-add up. The PD controller is an element too: see `control`. `simulate` also integrates
-the state of a `StatefulElement`. An `InertialElement` moves masses.
+A scene holds a tuple of elements, whose efforts add up. The PD controller is an element
+too: see `control`. Where such a tuple enters the library, `elements` adapts other
+callables, such as plain functions.
 
-Optional attributes of an element, or of a controller's reference:
-
-- `jump_ts`: an array of the times at which its efforts jump [s]; steps end there.
-- `check(linkage, ts)`: `simulate` calls it where values are concrete.
-- `possible()`: returns whether the values are valid. If not, `simulate` raises
-  ValueError; where they are traced, the motion ends as not finite.
-
-Where values are concrete, `simulate` reads `jump_ts` and `possible()` from a copy of
-the element with NumPy arrays, for which JAX compiles nothing.
-
-Elements in hot loops may be `ScalarElement`s, which run and compile faster.
+Where values are concrete, `simulate` reads `jump_ts` and checks values in a copy of the
+element with NumPy arrays, for which JAX compiles nothing.
 """
 
+import inspect
 from abc import abstractmethod
 from typing import Any
 
@@ -27,11 +18,104 @@ from jax import Array
 
 from ..linkage.linkage import Linkage
 from ..mechanics.equations import Scalars
+from .part import Foreign, Part, default, optional
 
-Forces = tuple[Any, ...]  # callables (t, q, qd, linkage) -> tau
+Forces = tuple[Any, ...]  # elements, or callables (t, q, qd, linkage) -> tau
 
 
-class ScalarElement(eqx.Module):
+class Element(Part):
+    """What acts on an arm: a pytree that computes joint efforts.
+
+    A subclass implements `__call__`, with joint positions, velocities and efforts of
+    shape (3,) [m or rad; m/s or rad/s; N or N m]. All else has a default:
+
+    - `conditions`: conditions on values, beside the bounds that `field` declares.
+    - `jump_ts`: times at which the efforts jump; steps end there [s]. By default they
+      are those of its fields: of a reference, or of a function of time.
+    - `check(linkage, ts)`: raises ValueError if the element does not fit the arm. It is
+      called by `simulate` where values are known.
+    - `potential_energy(q, linkage)`: energy that it stores, () [J]; by default None.
+
+    An element with a state is a `StatefulElement`, one that moves masses is an
+    `InertialElement`, one that pushes at points of links is a `PointElement`.
+
+    >>> import fdof_jax as fj
+    >>> class Drag(fj.Element):
+    ...     coefficient: fj.Values = fj.field(unit="N m s^2/rad^2", minimum=0)
+    ...     def __call__(self, t, q, qd, linkage):
+    ...         return -self.coefficient * abs(qd) * qd
+    >>> Drag(-1)
+    Traceback (most recent call last):
+    ValueError: coefficient: expected an array of 3 real numbers [N m s^2/rad^2], all \
+finite, at least 0 (or one number for all), got -1.
+    """
+
+    @abstractmethod
+    def __call__(self, t: Array, q: Array, qd: Array, linkage: Linkage) -> Any:
+        """Computes the efforts, (3,) [N or N m]."""
+
+    potential_energy = default(lambda self: None)
+
+    def schedule(self, t: Array, linkage: Linkage) -> Any:
+        """Computes what depends on time alone, for all stages of a step at once."""
+        return t
+
+    def initial_state(self, linkage: Linkage) -> Any:
+        """Returns the state at the start: an array or a pytree of arrays."""
+        return ()
+
+    def act(
+        self, t: Array, q: Array, qd: Array, linkage: Linkage, state: Any
+    ) -> tuple[Any, Any]:
+        """Returns the efforts (3,) [N or N m] and the rate of the state."""
+        return self(t, q, qd, linkage), ()
+
+    def loads_on_points(
+        self, t: Array, q: Array, qd: Array, qdd: Array, linkage: Linkage
+    ) -> tuple[Any, ...] | None:
+        """Returns the loads on points of links, which the bearings carry.
+
+        `joint_reactions` calls it, and rejects elements that return None.
+        """
+        return ()
+
+
+class ForeignElement(Foreign, Element):
+    """A callable `(t, q, qd, linkage) -> tau` of another kind, as an element."""
+
+    potential_energy = optional("potential_energy")
+
+    def opened(self, *arguments: Any) -> Element:
+        """Returns it with the closure of a plain function as leaves, at arguments."""
+        if not inspect.isfunction(self.called):
+            return self
+        closed = eqx.filter_closure_convert(self.called, *arguments)
+        return _Opened(self.called, closed)
+
+
+class _Opened(ForeignElement):
+    closed: Any
+
+    def __call__(self, *arguments: Any) -> Any:
+        return self.closed(*arguments)
+
+
+def elements(name: str, forces: Any) -> tuple[Element, ...]:
+    """Returns a tuple of callables as elements, or raises ValueError."""
+    if isinstance(forces, tuple) and all(
+        callable(item) and not isinstance(item, type) for item in forces
+    ):
+        return tuple(
+            item if isinstance(item, Element) else ForeignElement(item)
+            for item in forces
+        )
+    raise ValueError(
+        f"{name}: expected a tuple of callables (t, q, qd, linkage) -> tau, for "
+        f"instance (JointDamper(1.0),), got {forces!r}."
+    )
+
+
+class ScalarElement(Element):
     """A force element written in scalars, which fuses with the equations of motion.
 
     A subclass implements `respond`, and `schedule` if anything in it depends on time.
@@ -52,7 +136,7 @@ class ScalarElement(eqx.Module):
         return jnp.stack(self.respond(scheduled, tuple(q), tuple(qd), linkage))
 
 
-class StatefulElement(eqx.Module):
+class StatefulElement(Element):
     """A force element with a state of its own: an integral, a current, a lag.
 
     A subclass implements both methods; its efforts are in [N or N m].
@@ -63,13 +147,16 @@ class StatefulElement(eqx.Module):
         """Returns the state at the start: an array or a pytree of arrays."""
 
     @abstractmethod
-    def __call__(
+    def __call__(  # pyright: ignore[reportIncompatibleMethodOverride]
         self, t: Array, q: Array, qd: Array, linkage: Linkage, state: Any
     ) -> tuple[Array, Any]:
         """Returns the efforts (3,) [N or N m] and the rate of the state."""
 
+    def act(self, t, q, qd, linkage, state):
+        return self(t, q, qd, linkage, state)
 
-class InertialElement(eqx.Module):
+
+class InertialElement(Element):
     """A force element with masses, which add to the equations of motion.
 
     Its kinetic energy is the sum of weight * (d coordinate/dt)^2 / 2 [J]. For a body,
@@ -102,9 +189,5 @@ class InertialElement(eqx.Module):
         """
         return None
 
-
-def jumps_of(*parts: Any) -> Array | None:
-    """Returns all times at which the parts declare jumps, or None."""
-    found = [getattr(part, "jump_ts", None) for part in parts]
-    times = [jnp.asarray(jumps) for jumps in found if jumps is not None]
-    return jnp.concatenate(times) if times else None
+    def loads_on_points(self, t, q, qd, qdd, linkage):
+        return self.loads(t, q, qd, qdd, linkage)

@@ -1,15 +1,11 @@
 """Stops and friction of joints, which the paper's model does not have."""
 
-from typing import Any
-
 import jax.numpy as jnp
 from jax import Array
-from jaxtyping import Float
-from numpy.typing import ArrayLike
 
-from ..checks import concrete, real_array
 from ..linkage.linkage import Linkage
 from .element import ScalarElement
+from .part import Condition, Values, field
 
 
 class JointStops(ScalarElement):
@@ -35,39 +31,16 @@ class JointStops(ScalarElement):
     [0.0, -100.0, 100.0]
     """
 
-    lower: Float[Array, " joint"]
-    upper: Float[Array, " joint"]
-    stiffness: Float[Array, " joint"]
-    damping: Float[Array, " joint"]
-    smoothing: Float[Array, " joint"]
+    lower: Values = field(unit="m or rad", finite=False)
+    upper: Values = field(unit="m or rad", finite=False)
+    stiffness: Values = field(unit="N/m or N m/rad", above=0, default=1e4, kw_only=True)
+    damping: Values = field(unit="s/m or s/rad", minimum=0, default=0.0, kw_only=True)
+    smoothing: Values = field(unit="m or rad", above=0, default=1e-3, kw_only=True)
 
-    def __init__(
-        self,
-        lower: ArrayLike,
-        upper: ArrayLike,
-        *,
-        stiffness: ArrayLike = 1e4,
-        damping: ArrayLike = 0.0,
-        smoothing: ArrayLike = 1e-3,
-    ):
-        wide: dict[str, Any] = dict(finite=False, broadcast=True)
-        self.lower = real_array("lower", lower, (3,), **wide)
-        self.upper = real_array("upper", upper, (3,), **wide)
-        low, high = concrete(self.lower), concrete(self.upper)
-        if low is not None and high is not None and not (low < high).all():
-            raise ValueError(
-                f"lower: expected less than upper, got {low.tolist()} and "
-                f"{high.tolist()}."
-            )
-        positive: dict[str, Any] = dict(above=0, broadcast=True)
-        self.stiffness = real_array("stiffness", stiffness, (3,), **positive)
-        self.damping = real_array("damping", damping, (3,), minimum=0, broadcast=True)
-        self.smoothing = real_array("smoothing", smoothing, (3,), **positive)
-
-    def possible(self) -> Array:
-        """Returns whether ranges are not empty and values have the right sign."""
-        ranges = (self.lower < self.upper) & (self.damping >= 0)
-        return (ranges & (self.stiffness > 0) & (self.smoothing > 0)).all()
+    def conditions(self):
+        ends = self.lower, self.upper
+        apart = (self.lower < self.upper).all()
+        yield Condition(apart, "lower", "less than upper", ends)
 
     def respond(self, scheduled, q, qd, linkage):
         rows = zip(
@@ -130,16 +103,8 @@ class JointFriction(ScalarElement):
     [0.0, -3.808, 5.0]
     """
 
-    level: Float[Array, " joint"]
-    speed: Float[Array, " joint"]
-
-    def __init__(self, level: ArrayLike, speed: ArrayLike = 1e-2):
-        self.level = real_array("level", level, (3,), minimum=0, broadcast=True)
-        self.speed = real_array("speed", speed, (3,), above=0, broadcast=True)
-
-    def possible(self) -> Array:
-        """Returns whether levels are not negative and speeds positive."""
-        return ((self.level >= 0) & (self.speed > 0)).all()
+    level: Values = field(unit="N or N m", minimum=0)
+    speed: Values = field(unit="m/s or rad/s", above=0, default=1e-2)
 
     def respond(self, scheduled, q, qd, linkage):
         return tuple(

@@ -2,14 +2,9 @@
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jax import Array
-from jaxtyping import Float
-from numpy.typing import ArrayLike
 
-from ..checks import concrete, real_array
-from ..linkage.linkage import Linkage
 from .element import ScalarElement
+from .part import Condition, Values, field
 
 
 class JointDamper(ScalarElement):
@@ -29,23 +24,10 @@ class JointDamper(ScalarElement):
     [-1.0, -2.0, -3.0]
     """
 
-    coefficient: Float[Array, " joint"]
-
-    def __init__(self, coefficient: ArrayLike):
-        self.coefficient = real_array(
-            "coefficient", coefficient, (3,), minimum=0, broadcast=True
-        )
+    coefficient: Values = field(unit="N s/m or N m s/rad", minimum=0)
 
     def respond(self, scheduled, q, qd, linkage):
         return tuple(-c * rate for c, rate in zip(self.coefficient, qd))
-
-    def check(self, linkage: Linkage, ts: Array) -> None:
-        """Repeats the constructor's checks, which `equinox.tree_at` bypasses."""
-        JointDamper(self.coefficient)
-
-    def possible(self) -> Array:
-        """Returns whether the coefficients are not negative."""
-        return (self.coefficient >= 0).all()
 
 
 class JointEffort(ScalarElement):
@@ -62,17 +44,10 @@ class JointEffort(ScalarElement):
     [58.86, 29.43, 9.81]
     """
 
-    tau: Float[Array, " joint"]
-
-    def __init__(self, tau: ArrayLike):
-        self.tau = real_array("tau", tau, (3,))
+    tau: Values = field(unit="N or N m", broadcast=False)
 
     def respond(self, scheduled, q, qd, linkage):
         return tuple(self.tau)
-
-    def check(self, linkage: Linkage, ts: Array) -> None:
-        """Repeats the constructor's checks, which `equinox.tree_at` bypasses."""
-        JointEffort(self.tau)
 
 
 class EffortHistory(ScalarElement):
@@ -94,15 +69,15 @@ class EffortHistory(ScalarElement):
     [1.0, 2.0, 3.0]
     """
 
-    ts: Float[Array, " time"]
-    tau: Float[Array, "time joint"]
+    ts: Values = field((None,), unit="s")
+    tau: Values = field((None, 3), unit="N or N m")
 
-    def __init__(self, ts: ArrayLike, tau: ArrayLike):
-        self.ts = real_array("ts", ts, (None,))
-        times = concrete(self.ts)
-        if self.ts.size == 0 or times is not None and not (np.diff(times) > 0).all():
-            raise ValueError(f"ts: expected increasing times, got {ts!r}.")
-        self.tau = real_array("tau", tau, (self.ts.size, 3))
+    def conditions(self):
+        times, efforts = len(self.ts), len(self.tau)
+        rising = (self.ts[1:] > self.ts[:-1]).all() & (times > 0)
+        yield Condition(rising, "ts", "increasing times", (self.ts,))
+        same = times == efforts
+        yield Condition(same, "tau", f"{times} rows, one per time", (efforts,))
 
     def schedule(self, t, linkage):
         """Returns the efforts at a time."""
@@ -111,11 +86,3 @@ class EffortHistory(ScalarElement):
 
     def respond(self, scheduled, q, qd, linkage):
         return scheduled
-
-    def check(self, linkage: Linkage, ts: Array) -> None:
-        """Repeats the constructor's checks, which `equinox.tree_at` bypasses."""
-        EffortHistory(self.ts, self.tau)
-
-    def possible(self) -> Array:
-        """Returns whether the times increase."""
-        return (self.ts[1:] > self.ts[:-1]).all()

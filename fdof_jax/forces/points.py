@@ -175,6 +175,10 @@ class PointElement(ScalarElement):
         efforts = [load.efforts(frames) for load in self.loads(scheduled, frames, qd)]
         return tuple(reduce(add, rows) for rows in zip(*efforts))
 
+    def loads_on_points(self, t, q, qd, qdd, linkage):
+        frames = frames_of(linkage, tuple(q))
+        return self.loads(self.schedule(t, linkage), frames, tuple(qd))
+
 
 class Separation(eqx.Module):
     """Two points and the line between them."""

@@ -10,7 +10,8 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from ..checks import callable_tuple, keywords_as, real_array
+from ..checks import keywords_as, real_array
+from ..forces.element import elements
 from ..linkage.coordinates import real_state
 from ..linkage.linkage import check_linkage
 from ..mechanics.kinematics import joint_positions, tip_position
@@ -135,7 +136,7 @@ def _check_scene(scene: Any, ts: Array) -> None:
         raise ValueError(f"scene_at: expected it to return a Scene, got {scene!r}.")
     check_linkage(scene.linkage)
     real_state("scene_at(...).state0", scene.state0)
-    callable_tuple("scene_at(...).forces", scene.forces)
+    elements("scene_at(...).forces", scene.forces)
     check_elements(scene.forces, scene.linkage, ts)
 
 

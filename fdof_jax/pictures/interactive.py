@@ -13,6 +13,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.image import imsave
 
+from ..control.reference import reference_of
 from ..simulation.scene import Scene
 from ..simulation.simulate import simulate
 from ..simulation.solution import Solution
@@ -205,8 +206,8 @@ def sliders(scenes: Mapping[str, Scene] | None = None) -> Any:
     for name, scene in filled_mapping("scenes", scenes, "Scene").items():
         if not isinstance(scene, Scene):
             raise refuse(f"scenes[{name!r}]", "a Scene", scene)
-        if not callable(getattr(controller_of(scene).reference, "tip", None)):
-            task = controller_of(scene).reference
+        task = controller_of(scene).reference
+        if reference_of(task).tip is None:
             raise refuse(f"scenes[{name!r}]", "a controller of a task with a tip", task)
         # As an array, so that other times do not compile again.
         known[name] = scene._replace(t1=jnp.asarray(scene.t1, float))

@@ -22,7 +22,7 @@ from ..analysis.tracking import saturated
 from ..checks import real_array
 from ..control.pd import PDController
 from ..dynamics import energy, link_energies
-from ..forces.element import Forces, InertialElement
+from ..forces.element import Forces, InertialElement, elements
 from ..linkage.linkage import Linkage
 from ..simulation.simulate import joint_efforts
 from ..simulation.solution import Solution
@@ -121,11 +121,9 @@ def _powers(linkage: Linkage, forces: Forces, solution: Solution) -> np.ndarray:
     """
     efforts = joint_efforts(linkage, forces, solution).elements
     powers = jnp.einsum("etj,tj->et", efforts, solution.qd)
-    for k, element in enumerate(forces):
+    for k, element in enumerate(elements("forces", forces)):
         # The efforts of an inertial element exclude those of its potential energy.
-        if isinstance(element, InertialElement) or not hasattr(
-            element, "potential_energy"
-        ):
+        if isinstance(element, InertialElement) or element.potential_energy is None:
             continue
 
         def stored(q: Array, qd: Array, element: Any = element) -> Array:

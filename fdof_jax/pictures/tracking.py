@@ -12,6 +12,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import ListedColormap
 
 from ..control.circle import CircleTask
+from ..control.reference import reference_of
 from ..linkage.linkage import Linkage
 from ..simulation.solution import Solution
 from .axes import (
@@ -35,16 +36,17 @@ def _tip(
     linkage: Any, task: Any, solution: Any, name: str = "solution"
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Times of a solution, and the commanded and actual tip positions."""
-    if not callable(getattr(task, "tip", None)):
+    if not callable(task) or (tip := reference_of(task).tip) is None:
         raise refuse("task", "a CircleTask", task)
     ts, q, _ = reached(solution, name)
-    commanded = np.asarray(jax.vmap(task.tip)(jnp.asarray(ts))) @ [1, 1j]
+    commanded = np.asarray(jax.vmap(tip)(jnp.asarray(ts))) @ [1, 1j]
     return ts, commanded, geometry(linkage, q).end[:, 3]
 
 
 def _one_turn(task: Any, ts: np.ndarray, path: np.ndarray) -> np.ndarray:
     """One turn of the commanded path, as overlapping dashes make a solid line."""
-    turn = abs(float(getattr(task, "period", np.inf)))
+    period = reference_of(task).period
+    turn = np.inf if period is None else abs(float(period))
     return path[ts - ts[0] <= turn * (1 + 1e-6)]
 
 

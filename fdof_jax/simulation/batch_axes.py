@@ -47,11 +47,11 @@ def batch_of(linkage: Linkage, state0: Any, forces: Forces, forces_axes: Any) ->
     """Returns the inputs as a batch; raises ValueError if their shapes do not fit."""
     linkage_axes = []
     for name, rank in _LINKAGE_RANKS.items():
-        extra = getattr(linkage, name).ndim - rank
+        extra = vars(linkage)[name].ndim - rank
         if extra not in (0, 1):
             raise ValueError(
                 f"linkage.{name}: expected {rank} dimensions or a batch axis before "
-                f"them, got shape {getattr(linkage, name).shape}."
+                f"them, got shape {vars(linkage)[name].shape}."
             )
         linkage_axes.append(0 if extra else -1)
     state_axes = []
@@ -74,7 +74,7 @@ def batch_of(linkage: Linkage, state0: Any, forces: Forces, forces_axes: Any) ->
         ) from None
     inputs = (linkage, state0, forces)
     by_name = eqx.tree_at(
-        lambda x: [getattr(x, name) for name in _LINKAGE_RANKS], linkage, linkage_axes
+        lambda x: [vars(x)[name] for name in _LINKAGE_RANKS], linkage, linkage_axes
     )
     axes = (by_name, State(*state_axes), expanded)
     paths, _ = jax.tree_util.tree_flatten_with_path(inputs)

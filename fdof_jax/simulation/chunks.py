@@ -16,7 +16,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from numpy.typing import ArrayLike
 
 from ..dynamics import forward_dynamics
-from ..forces.element import StatefulElement
+from ..forces.element import elements
 from ..linkage.coordinates import real_joints
 from .batch_axes import Batch
 from .field import element_effort
@@ -84,10 +84,8 @@ def expected_work(t0: Array, moving: Any, shared: Any) -> tuple[Array, Array]:
     def member(moving):
         linkage, (q, qd), forces = eqx.combine(moving, shared)
         tau = jnp.zeros(3)
-        for index, element in enumerate(forces):
-            state = None
-            if isinstance(element, StatefulElement):
-                state = element.initial_state(linkage)
+        for index, element in enumerate(elements("forces", forces)):
+            state = element.initial_state(linkage)
             tau = tau + element_effort(index, element, t0, q, qd, linkage, state)[0]
         # Revolute joints cause most of the steps, slides hardly any.
         turning = jnp.stack(real_joints(linkage.ef))

@@ -9,7 +9,7 @@ import numpy as np
 from jax import Array
 
 from ..forces.added_inertia import added_inertia, inertial
-from ..forces.element import Forces, ScalarElement, StatefulElement
+from ..forces.element import Element, ScalarElement, StatefulElement
 from ..linkage.linkage import Linkage
 from ..mechanics.equations import Constants, zeros
 from ..mechanics.rates import conditioning, rates, rates_and_conditioning
@@ -25,19 +25,16 @@ class Args(NamedTuple):
     linkage: Linkage
     q0: Array
     constants: Constants
-    forces: Forces
+    forces: tuple[Element, ...]
 
 
 @with_checks
 def schedule_of(t: Array, args: Args) -> tuple[Any, ...]:
     """Returns each element's schedule, or the time for elements without one."""
-    return tuple(
-        element.schedule(t, args.linkage) if isinstance(element, ScalarElement) else t
-        for element in args.forces
-    )
+    return tuple(element.schedule(t, args.linkage) for element in args.forces)
 
 
-def stateful(forces: Forces) -> list[StatefulElement]:
+def stateful(forces: tuple[Element, ...]) -> list[StatefulElement]:
     """Returns the elements that have a state of their own."""
     return [element for element in forces if isinstance(element, StatefulElement)]
 
@@ -82,7 +79,7 @@ def applied(t: Any, y: Any, args: Args, schedule: tuple[Any, ...]) -> Applied:
             q = tuple(a + b for a, b in zip(args.q0, delta))
             effort = element.respond(scheduled, q, qd, args.linkage)
         else:
-            state = next(states) if isinstance(element, StatefulElement) else None
+            state = next(states) if isinstance(element, StatefulElement) else ()
             effort, rate = element_effort(
                 index, element, t, *arrays(), args.linkage, state
             )
@@ -136,30 +133,27 @@ def health_of(t, y, args) -> Array:
 @eqx.filter_jit  # traced once, not at each use by a solver
 def element_effort(
     index: int,
-    element: Any,
+    element: Element,
     t: Array,
     q: Array,
     qd: Array,
     linkage: Linkage,
-    state: Any = None,
+    state: Any,
 ) -> tuple[Array, Any]:
-    """Returns an element's effort and the rate of its state, None without a state.
+    """Returns an element's effort and the rate of its state, () without a state.
 
     Raises ValueError unless the effort is three real numbers.
     """
     expected = f"forces[{index}]: expected it to return tau, an array of 3 real numbers"
-    if isinstance(element, StatefulElement):
-        found = element(t, q, qd, linkage, state)
-        if not isinstance(found, tuple) or len(found) != 2:
-            raise ValueError(f"{expected}, and the rate of its state, got {found!r}.")
-        tau, rate = found
-        if jax.tree.map(jnp.shape, rate) != jax.tree.map(jnp.shape, state):
-            raise ValueError(
-                f"forces[{index}]: expected the rate of its state to be like the "
-                f"state, {state!r}, got {rate!r}."
-            )
-    else:
-        tau, rate = element(t, q, qd, linkage), None
+    found: Any = element.act(t, q, qd, linkage, state)
+    if not isinstance(found, tuple) or len(found) != 2:
+        raise ValueError(f"{expected}, and the rate of its state, got {found!r}.")
+    tau, rate = found
+    if jax.tree.map(jnp.shape, rate) != jax.tree.map(jnp.shape, state):
+        raise ValueError(
+            f"forces[{index}]: expected the rate of its state to be like the state, "
+            f"{state!r}, got {rate!r}."
+        )
     try:
         tau = jnp.asarray(tau)
     except (TypeError, ValueError) as error:

@@ -1,6 +1,5 @@
 """Integrates the equations of motion with diffrax."""
 
-import inspect
 from typing import Any
 
 import diffrax
@@ -12,7 +11,8 @@ from jax import Array
 
 from ..checks import is_traced
 from ..forces.added_inertia import inertial
-from ..forces.element import Forces, jumps_of
+from ..forces.element import Element, ForeignElement
+from ..forces.part import jumps_of
 from ..linkage.linkage import possible
 from ..mechanics.equations import link_constants, zeros
 from ..xla.callbacks import without_checks
@@ -65,14 +65,14 @@ def _step_for_tangents(t0: Array, args: Args, own: tuple, fraction: float) -> Ar
     return jax.lax.stop_gradient(jnp.where(step > 0, step, jnp.inf))
 
 
-def _batch_solver(forces: Forces) -> diffrax.AbstractSolver:
+def _batch_solver(forces: tuple[Element, ...]) -> diffrax.AbstractSolver:
     """Returns the fastest solver for large batches."""
     # Thirteen unrolled copies of these equations would take minutes to compile.
     many = inertial(forces) or prescribed(forces)
     return diffrax.Dopri8() if many else UnrolledDopri8()
 
 
-def _tangent_solver(forces: Forces) -> diffrax.AbstractSolver:
+def _tangent_solver(forces: tuple[Element, ...]) -> diffrax.AbstractSolver:
     """Returns the fastest solver for forward-mode derivatives."""
     many = inertial(forces) or prescribed(forces)
     if many or small_loops_are_kernels():
@@ -99,8 +99,7 @@ def _integrate(
     finite = (jnp.isfinite(state0.q) & jnp.isfinite(state0.qd)).all()
     valid = possible(linkage) & increasing & finite
     for element in forces:
-        if hasattr(element, "possible"):
-            valid = valid & element.possible()
+        valid = valid & element.possible()
     motion = prescribed(forces)
     if motion is not None:
         valid = valid & motion.agrees(ts[0], jnp.asarray(state0.q), linkage)
@@ -222,9 +221,7 @@ def _opened(inputs):
     linkage, state0, ts, own0, forces = inputs
     arguments = ts[0], *state0, linkage
     opened = tuple(
-        eqx.filter_closure_convert(element, *arguments)
-        if inspect.isfunction(element)
-        else element
+        element.opened(*arguments) if isinstance(element, ForeignElement) else element
         for element in forces
     )
     return linkage, state0, ts, own0, opened

@@ -6,21 +6,15 @@ momenta are continuous where a prescribed velocity jumps.
 
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float
 
-from ..control.reference import (
-    Reference,
-    checked_reference,
-    positions_at,
-    reference_motion,
-)
+from ..control.reference import follows, positions_at, reference_motion
 from ..dynamics import mass_and_bias
-from ..forces.element import Forces
+from ..forces.element import Element, Forces
 from ..linkage.linkage import Linkage
 from ..mechanics.equations import equations, zeros
 from ..xla.array_namespace import in_numpy
@@ -28,7 +22,7 @@ from ..xla.callbacks import with_checks
 from .field import LEAST_INERTIA_RATIO, Args, applied
 
 
-class PrescribedMotion(eqx.Module):
+class PrescribedMotion(Element):
     """Joints that follow a reference exactly, whatever effort that takes.
 
     Where the reference's velocity jumps, an impulse makes the velocities of the other
@@ -49,9 +43,9 @@ class PrescribedMotion(eqx.Module):
     """
 
     moved: Bool[Array, " joint"]
-    reference: Reference
+    reference: Any = follows()
 
-    def __init__(self, joints: int | tuple[int, ...], reference: Reference):
+    def __init__(self, joints: int | tuple[int, ...], reference: Any):
         numbers = joints if isinstance(joints, tuple) else (joints,)
         if not numbers or any(
             isinstance(n, bool) or not isinstance(n, int) or n not in (1, 2, 3)
@@ -62,7 +56,7 @@ class PrescribedMotion(eqx.Module):
                 f"{joints!r}."
             )
         self.moved = jax.device_put(np.isin([1, 2, 3], numbers))
-        self.reference = checked_reference(reference)
+        self.reference = reference
 
     @with_checks
     def at(self, t: Array, linkage: Linkage) -> tuple[Array, Array]:
@@ -79,17 +73,6 @@ class PrescribedMotion(eqx.Module):
     def __call__(self, t: Array, q: Array, qd: Array, linkage: Linkage) -> Array:
         """Returns zero efforts: the real ones depend on all other elements."""
         return jnp.zeros(3)
-
-    @property
-    def jump_ts(self) -> Array | None:
-        """Times at which the reference jumps, if it declares any."""
-        return getattr(self.reference, "jump_ts", None)
-
-    def check(self, linkage: Linkage, ts: Array) -> None:
-        """Runs the reference's own check, if it has one."""
-        check_reference: Any = getattr(self.reference, "check", None)
-        if check_reference is not None:
-            check_reference(linkage, ts)
 
 
 def prescribed(forces: Forces) -> PrescribedMotion | None:

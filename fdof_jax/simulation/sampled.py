@@ -10,8 +10,8 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from ..checks import callable_tuple, concrete, real_array, whole_number
-from ..forces.element import Forces, ScalarElement, StatefulElement
+from ..checks import called_as, concrete, real_array, whole_number
+from ..forces.element import Forces, ScalarElement, elements
 from ..forces.joints import JointEffort
 from ..linkage.coordinates import State, real_state
 from ..linkage.linkage import Linkage, check_linkage
@@ -38,8 +38,7 @@ class _Switched(ScalarElement):
 
 
 def _without_states(forces: Any) -> None:
-    callable_tuple("forces", forces)
-    if any(isinstance(e, StatefulElement) for e in forces):
+    if stateful(elements("forces", forces)):
         raise ValueError(
             "forces: expected elements without a state of their own, which would be "
             "lost (simulate takes such states as own0 and returns them), got "
@@ -139,11 +138,9 @@ def simulate_sampled(
     **Raises:** ValueError for malformed arguments.
     """
     check_linkage(linkage)
-    callable_tuple("forces", forces)
-    if not callable(control) or isinstance(control, type):
-        raise ValueError(
-            f"control: expected a callable (t, q, qd, linkage) -> tau, got {control!r}."
-        )
+    forces = elements("forces", forces)
+    called_as("control", control, "a callable (t, q, qd, linkage) -> tau")
+    (control,) = elements("control", (control,))
     period = real_array("period", period, (), above=0)
     t0 = real_array("t0", t0, ())
     whole_number("samples", samples, 1)
@@ -182,12 +179,10 @@ def _motion(
     """Simulates period by period; `delay` and the noise's `spread` may be None."""
 
     def command(t, seen, memory):
-        if not memory:
-            return real_array("control", control(t, *seen, linkage), (3,)), memory
-        tau, rates = control(t, *seen, linkage, *memory)
+        tau, rates = control.act(t, *seen, linkage, memory)
         step = times[1] - times[0]
-        later = jax.tree.map(lambda m, rate: m + step * rate, *memory, rates)
-        return real_array("control", tau, (3,)), (later,)
+        later = jax.tree.map(lambda m, rate: m + step * rate, memory, rates)
+        return real_array("control", tau, (3,)), later
 
     def one(carry, inputs):
         state, own, memory, held, result = carry
@@ -212,12 +207,12 @@ def _motion(
         result = diffrax.RESULTS.where(good, solution.result, result)
         return (State(q, qd), own, memory, tau, result), (q, qd, own, tau)
 
-    def initial(elements):
-        states = [element.initial_state(linkage) for element in stateful(elements)]
-        return tuple(jax.tree.map(lambda leaf: jnp.asarray(leaf, float), states))
+    def initial(element):
+        state = element.initial_state(linkage)
+        return jax.tree.map(lambda leaf: jnp.asarray(leaf, float), state)
 
     q0, qd0 = jnp.asarray(state0.q), jnp.asarray(state0.qd)
-    own0, memory0 = initial(forces), initial((control,))
+    own0, memory0 = tuple(map(initial, stateful(forces))), initial(control)
     held = jnp.zeros(3)
     if delay is not None:
         held = jnp.where(delay < times[1] - times[0], held, jnp.nan)

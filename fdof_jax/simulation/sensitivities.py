@@ -13,7 +13,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from ..forces.element import jumps_of
+from ..forces.element import elements
+from ..forces.part import jumps_of
 from ..mechanics.equations import link_constants, zeros
 from ..xla.callbacks import without_checks
 from .field import Args, initial_own, own_states, schedule_of, vector_field
@@ -64,8 +65,9 @@ def sensitivities(
         constants = link_constants(
             scene.linkage, q0, lambda x: (jnp.sin(x), jnp.cos(x))
         )
-        args = Args(scene.linkage, q0, constants, scene.forces)
-        motion = prescribed(scene.forces)
+        forces = elements("scene.forces", scene.forces)
+        args = Args(scene.linkage, q0, constants, forces)
+        motion = prescribed(forces)
         start = (
             (zeros(q0), tuple(qd0)) if motion is None else start_of(motion, args, qd0)
         )
@@ -107,7 +109,7 @@ def sensitivities(
         force_dtmin=False,
         norm=_largest,
     )
-    if (jumps := jumps_of(*scene_at(z).forces)) is not None:
+    if (jumps := jumps_of(*motion_of(z)[0].forces)) is not None:
         controller = landing_on(controller, jumps.astype(ts.dtype))
     with without_checks():
         found = diffrax.diffeqsolve(

@@ -11,14 +11,14 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from ..checks import (
-    callable_tuple,
     concrete,
     instance,
     is_traced,
     real_array,
     whole_number,
 )
-from ..forces.element import Forces, StatefulElement
+from ..forces.element import Element, Forces, StatefulElement, elements
+from ..forces.part import check_values
 from ..linkage.coordinates import State, real_state
 from ..linkage.linkage import Linkage, check_linkage
 from ..xla.array_namespace import in_numpy
@@ -84,21 +84,18 @@ def solve_options(
 
 
 def check_elements(forces: Forces, linkage: Linkage, ts: Array) -> None:
-    """Runs the elements' own checks on concrete values."""
-    for index, element in enumerate(forces):
-        values = in_numpy(element)
-        jumps = getattr(values, "jump_ts", None)
-        if jumps is not None:
-            real_array(f"forces[{index}].jump_ts", jumps, (None,))
-        check = getattr(element, "check", None)
+    """Checks the elements' values, where known, and runs their own checks."""
+    for index, element in enumerate(elements("forces", forces)):
+        place, values = f"forces[{index}]", in_numpy(element)
+        if values.jump_ts is not None:
+            real_array(f"{place}.jump_ts", values.jump_ts, (None,))
         if is_traced(linkage, ts, element):
             continue
-        if check is not None:
-            check(linkage, ts)
-        # `equinox.tree_at` bypasses the constructor.
-        if hasattr(values, "possible") and not values.possible():
+        check_values(place, element)  # `equinox.tree_at` bypasses the constructor
+        element.check(linkage, ts)
+        if not values.possible():
             raise ValueError(
-                f"forces[{index}]: expected values that its constructor accepts, got "
+                f"{place}: expected values that its constructor accepts, got "
                 f"{eqx.tree_pformat(element, short_arrays=False)}."
             )
 
@@ -167,7 +164,7 @@ def simulate(
     times = concrete(ts)
     if times is not None and not (np.diff(times) > 0).all():
         raise ValueError(f"ts: expected increasing times, got {times.tolist()[:20]}.")
-    callable_tuple("forces", forces)
+    forces = elements("forces", forces)
     solver, keywords = solve_options(
         solver,
         rtol=rtol,
@@ -240,7 +237,9 @@ def _raising(solution: Solution, state0: State) -> Solution:
     return solution.result.error_if(solution, failed)
 
 
-def _check_own(name, own, forces: Forces, linkage: Linkage, rows: tuple) -> None:
+def _check_own(
+    name, own, forces: tuple[Element, ...], linkage: Linkage, rows: tuple
+) -> None:
     """Raises ValueError unless `own` holds rows of the stateful elements' states."""
     expected = [
         jax.eval_shape(element.initial_state, linkage) for element in stateful(forces)
@@ -275,7 +274,7 @@ def joint_efforts(linkage: Linkage, forces: Forces, solution: Solution) -> Effor
     check_linkage(linkage)
     if not isinstance(solution, Solution):
         raise ValueError(f"solution: expected a Solution, got {solution!r}.")
-    callable_tuple("forces", forces)
+    forces = elements("forces", forces)
     if solution.q.ndim != 2:
         raise ValueError(
             "solution: expected one motion (use jax.vmap for a batch), got positions "
@@ -286,17 +285,19 @@ def joint_efforts(linkage: Linkage, forces: Forces, solution: Solution) -> Effor
 
 
 @eqx.filter_jit
-def _efforts(linkage: Linkage, forces: Forces, solution: Solution) -> Efforts:
+def _efforts(
+    linkage: Linkage, forces: tuple[Element, ...], solution: Solution
+) -> Efforts:
     motion_rows, own = (solution.ts, solution.q, solution.qd), iter(solution.own)
-    elements = []
+    efforts = []
     for index, element in enumerate(forces):
 
         def effort(t, q, qd, state, index=index, element=element):
             return element_effort(index, element, t, q, qd, linkage, state)[0]
 
-        state = next(own) if isinstance(element, StatefulElement) else None
-        elements.append(jax.vmap(effort)(*motion_rows, state))
-    stacked = jnp.stack(elements) if elements else jnp.zeros((0, *solution.q.shape))
+        state = next(own) if isinstance(element, StatefulElement) else ()
+        efforts.append(jax.vmap(effort)(*motion_rows, state))
+    stacked = jnp.stack(efforts) if efforts else jnp.zeros((0, *solution.q.shape))
     if (motion := prescribed(forces)) is not None:
         demand = lambda *row: prescribed_effort(linkage, forces, *row)
         demanded = jax.vmap(demand)(*motion_rows, jnp.sum(stacked, axis=0))

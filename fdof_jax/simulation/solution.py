@@ -72,7 +72,7 @@ class Solution(eqx.Module):
 
     def _facts(self) -> dict[str, str]:
         """Returns the known facts; none if the leaves are not arrays of a motion."""
-        if len(getattr(self.q, "shape", ())) < 2:
+        if len(np.shape(self.q)) < 2:
             return {}
         *batch, count, _ = self.q.shape
         motions = " x ".join(map(str, batch)) if batch else "1"

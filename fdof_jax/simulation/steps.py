@@ -147,8 +147,8 @@ def scale_tolerances(
     if scale is not None:
         instance("scale", scale, State)
         q, qd = (
-            real_array(f"scale.{name}", getattr(scale, name), (3,), above=0)
-            for name in ("q", "qd")
+            real_array(f"scale.{name}", value, (3,), above=0)
+            for name, value in zip(State._fields, scale)
         )
     else:
         size = jnp.sum(jnp.abs(linkage.length)) + jnp.sum(jnp.abs(linkage.com))

@@ -18,15 +18,8 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
-from ..checks import (
-    callable_tuple,
-    concrete,
-    instance,
-    is_traced,
-    real_array,
-    whole_number,
-)
-from ..forces.element import Forces
+from ..checks import concrete, instance, is_traced, real_array, whole_number
+from ..forces.element import Forces, elements
 from ..linkage.coordinates import State
 from ..linkage.linkage import Linkage
 from .batch_axes import Batch, batch_of
@@ -135,7 +128,7 @@ def sweep(
     times = concrete(ts)
     if times is not None and not (times.size and (np.diff(times) > 0).all()):
         raise ValueError(f"ts: expected increasing times, got {times.tolist()[:20]}.")
-    callable_tuple("forces", forces)
+    elements("forces", forces)
     whole_number("chunk", chunk, 1)
     solver, settings = solve_options(
         solver,

@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..checks import instance, real_array, whole_number
+from ..control.model_based import ModelBased
+from ..control.reference import reference_of
 from ..linkage.coordinates import State
 from ..linkage.linkage import Linkage, check_linkage
 from ..mechanics.kinematics import tip_jacobian, tip_position
@@ -70,7 +72,7 @@ def _hastened(controller: Any, rate: float) -> Any:
 
 def _believing(controller: Any, linkage: Linkage) -> Any:
     """The controller, with this linkage as its model if it has none."""
-    if getattr(controller, "model", linkage) is not None:
+    if not isinstance(controller, ModelBased) or controller.model is not None:
         return controller
     return eqx.tree_at(lambda c: c.model, controller, linkage, is_leaf=_is_none)
 
@@ -133,7 +135,7 @@ def perturbed(
     reach = float(real_array("start_offset", start_offset, (), minimum=0))
     controller = controller_of(scene)
     varied = bool((ranges["speed"] != 1).any())
-    if varied and not hasattr(controller.reference, "period"):
+    if varied and reference_of(controller.reference).period is None:
         raise ValueError(
             f"speed: expected (1, 1) for a reference without a `period`, got {speed!r}."
         )

@@ -8,7 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ..checks import callable_tuple, instance, is_traced, real_array
+from ..checks import instance, is_traced, real_array
+from ..control.reference import reference_of
+from ..forces.element import elements
 from ..linkage.coordinates import real_state
 from ..linkage.linkage import check_linkage, joint_names
 from ..search.methods import Evaluation
@@ -58,7 +60,7 @@ def evaluate_gains(z: Array, problem: tuple[Scene, Loss, Array]) -> Evaluation:
     # An actuator with a limit of 0 makes no effort, whatever its demand.
     limited = jnp.where(controller_of(trial).limit > 0, 1, 0)[None]
     square_error = jnp.full((), jnp.nan)
-    if hasattr(controller_of(trial).reference, "tip"):
+    if reference_of(controller_of(trial).reference).tip is not None:
         square_error = jnp.sum(tip_errors(trial, solution) ** 2)
     facts = dict(
         saturated=jnp.mean(demands > 1, axis=0),
@@ -83,13 +85,13 @@ def check_tuned(name: str, scene: Any, loss: Any) -> None:
     check_linkage(scene.linkage)
     real_state(f"{name}.state0", scene.state0)
     t1 = real_array(f"{name}.t1", scene.t1, (), above=0)
-    callable_tuple(f"{name}.forces", scene.forces)
+    elements(f"{name}.forces", scene.forces)
     controller = controller_of(scene)
     check_elements(scene.forces, scene.linkage, jnp.stack([jnp.zeros_like(t1), t1]))
     if isinstance(loss, Tracking):
         loss.check(scene)
     if isinstance(loss, Tracking) or loss is tip_errors:
-        if not hasattr(controller.reference, "tip"):
+        if reference_of(controller.reference).tip is None:
             raise ValueError(
                 "loss: expected one of your own, because the reference has no `tip` "
                 f"for the tip error, got {controller.reference!r}."

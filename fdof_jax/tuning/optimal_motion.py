@@ -12,9 +12,11 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from ..analysis.tracking import tip_deviation
-from ..checks import callable_tuple, instance, real_array, whole_number
+from ..checks import instance, real_array, whole_number
 from ..control.model_based import ComputedTorque
 from ..control.pd import PDController
+from ..control.reference import reference_of
+from ..forces.element import elements
 from ..forces.joints import EffortHistory
 from ..linkage.linkage import check_linkage
 from ..search.bounded import Run, minimise, reporting
@@ -161,7 +163,7 @@ def _check(scene: Any, horizon: Any) -> float:
         raise ValueError(
             f"horizon: expected at most the scene's t1, {t1:g} s, got {horizon:g} s."
         )
-    callable_tuple("scene.forces", scene.forces)
+    elements("scene.forces", scene.forces)
     controller = controller_of(scene)
     limit = np.asarray(controller.limit)
     if not np.isfinite(limit).all():
@@ -169,7 +171,7 @@ def _check(scene: Any, horizon: Any) -> float:
             "scene: expected finite limits of its controller, as the best efforts "
             f"without limits have none either, got {limit.tolist()}."
         )
-    if not hasattr(controller.reference, "tip"):
+    if reference_of(controller.reference).tip is None:
         raise ValueError(
             "scene: expected its controller to track a task with a `tip`, got "
             f"{controller.reference!r}."

@@ -20,12 +20,12 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 _ERRORS: Any = equinox._errors
-_CHOSEN = getattr(_ERRORS, "EQX_ON_ERROR", None)  # by the user's environment
+_CHOSEN = vars(_ERRORS).get("EQX_ON_ERROR")  # by the user's environment
 
 
 @contextlib.contextmanager
 def _set_to(choice: Any) -> Iterator[None]:
-    before = getattr(_ERRORS, "EQX_ON_ERROR", None)
+    before = vars(_ERRORS).get("EQX_ON_ERROR")
     if before is None:
         yield
         return

@@ -1,0 +1,241 @@
+"""The base of elements, references, paths and timings: declared values and conditions.
+
+What its values must fulfil is declared once: bounds of an array by `field`, all else by
+`conditions`. Constructors raise ValueError for values that do not fulfil it. `simulate`
+raises it too, since `equinox.tree_at` bypasses constructors. Where values are traced,
+`possible` reports it to the program.
+"""
+
+import dataclasses
+from collections.abc import Callable, Iterable, Iterator
+from functools import reduce
+from operator import and_
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import ArrayLike
+
+from ..checks import called_as, concrete, real_array
+from ..linkage.linkage import Linkage
+from ..xla.array_namespace import in_numpy
+
+if TYPE_CHECKING:
+
+    class Values:
+        """The type of a declared array, which is given as any numbers."""
+
+        def __get__(self, part: Any, owner: Any = None) -> Array: ...
+        def __set__(self, part: Any, value: ArrayLike) -> None: ...
+else:
+    Values = Array
+
+
+def field(
+    shape: tuple[int | None, ...] = (3,),
+    *,
+    unit: str,
+    minimum: float | None = None,
+    above: float | None = None,
+    finite: bool = True,
+    broadcast: bool | None = None,
+    function: bool = False,
+    default: Any = dataclasses.MISSING,
+    kw_only: bool = False,
+) -> Any:
+    """Declares a field of an element or a reference that is an array of real numbers.
+
+    The constructor converts what it is given. It refuses values out of bounds, as does
+    `simulate`; if they are traced, the motion ends as not finite.
+
+    **Arguments:**
+
+    - `shape`: by default one number per joint; `None` stands for any length.
+    - `unit`: for messages, for instance "N m s/rad".
+    - `minimum`, `above`: bounds; `finite`: whether infinities are refused.
+    - `broadcast`: whether one number for all entries is accepted, as it is by default
+      for one number per joint.
+    - `function`: whether a function that returns such an array is accepted.
+    - `default`, `kw_only`: as of `dataclasses.field`.
+
+    >>> import fdof_jax as fj
+    >>> class Drag(fj.Element):
+    ...     coefficient: fj.Values = fj.field(unit="N m s^2/rad^2", minimum=0)
+    ...     def __call__(self, t, q, qd, linkage):
+    ...         return -self.coefficient * abs(qd) * qd
+    >>> Drag(2).coefficient.tolist()
+    [2.0, 2.0, 2.0]
+    """
+    rules = dict(
+        shape=shape,
+        unit=unit,
+        minimum=minimum,
+        above=above,
+        finite=finite,
+        broadcast=shape == (3,) if broadcast is None else broadcast,
+    )
+    about = {"rules": rules, "function": function}
+    return dataclasses.field(default=default, kw_only=kw_only, metadata=about)
+
+
+def called(expected: str, kind: type = object) -> Any:
+    """Declares a field that is called, and says in words what is expected there."""
+    return dataclasses.field(metadata={"called": (expected, kind)})
+
+
+def default(compute: Callable[[Any], Any]) -> Any:
+    """Decorates a method that computes an attribute unless a subclass has its own.
+
+    Unlike a property, it does not stand in the way of a field of the same name.
+    """
+    return _Default(compute)
+
+
+class _Default:
+    def __init__(self, compute: Callable[[Any], Any]):
+        self.compute = compute
+
+    def __get__(self, part: Any, owner: Any = None) -> Any:
+        if part is None:
+            raise AttributeError("found in instances only: it is no default of a field")
+        return self.compute(part)
+
+
+class Condition(NamedTuple):
+    """A condition on the values of an element or a reference: see `Element.conditions`.
+
+    - `holds`: whether it is fulfilled: a bool, or an array of one.
+    - `name`, `expected`: of the message if it is not; `got`: what that message shows.
+    """
+
+    holds: Any
+    name: str
+    expected: str
+    got: tuple[Any, ...]
+
+
+class Part(eqx.Module):
+    """A pytree with declared arrays, conditions on them, and times of jumps."""
+
+    def conditions(self) -> Iterable[Condition]:
+        """Yields conditions beside the bounds of fields; also of traced values."""
+        return ()
+
+    jump_ts = default(lambda self: jumps_of(*(part for _, part in _within(self))))
+
+    def check(self, linkage: Linkage, ts: Array) -> None:
+        """Raises ValueError unless it fits the arm and the times; all values are known.
+
+        By default it runs the checks of the parts within.
+        """
+        for _, part in _within(self):
+            part.check(linkage, ts)
+
+    def possible(self) -> Any:
+        """Returns whether the constructor would accept the values; also if traced."""
+        own = [condition.holds for condition in self.conditions()]
+        fields = [_bounded(value, rules) for _, value, rules in _declared(self)]
+        parts = [part.possible() for _, part in _within(self)]
+        return reduce(and_, [*own, *fields, *parts], True)
+
+    def __check_init__(self):
+        for declared in dataclasses.fields(self):
+            if rule := declared.metadata.get("called"):
+                called_as(declared.name, vars(self)[declared.name], *rule)
+        for name, value, rules in _declared(self):
+            object.__setattr__(self, name, real_array(name, value, **rules))
+        _refuse("", self)
+
+
+def check_values(place: str, part: Part) -> None:
+    """Raises ValueError for known values that constructors would not accept.
+
+    `place`: where the part stands among the arguments, for the message.
+    """
+    for name, value, rules in _declared(part):
+        real_array(f"{place}.{name}", value, **rules)
+    _refuse(f"{place}.", part)
+    for name, inner in _within(part):
+        check_values(f"{place}.{name}", inner)
+
+
+def _refuse(place: str, part: Part) -> None:
+    for holds, name, expected, got in in_numpy(part).conditions():
+        if (known := concrete(holds)) is not None and not known:
+            shown = " and ".join(map(str, got))
+            raise ValueError(f"{place}{name}: expected {expected}, got {shown}.")
+
+
+def _declared(part: Part) -> Iterator[tuple[str, Any, dict[str, Any]]]:
+    """Yields names, values and rules of the declared arrays."""
+    for declared in dataclasses.fields(part):
+        value, about = vars(part)[declared.name], declared.metadata
+        if "rules" in about and not (about["function"] and callable(value)):
+            yield declared.name, value, about["rules"]
+
+
+def _bounded(value: Any, rules: dict[str, Any]) -> Any:
+    holds = abs(value) < np.inf if rules["finite"] else value == value
+    if rules["minimum"] is not None:
+        holds = holds & (value >= rules["minimum"])
+    if rules["above"] is not None:
+        holds = holds & (value > rules["above"])
+    return holds.all()
+
+
+def value_of(part: Part, name: str, *arguments: Any) -> Array:
+    """Returns a declared array, or what the function in its place returns."""
+    value = vars(part)[name]
+    if not callable(value):
+        return value
+    rules = type(part).__dataclass_fields__[name].metadata["rules"]
+    return real_array(name, value(*arguments), **rules)
+
+
+def _within(part: Part) -> Iterator[tuple[str, Part]]:
+    """Yields the fields that are parts, or are called."""
+    if isinstance(part, Foreign):  # its attributes say all
+        return
+    for name, value in vars(part).items():
+        if isinstance(value, Part):
+            yield name, value
+        elif callable(value):
+            yield name, Foreign(value)
+
+
+def jumps_of(*parts: Part) -> Array | None:
+    """Returns all times at which the parts jump, or None."""
+    found = [part.jump_ts for part in parts]
+    times = [jnp.asarray(jumps) for jumps in found if jumps is not None]
+    return jnp.concatenate(times) if times else None
+
+
+def optional(name: str) -> Any:
+    """Returns an attribute of a `Foreign` that is its callable's, or None."""
+    return property(lambda self: getattr(self.called, name, None))
+
+
+class Foreign(Part):
+    """A callable that is no part, and what its attributes say.
+
+    They have the names of a part's, and all are optional: `jump_ts`, `check`,
+    `possible`. Nothing else in the library asks a callable for attributes.
+    """
+
+    called: Any
+
+    jump_ts = optional("jump_ts")
+    _check = optional("check")
+    _possible = optional("possible")
+
+    def __call__(self, *arguments: Any) -> Any:
+        return self.called(*arguments)
+
+    def check(self, linkage, ts):
+        if self._check is not None:
+            self._check(linkage, ts)
+
+    def possible(self):
+        return True if self._possible is None else self._possible()
