@@ -99,9 +99,9 @@ def real_array(
     return jnp.asarray(array, dtype=float)
 
 
-def called_as(name: str, value: Any, expected: str, kind: type = object) -> Any:
-    """Returns `value` if it can be called and is of a kind, or raises ValueError."""
-    if callable(value) and isinstance(value, kind) and not isinstance(value, type):
+def called_as(name: str, value: Any, expected: str) -> Any:
+    """Returns `value` if it can be called and is no class, or raises ValueError."""
+    if callable(value) and not isinstance(value, type):
         return value
     raise ValueError(f"{name}: expected {expected}, got {value!r}.")
 

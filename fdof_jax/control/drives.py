@@ -13,7 +13,7 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from ..checks import real_array
-from ..forces.element import Element, StatefulElement, elements
+from ..forces.element import StatefulElement, element_of
 from ..forces.part import Condition, Values, called, field
 from .pd import PDController
 
@@ -95,16 +95,14 @@ class _Drive(StatefulElement):
 
     def initial_state(self, linkage):
         """The `DriveState` at the start."""
-        return DriveState(self.initial(), self._commander().initial_state(linkage))
+        inner = element_of(self.command).initial_state(linkage)
+        return DriveState(self.initial(), inner)
 
     def __call__(self, t, q, qd, linkage, state):
-        command, inner_rate = self._commander().act(t, q, qd, linkage, state.command)
-        command = real_array("command", command, (3,))
-        effort, rate = self.respond(command, qd, state.own)
+        own, inner = state
+        command, inner_rate = element_of(self.command).act(t, q, qd, linkage, inner)
+        effort, rate = self.respond(real_array("command", command, (3,)), qd, own)
         return effort, DriveState(rate, inner_rate)
-
-    def _commander(self) -> Element:
-        return elements("command", (self.command,))[0]
 
 
 class FirstOrderLag(_Drive):

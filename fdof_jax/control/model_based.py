@@ -22,9 +22,6 @@ class ModelBased(PDController):
     model: Linkage | None = None
 
     def __check_init__(self):
-        self._check_model()
-
-    def _check_model(self) -> None:
         if self.model is None:
             return
         try:
@@ -38,11 +35,11 @@ class ModelBased(PDController):
     def check(self, linkage: Linkage, ts: Array) -> None:
         """Runs the checks of a PD controller, and checks the model and its topology."""
         super().check(linkage, ts)
-        self._check_model()
-        if self.model is not None and not np.array_equal(self.model.ef, linkage.ef):
+        ModelBased.__check_init__(self)
+        if not np.array_equal(self._believed(linkage).ef, linkage.ef):
             raise ValueError(
                 "model: expected the arm's own topology, existence factors "
-                f"{linkage.ef.tolist()}, got {self.model.ef.tolist()}."
+                f"{linkage.ef.tolist()}, got {self._believed(linkage).ef.tolist()}."
             )
 
     def possible(self) -> Array:

@@ -6,9 +6,9 @@ import jax.numpy as jnp
 from jax import Array
 
 from ..forces.element import ScalarElement
-from ..forces.part import Values, field
+from ..forces.part import Values, called, field
 from ..linkage.linkage import Linkage
-from .reference import follows, reference_motion
+from .reference import EXPECTED, reference_motion
 
 
 class PDController(ScalarElement):
@@ -40,7 +40,7 @@ class PDController(ScalarElement):
     kp: Values = field(unit="N/m or N m/rad", minimum=0)
     kd: Values = field(unit="N s/m or N m s/rad", minimum=0)
     limit: Values = field(unit="N or N m", minimum=0, finite=False)
-    reference: Any = follows()
+    reference: Any = called(EXPECTED)
 
     # Units of (kp, kd) by the kind of joint.
     gain_units: ClassVar = {"R": ("N m/rad", "N m s/rad"), "P": ("N/m", "N s/m")}

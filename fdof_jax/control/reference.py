@@ -1,6 +1,5 @@
 """References of controllers, and whether an arm can reach them."""
 
-from abc import abstractmethod
 from typing import Any
 
 import equinox as eqx
@@ -8,15 +7,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
 from ..checks import called_as, is_traced, real_array
-from ..forces.part import Foreign, Part, called, default, optional
+from ..forces.part import Foreign, Part, default, optional
 from ..linkage.linkage import Linkage, check_linkage
 from ..xla.array_namespace import in_numpy
 
-_EXPECTED = "a callable (t, linkage) -> (q, qd), for instance CircleTask()"
+EXPECTED = "a callable (t, linkage) -> (q, qd), for instance CircleTask()"
 
 
 class Reference(Part):
@@ -24,8 +23,10 @@ class Reference(Part):
 
     Positions and velocities have shape (3,) [m or rad; m/s or rad/s]. Wherever a
     reference is expected, other callables are accepted, such as plain functions. A
-    subclass implements `__call__`; all else has a default:
+    subclass implements `__call__`, or `assembly`; all else has a default:
 
+    - `assembly(t, linkage)`: positions, and a root that is 0 at the edge of the reach.
+      The velocities are the positions' rates.
     - `jump_ts`: times at which the motion jumps; steps end there [s].
     - `check(linkage, ts)`: raises ValueError if the arm cannot follow.
     - `tip(t)`: the commanded position of the tip (2,) [m]; by default None.
@@ -40,21 +41,20 @@ class Reference(Part):
     >>> stand = fj.PDController(kp=100, kd=10, limit=30, reference=Stand(0.5))
     """
 
-    @abstractmethod
-    def __call__(self, t: Array, linkage: Linkage) -> tuple[Array, Array]:
-        """Joint positions [m or rad] and velocities [m/s or rad/s] at time `t` [s]."""
+    def assembly(self, t: Any, linkage: Linkage) -> tuple[Any, Any]:
+        raise NotImplementedError(f"{type(self).__name__} has no `__call__`")
 
     tip = default(lambda self: None)
     period = default(lambda self: None)
+    evaluates_in_numpy = default(lambda self: False)  # of `assembly`
 
-    @property
-    def evaluates_in_numpy(self) -> bool:
-        """Returns whether `assembly` runs in NumPy; a subclass may not."""
-        return False
-
-    def assembly(self, t: Any, linkage: Linkage) -> tuple[Any, Any]:
-        """Joint positions, and a root that is 0 at the edge of the reach."""
-        raise NotImplementedError  # only called if it `evaluates_in_numpy`
+    def __call__(
+        self, t: ArrayLike, linkage: Linkage
+    ) -> tuple[Float[Array, " joint"], Float[Array, " joint"]]:
+        """Joint positions [m or rad] and velocities [m/s or rad/s] at time `t` [s]."""
+        t = real_array("t", t, ())
+        positions = lambda t: self.assembly(t, linkage)[0]
+        return jax.jvp(positions, (t,), (jnp.ones_like(t),))
 
 
 class ForeignReference(Foreign, Reference):
@@ -64,16 +64,11 @@ class ForeignReference(Foreign, Reference):
     period = optional("period")
 
 
-def follows() -> Any:
-    """Declares the field of a reference."""
-    return called(_EXPECTED)
-
-
 def reference_of(value: Any) -> Reference:
     """Returns a callable as a reference, or raises ValueError."""
     if isinstance(value, Reference):
         return value
-    return ForeignReference(called_as("reference", value, _EXPECTED))
+    return ForeignReference(called_as("reference", value, EXPECTED))
 
 
 def reference_motion(reference: Any, t: Array, linkage: Linkage) -> tuple[Array, Array]:

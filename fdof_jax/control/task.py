@@ -3,14 +3,13 @@
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from ..checks import instance, real_array
-from ..forces.part import Condition, Values, called, field
+from ..checks import real_array
+from ..forces.part import Condition, Values, called, field, of_kind
 from ..linkage.linkage import Linkage
 from ..mechanics.inverse_kinematics import (
     known_directions,
@@ -40,9 +39,9 @@ class JointMove(Reference):
     ([0.5, 1.0, 1.5], [0.938, 1.875, 2.812])
     """
 
-    start: Values = field(unit="m or rad", broadcast=False)
-    end: Values = field(unit="m or rad", broadcast=False)
-    travel: Travel = called("a Travel", Travel)
+    start: Values = field((3,), unit="m or rad")
+    end: Values = field((3,), unit="m or rad")
+    travel: Travel = of_kind(Travel)
 
     @property
     def evaluates_in_numpy(self) -> bool:
@@ -53,14 +52,6 @@ class JointMove(Reference):
         """Joint positions, and 1 as the root: a joint move has no edge of a reach."""
         share = self.travel(t)[..., None]
         return self.start + share * (self.end - self.start), 1.0
-
-    def __call__(
-        self, t: ArrayLike, linkage: Linkage
-    ) -> tuple[Float[Array, " joint"], Float[Array, " joint"]]:
-        """Joint positions [m or rad] and velocities [m/s or rad/s] at time `t` [s]."""
-        t = real_array("t", t, ())
-        positions = lambda t: self.assembly(t, linkage)[0]
-        return jax.jvp(positions, (t,), (jnp.ones_like(t),))
 
 
 class TipTask(Reference):
@@ -90,13 +81,10 @@ class TipTask(Reference):
     [-3.5, 2.0]
     """
 
-    path: Path
+    path: Path = of_kind(Path)
     timing: Any = called("a Travel or Laps")
     orientation: Values = field((), unit="rad", default=0.0, kw_only=True)
     branch: Values = field((), unit="", default=1, kw_only=True)
-
-    def __check_init__(self):
-        instance("path", self.path, Path)
 
     def conditions(self):
         yield Condition(abs(self.branch) == 1, "branch", "1 or -1", (self.branch,))
@@ -135,14 +123,6 @@ class TipTask(Reference):
             linkage, directions, wrist, bearing, self.orientation, self.branch
         )
         return q, root, beside
-
-    def __call__(
-        self, t: ArrayLike, linkage: Linkage
-    ) -> tuple[Float[Array, " joint"], Float[Array, " joint"]]:
-        """Joint positions [m or rad] and velocities [m/s or rad/s] at time `t` [s]."""
-        t = real_array("t", t, ())
-        positions = lambda t: self.assembly(t, linkage)[0]
-        return jax.jvp(positions, (t,), (jnp.ones_like(t),))
 
     def check(self, linkage: Linkage, ts: Array) -> None:
         """Raises ValueError if the tip leaves the reach or the wrist's angle jumps.

@@ -10,7 +10,7 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from ..checks import concrete, one_of, real_array
+from ..checks import concrete, instance, one_of, real_array
 from ..forces.part import Condition, Part, Values, field
 from ..xla.array_namespace import namespace
 
@@ -125,8 +125,7 @@ def shock_against(travel: Travel, frequency: ArrayLike) -> Float[Array, ""]:
     >>> float(fj.shock_against(travel, frequency=8.0))
     2.934
     """
-    if not isinstance(travel, Travel):
-        raise ValueError(f"travel: expected a Travel, got {travel!r}.")
+    instance("travel", travel, Travel)
     frequency = real_array("frequency", frequency, (), above=0)
     turn = frequency * travel.duration
     if (angle := concrete(turn)) is not None and angle > _MOST_TURN:

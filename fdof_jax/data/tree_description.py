@@ -6,6 +6,7 @@ those of the caller.
 
 import dataclasses
 import importlib
+import inspect
 import struct
 import types
 from collections.abc import Callable, Sequence
@@ -74,7 +75,8 @@ def _class(name: str, classes: Sequence[type]) -> Any:
         found = vars(diffrax).get(qualname)
         if isinstance(found, _EnumerationMeta):
             return found
-    if _is_ours(module) and isinstance(found := _of_the_library(qualname), type):
+    found = _of_the_library(qualname) if _is_ours(module) else None
+    if isinstance(found, type) and not inspect.isabstract(found):
         return found
     same = [c for c in classes if _name(c) == name]
     # The module of a class is __main__ only while the script that defines it runs.

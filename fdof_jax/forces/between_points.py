@@ -1,7 +1,6 @@
 """Force elements at points of links: springs, constant forces, wrenches."""
 
 from abc import abstractmethod
-from collections.abc import Callable
 from functools import reduce
 from operator import add
 from typing import Any
@@ -11,12 +10,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jaxtyping import Bool, Int
+from jaxtyping import Int
 from numpy.typing import ArrayLike
 
 from ..checks import instance
 from ..linkage.linkage import Linkage
-from .part import Values, field, value_of
+from .part import Values, field, of_kind, value_of
 from .points import (
     Load,
     Point,
@@ -150,6 +149,11 @@ class Tension(LineElement):
         return self.tension * self.ends.length(linkage, q)
 
 
+def _flag(follows: Any) -> Array:
+    instance("follows", follows, bool)
+    return jax.device_put(np.array(follows))
+
+
 class Wrench(PointElement):
     """An external force and moment on a point of a link.
 
@@ -169,24 +173,10 @@ class Wrench(PointElement):
     [31.0, 21.0, 11.0]
     """
 
-    point: Point
-    follows: Bool[Array, ""]
-    force: Any = field((2,), unit="N", function=True)
-    moment: Any = field((), unit="N m", function=True)
-
-    def __init__(
-        self,
-        point: Point,
-        force: ArrayLike | Callable[[Array], ArrayLike] = (0.0, 0.0),
-        moment: ArrayLike | Callable[[Array], ArrayLike] = 0.0,
-        *,
-        follows: bool = False,
-    ):
-        instance("point", point, Point)
-        self.point = point
-        self.force, self.moment = force, moment
-        instance("follows", follows, bool)
-        self.follows = jax.device_put(np.array(follows))
+    point: Point = of_kind(Point)
+    force: Any = field((2,), unit="N", function=True, default=(0.0, 0.0))
+    moment: Any = field((), unit="N m", function=True, default=0.0)
+    follows: bool | Array = eqx.field(converter=_flag, default=False, kw_only=True)
 
     def schedule(self, t, linkage):
         """Returns the force and the moment at a time."""

@@ -58,7 +58,7 @@ finite, at least 0 (or one number for all), got -1.
 
     def schedule(self, t: Array, linkage: Linkage) -> Any:
         """Computes what depends on time alone, for all stages of a step at once."""
-        return t
+        return ()
 
     def initial_state(self, linkage: Linkage) -> Any:
         """Returns the state at the start: an array or a pytree of arrays."""
@@ -100,15 +100,17 @@ class _Opened(ForeignElement):
         return self.closed(*arguments)
 
 
+def element_of(value: Any) -> Element:
+    """Returns a callable as an element."""
+    return value if isinstance(value, Element) else ForeignElement(value)
+
+
 def elements(name: str, forces: Any) -> tuple[Element, ...]:
     """Returns a tuple of callables as elements, or raises ValueError."""
     if isinstance(forces, tuple) and all(
         callable(item) and not isinstance(item, type) for item in forces
     ):
-        return tuple(
-            item if isinstance(item, Element) else ForeignElement(item)
-            for item in forces
-        )
+        return tuple(map(element_of, forces))
     raise ValueError(
         f"{name}: expected a tuple of callables (t, q, qd, linkage) -> tau, for "
         f"instance (JointDamper(1.0),), got {forces!r}."
@@ -120,10 +122,6 @@ class ScalarElement(Element):
 
     A subclass implements `respond`, and `schedule` if anything in it depends on time.
     """
-
-    def schedule(self, t: Array, linkage: Linkage) -> Any:
-        """Computes what depends on time alone, for all stages of a step at once."""
-        return ()
 
     @abstractmethod
     def respond(

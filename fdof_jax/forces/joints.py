@@ -44,7 +44,7 @@ class JointEffort(ScalarElement):
     [58.86, 29.43, 9.81]
     """
 
-    tau: Values = field(unit="N or N m", broadcast=False)
+    tau: Values = field((3,), unit="N or N m")
 
     def respond(self, scheduled, q, qd, linkage):
         return tuple(self.tau)

@@ -18,7 +18,7 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
-from ..checks import called_as, concrete, real_array
+from ..checks import called_as, concrete, instance, real_array
 from ..linkage.linkage import Linkage
 from ..xla.array_namespace import in_numpy
 
@@ -34,13 +34,12 @@ else:
 
 
 def field(
-    shape: tuple[int | None, ...] = (3,),
+    shape: tuple[int | None, ...] | None = None,
     *,
     unit: str,
     minimum: float | None = None,
     above: float | None = None,
     finite: bool = True,
-    broadcast: bool | None = None,
     function: bool = False,
     default: Any = dataclasses.MISSING,
     kw_only: bool = False,
@@ -52,37 +51,28 @@ def field(
 
     **Arguments:**
 
-    - `shape`: by default one number per joint; `None` stands for any length.
+    - `shape`: by default one number per joint, or one for all; `None` within it stands
+      for any length.
     - `unit`: for messages, for instance "N m s/rad".
     - `minimum`, `above`: bounds; `finite`: whether infinities are refused.
-    - `broadcast`: whether one number for all entries is accepted, as it is by default
-      for one number per joint.
     - `function`: whether a function that returns such an array is accepted.
     - `default`, `kw_only`: as of `dataclasses.field`.
-
-    >>> import fdof_jax as fj
-    >>> class Drag(fj.Element):
-    ...     coefficient: fj.Values = fj.field(unit="N m s^2/rad^2", minimum=0)
-    ...     def __call__(self, t, q, qd, linkage):
-    ...         return -self.coefficient * abs(qd) * qd
-    >>> Drag(2).coefficient.tolist()
-    [2.0, 2.0, 2.0]
     """
-    rules = dict(
-        shape=shape,
-        unit=unit,
-        minimum=minimum,
-        above=above,
-        finite=finite,
-        broadcast=shape == (3,) if broadcast is None else broadcast,
-    )
+    per_joint = shape is None
+    rules = dict(shape=(3,) if per_joint else shape, broadcast=per_joint, unit=unit)
+    rules |= dict(minimum=minimum, above=above, finite=finite)
     about = {"rules": rules, "function": function}
     return dataclasses.field(default=default, kw_only=kw_only, metadata=about)
 
 
-def called(expected: str, kind: type = object) -> Any:
+def called(expected: str) -> Any:
     """Declares a field that is called, and says in words what is expected there."""
-    return dataclasses.field(metadata={"called": (expected, kind)})
+    return dataclasses.field(metadata={"called": expected})
+
+
+def of_kind(kind: type) -> Any:
+    """Declares a field that is an instance of a class."""
+    return dataclasses.field(metadata={"kind": kind})
 
 
 def default(compute: Callable[[Any], Any]) -> Any:
@@ -142,8 +132,11 @@ class Part(eqx.Module):
 
     def __check_init__(self):
         for declared in dataclasses.fields(self):
-            if rule := declared.metadata.get("called"):
-                called_as(declared.name, vars(self)[declared.name], *rule)
+            name, about = declared.name, declared.metadata
+            if "called" in about:
+                called_as(name, vars(self)[name], about["called"])
+            if "kind" in about:
+                instance(name, vars(self)[name], about["kind"])
         for name, value, rules in _declared(self):
             object.__setattr__(self, name, real_array(name, value, **rules))
         _refuse("", self)
@@ -201,7 +194,7 @@ def _within(part: Part) -> Iterator[tuple[str, Part]]:
     for name, value in vars(part).items():
         if isinstance(value, Part):
             yield name, value
-        elif callable(value):
+        elif callable(value) and not isinstance(value, type):
             yield name, Foreign(value)
 
 
@@ -212,9 +205,9 @@ def jumps_of(*parts: Part) -> Array | None:
     return jnp.concatenate(times) if times else None
 
 
-def optional(name: str) -> Any:
-    """Returns an attribute of a `Foreign` that is its callable's, or None."""
-    return property(lambda self: getattr(self.called, name, None))
+def optional(name: str, absent: Any = None) -> Any:
+    """Returns an attribute of a `Foreign` that its callable may have."""
+    return property(lambda self: getattr(self.called, name, absent))
 
 
 class Foreign(Part):
@@ -227,15 +220,8 @@ class Foreign(Part):
     called: Any
 
     jump_ts = optional("jump_ts")
-    _check = optional("check")
-    _possible = optional("possible")
+    check = optional("check", lambda linkage, ts: None)
+    possible = optional("possible", lambda: True)
 
     def __call__(self, *arguments: Any) -> Any:
         return self.called(*arguments)
-
-    def check(self, linkage, ts):
-        if self._check is not None:
-            self._check(linkage, ts)
-
-    def possible(self):
-        return True if self._possible is None else self._possible()

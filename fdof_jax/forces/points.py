@@ -14,15 +14,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jaxtyping import Complex, Float, Int
+from jaxtyping import Complex, Float
 from numpy.typing import ArrayLike
 
-from ..checks import instance, real_array, whole_number
+from ..checks import real_array, whole_number
 from ..linkage.coordinates import real_joints
 from ..linkage.linkage import Linkage
 from ..mechanics.equations import Scalars
 from ..xla.trigonometry import sincos
 from .element import ScalarElement
+from .part import Part, Values, field, of_kind
 
 
 class Frames(NamedTuple):
@@ -74,7 +75,15 @@ def pick(link: Array, choices: list[Array]) -> Array:
     return chosen
 
 
-class Point(eqx.Module):
+def _link(link: Any) -> Array:
+    if whole_number("link", link, 0) > 3:
+        raise ValueError(
+            f"link: expected 0 (the ground) or a moving link, 1 to 3, got {link!r}."
+        )
+    return jax.device_put(np.array(link))
+
+
+class Point(Part):
     """A point of a link or of the ground.
 
     **Arguments:**
@@ -93,18 +102,9 @@ class Point(eqx.Module):
     [1.0, 0.5]
     """
 
-    link: Int[Array, ""]
-    along: Float[Array, ""]
-    across: Float[Array, ""]
-
-    def __init__(self, link: int, along: ArrayLike = 0.0, across: ArrayLike = 0.0):
-        if whole_number("link", link, 0) > 3:
-            raise ValueError(
-                f"link: expected 0 (the ground) or a moving link, 1 to 3, got {link!r}."
-            )
-        self.link = jax.device_put(np.array(link))
-        self.along = real_array("along", along, ())
-        self.across = real_array("across", across, ())
+    link: Any = eqx.field(converter=_link)
+    along: Values = field((), unit="m", default=0.0)
+    across: Values = field((), unit="m", default=0.0)
 
     def position(self, linkage: Linkage, q: ArrayLike) -> Float[Array, " 2"]:
         """Computes the point's position (x, y) from the ground pivot [m]."""
@@ -180,16 +180,11 @@ class PointElement(ScalarElement):
         return self.loads(self.schedule(t, linkage), frames, tuple(qd))
 
 
-class Separation(eqx.Module):
+class Separation(Part):
     """Two points and the line between them."""
 
-    a: Point
-    b: Point
-
-    def __init__(self, a: Point, b: Point):
-        instance("a", a, Point)
-        instance("b", b, Point)
-        self.a, self.b = a, b
+    a: Point = of_kind(Point)
+    b: Point = of_kind(Point)
 
     def vector(self, frames: Frames) -> Complex[Array, ""]:
         """Returns the vector from `a` to `b` [m]."""

@@ -30,7 +30,7 @@ class Args(NamedTuple):
 
 @with_checks
 def schedule_of(t: Array, args: Args) -> tuple[Any, ...]:
-    """Returns each element's schedule, or the time for elements without one."""
+    """Returns each element's schedule."""
     return tuple(element.schedule(t, args.linkage) for element in args.forces)
 
 

@@ -12,9 +12,10 @@ import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float
 
-from ..control.reference import follows, positions_at, reference_motion
+from ..control.reference import EXPECTED, positions_at, reference_motion
 from ..dynamics import mass_and_bias
 from ..forces.element import Element, Forces
+from ..forces.part import called
 from ..linkage.linkage import Linkage
 from ..mechanics.equations import equations, zeros
 from ..xla.array_namespace import in_numpy
@@ -43,7 +44,7 @@ class PrescribedMotion(Element):
     """
 
     moved: Bool[Array, " joint"]
-    reference: Any = follows()
+    reference: Any = called(EXPECTED)
 
     def __init__(self, joints: int | tuple[int, ...], reference: Any):
         numbers = joints if isinstance(joints, tuple) else (joints,)

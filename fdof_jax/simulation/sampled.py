@@ -11,7 +11,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from ..checks import called_as, concrete, real_array, whole_number
-from ..forces.element import Forces, ScalarElement, elements
+from ..forces.element import Forces, ScalarElement, element_of, elements
 from ..forces.joints import JointEffort
 from ..linkage.coordinates import State, real_state
 from ..linkage.linkage import Linkage, check_linkage
@@ -139,8 +139,8 @@ def simulate_sampled(
     """
     check_linkage(linkage)
     forces = elements("forces", forces)
-    called_as("control", control, "a callable (t, q, qd, linkage) -> tau")
-    (control,) = elements("control", (control,))
+    control = called_as("control", control, "a callable (t, q, qd, linkage) -> tau")
+    control = element_of(control)
     period = real_array("period", period, (), above=0)
     t0 = real_array("t0", t0, ())
     whole_number("samples", samples, 1)

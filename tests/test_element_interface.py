@@ -1,0 +1,157 @@
+"""The base of elements and references: declared values, conditions, jumps, adapters."""
+
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from elements import PD, Hold, arm
+
+import fdof_jax as fj
+from fdof_jax.forces.element import elements
+from fdof_jax.simulation.simulate import check_elements
+
+ARM, TS = arm("RRR"), jnp.array([0.0, 1.0])
+
+
+class Pulse(fj.Element):
+    """A torque between two times: a field as times of jumps, and a condition on it."""
+
+    jump_ts: fj.Values = fj.field((2,), unit="s")
+    torque: fj.Values = fj.field((), unit="N m", minimum=0)
+
+    def conditions(self):
+        begin, end = self.jump_ts
+        yield fj.Condition(begin < end, "jump_ts", "increasing times", (begin, end))
+
+    def __call__(self, t, q, qd, linkage):
+        on = (t >= self.jump_ts[0]) & (t < self.jump_ts[1])
+        return jnp.where(on, self.torque, 0.0) * jnp.array([1.0, 0.0, 0.0])
+
+
+def moved(element, where, value):
+    return eqx.tree_at(where, element, jnp.asarray(value, float))
+
+
+def test_a_fault_is_told_by_constructor_door_and_program():
+    pulse = Pulse([0.1, 0.2], 3)
+    assert pulse.torque.dtype == float and pulse.possible()
+    for times, torque, words in (
+        ([0.2, 0.1], 3, "jump_ts: expected increasing times, got 0.2 and 0.1"),
+        (
+            [0.1, 0.2],
+            -1,
+            r"torque: expected a real number \[N m\], .*at least 0, got -1",
+        ),
+        ([0.1, 0.2], np.nan, "torque: expected a real number"),
+    ):
+        with pytest.raises(ValueError, match="^" + words):
+            Pulse(times, torque)
+        spoilt = moved(
+            moved(pulse, lambda p: p.jump_ts, times), lambda p: p.torque, torque
+        )
+        with pytest.raises(ValueError, match=r"^forces\[1\]\." + words):
+            check_elements((fj.JointDamper(1.0), spoilt), ARM, TS)
+        assert not jax.jit(lambda p: p.possible())(spoilt)
+        jax.jit(Pulse)(jnp.array(times), jnp.array(torque))  # unknown: not refused
+
+
+def test_every_element_tells_a_program_what_is_impossible():
+    effort = fj.JointEffort([1.0, 2.0, 3.0])
+    assert effort.possible()
+    assert not moved(effort, lambda e: e.tau, [1.0, np.inf, 3.0]).possible()
+
+
+def test_a_fault_within_is_told_with_its_place():
+    lag = fj.FirstOrderLag(fj.SpeedLimit(PD, 1.0, 2.0), 0.1)
+    spoilt = eqx.tree_at(lambda e: e.command.command.kp, lag, -PD.kp)
+    with pytest.raises(
+        ValueError, match=r"^forces\[0\]\.command\.command\.kp: expected"
+    ):
+        check_elements((spoilt,), ARM, TS)
+    assert lag.possible() and not spoilt.possible()
+
+
+def test_jumps_are_passed_on():
+    travel = fj.Travel(2.0, begin=1.0)
+    move = fj.JointMove([0, 0, 0], [1, 1, 1], travel)
+    pd = fj.PDController(1.0, 1.0, 1.0, move)
+    path = fj.TipTask(fj.Line([1, 0], [1, 1]), travel)
+    drive = fj.FirstOrderLag(pd, 0.1)
+    for part in (travel, move, path, pd, drive, fj.PrescribedMotion(1, move)):
+        np.testing.assert_array_equal(part.jump_ts, [1, 3])
+    assert PD.jump_ts is None and fj.JointDamper(1.0).jump_ts is None
+
+
+class Foreign(eqx.Module):
+    """A callable with the attributes that version 0.1 read."""
+
+    jump_ts: jax.Array
+    size: jax.Array
+
+    def __call__(self, t, q, qd, linkage):
+        return -self.size * q
+
+    def check(self, linkage, ts):
+        if self.size > 5:
+            raise ValueError("size: too much")
+
+    def possible(self):
+        return self.size >= 0
+
+    def potential_energy(self, q, linkage):
+        return self.size * jnp.sum(q**2) / 2
+
+
+def test_attributes_of_other_callables_count():
+    (element,) = elements("forces", (Foreign(TS, jnp.array(1.0)),))
+    assert isinstance(element, fj.Element) and element.possible()
+    np.testing.assert_array_equal(element.jump_ts, TS)
+    assert elements("forces", (element, PD)) == (element, PD)  # adapted once
+    for size, words in (
+        (9.0, "^size: too much"),
+        (-1.0, r"^forces\[0\]: expected values"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            check_elements((Foreign(TS, jnp.array(size)),), ARM, TS)
+    q = jnp.array([1.0, 2.0, 2.0])
+    with_spring = fj.energy(ARM, q, 0 * q, (Foreign(TS, jnp.array(2.0)),))
+    np.testing.assert_allclose(with_spring[1] - fj.energy(ARM, q, 0 * q)[1], 9.0)
+    drive = fj.SpeedLimit(Foreign(TS, jnp.array(1.0)), 1.0, 2.0)
+    np.testing.assert_array_equal(drive.jump_ts, TS)
+
+
+def test_a_function_in_place_of_an_array_is_checked_where_it_is_called():
+    wrench = fj.Wrench(fj.Point(3, 1.0), lambda t: jnp.zeros(3))
+    with pytest.raises(ValueError, match="^force: expected an array of 2 real numbers"):
+        wrench(0.0, jnp.zeros(3), jnp.zeros(3), ARM)
+    with pytest.raises(ValueError, match="^stiffness: expected"):
+        fj.SpringDamper(fj.Point(0), fj.Point(1), stiffness=lambda t: 1.0)
+
+
+def test_a_reference_of_one_s_own():
+    """Its velocities are the rates of its positions."""
+
+    class Parabola(fj.Reference):
+        bend: fj.Values = fj.field(unit="rad/s^2")
+
+        def assembly(self, t, linkage):
+            return self.bend * t**2, 1.0
+
+    q, qd = Parabola(3)(2.0, ARM)
+    assert (q.tolist(), qd.tolist()) == ([12.0] * 3, [12.0] * 3)
+    assert Parabola(3).tip is None and fj.CircleTask().tip is not None
+    assert fj.PDController(1.0, 1.0, 1.0, Hold(q)).jump_ts is None
+
+
+def test_nothing_else_is_asked_for_attributes():
+    """Only the adapter asks; saved trees are read by the names of their fields."""
+    folder = Path(fj.__file__).parent
+    asking = {
+        path.relative_to(folder).as_posix()
+        for path in folder.rglob("*.py")
+        if "hasattr(" in path.read_text() or "getattr(" in path.read_text()
+    }
+    assert asking == {"forces/part.py", "data/tree_description.py"}
