@@ -54,14 +54,14 @@ def real_array(
     def refuse(got: str) -> ValueError:
         size = "x".join("n" if n is None else str(n) for n in shape)
         expected = f"an array of {size} real numbers" if shape else "a real number"
-        if unit:
-            expected += f" [{unit}]"
         if finite:
             expected += ", all finite" if shape else ", finite"
         if minimum is not None:
             expected += f", at least {minimum:g}"
         if above is not None:
             expected += f", above {above:g}"
+        if unit:
+            expected += f" [{unit}]"
         if broadcast and shape:
             expected += " (or one number for all)"
         return ValueError(f"{name}: expected {expected}, got {got}.")

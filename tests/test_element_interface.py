@@ -43,7 +43,7 @@ def test_a_fault_is_told_by_constructor_door_and_program():
         (
             [0.1, 0.2],
             -1,
-            r"torque: expected a real number \[N m\], .*at least 0, got -1",
+            r"torque: expected a real number, .*at least 0 \[N m\], got -1",
         ),
         ([0.1, 0.2], np.nan, "torque: expected a real number"),
     ):

@@ -46,8 +46,8 @@ class Element(Part):
     ...         return -self.coefficient * abs(qd) * qd
     >>> Drag(-1)
     Traceback (most recent call last):
-    ValueError: coefficient: expected an array of 3 real numbers [N m s^2/rad^2], all \
-finite, at least 0 (or one number for all), got -1.
+    ValueError: coefficient: expected an array of 3 real numbers, all finite, at least \
+0 [N m s^2/rad^2] (or one number for all), got -1.
     """
 
     @abstractmethod
