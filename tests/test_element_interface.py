@@ -123,6 +123,24 @@ def test_attributes_of_other_callables_count():
     np.testing.assert_array_equal(drive.jump_ts, TS)
 
 
+def test_an_opened_function_keeps_its_jumps():
+    """Reverse mode opens closures, for derivatives in what they hold."""
+
+    def found(level):
+        def pushed(t, q, qd, linkage):
+            return level * jnp.where(t < 1, q, qd)
+
+        pushed.jump_ts = jnp.array([1.0])
+        (element,) = elements("forces", (pushed,))
+        at = jnp.array(0.0), jnp.ones(3), jnp.zeros(3), ARM
+        opened = element.opened(*at)
+        np.testing.assert_array_equal(opened.jump_ts, [1.0])
+        assert any(leaf is level for leaf in jax.tree.leaves(opened))
+        return jnp.sum(opened(*at))
+
+    assert jax.grad(found)(2.0) == 3.0
+
+
 def test_a_function_in_place_of_an_array_is_checked_where_it_is_called():
     wrench = fj.Wrench(fj.Point(3, 1.0), lambda t: jnp.zeros(3))
     with pytest.raises(ValueError, match="^force: expected an array of 2 real numbers"):
