@@ -5,6 +5,7 @@ import importlib
 import inspect
 import json
 import pickle
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -14,6 +15,7 @@ import pytest
 import fdof_jax as fj
 
 FOLDER = Path(fj.__file__).parent
+ROOT = Path(__file__).parents[1]
 
 
 def test_names():
@@ -110,3 +112,13 @@ def test_simulation_imports_neither_pictures_nor_searches():
     modules = imported("import fdof_jax as fj; fj.simulate, fj.sweep, fj.scenes")
     assert "diffrax" in modules
     assert not modules & {"matplotlib", "optax", "scipy"}
+
+
+def test_versions_agree_wherever_they_are_written():
+    assert f"\nversion: {fj.__version__}\n" in (ROOT / "CITATION.cff").read_text()
+    project = (ROOT / "pyproject.toml").read_text()
+    hooks = (ROOT / ".pre-commit-config.yaml").read_text()
+    ruff = re.search(r"ruff-pre-commit\s+rev: v(\S+)", hooks)[1]
+    basedpyright = re.search(r"basedpyright==([\d.]+)", hooks)[1]
+    assert f'"ruff=={ruff}"' in project
+    assert f'"basedpyright=={basedpyright}"' in project
