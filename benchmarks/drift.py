@@ -1,7 +1,8 @@
 """Long runs: the energy drift of Fig 5 over 1000 s against the time spent.
 
-Double precision follows this chaotic motion for 25 s; beyond, energy is what can be
-judged. It is zero; the defect is the largest |E| [J] at a thousand output times.
+Double precision follows this chaotic motion for 25 s; beyond, only the energy can be
+judged. The exact energy is zero; the defect is the largest |E| [J] at a thousand output
+times.
 """
 
 from collections.abc import Iterator

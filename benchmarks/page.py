@@ -17,7 +17,7 @@ def _solvers(points: list[dict]) -> list[str]:
 
 
 def _read_off(points: list[dict], to_value: Callable, sign: str) -> list[str]:
-    """A cell per target error; `sign` marks bounds: no looser point was measured."""
+    """Returns a cell per target error; `sign` marks bounds without looser points."""
     cells = []
     loosest = max((p["error"] for p in points if p["times"]), default=0)
     for target in TARGETS:
@@ -291,7 +291,7 @@ def sliders(points: list[dict]) -> str:
 
 
 def _machine(points: dict[str, list[dict]]) -> str:
-    """A line per machine and set of versions: which jobs ran there, at which commit."""
+    """Returns a line per machine and versions, with the jobs and their commits."""
     jobs: dict[str, dict[str, set[str]]] = {}
     for name, job in points.items():
         for point in job:
@@ -318,7 +318,7 @@ def _gpu(points: list[dict]) -> str:
 
 
 def tables(points: dict[str, list[dict]]) -> dict[str, str]:
-    """Text by name, for what has been measured."""
+    """Returns the text of each table that has been measured, by name."""
     makers = {
         "batches": batches,
         "batches-xla-flags": batches,
@@ -352,7 +352,7 @@ def tables(points: dict[str, list[dict]]) -> dict[str, str]:
 
 
 def filled(page: str, texts: dict[str, str]) -> str:
-    """The page with each text between its pair of markers."""
+    """Returns the page with each text between its pair of markers."""
     for name, text in texts.items():
         begin, end = f"<!-- begin: {name} -->", f"<!-- end: {name} -->"
         between = re.compile(re.escape(begin) + ".*?" + re.escape(end), re.DOTALL)

@@ -1,4 +1,4 @@
-"""One protocol in a process of its own: pinned to cores before JAX starts threads."""
+"""Runs one protocol in its own process, pinned to cores before JAX has threads."""
 
 import argparse
 import importlib
@@ -15,7 +15,7 @@ TWO_DEVICES = "--xla_force_host_platform_device_count=2"
 
 
 class Job(NamedTuple):
-    """What a process measures: a function of a module, on how many cores."""
+    """A measurement of a process: a function of a module, and a number of cores."""
 
     name: str
     module: str
@@ -58,7 +58,7 @@ JOBS = (
 
 
 def _plain(value: Any) -> Any:
-    """Valid JSON: NumPy numbers as numbers, NaN and infinity as null."""
+    """Returns valid JSON: NumPy numbers as numbers, NaN and infinity as null."""
     if isinstance(value, dict):
         return {str(k): _plain(v) for k, v in value.items()}
     if isinstance(value, list | tuple):

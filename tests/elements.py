@@ -26,7 +26,7 @@ HOOK, ELBOW, TIP = fj.Point(0, 0.3, -0.4), fj.Point(2, 0.5, 0.2), fj.Point(3, 0.
 
 
 class Swing(eqx.Module):
-    """A reference without jumps, which any step size controller takes."""
+    """A reference without jumps, which every step size controller accepts."""
 
     amplitude: jax.Array
 

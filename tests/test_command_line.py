@@ -1,4 +1,4 @@
-"""The commands run as a user would call them, and write what they say."""
+"""The commands run as a user calls them; their output and pictures are checked."""
 
 import json
 import os
@@ -66,7 +66,7 @@ def test_topologies_start_alike():
 
 
 def kept_gains(printed):
-    """Tuned kp and kd of a printed table."""
+    """Returns the tuned kp and kd from a printed table."""
     lines = [
         line.split() for line in printed.splitlines() if line[:4] in ("kp o", "kd o")
     ]
@@ -157,7 +157,7 @@ print(json.dumps({asked: answer(asked) for asked in json.loads(sys.argv[1])}))
 
 @pytest.fixture(scope="module")
 def answers(tmp_path_factory):
-    """All answers of one process: what one of them imports, the next ones show too."""
+    """Returns the answers of one process; an import by one shows in all later ones."""
     folder = tmp_path_factory.mktemp("command_line")
     (folder / "file").write_text("not a folder")
     (folder / "sealed").mkdir(mode=0o555)

@@ -1,4 +1,4 @@
-"""What `configure` sets, refuses and warns of."""
+"""The settings, errors and warnings of `configure`."""
 
 import json
 import os

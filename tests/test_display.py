@@ -1,4 +1,4 @@
-"""What a notebook or a prompt shows of an object: few words, no traced values."""
+"""Objects display in few words in a notebook or at a prompt, without traced values."""
 
 import xml.etree.ElementTree as xml
 
@@ -13,7 +13,7 @@ import fdof_jax as fj
 
 
 def cells(html: str) -> list[list[str | None]]:
-    """Of the tables in it."""
+    """Returns the cells of the tables in a page."""
     return [[cell.text for cell in row] for row in xml.fromstring(html).iter("tr")]
 
 

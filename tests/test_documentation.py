@@ -98,7 +98,7 @@ RETURNED_BY = {
 
 
 def examples():
-    """All code that tests run as examples: doctests, and the blocks of the guides."""
+    """Returns all code that tests run as examples: doctests and blocks of guides."""
     sources = (ROOT / "fdof_jax").rglob("*.py")
     lines = [
         re.findall(r"^ *(?:>>>|\.\.\.) (.*)", p.read_text(), re.M) for p in sources

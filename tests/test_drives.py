@@ -1,4 +1,4 @@
-"""Servo drives: closed forms, limits, and the states they integrate."""
+"""Servo drives: closed forms, limits, and the states that they integrate."""
 
 import equinox as eqx
 import jax
@@ -16,7 +16,7 @@ STILL = fj.State(np.zeros(3), np.zeros(3))
 
 
 def single(inertia=2.0):
-    """An arm whose last joint turns a balanced wheel: I qdd = tau, gravity or not."""
+    """Returns an arm whose last joint turns a balanced wheel: I qdd = tau."""
     return fj.Linkage(
         "RRR", length=[0, 1, 1, 0], com=[[0, 0]] * 3, mass=[1, 1, 1],
         inertia=[1e6, 1e6, inertia], gravity=0.0,
@@ -68,7 +68,7 @@ def test_a_motor_s_limits():
 
 
 def test_currents_stay_within_their_limit():
-    """Whatever the winding, also when the command turns round: i' = (limit - i) R/L."""
+    """Covers many windings and a reversed command; i' = (limit - i) R/L."""
     turning = lambda t, q, qd, linkage: only_last(jnp.where(t < 0.1, 100.0, -100.0))
     ts = np.linspace(0, 0.2, 41)
 
@@ -124,10 +124,10 @@ def test_an_integral_removes_the_sag():
 
 
 def test_anti_windup_keeps_the_overshoot_small():
-    """A step that saturates for long: a plain integral would wind up."""
+    """The step saturates for so long that a plain integral would wind up."""
 
     class WindsUp(fj.StatefulElement):
-        """The same without anti-windup."""
+        """The PID controller without anti-windup."""
 
         pid: fj.PIDController
 
@@ -147,7 +147,7 @@ def test_anti_windup_keeps_the_overshoot_small():
 
 
 def test_without_an_integral_it_is_the_pd_controller():
-    """At its limits, too; and an integral of zero stays zero."""
+    """Also holds at the limits; an integral of zero stays zero."""
     hold = Hold(only_last(1.0))
     pd = fj.PDController(8.0, 6.0, 1.0, hold)
     pid = fj.PIDController(8.0, 0.0, 6.0, 1.0, hold)
@@ -160,7 +160,7 @@ def test_without_an_integral_it_is_the_pd_controller():
 
 
 def test_drives_in_a_row():
-    """A PID controller's torque through a lag and a speed limit, with all states."""
+    """A PID controller's torque passes a lag and a speed limit, all with states."""
     pid = fj.PIDController(8.0, 2.0, 6.0, 10.0, Hold(only_last(1.0)))
     drive = fj.SpeedLimit(fj.FirstOrderLag(pid, 0.05), stall=5.0, no_load=3.0)
     solution = fj.simulate(single(), STILL, np.linspace(0, 20, 21), (drive,))
@@ -202,7 +202,7 @@ def test_states_of_elements_are_swept():
 
 
 class Wrong(fj.StatefulElement):
-    """Whose rate is not like its state."""
+    """An element whose rate has another shape than its state."""
 
     def initial_state(self, linkage):
         return jnp.zeros(3)

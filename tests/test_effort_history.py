@@ -1,4 +1,4 @@
-"""Efforts given at times: interpolated, and held beyond them."""
+"""Efforts given at times: interpolated between them, constant before and after."""
 
 import equinox as eqx
 import jax
@@ -23,7 +23,7 @@ def test_efforts_are_linear_between_the_times_and_held_beyond():
 
 
 def momentum(linkage, q, qd):
-    """Of the slide on the ground, which an effort in it changes if gravity does not."""
+    """Returns the momentum of the slide on the ground, which only efforts change."""
     zero = np.zeros(3)
     return fj.inverse_dynamics(linkage, q, zero, qd)[0]
 

@@ -1,4 +1,4 @@
-"""What is no tree of the library's is not saved, what is not whole is not loaded."""
+"""Unknown objects are not saved, and damaged files are not loaded."""
 
 import contextlib
 import json
@@ -353,7 +353,7 @@ def whole(path):
 
 
 def unharmed(path, tree):
-    """Whether the file is read; if not, it is refused in the way that it should be."""
+    """Returns whether a file can be read; checks the error if it cannot."""
     try:
         loaded = fj.load(path, OWN)
     except ValueError as error:

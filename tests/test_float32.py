@@ -1,4 +1,4 @@
-"""Single precision, in a process of its own: the tests' own one has x64 on."""
+"""Single precision, in a process of its own, as the tests' process has x64 on."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""The gradients that tuning follows, against differences and other modes."""
+"""The gradients that tuning follows, compared with differences and other modes."""
 
 import diffrax
 import equinox as eqx
@@ -45,7 +45,7 @@ def tangents(scene, tolerance, ts):
 
 
 def loss(scene, z, ts, adjoint=diffrax.ForwardMode()):
-    """By the program of plain calls, unless within a transformation."""
+    """Returns the sum of squares, by the plain calls' program unless transformed."""
     steps = diffrax.PIDController(rtol=1e-13, atol=1e-13)
     trial = with_gains(scene, gains_of(scene) * jnp.exp(z).reshape(2, 3))
     solution = fj.simulate(

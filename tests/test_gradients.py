@@ -17,11 +17,11 @@ ZERO = jnp.zeros(3)
 
 
 def outcome(problem, parameters, adjoint=diffrax.ForwardMode()):
-    """Mean squared tip deviation and last positions.
+    """Returns the mean squared tip deviation and the last positions.
 
-    Functions of log kp, log kd, log masses and a shift of the start, (12,). The problem
-    (arm, start, controller, times, steps) is values only: one program in forward and
-    one in reverse mode serve all tests.
+    They are functions of log kp, log kd, log masses and a shift of the start,
+    (12,). The problem (arm, start, controller, times, steps) consists of values
+    only, so one program in forward mode and one in reverse mode serve all tests.
     """
     linkage, state0, controller, ts, (steps, dt0) = problem
     log_kp, log_kd, log_mass, shift = parameters.reshape(4, 3)
@@ -47,7 +47,7 @@ def outcome(problem, parameters, adjoint=diffrax.ForwardMode()):
 
 @eqx.filter_jit
 def forward(problem, at):
-    """Slopes and values: one program for both."""
+    """Returns slopes and values from one program."""
 
     def twice(at):
         found = outcome(problem, at)
@@ -58,7 +58,7 @@ def forward(problem, at):
 
 @eqx.filter_jit
 def reverse(problem, at, weights):
-    """The gradient of the weighted sum of the deviation and of the positions."""
+    """Returns the gradient of the weighted sum of the deviation and the positions."""
 
     def weighed(at):
         loss, q = outcome(problem, at, diffrax.RecursiveCheckpointAdjoint())
@@ -68,7 +68,7 @@ def reverse(problem, at, weights):
 
 
 def steps(tolerance, dt0=1e-3, growth=10.0):
-    """Steps of `dt0` if none may grow: of one structure with adaptive ones."""
+    """Returns fixed steps of `dt0`, or adaptive steps; both have the same structure."""
     values = dict(rtol=tolerance, atol=tolerance, factormin=0.2, factormax=growth)
     values = {name: np.asarray(value) for name, value in values.items()}
     return diffrax.PIDController(**values), np.asarray(dt0)
@@ -112,7 +112,7 @@ def test_forward_reverse_and_differences_agree(kind):
 
 
 def test_both_modes_of_a_damped_arm_equal_differences():
-    """Of steps of one size, in its masses, damping and start."""
+    """Uses fixed steps; derivatives in masses, damping and start."""
     arm, (damper,) = scenes.fig3().linkage, scenes.fig3().forces
 
     def end(at, adjoint):
@@ -159,7 +159,7 @@ def test_gradient_of_a_batch_is_the_sum_of_the_gradients():
 
 @pytest.mark.slow
 def test_gradients_at_rest_and_at_zero_error_are_finite():
-    """Hanging still, on the circle's start, with nothing to correct."""
+    """The arm hangs still, or is at the start of its circle without an error."""
     linkage = scenes.fig7().linkage
     task = fj.CircleTask(center=(-4.0, 2.0), radius=0.5)
     q = fj.inverse_kinematics(linkage, task.tip(0.0), task.orientation)
@@ -176,7 +176,7 @@ CHAIN = eqx.tree_at(lambda x: x.inertia, scenes.fig5().linkage, np.full(3, 1 / 1
 
 
 def linear_motion(end):
-    """The exact derivative of the position in that at the start, of the hanging arm."""
+    """Returns the exact derivative of the hanging arm's position in its start."""
     stiffness = jax.jacfwd(lambda q: fj.forward_dynamics(CHAIN, q, ZERO, ZERO))(HANGING)
     rates = jnp.block([[jnp.zeros((3, 3)), jnp.eye(3)], [stiffness, jnp.zeros((3, 3))]])
     return jax.scipy.linalg.expm(rates * end, max_squarings=32)[:3, :3]
@@ -184,7 +184,7 @@ def linear_motion(end):
 
 @pytest.mark.slow
 def test_tangents_of_a_hanging_arm_are_controlled():
-    """At rest there is no error to see: steps are bounded by the time scale."""
+    """At rest the error estimate is 0; steps are bounded by the time scale instead."""
     # In the circle's reach, with a controller that does nothing.
     task = fj.CircleTask(center=(1.0, 1.0), radius=0.2)
     idle = fj.PDController(ZERO, ZERO, [np.inf] * 3, task)

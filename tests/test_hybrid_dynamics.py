@@ -25,7 +25,7 @@ REST = fj.State(np.zeros(3), np.zeros(3))
 
 
 class Push(eqx.Module):
-    """The cart accelerates at a constant rate from a velocity."""
+    """The cart starts with a velocity and accelerates at a constant rate."""
 
     velocity: jax.Array
     acceleration: jax.Array
@@ -38,7 +38,7 @@ class Push(eqx.Module):
 
 
 def pendulum(angle, rate, acceleration, ts):
-    """Of a pendulum whose pivot accelerates along x."""
+    """Returns the motion of a pendulum whose pivot accelerates along x."""
 
     def field(t, y):
         drive = G * np.sin(y[0]) + acceleration * np.cos(y[0])
@@ -61,7 +61,7 @@ def test_a_pendulum_on_a_cart_that_accelerates(acceleration):
 
 
 def test_a_jump_of_the_velocity_is_a_blow():
-    """The momentum of the pendulum about its pivot stays as it is."""
+    """Checks that the pendulum's momentum about its pivot does not change."""
     moving = fj.PrescribedMotion((1, 3), Push(jnp.array(0.6), jnp.array(0.0)))
     ts = np.linspace(0, 1, 6)
     start = fj.State([0, 0.4, 0], [0, 0.2, 0])
@@ -83,7 +83,7 @@ def swinging(topology, joints, forces=()):
 
 @eqx.filter_jit
 def along(linkage, forces, solution, efforts):
-    """Accelerations under efforts, those that are prescribed, and the energy."""
+    """Returns accelerations under efforts, the prescribed ones, and the energy."""
 
     def at(t, q, qd, tau):
         qdd = fj.forward_dynamics(linkage, q, qd, tau, forces)
@@ -113,7 +113,7 @@ def test_efforts_make_the_motion_and_do_its_work(topology, joints):
 
 
 def test_a_motion_prescribed_as_it_is_takes_no_effort():
-    """A cart that falls together with a pendulum that hangs on it, weightless."""
+    """A cart and the pendulum that hangs on it fall together, weightless."""
     falling = fj.Linkage(
         "PRR", length=[0, 0, 1, 1], com=[[0, 0], [0.5, 0], [0.5, 0]], mass=[1, 1, 1],
         inertia=[1, 1, 1], gravity=G,
@@ -198,7 +198,7 @@ def test_topologies_are_batched():
 
 
 def residual(travel, stroke=0.05):
-    """The load's swing after the travel, over the stroke."""
+    """Returns the load's swing after the travel, divided by the stroke."""
     move = fj.JointMove(np.zeros(3), [stroke, 0, 0], travel)
     motion = fj.PrescribedMotion((1, 3), move)
     ts = np.append(0.0, travel.duration + np.linspace(0.01, 2.5, 200))

@@ -1,4 +1,4 @@
-"""Points of the chain, their derivatives, and inverse kinematics as their inverse."""
+"""Points of the chain, their derivatives, and inverse kinematics."""
 
 from functools import partial
 
@@ -26,7 +26,7 @@ def stack(linkages):
 
 
 def samples(topology, seed=0):
-    """Random linkages of one topology, stacked, with random motions."""
+    """Returns stacked random linkages of one topology, with random motions."""
     rng = np.random.default_rng(seed)
     linkages = stack([random_linkage(topology, rng) for _ in range(SAMPLES)])
     q, qd = rng.uniform(-3, 3, (2, SAMPLES, 3))
@@ -35,18 +35,18 @@ def samples(topology, seed=0):
 
 @jax.jit
 def pose(linkage, q):
-    """Tip and orientation, (3,)."""
+    """Returns the tip and the orientation, (3,)."""
     x, _ = fj.to_chain(linkage, q, jnp.zeros(3))
     return jnp.append(fj.tip_position(linkage, q), x[5])
 
 
 def turns(angle):
-    """Distance of an angle from the nearest whole number of turns."""
+    """Returns the distance of an angle from the nearest whole number of turns."""
     return np.abs(np.angle(np.exp(1j * np.asarray(angle))))
 
 
 def joint_distance(topology, q, other):
-    """Largest difference of joint positions, of angles modulo whole turns."""
+    """Returns the largest difference of joint positions, angles modulo whole turns."""
     difference = np.asarray(q) - np.asarray(other)
     revolute = np.array([joint == "R" for joint in topology])
     return np.where(revolute, turns(difference), np.abs(difference)).max(axis=-1)
@@ -120,7 +120,7 @@ def solutions(linkages, targets, branch):
 
 @partial(jax.jit, static_argnums=2)
 def derivatives(linkages, targets, branch):
-    """Of the solutions in the poses, and the tip Jacobians there."""
+    """Returns the solutions' derivatives in the poses, and the tip Jacobians there."""
 
     def one(linkage, target):
         def q(target):

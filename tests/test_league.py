@@ -1,4 +1,4 @@
-"""One circle for all seven topologies."""
+"""One circle that all seven topologies track."""
 
 import jax
 import numpy as np

@@ -1,4 +1,4 @@
-"""Linear analysis: differences, known modes, small motions, rest, the regressor."""
+"""Linear analysis: differences, known modes, small motions, equilibria, regressor."""
 
 import diffrax
 import equinox as eqx
@@ -37,7 +37,7 @@ def modes_at(linkage, forces, *states, ts=0.0):
 
 
 def held(linkage, q, kp, kd, others=()):
-    """A PD controller that sags to `q`."""
+    """Returns a PD controller under which the arm sags to `q`."""
     load = fj.holding_efforts(linkage, q, others)
     load = load - sum(element(0.0, q, jnp.zeros(3), linkage) for element in others)
     return fj.PDController(kp, kd, jnp.inf, Hold(q + load / np.array(kp)))
@@ -93,7 +93,7 @@ def test_a_stiff_controller_of_limited_efforts_has_an_equilibrium():
 
     @jax.jit
     def rest(guess):
-        """And its derivative in the guess: one program for both."""
+        """Returns the equilibrium and its derivative in the guess, from one program."""
 
         def twice(q):
             found = fj.equilibrium(scene.linkage, scene.forces, q)
@@ -115,7 +115,7 @@ def test_a_stiff_controller_of_limited_efforts_has_an_equilibrium():
 
 
 def test_a_hanging_chain_of_point_masses_swings_as_is_known():
-    """Equal lengths and masses: squares in g/l are the zeros of Laguerre's L3."""
+    """Squared frequencies in g/l are the zeros of Laguerre's L3."""
     linkage = scenes.fig5().linkage
     hanging, failed = ([-np.pi / 2, 0.0, 0.0], STILL), ([0.3, np.nan, 0.0], STILL)
     modes = modes_at(linkage, (), hanging, failed)
@@ -196,7 +196,7 @@ def test_masses_of_elements_are_held_too():
 
 @pytest.mark.parametrize("share, found", [(0.95, True), (1.05, False)])
 def test_loads_that_nothing_holds_have_no_equilibrium(share, found):
-    """The motor of a shoulder can be too weak or too strong for any posture."""
+    """A shoulder motor can be too weak or too strong for every posture."""
     tau = share * fj.holding_efforts(ROD, STILL)
     q = fj.equilibrium(ROD, (fj.JointEffort(tau),), [0.4, 0.1, -0.1])
     assert np.isfinite(q).all() == found
@@ -217,10 +217,11 @@ def test_the_regressor_times_the_parameters_is_the_inverse_dynamics(topology):
 
 
 def test_nine_combinations_of_the_parameters_of_an_rpr_arm_are_identified():
-    """Three are lost.
+    """Three combinations are lost.
 
-    The first link's mass is not felt, the second's inertia adds to the first's, with
-    which it turns, and the third's mass to the second's, to which it is hinged.
+    The first link's mass has no effect. The second link's inertia adds to the
+    first's, as both turn together. The third link's mass adds to the second's, to
+    which it is hinged.
     """
     linkage, *_ = motion("RPR")
     samples = np.random.default_rng(1).uniform(-2, 2, (3, 40, 3))

@@ -1,4 +1,4 @@
-"""Linkages as data: existence factors, coordinates, refusals of what cannot move."""
+"""Linkages as data: existence factors, coordinates, rejected arms."""
 
 import re
 import warnings

@@ -1,4 +1,4 @@
-"""The package as users import it: every name is there, and costs nothing until used."""
+"""The package as users import it: names exist, and cost nothing until used."""
 
 import ast
 import importlib
@@ -42,7 +42,7 @@ OF_0_1 = json.loads((Path(__file__).parent / "names_of_0.1.json").read_text())
 
 @pytest.mark.parametrize("name", OF_0_1)
 def test_what_calls_version_0_1_calls_this_one(name):
-    """The same names, and arguments in the same places; what is new is optional."""
+    """Checks that names and places of arguments are the same; new ones are optional."""
     *module, name_there = name.split(".")
     found = getattr(
         importlib.import_module(".".join(["fdof_jax", *module])), name_there
@@ -97,7 +97,7 @@ def test_no_name_is_hidden_by_a_module():
 
 
 def imported(code):
-    """The names of all modules that a new process has imported after `code`."""
+    """Returns the names of all modules that a new process has imported after `code`."""
     command = [sys.executable, "-c", f"{code}; import sys; print(*sys.modules)"]
     run = subprocess.run(command, capture_output=True, text=True, check=True)
     return set(run.stdout.split())

@@ -1,4 +1,4 @@
-"""Compiled programs: what needs another one, what fails in one, and where they go."""
+"""Compiled programs: when another is needed, how one fails, where they are kept."""
 
 import functools
 import json
@@ -50,7 +50,7 @@ def test_a_program_that_raises_nothing_calls_nothing():
 
 @pytest.fixture
 def uncached():
-    """JAX cannot serialise again what comes out of its persistent cache."""
+    """Turns JAX's persistent cache off: its programs cannot be serialised again."""
     before = jax.config.jax_compilation_cache_dir
     jax.config.update("jax_compilation_cache_dir", None)
     compilation_cache.reset_cache()
@@ -108,7 +108,7 @@ def test_failures_under_jit_name_the_argument(q0, ts, words):
 
 
 class Fragile(eqx.Module):
-    """A user's own element, with a check that its values are asked for at run time."""
+    """A user's own element, which checks values at run time."""
 
     strength: jax.Array
 
@@ -172,7 +172,7 @@ print(json.dumps({
 
 
 def test_new_numbers_compile_nothing():
-    """In a process of its own: in this one the programs may be compiled already."""
+    """Runs in a new process, as this one may have compiled the programs already."""
     done = subprocess.run(
         [sys.executable, "-c", SCRIPT], capture_output=True, text=True, check=False
     )

@@ -1,4 +1,4 @@
-"""Sampled control: first order in the period, delay, noise; and the discrete step."""
+"""Sampled control: first order in the period, delay, noise; the discrete step."""
 
 import diffrax
 import jax
@@ -80,7 +80,7 @@ def test_a_step_is_a_simulation_under_a_held_effort():
 
 @pytest.mark.slow
 def test_a_step_is_differentiable_and_batched():
-    """As a predictive controller linearises it."""
+    """Linearises the step as a predictive controller does."""
     tau = jnp.array([1.0, -2.0, 0.5])
     step = lambda tau: fj.step(ARM, START, tau, 0.1, **STEPS).qd
     known = lambda tau: step(np.asarray(tau))  # by the program of plain calls
@@ -104,7 +104,7 @@ def test_gains_of_sampled_control_have_gradients():
 
 @pytest.mark.slow
 def test_a_digital_pid_controller_of_motors():
-    """Its integral by Euler's steps, and the motors' currents go on between samples."""
+    """The integral takes Euler's steps; motor currents go on between samples."""
     pid = fj.PIDController(8.0, 2.0, 6.0, 50.0, Hold(jnp.array([0.0, 0.0, 1.0])))
     motion = fj.simulate_sampled(WHEEL, REST, pid, 0.05, 100, **STEPS)
     integral = 0.0

@@ -1,4 +1,4 @@
-"""A sweep gives what jax.vmap(simulate) gives, member by member."""
+"""A sweep equals jax.vmap(simulate), member by member."""
 
 import diffrax
 import equinox as eqx
@@ -48,7 +48,7 @@ def test_a_solution_is_made_as_that_of_vmap(batch, clean):
 
 
 def test_members_equal_single_simulations(batch, clean):
-    """Which are those of vmap too: test_one_compilation.py."""
+    """That vmap equals single motions is in test_one_compilation.py."""
     assert successful(clean).all()
     for member in range(len(clean.q)):
         single = alone(batch, member)
@@ -152,7 +152,7 @@ def ramp(t, linkage):
 
 
 def test_arrays_without_the_axis_are_shared():
-    """Among them starting velocities, which are whole numbers here."""
+    """Shared arrays include starting velocities, here whole numbers."""
     linkage = random_linkage("RPR", np.random.default_rng(3))
     rng = np.random.default_rng(4)
     starts = rng.uniform(-1, 1, (3, 3))

@@ -1,4 +1,4 @@
-"""What a sweep refuses at its door."""
+"""Malformed arguments of a sweep raise errors that name them."""
 
 import functools
 

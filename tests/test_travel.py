@@ -54,7 +54,7 @@ def test_a_shock_is_a_jump_of_the_velocity_at_both_ends():
 @pytest.mark.parametrize("profile", PROFILES)
 @pytest.mark.parametrize("frequency", [2.0, 7.0])
 def test_the_shock_takes_the_load_s_frequency_out(profile, frequency):
-    """A load on a spring, x'' + w^2 x = -a, by its closed integral."""
+    """A load on a spring follows x'' + w^2 x = -a; its integral is in closed form."""
     plain = fj.Travel(1.5, profile=profile)
     shock = float(fj.shock_against(plain, frequency))
     shocked = fj.Travel(1.5, profile=profile, shock=shock)

@@ -1,6 +1,6 @@
-"""All public functions and their arguments, and which values are valid.
+"""All public functions and their arguments, with checks of which values are valid.
 
-What is valid is said here again, argument by argument, for `garbage` to compare with.
+The checks repeat the library's rules argument by argument, for `garbage` to compare.
 """
 
 import dataclasses
@@ -49,7 +49,7 @@ def sweep(
 
 
 def numbers(value: Any) -> np.ndarray | None:
-    """Real numbers as float64, None if these are none."""
+    """Returns real numbers as float64, or None if the value is none."""
     try:
         array = np.asarray(value)
         if array.dtype.kind not in "iuf":
@@ -74,7 +74,7 @@ def array_of(*shape, minimum=-np.inf, above=-np.inf, finite=True, broadcast=Fals
 
 
 def chain_rates(value):
-    """Of an RRR: no fictitious slide moves, but for rounding."""
+    """Returns whether an RRR's fictitious slides stand still, apart from rounding."""
     if not array_of(6)(value):
         return False
     rates = np.abs(numbers(value))

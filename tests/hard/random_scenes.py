@@ -11,7 +11,7 @@ from . import oracle
 
 
 def sized(low: float, high: float) -> st.SearchStrategy:
-    """Positive numbers, uniform in their logarithm."""
+    """Returns a strategy of positive numbers, uniform in their logarithm."""
     return st.floats(math.log10(low), math.log10(high)).map(lambda e: 10.0**e)
 
 

@@ -1,6 +1,6 @@
-"""Scenes 25 and 26: members of a batch that fail, and steps that run out.
+"""Scenes 25 and 26: members of a batch that fail, and solves out of steps.
 
-More on members that fail is in tests/test_sweep.py.
+More tests of members that fail are in tests/test_sweep.py.
 """
 
 import diffrax
@@ -20,7 +20,7 @@ OTHERS = np.delete(np.arange(SIZE), BAD)
 
 
 class Breaking(eqx.Module):
-    """No effort until a time, then none that is a number."""
+    """An effort of zero until a time, and NaN afterwards."""
 
     at: jax.Array
 
@@ -54,7 +54,7 @@ def by_sweep(q, qd, at):
 
 @pytest.mark.parametrize("motions", [by_vmap, by_sweep])
 def test_members_that_fail_harm_no_other(motions):
-    """All lanes of a batch go through the same loop, the last one's end is its end."""
+    """All members of a batch share one loop, which ends with the last member."""
     clean, mixed = motions(*batch(False)), motions(*batch(True))
     assert (clean.outcome == "successful").all()
     expected = np.full(SIZE, "successful")
@@ -78,7 +78,7 @@ def test_members_that_fail_harm_no_other(motions):
 
 
 def test_members_that_fail_add_nothing_to_a_shared_gradient():
-    """0 x NaN: in reverse mode every member's cotangent is added to the shared mass."""
+    """Reverse mode adds all members' cotangents to the shared mass; 0 x NaN is NaN."""
 
     @jax.jit
     def gradient(mass, q, qd, at, wanted):
@@ -104,7 +104,7 @@ def test_members_that_fail_add_nothing_to_a_shared_gradient():
 
 
 def test_a_member_that_starts_nan_adds_nothing_under_vmap():
-    """Whatever is NaN in a member would be so in the sum over all."""
+    """A NaN of one member would make the sum over all members NaN."""
 
     def loss(mass, q0):
         def end(q0):
@@ -124,7 +124,7 @@ def test_a_member_that_starts_nan_adds_nothing_under_vmap():
 
 @pytest.mark.parametrize("solver", [None, diffrax.Dopri8()])
 def test_a_controller_of_one_s_own_does_not_reject_for_ever(solver):
-    """diffrax's shortest step is 0: NaN is rejected until there are no steps left."""
+    """diffrax's shortest step is 0, so it would reject NaN until no steps are left."""
     steps = diffrax.PIDController(rtol=1e-8, atol=1e-8)
     motion = fj.simulate(
         arm(), START, TS, (Breaking(0.32),), solver=solver, throw=False,
@@ -144,7 +144,7 @@ def out_of_steps(q0, **keywords):
 
 
 def test_running_out_of_steps_is_told():
-    """The state that was reached looks like any other."""
+    """The last state reached looks like any other state."""
     solution = out_of_steps(START.q)
     assert solution.outcome == "out of steps"
     reached = solution.stats["time_reached"]
@@ -158,10 +158,10 @@ def test_running_out_of_steps_is_told():
 
 
 def test_a_gradient_of_what_was_not_reached_is_zero_and_the_value_tells():
-    """An output filled with NaN has a derivative of 0: an optimum, it seems.
+    """An output filled with NaN has a derivative of 0, which looks like an optimum.
 
-    A derivative of NaN would spoil that of a sum in which failed members are left out.
-    The value and the outcome tell instead.
+    A derivative of NaN would spoil the derivative of a sum that leaves failed
+    members out. The value and the outcome report the failure instead.
     """
 
     def end(q0):

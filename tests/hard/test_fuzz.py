@@ -1,4 +1,4 @@
-"""The fuzzer, 300 cases of it, always the same; and what longer runs have found."""
+"""The fuzzer on 300 cases, always the same; and cases found by longer runs."""
 
 import math
 

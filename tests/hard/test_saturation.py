@@ -1,6 +1,6 @@
 """Scene 19: derivatives at the limits of the actuators, and beyond them.
 
-That a tuner says so is in tests/test_tuning.py.
+That a tuner reports saturation is tested in tests/test_tuning.py.
 """
 
 import diffrax
@@ -19,8 +19,10 @@ KP = 128.0
 
 
 def test_the_derivative_at_the_limit_is_that_of_one_side():
-    """Demand and limit are equal: the effort has two derivatives, 0 and that of the
-    demand, and their mean is that of no motion."""
+    """Demand and limit are equal, so the effort has two one-sided derivatives.
+
+    These are 0 and the demand's derivative; their mean belongs to no motion.
+    """
     controller = fj.PDController(KP, 0.0, 32.0, Hold(jnp.full(3, 0.25)))
 
     def effort(kp):
@@ -34,7 +36,7 @@ def test_the_derivative_at_the_limit_is_that_of_one_side():
 
 
 def end(log_kp, limit, reference, adjoint):
-    """The sum of the joint positions after 0.2 s, and the share at the limit."""
+    """Returns the sum of joint positions after 0.2 s, and the share at the limit."""
     controller = fj.PDController(KP * jnp.exp(log_kp), 0.0, limit, reference)
     ts = np.linspace(0, 0.2, 11)
     solution = fj.simulate(arm(), START, ts, (controller,), adjoint=adjoint)
@@ -44,7 +46,7 @@ def end(log_kp, limit, reference, adjoint):
 
 @pytest.mark.parametrize("mode", ["forward", "reverse"])
 def test_gradients_at_and_beyond_saturation(mode):
-    """A derivative that jumps at the start, or is 0 because nothing can be changed."""
+    """The derivative jumps at the start, or is 0 because gains change nothing."""
     if mode == "forward":
         adjoint, derive = diffrax.ForwardMode(), jax.jacfwd
     else:
