@@ -75,7 +75,7 @@ def cases(
     def judge(result: Any) -> dict:
         motion = contestant.motion(result)
         q = np.asarray(motion.q)
-        if q.shape[-2] < exact.shape[-2]:  # the start is not among its outputs
+        if q.shape[-2] < exact.shape[-2]:  # its outputs do not include the start
             q = np.concatenate([exact[..., :1, :], q], axis=-2)
         errors = np.abs(q - exact)
         return {
@@ -116,7 +116,7 @@ def _simulate(
 ) -> Callable:
     chosen: dict[str, Any] = {} if solver is None else {"solver": solver}
     if long:
-        # No limit, and no checkpoints for a gradient that nobody takes.
+        # No limit of steps, and no checkpoints, as no gradient is taken.
         chosen.update(max_steps=None, adjoint=diffrax.ForwardMode())
 
     def run(linkage, state0, ts, forces, setting):

@@ -45,7 +45,7 @@ def _judge(problem: Problem, contestant: Contestant, result: Any) -> dict:
     motion = contestant.motion(result)
     q, qd = jnp.asarray(motion.q), jnp.asarray(motion.qd)
     defect = float(jnp.max(jnp.abs(own.energy(problem.linkage, q, qd))))
-    # A tenth of a joule is the failure here that a tenth of a radian is elsewhere.
+    # A tenth of a joule counts as a failure here, like a tenth of a radian elsewhere.
     return {"error": defect, "energy_defect": defect}
 
 

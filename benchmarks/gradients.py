@@ -223,8 +223,8 @@ def _grid(problem: Problem, batch: int) -> list[tuple[float, float, float]]:
     if problem.parameters > 6:
         points = [(1.0, TOLERANCE, np.inf)]  # 4 s of 256 would take minutes
         if problem.parameters == SAMPLES:
-            # A step across several samples sees few of them, and nothing of the motion
-            # tells: the gradient is wrong by tenths unless the steps are bounded.
+            # A step across several samples uses few of them, without an effect on the
+            # motion: the gradient is wrong by tenths unless the steps are bounded.
             bounded = (1.0, TOLERANCE, 1.0 / SAMPLES)
             points = [*points, bounded] if batch == 1 else [bounded]
         return points

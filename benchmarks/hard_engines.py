@@ -193,7 +193,7 @@ def mujoco(scene: HardScene) -> Callable[[], Run]:
         try:
             result = once(step)
         except Refused as failure:
-            refusal = failure  # of too long a step, perhaps
+            refusal = failure  # possibly because the step was too long
             continue
         chosen = step
         if error_of(scene, result) <= scene.bound:

@@ -25,7 +25,7 @@ ENDLESS = 30.0  # first calls of this length [s] are not repeated to learn their
 FEWEST, FEW, MANY = 3, 5, 15  # rounds: under any budget, of long calls, of the rest
 WORST_ERROR = 0.1  # a larger error is a failure, not a result
 TARGETS = (1e-3, 1e-6, 1e-9, 1e-12)
-# What can come of a hard case, best first.
+# The outcomes of a hard case, best first.
 OUTCOMES = ("solved", "refused as asked", "failed by name", "failed silently")
 
 

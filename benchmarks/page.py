@@ -205,7 +205,7 @@ def tuning(points: list[dict]) -> str:
     timed = [
         [
             p["problem"],
-            # What an earlier row has compiled serves this one.
+            # An earlier row compiled this program.
             number(p["compile_time"]) if p["compile_time"] > 1 else "-",
             number(p["time_median"], 3),
             number(p["time_median"] / p["batch"], 3),
@@ -297,7 +297,7 @@ def _machine(points: dict[str, list[dict]]) -> str:
         for point in job:
             versions = [f"{k} {v}" for k, v in point["versions"].items() if v]
             commits = jobs.setdefault(", ".join([point["cpu"], *versions]), {})
-            # Results of the jobs before are changes that are not committed yet.
+            # Uncommitted changes may be results of earlier jobs.
             commits.setdefault(point["commit"].removesuffix("-dirty"), set()).add(name)
     lines = []
     for machine, commits in jobs.items():

@@ -11,7 +11,7 @@ from matplotlib.ticker import NullFormatter
 
 from .measure import OUTCOMES, times_at
 
-# Okabe and Ito's colours, told apart with any colour vision; markers differ as well.
+# Okabe and Ito's colours suit all colour vision; markers differ as well.
 COLORS = ("#000000", "#E69F00", "#56B4E9", "#009E73", "#D55E00", "#0072B2", "#CC79A7",
           "#999999")  # fmt: skip
 MARKERS = "osD^v<>PX*ph"

@@ -29,7 +29,7 @@ fj.configure(x64=True)
 from fdof_jax.interactive import sliders
 sliders()"""
 
-# What is noted on the page: [time stamp of the event, time of the frame] per picture.
+# The page records [time stamp of the event, time of the frame] per picture.
 PROBE = """
 window.pictures = []; window.event_time = null;
 for (const kind of ['keydown', 'change'])
@@ -149,7 +149,7 @@ def run(quick: bool) -> Iterator[dict]:
         import nbformat
 
         book = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(CELL)])
-        # Without one a dialog asks for it.
+        # Without a kernel name a dialog asks for one.
         book.metadata.kernelspec = {"name": "python3", "display_name": "Python 3"}
         nbformat.write(book, Path(folder, "sliders.ipynb"))
         with jupyterlab(Path(folder)) as address, chromium() as browser:

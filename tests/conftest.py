@@ -8,7 +8,7 @@ import sweep_batch
 import fdof_jax as fj
 from fdof_jax.tuning.result import History
 
-# As an application sets JAX up: the laws hold for what users run.
+# JAX is set up as in an application, so the laws hold for what users run.
 fj.configure(x64=True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
@@ -20,11 +20,11 @@ SEARCHES = {
     "fdof_jax.tuning.optimal_motion.optimal_efforts",
     "fdof_jax.tuning.tune.tune_each",
 }
-# Scripts that need more than the tests do.
+# Scripts that need packages which the tests do not need.
 collect_ignore_glob = ["hard/make_*.py"]
 
 
-# Sweeps that several files look at.
+# Sweeps that several files test.
 
 
 @pytest.fixture(scope="session")

@@ -10,7 +10,7 @@ import numpy as np
 import fdof_jax as fj
 
 REFERENCE = json.loads((Path(__file__).parent / "reference.json").read_text())
-# The library refuses PPP, which the file holds for the equations only.
+# The library rejects PPP, which the file holds for the equations only.
 SCENES = {s["id"]: s for s in REFERENCE["scenes"] if s["topology"] != "PPP"}
 
 

@@ -65,7 +65,7 @@ def refused(path, words, classes=()):
         fj.load(path, classes)
 
 
-# Classes of one's own
+# Classes of a user
 
 
 class Push(eqx.Module):

@@ -13,8 +13,8 @@ from fdof_jax.simulation.looped_dopri8 import LoopedDopri8
 # Compilations dominate: nearly all tests share these shapes and settings.
 TS = np.linspace(0, 1.5, 7)
 CHUNK = 8  # also what the last few members are solved in
-# As exact as the default solver of batches, which is compiled in thrice the time and
-# is at work in test_one_compilation.py and test_step_control.py.
+# As exact as the default solver of batches, which takes three times as long to compile;
+# test_one_compilation.py and test_step_control.py use that one.
 SETTINGS = dict(
     solver=LoopedDopri8(),
     stepsize_controller=diffrax.PIDController(

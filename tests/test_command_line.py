@@ -92,16 +92,16 @@ def test_tuning_goes_on_where_it_was_saved(tmp_path, capsys):
     earlier, again = kept["results"]
     assert again.loss < earlier.loss
     np.testing.assert_array_equal(earlier.gains, saved["results"][0].gains)
-    # The same members and bounds, from where the first run has come to.
+    # The members and bounds are the same; the start is the first run's end.
     assert again.history.loss[0] == pytest.approx(earlier.loss, rel=1e-9)
     np.testing.assert_array_equal(again.upper, earlier.upper)
-    # And the same search, but for the random starts.
+    # The search is the same, except for the random starts.
     assert kept["search"] == saved["search"] | {"seed": 1}
     before, after = kept_gains(first), kept_gains(second)
     assert [row[1] for row in before] == [row[0] for row in after]
 
 
-# What is answered without JAX: the arguments, the exit status and part of the message.
+# Calls that need no JAX: the arguments, the exit status and part of the message.
 AT_ONCE = [
     ("--version", 0, fj.__version__),
     ("--help", 0, "--output"),

@@ -149,7 +149,7 @@ def test_each_stage_is_one_loop(compiled_solve):
 
     assert (loops(6), loops(7)) == (12, 2)
     assert loops(18) == 1  # state, error and rounding at the end of a step
-    # The polynomial's leading coefficient: another evaluation would repeat it.
+    # A second evaluation would repeat the polynomial's leading coefficient.
     assert compiled_solve.count("1.5918129027234826e-10") <= 3 * 14 + 4
 
 

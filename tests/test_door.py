@@ -148,5 +148,5 @@ def test_the_door_compiles_nothing_but_a_user_s_path():
         check=True,
     )
     library, own = json.loads(done.stdout)
-    # Some versions of JAX compile a program that takes NumPy's arguments in.
+    # Some versions of JAX compile a program that converts NumPy's arguments.
     assert library == 0 and own <= 2

@@ -11,7 +11,7 @@ from scipy.linalg import expm
 import fdof_jax as fj
 from fdof_jax.simulation.looped_dopri8 import LoopedDopri8
 
-# Joints that feel nothing of each other: slides at right angles carry point masses.
+# The joints do not affect each other: slides at right angles carry point masses.
 STILL = fj.State(np.zeros(3), np.zeros(3))
 
 
@@ -33,7 +33,7 @@ def test_a_lag_is_an_exponential():
     solution = fj.simulate(single(), STILL, ts, (lag,))
     effort = solution.own[0].own
     np.testing.assert_allclose(effort[:, 2], 3 * (1 - np.exp(-ts / 0.2)), atol=1e-9)
-    # tau = 3 (1 - e^(-t/T)) on an inertia of 2 that the rest of the arm hardly feels.
+    # tau = 3 (1 - e^(-t/T)) on an inertia of 2, hardly affected by the rest of the arm.
     rate = 1.5 * (ts - 0.2 * (1 - np.exp(-ts / 0.2)))
     np.testing.assert_allclose(solution.qd[:, 2], rate, rtol=3e-6, atol=1e-9)
     found = fj.joint_efforts(single(), (lag,), solution)

@@ -34,7 +34,7 @@ def test_the_momentum_gained_is_the_integral_of_the_efforts():
     forces = (fj.EffortHistory(TS, TAU),)
     solution = fj.simulate(linkage, START, [0, 0.7], forces)
     end = momentum(linkage, solution.q[-1], solution.qd[-1])
-    # Trapezia, and what is held before and after.
+    # Trapezia, and the constant efforts before and after.
     weights = np.array([0.1 + 0.075, 0.1, 0.025 + 0.16, 0.16 + 0.08])
     gained = end - momentum(linkage, *START)
     np.testing.assert_allclose(gained, weights @ TAU[:, 0], atol=1e-8)

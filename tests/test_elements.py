@@ -28,7 +28,7 @@ def is_number(path, leaf):
     return eqx.is_inexact_array(leaf) and path[-1] != jax.tree_util.GetAttrKey("ef")
 
 
-# What further limits hide.
+# Parameters that other limits hide.
 IDLE = {"DCMotor.command.limit"}
 
 
@@ -40,7 +40,7 @@ def scaled(forces, factors):
     for path, leaf in leaves:
         if is_number(path, leaf):
             factor = next(factors)
-            # Infinity, of no end, stays: its derivative times 0 is not a number.
+            # Infinity stays: its derivative times 0 is not a number.
             finite = jnp.isfinite(leaf)
             number = jnp.where(finite, leaf, 1)
             changed = jnp.where(number == 0, factor - 1, number * factor)
@@ -173,7 +173,7 @@ def test_reverse_mode_at_an_instant_equals_differences():
         wrong = np.flatnonzero(~(error <= 1e-6 * largest + 1e-7))
         assert not wrong.size, [(*labels, *ends)[min(i, len(labels))] for i in wrong]
         size = np.maximum(size, largest)
-    # All are at work but those that a limit puts out of it.
+    # All parameters act except those that a limit disables.
     idle = {n for n, s in zip(labels, size) if s < 1e-6}
     assert idle <= IDLE, idle - IDLE
 
@@ -212,7 +212,7 @@ def test_one_program_for_all_topologies():
 
     def acting(linkage):
         traces.append(1)
-        # A model of another topology would be refused.
+        # A model of another topology would be rejected.
         forces = tuple(elements.ALL.values())
         forces = eqx.tree_at(lambda f: f[place].model, forces, linkage)
         return all_acts(linkage, forces, jnp.array(0.1), *elements.START, 0.1)
@@ -222,7 +222,7 @@ def test_one_program_for_all_topologies():
     alone = [single(linkage) for linkage in arms]
     np.testing.assert_allclose(together, alone, rtol=1e-9, atol=1e-9)
     assert len(traces) == 2
-    # Arms of other topologies feel other efforts.
+    # Efforts differ between topologies.
     assert len({row.tobytes() for row in np.asarray(alone).round(6)}) == len(arms)
 
 

@@ -46,7 +46,7 @@ def path(tmp_path):
     return tmp_path / "tree.fdof"
 
 
-# What comes back
+# Trees that are saved and loaded
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -90,7 +90,7 @@ def test_a_solution(path, solved):
     assert loaded.outcome == "successful"
     assert loaded.result == diffrax.RESULTS.successful
     assert loaded.own[0].shape == (13, 3)
-    # The states of the elements, to go on from
+    # The elements' states, from which a motion can continue
     saved_and_loaded(path, {"own0": (loaded.own[0][-1],)})
 
 

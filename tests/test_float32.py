@@ -13,7 +13,7 @@ from helpers import programs
 
 import fdof_jax as fj
 
-# One process for all, because each would import the same for seconds.
+# One process for all tests, because importing takes seconds.
 OPTIONAL = {"matplotlib", "scipy.optimize", "mujoco", "pandas", "xarray", "ipywidgets"}
 PROGRAM = f"""
 import jax, sys

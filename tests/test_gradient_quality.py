@@ -75,7 +75,7 @@ def test_tangents_are_those_of_differences(point):
     assert np.linalg.norm(gradient - np.array(wanted)) < 1e-6 * size
     value = float(loss(scene, jnp.zeros(6), ts))
     assert float(residuals @ residuals) == pytest.approx(value, rel=1e-8)
-    # As tuning takes them.
+    # The gradients that tuning uses.
     timed = jax.tree.map(jnp.asarray, scene._replace(t1=3.0))
     residuals, jacobian, *_ = gradient_quality._tangents(timed)
     coarse = 2 * jacobian.T @ residuals
@@ -138,7 +138,7 @@ def test_the_report_is_what_it_says(report):
     assert report.horizons[4] == pytest.approx(1.0)
     assert 0.1 < report.saturated[1] < 0.13
     assert "P2 is at its limit for" in str(report)
-    # The slide that is at its limit is not damped, within it all joints are.
+    # The slide at its limit is not damped; within the limits all joints are.
     assert report.at_limit.shape == (101,) and 0.1 < report.at_limit.mean() < 0.13
     damping = report.modes.damping
     assert np.nanmin(damping[report.at_limit]) < 0.01 < damping[~report.at_limit].min()

@@ -85,7 +85,7 @@ STEPS = {"fixed": steps(1e9, 1 / 1024, growth=1.0), "adaptive": steps(1e-13)}
 def test_forward_reverse_and_differences_agree(kind):
     scene = jax.tree.map(jnp.asarray, scenes.fig7())
     problem = scene.linkage, scene.state0, scene.forces[0], TS, STEPS[kind]
-    # Off the paper's gains: nothing is special about this point.
+    # An ordinary point, away from the paper's gains.
     at = [0.1, -0.2, 0.3, 0.05, 0.2, -0.1, 0.0, 0.1, -0.1, 0.02, 0.1, -0.03]
     at = jnp.array(at)
     (tangents, _), _ = forward(problem, at)
@@ -97,7 +97,7 @@ def test_forward_reverse_and_differences_agree(kind):
         return float(after - before) / (2 * h)
 
     if kind == "fixed":
-        # Free of noise, but with a kink wherever a switching meets a step.
+        # No noise, but a kink wherever a switching meets a step.
         differences = [difference(e, 1e-6) for e in np.eye(at.size)]
     else:
         # Noise of the tolerance: long steps, extrapolated.
@@ -105,7 +105,7 @@ def test_forward_reverse_and_differences_agree(kind):
             (4 * difference(e, 5e-4) - difference(e, 1e-3)) / 3 for e in np.eye(at.size)
         ]
     scale = np.abs(tangents).max()
-    # Both round differently: beside a saturation that leads to other adaptive steps.
+    # The modes round differently, which changes adaptive steps beside a saturation.
     same = {"fixed": 1e-10, "adaptive": 1e-6}[kind]
     assert np.abs(tangents - gradient).max() <= same * scale
     assert np.abs(tangents - np.array(differences)).max() <= 1e-6 * scale
@@ -152,7 +152,7 @@ def test_gradient_of_a_batch_is_the_sum_of_the_gradients():
     starts = np.array([[0.1, 0.2, 0.3], [-0.5, 0.4, 0.0], [1.0, -1.0, 0.5]])
     mass = jnp.array([1.0, 1.2, 0.8])
     together = slope(mass, starts)
-    # Three of a kind, for which no other program is compiled.
+    # Three members of the same kind, so that no other program is compiled.
     alone = sum(slope(mass, np.tile(start, (3, 1))) / 3 for start in starts)
     np.testing.assert_allclose(together, alone, rtol=1e-8)
 

@@ -106,7 +106,7 @@ def test_efforts_make_the_motion_and_do_its_work(topology, joints):
     # Under these efforts the prescribed joints accelerate as they should.
     qdd, demanded, energy = along(linkage, forces, solution, efforts.total)
     np.testing.assert_allclose(qdd[:, moved], demanded[:, moved], atol=1e-9)
-    # And the energy changes by their work.
+    # The energy changes by their work.
     power = np.sum(np.asarray(efforts.total) * np.asarray(solution.qd), axis=1)
     work = simpson(power, x=ts)
     np.testing.assert_allclose(energy[-1] - energy[0], work, atol=1e-6 * np.ptp(power))
@@ -143,7 +143,7 @@ def test_starts_beside_the_reference_and_singular_equations_are_told():
         fj.simulate(CART, fj.State(starts.q[1], np.zeros(3)), [0, 1], (motion,))
     swept = fj.sweep(CART, starts, [0, 0.1], (motion,))
     assert swept.outcome.tolist() == ["successful", "not finite"]
-    # Two stretched links with a heavy tip; the slide, which is held, is well.
+    # Two stretched links with a heavy tip; the prescribed slide is well-conditioned.
     heavy = fj.Linkage(
         "PRR", length=[0, 0, 1, 1], com=[[0, 0], [0.5, 0], [1, 0]], mass=[1, 1, 1e11],
         inertia=[1, 0.1, 0],

@@ -108,7 +108,7 @@ def test_a_sparse_recording_with_noise_and_its_standard_errors(seen):
     assert (np.abs(errors_of(result)) < 3.5 * errors).all()
     slopes = jacobian(MIXED, TRUE)[there.ravel()]
     bound = result.noise**2 * np.linalg.inv(slopes.T @ slopes)
-    # The bound is that at the true parameters.
+    # The bound is taken at the true parameters.
     np.testing.assert_allclose(errors, np.sqrt(np.diag(bound)), rtol=0.05)
     for name, value in result.standard_errors.items():
         assert np.shape(value) == np.shape(TRUE[name])
@@ -175,7 +175,7 @@ def test_what_the_motion_does_not_tell(topology, untold, told, words):
     assert all(found[n] == pytest.approx(float(LINK[n]), abs=1e-5) for n in told)
     assert all(word in " ".join(result.weak) for word in words), result.weak
     assert len(result.weak) == len(untold) - (topology == "RPR")
-    assert "Cannot be told from this motion" in str(result)
+    assert "Not determined by this motion" in str(result)
 
 
 def test_directions_of_any_scale_are_told_from_those_that_vanish():

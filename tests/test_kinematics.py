@@ -145,7 +145,7 @@ def test_both_branches_reach_the_pose_and_one_is_the_original(topology):
         distances.append(joint_distance(topology, found, q))
     distances = np.array(distances)
     assert distances.min(axis=0).max() < 1e-7  # a square root near its zero
-    # Two slides make the solution unique; else the branches are different assemblies.
+    # Two slides make the solution unique; otherwise the branches are two assemblies.
     two = topology.count("P") < 2
     assert (
         (distances.max(axis=0) > 1e-3).mean() > 0.7 if two else distances.max() < 1e-7
@@ -260,7 +260,7 @@ def test_numpy_solves_the_joints_as_jax_does(topology, branch):
         q, root = solve_joints(known, directions, wrists, bearing, angle, sides)
         expected, _ = wrists_solved(linkage, wrists, angle, sides)
         assert isinstance(q, np.ndarray) and isinstance(root, np.ndarray)
-        # Next to the edge of the reach a root takes rounding to its square root.
+        # Near the edge of the reach a root enlarges rounding to its square root.
         off_edge = ~(np.abs(root) < 1e-6)
         np.testing.assert_allclose(q[off_edge], expected[off_edge], atol=1e-8)
         unreached += np.isnan(q).any(axis=1).sum()

@@ -81,7 +81,7 @@ def test_small_deviations_follow_the_exponential_of_a():
     solution = fj.simulate(linkage, start, [0, 0.5], forces)
     found = np.concatenate([solution.q[-1] - q, solution.qd[-1]])
     expected = scipy.linalg.expm(0.5 * np.asarray(A)) @ deviation
-    # The square of the deviations is left.
+    # The difference is of second order in the deviations.
     np.testing.assert_allclose(found, expected, atol=1e-8)
     assert np.abs(expected).max() > 1e-5
 
@@ -107,7 +107,7 @@ def test_a_stiff_controller_of_limited_efforts_has_an_equilibrium():
     held = fj.holding_efforts(scene.linkage, q)
     np.testing.assert_allclose(efforts, held, rtol=1e-9)
     assert 0.01 < np.abs(q - reference).max() < 0.3
-    # From a guess at which the slide is at its limit none is found.
+    # No equilibrium is found from a guess at which the slide is at its limit.
     assert all(np.isnan(found).all() for found in rest(jnp.asarray(scene.state0.q)))
 
 
@@ -230,14 +230,14 @@ def test_nine_combinations_of_the_parameters_of_an_rpr_arm_are_identified():
     values = np.linalg.svd(matrix, compute_uv=False)
     assert values[8] > 1e-3 * values[0] and values[9] < 1e-12 * values[0]
     np.testing.assert_allclose(matrix[:, 0], 0, atol=1e-12)
-    # What is found serves for other motions, though the parameters are not unique.
+    # The parameters found are not unique, but are right for other motions too.
     efforts = jax.vmap(lambda *row: fj.inverse_dynamics(linkage, *row))
     seen = np.asarray(efforts(*samples)).ravel()
     found, *_ = np.linalg.lstsq(matrix[:60], seen[:60], rcond=1e-10)
     np.testing.assert_allclose(matrix[60:] @ found, seen[60:], atol=1e-8)
 
 
-# At the door
+# Malformed arguments
 
 
 @pytest.mark.parametrize(

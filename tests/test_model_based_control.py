@@ -117,7 +117,7 @@ def test_errors_of_an_exact_model_are_linear(topology):
     q, qd = MOVE(0.0, linkage)
     solution = fj.simulate(linkage, fj.State(q - error, qd - rate), ts, (controller,))
     q_ref, _ = jax.vmap(lambda t: MOVE(t, linkage))(ts)
-    # Of the companion matrix of each joint.
+    # Eigenvalues of each joint's companion matrix.
     matrices = [[[0, 1], [-p, -d]] for p, d in zip(kp, kd)]
     grown = scipy.linalg.expm(ts[:, None, None, None] * np.array(matrices))
     start = np.stack([error, rate], axis=1)

@@ -11,7 +11,7 @@ from fdof_jax.search import methods
 from fdof_jax.search.lanes import Lanes
 from fdof_jax.tuning import optimal_motion
 
-# The same for all, so that they share programs.
+# The same for all tests, so that they share programs.
 HORIZON, KNOTS = 0.5, 26
 CONTROLLER = scenes.fig7().forces[0]
 
@@ -38,7 +38,7 @@ def test_no_controller_with_these_limits_does_better(best):
     assert best.converged
     assert (np.abs(best.efforts) <= limit).all()
     assert (np.abs(best.efforts) == limit).any()
-    # Both guesses come to the same place.
+    # Both guesses lead to the same result.
     np.testing.assert_allclose(best.guess_errors, best.tip_error, rtol=1e-3)
     assert rms_tip_error(best.scene, task) == pytest.approx(best.tip_error, rel=2e-3)
     own = rms_tip_error(scene, task)
@@ -105,7 +105,7 @@ def two_slides():
 def test_slides_are_controlled_as_fuller_found():
     scene = two_slides()
     found = fj.optimal_efforts(scene, horizon=HORIZON, knots=KNOTS)
-    # The first slide carries everything up, the second all but the first link left.
+    # The first slide moves everything up, the second moves all but link 1 to the left.
     (up, t_up), (left, t_left) = fuller(0.2, 120 / 6), fuller(0.3, 80 / 5)
     assert max(t_up, t_left) < HORIZON
     least = np.sqrt((up + left) / HORIZON)

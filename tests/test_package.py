@@ -24,7 +24,7 @@ def test_names():
         there = {}
         exec(f"from {module} import {name}", there)
         expected = there[name]
-        # Found by the first `getattr`, kept for the second.
+        # The first `getattr` finds the name, and keeps it for the second.
         assert getattr(fj, name) is vars(fj)[name] is expected
     assert dir(fj) == sorted([*fj.__all__, "__version__"])
     starred = {}
@@ -108,7 +108,7 @@ def test_the_package_imports_no_jax():
 
 
 def test_simulation_imports_neither_pictures_nor_searches():
-    # Whatever JAX and diffrax need: neither imports one of these today.
+    # JAX and diffrax import none of these themselves.
     modules = imported("import fdof_jax as fj; fj.simulate, fj.sweep, fj.scenes")
     assert "diffrax" in modules
     assert not modules & {"matplotlib", "optax", "scipy"}

@@ -115,7 +115,7 @@ def test_energy_stack_keeps_its_top_where_energy_is_only_taken_out():
     assert potential.min() == 0 and potential.max() > 0.5
     taken = top - stack["potential"]
     assert taken[0] == 0 and taken[-1] > 0.5 and np.diff(taken).min() > -1e-9
-    # Of the third order at least, Simpson's.
+    # Simpson's rule, of the third order at least.
     forces, few = lifted(0.0, 51)
     coarse = tops(plotting.energy_stack(LIFT, forces, few), few.ts)["taken out"]
     worse = np.abs(coarse - line[0]).max() / np.abs(top - line[0]).max()
@@ -155,7 +155,7 @@ def test_energy_stack_balances_for_all_elements():
     )
     forces = (*elements.ALL.values(), PrescribedMotion(2, elements.MOVE))
     ts = np.linspace(0, 0.3, 2001)
-    # A step from sample to sample.
+    # One step per sample.
     solution = simulate(arm, start, ts, forces, **elements.SHORT | dict(dt0=ts[1]))
     ax = plotting.energy_stack(arm, forces, solution)
     top, (line,) = tops(ax, solution.ts)["taken out"], values(ax)

@@ -79,7 +79,7 @@ def test_a_program_is_exported_and_serialised(uncached):
 @functools.cache
 def raising():
     def ends(q0, ts):
-        # Another solver than by default, because it compiles sooner.
+        # This solver compiles faster than the default.
         solver = diffrax.Dopri8()
         start = fj.State(q0, START.qd)
         return fj.simulate(ARM, start, ts, solver=solver, max_steps=32).q[-1]
@@ -178,7 +178,7 @@ def test_new_numbers_compile_nothing():
     )
     assert done.returncode == 0, done.stderr
     programs = json.loads(done.stdout)
-    # Without the event the test would see nothing.
+    # Without the event the test would count nothing.
     assert any("_solve_padded" in name for name in programs.pop("first"))
     assert programs == {
         "times": [[]] * 5,

@@ -24,7 +24,7 @@ def test_accelerations(name):
     masked = fj.masked_accelerations(r.linkage, r.x, r.xd, r.force)
     assert relative_error(masked, scene["acc0"]) <= bound(name)
     reduced = fj.forward_dynamics(r.linkage, *r.state0, r.tau)
-    # Differences of exact accelerations, where the printed doubles would cancel.
+    # Exact accelerations are subtracted, as the printed doubles would cancel.
     exact = to_joint(scene, [float(a) for a in scene["acc0_str"]])
     assert relative_error(reduced, exact) <= bound(name)
 
@@ -54,7 +54,7 @@ def solve(name, rtol=1e-12, atol=1e-12):
         r.state0,
         [0, *times],
         r.forces,
-        # Landing on the output times leaves out the interpolation's own error.
+        # Steps end at the output times, which excludes the error of interpolation.
         stepsize_controller=diffrax.ClipStepSizeController(
             diffrax.PIDController(rtol=rtol, atol=atol), step_ts=np.array(times)
         ),

@@ -24,14 +24,14 @@ MOVE = fj.JointMove([-0.5, 0.3, 0.2], [0.5, 0.6, -0.4], fj.Travel(1.0))
 # Soft enough for the longest period: the last link is light.
 KP, KD = np.array([100.0, 50.0, 10.0]), np.array([20.0, 10.0, 1.0])
 CONTROL = fj.PDController(KP, KD, np.inf, MOVE)
-# A program that is compiled sooner than that of the default.
+# This solver's program compiles faster than the default.
 SHORT = dict(solver=LoopedDopri8())
 
 
 def test_sampled_control_converges_at_first_order():
     exact = fj.simulate(ARM, START, [0, 0.4], (CONTROL,)).q[-1]
     periods = np.array([4e-3, 2e-3, 1e-3, 5e-4])
-    # As many samples of each period: one program.
+    # Equal numbers of samples for all periods, for one program.
     sampled = lambda p: fj.simulate_sampled(ARM, START, CONTROL, p, 800, **SHORT).q
     errors = [np.abs(sampled(p)[round(0.4 / p)] - exact).max() for p in periods]
     slopes = np.diff(np.log(errors)) / np.diff(np.log(periods))
@@ -44,7 +44,7 @@ def ramp(t, q, qd, linkage):
 
 @pytest.mark.parametrize("delay", [0.0, 0.03])
 def test_efforts_are_held_and_come_late(delay):
-    # Once by the default solver, which takes longer to compile.
+    # One run by the default solver, which takes longer to compile.
     options = {} if delay else SHORT
     motion = fj.simulate_sampled(WHEEL, REST, ramp, 0.1, 5, delay=delay, **options)
     np.testing.assert_allclose(motion.ts, np.arange(6) * 0.1, atol=1e-15)

@@ -144,7 +144,7 @@ def test_failed_members_add_nothing_to_a_gradient():
     np.testing.assert_allclose(gradient, expected, rtol=1e-7, atol=1e-9)
 
 
-# What is shared
+# Shared arrays
 
 
 def ramp(t, linkage):

@@ -170,7 +170,7 @@ def test_other_values_need_no_new_trace(batch, clean, monkeypatch):
     other = run((linkage, fj.State(q + 0.1, qd), forces))
     assert not calls
     assert not np.array_equal(other.q, clean.q)
-    # Fewer members need none either, and a new number of times shows the counting.
+    # Fewer members need no compilation either; a new number of times needs one.
     run(jax.tree.map(lambda a: a[:11], batch))
     assert not calls
     linkage, state0, forces = jax.tree.map(lambda a: a[0], batch)

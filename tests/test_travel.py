@@ -29,7 +29,7 @@ def test_a_profile_leads_from_start_to_end_and_rests_there(profile):
 @pytest.mark.parametrize(
     "profile, speed, acceleration",
     [
-        # In ways per duration, and per duration squared.
+        # In units of the way per duration, and per duration squared.
         ("harmonic", np.pi / 2, np.pi**2 / 2),
         ("cycloidal", 2.0, 2 * np.pi),
         ("quintic", 15 / 8, 10 / np.sqrt(3)),

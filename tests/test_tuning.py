@@ -28,7 +28,7 @@ def residuals_of(scene, gains, loss=tip_errors):
     trial = tuning.with_gains(scene, jnp.asarray(gains))
     ts = np.linspace(0, trial.t1, 1001)
     solution = fj.simulate(trial.linkage, trial.state0, ts, trial.forces)
-    # The time is that of the solution.
+    # The time is the solution's.
     return np.asarray(judged(loss, trial._replace(t1=0.0), solution))
 
 
@@ -63,7 +63,7 @@ def test_tuning_goes_down_to_a_point_where_only_bounds_hold():
     tuned = controller_of(result.scene)
     np.testing.assert_array_equal([tuned.kp, tuned.kd], result.gains)
     assert "gains are at a bound" in result.message
-    # The loss and the tip error are those of a simulation of its own.
+    # The loss and the tip error equal those of a separate simulation.
     loss = losses_of(scene, result.gains[None])[0]
     assert result.loss == pytest.approx(loss, rel=1e-6)
     assert result.tip_error == pytest.approx(loss**0.5, rel=1e-6)

@@ -19,7 +19,7 @@ def _package(name: str) -> Any:
         return import_module(name)
     except ImportError as error:
         raise ImportError(
-            f"{name} is not installed: pip install 'fdof_jax[data]' brings it."
+            f"{name} is not installed: pip install 'fdof_jax[data]' installs it."
         ) from error
 
 

@@ -198,7 +198,7 @@ def sliders(scenes: Mapping[str, Scene] | None = None) -> Any:
     except ImportError as error:
         raise ImportError(
             "sliders: expected ipywidgets, which pip install 'fdof_jax[notebook]' "
-            "brings."
+            "installs."
         ) from error
     known = {}
     scenes = circle_scenes() if scenes is None else scenes

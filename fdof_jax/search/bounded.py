@@ -126,7 +126,7 @@ def reporting(
         if report is not None:
             going = sum(run.reason is None for run in runs)
             report(
-                f"{number:4d}  {describe(runs)}, {going} of {len(runs)} runs going on"
+                f"{number:4d}  {describe(runs)}, {going} of {len(runs)} runs active"
             )
 
     return told

@@ -166,8 +166,8 @@ def _check(scene: Any, horizon: Any) -> float:
     limit = np.asarray(controller.limit)
     if not np.isfinite(limit).all():
         raise ValueError(
-            "scene: expected finite limits of its controller, as the best efforts "
-            f"without limits have none either, got {limit.tolist()}."
+            "scene: expected finite limits of its controller, as unlimited efforts "
+            f"have no best, got {limit.tolist()}."
         )
     if not hasattr(controller.reference, "tip"):
         raise ValueError(
@@ -263,7 +263,7 @@ def optimal_efforts(
     if not runs:
         raise RuntimeError(
             "optimal_efforts: the simulation fails with the efforts of every first "
-            "guess; take a shorter horizon."
+            "guess; use a shorter horizon."
         )
     run = min(runs, key=lambda run: run.best.loss)
     efforts = limit * run.best.z.reshape(-1, 3)

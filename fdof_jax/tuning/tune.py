@@ -109,7 +109,7 @@ def _failure(members: list[Scene], first: Row, ensemble: bool) -> ValueError:
     if failing.size == 0:
         return ValueError(
             "loss: expected finite numbers, not negative if only one, with finite "
-            "derivatives, got a loss that is not so at the scene's own gains."
+            "derivatives, got others at the scene's own gains."
         )
     index = int(failing[0])
     name = f"ensemble[{index}]" if ensemble else "scene"

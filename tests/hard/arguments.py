@@ -13,7 +13,7 @@ import numpy as np
 
 import fdof_jax as fj
 
-# Valid arguments, of which each call replaces one
+# Valid arguments; each call replaces one of them
 
 LINKS = dict(
     length=[0, 1, 1, 1], com=[[0.5, 0]] * 3, mass=[1] * 3, inertia=[1] * 3
@@ -45,7 +45,7 @@ def sweep(
     return fj.sweep(linkage, state0, ts, forces, **{**SETTINGS, **changes})
 
 
-# What is valid
+# Checks of valid values
 
 
 def numbers(value: Any) -> np.ndarray | None:
@@ -134,7 +134,7 @@ class Argument:
     call: Callable[[Any], Any]
     valid: Callable[[Any], bool]
     shape: tuple = ()
-    # Valid values may be refused, by name, for what they mean: a point out of reach.
+    # Valid values may be rejected by name for their meaning: a point out of reach.
     may_refuse: bool = False
     # Valid values are not tried: each would compile a program of its own.
     only_invalid: bool = False

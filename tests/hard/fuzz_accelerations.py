@@ -73,7 +73,7 @@ def check_accelerations(scene: Scene, report: Report) -> str:
     real = [joint == "R" for joint in arm.topology]
     if np.isfinite(xdd).all():
         still = np.where(real, slide, turn)
-        # What the terms alone would accelerate, too: they may cancel.
+        # The terms may cancel, so the accelerations by each of them count too.
         terms = [f / s**2 for f, s in zip(exact.efforts, exact.levers)]
         size = max(*terms, np.abs(xdd).max())
         if (np.abs(still) > ROUNDINGS * EPS * size).any():
@@ -100,7 +100,7 @@ def _told_ill_conditioned(linkage, scene: Scene, exact) -> bool:
 def _judge(name, value, exact, told, scene, report, spread=0.0) -> str:
     lost = resolution(exact)
     if lost >= UNRESOLVED:
-        # The bound means nothing; but who is wrong by much must have been told.
+        # The bound means nothing, but a large error must have been reported.
         if told:
             return "unresolved by float64, told"
         if not np.isfinite(value).all():

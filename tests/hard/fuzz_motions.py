@@ -17,7 +17,7 @@ from .oracle import EPS, ROUNDINGS
 from .random_scenes import Scene
 from .refusals import linkage_of, refusal
 
-TOLERANCE = 1e-11  # of simulate's default, relative and absolute
+TOLERANCE = 1e-11  # the default of simulate, relative and absolute
 INTERPOLATED = 30  # times the error of steps, at most, between them
 MAX_STEPS = 4096
 RESULTS = "successful max_steps_reached dt_min_reached singular nonfinite".split()
@@ -53,7 +53,7 @@ def check_motion(scene: Scene, report: Report) -> str:
     steps = int(solution.stats["num_steps"])
     report.motions.append((scene, ts, name, q, qd))
     finite = np.isfinite(np.concatenate([q, qd], axis=1)).all(axis=1)
-    # From 1 ms in steps of a fifth, nothing takes so many to begin with.
+    # No motion needs so many first steps, from 1 ms down by factors of five.
     if steps > 100 and not int(solution.stats["num_accepted_steps"]):
         raise Failure(f"{name}: {steps} steps and none accepted")
     if name != "successful":

@@ -18,7 +18,7 @@ import numpy as np
 
 TIMES = 21  # outputs of each scene, the start among them
 
-# Unless a scene says otherwise.
+# The default of all scenes.
 USUAL = dict(
     topology="RRR",
     length=[0.0, 1.0, 1.0, 1.0],
@@ -96,7 +96,7 @@ SCENES = {
 }
 # Derivatives of q at the end in these arguments.
 DERIVATIVES = {"driven-through-0-RPR": ("q0",), "fig5": ("q0", "mass", "length")}
-# The accelerations along the motion are wanted of these.
+# Scenes whose accelerations along the motion are stored.
 ACCELERATIONS = {"turn-slide-RPR", "near-parallel-PPR", "near-parallel-RPP"}
 PARAMETERS = (
     "length", "com", "mass", "inertia", "locked", "base_angle", "gravity", "effort",

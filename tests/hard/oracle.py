@@ -115,7 +115,7 @@ def _factors(M):
     rho = [mp.mpf(0)] * 3
     for k in (2, 1, 0):
         D[k] = rest[k][k]
-        # What is left of an exactly singular matrix is rounding at the working digits.
+        # Only rounding at the working digits remains of an exactly singular matrix.
         if M[k][k] == 0 or D[k] <= M[k][k] * mp.mpf(10) ** (10 - mp.dps):
             return D, None, tuple(map(float, rho))
         rho[k] = D[k] / M[k][k]
@@ -264,7 +264,7 @@ def motion(arm: Arm, q, qd, effort, damping, times, digits=30, most_steps=40):
                     step = h / 3
                     continue
                 t, y = (target if h == target - t else t + h), table[-1]
-                # Few rows sufficed: a longer step is cheaper.
+                # Few rows were enough: a longer step is cheaper.
                 step = max(step, h * (2 if j < 6 else 1))
             states.append(y)
         return states

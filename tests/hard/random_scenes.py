@@ -56,7 +56,7 @@ class Scene:
     tau: tuple
     junk: float  # effort on fictitious joints, which must not matter
     damping: tuple
-    pace: float  # how far the fastest joint goes in a simulation [m or rad], or so
+    pace: float  # about how far the fastest joint moves [m or rad]
     t0: float
 
 

@@ -107,7 +107,7 @@ def controller(tolerance, **keywords):
 
 
 TIGHT = controller(1e-12)
-DEFAULT = None  # what `simulate` does by itself
+DEFAULT = None  # the default of `simulate`
 
 
 def simulate(scene, steps, **keywords):

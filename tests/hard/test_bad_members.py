@@ -48,7 +48,7 @@ def by_vmap(q, qd, at):
 
 
 def by_sweep(q, qd, at):
-    # Chunks of as many as those that are late are solved in: one program.
+    # Late members are solved in chunks of this size too, by one program.
     return fj.sweep(arm(), fj.State(q, qd), TS, (Breaking(at),), forces_axes=0, chunk=8)
 
 

@@ -56,6 +56,6 @@ def test_a_pulse_of_a_microsecond():
         ).q[1:]
 
     assert np.abs(motion(pulse) - np.array(exact["q"])).max() <= 1e-8
-    # The pulse is what makes the motion.
+    # The motion depends on the pulse.
     without = motion(eqx.tree_at(lambda p: p.effort, pulse, jnp.array(0.0)))
     assert np.abs(without - np.array(exact["q"])).max() > 1e-3

@@ -54,8 +54,8 @@ def test_gradients_at_and_beyond_saturation(mode):
     gradient = jax.jit(
         derive(lambda *arguments: end(*arguments, adjoint), has_aux=True)
     )
-    # The efforts that gravity asks for, and a reference that demands exactly them: the
-    # arm rests at its limits.
+    # The reference demands exactly the efforts that gravity needs, so the arm rests at
+    # its limits.
     load = fj.inverse_dynamics(arm(), START.q, STILL, STILL)
     resting = Hold(START.q + load / KP)
     demand = fj.PDController(KP, 0.0, jnp.inf, resting).demand(
@@ -63,7 +63,7 @@ def test_gradients_at_and_beyond_saturation(mode):
     )
     at_limit, _ = gradient(0.0, jnp.abs(demand), resting)
     assert np.isfinite(at_limit)
-    # Weak actuators: the gains do nothing, and the share says so.
+    # Weak actuators: the gains have no effect, and the share is 1.
     weak, share = gradient(0.0, jnp.full(3, 1e-3), TARGET)
     assert weak == 0 and (share == 1).all()
     strong, share = gradient(0.0, jnp.full(3, 1e9), TARGET)
