@@ -35,6 +35,7 @@ from .prescribed import (
     motion_at,
     prescribed,
     start_of,
+    watched_hybrid_field,
 )
 from .solution import Solution
 from .step_wrappers import Watched, bounded, landing_on, undifferentiated
@@ -117,7 +118,9 @@ def _integrate(
         term = ScheduledTerm(vector_field, schedule_of, health_of, watched_field)
         start = zeros(q0), tuple(qd0)
     else:
-        term = ScheduledTerm(hybrid_field, schedule_of, health_of_hybrid)
+        term = ScheduledTerm(
+            hybrid_field, schedule_of, health_of_hybrid, watched_hybrid_field
+        )
         start = start_of(motion, args, qd0)
     controller = keywords["stepsize_controller"]
     # Implicit solvers are chosen for stiff modes, which would bound steps too tightly.
