@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.flatten_util import ravel_pytree
 
 from ..checks import is_traced
 from ..forces.added_inertia import inertial
@@ -17,7 +18,7 @@ from ..linkage.linkage import possible
 from ..mechanics.equations import link_constants, zeros
 from ..xla.callbacks import without_checks
 from ..xla.configuration import small_loops_are_kernels
-from .dopri8 import ScheduledTerm
+from .dopri8 import ScheduledTerm, constant
 from .field import (
     Args,
     health_of,
@@ -34,6 +35,7 @@ from .prescribed import (
     motion_at,
     prescribed,
     start_of,
+    watched_hybrid_field,
 )
 from .solution import Solution
 from .step_wrappers import Watched, bounded, landing_on, undifferentiated
@@ -62,7 +64,7 @@ def _step_for_tangents(t0: Array, args: Args, own: tuple, fraction: float) -> Ar
     linearised = jax.jacfwd(accelerations)(jnp.zeros_like(args.q0))
     omega2 = jnp.sqrt(jnp.abs(jnp.sum(linearised * linearised.T)))
     step = fraction / jnp.sqrt(omega2)
-    return jax.lax.stop_gradient(jnp.where(step > 0, step, jnp.inf))
+    return jnp.where(step > 0, step, jnp.inf)
 
 
 def _batch_solver(forces: Forces) -> diffrax.AbstractSolver:
@@ -116,7 +118,9 @@ def _integrate(
         term = ScheduledTerm(vector_field, schedule_of, health_of, watched_field)
         start = zeros(q0), tuple(qd0)
     else:
-        term = ScheduledTerm(hybrid_field, schedule_of, health_of_hybrid)
+        term = ScheduledTerm(
+            hybrid_field, schedule_of, health_of_hybrid, watched_hybrid_field
+        )
         start = start_of(motion, args, qd0)
     controller = keywords["stepsize_controller"]
     # Implicit solvers are chosen for stiff modes, which would bound steps too tightly.
@@ -126,7 +130,8 @@ def _integrate(
         controller = default_controller()
     if derivatives and not trusted:
         fraction = _OF_TIME_SCALE[0 if (solver.order(term) or 0) >= 8 else 1]
-        longest = lambda: _step_for_tangents(ts[0], args, own, fraction)
+        start_time, *start_of_motion = constant((ts[0], args, own))
+        longest = lambda: _step_for_tangents(start_time, *start_of_motion, fraction)
         controller = bounded(controller, longest)
     controller = undifferentiated(controller)
     if (jumps := jumps_of(*forces)) is not None:
@@ -189,9 +194,37 @@ def _integrate_reversibly(inputs, solver, keywords) -> Solution:
     return _integrate(solver or _batch_solver(inputs[-1]), inputs, keywords)
 
 
+# Up to so many numbers, tangents cost no more than the adjoint equations (one arm or
+# 256), and compile in half the time.
+_FEW = 12
+
+
+def _few(moving) -> bool:
+    """Whether tangents in all these numbers are cheaper than a backward pass."""
+    leaves = jax.tree.leaves(moving)
+    real = all(jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in leaves)
+    return real and sum(leaf.size for leaf in leaves) <= _FEW
+
+
+def _with_tangents(motion, moving):
+    """Returns what `motion` returns and the states' tangents in each number."""
+    start, whole = ravel_pytree(moving)
+
+    def along(direction):
+        shifted = lambda numbers: motion(whole(numbers))
+        return jax.jvp(shifted, (start,), (direction,), has_aux=True)
+
+    directions = jnp.eye(len(start), dtype=start.dtype)
+    return jax.vmap(along, out_axes=(None, 0, None))(directions)
+
+
 @_integrate_reversibly.def_fwd
 def _integrate_reversibly_fwd(perturbed, inputs, solver, keywords):
     moving, fixed = eqx.partition(inputs, perturbed)
+    few = _few(moving)
+    if few:
+        solver = solver or _tangent_solver(inputs[-1])
+        keywords = keywords | {"adjoint": diffrax.ForwardMode()}
 
     def motion(moving):
         inputs = eqx.combine(moving, fixed)
@@ -200,6 +233,9 @@ def _integrate_reversibly_fwd(perturbed, inputs, solver, keywords):
         )
         return (solution.q, solution.qd, solution.own), solution
 
+    if few:
+        states, tangents, solution = _with_tangents(motion, moving)
+        return solution, (tangents, states)
     states, pull_back, solution = eqx.filter_vjp(motion, moving, has_aux=True)
     return solution, (pull_back, states)
 
@@ -208,13 +244,23 @@ def _integrate_reversibly_fwd(perturbed, inputs, solver, keywords):
 def _integrate_reversibly_bwd(
     residuals, cotangent, perturbed, inputs, solver, keywords
 ):
-    pull_back, states = residuals
+    slopes, states = residuals
     wanted = eqx.combine(
         (cotangent.q, cotangent.qd, cotangent.own),
         jax.tree.map(jnp.zeros_like, states),
     )
-    (gradient,) = pull_back(wanted)
-    return gradient
+    moving = eqx.filter(inputs, perturbed)
+    if not _few(moving):
+        (gradient,) = slopes(wanted)
+        return gradient
+    start, whole = ravel_pytree(moving)
+
+    def part(weight: Array, tangent: Array) -> Array:
+        weight, tangent = weight.reshape(1, -1), tangent.reshape(len(start), -1)
+        # What was not reached has tangents that are not finite, and weights 0.
+        return jnp.where(weight == 0, 0, weight * tangent).sum(axis=1)
+
+    return whole(sum(jax.tree.leaves(jax.tree.map(part, wanted, slopes))))
 
 
 def _opened(inputs):
@@ -230,9 +276,14 @@ def _opened(inputs):
     return linkage, state0, ts, own0, opened
 
 
-@eqx.filter_jit
 def solve(solver, inputs, keywords) -> Solution:
     """Computes the motion for traced inputs: a batch, or with derivatives."""
+    # Within a program, a program of its own would also be traced without derivatives.
+    inside = is_traced(jax.device_put(np.zeros(())))
+    return (_solve if inside else _solve_compiled)(solver, inputs, keywords)
+
+
+def _solve(solver, inputs, keywords) -> Solution:
     adjoint = keywords["adjoint"]
     if isinstance(adjoint, diffrax.RecursiveCheckpointAdjoint):
         return _integrate_reversibly(_opened(inputs), solver, keywords)
@@ -241,6 +292,8 @@ def solve(solver, inputs, keywords) -> Solution:
         solver = _tangent_solver(inputs[-1]) if forward else LoopedDopri8()
     return _integrate(solver, inputs, keywords, derivatives=True)
 
+
+_solve_compiled = eqx.filter_jit(_solve)
 
 # All calls with at most this many output times share one program.
 _FEWEST_TIMES = 512
