@@ -184,7 +184,7 @@ def _integrate(
 
 @eqx.filter_custom_vjp
 def _integrate_reversibly(inputs, solver, keywords) -> Solution:
-    """Integrates a motion that may be differentiated in reverse mode.
+    """Integrates a motion that may be differentiated by `jax.grad`.
 
     Unrolled stages compile differently with and without derivatives, and the replay of
     the backward pass must reproduce the same bits: they serve the plain solve alone.
@@ -199,11 +199,15 @@ def _integrate_reversibly(inputs, solver, keywords) -> Solution:
 _FEW = 12
 
 
-def _few(moving) -> bool:
-    """Whether tangents in all these numbers are cheaper than a backward pass."""
+def _few(moving, adjoint) -> bool:
+    """Returns whether tangents in all these numbers serve better than the adjoint.
+
+    Who sets the number of checkpoints wants the adjoint.
+    """
     leaves = jax.tree.leaves(moving)
     real = all(jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in leaves)
-    return real and sum(leaf.size for leaf in leaves) <= _FEW
+    few = sum(leaf.size for leaf in leaves) <= _FEW
+    return real and few and adjoint.checkpoints is None
 
 
 def _with_tangents(motion, moving):
@@ -221,7 +225,7 @@ def _with_tangents(motion, moving):
 @_integrate_reversibly.def_fwd
 def _integrate_reversibly_fwd(perturbed, inputs, solver, keywords):
     moving, fixed = eqx.partition(inputs, perturbed)
-    few = _few(moving)
+    few = _few(moving, keywords["adjoint"])
     if few:
         solver = solver or _tangent_solver(inputs[-1])
         keywords = keywords | {"adjoint": diffrax.ForwardMode()}
@@ -250,7 +254,7 @@ def _integrate_reversibly_bwd(
         jax.tree.map(jnp.zeros_like, states),
     )
     moving = eqx.filter(inputs, perturbed)
-    if not _few(moving):
+    if not _few(moving, keywords["adjoint"]):
         (gradient,) = slopes(wanted)
         return gradient
     start, whole = ravel_pytree(moving)
