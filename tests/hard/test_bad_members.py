@@ -117,9 +117,14 @@ def test_a_member_that_starts_nan_adds_nothing_under_vmap():
 
     slope = jax.jit(jax.grad(loss))
     q0 = START.q + np.array([[0.0], [0.1]])
-    alone = slope(jnp.ones(3), q0[[0, 0]]) / 2  # two of them: the same program
+    # Two of them: the same program.
+    first, second = (slope(jnp.ones(3), q0[[k, k]]) / 2 for k in (0, 1))
     spoilt = slope(jnp.ones(3), np.where([[False], [True]], np.nan, q0))
-    np.testing.assert_allclose(spoilt, alone, rtol=1e-9)
+    np.testing.assert_allclose(spoilt, first, rtol=1e-9)
+    # Without such a member the gradient is the sum of both.
+    assert np.abs(first - second).max() > 1e-3
+    together = slope(jnp.ones(3), q0)
+    np.testing.assert_allclose(together, first + second, rtol=1e-8)
 
 
 @pytest.mark.parametrize("solver", [None, diffrax.Dopri8()])
