@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from elements import Swing
+from elements import SHORT, Swing
 from helpers import random_linkage
 from scipy.integrate import simpson, solve_ivp
 
@@ -191,9 +191,9 @@ def test_topologies_are_batched():
     stack = lambda trees: jax.tree.map(lambda *a: jnp.stack(a), *trees)
     linkages, starts, forces = map(stack, zip(*members))
     ts = [0, 0.3]
-    swept = fj.sweep(linkages, starts, ts, forces, forces_axes=0)
+    swept = fj.sweep(linkages, starts, ts, forces, forces_axes=0, **SHORT)
     for k, (linkage, start, forces) in enumerate(members):
-        alone = fj.simulate(linkage, start, ts, forces)
+        alone = fj.simulate(linkage, start, ts, forces, **SHORT)
         np.testing.assert_allclose(swept.q[k], alone.q, atol=1e-9)
 
 

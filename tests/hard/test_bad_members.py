@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import fdof_jax as fj
-from hard.scenes import START, arm
+from hard.scenes import OUTPUTS, START, arm, behind_the_door
 
 SIZE, TS = 256, np.linspace(0, 0.5, 6)
 NAN_START, NAN_LATER, FAST = 17, 101, 200
@@ -117,9 +117,14 @@ def test_a_member_that_starts_nan_adds_nothing_under_vmap():
 
     slope = jax.jit(jax.grad(loss))
     q0 = START.q + np.array([[0.0], [0.1]])
-    alone = slope(jnp.ones(3), q0[[0, 0]]) / 2  # two of them: the same program
+    # Two of them: the same program.
+    first, second = (slope(jnp.ones(3), q0[[k, k]]) / 2 for k in (0, 1))
     spoilt = slope(jnp.ones(3), np.where([[False], [True]], np.nan, q0))
-    np.testing.assert_allclose(spoilt, alone, rtol=1e-9)
+    np.testing.assert_allclose(spoilt, first, rtol=1e-9)
+    # Without such a member the gradient is the sum of both.
+    assert np.abs(first - second).max() > 1e-3
+    together = slope(jnp.ones(3), q0)
+    np.testing.assert_allclose(together, first + second, rtol=1e-8)
 
 
 @pytest.mark.parametrize("solver", [None, diffrax.Dopri8()])
@@ -137,15 +142,9 @@ def test_a_controller_of_one_s_own_does_not_reject_for_ever(solver):
 LONG = np.linspace(0, 5, 26)
 
 
-def out_of_steps(q0, **keywords):
-    return fj.simulate(
-        arm(), fj.State(q0, START.qd), LONG, max_steps=50, throw=False, **keywords
-    )
-
-
 def test_running_out_of_steps_is_told():
-    """The last state reached looks like any other state."""
-    solution = out_of_steps(START.q)
+    """The state that was reached looks like any other."""
+    solution = fj.simulate(arm(), START, LONG, max_steps=50, throw=False)
     assert solution.outcome == "out of steps"
     reached = solution.stats["time_reached"]
     assert 0 < reached < LONG[-1]
@@ -164,10 +163,6 @@ def test_a_gradient_of_what_was_not_reached_is_zero_and_the_value_tells():
     members out. The value and the outcome report the failure instead.
     """
 
-    def end(q0):
-        solution = out_of_steps(q0)
-        return solution.q[-1, 0], solution.result
-
-    (value, result), slope = jax.value_and_grad(end, has_aux=True)(START.q)
-    assert np.isnan(value) and result == diffrax.RESULTS.max_steps_reached
-    assert not np.any(slope)
+    motion, value, slopes = behind_the_door(arm(), START.q, np.linspace(0, 20, OUTPUTS))
+    assert np.isnan(value) and motion.result == diffrax.RESULTS.max_steps_reached
+    assert not any(np.any(slope) for slope in slopes)
