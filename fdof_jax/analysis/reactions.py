@@ -10,7 +10,8 @@ from jaxtyping import Float
 
 from ..dynamics import forward_dynamics
 from ..forces.element import Forces, InertialElement
-from ..forces.points import PointElement, cross, frames_of
+from ..forces.points import PointElement
+from ..linkage.frames import cross, frames
 from ..linkage.linkage import Linkage
 from ..mechanics.kinematics import joint_positions, mass_center_velocities, mass_centers
 from ..simulation.simulate import joint_efforts
@@ -21,12 +22,12 @@ def _loads(
     linkage: Linkage, forces: Forces, t: Any, q: Array, qd: Array, qdd: Array
 ) -> tuple[Array, Array]:
     """Forces on the ground and the links, and moments about the ground pivot."""
-    frames = frames_of(linkage, tuple(q))
+    parts = frames(linkage, q)
     force, moment = jnp.zeros(4, complex), jnp.zeros(4)
     for index, element in enumerate(forces):
         loads = ()
         if isinstance(element, PointElement):
-            loads = element.loads(element.schedule(t, linkage), frames, tuple(qd))
+            loads = element.loads(element.schedule(t, linkage), parts, tuple(qd))
         elif isinstance(element, InertialElement):
             loads = element.loads(t, q, qd, qdd, linkage)
             if loads is None:
@@ -36,7 +37,7 @@ def _loads(
                     f"{element!r}."
                 )
         for point, push, turn in loads:
-            about_pivot = turn + cross(point.place(frames), push)
+            about_pivot = turn + cross(point.place(parts), push)
             force = force.at[point.link].add(push)
             moment = moment.at[point.link].add(about_pivot)
     return force, moment

@@ -3,7 +3,11 @@
 import warnings
 from typing import TYPE_CHECKING
 
+import jax
 import numpy as np
+
+from .frames import frames
+from .topology import real_joints
 
 if TYPE_CHECKING:
     from .linkage import Linkage
@@ -19,28 +23,21 @@ def _least_inertia(linkage: "Linkage", configurations: int) -> np.ndarray:
     3x3 mass matrix (configurations, 3). Scaling to a diagonal of ones makes it free of
     units and sizes. NumPy avoids compilation in the constructor.
     """
-    ef, length, com, mass, inertia, locked, base_angle = (
-        np.asarray(a, dtype=float)
-        for a in (
-            linkage.ef, linkage.length, linkage.com, linkage.mass,
-            linkage.inertia, linkage.locked, linkage.base_angle,
-        )
-    )  # fmt: skip
-    revolute = ef[1::2] > 0.5
+    linkage = jax.tree.map(lambda a: np.asarray(a, dtype=float), linkage)
+    com, mass, inertia = linkage.com, linkage.mass, linkage.inertia
+    revolute = np.stack(real_joints(linkage.ef))
     ratios = np.empty((configurations, 3))
     random = np.random.default_rng(0)
-    reach = np.abs(length).sum() + np.abs(com).sum() + np.abs(locked[revolute]).sum()
+    sizes = linkage.length, com, linkage.locked[revolute]
+    reach = sum(np.abs(size).sum() for size in sizes)
     for row in ratios:
-        turn = np.where(revolute, random.uniform(-np.pi, np.pi, 3), locked)
-        slide = np.where(revolute, locked, (reach or 1) * random.uniform(-1, 1, 3))
-        angle = base_angle + np.concatenate([[0], np.cumsum(turn)])
-        along = np.exp(1j * angle)  # complex numbers as plane vectors
-        steps = (length[:3] + 1j * slide) * along[:3]
-        origin = np.cumsum(steps)
+        turn = random.uniform(-np.pi, np.pi, 3)
+        slide = (reach or 1) * random.uniform(-1, 1, 3)
+        start, along, *_ = frames(linkage, np.where(revolute, turn, slide))
         M = np.zeros((3, 3))
         for n in range(3):
-            centre = origin[n] + (com[n, 0] + 1j * com[n, 1]) * along[n + 1]
-            J = np.where(revolute, 1j * (centre - origin), 1j * along[:3])
+            centre = start[n + 1] + (com[n, 0] + 1j * com[n, 1]) * along[n + 1]
+            J = 1j * np.where(revolute, centre - start[1:], along[:3])
             J[n + 1 :] = 0
             turns = np.where(revolute, 1.0, 0.0)
             turns[n + 1 :] = 0
@@ -57,7 +54,7 @@ def _least_inertia(linkage: "Linkage", configurations: int) -> np.ndarray:
 
 def check_singularity(linkage: "Linkage") -> None:
     """Rejects linkages that are always singular; warns of those that may become so."""
-    revolute = np.asarray(linkage.ef)[1::2] > 0.5
+    revolute = np.stack(real_joints(np.asarray(linkage.ef)))
     names = "".join("R" if r else "P" for r in revolute)
     best = _least_inertia(linkage, configurations=5).max(axis=0)
     for k in (2, 1, 0):

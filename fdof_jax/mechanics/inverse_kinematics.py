@@ -9,10 +9,11 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from ..checks import concrete, real_array, sign
-from ..linkage.coordinates import real_joints
+from ..linkage.frames import unit_vector
 from ..linkage.linkage import Linkage, check_linkage
+from ..linkage.topology import real_joints
 from ..xla.array_namespace import in_numpy, namespace, plane_vector
-from .kinematics import as_points, unit_vectors
+from .kinematics import as_points
 
 
 def plane_angle(y: Array, x: Array) -> Array:
@@ -60,7 +61,7 @@ def known_directions(linkage: Linkage, orientation: Array) -> Directions:
     th3 = xp.where(r3, th2 + lock2, th3_from_tip)
     # One call for all: sine and cosine are most of the compiled code here.
     angles = xp.stack([linkage.base_angle, th2, th3, orientation, lock2])
-    return Directions(th2, th3, *unit_vectors(angles))
+    return Directions(th2, th3, *unit_vector(angles))
 
 
 def unmoved_part(linkage: Linkage, directions: Directions) -> Array:

@@ -24,6 +24,7 @@ from ..control.pd import PDController
 from ..dynamics import energy, link_energies
 from ..forces.element import Forces, InertialElement
 from ..linkage.linkage import Linkage
+from ..linkage.topology import real_joints
 from ..simulation.simulate import joint_efforts
 from ..simulation.solution import Solution
 from .axes import (
@@ -207,7 +208,7 @@ def effort_profile(
     reached(solution)
     efforts = joint_efforts(linkage, forces, solution)
     ts, total, elements = (np.asarray(a) for a in (solution.ts, *efforts))
-    units = np.where(np.asarray(linkage.ef)[1::2] > 0.5, "N m", "N")
+    units = np.where(real_joints(np.asarray(linkage.ef)), "N m", "N")
     panels = []
     for k, unit in enumerate(units):
         symbol = f"$T_{k + 2}$" if unit == "N m" else f"$F_{k + 1}$"
