@@ -24,32 +24,24 @@ def _least_inertia(linkage: "Linkage", configurations: int) -> np.ndarray:
     units and sizes. NumPy avoids compilation in the constructor.
     """
     linkage = jax.tree.map(lambda a: np.asarray(a, dtype=float), linkage)
-    com, mass, inertia = linkage.com, linkage.mass, linkage.inertia
     revolute = np.stack(real_joints(linkage.ef))
-    ratios = np.empty((configurations, 3))
-    random = np.random.default_rng(0)
-    sizes = linkage.length, com, linkage.locked[revolute]
+    sizes = linkage.length, linkage.com, linkage.locked[revolute]
     reach = sum(np.abs(size).sum() for size in sizes)
-    for row in ratios:
-        turn = random.uniform(-np.pi, np.pi, 3)
-        slide = (reach or 1) * random.uniform(-1, 1, 3)
-        start, along, *_ = frames(linkage, np.where(revolute, turn, slide))
-        M = np.zeros((3, 3))
-        for n in range(3):
-            centre = start[n + 1] + (com[n, 0] + 1j * com[n, 1]) * along[n + 1]
-            J = 1j * np.where(revolute, centre - start[1:], along[:3])
-            J[n + 1 :] = 0
-            turns = np.where(revolute, 1.0, 0.0)
-            turns[n + 1 :] = 0
-            M += mass[n] * np.real(np.outer(J.conj(), J)) + inertia[n] * np.outer(
-                turns, turns
-            )
-        # Eigenvalues, because pivots of an elimination lose accuracy near singularity.
-        scale = np.sqrt(np.maximum(np.diag(M), np.finfo(float).tiny))
-        scaled = M / np.outer(scale, scale)
-        for k in range(3):
-            row[k] = np.linalg.eigvalsh(scaled[k:, k:])[0]
-    return ratios
+    draws = np.random.default_rng(0).uniform(-1, 1, (configurations, 2, 3))
+    q = np.where(revolute, np.pi * draws[:, 0], (reach or 1) * draws[:, 1])
+    start, along, *_ = frames(linkage, q)
+    centre = start[:, 1:] + linkage.com @ [1, 1j] * along[:, 1:]
+    moved = np.tri(3)  # a joint moves only the links beyond it
+    arm = centre[:, :, None] - start[:, None, 1:]
+    J = moved * np.where(revolute, arm, along[:, None, :3])
+    M = np.einsum("n,cnj,cnk->cjk", linkage.mass, J.conj(), J).real
+    M += np.einsum("n,nj,nk->jk", linkage.inertia, moved * revolute, moved * revolute)
+    # Eigenvalues, because pivots of an elimination lose accuracy near singularity.
+    tiny = np.finfo(float).tiny
+    scale = np.sqrt(np.maximum(np.diagonal(M, axis1=1, axis2=2), tiny))
+    scaled = M / (scale[:, :, None] * scale[:, None])
+    least = [np.linalg.eigvalsh(scaled[:, k:, k:])[:, 0] for k in range(3)]
+    return np.stack(least, axis=1)
 
 
 def check_singularity(linkage: "Linkage") -> None:
