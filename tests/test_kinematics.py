@@ -239,9 +239,7 @@ def test_parallel_slides_reach_no_given_point(topology, lock, base_angle):
 @jax.jit
 def wrists_solved(linkage, wrists, orientation, branch):
     directions = known_directions(linkage, orientation)
-    one = lambda w, bearing: solve_joints(
-        linkage, directions, w, bearing, orientation, branch
-    )
+    one = lambda w, bearing: solve_joints(linkage, directions, w, bearing, branch)
     return jax.vmap(one)(wrists, plane_angle(wrists[:, 1], wrists[:, 0]))
 
 
@@ -257,7 +255,7 @@ def test_numpy_solves_the_joints_as_jax_does(topology, branch):
         bearing = plane_angle(wrists[:, 1], wrists[:, 0])
         angle = np.asarray(orientation)
         directions = known_directions(known, angle)
-        q, root = solve_joints(known, directions, wrists, bearing, angle, sides)
+        q, root = solve_joints(known, directions, wrists, bearing, sides)
         expected, _ = wrists_solved(linkage, wrists, angle, sides)
         assert isinstance(q, np.ndarray) and isinstance(root, np.ndarray)
         # Next to the edge of the reach a root takes rounding to its square root.

@@ -99,9 +99,7 @@ class CircleTask(eqx.Module):
         bearing = bearing - 2 * np.pi * whole_turns(at_start)
         _, cos, sin = (values[0] for values in turned)
         wrist = _on_circle(self, cos, sin) - unmoved
-        return solve_joints(
-            linkage, directions, wrist, bearing, self.orientation, self.branch
-        )
+        return solve_joints(linkage, directions, wrist, bearing, self.branch)
 
     def __call__(
         self, t: ArrayLike, linkage: Linkage

@@ -150,9 +150,7 @@ class TipTask(eqx.Module):
         beside = plane_angle(across, wrist @ hub)
         middle = plane_angle(hub[1], hub[0])
         bearing = middle - 2 * np.pi * whole_turns(middle) + beside
-        q, root = solve_joints(
-            linkage, directions, wrist, bearing, self.orientation, self.branch
-        )
+        q, root = solve_joints(linkage, directions, wrist, bearing, self.branch)
         return q, root, beside
 
     def __call__(
