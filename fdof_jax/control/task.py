@@ -1,10 +1,10 @@
 """References along paths of the tip, and moves of the joints."""
 
+from abc import abstractmethod
 from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jaxtyping import Float
@@ -21,10 +21,11 @@ from ..mechanics.inverse_kinematics import (
 )
 from ..xla.array_namespace import in_numpy, namespace
 from .paths import IN_NUMPY, Path, points_at
+from .reference import PositionReference
 from .timing import Laps, Travel
 
 
-class JointMove(eqx.Module):
+class JointMove(PositionReference):
     """A move of all joints from one position to another, in step.
 
     **Arguments:** `start`, `end`: joint positions [m or rad]; `travel`: a `Travel`.
@@ -49,23 +50,10 @@ class JointMove(eqx.Module):
         instance("travel", travel, Travel)
         self.travel = travel
 
-    @property
-    def evaluates_in_numpy(self) -> bool:
-        """Returns whether `assembly` runs in NumPy; a subclass may not."""
-        return type(self) is JointMove
-
     def assembly(self, t: Array, linkage: Linkage) -> tuple[Array, float]:
         """Joint positions, and 1 as the root: a joint move has no edge of a reach."""
         share = self.travel(t)[..., None]
         return self.start + share * (self.end - self.start), 1.0
-
-    def __call__(
-        self, t: ArrayLike, linkage: Linkage
-    ) -> tuple[Float[Array, " joint"], Float[Array, " joint"]]:
-        """Joint positions [m or rad] and velocities [m/s or rad/s] at time `t` [s]."""
-        t = real_array("t", t, ())
-        positions = lambda t: self.assembly(t, linkage)[0]
-        return jax.jvp(positions, (t,), (jnp.ones_like(t),))
 
     @property
     def jump_ts(self) -> Array:
@@ -73,7 +61,33 @@ class JointMove(eqx.Module):
         return self.travel.jump_ts
 
 
-class TipTask(eqx.Module):
+def between(a: Array, b: Array) -> Array:
+    """Computes the angle from `a` to `b` (..., 2), in [-pi, pi]."""
+    ax, ay, bx, by = a[..., 0], a[..., 1], b[..., 0], b[..., 1]
+    return plane_angle(ax * by - ay * bx, ax * bx + ay * by)
+
+
+class TipReference(PositionReference):
+    """A motion of the tip on which the last link keeps its angle."""
+
+    orientation: eqx.AbstractVar[Array]
+    branch: eqx.AbstractVar[Array]
+
+    @abstractmethod
+    def seen(self, t: Array, base: Array) -> tuple[Array, Array]:
+        """The wrist as seen from the first joint: points (..., 2) and their angle.
+
+        `base`: what the wrist's vector lacks to the tip's, (2,). The angle is
+        continuous in time.
+        """
+
+    def assembly(self, t, linkage):
+        directions = known_directions(linkage, self.orientation)
+        seen = self.seen(t, unmoved_part(linkage, directions))
+        return solve_joints(linkage, directions, *seen, self.branch)
+
+
+class TipTask(TipReference):
     """A path of the tip on which the last link keeps its angle.
 
     A call with `(t, linkage)` returns the joint reference, computed by the closed-form
@@ -124,18 +138,8 @@ class TipTask(eqx.Module):
         """The commanded tip position at time `t` [s]: (x, y) [m]."""
         return self.path.point(self.timing(real_array("t", t, ())))
 
-    @property
-    def evaluates_in_numpy(self) -> bool:
-        """Returns whether `assembly` runs in NumPy; a subclass may not."""
-        return type(self) is TipTask
-
-    def assembly(self, t: Array, linkage: Linkage) -> tuple[Array, Array]:
-        """Joint positions, and the root that is 0 at the edge of the reach."""
-        q, root, _ = self._solved(t, linkage)
-        return q, root
-
-    def _solved(self, t: Array, linkage: Linkage) -> tuple[Array, Array, Array]:
-        """The `assembly`, and the wrist's angle from the direction of the middle."""
+    def seen(self, t, base):
+        """The wrist and its angle, as the angle from the path's middle and its own."""
         own = not {type(self.path), type(self.timing)} <= IN_NUMPY
         if own and namespace(t) is np:
             with jax.ensure_compile_time_eval():  # also within transformations
@@ -143,23 +147,9 @@ class TipTask(eqx.Module):
             tip: Any = np.asarray(points).reshape(*np.shape(t), 2)
         else:
             tip = self.path.point(self.timing(t))
-        directions = known_directions(linkage, self.orientation)
-        unmoved = unmoved_part(linkage, directions)
-        wrist, hub = tip - unmoved, in_numpy(self.path.middle) - unmoved
-        across = hub[0] * wrist[..., 1] - hub[1] * wrist[..., 0]
-        beside = plane_angle(across, wrist @ hub)
+        wrist, hub = tip - base, in_numpy(self.path.middle) - base
         middle = plane_angle(hub[1], hub[0])
-        bearing = middle - 2 * np.pi * whole_turns(middle) + beside
-        q, root = solve_joints(linkage, directions, wrist, bearing, self.branch)
-        return q, root, beside
-
-    def __call__(
-        self, t: ArrayLike, linkage: Linkage
-    ) -> tuple[Float[Array, " joint"], Float[Array, " joint"]]:
-        """Joint positions [m or rad] and velocities [m/s or rad/s] at time `t` [s]."""
-        t = real_array("t", t, ())
-        positions = lambda t: self.assembly(t, linkage)[0]
-        return jax.jvp(positions, (t,), (jnp.ones_like(t),))
+        return wrist, middle - 2 * np.pi * whole_turns(middle) + between(hub, wrist)
 
     @property
     def jump_ts(self) -> Array | None:
@@ -176,7 +166,10 @@ class TipTask(eqx.Module):
         if isinstance(self.timing, Laps):  # all laps are alike
             end = min(end, ts[0] + abs(task.timing.period))
         times = np.linspace(ts[0], end, 1000, dtype=ts.dtype)
-        q, _, beside = task._solved(times, arm)
+        directions = known_directions(arm, task.orientation)
+        base = unmoved_part(arm, directions)
+        wrist, bearing = task.seen(times, base)
+        q, _ = solve_joints(arm, directions, wrist, bearing, task.branch)
         inside = np.isfinite(q).all(axis=1)
         if not inside.all():
             raise ValueError(
@@ -184,10 +177,8 @@ class TipTask(eqx.Module):
                 f"{task.orientation:g} rad on branch {task.branch:+g}, got one that "
                 f"leaves it at {times[inside.argmin()]:g} s."
             )
-        directions = known_directions(arm, task.orientation)
-        hub = in_numpy(task.path.middle) - unmoved_part(arm, directions)
-        behind = (np.abs(np.diff(beside)) > np.pi).any()
-        if behind or not hub.any():
+        behind = (np.abs(np.diff(bearing)) > np.pi).any()
+        if behind or (in_numpy(task.path.middle) == base).all():
             raise ValueError(
                 "reference: expected a path that does not pass behind the ground "
                 "pivot as seen from its middle, got one that does."

@@ -51,13 +51,13 @@ def frames(linkage: "Linkage", q: Any) -> Frames:
     revolute = xp.stack(real_joints(linkage.ef))
     slide = xp.where(revolute, linkage.locked, q)
     turn = xp.cumsum(xp.where(revolute, q, linkage.locked), axis=-1)
-    zero = xp.zeros_like(turn[..., :1])
-    angle = linkage.base_angle + xp.concatenate([zero, turn], axis=-1)
+    base = xp.broadcast_to(linkage.base_angle, turn[..., :1].shape)
+    angle = xp.concatenate([base, base + turn], axis=-1)
     direction = unit_vector(angle)
     # The length A runs along a link, the slide B across it.
     length = xp.broadcast_to(linkage.length[:3], slide.shape)
     steps = plane_vector(length, slide) * direction[..., :3]
-    start = xp.concatenate([zero, xp.cumsum(steps, axis=-1)], axis=-1)
+    start = xp.concatenate([xp.zeros_like(base), xp.cumsum(steps, axis=-1)], axis=-1)
     return Frames(start, direction, angle, slide, revolute)
 
 
