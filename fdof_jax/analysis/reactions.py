@@ -16,6 +16,7 @@ from ..linkage.linkage import Linkage
 from ..mechanics.kinematics import joint_positions, mass_center_velocities, mass_centers
 from ..simulation.simulate import joint_efforts
 from ..simulation.solution import Solution
+from ..xla.array_namespace import plane_vectors
 
 
 def _loads(
@@ -43,18 +44,15 @@ def _loads(
     return force, moment
 
 
-def _complex(vectors: Array) -> Array:
-    return jax.lax.complex(vectors[:, 0], vectors[:, 1])
-
-
 def _reactions(
     linkage: Linkage, forces: Forces, t: Array, q: Array, qd: Array, tau: Array
 ) -> Array:
     qdd = forward_dynamics(linkage, q, qd, tau, forces)
     motion = lambda q, qd: mass_center_velocities(linkage, q, qd)
     _, (acceleration, spin_up) = jax.jvp(motion, (q, qd), (qd, qdd))
-    needed = linkage.mass * (_complex(acceleration) + 1j * linkage.gravity)
-    center, joint = (_complex(f(linkage, q)) for f in (mass_centers, joint_positions))
+    needed = linkage.mass * (plane_vectors(acceleration) + 1j * linkage.gravity)
+    center = plane_vectors(mass_centers(linkage, q))
+    joint = plane_vectors(joint_positions(linkage, q))
     turning = linkage.inertia * spin_up + cross(center, needed)
     force, moment = _loads(linkage, forces, t, q, qd, qdd)
     # Each joint carries all links beyond it.

@@ -1,11 +1,13 @@
 """The circle of Fig 7."""
 
+import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from ..checks import concrete, real_array, sign
+from ..linkage.frames import dot
 from ..linkage.linkage import Linkage
 from ..mechanics.inverse_kinematics import (
     known_directions,
@@ -13,9 +15,9 @@ from ..mechanics.inverse_kinematics import (
     unmoved_part,
     whole_turns,
 )
-from ..xla.array_namespace import in_numpy, namespace, sine_and_cosine
+from ..xla.array_namespace import in_numpy, namespace, plane_vector, sine_and_cosine
 from .reference import known_reach
-from .task import TipReference, between
+from .task import TipReference, angle_between
 
 
 class CircleTask(TipReference):
@@ -77,13 +79,14 @@ class CircleTask(TipReference):
 
     def tip(self, t: ArrayLike) -> Float[Array, " 2"]:
         """The commanded tip position at time `t` [s]: (x, y) [m]."""
-        return self.center + self._ray(real_array("t", t, ()))[1]
+        _, ray = self._ray(real_array("t", t, ()))
+        return self.center + jnp.stack([ray.real, ray.imag])
 
     def _ray(self, t: Array) -> tuple[Array, Array]:
-        """Angle and vector (..., 2) from the centre to the tip."""
+        """Angle and vector from the centre to the tip."""
         angle = self.phase + 2 * np.pi * t / self.period
         sin, cos = sine_and_cosine(angle)
-        return angle, self.radius * namespace(angle).stack([cos, sin], axis=-1)
+        return angle, plane_vector(self.radius * cos, self.radius * sin)
 
     def seen(self, t, base):
         """The wrist and its angle, which starts within a turn.
@@ -91,13 +94,13 @@ class CircleTask(TipReference):
         The angle of the larger vector, to the centre or from there, is continuous. The
         smaller one adds at most a quarter turn, over which the arctangent is so too.
         """
-        xp, hub = namespace(t, self.phase), self.center - base
+        xp, hub = namespace(t, self.phase), plane_vector(*self.center) - base
         angle, ray = self._ray(xp.stack([t, xp.zeros_like(t)]))
-        around = self.radius**2 > hub[0] ** 2 + hub[1] ** 2
+        around = self.radius**2 > dot(hub, hub)
         larger = xp.where(around, ray, hub)
-        angle = xp.where(around, angle, plane_angle(hub[1], hub[0]))
+        angle = xp.where(around, angle, plane_angle(hub.imag, hub.real))
         wrist = hub + ray
-        bearing = angle + between(larger, wrist)
+        bearing = angle + angle_between(larger, wrist)
         return wrist[0], bearing[0] - 2 * np.pi * whole_turns(bearing[1])
 
     def check(self, linkage: Linkage, ts: Array) -> None:
@@ -114,11 +117,11 @@ class CircleTask(TipReference):
         turn = abs(period)
         # The reach ends first where the wrist is nearest to or farthest from the base,
         # or along a direction that the ground or the last link fixes.
-        hub = task.center - unmoved_part(arm, known_directions(arm, task.orientation))
+        base = unmoved_part(arm, known_directions(arm, task.orientation))
+        hub = plane_vector(*task.center) - base
         directions = np.array(
-            [np.arctan2(hub[1], hub[0]), arm.base_angle,
-             task.orientation - arm.locked[2]]
-        )  # fmt: skip
+            [np.angle(hub), arm.base_angle, task.orientation - arm.locked[2]]
+        )
         lead = np.concatenate([directions, directions + np.pi]) - task.phase
         extremes = start + (lead / (2 * np.pi) * period - start) % turn
         times = np.linspace(start, min(end, start + turn), 257)

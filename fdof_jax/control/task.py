@@ -11,6 +11,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from ..checks import instance, real_array, sign
+from ..linkage.frames import cross, dot
 from ..linkage.linkage import Linkage
 from ..mechanics.inverse_kinematics import (
     known_directions,
@@ -19,7 +20,7 @@ from ..mechanics.inverse_kinematics import (
     unmoved_part,
     whole_turns,
 )
-from ..xla.array_namespace import in_numpy, namespace
+from ..xla.array_namespace import in_numpy, namespace, plane_vectors
 from .paths import IN_NUMPY, Path, points_at
 from .reference import PositionReference
 from .timing import Laps, Travel
@@ -61,10 +62,9 @@ class JointMove(PositionReference):
         return self.travel.jump_ts
 
 
-def between(a: Array, b: Array) -> Array:
-    """Computes the angle from `a` to `b` (..., 2), in [-pi, pi]."""
-    ax, ay, bx, by = a[..., 0], a[..., 1], b[..., 0], b[..., 1]
-    return plane_angle(ax * by - ay * bx, ax * bx + ay * by)
+def angle_between(a: Array, b: Array) -> Array:
+    """Computes the angle from the vector `a` to `b`, in [-pi, pi]."""
+    return plane_angle(cross(a, b), dot(a, b))
 
 
 class TipReference(PositionReference):
@@ -75,10 +75,9 @@ class TipReference(PositionReference):
 
     @abstractmethod
     def seen(self, t: Array, base: Array) -> tuple[Array, Array]:
-        """The wrist as seen from the first joint: points (..., 2) and their angle.
+        """The wrist as seen from the first joint: vectors x + iy, and their angles.
 
-        `base`: what the wrist's vector lacks to the tip's, (2,). The angle is
-        continuous in time.
+        `base`: what these vectors lack to the tip. The angles are continuous in time.
         """
 
     def assembly(self, t, linkage):
@@ -147,9 +146,11 @@ class TipTask(TipReference):
             tip: Any = np.asarray(points).reshape(*np.shape(t), 2)
         else:
             tip = self.path.point(self.timing(t))
-        wrist, hub = tip - base, in_numpy(self.path.middle) - base
-        middle = plane_angle(hub[1], hub[0])
-        return wrist, middle - 2 * np.pi * whole_turns(middle) + between(hub, wrist)
+        wrist = plane_vectors(tip) - base
+        hub = plane_vectors(in_numpy(self.path.middle)) - base
+        middle = plane_angle(hub.imag, hub.real)
+        middle = middle - 2 * np.pi * whole_turns(middle)
+        return wrist, middle + angle_between(hub, wrist)
 
     @property
     def jump_ts(self) -> Array | None:
@@ -178,7 +179,7 @@ class TipTask(TipReference):
                 f"leaves it at {times[inside.argmin()]:g} s."
             )
         behind = (np.abs(np.diff(bearing)) > np.pi).any()
-        if behind or (in_numpy(task.path.middle) == base).all():
+        if behind or plane_vectors(in_numpy(task.path.middle)) == base:
             raise ValueError(
                 "reference: expected a path that does not pass behind the ground "
                 "pivot as seen from its middle, got one that does."

@@ -13,7 +13,6 @@ from ..linkage.frames import cross, dot, unit_vector
 from ..linkage.linkage import Linkage, check_linkage
 from ..linkage.topology import real_joints
 from ..xla.array_namespace import in_numpy, namespace, plane_vector
-from .kinematics import as_points
 
 
 def plane_angle(y: Array, x: Array) -> Array:
@@ -58,7 +57,7 @@ def known_directions(linkage: Linkage, orientation: Array) -> Directions:
 
 
 def unmoved_part(linkage: Linkage, directions: Directions) -> Array:
-    """Computes the sum of the ground's and the last link's vectors, (2,).
+    """Computes the sum of the ground's and the last link's vectors, x + iy [m].
 
     No joint moves this part of the tip's position. The rest is the wrist vector, from
     the first joint's start to the last link's start.
@@ -67,7 +66,7 @@ def unmoved_part(linkage: Linkage, directions: Directions) -> Array:
     r1, _, _ = real_joints(linkage.ef)
     fixed = plane_vector(linkage.length[0], xp.where(r1, linkage.locked[0], 0))
     e1, _, _, e4 = directions.vector
-    return as_points(e1 * fixed + e4 * linkage.length[3])
+    return e1 * fixed + e4 * linkage.length[3]
 
 
 def solve_joints(
@@ -77,7 +76,7 @@ def solve_joints(
     bearing: Array,
     branch: Array,
 ) -> tuple[Array, Array]:
-    """Computes joint positions (..., 3) from the wrist vector, NaN if out of reach.
+    """Computes joint positions (..., 3) from the wrist x + iy, NaN if out of reach.
 
     The second result is a root that is 0 just at the edge of the reach, where
     velocities are infinite.
@@ -98,7 +97,6 @@ def solve_joints(
     two_slides = ~(turning2 | turning3 | whole)
     th1, th2, th3, th4 = directions.angle
     e1, e2, e3, _ = directions.vector
-    w = plane_vector(wrist[..., 0], wrist[..., 1])
 
     # Vectors of links 2 and 3 in their own frames; a free slide counts as 0.
     free = xp.stack([r2, r3])
@@ -110,7 +108,7 @@ def solve_joints(
     # the slides run across a and, if there are two, across b.
     turns = xp.stack([turning2, turning3])
     known = xp.where(turns, 0, d * directions.vector[1:3]).sum()
-    rest = xp.where(framed, known, w - known)
+    rest = xp.where(framed, known, wrist - known)
     a = xp.where(r1, xp.where(r2, e3, e2), e1)
     b = xp.where(two_slides, xp.where(r3, e2, e3), 1j * a)
     span = cross(a, b)  # sine of the angle between two slides
@@ -119,7 +117,7 @@ def solve_joints(
 
     # A turning vector is known by its length and its component along a. For two, the
     # same holds of their product, one conjugated, by the law of cosines.
-    square = dot(w, w)
+    square = dot(wrist, wrist)
     inner = (square - reach2 - reach3) / 2
     component = dot(a, rest)
     along = xp.where(two_turning, inner, component)
@@ -180,8 +178,8 @@ def inverse_kinematics(
     # NumPy computes concrete values, as JAX would compile each single operation.
     arm, point, angle, side = in_numpy((linkage, tip, orientation, side))
     directions = known_directions(arm, angle)
-    wrist = point - unmoved_part(arm, directions)
-    bearing = plane_angle(wrist[1], wrist[0])
+    wrist = plane_vector(*point) - unmoved_part(arm, directions)
+    bearing = plane_angle(wrist.imag, wrist.real)
     bearing = bearing - 2 * np.pi * whole_turns(bearing)
     q, _ = solve_joints(arm, directions, wrist, bearing, side)
     values = concrete(q)
