@@ -12,7 +12,7 @@ from jax import Array
 from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
-from ..checks import is_traced, real_array
+from ..checks import function, is_traced, real_array
 from ..linkage.linkage import Linkage, check_linkage
 from ..xla.array_namespace import in_numpy
 
@@ -43,12 +43,8 @@ class PositionReference(eqx.Module):
 
 def checked_reference(value: Any) -> Any:
     """Returns `value` if it is callable as a reference, else raises ValueError."""
-    if not callable(value) or isinstance(value, type):
-        raise ValueError(
-            "reference: expected a callable (t, linkage) -> (q, qd), for instance "
-            f"CircleTask(), got {value!r}."
-        )
-    return value
+    expected = "a callable (t, linkage) -> (q, qd), for instance CircleTask()"
+    return function("reference", value, expected)
 
 
 def reference_motion(

@@ -10,7 +10,7 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from ..checks import instance, real_array, sign
+from ..checks import function, instance, real_array, sign
 from ..linkage.frames import cross, dot
 from ..linkage.linkage import Linkage
 from ..mechanics.inverse_kinematics import (
@@ -127,9 +127,8 @@ class TipTask(TipReference):
         branch: int = 1,
     ):
         instance("path", path, Path)
-        if not callable(timing) or isinstance(timing, type):
-            raise ValueError(f"timing: expected a Travel or Laps, got {timing!r}.")
-        self.path, self.timing = path, timing
+        self.path = path
+        self.timing = function("timing", timing, "a Travel or Laps")
         self.orientation = real_array("orientation", orientation, ())
         self.branch = sign("branch", branch)
 

@@ -9,6 +9,7 @@ import warnings
 from collections.abc import Mapping
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -137,6 +138,11 @@ def _powers(linkage: Linkage, forces: Forces, solution: Solution) -> np.ndarray:
     return np.asarray(powers)
 
 
+@eqx.filter_jit
+def _energies(linkage: Linkage, forces: Forces, q: Array, qd: Array) -> tuple:
+    return jax.vmap(lambda q, qd: energy(linkage, q, qd, forces))(q, qd)
+
+
 def energy_stack(
     linkage: Linkage, forces: Forces, solution: Solution, ax: Axes | None = None
 ) -> Axes:
@@ -161,8 +167,7 @@ def energy_stack(
     """
     ts, q, qd = reached(solution)
     powers = _powers(linkage, forces, solution)[:, : len(ts)]
-    both = jax.vmap(lambda q, qd: energy(linkage, q, qd, forces))(q, qd)
-    kinetic, potential = (np.asarray(each) for each in both)
+    kinetic, potential = map(np.asarray, _energies(linkage, forces, q, qd))
     potential = potential - potential.min()
     put_in, taken_out = (
         cumulative_simpson(part.sum(axis=0), x=ts, initial=0)
