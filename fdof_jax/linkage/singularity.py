@@ -30,7 +30,7 @@ def _least_inertia(linkage: "Linkage", configurations: int) -> np.ndarray:
     draws = np.random.default_rng(0).uniform(-1, 1, (configurations, 2, 3))
     q = np.where(revolute, np.pi * draws[:, 0], (reach or 1) * draws[:, 1])
     start, along, *_ = frames(linkage, q)
-    centre = start[:, 1:] + linkage.com @ [1, 1j] * along[:, 1:]
+    centre = start[:, 1:] + linkage.com @ np.array([1, 1j]) * along[:, 1:]
     moved = np.tri(3)  # a joint moves only the links beyond it
     arm = centre[:, :, None] - start[:, None, 1:]
     J = moved * np.where(revolute, arm, along[:, None, :3])

@@ -139,7 +139,7 @@ def _powers(linkage: Linkage, forces: Forces, solution: Solution) -> np.ndarray:
 
 
 @eqx.filter_jit
-def _energies(linkage: Linkage, forces: Forces, q: Array, qd: Array) -> tuple:
+def _energies(linkage: Linkage, forces: Forces, q: Any, qd: Any) -> tuple:
     return jax.vmap(lambda q, qd: energy(linkage, q, qd, forces))(q, qd)
 
 

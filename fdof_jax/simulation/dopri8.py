@@ -6,7 +6,7 @@ agree with `diffrax.Dopri8` up to rounding.
 
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import diffrax
 import equinox as eqx
@@ -47,6 +47,38 @@ class ScheduledTerm(diffrax.ODETerm):
 
     def vf(self, t, y, args):
         return self.vector_field(t, y, args, self.schedule(t, args))
+
+
+class ScheduledDopri8(diffrax.AbstractAdaptiveSolver):
+    """The parts of a solver whose state is the rates and `compensated` error of `y`."""
+
+    term_structure: ClassVar = ScheduledTerm
+
+    def order(self, terms) -> int:
+        return 8
+
+    def func(self, terms, t0, y0, args):
+        return terms.vf(t0, y0, args)
+
+    def start(self, terms, t0, y0, args) -> PyTree:
+        """Returns the rates at the start of a step."""
+        return self.func(terms, t0, y0, args)
+
+    def init(self, terms, t0, t1, y0, args):
+        return self.start(terms, t0, y0, args), jtu.tree_map(jnp.zeros_like, y0)
+
+    def renewed(self, terms, t0, y0, args, start, made_jump) -> PyTree:
+        """Returns the stored `start`, or a new one after a jump, which outdates it."""
+        if made_jump is False:
+            return start
+        fresh = self.start(terms, t0, y0, args)
+        return jtu.tree_map(lambda a, b: jnp.where(made_jump, a, b), fresh, start)
+
+
+def compensated(y0: PyTree, change: PyTree) -> tuple[PyTree, PyTree]:
+    """Returns y0 + change and its rounding error, which the next change includes."""
+    y = jtu.tree_map(lambda a, b: a + b, y0, change)
+    return y, jtu.tree_map(lambda a, b, c: c - (b - a), y0, y, change)
 
 
 def interpolation_weights(theta: Array) -> Array:
