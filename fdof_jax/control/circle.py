@@ -79,14 +79,8 @@ class CircleTask(TipReference):
 
     def tip(self, t: ArrayLike) -> Float[Array, " 2"]:
         """The commanded tip position at time `t` [s]: (x, y) [m]."""
-        _, ray = self._ray(real_array("t", t, ()))
+        _, ray = _ray(self, real_array("t", t, ()))
         return self.center + jnp.stack([ray.real, ray.imag])
-
-    def _ray(self, t: Array) -> tuple[Array, Array]:
-        """Angle and vector from the centre to the tip."""
-        angle = self.phase + 2 * np.pi * t / self.period
-        sin, cos = sine_and_cosine(angle)
-        return angle, plane_vector(self.radius * cos, self.radius * sin)
 
     def seen(self, t, base):
         """The wrist and its angle, which starts within a turn.
@@ -95,7 +89,7 @@ class CircleTask(TipReference):
         smaller one adds at most a quarter turn, over which the arctangent is so too.
         """
         xp, hub = namespace(t, self.phase), plane_vector(*self.center) - base
-        angle, ray = self._ray(xp.stack([t, xp.zeros_like(t)]))
+        angle, ray = _ray(self, xp.stack([t, xp.zeros_like(t)]))
         around = self.radius**2 > dot(hub, hub)
         larger = xp.where(around, ray, hub)
         angle = xp.where(around, angle, plane_angle(hub.imag, hub.real))
@@ -132,3 +126,11 @@ class CircleTask(TipReference):
                 f"orientation {task.orientation:g} rad on branch {task.branch:+g}, got "
                 f"center {task.center.tolist()} and radius {task.radius:g} m."
             )
+
+
+# A function, because each access to a method of an equinox module creates an object.
+def _ray(circle: CircleTask, t: Array) -> tuple[Array, Array]:
+    """Angle and vector from the centre to the tip."""
+    angle = circle.phase + 2 * np.pi * t / circle.period
+    sin, cos = sine_and_cosine(angle)
+    return angle, plane_vector(circle.radius * cos, circle.radius * sin)

@@ -92,8 +92,9 @@ def solve_joints(
     """
     xp = namespace(linkage, directions, wrist, bearing, branch)
     r1, r2, r3 = revolute = real_joints(linkage.ef)
+    # Which vectors turn by themselves: link 2's, link 3's, or the wrist's as a whole.
     turning2, turning3, whole = r1 & r2, r2 & r3, r1 & r3
-    framed, two_turning = whole & ~r2, whole & r2
+    two_turning, framed = whole & r2, whole & ~r2  # RRR, RPR
     two_slides = ~(turning2 | turning3 | whole)
     th1, th2, th3, th4 = directions.angle
     e1, e2, e3, _ = directions.vector
