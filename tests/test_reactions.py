@@ -8,7 +8,7 @@ import pytest
 from helpers import random_linkage
 
 import fdof_jax as fj
-from fdof_jax.forces.points import frames_of
+from fdof_jax.linkage.frames import frames
 
 GROUND, TIP = fj.Point(0, 0.3, -0.8), fj.Point(3, 0.5, 0.2)
 SPRING = fj.SpringDamper(GROUND, TIP, stiffness=30.0, damping=2.0, rest_length=0.4)
@@ -60,7 +60,7 @@ def test_each_link_is_in_balance(topology):
         load
         for element in (SPRING, ACROSS, PUSH)
         for load in element.loads(
-            element.schedule(0.0, linkage), frames_of(linkage, q), qd
+            element.schedule(0.0, linkage), frames(linkage, q), qd
         )
     ]
     weight = np.array([0, -float(linkage.gravity)])
@@ -147,8 +147,8 @@ def test_pins_carry_the_actuator(topology):
     total = tau + ACTUATOR(0.0, q, qd, linkage)
     qdd = fj.forward_dynamics(linkage, q, qd, total, (ACTUATOR,))
     loads = ACTUATOR.loads(0.0, q, qd, qdd, linkage)
-    frames = frames_of(linkage, q)
-    by_loads = sum(np.array(load.efforts(frames)) for load in loads)
+    parts = frames(linkage, q)
+    by_loads = sum(np.array(load.efforts(parts)) for load in loads)
     alone = fj.forward_dynamics(linkage, q, qd, tau + by_loads)
     np.testing.assert_allclose(alone, qdd, rtol=1e-9, atol=1e-9 * np.abs(qdd).max())
 

@@ -16,7 +16,7 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from ..checks import is_traced, real_array
+from ..checks import function, is_traced, real_array
 from ..forces.element import StatefulElement
 from ..linkage.linkage import Linkage
 from ..xla.array_namespace import in_numpy
@@ -152,12 +152,7 @@ class _Drive(StatefulElement):
 
 
 def _command(value: Any) -> Any:
-    if not callable(value) or isinstance(value, type):
-        raise ValueError(
-            "command: expected a force element, a PDController for instance, got "
-            f"{value!r}."
-        )
-    return value
+    return function("command", value, "a force element, a PDController for instance")
 
 
 class FirstOrderLag(_Drive):

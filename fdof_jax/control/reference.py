@@ -1,5 +1,6 @@
 """References of controllers, and whether an arm can reach them."""
 
+from abc import abstractmethod
 from collections.abc import Callable
 from typing import Any
 
@@ -8,24 +9,42 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
-from ..checks import is_traced, real_array
+from ..checks import function, is_traced, real_array
 from ..linkage.linkage import Linkage, check_linkage
 from ..xla.array_namespace import in_numpy
 
 Reference = Callable[[Array, Linkage], tuple[Array, Array]]
 
 
+class PositionReference(eqx.Module):
+    """A reference whose velocities are the exact rates of its positions."""
+
+    @property
+    def evaluates_in_numpy(self) -> bool:
+        """Returns whether `assembly` runs in NumPy; a user's subclass may not."""
+        return type(self).__module__.startswith(f"{__package__}.")
+
+    @abstractmethod
+    def assembly(self, t: Array, linkage: Linkage) -> tuple[Array, Any]:
+        """Joint positions, and the root that is 0 at the edge of the reach."""
+
+    def __call__(
+        self, t: ArrayLike, linkage: Linkage
+    ) -> tuple[Float[Array, " joint"], Float[Array, " joint"]]:
+        """Joint positions [m or rad] and velocities [m/s or rad/s] at time `t` [s]."""
+        check_linkage(linkage)
+        t = real_array("t", t, ())
+        positions = lambda t: self.assembly(t, linkage)[0]
+        return jax.jvp(positions, (t,), (jnp.ones_like(t),))
+
+
 def checked_reference(value: Any) -> Any:
     """Returns `value` if it is callable as a reference, else raises ValueError."""
-    if not callable(value) or isinstance(value, type):
-        raise ValueError(
-            "reference: expected a callable (t, linkage) -> (q, qd), for instance "
-            f"CircleTask(), got {value!r}."
-        )
-    return value
+    expected = "a callable (t, linkage) -> (q, qd), for instance CircleTask()"
+    return function("reference", value, expected)
 
 
 def reference_motion(

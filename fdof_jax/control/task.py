@@ -1,16 +1,17 @@
 """References along paths of the tip, and moves of the joints."""
 
+from abc import abstractmethod
 from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from ..checks import instance, real_array, sign
+from ..checks import function, instance, real_array, sign
+from ..linkage.frames import cross, dot
 from ..linkage.linkage import Linkage
 from ..mechanics.inverse_kinematics import (
     known_directions,
@@ -19,12 +20,13 @@ from ..mechanics.inverse_kinematics import (
     unmoved_part,
     whole_turns,
 )
-from ..xla.array_namespace import in_numpy, namespace
+from ..xla.array_namespace import in_numpy, namespace, plane_vectors
 from .paths import IN_NUMPY, Path, points_at
+from .reference import PositionReference
 from .timing import Laps, Travel
 
 
-class JointMove(eqx.Module):
+class JointMove(PositionReference):
     """A move of all joints from one position to another, in step.
 
     **Arguments:** `start`, `end`: joint positions [m or rad]; `travel`: a `Travel`.
@@ -49,23 +51,10 @@ class JointMove(eqx.Module):
         instance("travel", travel, Travel)
         self.travel = travel
 
-    @property
-    def evaluates_in_numpy(self) -> bool:
-        """Returns whether `assembly` runs in NumPy; a subclass may not."""
-        return type(self) is JointMove
-
     def assembly(self, t: Array, linkage: Linkage) -> tuple[Array, float]:
         """Joint positions, and 1 as the root: a joint move has no edge of a reach."""
         share = self.travel(t)[..., None]
         return self.start + share * (self.end - self.start), 1.0
-
-    def __call__(
-        self, t: ArrayLike, linkage: Linkage
-    ) -> tuple[Float[Array, " joint"], Float[Array, " joint"]]:
-        """Joint positions [m or rad] and velocities [m/s or rad/s] at time `t` [s]."""
-        t = real_array("t", t, ())
-        positions = lambda t: self.assembly(t, linkage)[0]
-        return jax.jvp(positions, (t,), (jnp.ones_like(t),))
 
     @property
     def jump_ts(self) -> Array:
@@ -73,7 +62,31 @@ class JointMove(eqx.Module):
         return self.travel.jump_ts
 
 
-class TipTask(eqx.Module):
+def angle_between(a: Array, b: Array) -> Array:
+    """Computes the angle from the vector `a` to `b`, in [-pi, pi]."""
+    return plane_angle(cross(a, b), dot(a, b))
+
+
+class TipReference(PositionReference):
+    """A motion of the tip on which the last link keeps its angle."""
+
+    orientation: eqx.AbstractVar[Array]
+    branch: eqx.AbstractVar[Array]
+
+    @abstractmethod
+    def seen(self, t: Array, base: Array) -> tuple[Array, Array]:
+        """The wrist as seen from the first joint: vectors x + iy, and their angles.
+
+        `base`: what these vectors lack to the tip. The angles are continuous in time.
+        """
+
+    def assembly(self, t, linkage):
+        directions = known_directions(linkage, self.orientation)
+        seen = self.seen(t, unmoved_part(linkage, directions))
+        return solve_joints(linkage, directions, *seen, self.branch)
+
+
+class TipTask(TipReference):
     """A path of the tip on which the last link keeps its angle.
 
     A call with `(t, linkage)` returns the joint reference, computed by the closed-form
@@ -114,9 +127,8 @@ class TipTask(eqx.Module):
         branch: int = 1,
     ):
         instance("path", path, Path)
-        if not callable(timing) or isinstance(timing, type):
-            raise ValueError(f"timing: expected a Travel or Laps, got {timing!r}.")
-        self.path, self.timing = path, timing
+        self.path = path
+        self.timing = function("timing", timing, "a Travel or Laps")
         self.orientation = real_array("orientation", orientation, ())
         self.branch = sign("branch", branch)
 
@@ -124,18 +136,8 @@ class TipTask(eqx.Module):
         """The commanded tip position at time `t` [s]: (x, y) [m]."""
         return self.path.point(self.timing(real_array("t", t, ())))
 
-    @property
-    def evaluates_in_numpy(self) -> bool:
-        """Returns whether `assembly` runs in NumPy; a subclass may not."""
-        return type(self) is TipTask
-
-    def assembly(self, t: Array, linkage: Linkage) -> tuple[Array, Array]:
-        """Joint positions, and the root that is 0 at the edge of the reach."""
-        q, root, _ = self._solved(t, linkage)
-        return q, root
-
-    def _solved(self, t: Array, linkage: Linkage) -> tuple[Array, Array, Array]:
-        """The `assembly`, and the wrist's angle from the direction of the middle."""
+    def seen(self, t, base):
+        """The wrist and its angle, as the angle from the path's middle and its own."""
         own = not {type(self.path), type(self.timing)} <= IN_NUMPY
         if own and namespace(t) is np:
             with jax.ensure_compile_time_eval():  # also within transformations
@@ -143,25 +145,11 @@ class TipTask(eqx.Module):
             tip: Any = np.asarray(points).reshape(*np.shape(t), 2)
         else:
             tip = self.path.point(self.timing(t))
-        directions = known_directions(linkage, self.orientation)
-        unmoved = unmoved_part(linkage, directions)
-        wrist, hub = tip - unmoved, in_numpy(self.path.middle) - unmoved
-        across = hub[0] * wrist[..., 1] - hub[1] * wrist[..., 0]
-        beside = plane_angle(across, wrist @ hub)
-        middle = plane_angle(hub[1], hub[0])
-        bearing = middle - 2 * np.pi * whole_turns(middle) + beside
-        q, root = solve_joints(
-            linkage, directions, wrist, bearing, self.orientation, self.branch
-        )
-        return q, root, beside
-
-    def __call__(
-        self, t: ArrayLike, linkage: Linkage
-    ) -> tuple[Float[Array, " joint"], Float[Array, " joint"]]:
-        """Joint positions [m or rad] and velocities [m/s or rad/s] at time `t` [s]."""
-        t = real_array("t", t, ())
-        positions = lambda t: self.assembly(t, linkage)[0]
-        return jax.jvp(positions, (t,), (jnp.ones_like(t),))
+        wrist = plane_vectors(tip) - base
+        hub = plane_vectors(in_numpy(self.path.middle)) - base
+        middle = plane_angle(hub.imag, hub.real)
+        middle = middle - 2 * np.pi * whole_turns(middle)
+        return wrist, middle + angle_between(hub, wrist)
 
     @property
     def jump_ts(self) -> Array | None:
@@ -178,7 +166,10 @@ class TipTask(eqx.Module):
         if isinstance(self.timing, Laps):  # all laps are alike
             end = min(end, ts[0] + abs(task.timing.period))
         times = np.linspace(ts[0], end, 1000, dtype=ts.dtype)
-        q, _, beside = task._solved(times, arm)
+        directions = known_directions(arm, task.orientation)
+        base = unmoved_part(arm, directions)
+        wrist, bearing = task.seen(times, base)
+        q, _ = solve_joints(arm, directions, wrist, bearing, task.branch)
         inside = np.isfinite(q).all(axis=1)
         if not inside.all():
             raise ValueError(
@@ -186,10 +177,8 @@ class TipTask(eqx.Module):
                 f"{task.orientation:g} rad on branch {task.branch:+g}, got one that "
                 f"leaves it at {times[inside.argmin()]:g} s."
             )
-        directions = known_directions(arm, task.orientation)
-        hub = in_numpy(task.path.middle) - unmoved_part(arm, directions)
-        behind = (np.abs(np.diff(beside)) > np.pi).any()
-        if behind or not hub.any():
+        behind = (np.abs(np.diff(bearing)) > np.pi).any()
+        if behind or plane_vectors(in_numpy(task.path.middle)) == base:
             raise ValueError(
                 "reference: expected a path that does not pass behind the ground "
                 "pivot as seen from its middle, got one that does."

@@ -2,12 +2,11 @@
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from ..checks import concrete, real_array
+from ..checks import increasing, real_array
 from ..linkage.linkage import Linkage
 from .element import ScalarElement
 
@@ -99,9 +98,7 @@ class EffortHistory(ScalarElement):
 
     def __init__(self, ts: ArrayLike, tau: ArrayLike):
         self.ts = real_array("ts", ts, (None,))
-        times = concrete(self.ts)
-        if self.ts.size == 0 or times is not None and not (np.diff(times) > 0).all():
-            raise ValueError(f"ts: expected increasing times, got {ts!r}.")
+        increasing("ts", self.ts)
         self.tau = real_array("tau", tau, (self.ts.size, 3))
 
     def schedule(self, t, linkage):

@@ -130,8 +130,8 @@ def _integrate(
         controller = default_controller()
     if derivatives and not trusted:
         fraction = _OF_TIME_SCALE[0 if (solver.order(term) or 0) >= 8 else 1]
-        start_time, *start_of_motion = constant((ts[0], args, own))
-        longest = lambda: _step_for_tangents(start_time, *start_of_motion, fraction)
+        began = constant((ts[0], args, own))
+        longest = lambda: _step_for_tangents(*began, fraction)
         controller = bounded(controller, longest)
     controller = undifferentiated(controller)
     if (jumps := jumps_of(*forces)) is not None:
@@ -264,7 +264,8 @@ def _integrate_reversibly_bwd(
         # What was not reached has tangents that are not finite, and weights 0.
         return jnp.where(weight == 0, 0, weight * tangent).sum(axis=1)
 
-    return whole(sum(jax.tree.leaves(jax.tree.map(part, wanted, slopes))))
+    parts = jax.tree.leaves(jax.tree.map(part, wanted, slopes))
+    return whole(jnp.sum(jnp.stack(parts), axis=0))
 
 
 def _opened(inputs):

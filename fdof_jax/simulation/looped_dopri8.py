@@ -8,7 +8,6 @@ it is traced once and leaves out what only other methods need.
 
 from typing import Any, ClassVar, NamedTuple
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -22,7 +21,8 @@ from .dopri8 import (
     STAGES,
     TABLEAU,
     DenseOutput,
-    ScheduledTerm,
+    ScheduledDopri8,
+    compensated,
     constant,
     interpolation_weights,
     verdict,
@@ -72,8 +72,7 @@ def _step(term: Any, t0, t1, y0, lost, args) -> tuple[_Step, Array]:
     stages = jnp.arange(STAGES), times, weights, schedule
     rates, healths = jax.lax.scan(stage, rates, stages)
     change = jtu.tree_map(lambda k, c: h * k + c, _weighted(lower[-1], rates), lost)
-    y = jtu.tree_map(lambda a, b: a + b, y0, change)
-    lost = jtu.tree_map(lambda a, b, c: c - (b - a), y0, y, change)
+    y, lost = compensated(y0, change)
     weights = jnp.asarray(TABLEAU.b_error, h.dtype)
     error = jtu.tree_map(lambda k: h * k, _weighted(weights, rates))
     # diffrax overlooks an infinity beside a NaN and finds no next step size.
@@ -93,14 +92,10 @@ class _Interpolation(DenseOutput):
         return jtu.tree_map(lambda a, k: a + self.step * k, self.y0, change)
 
 
-class LoopedDopri8(diffrax.AbstractAdaptiveSolver):
+class LoopedDopri8(ScheduledDopri8):
     """The method of `diffrax.Dopri8` up to rounding, for a single arm."""
 
-    term_structure: ClassVar = ScheduledTerm
     interpolation_cls: ClassVar = _Interpolation
-
-    def order(self, terms) -> int:
-        return 8
 
     def init(self, terms, t0, t1, y0, args):
         return jtu.tree_map(jnp.zeros_like, y0)
@@ -113,6 +108,3 @@ class LoopedDopri8(diffrax.AbstractAdaptiveSolver):
         imposed, result = verdict(end.health == 0, bad, h)
         error = jtu.tree_map(lambda e: jnp.where(bad, imposed, e), end.error)
         return end.y, error, dense_info, end.lost, result
-
-    def func(self, terms, t0, y0, args):
-        return terms.vf(t0, y0, args)

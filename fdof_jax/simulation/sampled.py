@@ -10,7 +10,7 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from ..checks import callable_tuple, concrete, real_array, whole_number
+from ..checks import callable_tuple, concrete, function, real_array, whole_number
 from ..forces.element import Forces, ScalarElement, StatefulElement
 from ..forces.joints import JointEffort
 from ..linkage.coordinates import State, real_state
@@ -140,10 +140,7 @@ def simulate_sampled(
     """
     check_linkage(linkage)
     callable_tuple("forces", forces)
-    if not callable(control) or isinstance(control, type):
-        raise ValueError(
-            f"control: expected a callable (t, q, qd, linkage) -> tau, got {control!r}."
-        )
+    function("control", control, "a callable (t, q, qd, linkage) -> tau")
     period = real_array("period", period, (), above=0)
     t0 = real_array("t0", t0, ())
     whole_number("samples", samples, 1)

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from ..analysis.tracking import tip_deviation
-from ..checks import callable_tuple, instance, real_array, whole_number
+from ..checks import callable_tuple, instance, place_of, real_array, whole_number
 from ..control.model_based import ComputedTorque
 from ..control.pd import PDController
 from ..forces.joints import EffortHistory
@@ -287,9 +287,7 @@ def _efforts_at(times: np.ndarray, scene: Scene, solution: Solution) -> np.ndarr
     """Efforts of a scene's controller along its motion, (time, 3)."""
     controller = controller_of(scene)
     efforts = joint_efforts(scene.linkage, scene.forces, solution).elements
-    mine = np.asarray(
-        efforts[[force is controller for force in scene.forces].index(True)]
-    )
+    mine = np.asarray(efforts[place_of(controller, scene.forces)])
     return np.stack([np.interp(times, solution.ts, column) for column in mine.T], 1)
 
 
