@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..linkage.frames import frames
-from ..linkage.linkage import Linkage
+from ..linkage.linkage import Linkage, check_linkage
 from ..xla.array_namespace import in_numpy
 
 
@@ -24,6 +24,7 @@ class Geometry(NamedTuple):
 
 def geometry(linkage: Linkage, q: np.ndarray) -> Geometry:
     """The `Geometry` of a linkage at joint positions (time, 3)."""
+    check_linkage(linkage)
     linkage = in_numpy(linkage)
     start, direction, angle, slide, revolute = frames(linkage, np.asarray(q))
     end = start + linkage.length * direction
