@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from modes import ADJOINT
 from test_costs import flops
 
 import fdof_jax as fj
@@ -187,8 +188,7 @@ def test_reverse_mode_of_a_motion_equals_differences():
     forces = tuple(elements.ALL[kind] for kind in kinds)
     ones, h = jnp.ones(len(names(forces))), 1e-5
     weights = jnp.array([1.0, -2.0, 3.0, 0.5, -0.7, 0.3])
-    adjoint = diffrax.RecursiveCheckpointAdjoint()
-    motion = lambda p: weights @ state_of(end(ARM, scaled(forces, p), adjoint))
+    motion = lambda p: weights @ state_of(end(ARM, scaled(forces, p), ADJOINT))
     both = jax.jit(jax.value_and_grad(motion))
     value = lambda p: float(both(p)[0])
     _, slope = both(ones)

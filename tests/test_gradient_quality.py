@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from modes import ADJOINT
 
 import fdof_jax as fj
 from fdof_jax import scenes
@@ -67,8 +68,7 @@ def forward(scene, z, ts):
 
 @eqx.filter_jit
 def reverse(scene, z, ts):
-    adjoint = diffrax.RecursiveCheckpointAdjoint()
-    return jax.grad(lambda z: loss(scene, z, ts, adjoint))(z)
+    return jax.grad(lambda z: loss(scene, z, ts, ADJOINT))(z)
 
 
 @pytest.mark.slow

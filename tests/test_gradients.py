@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from elements import SHORT
+from modes import ADJOINT
 
 import fdof_jax as fj
 from fdof_jax import scenes
@@ -61,7 +62,7 @@ def reverse(problem, at, weights):
     """Returns the gradient of the weighted sum of the deviation and the positions."""
 
     def weighed(at):
-        loss, q = outcome(problem, at, diffrax.RecursiveCheckpointAdjoint())
+        loss, q = outcome(problem, at, ADJOINT)
         return weights[0] * loss + weights[1] * jnp.sum(q)
 
     return jax.grad(weighed)(at)
@@ -127,8 +128,7 @@ def test_both_modes_of_a_damped_arm_equal_differences():
         return jnp.sum(motion.q[-1] * jnp.array([1.0, -2.0, 0.5]))
 
     at = jnp.array([5.0, 2.0, 1.0, 20.0, 10.0, 5.0, 0.3, -0.2, 0.5])
-    backward = diffrax.RecursiveCheckpointAdjoint()
-    both = jax.jit(jax.value_and_grad(lambda at: end(at, backward)))
+    both = jax.jit(jax.value_and_grad(lambda at: end(at, ADJOINT)))
     forward = jax.jit(jax.jacfwd(lambda at: end(at, diffrax.ForwardMode())))(at)
     value = lambda change: float(both(at + change)[0])
     h = 1e-5

@@ -54,6 +54,7 @@ def _step_for_tangents(t0: Array, args: Args, own: tuple, fraction: float) -> Ar
     hangs at rest. The bound is a fraction of the time scale 1/omega of the fastest mode
     about the start. The trace of the squared linearisation bounds omega^2 in any units.
     """
+    t0, args, own = constant((t0, args, own))
     still = zeros(args.q0)
     scheduled = schedule_of(t0, args)
 
@@ -130,8 +131,7 @@ def _integrate(
         controller = default_controller()
     if derivatives and not trusted:
         fraction = _OF_TIME_SCALE[0 if (solver.order(term) or 0) >= 8 else 1]
-        began = constant((ts[0], args, own))
-        longest = lambda: _step_for_tangents(*began, fraction)
+        longest = lambda: _step_for_tangents(ts[0], args, own, fraction)
         controller = bounded(controller, longest)
     controller = undifferentiated(controller)
     if (jumps := jumps_of(*forces)) is not None:

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from modes import ADJOINT
 
 import fdof_jax as fj
 from hard.scenes import OUTPUTS, START, arm, behind_the_door
@@ -85,8 +86,9 @@ def test_members_that_fail_add_nothing_to_a_shared_gradient():
         def loss(mass):
             linkage = eqx.tree_at(lambda a: a.mass, arm(), mass)
             motions = fj.sweep(
-                linkage, fj.State(q, qd), TS, (Breaking(at),), forces_axes=0
-            )
+                linkage, fj.State(q, qd), TS, (Breaking(at),), forces_axes=0,
+                adjoint=ADJOINT,
+            )  # fmt: skip
             counted = (motions.result == diffrax.RESULTS.successful) & wanted
             end = jnp.where(counted[:, None], motions.q[:, -1], 0)
             return jnp.sum(end**2) / jnp.sum(counted), jnp.sum(counted)

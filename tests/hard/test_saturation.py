@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from modes import ADJOINT
 
 import fdof_jax as fj
 from fdof_jax.analysis.tracking import saturated
@@ -50,7 +51,7 @@ def test_gradients_at_and_beyond_saturation(mode):
     if mode == "forward":
         adjoint, derive = diffrax.ForwardMode(), jax.jacfwd
     else:
-        adjoint, derive = diffrax.RecursiveCheckpointAdjoint(), jax.jacrev
+        adjoint, derive = ADJOINT, jax.jacrev
     gradient = jax.jit(
         derive(lambda *arguments: end(*arguments, adjoint), has_aux=True)
     )
