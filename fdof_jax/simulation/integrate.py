@@ -261,8 +261,10 @@ def _integrate_reversibly_bwd(
 
     def part(weight: Array, tangent: Array) -> Array:
         weight, tangent = weight.reshape(1, -1), tangent.reshape(len(start), -1)
-        # What was not reached has tangents that are not finite, and weights 0.
-        return jnp.where(weight == 0, 0, weight * tangent).sum(axis=1)
+        # States that were not reached are NaN, and constant; nor is a weight of 0 to
+        # pick up a tangent that is not finite.
+        unused = (weight == 0) | (tangent == 0)
+        return jnp.where(unused, 0, weight * tangent).sum(axis=1)
 
     parts = jax.tree.leaves(jax.tree.map(part, wanted, slopes))
     return whole(jnp.sum(jnp.stack(parts), axis=0))
