@@ -1,6 +1,6 @@
-"""Measure speed against error: `python -m benchmarks`.
+"""Measures speed against error: `python -m benchmarks`.
 
-Each protocol runs in a process of its own, one after the other; what they write is kept
+Each protocol runs in a process of its own, one after the other. Their results are kept
 as JSON lines, and drawn and tabulated at the end.
 """
 
@@ -77,7 +77,7 @@ def main() -> None:
 
 
 def load(folder: Path) -> dict[str, list[dict]]:
-    """The points of each job that has been measured, by the job's name."""
+    """Returns the points of each measured job, by the job's name."""
     points = {}
     for job in JOBS:
         file = folder / f"{job.name}.jsonl"

@@ -26,7 +26,7 @@ Row = tuple[str, Callable[[Problem], Contestant], tuple]
 
 
 def _fast(vmap: tuple, sweep: tuple, rk4: tuple, order8: tuple, taylor: tuple):
-    """Contestants for any size, each with its settings."""
+    """Returns contestants for any size, each with its settings."""
     return [
         ("fdof_jax", own.fdof_jax, vmap),
         ("fdof_jax sweep", own.sweep, sweep),
@@ -37,7 +37,7 @@ def _fast(vmap: tuple, sweep: tuple, rk4: tuple, order8: tuple, taylor: tuple):
 
 
 def table(batch: int) -> list[Row]:
-    """Contestants and settings for a batch size: the larger, the fewer, to end."""
+    """Returns contestants and settings for a batch size; large batches have fewer."""
     if batch > 16384:
         pair = (1e-7, 1e-10)
         return _fast(pair[:1], pair, (4e-3, 2e-3), (2e-2, 1e-2, 5e-3), (1e-6, 1e-9))
@@ -64,7 +64,7 @@ def table(batch: int) -> list[Row]:
 def measure_batch(
     problem: Problem, exact: np.ndarray, contestants: list, budget: float
 ) -> Iterator[dict]:
-    """Points of all contestants on one batch; `exact` may hold its first members."""
+    """Returns all contestants' points on a batch; `exact` may be its first members."""
     prepared = []
     judged = len(exact)
     for name, make, settings in contestants:
@@ -95,7 +95,7 @@ def first_members(motion: own.Motion, count: int) -> own.Motion:
 
 
 def run(quick: bool) -> Iterator[dict]:
-    """One core: all contestants, all sizes."""
+    """Measures all contestants at all sizes, on one core."""
     sizes = (
         {1: 10, 64: 20} if quick else {1: 10, 64: 20, 1024: 80, 16384: 30, 131072: 20}
     )
@@ -105,7 +105,7 @@ def run(quick: bool) -> Iterator[dict]:
 
 
 def run_xla_flags(quick: bool) -> Iterator[dict]:
-    """One core, XLA told to compile faster and to use wide vectors."""
+    """Measures on one core, with XLA told to compile faster and use wide vectors."""
     for batch, budget in ({64: 10} if quick else {1: 10, 1024: 50}).items():
         problem = fig5_batch(batch)
         contestants = [row for row in table(batch) if not row[0].startswith("MJX")]
@@ -121,7 +121,7 @@ def run_two_cores(quick: bool) -> Iterator[dict]:
 
 
 def run_two_devices(quick: bool) -> Iterator[dict]:
-    """Every core a device of JAX's: a sweep uses both, plain vmap one."""
+    """Measures with every core a device of JAX; a sweep uses both, plain vmap one."""
     for batch, budget in ({64: 10} if quick else {1024: 10, 16384: 10}).items():
         problem = fig5_batch(batch)
         rows = [row for row in table(batch) if row[0].startswith("fdof_jax")]
@@ -129,7 +129,7 @@ def run_two_devices(quick: bool) -> Iterator[dict]:
 
 
 def run_float32(quick: bool) -> Iterator[dict]:
-    """Without x64: the library, against the C kernel in float64 as reference."""
+    """Measures the library without x64, against the C kernel in float64."""
     for batch, budget in ({64: 10} if quick else {1024: 15, 16384: 20}).items():
         problem = fig5_batch(batch)
         problem = problem._replace(
@@ -146,7 +146,7 @@ def run_float32(quick: bool) -> Iterator[dict]:
 
 
 def _exact(problem: Problem) -> np.ndarray:
-    """The library's own tight reference takes minutes for the largest batches."""
+    """Returns the reference; the library's own takes minutes for large batches."""
     if problem.batch > 16384:
         try:
             return native_reference(problem)
@@ -156,7 +156,7 @@ def _exact(problem: Problem) -> np.ndarray:
 
 
 def native_reference(problem: Problem) -> np.ndarray:
-    """Joint positions at the start and the end, by C in steps of 2 ms: 1e-14 or so."""
+    """Returns joint positions at both ends, by C in steps of 2 ms, to about 1e-14."""
     q, qd = (np.float64(a) for a in problem.state0)
     kernel = Kernel("order 8", problem.linkage, q, qd)
     end, _ = kernel.joints(kernel(2e-3, 1000))
@@ -164,7 +164,7 @@ def native_reference(problem: Problem) -> np.ndarray:
 
 
 def run_accelerator(quick: bool) -> Iterator[dict]:
-    """The library and plain diffrax on a GPU: batches until its memory is full."""
+    """Measures the library and plain diffrax on a GPU, until its memory is full."""
     if jax.devices()[0].platform == "cpu":
         yield skipped(PROTOCOL, "GPU", "JAX sees none")
         return

@@ -1,8 +1,7 @@
 """The equations of one arm of known topology, in plain scalar arithmetic.
 
-What numba compiles and heyoka takes symbolically: nothing here knows of arrays. It is
-Kane's method, link by link, and shares no line with the library, so that agreement with
-it means something.
+numba compiles them, and heyoka takes them as symbols, so no arrays are used. They are
+Kane's method, link by link, and share no line with the library: agreement is evidence.
 """
 
 from collections.abc import Callable
@@ -29,9 +28,9 @@ def make_rates(
     drive: Drive | None = None,
     control: Callable | None = None,
 ) -> Callable:
-    """Rates of (q1, q2, q3, qd1, qd2, qd3), as a function of these six and the time.
+    """Returns a function from (q1, q2, q3, qd1, qd2, qd3) and the time to the rates.
 
-    `control` returns three more joint efforts, from the time and the six.
+    `control` returns three more joint efforts, from the time and the six numbers.
     """
     ef = np.asarray(linkage.ef)
     r1, r2, r3 = (bool(e) for e in ef[1::2] > 0.5)

@@ -1,7 +1,6 @@
-"""What it costs ordinary scenes that the solver watches for ill-conditioned ones.
+"""The cost to ordinary scenes of watching for ill-conditioned equations.
 
-The same solver with and without its watch over the conditioning of the equations, in
-the same steps.
+The same solver takes the same steps with and without its watch over the conditioning.
 """
 
 from collections.abc import Iterator
@@ -22,7 +21,7 @@ TOLERANCE = 1e-9
 
 
 class _Unwatched(UnrolledDopri8):
-    """All rates are taken to be in good health."""
+    """A solver that treats all rates as well-conditioned."""
 
     def _plain(self, terms):
         field = terms.term.vector_field

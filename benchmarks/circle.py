@@ -1,4 +1,4 @@
-"""Fig 7's controller in plain scalar arithmetic, for engines that know no JAX.
+"""Fig 7's controller in plain scalar arithmetic, for engines without JAX.
 
 Like `chain` it shares no line with the library.
 """
@@ -13,7 +13,7 @@ from .problems import Problem
 
 
 def make_reference(problem: Problem, compiled: Callable = lambda f: f) -> Callable:
-    """Positions and velocities that an RPR arm's joints shall have, from the time."""
+    """Returns a function from the time to an RPR arm's positions and velocities."""
     linkage, (controller,) = problem.linkage, problem.forces
     if problem.topology != "RPR":
         raise Skipped("a controller of another arm than Fig 7's")
@@ -49,7 +49,7 @@ def make_reference(problem: Problem, compiled: Callable = lambda f: f) -> Callab
 
 
 def make_control(problem: Problem, compiled: Callable = lambda f: f) -> Callable:
-    """Three efforts from the time, positions and velocities."""
+    """Returns a function from time, positions and velocities to three efforts."""
     reference = make_reference(problem, compiled)
     (controller,) = problem.forces
     k1, k2, k3 = np.asarray(controller.kp).tolist()

@@ -1,4 +1,4 @@
-"""From the start of a process to its first result, and how long that compiles.
+"""Times from the start of a process to its first result, and of compilation.
 
 Every sample is a process of its own: without `configure`; with it and an empty folder
 for compiled programs; with it and a folder that another process has filled.

@@ -1,7 +1,7 @@
-"""fdof_jax and plain diffrax as contestants, and what all contestants have in common.
+"""fdof_jax and plain diffrax as contestants, and what all contestants share.
 
-Every contestant is made by a function of a `Problem`, which may hold one motion or a
-batch, and is run at a setting: a tolerance or a step.
+A function of a `Problem`, which may hold one motion or a batch, makes each contestant.
+A contestant runs at a setting: a tolerance or a step.
 """
 
 from collections.abc import Callable
@@ -23,7 +23,7 @@ DT0 = 1e-3  # estimates of the first step fail from exact rest
 
 
 class Motion(NamedTuple):
-    """What a run came to: at the output times (..., time, 3), and steps taken."""
+    """The result of a run: states at the output times (..., time, 3), and steps."""
 
     q: Any
     qd: Any = None
@@ -32,7 +32,7 @@ class Motion(NamedTuple):
 
 
 class Contestant(NamedTuple):
-    """A solver prepared for a problem: `run(setting)`, and `motion` of what it returns.
+    """A solver prepared for a problem: `run(setting)`, and `motion` of its result.
 
     `motion` is not timed.
     """
@@ -45,13 +45,13 @@ class Contestant(NamedTuple):
 
 @jax.jit
 def energy(linkage: fj.Linkage, q: jax.Array, qd: jax.Array) -> jax.Array:
-    """Total energy at each of some states of one arm [J]."""
+    """Returns the total energy at each of several states of one arm [J]."""
     kinetic, potential = jax.vmap(fj.energy, (None, 0, 0))(linkage, q, qd)
     return kinetic + potential
 
 
 def _energy_defect(problem: Problem, motion: Motion) -> float | None:
-    """The largest change of energy [J], where nothing but gravity does work."""
+    """Returns the largest change of energy [J], where only gravity does work."""
     if problem.forces or problem.batch is not None or motion.qd is None:
         return None
     start = fj.energy(problem.linkage, *problem.state0)
@@ -66,15 +66,16 @@ def cases(
     problem: Problem,
     until: int | None = None,
 ) -> list[Case]:
-    """One case per setting, judged by its worst position error at any output time.
+    """Returns a case per setting, judged by its worst position error at any time.
 
-    `until` restricts that to the first output times; `error_end` has them all.
+    `until` restricts the error to the first output times; `error_end` covers them
+    all.
     """
 
     def judge(result: Any) -> dict:
         motion = contestant.motion(result)
         q = np.asarray(motion.q)
-        if q.shape[-2] < exact.shape[-2]:  # the start is not among its outputs
+        if q.shape[-2] < exact.shape[-2]:  # its outputs do not include the start
             q = np.concatenate([exact[..., :1, :], q], axis=-2)
         errors = np.abs(q - exact)
         return {
@@ -115,7 +116,7 @@ def _simulate(
 ) -> Callable:
     chosen: dict[str, Any] = {} if solver is None else {"solver": solver}
     if long:
-        # No limit, and no checkpoints for a gradient that nobody takes.
+        # No limit of steps, and no checkpoints, as no gradient is taken.
         chosen.update(max_steps=None, adjoint=diffrax.ForwardMode())
 
     def run(linkage, state0, ts, forces, setting):
@@ -149,7 +150,7 @@ def fdof_jax(
     fixed: bool = False,
     long: bool = False,
 ) -> Contestant:
-    """`simulate`, under `jax.vmap` for a batch; with its own default solver.
+    """Returns `simulate` as a contestant, under `jax.vmap` for a batch.
 
     `fixed`: the setting is a fixed step; `long`: without a limit of steps.
     """
@@ -164,7 +165,7 @@ def fdof_jax(
 
 
 def sweep(problem: Problem) -> Contestant:
-    """`sweep` of a batch."""
+    """Returns `sweep` of a batch as a contestant."""
 
     def run(tolerance: float):
         return fj.sweep(
@@ -217,7 +218,7 @@ def _plain_solve(form: Form, axes: tuple | None) -> Callable:
 
 
 def _plain(problem: Problem, form: Form) -> Contestant:
-    """Dopri8 on a stacked state, under plain `jax.vmap` for a batch."""
+    """Returns Dopri8 on a stacked state, under plain `jax.vmap` for a batch."""
     run, arguments = _plain_solve(form, problem.axes), _arguments(problem)
     return Contestant(
         form.name,
@@ -228,7 +229,7 @@ def _plain(problem: Problem, form: Form) -> Contestant:
 
 
 def _textbook_field(t, y, args):
-    """The triple pendulum of point masses in absolute angles, as in a textbook."""
+    """Returns rates of the triple pendulum of point masses, as in a textbook."""
     linkage, _ = args
     mass, length, gravity = linkage.mass, linkage.length[1:], linkage.gravity
     angle, rate = jnp.cumsum(y[:3]), jnp.cumsum(y[3:])
@@ -281,15 +282,15 @@ reduced_form = Form("plain diffrax, reduced", _reduced_field, _stacked, _halves)
 
 
 def plain_textbook(problem: Problem) -> Contestant:
-    """For Fig 5's arm only: no word of the library in it."""
+    """Returns textbook equations of Fig 5's arm, without any part of the library."""
     return _plain(problem, textbook_form)
 
 
 def plain_masked(problem: Problem) -> Contestant:
-    """The published form, without force elements: 12 states, the masked equations."""
+    """Returns the published form without forces: 12 states, masked equations."""
     return _plain(problem, masked_form)
 
 
 def plain_reduced(problem: Problem) -> Contestant:
-    """The library's own accelerations, stacked, with its force elements."""
+    """Returns the library's own accelerations, stacked, with its force elements."""
     return _plain(problem, reduced_form)

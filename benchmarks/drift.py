@@ -1,7 +1,8 @@
 """Long runs: the energy drift of Fig 5 over 1000 s against the time spent.
 
-Double precision follows this chaotic motion for 25 s; beyond, energy is what can be
-judged. It is zero; the defect is the largest |E| [J] at a thousand output times.
+Double precision follows this chaotic motion for 25 s; beyond, only the energy can be
+judged. The exact energy is zero; the defect is the largest |E| [J] at a thousand output
+times.
 """
 
 from collections.abc import Iterator
@@ -44,7 +45,7 @@ def _judge(problem: Problem, contestant: Contestant, result: Any) -> dict:
     motion = contestant.motion(result)
     q, qd = jnp.asarray(motion.q), jnp.asarray(motion.qd)
     defect = float(jnp.max(jnp.abs(own.energy(problem.linkage, q, qd))))
-    # A tenth of a joule is the failure here that a tenth of a radian is elsewhere.
+    # A tenth of a joule counts as a failure here, like a tenth of a radian elsewhere.
     return {"error": defect, "energy_defect": defect}
 
 

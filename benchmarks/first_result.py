@@ -2,10 +2,10 @@
 
     python -m benchmarks.first_result CASE [FOLDER]
 
-prints seconds as JSON: `imported` and `first` are those of CPU since the process began,
-when the library was imported and when the first result was there; `again` is the wall
-time of the same call with other numbers. With a folder, `configure` keeps compiled
-programs there. What is not needed for a case is not imported.
+prints seconds as JSON. `imported` and `first` are seconds of CPU from the start of the
+process to the import of the library and to the first result; `again` is the wall time
+of the same call with other numbers. With a folder, `configure` keeps compiled programs
+there. Modules that a case does not need are not imported.
 """
 
 import json
@@ -35,7 +35,7 @@ def fig7() -> Callable:
 
 
 def elements() -> Callable:
-    """PD control along a figure eight, beside a spring and stops."""
+    """Returns PD control along a figure eight, a spring and stops."""
     linkage = fj.Linkage(
         "RRR",
         length=[0, 1, 1, 0.3],

@@ -1,9 +1,9 @@
-"""The price of generality: one fixed-step RK4, the equations written in different ways.
+"""The price of generality: one fixed-step RK4 on equations in different forms.
 
-Existence factors as data against a topology known at compile time; reduced equations on
-scalars against the published form of twelve states and a masked 6x6 solve; JAX against
-C. The scheme, the steps and the batch are the same for all, and no adaptive solver
-stands between.
+Existence factors as data are compared with a topology known at compile time, reduced
+equations on scalars with the published form of twelve states and a masked 6x6 solve,
+and JAX with C. The scheme, the steps and the batch are the same for all; no adaptive
+solver takes part.
 """
 
 from collections.abc import Callable, Iterator
@@ -28,7 +28,7 @@ STEP = 1e-3
 
 
 def _rk4(field: Callable, y, step, steps):
-    """Classical Runge-Kutta over any pytree; the count of steps is traced."""
+    """Takes classical Runge-Kutta steps over any pytree; their number is traced."""
 
     def along(y, k, factor):
         return jax.tree.map(lambda a, b: a + factor * b, y, k)
@@ -59,7 +59,7 @@ def _contestant(problem: Problem, name: str, member: Callable, axes) -> Contesta
 
 
 def _scalars(problem: Problem, name: str, revolute: tuple | None, axes) -> Contestant:
-    """The library's right-hand side; `revolute`: the topology, if known beforehand."""
+    """Returns the library's right-hand side; `revolute`: the topology, if known."""
 
     def member(linkage, state0, step, steps):
         constants = link_constants(linkage, state0.q)

@@ -3,9 +3,9 @@
 The RPR arm of Fig 7 follows its circle; the loss is the mean squared distance of the
 tip. The paper's controller saturates at first, which costs a gradient digits: the six
 gains are measured with its limits and without. Parameters are factors of gains (as
-logarithms) and torques, so that the entries of a gradient are of one kind. A gradient's
-error is the norm of its difference from that at a tolerance of 1e-12, over the norm:
-that of the worst member in a batch.
+logarithms) and torques, so the entries of a gradient are of one kind. The error of a
+gradient is the norm of its difference from that at a tolerance of 1e-12, over the norm;
+in a batch it is that of the worst member.
 """
 
 from collections.abc import Callable, Iterator
@@ -61,20 +61,20 @@ class TorqueProfile(eqx.Module):
 
 
 def limited_gains(p: Array, horizon: Array) -> tuple:
-    """Six parameters: the logarithms of the factors of kp and kd."""
+    """Returns the controller for six parameters: log factors of kp and kd."""
     factor = jnp.exp(p)
     pair = PD.kp * factor[:3], PD.kd * factor[3:]
     return (eqx.tree_at(lambda pd: (pd.kp, pd.kd), PD, pair),)
 
 
 def gains(p: Array, horizon: Array) -> tuple:
-    """The same, without the limits of the efforts."""
+    """Returns the controller for the same six parameters, without effort limits."""
     (pd,) = limited_gains(p, horizon)
     return (eqx.tree_at(lambda pd: pd.limit, pd, jnp.full(3, jnp.inf)),)
 
 
 def way_point_gains(p: Array, horizon: Array) -> tuple:
-    """48 parameters: the same of eight controllers."""
+    """Returns controllers for 48 parameters, six for each way-point."""
     factor = jnp.exp(p).reshape(2, WINDOWS, 3)
     ends = (jnp.arange(WINDOWS) + 1) / WINDOWS * horizon
     target = jax.vmap(lambda t: PD.reference(t, SCENE.linkage)[0])(ends)
@@ -84,7 +84,7 @@ def way_point_gains(p: Array, horizon: Array) -> tuple:
 
 
 def torque_profile(p: Array, horizon: Array) -> tuple:
-    """500 parameters: a torque profile [N m] on top of the unlimited controller."""
+    """Returns the unlimited controller and a torque profile [N m], 500 parameters."""
     return *gains(jnp.zeros(6), horizon), TorqueProfile(p, horizon)
 
 
@@ -104,7 +104,7 @@ PROBLEMS = (
 
 
 def _loss(problem, adjoint, p, horizon, tolerance, longest):
-    """`longest` bounds the steps, for what a tolerance of the motion does not see."""
+    """Returns the loss; `longest` bounds the steps where the tolerance does not."""
     ts = jnp.linspace(0, 1, 201) * horizon
     steps = eqx.tree_at(
         lambda c: c.dtmax, controller(tolerance), longest, is_leaf=lambda x: x is None
@@ -127,7 +127,7 @@ def value(problem: Problem) -> Callable:
 
 
 def forward(problem: Problem) -> Callable:
-    """One tangent per parameter, all along one solve."""
+    """Returns a function to value and gradient: one tangent per parameter."""
     loss = partial(_loss, problem, diffrax.ForwardMode())
 
     def value_and_gradient(p, *settings):
@@ -140,7 +140,7 @@ def forward(problem: Problem) -> Callable:
 
 
 def reverse(problem: Problem) -> Callable:
-    """The library's default: checkpointed reverse mode."""
+    """Returns a function to value and gradient: checkpointed reverse mode."""
     return jax.value_and_grad(partial(_loss, problem, None))
 
 
@@ -148,7 +148,7 @@ MODES = {"none": value, "forward": forward, "reverse": reverse}
 
 
 def compiled(problem: Problem, mode: str) -> Callable:
-    """A function of p, which may have a leading batch axis, horizon and tolerance."""
+    """Compiles a function of p (possibly a batch), horizon and tolerance."""
     function = MODES[mode](problem)
 
     @jax.jit
@@ -162,7 +162,7 @@ def compiled(problem: Problem, mode: str) -> Callable:
 
 
 def parameters(problem: Problem, batch: int) -> Array:
-    """Random ones; a profile is smooth, as a planner would give it."""
+    """Returns random parameters; a profile is smooth, as from a planner."""
     rng = np.random.default_rng(4)
     if problem.parameters == SAMPLES:
         modes = np.sin(np.pi * np.outer(np.arange(1, 6), np.linspace(0, 1, SAMPLES)))
@@ -187,7 +187,7 @@ def measure_modes(
     tolerance: float,
     longest: float,
 ) -> list[dict]:
-    """One group: the forward solve alone, and the modes over it."""
+    """Measures one group: the forward solve alone, and the modes relative to it."""
     p = parameters(problem, batch)
     exactly = runs["forward" if problem.parameters == 6 else "reverse"]
     exact = np.asarray(exactly(p, horizon, TIGHT, horizon / 1000)[1])
@@ -219,12 +219,12 @@ def measure_modes(
 
 
 def _grid(problem: Problem, batch: int) -> list[tuple[float, float, float]]:
-    """(horizon, tolerance, longest step): all for six parameters of one arm."""
+    """Returns (horizon, tolerance, longest step), all for six parameters of one arm."""
     if problem.parameters > 6:
         points = [(1.0, TOLERANCE, np.inf)]  # 4 s of 256 would take minutes
         if problem.parameters == SAMPLES:
-            # A step across several samples sees few of them, and nothing of the motion
-            # tells: the gradient is wrong by tenths unless the steps are bounded.
+            # A step across several samples uses few of them, without an effect on the
+            # motion: the gradient is wrong by tenths unless the steps are bounded.
             bounded = (1.0, TOLERANCE, 1.0 / SAMPLES)
             points = [*points, bounded] if batch == 1 else [bounded]
         return points

@@ -1,4 +1,4 @@
-"""The hard cases on four engines: solved, refused as asked, or failed, and how."""
+"""The hard cases on four engines: solved, reported as unsolvable, or failed."""
 
 import time
 from collections.abc import Callable, Iterator
@@ -19,7 +19,7 @@ SOLVED, REFUSED, BY_NAME, SILENTLY = OUTCOMES
 
 
 def outcome(scene: HardScene, make: Callable) -> dict:
-    """What came of one scene on one engine, as fields of a record."""
+    """Returns the outcome of one scene on one engine, as fields of a record."""
     times: list[float] = []
     try:
         run = make(scene)
@@ -52,7 +52,7 @@ def outcome(scene: HardScene, make: Callable) -> dict:
 
 
 def run(quick: bool) -> Iterator[dict]:
-    """One record per scene and engine: `number`, `bound`, and as status an outcome."""
+    """Returns a record per scene and engine: `number`, `bound`, status (outcome)."""
     for scene in motions():
         if quick and scene.number > 3:
             return
@@ -72,7 +72,7 @@ SINGLE_BOUND = 1e-3  # of errors, where float64 is held to less
 
 
 def run_float32(quick: bool) -> Iterator[dict]:
-    """The motions on fdof_jax in float32: which hold, at which tolerance."""
+    """Measures the motions on fdof_jax in float32, at several tolerances."""
     for scene in motions():
         if quick and scene.number > 3:
             return

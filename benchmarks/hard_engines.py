@@ -1,4 +1,4 @@
-"""Engines that are asked for the hard cases, each used as its documentation suggests.
+"""Engines for the hard cases, each used as its documentation suggests.
 
 MuJoCo's steps are divided by ten until the scene is solved or a run takes too long.
 """
@@ -25,11 +25,11 @@ MUJOCO_MOST = 15_000_000  # steps of one run
 
 
 class Refused(Exception):
-    """A named result instead of a motion."""
+    """Raised for a named result instead of a motion."""
 
 
 class Run(NamedTuple):
-    """A motion at the output times, and how many steps it took."""
+    """A motion at the output times, and the number of steps."""
 
     q: Any
     qd: Any
@@ -75,7 +75,7 @@ def fdof_jax(scene: HardScene) -> Callable[[], Run]:
 
 
 def plain_diffrax(scene: HardScene) -> Callable[[], Run]:
-    """diffeqsolve on textbook equations, which know nothing of the library."""
+    """Runs diffeqsolve on textbook equations, independent of the library."""
     rates = make_rates(scene.linkage, jnp.sin, jnp.cos, scene.driven)
     steps = diffrax.PIDController(rtol=scene.tolerance, atol=scene.tolerance)
 
@@ -193,7 +193,7 @@ def mujoco(scene: HardScene) -> Callable[[], Run]:
         try:
             result = once(step)
         except Refused as failure:
-            refusal = failure  # of too long a step, perhaps
+            refusal = failure  # possibly because the step was too long
             continue
         chosen = step
         if error_of(scene, result) <= scene.bound:

@@ -1,7 +1,7 @@
-"""Hard cases that are no motion of one arm: what comes of them.
+"""Hard cases that are not motions of one arm, and their outcomes.
 
-fdof_jax has to pass the tests of `tests/hard`. What of it can be asked of plain diffrax
-is one number each, which has to stay below a bound.
+fdof_jax has to pass the tests of `tests/hard`. Those that plain diffrax can run too are
+reduced to one number each, which has to stay below a bound.
 """
 
 import subprocess
@@ -40,7 +40,7 @@ TESTS = {
 
 
 def tested(file: str, which: str) -> dict:
-    """Whether the tests of a scene pass."""
+    """Returns whether the tests of a scene pass."""
     root = Path(__file__).parent.parent
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-m"]
     command += ["slow or not slow", f"tests/hard/{file}", "-k", which]
@@ -52,7 +52,7 @@ def tested(file: str, which: str) -> dict:
 
 
 def _clipped() -> float:
-    """Scene 19: the derivative of an effort just at its limit, to one side or other."""
+    """Scene 19: the derivative of an effort at its limit, to one side or the other."""
     slope = jax.grad(lambda kp: jnp.clip(kp * 0.25, -32.0, 32.0))(128.0) / 0.25
     return min(abs(float(slope)), abs(float(slope) - 1))
 
@@ -98,7 +98,7 @@ def _spoilt() -> float:
 
 
 def _negative_mass() -> float:
-    """Scene 30: whether a tip of -1 kg goes through."""
+    """Scene 30: whether a tip of -1 kg is accepted."""
     scene = hard.free(hard.arm(), hard.START.q, np.array([0.0, 1.0]))
     linkage = eqx.tree_at(lambda a: a.mass, scene.linkage, jnp.array([1.0, 1.0, -1.0]))
     solution = _plain(scene._replace(linkage=linkage), 1e-9, throw=False)
@@ -106,7 +106,7 @@ def _negative_mass() -> float:
 
 
 def _plain(scene: Any, tolerance: float, effort: Any = None, throw: bool = True) -> Any:
-    """The motion under `effort(t)` at the first joint."""
+    """Returns the motion under `effort(t)` at the first joint."""
 
     control = None if effort is None else lambda t, *y: (effort(t), 0.0, 0.0)
     rates = make_rates(scene.linkage, jnp.sin, jnp.cos, control=control)
@@ -130,7 +130,7 @@ PLAIN = {19: (_clipped, 0.0), 23: (_steps_in_float32, 2.0), 24: (_pulse, 1e-8),
 
 
 def probed(probe: Callable[[], float], bound: float) -> dict:
-    """What came of a probe of plain diffrax."""
+    """Returns the outcome of a probe of plain diffrax."""
     try:
         error = probe()
     except Exception as failure:

@@ -1,4 +1,4 @@
-"""The motions of `tests/hard`, in a form that other engines can be asked for.
+"""The motions of `tests/hard`, in a form that other engines can run.
 
 Numbers are those of the table of hard cases in the page. Every motion is judged by one
 number, which has to stay below a bound: its error, unless `judge` says otherwise.
@@ -25,17 +25,17 @@ Judge = Callable[[np.ndarray, np.ndarray], float]  # of q, qd: (time, 3)
 
 
 class HardScene(NamedTuple):
-    """A motion of one arm under a `Drive`, and what must hold.
+    """A motion of one arm under a `Drive`, and the bounds that it must meet.
 
     - `judge`: the number that must not exceed `bound`.
-    - `tolerance`: what adaptive solvers are asked for.
+    - `tolerance`: the tolerance of adaptive solvers.
     - `stiff`: whether an implicit solver is recommended.
-    - `first_step`: of adaptive solvers [s]; None lets them estimate it.
-    - `most_steps`: more of an adaptive solver are too many.
-    - `scaled`: whether tolerances are meant in sizes of the arm.
-    - `may_refuse`: whether to be called ill-conditioned is as good as a solution.
-    - `derivative`: whether not the motion is judged, but the derivative of q at its end
-      in q at the start, (3, 3).
+    - `first_step`: the first step of adaptive solvers [s]; None: they estimate it.
+    - `most_steps`: the most steps that an adaptive solver may take.
+    - `scaled`: whether tolerances are in sizes of the arm.
+    - `may_refuse`: whether the report "ill-conditioned" is as good as a solution.
+    - `derivative`: whether the derivative of q at the end in q at the start, (3, 3), is
+      judged instead of the motion.
     """
 
     number: int
@@ -56,7 +56,7 @@ class HardScene(NamedTuple):
 
     @property
     def driven(self) -> Drive | None:
-        """The drive, None where there is none."""
+        """Returns the drive, or None where there is none."""
         return self.drive if np.any(self.drive) else None
 
 
@@ -65,7 +65,7 @@ def _error(exact: Any, rows: Any = ...) -> Judge:
 
 
 def _slope(scene: HardScene, exact: Any, bound: float) -> HardScene:
-    """The same scene, judged by its derivative; over its largest entry."""
+    """Returns the scene judged by its derivative, over the largest entry."""
     return scene._replace(
         name=f"{scene.name}: derivative",
         judge=lambda slope, _: hard.largest_error(slope, exact),
@@ -76,7 +76,7 @@ def _slope(scene: HardScene, exact: Any, bound: float) -> HardScene:
 
 
 def _of(number: int, name: str, scene: hard.Scene, bound: float, **more) -> HardScene:
-    """From the form in which the tests have it."""
+    """Returns a scene from the form that the tests use."""
     effort, damper = scene.forces
     drive = Drive(np.asarray(effort.tau), damping=np.asarray(damper.coefficient))
     judge = more.pop("judge", None) or _error(scene.q, scene.rows)
@@ -105,7 +105,7 @@ def _stiff(kp: float) -> HardScene:
 
 
 def _creep(q, qd):
-    """Of the velocities, against the balance of damping and gravity."""
+    """Returns the velocities' error against the balance of damping and gravity."""
     exact = [
         -np.asarray(fj.inverse_dynamics(hard.arm(), row, np.zeros(3), np.zeros(3)))
         for row in q[1:]
@@ -150,7 +150,7 @@ def _tight(state0: fj.State, ts: np.ndarray) -> np.ndarray:
 
 
 def _massless() -> HardScene:
-    """The acceleration of the last joint is undetermined: nothing can be right."""
+    """Returns a scene whose last acceleration is undetermined: no answer is right."""
     massless = eqx.tree_at(
         lambda arm: (arm.com, arm.inertia),
         hard.arm(),
@@ -163,7 +163,7 @@ def _massless() -> HardScene:
 
 
 def motions() -> Iterator[HardScene]:
-    """All scenes that are a motion of one arm under a `Drive`."""
+    """Returns all scenes that are a motion of one arm under a `Drive`."""
     load, common, fig5 = hard.load, hard.load_common, hard.fig5
     yield _of(1, "Fig 5, no inertia", load("fig5"), 1e-6, tolerance=1e-10)
     yield _of(2, "heavy tip, 1e3 kg", load("heavy-tip-1e3"), 1e-8)

@@ -5,7 +5,7 @@ from .measure import OUTCOMES
 
 
 def by_scene(points: list[dict]) -> dict[str, dict[int, str]]:
-    """Per engine, the worst outcome of each hard case that could be asked of it."""
+    """Returns, per engine, the worst outcome of each hard case that it can run."""
     worst: dict[str, dict[int, str]] = {}
     for point in points:
         if point["status"] != "skipped":

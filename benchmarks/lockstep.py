@@ -1,7 +1,8 @@
-"""Lock step: what one unusual member of a batch costs the others.
+"""Lock step: the cost of one unusual member of a batch to the others.
 
-256 random motions of Fig 5's arm: clean, with one that spins and so needs many times
-the steps, with one that is NaN at the start, and with one that turns NaN mid-run.
+The batches are 256 random motions of Fig 5's arm: clean, with one member that spins and
+so needs many times the steps, with one that is NaN at the start, and with one that
+turns NaN mid-run.
 """
 
 from collections.abc import Iterator
@@ -26,7 +27,7 @@ UNUSUAL = 100  # which member it is
 
 
 class TurnsNaN(eqx.Module):
-    """No effort; from 1 s on `amplitude`, which is zero or NaN."""
+    """An effort of 0, and from 1 s on of `amplitude`, which is zero or NaN."""
 
     amplitude: Array
 
@@ -79,7 +80,7 @@ def _scenes(batch: int) -> Iterator[tuple[str, Problem, Array]]:
 
 
 def _judge(exact: np.ndarray, ignored: int | None, solution: Any) -> dict:
-    """The error of all members but the one that cannot have a result."""
+    """Returns the error of all members except the one that cannot have a result."""
     errors = np.abs(np.asarray(solution.q) - exact).max(axis=(1, 2))
     steps = np.asarray(solution.stats["num_steps"])
     if ignored is not None:

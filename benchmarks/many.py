@@ -22,7 +22,7 @@ CHECKED = 10  # of each topology, against single motions
 
 
 def _arms(each: int) -> tuple[fj.Linkage, fj.State]:
-    """As `problems.random_linkage`, drawn for all at once."""
+    """Returns arms like those of `problems.random_linkage`, all drawn at once."""
     rng = np.random.default_rng(3)
     count = 7 * each
     one = fj.scenes.fig5().linkage
@@ -46,7 +46,7 @@ def _arms(each: int) -> tuple[fj.Linkage, fj.State]:
 
 
 def _peak() -> float:
-    """Largest resident memory of this process so far [MB]."""
+    """Returns the largest resident memory of this process so far [MB]."""
     unit = 1e6 if sys.platform == "darwin" else 1e3
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
 

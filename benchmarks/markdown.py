@@ -1,4 +1,4 @@
-"""Tables and numbers as Markdown has them."""
+"""Tables and numbers in Markdown."""
 
 from collections.abc import Iterable
 
@@ -10,7 +10,7 @@ def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
 
 
 def number(value: float | None, digits: int = 2) -> str:
-    """To some digits, with powers of ten only where they help."""
+    """Formats a number to some digits, with powers of ten only where they help."""
     if value is None or value != value:
         return "-"
     if value == 0 or 1e-2 <= abs(value) < 1e4:

@@ -1,8 +1,8 @@
-"""Interleaved timing, and the records that come of it.
+"""Interleaved timing, and its records.
 
 A `Case` is one contestant at one setting. `measure` runs all cases in turn, round after
-round, so that whatever else the machine does falls on all of them alike; ratios are
-taken within a round. A result is judged once, by its error, before anything is timed.
+round, so that other work of the machine affects all of them alike. Ratios are taken
+within a round. A result is judged once, by its error, before anything is timed.
 """
 
 import math
@@ -25,21 +25,21 @@ ENDLESS = 30.0  # first calls of this length [s] are not repeated to learn their
 FEWEST, FEW, MANY = 3, 5, 15  # rounds: under any budget, of long calls, of the rest
 WORST_ERROR = 0.1  # a larger error is a failure, not a result
 TARGETS = (1e-3, 1e-6, 1e-9, 1e-12)
-# What can come of a hard case, best first.
+# The outcomes of a hard case, best first.
 OUTCOMES = ("solved", "refused as asked", "failed by name", "failed silently")
 
 
 class Skipped(Exception):
-    """A contestant that is not at hand; the message says what is missing."""
+    """Raised if a contestant is not installed; the message names what is missing."""
 
 
 class Case(NamedTuple):
     """A contestant at one setting.
 
-    - `run`: does the work once; what it returns is waited for.
-    - `judge`: from what `run` returned to what is known of it: `error`, and as it may
-      be `energy_defect`, `steps`, `rejected`, `status`.
-    - `fields`: what else its record shall say.
+    - `run`: does the work once; the timer waits for its result.
+    - `judge`: returns what is known of the result: `error`, and possibly
+      `energy_defect`, `steps`, `rejected`, `status`.
+    - `fields`: further fields of its record.
     """
 
     solver: str
@@ -77,7 +77,7 @@ RECORD = {
 
 
 def record(**fields: Any) -> dict:
-    """A complete record: one JSON line."""
+    """Returns a complete record: one JSON line."""
     dtype = "float64" if jax.config.jax_enable_x64 else "float32"
     return {**RECORD, "dtype": dtype, **environment(), **fields}
 
@@ -112,14 +112,14 @@ def measure(
     equal_error: bool = True,
     **fields: Any,
 ) -> list[dict]:
-    """Records of all cases. Failed ones are not timed.
+    """Returns records of all cases. Failed cases are not timed.
 
     **Arguments:**
 
-    - `budget`: time after which no round begins, but for the first three [s].
+    - `budget`: time after which no round begins, except the first three [s].
     - `ratio_to`: the solver whose time divides those of the others, in each round: at
       the case's own error, or with `equal_error` off, its only case.
-    - `fields`: what all records have in common.
+    - `fields`: fields that all records share.
     """
     points, running = [], []
     for case in cases:
@@ -187,10 +187,11 @@ def _add_ratios(points: list[dict], ratio_to: str, equal_error: bool) -> None:
 
 
 def envelope(errors: Sequence[float], times: Sequence[float], error: float) -> float:
-    """The least time for an error, between measured points on logarithmic axes.
+    """Returns the least time for an error, between points on logarithmic axes.
 
-    Only points count that no other beats in both. Looser than the loosest of them, its
-    time stands, an upper bound; tighter than the tightest was not reached: NaN.
+    Only points that no other point beats in both count. For a looser error than any
+    of theirs the result is the time of the loosest point, an upper bound; for a
+    tighter error than any it is NaN.
     """
     front: list[tuple[float, float]] = []
     for e, t in sorted(zip(errors, times)):  # from the tightest: each must be faster
@@ -204,7 +205,7 @@ def envelope(errors: Sequence[float], times: Sequence[float], error: float) -> f
 
 
 def times_at(points: list[dict], error: float) -> np.ndarray | None:
-    """Per round, the time of one solver at an error; None where it was not reached."""
+    """Returns one solver's time at an error for each round; None if not reached."""
     good = [p for p in points if p["status"] == "ok" and p["times"]]
     if not good or error is None:
         return None
@@ -217,7 +218,7 @@ def times_at(points: list[dict], error: float) -> np.ndarray | None:
 
 @cache
 def environment() -> dict:
-    """Where and with what: the same for all records of a process."""
+    """Returns the machine and versions, the same for all records of a process."""
     names = ("jax", "jaxlib", "diffrax", "numpy", "scipy", "numba", "mujoco",
              "mujoco-mjx", "heyoka")  # fmt: skip
     versions = {"python": platform.python_version()}

@@ -72,7 +72,7 @@ def _library(method: str, lanes: int) -> ctypes.CDLL:
 
 
 def _arm(linkage: fj.Linkage) -> np.ndarray:
-    """The fields of the kernel's `Arm`."""
+    """Returns the fields of the kernel's `Arm`."""
     (_, b2, b3), (_, a2, a3, _) = linkage.locked.tolist(), linkage.length.tolist()
     m2, m3, m4 = linkage.mass.tolist()
     com, inertia = np.asarray(linkage.com), linkage.inertia.tolist()
@@ -87,10 +87,10 @@ def _arm(linkage: fj.Linkage) -> np.ndarray:
 
 
 class Kernel:
-    """Fixed steps of one method, for one arm and one or many starts.
+    """One method with fixed steps, for one arm and one or many starts.
 
     **Arguments:** `method`: "RK4" or "order 8"; `q`, `qd`: (3,) or (batch, 3);
-    `threads`: among which a batch is split.
+    `threads`: the number of threads that share a batch.
     """
 
     def __init__(
@@ -119,9 +119,10 @@ class Kernel:
         self.pool = ThreadPoolExecutor(threads) if threads > 1 else None
 
     def __call__(self, step: float, steps: int, saves: int = 1) -> np.ndarray:
-        """States after each of `saves` times `steps` steps: (blocks, saves, 6, lanes).
+        """Returns states after each of `saves` times `steps` steps.
 
-        Absolute angles and rates, as the kernel leaves them: see `joints`.
+        The shape is (blocks, saves, 6, lanes). Angles and rates are absolute,
+        as the kernel leaves them: see `joints`.
         """
         state = self.start.copy()
         saved = np.empty((len(state), saves, 6, self.lanes))
@@ -145,7 +146,7 @@ class Kernel:
         return saved
 
     def joints(self, saved: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Joint positions and rates of saved states: (batch, saves, 3) each."""
+        """Returns joint positions and rates of saved states: (batch, saves, 3) each."""
         blocks, saves = saved.shape[:2]
         state = saved.transpose(0, 3, 1, 2).reshape(blocks * self.lanes, saves, 6)
         state = state[: self.batch]

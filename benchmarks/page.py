@@ -17,7 +17,7 @@ def _solvers(points: list[dict]) -> list[str]:
 
 
 def _read_off(points: list[dict], to_value: Callable, sign: str) -> list[str]:
-    """A cell per target error; `sign` marks bounds: no looser point was measured."""
+    """Returns a cell per target error; `sign` marks bounds without looser points."""
     cells = []
     loosest = max((p["error"] for p in points if p["times"]), default=0)
     for target in TARGETS:
@@ -205,7 +205,7 @@ def tuning(points: list[dict]) -> str:
     timed = [
         [
             p["problem"],
-            # What an earlier row has compiled serves this one.
+            # An earlier row compiled this program.
             number(p["compile_time"]) if p["compile_time"] > 1 else "-",
             number(p["time_median"], 3),
             number(p["time_median"] / p["batch"], 3),
@@ -291,13 +291,13 @@ def sliders(points: list[dict]) -> str:
 
 
 def _machine(points: dict[str, list[dict]]) -> str:
-    """A line per machine and set of versions: which jobs ran there, at which commit."""
+    """Returns a line per machine and versions, with the jobs and their commits."""
     jobs: dict[str, dict[str, set[str]]] = {}
     for name, job in points.items():
         for point in job:
             versions = [f"{k} {v}" for k, v in point["versions"].items() if v]
             commits = jobs.setdefault(", ".join([point["cpu"], *versions]), {})
-            # Results of the jobs before are changes that are not committed yet.
+            # Uncommitted changes may be results of earlier jobs.
             commits.setdefault(point["commit"].removesuffix("-dirty"), set()).add(name)
     lines = []
     for machine, commits in jobs.items():
@@ -318,7 +318,7 @@ def _gpu(points: list[dict]) -> str:
 
 
 def tables(points: dict[str, list[dict]]) -> dict[str, str]:
-    """Text by name, for what has been measured."""
+    """Returns the text of each table that has been measured, by name."""
     makers = {
         "batches": batches,
         "batches-xla-flags": batches,
@@ -352,7 +352,7 @@ def tables(points: dict[str, list[dict]]) -> dict[str, str]:
 
 
 def filled(page: str, texts: dict[str, str]) -> str:
-    """The page with each text between its pair of markers."""
+    """Returns the page with each text between its pair of markers."""
     for name, text in texts.items():
         begin, end = f"<!-- begin: {name} -->", f"<!-- end: {name} -->"
         between = re.compile(re.escape(begin) + ".*?" + re.escape(end), re.DOTALL)

@@ -1,6 +1,6 @@
 """Other engines as contestants: SciPy, MuJoCo, MJX, heyoka and the C kernel.
 
-Each raises `Skipped` where it is not installed or cannot take the problem.
+Each raises `Skipped` if it is not installed or cannot run the problem.
 """
 
 import importlib
@@ -26,7 +26,7 @@ from .problems import Problem
 
 
 def module(name: str) -> Any:
-    """An installed peer."""
+    """Returns an installed peer."""
     try:
         return importlib.import_module(name)
     except ImportError:
@@ -49,7 +49,7 @@ def _threads() -> int:
 
 
 def _steps(problem: Problem, step: float) -> int:
-    """Steps between two output times, which must be whole."""
+    """Returns the steps between two output times, which must be a whole number."""
     between = float(problem.ts[1] - problem.ts[0])
     count = round(between / step)
     if not math.isclose(count * step, between, rel_tol=1e-9):
@@ -61,7 +61,7 @@ _COMPILED: dict[str, tuple] = {}
 
 
 def _scalar_rates(problem: Problem) -> tuple:
-    """The equations in plain floats, and what runs them; compiled once per problem."""
+    """Returns the equations in plain floats and their language, compiled once."""
     if problem.name not in _COMPILED:
         compiled, language = (lambda f: f), "Python"
         try:
@@ -75,7 +75,7 @@ def _scalar_rates(problem: Problem) -> tuple:
 
 
 def scipy(problem: Problem, method: str) -> Contestant:
-    """`solve_ivp` on a right-hand side compiled by numba where it is installed."""
+    """Returns `solve_ivp` on a right-hand side that numba compiles if installed."""
     _one_arm(problem)
     if problem.batch is not None:
         raise Skipped("no batches")
@@ -103,7 +103,7 @@ def scipy(problem: Problem, method: str) -> Contestant:
 
 
 def _with_servos(problem: Problem) -> str:
-    """The arm as MJCF, its controller, if it has one, as actuators."""
+    """Returns the arm as MJCF; a controller becomes actuators."""
     text = fj.to_mjcf(problem.linkage)
     if not problem.forces:
         return text
@@ -125,7 +125,7 @@ def _with_servos(problem: Problem) -> str:
 
 
 def mujoco(problem: Problem, integrator: str) -> Contestant:
-    """MuJoCo's own rollout in C; `integrator`: Euler, implicitfast or RK4.
+    """Returns MuJoCo's own rollout in C; `integrator`: Euler, implicitfast or RK4.
 
     A controller becomes its position servos, whose set points are held over a step.
     """
@@ -163,7 +163,7 @@ def mujoco(problem: Problem, integrator: str) -> Contestant:
 
 
 def mjx_rk4(problem: Problem) -> Contestant:
-    """MuJoCo's JAX port with its RK4, the step a traced number."""
+    """Returns MuJoCo's JAX port with its RK4; the step is a traced number."""
     _one_free_arm(problem)
     mj, mjx = module("mujoco"), module("mujoco.mjx")
     model = mj.MjModel.from_xml_string(fj.to_mjcf(problem.linkage))
@@ -197,7 +197,7 @@ def mjx_rk4(problem: Problem) -> Contestant:
 
 
 def symbolic(hy: Any, linkage: fj.Linkage, drive: Drive | None = None) -> list:
-    """The equations as heyoka takes them."""
+    """Returns the equations in heyoka's form."""
     variables = hy.make_vars("q1", "q2", "q3", "u1", "u2", "u3")
 
     def of(symbolic: Any, number: Any) -> Any:
@@ -209,7 +209,7 @@ def symbolic(hy: Any, linkage: fj.Linkage, drive: Drive | None = None) -> list:
 
 
 def extended(problem: Problem) -> np.ndarray:
-    """Positions at the output times by heyoka in 80-bit numbers: a reference."""
+    """Returns positions at the output times by heyoka in 80-bit numbers."""
     _one_free_arm(problem)
     hy = module("heyoka")
     wide = np.longdouble
@@ -228,7 +228,7 @@ def extended(problem: Problem) -> np.ndarray:
 
 
 def heyoka(problem: Problem) -> Contestant:
-    """Adaptive Taylor series compiled by LLVM; a batch by several members at a time."""
+    """Returns an adaptive Taylor series compiled by LLVM; batches in vectors."""
     _one_free_arm(problem)
     hy = module("heyoka")
     system = symbolic(hy, problem.linkage)
@@ -287,7 +287,7 @@ def heyoka(problem: Problem) -> Contestant:
 
 
 def native(problem: Problem, method: str) -> Contestant:
-    """The C kernel: "RK4" or "order 8"."""
+    """Returns the C kernel: "RK4" or "order 8"."""
     _one_free_arm(problem)
     kernel = Kernel(
         method,

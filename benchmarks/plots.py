@@ -1,4 +1,4 @@
-"""Plots of the results: error along x, what it costs along y."""
+"""Plots of the results, with the error along x and the cost along y."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -11,7 +11,7 @@ from matplotlib.ticker import NullFormatter
 
 from .measure import OUTCOMES, times_at
 
-# Okabe and Ito's colours, told apart with any colour vision; markers differ as well.
+# Okabe and Ito's colours suit all colour vision; markers differ as well.
 COLORS = ("#000000", "#E69F00", "#56B4E9", "#009E73", "#D55E00", "#0072B2", "#CC79A7",
           "#999999")  # fmt: skip
 MARKERS = "osD^v<>PX*ph"
@@ -50,7 +50,7 @@ def _axes(panels: int, height: float = 3.4):
 
 
 def _save(figure, path: Path) -> None:
-    """With one legend for all panels, below them."""
+    """Saves a figure, with one legend below all panels."""
     entries = {}
     for axis in figure.axes:
         for handle, label in zip(*axis.get_legend_handles_labels()):
@@ -63,7 +63,7 @@ def _save(figure, path: Path) -> None:
 
 
 def _curves(axis, points: list[dict], height: Callable[[dict], float]) -> None:
-    """One line per solver, and a cross at the bottom for each run that failed."""
+    """Draws a line per solver, and a cross at the bottom for each failed run."""
     for index, solver in enumerate(_solvers(points)):
         own = [p for p in points if p["solver"] == solver]
         good = [p for p in own if p["times"] and p["error"]]
@@ -103,7 +103,7 @@ def trajectory(points: list[dict], path: Path) -> None:
 
 
 def batches(points: list[dict], path: Path) -> None:
-    """Throughput against error at one size, and against the size at one error."""
+    """Draws throughput against error at one size, and against size at one error."""
     figure, (left, right) = _axes(2, height=4.2)
     sizes = sorted({p["batch"] for p in points if p["status"] != "skipped"})
     size = 1024 if 1024 in sizes else sizes[-1]
@@ -143,7 +143,7 @@ def generality(points: list[dict], path: Path) -> None:
 
 
 def gradients(points: list[dict], path: Path) -> None:
-    """Error of six gains' gradient against its cost, along tolerances."""
+    """Draws the error of six gains' gradient against its cost, along tolerances."""
     figure, axes = _axes(2)
     for axis, problem in zip(axes, ("gains", "gains, limited")):
         own = [
@@ -170,7 +170,7 @@ def drift(points: list[dict], path: Path) -> None:
 
 
 def hard_cases(points: list[dict], path: Path) -> None:
-    """One cell per scene and engine: what came of it, and error over bound."""
+    """Draws a cell per scene and engine: its outcome, and error over bound."""
     rows = list(dict.fromkeys((p["number"], p["problem"]) for p in points))
     engines = _solvers(points)
     colors = dict(zip(OUTCOMES, (COLORS[3], COLORS[2], COLORS[1], COLORS[4])))
@@ -215,7 +215,7 @@ PLOTS = {
 
 
 def draw(points: dict[str, list[dict]], folder: Path) -> None:
-    """A PNG for each job that has been measured and has a plot."""
+    """Draws a PNG for each measured job that has a plot."""
     matplotlib.rcParams["font.size"] = 8
     for name, plot in PLOTS.items():
         own = points.get(name, [])

@@ -1,4 +1,4 @@
-"""What is simulated: single motions and batches, with their reference solutions."""
+"""The problems: single motions and batches, with their reference solutions."""
 
 from collections.abc import Iterator
 from typing import Any, NamedTuple
@@ -15,7 +15,7 @@ REFERENCE_TOLERANCE = 1e-13
 
 
 class Problem(NamedTuple):
-    """One motion, or with leading axes in `state0` (and `linkage`) a batch of them."""
+    """One motion; with leading axes in `state0` (and `linkage`), a batch."""
 
     name: str
     linkage: fj.Linkage
@@ -31,7 +31,7 @@ class Problem(NamedTuple):
 
     @property
     def axes(self) -> tuple | None:
-        """What `jax.vmap` wants to know of `linkage` and `state0`; None for one."""
+        """Returns the axes of `linkage` and `state0` for `jax.vmap`; None for one."""
         if self.batch is None:
             return None
         return (0 if self.linkage.ef.ndim > 1 else None), 0
@@ -53,7 +53,7 @@ def fig7() -> Problem:
 
 
 def swinging_rpr() -> Problem:
-    """The arm of Fig 7 without its controller, falling from rest."""
+    """Returns the arm of Fig 7 without its controller, falling from rest."""
     return _free("rpr-swing", fj.scenes.fig7(), "RPR", 5.0)
 
 
@@ -72,7 +72,7 @@ def weightless_rrp() -> Problem:
 
 
 def random_linkage(topology: str, rng: np.random.Generator) -> fj.Linkage:
-    """Every link has inertia of its own: regular in all configurations."""
+    """Returns a random arm that is regular: every link has inertia of its own."""
     return fj.Linkage(
         topology,
         length=rng.uniform(0, 1.5, 4),
@@ -99,7 +99,7 @@ def random_singles(per_topology: int = 3) -> Iterator[Problem]:
 
 
 def fig5_batch(batch: int, half_width: float = 0.5) -> Problem:
-    """Fig 5's arm from random angles around level, at rest, for 2 s."""
+    """Returns Fig 5's arm from random angles around level, at rest, for 2 s."""
     q = np.random.default_rng(0).uniform(-half_width, half_width, (batch, 3))
     return Problem(
         "fig5-random-2s",
@@ -112,7 +112,7 @@ def fig5_batch(batch: int, half_width: float = 0.5) -> Problem:
 
 
 def mixed_batch(batch: int) -> Problem:
-    """Random arms of all topologies in random order, from random states, for 2 s."""
+    """Returns random arms of all topologies, from random states, for 2 s."""
     rng = np.random.default_rng(2)
     arms = [random_linkage(t, rng) for t in rng.choice(fj.TOPOLOGIES, batch)]
     linkage = jax.tree.map(lambda *leaves: jnp.stack(leaves), *arms)
@@ -148,7 +148,7 @@ def _reference(linkage, state0, ts, forces, axes):
 
 
 def reference(problem: Problem, chunk: int = 1024) -> np.ndarray:
-    """Joint positions at the output times, at a tolerance of 1e-13."""
+    """Returns joint positions at the output times, at a tolerance of 1e-13."""
     linkage, state0 = problem.linkage, problem.state0
     if problem.batch is None:
         motion = _reference(linkage, state0, problem.ts, problem.forces, None)

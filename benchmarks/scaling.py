@@ -1,4 +1,4 @@
-"""How cost grows: log-log slopes against batch, horizon, 1/error and gain."""
+"""Growth of cost: log-log slopes against batch, horizon, 1/error and gain."""
 
 from collections.abc import Iterator
 
@@ -33,7 +33,7 @@ def _errors(quick: bool) -> Iterator[tuple[float, Problem, float]]:
 
 
 def _gains(quick: bool) -> Iterator[tuple[float, Problem, float]]:
-    """Fig 7 without limits: kp and kd times a factor and its root."""
+    """Returns Fig 7 without limits: kp and kd times a factor and its root."""
     problem = fig7()._replace(ts=np.linspace(0, 4, 101))
     (pd,) = problem.forces
     for factor in (1, 10) if quick else (0.1, 1, 10, 100):
@@ -47,7 +47,7 @@ SERIES = {"batch": _batches, "horizon": _horizons, "error": _errors, "gain": _ga
 
 
 def slope(points: list[dict]) -> float | None:
-    """The exponent of the time's growth with `x`, by least squares on logarithms."""
+    """Returns the exponent of time against `x`, by least squares on logarithms."""
     good = [p for p in points if p["status"] == "ok" and p["times"]]
     if len(good) < 2:
         return None

@@ -1,7 +1,7 @@
-"""Single arms: a plain call, gradients and a search, against heyoka and each other.
+"""Single arms: a plain call, gradients and a search, beside heyoka.
 
-What a user waits for once everything is compiled, on the JAX that is installed: the job
-is run on the oldest and the newest.
+The times are those that a user waits once everything is compiled, with the installed
+JAX. The job runs on the oldest and the newest JAX.
 """
 
 from collections.abc import Callable, Iterator
@@ -26,7 +26,7 @@ TOLERANCES = (1e-5, 1e-7, 1e-9, 1e-11)
 def plain_call(
     problem: Problem, solver: diffrax.AbstractSolver | None = None
 ) -> Contestant:
-    """`simulate`, called as at a prompt."""
+    """Returns `simulate`, called as at a prompt."""
 
     def run(tolerance: float):
         return fj.simulate(
@@ -90,7 +90,7 @@ def _search(budget: float) -> Iterator[dict]:
 
 
 def _door(budget: float) -> Iterator[dict]:
-    """A call of `simulate` over the compiled solve within it."""
+    """Measures a call of `simulate` over the compiled solve within it."""
     scene = fj.scenes.fig7()
     ts = np.array([0.0, 0.01])
     call = lambda: fj.simulate(scene.linkage, scene.state0, ts, scene.forces)

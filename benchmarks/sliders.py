@@ -1,8 +1,8 @@
-"""Sliders in a browser: from the event on a page to the picture that answers it.
+"""Sliders in a browser: times from an event on the page to the new picture.
 
 A JupyterLab of its own on 127.0.0.1, a headless Chromium that opens a notebook of one
-cell, and real key presses. Both ends are told by the browser's own clock: an event's
-time stamp, and the first frame after the new image has been loaded.
+cell, and real key presses. The browser's own clock measures both ends: an event's time
+stamp, and the first frame after the new image has been loaded.
 """
 
 import contextlib
@@ -29,7 +29,7 @@ fj.configure(x64=True)
 from fdof_jax.interactive import sliders
 sliders()"""
 
-# What is noted on the page: [time stamp of the event, time of the frame] per picture.
+# The page records [time stamp of the event, time of the frame] per picture.
 PROBE = """
 window.pictures = []; window.event_time = null;
 for (const kind of ['keydown', 'change'])
@@ -42,7 +42,7 @@ document.querySelector('.jp-OutputArea img.widget-image').addEventListener(
 
 @contextlib.contextmanager
 def jupyterlab(folder: Path) -> Iterator[str]:
-    """The address of a JupyterLab that serves a folder, with nobody's settings."""
+    """Returns the address of a JupyterLab on a folder, without user settings."""
     token = os.urandom(16).hex()
     own = folder / ".jupyter"
     settings = {
@@ -88,7 +88,7 @@ def chromium() -> Iterator[Any]:
 
 
 def waited(what: str, found: Callable[[], Any], patience: float = PATIENCE) -> Any:
-    """What a function finds, once it finds something."""
+    """Returns the result of a function as soon as there is one."""
     began = time.perf_counter()
     while not (value := found()):
         if time.perf_counter() - began > patience:
@@ -98,7 +98,7 @@ def waited(what: str, found: Callable[[], Any], patience: float = PATIENCE) -> A
 
 
 def opened(browser: Any, address: str) -> None:
-    """Open a notebook and run all of its cells."""
+    """Opens a notebook and runs all of its cells."""
     browser.get(address)
     ready = """
         const shell = window.jupyterapp && window.jupyterapp.shell;
@@ -112,7 +112,7 @@ def opened(browser: Any, address: str) -> None:
 
 
 def moved(browser: Any, move: Callable[[int], Any], moves: int) -> list[float]:
-    """Latencies [s] of so many moves, each made when the one before is answered."""
+    """Returns latencies [s] of several moves; each follows the answer to the last."""
     browser.execute_script("window.pictures = []")
     for i in range(moves):
         move(i)
@@ -124,7 +124,7 @@ def moved(browser: Any, move: Callable[[int], Any], moves: int) -> list[float]:
 
 
 def held(browser: Any, press: Callable[[int], Any], moves: int) -> list[float]:
-    """Times between pictures [s] under more key presses than can be answered."""
+    """Returns times between pictures [s] under too many key presses to answer."""
     browser.execute_script("window.pictures = []")
     for i in range(moves):
         press(i)
@@ -149,7 +149,7 @@ def run(quick: bool) -> Iterator[dict]:
         import nbformat
 
         book = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(CELL)])
-        # Without one a dialog asks for it.
+        # Without a kernel name a dialog asks for one.
         book.metadata.kernelspec = {"name": "python3", "display_name": "Python 3"}
         nbformat.write(book, Path(folder, "sliders.ipynb"))
         with jupyterlab(Path(folder)) as address, chromium() as browser:

@@ -1,4 +1,4 @@
-"""What is to be reached, read off the measured points: ratios taken round by round."""
+"""The targets and the measured ratios, taken round by round."""
 
 from collections.abc import Callable, Iterator
 
@@ -24,7 +24,7 @@ def _per_round(above, below) -> np.ndarray | None:
 
 
 def ratio_at(points: list[dict], above: str, below: str, error: float, **fields):
-    """Per round, the time of one solver at an error over that of another."""
+    """Returns one solver's time at an error over another's, for each round."""
     return _per_round(
         times_at(_points(points, above, **fields), error),
         times_at(_points(points, below, **fields), error),
@@ -32,7 +32,7 @@ def ratio_at(points: list[dict], above: str, below: str, error: float, **fields)
 
 
 def _ratio_of(points: list[dict], above: dict, below: dict):
-    """The same for two single points; None where one is missing or has failed."""
+    """Returns the ratio of two single points; None if one is missing or failed."""
     found = []
     for wanted in (above, below):
         match = [p for p in points if all(p.get(k) == v for k, v in wanted.items())]
@@ -48,7 +48,7 @@ def _quartiles(ratio, number: Callable) -> tuple[str, str]:
 
 
 def targets(points: dict[str, list[dict]], number: Callable) -> Iterator[tuple]:
-    """(figure, measured, quartiles, required, aim) for what has been measured."""
+    """Returns (figure, measured, quartiles, required, aim) of measured targets."""
 
     def row(figure: str, ratio, required: str, aim: str) -> tuple:
         return figure, *_quartiles(ratio, number), required, aim

@@ -1,4 +1,4 @@
-"""One trajectory: time against error, over a paper's figures and random starts."""
+"""One trajectory: time against error, for the figures and random starts."""
 
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -20,7 +20,7 @@ Row = tuple[str, Callable[[Problem], Contestant], tuple]
 
 
 def rows(problem: Problem) -> list[Row]:
-    """Contestants and settings for one of the named problems."""
+    """Returns contestants and settings for one of the named problems."""
     plain = own.plain_textbook if problem.name == "fig5" else own.plain_reduced
     table: list[Row] = [
         ("fdof_jax", own.fdof_jax, TOLERANCES),
@@ -65,7 +65,7 @@ def _general(tolerances: tuple, steps: tuple) -> list[Row]:
 
 
 def random_rows() -> list[Row]:
-    """Those that take every topology, at fewer settings."""
+    """Returns the contestants that take every topology, at fewer settings."""
     tolerances = (1e-4, 1e-6, 1e-8, 1e-10, 1e-12)
     return [
         ("fdof_jax", own.fdof_jax, tolerances),
@@ -85,7 +85,7 @@ def _settings(contestant: Contestant, problem: Problem, settings: tuple) -> tupl
 
 
 def _prepared(problem: Problem, exact: np.ndarray, table: list[Row]) -> Iterator[Case]:
-    """Cases in the order of the table; None stands for a contestant left out."""
+    """Returns cases in the order of the table; None stands for a missing contestant."""
     for name, make, settings in table:
         try:
             contestant = make(problem)
@@ -119,7 +119,7 @@ def measure_one(
 
 
 def exact(problem: Problem) -> np.ndarray:
-    """The motion in extended precision, or in double where that is not at hand."""
+    """Returns the motion in extended precision, or in double without heyoka."""
     try:
         return peers.extended(problem)
     except Skipped:
@@ -127,7 +127,7 @@ def exact(problem: Problem) -> np.ndarray:
 
 
 def measure_fig5(budget: float) -> Iterator[dict]:
-    """Fig 5, twice from the same runs: the error up to 2 s, and up to the end.
+    """Measures Fig 5 twice from the same runs: errors up to 2 s, and to the end.
 
     The motion is chaotic: errors grow ten-thousandfold from 2 s to 10 s.
     """
@@ -143,7 +143,7 @@ def measure_fig5(budget: float) -> Iterator[dict]:
 
 
 def _together(parts: list[Case]) -> Case:
-    """The same setting on many problems, one after the other, judged by the worst."""
+    """Returns a case that runs many problems in turn, judged by the worst."""
 
     def judge(results: list) -> dict:
         known = [part.judge(result) for part, result in zip(parts, results)]
@@ -158,7 +158,7 @@ def _together(parts: list[Case]) -> Case:
 
 
 def measure_random(count: int, budget: float) -> Iterator[dict]:
-    """Random arms and starts of all topologies: total time at the worst error."""
+    """Measures random arms of all topologies: total time at the worst error."""
     many = list(problems.random_singles(count))
     prepared = []
     for row in random_rows():

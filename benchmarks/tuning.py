@@ -1,10 +1,11 @@
-"""Gain tuning on Fig 7's circle: how soon each optimiser comes how far.
+"""Gain tuning on Fig 7's circle: the progress of each optimiser.
 
-Best rms tip error so far against simulated time (a gradient's six tangents count as six
-more motions) and against wall time, compilation apart. All know the same bounds and
-start from the same random gains; the median of the starts counts.
+The best rms tip error so far is recorded against simulated time (a gradient's six
+tangents count as six more motions) and against wall time, compilation apart. All
+optimisers have the same bounds and start from the same random gains; the median of the
+starts counts.
 
-And what gains that are tuned to be robust reach on members that they have not seen.
+Robust gains are also judged on members that they were not tuned on.
 """
 
 import time
@@ -38,7 +39,7 @@ class _Enough(Exception):
 
 
 class _Trace:
-    """Best loss so far over simulated and wall time."""
+    """The best loss so far over simulated and wall time."""
 
     def __init__(self, budget: float):
         self.rows: list[tuple[float, float, float]] = []
@@ -54,13 +55,13 @@ class _Trace:
             raise _Enough
 
     def at(self, column: int, limit: float) -> float:
-        """The best rms tip error [mm] within the limit."""
+        """Returns the best rms tip error [mm] within the limit."""
         values = [row[2] for row in self.rows if row[column] <= limit]
         return values[-1] if values else np.inf
 
 
 def _loss(scene):
-    """Mean squared tip error by the library's default solver."""
+    """Returns the mean squared tip error by the library's default solver."""
     ts = jnp.linspace(0, scene.t1, 1001)
     solution = fj.simulate(
         scene.linkage,
@@ -74,7 +75,7 @@ def _loss(scene):
 
 
 def _value(scene) -> Callable:
-    """Losses of log-gains (lane, 6)."""
+    """Returns losses of log-gains (lane, 6)."""
 
     @jax.jit
     @jax.vmap
@@ -204,10 +205,10 @@ def _timed(what: str, times: int, tuned: Callable, starts: int) -> Iterator[dict
 
 
 def _robust(quick: bool) -> Iterator[dict]:
-    """Payloads to 2 kg, starts 0.3 m off, speeds to twice: the worst rms tip error.
+    """Returns worst rms tip errors: payloads to 2 kg, starts 0.3 m off, double speeds.
 
-    Of gains that know the nominal scene, another ensemble, or the members that judge:
-    no gains within the bounds do better than the last.
+    The gains are tuned on the nominal scene, on another ensemble, or on the members
+    that judge: no gains within the bounds do better than the last.
     """
     scene = scenes.fig7()
     pd = scene.forces[0]

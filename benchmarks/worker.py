@@ -1,4 +1,4 @@
-"""One protocol in a process of its own: pinned to cores before JAX starts threads."""
+"""Runs one protocol in its own process, pinned to cores before JAX has threads."""
 
 import argparse
 import importlib
@@ -15,7 +15,7 @@ TWO_DEVICES = "--xla_force_host_platform_device_count=2"
 
 
 class Job(NamedTuple):
-    """What a process measures: a function of a module, on how many cores."""
+    """A measurement of a process: a function of a module, and a number of cores."""
 
     name: str
     module: str
@@ -24,7 +24,7 @@ class Job(NamedTuple):
     x64: bool = True
     cpu: bool = True
     flags: str = ""  # for XLA
-    asked: bool = False  # whether it runs only if named
+    asked: bool = False  # whether it runs only when named
 
 
 JOBS = (
@@ -49,7 +49,7 @@ JOBS = (
     Job("drift", "drift"),
     Job("lockstep", "lockstep"),
     Job("tuning", "tuning"),
-    # A quarter of an hour, for outcomes more than for times: only when asked for.
+    # A quarter of an hour, mainly for outcomes: runs only when named.
     Job("hard_cases", "hard_cases", asked=True),
     Job("hard_cases-float32", "hard_cases", "run_float32", x64=False, asked=True),
     # Needs a browser.
@@ -58,7 +58,7 @@ JOBS = (
 
 
 def _plain(value: Any) -> Any:
-    """Valid JSON: NumPy numbers as numbers, NaN and infinity as null."""
+    """Returns valid JSON: NumPy numbers as numbers, NaN and infinity as null."""
     if isinstance(value, dict):
         return {str(k): _plain(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
@@ -78,7 +78,7 @@ def main() -> None:
     options = parser.parse_args()
     job = next(job for job in JOBS if job.name == options.job)
     available = sorted(os.sched_getaffinity(0))
-    # A GPU's host threads are not what is measured: they keep their cores.
+    # A GPU's host threads are not measured, so they keep their cores.
     if job.cpu:
         os.sched_setaffinity(0, available[: job.cores])
         os.environ["JAX_PLATFORMS"] = "cpu"
@@ -86,7 +86,7 @@ def main() -> None:
     import fdof_jax as fj
 
     fj.configure(x64=job.x64)
-    # Masses at an arm's own joints, as Fig 5 has them, are warned of at each export.
+    # Each export warns of masses at an arm's own joints, which Fig 5 has.
     warnings.filterwarnings("ignore", module="fdof_jax")
     from .measure import skipped
 

@@ -1,4 +1,4 @@
-"""Brings into the site what lies outside of docs/: a hook of MkDocs."""
+"""Adds files outside of docs/ to the site: a hook of MkDocs."""
 
 import re
 from importlib.resources import files as package_files
@@ -21,7 +21,8 @@ def on_config(config):
 
 @event_priority(50)  # before the plugins, one of which takes the notebooks
 def on_files(files, config):
-    pages = ["README.md", "CONTRIBUTING.md", "benchmarks/README.md", *NOTEBOOKS]
+    pages = ["README.md", "CONTRIBUTING.md", "CHANGELOG.md", "benchmarks/README.md"]
+    pages += ["CITATION.cff", *NOTEBOOKS]
     pictures = [
         path.relative_to(ROOT).as_posix()
         for path in ROOT.glob("benchmarks/results/*.png")
@@ -36,12 +37,14 @@ def on_files(files, config):
 
 
 def on_page_markdown(markdown, page, **_):
-    """What lies in docs/ is at the top of the site."""
+    """Adapts links to the site, in which the pages of docs/ are at the top."""
+    if "/" not in page.file.src_uri:
+        markdown = markdown.replace("](../", "](")
     return re.sub(r"(\]\((?:\.\./)*)docs/", r"\1", markdown)
 
 
 def on_page_content(html, page, **_):
-    """Links of notebooks to files lead to their pages."""
+    """Turns links of notebooks to files into links to their pages."""
     if page.file.src_uri.endswith(".ipynb"):
         html = re.sub(r'(href="(?:\.\./)*)docs/', r"\1", html)
         html = re.sub(r'(href="(?!https?:)[^"]*?)README\.md', r"\1index.html", html)

@@ -7,7 +7,7 @@ import pathlib
 import sys
 from typing import Any
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 # A name is imported at its first use, so that what needs no JAX starts at once. The
 # stub beside this file lists the names; editors and type checkers read it too.

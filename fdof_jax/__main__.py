@@ -110,21 +110,21 @@ def _add_tuning(command: argparse.ArgumentParser) -> None:
         ("period", None, not_zero, "time of one turn; two are simulated [s]"),
         ("factor", None, above_one, "the gains stay within this factor of the paper's"),
         ("price", None, not_negative, "price of a joint's constant full effort [m^2]"),
-        ("members", None, count, "size of the ensemble"),
+        ("members", None, count, "ensemble: number of scenes"),
         (
             "payload",
             2,
             not_negative,
-            "of the ensemble: least and greatest mass at the tip [kg]",
+            "ensemble: least and greatest mass at the tip [kg]",
         ),
         (
             "start-offset",
             None,
             not_negative,
-            "of the ensemble: offset of the tip at the start [m]",
+            "ensemble: offset of the tip at the start [m]",
         ),
-        ("speed", 2, speed, "of the ensemble: least and greatest factor on the speed"),
-        ("link-error", None, share, "of the ensemble: relative error of masses"),
+        ("speed", 2, speed, "ensemble: least and greatest factor on the speed"),
+        ("link-error", None, share, "ensemble: relative error of links' mass data"),
     ):
         default = vars(Job)[name.replace("-", "_")]
         shown = " ".join(map(str, default)) if numbers else default
@@ -140,11 +140,13 @@ def _add_tuning(command: argparse.ArgumentParser) -> None:
     search = command.add_argument_group("the search")
     # No defaults here: they would override those read by --resume.
     search.add_argument(
-        "--method", choices=METHODS, help="levenberg-marquardt by default"
+        "--method", choices=METHODS, help="optimiser; levenberg-marquardt by default"
     )
-    search.add_argument("--starts", type=count, help="runs; 1 by default")
-    search.add_argument("--seed", type=seed, help="of random starts; 0 by default")
-    search.add_argument("--max-steps", type=count, help="50 by default")
+    search.add_argument(
+        "--starts", type=count, help="runs; later ones from random gains; 1 by default"
+    )
+    search.add_argument("--seed", type=seed, help="seed of random gains; 0 by default")
+    search.add_argument("--max-steps", type=count, help="steps of a run; 50 by default")
     search.add_argument(
         "--save", type=_new_file, metavar="FILE", help="save the result"
     )

@@ -99,8 +99,24 @@ def real_array(
     return jnp.asarray(array, dtype=float)
 
 
-def called_as(name: str, value: Any, expected: str) -> Any:
-    """Returns `value` if it can be called and is no class, or raises ValueError."""
+def increasing(name: str, times: Array) -> None:
+    """Raises ValueError if there are no times, or if known ones do not increase."""
+    if times.size == 0:
+        raise ValueError(f"{name}: expected increasing times, at least one, got none.")
+    values = concrete(times)
+    if values is not None and not (np.diff(values) > 0).all():
+        raise ValueError(
+            f"{name}: expected increasing times, got {values.tolist()[:20]}."
+        )
+
+
+def place_of(item: Any, items: Sequence[Any]) -> int:
+    """Returns the index of the very object `item`; arrays need not compare equal."""
+    return [other is item for other in items].index(True)
+
+
+def function(name: str, value: Any, expected: str = "a callable") -> Any:
+    """Returns `value` if it is callable and no class, or raises ValueError."""
     if callable(value) and not isinstance(value, type):
         return value
     raise ValueError(f"{name}: expected {expected}, got {value!r}.")

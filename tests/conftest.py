@@ -8,7 +8,7 @@ import sweep_batch
 import fdof_jax as fj
 from fdof_jax.tuning.result import History
 
-# As an application sets JAX up: the laws hold for what users run.
+# JAX is set up as in an application, so the laws hold for what users run.
 fj.configure(x64=True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
@@ -20,11 +20,11 @@ SEARCHES = {
     "fdof_jax.tuning.optimal_motion.optimal_efforts",
     "fdof_jax.tuning.tune.tune_each",
 }
-# Scripts that need more than the tests do.
+# Scripts that need packages which the tests do not need.
 collect_ignore_glob = ["hard/make_*.py"]
 
 
-# Sweeps that several files look at.
+# Sweeps that several files test.
 
 
 @pytest.fixture(scope="session")
@@ -49,7 +49,7 @@ def swept(mixed):
 
 @pytest.fixture
 def tuned():
-    """A tuning result without a search: one of Fig 7's gains has gone to its bound."""
+    """Returns a tuning result made without a search; one of its gains is at a bound."""
     scene = fj.scenes.fig7()
     start = np.array([[1500.0, 20000.0, 800.0], [80.0, 50.0, 50.0]])
     gains = start + [[4500, 0, 0], [0, 0, 10]]
@@ -78,7 +78,7 @@ def tuned():
 
 
 def pytest_configure(config):
-    """Most of the tests' time is compilation: programs are kept beside pytest's own."""
+    """Keeps compiled programs beside pytest's cache; most test time is compilation."""
     if hasattr(config, "cache"):  # not with -p no:cacheprovider
         fj.configure(cache=config.cache.mkdir("programs"))
 
@@ -95,7 +95,7 @@ def pytest_report_header(config):
 
 
 def pytest_collection_modifyitems(items):
-    """The hard scenes are slow, as most compile programs of their own."""
+    """Marks the hard scenes slow, as most of them compile programs of their own."""
     for item in items:
         hard = item.path.parent == HARD and item.path.stem != "test_fuzz"
         if hard or item.name in SEARCHES:

@@ -26,7 +26,7 @@ HOOK, ELBOW, TIP = fj.Point(0, 0.3, -0.4), fj.Point(2, 0.5, 0.2), fj.Point(3, 0.
 
 
 class Swing(eqx.Module):
-    """A reference without jumps, which any step size controller takes."""
+    """A reference without jumps, which every step size controller accepts."""
 
     amplitude: jax.Array
 
@@ -48,7 +48,7 @@ class Hold(eqx.Module):
 MOVE = Swing(jax.device_put(np.array([0.3, 0.5, 0.2])))
 PD = fj.PDController([9.0, 7.0, 5.0], [3.0, 2.0, 1.0], [4.0, 2.0, 9.0], MOVE)
 
-# For laws of any solver: compiled sooner than the default, and differences are exact.
+# For laws of any solver: compiles faster than the default; differences are exact.
 SHORT = dict(
     solver=diffrax.Midpoint(),
     stepsize_controller=diffrax.ConstantStepSize(),

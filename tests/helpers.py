@@ -10,12 +10,12 @@ import numpy as np
 import fdof_jax as fj
 
 REFERENCE = json.loads((Path(__file__).parent / "reference.json").read_text())
-# The library refuses PPP, which the file holds for the equations only.
+# The library rejects PPP, which the file holds for the equations only.
 SCENES = {s["id"]: s for s in REFERENCE["scenes"] if s["topology"] != "PPP"}
 
 
 def programs():
-    """An environment in which another process takes and keeps the tests' programs."""
+    """Returns an environment in which a process shares the tests' compiled programs."""
     folder = jax.config.jax_compilation_cache_dir
     if folder is None:
         return {}
@@ -36,12 +36,12 @@ class ReferenceScene(NamedTuple):
 
 
 def real_part(scene, values):
-    """The entries of a (6,) joint quantity that belong to real joints, (3,)."""
+    """Returns the entries of a (6,) joint quantity that belong to real joints, (3,)."""
     return np.asarray(values)[np.asarray(scene["EF"]) == 1]
 
 
 def to_joint(scene, values):
-    """Joint coordinates (relative angles) of real joints, from absolute chain ones."""
+    """Returns the real joints' coordinates from chain coordinates (absolute angles)."""
     pairs = np.asarray(values, dtype=float).reshape(3, 2).copy()
     pairs[:, 1] = np.diff(pairs[:, 1], prepend=0)
     return real_part(scene, pairs.reshape(6))

@@ -1,4 +1,4 @@
-"""Saving, loading and damaging trees, and classes of a user's own to be saved."""
+"""Saves, loads and damages trees; defines user classes to be saved."""
 
 import dataclasses
 import json
@@ -20,7 +20,7 @@ SCENES = {"fig3": scenes.fig3(), "fig5": scenes.fig5(), "fig7": scenes.fig7()}
 
 
 def bits(leaf):
-    """Everything about a leaf that could have changed."""
+    """Returns everything about a leaf that could have changed."""
     if isinstance(leaf, float) and not isinstance(leaf, np.generic):
         return float, struct.pack("d", leaf)
     if not isinstance(leaf, jax.Array | np.ndarray | np.generic):
@@ -44,7 +44,7 @@ def saved_and_loaded(path, tree, classes=()):
 
 
 def describe(path, change):
-    """Change a file's description, `change` being given it, and leave it valid."""
+    """Changes a file's description by `change`, and leaves the file valid."""
     with zipfile.ZipFile(path) as archive:
         members = {name: archive.read(name) for name in archive.namelist()}
     description = json.loads(members["description.json"])
@@ -60,12 +60,12 @@ def archived(path, members):
 
 
 def refused(path, words, classes=()):
-    """The message names the file, and says what is wrong with it."""
+    """Checks that the error message names the file and the fault."""
     with pytest.raises(ValueError, match=rf"(?s)^{path}: expected .*{words}.*\.$"):
         fj.load(path, classes)
 
 
-# Classes of one's own
+# Classes of a user
 
 
 class Push(eqx.Module):

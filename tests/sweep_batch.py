@@ -1,4 +1,4 @@
-"""A batch of all topologies to sweep, and members of it that fail."""
+"""A batch of all topologies for sweeps, and members of it that fail."""
 
 import diffrax
 import equinox as eqx
@@ -13,8 +13,8 @@ from fdof_jax.simulation.looped_dopri8 import LoopedDopri8
 # Compilations dominate: nearly all tests share these shapes and settings.
 TS = np.linspace(0, 1.5, 7)
 CHUNK = 8  # also what the last few members are solved in
-# As exact as the default solver of batches, which is compiled in thrice the time and
-# is at work in test_one_compilation.py and test_step_control.py.
+# As exact as the default solver of batches, which takes three times as long to compile;
+# test_one_compilation.py and test_step_control.py use that one.
 SETTINGS = dict(
     solver=LoopedDopri8(),
     stepsize_controller=diffrax.PIDController(
@@ -25,7 +25,7 @@ SETTINGS = dict(
 
 
 class Push(eqx.Module):
-    """A smooth effort; `broken` joins it after 1 s."""
+    """A smooth effort; `broken` is added to it after 1 s."""
 
     tau: jax.Array
     broken: jax.Array
@@ -35,7 +35,7 @@ class Push(eqx.Module):
 
 
 def members():
-    """A batch of all topologies: linkages, starts and forces."""
+    """Returns a batch of all topologies: linkages, starts and forces."""
     rng = np.random.default_rng(5)
     linkages = [
         random_linkage(topology, rng) for _ in range(6) for topology in fj.TOPOLOGIES
@@ -67,7 +67,7 @@ FAILED = [NAN_START, NAN_LATER, SPENT]
 
 
 def with_failures(batch):
-    """A batch with members that fail, each in its own way, and a fast one."""
+    """Returns a batch with a fast member and members that fail in different ways."""
     linkage, (q, qd), (push,) = batch
     q, qd = q.copy(), qd.copy()
     q[NAN_START, 1] = np.nan

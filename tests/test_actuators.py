@@ -1,9 +1,10 @@
-"""Elements with inertia: an independent Lagrangian, energy, and inverse dynamics."""
+"""Elements with inertia: an independent Lagrangian, energy and inverse dynamics."""
 
 import jax
 import mujoco
 import numpy as np
 import pytest
+from elements import SHORT
 from helpers import random_linkage
 
 import fdof_jax as fj
@@ -22,7 +23,7 @@ def motion(topology, seed=0):
 
 
 def pins(linkage, q):
-    """The two pins as complex numbers, written out."""
+    """Returns the two pins as complex numbers, written out."""
     x, _ = fj.to_chain(linkage, q, np.zeros(3))
     x = np.asarray(x)
     turn = np.exp(1j * np.array([linkage.base_angle, *x[1::2]]))
@@ -31,14 +32,14 @@ def pins(linkage, q):
 
 
 def bodies(linkage, q):
-    """Mass centres and angle of cylinder and piston."""
+    """Returns the mass centres and the angle of cylinder and piston."""
     a, b = pins(linkage, q)
     unit = (b - a) / abs(b - a)
     return a + 0.2 * unit, b - 0.3 * unit, np.angle(unit)
 
 
 def lagrange(linkage, q, qd, qdd, h=1e-4):
-    """Generalised forces of the two bodies, by differences along the motion."""
+    """Returns both bodies' generalised forces, by differences along the motion."""
     jacobian = []
     for e in np.eye(3):
         ahead, behind = bodies(linkage, q + h * e), bodies(linkage, q - h * e)
@@ -101,7 +102,7 @@ def test_inverse_after_forward(topology, name):
 
 @pytest.mark.parametrize("topology", fj.TOPOLOGIES)
 def test_energy_and_work(topology):
-    """The energy changes at the power of the constant force between the pins."""
+    """Checks that the energy changes at the power of the force between the pins."""
     linkage, q, qd = motion(topology)
     forces = ACTUATOR, ARMATURE
     tau = sum(element(0.0, q, qd, linkage) for element in forces)
@@ -114,7 +115,7 @@ def test_energy_and_work(topology):
 
 
 def in_mujoco(linkage, q, qd):
-    """The actuator as two bodies of their own, the rod tied to its pin."""
+    """Returns the actuator as two MuJoCo bodies, with the rod tied to its pin."""
     text = fj.to_mjcf(linkage)
     third = text.index('<body name="link3"')
     text = f'{text[:third]}<site name="pin" pos="0.4 0.3 0"/>{text[third:]}'
@@ -154,7 +155,7 @@ def in_mujoco(linkage, q, qd):
 
 @pytest.mark.parametrize("topology", fj.TOPOLOGIES)
 def test_mujoco_with_a_soft_tie(topology):
-    """Which lets accelerations be off by 1e-4, and hardly the motion."""
+    """The tie changes accelerations by up to 1e-4, and the motion hardly at all."""
     linkage, q, qd = motion(topology)
     rest = np.zeros(3)
     model, data, arm = in_mujoco(linkage, q, rest)
@@ -174,7 +175,7 @@ def test_mujoco_with_a_soft_tie(topology):
 
 
 def test_the_conditioning_sees_the_armature():
-    """A light tip on a heavy arm gets well-conditioned by a heavy rotor."""
+    """Checks that a heavy rotor makes a light tip on a heavy arm well-conditioned."""
     linkage = fj.Linkage(
         "RRR", length=[0, 1, 1, 1], com=[[0.5, 0]] * 3, mass=[1, 1, 1e6],
         inertia=[1 / 12] * 3,
@@ -189,7 +190,7 @@ def test_a_scene_with_them_is_batched_like_any_other():
     linkage, q, qd = motion("RPR")
     many = fj.State(q + np.linspace(-0.1, 0.1, 5)[:, None], qd)
     ts, forces = [0, 0.2], (ACTUATOR, ARMATURE)
-    swept = fj.sweep(linkage, many, ts, forces)
+    swept = fj.sweep(linkage, many, ts, forces, **SHORT)
     for member, q0 in enumerate(many.q):
-        alone = fj.simulate(linkage, fj.State(q0, qd), ts, forces)
+        alone = fj.simulate(linkage, fj.State(q0, qd), ts, forces, **SHORT)
         np.testing.assert_allclose(swept.q[member], alone.q, atol=1e-9)

@@ -1,4 +1,4 @@
-"""Every malformed argument is refused at the door, by its name, in the user's words."""
+"""Every malformed argument raises an error that names it, before any computation."""
 
 import diffrax
 import equinox as eqx
@@ -39,7 +39,7 @@ def simulate(linkage=LINKAGE, state0=STATE, ts=TS, forces=(), **keywords):
 
 
 def refused(name, call, *arguments):
-    """The message names the argument, what was expected and what came."""
+    """Checks that the message states the argument, the expectation and the value."""
     with pytest.raises(ValueError, match=rf"(?s)^{name}: expected .+, got .+\.$"):
         call(*arguments)
 

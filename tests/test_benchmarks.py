@@ -1,4 +1,4 @@
-"""The benchmark suite: how it reads times off, what counts as failed, and one run."""
+"""The benchmark suite: reading times off, recognising failures, and one run."""
 
 import json
 import os

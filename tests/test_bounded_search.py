@@ -1,4 +1,4 @@
-"""Minimisation in a box: against SciPy, whatever the function."""
+"""Minimisation within bounds, compared with SciPy on several functions."""
 
 import jax
 import numpy as np
@@ -30,7 +30,7 @@ def test_box_minimum_is_that_of_scipy():
 
 @pytest.mark.parametrize("method", methods.METHODS)
 def test_minimise_finds_what_scipy_finds_within_bounds(method):
-    """Rosenbrock's function and an exponential fit, in boxes that cut them off."""
+    """Minimises Rosenbrock's function and an exponential fit in boxes that cut them."""
     t = np.linspace(0, 1, 12)
     data = 2 * np.exp(-1.5 * t) + 0.05 * np.cos(40 * t)
     problems = [

@@ -1,4 +1,4 @@
-"""The commands run as a user would call them, and write what they say."""
+"""The commands run as a user calls them; their output and pictures are checked."""
 
 import json
 import os
@@ -66,7 +66,7 @@ def test_topologies_start_alike():
 
 
 def kept_gains(printed):
-    """Tuned kp and kd of a printed table."""
+    """Returns the tuned kp and kd from a printed table."""
     lines = [
         line.split() for line in printed.splitlines() if line[:4] in ("kp o", "kd o")
     ]
@@ -92,16 +92,16 @@ def test_tuning_goes_on_where_it_was_saved(tmp_path, capsys):
     earlier, again = kept["results"]
     assert again.loss < earlier.loss
     np.testing.assert_array_equal(earlier.gains, saved["results"][0].gains)
-    # The same members and bounds, from where the first run has come to.
+    # The members and bounds are the same; the start is the first run's end.
     assert again.history.loss[0] == pytest.approx(earlier.loss, rel=1e-9)
     np.testing.assert_array_equal(again.upper, earlier.upper)
-    # And the same search, but for the random starts.
+    # The search is the same, except for the random starts.
     assert kept["search"] == saved["search"] | {"seed": 1}
     before, after = kept_gains(first), kept_gains(second)
     assert [row[1] for row in before] == [row[0] for row in after]
 
 
-# What is answered without JAX: the arguments, the exit status and part of the message.
+# Calls that need no JAX: the arguments, the exit status and part of the message.
 AT_ONCE = [
     ("--version", 0, fj.__version__),
     ("--help", 0, "--output"),
@@ -157,7 +157,7 @@ print(json.dumps({asked: answer(asked) for asked in json.loads(sys.argv[1])}))
 
 @pytest.fixture(scope="module")
 def answers(tmp_path_factory):
-    """All answers of one process: what one of them imports, the next ones show too."""
+    """Returns the answers of one process; an import by one shows in all later ones."""
     folder = tmp_path_factory.mktemp("command_line")
     (folder / "file").write_text("not a folder")
     (folder / "sealed").mkdir(mode=0o555)

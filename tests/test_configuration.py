@@ -1,4 +1,4 @@
-"""What `configure` sets, refuses and warns of."""
+"""The settings, errors and warnings of `configure`."""
 
 import json
 import os
@@ -16,7 +16,7 @@ from fdof_jax.xla import configuration
 
 NEEDS_OPTION = version.__version_info__ < (0, 12)
 
-# Imports whatever a user may import before, computes, then configures again: too late.
+# Imports what a user may import first, computes, then configures again, too late.
 APPLICATION = """
 import collections, json, os, sys, warnings
 import jax

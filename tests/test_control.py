@@ -1,4 +1,4 @@
-"""The saturated PD law and the circle's joint reference, continuous over many turns."""
+"""The saturated PD law, and the circle's joint reference over many turns."""
 
 from functools import partial
 
@@ -26,7 +26,7 @@ def arm(topology, **changes):
 
 
 def circle_of(linkage, **changes):
-    """A circle around the tip of a bent posture, within every topology's reach."""
+    """Returns a circle around a bent posture's tip, reachable for its topology."""
     q = [0.8, 1.5, 0.4]
     x, _ = fj.to_chain(linkage, q, [0, 0, 0])
     task = dict(
@@ -158,7 +158,7 @@ def test_the_reference_starts_where_inverse_kinematics_says(topology, branch):
 
 
 def wrist_arm(topology):
-    """An arm of long reach both ways; the RPR one has its slide through the base."""
+    """Returns an arm of long reach; the RPR one has its slide through the base."""
     length = [0, 2, 2.5, 0.4] if topology == "RRR" else [0, 0.1, 0.1, 0.4]
     return arm(topology, length=length, locked=0, base_angle=0)
 
@@ -226,7 +226,7 @@ def test_a_start_one_turn_away_unwinds():
 
 @jax.jit
 def reference_derivatives(task, linkage):
-    """In the circle and in the linkage, and the tip Jacobian."""
+    """Returns derivatives in the circle and the linkage, and the tip Jacobian."""
 
     def positions(task, linkage):
         return task(0.7, linkage)[0]

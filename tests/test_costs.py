@@ -1,4 +1,4 @@
-"""What a scene does not use costs nothing: lowered operation counts are exact."""
+"""Unused features cost nothing: lowered operation counts are exact."""
 
 import functools
 import re
@@ -64,7 +64,7 @@ def test_a_scene_without_elements_costs_the_bare_equations():
     ids=["damper", "effort", "history", "PD circle"],
 )
 def test_an_element_adds_its_own_cost_and_three_additions(element):
-    """At most: what it does not read, the positions for instance, is not computed."""
+    """At most three additions: inputs that an element does not read cost nothing."""
     own = element_flops(element)
     assert own <= field_flops(element) - field_flops() <= own + 3
     damper = fj.JointDamper(1.0)
@@ -73,7 +73,7 @@ def test_an_element_adds_its_own_cost_and_three_additions(element):
 
 
 def test_a_model_costs_only_the_controllers_that_have_one():
-    """Of PD control: two errors, their gains and sum, and the limit, at each joint."""
+    """PD control costs two errors, two gains, a sum and the limit at each joint."""
     gains = 9.0, 3.0, 10.0, Hold(jnp.ones(3))
     plain, held, computed = (
         element_flops(kind(*gains))
@@ -83,13 +83,13 @@ def test_a_model_costs_only_the_controllers_that_have_one():
 
 
 def test_the_equations_cost_little_and_call_no_transcendental_function():
-    """On CPU sine and cosine are polynomials; a matrix factorisation would show."""
+    """On CPU sine and cosine are polynomials; a matrix factorisation would be seen."""
     assert 0 < field_flops() <= 595
     assert transcendentals(field, *field_arguments(())) == 0
 
 
 def stacked_in_loops(forces):
-    """Whether the loops of a solve stack arrays or concatenate them."""
+    """Returns whether the loops of a solve stack or concatenate arrays."""
     linkage = scenes.fig5().linkage
 
     def motion(q):
@@ -113,14 +113,14 @@ def stacked_in_loops(forces):
 def test_the_dynamics_outputs_are_not_stacked():
     """XLA on CPU would compute the equations once per entry of a stacked output.
 
-    A function of arrays has to be given such.
+    A plain function of arrays needs stacked inputs.
     """
     assert not stacked_in_loops((fj.JointDamper(1.0),))
     assert stacked_in_loops((lambda t, q, qd, linkage: -qd,))
 
 
 def solve_of(ts):
-    """The compiled batch solve of Fig 5, and its text."""
+    """Returns the compiled batch solve of Fig 5, and its text."""
     linkage = scenes.fig5().linkage
 
     def motion(q):
@@ -136,9 +136,10 @@ def compiled_solve():
 
 
 def test_each_stage_is_one_loop(compiled_solve):
-    """None of the rates is computed more than once, nor is the end of a step.
+    """Checks that no rate, and no end of a step, is computed more than once.
 
-    Six rates at twelve stages, and their conditioning where steps begin and end.
+    There are six rates at twelve stages, and their conditioning where steps begin
+    and end.
     """
 
     def loops(results):
@@ -148,12 +149,12 @@ def test_each_stage_is_one_loop(compiled_solve):
 
     assert (loops(6), loops(7)) == (12, 2)
     assert loops(18) == 1  # state, error and rounding at the end of a step
-    # The polynomial's leading coefficient: another evaluation would repeat it.
+    # A second evaluation would repeat the polynomial's leading coefficient.
     assert compiled_solve.count("1.5918129027234826e-10") <= 3 * 14 + 4
 
 
 def test_saving_does_not_copy_what_has_been_saved(compiled_solve):
-    """(member, time) buffers are written in place."""
+    """Checks that (member, time) buffers are written in place."""
     loops, entry = compiled_solve.split("\nENTRY")
     copy = r"= f64\[16,12\]\S* copy\("
     assert re.search(copy, entry)  # each of six starts as a copy of one buffer

@@ -1,4 +1,4 @@
-"""What a notebook or a prompt shows of an object: few words, no traced values."""
+"""Objects display in few words in a notebook or at a prompt, without traced values."""
 
 import xml.etree.ElementTree as xml
 
@@ -13,7 +13,7 @@ import fdof_jax as fj
 
 
 def cells(html: str) -> list[list[str | None]]:
-    """Of the tables in it."""
+    """Returns the cells of the tables in a page."""
     return [[cell.text for cell in row] for row in xml.fromstring(html).iter("tr")]
 
 
@@ -50,7 +50,7 @@ def test_displays_read_no_traced_values():
     assert "ef=f64[6]" in seen[1]
     assert cells(seen[2]) == [["motions", "4"], ["times", "5"]]
     assert repr(jax.eval_shape(solution)) == "Solution(motions: 1; times: 5)"
-    # What has only the structure of a solution, axes for instance.
+    # Objects with only the structure of a solution, for instance axes.
     axes = jax.tree.map(lambda _: 0, solution())
     assert "q=0" in repr(axes) and axes._repr_html_() is None
 

@@ -66,7 +66,7 @@ def test_the_front_door_is_complete():
     assert not [name for name in names if not hasattr(fj, name)]
 
 
-# Every name that a user may import: with its module, where that is not `fdof_jax`.
+# Every name that a user may import, with its module unless that is `fdof_jax`.
 NAMES = [
     *(name for name in fj.__all__ if not inspect.ismodule(getattr(fj, name))),
     *(f"scenes.{name}" for name in ("fig3", "fig5", "fig7")),
@@ -76,14 +76,14 @@ NAMES = [
         for module in (drawing, plotting)
         for name, value in inspect.getmembers(module, inspect.isfunction)
         if value.__module__.startswith("fdof_jax.pictures")
-        # Pictures draw into what they are given, or into something new.
+        # Pictures draw into the axes or figure given, or into new ones.
         and {"ax", "fig"} & {
             p.name for p in inspect.signature(value).parameters.values()
             if p.default is None
         }
     ),
 ]  # fmt: skip
-# What the users of these functions do not make themselves.
+# Classes of results: the function that returns each.
 RETURNED_BY = {
     "FitResult": "fit",
     "GradientReport": "gradient_report",
@@ -99,7 +99,7 @@ RETURNED_BY = {
 
 
 def examples():
-    """All code that tests run as examples: doctests, and the blocks of the guides."""
+    """Returns all code that tests run as examples: doctests and blocks of guides."""
     sources = (ROOT / "fdof_jax").rglob("*.py")
     lines = [
         re.findall(r"^ *(?:>>>|\.\.\.) (.*)", p.read_text(), re.M) for p in sources

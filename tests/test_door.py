@@ -1,4 +1,4 @@
-"""What happens before a motion is computed: checks that compile nothing."""
+"""The checks before a motion is computed, which compile nothing."""
 
 import json
 import subprocess
@@ -24,7 +24,7 @@ TS = np.linspace(0, 3, 61)
 
 
 def references():
-    """All of the library's references: every path with every timing, and the others."""
+    """Returns the library's references: every path with every timing, and the rest."""
     paths = {
         "line": fj.Line([1.2, -0.4], [0.9, 0.8]),
         "ellipse": fj.Ellipse([1.1, 0.4], [0.4, 0.2], tilt=0.3),
@@ -48,7 +48,7 @@ def references():
 
 
 class Parabola(fj.Path):
-    """A user's own path, which NumPy may not be able to evaluate."""
+    """A user's own path, which NumPy may be unable to evaluate."""
 
     middle = np.array([1.2, 0.4])
 
@@ -88,7 +88,7 @@ _reachable = jax.jit(fj.reachable)
 
 
 def test_a_circle_that_touches_the_edge_of_the_reach_is_refused():
-    """There velocities are infinite."""
+    """The joint velocities are infinite at the edge."""
     arm = fj.Linkage("RRR", **ARM | {"length": [0, 1, 1, 0.25]})
     task = fj.CircleTask([1.25, 0], 1.0, 2.0, 0.0, 0.0)
     with pytest.raises(ValueError, match="reference: expected a circle within"):
@@ -100,7 +100,7 @@ def test_a_circle_that_touches_the_edge_of_the_reach_is_refused():
 
 
 def compiled_programs():
-    """How many the door takes: of the library's elements, and of a user's path."""
+    """Returns two counts of compiled programs: the library's and a user's path's."""
     count = [0]
 
     def listen(event, duration, **details):
@@ -135,7 +135,7 @@ def compiled_programs():
 
 
 def test_the_door_compiles_nothing_but_a_user_s_path():
-    """In a process of its own: in this one the programs may be compiled already."""
+    """Runs in a new process, as this one may have compiled the programs already."""
     script = (
         "import jax, json; jax.config.update('jax_enable_x64', True); import test_door;"
         "print(json.dumps(test_door.compiled_programs()))"
@@ -148,5 +148,5 @@ def test_the_door_compiles_nothing_but_a_user_s_path():
         check=True,
     )
     library, own = json.loads(done.stdout)
-    # Some versions of JAX compile a program that takes NumPy's arguments in.
+    # Some versions of JAX compile a program that converts NumPy's arguments.
     assert library == 0 and own <= 2

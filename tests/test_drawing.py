@@ -1,4 +1,4 @@
-"""Pictures show the linkage where it is, not pixels; helpers for tests of figures."""
+"""Pictures show the linkage in its place; pixels are not compared."""
 
 import subprocess
 from typing import Any
@@ -29,7 +29,7 @@ matplotlib.use("Agg")
 
 @pytest.fixture(autouse=True)
 def tidy():
-    """No figure outlives its test, and no function changes global settings."""
+    """Checks that every figure is closed and that global settings are unchanged."""
     before = dict(matplotlib.rcParams)
     yield
     plt.close("all")
@@ -49,7 +49,7 @@ def make_linkage(topology):
 
 
 def made_up(ts, q, qd=None) -> Solution:
-    """A solution without a solve: a figure takes only times and joint states."""
+    """Returns a solution without a solve; figures use only times and joint states."""
     q = jnp.asarray(q, dtype=float)
     qd = jnp.zeros_like(q) if qd is None else jnp.asarray(qd, dtype=float)
     return Solution(jnp.asarray(ts, dtype=float), q, qd, {}, None)  # type: ignore[arg-type]
@@ -224,7 +224,7 @@ def test_grid_of_animations_moves_together():
 
 
 def test_a_notebook_plays_an_animation_once():
-    """And does not show its figure again, as it does with all that are open."""
+    """Checks that the notebook does not also show the animation's still figure."""
     animation = drawing.animate(make_linkage("RRR"), swinging(), max_frames=2)
     html = animation._repr_html_()  # type: ignore[attr-defined]
     assert html.count("data:image/png") == 2 and "<script" in html

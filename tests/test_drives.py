@@ -1,4 +1,4 @@
-"""Servo drives: closed forms, limits, and the states they integrate."""
+"""Servo drives: closed forms, limits, and the states that they integrate."""
 
 import equinox as eqx
 import jax
@@ -11,12 +11,12 @@ from scipy.linalg import expm
 import fdof_jax as fj
 from fdof_jax.simulation.looped_dopri8 import LoopedDopri8
 
-# Joints that feel nothing of each other: slides at right angles carry point masses.
+# The joints do not affect each other: slides at right angles carry point masses.
 STILL = fj.State(np.zeros(3), np.zeros(3))
 
 
 def single(inertia=2.0):
-    """An arm whose last joint turns a balanced wheel: I qdd = tau, gravity or not."""
+    """Returns an arm whose last joint turns a balanced wheel: I qdd = tau."""
     return fj.Linkage(
         "RRR", length=[0, 1, 1, 0], com=[[0, 0]] * 3, mass=[1, 1, 1],
         inertia=[1e6, 1e6, inertia], gravity=0.0,
@@ -33,7 +33,7 @@ def test_a_lag_is_an_exponential():
     solution = fj.simulate(single(), STILL, ts, (lag,))
     effort = solution.own[0].own
     np.testing.assert_allclose(effort[:, 2], 3 * (1 - np.exp(-ts / 0.2)), atol=1e-9)
-    # tau = 3 (1 - e^(-t/T)) on an inertia of 2 that the rest of the arm hardly feels.
+    # tau = 3 (1 - e^(-t/T)) on an inertia of 2, hardly affected by the rest of the arm.
     rate = 1.5 * (ts - 0.2 * (1 - np.exp(-ts / 0.2)))
     np.testing.assert_allclose(solution.qd[:, 2], rate, rtol=3e-6, atol=1e-9)
     found = fj.joint_efforts(single(), (lag,), solution)
@@ -68,7 +68,7 @@ def test_a_motor_s_limits():
 
 
 def test_currents_stay_within_their_limit():
-    """Whatever the winding, also when the command turns round: i' = (limit - i) R/L."""
+    """Covers many windings and a reversed command; i' = (limit - i) R/L."""
     turning = lambda t, q, qd, linkage: only_last(jnp.where(t < 0.1, 100.0, -100.0))
     ts = np.linspace(0, 0.2, 41)
 
@@ -124,10 +124,10 @@ def test_an_integral_removes_the_sag():
 
 
 def test_anti_windup_keeps_the_overshoot_small():
-    """A step that saturates for long: a plain integral would wind up."""
+    """The step saturates for so long that a plain integral would wind up."""
 
     class WindsUp(fj.StatefulElement):
-        """The same without anti-windup."""
+        """The PID controller without anti-windup."""
 
         pid: fj.PIDController
 
@@ -147,7 +147,7 @@ def test_anti_windup_keeps_the_overshoot_small():
 
 
 def test_without_an_integral_it_is_the_pd_controller():
-    """At its limits, too; and an integral of zero stays zero."""
+    """Also holds at the limits; an integral of zero stays zero."""
     hold = Hold(only_last(1.0))
     pd = fj.PDController(8.0, 6.0, 1.0, hold)
     pid = fj.PIDController(8.0, 0.0, 6.0, 1.0, hold)
@@ -160,7 +160,7 @@ def test_without_an_integral_it_is_the_pd_controller():
 
 
 def test_drives_in_a_row():
-    """A PID controller's torque through a lag and a speed limit, with all states."""
+    """A PID controller's torque passes a lag and a speed limit, all with states."""
     pid = fj.PIDController(8.0, 2.0, 6.0, 10.0, Hold(only_last(1.0)))
     drive = fj.SpeedLimit(fj.FirstOrderLag(pid, 0.05), stall=5.0, no_load=3.0)
     solution = fj.simulate(single(), STILL, np.linspace(0, 20, 21), (drive,))
@@ -205,7 +205,7 @@ def test_states_of_elements_are_swept():
 
 
 class Wrong(fj.StatefulElement):
-    """Whose rate is not like its state."""
+    """An element whose rate has another shape than its state."""
 
     def initial_state(self, linkage):
         return jnp.zeros(3)

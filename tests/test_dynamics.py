@@ -23,13 +23,13 @@ def draw(case):
 
 
 def joint_mass_matrix(linkage, q):
-    """The reduced mass matrix, as inverse dynamics has it."""
+    """Returns the reduced mass matrix, column by column from inverse dynamics."""
     at_rest = jnp.zeros(3)
     return jax.jacfwd(lambda a: fj.inverse_dynamics(linkage, q, at_rest, a))(at_rest)
 
 
 def scatter(linkage, values):
-    """Joint quantities at the real joints of the chain, 0 at the fictitious ones."""
+    """Returns joint quantities at the chain's real joints, 0 at fictitious ones."""
     return np.asarray(linkage.ef) * np.repeat(values, 2)
 
 
@@ -105,7 +105,7 @@ def test_power_balance(case):
 @given(cases)
 @identities
 def test_constraint_forces_close_the_balance_of_the_chain(case):
-    """(15): with them, the unmasked equations give the same accelerations."""
+    """With constraint forces, (15) gives the same accelerations without masks."""
     linkage, q, qd, tau, rng = draw(case)
     x, xd = fj.to_chain(linkage, q, qd)
     force = rng.normal(size=6)

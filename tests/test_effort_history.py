@@ -1,4 +1,4 @@
-"""Efforts given at times: interpolated, and held beyond them."""
+"""Efforts given at times: interpolated between them, constant before and after."""
 
 import equinox as eqx
 import jax
@@ -23,7 +23,7 @@ def test_efforts_are_linear_between_the_times_and_held_beyond():
 
 
 def momentum(linkage, q, qd):
-    """Of the slide on the ground, which an effort in it changes if gravity does not."""
+    """Returns the momentum of the slide on the ground, which only efforts change."""
     zero = np.zeros(3)
     return fj.inverse_dynamics(linkage, q, zero, qd)[0]
 
@@ -34,7 +34,7 @@ def test_the_momentum_gained_is_the_integral_of_the_efforts():
     forces = (fj.EffortHistory(TS, TAU),)
     solution = fj.simulate(linkage, START, [0, 0.7], forces)
     end = momentum(linkage, solution.q[-1], solution.qd[-1])
-    # Trapezia, and what is held before and after.
+    # Trapezia, and the constant efforts before and after.
     weights = np.array([0.1 + 0.075, 0.1, 0.025 + 0.16, 0.16 + 0.08])
     gained = end - momentum(linkage, *START)
     np.testing.assert_allclose(gained, weights @ TAU[:, 0], atol=1e-8)

@@ -1,4 +1,4 @@
-"""What all force elements of the library have in common: gradients, batches, costs."""
+"""Properties of all force elements: gradients, batches and costs."""
 
 import diffrax
 import elements
@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from modes import ADJOINT
 from test_costs import flops
 
 import fdof_jax as fj
@@ -24,23 +25,23 @@ ARM = elements.arm("RPR")
 
 
 def is_number(path, leaf):
-    """Whether it is an array of parameters, which existence factors are not."""
+    """Returns whether a leaf is an array of parameters; existence factors are not."""
     return eqx.is_inexact_array(leaf) and path[-1] != jax.tree_util.GetAttrKey("ef")
 
 
-# What further limits hide.
+# Parameters that other limits hide.
 IDLE = {"DCMotor.command.limit"}
 
 
 def scaled(forces, factors):
-    """Every number multiplied by a factor of its array's, or moved if it is zero."""
+    """Multiplies every number by its array's factor, or shifts it if it is zero."""
     leaves, structure = jax.tree_util.tree_flatten_with_path(forces)
     factors = iter(factors)
     moved = []
     for path, leaf in leaves:
         if is_number(path, leaf):
             factor = next(factors)
-            # Infinity, of no end, stays: its derivative times 0 is not a number.
+            # Infinity stays: its derivative times 0 is not a number.
             finite = jnp.isfinite(leaf)
             number = jnp.where(finite, leaf, 1)
             changed = jnp.where(number == 0, factor - 1, number * factor)
@@ -59,7 +60,7 @@ def names(forces):
 
 
 def end(linkage, forces, adjoint=diffrax.ForwardMode()):
-    """Of a short motion in fixed steps, which makes differences exact."""
+    """Returns the end of a short motion; its fixed steps make differences exact."""
     return fj.simulate(
         linkage,
         elements.START,
@@ -77,7 +78,7 @@ def state_of(solution):
 
 
 def all_acts(linkage, forces, t, q, qd, grown):
-    """All that elements do at a moment, in states that have grown, and their first."""
+    """Returns the elements' actions at a moment, in grown states, and first states."""
     args = Args(linkage, q, None, forces)
     own = jnp.stack(*initial_own(args))
     y = zeros(q), tuple(qd), tuple(own + grown * jnp.cos(jnp.arange(own.size)))
@@ -87,7 +88,7 @@ def all_acts(linkage, forces, t, q, qd, grown):
 
 
 def slopes_and_differences(both, ones):
-    """By columns, of a program for a value and its derivative in a direction."""
+    """Returns derivatives and differences by columns, from one compiled program."""
     h, still = 1e-5, jnp.zeros_like(ones)
     slopes, differences = [], []
     for e in np.eye(len(ones)):
@@ -98,7 +99,7 @@ def slopes_and_differences(both, ones):
 
 
 def check_slopes(forces, slopes, differences):
-    """All parameters are at work but those that a limit puts out of it."""
+    """Checks the slopes; all parameters act except those that a limit disables."""
     size = np.abs(differences).max(axis=0)
     idle = {n for n, s in zip(names(forces), size) if s < 1e-6}
     assert idle <= IDLE, idle - IDLE
@@ -130,7 +131,7 @@ def test_slopes_in_all_parameters_equal_differences():
 
 
 def test_gradients_of_a_motion_equal_differences():
-    """In forward mode, of states and masses, which motions carry along."""
+    """Forward mode, with the states and masses that motions carry along."""
     chosen = ("motor with PID", "actuator")
     forces = tuple(elements.ALL[name] for name in chosen)
     motion = lambda p: state_of(end(ARM, scaled(forces, p)))
@@ -139,22 +140,24 @@ def test_gradients_of_a_motion_equal_differences():
     check_slopes(forces, *slopes_and_differences(both, ones))
 
 
+# Programs of seven elements are compiled in half the time of one with all.
 @pytest.mark.slow
-def test_reverse_mode_at_an_instant_equals_differences():
+@pytest.mark.parametrize("kinds", np.array_split(list(elements.ALL), 3), ids=" ".join)
+def test_reverse_mode_at_an_instant_equals_differences(kinds):
     """In all parameters, positions, velocities and own states, of what is integrated.
 
-    A motion's reverse mode is made of these: see the next test.
+    The reverse mode of a motion consists of these derivatives: see the next test.
     """
-    forces = tuple(elements.ALL.values())
-    (own0,) = initial_own(arguments(forces))
+    forces = tuple(elements.ALL[kind] for kind in kinds)
     labels = names(forces)
-    ends = np.cumsum([len(labels), 3, 3, len(own0)])
+    sizes = [len(own) for own in initial_own(arguments(forces))]
+    ends = np.cumsum([len(labels), 3, 3, *sizes])
 
     @jax.jit
     def found(t, x):
-        factors, delta, qd, own = jnp.split(x, ends[:-1])
+        factors, *parts = jnp.split(x, ends[:-1])
         args = arguments(scaled(forces, factors))
-        y = tuple(delta), tuple(qd), tuple(own)
+        y = tuple(tuple(part) for part in parts)
         return jnp.stack(jax.tree.leaves((field(t, y, args), initial_own(args))))
 
     slope = jax.jit(jax.grad(lambda x, t, weights: weights @ found(t, x)))
@@ -173,20 +176,19 @@ def test_reverse_mode_at_an_instant_equals_differences():
         wrong = np.flatnonzero(~(error <= 1e-6 * largest + 1e-7))
         assert not wrong.size, [(*labels, *ends)[min(i, len(labels))] for i in wrong]
         size = np.maximum(size, largest)
-    # All are at work but those that a limit puts out of it.
+    # All parameters act except those that a limit disables.
     idle = {n for n, s in zip(labels, size) if s < 1e-6}
     assert idle <= IDLE, idle - IDLE
 
 
 @pytest.mark.slow
 def test_reverse_mode_of_a_motion_equals_differences():
-    """One element in scalars, one in arrays, one with a state and one with inertia."""
+    """Covers elements in scalars, in arrays, with a state and with inertia."""
     kinds = ("PD", "spring", "lag", "armature")
     forces = tuple(elements.ALL[kind] for kind in kinds)
     ones, h = jnp.ones(len(names(forces))), 1e-5
     weights = jnp.array([1.0, -2.0, 3.0, 0.5, -0.7, 0.3])
-    adjoint = diffrax.RecursiveCheckpointAdjoint()
-    motion = lambda p: weights @ state_of(end(ARM, scaled(forces, p), adjoint))
+    motion = lambda p: weights @ state_of(end(ARM, scaled(forces, p), ADJOINT))
     both = jax.jit(jax.value_and_grad(motion))
     value = lambda p: float(both(p)[0])
     _, slope = both(ones)
@@ -201,10 +203,10 @@ def test_reverse_mode_of_a_motion_equals_differences():
 
 
 def test_one_program_for_all_topologies():
-    """What elements do in a batch of all arms is what they do on each alone.
+    """Checks that elements act in a batch of all arms as on each arm alone.
 
-    Motions in a batch, states of elements included: test_one_compilation.py and
-    test_drives.py.
+    For motions in a batch, also with states of elements, see
+    test_one_compilation.py and test_drives.py.
     """
     place = list(elements.ALL).index("computed torque")
     arms = [elements.arm(topology) for topology in fj.TOPOLOGIES]
@@ -212,7 +214,7 @@ def test_one_program_for_all_topologies():
 
     def acting(linkage):
         traces.append(1)
-        # A model of another topology would be refused.
+        # A model of another topology would be rejected.
         forces = tuple(elements.ALL.values())
         forces = eqx.tree_at(lambda f: f[place].model, forces, linkage)
         return all_acts(linkage, forces, jnp.array(0.1), *elements.START, 0.1)
@@ -222,7 +224,7 @@ def test_one_program_for_all_topologies():
     alone = [single(linkage) for linkage in arms]
     np.testing.assert_allclose(together, alone, rtol=1e-9, atol=1e-9)
     assert len(traces) == 2
-    # Arms of other topologies feel other efforts.
+    # Efforts differ between topologies.
     assert len({row.tobytes() for row in np.asarray(alone).round(6)}) == len(arms)
 
 
@@ -291,7 +293,7 @@ def test_an_element_with_state_costs_its_own(name):
 
 @pytest.mark.parametrize("name", elements.WITH_INERTIA)
 def test_an_element_with_inertia_costs_its_own(name):
-    """Six sums of the mass matrix's entries besides."""
+    """Adding to the entries of the mass matrix costs six sums more."""
     element = elements.WITH_INERTIA[name]
     own = flops(lambda e, *a: e(*a), element, jnp.array(0.1), *elements.START, ARM)
     own += flops(

@@ -1,4 +1,4 @@
-"""Saved trees come back as they were."""
+"""Saved trees are loaded unchanged."""
 
 import dataclasses
 import os
@@ -46,7 +46,7 @@ def path(tmp_path):
     return tmp_path / "tree.fdof"
 
 
-# What comes back
+# Trees that are saved and loaded
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -78,7 +78,7 @@ def test_references_with_static_fields(name, path):
 
 @pytest.fixture(scope="module")
 def solved():
-    """A call of `simulate`, and what it has returned."""
+    """Returns a call of `simulate` and its solution."""
     scene = scenes.fig7()
     ts, forces = np.linspace(0, 0.1, 13), (elements.WITH_STATE["PID"],)
     call = scene.linkage, scene.state0, ts, forces
@@ -90,7 +90,7 @@ def test_a_solution(path, solved):
     assert loaded.outcome == "successful"
     assert loaded.result == diffrax.RESULTS.successful
     assert loaded.own[0].shape == (13, 3)
-    # The states of the elements, to go on from
+    # The elements' states, from which a motion can continue
     saved_and_loaded(path, {"own0": (loaded.own[0][-1],)})
 
 
@@ -112,7 +112,7 @@ def test_a_tuned_scene(path):
 
 
 def test_all_fields_of_a_tuned_scene(path):
-    """Stand-ins for what the slow test has computed."""
+    """Uses stand-ins for the results that the slow test computes."""
     tuned = object.__new__(fj.TuneResult)
     for field in dataclasses.fields(tuned):
         object.__setattr__(tuned, field.name, {field.name: np.ones(2)})
@@ -141,7 +141,7 @@ def test_a_loaded_scene_simulates_the_same_without_a_compilation(
 
 
 def test_a_loaded_solution_compiles_nothing(path, solved):
-    """Its counts of steps are of a weak type, which matters to JAX."""
+    """Step counts have a weak type; JAX compiles anew if that type changes."""
     calls = []
     steps = jax.jit(lambda s: (calls.append(1), s.stats["num_steps"])[1])
     steps(solved[1])
@@ -264,7 +264,7 @@ assert type(run).__module__ == "fdof_jax.tuning.result"
 
 
 def test_another_process_reads_it(path, tmp_path):
-    """And imports modules of the library's that are not there yet."""
+    """The other process imports the library's modules while it reads."""
     from fdof_jax.tuning.result import History
 
     run = History(*range(len(dataclasses.fields(History))))
@@ -293,13 +293,13 @@ OF_0_1 = Path(__file__).parent / "saved_by_0.1.fdof"
 
 
 def equal(a, b):
-    """All but what JAX calls weak types, which another constructor may choose."""
+    """Checks equality apart from JAX's weak types, which constructors may change."""
     assert jax.tree.structure(a) == jax.tree.structure(b)
     jax.tree.map(np.testing.assert_array_equal, a, b)
 
 
 def test_a_file_of_version_0_1():
-    """It names the module of each class: later versions have them elsewhere."""
+    """Such a file names the module of each class; later versions have moved classes."""
     tree = fj.load(OF_0_1, OWN)
     equal(tree["scenes"], SCENES)
     equal(tree["elements"], elements.ALL)
@@ -317,7 +317,7 @@ def test_what_the_command_line_saves(path):
 
 
 def test_files_name_no_module(path):
-    """Classes may move from one to another, and files stay readable."""
+    """Checks that classes can change module while files stay readable."""
     fj.save(path, fj.load(OF_0_1, OWN))
     with zipfile.ZipFile(path) as archive:
         text = archive.read("description.json").decode()

@@ -1,4 +1,4 @@
-"""What is no tree of the library's is not saved, what is not whole is not loaded."""
+"""Unknown objects are not saved, and damaged files are not loaded."""
 
 import contextlib
 import json
@@ -38,7 +38,7 @@ def path(tmp_path):
     return tmp_path / "tree.fdof"
 
 
-# What cannot be saved
+# Objects that cannot be saved
 
 
 def cyclic():
@@ -132,7 +132,7 @@ def test_a_file_is_replaced(path):
     assert os.listdir(path.parent) == [path.name]
 
 
-# What cannot be read
+# Files that cannot be read
 
 
 @pytest.mark.parametrize("value", [None, 3, ["a"], b"a"])
@@ -261,7 +261,7 @@ def test_unknown_classes(path):
     refused(path, "saved_trees:Push.*classes=", (Pair,))
     fj.save(path, Colour.red)
     refused(path, "saved_trees:Colour.*classes=")
-    # A class that is no record, nor an enumeration
+    # A class that is neither a record nor an enumeration
     describe(path, lambda d: d["tree"].update({"class": "fdof_jax.scenes:Scene"}))
     refused(path, "enumeration, got fdof_jax.scenes:Scene")
     fj.save(path, Nothing())
@@ -300,7 +300,7 @@ def test_a_class_with_other_fields(path):
     fj.save(path, [old(1, 2)])
     refused(path, r"Element .*'reference'.* got \['gain', 'limit'\]", (new,))
     refused(path, r"\['gain'\].* got \['gain', 'limit'\]", (version("gain"),))
-    # Their order means nothing.
+    # Their order has no meaning.
     turned = fj.load(path, (version("limit", "gain"),))[0]
     assert (turned.gain, turned.limit) == (1, 2)
 
@@ -353,7 +353,7 @@ def whole(path):
 
 
 def unharmed(path, tree):
-    """Whether the file is read; if not, it is refused in the way that it should be."""
+    """Returns whether a file can be read; checks the error if it cannot."""
     try:
         loaded = fj.load(path, OWN)
     except ValueError as error:
@@ -381,5 +381,5 @@ def test_a_byte_flipped_anywhere(flip, whole, path):
         flipped[place] ^= flip
         path.write_bytes(flipped)
         read += unharmed(path, tree)
-    # Few bytes mean nothing: dates, for instance.
+    # A few bytes have no meaning, for instance dates.
     assert read < len(content) / 4

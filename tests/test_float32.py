@@ -1,4 +1,4 @@
-"""Single precision, in a process of its own: the tests' own one has x64 on."""
+"""Single precision, in a process of its own, as the tests' process has x64 on."""
 
 import json
 import os
@@ -13,7 +13,7 @@ from helpers import programs
 
 import fdof_jax as fj
 
-# One process for all, because each would import the same for seconds.
+# One process for all tests, because importing takes seconds.
 OPTIONAL = {"matplotlib", "scipy.optimize", "mujoco", "pandas", "xarray", "ipywidgets"}
 PROGRAM = f"""
 import jax, sys
@@ -102,7 +102,7 @@ import elements
 import fdof_jax as fj
 
 forces, arm = tuple(elements.ALL.values()), elements.arm("RPR")
-motion = fj.simulate(arm, elements.START, [0, 0.3], forces)
+motion = fj.simulate(arm, elements.START, [0, 0.3], forces, **elements.SHORT)
 states = jax.tree.leaves((motion.q, motion.own))
 assert {leaf.dtype.name for leaf in states} == {"float32"}
 reactions = fj.joint_reactions(arm, forces, motion)
@@ -116,7 +116,7 @@ def test_force_elements_in_single_precision():
     assert result.returncode == 0, result.stderr[-3000:]
     q, reactions = json.loads(result.stdout)
     forces, arm = tuple(elements.ALL.values()), elements.arm("RPR")
-    motion = fj.simulate(arm, elements.START, [0, 0.3], forces)
+    motion = fj.simulate(arm, elements.START, [0, 0.3], forces, **elements.SHORT)
     np.testing.assert_allclose(q, motion.q[-1], atol=1e-4)
     exact = fj.joint_reactions(arm, forces, motion)[-1]
     np.testing.assert_allclose(reactions, exact, atol=1e-3 * np.abs(exact).max())

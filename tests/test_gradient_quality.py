@@ -1,4 +1,4 @@
-"""The gradients that tuning follows, against differences and other modes."""
+"""The gradients that tuning follows, compared with differences and other modes."""
 
 import diffrax
 import equinox as eqx
@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from modes import ADJOINT
 
 import fdof_jax as fj
 from fdof_jax import scenes
@@ -45,7 +46,7 @@ def tangents(scene, tolerance, ts):
 
 
 def loss(scene, z, ts, adjoint=diffrax.ForwardMode()):
-    """By the program of plain calls, unless within a transformation."""
+    """Returns the sum of squares, by the plain calls' program unless transformed."""
     steps = diffrax.PIDController(rtol=1e-13, atol=1e-13)
     trial = with_gains(scene, gains_of(scene) * jnp.exp(z).reshape(2, 3))
     solution = fj.simulate(
@@ -58,6 +59,16 @@ def loss(scene, z, ts, adjoint=diffrax.ForwardMode()):
         throw=False,
     )
     return jnp.sum(tip_errors(trial, solution) ** 2)
+
+
+@eqx.filter_jit
+def forward(scene, z, ts):
+    return jax.jacfwd(lambda z: loss(scene, z, ts))(z)
+
+
+@eqx.filter_jit
+def reverse(scene, z, ts):
+    return jax.grad(lambda z: loss(scene, z, ts, ADJOINT))(z)
 
 
 @pytest.mark.slow
@@ -75,7 +86,7 @@ def test_tangents_are_those_of_differences(point):
     assert np.linalg.norm(gradient - np.array(wanted)) < 1e-6 * size
     value = float(loss(scene, jnp.zeros(6), ts))
     assert float(residuals @ residuals) == pytest.approx(value, rel=1e-8)
-    # As tuning takes them.
+    # The gradients that tuning uses.
     timed = jax.tree.map(jnp.asarray, scene._replace(t1=3.0))
     residuals, jacobian, *_ = gradient_quality._tangents(timed)
     coarse = 2 * jacobian.T @ residuals
@@ -88,13 +99,11 @@ def test_forward_and_reverse_mode_are_the_tangents(point):
     scene, ts = POINTS[point], np.linspace(0, 1, 1001)
     *_, gradient = tangents(scene, 1e-11, ts)
     size, z = np.linalg.norm(gradient), jnp.zeros(6)
-    forward = jax.jit(jax.jacfwd(lambda z: loss(scene, z, ts)))(z)
-    adjoint = diffrax.RecursiveCheckpointAdjoint()
-    reverse = jax.jit(jax.grad(lambda z: loss(scene, z, ts, adjoint=adjoint)))(z)
+    scene = jax.tree.map(jnp.asarray, scene)  # one program in each mode for all points
     # A step over the end of a saturation leaves tangents wrong by its length.
     near = (1e-5 if point == "saturated" else 1e-6) * size
-    assert np.linalg.norm(forward - gradient) < near
-    assert np.linalg.norm(reverse - gradient) < near
+    assert np.linalg.norm(forward(scene, z, ts) - gradient) < near
+    assert np.linalg.norm(reverse(scene, z, ts) - gradient) < near
 
 
 def test_nothing_is_nan_at_rest_at_zero_error_or_at_saturation():
@@ -138,7 +147,7 @@ def test_the_report_is_what_it_says(report):
     assert report.horizons[4] == pytest.approx(1.0)
     assert 0.1 < report.saturated[1] < 0.13
     assert "P2 is at its limit for" in str(report)
-    # The slide that is at its limit is not damped, within it all joints are.
+    # The slide at its limit is not damped; within the limits all joints are.
     assert report.at_limit.shape == (101,) and 0.1 < report.at_limit.mean() < 0.13
     damping = report.modes.damping
     assert np.nanmin(damping[report.at_limit]) < 0.01 < damping[~report.at_limit].min()

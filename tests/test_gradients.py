@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from elements import SHORT
+from modes import ADJOINT
 
 import fdof_jax as fj
 from fdof_jax import scenes
@@ -17,11 +18,11 @@ ZERO = jnp.zeros(3)
 
 
 def outcome(problem, parameters, adjoint=diffrax.ForwardMode()):
-    """Mean squared tip deviation and last positions.
+    """Returns the mean squared tip deviation and the last positions.
 
-    Functions of log kp, log kd, log masses and a shift of the start, (12,). The problem
-    (arm, start, controller, times, steps) is values only: one program in forward and
-    one in reverse mode serve all tests.
+    They are functions of log kp, log kd, log masses and a shift of the start,
+    (12,). The problem (arm, start, controller, times, steps) consists of values
+    only, so one program in forward mode and one in reverse mode serve all tests.
     """
     linkage, state0, controller, ts, (steps, dt0) = problem
     log_kp, log_kd, log_mass, shift = parameters.reshape(4, 3)
@@ -47,7 +48,7 @@ def outcome(problem, parameters, adjoint=diffrax.ForwardMode()):
 
 @eqx.filter_jit
 def forward(problem, at):
-    """Slopes and values: one program for both."""
+    """Returns slopes and values from one program."""
 
     def twice(at):
         found = outcome(problem, at)
@@ -58,17 +59,17 @@ def forward(problem, at):
 
 @eqx.filter_jit
 def reverse(problem, at, weights):
-    """The gradient of the weighted sum of the deviation and of the positions."""
+    """Returns the gradient of the weighted sum of the deviation and the positions."""
 
     def weighed(at):
-        loss, q = outcome(problem, at, diffrax.RecursiveCheckpointAdjoint())
+        loss, q = outcome(problem, at, ADJOINT)
         return weights[0] * loss + weights[1] * jnp.sum(q)
 
     return jax.grad(weighed)(at)
 
 
 def steps(tolerance, dt0=1e-3, growth=10.0):
-    """Steps of `dt0` if none may grow: of one structure with adaptive ones."""
+    """Returns fixed steps of `dt0`, or adaptive steps; both have the same structure."""
     values = dict(rtol=tolerance, atol=tolerance, factormin=0.2, factormax=growth)
     values = {name: np.asarray(value) for name, value in values.items()}
     return diffrax.PIDController(**values), np.asarray(dt0)
@@ -85,7 +86,7 @@ STEPS = {"fixed": steps(1e9, 1 / 1024, growth=1.0), "adaptive": steps(1e-13)}
 def test_forward_reverse_and_differences_agree(kind):
     scene = jax.tree.map(jnp.asarray, scenes.fig7())
     problem = scene.linkage, scene.state0, scene.forces[0], TS, STEPS[kind]
-    # Off the paper's gains: nothing is special about this point.
+    # An ordinary point, away from the paper's gains.
     at = [0.1, -0.2, 0.3, 0.05, 0.2, -0.1, 0.0, 0.1, -0.1, 0.02, 0.1, -0.03]
     at = jnp.array(at)
     (tangents, _), _ = forward(problem, at)
@@ -97,7 +98,7 @@ def test_forward_reverse_and_differences_agree(kind):
         return float(after - before) / (2 * h)
 
     if kind == "fixed":
-        # Free of noise, but with a kink wherever a switching meets a step.
+        # No noise, but a kink wherever a switching meets a step.
         differences = [difference(e, 1e-6) for e in np.eye(at.size)]
     else:
         # Noise of the tolerance: long steps, extrapolated.
@@ -105,14 +106,14 @@ def test_forward_reverse_and_differences_agree(kind):
             (4 * difference(e, 5e-4) - difference(e, 1e-3)) / 3 for e in np.eye(at.size)
         ]
     scale = np.abs(tangents).max()
-    # Both round differently: beside a saturation that leads to other adaptive steps.
+    # The modes round differently, which changes adaptive steps beside a saturation.
     same = {"fixed": 1e-10, "adaptive": 1e-6}[kind]
     assert np.abs(tangents - gradient).max() <= same * scale
     assert np.abs(tangents - np.array(differences)).max() <= 1e-6 * scale
 
 
 def test_both_modes_of_a_damped_arm_equal_differences():
-    """Of steps of one size, in its masses, damping and start."""
+    """Uses fixed steps; derivatives in masses, damping and start."""
     arm, (damper,) = scenes.fig3().linkage, scenes.fig3().forces
 
     def end(at, adjoint):
@@ -127,8 +128,7 @@ def test_both_modes_of_a_damped_arm_equal_differences():
         return jnp.sum(motion.q[-1] * jnp.array([1.0, -2.0, 0.5]))
 
     at = jnp.array([5.0, 2.0, 1.0, 20.0, 10.0, 5.0, 0.3, -0.2, 0.5])
-    backward = diffrax.RecursiveCheckpointAdjoint()
-    both = jax.jit(jax.value_and_grad(lambda at: end(at, backward)))
+    both = jax.jit(jax.value_and_grad(lambda at: end(at, ADJOINT)))
     forward = jax.jit(jax.jacfwd(lambda at: end(at, diffrax.ForwardMode())))(at)
     value = lambda change: float(both(at + change)[0])
     h = 1e-5
@@ -139,27 +139,8 @@ def test_both_modes_of_a_damped_arm_equal_differences():
 
 
 @pytest.mark.slow
-def test_gradient_of_a_batch_is_the_sum_of_the_gradients():
-    def total(mass, starts):
-        linkage = eqx.tree_at(lambda x: x.mass, scenes.fig5().linkage, mass)
-        motion = jax.vmap(
-            lambda q: fj.simulate(linkage, fj.State(q, ZERO), [0, 0.5], **SHORT).q[-1]
-        )
-        return jnp.sum(motion(starts) ** 2)
-
-    slope = jax.jit(jax.grad(total))
-
-    starts = np.array([[0.1, 0.2, 0.3], [-0.5, 0.4, 0.0], [1.0, -1.0, 0.5]])
-    mass = jnp.array([1.0, 1.2, 0.8])
-    together = slope(mass, starts)
-    # Three of a kind, for which no other program is compiled.
-    alone = sum(slope(mass, np.tile(start, (3, 1))) / 3 for start in starts)
-    np.testing.assert_allclose(together, alone, rtol=1e-8)
-
-
-@pytest.mark.slow
 def test_gradients_at_rest_and_at_zero_error_are_finite():
-    """Hanging still, on the circle's start, with nothing to correct."""
+    """The arm hangs still, or is at the start of its circle without an error."""
     linkage = scenes.fig7().linkage
     task = fj.CircleTask(center=(-4.0, 2.0), radius=0.5)
     q = fj.inverse_kinematics(linkage, task.tip(0.0), task.orientation)
@@ -176,7 +157,7 @@ CHAIN = eqx.tree_at(lambda x: x.inertia, scenes.fig5().linkage, np.full(3, 1 / 1
 
 
 def linear_motion(end):
-    """The exact derivative of the position in that at the start, of the hanging arm."""
+    """Returns the exact derivative of the hanging arm's position in its start."""
     stiffness = jax.jacfwd(lambda q: fj.forward_dynamics(CHAIN, q, ZERO, ZERO))(HANGING)
     rates = jnp.block([[jnp.zeros((3, 3)), jnp.eye(3)], [stiffness, jnp.zeros((3, 3))]])
     return jax.scipy.linalg.expm(rates * end, max_squarings=32)[:3, :3]
@@ -184,7 +165,7 @@ def linear_motion(end):
 
 @pytest.mark.slow
 def test_tangents_of_a_hanging_arm_are_controlled():
-    """At rest there is no error to see: steps are bounded by the time scale."""
+    """At rest the error estimate is 0; steps are bounded by the time scale instead."""
     # In the circle's reach, with a controller that does nothing.
     task = fj.CircleTask(center=(1.0, 1.0), radius=0.2)
     idle = fj.PDController(ZERO, ZERO, [np.inf] * 3, task)
@@ -238,10 +219,14 @@ def test_a_function_may_close_over_what_is_differentiated():
         motion = fj.simulate(scene.linkage, scene.state0, [0, 0.3], forces, **SHORT)
         return motion.q[-1, 0]
 
-    both = jax.jit(jax.value_and_grad(end), static_argnums=1)
-    closed = both(0.5, lambda c: lambda t, q, qd, linkage: -c * qd)
-    held = both(0.5, fj.JointDamper)
-    np.testing.assert_allclose(closed, held, rtol=1e-8)
+    both = jax.jit(
+        jax.value_and_grad(lambda c: end(c, lambda c: lambda t, q, qd, arm: -c * qd))
+    )
+    value, slope = both(0.5)
+    np.testing.assert_allclose(value, end(0.5, fj.JointDamper), rtol=1e-12)
+    ends = [both(0.5 + h)[0] for h in (1e-4, -1e-4, 2e-4, -2e-4)]
+    difference = (8 * (ends[0] - ends[1]) - (ends[2] - ends[3])) / 12e-4
+    np.testing.assert_allclose(slope, difference, rtol=1e-8)
 
     def controller(c):
         return fj.PDController(1.0, 1.0, 9.0, lambda t, linkage: (c * ZERO, ZERO))

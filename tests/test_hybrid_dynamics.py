@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from elements import Swing
+from elements import SHORT, Swing
 from helpers import random_linkage
 from scipy.integrate import simpson, solve_ivp
 
@@ -25,7 +25,7 @@ REST = fj.State(np.zeros(3), np.zeros(3))
 
 
 class Push(eqx.Module):
-    """The cart accelerates at a constant rate from a velocity."""
+    """The cart starts with a velocity and accelerates at a constant rate."""
 
     velocity: jax.Array
     acceleration: jax.Array
@@ -38,7 +38,7 @@ class Push(eqx.Module):
 
 
 def pendulum(angle, rate, acceleration, ts):
-    """Of a pendulum whose pivot accelerates along x."""
+    """Returns the motion of a pendulum whose pivot accelerates along x."""
 
     def field(t, y):
         drive = G * np.sin(y[0]) + acceleration * np.cos(y[0])
@@ -61,7 +61,7 @@ def test_a_pendulum_on_a_cart_that_accelerates(acceleration):
 
 
 def test_a_jump_of_the_velocity_is_a_blow():
-    """The momentum of the pendulum about its pivot stays as it is."""
+    """Checks that the pendulum's momentum about its pivot does not change."""
     moving = fj.PrescribedMotion((1, 3), Push(jnp.array(0.6), jnp.array(0.0)))
     ts = np.linspace(0, 1, 6)
     start = fj.State([0, 0.4, 0], [0, 0.2, 0])
@@ -83,7 +83,7 @@ def swinging(topology, joints, forces=()):
 
 @eqx.filter_jit
 def along(linkage, forces, solution, efforts):
-    """Accelerations under efforts, those that are prescribed, and the energy."""
+    """Returns accelerations under efforts, the prescribed ones, and the energy."""
 
     def at(t, q, qd, tau):
         qdd = fj.forward_dynamics(linkage, q, qd, tau, forces)
@@ -106,14 +106,14 @@ def test_efforts_make_the_motion_and_do_its_work(topology, joints):
     # Under these efforts the prescribed joints accelerate as they should.
     qdd, demanded, energy = along(linkage, forces, solution, efforts.total)
     np.testing.assert_allclose(qdd[:, moved], demanded[:, moved], atol=1e-9)
-    # And the energy changes by their work.
+    # The energy changes by their work.
     power = np.sum(np.asarray(efforts.total) * np.asarray(solution.qd), axis=1)
     work = simpson(power, x=ts)
     np.testing.assert_allclose(energy[-1] - energy[0], work, atol=1e-6 * np.ptp(power))
 
 
 def test_a_motion_prescribed_as_it_is_takes_no_effort():
-    """A cart that falls together with a pendulum that hangs on it, weightless."""
+    """A cart and the pendulum that hangs on it fall together, weightless."""
     falling = fj.Linkage(
         "PRR", length=[0, 0, 1, 1], com=[[0, 0], [0.5, 0], [0.5, 0]], mass=[1, 1, 1],
         inertia=[1, 1, 1], gravity=G,
@@ -143,7 +143,7 @@ def test_starts_beside_the_reference_and_singular_equations_are_told():
         fj.simulate(CART, fj.State(starts.q[1], np.zeros(3)), [0, 1], (motion,))
     swept = fj.sweep(CART, starts, [0, 0.1], (motion,))
     assert swept.outcome.tolist() == ["successful", "not finite"]
-    # Two stretched links with a heavy tip; the slide, which is held, is well.
+    # Two stretched links with a heavy tip; the prescribed slide is well-conditioned.
     heavy = fj.Linkage(
         "PRR", length=[0, 0, 1, 1], com=[[0, 0], [0.5, 0], [1, 0]], mass=[1, 1, 1e11],
         inertia=[1, 0.1, 0],
@@ -191,14 +191,14 @@ def test_topologies_are_batched():
     stack = lambda trees: jax.tree.map(lambda *a: jnp.stack(a), *trees)
     linkages, starts, forces = map(stack, zip(*members))
     ts = [0, 0.3]
-    swept = fj.sweep(linkages, starts, ts, forces, forces_axes=0)
+    swept = fj.sweep(linkages, starts, ts, forces, forces_axes=0, **SHORT)
     for k, (linkage, start, forces) in enumerate(members):
-        alone = fj.simulate(linkage, start, ts, forces)
+        alone = fj.simulate(linkage, start, ts, forces, **SHORT)
         np.testing.assert_allclose(swept.q[k], alone.q, atol=1e-9)
 
 
 def residual(travel, stroke=0.05):
-    """The load's swing after the travel, over the stroke."""
+    """Returns the load's swing after the travel, divided by the stroke."""
     move = fj.JointMove(np.zeros(3), [stroke, 0, 0], travel)
     motion = fj.PrescribedMotion((1, 3), move)
     ts = np.append(0.0, travel.duration + np.linspace(0.01, 2.5, 200))

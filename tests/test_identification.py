@@ -1,4 +1,4 @@
-"""Identification: exact without noise, and as exact as can be with it."""
+"""Identification is exact without noise, and meets the Cramér-Rao bound with it."""
 
 import equinox as eqx
 import jax
@@ -28,7 +28,7 @@ SINES = Sines(jnp.array([20.0, 8.0, 3.0]), jnp.array([5.0, 7.0, 9.0]))
 
 
 def recorded(scene, ts=TS, observe=fj.link_ends):
-    """What would be seen without noise, by `simulate` at its own tolerance."""
+    """Returns the readings without noise, by `simulate` at its default tolerance."""
     # As arrays of one structure, for one compilation.
     scene = jax.tree.map(jnp.asarray, scene)
     solution = fj.simulate(scene.linkage, scene.state0, ts, scene.forces)
@@ -36,7 +36,7 @@ def recorded(scene, ts=TS, observe=fj.link_ends):
 
 
 def jacobian(scene_at, parameters, observe=fj.link_ends):
-    """By central differences of `simulate`, over single numbers: (reading, n)."""
+    """Returns central differences of `simulate` in each single number, (reading, n)."""
     columns = []
     for name, value in parameters.items():
         for index in np.ndindex(np.shape(value)):
@@ -52,7 +52,7 @@ def jacobian(scene_at, parameters, observe=fj.link_ends):
 
 
 class Mixed(eqx.Module):
-    """An RPR arm: of link 4 the mass and the offset, an inertia, and all damping."""
+    """Unknowns of an RPR arm: link 4's mass and offset, an inertia, all damping."""
 
     start: fj.State
 
@@ -98,7 +98,7 @@ def test_masses_inertias_offsets_and_damping_are_recovered(seen):
 
 
 def test_a_sparse_recording_with_noise_and_its_standard_errors(seen):
-    """Against differences of `simulate`, with every second sample and more missing."""
+    """Every second sample and more are missing; compared with differences."""
     rng = np.random.default_rng(0)
     there = rng.uniform(size=seen.shape) < 0.4
     noisy = np.where(there, seen + 1e-3 * rng.normal(size=seen.shape), np.nan)
@@ -108,7 +108,7 @@ def test_a_sparse_recording_with_noise_and_its_standard_errors(seen):
     assert (np.abs(errors_of(result)) < 3.5 * errors).all()
     slopes = jacobian(MIXED, TRUE)[there.ravel()]
     bound = result.noise**2 * np.linalg.inv(slopes.T @ slopes)
-    # The bound is that at the true parameters.
+    # The bound is taken at the true parameters.
     np.testing.assert_allclose(errors, np.sqrt(np.diag(bound)), rtol=0.05)
     for name, value in result.standard_errors.items():
         assert np.shape(value) == np.shape(TRUE[name])
@@ -126,7 +126,7 @@ def test_parameters_stay_within_their_bounds_and_a_poor_fit_is_told(seen):
 
 
 class FirstLink(eqx.Module):
-    """Mass and mass centre of the first link, and its inertia about its start."""
+    """Unknowns: the first link's mass, mass centre and inertia about its start."""
 
     ef: jax.Array
 
@@ -159,7 +159,7 @@ LINK = dict(m=jnp.asarray(3.0), p=jnp.asarray(0.5), J=jnp.asarray(1.1))
     ],
 )
 def test_what_the_motion_does_not_tell(topology, untold, told, words):
-    """A link on the ground's pivot shows its m p and J only; on its slide only m."""
+    """A link on the ground's pivot shows only its m p and J; on its slide, only m."""
     scene_at = FirstLink(fj.existence_factors(topology))
     readings = recorded(scene_at(LINK), TS, encoders)
     first = dict(m=2.5, p=0.4, J=1.3)
@@ -175,7 +175,7 @@ def test_what_the_motion_does_not_tell(topology, untold, told, words):
     assert all(found[n] == pytest.approx(float(LINK[n]), abs=1e-5) for n in told)
     assert all(word in " ".join(result.weak) for word in words), result.weak
     assert len(result.weak) == len(untold) - (topology == "RPR")
-    assert "Cannot be told from this motion" in str(result)
+    assert "Not determined by this motion" in str(result)
 
 
 def test_directions_of_any_scale_are_told_from_those_that_vanish():
@@ -196,7 +196,7 @@ def test_directions_of_any_scale_are_told_from_those_that_vanish():
 
 
 def test_hardly_told_combinations_are_named():
-    """What is known to more than its size, and by how much."""
+    """Checks that the message names each combination and its uncertainty."""
     words = fit_result._in_words(
         ("a", "b"), np.zeros((2, 0)), np.array([[4.0, -3.99], [-3.99, 4.0]])
     )
@@ -205,7 +205,7 @@ def test_hardly_told_combinations_are_named():
 
 
 def test_recordings_judged_together(seen):
-    """Two motions tell more than one of them, in one fit."""
+    """Two motions, in one fit, determine more than one of them does."""
     other = Mixed(fj.State(jnp.array([0.1, 0.5, 0.5]), jnp.zeros(3)))
     rng = np.random.default_rng(2)
     readings = np.stack([seen, recorded(other(TRUE))])
@@ -219,10 +219,10 @@ def test_recordings_judged_together(seen):
 
 
 def base_parameters(linkage):
-    """Five of the nine that an RRR arm's motion can tell; all others are known.
+    """Returns five of the nine numbers that an RRR arm's motion determines.
 
-    J: inertias about the starts of links with the masses beyond them at their ends; h:
-    their moments m p.
+    All other numbers are known. J: inertias about the starts of links with the
+    masses beyond them at their ends; h: their moments m p.
     """
     mass, moment, _, inertia = fj.inertial_parameters(linkage).T
     a2, a3 = LENGTH[1:3]

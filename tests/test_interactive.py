@@ -1,4 +1,4 @@
-"""Sliders: what a move changes, that it compiles nothing, and how failures are told."""
+"""Sliders: the effect of a move, which compiles nothing, and messages on failures."""
 
 import subprocess
 import sys
@@ -20,7 +20,7 @@ STIFF = with_gains(CIRCLES["RRR"], np.full((2, 3), 1e9))
 
 
 class Box:
-    """The box with its parts by what is written beside them."""
+    """The box of sliders, with its parts by their labels."""
 
     def __init__(self, *arguments):
         controls, (self.image, self.words) = [
@@ -46,7 +46,7 @@ def all_arms():
 
 @pytest.fixture
 def box(all_arms):
-    """The same in each test: only its first motion is compiled."""
+    """Returns the same box for all tests, so that only its first motion is compiled."""
     for part in all_arms.parts.values():
         if hasattr(part, "min"):
             part.value = 1.0
@@ -88,7 +88,7 @@ def test_choosing_an_arm_keeps_the_sliders(box):
 
 
 def test_the_way_of_the_sliders_does_not_matter(box):
-    """Axes that are kept as pixels leave no trace of what was shown before."""
+    """Checks that axes stored as pixels keep no trace of the previous picture."""
     there = box.move(arm="PRR", A3=1.3)
     back = box.move(A3=1.0)
     assert np.abs(there - back).max() > 0.5
@@ -114,7 +114,7 @@ def test_a_motion_that_fails_is_told(box):
 
 
 def test_a_slider_starts_on_one_of_its_steps(box):
-    """Else the browser moves it."""
+    """The browser would otherwise move the slider."""
     for name, part in box.parts.items():
         if name.startswith("k"):
             steps = np.array([0 - part.min, part.max]) / part.step

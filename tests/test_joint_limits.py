@@ -22,7 +22,7 @@ def last(value):
 
 
 def test_a_bounce_keeps_the_energy():
-    """The penetration is (d + w)^2 / 4w up to a depth w, and the depth from there."""
+    """The penetration is (d + w)^2 / 4w up to a depth w, and the depth beyond."""
     k, w, end = 300.0, 0.02, 1.0
     stops = fj.JointStops(-np.inf, [np.inf, np.inf, end], stiffness=k, smoothing=w)
     ts = np.linspace(0, 1, 101)
@@ -43,7 +43,7 @@ def test_a_bounce_keeps_the_energy():
 
 
 def test_deep_in_a_stop_the_spring_is_linear():
-    """Half a period of sqrt(k/m), when the rounding is small."""
+    """A contact lasts half a period of sqrt(k/m) if the rounding is small."""
     k, speed = 800.0, 2.0
     stops = fj.JointStops(-1.0, np.inf, stiffness=k, smoothing=1e-7)
     half = np.pi / np.sqrt(k / 2)
@@ -96,7 +96,7 @@ def test_stops_have_finite_derivatives_everywhere():
 
 
 def test_friction_stops_a_slide():
-    """2 dv/dt = -F tanh(v/s), so sinh(v/s) falls exponentially."""
+    """From 2 dv/dt = -F tanh(v/s) it follows that sinh(v/s) falls exponentially."""
     level, speed, v0 = 4.0, 0.05, 1.5
     friction = fj.JointFriction(level, speed)
     ts = np.linspace(0, 1.2, 25)

@@ -1,4 +1,4 @@
-"""Points of the chain, their derivatives, and inverse kinematics as their inverse."""
+"""Points of the chain, their derivatives, and inverse kinematics."""
 
 from functools import partial
 
@@ -26,7 +26,7 @@ def stack(linkages):
 
 
 def samples(topology, seed=0):
-    """Random linkages of one topology, stacked, with random motions."""
+    """Returns stacked random linkages of one topology, with random motions."""
     rng = np.random.default_rng(seed)
     linkages = stack([random_linkage(topology, rng) for _ in range(SAMPLES)])
     q, qd = rng.uniform(-3, 3, (2, SAMPLES, 3))
@@ -35,18 +35,18 @@ def samples(topology, seed=0):
 
 @jax.jit
 def pose(linkage, q):
-    """Tip and orientation, (3,)."""
+    """Returns the tip and the orientation, (3,)."""
     x, _ = fj.to_chain(linkage, q, jnp.zeros(3))
     return jnp.append(fj.tip_position(linkage, q), x[5])
 
 
 def turns(angle):
-    """Distance of an angle from the nearest whole number of turns."""
+    """Returns the distance of an angle from the nearest whole number of turns."""
     return np.abs(np.angle(np.exp(1j * np.asarray(angle))))
 
 
 def joint_distance(topology, q, other):
-    """Largest difference of joint positions, of angles modulo whole turns."""
+    """Returns the largest difference of joint positions, angles modulo whole turns."""
     difference = np.asarray(q) - np.asarray(other)
     revolute = np.array([joint == "R" for joint in topology])
     return np.where(revolute, turns(difference), np.abs(difference)).max(axis=-1)
@@ -120,7 +120,7 @@ def solutions(linkages, targets, branch):
 
 @partial(jax.jit, static_argnums=2)
 def derivatives(linkages, targets, branch):
-    """Of the solutions in the poses, and the tip Jacobians there."""
+    """Returns the solutions' derivatives in the poses, and the tip Jacobians there."""
 
     def one(linkage, target):
         def q(target):
@@ -145,7 +145,7 @@ def test_both_branches_reach_the_pose_and_one_is_the_original(topology):
         distances.append(joint_distance(topology, found, q))
     distances = np.array(distances)
     assert distances.min(axis=0).max() < 1e-7  # a square root near its zero
-    # Two slides make the solution unique; else the branches are different assemblies.
+    # Two slides make the solution unique; otherwise the branches are two assemblies.
     two = topology.count("P") < 2
     assert (
         (distances.max(axis=0) > 1e-3).mean() > 0.7 if two else distances.max() < 1e-7
@@ -239,10 +239,8 @@ def test_parallel_slides_reach_no_given_point(topology, lock, base_angle):
 @jax.jit
 def wrists_solved(linkage, wrists, orientation, branch):
     directions = known_directions(linkage, orientation)
-    one = lambda w, bearing: solve_joints(
-        linkage, directions, w, bearing, orientation, branch
-    )
-    return jax.vmap(one)(wrists, plane_angle(wrists[:, 1], wrists[:, 0]))
+    one = lambda w, bearing: solve_joints(linkage, directions, w, bearing, branch)
+    return jax.vmap(one)(wrists, plane_angle(wrists.imag, wrists.real))
 
 
 @each_topology
@@ -252,15 +250,16 @@ def test_numpy_solves_the_joints_as_jax_does(topology, branch):
     unreached = 0
     for _ in range(4):
         linkage = random_linkage(topology, rng)
-        wrists, orientation = rng.uniform(-2.5, 2.5, (1000, 2)), rng.uniform(-3, 3)
+        wrists = rng.uniform(-2.5, 2.5, (1000, 2)) @ [1, 1j]
+        orientation = rng.uniform(-3, 3)
         known, sides = jax.tree.map(np.asarray, linkage), np.asarray(float(branch))
-        bearing = plane_angle(wrists[:, 1], wrists[:, 0])
+        bearing = plane_angle(wrists.imag, wrists.real)
         angle = np.asarray(orientation)
         directions = known_directions(known, angle)
-        q, root = solve_joints(known, directions, wrists, bearing, angle, sides)
+        q, root = solve_joints(known, directions, wrists, bearing, sides)
         expected, _ = wrists_solved(linkage, wrists, angle, sides)
         assert isinstance(q, np.ndarray) and isinstance(root, np.ndarray)
-        # Next to the edge of the reach a root takes rounding to its square root.
+        # Near the edge of the reach a root enlarges rounding to its square root.
         off_edge = ~(np.abs(root) < 1e-6)
         np.testing.assert_allclose(q[off_edge], expected[off_edge], atol=1e-8)
         unreached += np.isnan(q).any(axis=1).sum()

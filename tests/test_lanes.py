@@ -31,7 +31,7 @@ def test_power_mean_has_the_derivatives_of_its_own_formula():
         ]
         slopes = [(a.loss[0] - b.loss[0]) / (2 * h) for a, b in sides]
         np.testing.assert_allclose(here.gradient[0], slopes, rtol=1e-6)
-        # Of linear residuals Gauss and Newton's curvature is the second derivative.
+        # For linear residuals the Gauss-Newton curvature is the second derivative.
         bends = [(a.gradient[0] - b.gradient[0]) / (2 * h) for a, b in sides]
         np.testing.assert_allclose(here.curvature[0], bends, rtol=1e-5, atol=1e-5)
     nothing = methods.Evaluation(

@@ -1,4 +1,4 @@
-"""One circle for all seven topologies."""
+"""One circle that all seven topologies track."""
 
 import jax
 import numpy as np
@@ -40,7 +40,7 @@ def test_reachable_says_when():
         center=(1.99, 0.95), radius=0.75, period=4.0, orientation=0.8, branch=-1
     )
     found = np.asarray(fj.reachable(scene.linkage, task, TS))
-    # Of known values and of traced ones, within a transformation.
+    # With known values, and with traced ones within a transformation.
     known = jax.jit(lambda x: x + fj.reachable(scene.linkage, task, TS))(0)
     np.testing.assert_array_equal(known, found)
     traced = jax.jit(lambda ts: fj.reachable(scene.linkage, task, ts))(TS)

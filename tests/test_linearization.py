@@ -1,4 +1,4 @@
-"""Linear analysis: differences, known modes, small motions, rest, the regressor."""
+"""Linear analysis: differences, known modes, small motions, equilibria, regressor."""
 
 import diffrax
 import equinox as eqx
@@ -7,8 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
-from elements import WITH_INERTIA, Hold
+from elements import Hold
 from helpers import random_linkage
+from test_reactions import TipLoad
 
 import fdof_jax as fj
 from fdof_jax import scenes
@@ -37,7 +38,7 @@ def modes_at(linkage, forces, *states, ts=0.0):
 
 
 def held(linkage, q, kp, kd, others=()):
-    """A PD controller that sags to `q`."""
+    """Returns a PD controller under which the arm sags to `q`."""
     load = fj.holding_efforts(linkage, q, others)
     load = load - sum(element(0.0, q, jnp.zeros(3), linkage) for element in others)
     return fj.PDController(kp, kd, jnp.inf, Hold(q + load / np.array(kp)))
@@ -81,7 +82,7 @@ def test_small_deviations_follow_the_exponential_of_a():
     solution = fj.simulate(linkage, start, [0, 0.5], forces)
     found = np.concatenate([solution.q[-1] - q, solution.qd[-1]])
     expected = scipy.linalg.expm(0.5 * np.asarray(A)) @ deviation
-    # The square of the deviations is left.
+    # The difference is of second order in the deviations.
     np.testing.assert_allclose(found, expected, atol=1e-8)
     assert np.abs(expected).max() > 1e-5
 
@@ -93,7 +94,7 @@ def test_a_stiff_controller_of_limited_efforts_has_an_equilibrium():
 
     @jax.jit
     def rest(guess):
-        """And its derivative in the guess: one program for both."""
+        """Returns the equilibrium and its derivative in the guess, from one program."""
 
         def twice(q):
             found = fj.equilibrium(scene.linkage, scene.forces, q)
@@ -107,7 +108,7 @@ def test_a_stiff_controller_of_limited_efforts_has_an_equilibrium():
     held = fj.holding_efforts(scene.linkage, q)
     np.testing.assert_allclose(efforts, held, rtol=1e-9)
     assert 0.01 < np.abs(q - reference).max() < 0.3
-    # From a guess at which the slide is at its limit none is found.
+    # No equilibrium is found from a guess at which the slide is at its limit.
     assert all(np.isnan(found).all() for found in rest(jnp.asarray(scene.state0.q)))
 
 
@@ -115,7 +116,7 @@ def test_a_stiff_controller_of_limited_efforts_has_an_equilibrium():
 
 
 def test_a_hanging_chain_of_point_masses_swings_as_is_known():
-    """Equal lengths and masses: squares in g/l are the zeros of Laguerre's L3."""
+    """Squared frequencies in g/l are the zeros of Laguerre's L3."""
     linkage = scenes.fig5().linkage
     hanging, failed = ([-np.pi / 2, 0.0, 0.0], STILL), ([0.3, np.nan, 0.0], STILL)
     modes = modes_at(linkage, (), hanging, failed)
@@ -188,15 +189,15 @@ def test_equilibria_are_where_the_efforts_hold_the_arm(topology):
 @pytest.mark.slow
 def test_masses_of_elements_are_held_too():
     linkage, q, *_ = motion("PRR")
-    actuator = WITH_INERTIA["actuator"]
-    controller = held(linkage, q, [300.0, 200.0, 100.0], np.ones(3), (actuator,))
-    found = fj.equilibrium(linkage, (controller, actuator), q + 0.05)
+    load = TipLoad()
+    controller = held(linkage, q, [300.0, 200.0, 100.0], np.ones(3), (load,))
+    found = fj.equilibrium(linkage, (controller, load), q + 0.05)
     np.testing.assert_allclose(found, q, atol=1e-8)
 
 
 @pytest.mark.parametrize("share, found", [(0.95, True), (1.05, False)])
 def test_loads_that_nothing_holds_have_no_equilibrium(share, found):
-    """The motor of a shoulder can be too weak or too strong for any posture."""
+    """A shoulder motor can be too weak or too strong for every posture."""
     tau = share * fj.holding_efforts(ROD, STILL)
     q = fj.equilibrium(ROD, (fj.JointEffort(tau),), [0.4, 0.1, -0.1])
     assert np.isfinite(q).all() == found
@@ -217,10 +218,11 @@ def test_the_regressor_times_the_parameters_is_the_inverse_dynamics(topology):
 
 
 def test_nine_combinations_of_the_parameters_of_an_rpr_arm_are_identified():
-    """Three are lost.
+    """Three combinations are lost.
 
-    The first link's mass is not felt, the second's inertia adds to the first's, with
-    which it turns, and the third's mass to the second's, to which it is hinged.
+    The first link's mass has no effect. The second link's inertia adds to the
+    first's, as both turn together. The third link's mass adds to the second's, to
+    which it is hinged.
     """
     linkage, *_ = motion("RPR")
     samples = np.random.default_rng(1).uniform(-2, 2, (3, 40, 3))
@@ -229,14 +231,14 @@ def test_nine_combinations_of_the_parameters_of_an_rpr_arm_are_identified():
     values = np.linalg.svd(matrix, compute_uv=False)
     assert values[8] > 1e-3 * values[0] and values[9] < 1e-12 * values[0]
     np.testing.assert_allclose(matrix[:, 0], 0, atol=1e-12)
-    # What is found serves for other motions, though the parameters are not unique.
+    # The parameters found are not unique, but are right for other motions too.
     efforts = jax.vmap(lambda *row: fj.inverse_dynamics(linkage, *row))
     seen = np.asarray(efforts(*samples)).ravel()
     found, *_ = np.linalg.lstsq(matrix[:60], seen[:60], rcond=1e-10)
     np.testing.assert_allclose(matrix[60:] @ found, seen[60:], atol=1e-8)
 
 
-# At the door
+# Malformed arguments
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Linkages as data: existence factors, coordinates, refusals of what cannot move."""
+"""Linkages as data: existence factors, coordinates, rejected arms."""
 
 import re
 import warnings
@@ -160,7 +160,7 @@ def test_from_chain_can_be_traced():
     np.testing.assert_allclose(states.qd, [[0.4, 0.5, 0.6], [0.8, 1.0, 1.2]])
 
 
-# Linkages that cannot be, and linkages that are delicate
+# Impossible linkages, and ill-conditioned ones
 
 
 @pytest.mark.parametrize(
@@ -185,7 +185,7 @@ def test_from_chain_can_be_traced():
         ),
         ("RPR", dict(mass=[1, 0, 0]), 2, 2),
         ("RPP", dict(mass=[1, 0, 1], locked=[0.1, 0, 0.2]), 2, 2),
-        # Nor the first.
+        # The first joint does not either.
         (
             "RRP",
             dict(length=[0, 0, 1, 1], locked=0, mass=[0, 1, 1], inertia=[0, 1, 1]),

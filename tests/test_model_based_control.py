@@ -1,4 +1,4 @@
-"""Gravity feed-forward against Fig 7's table; computed torque against its errors."""
+"""Gravity feed-forward against Fig 7's table; computed torque's error dynamics."""
 
 import equinox as eqx
 import jax
@@ -109,7 +109,7 @@ def test_the_effort_is_the_inverse_dynamics_of_what_is_demanded(topology):
 
 @each_topology
 def test_errors_of_an_exact_model_are_linear(topology):
-    """d2e/dt2 + kd de/dt + kp e = 0: critical, underdamped and overdamped."""
+    """d2e/dt2 + kd de/dt + kp e = 0, critically damped, underdamped and overdamped."""
     linkage, ts = arm(topology), np.linspace(0, 1.5, 4)
     kp, kd = np.array([9.0, 25.0, 16.0]), np.array([6.0, 4.0, 10.0])
     controller = fj.ComputedTorque(kp, kd, jnp.inf, MOVE)
@@ -117,7 +117,7 @@ def test_errors_of_an_exact_model_are_linear(topology):
     q, qd = MOVE(0.0, linkage)
     solution = fj.simulate(linkage, fj.State(q - error, qd - rate), ts, (controller,))
     q_ref, _ = jax.vmap(lambda t: MOVE(t, linkage))(ts)
-    # Of the companion matrix of each joint.
+    # Eigenvalues of each joint's companion matrix.
     matrices = [[[0, 1], [-p, -d]] for p, d in zip(kp, kd)]
     grown = scipy.linalg.expm(ts[:, None, None, None] * np.array(matrices))
     start = np.stack([error, rate], axis=1)

@@ -1,4 +1,4 @@
-"""The notebooks: short cells, small files, committed outputs; and they run."""
+"""The notebooks have short cells, small files and committed outputs, and they run."""
 
 from pathlib import Path
 
@@ -18,13 +18,13 @@ each_notebook = pytest.mark.parametrize(
 
 
 def code_cells(notebook):
-    """All but the one that installs."""
+    """Returns all code cells except the one that installs."""
     cells = [cell for cell in notebook.cells if cell.cell_type == "code"]
     return [cell for cell in cells if "install" not in cell.metadata.get("tags", [])]
 
 
 def unwanted(notebook):
-    """What was printed to stderr, warnings among it, or raised."""
+    """Returns text printed to stderr, including warnings, and errors raised."""
     return [
         output.get("text") or output.get("evalue")
         for cell in code_cells(notebook)
@@ -34,7 +34,7 @@ def unwanted(notebook):
 
 
 def pictures(notebook):
-    """How many outputs are more than text."""
+    """Returns the number of outputs that are more than text."""
     kinds = [
         set(output.get("data", {}))
         for cell in code_cells(notebook)

@@ -1,6 +1,6 @@
-"""One trace serves all topologies; batches equal singles.
+"""One trace serves all topologies; batches equal single motions.
 
-Plain calls need no other program for another topology: test_programs.py.
+That plain calls share one program among topologies is in test_programs.py.
 """
 
 import functools
@@ -34,7 +34,7 @@ def linkage_and_state(topology):
 
 
 def circle(linkage, state):
-    """A small circle around the tip's start, on the assembly that the start has."""
+    """Returns a small circle around the tip's start, on the start's assembly."""
     tip = np.asarray(fj.tip_position(linkage, state.q))
     orientation = float(fj.to_chain(linkage, state.q, np.zeros(3))[0][5])
     for branch in (1, -1):

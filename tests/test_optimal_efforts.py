@@ -1,4 +1,4 @@
-"""The best open-loop efforts: Fuller's control of a slide, and no controller better."""
+"""The best open-loop efforts: Fuller's control of a slide; no controller is better."""
 
 import numpy as np
 import pytest
@@ -11,13 +11,13 @@ from fdof_jax.search import methods
 from fdof_jax.search.lanes import Lanes
 from fdof_jax.tuning import optimal_motion
 
-# The same for all, so that they share programs.
+# The same for all tests, so that they share programs.
 HORIZON, KNOTS = 0.5, 26
 CONTROLLER = scenes.fig7().forces[0]
 
 
 def rms_tip_error(scene, task):
-    """By the trapezium rule, of a motion of its own."""
+    """Returns the rms tip error by the trapezium rule, from a motion of its own."""
     ts = np.linspace(0, HORIZON, 501)
     solution = fj.simulate(scene.linkage, scene.state0, ts, scene.forces)
     q, times = np.asarray(solution.q), np.asarray(solution.ts)
@@ -38,7 +38,7 @@ def test_no_controller_with_these_limits_does_better(best):
     assert best.converged
     assert (np.abs(best.efforts) <= limit).all()
     assert (np.abs(best.efforts) == limit).any()
-    # Both guesses come to the same place.
+    # Both guesses lead to the same result.
     np.testing.assert_allclose(best.guess_errors, best.tip_error, rtol=1e-3)
     assert rms_tip_error(best.scene, task) == pytest.approx(best.tip_error, rel=2e-3)
     own = rms_tip_error(scene, task)
@@ -66,10 +66,10 @@ def test_derivatives_against_differences(best):
 
 
 def fuller(offset, push):
-    """The least integral of x^2 from x = `offset` at rest, where |x''| <= `push`.
+    """Returns the least integral of x^2 from rest at `offset`, and its duration.
 
-    And the time it takes. Fuller's problem: the best control switches where
-    x = -c v |v| / push, ever faster.
+    The acceleration is limited to |x''| <= `push`. In this problem of Fuller the
+    best control switches where x = -c v |v| / push, ever faster.
     """
     c = np.sqrt((np.sqrt(33) - 1) / 24)
     x, v, integral, time = offset, 0.0, 0.0, 0.0
@@ -85,7 +85,7 @@ def fuller(offset, push):
 
 
 def two_slides():
-    """Across each other, without gravity; the last joint turns nothing and is held."""
+    """Returns two crossed slides without gravity; the last joint moves nothing."""
     linkage = fj.Linkage(
         "PPR",
         length=[0, 1, 1, 1],
@@ -105,7 +105,7 @@ def two_slides():
 def test_slides_are_controlled_as_fuller_found():
     scene = two_slides()
     found = fj.optimal_efforts(scene, horizon=HORIZON, knots=KNOTS)
-    # The first slide carries everything up, the second all but the first link left.
+    # The first slide moves everything up, the second moves all but link 1 to the left.
     (up, t_up), (left, t_left) = fuller(0.2, 120 / 6), fuller(0.3, 80 / 5)
     assert max(t_up, t_left) < HORIZON
     least = np.sqrt((up + left) / HORIZON)
@@ -133,7 +133,7 @@ def test_scipy_finds_no_better_efforts():
 
 @pytest.mark.parametrize("size", [3, 200])
 def test_steps_within_a_box_are_the_least(size):
-    """What makes a step the least: no slope inside, and none into the box at bounds."""
+    """At a minimum there is no slope inside, and at bounds none into the box."""
     draw = np.random.default_rng(size)
     for damping in (1e-6, 1e-3, 1.0):
         root = draw.normal(size=(2 * size, size)) * draw.uniform(0.01, 10, size)

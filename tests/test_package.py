@@ -1,10 +1,11 @@
-"""The package as users import it: every name is there, and costs nothing until used."""
+"""The package as users import it: names exist, and cost nothing until used."""
 
 import ast
 import importlib
 import inspect
 import json
 import pickle
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -14,6 +15,7 @@ import pytest
 import fdof_jax as fj
 
 FOLDER = Path(fj.__file__).parent
+ROOT = Path(__file__).parents[1]
 
 
 def test_names():
@@ -22,7 +24,7 @@ def test_names():
         there = {}
         exec(f"from {module} import {name}", there)
         expected = there[name]
-        # Found by the first `getattr`, kept for the second.
+        # The first `getattr` finds the name, and keeps it for the second.
         assert getattr(fj, name) is vars(fj)[name] is expected
     assert dir(fj) == sorted([*fj.__all__, "__version__"])
     starred = {}
@@ -40,7 +42,7 @@ OF_0_1 = json.loads((Path(__file__).parent / "names_of_0.1.json").read_text())
 
 @pytest.mark.parametrize("name", OF_0_1)
 def test_what_calls_version_0_1_calls_this_one(name):
-    """The same names, and arguments in the same places; what is new is optional."""
+    """Checks that names and places of arguments are the same; new ones are optional."""
     *module, name_there = name.split(".")
     found = getattr(
         importlib.import_module(".".join(["fdof_jax", *module])), name_there
@@ -95,7 +97,7 @@ def test_no_name_is_hidden_by_a_module():
 
 
 def imported(code):
-    """The names of all modules that a new process has imported after `code`."""
+    """Returns the names of all modules that a new process has imported after `code`."""
     command = [sys.executable, "-c", f"{code}; import sys; print(*sys.modules)"]
     run = subprocess.run(command, capture_output=True, text=True, check=True)
     return set(run.stdout.split())
@@ -106,7 +108,17 @@ def test_the_package_imports_no_jax():
 
 
 def test_simulation_imports_neither_pictures_nor_searches():
-    # Whatever JAX and diffrax need: neither imports one of these today.
+    # JAX and diffrax import none of these themselves.
     modules = imported("import fdof_jax as fj; fj.simulate, fj.sweep, fj.scenes")
     assert "diffrax" in modules
     assert not modules & {"matplotlib", "optax", "scipy"}
+
+
+def test_versions_agree_wherever_they_are_written():
+    assert f"\nversion: {fj.__version__}\n" in (ROOT / "CITATION.cff").read_text()
+    project = (ROOT / "pyproject.toml").read_text()
+    hooks = (ROOT / ".pre-commit-config.yaml").read_text()
+    ruff = re.search(r"ruff-pre-commit\s+rev: v(\S+)", hooks)[1]
+    basedpyright = re.search(r"basedpyright==([\d.]+)", hooks)[1]
+    assert f'"ruff=={ruff}"' in project
+    assert f'"basedpyright=={basedpyright}"' in project

@@ -1,4 +1,4 @@
-"""Curves show the right numbers, labels and units, not pixels."""
+"""Curves show the right numbers, labels and units; pixels are not compared."""
 
 import elements
 import equinox as eqx
@@ -70,7 +70,7 @@ def test_energy_profile_adds_up():
 
 
 def tops(ax: Axes, ts) -> dict[str, np.ndarray]:
-    """The upper edge of each band of a stack."""
+    """Returns the upper edge of each band of a stack."""
     found = {}
     for band in ax.collections:
         x, y = band.get_paths()[0].vertices.T
@@ -83,9 +83,9 @@ MASS, DAMPING, STIFFNESS = 4.0, 3.0, 50.0
 
 
 def lifted(effort: float, count: int = 401) -> tuple[tuple, Solution]:
-    """The first slide swings on a stop, damped and under a constant effort: exactly.
+    """Returns an exact motion: the first slide on a damped stop under an effort.
 
-    The others stand still. All masses move with it.
+    The other joints stand still, and all masses move with the slide.
     """
     damper = JointDamper([DAMPING, 0, 0])
     stops = JointStops([0, -np.inf, -np.inf], np.inf, stiffness=STIFFNESS)
@@ -115,7 +115,7 @@ def test_energy_stack_keeps_its_top_where_energy_is_only_taken_out():
     assert potential.min() == 0 and potential.max() > 0.5
     taken = top - stack["potential"]
     assert taken[0] == 0 and taken[-1] > 0.5 and np.diff(taken).min() > -1e-9
-    # Of the third order at least, Simpson's.
+    # Simpson's rule, of the third order at least.
     forces, few = lifted(0.0, 51)
     coarse = tops(plotting.energy_stack(LIFT, forces, few), few.ts)["taken out"]
     worse = np.abs(coarse - line[0]).max() / np.abs(top - line[0]).max()
@@ -147,7 +147,7 @@ def test_energy_stack_of_a_free_arm_and_of_what_was_reached():
 
 @pytest.mark.slow
 def test_energy_stack_balances_for_all_elements():
-    """Beside a prescribed motion; without one the stack is exact in the tests above."""
+    """Includes a prescribed motion; without one the tests above are exact."""
     arm, start = elements.arm("RPR"), elements.START
     q, qd = elements.MOVE(jnp.zeros(()), arm)
     start = State(
@@ -155,7 +155,7 @@ def test_energy_stack_balances_for_all_elements():
     )
     forces = (*elements.ALL.values(), PrescribedMotion(2, elements.MOVE))
     ts = np.linspace(0, 0.3, 2001)
-    # A step from sample to sample.
+    # One step per sample.
     solution = simulate(arm, start, ts, forces, **elements.SHORT | dict(dt0=ts[1]))
     ax = plotting.energy_stack(arm, forces, solution)
     top, (line,) = tops(ax, solution.ts)["taken out"], values(ax)

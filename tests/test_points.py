@@ -59,7 +59,7 @@ def test_a_wrench_on_the_ground_does_nothing():
 
 
 class Pulse(eqx.Module):
-    """A force for 20 ms, which says when."""
+    """A force for 20 ms that declares its times."""
 
     @property
     def jump_ts(self):

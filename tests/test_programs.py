@@ -1,4 +1,4 @@
-"""Compiled programs: what needs another one, what fails in one, and where they go."""
+"""Compiled programs: when another is needed, how one fails, where they are kept."""
 
 import functools
 import json
@@ -50,7 +50,7 @@ def test_a_program_that_raises_nothing_calls_nothing():
 
 @pytest.fixture
 def uncached():
-    """JAX cannot serialise again what comes out of its persistent cache."""
+    """Turns JAX's persistent cache off: its programs cannot be serialised again."""
     before = jax.config.jax_compilation_cache_dir
     jax.config.update("jax_compilation_cache_dir", None)
     compilation_cache.reset_cache()
@@ -79,7 +79,7 @@ def test_a_program_is_exported_and_serialised(uncached):
 @functools.cache
 def raising():
     def ends(q0, ts):
-        # Another solver than by default, because it compiles sooner.
+        # This solver compiles faster than the default.
         solver = diffrax.Dopri8()
         start = fj.State(q0, START.qd)
         return fj.simulate(ARM, start, ts, solver=solver, max_steps=32).q[-1]
@@ -108,7 +108,7 @@ def test_failures_under_jit_name_the_argument(q0, ts, words):
 
 
 class Fragile(eqx.Module):
-    """A user's own element, with a check that its values are asked for at run time."""
+    """A user's own element, which checks values at run time."""
 
     strength: jax.Array
 
@@ -172,13 +172,13 @@ print(json.dumps({
 
 
 def test_new_numbers_compile_nothing():
-    """In a process of its own: in this one the programs may be compiled already."""
+    """Runs in a new process, as this one may have compiled the programs already."""
     done = subprocess.run(
         [sys.executable, "-c", SCRIPT], capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
     programs = json.loads(done.stdout)
-    # Without the event the test would see nothing.
+    # Without the event the test would count nothing.
     assert any("_solve_padded" in name for name in programs.pop("first"))
     assert programs == {
         "times": [[]] * 5,

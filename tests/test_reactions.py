@@ -1,4 +1,4 @@
-"""Bearing reactions: each link's balance, MuJoCo, and the paper's constraint forces."""
+"""Bearing reactions: balance of each link, MuJoCo, the paper's constraint forces."""
 
 import jax
 import jax.numpy as jnp
@@ -8,7 +8,7 @@ import pytest
 from helpers import random_linkage
 
 import fdof_jax as fj
-from fdof_jax.forces.points import frames_of
+from fdof_jax.linkage.frames import frames
 
 GROUND, TIP = fj.Point(0, 0.3, -0.8), fj.Point(3, 0.5, 0.2)
 SPRING = fj.SpringDamper(GROUND, TIP, stiffness=30.0, damping=2.0, rest_length=0.4)
@@ -27,7 +27,7 @@ def motion(topology, seed=0):
 
 
 def instant(linkage, q, qd, forces):
-    """The reactions at one moment, and the accelerations then."""
+    """Returns the reactions and the accelerations at one moment."""
     result = fj.simulate(linkage, fj.State(q, qd), [0.0])  # the start alone
     reactions = fj.joint_reactions(linkage, forces, result)[0]
     tau = fj.joint_efforts(linkage, forces, result).total[0]
@@ -35,7 +35,7 @@ def instant(linkage, q, qd, forces):
 
 
 def second(function, q, qd, qdd):
-    """The second derivative in time of a function of the positions."""
+    """Returns the second derivative in time of a function of the positions."""
     rate = lambda q, qd: jax.jvp(function, (q,), (qd,))[1]
     arrays = map(jnp.asarray, (q, qd, qdd))
     q, qd, qdd = arrays
@@ -48,7 +48,7 @@ def cross(a, b):
 
 @pytest.mark.parametrize("topology", fj.TOPOLOGIES)
 def test_each_link_is_in_balance(topology):
-    """m a and I alpha are what bearings, loads and weight do, link by link."""
+    """Checks for each link that bearings, loads and weight sum to m a and I alpha."""
     linkage, q, qd = motion(topology)
     forces = SPRING, ACROSS, PUSH, *JOINTS
     reactions, qdd = instant(linkage, q, qd, forces)
@@ -60,7 +60,7 @@ def test_each_link_is_in_balance(topology):
         load
         for element in (SPRING, ACROSS, PUSH)
         for load in element.loads(
-            element.schedule(0.0, linkage), frames_of(linkage, q), qd
+            element.schedule(0.0, linkage), frames(linkage, q), qd
         )
     ]
     weight = np.array([0, -float(linkage.gravity)])
@@ -141,14 +141,14 @@ def test_mujoco_has_the_same_reactions(topology):
 
 @pytest.mark.parametrize("topology", fj.TOPOLOGIES)
 def test_pins_carry_the_actuator(topology):
-    """The loads of its pins are what it does to the equations of motion."""
+    """Checks that the loads of its pins give the actuator's terms of the equations."""
     linkage, q, qd = motion(topology)
     tau = fj.JointEffort([1.0, -2.0, 0.7])(0.0, q, qd, linkage)
     total = tau + ACTUATOR(0.0, q, qd, linkage)
     qdd = fj.forward_dynamics(linkage, q, qd, total, (ACTUATOR,))
     loads = ACTUATOR.loads(0.0, q, qd, qdd, linkage)
-    frames = frames_of(linkage, q)
-    by_loads = sum(np.array(load.efforts(frames)) for load in loads)
+    parts = frames(linkage, q)
+    by_loads = sum(np.array(load.efforts(parts)) for load in loads)
     alone = fj.forward_dynamics(linkage, q, qd, tau + by_loads)
     np.testing.assert_allclose(alone, qdd, rtol=1e-9, atol=1e-9 * np.abs(qdd).max())
 
@@ -167,7 +167,7 @@ def test_a_hanging_arm_weighs_on_its_bearings():
 
 
 class TipLoad(fj.InertialElement):
-    """A point mass at the tip, which says or does not say what carries it."""
+    """A point mass at the tip, which may declare where it is carried."""
 
     mass: float = 2.0
 

@@ -1,4 +1,4 @@
-"""The library against the 50-digit reference scenes."""
+"""The library compared with reference scenes of 50 digits."""
 
 import diffrax
 import jax
@@ -24,7 +24,7 @@ def test_accelerations(name):
     masked = fj.masked_accelerations(r.linkage, r.x, r.xd, r.force)
     assert relative_error(masked, scene["acc0"]) <= bound(name)
     reduced = fj.forward_dynamics(r.linkage, *r.state0, r.tau)
-    # Differences of exact accelerations, where the printed doubles would cancel.
+    # Exact accelerations are subtracted, as the printed doubles would cancel.
     exact = to_joint(scene, [float(a) for a in scene["acc0_str"]])
     assert relative_error(reduced, exact) <= bound(name)
 
@@ -46,7 +46,7 @@ def test_energy(name):
 
 
 def solve(name, rtol=1e-12, atol=1e-12):
-    """Chain coordinates and rates at the scene's output times, and the energies."""
+    """Returns chain coordinates, rates and energies at the scene's output times."""
     scene, r = SCENES[name], load(name)
     times = [state["t"] for state in scene["states"]]
     solution = fj.simulate(
@@ -54,7 +54,7 @@ def solve(name, rtol=1e-12, atol=1e-12):
         r.state0,
         [0, *times],
         r.forces,
-        # Landing on the output times leaves out the interpolation's own error.
+        # Steps end at the output times, which excludes the error of interpolation.
         stepsize_controller=diffrax.ClipStepSizeController(
             diffrax.PIDController(rtol=rtol, atol=atol), step_ts=np.array(times)
         ),
@@ -75,7 +75,7 @@ def test_states(name):
 
 
 def test_inverted_pendulum_falls_at_the_right_rate():
-    """Its deviation from upright grows from the 6e-17 by which pi/2 is rounded."""
+    """The deviation from upright grows from 6e-17, the rounding error of pi/2."""
     states = SCENES["hard-inverted"]["states"]
     x, xd, _ = solve("hard-inverted", rtol=1e-12, atol=1e-16)
     deviation = np.asarray(x)[:, 1::2] - np.pi / 2

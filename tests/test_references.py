@@ -1,4 +1,4 @@
-"""References: tip paths through the inverse kinematics, moves in joint space."""
+"""References: tip paths by inverse kinematics, and moves in joint space."""
 
 import equinox as eqx
 import jax
@@ -26,7 +26,7 @@ TIMINGS = {"travel": fj.Travel(2.0), "laps": fj.Laps(2.0)}
 
 @eqx.filter_jit
 def seen(path, timing, branch, ts):
-    """What a task asks for, and where that puts the tip: one program per path."""
+    """Returns a task's joint positions and tips; one program serves each path."""
     task = fj.TipTask(path, timing, orientation=0.2, branch=branch)
 
     def at(t):
@@ -94,7 +94,7 @@ def test_a_path_behind_the_pivot_is_refused_where_it_is_simulated(x):
 
 
 class Swinging(fj.Path):
-    """To and fro along a wide arc, which is looked at lap by lap."""
+    """A path to and fro along a wide arc, checked lap by lap."""
 
     @property
     def middle(self):

@@ -1,4 +1,4 @@
-"""Sampled control: first order in the period, delay, noise; and the discrete step."""
+"""Sampled control: first order in the period, delay, noise; the discrete step."""
 
 import diffrax
 import jax
@@ -24,14 +24,14 @@ MOVE = fj.JointMove([-0.5, 0.3, 0.2], [0.5, 0.6, -0.4], fj.Travel(1.0))
 # Soft enough for the longest period: the last link is light.
 KP, KD = np.array([100.0, 50.0, 10.0]), np.array([20.0, 10.0, 1.0])
 CONTROL = fj.PDController(KP, KD, np.inf, MOVE)
-# A program that is compiled sooner than that of the default.
+# This solver's program compiles faster than the default.
 SHORT = dict(solver=LoopedDopri8())
 
 
 def test_sampled_control_converges_at_first_order():
     exact = fj.simulate(ARM, START, [0, 0.4], (CONTROL,)).q[-1]
     periods = np.array([4e-3, 2e-3, 1e-3, 5e-4])
-    # As many samples of each period: one program.
+    # Equal numbers of samples for all periods, for one program.
     sampled = lambda p: fj.simulate_sampled(ARM, START, CONTROL, p, 800, **SHORT).q
     errors = [np.abs(sampled(p)[round(0.4 / p)] - exact).max() for p in periods]
     slopes = np.diff(np.log(errors)) / np.diff(np.log(periods))
@@ -44,7 +44,7 @@ def ramp(t, q, qd, linkage):
 
 @pytest.mark.parametrize("delay", [0.0, 0.03])
 def test_efforts_are_held_and_come_late(delay):
-    # Once by the default solver, which takes longer to compile.
+    # One run by the default solver, which takes longer to compile.
     options = {} if delay else SHORT
     motion = fj.simulate_sampled(WHEEL, REST, ramp, 0.1, 5, delay=delay, **options)
     np.testing.assert_allclose(motion.ts, np.arange(6) * 0.1, atol=1e-15)
@@ -80,7 +80,7 @@ def test_a_step_is_a_simulation_under_a_held_effort():
 
 @pytest.mark.slow
 def test_a_step_is_differentiable_and_batched():
-    """As a predictive controller linearises it."""
+    """Linearises the step as a predictive controller does."""
     tau = jnp.array([1.0, -2.0, 0.5])
     step = lambda tau: fj.step(ARM, START, tau, 0.1, **STEPS).qd
     known = lambda tau: step(np.asarray(tau))  # by the program of plain calls
@@ -97,14 +97,14 @@ def test_gains_of_sampled_control_have_gradients():
         control = fj.PDController(factor * KP, KD, np.inf, MOVE)
         return fj.simulate_sampled(ARM, START, control, 0.02, 10, **STEPS).q[-1, 0]
 
-    slope = jax.grad(end)(1.0)
-    difference = (end(1.001) - end(0.999)) / 0.002
-    np.testing.assert_allclose(slope, difference, rtol=1e-6)
+    both = jax.jit(jax.value_and_grad(end))
+    difference = (both(1.001)[0] - both(0.999)[0]) / 0.002
+    np.testing.assert_allclose(both(1.0)[1], difference, rtol=1e-6)
 
 
 @pytest.mark.slow
 def test_a_digital_pid_controller_of_motors():
-    """Its integral by Euler's steps, and the motors' currents go on between samples."""
+    """The integral takes Euler's steps; motor currents go on between samples."""
     pid = fj.PIDController(8.0, 2.0, 6.0, 50.0, Hold(jnp.array([0.0, 0.0, 1.0])))
     motion = fj.simulate_sampled(WHEEL, REST, pid, 0.05, 100, **STEPS)
     integral = 0.0

@@ -1,4 +1,4 @@
-"""Simulation: the paper's figures, order of convergence, and how solves end."""
+"""Simulation: the paper's figures, order of convergence, and endings of solves."""
 
 import diffrax
 import jax
@@ -68,7 +68,7 @@ def test_fig5_conserves_its_energy_and_passes_it_between_links():
 
 @pytest.mark.parametrize("name", ["fig3", "fig5", "fig7-free"])
 def test_default_accuracy_to_two_seconds(name):
-    """With the default solver and tolerance, at times between the steps."""
+    """Uses the default solver and tolerance, at times between the steps."""
     states = [state for state in SCENES[name]["states"] if state["t"] <= 2]
     r = load(name)
     ts = [0, *(state["t"] for state in states)]
@@ -184,7 +184,7 @@ def test_one_time_gives_the_start():
 
 
 def test_a_start_after_many_turns_moves_alike():
-    """Positions are integrated as displacements: an offset costs no accuracy."""
+    """Positions are integrated as displacements, so an offset costs no accuracy."""
     scene = scenes.fig3()
     turns = 2 * np.pi * 1e6
     q = np.array([-0.5, 0.3, 0.2])

@@ -1,4 +1,4 @@
-"""One method, three solvers: those of single arms, of batches, and diffrax's own."""
+"""One method in three solvers: for single arms, for batches, and diffrax's own."""
 
 import diffrax
 import jax

@@ -1,4 +1,4 @@
-"""What stops a solve, what steps land on, in which units tolerances are meant."""
+"""Conditions that stop a solve, times where steps end, and units of tolerances."""
 
 import diffrax
 import equinox as eqx
@@ -48,7 +48,7 @@ def test_outcome_and_time_reached_of_each_member():
 
 
 def test_a_mass_matrix_that_turns_singular_is_named():
-    """A link without inertia of its own: singular where the others line up."""
+    """A link without inertia of its own is singular where the others line up."""
     arm = eqx.tree_at(lambda a: a.inertia, ARM, jnp.array([1 / 12, 0, 0]))
     arm = eqx.tree_at(lambda a: (a.mass, a.com), arm,
                       (jnp.array([1.0, 0, 1]), arm.com.at[2, 0].set(1.0)))  # fmt: skip
@@ -117,7 +117,7 @@ def test_jumps_need_adaptive_steps():
 
 
 def test_tolerances_in_sizes_of_the_arm():
-    """An arm of 1 mm moves as one of 1 m, in 0.03 of the time."""
+    """Checks that an arm of 1 mm moves like one of 1 m, in 0.03 of the time."""
     size = 1e-3
     small = fj.Linkage(
         "RPR", length=[0, size, size, size], com=[[0.5 * size, 0]] * 3, mass=[1] * 3,

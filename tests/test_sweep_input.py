@@ -1,4 +1,4 @@
-"""What a sweep refuses at its door."""
+"""Malformed arguments of a sweep raise errors that name them."""
 
 import functools
 
@@ -11,7 +11,7 @@ from sweep_batch import SETTINGS, TS, members
 
 import fdof_jax as fj
 
-# The door
+# Malformed arguments
 
 
 def refused(name, **changes):
@@ -30,7 +30,7 @@ INPUTS = "linkage, state0, forces"
 
 def test_a_batch_is_expected():
     refused(INPUTS, linkage=ONE, state0=STATE, forces=())
-    # Without axes of theirs, forces are shared.
+    # Forces without a leading axis are shared.
     refused(INPUTS, linkage=ONE, state0=STATE, forces_axes=None)
     empty = jax.tree.map(lambda a: a[:0], (TWO, STATES))
     refused(INPUTS, linkage=empty[0], state0=empty[1], forces=())

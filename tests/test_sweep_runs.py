@@ -1,4 +1,4 @@
-"""How a sweep runs: checkpoints, progress, devices, processes, compilations."""
+"""Runs of a sweep: checkpoints, progress, devices, processes, compilations."""
 
 import os
 import socket
@@ -21,7 +21,7 @@ from fdof_jax.simulation import chunks, integrate
 
 @pytest.fixture
 def solved(monkeypatch):
-    """The chunks solved from here on; a trace alone is none."""
+    """Returns a list of the chunks solved from here on; traced calls are left out."""
     found = []
     original = chunks._solve_chunk
 
@@ -68,7 +68,7 @@ def test_a_checkpoint_serves_no_other_sweep(batch, clean, solved, tmp_path):
 
 
 def test_a_checkpoint_may_be_of_another_chunk(batch, clean, solved, tmp_path):
-    """The chunks of 8 do not take up those of one member that were there before."""
+    """Checks that chunks of 8 members ignore earlier checkpoints of single members."""
     tiny = jax.tree.map(lambda a: a[:CHUNK], batch)
     ones = run(tiny, checkpoint=tmp_path, chunk=1)
     solved.clear()
@@ -115,7 +115,7 @@ np.savez(path, q=solution.q, qd=solution.qd, steps=steps, good=good)
 
 
 def workers(folder, processes, devices):
-    """What each of some processes returns, all devices seen by all of them."""
+    """Returns the results of several processes, each of which sees all devices."""
     with socket.socket() as port:
         port.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{port.getsockname()[1]}"
@@ -147,7 +147,7 @@ def workers(folder, processes, devices):
 
 
 def test_more_devices_and_processes_change_nothing(clean, tmp_path):
-    """Two devices in each of two processes."""
+    """Uses two devices in each of two processes."""
     for answer in workers(tmp_path, processes=2, devices=4):
         assert answer["good"].all()
         np.testing.assert_allclose(answer["q"], clean.q, rtol=1e-8, atol=1e-8)
@@ -170,7 +170,7 @@ def test_other_values_need_no_new_trace(batch, clean, monkeypatch):
     other = run((linkage, fj.State(q + 0.1, qd), forces))
     assert not calls
     assert not np.array_equal(other.q, clean.q)
-    # Fewer members need none either, and a new number of times shows the counting.
+    # Fewer members need no compilation either; a new number of times needs one.
     run(jax.tree.map(lambda a: a[:11], batch))
     assert not calls
     linkage, state0, forces = jax.tree.map(lambda a: a[0], batch)

@@ -1,4 +1,4 @@
-"""Solutions as labelled arrays: the same numbers, with names, units and outcomes."""
+"""Solutions as labelled arrays: equal numbers, with names, units and outcomes."""
 
 import sys
 
@@ -16,7 +16,7 @@ TS = np.linspace(0, 2, 5)
 
 
 def solution(*batch, failed=()) -> fj.Solution:
-    """Without a solve; of a batch, which motions have failed."""
+    """Returns a solution without a solve; for a batch, some motions have failed."""
     q = np.random.default_rng(0).normal(size=(2, *batch, len(TS), 3))
     good = np.ones(batch, bool)
     for place in failed:

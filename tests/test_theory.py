@@ -1,4 +1,4 @@
-"""The formulas of docs/theory.md, in vectors, equal the equations as printed."""
+"""The vector formulas of docs/theory.md equal the printed equations."""
 
 import jax
 import numpy as np
@@ -16,7 +16,7 @@ def random_case(seed):
 
 
 def vectors(linkage, x):
-    """e, c and d as complex numbers, mu, s and J; the index is the link's number."""
+    """Returns e, c and d as complex numbers, mu, s and J, by the link's number."""
     angle = np.array([0, linkage.base_angle, *x[1::2]])
     slide = np.array([0, *x[0::2], 0])
     e = np.exp(1j * angle)

@@ -29,7 +29,7 @@ def test_a_profile_leads_from_start_to_end_and_rests_there(profile):
 @pytest.mark.parametrize(
     "profile, speed, acceleration",
     [
-        # In ways per duration, and per duration squared.
+        # In units of the way per duration, and per duration squared.
         ("harmonic", np.pi / 2, np.pi**2 / 2),
         ("cycloidal", 2.0, 2 * np.pi),
         ("quintic", 15 / 8, 10 / np.sqrt(3)),
@@ -54,7 +54,7 @@ def test_a_shock_is_a_jump_of_the_velocity_at_both_ends():
 @pytest.mark.parametrize("profile", PROFILES)
 @pytest.mark.parametrize("frequency", [2.0, 7.0])
 def test_the_shock_takes_the_load_s_frequency_out(profile, frequency):
-    """A load on a spring, x'' + w^2 x = -a, by its closed integral."""
+    """A load on a spring follows x'' + w^2 x = -a; its integral is in closed form."""
     plain = fj.Travel(1.5, profile=profile)
     shock = float(fj.shock_against(plain, frequency))
     shocked = fj.Travel(1.5, profile=profile, shock=shock)

@@ -1,4 +1,4 @@
-"""sin and cos to 2 ulp, relative, against 50 digits and more."""
+"""sin and cos to 2 ulp, relative, compared with 50 digits and more."""
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +12,7 @@ RANGES = {np.float64: 2.0**20, np.float32: 1500.0}
 
 
 def arguments(dtype, rng):
-    """A dense sweep, tiny angles, and the numbers nearest to multiples of pi/2."""
+    """Returns a dense sweep, tiny angles, and numbers nearest to multiples of pi/2."""
     largest = RANGES[dtype]
     quadrants = np.unique(rng.integers(1, int(largest * 2 / np.pi), 1500))
     quadrants = np.concatenate([np.arange(1, 500), quadrants])

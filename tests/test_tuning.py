@@ -1,4 +1,4 @@
-"""Gain tuning: converges within its bounds, to what no random search beats."""
+"""Gain tuning converges within its bounds; no random search beats its result."""
 
 import equinox as eqx
 import jax
@@ -14,7 +14,7 @@ from fdof_jax.tuning.losses import controller_of, tip_errors
 
 
 def losses_of(scene, gains):
-    """Mean squared tip errors, one per row of gains (n, 2, 3)."""
+    """Returns the mean squared tip error of each row of gains (n, 2, 3)."""
     return np.array([np.sum(residuals_of(scene, row) ** 2) for row in gains])
 
 
@@ -24,11 +24,11 @@ def judged(loss, scene, solution):
 
 
 def residuals_of(scene, gains, loss=tip_errors):
-    """By a plain simulation, whose program is the same for all."""
+    """Returns residuals of a plain simulation, whose program is shared."""
     trial = tuning.with_gains(scene, jnp.asarray(gains))
     ts = np.linspace(0, trial.t1, 1001)
     solution = fj.simulate(trial.linkage, trial.state0, ts, trial.forces)
-    # The time is that of the solution.
+    # The time is the solution's.
     return np.asarray(judged(loss, trial._replace(t1=0.0), solution))
 
 
@@ -63,7 +63,7 @@ def test_tuning_goes_down_to_a_point_where_only_bounds_hold():
     tuned = controller_of(result.scene)
     np.testing.assert_array_equal([tuned.kp, tuned.kd], result.gains)
     assert "gains are at a bound" in result.message
-    # The loss and the tip error are those of a simulation of its own.
+    # The loss and the tip error equal those of a separate simulation.
     loss = losses_of(scene, result.gains[None])[0]
     assert result.loss == pytest.approx(loss, rel=1e-6)
     assert result.tip_error == pytest.approx(loss**0.5, rel=1e-6)
@@ -304,7 +304,7 @@ class TestEnsembles:
 
 
 class MeanSquare(eqx.Module):
-    """A scalar loss."""
+    """A scalar loss, the mean square."""
 
     factor: jax.Array
 
@@ -347,7 +347,7 @@ def test_own_loss_and_a_plain_function_beside_the_controller():
 
 
 class Indexed(eqx.Module):
-    """An effort on one joint, named by an index, with a table of whole numbers."""
+    """An effort on one joint, given by an index, with a table of whole numbers."""
 
     joint: int
     on: bool

@@ -1,4 +1,4 @@
-"""Gain tuning refuses what it cannot tune, in words."""
+"""Gain tuning raises errors for scenes and settings that it cannot tune."""
 
 import jax
 import numpy as np
@@ -53,7 +53,7 @@ def test_malformed_arguments(keywords, message):
     ],
 )
 def test_malformed_scenes(scene):
-    """Without exactly one controller, or not a scene at all."""
+    """Covers values that are no scene, and scenes without exactly one controller."""
     with pytest.raises(ValueError, match="scene|linkage"):
         fj.tune(scene)
 

@@ -12,7 +12,7 @@ from ..checks import real_array
 from ..dynamics import inverse_dynamics
 from ..forces.element import Forces
 from ..linkage.linkage import Linkage
-from .linearization import checked
+from .linearization import checked, with_forces
 
 
 def equilibrium(
@@ -46,10 +46,8 @@ def _rest(linkage: Linkage, forces: Forces, q: Array, t: Array) -> Array:
     still = jnp.zeros(3)
 
     def efforts(q, _):
-        total = -inverse_dynamics(linkage, q, still, still, forces)
-        for element in forces:
-            total = total + element(t, q, still, linkage)
-        return total
+        weight = -inverse_dynamics(linkage, q, still, still, forces)
+        return with_forces(weight, linkage, forces, q, still, t)
 
     # Efforts relative to their rounding errors' scale: stiff controllers converge as
     # exactly as soft springs.

@@ -35,17 +35,18 @@ class Linearization(NamedTuple):
     B: Float[Array, "6 joint"]
 
 
-def _accelerations(
+def with_forces(
+    tau: Array,
     linkage: Linkage,
     forces: tuple[Element, ...],
     q: Array,
     qd: Array,
-    tau: Array,
     t: Array,
 ) -> Array:
+    """Adds the efforts of the elements to `tau`."""
     for element in forces:
         tau = tau + element(t, q, qd, linkage)
-    return forward_dynamics(linkage, q, qd, tau, forces)
+    return tau
 
 
 def checked(linkage: Linkage, forces: Forces) -> tuple[Element, ...]:
@@ -93,7 +94,8 @@ def _linearized(
 ) -> Linearization:
     def rates(y):
         q, qd, tau = jnp.split(y, 3)
-        return jnp.concatenate([qd, _accelerations(linkage, forces, q, qd, tau, t)])
+        tau = with_forces(tau, linkage, forces, q, qd, t)
+        return jnp.concatenate([qd, forward_dynamics(linkage, q, qd, tau, forces)])
 
     slopes = jax.jacfwd(rates)(jnp.concatenate([q, qd, jnp.zeros_like(q)]))
     return Linearization(slopes[:, :6], slopes[:, 6:])

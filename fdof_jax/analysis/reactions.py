@@ -10,18 +10,19 @@ from jaxtyping import Float
 
 from ..dynamics import forward_dynamics
 from ..forces.element import Forces, elements
-from ..forces.points import cross, frames_of
+from ..linkage.frames import cross, frames
 from ..linkage.linkage import Linkage
 from ..mechanics.kinematics import joint_positions, mass_center_velocities, mass_centers
 from ..simulation.simulate import joint_efforts
 from ..simulation.solution import Solution
+from ..xla.array_namespace import plane_vectors
 
 
 def _loads(
     linkage: Linkage, forces: Forces, t: Any, q: Array, qd: Array, qdd: Array
 ) -> tuple[Array, Array]:
     """Forces on the ground and the links, and moments about the ground pivot."""
-    frames = frames_of(linkage, tuple(q))
+    parts = frames(linkage, q)
     force, moment = jnp.zeros(4, complex), jnp.zeros(4)
     for index, element in enumerate(forces):
         loads = element.loads_on_points(t, q, qd, qdd, linkage)
@@ -32,14 +33,10 @@ def _loads(
                 f"{element!r}."
             )
         for point, push, turn in loads:
-            about_pivot = turn + cross(point.place(frames), push)
+            about_pivot = turn + cross(point.place(parts), push)
             force = force.at[point.link].add(push)
             moment = moment.at[point.link].add(about_pivot)
     return force, moment
-
-
-def _complex(vectors: Array) -> Array:
-    return jax.lax.complex(vectors[:, 0], vectors[:, 1])
 
 
 def _reactions(
@@ -48,8 +45,9 @@ def _reactions(
     qdd = forward_dynamics(linkage, q, qd, tau, forces)
     motion = lambda q, qd: mass_center_velocities(linkage, q, qd)
     _, (acceleration, spin_up) = jax.jvp(motion, (q, qd), (qd, qdd))
-    needed = linkage.mass * (_complex(acceleration) + 1j * linkage.gravity)
-    center, joint = (_complex(f(linkage, q)) for f in (mass_centers, joint_positions))
+    needed = linkage.mass * (plane_vectors(acceleration) + 1j * linkage.gravity)
+    center = plane_vectors(mass_centers(linkage, q))
+    joint = plane_vectors(joint_positions(linkage, q))
     turning = linkage.inertia * spin_up + cross(center, needed)
     force, moment = _loads(linkage, forces, t, q, qd, qdd)
     # Each joint carries all links beyond it.

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
-from ..forces.points import dot, frames_of
+from ..linkage.frames import dot, frames
 from ..linkage.linkage import Linkage, check_linkage, compiled
 
 
@@ -59,9 +59,8 @@ def regressor(
     """
 
     def parts(q):
-        frames = frames_of(linkage, tuple(q))
-        start, direction = (jnp.stack(rows[1:]) for rows in frames[:2])
-        return start, direction
+        start, direction, *_ = frames(linkage, q)
+        return start[1:], direction[1:]
 
     def lagrangians(q, qd):
         """Lagrangians of unit parameters, (3, 4)."""

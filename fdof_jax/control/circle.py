@@ -1,26 +1,27 @@
 """The circle of Fig 7."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from ..checks import concrete, real_array, sign
-from ..linkage.linkage import Linkage, check_linkage
+from ..checks import real_array
+from ..forces.part import Condition, Values, field
+from ..linkage.frames import dot
+from ..linkage.linkage import Linkage
 from ..mechanics.inverse_kinematics import (
     known_directions,
     plane_angle,
-    solve_joints,
     unmoved_part,
     whole_turns,
 )
-from ..xla.array_namespace import in_numpy, namespace, sine_and_cosine
-from .reference import Reference, known_reach
+from ..xla.array_namespace import in_numpy, namespace, plane_vector, sine_and_cosine
+from .reference import known_reach
+from .task import TipReference, angle_between
 
 
-class CircleTask(Reference):
+class CircleTask(TipReference):
     """A circle traced by the tip at constant speed; the last link keeps its angle.
 
     A call with `(t, linkage)` returns the joint reference, computed by the closed-form
@@ -52,84 +53,49 @@ class CircleTask(Reference):
     ([-4.75, 2.0], [-4.75, 2.0])
     """
 
-    center: Float[Array, " 2"]
-    radius: Float[Array, ""]
-    period: Float[Array, ""]
-    phase: Float[Array, ""]
-    orientation: Float[Array, ""]
-    branch: Float[Array, ""]
+    center: Values = field((2,), unit="m", default=(-4.0, 2.0))
+    radius: Values = field((), unit="m", minimum=0, default=0.75)
+    period: Values = field((), unit="s", default=5.0)
+    phase: Values = field((), unit="rad", default=np.pi)
+    orientation: Values = field((), unit="rad", default=np.pi / 2)
+    branch: Values = field((), unit="", default=1)
 
-    def __init__(
-        self,
-        center: ArrayLike = (-4.0, 2.0),
-        radius: ArrayLike = 0.75,
-        period: ArrayLike = 5.0,
-        phase: ArrayLike = np.pi,
-        orientation: ArrayLike = np.pi / 2,
-        branch: int = 1,
-    ):
-        self.center = real_array("center", center, (2,))
-        self.radius = real_array("radius", radius, (), minimum=0)
-        self.period = real_array("period", period, ())
-        if (given := concrete(self.period)) is not None and given == 0:
-            raise ValueError("period: expected a time other than 0 s, got 0.")
-        self.phase = real_array("phase", phase, ())
-        self.orientation = real_array("orientation", orientation, ())
-        self.branch = sign("branch", branch)
-
-    @property
-    def evaluates_in_numpy(self) -> bool:
-        """Returns whether `assembly` runs in NumPy; a subclass may not."""
-        return type(self) is CircleTask
+    def conditions(self):
+        yield from super().conditions()
+        yield Condition(self.period != 0, "period", "not zero", (self.period,))
 
     def tip(self, t: ArrayLike) -> Float[Array, " 2"]:
         """The commanded tip position at time `t` [s]: (x, y) [m]."""
-        _, cos, sin = _turned(self, real_array("t", t, ()))
-        return _on_circle(self, cos, sin)
+        _, ray = _ray(self, real_array("t", t, ()))
+        return self.center + jnp.stack([ray.real, ray.imag])
 
-    def assembly(self, t: Array, linkage: Linkage) -> tuple[Array, Array]:
-        """Joint positions, and the root that is 0 at the edge of the reach."""
-        directions = known_directions(linkage, self.orientation)
-        unmoved = unmoved_part(linkage, directions)
-        hub = self.center - unmoved
-        xp = namespace(t, self.phase)
-        turned = _turned(self, xp.stack([t, xp.zeros_like(t)]))
-        bearing, at_start = _bearing(self, turned, hub)
-        bearing = bearing - 2 * np.pi * whole_turns(at_start)
-        _, cos, sin = (values[0] for values in turned)
-        wrist = _on_circle(self, cos, sin) - unmoved
-        return solve_joints(
-            linkage, directions, wrist, bearing, self.orientation, self.branch
-        )
+    def seen(self, t, base):
+        """The wrist and its angle, which starts within a turn.
 
-    def __call__(
-        self, t: ArrayLike, linkage: Linkage
-    ) -> tuple[Float[Array, " joint"], Float[Array, " joint"]]:
-        """Joint positions [m or rad] and velocities [m/s or rad/s] at time `t` [s]."""
-        check_linkage(linkage)
-        t = real_array("t", t, ())
-        positions = lambda t: self.assembly(t, linkage)[0]
-        return jax.jvp(positions, (t,), (jnp.ones_like(t),))
+        The angle of the larger vector, to the centre or from there, is continuous. The
+        smaller one adds at most a quarter turn, over which the arctangent is so too.
+        """
+        xp, hub = namespace(t, self.phase), plane_vector(*self.center) - base
+        angle, ray = _ray(self, xp.stack([t, xp.zeros_like(t)]))
+        around = self.radius**2 > dot(hub, hub)
+        larger = xp.where(around, ray, hub)
+        angle = xp.where(around, angle, plane_angle(hub.imag, hub.real))
+        wrist = hub + ray
+        bearing = angle + angle_between(larger, wrist)
+        return wrist[0], bearing[0] - 2 * np.pi * whole_turns(bearing[1])
 
     def check(self, linkage: Linkage, ts: Array) -> None:
-        """Raises ValueError if the tip leaves the linkage's reach between the times.
-
-        The constructor's checks are repeated first.
-        """
-        CircleTask(
-            self.center, self.radius, self.period, self.phase, self.orientation,
-            int(self.branch),
-        )  # fmt: skip
+        """Raises ValueError if the tip leaves the linkage's reach between the times."""
         task, arm, ts = in_numpy((self, linkage, ts))
         start, end, period = float(ts[0]), float(ts[-1]), float(task.period)
         turn = abs(period)
         # The reach ends first where the wrist is nearest to or farthest from the base,
         # or along a direction that the ground or the last link fixes.
-        hub = task.center - unmoved_part(arm, known_directions(arm, task.orientation))
+        base = unmoved_part(arm, known_directions(arm, task.orientation))
+        hub = plane_vector(*task.center) - base
         directions = np.array(
-            [np.arctan2(hub[1], hub[0]), arm.base_angle,
-             task.orientation - arm.locked[2]]
-        )  # fmt: skip
+            [np.angle(hub), arm.base_angle, task.orientation - arm.locked[2]]
+        )
         lead = np.concatenate([directions, directions + np.pi]) - task.phase
         extremes = start + (lead / (2 * np.pi) * period - start) % turn
         times = np.linspace(start, min(end, start + turn), 257)
@@ -142,34 +108,9 @@ class CircleTask(Reference):
             )
 
 
-# Functions, because each access to a method of an equinox module creates an object.
-
-
-def _turned(circle: CircleTask, t: Array) -> tuple[Array, Array, Array]:
-    """Angle, cosine and sine of the direction from the centre at times `t`."""
+# A function, because each access to a method of an equinox module creates an object.
+def _ray(circle: CircleTask, t: Array) -> tuple[Array, Array]:
+    """Angle and vector from the centre to the tip."""
     angle = circle.phase + 2 * np.pi * t / circle.period
     sin, cos = sine_and_cosine(angle)
-    return angle, cos, sin
-
-
-def _on_circle(circle: CircleTask, cos: Array, sin: Array) -> Array:
-    """Points of the circle, (..., 2)."""
-    return circle.center + circle.radius * namespace(cos).stack([cos, sin], axis=-1)
-
-
-def _bearing(circle: CircleTask, turned: tuple, hub: Array) -> Array:
-    """Angle of hub + radius * (cos, sin), without jumps.
-
-    The angle of the larger of the two vectors is continuous. The smaller one adds at
-    most a quarter turn, over which the arctangent does not jump.
-    """
-    angle, cos, sin = turned
-    xp, radius = namespace(angle, hub), circle.radius
-    along, across = hub[0] * cos + hub[1] * sin, hub[1] * cos - hub[0] * sin
-    square = hub[0] ** 2 + hub[1] ** 2
-    around = radius**2 > square
-    carrier = xp.where(around, angle, plane_angle(hub[1], hub[0]))
-    return carrier + plane_angle(
-        xp.where(around, across, -radius * across),
-        xp.where(around, radius + along, square + radius * along),
-    )
+    return angle, plane_vector(circle.radius * cos, circle.radius * sin)

@@ -8,7 +8,7 @@ import numpy as np
 from jax import Array
 
 from ..checks import real_array
-from ..forces.points import frames_of
+from ..linkage.frames import scalar_frames
 from ..linkage.linkage import Linkage, check_linkage, possible
 from ..mechanics.equations import Scalars, link_constants
 from ..mechanics.rates import required_efforts
@@ -82,7 +82,7 @@ class GravityFeedforward(ModelBased):
 
 def _held(linkage: Linkage, q: Scalars) -> tuple[Array, ...]:
     """The efforts that hold the arm at rest against gravity, in joint order."""
-    start, direction, turning = frames_of(linkage, q)
+    start, direction, *_, revolute = scalar_frames(linkage, q)
     # The mass beyond a joint, and its first moment in x about the ground pivot.
     mass, moment = jnp.zeros(()), jnp.zeros(())
     efforts = []
@@ -94,7 +94,7 @@ def _held(linkage: Linkage, q: Scalars) -> tuple[Array, ...]:
         moment = moment + linkage.mass[k] * center
         # A slide runs across the previous link: it rises as that link runs along x.
         arm = jnp.where(
-            turning[k], moment - mass * start[k + 1].real, mass * direction[k].real
+            revolute[k], moment - mass * start[k + 1].real, mass * direction[k].real
         )
         efforts.append(linkage.gravity * arm)
     return tuple(reversed(efforts))

@@ -10,7 +10,7 @@ from jax import Array
 from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
-from ..checks import called_as, is_traced, real_array
+from ..checks import function, is_traced, real_array
 from ..forces.part import Foreign, Part, default, optional
 from ..linkage.linkage import Linkage, check_linkage
 from ..xla.array_namespace import in_numpy
@@ -26,7 +26,7 @@ class Reference(Part):
     subclass implements `__call__`, or `assembly`; all else has a default:
 
     - `assembly(t, linkage)`: positions, and a root that is 0 at the edge of the reach.
-      The velocities are the positions' rates.
+      The velocities are the exact rates of the positions.
     - `jump_ts`: times at which the motion jumps; steps end there [s].
     - `check(linkage, ts)`: raises ValueError if the arm cannot follow.
     - `tip(t)`: the commanded position of the tip (2,) [m]; by default None.
@@ -41,17 +41,22 @@ class Reference(Part):
     >>> stand = fj.PDController(kp=100, kd=10, limit=30, reference=Stand(0.5))
     """
 
-    def assembly(self, t: Any, linkage: Linkage) -> tuple[Any, Any]:
-        raise NotImplementedError(f"{type(self).__name__} has no `__call__`")
-
     tip = default(lambda self: None)
     period = default(lambda self: None)
-    evaluates_in_numpy = default(lambda self: False)  # of `assembly`
+
+    @default
+    def evaluates_in_numpy(self) -> bool:
+        """Returns whether `assembly` runs in NumPy; a user's subclass may not."""
+        return type(self).__module__.startswith(f"{__package__}.")
+
+    def assembly(self, t: Any, linkage: Linkage) -> tuple[Any, Any]:
+        raise NotImplementedError(f"{type(self).__name__} has no `__call__`")
 
     def __call__(
         self, t: ArrayLike, linkage: Linkage
     ) -> tuple[Float[Array, " joint"], Float[Array, " joint"]]:
         """Joint positions [m or rad] and velocities [m/s or rad/s] at time `t` [s]."""
+        check_linkage(linkage)
         t = real_array("t", t, ())
         positions = lambda t: self.assembly(t, linkage)[0]
         return jax.jvp(positions, (t,), (jnp.ones_like(t),))
@@ -62,13 +67,14 @@ class ForeignReference(Foreign, Reference):
 
     tip = optional("tip")
     period = optional("period")
+    evaluates_in_numpy = False
 
 
 def reference_of(value: Any) -> Reference:
     """Returns a callable as a reference, or raises ValueError."""
     if isinstance(value, Reference):
         return value
-    return ForeignReference(called_as("reference", value, EXPECTED))
+    return ForeignReference(function("reference", value, EXPECTED))
 
 
 def reference_motion(reference: Any, t: Array, linkage: Linkage) -> tuple[Array, Array]:

@@ -1,7 +1,9 @@
 """References along paths of the tip, and moves of the joints."""
 
+from abc import abstractmethod
 from typing import Any
 
+import equinox as eqx
 import jax
 import numpy as np
 from jax import Array
@@ -10,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from ..checks import real_array
 from ..forces.part import Condition, Values, called, field, of_kind
+from ..linkage.frames import cross, dot
 from ..linkage.linkage import Linkage
 from ..mechanics.inverse_kinematics import (
     known_directions,
@@ -18,7 +21,7 @@ from ..mechanics.inverse_kinematics import (
     unmoved_part,
     whole_turns,
 )
-from ..xla.array_namespace import in_numpy, namespace
+from ..xla.array_namespace import in_numpy, namespace, plane_vectors
 from .paths import IN_NUMPY, Path, points_at
 from .reference import Reference
 from .timing import Laps, Travel
@@ -43,18 +46,40 @@ class JointMove(Reference):
     end: Values = field((3,), unit="m or rad")
     travel: Travel = of_kind(Travel)
 
-    @property
-    def evaluates_in_numpy(self) -> bool:
-        """Returns whether `assembly` runs in NumPy; a subclass may not."""
-        return type(self) is JointMove
-
     def assembly(self, t: Array, linkage: Linkage) -> tuple[Array, float]:
         """Joint positions, and 1 as the root: a joint move has no edge of a reach."""
         share = self.travel(t)[..., None]
         return self.start + share * (self.end - self.start), 1.0
 
 
-class TipTask(Reference):
+def angle_between(a: Array, b: Array) -> Array:
+    """Computes the angle from the vector `a` to `b`, in [-pi, pi]."""
+    return plane_angle(cross(a, b), dot(a, b))
+
+
+class TipReference(Reference):
+    """A motion of the tip on which the last link keeps its angle."""
+
+    orientation: eqx.AbstractVar[Values]
+    branch: eqx.AbstractVar[Values]
+
+    def conditions(self):
+        yield Condition(abs(self.branch) == 1, "branch", "1 or -1", (self.branch,))
+
+    @abstractmethod
+    def seen(self, t: Array, base: Array) -> tuple[Array, Array]:
+        """The wrist as seen from the first joint: vectors x + iy, and their angles.
+
+        `base`: what these vectors lack to the tip. The angles are continuous in time.
+        """
+
+    def assembly(self, t, linkage):
+        directions = known_directions(linkage, self.orientation)
+        seen = self.seen(t, unmoved_part(linkage, directions))
+        return solve_joints(linkage, directions, *seen, self.branch)
+
+
+class TipTask(TipReference):
     """A path of the tip on which the last link keeps its angle.
 
     A call with `(t, linkage)` returns the joint reference, computed by the closed-form
@@ -86,25 +111,12 @@ class TipTask(Reference):
     orientation: Values = field((), unit="rad", default=0.0, kw_only=True)
     branch: Values = field((), unit="", default=1, kw_only=True)
 
-    def conditions(self):
-        yield Condition(abs(self.branch) == 1, "branch", "1 or -1", (self.branch,))
-
     def tip(self, t: ArrayLike) -> Float[Array, " 2"]:
         """The commanded tip position at time `t` [s]: (x, y) [m]."""
         return self.path.point(self.timing(real_array("t", t, ())))
 
-    @property
-    def evaluates_in_numpy(self) -> bool:
-        """Returns whether `assembly` runs in NumPy; a subclass may not."""
-        return type(self) is TipTask
-
-    def assembly(self, t: Array, linkage: Linkage) -> tuple[Array, Array]:
-        """Joint positions, and the root that is 0 at the edge of the reach."""
-        q, root, _ = self._solved(t, linkage)
-        return q, root
-
-    def _solved(self, t: Array, linkage: Linkage) -> tuple[Array, Array, Array]:
-        """The `assembly`, and the wrist's angle from the direction of the middle."""
+    def seen(self, t, base):
+        """The wrist and its angle, as the angle from the path's middle and its own."""
         own = not {type(self.path), type(self.timing)} <= IN_NUMPY
         if own and namespace(t) is np:
             with jax.ensure_compile_time_eval():  # also within transformations
@@ -112,17 +124,11 @@ class TipTask(Reference):
             tip: Any = np.asarray(points).reshape(*np.shape(t), 2)
         else:
             tip = self.path.point(self.timing(t))
-        directions = known_directions(linkage, self.orientation)
-        unmoved = unmoved_part(linkage, directions)
-        wrist, hub = tip - unmoved, in_numpy(self.path.middle) - unmoved
-        across = hub[0] * wrist[..., 1] - hub[1] * wrist[..., 0]
-        beside = plane_angle(across, wrist @ hub)
-        middle = plane_angle(hub[1], hub[0])
-        bearing = middle - 2 * np.pi * whole_turns(middle) + beside
-        q, root = solve_joints(
-            linkage, directions, wrist, bearing, self.orientation, self.branch
-        )
-        return q, root, beside
+        wrist = plane_vectors(tip) - base
+        hub = plane_vectors(in_numpy(self.path.middle)) - base
+        middle = plane_angle(hub.imag, hub.real)
+        middle = middle - 2 * np.pi * whole_turns(middle)
+        return wrist, middle + angle_between(hub, wrist)
 
     def check(self, linkage: Linkage, ts: Array) -> None:
         """Raises ValueError if the tip leaves the reach or the wrist's angle jumps.
@@ -135,7 +141,10 @@ class TipTask(Reference):
         if isinstance(self.timing, Laps):  # all laps are alike
             end = min(end, ts[0] + abs(task.timing.period))
         times = np.linspace(ts[0], end, 1000, dtype=ts.dtype)
-        q, _, beside = task._solved(times, arm)
+        directions = known_directions(arm, task.orientation)
+        base = unmoved_part(arm, directions)
+        wrist, bearing = task.seen(times, base)
+        q, _ = solve_joints(arm, directions, wrist, bearing, task.branch)
         inside = np.isfinite(q).all(axis=1)
         if not inside.all():
             raise ValueError(
@@ -143,10 +152,8 @@ class TipTask(Reference):
                 f"{task.orientation:g} rad on branch {task.branch:+g}, got one that "
                 f"leaves it at {times[inside.argmin()]:g} s."
             )
-        directions = known_directions(arm, task.orientation)
-        hub = in_numpy(task.path.middle) - unmoved_part(arm, directions)
-        behind = (np.abs(np.diff(beside)) > np.pi).any()
-        if behind or not hub.any():
+        behind = (np.abs(np.diff(bearing)) > np.pi).any()
+        if behind or plane_vectors(in_numpy(task.path.middle)) == base:
             raise ValueError(
                 "reference: expected a path that does not pass behind the ground "
                 "pivot as seen from its middle, got one that does."

@@ -43,8 +43,8 @@ def _read(file: Any, classes: Sequence[type]) -> Any:
             writer = description["written by"][_FORMAT]
             raise Unreadable(
                 f"expected version {_VERSION} of the format, got "
-                f"{description['version']}: fdof_jax {writer}, which has written it, "
-                "or a newer one reads it"
+                f"{description['version']}: fdof_jax {writer}, which wrote it, "
+                "or a newer version can read it"
             )
 
         def array(index: int) -> np.ndarray:

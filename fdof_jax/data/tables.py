@@ -7,6 +7,7 @@ import numpy as np
 
 from ..checks import instance, known
 from ..linkage.linkage import Linkage
+from ..linkage.topology import real_joints
 from ..simulation.solution import Solution
 
 if TYPE_CHECKING:
@@ -19,14 +20,14 @@ def _package(name: str) -> Any:
         return import_module(name)
     except ImportError as error:
         raise ImportError(
-            f"{name} is not installed: pip install 'fdof_jax[data]' brings it."
+            f"{name} is not installed: pip install 'fdof_jax[data]' installs it."
         ) from error
 
 
 def _joints(linkage: Linkage) -> tuple[list[str], list[str]]:
     """Names and units of the joints; both are neutral if a batch mixes the kinds."""
     names, units = [], []
-    for k, revolute in enumerate(np.asarray(linkage.ef).reshape(-1, 6).T[1::2] > 0.5):
+    for k, revolute in enumerate(real_joints(np.asarray(linkage.ef).reshape(-1, 6).T)):
         mixed = revolute.any() and not revolute.all()
         kind, unit = ("R", "rad") if revolute.any() else ("P", "m")
         names.append(f"{k + 1}" if mixed else f"{kind}{k + 1}")

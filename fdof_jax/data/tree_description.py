@@ -293,7 +293,7 @@ class Restorer:
         # Otherwise JAX would round silently.
         if jax.dtypes.canonicalize_dtype(array.dtype) != array.dtype:
             raise Unreadable(
-                f"expected arrays that JAX takes as it is configured, got {array.dtype}"
+                f"expected arrays that JAX accepts as configured, got {array.dtype}"
                 ': jax.config.update("jax_enable_x64", True) enables it'
             )
         if node["weak"]:

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax import Array
 from numpy.typing import ArrayLike
 
+from ..linkage.frames import cross, dot, scalar_frames
 from ..linkage.linkage import Linkage
 from .element import InertialElement
 from .part import Values, field, value_of
@@ -15,9 +16,6 @@ from .points import (
     Load,
     Point,
     Separation,
-    cross,
-    dot,
-    frames_of,
     length_of,
     over,
 )
@@ -99,7 +97,7 @@ class LinearActuator(InertialElement):
 
     def _bodies(self, linkage: Linkage, q: Array) -> tuple[Array, Array, Array]:
         """Mass centres of cylinder and piston, and the vector between the pins."""
-        frames = frames_of(linkage, tuple(q))
+        frames = scalar_frames(linkage, tuple(q))
         vector = self.ends.vector(frames)
         unit = vector * over(length_of(vector))
         cylinder = self.ends.a.place(frames) + self.com[0] * unit
@@ -120,7 +118,7 @@ class LinearActuator(InertialElement):
         return linkage.gravity * jnp.sum(self.mass * height)
 
     def __call__(self, t, q, qd, linkage):
-        frames = frames_of(linkage, tuple(q))
+        frames = scalar_frames(linkage, tuple(q))
         vector = self.ends.vector(frames)
         length = length_of(vector)
         slopes = jnp.stack(self.ends.slopes(frames, vector)) * over(length)

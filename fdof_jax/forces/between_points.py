@@ -14,6 +14,7 @@ from jaxtyping import Int
 from numpy.typing import ArrayLike
 
 from ..checks import instance
+from ..linkage.frames import scalar_frames
 from ..linkage.linkage import Linkage
 from .part import Values, field, of_kind, value_of
 from .points import (
@@ -21,7 +22,6 @@ from .points import (
     Point,
     PointElement,
     Separation,
-    frames_of,
     length_of,
     over,
     pick,
@@ -52,7 +52,7 @@ class LineElement(PointElement):
         return Load(self.ends.a, pull * vector), Load(self.ends.b, -pull * vector)
 
     def respond(self, scheduled, q, qd, linkage):
-        _, slopes, pull = self._pull(scheduled, frames_of(linkage, q), qd)
+        _, slopes, pull = self._pull(scheduled, scalar_frames(linkage, q), qd)
         return tuple(-pull * slope for slope in slopes)
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
-from ..checks import called_as, concrete, instance, real_array
+from ..checks import concrete, function, instance, real_array
 from ..linkage.linkage import Linkage
 from ..xla.array_namespace import in_numpy
 
@@ -134,7 +134,7 @@ class Part(eqx.Module):
         for declared in dataclasses.fields(self):
             name, about = declared.name, declared.metadata
             if "called" in about:
-                called_as(name, vars(self)[name], about["called"])
+                function(name, vars(self)[name], about["called"])
             if "kind" in about:
                 instance(name, vars(self)[name], about["kind"])
         for name, value, rules in _declared(self):

@@ -18,53 +18,11 @@ from jaxtyping import Complex, Float
 from numpy.typing import ArrayLike
 
 from ..checks import real_array, whole_number
-from ..linkage.coordinates import real_joints
+from ..linkage.frames import Frames, cross, frames, scalar_frames
 from ..linkage.linkage import Linkage
 from ..mechanics.equations import Scalars
-from ..xla.trigonometry import sincos
 from .element import ScalarElement
 from .part import Part, Values, field, of_kind
-
-
-class Frames(NamedTuple):
-    """Starts and directions of the ground and the moving links: four scalars each.
-
-    `turning`: whether the joint before each moving link is revolute.
-    """
-
-    start: list[Array]
-    direction: list[Array]
-    turning: Scalars
-
-
-def frames_of(linkage: Linkage, q: Scalars) -> Frames:
-    """Computes the frames at joint positions."""
-    turning = real_joints(linkage.ef)
-    angle, start = linkage.base_angle, [jnp.zeros((), complex)]
-    direction = []
-    for k, turns in enumerate(turning):
-        direction.append(_direction(angle))
-        # The length A runs along a link, the slide B across it.
-        slide = jnp.where(turns, linkage.locked[k], q[k])
-        step = jax.lax.complex(linkage.length[k], slide)
-        start.append(start[k] + step * direction[k])
-        angle = angle + jnp.where(turns, q[k], linkage.locked[k])
-    return Frames(start, [*direction, _direction(angle)], turning)
-
-
-def _direction(angle: Array) -> Array:
-    sin, cos = sincos(angle)
-    return jax.lax.complex(cos, sin)
-
-
-def dot(a: Array, b: Array) -> Array:
-    """The dot product of two vectors of the plane."""
-    return a.real * b.real + a.imag * b.imag
-
-
-def cross(a: Array, b: Array) -> Array:
-    """The cross product of two vectors of the plane."""
-    return a.real * b.imag - a.imag * b.real
 
 
 def pick(link: Array, choices: list[Array]) -> Array:
@@ -108,7 +66,7 @@ class Point(Part):
 
     def position(self, linkage: Linkage, q: ArrayLike) -> Float[Array, " 2"]:
         """Computes the point's position (x, y) from the ground pivot [m]."""
-        place = self.place(frames_of(linkage, tuple(real_array("q", q, (3,)))))
+        place = self.place(frames(linkage, real_array("q", q, (3,))))
         return jnp.stack([place.real, place.imag])
 
     def place(self, frames: Frames) -> Complex[Array, ""]:
@@ -144,7 +102,7 @@ def work(
     frames: Frames, place: Array, force: Array, moment: Any = 0.0
 ) -> tuple[Array, ...]:
     """Power of a load beyond all joints, per unit of each joint's rate."""
-    rows = zip(frames.turning, frames.start[1:], frames.direction)
+    rows = zip(frames.revolute, frames.start[1:], frames.direction)
     return tuple(
         jnp.where(turns, cross(place - pivot, force) + moment, cross(link, force))
         for turns, pivot, link in rows
@@ -171,13 +129,13 @@ class PointElement(ScalarElement):
         """Returns the loads on points, given the result of `schedule`."""
 
     def respond(self, scheduled, q, qd, linkage):
-        frames = frames_of(linkage, q)
+        frames = scalar_frames(linkage, q)
         efforts = [load.efforts(frames) for load in self.loads(scheduled, frames, qd)]
         return tuple(reduce(add, rows) for rows in zip(*efforts))
 
     def loads_on_points(self, t, q, qd, qdd, linkage):
-        frames = frames_of(linkage, tuple(q))
-        return self.loads(self.schedule(t, linkage), frames, tuple(qd))
+        scheduled = self.schedule(t, linkage)
+        return self.loads(scheduled, frames(linkage, q), tuple(qd))
 
 
 class Separation(Part):
@@ -192,7 +150,7 @@ class Separation(Part):
 
     def length(self, linkage: Linkage, q: Array) -> Array:
         """Computes the points' distance [m], with derivative 0 where they meet."""
-        return length_of(self.vector(frames_of(linkage, tuple(q))))
+        return length_of(self.vector(scalar_frames(linkage, tuple(q))))
 
     def slopes(self, frames: Frames, vector: Array) -> tuple[Array, ...]:
         """Derivatives of length^2 / 2 in the joint positions."""

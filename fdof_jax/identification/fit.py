@@ -145,8 +145,8 @@ def _called(scene_at: SceneAt, parameters: dict[str, Array]) -> Any:
         return scene_at(parameters)
     except KeyError as error:
         raise ValueError(
-            f"start: expected a value for {error}, which scene_at may have asked for, "
-            f"got {list(parameters)}."
+            f"start: expected a value for {error}, which scene_at may use, got "
+            f"{list(parameters)}."
         ) from error
 
 

@@ -120,7 +120,7 @@ def _together(labels: tuple[str, ...], direction: np.ndarray, least: float) -> s
 def _in_words(labels, untold, covariance) -> tuple[str, ...]:
     """Undetermined directions in words, and weak ones by the relative covariance."""
     words = [
-        "Cannot be told from this motion, which does not change with: "
+        "Not determined by this motion, which does not change with: "
         f"{_together(labels, row, 1e-3)}."
         for row in _sparse(untold)
     ]
@@ -128,8 +128,8 @@ def _in_words(labels, untold, covariance) -> tuple[str, ...]:
     for variance, vector in zip(variances[::-1], vectors.T[::-1]):
         if variance > _WEAK**2:
             words.append(
-                f"Hardly told from this motion, to {100 * variance**0.5:.3g} % of its "
-                f"size: {_together(labels, vector, 0.05)}."
+                f"Hardly determined by this motion, to {100 * variance**0.5:.3g} % of "
+                f"its size: {_together(labels, vector, 0.05)}."
             )
     return tuple(words)
 

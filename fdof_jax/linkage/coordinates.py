@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from ..checks import concrete, real_array
 from ..xla.array_namespace import in_numpy, namespace
 from .linkage import Linkage, compiled
-from .topology import pairs_of
+from .topology import pairs_of, real_joints
 
 
 class State(NamedTuple):
@@ -39,11 +39,6 @@ def real_state(name: str, value: Any) -> State:
     except (TypeError, ValueError):
         raise ValueError(f"{name}: expected a State(q, qd), got {value!r}.") from None
     return State(real_array(f"{name}.q", q, (3,)), real_array(f"{name}.qd", qd, (3,)))
-
-
-def real_joints(ef: Array) -> tuple[Array, Array, Array]:
-    """Returns whether the real joint of each pair is revolute."""
-    return ef[1] > 0.5, ef[3] > 0.5, ef[5] > 0.5
 
 
 @compiled(q=(3,), qd=(3,))
@@ -106,9 +101,9 @@ def from_chain(
         real_array("base_angle", base_angle, ()),
     )
     chain, chain_rate, ground = in_numpy(given)
-    ef = jnp.asarray(topology) if pairs is None else pairs
+    ef = jnp.asarray(topology) if pairs is None else pairs.reshape(6)
     xp = namespace(ef, chain, chain_rate, ground)
-    revolute = ef.reshape(3, 2)[:, 1] > 0.5
+    revolute = xp.stack(real_joints(ef))
     slide, turn = chain[0::2], xp.diff(chain[1::2], prepend=ground)
     slide_rate, turn_rate = chain_rate[0::2], xp.diff(chain_rate[1::2], prepend=0)
     held = concrete(xp.where(revolute, slide_rate, turn_rate))

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 
 from ..checks import is_traced, known, real_array
 from .singularity import check_singularity
-from .topology import pairs_of
+from .topology import pairs_of, real_joints
 
 
 class Linkage(eqx.Module):
@@ -133,8 +133,8 @@ def _short(value: Array) -> str:
 
 def joint_names(linkage: Linkage) -> list[str]:
     """Returns the names of the real joints in order, for instance R1, P2, R3."""
-    kinds = np.where(np.asarray(linkage.ef)[1::2] > 0.5, "R", "P")
-    return [f"{kind}{k + 1}" for k, kind in enumerate(kinds)]
+    revolute = real_joints(np.asarray(linkage.ef))
+    return [f"{'R' if turns else 'P'}{k + 1}" for k, turns in enumerate(revolute)]
 
 
 _T = TypeVar("_T")

@@ -3,7 +3,11 @@
 import warnings
 from typing import TYPE_CHECKING
 
+import jax
 import numpy as np
+
+from .frames import frames
+from .topology import real_joints
 
 if TYPE_CHECKING:
     from .linkage import Linkage
@@ -19,45 +23,30 @@ def _least_inertia(linkage: "Linkage", configurations: int) -> np.ndarray:
     3x3 mass matrix (configurations, 3). Scaling to a diagonal of ones makes it free of
     units and sizes. NumPy avoids compilation in the constructor.
     """
-    ef, length, com, mass, inertia, locked, base_angle = (
-        np.asarray(a, dtype=float)
-        for a in (
-            linkage.ef, linkage.length, linkage.com, linkage.mass,
-            linkage.inertia, linkage.locked, linkage.base_angle,
-        )
-    )  # fmt: skip
-    revolute = ef[1::2] > 0.5
-    ratios = np.empty((configurations, 3))
-    random = np.random.default_rng(0)
-    reach = np.abs(length).sum() + np.abs(com).sum() + np.abs(locked[revolute]).sum()
-    for row in ratios:
-        turn = np.where(revolute, random.uniform(-np.pi, np.pi, 3), locked)
-        slide = np.where(revolute, locked, (reach or 1) * random.uniform(-1, 1, 3))
-        angle = base_angle + np.concatenate([[0], np.cumsum(turn)])
-        along = np.exp(1j * angle)  # complex numbers as plane vectors
-        steps = (length[:3] + 1j * slide) * along[:3]
-        origin = np.cumsum(steps)
-        M = np.zeros((3, 3))
-        for n in range(3):
-            centre = origin[n] + (com[n, 0] + 1j * com[n, 1]) * along[n + 1]
-            J = np.where(revolute, 1j * (centre - origin), 1j * along[:3])
-            J[n + 1 :] = 0
-            turns = np.where(revolute, 1.0, 0.0)
-            turns[n + 1 :] = 0
-            M += mass[n] * np.real(np.outer(J.conj(), J)) + inertia[n] * np.outer(
-                turns, turns
-            )
-        # Eigenvalues, because pivots of an elimination lose accuracy near singularity.
-        scale = np.sqrt(np.maximum(np.diag(M), np.finfo(float).tiny))
-        scaled = M / np.outer(scale, scale)
-        for k in range(3):
-            row[k] = np.linalg.eigvalsh(scaled[k:, k:])[0]
-    return ratios
+    linkage = jax.tree.map(lambda a: np.asarray(a, dtype=float), linkage)
+    revolute = np.stack(real_joints(linkage.ef))
+    sizes = linkage.length, linkage.com, linkage.locked[revolute]
+    reach = sum(np.abs(size).sum() for size in sizes)
+    draws = np.random.default_rng(0).uniform(-1, 1, (configurations, 2, 3))
+    q = np.where(revolute, np.pi * draws[:, 0], (reach or 1) * draws[:, 1])
+    start, along, *_ = frames(linkage, q)
+    centre = start[:, 1:] + linkage.com @ np.array([1, 1j]) * along[:, 1:]
+    moved = np.tri(3)  # a joint moves only the links beyond it
+    arm = centre[:, :, None] - start[:, None, 1:]
+    J = moved * np.where(revolute, arm, along[:, None, :3])
+    M = np.einsum("n,cnj,cnk->cjk", linkage.mass, J.conj(), J).real
+    M += np.einsum("n,nj,nk->jk", linkage.inertia, moved * revolute, moved * revolute)
+    # Eigenvalues, because pivots of an elimination lose accuracy near singularity.
+    tiny = np.finfo(float).tiny
+    scale = np.sqrt(np.maximum(np.diagonal(M, axis1=1, axis2=2), tiny))
+    scaled = M / (scale[:, :, None] * scale[:, None])
+    least = [np.linalg.eigvalsh(scaled[:, k:, k:])[:, 0] for k in range(3)]
+    return np.stack(least, axis=1)
 
 
 def check_singularity(linkage: "Linkage") -> None:
     """Rejects linkages that are always singular; warns of those that may become so."""
-    revolute = np.asarray(linkage.ef)[1::2] > 0.5
+    revolute = np.stack(real_joints(np.asarray(linkage.ef)))
     names = "".join("R" if r else "P" for r in revolute)
     best = _least_inertia(linkage, configurations=5).max(axis=0)
     for k in (2, 1, 0):

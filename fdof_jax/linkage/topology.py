@@ -12,6 +12,14 @@ from ..checks import instance, is_traced
 TOPOLOGIES = ("RRR", "RRP", "RPR", "PRR", "RPP", "PRP", "PPR")
 
 
+def real_joints(ef: Any) -> tuple[Any, Any, Any]:
+    """Returns whether the real joint of each pair is revolute.
+
+    The first axis of `ef` holds the existence factors.
+    """
+    return ef[1] > 0.5, ef[3] > 0.5, ef[5] > 0.5
+
+
 def pairs_of(topology: Any) -> np.ndarray | None:
     """Returns (3, 2) existence factors (prismatic, revolute), or None while traced."""
     if isinstance(topology, str):

@@ -16,8 +16,9 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
-from ..linkage.coordinates import real_joints, to_chain
+from ..linkage.coordinates import to_chain
 from ..linkage.linkage import Linkage
+from ..linkage.topology import real_joints
 from ..xla.trigonometry import sincos
 
 Scalars = tuple[Array, ...]

@@ -9,10 +9,10 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from ..checks import concrete, real_array, sign
-from ..linkage.coordinates import real_joints
+from ..linkage.frames import cross, dot, unit_vector
 from ..linkage.linkage import Linkage, check_linkage
+from ..linkage.topology import real_joints
 from ..xla.array_namespace import in_numpy, namespace, plane_vector
-from .kinematics import as_points, unit_vectors
 
 
 def plane_angle(y: Array, x: Array) -> Array:
@@ -35,19 +35,13 @@ def whole_turns(angle: Array) -> Array:
 class Directions(NamedTuple):
     """Directions of the links that do not depend on the tip's position.
 
-    - `th2`, `th3`: angles of links 2 and 3 where they follow from the ground or from
-      the last link's orientation; arbitrary otherwise [rad].
-    - `e1`, `e2`, `e3`, `e4`: unit vectors of the links' angles.
-    - `turn`: unit vector of `locked[1]`, the angle from link 2 to link 3 in RPR arms.
+    - `angle`: angles of the ground and the three links (4,) [rad]. Those of links 2
+      and 3 follow from the ground or from the last link, or are arbitrary.
+    - `vector`: unit vectors x + iy of these angles (4,).
     """
 
-    th2: Array
-    th3: Array
-    e1: Array
-    e2: Array
-    e3: Array
-    e4: Array
-    turn: Array
+    angle: Array
+    vector: Array
 
 
 def known_directions(linkage: Linkage, orientation: Array) -> Directions:
@@ -55,16 +49,15 @@ def known_directions(linkage: Linkage, orientation: Array) -> Directions:
     xp = namespace(linkage, orientation)
     r1, _, r3 = real_joints(linkage.ef)
     lock1, lock2, lock3 = linkage.locked
-    th3_from_tip = orientation - lock3
-    th2 = xp.where(r1, th3_from_tip - lock2, linkage.base_angle + lock1)
-    th3 = xp.where(r3, th2 + lock2, th3_from_tip)
-    # One call for all: sine and cosine are most of the compiled code here.
-    angles = xp.stack([linkage.base_angle, th2, th3, orientation, lock2])
-    return Directions(th2, th3, *unit_vectors(angles))
+    from_tip = orientation - lock3
+    second = xp.where(r1, from_tip - lock2, linkage.base_angle + lock1)
+    third = xp.where(r3, second + lock2, from_tip)
+    angle = xp.stack([linkage.base_angle, second, third, orientation])
+    return Directions(angle, unit_vector(angle))
 
 
 def unmoved_part(linkage: Linkage, directions: Directions) -> Array:
-    """Computes the sum of the ground's and the last link's vectors, (2,).
+    """Computes the sum of the ground's and the last link's vectors, x + iy [m].
 
     No joint moves this part of the tip's position. The rest is the wrist vector, from
     the first joint's start to the last link's start.
@@ -72,7 +65,8 @@ def unmoved_part(linkage: Linkage, directions: Directions) -> Array:
     xp = namespace(linkage, directions)
     r1, _, _ = real_joints(linkage.ef)
     fixed = plane_vector(linkage.length[0], xp.where(r1, linkage.locked[0], 0))
-    return as_points(directions.e1 * fixed + directions.e4 * linkage.length[3])
+    e1, _, _, e4 = directions.vector
+    return e1 * fixed + e4 * linkage.length[3]
 
 
 def solve_joints(
@@ -80,10 +74,9 @@ def solve_joints(
     directions: Directions,
     wrist: Array,
     bearing: Array,
-    orientation: Array,
     branch: Array,
 ) -> tuple[Array, Array]:
-    """Computes joint positions (..., 3) from the wrist vector, NaN if out of reach.
+    """Computes joint positions (..., 3) from the wrist x + iy, NaN if out of reach.
 
     The second result is a root that is 0 just at the edge of the reach, where
     velocities are infinite.
@@ -91,94 +84,60 @@ def solve_joints(
     `bearing` is the direction angle of `wrist`. As an argument it can be continuous
     along a path that winds around the pivot.
 
-    The chain up to the wrist has two free joints, in four kinds: two turning vectors
-    (RRR), a turning frame in which one slide moves (RPR), one turning vector and one
-    slide of known direction (PRR, RRP), two slides (PPR, RPP, PRP). All kinds but the
-    last need one square root, whose sign is the branch.
+    The vectors of links 2 and 3 and the slides add up to the wrist vector. Two of these
+    parts are unknown, in three kinds: two vectors of known lengths (RRR), one vector of
+    known length and one slide of known direction (RRP, PRR, and RPR as seen from link
+    2, where the wrist vector turns), two slides (PPR, RPP, PRP). The first two kinds
+    need a square root, whose sign is the branch.
     """
-    xp = namespace(linkage, wrist, bearing, orientation, branch)
-    r1, r2, r3 = real_joints(linkage.ef)
-    th1 = linkage.base_angle
-    th2_known, th3_known, e1, e2, e3, _, turn = directions
-    _, a2, a3, _ = linkage.length
-    _, lock2, lock3 = linkage.locked
-    two_turning = r1 & r2 & r3
-    framed = r1 & ~r2 & r3
-    two_slides = (r1 ^ r2) & (r2 ^ r3) & ~framed | (~r1 & ~r2) | (~r2 & ~r3)
-    turning_third = ~r1 & r2 & r3  # PRR: link 3 turns; in RRP it is link 2
-
-    w = plane_vector(wrist[..., 0], wrist[..., 1])
-
-    def dot(u: Array, v: Array) -> Array:
-        return u.real * v.real + u.imag * v.imag
-
-    def cross(u: Array, v: Array) -> Array:
-        return u.real * v.imag - u.imag * v.real
+    xp = namespace(linkage, directions, wrist, bearing, branch)
+    r1, r2, r3 = revolute = real_joints(linkage.ef)
+    # Which vectors turn by themselves: link 2's, link 3's, or the wrist's as a whole.
+    turning2, turning3, whole = r1 & r2, r2 & r3, r1 & r3
+    two_turning, framed = whole & r2, whole & ~r2  # RRR, RPR
+    two_slides = ~(turning2 | turning3 | whole)
+    th1, th2, th3, th4 = directions.angle
+    e1, e2, e3, _ = directions.vector
 
     # Vectors of links 2 and 3 in their own frames; a free slide counts as 0.
-    d2 = plane_vector(a2, xp.where(r2, lock2, 0))
-    d3 = plane_vector(a3, xp.where(r3, lock3, 0))
-    reach2, reach3 = dot(d2, d2), dot(d3, d3)
+    free = xp.stack([r2, r3])
+    d = plane_vector(linkage.length[1:3], xp.where(free, linkage.locked[1:], 0))
+    reach2, reach3 = dot(d, d)
+    own2, own3 = plane_angle(d.imag, d.real)
 
-    # Two slides: the rest of the wrist vector is resolved along their directions.
-    rest = w - d2 * e2 - d3 * e3
-    first = 1j * xp.where(r1, e2, e1)
-    second = 1j * xp.where(r3, e2, e3)
-    span = cross(first, second)  # sine of the angle between the slides
+    # What the known vectors leave of the wrist vector, along the directions a and b:
+    # the slides run across a and, if there are two, across b.
+    turns = xp.stack([turning2, turning3])
+    known = xp.where(turns, 0, d * directions.vector[1:3]).sum()
+    rest = xp.where(framed, known, wrist - known)
+    a = xp.where(r1, xp.where(r2, e3, e2), e1)
+    b = xp.where(two_slides, xp.where(r3, e2, e3), 1j * a)
+    span = cross(a, b)  # sine of the angle between two slides
     parallel = xp.abs(span) <= 16 * np.finfo(span.dtype).eps
-    span = xp.where(two_slides, xp.where(parallel, xp.nan, span), 1)
-    slide_first, slide_second = cross(rest, second) / span, cross(first, rest) / span
+    span = xp.where(parallel, xp.nan, span)
 
-    # One turning vector, one slide along i*across: only the turning vector contributes
-    # to the wrist vector's component along `across`.
-    across = xp.where(turning_third, e1, e3)
-    remainder = w - xp.where(turning_third, d2 * e2, d3 * e3)
-    turning = xp.where(turning_third, reach3, reach2)
-    along_turning = dot(across, remainder)
-
-    # RPR: link 3 and its vector as seen from link 2.
-    framed_d3 = d3 * turn
-    distance = a2 + framed_d3.real
-
-    # RRR: the law of cosines, between the vectors of links 2 and 3.
-    square = dot(w, w)
+    # A turning vector is known by its length and its component along a. For two, the
+    # same holds of their product, one conjugated, by the law of cosines.
+    square = dot(wrist, wrist)
     inner = (square - reach2 - reach3) / 2
-
-    radicand = xp.where(
-        two_turning,
-        reach2 * reach3 - inner**2,
-        xp.where(framed, square - distance**2, turning - along_turning**2),
-    )
+    component = dot(a, rest)
+    along = xp.where(two_turning, inner, component)
+    size = xp.where(turning2, reach2, 1) * xp.where(turning3, reach3, 1)
+    size = xp.where(framed, square, size)
     with np.errstate(invalid="ignore"):  # NaN out of reach is intended
-        root = branch * xp.sqrt(xp.where(two_slides, 1, radicand))
-    base = xp.where(
-        two_turning, reach2 + inner, xp.where(framed, distance, along_turning)
-    )
-    angle = plane_angle(root, base)
-    own2, own3 = plane_angle(d2.imag, d2.real), plane_angle(d3.imag, d3.real)
-    turned = xp.where(turning_third, th1, th3_known) + angle
-    th2 = xp.where(
-        two_turning,
-        bearing - angle - own2,
-        xp.where(framed, bearing - angle, xp.where(r1 & r2, turned - own2, th2_known)),
-    )
-    th3 = xp.where(
-        two_turning,
-        th2 + own2 + plane_angle(root, inner) - own3,
-        xp.where(
-            framed, th2 + lock2, xp.where(turning_third, turned - own3, th3_known)
-        ),
-    )
-    slide = dot(1j * across, remainder) - root
-    slide1 = xp.where(two_slides, slide_first, slide)
-    slide2 = xp.where(
-        framed, root - framed_d3.imag, xp.where(r1, slide_first, slide_second)
-    )
-    slide3 = xp.where(two_slides, slide_second, slide)
-    q1 = xp.where(r1, th2 - th1, slide1)
-    q2 = xp.where(r2, th3 - th2, slide2)
-    q3 = xp.where(r3, orientation - th3, slide3)
-    return xp.stack([q1, q2, q3], axis=-1), root
+        root = branch * xp.sqrt(xp.where(two_slides, 1, size - along**2))
+
+    angle = plane_angle(root, along + xp.where(two_turning, reach2, 0))
+    second = xp.where(whole, bearing - angle, xp.where(turning2, th3 + angle, th2))
+    second = second - xp.where(turning2, own2, 0)
+    bend = xp.where(r2, own2 + plane_angle(root, inner) - own3, linkage.locked[1])
+    third = xp.where(whole, second + bend, xp.where(turning3, th1 + angle - own3, th3))
+    slide = dot(b, rest) / span - xp.where(two_slides, 0, root)
+    other = xp.where(two_slides, -component / span, slide)
+    turned = second - th1, third - second, th4 - third
+    slid = slide, xp.where(framed, -slide, xp.where(r1, slide, other)), other
+    q = [xp.where(*joint) for joint in zip(revolute, turned, slid)]
+    return xp.stack(q, axis=-1), root
 
 
 def inverse_kinematics(
@@ -220,10 +179,10 @@ def inverse_kinematics(
     # NumPy computes concrete values, as JAX would compile each single operation.
     arm, point, angle, side = in_numpy((linkage, tip, orientation, side))
     directions = known_directions(arm, angle)
-    wrist = point - unmoved_part(arm, directions)
-    bearing = plane_angle(wrist[1], wrist[0])
+    wrist = plane_vector(*point) - unmoved_part(arm, directions)
+    bearing = plane_angle(wrist.imag, wrist.real)
     bearing = bearing - 2 * np.pi * whole_turns(bearing)
-    q, _ = solve_joints(arm, directions, wrist, bearing, angle, side)
+    q, _ = solve_joints(arm, directions, wrist, bearing, side)
     values = concrete(q)
     if values is not None and not np.isfinite(values).all():
         raise ValueError(

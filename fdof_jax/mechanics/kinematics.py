@@ -5,30 +5,14 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
-from ..linkage.coordinates import real_joints, to_chain
+from ..linkage.frames import frames
 from ..linkage.linkage import Linkage, compiled
-from ..xla.array_namespace import namespace, plane_vector, sine_and_cosine
-
-# Vectors of the plane are complex numbers here: multiplying by exp(i th) turns them,
-# multiplying by i turns them by 90 degrees. Inverse kinematics also calls these helpers
-# with NumPy arrays, and for many points at once, with shapes such as (..., 2).
+from ..xla.array_namespace import namespace
 
 
-def unit_vectors(angle: Array) -> Array:
-    sin, cos = sine_and_cosine(angle)
-    return plane_vector(cos, sin)
-
-
-def as_points(points: Array) -> Array:
-    return namespace(points).stack([points.real, points.imag], axis=-1)
-
-
-def _chain(linkage: Linkage, q: Array) -> tuple[Array, Array, Array]:
-    """Computes slides B1..B3, directions e_1..e_4 and starts of the moving links."""
-    x, _ = to_chain(linkage, q, jnp.zeros(3))
-    e = unit_vectors(jnp.concatenate([linkage.base_angle[None], x[1::2]]))
-    steps = jax.lax.complex(linkage.length[:3], x[0::2]) * e[:3]
-    return x[0::2], e, jnp.cumsum(steps)
+def as_points(vectors: Array) -> Array:
+    """Returns x + iy as points (..., 2)."""
+    return namespace(vectors).stack([vectors.real, vectors.imag], axis=-1)
 
 
 @compiled(q=(3,))
@@ -46,7 +30,7 @@ def joint_positions(
     >>> fj.joint_positions(arm, [0.0, 1.5707963, 0.0]).tolist()
     [[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]]
     """
-    return as_points(_chain(linkage, q)[2])
+    return as_points(frames(linkage, q).start[1:])
 
 
 @compiled(q=(3,))
@@ -62,9 +46,9 @@ def mass_centers(linkage: Linkage, q: Float[Array, " joint"]) -> Float[Array, "l
     >>> fj.mass_centers(arm, [0.0, 1.5707963, 0.0]).tolist()
     [[1.0, 0.0], [1.0, 1.0], [1.0, 2.0]]
     """
-    _, e, start = _chain(linkage, q)
+    start, direction, *_ = frames(linkage, q)
     offset = jax.lax.complex(linkage.com[:, 0], linkage.com[:, 1])
-    return as_points(start + offset * e[1:])
+    return as_points(start[1:] + offset * direction[1:])
 
 
 @compiled(q=(3,), qd=(3,))
@@ -77,14 +61,14 @@ def mass_center_velocities(
 
     **Returns:** one velocity (x, y) [m/s] and one angular velocity [rad/s] per link.
     """
-    slide, e, _ = _chain(linkage, q)
-    _, xd = to_chain(linkage, q, qd)
-    rate = jnp.concatenate([jnp.zeros(1), xd[1::2]])
+    _, e, _, slide, revolute = frames(linkage, q)
+    turning = jnp.cumsum(jnp.where(revolute, qd, 0))
+    rate = jnp.concatenate([jnp.zeros(1), turning])
     # d/dt (A + iB) e: the link turns, and the slide moves across it.
     arm = jax.lax.complex(linkage.length[:3], slide)
-    start = jnp.cumsum(1j * (rate[:3] * arm + xd[0::2]) * e[:3])
+    start = jnp.cumsum(1j * (rate[:3] * arm + jnp.where(revolute, 0, qd)) * e[:3])
     offset = jax.lax.complex(linkage.com[:, 0], linkage.com[:, 1])
-    return as_points(start + 1j * (rate[1:] * offset * e[1:])), rate[1:]
+    return as_points(start + 1j * (turning * offset * e[1:])), turning
 
 
 @compiled(q=(3,))
@@ -100,8 +84,8 @@ def tip_position(linkage: Linkage, q: Float[Array, " joint"]) -> Float[Array, " 
     >>> fj.tip_position(arm, [0.0, 1.5707963, 0.0]).tolist()
     [1.0, 2.0]
     """
-    _, e, start = _chain(linkage, q)
-    return as_points(start[2] + linkage.length[3] * e[3])
+    start, direction, *_ = frames(linkage, q)
+    return as_points(start[3] + linkage.length[3] * direction[3])
 
 
 @compiled(q=(3,))
@@ -119,8 +103,7 @@ def tip_jacobian(
     >>> fj.tip_jacobian(arm, [0.0, 0.0, 0.0]).tolist()  # stretched: no motion along x
     [[0.0, 0.0, 0.0], [3.0, 2.0, 1.0], [1.0, 1.0, 1.0]]
     """
-    _, e, start = _chain(linkage, q)
-    tip = start[2] + linkage.length[3] * e[3]
-    revolute = jnp.stack(real_joints(linkage.ef))
-    columns = jnp.where(revolute, 1j * (tip - start), 1j * e[:3])
+    start, direction, *_, revolute = frames(linkage, q)
+    tip = start[3] + linkage.length[3] * direction[3]
+    columns = 1j * jnp.where(revolute, tip - start[1:], direction[:3])
     return jnp.stack([columns.real, columns.imag, jnp.where(revolute, 1.0, 0.0)])

@@ -192,9 +192,9 @@ def rates(
     return fused(_rates)(c, delta, qd, tau, added)
 
 
-def _rates_jvp(primals, tangents):
+def _change(primals, values, tangents) -> tuple[Scalars, Scalars]:
+    """Tangents of the `values` of `rates`."""
     c, delta, qd, _, added = primals
-    values = rates(*primals)
     by_state, by_tau = _sensitivities(c, delta, qd, values[1], added)
     c_dot, *others, added_dot = tangents
     delta_dot, qd_dot, efforts_dot = map(_dense, others)
@@ -210,7 +210,7 @@ def _rates_jvp(primals, tangents):
         efforts_dot = minus(efforts_dot, demanded)
     for column, effort in zip(by_tau, efforts_dot):
         change = tuple(a + b * effort for a, b in zip(change, column))
-    return values, (qd_dot, change)
+    return qd_dot, change
 
 
 def _dense(tangents: Any) -> Any:
@@ -224,7 +224,10 @@ def _dense(tangents: Any) -> Any:
     return jax.tree.map(filled, tangents)
 
 
-rates.defjvp(_rates_jvp, symbolic_zeros=True)
+@functools.partial(rates.defjvp, symbolic_zeros=True)
+def _rates_jvp(primals, tangents):
+    values = rates(*primals)
+    return values, _change(primals, values, tangents)
 
 
 @jax.custom_jvp
@@ -244,10 +247,10 @@ def rates_and_conditioning(
     return (qd, qdd), loss
 
 
-@rates_and_conditioning.defjvp
+@functools.partial(rates_and_conditioning.defjvp, symbolic_zeros=True)
 def _rates_and_conditioning_jvp(primals, tangents):
     values, loss = rates_and_conditioning(*primals)
-    _, change = jax.jvp(rates, primals, tangents)
+    change = _change(primals, values, tangents)
     return (values, loss), (change, jnp.zeros_like(loss))
 
 

@@ -2,11 +2,11 @@
 
 from typing import NamedTuple
 
-import jax
 import numpy as np
 
-from ..linkage.coordinates import to_chain
-from ..linkage.linkage import Linkage
+from ..linkage.frames import frames
+from ..linkage.linkage import Linkage, check_linkage
+from ..xla.array_namespace import in_numpy
 
 
 class Geometry(NamedTuple):
@@ -24,18 +24,13 @@ class Geometry(NamedTuple):
 
 def geometry(linkage: Linkage, q: np.ndarray) -> Geometry:
     """The `Geometry` of a linkage at joint positions (time, 3)."""
-    x = np.asarray(jax.vmap(lambda q: to_chain(linkage, q, np.zeros(3))[0])(q))
-    angle = np.column_stack([np.full(len(x), linkage.base_angle), x[:, 1::2]])
-    slide = x[:, 0::2]
-    direction = np.exp(1j * angle)
-    along = np.asarray(linkage.length) * direction
-    steps = along[:, :3] + 1j * slide * direction[:, :3]
-    start = np.cumsum(np.column_stack([np.zeros(len(x)), steps]), axis=1)
-    end = start + along
-    com = np.asarray(linkage.com)
+    check_linkage(linkage)
+    linkage = in_numpy(linkage)
+    start, direction, angle, slide, revolute = frames(linkage, np.asarray(q))
+    end = start + linkage.length * direction
+    com = linkage.com
     foot = start[:, 1:] + com[:, 0] * direction[:, 1:]  # mass centre projected on A_n
     center = foot + 1j * com[:, 1] * direction[:, 1:]
-    revolute = np.asarray(linkage.ef)[1::2] > 0.5
 
     points = {}
     for n in range(4):

@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import imsave
 
 from ..control.reference import reference_of
+from ..linkage.topology import real_joints
 from ..simulation.scene import Scene
 from ..simulation.simulate import simulate
 from ..simulation.solution import Solution
@@ -83,7 +84,7 @@ def _told(moved: _Moved, error: np.ndarray) -> str:
         text = f"Tip error: rms {1e3 * np.sqrt(np.mean(error**2)):.3g} mm."
     linkage, controller = moved.scene.linkage, controller_of(moved.scene)
     rows = ""
-    for k, revolute in enumerate(np.asarray(linkage.ef)[1::2] > 0.5):
+    for k, revolute in enumerate(real_joints(np.asarray(linkage.ef))):
         kind = "R" if revolute else "P"
         kp, kd = (
             f"{float(gain[k]):.4g} {unit}"
@@ -199,7 +200,7 @@ def sliders(scenes: Mapping[str, Scene] | None = None) -> Any:
     except ImportError as error:
         raise ImportError(
             "sliders: expected ipywidgets, which pip install 'fdof_jax[notebook]' "
-            "brings."
+            "installs."
         ) from error
     known = {}
     scenes = circle_scenes() if scenes is None else scenes

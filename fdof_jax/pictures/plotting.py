@@ -9,6 +9,7 @@ import warnings
 from collections.abc import Mapping
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -24,6 +25,7 @@ from ..control.pd import PDController
 from ..dynamics import energy, link_energies
 from ..forces.element import Forces, InertialElement, elements
 from ..linkage.linkage import Linkage
+from ..linkage.topology import real_joints
 from ..simulation.simulate import joint_efforts
 from ..simulation.solution import Solution
 from .axes import (
@@ -134,6 +136,11 @@ def _powers(linkage: Linkage, forces: Forces, solution: Solution) -> np.ndarray:
     return np.asarray(powers)
 
 
+@eqx.filter_jit
+def _energies(linkage: Linkage, forces: Forces, q: Any, qd: Any) -> tuple:
+    return jax.vmap(lambda q, qd: energy(linkage, q, qd, forces))(q, qd)
+
+
 def energy_stack(
     linkage: Linkage, forces: Forces, solution: Solution, ax: Axes | None = None
 ) -> Axes:
@@ -158,8 +165,7 @@ def energy_stack(
     """
     ts, q, qd = reached(solution)
     powers = _powers(linkage, forces, solution)[:, : len(ts)]
-    both = jax.vmap(lambda q, qd: energy(linkage, q, qd, forces))(q, qd)
-    kinetic, potential = (np.asarray(each) for each in both)
+    kinetic, potential = map(np.asarray, _energies(linkage, forces, q, qd))
     potential = potential - potential.min()
     put_in, taken_out = (
         cumulative_simpson(part.sum(axis=0), x=ts, initial=0)
@@ -205,7 +211,7 @@ def effort_profile(
     reached(solution)
     efforts = joint_efforts(linkage, forces, solution)
     ts, total, elements = (np.asarray(a) for a in (solution.ts, *efforts))
-    units = np.where(np.asarray(linkage.ef)[1::2] > 0.5, "N m", "N")
+    units = np.where(real_joints(np.asarray(linkage.ef)), "N m", "N")
     panels = []
     for k, unit in enumerate(units):
         symbol = f"$T_{k + 2}$" if unit == "N m" else f"$F_{k + 1}$"

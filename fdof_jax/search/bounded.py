@@ -125,9 +125,7 @@ def reporting(
     def told(number: int, runs: list[Run]) -> None:
         if report is not None:
             going = sum(run.reason is None for run in runs)
-            report(
-                f"{number:4d}  {describe(runs)}, {going} of {len(runs)} runs going on"
-            )
+            report(f"{number:4d}  {describe(runs)}, {going} of {len(runs)} runs active")
 
     return told
 

@@ -75,7 +75,7 @@ def run_tuning(
     """
     earlier: list[TuneResult] = []
     if resume is not None:
-        _say(f"go on from {resume}")
+        _say(f"continue from {resume}")
         saved = load(resume)
         if not isinstance(saved, dict) or set(saved) != {"job", "search", "results"}:
             raise ValueError(

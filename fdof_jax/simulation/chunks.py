@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from ..dynamics import forward_dynamics
 from ..forces.element import elements
-from ..linkage.coordinates import real_joints
+from ..linkage.topology import real_joints
 from .batch_axes import Batch
 from .field import element_effort
 from .simulate import simulate

@@ -6,7 +6,7 @@ agree with `diffrax.Dopri8` up to rounding.
 
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import diffrax
 import equinox as eqx
@@ -36,17 +36,34 @@ class ScheduledTerm(diffrax.ODETerm):
     `schedule(t, args)` computes this argument, for all stages of a step at once.
     `health(t, y, args)` is positive where the equations have a solution and 0 where
     they are singular. `watched_field` takes the arguments of the vector field and
-    returns the rates and their health, NaN where the rates are not finite. Only
-    `UnrolledDopri8` needs `watched_field`.
+    returns the rates and their health, NaN where the rates are not finite.
     """
 
     vector_field: Callable[..., PyTree] = eqx.field(static=True)
     schedule: Callable[[Any, Any], PyTree] = eqx.field(static=True)
     health: Callable[..., Array] = eqx.field(static=True)
-    watched_field: Any = eqx.field(static=True, default=None)
+    watched_field: Callable[..., tuple[PyTree, Array]] = eqx.field(static=True)
 
     def vf(self, t, y, args):
         return self.vector_field(t, y, args, self.schedule(t, args))
+
+
+class ScheduledDopri8(diffrax.AbstractAdaptiveSolver):
+    """What both solvers have in common."""
+
+    term_structure: ClassVar = ScheduledTerm
+
+    def order(self, terms) -> int:
+        return 8
+
+    def func(self, terms, t0, y0, args):
+        return terms.vf(t0, y0, args)
+
+
+def compensated(y0: PyTree, change: PyTree) -> tuple[PyTree, PyTree]:
+    """Returns y0 + change and its rounding error, which the next change includes."""
+    y = jtu.tree_map(lambda a, b: a + b, y0, change)
+    return y, jtu.tree_map(lambda a, b, c: c - (b - a), y0, y, change)
 
 
 def interpolation_weights(theta: Array) -> Array:

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.flatten_util import ravel_pytree
 
 from ..checks import is_traced
 from ..forces.added_inertia import inertial
@@ -17,7 +18,7 @@ from ..linkage.linkage import possible
 from ..mechanics.equations import link_constants, zeros
 from ..xla.callbacks import without_checks
 from ..xla.configuration import small_loops_are_kernels
-from .dopri8 import ScheduledTerm
+from .dopri8 import ScheduledTerm, constant
 from .field import (
     Args,
     health_of,
@@ -34,6 +35,7 @@ from .prescribed import (
     motion_at,
     prescribed,
     start_of,
+    watched_hybrid_field,
 )
 from .solution import Solution
 from .step_wrappers import Watched, bounded, landing_on, undifferentiated
@@ -52,6 +54,7 @@ def _step_for_tangents(t0: Array, args: Args, own: tuple, fraction: float) -> Ar
     hangs at rest. The bound is a fraction of the time scale 1/omega of the fastest mode
     about the start. The trace of the squared linearisation bounds omega^2 in any units.
     """
+    t0, args, own = constant((t0, args, own))
     still = zeros(args.q0)
     scheduled = schedule_of(t0, args)
 
@@ -62,7 +65,7 @@ def _step_for_tangents(t0: Array, args: Args, own: tuple, fraction: float) -> Ar
     linearised = jax.jacfwd(accelerations)(jnp.zeros_like(args.q0))
     omega2 = jnp.sqrt(jnp.abs(jnp.sum(linearised * linearised.T)))
     step = fraction / jnp.sqrt(omega2)
-    return jax.lax.stop_gradient(jnp.where(step > 0, step, jnp.inf))
+    return jnp.where(step > 0, step, jnp.inf)
 
 
 def _batch_solver(forces: tuple[Element, ...]) -> diffrax.AbstractSolver:
@@ -115,7 +118,9 @@ def _integrate(
         term = ScheduledTerm(vector_field, schedule_of, health_of, watched_field)
         start = zeros(q0), tuple(qd0)
     else:
-        term = ScheduledTerm(hybrid_field, schedule_of, health_of_hybrid)
+        term = ScheduledTerm(
+            hybrid_field, schedule_of, health_of_hybrid, watched_hybrid_field
+        )
         start = start_of(motion, args, qd0)
     controller = keywords["stepsize_controller"]
     # Implicit solvers are chosen for stiff modes, which would bound steps too tightly.
@@ -178,7 +183,7 @@ def _integrate(
 
 @eqx.filter_custom_vjp
 def _integrate_reversibly(inputs, solver, keywords) -> Solution:
-    """Integrates a motion that may be differentiated in reverse mode.
+    """Integrates a motion that may be differentiated by `jax.grad`.
 
     Unrolled stages compile differently with and without derivatives, and the replay of
     the backward pass must reproduce the same bits: they serve the plain solve alone.
@@ -188,9 +193,41 @@ def _integrate_reversibly(inputs, solver, keywords) -> Solution:
     return _integrate(solver or _batch_solver(inputs[-1]), inputs, keywords)
 
 
+# Up to so many numbers, tangents cost no more than the adjoint equations (one arm or
+# 256), and compile in half the time.
+_FEW = 12
+
+
+def _few(moving, adjoint) -> bool:
+    """Returns whether tangents in all these numbers serve better than the adjoint.
+
+    Who sets the number of checkpoints wants the adjoint.
+    """
+    leaves = jax.tree.leaves(moving)
+    real = all(jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in leaves)
+    few = sum(leaf.size for leaf in leaves) <= _FEW
+    return real and few and adjoint.checkpoints is None
+
+
+def _with_tangents(motion, moving):
+    """Returns what `motion` returns and the states' tangents in each number."""
+    start, whole = ravel_pytree(moving)
+
+    def along(direction):
+        shifted = lambda numbers: motion(whole(numbers))
+        return jax.jvp(shifted, (start,), (direction,), has_aux=True)
+
+    directions = jnp.eye(len(start), dtype=start.dtype)
+    return jax.vmap(along, out_axes=(None, 0, None))(directions)
+
+
 @_integrate_reversibly.def_fwd
 def _integrate_reversibly_fwd(perturbed, inputs, solver, keywords):
     moving, fixed = eqx.partition(inputs, perturbed)
+    few = _few(moving, keywords["adjoint"])
+    if few:
+        solver = solver or _tangent_solver(inputs[-1])
+        keywords = keywords | {"adjoint": diffrax.ForwardMode()}
 
     def motion(moving):
         inputs = eqx.combine(moving, fixed)
@@ -199,6 +236,9 @@ def _integrate_reversibly_fwd(perturbed, inputs, solver, keywords):
         )
         return (solution.q, solution.qd, solution.own), solution
 
+    if few:
+        states, tangents, solution = _with_tangents(motion, moving)
+        return solution, (tangents, states)
     states, pull_back, solution = eqx.filter_vjp(motion, moving, has_aux=True)
     return solution, (pull_back, states)
 
@@ -207,13 +247,26 @@ def _integrate_reversibly_fwd(perturbed, inputs, solver, keywords):
 def _integrate_reversibly_bwd(
     residuals, cotangent, perturbed, inputs, solver, keywords
 ):
-    pull_back, states = residuals
+    slopes, states = residuals
     wanted = eqx.combine(
         (cotangent.q, cotangent.qd, cotangent.own),
         jax.tree.map(jnp.zeros_like, states),
     )
-    (gradient,) = pull_back(wanted)
-    return gradient
+    moving = eqx.filter(inputs, perturbed)
+    if not _few(moving, keywords["adjoint"]):
+        (gradient,) = slopes(wanted)
+        return gradient
+    start, whole = ravel_pytree(moving)
+
+    def part(weight: Array, tangent: Array) -> Array:
+        weight, tangent = weight.reshape(1, -1), tangent.reshape(len(start), -1)
+        # States that were not reached are NaN, and constant; nor is a weight of 0 to
+        # pick up a tangent that is not finite.
+        unused = (weight == 0) | (tangent == 0)
+        return jnp.where(unused, 0, weight * tangent).sum(axis=1)
+
+    parts = jax.tree.leaves(jax.tree.map(part, wanted, slopes))
+    return whole(jnp.sum(jnp.stack(parts), axis=0))
 
 
 def _opened(inputs):
@@ -227,9 +280,14 @@ def _opened(inputs):
     return linkage, state0, ts, own0, opened
 
 
-@eqx.filter_jit
 def solve(solver, inputs, keywords) -> Solution:
     """Computes the motion for traced inputs: a batch, or with derivatives."""
+    # Within a program, a program of its own would also be traced without derivatives.
+    inside = is_traced(jax.device_put(np.zeros(())))
+    return (_solve if inside else _solve_compiled)(solver, inputs, keywords)
+
+
+def _solve(solver, inputs, keywords) -> Solution:
     adjoint = keywords["adjoint"]
     if isinstance(adjoint, diffrax.RecursiveCheckpointAdjoint):
         return _integrate_reversibly(_opened(inputs), solver, keywords)
@@ -238,6 +296,8 @@ def solve(solver, inputs, keywords) -> Solution:
         solver = _tangent_solver(inputs[-1]) if forward else LoopedDopri8()
     return _integrate(solver, inputs, keywords, derivatives=True)
 
+
+_solve_compiled = eqx.filter_jit(_solve)
 
 # All calls with at most this many output times share one program.
 _FEWEST_TIMES = 512

@@ -8,7 +8,6 @@ it is traced once and leaves out what only other methods need.
 
 from typing import Any, ClassVar, NamedTuple
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -22,7 +21,8 @@ from .dopri8 import (
     STAGES,
     TABLEAU,
     DenseOutput,
-    ScheduledTerm,
+    ScheduledDopri8,
+    compensated,
     constant,
     interpolation_weights,
     verdict,
@@ -52,33 +52,34 @@ class _Step(NamedTuple):
 # different rounding leads to different steps and to a wrong gradient.
 @eqx.filter_jit  # traced once, not at each use in a solve
 @eqx.filter_checkpoint
-def _step(term: Any, t0, t1, y0, lost, args, f0) -> tuple[_Step, Array]:
+def _step(term: Any, t0, t1, y0, lost, args) -> tuple[_Step, Array]:
     # diffrax wraps the term to integrate backward in time too.
     inner, h = term.term, term.contr(t0, t1)
     times = (t0 + (t1 - t0) * jnp.asarray(NODES, t0.dtype)) * term.direction
-    schedule = jax.vmap(inner.schedule, in_axes=(0, None))(times[1:], args)
+    schedule = jax.vmap(inner.schedule, in_axes=(0, None))(times, args)
     lower = jnp.asarray(LOWER, h.dtype)
 
     def stage(rates, row):
         index, t, weights, scheduled = row
         y = jtu.tree_map(lambda a, k: a + h * k, y0, _weighted(weights, rates))
-        rate = inner.vector_field(t, y, args, scheduled)
-        return jtu.tree_map(lambda ks, k: ks.at[index].set(k), rates, rate), None
+        rate, health = inner.watched_field(t, y, args, scheduled)
+        return jtu.tree_map(lambda ks, k: ks.at[index].set(k), rates, rate), health
 
-    rates = jtu.tree_map(lambda k: jnp.zeros(STAGES, k.dtype).at[0].set(k), f0)
-    stages = jnp.arange(1, STAGES), times[1:], lower, schedule
-    rates, _ = jax.lax.scan(stage, rates, stages)
+    # The first rate is that of the last step's end. To evaluate it again costs a
+    # fourteenth; to keep it, a second copy of the equations for the first step.
+    rates = jtu.tree_map(lambda y: jnp.zeros(STAGES, y.dtype), y0)
+    weights = jnp.concatenate([jnp.zeros((1, STAGES), h.dtype), lower])
+    stages = jnp.arange(STAGES), times, weights, schedule
+    rates, healths = jax.lax.scan(stage, rates, stages)
     change = jtu.tree_map(lambda k, c: h * k + c, _weighted(lower[-1], rates), lost)
-    y = jtu.tree_map(lambda a, b: a + b, y0, change)
-    lost = jtu.tree_map(lambda a, b, c: c - (b - a), y0, y, change)
+    y, lost = compensated(y0, change)
     weights = jnp.asarray(TABLEAU.b_error, h.dtype)
     error = jtu.tree_map(lambda k: h * k, _weighted(weights, rates))
     # diffrax overlooks an infinity beside a NaN and finds no next step size.
     last = jtu.tree_map(lambda k: k[-1], rates)
     finite = jnp.isfinite(sum(jtu.tree_leaves((y, last))))
     # If the end is not finite, the health at the start shows why.
-    judged = jtu.tree_map(lambda a, b: jnp.where(finite, a, b), y, y0)
-    health = inner.health(times[-1], *constant((judged, args)))
+    health = jnp.where(finite, healths[-1], healths[0])
     health = jnp.where(finite | (health == 0), health, jnp.nan)
     y = jtu.tree_map(lambda a: jnp.where(finite, a, jnp.nan), y)
     error, lost = constant((error, lost))
@@ -91,31 +92,19 @@ class _Interpolation(DenseOutput):
         return jtu.tree_map(lambda a, k: a + self.step * k, self.y0, change)
 
 
-class LoopedDopri8(diffrax.AbstractAdaptiveSolver):
+class LoopedDopri8(ScheduledDopri8):
     """The method of `diffrax.Dopri8` up to rounding, for a single arm."""
 
-    term_structure: ClassVar = ScheduledTerm
     interpolation_cls: ClassVar = _Interpolation
 
-    def order(self, terms) -> int:
-        return 8
-
     def init(self, terms, t0, t1, y0, args):
-        return self.func(terms, t0, y0, args), jtu.tree_map(jnp.zeros_like, y0)
+        return jtu.tree_map(jnp.zeros_like, y0)
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        # After a jump the stored rates are outdated.
-        f0, lost = solver_state
-        if made_jump is not False:
-            fresh = self.func(terms, t0, y0, args)
-            f0 = jtu.tree_map(lambda a, b: jnp.where(made_jump, a, b), fresh, f0)
-        end, h = _step(terms, t0, t1, y0, lost, args, f0)
+        del made_jump  # no rate is kept from one step to the next
+        end, h = _step(terms, t0, t1, y0, solver_state, args)
         dense_info = dict(y0=y0, step=h, rates=end.rates)
-        last = jtu.tree_map(lambda k: k[-1], end.rates)
         bad = jnp.isnan(end.health) | (end.health == 0)
         imposed, result = verdict(end.health == 0, bad, h)
         error = jtu.tree_map(lambda e: jnp.where(bad, imposed, e), end.error)
-        return end.y, error, dense_info, (last, end.lost), result
-
-    def func(self, terms, t0, y0, args):
-        return terms.vf(t0, y0, args)
+        return end.y, error, dense_info, end.lost, result

@@ -134,6 +134,13 @@ def hybrid_field(t, y, args, schedule) -> tuple[Any, ...]:
     return (*moving, acting.own_rates) if own else moving
 
 
+def watched_hybrid_field(t, y, args, schedule) -> tuple[tuple[Any, ...], Array]:
+    """Rates of `hybrid_field` and their health, as in `field.watched_field`."""
+    rates, health = hybrid_field(t, y, args, schedule), health_of_hybrid(t, y, args)
+    finite = jnp.isfinite(sum(jax.tree.leaves(rates)))
+    return rates, jnp.where(finite | (health == 0), health, jnp.nan)
+
+
 def health_of_hybrid(t, y, args) -> Array:
     """Health of the driven joints' equations, as in `field.health_of`."""
     motion = prescribed(args.forces)

@@ -10,7 +10,7 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from ..checks import called_as, concrete, real_array, whole_number
+from ..checks import concrete, function, real_array, whole_number
 from ..forces.element import Forces, ScalarElement, element_of, elements
 from ..forces.joints import JointEffort
 from ..linkage.coordinates import State, real_state
@@ -139,8 +139,8 @@ def simulate_sampled(
     """
     check_linkage(linkage)
     forces = elements("forces", forces)
-    control = called_as("control", control, "a callable (t, q, qd, linkage) -> tau")
-    control = element_of(control)
+    expected = "a callable (t, q, qd, linkage) -> tau"
+    control = element_of(function("control", control, expected))
     period = real_array("period", period, (), above=0)
     t0 = real_array("t0", t0, ())
     whole_number("samples", samples, 1)

@@ -74,7 +74,7 @@ def stacked(scenes: Sequence[Any], name: str = "scenes") -> Any:
             np.shape, other[0]
         ) != jax.tree.map(np.shape, first[0]):
             raise ValueError(
-                f"{name}[{index}]: expected one like {name}[0] but for numbers, got "
+                f"{name}[{index}]: expected one like {name}[0] except for numbers, got "
                 f"{scenes[index]!r} and {scenes[0]!r}."
             )
     rows = [first[0], *(other[0] for other in others)]

@@ -81,6 +81,7 @@ def sensitivities(
     structure = jax.tree.structure(motion_of(z)[1])
     directions = jnp.eye(z.size, dtype=z.dtype)
 
+    @jax.jit  # traced once, not at each use by the solver
     def field(t, state, z):
         def rates(row, z):
             args, _ = motion_of(z)

@@ -11,9 +11,10 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from ..checks import (
-    concrete,
+    increasing,
     instance,
     is_traced,
+    place_of,
     real_array,
     whole_number,
 )
@@ -159,11 +160,7 @@ def simulate(
     check_linkage(linkage)
     state0 = real_state("state0", state0)
     ts = real_array("ts", ts, (None,))
-    if ts.size == 0:
-        raise ValueError("ts: expected at least one time, got none.")
-    times = concrete(ts)
-    if times is not None and not (np.diff(times) > 0).all():
-        raise ValueError(f"ts: expected increasing times, got {times.tolist()[:20]}.")
+    increasing("ts", ts)
     forces = elements("forces", forces)
     solver, keywords = solve_options(
         solver,
@@ -301,6 +298,6 @@ def _efforts(
     if (motion := prescribed(forces)) is not None:
         demand = lambda *row: prescribed_effort(linkage, forces, *row)
         demanded = jax.vmap(demand)(*motion_rows, jnp.sum(stacked, axis=0))
-        place = [element is motion for element in forces].index(True)
+        place = place_of(motion, forces)
         stacked = stacked.at[place].set(demanded)
     return Efforts(jnp.sum(stacked, axis=0), stacked)

@@ -12,8 +12,9 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from ..checks import concrete, instance, is_traced, real_array
-from ..linkage.coordinates import State, real_joints
+from ..linkage.coordinates import State
 from ..linkage.linkage import Linkage, check_linkage
+from ..linkage.topology import real_joints
 from .step_wrappers import Adaptive, with_pid
 
 # Rounding keeps float32 from meeting a tighter relative or absolute tolerance.

@@ -18,7 +18,7 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
-from ..checks import concrete, instance, is_traced, real_array, whole_number
+from ..checks import increasing, instance, is_traced, real_array, whole_number
 from ..forces.element import Forces, elements
 from ..linkage.coordinates import State
 from ..linkage.linkage import Linkage
@@ -33,7 +33,7 @@ def _traced(batch: Batch, ts: Array, settings: dict, chunk: int) -> Solution:
     moving, shared = batch.split()
     order = jnp.lexsort(expected_work(ts[0], moving, shared)[::-1])
 
-    def in_chunks(moving, shared):
+    def solved(moving, shared):
         return jax.lax.map(
             lambda member: motion_of(settings, ts, member, shared, None),
             moving,
@@ -53,11 +53,11 @@ def _traced(batch: Batch, ts: Array, settings: dict, chunk: int) -> Solution:
     moving = jax.tree.map(lambda leaf: jnp.asarray(leaf)[order], moving)
     # A first solve finds the members that fail. In the differentiated solve the first
     # good member replaces them, because NaN would spoil derivatives of shared arrays.
-    frozen = in_chunks(*where(False, (moving, shared)))
+    frozen = solved(*where(False, (moving, shared)))
     good = frozen[-1] == diffrax.RESULTS.successful
     source = jnp.where(good, jnp.arange(batch.size), jnp.argmax(good))
     moving, shared = where(jnp.any(good), (moving, shared))
-    *states, _, _ = in_chunks(jax.tree.map(lambda leaf: leaf[source], moving), shared)
+    *states, _, _ = solved(jax.tree.map(lambda leaf: leaf[source], moving), shared)
     states = jax.tree.map(
         lambda a, b: jnp.where(good.reshape(-1, *[1] * (a.ndim - 1)), a, b),
         tuple(states),
@@ -125,9 +125,7 @@ def sweep(
     except (TypeError, ValueError):
         raise ValueError(f"state0: expected a State(q, qd), got {state0!r}.") from None
     ts = real_array("ts", ts, (None,))
-    times = concrete(ts)
-    if times is not None and not (times.size and (np.diff(times) > 0).all()):
-        raise ValueError(f"ts: expected increasing times, got {times.tolist()[:20]}.")
+    increasing("ts", ts)
     elements("forces", forces)
     whole_number("chunk", chunk, 1)
     solver, settings = solve_options(

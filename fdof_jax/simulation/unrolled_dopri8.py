@@ -11,7 +11,6 @@ linearises the vector field at all stages at once.
 from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -27,7 +26,8 @@ from .dopri8 import (
     NODES,
     TABLEAU,
     DenseOutput,
-    ScheduledTerm,
+    ScheduledDopri8,
+    compensated,
     constant,
     interpolation_weights,
     verdict,
@@ -92,8 +92,7 @@ def _unrolled(fields, times, h, y0, lost, args, schedule, f0) -> tuple[_Step, Ra
         y = _sum(y0, _scaled(h, _combine(row, rates)))
         rates.append(field(times[stage], y, args, _at(stage, schedule)))
     increment = _sum(_scaled(h, _combine(LOWER[-1], rates)), lost)
-    y = _sum(y0, increment)
-    lost = jtu.tree_map(lambda a, b, c: c - (b - a), y0, y, increment)
+    y, lost = compensated(y0, increment)
     error = _scaled(h, _combine(TABLEAU.b_error, rates))
     # diffrax overlooks an infinity beside a NaN and finds no next step size.
     poison = 0 * sum(jtu.tree_leaves(y))
@@ -209,7 +208,7 @@ class _Interpolation(DenseOutput):
         return _interpolate(self.y0, self.step, self.rates, theta)
 
 
-class UnrolledDopri8(diffrax.AbstractAdaptiveSolver):
+class UnrolledDopri8(ScheduledDopri8):
     """The method of `diffrax.Dopri8` up to rounding, for large batches.
 
     `for_tangents`: whether to compile for forward-mode derivatives.
@@ -217,11 +216,7 @@ class UnrolledDopri8(diffrax.AbstractAdaptiveSolver):
 
     for_tangents: bool = eqx.field(static=True, default=False)
 
-    term_structure: ClassVar = ScheduledTerm
     interpolation_cls: ClassVar = _Interpolation
-
-    def order(self, terms) -> int:
-        return 8
 
     def init(self, terms, t0, t1, y0, args):
         return self._start(terms, t0, y0, args), jtu.tree_map(jnp.zeros_like, y0)
@@ -236,9 +231,8 @@ class UnrolledDopri8(diffrax.AbstractAdaptiveSolver):
         return term.watched_field(t, y0, args, term.schedule(t, args))
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        # After a jump the stored rates are outdated.
         start, lost = solver_state
-        if made_jump is not False:
+        if made_jump is not False:  # the stored rates are outdated after a jump
             fresh = self._start(terms, t0, y0, args)
             start = jtu.tree_map(lambda a, b: jnp.where(made_jump, a, b), fresh, start)
         f0, health = start
@@ -249,6 +243,3 @@ class UnrolledDopri8(diffrax.AbstractAdaptiveSolver):
         imposed, result = verdict(health == 0, bad, h)
         error = jtu.tree_map(lambda e: jnp.where(bad, imposed, e), end.error)
         return end.y, error, dense_info, state, result
-
-    def func(self, terms, t0, y0, args):
-        return terms.vf(t0, y0, args)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ..checks import instance, is_traced, real_array
+from ..checks import instance, is_traced, place_of, real_array
 from ..control.reference import reference_of
 from ..forces.element import elements
 from ..linkage.coordinates import real_state
@@ -27,7 +27,7 @@ SAMPLES = 1001
 def with_gains(scene: Scene, gains: Array) -> Scene:
     """The scene with the rows of `gains` as its controller's kp and kd."""
     controller = controller_of(scene)
-    index = [force is controller for force in scene.forces].index(True)
+    index = place_of(controller, scene.forces)
     controller = eqx.tree_at(lambda c: (c.kp, c.kd), controller, (gains[0], gains[1]))
     forces = (*scene.forces[:index], controller, *scene.forces[index + 1 :])
     return scene._replace(forces=forces)

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from ..analysis.tracking import tip_deviation
-from ..checks import instance, real_array, whole_number
+from ..checks import instance, place_of, real_array, whole_number
 from ..control.model_based import ComputedTorque
 from ..control.pd import PDController
 from ..control.reference import reference_of
@@ -168,8 +168,8 @@ def _check(scene: Any, horizon: Any) -> float:
     limit = np.asarray(controller.limit)
     if not np.isfinite(limit).all():
         raise ValueError(
-            "scene: expected finite limits of its controller, as the best efforts "
-            f"without limits have none either, got {limit.tolist()}."
+            "scene: expected finite limits of its controller, as unlimited efforts "
+            f"have no best, got {limit.tolist()}."
         )
     if reference_of(controller.reference).tip is None:
         raise ValueError(
@@ -265,7 +265,7 @@ def optimal_efforts(
     if not runs:
         raise RuntimeError(
             "optimal_efforts: the simulation fails with the efforts of every first "
-            "guess; take a shorter horizon."
+            "guess; use a shorter horizon."
         )
     run = min(runs, key=lambda run: run.best.loss)
     efforts = limit * run.best.z.reshape(-1, 3)
@@ -289,9 +289,7 @@ def _efforts_at(times: np.ndarray, scene: Scene, solution: Solution) -> np.ndarr
     """Efforts of a scene's controller along its motion, (time, 3)."""
     controller = controller_of(scene)
     efforts = joint_efforts(scene.linkage, scene.forces, solution).elements
-    mine = np.asarray(
-        efforts[[force is controller for force in scene.forces].index(True)]
-    )
+    mine = np.asarray(efforts[place_of(controller, scene.forces)])
     return np.stack([np.interp(times, solution.ts, column) for column in mine.T], 1)
 
 

@@ -294,7 +294,7 @@ def _message(scene, run, history, lower, upper) -> str:
     for joint in np.flatnonzero(share > _MOSTLY):
         parts.append(
             f"{names[joint]} is at its limit for {100 * share[joint]:.4g} % of the "
-            "time, so its gains have next to no effect"
+            "time, so its gains have hardly any effect"
         )
     return "; ".join(parts)
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..checks import keywords_as, one_of, real_array, whole_number
+from ..checks import function, keywords_as, one_of, real_array, whole_number
 from ..search.bounded import Row, Run, minimise, reporting
 from ..search.lanes import Lanes
 from ..search.methods import METHODS
@@ -63,9 +63,7 @@ def _search(
     draw = np.random.default_rng(whole_number("seed", seed, 0))
     told = reporting(report, _best_so_far)
     for scene, loss in zip(scenes, losses):
-        if not callable(loss) or isinstance(loss, type):
-            raise ValueError(f"loss: expected a callable, got {loss!r}.")
-        check_tuned("scene", scene, loss)
+        check_tuned("scene", scene, function("loss", loss))
     boxes = [bounds_of(scene, factor, bounds) for scene in scenes]
     if ensemble is None:
         members = [[scene] for scene in scenes]
@@ -109,7 +107,7 @@ def _failure(members: list[Scene], first: Row, ensemble: bool) -> ValueError:
     if failing.size == 0:
         return ValueError(
             "loss: expected finite numbers, not negative if only one, with finite "
-            "derivatives, got a loss that is not so at the scene's own gains."
+            "derivatives, got others at the scene's own gains."
         )
     index = int(failing[0])
     name = f"ensemble[{index}]" if ensemble else "scene"

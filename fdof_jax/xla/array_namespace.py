@@ -42,3 +42,8 @@ def plane_vector(x: Any, y: Any) -> Any:
     """Returns x + iy."""
     # JAX would compute and differentiate a product with 1j.
     return jax.lax.complex(x, y) if namespace(x, y) is jnp else x + 1j * y
+
+
+def plane_vectors(points: Any) -> Any:
+    """Returns x + iy of points (..., 2)."""
+    return plane_vector(points[..., 0], points[..., 1])

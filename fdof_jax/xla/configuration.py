@@ -75,7 +75,7 @@ def _compile_small_loops_as_kernels() -> None:
         os.environ["XLA_FLAGS"] = f"{flags} {_FLAG}".strip()
         return
     warnings.warn(
-        "configure: XLA could not be told to compile small loops as one kernel, so "
+        "configure: XLA could not be set to compile small loops as one kernel, so "
         f"single arms are simulated more slowly: {reason}.",
         stacklevel=3,  # the line that calls configure
     )

@@ -1,6 +1,6 @@
-"""All public functions and their arguments, and which values are valid.
+"""All public functions and their arguments, with checks of which values are valid.
 
-What is valid is said here again, argument by argument, for `garbage` to compare with.
+The checks repeat the library's rules argument by argument, for `garbage` to compare.
 """
 
 import dataclasses
@@ -13,7 +13,7 @@ import numpy as np
 
 import fdof_jax as fj
 
-# Valid arguments, of which each call replaces one
+# Valid arguments; each call replaces one of them
 
 LINKS = dict(
     length=[0, 1, 1, 1], com=[[0.5, 0]] * 3, mass=[1] * 3, inertia=[1] * 3
@@ -45,11 +45,11 @@ def sweep(
     return fj.sweep(linkage, state0, ts, forces, **{**SETTINGS, **changes})
 
 
-# What is valid
+# Checks of valid values
 
 
 def numbers(value: Any) -> np.ndarray | None:
-    """Real numbers as float64, None if these are none."""
+    """Returns real numbers as float64, or None if the value is none."""
     try:
         array = np.asarray(value)
         if array.dtype.kind not in "iuf":
@@ -74,7 +74,7 @@ def array_of(*shape, minimum=-np.inf, above=-np.inf, finite=True, broadcast=Fals
 
 
 def chain_rates(value):
-    """Of an RRR: no fictitious slide moves, but for rounding."""
+    """Returns whether an RRR's fictitious slides stand still, apart from rounding."""
     if not array_of(6)(value):
         return False
     rates = np.abs(numbers(value))
@@ -134,7 +134,7 @@ class Argument:
     call: Callable[[Any], Any]
     valid: Callable[[Any], bool]
     shape: tuple = ()
-    # Valid values may be refused, by name, for what they mean: a point out of reach.
+    # Valid values may be rejected by name for their meaning: a point out of reach.
     may_refuse: bool = False
     # Valid values are not tried: each would compile a program of its own.
     only_invalid: bool = False

@@ -1,11 +1,11 @@
-"""Random arms, states and arguments: nothing may be silently wrong, hang or crash.
+"""Random arms, states and arguments: no silent errors, hangs or crashes.
 
-`python -m tests.hard.fuzz --cases 10000` draws cases of three kinds and prints what
-came of them; `test_fuzz.py` runs 300 in pytest.
+`python -m tests.hard.fuzz --cases 10000` draws cases of three kinds and prints their
+outcomes; `test_fuzz.py` runs 300 in pytest.
 
-A case comes to a named outcome or raises `Failure`. Ill-conditioned arms are judged by
-what rounding alone can do to them: the bounds are computed by the oracle, at the case,
-from the sizes of the terms that a computation in float64 has to add up.
+A case ends with a named outcome or raises `Failure`. Ill-conditioned arms are judged by
+the effect of rounding alone. The oracle computes the bounds at the case, from the sizes
+of the terms that a computation in float64 adds up.
 """
 
 import argparse
@@ -39,7 +39,7 @@ KINDS: dict[str, tuple[st.SearchStrategy, Callable[[Any, Report], str], float]] 
 
 
 def check(kind: str, case: Any, report: Report) -> None:
-    """Run one case; raise `Failure` for whatever is not a named outcome."""
+    """Runs one case; raises `Failure` unless it ends with a named outcome."""
     before = time.process_time()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # arms that may be singular somewhere
@@ -57,7 +57,7 @@ def check(kind: str, case: Any, report: Report) -> None:
 
 
 def run(kind: str, cases: int, report: Report, *, seed: int | None = None) -> None:
-    """Draw cases of a kind; without a seed always the same ones, and raise failures."""
+    """Draws cases of a kind, always the same ones without a seed; raises failures."""
 
     def one(case):
         try:

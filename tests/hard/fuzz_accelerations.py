@@ -1,4 +1,4 @@
-"""Accelerations of random arms, against 50 digits and what rounding can do to them."""
+"""Accelerations of random arms, against 50 digits and bounds of rounding."""
 
 import math
 
@@ -17,11 +17,11 @@ UNRESOLVED = 0.1
 
 
 def resolution(a: oracle.Acceleration) -> float:
-    """The share of the acceleration that rounding takes, to first order.
+    """Returns the relative rounding error of the acceleration, to first order.
 
-    Every entry of M is wrong by some roundings of the product of its joints' levers,
-    so the relative error of M^-1 is that times M^-1 scaled by the levers: about
-    eps / min rho if no lengths cancel, eps / (rho_1 rho_2) at worst.
+    Every entry of M is wrong by some roundings of the product of its joints'
+    levers. The relative error of M^-1 is that times M^-1 scaled by the levers:
+    about eps / min rho if no lengths cancel, and eps / (rho_1 rho_2) at worst.
     """
     if a.qdd is None:
         return math.inf
@@ -36,9 +36,10 @@ def resolution(a: oracle.Acceleration) -> float:
 def rounding_bound(a: oracle.Acceleration) -> list[float]:
     """|M^-1| (|terms of tau - bias| + |terms of M| |qdd|) eps times some roundings.
 
-    Holds for every computation whose sums are made of these terms, among them the
-    solution without pivoting of a positive definite system. An absolute angle is right
-    to an ulp of the angles it is the sum of, hence `angles`.
+    The bound holds for every computation whose sums consist of these terms, for
+    instance the solution of a positive definite system without pivoting. An
+    absolute angle is right to an ulp of the angles that it is the sum of, hence
+    `angles`.
     """
     assert a.qdd is not None
     carried = sum(s * abs(float(x)) for s, x in zip(a.levers, a.qdd))
@@ -72,7 +73,7 @@ def check_accelerations(scene: Scene, report: Report) -> str:
     real = [joint == "R" for joint in arm.topology]
     if np.isfinite(xdd).all():
         still = np.where(real, slide, turn)
-        # What the terms alone would accelerate, too: they may cancel.
+        # The terms may cancel, so the accelerations by each of them count too.
         terms = [f / s**2 for f, s in zip(exact.efforts, exact.levers)]
         size = max(*terms, np.abs(xdd).max())
         if (np.abs(still) > ROUNDINGS * EPS * size).any():
@@ -85,7 +86,7 @@ def check_accelerations(scene: Scene, report: Report) -> str:
 
 
 def _told_ill_conditioned(linkage, scene: Scene, exact) -> bool:
-    """Whether `inertia_ratios` says so; its own error is checked."""
+    """Returns whether `inertia_ratios` reports the arm; checks their own error."""
     ratios = np.asarray(fj.inertia_ratios(linkage, scene.q))
     if exact.qdd is not None and resolution(exact) < 1e-3:
         expected = [
@@ -99,7 +100,7 @@ def _told_ill_conditioned(linkage, scene: Scene, exact) -> bool:
 def _judge(name, value, exact, told, scene, report, spread=0.0) -> str:
     lost = resolution(exact)
     if lost >= UNRESOLVED:
-        # The bound means nothing; but who is wrong by much must have been told.
+        # The bound means nothing, but a large error must have been reported.
         if told:
             return "unresolved by float64, told"
         if not np.isfinite(value).all():
@@ -125,7 +126,7 @@ def _judge(name, value, exact, told, scene, report, spread=0.0) -> str:
 
 
 def _relative_error(value, exact: oracle.Acceleration) -> float:
-    """In the norm of the levers, which makes all joints comparable."""
+    """Returns the error in the norm of the levers, which makes joints comparable."""
     if exact.qdd is None:
         return math.inf
     pairs = list(zip(exact.levers, value, map(float, exact.qdd)))

@@ -1,4 +1,4 @@
-"""Motions of random arms: their ends, energies, states at 30 digits; sweeps of them."""
+"""Motions of random arms: ends, energies, states at 30 digits, and sweeps."""
 
 import math
 import random
@@ -17,7 +17,7 @@ from .oracle import EPS, ROUNDINGS
 from .random_scenes import Scene
 from .refusals import linkage_of, refusal
 
-TOLERANCE = 1e-11  # of simulate's default, relative and absolute
+TOLERANCE = 1e-11  # the default of simulate, relative and absolute
 INTERPOLATED = 30  # times the error of steps, at most, between them
 MAX_STEPS = 4096
 RESULTS = "successful max_steps_reached dt_min_reached singular nonfinite".split()
@@ -53,7 +53,7 @@ def check_motion(scene: Scene, report: Report) -> str:
     steps = int(solution.stats["num_steps"])
     report.motions.append((scene, ts, name, q, qd))
     finite = np.isfinite(np.concatenate([q, qd], axis=1)).all(axis=1)
-    # From 1 ms in steps of a fifth, nothing takes so many to begin with.
+    # No motion needs so many first steps, from 1 ms down by factors of five.
     if steps > 100 and not int(solution.stats["num_accepted_steps"]):
         raise Failure(f"{name}: {steps} steps and none accepted")
     if name != "successful":
@@ -89,11 +89,11 @@ def result_name(result: Any) -> str:
 
 
 def _check_energy(scene: Scene, ts, q, qd, steps: int, report: Report) -> None:
-    """Energy less the work of constant efforts: kept, or lost where there is damping.
+    """Checks the energy less the work of constant efforts; damping may reduce it.
 
-    The bound lets each step be wrong by the tolerance in every coordinate, and each
-    evaluation by its roundings: what that does to the energy is given by its
-    derivatives, of which `levers` and `efforts` hold the sizes.
+    The bound allows each step an error of the tolerance in every coordinate, and
+    each evaluation its roundings. The derivatives of the energy, whose sizes are
+    `levers` and `efforts`, give the effect on the energy.
     """
     first = oracle.energy(scene.arm, scene.q, scene.qd)
     bound, last = 0.0, 0.0
@@ -127,11 +127,12 @@ def _check_energy(scene: Scene, ts, q, qd, steps: int, report: Report) -> None:
 
 
 def check_state(scene: Scene, ts, q, qd, report: Report) -> str:
-    """States against a run at 30 digits; the bound is what small changes would do.
+    """Compares states with a run at 30 digits, to the effect of small changes.
 
-    What is interpolated between steps, all but the end, may be wrong by `INTERPOLATED`
-    times the tolerance besides. Two more runs start as far off as the tolerance allows,
-    with parameters wrong in their last digits, all with random signs.
+    States interpolated between steps, all but the end, may also be wrong by
+    `INTERPOLATED` times the tolerance. Two more runs start as far off as the
+    tolerance allows, with parameters wrong in their last digits, all with random
+    signs.
     """
 
     def states(arm, q, qd):
@@ -185,7 +186,7 @@ def check_state(scene: Scene, ts, q, qd, report: Report) -> str:
 
 
 def check_sample(report: Report, sample: int) -> None:
-    """States of the first motions that are short enough, against the reference."""
+    """Compares states of the first motions that are short enough with the reference."""
     for scene, ts, name, q, qd in report.motions:
         if sample == 0:
             break
@@ -201,7 +202,7 @@ def check_sample(report: Report, sample: int) -> None:
 
 
 def check_sweep(report: Report) -> None:
-    """The same arms in one `sweep`, each as if it were alone."""
+    """Checks that one `sweep` of the same arms equals each arm alone."""
     found = [scene for scene, *_ in report.motions]
     if not found:
         return

@@ -1,4 +1,4 @@
-"""What the fuzzer finds: failures, and a report of the other outcomes."""
+"""Failures that the fuzzer finds, and a report of the other outcomes."""
 
 import collections
 import dataclasses
@@ -11,7 +11,7 @@ class Failure(AssertionError):
 
 @dataclasses.dataclass
 class Report:
-    """What came of the cases: outcomes by kind, and the worst error over its bound."""
+    """Outcomes of the cases by kind, and the worst ratio of error to bound."""
 
     outcomes: collections.Counter = dataclasses.field(
         default_factory=collections.Counter

@@ -1,6 +1,6 @@
-"""Values of every kind for every argument: taken if they are valid, else refused.
+"""Values of every kind for every argument: valid ones work, others raise an error.
 
-A refusal is a ValueError or a TypeError whose message names the argument.
+The error is a ValueError or a TypeError whose message names the argument.
 """
 
 import dataclasses
@@ -23,7 +23,7 @@ from .fuzz_report import Failure, Report
 
 
 class Hostile:
-    """Refuses to be an array, or to be shown."""
+    """An object that raises when it is converted to an array or shown."""
 
     def __array__(self, *args, **keywords):
         raise RuntimeError("no array")
@@ -98,7 +98,7 @@ DTYPES = st.one_of(
 
 
 def of_shape(shape: tuple) -> st.SearchStrategy:
-    """Arrays and nested lists that have the shape, with one entry of any kind."""
+    """Returns arrays and nested lists of the shape, with one entry of any kind."""
 
     @st.composite
     def spoiled(draw):

@@ -1,14 +1,14 @@
-"""Makes driven_reference.json: motions under control, and others at extremes.
+"""Makes driven_reference.json: motions under control, and extreme motions.
 
-Needs heyoka and SciPy (the extra `benchmark`); some minutes on one core:
+Needs heyoka and SciPy (the extra `benchmark`) and some minutes on one core:
 
     python tests/hard/make_driven_reference.py
 
-The equations are those of `make_reference`, with efforts that depend on the state put
-in the place of the constant ones. Controlled motions are integrated by Taylor series in
-80-bit numbers (19 digits, on x86), piece by piece where efforts jump; derivatives are
-differences over 1e-5. The saturated motion is one of SciPy's DOP853 at a tolerance of
-1e-12.
+The equations are those of `make_reference`, with efforts that depend on the state
+instead of constant ones. Controlled motions are integrated by Taylor series in 80-bit
+numbers (19 digits, on x86), piece by piece where efforts jump. Derivatives are
+differences over 1e-5. The saturated motion is computed by SciPy's DOP853 at a tolerance
+of 1e-12.
 """
 
 import json
@@ -27,7 +27,7 @@ real = np.longdouble
 
 @cache
 def controlled():
-    """Integrator of the usual arm under kp (target - q) - kd qd + effort."""
+    """Returns an integrator of the usual arm under kp (target - q) - kd qd + effort."""
     count, state, rates = lagrange("RRR")
     sizes = [np.size(USUAL[name]) for name in PARAMETERS]
     first = int(sum(sizes[: PARAMETERS.index("effort")]))
@@ -47,7 +47,7 @@ def controlled():
 
 
 def hold(state, t0, ts, kp, kd, target=TARGET, effort=(0.0, 0.0, 0.0)):
-    """States at `ts` from `state` at `t0`."""
+    """Returns the states at `ts` from `state` at `t0`."""
     integrator = controlled()
     scene = USUAL | dict(effort=effort)
     values = sum((list(map(real, np.ravel(scene[n]))) for n in PARAMETERS[:-1]), [])
@@ -70,7 +70,7 @@ def doubles(array):
 
 
 def stiff(kp):
-    """The positions, and their derivatives in log kp with kd = 2 sqrt(kp)."""
+    """Returns positions and their derivatives in log kp with kd = 2 sqrt(kp)."""
     ts = np.linspace(0, 1, 11)[1:]
 
     def positions(shift):
@@ -96,7 +96,7 @@ def stepping():
 
 
 def pulse():
-    """1e5 N m at the first joint for 1 us from 7.3 s; nothing else but gravity."""
+    """Returns a motion under gravity and a pulse of 1e5 N m for 1 us at 7.3 s."""
     zero = real(0)
     begin, end = 7.3, 7.3 + 1e-6
     before = hold(start(), 0, [4.0, begin], zero, zero)
@@ -107,7 +107,7 @@ def pulse():
 
 
 def saturated():
-    """Mean over 2001 times in 2 s of the squared distance from the target.
+    """Returns the mean squared distance from the target, over 2001 times in 2 s.
 
     kp = 1e6, kd = 2e3, efforts within +-50 N m.
     """
@@ -140,7 +140,7 @@ def saturated():
 
 
 def free(changes):
-    """As those of `make_reference`, at its 21 times."""
+    """Returns motions like those of `make_reference`, at its 21 times."""
     scene = USUAL | changes
     return scene | dict(q=doubles(motion(scene, bits=200)[:, :3]))
 

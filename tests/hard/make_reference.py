@@ -1,13 +1,13 @@
-"""Makes reference.json: the hard scenes that tests/reference.json does not hold.
+"""Makes reference.json: the hard scenes that are not in tests/reference.json.
 
-Needs heyoka (the extra `benchmark`); a minute or so on one core:
+Needs heyoka (the extra `benchmark`) and about a minute on one core:
 
     python tests/hard/make_reference.py
 
 The equations come from the velocities of the mass centres per unit of each joint's
-rate, not from the paper's formulas; heyoka integrates them by Taylor series in 200 bits
-(60 digits). Derivatives are differences over 1e-20. All is computed again in 160 bits,
-which has to agree. All parameters are the doubles as which JSON prints them.
+rate, not from the paper's formulas. heyoka integrates them by Taylor series in 200 bits
+(60 digits). Derivatives are differences over 1e-20. Everything is computed again in 160
+bits, which has to agree. All parameters are doubles, as JSON prints them.
 """
 
 import json
@@ -18,7 +18,7 @@ import numpy as np
 
 TIMES = 21  # outputs of each scene, the start among them
 
-# Unless a scene says otherwise.
+# The default of all scenes.
 USUAL = dict(
     topology="RRR",
     length=[0.0, 1.0, 1.0, 1.0],
@@ -96,7 +96,7 @@ SCENES = {
 }
 # Derivatives of q at the end in these arguments.
 DERIVATIVES = {"driven-through-0-RPR": ("q0",), "fig5": ("q0", "mass", "length")}
-# The accelerations along the motion are wanted of these.
+# Scenes whose accelerations along the motion are stored.
 ACCELERATIONS = {"turn-slide-RPR", "near-parallel-PPR", "near-parallel-RPP"}
 PARAMETERS = (
     "length", "com", "mass", "inertia", "locked", "base_angle", "gravity", "effort",
@@ -105,7 +105,7 @@ PARAMETERS = (
 
 
 def lagrange(topology):
-    """The parameters, the state and its rates, as heyoka's expressions."""
+    """Returns the parameters, the state and its rates as heyoka's expressions."""
     import heyoka as hy
 
     n = len(topology)
@@ -182,7 +182,7 @@ def integrator(topology, bits):
 
 
 def motion(scene, changed=None, by=None, *, bits):
-    """States at the output times; `changed`: (argument, index) moved by `by`."""
+    """Returns the states; `changed`: (argument, index), moved by `by`."""
     import heyoka as hy
 
     real = lambda x: hy.real(x, prec=bits)
@@ -218,7 +218,7 @@ def accelerations(scene, states, *, bits):
 
 
 def derivative(scene, name, *, bits):
-    """Of q at the end, (3, size of the argument)."""
+    """Returns the derivative of q at the end, (3, size of the argument)."""
     import heyoka as hy
 
     step = hy.real("1e-20", prec=bits)
@@ -233,7 +233,7 @@ def derivative(scene, name, *, bits):
 
 
 def agreed(compute, *arguments):
-    """As doubles, if fewer bits give the same to 1e-20."""
+    """Returns the values as doubles if fewer bits give the same to 1e-20."""
     value, less = compute(*arguments, bits=200), compute(*arguments, bits=160)
     gap = np.abs(value - less).astype(float) / (1 + np.abs(value.astype(float)))
     assert gap.max() < 1e-20, gap.max()

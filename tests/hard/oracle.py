@@ -1,10 +1,10 @@
 """Accelerations and motions of an arm at many digits, independent of the library.
 
-Nothing here knows the paper's equations: the mass centres' velocities are written down
-as a Jacobian of the joint rates, and M = sum m J^T J + I w w^T, the rest from the
-accelerations that the centres have while the joints keep their rates. Conventions as in
-the README: link n = 2, 3, 4 starts at its characteristic point, A_n along it, B_n
-across it.
+The paper's equations are not used. The mass centres' velocities are written as a
+Jacobian of the joint rates, which gives M = sum m J^T J + I w w^T. The other terms come
+from the centres' accelerations while the joints keep their rates. The conventions are
+those of docs/conventions.md: link n = 2, 3, 4 starts at its characteristic point, with
+A_n along it and B_n across it.
 """
 
 import sys
@@ -33,14 +33,14 @@ class Arm(NamedTuple):
 
 
 class Acceleration(NamedTuple):
-    """Joint accelerations, and what it takes to judge a computation of them.
+    """Joint accelerations, and data to judge a computation of them.
 
     - `qdd`: the accelerations (mpmath numbers), None if the mass matrix is singular.
     - `rho`: the pivots of the mass matrix, from the tip, over its diagonal: in [0, 1].
     - `matrix`: the mass matrix.
     - `inverse`: its inverse, as floats.
-    - `levers`: square roots of the diagonal, but with all lengths added as absolute
-      values: what a sum that cancels was made of.
+    - `levers`: square roots of the diagonal, with all lengths added as absolute values:
+      the size of the terms of a sum that cancels.
     - `efforts`: the terms of efforts minus bias added as absolute values.
     - `angles`: the largest sum of absolute angles [rad].
     """
@@ -55,7 +55,7 @@ class Acceleration(NamedTuple):
 
 
 def chain(arm: Arm, q, qd):
-    """Slides and absolute angles of the three pairs and their rates, unrounded."""
+    """Returns slides and absolute angles of the pairs, and rates, unrounded."""
     slide, slide_rate, angle, rate = [], [], [mp.mpf(arm.base_angle)], [mp.mpf(0)]
     for joint, position, velocity, locked in zip(arm.topology, q, qd, arm.locked):
         turns = joint == "R"
@@ -67,7 +67,7 @@ def chain(arm: Arm, q, qd):
 
 
 def equations(arm: Arm, slide, slide_rate, angle, rate):
-    """Mass matrix, bias (velocity terms and gravity) and potential energy."""
+    """Returns mass matrix, bias (velocity terms, gravity) and potential energy."""
     g = mp.mpf(arm.gravity)
     along = [mp.cos_sin(a) for a in angle]  # of links 1..4
     across = [(-s, c) for c, s in along]
@@ -109,13 +109,13 @@ def equations(arm: Arm, slide, slide_rate, angle, rate):
 
 
 def _factors(M):
-    """U^T D U by pivots from the tip, and their ratios to the diagonal."""
+    """Returns U^T D U by pivots from the tip, and their ratios to the diagonal."""
     D, L = [mp.mpf(0)] * 3, [[mp.mpf(0)] * 3 for _ in range(3)]
     rest = [row[:] for row in M]
     rho = [mp.mpf(0)] * 3
     for k in (2, 1, 0):
         D[k] = rest[k][k]
-        # What is left of an exactly singular matrix is rounding at the working digits.
+        # Only rounding at the working digits remains of an exactly singular matrix.
         if M[k][k] == 0 or D[k] <= M[k][k] * mp.mpf(10) ** (10 - mp.dps):
             return D, None, tuple(map(float, rho))
         rho[k] = D[k] / M[k][k]
@@ -136,7 +136,7 @@ def _solve(D, L, f):
 
 
 def _sizes(arm: Arm, q, qd, tau, slide, slide_rate):
-    """`levers`, `efforts` and `angles` of an `Acceleration`, in plain floats."""
+    """Returns `levers`, `efforts` and `angles` of an `Acceleration`, as floats."""
     turns = [joint == "R" for joint in arm.topology]
     rate = [0.0]
     for turn, velocity in zip(turns, qd):
@@ -163,13 +163,13 @@ def _sizes(arm: Arm, q, qd, tau, slide, slide_rate):
 
 
 def acceleration(arm: Arm, q, qd, tau, digits: int = DIGITS) -> Acceleration:
-    """Joint accelerations under the joint efforts `tau`."""
+    """Returns joint accelerations under the joint efforts `tau`."""
     with mpmath.workdps(digits):
         return _acceleration(arm, q, qd, tau, *chain(arm, q, qd))
 
 
 def acceleration_of_chain(arm: Arm, x, xd, tau, digits: int = DIGITS) -> Acceleration:
-    """The same at the six chain coordinates, whose angles are absolute."""
+    """Returns joint accelerations at chain coordinates, whose angles are absolute."""
     with mpmath.workdps(digits):
         slide, angle = x[0::2], [arm.base_angle, *x[1::2]]
         slide_rate, rate = xd[0::2], [0, *xd[1::2]]
@@ -195,7 +195,7 @@ def _acceleration(arm, q, qd, tau, slide, slide_rate, angle, rate) -> Accelerati
 
 
 def energy(arm: Arm, q, qd, digits: int = 30):
-    """Kinetic plus potential energy [J], an mpmath number."""
+    """Returns kinetic plus potential energy [J], an mpmath number."""
     with mpmath.workdps(digits):
         M, _, potential = equations(arm, *chain(arm, q, qd))
         kinetic = sum(M[i][j] * qd[i] * qd[j] for i in range(3) for j in range(3)) / 2
@@ -203,14 +203,15 @@ def energy(arm: Arm, q, qd, digits: int = 30):
 
 
 class MotionTooLong(Exception):
-    """The reference run would take more than its share of steps."""
+    """Raised if the reference run would take too many steps."""
 
 
 def motion(arm: Arm, q, qd, effort, damping, times, digits=30, most_steps=40):
-    """States (q, qd) at `times`, by extrapolation of the midpoint rule.
+    """Returns states (q, qd) at `times`, by extrapolation of the midpoint rule.
 
-    `effort` and `damping` are three numbers each: tau = effort - damping * qd. Local
-    errors are 1e-18 of the motion, seven digits better than the library's own.
+    `effort` and `damping` are three numbers each: tau = effort - damping * qd.
+    Local errors are 1e-18 of the motion, seven digits better than the library's
+    own.
     """
     tolerance = mp.mpf(10) ** -18
 
@@ -263,7 +264,7 @@ def motion(arm: Arm, q, qd, effort, damping, times, digits=30, most_steps=40):
                     step = h / 3
                     continue
                 t, y = (target if h == target - t else t + h), table[-1]
-                # Few rows sufficed: a longer step is cheaper.
+                # Few rows were enough: a longer step is cheaper.
                 step = max(step, h * (2 if j < 6 else 1))
             states.append(y)
         return states

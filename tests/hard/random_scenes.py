@@ -11,7 +11,7 @@ from . import oracle
 
 
 def sized(low: float, high: float) -> st.SearchStrategy:
-    """Positive numbers, uniform in their logarithm."""
+    """Returns a strategy of positive numbers, uniform in their logarithm."""
     return st.floats(math.log10(low), math.log10(high)).map(lambda e: 10.0**e)
 
 
@@ -56,7 +56,7 @@ class Scene:
     tau: tuple
     junk: float  # effort on fictitious joints, which must not matter
     damping: tuple
-    pace: float  # how far the fastest joint goes in a simulation [m or rad], or so
+    pace: float  # about how far the fastest joint moves [m or rad]
     t0: float
 
 

@@ -1,4 +1,4 @@
-"""Which arms `Linkage` is right to refuse."""
+"""The arms that `Linkage` should reject."""
 
 import math
 import random
@@ -10,7 +10,7 @@ from .fuzz_report import Failure
 
 
 def linkage_of(arm: oracle.Arm) -> fj.Linkage | None:
-    """The library's own, None if it refuses and is right to."""
+    """Returns the library's linkage, or None if it rejects the arm as singular."""
     try:
         linkage = fj.Linkage(
             arm.topology,
@@ -30,9 +30,9 @@ def linkage_of(arm: oracle.Arm) -> fj.Linkage | None:
 
 
 def never_determined(arm: oracle.Arm) -> str | None:
-    """Whether some joint moves no inertia in any configuration: why refusing is right.
+    """Returns why the arm is singular in every configuration, or None if it is not.
 
-    Or not to 13 digits: the door works in float64.
+    Singular to 13 digits is enough, as `Linkage` computes in float64.
     """
     rng = random.Random(0)
     reach = sum(map(abs, arm.length)) + sum(abs(c) for pair in arm.com for c in pair)

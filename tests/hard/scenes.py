@@ -1,4 +1,4 @@
-"""The hard scenes as arguments of `simulate`, and how their errors are measured.
+"""The hard scenes as arguments of `simulate`, and measures of their errors.
 
 Unless a scene says otherwise: `arm()` from `START`.
 """
@@ -30,7 +30,7 @@ OUTPUTS = 21  # of every simulation here: one compilation serves all
 
 
 class Scene(NamedTuple):
-    """What `simulate` takes, and the reference `q` at the times `ts[rows]`."""
+    """Arguments of `simulate`, and the reference `q` at the times `ts[rows]`."""
 
     linkage: fj.Linkage
     state0: fj.State
@@ -41,7 +41,7 @@ class Scene(NamedTuple):
 
 
 def arm(topology="RRR", **changes):
-    """Links of 1 m and 1 kg, unless a scene says otherwise."""
+    """Returns links of 1 m and 1 kg, unless a scene says otherwise."""
     return fj.Linkage(topology, **(USUAL | changes))
 
 
@@ -59,14 +59,14 @@ TARGET = Hold(jnp.array([-0.4, 0.2, 0.3]))
 
 
 def free(linkage, q0, ts, **reference):
-    """From rest; without efforts, but compiled for them as the other scenes are."""
+    """Returns a scene from rest without efforts, compiled like those with efforts."""
     state0 = fj.State(np.array(q0, dtype=float), np.zeros(3))
     forces = fj.JointEffort(np.zeros(3)), fj.JointDamper(np.zeros(3))
     return Scene(linkage, state0, forces, ts, **reference)
 
 
 def load(name):
-    """A scene of the files in this folder."""
+    """Returns a scene of the files in this folder."""
     scene = (REFERENCE | DRIVEN)[name]
     links = ("length", "com", "mass", "inertia", "locked", "base_angle", "gravity")
     return Scene(
@@ -82,7 +82,7 @@ def load(name):
 
 
 def load_common(name):
-    """A scene of tests/reference.json, which holds fewer times."""
+    """Returns a scene of tests/reference.json, which holds fewer times."""
     scene, r = helpers.SCENES[name], helpers.load(name)
     times = [state["t"] for state in scene["states"]]
     ts = np.linspace(0, times[-1], OUTPUTS)
@@ -92,7 +92,7 @@ def load_common(name):
 
 
 def fig5(times):
-    """Fig 5 at some of 0, 0.5 .. 60 s, from tests/reference.json."""
+    """Returns Fig 5 at some of 0, 0.5 .. 60 s, from tests/reference.json."""
     rows = {row["t"]: row["th"] for row in helpers.REFERENCE["chaos"]["rows"]}
     angles = np.array([rows.get(t, [0.0] * 3) for t in times])
     linkage = fj.scenes.fig5().linkage
@@ -107,7 +107,7 @@ def controller(tolerance, **keywords):
 
 
 TIGHT = controller(1e-12)
-DEFAULT = None  # what `simulate` does by itself
+DEFAULT = None  # the default of `simulate`
 
 
 def simulate(scene, steps, **keywords):
@@ -123,19 +123,19 @@ def simulate(scene, steps, **keywords):
 
 
 def error(motion, scene):
-    """The largest of all joints and output times [m or rad]."""
+    """Returns the largest error of all joints and output times [m or rad]."""
     return np.abs(np.asarray(motion.q)[scene.rows] - scene.q).max()
 
 
 def drift(linkage, q, qd):
-    """The largest change of energy over the largest kinetic energy."""
+    """Returns the largest change of energy over the largest kinetic energy."""
     kinetic, potential = jax.vmap(fj.energy, in_axes=(None, 0, 0))(linkage, q, qd)
     total = np.asarray(kinetic + potential)
     return np.abs(total - total[0]).max() / np.max(kinetic)
 
 
 def slopes(scene, steps):
-    """Derivatives of q at the end in q0, masses and lengths, by forward mode."""
+    """Returns derivatives of the last q in q0, masses and lengths, by forward mode."""
     return _slopes(
         scene._replace(rows=None, q=None), steps
     )  # one form, one compilation
@@ -164,7 +164,7 @@ def _slopes(scene, steps):
 
 
 def pulled_back(scene, weights):
-    """Derivative of weights . q at the end in q0, by reverse mode and default steps."""
+    """Returns the derivative of weights . q at the end in q0, by reverse mode."""
     return _pulled_back(scene._replace(rows=None, q=None), weights)
 
 
@@ -179,14 +179,33 @@ def _pulled_back(scene, weights):
     return jax.grad(end)(jnp.asarray(scene.state0.q))
 
 
+@eqx.filter_jit
+def behind_the_door(linkage, q0, ts):
+    """A motion of at most 99 steps, the sum of q^2 at its end, and that sum's slopes.
+
+    The slopes are those in the masses and in q0, by reverse mode. One program serves
+    three files.
+    """
+
+    def end(mass, q0):
+        changed = eqx.tree_at(lambda a: a.mass, linkage, mass)
+        start = fj.State(q0, START.qd)
+        motion = fj.simulate(changed, start, ts, max_steps=99, throw=False)
+        return jnp.sum(motion.q[-1] ** 2), motion
+
+    derive = jax.value_and_grad(end, (0, 1), has_aux=True)
+    (value, motion), slopes = derive(linkage.mass, jnp.asarray(q0))
+    return motion, value, slopes
+
+
 def largest_error(value, exact):
-    """Of a derivative, over its largest entry."""
+    """Returns the largest error of a derivative, over its largest entry."""
     value, exact = np.asarray(value), np.asarray(exact)
     return np.abs(value - exact).max() / np.abs(exact).max()
 
 
 def without_turns(q):
-    """The angles that are left, for these angles as they are rounded."""
+    """Returns angles less their whole turns, for the angles as rounded."""
     with mpmath.workdps(50):
         turn = 2 * mpmath.pi
         return np.array(
@@ -195,9 +214,10 @@ def without_turns(q):
 
 
 def linear_motion(t, upright=False):
-    """Derivative of q(t) in q0 for the usual arm hanging at rest, or upright.
+    """Returns the derivative of q(t) in q0 for the usual arm, hanging or upright.
 
-    In absolute angles the energies are sums of M_ij th_i' th_j' / 2 and K_i th_i^2 / 2.
+    In absolute angles the energies are sums of M_ij th_i' th_j' / 2 and K_i th_i^2
+    / 2.
     """
     n = np.arange(3)
     beyond = 2 - n  # links that hang on this one
@@ -214,12 +234,12 @@ _UPRIGHT, _MOVED = np.array([np.pi / 2, 0, 0]), np.array([1e-6, 0, 0])
 
 
 def beside_upright():
-    """From a microradian beside the upright equilibrium."""
+    """Returns a scene that starts a microradian beside the upright equilibrium."""
     return free(arm(), _UPRIGHT + _MOVED, np.linspace(0, 1, OUTPUTS))
 
 
 def growth_error(q):
-    """Of the rate at which a motion of that scene grows while it is small, relative."""
+    """Returns the relative error of that scene's growth rate while it is small."""
     scene = beside_upright()
     exact = [linear_motion(t, upright=True) @ _MOVED for t in scene.ts]
     away = np.asarray(q) - _UPRIGHT

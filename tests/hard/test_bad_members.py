@@ -1,6 +1,6 @@
-"""Scenes 25 and 26: members of a batch that fail, and steps that run out.
+"""Scenes 25 and 26: members of a batch that fail, and solves out of steps.
 
-More on members that fail is in tests/test_sweep.py.
+More tests of members that fail are in tests/test_sweep.py.
 """
 
 import diffrax
@@ -9,9 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from modes import ADJOINT
 
 import fdof_jax as fj
-from hard.scenes import START, arm
+from hard.scenes import OUTPUTS, START, arm, behind_the_door
 
 SIZE, TS = 256, np.linspace(0, 0.5, 6)
 NAN_START, NAN_LATER, FAST = 17, 101, 200
@@ -20,7 +21,7 @@ OTHERS = np.delete(np.arange(SIZE), BAD)
 
 
 class Breaking(eqx.Module):
-    """No effort until a time, then none that is a number."""
+    """An effort of zero until a time, and NaN afterwards."""
 
     at: jax.Array
 
@@ -48,13 +49,13 @@ def by_vmap(q, qd, at):
 
 
 def by_sweep(q, qd, at):
-    # Chunks of as many as those that are late are solved in: one program.
+    # Late members are solved in chunks of this size too, by one program.
     return fj.sweep(arm(), fj.State(q, qd), TS, (Breaking(at),), forces_axes=0, chunk=8)
 
 
 @pytest.mark.parametrize("motions", [by_vmap, by_sweep])
 def test_members_that_fail_harm_no_other(motions):
-    """All lanes of a batch go through the same loop, the last one's end is its end."""
+    """All members of a batch share one loop, which ends with the last member."""
     clean, mixed = motions(*batch(False)), motions(*batch(True))
     assert (clean.outcome == "successful").all()
     expected = np.full(SIZE, "successful")
@@ -78,15 +79,16 @@ def test_members_that_fail_harm_no_other(motions):
 
 
 def test_members_that_fail_add_nothing_to_a_shared_gradient():
-    """0 x NaN: in reverse mode every member's cotangent is added to the shared mass."""
+    """Reverse mode adds all members' cotangents to the shared mass; 0 x NaN is NaN."""
 
     @jax.jit
     def gradient(mass, q, qd, at, wanted):
         def loss(mass):
             linkage = eqx.tree_at(lambda a: a.mass, arm(), mass)
             motions = fj.sweep(
-                linkage, fj.State(q, qd), TS, (Breaking(at),), forces_axes=0
-            )
+                linkage, fj.State(q, qd), TS, (Breaking(at),), forces_axes=0,
+                adjoint=ADJOINT,
+            )  # fmt: skip
             counted = (motions.result == diffrax.RESULTS.successful) & wanted
             end = jnp.where(counted[:, None], motions.q[:, -1], 0)
             return jnp.sum(end**2) / jnp.sum(counted), jnp.sum(counted)
@@ -104,7 +106,7 @@ def test_members_that_fail_add_nothing_to_a_shared_gradient():
 
 
 def test_a_member_that_starts_nan_adds_nothing_under_vmap():
-    """Whatever is NaN in a member would be so in the sum over all."""
+    """A NaN of one member would make the sum over all members NaN."""
 
     def loss(mass, q0):
         def end(q0):
@@ -117,14 +119,19 @@ def test_a_member_that_starts_nan_adds_nothing_under_vmap():
 
     slope = jax.jit(jax.grad(loss))
     q0 = START.q + np.array([[0.0], [0.1]])
-    alone = slope(jnp.ones(3), q0[[0, 0]]) / 2  # two of them: the same program
+    # Two of them: the same program.
+    first, second = (slope(jnp.ones(3), q0[[k, k]]) / 2 for k in (0, 1))
     spoilt = slope(jnp.ones(3), np.where([[False], [True]], np.nan, q0))
-    np.testing.assert_allclose(spoilt, alone, rtol=1e-9)
+    np.testing.assert_allclose(spoilt, first, rtol=1e-9)
+    # Without such a member the gradient is the sum of both.
+    assert np.abs(first - second).max() > 1e-3
+    together = slope(jnp.ones(3), q0)
+    np.testing.assert_allclose(together, first + second, rtol=1e-8)
 
 
 @pytest.mark.parametrize("solver", [None, diffrax.Dopri8()])
 def test_a_controller_of_one_s_own_does_not_reject_for_ever(solver):
-    """diffrax's shortest step is 0: NaN is rejected until there are no steps left."""
+    """diffrax's shortest step is 0, so it would reject NaN until no steps are left."""
     steps = diffrax.PIDController(rtol=1e-8, atol=1e-8)
     motion = fj.simulate(
         arm(), START, TS, (Breaking(0.32),), solver=solver, throw=False,
@@ -137,15 +144,9 @@ def test_a_controller_of_one_s_own_does_not_reject_for_ever(solver):
 LONG = np.linspace(0, 5, 26)
 
 
-def out_of_steps(q0, **keywords):
-    return fj.simulate(
-        arm(), fj.State(q0, START.qd), LONG, max_steps=50, throw=False, **keywords
-    )
-
-
 def test_running_out_of_steps_is_told():
     """The state that was reached looks like any other."""
-    solution = out_of_steps(START.q)
+    solution = fj.simulate(arm(), START, LONG, max_steps=50, throw=False)
     assert solution.outcome == "out of steps"
     reached = solution.stats["time_reached"]
     assert 0 < reached < LONG[-1]
@@ -158,16 +159,12 @@ def test_running_out_of_steps_is_told():
 
 
 def test_a_gradient_of_what_was_not_reached_is_zero_and_the_value_tells():
-    """An output filled with NaN has a derivative of 0: an optimum, it seems.
+    """An output filled with NaN has a derivative of 0, which looks like an optimum.
 
-    A derivative of NaN would spoil that of a sum in which failed members are left out.
-    The value and the outcome tell instead.
+    A derivative of NaN would spoil the derivative of a sum that leaves failed
+    members out. The value and the outcome report the failure instead.
     """
 
-    def end(q0):
-        solution = out_of_steps(q0)
-        return solution.q[-1, 0], solution.result
-
-    (value, result), slope = jax.value_and_grad(end, has_aux=True)(START.q)
-    assert np.isnan(value) and result == diffrax.RESULTS.max_steps_reached
-    assert not np.any(slope)
+    motion, value, slopes = behind_the_door(arm(), START.q, np.linspace(0, 20, OUTPUTS))
+    assert np.isnan(value) and motion.result == diffrax.RESULTS.max_steps_reached
+    assert not any(np.any(slope) for slope in slopes)

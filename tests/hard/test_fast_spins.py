@@ -20,10 +20,10 @@ def test_fast_spins(name):
 def test_a_fast_tip_on_slow_links(tolerance, bound):
     """The time scales of the links lie far apart, and errors grow 9.5e5 times.
 
-    That is the derivative of q after 0.5 s in qd at the start, in computations with 60
-    digits [s]. A tolerance of 1e-12 of 1000 rad/s therefore means an error of 1e-3 rad,
-    one of 1e-14 and each rounding of such a velocity 1e-5 and 5e-8 rad: no program in
-    float64 comes below 1e-7 for sure.
+    That is the derivative of q after 0.5 s in qd at the start, in computations with
+    60 digits [s]. A tolerance of 1e-12 of 1000 rad/s therefore means an error of
+    1e-3 rad. A tolerance of 1e-14 means 1e-5 rad, and each rounding of such a
+    velocity 5e-8 rad. No program in float64 is sure to have an error below 1e-7.
     """
     scene = hard.load("spin-of-the-tip")
     motion = hard.simulate(scene, hard.controller(tolerance))

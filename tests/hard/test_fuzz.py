@@ -1,4 +1,4 @@
-"""The fuzzer, 300 cases of it, always the same; and what longer runs have found."""
+"""The fuzzer on 300 cases, always the same; and cases found by longer runs."""
 
 import math
 
@@ -45,7 +45,7 @@ FOUND = {
             tau=(0.0, 0.0, 1e4),
         ),
     ),
-    # The same, as an error 40 times what rounding the terms explains.
+    # The same fault: an error 40 times that of rounding the terms.
     "masked: an inertia of 1e6": (
         "accelerations",
         scene(
@@ -67,7 +67,7 @@ FOUND = {
             tau=(212.25726232617592, 1.0, -720006.8483329134),
         ),
     ),
-    # Two pivot ratios of 1e-8 lose 16 digits together; each alone says 8.
+    # Two pivot ratios of 1e-8 lose 16 digits together; each alone indicates 8.
     "two small pivots": (
         "accelerations",
         scene(
@@ -86,7 +86,7 @@ FOUND = {
             tau=(1.0, 2.0, 3.0),
         ),
     ),
-    # A joint with no inertia at all: its ratio was 0 / 0, and nobody was told.
+    # A joint without any inertia: its ratio was 0 / 0, which was not reported.
     "a mass at the joint": (
         "accelerations",
         scene(
@@ -103,7 +103,7 @@ FOUND = {
             q=(-79.43282347242814, -1e-12, 1.0),
         ),
     ),
-    # Singular where it starts: that is a state reached, and its name is not the step.
+    # Singular at the start: the outcome must name this, not the step size.
     "singular at the start": (
         "motions",
         scene(

@@ -30,8 +30,11 @@ class Pulse(eqx.Module):
 
 
 def test_a_reference_that_steps():
-    """No formula of high order holds across a jump, and rejections halve the steps down
-    to it; declared, it costs nothing."""
+    """No formula of high order holds across a jump.
+
+    Rejections halve the steps down to an undeclared jump; a declared one costs
+    nothing.
+    """
     jumps = jnp.array([1.0, 2.0, 3.0])
     exact = DRIVEN["stepping"]
     controller = fj.PDController(200.0, 30.0, jnp.inf, Staircase(jumps))
@@ -42,7 +45,7 @@ def test_a_reference_that_steps():
 
 
 def test_a_pulse_of_a_microsecond():
-    """It lies between the stages of any step that does not know of it."""
+    """The pulse lies between the stages of every step that is not told of it."""
     exact = DRIVEN["pulse"]
     pulse = Pulse(jnp.array([7.3, 7.3 + 1e-6]), jnp.array(1e5))
 
@@ -53,6 +56,6 @@ def test_a_pulse_of_a_microsecond():
         ).q[1:]
 
     assert np.abs(motion(pulse) - np.array(exact["q"])).max() <= 1e-8
-    # The pulse is what makes the motion.
+    # The motion depends on the pulse.
     without = motion(eqx.tree_at(lambda p: p.effort, pulse, jnp.array(0.0)))
     assert np.abs(without - np.array(exact["q"])).max() > 1e-3

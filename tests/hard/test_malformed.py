@@ -1,7 +1,7 @@
-"""Scene 30: malformed input behind the doors, where no call sees the values.
+"""Scene 30: malformed values that no call can check, because they are traced.
 
-What doors refuse, at every function and argument, is in tests/test_bad_input.py and
-tests/test_sweep_input.py; locked velocities are in tests/test_linkage.py.
+Errors that calls raise, for every function and argument, are in tests/test_bad_input.py
+and tests/test_sweep_input.py; locked velocities are in tests/test_linkage.py.
 """
 
 import equinox as eqx
@@ -65,7 +65,7 @@ CASES = {
 
 @pytest.mark.parametrize("name, value", CASES.values(), ids=CASES)
 def test_traced_values_that_no_door_sees(name, value):
-    """Nothing can be raised for one member of a batch: its result has to say it."""
+    """Nothing can be raised for one member of a batch; its result reports the fault."""
     solution = traced(**GOOD | {name: jnp.asarray(value, float)})
     expected = ["not finite", "ill-conditioned"]
     if name == "ts":
@@ -93,7 +93,7 @@ INSIDE = {
 
 @pytest.mark.parametrize("name", INSIDE)
 def test_modules_changed_after_their_door(name):
-    """`eqx.tree_at` asks no constructor: the values are there to be seen by a call."""
+    """`eqx.tree_at` calls no constructor, but a call can check the values."""
     argument = "topology" if name == "ef" else name
     for value in INSIDE[name]:
         with pytest.raises(ValueError, match=rf"{argument}: expected .*, got "):

@@ -7,7 +7,7 @@ from hard import scenes as hard
 
 
 def test_point_masses():
-    """Without moments of inertia nothing keeps the mass matrix from singularity."""
+    """Without moments of inertia nothing keeps the mass matrix from being singular."""
     scene = hard.fig5(np.linspace(0, 10, hard.OUTPUTS))
     motion = hard.simulate(scene, hard.controller(1e-10))
     assert hard.error(motion, scene) <= 1e-6
@@ -28,7 +28,7 @@ def test_gradients_of_point_masses():
     [("1e3", 1e-8), pytest.param("1e6", 1e-5, marks=pytest.mark.slow)],
 )
 def test_heavy_tip(name, bound):
-    """The mass matrix, of condition 2e5 and 2e8, loses as many digits."""
+    """The mass matrix, of condition 2e5 and 2e8, loses five and eight digits."""
     scene = hard.load(f"heavy-tip-{name}")
     assert hard.error(hard.simulate(scene, hard.TIGHT), scene) <= bound
 
@@ -44,8 +44,8 @@ def test_light_tip(name, bound):
 def test_light_tip_leaves_a_two_link_chain(name, bound):
     """One fast light body must not disturb two slow heavy ones.
 
-    By its own weight it moves them: by 1.082e-5 and 1.082e-8 rad in computations with
-    60 digits.
+    Its own weight moves them by 1.082e-5 and 1.082e-8 rad, in computations with 60
+    digits.
     """
     motion = hard.simulate(hard.load(f"light-tip-{name}"), hard.TIGHT)
     two_links = np.array(hard.REFERENCE["two-links"]["q"])

@@ -19,8 +19,10 @@ def final(q0, adjoint=diffrax.RecursiveCheckpointAdjoint()):
 
 @pytest.mark.parametrize("mode", ["forward", "reverse"])
 def test_the_gradient_is_that_of_linear_theory(mode):
-    """Nothing moves, so that adaptive steps grow without bound, and the error of the
-    tangents is not controlled."""
+    """Nothing moves, so adaptive steps grow without bound.
+
+    The error of the tangents is then not controlled.
+    """
     if mode == "forward":
         gradient = jax.jacfwd(lambda q0: final(q0, diffrax.ForwardMode()))
     else:
@@ -32,7 +34,7 @@ def test_the_gradient_is_that_of_linear_theory(mode):
 
 @pytest.mark.parametrize("steps", ["scaled", "own"])
 def test_other_tolerances_do_not_make_it_wrong(steps):
-    """Only a longest step that is set, `dtmax`, is left as it is."""
+    """Only an explicit longest step, `dtmax`, is left unchanged."""
     controller = {
         "scaled": fj.scale_tolerances(arm()),
         "own": diffrax.PIDController(rtol=1e-8, atol=1e-8),
@@ -50,13 +52,13 @@ def test_other_tolerances_do_not_make_it_wrong(steps):
 
 
 def test_the_arm_stays():
-    """Every term is 0, or what rounding of pi/2 makes of it."""
+    """Every term is 0, apart from the rounding of pi/2."""
     assert np.abs(final(HANGING) - HANGING).max() < 1e-12
 
 
 @pytest.mark.parametrize("solver", [diffrax.Dopri8(), diffrax.Kvaerno5()])
 def test_another_solver_does_not_make_it_wrong(solver):
-    """An implicit solver crosses the 10 s in a few steps: finite, and wrong."""
+    """An implicit solver would cross the 10 s in a few steps, with a wrong gradient."""
 
     def end(q0):
         adjoint = diffrax.ForwardMode()

@@ -1,6 +1,6 @@
 """Scene 19: derivatives at the limits of the actuators, and beyond them.
 
-That a tuner says so is in tests/test_tuning.py.
+That a tuner reports saturation is tested in tests/test_tuning.py.
 """
 
 import diffrax
@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from modes import ADJOINT
 
 import fdof_jax as fj
 from fdof_jax.analysis.tracking import saturated
@@ -19,8 +20,10 @@ KP = 128.0
 
 
 def test_the_derivative_at_the_limit_is_that_of_one_side():
-    """Demand and limit are equal: the effort has two derivatives, 0 and that of the
-    demand, and their mean is that of no motion."""
+    """Demand and limit are equal, so the effort has two one-sided derivatives.
+
+    These are 0 and the demand's derivative; their mean belongs to no motion.
+    """
     controller = fj.PDController(KP, 0.0, 32.0, Hold(jnp.full(3, 0.25)))
 
     def effort(kp):
@@ -34,7 +37,7 @@ def test_the_derivative_at_the_limit_is_that_of_one_side():
 
 
 def end(log_kp, limit, reference, adjoint):
-    """The sum of the joint positions after 0.2 s, and the share at the limit."""
+    """Returns the sum of joint positions after 0.2 s, and the share at the limit."""
     controller = fj.PDController(KP * jnp.exp(log_kp), 0.0, limit, reference)
     ts = np.linspace(0, 0.2, 11)
     solution = fj.simulate(arm(), START, ts, (controller,), adjoint=adjoint)
@@ -44,16 +47,16 @@ def end(log_kp, limit, reference, adjoint):
 
 @pytest.mark.parametrize("mode", ["forward", "reverse"])
 def test_gradients_at_and_beyond_saturation(mode):
-    """A derivative that jumps at the start, or is 0 because nothing can be changed."""
+    """The derivative jumps at the start, or is 0 because gains change nothing."""
     if mode == "forward":
         adjoint, derive = diffrax.ForwardMode(), jax.jacfwd
     else:
-        adjoint, derive = diffrax.RecursiveCheckpointAdjoint(), jax.jacrev
+        adjoint, derive = ADJOINT, jax.jacrev
     gradient = jax.jit(
         derive(lambda *arguments: end(*arguments, adjoint), has_aux=True)
     )
-    # The efforts that gravity asks for, and a reference that demands exactly them: the
-    # arm rests at its limits.
+    # The reference demands exactly the efforts that gravity needs, so the arm rests at
+    # its limits.
     load = fj.inverse_dynamics(arm(), START.q, STILL, STILL)
     resting = Hold(START.q + load / KP)
     demand = fj.PDController(KP, 0.0, jnp.inf, resting).demand(
@@ -61,7 +64,7 @@ def test_gradients_at_and_beyond_saturation(mode):
     )
     at_limit, _ = gradient(0.0, jnp.abs(demand), resting)
     assert np.isfinite(at_limit)
-    # Weak actuators: the gains do nothing, and the share says so.
+    # Weak actuators: the gains have no effect, and the share is 1.
     weak, share = gradient(0.0, jnp.full(3, 1e-3), TARGET)
     assert weak == 0 and (share == 1).all()
     strong, share = gradient(0.0, jnp.full(3, 1e9), TARGET)

@@ -1,4 +1,4 @@
-"""Scenes 21 and 22: other sizes than a metre, other units, and many turns away."""
+"""Scenes 21 and 22: sizes other than a metre, other units, and many turns."""
 
 import equinox as eqx
 import numpy as np
@@ -17,7 +17,7 @@ def scaled_motion(linkage, state0, ts, dt0):
 
 
 def scaled(topology, size, mass, gravity=9.81):
-    """The usual arm in other units, and the factors of its joints and of time."""
+    """Returns the usual arm in other units, and factors of its joints and time."""
     linkage = arm(
         topology,
         length=np.array(USUAL["length"]) * size,
@@ -32,8 +32,10 @@ def scaled(topology, size, mass, gravity=9.81):
 
 @pytest.mark.parametrize("topology", ["RRR", "RPR"])
 def test_sizes_and_units_do_not_matter(topology):
-    """An absolute tolerance of 1e-11 m is 1e-8 of an arm of 1 mm, and near rounding for
-    one of 1 km."""
+    """An absolute tolerance of 1e-11 m depends on the size of the arm.
+
+    It is 1e-8 of an arm of 1 mm, and near rounding for one of 1 km.
+    """
     worlds = {
         "1 mm": scaled(topology, 1e-3, 1e-3),
         "1 km, 1e9 kg": scaled(topology, 1e3, 1e9),
@@ -51,11 +53,11 @@ def test_sizes_and_units_do_not_matter(topology):
 @pytest.mark.parametrize("joints", [[1, 0, 0], [1, 1, 1]], ids=["first", "all"])
 @pytest.mark.parametrize("turns", [1e6, 1e8])
 def test_turns_do_not_matter(turns, joints):
-    """The arguments of sine and cosine lose ten digits, sums of angles as many, and a
-    tolerance relative to the angle means nothing.
+    """Arguments of sine and cosine, and sums of angles, lose ten digits.
 
-    The result keeps the turns, so that a position in it is rounded by up to 6e-8 rad
-    after 1e8 turns: the bound is 1e-9 or an ulp of it.
+    A tolerance relative to the angle means nothing. The result keeps the turns, so
+    a position in it is rounded by up to 6e-8 rad after 1e8 turns: the bound is 1e-9
+    or an ulp of it.
     """
     offset = START.q + 2 * np.pi * turns * np.array(joints)
     kept = without_turns(offset)

@@ -81,11 +81,11 @@ print(motion.stats["num_steps"])
 def test_turns_do_not_matter(turns):
     """After 1e6 turns neighbouring numbers are half a radian apart.
 
-    The result keeps the turns, so that the bound is 1e-3 or an ulp of it.
+    The result keeps the turns, so the bound is 1e-3 or an ulp of it.
     """
     run(f"""
 offset = np.array([-0.5, 0.3, 0.2], np.float32) + np.float32(2 * np.pi * {turns})
-# The angles that are left, for these angles as they are rounded.
+# The angles less their whole turns, for the angles as rounded.
 kept = np.remainder(offset.astype(float) + np.pi, 2 * np.pi) - np.pi
 plain, far = (
     fj.simulate(arm(), fj.State(q, [0, 0, 0]), ts / 5) for q in (kept, offset)

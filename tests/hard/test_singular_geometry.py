@@ -1,4 +1,4 @@
-"""Scenes 6 to 9: the paper's form is singular, joints do the same, axes nearly so."""
+"""Scenes 6 to 9: singular in the paper's form, equal joints, near-parallel axes."""
 
 import warnings
 
@@ -42,7 +42,7 @@ def test_a_slide_through_a_pivot_is_singular_only_in_the_paper_s_matrix():
     "name", ["hard-zerolengthRR", "parallel-axes-PPR", "parallel-axes-RPP"]
 )
 def test_two_joints_that_do_the_same(name):
-    """The paper forbids what only costs the tip a direction and no accuracy."""
+    """The paper forbids this, but it costs the tip a direction and no accuracy."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         scene = (hard.load_common if name in SCENES else hard.load)(name)
@@ -53,7 +53,7 @@ def test_two_joints_that_do_the_same(name):
 
 @pytest.mark.parametrize("name", ["near-parallel-PPR", "near-parallel-RPP"])
 def test_accelerations_of_nearly_parallel_axes(name):
-    """Between slides 1e-3 rad apart a link of 1e-6 kg is left by cancellation."""
+    """Cancellation leaves only a link of 1e-6 kg between slides 1e-3 rad apart."""
     scene, reference = hard.load(name), hard.REFERENCE[name]
     for q, qd, qdd in zip(*(reference[key] for key in ("q", "qd", "qdd"))):
         reduced = fj.forward_dynamics(scene.linkage, q, qd, np.zeros(3))
@@ -64,12 +64,12 @@ def test_accelerations_of_nearly_parallel_axes(name):
     "name, bound", [("near-parallel-PPR", 1e-8), ("near-parallel-RPP", 1e-6)]
 )
 def test_nearly_parallel_axes(name, bound):
-    """The step control sees rounding, enlarged by the condition of 4e6, as an error.
+    """The step control takes rounding, enlarged by the condition of 4e6, for an error.
 
-    In 5 s the light link of the second arm gets 890 m away, turning at up to 2.6 rad/s.
-    The slides move by 1.5e7 m per newton (computed with 60 digits): to round the tip's
-    weight of 9.81 N moves them by up to 1.4e-8 m, and to round the centrifugal forces
-    along them, of up to 6 kN, by 7e-6 m.
+    In 5 s the light link of the second arm gets 890 m away, turning at up to 2.6
+    rad/s. The slides move by 1.5e7 m per newton (computed with 60 digits). Rounding
+    of the tip's weight of 9.81 N moves them by up to 1.4e-8 m, and rounding of the
+    centrifugal forces along them, of up to 6 kN, by 7e-6 m.
     """
     scene = hard.load(name)
     motion = hard.simulate(scene, hard.TIGHT)
@@ -78,7 +78,7 @@ def test_nearly_parallel_axes(name, bound):
 
 
 def test_a_slide_driven_through_zero():
-    """The lever arm of all that hangs on the slide changes its sign."""
+    """The lever arm of everything that hangs on the slide changes its sign."""
     scene = hard.load("driven-through-0-RPR")
     motion = hard.simulate(scene, hard.TIGHT)
     np.testing.assert_allclose(motion.qd[:, 1], -2, atol=0.1)

@@ -1,4 +1,4 @@
-"""Scenes 17, 18 and 20: stiff controllers and dampers, one chatters at its limit."""
+"""Scenes 17, 18 and 20: stiff controllers and dampers; one chatters at its limit."""
 
 import diffrax
 import jax
@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import mpmath
 import numpy as np
 import pytest
+from modes import ADJOINT
 
 import fdof_jax as fj
 from hard import oracle
@@ -27,7 +28,7 @@ IMPLICIT = dict(
 
 
 def held(log_kp, adjoint):
-    """The motion under kp, and kd = 2 sqrt(kp)."""
+    """Returns the motion under kp and kd = 2 sqrt(kp)."""
     kp = jnp.exp(log_kp)
     controller = fj.PDController(kp, 2 * jnp.sqrt(kp), jnp.inf, TARGET)
     ts = np.linspace(0, 1, 11)
@@ -63,7 +64,7 @@ def test_the_gradient_in_reverse_mode():
     @jax.jit
     @jax.grad
     def gradient(log_kp):
-        return jnp.sum(held(log_kp, diffrax.RecursiveCheckpointAdjoint())[0])
+        return jnp.sum(held(log_kp, ADJOINT)[0])
 
     for kp in STIFFNESSES:
         right = np.sum(DRIVEN[f"stiff-{kp:.0e}"]["dq_dlogkp"])
@@ -71,8 +72,10 @@ def test_the_gradient_in_reverse_mode():
 
 
 def test_creep_under_heavy_damping():
-    """Velocities die at rates of 1e6 to 1e8 per second; what is left is the balance of
-    damping and gravity, 1e-5 rad/s."""
+    """Velocities die at rates of 1e6 to 1e8 per second.
+
+    The balance of damping and gravity remains, 1e-5 rad/s.
+    """
     damping = 1e6
 
     @jax.jit
@@ -106,8 +109,10 @@ def test_creep_under_heavy_damping():
 
 
 def test_chattering_at_a_limit():
-    """Efforts leave their limit for microseconds: stiff there, and each corner is a
-    jump of the derivative inside some step."""
+    """Efforts leave their limit for microseconds, and are stiff there.
+
+    Each corner is a jump of the derivative inside some step.
+    """
     controller = fj.PDController(1e6, 2e3, 50.0, TARGET)
     ts = np.linspace(0, 2, 2001)
     solution = fj.simulate(arm(), START, ts, (controller,), **IMPLICIT)

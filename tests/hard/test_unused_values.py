@@ -1,4 +1,4 @@
-"""Scene 27: junk where a topology does not look, as 0 x NaN is NaN."""
+"""Scene 27: junk in values that a topology does not use, as 0 x NaN is NaN."""
 
 import equinox as eqx
 import jax
@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 import fdof_jax as fj
-from hard.scenes import START, arm
+from hard.scenes import OUTPUTS, START, arm, behind_the_door
 
-TS = np.linspace(0, 0.5, 6)
+TS = np.linspace(0, 0.5, OUTPUTS)
 JUNK = [1e30, np.nan]
 
 
 def unused(topology):
-    """The entries of a linkage that no acceleration depends on."""
+    """Returns the entries of a linkage that no acceleration depends on."""
     entries = {"length": [0, 3], "locked": [], "com": [], "inertia": []}
     if topology.startswith("R"):
         entries["locked"].append(0)  # where it stands, not how it moves
@@ -28,7 +28,7 @@ def unused(topology):
 
 
 def fictitious(topology):
-    """Which of the six chain coordinates belong to no joint."""
+    """Returns which of the six chain coordinates belong to no joint."""
     return np.flatnonzero(np.asarray(fj.existence_factors(topology)) == 0)
 
 
@@ -40,7 +40,7 @@ def with_junk(array, rows, junk):
 
 @jax.jit
 def masked(linkage, x, xd, force):
-    """Accelerations of the paper's form, and their derivatives."""
+    """Returns accelerations of the paper's form, and their derivatives."""
 
     def accelerations(mass, x):
         changed = eqx.tree_at(lambda a: a.mass, linkage, mass)
@@ -52,7 +52,7 @@ def masked(linkage, x, xd, force):
 
 @pytest.mark.parametrize("topology", fj.TOPOLOGIES)
 def test_efforts_of_fictitious_joints(topology):
-    """The paper's equations add them and take them away again."""
+    """The paper's equations add them and subtract them again."""
     linkage = arm(topology, locked=0.2)
     x, xd = fj.to_chain(linkage, START.q, START.qd)
     force = jnp.arange(1.0, 7.0)
@@ -66,28 +66,20 @@ def test_efforts_of_fictitious_joints(topology):
         fj.masked_accelerations(linkage, x, xd, dirty)
 
 
-@jax.jit
 def motion(linkage):
     """A motion and its gradient, where no door sees the values."""
-
-    def end(mass, q0):
-        changed = eqx.tree_at(lambda a: a.mass, linkage, mass)
-        solution = fj.simulate(changed, fj.State(q0, START.qd), TS, throw=False)
-        return jnp.sum(solution.q[-1] ** 2), solution
-
-    derive = jax.grad(end, (0, 1), has_aux=True)
-    gradients, solution = derive(linkage.mass, jnp.asarray(START.q))
-    return (solution.q, gradients), solution
+    solution, _, slopes = behind_the_door(linkage, START.q, TS)
+    return (solution.q, slopes), solution
 
 
 @pytest.mark.parametrize("junk", JUNK)
 @pytest.mark.parametrize("topology", fj.TOPOLOGIES)
 def test_parameters_that_a_topology_does_not_use(topology, junk):
-    """One compiled program serves all topologies: what one does not use is selected
-    away, and selections multiply by 0 in reverse.
+    """One compiled program serves all topologies and selects unused values away.
 
-    NaN is refused at the door (tests/test_bad_input.py); behind it, links that only
-    slide are spoilt by one, and the motion says so.
+    Selections multiply by 0 in reverse mode. NaN in arguments raises an error
+    (tests/test_bad_input.py). If it is traced, it spoils links that only slide, and
+    the motion reports it.
     """
     linkage = arm(topology, locked=[0.2, 0.3, 0.4])
     clean, solution = motion(linkage)

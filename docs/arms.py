@@ -1,0 +1,37 @@
+"""Makes arms.gif, the picture at the top of the README: `python docs/arms.py`."""
+
+import dataclasses
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("agg")  # the picture is written, never shown
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+import fdof_jax as fj
+from fdof_jax import drawing
+
+fj.configure(x64=True)
+ts = np.linspace(0, 5, 501)  # one turn of the circle
+
+# The tuned arm is shown on its second turn, so the animation repeats without a jump.
+scene = fj.tune(fj.scenes.fig7()).scene
+turns = fj.simulate(scene.linkage, scene.state0, np.linspace(0, 10, 1001), scene.forces)
+second = dataclasses.replace(turns, ts=ts, q=turns.q[500:], qd=turns.qd[500:])
+pendulum = fj.scenes.fig5()
+fall = fj.simulate(pendulum.linkage, pendulum.state0, ts)
+
+figure = plt.figure(figsize=(7.2, 3.7), layout="constrained")
+animation = drawing.animate_grid(
+    {
+        "RPR: gains tuned by gradients": (scene.linkage, second),
+        "RRR: a triple pendulum falls": (pendulum.linkage, fall),
+    },
+    figure,
+    fps=20,
+)
+circle = np.asarray([scene.forces[0].reference.tip(t) for t in ts[::5]])
+figure.axes[0].plot(*circle.T, "--", color="C0", lw=0.8, zorder=0)
+animation.save(Path(__file__).with_suffix(".gif"), writer="pillow", dpi=80)

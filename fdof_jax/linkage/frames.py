@@ -1,0 +1,79 @@
+"""Forward kinematics: where the links start, and along which directions they run."""
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import jax.numpy as jnp
+
+from ..xla.array_namespace import namespace, plane_vector, sine_and_cosine
+from .topology import real_joints
+
+if TYPE_CHECKING:
+    from .linkage import Linkage
+
+# Vectors of the plane are complex numbers x + iy. A product with exp(i th) turns them
+# by th, a product with i by 90 degrees. The functions also take NumPy arrays.
+
+
+def unit_vector(angle: Any) -> Any:
+    """Returns exp(i angle)."""
+    sin, cos = sine_and_cosine(angle)
+    return plane_vector(cos, sin)
+
+
+def dot(a: Any, b: Any) -> Any:
+    """Computes the dot product of two vectors of the plane."""
+    return a.real * b.real + a.imag * b.imag
+
+
+def cross(a: Any, b: Any) -> Any:
+    """Computes the cross product of two vectors of the plane."""
+    return a.real * b.imag - a.imag * b.real
+
+
+class Frames(NamedTuple):
+    """The ground (0) and the moving links (1 to 3), in the last axis of arrays.
+
+    - `start`: characteristic points x + iy [m]; `direction`: unit vectors (..., 4).
+    - `angle`: absolute angles th_1 to th_4 [rad]; `slide`: B_1 to B_3 [m].
+    - `revolute`: whether the joint before each moving link is revolute (3,).
+    """
+
+    start: Any
+    direction: Any
+    angle: Any
+    slide: Any
+    revolute: Any
+
+
+def frames(linkage: "Linkage", q: Any) -> Frames:
+    """Computes the frames at joint positions (..., 3)."""
+    xp = namespace(linkage, q)
+    revolute = xp.stack(real_joints(linkage.ef))
+    slide = xp.where(revolute, linkage.locked, q)
+    turn = xp.cumsum(xp.where(revolute, q, linkage.locked), axis=-1)
+    base = xp.broadcast_to(linkage.base_angle, turn[..., :1].shape)
+    angle = xp.concatenate([base, base + turn], axis=-1)
+    direction = unit_vector(angle)
+    # The length A runs along a link, the slide B across it.
+    length = xp.broadcast_to(linkage.length[:3], slide.shape)
+    steps = plane_vector(length, slide) * direction[..., :3]
+    start = xp.concatenate([xp.zeros_like(base), xp.cumsum(steps, axis=-1)], axis=-1)
+    return Frames(start, direction, angle, slide, revolute)
+
+
+def scalar_frames(linkage: "Linkage", q: tuple) -> Frames:
+    """Computes the frames as lists of scalars, which fuse with the equations of motion.
+
+    A sweep with a spring takes 1.3 times as long with the arrays of `frames`.
+    """
+    revolute = real_joints(linkage.ef)
+    angle, slide, direction = [linkage.base_angle], [], []
+    start = [jnp.zeros((), complex)]
+    for k, turns in enumerate(revolute):
+        direction.append(unit_vector(angle[k]))
+        slide.append(jnp.where(turns, linkage.locked[k], q[k]))
+        step = plane_vector(linkage.length[k], slide[k])
+        start.append(start[k] + step * direction[k])
+        angle.append(angle[k] + jnp.where(turns, q[k], linkage.locked[k]))
+    direction.append(unit_vector(angle[3]))
+    return Frames(start, direction, angle, slide, revolute)

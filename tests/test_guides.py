@@ -1,0 +1,51 @@
+"""The examples of the guides run, in order, as written."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+DOCS = Path(__file__).parents[1] / "docs"
+
+
+def run(page):
+    """Runs the Python blocks of a page and returns their names."""
+    namespace = {}
+    for block in re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL):
+        exec(compile(block, page.name, "exec"), namespace)
+    return namespace
+
+
+@pytest.mark.slow
+def test_batches():
+    names = run(DOCS / "batches.md")
+    assert np.isfinite(names["motions"].q).all()
+    assert np.isfinite(names["many"].q).all()
+
+
+@pytest.mark.slow
+def test_gradients():
+    names = run(DOCS / "gradients.md")
+    np.testing.assert_allclose(names["reverse"], names["forward"], rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_tuning(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    names = run(DOCS / "tuning.md")
+    assert names["result"].loss ** 0.5 < 0.07
+    assert names["front"].tip_error.shape == (3,)
+
+
+@pytest.mark.slow
+def test_identification():
+    found = run(DOCS / "identification.md")["found"]
+    assert found.converged
+    assert abs(found.parameters["mass"] - 1.3) < 0.05
+
+
+@pytest.mark.slow
+def test_hard_cases():
+    two = run(DOCS / "hard-cases.md")["two"]
+    assert two.outcome.tolist() == ["successful", "not finite"]
