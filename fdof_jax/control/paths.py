@@ -12,7 +12,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from ..checks import instance, real_array
-from ..forces.part import Part, Values, field
+from ..forces.part import Part, Values, default, field
 from ..xla.array_namespace import in_numpy, namespace, sine_and_cosine
 from .timing import Laps, Travel
 
@@ -30,7 +30,10 @@ class Path(Part):
     [-4.0, 2.25]
     """
 
-    middle: eqx.AbstractVar[Array]  # a point (x, y) amid the curve [m]
+    @default
+    def middle(self) -> Array:
+        """A point (x, y) amid the curve [m]."""
+        raise NotImplementedError(f"{type(self).__name__} has no `middle`")
 
     @abstractmethod
     def point(self, share: Array) -> Array:
@@ -53,7 +56,7 @@ class Line(Path):
     end: Values = field((2,), unit="m")
 
     @property
-    def middle(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def middle(self) -> Array:
         return (self.start + self.end) / 2
 
     def point(self, share):
@@ -64,7 +67,7 @@ class Line(Path):
 class _Closed(Path):
     """A closed curve around `middle` with two `sizes`, turned by the angle `tilt`."""
 
-    middle: Values = field((2,), unit="m")  # pyright: ignore
+    middle: Values = field((2,), unit="m")
     sizes: Values = field((2,), unit="m", minimum=0)
     tilt: Values = field((), unit="rad", default=0.0, kw_only=True)
 
@@ -149,7 +152,7 @@ class Spline(Path):
         self.bends = jnp.asarray(xp.linalg.solve(matrix, right), dtype=float)
 
     @property
-    def middle(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def middle(self) -> Array:
         return self.points.mean(axis=0)
 
     def point(self, share):

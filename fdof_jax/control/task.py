@@ -3,7 +3,6 @@
 from abc import abstractmethod
 from typing import Any
 
-import equinox as eqx
 import jax
 import numpy as np
 from jax import Array
@@ -11,7 +10,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from ..checks import real_array
-from ..forces.part import Condition, Values, called, field, of_kind
+from ..forces.part import Condition, Values, called, default, field, of_kind
 from ..linkage.frames import cross, dot
 from ..linkage.linkage import Linkage
 from ..mechanics.inverse_kinematics import (
@@ -60,8 +59,8 @@ def angle_between(a: Array, b: Array) -> Array:
 class TipReference(Reference):
     """A motion of the tip on which the last link keeps its angle."""
 
-    orientation: eqx.AbstractVar[Values]
-    branch: eqx.AbstractVar[Values]
+    orientation = default(lambda self: 0.0)
+    branch = default(lambda self: 1.0)
 
     def conditions(self):
         yield Condition(abs(self.branch) == 1, "branch", "1 or -1", (self.branch,))

@@ -10,7 +10,7 @@ import dataclasses
 from collections.abc import Callable, Iterable, Iterator
 from functools import reduce
 from operator import and_
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, dataclass_transform
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -106,7 +106,12 @@ class Condition(NamedTuple):
     got: tuple[Any, ...]
 
 
-class Part(eqx.Module):
+@dataclass_transform(field_specifiers=(eqx.field, field, called, of_kind))
+class _Fields(type(eqx.Module)):
+    """Tells type checkers and editors the arguments of constructors."""
+
+
+class Part(eqx.Module, metaclass=_Fields):
     """A pytree with declared arrays, conditions on them, and times of jumps."""
 
     def conditions(self) -> Iterable[Condition]:
