@@ -55,6 +55,14 @@ def test_efforts_are_held_and_come_late(delay):
     np.testing.assert_allclose(motion.qd[1:, 2], np.cumsum(gained), rtol=1e-7)
 
 
+def test_no_delay_is_known_within_jit():
+    """Constant steps cannot end where a late effort starts to act."""
+    steps = diffrax.ConstantStepSize()
+    options = dict(solver=diffrax.Heun(), stepsize_controller=steps, dt0=0.05)
+    end = lambda start: fj.simulate_sampled(WHEEL, start, ramp, 0.1, 2, **options).qd
+    np.testing.assert_allclose(jax.jit(end)(REST)[-1, 2], 0.105, rtol=1e-7)
+
+
 def test_noise_is_what_the_key_says():
     seen = lambda t, q, qd, linkage: q + 10 * qd
     run = lambda seed: fj.simulate_sampled(

@@ -141,10 +141,11 @@ def simulate_sampled(
     forces = elements("forces", forces)
     expected = "a callable (t, q, qd, linkage) -> tau"
     control = element_of(function("control", control, expected))
-    period = real_array("period", period, (), above=0)
+    every = real_array("period", period, (), above=0)
     t0 = real_array("t0", t0, ())
     whole_number("samples", samples, 1)
-    delay = real_array("delay", delay, (), minimum=0)
+    late = real_array("delay", delay, (), minimum=0)
+    # Within `jax.jit`, arrays made of known numbers are traced.
     known, longest = concrete(delay), concrete(period)
     if known is not None and longest is not None and not known < longest:
         raise ValueError(
@@ -164,9 +165,9 @@ def simulate_sampled(
             for k, value in enumerate(noise)
         ]
     state0 = real_state("state0", state0)
-    times = t0 + period * jnp.arange(samples + 1)
+    times = t0 + every * jnp.arange(samples + 1)
     check_elements((control, *forces), linkage, times)
-    late = None if known is not None and known == 0 else delay
+    late = None if known is not None and known == 0 else late
     keys = None if key is None else jax.random.split(key, samples)
     options = dict(throw=False) | options
     return _motion(linkage, state0, control, times, forces, late, spread, keys, options)
