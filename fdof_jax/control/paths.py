@@ -14,7 +14,6 @@ from numpy.typing import ArrayLike
 from ..checks import instance, real_array
 from ..forces.part import Part, Values, default, field
 from ..xla.array_namespace import in_numpy, namespace, sine_and_cosine
-from .timing import Laps, Travel
 
 
 class Path(Part):
@@ -168,10 +167,6 @@ class Spline(Path):
         a, after = 1 - b, (k + 1) % count
         bend = (a**3 - a) * self.bends[k] + (b**3 - b) * self.bends[after]
         return a * self.points[k] + b * self.points[after] + bend / 6
-
-
-# The paths and timings whose formulas also run in NumPy.
-IN_NUMPY = {Line, Ellipse, FigureEight, Spline, Travel, Laps}
 
 
 @eqx.filter_jit

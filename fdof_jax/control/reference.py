@@ -44,11 +44,6 @@ class Reference(Part):
     tip = default(lambda self: None)
     period = default(lambda self: None)
 
-    @default
-    def evaluates_in_numpy(self) -> bool:
-        """Returns whether `assembly` runs in NumPy; a user's subclass may not."""
-        return type(self).__module__.startswith(f"{__package__}.")
-
     def assembly(self, t: Any, linkage: Linkage) -> tuple[Any, Any]:
         raise NotImplementedError(f"{type(self).__name__} has no `__call__`")
 
@@ -67,7 +62,6 @@ class ForeignReference(Foreign, Reference):
 
     tip = optional("tip")
     period = optional("period")
-    evaluates_in_numpy = False
 
 
 def reference_of(value: Any) -> Reference:
@@ -88,6 +82,11 @@ def reference_motion(reference: Any, t: Array, linkage: Linkage) -> tuple[Array,
     return q_ref, qd_ref
 
 
+def runs_in_numpy(*parts: Any) -> bool:
+    """Returns whether all parts are this room's own; users' need not run in NumPy."""
+    return all(type(part).__module__.startswith(f"{__package__}.") for part in parts)
+
+
 def known_assembly(
     reference: Any, linkage: Linkage, times: ArrayLike
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -98,15 +97,14 @@ def known_assembly(
 
 def positions_at(reference: Any, t: Array, linkage: Linkage) -> Any:
     """Positions of a reference, by NumPy if it can and nothing is traced."""
-    numpy = reference_of(reference).evaluates_in_numpy
-    if numpy and not is_traced(reference, t, linkage):
+    if runs_in_numpy(reference) and not is_traced(reference, t, linkage):
         return known_assembly(reference, linkage, t)[0]
     return reference_motion(reference, t, linkage)[0]
 
 
 def known_reach(reference: Any, linkage: Linkage, times: ArrayLike) -> np.ndarray:
     """Computes `reachable` for known values."""
-    if reference_of(reference).evaluates_in_numpy:
+    if runs_in_numpy(reference):
         q, root = known_assembly(reference, linkage, times)
         return np.isfinite(q).all(axis=1) & (root != 0)
     with jax.ensure_compile_time_eval():  # also within transformations
@@ -135,7 +133,7 @@ def reachable(linkage: Linkage, reference: Any, ts: ArrayLike) -> Bool[Array, " 
     """
     check_linkage(linkage)
     ts = real_array("ts", ts, (None,))
-    arguments = reference_of(reference), linkage, ts
+    arguments = function("reference", reference, EXPECTED), linkage, ts
     if is_traced(arguments):
         return _finite(*arguments)
     return jax.device_put(known_reach(*arguments))

@@ -21,8 +21,8 @@ from ..mechanics.inverse_kinematics import (
     whole_turns,
 )
 from ..xla.array_namespace import in_numpy, namespace, plane_vectors
-from .paths import IN_NUMPY, Path, points_at
-from .reference import Reference
+from .paths import Path, points_at
+from .reference import Reference, runs_in_numpy
 from .timing import Laps, Travel
 
 
@@ -116,8 +116,7 @@ class TipTask(TipReference):
 
     def seen(self, t, base):
         """The wrist and its angle, as the angle from the path's middle and its own."""
-        own = not {type(self.path), type(self.timing)} <= IN_NUMPY
-        if own and namespace(t) is np:
+        if namespace(t) is np and not runs_in_numpy(self.path, self.timing):
             with jax.ensure_compile_time_eval():  # also within transformations
                 points = points_at(self.path, self.timing, jax.device_put(np.ravel(t)))
             tip: Any = np.asarray(points).reshape(*np.shape(t), 2)
