@@ -4,6 +4,7 @@ import jax
 import mujoco
 import numpy as np
 import pytest
+from elements import SHORT
 from helpers import random_linkage
 
 import fdof_jax as fj
@@ -189,7 +190,7 @@ def test_a_scene_with_them_is_batched_like_any_other():
     linkage, q, qd = motion("RPR")
     many = fj.State(q + np.linspace(-0.1, 0.1, 5)[:, None], qd)
     ts, forces = [0, 0.2], (ACTUATOR, ARMATURE)
-    swept = fj.sweep(linkage, many, ts, forces)
+    swept = fj.sweep(linkage, many, ts, forces, **SHORT)
     for member, q0 in enumerate(many.q):
-        alone = fj.simulate(linkage, fj.State(q0, qd), ts, forces)
+        alone = fj.simulate(linkage, fj.State(q0, qd), ts, forces, **SHORT)
         np.testing.assert_allclose(swept.q[member], alone.q, atol=1e-9)

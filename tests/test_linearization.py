@@ -7,8 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
-from elements import WITH_INERTIA, Hold
+from elements import Hold
 from helpers import random_linkage
+from test_reactions import TipLoad
 
 import fdof_jax as fj
 from fdof_jax import scenes
@@ -188,9 +189,9 @@ def test_equilibria_are_where_the_efforts_hold_the_arm(topology):
 @pytest.mark.slow
 def test_masses_of_elements_are_held_too():
     linkage, q, *_ = motion("PRR")
-    actuator = WITH_INERTIA["actuator"]
-    controller = held(linkage, q, [300.0, 200.0, 100.0], np.ones(3), (actuator,))
-    found = fj.equilibrium(linkage, (controller, actuator), q + 0.05)
+    load = TipLoad()
+    controller = held(linkage, q, [300.0, 200.0, 100.0], np.ones(3), (load,))
+    found = fj.equilibrium(linkage, (controller, load), q + 0.05)
     np.testing.assert_allclose(found, q, atol=1e-8)
 
 

@@ -179,6 +179,25 @@ def _pulled_back(scene, weights):
     return jax.grad(end)(jnp.asarray(scene.state0.q))
 
 
+@eqx.filter_jit
+def behind_the_door(linkage, q0, ts):
+    """A motion of at most 99 steps, the sum of q^2 at its end, and that sum's slopes.
+
+    The slopes are those in the masses and in q0, by reverse mode. One program serves
+    three files.
+    """
+
+    def end(mass, q0):
+        changed = eqx.tree_at(lambda a: a.mass, linkage, mass)
+        start = fj.State(q0, START.qd)
+        motion = fj.simulate(changed, start, ts, max_steps=99, throw=False)
+        return jnp.sum(motion.q[-1] ** 2), motion
+
+    derive = jax.value_and_grad(end, (0, 1), has_aux=True)
+    (value, motion), slopes = derive(linkage.mass, jnp.asarray(q0))
+    return motion, value, slopes
+
+
 def largest_error(value, exact):
     """Of a derivative, over its largest entry."""
     value, exact = np.asarray(value), np.asarray(exact)
