@@ -150,14 +150,12 @@ def test_reverse_mode_at_an_instant_equals_differences(kinds):
     """
     forces = tuple(elements.ALL[kind] for kind in kinds)
     labels = names(forces)
-    sizes = [len(own) for own in initial_own(arguments(forces))]
-    ends = np.cumsum([len(labels), 3, 3, *sizes])
+    ends = np.cumsum([len(labels), 3, 3, *map(len, initial_own(arguments(forces)))])
 
     @jax.jit
     def found(t, x):
         factors, *parts = jnp.split(x, ends[:-1])
-        args = arguments(scaled(forces, factors))
-        y = tuple(tuple(part) for part in parts)
+        y, args = tuple(map(tuple, parts)), arguments(scaled(forces, factors))
         return jnp.stack(jax.tree.leaves((field(t, y, args), initial_own(args))))
 
     slope = jax.jit(jax.grad(lambda x, t, weights: weights @ found(t, x)))

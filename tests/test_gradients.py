@@ -76,8 +76,8 @@ def steps(tolerance, dt0=1e-3, growth=10.0):
 
 
 # A step over the end of a saturation is as short as the kink there demands, about the
-# square root of the tolerance, and leaves tangents wrong by its length: 1.4e-6 of the
-# gradient at 1e-11, 8e-7 at 1e-12, 1.4e-7 at 1e-13.
+# square root of the tolerance, and leaves tangents wrong by its length: 3e-7 s at a
+# tolerance of 1e-13. How much of that step is wrong depends on rounding.
 STEPS = {"fixed": steps(1e9, 1 / 1024, growth=1.0), "adaptive": steps(1e-13)}
 
 

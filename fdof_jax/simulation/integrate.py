@@ -283,8 +283,15 @@ def _opened(inputs):
 def solve(solver, inputs, keywords) -> Solution:
     """Computes the motion for traced inputs: a batch, or with derivatives."""
     # Within a program, a program of its own would also be traced without derivatives.
-    inside = is_traced(jax.device_put(np.zeros(())))
-    return (_solve if inside else _solve_compiled)(solver, inputs, keywords)
+    if not is_traced(jax.device_put(np.zeros(()))):
+        return _solve_compiled(solver, inputs, keywords)
+    # Within `vmap` even a tracer may hold a NumPy array, which rules of derivatives
+    # refuse in JAX 0.10.
+    known = jax.Array, np.ndarray, np.generic
+    inputs = jax.tree.map(
+        lambda x: jax.device_put(x) if isinstance(x, known) else x, inputs
+    )
+    return _solve(solver, inputs, keywords)
 
 
 def _solve(solver, inputs, keywords) -> Solution:

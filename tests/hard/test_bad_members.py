@@ -35,7 +35,7 @@ def batch(bad):
     qd = rng.uniform(-1, 1, (SIZE, 3))
     at = np.full(SIZE, 1e9)
     if bad:
-        q[NAN_START, 1], at[NAN_LATER], qd[FAST] = np.nan, 0.32, [300, 0, 0]
+        q[NAN_START, 1], at[NAN_LATER], qd[FAST] = np.nan, 0.32, [100, 0, 0]
     return jnp.asarray(q), jnp.asarray(qd), jnp.asarray(at)
 
 

