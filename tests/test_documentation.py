@@ -22,7 +22,7 @@ PUBLIC = {
 UNITLESS = {
     "existence_factors", "to_mjcf", "fig3", "fig5", "fig7", "load", "save", "stacked",
     "tune_each", "gradient_report", "league_table", "circle_scenes", "configure",
-    "Condition", "field",
+    "Condition", "Values", "field",
 }  # fmt: skip
 # Names that implement something printed in the paper.
 SOURCES = {

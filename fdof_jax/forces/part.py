@@ -10,7 +10,7 @@ import dataclasses
 from collections.abc import Callable, Iterable, Iterator
 from functools import reduce
 from operator import and_
-from typing import TYPE_CHECKING, Any, NamedTuple, dataclass_transform
+from typing import Any, NamedTuple, dataclass_transform
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -22,15 +22,12 @@ from ..checks import concrete, function, instance, real_array
 from ..linkage.linkage import Linkage
 from ..xla.array_namespace import in_numpy
 
-if TYPE_CHECKING:
 
-    class Values:
-        """The type of a declared array, which is given as any numbers."""
+class Values:
+    """The type of a declared array, which is given as any numbers."""
 
-        def __get__(self, part: Any, owner: Any = None) -> Array: ...
-        def __set__(self, part: Any, value: ArrayLike) -> None: ...
-else:
-    Values = Array
+    def __get__(self, part: Any, owner: Any = None) -> Array: ...
+    def __set__(self, part: Any, value: ArrayLike) -> None: ...
 
 
 def field(
