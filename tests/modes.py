@@ -2,6 +2,6 @@
 
 import diffrax
 
-# By default `jax.grad` in a few numbers takes tangents. With a checkpoint at each step no
-# part of a motion is repeated with other rounding, which could accept other steps.
+# By default `jax.grad` in a few numbers takes tangents. With a checkpoint at each step
+# no part of a motion is repeated with other rounding, which could accept other steps.
 ADJOINT = diffrax.RecursiveCheckpointAdjoint(checkpoints=1024)
