@@ -44,11 +44,13 @@ def elements() -> Callable:
         inertia=[0.1] * 3,
     )
     start = fj.State([0.0, 1.0, 0.5], [0, 0, 0])
-    task = fj.TipTask(fj.FigureEight([1.1, 0.4], [0.4, 0.2]), fj.Laps(2.0))
+    task = fj.TipTask(
+        fj.references.FigureEight([1.1, 0.4], [0.4, 0.2]), fj.references.Laps(2.0)
+    )
     forces = (
         fj.PDController(400.0, 40.0, 1000.0, task),
         fj.SpringDamper(fj.Point(0, 0, 1), fj.Point(2, 0.5), stiffness=50, damping=1),
-        fj.JointStops(-3.0, 3.0),
+        fj.forces.JointStops(-3.0, 3.0),
     )
     return _simulate(fj.Scene(linkage, start, forces, 2.0))
 

@@ -212,12 +212,12 @@ def _robust(quick: bool) -> Iterator[dict]:
     """
     scene = scenes.fig7()
     pd = scene.forces[0]
-    computed = fj.ComputedTorque(100.0, 20.0, pd.limit, pd.reference)
+    computed = fj.control.ComputedTorque(100.0, 20.0, pd.limit, pd.reference)
     varied = dict(payload=(0, 2), start_offset=0.3, speed=(1, 2))
     for name, controller in (("PD", pd), ("computed torque", computed)):
         nominal = scene._replace(forces=(controller,))
-        seen = fj.perturbed(nominal, 2 if quick else 16, seed=1, **varied)
-        held = fj.perturbed(nominal, 2 if quick else 64, seed=2, **varied)
+        seen = fj.tuning.perturbed(nominal, 2 if quick else 16, seed=1, **varied)
+        held = fj.tuning.perturbed(nominal, 2 if quick else 64, seed=2, **varied)
         judge = jax.jit(jax.vmap(lambda s, g: _loss(with_gains(s, g)), (0, None)))
         for factor in (4.0, 10.0):
             worst = {}
@@ -233,7 +233,7 @@ def _robust(quick: bool) -> Iterator[dict]:
 
 
 def run(quick: bool) -> Iterator[dict]:
-    scene, arms = scenes.fig7(), list(fj.circle_scenes().values())
+    scene, arms = scenes.fig7(), list(fj.tuning.circle_scenes().values())
     few, times = (2, 1) if quick else (20, 3)
     for factor in (4.0, 10.0):
         one = lambda factor=factor: fj.tune(scene, factor=factor)
@@ -243,7 +243,7 @@ def run(quick: bool) -> Iterator[dict]:
         yield from _timed(f"x{factor:g}, {few} starts", 1, many, few)
     yield from _timed("RPR on the league's circle", times, lambda: fj.tune(arms[2]), 1)
     each = 2 if quick else 32
-    every = lambda: fj.tune_each(arms, starts=each)
+    every = lambda: fj.tuning.tune_each(arms, starts=each)
     yield from _timed(f"7 topologies x {each} starts", 1, every, 7 * each)
     yield from _robust(quick)
     yield from _race(quick)

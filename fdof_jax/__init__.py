@@ -1,39 +1,29 @@
 """Dynamics of planar open-chain linkages in JAX."""
 
-import ast
 import importlib
 import importlib.machinery
-import pathlib
 import sys
+import warnings
 from typing import Any
+
+from .names import attach, room_of
 
 __version__ = "0.2.0"
 
-# A name is imported at its first use, so that what needs no JAX starts at once. The
-# stub beside this file lists the names; editors and type checkers read it too.
-_STUB = ast.parse(pathlib.Path(__file__).with_suffix(".pyi").read_text())
-_MODULE_OF = {
-    name.name: statement.module or ""
-    for statement in _STUB.body
-    if isinstance(statement, ast.ImportFrom)
-    for name in statement.names
-}
-__all__ = list(_MODULE_OF)  # pyright: ignore[reportUnsupportedDunderAll]
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _MODULE_OF:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    place = ".".join(filter(None, [__name__, _MODULE_OF[name]]))
-    value = vars(importlib.import_module(place)).get(name)
-    if value is None:  # a module
-        value = importlib.import_module(f"{place}.{name}")
-    globals()[name] = value  # found without this function from now on
-    return value
+# A name is imported at its first use, so that what needs no JAX starts at once.
+_find, _names, __all__ = attach(__name__, __file__)
 
 
 def __dir__() -> list[str]:
-    return [*__all__, "__version__"]
+    return [*_names(), "__version__"]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__ and (room := room_of(name)):
+        message = f"{__name__}.{name} is now {room.__name__}.{name}"
+        warnings.warn(message, DeprecationWarning, stacklevel=2)
+        return getattr(room, name)
+    return _find(name)
 
 
 class _Moved:

@@ -58,7 +58,7 @@ def inertia_ratios(
 
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig5().linkage
-    >>> float(fj.inertia_ratios(arm, [0, 0, 0]).min())  # a digit is lost
+    >>> float(fj.analysis.inertia_ratios(arm, [0, 0, 0]).min())  # a digit is lost
     0.04
     """
     more = added_inertia(linkage, forces, q, jnp.zeros_like(q))

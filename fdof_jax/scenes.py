@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from .control.circle import CircleTask
 from .control.pd import PDController
 from .forces.joints import JointDamper
 from .linkage.coordinates import State, from_chain
 from .linkage.linkage import Linkage
+from .references.circle import CircleTask
 from .simulation.scene import Scene as Scene
 
 

@@ -15,10 +15,10 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 HARD = Path(__file__).parent / "hard"
 # Doctests that compile searches.
 SEARCHES = {
-    "fdof_jax.identification.fit.fit_each",
+    "fdof_jax.identification.fitting.fit_each",
     "fdof_jax.tuning.league.league_table",
     "fdof_jax.tuning.optimal_motion.optimal_efforts",
-    "fdof_jax.tuning.tune.tune_each",
+    "fdof_jax.tuning.tuning.tune_each",
 }
 # Scripts that need packages which the tests do not need.
 collect_ignore_glob = ["hard/make_*.py"]

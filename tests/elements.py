@@ -60,13 +60,13 @@ PLAIN = {
     "damper": fj.JointDamper([0.3, 0.2, 0.1]),
     "effort": fj.JointEffort([1.0, -0.5, 0.3]),
     "PD": PD,
-    "history": fj.EffortHistory(
+    "history": fj.forces.EffortHistory(
         [0.013, 0.0519, 0.0873, 0.3], [[2, 0, 1], [-1, 3, 0], [0, 1, 2], [1, 1, -3]]
     ),
-    "gravity": fj.GravityFeedforward(
+    "gravity": fj.control.GravityFeedforward(
         [9.0, 7.0, 5.0], [3.0, 2.0, 1.0], [4.0, 50.0, 9.0], MOVE
     ),
-    "computed torque": fj.ComputedTorque(
+    "computed torque": fj.control.ComputedTorque(
         [9.0, 7.0, 5.0], [3.0, 2.0, 1.0], [90.0, 2.0, 60.0], MOVE, arm("RPR")
     ),
     "spring": fj.SpringDamper(
@@ -78,28 +78,28 @@ PLAIN = {
     "bumper": fj.SpringDamper(
         HOOK, TIP, stiffness=25.0, damping=0.1, rest_length=3.0, one_sided="bumper"
     ),
-    "tension": fj.Tension(HOOK, TIP, 2.5),
+    "tension": fj.forces.Tension(HOOK, TIP, 2.5),
     "wrench": fj.Wrench(TIP, [3.0, -2.0], 0.7),
     "following wrench": fj.Wrench(ELBOW, [1.0, 2.0], follows=True),
-    "stops": fj.JointStops(
+    "stops": fj.forces.JointStops(
         [-1.0, -0.12, -np.inf], [0.22, 2.0, 0.35], stiffness=40.0, damping=0.5,
         smoothing=0.1,
     ),
-    "friction": fj.JointFriction([0.4, 0.3, 0.2], 0.5),
+    "friction": fj.forces.JointFriction([0.4, 0.3, 0.2], 0.5),
 }  # fmt: skip
 WITH_STATE = {
-    "speed limit": fj.SpeedLimit(PD, stall=3.0, no_load=4.0),
-    "PID": fj.PIDController(8.0, [4.0, 3.0, 2.0], 2.0, [3.0, 9.0, 1.0], MOVE),
-    "lag": fj.FirstOrderLag(PD, 0.2, start=[0.5, 0.0, 0.0]),
-    "motor": fj.DCMotor(
+    "speed limit": fj.control.SpeedLimit(PD, stall=3.0, no_load=4.0),
+    "PID": fj.control.PIDController(8.0, [4.0, 3.0, 2.0], 2.0, [3.0, 9.0, 1.0], MOVE),
+    "lag": fj.control.FirstOrderLag(PD, 0.2, start=[0.5, 0.0, 0.0]),
+    "motor": fj.control.DCMotor(
         PD, resistance=2.0, inductance=0.3, constant=0.4, gear=3.0,
         voltage_limit=[5.0, 0.2, 5.0],
         current_limit=[0.3, 9.0, 0.1],
     ),
 }  # fmt: skip
-WITH_STATE["motor with PID"] = fj.FirstOrderLag(WITH_STATE["PID"], 0.1)
+WITH_STATE["motor with PID"] = fj.control.FirstOrderLag(WITH_STATE["PID"], 0.1)
 WITH_INERTIA = {
-    "armature": fj.Armature([0.3, 0.2, 0.1]),
+    "armature": fj.forces.Armature([0.3, 0.2, 0.1]),
     "actuator": fj.LinearActuator(
         HOOK, ELBOW, force=5.0, mass=[1.2, 0.7], com=[0.2, 0.3], inertia=[0.05, 0.03]
     ),

@@ -13,7 +13,7 @@ PINS = fj.Point(0, -0.6, -0.8), fj.Point(2, 0.4, 0.3)
 ACTUATOR = fj.LinearActuator(
     *PINS, force=5.0, mass=[1.2, 0.7], com=[0.2, 0.3], inertia=[0.05, 0.03]
 )
-ARMATURE = fj.Armature([0.3, 0.2, 0.1])
+ARMATURE = fj.forces.Armature([0.3, 0.2, 0.1])
 ELEMENTS = {"armature": ARMATURE, "actuator": ACTUATOR}
 
 
@@ -181,8 +181,10 @@ def test_the_conditioning_sees_the_armature():
         inertia=[1 / 12] * 3,
     )  # fmt: skip
     q = np.array([0.1, 0.2, 0.3])
-    assert fj.inertia_ratios(linkage, q).min() < 1e-4
-    assert fj.inertia_ratios(linkage, q, (fj.Armature(1e9),)).min() > 0.9
+    assert fj.analysis.inertia_ratios(linkage, q).min() < 1e-4
+    assert (
+        fj.analysis.inertia_ratios(linkage, q, (fj.forces.Armature(1e9),)).min() > 0.9
+    )
 
 
 @pytest.mark.slow

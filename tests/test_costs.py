@@ -58,7 +58,7 @@ def test_a_scene_without_elements_costs_the_bare_equations():
     [
         fj.JointDamper(2.0),
         fj.JointEffort([1.0, 2.0, 3.0]),
-        fj.EffortHistory([0.0, 0.2], [[1, 2, 3], [3, 2, 1]]),
+        fj.forces.EffortHistory([0.0, 0.2], [[1, 2, 3], [3, 2, 1]]),
         scenes.fig7().forces[0],
     ],
     ids=["damper", "effort", "history", "PD circle"],
@@ -77,7 +77,11 @@ def test_a_model_costs_only_the_controllers_that_have_one():
     gains = 9.0, 3.0, 10.0, Hold(jnp.ones(3))
     plain, held, computed = (
         element_flops(kind(*gains))
-        for kind in (fj.PDController, fj.GravityFeedforward, fj.ComputedTorque)
+        for kind in (
+            fj.PDController,
+            fj.control.GravityFeedforward,
+            fj.control.ComputedTorque,
+        )
     )
     assert plain == 33 < held <= 350 and computed <= 850
 

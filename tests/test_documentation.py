@@ -11,9 +11,13 @@ from fdof_jax import drawing, plotting, scenes
 
 ROOT = Path(__file__).parents[1]
 
+ROOMS = [
+    fj.analysis, fj.control, fj.data, fj.forces, fj.identification, fj.references,
+    fj.tuning,
+]  # fmt: skip
 PUBLIC = {
     name: value
-    for module in (fj, scenes)
+    for module in (fj, *ROOMS, scenes)
     for name in dir(module)
     if callable(value := getattr(module, name))
     and getattr(value, "__module__", "").startswith("fdof_jax")
@@ -69,6 +73,12 @@ def test_the_front_door_is_complete():
 # Every name that a user may import, with its module unless that is `fdof_jax`.
 NAMES = [
     *(name for name in fj.__all__ if not inspect.ismodule(getattr(fj, name))),
+    *(
+        f"{room.__name__.removeprefix('fdof_jax.')}.{name}"
+        for room in ROOMS
+        for name in room.__all__
+        if name not in fj.__all__
+    ),
     *(f"scenes.{name}" for name in ("fig3", "fig5", "fig7")),
     "interactive.sliders",
     *(
@@ -113,13 +123,13 @@ def test_every_name_has_an_example():
     ran = examples()
     for name in NAMES:
         short = name.split(".")[-1]
-        maker = RETURNED_BY.get(name, short)
+        maker = RETURNED_BY.get(short, short)
         assert re.search(
-            rf"\b(fj|scenes|drawing|plotting|interactive)\.{maker}\b", ran
+            rf"\b(fj(\.[a-z]+)?|scenes|drawing|plotting|interactive)\.{maker}\b", ran
         ), name
-        if name in RETURNED_BY:
-            returned = inspect.signature(getattr(fj, maker)).return_annotation
-            assert name in returned.__name__
+        if short in RETURNED_BY:
+            returned = inspect.signature(PUBLIC[maker]).return_annotation
+            assert short in returned.__name__
 
 
 def test_every_name_has_a_place_in_the_reference():

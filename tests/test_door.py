@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 import fdof_jax as fj
-from fdof_jax.control.reference import known_assembly
-from fdof_jax.control.timing import PROFILES
+from fdof_jax.references.reference import known_assembly
+from fdof_jax.references.timing import PROFILES
 from fdof_jax.simulation.simulate import check_elements
 
 ARM = dict(
@@ -26,20 +26,20 @@ TS = np.linspace(0, 3, 61)
 def references():
     """Returns the library's references: every path with every timing, and the rest."""
     paths = {
-        "line": fj.Line([1.2, -0.4], [0.9, 0.8]),
-        "ellipse": fj.Ellipse([1.1, 0.4], [0.4, 0.2], tilt=0.3),
-        "eight": fj.FigureEight([1.1, 0.4], [0.4, 0.2], tilt=-0.2),
-        "spline": fj.Spline(POINTS),
-        "closed spline": fj.Spline(POINTS, closed=True),
+        "line": fj.references.Line([1.2, -0.4], [0.9, 0.8]),
+        "ellipse": fj.references.Ellipse([1.1, 0.4], [0.4, 0.2], tilt=0.3),
+        "eight": fj.references.FigureEight([1.1, 0.4], [0.4, 0.2], tilt=-0.2),
+        "spline": fj.references.Spline(POINTS),
+        "closed spline": fj.references.Spline(POINTS, closed=True),
     }
     timings = {
-        profile: fj.Travel(2.0, begin=0.5, profile=profile, shock=0.2)
+        profile: fj.references.Travel(2.0, begin=0.5, profile=profile, shock=0.2)
         for profile in PROFILES
     }
-    timings["laps"] = fj.Laps(2.0, phase=0.1)
+    timings["laps"] = fj.references.Laps(2.0, phase=0.1)
     return {
         "circle": fj.CircleTask([1.1, 0.4], 0.3, 2.0, 0.5, 0.0),
-        "move": fj.JointMove(START, [1, 2, 3], timings["quintic"]),
+        "move": fj.references.JointMove(START, [1, 2, 3], timings["quintic"]),
     } | {
         f"{path}, {timing}": fj.TipTask(paths[path], timings[timing])
         for path in paths
@@ -47,7 +47,7 @@ def references():
     }
 
 
-class Parabola(fj.Path):
+class Parabola(fj.references.Path):
     """A user's own path, which NumPy may be unable to evaluate."""
 
     middle = np.array([1.2, 0.4])
@@ -76,15 +76,21 @@ def test_reachable_is_the_same_for_known_and_for_traced_times(topology):
         random = np.random.default_rng(seed)
         center, (radius, phase, angle) = random.normal(size=2), random.uniform(size=3)
         circle = fj.CircleTask(center, radius, 2.0, phase, angle, (-1) ** seed)
-        path = fj.Ellipse(center, [radius, 0.5], tilt=phase)
-        for task in circle, fj.TipTask(path, fj.Laps(2.0), orientation=angle):
-            known, traced = fj.reachable(arm, task, TS), _reachable(arm, task, TS)
+        path = fj.references.Ellipse(center, [radius, 0.5], tilt=phase)
+        for task in (
+            circle,
+            fj.TipTask(path, fj.references.Laps(2.0), orientation=angle),
+        ):
+            known, traced = (
+                fj.references.reachable(arm, task, TS),
+                _reachable(arm, task, TS),
+            )
             np.testing.assert_array_equal(known, traced)
             some += known.any() and not known.all()
     assert some or topology.count("P") == 2  # of which none is out of reach
 
 
-_reachable = jax.jit(fj.reachable)
+_reachable = jax.jit(fj.references.reachable)
 
 
 def test_a_circle_that_touches_the_edge_of_the_reach_is_refused():
@@ -93,7 +99,7 @@ def test_a_circle_that_touches_the_edge_of_the_reach_is_refused():
     task = fj.CircleTask([1.25, 0], 1.0, 2.0, 0.0, 0.0)
     with pytest.raises(ValueError, match="reference: expected a circle within"):
         task.check(arm, TS)
-    assert not fj.reachable(arm, task, TS)[0]
+    assert not fj.references.reachable(arm, task, TS)[0]
 
 
 # Compilations
@@ -123,13 +129,17 @@ def compiled_programs():
         )
         check_elements(forces, arm, times)
         forces[1].agrees(0.0, START, arm)
-        fj.reachable(arm, reference, times)
+        fj.references.reachable(arm, reference, times)
     fj.inverse_kinematics(arm, [1.2, 0.3], 0.0)
-    for scene in fj.scenes.fig3(), fj.scenes.fig7(), *fj.circle_scenes().values():
+    for scene in (
+        fj.scenes.fig3(),
+        fj.scenes.fig7(),
+        *fj.tuning.circle_scenes().values(),
+    ):
         check_elements(scene.forces, scene.linkage, times)
     library = count[0]
     for slope in (1.0, 2.0):
-        own = fj.TipTask(Parabola(), fj.Travel(2.0 * slope))
+        own = fj.TipTask(Parabola(), fj.references.Travel(2.0 * slope))
         check_elements((fj.PDController(10.0, 1.0, 5.0, own),), arm, times)
     return library, count[0] - library
 

@@ -28,7 +28,7 @@ def only_last(value):
 
 
 def test_a_lag_is_an_exponential():
-    lag = fj.FirstOrderLag(fj.JointEffort([0, 0, 3.0]), 0.2)
+    lag = fj.control.FirstOrderLag(fj.JointEffort([0, 0, 3.0]), 0.2)
     ts = np.linspace(0, 1, 11)
     solution = fj.simulate(single(), STILL, ts, (lag,))
     effort = solution.own[0].own
@@ -41,7 +41,7 @@ def test_a_lag_is_an_exponential():
 
 
 def test_a_motor_reaches_its_current_and_its_speed():
-    motor = fj.DCMotor(
+    motor = fj.control.DCMotor(
         fj.JointEffort([0, 0, 12.0]), resistance=2.0, inductance=0.5, constant=0.1,
         gear=3.0,
     )  # fmt: skip
@@ -62,7 +62,7 @@ def test_a_motor_s_limits():
     command = fj.JointEffort([0, 0, 100.0])
     options = dict(resistance=2.0, inductance=0.01, constant=0.1)
     ts = np.linspace(0, 0.2, 21)
-    low = fj.DCMotor(command, voltage_limit=4.0, **options)
+    low = fj.control.DCMotor(command, voltage_limit=4.0, **options)
     current = fj.simulate(single(), STILL, ts, (low,)).own[0].own[:, 2]
     assert current.max() == pytest.approx(2.0, rel=1e-2)  # V / R, less the back-EMF
 
@@ -73,7 +73,7 @@ def test_currents_stay_within_their_limit():
     ts = np.linspace(0, 0.2, 41)
 
     def current(resistance, limit):
-        motor = fj.DCMotor(
+        motor = fj.control.DCMotor(
             turning, resistance=resistance, inductance=0.01, constant=0.1,
             current_limit=limit,
         )  # fmt: skip
@@ -92,7 +92,9 @@ def test_currents_stay_within_their_limit():
 
 
 def test_a_speed_limit_is_a_line():
-    drive = fj.SpeedLimit(fj.JointEffort([9.0, 9.0, -9.0]), stall=6.0, no_load=2.0)
+    drive = fj.control.SpeedLimit(
+        fj.JointEffort([9.0, 9.0, -9.0]), stall=6.0, no_load=2.0
+    )
     q = np.zeros(3)
     for qd, expected in (
         ([0, 0, 0], [6, 6, -6]),
@@ -111,8 +113,8 @@ def test_an_integral_removes_the_sag():
     )  # fmt: skip
     hold = Hold(jnp.array([0.3, 0.2, 0.1]))
     start = fj.State(np.zeros(3), np.zeros(3))
-    pd = fj.PIDController(200.0, 0.0, 40.0, jnp.inf, hold)  # see below
-    pid = fj.PIDController(200.0, 300.0, 40.0, jnp.inf, hold)
+    pd = fj.control.PIDController(200.0, 0.0, 40.0, jnp.inf, hold)  # see below
+    pid = fj.control.PIDController(200.0, 300.0, 40.0, jnp.inf, hold)
     ends = [
         np.abs(fj.simulate(arm, start, [0, 15], (f,)).q[-1] - hold.target).max()
         for f in (pd, pid)
@@ -126,10 +128,10 @@ def test_an_integral_removes_the_sag():
 def test_anti_windup_keeps_the_overshoot_small():
     """The step saturates for so long that a plain integral would wind up."""
 
-    class WindsUp(fj.StatefulElement):
+    class WindsUp(fj.forces.StatefulElement):
         """The PID controller without anti-windup."""
 
-        pid: fj.PIDController
+        pid: fj.control.PIDController
 
         def initial_state(self, linkage):
             return self.pid.initial_state(linkage)
@@ -138,7 +140,7 @@ def test_anti_windup_keeps_the_overshoot_small():
             effort, _ = self.pid(t, q, qd, linkage, state)
             return effort, self.pid.ki * (self.pid.pd.reference(t, linkage)[0] - q)
 
-    pid = fj.PIDController(8.0, 2.0, 6.0, 1.0, Hold(only_last(3.0)))
+    pid = fj.control.PIDController(8.0, 2.0, 6.0, 1.0, Hold(only_last(3.0)))
     ts = np.linspace(0, 30, 301)
     motions = [fj.simulate(single(), STILL, ts, (f,)) for f in (WindsUp(pid), pid)]
     wild, calm = (float(m.q[:, 2].max() - 3) for m in motions)
@@ -150,7 +152,7 @@ def test_without_an_integral_it_is_the_pd_controller():
     """Also holds at the limits; an integral of zero stays zero."""
     hold = Hold(only_last(1.0))
     pd = fj.PDController(8.0, 6.0, 1.0, hold)
-    pid = fj.PIDController(8.0, 0.0, 6.0, 1.0, hold)
+    pid = fj.control.PIDController(8.0, 0.0, 6.0, 1.0, hold)
     state = pid.initial_state(single())
     assert not np.any(state)
     for at in 0.1 * np.random.default_rng(0).normal(size=(9, 2, 3)):
@@ -161,8 +163,10 @@ def test_without_an_integral_it_is_the_pd_controller():
 
 def test_drives_in_a_row():
     """A PID controller's torque passes a lag and a speed limit, all with states."""
-    pid = fj.PIDController(8.0, 2.0, 6.0, 10.0, Hold(only_last(1.0)))
-    drive = fj.SpeedLimit(fj.FirstOrderLag(pid, 0.05), stall=5.0, no_load=3.0)
+    pid = fj.control.PIDController(8.0, 2.0, 6.0, 10.0, Hold(only_last(1.0)))
+    drive = fj.control.SpeedLimit(
+        fj.control.FirstOrderLag(pid, 0.05), stall=5.0, no_load=3.0
+    )
     solution = fj.simulate(single(), STILL, np.linspace(0, 20, 21), (drive,))
     state = solution.own[0]
     assert state.own == () and state.command.own.shape == (21, 3)
@@ -171,7 +175,7 @@ def test_drives_in_a_row():
 
 
 def test_a_motion_goes_on_from_its_states():
-    lag = fj.FirstOrderLag(fj.JointEffort([0, 0, 3.0]), 0.2)
+    lag = fj.control.FirstOrderLag(fj.JointEffort([0, 0, 3.0]), 0.2)
     whole = fj.simulate(single(), STILL, [0, 0.5, 1.0], (lag,))
     half = fj.State(whole.q[1], whole.qd[1])
     own = jax.tree.map(lambda rows: rows[1], whole.own)
@@ -184,7 +188,7 @@ def test_a_motion_goes_on_from_its_states():
 
 
 def test_a_state_that_is_not_a_number_is_told():
-    lag = fj.FirstOrderLag(fj.JointEffort([0, 0, 3.0]), 0.2)
+    lag = fj.control.FirstOrderLag(fj.JointEffort([0, 0, 3.0]), 0.2)
     own0 = jax.tree.map(lambda x: jnp.nan * x, (lag.initial_state(single()),))
     solution = fj.simulate(single(), STILL, [0, 1.0], (lag,), own0=own0, throw=False)
     assert str(solution.outcome) == "not finite"
@@ -195,7 +199,7 @@ def test_a_state_that_is_not_a_number_is_told():
 
 
 def test_states_of_elements_are_swept():
-    lag = fj.FirstOrderLag(fj.JointEffort([0, 0, 3.0]), 0.2)
+    lag = fj.control.FirstOrderLag(fj.JointEffort([0, 0, 3.0]), 0.2)
     q = np.linspace(0, 1, 5)[:, None] * np.ones(3)
     starts, ts = fj.State(q, np.zeros(3)), [0, 0.2, 0.4]
     solution = fj.sweep(single(), starts, ts, (lag,), solver=LoopedDopri8())
@@ -204,7 +208,7 @@ def test_states_of_elements_are_swept():
     np.testing.assert_allclose(effort[..., 2], np.tile(exact, (5, 1)), atol=1e-9)
 
 
-class Wrong(fj.StatefulElement):
+class Wrong(fj.forces.StatefulElement):
     """An element whose rate has another shape than its state."""
 
     def initial_state(self, linkage):
@@ -220,13 +224,15 @@ def test_malformed_elements_are_refused():
     ):
         fj.simulate(single(), STILL, [0, 1], (Wrong(),))
     with pytest.raises(ValueError, match="command: expected a force element"):
-        fj.FirstOrderLag(3.0, 0.1)
-    short = fj.FirstOrderLag(lambda t, q, qd, linkage: 5.0, 0.1)
+        fj.control.FirstOrderLag(3.0, 0.1)
+    short = fj.control.FirstOrderLag(lambda t, q, qd, linkage: 5.0, 0.1)
     with pytest.raises(ValueError, match="command: expected an array of 3"):
         fj.simulate(single(), STILL, [0, 1], (short,))
     with pytest.raises(ValueError, match="ki: expected 0 where kp is"):
-        fj.PIDController(0.0, 1.0, 1.0, 1.0, Hold(only_last(1.0)))
+        fj.control.PIDController(0.0, 1.0, 1.0, 1.0, Hold(only_last(1.0)))
     with pytest.raises(ValueError, match="time_constant: expected .* above 0"):
-        fj.FirstOrderLag(fj.JointEffort(np.ones(3)), 0.0)
+        fj.control.FirstOrderLag(fj.JointEffort(np.ones(3)), 0.0)
     with pytest.raises(ValueError, match="resistance: expected"):
-        fj.DCMotor(fj.JointEffort(np.ones(3)), resistance=-1, inductance=1, constant=1)
+        fj.control.DCMotor(
+            fj.JointEffort(np.ones(3)), resistance=-1, inductance=1, constant=1
+        )

@@ -13,12 +13,12 @@ TAU = np.random.default_rng(0).normal(size=(4, 3))
 
 
 def test_efforts_are_linear_between_the_times_and_held_beyond():
-    history, zero = fj.EffortHistory(TS, TAU), np.zeros(3)
+    history, zero = fj.forces.EffortHistory(TS, TAU), np.zeros(3)
     times = np.array([-1, 0.1, 0.17, 0.25, 0.299, 0.5, 0.62, 3])
     found = jax.vmap(lambda t: history(t, zero, zero, None))(times)
     expected = np.stack([np.interp(times, TS, column) for column in TAU.T], axis=1)
     np.testing.assert_allclose(found, expected, rtol=1e-12)
-    constant = fj.EffortHistory([0.5], TAU[:1])
+    constant = fj.forces.EffortHistory([0.5], TAU[:1])
     np.testing.assert_array_equal(constant(0.7, zero, zero, None), TAU[0])
 
 
@@ -31,7 +31,7 @@ def momentum(linkage, q, qd):
 @pytest.mark.slow
 def test_the_momentum_gained_is_the_integral_of_the_efforts():
     linkage = eqx.tree_at(lambda k: k.gravity, arm("PRR"), 0.0)
-    forces = (fj.EffortHistory(TS, TAU),)
+    forces = (fj.forces.EffortHistory(TS, TAU),)
     solution = fj.simulate(linkage, START, [0, 0.7], forces)
     end = momentum(linkage, solution.q[-1], solution.qd[-1])
     # Trapezia, and the constant efforts before and after.
@@ -51,11 +51,11 @@ def test_the_momentum_gained_is_the_integral_of_the_efforts():
 )
 def test_malformed_histories_are_refused(ts, tau, name):
     with pytest.raises(ValueError, match=name):
-        fj.EffortHistory(ts, tau)
+        fj.forces.EffortHistory(ts, tau)
 
 
 def test_times_that_no_constructor_saw_are_checked():
-    spoilt = eqx.tree_at(lambda h: h.ts, fj.EffortHistory(TS, TAU), -TS)
+    spoilt = eqx.tree_at(lambda h: h.ts, fj.forces.EffortHistory(TS, TAU), -TS)
     with pytest.raises(ValueError, match="ts: expected increasing times"):
         fj.simulate(arm("RRR"), START, [0, 0.1], (spoilt,))
     assert not jax.jit(lambda h: h.possible())(spoilt)

@@ -24,7 +24,9 @@ class Pulse(fj.Element):
 
     def conditions(self):
         begin, end = self.jump_ts
-        yield fj.Condition(begin < end, "jump_ts", "increasing times", (begin, end))
+        yield fj.forces.Condition(
+            begin < end, "jump_ts", "increasing times", (begin, end)
+        )
 
     def __call__(self, t, q, qd, linkage):
         on = (t >= self.jump_ts[0]) & (t < self.jump_ts[1])
@@ -65,7 +67,7 @@ def test_every_element_tells_a_program_what_is_impossible():
 
 
 def test_a_fault_within_is_told_with_its_place():
-    lag = fj.FirstOrderLag(fj.SpeedLimit(PD, 1.0, 2.0), 0.1)
+    lag = fj.control.FirstOrderLag(fj.control.SpeedLimit(PD, 1.0, 2.0), 0.1)
     spoilt = eqx.tree_at(lambda e: e.command.command.kp, lag, -PD.kp)
     with pytest.raises(
         ValueError, match=r"^forces\[0\]\.command\.command\.kp: expected"
@@ -75,11 +77,11 @@ def test_a_fault_within_is_told_with_its_place():
 
 
 def test_jumps_are_passed_on():
-    travel = fj.Travel(2.0, begin=1.0)
-    move = fj.JointMove([0, 0, 0], [1, 1, 1], travel)
+    travel = fj.references.Travel(2.0, begin=1.0)
+    move = fj.references.JointMove([0, 0, 0], [1, 1, 1], travel)
     pd = fj.PDController(1.0, 1.0, 1.0, move)
-    path = fj.TipTask(fj.Line([1, 0], [1, 1]), travel)
-    drive = fj.FirstOrderLag(pd, 0.1)
+    path = fj.TipTask(fj.references.Line([1, 0], [1, 1]), travel)
+    drive = fj.control.FirstOrderLag(pd, 0.1)
     for part in (travel, move, path, pd, drive, fj.PrescribedMotion(1, move)):
         np.testing.assert_array_equal(part.jump_ts, [1, 3])
     assert PD.jump_ts is None and fj.JointDamper(1.0).jump_ts is None
@@ -119,7 +121,7 @@ def test_attributes_of_other_callables_count():
     q = jnp.array([1.0, 2.0, 2.0])
     with_spring = fj.energy(ARM, q, 0 * q, (Foreign(TS, jnp.array(2.0)),))
     np.testing.assert_allclose(with_spring[1] - fj.energy(ARM, q, 0 * q)[1], 9.0)
-    drive = fj.SpeedLimit(Foreign(TS, jnp.array(1.0)), 1.0, 2.0)
+    drive = fj.control.SpeedLimit(Foreign(TS, jnp.array(1.0)), 1.0, 2.0)
     np.testing.assert_array_equal(drive.jump_ts, TS)
 
 
@@ -152,7 +154,7 @@ def test_a_function_in_place_of_an_array_is_checked_where_it_is_called():
 def test_a_reference_of_one_s_own():
     """Its velocities are the rates of its positions."""
 
-    class Parabola(fj.Reference):
+    class Parabola(fj.references.Reference):
         bend: fj.Values = fj.field(unit="rad/s^2")
 
         def assembly(self, t, linkage):

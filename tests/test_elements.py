@@ -111,7 +111,7 @@ def check_slopes(forces, slopes, differences):
 
 
 def test_slopes_in_all_parameters_equal_differences():
-    limited = fj.SpeedLimit(elements.PD, stall=[1.0, 3.0, 0.5], no_load=4.0)
+    limited = fj.control.SpeedLimit(elements.PD, stall=[1.0, 3.0, 0.5], no_load=4.0)
     forces = tuple((elements.ALL | {"speed limit": limited}).values())
 
     def acting(p, *at):

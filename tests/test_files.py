@@ -36,7 +36,7 @@ from fdof_jax import scenes
 from fdof_jax.shell.tuning_run import Job
 from fdof_jax.simulation import integrate
 from fdof_jax.simulation.looped_dopri8 import LoopedDopri8
-from fdof_jax.tuning import tune as tuning
+from fdof_jax.tuning import tuning
 
 TS = np.linspace(0, 0.1, 4)
 
@@ -63,10 +63,15 @@ def test_elements(name, path):
 
 
 REFERENCES = {
-    "move": fj.JointMove([0, 0, 0], [1, 2, 3], fj.Travel(2.0, profile="cycloidal")),
-    "line": fj.TipTask(fj.Line([0, 1], [2, 3]), fj.Laps(2.0), orientation=0.1),
+    "move": fj.references.JointMove(
+        [0, 0, 0], [1, 2, 3], fj.references.Travel(2.0, profile="cycloidal")
+    ),
+    "line": fj.TipTask(
+        fj.references.Line([0, 1], [2, 3]), fj.references.Laps(2.0), orientation=0.1
+    ),
     "spline": fj.TipTask(
-        fj.Spline([[0, 0], [1, 0], [1, 1], [0, 1]], closed=True), fj.Travel(1.0)
+        fj.references.Spline([[0, 0], [1, 0], [1, 1], [0, 1]], closed=True),
+        fj.references.Travel(1.0),
     ),
 }
 
@@ -303,12 +308,12 @@ def test_a_file_of_version_0_1():
     tree = fj.load(OF_0_1, OWN)
     equal(tree["scenes"], SCENES)
     equal(tree["elements"], elements.ALL)
-    assert tree["functions"] == [fj.sweep, fj.tip_errors, fj.simulate]
+    assert tree["functions"] == [fj.sweep, fj.tuning.tip_errors, fj.simulate]
     assert type(tree["tuned"]) is fj.TuneResult
-    assert type(tree["optimal"]) is fj.OptimalMotion
+    assert type(tree["optimal"]) is fj.tuning.OptimalMotion
     assert tree["solution"].outcome == "successful"
-    travel = fj.Travel(2.0, begin=0.5, profile="trapezoidal")
-    spline = fj.Spline([[0, 0], [1, 0], [1, 1], [0, 1]], closed=True)
+    travel = fj.references.Travel(2.0, begin=0.5, profile="trapezoidal")
+    spline = fj.references.Spline([[0, 0], [1, 0], [1, 1], [0, 1]], closed=True)
     equal(tree["references"][7], fj.TipTask(spline, travel, orientation=0.1))
 
 

@@ -29,7 +29,7 @@ from saved_trees import (
 )
 
 import fdof_jax as fj
-from fdof_jax.control.timing import PROFILES
+from fdof_jax.references.timing import PROFILES
 from fdof_jax.simulation.looped_dopri8 import LoopedDopri8
 
 

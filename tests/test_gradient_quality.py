@@ -131,7 +131,7 @@ def test_nothing_is_nan_at_rest_at_zero_error_or_at_saturation():
 
 @pytest.fixture(scope="module")
 def report():
-    return fj.gradient_report(scenes.fig7()._replace(t1=2.0))
+    return fj.tuning.gradient_report(scenes.fig7()._replace(t1=2.0))
 
 
 def test_the_report_is_what_it_says(report):
@@ -158,7 +158,7 @@ def test_the_report_is_what_it_says(report):
 
 def test_a_report_says_where_gains_have_no_effect():
     scene = with_limit([1000.0, 1e-6, 400.0])._replace(t1=0.5)
-    found = fj.gradient_report(scene)
+    found = fj.tuning.gradient_report(scene)
     assert not found.gradient[:, 1].any() and found.saturated[1] == 1
     assert "P2 is at its limit throughout" in found.warnings[0]
 
@@ -167,8 +167,8 @@ def test_a_report_without_modes_for_elements_with_a_state():
     scene = scenes.fig7()._replace(t1=0.2)
     # Whole numbers in lists are a state too.
     scene = scene._replace(state0=fj.State([2, 3, -2], [0, 0, 0]))
-    lag = fj.FirstOrderLag(fj.JointEffort(np.ones(3)), 0.1)
-    found = fj.gradient_report(scene._replace(forces=(*scene.forces, lag)))
+    lag = fj.control.FirstOrderLag(fj.JointEffort(np.ones(3)), 0.1)
+    found = fj.tuning.gradient_report(scene._replace(forces=(*scene.forces, lag)))
     # P2 is at its limit throughout: the gradient is small, and most of it noise.
     assert found.modes is None and found.error < 1e-2
     assert "natural frequencies" not in str(found)

@@ -96,7 +96,7 @@ def along(linkage, forces, solution, efforts):
 @pytest.mark.parametrize("joints", [1, 2, 3, (1, 2), (1, 2, 3)], ids=str)
 @pytest.mark.parametrize("topology", ["RRR", "RPR", "PRP"])
 def test_efforts_make_the_motion_and_do_its_work(topology, joints):
-    armature = fj.Armature(0.3)
+    armature = fj.forces.Armature(0.3)
     linkage, start, forces = swinging(topology, joints, (armature,))
     ts = np.linspace(0, 1, 101)
     solution = fj.simulate(linkage, start, ts, forces)
@@ -199,7 +199,7 @@ def test_topologies_are_batched():
 
 def residual(travel, stroke=0.05):
     """Returns the load's swing after the travel, divided by the stroke."""
-    move = fj.JointMove(np.zeros(3), [stroke, 0, 0], travel)
+    move = fj.references.JointMove(np.zeros(3), [stroke, 0, 0], travel)
     motion = fj.PrescribedMotion((1, 3), move)
     ts = np.append(0.0, travel.duration + np.linspace(0.01, 2.5, 200))
     swing = fj.simulate(CART, REST, ts, (motion,)).q[1:, 1]
@@ -208,9 +208,9 @@ def residual(travel, stroke=0.05):
 
 
 def test_the_shock_removes_residual_vibration():
-    plain = fj.Travel(1.6, profile="harmonic")
-    shock = fj.shock_against(plain, FREQUENCY)
-    shocked = fj.Travel(1.6, profile="harmonic", shock=shock)
+    plain = fj.references.Travel(1.6, profile="harmonic")
+    shock = fj.references.shock_against(plain, FREQUENCY)
+    shocked = fj.references.Travel(1.6, profile="harmonic", shock=shock)
     before, after = residual(plain), residual(shocked)
     assert before >= 0.1 and after <= before / 20
 

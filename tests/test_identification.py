@@ -27,7 +27,7 @@ class Sines(eqx.Module):
 SINES = Sines(jnp.array([20.0, 8.0, 3.0]), jnp.array([5.0, 7.0, 9.0]))
 
 
-def recorded(scene, ts=TS, observe=fj.link_ends):
+def recorded(scene, ts=TS, observe=fj.identification.link_ends):
     """Returns the readings without noise, by `simulate` at its default tolerance."""
     # As arrays of one structure, for one compilation.
     scene = jax.tree.map(jnp.asarray, scene)
@@ -35,7 +35,7 @@ def recorded(scene, ts=TS, observe=fj.link_ends):
     return np.asarray(observe(scene, solution))
 
 
-def jacobian(scene_at, parameters, observe=fj.link_ends):
+def jacobian(scene_at, parameters, observe=fj.identification.link_ends):
     """Returns central differences of `simulate` in each single number, (reading, n)."""
     columns = []
     for name, value in parameters.items():
@@ -224,7 +224,7 @@ def base_parameters(linkage):
     All other numbers are known. J: inertias about the starts of links with the
     masses beyond them at their ends; h: their moments m p.
     """
-    mass, moment, _, inertia = fj.inertial_parameters(linkage).T
+    mass, moment, _, inertia = fj.analysis.inertial_parameters(linkage).T
     a2, a3 = LENGTH[1:3]
     return dict(
         J2=inertia[0] + (mass[1] + mass[2]) * a2**2,
@@ -274,7 +274,7 @@ def test_five_base_parameters_are_as_exact_as_the_noise_lets_them_be():
     bound = noise * np.sqrt(np.diag(np.linalg.inv(slopes.T @ slopes)))
     rng = np.random.default_rng(0)
     noisy = clean + noise * rng.normal(size=(draws, *clean.shape))
-    results = fj.fit_each(scene_at, first, TS, noisy, noise=noise)
+    results = fj.identification.fit_each(scene_at, first, TS, noisy, noise=noise)
     assert all(result.converged and not result.weak for result in results)
     errors = np.stack([errors_of(result, true) for result in results])
     ratio = np.sqrt(np.mean(errors**2, axis=0)) / bound
@@ -333,9 +333,9 @@ def test_malformed_arguments(changes, message):
 
 def test_malformed_batches():
     with pytest.raises(ValueError, match="observed: expected recordings"):
-        fj.fit_each(MIXED, FIRST, TS, 3.0)
+        fj.identification.fit_each(MIXED, FIRST, TS, 3.0)
     with pytest.raises(TypeError, match="tolerance: expected a keyword among observe,"):
-        fj.fit_each(MIXED, FIRST, TS, SEEN[None], tolerance=1e-3)
+        fj.identification.fit_each(MIXED, FIRST, TS, SEEN[None], tolerance=1e-3)
 
 
 def test_progress_is_reported_and_nothing_compiles_twice(seen):

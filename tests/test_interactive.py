@@ -14,7 +14,7 @@ from fdof_jax import scenes
 from fdof_jax.simulation import integrate
 from fdof_jax.tuning.gains import with_gains
 
-CIRCLES = fj.circle_scenes()
+CIRCLES = fj.tuning.circle_scenes()
 CONTROLLER = CIRCLES["RRR"].forces[0]
 STIFF = with_gains(CIRCLES["RRR"], np.full((2, 3), 1e9))
 
@@ -72,7 +72,7 @@ def test_the_error_is_that_of_a_simulation(box):
     scene = with_gains(CIRCLES["RRR"], gains)
     ts = np.linspace(0, 4, 201)
     solution = fj.simulate(scene.linkage, scene.state0, ts, scene.forces)
-    rms = np.sqrt((np.asarray(fj.tip_errors(scene, solution)) ** 2).sum())
+    rms = np.sqrt((np.asarray(fj.tuning.tip_errors(scene, solution)) ** 2).sum())
     assert f"rms {1e3 * rms:.3g} mm" in box.words.value
 
 

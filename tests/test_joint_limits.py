@@ -24,7 +24,9 @@ def last(value):
 def test_a_bounce_keeps_the_energy():
     """The penetration is (d + w)^2 / 4w up to a depth w, and the depth beyond."""
     k, w, end = 300.0, 0.02, 1.0
-    stops = fj.JointStops(-np.inf, [np.inf, np.inf, end], stiffness=k, smoothing=w)
+    stops = fj.forces.JointStops(
+        -np.inf, [np.inf, np.inf, end], stiffness=k, smoothing=w
+    )
     ts = np.linspace(0, 1, 101)
     solution = fj.simulate(SLIDE, fj.State(last(0.5), last(3.0)), ts, (stops,))
     x, v = np.asarray(solution.q[:, 2]), np.asarray(solution.qd[:, 2])
@@ -45,7 +47,7 @@ def test_a_bounce_keeps_the_energy():
 def test_deep_in_a_stop_the_spring_is_linear():
     """A contact lasts half a period of sqrt(k/m) if the rounding is small."""
     k, speed = 800.0, 2.0
-    stops = fj.JointStops(-1.0, np.inf, stiffness=k, smoothing=1e-7)
+    stops = fj.forces.JointStops(-1.0, np.inf, stiffness=k, smoothing=1e-7)
     half = np.pi / np.sqrt(k / 2)
     motion = fj.simulate(
         SLIDE, fj.State(last(-1.0), last(-speed)), [0, half / 2, half], (stops,)
@@ -56,7 +58,9 @@ def test_deep_in_a_stop_the_spring_is_linear():
 
 
 def test_damping_takes_energy_and_never_pulls():
-    stops = fj.JointStops(-np.inf, 1.0, stiffness=300.0, damping=0.3, smoothing=1e-3)
+    stops = fj.forces.JointStops(
+        -np.inf, 1.0, stiffness=300.0, damping=0.3, smoothing=1e-3
+    )
     start = fj.State(last(0.9), last(3.0))
     solution = fj.simulate(SLIDE, start, np.linspace(0, 1, 201), (stops,))
     assert 0.3 < -solution.qd[-1, 2] / 3 < 0.9
@@ -69,7 +73,7 @@ def test_damping_takes_energy_and_never_pulls():
 @pytest.mark.parametrize("topology", fj.TOPOLOGIES)
 def test_within_the_range_stops_do_nothing_and_outside_they_push_back(topology):
     linkage = random_linkage(topology, np.random.default_rng(0))
-    stops = fj.JointStops([-1, -np.inf, -2], [1, 2, np.inf], smoothing=1e-3)
+    stops = fj.forces.JointStops([-1, -np.inf, -2], [1, 2, np.inf], smoothing=1e-3)
     inside = stops(0.0, np.array([0.5, -1e30, 1e30]), STILL, linkage)
     np.testing.assert_array_equal(inside, 0)
     outside = stops(0.0, np.array([-1.5, 3.0, -2.5]), STILL, linkage)
@@ -80,7 +84,7 @@ def test_stops_have_finite_derivatives_everywhere():
     def push(q, qd, stops):
         return stops(0.0, q, qd, SLIDE)
 
-    stops = fj.JointStops(-1.0, [1.0, np.inf, 1e300], damping=0.5)
+    stops = fj.forces.JointStops(-1.0, [1.0, np.inf, 1e300], damping=0.5)
     for x in (-1e30, -1.0, 0.0, 1.0, 1e12):
         q = jnp.full(3, x)
         slopes = jax.jacrev(push, argnums=(0, 1))(q, jnp.ones(3), stops)
@@ -98,7 +102,7 @@ def test_stops_have_finite_derivatives_everywhere():
 def test_friction_stops_a_slide():
     """From 2 dv/dt = -F tanh(v/s) it follows that sinh(v/s) falls exponentially."""
     level, speed, v0 = 4.0, 0.05, 1.5
-    friction = fj.JointFriction(level, speed)
+    friction = fj.forces.JointFriction(level, speed)
     ts = np.linspace(0, 1.2, 25)
     solution = fj.simulate(SLIDE, fj.State(STILL, last(v0)), ts, (friction,))
     exact = speed * np.arcsinh(np.sinh(v0 / speed) * np.exp(-level / 2 * ts / speed))
@@ -112,13 +116,22 @@ def test_friction_stops_a_slide():
 @pytest.mark.parametrize(
     "make, message",
     [
-        (lambda: fj.JointStops(1, 1), "lower: expected less than upper"),
-        (lambda: fj.JointStops(np.nan, 1), "lower: expected"),
-        (lambda: fj.JointStops(0, 1, stiffness=0), "stiffness: expected .* above 0"),
-        (lambda: fj.JointStops(0, 1, smoothing=0), "smoothing: expected .* above 0"),
-        (lambda: fj.JointStops(0, 1, damping=-1), "damping: expected .* at least 0"),
-        (lambda: fj.JointFriction(-1), "level: expected .* at least 0"),
-        (lambda: fj.JointFriction(1, 0), "speed: expected .* above 0"),
+        (lambda: fj.forces.JointStops(1, 1), "lower: expected less than upper"),
+        (lambda: fj.forces.JointStops(np.nan, 1), "lower: expected"),
+        (
+            lambda: fj.forces.JointStops(0, 1, stiffness=0),
+            "stiffness: expected .* above 0",
+        ),
+        (
+            lambda: fj.forces.JointStops(0, 1, smoothing=0),
+            "smoothing: expected .* above 0",
+        ),
+        (
+            lambda: fj.forces.JointStops(0, 1, damping=-1),
+            "damping: expected .* at least 0",
+        ),
+        (lambda: fj.forces.JointFriction(-1), "level: expected .* at least 0"),
+        (lambda: fj.forces.JointFriction(1, 0), "speed: expected .* above 0"),
     ],
 )
 def test_malformed_arguments_are_refused(make, message):

@@ -6,7 +6,7 @@ import pytest
 
 import fdof_jax as fj
 
-SCENES = fj.circle_scenes()
+SCENES = fj.tuning.circle_scenes()
 TS = np.linspace(0, 4, 201)
 
 
@@ -14,7 +14,7 @@ TS = np.linspace(0, 4, 201)
 def test_the_circle_is_reachable_from_where_the_arm_is(topology):
     scene = SCENES[topology]
     task = scene.forces[0].reference
-    assert fj.reachable(scene.linkage, task, TS).all()
+    assert fj.references.reachable(scene.linkage, task, TS).all()
     motion = jax.vmap(lambda t: task(t, scene.linkage)[0])
     q = np.asarray(motion(TS))
     # Within reach of the start, without a jump, and away from singularities.
@@ -39,11 +39,11 @@ def test_reachable_says_when():
     task = fj.CircleTask(
         center=(1.99, 0.95), radius=0.75, period=4.0, orientation=0.8, branch=-1
     )
-    found = np.asarray(fj.reachable(scene.linkage, task, TS))
+    found = np.asarray(fj.references.reachable(scene.linkage, task, TS))
     # With known values, and with traced ones within a transformation.
-    known = jax.jit(lambda x: x + fj.reachable(scene.linkage, task, TS))(0)
+    known = jax.jit(lambda x: x + fj.references.reachable(scene.linkage, task, TS))(0)
     np.testing.assert_array_equal(known, found)
-    traced = jax.jit(lambda ts: fj.reachable(scene.linkage, task, ts))(TS)
+    traced = jax.jit(lambda ts: fj.references.reachable(scene.linkage, task, ts))(TS)
     np.testing.assert_array_equal(traced, found)
     assert found.any() and not found.all()
     for t, there in zip(TS[::25], found[::25]):
@@ -56,18 +56,18 @@ def test_reachable_says_when():
 
 def test_all_are_tuned_in_one_program_and_as_they_are_alone():
     few = {name: SCENES[name]._replace(t1=1.0) for name in ("RPR", "PPR")}
-    together = fj.tune_each(few, max_steps=4)
+    together = fj.tuning.tune_each(few, max_steps=4)
     alone = fj.tune(few["PPR"], max_steps=4)
     np.testing.assert_allclose(together["PPR"].gains, alone.gains, rtol=1e-3)
     assert together["PPR"].loss == pytest.approx(alone.loss, rel=1e-4)
-    table = fj.league_table(together).splitlines()
+    table = fj.tuning.league_table(together).splitlines()
     assert [row.split()[0] for row in table[2:]] == ["PPR", "RPR"]
     assert f"{1e3 * together['RPR'].tip_error:.4g}" in table[3]
 
 
 def test_scenes_that_cannot_be_tuned_together():
     with pytest.raises(ValueError, match="scenes: expected a list"):
-        fj.tune_each(SCENES["RRR"])
+        fj.tuning.tune_each(SCENES["RRR"])
     other = SCENES["RRR"]._replace(forces=(*SCENES["RRR"].forces, fj.JointDamper(1.0)))
     with pytest.raises(ValueError, match=r"scenes\[1\]: expected one like scenes\[0\]"):
-        fj.tune_each([SCENES["RRR"], other])
+        fj.tuning.tune_each([SCENES["RRR"], other])

@@ -34,12 +34,12 @@ def modes_at(linkage, forces, *states, ts=0.0):
     q, qd = (jnp.array(rows) for rows in zip(*states))
     ts = jnp.broadcast_to(ts, len(q))
     motion = fj.Solution(ts, q, qd, {}, diffrax.RESULTS.successful)
-    return fj.closed_loop_modes(linkage, forces, motion)
+    return fj.analysis.closed_loop_modes(linkage, forces, motion)
 
 
 def held(linkage, q, kp, kd, others=()):
     """Returns a PD controller under which the arm sags to `q`."""
-    load = fj.holding_efforts(linkage, q, others)
+    load = fj.analysis.holding_efforts(linkage, q, others)
     load = load - sum(element(0.0, q, jnp.zeros(3), linkage) for element in others)
     return fj.PDController(kp, kd, jnp.inf, Hold(q + load / np.array(kp)))
 
@@ -57,7 +57,7 @@ def slopes(function, y, h=1e-6):
 @each_topology
 def test_a_and_b_are_slopes(topology):
     linkage, q, qd, tau = motion(topology)
-    forces = fj.JointDamper(0.3), fj.JointEffort(tau), fj.Armature(0.2)
+    forces = fj.JointDamper(0.3), fj.JointEffort(tau), fj.forces.Armature(0.2)
     A, B = fj.linearize(linkage, forces, fj.State(q, qd))
 
     def rates(y, effort):
@@ -75,7 +75,9 @@ def test_a_and_b_are_slopes(topology):
 def test_small_deviations_follow_the_exponential_of_a():
     linkage, q, *_ = motion("RPR")
     forces = (held(linkage, q, [60.0, 90.0, 40.0], [5.0, 3.0, 2.0]),)
-    np.testing.assert_allclose(fj.equilibrium(linkage, forces, q + 0.05), q, atol=1e-8)
+    np.testing.assert_allclose(
+        fj.analysis.equilibrium(linkage, forces, q + 0.05), q, atol=1e-8
+    )
     A, _ = fj.linearize(linkage, forces, fj.State(q, STILL))
     deviation = 1e-5 * np.array([1, -2, 3, 4, -5, 6])
     start = fj.State(q + deviation[:3], deviation[3:])
@@ -97,7 +99,7 @@ def test_a_stiff_controller_of_limited_efforts_has_an_equilibrium():
         """Returns the equilibrium and its derivative in the guess, from one program."""
 
         def twice(q):
-            found = fj.equilibrium(scene.linkage, scene.forces, q)
+            found = fj.analysis.equilibrium(scene.linkage, scene.forces, q)
             return found, found
 
         return jax.jacfwd(twice, has_aux=True)(guess)
@@ -105,7 +107,7 @@ def test_a_stiff_controller_of_limited_efforts_has_an_equilibrium():
     slope, q = rest(reference)
     assert np.isfinite(slope).all()
     efforts = controller(0.0, q, STILL, scene.linkage)
-    held = fj.holding_efforts(scene.linkage, q)
+    held = fj.analysis.holding_efforts(scene.linkage, q)
     np.testing.assert_allclose(efforts, held, rtol=1e-9)
     assert 0.01 < np.abs(q - reference).max() < 0.3
     # No equilibrium is found from a guess at which the slide is at its limit.
@@ -179,11 +181,13 @@ def test_a_saturated_joint_has_no_gains():
 @each_topology
 def test_equilibria_are_where_the_efforts_hold_the_arm(topology):
     linkage, q, *_ = motion(topology)
-    tau = fj.holding_efforts(linkage, q)
+    tau = fj.analysis.holding_efforts(linkage, q)
     qdd = fj.forward_dynamics(linkage, q, STILL, tau)
     np.testing.assert_allclose(qdd, 0, atol=1e-9)
     forces = (held(linkage, q, [300.0, 200.0, 100.0], np.ones(3)),)
-    np.testing.assert_allclose(fj.equilibrium(linkage, forces, q + 0.05), q, atol=1e-8)
+    np.testing.assert_allclose(
+        fj.analysis.equilibrium(linkage, forces, q + 0.05), q, atol=1e-8
+    )
 
 
 @pytest.mark.slow
@@ -191,18 +195,18 @@ def test_masses_of_elements_are_held_too():
     linkage, q, *_ = motion("PRR")
     load = TipLoad()
     controller = held(linkage, q, [300.0, 200.0, 100.0], np.ones(3), (load,))
-    found = fj.equilibrium(linkage, (controller, load), q + 0.05)
+    found = fj.analysis.equilibrium(linkage, (controller, load), q + 0.05)
     np.testing.assert_allclose(found, q, atol=1e-8)
 
 
 @pytest.mark.parametrize("share, found", [(0.95, True), (1.05, False)])
 def test_loads_that_nothing_holds_have_no_equilibrium(share, found):
     """A shoulder motor can be too weak or too strong for every posture."""
-    tau = share * fj.holding_efforts(ROD, STILL)
-    q = fj.equilibrium(ROD, (fj.JointEffort(tau),), [0.4, 0.1, -0.1])
+    tau = share * fj.analysis.holding_efforts(ROD, STILL)
+    q = fj.analysis.equilibrium(ROD, (fj.JointEffort(tau),), [0.4, 0.1, -0.1])
     assert np.isfinite(q).all() == found
     if found:
-        np.testing.assert_allclose(fj.holding_efforts(ROD, q), tau, atol=1e-9)
+        np.testing.assert_allclose(fj.analysis.holding_efforts(ROD, q), tau, atol=1e-9)
 
 
 # The regressor
@@ -211,8 +215,8 @@ def test_loads_that_nothing_holds_have_no_equilibrium(share, found):
 @each_topology
 def test_the_regressor_times_the_parameters_is_the_inverse_dynamics(topology):
     linkage, q, qd, qdd = motion(topology)
-    matrix = fj.regressor(linkage, q, qd, qdd)
-    tau = jnp.einsum("jlp,lp->j", matrix, fj.inertial_parameters(linkage))
+    matrix = fj.analysis.regressor(linkage, q, qd, qdd)
+    tau = jnp.einsum("jlp,lp->j", matrix, fj.analysis.inertial_parameters(linkage))
     exact = fj.inverse_dynamics(linkage, q, qd, qdd)
     np.testing.assert_allclose(tau, exact, rtol=1e-10, atol=1e-10)
 
@@ -226,7 +230,7 @@ def test_nine_combinations_of_the_parameters_of_an_rpr_arm_are_identified():
     """
     linkage, *_ = motion("RPR")
     samples = np.random.default_rng(1).uniform(-2, 2, (3, 40, 3))
-    stacked = jax.vmap(lambda *row: fj.regressor(linkage, *row))(*samples)
+    stacked = jax.vmap(lambda *row: fj.analysis.regressor(linkage, *row))(*samples)
     matrix = np.asarray(stacked).reshape(120, 12)
     values = np.linalg.svd(matrix, compute_uv=False)
     assert values[8] > 1e-3 * values[0] and values[9] < 1e-12 * values[0]
@@ -244,7 +248,7 @@ def test_nine_combinations_of_the_parameters_of_an_rpr_arm_are_identified():
 @pytest.mark.parametrize(
     "element",
     [
-        fj.FirstOrderLag(fj.JointEffort(np.ones(3)), 0.1),
+        fj.control.FirstOrderLag(fj.JointEffort(np.ones(3)), 0.1),
         fj.PrescribedMotion(1, Hold(jnp.zeros(3))),
     ],
     ids=["state", "prescribed"],
@@ -253,7 +257,7 @@ def test_elements_that_are_no_function_of_the_state_are_refused(element):
     state = fj.State(STILL, STILL)
     for call in (
         lambda: fj.linearize(ROD, (element,), state),
-        lambda: fj.equilibrium(ROD, (element,), STILL),
+        lambda: fj.analysis.equilibrium(ROD, (element,), STILL),
         lambda: modes_at(ROD, (element,), (STILL, STILL)),
     ):
         with pytest.raises(ValueError, match="forces: expected elements without"):
@@ -263,7 +267,7 @@ def test_elements_that_are_no_function_of_the_state_are_refused(element):
 def test_modes_are_refused_of_what_is_traced_or_stacked():
     def of(q):
         rows = fj.Solution(jnp.zeros(1), q, q, {}, diffrax.RESULTS.successful)
-        return fj.closed_loop_modes(ROD, (), rows).frequency
+        return fj.analysis.closed_loop_modes(ROD, (), rows).frequency
 
     for call in jax.jit(of), lambda q: of(q[None]):
         with pytest.raises(ValueError, match="solution: expected one motion"):

@@ -34,17 +34,17 @@ def test_the_weight_is_held_where_the_arm_is(topology):
     linkage, q, qd = sample(topology)
     plain = fj.PDController(*FREE).demand(0.4, q, qd, linkage)
     for model in None, heavier(linkage):
-        controller = fj.GravityFeedforward(*FREE, model)
-        held = fj.holding_efforts(linkage if model is None else model, q)
+        controller = fj.control.GravityFeedforward(*FREE, model)
+        held = fj.analysis.holding_efforts(linkage if model is None else model, q)
         found = controller.demand(0.4, q, qd, linkage)
         np.testing.assert_allclose(found, plain + held, rtol=1e-12, atol=1e-12)
 
 
 def test_the_whole_effort_is_limited():
     linkage, q, qd = sample("RPR")
-    free = fj.GravityFeedforward(*FREE).demand(0.4, q, qd, linkage)
+    free = fj.control.GravityFeedforward(*FREE).demand(0.4, q, qd, linkage)
     limit = np.abs(free) * [0.5, 2, 0.9]
-    controller = fj.GravityFeedforward(*FREE[:2], limit, MOVE)
+    controller = fj.control.GravityFeedforward(*FREE[:2], limit, MOVE)
     expected = np.clip(free, -limit, limit)
     np.testing.assert_allclose(controller(0.4, q, qd, linkage), expected)
 
@@ -52,7 +52,7 @@ def test_the_whole_effort_is_limited():
 def fed_forward():
     scene = scenes.fig7()
     pd = scene.forces[0]
-    controller = fj.GravityFeedforward(pd.kp, pd.kd, pd.limit, pd.reference)
+    controller = fj.control.GravityFeedforward(pd.kp, pd.kd, pd.limit, pd.reference)
     return scene._replace(forces=(controller,))
 
 
@@ -86,7 +86,7 @@ def test_fig_7_with_gravity_held():
 def test_its_gains_are_tuned():
     scene = fed_forward()._replace(t1=1.0)
     result = fj.tune(scene, max_steps=3)
-    assert isinstance(result.scene.forces[0], fj.GravityFeedforward)
+    assert isinstance(result.scene.forces[0], fj.control.GravityFeedforward)
     assert result.loss < 0.8 * result.history.loss[0]
 
 
@@ -100,7 +100,7 @@ def test_the_effort_is_the_inverse_dynamics_of_what_is_demanded(topology):
     qdd_ref = (MOVE(0.4 + h, linkage)[1] - MOVE(0.4 - h, linkage)[1]) / (2 * h)
     demanded = qdd_ref + 8 * (q_ref - q) + 5 * (qd_ref - qd)
     for model in None, heavier(linkage):
-        controller = fj.ComputedTorque(*FREE, model)
+        controller = fj.control.ComputedTorque(*FREE, model)
         believed = linkage if model is None else model
         expected = fj.inverse_dynamics(believed, q, qd, demanded)
         found = controller.demand(0.4, q, qd, linkage)
@@ -112,7 +112,7 @@ def test_errors_of_an_exact_model_are_linear(topology):
     """d2e/dt2 + kd de/dt + kp e = 0, critically damped, underdamped and overdamped."""
     linkage, ts = arm(topology), np.linspace(0, 1.5, 4)
     kp, kd = np.array([9.0, 25.0, 16.0]), np.array([6.0, 4.0, 10.0])
-    controller = fj.ComputedTorque(kp, kd, jnp.inf, MOVE)
+    controller = fj.control.ComputedTorque(kp, kd, jnp.inf, MOVE)
     error, rate = np.array([0.2, -0.1, 0.3]), np.array([-0.5, 0.4, 0.1])
     q, qd = MOVE(0.0, linkage)
     solution = fj.simulate(linkage, fj.State(q - error, qd - rate), ts, (controller,))
@@ -128,7 +128,7 @@ def test_errors_of_an_exact_model_are_linear(topology):
 def test_the_acceleration_is_that_of_the_inverse_kinematics():
     linkage, task, t, h = scenes.fig7().linkage, fj.CircleTask(), 0.7, 1e-5
     rates = [task(t + step, linkage)[1] for step in (h, -h)]
-    controller = fj.ComputedTorque(100.0, 20.0, jnp.inf, task)
+    controller = fj.control.ComputedTorque(100.0, 20.0, jnp.inf, task)
     q_ref, qd_ref, qdd_ref = controller.schedule(t, linkage)
     np.testing.assert_allclose(qdd_ref, (rates[0] - rates[1]) / (2 * h), atol=1e-7)
     np.testing.assert_allclose((q_ref, qd_ref), task(t, linkage), rtol=1e-12)
@@ -137,7 +137,9 @@ def test_the_acceleration_is_that_of_the_inverse_kinematics():
 # Models
 
 
-@pytest.mark.parametrize("kind", [fj.GravityFeedforward, fj.ComputedTorque])
+@pytest.mark.parametrize(
+    "kind", [fj.control.GravityFeedforward, fj.control.ComputedTorque]
+)
 def test_models_are_checked(kind):
     linkage = arm("RPR")
     for model, message in (

@@ -29,7 +29,7 @@ def rms_tip_error(scene, task):
 
 @pytest.fixture(scope="module")
 def best():
-    return fj.optimal_efforts(scenes.fig7(), horizon=HORIZON, knots=KNOTS)
+    return fj.tuning.optimal_efforts(scenes.fig7(), horizon=HORIZON, knots=KNOTS)
 
 
 def test_no_controller_with_these_limits_does_better(best):
@@ -43,7 +43,7 @@ def test_no_controller_with_these_limits_does_better(best):
     assert rms_tip_error(best.scene, task) == pytest.approx(best.tip_error, rel=2e-3)
     own = rms_tip_error(scene, task)
     assert best.controller_error == pytest.approx(own, rel=2e-3)
-    torque = fj.ComputedTorque(100.0, 20.0, limit, task, None)
+    torque = fj.control.ComputedTorque(100.0, 20.0, limit, task, None)
     known = rms_tip_error(scene._replace(forces=(torque,)), task)
     assert best.tip_error < 0.6 * known < 0.6 * own
     assert best.bound(2.0) == pytest.approx(best.tip_error / 2)
@@ -104,7 +104,7 @@ def two_slides():
 
 def test_slides_are_controlled_as_fuller_found():
     scene = two_slides()
-    found = fj.optimal_efforts(scene, horizon=HORIZON, knots=KNOTS)
+    found = fj.tuning.optimal_efforts(scene, horizon=HORIZON, knots=KNOTS)
     # The first slide moves everything up, the second moves all but link 1 to the left.
     (up, t_up), (left, t_left) = fuller(0.2, 120 / 6), fuller(0.3, 80 / 5)
     assert max(t_up, t_left) < HORIZON
@@ -117,12 +117,12 @@ def test_slides_are_controlled_as_fuller_found():
 def test_scipy_finds_no_better_efforts():
     scene, limit = scenes.fig7(), np.asarray(CONTROLLER.limit)
     knots = np.linspace(0, 0.4, 6)
-    found = fj.optimal_efforts(scene, horizon=0.4, knots=6, effort_rate=0)
+    found = fj.tuning.optimal_efforts(scene, horizon=0.4, knots=6, effort_rate=0)
     ts = np.linspace(0, 0.4, 501)
     weights = np.sqrt(np.convolve(np.full(500, 1 / 500), [0.5, 0.5]))
 
     def residuals(z):
-        forces = (fj.EffortHistory(knots, limit * z.reshape(-1, 3)),)
+        forces = (fj.forces.EffortHistory(knots, limit * z.reshape(-1, 3)),)
         solution = fj.simulate(scene.linkage, scene.state0, ts, forces)
         deviation = tip_deviation(scene.linkage, CONTROLLER.reference, solution)
         return np.asarray(weights[:, None] * deviation).ravel()
@@ -186,7 +186,7 @@ def changed(**fields):
 )
 def test_malformed_arguments(scene, keywords, message):
     with pytest.raises(ValueError, match=message):
-        fj.optimal_efforts(scene, **keywords)
+        fj.tuning.optimal_efforts(scene, **keywords)
 
 
 def test_the_bound_is_for_longer_runs(best):

@@ -8,6 +8,7 @@ import pickle
 import re
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import pytest
@@ -18,21 +19,43 @@ FOLDER = Path(fj.__file__).parent
 ROOT = Path(__file__).parents[1]
 
 
-def test_names():
-    for name in fj.__all__:
-        module = ".".join(filter(None, ["fdof_jax", fj._MODULE_OF[name]]))
-        there = {}
-        exec(f"from {module} import {name}", there)
-        expected = there[name]
+NAMESPACES = [
+    fj, fj.analysis, fj.control, fj.data, fj.forces, fj.identification, fj.references,
+    fj.tuning,
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("package", NAMESPACES, ids=lambda package: package.__name__)
+def test_names(package):
+    for name in package.__all__:
         # The first `getattr` finds the name, and keeps it for the second.
-        assert getattr(fj, name) is vars(fj)[name] is expected
-    assert dir(fj) == sorted([*fj.__all__, "__version__"])
+        value = getattr(package, name)
+        assert value is vars(package)[name]
+        assert value.__name__.endswith(name) if callable(value) else value is not None
+    assert set(dir(package)) - {"__version__"} == set(package.__all__)
     starred = {}
-    exec("from fdof_jax import *", starred)
-    assert set(fj.__all__) <= set(starred)
+    exec(f"from {package.__name__} import *", starred)
+    assert set(package.__all__) <= set(starred)
+    with pytest.raises(
+        AttributeError, match=f"{package.__name__!r} has no .* 'simulat'"
+    ):
+        getattr(package, "simulat")  # noqa: B009
+
+
+def test_the_top_is_short():
+    assert len(dir(fj)) <= 70
+
+
+def test_a_name_means_one_thing():
+    for room in NAMESPACES[1:]:
+        for name in room.__all__:
+            for other in NAMESPACES:
+                if name in other.__all__:
+                    assert getattr(room, name) is getattr(other, name)
+
+
+def test_pickles_and_import_errors():
     assert pickle.loads(pickle.dumps(fj.simulate)) is fj.simulate
-    with pytest.raises(AttributeError, match="'fdof_jax' has no attribute 'simulat'"):
-        getattr(fj, "simulat")  # noqa: B009
     with pytest.raises(ImportError, match="cannot import name 'simulat'"):
         from fdof_jax import simulat  # noqa: F401
 
@@ -44,9 +67,14 @@ OF_0_1 = json.loads((Path(__file__).parent / "names_of_0.1.json").read_text())
 def test_what_calls_version_0_1_calls_this_one(name):
     """Checks that names and places of arguments are the same; new ones are optional."""
     *module, name_there = name.split(".")
-    found = getattr(
-        importlib.import_module(".".join(["fdof_jax", *module])), name_there
-    )
+    there = importlib.import_module(".".join(["fdof_jax", *module]))
+    with warnings.catch_warnings(record=True, action="always") as warned:
+        found = getattr(there, name_there)
+    now_in = [room.__name__ for room in NAMESPACES[1:] if name in room.__all__]
+    moved = not module and name not in fj.__all__
+    message = f"fdof_jax.{name} is now {now_in[0]}.{name}" if moved else None
+    assert [str(w.message) for w in warned] == [message] * moved
+    assert all(w.filename == __file__ for w in warned)
     if OF_0_1[name] is None:
         return
     before = [word for word in OF_0_1[name].split(", ") if word not in ("", "*")]
@@ -64,10 +92,10 @@ def test_what_calls_version_0_1_calls_this_one(name):
 
 
 ROOMS = {
-    "checks": 0, "xla": 0, "linkage": 1, "mechanics": 2, "forces": 3, "dynamics": 4,
-    "control": 4, "simulation": 5, "analysis": 6, "search": 7, "tuning": 8,
-    "identification": 8, "pictures": 9, "data": 9, "scenes": 10, "shell": 11,
-    "__main__": 12,
+    "checks": 0, "names": 0, "xla": 0, "linkage": 1, "mechanics": 2, "forces": 3,
+    "dynamics": 4, "references": 4, "control": 5, "simulation": 6, "analysis": 7,
+    "search": 8, "tuning": 9, "identification": 9, "pictures": 10, "data": 10,
+    "scenes": 11, "shell": 12, "__main__": 13, "__init__": 13,
 }  # fmt: skip
 
 
@@ -92,8 +120,10 @@ def test_rooms_import_from_those_below_them_only():
 
 def test_no_name_is_hidden_by_a_module():
     """An imported submodule becomes an attribute of the package."""
-    modules = {path.stem for path in FOLDER.glob("*")}
-    assert modules & set(fj.__all__) == {"scenes"}
+    for package in NAMESPACES:
+        folder = Path(package.__file__).parent
+        for name in {path.stem for path in folder.glob("*")} & set(package.__all__):
+            assert inspect.ismodule(getattr(package, name))
 
 
 def imported(code):
@@ -105,6 +135,12 @@ def imported(code):
 
 def test_the_package_imports_no_jax():
     assert not imported("import fdof_jax; fdof_jax.__version__") & {"jax", "numpy"}
+
+
+def test_an_element_imports_neither_other_elements_nor_simulation():
+    modules = imported("import fdof_jax as fj; fj.forces.Tension")
+    assert "fdof_jax.forces.between_points" in modules
+    assert not modules & {"fdof_jax.forces.actuators", "diffrax"}
 
 
 def test_simulation_imports_neither_pictures_nor_searches():

@@ -25,7 +25,6 @@ from fdof_jax import (
     CircleTask,
     JointDamper,
     JointEffort,
-    JointStops,
     PDController,
     PrescribedMotion,
     Solution,
@@ -34,6 +33,7 @@ from fdof_jax import (
     simulate,
     tip_position,
 )
+from fdof_jax.forces import JointStops
 
 
 def values(ax: Axes) -> list[np.ndarray]:

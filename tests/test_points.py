@@ -15,7 +15,7 @@ ELEMENTS = {
     "spring": fj.SpringDamper(A, B, stiffness=30.0, rest_length=0.4),
     "cable": fj.SpringDamper(A, B, stiffness=30.0, rest_length=0.4, one_sided="cable"),
     "spring of no length": fj.SpringDamper(fj.Point(1), B, stiffness=30.0),
-    "tension": fj.Tension(A, B, 7.0),
+    "tension": fj.forces.Tension(A, B, 7.0),
 }
 
 
@@ -194,7 +194,7 @@ def test_where_points_meet_forces_and_derivatives_are_finite():
         ),
         (lambda: fj.SpringDamper(A, B, one_sided="rope"), "one_sided: expected False"),
         (lambda: fj.SpringDamper(A, B, one_sided=True), "one_sided: expected False"),
-        (lambda: fj.Tension(A, B, "x"), "tension: expected a real number"),
+        (lambda: fj.forces.Tension(A, B, "x"), "tension: expected a real number"),
         (lambda: fj.Wrench(A, [1, 2, 3]), "force: expected an array of 2"),
         (lambda: fj.Wrench(A, follows=1), "follows: expected a bool"),
     ],

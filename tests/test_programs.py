@@ -148,7 +148,7 @@ arm, start, forces, _ = fj.scenes.fig7()
 (pd,) = forces
 more = eqx.tree_at(lambda pd: (pd.kp, pd.kd), pd, (pd.kp * 2, pd.kd * 2))
 heavy = eqx.tree_at(lambda arm: arm.mass, arm, arm.mass * 2)
-scenes = fj.circle_scenes().values()
+scenes = fj.tuning.circle_scenes().values()
 programs.clear()
 
 def compiled(linkage, state0, ts, forces):

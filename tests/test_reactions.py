@@ -12,7 +12,7 @@ from fdof_jax.linkage.frames import frames
 
 GROUND, TIP = fj.Point(0, 0.3, -0.8), fj.Point(3, 0.5, 0.2)
 SPRING = fj.SpringDamper(GROUND, TIP, stiffness=30.0, damping=2.0, rest_length=0.4)
-ACROSS = fj.Tension(fj.Point(1, 0.2), fj.Point(3, 0.1, 0.3), 7.0)
+ACROSS = fj.forces.Tension(fj.Point(1, 0.2), fj.Point(3, 0.1, 0.3), 7.0)
 PUSH = fj.Wrench(fj.Point(2, 0.4), [3.0, -2.0], 1.5, follows=True)
 ACTUATOR = fj.LinearActuator(
     fj.Point(0, -0.6, -0.8), fj.Point(2, 0.4, 0.3),
@@ -89,7 +89,7 @@ def test_each_link_is_in_balance(topology):
 @pytest.mark.parametrize("topology", fj.TOPOLOGIES)
 def test_the_free_component_is_the_joint_s_effort(topology):
     linkage, q, qd = motion(topology)
-    forces = SPRING, ACTUATOR, fj.Armature(0.3), *JOINTS
+    forces = SPRING, ACTUATOR, fj.forces.Armature(0.3), *JOINTS
     reactions, qdd = instant(linkage, q, qd, forces)
     x, _ = fj.to_chain(linkage, q, qd)
     before = np.array([linkage.base_angle, *x[1:5:2]])
@@ -166,7 +166,7 @@ def test_a_hanging_arm_weighs_on_its_bearings():
     )
 
 
-class TipLoad(fj.InertialElement):
+class TipLoad(fj.forces.InertialElement):
     """A point mass at the tip, which may declare where it is carried."""
 
     mass: float = 2.0
@@ -187,7 +187,7 @@ class CarriedTipLoad(TipLoad):
         rate = lambda q, qd: jax.jvp(place, (q,), (qd,))[1]
         _, (x, y) = jax.jvp(rate, (q, qd), (qd, qdd))
         push = -self.mass * jax.lax.complex(x, y + linkage.gravity)
-        return (fj.Load(fj.Point(3, 1.0), push),)
+        return (fj.forces.Load(fj.Point(3, 1.0), push),)
 
 
 def test_an_element_of_one_s_own_is_carried_or_refused():

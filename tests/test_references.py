@@ -15,13 +15,13 @@ ARM = fj.Linkage(
 SLIDING = fj.scenes.fig7().linkage
 POINTS = np.array([[1.2, 0.3], [1.4, 0.6], [1.1, 0.9], [0.8, 0.5]])
 PATHS = {
-    "line": fj.Line([1.2, -0.4], [0.9, 0.8]),
-    "ellipse": fj.Ellipse([1.1, 0.4], [0.4, 0.2], tilt=0.3),
-    "eight": fj.FigureEight([1.1, 0.4], [0.4, 0.2], tilt=-0.2),
-    "spline": fj.Spline(POINTS),
-    "closed spline": fj.Spline(POINTS, closed=True),
+    "line": fj.references.Line([1.2, -0.4], [0.9, 0.8]),
+    "ellipse": fj.references.Ellipse([1.1, 0.4], [0.4, 0.2], tilt=0.3),
+    "eight": fj.references.FigureEight([1.1, 0.4], [0.4, 0.2], tilt=-0.2),
+    "spline": fj.references.Spline(POINTS),
+    "closed spline": fj.references.Spline(POINTS, closed=True),
 }
-TIMINGS = {"travel": fj.Travel(2.0), "laps": fj.Laps(2.0)}
+TIMINGS = {"travel": fj.references.Travel(2.0), "laps": fj.references.Laps(2.0)}
 
 
 @eqx.filter_jit
@@ -51,8 +51,10 @@ def test_the_tip_is_on_the_path(path, timing, branch):
 
 def test_the_circle_as_an_ellipse_is_fig_7_s():
     circle = fj.CircleTask()
-    ellipse = fj.Ellipse([-4, 2], [0.75, 0.75])
-    task = fj.TipTask(ellipse, fj.Laps(5.0, phase=0.5), orientation=np.pi / 2)
+    ellipse = fj.references.Ellipse([-4, 2], [0.75, 0.75])
+    task = fj.TipTask(
+        ellipse, fj.references.Laps(5.0, phase=0.5), orientation=np.pi / 2
+    )
     for t in (0.0, 1.3, 4.0, 11.0):
         for a, b in zip(task(t, SLIDING), circle(t, SLIDING)):
             np.testing.assert_allclose(a, b, atol=1e-12)
@@ -60,7 +62,7 @@ def test_the_circle_as_an_ellipse_is_fig_7_s():
 
 @pytest.mark.parametrize("closed", [False, True])
 def test_a_spline_is_scipy_s(closed):
-    path = fj.Spline(POINTS, closed=closed)
+    path = fj.references.Spline(POINTS, closed=closed)
     knots = np.linspace(0, 1, 5 if closed else 4)
     points = np.vstack([POINTS, POINTS[:1]]) if closed else POINTS
     exact = CubicSpline(knots, points, bc_type="periodic" if closed else "natural")
@@ -69,7 +71,9 @@ def test_a_spline_is_scipy_s(closed):
 
 
 def test_a_joint_move():
-    move = fj.JointMove([0, 1, 2], [1, 1, 0], fj.Travel(2.0, profile="cycloidal"))
+    move = fj.references.JointMove(
+        [0, 1, 2], [1, 1, 0], fj.references.Travel(2.0, profile="cycloidal")
+    )
     q, qd = move(1.0, ARM)
     np.testing.assert_allclose(q, [0.5, 1, 1], atol=1e-15)
     np.testing.assert_allclose(qd, [1, 0, -2], atol=1e-14)
@@ -77,7 +81,7 @@ def test_a_joint_move():
 
 
 def test_a_path_out_of_reach_is_refused_where_it_is_simulated():
-    task = fj.TipTask(fj.Line([1, 0], [4, 0]), fj.Travel(2.0))
+    task = fj.TipTask(fj.references.Line([1, 0], [4, 0]), fj.references.Travel(2.0))
     forces = (fj.PDController(10.0, 1.0, 100.0, task),)
     start = fj.State(np.zeros(3), np.zeros(3))
     with pytest.raises(ValueError, match="reference: expected a path within"):
@@ -86,14 +90,16 @@ def test_a_path_out_of_reach_is_refused_where_it_is_simulated():
 
 @pytest.mark.parametrize("x", [0.3, 0.5])
 def test_a_path_behind_the_pivot_is_refused_where_it_is_simulated(x):
-    ring = fj.TipTask(fj.Ellipse([x, 0], [1.2, 1.2]), fj.Laps(2.0))
+    ring = fj.TipTask(
+        fj.references.Ellipse([x, 0], [1.2, 1.2]), fj.references.Laps(2.0)
+    )
     forces = (fj.PDController(10.0, 1.0, 100.0, ring),)
     start = fj.State(np.zeros(3), np.zeros(3))
     with pytest.raises(ValueError, match="reference: expected a path that does not"):
         fj.simulate(ARM, start, [0, 2], forces)
 
 
-class Swinging(fj.Path):
+class Swinging(fj.references.Path):
     """A path to and fro along a wide arc, checked lap by lap."""
 
     @property
@@ -110,17 +116,17 @@ def test_many_laps_are_as_good_as_one():
         "RRR", length=[0, 1, 1, 0.3], com=[[0.5, 0]] * 3, mass=[1] * 3,
         inertia=[0.1] * 3,
     )  # fmt: skip
-    task = fj.TipTask(Swinging(), fj.Laps(1.0))
+    task = fj.TipTask(Swinging(), fj.references.Laps(1.0))
     for end in (1.0, 400.0):
         task.check(arm, jnp.array([0.0, end]))
 
 
 def test_malformed_references_are_refused():
     with pytest.raises(ValueError, match="points: expected three or more"):
-        fj.Spline(POINTS[:2])
+        fj.references.Spline(POINTS[:2])
     with pytest.raises(ValueError, match="path: expected a Path"):
-        fj.TipTask("line", fj.Travel(1.0))
+        fj.TipTask("line", fj.references.Travel(1.0))
     with pytest.raises(ValueError, match="timing: expected"):
         fj.TipTask(PATHS["line"], 3.0)
     with pytest.raises(ValueError, match="travel: expected a Travel"):
-        fj.JointMove(np.zeros(3), np.ones(3), 2.0)
+        fj.references.JointMove(np.zeros(3), np.ones(3), 2.0)

@@ -20,7 +20,9 @@ WHEEL = fj.Linkage(
 )  # fmt: skip
 REST = fj.State(np.zeros(3), np.zeros(3))
 START = fj.State(np.array([-0.5, 0.3, 0.2]), np.array([0.3, -0.2, 0.1]))
-MOVE = fj.JointMove([-0.5, 0.3, 0.2], [0.5, 0.6, -0.4], fj.Travel(1.0))
+MOVE = fj.references.JointMove(
+    [-0.5, 0.3, 0.2], [0.5, 0.6, -0.4], fj.references.Travel(1.0)
+)
 # Soft enough for the longest period: the last link is light.
 KP, KD = np.array([100.0, 50.0, 10.0]), np.array([20.0, 10.0, 1.0])
 CONTROL = fj.PDController(KP, KD, np.inf, MOVE)
@@ -113,14 +115,16 @@ def test_gains_of_sampled_control_have_gradients():
 @pytest.mark.slow
 def test_a_digital_pid_controller_of_motors():
     """The integral takes Euler's steps; motor currents go on between samples."""
-    pid = fj.PIDController(8.0, 2.0, 6.0, 50.0, Hold(jnp.array([0.0, 0.0, 1.0])))
+    pid = fj.control.PIDController(
+        8.0, 2.0, 6.0, 50.0, Hold(jnp.array([0.0, 0.0, 1.0]))
+    )
     motion = fj.simulate_sampled(WHEEL, REST, pid, 0.05, 100, **STEPS)
     integral = 0.0
     for k in range(100):
         demand = 8 * (1 - motion.q[k, 2]) - 6 * motion.qd[k, 2] + integral
         np.testing.assert_allclose(motion.tau[k, 2], demand, atol=1e-9)
         integral += 0.05 * 2 * (1 - motion.q[k, 2])
-    motor = fj.DCMotor(
+    motor = fj.control.DCMotor(
         fj.JointEffort([0, 0, 12.0]), resistance=2.0, inductance=0.5, constant=0.3
     )
     idle = fj.JointEffort(np.zeros(3))
@@ -149,7 +153,7 @@ def test_a_failure_is_named():
 
 
 def test_malformed_arguments_are_refused():
-    lag = fj.FirstOrderLag(fj.JointEffort(np.ones(3)), 0.1)
+    lag = fj.control.FirstOrderLag(fj.JointEffort(np.ones(3)), 0.1)
     for name, changes in {
         "period": dict(period=0.0),
         "samples": dict(samples=0),

@@ -39,7 +39,9 @@ def test_all_take_the_same_steps():
 
 @pytest.mark.slow
 def test_a_batch_moves_as_its_members_across_jumps_and_saturation():
-    task = fj.JointMove(START.q, START.q + 0.3, fj.Travel(0.2, begin=0.05))
+    task = fj.references.JointMove(
+        START.q, START.q + 0.3, fj.references.Travel(0.2, begin=0.05)
+    )
     pd = fj.PDController(90.0, 8.0, [9.0, 4.0, 2.0], task)
     forces = (pd, *FORCES[:2])
     linkages = [arm(topology) for topology in ("RPR", "PRR")]

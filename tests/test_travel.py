@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import fdof_jax as fj
-from fdof_jax.control.timing import PROFILES
+from fdof_jax.references.timing import PROFILES
 
 TIMES = np.linspace(0, 2, 201)
 
@@ -18,7 +18,7 @@ def derivatives(travel, times=TIMES):
 
 @pytest.mark.parametrize("profile", PROFILES)
 def test_a_profile_leads_from_start_to_end_and_rests_there(profile):
-    travel = fj.Travel(2.0, begin=0.5, profile=profile)
+    travel = fj.references.Travel(2.0, begin=0.5, profile=profile)
     way, rate, _ = derivatives(travel, np.linspace(0, 3, 301))
     assert (way[:51] == 0).all() and (way[-50:] == 1).all()
     assert (rate[:51] == 0).all() and (rate[-50:] == 0).all()
@@ -37,13 +37,13 @@ def test_a_profile_leads_from_start_to_end_and_rests_there(profile):
     ],
 )
 def test_largest_speed_and_acceleration(profile, speed, acceleration):
-    _, rate, second = derivatives(fj.Travel(2.0, profile=profile))
+    _, rate, second = derivatives(fj.references.Travel(2.0, profile=profile))
     assert rate.max() == pytest.approx(speed / 2, rel=1e-3)
     assert np.abs(second).max() == pytest.approx(acceleration / 4, rel=1e-2)
 
 
 def test_a_shock_is_a_jump_of_the_velocity_at_both_ends():
-    travel = fj.Travel(2.0, begin=1.0, profile="harmonic", shock=0.3)
+    travel = fj.references.Travel(2.0, begin=1.0, profile="harmonic", shock=0.3)
     rate = jax.grad(travel)
     assert rate(1.0 - 1e-9) == 0 and rate(1.0) == pytest.approx(0.15)
     assert rate(3.0 - 1e-9) == pytest.approx(0.15) and rate(3.0) == 0
@@ -55,9 +55,9 @@ def test_a_shock_is_a_jump_of_the_velocity_at_both_ends():
 @pytest.mark.parametrize("frequency", [2.0, 7.0])
 def test_the_shock_takes_the_load_s_frequency_out(profile, frequency):
     """A load on a spring follows x'' + w^2 x = -a; its integral is in closed form."""
-    plain = fj.Travel(1.5, profile=profile)
-    shock = float(fj.shock_against(plain, frequency))
-    shocked = fj.Travel(1.5, profile=profile, shock=shock)
+    plain = fj.references.Travel(1.5, profile=profile)
+    shock = float(fj.references.shock_against(plain, frequency))
+    shocked = fj.references.Travel(1.5, profile=profile, shock=shock)
     times = (np.arange(200_000) + 0.5) * 1.5 / 200_000
     residual = [
         abs(
@@ -73,19 +73,19 @@ def test_the_shock_takes_the_load_s_frequency_out(profile, frequency):
 
 def test_malformed_travels_are_refused():
     with pytest.raises(ValueError, match="duration: expected .* above 0"):
-        fj.Travel(0.0)
+        fj.references.Travel(0.0)
     with pytest.raises(ValueError, match="profile: expected one of"):
-        fj.Travel(1.0, profile="linear")
+        fj.references.Travel(1.0, profile="linear")
     with pytest.raises(ValueError, match="frequency: expected .* above 0"):
-        fj.shock_against(fj.Travel(1.0), -1.0)
+        fj.references.shock_against(fj.references.Travel(1.0), -1.0)
     with pytest.raises(ValueError, match="frequency: expected at most 250 rad"):
-        fj.shock_against(fj.Travel(1.0), 300.0)
+        fj.references.shock_against(fj.references.Travel(1.0), 300.0)
     with pytest.raises(ValueError, match="period: expected not zero"):
-        fj.Laps(0.0)
+        fj.references.Laps(0.0)
     with pytest.raises(ValueError, match="travel: expected a Travel"):
-        fj.shock_against(1.0, 1.0)
+        fj.references.shock_against(1.0, 1.0)
 
 
 def test_laps_go_on():
-    laps = fj.Laps(4.0, phase=0.25)
+    laps = fj.references.Laps(4.0, phase=0.25)
     assert laps(jnp.array(10.0)) == 2.75

@@ -9,7 +9,7 @@ import pytest
 import fdof_jax as fj
 from fdof_jax import scenes
 from fdof_jax.search import lanes
-from fdof_jax.tuning import tune as tuning
+from fdof_jax.tuning import tuning
 from fdof_jax.tuning.losses import controller_of, tip_errors
 
 
@@ -149,25 +149,25 @@ class TestTracking:
             + 0.1 * np.mean(np.sum(relative**2, axis=1))
             + 1e-4 * np.mean(np.sum(rates**2, axis=1))
         )
-        loss = fj.Tracking(effort=0.1, effort_rate=1e-4)
+        loss = fj.tuning.Tracking(effort=0.1, effort_rate=1e-4)
         residuals = residuals_of(scene, gains_of(scene), loss)
         assert float(residuals @ residuals) == pytest.approx(float(expected), rel=1e-10)
 
     def test_a_higher_price_buys_less_effort_in_one_program(self):
-        front = fj.trade_off(self.scene, [0.0, 1e-2, 1.0], max_steps=15)
+        front = fj.tuning.trade_off(self.scene, [0.0, 1e-2, 1.0], max_steps=15)
         assert (np.diff(front.effort) < 0).all() and (
             np.diff(front.tip_error) > 0
         ).all()
         for price, result in zip(front.prices, front.results):
-            loss = fj.Tracking(effort=price)
+            loss = fj.tuning.Tracking(effort=price)
             residuals = residuals_of(self.scene, result.gains, loss)
             assert result.loss == pytest.approx(residuals @ residuals, rel=1e-5)
         assert f"{1e3 * front.tip_error[1]:.4g}" in str(front)
 
     @pytest.mark.slow
     def test_a_price_among_others_gives_what_it_gives_alone(self):
-        front = fj.trade_off(self.scene, [0.0, 1e-2, 1.0], max_steps=15)
-        alone = fj.tune(self.scene, loss=fj.Tracking(effort=1e-2), max_steps=15)
+        front = fj.tuning.trade_off(self.scene, [0.0, 1e-2, 1.0], max_steps=15)
+        alone = fj.tune(self.scene, loss=fj.tuning.Tracking(effort=1e-2), max_steps=15)
         assert front.results[1].loss == pytest.approx(alone.loss, rel=1e-4)
 
     def test_efforts_without_limits_have_no_price(self):
@@ -181,20 +181,22 @@ class TestTracking:
         for other in (free, weak):
             with pytest.raises(ValueError, match="loss: expected finite limits"):
                 scene = self.scene._replace(forces=(other,))
-                fj.tune(scene, loss=fj.Tracking(effort=1.0))
+                fj.tune(scene, loss=fj.tuning.Tracking(effort=1.0))
 
     def test_all_prices_are_judged_with_all_members(self):
         limit = lambda scene: scene.forces[0].limit
         free = eqx.tree_at(limit, self.scene, jnp.full(3, jnp.inf))
-        ensemble = fj.stacked([self.scene, free])
+        ensemble = fj.tuning.stacked([self.scene, free])
         with pytest.raises(ValueError, match="loss: expected finite limits"):
-            fj.trade_off(self.scene, [0.0, 0.1], ensemble=ensemble)
+            fj.tuning.trade_off(self.scene, [0.0, 0.1], ensemble=ensemble)
 
 
 def model_based(scene, kind):
     controller = scene.forces[0]
     gains = (
-        (100.0, 20.0) if kind is fj.ComputedTorque else (controller.kp, controller.kd)
+        (100.0, 20.0)
+        if kind is fj.control.ComputedTorque
+        else (controller.kp, controller.kd)
     )
     replaced = kind(*gains, controller.limit, controller.reference)
     return scene._replace(forces=(replaced,))
@@ -204,7 +206,7 @@ class TestEnsembles:
     scene = scenes.fig7()._replace(t1=1.0)
 
     def ensemble(self, members=3):
-        return fj.perturbed(
+        return fj.tuning.perturbed(
             self.scene, members, payload=(0, 2), link_error=0.1, start_offset=0.3,
             speed=(1, 2), seed=1,
         )  # fmt: skip
@@ -229,7 +231,7 @@ class TestEnsembles:
 
     def test_a_payload_weighs_at_the_tip(self):
         arm = self.scene.linkage
-        loaded = fj.with_payload(arm, 1.5)
+        loaded = fj.tuning.with_payload(arm, 1.5)
         q, qd = np.array([0.3, 1.2, -0.4]), np.array([1.0, -0.5, 2.0])
         velocity = np.asarray(fj.tip_jacobian(arm, q) @ qd)[:2]
         kinetic, potential = fj.energy(arm, q, qd)
@@ -258,16 +260,18 @@ class TestEnsembles:
                 loss, rel=1e-5
             )
 
-    @pytest.mark.parametrize("kind", [fj.GravityFeedforward, fj.ComputedTorque])
+    @pytest.mark.parametrize(
+        "kind", [fj.control.GravityFeedforward, fj.control.ComputedTorque]
+    )
     def test_model_based_controllers_do_not_know_the_payload(self, kind):
-        many = fj.perturbed(model_based(self.scene, kind), 4, payload=(1, 2))
+        many = fj.tuning.perturbed(model_based(self.scene, kind), 4, payload=(1, 2))
         model, arm = many.forces[0].model, self.scene.linkage
         np.testing.assert_array_equal(model.mass, np.tile(arm.mass, (4, 1)))
         assert (np.asarray(many.linkage.mass)[:, 2] >= arm.mass[2] + 1).all()
 
     def test_computed_torque_is_tuned_for_payloads_in_units_of_its_own(self):
-        scene = model_based(self.scene._replace(t1=0.2), fj.ComputedTorque)
-        many = fj.perturbed(scene, 4, payload=(1, 2))
+        scene = model_based(self.scene._replace(t1=0.2), fj.control.ComputedTorque)
+        many = fj.tuning.perturbed(scene, 4, payload=(1, 2))
         result = fj.tune(scene, ensemble=many, max_steps=1)
         assert result.loss < result.history.loss[0] and len(result.member_loss) == 4
         assert "kp of P2 [1/s^2]" in str(result) and "kd of R1 [1/s]" in str(result)
@@ -287,20 +291,20 @@ class TestEnsembles:
         with pytest.raises(ValueError, match="ensemble: expected scenes stacked"):
             fj.tune(self.scene, ensemble=self.scene)
         with pytest.raises(ValueError, match=r"scenes\[1\]: expected one like"):
-            fj.stacked([self.scene, scenes.fig5()])
+            fj.tuning.stacked([self.scene, scenes.fig5()])
         still = fj.PDController(1, 1, 1, lambda t, arm: (jnp.zeros(3), jnp.zeros(3)))
         short = scenes.fig5()._replace(forces=(still,))
         with pytest.raises(ValueError, match="start_offset: expected one within"):
-            fj.perturbed(short, 2, start_offset=100.0)
-        other = fj.stacked([fj.circle_scenes()["RRR"]])
+            fj.tuning.perturbed(short, 2, start_offset=100.0)
+        other = fj.tuning.stacked([fj.tuning.circle_scenes()["RRR"]])
         with pytest.raises(ValueError, match=r"ensemble\[0\]: expected joints and"):
             fj.tune(self.scene, ensemble=other)
         with pytest.raises(ValueError, match="payload: expected the least before"):
-            fj.perturbed(self.scene, 2, payload=(2.0, 0.0))
+            fj.tuning.perturbed(self.scene, 2, payload=(2.0, 0.0))
         with pytest.raises(ValueError, match="link_error: expected less than 1"):
-            fj.perturbed(self.scene, 2, link_error=1.5)
+            fj.tuning.perturbed(self.scene, 2, link_error=1.5)
         with pytest.raises(ValueError, match="speed"):
-            fj.perturbed(self.scene, 2, speed=(2.0, 0.0))
+            fj.tuning.perturbed(self.scene, 2, speed=(2.0, 0.0))
 
 
 class MeanSquare(eqx.Module):

@@ -73,8 +73,8 @@ def test_a_loss_that_is_no_number_is_refused(value):
 def test_keywords_of_tune_are_those_of_its_relatives():
     scene = scenes.fig7()
     with pytest.raises(TypeError, match="step: expected a keyword among factor, "):
-        fj.tune_each([scene], step=3)
+        fj.tuning.tune_each([scene], step=3)
     with pytest.raises(TypeError, match="ensemble: expected a keyword"):
-        fj.tune_each([scene], ensemble=scene)
+        fj.tuning.tune_each([scene], ensemble=scene)
     with pytest.raises(TypeError, match="loss: expected a keyword"):
-        fj.trade_off(scene, [0.0], loss=losses.tip_errors)
+        fj.tuning.trade_off(scene, [0.0], loss=losses.tip_errors)

@@ -110,7 +110,7 @@ class Modes(eqx.Module):
     >>> import numpy as np
     >>> arm, start, forces, _ = fj.scenes.fig7()
     >>> motion = fj.simulate(arm, start, np.linspace(0, 1, 101), forces)
-    >>> modes = fj.closed_loop_modes(arm, forces, motion)
+    >>> modes = fj.analysis.closed_loop_modes(arm, forces, motion)
     >>> modes.eigenvalues.shape, float(modes.longest_step[-1])  # [s]
     ((101, 6), 0.022)
     """
@@ -160,7 +160,7 @@ def closed_loop_modes(linkage: Linkage, forces: Forces, solution: Solution) -> M
     >>> import numpy as np
     >>> arm, start, forces, _ = fj.scenes.fig7()
     >>> motion = fj.simulate(arm, start, np.linspace(0, 1, 101), forces)
-    >>> modes = fj.closed_loop_modes(arm, forces, motion)
+    >>> modes = fj.analysis.closed_loop_modes(arm, forces, motion)
     >>> modes.frequency[-1].tolist()  # [rad/s]
     [5.943, 5.943, 20.677, 20.677, 118.149, 118.149]
     """

@@ -6,10 +6,10 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float
 
-from ..control.circle import CircleTask
 from ..control.pd import PDController
 from ..linkage.linkage import Linkage
 from ..mechanics.kinematics import tip_position
+from ..references.circle import CircleTask
 from ..simulation.solution import Solution
 
 

@@ -1,1 +1,5 @@
-"""Controllers, drives, and reference motions along paths."""
+"""Controllers, feedforward and drives."""
+
+from ..names import attach
+
+__getattr__, __dir__, __all__ = attach(__name__, __file__)

@@ -35,7 +35,7 @@ class PIDController(StatefulElement):
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig7().linkage
     >>> task = fj.CircleTask()
-    >>> pid = fj.PIDController(kp=100, ki=50, kd=0, limit=30, reference=task)
+    >>> pid = fj.control.PIDController(kp=100, ki=50, kd=0, limit=30, reference=task)
     >>> q, qd = task(0.0, arm)
     >>> effort, rate = pid(0.0, q - 0.1, qd, arm, pid.initial_state(arm))
     >>> effort.tolist(), rate.tolist()  # the integral's share grows
@@ -117,7 +117,7 @@ class FirstOrderLag(_Drive):
 
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig5().linkage
-    >>> lag = fj.FirstOrderLag(fj.JointEffort([10, 0, 0]), time_constant=0.1)
+    >>> lag = fj.control.FirstOrderLag(fj.JointEffort([10, 0, 0]), time_constant=0.1)
     >>> effort, rate = lag(0.0, [0, 0, 0], [0, 0, 0], arm, lag.initial_state(arm))
     >>> effort.tolist(), rate.own.tolist()  # towards 10 N m, in 0.1 s at this rate
     ([0.0, 0.0, 0.0], [100.0, 0.0, 0.0])
@@ -148,7 +148,7 @@ class SpeedLimit(_Drive):
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig5().linkage
     >>> import jax.numpy as jnp
-    >>> limited = fj.SpeedLimit(fj.JointEffort([9, 9, 9]), stall=8, no_load=4)
+    >>> limited = fj.control.SpeedLimit(fj.JointEffort([9, 9, 9]), stall=8, no_load=4)
     >>> speeds, state = jnp.array([0.0, 2.0, 5.0]), limited.initial_state(arm)
     >>> limited(0.0, [0, 0, 0], speeds, arm, state)[0].tolist()
     [8.0, 4.0, 0.0]
@@ -186,7 +186,7 @@ class DCMotor(_Drive):
     >>> arm = fj.scenes.fig5().linkage
     >>> import jax.numpy as jnp
     >>> volts = fj.JointEffort([24, 24, 24])
-    >>> motor = fj.DCMotor(volts, resistance=2, inductance=0.01, constant=0.1)
+    >>> motor = fj.control.DCMotor(volts, resistance=2, inductance=0.01, constant=0.1)
     >>> speeds, state = jnp.array([0.0, 120, 240]), motor.initial_state(arm)
     >>> motor(0.0, [0, 0, 0], speeds, arm, state)[1].own.tolist()  # rates [A/s]
     [2400.0, 1200.0, 0.0]

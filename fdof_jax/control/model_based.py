@@ -12,8 +12,8 @@ from ..linkage.frames import scalar_frames
 from ..linkage.linkage import Linkage, check_linkage, possible
 from ..mechanics.equations import Scalars, link_constants
 from ..mechanics.rates import required_efforts
+from ..references.reference import reference_motion
 from .pd import PDController
-from .reference import reference_motion
 
 
 class ModelBased(PDController):
@@ -68,9 +68,9 @@ class GravityFeedforward(ModelBased):
     >>> arm = fj.scenes.fig7().linkage
     >>> task = fj.CircleTask()
     >>> q, qd = task(0.0, arm)  # no error is left to correct
-    >>> fj.GravityFeedforward(500, 50, 500, task)(0.0, q, qd, arm).tolist()
+    >>> fj.control.GravityFeedforward(500, 50, 500, task)(0.0, q, qd, arm).tolist()
     [-93.195, 0.0, 0.0]
-    >>> fj.holding_efforts(arm, q).tolist()
+    >>> fj.analysis.holding_efforts(arm, q).tolist()
     [-93.195, 0.0, 0.0]
     """
 
@@ -122,8 +122,8 @@ class ComputedTorque(ModelBased):
 
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig7().linkage
-    >>> stand = fj.JointMove([1, 2, 0], [1, 2, 0], fj.Travel(1.0))
-    >>> control = fj.ComputedTorque(kp=25, kd=10, limit=500, reference=stand)
+    >>> stand = fj.references.JointMove([1, 2, 0], [1, 2, 0], fj.references.Travel(1.0))
+    >>> control = fj.control.ComputedTorque(kp=25, kd=10, limit=500, reference=stand)
     >>> tau = control(0.0, stand.end - 0.1, stand.end * 0, arm)
     >>> fj.forward_dynamics(arm, stand.end - 0.1, [0, 0, 0], tau).tolist()  # kp / 10
     [2.5, 2.5, 2.5]

@@ -8,7 +8,7 @@ from jax import Array
 from ..forces.element import ScalarElement
 from ..forces.part import Values, called, field
 from ..linkage.linkage import Linkage
-from .reference import EXPECTED, reference_motion
+from ..references.reference import EXPECTED, reference_motion
 
 
 class PDController(ScalarElement):

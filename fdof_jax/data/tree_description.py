@@ -20,6 +20,7 @@ from jax import Array
 
 from .. import __all__ as _NAMES, __name__ as _PACKAGE
 from ..checks import is_traced
+from ..names import room_of
 
 _RESULT: Any = diffrax.RESULTS.successful
 _Item, _EnumerationMeta = type(_RESULT), type(diffrax.RESULTS)
@@ -31,7 +32,7 @@ class Unreadable(Exception):
 
 # Names of classes and functions
 
-# Classes in saved trees that are not in the library's top namespace.
+# Classes in saved trees that are not public.
 _WITHIN = {
     "DriveState": "control.drives",
     "History": "tuning.result",
@@ -56,10 +57,12 @@ def _name(thing: Any) -> str:
 
 def _of_the_library(name: str) -> Any:
     """Returns the class or function of the library with the given name, or None."""
-    if name not in (*_NAMES, *_WITHIN):
-        return None
-    place = f"{_PACKAGE}.{_WITHIN[name]}" if name in _WITHIN else _PACKAGE
-    found = getattr(importlib.import_module(place), name)
+    if name in (*_NAMES, *_WITHIN):
+        place = ".".join(filter(None, [_PACKAGE, _WITHIN.get(name)]))
+        module = importlib.import_module(place)
+    else:
+        module = room_of(name)
+    found = getattr(module, name, None)
     return found if isinstance(found, type | types.FunctionType) else None
 
 

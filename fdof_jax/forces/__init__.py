@@ -1,21 +1,5 @@
 """Force elements: joint efforts, springs, dampers, stops, actuators."""
 
-from .actuators import Armature as Armature, LinearActuator as LinearActuator
-from .between_points import (
-    SpringDamper as SpringDamper,
-    Tension as Tension,
-    Wrench as Wrench,
-)
-from .element import (
-    Element as Element,
-    InertialElement as InertialElement,
-    ScalarElement as ScalarElement,
-    StatefulElement as StatefulElement,
-)
-from .joint_limits import JointFriction as JointFriction, JointStops as JointStops
-from .joints import (
-    EffortHistory as EffortHistory,
-    JointDamper as JointDamper,
-    JointEffort as JointEffort,
-)
-from .points import Load as Load, Point as Point, PointElement as PointElement
+from ..names import attach
+
+__getattr__, __dir__, __all__ = attach(__name__, __file__)

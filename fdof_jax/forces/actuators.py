@@ -31,7 +31,7 @@ class Armature(InertialElement):
 
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig5().linkage
-    >>> rotors, zero = (fj.Armature(0.5),), [0, 0, 0]
+    >>> rotors, zero = (fj.forces.Armature(0.5),), [0, 0, 0]
     >>> fj.forward_dynamics(arm, zero, zero, zero, rotors).tolist()  # slower than -g
     [-5.664, 2.225, 1.82]
     """

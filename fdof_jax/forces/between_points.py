@@ -129,7 +129,7 @@ class Tension(LineElement):
 
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig5().linkage
-    >>> rope = fj.Tension(fj.Point(0, 1, 2), fj.Point(1, 1), tension=10)
+    >>> rope = fj.forces.Tension(fj.Point(0, 1, 2), fj.Point(1, 1), tension=10)
     >>> rope(0.0, [0.0, 0.0, 0.0], [0.0, 0.0, 0.0], arm).tolist()  # straight up
     [10.0, 0.0, 0.0]
     """

@@ -26,7 +26,7 @@ class JointStops(ScalarElement):
 
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig5().linkage
-    >>> stops = fj.JointStops(-1.0, 1.0, stiffness=1e4)
+    >>> stops = fj.forces.JointStops(-1.0, 1.0, stiffness=1e4)
     >>> stops(0.0, [0.0, 1.01, -1.01], [0, 0, 0], arm).tolist()
     [0.0, -100.0, 100.0]
     """
@@ -99,7 +99,7 @@ class JointFriction(ScalarElement):
 
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig5().linkage
-    >>> fj.JointFriction(5)(0.0, [0, 0, 0], [0.0, 0.01, -1.0], arm).tolist()
+    >>> fj.forces.JointFriction(5)(0.0, [0, 0, 0], [0.0, 0.01, -1.0], arm).tolist()
     [0.0, -3.808, 5.0]
     """
 

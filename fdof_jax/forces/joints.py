@@ -39,7 +39,7 @@ class JointEffort(ScalarElement):
 
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig5().linkage
-    >>> hold = fj.JointEffort(fj.holding_efforts(arm, [0, 0, 0]))
+    >>> hold = fj.JointEffort(fj.analysis.holding_efforts(arm, [0, 0, 0]))
     >>> hold(0.0, [0, 0, 0], [0, 0, 0], arm).tolist()
     [58.86, 29.43, 9.81]
     """
@@ -64,7 +64,7 @@ class EffortHistory(ScalarElement):
 
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig5().linkage
-    >>> history = fj.EffortHistory([0, 1], [[0, 0, 0], [2, 4, 6]])
+    >>> history = fj.forces.EffortHistory([0, 1], [[0, 0, 0], [2, 4, 6]])
     >>> history(0.5, [0, 0, 0], [0, 0, 0], arm).tolist()
     [1.0, 2.0, 3.0]
     """

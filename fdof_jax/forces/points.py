@@ -117,9 +117,10 @@ class PointElement(ScalarElement):
 
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig5().linkage
-    >>> class Weight(fj.PointElement):
+    >>> class Weight(fj.forces.PointElement):
     ...     def loads(self, scheduled, frames, qd):
-    ...         return (fj.Load(fj.Point(3, 1.0), force=-10j),)  # downwards at the tip
+    ...         tip = fj.Point(3, 1.0)
+    ...         return (fj.forces.Load(tip, force=-10j),)  # downwards
     >>> Weight()(0.0, [0.0, 0.0, 0.0], [0.0, 0.0, 0.0], arm).tolist()
     [-30.0, -20.0, -10.0]
     """

@@ -11,9 +11,9 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.colors import ListedColormap
 
-from ..control.circle import CircleTask
-from ..control.reference import reference_of
 from ..linkage.linkage import Linkage
+from ..references.circle import CircleTask
+from ..references.reference import reference_of
 from ..simulation.solution import Solution
 from .axes import (
     BLACK,

@@ -11,15 +11,15 @@ import equinox as eqx
 import matplotlib
 
 from .. import scenes
-from ..control.circle import CircleTask
 from ..data.files import load, save
+from ..references.circle import CircleTask
 from ..simulation.scene import Scene
 from ..tuning.ensembles import perturbed
 from ..tuning.gradient_quality import gradient_report
 from ..tuning.league import circle_scenes, league_table
 from ..tuning.losses import Tracking, tip_errors
 from ..tuning.result import TuneResult
-from ..tuning.tune import tune, tune_each
+from ..tuning.tuning import tune, tune_each
 from ..xla.configuration import configure
 from . import showcase
 from .tuning_run import Job

@@ -24,7 +24,7 @@ from ..simulation.scene import Scene
 from ..simulation.simulate import simulate
 from ..simulation.solution import Solution
 from ..tuning.league import arm_at
-from ..tuning.tune import TuneResult, tune
+from ..tuning.tuning import TuneResult, tune
 
 _SAMPLE = 0.01  # output times [s]
 

@@ -12,12 +12,12 @@ import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float
 
-from ..control.reference import EXPECTED, positions_at, reference_motion
 from ..dynamics import mass_and_bias
 from ..forces.element import Element, Forces
 from ..forces.part import called
 from ..linkage.linkage import Linkage
 from ..mechanics.equations import equations, zeros
+from ..references.reference import EXPECTED, positions_at, reference_motion
 from ..xla.array_namespace import in_numpy
 from ..xla.callbacks import with_checks
 from .field import LEAST_INERTIA_RATIO, Args, applied

@@ -63,7 +63,7 @@ def stacked(scenes: Sequence[Any], name: str = "scenes") -> Any:
 
     >>> import fdof_jax as fj
     >>> short = fj.scenes.fig7()._replace(t1=2.0)
-    >>> fj.stacked([short, short]).linkage.mass.shape
+    >>> fj.tuning.stacked([short, short]).linkage.mass.shape
     (2, 3)
     """
     if not isinstance(scenes, list | tuple) or isinstance(scenes, Scene) or not scenes:

@@ -9,10 +9,10 @@ from numpy.typing import ArrayLike
 
 from ..checks import instance, real_array, whole_number
 from ..control.model_based import ModelBased
-from ..control.reference import reference_of
 from ..linkage.coordinates import State
 from ..linkage.linkage import Linkage, check_linkage
 from ..mechanics.kinematics import tip_jacobian, tip_position
+from ..references.reference import reference_of
 from ..simulation.scene import Scene, stacked
 from .losses import controller_of
 
@@ -26,7 +26,7 @@ def with_payload(linkage: Linkage, mass: ArrayLike) -> Linkage:
 
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig5().linkage
-    >>> fj.with_payload(arm, 2.0).mass.tolist()
+    >>> fj.tuning.with_payload(arm, 2.0).mass.tolist()
     [1.0, 1.0, 3.0]
     """
     check_linkage(linkage)
@@ -109,7 +109,7 @@ def perturbed(
     **Raises:** ValueError for malformed arguments, and for a start out of reach.
 
     >>> import fdof_jax as fj
-    >>> ensemble = fj.perturbed(fj.scenes.fig7(), 4, payload=(0, 2))
+    >>> ensemble = fj.tuning.perturbed(fj.scenes.fig7(), 4, payload=(0, 2))
     >>> ensemble.linkage.mass[:, 2].tolist()  # 1 kg and what it carries
     [2.715, 2.371, 1.783, 1.809]
     """

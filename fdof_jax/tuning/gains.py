@@ -9,10 +9,10 @@ import numpy as np
 from jax import Array
 
 from ..checks import instance, is_traced, place_of, real_array
-from ..control.reference import reference_of
 from ..forces.element import elements
 from ..linkage.coordinates import real_state
 from ..linkage.linkage import check_linkage, joint_names
+from ..references.reference import reference_of
 from ..search.methods import Evaluation
 from ..simulation.scene import Scene
 from ..simulation.sensitivities import sensitivities

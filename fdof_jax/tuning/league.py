@@ -4,11 +4,11 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ..control.circle import CircleTask
 from ..control.pd import PDController
 from ..linkage.coordinates import State, from_chain
 from ..linkage.linkage import Linkage
 from ..linkage.topology import TOPOLOGIES
+from ..references.circle import CircleTask
 from ..simulation.scene import Scene
 from .result import TuneResult
 
@@ -51,7 +51,7 @@ def circle_scenes() -> dict[str, Scene]:
     (150 N m or N).
 
     >>> import fdof_jax as fj
-    >>> scenes = fj.circle_scenes()
+    >>> scenes = fj.tuning.circle_scenes()
     >>> starts = [fj.tip_position(s.linkage, s.state0.q) for s in scenes.values()]
     >>> starts[0].tolist(), starts[-1].tolist()  # the same for all
     ([1.994, 1.151], [1.994, 1.151])
@@ -79,9 +79,9 @@ def league_table(results: Mapping[str, TuneResult]) -> str:
     **Arguments:** `results`: by name, for instance those of `tune_each`.
 
     >>> import fdof_jax as fj
-    >>> scenes = fj.circle_scenes()
+    >>> scenes = fj.tuning.circle_scenes()
     >>> pair = {name: scenes[name]._replace(t1=1.0) for name in ("PPR", "RRR")}
-    >>> print(fj.league_table(fj.tune_each(pair, max_steps=2)))
+    >>> print(fj.tuning.league_table(fj.tuning.tune_each(pair, max_steps=2)))
            rms tip error [mm]     effort [% of limit]        gains
                start       tuned       start       tuned at bounds
     PPR         15.2       7.671       6.762       14.51       2/6

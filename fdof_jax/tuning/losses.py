@@ -42,7 +42,7 @@ def tip_errors(scene: Scene, solution: Solution) -> Float[Array, " residual"]:
     >>> import numpy as np
     >>> arm, start, forces, _ = fj.scenes.fig7()
     >>> motion = fj.simulate(arm, start, np.linspace(0, 1, 101), forces)
-    >>> errors = fj.tip_errors(fj.scenes.fig7(), motion)
+    >>> errors = fj.tuning.tip_errors(fj.scenes.fig7(), motion)
     >>> float((errors**2).sum() ** 0.5)  # rms over the first second [m]
     0.351
     """
@@ -83,7 +83,7 @@ class Tracking(eqx.Module):
     >>> import numpy as np
     >>> arm, start, forces, _ = fj.scenes.fig7()
     >>> motion = fj.simulate(arm, start, np.linspace(0, 1, 101), forces)
-    >>> residuals = fj.Tracking(effort=0.1)(fj.scenes.fig7(), motion)
+    >>> residuals = fj.tuning.Tracking(effort=0.1)(fj.scenes.fig7(), motion)
     >>> float((residuals**2).sum())  # [m^2]
     0.15
     """

@@ -15,10 +15,10 @@ from ..analysis.tracking import tip_deviation
 from ..checks import instance, place_of, real_array, whole_number
 from ..control.model_based import ComputedTorque
 from ..control.pd import PDController
-from ..control.reference import reference_of
 from ..forces.element import elements
 from ..forces.joints import EffortHistory
 from ..linkage.linkage import check_linkage
+from ..references.reference import reference_of
 from ..search.bounded import Run, minimise, reporting
 from ..search.lanes import Lanes
 from ..search.methods import Evaluation
@@ -224,7 +224,8 @@ def optimal_efforts(
     with the efforts of every first guess.
 
     >>> import fdof_jax as fj
-    >>> best = fj.optimal_efforts(fj.scenes.fig7(), horizon=0.3, knots=7, max_steps=20)
+    >>> scene = fj.scenes.fig7()
+    >>> best = fj.tuning.optimal_efforts(scene, horizon=0.3, knots=7, max_steps=20)
     >>> best.controller_error, best.tip_error  # [m]
     (0.119, 0.08)
     """

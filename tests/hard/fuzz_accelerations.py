@@ -87,7 +87,7 @@ def check_accelerations(scene: Scene, report: Report) -> str:
 
 def _told_ill_conditioned(linkage, scene: Scene, exact) -> bool:
     """Returns whether `inertia_ratios` reports the arm; checks their own error."""
-    ratios = np.asarray(fj.inertia_ratios(linkage, scene.q))
+    ratios = np.asarray(fj.analysis.inertia_ratios(linkage, scene.q))
     if exact.qdd is not None and resolution(exact) < 1e-3:
         expected = [
             float(1 / (exact.matrix[k][k] * exact.inverse[k][k])) for k in range(3)

@@ -45,7 +45,7 @@ def everything(linkage, q, qd):
         centres=fj.mass_centers(linkage, q),
         energy=fj.energy(linkage, q, qd),
         qdd=fj.forward_dynamics(linkage, q, qd, STILL),
-        conditioning=fj.inertia_ratios(linkage, q),
+        conditioning=fj.analysis.inertia_ratios(linkage, q),
         angles=sincos(q),
     )
 

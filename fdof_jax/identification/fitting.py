@@ -50,7 +50,7 @@ def link_ends(scene: Scene, solution: Solution) -> Float[Array, "time link 2"]:
     >>> import numpy as np
     >>> arm, start, *_ = fj.scenes.fig5()
     >>> motion = fj.simulate(arm, start, np.linspace(0, 1, 101))
-    >>> fj.link_ends(fj.scenes.fig5(), motion)[0].tolist()
+    >>> fj.identification.link_ends(fj.scenes.fig5(), motion)[0].tolist()
     [[1.0, 0.0], [2.0, 0.0], [3.0, 0.0]]
     """
 
@@ -334,8 +334,9 @@ def fit_each(
     >>> ts = np.linspace(0, 1, 51)
     >>> dampers = fj.JointDamper(15.0), fj.JointDamper(25.0)
     >>> motions = [fj.simulate(arm, start, ts, (damper,)) for damper in dampers]
-    >>> markers = np.stack([fj.link_ends(damped({"damping": 1.0}), m) for m in motions])
-    >>> found = fj.fit_each(damped, {"damping": 20.0}, ts, markers)
+    >>> scene = damped({"damping": 1.0})
+    >>> markers = np.stack([fj.identification.link_ends(scene, m) for m in motions])
+    >>> found = fj.identification.fit_each(damped, {"damping": 20.0}, ts, markers)
     >>> [float(each.parameters["damping"]) for each in found]
     [15.0, 25.0]
     """

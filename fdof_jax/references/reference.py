@@ -34,7 +34,7 @@ class Reference(Part):
 
     >>> import fdof_jax as fj
     >>> import jax.numpy as jnp
-    >>> class Stand(fj.Reference):
+    >>> class Stand(fj.references.Reference):
     ...     target: fj.Values = fj.field(unit="m or rad")
     ...     def __call__(self, t, linkage):
     ...         return self.target, jnp.zeros(3)
@@ -128,7 +128,7 @@ def reachable(linkage: Linkage, reference: Any, ts: ArrayLike) -> Bool[Array, " 
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig7().linkage
     >>> circle = fj.CircleTask(center=[-1, 2], radius=0.75)  # too near the base
-    >>> fj.reachable(arm, circle, [0.0, 1.875, 2.5]).tolist()
+    >>> fj.references.reachable(arm, circle, [0.0, 1.875, 2.5]).tolist()
     [True, False, True]
     """
     check_linkage(linkage)

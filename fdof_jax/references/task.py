@@ -35,7 +35,7 @@ class JointMove(Reference):
 
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig5().linkage
-    >>> move = fj.JointMove([0, 0, 0], [1, 2, 3], fj.Travel(2.0))
+    >>> move = fj.references.JointMove([0, 0, 0], [1, 2, 3], fj.references.Travel(2.0))
     >>> q, qd = move(1.0, arm)
     >>> q.tolist(), qd.tolist()  # halfway, at 15/8 of the mean speed
     ([0.5, 1.0, 1.5], [0.938, 1.875, 2.812])
@@ -98,8 +98,8 @@ class TipTask(TipReference):
 
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig7().linkage
-    >>> line = fj.Line([-4, 2], [-3, 2])
-    >>> task = fj.TipTask(line, fj.Travel(1.0), orientation=1.5707963)
+    >>> line = fj.references.Line([-4, 2], [-3, 2])
+    >>> task = fj.TipTask(line, fj.references.Travel(1.0), orientation=1.5707963)
     >>> q, qd = task(0.5, arm)
     >>> fj.tip_position(arm, q).tolist()
     [-3.5, 2.0]

@@ -21,11 +21,11 @@ class Path(Part):
 
     >>> import fdof_jax as fj
     >>> import jax.numpy as jnp
-    >>> class Parabola(fj.Path):
+    >>> class Parabola(fj.references.Path):
     ...     middle = jnp.array([-4.0, 2.0])
     ...     def point(self, share):
     ...         return jnp.stack([share - 4.5, 2 + share**2])
-    >>> fj.TipTask(Parabola(), fj.Travel(1.0)).tip(0.5).tolist()
+    >>> fj.TipTask(Parabola(), fj.references.Travel(1.0)).tip(0.5).tolist()
     [-4.0, 2.25]
     """
 
@@ -47,7 +47,7 @@ class Line(Path):
     **Raises:** ValueError for malformed points.
 
     >>> import fdof_jax as fj
-    >>> fj.Line([0, 0], [2, 4]).point(0.25).tolist()
+    >>> fj.references.Line([0, 0], [2, 4]).point(0.25).tolist()
     [0.5, 1.0]
     """
 
@@ -86,7 +86,8 @@ class Ellipse(_Closed):
     **Raises:** ValueError for malformed arguments.
 
     >>> import fdof_jax as fj
-    >>> fj.Ellipse([1, 0], [2, 1]).point(0.25).tolist()  # a quarter of the way round
+    >>> ellipse = fj.references.Ellipse([1, 0], [2, 1])
+    >>> ellipse.point(0.25).tolist()  # a quarter of the way round
     [1.0, 1.0]
     """
 
@@ -104,7 +105,7 @@ class FigureEight(_Closed):
     **Raises:** ValueError for malformed arguments.
 
     >>> import fdof_jax as fj
-    >>> eight = fj.FigureEight([0, 0], [2, 1])
+    >>> eight = fj.references.FigureEight([0, 0], [2, 1])
     >>> [eight.point(share).tolist() for share in (0, 0.25, 0.5)]
     [[0.0, 0.0], [2.0, 0.0], [0.0, 0.0]]
     """
@@ -123,7 +124,7 @@ class Spline(Path):
     **Raises:** ValueError for malformed arguments.
 
     >>> import fdof_jax as fj
-    >>> fj.Spline([[0, 0], [1, 1], [2, 0]]).point(0.5).tolist()
+    >>> fj.references.Spline([[0, 0], [1, 1], [2, 0]]).point(0.5).tolist()
     [1.0, 1.0]
     """
 

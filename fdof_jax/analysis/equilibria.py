@@ -34,7 +34,7 @@ def equilibrium(
 
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig5().linkage
-    >>> fj.equilibrium(arm, (), [-1.0, 0.1, 0.1]).tolist()  # it hangs
+    >>> fj.analysis.equilibrium(arm, (), [-1.0, 0.1, 0.1]).tolist()  # it hangs
     [-1.571, 0.0, 0.0]
     """
     forces = checked(linkage, forces)
@@ -76,7 +76,7 @@ def holding_efforts(
 
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig5().linkage
-    >>> fj.holding_efforts(arm, [0, 0, 0]).tolist()
+    >>> fj.analysis.holding_efforts(arm, [0, 0, 0]).tolist()
     [58.86, 29.43, 9.81]
     """
     still = jnp.zeros(3)

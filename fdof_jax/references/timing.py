@@ -52,7 +52,7 @@ class Travel(Part):
     **Raises:** ValueError for malformed arguments.
 
     >>> import fdof_jax as fj
-    >>> harmonic = fj.Travel(2.0, profile="harmonic")
+    >>> harmonic = fj.references.Travel(2.0, profile="harmonic")
     >>> [float(harmonic(t)) for t in (0, 0.5, 1, 3)]
     [0.0, 0.146, 0.5, 1.0]
     """
@@ -91,7 +91,7 @@ class Laps(Part):
     **Raises:** ValueError for malformed arguments.
 
     >>> import fdof_jax as fj
-    >>> [float(fj.Laps(period=4)(t)) for t in (1, 4, 10)]
+    >>> [float(fj.references.Laps(period=4)(t)) for t in (1, 4, 10)]
     [0.25, 1.0, 2.5]
     """
 
@@ -121,8 +121,8 @@ def shock_against(travel: Travel, frequency: ArrayLike) -> Float[Array, ""]:
     exceeds 250 rad (the result is NaN if that product is traced).
 
     >>> import fdof_jax as fj
-    >>> travel = fj.Travel(1.5, profile="harmonic")
-    >>> float(fj.shock_against(travel, frequency=8.0))
+    >>> travel = fj.references.Travel(1.5, profile="harmonic")
+    >>> float(fj.references.shock_against(travel, frequency=8.0))
     2.934
     """
     instance("travel", travel, Travel)

@@ -210,9 +210,9 @@ def tune_each(scenes: Any, *, loss: Loss = tip_errors, **keywords: Any) -> Any:
     for unknown keywords.
 
     >>> import fdof_jax as fj
-    >>> scenes = fj.circle_scenes()
+    >>> scenes = fj.tuning.circle_scenes()
     >>> pair = {name: scenes[name]._replace(t1=1.0) for name in ("PPR", "RRR")}
-    >>> results = fj.tune_each(pair, max_steps=2)
+    >>> results = fj.tuning.tune_each(pair, max_steps=2)
     >>> {name: result.tip_error for name, result in results.items()}  # [m]
     {'PPR': 0.0077, 'RRR': 0.0293}
     """

@@ -19,7 +19,8 @@ def inertial_parameters(linkage: Linkage) -> Float[Array, "link 4"]:
 
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig3().linkage
-    >>> fj.inertial_parameters(arm)[0].tolist()  # m, m p, m q, I about the pivot
+    >>> p = fj.analysis.inertial_parameters(arm)
+    >>> p[0].tolist()  # m, m p, m q, I about the pivot
     [5.0, 2.5, -5.0, 6.25]
     """
     check_linkage(linkage)
@@ -52,7 +53,8 @@ def regressor(
     >>> arm = fj.scenes.fig5().linkage
     >>> import numpy as np
     >>> state = [0.1, 0.2, 0.3], [1, 0, -1], [0.5, 0.5, 0.5]
-    >>> np.tensordot(fj.regressor(arm, *state), fj.inertial_parameters(arm), 2).tolist()
+    >>> p = fj.analysis.inertial_parameters(arm)
+    >>> np.tensordot(fj.analysis.regressor(arm, *state), p, 2).tolist()
     [68.982, 35.32, 11.766]
     >>> fj.inverse_dynamics(arm, *state).tolist()
     [68.982, 35.32, 11.766]

@@ -1,0 +1,15 @@
+from ..dynamics import inertia_ratios as inertia_ratios
+from .equilibria import equilibrium as equilibrium, holding_efforts as holding_efforts
+from .linearization import (
+    Linearization as Linearization,
+    Modes as Modes,
+    closed_loop_modes as closed_loop_modes,
+    linearize as linearize,
+)
+from .reactions import joint_reactions as joint_reactions
+from .regression import (
+    inertial_parameters as inertial_parameters,
+    regressor as regressor,
+)
+
+__all__: list[str]
