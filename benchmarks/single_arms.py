@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 import fdof_jax as fj
-from fdof_jax.simulation.integrate import solve_one
+from fdof_jax.simulation.plain import solve_one
 
 from . import contestants as own, gradients, peers, problems, trajectory
 from .contestants import Contestant

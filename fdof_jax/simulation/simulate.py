@@ -24,10 +24,11 @@ from ..linkage.coordinates import State, real_state
 from ..linkage.linkage import Linkage, check_linkage
 from ..xla.array_namespace import in_numpy
 from .field import element_effort, stateful
-from .integrate import solve, solve_one
+from .plain import solve_one
 from .prescribed import prescribed, prescribed_effort
 from .solution import Efforts, Solution
 from .steps import at_tolerances, within_reach
+from .traced import solve
 
 
 def solve_options(

@@ -1,0 +1,160 @@
+"""Solves traced inputs: batches, derivatives, and calls within a user's program."""
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.flatten_util import ravel_pytree
+
+from ..checks import is_traced
+from ..forces.added_inertia import inertial
+from ..forces.element import Element, ForeignElement
+from ..xla.configuration import small_loops_are_kernels
+from .integrate import integrate
+from .looped_dopri8 import LoopedDopri8
+from .prescribed import prescribed
+from .solution import Solution
+from .unrolled_dopri8 import UnrolledDopri8
+
+
+def _batch_solver(forces: tuple[Element, ...]) -> diffrax.AbstractSolver:
+    """Returns the fastest solver for large batches."""
+    # Thirteen unrolled copies of these equations would take minutes to compile.
+    many = inertial(forces) or prescribed(forces)
+    return diffrax.Dopri8() if many else UnrolledDopri8()
+
+
+def _tangent_solver(forces: tuple[Element, ...]) -> diffrax.AbstractSolver:
+    """Returns the fastest solver for forward-mode derivatives."""
+    many = inertial(forces) or prescribed(forces)
+    if many or small_loops_are_kernels():
+        return LoopedDopri8()
+    return UnrolledDopri8(for_tangents=True)
+
+
+@eqx.filter_custom_vjp
+def _integrate_reversibly(inputs, solver, keywords) -> Solution:
+    """Integrates a motion that may be differentiated by `jax.grad`.
+
+    Unrolled stages compile differently with and without derivatives, and the replay of
+    the backward pass must reproduce the same bits: they serve the plain solve alone.
+    """
+    # The plain solve needs no loops for reverse mode, which take longer to compile.
+    keywords = keywords | {"adjoint": diffrax.ForwardMode()}
+    return integrate(solver or _batch_solver(inputs[-1]), inputs, keywords)
+
+
+# Up to so many numbers, tangents cost no more than the adjoint equations (one arm or
+# 256), and compile in half the time.
+_FEW = 12
+
+
+def _few(moving, adjoint) -> bool:
+    """Returns whether tangents in all these numbers serve better than the adjoint.
+
+    Who sets the number of checkpoints wants the adjoint.
+    """
+    leaves = jax.tree.leaves(moving)
+    real = all(jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in leaves)
+    few = sum(leaf.size for leaf in leaves) <= _FEW
+    return real and few and adjoint.checkpoints is None
+
+
+def _with_tangents(motion, moving):
+    """Returns what `motion` returns and the states' tangents in each number."""
+    start, whole = ravel_pytree(moving)
+
+    def along(direction):
+        shifted = lambda numbers: motion(whole(numbers))
+        return jax.jvp(shifted, (start,), (direction,), has_aux=True)
+
+    directions = jnp.eye(len(start), dtype=start.dtype)
+    return jax.vmap(along, out_axes=(None, 0, None))(directions)
+
+
+@_integrate_reversibly.def_fwd
+def _integrate_reversibly_fwd(perturbed, inputs, solver, keywords):
+    moving, fixed = eqx.partition(inputs, perturbed)
+    few = _few(moving, keywords["adjoint"])
+    if few:
+        solver = solver or _tangent_solver(inputs[-1])
+        keywords = keywords | {"adjoint": diffrax.ForwardMode()}
+
+    def motion(moving):
+        inputs = eqx.combine(moving, fixed)
+        solution = integrate(
+            solver or LoopedDopri8(), inputs, keywords, derivatives=True
+        )
+        return (solution.q, solution.qd, solution.own), solution
+
+    if few:
+        states, tangents, solution = _with_tangents(motion, moving)
+        return solution, (tangents, states)
+    states, pull_back, solution = eqx.filter_vjp(motion, moving, has_aux=True)
+    return solution, (pull_back, states)
+
+
+@_integrate_reversibly.def_bwd
+def _integrate_reversibly_bwd(
+    residuals, cotangent, perturbed, inputs, solver, keywords
+):
+    slopes, states = residuals
+    wanted = eqx.combine(
+        (cotangent.q, cotangent.qd, cotangent.own),
+        jax.tree.map(jnp.zeros_like, states),
+    )
+    moving = eqx.filter(inputs, perturbed)
+    if not _few(moving, keywords["adjoint"]):
+        (gradient,) = slopes(wanted)
+        return gradient
+    start, whole = ravel_pytree(moving)
+
+    def part(weight: Array, tangent: Array) -> Array:
+        weight, tangent = weight.reshape(1, -1), tangent.reshape(len(start), -1)
+        # States that were not reached are NaN, and constant; nor is a weight of 0 to
+        # pick up a tangent that is not finite.
+        unused = (weight == 0) | (tangent == 0)
+        return jnp.where(unused, 0, weight * tangent).sum(axis=1)
+
+    parts = jax.tree.leaves(jax.tree.map(part, wanted, slopes))
+    return whole(jnp.sum(jnp.stack(parts), axis=0))
+
+
+def _opened(inputs):
+    """Returns the inputs, with the closures of plain functions as leaves."""
+    linkage, state0, ts, own0, forces = inputs
+    arguments = ts[0], *state0, linkage
+    opened = tuple(
+        element.opened(*arguments) if isinstance(element, ForeignElement) else element
+        for element in forces
+    )
+    return linkage, state0, ts, own0, opened
+
+
+def solve(solver, inputs, keywords) -> Solution:
+    """Computes the motion for traced inputs: a batch, or with derivatives."""
+    # Within a program, a program of its own would also be traced without derivatives.
+    if not is_traced(jax.device_put(np.zeros(()))):
+        return _solve_compiled(solver, inputs, keywords)
+    # Within `vmap` even a tracer may hold a NumPy array, which rules of derivatives
+    # refuse in JAX 0.10.
+    known = jax.Array, np.ndarray, np.generic
+    inputs = jax.tree.map(
+        lambda x: jax.device_put(x) if isinstance(x, known) else x, inputs
+    )
+    return _solve(solver, inputs, keywords)
+
+
+def _solve(solver, inputs, keywords) -> Solution:
+    adjoint = keywords["adjoint"]
+    if isinstance(adjoint, diffrax.RecursiveCheckpointAdjoint):
+        return _integrate_reversibly(_opened(inputs), solver, keywords)
+    if solver is None:
+        forward = isinstance(adjoint, diffrax.ForwardMode)
+        solver = _tangent_solver(inputs[-1]) if forward else LoopedDopri8()
+    return integrate(solver, inputs, keywords, derivatives=True)
+
+
+_solve_compiled = eqx.filter_jit(_solve)
