@@ -33,7 +33,7 @@ def solution(*batch, failed=()) -> fj.Solution:
 
 def test_a_motion_has_named_joints_with_units():
     motion, arm = solution(), make_linkage("RPR")
-    found = fj.to_xarray(motion, arm)
+    found = fj.to_xarray(arm, motion)
     assert dict(found.sizes) == {"time": 5, "joint": 3}
     assert found.joint.values.tolist() == ["R1", "P2", "R3"]
     assert found.unit.values.tolist() == ["rad", "m", "rad"]
@@ -42,12 +42,12 @@ def test_a_motion_has_named_joints_with_units():
     np.testing.assert_array_equal(found.q.sel(joint="P2"), motion.q[:, 1])
     np.testing.assert_array_equal(found.qd.sel(time=1.0), motion.qd[2])
     assert (found.outcome, found.num_steps) == ("successful", 7)
-    assert fj.to_xarray(motion, make_linkage("RRR")).qd.units == "rad/s"
+    assert fj.to_xarray(make_linkage("RRR"), motion).qd.units == "rad/s"
 
 
 def test_a_batch_has_axes_and_says_what_failed():
     motion = solution(4, failed=[2])
-    found = fj.to_xarray(motion, make_linkage("RRP"))
+    found = fj.to_xarray(make_linkage("RRP"), motion)
     assert found.q.dims == ("batch", "time", "joint")
     np.testing.assert_array_equal(found.q, motion.q)
     good = ["successful", "successful", "ill-conditioned", "successful"]
@@ -55,7 +55,7 @@ def test_a_batch_has_axes_and_says_what_failed():
     assert found.time_reached.values.tolist() == [2, 2, 0.1, 2]
     named = found.rename(batch="payload").assign_coords(payload=[0, 1, 2, 3])
     assert named.outcome.sel(payload=2) == "ill-conditioned"
-    two = fj.to_xarray(solution(4, 2), make_linkage("RRP"))
+    two = fj.to_xarray(make_linkage("RRP"), solution(4, 2))
     assert two.q.dims == ("batch_1", "batch_2", "time", "joint")
     assert two.outcome.dims == ("batch_1", "batch_2")
 
@@ -64,15 +64,15 @@ def test_joints_of_two_kinds_are_numbers():
     arms = jax.tree.map(
         lambda *a: jnp.stack(a), make_linkage("RRP"), make_linkage("RPP")
     )
-    found = fj.to_xarray(solution(2), arms)
+    found = fj.to_xarray(arms, solution(2))
     assert found.joint.values.tolist() == ["R1", "2", "P3"]
     assert found.unit.values.tolist() == ["rad", "m or rad", "m"]
-    assert "2 [m/s or rad/s]" in fj.to_pandas(solution(2), arms)
+    assert "2 [m/s or rad/s]" in fj.to_pandas(arms, solution(2))
 
 
 def test_a_table_of_a_motion():
     motion = solution()
-    found = fj.to_pandas(motion, make_linkage("PRR"))
+    found = fj.to_pandas(make_linkage("PRR"), motion)
     assert list(found) == [
         "P1 [m]", "R2 [rad]", "R3 [rad]", "P1 [m/s]", "R2 [rad/s]", "R3 [rad/s]",
         "outcome",
@@ -85,14 +85,14 @@ def test_a_table_of_a_motion():
 
 def test_a_table_of_a_batch():
     motion = solution(3, 2, failed=[(1, 0)])
-    found = fj.to_pandas(motion, make_linkage("PRR"))
+    found = fj.to_pandas(make_linkage("PRR"), motion)
     assert found.index.names == ["batch_1", "batch_2", "time [s]"]
     row = found.loc[2, 1, TS[3]]
     assert row["R3 [rad]"] == motion.q[2, 1, 3, 2]
     assert row["P1 [m/s]"] == motion.qd[2, 1, 3, 0]
     failed = found[found.outcome != "successful"]
     assert set(failed.index.droplevel("time [s]")) == {(1, 0)}
-    assert list(fj.to_pandas(solution(2), make_linkage("PRR")).index.names) == [
+    assert list(fj.to_pandas(make_linkage("PRR"), solution(2)).index.names) == [
         "batch",
         "time [s]",
     ]
@@ -102,24 +102,32 @@ def test_a_table_of_a_batch():
 def test_malformed_arguments_are_named(convert):
     arm = make_linkage("RRR")
     with pytest.raises(ValueError, match="^solution: expected a Solution"):
-        convert(solution().q, arm)
+        convert(arm, solution().q)
     with pytest.raises(ValueError, match="^linkage: expected a Linkage"):
-        convert(solution(), "RRR")
+        convert("RRR", solution())
     other = solution(2)
     other = fj.Solution(
         other.ts.at[1].add(1.0), other.q, other.qd, other.stats, other.result
     )
     with pytest.raises(ValueError, match="^solution.ts: expected the same times"):
-        convert(other, arm)
+        convert(arm, other)
     with pytest.raises(ValueError, match="traced"):
-        jax.jit(lambda arm: convert(solution(), arm))(arm)
+        jax.jit(lambda arm: convert(arm, solution()))(arm)
+
+
+@pytest.mark.parametrize("convert", [fj.to_xarray, fj.to_pandas])
+def test_the_order_of_0_1_is_deprecated(convert):
+    motion, arm = solution(), make_linkage("RRR")
+    with pytest.warns(DeprecationWarning, match=r"expected \(linkage, solution\)") as w:
+        assert convert(motion, arm).equals(convert(arm, motion))
+    assert [warning.filename for warning in w] == [__file__]
 
 
 @pytest.mark.parametrize("name", ["xarray", "pandas"])
 def test_a_package_that_is_missing_is_named_with_the_extra(name, monkeypatch):
     monkeypatch.setitem(sys.modules, name, None)
     with pytest.raises(ImportError, match=rf"{name} .*fdof_jax\[data\]"):
-        getattr(fj, f"to_{name}")(solution(), make_linkage("RRR"))
+        getattr(fj, f"to_{name}")(make_linkage("RRR"), solution())
 
 
 def test_the_table_of_tuned_gains_is_a_frame(tuned):

@@ -1,5 +1,6 @@
 """Motions as xarray Datasets and pandas DataFrames (optional packages)."""
 
+import warnings
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -39,7 +40,16 @@ def _rate(unit: str) -> str:
     return " or ".join(f"{one}/s" for one in unit.split(" or "))
 
 
-def _checked(solution: Any, linkage: Any) -> tuple[np.ndarray, list[str]]:
+def _in_order(linkage: Any, solution: Any) -> tuple[Linkage, Solution]:
+    """The two arguments, which version 0.1 took in the other order."""
+    if isinstance(linkage, Solution):
+        message = "fdof_jax: expected (linkage, solution), got (solution, linkage)"
+        warnings.warn(message, DeprecationWarning, stacklevel=3)
+        return solution, linkage
+    return linkage, solution
+
+
+def _checked(linkage: Any, solution: Any) -> tuple[np.ndarray, list[str]]:
     """The common times of all motions, and the names of the batch axes."""
     instance("solution", solution, Solution)
     instance("linkage", linkage, Linkage)
@@ -54,7 +64,7 @@ def _checked(solution: Any, linkage: Any) -> tuple[np.ndarray, list[str]]:
     return ts[0], ["batch"] if axes == 1 else [f"batch_{k + 1}" for k in range(axes)]
 
 
-def to_xarray(solution: Solution, linkage: Linkage) -> "xarray.Dataset":
+def to_xarray(linkage: Linkage, solution: Solution) -> "xarray.Dataset":
     """Converts a solution to an xarray Dataset, with names and units.
 
     The Dataset holds joint positions `q` and velocities `qd` over `time` and `joint`,
@@ -64,8 +74,8 @@ def to_xarray(solution: Solution, linkage: Linkage) -> "xarray.Dataset":
     `batch_1`, `batch_2` and so on). To name an axis and give it values, use
     `.rename(batch="payload").assign_coords(payload=masses)`.
 
-    **Arguments:** `solution`: result of `simulate`, of a batch of it, or of `sweep`,
-    all at the same times [s]; `linkage`: that of the solution, one or a batch.
+    **Arguments:** `linkage`: that of the solution, one or a batch; `solution`: result
+    of `simulate`, of a batch of it, or of `sweep`, all at the same times [s].
 
     **Returns:** the Dataset; the attributes `units` of its variables are SI.
 
@@ -73,7 +83,8 @@ def to_xarray(solution: Solution, linkage: Linkage) -> "xarray.Dataset":
     for malformed arguments.
     """
     xarray = _package("xarray")
-    times, batch = _checked(solution, linkage)
+    linkage, solution = _in_order(linkage, solution)
+    times, batch = _checked(linkage, solution)
     names, units = _joints(linkage)
     common = units[0] if len(set(units)) == 1 else "m or rad"
     rows, steps = [*batch, "time", "joint"], solution.stats["num_steps"]
@@ -99,7 +110,7 @@ def to_xarray(solution: Solution, linkage: Linkage) -> "xarray.Dataset":
     return xarray.Dataset(labelled(variables), labelled(coordinates))
 
 
-def to_pandas(solution: Solution, linkage: Linkage) -> "pandas.DataFrame":
+def to_pandas(linkage: Linkage, solution: Solution) -> "pandas.DataFrame":
     """Converts a solution to a pandas DataFrame with a row per time.
 
     There is a column per joint position and velocity, named `R1 [rad]`, `P2 [m/s]` and
@@ -115,7 +126,8 @@ def to_pandas(solution: Solution, linkage: Linkage) -> "pandas.DataFrame":
     for malformed arguments.
     """
     pandas = _package("pandas")
-    times, batch = _checked(solution, linkage)
+    linkage, solution = _in_order(linkage, solution)
+    times, batch = _checked(linkage, solution)
     columns = {}
     for values, unit_of in ((solution.q, str), (solution.qd, _rate)):
         for k, (name, unit) in enumerate(zip(*_joints(linkage))):
