@@ -22,7 +22,7 @@ def __getattr__(name: str) -> Any:
     if name not in __all__ and (room := room_of(name)):
         message = f"{__name__}.{name} is now {room.__name__}.{name}"
         warnings.warn(message, DeprecationWarning, stacklevel=2)
-        return getattr(room, name)
+        return room.__getattr__(name)
     return _find(name)
 
 

@@ -13,14 +13,13 @@ from operator import and_
 from typing import Any, NamedTuple, dataclass_transform
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
 from ..checks import concrete, function, instance, real_array
 from ..linkage.linkage import Linkage
-from ..xla.array_namespace import in_numpy
+from ..xla.array_namespace import in_numpy, namespace
 
 
 class Values:
@@ -203,8 +202,9 @@ def _within(part: Part) -> Iterator[tuple[str, Part]]:
 def jumps_of(*parts: Part) -> Array | None:
     """Returns all times at which the parts jump, or None."""
     found = [part.jump_ts for part in parts]
-    times = [jnp.asarray(jumps) for jumps in found if jumps is not None]
-    return jnp.concatenate(times) if times else None
+    times = [jumps for jumps in found if jumps is not None]
+    numpy = namespace(times)  # JAX would compile a program for known times
+    return numpy.concatenate([numpy.asarray(t) for t in times]) if times else None
 
 
 def optional(name: str, absent: Any = None) -> Any:
