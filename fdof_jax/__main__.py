@@ -104,32 +104,27 @@ def _add_tuning(command: argparse.ArgumentParser) -> None:
     count = _number(int, "a whole number of at least 1", lambda n: n >= 1)
     seed = _number(int, "a whole number of at least 0", lambda n: n >= 0)
     job = command.add_argument_group("the circle and the loss")
-    for name, numbers, kind, text in (
-        ("center", 2, real, "middle of the circle, x y [m]"),
+    ends = "LEAST", "GREATEST"
+    for name, parts, kind, text in (
+        ("center", ("X", "Y"), real, "middle of the circle [m]"),
         ("radius", None, not_negative, "radius of the circle [m]"),
         ("period", None, not_zero, "time of one turn; two are simulated [s]"),
         ("factor", None, above_one, "the gains stay within this factor of the paper's"),
         ("price", None, not_negative, "price of a joint's constant full effort [m^2]"),
         ("members", None, count, "ensemble: number of scenes"),
-        (
-            "payload",
-            2,
-            not_negative,
-            "ensemble: least and greatest mass at the tip [kg]",
-        ),
-        (
-            "start-offset",
-            None,
-            not_negative,
-            "ensemble: offset of the tip at the start [m]",
-        ),
-        ("speed", 2, speed, "ensemble: least and greatest factor on the speed"),
+        ("payload", ends, not_negative, "ensemble: mass at the tip [kg]"),
+        ("start-offset", None, not_negative, "ensemble: tip's offset at the start [m]"),
+        ("speed", ends, speed, "ensemble: factor on the speed"),
         ("link-error", None, share, "ensemble: relative error of links' mass data"),
     ):
         default = vars(Job)[name.replace("-", "_")]
-        shown = " ".join(map(str, default)) if numbers else default
+        shown = " ".join(map(str, default)) if parts else default
         job.add_argument(
-            f"--{name}", nargs=numbers, type=kind, help=f"{text}; {shown} by default"
+            f"--{name}",
+            nargs=len(parts) if parts else None,
+            metavar=parts,
+            type=kind,
+            help=f"{text}; {shown} by default",
         )
     job.add_argument(
         "--over",

@@ -143,7 +143,8 @@ def test_cache_that_cannot_be_written(restored, tmp_path):
     words = r"^cache: expected a folder that can be written, got .*\.$"
     file = tmp_path / "file"
     file.touch()
-    for value in (file, str(file / "below"), "~no-such-user/cache"):
+    places = file, file / "below", "~no-such-user/cache", "gs://bucket", "null\0byte"
+    for value in places:
         with pytest.raises(ValueError, match=words):
             fj.configure(cache=value)
     closed = tmp_path / "closed"

@@ -78,33 +78,42 @@ def test_a_program_is_exported_and_serialised(uncached):
 
 @functools.cache
 def raising():
-    def ends(q0, ts):
+    def ends(q0, ts, mass, coefficient):
         # This solver compiles faster than the default.
         solver = diffrax.Dopri8()
         start = fj.State(q0, START.qd)
-        return fj.simulate(ARM, start, ts, solver=solver, max_steps=32).q[-1]
+        arm = eqx.tree_at(lambda a: a.mass, ARM, mass)
+        damper = eqx.tree_at(lambda d: d.coefficient, DAMPER, coefficient)
+        options = dict(solver=solver, max_steps=32)
+        return fj.simulate(arm, start, ts, (damper,), **options).q[-1]
 
     return jax.jit(ends)
 
 
 def test_what_succeeds_under_jit_raises_nothing():
-    assert np.isfinite(raising()(START.q, TS)).all()
+    assert np.isfinite(raising()(START.q, TS, ARM.mass, jnp.ones(3))).all()
 
 
 @pytest.mark.parametrize(
-    "q0, ts, words",
+    "changed, words",
     [
-        (START.q, [0, 0.1, 0.05, 0.2], "ts: expected increasing times"),
-        (START.q, [0, 0.1, 0.1, 0.2], "ts: expected increasing times"),
-        (START.q, [0, 0.1, np.nan, 0.2], "ts: expected increasing times"),
-        ([0, np.nan, 0], TS, "state0: expected finite numbers"),
-        ([np.inf, 0, 0], TS, "state0: expected finite numbers"),
-        (START.q, [0, 1, 2, 50], "max_steps"),
+        (dict(ts=[0, 0.1, 0.05, 0.2]), "ts: expected finite, increasing times"),
+        (dict(ts=[0, 0.1, 0.1, 0.2]), "ts: expected finite, increasing times"),
+        (dict(ts=[0, 0.1, np.nan, 0.2]), "ts: expected finite, increasing times"),
+        (dict(ts=[0, 0.1, 0.2, np.inf]), "ts: expected finite, increasing times"),
+        (dict(q0=[0, np.nan, 0]), "state0: expected finite numbers"),
+        (dict(q0=[np.inf, 0, 0]), "state0: expected finite numbers"),
+        (dict(mass=[1, -1, 1]), "linkage: expected values that its constructor"),
+        (dict(mass=[1, np.nan, 1]), "linkage: expected values that its constructor"),
+        (dict(coefficient=[-1, 1, 1]), r"forces\[0\]: expected values that its"),
+        (dict(ts=[0, 1, 2, 50]), "max_steps"),
     ],
 )
-def test_failures_under_jit_name_the_argument(q0, ts, words):
+def test_failures_under_jit_name_the_argument(changed, words):
+    sound = dict(q0=START.q, ts=TS, mass=ARM.mass, coefficient=[1, 1, 1])
+    values = (jnp.asarray(value, float) for value in (sound | changed).values())
     with pytest.raises(Exception, match=words):
-        raising()(jnp.asarray(q0, float), jnp.asarray(ts, float)).block_until_ready()
+        raising()(*values).block_until_ready()
 
 
 class Fragile(eqx.Module):

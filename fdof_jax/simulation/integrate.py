@@ -133,7 +133,8 @@ def _harmless(inputs, padded: bool) -> tuple[Array, Array, tuple[Array, Array]]:
     """
     linkage, state0, asked, _, forces = inputs
     growth = jnp.diff(asked)
-    increasing = ((growth >= 0) if padded else (growth > 0)).all()
+    grows = (growth >= 0) if padded else (growth > 0)
+    increasing = (grows & (growth < jnp.inf)).all()
     harmless = 1e-3 * jnp.arange(len(asked), dtype=asked.dtype)
     ts = jnp.where(increasing, asked, harmless)
     finite = (jnp.isfinite(state0.q) & jnp.isfinite(state0.qd)).all()

@@ -21,7 +21,7 @@ from ..checks import (
 from ..forces.element import Element, Forces, StatefulElement, elements
 from ..forces.part import check_values
 from ..linkage.coordinates import State, real_state
-from ..linkage.linkage import Linkage, check_linkage
+from ..linkage.linkage import Linkage, check_linkage, possible
 from ..xla.array_namespace import in_numpy
 from .field import element_effort, stateful
 from .plain import solve_one
@@ -195,7 +195,7 @@ def simulate(
             solution = solve(solver, inputs, keywords)
             # The caller's `ts` itself keeps derivatives in the times.
             solution = eqx.tree_at(lambda s: s.ts, solution, ts)
-            return _raising(solution, state0) if throw else solution
+            return _raising(solution, inputs) if throw else solution
     except TypeError as error:
         if "forward-mode" in str(error):
             raise TypeError(
@@ -222,15 +222,24 @@ def simulate(
     return solution
 
 
-def _raising(solution: Solution, state0: State) -> Solution:
+def _raising(solution: Solution, inputs: tuple[Any, ...]) -> Solution:
     """Adds run-time errors for bad values and failures to a traced solution."""
-    late = ~(jnp.diff(solution.ts) > 0)  # also true for NaN
-    unknown = ~jnp.isfinite(jnp.stack(jax.tree.leaves(state0)))
-    for failed, message in (
-        (late, "ts: expected increasing times, got others."),
-        (unknown, "state0: expected finite numbers, got others."),
-    ):
-        solution = eqx.error_if(solution, failed, f"simulate: {message}")
+    linkage, state0, ts, _, forces = inputs
+    growth, accepted = jnp.diff(ts), "values that its constructor accepts"
+    wrong = {
+        "ts: expected finite, increasing times": ~((0 < growth) & (growth < jnp.inf)),
+        "state0: expected finite numbers": ~jnp.isfinite(jnp.stack(state0)),
+        f"linkage: expected {accepted}": ~possible(linkage),
+    }
+    for index, element in enumerate(forces):
+        wrong[f"forces[{index}]: expected {accepted}"] = ~jnp.asarray(
+            element.possible()
+        )
+    faults = jnp.stack([fault.any() for fault in wrong.values()])
+    messages = [f"simulate: {message}, got others." for message in wrong]
+    solution = eqx.branched_error_if(
+        solution, faults.any(), jnp.argmax(faults), messages
+    )
     failed = solution.result != diffrax.RESULTS.successful
     return solution.result.error_if(solution, failed)
 

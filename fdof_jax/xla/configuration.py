@@ -43,7 +43,8 @@ def configure(
 
     **Arguments:** None leaves a setting as it is.
 
-    - `x64`: whether numbers have double precision.
+    - `x64`: whether numbers have double precision. Arms and elements that exist
+      already keep theirs.
     - `cache`: a folder that keeps compiled programs for later processes; True for a
       folder in the user's cache directory, False for no folder. Each kind of processor
       has its own subfolder. Programs are deleted only if
@@ -98,12 +99,15 @@ def _keep_programs(cache: Any) -> None:
 def _writable_folder(cache: Any) -> str:
     """Returns the subfolder of this kind of processor, created if missing."""
     try:
+        if "://" in str(cache):
+            raise ValueError("an address, not a folder")
         folder = _user_cache() if cache is True else Path(cache).expanduser()
         folder = folder.resolve() / _processor()
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             pass
-    except (OSError, RuntimeError) as error:  # RuntimeError: no home directory
+    # RuntimeError: no home directory; ValueError: not a path
+    except (OSError, RuntimeError, ValueError) as error:
         raise ValueError(
             f"cache: expected a folder that can be written, got {cache!r} ({error})."
         ) from error
