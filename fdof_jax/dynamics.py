@@ -10,6 +10,7 @@ from .linkage.linkage import Linkage, compiled
 from .mechanics.equations import Constants, equations, link_constants, zeros
 from .mechanics.kinematics import mass_center_velocities, mass_centers
 from .mechanics.rates import inertia_diagonals, rates
+from .mechanics.solve import with_added
 
 
 @compiled(q=(3,), qd=(3,), tau=(3,), forces=inertial)
@@ -151,12 +152,14 @@ def mass_and_bias(
     """
     q0, constants = start or (q, link_constants(linkage, q))
     m = equations(constants, tuple(q - q0), tuple(qd))
-    six, bias = (m.m11, m.m12, m.m13, m.m22, m.m23, m.m33), jnp.stack(m.bias)
+    bias = jnp.stack(m.bias)
     if (more := added_inertia(linkage, forces, q, qd)) is not None:
-        six = tuple(a + b for a, b in zip(six, more[0]))
-        bias = bias + more[1]
-    m11, m12, m13, m22, m23, m33 = six
-    return jnp.array([[m11, m12, m13], [m12, m22, m23], [m13, m23, m33]]), bias
+        m, bias = with_added(more[0], m), bias + more[1]
+    joints = range(len(m.bias))
+    matrix = [[m.mass[min(i, j)][abs(i - j)] for j in joints] for i in joints]
+    moves = ~jnp.stack(constants.fixed)
+    matrix = jnp.where(jnp.outer(moves, moves), jnp.array(matrix), jnp.eye(len(moves)))
+    return matrix, jnp.where(moves, bias, 0)
 
 
 @compiled(q=(3,), qd=(3,))

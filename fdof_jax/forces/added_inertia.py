@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ..linkage.linkage import Linkage
-from ..mechanics.solve import Added
+from ..mechanics.equations import Upper
 from .element import Element, Forces, InertialElement, elements
 
 
@@ -40,7 +40,7 @@ def added_energy(
 
 def added_inertia(
     linkage: Linkage, forces: Forces, q: Array, qd: Array
-) -> tuple[Added, Array] | None:
+) -> tuple[Upper, Array] | None:
     """Computes what elements add to the mass matrix and the bias (3,), if anything.
 
     M = J^T W J and bias = J^T W (dJ/dt) qd + dV/dq, where J is the derivative of the
@@ -59,6 +59,5 @@ def added_inertia(
         slope = jax.jacfwd(lambda q, e=element: e.potential_energy(q, linkage))(q)
         biases.append(jnp.sum(weighted * turning[:, None], axis=0) + slope)
     matrix, bias = (reduce(add, rows) for rows in (matrices, biases))
-    upper = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-    m11, m12, m13, m22, m23, m33 = (matrix[place] for place in upper)
-    return (m11, m12, m13, m22, m23, m33), bias
+    upper = tuple(tuple(row[k:]) for k, row in enumerate(matrix))
+    return upper, bias

@@ -12,12 +12,17 @@ from ..checks import instance, is_traced
 TOPOLOGIES = ("RRR", "RRP", "RPR", "PRR", "RPP", "PRP", "PPR")
 
 
-def real_joints(ef: Any) -> tuple[Any, Any, Any]:
+def real_joints(ef: Any) -> tuple[Any, ...]:
     """Returns whether the real joint of each pair is revolute.
 
     The first axis of `ef` holds the existence factors.
     """
-    return ef[1] > 0.5, ef[3] > 0.5, ef[5] > 0.5
+    return tuple(ef[k] > 0.5 for k in range(1, len(ef), 2))
+
+
+def fixed_pairs(ef: Any) -> tuple[Any, ...]:
+    """Returns whether both joints of each pair are fictitious, so that it is fixed."""
+    return tuple(ef[k - 1] + ef[k] < 0.5 for k in range(1, len(ef), 2))
 
 
 def pairs_of(topology: Any) -> np.ndarray | None:

@@ -7,6 +7,7 @@ all results, also of derivatives.
 
 import functools
 from collections.abc import Callable
+from operator import add
 from typing import Any
 
 import jax
@@ -20,11 +21,16 @@ from .equations import (
     Directions,
     Equations,
     Scalars,
+    Upper,
     directions,
     equations,
     turns,
 )
-from .solve import Added, Matrix, divided, fused, minus, solver_of, times, with_added
+from .solve import Matrix, divided, fused, minus, solver_of, times, with_added
+
+
+def _still(delta: Scalars) -> Scalars:
+    return (jnp.zeros_like(delta[0]),) * len(delta)
 
 
 def _rates(
@@ -33,7 +39,7 @@ def _rates(
     delta: Scalars,
     qd: Scalars,
     tau: Scalars,
-    added: Added | None,
+    added: Upper | None,
 ) -> tuple[Scalars, Scalars]:
     m = with_added(added, equations(c, delta, qd))
     solve, _ = solver_of(c, m, added, reciprocal)
@@ -48,7 +54,7 @@ def _rates_and_conditioning(
     delta: Scalars,
     qd: Scalars,
     tau: Scalars,
-    added: Added | None,
+    added: Upper | None,
 ) -> tuple[Scalars, Scalars, Array]:
     m = with_added(added, equations(c, delta, qd))
     solve, inverse_diagonal = solver_of(c, m, added, reciprocal)
@@ -57,22 +63,22 @@ def _rates_and_conditioning(
 
 def _loss(m: Equations, inverse: Scalars) -> Array:
     """Computes the amplification of rounding errors in the accelerations."""
-    i11, i22, i33 = inverse
-    loss = jnp.maximum(m.m11 * i11, jnp.maximum(m.m22 * i22, m.m33 * i33))
+    losses = (row[0] * entry for row, entry in zip(m.mass, inverse))
+    loss = functools.reduce(jnp.maximum, losses)
     # An infinite inverse times a mass of zero would be NaN.
-    return jnp.where(i11 == jnp.inf, jnp.inf, loss)
+    singular = functools.reduce(jnp.maximum, inverse) == jnp.inf
+    return jnp.where(singular, jnp.inf, loss)
 
 
 def _conditioning(
-    reciprocal: Callable, c: Constants, delta: Scalars, added: Added | None
+    reciprocal: Callable, c: Constants, delta: Scalars, added: Upper | None
 ) -> Array:
-    zero = jnp.zeros_like(delta[0])
-    m = with_added(added, equations(c, delta, (zero, zero, zero)))
+    m = with_added(added, equations(c, delta, _still(delta)))
     _, inverse_diagonal = solver_of(c, m, added, reciprocal)
     return _loss(m, inverse_diagonal())
 
 
-def conditioning(c: Constants, delta: Scalars, added: Added | None = None) -> Array:
+def conditioning(c: Constants, delta: Scalars, added: Upper | None = None) -> Array:
     """Computes the amplification of rounding errors, see `rates_and_conditioning`."""
     return fused(_conditioning)(c, delta, added)
 
@@ -87,21 +93,18 @@ def required_efforts(
 ) -> Scalars:
     """Computes the inverse dynamics, M qdd + bias."""
     m = equations(c, delta, qd, turned)
-    y1, y2, y3 = times((m.m11, m.m12, m.m13, m.m22, m.m23, m.m33), qdd)
-    b1, b2, b3 = m.bias
-    return y1 + b1, y2 + b2, y3 + b3
+    return tuple(map(add, times(m.mass, qdd), m.bias))
 
 
 def _directions_and_inverse(
-    reciprocal: Callable, c: Constants, delta: Scalars, added: Added | None
+    reciprocal: Callable, c: Constants, delta: Scalars, added: Upper | None
 ) -> tuple[Directions, Matrix]:
     """Computes the links' directions and the columns of the inverse mass matrix."""
     turned = directions(c, delta)
-    zero, one = jnp.zeros_like(delta[0]), jnp.ones_like(delta[0])
-    m = with_added(added, equations(c, delta, (zero, zero, zero), turned))
+    m = with_added(added, equations(c, delta, _still(delta), turned))
     solve, _ = solver_of(c, m, added, reciprocal)
-    unit = (one, zero, zero), (zero, one, zero), (zero, zero, one)
-    return turned, (solve(unit[0]), solve(unit[1]), solve(unit[2]))
+    unit = jnp.eye(len(delta), dtype=delta[0].dtype)
+    return turned, tuple(solve(tuple(row)) for row in unit)
 
 
 def _demanded_change(
@@ -127,9 +130,9 @@ def _demanded_change(
     return change
 
 
-def _unit_directions(dtype: Any) -> tuple[Scalars, Scalars]:
-    rows = tuple(jnp.eye(6, dtype=dtype))
-    return rows[:3], rows[3:]
+def _unit_directions(delta: Scalars) -> tuple[Scalars, Scalars]:
+    rows = tuple(jnp.eye(2 * len(delta), dtype=delta[0].dtype))
+    return rows[: len(delta)], rows[len(delta) :]
 
 
 def _derivatives(
@@ -138,19 +141,19 @@ def _derivatives(
     delta: Scalars,
     qd: Scalars,
     qdd: Scalars,
-    added: Added | None,
+    added: Upper | None,
 ) -> tuple[Scalars, Matrix]:
     # Sines and cosines come first, as XLA would otherwise compute them anew for each of
     # the following results. This makes a single arm's derivatives 1.7 times faster.
     turned, inverse = evaluated(_directions_and_inverse)(c, delta, added)
-    # As lanes of one loop, the six directions need the code of only one.
+    # As lanes of one loop, all directions need the code of only one.
     demanded = jax.vmap(
         lambda d: evaluated(_demanded_change)(c, delta, qd, qdd, turned, d)
-    )(_unit_directions(delta[0].dtype))
+    )(_unit_directions(delta))
     # The linear solve itself is not differentiated: qdd' = -M^-1 (change of efforts).
     by_state: Any = tuple(
         -sum(column[row] * change for column, change in zip(inverse, demanded))
-        for row in range(3)
+        for row in range(len(delta))
     )
     return by_state, inverse
 
@@ -163,9 +166,9 @@ def _plain_sensitivities(*arguments):
 
 @jax.custom_jvp
 def _one_loop_sensitivities(
-    c: Constants, delta: Scalars, qd: Scalars, qdd: Scalars, added: Added | None
+    c: Constants, delta: Scalars, qd: Scalars, qdd: Scalars, added: Upper | None
 ) -> tuple[Scalars, Matrix]:
-    """Derivatives of the accelerations: three rows in (delta, qd), columns in tau."""
+    """Derivatives of the accelerations: rows in (delta, qd), columns in tau."""
     return _derivatives(fused, c, delta, qd, qdd, added)
 
 
@@ -183,7 +186,7 @@ def rates(
     delta: Scalars,
     qd: Scalars,
     tau: Scalars,
-    added: Added | None = None,
+    added: Upper | None = None,
 ) -> tuple[Scalars, Scalars]:
     """Computes the rates of `delta` and `qd`: velocities and accelerations.
 
@@ -236,7 +239,7 @@ def rates_and_conditioning(
     delta: Scalars,
     qd: Scalars,
     tau: Scalars,
-    added: Added | None = None,
+    added: Upper | None = None,
 ) -> tuple[tuple[Scalars, Scalars], Array]:
     """Computes `rates` and the amplification of rounding errors in them.
 
@@ -255,10 +258,9 @@ def _rates_and_conditioning_jvp(primals, tangents):
 
 
 def inertia_diagonals(
-    c: Constants, delta: Scalars, added: Added | None = None
+    c: Constants, delta: Scalars, added: Upper | None = None
 ) -> tuple[Scalars, Scalars]:
     """Diagonals of the mass matrix and its inverse, which is infinite if singular."""
-    zero = jnp.zeros_like(delta[0])
-    m = with_added(added, equations(c, delta, (zero, zero, zero)))
+    m = with_added(added, equations(c, delta, _still(delta)))
     _, inverse_diagonal = solver_of(c, m, added, divided)
-    return (m.m11, m.m22, m.m33), inverse_diagonal()
+    return tuple(row[0] for row in m.mass), inverse_diagonal()

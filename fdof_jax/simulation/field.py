@@ -11,9 +11,8 @@ from jax import Array
 from ..forces.added_inertia import added_inertia, inertial
 from ..forces.element import Element, ScalarElement, StatefulElement
 from ..linkage.linkage import Linkage
-from ..mechanics.equations import Constants, zeros
+from ..mechanics.equations import Constants, Upper, zeros
 from ..mechanics.rates import conditioning, rates, rates_and_conditioning
-from ..mechanics.solve import Added
 from ..xla.callbacks import with_checks
 
 # Below this inertia ratio the accelerations have six correct digits at best (float64)
@@ -64,7 +63,7 @@ class Applied(NamedTuple):
 
     tau: tuple[Array, ...]
     own_rates: tuple[Array, ...]
-    added: Added | None
+    added: Upper | None
 
 
 @with_checks
@@ -111,7 +110,7 @@ def watched_field(t, y, args, schedule) -> tuple[tuple[Any, ...], Array]:
     (qd, qdd), loss = rates_and_conditioning(
         args.constants, delta, qd, acting.tau, acting.added
     )
-    finite = jnp.isfinite(qdd[0] + qdd[1] + qdd[2] + sum(acting.own_rates))
+    finite = jnp.isfinite(sum((*qdd, *acting.own_rates)))
     health = jnp.where(loss * LEAST_INERTIA_RATIO[loss.dtype] > 1, 0, loss)
     # A singular matrix also makes accelerations not finite; health 0 prevails.
     health = jnp.where(finite | (health == 0), health, jnp.nan)
