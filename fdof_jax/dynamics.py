@@ -13,7 +13,7 @@ from .mechanics.rates import inertia_diagonals, rates
 from .mechanics.solve import with_added
 
 
-@compiled(q=(3,), qd=(3,), tau=(3,), forces=inertial)
+@compiled("q", "qd", "tau", forces=inertial)
 def forward_dynamics(
     linkage: Linkage,
     q: Float[Array, " joint"],
@@ -43,7 +43,7 @@ def forward_dynamics(
     return jnp.stack(qdd)
 
 
-@compiled(q=(3,), forces=inertial)
+@compiled("q", forces=inertial)
 def inertia_ratios(
     linkage: Linkage, q: Float[Array, " joint"], forces: Forces = ()
 ) -> Float[Array, " joint"]:
@@ -69,7 +69,7 @@ def inertia_ratios(
     return jnp.stack([jnp.where(own > 0, 1 / i / own, 0) for own, i in pairs])
 
 
-@compiled(q=(3,), qd=(3,), qdd=(3,), forces=inertial)
+@compiled("q", "qd", "qdd", forces=inertial)
 def inverse_dynamics(
     linkage: Linkage,
     q: Float[Array, " joint"],
@@ -90,10 +90,10 @@ def inverse_dynamics(
     [58.86, 29.43, 9.81]
     """
     matrix, bias = mass_and_bias(linkage, forces, q, qd)
-    return matrix @ qdd + bias
+    return matrix @ qdd + bias  # 0 at fixed pairs, as `qdd` and the bias are
 
 
-@compiled(q=(3,), forces=inertial)
+@compiled("q", forces=inertial)
 def joint_mass_matrix(
     linkage: Linkage, q: Float[Array, " joint"], forces: Forces = ()
 ) -> Float[Array, "joint joint"]:
@@ -114,7 +114,7 @@ def joint_mass_matrix(
     return mass_and_bias(linkage, forces, q, jnp.zeros_like(q))[0]
 
 
-@compiled(q=(3,), qd=(3,), forces=inertial)
+@compiled("q", "qd", forces=inertial)
 def joint_bias(
     linkage: Linkage,
     q: Float[Array, " joint"],
@@ -162,7 +162,7 @@ def mass_and_bias(
     return matrix, jnp.where(moves, bias, 0)
 
 
-@compiled(q=(3,), qd=(3,))
+@compiled("q", "qd")
 def link_energies(
     linkage: Linkage,
     q: Float[Array, " joint"],
@@ -186,7 +186,7 @@ def link_energies(
     return kinetic / 2, linkage.mass * linkage.gravity * height
 
 
-@compiled(q=(3,), qd=(3,), forces=energetic)
+@compiled("q", "qd", forces=energetic)
 def energy(
     linkage: Linkage,
     q: Float[Array, " joint"],

@@ -28,7 +28,7 @@ def inertial_parameters(linkage: Linkage) -> Float[Array, "link 4"]:
     return jnp.stack([m, m * p, m * q, linkage.inertia + m * (p**2 + q**2)], axis=1)
 
 
-@compiled(q=(3,), qd=(3,), qdd=(3,))
+@compiled("q", "qd", "qdd")
 def regressor(
     linkage: Linkage,
     q: Float[Array, " joint"],

@@ -11,15 +11,15 @@ from numpy.typing import ArrayLike
 from ..checks import concrete, real_array
 from ..xla.array_namespace import in_numpy, namespace
 from .linkage import Linkage, compiled
-from .topology import pairs_of, real_joints
+from .topology import letters, pairs_of, real_joints
 
 
 class State(NamedTuple):
     """Joint positions and velocities; a bare pytree that functions check on use.
 
     - `q`: the slide B_k [m] of a prismatic joint or the relative angle th_{k+1} - th_k
-      [rad] of a revolute joint, in joint order (3,).
-    - `qd`: the rates of `q` (3,).
+      [rad] of a revolute joint, in joint order (n,). Ignored at fixed pairs.
+    - `qd`: the rates of `q` (n,).
 
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig5().linkage
@@ -41,11 +41,11 @@ def real_state(name: str, value: Any) -> State:
     return State(real_array(f"{name}.q", q, (3,)), real_array(f"{name}.qd", qd, (3,)))
 
 
-@compiled(q=(3,), qd=(3,))
+@compiled("q", "qd")
 def to_chain(
     linkage: Linkage, q: Float[Array, " joint"], qd: Float[Array, " joint"]
-) -> tuple[Float[Array, " 6"], Float[Array, " 6"]]:
-    """Computes chain coordinates (B1, th2, B2, th3, B3, th4) and their rates.
+) -> tuple[Float[Array, " chain"], Float[Array, " chain"]]:
+    """Computes chain coordinates (B1, th2, B2, th3, ...) and their rates.
 
     Angles are absolute, as in the paper; fictitious joints stand at `linkage.locked`.
 
@@ -66,7 +66,7 @@ def to_chain(
     xd = jnp.stack(
         [jnp.where(revolute, 0, qd), jnp.cumsum(jnp.where(revolute, qd, 0))], axis=1
     )
-    return x.reshape(6), xd.reshape(6)
+    return x.ravel(), xd.ravel()
 
 
 def from_chain(
@@ -74,13 +74,13 @@ def from_chain(
     x: ArrayLike,
     xd: ArrayLike,
     base_angle: ArrayLike = 0.0,
-) -> tuple[Float[Array, " 3"], State]:
+) -> tuple[Float[Array, " joint"], State]:
     """Computes locked positions and joint state from the paper's chain coordinates.
 
     **Arguments:**
 
-    - `topology`: one of `TOPOLOGIES`, or six existence factors.
-    - `x`, `xd`: (B1, th2, B2, th3, B3, th4), absolute angles [m, rad], and rates.
+    - `topology`: as for `Linkage`, without fixed pairs.
+    - `x`, `xd`: (B1, th2, B2, th3, ...), absolute angles [m, rad], and rates.
     - `base_angle`: th1 [rad].
 
     **Returns:** `locked` for `Linkage`, and the `State`.
@@ -95,13 +95,18 @@ def from_chain(
     ([0.0, 1.0, 0.0], [1.5, 2.5, -0.5])
     """
     pairs = pairs_of(topology)
+    if pairs is not None and not pairs.any(axis=1).all():
+        raise ValueError(
+            "topology: expected no fixed pair with chain coordinates, got "
+            f"{letters(pairs)}."
+        )
+    ef = jnp.asarray(topology) if pairs is None else pairs.ravel()
     given = (
-        real_array("x", x, (6,)),
-        real_array("xd", xd, (6,)),
+        real_array("x", x, (ef.size,)),
+        real_array("xd", xd, (ef.size,)),
         real_array("base_angle", base_angle, ()),
     )
     chain, chain_rate, ground = in_numpy(given)
-    ef = jnp.asarray(topology) if pairs is None else pairs.reshape(6)
     xp = namespace(ef, chain, chain_rate, ground)
     revolute = xp.stack(real_joints(ef))
     slide, turn = chain[0::2], xp.diff(chain[1::2], prepend=ground)

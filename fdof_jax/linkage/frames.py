@@ -31,11 +31,11 @@ def cross(a: Any, b: Any) -> Any:
 
 
 class Frames(NamedTuple):
-    """The ground (0) and the moving links (1 to 3), in the last axis of arrays.
+    """The ground (0) and the moving links (1 to n), in the last axis of arrays.
 
-    - `start`: characteristic points x + iy [m]; `direction`: unit vectors (..., 4).
-    - `angle`: absolute angles th_1 to th_4 [rad]; `slide`: B_1 to B_3 [m].
-    - `revolute`: whether the joint before each moving link is revolute (3,).
+    - `start`: characteristic points x + iy [m]; `direction`: unit vectors (..., n + 1).
+    - `angle`: absolute angles [rad], of links 0 to n; `slide`: B_k of joints 1 to n [m].
+    - `revolute`: whether the joint before each moving link is revolute (n,).
     """
 
     start: Any
@@ -46,7 +46,7 @@ class Frames(NamedTuple):
 
 
 def frames(linkage: "Linkage", q: Any) -> Frames:
-    """Computes the frames at joint positions (..., 3)."""
+    """Computes the frames at joint positions (..., n), 0 at fixed pairs."""
     xp = namespace(linkage, q)
     revolute = xp.stack(real_joints(linkage.ef))
     slide = xp.where(revolute, linkage.locked, q)
@@ -55,8 +55,8 @@ def frames(linkage: "Linkage", q: Any) -> Frames:
     angle = xp.concatenate([base, base + turn], axis=-1)
     direction = unit_vector(angle)
     # The length A runs along a link, the slide B across it.
-    length = xp.broadcast_to(linkage.length[:3], slide.shape)
-    steps = plane_vector(length, slide) * direction[..., :3]
+    length = xp.broadcast_to(linkage.length[:-1], slide.shape)
+    steps = plane_vector(length, slide) * direction[..., :-1]
     start = xp.concatenate([xp.zeros_like(base), xp.cumsum(steps, axis=-1)], axis=-1)
     return Frames(start, direction, angle, slide, revolute)
 
@@ -75,5 +75,5 @@ def scalar_frames(linkage: "Linkage", q: tuple) -> Frames:
         step = plane_vector(linkage.length[k], slide[k])
         start.append(start[k] + step * direction[k])
         angle.append(angle[k] + jnp.where(turns, q[k], linkage.locked[k]))
-    direction.append(unit_vector(angle[3]))
+    direction.append(unit_vector(angle[-1]))
     return Frames(start, direction, angle, slide, revolute)

@@ -1,9 +1,9 @@
 """The linkage: its joints and its links.
 
-Pair k of the chain P-R-P-R-P-R joins link k to link k + 1. Its prismatic joint slides
+Pair k of the chain P-R-P-R-P-R... joins link k to link k + 1. Its prismatic joint slides
 by B_k across link k; its revolute joint is at the start of link k + 1. Link 1 is the
 ground. One joint of each pair is real; the other is fictitious and held at its initial
-value.
+value. In a fixed pair both are fictitious.
 """
 
 import functools
@@ -21,27 +21,28 @@ from numpy.typing import ArrayLike
 
 from ..checks import is_traced, known, real_array
 from .singularity import check_singularity
-from .topology import pairs_of, real_joints
+from .topology import can_move, fixed_pairs, letters, pairs_of
 
 
 class Linkage(eqx.Module):
-    """A planar chain of three moving links, as in Fig 1 of the paper.
+    """A planar chain of moving links, as in Fig 1 of the paper.
 
-    Link n starts at its characteristic point. Its vector A_n runs along the link. The
-    slide B_n of the next prismatic joint is perpendicular to A_n (90 degrees
-    counter-clockwise). The mass centre lies p_n along and q_n across the link. Every
+    The paper's chain has three pairs of joints; a linkage has n, from 1 to 8. Link n starts at its characteristic point. Its vector A_n runs along the link. The
+    slide B_k of the next prismatic joint is perpendicular to A_k (90 degrees
+    counter-clockwise). The mass centre lies p_k along and q_k across the link. Every
     field is an array, so linkages of different topologies share one compilation and can
     be stacked into a batch.
 
     **Arguments:**
 
-    - `topology`: one of `TOPOLOGIES`, or six existence factors; stored as `ef`.
-    - `length`: A1..A4 [m]; A1 belongs to the ground.
-    - `com`: (p_n, q_n) of the three moving links [m].
-    - `mass`: masses m2..m4 of the moving links [kg].
-    - `inertia`: moments of inertia I2..I4 about the mass centres [kg m^2].
-    - `locked`: position of the fictitious joint of each pair: B_k [m] where the real
-      joint is revolute, th_{k+1} - th_k [rad] where it is prismatic.
+    - `topology`: a letter per pair: R (revolute), P (prismatic) or F (fixed), such as
+      "RPR"; or two existence factors per pair. Stored as `ef` (2n,).
+    - `length`: A1, A2, ... of the ground and the moving links (n + 1,) [m].
+    - `com`: (p, q) of each moving link (n, 2) [m].
+    - `mass`: masses of the moving links (n,) [kg].
+    - `inertia`: moments of inertia about the mass centres (n,) [kg m^2].
+    - `locked`: position of the fictitious joint of each pair (n,): B_k [m] where the
+      real joint is revolute, th_{k+1} - th_k [rad] elsewhere.
     - `base_angle`: th1, the angle of the ground's vector A1 [rad].
     - `gravity`: acceleration along -y [m/s^2].
 
@@ -57,12 +58,12 @@ class Linkage(eqx.Module):
     (3,)
     """
 
-    ef: Float[Array, " 6"]
-    length: Float[Array, " 4"]
-    com: Float[Array, "3 2"]
-    mass: Float[Array, " 3"]
-    inertia: Float[Array, " 3"]
-    locked: Float[Array, " 3"]
+    ef: Float[Array, " factor"]
+    length: Float[Array, " length"]
+    com: Float[Array, "link 2"]
+    mass: Float[Array, " link"]
+    inertia: Float[Array, " link"]
+    locked: Float[Array, " joint"]
     base_angle: Float[Array, ""]
     gravity: Float[Array, ""]
 
@@ -79,13 +80,14 @@ class Linkage(eqx.Module):
         gravity: ArrayLike = 9.81,
     ):
         pairs = pairs_of(topology)
-        ef = topology if pairs is None else pairs.reshape(6)
+        ef = topology if pairs is None else pairs.ravel()
         self.ef = jnp.asarray(ef, dtype=float)
-        self.length = real_array("length", length, (4,))
-        self.com = real_array("com", com, (3, 2))
-        self.mass = real_array("mass", mass, (3,), minimum=0)
-        self.inertia = real_array("inertia", inertia, (3,), minimum=0)
-        self.locked = real_array("locked", locked, (3,), broadcast=True)
+        n = self.ef.size // 2
+        self.length = real_array("length", length, (n + 1,))
+        self.com = real_array("com", com, (n, 2))
+        self.mass = real_array("mass", mass, (n,), minimum=0)
+        self.inertia = real_array("inertia", inertia, (n,), minimum=0)
+        self.locked = real_array("locked", locked, (n,), broadcast=True)
         self.base_angle = real_array("base_angle", base_angle, ())
         self.gravity = real_array("gravity", gravity, ())
         if not is_traced(list(vars(self).values())):
@@ -113,9 +115,9 @@ class Linkage(eqx.Module):
 
     def __repr__(self) -> str:
         """Shows the values of a single linkage, or the shapes of a batch."""
-        if np.size(self.ef) != 6 or not known(self):
+        if np.ndim(self.ef) != 1 or not known(self):
             return super().__repr__()
-        topology = "".join(name[0] for name in joint_names(self))
+        topology = letters(self.ef)
         values = {name: _short(value) for name, value in vars(self).items()}
         del values["ef"]
         fields = (f"{name}={value}" for name, value in values.items())
@@ -132,33 +134,55 @@ def _short(value: Array) -> str:
 
 
 def joint_names(linkage: Linkage) -> list[str]:
-    """Returns the names of the real joints in order, for instance R1, P2, R3."""
-    revolute = real_joints(np.asarray(linkage.ef))
-    return [f"{'R' if turns else 'P'}{k + 1}" for k, turns in enumerate(revolute)]
+    """Returns the names of the joints in order, for instance R1, P2, F3."""
+    return [f"{kind}{k + 1}" for k, kind in enumerate(letters(linkage.ef))]
+
+
+def joints_of(linkage: Linkage) -> int:
+    """Returns the number of pairs of joints."""
+    return jnp.size(linkage.ef) // 2
+
+
+def without_fixed(linkage: Linkage, values: Array) -> Array:
+    """Returns values of the joints (..., joint), 0 at fixed pairs."""
+    return jnp.where(jnp.stack(fixed_pairs(linkage.ef)), 0, values)
 
 
 _T = TypeVar("_T")
 
 
 def compiled(
-    **doors: tuple[int, ...] | Callable[[Any], Any],
+    *per_joint: str, **doors: tuple[int, ...] | Callable[[Any], Any]
 ) -> Callable[[Callable[..., _T]], Callable[..., _T]]:
     """Decorates a function of a linkage and arrays: checks arguments, then compiles.
 
-    Each keyword names an argument and gives the shape of its array, or a function that
-    checks and converts it. The decorated function accepts anything that converts to
-    such an array. Without compilation, a call outside of `jax.jit` would dispatch
-    hundreds of single operations.
+    `per_joint` names arguments with a value per joint, which are ignored at fixed
+    pairs. Each keyword names an argument and gives the shape of its array, or a
+    function that checks and converts it. The decorated function accepts anything that
+    converts to such an array. Without compilation, a call outside of `jax.jit` would
+    dispatch hundreds of single operations.
     """
 
     def decorate(function: Callable[..., _T]) -> Callable[..., _T]:
-        inner = eqx.filter_jit(function)  # force elements may hold functions
         signature = inspect.signature(function)
+
+        @eqx.filter_jit  # force elements may hold functions
+        @functools.wraps(function)
+        def inner(*args: Any, **kwargs: Any) -> _T:
+            arguments = signature.bind(*args, **kwargs).arguments
+            for name in per_joint:
+                moving = without_fixed(arguments["linkage"], arguments[name])
+                arguments[name] = moving
+            return function(**arguments)
 
         @functools.wraps(function)
         def checked(*args: Any, **kwargs: Any) -> _T:
             arguments = signature.bind(*args, **kwargs).arguments
-            check_linkage(arguments["linkage"])
+            linkage = arguments["linkage"]
+            check_linkage(linkage)
+            for name in per_joint:
+                shape = (joints_of(linkage),)
+                arguments[name] = real_array(name, arguments[name], shape)
             for name, door in doors.items():
                 if callable(door):
                     if name in arguments:
@@ -179,7 +203,7 @@ def check_linkage(linkage: Any) -> None:
     """
     if not isinstance(linkage, Linkage):
         raise ValueError(f"linkage: expected a Linkage, got {linkage!r}.")
-    if jnp.shape(linkage.ef) != (6,):
+    if jnp.ndim(linkage.ef) != 1:
         raise ValueError(
             "linkage: expected one linkage (use jax.vmap for a batch), got existence "
             f"factors of shape {jnp.shape(linkage.ef)}."
@@ -199,15 +223,15 @@ def check_linkage(linkage: Any) -> None:
 def possible(linkage: Linkage) -> Array:
     """Returns whether the constructor would accept the values; works on traced ones.
 
-    Checks that existence factors are 0 or 1 and complementary in each pair, that one
-    joint at least is revolute, and that masses and inertias are not negative. Singular
+    Checks that existence factors are 0 or 1, with one real joint at most in each pair,
+    that the chain can move, and that masses and inertias are not negative. Singular
     mass matrices are not checked.
     """
-    pairs = linkage.ef.reshape(3, 2)
-    factors = ((pairs == 0) | (pairs == 1)).all() & (pairs.sum(axis=1) == 1).all()
+    pairs = linkage.ef.reshape(-1, 2)
+    factors = ((pairs == 0) | (pairs == 1)).all() & (pairs.sum(axis=1) <= 1).all()
     return (
         factors
-        & pairs[:, 1].any()
+        & can_move(pairs)
         & (linkage.mass >= 0).all()
         & (linkage.inertia >= 0).all()
     )

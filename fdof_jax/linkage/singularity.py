@@ -7,7 +7,7 @@ import jax
 import numpy as np
 
 from .frames import frames
-from .topology import real_joints
+from .topology import fixed_pairs, letters, real_joints
 
 if TYPE_CHECKING:
     from .linkage import Linkage
@@ -20,36 +20,40 @@ def _least_inertia(linkage: "Linkage", configurations: int) -> np.ndarray:
     """Measures how far from singular the joints from k outwards are.
 
     Returns, at random configurations, the least eigenvalue of the joints' block of the
-    3x3 mass matrix (configurations, 3). Scaling to a diagonal of ones makes it free of
+    mass matrix (configurations, n), fixed pairs left out. Scaling to a diagonal of ones makes it free of
     units and sizes. NumPy avoids compilation in the constructor.
     """
     linkage = jax.tree.map(lambda a: np.asarray(a, dtype=float), linkage)
     revolute = np.stack(real_joints(linkage.ef))
     sizes = linkage.length, linkage.com, linkage.locked[revolute]
     reach = sum(np.abs(size).sum() for size in sizes)
-    draws = np.random.default_rng(0).uniform(-1, 1, (configurations, 2, 3))
-    q = np.where(revolute, np.pi * draws[:, 0], (reach or 1) * draws[:, 1])
+    n, moves = len(revolute), ~np.stack(fixed_pairs(linkage.ef))
+    draws = np.random.default_rng(0).uniform(-1, 1, (configurations, 2, n))
+    q = np.where(revolute, np.pi * draws[:, 0], (reach or 1) * draws[:, 1] * moves)
     start, along, *_ = frames(linkage, q)
     centre = start[:, 1:] + linkage.com @ np.array([1, 1j]) * along[:, 1:]
-    moved = np.tri(3)  # a joint moves only the links beyond it
+    moved = np.tri(n) * moves  # a joint moves only the links beyond it
     arm = centre[:, :, None] - start[:, None, 1:]
-    J = moved * np.where(revolute, arm, along[:, None, :3])
+    J = moved * np.where(revolute, arm, along[:, None, :-1])
     M = np.einsum("n,cnj,cnk->cjk", linkage.mass, J.conj(), J).real
     M += np.einsum("n,nj,nk->jk", linkage.inertia, moved * revolute, moved * revolute)
     # Eigenvalues, because pivots of an elimination lose accuracy near singularity.
     tiny = np.finfo(float).tiny
     scale = np.sqrt(np.maximum(np.diagonal(M, axis1=1, axis2=2), tiny))
     scaled = M / (scale[:, :, None] * scale[:, None])
-    least = [np.linalg.eigvalsh(scaled[:, k:, k:])[:, 0] for k in range(3)]
+    # The diagonal of ones, at fixed pairs too, leaves the least eigenvalue as it is.
+    diagonal = np.arange(n)
+    scaled[:, diagonal, diagonal] = np.where(moves, scaled[:, diagonal, diagonal], 1)
+    least = [np.linalg.eigvalsh(scaled[:, k:, k:])[:, 0] for k in range(n)]
     return np.stack(least, axis=1)
 
 
 def check_singularity(linkage: "Linkage") -> None:
     """Rejects linkages that are always singular; warns of those that may become so."""
     revolute = np.stack(real_joints(np.asarray(linkage.ef)))
-    names = "".join("R" if r else "P" for r in revolute)
+    names = letters(linkage.ef)
     best = _least_inertia(linkage, configurations=5).max(axis=0)
-    for k in (2, 1, 0):
+    for k in reversed(range(len(names))):
         if best[k] <= _SINGULAR:
             kind = "revolute" if revolute[k] else "prismatic"
             raise ValueError(
@@ -63,13 +67,15 @@ def check_singularity(linkage: "Linkage") -> None:
         revolute, inertia + mass * (np.asarray(linkage.com) ** 2).sum(axis=1), mass
     )
     locked, length = np.asarray(linkage.locked), np.asarray(linkage.length)
-    for k in np.flatnonzero(own == 0):
+    fixed = np.stack(fixed_pairs(np.asarray(linkage.ef)))
+    for k in np.flatnonzero((own == 0) & ~fixed):
         warnings.warn(
             f"moving link {k + 1} carries no inertia of its own about joint {k + 1}: "
             "the mass matrix may be singular in some configurations.",
             stacklevel=5,
         )
-    for k in (1, 2):
+    prismatic = ~revolute & ~fixed
+    for k in range(1, len(names)):
         if revolute[k - 1] and revolute[k] and np.hypot(length[k], locked[k]) == 0:
             warnings.warn(
                 f"revolute joints {k} and {k + 1} coincide (moving link {k} has no "
@@ -78,8 +84,8 @@ def check_singularity(linkage: "Linkage") -> None:
                 stacklevel=5,
             )
         if (
-            not revolute[k - 1]
-            and not revolute[k]
+            prismatic[k - 1]
+            and prismatic[k]
             and abs(np.sin(locked[k - 1])) < 8 * np.finfo(locked.dtype).eps
         ):
             warnings.warn(

@@ -1,4 +1,4 @@
-"""The seven topologies and their existence factors."""
+"""Topologies: which joint of each pair is real, as letters or existence factors."""
 
 from typing import Any
 
@@ -10,6 +10,10 @@ from jaxtyping import Float
 from ..checks import instance, is_traced
 
 TOPOLOGIES = ("RRR", "RRP", "RPR", "PRR", "RPP", "PRP", "PPR")
+MOST_PAIRS = 8
+
+# (prismatic, revolute) of a pair.
+_FACTORS = {"P": (1, 0), "R": (0, 1), "F": (0, 0)}
 
 
 def real_joints(ef: Any) -> tuple[Any, ...]:
@@ -25,56 +29,64 @@ def fixed_pairs(ef: Any) -> tuple[Any, ...]:
     return tuple(ef[k - 1] + ef[k] < 0.5 for k in range(1, len(ef), 2))
 
 
+def letters(ef: Any) -> str:
+    """Returns known existence factors as a name, such as RPR."""
+    pairs = np.asarray(ef).reshape(-1, 2)
+    return "".join("R" if turns else "P" if slides else "F" for slides, turns in pairs)
+
+
 def pairs_of(topology: Any) -> np.ndarray | None:
-    """Returns (3, 2) existence factors (prismatic, revolute), or None while traced."""
+    """Returns (n, 2) existence factors (prismatic, revolute), or None while traced."""
+    expected = (
+        f"topology: expected 1 to {MOST_PAIRS} letters R (revolute), P (prismatic) or "
+        "F (fixed), or two existence factors of 0 or 1 for each pair of joints"
+    )
     if isinstance(topology, str):
-        if topology not in TOPOLOGIES:
-            detail = ""
-            if topology == "PPP":
-                detail = " (PPP cannot orient its last link: the paper excludes it)"
-            raise ValueError(
-                f"topology: expected one of {', '.join(TOPOLOGIES)}, "
-                f"got {topology!r}{detail}."
-            )
-        return np.array([[j == "P", j == "R"] for j in topology], dtype=float)
-    if is_traced(topology):
-        if jnp.shape(topology) != (6,):
-            raise ValueError(
-                "topology: expected a name or 6 existence factors, got shape "
-                f"{jnp.shape(topology)}."
-            )
+        if not 0 < len(topology) <= MOST_PAIRS or set(topology) - set(_FACTORS):
+            raise ValueError(f"{expected}, got {topology!r}.")
+        pairs = np.array([_FACTORS[joint] for joint in topology], dtype=float)
+    elif is_traced(topology):
+        if jnp.ndim(topology) != 1 or jnp.size(topology) not in _SIZES:
+            raise ValueError(f"{expected}, got shape {jnp.shape(topology)}.")
         return None
-    try:
-        given = np.asarray(topology)
-        ef = given.astype(float) if given.dtype.kind in "biuf" else np.empty(0)
-    except (TypeError, ValueError):
-        ef = np.empty(0)
-    if ef.shape != (6,) or not np.isin(ef, (0, 1)).all():
+    else:
+        try:
+            given = np.asarray(topology)
+            ef = given.astype(float) if given.dtype.kind in "biuf" else np.empty(0)
+        except (TypeError, ValueError):
+            ef = np.empty(0)
+        if ef.ndim != 1 or ef.size not in _SIZES or not np.isin(ef, (0, 1)).all():
+            raise ValueError(f"{expected}, got {topology!r}.")
+        pairs = ef.reshape(-1, 2)
+    if (pairs.sum(axis=1) > 1).any():
         raise ValueError(
-            f"topology: expected one of {', '.join(TOPOLOGIES)} or six existence "
-            f"factors of 0 or 1, got {topology!r}."
+            "topology: expected one real joint at most in each (prismatic, revolute) "
+            f"pair of existence factors (equation 4), got {pairs.astype(int).tolist()}."
         )
-    pairs = ef.reshape(3, 2)
-    if not (pairs.sum(axis=1) == 1).all():
+    if not can_move(pairs):
         raise ValueError(
-            "topology: expected exactly one real joint in each (prismatic, revolute) "
-            f"pair of existence factors (equation 4), got {ef.astype(int).tolist()}."
-        )
-    if pairs[:, 0].all():
-        raise ValueError(
-            "topology: expected at least one revolute joint, got PPP, which cannot "
-            "orient its last link."
+            "topology: expected a joint that moves, and one that turns among three or "
+            f"more (PPP cannot orient its last link), got {letters(pairs)}."
         )
     return pairs
 
 
-def existence_factors(topology: str) -> Float[Array, " 6"]:
-    """Returns the existence factors EF1..EF6 of a topology, equation (4).
+_SIZES = range(2, 2 * MOST_PAIRS + 1, 2)
+
+
+def can_move(pairs: Any) -> Any:
+    """Returns whether the paper's rule on slides and ours on fixed pairs are met."""
+    number = pairs.sum()
+    return (number > 0) & ((number <= 2) | (pairs[:, 1].sum() > 0))
+
+
+def existence_factors(topology: str) -> Float[Array, " factor"]:
+    """Returns the existence factors of a topology, equation (4): EF1, EF2, ...
 
     Each pair is (prismatic, revolute), with 1 for a real joint and 0 for a fictitious
-    one: "RPR" gives 0, 1, 1, 0, 0, 1.
+    one: "RPR" gives 0, 1, 1, 0, 0, 1. A fixed pair, F, is (0, 0).
 
-    **Arguments:** `topology`: one of `TOPOLOGIES`.
+    **Arguments:** `topology`: up to eight letters R, P or F, as for a `Linkage`.
 
     **Raises:** ValueError for any other name.
 
@@ -85,4 +97,4 @@ def existence_factors(topology: str) -> Float[Array, " 6"]:
     instance("topology", topology, str)
     pairs = pairs_of(topology)
     assert pairs is not None  # a name is not traced
-    return jnp.asarray(pairs.reshape(6), dtype=float)
+    return jnp.asarray(pairs.ravel(), dtype=float)

@@ -6,7 +6,7 @@ from jax import Array
 from jaxtyping import Float
 
 from ..linkage.frames import frames
-from ..linkage.linkage import Linkage, compiled
+from ..linkage.linkage import Linkage, compiled, without_fixed
 from ..xla.array_namespace import namespace
 
 
@@ -15,7 +15,7 @@ def as_points(vectors: Array) -> Array:
     return namespace(vectors).stack([vectors.real, vectors.imag], axis=-1)
 
 
-@compiled(q=(3,))
+@compiled("q")
 def joint_positions(
     linkage: Linkage, q: Float[Array, " joint"]
 ) -> Float[Array, "joint 2"]:
@@ -33,7 +33,7 @@ def joint_positions(
     return as_points(frames(linkage, q).start[1:])
 
 
-@compiled(q=(3,))
+@compiled("q")
 def mass_centers(linkage: Linkage, q: Float[Array, " joint"]) -> Float[Array, "link 2"]:
     """Computes the mass centres of the moving links.
 
@@ -51,7 +51,7 @@ def mass_centers(linkage: Linkage, q: Float[Array, " joint"]) -> Float[Array, "l
     return as_points(start[1:] + offset * direction[1:])
 
 
-@compiled(q=(3,), qd=(3,))
+@compiled("q", "qd")
 def mass_center_velocities(
     linkage: Linkage, q: Float[Array, " joint"], qd: Float[Array, " joint"]
 ) -> tuple[Float[Array, "link 2"], Float[Array, " link"]]:
@@ -65,15 +65,15 @@ def mass_center_velocities(
     turning = jnp.cumsum(jnp.where(revolute, qd, 0))
     rate = jnp.concatenate([jnp.zeros(1), turning])
     # d/dt (A + iB) e: the link turns, and the slide moves across it.
-    arm = jax.lax.complex(linkage.length[:3], slide)
-    start = jnp.cumsum(1j * (rate[:3] * arm + jnp.where(revolute, 0, qd)) * e[:3])
+    arm = jax.lax.complex(linkage.length[:-1], slide)
+    start = jnp.cumsum(1j * (rate[:-1] * arm + jnp.where(revolute, 0, qd)) * e[:-1])
     offset = jax.lax.complex(linkage.com[:, 0], linkage.com[:, 1])
     return as_points(start + 1j * (turning * offset * e[1:])), turning
 
 
-@compiled(q=(3,))
+@compiled("q")
 def tip_position(linkage: Linkage, q: Float[Array, " joint"]) -> Float[Array, " 2"]:
-    """Computes the tip's position: the end of the last link's vector A4.
+    """Computes the tip's position: the end of the last link's vector A.
 
     **Arguments:** `q`: joint positions [m or rad].
 
@@ -85,10 +85,10 @@ def tip_position(linkage: Linkage, q: Float[Array, " joint"]) -> Float[Array, " 
     [1.0, 2.0]
     """
     start, direction, *_ = frames(linkage, q)
-    return as_points(start[3] + linkage.length[3] * direction[3])
+    return as_points(start[-1] + linkage.length[-1] * direction[-1])
 
 
-@compiled(q=(3,))
+@compiled("q")
 def tip_jacobian(
     linkage: Linkage, q: Float[Array, " joint"]
 ) -> Float[Array, "3 joint"]:
@@ -104,6 +104,7 @@ def tip_jacobian(
     [[0.0, 0.0, 0.0], [3.0, 2.0, 1.0], [1.0, 1.0, 1.0]]
     """
     start, direction, *_, revolute = frames(linkage, q)
-    tip = start[3] + linkage.length[3] * direction[3]
-    columns = 1j * jnp.where(revolute, tip - start[1:], direction[:3])
+    tip = start[-1] + linkage.length[-1] * direction[-1]
+    columns = 1j * jnp.where(revolute, tip - start[1:], direction[:-1])
+    columns = without_fixed(linkage, columns)
     return jnp.stack([columns.real, columns.imag, jnp.where(revolute, 1.0, 0.0)])

@@ -9,11 +9,27 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
-from ..linkage.linkage import Linkage, compiled
+from ..checks import is_traced
+from ..linkage.linkage import Linkage, compiled, joints_of
+from ..linkage.topology import letters
 from ..xla.trigonometry import sincos
 
 
-@compiled(x=(6,))
+def three_pairs(linkage: Linkage) -> Linkage:
+    """Returns a linkage of three pairs without a fixed one, or raises ValueError."""
+    if joints_of(linkage) != 3:
+        raise ValueError(
+            "linkage: expected three pairs of joints, of which the paper's equations "
+            f"are, got {joints_of(linkage)}."
+        )
+    if not is_traced(linkage.ef) and "F" in (name := letters(linkage.ef)):
+        raise ValueError(
+            f"linkage: expected no fixed pair in the paper's equations, got {name}."
+        )
+    return linkage
+
+
+@compiled(linkage=three_pairs, x=(6,))
 def mass_matrix(
     linkage: Linkage, x: Float[Array, " chain"]
 ) -> Float[Array, "chain chain"]:
@@ -77,7 +93,7 @@ def mass_matrix(
     )
 
 
-@compiled(x=(6,), xd=(6,))
+@compiled(linkage=three_pairs, x=(6,), xd=(6,))
 def bias_force(
     linkage: Linkage, x: Float[Array, " chain"], xd: Float[Array, " chain"]
 ) -> Float[Array, " chain"]:
@@ -175,7 +191,7 @@ def bias_force(
     return jnp.stack([phi_B1, phi_th2, phi_B2, phi_th3, phi_B3, phi_th4])
 
 
-@compiled(x=(6,), xd=(6,), force=(6,))
+@compiled(linkage=three_pairs, x=(6,), xd=(6,), force=(6,))
 def masked_accelerations(
     linkage: Linkage,
     x: Float[Array, " chain"],
@@ -229,7 +245,7 @@ def masked_accelerations(
     return jnp.stack([xdd[0], th2, xdd[2], th3, xdd[4], th4])
 
 
-@compiled(x=(6,), xd=(6,), force=(6,))
+@compiled(linkage=three_pairs, x=(6,), xd=(6,), force=(6,))
 def constraint_forces(
     linkage: Linkage,
     x: Float[Array, " chain"],
