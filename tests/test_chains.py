@@ -1,0 +1,228 @@
+"""Chains of one to eight pairs of joints: equations, energies and kinematics."""
+
+import chains
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+import fdof_jax as fj
+
+PAIRS = [
+    pytest.param(n, marks=pytest.mark.slow) if n in (4, 6, 7) else n
+    for n in range(1, 9)
+]
+
+
+def cases(pairs, count=12):
+    """Yields topologies of so many pairs, chains, and random q, qd and tau."""
+    rng = np.random.default_rng(pairs)
+    for _ in range(count):
+        topology = chains.random_topology(pairs, rng)
+        chain = chains.random_chain(topology, rng)
+        yield topology, chain, rng.normal(size=(3, pairs)) * [[1], [2], [5]]
+
+
+@jax.jit  # one program for all chains of a length
+def everything(chain, q, qd, tau):
+    qdd = fj.forward_dynamics(chain, q, qd, tau)
+    return dict(
+        qdd=qdd,
+        tau=fj.inverse_dynamics(chain, q, qd, qdd),
+        bias=fj.joint_bias(chain, q, qd),
+        matrix=fj.joint_mass_matrix(chain, q),
+        energy=fj.energy(chain, q, qd),
+        centers=fj.mass_centers(chain, q),
+        tip=fj.tip_position(chain, q),
+        velocity=jax.jvp(lambda q: fj.tip_position(chain, q), (q,), (qd,))[1],
+        jacobian=fj.tip_jacobian(chain, q),
+    )
+
+
+@pytest.mark.parametrize("pairs", PAIRS)
+def test_motion_energy_and_kinematics_equal_mujoco(pairs):
+    for topology, chain, (q, qd, tau) in cases(pairs):
+        found = jax.tree.map(np.asarray, everything(chain, q, qd, tau))
+        real = chains.moving(topology)
+        model, data = chains.in_mujoco(topology, chain)
+        data.qpos, data.qvel, data.qfrc_applied = q[real], qd[real], tau[real]
+        mujoco.mj_forward(model, data)
+        assert (found["qdd"][~real] == 0).all()
+        error = np.abs(found["qdd"][real] - data.qacc).max()
+        assert error <= 1e-10 * (1 + np.abs(data.qacc).max()), topology
+        kinetic, potential = found["energy"]
+        np.testing.assert_allclose(
+            [potential, kinetic], data.energy, rtol=1e-11, atol=1e-11
+        )
+        tip, centers = data.site("tip").xpos[:2], data.xipos[2:, :2]
+        np.testing.assert_allclose(found["tip"], tip, atol=1e-12)
+        np.testing.assert_allclose(found["centers"], centers, atol=1e-12)
+
+        # The motion gives back what acts.
+        scale = 1 + np.abs(found["bias"]).max()
+        np.testing.assert_allclose(
+            found["tau"], np.where(real, tau, 0), atol=1e-10 * scale
+        )
+        # The mass matrix is that of the kinetic energy.
+        matrix, moved = found["matrix"], np.where(real, qd, 0)
+        np.testing.assert_array_equal(matrix, matrix.T)
+        np.testing.assert_array_equal(matrix[~real], np.eye(pairs)[~real])
+        np.testing.assert_allclose(moved @ matrix @ moved / 2, kinetic, rtol=1e-12)
+        # The tip moves as its Jacobian says.
+        jacobian = found["jacobian"]
+        np.testing.assert_allclose(jacobian[:2] @ qd, found["velocity"], atol=1e-12)
+        np.testing.assert_array_equal(jacobian[2], [joint == "R" for joint in topology])
+
+
+def test_what_is_given_at_fixed_pairs_does_not_matter():
+    rng = np.random.default_rng(0)
+    chain = chains.random_chain("RFPRF", rng)
+    q, qd, tau = rng.normal(size=(3, 5))
+    other = [np.where(chains.moving("RFPRF"), a, np.nan) for a in (q, qd, tau)]
+    other = [np.nan_to_num(a, nan=7.0) for a in other]
+    for function in (fj.forward_dynamics, fj.inverse_dynamics):
+        expected = function(chain, q, qd, tau)
+        np.testing.assert_array_equal(function(chain, *other), expected)
+    np.testing.assert_array_equal(
+        fj.tip_position(chain, other[0]), fj.tip_position(chain, q)
+    )
+
+
+def test_a_shorter_chain_is_a_longer_one_with_fixed_pairs():
+    rng = np.random.default_rng(1)
+    short = chains.random_chain("RPR", rng)
+    # A massless link of no length behind the tip, and one before the first joint.
+    longer = fj.Linkage(
+        "FRPRF",
+        length=[0, *short.length, 0],
+        com=[[0, 0], *short.com, [0.3, 0.1]],
+        mass=[2, *short.mass, 0],
+        inertia=[1, *short.inertia, 0],
+        locked=[0, *short.locked, 0.4],
+        base_angle=short.base_angle,
+        gravity=short.gravity,
+    )
+    q, qd, tau = rng.normal(size=(3, 3))
+    padded = [np.pad(a, 1) for a in (q, qd, tau)]
+    np.testing.assert_allclose(
+        fj.forward_dynamics(longer, *padded)[1:4],
+        fj.forward_dynamics(short, q, qd, tau),
+        rtol=1e-13,
+    )
+    ratios = fj.analysis.inertia_ratios
+    np.testing.assert_allclose(
+        ratios(longer, padded[0])[1:4], ratios(short, q), rtol=1e-12
+    )
+
+
+def test_one_program_serves_all_chains_of_a_length_and_batches_of_them():
+    rng = np.random.default_rng(2)
+    names = "RRRR", "RFRP", "FPRF", "PRRF"
+    members = [chains.random_chain(name, rng) for name in names]
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *members)
+    q, qd, tau = rng.normal(size=(3, 4, 4))
+
+    @eqx.debug.assert_max_traces(max_traces=1)
+    def motion(chain, q, qd, tau):
+        return fj.forward_dynamics(chain, q, qd, tau)
+
+    single = jax.jit(motion)
+    one_by_one = [single(*arguments) for arguments in zip(members, q, qd, tau)]
+    together = jax.vmap(fj.forward_dynamics)(stacked, q, qd, tau)
+    np.testing.assert_allclose(together, one_by_one, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("topology", ["RP", "RFRR", "PRRPRR"])
+def test_derivatives_equal_differences(topology):
+    rng = np.random.default_rng(3)
+    n = len(topology)
+    chain = chains.random_chain(topology, rng)
+    q, qd, tau = jnp.asarray(rng.normal(size=(3, n)))
+    weights = rng.normal(size=n)
+
+    def value(chain, q, qd, tau):
+        return fj.forward_dynamics(chain, q, qd, tau) @ weights
+
+    arguments = chain, q, qd, tau
+    direction = jax.tree.map(lambda a: jnp.asarray(rng.normal(size=a.shape)), arguments)
+    direction = eqx.tree_at(lambda d: d[0].ef, direction, jnp.zeros(2 * n))
+    _, slope = jax.jvp(value, arguments, direction)
+    gradient = jax.grad(value, argnums=(0, 1, 2, 3))(*arguments)
+    products = jax.tree.map(lambda a, b: jnp.sum(a * b), gradient, direction)
+    assert float(sum(jax.tree.leaves(products))) == pytest.approx(float(slope), 1e-11)
+
+    def shifted(step):
+        moved = jax.tree.map(lambda a, b: a + step * b, arguments, direction)
+        return float(value(*moved))
+
+    h = 1e-3
+    coarse, fine = ((shifted(s) - shifted(-s)) / (2 * s) for s in (h, h / 2))
+    assert float(slope) == pytest.approx((4 * fine - coarse) / 3, rel=1e-7)
+
+
+def test_slides_that_are_nearly_parallel_keep_their_pivot():
+    # Beyond 1e-8 rad, m - m cos^2 would have no digit left. Fixed pairs between and
+    # beyond the slides change nothing.
+    angle = 1e-6
+    for topology, locked in (("RPP", [0, angle, 0]), ("RPFPF", [0, angle, 0, 0.3, 0.1])):
+        n = len(topology)
+        chain = fj.Linkage(
+            topology,
+            length=np.zeros(n + 1),
+            com=np.zeros((n, 2)),
+            mass=np.where(chains.moving(topology), 1, 0),
+            inertia=np.where(chains.moving(topology), 1, 0),
+            locked=locked,
+            gravity=0,
+        )
+        tau = np.zeros(n)
+        tau[1] = 1
+        qdd = np.asarray(fj.forward_dynamics(chain, [0] * n, [0] * n, tau))
+        # 1 N on two slides of 2 kg and 1 kg: the pivot is 1 + sin^2 [kg].
+        assert qdd[1] == pytest.approx(1 / (1 + np.sin(angle) ** 2), rel=1e-15)
+
+
+@pytest.mark.parametrize(
+    "topology, words",
+    [
+        ("", "1 to 8 letters"),
+        ("RXR", "1 to 8 letters"),
+        ("R" * 9, "1 to 8 letters"),
+        ([0, 1, 1], "1 to 8 letters"),
+        ([0] * 18, "1 to 8 letters"),
+        ("FF", "a joint that moves"),
+        ("PFPP", "one that turns among three"),
+        ([1, 1, 0, 1], "one real joint at most"),
+        ([0, 0.5], "0 or 1"),
+    ],
+)
+def test_topologies_refused(topology, words):
+    with pytest.raises(ValueError, match=rf"^topology: .*{words}"):
+        n = max(len(topology) if isinstance(topology, str) else len(topology) // 2, 1)
+        fj.Linkage(
+            topology,
+            length=[1] * (n + 1),
+            com=[[0, 0]] * n,
+            mass=[1] * n,
+            inertia=[1] * n,
+        )
+
+
+def test_the_papers_equations_are_for_three_pairs():
+    rng = np.random.default_rng(4)
+    for topology, words in (("RR", "three pairs"), ("RFR", "no fixed pair")):
+        chain = chains.random_chain(topology, rng)
+        with pytest.raises(ValueError, match=rf"^linkage: expected {words}"):
+            fj.mass_matrix(chain, np.zeros(6))
+
+
+def test_shapes_are_those_of_the_chain():
+    chain = chains.random_chain("RR", np.random.default_rng(5))
+    with pytest.raises(ValueError, match=r"^q: expected an array of 2 .*\(3,\)"):
+        fj.tip_position(chain, [0, 0, 0])
+    with pytest.raises(ValueError, match="^mass: expected an array of 2 "):
+        chain.replace(mass=[1, 1, 1])
+    assert repr(chain).startswith("Linkage('RR'")
+    assert fj.existence_factors("RRFPR").tolist() == [0, 1, 0, 1, 0, 0, 1, 0, 0, 1]
