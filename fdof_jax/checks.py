@@ -16,6 +16,10 @@ from jax import Array
 from jax.core import Tracer
 
 
+# In a shape: any number of joints, which is compared with the arm's where both meet.
+JOINT = "joint"
+
+
 def is_traced(*trees: Any) -> bool:
     """Returns whether a JAX transformation traces any leaf of `trees`."""
     return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(trees))
@@ -35,7 +39,7 @@ def concrete(value: Any) -> np.ndarray | None:
 def real_array(
     name: str,
     value: Any,
-    shape: tuple[int | None, ...],
+    shape: tuple[int | str | None, ...],
     *,
     minimum: float | None = None,
     above: float | None = None,
@@ -45,14 +49,14 @@ def real_array(
 ) -> Array:
     """Returns `value` as an array of the default float dtype and the given shape.
 
-    `None` in `shape` stands for any length. `broadcast` also accepts one number for all
-    entries. Raises ValueError for a wrong shape, a type that is not real numbers, NaN,
+    `None` in `shape` stands for any length, and JOINT for that of any arm. `broadcast`
+    also accepts one number for all entries, and repeats it if the shape is known. Raises ValueError for a wrong shape, a type that is not real numbers, NaN,
     infinities (unless `finite=False`) and entries below `minimum` or not above `above`;
     the message names the `unit`.
     """
 
     def refuse(got: str) -> ValueError:
-        size = "x".join("n" if n is None else str(n) for n in shape)
+        size = "x".join("n" if n in (None, JOINT) else str(n) for n in shape)
         expected = f"an array of {size} real numbers" if shape else "a real number"
         if finite:
             expected += ", all finite" if shape else ", finite"
@@ -74,7 +78,7 @@ def real_array(
     if array.dtype.kind not in "iuf":
         raise refuse(repr(value))
     fits = array.ndim == len(shape) and all(
-        want is None or want == have for want, have in zip(shape, array.shape)
+        want in (None, JOINT, have) for want, have in zip(shape, array.shape)
     )
     if not fits and not (broadcast and array.ndim == 0):
         raise refuse(f"shape {array.shape}" if array.ndim else repr(value))
@@ -94,7 +98,7 @@ def real_array(
             return value
         array = kept
     # NumPy broadcasts concrete values without compiling a program.
-    if not fits:
+    if not fits and JOINT not in shape:
         array = (jnp if traced else np).broadcast_to(array, shape)  # type: ignore[arg-type]
     return jnp.asarray(array, dtype=float)
 

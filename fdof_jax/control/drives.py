@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from ..checks import real_array
 from ..forces.element import StatefulElement, element_of
 from ..forces.part import Condition, Values, called, field
+from ..linkage.linkage import Linkage, joints_of
 from .pd import PDController
 
 
@@ -61,8 +62,8 @@ class PIDController(StatefulElement):
         yield Condition(paired, "ki", "0 where kp is", (self.ki, self.pd.kp))
 
     def initial_state(self, linkage):
-        """The integral's share of the effort at the start, zeros (3,) [N or N m]."""
-        return jnp.zeros(3)
+        """The integral's share of the effort at the start, zeros (n,) [N or N m]."""
+        return jnp.zeros(joints_of(linkage))
 
     def __call__(self, t, q, qd, linkage, state):
         position, velocity = self.pd.schedule(t, linkage)
@@ -85,23 +86,23 @@ class _Drive(StatefulElement):
 
     command: Any = called("a force element, a PDController for instance")
 
-    def initial(self) -> Any:
+    def initial(self, linkage: Linkage) -> Any:
         """The drive's own state at the start."""
         return ()
 
     @abstractmethod
     def respond(self, command: Array, qd: Array, own: Any) -> tuple[Array, Any]:
-        """The efforts (3,) and the rate of the drive's own state."""
+        """The efforts (n,) and the rate of the drive's own state."""
 
     def initial_state(self, linkage):
         """The `DriveState` at the start."""
         inner = element_of(self.command).initial_state(linkage)
-        return DriveState(self.initial(), inner)
+        return DriveState(self.initial(linkage), inner)
 
     def __call__(self, t, q, qd, linkage, state):
         own, inner = state
         command, inner_rate = element_of(self.command).act(t, q, qd, linkage, inner)
-        effort, rate = self.respond(real_array("command", command, (3,)), qd, own)
+        effort, rate = self.respond(real_array("command", command, jnp.shape(qd)), qd, own)
         return effort, DriveState(rate, inner_rate)
 
 
@@ -126,9 +127,9 @@ class FirstOrderLag(_Drive):
     time_constant: Values = field(unit="s", above=0)
     start: Values = field(unit="N or N m", default=0.0, kw_only=True)
 
-    def initial(self):
-        """The initial effort, (3,) [N or N m]."""
-        return self.start
+    def initial(self, linkage):
+        """The initial effort, (n,) [N or N m]."""
+        return jnp.broadcast_to(self.start, joints_of(linkage))
 
     def respond(self, command, qd, own):
         return own, (command - own) / self.time_constant
@@ -203,9 +204,9 @@ class DCMotor(_Drive):
         unit="A", above=0, finite=False, default=jnp.inf, kw_only=True
     )
 
-    def initial(self):
-        """The initial currents, zeros (3,) [A]."""
-        return jnp.zeros(3)
+    def initial(self, linkage):
+        """The initial currents, zeros (n,) [A]."""
+        return jnp.zeros(joints_of(linkage))
 
     def respond(self, command, qd, own):
         per_joint = self.constant * self.gear

@@ -86,7 +86,7 @@ def _held(linkage: Linkage, q: Scalars) -> tuple[Array, ...]:
     # The mass beyond a joint, and its first moment in x about the ground pivot.
     mass, moment = jnp.zeros(()), jnp.zeros(())
     efforts = []
-    for k in (2, 1, 0):
+    for k in reversed(range(len(q))):
         along, across = linkage.com[k]
         e = direction[k + 1]
         center = start[k + 1].real + along * e.real - across * e.imag
@@ -141,6 +141,6 @@ class ComputedTorque(ModelBased):
     def unlimited(self, scheduled, q, qd, linkage):
         *motion, qdd_ref = scheduled
         errors = super().unlimited(motion, q, qd, linkage)
-        constants = link_constants(self._believed(linkage), jnp.zeros(3))
+        constants = link_constants(self._believed(linkage), jnp.zeros(len(q)))
         demanded = tuple(a + b for a, b in zip(qdd_ref, errors))
         return required_efforts(constants, tuple(q), tuple(qd), demanded)

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ..forces.element import ScalarElement
-from ..forces.part import Values, called, field
+from ..forces.part import Values, called, each, field
 from ..linkage.linkage import Linkage
 from ..references.reference import EXPECTED, reference_motion
 
@@ -54,7 +54,7 @@ class PDController(ScalarElement):
         return tuple(
             jnp.where(jnp.abs(effort) <= limit, effort, jnp.clip(effort, -limit, limit))
             for effort, limit in zip(
-                self.unlimited(scheduled, q, qd, linkage), self.limit
+                self.unlimited(scheduled, q, qd, linkage), each(self.limit, q)
             )
         )
 
@@ -65,10 +65,10 @@ class PDController(ScalarElement):
         return tuple(
             kp * (position - q) + kd * (velocity - qd)
             for kp, kd, position, velocity, q, qd in zip(
-                self.kp, self.kd, *scheduled, q, qd
+                each(self.kp, q), each(self.kd, q), *scheduled, q, qd
             )
         )
 
     def demand(self, t: Array, q: Array, qd: Array, linkage: Linkage) -> Array:
-        """The efforts before clipping, (3,) [N or N m]."""
+        """The efforts before clipping, (n,) [N or N m]."""
         return jnp.stack(self.unlimited(self.schedule(t, linkage), q, qd, linkage))

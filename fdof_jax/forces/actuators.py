@@ -9,7 +9,7 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from ..linkage.frames import cross, dot, scalar_frames
-from ..linkage.linkage import Linkage
+from ..linkage.linkage import Linkage, joints_of
 from .element import InertialElement
 from .part import Values, field, value_of
 from .points import (
@@ -42,7 +42,7 @@ class Armature(InertialElement):
         return q
 
     def weights(self, linkage):
-        return self.inertia
+        return jnp.broadcast_to(self.inertia, joints_of(linkage))
 
     def loads(self, t, q, qd, qdd, linkage):
         """Returns no loads: the rotors act in the joints themselves."""

@@ -27,7 +27,7 @@ class Element(Part):
     """What acts on an arm: a pytree that computes joint efforts.
 
     A subclass implements `__call__`, with joint positions, velocities and efforts of
-    shape (3,) [m or rad; m/s or rad/s; N or N m]. All else has a default:
+    shape (n,) [m or rad; m/s or rad/s; N or N m]. All else has a default:
 
     - `conditions`: conditions on values, beside the bounds that `field` declares.
     - `jump_ts`: times at which the efforts jump; steps end there [s]. By default they
@@ -46,13 +46,13 @@ class Element(Part):
     ...         return -self.coefficient * abs(qd) * qd
     >>> Drag(-1)
     Traceback (most recent call last):
-    ValueError: coefficient: expected an array of 3 real numbers, all finite, at least \
+    ValueError: coefficient: expected an array of n real numbers, all finite, at least \
 0 [N m s^2/rad^2] (or one number for all), got -1.
     """
 
     @abstractmethod
     def __call__(self, t: Array, q: Array, qd: Array, linkage: Linkage) -> Any:
-        """Computes the efforts, (3,) [N or N m]."""
+        """Computes the efforts, (n,) [N or N m]."""
 
     potential_energy = default(lambda self: None)
 
@@ -67,7 +67,7 @@ class Element(Part):
     def act(
         self, t: Array, q: Array, qd: Array, linkage: Linkage, state: Any
     ) -> tuple[Any, Any]:
-        """Returns the efforts (3,) [N or N m] and the rate of the state."""
+        """Returns the efforts (n,) [N or N m] and the rate of the state."""
         return self(t, q, qd, linkage), ()
 
     def loads_on_points(
@@ -127,7 +127,7 @@ class ScalarElement(Element):
     def respond(
         self, scheduled: Any, q: Scalars, qd: Scalars, linkage: Linkage
     ) -> tuple[Array, ...]:
-        """Computes the three efforts [N or N m] from the result of `schedule`."""
+        """Computes the efforts [N or N m] from the result of `schedule`."""
 
     def __call__(self, t: Array, q: Array, qd: Array, linkage: Linkage) -> Array:
         scheduled = self.schedule(t, linkage)
@@ -148,7 +148,7 @@ class StatefulElement(Element):
     def __call__(  # pyright: ignore[reportIncompatibleMethodOverride]
         self, t: Array, q: Array, qd: Array, linkage: Linkage, state: Any
     ) -> tuple[Array, Any]:
-        """Returns the efforts (3,) [N or N m] and the rate of the state."""
+        """Returns the efforts (n,) [N or N m] and the rate of the state."""
 
     def act(self, t, q, qd, linkage, state):
         return self(t, q, qd, linkage, state)
@@ -175,8 +175,8 @@ class InertialElement(Element):
         return jnp.zeros(())
 
     def __call__(self, t: Array, q: Array, qd: Array, linkage: Linkage) -> Array:
-        """Computes further efforts, (3,) [N or N m]; 0 unless overridden."""
-        return jnp.zeros(3)
+        """Computes further efforts, (n,) [N or N m]; 0 unless overridden."""
+        return jnp.zeros_like(q)
 
     def loads(
         self, t: Array, q: Array, qd: Array, qdd: Array, linkage: Linkage

@@ -5,7 +5,7 @@ from jax import Array
 
 from ..linkage.linkage import Linkage
 from .element import ScalarElement
-from .part import Condition, Values, field
+from .part import Condition, Values, each, field
 
 
 class JointStops(ScalarElement):
@@ -43,9 +43,8 @@ class JointStops(ScalarElement):
         yield Condition(apart, "lower", "less than upper", ends)
 
     def respond(self, scheduled, q, qd, linkage):
-        rows = zip(
-            q, qd, self.lower, self.upper, self.stiffness, self.damping, self.smoothing
-        )
+        values = self.lower, self.upper, self.stiffness, self.damping, self.smoothing
+        rows = zip(q, qd, *(each(value, q) for value in values))
         return tuple(
             _push(low - x, -rate, k, d, width) - _push(x - high, rate, k, d, width)
             for x, rate, low, high, k, d, width in rows
@@ -109,5 +108,5 @@ class JointFriction(ScalarElement):
     def respond(self, scheduled, q, qd, linkage):
         return tuple(
             -level * jnp.tanh(rate / speed)
-            for level, speed, rate in zip(self.level, self.speed, qd)
+            for level, speed, rate in zip(each(self.level, qd), each(self.speed, qd), qd)
         )

@@ -3,8 +3,9 @@
 import jax
 import jax.numpy as jnp
 
+from ..checks import JOINT
 from .element import ScalarElement
-from .part import Condition, Values, field
+from .part import Condition, Values, each, field
 
 
 class JointDamper(ScalarElement):
@@ -27,7 +28,7 @@ class JointDamper(ScalarElement):
     coefficient: Values = field(unit="N s/m or N m s/rad", minimum=0)
 
     def respond(self, scheduled, q, qd, linkage):
-        return tuple(-c * rate for c, rate in zip(self.coefficient, qd))
+        return tuple(-c * rate for c, rate in zip(each(self.coefficient, qd), qd))
 
 
 class JointEffort(ScalarElement):
@@ -44,7 +45,7 @@ class JointEffort(ScalarElement):
     [58.86, 29.43, 9.81]
     """
 
-    tau: Values = field((3,), unit="N or N m")
+    tau: Values = field((JOINT,), unit="N or N m")
 
     def respond(self, scheduled, q, qd, linkage):
         return tuple(self.tau)
@@ -58,7 +59,7 @@ class EffortHistory(ScalarElement):
     the steps to the distance of two samples (`diffrax.PIDController(..., dtmax=...)`).
 
     **Arguments:** `ts`: increasing times, one or more [s]; `tau`: the efforts at `ts`,
-    (time, 3) [N or N m].
+    (time, joint) [N or N m].
 
     **Raises:** ValueError for malformed arguments.
 
@@ -70,7 +71,7 @@ class EffortHistory(ScalarElement):
     """
 
     ts: Values = field((None,), unit="s")
-    tau: Values = field((None, 3), unit="N or N m")
+    tau: Values = field((None, JOINT), unit="N or N m")
 
     def conditions(self):
         times, efforts = len(self.ts), len(self.tau)

@@ -13,11 +13,12 @@ from operator import and_
 from typing import Any, NamedTuple, dataclass_transform
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
-from ..checks import concrete, function, instance, real_array
+from ..checks import JOINT, concrete, function, instance, real_array
 from ..linkage.linkage import Linkage
 from ..xla.array_namespace import in_numpy, namespace
 
@@ -30,7 +31,7 @@ class Values:
 
 
 def field(
-    shape: tuple[int | None, ...] | None = None,
+    shape: tuple[int | str | None, ...] | None = None,
     *,
     unit: str,
     minimum: float | None = None,
@@ -47,15 +48,15 @@ def field(
 
     **Arguments:**
 
-    - `shape`: by default one number per joint, or one for all; `None` within it stands
-      for any length.
+    - `shape`: by default one number per joint, or one for all (then `each` repeats it);
+      `None` within it stands for any length, `JOINT` for the number of joints.
     - `unit`: for messages, for instance "N m s/rad".
     - `minimum`, `above`: bounds; `finite`: whether infinities are refused.
     - `function`: whether a function that returns such an array is accepted.
     - `default`, `kw_only`: as of `dataclasses.field`.
     """
     per_joint = shape is None
-    rules = dict(shape=(3,) if per_joint else shape, broadcast=per_joint, unit=unit)
+    rules = dict(shape=(JOINT,) if per_joint else shape, broadcast=per_joint, unit=unit)
     rules |= dict(minimum=minimum, above=above, finite=finite)
     about = {"rules": rules, "function": function}
     return dataclasses.field(default=default, kw_only=kw_only, metadata=about)
@@ -177,6 +178,24 @@ def _bounded(value: Any, rules: dict[str, Any]) -> Any:
     if rules["above"] is not None:
         holds = holds & (value > rules["above"])
     return holds.all()
+
+
+def each(values: Array, joints: Any) -> tuple[Array, ...]:
+    """Returns the declared values of the joints as scalars, one for each of `joints`."""
+    return tuple(values) if jnp.ndim(values) else (values,) * len(joints)
+
+
+def check_joints(place: str, part: Part, count: int) -> None:
+    """Raises ValueError unless declared arrays have an entry for each joint."""
+    for name, value, rules in _declared(part):
+        for wanted, size in zip(rules["shape"], jnp.shape(value)):
+            if wanted == JOINT and size != count:
+                raise ValueError(
+                    f"{place}.{name}: expected numbers for {count} joints, as the "
+                    f"linkage has, got {size}."
+                )
+    for name, inner in _within(part):
+        check_joints(f"{place}.{name}", inner, count)
 
 
 def value_of(part: Part, name: str, *arguments: Any) -> Array:

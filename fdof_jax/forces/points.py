@@ -17,26 +17,28 @@ from jax import Array
 from jaxtyping import Complex, Float
 from numpy.typing import ArrayLike
 
-from ..checks import real_array, whole_number
+from ..checks import is_traced, real_array, whole_number
 from ..linkage.frames import Frames, cross, frames, scalar_frames
-from ..linkage.linkage import Linkage
+from ..linkage.linkage import Linkage, joints_of, without_fixed
+from ..linkage.topology import MOST_PAIRS
 from ..mechanics.equations import Scalars
 from .element import ScalarElement
 from .part import Part, Values, field, of_kind
 
 
 def pick(link: Array, choices: list[Array]) -> Array:
-    """Selects a link's value from those of the ground and the three links."""
+    """Selects a link's value from those of the ground and the links."""
     chosen = choices[0]
-    for k in (1, 2, 3):
-        chosen = jnp.where(link == k, choices[k], chosen)
+    for k, choice in enumerate(choices):
+        chosen = jnp.where(link == k, choice, chosen) if k else chosen
     return chosen
 
 
 def _link(link: Any) -> Array:
-    if whole_number("link", link, 0) > 3:
+    if whole_number("link", link, 0) > MOST_PAIRS:
         raise ValueError(
-            f"link: expected 0 (the ground) or a moving link, 1 to 3, got {link!r}."
+            f"link: expected 0 (the ground) or a moving link, 1 to {MOST_PAIRS}, got "
+            f"{link!r}."
         )
     return jax.device_put(np.array(link))
 
@@ -46,7 +48,7 @@ class Point(Part):
 
     **Arguments:**
 
-    - `link`: 0 is the ground, 1 to 3 are the moving links.
+    - `link`: 0 is the ground, 1, 2, ... are the moving links.
     - `along`, `across`: coordinates in the link's own frame [m]. Its origin is the
       link's characteristic point, or the ground pivot. Its first axis is the link's
       vector A; the ground's first axis is at the base angle.
@@ -66,8 +68,18 @@ class Point(Part):
 
     def position(self, linkage: Linkage, q: ArrayLike) -> Float[Array, " 2"]:
         """Computes the point's position (x, y) from the ground pivot [m]."""
-        place = self.place(frames(linkage, real_array("q", q, (3,))))
+        self.check(linkage, jnp.zeros(1))
+        q = real_array("q", q, (joints_of(linkage),))
+        place = self.place(frames(linkage, without_fixed(linkage, q)))
         return jnp.stack([place.real, place.imag])
+
+    def check(self, linkage: Linkage, ts: Array) -> None:
+        """Raises ValueError if the linkage has no such link."""
+        if not is_traced(self.link) and self.link > (last := joints_of(linkage)):
+            raise ValueError(
+                f"link: expected 0 (the ground) or a moving link, 1 to {last}, got "
+                f"{self.link}."
+            )
 
     def place(self, frames: Frames) -> Complex[Array, ""]:
         """Computes the point's position x + iy [m]."""

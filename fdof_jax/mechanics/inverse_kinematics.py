@@ -1,6 +1,6 @@
 """Inverse kinematics: joint positions for a commanded tip."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -8,10 +8,10 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from ..checks import concrete, real_array, sign
-from ..linkage.frames import cross, dot, unit_vector
-from ..linkage.linkage import Linkage, check_linkage
-from ..linkage.topology import real_joints
+from ..checks import concrete, is_traced, real_array, sign
+from ..linkage.frames import cross, dot, frames, unit_vector
+from ..linkage.linkage import Linkage, check_linkage, joints_of
+from ..linkage.topology import fixed_pairs, real_joints
 from ..xla.array_namespace import in_numpy, namespace, plane_vector
 
 
@@ -32,6 +32,96 @@ def whole_turns(angle: Array) -> Array:
     return namespace(angle).ceil((angle - np.pi - margin) / (2 * np.pi))
 
 
+class Arm(NamedTuple):
+    """Three joints and what is between them, as the closed form sees a linkage.
+
+    Vectors x + iy are in the frame of the link before the joint at their end. They go
+    from joint to joint, and on to the tip; a joint's own slide counts as 0.
+
+    - `revolute`: whether the joints turn; `angle`: by how much slides turn [rad].
+    - `base_angle`: direction of the link before the first joint [rad].
+    - `ground`: vector to the first joint; `links`: to the second and the third (2,);
+      `tip`: on to the tip [m].
+    """
+
+    revolute: tuple[Any, Any, Any]
+    angle: Any
+    base_angle: Any
+    ground: Any
+    links: Any
+    tip: Any
+
+
+def arm_of(linkage: Linkage, oriented: bool = True) -> tuple[Arm, "Placed"]:
+    """Returns a linkage as an arm of three joints, and where its joints are in it.
+
+    `oriented`: whether the last link's direction is commanded. Otherwise two joints
+    move, and a third one that turns at the tip takes any direction.
+
+    Raises ValueError unless three joints move, or two.
+    """
+    wanted, n = 2 + oriented, joints_of(linkage)
+    found = None if is_traced(linkage.ef) else int(np.sum(np.asarray(linkage.ef)))
+    if n < wanted or found not in (None, wanted):
+        also = "" if oriented else " where no orientation is commanded"
+        raise ValueError(
+            f"linkage: expected {wanted} joints that move{also}, the others fixed, got "
+            f"{found or n}."
+        )
+    xp = namespace(linkage)
+    revolute = xp.stack(real_joints(linkage.ef))
+    slide = xp.where(revolute, linkage.locked, 0)
+    if n == wanted:
+        vector = plane_vector(linkage.length[:-1], slide)
+        tip = plane_vector(linkage.length[-1], xp.zeros_like(slide[0]))
+        angle, base_angle, offset, place = linkage.locked, linkage.base_angle, 0, None
+    else:
+        # Where the chain is with its joints at 0: what is fixed keeps its shape.
+        zero = xp.zeros_like(linkage.locked)
+        start, direction, angles, *_ = frames(linkage, zero)
+        fixed = xp.stack(fixed_pairs(linkage.ef))
+        place = xp.argsort(fixed, stable=True)[:wanted]
+        begins = xp.concatenate([xp.zeros_like(place[:1]), place + 1])
+        ends = xp.concatenate([place, xp.full_like(place[:1], n)])
+        turned = angles[ends] - angles[begins]  # within a rigid part
+        end = xp.concatenate([start[1:], start[-1:] + linkage.length[-1] * direction[-1:]])
+        vectors = (end[ends] - start[begins]) * direction[ends].conj()
+        vector, tip = vectors[:-1], vectors[-1]
+        revolute = revolute[place]
+        angle = linkage.locked[place] + turned[1:]
+        base_angle = angles[ends[0]]
+        offset = xp.where(revolute, turned[1:], vector.imag)
+        vector = plane_vector(vector.real, xp.where(revolute, vector.imag, 0))
+    if not oriented:
+        one = xp.ones_like(revolute[:1])
+        revolute, angle = (
+            xp.concatenate([a, b]) for a, b in ((revolute, one), (angle, angle[:1]))
+        )
+        vector, tip = xp.concatenate([vector, tip[None]]), xp.zeros_like(tip)
+    arm = Arm(tuple(revolute), angle, base_angle, vector[0], vector[1:], tip)
+    return arm, Placed(place, offset, n)
+
+
+class Placed(NamedTuple):
+    """Where the joints of an `Arm` are among the n of a linkage, if not all are.
+
+    `offset`: what the positions have beyond those in the linkage [m or rad].
+    """
+
+    place: Any
+    offset: Any
+    n: int
+
+    def __call__(self, q: Any) -> Any:
+        """Returns positions in the linkage (..., n), from those of the arm (..., 3)."""
+        if self.place is None:
+            return q[..., : self.n]
+        xp = namespace(q, self.place, self.offset)
+        at = xp.arange(self.n)[:, None] == self.place
+        moved = q[..., : len(self.place)] - self.offset
+        return xp.where(at, moved[..., None, :], 0).sum(axis=-1)
+
+
 class Directions(NamedTuple):
     """Directions of the links that do not depend on the tip's position.
 
@@ -44,39 +134,36 @@ class Directions(NamedTuple):
     vector: Array
 
 
-def known_directions(linkage: Linkage, orientation: Array) -> Directions:
+def known_directions(arm: Arm, orientation: Array) -> Directions:
     """Computes directions that follow from the ground or the last link's angle."""
-    xp = namespace(linkage, orientation)
-    r1, _, r3 = real_joints(linkage.ef)
-    lock1, lock2, lock3 = linkage.locked
+    xp = namespace(arm, orientation)
+    r1, _, r3 = arm.revolute
+    lock1, lock2, lock3 = arm.angle
     from_tip = orientation - lock3
-    second = xp.where(r1, from_tip - lock2, linkage.base_angle + lock1)
+    second = xp.where(r1, from_tip - lock2, arm.base_angle + lock1)
     third = xp.where(r3, second + lock2, from_tip)
-    angle = xp.stack([linkage.base_angle, second, third, orientation])
+    angle = xp.stack([arm.base_angle, second, third, orientation])
     return Directions(angle, unit_vector(angle))
 
 
-def unmoved_part(linkage: Linkage, directions: Directions) -> Array:
+def unmoved_part(arm: Arm, directions: Directions) -> Array:
     """Computes the sum of the ground's and the last link's vectors, x + iy [m].
 
     No joint moves this part of the tip's position. The rest is the wrist vector, from
     the first joint's start to the last link's start.
     """
-    xp = namespace(linkage, directions)
-    r1, _, _ = real_joints(linkage.ef)
-    fixed = plane_vector(linkage.length[0], xp.where(r1, linkage.locked[0], 0))
     e1, _, _, e4 = directions.vector
-    return e1 * fixed + e4 * linkage.length[3]
+    return e1 * arm.ground + e4 * arm.tip
 
 
 def solve_joints(
-    linkage: Linkage,
+    arm: Arm,
     directions: Directions,
     wrist: Array,
     bearing: Array,
     branch: Array,
 ) -> tuple[Array, Array]:
-    """Computes joint positions (..., 3) from the wrist x + iy, NaN if out of reach.
+    """Computes positions of the arm (..., 3) from the wrist x + iy, NaN out of reach.
 
     The second result is a root that is 0 just at the edge of the reach, where
     velocities are infinite.
@@ -90,8 +177,8 @@ def solve_joints(
     2, where the wrist vector turns), two slides (PPR, RPP, PRP). The first two kinds
     need a square root, whose sign is the branch.
     """
-    xp = namespace(linkage, directions, wrist, bearing, branch)
-    r1, r2, r3 = revolute = real_joints(linkage.ef)
+    xp = namespace(arm, directions, wrist, bearing, branch)
+    r1, r2, r3 = arm.revolute
     # Which vectors turn by themselves: link 2's, link 3's, or the wrist's as a whole.
     turning2, turning3, whole = r1 & r2, r2 & r3, r1 & r3
     two_turning, framed = whole & r2, whole & ~r2  # RRR, RPR
@@ -99,9 +186,7 @@ def solve_joints(
     th1, th2, th3, th4 = directions.angle
     e1, e2, e3, _ = directions.vector
 
-    # Vectors of links 2 and 3 in their own frames; a free slide counts as 0.
-    free = xp.stack([r2, r3])
-    d = plane_vector(linkage.length[1:3], xp.where(free, linkage.locked[1:], 0))
+    d = arm.links
     reach2, reach3 = dot(d, d)
     own2, own3 = plane_angle(d.imag, d.real)
 
@@ -130,41 +215,45 @@ def solve_joints(
     angle = plane_angle(root, along + xp.where(two_turning, reach2, 0))
     second = xp.where(whole, bearing - angle, xp.where(turning2, th3 + angle, th2))
     second = second - xp.where(turning2, own2, 0)
-    bend = xp.where(r2, own2 + plane_angle(root, inner) - own3, linkage.locked[1])
+    bend = xp.where(r2, own2 + plane_angle(root, inner) - own3, arm.angle[1])
     third = xp.where(whole, second + bend, xp.where(turning3, th1 + angle - own3, th3))
     slide = dot(b, rest) / span - xp.where(two_slides, 0, root)
     other = xp.where(two_slides, -component / span, slide)
     turned = second - th1, third - second, th4 - third
     slid = slide, xp.where(framed, -slide, xp.where(r1, slide, other)), other
-    q = [xp.where(*joint) for joint in zip(revolute, turned, slid)]
+    q = [xp.where(*joint) for joint in zip(arm.revolute, turned, slid)]
     return xp.stack(q, axis=-1), root
 
 
 def inverse_kinematics(
     linkage: Linkage,
     tip: ArrayLike,
-    orientation: ArrayLike,
+    orientation: ArrayLike | None,
     *,
     branch: int = 1,
 ) -> Float[Array, " joint"]:
-    """Computes joint positions for a tip position and a direction of A4.
+    """Computes joint positions for a tip position and a direction of the last link.
 
-    The solution is in closed form for every topology, selected by the existence
-    factors. The direction from the first joint to the last link's start is in
-    (-pi, pi]; the angles follow from it without wrapping.
+    The solution is in closed form for every topology of three joints that move, and of
+    two where no orientation is commanded. It is selected by the existence factors; fixed
+    pairs may be anywhere. The direction from the first joint to the last link's start
+    is in (-pi, pi]; the angles follow from it without wrapping.
 
     **Arguments:**
 
     - `tip`: the point (x, y) [m].
-    - `orientation`: th4, the absolute angle of the last link [rad].
+    - `orientation`: the absolute angle of the last link [rad], th4 in the paper; None
+      for an arm of two joints.
     - `branch`: 1 or -1, the choice between two assemblies: the sign of the turn from
       A2 to A3 (RRR), of the slide measured from the foot of the perpendicular (RPR), or
-      of the side of the turning vector (PRR, RRP). Ignored where there is only one.
+      of the side of the turning vector (PRR, RRP). Two joints are as with a third that
+      turns at the tip. Ignored where there is only one assembly.
 
-    **Returns:** `q` [m or rad]; NaN for traced arguments if the point is out of reach.
+    **Returns:** `q` [m or rad], 0 at fixed pairs; NaN for traced arguments if the point
+    is out of reach.
 
-    **Raises:** ValueError for malformed arguments, and for concrete arguments if the
-    point is out of reach.
+    **Raises:** ValueError for malformed arguments, for a linkage of another number of
+    joints, and for concrete arguments if the point is out of reach.
 
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig7().linkage
@@ -173,20 +262,22 @@ def inverse_kinematics(
     ([1.571, 2.5, -1.571], [-5.0, 2.0])
     """
     check_linkage(linkage)
+    oriented = orientation is not None
     tip = real_array("tip", tip, (2,))
-    orientation = real_array("orientation", orientation, ())
+    direction = real_array("orientation", orientation if oriented else 0.0, ())
     side = sign("branch", branch)
     # NumPy computes concrete values, as JAX would compile each single operation.
-    arm, point, angle, side = in_numpy((linkage, tip, orientation, side))
+    known, point, angle, side = in_numpy((linkage, tip, direction, side))
+    arm, placed = arm_of(known, oriented)
     directions = known_directions(arm, angle)
     wrist = plane_vector(*point) - unmoved_part(arm, directions)
     bearing = plane_angle(wrist.imag, wrist.real)
     bearing = bearing - 2 * np.pi * whole_turns(bearing)
-    q, _ = solve_joints(arm, directions, wrist, bearing, side)
+    q = placed(solve_joints(arm, directions, wrist, bearing, side)[0])
     values = concrete(q)
     if values is not None and not np.isfinite(values).all():
+        at = f" at orientation {angle:g} rad" if oriented else ""
         raise ValueError(
-            f"tip: expected a point within reach at orientation {angle:g} rad, "
-            f"got {tip.tolist()}."
+            f"tip: expected a point within reach{at}, got {tip.tolist()}."
         )
     return jnp.asarray(q, dtype=float)

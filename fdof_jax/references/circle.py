@@ -11,6 +11,7 @@ from ..forces.part import Condition, Values, field
 from ..linkage.frames import dot
 from ..linkage.linkage import Linkage
 from ..mechanics.inverse_kinematics import (
+    arm_of,
     known_directions,
     plane_angle,
     unmoved_part,
@@ -91,10 +92,11 @@ class CircleTask(TipReference):
         turn = abs(period)
         # The reach ends first where the wrist is nearest to or farthest from the base,
         # or along a direction that the ground or the last link fixes.
-        base = unmoved_part(arm, known_directions(arm, task.orientation))
+        three, _ = arm_of(arm)
+        base = unmoved_part(three, known_directions(three, task.orientation))
         hub = plane_vector(*task.center) - base
         directions = np.array(
-            [np.angle(hub), arm.base_angle, task.orientation - arm.locked[2]]
+            [np.angle(hub), three.base_angle, task.orientation - three.angle[2]]
         )
         lead = np.concatenate([directions, directions + np.pi]) - task.phase
         extremes = start + (lead / (2 * np.pi) * period - start) % turn

@@ -14,6 +14,7 @@ from ..forces.part import Condition, Values, called, default, field, of_kind
 from ..linkage.frames import cross, dot
 from ..linkage.linkage import Linkage
 from ..mechanics.inverse_kinematics import (
+    arm_of,
     known_directions,
     plane_angle,
     solve_joints,
@@ -73,9 +74,16 @@ class TipReference(Reference):
         """
 
     def assembly(self, t, linkage):
-        directions = known_directions(linkage, self.orientation)
-        seen = self.seen(t, unmoved_part(linkage, directions))
-        return solve_joints(linkage, directions, *seen, self.branch)
+        arm, placed = arm_of(linkage, self.orientation is not None)
+        directions = known_directions(arm, self.direction)
+        seen = self.seen(t, unmoved_part(arm, directions))
+        q, root = solve_joints(arm, directions, *seen, self.branch)
+        return placed(q), root
+
+    @property
+    def direction(self) -> Array:
+        """The last link's absolute angle; any, 0, where none is commanded [rad]."""
+        return jnp.zeros(()) if self.orientation is None else self.orientation
 
 
 class TipTask(TipReference):
@@ -139,10 +147,11 @@ class TipTask(TipReference):
         if isinstance(self.timing, Laps):  # all laps are alike
             end = min(end, ts[0] + abs(task.timing.period))
         times = np.linspace(ts[0], end, 1000, dtype=ts.dtype)
-        directions = known_directions(arm, task.orientation)
-        base = unmoved_part(arm, directions)
+        three, _ = arm_of(arm, task.orientation is not None)
+        directions = known_directions(three, task.direction)
+        base = unmoved_part(three, directions)
         wrist, bearing = task.seen(times, base)
-        q, _ = solve_joints(arm, directions, wrist, bearing, task.branch)
+        q, _ = solve_joints(three, directions, wrist, bearing, task.branch)
         inside = np.isfinite(q).all(axis=1)
         if not inside.all():
             raise ValueError(

@@ -37,6 +37,15 @@ USUAL = dict(
 FIG5 = dict(com=[[1.0, 0.0]] * 3, inertia=[0.0] * 3, q0=[0.0, 0.0, 0.0], t1=10.0)
 
 
+def chain(topology, **changes):
+    """Returns a scene of so many pairs, with the defaults of all scenes."""
+    n = len(topology)
+    sizes = dict.fromkeys(("inertia", "locked", "effort", "damping", "q0", "qd0"), n)
+    rows = {name: [USUAL[name][0]] * size for name, size in sizes.items()}
+    more = dict(length=[0.0] + [1.0] * n, com=[[0.5, 0.0]] * n, mass=[1.0] * n)
+    return rows | more | dict(topology=topology) | changes
+
+
 def heavy_tip(mass):
     return dict(mass=[1.0, 1.0, mass], t1=2.0)
 
@@ -50,17 +59,43 @@ SCENES = {
     "heavy-tip-1e6": heavy_tip(1e6),
     "light-tip-1e-6": light_tip(1e-6),
     "light-tip-1e-9": light_tip(1e-9),
-    "two-links": dict(
-        topology="RR",
-        length=[0.0, 1.0, 1.0],
-        com=[[0.5, 0.0]] * 2,
-        mass=[1.0, 1.0],
-        inertia=[1 / 12] * 2,
-        locked=[0.0, 0.0],
-        effort=[0.0, 0.0],
-        damping=[0.0, 0.0],
-        q0=[-0.5, 0.3],
-        qd0=[0.0, 0.0],
+    "two-links": chain("RR", q0=[-0.5, 0.3], t1=2.0),
+    "double-pendulum": chain(
+        "RR",
+        length=[0.0, 1.0, 0.7],
+        com=[[0.6, 0.1], [0.3, -0.2]],
+        mass=[1.5, 0.8],
+        q0=[0.4, 0.9],
+        t1=10.0,
+    ),
+    "cart-pole": chain(
+        "PR",
+        length=[0.0, 0.0, 1.0],
+        com=[[0.0, 0.0], [0.5, 0.0]],
+        mass=[1.0, 0.3],
+        # The slide is horizontal, across a ground that points down; the pole hangs.
+        base_angle=-float(np.pi / 2),
+        damping=[0.1, 0.02],
+        q0=[0.2, 2.5],
+        qd0=[0.5, 0.0],
+        t1=10.0,
+    ),
+    "five-links": chain(
+        "RRRRR",
+        length=[0.0, 0.5, 0.5, 0.5, 0.5, 0.5],
+        com=[[0.25, 0.05]] * 5,
+        q0=[-0.5, 0.3, 0.2, -0.4, 0.6],
+        damping=[0.2] * 5,
+    ),
+    "six-pairs": chain(
+        "PRRPRR",
+        length=[0.0, 0.5, 0.4, 0.3, 0.4, 0.5, 0.3],
+        com=[[0.2, 0.1]] * 6,
+        locked=[0.3, 0.0, 0.1, -0.5, 0.2, 0.0],
+        effort=[0.0, 0.0, 0.0, 20.0, 0.0, 0.0],
+        damping=[5.0, 1.0, 1.0, 20.0, 1.0, 0.5],
+        q0=[0.1, -0.5, 0.3, 0.2, -0.4, 0.6],
+        qd0=[0.3, 0.0, -0.5, 0.2, 0.0, 1.0],
         t1=2.0,
     ),
     "turn-slide-RPR": dict(
@@ -95,7 +130,12 @@ SCENES = {
     "fig5": FIG5,
 }
 # Derivatives of q at the end in these arguments.
-DERIVATIVES = {"driven-through-0-RPR": ("q0",), "fig5": ("q0", "mass", "length")}
+DERIVATIVES = {
+    "driven-through-0-RPR": ("q0",),
+    "fig5": ("q0", "mass", "length"),
+    "double-pendulum": ("q0",),
+    "six-pairs": ("q0", "mass"),
+}
 # Scenes whose accelerations along the motion are stored.
 ACCELERATIONS = {"turn-slide-RPR", "near-parallel-PPR", "near-parallel-RPP"}
 PARAMETERS = (
