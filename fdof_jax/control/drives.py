@@ -1,8 +1,7 @@
 """Servo drives, which turn a controller's command into a joint's effort.
 
-All drives work joint by joint. A command is a force element, for instance a
-`PDController`, a `PIDController` or another drive. It returns efforts, or voltages for
-a motor.
+A command is a force element, such as a `PDController` or another drive. It returns
+efforts, or voltages for a motor.
 """
 
 from abc import abstractmethod
@@ -94,7 +93,6 @@ class _Drive(StatefulElement):
         """The efforts (3,) and the rate of the drive's own state."""
 
     def initial_state(self, linkage):
-        """The `DriveState` at the start."""
         inner = element_of(self.command).initial_state(linkage)
         return DriveState(self.initial(), inner)
 
@@ -127,7 +125,6 @@ class FirstOrderLag(_Drive):
     start: Values = field(unit="N or N m", default=0.0, kw_only=True)
 
     def initial(self):
-        """The initial effort, (3,) [N or N m]."""
         return self.start
 
     def respond(self, command, qd, own):
@@ -204,8 +201,7 @@ class DCMotor(_Drive):
     )
 
     def initial(self):
-        """The initial currents, zeros (3,) [A]."""
-        return jnp.zeros(3)
+        return jnp.zeros(3)  # currents [A]
 
     def respond(self, command, qd, own):
         per_joint = self.constant * self.gear
