@@ -3,12 +3,13 @@
 The same solver takes the same steps with and without its watch over the conditioning.
 """
 
+import dataclasses
 from collections.abc import Iterator
 
 import equinox as eqx
 import jax.numpy as jnp
 
-from fdof_jax.simulation.unrolled_dopri8 import ScheduledTerm, UnrolledDopri8
+from fdof_jax.simulation.unrolled_dopri8 import UnrolledDopri8
 
 from . import problems
 from .contestants import cases, fdof_jax
@@ -26,7 +27,7 @@ class _Unwatched(UnrolledDopri8):
     def _plain(self, terms):
         field = terms.term.vector_field
         healthy = lambda *arguments: (field(*arguments), jnp.ones(()))
-        term = ScheduledTerm(field, healthy, terms.term.schedule)
+        term = dataclasses.replace(terms.term, watched_field=healthy)
         return eqx.tree_at(lambda wrapped: wrapped.term, terms, term)
 
     def init(self, terms, t0, t1, y0, args):

@@ -96,13 +96,14 @@ def _door(budget: float) -> Iterator[dict]:
     call = lambda: fj.simulate(scene.linkage, scene.state0, ts, scene.forces)
     inputs = scene.linkage, scene.state0, ts, None, scene.forces
     keywords = dict(
+        solver=None,
         stepsize_controller=None,
         dt0=jax.numpy.asarray(1e-3),
         adjoint=diffrax.RecursiveCheckpointAdjoint(),
         max_steps=65536,
         progress_meter=diffrax.NoProgressMeter(),
     )
-    solve: Callable = lambda: solve_one(None, inputs, keywords)[0]
+    solve: Callable = lambda: solve_one(inputs, keywords)[0]
     exact = np.asarray(call().q[-1])
     judge = lambda motion: {"error": float(np.abs(motion.q[-1] - exact).max())}
     yield from measure(

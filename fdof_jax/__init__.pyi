@@ -60,6 +60,7 @@ from .pictures import (
 )
 from .references.circle import CircleTask as CircleTask
 from .references.task import TipTask as TipTask
+from .simulation.efforts import Efforts as Efforts, joint_efforts as joint_efforts
 from .simulation.prescribed import PrescribedMotion as PrescribedMotion
 from .simulation.sampled import (
     SampledMotion as SampledMotion,
@@ -67,8 +68,8 @@ from .simulation.sampled import (
     step as step,
 )
 from .simulation.scene import Scene as Scene
-from .simulation.simulate import joint_efforts as joint_efforts, simulate as simulate
-from .simulation.solution import Efforts as Efforts, Solution as Solution
+from .simulation.simulate import simulate as simulate
+from .simulation.solution import Solution as Solution
 from .simulation.steps import scale_tolerances as scale_tolerances
 from .simulation.sweep import sweep as sweep
 from .tuning.result import TuneResult as TuneResult

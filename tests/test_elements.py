@@ -80,7 +80,7 @@ def state_of(solution):
 def all_acts(linkage, forces, t, q, qd, grown):
     """Returns the elements' actions at a moment, in grown states, and first states."""
     args = Args(linkage, q, None, forces)
-    own = jnp.stack(*initial_own(args))
+    own = jnp.stack(initial_own(args))
     y = zeros(q), tuple(qd), tuple(own + grown * jnp.cos(jnp.arange(own.size)))
     found = applied(t, y, args, schedule_of(t, args))
     leaves = jax.tree.leaves((found, own))
@@ -150,7 +150,7 @@ def test_reverse_mode_at_an_instant_equals_differences(kinds):
     """
     forces = tuple(elements.ALL[kind] for kind in kinds)
     labels = names(forces)
-    ends = np.cumsum([len(labels), 3, 3, *map(len, initial_own(arguments(forces)))])
+    ends = np.cumsum([len(labels), 3, 3, len(initial_own(arguments(forces)))])
 
     @jax.jit
     def found(t, x):
@@ -265,7 +265,7 @@ def arguments(forces):
 def field_flops(*forces):
     q, t = elements.START.q, jnp.array(0.1)
     args = arguments(forces)
-    y = zeros(q), tuple(elements.START.qd), *initial_own(args)
+    y = zeros(q), tuple(elements.START.qd), initial_own(args)
     return flops(field, t, y, args)
 
 

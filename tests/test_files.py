@@ -34,7 +34,7 @@ from saved_trees import (
 import fdof_jax as fj
 from fdof_jax import scenes
 from fdof_jax.shell.tuning_run import Job
-from fdof_jax.simulation import integrate
+from fdof_jax.simulation import prescribed
 from fdof_jax.simulation.looped_dopri8 import LoopedDopri8
 from fdof_jax.tuning import tuning
 
@@ -128,13 +128,13 @@ def test_a_loaded_scene_simulates_the_same_without_a_compilation(
     path, solved, monkeypatch
 ):
     calls = []
-    original = integrate.vector_field
+    original = prescribed.vector_field
 
     def counted(*arguments):
         calls.append(1)
         return original(*arguments)
 
-    monkeypatch.setattr(integrate, "vector_field", counted)
+    monkeypatch.setattr(prescribed, "vector_field", counted)
     call, solution = solved
     loaded = saved_and_loaded(path, call, OWN)
     same(fj.simulate(*loaded), solution)

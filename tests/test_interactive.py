@@ -11,7 +11,7 @@ from fdof_jax.interactive import sliders
 
 import fdof_jax as fj
 from fdof_jax import scenes
-from fdof_jax.simulation import integrate
+from fdof_jax.simulation import prescribed
 from fdof_jax.tuning.gains import with_gains
 
 CIRCLES = fj.tuning.circle_scenes()
@@ -77,7 +77,7 @@ def test_the_error_is_that_of_a_simulation(box):
 
 
 def test_nothing_is_compiled_after_the_first_picture(box, monkeypatch):
-    monkeypatch.setattr(integrate, "vector_field", None)  # no second trace
+    monkeypatch.setattr(prescribed, "vector_field", None)  # no second trace
     shown = {name: box.move(arm=name, A2=1.1).tobytes() for name in fj.TOPOLOGIES}
     assert len(set(shown.values())) == 7
 

@@ -111,6 +111,15 @@ class Swinging(fj.references.Path):
         return self.middle + 1.2 * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
 
 
+def test_a_path_without_middle_is_refused():
+    class Nowhere(fj.references.Path):
+        def point(self, share):
+            return jnp.stack([share, share])
+
+    with pytest.raises(ValueError, match="^path: expected a Path that .*`middle`.*got"):
+        fj.TipTask(Nowhere(), fj.references.Laps(1.0))
+
+
 def test_many_laps_are_as_good_as_one():
     arm = fj.Linkage(
         "RRR", length=[0, 1, 1, 0.3], com=[[0.5, 0]] * 3, mass=[1] * 3,

@@ -14,7 +14,7 @@ from sweep_batch import CHUNK, run
 
 import fdof_jax as fj
 from fdof_jax.checks import is_traced
-from fdof_jax.simulation import chunks, integrate
+from fdof_jax.simulation import chunks, prescribed
 
 # Checkpoints
 
@@ -159,13 +159,13 @@ def test_more_devices_and_processes_change_nothing(clean, tmp_path):
 
 def test_other_values_need_no_new_trace(batch, clean, monkeypatch):
     calls = []
-    original = integrate.vector_field
+    original = prescribed.vector_field
 
     def counted(*arguments):
         calls.append(1)
         return original(*arguments)
 
-    monkeypatch.setattr(integrate, "vector_field", counted)
+    monkeypatch.setattr(prescribed, "vector_field", counted)
     linkage, (q, qd), forces = batch
     other = run((linkage, fj.State(q + 0.1, qd), forces))
     assert not calls

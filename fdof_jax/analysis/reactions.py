@@ -13,7 +13,7 @@ from ..forces.element import Forces, elements
 from ..linkage.frames import cross, frames
 from ..linkage.linkage import Linkage
 from ..mechanics.kinematics import joint_positions, mass_center_velocities, mass_centers
-from ..simulation.simulate import joint_efforts
+from ..simulation.efforts import joint_efforts
 from ..simulation.solution import Solution
 from ..xla.array_namespace import plane_vectors
 
@@ -32,10 +32,10 @@ def _loads(
                 "method `loads` that says which points of links carry them, got "
                 f"{element!r}."
             )
-        for point, push, turn in loads:
-            about_pivot = turn + cross(point.place(parts), push)
-            force = force.at[point.link].add(push)
-            moment = moment.at[point.link].add(about_pivot)
+        for load in loads:
+            about_pivot = load.moment + cross(load.point.place(parts), load.vector())
+            force = force.at[load.point.link].add(load.vector())
+            moment = moment.at[load.point.link].add(about_pivot)
     return force, moment
 
 

@@ -1,8 +1,7 @@
 """Servo drives, which turn a controller's command into a joint's effort.
 
-All drives work joint by joint. A command is a force element, for instance a
-`PDController`, a `PIDController` or another drive. It returns efforts, or voltages for
-a motor.
+A command is a force element, such as a `PDController` or another drive. It returns
+efforts, or voltages for a motor.
 """
 
 from abc import abstractmethod
@@ -95,7 +94,6 @@ class _Drive(StatefulElement):
         """The efforts (n,) and the rate of the drive's own state."""
 
     def initial_state(self, linkage):
-        """The `DriveState` at the start."""
         inner = element_of(self.command).initial_state(linkage)
         return DriveState(self.initial(linkage), inner)
 
@@ -128,7 +126,6 @@ class FirstOrderLag(_Drive):
     start: Values = field(unit="N or N m", default=0.0, kw_only=True)
 
     def initial(self, linkage):
-        """The initial effort, (n,) [N or N m]."""
         return jnp.broadcast_to(self.start, joints_of(linkage))
 
     def respond(self, command, qd, own):
@@ -205,8 +202,7 @@ class DCMotor(_Drive):
     )
 
     def initial(self, linkage):
-        """The initial currents, zeros (n,) [A]."""
-        return jnp.zeros(joints_of(linkage))
+        return jnp.zeros(joints_of(linkage))  # currents [A]
 
     def respond(self, command, qd, own):
         per_joint = self.constant * self.gear

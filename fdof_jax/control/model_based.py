@@ -33,7 +33,6 @@ class ModelBased(PDController):
         return linkage if self.model is None else self.model
 
     def check(self, linkage: Linkage, ts: Array) -> None:
-        """Runs the checks of a PD controller, and checks the model and its topology."""
         super().check(linkage, ts)
         ModelBased.__check_init__(self)
         if not np.array_equal(self._believed(linkage).ef, linkage.ef):
@@ -43,7 +42,6 @@ class ModelBased(PDController):
             )
 
     def possible(self) -> Array:
-        """Returns whether no gain or limit is negative and the model is possible."""
         own = super().possible()
         return own if self.model is None else own & possible(self.model)
 
@@ -132,7 +130,6 @@ class ComputedTorque(ModelBased):
     gain_units: ClassVar = dict.fromkeys("RP", ("1/s^2", "1/s"))
 
     def schedule(self, t, linkage):
-        """The reference motion and its accelerations: (q_ref, qd_ref, qdd_ref)."""
         t = real_array("t", t, ())
         motion = lambda t: reference_motion(self.reference, t, linkage)
         (q_ref, qd_ref), (_, qdd_ref) = jax.jvp(motion, (t,), (jnp.ones_like(t),))

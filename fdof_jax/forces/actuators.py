@@ -45,7 +45,7 @@ class Armature(InertialElement):
         return jnp.broadcast_to(self.inertia, joints_of(linkage))
 
     def loads(self, t, q, qd, qdd, linkage):
-        """Returns no loads: the rotors act in the joints themselves."""
+        """Returns no loads: the rotors act in the joints."""
         return ()
 
 
@@ -127,10 +127,9 @@ class LinearActuator(InertialElement):
     def loads(
         self, t: Array, q: Array, qd: Array, qdd: Array, linkage: Linkage
     ) -> tuple[Load, Load]:
-        """Loads of the pins on the links while the joints accelerate by `qdd`.
+        """Loads of the pins on the links: the force between them, weight and inertia.
 
-        The loads hold the force between the pins and the weight and inertia of the two
-        bodies. The moments about the first pin determine each pin's sideways share.
+        The moments about the first pin determine each pin's sideways share.
         """
         along = lambda q, qd: jax.jvp(
             lambda q: self.coordinates(q, linkage), (q,), (qd,)

@@ -29,10 +29,7 @@ from .points import (
 
 
 class LineElement(PointElement):
-    """A force element that pulls two points together along the line that joins them.
-
-    A subclass implements `pull`.
-    """
+    """A force element that pulls two points together along the line that joins them."""
 
     ends: eqx.AbstractVar[Separation]
 

@@ -1,11 +1,7 @@
 """Force elements: forces and torques on the joints besides gravity.
 
-A scene holds a tuple of elements, whose efforts add up. The PD controller is an element
-too: see `control`. Where such a tuple enters the library, `elements` adapts other
-callables, such as plain functions.
-
-Where values are concrete, `simulate` reads `jump_ts` and checks values in a copy of the
-element with NumPy arrays, for which JAX compiles nothing.
+A scene holds a tuple of elements, whose efforts add up. Where such a tuple enters the
+library, `elements` adapts other callables, such as plain functions.
 """
 
 import inspect
@@ -32,8 +28,8 @@ class Element(Part):
     - `conditions`: conditions on values, beside the bounds that `field` declares.
     - `jump_ts`: times at which the efforts jump; steps end there [s]. By default they
       are those of its fields: of a reference, or of a function of time.
-    - `check(linkage, ts)`: raises ValueError if the element does not fit the arm. It is
-      called by `simulate` where values are known.
+    - `check(linkage, ts)`: raises ValueError if the element does not fit the arm;
+      `simulate` calls it where values are known.
     - `potential_energy(q, linkage)`: energy that it stores, () [J]; by default None.
 
     An element with a state is a `StatefulElement`, one that moves masses is an
@@ -73,10 +69,7 @@ class Element(Part):
     def loads_on_points(
         self, t: Array, q: Array, qd: Array, qdd: Array, linkage: Linkage
     ) -> tuple[Any, ...] | None:
-        """Returns the loads on points of links, which the bearings carry.
-
-        `joint_reactions` calls it, and rejects elements that return None.
-        """
+        """Returns the `Load`s that bearings carry; None: `joint_reactions` raises."""
         return ()
 
 
@@ -135,10 +128,7 @@ class ScalarElement(Element):
 
 
 class StatefulElement(Element):
-    """A force element with a state of its own: an integral, a current, a lag.
-
-    A subclass implements both methods; its efforts are in [N or N m].
-    """
+    """A force element with a state of its own: an integral, a current, a lag."""
 
     @abstractmethod
     def initial_state(self, linkage: Linkage) -> Any:
@@ -181,10 +171,7 @@ class InertialElement(Element):
     def loads(
         self, t: Array, q: Array, qd: Array, qdd: Array, linkage: Linkage
     ) -> tuple[Any, ...] | None:
-        """Returns the loads on points of links, a tuple of `points.Load`.
-
-        Only `joint_reactions` calls it, and rejects elements that return None.
-        """
+        """Returns the `Load`s of the masses on points, for `joint_reactions` alone."""
         return None
 
     def loads_on_points(self, t, q, qd, qdd, linkage):

@@ -81,7 +81,6 @@ class EffortHistory(ScalarElement):
         yield Condition(same, "tau", f"{times} rows, one per time", (efforts,))
 
     def schedule(self, t, linkage):
-        """Returns the efforts at a time."""
         columns = jax.vmap(lambda tau: jnp.interp(t, self.ts, tau), in_axes=1)(self.tau)
         return tuple(columns)
 

@@ -1,9 +1,8 @@
 """The base of elements, references, paths and timings: declared values and conditions.
 
-What its values must fulfil is declared once: bounds of an array by `field`, all else by
-`conditions`. Constructors raise ValueError for values that do not fulfil it. `simulate`
-raises it too, since `equinox.tree_at` bypasses constructors. Where values are traced,
-`possible` reports it to the program.
+Bounds of an array are declared by `field`, all else by `conditions`. Constructors raise
+ValueError for other values. `simulate` raises it too, since `equinox.tree_at` bypasses
+constructors. Where values are traced, `possible` reports them to the program.
 """
 
 import dataclasses
@@ -43,8 +42,8 @@ def field(
 ) -> Any:
     """Declares a field of an element or a reference that is an array of real numbers.
 
-    The constructor converts what it is given. It refuses values out of bounds, as does
-    `simulate`; if they are traced, the motion ends as not finite.
+    Constructors and `simulate` raise ValueError for values out of bounds; if they are
+    traced, the motion ends as not finite.
 
     **Arguments:**
 
@@ -118,10 +117,7 @@ class Part(eqx.Module, metaclass=_Fields):
     jump_ts = default(lambda self: jumps_of(*(part for _, part in _within(self))))
 
     def check(self, linkage: Linkage, ts: Array) -> None:
-        """Raises ValueError unless it fits the arm and the times; all values are known.
-
-        By default it runs the checks of the parts within.
-        """
+        """Raises ValueError unless it fits the arm and the times, all known."""
         for _, part in _within(self):
             part.check(linkage, ts)
 
@@ -145,10 +141,7 @@ class Part(eqx.Module, metaclass=_Fields):
 
 
 def check_values(place: str, part: Part) -> None:
-    """Raises ValueError for known values that constructors would not accept.
-
-    `place`: where the part stands among the arguments, for the message.
-    """
+    """Raises ValueError for known values that constructors would not accept."""
     for name, value, rules in _declared(part):
         real_array(f"{place}.{name}", value, **rules)
     _refuse(f"{place}.", part)
@@ -232,11 +225,7 @@ def optional(name: str, absent: Any = None) -> Any:
 
 
 class Foreign(Part):
-    """A callable that is no part, and what its attributes say.
-
-    They have the names of a part's, and all are optional: `jump_ts`, `check`,
-    `possible`. Nothing else in the library asks a callable for attributes.
-    """
+    """A callable that is no part; it may have some of a part's attributes."""
 
     called: Any
 

@@ -91,19 +91,25 @@ class Point(Part):
 class Load(NamedTuple):
     """A force and a moment on a point.
 
-    - `force`: x + iy, a complex number [N]; `moment`: counter-clockwise [N m].
+    - `force`: (x, y) [N]; `moment`: counter-clockwise [N m].
     """
 
     point: Point
-    force: Array
+    force: Any
     moment: Any = 0.0
 
-    def efforts(self, frames: Frames) -> tuple[Array, ...]:
-        """Computes the joint efforts that do the same work [N or N m].
+    def vector(self) -> Array:
+        """Returns the force x + iy [N]."""
+        try:
+            x, y = self.force
+        except TypeError:  # the library's own loads, and those of version 0.1
+            return self.force
+        return jax.lax.complex(*(jnp.asarray(part, float) for part in (x, y)))
 
-        A joint moves only the links beyond it.
-        """
-        efforts = work(frames, self.point.place(frames), self.force, self.moment)
+    def efforts(self, frames: Frames) -> tuple[Array, ...]:
+        """Computes the joint efforts that do the same work [N or N m]."""
+        # A joint moves only the links beyond it.
+        efforts = work(frames, self.point.place(frames), self.vector(), self.moment)
         return tuple(
             jnp.where(k < self.point.link, effort, 0)
             for k, effort in enumerate(efforts)
@@ -124,22 +130,21 @@ def work(
 class PointElement(ScalarElement):
     """A force element that acts on points of links or of the ground.
 
-    A subclass implements `loads` [N and N m]. The bearings carry these loads, unlike
-    efforts in the joints: see `joint_reactions`.
+    The bearings carry its loads, unlike efforts in the joints: see `joint_reactions`.
 
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig5().linkage
     >>> class Weight(fj.forces.PointElement):
     ...     def loads(self, scheduled, frames, qd):
     ...         tip = fj.Point(3, 1.0)
-    ...         return (fj.forces.Load(tip, force=-10j),)  # downwards
+    ...         return (fj.forces.Load(tip, force=(0, -10)),)  # downwards
     >>> Weight()(0.0, [0.0, 0.0, 0.0], [0.0, 0.0, 0.0], arm).tolist()
     [-30.0, -20.0, -10.0]
     """
 
     @abstractmethod
     def loads(self, scheduled: Any, frames: Frames, qd: Scalars) -> tuple[Load, ...]:
-        """Returns the loads on points, given the result of `schedule`."""
+        """Returns the loads on points [N and N m], given the result of `schedule`."""
 
     def respond(self, scheduled, q, qd, linkage):
         frames = scalar_frames(linkage, q)

@@ -26,7 +26,7 @@ from ..dynamics import energy, link_energies
 from ..forces.element import Forces, InertialElement, elements
 from ..linkage.linkage import Linkage
 from ..linkage.topology import real_joints
-from ..simulation.simulate import joint_efforts
+from ..simulation.efforts import joint_efforts
 from ..simulation.solution import Solution
 from .axes import (
     BLACK,

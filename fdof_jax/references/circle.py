@@ -27,8 +27,8 @@ class CircleTask(TipReference):
 
     A call with `(t, linkage)` returns the joint reference, computed by the closed-form
     inverse kinematics and its exact rate. The reference is continuous in time, also
-    where the path crosses the negative x axis or winds around the base. At t = 0 it
-    equals that of `inverse_kinematics`.
+    where the path winds around the base, which no `TipTask` may do. At t = 0 it equals
+    that of `inverse_kinematics`.
 
     The circle of Fig 7 is not printed in the paper: the default is our choice. It lies
     inside the reach of the figure's arm and starts 0.25 m from the arm's tip, because
@@ -74,7 +74,7 @@ class CircleTask(TipReference):
         """The wrist and its angle, which starts within a turn.
 
         The angle of the larger vector, to the centre or from there, is continuous. The
-        smaller one adds at most a quarter turn, over which the arctangent is so too.
+        smaller one adds at most a quarter turn.
         """
         xp, hub = namespace(t, self.phase), plane_vector(*self.center) - base
         angle, ray = _ray(self, xp.stack([t, xp.zeros_like(t)]))

@@ -29,10 +29,7 @@ class Path(Part):
     [-4.0, 2.25]
     """
 
-    @default
-    def middle(self) -> Array:
-        """A point (x, y) amid the curve [m]."""
-        raise NotImplementedError(f"{type(self).__name__} has no `middle`")
+    middle = default(lambda self: None)  # a point (x, y) amid the curve [m]
 
     @abstractmethod
     def point(self, share: Array) -> Array:

@@ -118,6 +118,11 @@ class TipTask(TipReference):
     orientation: Values = field((), unit="rad", default=0.0, kw_only=True)
     branch: Values = field((), unit="", default=1, kw_only=True)
 
+    def conditions(self):
+        yield from super().conditions()
+        known, expected = self.path.middle is not None, "a Path that defines `middle`"
+        yield Condition(known, "path", f"{expected}, a point (x, y)", (self.path,))
+
     def tip(self, t: ArrayLike) -> Float[Array, " 2"]:
         """The commanded tip position at time `t` [s]: (x, y) [m]."""
         return self.path.point(self.timing(real_array("t", t, ())))

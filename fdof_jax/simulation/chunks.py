@@ -13,16 +13,16 @@ import numpy as np
 from jax import Array
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from numpy.typing import ArrayLike
 
 from ..dynamics import forward_dynamics
 from ..forces.element import elements
 from ..linkage.topology import real_joints
+from ..xla.array_namespace import in_numpy
 from .batch_axes import Batch
 from .field import element_effort
 from .simulate import simulate
 from .solution import Solution
-from .step_wrappers import limited
+from .step_wrappers import Limited
 from .steps import default_controller
 
 _FIRST_LIMIT = 256  # limit of steps in the first chunk
@@ -30,27 +30,21 @@ _SLACK = 2.0  # a member may take this many times the steps of most others
 _SMALL = 8  # lanes of the chunks for a few slow members
 
 
-def floats_of(value: ArrayLike) -> Array:
-    array = jnp.asarray(value)
-    return array.astype(float) if array.dtype.kind in "iu" else array
+def _adaptive(settings: dict) -> bool:
+    controller = settings["stepsize_controller"] or default_controller()
+    return isinstance(controller, diffrax.AbstractAdaptiveStepSizeController)
 
 
-def motion_of(settings: dict, ts: Array, moving: Any, shared: Any, limit: Array | None):
-    """Computes one member's solution, without the times that all share."""
+def motion_of(
+    settings: dict, ts: Array, moving: Any, shared: Any, limit: Array | None
+) -> Solution:
+    """Computes one member's motion, with a limit of adaptive steps if it is given."""
     linkage, state0, forces = eqx.combine(moving, shared)
-    controller = settings["stepsize_controller"]
-    if limit is not None:
-        inner = default_controller() if controller is None else controller
-        controller = limited(inner, limit)
-    solution = simulate(
-        linkage,
-        state0,
-        ts,
-        forces,
-        throw=False,
-        **{**settings, "stepsize_controller": controller},
-    )
-    return solution.q, solution.qd, solution.own, solution.stats, solution.result
+    if limit is not None and _adaptive(settings):
+        inner = settings["stepsize_controller"] or default_controller()
+        limited = Limited(inner, limit)  # pyright: ignore[reportCallIssue]
+        settings = settings | {"stepsize_controller": limited}
+    return simulate(linkage, state0, ts, forces, throw=False, **settings)
 
 
 @eqx.filter_jit
@@ -104,18 +98,17 @@ class _Chunks:
 
     def __init__(self, batch: Batch, ts: Array, settings: dict, folder: Path | None):
         moving, self.shared = batch.split()
-        self.leaves, self.structure = jax.tree.flatten(moving)
-        self.leaves = [np.asarray(leaf) for leaf in self.leaves]
+        self.moving = in_numpy(moving)
         self.ts, self.settings, self.folder = ts, settings, folder
         devices = jax.devices()
         self.devices = len(devices)
         self.mesh = Mesh(np.array(devices), ("member",)) if len(devices) > 1 else None
         self.size = batch.size
         self.results: list[np.ndarray] = []
-        self.result_structure: Any = None
+        self.structure: Any = None  # of a solution
         if folder is not None:
             folder.mkdir(parents=True, exist_ok=True)
-            self.digest = hashlib.sha256(repr((settings, batch.axes)).encode())
+            self.digest = hashlib.sha256(repr((settings, batch.batched)).encode())
             # The repr of the settings leaves out the values of arrays.
             arrays = eqx.filter(settings, eqx.is_array)
             for leaf in jax.tree.leaves((batch.inputs, ts, arrays)):
@@ -127,28 +120,20 @@ class _Chunks:
         """Solves members, at most `lanes` per device; returns their step counts."""
         padded = np.full(lanes * self.devices, members[0])
         padded[: len(members)] = members
-        moving = jax.tree.unflatten(
-            self.structure, [self._place(leaf[padded]) for leaf in self.leaves]
-        )
-        path = None
-        if self.folder is not None:
-            # Another chunk size groups other members.
-            digest = self.digest.copy()
-            digest.update(repr((members.tolist(), limit)).encode())
-            path = self.folder / f"{digest.hexdigest()[:32]}.npz"
-        limit_array = np.asarray(limit, np.int32)
+        moving = jax.tree.map(lambda leaf: self._place(leaf[padded]), self.moving)
         arguments = (
-            self.settings, self.mesh, self.ts, moving, self.shared, limit_array
+            self.settings, self.mesh, self.ts, moving, self.shared,
+            np.asarray(limit, np.int32),
         )  # fmt: skip
+        path = self._path(members, limit)
         if path is not None and path.exists():
             with np.load(path) as saved:
-                values = [saved[f"arr_{i}"] for i in range(len(saved.files))]
-            if self.result_structure is None:
-                self.result_structure = jax.tree.structure(
-                    eqx.filter_eval_shape(_solve_chunk, *arguments)
-                )
+                values = list(saved.values())
+            if self.structure is None:
+                like = eqx.filter_eval_shape(_solve_chunk, *arguments)
+                self.structure = jax.tree.structure(like)
         else:
-            solved, self.result_structure = jax.tree.flatten(_solve_chunk(*arguments))
+            solved, self.structure = jax.tree.flatten(_solve_chunk(*arguments))
             if jax.process_count() > 1:
                 solved = multihost_utils.process_allgather(solved, tiled=True)
             values = [np.asarray(leaf)[: len(members)] for leaf in solved]
@@ -163,8 +148,15 @@ class _Chunks:
             ]
         for kept, value in zip(self.results, values):
             kept[members] = value
-        *_, stats, _ = jax.tree.unflatten(self.result_structure, values)
-        return stats["num_steps"]
+        return jax.tree.unflatten(self.structure, values).stats["num_steps"]
+
+    def _path(self, members: np.ndarray, limit: int) -> Path | None:
+        """Returns the file of a chunk; another chunk size groups other members."""
+        if self.folder is None:
+            return None
+        digest = self.digest.copy()
+        digest.update(repr((members.tolist(), limit)).encode())
+        return self.folder / f"{digest.hexdigest()[:32]}.npz"
 
     def _place(self, rows: np.ndarray) -> np.ndarray | Array:
         if jax.process_count() == 1:
@@ -172,12 +164,6 @@ class _Chunks:
         assert self.mesh is not None  # several processes have several devices
         sharding = NamedSharding(self.mesh, PartitionSpec("member"))
         return jax.make_array_from_callback(rows.shape, sharding, lambda i: rows[i])
-
-    def solution(self) -> Solution:
-        leaves = [jnp.asarray(leaf) for leaf in self.results]
-        q, qd, own, stats, result = jax.tree.unflatten(self.result_structure, leaves)
-        ts = jnp.broadcast_to(self.ts, (self.size, *self.ts.shape))
-        return Solution(ts, q, qd, stats, result, own)
 
 
 def in_chunks(
@@ -192,9 +178,11 @@ def in_chunks(
     waiting = np.lexsort((work, topology))  # NaN comes last
     chunks = _Chunks(batch, ts, settings, folder)
     max_steps = settings["max_steps"] or np.iinfo(np.int32).max
+    # Members with steps of given lengths take equally many.
+    first = _FIRST_LIMIT if _adaptive(settings) else max_steps
     # Small batches are cut too, so that a slow member delays few others.
     share = -(-batch.size // (8 * chunks.devices))
-    lanes, limit = min(chunk, max(share, 8 * _SMALL)), _FIRST_LIMIT
+    lanes, limit = min(chunk, max(share, 8 * _SMALL)), first
     done, progress = 0, meter.init()
     while len(waiting):
         late = []
@@ -213,10 +201,11 @@ def in_chunks(
             done += len(members) - out_of_steps.sum()
             progress = meter.step(progress, jnp.asarray(done / batch.size))
             typical = np.percentile(steps[~out_of_steps], 90)
-            limit = max(int(_SLACK * typical), _FIRST_LIMIT // 4)
+            limit = max(int(_SLACK * typical), first // 4)
         waiting = np.concatenate(late)
         limit = 8 * limit
         if len(waiting) <= lanes // 2:
             lanes = min(lanes, _SMALL) if len(waiting) > 1 else 1
     meter.close(progress)
-    return chunks.solution()
+    leaves = [jnp.asarray(leaf) for leaf in chunks.results]
+    return jax.tree.unflatten(chunks.structure, leaves)

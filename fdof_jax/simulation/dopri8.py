@@ -34,9 +34,8 @@ class ScheduledTerm(diffrax.ODETerm):
     """A term whose vector field takes a fourth argument, which depends on time alone.
 
     `schedule(t, args)` computes this argument, for all stages of a step at once.
-    `health(t, y, args)` is positive where the equations have a solution and 0 where
-    they are singular. `watched_field` takes the arguments of the vector field and
-    returns the rates and their health, NaN where the rates are not finite.
+    `health(t, y, args)` is positive, or 0 where the equations are singular.
+    `watched_field` returns the rates and their health, NaN if they are not finite.
     """
 
     vector_field: Callable[..., PyTree] = eqx.field(static=True)
@@ -104,14 +103,17 @@ def constant(tree: PyTree) -> PyTree:
     )
 
 
-def verdict(singular: Array, bad: Array, h: Any) -> tuple[Array, Any]:
-    """Returns the error to impose on a step in bad health, and the step's result.
+def verdict(error: PyTree, health: Array, h: Array) -> tuple[PyTree, Any]:
+    """Returns the error of a step, replaced if its health is bad, and its result.
 
-    An infinite error rejects the step until it is short. diffrax ignores the results of
+    The health is NaN for a step that is not finite, and 0 for a singular one. An
+    infinite error rejects the step until it is short. diffrax ignores the results of
     rejected steps, so the short step is accepted, with error 0.
     """
-    short = jnp.abs(h) < SHORTEST[h.dtype]
+    singular, short = health == 0, jnp.abs(h) < SHORTEST[h.dtype]
+    bad = singular | jnp.isnan(health)
     results: Any = diffrax.RESULTS
     kind = results.where(singular, results.singular, results.nonfinite)
     result = results.where(bad & short, kind, results.successful)
-    return jnp.where(short, 0, jnp.inf), result
+    imposed = jnp.where(short, 0, jnp.inf)
+    return jtu.tree_map(lambda e: jnp.where(bad, imposed, e), error), result

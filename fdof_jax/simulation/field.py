@@ -1,5 +1,6 @@
 """The vector field of a linkage with force elements, as integrators call it."""
 
+from itertools import islice
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -11,7 +12,7 @@ from jax import Array
 from ..forces.added_inertia import added_inertia, inertial
 from ..forces.element import Element, ScalarElement, StatefulElement
 from ..linkage.linkage import Linkage
-from ..mechanics.equations import Constants, Upper, zeros
+from ..mechanics.equations import Constants, Scalars, Upper, link_constants, zeros
 from ..mechanics.rates import conditioning, rates, rates_and_conditioning
 from ..xla.callbacks import with_checks
 
@@ -27,6 +28,12 @@ class Args(NamedTuple):
     forces: tuple[Element, ...]
 
 
+def args_of(linkage: Linkage, q0: Array, forces: tuple[Element, ...]) -> Args:
+    # XLA's own sine and cosine, once per solve, as start angles may be large.
+    constants = link_constants(linkage, q0, lambda x: (jnp.sin(x), jnp.cos(x)))
+    return Args(linkage, q0, constants, forces)
+
+
 @with_checks
 def schedule_of(t: Array, args: Args) -> tuple[Any, ...]:
     """Returns each element's schedule."""
@@ -38,19 +45,28 @@ def stateful(forces: tuple[Element, ...]) -> list[StatefulElement]:
     return [element for element in forces if isinstance(element, StatefulElement)]
 
 
-def own_states(args: Args, scalars: tuple[Array, ...]) -> list[Any]:
+def initial_states(linkage: Linkage, forces: tuple[Element, ...]) -> tuple[Any, ...]:
+    return tuple(element.initial_state(linkage) for element in stateful(forces))
+
+
+def initial_own(args: Args, own0: Any = None) -> tuple[Array, ...]:
+    """Returns the elements' initial states as scalars: `own0`, or their defaults."""
+    own = initial_states(args.linkage, args.forces) if own0 is None else own0
+    return _scalars(own, args.q0.dtype)
+
+
+def whole(delta: Any, qd: Any, own: tuple[Array, ...]) -> tuple[Any, ...]:
+    """Returns an integrated state, or its rates; diffrax takes no empty tuple in it."""
+    return (delta, qd, own) if own else (delta, qd)
+
+
+def own_states(args: Args, y: Any) -> tuple[Any, ...]:
     """Rebuilds the states of the stateful elements from the integrated scalars."""
-    states, place = [], 0
-    for element in stateful(args.forces):
-        shapes = jax.eval_shape(element.initial_state, args.linkage)
-        leaves, structure = jax.tree.flatten(shapes)
-        arrays = []
-        for leaf in leaves:
-            own = scalars[place : place + leaf.size]
-            arrays.append(jnp.array(own).reshape(leaf.shape))
-            place += leaf.size
-        states.append(jax.tree.unflatten(structure, arrays))
-    return states
+    left = iter(y[2] if len(y) > 2 else ())
+    return jax.tree.map(
+        lambda leaf: jnp.array([*islice(left, leaf.size)]).reshape(leaf.shape),
+        jax.eval_shape(lambda: initial_states(args.linkage, args.forces)),
+    )
 
 
 def _scalars(tree: Any, dtype: Any) -> tuple[Array, ...]:
@@ -58,19 +74,16 @@ def _scalars(tree: Any, dtype: Any) -> tuple[Array, ...]:
     return tuple(jnp.concatenate(leaves)) if leaves else ()
 
 
-class Applied(NamedTuple):
-    """Efforts of the force elements, rates of their states, and inertia they add."""
-
-    tau: tuple[Array, ...]
-    own_rates: tuple[Array, ...]
-    added: Upper | None
-
-
 @with_checks
-def applied(t: Any, y: Any, args: Args, schedule: tuple[Any, ...]) -> Applied:
-    """Evaluates the force elements; builds arrays only where an element needs them."""
-    delta, qd, *own = y
-    states = iter(own_states(args, *own) if own else ())
+def applied(
+    t: Any, y: Any, args: Args, schedule: tuple[Any, ...]
+) -> tuple[Scalars, Scalars, Upper | None]:
+    """Returns efforts of the elements, rates of their states, and inertia they add.
+
+    Builds arrays only where an element needs them.
+    """
+    delta, qd, *_ = y
+    states = iter(own_states(args, y))
     tau, own_rates = None, []
     arrays = lambda: (args.q0 + jnp.stack(delta), jnp.stack(qd))
     for index, (element, scheduled) in enumerate(zip(args.forces, schedule)):
@@ -86,35 +99,43 @@ def applied(t: Any, y: Any, args: Args, schedule: tuple[Any, ...]) -> Applied:
         tau = effort if tau is None else tuple(a + b for a, b in zip(tau, effort))
     tau = zeros(args.q0) if tau is None else tuple(tau)
     if not inertial(args.forces):
-        return Applied(tau, tuple(own_rates), None)
+        return tau, tuple(own_rates), None
     added, bias = _added(args.linkage, inertial(args.forces), *arrays())
     tau = tuple(a - b for a, b in zip(tau, bias))
-    return Applied(tau, tuple(own_rates), added)
+    return tau, tuple(own_rates), added
 
 
 _added: Any = eqx.filter_jit(added_inertia)  # traced once, not at each use by a solver
 
 
+def health_at(loss: Array) -> Array:
+    """Returns the health at a loss of accuracy: positive, or 0 if too much is lost."""
+    return jnp.where(loss * LEAST_INERTIA_RATIO[loss.dtype] > 1, 0, loss)
+
+
+def health_with(rates: Any, health: Array) -> Array:
+    """Returns the health beside rates: NaN where they are not finite.
+
+    A singular matrix also makes accelerations not finite; health 0 prevails.
+    """
+    finite = jnp.isfinite(sum(jax.tree.leaves(rates)))
+    return jnp.where(finite | (health == 0), health, jnp.nan)
+
+
 def vector_field(t, y, args, schedule) -> tuple[Any, ...]:
     """Rates of joint displacements, of velocities and of the elements' own states."""
-    delta, qd, *own = y
-    acting = applied(t, y, args, schedule)
-    moving = rates(args.constants, delta, qd, acting.tau, acting.added)
-    return (*moving, acting.own_rates) if own else moving
+    delta, qd, *_ = y
+    tau, own_rates, added = applied(t, y, args, schedule)
+    return whole(*rates(args.constants, delta, qd, tau, added), own_rates)
 
 
 def watched_field(t, y, args, schedule) -> tuple[tuple[Any, ...], Array]:
     """Rates of `vector_field` and their health, which `ScheduledTerm` defines."""
-    delta, qd, *own = y
-    acting = applied(t, y, args, schedule)
-    (qd, qdd), loss = rates_and_conditioning(
-        args.constants, delta, qd, acting.tau, acting.added
-    )
-    finite = jnp.isfinite(sum((*qdd, *acting.own_rates)))
-    health = jnp.where(loss * LEAST_INERTIA_RATIO[loss.dtype] > 1, 0, loss)
-    # A singular matrix also makes accelerations not finite; health 0 prevails.
-    health = jnp.where(finite | (health == 0), health, jnp.nan)
-    return ((qd, qdd, acting.own_rates) if own else (qd, qdd)), health
+    delta, qd, *_ = y
+    tau, own_rates, added = applied(t, y, args, schedule)
+    (qd, qdd), loss = rates_and_conditioning(args.constants, delta, qd, tau, added)
+    health = health_with((qdd, own_rates), health_at(loss))
+    return whole(qd, qdd, own_rates), health
 
 
 def health_of(t, y, args) -> Array:
@@ -125,8 +146,7 @@ def health_of(t, y, args) -> Array:
         q = args.q0 + jnp.stack(delta)
         still = jnp.zeros_like(q)
         added, _ = _added(args.linkage, inertial(args.forces), q, still)
-    loss = conditioning(args.constants, delta, added)
-    return jnp.where(loss * LEAST_INERTIA_RATIO[loss.dtype] > 1, 0, loss)
+    return health_at(conditioning(args.constants, delta, added))
 
 
 @eqx.filter_jit  # traced once, not at each use by a solver
@@ -160,10 +180,3 @@ def element_effort(
     if tau.shape != (3,) or tau.dtype.kind not in "iuf":
         raise ValueError(f"{expected}, got shape {tau.shape} and dtype {tau.dtype}.")
     return tau.astype(q.dtype), rate
-
-
-def initial_own(args: Args, own0: Any = None) -> tuple[tuple[Array, ...], ...]:
-    """Returns the elements' initial states as scalars: `own0`, or their defaults."""
-    if own0 is None:
-        own0 = [e.initial_state(args.linkage) for e in stateful(args.forces)]
-    return (_scalars(own0, args.q0.dtype),) if own0 else ()

@@ -1,37 +1,28 @@
 """Integrates the equations of motion with diffrax: free, prescribed, differentiated."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import diffrax
 import jax
 import jax.numpy as jnp
 from jax import Array
 
-from ..forces.part import jumps_of
 from ..linkage.linkage import possible
-from ..mechanics.equations import link_constants, zeros
+from ..mechanics.equations import zeros
 from ..xla.callbacks import without_checks
 from .dopri8 import ScheduledTerm, constant
 from .field import (
     Args,
-    health_of,
+    args_of,
     initial_own,
     own_states,
     schedule_of,
     vector_field,
-    watched_field,
+    whole,
 )
 from .looped_dopri8 import LoopedDopri8
-from .prescribed import (
-    PrescribedMotion,
-    health_of_hybrid,
-    hybrid_field,
-    motion_at,
-    prescribed,
-    start_of,
-    watched_hybrid_field,
-)
+from .prescribed import motion_at, prescribed, start_of, term_of
 from .solution import Solution
 from .step_wrappers import Watched, bounded, landing_on, undifferentiated
 from .steps import default_controller
@@ -54,7 +45,7 @@ def _step_for_tangents(t0: Array, args: Args, own: tuple, fraction: float) -> Ar
     scheduled = schedule_of(t0, args)
 
     def accelerations(delta):
-        y = (tuple(delta), still, *own)
+        y = whole(tuple(delta), still, own)
         return jnp.stack(vector_field(t0, y, args, scheduled)[1])
 
     linearised = jax.jacfwd(accelerations)(jnp.zeros_like(args.q0))
@@ -64,39 +55,35 @@ def _step_for_tangents(t0: Array, args: Args, own: tuple, fraction: float) -> Ar
 
 
 def integrate(
-    solver, inputs, keywords, derivatives: bool = False, padded: bool = False
+    inputs, keywords, derivatives: bool = False, padded: bool = False
 ) -> Solution:
-    """Integrates one motion.
+    """Integrates one motion, by default with `LoopedDopri8`.
 
     `derivatives`: whether to bound the steps so that derivatives are accurate too.
     `padded`: whether the last time may be repeated.
     """
     linkage, state0, asked, own0, forces = inputs
+    solver = keywords["solver"] or LoopedDopri8()
     valid, ts, (q0, qd0) = _harmless(inputs, padded)
-    # XLA's own sine and cosine, once per solve, as start angles may be large.
-    constants = link_constants(linkage, q0, lambda x: (jnp.sin(x), jnp.cos(x)))
-    args = Args(linkage, q0, constants, forces)
+    args = args_of(linkage, q0, forces)
     own = initial_own(args, own0)
-    for state in own:
-        known = jnp.isfinite(jnp.array(state)).all()
-        valid, own = valid & known, (tuple(jnp.where(known, x, 0) for x in state),)
-    term, start, motion = _equations(prescribed(forces), args, qd0)
+    known = jnp.isfinite(jnp.array(own)).all()
+    valid, own = valid & known, tuple(jnp.where(known, x, 0) for x in own)
+    term = term_of(forces)
     bound = lambda fraction: _step_for_tangents(ts[0], args, own, fraction)
     controller = _controller(
         keywords["stepsize_controller"], solver, term, bound if derivatives else None
     )
-    if (jumps := jumps_of(*forces)) is not None:
-        controller = landing_on(controller, jumps.astype(ts.dtype))
+    controller = landing_on(controller, forces, ts.dtype)
     adaptive = isinstance(controller, diffrax.AbstractAdaptiveStepSizeController)
     if adaptive and not isinstance(solver, UnrolledDopri8 | LoopedDopri8):
         controller = Watched(controller, term.health)  # pyright: ignore[reportCallIssue]
     with without_checks():
         found = diffrax.diffeqsolve(
             term,
-            solver,
             t0=ts[0],
             t1=ts[-1],
-            y0=(*start, *own),
+            y0=whole(*start_of(args, qd0), own),
             args=args,
             saveat=diffrax.SaveAt(
                 subs=(
@@ -105,12 +92,12 @@ def integrate(
                 )
             ),
             throw=False,
-            **keywords | {"stepsize_controller": controller},
+            **keywords | {"solver": solver, "stepsize_controller": controller},
         )
     assert found.ys is not None  # because of saveat
     states, (reached,) = found.ys
-    q, qd = motion(ts, states)
-    rows = [jax.vmap(lambda own: own_states(args, own))(own) for own in states[2:]]
+    at = lambda t, y: (*motion_at(args, t, y), own_states(args, y))
+    q, qd, own = jax.vmap(at)(ts, states)
 
     def shown(a):
         """Replaces the infinity that diffrax leaves at times not reached by NaN."""
@@ -118,10 +105,9 @@ def integrate(
 
     # diffrax saves the start only with the first step.
     q, qd = shown(q).at[0].set(state0.q), shown(qd).at[0].set(state0.qd)
-    own_shown = tuple(jax.tree.map(shown, rows[0])) if rows else ()
     stats = found.stats | {"time_reached": jnp.where(valid, reached, asked[0])}
     result = _judged(valid, found.result, q, qd)
-    return Solution(asked, q, qd, stats, result, own_shown)
+    return Solution(asked, q, qd, stats, result, jax.tree.map(shown, own))
 
 
 def _harmless(inputs, padded: bool) -> tuple[Array, Array, tuple[Array, Array]]:
@@ -146,32 +132,6 @@ def _harmless(inputs, padded: bool) -> tuple[Array, Array, tuple[Array, Array]]:
         valid = valid & motion.agrees(ts[0], jnp.asarray(state0.q), linkage)
     q0, qd0 = (jnp.where(finite, a, 0) for a in state0)
     return valid, ts, (q0, qd0)
-
-
-class _Equations(NamedTuple):
-    """What is integrated, from which start, and the `motion(ts, states)` it means."""
-
-    term: ScheduledTerm
-    start: tuple[Any, ...]
-    motion: Callable[[Array, Any], tuple[Array, Array]]
-
-
-def _equations(moved: PrescribedMotion | None, args: Args, qd0: Array) -> _Equations:
-    """Returns the equations of displacements and velocities, or of momenta."""
-    if moved is not None:
-        term = ScheduledTerm(
-            hybrid_field, schedule_of, health_of_hybrid, watched_hybrid_field
-        )
-        at = jax.vmap(lambda t, y: motion_at(moved, args, t, y))
-        motion = lambda ts, states: at(ts, states[:2])
-        return _Equations(term, start_of(moved, args, qd0), motion)
-
-    def free(ts, states):
-        delta, qd = (jnp.stack(rows, axis=-1) for rows in states[:2])
-        return args.q0[None] + delta, qd
-
-    term = ScheduledTerm(vector_field, schedule_of, health_of, watched_field)
-    return _Equations(term, (zeros(args.q0), tuple(qd0)), free)
 
 
 def _controller(

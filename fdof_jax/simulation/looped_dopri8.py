@@ -6,7 +6,7 @@ too. This solver compiles a tenth faster, and its derivatives in two thirds of t
 it is traced once and leaves out what only other methods need.
 """
 
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -35,24 +35,15 @@ def _weighted(weights: Array, rates: PyTree) -> PyTree:
     return jtu.tree_map(lambda k: jnp.sum(weights * k), rates)
 
 
-class _Step(NamedTuple):
-    """The end of a step, its error and health, and the rates of all stages.
-
-    `lost` is the rounding error of `y`, which the next step adds (Kahan).
-    """
-
-    y: PyTree
-    error: PyTree
-    lost: PyTree
-    rates: PyTree
-    health: Array
-
-
 # Reverse mode replays steps with the very code that took them: near a saturation,
 # different rounding leads to different steps and to a wrong gradient.
 @eqx.filter_jit  # traced once, not at each use in a solve
 @eqx.filter_checkpoint
-def _step(term: Any, t0, t1, y0, lost, args) -> tuple[_Step, Array]:
+def _step(term: Any, t0, t1, y0, lost, args):
+    """Takes a step; returns what `diffrax.AbstractSolver.step` does.
+
+    The solver's state is the rounding error of `y`, which the next step adds (Kahan).
+    """
     # diffrax wraps the term to integrate backward in time too.
     inner, h = term.term, term.contr(t0, t1)
     times = (t0 + (t1 - t0) * jnp.asarray(NODES, t0.dtype)) * term.direction
@@ -82,8 +73,8 @@ def _step(term: Any, t0, t1, y0, lost, args) -> tuple[_Step, Array]:
     health = jnp.where(finite, healths[-1], healths[0])
     health = jnp.where(finite | (health == 0), health, jnp.nan)
     y = jtu.tree_map(lambda a: jnp.where(finite, a, jnp.nan), y)
-    error, lost = constant((error, lost))
-    return _Step(y, error, lost, rates, health), h
+    error, result = verdict(*constant((error, health)), h)
+    return y, error, dict(y0=y0, step=h, rates=rates), constant(lost), result
 
 
 class _Interpolation(DenseOutput):
@@ -102,9 +93,4 @@ class LoopedDopri8(ScheduledDopri8):
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         del made_jump  # no rate is kept from one step to the next
-        end, h = _step(terms, t0, t1, y0, solver_state, args)
-        dense_info = dict(y0=y0, step=h, rates=end.rates)
-        bad = jnp.isnan(end.health) | (end.health == 0)
-        imposed, result = verdict(end.health == 0, bad, h)
-        error = jtu.tree_map(lambda e: jnp.where(bad, imposed, e), end.error)
-        return end.y, error, dense_info, end.lost, result
+        return _step(terms, t0, t1, y0, solver_state, args)

@@ -8,14 +8,13 @@ from jax import Array
 
 from ..checks import is_traced
 from .integrate import integrate
-from .looped_dopri8 import LoopedDopri8
 from .solution import Solution
 
 # All calls with at most this many output times share one program.
 _FEWEST_TIMES = 512
 
 
-def solve_one(solver, inputs, keywords) -> tuple[Solution, bool] | None:
+def solve_one(inputs, keywords) -> tuple[Solution, bool] | None:
     """Computes the motion of one arm from concrete inputs, and whether it succeeded.
 
     Output times are padded with the last one to a power of two, so that few programs
@@ -26,9 +25,8 @@ def solve_one(solver, inputs, keywords) -> tuple[Solution, bool] | None:
     count = len(times)
     size = max(_FEWEST_TIMES, 1 << (count - 1).bit_length())
     filled = np.pad(times, (0, size - count), mode="edge")
-    solution, succeeded = _solve_padded(
-        solver, (linkage, state0, filled, own0, forces), keywords
-    )
+    padded = linkage, state0, filled, own0, forces
+    solution, succeeded = _solve_padded(padded, keywords)
     if is_traced(solution):
         return None
 
@@ -42,10 +40,9 @@ def solve_one(solver, inputs, keywords) -> tuple[Solution, bool] | None:
 
 
 @eqx.filter_jit
-def _solve_padded(solver, inputs, keywords) -> tuple[Solution, Array]:
+def _solve_padded(inputs, keywords) -> tuple[Solution, Array]:
     # The steps are those of the same call with forward-mode derivatives.
     derivatives = isinstance(keywords["adjoint"], diffrax.ForwardMode)
     keywords = keywords | {"adjoint": diffrax.ForwardMode()}
-    solver = LoopedDopri8() if solver is None else solver
-    solution = integrate(solver, inputs, keywords, derivatives, padded=True)
+    solution = integrate(inputs, keywords, derivatives, padded=True)
     return solution, solution.result == diffrax.RESULTS.successful

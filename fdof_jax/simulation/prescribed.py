@@ -20,7 +20,18 @@ from ..mechanics.equations import equations, zeros
 from ..references.reference import EXPECTED, positions_at, reference_motion
 from ..xla.array_namespace import in_numpy
 from ..xla.callbacks import with_checks
-from .field import LEAST_INERTIA_RATIO, Args, applied
+from .dopri8 import ScheduledTerm
+from .field import (
+    Args,
+    applied,
+    health_at,
+    health_of,
+    health_with,
+    schedule_of,
+    vector_field,
+    watched_field,
+    whole,
+)
 
 
 class PrescribedMotion(Element):
@@ -61,7 +72,6 @@ class PrescribedMotion(Element):
 
     @with_checks
     def at(self, t: Array, linkage: Linkage) -> tuple[Array, Array]:
-        """Returns the checked positions and velocities of the reference at a time."""
         return reference_motion(self.reference, t, linkage)
 
     def agrees(self, t: Array, q: Array, linkage: Linkage) -> Array:
@@ -72,8 +82,7 @@ class PrescribedMotion(Element):
         return (near | ~moved).all()
 
     def __call__(self, t: Array, q: Array, qd: Array, linkage: Linkage) -> Array:
-        """Returns zero efforts: the real ones depend on all other elements."""
-        return jnp.zeros(3)
+        return jnp.zeros(3)  # the real efforts depend on all other elements
 
 
 def prescribed(forces: Forces) -> PrescribedMotion | None:
@@ -98,58 +107,65 @@ def _split(moved: Array, matrix: Array, known: Array, right: Array) -> Array:
     return jnp.linalg.solve(free, jnp.where(moved, known, right - matrix @ known))
 
 
-def motion_at(
-    motion: PrescribedMotion, args: Args, t: Any, y: Any
-) -> tuple[Array, Array]:
-    """Joint positions and velocities at a state of displacements and momenta."""
-    delta, momenta, *_ = y
+def motion_at(args: Args, t: Any, y: Any) -> tuple[Array, Array]:
+    """Joint positions and velocities at an integrated state."""
+    q, rates = args.q0 + jnp.stack(y[0]), jnp.stack(y[1])
+    if (motion := prescribed(args.forces)) is None:
+        return q, rates
     position, velocity = motion.at(t, args.linkage)
-    q = jnp.where(motion.moved, position, args.q0 + jnp.stack(delta))
+    q = jnp.where(motion.moved, position, q)
     matrix, _ = _mass_and_bias(args, q, jnp.zeros(3))
-    return q, _split(motion.moved, matrix, velocity, jnp.stack(momenta))
+    return q, _split(motion.moved, matrix, velocity, rates)
 
 
-def start_of(motion: PrescribedMotion, args: Args, qd: Array) -> tuple[Any, Any]:
-    """Displacements and momenta at the start, before any jump there."""
+def start_of(args: Args, qd: Array) -> tuple[Any, Any]:
+    """Displacements and velocities or momenta at the start, before any jump there."""
+    if (motion := prescribed(args.forces)) is None:
+        return zeros(args.q0), tuple(qd)
     matrix, _ = _mass_and_bias(args, args.q0, jnp.zeros(3))
     return zeros(args.q0), tuple(jnp.where(motion.moved, 0, matrix @ qd))
 
 
-def hybrid_field(t, y, args, schedule) -> tuple[Any, ...]:
+def term_of(forces: tuple[Element, ...]) -> ScheduledTerm:
+    """Returns the equations of velocities or, with a prescribed motion, of momenta."""
+    if prescribed(forces) is None:
+        return ScheduledTerm(vector_field, schedule_of, health_of, watched_field)
+    return ScheduledTerm(_hybrid_field, schedule_of, _health, _watched_hybrid_field)
+
+
+def _hybrid_field(t, y, args, schedule) -> tuple[Any, ...]:
     """Rates of displacements and momenta, 0 at prescribed joints.
 
     The rate of the momenta is M' qd - bias + tau, where M' is the mass matrix's rate.
     """
     motion = prescribed(args.forces)
     assert motion is not None  # this field serves prescribed motions only
-    own = y[2:]
-    q, qd = motion_at(motion, args, t, y)
-    acting = applied(t, (tuple(q - args.q0), tuple(qd), *own), args, schedule)
+    q, qd = motion_at(args, t, y)
+    moving = tuple(q - args.q0), tuple(qd)
+    tau, own_rates, _ = applied(t, (*moving, *y[2:]), args, schedule)
     # The efforts already include the bias of masses that elements move.
-    bias = jnp.stack(equations(args.constants, tuple(q - args.q0), tuple(qd)).bias)
+    bias = jnp.stack(equations(args.constants, *moving).bias)
     momenta = lambda q: _mass_and_bias(args, q, jnp.zeros(3))[0] @ qd
     _, change = jax.jvp(momenta, (q,), (qd,))
-    driven = jnp.where(motion.moved, 0, change - bias + jnp.stack(acting.tau))
-    moving = tuple(jnp.where(motion.moved, 0, qd)), tuple(driven)
-    return (*moving, acting.own_rates) if own else moving
+    driven = jnp.where(motion.moved, 0, change - bias + jnp.stack(tau))
+    return whole(tuple(jnp.where(motion.moved, 0, qd)), tuple(driven), own_rates)
 
 
-def watched_hybrid_field(t, y, args, schedule) -> tuple[tuple[Any, ...], Array]:
-    """Rates of `hybrid_field` and their health, as in `field.watched_field`."""
-    rates, health = hybrid_field(t, y, args, schedule), health_of_hybrid(t, y, args)
-    finite = jnp.isfinite(sum(jax.tree.leaves(rates)))
-    return rates, jnp.where(finite | (health == 0), health, jnp.nan)
+def _watched_hybrid_field(t, y, args, schedule) -> tuple[tuple[Any, ...], Array]:
+    """Rates of `_hybrid_field` and their health, as in `field.watched_field`."""
+    rates = _hybrid_field(t, y, args, schedule)
+    return rates, health_with(rates, _health(t, y, args))
 
 
-def health_of_hybrid(t, y, args) -> Array:
+def _health(t, y, args) -> Array:
     """Health of the driven joints' equations, as in `field.health_of`."""
     motion = prescribed(args.forces)
     assert motion is not None
-    q, _ = motion_at(motion, args, t, y)
+    q, _ = motion_at(args, t, y)
     matrix, _ = _mass_and_bias(args, q, jnp.zeros(3))
     free = jnp.where(jnp.outer(~motion.moved, ~motion.moved), matrix, jnp.eye(3))
     loss = jnp.max(jnp.diag(free) * jnp.diag(jnp.linalg.inv(free)))
-    return jnp.where(loss * LEAST_INERTIA_RATIO[loss.dtype] <= 1, loss, 0)
+    return jnp.where(jnp.isnan(loss), 0, health_at(loss))
 
 
 def prescribed_effort(

@@ -15,7 +15,7 @@ from ..forces.element import Forces, ScalarElement, element_of, elements
 from ..forces.joints import JointEffort
 from ..linkage.coordinates import State, real_state
 from ..linkage.linkage import Linkage, check_linkage
-from .field import stateful
+from .field import initial_states, stateful
 from .simulate import check_elements, simulate
 
 
@@ -35,15 +35,6 @@ class _Switched(ScalarElement):
     @property
     def jump_ts(self) -> Array:
         return self.switch[None]
-
-
-def _without_states(forces: Any) -> None:
-    if stateful(elements("forces", forces)):
-        raise ValueError(
-            "forces: expected elements without a state of their own, which would be "
-            "lost (simulate takes such states as own0 and returns them), got "
-            f"{forces!r}."
-        )
 
 
 def step(
@@ -73,13 +64,17 @@ def step(
 
     **Raises:** ValueError for malformed arguments.
     """
-    _without_states(forces)
+    if stateful(elements("forces", forces)):
+        raise ValueError(
+            "forces: expected elements without a state of their own, which would be "
+            "lost (simulate takes such states as own0 and returns them), got "
+            f"{forces!r}."
+        )
     state = real_state("state", state)
     dt, t = real_array("dt", dt, (), above=0), real_array("t", t, ())
-    ts = jnp.stack([t, t + dt])
-    effort = JointEffort(tau)
+    ts, acting = jnp.stack([t, t + dt]), (*forces, JointEffort(tau))
     options = dict(throw=False) | options
-    solution = simulate(linkage, state, ts, (*forces, effort), **options)
+    solution = simulate(linkage, state, ts, acting, **options)
     return State(solution.q[-1], solution.qd[-1])
 
 
@@ -160,10 +155,12 @@ def simulate_sampled(
                 "noise: expected a pair of standard deviations, of positions and of "
                 f"velocities, got {noise!r}."
             )
-        spread = [
-            real_array(f"noise[{k}]", value, (3,), minimum=0, broadcast=True)
-            for k, value in enumerate(noise)
-        ]
+        spread = State(
+            *(
+                real_array(f"noise[{k}]", value, (3,), minimum=0, broadcast=True)
+                for k, value in enumerate(noise)
+            )
+        )
     state0 = real_state("state0", state0)
     times = t0 + every * jnp.arange(samples + 1)
     check_elements((control, *forces), linkage, times)
@@ -179,48 +176,42 @@ def _motion(
 ) -> SampledMotion:
     """Simulates period by period; `delay` and the noise's `spread` may be None."""
 
-    def command(t, seen, memory):
-        tau, rates = control.act(t, *seen, linkage, memory)
-        step = times[1] - times[0]
-        later = jax.tree.map(lambda m, rate: m + step * rate, memory, rates)
-        return real_array("control", tau, (3,)), later
+    period = times[1] - times[0]
 
     def one(carry, inputs):
-        state, own, memory, held, result = carry
+        (state, own), memory, held, result = carry
         begin, end, key = inputs
         seen = state
         if spread is not None:
-            seen = State(
-                *(
-                    value + size * jax.random.normal(k, (3,))
-                    for value, size, k in zip(state, spread, jax.random.split(key))
-                )
+            seen = jax.tree.map(
+                lambda value, size, key: value + size * jax.random.normal(key, (3,)),
+                *(state, spread, State(*jax.random.split(key))),
             )
-        tau, memory = command(begin, seen, memory)
+        tau, rates = control.act(begin, *seen, linkage, memory)
+        tau = real_array("control", tau, (3,))
+        memory = jax.tree.map(lambda m, rate: m + period * rate, memory, rates)
         effort = (
             JointEffort(tau) if delay is None else _Switched(held, tau, begin + delay)
         )
         acting, two = (*forces, effort), jnp.stack([begin, end])
         solution = simulate(linkage, state, two, acting, own0=own, **options)
-        q, qd = solution.q[-1], solution.qd[-1]
-        own = jax.tree.map(lambda rows: rows[-1], solution.own)
+        rows = State(solution.q, solution.qd), solution.own
+        last = jax.tree.map(lambda rows: rows[-1], rows)
         good = result == diffrax.RESULTS.successful
         result = diffrax.RESULTS.where(good, solution.result, result)
-        return (State(q, qd), own, memory, tau, result), (q, qd, own, tau)
+        return (last, memory, tau, result), (last, tau)
 
-    def initial(element):
-        state = element.initial_state(linkage)
-        return jax.tree.map(lambda leaf: jnp.asarray(leaf, float), state)
-
-    q0, qd0 = jnp.asarray(state0.q), jnp.asarray(state0.qd)
-    own0, memory0 = tuple(map(initial, stateful(forces))), initial(control)
+    own0 = initial_states(linkage, forces), control.initial_state(linkage)
+    own0, memory0 = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), own0)
     held = jnp.zeros(3)
     if delay is not None:
-        held = jnp.where(delay < times[1] - times[0], held, jnp.nan)
-    start = State(q0, qd0), own0, memory0, held, diffrax.RESULTS.successful
-    (*_, result), (q, qd, own, tau) = jax.lax.scan(
-        one, start, (times[:-1], times[1:], keys)
+        held = jnp.where(delay < period, held, jnp.nan)
+    first = jax.tree.map(jnp.asarray, state0), own0
+    (*_, result), (later, tau) = jax.lax.scan(
+        one,
+        (first, memory0, held, diffrax.RESULTS.successful),
+        (times[:-1], times[1:], keys),
     )
-    q, qd = jnp.vstack([q0, q]), jnp.vstack([qd0, qd])
     rows = lambda first, later: jnp.concatenate([first[None], later])
-    return SampledMotion(times, q, qd, tau, result, jax.tree.map(rows, own0, own))
+    (q, qd), own = jax.tree.map(rows, first, later)
+    return SampledMotion(times, q, qd, tau, result, own)

@@ -47,13 +47,10 @@ def _as_array(leaf: Any) -> np.ndarray:
     return array.astype(jnp.result_type(float)) if floating else array
 
 
-def _plain(scene: Any) -> Any:
-    """Returns a scene with its end time, which may be an integer, as a float."""
-    return scene._replace(t1=_float(scene.t1)) if isinstance(scene, Scene) else scene
-
-
-def _float(value: Any) -> np.ndarray:
-    return np.asarray(value, jnp.result_type(float))
+def _parts(scene: Any) -> tuple[Any, Any]:
+    if isinstance(scene, Scene):  # whose end time may be an integer
+        scene = scene._replace(t1=np.asarray(scene.t1, float))
+    return eqx.partition(scene, is_number)
 
 
 def stacked(scenes: Sequence[Any], name: str = "scenes") -> Any:
@@ -68,7 +65,7 @@ def stacked(scenes: Sequence[Any], name: str = "scenes") -> Any:
     """
     if not isinstance(scenes, list | tuple) or isinstance(scenes, Scene) or not scenes:
         raise ValueError(f"{name}: expected a list of scenes, got {scenes!r}.")
-    first, *others = (eqx.partition(_plain(scene), is_number) for scene in scenes)
+    first, *others = map(_parts, scenes)
     for index, other in enumerate(others, start=1):
         if not eqx.tree_equal(other[1], first[1]) or jax.tree.map(
             np.shape, other[0]

@@ -1,12 +1,12 @@
 """Integrates a motion together with its derivatives in a few parameters.
 
-The derivatives obey the variational equations. As part of the state they are under the
-same error control as the motion. Differentiation through the integrator, which takes
-twice as long to compile, is not needed.
+The derivatives obey the variational equations, under the same error control as the
+motion. Differentiation through the integrator would take twice as long to compile.
 """
 
+import dataclasses
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import diffrax
 import jax
@@ -14,11 +14,9 @@ import jax.numpy as jnp
 from jax import Array
 
 from ..forces.element import elements
-from ..forces.part import jumps_of
-from ..mechanics.equations import link_constants, zeros
 from ..xla.callbacks import without_checks
-from .field import Args, initial_own, own_states, schedule_of, vector_field
-from .prescribed import hybrid_field, motion_at, prescribed, start_of
+from .field import args_of, initial_own, own_states, whole
+from .prescribed import motion_at, start_of, term_of
 from .scene import Scene
 from .solution import Solution
 from .step_wrappers import landing_on
@@ -62,16 +60,8 @@ def sensitivities(
     def motion_of(z):
         scene = scene_at(z)
         q0, qd0 = (jnp.asarray(a, dtype=float) for a in scene.state0)
-        constants = link_constants(
-            scene.linkage, q0, lambda x: (jnp.sin(x), jnp.cos(x))
-        )
-        forces = elements("scene.forces", scene.forces)
-        args = Args(scene.linkage, q0, constants, forces)
-        motion = prescribed(forces)
-        start = (
-            (zeros(q0), tuple(qd0)) if motion is None else start_of(motion, args, qd0)
-        )
-        return args, (*start, *initial_own(args))
+        args = args_of(scene.linkage, q0, elements("scene.forces", scene.forces))
+        return args, whole(*start_of(args, qd0), initial_own(args))
 
     # One array, with the motion as first row and the derivatives below, gives the
     # integrator fewer and larger operations.
@@ -85,9 +75,8 @@ def sensitivities(
     def field(t, state, z):
         def rates(row, z):
             args, _ = motion_of(z)
-            chosen = vector_field if prescribed(args.forces) is None else hybrid_field
             y = jax.tree.unflatten(structure, tuple(row))
-            rates = chosen(t, y, args, schedule_of(t, args))
+            rates = term_of(args.forces).vf(t, y, args)
             return jnp.stack(jax.tree.leaves(rates))
 
         value, along = jax.linearize(rates, state[0], z)
@@ -96,22 +85,11 @@ def sensitivities(
     def observed(z, t, row):
         args, _ = motion_of(z)
         y = jax.tree.unflatten(structure, tuple(row))
-        motion = prescribed(args.forces)
-        own = tuple(own_states(args, *y[2:])) if len(y) > 2 else ()
-        if motion is None:
-            return args.q0 + jnp.stack(y[0]), jnp.stack(y[1]), own
-        return *motion_at(motion, args, t, y), own
+        return *motion_at(args, t, y), own_states(args, y)
 
-    controller: Any = adaptive(tolerance, max(tolerance, TOLERANCE))
-    controller = diffrax.PIDController(
-        rtol=controller.rtol,
-        atol=controller.atol,
-        dtmin=controller.dtmin,
-        force_dtmin=False,
-        norm=_largest,
-    )
-    if (jumps := jumps_of(*motion_of(z)[0].forces)) is not None:
-        controller = landing_on(controller, jumps.astype(ts.dtype))
+    controller = adaptive(tolerance, max(tolerance, TOLERANCE))
+    controller = dataclasses.replace(controller, norm=_largest)
+    controller = landing_on(controller, motion_of(z)[0].forces, ts.dtype)
     with without_checks():
         found = diffrax.diffeqsolve(
             diffrax.ODETerm(field),  # pyright: ignore[reportArgumentType]

@@ -1,4 +1,4 @@
-"""Simulates motions of a linkage and computes the efforts along them."""
+"""Simulates motions of a linkage: the door, with its checks."""
 
 from typing import Any
 
@@ -10,30 +10,23 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
-from ..checks import (
-    increasing,
-    instance,
-    is_traced,
-    place_of,
-    real_array,
-    whole_number,
-)
-from ..forces.element import Element, Forces, StatefulElement, elements
+from ..checks import increasing, instance, is_traced, real_array, whole_number
+from ..forces.element import Element, Forces, elements
 from ..forces.part import check_values
 from ..linkage.coordinates import State, real_state
 from ..linkage.linkage import Linkage, check_linkage, possible
 from ..xla.array_namespace import in_numpy
-from .field import element_effort, stateful
+from .field import initial_states
 from .plain import solve_one
-from .prescribed import prescribed, prescribed_effort
-from .solution import Efforts, Solution
+from .prescribed import prescribed
+from .solution import Solution
 from .steps import at_tolerances, within_reach
 from .traced import solve
 
 
 def solve_options(
-    solver: diffrax.AbstractSolver | None,
     *,
+    solver: diffrax.AbstractSolver | None,
     rtol: ArrayLike | None,
     atol: ArrayLike | None,
     stepsize_controller: diffrax.AbstractStepSizeController | None,
@@ -42,11 +35,8 @@ def solve_options(
     max_steps: int | None,
     throw: bool,
     progress_meter: diffrax.AbstractProgressMeter,
-) -> tuple[diffrax.AbstractSolver | None, dict[str, Any]]:
-    """Checks `simulate`'s keywords; returns the solver and diffeqsolve's keywords.
-
-    The result leaves out `throw`, which callers handle.
-    """
+) -> dict[str, Any]:
+    """Checks `simulate`'s keywords; returns those of diffeqsolve, without `throw`."""
     if dt0 is not None:
         dt0 = real_array("dt0", dt0, (), above=0)  # an array: new values, no new trace
     if max_steps is not None:
@@ -57,12 +47,9 @@ def solve_options(
             "ForwardMode, got BacksolveAdjoint, whose gradients are wrong on these "
             "problems."
         )
-    for name, value, kind in (
-        ("adjoint", adjoint, diffrax.AbstractAdjoint),
-        ("throw", throw, bool),
-        ("progress_meter", progress_meter, diffrax.AbstractProgressMeter),
-    ):
-        instance(name, value, kind)
+    instance("adjoint", adjoint, diffrax.AbstractAdjoint)
+    instance("throw", throw, bool)
+    instance("progress_meter", progress_meter, diffrax.AbstractProgressMeter)
     if solver is not None:
         instance("solver", solver, diffrax.AbstractSolver)
     if rtol is not None or atol is not None:
@@ -76,7 +63,8 @@ def solve_options(
         kind = diffrax.AbstractStepSizeController
         instance("stepsize_controller", stepsize_controller, kind)
         stepsize_controller = within_reach(stepsize_controller)
-    return solver, dict(
+    return dict(
+        solver=solver,
         stepsize_controller=stepsize_controller,
         dt0=dt0,
         adjoint=adjoint,
@@ -163,8 +151,8 @@ def simulate(
     ts = real_array("ts", ts, (None,))
     increasing("ts", ts)
     forces = elements("forces", forces)
-    solver, keywords = solve_options(
-        solver,
+    keywords = solve_options(
+        solver=solver,
         rtol=rtol,
         atol=atol,
         stepsize_controller=stepsize_controller,
@@ -184,15 +172,15 @@ def simulate(
                 f"prescribed, got {np.asarray(state0.q).tolist()}."
             )
     if own0 is not None:
-        _check_own("own0", own0, forces, linkage, ())
+        check_own("own0", own0, forces, linkage, ())
     inputs = linkage, state0, ts, own0, forces
     try:
         one = None
         # A new constant is traced only if this call is inside `jax.jit`.
-        if not is_traced(inputs, solver, keywords, jax.device_put(np.zeros(()))):
-            one = solve_one(solver, inputs, keywords)
+        if not is_traced(inputs, keywords, jax.device_put(np.zeros(()))):
+            one = solve_one(inputs, keywords)
         if one is None:
-            solution = solve(solver, inputs, keywords)
+            solution = solve(inputs, keywords)
             # The caller's `ts` itself keeps derivatives in the times.
             solution = eqx.tree_at(lambda s: s.ts, solution, ts)
             return _raising(solution, inputs) if throw else solution
@@ -244,70 +232,15 @@ def _raising(solution: Solution, inputs: tuple[Any, ...]) -> Solution:
     return solution.result.error_if(solution, failed)
 
 
-def _check_own(
+def check_own(
     name, own, forces: tuple[Element, ...], linkage: Linkage, rows: tuple
 ) -> None:
     """Raises ValueError unless `own` holds rows of the stateful elements' states."""
-    expected = [
-        jax.eval_shape(element.initial_state, linkage) for element in stateful(forces)
-    ]
-    shapes = jax.tree.map(lambda leaf: (*rows, *leaf.shape), tuple(expected))
+    expected = jax.eval_shape(lambda: initial_states(linkage, forces))
+    shapes = jax.tree.map(lambda leaf: (*rows, *leaf.shape), expected)
     found = jax.tree.map(jnp.shape, own)
     if found != shapes:
         raise ValueError(
             f"{name}: expected the states of the forces' elements, of shapes {shapes}, "
             f"got {found}."
         )
-
-
-def joint_efforts(linkage: Linkage, forces: Forces, solution: Solution) -> Efforts:
-    """Computes the joint efforts of the force elements along a motion.
-
-    **Arguments:** the linkage, the forces and the solution of one `simulate`.
-
-    **Returns:** `Efforts(total, elements)` [N or N m], of shapes (time, 3) and
-    (element, time, 3).
-
-    **Raises:** ValueError if `forces` is not a tuple of force elements.
-
-    >>> import fdof_jax as fj
-    >>> import numpy as np
-    >>> arm, start, forces, _ = fj.scenes.fig7()
-    >>> motion = fj.simulate(arm, start, np.linspace(0, 1, 101), forces)
-    >>> total, elements = fj.joint_efforts(arm, forces, motion)
-    >>> total[0].tolist(), elements.shape
-    ([15.873, -300.0, -9.921], (1, 101, 3))
-    """
-    check_linkage(linkage)
-    if not isinstance(solution, Solution):
-        raise ValueError(f"solution: expected a Solution, got {solution!r}.")
-    forces = elements("forces", forces)
-    if solution.q.ndim != 2:
-        raise ValueError(
-            "solution: expected one motion (use jax.vmap for a batch), got positions "
-            f"of shape {solution.q.shape}."
-        )
-    _check_own("solution.own", solution.own, forces, linkage, solution.ts.shape)
-    return _efforts(linkage, forces, solution)
-
-
-@eqx.filter_jit
-def _efforts(
-    linkage: Linkage, forces: tuple[Element, ...], solution: Solution
-) -> Efforts:
-    motion_rows, own = (solution.ts, solution.q, solution.qd), iter(solution.own)
-    efforts = []
-    for index, element in enumerate(forces):
-
-        def effort(t, q, qd, state, index=index, element=element):
-            return element_effort(index, element, t, q, qd, linkage, state)[0]
-
-        state = next(own) if isinstance(element, StatefulElement) else ()
-        efforts.append(jax.vmap(effort)(*motion_rows, state))
-    stacked = jnp.stack(efforts) if efforts else jnp.zeros((0, *solution.q.shape))
-    if (motion := prescribed(forces)) is not None:
-        demand = lambda *row: prescribed_effort(linkage, forces, *row)
-        demanded = jax.vmap(demand)(*motion_rows, jnp.sum(stacked, axis=0))
-        place = place_of(motion, forces)
-        stacked = stacked.at[place].set(demanded)
-    return Efforts(jnp.sum(stacked, axis=0), stacked)

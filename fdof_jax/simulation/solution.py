@@ -1,6 +1,6 @@
 """The results of a simulation."""
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import diffrax
 import equinox as eqx
@@ -91,14 +91,3 @@ class Solution(eqx.Module):
             least, most = steps.min(), steps.max()
             facts["steps"] = f"{least}" if least == most else f"{least} to {most}"
         return facts
-
-
-class Efforts(NamedTuple):
-    """Joint efforts along a motion [N or N m].
-
-    - `total`: sum over all force elements (time, 3).
-    - `elements`: efforts of each force element (element, time, 3).
-    """
-
-    total: Float[Array, "time joint"]
-    elements: Float[Array, "element time joint"]

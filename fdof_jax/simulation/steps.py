@@ -5,7 +5,6 @@ import warnings
 from typing import Any
 
 import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import Array
@@ -26,16 +25,10 @@ def adaptive(double: float, single: float) -> diffrax.PIDController:
     x64 = jnp.result_type(float) == jnp.float64
     tolerance = double if x64 else single
     # The shortest step ends solves that rounding keeps from meeting the tolerance.
+    shortest = 1e-13 if x64 else 1e-8
     return diffrax.PIDController(
-        rtol=tolerance,
-        atol=tolerance,
-        dtmin=_shortest_step(),
-        force_dtmin=False,
+        rtol=tolerance, atol=tolerance, dtmin=shortest, force_dtmin=False
     )
-
-
-def _shortest_step() -> float:
-    return 1e-13 if jnp.result_type(float) == jnp.float64 else 1e-8
 
 
 def default_controller() -> diffrax.PIDController:
@@ -67,11 +60,12 @@ def within_reach(
 
     def mended(pid: diffrax.PIDController) -> diffrax.PIDController:
         if pid.dtmin is None:
-            pid = dataclasses.replace(pid, dtmin=_shortest_step(), force_dtmin=False)
+            shortest = default_controller().dtmin
+            pid = dataclasses.replace(pid, dtmin=shortest, force_dtmin=False)
         if x64:
             return pid
-        tolerances = met(pid.rtol, "rtol"), met(pid.atol, "atol")
-        return eqx.tree_at(lambda p: (p.rtol, p.atol), pid, tolerances)
+        rtol, atol = met(pid.rtol, "rtol"), met(pid.atol, "atol")
+        return dataclasses.replace(pid, rtol=rtol, atol=atol)
 
     def met(tolerance: Any, name: str) -> Any:
         known = concrete(tolerance)
@@ -93,25 +87,23 @@ class _Scaled(Adaptive):
     controller: Any
     unit: tuple[tuple[Array, ...], tuple[Array, ...]]  # of q and of qd
 
-    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
-        if dt0 is None:
+    def init(self, *arguments):
+        if arguments[4] is None:
             raise ValueError(
                 "dt0: expected a first step [s] with scaled tolerances, got None."
             )
-        return self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
+        return super().init(*arguments)
 
-    def adapt_step_size(  # pyright: ignore[reportIncompatibleMethodOverride]
-        self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state
-    ):
+    def adapt_step_size(self, *arguments):
+        t0, t1, y0, y1_candidate, args, y_error, *rest = arguments
+
         def scaled(state: Any) -> Any:
             # The elements' own states come last and keep their units.
             motion = jax.tree.map(lambda a, unit: a / unit, state[:2], self.unit)
             return (*motion, *state[2:])
 
         y0, y1_candidate, y_error = map(scaled, (y0, y1_candidate, y_error))
-        return self.controller.adapt_step_size(
-            t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state
-        )
+        return super().adapt_step_size(t0, t1, y0, y1_candidate, args, y_error, *rest)
 
 
 def scale_tolerances(

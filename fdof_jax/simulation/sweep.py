@@ -23,7 +23,7 @@ from ..forces.element import Forces, elements
 from ..linkage.coordinates import State
 from ..linkage.linkage import Linkage
 from .batch_axes import Batch, batch_of
-from .chunks import expected_work, floats_of, in_chunks, motion_of
+from .chunks import expected_work, in_chunks, motion_of
 from .simulate import solve_options
 from .solution import Solution
 
@@ -54,20 +54,16 @@ def _traced(batch: Batch, ts: Array, settings: dict, chunk: int) -> Solution:
     # A first solve finds the members that fail. In the differentiated solve the first
     # good member replaces them, because NaN would spoil derivatives of shared arrays.
     frozen = solved(*where(False, (moving, shared)))
-    good = frozen[-1] == diffrax.RESULTS.successful
+    good = frozen.result == diffrax.RESULTS.successful
     source = jnp.where(good, jnp.arange(batch.size), jnp.argmax(good))
     moving, shared = where(jnp.any(good), (moving, shared))
-    *states, _, _ = solved(jax.tree.map(lambda leaf: leaf[source], moving), shared)
-    states = jax.tree.map(
-        lambda a, b: jnp.where(good.reshape(-1, *[1] * (a.ndim - 1)), a, b),
-        tuple(states),
-        frozen[:3],
-    )
+    again = solved(jax.tree.map(lambda leaf: leaf[source], moving), shared)
     back = jnp.argsort(order)
-    everything = (*states, *frozen[3:])
-    q, qd, own, stats, result = jax.tree.map(lambda leaf: leaf[back], everything)
-    ts = jnp.broadcast_to(ts, (batch.size, *ts.shape))
-    return Solution(ts, q, qd, stats, result, own)
+
+    def chosen(a, b):
+        return jnp.where(good.reshape(-1, *[1] * (a.ndim - 1)), a, b)[back]
+
+    return jax.tree.map(chosen, again, frozen)
 
 
 def sweep(
@@ -121,15 +117,16 @@ def sweep(
     """
     instance("linkage", linkage, Linkage)
     try:
-        state0 = State(*map(floats_of, state0))
+        q, qd = map(jnp.asarray, state0)
     except (TypeError, ValueError):
         raise ValueError(f"state0: expected a State(q, qd), got {state0!r}.") from None
+    state0 = State(*(a.astype(float) if a.dtype.kind in "iu" else a for a in (q, qd)))
     ts = real_array("ts", ts, (None,))
     increasing("ts", ts)
     elements("forces", forces)
     whole_number("chunk", chunk, 1)
-    solver, settings = solve_options(
-        solver,
+    settings = solve_options(
+        solver=solver,
         rtol=rtol,
         atol=atol,
         stepsize_controller=stepsize_controller,
@@ -140,7 +137,6 @@ def sweep(
         progress_meter=progress_meter,
     )
     del settings["progress_meter"]  # it counts finished members, not time
-    settings["solver"] = solver
     batch = batch_of(linkage, state0, forces, forces_axes)
     if checkpoint is not None and not isinstance(checkpoint, str | os.PathLike):
         raise ValueError(f"checkpoint: expected a folder, got {checkpoint!r}.")

@@ -11,9 +11,7 @@ from jax.flatten_util import ravel_pytree
 from ..checks import is_traced
 from ..forces.added_inertia import inertial
 from ..forces.element import Element, ForeignElement
-from ..xla.configuration import small_loops_are_kernels
 from .integrate import integrate
-from .looped_dopri8 import LoopedDopri8
 from .prescribed import prescribed
 from .solution import Solution
 from .unrolled_dopri8 import UnrolledDopri8
@@ -26,24 +24,18 @@ def _batch_solver(forces: tuple[Element, ...]) -> diffrax.AbstractSolver:
     return diffrax.Dopri8() if many else UnrolledDopri8()
 
 
-def _tangent_solver(forces: tuple[Element, ...]) -> diffrax.AbstractSolver:
-    """Returns the fastest solver for forward-mode derivatives."""
-    many = inertial(forces) or prescribed(forces)
-    if many or small_loops_are_kernels():
-        return LoopedDopri8()
-    return UnrolledDopri8(for_tangents=True)
-
-
 @eqx.filter_custom_vjp
-def _integrate_reversibly(inputs, solver, keywords) -> Solution:
+def _integrate_reversibly(inputs, keywords) -> Solution:
     """Integrates a motion that may be differentiated by `jax.grad`.
 
     Unrolled stages compile differently with and without derivatives, and the replay of
     the backward pass must reproduce the same bits: they serve the plain solve alone.
     """
     # The plain solve needs no loops for reverse mode, which take longer to compile.
-    keywords = keywords | {"adjoint": diffrax.ForwardMode()}
-    return integrate(solver or _batch_solver(inputs[-1]), inputs, keywords)
+    solver = keywords["solver"] or _batch_solver(inputs[-1])
+    return integrate(
+        inputs, keywords | {"solver": solver, "adjoint": diffrax.ForwardMode()}
+    )
 
 
 # Up to so many numbers, tangents cost no more than the adjoint equations (one arm or
@@ -75,18 +67,15 @@ def _with_tangents(motion, moving):
 
 
 @_integrate_reversibly.def_fwd
-def _integrate_reversibly_fwd(perturbed, inputs, solver, keywords):
+def _integrate_reversibly_fwd(perturbed, inputs, keywords):
     moving, fixed = eqx.partition(inputs, perturbed)
     few = _few(moving, keywords["adjoint"])
     if few:
-        solver = solver or _tangent_solver(inputs[-1])
         keywords = keywords | {"adjoint": diffrax.ForwardMode()}
 
     def motion(moving):
         inputs = eqx.combine(moving, fixed)
-        solution = integrate(
-            solver or LoopedDopri8(), inputs, keywords, derivatives=True
-        )
+        solution = integrate(inputs, keywords, derivatives=True)
         return (solution.q, solution.qd, solution.own), solution
 
     if few:
@@ -97,9 +86,7 @@ def _integrate_reversibly_fwd(perturbed, inputs, solver, keywords):
 
 
 @_integrate_reversibly.def_bwd
-def _integrate_reversibly_bwd(
-    residuals, cotangent, perturbed, inputs, solver, keywords
-):
+def _integrate_reversibly_bwd(residuals, cotangent, perturbed, inputs, keywords):
     slopes, states = residuals
     wanted = eqx.combine(
         (cotangent.q, cotangent.qd, cotangent.own),
@@ -133,28 +120,24 @@ def _opened(inputs):
     return linkage, state0, ts, own0, opened
 
 
-def solve(solver, inputs, keywords) -> Solution:
+def solve(inputs, keywords) -> Solution:
     """Computes the motion for traced inputs: a batch, or with derivatives."""
     # Within a program, a program of its own would also be traced without derivatives.
     if not is_traced(jax.device_put(np.zeros(()))):
-        return _solve_compiled(solver, inputs, keywords)
+        return _solve_compiled(inputs, keywords)
     # Within `vmap` even a tracer may hold a NumPy array, which rules of derivatives
     # refuse in JAX 0.10.
     known = jax.Array, np.ndarray, np.generic
     inputs = jax.tree.map(
         lambda x: jax.device_put(x) if isinstance(x, known) else x, inputs
     )
-    return _solve(solver, inputs, keywords)
+    return _solve(inputs, keywords)
 
 
-def _solve(solver, inputs, keywords) -> Solution:
-    adjoint = keywords["adjoint"]
-    if isinstance(adjoint, diffrax.RecursiveCheckpointAdjoint):
-        return _integrate_reversibly(_opened(inputs), solver, keywords)
-    if solver is None:
-        forward = isinstance(adjoint, diffrax.ForwardMode)
-        solver = _tangent_solver(inputs[-1]) if forward else LoopedDopri8()
-    return integrate(solver, inputs, keywords, derivatives=True)
+def _solve(inputs, keywords) -> Solution:
+    if isinstance(keywords["adjoint"], diffrax.RecursiveCheckpointAdjoint):
+        return _integrate_reversibly(_opened(inputs), keywords)
+    return integrate(inputs, keywords, derivatives=True)
 
 
 _solve_compiled = eqx.filter_jit(_solve)

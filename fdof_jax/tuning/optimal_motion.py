@@ -22,9 +22,10 @@ from ..references.reference import reference_of
 from ..search.bounded import Run, minimise, reporting
 from ..search.lanes import Lanes
 from ..search.methods import Evaluation
+from ..simulation.efforts import joint_efforts
 from ..simulation.scene import Scene
 from ..simulation.sensitivities import sensitivities
-from ..simulation.simulate import check_elements, joint_efforts, simulate
+from ..simulation.simulate import check_elements, simulate
 from ..simulation.solution import Solution
 from .losses import controller_of
 

@@ -1,0 +1,80 @@
+"""Computes the efforts of force elements along a motion."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float
+
+from ..checks import instance, place_of
+from ..forces.element import Element, Forces, StatefulElement, elements
+from ..linkage.linkage import Linkage, check_linkage
+from .field import element_effort
+from .prescribed import prescribed, prescribed_effort
+from .simulate import check_own
+from .solution import Solution
+
+
+class Efforts(NamedTuple):
+    """Joint efforts along a motion [N or N m].
+
+    - `total`: sum over all force elements (time, 3).
+    - `elements`: efforts of each force element (element, time, 3).
+    """
+
+    total: Float[Array, "time joint"]
+    elements: Float[Array, "element time joint"]
+
+
+def joint_efforts(linkage: Linkage, forces: Forces, solution: Solution) -> Efforts:
+    """Computes the joint efforts of the force elements along a motion.
+
+    **Arguments:** the linkage, the forces and the solution of one `simulate`.
+
+    **Returns:** `Efforts(total, elements)` [N or N m], of shapes (time, 3) and
+    (element, time, 3).
+
+    **Raises:** ValueError if `forces` is not a tuple of force elements.
+
+    >>> import fdof_jax as fj
+    >>> import numpy as np
+    >>> arm, start, forces, _ = fj.scenes.fig7()
+    >>> motion = fj.simulate(arm, start, np.linspace(0, 1, 101), forces)
+    >>> total, elements = fj.joint_efforts(arm, forces, motion)
+    >>> total[0].tolist(), elements.shape
+    ([15.873, -300.0, -9.921], (1, 101, 3))
+    """
+    check_linkage(linkage)
+    instance("solution", solution, Solution)
+    forces = elements("forces", forces)
+    if solution.q.ndim != 2:
+        raise ValueError(
+            "solution: expected one motion (use jax.vmap for a batch), got positions "
+            f"of shape {solution.q.shape}."
+        )
+    check_own("solution.own", solution.own, forces, linkage, solution.ts.shape)
+    return _efforts(linkage, forces, solution)
+
+
+@eqx.filter_jit
+def _efforts(
+    linkage: Linkage, forces: tuple[Element, ...], solution: Solution
+) -> Efforts:
+    motion_rows, own = (solution.ts, solution.q, solution.qd), iter(solution.own)
+    efforts = []
+    for index, element in enumerate(forces):
+
+        def effort(t, q, qd, state, index=index, element=element):
+            return element_effort(index, element, t, q, qd, linkage, state)[0]
+
+        state = next(own) if isinstance(element, StatefulElement) else ()
+        efforts.append(jax.vmap(effort)(*motion_rows, state))
+    stacked = jnp.stack(efforts) if efforts else jnp.zeros((0, *solution.q.shape))
+    if (motion := prescribed(forces)) is not None:
+        demand = lambda *row: prescribed_effort(linkage, forces, *row)
+        demanded = jax.vmap(demand)(*motion_rows, jnp.sum(stacked, axis=0))
+        place = place_of(motion, forces)
+        stacked = stacked.at[place].set(demanded)
+    return Efforts(jnp.sum(stacked, axis=0), stacked)
