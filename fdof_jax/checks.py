@@ -15,7 +15,6 @@ import numpy as np
 from jax import Array
 from jax.core import Tracer
 
-
 # In a shape: any number of joints, which is compared with the arm's where both meet.
 JOINT = "joint"
 
@@ -50,7 +49,8 @@ def real_array(
     """Returns `value` as an array of the default float dtype and the given shape.
 
     `None` in `shape` stands for any length, and JOINT for that of any arm. `broadcast`
-    also accepts one number for all entries, and repeats it if the shape is known. Raises ValueError for a wrong shape, a type that is not real numbers, NaN,
+    also accepts one number for all entries, and repeats it if the shape is known.
+    Raises ValueError for a wrong shape, a type that is not real numbers, NaN,
     infinities (unless `finite=False`) and entries below `minimum` or not above `above`;
     the message names the `unit`.
     """

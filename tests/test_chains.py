@@ -166,7 +166,10 @@ def test_slides_that_are_nearly_parallel_keep_their_pivot():
     # Beyond 1e-8 rad, m - m cos^2 would have no digit left. Fixed pairs between and
     # beyond the slides change nothing.
     angle = 1e-6
-    for topology, locked in (("RPP", [0, angle, 0]), ("RPFPF", [0, angle, 0, 0.3, 0.1])):
+    for topology, locked in (
+        ("RPP", [0, angle, 0]),
+        ("RPFPF", [0, angle, 0, 0.3, 0.1]),
+    ):
         n = len(topology)
         chain = fj.Linkage(
             topology,

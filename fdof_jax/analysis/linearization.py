@@ -84,7 +84,7 @@ def linearize(
     [2.02, 4.744, 7.855]
     """
     forces = checked(linkage, forces)
-    q, qd = map(jnp.asarray, real_state("state", state))
+    q, qd = map(jnp.asarray, real_state("state", state, linkage))
     return _linearized(linkage, forces, q, qd, real_array("t", t, ()))
 
 

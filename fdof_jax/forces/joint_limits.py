@@ -108,5 +108,7 @@ class JointFriction(ScalarElement):
     def respond(self, scheduled, q, qd, linkage):
         return tuple(
             -level * jnp.tanh(rate / speed)
-            for level, speed, rate in zip(each(self.level, qd), each(self.speed, qd), qd)
+            for level, speed, rate in zip(
+                each(self.level, qd), each(self.speed, qd), qd
+            )
         )

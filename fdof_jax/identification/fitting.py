@@ -135,7 +135,7 @@ def _check_scene(scene: Any, ts: Array) -> None:
     if not isinstance(scene, Scene):
         raise ValueError(f"scene_at: expected it to return a Scene, got {scene!r}.")
     check_linkage(scene.linkage)
-    real_state("scene_at(...).state0", scene.state0)
+    real_state("scene_at(...).state0", scene.state0, scene.linkage)
     elements("scene_at(...).forces", scene.forces)
     check_elements(scene.forces, scene.linkage, ts)
 

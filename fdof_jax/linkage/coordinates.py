@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from ..checks import concrete, real_array
 from ..xla.array_namespace import in_numpy, namespace
-from .linkage import Linkage, compiled
+from .linkage import Linkage, compiled, joints_of
 from .topology import letters, pairs_of, real_joints
 
 
@@ -32,13 +32,14 @@ class State(NamedTuple):
     qd: ArrayLike
 
 
-def real_state(name: str, value: Any) -> State:
-    """Returns `value` as a state of arrays (3,) or raises ValueError."""
+def real_state(name: str, value: Any, linkage: Linkage) -> State:
+    """Returns `value` as a state of the linkage's joints, or raises ValueError."""
     try:
         q, qd = value
     except (TypeError, ValueError):
         raise ValueError(f"{name}: expected a State(q, qd), got {value!r}.") from None
-    return State(real_array(f"{name}.q", q, (3,)), real_array(f"{name}.qd", qd, (3,)))
+    shape = (joints_of(linkage),)
+    return State(real_array(f"{name}.q", q, shape), real_array(f"{name}.qd", qd, shape))
 
 
 @compiled("q", "qd")

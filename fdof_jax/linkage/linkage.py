@@ -1,6 +1,6 @@
 """The linkage: its joints and its links.
 
-Pair k of the chain P-R-P-R-P-R... joins link k to link k + 1. Its prismatic joint slides
+Pair k of the chain P-R-P-R-... joins link k to link k + 1. Its prismatic joint slides
 by B_k across link k; its revolute joint is at the start of link k + 1. Link 1 is the
 ground. One joint of each pair is real; the other is fictitious and held at its initial
 value. In a fixed pair both are fictitious.
@@ -27,11 +27,12 @@ from .topology import can_move, fixed_pairs, letters, pairs_of
 class Linkage(eqx.Module):
     """A planar chain of moving links, as in Fig 1 of the paper.
 
-    The paper's chain has three pairs of joints; a linkage has n, from 1 to 8. Link n starts at its characteristic point. Its vector A_n runs along the link. The
-    slide B_k of the next prismatic joint is perpendicular to A_k (90 degrees
+    The paper's chain has three pairs of joints; a linkage has n, from 1 to 8. Link k
+    starts at its characteristic point. Its vector A_k runs along the link. The slide
+    B_k of the next prismatic joint is perpendicular to A_k (90 degrees
     counter-clockwise). The mass centre lies p_k along and q_k across the link. Every
     field is an array, so linkages of different topologies share one compilation and can
-    be stacked into a batch.
+    be stacked into a batch; fixed pairs make chains of different lengths alike.
 
     **Arguments:**
 

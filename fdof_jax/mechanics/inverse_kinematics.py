@@ -84,7 +84,9 @@ def arm_of(linkage: Linkage, oriented: bool = True) -> tuple[Arm, "Placed"]:
         begins = xp.concatenate([xp.zeros_like(place[:1]), place + 1])
         ends = xp.concatenate([place, xp.full_like(place[:1], n)])
         turned = angles[ends] - angles[begins]  # within a rigid part
-        end = xp.concatenate([start[1:], start[-1:] + linkage.length[-1] * direction[-1:]])
+        end = xp.concatenate(
+            [start[1:], start[-1:] + linkage.length[-1] * direction[-1:]]
+        )
         vectors = (end[ends] - start[begins]) * direction[ends].conj()
         vector, tip = vectors[:-1], vectors[-1]
         revolute = revolute[place]
@@ -277,7 +279,5 @@ def inverse_kinematics(
     values = concrete(q)
     if values is not None and not np.isfinite(values).all():
         at = f" at orientation {angle:g} rad" if oriented else ""
-        raise ValueError(
-            f"tip: expected a point within reach{at}, got {tip.tolist()}."
-        )
+        raise ValueError(f"tip: expected a point within reach{at}, got {tip.tolist()}.")
     return jnp.asarray(q, dtype=float)

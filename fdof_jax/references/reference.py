@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from ..checks import function, is_traced, real_array
 from ..forces.part import Foreign, Part, default, optional
-from ..linkage.linkage import Linkage, check_linkage
+from ..linkage.linkage import Linkage, check_linkage, joints_of
 from ..xla.array_namespace import in_numpy
 
 EXPECTED = "a callable (t, linkage) -> (q, qd), for instance CircleTask()"
@@ -21,7 +21,7 @@ EXPECTED = "a callable (t, linkage) -> (q, qd), for instance CircleTask()"
 class Reference(Part):
     """A motion of the joints to follow: called as `(t, linkage) -> (q, qd)`.
 
-    Positions and velocities have shape (3,) [m or rad; m/s or rad/s]. Wherever a
+    Positions and velocities have shape (n,) [m or rad; m/s or rad/s]. Wherever a
     reference is expected, other callables are accepted, such as plain functions. A
     subclass implements `__call__`, or `assembly`; all else has a default:
 
@@ -37,7 +37,7 @@ class Reference(Part):
     >>> class Stand(fj.references.Reference):
     ...     target: fj.Values = fj.field(unit="m or rad")
     ...     def __call__(self, t, linkage):
-    ...         return self.target, jnp.zeros(3)
+    ...         return self.target, 0 * self.target
     >>> stand = fj.PDController(kp=100, kd=10, limit=30, reference=Stand(0.5))
     """
 
@@ -78,7 +78,7 @@ def reference_motion(reference: Any, t: Array, linkage: Linkage) -> tuple[Array,
         raise ValueError(
             f"reference: expected it to return (q_ref, qd_ref), got {motion!r}."
         )
-    q_ref, qd_ref = (real_array("reference", m, (3,)) for m in motion)
+    q_ref, qd_ref = (real_array("reference", m, (joints_of(linkage),)) for m in motion)
     return q_ref, qd_ref
 
 

@@ -4,12 +4,13 @@ from abc import abstractmethod
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from ..checks import real_array
+from ..checks import JOINT, real_array
 from ..forces.part import Condition, Values, called, default, field, of_kind
 from ..linkage.frames import cross, dot
 from ..linkage.linkage import Linkage
@@ -42,8 +43,8 @@ class JointMove(Reference):
     ([0.5, 1.0, 1.5], [0.938, 1.875, 2.812])
     """
 
-    start: Values = field((3,), unit="m or rad")
-    end: Values = field((3,), unit="m or rad")
+    start: Values = field((JOINT,), unit="m or rad")
+    end: Values = field((JOINT,), unit="m or rad")
     travel: Travel = of_kind(Travel)
 
     def assembly(self, t: Array, linkage: Linkage) -> tuple[Array, float]:

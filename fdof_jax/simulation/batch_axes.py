@@ -33,11 +33,11 @@ def _name(part: Any, *rest: Any) -> str:
     return ("linkage", "state0", "forces")[part.idx] + jax.tree_util.keystr(rest)
 
 
-def _has_axis(path: Any, array: Any) -> bool:
+def _has_axis(path: Any, array: Any, joints: int) -> bool:
     rank, shape = _RANKS[path[-1].name], array.shape
     fits = array.ndim - rank in (0, 1) and array.dtype.kind in "iuf"
-    if not fits or path[-1].name in State._fields and shape[-1] != 3:
-        own = "(3,)" if path[-1].name in State._fields else f"{rank} dimensions"
+    if not fits or path[-1].name in State._fields and shape[-1] != joints:
+        own = f"({joints},)" if path[-1].name in State._fields else f"{rank} dimensions"
         raise ValueError(
             f"{_name(*path)}: expected real numbers of {own}, or of a batch axis "
             f"before, got {array.dtype} of shape {shape}."
@@ -55,7 +55,8 @@ def batch_of(linkage: Linkage, state0: Any, forces: Forces, forces_axes: Any) ->
     """Returns the inputs as a batch; raises ValueError if their shapes do not fit."""
     inputs = linkage, state0, forces
     arm, _ = jax.tree_util.tree_flatten_with_path((linkage, state0))
-    batched = [_has_axis(path, array) for path, array in arm]
+    joints = linkage.ef.shape[-1] // 2
+    batched = [_has_axis(path, array, joints) for path, array in arm]
     try:
         batched += jax.tree.leaves(
             jax.tree.map(

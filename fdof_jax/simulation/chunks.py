@@ -77,7 +77,7 @@ def expected_work(t0: Array, moving: Any, shared: Any) -> tuple[Array, Array]:
 
     def member(moving):
         linkage, (q, qd), forces = eqx.combine(moving, shared)
-        tau = jnp.zeros(3)
+        tau = jnp.zeros_like(q)
         for index, element in enumerate(elements("forces", forces)):
             state = element.initial_state(linkage)
             tau = tau + element_effort(index, element, t0, q, qd, linkage, state)[0]
@@ -86,7 +86,7 @@ def expected_work(t0: Array, moving: Any, shared: Any) -> tuple[Array, Array]:
         rate = jnp.where(turning, qd, 0)
         qdd = forward_dynamics(linkage, q, qd, tau, forces)
         acceleration = jnp.where(turning, qdd, 0)
-        topology = jnp.sum(jnp.where(turning, jnp.array([4, 2, 1]), 0))
+        topology = jnp.sum(jnp.where(turning, 2 ** jnp.arange(len(q))[::-1], 0))
         norm = jnp.linalg.norm
         return topology, norm(rate) + jnp.sqrt(norm(acceleration))
 

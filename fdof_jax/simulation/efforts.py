@@ -20,8 +20,8 @@ from .solution import Solution
 class Efforts(NamedTuple):
     """Joint efforts along a motion [N or N m].
 
-    - `total`: sum over all force elements (time, 3).
-    - `elements`: efforts of each force element (element, time, 3).
+    - `total`: sum over all force elements (time, n).
+    - `elements`: efforts of each force element (element, time, n).
     """
 
     total: Float[Array, "time joint"]
@@ -33,8 +33,8 @@ def joint_efforts(linkage: Linkage, forces: Forces, solution: Solution) -> Effor
 
     **Arguments:** the linkage, the forces and the solution of one `simulate`.
 
-    **Returns:** `Efforts(total, elements)` [N or N m], of shapes (time, 3) and
-    (element, time, 3).
+    **Returns:** `Efforts(total, elements)` [N or N m], of shapes (time, n) and
+    (element, time, n).
 
     **Raises:** ValueError if `forces` is not a tuple of force elements.
 

@@ -161,9 +161,11 @@ def element_effort(
 ) -> tuple[Array, Any]:
     """Returns an element's effort and the rate of its state, () without a state.
 
-    Raises ValueError unless the effort is three real numbers.
+    Raises ValueError unless the effort is a real number for each joint.
     """
-    expected = f"forces[{index}]: expected it to return tau, an array of 3 real numbers"
+    expected = (
+        f"forces[{index}]: expected it to return tau, an array of {len(q)} real numbers"
+    )
     found: Any = element.act(t, q, qd, linkage, state)
     if not isinstance(found, tuple) or len(found) != 2:
         raise ValueError(f"{expected}, and the rate of its state, got {found!r}.")
@@ -177,6 +179,6 @@ def element_effort(
         tau = jnp.asarray(tau)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{expected}, got {tau!r}.") from error
-    if tau.shape != (3,) or tau.dtype.kind not in "iuf":
+    if tau.shape != q.shape or tau.dtype.kind not in "iuf":
         raise ValueError(f"{expected}, got shape {tau.shape} and dtype {tau.dtype}.")
     return tau.astype(q.dtype), rate

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from ..linkage.linkage import possible
+from ..linkage.linkage import possible, without_fixed
 from ..mechanics.equations import zeros
 from ..xla.callbacks import without_checks
 from .dopri8 import ScheduledTerm, constant
@@ -104,7 +104,8 @@ def integrate(
         return jnp.where(jnp.isinf(a) | ~valid, jnp.nan, a)
 
     # diffrax saves the start only with the first step.
-    q, qd = shown(q).at[0].set(state0.q), shown(qd).at[0].set(state0.qd)
+    start = (without_fixed(linkage, value) for value in state0)
+    q, qd = (shown(rows).at[0].set(first) for rows, first in zip((q, qd), start))
     stats = found.stats | {"time_reached": jnp.where(valid, reached, asked[0])}
     result = _judged(valid, found.result, q, qd)
     return Solution(asked, q, qd, stats, result, jax.tree.map(shown, own))
@@ -130,7 +131,7 @@ def _harmless(inputs, padded: bool) -> tuple[Array, Array, tuple[Array, Array]]:
     motion = prescribed(forces)
     if motion is not None:
         valid = valid & motion.agrees(ts[0], jnp.asarray(state0.q), linkage)
-    q0, qd0 = (jnp.where(finite, a, 0) for a in state0)
+    q0, qd0 = (without_fixed(linkage, jnp.where(finite, a, 0)) for a in state0)
     return valid, ts, (q0, qd0)
 
 

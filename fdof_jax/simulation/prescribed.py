@@ -15,7 +15,8 @@ from jaxtyping import Bool, Float
 from ..dynamics import mass_and_bias
 from ..forces.element import Element, Forces
 from ..forces.part import called
-from ..linkage.linkage import Linkage
+from ..linkage.linkage import Linkage, joints_of, without_fixed
+from ..linkage.topology import MOST_PAIRS
 from ..mechanics.equations import equations, zeros
 from ..references.reference import EXPECTED, positions_at, reference_motion
 from ..xla.array_namespace import in_numpy
@@ -33,6 +34,8 @@ from .field import (
     whole,
 )
 
+_NUMBERS = tuple(range(1, MOST_PAIRS + 1))
+
 
 class PrescribedMotion(Element):
     """Joints that follow a reference exactly, whatever effort that takes.
@@ -46,7 +49,7 @@ class PrescribedMotion(Element):
 
     **Arguments:**
 
-    - `joints`: the number of a prescribed joint, 1 to 3, or a tuple of such numbers.
+    - `joints`: the number of a prescribed joint, from 1, or a tuple of such numbers.
     - `reference`: `(t, linkage) -> (q, qd)`, as for a `PDController`; values for other
       joints are ignored. The positions must be continuous and equal those of `state0`
       at the start of a simulation; the velocities must be their rates.
@@ -54,21 +57,25 @@ class PrescribedMotion(Element):
     **Raises:** ValueError for malformed arguments.
     """
 
-    moved: Bool[Array, " joint"]
+    moved: Bool[Array, " number"]
     reference: Any = called(EXPECTED)
 
     def __init__(self, joints: int | tuple[int, ...], reference: Any):
         numbers = joints if isinstance(joints, tuple) else (joints,)
         if not numbers or any(
-            isinstance(n, bool) or not isinstance(n, int) or n not in (1, 2, 3)
+            isinstance(n, bool) or not isinstance(n, int) or n not in _NUMBERS
             for n in numbers
         ):
             raise ValueError(
-                f"joints: expected a number of 1 to 3, or a tuple of such, got "
-                f"{joints!r}."
+                f"joints: expected a number of 1 to {_NUMBERS[-1]}, or a tuple of "
+                f"such, got {joints!r}."
             )
-        self.moved = jax.device_put(np.isin([1, 2, 3], numbers))
+        self.moved = jax.device_put(np.isin(_NUMBERS, numbers))
         self.reference = reference
+
+    def of(self, q: Array) -> Array:
+        """Returns whether each joint of an arm with positions `q` is prescribed."""
+        return self.moved[: len(q)]
 
     @with_checks
     def at(self, t: Array, linkage: Linkage) -> tuple[Array, Array]:
@@ -77,12 +84,19 @@ class PrescribedMotion(Element):
     def agrees(self, t: Array, q: Array, linkage: Linkage) -> Array:
         """Returns whether prescribed joints are at the reference, to 1 in a million."""
         begin = positions_at(self.reference, t, linkage)
-        q, moved = in_numpy((q, self.moved))
+        q, moved = in_numpy((q, self.of(q)))
         near = abs(q - begin) <= 1e-6 * (1 + abs(begin))
         return (near | ~moved).all()
 
+    def check(self, linkage: Linkage, ts: Array) -> None:
+        """Runs the checks of the reference; raises ValueError for joints not there."""
+        super().check(linkage, ts)
+        if np.asarray(self.moved)[(count := joints_of(linkage)) :].any():
+            numbers = [n for n, m in zip(_NUMBERS, np.asarray(self.moved)) if m]
+            raise ValueError(f"joints: expected 1 to {count}, got {numbers}.")
+
     def __call__(self, t: Array, q: Array, qd: Array, linkage: Linkage) -> Array:
-        return jnp.zeros(3)  # the real efforts depend on all other elements
+        return jnp.zeros_like(q)  # the real efforts depend on all other elements
 
 
 def prescribed(forces: Forces) -> PrescribedMotion | None:
@@ -102,7 +116,7 @@ def _mass_and_bias(args: Args, q: Array, qd: Array) -> tuple[Array, Array]:
 
 def _split(moved: Array, matrix: Array, known: Array, right: Array) -> Array:
     """Solves the rows of the driven joints, given those of the prescribed ones."""
-    free = jnp.where(jnp.outer(~moved, ~moved), matrix, jnp.eye(3))
+    free = jnp.where(jnp.outer(~moved, ~moved), matrix, jnp.eye(len(moved)))
     known = jnp.where(moved, known, 0)
     return jnp.linalg.solve(free, jnp.where(moved, known, right - matrix @ known))
 
@@ -113,17 +127,17 @@ def motion_at(args: Args, t: Any, y: Any) -> tuple[Array, Array]:
     if (motion := prescribed(args.forces)) is None:
         return q, rates
     position, velocity = motion.at(t, args.linkage)
-    q = jnp.where(motion.moved, position, q)
-    matrix, _ = _mass_and_bias(args, q, jnp.zeros(3))
-    return q, _split(motion.moved, matrix, velocity, rates)
+    q = jnp.where(motion.of(q), position, q)
+    matrix, _ = _mass_and_bias(args, q, jnp.zeros_like(q))
+    return q, _split(motion.of(q), matrix, velocity, rates)
 
 
 def start_of(args: Args, qd: Array) -> tuple[Any, Any]:
     """Displacements and velocities or momenta at the start, before any jump there."""
     if (motion := prescribed(args.forces)) is None:
         return zeros(args.q0), tuple(qd)
-    matrix, _ = _mass_and_bias(args, args.q0, jnp.zeros(3))
-    return zeros(args.q0), tuple(jnp.where(motion.moved, 0, matrix @ qd))
+    matrix, _ = _mass_and_bias(args, args.q0, jnp.zeros_like(args.q0))
+    return zeros(args.q0), tuple(jnp.where(motion.of(qd), 0, matrix @ qd))
 
 
 def term_of(forces: tuple[Element, ...]) -> ScheduledTerm:
@@ -145,10 +159,11 @@ def _hybrid_field(t, y, args, schedule) -> tuple[Any, ...]:
     tau, own_rates, _ = applied(t, (*moving, *y[2:]), args, schedule)
     # The efforts already include the bias of masses that elements move.
     bias = jnp.stack(equations(args.constants, *moving).bias)
-    momenta = lambda q: _mass_and_bias(args, q, jnp.zeros(3))[0] @ qd
+    momenta = lambda q: _mass_and_bias(args, q, jnp.zeros_like(q))[0] @ qd
     _, change = jax.jvp(momenta, (q,), (qd,))
-    driven = jnp.where(motion.moved, 0, change - bias + jnp.stack(tau))
-    return whole(tuple(jnp.where(motion.moved, 0, qd)), tuple(driven), own_rates)
+    moved, change = motion.of(q), change - bias + jnp.stack(tau)
+    driven = jnp.where(moved, 0, without_fixed(args.linkage, change))
+    return whole(tuple(jnp.where(moved, 0, qd)), tuple(driven), own_rates)
 
 
 def _watched_hybrid_field(t, y, args, schedule) -> tuple[tuple[Any, ...], Array]:
@@ -162,8 +177,9 @@ def _health(t, y, args) -> Array:
     motion = prescribed(args.forces)
     assert motion is not None
     q, _ = motion_at(args, t, y)
-    matrix, _ = _mass_and_bias(args, q, jnp.zeros(3))
-    free = jnp.where(jnp.outer(~motion.moved, ~motion.moved), matrix, jnp.eye(3))
+    matrix, _ = _mass_and_bias(args, q, jnp.zeros_like(q))
+    driven = ~motion.of(q)
+    free = jnp.where(jnp.outer(driven, driven), matrix, jnp.eye(len(q)))
     loss = jnp.max(jnp.diag(free) * jnp.diag(jnp.linalg.inv(free)))
     return jnp.where(jnp.isnan(loss), 0, health_at(loss))
 
@@ -177,5 +193,6 @@ def prescribed_effort(
     matrix, bias = mass_and_bias(linkage, forces, q, qd)
     velocity = lambda t: motion.at(t, linkage)[1]
     _, demanded = jax.jvp(velocity, (t,), (jnp.ones_like(t),))
-    qdd = _split(motion.moved, matrix, demanded, tau - bias)
-    return jnp.where(motion.moved, matrix @ qdd + bias - tau, 0)
+    moved = motion.of(q)
+    qdd = _split(moved, matrix, demanded, tau - bias)
+    return jnp.where(moved, matrix @ qdd + bias - tau, 0)

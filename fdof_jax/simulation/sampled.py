@@ -14,7 +14,7 @@ from ..checks import concrete, function, real_array, whole_number
 from ..forces.element import Forces, ScalarElement, element_of, elements
 from ..forces.joints import JointEffort
 from ..linkage.coordinates import State, real_state
-from ..linkage.linkage import Linkage, check_linkage
+from ..linkage.linkage import Linkage, check_linkage, joints_of
 from .field import initial_states, stateful
 from .simulate import check_elements, simulate
 
@@ -55,7 +55,7 @@ def step(
     **Arguments:**
 
     - `linkage`, `state`: the arm, and its joint positions and velocities.
-    - `tau`: joint efforts, (3,) [N or N m]; `dt`: how long they are held [s].
+    - `tau`: joint efforts, (n,) [N or N m]; `dt`: how long they are held [s].
     - `forces`: other force elements, without states of their own; `t`: the time at the
       start, which the elements receive [s].
     - `options`: keywords of `simulate`.
@@ -70,7 +70,8 @@ def step(
             "lost (simulate takes such states as own0 and returns them), got "
             f"{forces!r}."
         )
-    state = real_state("state", state)
+    check_linkage(linkage)
+    state = real_state("state", state, linkage)
     dt, t = real_array("dt", dt, (), above=0), real_array("t", t, ())
     ts, acting = jnp.stack([t, t + dt]), (*forces, JointEffort(tau))
     options = dict(throw=False) | options
@@ -83,7 +84,7 @@ class SampledMotion(NamedTuple):
 
     - `ts`: sampling times, including the end (samples + 1,) [s].
     - `q`, `qd`: joint positions and velocities at `ts`; NaN after a failure.
-    - `tau`: efforts commanded at each sample (samples, 3) [N or N m].
+    - `tau`: efforts commanded at each sample (samples, n) [N or N m].
     - `result`: diffrax's result: `successful`, or that of the first failed period.
     - `own`: the states of the forces' `StatefulElement`s at `ts`.
     """
@@ -124,7 +125,7 @@ def simulate_sampled(
     - `delay`: time from measurement to action, less than a period [s]. The effort is
       zero until the first command acts. A traced delay that is too long ends the motion
       as not finite.
-    - `noise`: standard deviations of the measured positions and velocities (each (3,)
+    - `noise`: standard deviations of the measured positions and velocities (each (n,)
       or one for all), with a `jax.random` `key`.
     - `options`: keywords of `simulate`.
 
@@ -133,7 +134,7 @@ def simulate_sampled(
     **Raises:** ValueError for malformed arguments.
     """
     check_linkage(linkage)
-    forces = elements("forces", forces)
+    forces, n = elements("forces", forces), joints_of(linkage)
     expected = "a callable (t, q, qd, linkage) -> tau"
     control = element_of(function("control", control, expected))
     every = real_array("period", period, (), above=0)
@@ -157,11 +158,11 @@ def simulate_sampled(
             )
         spread = State(
             *(
-                real_array(f"noise[{k}]", value, (3,), minimum=0, broadcast=True)
+                real_array(f"noise[{k}]", value, (n,), minimum=0, broadcast=True)
                 for k, value in enumerate(noise)
             )
         )
-    state0 = real_state("state0", state0)
+    state0 = real_state("state0", state0, linkage)
     times = t0 + every * jnp.arange(samples + 1)
     check_elements((control, *forces), linkage, times)
     late = None if known is not None and known == 0 else late
@@ -184,11 +185,13 @@ def _motion(
         seen = state
         if spread is not None:
             seen = jax.tree.map(
-                lambda value, size, key: value + size * jax.random.normal(key, (3,)),
+                lambda value, size, key: (
+                    value + size * jax.random.normal(key, size.shape)
+                ),
                 *(state, spread, State(*jax.random.split(key))),
             )
         tau, rates = control.act(begin, *seen, linkage, memory)
-        tau = real_array("control", tau, (3,))
+        tau = real_array("control", tau, seen.q.shape)
         memory = jax.tree.map(lambda m, rate: m + period * rate, memory, rates)
         effort = (
             JointEffort(tau) if delay is None else _Switched(held, tau, begin + delay)
@@ -203,7 +206,7 @@ def _motion(
 
     own0 = initial_states(linkage, forces), control.initial_state(linkage)
     own0, memory0 = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), own0)
-    held = jnp.zeros(3)
+    held = jnp.zeros(joints_of(linkage))
     if delay is not None:
         held = jnp.where(delay < period, held, jnp.nan)
     first = jax.tree.map(jnp.asarray, state0), own0

@@ -12,9 +12,9 @@ from numpy.typing import ArrayLike
 
 from ..checks import increasing, instance, is_traced, real_array, whole_number
 from ..forces.element import Element, Forces, elements
-from ..forces.part import check_values
+from ..forces.part import check_joints, check_values
 from ..linkage.coordinates import State, real_state
-from ..linkage.linkage import Linkage, check_linkage, possible
+from ..linkage.linkage import Linkage, check_linkage, joints_of, possible
 from ..xla.array_namespace import in_numpy
 from .field import initial_states
 from .plain import solve_one
@@ -79,6 +79,7 @@ def check_elements(forces: Forces, linkage: Linkage, ts: Array) -> None:
         place, values = f"forces[{index}]", in_numpy(element)
         if values.jump_ts is not None:
             real_array(f"{place}.jump_ts", values.jump_ts, (None,))
+        check_joints(place, element, joints_of(linkage))
         if is_traced(linkage, ts, element):
             continue
         check_values(place, element)  # `equinox.tree_at` bypasses the constructor
@@ -147,7 +148,7 @@ def simulate(
     (54.889, -54.889)
     """
     check_linkage(linkage)
-    state0 = real_state("state0", state0)
+    state0 = real_state("state0", state0, linkage)
     ts = real_array("ts", ts, (None,))
     increasing("ts", ts)
     forces = elements("forces", forces)

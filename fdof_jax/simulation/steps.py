@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from ..checks import concrete, instance, is_traced, real_array
 from ..linkage.coordinates import State
-from ..linkage.linkage import Linkage, check_linkage
+from ..linkage.linkage import Linkage, check_linkage, joints_of
 from ..linkage.topology import real_joints
 from .step_wrappers import Adaptive, with_pid
 
@@ -122,7 +122,7 @@ def scale_tolerances(
     **Arguments:**
 
     - `controller`: the controller to scale; by default that of `simulate`.
-    - `scale`: other units per coordinate, a State of two positive arrays (3,)
+    - `scale`: other units per coordinate, a State of two positive arrays (n,)
       [m or rad, m/s or rad/s].
 
     **Raises:** ValueError for a controller that is not adaptive, a scale that is not
@@ -140,7 +140,7 @@ def scale_tolerances(
     if scale is not None:
         instance("scale", scale, State)
         q, qd = (
-            real_array(f"scale.{name}", value, (3,), above=0)
+            real_array(f"scale.{name}", value, (joints_of(linkage),), above=0)
             for name, value in zip(State._fields, scale)
         )
     else:

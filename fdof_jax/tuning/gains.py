@@ -83,7 +83,7 @@ def check_tuned(name: str, scene: Any, loss: Any) -> None:
             "JAX's transformations."
         )
     check_linkage(scene.linkage)
-    real_state(f"{name}.state0", scene.state0)
+    real_state(f"{name}.state0", scene.state0, scene.linkage)
     t1 = real_array(f"{name}.t1", scene.t1, (), above=0)
     elements(f"{name}.forces", scene.forces)
     controller = controller_of(scene)
