@@ -174,7 +174,7 @@ def _bounded(value: Any, rules: dict[str, Any]) -> Any:
 
 
 def each(values: Array, joints: Any) -> tuple[Array, ...]:
-    """Returns the declared values of the joints as scalars, one for each of `joints`."""
+    """Returns declared values of joints as scalars, one for each of `joints`."""
     return tuple(values) if jnp.ndim(values) else (values,) * len(joints)
 
 

@@ -34,7 +34,7 @@ class Frames(NamedTuple):
     """The ground (0) and the moving links (1 to n), in the last axis of arrays.
 
     - `start`: characteristic points x + iy [m]; `direction`: unit vectors (..., n + 1).
-    - `angle`: absolute angles [rad], of links 0 to n; `slide`: B_k of joints 1 to n [m].
+    - `angle`: absolute angles [rad]; `slide`: B_k of joints 1 to n [m].
     - `revolute`: whether the joint before each moving link is revolute (n,).
     """
 

@@ -20,8 +20,8 @@ def _least_inertia(linkage: "Linkage", configurations: int) -> np.ndarray:
     """Measures how far from singular the joints from k outwards are.
 
     Returns, at random configurations, the least eigenvalue of the joints' block of the
-    mass matrix (configurations, n), fixed pairs left out. Scaling to a diagonal of ones makes it free of
-    units and sizes. NumPy avoids compilation in the constructor.
+    mass matrix (configurations, n), fixed pairs left out. Scaling to a diagonal of ones
+    makes it free of units and sizes. NumPy avoids compilation in the constructor.
     """
     linkage = jax.tree.map(lambda a: np.asarray(a, dtype=float), linkage)
     revolute = np.stack(real_joints(linkage.ef))

@@ -192,7 +192,8 @@ def equations(
     enter the moments about a joint as differences, which are products with joint rates.
     """
     r, joints, last = c.revolute, range(len(delta)), len(delta) - 1
-    # Joint k turns about the start of link k, or slides across link k - 1, along i e[k].
+    # Joint k turns about the start of its link, or slides across the link before, along
+    # i e[k].
     e = c.direction[0], *(directions(c, delta) if turned is None else turned)
     slide = [c.slide[k] + jnp.where(r[k], 0, delta[k]) for k in joints]
     step = [_in_frame(c.along[k], slide[k + 1], e[k + 1]) for k in joints[:-1]]

@@ -237,9 +237,9 @@ def inverse_kinematics(
     """Computes joint positions for a tip position and a direction of the last link.
 
     The solution is in closed form for every topology of three joints that move, and of
-    two where no orientation is commanded. It is selected by the existence factors; fixed
-    pairs may be anywhere. The direction from the first joint to the last link's start
-    is in (-pi, pi]; the angles follow from it without wrapping.
+    two where no orientation is commanded. It is selected by the existence factors;
+    fixed pairs may be anywhere. The direction from the first joint to the last link's
+    start is in (-pi, pi]; the angles follow from it without wrapping.
 
     **Arguments:**
 
