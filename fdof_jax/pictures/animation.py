@@ -8,14 +8,13 @@ import numpy as np
 from matplotlib.animation import FuncAnimation
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from numpy.typing import ArrayLike
 
 from ..checks import real_array, whole_number
 from ..linkage.linkage import Linkage
 from ..simulation.solution import Solution
-from .arms import DrawnMotion, draw_arm, draw_ground, geometries_of, panels_of
-from .axes import GREY, plane_axes, reached, xy
+from .arms import draw_motion, geometries_of, panels_of
+from .axes import plane_axes, reached, xy
 from .geometry import Geometry, geometry
 
 
@@ -43,9 +42,9 @@ def _frame_times(
     """Times of the frames, and the pause between two frames [ms]."""
     fps = float(real_array("fps", fps, (), above=0))
     speed = float(real_array("speed", speed, (), above=0))
+    most = whole_number("max_frames", max_frames, 1)
     begin, end = min(ts[0] for ts in timelines), max(ts[-1] for ts in timelines)
     duration = (end - begin) / speed
-    most = whole_number("max_frames", max_frames, 1)
     frames = min(most, int(np.ceil(duration * fps)) + 1)
     pause = duration / (frames - 1) if frames > 1 else 1 / fps
     return np.linspace(begin, end, frames), 1000 * pause
@@ -62,31 +61,24 @@ def _animation(
     """Animates motions in panels of a `new` or given figure; `say` writes the time."""
     moving = []
     for ax, (ts, g) in zip(panels, motions):
-        draw_ground(ax)
-        points = np.hstack(list(g.points.values()))
-        (trace,) = ax.plot(*xy(points), color=GREY, lw=1, gid="tip path")
-        lines = draw_arm(ax, g, 0, mass_centers=True)
         samples = np.array([np.abs(ts - t).argmin() for t in times])
-        moving.append((g, DrawnMotion(trace, [lines]), samples))
+        moving.append((g, draw_motion(ax, g, samples[:1], mass_centers=True), samples))
+        ax.update_datalim(np.column_stack(xy(g.all_points)))  # of all samples
 
-    def show(frame: int) -> list[Line2D]:
+    def show(frame: int) -> None:
         for g, drawn, samples in moving:
             drawn.move(g, samples[frame : frame + 1])
         say(f"t = {times[frame]:.2f} s", fontsize="medium")
-        return [
-            line for _, (path, (arm,)), _ in moving for line in (path, *arm.values())
-        ]
 
+    show(0)
     figure = panels[0].get_figure(root=True)
     assert figure is not None  # axes are always in a figure
-    say("t = 0 s", fontsize="medium")
     figure.draw_without_rendering()
     for ax in panels:
-        ax.autoscale(False)  # the limits already hold all samples
+        ax.autoscale(False)
         ax.set_adjustable("box")
     if new:
         figure.set_layout_engine("none")  # a layout per frame takes half the time
-    show(0)
     return _Animation(figure, show, len(times), interval=pause, cache_frame_data=False)
 
 
@@ -109,13 +101,11 @@ def animate(
     **Returns:** the animation; a notebook plays it if it is the last line of a cell.
     Keep it until it is shown. `.save("motion.gif")` and `.save("motion.mp4")` write it,
     the latter with ffmpeg; `.to_jshtml()` returns a player as text, for a web page.
-
-    **Raises:** ValueError for malformed arguments.
     """
     ts, q, _ = reached(solution)
     times, pause = _frame_times([ts], fps, speed, max_frames)
     g = geometry(linkage, q)
-    panel = plane_axes(ax, np.hstack(list(g.points.values())))
+    panel = plane_axes(ax, g.all_points)
     return _animation([panel], [(ts, g)], times, pause, panel.set_title, ax is None)
 
 
@@ -133,8 +123,6 @@ def animate_grid(
     `animate`.
 
     **Returns:** the animation, as in `animate`.
-
-    **Raises:** ValueError for malformed arguments.
     """
     geometries = geometries_of(motions)
     shown = list(geometries.values())

@@ -3,8 +3,8 @@
 Every function draws into the given axes (`ax`) or figure (`fig`), or into a new one,
 and returns it; `animate` and `animate_grid` return an animation. Nothing is shown or
 saved, and no global setting changes. A `solution` is that of one `simulate`; of a
-failed one, the samples reached are drawn. Links are numbered as in the paper: the
-ground is link 1, the moving links are 2 to 4. Curves over time are in `plotting`.
+failed one, the samples reached are drawn. Link 0 is the ground, links 1 to 3 move.
+Malformed arguments raise ValueError. Curves over time are in `plotting`.
 """
 
 from collections.abc import Mapping
@@ -18,17 +18,19 @@ from numpy.typing import ArrayLike
 from ..checks import real_array, whole_number
 from ..linkage.linkage import Linkage
 from ..simulation.solution import Solution
-from .animation import animate as animate, animate_grid as animate_grid
+from .animation import animate, animate_grid
 from .arms import draw_arm, draw_ground, draw_motion, geometries_of, panels_of
-from .axes import (
-    BLACK as BLACK,
-    GREY as GREY,
-    SERIES as SERIES,
-    legend,
-    plane_axes,
-    reached,
-)
+from .axes import BLACK, GREY, SERIES, legend, plane_axes, reached
 from .geometry import geometry
+
+__all__ = [
+    "BLACK", "GREY", "SERIES", "animate", "animate_grid", "chrono_cyclograph",
+    "draw_linkage", "topology_grid",
+]  # fmt: skip
+
+
+def __dir__() -> list[str]:
+    return __all__
 
 
 def draw_linkage(
@@ -42,22 +44,20 @@ def draw_linkage(
 ) -> Axes:
     """Draws one configuration, to scale.
 
-    A link is a line along its vector A_n, bent by the fixed B_n where the next joint is
+    A link is a line along its vector A, bent by the fixed B where the next joint is
     revolute. Real revolute joints are pins; real prismatic joints are carriages on a
-    rail of length B_n. Fictitious joints are not drawn. The tip is a square. A mass
+    rail of length B. Fictitious joints are not drawn. The tip is a square. A mass
     centre is a dot, joined to its link if it lies beside it.
 
     **Arguments:** `q`: joint positions [m or rad]; `color`: common colour of all links,
     by default one per link; `alpha`: opacity, 0 to 1; `mass_centers`: whether to draw
     them.
 
-    **Returns:** the axes. The `gid` of a line names its part: "link 2", "pin 1",
-    "rail 2", "slider 2", "mass 3", "tip 4", "ground".
-
-    **Raises:** ValueError for malformed arguments.
+    **Returns:** the axes. The `gid` of a line names its part: "link 1", "pin 1",
+    "rail 2", "slider 2", "mass 3", "tip 3", "ground".
     """
     g = geometry(linkage, np.asarray(real_array("q", q, (3,)))[None])
-    ax = plane_axes(ax, np.hstack(list(g.points.values())))
+    ax = plane_axes(ax, g.all_points)
     draw_ground(ax)
     draw_arm(ax, g, 0, mass_centers, alpha, color)
     return ax
@@ -80,8 +80,6 @@ def chrono_cyclograph(
     `until`: last time, by default the solution's [s]; `mass_centers`: whether to draw
     them.
 
-    **Returns:** the axes.
-
     **Raises:** ValueError for malformed arguments and for an `until` before the start.
     """
     ts, q, _ = reached(solution)
@@ -93,7 +91,7 @@ def chrono_cyclograph(
     # The added 1e-6 keeps the last step if the division falls short by rounding.
     steps = np.arange(np.floor((last - ts[0]) / step + 1e-6) + 1)
     indices = np.unique([np.abs(ts - t).argmin() for t in ts[0] + step * steps])
-    ax = plane_axes(ax, g.end[: indices[-1] + 1])
+    ax = plane_axes(ax, g.all_points[: indices[-1] + 1])
     draw_motion(ax, g, indices, mass_centers)
     legend(ax)
     return ax
@@ -109,10 +107,6 @@ def topology_grid(
 
     **Arguments:** `motions`: title -> (linkage, its solution); `configurations`: number
     for each, evenly spaced in samples from the first (faint) to the last.
-
-    **Returns:** the figure.
-
-    **Raises:** ValueError for malformed arguments.
     """
     whole_number("configurations", configurations, 2)
     geometries = geometries_of(motions)
