@@ -10,7 +10,6 @@ import pytest
 
 import fdof_jax as fj
 from fdof_jax.__main__ import main
-from fdof_jax.shell import commands
 
 
 def pictures(folder):
@@ -58,17 +57,6 @@ def test_figures(tmp_path, capsys):
 def test_topologies(tmp_path):
     main(["--output", str(tmp_path), "topologies"])
     assert pictures(tmp_path) == ["topologies.png"]
-
-
-def test_topologies_start_alike():
-    from fdof_jax import to_chain
-
-    chains = [
-        to_chain(scene.linkage, *scene.state0)[0]
-        for scene in commands.topology_scenes().values()
-    ]
-    assert len(chains) == 7
-    np.testing.assert_allclose(chains, np.tile(chains[0], (7, 1)), atol=1e-14)
 
 
 @pytest.mark.slow

@@ -210,9 +210,8 @@ class Restorer:
         if kind == "function":
             found = _found(node["name"])
             if not isinstance(found, types.FunctionType):
-                raise Unreadable(
-                    f"expected a function of the library, got {node['name']}"
-                )
+                name = node["name"]
+                raise Unreadable(f"expected a function of the library, got {name}")
             return found
         if kind == "enumeration":
             return self.item(node)
@@ -257,20 +256,13 @@ class Restorer:
 
     def array(self, node: dict) -> np.ndarray:
         array = self.stored(node["array"])
-        if array.dtype.name != node["dtype"]:
+        if array.dtype.kind == "V":
             # NumPy's format stores other packages' dtypes as raw bytes.
-            extended = jnp.dtype(node["dtype"])
-            if array.dtype.kind != "V" or array.dtype.itemsize != extended.itemsize:
-                raise Unreadable(
-                    f"expected array {node['array']} to be of {node['dtype']}, got "
-                    f"{array.dtype}"
-                )
-            array = array.view(extended)
-        if list(array.shape) != node["shape"]:
-            raise Unreadable(
-                f"expected array {node['array']} to have shape {node['shape']}, got "
-                f"{list(array.shape)}"
-            )
+            array = array.view(jnp.dtype(node["dtype"]))
+        expected = node["dtype"], node["shape"]
+        got = array.dtype.name, list(array.shape)
+        if got != expected:
+            raise Unreadable(f"expected array {node['array']} as {expected}, got {got}")
         return array
 
     def placed(self, node: dict, array: np.ndarray) -> Any:
@@ -281,9 +273,8 @@ class Restorer:
         if kind == "scalar":
             return array[()]
         if kind == "key":
-            return jax.random.wrap_key_data(
-                jnp.asarray(array), impl=node["implementation"]
-            )
+            how = node["implementation"]
+            return jax.random.wrap_key_data(jnp.asarray(array), impl=how)
         if kind != "jax":
             raise KeyError(kind)
         # Otherwise JAX would round silently.

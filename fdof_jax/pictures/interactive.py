@@ -23,9 +23,8 @@ from ..simulation.solution import Solution
 from ..tuning.gains import with_gains
 from ..tuning.league import circle_scenes
 from ..tuning.losses import controller_of
-from .arms import draw_motion
+from .arms import draw_motion, geometry
 from .axes import BLACK, SERIES, filled_mapping, legend, plane_axes, reached, xy
-from .geometry import geometry
 
 __all__ = ["sliders"]
 

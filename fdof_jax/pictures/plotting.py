@@ -27,6 +27,7 @@ from ..linkage.linkage import Linkage
 from ..linkage.topology import real_joints
 from ..simulation.simulate import joint_efforts
 from ..simulation.solution import Solution
+from .arms import geometry
 from .axes import (
     BLACK,
     GREY,
@@ -37,7 +38,6 @@ from .axes import (
     legend,
     reached,
 )
-from .geometry import geometry
 from .tracking import tracking, tracking_by_error, tracking_error
 
 __all__ = [

@@ -16,6 +16,7 @@ from ..linkage.linkage import Linkage
 from ..references.circle import CircleTask
 from ..references.reference import reference_of
 from ..simulation.solution import Solution
+from .arms import geometry
 from .axes import (
     BLACK,
     SERIES,
@@ -26,7 +27,6 @@ from .axes import (
     reached,
     xy,
 )
-from .geometry import geometry
 
 # Without the lightest colours, which are hard to see on white.
 _DARK_TO_LIGHT = ListedColormap(colormaps["plasma"](np.linspace(0, 0.85, 256)))
