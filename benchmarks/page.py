@@ -12,10 +12,6 @@ from .scaling import slope
 from .targets import targets
 
 
-def _solvers(points: list[dict]) -> list[str]:
-    return list(dict.fromkeys(p["solver"] for p in points))
-
-
 def _read_off(points: list[dict], to_value: Callable, sign: str) -> list[str]:
     """Returns a cell per target error; `sign` marks bounds without looser points."""
     cells = []
@@ -30,27 +26,27 @@ def _read_off(points: list[dict], to_value: Callable, sign: str) -> list[str]:
     return cells
 
 
-_ERRORS = [f"{target:g}" for target in TARGETS]
-
-
 def _by_solver(points: list[dict], to_value: Callable, sign: str) -> str:
-    rows = []
-    for solver in _solvers([p for p in points if p["status"] != "skipped"]):
+    rows, measured = [], [p for p in points if p["status"] != "skipped"]
+    for solver in dict.fromkeys(p["solver"] for p in measured):
         own = [p for p in points if p["solver"] == solver]
         first = max((p["compile_time"] or 0 for p in own), default=0)
         failed = [f"{p['setting']:g}" for p in own if p["status"] == "failed"]
         rows.append(
             [solver, *_read_off(own, to_value, sign), number(first), ", ".join(failed)]
         )
-    text = table(["", *_ERRORS, "compile [s]", "failed at"], rows)
+    errors = [f"{target:g}" for target in TARGETS]
+    text = table(["", *errors, "compile [s]", "failed at"], rows)
     skips = [p for p in points if p["status"] == "skipped"]
     return text + "".join(f"\n\nSkipped: {p['solver']}: {p['reason']}." for p in skips)
 
 
 def batches(points: list[dict]) -> str:
-    parts = []
-    for batch in dict.fromkeys(p["batch"] for p in points if p["status"] != "skipped"):
-        own = [p for p in points if p["batch"] == batch and p["status"] != "skipped"]
+    measured, parts = [p for p in points if p["status"] != "skipped"], []
+    if not measured:
+        return "Not measured: no GPU was at hand."
+    for batch in dict.fromkeys(p["batch"] for p in measured):
+        own = [p for p in measured if p["batch"] == batch]
         simulated = next((p["simulated"] for p in own if "simulated" in p), None)
         text = _by_solver(own, lambda wall, s=simulated: s / wall, "≥")
         parts.append(
@@ -74,79 +70,110 @@ def trajectory(points: list[dict]) -> str:
     return "\n\n".join(parts)
 
 
-def _ratio(point: dict) -> list[str]:
-    quartiles = point["ratio_quartiles"] or [None, None]
-    return [number(point["ratio"], 3), " to ".join(number(q, 3) for q in quartiles)]
+def _listed(points: list[dict], columns: list[tuple[str, str | Callable]]) -> str:
+    """Returns a table with a row per point, of columns (head, key or function)."""
+    rows = [
+        [str(p[cell]) if isinstance(cell, str) else cell(p) for _, cell in columns]
+        for p in points
+    ]
+    return table([head for head, _ in columns], rows)
+
+
+def _number(key: str, digits: int = 2) -> Callable[[dict], str]:
+    return lambda p: number(p.get(key), digits)
+
+
+def _milliseconds(p: dict) -> str:
+    return number(p["time_median"] and 1e3 * p["time_median"], 3)
+
+
+def _quartiles(p: dict) -> str:
+    return " to ".join(number(q, 3) for q in p["ratio_quartiles"] or [None, None])
+
+
+_ratio = _number("ratio", 3)
+_FAILED = "failed", lambda p: p["reason"] or ""
+
+
+_COLUMNS: dict[str, list[tuple[str, str | Callable]]] = {
+    "gradients": [
+        ("parameters", "problem"),
+        ("number", "parameters"),
+        ("batch", "batch"),
+        ("horizon [s]", lambda p: f"{p['horizon']:g}"),
+        ("tolerance", _number("setting")),
+        ("steps up to [s]", _number("longest_step")),
+        ("mode", "gradient_mode"),
+        ("ms", _milliseconds),
+        ("over forward", _ratio),
+        ("quartiles", _quartiles),
+        ("gradient error", _number("error")),
+        ("compile [s]", _number("compile_time")),
+        _FAILED,
+    ],
+    "single_arms": [
+        ("", "problem"),
+        ("", "solver"),
+        ("tolerance", _number("setting")),
+        ("ms", _milliseconds),
+        ("ratio", _ratio),
+        ("quartiles", _quartiles),
+        ("to", lambda p: p["ratio_to"] or ""),
+        ("error", _number("error")),
+        _FAILED,
+    ],
+    "compile_times": [
+        ("", "problem"),
+        ("", "solver"),
+        ("of a process [s]", _number("time_median", 3)),
+        ("of the first call [s]", _number("compile_time", 3)),
+        (
+            "second call [ms]",
+            lambda p: number(1e3 * np.median(p["again"]) if p["times"] else None, 3),
+        ),
+        _FAILED,
+    ],
+    "drift": [
+        ("", "solver"),
+        ("setting", lambda p: f"{p['kind']} {p['setting']:g}" if p["setting"] else ""),
+        ("s", _number("time_median", 3)),
+        ("largest energy error [J]", _number("energy_defect")),
+        _FAILED,
+    ],
+    "lockstep": [
+        ("", "solver"),
+        ("ms", _milliseconds),
+        ("over clean", _ratio),
+        ("quartiles", _quartiles),
+        ("mean steps", _number("steps", 3)),
+        ("most", _number("steps_max", 4)),
+        ("most/mean", _number("waste")),
+        _FAILED,
+    ],
+    "many": [
+        ("scenes", "problem"),
+        ("s", _number("time_median", 3)),
+        ("mean steps", _number("steps", 3)),
+        ("most", "steps_max"),
+        ("successful", "successful"),
+        ("off single motions by", _number("against_singles")),
+        ("memory before [MB]", lambda p: f"{p['memory_before_mb']:.0f}"),
+        ("at most [MB]", lambda p: f"{p['memory_peak_mb']:.0f}"),
+        ("of it results [MB]", lambda p: f"{p['saved_mb']:.0f}"),
+    ],
+}
 
 
 def generality(points: list[dict]) -> str:
-    rows = [
-        [
-            p["problem"],
-            p["solver"],
-            number(1e9 * p["time_median"] / p["member_steps"], 3),
-            *_ratio(p),
-        ]
-        for p in points
-        if p["times"]
+    each = lambda p: number(1e9 * p["time_median"] / p["member_steps"], 3)
+    columns = [
+        ("problem", "problem"),
+        ("", "solver"),
+        ("ns per member and step", each),
+        ("ratio", _ratio),
+        ("quartiles", _quartiles),
     ]
-    head = ["problem", "", "ns per member and step", "ratio", "quartiles"]
-    return table(head, rows)
-
-
-def gradients(points: list[dict]) -> str:
-    rows = [
-        [
-            p["problem"],
-            str(p["parameters"]),
-            str(p["batch"]),
-            f"{p['horizon']:g}",
-            number(p["setting"]),
-            number(p["longest_step"]),
-            p["gradient_mode"],
-            number(p["time_median"] and 1e3 * p["time_median"], 3),
-            *_ratio(p),
-            number(p["error"]),
-            number(p["compile_time"]),
-            p["reason"] or "",
-        ]
-        for p in points
-    ]
-    head = [
-        "parameters", "number", "batch", "horizon [s]", "tolerance",
-        "steps up to [s]", "mode", "ms",
-        "over forward", "quartiles", "gradient error", "compile [s]", "failed",
-    ]  # fmt: skip
-    return table(head, rows)
-
-
-def single_arms(points: list[dict]) -> str:
-    rows = [
-        [
-            p["problem"],
-            p["solver"],
-            number(p["setting"]),
-            number(p["time_median"] and 1e3 * p["time_median"], 3),
-            *_ratio(p),
-            p["ratio_to"] or "",
-            number(p["error"]),
-            p["reason"] or "",
-        ]
-        for p in points
-    ]
-    head = ["", "", "tolerance", "ms", "ratio", "quartiles", "to", "error", "failed"]
-    return table(head, rows)
-
-
-def compile_times(points: list[dict]) -> str:
-    rows = []
-    for p in points:
-        again = 1e3 * np.median(p["again"]) if p["times"] else None
-        seconds = number(p["time_median"], 3), number(p["compile_time"], 3)
-        rows.append([p["problem"], p["solver"], *seconds, number(again, 3)])
-        rows[-1].append(p["reason"] or "")
-    head = "of a process [s]", "of the first call [s]", "second call [ms]", "failed"
-    return table(["", "", *head], rows)
+    return _listed([p for p in points if p["times"]], columns)
 
 
 def scaling(points: list[dict]) -> str:
@@ -161,131 +188,58 @@ def scaling(points: list[dict]) -> str:
     return table(["time against", "from", "exponent"], rows)
 
 
-def drift(points: list[dict]) -> str:
-    rows = [
-        [
-            p["solver"],
-            f"{p['kind']} {p['setting']:g}" if p["setting"] else "",
-            number(p["time_median"], 3),
-            number(p["energy_defect"]),
-            p["reason"] or "",
-        ]
-        for p in points
-    ]
-    return table(["", "setting", "s", "largest energy error [J]", "failed"], rows)
-
-
-def lockstep(points: list[dict]) -> str:
-    rows = [
-        [
-            p["solver"],
-            number(p["time_median"] and 1e3 * p["time_median"], 3),
-            *_ratio(p),
-            number(p["steps"], 3),
-            number(p.get("steps_max"), 4),
-            number(p.get("waste")),
-            p["reason"] or "",
-        ]
-        for p in points
-    ]
-    head = [
-        "",
-        "ms",
-        "over clean",
-        "quartiles",
-        "mean steps",
-        "most",
-        "most/mean",
-        "failed",
-    ]
-    return table(head, rows)
-
-
 def tuning(points: list[dict]) -> str:
-    timed = [
-        [
-            p["problem"],
-            # An earlier row compiled this program.
-            number(p["compile_time"]) if p["compile_time"] > 1 else "-",
-            number(p["time_median"], 3),
-            number(p["time_median"] / p["batch"], 3),
-            f"{100 * p['near']:.0f} %",
-        ]
-        for p in points
-        if p["kind"] == "time"
-    ]
-    seconds_of = {p["problem"]: p["time_median"] for p in points if p["kind"] == "time"}
-    *_, one, every = seconds_of.values()
-    ratio = (
-        f"Seven topologies with all their starts take {every / one:.0f} times as long "
-        "as one with one start."
+    timed, robust, races = (
+        [p for p in points if p["kind"] == kind] for kind in ("time", "robust", "race")
     )
-    robust = [
+    seconds = _listed(
+        timed,
+        [
+            ("", "problem"),
+            # An earlier row compiled what seems to take no time.
+            (
+                "compile [s]",
+                lambda p: number(p["compile_time"]) if p["compile_time"] > 1 else "-",
+            ),
+            ("s", _number("time_median", 3)),
+            ("s per start", lambda p: number(p["time_median"] / p["batch"], 3)),
+            ("starts within 1 % of the best", lambda p: f"{100 * p['near']:.0f} %"),
+        ],
+    )
+    *_, one, every = [p["time_median"] for p in timed]
+    worst = [
         [p["problem"], p["solver"], *(number(v, 4) for v in p["worst"].values())]
-        for p in points
-        if p["kind"] == "robust"
+        for p in robust
     ]
-    races = [p for p in points if p["kind"] == "race"]
     limits = list(races[0]["best"]) if races else []
     raced = [
         [p["problem"], p["solver"], *(number(p["best"][limit], 4) for limit in limits)]
         for p in races
     ]
-    head = ["", "compile [s]", "s", "s per start", "starts within 1 % of the best"]
-    seconds = [f"{limit} s" for limit in limits]
     return "\n\n".join(
         [
-            table(head, timed),
-            ratio,
+            seconds,
+            f"Seven topologies with all their starts take {every / one:.0f} times as "
+            "long as one with one start.",
             "Worst rms tip error [mm] over 64 members, of gains tuned for the nominal "
             "scene, for 16 other members, and, as a bound, for these 64 themselves:",
-            table(["", "controller", "nominal", "robust", "bound"], robust),
+            table(["", "controller", "nominal", "robust", "bound"], worst),
             "Best rms tip error [mm] after so many seconds, median of the starts:",
-            table(["", "optimiser", *seconds], raced),
+            table(["", "optimiser", *(f"{limit} s" for limit in limits)], raced),
         ]
     )
 
 
-def many(points: list[dict]) -> str:
-    rows = [
-        [
-            p["problem"],
-            number(p["time_median"], 3),
-            number(p["steps"], 3),
-            str(p["steps_max"]),
-            str(p["successful"]),
-            number(p["against_singles"]),
-            f"{p['memory_before_mb']:.0f}",
-            f"{p['memory_peak_mb']:.0f}",
-            f"{p['saved_mb']:.0f}",
-        ]
-        for p in points
-    ]
-    head = [
-        "scenes", "s", "mean steps", "most", "successful", "off single motions by",
-        "memory before [MB]", "at most [MB]", "of it results [MB]",
-    ]  # fmt: skip
-    return table(head, rows)
-
-
 def sliders(points: list[dict]) -> str:
-    rows = [
-        [
-            p["problem"],
-            str(len(p["times"])),
-            number(1e3 * p["time_median"], 3),
-            number(1e3 * p["time_95"], 3),
-            f"{100 * p['under_100_ms']:.1f} %",
-        ]
-        for p in points
-        if p["times"]
-    ]
     moves = [t for p in points if not p["problem"].startswith("between")
              for t in p["times"]]  # fmt: skip
-    if moves:
-        median, most = (number(1e3 * np.quantile(moves, q), 3) for q in (0.5, 0.95))
-        share = f"{100 * np.mean(np.array(moves) < 0.1):.1f} %"
-        rows.append(["all moves", str(len(moves)), median, most, share])
+    rows = []
+    for p in [*points, {"problem": "all moves", "times": moves}]:
+        if p["times"]:
+            median, most = (number(1e3 * np.quantile(p["times"], q), 3)
+                            for q in (0.5, 0.95))  # fmt: skip
+            share = f"{100 * np.mean(np.array(p['times']) < 0.1):.1f} %"
+            rows.append([p["problem"], str(len(p["times"])), median, most, share])
     head = ["", "pictures", "median [ms]", "95 % within [ms]", "under 100 ms"]
     return table(head, rows)
 
@@ -309,41 +263,27 @@ def _machine(points: dict[str, list[dict]]) -> str:
     return "\n".join(lines)
 
 
-_NOT_MEASURED = "Not measured: no GPU was at hand."
-
-
-def _gpu(points: list[dict]) -> str:
-    measured = [p for p in points if p["status"] != "skipped"]
-    return batches(measured) if measured else _NOT_MEASURED
-
-
 def tables(points: dict[str, list[dict]]) -> dict[str, str]:
     """Returns the text of each table that has been measured, by name."""
     makers = {
         "batches": batches,
-        "batches-xla-flags": batches,
-        "batches-two-cores": batches,
-        "batches-two-devices": batches,
-        "batches-float32": batches,
-        "batches-gpu": _gpu,
-        "batches-gpu-float32": _gpu,
         "mixed": batches,
-        "many": many,
         "trajectory": trajectory,
         "generality": generality,
         "checks": generality,
-        "gradients": gradients,
-        "single_arms": single_arms,
-        "compile_times": compile_times,
         "scaling": scaling,
-        "drift": drift,
-        "lockstep": lockstep,
         "tuning": tuning,
         "hard_cases": hard_cases,
         "hard_cases-float32": hard_cases_float32,
         "sliders": sliders,
     }
-    texts = {name: makers[name](own) for name, own in points.items() if own}
+    texts = {}
+    for name, own in points.items():
+        if name in _COLUMNS:
+            texts[name] = _listed(own, _COLUMNS[name])
+        elif own:
+            kind = name if name in makers else name.partition("-")[0]
+            texts[name] = makers[kind](own)
     if texts:
         rows = [[*map(str, row)] for row in targets(points, number)]
         head = ["figure", "measured", "quartiles", "required", "aim for"]

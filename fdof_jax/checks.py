@@ -35,6 +35,11 @@ def concrete(value: Any) -> np.ndarray | None:
     return None if is_traced(value) else np.asarray(value)
 
 
+def refusal(name: str, expected: str, got: Any) -> ValueError:
+    """Returns the error to raise for a malformed argument."""
+    return ValueError(f"{name}: expected {expected}, got {got!r}.")
+
+
 def real_array(
     name: str,
     value: Any,
@@ -109,9 +114,7 @@ def increasing(name: str, times: Array) -> None:
         raise ValueError(f"{name}: expected increasing times, at least one, got none.")
     values = concrete(times)
     if values is not None and not (np.diff(values) > 0).all():
-        raise ValueError(
-            f"{name}: expected increasing times, got {values.tolist()[:20]}."
-        )
+        raise refusal(name, "increasing times", values.tolist()[:20])
 
 
 def place_of(item: Any, items: Sequence[Any]) -> int:
@@ -123,22 +126,20 @@ def function(name: str, value: Any, expected: str = "a callable") -> Any:
     """Returns `value` if it is callable and no class, or raises ValueError."""
     if callable(value) and not isinstance(value, type):
         return value
-    raise ValueError(f"{name}: expected {expected}, got {value!r}.")
+    raise refusal(name, expected, value)
 
 
 def instance(name: str, value: Any, kind: type) -> None:
     """Raises ValueError unless `value` is an instance of `kind`."""
     if not isinstance(value, kind):
-        raise ValueError(f"{name}: expected a {kind.__name__}, got {value!r}.")
+        raise refusal(name, f"a {kind.__name__}", value)
 
 
 def whole_number(name: str, value: Any, minimum: int) -> int:
     """Returns `value` if it is an integer of at least `minimum`, not a bool."""
     whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
     if not whole or value < minimum:
-        raise ValueError(
-            f"{name}: expected a whole number of at least {minimum}, got {value!r}."
-        )
+        raise refusal(name, f"a whole number of at least {minimum}", value)
     return int(value)
 
 
@@ -146,7 +147,7 @@ def one_of(name: str, value: Any, options: Sequence[Any]) -> Any:
     """Returns `value` if it is among `options`, or raises ValueError."""
     if isinstance(value, str | int | float) and value in options:
         return value
-    raise ValueError(f"{name}: expected one of {tuple(options)}, got {value!r}.")
+    raise refusal(name, f"one of {tuple(options)}", value)
 
 
 def keywords_as(
@@ -173,5 +174,5 @@ def sign(name: str, value: Any) -> Array:
     """Returns `value` as an array if it is 1 or -1, or raises ValueError."""
     array = real_array(name, value, ())
     if (given := concrete(array)) is not None and abs(given) != 1:
-        raise ValueError(f"{name}: expected 1 or -1, got {value!r}.")
+        raise refusal(name, "1 or -1", value)
     return array

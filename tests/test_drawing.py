@@ -87,20 +87,20 @@ def test_linkage_is_drawn_where_kinematics_puts_it(topology):
         np.testing.assert_allclose(at, [joints[k]], atol=1e-12)
         assert f"{other} {k + 1}" not in drawn
         assert (f"rail {k + 1}" in drawn) == (kind == "P")
-        link, bone = drawn[f"link {k + 2}"].get_xydata(), linkage.length[k + 1]
+        link, bone = drawn[f"link {k + 1}"].get_xydata(), linkage.length[k + 1]
         np.testing.assert_allclose(link[0], joints[k], atol=1e-12)
         np.testing.assert_allclose(np.linalg.norm(link[1] - link[0]), bone)
         # The fixed offset belongs to the link, the slide to the rail.
-        rail = drawn.get(f"rail {k + 2}", drawn[f"link {k + 2}"])
+        rail = drawn.get(f"rail {k + 2}", drawn[f"link {k + 1}"])
         np.testing.assert_allclose(rail.get_xydata()[-1], ends[k + 1], atol=1e-12)
-        dot = drawn[f"mass {k + 2}"].get_xydata()[-1]
+        dot = drawn[f"mass {k + 1}"].get_xydata()[-1]
         np.testing.assert_allclose(dot, centers[k], atol=1e-12)
-    np.testing.assert_allclose(drawn["tip 4"].get_xydata(), [ends[-1]], atol=1e-12)
+    np.testing.assert_allclose(drawn["tip 3"].get_xydata(), [ends[-1]], atol=1e-12)
 
 
 def test_slides_stand_across_their_link():
     drawn = lines(drawing.draw_linkage(make_linkage("RPR"), [0.3, 0.4, -0.5]))
-    along = np.diff(drawn["link 2"].get_xydata(), axis=0)[0]
+    along = np.diff(drawn["link 1"].get_xydata(), axis=0)[0]
     rail = np.diff(drawn["rail 2"].get_xydata(), axis=0)[0]
     np.testing.assert_allclose(rail, 0.4 * np.array([-along[1], along[0]]), atol=1e-12)
     turn = drawn["slider 2"]._marker.get_user_transform().get_matrix()
@@ -120,14 +120,14 @@ def test_linkage_options():
     assert ax.get_aspect() == 1
     drawn = lines(ax)
     assert not [name for name in drawn if name.startswith("mass")]
-    assert {drawn[f"link {n}"].get_color() for n in (2, 3, 4)} == {"red"}
-    assert drawn["link 2"].get_alpha() == 0.5
+    assert {drawn[f"link {n}"].get_color() for n in (1, 2, 3)} == {"red"}
+    assert drawn["link 1"].get_alpha() == 0.5
 
 
 def test_chrono_cyclograph_takes_the_nearest_samples():
     linkage, solution = make_linkage("RPR"), swinging()
     ax = drawing.chrono_cyclograph(linkage, solution, every=0.1, until=0.3)
-    tips = named(ax, "tip 4")
+    tips = named(ax, "tip 3")
     assert len(tips) == 4
     for line, sample in zip(tips, (0, 10, 20, 30)):
         expected = tip_position(linkage, solution.q[sample])
@@ -135,20 +135,20 @@ def test_chrono_cyclograph_takes_the_nearest_samples():
     alphas = [line.get_alpha() for line in tips]
     assert alphas == sorted(alphas) and alphas[-1] == 1
     assert len(lines(ax)["tip path"].get_xydata()) == 31
-    assert labels(ax) == ["tip path", "link 2", "link 3", "link 4"]
+    assert labels(ax) == ["tip path", "link 1", "link 2", "link 3"]
 
 
 @pytest.mark.parametrize("until, count", [(None, 11), (5.0, 11), (0.0, 1)])
 def test_chrono_cyclograph_ends(until, count):
     ax = drawing.chrono_cyclograph(make_linkage("RRR"), swinging(), until=until)
-    assert len(named(ax, "tip 4")) == count
+    assert len(named(ax, "tip 3")) == count
 
 
 def test_what_a_failed_solve_did_not_reach_is_left_out():
     solution = swinging()
     solution = eqx.tree_at(lambda s: s.q, solution, solution.q.at[51:].set(jnp.nan))
     ax = drawing.chrono_cyclograph(make_linkage("RRR"), solution)
-    assert len(named(ax, "tip 4")) == 6
+    assert len(named(ax, "tip 3")) == 6
 
 
 def test_topology_grid_has_a_panel_for_each():
@@ -158,7 +158,7 @@ def test_topology_grid_has_a_panel_for_each():
     assert [ax.get_title() for ax in fig.axes] == list(TOPOLOGIES)
     assert (fig.get_supxlabel(), fig.get_supylabel()) == ("x [m]", "y [m]")
     for ax in fig.axes:
-        assert len(named(ax, "tip 4")) == 2
+        assert len(named(ax, "tip 3")) == 2
 
 
 @pytest.mark.parametrize(
@@ -180,7 +180,7 @@ def test_animation_is_capped_and_moves(kind, writer, tmp_path):
     path = drawn["tip path"].get_xydata()
     assert ((path > [left, bottom]) & (path < [right, top])).all()
     expected = tip_position(linkage, solution.q[-1])
-    np.testing.assert_allclose(drawn["tip 4"].get_xydata(), [expected], atol=1e-12)
+    np.testing.assert_allclose(drawn["tip 3"].get_xydata(), [expected], atol=1e-12)
     assert len(path) == 101
 
 
@@ -213,7 +213,7 @@ def test_grid_of_animations_moves_together():
             (short, second, other),
         ):
             expected = tip_position(linkage, solution.q[i])
-            tip, path = lines(ax)["tip 4"], lines(ax)["tip path"]
+            tip, path = lines(ax)["tip 3"], lines(ax)["tip path"]
             np.testing.assert_allclose(tip.get_xydata(), [expected], atol=1e-12)
             assert len(path.get_xydata()) == i + 1
     animation._draw_was_started = True  # type: ignore[attr-defined]

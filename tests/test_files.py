@@ -2,12 +2,7 @@
 
 import dataclasses
 import os
-import re
 import struct
-import subprocess
-import sys
-import zipfile
-from pathlib import Path
 
 import diffrax
 import elements
@@ -25,15 +20,12 @@ from saved_trees import (
     Pair,
     Plain,
     Push,
-    describe,
-    refused,
     same,
     saved_and_loaded,
 )
 
 import fdof_jax as fj
 from fdof_jax import scenes
-from fdof_jax.shell.tuning_run import Job
 from fdof_jax.simulation import prescribed
 from fdof_jax.simulation.looped_dopri8 import LoopedDopri8
 from fdof_jax.tuning import tuning
@@ -241,94 +233,3 @@ class Careful(eqx.Module):
 def test_no_constructor_is_called(path):
     saved_and_loaded(path, Careful(1.0), (Careful,))
     saved_and_loaded(path, eqx.tree_at(lambda c: c.value, Careful(1), None), (Careful,))
-
-
-def test_classes_of_a_script(path, monkeypatch):
-    push = Push(jnp.ones(3), "own")
-    monkeypatch.setattr(Push, "__module__", "__main__")
-    fj.save(path, push)
-    monkeypatch.undo()
-    same(fj.load(path, [Push]), push)
-    fj.save(path, push)
-    monkeypatch.setattr(Push, "__module__", "__main__")
-    same(fj.load(path, [Push]), push)
-    monkeypatch.setattr(Push, "__module__", "elsewhere")
-    refused(path, "saved_trees:Push", [Push])
-
-
-READER = """
-import sys
-import jax
-jax.config.update("jax_enable_x64", True)
-import fdof_jax as fj
-assert "fdof_jax.tuning.result" not in sys.modules
-run, scene = fj.load(sys.argv[1])
-fj.save(sys.argv[2], (run, scene))
-assert type(run).__module__ == "fdof_jax.tuning.result"
-"""
-
-
-def test_another_process_reads_it(path, tmp_path):
-    """The other process imports the library's modules while it reads."""
-    from fdof_jax.tuning.result import History
-
-    run = History(*range(len(dataclasses.fields(History))))
-    fj.save(path, (run, SCENES["fig7"]))
-    other = tmp_path / "other"
-    arguments = [sys.executable, "-c", READER, path, other]
-    subprocess.run(arguments, check=True, env=os.environ, timeout=120)
-    same(fj.load(other), (run, SCENES["fig7"]))
-    assert other.read_bytes() == path.read_bytes()
-
-
-def test_members_that_another_version_counts_differently(path):
-    fj.save(path, [Colour.red, Colour.green])
-
-    def swap(description):
-        for node in description["tree"]:
-            node["members"] = {"red": 1, "green": 0}
-
-    describe(path, swap)
-    same(fj.load(path, OWN), [Colour.green, Colour.red])
-    describe(path, lambda d: d["tree"][0].update(members={"red": 1, "blue": 0}))
-    refused(path, "Colour.*blue", OWN)
-
-
-OF_0_1 = Path(__file__).parent / "saved_by_0.1.fdof"
-
-
-def equal(a, b):
-    """Checks equality apart from JAX's weak types, which constructors may change."""
-    assert jax.tree.structure(a) == jax.tree.structure(b)
-    jax.tree.map(np.testing.assert_array_equal, a, b)
-
-
-def test_a_file_of_version_0_1():
-    """Such a file names the module of each class; later versions have moved classes."""
-    tree = fj.load(OF_0_1, OWN)
-    equal(tree["scenes"], SCENES)
-    equal(tree["elements"], elements.ALL)
-    assert tree["functions"] == [fj.sweep, fj.tuning.tip_errors, fj.simulate]
-    assert type(tree["tuned"]) is fj.TuneResult
-    assert type(tree["optimal"]) is fj.tuning.OptimalMotion
-    assert tree["solution"].outcome == "successful"
-    travel = fj.references.Travel(2.0, begin=0.5, profile="trapezoidal")
-    spline = fj.references.Spline([[0, 0], [1, 0], [1, 1], [0, 1]], closed=True)
-    equal(tree["references"][7], fj.TipTask(spline, travel, orientation=0.1))
-
-
-def test_what_the_command_line_saves(path):
-    saved_and_loaded(path, {"job": Job(), "search": {"seed": 1}, "results": []})
-
-
-def test_files_name_no_module(path):
-    """Checks that classes can change module while files stay readable."""
-    fj.save(path, fj.load(OF_0_1, OWN))
-    with zipfile.ZipFile(path) as archive:
-        text = archive.read("description.json").decode()
-    names = re.findall(r'"(?:class|name)": "([^"]*)"', text)
-    assert {name.partition(":")[0] for name in names} == {
-        "diffrax",
-        "elements",
-        "fdof_jax",
-    }

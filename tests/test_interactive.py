@@ -55,13 +55,23 @@ def box(all_arms):
 
 
 def test_every_slider_changes_picture_and_words(box):
-    for name in ("A2", "A3", "A4", "kp 1", "kp 2", "kp 3", "kd 1", "kd 2", "kd 3"):
+    for name in (
+        "link 1",
+        "link 2",
+        "link 3",
+        "kp 1",
+        "kp 2",
+        "kp 3",
+        "kd 1",
+        "kd 2",
+        "kd 3",
+    ):
         before, words = box.pixels, box.words.value
         after = box.move(**{name: 1.2})
         assert after.shape == before.shape
         assert np.abs(after - before).max() > 0.5, name
         assert box.words.value != words, name
-    assert "600 N m/rad" in box.words.value and "A3 = 0.96 m" in box.words.value
+    assert "600 N m/rad" in box.words.value and "link 2: 0.96 m" in box.words.value
 
 
 @pytest.mark.slow
@@ -78,19 +88,19 @@ def test_the_error_is_that_of_a_simulation(box):
 
 def test_nothing_is_compiled_after_the_first_picture(box, monkeypatch):
     monkeypatch.setattr(prescribed, "vector_field", None)  # no second trace
-    shown = {name: box.move(arm=name, A2=1.1).tobytes() for name in fj.TOPOLOGIES}
+    shown = {name: box.move(arm=name, link_1=1.1).tobytes() for name in fj.TOPOLOGIES}
     assert len(set(shown.values())) == 7
 
 
 def test_choosing_an_arm_keeps_the_sliders(box):
-    box.move(A2=1.1, kp_1=2.0, arm="PPR")
-    assert "A2 = 1.1 m" in box.words.value and "4000 N/m" in box.words.value
+    box.move(link_1=1.1, kp_1=2.0, arm="PPR")
+    assert "link 1: 1.1 m" in box.words.value and "4000 N/m" in box.words.value
 
 
 def test_the_way_of_the_sliders_does_not_matter(box):
     """Checks that axes stored as pixels keep no trace of the previous picture."""
-    there = box.move(arm="PRR", A3=1.3)
-    back = box.move(A3=1.0)
+    there = box.move(arm="PRR", link_2=1.3)
+    back = box.move(link_2=1.0)
     assert np.abs(there - back).max() > 0.5
     box.move(arm="RRR")
     np.testing.assert_array_equal(box.move(arm="PRR"), box.move(arm="PRR"))
@@ -101,10 +111,10 @@ def test_the_way_of_the_sliders_does_not_matter(box):
 
 def test_a_circle_out_of_reach_is_told_and_the_arm_still_drawn(box):
     before = box.pixels
-    after = box.move(A2=0.5, A3=0.5)
+    after = box.move(link_1=0.5, link_2=0.5)
     assert "out of the arm's reach</b> from 0.00 s" in box.words.value
     assert np.abs(after - before).max() > 0.5
-    box.move(A2=1.0, A3=1.0)
+    box.move(link_1=1.0, link_2=1.0)
     assert "Tip error: rms" in box.words.value
 
 
@@ -118,7 +128,7 @@ def test_a_slider_starts_on_one_of_its_steps(box):
     for name, part in box.parts.items():
         if name.startswith("k"):
             steps = np.array([0 - part.min, part.max]) / part.step
-        elif name.startswith("A"):
+        elif name.startswith("link"):
             steps = np.array([1 - part.min, part.max - 1]) / part.step
         else:
             continue

@@ -47,12 +47,12 @@ def test_motion_profile_shows_absolute_angles_in_degrees_and_slides():
     assert angles.get_ylabel() == "angle [degrees]"
     assert slides.get_ylabel() == "slide [m]"
     assert slides.get_xlabel() == "time [s]"
-    assert labels(angles) == [r"$\theta_2$", r"$\theta_4$"]
+    assert labels(angles) == [r"$\theta_1$", r"$\theta_3$"]
     assert labels(slides) == ["$B_2$"]
     q = np.asarray(solution.q)
-    th2, th4 = values(angles)
-    np.testing.assert_allclose(th2, np.rad2deg(0.4 + q[:, 0]))
-    np.testing.assert_allclose(th4, np.rad2deg(0.4 + q[:, 0] + 0.7 + q[:, 2]))
+    th1, th3 = values(angles)
+    np.testing.assert_allclose(th1, np.rad2deg(0.4 + q[:, 0]))
+    np.testing.assert_allclose(th3, np.rad2deg(0.4 + q[:, 0] + 0.7 + q[:, 2]))
     np.testing.assert_allclose(values(slides)[0], q[:, 1])
     only = plotting.motion_profile(make_linkage("RRR"), solution, plt.figure())
     assert len(only.axes) == 1
@@ -62,7 +62,7 @@ def test_energy_profile_adds_up():
     fig = plotting.energy_profile(make_linkage("PRR"), swinging())
     kinetic, potential, whole = fig.axes
     assert all("[J]" in ax.get_ylabel() for ax in fig.axes)
-    assert labels(kinetic) == ["link 2", "link 3", "link 4"]
+    assert labels(kinetic) == ["link 1", "link 2", "link 3"]
     assert labels(whole) == ["kinetic", "potential", "total"]
     sums = [sum(values(ax)) for ax in (kinetic, potential)]
     for total, expected in zip(values(whole), (*sums, sums[0] + sums[1])):
@@ -173,7 +173,7 @@ def test_effort_profile_has_units_limits_and_saturation():
     solution = made_up(np.linspace(0, 1, 11), q)
     fig = plotting.effort_profile(make_linkage("RPR"), forces, solution)
     names = [ax.get_ylabel() for ax in fig.axes]
-    assert names == ["$T_2$ [N m]", "$F_2$ [N]", "$T_4$ [N m]"]
+    assert names == ["$T_1$ [N m]", "$F_2$ [N]", "$T_3$ [N m]"]
     dots = [named(ax, f"saturated {k + 1}") for k, ax in enumerate(fig.axes)]
     assert len(dots[0][0].get_xydata()) == 0 and not dots[2]
     np.testing.assert_allclose(dots[1][0].get_ydata(), np.full(5, -300.0))

@@ -6,6 +6,7 @@ import numpy as np
 
 from ..checks import is_traced
 from ..linkage.linkage import Linkage, check_linkage
+from ..linkage.topology import real_joints
 
 # MuJoCo rejects smaller masses and inertias of moving bodies (its mjMINVAL).
 _SMALLEST = 1e-15
@@ -40,43 +41,24 @@ def to_mjcf(linkage: Linkage) -> str:
     mass = np.maximum(np.asarray(linkage.mass), _SMALLEST)
     inertia = np.maximum(np.asarray(linkage.inertia), _SMALLEST)
 
+    add = ElementTree.SubElement
     root = ElementTree.Element("mujoco", model="linkage")
-    ElementTree.SubElement(root, "compiler", angle="radian")
-    option = ElementTree.SubElement(
-        root, "option", gravity=_text(0, -float(linkage.gravity), 0)
-    )
-    ElementTree.SubElement(option, "flag", contact="disable")
-    world = ElementTree.SubElement(root, "worldbody")
-    parent = ElementTree.SubElement(
-        world, "body", name="ground", quat=_turn(float(linkage.base_angle))
-    )
-    for k in range(3):
-        revolute = ef[2 * k + 1] > 0.5
-        body = ElementTree.SubElement(
-            parent,
-            "body",
-            name=f"link{k + 1}",
-            pos=_text(length[k], locked[k] if revolute else 0, 0),
-            quat=_turn(0.0 if revolute else locked[k]),
-        )
+    add(root, "compiler", angle="radian")
+    option = add(root, "option", gravity=_text(0, -float(linkage.gravity), 0))
+    add(option, "flag", contact="disable")
+    world = add(root, "worldbody")
+    body = add(world, "body", name="ground", quat=_turn(float(linkage.base_angle)))
+    for k, revolute in enumerate(real_joints(ef)):
+        side, turn = (locked[k], 0.0) if revolute else (0.0, locked[k])
+        place = _text(length[k], side, 0)
+        body = add(body, "body", name=f"link{k + 1}", pos=place, quat=_turn(turn))
         # Joint axes are given in the frame of the moving body.
-        axis = (0, 0, 1) if revolute else (np.sin(locked[k]), np.cos(locked[k]), 0)
-        ElementTree.SubElement(
-            body,
-            "joint",
-            name=f"joint{k + 1}",
-            type="hinge" if revolute else "slide",
-            axis=_text(*axis),
-        )
-        ElementTree.SubElement(
-            body,
-            "inertial",
-            pos=_text(*com[k], 0),
-            mass=_text(mass[k]),
-            diaginertia=_text(*[inertia[k]] * 3),
-        )
-        parent = body
-    ElementTree.SubElement(parent, "site", name="tip", pos=_text(length[3], 0, 0))
+        axis = (0, 0, 1) if revolute else (np.sin(turn), np.cos(turn), 0)
+        kind = "hinge" if revolute else "slide"
+        add(body, "joint", name=f"joint{k + 1}", type=kind, axis=_text(*axis))
+        own = dict(mass=_text(mass[k]), diaginertia=_text(*[inertia[k]] * 3))
+        add(body, "inertial", dict(pos=_text(*com[k], 0)) | own)
+    add(body, "site", name="tip", pos=_text(length[3], 0, 0))
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="unicode")
 

@@ -28,7 +28,7 @@ def _package(name: str) -> Any:
 def _joints(linkage: Linkage) -> tuple[list[str], list[str]]:
     """Names and units of the joints; both are neutral if a batch mixes the kinds."""
     names, units = [], []
-    for k, revolute in enumerate(real_joints(np.asarray(linkage.ef).reshape(-1, 6).T)):
+    for k, revolute in enumerate(real_joints(np.asarray(linkage.ef).T)):
         mixed = revolute.any() and not revolute.all()
         kind, unit = ("R", "rad") if revolute.any() else ("P", "m")
         names.append(f"{k + 1}" if mixed else f"{kind}{k + 1}")
@@ -40,17 +40,14 @@ def _rate(unit: str) -> str:
     return " or ".join(f"{one}/s" for one in unit.split(" or "))
 
 
-def _in_order(linkage: Any, solution: Any) -> tuple[Linkage, Solution]:
-    """The two arguments, which version 0.1 took in the other order."""
-    if isinstance(linkage, Solution):
+def _checked(
+    linkage: Any, solution: Any
+) -> tuple[Linkage, Solution, np.ndarray, list[str]]:
+    """The arguments, the common times of all motions, and names of the batch axes."""
+    if isinstance(linkage, Solution):  # the order of version 0.1
         message = "fdof_jax: expected (linkage, solution), got (solution, linkage)"
         warnings.warn(message, DeprecationWarning, stacklevel=3)
-        return solution, linkage
-    return linkage, solution
-
-
-def _checked(linkage: Any, solution: Any) -> tuple[np.ndarray, list[str]]:
-    """The common times of all motions, and the names of the batch axes."""
+        linkage, solution = solution, linkage
     instance("solution", solution, Solution)
     instance("linkage", linkage, Linkage)
     if not known(solution, linkage):
@@ -61,7 +58,8 @@ def _checked(linkage: Any, solution: Any) -> tuple[np.ndarray, list[str]]:
             "solution.ts: expected the same times for all motions, got different ones."
         )
     axes = solution.q.ndim - 2
-    return ts[0], ["batch"] if axes == 1 else [f"batch_{k + 1}" for k in range(axes)]
+    batch = ["batch"] if axes == 1 else [f"batch_{k + 1}" for k in range(axes)]
+    return linkage, solution, ts[0], batch
 
 
 def to_xarray(linkage: Linkage, solution: Solution) -> "xarray.Dataset":
@@ -83,8 +81,7 @@ def to_xarray(linkage: Linkage, solution: Solution) -> "xarray.Dataset":
     for malformed arguments.
     """
     xarray = _package("xarray")
-    linkage, solution = _in_order(linkage, solution)
-    times, batch = _checked(linkage, solution)
+    linkage, solution, times, batch = _checked(linkage, solution)
     names, units = _joints(linkage)
     common = units[0] if len(set(units)) == 1 else "m or rad"
     rows, steps = [*batch, "time", "joint"], solution.stats["num_steps"]
@@ -126,8 +123,7 @@ def to_pandas(linkage: Linkage, solution: Solution) -> "pandas.DataFrame":
     for malformed arguments.
     """
     pandas = _package("pandas")
-    linkage, solution = _in_order(linkage, solution)
-    times, batch = _checked(linkage, solution)
+    linkage, solution, times, batch = _checked(linkage, solution)
     columns = {}
     for values, unit_of in ((solution.q, str), (solution.qd, _rate)):
         for k, (name, unit) in enumerate(zip(*_joints(linkage))):

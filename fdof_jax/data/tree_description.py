@@ -19,7 +19,7 @@ import numpy as np
 from jax import Array
 
 from .. import __all__ as _NAMES, __name__ as _PACKAGE
-from ..checks import is_traced
+from ..checks import is_traced, refusal
 from ..names import room_of
 
 _RESULT: Any = diffrax.RESULTS.successful
@@ -36,23 +36,31 @@ class Unreadable(Exception):
 _WITHIN = {
     "DriveState": "control.drives",
     "History": "tuning.result",
-    "Job": "shell.tuning_run",
     "Separation": "forces.points",
     "_Knots": "tuning.optimal_motion",
 }
+# Classes in files of 0.1 that are no more; their instances are loaded as dictionaries.
+_REMOVED = (f"{_PACKAGE}.tuning_run:Job",)
 
 
 def _name(thing: Any) -> str:
     """The name to store: the public one, independent of the defining module."""
     name = thing.__qualname__
-    # The module that defines an enumeration of diffrax may change.
-    for package, found in (
-        ("diffrax", getattr(diffrax, name, None)),
-        (_PACKAGE, _of_the_library(name)),
-    ):
-        if found is thing:
-            return f"{package}:{name}"
+    if vars(diffrax).get(name) is thing:
+        return f"diffrax:{name}"
+    if _of_the_library(name) is thing:
+        return f"{_PACKAGE}:{name}"
     return f"{thing.__module__}:{name}"
+
+
+def _found(name: str) -> Any:
+    """Returns what a file may name without `classes`, or None."""
+    module, _, qualname = name.partition(":")
+    if module == "diffrax":
+        found = vars(diffrax).get(qualname)
+        return found if isinstance(found, _EnumerationMeta) else None
+    # Version 0.1 stored submodules.
+    return _of_the_library(qualname) if module.partition(".")[0] == _PACKAGE else None
 
 
 def _of_the_library(name: str) -> Any:
@@ -66,19 +74,9 @@ def _of_the_library(name: str) -> Any:
     return found if isinstance(found, type | types.FunctionType) else None
 
 
-def _is_ours(module: str) -> bool:
-    """Returns whether a module is the library's; version 0.1 stored submodules."""
-    return module.partition(".")[0] == _PACKAGE
-
-
 def _class(name: str, classes: Sequence[type]) -> Any:
     """Returns the class named `name`, of the library, diffrax or the caller."""
-    module, _, qualname = name.partition(":")
-    if module == "diffrax":
-        found = vars(diffrax).get(qualname)
-        if isinstance(found, _EnumerationMeta):
-            return found
-    found = _of_the_library(qualname) if _is_ours(module) else None
+    found, (module, _, qualname) = _found(name), name.partition(":")
     if isinstance(found, type) and not inspect.isabstract(found):
         return found
     same = [c for c in classes if _name(c) == name]
@@ -99,12 +97,10 @@ def _class(name: str, classes: Sequence[type]) -> Any:
 
 def _fields(kind: Any) -> list[str] | None:
     """Field names of a NamedTuple or dataclass, None for other classes."""
-    if issubclass(kind, tuple):
-        names = getattr(kind, "_fields", None)
-        return None if names is None else list(names)
     if dataclasses.is_dataclass(kind):
         return [field.name for field in dataclasses.fields(kind)]
-    return None
+    names = getattr(kind, "_fields", None) if issubclass(kind, tuple) else None
+    return None if names is None else list(names)
 
 
 def _members(enumeration: Any) -> dict[str, int]:
@@ -128,9 +124,7 @@ def described(place: str, value: Any, arrays: list[np.ndarray]) -> Any:
         return items if kind is list else {"kind": "tuple", "items": items}
     if kind is dict:
         if not all(type(key) is str for key in value):
-            raise ValueError(
-                f"{place}: expected strings as keys, got {list(value)[:20]!r}."
-            )
+            raise refusal(place, "strings as keys", list(value)[:20])
         items = {k: described(f"{place}[{k!r}]", v, arrays) for k, v in value.items()}
         return {"kind": "dict", "items": items}
     if isinstance(value, Array) or kind is np.ndarray or isinstance(value, np.generic):
@@ -145,22 +139,23 @@ def described(place: str, value: Any, arrays: list[np.ndarray]) -> Any:
     if isinstance(value, types.FunctionType):
         if _of_the_library(value.__qualname__) is value:
             return {"kind": "function", "name": _name(value)}
-        raise ValueError(
-            f"{place}: expected an equinox.Module with a __call__, which can be saved "
-            f"in place of a function of one's own, got {value!r}."
-        )
-    unnamed = _is_ours(kind.__module__) and _of_the_library(kind.__qualname__) != kind
-    if not unnamed and (names := _fields(kind)) is not None:
+        expected = "an equinox.Module with a __call__, which can be saved in place of a"
+        raise refusal(place, f"{expected} function of one's own", value)
+    names, stored = _fields(kind), _name(kind)
+    # Classes within the library that `_found` does not know could not be loaded.
+    if names is not None and not stored.startswith(f"{_PACKAGE}."):
         fields = {}
         for name in names:
             if not hasattr(value, name):
                 raise ValueError(f"{place}.{name}: expected a value, got none.")
             item = getattr(value, name)
             fields[name] = described(f"{place}.{name}", item, arrays)
-        return {"kind": "object", "class": _name(kind), "fields": fields}
-    raise ValueError(
-        f"{place}: expected arrays, numbers, strings, or lists, tuples, dicts, "
-        f"NamedTuples, dataclasses and modules of such, got {value!r}."
+        return {"kind": "object", "class": stored, "fields": fields}
+    raise refusal(
+        place,
+        "arrays, numbers, strings, or lists, tuples, dicts, NamedTuples, dataclasses "
+        "and modules of such",
+        value,
     )
 
 
@@ -213,12 +208,10 @@ class Restorer:
         if kind == "dict":
             return {key: self.tree(item) for key, item in node["items"].items()}
         if kind == "function":
-            module, _, qualname = node["name"].partition(":")
-            found = _of_the_library(qualname) if _is_ours(module) else None
+            found = _found(node["name"])
             if not isinstance(found, types.FunctionType):
-                raise Unreadable(
-                    f"expected a function of the library, got {node['name']}"
-                )
+                name = node["name"]
+                raise Unreadable(f"expected a function of the library, got {name}")
             return found
         if kind == "enumeration":
             return self.item(node)
@@ -227,6 +220,8 @@ class Restorer:
         return self.placed(node, self.array(node))
 
     def instance(self, node: dict) -> Any:
+        if node["class"] in _REMOVED:
+            return {name: self.tree(item) for name, item in node["fields"].items()}
         cls = _class(node["class"], self.classes)
         names, fields = _fields(cls), node["fields"]
         if names is None or set(names) != set(fields):
@@ -257,27 +252,17 @@ class Restorer:
                     f"expected a member that {node['class']} has, got {names[number]}"
                 )
             value[numbers == number] = here[names[number]]
-        item = object.__new__(_Item)
-        object.__setattr__(item, "_value", self.placed(node["value"], value))
-        object.__setattr__(item, "_enumeration", enumeration)
-        return item
+        return _Item(self.placed(node["value"], value), enumeration)
 
     def array(self, node: dict) -> np.ndarray:
         array = self.stored(node["array"])
-        if array.dtype.name != node["dtype"]:
+        if array.dtype.kind == "V":
             # NumPy's format stores other packages' dtypes as raw bytes.
-            extended = jnp.dtype(node["dtype"])
-            if array.dtype.kind != "V" or array.dtype.itemsize != extended.itemsize:
-                raise Unreadable(
-                    f"expected array {node['array']} to be of {node['dtype']}, got "
-                    f"{array.dtype}"
-                )
-            array = array.view(extended)
-        if list(array.shape) != node["shape"]:
-            raise Unreadable(
-                f"expected array {node['array']} to have shape {node['shape']}, got "
-                f"{list(array.shape)}"
-            )
+            array = array.view(jnp.dtype(node["dtype"]))
+        expected = node["dtype"], node["shape"]
+        got = array.dtype.name, list(array.shape)
+        if got != expected:
+            raise Unreadable(f"expected array {node['array']} as {expected}, got {got}")
         return array
 
     def placed(self, node: dict, array: np.ndarray) -> Any:
@@ -288,9 +273,8 @@ class Restorer:
         if kind == "scalar":
             return array[()]
         if kind == "key":
-            return jax.random.wrap_key_data(
-                jnp.asarray(array), impl=node["implementation"]
-            )
+            how = node["implementation"]
+            return jax.random.wrap_key_data(jnp.asarray(array), impl=how)
         if kind != "jax":
             raise KeyError(kind)
         # Otherwise JAX would round silently.

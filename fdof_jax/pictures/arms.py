@@ -1,4 +1,4 @@
-"""Lines and markers of an arm: its links, joints and ground."""
+"""An arm in pictures: where its parts are, and their lines and markers."""
 
 from typing import Any, NamedTuple
 
@@ -9,7 +9,10 @@ from matplotlib.lines import Line2D
 from matplotlib.markers import MarkerStyle
 from matplotlib.path import Path
 
-from ..linkage.linkage import Linkage
+from ..checks import refusal
+from ..linkage.frames import frames
+from ..linkage.linkage import Linkage, check_linkage
+from ..xla.array_namespace import in_numpy
 from .axes import (
     BLACK,
     GREY,
@@ -18,10 +21,56 @@ from .axes import (
     filled_mapping,
     plane_axes,
     reached,
-    refuse,
     xy,
 )
-from .geometry import Geometry, geometry
+
+
+class Geometry(NamedTuple):
+    """A linkage at all samples; points of the plane are complex numbers.
+
+    Link 0 is the ground, and links 1 to 3 move; joint k is between links k - 1 and k.
+    """
+
+    angle: np.ndarray  # absolute angles of links 0 to 3 [rad]: (time, 4)
+    slide: np.ndarray  # B_1 to B_3 [m]: (time, 3)
+    revolute: np.ndarray  # whether each real joint is revolute: (3,)
+    points: dict[str, np.ndarray]  # by name of the part, in drawing order: (time, n)
+
+    @property
+    def tip(self) -> np.ndarray:
+        return self.points["tip 3"][:, 0]
+
+    @property
+    def all_points(self) -> np.ndarray:
+        return np.hstack(list(self.points.values()))
+
+
+def geometry(linkage: Linkage, q: np.ndarray) -> Geometry:
+    """The `Geometry` of a linkage at joint positions (time, 3)."""
+    check_linkage(linkage)
+    linkage = in_numpy(linkage)
+    start, direction, angle, slide, revolute = frames(linkage, np.asarray(q))
+    end = start + linkage.length * direction
+    along, across = linkage.com.T
+    foot = start[:, 1:] + along * direction[:, 1:]  # mass centre projected on the link
+    center = foot + 1j * across * direction[:, 1:]
+
+    points = {}
+    for n in range(4):
+        link = [start[:, n], end[:, n]]
+        if n < 3 and revolute[n]:
+            link.append(start[:, n + 1])  # across by the fixed B
+        elif n < 3:
+            points[f"rail {n + 1}"] = np.column_stack([end[:, n], start[:, n + 1]])
+        points[f"link {n}"] = np.column_stack(link)
+    for n in range(3):
+        points[f"mass {n + 1}"] = np.column_stack([foot[:, n], center[:, n]])
+    for n in range(3):
+        kind = "pin" if revolute[n] else "slider"
+        points[f"{kind} {n + 1}"] = start[:, n + 1 : n + 2]
+    points["tip 3"] = end[:, 3:]
+    return Geometry(angle, slide, revolute, points)
+
 
 _LINKS = (BLACK, *SERIES[:3])
 
@@ -39,7 +88,7 @@ _STYLES: dict[str, dict[str, Any]] = {
     "link": dict(lw=2.2, solid_capstyle="round", solid_joinstyle="round"),
     "rail": dict(lw=0.9),
     "mass": dict(lw=0.6, marker="o", markersize=4, markevery=[1]),
-    "pin": dict(marker="o", markersize=4.5, mfc="white"),
+    "pin": dict(color=BLACK, marker="o", markersize=4.5, mfc="white"),
     "slider": dict(markersize=15, mfc="white", mew=0.9),
     "tip": dict(marker="s", markersize=3.5),
 }
@@ -70,13 +119,17 @@ def draw_arm(
         kind, number = name.split()
         if kind == "mass" and not mass_centers:
             continue
-        own = BLACK if kind == "pin" else _LINKS[int(number) - 1]
-        (lines[name],) = ax.plot(*xy(points[i]), alpha=alpha, gid=name)
-        lines[name].set(color=own if color is None else color, **_STYLES[kind])
-        if name == "link 1":
-            lines[name].set_linewidth(1.2)
+        # A joint's rail and carriage belong to the link before it.
+        link = int(number) - (kind in ("rail", "slider"))
+        (line,) = ax.plot(*xy(points[i]), alpha=alpha, gid=name, color=_LINKS[link])
+        line.set(**_STYLES[kind])
+        if color is not None:
+            line.set_color(color)
+        if name == "link 0":
+            line.set_linewidth(1.2)
         elif kind == "link" and label:
-            lines[name].set_label(name)
+            line.set_label(name)
+        lines[name] = line
     _place(lines, g, i)
     return lines
 
@@ -94,7 +147,7 @@ class DrawnMotion(NamedTuple):
 
     def move(self, g: Geometry, indices: np.ndarray) -> None:
         """Moves the lines to a motion of the same topology, at as many samples."""
-        self.path.set_data(*xy(g.end[: indices[-1] + 1, 3]))
+        self.path.set_data(*xy(g.tip[: indices[-1] + 1]))
         for lines, i in zip(self.arms, indices):
             _place(lines, g, i)
 
@@ -104,13 +157,13 @@ def draw_motion(
 ) -> DrawnMotion:
     """Draws the samples `indices` from faint to full, and the tip's path up to them."""
     draw_ground(ax)
-    path = g.end[: indices[-1] + 1, 3]
-    (path,) = ax.plot(*xy(path), color=GREY, lw=1, label="tip path", gid="tip path")
+    path = xy(g.tip[: indices[-1] + 1])
+    (line,) = ax.plot(*path, color=GREY, lw=1, label="tip path", gid="tip path")
     arms = [
         draw_arm(ax, g, i, mass_centers, float(alpha), label=i == indices[-1])
         for i, alpha in zip(indices, np.linspace(1, 0.15, len(indices))[::-1])
     ]
-    return DrawnMotion(path, arms)
+    return DrawnMotion(line, arms)
 
 
 def geometries_of(motions: Any) -> dict[str, tuple[np.ndarray, Geometry]]:
@@ -121,7 +174,7 @@ def geometries_of(motions: Any) -> dict[str, tuple[np.ndarray, Geometry]]:
         name = f"motions[{title!r}]"
         fits = isinstance(pair, tuple) and len(pair) == 2
         if not (fits and isinstance(pair[0], Linkage)):
-            raise refuse(name, "(Linkage, Solution)", pair)
+            raise refusal(name, "(Linkage, Solution)", pair)
         ts, q, _ = reached(pair[1], name)
         found[title] = ts, geometry(pair[0], q)
     return found
@@ -136,7 +189,7 @@ def panels_of(
     fig = figure_or_new(fig, 0.3 + 1.75 * columns, 0.4 + 1.9 * rows)
     panels = []
     for position, (title, (_, g)) in enumerate(geometries.items()):
-        ax = plane_axes(fig.add_subplot(rows, columns, position + 1), g.end)
+        ax = plane_axes(fig.add_subplot(rows, columns, position + 1), g.tip)
         ax.set_aspect("equal", adjustable="datalim")
         ax.set(title=title, xlabel="", ylabel="")
         ax.tick_params(labelsize="small")

@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from ..checks import refusal
 from ..simulation.solution import Solution
 
 # Okabe and Ito's colours, distinct under the common kinds of colour blindness.
@@ -15,27 +16,22 @@ BLACK, GREY = "#000000", "#808080"
 SERIES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 
 
-def refuse(name: str, expected: str, got: Any) -> ValueError:
-    """The error to raise for a malformed argument."""
-    return ValueError(f"{name}: expected {expected}, got {got!r}.")
-
-
 def reached(solution: Any, name: str = "solution") -> list[np.ndarray]:
     """Arrays `ts`, `q` and `qd` of one solution, up to the last time reached."""
     if not isinstance(solution, Solution) or np.ndim(solution.q) != 2:
         expected = "the Solution of one simulate (of a batch, pass one member)"
-        raise refuse(name, expected, solution)
+        raise refusal(name, expected, solution)
     arrays = [np.asarray(a) for a in (solution.ts, solution.q, solution.qd)]
     finite = np.isfinite(arrays[1]).all(axis=1)
     if not finite.any():
-        raise refuse(name, "at least one finite sample", solution)
+        raise refusal(name, "at least one finite sample", solution)
     return [array[finite] for array in arrays]
 
 
 def filled_mapping(name: str, value: Any, kind: str) -> Mapping:
     """Returns `value` if it is a nonempty dictionary, else raises ValueError."""
     if not isinstance(value, Mapping) or not value:
-        raise refuse(name, f"a dictionary, not empty, of label: {kind}", value)
+        raise refusal(name, f"a dictionary, not empty, of label: {kind}", value)
     return value
 
 
@@ -44,7 +40,7 @@ def figure_or_new(fig: Any, width: float, height: float) -> Figure:
     if fig is None:
         return plt.figure(figsize=(width, height), layout="constrained")
     if not isinstance(fig, Figure):
-        raise refuse("fig", "a matplotlib Figure or None", fig)
+        raise refusal("fig", "a matplotlib Figure or None", fig)
     return fig
 
 
@@ -53,7 +49,7 @@ def axes_or_new(ax: Any, height: float) -> Axes:
     if ax is None:
         return figure_or_new(None, 3.5, height).subplots()
     if not isinstance(ax, Axes):
-        raise refuse("ax", "matplotlib Axes or None", ax)
+        raise refusal("ax", "matplotlib Axes or None", ax)
     return ax
 
 

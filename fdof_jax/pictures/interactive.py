@@ -13,18 +13,25 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.image import imsave
 
-from ..linkage.topology import real_joints
+from ..checks import instance, refusal
+from ..linkage.linkage import joint_names
 from ..references.reference import reference_of
+from ..simulation.html_table import html_table
 from ..simulation.scene import Scene
 from ..simulation.simulate import simulate
 from ..simulation.solution import Solution
-from ..simulation.steps import adaptive
 from ..tuning.gains import with_gains
 from ..tuning.league import circle_scenes
 from ..tuning.losses import controller_of
-from .arms import draw_motion
-from .axes import BLACK, SERIES, filled_mapping, legend, reached, refuse, xy
-from .geometry import geometry
+from .arms import draw_motion, geometry
+from .axes import BLACK, SERIES, filled_mapping, legend, plane_axes, reached, xy
+
+__all__ = ["sliders"]
+
+
+def __dir__() -> list[str]:
+    return __all__
+
 
 _SAMPLES = 201
 _CONFIGURATIONS = 5  # drawn of each motion
@@ -44,27 +51,18 @@ class _Moved(NamedTuple):
 @eqx.filter_jit
 def _moved(scene: Scene, stretch: Array, factor: Array) -> _Moved:
     """Simulates a scene with lengths * `stretch` (3,) and gains * `factor` (2, 3)."""
-    linkage = eqx.tree_at(
-        lambda linkage: (linkage.length, linkage.com),
-        scene.linkage,
-        (
-            scene.linkage.length.at[1:].multiply(stretch),
-            scene.linkage.com.at[:, 0].multiply(stretch),
-        ),
+    length, com = scene.linkage.length, scene.linkage.com
+    linkage = scene.linkage.replace(
+        length=length.at[1:].multiply(stretch), com=com.at[:, 0].multiply(stretch)
     )
     controller = controller_of(scene)
     gains = factor * jnp.stack([controller.kp, controller.kd])
     scene = with_gains(scene._replace(linkage=linkage), gains)
     ts = jnp.linspace(0, scene.t1, _SAMPLES)
     solution = simulate(
-        linkage,
-        scene.state0,
-        ts,
-        scene.forces,
-        stepsize_controller=adaptive(_TOLERANCE, _TOLERANCE),
-        max_steps=_MAX_STEPS,
-        throw=False,
-    )
+        linkage, scene.state0, ts, scene.forces,
+        rtol=_TOLERANCE, atol=_TOLERANCE, max_steps=_MAX_STEPS, throw=False,
+    )  # fmt: skip
     task: Any = controller.reference
     positions, _ = jax.vmap(lambda t: task(t, linkage))(ts)
     commanded = jax.vmap(task.tip)(ts)
@@ -74,31 +72,22 @@ def _moved(scene: Scene, stretch: Array, factor: Array) -> _Moved:
 def _told(moved: _Moved, error: np.ndarray) -> str:
     """HTML text on the motion's end, gains and lengths; `error`: tip errors [m]."""
     solution = moved.solution
-    time = float(solution.stats["time_reached"])
     if not np.all(moved.possible):
         from_time = float(solution.ts[np.argmin(moved.possible)])
         text = f"<b>The path is out of the arm's reach</b> from {from_time:.2f} s on."
     elif str(solution.outcome) != "successful":
+        time = float(solution.stats["time_reached"])
         text = f"<b>Ended at {time:.2f} s: {solution.outcome}.</b>"
     else:
         text = f"Tip error: rms {1e3 * np.sqrt(np.mean(error**2)):.3g} mm."
     linkage, controller = moved.scene.linkage, controller_of(moved.scene)
-    rows = ""
-    for k, revolute in enumerate(real_joints(np.asarray(linkage.ef))):
-        kind = "R" if revolute else "P"
-        kp, kd = (
-            f"{float(gain[k]):.4g} {unit}"
-            for gain, unit in zip(
-                (controller.kp, controller.kd), controller.gain_units[kind]
-            )
-        )
-        length = f"A{k + 2} = {float(linkage.length[k + 1]):.3g} m"
-        rows += "<tr>"
-        for cell in (f"{kind}{k + 1}", kp, kd, length):
-            rows += f"<td style='padding-right: 1.5em'>{cell}</td>"
-        rows += "</tr>"
-    head = "<tr><th>joint</th><th>kp</th><th>kd</th><th>link after it</th></tr>"
-    return f"{text}<table style='text-align: left'>{head}{rows}</table>"
+    rows = []
+    for k, joint in enumerate(joint_names(linkage)):
+        p_unit, d_unit = controller.gain_units[joint[0]]
+        kp, kd, length = controller.kp[k], controller.kd[k], linkage.length[k + 1]
+        gains = f"{float(kp):.4g} {p_unit}", f"{float(kd):.4g} {d_unit}"
+        rows.append((joint, *gains, f"link {k + 1}: {float(length):.3g} m"))
+    return text + html_table(rows, ("joint", "kp", "kd", "length after it"))
 
 
 class _Picture:
@@ -111,10 +100,9 @@ class _Picture:
     def __init__(self):
         self._figure = Figure(figsize=(7, 3.2), dpi=100)
         self._canvas = FigureCanvasAgg(self._figure)
-        self._plane = self._figure.add_axes((0.1, 0.16, 0.43, 0.66))
+        plane = self._figure.add_axes((0.1, 0.16, 0.43, 0.66))
+        self._plane = plane_axes(plane, np.zeros(1))
         self._plane.set_aspect("equal", adjustable="datalim")
-        self._plane.margins(0.1, 0.16)  # below, the ground needs room
-        self._plane.set(xlabel="x [m]", ylabel="y [m]")
         self._time = self._figure.add_axes((0.64, 0.16, 0.34, 0.66))
         self._time.set(xlabel="time [s]", ylabel="tip error [mm]")
         for ax in self._figure.axes:
@@ -127,7 +115,7 @@ class _Picture:
         ts, q, _ = reached(moved.solution)
         path = geometry(moved.scene.linkage, q)
         commanded = np.asarray(moved.commanded) @ [1, 1j]
-        error = np.abs(path.end[:, 3] - commanded[: len(ts)])
+        error = np.abs(path.tip - commanded[: len(ts)])
         shown = np.linspace(0, len(ts) - 1, _CONFIGURATIONS).round().astype(int)
 
         if self._lines is None:
@@ -205,18 +193,19 @@ def sliders(scenes: Mapping[str, Scene] | None = None) -> Any:
     known = {}
     scenes = circle_scenes() if scenes is None else scenes
     for name, scene in filled_mapping("scenes", scenes, "Scene").items():
-        if not isinstance(scene, Scene):
-            raise refuse(f"scenes[{name!r}]", "a Scene", scene)
+        instance(f"scenes[{name!r}]", scene, Scene)
         task = controller_of(scene).reference
         if reference_of(task).tip is None:
-            raise refuse(f"scenes[{name!r}]", "a controller of a task with a tip", task)
+            raise refusal(
+                f"scenes[{name!r}]", "a controller of a task with a tip", task
+            )
         # As an array, so that other times do not compile again.
         known[name] = scene._replace(t1=jnp.asarray(scene.t1, float))
 
     arm = widgets.Dropdown(options=list(known), description="arm")
     lengths = [
-        widgets.FloatSlider(1.0, min=0.5, max=1.5, step=0.01, description=f"A{n}")
-        for n in (2, 3, 4)
+        widgets.FloatSlider(1.0, min=0.5, max=1.5, step=0.01, description=f"link {n}")
+        for n in (1, 2, 3)
     ]
     # A factor of 4, as in `tune`. The browser shows only whole steps from the least
     # value, so the factor 1 must lie on a step.
@@ -241,14 +230,8 @@ def sliders(scenes: Mapping[str, Scene] | None = None) -> Any:
     # While a picture is drawn, the browser keeps only the newest value: no queue grows.
     for control in (arm, *lengths, *gains):
         control.observe(redraw, "value")
-    controls = widgets.VBox(
-        [
-            arm,
-            widgets.HTML("Lengths of the links, times the scene's:"),
-            *lengths,
-            widgets.HTML("Gains of the joints, times the scene's:"),
-            *gains,
-        ]
-    )
+    of_lengths = widgets.HTML("Lengths of the links, times the scene's:")
+    of_gains = widgets.HTML("Gains of the joints, times the scene's:")
+    controls = widgets.VBox([arm, of_lengths, *lengths, of_gains, *gains])
     layout = widgets.Layout(flex_flow="row wrap")
     return widgets.Box([controls, widgets.VBox([image, words])], layout=layout)

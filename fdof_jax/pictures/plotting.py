@@ -9,7 +9,6 @@ import warnings
 from collections.abc import Mapping
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,7 +19,7 @@ from numpy.typing import ArrayLike
 from scipy.integrate import cumulative_simpson
 
 from ..analysis.tracking import saturated
-from ..checks import real_array
+from ..checks import real_array, refusal
 from ..control.pd import PDController
 from ..dynamics import energy, link_energies
 from ..forces.element import Forces, InertialElement, elements
@@ -28,6 +27,7 @@ from ..linkage.linkage import Linkage
 from ..linkage.topology import real_joints
 from ..simulation.efforts import joint_efforts
 from ..simulation.solution import Solution
+from .arms import geometry
 from .axes import (
     BLACK,
     GREY,
@@ -37,14 +37,18 @@ from .axes import (
     filled_mapping,
     legend,
     reached,
-    refuse,
 )
-from .geometry import geometry
-from .tracking import (
-    tracking as tracking,
-    tracking_by_error as tracking_by_error,
-    tracking_error as tracking_error,
-)
+from .tracking import tracking, tracking_by_error, tracking_error
+
+__all__ = [
+    "effort_profile", "energy_profile", "energy_stack", "motion_profile", "tracking",
+    "tracking_by_error", "tracking_error", "work_precision",
+]  # fmt: skip
+
+
+def __dir__() -> list[str]:
+    return __all__
+
 
 _LIGHT_GREY = "#BBBBBB"
 
@@ -66,12 +70,8 @@ def motion_profile(
 ) -> Figure:
     """Plots the motion of the real joints over time, as in the paper's Figs 4 and 6.
 
-    One panel shows the absolute angles th_n of links on revolute joints [degrees],
-    another the slides B_n of prismatic joints [m].
-
-    **Returns:** the figure.
-
-    **Raises:** ValueError for malformed arguments.
+    One panel shows the absolute angles of links on revolute joints [degrees], another
+    the slides of prismatic joints [m]; theta_k and B_k are those of joint k.
     """
     ts, q, _ = reached(solution)
     g = geometry(linkage, q)
@@ -79,7 +79,7 @@ def motion_profile(
     for k, revolute in enumerate(g.revolute):
         if revolute:
             degrees = np.rad2deg(g.angle[:, k + 1])
-            angles.append((rf"$\theta_{k + 2}$", degrees, SERIES[k]))
+            angles.append((rf"$\theta_{k + 1}$", degrees, SERIES[k]))
         else:
             slides.append((f"$B_{k + 1}$", g.slide[:, k], SERIES[k]))
     panels = [("angle [degrees]", angles), ("slide [m]", slides)][: 1 + bool(slides)]
@@ -92,16 +92,11 @@ def motion_profile(
 def energy_profile(
     linkage: Linkage, solution: Solution, fig: Figure | None = None
 ) -> Figure:
-    """Plots kinetic and potential energy of each link, and their sums, over time [J].
-
-    **Returns:** the figure.
-
-    **Raises:** ValueError for malformed arguments.
-    """
+    """Plots kinetic and potential energy of each link and of all over time [J]."""
     ts, q, qd = reached(solution)
     energies = jax.vmap(lambda q, qd: link_energies(linkage, q, qd))(q, qd)
     kinetic, potential = (np.asarray(each) for each in energies)
-    names = "link 2", "link 3", "link 4"
+    names = "link 1", "link 2", "link 3"
     sums = kinetic.sum(axis=1), potential.sum(axis=1), (kinetic + potential).sum(axis=1)
     whole = zip(("kinetic", "potential", "total"), sums, (*SERIES[3:5], BLACK))
     panels = [
@@ -136,11 +131,6 @@ def _powers(linkage: Linkage, forces: Forces, solution: Solution) -> np.ndarray:
     return np.asarray(powers)
 
 
-@eqx.filter_jit
-def _energies(linkage: Linkage, forces: Forces, q: Any, qd: Any) -> tuple:
-    return jax.vmap(lambda q, qd: energy(linkage, q, qd, forces))(q, qd)
-
-
 def energy_stack(
     linkage: Linkage, forces: Forces, solution: Solution, ax: Axes | None = None
 ) -> Axes:
@@ -157,15 +147,14 @@ def energy_stack(
 
     **Arguments:** `forces`: those of the solution.
 
-    **Returns:** the axes.
-
     **Raises:** ValueError for malformed arguments. Warns if top and line differ by more
     than a hundredth of the energy: the samples are then too far apart, or the forces
     are not those of the solution.
     """
     ts, q, qd = reached(solution)
     powers = _powers(linkage, forces, solution)[:, : len(ts)]
-    kinetic, potential = map(np.asarray, _energies(linkage, forces, q, qd))
+    energies = jax.vmap(lambda q, qd: energy(linkage, q, qd, forces))(q, qd)
+    kinetic, potential = map(np.asarray, energies)
     potential = potential - potential.min()
     put_in, taken_out = (
         cumulative_simpson(part.sum(axis=0), x=ts, initial=0)
@@ -203,19 +192,16 @@ def effort_profile(
     Orange dots mark samples at which the controller is saturated.
 
     **Arguments:** `forces`: those of the solution.
-
-    **Returns:** the figure.
-
-    **Raises:** ValueError for malformed arguments.
     """
     reached(solution)
     efforts = joint_efforts(linkage, forces, solution)
     ts, total, elements = (np.asarray(a) for a in (solution.ts, *efforts))
-    units = np.where(real_joints(np.asarray(linkage.ef)), "N m", "N")
-    panels = []
-    for k, unit in enumerate(units):
-        symbol = f"$T_{k + 2}$" if unit == "N m" else f"$F_{k + 1}$"
-        panels.append((f"{symbol} [{unit}]", [("total", total[:, k], SERIES[0])]))
+    units, panels = [], []
+    for k, revolute in enumerate(real_joints(np.asarray(linkage.ef))):
+        symbol, unit = ("T", "N m") if revolute else ("F", "N")
+        curve = "total", total[:, k], SERIES[0]
+        panels.append((f"${symbol}_{k + 1}$ [{unit}]", [curve]))
+        units.append(unit)
     fig = figure_or_new(fig, 3.5, 5.2)
     axes = _time_panels(fig, ts, panels)
     for k, (ax, unit) in enumerate(zip(axes, units)):
@@ -246,16 +232,12 @@ def work_precision(
 
     **Arguments:** `measured`: label -> (errors, times [s]), equally many, all above 0,
     in any order.
-
-    **Returns:** the axes.
-
-    **Raises:** ValueError for malformed arguments.
     """
     curves = {}
     for label, pair in filled_mapping("measured", measured, "(errors, times)").items():
         name = f"measured[{label!r}]"
         if not isinstance(pair, tuple) or len(pair) != 2:
-            raise refuse(name, "(errors, times)", pair)
+            raise refusal(name, "(errors, times)", pair)
         errors, times = (
             np.asarray(real_array(name, p, (None,), above=0)) for p in pair
         )

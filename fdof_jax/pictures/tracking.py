@@ -11,10 +11,12 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.colors import ListedColormap
 
+from ..checks import refusal
 from ..linkage.linkage import Linkage
 from ..references.circle import CircleTask
 from ..references.reference import reference_of
 from ..simulation.solution import Solution
+from .arms import geometry
 from .axes import (
     BLACK,
     SERIES,
@@ -23,10 +25,8 @@ from .axes import (
     legend,
     plane_axes,
     reached,
-    refuse,
     xy,
 )
-from .geometry import geometry
 
 # Without the lightest colours, which are hard to see on white.
 _DARK_TO_LIGHT = ListedColormap(colormaps["plasma"](np.linspace(0, 0.85, 256)))
@@ -37,10 +37,10 @@ def _tip(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Times of a solution, and the commanded and actual tip positions."""
     if not callable(task) or (tip := reference_of(task).tip) is None:
-        raise refuse("task", "a CircleTask", task)
+        raise refusal("task", "a CircleTask", task)
     ts, q, _ = reached(solution, name)
     commanded = np.asarray(jax.vmap(tip)(jnp.asarray(ts))) @ [1, 1j]
-    return ts, commanded, geometry(linkage, q).end[:, 3]
+    return ts, commanded, geometry(linkage, q).tip
 
 
 def _one_turn(task: Any, ts: np.ndarray, path: np.ndarray) -> np.ndarray:
@@ -72,10 +72,6 @@ def tracking(
 
     **Arguments:** `task`: `task.tip(t)` is the commanded tip position [m]; `solutions`:
     one curve per label.
-
-    **Returns:** the axes.
-
-    **Raises:** ValueError for malformed arguments.
     """
     curves = _tips(linkage, task, solutions)
     _, _, ts, longest, _ = max(curves, key=lambda curve: len(curve[2]))
@@ -101,8 +97,6 @@ def tracking_by_error(
     **Arguments:** `task`: `task.tip(t)` is the commanded tip position [m].
 
     **Returns:** the axes, with a colour bar beside them.
-
-    **Raises:** ValueError for malformed arguments.
     """
     ts, commanded, actual = _tip(linkage, task, solution)
     error = 1000 * np.abs(actual - commanded)
@@ -137,10 +131,6 @@ def tracking_error(
     """Plots the distance of the tip from its set point over time [m].
 
     **Arguments:** as in `tracking`.
-
-    **Returns:** the axes.
-
-    **Raises:** ValueError for malformed arguments.
     """
     curves = _tips(linkage, task, solutions)
     ax = axes_or_new(ax, 2.6)

@@ -1,174 +1,166 @@
-"""The commands of `fdof-jax`, which print results and return the pictures' paths.
+"""The commands of `fdof-jax`, which print results and return the files they write."""
 
-Pictures are written into an existing folder. Arguments have already been checked as far
-as possible without JAX.
-"""
-
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import equinox as eqx
+import jax
 import matplotlib
+import matplotlib.pyplot as plt
+import numpy as np
 
 from .. import scenes
-from ..data.files import load, save
+from ..analysis.tracking import tip_deviation
+from ..checks import real_array
+from ..data.files import save
+from ..forces.joints import JointDamper
+from ..pictures import drawing, plotting
 from ..references.circle import CircleTask
-from ..simulation.scene import Scene
+from ..simulation.scene import Scene, stacked
+from ..simulation.simulate import simulate
+from ..simulation.solution import Solution
 from ..tuning.ensembles import perturbed
-from ..tuning.gradient_quality import gradient_report
 from ..tuning.league import circle_scenes, league_table
 from ..tuning.losses import Tracking, tip_errors
-from ..tuning.result import TuneResult
 from ..tuning.tuning import tune, tune_each
 from ..xla.configuration import configure
-from . import showcase
-from .tuning_run import Job
 
 
-def set_up() -> None:
-    """Sets up JAX and matplotlib for a process that only runs commands."""
+def run(command: str, output: Path, options: dict[str, Any]) -> list[Path]:
+    """Runs a command in a process of its own; its files go into the folder `output`.
+
+    **Raises:** ValueError for options that the library rejects.
+    """
     matplotlib.use("agg")  # pictures are written, never shown
     configure(x64=True)
+    return _COMMANDS[command](output, **options)
 
 
-def run_circle(output: Path) -> list[Path]:
-    """Tracks Fig 7's circle, tunes the gains, and tracks the circle again."""
-    run = showcase.run_circle(output, _say, print)
-    _print_circle(run)
-    return run.pictures
-
-
-def run_figures(output: Path) -> list[Path]:
+def _figures(output: Path) -> list[Path]:
     """Reproduces the paper's Figs 3 to 7."""
-    return showcase.run_figures(output, _say)
+    _say("Figs 3 and 4: damped triple pendulum")
+    arm, motion = scenes.fig3().linkage, _motion(scenes.fig3())
+    fig3 = drawing.chrono_cyclograph(arm, motion, until=1.5, mass_centers=True)
+    pictures = {"fig3": fig3.figure, "fig4": plotting.motion_profile(arm, motion)}
+    _say("Figs 5 and 6: conservative triple pendulum")
+    arm, motion = scenes.fig5().linkage, _motion(scenes.fig5())
+    pictures["fig5"] = drawing.chrono_cyclograph(arm, motion, until=1.5).figure
+    pictures["fig6-angles"] = plotting.motion_profile(arm, motion)
+    pictures["fig6-energies"] = plotting.energy_profile(arm, motion)
+    _say("Fig 7: RPR arm under PD control")
+    arm, _, (controller,), _ = scenes.fig7()
+    motion = _motion(scenes.fig7())
+    axes = drawing.chrono_cyclograph(arm, motion, until=0.5)
+    plotting.tracking(arm, controller.reference, {"tip": motion}, axes)
+    return _saved(output, pictures | {"fig7": axes.figure})
 
 
-def run_topologies(output: Path) -> list[Path]:
-    """Simulates all seven topologies in one compiled call."""
-    solutions, picture = showcase.run_topologies(output, _say)
-    for topology, (_, solution) in solutions.items():
+def _topologies(output: Path) -> list[Path]:
+    """Simulates the fall of one arm in all seven topologies, in one compiled call."""
+    _say("simulate all seven topologies in one compiled call")
+    members = circle_scenes()
+    for topology, scene in members.items():
+        # Slides, damped more, do not fall out of sight.
+        damper = JointDamper([{"R": 1.0, "P": 30.0}[joint] for joint in topology])
+        members[topology] = scene._replace(forces=(damper,), t1=2.0)
+    ts = _times(members["RRR"])
+
+    @jax.jit
+    @jax.vmap
+    def simulated(scene: Scene) -> Solution:
+        return simulate(scene.linkage, scene.state0, ts, scene.forces)
+
+    together, motions = simulated(stacked(list(members.values()))), {}
+    for i, (topology, scene) in enumerate(members.items()):
+        solution = jax.tree.map(lambda leaf, i=i: leaf[i], together)
+        motions[topology] = scene.linkage, solution
         print(f"  {topology}: {int(solution.stats['num_steps'])} steps")
-    return [picture]
+    return _saved(output, {"topologies": drawing.topology_grid(motions)})
 
 
-def run_league() -> None:
+def _league(output: Path) -> list[Path]:
     """Tunes the gains of all seven topologies on one circle."""
     _say("tune all seven topologies in one compiled program")
     results = tune_each(circle_scenes(), report=print)
     print(f"\n{league_table(results)}")
+    save(output / "league.fdof", results)
+    return [output / "league.fdof"]
 
 
-def run_tuning(
-    output: Path,
-    job: Job,
-    resume: Path | None,
-    save_to: Path | None,
-    search: dict[str, Any],
-) -> list[Path]:
-    """Tunes the gains of a job, or resumes a saved run where it stopped.
+def _tune(output: Path, **options: Any) -> list[Path]:
+    """Tracks a circle with Fig 7's arm for two turns, tunes the gains, tracks it again.
 
-    **Arguments:** `search`: method, starts, seed and max_steps of `tune`. A resumed run
-    keeps settings that are not given, except the seed, which is increased by one for
-    other random starts.
-
-    **Raises:** ValueError as `tune` and `load`.
+    **Arguments:** `options`: keywords of `CircleTask`, `perturbed` and `tune`, and the
+    `price` of effort.
     """
-    earlier: list[TuneResult] = []
-    if resume is not None:
-        _say(f"continue from {resume}")
-        saved = load(resume)
-        if not isinstance(saved, dict) or set(saved) != {"job", "search", "results"}:
-            raise ValueError(
-                f"{resume}: expected a file written by `fdof-jax tune --save`, got one "
-                f"that holds a {type(saved).__name__}."
-            )
-        job, earlier = saved["job"], saved["results"]
-        search = {**saved["search"], "seed": saved["search"]["seed"] + 1, **search}
-    else:
-        search = {"seed": 0, **search}
-    scene = _scene(job)
-    _say("tune the gains (compiling first, some ten seconds)")
-    last = earlier[-1] if earlier else None
-    start = last.scene if last else scene
-    result = tune(
-        start,
-        factor=None if last else job.factor,
-        bounds=(last.lower, last.upper) if last else None,
-        loss=Tracking(effort=job.price) if job.price > 0 else tip_errors,
-        ensemble=_ensemble(job, scene),
-        over="mean" if job.over == "nominal" else job.over,
-        report=print,
-        **search,
-    )
-    if save_to is not None:
-        results = [*earlier, result]
-        save(save_to, {"job": job, "search": search, "results": results})
-    _say("compare the gradients with differences (compiling again)")
-    reports = gradient_report(start), gradient_report(result.scene)
-    _say("draw")
-    first, second = map(showcase.simulate_finely, (start, result.scene))
-    pictures = showcase.draw_circle(output, start, first, result, second)
-    print(f"\n{result}")
-    for when, report in zip(("before", "after"), reports):
-        print(f"\n{when} tuning: {report}")
-    return pictures
 
+    def given(names: str) -> dict[str, Any]:
+        return {name: options[name] for name in names.split() if name in options}
 
-def _scene(job: Job) -> Scene:
-    """The nominal scene: Fig 7's arm on the job's circle, for two turns."""
+    task = CircleTask(**given("center radius period"))
     scene = scenes.fig7()
-    task = CircleTask(center=job.center, radius=job.radius, period=job.period)
     controller = eqx.tree_at(lambda c: c.reference, scene.forces[0], task)
-    return scene._replace(forces=(controller,), t1=2 * abs(job.period))
-
-
-def _ensemble(job: Job, scene: Scene) -> Scene | None:
-    """The ensemble of the job's variations of the nominal scene, or None."""
-    if job.over == "nominal":
-        return None
-    return perturbed(
+    scene = scene._replace(forces=(controller,), t1=2 * abs(float(task.period)))
+    variations = given("members payload start_offset speed link_error")
+    ensemble = None
+    if variations:
+        ensemble = perturbed(scene, **{"members": 16} | variations)
+    loss = tip_errors
+    if "price" in options:
+        loss = Tracking(real_array("price", options["price"], (), minimum=0))
+    _say("tune the gains (compiling first, some ten seconds)")
+    tuned = tune(
         scene,
-        job.members,
-        payload=job.payload,
-        start_offset=job.start_offset,
-        speed=job.speed,
-        link_error=job.link_error,
+        loss=loss,
+        ensemble=ensemble,
+        report=print,
+        **given("factor over method starts seed max_steps"),
     )
+    _say("simulate and draw")
+    motions, pictures, errors = {}, {}, []
+    for name, (arm, _, forces, t1) in (("paper", scene), ("tuned", tuned.scene)):
+        motion = motions[f"{name} gains"] = _motion(scene._replace(forces=forces))
+        pictures[f"circle-motion-{name}"] = plotting.motion_profile(arm, motion)
+        efforts = plotting.effort_profile(arm, forces, motion)
+        pictures[f"circle-efforts-{name}"] = efforts
+        late = (t1 / 2 <= motion.ts) & (motion.ts < t1)
+        deviation = np.asarray(tip_deviation(arm, task, motion))[late]
+        errors.append(1e3 * np.sqrt((deviation**2).sum(axis=1).mean()))
+    path = plotting.tracking(scene.linkage, task, motions)
+    error = plotting.tracking_error(scene.linkage, task, motions)
+    pictures |= {"circle-path": path.figure, "circle-error": error.figure}
+    print(f"\n{tuned}")
+    print("rms tip error in the second turn [mm]: {:.5g} to {:.5g}".format(*errors))
+    save(output / "tuned.fdof", tuned)
+    return [*_saved(output, pictures), output / "tuned.fdof"]
+
+
+_COMMANDS: dict[str, Callable[..., list[Path]]] = {
+    "circle": _tune,
+    "figures": _figures,
+    "topologies": _topologies,
+    "league": _league,
+    "tune": _tune,
+}
+
+
+def _times(scene: Scene) -> np.ndarray:
+    """Output times every hundredth of a second."""
+    return np.arange(round(float(scene.t1) / 0.01) + 1) * 0.01
+
+
+def _motion(scene: Scene) -> Solution:
+    return simulate(scene.linkage, scene.state0, _times(scene), scene.forces)
 
 
 def _say(text: str) -> None:
     print(f"{text} ...", flush=True)
 
 
-def _print_circle(run: showcase.CircleRun) -> None:
-    before, after = run.before, run.after
-    joints = "T2", "F2", "T4"
-    kp_units, kd_units = (
-        ("N m/rad", "N/m", "N m/rad"),
-        ("N m s/rad", "N s/m", "N m s/rad"),
-    )
-    rows = [
-        ("tip error, whole run: rms [mm]", 1e3 * before.rms, 1e3 * after.rms),
-        ("  largest [mm]", 1e3 * before.largest, 1e3 * after.largest),
-        ("second period: rms [mm]", 1e3 * before.rms_second, 1e3 * after.rms_second),
-        ("  largest [mm]", 1e3 * before.largest_second, 1e3 * after.largest_second),
-    ]
-    for k, joint in enumerate(joints):
-        rows.append((f"kp of {joint} [{kp_units[k]}]", before.kp[k], after.kp[k]))
-    for k, joint in enumerate(joints):
-        rows.append((f"kd of {joint} [{kd_units[k]}]", before.kd[k], after.kd[k]))
-    for k, joint in enumerate(joints):
-        share = 100 * before.saturated[k], 100 * after.saturated[k]
-        rows.append((f"time at the limit of {joint} [%]", *share))
-    print(f"\n{'':34}{'paper':>12}{'tuned':>12}")
-    for label, first, second in rows:
-        print(f"{label:34}{first:12.5g}{second:12.5g}")
-    history = run.tuned.history
-    print(
-        f"\ntuning: {len(history.loss) - 1} iterations, {run.tuned.message}; projected "
-        f"gradient {history.gradient_norm[0]:.2g} -> {history.gradient_norm[-1]:.2g}"
-    )
-    times = ", ".join(
-        f"{what} {seconds:.1f} s" for what, seconds in run.wall_times.items()
-    )
-    print(f"time, compilation included: {times}")
+def _saved(output: Path, pictures: dict[str, Any]) -> list[Path]:
+    """Writes figures, by name, into the folder."""
+    for name, figure in pictures.items():
+        figure.savefig(output / f"{name}.png", dpi=150)
+        plt.close(figure)
+    return [output / f"{name}.png" for name in pictures]
