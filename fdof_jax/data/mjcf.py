@@ -6,17 +6,17 @@ import numpy as np
 
 from ..checks import is_traced
 from ..linkage.linkage import Linkage, check_linkage
-from ..linkage.topology import real_joints
+from ..linkage.topology import letters
 
 # MuJoCo rejects smaller masses and inertias of moving bodies (its mjMINVAL).
 _SMALLEST = 1e-15
 
 
 def to_mjcf(linkage: Linkage) -> str:
-    """Exports a linkage as a MuJoCo model (MJCF) of three bodies and three joints.
+    """Exports a linkage as a MuJoCo model (MJCF) with a body for each link.
 
-    Joints `joint1`..`joint3` are hinges about z and slides in the plane z = 0, with
-    `qpos` equal to this library's `q`; a site `tip` marks the tip. Nothing collides.
+    Joints `joint1`, `joint2`, ... are hinges about z and slides in the plane z = 0, with
+    `qpos` equal to this library's `q`, without fixed pairs; a site `tip` marks the tip. Nothing collides.
     Masses and moments of inertia below 1e-15, in particular zero, become 1e-15, the
     smallest that MuJoCo accepts.
 
@@ -35,8 +35,8 @@ def to_mjcf(linkage: Linkage) -> str:
     check_linkage(linkage)
     if is_traced(linkage):
         raise ValueError("linkage: expected concrete values, got traced ones.")
-    ef, length, com, locked = (
-        np.asarray(a) for a in (linkage.ef, linkage.length, linkage.com, linkage.locked)
+    length, com, locked = map(
+        np.asarray, (linkage.length, linkage.com, linkage.locked)
     )
     mass = np.maximum(np.asarray(linkage.mass), _SMALLEST)
     inertia = np.maximum(np.asarray(linkage.inertia), _SMALLEST)
@@ -48,17 +48,18 @@ def to_mjcf(linkage: Linkage) -> str:
     add(option, "flag", contact="disable")
     world = add(root, "worldbody")
     body = add(world, "body", name="ground", quat=_turn(float(linkage.base_angle)))
-    for k, revolute in enumerate(real_joints(ef)):
-        side, turn = (locked[k], 0.0) if revolute else (0.0, locked[k])
+    for k, joint in enumerate(letters(linkage.ef)):
+        side, turn = (locked[k], 0.0) if joint == "R" else (0.0, locked[k])
         place = _text(length[k], side, 0)
         body = add(body, "body", name=f"link{k + 1}", pos=place, quat=_turn(turn))
         # Joint axes are given in the frame of the moving body.
-        axis = (0, 0, 1) if revolute else (np.sin(turn), np.cos(turn), 0)
-        kind = "hinge" if revolute else "slide"
-        add(body, "joint", name=f"joint{k + 1}", type=kind, axis=_text(*axis))
+        axis = (0, 0, 1) if joint == "R" else (np.sin(turn), np.cos(turn), 0)
+        kind = "hinge" if joint == "R" else "slide"
+        if joint != "F":
+            add(body, "joint", name=f"joint{k + 1}", type=kind, axis=_text(*axis))
         own = dict(mass=_text(mass[k]), diaginertia=_text(*[inertia[k]] * 3))
         add(body, "inertial", dict(pos=_text(*com[k], 0)) | own)
-    add(body, "site", name="tip", pos=_text(length[3], 0, 0))
+    add(body, "site", name="tip", pos=_text(length[-1], 0, 0))
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="unicode")
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..checks import instance, known
 from ..linkage.linkage import Linkage
-from ..linkage.topology import real_joints
+from ..linkage.topology import letters
 from ..simulation.solution import Solution
 
 if TYPE_CHECKING:
@@ -28,11 +28,11 @@ def _package(name: str) -> Any:
 def _joints(linkage: Linkage) -> tuple[list[str], list[str]]:
     """Names and units of the joints; both are neutral if a batch mixes the kinds."""
     names, units = [], []
-    for k, revolute in enumerate(real_joints(np.asarray(linkage.ef).T)):
-        mixed = revolute.any() and not revolute.all()
-        kind, unit = ("R", "rad") if revolute.any() else ("P", "m")
-        names.append(f"{k + 1}" if mixed else f"{kind}{k + 1}")
-        units.append("m or rad" if mixed else unit)
+    of_members = np.asarray(linkage.ef).reshape(-1, linkage.ef.shape[-1])
+    for k, kinds in enumerate(map(set, zip(*map(letters, of_members)))):
+        names.append(f"{min(kinds)}{k + 1}" if len(kinds) == 1 else f"{k + 1}")
+        moving = sorted(kinds - {"F"}) or ["R"]
+        units.append(" or ".join({"P": "m", "R": "rad"}[kind] for kind in moving))
     return names, units
 
 

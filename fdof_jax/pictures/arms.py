@@ -12,6 +12,7 @@ from matplotlib.path import Path
 from ..checks import refusal
 from ..linkage.frames import frames
 from ..linkage.linkage import Linkage, check_linkage
+from ..linkage.topology import letters
 from ..xla.array_namespace import in_numpy
 from .axes import (
     BLACK,
@@ -28,17 +29,17 @@ from .axes import (
 class Geometry(NamedTuple):
     """A linkage at all samples; points of the plane are complex numbers.
 
-    Link 0 is the ground, and links 1 to 3 move; joint k is between links k - 1 and k.
+    Link 0 is the ground, links 1 to n move; joint k is between links k - 1 and k.
     """
 
-    angle: np.ndarray  # absolute angles of links 0 to 3 [rad]: (time, 4)
-    slide: np.ndarray  # B_1 to B_3 [m]: (time, 3)
-    revolute: np.ndarray  # whether each real joint is revolute: (3,)
-    points: dict[str, np.ndarray]  # by name of the part, in drawing order: (time, n)
+    angle: np.ndarray  # absolute angles of links 0 to n [rad]: (time, n + 1)
+    slide: np.ndarray  # B_1 to B_n [m]: (time, n)
+    kinds: str  # R, P or F of each joint
+    points: dict[str, np.ndarray]  # by name of the part, in drawing order: (time, ...)
 
     @property
     def tip(self) -> np.ndarray:
-        return self.points["tip 3"][:, 0]
+        return self.points[f"tip {len(self.kinds)}"][:, 0]
 
     @property
     def all_points(self) -> np.ndarray:
@@ -46,33 +47,40 @@ class Geometry(NamedTuple):
 
 
 def geometry(linkage: Linkage, q: np.ndarray) -> Geometry:
-    """The `Geometry` of a linkage at joint positions (time, 3)."""
+    """The `Geometry` of a linkage at joint positions (time, n)."""
     check_linkage(linkage)
     linkage = in_numpy(linkage)
-    start, direction, angle, slide, revolute = frames(linkage, np.asarray(q))
+    kinds = letters(linkage.ef)
+    moves = np.array([kind != "F" for kind in kinds])
+    start, direction, angle, slide, _ = frames(linkage, np.where(moves, q, 0))
     end = start + linkage.length * direction
     along, across = linkage.com.T
     foot = start[:, 1:] + along * direction[:, 1:]  # mass centre projected on the link
     center = foot + 1j * across * direction[:, 1:]
 
     points = {}
-    for n in range(4):
-        link = [start[:, n], end[:, n]]
-        if n < 3 and revolute[n]:
-            link.append(start[:, n + 1])  # across by the fixed B
-        elif n < 3:
-            points[f"rail {n + 1}"] = np.column_stack([end[:, n], start[:, n + 1]])
-        points[f"link {n}"] = np.column_stack(link)
-    for n in range(3):
-        points[f"mass {n + 1}"] = np.column_stack([foot[:, n], center[:, n]])
-    for n in range(3):
-        kind = "pin" if revolute[n] else "slider"
-        points[f"{kind} {n + 1}"] = start[:, n + 1 : n + 2]
-    points["tip 3"] = end[:, 3:]
-    return Geometry(angle, slide, revolute, points)
+    last = len(kinds)
+    for k, kind in enumerate(kinds):
+        link = [start[:, k], end[:, k]]
+        if kind == "P":
+            points[f"rail {k + 1}"] = np.column_stack([end[:, k], start[:, k + 1]])
+        else:
+            link.append(start[:, k + 1])  # across by the fixed B
+        points[f"link {k}"] = np.column_stack(link)
+    points[f"link {last}"] = np.column_stack([start[:, last], end[:, last]])
+    for k in range(last):
+        points[f"mass {k + 1}"] = np.column_stack([foot[:, k], center[:, k]])
+    for k, kind in enumerate(kinds):
+        if kind != "F":
+            name = "pin" if kind == "R" else "slider"
+            points[f"{name} {k + 1}"] = start[:, k + 1 : k + 2]
+    points[f"tip {last}"] = end[:, last:]
+    return Geometry(angle, slide, kinds, points)
 
 
-_LINKS = (BLACK, *SERIES[:3])
+def _color(link: int) -> str:
+    return SERIES[(link - 1) % len(SERIES)] if link else BLACK
+
 
 # Markers, in points: a carriage on a piece of its rail, a bearing on hatched ground.
 # Path codes: 1 moves the pen, 2 draws a line, 79 closes the outline.
@@ -121,7 +129,7 @@ def draw_arm(
             continue
         # A joint's rail and carriage belong to the link before it.
         link = int(number) - (kind in ("rail", "slider"))
-        (line,) = ax.plot(*xy(points[i]), alpha=alpha, gid=name, color=_LINKS[link])
+        (line,) = ax.plot(*xy(points[i]), alpha=alpha, gid=name, color=_color(link))
         line.set(**_STYLES[kind])
         if color is not None:
             line.set_color(color)

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import imsave
 
 from ..checks import instance, refusal
-from ..linkage.linkage import joint_names
+from ..linkage.linkage import joint_names, joints_of
 from ..references.reference import reference_of
 from ..simulation.html_table import html_table
 from ..simulation.scene import Scene
@@ -50,13 +50,13 @@ class _Moved(NamedTuple):
 
 @eqx.filter_jit
 def _moved(scene: Scene, stretch: Array, factor: Array) -> _Moved:
-    """Simulates a scene with lengths * `stretch` (3,) and gains * `factor` (2, 3)."""
+    """Simulates a scene with lengths * `stretch` (n,) and gains * `factor` (2, n)."""
     length, com = scene.linkage.length, scene.linkage.com
     linkage = scene.linkage.replace(
         length=length.at[1:].multiply(stretch), com=com.at[:, 0].multiply(stretch)
     )
     controller = controller_of(scene)
-    gains = factor * jnp.stack([controller.kp, controller.kd])
+    gains = factor * gains_of(controller, linkage)
     scene = with_gains(scene._replace(linkage=linkage), gains)
     ts = jnp.linspace(0, scene.t1, _SAMPLES)
     solution = simulate(
@@ -84,7 +84,7 @@ def _told(moved: _Moved, error: np.ndarray) -> str:
     rows = []
     for k, joint in enumerate(joint_names(linkage)):
         p_unit, d_unit = controller.gain_units[joint[0]]
-        kp, kd, length = controller.kp[k], controller.kd[k], linkage.length[k + 1]
+        (kp, kd), length = gains_of(controller, linkage)[:, k], linkage.length[k + 1]
         gains = f"{float(kp):.4g} {p_unit}", f"{float(kd):.4g} {d_unit}"
         rows.append((joint, *gains, f"link {k + 1}: {float(length):.3g} m"))
     return text + html_table(rows, ("joint", "kp", "kd", "length after it"))
@@ -202,10 +202,14 @@ def sliders(scenes: Mapping[str, Scene] | None = None) -> Any:
         # As an array, so that other times do not compile again.
         known[name] = scene._replace(t1=jnp.asarray(scene.t1, float))
 
+    sizes = {joints_of(scene.linkage) for scene in known.values()}
+    if len(sizes) > 1:
+        raise refusal("scenes", "arms of one number of joints", sizes)
+    numbers = range(1, sizes.pop() + 1)
     arm = widgets.Dropdown(options=list(known), description="arm")
     lengths = [
         widgets.FloatSlider(1.0, min=0.5, max=1.5, step=0.01, description=f"link {n}")
-        for n in (1, 2, 3)
+        for n in numbers
     ]
     # A factor of 4, as in `tune`. The browser shows only whole steps from the least
     # value, so the factor 1 must lie on a step.
@@ -214,14 +218,14 @@ def sliders(scenes: Mapping[str, Scene] | None = None) -> Any:
     gains = [
         widgets.FloatLogSlider(1.0, description=f"{gain} {k}", **span)
         for gain in ("kp", "kd")
-        for k in (1, 2, 3)
+        for k in numbers
     ]
     image, words = widgets.Image(format="png"), widgets.HTML()
     pictures = {name: _Picture() for name in known}
 
     def redraw(change: Any = None) -> None:
         stretch = jnp.array([slider.value for slider in lengths])
-        factor = jnp.array([slider.value for slider in gains]).reshape(2, 3)
+        factor = jnp.array([slider.value for slider in gains]).reshape(2, -1)
         moved = _moved(known[arm.value], stretch, factor)
         image.value, error = pictures[arm.value].draw(moved)
         words.value = _told(moved, error)

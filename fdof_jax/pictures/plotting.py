@@ -24,7 +24,7 @@ from ..control.pd import PDController
 from ..dynamics import energy, link_energies
 from ..forces.element import Forces, InertialElement, elements
 from ..linkage.linkage import Linkage
-from ..linkage.topology import real_joints
+from ..linkage.topology import letters
 from ..simulation.efforts import joint_efforts
 from ..simulation.solution import Solution
 from .arms import geometry
@@ -197,18 +197,20 @@ def effort_profile(
     efforts = joint_efforts(linkage, forces, solution)
     ts, total, elements = (np.asarray(a) for a in (solution.ts, *efforts))
     units, panels = [], []
-    for k, revolute in enumerate(real_joints(np.asarray(linkage.ef))):
-        symbol, unit = ("T", "N m") if revolute else ("F", "N")
+    moving = [k for k, kind in enumerate(letters(linkage.ef)) if kind != "F"]
+    for k in moving:
+        symbol, unit = ("T", "N m") if letters(linkage.ef)[k] == "R" else ("F", "N")
         curve = "total", total[:, k], SERIES[0]
         panels.append((f"${symbol}_{k + 1}$ [{unit}]", [curve]))
         units.append(unit)
     fig = figure_or_new(fig, 3.5, 5.2)
     axes = _time_panels(fig, ts, panels)
-    for k, (ax, unit) in enumerate(zip(axes, units)):
+    for k, ax, unit in zip(moving, axes, units):
         low, high = ax.get_ylim()  # before the bands, which may be far wider
         for element, effort in zip(forces, elements):
-            if isinstance(element, PDController) and np.isfinite(element.limit[k]):
-                limit = float(element.limit[k])
+            if isinstance(element, PDController) and np.isfinite(
+                limit := float(each(element.limit, total[0])[k])
+            ):
                 ax.axhspan(-limit, limit, color=GREY, alpha=0.15, lw=0, label="limits")
                 at = np.asarray(saturated(element, linkage, solution))[:, k]
                 dots = ax.plot(ts[at], effort[at, k], ".", color=SERIES[1], zorder=3)
