@@ -1,4 +1,4 @@
-"""Public names: imported at their first use, and found in their rooms."""
+"""Imports at the first use: of public names, and of packages that extras install."""
 
 import ast
 import importlib.util
@@ -45,3 +45,13 @@ def room_of(name: str) -> Any:
         if name in module.__all__:
             return module
     return None
+
+
+def optional_package(name: str, extra: str) -> Any:
+    """Returns the package, or raises ImportError that names the extra to install."""
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise ImportError(
+            f"{name} is not installed: pip install 'fdof_jax[{extra}]' installs it."
+        ) from error

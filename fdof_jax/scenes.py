@@ -1,4 +1,4 @@
-"""The paper's three examples as data; each value is from the figure's own list."""
+"""Examples as data: the paper's three, each value from the figure's list, and chains."""
 
 import numpy as np
 
@@ -6,7 +6,11 @@ from .control.pd import PDController
 from .forces.joints import JointDamper
 from .linkage.coordinates import State, from_chain
 from .linkage.linkage import Linkage
+from .mechanics.inverse_kinematics import inverse_kinematics
 from .references.circle import CircleTask
+from .references.paths import Ellipse
+from .references.task import TipTask
+from .references.timing import Laps
 from .simulation.scene import Scene as Scene
 
 
@@ -81,3 +85,82 @@ def fig7() -> Scene:
         reference=CircleTask(),
     )
     return Scene(linkage, state0, (controller,), 10.0)
+
+
+def double_pendulum() -> Scene:
+    """A conservative double pendulum of two rods, released with both at a height.
+
+    >>> import fdof_jax as fj
+    >>> fj.scenes.double_pendulum().linkage.mass.tolist()  # [kg]
+    [1.0, 1.0]
+    """
+    linkage = Linkage(
+        "RR",
+        length=[0, 1, 1],
+        com=[[0.5, 0], [0.5, 0]],
+        mass=[1, 1],
+        inertia=[1 / 12, 1 / 12],
+    )
+    return Scene(linkage, State([0.5, 0.5], [0, 0]), (), 10.0)
+
+
+def cart_pole() -> Scene:
+    """A pole that hangs from a cart on a level rail; q is the cart's x and the pole's angle.
+
+    The ground's frame points down, so that the cart slides along x and an angle of 0
+    is that of rest. The cart starts at 0 with the pole 0.2 rad away.
+
+    >>> import fdof_jax as fj
+    >>> arm, start, *_ = fj.scenes.cart_pole()
+    >>> fj.tip_position(arm, [0.3, 0.0]).tolist()  # below the cart
+    [0.3, -1.0]
+    """
+    linkage = Linkage(
+        "PR",
+        length=[0, 0, 1],
+        com=[[0, 0], [0.5, 0]],
+        mass=[1, 0.3],
+        inertia=[0, 0.025],
+        base_angle=-np.pi / 2,
+    )
+    return Scene(linkage, State([0.0, 0.2], [0, 0]), (), 10.0)
+
+
+def two_link_circle() -> Scene:
+    """A two-link arm under PD control whose tip tracks a circle, in a level plane.
+
+    >>> import fdof_jax as fj
+    >>> arm, start, (control,), t1 = fj.scenes.two_link_circle()
+    >>> fj.tip_position(arm, start.q).tolist()  # 0.1 m beside the circle's start
+    [1.1, 0.0]
+    """
+    linkage = Linkage(
+        "RR",
+        length=[0, 1, 0.8],
+        com=[[0.5, 0], [0.4, 0]],
+        mass=[2, 1],
+        inertia=[1 / 6, 0.8**2 / 12],
+        gravity=0,
+    )
+    circle = Ellipse(center=[0.7, 0], radii=0.3)
+    task = TipTask(circle, Laps(period=2.0), orientation=None)
+    controller = PDController(kp=100, kd=10, limit=[60, 30], reference=task)
+    start = inverse_kinematics(linkage, [1.1, 0], None)
+    return Scene(linkage, State(start, np.zeros(2)), (controller,), 4.0)
+
+
+def five_links() -> Scene:
+    """A conservative chain of five rods, from a bent shape at rest.
+
+    >>> import fdof_jax as fj
+    >>> fj.scenes.five_links().linkage.mass.shape
+    (5,)
+    """
+    linkage = Linkage(
+        "RRRRR",
+        length=[0, *[0.5] * 5],
+        com=[[0.25, 0]] * 5,
+        mass=[1] * 5,
+        inertia=[0.25 / 12] * 5,
+    )
+    return Scene(linkage, State([-0.5, 0.3, 0.2, -0.4, 0.6], np.zeros(5)), (), 10.0)

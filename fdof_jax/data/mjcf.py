@@ -15,9 +15,9 @@ _SMALLEST = 1e-15
 def to_mjcf(linkage: Linkage) -> str:
     """Exports a linkage as a MuJoCo model (MJCF) with a body for each link.
 
-    Joints `joint1`, `joint2`, ... are hinges about z and slides in the plane z = 0, with
-    `qpos` equal to this library's `q`, without fixed pairs; a site `tip` marks the tip. Nothing collides.
-    Masses and moments of inertia below 1e-15, in particular zero, become 1e-15, the
+    Joints `joint1`, `joint2`, ... are hinges about z and slides in the plane z = 0,
+    with `qpos` equal to this library's `q` without fixed pairs. A site `tip` marks the
+    tip. Nothing collides. Masses and moments of inertia below 1e-15, in particular zero, become 1e-15, the
     smallest that MuJoCo accepts.
 
     **Arguments:** `linkage`: one linkage with concrete values.
@@ -35,9 +35,7 @@ def to_mjcf(linkage: Linkage) -> str:
     check_linkage(linkage)
     if is_traced(linkage):
         raise ValueError("linkage: expected concrete values, got traced ones.")
-    length, com, locked = map(
-        np.asarray, (linkage.length, linkage.com, linkage.locked)
-    )
+    length, com, locked = map(np.asarray, (linkage.length, linkage.com, linkage.locked))
     mass = np.maximum(np.asarray(linkage.mass), _SMALLEST)
     inertia = np.maximum(np.asarray(linkage.inertia), _SMALLEST)
 

@@ -1,28 +1,23 @@
 """Motions as xarray Datasets and pandas DataFrames (optional packages)."""
 
 import warnings
-from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..checks import instance, known
 from ..linkage.linkage import Linkage
+<<<<<<< HEAD
 from ..linkage.topology import letters
+=======
+from ..linkage.topology import real_joints
+from ..names import optional_package
+>>>>>>> C
 from ..simulation.solution import Solution
 
 if TYPE_CHECKING:
     import pandas
     import xarray
-
-
-def _package(name: str) -> Any:
-    try:
-        return import_module(name)
-    except ImportError as error:
-        raise ImportError(
-            f"{name} is not installed: pip install 'fdof_jax[data]' installs it."
-        ) from error
 
 
 def _joints(linkage: Linkage) -> tuple[list[str], list[str]]:
@@ -80,7 +75,7 @@ def to_xarray(linkage: Linkage, solution: Solution) -> "xarray.Dataset":
     **Raises:** ImportError without xarray, which `fdof_jax[data]` brings; ValueError
     for malformed arguments.
     """
-    xarray = _package("xarray")
+    xarray = optional_package("xarray", "data")
     linkage, solution, times, batch = _checked(linkage, solution)
     names, units = _joints(linkage)
     common = units[0] if len(set(units)) == 1 else "m or rad"
@@ -122,7 +117,7 @@ def to_pandas(linkage: Linkage, solution: Solution) -> "pandas.DataFrame":
     **Raises:** ImportError without pandas, which `fdof_jax[data]` brings; ValueError
     for malformed arguments.
     """
-    pandas = _package("pandas")
+    pandas = optional_package("pandas", "data")
     linkage, solution, times, batch = _checked(linkage, solution)
     columns = {}
     for values, unit_of in ((solution.q, str), (solution.qd, _rate)):

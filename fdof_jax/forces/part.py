@@ -37,6 +37,7 @@ def field(
     above: float | None = None,
     finite: bool = True,
     function: bool = False,
+    optional: bool = False,
     default: Any = dataclasses.MISSING,
     kw_only: bool = False,
 ) -> Any:
@@ -51,13 +52,14 @@ def field(
       `None` within it stands for any length, `JOINT` for the number of joints.
     - `unit`: for messages, for instance "N m s/rad".
     - `minimum`, `above`: bounds; `finite`: whether infinities are refused.
-    - `function`: whether a function that returns such an array is accepted.
+    - `function`: whether a function that returns such an array is accepted;
+      `optional`: whether None is.
     - `default`, `kw_only`: as of `dataclasses.field`.
     """
     per_joint = shape is None
     rules = dict(shape=(JOINT,) if per_joint else shape, broadcast=per_joint, unit=unit)
     rules |= dict(minimum=minimum, above=above, finite=finite)
-    about = {"rules": rules, "function": function}
+    about = {"rules": rules, "function": function, "optional": optional}
     return dataclasses.field(default=default, kw_only=kw_only, metadata=about)
 
 
@@ -160,7 +162,9 @@ def _declared(part: Part) -> Iterator[tuple[str, Any, dict[str, Any]]]:
     """Yields names, values and rules of the declared arrays."""
     for declared in dataclasses.fields(part):
         value, about = vars(part)[declared.name], declared.metadata
-        if "rules" in about and not (about["function"] and callable(value)):
+        if "rules" not in about or value is None and about["optional"]:
+            continue
+        if not (about["function"] and callable(value)):
             yield declared.name, value, about["rules"]
 
 

@@ -15,6 +15,7 @@ from matplotlib.image import imsave
 
 from ..checks import instance, refusal
 from ..linkage.linkage import joint_names, joints_of
+from ..names import optional_package
 from ..references.reference import reference_of
 from ..simulation.html_table import html_table
 from ..simulation.scene import Scene
@@ -183,13 +184,7 @@ def sliders(scenes: Mapping[str, Scene] | None = None) -> Any:
 
     **Raises:** ImportError without ipywidgets; ValueError for malformed arguments.
     """
-    try:
-        import ipywidgets as widgets
-    except ImportError as error:
-        raise ImportError(
-            "sliders: expected ipywidgets, which pip install 'fdof_jax[notebook]' "
-            "installs."
-        ) from error
+    widgets = optional_package("ipywidgets", "notebook")
     known = {}
     scenes = circle_scenes() if scenes is None else scenes
     for name, scene in filled_mapping("scenes", scenes, "Scene").items():

@@ -23,6 +23,7 @@ from ..checks import real_array, refusal
 from ..control.pd import PDController
 from ..dynamics import energy, link_energies
 from ..forces.element import Forces, InertialElement, elements
+from ..forces.part import each
 from ..linkage.linkage import Linkage
 from ..linkage.topology import letters
 from ..simulation.efforts import joint_efforts

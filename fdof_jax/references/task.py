@@ -4,7 +4,6 @@ from abc import abstractmethod
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jaxtyping import Float
@@ -83,8 +82,8 @@ class TipReference(Reference):
 
     @property
     def direction(self) -> Array:
-        """The last link's absolute angle; any, 0, where none is commanded [rad]."""
-        return jnp.zeros(()) if self.orientation is None else self.orientation
+        """The last link's absolute angle, or 0 where none is commanded [rad]."""
+        return 0.0 if self.orientation is None else self.orientation
 
 
 class TipTask(TipReference):
@@ -99,7 +98,8 @@ class TipTask(TipReference):
 
     - `path`: a `Path`: `Line`, `Ellipse`, `FigureEight`, `Spline` or your own subclass.
     - `timing`: a `Travel` or `Laps`, or any function from time to the share of the way.
-    - `orientation`: th4, the absolute angle of the last link [rad].
+    - `orientation`: the absolute angle of the last link [rad], th4 in the paper; None
+      for an arm of two joints, whose last link turns as it must.
     - `branch`: assembly of the arm, 1 or -1: see `inverse_kinematics`.
 
     **Raises:** ValueError for malformed arguments. `check`, and so `simulate`, raises
@@ -116,7 +116,9 @@ class TipTask(TipReference):
 
     path: Path = of_kind(Path)
     timing: Any = called("a Travel or Laps")
-    orientation: Values = field((), unit="rad", default=0.0, kw_only=True)
+    orientation: Values = field(
+        (), unit="rad", optional=True, default=0.0, kw_only=True
+    )
     branch: Values = field((), unit="", default=1, kw_only=True)
 
     def conditions(self):
@@ -162,7 +164,7 @@ class TipTask(TipReference):
         if not inside.all():
             raise ValueError(
                 "reference: expected a path within the linkage's reach at orientation "
-                f"{task.orientation:g} rad on branch {task.branch:+g}, got one that "
+                f"{task.direction:g} rad on branch {task.branch:+g}, got one that "
                 f"leaves it at {times[inside.argmin()]:g} s."
             )
         behind = (np.abs(np.diff(bearing)) > np.pi).any()

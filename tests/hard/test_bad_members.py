@@ -12,6 +12,7 @@ import pytest
 from modes import ADJOINT
 
 import fdof_jax as fj
+from fdof_jax.simulation.looped_dopri8 import LoopedDopri8
 from hard.scenes import OUTPUTS, START, arm, behind_the_door
 
 SIZE, TS = 256, np.linspace(0, 0.5, 6)
@@ -79,7 +80,10 @@ def test_members_that_fail_harm_no_other(motions):
 
 
 def test_members_that_fail_add_nothing_to_a_shared_gradient():
-    """Reverse mode adds all members' cotangents to the shared mass; 0 x NaN is NaN."""
+    """Reverse mode adds all members' cotangents to the shared mass; 0 x NaN is NaN.
+
+    The default solver is in `test_sweep`.
+    """
 
     @jax.jit
     def gradient(mass, q, qd, at, wanted):
@@ -87,7 +91,7 @@ def test_members_that_fail_add_nothing_to_a_shared_gradient():
             linkage = eqx.tree_at(lambda a: a.mass, arm(), mass)
             motions = fj.sweep(
                 linkage, fj.State(q, qd), TS, (Breaking(at),), forces_axes=0,
-                adjoint=ADJOINT,
+                adjoint=ADJOINT, solver=LoopedDopri8(),
             )  # fmt: skip
             counted = (motions.result == diffrax.RESULTS.successful) & wanted
             end = jnp.where(counted[:, None], motions.q[:, -1], 0)
