@@ -1,4 +1,4 @@
-"""Examples as data: the paper's three, each value from the figure's list, and chains."""
+"""Examples as data: the paper's three, each value from its figure, and chains."""
 
 import numpy as np
 
@@ -105,7 +105,7 @@ def double_pendulum() -> Scene:
 
 
 def cart_pole() -> Scene:
-    """A pole that hangs from a cart on a level rail; q is the cart's x and the pole's angle.
+    """A pole that hangs from a cart on a level rail; q: the cart's x, the pole's angle.
 
     The ground's frame points down, so that the cart slides along x and an angle of 0
     is that of rest. The cart starts at 0 with the pole 0.2 rad away.
@@ -142,7 +142,7 @@ def two_link_circle() -> Scene:
         inertia=[1 / 6, 0.8**2 / 12],
         gravity=0,
     )
-    circle = Ellipse(center=[0.7, 0], radii=0.3)
+    circle = Ellipse([0.7, 0], [0.3, 0.3])
     task = TipTask(circle, Laps(period=2.0), orientation=None)
     controller = PDController(kp=100, kd=10, limit=[60, 30], reference=task)
     start = inverse_kinematics(linkage, [1.1, 0], None)

@@ -7,12 +7,8 @@ import numpy as np
 
 from ..checks import instance, known
 from ..linkage.linkage import Linkage
-<<<<<<< HEAD
 from ..linkage.topology import letters
-=======
-from ..linkage.topology import real_joints
 from ..names import optional_package
->>>>>>> C
 from ..simulation.solution import Solution
 
 if TYPE_CHECKING:
