@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Sequence
 
 # The names in `search.methods.METHODS`, copied so that JAX need not be imported.
-METHODS = ("levenberg-marquardt", "l-bfgs", "adam")
+METHODS = ("levenberg-marquardt", "l-bfgs")
 
 
 @dataclasses.dataclass(frozen=True)
