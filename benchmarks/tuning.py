@@ -95,7 +95,7 @@ def _by_gradients(method: str, scene, start, low, high, trace: _Trace) -> None:
 
     minimise(
         evaluate, start[None], low[None], high[None], method=method, max_steps=10_000,
-        enough=0.0, report=lambda number, runs: None,
+        enough=0.0,
     )  # fmt: skip
 
 

@@ -52,8 +52,7 @@ def test_no_controller_with_these_limits_does_better(best):
 
 def test_derivatives_against_differences(best):
     limit = np.asarray(CONTROLLER.limit)
-    free = best.scene._replace(forces=(optimal_motion._Knots(best.ts, best.efforts),))
-    problem = free, CONTROLLER.reference, limit, np.array(1e-9), best.solution.ts
+    problem = scenes.fig7(), best.ts, np.array(1e-9), best.solution.ts
     lanes = Lanes(optimal_motion._lane, [[problem]], starts=2)
     draw = np.random.default_rng(0)
     z = 0.9 * (best.efforts / limit).ravel()

@@ -14,7 +14,7 @@ from fdof_jax.tuning import losses
     [
         (dict(factor=1.0), "factor"),
         (dict(factor="4"), "factor"),
-        (dict(method="newton"), "method"),
+        (dict(method="adam"), "method: expected one of"),
         (dict(max_steps=0), "max_steps"),
         (dict(max_steps=2.5), "max_steps"),
         (dict(max_steps=True), "max_steps"),
@@ -29,7 +29,7 @@ from fdof_jax.tuning import losses
         (dict(loss=losses.Tracking), "loss: expected a callable"),
         (dict(bounds=(1, 2, 3)), "bounds"),
         (dict(bounds=(np.ones((2, 3)), np.ones((2, 2)))), "bounds"),
-        (dict(bounds=(np.full((2, 3), 9), np.ones((2, 3)))), "bounds: expected the le"),
+        (dict(bounds=(np.full((2, 3), 9), np.ones((2, 3)))), "bounds: expected the sc"),
         (dict(bounds=(np.ones((2, 3)), 2 * np.ones((2, 3)))), "bounds"),
         (dict(bounds=(np.zeros((2, 3)), np.full((2, 3), 1e9))), "bounds"),
     ],

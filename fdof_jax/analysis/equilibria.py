@@ -12,7 +12,7 @@ from ..checks import real_array
 from ..dynamics import inverse_dynamics
 from ..forces.element import Forces
 from ..linkage.linkage import Linkage
-from .linearization import checked, with_forces
+from .linearization import checked
 
 
 def equilibrium(
@@ -47,7 +47,7 @@ def _rest(linkage: Linkage, forces: Forces, q: Array, t: Array) -> Array:
 
     def efforts(q, _):
         weight = -inverse_dynamics(linkage, q, still, still, forces)
-        return with_forces(weight, linkage, forces, q, still, t)
+        return sum((element(t, q, still, linkage) for element in forces), weight)
 
     # Efforts relative to their rounding errors' scale: stiff controllers converge as
     # exactly as soft springs.

@@ -35,30 +35,21 @@ class Linearization(NamedTuple):
     B: Float[Array, "6 joint"]
 
 
-def with_forces(
-    tau: Array,
-    linkage: Linkage,
-    forces: tuple[Element, ...],
-    q: Array,
-    qd: Array,
-    t: Array,
-) -> Array:
-    """Adds the efforts of the elements to `tau`."""
-    for element in forces:
-        tau = tau + element(t, q, qd, linkage)
-    return tau
+def depends_on_state_alone(forces: tuple[Element, ...]) -> bool:
+    """Returns whether no element has a state of its own or prescribes a motion."""
+    return not stateful(forces) and prescribed(forces) is None
 
 
 def checked(linkage: Linkage, forces: Forces) -> tuple[Element, ...]:
     """Returns the forces as elements, which may have no state."""
     check_linkage(linkage)
     found = elements("forces", forces)
-    if stateful(found) or prescribed(found) is not None:
-        raise ValueError(
-            "forces: expected elements without a state of their own and no "
-            f"PrescribedMotion, got {forces!r}."
-        )
-    return found
+    if depends_on_state_alone(found):
+        return found
+    raise ValueError(
+        "forces: expected elements without a state of their own and no "
+        f"PrescribedMotion, got {forces!r}."
+    )
 
 
 def linearize(
@@ -94,7 +85,7 @@ def _linearized(
 ) -> Linearization:
     def rates(y):
         q, qd, tau = jnp.split(y, 3)
-        tau = with_forces(tau, linkage, forces, q, qd, t)
+        tau = sum((element(t, q, qd, linkage) for element in forces), tau)
         return jnp.concatenate([qd, forward_dynamics(linkage, q, qd, tau, forces)])
 
     slopes = jax.jacfwd(rates)(jnp.concatenate([q, qd, jnp.zeros_like(q)]))
@@ -105,14 +96,6 @@ class Modes(eqx.Module):
     """Eigenvalues of the matrix A along a motion, the fastest last.
 
     - `eigenvalues`: (time, 6) [1/s]; NaN where the motion is NaN.
-
-    >>> import fdof_jax as fj
-    >>> import numpy as np
-    >>> arm, start, forces, _ = fj.scenes.fig7()
-    >>> motion = fj.simulate(arm, start, np.linspace(0, 1, 101), forces)
-    >>> modes = fj.analysis.closed_loop_modes(arm, forces, motion)
-    >>> modes.eigenvalues.shape, float(modes.longest_step[-1])  # [s]
-    ((101, 6), 0.022)
     """
 
     eigenvalues: Complex[np.ndarray, "time 6"]
@@ -163,6 +146,8 @@ def closed_loop_modes(linkage: Linkage, forces: Forces, solution: Solution) -> M
     >>> modes = fj.analysis.closed_loop_modes(arm, forces, motion)
     >>> modes.frequency[-1].tolist()  # [rad/s]
     [5.943, 5.943, 20.677, 20.677, 118.149, 118.149]
+    >>> float(modes.longest_step[-1])  # [s]
+    0.022
     """
     forces = checked(linkage, forces)
     instance("solution", solution, Solution)

@@ -39,24 +39,6 @@ def _loads(
     return force, moment
 
 
-def _reactions(
-    linkage: Linkage, forces: Forces, t: Array, q: Array, qd: Array, tau: Array
-) -> Array:
-    qdd = forward_dynamics(linkage, q, qd, tau, forces)
-    motion = lambda q, qd: mass_center_velocities(linkage, q, qd)
-    _, (acceleration, spin_up) = jax.jvp(motion, (q, qd), (qd, qdd))
-    needed = linkage.mass * (plane_vectors(acceleration) + 1j * linkage.gravity)
-    center = plane_vectors(mass_centers(linkage, q))
-    joint = plane_vectors(joint_positions(linkage, q))
-    turning = linkage.inertia * spin_up + cross(center, needed)
-    force, moment = _loads(linkage, forces, t, q, qd, qdd)
-    # Each joint carries all links beyond it.
-    beyond = lambda rows: jnp.cumsum(rows[::-1])[::-1]
-    carried, about_pivot = beyond(needed - force[1:]), beyond(turning - moment[1:])
-    about = about_pivot - cross(joint, carried)
-    return jnp.stack([carried.real, carried.imag, about], axis=1)
-
-
 def joint_reactions(
     linkage: Linkage, forces: Forces, solution: Solution
 ) -> Float[Array, "time joint 3"]:
@@ -83,10 +65,26 @@ def joint_reactions(
     """
     forces = elements("forces", forces)
     efforts = joint_efforts(linkage, forces, solution)
-    return _along(linkage, forces, solution, efforts.total)
+    return _reactions(linkage, forces, solution, efforts.total)
 
 
 @eqx.filter_jit
-def _along(linkage, forces, solution, total) -> Array:
-    motion = solution.ts, solution.q, solution.qd, total
-    return jax.vmap(lambda *m: _reactions(linkage, forces, *m))(*motion)
+def _reactions(
+    linkage: Linkage, forces: Forces, solution: Solution, total: Array
+) -> Array:
+    def at(t, q, qd, tau):
+        qdd = forward_dynamics(linkage, q, qd, tau, forces)
+        motion = lambda q, qd: mass_center_velocities(linkage, q, qd)
+        _, (acceleration, spin_up) = jax.jvp(motion, (q, qd), (qd, qdd))
+        needed = linkage.mass * (plane_vectors(acceleration) + 1j * linkage.gravity)
+        center = plane_vectors(mass_centers(linkage, q))
+        joint = plane_vectors(joint_positions(linkage, q))
+        turning = linkage.inertia * spin_up + cross(center, needed)
+        force, moment = _loads(linkage, forces, t, q, qd, qdd)
+        # Each joint carries all links beyond it.
+        beyond = lambda rows: jnp.cumsum(rows[::-1])[::-1]
+        carried, about_pivot = beyond(needed - force[1:]), beyond(turning - moment[1:])
+        about = about_pivot - cross(joint, carried)
+        return jnp.stack([carried.real, carried.imag, about], axis=1)
+
+    return jax.vmap(at)(solution.ts, solution.q, solution.qd, total)

@@ -13,18 +13,27 @@ from ..references.circle import CircleTask
 from ..simulation.solution import Solution
 
 
+def relative_demands(
+    controller: PDController, linkage: Linkage, solution: Solution
+) -> Float[Array, "time joint"]:
+    """The controller's demands over its limits; 0 where a limit is infinite.
+
+    Where a limit is 0, a demand other than 0 gives an infinity of its sign.
+    """
+    demands = jax.vmap(controller.demand, in_axes=(0, 0, 0, None))(
+        solution.ts, solution.q, solution.qd, linkage
+    )
+    limit = controller.limit[None]
+    beyond = jnp.where(demands == 0, 0, jnp.sign(demands) * jnp.inf)
+    return jnp.where(limit > 0, demands / jnp.where(limit > 0, limit, 1), beyond)
+
+
 @eqx.filter_jit
 def saturated(
     controller: PDController, linkage: Linkage, solution: Solution
 ) -> Bool[Array, "time joint"]:
-    """Returns whether each actuator is at its limit, along a motion.
-
-    **Arguments:** `controller`; `linkage`; `solution`: a motion under the controller.
-    """
-    demand = jax.vmap(controller.demand, in_axes=(0, 0, 0, None))(
-        solution.ts, solution.q, solution.qd, linkage
-    )
-    return jnp.abs(demand) > controller.limit[None]
+    """Returns whether each actuator is at its limit, along a motion."""
+    return jnp.abs(relative_demands(controller, linkage, solution)) > 1
 
 
 @eqx.filter_jit

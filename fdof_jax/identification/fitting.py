@@ -7,23 +7,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from ..checks import keywords_as, real_array
-from ..forces.element import elements
-from ..linkage.coordinates import real_state
-from ..linkage.linkage import check_linkage
-from ..mechanics.kinematics import joint_positions, tip_position
-from ..search.bounded import Run, minimise, reporting
+from ..checks import function, keywords_as, real_array
+from ..search.bounded import Run, minimise
 from ..search.lanes import Lanes
 from ..search.methods import Evaluation
+from ..search.simulated import check_scene, sum_of_squares
 from ..simulation.scene import Scene, stacked
 from ..simulation.sensitivities import sensitivities
-from ..simulation.simulate import check_elements
 from ..simulation.solution import Solution
+from .recordings import link_ends, observations
 from .result import FitResult, fit_result
-from .unknowns import unknowns_of
+from .unknowns import Shapes, Unknowns, named, unknowns_of
 
 SceneAt = Callable[[dict[str, Array]], Scene]
 Observe = Callable[[Scene, Solution], Array]
@@ -39,38 +35,16 @@ _SHARES = (0.25, 0.5, 0.75, 1.0)
 _ENOUGH_EARLY = 1e-3  # only a start for the next part is needed
 
 
-def link_ends(scene: Scene, solution: Solution) -> Float[Array, "time link 2"]:
-    """Positions of three markers: the joints at the ends of links 2 and 3, and the tip.
-
-    **Arguments:** `scene`; `solution`: its motion.
-
-    **Returns:** points (x, y) from the ground pivot [m].
-
-    >>> import fdof_jax as fj
-    >>> import numpy as np
-    >>> arm, start, *_ = fj.scenes.fig5()
-    >>> motion = fj.simulate(arm, start, np.linspace(0, 1, 101))
-    >>> fj.identification.link_ends(fj.scenes.fig5(), motion)[0].tolist()
-    [[1.0, 0.0], [2.0, 0.0], [3.0, 0.0]]
-    """
-
-    def ends(q):
-        tip = tip_position(scene.linkage, q)
-        return jnp.concatenate([joint_positions(scene.linkage, q)[1:], tip[None]])
-
-    return jax.vmap(ends)(solution.q)
-
-
 class _Problem(NamedTuple):
     """A recording, its scene and observation; `weight` is 0 where a sample is missing.
 
-    The parameters are `scale` times the unknowns.
+    The parameters, of the given shapes, are `scale` times the unknowns.
     """
 
     scene_at: SceneAt
     observe: Observe
-    names: tuple[str, ...]
-    scale: tuple[Any, ...]
+    shapes: Shapes
+    scale: Any
     ts: Any
     observed: Any
     weight: Any
@@ -78,14 +52,10 @@ class _Problem(NamedTuple):
 
 def _lane(z: Array, problem: _Problem) -> Evaluation:
     """Evaluates a recording's weighted sum of squares and its derivatives in `z`."""
+    weight = problem.weight
 
     def scene_at(z):
-        splits = np.cumsum([scale.size for scale in problem.scale])[:-1]
-        parts = [
-            scale * part.reshape(scale.shape)
-            for scale, part in zip(problem.scale, jnp.split(z, splits))
-        ]
-        return problem.scene_at(dict(zip(problem.names, parts)))
+        return problem.scene_at(named(problem.shapes, problem.scale * z))
 
     def residuals(scene, solution):
         seen = jnp.asarray(problem.observe(scene, solution))
@@ -94,76 +64,50 @@ def _lane(z: Array, problem: _Problem) -> Evaluation:
                 "observed: expected the shape of what `observe` returns, "
                 f"{seen.shape}, got {problem.observed.shape}."
             )
-        misfit = jnp.where(problem.weight > 0, seen - problem.observed, 0)
-        return (problem.weight * misfit).reshape(-1)
+        misfit = jnp.where(weight > 0, seen - problem.observed, 0)
+        return (weight * misfit).reshape(-1)
 
-    value, jacobian, _, solution = sensitivities(
-        scene_at, residuals, z, problem.ts, _TOLERANCE
-    )
-    raw = value / jnp.where(problem.weight > 0, problem.weight, 1).reshape(-1)
-    facts: Any = dict(squares=jnp.sum(raw**2), steps=solution.stats["num_steps"])
-    loss: Any = jnp.sum(value**2)
-    gradient: Any = 2 * jacobian.T @ value
-    curvature: Any = 2 * jacobian.T @ jacobian
-    return Evaluation(loss, gradient, curvature, facts)
+    found = sensitivities(scene_at, residuals, z, problem.ts, _TOLERANCE)
+    unweighted = found.residuals / jnp.where(weight > 0, weight, 1).reshape(-1)
+    return sum_of_squares(found, squares=jnp.sum(unweighted**2))
 
 
-def _observations(observed: Any, noise: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Readings (recording, time, ...), 0 where missing, and their weights."""
+def _check_scene_at(scene_at: SceneAt, parameters: dict[str, Array], ts: Array) -> None:
     try:
-        readings = np.asarray(observed, dtype=jnp.result_type(float))
-    except (TypeError, ValueError) as error:
-        raise ValueError(
-            f"observed: expected an array of real numbers, got {observed!r}."
-        ) from error
-    if np.isinf(readings).any():
-        raise ValueError("observed: expected finite readings (or NaN), got infinity.")
-    there = ~np.isnan(readings)
-    spread = np.ones(()) if noise is None else noise
-    spread = np.asarray(real_array("noise", spread, np.shape(spread), above=0))
-    try:
-        weights = np.broadcast_to(1 / spread, readings.shape[1:])
-    except ValueError:
-        raise ValueError(
-            "noise: expected one number, or an array that broadcasts to a recording, "
-            f"{readings.shape[1:]}, got shape {spread.shape}."
-        ) from None
-    return np.where(there, readings, 0), np.where(there, weights, 0)
-
-
-def _check_scene(scene: Any, ts: Array) -> None:
-    if not isinstance(scene, Scene):
-        raise ValueError(f"scene_at: expected it to return a Scene, got {scene!r}.")
-    check_linkage(scene.linkage)
-    real_state("scene_at(...).state0", scene.state0, scene.linkage)
-    elements("scene_at(...).forces", scene.forces)
-    check_elements(scene.forces, scene.linkage, ts)
-
-
-def _called(scene_at: SceneAt, parameters: dict[str, Array]) -> Any:
-    try:
-        return scene_at(parameters)
+        scene = scene_at(parameters)
     except KeyError as error:
         raise ValueError(
             f"start: expected a value for {error}, which scene_at may use, got "
             f"{list(parameters)}."
         ) from error
+    check_scene("scene_at(...)", scene, ts)
 
 
 def _longer_and_longer(
-    until: Callable[[float], Lanes],
-    z: np.ndarray,
-    low: np.ndarray,
-    high: np.ndarray,
-    **keywords: Any,
+    rows: list[list[_Problem]], unknowns: Unknowns, **keywords: Any
 ) -> list[Run]:
     """Searches over growing shares of the time; returns the runs over all of it."""
-    keywords = dict(method="levenberg-marquardt") | keywords
+    keywords |= dict(method="levenberg-marquardt", describe=_squares_so_far)
+    z, low, high = (
+        np.broadcast_to(numbers / unknowns.scale, (len(rows), numbers.size))
+        for numbers in (unknowns.start, unknowns.low, unknowns.high)
+    )
+
+    def until(share: float) -> Lanes:
+        """The lanes with weights for readings up to this share of the time only."""
+
+        def shortened(problem: _Problem) -> _Problem:
+            ts, weight = np.asarray(problem.ts), problem.weight
+            early = (ts - ts[0]) / (ts[-1] - ts[0]) <= share
+            return problem._replace(weight=(weight.T * early).T)
+
+        return Lanes(_lane, [[shortened(problem) for problem in row] for row in rows])
+
     for share, longer in zip(_SHARES, _SHARES[1:]):
         runs = minimise(until(share), z, low, high, enough=_ENOUGH_EARLY, **keywords)
         # Over a short time, noise may lead away from the parameters.
-        better = until(longer)
-        found, every = np.stack([run.z for run in runs]), np.arange(len(z))
+        better, every = until(longer), np.arange(len(rows))
+        found = np.stack([run.z for run in runs])
         gain = better(found, every).loss < better(z, every).loss
         z = np.where(gain[:, None], found, z)
     return minimise(until(1), z, low, high, enough=_ENOUGH, **keywords)
@@ -188,50 +132,30 @@ def _search(
     The keywords are those of `fit`; `observed` has recordings as first axis.
     """
     unknowns = unknowns_of(start, bounds, scale)
-    told = reporting(report, _squares_so_far)
     ts = real_array("ts", ts, (None,))
     if ts.size < 2 or not (np.diff(ts) > 0).all():
         raise ValueError(f"ts: expected two or more increasing times, got {ts}.")
-    readings, weights = _observations(observed, noise)
-    if readings.shape[1:2] != ts.shape:
-        raise ValueError(
-            f"observed: expected a row for each of the {ts.size} times, got shape "
-            f"{readings.shape[1:]}."
-        )
-    for name, value in (*(("scene_at", s) for s in scenes_at), ("observe", observe)):
-        if not callable(value):
-            raise ValueError(f"{name}: expected a callable, got {value!r}.")
-    stacked(scenes_at, "scene_at")  # raises unless all are alike
-    first = dict(zip(unknowns.names, map(jnp.asarray, unknowns.start)))
+    readings, weights = observations(observed, noise, ts)
     for scene_at in scenes_at:
-        _check_scene(_called(scene_at, first), ts)
+        function("scene_at", scene_at)
+    function("observe", observe)
+    stacked(scenes_at, "scene_at")  # raises unless all are alike
+    first = jax.tree.map(jnp.asarray, named(unknowns.shapes, unknowns.start))
+    for scene_at in scenes_at:
+        _check_scene_at(scene_at, first, ts)
     problems = [
-        _Problem(scene_at, observe, unknowns.names, unknowns.scale, ts, *row)
+        _Problem(scene_at, observe, unknowns.shapes, unknowns.scale, ts, *row)
         for scene_at, *row in zip(scenes_at, readings, weights)
     ]
     rows = [problems] if together else [[problem] for problem in problems]
-    passed = np.asarray((ts - ts[0]) / (ts[-1] - ts[0]))
-    passed = passed.reshape(-1, *[1] * (readings.ndim - 2))
-
-    def until(share: float) -> Lanes:
-        """The lanes with weights for readings up to this share of the time only."""
-        early = passed <= share
-        return Lanes(
-            _lane, [[p._replace(weight=p.weight * early) for p in row] for row in rows]
-        )
-
     counts = [sum(int((p.weight > 0).sum()) for p in row) for row in rows]
-    if min(counts) <= unknowns.flat_start.size:
+    if min(counts) <= unknowns.start.size:
         raise ValueError(
-            f"observed: expected more readings than the {unknowns.flat_start.size} "
+            f"observed: expected more readings than the {unknowns.start.size} "
             f"unknowns, got {min(counts)}."
         )
-    box = unknowns.flat_start, unknowns.flat_low, unknowns.flat_high
-    z, low, high = (
-        np.broadcast_to(a / unknowns.flat_scale, (len(rows), a.size)) for a in box
-    )
-    runs = _longer_and_longer(until, z, low, high, max_steps=max_steps, report=told)
-    if any(not np.isfinite(run.best.loss) for run in runs):
+    runs = _longer_and_longer(rows, unknowns, max_steps=max_steps, report=report)
+    if any(run.failed for run in runs):
         raise ValueError(
             "start: expected parameters at which the scene can be simulated over ts, "
             f"got {start!r}."

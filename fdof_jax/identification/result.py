@@ -10,8 +10,9 @@ import numpy as np
 from jaxtyping import Float
 
 from ..search.bounded import Run
+from ..search.methods import held_at_bounds
 from ..simulation.scene import Scene
-from .unknowns import Unknowns, flat
+from .unknowns import Unknowns, named
 
 # A combination is weak if its standard error exceeds this part of its size.
 _WEAK = 1.0
@@ -60,7 +61,7 @@ class FitResult(eqx.Module):
     history: Float[np.ndarray, " iteration"]
 
     def __str__(self) -> str:
-        values = flat(self.parameters.values())
+        values = np.concatenate([np.ravel(v) for v in self.parameters.values()])
         errors = np.sqrt(np.diag(self.covariance))
         width = max(12, *(len(name) + 2 for name in self.names))
         rows = [f"{'':{width}}{'value':>12}{'std error':>12}{'relative':>12}"]
@@ -142,33 +143,27 @@ def fit_result(
     count: int,
 ) -> FitResult:
     """The result of a run over `count` readings."""
-    assert run.at is not None and run.reason is not None
-    scale = unknowns.flat_scale
-    low, high = unknowns.flat_low, unknowns.flat_high
+    shapes, _, scale, low, high = unknowns
     values = np.clip(run.z * scale, low, high)
     sizes = np.maximum(np.abs(values), scale)
     # The loss is a mean over recordings, but a sum is needed. From here on, parameters
     # are relative to their sizes.
-    members = len(run.at.facts["squares"])
+    members, relative = len(run.best.facts["squares"]), sizes / scale
     loss = members * run.at.loss
-    normal = (
-        members * run.at.curvature / 2 * np.outer(sizes, sizes) / np.outer(scale, scale)
-    )
-    slope = members * run.at.gradient / 2 * sizes / scale
-    eps = float(jnp.finfo(float).eps)
+    normal = members * run.at.curvature / 2 * np.outer(relative, relative)
+    slope = members * run.at.gradient / 2 * relative
     degrees = count - len(values)
     variance = 1.0 if noise_given else loss / degrees
+    eps = float(jnp.finfo(float).eps)
     inverse, untold = told_and_untold(normal, eps)
-    relative = variance * inverse
     # Infinite along undetermined directions. As infinities of both signs must not be
     # added up, one projection decides the sign.
     basis, _ = np.linalg.qr(untold)
     shared = basis @ basis.T
     unknown = np.copysign(np.inf, shared)
-    covariance = np.where(np.abs(shared) > _SHARED, unknown, relative)
+    covariance = np.where(np.abs(shared) > _SHARED, unknown, variance * inverse)
     covariance *= np.outer(sizes, sizes)
-    free = (values > low) | (slope < 0)
-    free &= (values < high) | (slope > 0)
+    free = ~held_at_bounds(values, slope, low, high)
     step = np.zeros_like(slope)
     if free.any():
         within, _ = told_and_untold(normal[np.ix_(free, free)], eps)
@@ -184,22 +179,21 @@ def fit_result(
             f"the residuals are {noise:.3g} times the noise: this scene does not move "
             "as observed with any such parameters"
         )
-    parameters = unknowns.named(values)
-    # Print directions in parts of the values, unless these are nearly zero.
-    parts_of = np.where(np.abs(values) > 1e-3 * sizes, values, sizes)
-    untold = untold * (sizes / parts_of)[:, None]
+    parameters = named(shapes, values)
     try:
         scene_at(jax.tree.map(jnp.asarray, parameters))
     except ValueError as error:
         # During the search values were traced, so constructors could not check them.
         parts.append(f"no scene has these parameters ({error}); set bounds")
-    errors = np.sqrt(np.diag(covariance))
+    # Print directions in parts of the values, unless these are nearly zero.
+    parts_of = np.where(np.abs(values) > 1e-3 * sizes, values, sizes)
+    untold = untold * (sizes / parts_of)[:, None]
     return FitResult(
         parameters=parameters,
-        standard_errors=unknowns.named(errors),
+        standard_errors=named(shapes, np.sqrt(np.diag(covariance))),
         names=unknowns.labels,
         covariance=covariance,
-        weak=_in_words(unknowns.labels, untold, relative),
+        weak=_in_words(unknowns.labels, untold, variance * inverse),
         rms=float(np.sqrt(np.sum(run.best.facts["squares"]) / count)),
         noise=noise,
         converged=bool(small or np.abs(step).max() <= _REMAINING_PART),

@@ -11,15 +11,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..checks import whole_number
-from .methods import (
-    GRADIENT_OF_LOSS,
-    LONGEST_STEP,
-    METHODS,
-    Adam,
-    Evaluation,
-    held_at_bounds,
-)
+from .methods import METHODS, Evaluation, held_at_bounds
 
+# Greatest change of an unknown in a step: a factor of 7 if unknowns are logarithms.
+_LONGEST_STEP = 2.0
+# A run stops if, to first order, changing the unknowns by 1 hardly changes the loss.
+_GRADIENT_OF_LOSS = 1e-6
 # The loss may vanish, so its gradient is also compared with that at the start.
 _GRADIENT_DECREASE = 1e-10
 # A stop for another reason counts as convergence if the projected gradient is at most
@@ -44,20 +41,17 @@ class Run:
         self.method, self.enough = method(z), enough
         self.z, self.low, self.high = z, low, high
         self.rows: list[Row] = []
-        self.reason: str | None = None
+        self.reason = ""  # while it runs
         self.exhausted = False  # whether it stopped only for lack of steps
         self.flat = False  # whether the gradient at the start is zero, also at bounds
-        self.at: Evaluation | None = None
+        self.at: Any = None  # the evaluation at `z`
 
     def arrive(self, z: np.ndarray, here: Evaluation, began: float) -> None:
         """Accepts or rejects the point `z` by its evaluation `here`."""
-        finite = np.isfinite(here.loss) and np.isfinite(here.gradient).all()
-        finite = finite and np.isfinite(here.curvature).all()
-        adam = isinstance(self.method, Adam)
-        if self.at is not None and not (finite and (adam or here.loss < self.at.loss)):
-            if adam:
-                self.reason = "a step led to where the simulation fails"
-            elif not self.method.refused():
+        before = self.at
+        finite = all(np.isfinite(value).all() for value in here[:3])
+        if before is not None and not (finite and here.loss < before.loss):
+            if not self.method.refused():
                 self.reason = "no step decreases the loss any further"
             return
         if not finite:  # at the start
@@ -66,68 +60,51 @@ class Run:
         held = held_at_bounds(z, here.gradient, self.low, self.high)
         held |= self.low >= self.high
         norm = float(np.linalg.norm(np.where(held, 0, here.gradient)))
-        before, self.at, self.z = self.at, here, z
-        if before is None:
-            self.flat = not here.gradient.any()
+        self.at, self.z = here, z
         self.rows.append(
             Row(z, float(here.loss), norm, here.facts, time.perf_counter() - began)
         )
-        if self.reason is not None:
-            return
-        if before is not None:
-            self.method.accepted(before.loss - here.loss)
-        if self._small(norm, here.loss, GRADIENT_OF_LOSS):
+        if self._small(_GRADIENT_OF_LOSS):
             self.reason = "the projected gradient vanishes"
-        elif before is not None and not adam:
-            if before.loss - here.loss < self.enough * before.loss:
-                self.reason = "the loss decreases no further"
+        if before is None:
+            self.flat = not here.gradient.any()
+            return
+        self.method.accepted()
+        if not self.reason and before.loss - here.loss < self.enough * before.loss:
+            self.reason = "the loss decreases no further"
 
-    def _small(self, norm: float, loss: float, of_loss: float) -> bool:
-        return norm <= max(
-            _GRADIENT_DECREASE * self.rows[0].gradient_norm, of_loss * loss
-        )
+    def _small(self, of_loss: float) -> bool:
+        """Returns whether the projected gradient is at most this part of the loss."""
+        least = _GRADIENT_DECREASE * self.rows[0].gradient_norm
+        return self.best.gradient_norm <= max(least, of_loss * self.best.loss)
 
     def next(self) -> np.ndarray:
-        assert self.at is not None
-        low = np.maximum(self.low, self.z - LONGEST_STEP)
-        high = np.minimum(self.high, self.z + LONGEST_STEP)
+        """Returns the point to evaluate next."""
+        low = np.maximum(self.low, self.z - _LONGEST_STEP)
+        high = np.minimum(self.high, self.z + _LONGEST_STEP)
         step = self.method.step(self.z, self.at, low, high)
         # By rounding, z + (high - z) may exceed high.
         return np.clip(self.z + step, low, high)
 
     @property
     def best(self) -> Row:
-        """The point of least loss, which need not be Adam's last."""
-        return min(self.rows, key=lambda row: row.loss)
+        """The last point, as each accepted one decreases the loss."""
+        return self.rows[-1]
 
     @property
     def failed(self) -> bool:
         """Returns whether the function could not be evaluated at the start."""
-        return not np.isfinite(self.rows[0].gradient_norm)
+        return not np.isfinite(self.best.loss)
 
     @property
     def converged(self) -> bool:
-        best = self.best
-        small = self._small(best.gradient_norm, best.loss, _CONVERGED)
-        return bool(not self.flat and not self.failed and not self.exhausted and small)
+        stopped = not (self.flat or self.failed or self.exhausted)
+        return stopped and self._small(_CONVERGED)
 
 
-def reporting(
-    report: Any, describe: Callable[[list[Run]], str]
-) -> Callable[[int, list[Run]], None]:
-    """Returns a callback for `minimise` that passes a line per step to `report`.
-
-    Raises ValueError if `report` is neither callable nor None.
-    """
-    if not (report is None or callable(report)):
-        raise ValueError(f"report: expected a callable or None, got {report!r}.")
-
-    def told(number: int, runs: list[Run]) -> None:
-        if report is not None:
-            going = sum(run.reason is None for run in runs)
-            report(f"{number:4d}  {describe(runs)}, {going} of {len(runs)} runs active")
-
-    return told
+def best_of(runs: list[Run]) -> Run:
+    """Returns the run of least loss, a failed one only if all have failed."""
+    return min(runs, key=lambda run: (run.failed, run.best.loss))
 
 
 def minimise(
@@ -139,30 +116,37 @@ def minimise(
     method: str,
     max_steps: int,
     enough: float,
-    report: Callable[[int, list[Run]], None],
+    report: Callable[[str], Any] | None = None,
+    describe: Callable[[list[Run]], str] = str,
 ) -> list[Run]:
     """Minimises a function per run, from (run, n) starts within (run, n) bounds.
 
     **Arguments:** `evaluate`: `(z, runs) -> Evaluation`, for points `z` of the runs
     with indices `runs`; `method`: one of `METHODS`; `max_steps`: evaluations after the
     first; `enough`: a run stops when its loss falls by less than this part; `report`:
-    called after each step with its number and the runs.
+    called after each step with a line in which `describe` says where the runs are.
 
-    **Raises:** ValueError unless `max_steps` is a whole number of at least 1.
+    **Raises:** ValueError unless `max_steps` is a whole number of at least 1, and
+    `report` a callable or None.
     """
     max_steps = whole_number("max_steps", max_steps, 1)
+    if not (report is None or callable(report)):
+        raise ValueError(f"report: expected a callable or None, got {report!r}.")
     began = time.perf_counter()
     runs = [Run(METHODS[method], enough, *row) for row in zip(start, low, high)]
     for number in range(max_steps + 1):
-        going = [i for i, run in enumerate(runs) if run.reason is None]
+        going = [i for i, run in enumerate(runs) if not run.reason]
         if not going:
             break
         trials = [runs[i].next() if number else runs[i].z for i in going]
         found = evaluate(np.stack(trials), np.array(going))
         for place, (i, trial) in enumerate(zip(going, trials)):
             runs[i].arrive(trial, found.row(place), began)
-        report(number, runs)
+        if report is not None:
+            count = sum(not run.reason for run in runs)
+            active = f"{count} of {len(runs)} runs active"
+            report(f"{number:4d}  {describe(runs)}, {active}")
     for run in runs:
-        if run.reason is None:
+        if not run.reason:
             run.exhausted, run.reason = True, f"stopped after {max_steps} evaluations"
     return runs

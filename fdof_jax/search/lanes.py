@@ -21,12 +21,16 @@ Evaluate = Callable[[Array, Any], Evaluation]  # (z, problem) of one lane
 
 @eqx.filter_jit
 def _evaluate(evaluate: Evaluate, z: Array, moving: Any, shared: Any) -> Evaluation:
-    """Evaluates one lane, or several if `z` and `moving` have a leading axis."""
+    """Evaluates lanes, along the leading axis of `z` and `moving`."""
 
     def lane(z, moving):
         return evaluate(z, eqx.combine(moving, shared))
 
-    return lane(z, moving) if z.ndim == 1 else jax.vmap(lane)(z, moving)
+    if len(z) > 1:
+        return jax.vmap(lane)(z, moving)
+    # A single lane is compiled without a batch, which is faster.
+    one = lane(*jax.tree.map(lambda a: a[0], (z, moving)))
+    return jax.tree.map(lambda a: a[None], one)
 
 
 def _moves(leaf: Any) -> bool:
@@ -35,10 +39,7 @@ def _moves(leaf: Any) -> bool:
 
 
 class Lanes:
-    """Evaluates runs by one compiled program, in groups of lanes with similar work.
-
-    Work is measured by `steps`, which the facts of an evaluation must include.
-    """
+    """Evaluates runs by one compiled program, in groups of lanes."""
 
     def __init__(
         self,
@@ -57,39 +58,30 @@ class Lanes:
         self.shared = jax.tree.map(
             lambda a: jnp.asarray(a[0, 0]) if isinstance(a, np.ndarray) else a, shared
         )
-        leaves, self.structure = jax.tree.flatten(moving)
-        self.leaves = [np.repeat(leaf, starts, axis=0) for leaf in leaves]
+        self.moving = jax.tree.map(lambda a: np.repeat(a, starts, axis=0), moving)
         self.members = len(problems[0])
-        self.steps = np.zeros((len(problems) * starts, self.members), int)
-        groups = -(-self.steps.size // _LANES)
-        self.size = -(-self.steps.size // groups)
+        lanes = len(problems) * starts * self.members
+        self.size = -(-lanes // -(-lanes // _LANES))
 
     def __call__(self, z: np.ndarray, runs: np.ndarray) -> Evaluation:
-        lanes = [(run, member) for run in runs for member in range(self.members)]
-        rows = np.repeat(z, self.members, axis=0)
-        if self.size == 1:
-            groups: Any = [np.array(0)]
-        else:
-            work = np.argsort([-self.steps[lane] for lane in lanes], kind="stable")
-            # Copies fill the last group.
-            groups = np.resize(work, (-(-len(lanes) // self.size), self.size))
-        found: list[Any] = [None] * len(lanes)
-        for group in groups:
-            run, member = np.moveaxis(np.array(lanes)[group], -1, 0)
-            arrays = [jnp.asarray(leaf[run, member]) for leaf in self.leaves]
-            moving = jax.tree.unflatten(self.structure, arrays)
-            at = jnp.asarray(rows[group])
-            values = _evaluate(self.evaluate, at, moving, self.shared)
-            values = jax.tree.map(np.asarray, values)
-            for place, lane in enumerate(np.atleast_1d(group)):
-                found[lane] = values.row(place) if group.ndim else values
-        for lane, values in zip(lanes, found):
-            self.steps[lane] = values.facts["steps"]
+        points = np.repeat(z, self.members, axis=0)
+        run = np.repeat(runs, self.members)
+        member = np.tile(np.arange(self.members), len(runs))
+
+        def evaluated(lanes: np.ndarray) -> Evaluation:
+            there = run[lanes], member[lanes]
+            moving = jax.tree.map(lambda a: jnp.asarray(a[there]), self.moving)
+            here = jnp.asarray(points[lanes])
+            found = _evaluate(self.evaluate, here, moving, self.shared)
+            return jax.tree.map(np.asarray, found)
+
+        # Copies fill the last group.
+        shape = -(-len(run) // self.size), self.size
+        groups = map(evaluated, np.resize(np.arange(len(run)), shape))
+        rows = jax.tree.map(lambda *a: np.concatenate(a)[: len(run)], *groups)
         shape = len(runs), self.members
-        by_run = jax.tree.map(
-            lambda *a: np.stack(a).reshape(*shape, *a[0].shape), *found
-        )
-        return power_mean(by_run, self.order)
+        members = jax.tree.map(lambda a: a.reshape(*shape, *a.shape[1:]), rows)
+        return power_mean(members, self.order)
 
 
 def power_mean(members: Evaluation, order: int) -> Evaluation:

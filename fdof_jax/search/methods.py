@@ -7,11 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
 
-# A run stops if, to first order, changing the unknowns by 1 hardly changes the loss.
-GRADIENT_OF_LOSS = 1e-6
-# Greatest change of an unknown in a step: a factor of 7 if unknowns are logarithms.
-LONGEST_STEP = 2.0
-
 
 class Evaluation(NamedTuple):
     """A function and its derivatives at one point per run.
@@ -31,35 +26,22 @@ class Evaluation(NamedTuple):
 
 
 class LevenbergMarquardt:
-    """The Levenberg-Marquardt method: steps to the damped model's minimum in the box.
-
-    Along a valley whose floor is flatter than the model, steps are repeatedly too
-    short. After a step that decreases the loss more than predicted, the next one is
-    stretched.
-    """
+    """The Levenberg-Marquardt method: steps to its model's minimum in the box."""
 
     def __init__(self, z: np.ndarray):
-        self.damping, self.growth, self.stretch = 1e-3, 4, 1
-        self.promised = 0.0
+        self.damping, self.growth = 1e-3, 4
 
     def step(self, z, here: Evaluation, low, high) -> np.ndarray:
         normal = here.curvature.copy()
         scale = np.diag(normal)
         normal += np.diag(self.damping * scale + 1e-12 * scale.sum() + 1e-300)
-        step = box_minimum(normal, here.gradient, low - z, high - z)
-        self.promised = -(here.gradient @ step + step @ here.curvature @ step / 2)
-        return np.clip(self.stretch * step, low - z, high - z)
+        return box_minimum(normal, here.gradient, low - z, high - z)
 
-    def accepted(self, decrease: float) -> None:
-        more = decrease > 1.2 * self.promised
-        self.stretch = min(2 * self.stretch, 4) if more else 1
+    def accepted(self) -> None:
         self.damping, self.growth = max(self.damping / 4, 1e-9), 4
 
     def refused(self) -> bool:
         """Shortens the next step, and returns whether one is left to try."""
-        if self.stretch > 1:
-            self.stretch = 1
-            return True
         self.damping *= self.growth
         self.growth *= 2
         return self.damping <= 1e8
@@ -92,7 +74,7 @@ class LBFGS:
             direction = 0.3 * direction / np.abs(direction).max()
         return np.clip(z + self.share * direction, low, high) - z
 
-    def accepted(self, decrease: float) -> None:
+    def accepted(self) -> None:
         self.direction, self.share = None, 1.0
 
     def refused(self) -> bool:
@@ -100,29 +82,9 @@ class LBFGS:
         return self.share > 1e-8
 
 
-class Adam:
-    """optax's Adam, clipped to the box; the loss may rise on the way."""
-
-    def __init__(self, z: np.ndarray):
-        import optax
-
-        self.optimiser = optax.adam(0.05)
-        self.state: Any = self.optimiser.init(jnp.asarray(z))
-
-    def step(self, z, here: Evaluation, low, high) -> np.ndarray:
-        update, self.state = self.optimiser.update(
-            jnp.asarray(here.gradient), self.state
-        )
-        return np.clip(z + np.asarray(update), low, high) - z
-
-    def accepted(self, decrease: float) -> None:
-        pass
-
-
 METHODS: dict[str, Any] = {
     "levenberg-marquardt": LevenbergMarquardt,
     "l-bfgs": LBFGS,
-    "adam": Adam,
 }
 
 

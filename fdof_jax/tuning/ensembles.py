@@ -1,10 +1,9 @@
 """Ensembles: scenes that differ in numbers, stacked along a leading axis."""
 
-from typing import Any
-
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 from numpy.typing import ArrayLike
 
 from ..checks import instance, real_array, whole_number
@@ -14,7 +13,11 @@ from ..linkage.linkage import Linkage, check_linkage
 from ..mechanics.kinematics import tip_jacobian, tip_position
 from ..references.reference import reference_of
 from ..simulation.scene import Scene, stacked
-from .losses import controller_of
+from .losses import controller_of, with_controller
+
+
+def _bodies(linkage: Linkage) -> tuple[Array, Array, Array]:
+    return linkage.mass, linkage.com, linkage.inertia
 
 
 def with_payload(linkage: Linkage, mass: ArrayLike) -> Linkage:
@@ -31,54 +34,32 @@ def with_payload(linkage: Linkage, mass: ArrayLike) -> Linkage:
     """
     check_linkage(linkage)
     mass = real_array("mass", mass, (), minimum=0)
-    tip = jnp.stack([linkage.length[3], jnp.zeros(())])
-    own, center = linkage.mass[2], linkage.com[2]
+    own, center, inertia = (values[2] for values in _bodies(linkage))
+    to_tip = jnp.stack([linkage.length[3], jnp.zeros(())]) - center
     total = own + mass
-    # The inertia of two masses about their common centre: reduced mass * distance^2.
-    reduced = own * mass / jnp.where(total > 0, total, 1)
-    shift = mass / jnp.where(total > 0, total, 1) * (tip - center)
-    inertia = linkage.inertia[2] + reduced * jnp.sum((tip - center) ** 2)
-    return eqx.tree_at(
-        lambda arm: (arm.mass, arm.com, arm.inertia),
-        linkage,
-        (
-            linkage.mass.at[2].set(total),
-            linkage.com.at[2].set(center + shift),
-            linkage.inertia.at[2].set(inertia),
-        ),
+    share = mass / jnp.where(total > 0, total, 1)
+    last = (
+        total,
+        center + share * to_tip,
+        # Of two masses about their common centre: reduced mass * distance^2.
+        inertia + own * share * jnp.sum(to_tip**2),
     )
+    changed = [values.at[2].set(new) for values, new in zip(_bodies(linkage), last)]
+    return eqx.tree_at(_bodies, linkage, changed)
 
 
 def _displaced(linkage: Linkage, q: np.ndarray, offset: np.ndarray) -> np.ndarray:
     """Joint positions with the tip moved by `offset` and the last link's angle kept."""
-    aim, there = np.asarray(tip_position(linkage, q)) + offset, q
+    aim = np.asarray(tip_position(linkage, q)) + offset
     for _ in range(50):
-        missing = np.append(aim - np.asarray(tip_position(linkage, there)), 0.0)
-        slopes = np.asarray(tip_jacobian(linkage, there))
-        there = there + np.linalg.lstsq(slopes, missing)[0]
+        missing = np.append(aim - np.asarray(tip_position(linkage, q)), 0.0)
         if np.linalg.norm(missing) < 1e-9:
-            return there
+            return q
+        q = q + np.linalg.lstsq(np.asarray(tip_jacobian(linkage, q)), missing)[0]
     raise ValueError(
         "start_offset: expected one within the linkage's reach, got "
         f"{np.linalg.norm(offset):g} m."
     )
-
-
-def _hastened(controller: Any, rate: float) -> Any:
-    """The controller with its reference faster by the factor `rate`."""
-    period = controller.reference.period / rate
-    return eqx.tree_at(lambda c: c.reference.period, controller, period)
-
-
-def _believing(controller: Any, linkage: Linkage) -> Any:
-    """The controller, with this linkage as its model if it has none."""
-    if not isinstance(controller, ModelBased) or controller.model is not None:
-        return controller
-    return eqx.tree_at(lambda c: c.model, controller, linkage, is_leaf=_is_none)
-
-
-def _is_none(node: Any) -> bool:
-    return node is None
 
 
 def perturbed(
@@ -133,39 +114,35 @@ def perturbed(
             f"got {error:g}."
         )
     reach = float(real_array("start_offset", start_offset, (), minimum=0))
-    controller = controller_of(scene)
+    linkage, controller = scene.linkage, controller_of(scene)
     varied = bool((ranges["speed"] != 1).any())
     if varied and reference_of(controller.reference).period is None:
         raise ValueError(
             f"speed: expected (1, 1) for a reference without a `period`, got {speed!r}."
         )
-    linkage, found = scene.linkage, []
-    nominal = _believing(controller, linkage)
-    forces = tuple(nominal if f is controller else f for f in scene.forces)
-    scene, controller = scene._replace(forces=forces), nominal
-    for _ in range(members):
-        factors = [
-            1 + draw.uniform(-error, error, leaf.shape)
-            for leaf in (linkage.mass, linkage.com, linkage.inertia)
+    if isinstance(controller, ModelBased) and controller.model is None:
+        none = lambda node: node is None
+        known = eqx.tree_at(lambda c: c.model, controller, linkage, is_leaf=none)
+        scene = with_controller(scene, known)
+
+    def member() -> Scene:
+        bodies = [
+            values * (1 + draw.uniform(-error, error, values.shape))
+            for values in _bodies(linkage)
         ]
-        arm = eqx.tree_at(
-            lambda arm: (arm.mass, arm.com, arm.inertia),
-            linkage,
-            (linkage.mass * factors[0], linkage.com * factors[1],
-             linkage.inertia * factors[2]),
-        )  # fmt: skip
+        arm = eqx.tree_at(_bodies, linkage, bodies)
         arm = with_payload(arm, draw.uniform(*ranges["payload"]))
         distance, angle = reach * draw.uniform(), draw.uniform(0, 2 * np.pi)
         offset = distance * np.array([np.cos(angle), np.sin(angle)])
         rate = draw.uniform(*ranges["speed"])
-        q = np.asarray(scene.state0.q)
+        q, found = np.asarray(scene.state0.q), scene
         if reach > 0:
             q = _displaced(linkage, q, offset)
-        forces = scene.forces
         if varied:
-            forces = tuple(
-                _hastened(force, rate) if force is controller else force
-                for force in forces
-            )
-        found.append(Scene(arm, State(q, scene.state0.qd), forces, scene.t1))
-    return stacked(found)
+            period = lambda controller: controller.reference.period
+            known = controller_of(scene)
+            faster = eqx.tree_at(period, known, period(known) / rate)
+            found = with_controller(scene, faster)
+        return found._replace(linkage=arm, state0=State(q, scene.state0.qd))
+
+    return stacked([member() for _ in range(members)])

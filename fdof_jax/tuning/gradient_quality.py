@@ -1,7 +1,5 @@
 """Checks of the gradient that gain tuning follows."""
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -9,15 +7,14 @@ import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float
 
-from ..analysis.linearization import Modes, closed_loop_modes
+from ..analysis.linearization import Modes, closed_loop_modes, depends_on_state_alone
+from ..analysis.tracking import relative_demands
 from ..linkage.linkage import joint_names
-from ..simulation.field import stateful
-from ..simulation.prescribed import prescribed
 from ..simulation.scene import Scene, is_number
-from ..simulation.sensitivities import sensitivities
 from ..simulation.simulate import simulate
-from .gains import SAMPLES, check_tuned, with_gains
-from .losses import controller_of, relative_demands, tip_errors
+from ..simulation.solution import Solution
+from .gains import SAMPLES, check_tuned, gain_sensitivities, with_gains
+from .losses import controller_of, gains_of, tip_errors
 
 _HORIZONS = 10
 # The step of the differences in the log-gains. The error of the extrapolated
@@ -82,18 +79,13 @@ class GradientReport(eqx.Module):
 
 
 @eqx.filter_jit
-def _tangents(scene: Scene) -> tuple[Array, Array, Array, Any]:
+def _tangents(scene: Scene) -> tuple[Array, Array, Array, Solution]:
     """Residuals, their Jacobian in the log-gains, relative demands, and the motion."""
     controller = controller_of(scene)
     gains = jnp.stack([controller.kp, controller.kd])
-
-    def scene_at(z):
-        # Factors on the gains keep a gain of zero at zero.
-        return with_gains(scene, gains * jnp.exp(z).reshape(2, 3))
-
-    ts = jnp.linspace(0, scene.t1, SAMPLES)
-    found = sensitivities(scene_at, tip_errors, jnp.zeros(6), ts)
-    demands = relative_demands(found.scene, found.solution)
+    z = jnp.log(jnp.where(gains > 0, gains, 1)).ravel()
+    found = gain_sensitivities(z, scene, tip_errors, gains > 0)
+    demands = relative_demands(controller, scene.linkage, found.solution)
     return found.residuals, found.jacobian, demands, found.solution
 
 
@@ -115,51 +107,50 @@ def gradient_report(scene: Scene) -> GradientReport:
 
     **Raises:** ValueError as `tune`.
     """
-    check_tuned("scene", scene, tip_errors)
+    check_tuned("scene", scene)
     scene = jax.tree.map(
         lambda a: jnp.asarray(a) if is_number(a) else a,
         scene._replace(t1=float(scene.t1)),
     )
-    residuals, jacobian, demands, solution = map(_numpy, _tangents(scene))
+    residuals, jacobian, demands, solution = jax.tree.map(
+        lambda a: np.asarray(a) if eqx.is_array(a) else a, _tangents(scene)
+    )
     along = 2 * np.cumsum(residuals[:, None] * jacobian, axis=0)
     gradient = along[-1].reshape(2, 3)
-    steps = np.eye(6).reshape(6, 1, 2, 3)
-    sides = np.array([_STEP, -_STEP, _STEP / 2, -_STEP / 2])[:, None, None]
-    controller = controller_of(scene)
-    gains = np.stack([controller.kp, controller.kd])
-    changed = gains * np.exp(sides * steps).reshape(24, 2, 3)
-    loss = np.array([_loss(scene, trial) for trial in changed])
+    gains = gains_of(scene)
+
+    def difference(unit: np.ndarray, h: float) -> float:
+        sides = (_loss(scene, gains * np.exp(s * unit)) for s in (h, -h))
+        return float(np.subtract(*sides)) / (2 * h)
+
     far, near = (
-        (loss.reshape(6, 4)[:, k] - loss.reshape(6, 4)[:, k + 1]) / width
-        for k, width in ((0, 2 * _STEP), (2, _STEP))
+        np.array([difference(unit, h) for unit in np.eye(6).reshape(6, 2, 3)])
+        for h in (_STEP, _STEP / 2)
     )
     differences = ((4 * near - far) / 3).reshape(2, 3)
     size = np.linalg.norm(differences)
-    error = np.linalg.norm(gradient - differences) / size if size > 0 else 0.0
+    error = float(np.linalg.norm(gradient - differences) / size) if size > 0 else 0.0
     # The error up to a time is the mean over that time, not over the whole run.
     times = np.linspace(0, SAMPLES - 1, _HORIZONS + 1).astype(int)[1:]
     shares = (times + 1) / SAMPLES
     norms = np.linalg.norm(along[2 * times + 1], axis=1) / shares
     few = jax.tree.map(lambda a: a[::10] if np.ndim(a) else a, solution)
-    saturated = np.mean(np.abs(demands) > 1, axis=0)
+    at_limit = np.abs(demands) > 1
+    saturated = np.mean(at_limit, axis=0)
     modes = None
-    if not stateful(scene.forces) and prescribed(scene.forces) is None:
+    if depends_on_state_alone(scene.forces):
         modes = closed_loop_modes(scene.linkage, scene.forces, few)
     return GradientReport(
         gradient=gradient,
         differences=differences,
-        error=float(error),
+        error=error,
         horizons=np.asarray(solution.ts)[times],
         gradient_norm=norms,
         saturated=saturated,
         modes=modes,
-        at_limit=(np.abs(demands) > 1).any(axis=1)[::10],
+        at_limit=at_limit.any(axis=1)[::10],
         warnings=_warnings(scene, gradient, saturated, error),
     )
-
-
-def _numpy(tree: Any) -> Any:
-    return jax.tree.map(lambda a: np.asarray(a) if eqx.is_array(a) else a, tree)
 
 
 def _warnings(scene: Scene, gradient, saturated, error) -> list[str]:

@@ -19,11 +19,7 @@ _BASE = np.pi / 2  # a slide on the ground is level
 _CENTER = [1.99, 0.95]
 # The assembly (of two) that each arm starts in.
 _BRANCH = dict(zip(TOPOLOGIES, (-1, 1, -1, -1, 1, 1, 1)))
-_KP, _KD, _LIMIT = (
-    {"R": 500.0, "P": 2000.0},
-    {"R": 50.0, "P": 200.0},
-    {"R": 150.0, "P": 150.0},
-)
+_KP, _KD = {"R": 500.0, "P": 2000.0}, {"R": 50.0, "P": 200.0}
 
 
 def arm_at(topology: str, x: np.ndarray) -> tuple[Linkage, State]:
@@ -67,8 +63,8 @@ def circle_scenes() -> dict[str, Scene]:
             orientation=_START[5],
             branch=_BRANCH[topology],
         )
-        kp, kd, limit = ([of[kind] for kind in topology] for of in (_KP, _KD, _LIMIT))
-        controller = PDController(kp, kd, limit, task)
+        kp, kd = ([of[kind] for kind in topology] for of in (_KP, _KD))
+        controller = PDController(kp, kd, 150.0, task)
         found[topology] = Scene(linkage, state0, (controller,), 4.0)
     return found
 

@@ -1,20 +1,22 @@
 """Losses for gain tuning: tip error, effort, rate of effort."""
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from ..analysis.tracking import tip_deviation
+from ..analysis.tracking import relative_demands, tip_deviation
 from ..checks import real_array
 from ..control.pd import PDController
 from ..simulation.scene import Scene
 from ..simulation.solution import Solution
+
+Loss = Callable[[Scene, Solution], Array]
 
 
 def controller_of(scene: Scene) -> PDController:
@@ -26,6 +28,19 @@ def controller_of(scene: Scene) -> PDController:
             f"a drive), got {len(found)} in {scene.forces!r}."
         )
     return found[0]
+
+
+def with_controller(scene: Scene, element: Any) -> Scene:
+    """The scene with another force element in place of its controller."""
+    controller = controller_of(scene)
+    forces = (element if force is controller else force for force in scene.forces)
+    return scene._replace(forces=tuple(forces))
+
+
+def gains_of(scene: Scene) -> np.ndarray:
+    """kp and kd of a scene's controller (2, 3)."""
+    controller = controller_of(scene)
+    return np.stack([controller.kp, controller.kd])
 
 
 def tip_errors(scene: Scene, solution: Solution) -> Float[Array, " residual"]:
@@ -49,20 +64,6 @@ def tip_errors(scene: Scene, solution: Solution) -> Float[Array, " residual"]:
     task: Any = controller_of(scene).reference
     deviation = tip_deviation(scene.linkage, task, solution)
     return deviation.reshape(-1) / solution.ts.size**0.5
-
-
-def relative_demands(scene: Scene, solution: Solution) -> Float[Array, "time joint"]:
-    """The controller's demands over its limits; 0 where a limit is infinite.
-
-    Where a limit is 0, a demand other than 0 gives an infinity of its sign.
-    """
-    controller = controller_of(scene)
-    demands = jax.vmap(controller.demand, in_axes=(0, 0, 0, None))(
-        solution.ts, solution.q, solution.qd, scene.linkage
-    )
-    limit = controller.limit[None]
-    beyond = jnp.where(demands == 0, 0, jnp.sign(demands) * jnp.inf)
-    return jnp.where(limit > 0, demands / jnp.where(limit > 0, limit, 1), beyond)
 
 
 class Tracking(eqx.Module):
@@ -96,7 +97,9 @@ class Tracking(eqx.Module):
         self.effort_rate = real_array("effort_rate", effort_rate, (), minimum=0)
 
     def __call__(self, scene: Scene, solution: Solution) -> Float[Array, " residual"]:
-        efforts = jnp.clip(relative_demands(scene, solution), -1, 1)
+        controller = controller_of(scene)
+        demands = relative_demands(controller, scene.linkage, solution)
+        efforts = jnp.clip(demands, -1, 1)
         rates = jnp.diff(efforts, axis=0) / jnp.diff(solution.ts)[:, None]
         parts = [tip_errors(scene, solution)]
         for price, values in ((self.effort, efforts), (self.effort_rate, rates)):

@@ -4,7 +4,6 @@ from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -12,22 +11,20 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from ..analysis.tracking import tip_deviation
-from ..checks import instance, place_of, real_array, whole_number
+from ..checks import place_of, real_array, whole_number
 from ..control.model_based import ComputedTorque
-from ..control.pd import PDController
-from ..forces.element import elements
 from ..forces.joints import EffortHistory
-from ..linkage.linkage import check_linkage
-from ..references.reference import reference_of
-from ..search.bounded import Run, minimise, reporting
+from ..search.bounded import Run, best_of, minimise
 from ..search.lanes import Lanes
 from ..search.methods import Evaluation
+from ..search.simulated import sum_of_squares
 from ..simulation.efforts import joint_efforts
 from ..simulation.scene import Scene
 from ..simulation.sensitivities import sensitivities
-from ..simulation.simulate import check_elements, simulate
+from ..simulation.simulate import simulate
 from ..simulation.solution import Solution
-from .losses import controller_of
+from .gains import check_tuned
+from .losses import controller_of, with_controller
 
 _SAMPLES = 501
 # The tolerance of derivatives and motion. Their errors make the loss uneven: at 1e-5,
@@ -101,84 +98,37 @@ class OptimalMotion(eqx.Module):
         )
 
 
-def _roots_of_weights(ts: Array) -> Array:
-    """Roots of the trapezium weights: scaled squares sum to their mean over time."""
-    gaps = jnp.diff(ts)
-    shares = jnp.concatenate([gaps[:1], gaps[1:] + gaps[:-1], gaps[-1:]]) / 2
-    return jnp.sqrt(shares / (ts[-1] - ts[0]))
-
-
 @eqx.filter_jit
 def _deviations(scene: Scene, task: Any, solution: Solution) -> Array:
-    """Tip errors at the output times, scaled so that their squares sum to the mean."""
-    roots = _roots_of_weights(solution.ts)
-    return (roots[:, None] * tip_deviation(scene.linkage, task, solution)).reshape(-1)
+    """Tip errors whose squares sum to their mean, by the trapezium rule."""
+    gaps = jnp.diff(solution.ts)
+    shares = jnp.concatenate([gaps[:1], gaps[1:] + gaps[:-1], gaps[-1:]]) / 2
+    roots = jnp.sqrt(shares / jnp.sum(gaps))[:, None]
+    return (roots * tip_deviation(scene.linkage, task, solution)).reshape(-1)
 
 
-def _with(scene: Scene, replaced: type, element: Any) -> Scene:
-    """The scene with `element` in place of the element of class `replaced`."""
-    forces = (element if isinstance(f, replaced) else f for f in scene.forces)
-    return scene._replace(forces=tuple(forces))
-
-
-def _lane(z: Array, problem: tuple[Scene, Any, Array, Array, Array]) -> Evaluation:
+def _lane(z: Array, problem: tuple[Scene, Array, Array, Array]) -> Evaluation:
     """Evaluates mean squared tip error plus price, in efforts over limits `z`.
 
-    `problem`: the scene with `_Knots`, the task, the controller's limits, the price,
-    and the times of the tip errors.
+    `problem`: the scene, the knots, the price, and the times of the tip errors.
     """
-    scene, task, limit, price, ts = problem
-    (knots,) = (force.ts for force in scene.forces if isinstance(force, _Knots))
+    scene, knots, price, ts = problem
+    controller = controller_of(scene)
+    limit = controller.limit[None]
 
     def scene_at(z):
-        return _with(scene, _Knots, _Knots(knots, limit[None] * z.reshape(-1, 3)))
-
-    def rates(z):
-        changes = jnp.diff(z.reshape(-1, 3), axis=0)
-        gaps = jnp.diff(knots) * (knots[-1] - knots[0])
-        return (changes / jnp.sqrt(gaps)[:, None]).reshape(-1)
+        return with_controller(scene, _Knots(knots, limit * z.reshape(-1, 3)))
 
     def residuals(trial, solution):
-        return _deviations(trial, task, solution)
+        errors = _deviations(trial, controller.reference, solution)
+        (efforts,) = (force.tau for force in trial.forces if isinstance(force, _Knots))
+        changes = jnp.diff(efforts / jnp.where(limit > 0, limit, 1), axis=0)
+        gaps = jnp.diff(knots)[:, None] * (knots[-1] - knots[0])
+        return jnp.concatenate([errors, (jnp.sqrt(price / gaps) * changes).reshape(-1)])
 
-    errors, jacobian, _, solution = sensitivities(
-        scene_at, residuals, z, ts, _TOLERANCE
-    )
-    bent = jax.jacfwd(rates)(z)
-    evaluation: Any = Evaluation  # of JAX arrays, which become NumPy's
-    return evaluation(
-        jnp.sum(errors**2) + price * jnp.sum(rates(z) ** 2),
-        2 * (errors @ jacobian + price * rates(z) @ bent),
-        2 * (jacobian.T @ jacobian + price * bent.T @ bent),
-        dict(tip_error=jnp.sqrt(jnp.sum(errors**2)), steps=solution.stats["num_steps"]),
-    )
-
-
-def _check(scene: Any, horizon: Any) -> float:
-    """Checks scene and horizon, and returns the horizon as a number."""
-    instance("scene", scene, Scene)
-    check_linkage(scene.linkage)
-    t1 = float(real_array("scene.t1", scene.t1, (), above=0))
-    horizon = float(real_array("horizon", horizon, (), above=0))
-    if horizon > t1:
-        raise ValueError(
-            f"horizon: expected at most the scene's t1, {t1:g} s, got {horizon:g} s."
-        )
-    elements("scene.forces", scene.forces)
-    controller = controller_of(scene)
-    limit = np.asarray(controller.limit)
-    if not np.isfinite(limit).all():
-        raise ValueError(
-            "scene: expected finite limits of its controller, as unlimited efforts "
-            f"have no best, got {limit.tolist()}."
-        )
-    if reference_of(controller.reference).tip is None:
-        raise ValueError(
-            "scene: expected its controller to track a task with a `tip`, got "
-            f"{controller.reference!r}."
-        )
-    check_elements(scene.forces, scene.linkage, jnp.array([0.0, horizon]))
-    return horizon
+    found = sensitivities(scene_at, residuals, z, ts, _TOLERANCE)
+    errors = found.residuals[: 2 * ts.size]
+    return sum_of_squares(found, tip_error=jnp.linalg.norm(errors))
 
 
 def optimal_efforts(
@@ -230,13 +180,22 @@ def optimal_efforts(
     >>> best.controller_error, best.tip_error  # [m]
     (0.119, 0.08)
     """
-    horizon = _check(scene, horizon)
+    check_tuned("scene", scene)
+    controller, t1 = controller_of(scene), float(scene.t1)
+    task, limit = controller.reference, np.asarray(controller.limit)
+    if not np.isfinite(limit).all():
+        raise ValueError(
+            "scene: expected finite limits of its controller, as unlimited efforts "
+            f"have no best, got {limit.tolist()}."
+        )
+    end = float(real_array("horizon", horizon, (), above=0))
+    if end > t1:
+        raise ValueError(
+            f"horizon: expected at most the scene's t1, {t1:g} s, got {end:g} s."
+        )
     knots = whole_number("knots", knots, 2)
     price = real_array("effort_rate", effort_rate, (), minimum=0)
-    told = reporting(report, _errors_so_far)
-    controller = controller_of(scene)
-    task, limit = controller.reference, np.asarray(controller.limit)
-    ts, times = np.linspace(0, horizon, _SAMPLES), np.linspace(0, horizon, knots)
+    ts, times = np.linspace(0, end, _SAMPLES), np.linspace(0, end, knots)
 
     def moved(scene: Scene) -> Solution:
         return simulate(scene.linkage, scene.state0, ts, scene.forces, throw=False)
@@ -244,35 +203,33 @@ def optimal_efforts(
     def error_of(scene: Scene, solution: Solution) -> float:
         return float(np.linalg.norm(_deviations(scene, task, solution)))
 
-    kp, kd = jnp.full(3, _BANDWIDTH**2), jnp.full(3, 2 * _BANDWIDTH)
-    known = ComputedTorque(kp, kd, jnp.asarray(limit), task, None)
-    guides = [scene, _with(scene, PDController, known)]
+    known = ComputedTorque(_BANDWIDTH**2, 2 * _BANDWIDTH, limit, task)
+    guides = [scene, with_controller(scene, known)]
     solutions = [moved(guide) for guide in guides]
-    guesses = [
-        _efforts_at(times, guide, solution)
-        for guide, solution in zip(guides, solutions)
-    ]
     # Efforts without a limit above zero are zero, whatever the unknowns.
     bound = np.tile(np.where(limit > 0, 1.0, 0.0), knots)
-    start = np.stack([(tau / np.where(limit > 0, limit, 1)).ravel() for tau in guesses])
+    start = np.stack(
+        [
+            (_efforts_at(times, *motion) / np.where(limit > 0, limit, 1)).ravel()
+            for motion in zip(guides, solutions)
+        ]
+    )
     start = np.clip(np.nan_to_num(start), -bound, bound)
-    free = _with(scene, PDController, _Knots(jnp.asarray(times), jnp.zeros((knots, 3))))
-    lanes = Lanes(_lane, [[(free, task, limit, price, ts)]], starts=len(start))
-    bounds = np.broadcast_to(bound, start.shape)
+    lanes = Lanes(_lane, [[(scene, times, price, ts)]], starts=len(start))
+    high = np.broadcast_to(bound, start.shape)
     runs = minimise(
-        lanes, start, -bounds, bounds, method="levenberg-marquardt",
-        max_steps=max_steps, enough=_ENOUGH, report=told,
+        lanes, start, -high, high, method="levenberg-marquardt", max_steps=max_steps,
+        enough=_ENOUGH, report=report, describe=_errors_so_far,
     )  # fmt: skip
-    runs = [run for run in runs if np.isfinite(run.best.loss)]
+    runs = [run for run in runs if not run.failed]
     if not runs:
         raise RuntimeError(
             "optimal_efforts: the simulation fails with the efforts of every first "
             "guess; use a shorter horizon."
         )
-    run = min(runs, key=lambda run: run.best.loss)
-    efforts = limit * run.best.z.reshape(-1, 3)
-    found = _with(scene, PDController, EffortHistory(times, efforts))
-    found = found._replace(t1=horizon)
+    run = best_of(runs)
+    efforts = limit * run.z.reshape(-1, 3)
+    found = with_controller(scene, EffortHistory(times, efforts))._replace(t1=end)
     solution = moved(found)
     return OptimalMotion(
         scene=found,
@@ -283,7 +240,7 @@ def optimal_efforts(
         solution=solution,
         guess_errors=np.array([_tip_error(run) for run in runs]),
         converged=run.best.gradient_norm <= _SMALL_GRADIENT * run.best.loss,
-        message=str(run.reason),
+        message=run.reason,
     )
 
 

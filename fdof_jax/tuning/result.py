@@ -1,25 +1,25 @@
 """Results of gain tuning, and their tables."""
 
-from collections.abc import Callable
 from html import escape
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
 from ..checks import known
 from ..linkage.linkage import joint_names
-from ..search.bounded import Run
+from ..search.bounded import Run, best_of
 from ..simulation.html_table import html_table
 from ..simulation.scene import Scene
+from .gains import with_gains
 from .losses import controller_of
 
 # Joints with actuators at their limits for a larger share of the time are hardly
 # controlled.
 _MOSTLY = 0.9
-_COLUMNS = ("start", "tuned", "least", "greatest")
 
 
 class History(eqx.Module):
@@ -82,12 +82,12 @@ class TuneResult(eqx.Module):
     @property
     def losses(self) -> Float[np.ndarray, " start"]:
         """Least loss of each run; NaN where its start could not be simulated."""
-        return np.array([history.loss.min() for history in self.histories])
+        return np.array([history.loss[-1] for history in self.histories])
 
     @property
     def gains(self) -> Float[np.ndarray, "2 joint"]:
         """The tuned kp and kd."""
-        return self.history.gains[_best(self.history)]
+        return self.history.gains[-1]
 
     @property
     def at_bound(self) -> Bool[np.ndarray, "2 joint"]:
@@ -97,12 +97,12 @@ class TuneResult(eqx.Module):
     @property
     def tip_error(self) -> float:
         """Rms tip error [m]; NaN for a reference without a `tip`."""
-        return float(self.history.tip_error[_best(self.history)])
+        return float(self.history.tip_error[-1])
 
     @property
     def effort(self) -> float:
         """Root mean square of the efforts over their limits, over time and joints."""
-        return float(np.sqrt(np.mean(self.history.effort[_best(self.history)] ** 2)))
+        return float(np.sqrt(np.mean(self.history.effort[-1] ** 2)))
 
     @property
     def table(self) -> dict[str, list]:
@@ -128,36 +128,33 @@ class TuneResult(eqx.Module):
 
     def _rows(self) -> list[list[str]]:
         """Rows of the printed table: a label, up to four numbers, and a remark."""
-        rows = []
+        rows = [["", "start", "tuned", "least", "greatest", ""]]
         for gain, joint, unit, *values, held in zip(*self.table.values()):
             cells = [f"{value:.5g}" for value in values]
             mark = "at its bound" if held else ""
             rows.append([f"{gain} of {joint} [{unit}]", *cells, mark])
-        history, best, first = self.history, _best(self.history), self.histories[0]
-        compared = [("loss", lambda h: h.loss, 1.0)]
+        first, last = self.histories[0], self.history
+        compared = [("loss", first.loss[0], last.loss[-1])]
         if np.isfinite(self.tip_error):
-            compared.append(("rms tip error [mm]", lambda h: h.tip_error, 1e3))
-        for joint, name in enumerate(joint_names(self.scene.linkage)):
-            share = lambda h, joint=joint: h.saturated[:, joint]
-            compared.append((f"{name} at its limit [%]", share, 1e2))
-        for label, values, scale in compared:
-            before, after = scale * values(first)[0], scale * values(history)[best]
+            error = first.tip_error[0], last.tip_error[-1]
+            compared.append(("rms tip error [mm]", 1e3 * error[0], 1e3 * error[1]))
+        shares = 100 * first.saturated[0], 100 * last.saturated[-1]
+        for name, *share in zip(joint_names(self.scene.linkage), *shares):
+            compared.append((f"{name} at its limit [%]", *share))
+        for label, before, after in compared:
             rows.append([label, f"{before:.5g}", f"{after:.5g}", "", "", ""])
         return rows
 
     def _remarks(self) -> list[str]:
         """Lines below the table."""
-        rows = []
-        if len(self.losses) > 1:
-            failed = np.isnan(self.losses).sum()
-            if failed:
-                rows.append(
-                    f"{failed} of {len(self.losses)} starts could not be simulated"
-                )
-            near = np.sum(self.losses**0.5 <= 1.01 * self.loss**0.5)
+        rows, losses = [], self.losses
+        if len(losses) > 1:
+            if failed := np.isnan(losses).sum():
+                rows.append(f"{failed} of {len(losses)} starts could not be simulated")
+            near = np.sum(losses**0.5 <= 1.01 * self.loss**0.5)
             rows.append(
-                f"{near} of {len(self.losses)} starts within 1 % of the best in "
-                "the root of the loss"
+                f"{near} of {len(losses)} starts within 1 % of the best in the root of "
+                "the loss"
             )
         if len(self.member_loss) > 1:
             what, values = "root of the loss", np.sqrt(self.member_loss)
@@ -178,7 +175,7 @@ class TuneResult(eqx.Module):
     def __str__(self) -> str:
         lines = [
             f"{label:24}" + "".join(f"{cell:>12}" for cell in cells) + f"  {mark}"
-            for label, *cells, mark in [["", *_COLUMNS, ""], *self._rows()]
+            for label, *cells, mark in self._rows()
         ]
         return "\n".join([*map(str.rstrip, lines), *self._remarks()])
 
@@ -195,7 +192,8 @@ class TuneResult(eqx.Module):
 
     def _repr_html_(self) -> str:
         remarks = "".join(f"<p>{escape(remark)}</p>" for remark in self._remarks())
-        return html_table(self._rows(), ["", *_COLUMNS, ""]) + remarks
+        header, *rows = self._rows()
+        return html_table(rows, header) + remarks
 
 
 class TradeOff(eqx.Module):
@@ -221,15 +219,27 @@ class TradeOff(eqx.Module):
         return "\n".join(rows)
 
 
-def _best(history: History) -> int:
-    return int(np.argmin(history.loss))
-
-
 def _at_bound(gains, lower, upper) -> np.ndarray:
     # By rounding, exp(log(bound)) may lie just inside the bound.
     hair = 100 * np.finfo(jnp.result_type(float)).eps
-    free = (gains > 0) & (lower < upper)
-    return free & ((gains <= lower * (1 + hair)) | (gains >= upper * (1 - hair)))
+    held = (gains <= lower * (1 + hair)) | (gains >= upper * (1 - hair))
+    return held & (lower < upper)
+
+
+def _history(run: Run, lower: np.ndarray, upper: np.ndarray) -> History:
+    rows: Any = jax.tree.map(lambda *values: np.stack(values), *run.rows)
+    gains = np.clip(np.exp(rows.z).reshape(-1, 2, 3), lower, upper)
+    # Means over the members.
+    mean = {name: np.mean(values, axis=1) for name, values in rows.facts.items()}
+    return History(
+        loss=rows.loss,
+        gradient_norm=rows.gradient_norm,
+        gains=gains,
+        saturated=mean["saturated"],
+        effort=mean["effort"],
+        tip_error=np.sqrt(mean["square_error"]),
+        wall_time=rows.wall_time,
+    )
 
 
 def result_of(
@@ -238,68 +248,38 @@ def result_of(
     lower: np.ndarray,
     upper: np.ndarray,
     settings: dict[str, Any],
-    with_gains: Callable,
 ) -> TuneResult:
     """The result of one scene's runs, taken from the best."""
-    tuned = lower > 0
-
-    def gains_of(z):
-        return np.where(tuned, np.clip(np.exp(z).reshape(2, 3), lower, upper), 0)
-
-    def history_of(run: Run) -> History:
-        def mean(fact: str) -> np.ndarray:
-            """The mean over the members."""
-            return np.array([np.mean(row.facts[fact], axis=0) for row in run.rows])
-
-        return History(
-            loss=np.array([row.loss for row in run.rows]),
-            gradient_norm=np.array([row.gradient_norm for row in run.rows]),
-            gains=np.stack([gains_of(row.z) for row in run.rows]),
-            saturated=mean("saturated"),
-            effort=mean("effort"),
-            tip_error=np.sqrt(mean("square_error")),
-            wall_time=np.array([row.wall_time for row in run.rows]),
-        )
-
-    run = min(runs, key=lambda run: (run.failed, run.best.loss))
-    history = history_of(run)
-    best, share = run.best, history.saturated[_best(history)]
-    assert run.reason is not None
+    run = best_of(runs)
+    history = _history(run, lower, upper)
     return TuneResult(
-        scene=with_gains(scene, jnp.asarray(gains_of(best.z))),
-        loss=best.loss,
-        histories=[history_of(run) for run in runs],
+        scene=with_gains(scene, jnp.asarray(history.gains[-1])),
+        loss=run.best.loss,
+        histories=[_history(run, lower, upper) for run in runs],
         lower=lower,
         upper=upper,
-        converged=run.converged and share.max() <= _MOSTLY,
+        converged=run.converged and history.saturated[-1].max() <= _MOSTLY,
         message=_message(scene, run, history, lower, upper),
-        member_loss=best.facts["member_loss"],
-        member_tip_error=np.sqrt(best.facts["square_error"]),
+        member_loss=run.best.facts["member_loss"],
+        member_tip_error=np.sqrt(run.best.facts["square_error"]),
         settings=settings,
     )
 
 
 def _message(scene, run, history, lower, upper) -> str:
     """The reason for stopping, and what may look like convergence but is not."""
-    names, share = joint_names(scene.linkage), history.saturated[_best(history)]
-    tuned = (controller_gains(scene) > 0) & (lower < upper)
     reason = run.reason
     if run.flat:
         at_limit = history.saturated[0].min() == 1
         reason = "the gradient is zero at the start" + (
             ", because every actuator is at its limit throughout" if at_limit else ""
         )
-    held = int(np.sum(_at_bound(history.gains[_best(history)], lower, upper)))
-    parts = [reason, f"{held} of {int(tuned.sum())} gains are at a bound"]
-    for joint in np.flatnonzero(share > _MOSTLY):
-        parts.append(
-            f"{names[joint]} is at its limit for {100 * share[joint]:.4g} % of the "
-            "time, so its gains have hardly any effect"
-        )
+    held = np.sum(_at_bound(history.gains[-1], lower, upper))
+    parts = [reason, f"{held} of {np.sum(lower < upper)} gains are at a bound"]
+    for name, share in zip(joint_names(scene.linkage), history.saturated[-1]):
+        if share > _MOSTLY:
+            parts.append(
+                f"{name} is at its limit for {100 * share:.4g} % of the time, so its "
+                "gains have hardly any effect"
+            )
     return "; ".join(parts)
-
-
-def controller_gains(scene: Scene) -> np.ndarray:
-    """kp and kd of a scene's controller (2, 3)."""
-    controller = controller_of(scene)
-    return np.stack([np.asarray(controller.kp), np.asarray(controller.kd)])

@@ -1,28 +1,20 @@
 """Tuning of PD gains by gradients through the simulation."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, overload
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ..checks import function, keywords_as, one_of, real_array, whole_number
-from ..search.bounded import Row, Run, minimise, reporting
+from ..search.bounded import Row, Run, best_of, minimise
 from ..search.lanes import Lanes
 from ..search.methods import METHODS
 from ..simulation.scene import Scene, stacked, unstacked
 from ..simulation.sensitivities import TOLERANCE
-from .gains import (
-    SAMPLES,
-    Loss,
-    bounds_of,
-    check_alike,
-    check_tuned,
-    evaluate_gains,
-    with_gains,
-)
-from .losses import Tracking, tip_errors
+from .gains import SAMPLES, bounds_of, check_alike, check_tuned, evaluate_gains
+from .losses import Loss, Tracking, tip_errors
 from .result import TradeOff, TuneResult, result_of
 
 _ENOUGH = 1e-4  # relative decrease of the loss; half of it in the rms error
@@ -61,7 +53,6 @@ def _search(
         raise ValueError("over: expected an ensemble to take the worst of, got none.")
     starts = whole_number("starts", starts, 1)
     draw = np.random.default_rng(whole_number("seed", seed, 0))
-    told = reporting(report, _best_so_far)
     for scene, loss in zip(scenes, losses):
         check_tuned("scene", scene, function("loss", loss))
     boxes = [bounds_of(scene, factor, bounds) for scene in scenes]
@@ -81,8 +72,8 @@ def _search(
     columns = zip(*(_started(box, starts, draw) for box in boxes))
     z, low, high = map(np.concatenate, columns)
     runs = minimise(
-        lanes, z, low, high, method=method, max_steps=max_steps,
-        enough=_ENOUGH, report=told,
+        lanes, z, low, high, method=method, max_steps=max_steps, enough=_ENOUGH,
+        report=report, describe=_best_so_far,
     )  # fmt: skip
     settings = dict(
         method=method,
@@ -97,7 +88,7 @@ def _search(
         mine = runs[i * starts : (i + 1) * starts]
         if all(run.failed for run in mine):
             raise _failure(members[i], mine[0].rows[0], ensemble is not None)
-        results.append(result_of(scene, mine, lower, upper, settings, with_gains))
+        results.append(result_of(scene, mine, lower, upper, settings))
     return results
 
 
@@ -119,7 +110,7 @@ def _failure(members: list[Scene], first: Row, ensemble: bool) -> ValueError:
 
 
 def _best_so_far(runs: list[Run]) -> str:
-    best = min(runs, key=lambda run: (run.failed, run.best.loss)).best
+    best = best_of(runs).best
     error = 1e3 * np.sqrt(np.mean(best.facts["square_error"]))
     what = f"loss {best.loss:.6g}"
     if np.isfinite(error):
@@ -164,7 +155,7 @@ def tune(
       start from those of `scene`.
     - `over`: "mean", the mean loss of the ensemble, or "worst", its worst as a power
       mean of order 32.
-    - `method`: "levenberg-marquardt", "l-bfgs" or "adam" (the latter two by optax).
+    - `method`: "levenberg-marquardt", or "l-bfgs" by optax.
     - `starts`: number of runs: one from the scene's gains, the others from random gains
       within the bounds. The best counts.
     - `seed`: seed of the random starts.
@@ -184,19 +175,12 @@ def tune(
     )[0]  # fmt: skip
 
 
-@overload
 def tune_each(
-    scenes: Mapping[str, Scene], *, loss: Loss = ..., **keywords: Any
-) -> dict[str, TuneResult]: ...
-
-
-@overload
-def tune_each(
-    scenes: Sequence[Scene], *, loss: Loss = ..., **keywords: Any
-) -> list[TuneResult]: ...
-
-
-def tune_each(scenes: Any, *, loss: Loss = tip_errors, **keywords: Any) -> Any:
+    scenes: Mapping[str, Scene] | Sequence[Scene],
+    *,
+    loss: Loss = tip_errors,
+    **keywords: Any,
+) -> Any:
     """Tunes several scenes of one structure in one compiled program.
 
     The topologies may differ.
@@ -221,8 +205,8 @@ def tune_each(scenes: Any, *, loss: Loss = tip_errors, **keywords: Any) -> Any:
         return dict(zip(scenes, results))
     keywords = keywords_as(tune, keywords, without=("loss", "ensemble", "over"))
     stacked(scenes)  # raises unless the scenes are alike
-    keywords |= dict(ensemble=None, over="mean")
-    return _search(scenes, [loss] * len(scenes), **keywords)
+    losses = [loss] * len(scenes)
+    return _search(scenes, losses, ensemble=None, over="mean", **keywords)
 
 
 def trade_off(scene: Scene, prices: ArrayLike, **keywords: Any) -> TradeOff:

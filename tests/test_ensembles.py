@@ -1,0 +1,128 @@
+"""Ensembles for robust tuning: their members, and the loss over all of them."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_tuning import losses_of
+
+import fdof_jax as fj
+from fdof_jax import scenes
+from fdof_jax.tuning.losses import controller_of
+
+
+def model_based(scene, kind):
+    controller = scene.forces[0]
+    gains = (
+        (100.0, 20.0)
+        if kind is fj.control.ComputedTorque
+        else (controller.kp, controller.kd)
+    )
+    replaced = kind(*gains, controller.limit, controller.reference)
+    return scene._replace(forces=(replaced,))
+
+
+class TestEnsembles:
+    scene = scenes.fig7()._replace(t1=1.0)
+
+    def ensemble(self, members=3):
+        return fj.tuning.perturbed(
+            self.scene, members, payload=(0, 2), link_error=0.1, start_offset=0.3,
+            speed=(1, 2), seed=1,
+        )  # fmt: skip
+
+    def test_members_are_as_asked(self):
+        many = self.ensemble(200)
+        mass = np.asarray(many.linkage.mass)
+        assert mass.shape == (200, 3)
+        assert 0.9 <= mass[:, :2].min() < 0.92 and 1.08 < mass[:, :2].max() <= 1.1
+        assert mass[:, 2].min() >= 0.9 and 2.7 < mass[:, 2].max() <= 3.1
+        period = np.asarray(many.forces[0].reference.period)
+        assert 2.5 <= period.min() < 2.55 and 4.9 < period.max() <= 5.0
+        tips = jax.vmap(fj.tip_position)(many.linkage, jnp.asarray(many.state0.q))
+        nominal = fj.tip_position(self.scene.linkage, self.scene.state0.q)
+        distance = np.linalg.norm(np.asarray(tips) - np.asarray(nominal), axis=1)
+        assert 0.28 < distance.max() <= 0.3 + 1e-6
+        # The last link keeps its angle.
+        turned = np.sum(np.asarray(many.state0.q)[:, ::2], axis=1)
+        np.testing.assert_allclose(turned, self.scene.state0.q[::2].sum(), atol=1e-6)
+        again = self.ensemble(200)
+        assert eqx.tree_equal(many, again)
+
+    def test_a_payload_weighs_at_the_tip(self):
+        arm = self.scene.linkage
+        loaded = fj.tuning.with_payload(arm, 1.5)
+        q, qd = np.array([0.3, 1.2, -0.4]), np.array([1.0, -0.5, 2.0])
+        velocity = np.asarray(fj.tip_jacobian(arm, q) @ qd)[:2]
+        kinetic, potential = fj.energy(arm, q, qd)
+        more, higher = fj.energy(loaded, q, qd)
+        assert more - kinetic == pytest.approx(0.75 * velocity @ velocity)
+        height = fj.tip_position(arm, q)[1]
+        assert higher - potential == pytest.approx(1.5 * 9.81 * height)
+
+    def test_the_loss_is_the_mean_or_nearly_the_worst_of_the_members(self):
+        ensemble = self.ensemble()
+        mean = fj.tune(self.scene, ensemble=ensemble, max_steps=8)
+        worst = fj.tune(self.scene, ensemble=ensemble, over="worst", max_steps=8)
+        assert mean.loss == pytest.approx(mean.member_loss.mean())
+        top = worst.member_loss.max()
+        assert top * 3 ** (-1 / 32) <= worst.loss <= top
+        by_mean = np.mean(mean.member_loss**32) ** (1 / 32)
+        assert worst.loss <= by_mean * (1 + 1e-4)
+        alone = ensemble.forces[0].reference, ensemble.linkage
+        for i, loss in enumerate(worst.member_loss):
+            task, arm = jax.tree.map(lambda a, i=i: jnp.asarray(a[i]), alone)
+            controller = controller_of(worst.scene)
+            controller = eqx.tree_at(lambda c: c.reference, controller, task)
+            start = fj.State(*(jnp.asarray(a[i]) for a in ensemble.state0))
+            member = fj.Scene(arm, start, (controller,), 1.0)
+            assert losses_of(member, worst.gains[None])[0] == pytest.approx(
+                loss, rel=1e-5
+            )
+
+    @pytest.mark.parametrize(
+        "kind", [fj.control.GravityFeedforward, fj.control.ComputedTorque]
+    )
+    def test_model_based_controllers_do_not_know_the_payload(self, kind):
+        many = fj.tuning.perturbed(model_based(self.scene, kind), 4, payload=(1, 2))
+        model, arm = many.forces[0].model, self.scene.linkage
+        np.testing.assert_array_equal(model.mass, np.tile(arm.mass, (4, 1)))
+        assert (np.asarray(many.linkage.mass)[:, 2] >= arm.mass[2] + 1).all()
+
+    def test_computed_torque_is_tuned_for_payloads_in_units_of_its_own(self):
+        scene = model_based(self.scene._replace(t1=0.2), fj.control.ComputedTorque)
+        many = fj.tuning.perturbed(scene, 4, payload=(1, 2))
+        result = fj.tune(scene, ensemble=many, max_steps=1)
+        assert result.loss < result.history.loss[0] and len(result.member_loss) == 4
+        assert "kp of P2 [1/s^2]" in str(result) and "kd of R1 [1/s]" in str(result)
+
+    def test_a_member_that_fails_is_named(self):
+        ensemble = self.ensemble()
+        masses = lambda many: (many.linkage.mass, many.linkage.inertia)
+        none_in_second = np.array([[1.0], [0.0], [1.0]])
+        ensemble = eqx.tree_at(
+            masses, ensemble, [none_in_second * a for a in masses(ensemble)]
+        )
+        message = r"ensemble\[1\]: expected one that can be simulated"
+        with pytest.raises(ValueError, match=message):
+            fj.tune(self.scene, ensemble=ensemble)
+
+    def test_what_is_no_ensemble_is_refused(self):
+        with pytest.raises(ValueError, match="ensemble: expected scenes stacked"):
+            fj.tune(self.scene, ensemble=self.scene)
+        with pytest.raises(ValueError, match=r"scenes\[1\]: expected one like"):
+            fj.tuning.stacked([self.scene, scenes.fig5()])
+        still = fj.PDController(1, 1, 1, lambda t, arm: (jnp.zeros(3), jnp.zeros(3)))
+        short = scenes.fig5()._replace(forces=(still,))
+        with pytest.raises(ValueError, match="start_offset: expected one within"):
+            fj.tuning.perturbed(short, 2, start_offset=100.0)
+        other = fj.tuning.stacked([fj.tuning.circle_scenes()["RRR"]])
+        with pytest.raises(ValueError, match=r"ensemble\[0\]: expected joints and"):
+            fj.tune(self.scene, ensemble=other)
+        with pytest.raises(ValueError, match="payload: expected the least before"):
+            fj.tuning.perturbed(self.scene, 2, payload=(2.0, 0.0))
+        with pytest.raises(ValueError, match="link_error: expected less than 1"):
+            fj.tuning.perturbed(self.scene, 2, link_error=1.5)
+        with pytest.raises(ValueError, match="speed"):
+            fj.tuning.perturbed(self.scene, 2, speed=(2.0, 0.0))
