@@ -11,7 +11,8 @@ from numpy.typing import ArrayLike
 from ..checks import real_array
 from ..dynamics import inverse_dynamics
 from ..forces.element import Forces
-from ..linkage.linkage import Linkage
+from ..linkage.linkage import Linkage, joints_of, without_fixed
+from ..linkage.topology import fixed_pairs
 from .linearization import checked
 
 
@@ -26,7 +27,7 @@ def equilibrium(
     **Arguments:** `linkage`; `forces`: elements without a state of their own; `q`:
     first guess [m or rad]; `t`: time at which the elements are evaluated [s].
 
-    **Returns:** positions (3,); NaN if the Levenberg-Marquardt method finds none, for
+    **Returns:** positions (n,); NaN if the Levenberg-Marquardt method finds none, for
     instance from a guess at which actuators are at their limits. The equilibrium need
     not be stable: see `linearize`.
 
@@ -38,16 +39,24 @@ def equilibrium(
     [-1.571, 0.0, 0.0]
     """
     forces = checked(linkage, forces)
-    return _rest(linkage, forces, real_array("q", q, (3,)), real_array("t", t, ()))
+    return _rest(
+        linkage,
+        forces,
+        real_array("q", q, (joints_of(linkage),)),
+        real_array("t", t, ()),
+    )
 
 
 @eqx.filter_jit
 def _rest(linkage: Linkage, forces: Forces, q: Array, t: Array) -> Array:
-    still = jnp.zeros(3)
+    q = without_fixed(linkage, q)
+    still = jnp.zeros_like(q)
 
     def efforts(q, _):
         weight = -inverse_dynamics(linkage, q, still, still, forces)
-        return sum((element(t, q, still, linkage) for element in forces), weight)
+        acting = sum((element(t, q, still, linkage) for element in forces), weight)
+        # A fixed pair is in equilibrium at 0.
+        return jnp.where(jnp.stack(fixed_pairs(linkage.ef)), -q, acting)
 
     # Efforts relative to their rounding errors' scale: stiff controllers converge as
     # exactly as soft springs.
@@ -79,5 +88,5 @@ def holding_efforts(
     >>> fj.analysis.holding_efforts(arm, [0, 0, 0]).tolist()
     [58.86, 29.43, 9.81]
     """
-    still = jnp.zeros(3)
+    still = jnp.zeros_like(jnp.asarray(q, float))
     return inverse_dynamics(linkage, q, still, still, forces)

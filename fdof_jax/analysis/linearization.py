@@ -14,7 +14,7 @@ from ..checks import instance, is_traced, real_array
 from ..dynamics import forward_dynamics
 from ..forces.element import Element, Forces, elements
 from ..linkage.coordinates import State, real_state
-from ..linkage.linkage import Linkage, check_linkage
+from ..linkage.linkage import Linkage, check_linkage, without_fixed
 from ..simulation.field import stateful
 from ..simulation.prescribed import prescribed
 from ..simulation.solution import Solution
@@ -25,7 +25,7 @@ _STABLE = 2.6
 
 
 class Linearization(NamedTuple):
-    """Matrices of d(q, qd)/dt = A (q, qd) + B tau about a state, (6, 6) and (6, 3).
+    """Matrices of d(q, qd)/dt = A (q, qd) + B tau about a state, (2n, 2n) and (2n, n).
 
     They hold for small changes of positions [m or rad], velocities and efforts
     [N or N m].
@@ -84,29 +84,29 @@ def _linearized(
     linkage: Linkage, forces: Forces, q: Array, qd: Array, t: Array
 ) -> Linearization:
     def rates(y):
-        q, qd, tau = jnp.split(y, 3)
+        q, qd, tau = (without_fixed(linkage, part) for part in jnp.split(y, 3))
         tau = sum((element(t, q, qd, linkage) for element in forces), tau)
         return jnp.concatenate([qd, forward_dynamics(linkage, q, qd, tau, forces)])
 
     slopes = jax.jacfwd(rates)(jnp.concatenate([q, qd, jnp.zeros_like(q)]))
-    return Linearization(slopes[:, :6], slopes[:, 6:])
+    return Linearization(*jnp.split(slopes, [2 * q.size], axis=1))
 
 
 class Modes(eqx.Module):
     """Eigenvalues of the matrix A along a motion, the fastest last.
 
-    - `eigenvalues`: (time, 6) [1/s]; NaN where the motion is NaN.
+    - `eigenvalues`: (time, 2n) [1/s]; NaN where the motion is NaN.
     """
 
-    eigenvalues: Complex[np.ndarray, "time 6"]
+    eigenvalues: Complex[np.ndarray, "time mode"]
 
     @property
-    def frequency(self) -> Float[np.ndarray, "time 6"]:
+    def frequency(self) -> Float[np.ndarray, "time mode"]:
         """Natural frequencies, the eigenvalues' magnitudes [rad/s]."""
         return np.abs(self.eigenvalues)
 
     @property
-    def damping(self) -> Float[np.ndarray, "time 6"]:
+    def damping(self) -> Float[np.ndarray, "time mode"]:
         """Damping ratios: 1 or -1 for real eigenvalues, NaN for zero."""
         with np.errstate(invalid="ignore"):
             return -np.real(self.eigenvalues) / self.frequency

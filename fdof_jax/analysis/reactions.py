@@ -23,7 +23,7 @@ def _loads(
 ) -> tuple[Array, Array]:
     """Forces on the ground and the links, and moments about the ground pivot."""
     parts = frames(linkage, q)
-    force, moment = jnp.zeros(4, complex), jnp.zeros(4)
+    force, moment = jnp.zeros(q.size + 1, complex), jnp.zeros(q.size + 1)
     for index, element in enumerate(forces):
         loads = element.loads_on_points(t, q, qd, qdd, linkage)
         if loads is None:

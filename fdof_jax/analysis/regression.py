@@ -46,7 +46,7 @@ def regressor(
     parameters that can be identified: nine of the twelve for an RPR arm.
 
     **Arguments:** `linkage`; `q`, `qd`, `qdd`: joint positions, velocities and
-    accelerations (3,) [m or rad, and per s and s^2].
+    accelerations (n,) [m or rad, and per s and s^2].
 
     **Raises:** ValueError for malformed arguments.
 
@@ -73,4 +73,4 @@ def regressor(
         return inverse_dynamics(arm, q, qd, qdd)
 
     # The efforts are linear in the parameters, so any values serve.
-    return jax.jacfwd(efforts)(jnp.tile(jnp.array([1.0, 0.0, 0.0, 1.0]), (3, 1)))
+    return jax.jacfwd(efforts)(jnp.tile(jnp.array([1.0, 0.0, 0.0, 1.0]), (q.size, 1)))

@@ -17,8 +17,8 @@ def to_mjcf(linkage: Linkage) -> str:
 
     Joints `joint1`, `joint2`, ... are hinges about z and slides in the plane z = 0,
     with `qpos` equal to this library's `q` without fixed pairs. A site `tip` marks the
-    tip. Nothing collides. Masses and moments of inertia below 1e-15, in particular zero, become 1e-15, the
-    smallest that MuJoCo accepts.
+    tip. Nothing collides. Masses and moments of inertia below 1e-15, in particular
+    zero, become 1e-15, the smallest that MuJoCo accepts.
 
     **Arguments:** `linkage`: one linkage with concrete values.
 

@@ -15,7 +15,7 @@ from ..simulation.solution import Solution
 
 
 def link_ends(scene: Scene, solution: Solution) -> Float[Array, "time link 2"]:
-    """Positions of three markers: the joints at the ends of links 2 and 3, and the tip.
+    """Positions of markers at the ends of the links: the next joints, and the tip.
 
     **Arguments:** `scene`; `solution`: its motion.
 

@@ -11,7 +11,7 @@ sliding along a direction; at a fixed pair, displacement and rate are zero.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jax import Array
@@ -218,11 +218,12 @@ def equations(
     # `second` about the joint, the `force` and `moment` that bend its path from a
     # rotation with the joint, and -i times its `momentum` at unit rate of the joint.
     first, second = _in_frame(*c.moment[last], e[last + 1]), c.second[last]
-    force = moment = momentum = None
+    force: Vector | None = None
+    moment: Any = None
+    momentum: Any = None
     rows, bias = [], []
     for k in reversed(joints):
         if k < last:
-            assert momentum is not None
             mass_slide = c.beyond[k + 1] * slide[k + 1]
             more = _scale(gained[k + 1], momentum)
             force = more if force is None else _add(force, more)

@@ -78,7 +78,7 @@ def geometry(linkage: Linkage, q: np.ndarray) -> Geometry:
     return Geometry(angle, slide, kinds, points)
 
 
-def _color(link: int) -> str:
+def link_color(link: int) -> str:
     return SERIES[(link - 1) % len(SERIES)] if link else BLACK
 
 
@@ -129,7 +129,7 @@ def draw_arm(
             continue
         # A joint's rail and carriage belong to the link before it.
         link = int(number) - (kind in ("rail", "slider"))
-        (line,) = ax.plot(*xy(points[i]), alpha=alpha, gid=name, color=_color(link))
+        (line,) = ax.plot(*xy(points[i]), alpha=alpha, gid=name, color=link_color(link))
         line.set(**_STYLES[kind])
         if color is not None:
             line.set_color(color)

@@ -23,7 +23,7 @@ from ..simulation.simulate import simulate
 from ..simulation.solution import Solution
 from ..tuning.gains import with_gains
 from ..tuning.league import circle_scenes
-from ..tuning.losses import controller_of
+from ..tuning.losses import controller_of, gains_of
 from .arms import draw_motion, geometry
 from .axes import BLACK, SERIES, filled_mapping, legend, plane_axes, reached, xy
 
@@ -57,7 +57,7 @@ def _moved(scene: Scene, stretch: Array, factor: Array) -> _Moved:
         length=length.at[1:].multiply(stretch), com=com.at[:, 0].multiply(stretch)
     )
     controller = controller_of(scene)
-    gains = factor * gains_of(controller, linkage)
+    gains = factor * gains_of(scene)
     scene = with_gains(scene._replace(linkage=linkage), gains)
     ts = jnp.linspace(0, scene.t1, _SAMPLES)
     solution = simulate(
@@ -85,7 +85,7 @@ def _told(moved: _Moved, error: np.ndarray) -> str:
     rows = []
     for k, joint in enumerate(joint_names(linkage)):
         p_unit, d_unit = controller.gain_units[joint[0]]
-        (kp, kd), length = gains_of(controller, linkage)[:, k], linkage.length[k + 1]
+        (kp, kd), length = gains_of(moved.scene)[:, k], linkage.length[k + 1]
         gains = f"{float(kp):.4g} {p_unit}", f"{float(kd):.4g} {d_unit}"
         rows.append((joint, *gains, f"link {k + 1}: {float(length):.3g} m"))
     return text + html_table(rows, ("joint", "kp", "kd", "length after it"))

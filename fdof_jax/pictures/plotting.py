@@ -28,7 +28,7 @@ from ..linkage.linkage import Linkage
 from ..linkage.topology import letters
 from ..simulation.efforts import joint_efforts
 from ..simulation.solution import Solution
-from .arms import geometry
+from .arms import geometry, link_color
 from .axes import (
     BLACK,
     GREY,
@@ -77,13 +77,14 @@ def motion_profile(
     ts, q, _ = reached(solution)
     g = geometry(linkage, q)
     angles, slides = [], []
-    for k, revolute in enumerate(g.revolute):
-        if revolute:
-            degrees = np.rad2deg(g.angle[:, k + 1])
-            angles.append((rf"$\theta_{k + 1}$", degrees, SERIES[k]))
-        else:
-            slides.append((f"$B_{k + 1}$", g.slide[:, k], SERIES[k]))
-    panels = [("angle [degrees]", angles), ("slide [m]", slides)][: 1 + bool(slides)]
+    for k, kind in enumerate(g.kinds, start=1):
+        if kind == "R":
+            degrees = np.rad2deg(g.angle[:, k])
+            angles.append((rf"$\theta_{k}$", degrees, link_color(k)))
+        elif kind == "P":
+            slides.append((f"$B_{k}$", g.slide[:, k - 1], link_color(k)))
+    panels = [("angle [degrees]", angles), ("slide [m]", slides)]
+    panels = [panel for panel in panels if panel[1]]
     fig = figure_or_new(fig, 3.5, 0.6 + 1.9 * len(panels))
     for ax in _time_panels(fig, ts, panels):
         legend(ax)
@@ -97,12 +98,13 @@ def energy_profile(
     ts, q, qd = reached(solution)
     energies = jax.vmap(lambda q, qd: link_energies(linkage, q, qd))(q, qd)
     kinetic, potential = (np.asarray(each) for each in energies)
-    names = "link 1", "link 2", "link 3"
+    links = range(1, kinetic.shape[1] + 1)
+    names, colors = [f"link {k}" for k in links], [link_color(k) for k in links]
     sums = kinetic.sum(axis=1), potential.sum(axis=1), (kinetic + potential).sum(axis=1)
     whole = zip(("kinetic", "potential", "total"), sums, (*SERIES[3:5], BLACK))
     panels = [
-        ("kinetic energy [J]", list(zip(names, kinetic.T, SERIES))),
-        ("potential energy [J]", list(zip(names, potential.T, SERIES))),
+        ("kinetic energy [J]", list(zip(names, kinetic.T, colors))),
+        ("potential energy [J]", list(zip(names, potential.T, colors))),
         ("of all links [J]", list(whole)),
     ]
     fig = figure_or_new(fig, 3.5, 6.0)

@@ -81,7 +81,7 @@ class TipReference(Reference):
         return placed(q), root
 
     @property
-    def direction(self) -> Array:
+    def direction(self) -> Any:
         """The last link's absolute angle, or 0 where none is commanded [rad]."""
         return 0.0 if self.orientation is None else self.orientation
 

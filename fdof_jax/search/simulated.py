@@ -19,7 +19,7 @@ def check_scene(name: str, scene: Any, ts: Array) -> None:
     """Raises ValueError unless `scene` can be simulated over the times `ts`."""
     instance(name, scene, Scene)
     check_linkage(scene.linkage)
-    real_state(f"{name}.state0", scene.state0)
+    real_state(f"{name}.state0", scene.state0, scene.linkage)
     elements(f"{name}.forces", scene.forces)
     check_elements(scene.forces, scene.linkage, ts)
 

@@ -34,8 +34,8 @@ def with_payload(linkage: Linkage, mass: ArrayLike) -> Linkage:
     """
     check_linkage(linkage)
     mass = real_array("mass", mass, (), minimum=0)
-    own, center, inertia = (values[2] for values in _bodies(linkage))
-    to_tip = jnp.stack([linkage.length[3], jnp.zeros(())]) - center
+    own, center, inertia = (values[-1] for values in _bodies(linkage))
+    to_tip = jnp.stack([linkage.length[-1], jnp.zeros(())]) - center
     total = own + mass
     share = mass / jnp.where(total > 0, total, 1)
     last = (
@@ -44,7 +44,7 @@ def with_payload(linkage: Linkage, mass: ArrayLike) -> Linkage:
         # Of two masses about their common centre: reduced mass * distance^2.
         inertia + own * share * jnp.sum(to_tip**2),
     )
-    changed = [values.at[2].set(new) for values, new in zip(_bodies(linkage), last)]
+    changed = [values.at[-1].set(new) for values, new in zip(_bodies(linkage), last)]
     return eqx.tree_at(_bodies, linkage, changed)
 
 

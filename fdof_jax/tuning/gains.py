@@ -37,13 +37,13 @@ def with_gains(scene: Scene, gains: Array) -> Scene:
 def gain_sensitivities(
     z: Array, scene: Scene, loss: Loss, tuned: Array
 ) -> Sensitivities:
-    """Residuals of a loss and their derivatives in the log-gains `z` (6,).
+    """Residuals of a loss and their derivatives in the log-gains `z` (2n,).
 
-    `tuned` (2, 3) says which gains are not zero: zero has no logarithm, and stays.
+    `tuned` (2, n) says which gains are not zero: zero has no logarithm, and stays.
     """
 
     def scene_at(z):
-        return with_gains(scene, jnp.where(tuned, jnp.exp(z.reshape(2, 3)), 0))
+        return with_gains(scene, jnp.where(tuned, jnp.exp(z.reshape(tuned.shape)), 0))
 
     def residuals(scene, solution):
         value = loss(scene, solution)
@@ -116,7 +116,7 @@ def check_alike(name: str, member: Scene, scene: Scene) -> None:
 
 
 def bounds_of(scene: Scene, factor: Any, bounds: Any) -> tuple[np.ndarray, ...]:
-    """The start, least and greatest values of kp and kd, (2, 3) each."""
+    """The start, least and greatest values of kp and kd, (2, n) each."""
     start = gains_of(scene)
     if bounds is None:
         factor = 4.0 if factor is None else factor
@@ -127,7 +127,7 @@ def bounds_of(scene: Scene, factor: Any, bounds: Any) -> tuple[np.ndarray, ...]:
     if not isinstance(bounds, tuple | list | np.ndarray) or len(bounds) != 2:
         raise ValueError(f"bounds: expected (lower, upper), got {bounds!r}.")
     lower, upper = (
-        np.asarray(real_array(f"bounds[{i}]", b, (2, 3), minimum=0))
+        np.asarray(real_array(f"bounds[{i}]", b, start.shape, minimum=0))
         for i, b in enumerate(bounds)
     )
     if not ((lower <= start) & (start <= upper)).all():

@@ -25,7 +25,7 @@ _STEP = 1e-2
 class GradientReport(eqx.Module):
     """The gradient of the mean squared tip error [m^2] at a scene's gains.
 
-    Derivatives are in the logarithms of kp and kd (2, 3). The error is that of this
+    Derivatives are in the logarithms of kp and kd (2, n). The error is that of this
     scene alone, without prices of effort, even if it was tuned for an ensemble or with
     prices. A report prints itself in words.
 
@@ -34,7 +34,7 @@ class GradientReport(eqx.Module):
     - `error`: norm of `gradient - differences` over the norm of `differences`.
     - `horizons`, `gradient_norm`: times [s], and the norm of the gradient of the error
       over the run up to each of them.
-    - `saturated`: share of the time that each actuator spends at its limit (3,).
+    - `saturated`: share of the time that each actuator spends at its limit (n,).
     - `modes`: closed-loop eigenvalues along the path, at 101 times; None with elements
       that have a state of their own or prescribe a motion.
     - `at_limit`: whether any actuator is at its limit, and so does not control its
@@ -81,8 +81,7 @@ class GradientReport(eqx.Module):
 @eqx.filter_jit
 def _tangents(scene: Scene) -> tuple[Array, Array, Array, Solution]:
     """Residuals, their Jacobian in the log-gains, relative demands, and the motion."""
-    controller = controller_of(scene)
-    gains = jnp.stack([controller.kp, controller.kd])
+    controller, gains = controller_of(scene), gains_of(scene)
     z = jnp.log(jnp.where(gains > 0, gains, 1)).ravel()
     found = gain_sensitivities(z, scene, tip_errors, gains > 0)
     demands = relative_demands(controller, scene.linkage, found.solution)
@@ -116,18 +115,18 @@ def gradient_report(scene: Scene) -> GradientReport:
         lambda a: np.asarray(a) if eqx.is_array(a) else a, _tangents(scene)
     )
     along = 2 * np.cumsum(residuals[:, None] * jacobian, axis=0)
-    gradient = along[-1].reshape(2, 3)
-    gains = gains_of(scene)
+    gains = np.asarray(gains_of(scene))
+    gradient = along[-1].reshape(gains.shape)
 
     def difference(unit: np.ndarray, h: float) -> float:
-        sides = (_loss(scene, gains * np.exp(s * unit)) for s in (h, -h))
-        return float(np.subtract(*sides)) / (2 * h)
+        after, before = (_loss(scene, gains * np.exp(s * unit)) for s in (h, -h))
+        return (after - before) / (2 * h)
 
+    units = np.eye(gains.size).reshape(-1, *gains.shape)
     far, near = (
-        np.array([difference(unit, h) for unit in np.eye(6).reshape(6, 2, 3)])
-        for h in (_STEP, _STEP / 2)
+        np.array([difference(unit, h) for unit in units]) for h in (_STEP, _STEP / 2)
     )
-    differences = ((4 * near - far) / 3).reshape(2, 3)
+    differences = ((4 * near - far) / 3).reshape(gains.shape)
     size = np.linalg.norm(differences)
     error = float(np.linalg.norm(gradient - differences) / size) if size > 0 else 0.0
     # The error up to a time is the mean over that time, not over the whole run.

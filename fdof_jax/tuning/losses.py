@@ -11,10 +11,12 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from ..analysis.tracking import relative_demands, tip_deviation
-from ..checks import real_array
+from ..checks import is_traced, real_array
 from ..control.pd import PDController
+from ..linkage.topology import fixed_pairs
 from ..simulation.scene import Scene
 from ..simulation.solution import Solution
+from ..xla.array_namespace import namespace
 
 Loss = Callable[[Scene, Solution], Array]
 
@@ -37,10 +39,15 @@ def with_controller(scene: Scene, element: Any) -> Scene:
     return scene._replace(forces=tuple(forces))
 
 
-def gains_of(scene: Scene) -> np.ndarray:
-    """kp and kd of a scene's controller (2, 3)."""
+def gains_of(scene: Scene) -> Any:
+    """kp and kd of a scene's controller (2, n), 0 at fixed pairs."""
     controller = controller_of(scene)
-    return np.stack([controller.kp, controller.kd])
+    kp, kd, ef = controller.kp, controller.kd, scene.linkage.ef
+    if not is_traced(kp, kd, ef):  # JAX would compile programs for known numbers
+        kp, kd, ef = map(np.asarray, (kp, kd, ef))
+    xp = namespace(kp, kd, ef)
+    fixed = xp.stack(fixed_pairs(ef))
+    return xp.stack([xp.where(fixed, 0, kp), xp.where(fixed, 0, kd)])
 
 
 def tip_errors(scene: Scene, solution: Solution) -> Float[Array, " residual"]:

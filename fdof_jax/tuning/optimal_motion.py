@@ -14,6 +14,7 @@ from ..analysis.tracking import tip_deviation
 from ..checks import place_of, real_array, whole_number
 from ..control.model_based import ComputedTorque
 from ..forces.joints import EffortHistory
+from ..linkage.linkage import joints_of
 from ..search.bounded import Run, best_of, minimise
 from ..search.lanes import Lanes
 from ..search.methods import Evaluation
@@ -52,7 +53,7 @@ class OptimalMotion(eqx.Module):
 
     - `scene`: the scene with an `EffortHistory` in place of its controller, up to the
       horizon.
-    - `ts`, `efforts`: the knots (knot,) [s] and the efforts there (knot, 3)
+    - `ts`, `efforts`: the knots (knot,) [s] and the efforts there (knot, n)
       [N or N m].
     - `tip_error`: rms tip error over the horizon [m], without the price of effort.
     - `controller_error`: rms tip error of the scene's own controller [m].
@@ -117,7 +118,7 @@ def _lane(z: Array, problem: tuple[Scene, Array, Array, Array]) -> Evaluation:
     limit = controller.limit[None]
 
     def scene_at(z):
-        return with_controller(scene, _Knots(knots, limit * z.reshape(-1, 3)))
+        return with_controller(scene, _Knots(knots, limit * z.reshape(knots.size, -1)))
 
     def residuals(trial, solution):
         errors = _deviations(trial, controller.reference, solution)
@@ -182,7 +183,8 @@ def optimal_efforts(
     """
     check_tuned("scene", scene)
     controller, t1 = controller_of(scene), float(scene.t1)
-    task, limit = controller.reference, np.asarray(controller.limit)
+    task = controller.reference
+    limit = np.broadcast_to(controller.limit, joints_of(scene.linkage))
     if not np.isfinite(limit).all():
         raise ValueError(
             "scene: expected finite limits of its controller, as unlimited efforts "
@@ -228,7 +230,7 @@ def optimal_efforts(
             "guess; use a shorter horizon."
         )
     run = best_of(runs)
-    efforts = limit * run.z.reshape(-1, 3)
+    efforts = limit * run.z.reshape(knots, -1)
     found = with_controller(scene, EffortHistory(times, efforts))._replace(t1=end)
     solution = moved(found)
     return OptimalMotion(
@@ -245,7 +247,7 @@ def optimal_efforts(
 
 
 def _efforts_at(times: np.ndarray, scene: Scene, solution: Solution) -> np.ndarray:
-    """Efforts of a scene's controller along its motion, (time, 3)."""
+    """Efforts of a scene's controller along its motion, (time, n)."""
     controller = controller_of(scene)
     efforts = joint_efforts(scene.linkage, scene.forces, solution).elements
     mine = np.asarray(efforts[place_of(controller, scene.forces)])

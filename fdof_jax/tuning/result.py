@@ -53,7 +53,7 @@ class TuneResult(eqx.Module):
     - `scene`: the scene with its tuned gains.
     - `loss`: loss with the tuned gains [m^2 with the default loss].
     - `histories`: `History` of each run, the first from the scene's own gains.
-    - `lower`, `upper`: the bounds of kp and kd (2, 3).
+    - `lower`, `upper`: the bounds of kp and kd (2, n).
     - `converged`: whether the run stopped by itself, no actuator was at its limit most
       of the time, and a change of the gains by 1 % would change the loss by less
       than 1e-4 of it, to first order and within the bounds.
@@ -228,7 +228,7 @@ def _at_bound(gains, lower, upper) -> np.ndarray:
 
 def _history(run: Run, lower: np.ndarray, upper: np.ndarray) -> History:
     rows: Any = jax.tree.map(lambda *values: np.stack(values), *run.rows)
-    gains = np.clip(np.exp(rows.z).reshape(-1, 2, 3), lower, upper)
+    gains = np.clip(np.exp(rows.z).reshape(-1, *lower.shape), lower, upper)
     # Means over the members.
     mean = {name: np.mean(values, axis=1) for name, values in rows.facts.items()}
     return History(

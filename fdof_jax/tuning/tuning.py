@@ -145,7 +145,7 @@ def tune(
     - `scene`: must hold exactly one `PDController`.
     - `factor`: the gains stay within this factor of their start, above 1; by default 4.
     - `bounds`: instead of a factor, the least and the greatest kp and kd: two arrays
-      (2, 3), first row kp, second kd [N/m or N m/rad, N s/m or N m s/rad].
+      (2, n), first row kp, second kd [N/m or N m/rad, N s/m or N m s/rad].
     - `loss`: `(scene, solution) -> residuals`. The sum of squares of an array is
       minimised; a scalar, never negative, is minimised itself, which gives
       Levenberg-Marquardt little to go by. By default `tip_errors`: the mean squared tip
