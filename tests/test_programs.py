@@ -19,6 +19,7 @@ import fdof_jax as fj
 
 ARM, START, FORCES, _ = fj.scenes.fig5()
 TS = np.linspace(0, 0.1, 4)
+DAMPER = fj.JointDamper(1.0)
 
 
 # Exported and serialised
