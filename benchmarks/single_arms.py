@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 import fdof_jax as fj
-from fdof_jax.simulation.plain import solve_one
+from fdof_jax.simulation.solve import solve
 
 from . import contestants as own, gradients, peers, problems, trajectory
 from .contestants import Contestant
@@ -103,12 +103,12 @@ def _door(budget: float) -> Iterator[dict]:
         max_steps=65536,
         progress_meter=diffrax.NoProgressMeter(),
     )
-    solve: Callable = lambda: solve_one(inputs, keywords)[0]
+    alone: Callable = lambda: solve(inputs, keywords)[0]
     exact = np.asarray(call().q[-1])
     judge = lambda motion: {"error": float(np.abs(motion.q[-1] - exact).max())}
     yield from measure(
         PROTOCOL,
-        [Case("fdof_jax, solve alone", None, solve, judge),
+        [Case("fdof_jax, solve alone", None, alone, judge),
          Case("fdof_jax, plain call", None, call, judge)],
         budget=budget,
         ratio_to="fdof_jax, solve alone",

@@ -17,11 +17,10 @@ from ..linkage.coordinates import State, real_state
 from ..linkage.linkage import Linkage, check_linkage, joints_of, possible
 from ..xla.array_namespace import in_numpy
 from .field import initial_states
-from .plain import solve_one
 from .prescribed import prescribed
 from .solution import Solution
+from .solve import solve
 from .steps import at_tolerances, within_reach
-from .traced import solve
 
 
 def solve_options(
@@ -176,12 +175,8 @@ def simulate(
         check_own("own0", own0, forces, linkage, ())
     inputs = linkage, state0, ts, own0, forces
     try:
-        one = None
-        # A new constant is traced only if this call is inside `jax.jit`.
-        if not is_traced(inputs, keywords, jax.device_put(np.zeros(()))):
-            one = solve_one(inputs, keywords)
-        if one is None:
-            solution = solve(inputs, keywords)
+        solution, succeeded = solve(inputs, keywords)
+        if succeeded is None:
             # The caller's `ts` itself keeps derivatives in the times.
             solution = eqx.tree_at(lambda s: s.ts, solution, ts)
             return _raising(solution, inputs) if throw else solution
@@ -201,7 +196,6 @@ def simulate(
                 "that an element holds."
             ) from error
         raise
-    solution, succeeded = one
     if throw and not succeeded:
         raise RuntimeError(
             f"simulate: {solution.outcome} at t = "

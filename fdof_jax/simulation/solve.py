@@ -1,4 +1,4 @@
-"""Solves traced inputs: batches, derivatives, and calls within a user's program."""
+"""Solves a motion: of one arm at a prompt, in a batch, with derivatives."""
 
 import diffrax
 import equinox as eqx
@@ -15,6 +15,59 @@ from .integrate import integrate
 from .prescribed import prescribed
 from .solution import Solution
 from .unrolled_dopri8 import UnrolledDopri8
+
+# All plain calls with at most this many output times share one program.
+_FEWEST_TIMES = 512
+
+
+def solve(inputs, keywords) -> tuple[Solution, bool | None]:
+    """Computes a motion, and whether it succeeded: None within transformations."""
+    # A new constant is traced only inside `jax.jit`, where a program of its own would
+    # also be traced without derivatives.
+    if is_traced(jax.device_put(np.zeros(()))):
+        # Within `vmap` even a tracer may hold a NumPy array, which rules of derivatives
+        # refuse in JAX 0.10.
+        known = jax.Array, np.ndarray, np.generic
+        inputs = jax.tree.map(
+            lambda x: jax.device_put(x) if isinstance(x, known) else x, inputs
+        )
+        return _solve(inputs, keywords), None
+    one = None if is_traced(inputs, keywords) else _solve_one(inputs, keywords)
+    return one or (_solve_compiled(inputs, keywords), None)
+
+
+def _solve_one(inputs, keywords) -> tuple[Solution, bool] | None:
+    """Computes the motion of one arm from concrete inputs, and whether it succeeded.
+
+    Output times are padded with the last one to a power of two, so that few programs
+    serve all numbers of them. Returns None if a force element holds a traced value.
+    """
+    linkage, state0, ts, own0, forces = inputs
+    times = np.asarray(ts)
+    count = len(times)
+    size = max(_FEWEST_TIMES, 1 << (count - 1).bit_length())
+    filled = np.pad(times, (0, size - count), mode="edge")
+    padded = linkage, state0, filled, own0, forces
+    solution, succeeded = _solve_padded(padded, keywords)
+    if is_traced(solution):
+        return None
+
+    def cut(rows: Array) -> Array:
+        # JAX slices and jnp.asarray would compile a program for each new shape.
+        return jax.device_put(np.asarray(rows)[:count])
+
+    q, qd, own = cut(solution.q), cut(solution.qd), jax.tree.map(cut, solution.own)
+    whole = Solution(ts, q, qd, solution.stats, solution.result, own)
+    return whole, bool(succeeded)
+
+
+@eqx.filter_jit
+def _solve_padded(inputs, keywords) -> tuple[Solution, Array]:
+    # The steps are those of the same call with forward-mode derivatives.
+    derivatives = isinstance(keywords["adjoint"], diffrax.ForwardMode)
+    keywords = keywords | {"adjoint": diffrax.ForwardMode()}
+    solution = integrate(inputs, keywords, derivatives, padded=True)
+    return solution, solution.result == diffrax.RESULTS.successful
 
 
 def _batch_solver(forces: tuple[Element, ...]) -> diffrax.AbstractSolver:
@@ -118,20 +171,6 @@ def _opened(inputs):
         for element in forces
     )
     return linkage, state0, ts, own0, opened
-
-
-def solve(inputs, keywords) -> Solution:
-    """Computes the motion for traced inputs: a batch, or with derivatives."""
-    # Within a program, a program of its own would also be traced without derivatives.
-    if not is_traced(jax.device_put(np.zeros(()))):
-        return _solve_compiled(inputs, keywords)
-    # Within `vmap` even a tracer may hold a NumPy array, which rules of derivatives
-    # refuse in JAX 0.10.
-    known = jax.Array, np.ndarray, np.generic
-    inputs = jax.tree.map(
-        lambda x: jax.device_put(x) if isinstance(x, known) else x, inputs
-    )
-    return _solve(inputs, keywords)
 
 
 def _solve(inputs, keywords) -> Solution:
