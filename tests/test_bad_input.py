@@ -90,6 +90,10 @@ ARRAYS = {
     if name not in ("linkage", "topology")
 }
 UNBOUNDED = {"controller limit"}  # infinity means no limit
+ANY_LENGTH = {  # of time, or of another arm
+    "simulate ts", "JointDamper coefficient", "JointEffort tau", "controller kp",
+    "controller kd", "controller limit",
+}  # fmt: skip
 
 MALFORMED = {
     "None": lambda shape: None,
@@ -118,9 +122,12 @@ def with_entry(shape, entry):
 @pytest.mark.parametrize("argument", ARRAYS)
 def test_arrays_are_refused(argument, kind):
     name, shape, call = ARRAYS[argument]
-    if name == "ts" and kind == "too long":
-        return  # any number of times will do
-    refused(name, call, MALFORMED[kind](shape))
+    value = MALFORMED[kind](shape)
+    if kind == "too long" and argument in ANY_LENGTH:
+        return
+    if kind == "None" and argument == "inverse_kinematics orientation":
+        name = "linkage"  # None is for an arm of two joints
+    refused(name, call, value)
 
 
 @pytest.mark.parametrize("argument", sorted(ARRAYS.keys() - UNBOUNDED))
@@ -146,8 +153,8 @@ def test_negative_values_are_refused(argument):
 @pytest.mark.parametrize(
     "topology",
     [
-        "PPP", "RR", "RRRR", "rrr", "XRR", "", None, 3,
-        [0, 1, 0, 1], [0, 1, 0, 1, 1, 1], [0, 1, 0, 0, 0, 1], [1, 0, 1, 0, 1, 0],
+        "PPP", "PFPP", "FFF", "R" * 9, "rrr", "XRR", "", None, 3,
+        [0, 1, 0], [0, 1, 0, 1, 1, 1], [0] * 6, [1, 0, 1, 0, 1, 0], [0, 1] * 9,
         [0, 1, 0, 1, 0, 0.5], [0, 1, 0, 1, 0, np.nan], [0, 1, 0, 1, 0, 1j],
         np.array([0, 1, 0, 1, 0, 1 + 0j]), ["0", "1", "0", "1", "0", "1"],
         [[0, 1], [0, 1], [0, 1]],

@@ -70,7 +70,7 @@ def test_the_controller_is_the_clipped_sum_of_both_errors(limit):
 def test_one_gain_serves_all_joints():
     controller = fj.PDController(2, 3, np.inf, lambda t, k: (jnp.ones(3), jnp.ones(3)))
     for field in (controller.kp, controller.kd, controller.limit):
-        assert field.shape == (3,) and field.dtype == jnp.result_type(float)
+        assert field.shape == () and field.dtype == jnp.result_type(float)
     np.testing.assert_array_equal(
         controller(0.0, jnp.zeros(3), jnp.zeros(3), arm("RRR")), [5, 5, 5]
     )

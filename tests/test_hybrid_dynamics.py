@@ -101,7 +101,7 @@ def test_efforts_make_the_motion_and_do_its_work(topology, joints):
     ts = np.linspace(0, 1, 101)
     solution = fj.simulate(linkage, start, ts, forces)
     efforts = fj.joint_efforts(linkage, forces, solution)
-    moved = np.asarray(forces[0].moved)
+    moved = np.asarray(forces[0].of(start.q))
     assert (np.asarray(efforts.elements[0])[:, ~moved] == 0).all()
     # Under these efforts the prescribed joints accelerate as they should.
     qdd, demanded, energy = along(linkage, forces, solution, efforts.total)
@@ -162,7 +162,7 @@ def test_gradients_equal_differences(mode):
     def end(p, adjoint):
         reference = Swing(jnp.array([0.3, 0.2, 0.4]) * p[0])
         q, qd = reference(0.0, linkage)
-        state0 = fj.State(jnp.where(motion.moved, q, start.q), start.qd)
+        state0 = fj.State(jnp.where(motion.of(q), q, start.q), start.qd)
         forces = fj.PrescribedMotion(1, reference), fj.JointDamper(p[1])
         return fj.simulate(linkage, state0, [0, 0.5], forces, adjoint=adjoint).q[-1]
 
@@ -217,12 +217,15 @@ def test_the_shock_removes_residual_vibration():
 
 def test_malformed_motions_are_refused():
     hold = Push(jnp.array(0.0), jnp.array(0.0))
-    for joints in (0, 4, (1, 0), 1.0, (), [1, 2], True):
+    for joints in (0, 9, (1, 0), 1.0, (), [1, 2], True):
         with pytest.raises(ValueError, match="joints: expected"):
             fj.PrescribedMotion(joints, hold)
     with pytest.raises(ValueError, match="reference: expected a callable"):
         fj.PrescribedMotion(1, 3.0)
-    motion = fj.PrescribedMotion(1, lambda t, linkage: (0.0, 0.0))
+    motion = fj.PrescribedMotion(4, hold)
+    with pytest.raises(ValueError, match=r"joints: expected 1 to 3, got \[4\]"):
+        fj.simulate(CART, REST, [0, 1], (motion,))
+    motion = fj.PrescribedMotion(1, lambda t, linkage: (jnp.zeros(2), jnp.zeros(2)))
     with pytest.raises(ValueError, match="reference: expected an array of 3"):
         fj.simulate(CART, REST, [0, 1], (motion,))
     motion = fj.PrescribedMotion(1, hold)

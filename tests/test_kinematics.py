@@ -10,6 +10,7 @@ from helpers import random_linkage
 
 import fdof_jax as fj
 from fdof_jax.mechanics.inverse_kinematics import (
+    arm_of,
     known_directions,
     plane_angle,
     solve_joints,
@@ -238,8 +239,9 @@ def test_parallel_slides_reach_no_given_point(topology, lock, base_angle):
 
 @jax.jit
 def wrists_solved(linkage, wrists, orientation, branch):
-    directions = known_directions(linkage, orientation)
-    one = lambda w, bearing: solve_joints(linkage, directions, w, bearing, branch)
+    arm, _ = arm_of(linkage)
+    directions = known_directions(arm, orientation)
+    one = lambda w, bearing: solve_joints(arm, directions, w, bearing, branch)
     return jax.vmap(one)(wrists, plane_angle(wrists.imag, wrists.real))
 
 
@@ -255,8 +257,9 @@ def test_numpy_solves_the_joints_as_jax_does(topology, branch):
         known, sides = jax.tree.map(np.asarray, linkage), np.asarray(float(branch))
         bearing = plane_angle(wrists.imag, wrists.real)
         angle = np.asarray(orientation)
-        directions = known_directions(known, angle)
-        q, root = solve_joints(known, directions, wrists, bearing, sides)
+        three, _ = arm_of(known)
+        directions = known_directions(three, angle)
+        q, root = solve_joints(three, directions, wrists, bearing, sides)
         expected, _ = wrists_solved(linkage, wrists, angle, sides)
         assert isinstance(q, np.ndarray) and isinstance(root, np.ndarray)
         # Near the edge of the reach a root enlarges rounding to its square root.

@@ -184,7 +184,7 @@ def test_where_points_meet_forces_and_derivatives_are_finite():
 @pytest.mark.parametrize(
     "make, message",
     [
-        (lambda: fj.Point(4), "link: expected 0"),
+        (lambda: fj.Point(9), "link: expected 0"),
         (lambda: fj.Point(1.5), "link: expected a whole number"),
         (lambda: fj.Point(1, np.nan), "along: expected a real number, finite"),
         (lambda: fj.SpringDamper(A, 3), "b: expected a Point"),

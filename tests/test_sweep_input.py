@@ -45,8 +45,9 @@ def test_one_size_is_expected():
     sizes = r"state0\.q: 2, .*forces\[0\]\.coefficient: 3\.$"
     with pytest.raises(ValueError, match=sizes):
         fj.sweep(TWO, STATES, TS, damper, forces_axes=0)
+    effort = (fj.JointEffort([1.0, 2.0, 3.0]),)  # a member's would be one number
     with pytest.raises(TypeError, match="^forces, forces_axes: .*forces_axes=0"):
-        fj.sweep(ONE, three, TS, damper, forces_axes=0)
+        fj.sweep(ONE, three, TS, effort, forces_axes=0)
 
 
 @pytest.mark.parametrize("field", ["ef", "com", "mass", "gravity"])

@@ -128,7 +128,11 @@ class ScalarElement(Element):
 
 
 class StatefulElement(Element):
-    """A force element with a state of its own: an integral, a current, a lag."""
+    """A force element with a state of its own: an integral, a current, a lag.
+
+    A subclass implements `initial_state` and `__call__`, which returns the efforts
+    [N or N m] and the rate of the state.
+    """
 
     @abstractmethod
     def initial_state(self, linkage: Linkage) -> Any:

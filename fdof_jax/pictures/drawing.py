@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
 from ..checks import real_array, whole_number
-from ..linkage.linkage import Linkage, joints_of
+from ..linkage.linkage import Linkage, check_linkage, joints_of
 from ..simulation.solution import Solution
 from .arms import (
     Geometry,
@@ -64,6 +64,7 @@ def draw_linkage(
     **Returns:** the axes. The `gid` of a line names its part: "link 1", "pin 1",
     "rail 2", "slider 2", "mass 3", "tip 3", "ground".
     """
+    check_linkage(linkage)
     g = geometry(linkage, np.asarray(real_array("q", q, (joints_of(linkage),)))[None])
     ax = plane_axes(ax, g.all_points)
     draw_ground(ax)

@@ -52,8 +52,8 @@ class Reference(Part):
     ) -> tuple[Float[Array, " joint"], Float[Array, " joint"]]:
         """Joint positions [m or rad] and velocities [m/s or rad/s] at time `t` [s]."""
         check_linkage(linkage)
-        t = real_array("t", t, ())
-        positions = lambda t: self.assembly(t, linkage)[0]
+        t, shape = real_array("t", t, ()), (joints_of(linkage),)
+        positions = lambda t: jnp.broadcast_to(self.assembly(t, linkage)[0], shape)
         return jax.jvp(positions, (t,), (jnp.ones_like(t),))
 
 
@@ -72,13 +72,16 @@ def reference_of(value: Any) -> Reference:
 
 
 def reference_motion(reference: Any, t: Array, linkage: Linkage) -> tuple[Array, Array]:
-    """Positions and velocities of a reference, checked to be two arrays (3,)."""
+    """Positions and velocities of a reference, checked to be two arrays (n,)."""
     motion = reference(t, linkage)
     if not isinstance(motion, tuple) or len(motion) != 2:
         raise ValueError(
             f"reference: expected it to return (q_ref, qd_ref), got {motion!r}."
         )
-    q_ref, qd_ref = (real_array("reference", m, (joints_of(linkage),)) for m in motion)
+    shape = (joints_of(linkage),)
+    q_ref, qd_ref = (
+        real_array("reference", part, shape, broadcast=True) for part in motion
+    )
     return q_ref, qd_ref
 
 
