@@ -100,9 +100,7 @@ class _Drive(StatefulElement):
     def __call__(self, t, q, qd, linkage, state):
         own, inner = state
         command, inner_rate = element_of(self.command).act(t, q, qd, linkage, inner)
-        effort, rate = self.respond(
-            real_array("command", command, jnp.shape(qd)), qd, own
-        )
+        effort, rate = self.respond(real_array("command", command, (len(qd),)), qd, own)
         return effort, DriveState(rate, inner_rate)
 
 

@@ -130,7 +130,8 @@ def work(
 class PointElement(ScalarElement):
     """A force element that acts on points of links or of the ground.
 
-    A subclass implements `loads` [N and N m]. The bearings carry these loads, unlike efforts in the joints: see `joint_reactions`.
+    A subclass implements `loads` [N and N m]. The bearings carry these loads, unlike
+    efforts in the joints: see `joint_reactions`.
 
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig5().linkage
