@@ -23,7 +23,7 @@ def relative_demands(
     demands = jax.vmap(controller.demand, in_axes=(0, 0, 0, None))(
         solution.ts, solution.q, solution.qd, linkage
     )
-    limit = controller.limit[None]
+    limit = jnp.broadcast_to(controller.limit, demands.shape)
     beyond = jnp.where(demands == 0, 0, jnp.sign(demands) * jnp.inf)
     return jnp.where(limit > 0, demands / jnp.where(limit > 0, limit, 1), beyond)
 

@@ -68,7 +68,7 @@ def evaluate_gains(z: Array, problem: tuple[Scene, Loss, Array]) -> Evaluation:
     controller = controller_of(scene)
     demands = jnp.abs(relative_demands(controller, scene.linkage, solution))
     # An actuator with a limit of 0 makes no effort, whatever its demand.
-    limited = jnp.where(controller.limit > 0, 1, 0)[None]
+    limited = jnp.broadcast_to(jnp.where(controller.limit > 0, 1, 0), demands.shape)
     square_error = jnp.full((), jnp.nan)
     if reference_of(controller.reference).tip is not None:
         square_error = jnp.sum(tip_errors(scene, solution) ** 2)

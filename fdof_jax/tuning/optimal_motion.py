@@ -115,7 +115,7 @@ def _lane(z: Array, problem: tuple[Scene, Array, Array, Array]) -> Evaluation:
     """
     scene, knots, price, ts = problem
     controller = controller_of(scene)
-    limit = controller.limit[None]
+    limit = jnp.broadcast_to(controller.limit, (1, joints_of(scene.linkage)))
 
     def scene_at(z):
         return with_controller(scene, _Knots(knots, limit * z.reshape(knots.size, -1)))
