@@ -3,6 +3,9 @@
 The MJCF here shares no line with `fdof_jax.to_mjcf`.
 """
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 
@@ -70,3 +73,12 @@ def in_mujoco(topology, chain):
         </worldbody>
       </mujoco>""")
     return model, mujoco.MjData(model)
+
+
+class Hold(eqx.Module):
+    """A reference that stands still."""
+
+    target: jax.Array
+
+    def __call__(self, t, linkage):
+        return self.target, jnp.zeros_like(self.target)

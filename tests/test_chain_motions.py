@@ -1,0 +1,234 @@
+"""Motions of chains of other numbers of joints than three, and their derivatives."""
+
+import json
+from pathlib import Path
+
+import chains
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from elements import SHORT
+from modes import ADJOINT
+
+import fdof_jax as fj
+
+REFERENCE = json.loads((Path(__file__).parent / "hard/reference.json").read_text())
+FIELDS = "length", "com", "mass", "inertia", "locked", "base_angle", "gravity"
+TS = np.linspace(0, 0.5, 6)
+
+
+def scene(name):
+    """Returns the linkage, the start, the forces and the times of a reference."""
+    values = REFERENCE[name]
+    arm = fj.Linkage(values["topology"], **{field: values[field] for field in FIELDS})
+    start = fj.State(*jnp.asarray([values["q0"], values["qd0"]]))
+    forces = fj.JointEffort(values["effort"]), fj.JointDamper(values["damping"])
+    return arm, start, forces, np.linspace(0, values["t1"], len(values["q"]))
+
+
+# Ten times the errors that were found: at the end of the motion and, interpolated,
+# before. The double pendulum multiplies errors by 5000.
+BOUNDS = {
+    "two-links": (1e-10, 1e-9),
+    "double-pendulum": (2e-8, 2e-8),
+    "cart-pole": (3e-11, 5e-10),
+    "five-links": (6e-12, 8e-10),
+    "six-pairs": (2e-12, 3e-10),
+}
+
+
+@pytest.mark.parametrize("name", BOUNDS)
+def test_motions_equal_the_reference(name):
+    arm, start, forces, ts = scene(name)
+    motion = fj.simulate(arm, start, ts, forces)
+    error = np.abs(motion.q - np.asarray(REFERENCE[name]["q"])).max(axis=1)
+    at_end, before = BOUNDS[name]
+    assert error[-1] <= at_end
+    assert error.max() <= before
+
+
+@pytest.mark.parametrize(
+    "name, bound",
+    [
+        ("double-pendulum", 2e-9),
+        pytest.param("six-pairs", 4e-12, marks=pytest.mark.slow),
+    ],
+)
+@pytest.mark.parametrize("mode", ["forward", "reverse"])
+def test_derivatives_of_motions_equal_the_reference(name, bound, mode):
+    arm, start, forces, ts = scene(name)
+    adjoint = diffrax.ForwardMode() if mode == "forward" else ADJOINT
+
+    def end(q0, mass):
+        linkage = eqx.tree_at(lambda arm: arm.mass, arm, mass)
+        state0 = start._replace(q=q0)
+        return fj.simulate(linkage, state0, ts[[0, -1]], forces, adjoint=adjoint).q[-1]
+
+    transform = jax.jacfwd if mode == "forward" else jax.jacrev
+    slopes = jax.jit(transform(end, (0, 1)))(start.q, arm.mass)
+    for argument, slope in zip(("dq_dq0", "dq_dmass"), slopes):
+        if argument in REFERENCE[name]:
+            expected = np.asarray(REFERENCE[name][argument])
+            within = bound * np.abs(expected).max()
+            np.testing.assert_allclose(slope, expected, rtol=0, atol=within)
+
+
+@pytest.mark.parametrize("name", ["double_pendulum", "cart_pole", "five_links"])
+def test_energy_stays(name):
+    arm, start, forces, t1 = getattr(fj.scenes, name)()
+    motion = fj.simulate(arm, start, np.linspace(0, t1, 101), forces)
+    kinetic, potential = jax.vmap(fj.energy, (None, 0, 0))(arm, motion.q, motion.qd)
+    assert kinetic.max() > 0.01  # [J]
+    np.testing.assert_allclose(kinetic + potential, potential[0], rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    "topology",
+    ["RP", *(pytest.param(t, marks=pytest.mark.slow) for t in ("PRFR", "RRPFRR"))],
+)
+def test_gradients_of_motions_equal_differences(topology):
+    rng = np.random.default_rng(len(topology))
+    n = len(topology)
+    chain = chains.random_chain(topology, rng)
+    weights = rng.normal(size=(2, n))
+    ends = fj.Point(0, 3.0, -2.0), fj.Point(n, 0.3, 0.1)
+
+    def value(arguments, adjoint=ADJOINT):
+        chain, q, qd, damping, stiffness, rest_length = arguments
+        spring = fj.SpringDamper(
+            *ends, stiffness=stiffness, damping=0.5, rest_length=rest_length
+        )
+        motion = fj.simulate(
+            chain,
+            fj.State(q, qd),
+            [0, 0.1],
+            (fj.JointDamper(damping), spring),
+            adjoint=adjoint,
+            **SHORT,
+        )
+        return jnp.sum(weights * jnp.stack([motion.q[-1], motion.qd[-1]]))
+
+    q, qd = rng.normal(size=(2, n))
+    numbers = chain, q, qd, rng.uniform(0.1, 1, n), 20.0, 0.4
+    arguments = jax.tree.map(jnp.asarray, numbers)
+    direction = jax.tree.map(lambda a: jnp.asarray(rng.normal(size=a.shape)), arguments)
+    direction = eqx.tree_at(lambda d: d[0].ef, direction, jnp.zeros(2 * n))
+    single, reverse = jax.jit(value), jax.jit(jax.grad(value))
+    forward = lambda a, d: jax.jvp(
+        lambda a: value(a, diffrax.ForwardMode()), (a,), (d,)
+    )
+    _, slope = jax.jit(forward)(arguments, direction)
+    products = jax.tree.map(lambda a, b: jnp.sum(a * b), reverse(arguments), direction)
+    assert float(sum(jax.tree.leaves(products))) == pytest.approx(float(slope), 1e-11)
+
+    def shifted(step):
+        return float(
+            single(jax.tree.map(lambda a, b: a + step * b, arguments, direction))
+        )
+
+    h = 1e-3
+    coarse, fine = ((shifted(s) - shifted(-s)) / (2 * s) for s in (h, h / 2))
+    assert float(slope) == pytest.approx((4 * fine - coarse) / 3, rel=1e-8)
+
+
+def stacked(members):
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *members)
+
+
+def test_one_trace_serves_all_chains_of_a_length_and_batches_equal_their_members():
+    rng = np.random.default_rng(4)
+    names = "RRRR", "RFRP", "FPRF"
+    members = [
+        (
+            chains.random_chain(name, rng),
+            fj.State(*jnp.asarray(rng.normal(size=(2, 4)))),
+        )
+        for name in names
+    ]
+
+    @eqx.debug.assert_max_traces(max_traces=1)
+    def motion(chain, start):
+        return fj.simulate(chain, start, TS, (fj.JointDamper(0.3),), **SHORT)
+
+    single = jax.jit(motion)
+    alone = [single(*member) for member in members]
+    together = jax.jit(jax.vmap(motion.__wrapped__))(*stacked(members))
+    for i, solution in enumerate(alone):
+        for a, b in ((together.q, solution.q), (together.qd, solution.qd)):
+            np.testing.assert_allclose(a[i], b, rtol=1e-12, atol=1e-12)
+
+
+def pendulum(links, pairs):
+    """Returns so many rods as a chain of at least as many pairs, and a start."""
+    rng = np.random.default_rng(links)
+    sizes = lambda values: [*values, *[0] * (pairs - links)]
+    chain = fj.Linkage(
+        "R" * links + "F" * (pairs - links),
+        length=[0, *sizes([1] * links)],
+        com=[[0.5, 0]] * pairs,
+        mass=sizes(range(1, links + 1)),
+        inertia=sizes([1 / 12] * links),
+    )
+    start = [sizes(row) for row in rng.normal(size=(2, links))]
+    return chain, fj.State(*jnp.asarray(start))
+
+
+def test_a_batch_mixes_chains_of_different_lengths():
+    motion = lambda *member: fj.simulate(*member, TS, **SHORT)
+    members = [pendulum(links, 3) for links in (1, 2, 3)]
+    together = jax.jit(jax.vmap(motion))(*stacked(members))
+    for links in (1, 2, 3):
+        alone = motion(*pendulum(links, links))
+        mixed = together.q[links - 1]
+        np.testing.assert_allclose(mixed[:, :links], alone.q, atol=1e-12)
+        np.testing.assert_array_equal(mixed[:, links:], 0)
+
+
+def test_what_is_given_at_fixed_pairs_does_not_move_them():
+    rng = np.random.default_rng(6)
+    chain, n = chains.random_chain("RFPRF", rng), 5
+    real = chains.moving("RFPRF")
+    still = lambda values, otherwise: jnp.where(real, values, otherwise)
+    q, qd, tau, gains, target = jnp.asarray(rng.normal(size=(5, n))) ** 2
+
+    @jax.jit
+    def motion(q, qd, tau, gains, target):
+        forces = (
+            fj.PDController(gains, gains, 1 + gains, chains.Hold(target)),
+            fj.JointEffort(tau),
+            fj.JointDamper(gains),
+            fj.forces.Armature(gains),
+        )
+        return fj.simulate(chain, fj.State(q, qd), TS, forces, **SHORT)
+
+    values = q, qd, tau, gains, target
+    zero, seven = (motion(*(still(v, junk) for v in values)) for junk in (0.0, 7.0))
+    for name in ("q", "qd"):
+        found = getattr(seven, name)
+        np.testing.assert_array_equal(found, getattr(zero, name))
+        np.testing.assert_array_equal(found[:, ~real], 0)
+    assert np.abs(seven.q[-1] - seven.q[0])[real].min() > 1e-3
+
+
+@pytest.mark.parametrize("pairs", range(1, 9))
+def test_exported_models_move_alike(pairs):
+    rng = np.random.default_rng(pairs)
+    for _ in range(4):
+        topology = chains.random_topology(pairs, rng)
+        chain = chains.random_chain(topology, rng)
+        real = chains.moving(topology)
+        model = mujoco.MjModel.from_xml_string(fj.to_mjcf(chain))
+        data = mujoco.MjData(model)
+        names = [model.joint(k).name for k in range(model.njnt)]
+        assert names == [f"joint{k + 1}" for k in np.flatnonzero(real)]
+        q, qd, tau = rng.normal(size=(3, pairs))
+        data.qpos, data.qvel, data.qfrc_applied = q[real], qd[real], tau[real]
+        mujoco.mj_forward(model, data)
+        qdd = np.asarray(fj.forward_dynamics(chain, q, qd, tau))[real]
+        np.testing.assert_allclose(qdd, data.qacc, atol=1e-10 * (1 + np.abs(qdd).max()))
+        tip = data.site("tip").xpos[:2]
+        np.testing.assert_allclose(fj.tip_position(chain, q), tip, atol=1e-12)
