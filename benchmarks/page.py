@@ -6,6 +6,7 @@ from collections.abc import Callable
 import numpy as np
 
 from .hard_tables import hard_cases, hard_cases_float32
+from .joints import joints_table
 from .markdown import number, table
 from .measure import TARGETS, times_at
 from .scaling import slope
@@ -35,7 +36,7 @@ def _by_solver(points: list[dict], to_value: Callable, sign: str) -> str:
         rows.append(
             [solver, *_read_off(own, to_value, sign), number(first), ", ".join(failed)]
         )
-    errors = [f"{target:g}" for target in TARGETS]
+    errors = map("{:g}".format, TARGETS)
     text = table(["", *errors, "compile [s]", "failed at"], rows)
     skips = [p for p in points if p["status"] == "skipped"]
     return text + "".join(f"\n\nSkipped: {p['solver']}: {p['reason']}." for p in skips)
@@ -166,13 +167,8 @@ _COLUMNS: dict[str, list[tuple[str, str | Callable]]] = {
 
 def generality(points: list[dict]) -> str:
     each = lambda p: number(1e9 * p["time_median"] / p["member_steps"], 3)
-    columns = [
-        ("problem", "problem"),
-        ("", "solver"),
-        ("ns per member and step", each),
-        ("ratio", _ratio),
-        ("quartiles", _quartiles),
-    ]
+    columns = [("problem", "problem"), ("", "solver"), ("ns per member and step", each)]
+    columns += [("ratio", _ratio), ("quartiles", _quartiles)]
     return _listed([p for p in points if p["times"]], columns)
 
 
@@ -272,6 +268,7 @@ def tables(points: dict[str, list[dict]]) -> dict[str, str]:
         "generality": generality,
         "checks": generality,
         "scaling": scaling,
+        "joints": joints_table,
         "tuning": tuning,
         "hard_cases": hard_cases,
         "hard_cases-float32": hard_cases_float32,

@@ -6,6 +6,7 @@ Each raises `Skipped` if it is not installed or cannot run the problem.
 import importlib
 import math
 import os
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from typing import Any
@@ -153,11 +154,10 @@ def mujoco(problem: Problem, integrator: str) -> Contestant:
         count = every * (len(problem.ts) - 1)
         chosen = {"control": set_points(step, count)} if problem.forces else {}
         states, _ = rollout.rollout(model, data, start, nstep=count, **chosen)
-        return states[:, every - 1 :: every, 1:7]
+        return states[:, every - 1 :: every, 1 : start.shape[1]]
 
     def motion(states: np.ndarray) -> Motion:
-        states = states[0] if single else states
-        return Motion(states[..., :3], states[..., 3:])
+        return Motion(*np.split(states[0] if single else states, 2, axis=-1))
 
     return Contestant(f"MuJoCo {integrator}", "step", run, motion)
 
@@ -227,11 +227,11 @@ def extended(problem: Problem) -> np.ndarray:
     return states[:, :3].astype(float)
 
 
-def heyoka(problem: Problem) -> Contestant:
+def heyoka(problem: Problem, equations: Callable = symbolic) -> Contestant:
     """Returns an adaptive Taylor series compiled by LLVM; batches in vectors."""
     _one_free_arm(problem)
     hy = module("heyoka")
-    system = symbolic(hy, problem.linkage)
+    system = equations(hy, problem.linkage)
     q, qd = (np.atleast_2d(a) for a in problem.state0)
     start = np.concatenate([q, qd], axis=1).T
     begin, first, ts = problem.ts[0], problem.ts[0] + DT0, problem.ts[1:]
@@ -267,7 +267,7 @@ def heyoka(problem: Problem) -> Contestant:
             ends[members, 0] = integrator.state.T
 
     def run_batch(tolerance: float) -> np.ndarray:
-        ends = np.empty((start.shape[1], 1, 6))
+        ends = np.empty((start.shape[1], 1, len(start)))
         integrators = prepared(tolerance)
         number = start.shape[1] // lanes
         if threads == 1:
@@ -282,7 +282,7 @@ def heyoka(problem: Problem) -> Contestant:
         "heyoka",
         "tolerance",
         run_single if single else run_batch,
-        lambda states: Motion(states[..., :3], states[..., 3:]),
+        lambda states: Motion(*np.split(states, 2, axis=-1)),
     )
 
 

@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.ticker import NullFormatter
 
+from .joints import speed
 from .measure import OUTCOMES, times_at
 
 # Okabe and Ito's colours suit all colour vision; markers differ as well.
@@ -127,6 +128,24 @@ def batches(points: list[dict], path: Path) -> None:
     _save(figure, path)
 
 
+def joints(points: list[dict], path: Path) -> None:
+    """Draws the time of a simulated second against the number of joints."""
+    points = [p for p in points if p["status"] != "skipped"]
+    figure, axes = _axes(2)
+    for axis, batch in zip(axes, dict.fromkeys(p["batch"] for p in points)):
+        for index, solver in enumerate(_solvers(points)):
+            mine = [p for p in points if (p["solver"], p["batch"]) == (solver, batch)]
+            numbers = list(dict.fromkeys(p["joints"] for p in mine))
+            speeds = [speed([p for p in mine if p["joints"] == n]) for n in numbers]
+            times = [np.nan if s is None else 1e6 / s for s in speeds]
+            axis.semilogy(numbers, times, label=solver, **_style(solver, index))
+        axis.set_title(f"batch of {batch}" if batch > 1 else "one chain", fontsize=9)
+        axis.set_xlabel("joints")
+        axis.grid(alpha=0.3)
+    axes[0].set_ylabel("time per simulated s [µs]")
+    _save(figure, path)
+
+
 def generality(points: list[dict], path: Path) -> None:
     figure, (axis,) = _axes(1, height=2.4)
     own = [p for p in points if p["problem"] == "RRR-rk4" and p["times"]]
@@ -207,6 +226,7 @@ PLOTS = {
     "batches-gpu": batches,
     "batches-gpu-float32": batches,
     "mixed": batches,
+    "joints": joints,
     "generality": generality,
     "gradients": gradients,
     "drift": drift,

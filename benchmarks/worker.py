@@ -46,6 +46,7 @@ JOBS = (
     Job("gradients", "gradients"),
     Job("compile_times", "compile_times"),
     Job("scaling", "scaling"),
+    Job("joints", "joints"),
     Job("drift", "drift"),
     Job("lockstep", "lockstep"),
     Job("tuning", "tuning"),

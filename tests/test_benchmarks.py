@@ -112,9 +112,9 @@ def test_the_circle_in_scalars_is_that_of_the_library():
 @pytest.fixture(scope="module")
 def quick_run(tmp_path_factory):
     output = tmp_path_factory.mktemp("benchmarks")
-    command = [sys.executable, "-m", "benchmarks", "--quick", "--only", "generality"]
+    command = [sys.executable, "-m", "benchmarks", "--quick"]
     result = subprocess.run(
-        [*command, "--output", str(output)],
+        [*command, "--only", "generality,joints", "--output", str(output)],
         cwd=ROOT,
         env={**os.environ, "JAX_PLATFORMS": "cpu"},
         capture_output=True,
@@ -144,6 +144,16 @@ def test_the_smallest_protocol_runs_end_to_end(quick_run):
     }
     assert all(p["error"] < 1e-9 and p["time_min"] > 0 for p in measured)
     assert (quick_run / "generality.png").stat().st_size > 1000
+
+
+def test_the_number_of_joints_is_measured_end_to_end(quick_run):
+    points = [_valid(line) for line in (quick_run / "joints.jsonl").open()]
+    own = [p for p in points if p["solver"] == "fdof_jax"]
+    assert {p["batch"] for p in own} == {1, 16}
+    assert all(p["status"] == "ok" and p["flops"] > 0 for p in own)
+    assert min(p["error"] for p in own) < 1e-9
+    assert (quick_run / "joints.png").stat().st_size > 1000
+    assert "simulated s per s" in page.tables({"joints": points})["joints"]
 
 
 def test_tables_go_between_their_markers(quick_run):

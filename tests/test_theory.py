@@ -23,7 +23,7 @@ def vectors(linkage, x):
     d = np.array([0, *(np.asarray(linkage.length) + 1j * slide[1:])]) * e
     c = np.array([0, 0, *(np.asarray(linkage.com) @ [1, 1j])]) * e
     m = np.array([0, 0, *linkage.mass])
-    mu = np.array([m[n:].sum() for n in range(6)])
+    mu = np.array([m[n:].sum() for n in range(len(m) + 1)])
     s = m * c + mu[1:] * d
     J = np.array([0, 0, *linkage.inertia]) + m * abs(c) ** 2 + mu[1:] * abs(d) ** 2
     return e, c, d, m, mu, s, J
@@ -72,6 +72,32 @@ def test_velocities_and_gravity():
         own = dot(1j * c[n + 1], f[n + 1])
         phi.append(own + dot(1j * d[n + 1], beyond[n + 1]))
     np.testing.assert_allclose(fj.bias_force(linkage, x, xd), phi, rtol=1e-12)
+
+
+def test_the_recursion_for_any_number_of_joints():
+    topology, rng = "RPRRP", np.random.default_rng(3)
+    linkage = fj.Linkage(
+        topology, length=rng.uniform(0.3, 2, 6), com=rng.normal(size=(5, 2)),
+        mass=rng.uniform(0.5, 2, 5), inertia=rng.uniform(0.1, 1, 5),
+        locked=rng.normal(size=5), base_angle=0.4,
+    )  # fmt: skip
+    q = rng.normal(size=5)
+    x, _ = fj.to_chain(linkage, q, q)
+    e, _, d, _, mu, s, J = vectors(linkage, x)
+    F, H = np.zeros(8, complex), np.zeros(8)
+    for n in reversed(range(2, 7)):
+        F[n] = s[n] + F[n + 1]
+        H[n] = J[n] + 2 * dot(d[n], F[n + 1]) + H[n + 1]
+    turns = dict(enumerate((joint == "R" for joint in topology), start=1))
+    M = np.zeros((5, 5))
+    for k in range(1, 6):
+        p = F[k + 1] if turns[k] else mu[k + 1] * e[k]
+        h = H[k + 1] if turns[k] else dot(F[k + 1], e[k])
+        for i in reversed(range(1, k + 1)):
+            if i < k:
+                h = h + dot(d[i + 1], p)
+            M[i - 1, k - 1] = M[k - 1, i - 1] = h if turns[i] else dot(e[i], p)
+    np.testing.assert_allclose(fj.joint_mass_matrix(linkage, q), M, rtol=1e-13)
 
 
 def test_the_reduced_equations():
