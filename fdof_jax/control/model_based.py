@@ -139,5 +139,6 @@ class ComputedTorque(ModelBased):
         *motion, qdd_ref = scheduled
         errors = super().unlimited(motion, q, qd, linkage)
         constants = link_constants(self._believed(linkage), jnp.zeros(len(q)))
-        demanded = tuple(a + b for a, b in zip(qdd_ref, errors))
+        rows = zip(constants.fixed, qdd_ref, errors)
+        demanded = tuple(jnp.where(fixed, 0, a + b) for fixed, a, b in rows)
         return required_efforts(constants, tuple(q), tuple(qd), demanded)

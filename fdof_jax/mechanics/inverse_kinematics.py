@@ -58,7 +58,8 @@ def arm_of(linkage: Linkage, oriented: bool = True) -> tuple[Arm, "Placed"]:
     `oriented`: whether the last link's direction is commanded. Otherwise two joints
     move, and a third one that turns at the tip takes any direction.
 
-    Raises ValueError unless three joints move, or two.
+    Raises ValueError unless three joints move, or two; for traced existence factors,
+    the tip is NaN instead.
     """
     wanted, n = 2 + oriented, joints_of(linkage)
     found = None if is_traced(linkage.ef) else int(np.sum(np.asarray(linkage.ef)))
@@ -100,6 +101,8 @@ def arm_of(linkage: Linkage, oriented: bool = True) -> tuple[Arm, "Placed"]:
             xp.concatenate([a, b]) for a, b in ((revolute, one), (angle, angle[:1]))
         )
         vector, tip = xp.concatenate([vector, tip[None]]), xp.zeros_like(tip)
+    if found is None:
+        tip = xp.where(xp.sum(linkage.ef) == wanted, tip, xp.nan)
     arm = Arm(tuple(revolute), angle, base_angle, vector[0], vector[1:], tip)
     return arm, Placed(place, offset, n)
 
@@ -119,7 +122,7 @@ class Placed(NamedTuple):
         if self.place is None:
             return q[..., : self.n]
         xp = namespace(q, self.place, self.offset)
-        at = xp.arange(self.n)[:, None] == self.place
+        at = xp.arange(self.n)[:, None] == self.place[None]
         moved = q[..., : len(self.place)] - self.offset
         return xp.where(at, moved[..., None, :], 0).sum(axis=-1)
 

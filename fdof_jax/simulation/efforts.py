@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from ..checks import instance, place_of
 from ..forces.element import Element, Forces, StatefulElement, elements
-from ..linkage.linkage import Linkage, check_linkage
+from ..linkage.linkage import Linkage, check_linkage, without_fixed
 from .field import element_effort
 from .prescribed import prescribed, prescribed_effort
 from .simulate import check_own
@@ -18,7 +18,7 @@ from .solution import Solution
 
 
 class Efforts(NamedTuple):
-    """Joint efforts along a motion [N or N m].
+    """Joint efforts along a motion, 0 at fixed pairs [N or N m].
 
     - `total`: sum over all force elements (time, n).
     - `elements`: efforts of each force element (element, time, n).
@@ -77,4 +77,5 @@ def _efforts(
         demanded = jax.vmap(demand)(*motion_rows, jnp.sum(stacked, axis=0))
         place = place_of(motion, forces)
         stacked = stacked.at[place].set(demanded)
+    stacked = without_fixed(linkage, stacked)
     return Efforts(jnp.sum(stacked, axis=0), stacked)

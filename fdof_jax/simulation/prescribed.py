@@ -16,7 +16,7 @@ from ..dynamics import mass_and_bias
 from ..forces.element import Element, Forces
 from ..forces.part import called
 from ..linkage.linkage import Linkage, joints_of, without_fixed
-from ..linkage.topology import MOST_PAIRS
+from ..linkage.topology import MOST_PAIRS, fixed_pairs
 from ..mechanics.equations import equations, zeros
 from ..references.reference import EXPECTED, positions_at, reference_motion
 from ..xla.array_namespace import in_numpy
@@ -51,8 +51,9 @@ class PrescribedMotion(Element):
 
     - `joints`: the number of a prescribed joint, from 1, or a tuple of such numbers.
     - `reference`: `(t, linkage) -> (q, qd)`, as for a `PDController`; values for other
-      joints are ignored. The positions must be continuous and equal those of `state0`
-      at the start of a simulation; the velocities must be their rates.
+      joints and for fixed pairs are ignored. The positions must be continuous and equal
+      those of `state0` at the start of a simulation; the velocities must be their
+      rates.
 
     **Raises:** ValueError for malformed arguments.
     """
@@ -73,9 +74,10 @@ class PrescribedMotion(Element):
         self.moved = jax.device_put(np.isin(_NUMBERS, numbers))
         self.reference = reference
 
-    def of(self, q: Array) -> Array:
-        """Returns whether each joint of an arm with positions `q` is prescribed."""
-        return self.moved[: len(q)]
+    def of(self, linkage: Linkage) -> Array:
+        """Returns whether each joint of an arm is prescribed; a fixed pair is not."""
+        fixed = jnp.stack(fixed_pairs(linkage.ef))
+        return self.moved[: joints_of(linkage)] & ~fixed
 
     @with_checks
     def at(self, t: Array, linkage: Linkage) -> tuple[Array, Array]:
@@ -84,7 +86,7 @@ class PrescribedMotion(Element):
     def agrees(self, t: Array, q: Array, linkage: Linkage) -> Array:
         """Returns whether prescribed joints are at the reference, to 1 in a million."""
         begin = positions_at(self.reference, t, linkage)
-        q, moved = in_numpy((q, self.of(q)))
+        q, moved = in_numpy((q, self.of(linkage)))
         near = abs(q - begin) <= 1e-6 * (1 + abs(begin))
         return (near | ~moved).all()
 
@@ -127,9 +129,9 @@ def motion_at(args: Args, t: Any, y: Any) -> tuple[Array, Array]:
     if (motion := prescribed(args.forces)) is None:
         return q, rates
     position, velocity = motion.at(t, args.linkage)
-    q = jnp.where(motion.of(q), position, q)
+    q = jnp.where(motion.of(args.linkage), position, q)
     matrix, _ = _mass_and_bias(args, q, jnp.zeros_like(q))
-    return q, _split(motion.of(q), matrix, velocity, rates)
+    return q, _split(motion.of(args.linkage), matrix, velocity, rates)
 
 
 def start_of(args: Args, qd: Array) -> tuple[Any, Any]:
@@ -137,7 +139,7 @@ def start_of(args: Args, qd: Array) -> tuple[Any, Any]:
     if (motion := prescribed(args.forces)) is None:
         return zeros(args.q0), tuple(qd)
     matrix, _ = _mass_and_bias(args, args.q0, jnp.zeros_like(args.q0))
-    return zeros(args.q0), tuple(jnp.where(motion.of(qd), 0, matrix @ qd))
+    return zeros(args.q0), tuple(jnp.where(motion.of(args.linkage), 0, matrix @ qd))
 
 
 def term_of(forces: tuple[Element, ...]) -> ScheduledTerm:
@@ -161,7 +163,7 @@ def _hybrid_field(t, y, args, schedule) -> tuple[Any, ...]:
     bias = jnp.stack(equations(args.constants, *moving).bias)
     momenta = lambda q: _mass_and_bias(args, q, jnp.zeros_like(q))[0] @ qd
     _, change = jax.jvp(momenta, (q,), (qd,))
-    moved, change = motion.of(q), change - bias + jnp.stack(tau)
+    moved, change = motion.of(args.linkage), change - bias + jnp.stack(tau)
     driven = jnp.where(moved, 0, without_fixed(args.linkage, change))
     return whole(tuple(jnp.where(moved, 0, qd)), tuple(driven), own_rates)
 
@@ -178,7 +180,7 @@ def _health(t, y, args) -> Array:
     assert motion is not None
     q, _ = motion_at(args, t, y)
     matrix, _ = _mass_and_bias(args, q, jnp.zeros_like(q))
-    driven = ~motion.of(q)
+    driven = ~motion.of(args.linkage)
     free = jnp.where(jnp.outer(driven, driven), matrix, jnp.eye(len(q)))
     loss = jnp.max(jnp.diag(free) * jnp.diag(jnp.linalg.inv(free)))
     return jnp.where(jnp.isnan(loss), 0, health_at(loss))
@@ -193,6 +195,6 @@ def prescribed_effort(
     matrix, bias = mass_and_bias(linkage, forces, q, qd)
     velocity = lambda t: motion.at(t, linkage)[1]
     _, demanded = jax.jvp(velocity, (t,), (jnp.ones_like(t),))
-    moved = motion.of(q)
+    moved = motion.of(linkage)
     qdd = _split(moved, matrix, demanded, tau - bias)
     return jnp.where(moved, matrix @ qdd + bias - tau, 0)
