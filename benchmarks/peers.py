@@ -227,8 +227,13 @@ def extended(problem: Problem) -> np.ndarray:
     return states[:, :3].astype(float)
 
 
-def heyoka(problem: Problem, equations: Callable = symbolic) -> Contestant:
-    """Returns an adaptive Taylor series compiled by LLVM; batches in vectors."""
+def heyoka(
+    problem: Problem, equations: Callable = symbolic, compact: bool = False
+) -> Contestant:
+    """Returns an adaptive Taylor series compiled by LLVM; batches in vectors.
+
+    `compact`: compiled sooner, and slower.
+    """
     _one_free_arm(problem)
     hy = module("heyoka")
     system = equations(hy, problem.linkage)
@@ -244,9 +249,14 @@ def heyoka(problem: Problem, equations: Callable = symbolic) -> Contestant:
     @cache
     def prepared(tolerance: float) -> list:
         if single:
-            return [hy.taylor_adaptive(system, start[:, 0].copy(), tol=tolerance)]
+            begun = start[:, 0].copy()
+            return [
+                hy.taylor_adaptive(system, begun, tol=tolerance, compact_mode=compact)
+            ]
         block = start[:, :lanes].copy()
-        one = hy.taylor_adaptive_batch(system, block, tol=tolerance)
+        one = hy.taylor_adaptive_batch(
+            system, block, tol=tolerance, compact_mode=compact
+        )
         return [one, *(one.__deepcopy__({}) for _ in range(threads - 1))]
 
     def run_single(tolerance: float) -> np.ndarray:
