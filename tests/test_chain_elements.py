@@ -12,7 +12,6 @@ from elements import SHORT
 
 import fdof_jax as fj
 
-
 FIVE = pytest.param("RPFRR", marks=pytest.mark.slow)
 
 

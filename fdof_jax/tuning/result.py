@@ -112,7 +112,7 @@ class TuneResult(eqx.Module):
         `start` and `tuned`; the bounds `least` and `greatest`; and `at_bound`.
         """
         names = joint_names(self.scene.linkage)
-        units = controller_of(self.scene).gain_units
+        units = {"F": ("", "")} | controller_of(self.scene).gain_units
         values = {
             "start": self.histories[0].gains[0],
             "tuned": self.gains,
@@ -121,7 +121,7 @@ class TuneResult(eqx.Module):
             "at_bound": self.at_bound,
         }
         return {
-            "gain": ["kp"] * 3 + ["kd"] * 3,
+            "gain": ["kp"] * len(names) + ["kd"] * len(names),
             "joint": names * 2,
             "unit": [units[name[0]][kind] for kind in range(2) for name in names],
         } | {name: np.ravel(value).tolist() for name, value in values.items()}
@@ -187,7 +187,7 @@ class TuneResult(eqx.Module):
         first, held = self.histories[0], int(self.at_bound.sum())
         return (
             f"TuneResult({topology}, loss {first.loss[0]:.5g} to {self.loss:.5g}, "
-            f"{held} of 6 gains at a bound, {self._verdict})"
+            f"{held} of {self.at_bound.size} gains at a bound, {self._verdict})"
         )
 
     def _repr_html_(self) -> str:

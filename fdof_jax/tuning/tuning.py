@@ -24,11 +24,11 @@ _WORST = 32
 
 
 def _started(box, starts: int, draw: np.random.Generator) -> tuple[np.ndarray, ...]:
-    """Starts, lower and upper bounds in the log-gains, (start, 6) each."""
+    """Starts, lower and upper bounds in the log-gains, (start, 2n) each."""
     real = (box[0] > 0).ravel()
     here, least, most = (np.log(np.where(real, b.ravel(), 1)) for b in box)
-    others = draw.uniform(least, most, (starts - 1, 6))
-    same = (np.broadcast_to(a, (starts, 6)) for a in (least, most))
+    others = draw.uniform(least, most, (starts - 1, least.size))
+    same = (np.broadcast_to(a, (starts, a.size)) for a in (least, most))
     return np.concatenate([here[None], others]), *same
 
 

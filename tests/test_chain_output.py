@@ -1,0 +1,114 @@
+"""Tables, files and pictures of chains, and shapes that do not fit a chain."""
+
+import chains
+import jax
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+from elements import SHORT
+
+import fdof_jax as fj
+
+TWO = chains.random_chain("RR", np.random.default_rng(0))
+REST = fj.State(np.zeros(2), np.zeros(2))
+
+
+@pytest.fixture(scope="module", params=["R", "RP", "RFPRR"])
+def motion(request):
+    topology = request.param
+    n = len(topology)
+    chain = chains.random_chain(topology, np.random.default_rng(n))
+    start, forces = (
+        fj.State(np.full(n, 0.2), np.zeros(n)),
+        (fj.JointDamper(np.ones(n)),),
+    )
+    solution = fj.simulate(chain, start, np.linspace(0, 0.1, 11), forces, **SHORT)
+    return topology, fj.Scene(chain, start, forces, 0.1), solution
+
+
+def test_tables_have_a_column_per_joint(motion):
+    topology, (chain, *_), solution = motion
+    names = [f"{kind}{k + 1}" for k, kind in enumerate(topology)]
+    columns = list(fj.to_pandas(chain, solution).columns)
+    assert [c.split()[0] for c in columns[: len(names)]] == names
+    assert fj.to_xarray(chain, solution).joint.values.tolist() == names
+
+
+def test_files_keep_scenes_and_motions(motion, tmp_path):
+    _, *kept = motion
+    for item in kept:
+        fj.save(tmp_path / "item", item)
+        again = fj.load(tmp_path / "item")
+        jax.tree.map(np.testing.assert_array_equal, again, item)
+
+
+def test_pictures_show_all_joints_that_move(motion):
+    topology, (chain, _, forces, _), solution = motion
+    n, moving = len(topology), len(topology.replace("F", ""))
+    curves = lambda fig: [len(ax.lines) for ax in fig.axes]
+    assert sum(curves(fj.plotting.motion_profile(chain, solution))) == moving
+    efforts = fj.plotting.effort_profile(chain, forces, solution)
+    assert sum(curves(efforts)) == moving
+    kinetic, potential, _ = curves(fj.plotting.energy_profile(chain, solution))
+    assert kinetic == potential == n
+    fig, ax = plt.subplots()
+    fj.drawing.draw_linkage(chain, solution.q[0], ax)
+    film = fj.drawing.animate(chain, solution)
+    film._init_draw()  # the first frame
+    drawn = film._fig.axes[0].lines
+    tip = np.asarray(fj.tip_position(chain, solution.q[0]))
+    for lines in (ax.lines, drawn):
+        points = np.concatenate([np.array(line.get_data()).T for line in lines])
+        assert np.linalg.norm(points - tip, axis=1).min() < 1e-9
+    plt.close("all")
+
+
+MISFITS = {
+    "kp": lambda: fj.PDController([1, 1, 1], 1, 1, chains.Hold(jnp.zeros(2))),
+    "coefficient": lambda: fj.JointDamper([1, 2, 3]),
+    "tau": lambda: fj.JointEffort([1, 2, 3]),
+    "inertia": lambda: fj.forces.Armature([1, 2, 3]),
+    "lower": lambda: fj.forces.JointStops([-1, -1, -1], 1.0),
+    "command.tau": lambda: fj.control.FirstOrderLag(fj.JointEffort([1, 2, 3]), 0.1),
+    "reference.start": lambda: fj.PDController(
+        1, 1, 1, fj.references.JointMove([0] * 3, [1] * 3, fj.references.Travel(1.0))
+    ),
+}
+
+
+@pytest.mark.parametrize("name", MISFITS)
+def test_elements_of_other_chains_are_refused(name):
+    expected = rf"^forces\[0\]\.{name}: expected numbers for 2 joints, .*got 3"
+    forces = (MISFITS[name](),)
+    known = lambda q: fj.simulate(TWO, REST._replace(q=q), [0, 0.1], forces)
+    for call in (known, jax.jit(known)):
+        with pytest.raises(ValueError, match=expected):
+            call(REST.q)
+
+
+def test_states_and_links_of_other_chains_are_refused():
+    three = fj.State(np.zeros(3), np.zeros(3))
+    words = "expected an array of 2 real numbers"
+    with pytest.raises(ValueError, match=rf"^state0\.q: {words}.*\(3,\)"):
+        fj.simulate(TWO, three, [0, 0.1])
+    with pytest.raises(ValueError, match=rf"^state\.q: {words}"):
+        fj.step(TWO, three, [0, 0], 0.1)
+    with pytest.raises(ValueError, match=rf"^state\.q: {words}"):
+        fj.linearize(TWO, (), three)
+    with pytest.raises(ValueError, match=rf"^q: {words}"):
+        fj.analysis.equilibrium(TWO, (), np.zeros(3))
+    point = fj.Point(3, 0.1)
+    ends = fj.Point(0, 0.1), point
+    for element in (
+        fj.Wrench(point, [1, 0]),
+        fj.SpringDamper(*ends, stiffness=1.0),
+        fj.LinearActuator(*ends),
+    ):
+        with pytest.raises(ValueError, match="^link: expected 0 .* 1 to 2, got 3"):
+            fj.simulate(TWO, REST, [0, 0.1], (element,))
+    hold = chains.Hold(jnp.zeros(3))
+    with pytest.raises(ValueError, match="^joints: expected 1 to 2, got .*3"):
+        fj.simulate(TWO, REST, [0, 0.1], (fj.PrescribedMotion(3, hold),))
+    with pytest.raises(ValueError, match=f"^reference: {words}"):
+        fj.simulate(TWO, REST, [0, 0.1], (fj.PDController(1, 1, 1, hold),))
