@@ -12,12 +12,13 @@ from operator import and_
 from typing import Any, NamedTuple, dataclass_transform
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
-from ..checks import JOINT, concrete, function, instance, real_array
+from ..checks import JOINT, concrete, function, instance, is_traced, real_array
 from ..linkage.linkage import Linkage
 from ..xla.array_namespace import in_numpy, namespace
 
@@ -180,6 +181,28 @@ def _bounded(value: Any, rules: dict[str, Any]) -> Any:
 def each(values: Array, joints: Any) -> tuple[Array, ...]:
     """Returns declared values of joints as scalars, one for each of `joints`."""
     return tuple(values) if jnp.ndim(values) else (values,) * len(joints)
+
+
+def sized(part: Any, joints: int) -> Any:
+    """Returns the part with an entry per joint where it has one number for all.
+
+    Programs then do not depend on how the numbers were given.
+    """
+    changes = {name: sized(inner, joints) for name, inner in _within(part)}
+    for name, value, rules in _declared(part):
+        if rules["shape"] == (JOINT,) and jnp.ndim(value) == 0:
+            changes[name] = (
+                jnp.broadcast_to(value, joints)
+                if is_traced(value)
+                else jax.device_put(np.full(joints, value))  # compiles nothing
+            )
+    changes = {n: new for n, new in changes.items() if not isinstance(new, Foreign)}
+    if not changes:
+        return part
+    copied = object.__new__(type(part))
+    for name, value in (vars(part) | changes).items():
+        object.__setattr__(copied, name, value)
+    return copied
 
 
 def check_joints(place: str, part: Part, count: int) -> None:

@@ -17,7 +17,7 @@ from jax import Array
 from jaxtyping import Complex, Float
 from numpy.typing import ArrayLike
 
-from ..checks import is_traced, real_array, whole_number
+from ..checks import concrete, real_array, whole_number
 from ..linkage.frames import Frames, cross, frames, scalar_frames
 from ..linkage.linkage import Linkage, joints_of, without_fixed
 from ..linkage.topology import MOST_PAIRS
@@ -75,10 +75,11 @@ class Point(Part):
 
     def check(self, linkage: Linkage, ts: Array) -> None:
         """Raises ValueError if the linkage has no such link."""
-        if not is_traced(self.link) and self.link > (last := joints_of(linkage)):
+        last, link = joints_of(linkage), concrete(self.link)
+        if link is not None and link > last:
             raise ValueError(
                 f"link: expected 0 (the ground) or a moving link, 1 to {last}, got "
-                f"{self.link}."
+                f"{link}."
             )
 
     def place(self, frames: Frames) -> Complex[Array, ""]:

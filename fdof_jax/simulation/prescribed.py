@@ -19,7 +19,7 @@ from ..linkage.linkage import Linkage, joints_of, without_fixed
 from ..linkage.topology import MOST_PAIRS, fixed_pairs
 from ..mechanics.equations import equations, zeros
 from ..references.reference import EXPECTED, positions_at, reference_motion
-from ..xla.array_namespace import in_numpy
+from ..xla.array_namespace import in_numpy, namespace
 from ..xla.callbacks import with_checks
 from .dopri8 import ScheduledTerm
 from .field import (
@@ -76,8 +76,9 @@ class PrescribedMotion(Element):
 
     def of(self, linkage: Linkage) -> Array:
         """Returns whether each joint of an arm is prescribed; a fixed pair is not."""
-        fixed = jnp.stack(fixed_pairs(linkage.ef))
-        return self.moved[: joints_of(linkage)] & ~fixed
+        moved, ef = in_numpy((self.moved, linkage.ef))
+        fixed = namespace(moved, ef).stack(fixed_pairs(ef))
+        return moved[: joints_of(linkage)] & ~fixed
 
     @with_checks
     def at(self, t: Array, linkage: Linkage) -> tuple[Array, Array]:
@@ -86,9 +87,8 @@ class PrescribedMotion(Element):
     def agrees(self, t: Array, q: Array, linkage: Linkage) -> Array:
         """Returns whether prescribed joints are at the reference, to 1 in a million."""
         begin = positions_at(self.reference, t, linkage)
-        q, moved = in_numpy((q, self.of(linkage)))
-        near = abs(q - begin) <= 1e-6 * (1 + abs(begin))
-        return (near | ~moved).all()
+        near = abs(in_numpy(q) - begin) <= 1e-6 * (1 + abs(begin))
+        return (near | ~self.of(linkage)).all()
 
     def check(self, linkage: Linkage, ts: Array) -> None:
         """Runs the checks of the reference; raises ValueError for joints not there."""

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from ..checks import increasing, instance, is_traced, real_array, whole_number
 from ..forces.element import Element, Forces, elements
-from ..forces.part import check_joints, check_values
+from ..forces.part import check_joints, check_values, sized
 from ..linkage.coordinates import State, real_state
 from ..linkage.linkage import Linkage, check_linkage, joints_of, possible
 from ..xla.array_namespace import in_numpy
@@ -163,6 +163,7 @@ def simulate(
         progress_meter=progress_meter,
     )
     check_elements(forces, linkage, ts)
+    forces = tuple(sized(element, joints_of(linkage)) for element in forces)
     motion = prescribed(forces)
     if motion is not None and not is_traced(linkage, state0, ts, motion):
         if not motion.agrees(np.asarray(ts)[0], jnp.asarray(state0.q), linkage):
