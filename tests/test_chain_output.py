@@ -85,6 +85,9 @@ def test_elements_of_other_chains_are_refused(name):
     for call in (known, jax.jit(known)):
         with pytest.raises(ValueError, match=expected):
             call(REST.q)
+    if not name.startswith("command"):  # of a state, which has no linearization
+        with pytest.raises(ValueError, match=expected):
+            fj.linearize(TWO, forces, REST)
 
 
 def test_states_and_links_of_other_chains_are_refused():
@@ -107,6 +110,10 @@ def test_states_and_links_of_other_chains_are_refused():
     ):
         with pytest.raises(ValueError, match="^link: expected 0 .* 1 to 2, got 3"):
             fj.simulate(TWO, REST, [0, 0.1], (element,))
+    # A sweep solves values as they are: such a member fails.
+    both = fj.State(np.zeros((2, 2)), np.zeros((2, 2)))
+    swept = fj.sweep(TWO, both, [0, 0.1], (fj.Wrench(point, [1, 0]),), **SHORT)
+    assert swept.outcome.tolist() == ["not finite"] * 2
     hold = chains.Hold(jnp.zeros(3))
     with pytest.raises(ValueError, match="^joints: expected 1 to 2, got .*3"):
         fj.simulate(TWO, REST, [0, 0.1], (fj.PrescribedMotion(3, hold),))

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from ..checks import instance, is_traced, real_array
 from ..dynamics import forward_dynamics
-from ..forces.element import Element, Forces, elements
+from ..forces.element import Element, Forces, elements_on
 from ..linkage.coordinates import State, real_state
 from ..linkage.linkage import Linkage, check_linkage, without_fixed
 from ..simulation.field import stateful
@@ -43,7 +43,7 @@ def depends_on_state_alone(forces: tuple[Element, ...]) -> bool:
 def checked(linkage: Linkage, forces: Forces) -> tuple[Element, ...]:
     """Returns the forces as elements, which may have no state."""
     check_linkage(linkage)
-    found = elements("forces", forces)
+    found = elements_on(linkage, forces)
     if depends_on_state_alone(found):
         return found
     raise ValueError(

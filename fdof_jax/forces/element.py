@@ -12,9 +12,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jax import Array
 
-from ..linkage.linkage import Linkage
+from ..linkage.linkage import Linkage, joints_of
 from ..mechanics.equations import Scalars
-from .part import Foreign, Part, default, optional
+from .part import Foreign, Part, check_joints, default, optional
 
 Forces = tuple[Any, ...]  # elements, or callables (t, q, qd, linkage) -> tau
 
@@ -108,6 +108,14 @@ def elements(name: str, forces: Any) -> tuple[Element, ...]:
         f"{name}: expected a tuple of callables (t, q, qd, linkage) -> tau, for "
         f"instance (JointDamper(1.0),), got {forces!r}."
     )
+
+
+def elements_on(linkage: Linkage, forces: Any) -> tuple[Element, ...]:
+    """Returns forces as elements, or raises ValueError for values of other chains."""
+    found = elements("forces", forces)
+    for index, element in enumerate(found):
+        check_joints(f"forces[{index}]", element, joints_of(linkage))
+    return found
 
 
 class ScalarElement(Element):

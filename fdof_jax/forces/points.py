@@ -27,10 +27,10 @@ from .part import Part, Values, field, of_kind
 
 
 def pick(link: Array, choices: list[Array]) -> Array:
-    """Selects a link's value from those of the ground and the links."""
-    chosen = choices[0]
+    """Selects a link's value from those of the ground and the links, NaN if beyond."""
+    chosen: Any = jnp.nan
     for k, choice in enumerate(choices):
-        chosen = jnp.where(link == k, choice, chosen) if k else chosen
+        chosen = jnp.where(link == k, choice, chosen)
     return chosen
 
 

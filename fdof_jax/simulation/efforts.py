@@ -9,7 +9,7 @@ from jax import Array
 from jaxtyping import Float
 
 from ..checks import instance, place_of
-from ..forces.element import Element, Forces, StatefulElement, elements
+from ..forces.element import Element, Forces, StatefulElement, elements_on
 from ..linkage.linkage import Linkage, check_linkage, without_fixed
 from .field import element_effort
 from .prescribed import prescribed, prescribed_effort
@@ -48,7 +48,7 @@ def joint_efforts(linkage: Linkage, forces: Forces, solution: Solution) -> Effor
     """
     check_linkage(linkage)
     instance("solution", solution, Solution)
-    forces = elements("forces", forces)
+    forces = elements_on(linkage, forces)
     if solution.q.ndim != 2:
         raise ValueError(
             "solution: expected one motion (use jax.vmap for a batch), got positions "

@@ -11,8 +11,8 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from ..checks import increasing, instance, is_traced, real_array, whole_number
-from ..forces.element import Element, Forces, elements
-from ..forces.part import check_joints, check_values, sized
+from ..forces.element import Element, Forces, elements, elements_on
+from ..forces.part import check_values, sized
 from ..linkage.coordinates import State, real_state
 from ..linkage.linkage import Linkage, check_linkage, joints_of, possible
 from ..xla.array_namespace import in_numpy
@@ -74,11 +74,10 @@ def solve_options(
 
 def check_elements(forces: Forces, linkage: Linkage, ts: Array) -> None:
     """Checks the elements' values, where known, and runs their own checks."""
-    for index, element in enumerate(elements("forces", forces)):
+    for index, element in enumerate(elements_on(linkage, forces)):
         place, values = f"forces[{index}]", in_numpy(element)
         if values.jump_ts is not None:
             real_array(f"{place}.jump_ts", values.jump_ts, (None,))
-        check_joints(place, element, joints_of(linkage))
         if is_traced(linkage, ts, element):
             continue
         check_values(place, element)  # `equinox.tree_at` bypasses the constructor
