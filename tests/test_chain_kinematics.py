@@ -9,6 +9,7 @@ from elements import SHORT
 import fdof_jax as fj
 
 TS = np.linspace(0, 0.2, 5)
+slow = lambda topology: pytest.param(topology, marks=pytest.mark.slow)
 WORDS = "^linkage: expected {} joints that move.*, the others fixed, got {}"
 
 
@@ -81,7 +82,7 @@ def test_chains_of_other_numbers_of_joints_are_refused(topology, orientation, wa
             fj.simulate(chain, fj.State(np.zeros(n), np.zeros(n)), [0, 0.1], (pd,))
 
 
-@pytest.mark.parametrize("topology", ["RR", "RP", "PR", "FRFP"])
+@pytest.mark.parametrize("topology", ["RR", "RP", "PR", slow("FRFP")])
 def test_tasks_without_orientation_are_followed_at_their_exact_rates(topology):
     chain = chains.random_chain(topology, np.random.default_rng(10))
     chain = chain.replace(length=np.linspace(0.4, 1, len(topology) + 1))
@@ -118,7 +119,7 @@ def test_tasks_without_orientation_are_followed_at_their_exact_rates(topology):
         np.testing.assert_allclose(fj.tip_position(chain, q), task.tip(t), atol=1e-4)
 
 
-@pytest.mark.parametrize("topology", ["FRFRR", "RPFR"])
+@pytest.mark.parametrize("topology", ["FRFRR", slow("RPFR")])
 def test_circles_of_three_joints_and_fixed_pairs(topology):
     chain = chains.random_chain(topology, np.random.default_rng(11))
     q = np.where(chains.moving(topology), 0.5, 0)
