@@ -95,8 +95,9 @@ class _Default:
 class Condition(NamedTuple):
     """A condition on the values of an element or a reference: see `Element.conditions`.
 
-    - `holds`: whether it is fulfilled: a bool, or an array of one.
-    - `name`, `expected`: of the message if it is not; `got`: what that message shows.
+    - `holds`: whether it is fulfilled: one bool, or an array () of it.
+    - `name`, `expected`: of the message if it is not; `got`: a tuple of the values that
+      the message shows.
     """
 
     holds: Any

@@ -65,8 +65,10 @@ def pairs_of(topology: Any) -> np.ndarray | None:
         )
     if not can_move(pairs):
         raise ValueError(
-            "topology: expected a joint that moves, and one that turns among three or "
-            f"more (PPP cannot orient its last link), got {letters(pairs)}."
+            "topology: expected a joint that moves, got fixed pairs only."
+            if not pairs.any()
+            else "topology: expected one joint that turns among three or more (PPP "
+            f"cannot orient its last link), got {letters(pairs)}."
         )
     return pairs
 

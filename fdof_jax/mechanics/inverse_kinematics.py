@@ -65,9 +65,10 @@ def arm_of(linkage: Linkage, oriented: bool = True) -> tuple[Arm, "Placed"]:
     found = None if is_traced(linkage.ef) else int(np.sum(np.asarray(linkage.ef)))
     if n < wanted or found not in (None, wanted):
         also = "" if oriented else " where no orientation is commanded"
+        cure = "; two need orientation=None" if oriented and (found or n) == 2 else ""
         raise ValueError(
             f"linkage: expected {wanted} joints that move{also}, the others fixed, got "
-            f"{found or n}."
+            f"{found or n}{cure}."
         )
     xp = namespace(linkage)
     revolute = xp.stack(real_joints(linkage.ef))

@@ -3,7 +3,7 @@
 Every function draws into the given axes (`ax`) or figure (`fig`), or into a new one,
 and returns it; `animate` and `animate_grid` return an animation. Nothing is shown or
 saved, and no global setting changes. A `solution` is that of one `simulate`; of a
-failed one, the samples reached are drawn. Link 0 is the ground, links 1 to 3 move.
+failed one, the samples reached are drawn. Link 0 is the ground, links 1, 2, ... move.
 Malformed arguments raise ValueError. Curves over time are in `plotting`.
 """
 
