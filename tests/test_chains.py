@@ -196,7 +196,7 @@ def test_slides_that_are_nearly_parallel_keep_their_pivot():
         ([0, 1, 1], "1 to 8 letters"),
         ([0] * 18, "1 to 8 letters"),
         ("FF", "a joint that moves"),
-        ("PFPP", "one that turns among three"),
+        ("PFPP", "one joint that turns among three"),
         ([1, 1, 0, 1], "one real joint at most"),
         ([0, 0.5], "0 or 1"),
     ],
