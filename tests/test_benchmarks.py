@@ -109,12 +109,10 @@ def test_the_circle_in_scalars_is_that_of_the_library():
         np.testing.assert_allclose(control(t, *state), effort, rtol=1e-9, atol=1e-9)
 
 
-@pytest.fixture(scope="module")
-def quick_run(tmp_path_factory):
-    output = tmp_path_factory.mktemp("benchmarks")
+def run_quickly(protocol, output):
     command = [sys.executable, "-m", "benchmarks", "--quick"]
     result = subprocess.run(
-        [*command, "--only", "generality,joints", "--output", str(output)],
+        [*command, "--only", protocol, "--output", str(output)],
         cwd=ROOT,
         env={**os.environ, "JAX_PLATFORMS": "cpu"},
         capture_output=True,
@@ -123,6 +121,11 @@ def quick_run(tmp_path_factory):
     )
     assert result.returncode == 0, result.stdout + result.stderr
     return output
+
+
+@pytest.fixture(scope="module")
+def quick_run(tmp_path_factory):
+    return run_quickly("generality", tmp_path_factory.mktemp("benchmarks"))
 
 
 def _valid(text):
@@ -146,7 +149,9 @@ def test_the_smallest_protocol_runs_end_to_end(quick_run):
     assert (quick_run / "generality.png").stat().st_size > 1000
 
 
-def test_the_number_of_joints_is_measured_end_to_end(quick_run):
+@pytest.mark.slow
+def test_the_number_of_joints_is_measured_end_to_end(tmp_path):
+    quick_run = run_quickly("joints", tmp_path)
     points = [_valid(line) for line in (quick_run / "joints.jsonl").open()]
     own = [p for p in points if p["solver"] == "fdof_jax"]
     assert {p["batch"] for p in own} == {1, 16}

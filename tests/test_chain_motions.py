@@ -58,7 +58,9 @@ def test_motions_equal_the_reference(name):
         pytest.param("six-pairs", 4e-12, marks=pytest.mark.slow),
     ],
 )
-@pytest.mark.parametrize("mode", ["forward", "reverse"])
+@pytest.mark.parametrize(
+    "mode", ["forward", pytest.param("reverse", marks=pytest.mark.slow)]
+)
 def test_derivatives_of_motions_equal_the_reference(name, bound, mode):
     arm, start, forces, ts = scene(name)
     adjoint = diffrax.ForwardMode() if mode == "forward" else ADJOINT
@@ -86,10 +88,8 @@ def test_energy_stays(name):
     np.testing.assert_allclose(kinetic + potential, potential[0], rtol=0, atol=1e-7)
 
 
-@pytest.mark.parametrize(
-    "topology",
-    ["RP", *(pytest.param(t, marks=pytest.mark.slow) for t in ("PRFR", "RRPFRR"))],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("topology", ["RP", "PRFR", "RRPFRR"])
 def test_gradients_of_motions_equal_differences(topology):
     rng = np.random.default_rng(len(topology))
     n = len(topology)
