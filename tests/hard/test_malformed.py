@@ -52,7 +52,7 @@ CASES = {
     "limit nan": ("limit", [10, NAN, 10]),
     "limit negative": ("limit", [10, -10, 10]),
     "both joints of a pair": ("ef", [0, 1, 1, 1, 0, 1]),
-    "no joint of a pair": ("ef", [0, 1, 0, 0, 0, 1]),
+    "no joint at all": ("ef", [0] * 6),
     "ef nan": ("ef", [0, 1, NAN, NAN, 0, 1]),
     "PPP": ("ef", [1, 0, 1, 0, 1, 0]),
     "ts not increasing": ("ts", [0, 0.5, 0.2, 0.7, 1]),

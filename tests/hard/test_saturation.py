@@ -24,7 +24,8 @@ def test_the_derivative_at_the_limit_is_that_of_one_side():
 
     These are 0 and the demand's derivative; their mean belongs to no motion.
     """
-    controller = fj.PDController(KP, 0.0, 32.0, Hold(jnp.full(3, 0.25)))
+    kp = jnp.full(3, KP)
+    controller = fj.PDController(kp, 0.0, 32.0, Hold(jnp.full(3, 0.25)))
 
     def effort(kp):
         changed = eqx.tree_at(lambda c: c.kp, controller, kp)
