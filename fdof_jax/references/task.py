@@ -116,9 +116,7 @@ class TipTask(TipReference):
 
     path: Path = of_kind(Path)
     timing: Any = called("a Travel or Laps")
-    orientation: Any = field(
-        (), unit="rad", optional=True, default=0.0, kw_only=True
-    )
+    orientation: Any = field((), unit="rad", optional=True, default=0.0, kw_only=True)
     branch: Values = field((), unit="", default=1, kw_only=True)
 
     def conditions(self):
