@@ -1,4 +1,4 @@
-"""Elements, controllers and analysis on a chain of two pairs and on one of five."""
+"""Elements, controllers and analysis on a chain of two pairs and on one of four."""
 
 from types import SimpleNamespace
 
@@ -12,7 +12,7 @@ from elements import SHORT
 
 import fdof_jax as fj
 
-FIVE = pytest.param("RPFRR", marks=pytest.mark.slow)
+FOUR = pytest.param("RPFR", marks=pytest.mark.slow)
 
 
 def elements_of(n, gain, hold, ends):
@@ -81,7 +81,7 @@ def everything(chain, q, qd, qdd, gain, hold, ends):
     )
 
 
-@pytest.fixture(scope="module", params=["RP", FIVE])
+@pytest.fixture(scope="module", params=["RP", FOUR])
 def case(request):
     """A chain, its state and gains, and results; fixed pairs are given odd values."""
     topology = request.param

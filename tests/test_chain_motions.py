@@ -51,15 +51,14 @@ def test_motions_equal_the_reference(name):
     assert error.max() <= before
 
 
+# Of six pairs in reverse mode: `test_gradients_of_motions_equal_differences`.
 @pytest.mark.parametrize(
-    "name, bound",
+    "name, bound, mode",
     [
-        ("double-pendulum", 2e-9),
-        pytest.param("six-pairs", 4e-12, marks=pytest.mark.slow),
+        ("double-pendulum", 2e-9, "forward"),
+        pytest.param("double-pendulum", 2e-9, "reverse", marks=pytest.mark.slow),
+        pytest.param("six-pairs", 4e-12, "forward", marks=pytest.mark.slow),
     ],
-)
-@pytest.mark.parametrize(
-    "mode", ["forward", pytest.param("reverse", marks=pytest.mark.slow)]
 )
 def test_derivatives_of_motions_equal_the_reference(name, bound, mode):
     arm, start, forces, ts = scene(name)
@@ -118,12 +117,14 @@ def test_gradients_of_motions_equal_differences(topology):
     direction = jax.tree.map(lambda a: jnp.asarray(rng.normal(size=a.shape)), arguments)
     direction = eqx.tree_at(lambda d: d[0].ef, direction, jnp.zeros(2 * n))
     single, reverse = jax.jit(value), jax.jit(jax.grad(value))
-    forward = lambda a, d: jax.jvp(
-        lambda a: value(a, diffrax.ForwardMode()), (a,), (d,)
-    )
-    _, slope = jax.jit(forward)(arguments, direction)
     products = jax.tree.map(lambda a, b: jnp.sum(a * b), reverse(arguments), direction)
-    assert float(sum(jax.tree.leaves(products))) == pytest.approx(float(slope), 1e-11)
+    slope = float(sum(jax.tree.leaves(products)))
+    if n == 2:
+        forward = lambda a, d: jax.jvp(
+            lambda a: value(a, diffrax.ForwardMode()), (a,), (d,)
+        )
+        _, tangent = jax.jit(forward)(arguments, direction)
+        assert slope == pytest.approx(float(tangent), 1e-11)
 
     def shifted(step):
         return float(
@@ -132,7 +133,7 @@ def test_gradients_of_motions_equal_differences(topology):
 
     h = 1e-3
     coarse, fine = ((shifted(s) - shifted(-s)) / (2 * s) for s in (h, h / 2))
-    assert float(slope) == pytest.approx((4 * fine - coarse) / 3, rel=1e-8)
+    assert slope == pytest.approx((4 * fine - coarse) / 3, rel=1e-8)
 
 
 def stacked(members):

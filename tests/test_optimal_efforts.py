@@ -126,7 +126,9 @@ def test_scipy_finds_no_better_efforts():
         deviation = tip_deviation(scene.linkage, CONTROLLER.reference, solution)
         return np.asarray(weights[:, None] * deviation).ravel()
 
-    other = least_squares(residuals, np.zeros(18), bounds=(-1, 1), diff_step=1e-6)
+    other = least_squares(
+        residuals, np.zeros(18), bounds=(-1, 1), diff_step=1e-6, ftol=1e-6
+    )
     assert found.tip_error == pytest.approx(np.sqrt(2 * other.cost), rel=1e-3)
 
 

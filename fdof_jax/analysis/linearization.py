@@ -92,6 +92,17 @@ def _linearized(
     return Linearization(*jnp.split(slopes, [2 * q.size], axis=1))
 
 
+@eqx.filter_jit
+def _each_linearized(
+    linkage: Linkage, forces: Forces, solution: Solution
+) -> Float[Array, "time state state"]:
+    """Returns A at each time of a motion."""
+    # A loop compiles in two thirds of the time of `jax.vmap`, and runs four times as
+    # fast (101 times of Fig 7, one core).
+    rows = solution.q, solution.qd, solution.ts
+    return jax.lax.map(lambda row: _linearized(linkage, forces, *row).A, rows)
+
+
 class Modes(eqx.Module):
     """Eigenvalues of the matrix A along a motion, the fastest last.
 
@@ -156,9 +167,7 @@ def closed_loop_modes(linkage: Linkage, forces: Forces, solution: Solution) -> M
             "solution: expected one motion, outside of JAX's transformations, got "
             f"positions {solution.q}."
         )
-    rows = solution.q, solution.qd, solution.ts
-    each = jax.vmap(lambda *row: _linearized(linkage, forces, *row).A)
-    A = np.asarray(each(*rows))
+    A = np.asarray(_each_linearized(linkage, forces, solution))
     known = np.isfinite(A).all(axis=(1, 2))
     values = np.full(A.shape[:2], np.nan, complex)
     values[known] = np.linalg.eigvals(A[known])

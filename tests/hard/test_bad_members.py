@@ -1,6 +1,6 @@
 """Scenes 25 and 26: members of a batch that fail, and solves out of steps.
 
-More tests of members that fail are in tests/test_sweep.py.
+More tests of members that fail are in tests/test_sweep.py, with their gradients.
 """
 
 import diffrax
@@ -9,10 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from modes import ADJOINT
 
 import fdof_jax as fj
-from fdof_jax.simulation.looped_dopri8 import LoopedDopri8
 from hard.scenes import OUTPUTS, START, arm, behind_the_door
 
 SIZE, TS = 256, np.linspace(0, 0.5, 6)
@@ -77,36 +75,6 @@ def test_members_that_fail_harm_no_other(motions):
     assert (mixed.stats["num_steps"][BAD[:2]] < 200).all()
     alone = fj.simulate(arm(), fj.State(*(a[FAST] for a in batch(True)[:2])), TS)
     np.testing.assert_allclose(mixed.q[FAST], alone.q, atol=1e-7)
-
-
-def test_members_that_fail_add_nothing_to_a_shared_gradient():
-    """Reverse mode adds all members' cotangents to the shared mass; 0 x NaN is NaN.
-
-    The default solver is in `test_sweep`.
-    """
-
-    @jax.jit
-    def gradient(mass, q, qd, at, wanted):
-        def loss(mass):
-            linkage = eqx.tree_at(lambda a: a.mass, arm(), mass)
-            motions = fj.sweep(
-                linkage, fj.State(q, qd), TS, (Breaking(at),), forces_axes=0,
-                adjoint=ADJOINT, solver=LoopedDopri8(),
-            )  # fmt: skip
-            counted = (motions.result == diffrax.RESULTS.successful) & wanted
-            end = jnp.where(counted[:, None], motions.q[:, -1], 0)
-            return jnp.sum(end**2) / jnp.sum(counted), jnp.sum(counted)
-
-        return jax.grad(loss, has_aux=True)(mass)
-
-    wanted = jnp.ones(SIZE, bool)
-    mixed, counted = gradient(jnp.ones(3), *batch(True), wanted.at[FAST].set(False))
-    assert counted == SIZE - 3
-    clean, _ = gradient(jnp.ones(3), *batch(False), wanted.at[BAD].set(False))
-    assert np.abs(clean).max() > 1e-3
-    np.testing.assert_allclose(mixed, clean, rtol=1e-9)
-    full, counted = gradient(jnp.ones(3), *batch(True), wanted)
-    assert counted == SIZE - 2 and np.isfinite(full).all()
 
 
 def test_a_member_that_starts_nan_adds_nothing_under_vmap():
