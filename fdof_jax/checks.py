@@ -50,6 +50,7 @@ def real_array(
     finite: bool = True,
     broadcast: bool = False,
     unit: str = "",
+    of: str = "",
 ) -> Array:
     """Returns `value` as an array of the default float dtype and the given shape.
 
@@ -57,12 +58,14 @@ def real_array(
     also accepts one number for all entries, and repeats it if the shape is known.
     Raises ValueError for a wrong shape, a type that is not real numbers, NaN,
     infinities (unless `finite=False`) and entries below `minimum` or not above `above`;
-    the message names the `unit`.
+    the message names the `unit`, and what the numbers are `of`.
     """
 
     def refuse(got: str) -> ValueError:
         size = "x".join("n" if n in (None, JOINT) else str(n) for n in shape)
         expected = f"an array of {size} real numbers" if shape else "a real number"
+        if of:
+            expected += f" for {of}"
         if finite:
             expected += ", all finite" if shape else ", finite"
         if minimum is not None:
@@ -97,7 +100,8 @@ def real_array(
         if above is not None:
             bad |= kept <= above
         if bad.any():
-            raise refuse(np.array2string(np.asarray(array), threshold=20))
+            shown = np.array2string(np.asarray(array), threshold=20)
+            raise refuse(shown.removesuffix("."))  # 1.0 is shown as "1."
         ready = isinstance(value, Array) and value.dtype == kept.dtype
         if ready and fits and not value.weak_type:
             return value

@@ -17,7 +17,7 @@ from ..linkage.coordinates import State, real_state
 from ..linkage.linkage import Linkage, check_linkage, without_fixed
 from ..simulation.field import stateful
 from ..simulation.prescribed import prescribed
-from ..simulation.solution import Solution
+from ..simulation.solution import Solution, check_joints
 
 # Explicit Runge-Kutta methods of order 4 in 4 stages damp every damped mode if the step
 # size times |eigenvalue| is below this (2.8 for undamped and overdamped modes).
@@ -156,6 +156,7 @@ def closed_loop_modes(linkage: Linkage, forces: Forces, solution: Solution) -> M
             "solution: expected one motion, outside of JAX's transformations, got "
             f"positions {solution.q}."
         )
+    check_joints("solution", solution, linkage)
     rows = solution.q, solution.qd, solution.ts
     each = jax.vmap(lambda *row: _linearized(linkage, forces, *row).A)
     A = np.asarray(each(*rows))

@@ -9,7 +9,7 @@ from ..checks import instance, known
 from ..linkage.linkage import Linkage
 from ..linkage.topology import letters
 from ..names import optional_package
-from ..simulation.solution import Solution
+from ..simulation.solution import Solution, check_joints
 
 if TYPE_CHECKING:
     import pandas
@@ -41,6 +41,7 @@ def _checked(
         linkage, solution = solution, linkage
     instance("solution", solution, Solution)
     instance("linkage", linkage, Linkage)
+    check_joints("solution", solution, linkage)
     if not known(solution, linkage):
         raise ValueError("solution, linkage: expected numbers, got traced values.")
     ts = np.asarray(solution.ts).reshape((-1, solution.q.shape[-2]))
