@@ -5,6 +5,7 @@ by `jax.jit`, `jax.vmap` or `jax.grad` is not known yet.
 """
 
 import inspect
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -172,6 +173,18 @@ def keywords_as(
                 f"{name}: expected a keyword among {', '.join(allowed)}, got another."
             )
     return allowed | given
+
+
+def in_order(expected: str, swapped: bool, first: Any, second: Any) -> tuple[Any, Any]:
+    """Returns two arguments in the `expected` order, and warns if they are swapped.
+
+    Version 0.1 had the other order in some functions.
+    """
+    if not swapped:
+        return first, second
+    message = f"fdof_jax: expected ({expected}), got the order of version 0.1"
+    warnings.warn(message, DeprecationWarning, stacklevel=3)
+    return second, first
 
 
 def sign(name: str, value: Any) -> Array:

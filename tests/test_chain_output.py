@@ -88,7 +88,7 @@ def test_elements_of_other_chains_are_refused(name):
             call(REST.q)
     if not name.startswith("command"):  # of a state, which has no linearization
         with pytest.raises(ValueError, match=expected):
-            fj.linearize(TWO, forces, REST)
+            fj.linearize(TWO, REST, forces)
 
 
 def test_states_and_links_of_other_chains_are_refused():
@@ -99,9 +99,9 @@ def test_states_and_links_of_other_chains_are_refused():
     with pytest.raises(ValueError, match=rf"^state\.q: {words}"):
         fj.step(TWO, three, [0, 0], 0.1)
     with pytest.raises(ValueError, match=rf"^state\.q: {words}"):
-        fj.linearize(TWO, (), three)
+        fj.linearize(TWO, three)
     with pytest.raises(ValueError, match=rf"^q: {words}"):
-        fj.analysis.equilibrium(TWO, (), np.zeros(3))
+        fj.analysis.equilibrium(TWO, np.zeros(3))
     point = fj.Point(3, 0.1)
     ends = fj.Point(0, 0.1), point
     for element in (

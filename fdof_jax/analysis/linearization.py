@@ -10,7 +10,7 @@ from jax import Array
 from jaxtyping import Complex, Float
 from numpy.typing import ArrayLike
 
-from ..checks import instance, is_traced, real_array
+from ..checks import in_order, instance, is_traced, real_array
 from ..dynamics import forward_dynamics
 from ..forces.element import Element, Forces, elements_on
 from ..linkage.coordinates import State, real_state
@@ -53,12 +53,12 @@ def checked(linkage: Linkage, forces: Forces) -> tuple[Element, ...]:
 
 
 def linearize(
-    linkage: Linkage, forces: Forces, state: State, t: ArrayLike = 0.0
+    linkage: Linkage, state: State, forces: Forces = (), t: ArrayLike = 0.0
 ) -> Linearization:
     """Linearises the equations of motion about a state, at a time.
 
-    **Arguments:** `linkage`; `forces`: elements without a state of their own; `state`:
-    joint positions and velocities; `t`: time at which the elements are evaluated [s].
+    **Arguments:** `linkage`; `state`: joint positions and velocities; `forces`:
+    elements without a state of their own; `t`: time at which they are evaluated [s].
 
     **Returns:** `A` and `B` of d(q, qd)/dt = A (q, qd) + B tau, for small changes. The
     efforts tau act in the joints in addition to the forces [N or N m]. For a force with
@@ -70,10 +70,12 @@ def linearize(
     >>> import numpy as np
     >>> arm, start, *_ = fj.scenes.fig5()
     >>> hanging = start._replace(q=np.array([-np.pi / 2, 0, 0]))
-    >>> linear = fj.linearize(arm, (), hanging)
+    >>> linear = fj.linearize(arm, hanging)
     >>> np.sort(abs(np.linalg.eigvals(linear.A)))[::2].tolist()  # modes [rad/s]
     [2.02, 4.744, 7.855]
     """
+    swapped = isinstance(state, tuple) and all(map(callable, state))
+    state, forces = in_order("linkage, state, forces", swapped, state, forces)
     forces = checked(linkage, forces)
     q, qd = map(jnp.asarray, real_state("state", state, linkage))
     return _linearized(linkage, forces, q, qd, real_array("t", t, ()))
