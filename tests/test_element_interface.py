@@ -225,6 +225,14 @@ def test_a_reference_of_one_s_own():
     assert fj.PDController(1.0, 1.0, 1.0, Hold(q)).jump_ts is None
 
 
+def test_a_reference_without_a_motion_is_refused():
+    class Nothing(fj.references.Reference):
+        pass
+
+    with pytest.raises(TypeError, match="^Nothing: expected a method `__call__`"):
+        Nothing()
+
+
 def test_nothing_else_is_asked_for_attributes():
     """Only the adapter asks; saved trees are read by the names of their fields."""
     folder = Path(fj.__file__).parent
