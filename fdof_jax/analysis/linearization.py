@@ -31,8 +31,8 @@ class Linearization(NamedTuple):
     [N or N m].
     """
 
-    A: Float[Array, "6 6"]
-    B: Float[Array, "6 joint"]
+    A: Float[Array, "state state"]
+    B: Float[Array, "state joint"]
 
 
 def depends_on_state_alone(forces: tuple[Element, ...]) -> bool:
