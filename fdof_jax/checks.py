@@ -5,6 +5,7 @@ by `jax.jit`, `jax.vmap` or `jax.grad` is not known yet.
 """
 
 import inspect
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -50,6 +51,7 @@ def real_array(
     finite: bool = True,
     broadcast: bool = False,
     unit: str = "",
+    of: str = "",
 ) -> Array:
     """Returns `value` as an array of the default float dtype and the given shape.
 
@@ -57,12 +59,14 @@ def real_array(
     also accepts one number for all entries, and repeats it if the shape is known.
     Raises ValueError for a wrong shape, a type that is not real numbers, NaN,
     infinities (unless `finite=False`) and entries below `minimum` or not above `above`;
-    the message names the `unit`.
+    the message names the `unit`, and what the numbers are `of`.
     """
 
     def refuse(got: str) -> ValueError:
         size = "x".join("n" if n in (None, JOINT) else str(n) for n in shape)
         expected = f"an array of {size} real numbers" if shape else "a real number"
+        if of:
+            expected += f" for {of}"
         if finite:
             expected += ", all finite" if shape else ", finite"
         if minimum is not None:
@@ -97,7 +101,8 @@ def real_array(
         if above is not None:
             bad |= kept <= above
         if bad.any():
-            raise refuse(np.array2string(np.asarray(array), threshold=20))
+            shown = np.array2string(np.asarray(array), threshold=20)
+            raise refuse(shown.removesuffix("."))  # 1.0 is shown as "1."
         ready = isinstance(value, Array) and value.dtype == kept.dtype
         if ready and fits and not value.weak_type:
             return value
@@ -168,6 +173,18 @@ def keywords_as(
                 f"{name}: expected a keyword among {', '.join(allowed)}, got another."
             )
     return allowed | given
+
+
+def in_order(expected: str, swapped: bool, first: Any, second: Any) -> tuple[Any, Any]:
+    """Returns two arguments in the `expected` order, and warns if they are swapped.
+
+    Version 0.1 had the other order in some functions.
+    """
+    if not swapped:
+        return first, second
+    message = f"fdof_jax: expected ({expected}), got the order of version 0.1"
+    warnings.warn(message, DeprecationWarning, stacklevel=3)
+    return second, first
 
 
 def sign(name: str, value: Any) -> Array:

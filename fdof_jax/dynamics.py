@@ -4,7 +4,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
-from .forces.added_inertia import added_energy, added_inertia, energetic, inertial
+from .forces.added_inertia import added_energy, added_inertia, energetic_on, inertial_on
 from .forces.element import Forces
 from .linkage.linkage import Linkage, compiled
 from .mechanics.equations import Constants, equations, link_constants, zeros
@@ -13,7 +13,7 @@ from .mechanics.rates import inertia_diagonals, rates
 from .mechanics.solve import with_added
 
 
-@compiled("q", "qd", "tau", forces=inertial)
+@compiled("q", "qd", "tau", forces=inertial_on)
 def forward_dynamics(
     linkage: Linkage,
     q: Float[Array, " joint"],
@@ -43,7 +43,7 @@ def forward_dynamics(
     return jnp.stack(qdd)
 
 
-@compiled("q", forces=inertial)
+@compiled("q", forces=inertial_on)
 def inertia_ratios(
     linkage: Linkage, q: Float[Array, " joint"], forces: Forces = ()
 ) -> Float[Array, " joint"]:
@@ -69,7 +69,7 @@ def inertia_ratios(
     return jnp.stack([jnp.where(own > 0, 1 / i / own, 0) for own, i in pairs])
 
 
-@compiled("q", "qd", "qdd", forces=inertial)
+@compiled("q", "qd", "qdd", forces=inertial_on)
 def inverse_dynamics(
     linkage: Linkage,
     q: Float[Array, " joint"],
@@ -93,7 +93,7 @@ def inverse_dynamics(
     return matrix @ qdd + bias  # 0 at fixed pairs, as `qdd` and the bias are
 
 
-@compiled("q", forces=inertial)
+@compiled("q", forces=inertial_on)
 def joint_mass_matrix(
     linkage: Linkage, q: Float[Array, " joint"], forces: Forces = ()
 ) -> Float[Array, "joint joint"]:
@@ -114,7 +114,7 @@ def joint_mass_matrix(
     return mass_and_bias(linkage, forces, q, jnp.zeros_like(q))[0]
 
 
-@compiled("q", "qd", forces=inertial)
+@compiled("q", "qd", forces=inertial_on)
 def joint_bias(
     linkage: Linkage,
     q: Float[Array, " joint"],
@@ -186,7 +186,7 @@ def link_energies(
     return kinetic / 2, linkage.mass * linkage.gravity * height
 
 
-@compiled("q", "qd", forces=energetic)
+@compiled("q", "qd", forces=energetic_on)
 def energy(
     linkage: Linkage,
     q: Float[Array, " joint"],

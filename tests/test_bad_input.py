@@ -295,7 +295,8 @@ def test_circles_out_of_reach_are_refused_at_the_door(circle):
     )
     if "center" in circle:  # this arm's slide has no end: only too near is out of reach
         scene = scene._replace(linkage=make("RRR"))
-    with pytest.raises(ValueError, match="^reference: expected .* reach .*, got .*"):
+    place = r"^forces\[0\]\.reference"
+    with pytest.raises(ValueError, match=place + ": expected .* reach .*, got .*"):
         fj.simulate(scene.linkage, scene.state0, [0, 5.0], forces)
 
 

@@ -57,7 +57,7 @@ def everything(chain, q, qd, qdd, gain, hold, ends):
     )
     direction = jnp.stack([q + 0.3, qd - 0.2])
     direction = jnp.where(jnp.stack([gain, gain]) > 0, direction, 0)
-    linear = fj.linearize(chain, (elements["damper"],), fj.State(q, qd))
+    linear = fj.linearize(chain, fj.State(q, qd), (elements["damper"],))
     return dict(
         effort=effort,
         at_rest=at_rest,
@@ -147,7 +147,7 @@ def test_linearization_is_the_derivative(case):
 def test_equilibrium_is_held_by_the_controller(case):
     pd = fj.PDController(500 * case.gain, 1.0, np.inf, case.hold)
     guess = np.where(case.real, case.target, 7.0)
-    q = fj.analysis.equilibrium(case.chain, (pd,), guess)
+    q = fj.analysis.equilibrium(case.chain, guess, (pd,))
     same(np.asarray(q)[~case.real], 0)
     held = fj.analysis.holding_efforts(case.chain, q)
     same(np.where(case.real, pd(0.0, q, 0 * q, case.chain), 0), held, 1e-8)

@@ -1,6 +1,7 @@
 """Tables, files and pictures of chains, and shapes that do not fit a chain."""
 
 import chains
+import diffrax
 import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
@@ -87,7 +88,7 @@ def test_elements_of_other_chains_are_refused(name):
             call(REST.q)
     if not name.startswith("command"):  # of a state, which has no linearization
         with pytest.raises(ValueError, match=expected):
-            fj.linearize(TWO, forces, REST)
+            fj.linearize(TWO, REST, forces)
 
 
 def test_states_and_links_of_other_chains_are_refused():
@@ -98,9 +99,9 @@ def test_states_and_links_of_other_chains_are_refused():
     with pytest.raises(ValueError, match=rf"^state\.q: {words}"):
         fj.step(TWO, three, [0, 0], 0.1)
     with pytest.raises(ValueError, match=rf"^state\.q: {words}"):
-        fj.linearize(TWO, (), three)
+        fj.linearize(TWO, three)
     with pytest.raises(ValueError, match=rf"^q: {words}"):
-        fj.analysis.equilibrium(TWO, (), np.zeros(3))
+        fj.analysis.equilibrium(TWO, np.zeros(3))
     point = fj.Point(3, 0.1)
     ends = fj.Point(0, 0.1), point
     for element in (
@@ -108,14 +109,56 @@ def test_states_and_links_of_other_chains_are_refused():
         fj.SpringDamper(*ends, stiffness=1.0),
         fj.LinearActuator(*ends),
     ):
-        with pytest.raises(ValueError, match="^link: expected 0 .* 1 to 2, got 3"):
+        with pytest.raises(
+            ValueError, match=r"^forces\[0\]\.link: expected 0 .* 1 to 2, got"
+        ):
             fj.simulate(TWO, REST, [0, 0.1], (element,))
+    armature, zeros = (fj.forces.Armature([1, 2, 3]),), np.zeros(2)
+    for call in (fj.forward_dynamics, lambda *row: fj.energy(*row[:3], row[4])):
+        with pytest.raises(ValueError, match=r"^forces\[0\]\.inertia: .* 2 joints"):
+            call(TWO, zeros, zeros, zeros, armature)
     # A sweep solves values as they are: such a member fails.
     both = fj.State(np.zeros((2, 2)), np.zeros((2, 2)))
     swept = fj.sweep(TWO, both, [0, 0.1], (fj.Wrench(point, [1, 0]),), **SHORT)
     assert swept.outcome.tolist() == ["not finite"] * 2
     hold = chains.Hold(jnp.zeros(3))
-    with pytest.raises(ValueError, match="^joints: expected 1 to 2, got .*3"):
+    with pytest.raises(ValueError, match=r"\.joints: expected 1 to 2, got .*3"):
         fj.simulate(TWO, REST, [0, 0.1], (fj.PrescribedMotion(3, hold),))
     with pytest.raises(ValueError, match=f"^reference: {words}"):
         fj.simulate(TWO, REST, [0, 0.1], (fj.PDController(1, 1, 1, hold),))
+
+
+def test_motions_of_other_chains_are_refused():
+    motion = fj.Solution(
+        *(np.zeros(2), np.zeros((2, 3)), np.zeros((2, 3))),
+        stats={"num_steps": 1, "time_reached": 0.0},
+        result=diffrax.RESULTS.successful,
+    )
+    task = fj.CircleTask()
+    for call in (
+        lambda: fj.to_pandas(TWO, motion),
+        lambda: fj.to_xarray(TWO, motion),
+        lambda: fj.drawing.chrono_cyclograph(TWO, motion),
+        lambda: fj.plotting.energy_profile(TWO, motion),
+        lambda: fj.plotting.effort_profile(TWO, (), motion),
+        lambda: fj.plotting.tracking_by_error(TWO, task, motion),
+        lambda: fj.analysis.closed_loop_modes(TWO, (), motion),
+        lambda: fj.joint_efforts(TWO, (), motion),
+    ):
+        with pytest.raises(ValueError, match="^solution: expected a motion of 2 joint"):
+            call()
+    with pytest.raises(ValueError, match=r"^motions\['a'\]: expected a motion of 2"):
+        fj.drawing.topology_grid({"a": (TWO, motion)})
+
+
+def test_sizes_are_refused_with_their_reason():
+    fields = dict(length=[0, 1, 1], com=np.zeros((2, 2)), mass=[1, 1], inertia=[1, 1])
+    for name, words in (
+        ("length", "3 real numbers for the ground and 2 moving links"),
+        ("mass", "2 real numbers for 2 moving links"),
+        ("com", "2x2 real numbers for 2 moving links"),
+    ):
+        with pytest.raises(ValueError, match=f"^{name}: expected an array of {words}"):
+            fj.Linkage("RR", **fields | {name: np.zeros((4, 4))})
+    with pytest.raises(ValueError, match="^q: expected .* numbers for 2 joints"):
+        fj.tip_position(TWO, [0, 0, 0])

@@ -11,6 +11,7 @@ from elements import PD, Hold, arm
 
 import fdof_jax as fj
 from fdof_jax.forces.element import elements
+from fdof_jax.simulation.field import element_effort
 from fdof_jax.simulation.simulate import check_elements
 
 ARM, TS = arm("RRR"), jnp.array([0.0, 1.0])
@@ -66,6 +67,64 @@ def test_every_element_tells_a_program_what_is_impossible():
     assert not moved(effort, lambda e: e.tau, [1.0, np.inf, 3.0]).possible()
 
 
+class Graded(fj.Element):
+    """Numbers that must fall: a condition on an array, which shows one value."""
+
+    levels: fj.Values = fj.field((3,), unit="N m")
+
+    def conditions(self):
+        falling = self.levels[1:] < self.levels[:-1]
+        yield fj.forces.Condition(falling, "levels", "falling numbers", self.levels)
+
+    def __call__(self, t, q, qd, linkage):
+        return self.levels
+
+
+def test_a_condition_may_be_an_array_and_show_one_value():
+    graded = Graded([3, 2, 1])
+    assert graded.possible()
+    with pytest.raises(ValueError, match=r"^levels: expected falling .*\[3\. 2\. 4"):
+        Graded([3, 2, 4])
+    spoilt = moved(graded, lambda g: g.levels, [3, 2, 4])
+    assert not jax.jit(lambda g: g.possible())(spoilt)
+
+
+def test_a_number_is_shown_without_a_second_stop():
+    with pytest.raises(ValueError, match=r"got -1\.$"):
+        fj.JointDamper(np.array(-1.0))
+
+
+class Unequal(fj.forces.InertialElement):
+    def coordinates(self, q, linkage):
+        return q[:2]
+
+    def weights(self, linkage):
+        return jnp.ones(3)
+
+
+def test_weights_are_as_many_as_coordinates():
+    q = jnp.zeros(3)
+    for call in (fj.forward_dynamics, lambda *row: fj.energy(*row[:3], row[4])):
+        with pytest.raises(ValueError, match="^Unequal: .*as many weights .*3,.*2,"):
+            call(ARM, q, q, q, (Unequal(),))
+
+
+class Lost(fj.forces.StatefulElement):
+    """Returns the rate of another state."""
+
+    def initial_state(self, linkage):
+        return jnp.zeros(3)
+
+    def __call__(self, t, q, qd, linkage, state):
+        return q, state[:2]
+
+
+def test_messages_on_states_show_shapes():
+    q = jnp.zeros(3)
+    with pytest.raises(ValueError, match=r"rate .*state, f64\[3\], got f64\[2\]\."):
+        element_effort(0, Lost(), 0.0, q, q, ARM, q)
+
+
 def test_a_fault_within_is_told_with_its_place():
     lag = fj.control.FirstOrderLag(fj.control.SpeedLimit(PD, 1.0, 2.0), 0.1)
     spoilt = eqx.tree_at(lambda e: e.command.command.kp, lag, -PD.kp)
@@ -113,7 +172,7 @@ def test_attributes_of_other_callables_count():
     np.testing.assert_array_equal(element.jump_ts, TS)
     assert elements("forces", (element, PD)) == (element, PD)  # adapted once
     for size, words in (
-        (9.0, "^size: too much"),
+        (9.0, r"^forces\[0\]\.size: too much"),
         (-1.0, r"^forces\[0\]: expected values"),
     ):
         with pytest.raises(ValueError, match=words):
@@ -164,6 +223,14 @@ def test_a_reference_of_one_s_own():
     assert (q.tolist(), qd.tolist()) == ([12.0] * 3, [12.0] * 3)
     assert Parabola(3).tip is None and fj.CircleTask().tip is not None
     assert fj.PDController(1.0, 1.0, 1.0, Hold(q)).jump_ts is None
+
+
+def test_a_reference_without_a_motion_is_refused():
+    class Nothing(fj.references.Reference):
+        pass
+
+    with pytest.raises(TypeError, match="^Nothing: expected a method `__call__`"):
+        Nothing()
 
 
 def test_nothing_else_is_asked_for_attributes():

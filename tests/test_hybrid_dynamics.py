@@ -14,11 +14,12 @@ import fdof_jax as fj
 
 # A cart that slides along x and carries a pendulum: link 3 turns with link 4.
 LENGTH, MASS, INERTIA, G = 0.8, 1.5, 0.2, 9.81
-CART = fj.Linkage(
-    "PRR", length=[0, 0, 0, LENGTH], com=[[0, 0], [0, 0], [LENGTH, 0]],
-    mass=[2, 0, MASS], inertia=[1, INERTIA, 0], locked=[0, 0, 0], base_angle=-np.pi / 2,
-    gravity=G,
-)  # fmt: skip
+with pytest.warns(UserWarning, match="joints 2 and 3 coincide"):
+    CART = fj.Linkage(
+        "PRR", length=[0, 0, 0, LENGTH], com=[[0, 0], [0, 0], [LENGTH, 0]],
+        mass=[2, 0, MASS], inertia=[1, INERTIA, 0], locked=[0, 0, 0],
+        base_angle=-np.pi / 2, gravity=G,
+    )  # fmt: skip
 ROTOR = MASS * LENGTH**2 + INERTIA
 FREQUENCY = np.sqrt(MASS * G * LENGTH / ROTOR)
 REST = fj.State(np.zeros(3), np.zeros(3))

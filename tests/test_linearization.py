@@ -58,7 +58,7 @@ def slopes(function, y, h=1e-6):
 def test_a_and_b_are_slopes(topology):
     linkage, q, qd, tau = motion(topology)
     forces = fj.JointDamper(0.3), fj.JointEffort(tau), fj.forces.Armature(0.2)
-    A, B = fj.linearize(linkage, forces, fj.State(q, qd))
+    A, B = fj.linearize(linkage, fj.State(q, qd), forces)
 
     def rates(y, effort):
         total = tau - 0.3 * y[3:] + effort
@@ -76,9 +76,9 @@ def test_small_deviations_follow_the_exponential_of_a():
     linkage, q, *_ = motion("RPR")
     forces = (held(linkage, q, [60.0, 90.0, 40.0], [5.0, 3.0, 2.0]),)
     np.testing.assert_allclose(
-        fj.analysis.equilibrium(linkage, forces, q + 0.05), q, atol=1e-8
+        fj.analysis.equilibrium(linkage, q + 0.05, forces), q, atol=1e-8
     )
-    A, _ = fj.linearize(linkage, forces, fj.State(q, STILL))
+    A, _ = fj.linearize(linkage, fj.State(q, STILL), forces)
     deviation = 1e-5 * np.array([1, -2, 3, 4, -5, 6])
     start = fj.State(q + deviation[:3], deviation[3:])
     solution = fj.simulate(linkage, start, [0, 0.5], forces)
@@ -99,7 +99,7 @@ def test_a_stiff_controller_of_limited_efforts_has_an_equilibrium():
         """Returns the equilibrium and its derivative in the guess, from one program."""
 
         def twice(q):
-            found = fj.analysis.equilibrium(scene.linkage, scene.forces, q)
+            found = fj.analysis.equilibrium(scene.linkage, q, scene.forces)
             return found, found
 
         return jax.jacfwd(twice, has_aux=True)(guess)
@@ -186,7 +186,7 @@ def test_equilibria_are_where_the_efforts_hold_the_arm(topology):
     np.testing.assert_allclose(qdd, 0, atol=1e-9)
     forces = (held(linkage, q, [300.0, 200.0, 100.0], np.ones(3)),)
     np.testing.assert_allclose(
-        fj.analysis.equilibrium(linkage, forces, q + 0.05), q, atol=1e-8
+        fj.analysis.equilibrium(linkage, q + 0.05, forces), q, atol=1e-8
     )
 
 
@@ -195,7 +195,7 @@ def test_masses_of_elements_are_held_too():
     linkage, q, *_ = motion("PRR")
     load = TipLoad()
     controller = held(linkage, q, [300.0, 200.0, 100.0], np.ones(3), (load,))
-    found = fj.analysis.equilibrium(linkage, (controller, load), q + 0.05)
+    found = fj.analysis.equilibrium(linkage, q + 0.05, (controller, load))
     np.testing.assert_allclose(found, q, atol=1e-8)
 
 
@@ -203,7 +203,7 @@ def test_masses_of_elements_are_held_too():
 def test_loads_that_nothing_holds_have_no_equilibrium(share, found):
     """A shoulder motor can be too weak or too strong for every posture."""
     tau = share * fj.analysis.holding_efforts(ROD, STILL)
-    q = fj.analysis.equilibrium(ROD, (fj.JointEffort(tau),), [0.4, 0.1, -0.1])
+    q = fj.analysis.equilibrium(ROD, [0.4, 0.1, -0.1], (fj.JointEffort(tau),))
     assert np.isfinite(q).all() == found
     if found:
         np.testing.assert_allclose(fj.analysis.holding_efforts(ROD, q), tau, atol=1e-9)
@@ -256,12 +256,23 @@ def test_nine_combinations_of_the_parameters_of_an_rpr_arm_are_identified():
 def test_elements_that_are_no_function_of_the_state_are_refused(element):
     state = fj.State(STILL, STILL)
     for call in (
-        lambda: fj.linearize(ROD, (element,), state),
-        lambda: fj.analysis.equilibrium(ROD, (element,), STILL),
+        lambda: fj.linearize(ROD, state, (element,)),
+        lambda: fj.analysis.equilibrium(ROD, STILL, (element,)),
         lambda: modes_at(ROD, (element,), (STILL, STILL)),
     ):
         with pytest.raises(ValueError, match="forces: expected elements without"):
             call()
+
+
+def test_the_order_of_0_1_is_deprecated():
+    state, forces = fj.State(STILL, STILL), (fj.JointDamper(1.0),)
+    calls = [(fj.linearize, state), (fj.analysis.equilibrium, np.array([-1.6, 0, 0]))]
+    for function, at in calls:
+        now = function(ROD, at, forces)
+        with pytest.warns(DeprecationWarning, match="order of version 0.1") as warned:
+            before = function(ROD, forces, at)
+        assert [warning.filename for warning in warned] == [__file__]
+        assert all(map(np.array_equal, now, before))
 
 
 def test_modes_are_refused_of_what_is_traced_or_stacked():

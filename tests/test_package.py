@@ -62,8 +62,8 @@ def test_pickles_and_import_errors():
 
 OF_0_1 = json.loads((Path(__file__).parent / "names_of_0.1.json").read_text())
 
-# Both orders of arguments work: see tests/test_tables.py.
-OTHER_ORDER = "to_pandas", "to_xarray"
+# Both orders of arguments work: see test_tables.py and test_linearization.py.
+OTHER_ORDER = "to_pandas", "to_xarray", "linearize", "equilibrium"
 
 
 @pytest.mark.parametrize("name", OF_0_1)

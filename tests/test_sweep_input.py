@@ -67,7 +67,7 @@ def test_states_of_another_shape_are_refused(value):
 
 @pytest.mark.parametrize(
     "state0",
-    [None, 3, [STATES.q], (STATES.q,) * 3, ("a", "b"), ([[0], [0, 1]], STATES.qd)],
+    [None, 3, [STATES.q], (STATES.q,) * 3, ("one", "two"), ([[0], [0, 1]], STATES.qd)],
     ids=str,
 )
 def test_what_is_not_a_state_is_refused(state0):

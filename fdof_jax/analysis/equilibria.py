@@ -8,7 +8,7 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from ..checks import real_array
+from ..checks import in_order, real_array
 from ..dynamics import inverse_dynamics
 from ..forces.element import Forces
 from ..linkage.linkage import Linkage, joints_of, without_fixed
@@ -17,15 +17,15 @@ from .linearization import checked
 
 
 def equilibrium(
-    linkage: Linkage, forces: Forces, q: ArrayLike, t: ArrayLike = 0.0
+    linkage: Linkage, q: ArrayLike, forces: Forces = (), t: ArrayLike = 0.0
 ) -> Float[Array, " joint"]:
     """Joint positions near `q` at which the arm stays at rest under its forces.
 
     An equilibrium is an operating point for `linearize`. Under a PD controller it is
     the position held while the reference stands still, including the sag.
 
-    **Arguments:** `linkage`; `forces`: elements without a state of their own; `q`:
-    first guess [m or rad]; `t`: time at which the elements are evaluated [s].
+    **Arguments:** `linkage`; `q`: first guess [m or rad]; `forces`: elements without a
+    state of their own; `t`: time at which they are evaluated [s].
 
     **Returns:** positions (n,); NaN if the Levenberg-Marquardt method finds none, for
     instance from a guess at which actuators are at their limits. The equilibrium need
@@ -35,9 +35,11 @@ def equilibrium(
 
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig5().linkage
-    >>> fj.analysis.equilibrium(arm, (), [-1.0, 0.1, 0.1]).tolist()  # it hangs
+    >>> fj.analysis.equilibrium(arm, [-1.0, 0.1, 0.1]).tolist()  # it hangs
     [-1.571, 0.0, 0.0]
     """
+    swapped = isinstance(q, tuple) and all(map(callable, q))
+    q, forces = in_order("linkage, q, forces", swapped, q, forces)
     forces = checked(linkage, forces)
     return _rest(
         linkage,

@@ -10,14 +10,14 @@ from jax import Array
 from jaxtyping import Complex, Float
 from numpy.typing import ArrayLike
 
-from ..checks import instance, is_traced, real_array
+from ..checks import in_order, instance, is_traced, real_array
 from ..dynamics import forward_dynamics
 from ..forces.element import Element, Forces, elements_on
 from ..linkage.coordinates import State, real_state
 from ..linkage.linkage import Linkage, check_linkage, without_fixed
 from ..simulation.field import stateful
 from ..simulation.prescribed import prescribed
-from ..simulation.solution import Solution
+from ..simulation.solution import Solution, check_joints
 
 # Explicit Runge-Kutta methods of order 4 in 4 stages damp every damped mode if the step
 # size times |eigenvalue| is below this (2.8 for undamped and overdamped modes).
@@ -31,8 +31,8 @@ class Linearization(NamedTuple):
     [N or N m].
     """
 
-    A: Float[Array, "6 6"]
-    B: Float[Array, "6 joint"]
+    A: Float[Array, "state state"]
+    B: Float[Array, "state joint"]
 
 
 def depends_on_state_alone(forces: tuple[Element, ...]) -> bool:
@@ -53,12 +53,12 @@ def checked(linkage: Linkage, forces: Forces) -> tuple[Element, ...]:
 
 
 def linearize(
-    linkage: Linkage, forces: Forces, state: State, t: ArrayLike = 0.0
+    linkage: Linkage, state: State, forces: Forces = (), t: ArrayLike = 0.0
 ) -> Linearization:
     """Linearises the equations of motion about a state, at a time.
 
-    **Arguments:** `linkage`; `forces`: elements without a state of their own; `state`:
-    joint positions and velocities; `t`: time at which the elements are evaluated [s].
+    **Arguments:** `linkage`; `state`: joint positions and velocities; `forces`:
+    elements without a state of their own; `t`: time at which they are evaluated [s].
 
     **Returns:** `A` and `B` of d(q, qd)/dt = A (q, qd) + B tau, for small changes. The
     efforts tau act in the joints in addition to the forces [N or N m]. For a force with
@@ -70,10 +70,12 @@ def linearize(
     >>> import numpy as np
     >>> arm, start, *_ = fj.scenes.fig5()
     >>> hanging = start._replace(q=np.array([-np.pi / 2, 0, 0]))
-    >>> linear = fj.linearize(arm, (), hanging)
+    >>> linear = fj.linearize(arm, hanging)
     >>> np.sort(abs(np.linalg.eigvals(linear.A)))[::2].tolist()  # modes [rad/s]
     [2.02, 4.744, 7.855]
     """
+    swapped = isinstance(state, tuple) and all(map(callable, state))
+    state, forces = in_order("linkage, state, forces", swapped, state, forces)
     forces = checked(linkage, forces)
     q, qd = map(jnp.asarray, real_state("state", state, linkage))
     return _linearized(linkage, forces, q, qd, real_array("t", t, ()))
@@ -167,6 +169,7 @@ def closed_loop_modes(linkage: Linkage, forces: Forces, solution: Solution) -> M
             "solution: expected one motion, outside of JAX's transformations, got "
             f"positions {solution.q}."
         )
+    check_joints("solution", solution, linkage)
     A = np.asarray(_each_linearized(linkage, forces, solution))
     known = np.isfinite(A).all(axis=(1, 2))
     values = np.full(A.shape[:2], np.nan, complex)

@@ -1,15 +1,14 @@
 """Motions as xarray Datasets and pandas DataFrames (optional packages)."""
 
-import warnings
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..checks import instance, known
+from ..checks import in_order, instance, known
 from ..linkage.linkage import Linkage
 from ..linkage.topology import letters
 from ..names import optional_package
-from ..simulation.solution import Solution
+from ..simulation.solution import Solution, check_joints
 
 if TYPE_CHECKING:
     import pandas
@@ -31,16 +30,11 @@ def _rate(unit: str) -> str:
     return " or ".join(f"{one}/s" for one in unit.split(" or "))
 
 
-def _checked(
-    linkage: Any, solution: Any
-) -> tuple[Linkage, Solution, np.ndarray, list[str]]:
-    """The arguments, the common times of all motions, and names of the batch axes."""
-    if isinstance(linkage, Solution):  # the order of version 0.1
-        message = "fdof_jax: expected (linkage, solution), got (solution, linkage)"
-        warnings.warn(message, DeprecationWarning, stacklevel=3)
-        linkage, solution = solution, linkage
+def _checked(linkage: Linkage, solution: Solution) -> tuple[np.ndarray, list[str]]:
+    """The common times of all motions, and names of the batch axes."""
     instance("solution", solution, Solution)
     instance("linkage", linkage, Linkage)
+    check_joints("solution", solution, linkage)
     if not known(solution, linkage):
         raise ValueError("solution, linkage: expected numbers, got traced values.")
     ts = np.asarray(solution.ts).reshape((-1, solution.q.shape[-2]))
@@ -50,7 +44,7 @@ def _checked(
         )
     axes = solution.q.ndim - 2
     batch = ["batch"] if axes == 1 else [f"batch_{k + 1}" for k in range(axes)]
-    return linkage, solution, ts[0], batch
+    return ts[0], batch
 
 
 def to_xarray(linkage: Linkage, solution: Solution) -> "xarray.Dataset":
@@ -72,7 +66,9 @@ def to_xarray(linkage: Linkage, solution: Solution) -> "xarray.Dataset":
     for malformed arguments.
     """
     xarray = optional_package("xarray", "data")
-    linkage, solution, times, batch = _checked(linkage, solution)
+    swapped = isinstance(linkage, Solution)
+    linkage, solution = in_order("linkage, solution", swapped, linkage, solution)
+    times, batch = _checked(linkage, solution)
     names, units = _joints(linkage)
     common = units[0] if len(set(units)) == 1 else "m or rad"
     rows, steps = [*batch, "time", "joint"], solution.stats["num_steps"]
@@ -114,7 +110,9 @@ def to_pandas(linkage: Linkage, solution: Solution) -> "pandas.DataFrame":
     for malformed arguments.
     """
     pandas = optional_package("pandas", "data")
-    linkage, solution, times, batch = _checked(linkage, solution)
+    swapped = isinstance(linkage, Solution)
+    linkage, solution = in_order("linkage, solution", swapped, linkage, solution)
+    times, batch = _checked(linkage, solution)
     columns = {}
     for values, unit_of in ((solution.q, str), (solution.qd, _rate)):
         for k, (name, unit) in enumerate(zip(*_joints(linkage))):

@@ -2,6 +2,7 @@
 
 from functools import reduce
 from operator import add
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -9,18 +10,22 @@ from jax import Array
 
 from ..linkage.linkage import Linkage
 from ..mechanics.equations import Upper
-from .element import Element, Forces, InertialElement, elements
+from .element import Element, Forces, InertialElement, elements_on
 
 
 def inertial(forces: Forces) -> tuple[InertialElement, ...]:
+    """Returns the elements that move masses."""
+    return tuple(e for e in forces if isinstance(e, InertialElement))
+
+
+def inertial_on(linkage: Linkage, forces: Any) -> tuple[InertialElement, ...]:
     """Checks the tuple of elements and returns those that move masses."""
-    found = elements("forces", forces)
-    return tuple(e for e in found if isinstance(e, InertialElement))
+    return inertial(elements_on(linkage, forces))
 
 
-def energetic(forces: Forces) -> tuple[Element, ...]:
+def energetic_on(linkage: Linkage, forces: Any) -> tuple[Element, ...]:
     """Checks the tuple of elements and returns those with energy, springs included."""
-    found = elements("forces", forces)
+    found = elements_on(linkage, forces)
     return tuple(e for e in found if e.potential_energy is not None)
 
 
@@ -29,13 +34,24 @@ def added_energy(
 ) -> tuple[Array, Array]:
     """Computes the kinetic and the potential energy of the elements [J]."""
     kinetic, potential = jnp.zeros(()), jnp.zeros(())
-    for element in energetic(forces):
+    for element in energetic_on(linkage, forces):
         potential = potential + element.potential_energy(q, linkage)
         if isinstance(element, InertialElement):
             coordinates = lambda q, e=element: e.coordinates(q, linkage)
             _, rates = jax.jvp(coordinates, (q,), (qd,))
-            kinetic = kinetic + jnp.sum(element.weights(linkage) * rates**2) / 2
+            weights = _weights(element, linkage, rates)
+            kinetic = kinetic + jnp.sum(weights * rates**2) / 2
     return kinetic, potential
+
+
+def _weights(element: InertialElement, linkage: Linkage, coordinates: Array) -> Array:
+    weights = jnp.asarray(element.weights(linkage))
+    if weights.shape != coordinates.shape or weights.ndim != 1:
+        raise ValueError(
+            f"{type(element).__name__}: expected as many weights as coordinates, got "
+            f"shapes {weights.shape} and {coordinates.shape}."
+        )
+    return weights
 
 
 def added_inertia(
@@ -53,7 +69,10 @@ def added_inertia(
         coordinates = lambda q, e=element: e.coordinates(q, linkage)
         along = lambda q, c=coordinates: jax.jvp(c, (q,), (qd,))[1]
         _, turning = jax.jvp(along, (q,), (qd,))
-        jacobian, weights = jax.jacfwd(coordinates)(q), element.weights(linkage)
+        jacobian, weights = (
+            jax.jacfwd(coordinates)(q),
+            _weights(element, linkage, turning),
+        )
         weighted = weights[:, None] * jacobian
         matrices.append(jnp.sum(weighted[:, :, None] * jacobian[:, None, :], axis=0))
         slope = jax.jacfwd(lambda q, e=element: e.potential_energy(q, linkage))(q)

@@ -95,15 +95,15 @@ class _Default:
 class Condition(NamedTuple):
     """A condition on the values of an element or a reference: see `Element.conditions`.
 
-    - `holds`: whether it is fulfilled: one bool, or an array () of it.
-    - `name`, `expected`: of the message if it is not; `got`: a tuple of the values that
-      the message shows.
+    - `holds`: whether it is fulfilled: a bool, or an array whose entries must all be.
+    - `name`, `expected`: of the message if it is not; `got`: the value that the message
+      shows, or a tuple of several.
     """
 
     holds: Any
     name: str
     expected: str
-    got: tuple[Any, ...]
+    got: Any
 
 
 @dataclass_transform(field_specifiers=(eqx.field, field, called, of_kind))
@@ -127,7 +127,7 @@ class Part(eqx.Module, metaclass=_Fields):
 
     def possible(self) -> Any:
         """Returns whether the constructor would accept the values; also if traced."""
-        own = [condition.holds for condition in self.conditions()]
+        own = [_all(condition.holds) for condition in self.conditions()]
         fields = [_bounded(value, rules) for _, value, rules in _declared(self)]
         parts = [part.possible() for _, part in _within(self)]
         return reduce(and_, [*own, *fields, *parts], True)
@@ -155,9 +155,13 @@ def check_values(place: str, part: Part) -> None:
 
 def _refuse(place: str, part: Part) -> None:
     for holds, name, expected, got in in_numpy(part).conditions():
-        if (known := concrete(holds)) is not None and not known:
-            shown = " and ".join(map(str, got))
+        if (known := concrete(_all(holds))) is not None and not known:
+            shown = " and ".join(map(str, got)) if isinstance(got, tuple) else got
             raise ValueError(f"{place}{name}: expected {expected}, got {shown}.")
+
+
+def _all(holds: Any) -> Any:
+    return namespace(holds).all(holds)
 
 
 def _declared(part: Part) -> Iterator[tuple[str, Any, dict[str, Any]]]:

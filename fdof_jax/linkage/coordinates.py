@@ -38,8 +38,13 @@ def real_state(name: str, value: Any, linkage: Linkage) -> State:
         q, qd = value
     except (TypeError, ValueError):
         raise ValueError(f"{name}: expected a State(q, qd), got {value!r}.") from None
-    shape = (joints_of(linkage),)
-    return State(real_array(f"{name}.q", q, shape), real_array(f"{name}.qd", qd, shape))
+    n = joints_of(linkage)
+    return State(
+        *(
+            real_array(f"{name}.{part}", values, (n,), of=f"{n} joints")
+            for part, values in (("q", q), ("qd", qd))
+        )
+    )
 
 
 @compiled("q", "qd")

@@ -84,11 +84,13 @@ class Linkage(eqx.Module):
         ef = topology if pairs is None else pairs.ravel()
         self.ef = jnp.asarray(ef, dtype=float)
         n = self.ef.size // 2
-        self.length = real_array("length", length, (n + 1,))
-        self.com = real_array("com", com, (n, 2))
-        self.mass = real_array("mass", mass, (n,), minimum=0)
-        self.inertia = real_array("inertia", inertia, (n,), minimum=0)
-        self.locked = real_array("locked", locked, (n,), broadcast=True)
+        links, pairs = f"{n} moving links", f"{n} pairs of joints"
+        ground = f"the ground and {links}"
+        self.length = real_array("length", length, (n + 1,), of=ground)
+        self.com = real_array("com", com, (n, 2), of=links)
+        self.mass = real_array("mass", mass, (n,), minimum=0, of=links)
+        self.inertia = real_array("inertia", inertia, (n,), minimum=0, of=links)
+        self.locked = real_array("locked", locked, (n,), broadcast=True, of=pairs)
         self.base_angle = real_array("base_angle", base_angle, ())
         self.gravity = real_array("gravity", gravity, ())
         if not is_traced(list(vars(self).values())):
@@ -153,15 +155,15 @@ _T = TypeVar("_T")
 
 
 def compiled(
-    *per_joint: str, **doors: tuple[int, ...] | Callable[[Any], Any]
+    *per_joint: str, **doors: tuple[int, ...] | Callable[[Linkage, Any], Any]
 ) -> Callable[[Callable[..., _T]], Callable[..., _T]]:
     """Decorates a function of a linkage and arrays: checks arguments, then compiles.
 
     `per_joint` names arguments with a value per joint, which are ignored at fixed
     pairs. Each keyword names an argument and gives the shape of its array, or a
-    function that checks and converts it. The decorated function accepts anything that
-    converts to such an array. Without compilation, a call outside of `jax.jit` would
-    dispatch hundreds of single operations.
+    function of linkage and argument that checks and converts it. The decorated function
+    accepts anything that converts to such an array. Without compilation, a call outside
+    of `jax.jit` would dispatch hundreds of single operations.
     """
 
     def decorate(function: Callable[..., _T]) -> Callable[..., _T]:
@@ -182,12 +184,14 @@ def compiled(
             linkage = arguments["linkage"]
             check_linkage(linkage)
             for name in per_joint:
-                shape = (joints_of(linkage),)
-                arguments[name] = real_array(name, arguments[name], shape)
+                n = joints_of(linkage)
+                arguments[name] = real_array(
+                    name, arguments[name], (n,), of=f"{n} joints"
+                )
             for name, door in doors.items():
                 if callable(door):
                     if name in arguments:
-                        arguments[name] = door(arguments[name])
+                        arguments[name] = door(linkage, arguments[name])
                 else:
                     arguments[name] = real_array(name, arguments[name], door)
             return inner(**arguments)

@@ -58,9 +58,8 @@ def check_singularity(linkage: "Linkage") -> None:
             kind = "revolute" if revolute[k] else "prismatic"
             raise ValueError(
                 f"mass, inertia, com: expected joint {k + 1} ({kind}) of {names} to "
-                f"move some inertia of moving link {k + 1} (m{k + 2}, I{k + 2}, "
-                f"p{k + 2}, q{k + 2}) or of the links beyond it, got none in any "
-                "configuration: its acceleration is undetermined."
+                f"move some inertia of link {k + 1} or of the links beyond it, got "
+                "none in any configuration: its acceleration is undetermined."
             )
     mass, inertia = np.asarray(linkage.mass), np.asarray(linkage.inertia)
     own = np.where(
@@ -70,7 +69,7 @@ def check_singularity(linkage: "Linkage") -> None:
     fixed = np.stack(fixed_pairs(np.asarray(linkage.ef)))
     for k in np.flatnonzero((own == 0) & ~fixed):
         warnings.warn(
-            f"moving link {k + 1} carries no inertia of its own about joint {k + 1}: "
+            f"link {k + 1} carries no inertia of its own about joint {k + 1}: "
             "the mass matrix may be singular in some configurations.",
             stacklevel=5,
         )
@@ -78,7 +77,7 @@ def check_singularity(linkage: "Linkage") -> None:
     for k in range(1, len(names)):
         if revolute[k - 1] and revolute[k] and np.hypot(length[k], locked[k]) == 0:
             warnings.warn(
-                f"revolute joints {k} and {k + 1} coincide (moving link {k} has no "
+                f"revolute joints {k} and {k + 1} coincide (link {k} has no "
                 "length, the paper's rule (i)): one of them is redundant for "
                 "positioning.",
                 stacklevel=5,

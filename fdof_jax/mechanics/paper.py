@@ -15,7 +15,7 @@ from ..linkage.topology import letters
 from ..xla.trigonometry import sincos
 
 
-def three_pairs(linkage: Linkage) -> Linkage:
+def three_pairs(linkage: Linkage, _: Linkage) -> Linkage:
     """Returns a linkage of three pairs without a fixed one, or raises ValueError."""
     if joints_of(linkage) != 3:
         raise ValueError(

@@ -9,18 +9,21 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ..checks import refusal
-from ..simulation.solution import Solution
+from ..linkage.linkage import check_linkage
+from ..simulation.solution import Solution, check_joints
 
 # Okabe and Ito's colours, distinct under the common kinds of colour blindness.
 BLACK, GREY = "#000000", "#808080"
 SERIES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 
 
-def reached(solution: Any, name: str = "solution") -> list[np.ndarray]:
+def reached(linkage: Any, solution: Any, name: str = "solution") -> list[np.ndarray]:
     """Arrays `ts`, `q` and `qd` of one solution, up to the last time reached."""
+    check_linkage(linkage)
     if not isinstance(solution, Solution) or np.ndim(solution.q) != 2:
         expected = "the Solution of one simulate (of a batch, pass one member)"
         raise refusal(name, expected, solution)
+    check_joints(name, solution, linkage)
     arrays = [np.asarray(a) for a in (solution.ts, solution.q, solution.qd)]
     finite = np.isfinite(arrays[1]).all(axis=1)
     if not finite.any():

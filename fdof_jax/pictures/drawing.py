@@ -91,7 +91,7 @@ def chrono_cyclograph(
 
     **Raises:** ValueError for malformed arguments and for an `until` before the start.
     """
-    ts, q, _ = reached(solution)
+    ts, q, _ = reached(linkage, solution)
     g = geometry(linkage, q)
     step = float(real_array("every", every, (), above=0))
     last = ts[-1]
@@ -210,7 +210,7 @@ def animate(
     Keep it until it is shown. `.save("motion.gif")` and `.save("motion.mp4")` write it,
     the latter with ffmpeg; `.to_jshtml()` returns a player as text, for a web page.
     """
-    ts, q, _ = reached(solution)
+    ts, q, _ = reached(linkage, solution)
     times, pause = _frame_times([ts], fps, speed, max_frames)
     g = geometry(linkage, q)
     panel = plane_axes(ax, g.all_points)

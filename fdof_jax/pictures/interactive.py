@@ -113,7 +113,7 @@ class _Picture:
 
     def draw(self, moved: _Moved) -> tuple[bytes, np.ndarray]:
         """The picture as PNG, and the tip's error [m]; all calls need one topology."""
-        ts, q, _ = reached(moved.solution)
+        ts, q, _ = reached(moved.scene.linkage, moved.solution)
         path = geometry(moved.scene.linkage, q)
         commanded = np.asarray(moved.commanded) @ [1, 1j]
         error = np.abs(path.tip - commanded[: len(ts)])

@@ -74,7 +74,7 @@ def motion_profile(
     One panel shows the absolute angles of links on revolute joints [degrees], another
     the slides of prismatic joints [m]; theta_k and B_k are those of joint k.
     """
-    ts, q, _ = reached(solution)
+    ts, q, _ = reached(linkage, solution)
     g = geometry(linkage, q)
     angles, slides = [], []
     for k, kind in enumerate(g.kinds, start=1):
@@ -95,7 +95,7 @@ def energy_profile(
     linkage: Linkage, solution: Solution, fig: Figure | None = None
 ) -> Figure:
     """Plots kinetic and potential energy of each link and of all over time [J]."""
-    ts, q, qd = reached(solution)
+    ts, q, qd = reached(linkage, solution)
     energies = jax.vmap(lambda q, qd: link_energies(linkage, q, qd))(q, qd)
     kinetic, potential = (np.asarray(each) for each in energies)
     links = range(1, kinetic.shape[1] + 1)
@@ -154,7 +154,7 @@ def energy_stack(
     than a hundredth of the energy: the samples are then too far apart, or the forces
     are not those of the solution.
     """
-    ts, q, qd = reached(solution)
+    ts, q, qd = reached(linkage, solution)
     powers = _powers(linkage, forces, solution)[:, : len(ts)]
     energies = jax.vmap(lambda q, qd: energy(linkage, q, qd, forces))(q, qd)
     kinetic, potential = map(np.asarray, energies)
@@ -196,7 +196,7 @@ def effort_profile(
 
     **Arguments:** `forces`: those of the solution.
     """
-    reached(solution)
+    reached(linkage, solution)
     efforts = joint_efforts(linkage, forces, solution)
     ts, total, elements = (np.asarray(a) for a in (solution.ts, *efforts))
     units, panels = [], []

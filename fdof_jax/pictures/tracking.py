@@ -38,7 +38,7 @@ def _tip(
     """Times of a solution, and the commanded and actual tip positions."""
     if not callable(task) or (tip := reference_of(task).tip) is None:
         raise refusal("task", "a CircleTask", task)
-    ts, q, _ = reached(solution, name)
+    ts, q, _ = reached(linkage, solution, name)
     commanded = np.asarray(jax.vmap(tip)(jnp.asarray(ts))) @ [1, 1j]
     return ts, commanded, geometry(linkage, q).tip
 

@@ -1,4 +1,4 @@
-"""The circle of Fig 7."""
+"""The circle of Fig 7: no `TipTask`, as its path may wind around the base."""
 
 import jax.numpy as jnp
 import numpy as np

@@ -44,8 +44,17 @@ class Reference(Part):
     tip = default(lambda self: None)
     period = default(lambda self: None)
 
+    def __check_init__(self):
+        kind = type(self)
+        if (kind.__call__, kind.assembly) == (Reference.__call__, Reference.assembly):
+            raise TypeError(
+                f"{kind.__name__}: expected a method `__call__` or `assembly`, got "
+                "neither."
+            )
+
     def assembly(self, t: Any, linkage: Linkage) -> tuple[Any, Any]:
-        raise NotImplementedError(f"{type(self).__name__} has no `__call__`")
+        """Positions (n,) [m or rad], and a root that is 0 at the edge of the reach."""
+        raise NotImplementedError  # found at construction
 
     def __call__(
         self, t: ArrayLike, linkage: Linkage

@@ -10,11 +10,11 @@ from jaxtyping import Float
 
 from ..checks import instance, place_of
 from ..forces.element import Element, Forces, StatefulElement, elements_on
-from ..linkage.linkage import Linkage, check_linkage, joints_of, without_fixed
+from ..linkage.linkage import Linkage, check_linkage, without_fixed
 from .field import element_effort
 from .prescribed import prescribed, prescribed_effort
 from .simulate import check_own
-from .solution import Solution
+from .solution import Solution, check_joints
 
 
 class Efforts(NamedTuple):
@@ -54,11 +54,7 @@ def joint_efforts(linkage: Linkage, forces: Forces, solution: Solution) -> Effor
             "solution: expected one motion (use jax.vmap for a batch), got positions "
             f"of shape {solution.q.shape}."
         )
-    if solution.q.shape[1] != joints_of(linkage):
-        raise ValueError(
-            f"solution: expected a motion of {joints_of(linkage)} joints, as the "
-            f"linkage has, got positions of shape {solution.q.shape}."
-        )
+    check_joints("solution", solution, linkage)
     check_own("solution.own", solution.own, forces, linkage, solution.ts.shape)
     return _efforts(linkage, forces, solution)
 

@@ -168,17 +168,21 @@ def element_effort(
     )
     found: Any = element.act(t, q, qd, linkage, state)
     if not isinstance(found, tuple) or len(found) != 2:
-        raise ValueError(f"{expected}, and the rate of its state, got {found!r}.")
+        raise ValueError(f"{expected}, and the rate of its state, got {_shown(found)}.")
     tau, rate = found
     if jax.tree.map(jnp.shape, rate) != jax.tree.map(jnp.shape, state):
         raise ValueError(
             f"forces[{index}]: expected the rate of its state to be like the state, "
-            f"{state!r}, got {rate!r}."
+            f"{_shown(state)}, got {_shown(rate)}."
         )
     try:
         tau = jnp.asarray(tau)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{expected}, got {tau!r}.") from error
+        raise ValueError(f"{expected}, got {_shown(tau)}.") from error
     if tau.shape != q.shape or tau.dtype.kind not in "iuf":
         raise ValueError(f"{expected}, got shape {tau.shape} and dtype {tau.dtype}.")
     return tau.astype(q.dtype), rate
+
+
+def _shown(tree: Any) -> str:
+    return eqx.tree_pformat(tree)  # arrays by dtype and shape, traced ones too

@@ -81,7 +81,10 @@ def check_elements(forces: Forces, linkage: Linkage, ts: Array) -> None:
         if is_traced(linkage, ts, element):
             continue
         check_values(place, element)  # `equinox.tree_at` bypasses the constructor
-        element.check(linkage, ts)
+        try:
+            element.check(linkage, ts)
+        except ValueError as error:
+            raise ValueError(f"{place}.{error}") from error
         if not values.possible():
             raise ValueError(
                 f"{place}: expected values that its constructor accepts, got "

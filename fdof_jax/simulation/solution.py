@@ -9,6 +9,7 @@ from jax import Array
 from jaxtyping import Float
 
 from ..checks import known
+from ..linkage.linkage import Linkage
 from .html_table import html_table
 
 
@@ -91,3 +92,13 @@ class Solution(eqx.Module):
             least, most = steps.min(), steps.max()
             facts["steps"] = f"{least}" if least == most else f"{least} to {most}"
         return facts
+
+
+def check_joints(name: str, solution: Solution, linkage: Linkage) -> None:
+    """Raises ValueError unless the motions have the linkage's number of joints."""
+    count = np.shape(linkage.ef)[-1] // 2  # of a batch too
+    if np.shape(solution.q)[-1] != count:
+        raise ValueError(
+            f"{name}: expected a motion of {count} joints, as the linkage has, got "
+            f"positions of shape {np.shape(solution.q)}."
+        )

@@ -53,6 +53,7 @@ def everything(linkage, q, qd):
 slopes = jax.jit(jax.jacrev(everything, (1, 2)))
 
 
+@pytest.mark.filterwarnings("ignore:prismatic joints .* are parallel")
 @pytest.mark.parametrize("topology", fj.TOPOLOGIES)
 def test_kinematics_where_everything_is_zero(topology):
     """The arm is straight along the x axis, at rest: atan2, roots and norms of 0."""
