@@ -82,7 +82,7 @@ def load(folder: Path) -> dict[str, list[dict]]:
     for job in JOBS:
         file = folder / f"{job.name}.jsonl"
         if file.exists():
-            points[job.name] = [json.loads(line) for line in file.open()]
+            points[job.name] = list(map(json.loads, file.read_text().splitlines()))
     return points
 
 

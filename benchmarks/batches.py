@@ -32,7 +32,7 @@ def _fast(vmap: tuple, sweep: tuple, rk4: tuple, order8: tuple, taylor: tuple):
         ("fdof_jax sweep", own.sweep, sweep),
         ("C RK4", partial(peers.native, method="RK4"), rk4),
         ("C order 8", partial(peers.native, method="order 8"), order8),
-        ("heyoka", peers.heyoka, taylor),
+        ("heyoka", taylor.heyoka, taylor),
     ]
 
 

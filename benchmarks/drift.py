@@ -13,7 +13,7 @@ import diffrax
 import jax.numpy as jnp
 import numpy as np
 
-from . import contestants as own, peers
+from . import contestants as own, peers, taylor
 from .contestants import Contestant
 from .measure import Case, Skipped, measure, skipped
 from .problems import Problem, fig5
@@ -36,7 +36,7 @@ TABLE = (
         (1e-3,),
     ),
     ("C order 8", partial(peers.native, method="order 8"), (5e-3, 2.5e-3, 1.25e-3)),
-    ("heyoka", peers.heyoka, (1e-9, 1e-12, 1e-15)),
+    ("heyoka", taylor.heyoka, (1e-9, 1e-12, 1e-15)),
     ("MuJoCo RK4", partial(peers.mujoco, integrator="RK4"), (5e-3, 2.5e-3)),
 )
 

@@ -17,7 +17,8 @@ import fdof_jax as fj
 from .chain import make_rates
 from .hard_scenes import HardScene
 from .measure import Skipped
-from .peers import module, symbolic
+from .peers import module
+from .taylor import symbolic
 
 MAX_STEPS = 5_000_000  # of adaptive solvers
 MUJOCO_STEPS = (1e-2, 1e-3, 1e-4, 1e-5)

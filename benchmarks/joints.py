@@ -11,7 +11,7 @@ import fdof_jax as fj
 from fdof_jax.mechanics.equations import link_constants, zeros
 from fdof_jax.mechanics.rates import rates
 
-from . import contestants as own, peers
+from . import contestants as own, peers, taylor
 from .contestants import Contestant, cases
 from .markdown import number, table
 from .measure import ENDLESS, Skipped, measure, skipped, times_at
@@ -98,7 +98,7 @@ def flops(linkage: fj.Linkage) -> float:
 def _exact(problem: Problem) -> np.ndarray:
     """Returns joint positions at both ends, to about 1e-13."""
     try:
-        heyoka = peers.heyoka(problem, rods, compact=True)
+        heyoka = taylor.heyoka(problem, rods, compact=True)
     except Skipped:
         return reference(problem)
     end = heyoka.motion(heyoka.run(1e-15)).q
@@ -112,7 +112,7 @@ def contestants(batch: int) -> list[Row]:
     """Returns names, contestants, their settings and how many members they run."""
     return [
         ("fdof_jax", own.fdof_jax, (1e-7, 1e-9, 1e-11), batch),
-        ("heyoka", partial(peers.heyoka, equations=rods), (1e-7, 1e-9), batch),
+        ("heyoka", partial(taylor.heyoka, equations=rods), (1e-7, 1e-9), batch),
         (
             "MuJoCo RK4",
             partial(peers.mujoco, integrator="RK4"),

@@ -1,4 +1,4 @@
-"""Other engines as contestants: SciPy, MuJoCo, MJX, heyoka and the C kernel.
+"""Other engines as contestants: SciPy, MuJoCo, MJX and the C kernel.
 
 Each raises `Skipped` if it is not installed or cannot run the problem.
 """
@@ -6,8 +6,6 @@ Each raises `Skipped` if it is not installed or cannot run the problem.
 import importlib
 import math
 import os
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from typing import Any
 from xml.etree import ElementTree
@@ -18,9 +16,9 @@ import numpy as np
 
 import fdof_jax as fj
 
-from .chain import Drive, make_rates
+from .chain import make_rates
 from .circle import make_control, make_reference
-from .contestants import DT0, MAX_STEPS, Contestant, Motion
+from .contestants import DT0, Contestant, Motion
 from .measure import Skipped
 from .native import Kernel
 from .problems import Problem
@@ -34,7 +32,7 @@ def module(name: str) -> Any:
         raise Skipped(f"{name} is not installed") from None
 
 
-def _one_free_arm(problem: Problem) -> None:
+def one_free_arm(problem: Problem) -> None:
     if problem.forces:
         raise Skipped("no controllers with limits")
     _one_arm(problem)
@@ -45,7 +43,7 @@ def _one_arm(problem: Problem) -> None:
         raise Skipped("one arm only, not a batch of different ones")
 
 
-def _threads() -> int:
+def threads() -> int:
     return len(os.sched_getaffinity(0))
 
 
@@ -138,7 +136,7 @@ def mujoco(problem: Problem, integrator: str) -> Contestant:
     q, qd = (np.atleast_2d(a) for a in problem.state0)
     # Full physics state: time, positions, velocities.
     start = np.concatenate([np.zeros((len(q), 1)), q, qd], axis=1)
-    data = [mj.MjData(model) for _ in range(min(_threads(), len(q)))]
+    data = [mj.MjData(model) for _ in range(min(threads(), len(q)))]
     single = problem.batch is None
 
     @cache
@@ -164,7 +162,7 @@ def mujoco(problem: Problem, integrator: str) -> Contestant:
 
 def mjx_rk4(problem: Problem) -> Contestant:
     """Returns MuJoCo's JAX port with its RK4; the step is a traced number."""
-    _one_free_arm(problem)
+    one_free_arm(problem)
     mj, mjx = module("mujoco"), module("mujoco.mjx")
     model = mj.MjModel.from_xml_string(fj.to_mjcf(problem.linkage))
     model.opt.integrator = mj.mjtIntegrator.mjINT_RK4
@@ -196,115 +194,15 @@ def mjx_rk4(problem: Problem) -> Contestant:
     )
 
 
-def symbolic(hy: Any, linkage: fj.Linkage, drive: Drive | None = None) -> list:
-    """Returns the equations in heyoka's form."""
-    variables = hy.make_vars("q1", "q2", "q3", "u1", "u2", "u3")
-
-    def of(symbolic: Any, number: Any) -> Any:
-        # Angles that no joint turns are plain numbers.
-        return lambda x: symbolic(x) if isinstance(x, hy.expression) else number(x)
-
-    rates = make_rates(linkage, of(hy.sin, math.sin), of(hy.cos, math.cos), drive)
-    return list(zip(variables, rates(*variables)))
-
-
-def extended(problem: Problem) -> np.ndarray:
-    """Returns positions at the output times by heyoka in 80-bit numbers."""
-    _one_free_arm(problem)
-    hy = module("heyoka")
-    wide = np.longdouble
-    if np.finfo(wide).nmant < 63:
-        raise Skipped("no 80-bit numbers here")
-    start = np.concatenate([problem.state0.q, problem.state0.qd]).astype(wide)
-    integrator = hy.taylor_adaptive(
-        symbolic(hy, problem.linkage), start, fp_type=wide, tol=wide(1e-19)
-    )
-    ts = problem.ts.astype(wide)
-    integrator.propagate_until(ts[0] + wide(DT0))
-    grid = np.concatenate([[integrator.time], ts[1:]])
-    states = integrator.propagate_grid(grid)[-1]
-    states[0] = start
-    return states[:, :3].astype(float)
-
-
-def heyoka(
-    problem: Problem, equations: Callable = symbolic, compact: bool = False
-) -> Contestant:
-    """Returns an adaptive Taylor series compiled by LLVM; batches in vectors.
-
-    `compact`: compiled sooner, and slower.
-    """
-    _one_free_arm(problem)
-    hy = module("heyoka")
-    system = equations(hy, problem.linkage)
-    q, qd = (np.atleast_2d(a) for a in problem.state0)
-    start = np.concatenate([q, qd], axis=1).T
-    begin, first, ts = problem.ts[0], problem.ts[0] + DT0, problem.ts[1:]
-    single = problem.batch is None
-    lanes = 1 if single else min(8, start.shape[1])
-    if start.shape[1] % lanes:
-        raise Skipped(f"batches that {lanes} does not divide")
-    threads = _threads()
-
-    @cache
-    def prepared(tolerance: float) -> list:
-        if single:
-            begun = start[:, 0].copy()
-            return [
-                hy.taylor_adaptive(system, begun, tol=tolerance, compact_mode=compact)
-            ]
-        block = start[:, :lanes].copy()
-        one = hy.taylor_adaptive_batch(
-            system, block, tol=tolerance, compact_mode=compact
-        )
-        return [one, *(one.__deepcopy__({}) for _ in range(threads - 1))]
-
-    def run_single(tolerance: float) -> np.ndarray:
-        (integrator,) = prepared(tolerance)
-        integrator.time = begin
-        integrator.state[:] = start[:, 0]
-        # From exact rest the estimate of the first step fails.
-        integrator.propagate_until(first)
-        grid = np.concatenate([[first], ts])
-        return integrator.propagate_grid(grid)[-1][1:]
-
-    def blocks(integrator: Any, numbers: range, ends: np.ndarray) -> None:
-        for number in numbers:
-            members = slice(number * lanes, (number + 1) * lanes)
-            integrator.set_time(begin)
-            integrator.state[:] = start[:, members]
-            integrator.propagate_until(ts[-1], max_steps=MAX_STEPS)
-            ends[members, 0] = integrator.state.T
-
-    def run_batch(tolerance: float) -> np.ndarray:
-        ends = np.empty((start.shape[1], 1, len(start)))
-        integrators = prepared(tolerance)
-        number = start.shape[1] // lanes
-        if threads == 1:
-            blocks(integrators[0], range(number), ends)
-        else:
-            with ThreadPoolExecutor(threads) as pool:
-                shares = [range(i, number, threads) for i in range(threads)]
-                list(pool.map(blocks, integrators, shares, [ends] * threads))
-        return ends
-
-    return Contestant(
-        "heyoka",
-        "tolerance",
-        run_single if single else run_batch,
-        lambda states: Motion(*np.split(states, 2, axis=-1)),
-    )
-
-
 def native(problem: Problem, method: str) -> Contestant:
     """Returns the C kernel: "RK4" or "order 8"."""
-    _one_free_arm(problem)
+    one_free_arm(problem)
     kernel = Kernel(
         method,
         problem.linkage,
         np.asarray(problem.state0.q),
         np.asarray(problem.state0.qd),
-        threads=_threads(),
+        threads=threads(),
     )
     saves = len(problem.ts) - 1
 

@@ -14,7 +14,7 @@ import numpy as np
 import fdof_jax as fj
 from fdof_jax.simulation.solve import solve
 
-from . import contestants as own, gradients, peers, problems, trajectory
+from . import contestants as own, gradients, problems, taylor, trajectory
 from .contestants import Contestant
 from .measure import Case, measure
 from .problems import Problem, controller
@@ -49,7 +49,7 @@ def _motion(budget: float) -> Iterator[dict]:
         ("", plain_call, TOLERANCES),
         ("", partial(plain_call, solver=diffrax.Dopri8()), TOLERANCES),
         ("", own.fdof_jax, TOLERANCES),
-        ("heyoka", peers.heyoka, (1e-7, 1e-10, 1e-12, 1e-15)),
+        ("heyoka", taylor.heyoka, (1e-7, 1e-10, 1e-12, 1e-15)),
     ]
     prepared = [c for c in trajectory._prepared(problem, exact, rows)]
     yield from measure(

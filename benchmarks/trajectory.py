@@ -6,7 +6,7 @@ from functools import partial
 import diffrax
 import numpy as np
 
-from . import contestants as own, peers, problems
+from . import contestants as own, peers, problems, taylor
 from .contestants import Contestant, cases
 from .measure import WORST_ERROR, Case, Skipped, measure, skipped
 from .problems import Problem, reference
@@ -33,7 +33,7 @@ def rows(problem: Problem) -> list[Row]:
             partial(peers.mujoco, integrator="implicitfast"),
             (10, 100, 1000),
         ),
-        ("heyoka", peers.heyoka, (1e-4, 1e-7, 1e-10, 1e-12, 1e-15)),
+        ("heyoka", taylor.heyoka, (1e-4, 1e-7, 1e-10, 1e-12, 1e-15)),
         ("C RK4", partial(peers.native, method="RK4"), (10, 25, 50, 100, 250, 1000)),
         (
             "C order 8",
@@ -73,7 +73,7 @@ def random_rows() -> list[Row]:
         ("plain diffrax", own.plain_reduced, tolerances),
         *_general(tolerances[::2], (1, 4, 16)),
         ("MuJoCo Euler", partial(peers.mujoco, integrator="Euler"), (4, 40, 200)),
-        ("heyoka", peers.heyoka, (1e-4, 1e-9, 1e-15)),
+        ("heyoka", taylor.heyoka, (1e-4, 1e-9, 1e-15)),
     ]
 
 
@@ -121,7 +121,7 @@ def measure_one(
 def exact(problem: Problem) -> np.ndarray:
     """Returns the motion in extended precision, or in double without heyoka."""
     try:
-        return peers.extended(problem)
+        return taylor.extended(problem)
     except Skipped:
         return reference(problem)
 

@@ -1,7 +1,6 @@
 """Every malformed argument raises an error that names it, before any computation."""
 
 import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -161,7 +160,6 @@ def test_negative_values_are_refused(argument):
     ],
     ids=repr,
 )  # fmt: skip
-@pytest.mark.filterwarnings("error")
 def test_unknown_topologies_are_refused(topology):
     refused("topology", make, topology)
     refused("topology", fj.from_chain, topology, CHAIN, CHAIN)
@@ -248,58 +246,3 @@ def test_forward_mode_through_the_default_adjoint_names_the_cure():
 
     with pytest.raises(TypeError, match=r"adjoint=diffrax\.ForwardMode\(\)"):
         jax.jacfwd(end)(jnp.zeros(3))
-
-
-# Control and inverse kinematics
-
-
-def test_period_zero_is_refused():
-    refused("period", lambda: fj.CircleTask(period=0))
-
-
-@pytest.mark.parametrize("branch", [0, 2, -1.5, "1", None, True, np.nan, [1]], ids=repr)
-def test_branches_other_than_plus_and_minus_one_are_refused(branch):
-    refused("branch", lambda: fj.CircleTask(branch=branch))
-    refused(
-        "branch", lambda: fj.inverse_kinematics(LINKAGE, [1, 1], 0.0, branch=branch)
-    )
-
-
-@pytest.mark.parametrize("branch", [1, -1.0, np.int64(-1), np.float32(1), jnp.array(1)])
-def test_numbers_of_any_kind_name_a_branch(branch):
-    assert fj.CircleTask(branch=branch).branch == float(branch)
-    fj.inverse_kinematics(LINKAGE, [1, 1], 0.0, branch=branch)
-
-
-@pytest.mark.parametrize("value", [None, 3.0, (ZERO, ZERO), fj.CircleTask])
-def test_references_that_cannot_be_called_are_refused(value):
-    refused("reference", lambda: controller(reference=value))
-
-
-@pytest.mark.parametrize(
-    "returned",
-    [None, ZERO, (np.zeros(2), np.zeros(2)), (ZERO, None)] + [(ZERO * 1j, ZERO)],
-    ids=repr,
-)
-def test_references_that_return_no_motion_are_refused(returned):
-    element = controller(reference=lambda t, linkage: returned)
-    refused("reference", lambda: element(0.0, jnp.zeros(3), jnp.zeros(3), LINKAGE))
-    refused("reference", lambda: simulate(forces=(element,)))
-
-
-@pytest.mark.parametrize("circle", [dict(center=[9, 9]), dict(radius=5.0)], ids=str)
-def test_circles_out_of_reach_are_refused_at_the_door(circle):
-    scene = fj.scenes.fig7()
-    forces = eqx.tree_at(
-        lambda f: f[0].reference, scene.forces, fj.CircleTask(branch=1, **circle)
-    )
-    if "center" in circle:  # this arm's slide has no end: only too near is out of reach
-        scene = scene._replace(linkage=make("RRR"))
-    place = r"^forces\[0\]\.reference"
-    with pytest.raises(ValueError, match=place + ": expected .* reach .*, got .*"):
-        fj.simulate(scene.linkage, scene.state0, [0, 5.0], forces)
-
-
-def test_points_out_of_reach_are_refused():
-    with pytest.raises(ValueError, match=r"^tip: expected .* reach .*, got \[9"):
-        fj.inverse_kinematics(LINKAGE, [9, 9], 0.0)

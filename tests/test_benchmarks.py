@@ -128,6 +128,11 @@ def quick_run(tmp_path_factory):
     return run_quickly("generality", tmp_path_factory.mktemp("benchmarks"))
 
 
+def points_of(folder, name):
+    lines = (folder / f"{name}.jsonl").read_text().splitlines()
+    return list(map(_valid, lines))
+
+
 def _valid(text):
     def refuse(constant):
         raise ValueError(f"not JSON: {constant}")
@@ -136,7 +141,7 @@ def _valid(text):
 
 
 def test_the_smallest_protocol_runs_end_to_end(quick_run):
-    points = [_valid(line) for line in (quick_run / "generality.jsonl").open()]
+    points = points_of(quick_run, "generality")
     assert points
     for point in points:
         assert set(RECORD) <= set(point)
@@ -152,7 +157,7 @@ def test_the_smallest_protocol_runs_end_to_end(quick_run):
 @pytest.mark.slow
 def test_the_number_of_joints_is_measured_end_to_end(tmp_path):
     quick_run = run_quickly("joints", tmp_path)
-    points = [_valid(line) for line in (quick_run / "joints.jsonl").open()]
+    points = points_of(quick_run, "joints")
     own = [p for p in points if p["solver"] == "fdof_jax"]
     assert {p["batch"] for p in own} == {1, 16}
     assert all(p["status"] == "ok" and p["flops"] > 0 for p in own)
@@ -162,7 +167,7 @@ def test_the_number_of_joints_is_measured_end_to_end(tmp_path):
 
 
 def test_tables_go_between_their_markers(quick_run):
-    points = [_valid(line) for line in (quick_run / "generality.jsonl").open()]
+    points = points_of(quick_run, "generality")
     texts = page.tables({"generality": points})
     text = "before\n<!-- begin: generality -->old<!-- end: generality -->\nafter"
     filled = page.filled(text, texts)

@@ -11,6 +11,7 @@ import pytest
 from elements import SHORT
 
 import fdof_jax as fj
+from fdof_jax.analysis.tracking import saturated
 
 FOUR = pytest.param("RPFR", marks=pytest.mark.slow)
 
@@ -214,10 +215,14 @@ def test_sampled_control_steps_and_sweeps_agree(case):
     sampled = fj.simulate_sampled(chain, start, pd, 0.05, 2, **SHORT)
     state = start
     for tau in sampled.tau:
-        same(np.where(real, pd(0.0, *state, chain) - tau, 0), 0)
+        same(np.where(real, pd(0.0, *state, chain), 0) - tau, 0)
         state = fj.step(chain, state, tau, 0.05, **SHORT)
     same(state.q, sampled.q[-1])
     same(state.qd, sampled.qd[-1])
+    rows = fj.Solution(*sampled[:3], stats={}, result=sampled.result)
+    weak = fj.PDController(case.gain, case.gain, 1e-6, case.hold)
+    at_limit = np.asarray(saturated(weak, chain, rows))
+    assert at_limit[:, real].any() and not at_limit[:, ~real].any()
     both = fj.State(*(jnp.stack([a, 1.1 * a]) for a in start))
     hold = (fj.JointEffort(sampled.tau[0]),)
     swept = fj.sweep(chain, both, [0, 0.05], hold, **SHORT)

@@ -10,7 +10,6 @@ GUIDE = Path(__file__).parents[1] / "docs" / "pictures.md"
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("error")
 def test_examples(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     namespace = {}

@@ -7,7 +7,7 @@ from jax import Array
 from jaxtyping import Bool, Float
 
 from ..control.pd import PDController
-from ..linkage.linkage import Linkage
+from ..linkage.linkage import Linkage, without_fixed
 from ..mechanics.kinematics import tip_position
 from ..references.circle import CircleTask
 from ..simulation.solution import Solution
@@ -16,13 +16,14 @@ from ..simulation.solution import Solution
 def relative_demands(
     controller: PDController, linkage: Linkage, solution: Solution
 ) -> Float[Array, "time joint"]:
-    """The controller's demands over its limits; 0 where a limit is infinite.
+    """The controller's demands over its limits; 0 at fixed pairs and infinite limits.
 
     Where a limit is 0, a demand other than 0 gives an infinity of its sign.
     """
     demands = jax.vmap(controller.demand, in_axes=(0, 0, 0, None))(
         solution.ts, solution.q, solution.qd, linkage
     )
+    demands = without_fixed(linkage, demands)
     limit = jnp.broadcast_to(controller.limit, demands.shape)
     beyond = jnp.where(demands == 0, 0, jnp.sign(demands) * jnp.inf)
     return jnp.where(limit > 0, demands / jnp.where(limit > 0, limit, 1), beyond)

@@ -183,7 +183,7 @@ def geometries_of(motions: Any) -> dict[str, tuple[np.ndarray, Geometry]]:
         fits = isinstance(pair, tuple) and len(pair) == 2
         if not (fits and isinstance(pair[0], Linkage)):
             raise refusal(name, "(Linkage, Solution)", pair)
-        ts, q, _ = reached(*pair, name)
+        ts, q, _ = reached(pair[0], pair[1], name)
         found[title] = ts, geometry(pair[0], q)
     return found
 

@@ -14,7 +14,7 @@ from ..checks import concrete, function, real_array, whole_number
 from ..forces.element import Forces, ScalarElement, element_of, elements
 from ..forces.joints import JointEffort
 from ..linkage.coordinates import State, real_state
-from ..linkage.linkage import Linkage, check_linkage, joints_of
+from ..linkage.linkage import Linkage, check_linkage, joints_of, without_fixed
 from .field import initial_states, stateful
 from .simulate import check_elements, simulate
 
@@ -84,7 +84,8 @@ class SampledMotion(NamedTuple):
 
     - `ts`: sampling times, including the end (samples + 1,) [s].
     - `q`, `qd`: joint positions and velocities at `ts`; NaN after a failure.
-    - `tau`: efforts commanded at each sample (samples, n) [N or N m].
+    - `tau`: efforts commanded at each sample (samples, n), 0 at fixed pairs
+      [N or N m].
     - `result`: diffrax's result: `successful`, or that of the first failed period.
     - `own`: the states of the forces' `StatefulElement`s at `ts`.
     """
@@ -191,7 +192,7 @@ def _motion(
                 *(state, spread, State(*jax.random.split(key))),
             )
         tau, rates = control.act(begin, *seen, linkage, memory)
-        tau = real_array("control", tau, seen.q.shape)
+        tau = without_fixed(linkage, real_array("control", tau, seen.q.shape))
         memory = jax.tree.map(lambda m, rate: m + period * rate, memory, rates)
         effort = (
             JointEffort(tau) if delay is None else _Switched(held, tau, begin + delay)

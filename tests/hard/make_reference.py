@@ -17,8 +17,6 @@ from pathlib import Path
 import numpy as np
 
 TIMES = 21  # outputs of each scene, the start among them
-
-# The default of all scenes.
 USUAL = dict(
     topology="RRR",
     length=[0.0, 1.0, 1.0, 1.0],
@@ -292,8 +290,7 @@ def main():
             qdd = agreed(accelerations, scene, states)
             made[name] |= dict(qd=qd.tolist(), qdd=qdd.tolist())
         for argument in DERIVATIVES.get(name, ()):
-            slopes = agreed(derivative, scene, argument)
-            made[name][f"dq_d{argument}"] = slopes.tolist()
+            made[name][f"dq_d{argument}"] = agreed(derivative, scene, argument).tolist()
     text = json.dumps(made, indent=1)
     Path(__file__).with_name("reference.json").write_text(text + "\n")
 
