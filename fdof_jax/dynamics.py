@@ -52,7 +52,7 @@ def inertia_ratios(
     The ratio 1 / (M_kk (M^-1)_kk) of the 3x3 mass matrix has no unit. It divides the
     inertia [kg or kg m^2] of a joint while the others are free to move by its inertia
     while they are locked. The accelerations lose about -log10 of the least ratio in
-    digits. Below 1e-9 in float64 or 1e-5 in float32, `simulate` stops and reports it.
+    digits. Below 1e-11 in float64 or 1e-5 in float32, `simulate` stops and reports it.
     The ratio is zero where the matrix is not positive definite.
 
     **Arguments:** `q` [m or rad]; `forces`: force elements that add masses.

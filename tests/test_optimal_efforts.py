@@ -193,3 +193,13 @@ def test_malformed_arguments(scene, keywords, message):
 def test_the_bound_is_for_longer_runs(best):
     with pytest.raises(ValueError, match="t1: expected"):
         best.bound(0.3)
+
+
+def test_a_search_that_has_not_converged_gives_no_bound():
+    """The scene's own controller, tuned, beats the number it would give."""
+    found = fj.tuning.optimal_efforts(
+        scenes.fig7(), horizon=HORIZON, knots=KNOTS, max_steps=1
+    )
+    assert not found.converged
+    with pytest.raises(RuntimeError, match="bound: expected a search that has conv"):
+        found.bound(1.0)

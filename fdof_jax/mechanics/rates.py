@@ -13,7 +13,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
 from jax.custom_derivatives import SymbolicZero
 
 from .equations import (
@@ -55,30 +54,31 @@ def _rates_and_conditioning(
     qd: Scalars,
     tau: Scalars,
     added: Upper | None,
-) -> tuple[Scalars, Scalars, Array]:
+) -> tuple[Scalars, Scalars, Scalars]:
     m = with_added(added, equations(c, delta, qd))
     solve, inverse_diagonal = solver_of(c, m, added, reciprocal)
-    return qd, solve(minus(tau, m.bias)), _loss(m, inverse_diagonal())
+    return qd, solve(minus(tau, m.bias)), _losses(m, inverse_diagonal())
 
 
-def _loss(m: Equations, inverse: Scalars) -> Array:
-    """Computes the amplification of rounding errors in the accelerations."""
-    losses = (row[0] * entry for row, entry in zip(m.mass, inverse))
-    loss = functools.reduce(jnp.maximum, losses)
+def _losses(m: Equations, inverse: Scalars) -> Scalars:
+    """Computes the amplification of rounding errors in each joint's acceleration."""
     # An infinite inverse times a mass of zero would be NaN.
     singular = functools.reduce(jnp.maximum, inverse) == jnp.inf
-    return jnp.where(singular, jnp.inf, loss)
+    return tuple(
+        jnp.where(singular, jnp.inf, row[0] * entry)
+        for row, entry in zip(m.mass, inverse)
+    )
 
 
 def _conditioning(
     reciprocal: Callable, c: Constants, delta: Scalars, added: Upper | None
-) -> Array:
+) -> Scalars:
     m = with_added(added, equations(c, delta, _still(delta)))
     _, inverse_diagonal = solver_of(c, m, added, reciprocal)
-    return _loss(m, inverse_diagonal())
+    return _losses(m, inverse_diagonal())
 
 
-def conditioning(c: Constants, delta: Scalars, added: Upper | None = None) -> Array:
+def conditioning(c: Constants, delta: Scalars, added: Upper | None = None) -> Scalars:
     """Computes the amplification of rounding errors, see `rates_and_conditioning`."""
     return fused(_conditioning)(c, delta, added)
 
@@ -240,21 +240,21 @@ def rates_and_conditioning(
     qd: Scalars,
     tau: Scalars,
     added: Upper | None = None,
-) -> tuple[tuple[Scalars, Scalars], Array]:
+) -> tuple[tuple[Scalars, Scalars], Scalars]:
     """Computes `rates` and the amplification of rounding errors in them.
 
-    The amplification is 1 over the least of the `inertia_ratios`, infinite where the
-    mass matrix is not positive definite, and constant for derivatives.
+    The amplifications are 1 over the `inertia_ratios`, 0 at fixed pairs, infinite where
+    the mass matrix is not positive definite, and constant for derivatives.
     """
-    qd, qdd, loss = fused(_rates_and_conditioning)(c, delta, qd, tau, added)
-    return (qd, qdd), loss
+    qd, qdd, losses = fused(_rates_and_conditioning)(c, delta, qd, tau, added)
+    return (qd, qdd), losses
 
 
 @functools.partial(rates_and_conditioning.defjvp, symbolic_zeros=True)
 def _rates_and_conditioning_jvp(primals, tangents):
-    values, loss = rates_and_conditioning(*primals)
+    values, losses = rates_and_conditioning(*primals)
     change = _change(primals, values, tangents)
-    return (values, loss), (change, jnp.zeros_like(loss))
+    return (values, losses), (change, tuple(map(jnp.zeros_like, losses)))
 
 
 def inertia_diagonals(

@@ -4,9 +4,11 @@
 agree with `diffrax.Dopri8` up to rounding.
 """
 
+import functools
+import operator
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -30,18 +32,22 @@ _INTERPOLATION: Any = diffrax.Dopri8.interpolation_cls
 DENSE = _INTERPOLATION.eval_coeffs  # (stage, power), highest first
 
 
+Health = tuple[Array, ...]  # one per joint, see `ScheduledTerm`
+
+
 class ScheduledTerm(diffrax.ODETerm):
     """A term whose vector field takes a fourth argument, which depends on time alone.
 
     `schedule(t, args)` computes this argument, for all stages of a step at once.
-    `health(t, y, args)` is positive, or 0 where the equations are singular.
-    `watched_field` returns the rates and their health, NaN if they are not finite.
+    `health(t, y, args)` holds the loss of accuracy in the rates of each joint, at least
+    1, or 0 where the equations are singular. `watched_field` returns the rates and
+    their health, NaN if they are not finite.
     """
 
     vector_field: Callable[..., PyTree] = eqx.field(static=True)
     schedule: Callable[[Any, Any], PyTree] = eqx.field(static=True)
-    health: Callable[..., Array] = eqx.field(static=True)
-    watched_field: Callable[..., tuple[PyTree, Array]] = eqx.field(static=True)
+    health: Callable[..., Health] = eqx.field(static=True)
+    watched_field: Callable[..., tuple[PyTree, Health]] = eqx.field(static=True)
 
     def vf(self, t, y, args):
         return self.vector_field(t, y, args, self.schedule(t, args))
@@ -103,17 +109,34 @@ def constant(tree: PyTree) -> PyTree:
     )
 
 
-def verdict(error: PyTree, health: Array, h: Array) -> tuple[PyTree, Any]:
-    """Returns the error of a step, replaced if its health is bad, and its result.
+def is_singular(health: Health) -> Array:
+    return functools.reduce(operator.or_, (x == 0 for x in health))
+
+
+def health_if(finite: Array, health: Health) -> Health:
+    """Returns the health, NaN where rates are not finite unless they are singular."""
+    return tuple(jnp.where(finite | (x == 0), x, jnp.nan) for x in health)
+
+
+class Estimate(NamedTuple):
+    """The error of a step and its `Health`, 1 if it is bad, as controllers get them."""
+
+    error: PyTree
+    health: Health
+
+
+def verdict(error: PyTree, health: Health, h: Array) -> tuple[Estimate, Any]:
+    """Returns the estimated error of a step, replaced if its health is bad, and result.
 
     The health is NaN for a step that is not finite, and 0 for a singular one. An
     infinite error rejects the step until it is short. diffrax ignores the results of
     rejected steps, so the short step is accepted, with error 0.
     """
-    singular, short = health == 0, jnp.abs(h) < SHORTEST[h.dtype]
-    bad = singular | jnp.isnan(health)
+    singular, short = is_singular(health), jnp.abs(h) < SHORTEST[h.dtype]
+    bad = singular | jnp.isnan(sum(health))
     results: Any = diffrax.RESULTS
     kind = results.where(singular, results.singular, results.nonfinite)
     result = results.where(bad & short, kind, results.successful)
     imposed = jnp.where(short, 0, jnp.inf)
-    return jtu.tree_map(lambda e: jnp.where(bad, imposed, e), error), result
+    error = jtu.tree_map(lambda e: jnp.where(bad, imposed, e), error)
+    return Estimate(error, tuple(jnp.where(bad, 1, x) for x in health)), result

@@ -15,10 +15,11 @@ from ..linkage.linkage import Linkage
 from ..mechanics.equations import Constants, Scalars, Upper, link_constants, zeros
 from ..mechanics.rates import conditioning, rates, rates_and_conditioning
 from ..xla.callbacks import with_checks
+from .dopri8 import Health, health_if
 
-# Below this inertia ratio the accelerations have six correct digits at best (float64)
-# or two (float32), and rounding determines the adaptive steps.
-LEAST_INERTIA_RATIO = {np.dtype("float64"): 1e-9, np.dtype("float32"): 1e-5}
+# Below this inertia ratio the accelerations have four correct digits at best (float64)
+# or two (float32).
+LEAST_INERTIA_RATIO = {np.dtype("float64"): 1e-11, np.dtype("float32"): 1e-5}
 
 
 class Args(NamedTuple):
@@ -108,18 +109,17 @@ def applied(
 _added: Any = eqx.filter_jit(added_inertia)  # traced once, not at each use by a solver
 
 
-def health_at(loss: Array) -> Array:
-    """Returns the health at a loss of accuracy: positive, or 0 if too much is lost."""
-    return jnp.where(loss * LEAST_INERTIA_RATIO[loss.dtype] > 1, 0, loss)
+def health_at(losses: Scalars) -> Health:
+    """Returns the health at losses of accuracy: these, or 0 if too much is lost."""
+    least = LEAST_INERTIA_RATIO[losses[0].dtype]
+    # Exactly, no loss is below 1; that of a fixed pair is stored as 0.
+    return tuple(
+        jnp.where(loss * least > 1, 0, jnp.where(loss < 1, 1, loss)) for loss in losses
+    )
 
 
-def health_with(rates: Any, health: Array) -> Array:
-    """Returns the health beside rates: NaN where they are not finite.
-
-    A singular matrix also makes accelerations not finite; health 0 prevails.
-    """
-    finite = jnp.isfinite(sum(jax.tree.leaves(rates)))
-    return jnp.where(finite | (health == 0), health, jnp.nan)
+def health_with(rates: Any, health: Health) -> Health:
+    return health_if(jnp.isfinite(sum(jax.tree.leaves(rates))), health)
 
 
 def vector_field(t, y, args, schedule) -> tuple[Any, ...]:
@@ -129,17 +129,17 @@ def vector_field(t, y, args, schedule) -> tuple[Any, ...]:
     return whole(*rates(args.constants, delta, qd, tau, added), own_rates)
 
 
-def watched_field(t, y, args, schedule) -> tuple[tuple[Any, ...], Array]:
+def watched_field(t, y, args, schedule) -> tuple[tuple[Any, ...], Health]:
     """Rates of `vector_field` and their health, which `ScheduledTerm` defines."""
     delta, qd, *_ = y
     tau, own_rates, added = applied(t, y, args, schedule)
-    (qd, qdd), loss = rates_and_conditioning(args.constants, delta, qd, tau, added)
-    health = health_with((qdd, own_rates), health_at(loss))
+    (qd, qdd), losses = rates_and_conditioning(args.constants, delta, qd, tau, added)
+    health = health_with((qdd, own_rates), health_at(losses))
     return whole(qd, qdd, own_rates), health
 
 
-def health_of(t, y, args) -> Array:
-    """Health of the equations: positive, or 0 where they are singular."""
+def health_of(t, y, args) -> Health:
+    """Health of the equations at each joint: positive, or 0 where they are singular."""
     delta, *_ = y
     added = None
     if inertial(args.forces):

@@ -23,6 +23,7 @@ from .field import (
 )
 from .looped_dopri8 import LoopedDopri8
 from .prescribed import motion_at, prescribed, start_of, term_of
+from .rounding import Recorded, above_rounding
 from .solution import Solution
 from .step_wrappers import Watched, bounded, landing_on, undifferentiated
 from .steps import default_controller
@@ -76,8 +77,10 @@ def integrate(
     )
     controller = landing_on(controller, forces, ts.dtype)
     adaptive = isinstance(controller, diffrax.AbstractAdaptiveStepSizeController)
-    if adaptive and not isinstance(solver, UnrolledDopri8 | LoopedDopri8):
-        controller = Watched(controller, term.health)  # pyright: ignore[reportCallIssue]
+    if adaptive:
+        controller = Recorded(controller)  # pyright: ignore[reportCallIssue]
+        if not isinstance(solver, UnrolledDopri8 | LoopedDopri8):
+            controller = Watched(controller, term.health)  # pyright: ignore[reportCallIssue]
     with without_checks():
         found = diffrax.diffeqsolve(
             term,
@@ -89,7 +92,8 @@ def integrate(
                 subs=(
                     diffrax.SubSaveAt(ts=ts),
                     diffrax.SubSaveAt(t1=True, fn=lambda t, y, args: t),
-                )
+                ),
+                controller_state=adaptive,
             ),
             throw=False,
             **keywords | {"solver": solver, "stepsize_controller": controller},
@@ -106,7 +110,13 @@ def integrate(
     # diffrax saves the start only with the first step.
     start = (without_fixed(linkage, value) for value in state0)
     q, qd = (shown(rows).at[0].set(first) for rows, first in zip((q, qd), start))
+    # Constant steps go on when the state is no longer finite.
+    lost = (ts <= reached) & ~jnp.isfinite(q + qd).all(axis=1)
+    reached = jnp.where(lost.any(), ts[jnp.argmax(lost) - 1], reached)
     stats = found.stats | {"time_reached": jnp.where(valid, reached, asked[0])}
+    if adaptive:
+        _, loss = found.controller_state
+        stats["accuracy"] = jnp.finfo(q.dtype).eps * loss
     result = _judged(valid, found.result, q, qd)
     return Solution(asked, q, qd, stats, result, jax.tree.map(shown, own))
 
@@ -150,7 +160,7 @@ def _controller(
     if bound is not None and not trusted:
         fraction = _OF_TIME_SCALE[0 if (solver.order(term) or 0) >= 8 else 1]
         controller = bounded(controller, lambda: bound(fraction))
-    return undifferentiated(controller)
+    return above_rounding(undifferentiated(controller))
 
 
 def _judged(valid: Array, result: Any, q: Array, qd: Array) -> Any:

@@ -24,6 +24,7 @@ from .dopri8 import (
     ScheduledDopri8,
     compensated,
     constant,
+    health_if,
     interpolation_weights,
     verdict,
 )
@@ -70,8 +71,8 @@ def _step(term: Any, t0, t1, y0, lost, args):
     last = jtu.tree_map(lambda k: k[-1], rates)
     finite = jnp.isfinite(sum(jtu.tree_leaves((y, last))))
     # If the end is not finite, the health at the start shows why.
-    health = jnp.where(finite, healths[-1], healths[0])
-    health = jnp.where(finite | (health == 0), health, jnp.nan)
+    health = tuple(jnp.where(finite, x[-1], x[0]) for x in healths)
+    health = health_if(finite, health)
     y = jtu.tree_map(lambda a: jnp.where(finite, a, jnp.nan), y)
     error, result = verdict(*constant((error, health)), h)
     return y, error, dict(y0=y0, step=h, rates=rates), constant(lost), result

@@ -21,7 +21,7 @@ from ..mechanics.equations import equations, zeros
 from ..references.reference import EXPECTED, positions_at, reference_motion
 from ..xla.array_namespace import in_numpy, namespace
 from ..xla.callbacks import with_checks
-from .dopri8 import ScheduledTerm
+from .dopri8 import Health, ScheduledTerm
 from .field import (
     Args,
     applied,
@@ -168,13 +168,13 @@ def _hybrid_field(t, y, args, schedule) -> tuple[Any, ...]:
     return whole(tuple(jnp.where(moved, 0, qd)), tuple(driven), own_rates)
 
 
-def _watched_hybrid_field(t, y, args, schedule) -> tuple[tuple[Any, ...], Array]:
+def _watched_hybrid_field(t, y, args, schedule) -> tuple[tuple[Any, ...], Health]:
     """Rates of `_hybrid_field` and their health, as in `field.watched_field`."""
     rates = _hybrid_field(t, y, args, schedule)
     return rates, health_with(rates, _health(t, y, args))
 
 
-def _health(t, y, args) -> Array:
+def _health(t, y, args) -> Health:
     """Health of the driven joints' equations, as in `field.health_of`."""
     motion = prescribed(args.forces)
     assert motion is not None
@@ -182,8 +182,8 @@ def _health(t, y, args) -> Array:
     matrix, _ = _mass_and_bias(args, q, jnp.zeros_like(q))
     driven = ~motion.of(args.linkage)
     free = jnp.where(jnp.outer(driven, driven), matrix, jnp.eye(len(q)))
-    loss = jnp.max(jnp.diag(free) * jnp.diag(jnp.linalg.inv(free)))
-    return jnp.where(jnp.isnan(loss), 0, health_at(loss))
+    losses = jnp.diag(free) * jnp.diag(jnp.linalg.inv(free))
+    return health_at(tuple(jnp.where(jnp.isnan(losses), jnp.inf, losses)))
 
 
 def prescribed_effort(

@@ -18,7 +18,9 @@ class Solution(eqx.Module):
 
     - `ts`: output times [s].
     - `q`, `qd`: joint positions [m or rad] and velocities at `ts`; NaN after a failure.
-    - `stats`: diffrax's statistics, `num_steps` among them, and `time_reached` [s].
+    - `stats`: diffrax's statistics, `num_steps` among them; `time_reached` [s]; and,
+      with adaptive steps, `accuracy`: the relative rounding error of the accelerations
+      at the worst step. Steps do not chase errors below it.
     - `result`: diffrax's result, one per trajectory: `diffrax.RESULTS.successful` or
       the reason for the failure. `outcome` states it in words.
     - `own`: the states of the `StatefulElement`s at `ts`, in the order of the forces;

@@ -12,7 +12,7 @@ from jax import Array
 
 from ..forces.element import Element
 from ..forces.part import jumps_of
-from .dopri8 import constant, verdict
+from .dopri8 import Health, constant, health_if, is_singular, verdict
 
 
 def with_pid(change: Callable[[diffrax.PIDController], Any], controller: Any) -> Any:
@@ -23,6 +23,19 @@ def with_pid(change: Callable[[diffrax.PIDController], Any], controller: Any) ->
 
     return jax.tree.map(
         lambda node: change(node) if is_pid(node) else node, controller, is_leaf=is_pid
+    )
+
+
+def with_judge(change: Callable[[Any], Any], controller: Any) -> Any:
+    """Returns a controller with `change` applied to the one that judges errors."""
+
+    def judges(node: Any) -> bool:
+        wrapper = isinstance(node, Adaptive | diffrax.ClipStepSizeController)
+        adaptive = isinstance(node, diffrax.AbstractAdaptiveStepSizeController)
+        return adaptive and not wrapper
+
+    return jax.tree.map(
+        lambda node: change(node) if judges(node) else node, controller, is_leaf=judges
     )
 
 
@@ -104,7 +117,7 @@ def undifferentiated(controller: Any) -> Any:
 
     Up to the tolerance, the motion does not depend on where its steps end.
     """
-    return with_pid(_Undifferentiated, controller)  # pyright: ignore[reportArgumentType]
+    return with_judge(_Undifferentiated, controller)  # pyright: ignore[reportArgumentType]
 
 
 class _Undifferentiated(Adaptive):
@@ -124,7 +137,7 @@ class Watched(Adaptive):
     """
 
     controller: Any
-    health: Callable[[Any, Any, Any], Array] = eqx.field(static=True)  # (t, y, args)
+    health: Callable[[Any, Any, Any], Health] = eqx.field(static=True)  # (t, y, args)
 
     def adapt_step_size(self, *arguments):
         t0, t1, y0, y1_candidate, args, y_error, *rest = arguments
@@ -133,13 +146,12 @@ class Watched(Adaptive):
         finite = jnp.isfinite(sum(map(jnp.sum, leaves)))
         # If the end is not finite, the health at the start shows why.
         judged = jax.tree.map(lambda a, b: jnp.where(finite, a, b), y1_candidate, y0)
-        health = self.health(*constant((t1, judged, args)))
-        health = jnp.where(finite | (health == 0), health, jnp.nan)
-        bad = jnp.isnan(health) | (health == 0)
-        y_error, failure = verdict(y_error, health, t1 - t0)
+        health = health_if(finite, self.health(*constant((t1, judged, args))))
+        bad = jnp.isnan(sum(health)) | is_singular(health)
+        estimate, failure = verdict(y_error, health, t1 - t0)
         # The error is scaled by the state, which must be finite for that.
         end = jax.tree.map(lambda a, b: jnp.where(bad, a, b), y0, y1_candidate)
-        *step, result = super().adapt_step_size(t0, t1, y0, end, args, y_error, *rest)
+        *step, result = super().adapt_step_size(t0, t1, y0, end, args, estimate, *rest)
         failed = failure != diffrax.RESULTS.successful
         return *step, diffrax.RESULTS.where(failed, failure, result)
 

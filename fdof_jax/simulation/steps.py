@@ -14,6 +14,7 @@ from ..checks import concrete, instance, is_traced, real_array
 from ..linkage.coordinates import State
 from ..linkage.linkage import Linkage, check_linkage, joints_of
 from ..linkage.topology import real_joints
+from .dopri8 import Estimate
 from .step_wrappers import Adaptive, with_pid
 
 # Rounding keeps float32 from meeting a tighter relative or absolute tolerance.
@@ -95,15 +96,16 @@ class _Scaled(Adaptive):
         return super().init(*arguments)
 
     def adapt_step_size(self, *arguments):
-        t0, t1, y0, y1_candidate, args, y_error, *rest = arguments
+        t0, t1, y0, y1_candidate, args, (error, health), *rest = arguments
 
         def scaled(state: Any) -> Any:
             # The elements' own states come last and keep their units.
             motion = jax.tree.map(lambda a, unit: a / unit, state[:2], self.unit)
             return (*motion, *state[2:])
 
-        y0, y1_candidate, y_error = map(scaled, (y0, y1_candidate, y_error))
-        return super().adapt_step_size(t0, t1, y0, y1_candidate, args, y_error, *rest)
+        y0, y1_candidate, error = map(scaled, (y0, y1_candidate, error))
+        estimate = Estimate(error, health)
+        return super().adapt_step_size(t0, t1, y0, y1_candidate, args, estimate, *rest)
 
 
 def scale_tolerances(

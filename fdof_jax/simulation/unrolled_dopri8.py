@@ -25,9 +25,11 @@ from .dopri8 import (
     NODES,
     TABLEAU,
     DenseOutput,
+    Health,
     ScheduledDopri8,
     compensated,
     interpolation_weights,
+    is_singular,
     verdict,
 )
 
@@ -68,7 +70,7 @@ class _Step(NamedTuple):
     error: State
     lost: State
     rate: State
-    health: Array
+    health: Health
 
 
 @eqx.filter_jit  # traced once, not at each use in a solve
@@ -127,6 +129,7 @@ class UnrolledDopri8(ScheduledDopri8):
         end, rates, h = _step(terms, t0, t1, y0, lost, args, f0)
         dense_info = dict(y0=y0, step=h, rates=rates)
         # A singular start makes the end not finite.
-        health = jnp.where(health == 0, 0, end.health)
+        singular = is_singular(health)
+        health = tuple(jnp.where(singular, 0, x) for x in end.health)
         error, result = verdict(end.error, health, h)
         return end.y, error, dense_info, ((end.rate, end.health), end.lost), result

@@ -80,8 +80,14 @@ class OptimalMotion(eqx.Module):
 
         **Arguments:** `t1`: not before the horizon [s].
 
-        **Raises:** ValueError for an earlier `t1`.
+        **Raises:** ValueError for an earlier `t1`; RuntimeError if the search has not
+        converged, because better efforts may then exist.
         """
+        if not self.converged:
+            raise RuntimeError(
+                f"bound: expected a search that has converged, got {self.message!r}; "
+                "use more max_steps or a shorter horizon."
+            )
         horizon = float(self.ts[-1])
         t1 = float(real_array("t1", t1, (), minimum=horizon))
         return self.tip_error * (horizon / t1) ** 0.5

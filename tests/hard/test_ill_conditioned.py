@@ -17,8 +17,7 @@ TS = np.linspace(0, 2, OUTPUTS)
 def test_a_tip_of_a_million_tonnes(steps):
     """A condition of 2e11 leaves five digits.
 
-    Rounding, not the method, determines the error estimate, and tight tolerances
-    cannot be met.
+    Rounding, not the method, determines the error estimate.
     """
     solution = fj.simulate(
         arm(mass=[1, 1, 1e9]),
@@ -26,22 +25,15 @@ def test_a_tip_of_a_million_tonnes(steps):
         TS,
         stepsize_controller=steps,
         max_steps=10_000,
-        throw=False,
     )
-    assert solution.stats["num_steps"] < 10_000
-    if solution.outcome == "successful":
-        error = np.abs(solution.q - np.array(DRIVEN["heavy-tip-1e9"]["q"])).max()
-        assert error <= 1e-3
-    else:
-        assert solution.outcome == "ill-conditioned"
-        reached = TS <= solution.stats["time_reached"]
-        np.testing.assert_array_equal(np.isfinite(solution.q).all(axis=1), reached)
+    error = np.abs(solution.q - np.array(DRIVEN["heavy-tip-1e9"]["q"])).max()
+    assert error <= 1e-3
 
 
 @pytest.mark.parametrize("how", ["gradient", "Dopri8", "Kvaerno5"])
 def test_other_solvers_are_stopped_too(how):
     """Only the default solver itself checks the conditioning."""
-    heavy = arm(mass=[1, 1, 1e9])
+    heavy = arm(mass=[1, 1, 1e12])
     if how == "gradient":
         motion, *_ = behind_the_door(heavy, START.q, TS)
     else:

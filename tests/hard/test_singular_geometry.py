@@ -61,10 +61,11 @@ def test_accelerations_of_nearly_parallel_axes(name):
 
 
 @pytest.mark.parametrize(
-    "name, bound", [("near-parallel-PPR", 1e-8), ("near-parallel-RPP", 1e-6)]
+    "name, bound, steps",
+    [("near-parallel-PPR", 1e-8, 21), ("near-parallel-RPP", 1e-6, 43)],
 )
-def test_nearly_parallel_axes(name, bound):
-    """The step control takes rounding, enlarged by the condition of 4e6, for an error.
+def test_nearly_parallel_axes(name, bound, steps):
+    """A condition of 4e6 enlarges rounding; `steps` are those of heyoka.
 
     In 5 s the light link of the second arm gets 890 m away, turning at up to 2.6
     rad/s. The slides move by 1.5e7 m per newton (computed with 60 digits). Rounding
@@ -74,7 +75,7 @@ def test_nearly_parallel_axes(name, bound):
     scene = hard.load(name)
     motion = hard.simulate(scene, hard.TIGHT)
     assert hard.error(motion, scene) <= bound
-    assert motion.stats["num_steps"] <= 10_000
+    assert motion.stats["num_steps"] <= 5 * steps
 
 
 def test_a_slide_driven_through_zero():

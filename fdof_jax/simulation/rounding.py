@@ -1,0 +1,87 @@
+"""Step control that does not chase rounding errors, and the accuracy that they leave.
+
+Equations that lose accuracy amplify rounding errors in the rates. The error estimate of
+a step is then this noise times the step size: no shorter step brings it below a tight
+tolerance, and steps that try reach nothing.
+"""
+
+import functools
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from .dopri8 import Health, constant
+from .step_wrappers import Adaptive, with_judge
+
+# Rounding errors of an acceleration, over its size times eps and the loss of accuracy:
+# less for slides, whose inertia is a sum of masses without levers.
+_OF_REVOLUTE, _OF_SLIDE = 1.0, 0.5
+# An error estimate sums the noise of all stages. Up to so many rounding errors it does
+# not reject a step, and beyond one it does not shorten the next.
+_DOUBTFUL = 8.0
+_SAME_STEP = 0.43  # the error over its tolerance at which a PID controller keeps a step
+
+
+def above_rounding(controller: Any) -> Any:
+    """Returns an adaptive controller that does not chase rounding errors."""
+    return with_judge(_AboveRounding, controller)  # pyright: ignore[reportArgumentType]
+
+
+class _AboveRounding(Adaptive):
+    controller: Any
+
+    def adapt_step_size(self, *arguments):
+        t0, t1, y0, y1_candidate, args, (error, health), *rest = arguments
+        revolute = args.constants.revolute
+        of_qd = _rounding(revolute, health, y0, y1_candidate)
+        of_delta = tuple(jnp.abs(t1 - t0) * noise for noise in of_qd)
+
+        def judged(error: Array, start: Array, rounding: Array) -> Array:
+            tolerance = self.atol + self.rtol * jnp.abs(start)
+            met = rounding > tolerance
+            # In healthy equations the division is by a tolerance and has no effect.
+            ratio = jnp.abs(error) / jnp.where(met, rounding, tolerance)
+            doubtful = jnp.maximum(jnp.minimum(ratio, _SAME_STEP), ratio / _DOUBTFUL)
+            return jnp.where(met, tolerance * doubtful, error)
+
+        # The elements' own states come last; their rates do not lose accuracy.
+        motion = jax.tree.map(judged, error[:2], y0[:2], (of_delta, of_qd))
+        error = (*motion, *error[2:])
+        return super().adapt_step_size(t0, t1, y0, y1_candidate, args, error, *rest)
+
+
+def _rounding(revolute: Sequence[Array], health: Health, y0: Any, y1: Any) -> Health:
+    """Estimates the rounding errors of a step in each velocity or momentum.
+
+    A velocity changes by its acceleration, and its direction turns with the links.
+    Joints that lose accuracy disturb those that do not.
+    """
+    largest = functools.partial(functools.reduce, jnp.maximum)
+    shift, change = jax.tree.map(lambda a, b: jnp.abs(b - a), y0[:2], y1[:2])
+    turned = sum(jnp.where(r, step, 0) for r, step in zip(revolute, shift))
+    size = jnp.maximum(largest(change), turned * largest(map(jnp.abs, y0[1])))
+    worst = jnp.finfo(size.dtype).eps * jnp.sqrt(largest(health)) * size
+    return tuple(
+        jnp.where(r, _OF_REVOLUTE, _OF_SLIDE) * jnp.sqrt(loss) * worst
+        for r, loss in zip(revolute, health)
+    )
+
+
+class Recorded(Adaptive):
+    """A controller whose state includes the largest loss of accuracy so far."""
+
+    controller: Any
+
+    def init(self, *arguments):
+        first, state = super().init(*arguments)
+        return first, (state, jnp.zeros_like(first))
+
+    def adapt_step_size(self, *arguments):
+        *arguments, (state, largest) = arguments
+        loss = constant(functools.reduce(jnp.maximum, arguments[5].health))
+        keep, *step, state, result = super().adapt_step_size(*arguments, state)
+        largest = jnp.where(keep, jnp.maximum(largest, loss), largest)
+        return keep, *step, (state, largest), result
