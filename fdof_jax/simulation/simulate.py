@@ -84,6 +84,8 @@ def check_elements(forces: Forces, linkage: Linkage, ts: Array) -> None:
         try:
             element.check(linkage, ts)
         except ValueError as error:
+            if str(error).startswith(("linkage", "ts")):  # the arguments of this call
+                raise
             raise ValueError(f"{place}.{error}") from error
         if not values.possible():
             raise ValueError(
