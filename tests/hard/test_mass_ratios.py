@@ -29,7 +29,8 @@ def test_gradients_of_point_masses():
 
 
 @pytest.mark.parametrize(
-    "name, bound, steps", [("1e3", 1e-8, 1130), ("1e6", 1e-6, 2503), ("1e9", 1e-3, 3837)]
+    "name, bound, steps",
+    [("1e3", 1e-8, 1130), ("1e6", 1e-6, 2503), ("1e9", 1e-3, 3837)],
 )
 def test_heavy_tip(name, bound, steps):
     """The mass matrix, of condition 2e5 to 2e11, loses five to eleven digits.
