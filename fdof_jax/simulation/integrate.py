@@ -115,6 +115,7 @@ def integrate(
     reached = jnp.where(lost.any(), ts[jnp.argmax(lost) - 1], reached)
     stats = found.stats | {"time_reached": jnp.where(valid, reached, asked[0])}
     if adaptive:
+        assert found.controller_state is not None  # because of saveat
         _, loss = found.controller_state
         stats["accuracy"] = jnp.finfo(q.dtype).eps * loss
     result = _judged(valid, found.result, q, qd)
