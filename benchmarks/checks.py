@@ -26,7 +26,7 @@ class _Unwatched(UnrolledDopri8):
 
     def _plain(self, terms):
         field = terms.term.vector_field
-        healthy = lambda *arguments: (field(*arguments), jnp.ones(()))
+        healthy = lambda *arguments: (field(*arguments), (jnp.ones(()),) * 3)
         term = dataclasses.replace(terms.term, watched_field=healthy)
         return eqx.tree_at(lambda wrapped: wrapped.term, terms, term)
 

@@ -56,9 +56,10 @@ def fdof_jax(scene: HardScene) -> Callable[[], Run]:
         stepsize_controller=steps,
         dt0=scene.first_step,
         max_steps=MAX_STEPS,
-        adjoint=diffrax.ForwardMode(),
         throw=False,
     )
+    if scene.derivative:
+        keywords["adjoint"] = diffrax.ForwardMode()
 
     @jax.jit
     def solve(q0):

@@ -44,8 +44,28 @@ def hard_cases(points: list[dict]) -> str:
         [
             table(["", *OUTCOMES, "not asked"], counts),
             table(["", "scene", "bound", *worst], body),
+            _steps(points),
         ]
     )
+
+
+def _steps(points: list[dict]) -> str:
+    """Returns the steps of fdof_jax beside those of heyoka, where both move the arm."""
+    found: dict[tuple, dict[str, dict]] = {}
+    for p in points:
+        found.setdefault((p["number"], p["problem"]), {})[p["solver"]] = p
+    rows = []
+    for (scene, name), by in found.items():
+        both = [by.get(engine, {}) for engine in ("fdof_jax", "heyoka")]
+        own, other = (point.get("steps") for point in both)
+        if own and other:
+            errors = [number(point["error"]) for point in both]
+            if both[1]["status"] != OUTCOMES[0]:
+                errors[1] = f"({errors[1]})"  # beyond the bound
+            cells = f"{own}", f"{other}", f"{own / other:.2g}", *errors
+            rows.append([str(scene), name, *cells])
+    head = ["steps of fdof_jax", "of heyoka", "ratio", "error", "of heyoka"]
+    return table(["", "scene", *head], rows)
 
 
 def hard_cases_float32(points: list[dict]) -> str:

@@ -126,3 +126,16 @@ class TestEnsembles:
             fj.tuning.perturbed(self.scene, 2, link_error=1.5)
         with pytest.raises(ValueError, match="speed"):
             fj.tuning.perturbed(self.scene, 2, speed=(2.0, 0.0))
+
+
+def test_a_payload_is_a_point_mass_at_the_tip():
+    """Wherever the last link's mass centre is: it adds m J^T J to the mass matrix."""
+    arm = fj.Linkage(
+        "RRR", length=[0, 1, 1, 0.8], com=[[0.5, 0.1], [0.4, 0], [0.3, -0.2]],
+        mass=[1, 1, 2], inertia=[0.1, 0.1, 0.3],
+    )  # fmt: skip
+    q = np.array([0.3, -0.7, 1.1])
+    jacobian = np.asarray(fj.tip_jacobian(arm, q))[:2]
+    loaded = fj.tuning.with_payload(arm, 1.5)
+    more = fj.joint_mass_matrix(loaded, q) - fj.joint_mass_matrix(arm, q)
+    np.testing.assert_allclose(more, 1.5 * jacobian.T @ jacobian, atol=1e-14)

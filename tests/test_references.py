@@ -1,5 +1,6 @@
 """References: tip paths by inverse kinematics, and moves in joint space."""
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -97,6 +98,48 @@ def test_a_path_behind_the_pivot_is_refused_where_it_is_simulated(x):
     start = fj.State(np.zeros(3), np.zeros(3))
     with pytest.raises(ValueError, match="reference: expected a path that does not"):
         fj.simulate(ARM, start, [0, 2], forces)
+    assert not fj.references.reachable(ARM, ring, [0.0, 0.4, 2.0]).any()
+
+
+def test_a_path_behind_the_pivot_or_left_by_laps_fails_where_it_is_traced():
+    """Its joints would jump by a turn, which the motion would follow."""
+
+    @jax.jit
+    def outcomes(x, size):
+        def of(path):
+            task = fj.TipTask(path, fj.references.Laps(-2.0))
+            forces = (fj.PDController(10.0, 1.0, 100.0, task),)
+            start = fj.State(np.zeros(3), np.zeros(3))
+            motion = fj.simulate(ARM, start, [0, 0.1, 2], forces, throw=False)
+            return motion.result, fj.references.reachable(ARM, task, [0.0, 2.0])
+
+        line = fj.references.Line([1, 0], [1 + x, 0.5])
+        return of(fj.references.Ellipse([x, 0], [size, size])), of(line)
+
+    cases = (0.5, 1.2, "nonfinite"), (1.3, 0.4, "successful")
+    for x, size, expected in cases:
+        (ring, seen), (line, beyond) = outcomes(x, size)
+        assert ring == getattr(diffrax.RESULTS, expected)
+        assert line == diffrax.RESULTS.nonfinite
+        assert seen.all() == (x == 1.3) and not beyond.any()
+
+
+def test_laps_need_a_closed_path():
+    line = fj.references.Line([1, 0], [1, 0.5])
+    task = fj.TipTask(line, fj.references.Laps(2.0))
+    with pytest.raises(ValueError, match="a closed path for `Laps`, .* ends 0.5 m"):
+        task.check(ARM, jnp.array([0.0, 1.0]))
+
+
+def test_backward_laps_are_checked_over_a_whole_lap():
+    ring = fj.TipTask(
+        fj.references.Ellipse([0.5, 0], [1.2, 1.2]), fj.references.Laps(-2.0)
+    )
+    with pytest.raises(ValueError, match="behind the ground pivot"):
+        ring.check(ARM, jnp.array([0.0, 5.0]))
+    ring.check(ARM, jnp.array([0.0, 0.2]))
+    times = jnp.array([0.0, 0.2]), jnp.array([0.0, 5.0])
+    assert [bool(ring.fits(ARM, ts)) for ts in times] == [True, False]
 
 
 class Swinging(fj.references.Path):

@@ -153,6 +153,8 @@ def test_constant_steps_that_are_too_long_do_not_succeed():
     still = scene.state0._replace(qd=np.ones(3))
     solution = fj.simulate(scene.linkage, still, ts, stiff, throw=False, **keywords)
     assert solution.outcome == "not finite" and np.isnan(solution.q[-1]).all()
+    finite = np.isfinite(solution.q).all(axis=1)
+    assert solution.stats["time_reached"] == ts[finite][-1]
     with pytest.raises(RuntimeError, match="not finite"):
         fj.simulate(scene.linkage, still, ts, stiff, **keywords)
 

@@ -89,3 +89,19 @@ def test_malformed_travels_are_refused():
 def test_laps_go_on():
     laps = fj.references.Laps(4.0, phase=0.25)
     assert laps(jnp.array(10.0)) == 2.75
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+def test_steps_end_where_the_acceleration_jumps(profile):
+    """Of a quintic only the third derivative jumps, at both ends."""
+    travel = fj.references.Travel(2.0, begin=0.5, profile=profile)
+    inside = [1.0, 2.0] if profile == "trapezoidal" else []
+    np.testing.assert_allclose(travel.jump_ts, [0.5, *inside, 2.5], rtol=1e-15)
+    way = jax.grad(jax.grad(travel))
+    times = np.linspace(0.4, 2.6, 1101)
+    second = np.asarray(jax.vmap(way)(times))
+    jumps = times[1:][np.abs(np.diff(second)) > 0.3]
+    if profile in ("harmonic", "trapezoidal"):
+        np.testing.assert_allclose(jumps, travel.jump_ts, atol=0.003)
+    else:
+        assert not len(jumps)

@@ -125,6 +125,11 @@ class Part(eqx.Module, metaclass=_Fields):
         for _, part in _within(self):
             part.check(linkage, ts)
 
+    def fits(self, linkage: Linkage, ts: Array) -> Any:
+        """Returns whether `check` would accept an arm and times; also if traced."""
+        parts = [part.fits(linkage, ts) for _, part in _within(self)]
+        return reduce(and_, parts, True)
+
     def possible(self) -> Any:
         """Returns whether the constructor would accept the values; also if traced."""
         own = [_all(condition.holds) for condition in self.conditions()]

@@ -132,6 +132,9 @@ def _finite(reference: Any, linkage: Linkage, times: ArrayLike) -> Array:
 def reachable(linkage: Linkage, reference: Any, ts: ArrayLike) -> Bool[Array, " time"]:
     """Returns whether a linkage can reach the reference at each time.
 
+    A `TipTask` that passes behind the pivot between the first and the last time, so
+    that joints would jump, is out of reach at all times.
+
     **Arguments:** `linkage`; `reference`: for instance a `CircleTask` or `TipTask`;
     `ts`: times (time,) [s].
 
@@ -146,6 +149,12 @@ def reachable(linkage: Linkage, reference: Any, ts: ArrayLike) -> Bool[Array, " 
     check_linkage(linkage)
     ts = real_array("ts", ts, (None,))
     arguments = function("reference", reference, EXPECTED), linkage, ts
-    if is_traced(arguments):
-        return _finite(*arguments)
-    return jax.device_put(known_reach(*arguments))
+    near = _finite(*arguments) if is_traced(arguments) else known_reach(*arguments)
+    if isinstance(reference, Part) and len(ts):
+        near = near & _fits(reference, linkage, jnp.sort(ts))
+    return jnp.asarray(near)
+
+
+@eqx.filter_jit
+def _fits(reference: Part, linkage: Linkage, ts: Array) -> Array:
+    return jnp.asarray(reference.fits(linkage, ts))

@@ -26,6 +26,8 @@ from .paths import Path, points_at
 from .reference import Reference, runs_in_numpy
 from .timing import Laps, Travel
 
+_CLOSED = 1e-3  # laps that end as near to their start are closed [m]
+
 
 class JointMove(Reference):
     """A move of all joints from one position to another, in step.
@@ -146,16 +148,12 @@ class TipTask(TipReference):
         """Raises ValueError if the tip leaves the reach or the wrist's angle jumps.
 
         Both are checked at 1000 times between `ts[0]` and `ts[-1]`, at most one lap.
+        The path of `Laps` has to be closed.
         """
         super().check(linkage, ts)
         task, arm, ts = in_numpy((self, linkage, ts))
-        end = ts[-1]
-        if isinstance(self.timing, Laps):  # all laps are alike
-            end = min(end, ts[0] + abs(task.timing.period))
-        times = np.linspace(ts[0], end, 1000, dtype=ts.dtype)
-        three, _ = arm_of(arm, task.orientation is not None)
-        directions = known_directions(three, task.direction)
-        base = unmoved_part(three, directions)
+        three, directions, base = task._placed(arm)
+        times = task._times(ts)
         wrist, bearing = task.seen(times, base)
         q, _ = solve_joints(three, directions, wrist, bearing, task.branch)
         inside = np.isfinite(q).all(axis=1)
@@ -165,9 +163,44 @@ class TipTask(TipReference):
                 f"{task.direction:g} rad on branch {task.branch:+g}, got one that "
                 f"leaves it at {times[inside.argmin()]:g} s."
             )
-        behind = (np.abs(np.diff(bearing)) > np.pi).any()
-        if behind or plane_vectors(in_numpy(task.path.middle)) == base:
+        if not task._ahead(bearing, base):
             raise ValueError(
                 "reference: expected a path that does not pass behind the ground "
                 "pivot as seen from its middle, got one that does."
             )
+        gap = task._gap(lambda t: task.seen(t, base)[0], ts)
+        if gap > _CLOSED:
+            raise ValueError(
+                "reference: expected a closed path for `Laps`, got one that ends "
+                f"{gap:g} m from its start."
+            )
+
+    def fits(self, linkage, ts):
+        _, _, base = self._placed(linkage)
+        seen = lambda t: self.seen(t, base)
+        _, bearing = jax.vmap(seen)(self._times(ts))
+        closed = self._gap(lambda t: seen(t)[0], ts) <= _CLOSED
+        return super().fits(linkage, ts) & self._ahead(bearing, base) & closed
+
+    def _placed(self, linkage: Linkage) -> tuple[Any, Any, Array]:
+        """Returns the arm, its known directions, and what a wrist lacks to the tip."""
+        arm, _ = arm_of(linkage, self.orientation is not None)
+        directions = known_directions(arm, self.direction)
+        return arm, directions, unmoved_part(arm, directions)
+
+    def _times(self, ts: Array) -> Array:
+        xp, end = namespace(self, ts), ts[-1]
+        if isinstance(self.timing, Laps):  # all laps are alike
+            end = xp.minimum(end, ts[0] + abs(self.timing.period))
+        return xp.linspace(ts[0], end, 1000, dtype=ts.dtype)
+
+    def _ahead(self, bearing: Array, base: Array) -> Any:
+        """Returns whether the wrist never passes behind the ground pivot."""
+        jumps = abs(namespace(bearing).diff(bearing)) > np.pi
+        return ~jumps.any() & (plane_vectors(in_numpy(self.path.middle)) != base)
+
+    def _gap(self, wrist: Any, ts: Array) -> Any:
+        """Returns how far a lap ends from its start [m], 0 without laps."""
+        if not isinstance(self.timing, Laps):
+            return 0.0
+        return abs(wrist(ts[0] + self.timing.period) - wrist(ts[0]))

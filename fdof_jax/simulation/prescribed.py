@@ -183,7 +183,7 @@ def _health(t, y, args) -> Health:
     driven = ~motion.of(args.linkage)
     free = jnp.where(jnp.outer(driven, driven), matrix, jnp.eye(len(q)))
     losses = jnp.diag(free) * jnp.diag(jnp.linalg.inv(free))
-    return health_at(tuple(jnp.where(jnp.isnan(losses), jnp.inf, losses)))
+    return health_at(tuple(jnp.where(losses > 0, losses, jnp.inf)))
 
 
 def prescribed_effort(
