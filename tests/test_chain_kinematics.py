@@ -119,7 +119,8 @@ def test_tasks_without_orientation_are_followed_at_their_exact_rates(topology):
         np.testing.assert_allclose(fj.tip_position(chain, q), task.tip(t), atol=1e-4)
 
 
-@pytest.mark.parametrize("topology", ["FRFRR", slow("RPFR")])
+@pytest.mark.slow
+@pytest.mark.parametrize("topology", ["FRFRR", "RPFR"])
 def test_circles_of_three_joints_and_fixed_pairs(topology):
     chain = chains.random_chain(topology, np.random.default_rng(11))
     q = np.where(chains.moving(topology), 0.5, 0)

@@ -90,6 +90,7 @@ class TestEnsembles:
         np.testing.assert_array_equal(model.mass, np.tile(arm.mass, (4, 1)))
         assert (np.asarray(many.linkage.mass)[:, 2] >= arm.mass[2] + 1).all()
 
+    @pytest.mark.slow
     def test_computed_torque_is_tuned_for_payloads_in_units_of_its_own(self):
         scene = model_based(self.scene._replace(t1=0.2), fj.control.ComputedTorque)
         many = fj.tuning.perturbed(scene, 4, payload=(1, 2))

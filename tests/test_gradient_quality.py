@@ -163,6 +163,7 @@ def test_a_report_says_where_gains_have_no_effect():
     assert "P2 is at its limit throughout" in found.warnings[0]
 
 
+@pytest.mark.slow
 def test_a_report_without_modes_for_elements_with_a_state():
     scene = scenes.fig7()._replace(t1=0.2)
     # Whole numbers in lists are a state too.

@@ -56,6 +56,7 @@ def test_reachable_says_when():
             assert not there
 
 
+@pytest.mark.slow
 def test_all_are_tuned_in_one_program_and_as_they_are_alone():
     few = {name: SCENES[name]._replace(t1=1.0) for name in ("RPR", "PPR")}
     together = fj.tuning.tune_each(few, max_steps=4)

@@ -72,6 +72,7 @@ def test_a_and_b_are_slopes(topology):
     np.testing.assert_allclose(B, by_u, atol=1e-7 * np.abs(B).max())
 
 
+@pytest.mark.slow
 def test_small_deviations_follow_the_exponential_of_a():
     linkage, q, *_ = motion("RPR")
     forces = (held(linkage, q, [60.0, 90.0, 40.0], [5.0, 3.0, 2.0]),)

@@ -146,6 +146,7 @@ def workers(folder, processes, devices):
     return answers
 
 
+@pytest.mark.slow
 def test_more_devices_and_processes_change_nothing(clean, tmp_path):
     """Uses two devices in each of two processes."""
     for answer in workers(tmp_path, processes=2, devices=4):
