@@ -7,7 +7,6 @@ wrote it; each array is a member in NumPy's `.npy` format.
 import io
 import json
 import os
-import secrets
 import zipfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .. import __version__
+from ..whole_files import whole_file
 from .tree_description import Restorer, Unreadable, described
 
 _FORMAT, _VERSION = "fdof_jax", 1
@@ -104,20 +104,12 @@ def save(path: str | os.PathLike, tree: Any) -> None:
         "tree": tree_node,
     }
     text = json.dumps(description, allow_nan=False, indent=1)
-    unfinished = path.with_name(f"{path.name}.{secrets.token_hex(4)}.part")
-    try:
-        with unfinished.open("xb") as file:
-            with zipfile.ZipFile(file, "w") as archive:
-                archive.writestr(zipfile.ZipInfo(_DESCRIPTION), text)
-                for index, array in enumerate(arrays):
-                    info = zipfile.ZipInfo(f"arrays/{index}.npy")
-                    with archive.open(info, "w", force_zip64=True) as member:
-                        np.lib.format.write_array(member, array, allow_pickle=False)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(unfinished, path)
-    finally:
-        unfinished.unlink(missing_ok=True)
+    with whole_file(path) as file, zipfile.ZipFile(file, "w") as archive:
+        archive.writestr(zipfile.ZipInfo(_DESCRIPTION), text)
+        for index, array in enumerate(arrays):
+            info = zipfile.ZipInfo(f"arrays/{index}.npy")
+            with archive.open(info, "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, array, allow_pickle=False)
 
 
 def load(path: str | os.PathLike, classes: Sequence[type] = ()) -> Any:

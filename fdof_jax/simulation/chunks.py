@@ -1,8 +1,5 @@
 """Solves a batch in chunks of members that take about equally long."""
 
-import hashlib
-import os
-from pathlib import Path
 from typing import Any
 
 import diffrax
@@ -19,6 +16,7 @@ from ..forces.element import elements
 from ..linkage.topology import real_joints
 from ..xla.array_namespace import in_numpy
 from .batch_axes import Batch
+from .checkpoints import Checkpoint, Rows
 from .field import element_effort
 from .simulate import simulate
 from .solution import Solution
@@ -94,27 +92,21 @@ def expected_work(t0: Array, moving: Any, shared: Any) -> tuple[Array, Array]:
 
 
 class _Chunks:
-    """Solves chunks and keeps their results in memory and optionally in a folder."""
+    """Solves chunks; keeps their results in memory and, if given, in a checkpoint."""
 
-    def __init__(self, batch: Batch, ts: Array, settings: dict, folder: Path | None):
+    def __init__(
+        self, batch: Batch, ts: Array, settings: dict, checkpoint: Checkpoint | None
+    ):
         moving, self.shared = batch.split()
         self.moving = in_numpy(moving)
-        self.ts, self.settings, self.folder = ts, settings, folder
+        self.ts, self.settings, self.checkpoint = ts, settings, checkpoint
         devices = jax.devices()
         self.devices = len(devices)
         self.mesh = Mesh(np.array(devices), ("member",)) if len(devices) > 1 else None
         self.size = batch.size
         self.results: list[np.ndarray] = []
         self.structure: Any = None  # of a solution
-        if folder is not None:
-            folder.mkdir(parents=True, exist_ok=True)
-            self.digest = hashlib.sha256(repr((settings, batch.batched)).encode())
-            # The repr of the settings leaves out the values of arrays.
-            arrays = eqx.filter(settings, eqx.is_array)
-            for leaf in jax.tree.leaves((batch.inputs, ts, arrays)):
-                leaf = np.asarray(leaf)
-                self.digest.update(repr((leaf.shape, leaf.dtype)).encode())
-                self.digest.update(leaf.tobytes())
+        self.rows: Rows | None = None
 
     def solve(self, members: np.ndarray, lanes: int, limit: int) -> np.ndarray:
         """Solves members, at most `lanes` per device; returns their step counts."""
@@ -125,23 +117,14 @@ class _Chunks:
             self.settings, self.mesh, self.ts, moving, self.shared,
             np.asarray(limit, np.int32),
         )  # fmt: skip
-        path = self._path(members, limit)
-        if path is not None and path.exists():
-            with np.load(path) as saved:
-                values = list(saved.values())
-            if self.structure is None:
-                like = eqx.filter_eval_shape(_solve_chunk, *arguments)
-                self.structure = jax.tree.structure(like)
-        else:
+        values = self._kept(members, limit, arguments)
+        if values is None:
             solved, self.structure = jax.tree.flatten(_solve_chunk(*arguments))
             if jax.process_count() > 1:
                 solved = multihost_utils.process_allgather(solved, tiled=True)
             values = [np.asarray(leaf)[: len(members)] for leaf in solved]
-            if path is not None and jax.process_index() == 0:
-                unfinished = path.with_suffix(".part")
-                with unfinished.open("wb") as file:
-                    np.savez(file, *values)
-                os.replace(unfinished, path)
+            if self.checkpoint is not None and jax.process_index() == 0:
+                self.checkpoint.write(members, limit, values)
         if not self.results:
             self.results = [
                 np.empty((self.size, *v.shape[1:]), v.dtype) for v in values
@@ -150,13 +133,17 @@ class _Chunks:
             kept[members] = value
         return jax.tree.unflatten(self.structure, values).stats["num_steps"]
 
-    def _path(self, members: np.ndarray, limit: int) -> Path | None:
-        """Returns the file of a chunk; another chunk size groups other members."""
-        if self.folder is None:
+    def _kept(
+        self, members: np.ndarray, limit: int, arguments: tuple
+    ) -> list[np.ndarray] | None:
+        """Returns the arrays of a chunk that the checkpoint holds, or None."""
+        if self.checkpoint is None or not self.checkpoint.has(members, limit):
             return None
-        digest = self.digest.copy()
-        digest.update(repr((members.tolist(), limit)).encode())
-        return self.folder / f"{digest.hexdigest()[:32]}.npz"
+        if self.rows is None:
+            like = eqx.filter_eval_shape(_solve_chunk, *arguments)
+            arrays, self.structure = jax.tree.flatten(like)
+            self.rows = Rows(arrays)
+        return self.checkpoint.read(members, limit, self.rows)
 
     def _place(self, rows: np.ndarray) -> np.ndarray | Array:
         if jax.process_count() == 1:
@@ -171,12 +158,12 @@ def in_chunks(
     ts: Array,
     settings: dict,
     chunk: int,
-    folder: Path | None,
+    checkpoint: Checkpoint | None,
     meter: diffrax.AbstractProgressMeter,
 ) -> Solution:
     topology, work = map(np.asarray, expected_work(ts[0], *batch.split()))
     waiting = np.lexsort((work, topology))  # NaN comes last
-    chunks = _Chunks(batch, ts, settings, folder)
+    chunks = _Chunks(batch, ts, settings, checkpoint)
     max_steps = settings["max_steps"] or np.iinfo(np.int32).max
     # Members with steps of given lengths take equally many.
     first = _FIRST_LIMIT if _adaptive(settings) else max_steps

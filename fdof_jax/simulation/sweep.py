@@ -7,7 +7,6 @@ batch of slow members.
 """
 
 import os
-from pathlib import Path
 from typing import Any
 
 import diffrax
@@ -23,6 +22,7 @@ from ..forces.element import Forces, elements
 from ..linkage.coordinates import State
 from ..linkage.linkage import Linkage
 from .batch_axes import Batch, batch_of
+from .checkpoints import Checkpoint
 from .chunks import expected_work, in_chunks, motion_of
 from .simulate import solve_options
 from .solution import Solution
@@ -102,7 +102,8 @@ def sweep(
     - `chunk`: largest number of members to solve together, per device.
     - `throw`: whether to raise an error if any member fails.
     - `checkpoint`: a folder for the results of finished chunks. A repeated call resumes
-      from them.
+      from them. A file that is damaged, or of another chunk, is reported by a warning,
+      and its members are solved again.
     - `solver`, `rtol`, `atol`, `stepsize_controller`, `dt0`, `adjoint`, `max_steps`,
       `progress_meter`: as in `simulate`.
 
@@ -138,8 +139,6 @@ def sweep(
     )
     del settings["progress_meter"]  # it counts finished members, not time
     batch = batch_of(linkage, state0, forces, forces_axes)
-    if checkpoint is not None and not isinstance(checkpoint, str | os.PathLike):
-        raise ValueError(f"checkpoint: expected a folder, got {checkpoint!r}.")
     try:
         eqx.filter_eval_shape(expected_work, ts[0], *batch.split())
     except TypeError as error:
@@ -153,8 +152,12 @@ def sweep(
                 "throw, checkpoint: expected their defaults under jit, grad or vmap."
             )
         return _traced(batch, ts, settings, chunk)
-    folder = None if checkpoint is None else Path(checkpoint)
-    solution = in_chunks(batch, ts, settings, chunk, folder, progress_meter)
+    kept = None
+    if checkpoint is not None:
+        # The repr of the settings leaves out the values of arrays.
+        arrays = batch.inputs, ts, eqx.filter(settings, eqx.is_array)
+        kept = Checkpoint(checkpoint, (settings, batch.batched), arrays)
+    solution = in_chunks(batch, ts, settings, chunk, kept, progress_meter)
     failed = np.flatnonzero(np.asarray(solution.result != diffrax.RESULTS.successful))
     if throw and len(failed):
         raise RuntimeError(
