@@ -66,6 +66,7 @@ def _traced(batch: Batch, ts: Array, settings: dict, chunk: int) -> Solution:
     return jax.tree.map(chosen, again, frozen)
 
 
+@jax.transfer_guard("allow")  # its transfers are meant: the batch comes in chunks
 def sweep(
     linkage: Linkage,
     state0: State,
