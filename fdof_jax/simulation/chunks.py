@@ -1,5 +1,7 @@
 """Solves a batch in chunks of members that take about equally long."""
 
+import re
+from collections.abc import Callable
 from typing import Any
 
 import diffrax
@@ -11,6 +13,7 @@ from jax import Array
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from ..checks import refusal
 from ..dynamics import forward_dynamics
 from ..forces.element import elements
 from ..linkage.topology import real_joints
@@ -45,13 +48,31 @@ def motion_of(
     return simulate(linkage, state0, ts, forces, throw=False, **settings)
 
 
+def outcome_of(
+    settings: dict,
+    reduce: Callable[[Solution], Any],
+    ts: Array,
+    moving: Any,
+    shared: Any,
+    limit: Array | None,
+) -> tuple[Any, Array, Array]:
+    """Computes what is kept of one member, its steps, and whether it failed."""
+    solution = motion_of(settings, ts, moving, shared, limit)
+    kept = reduce(solution)
+    if not all(map(eqx.is_array_like, jax.tree.leaves(kept))):
+        raise refusal("reduce", "a function that returns arrays", kept)
+    failed = solution.result != diffrax.RESULTS.successful
+    return kept, solution.stats["num_steps"], failed
+
+
 @eqx.filter_jit
-def _solve_chunk(settings, mesh, ts, moving, shared, limit):
-    arrays, static = eqx.partition((ts, shared, limit), eqx.is_array)
+def _solve_chunk(settings, mesh, reduce, ts, moving, shared, limit):
+    arrays, static = eqx.partition((reduce, ts, shared, limit), eqx.is_array)
 
     def run(moving, arrays):
-        ts, shared, limit = eqx.combine(arrays, static)
-        return jax.vmap(lambda m: motion_of(settings, ts, m, shared, limit))(moving)
+        reduce, ts, shared, limit = eqx.combine(arrays, static)
+        member = lambda m: outcome_of(settings, reduce, ts, m, shared, limit)
+        return jax.vmap(member)(moving)
 
     if mesh is not None:
         lanes, same = PartitionSpec("member"), PartitionSpec()
@@ -95,17 +116,23 @@ class _Chunks:
     """Solves chunks; keeps their results in memory and, if given, in a checkpoint."""
 
     def __init__(
-        self, batch: Batch, ts: Array, settings: dict, checkpoint: Checkpoint | None
+        self,
+        batch: Batch,
+        ts: Array,
+        settings: dict,
+        reduce: Callable[[Solution], Any],
+        checkpoint: Checkpoint | None,
     ):
         moving, self.shared = batch.split()
         self.moving = in_numpy(moving)
-        self.ts, self.settings, self.checkpoint = ts, settings, checkpoint
+        self.ts, self.settings, self.reduce = ts, settings, reduce
+        self.checkpoint = checkpoint
         devices = jax.devices()
         self.devices = len(devices)
         self.mesh = Mesh(np.array(devices), ("member",)) if len(devices) > 1 else None
         self.size = batch.size
         self.results: list[np.ndarray] = []
-        self.structure: Any = None  # of a solution
+        self.structure: Any = None  # of the outcomes
         self.rows: Rows | None = None
 
     def solve(self, members: np.ndarray, lanes: int, limit: int) -> np.ndarray:
@@ -114,7 +141,7 @@ class _Chunks:
         padded[: len(members)] = members
         moving = jax.tree.map(lambda leaf: self._place(leaf[padded]), self.moving)
         arguments = (
-            self.settings, self.mesh, self.ts, moving, self.shared,
+            self.settings, self.mesh, self.reduce, self.ts, moving, self.shared,
             np.asarray(limit, np.int32),
         )  # fmt: skip
         values = self._kept(members, limit, arguments)
@@ -131,7 +158,8 @@ class _Chunks:
             ]
         for kept, value in zip(self.results, values):
             kept[members] = value
-        return jax.tree.unflatten(self.structure, values).stats["num_steps"]
+        _, steps, _ = jax.tree.unflatten(self.structure, values)
+        return steps
 
     def _kept(
         self, members: np.ndarray, limit: int, arguments: tuple
@@ -157,13 +185,15 @@ def in_chunks(
     batch: Batch,
     ts: Array,
     settings: dict,
+    reduce: Callable[[Solution], Any],
     chunk: int,
     checkpoint: Checkpoint | None,
     meter: diffrax.AbstractProgressMeter,
-) -> Solution:
+) -> tuple[Any, np.ndarray]:
+    """Returns what is kept of all members, and which of them failed."""
     topology, work = map(np.asarray, expected_work(ts[0], *batch.split()))
     waiting = np.lexsort((work, topology))  # NaN comes last
-    chunks = _Chunks(batch, ts, settings, checkpoint)
+    chunks = _Chunks(batch, ts, settings, reduce, checkpoint)
     max_steps = settings["max_steps"] or np.iinfo(np.int32).max
     # Members with steps of given lengths take equally many.
     first = _FIRST_LIMIT if _adaptive(settings) else max_steps
@@ -194,5 +224,16 @@ def in_chunks(
         if len(waiting) <= lanes // 2:
             lanes = min(lanes, _SMALL) if len(waiting) > 1 else 1
     meter.close(progress)
-    leaves = [jnp.asarray(leaf) for leaf in chunks.results]
-    return jax.tree.unflatten(chunks.structure, leaves)
+    kept, _, failed = jax.tree.unflatten(chunks.structure, chunks.results)
+    return jax.tree.map(jnp.asarray, kept), failed
+
+
+def program_of(
+    reduce: Callable[[Solution], Any], batch: Batch, ts: Array, settings: dict
+) -> tuple[str, list]:
+    """Returns text and constants that name what `reduce` computes, in any process."""
+    moving, shared = batch.split()
+    first = jax.tree.map(lambda leaf: leaf[0], moving)
+    like = eqx.filter_eval_shape(motion_of, settings, ts, first, shared, None)
+    program, _, _ = eqx.filter_make_jaxpr(reduce)(like)
+    return re.sub(" at 0x[0-9a-f]+", "", str(program)), program.consts
