@@ -131,7 +131,7 @@ class _Chunks:
         self.devices = len(devices)
         self.mesh = Mesh(np.array(devices), ("member",)) if len(devices) > 1 else None
         self.size = batch.size
-        self.results: list[np.ndarray] = []
+        self.results: list[Any] = []
         self.structure: Any = None  # of the outcomes
         self.rows: Rows | None = None
 
@@ -224,8 +224,11 @@ def in_chunks(
         if len(waiting) <= lanes // 2:
             lanes = min(lanes, _SMALL) if len(waiting) > 1 else 1
     meter.close(progress)
-    kept, _, failed = jax.tree.unflatten(chunks.structure, chunks.results)
-    return jax.tree.map(jnp.asarray, kept), failed
+    leaves = chunks.results
+    for index, leaf in enumerate(leaves):
+        leaves[index] = jnp.asarray(leaf)  # frees one array before the next is copied
+    kept, _, failed = jax.tree.unflatten(chunks.structure, leaves)
+    return kept, np.asarray(failed)
 
 
 def program_of(
