@@ -39,7 +39,7 @@ def test_a_checkpoint_spares_finished_chunks(mixed, swept, solved, tmp_path):
     first = run(mixed, checkpoint=folder)
     saved = sorted(folder.iterdir())
     assert len(saved) == len(solved) > len(first.q) // CHUNK
-    assert {file.suffix for file in saved} == {".npz"}
+    assert {file.suffix for file in saved} == {".chunk"}
     solved.clear()
 
     again = run(mixed, checkpoint=str(folder))

@@ -7,8 +7,9 @@ wrote it; each array is a member in NumPy's `.npy` format.
 import io
 import json
 import os
-import secrets
+import struct
 import zipfile
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -20,10 +21,19 @@ import jax.numpy as jnp
 import numpy as np
 
 from .. import __version__
+from ..whole_files import whole_file
 from .tree_description import Restorer, Unreadable, described
 
 _FORMAT, _VERSION = "fdof_jax", 1
 _DESCRIPTION = "description.json"
+# `save` does not compress, but another program may have compressed a file afterwards.
+_EXPANSION = 16
+# What zipfile, NumPy, JSON and `Restorer` raise for a damaged file. Other errors, for
+# instance of a device or of memory, say nothing about the file.
+_DAMAGED = (
+    zipfile.BadZipFile, EOFError, LookupError, ValueError, TypeError, AttributeError,
+    struct.error, zlib.error, RecursionError, NotImplementedError,
+)  # fmt: skip
 
 
 def _read(file: Any, classes: Sequence[type]) -> Any:
@@ -34,7 +44,8 @@ def _read(file: Any, classes: Sequence[type]) -> Any:
             raise Unreadable(
                 "expected a file that fdof_jax.save has written, got another archive"
             )
-        description = json.loads(archive.read(_DESCRIPTION))
+        _check_sizes(file, archive.infolist())
+        description = json.loads(_content(archive, _DESCRIPTION))
         if description["format"] != _FORMAT:
             raise Unreadable(
                 f"expected the format {_FORMAT}, got {description['format']}"
@@ -47,12 +58,53 @@ def _read(file: Any, classes: Sequence[type]) -> Any:
                 "or a newer version can read it"
             )
 
+        unread = set(archive.namelist())
+
         def array(index: int) -> np.ndarray:
-            # zipfile checks the checksum only if the member is read to its end.
-            member = io.BytesIO(archive.read(f"arrays/{index}.npy"))
-            return np.lib.format.read_array(member, allow_pickle=False)
+            # Each array has one place, which limits their memory.
+            unread.remove(name := f"arrays/{index}.npy")
+            return _array(_content(archive, name))
 
         return Restorer(array, classes).tree(description["tree"])
+
+
+def _check_sizes(file: Any, members: Sequence[zipfile.ZipInfo]) -> None:
+    """Raises Unreadable if the members may take much more memory than the file."""
+    size = os.stat(file.fileno()).st_size
+    known, encrypted = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED), 1
+    for member in members:
+        within = 0 <= member.header_offset < size
+        plain = member.compress_type in known and not member.flag_bits & encrypted
+        if not within or not plain:
+            raise Unreadable(
+                "expected contents that fdof_jax.save has written, got "
+                f"{member.filename} encrypted, compressed in another way or damaged"
+            )
+    declared = sum(member.file_size for member in members)
+    if declared > _EXPANSION * size:
+        raise Unreadable(
+            f"expected contents of at most {_EXPANSION} times the {size} bytes of the "
+            f"file, got {declared} bytes: it is damaged"
+        )
+
+
+def _content(archive: zipfile.ZipFile, name: str) -> bytes:
+    with archive.open(name) as member:
+        # Without a number zipfile would inflate more than the member declares.
+        return member.read(archive.getinfo(name).file_size)
+
+
+def _array(content: bytes) -> np.ndarray:
+    """Returns the array of a `.npy` file of the version that `save` writes."""
+    member = io.BytesIO(content)
+    if np.lib.format.read_magic(member) != (1, 0):
+        raise ValueError("another version of NumPy's format")
+    shape, fortran, dtype = np.lib.format.read_array_header_1_0(member)
+    if dtype.hasobject:
+        raise ValueError("an array of objects")
+    # `read_array` would reserve what the header declares before it reads.
+    order = "F" if fortran else "C"
+    return np.ndarray(shape, dtype, content, member.tell(), order=order).copy("K")
 
 
 def _checked(path: Any) -> Path:
@@ -104,20 +156,12 @@ def save(path: str | os.PathLike, tree: Any) -> None:
         "tree": tree_node,
     }
     text = json.dumps(description, allow_nan=False, indent=1)
-    unfinished = path.with_name(f"{path.name}.{secrets.token_hex(4)}.part")
-    try:
-        with unfinished.open("xb") as file:
-            with zipfile.ZipFile(file, "w") as archive:
-                archive.writestr(zipfile.ZipInfo(_DESCRIPTION), text)
-                for index, array in enumerate(arrays):
-                    info = zipfile.ZipInfo(f"arrays/{index}.npy")
-                    with archive.open(info, "w", force_zip64=True) as member:
-                        np.lib.format.write_array(member, array, allow_pickle=False)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(unfinished, path)
-    finally:
-        unfinished.unlink(missing_ok=True)
+    with whole_file(path) as file, zipfile.ZipFile(file, "w") as archive:
+        archive.writestr(zipfile.ZipInfo(_DESCRIPTION), text)
+        for index, array in enumerate(arrays):
+            info = zipfile.ZipInfo(f"arrays/{index}.npy")
+            with archive.open(info, "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, array, allow_pickle=False)
 
 
 def load(path: str | os.PathLike, classes: Sequence[type] = ()) -> Any:
@@ -136,7 +180,8 @@ def load(path: str | os.PathLike, classes: Sequence[type] = ()) -> Any:
     **Raises:** FileNotFoundError if there is no file. ValueError if the file was not
     written by `save`, is damaged or cut short, has a newer format, holds a class that
     is unknown or has other fields, or holds arrays in double precision while JAX has it
-    disabled; the message names the file and the reason.
+    disabled; the message names the file and the reason. A file that holds far
+    more than its size is refused before it is read.
     """
     path = _checked(path)
     if not isinstance(classes, tuple | list) or not all(
@@ -148,7 +193,7 @@ def load(path: str | os.PathLike, classes: Sequence[type] = ()) -> Any:
             return _read(file, classes)
         except Unreadable as problem:
             raise ValueError(f"{path}: {problem}.") from None
-        except Exception as error:  # zipfile, NumPy and JSON raise many kinds
+        except _DAMAGED as error:
             raise ValueError(
                 f"{path}: expected a whole file, got one that is damaged or cut short "
                 f"({type(error).__name__}: {error})."

@@ -8,10 +8,10 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
-from ..checks import real_array
+from ..checks import instance, real_array
 from ..mechanics.kinematics import joint_positions, tip_position
 from ..simulation.scene import Scene
-from ..simulation.solution import Solution
+from ..simulation.solution import Solution, check_joints
 
 
 def link_ends(scene: Scene, solution: Solution) -> Float[Array, "time link 2"]:
@@ -21,6 +21,8 @@ def link_ends(scene: Scene, solution: Solution) -> Float[Array, "time link 2"]:
 
     **Returns:** points (x, y) from the ground pivot [m].
 
+    **Raises:** ValueError for malformed arguments.
+
     >>> import fdof_jax as fj
     >>> import numpy as np
     >>> arm, start, *_ = fj.scenes.fig5()
@@ -28,6 +30,10 @@ def link_ends(scene: Scene, solution: Solution) -> Float[Array, "time link 2"]:
     >>> fj.identification.link_ends(fj.scenes.fig5(), motion)[0].tolist()
     [[1.0, 0.0], [2.0, 0.0], [3.0, 0.0]]
     """
+
+    instance("scene", scene, Scene)
+    instance("solution", solution, Solution)
+    check_joints("solution", solution, scene.linkage)
 
     def ends(q):
         tip = tip_position(scene.linkage, q)

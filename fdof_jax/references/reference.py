@@ -10,7 +10,7 @@ from jax import Array
 from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
-from ..checks import function, is_traced, real_array
+from ..checks import function, is_traced, real_array, refusal
 from ..forces.part import Foreign, Part, default, optional
 from ..linkage.linkage import Linkage, check_linkage, joints_of
 from ..xla.array_namespace import in_numpy
@@ -77,6 +77,8 @@ def reference_of(value: Any) -> Reference:
     """Returns a callable as a reference, or raises ValueError."""
     if isinstance(value, Reference):
         return value
+    if isinstance(value, Part):  # a force element or a path
+        raise refusal("reference", EXPECTED, value)
     return ForeignReference(function("reference", value, EXPECTED))
 
 
@@ -125,7 +127,7 @@ def known_reach(reference: Any, linkage: Linkage, times: ArrayLike) -> np.ndarra
 
 @eqx.filter_jit
 def _finite(reference: Any, linkage: Linkage, times: ArrayLike) -> Array:
-    motion = jax.vmap(lambda t: reference(t, linkage))(times)
+    motion = jax.vmap(lambda t: reference_motion(reference, t, linkage))(times)
     return jnp.isfinite(jnp.concatenate(motion, axis=1)).all(axis=1)
 
 
@@ -148,13 +150,15 @@ def reachable(linkage: Linkage, reference: Any, ts: ArrayLike) -> Bool[Array, " 
     """
     check_linkage(linkage)
     ts = real_array("ts", ts, (None,))
-    arguments = function("reference", reference, EXPECTED), linkage, ts
+    reference_of(reference)  # refuses what is none
+    arguments = reference, linkage, ts
     near = _finite(*arguments) if is_traced(arguments) else known_reach(*arguments)
-    if isinstance(reference, Part) and len(ts):
-        near = near & _fits(reference, linkage, jnp.sort(ts))
-    return jnp.asarray(near)
+    near = jax.device_put(near)
+    if not isinstance(reference, Part) or not len(ts):
+        return near
+    return near & _fits(reference, linkage, ts)
 
 
 @eqx.filter_jit
 def _fits(reference: Part, linkage: Linkage, ts: Array) -> Array:
-    return jnp.asarray(reference.fits(linkage, ts))
+    return jnp.asarray(reference.fits(linkage, jnp.sort(ts)))

@@ -1,8 +1,7 @@
 """Solves a batch in chunks of members that take about equally long."""
 
-import hashlib
-import os
-from pathlib import Path
+import re
+from collections.abc import Callable
 from typing import Any
 
 import diffrax
@@ -14,11 +13,13 @@ from jax import Array
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from ..checks import refusal
 from ..dynamics import forward_dynamics
 from ..forces.element import elements
 from ..linkage.topology import real_joints
 from ..xla.array_namespace import in_numpy
 from .batch_axes import Batch
+from .checkpoints import Checkpoint, Rows
 from .field import element_effort
 from .simulate import simulate
 from .solution import Solution
@@ -47,13 +48,31 @@ def motion_of(
     return simulate(linkage, state0, ts, forces, throw=False, **settings)
 
 
+def outcome_of(
+    settings: dict,
+    reduce: Callable[[Solution], Any],
+    ts: Array,
+    moving: Any,
+    shared: Any,
+    limit: Array | None,
+) -> tuple[Any, Array, Array]:
+    """Computes what is kept of one member, its steps, and whether it failed."""
+    solution = motion_of(settings, ts, moving, shared, limit)
+    kept = reduce(solution)
+    if not all(map(eqx.is_array_like, jax.tree.leaves(kept))):
+        raise refusal("reduce", "a function that returns arrays", kept)
+    failed = solution.result != diffrax.RESULTS.successful
+    return kept, solution.stats["num_steps"], failed
+
+
 @eqx.filter_jit
-def _solve_chunk(settings, mesh, ts, moving, shared, limit):
-    arrays, static = eqx.partition((ts, shared, limit), eqx.is_array)
+def _solve_chunk(settings, mesh, reduce, ts, moving, shared, limit):
+    arrays, static = eqx.partition((reduce, ts, shared, limit), eqx.is_array)
 
     def run(moving, arrays):
-        ts, shared, limit = eqx.combine(arrays, static)
-        return jax.vmap(lambda m: motion_of(settings, ts, m, shared, limit))(moving)
+        reduce, ts, shared, limit = eqx.combine(arrays, static)
+        member = lambda m: outcome_of(settings, reduce, ts, m, shared, limit)
+        return jax.vmap(member)(moving)
 
     if mesh is not None:
         lanes, same = PartitionSpec("member"), PartitionSpec()
@@ -94,27 +113,27 @@ def expected_work(t0: Array, moving: Any, shared: Any) -> tuple[Array, Array]:
 
 
 class _Chunks:
-    """Solves chunks and keeps their results in memory and optionally in a folder."""
+    """Solves chunks; keeps their results in memory and, if given, in a checkpoint."""
 
-    def __init__(self, batch: Batch, ts: Array, settings: dict, folder: Path | None):
+    def __init__(
+        self,
+        batch: Batch,
+        ts: Array,
+        settings: dict,
+        reduce: Callable[[Solution], Any],
+        checkpoint: Checkpoint | None,
+    ):
         moving, self.shared = batch.split()
         self.moving = in_numpy(moving)
-        self.ts, self.settings, self.folder = ts, settings, folder
+        self.ts, self.settings, self.reduce = ts, settings, reduce
+        self.checkpoint = checkpoint
         devices = jax.devices()
         self.devices = len(devices)
         self.mesh = Mesh(np.array(devices), ("member",)) if len(devices) > 1 else None
         self.size = batch.size
-        self.results: list[np.ndarray] = []
-        self.structure: Any = None  # of a solution
-        if folder is not None:
-            folder.mkdir(parents=True, exist_ok=True)
-            self.digest = hashlib.sha256(repr((settings, batch.batched)).encode())
-            # The repr of the settings leaves out the values of arrays.
-            arrays = eqx.filter(settings, eqx.is_array)
-            for leaf in jax.tree.leaves((batch.inputs, ts, arrays)):
-                leaf = np.asarray(leaf)
-                self.digest.update(repr((leaf.shape, leaf.dtype)).encode())
-                self.digest.update(leaf.tobytes())
+        self.results: list[Any] = []
+        self.structure: Any = None  # of the outcomes
+        self.rows: Rows | None = None
 
     def solve(self, members: np.ndarray, lanes: int, limit: int) -> np.ndarray:
         """Solves members, at most `lanes` per device; returns their step counts."""
@@ -122,41 +141,37 @@ class _Chunks:
         padded[: len(members)] = members
         moving = jax.tree.map(lambda leaf: self._place(leaf[padded]), self.moving)
         arguments = (
-            self.settings, self.mesh, self.ts, moving, self.shared,
+            self.settings, self.mesh, self.reduce, self.ts, moving, self.shared,
             np.asarray(limit, np.int32),
         )  # fmt: skip
-        path = self._path(members, limit)
-        if path is not None and path.exists():
-            with np.load(path) as saved:
-                values = list(saved.values())
-            if self.structure is None:
-                like = eqx.filter_eval_shape(_solve_chunk, *arguments)
-                self.structure = jax.tree.structure(like)
-        else:
+        values = self._kept(members, limit, arguments)
+        if values is None:
             solved, self.structure = jax.tree.flatten(_solve_chunk(*arguments))
             if jax.process_count() > 1:
                 solved = multihost_utils.process_allgather(solved, tiled=True)
             values = [np.asarray(leaf)[: len(members)] for leaf in solved]
-            if path is not None and jax.process_index() == 0:
-                unfinished = path.with_suffix(".part")
-                with unfinished.open("wb") as file:
-                    np.savez(file, *values)
-                os.replace(unfinished, path)
+            if self.checkpoint is not None and jax.process_index() == 0:
+                self.checkpoint.write(members, limit, values)
         if not self.results:
             self.results = [
                 np.empty((self.size, *v.shape[1:]), v.dtype) for v in values
             ]
         for kept, value in zip(self.results, values):
             kept[members] = value
-        return jax.tree.unflatten(self.structure, values).stats["num_steps"]
+        _, steps, _ = jax.tree.unflatten(self.structure, values)
+        return steps
 
-    def _path(self, members: np.ndarray, limit: int) -> Path | None:
-        """Returns the file of a chunk; another chunk size groups other members."""
-        if self.folder is None:
+    def _kept(
+        self, members: np.ndarray, limit: int, arguments: tuple
+    ) -> list[np.ndarray] | None:
+        """Returns the arrays of a chunk that the checkpoint holds, or None."""
+        if self.checkpoint is None or not self.checkpoint.has(members, limit):
             return None
-        digest = self.digest.copy()
-        digest.update(repr((members.tolist(), limit)).encode())
-        return self.folder / f"{digest.hexdigest()[:32]}.npz"
+        if self.rows is None:
+            like = eqx.filter_eval_shape(_solve_chunk, *arguments)
+            arrays, self.structure = jax.tree.flatten(like)
+            self.rows = Rows(arrays)
+        return self.checkpoint.read(members, limit, self.rows)
 
     def _place(self, rows: np.ndarray) -> np.ndarray | Array:
         if jax.process_count() == 1:
@@ -170,13 +185,15 @@ def in_chunks(
     batch: Batch,
     ts: Array,
     settings: dict,
+    reduce: Callable[[Solution], Any],
     chunk: int,
-    folder: Path | None,
+    checkpoint: Checkpoint | None,
     meter: diffrax.AbstractProgressMeter,
-) -> Solution:
+) -> tuple[Any, np.ndarray]:
+    """Returns what is kept of all members, and which of them failed."""
     topology, work = map(np.asarray, expected_work(ts[0], *batch.split()))
     waiting = np.lexsort((work, topology))  # NaN comes last
-    chunks = _Chunks(batch, ts, settings, folder)
+    chunks = _Chunks(batch, ts, settings, reduce, checkpoint)
     max_steps = settings["max_steps"] or np.iinfo(np.int32).max
     # Members with steps of given lengths take equally many.
     first = _FIRST_LIMIT if _adaptive(settings) else max_steps
@@ -207,5 +224,19 @@ def in_chunks(
         if len(waiting) <= lanes // 2:
             lanes = min(lanes, _SMALL) if len(waiting) > 1 else 1
     meter.close(progress)
-    leaves = [jnp.asarray(leaf) for leaf in chunks.results]
-    return jax.tree.unflatten(chunks.structure, leaves)
+    leaves = chunks.results
+    for index, leaf in enumerate(leaves):
+        leaves[index] = jnp.asarray(leaf)  # frees one array before the next is copied
+    kept, _, failed = jax.tree.unflatten(chunks.structure, leaves)
+    return kept, np.asarray(failed)
+
+
+def program_of(
+    reduce: Callable[[Solution], Any], batch: Batch, ts: Array, settings: dict
+) -> tuple[str, list]:
+    """Returns text and constants that name what `reduce` computes, in any process."""
+    moving, shared = batch.split()
+    first = jax.tree.map(lambda leaf: leaf[0], moving)
+    like = eqx.filter_eval_shape(motion_of, settings, ts, first, shared, None)
+    program, _, _ = eqx.filter_make_jaxpr(reduce)(like)
+    return re.sub(" at 0x[0-9a-f]+", "", str(program)), program.consts

@@ -7,35 +7,46 @@ batch of slow members.
 """
 
 import os
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
-from ..checks import increasing, instance, is_traced, real_array, whole_number
+from ..checks import function, increasing, instance, is_traced, real_array, whole_number
 from ..forces.element import Forces, elements
 from ..linkage.coordinates import State
 from ..linkage.linkage import Linkage
 from .batch_axes import Batch, batch_of
-from .chunks import expected_work, in_chunks, motion_of
+from .checkpoints import Checkpoint
+from .chunks import expected_work, in_chunks, outcome_of, program_of
 from .simulate import solve_options
 from .solution import Solution
 
 
-def _traced(batch: Batch, ts: Array, settings: dict, chunk: int) -> Solution:
+def _without_times(solution: Solution) -> Solution:
+    """Leaves out the output times, which all members have in common."""
+    return eqx.tree_at(lambda s: s.ts, solution, None)
+
+
+def _traced(
+    batch: Batch,
+    ts: Array,
+    settings: dict,
+    reduce: Callable[[Solution], Any],
+    chunk: int,
+) -> Any:
     """Solves a traced batch in chunks; failed members enter no derivative."""
     moving, shared = batch.split()
     order = jnp.lexsort(expected_work(ts[0], moving, shared)[::-1])
 
     def solved(moving, shared):
         return jax.lax.map(
-            lambda member: motion_of(settings, ts, member, shared, None),
+            lambda member: outcome_of(settings, reduce, ts, member, shared, None),
             moving,
             batch_size=chunk,
         )
@@ -53,11 +64,11 @@ def _traced(batch: Batch, ts: Array, settings: dict, chunk: int) -> Solution:
     moving = jax.tree.map(lambda leaf: jnp.asarray(leaf)[order], moving)
     # A first solve finds the members that fail. In the differentiated solve the first
     # good member replaces them, because NaN would spoil derivatives of shared arrays.
-    frozen = solved(*where(False, (moving, shared)))
-    good = frozen.result == diffrax.RESULTS.successful
+    frozen, _, failed = solved(*where(False, (moving, shared)))
+    good = ~failed
     source = jnp.where(good, jnp.arange(batch.size), jnp.argmax(good))
     moving, shared = where(jnp.any(good), (moving, shared))
-    again = solved(jax.tree.map(lambda leaf: leaf[source], moving), shared)
+    again, _, _ = solved(jax.tree.map(lambda leaf: leaf[source], moving), shared)
     back = jnp.argsort(order)
 
     def chosen(a, b):
@@ -66,6 +77,7 @@ def _traced(batch: Batch, ts: Array, settings: dict, chunk: int) -> Solution:
     return jax.tree.map(chosen, again, frozen)
 
 
+@jax.transfer_guard("allow")  # its transfers are meant: the batch comes in chunks
 def sweep(
     linkage: Linkage,
     state0: State,
@@ -73,6 +85,7 @@ def sweep(
     forces: Forces = (),
     *,
     forces_axes: Any = None,
+    reduce: Callable[[Solution], Any] | None = None,
     chunk: int = 512,
     throw: bool = False,
     checkpoint: str | os.PathLike | None = None,
@@ -84,7 +97,7 @@ def sweep(
     adjoint: diffrax.AbstractAdjoint = diffrax.RecursiveCheckpointAdjoint(),
     max_steps: int | None = 65536,
     progress_meter: diffrax.AbstractProgressMeter = diffrax.NoProgressMeter(),
-) -> Solution:
+) -> Any:
     """Computes many motions, as `jax.vmap(simulate)` does, but faster.
 
     A member that fails ends early with a result of its own, and slow members delay few
@@ -99,18 +112,24 @@ def sweep(
     - `forces`: force elements; `forces_axes`: which of their arrays carry the batch
       axis, as `in_axes` of `jax.vmap`: 0 for all, None (the default) for none, or a
       tuple of these with one entry per element.
+    - `reduce`: a function of one member's `Solution`, for instance
+      `lambda motion: motion.q[-1]`; of each member only the arrays that it returns are
+      kept, also in a checkpoint. It is part of the compiled program: pass the same
+      function again to use that again.
     - `chunk`: largest number of members to solve together, per device.
     - `throw`: whether to raise an error if any member fails.
     - `checkpoint`: a folder for the results of finished chunks. A repeated call resumes
-      from them.
+      from them. A file that is damaged, or of another chunk, is reported by a warning,
+      and its members are solved again.
     - `solver`, `rtol`, `atol`, `stepsize_controller`, `dt0`, `adjoint`, `max_steps`,
       `progress_meter`: as in `simulate`.
 
     **Returns:** a `Solution` with a leading batch axis everywhere; `result` reports how
-    each member ended. Under `jax.grad` or another transformation a failed member adds
-    nothing to any derivative, and `solution.result == diffrax.RESULTS.successful`
-    selects the members that count. Finding them takes one more solve, without
-    derivatives.
+    each member ended. With `reduce`, what that returns, with a leading batch axis:
+    NaN, or a `motion.result` in it, marks members that failed. Under `jax.grad` or
+    another transformation a failed member adds nothing to any derivative, and
+    `solution.result == diffrax.RESULTS.successful` selects the members that count.
+    Finding them takes one more solve, without derivatives.
 
     **Raises:** ValueError for malformed arguments; RuntimeError, with `throw=True`, if
     a member fails.
@@ -138,8 +157,6 @@ def sweep(
     )
     del settings["progress_meter"]  # it counts finished members, not time
     batch = batch_of(linkage, state0, forces, forces_axes)
-    if checkpoint is not None and not isinstance(checkpoint, str | os.PathLike):
-        raise ValueError(f"checkpoint: expected a folder, got {checkpoint!r}.")
     try:
         eqx.filter_eval_shape(expected_work, ts[0], *batch.split())
     except TypeError as error:
@@ -147,18 +164,31 @@ def sweep(
             "forces, forces_axes: expected force elements that work for one member, "
             f"got an error with forces_axes={forces_axes!r}: {error}"
         ) from error
-    if is_traced(batch.inputs, ts):
+    keep = _without_times if reduce is None else function("reduce", reduce)
+
+    def whole(kept: Any) -> Any:
+        if reduce is not None:
+            return kept
+        times = jnp.broadcast_to(ts, (batch.size, *ts.shape))
+        return eqx.tree_at(lambda s: s.ts, kept, times, is_leaf=lambda x: x is None)
+
+    if is_traced(batch.inputs, ts, reduce):
         if throw or checkpoint is not None:
             raise ValueError(
                 "throw, checkpoint: expected their defaults under jit, grad or vmap."
             )
-        return _traced(batch, ts, settings, chunk)
-    folder = None if checkpoint is None else Path(checkpoint)
-    solution = in_chunks(batch, ts, settings, chunk, folder, progress_meter)
-    failed = np.flatnonzero(np.asarray(solution.result != diffrax.RESULTS.successful))
-    if throw and len(failed):
+        return whole(_traced(batch, ts, settings, keep, chunk))
+    folder = None
+    if checkpoint is not None:
+        # The repr of the settings leaves out the values of arrays.
+        arrays = batch.inputs, ts, eqx.filter(settings, eqx.is_array)
+        named = None if reduce is None else program_of(reduce, batch, ts, settings)
+        text = settings, batch.batched, named and named[0]
+        folder = Checkpoint(checkpoint, text, (arrays, named and named[1]))
+    kept, failed = in_chunks(batch, ts, settings, keep, chunk, folder, progress_meter)
+    if throw and failed.any():
         raise RuntimeError(
-            f"sweep: {len(failed)} of {batch.size} members failed, the first of them "
-            f"member {failed[0]}."
+            f"sweep: {failed.sum()} of {batch.size} members failed, the first of them "
+            f"member {failed.argmax()}."
         )
-    return solution
+    return whole(kept)

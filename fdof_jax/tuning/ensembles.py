@@ -6,7 +6,7 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
-from ..checks import instance, real_array, whole_number
+from ..checks import instance, real_array, refusal, whole_number
 from ..control.model_based import ModelBased
 from ..linkage.coordinates import State
 from ..linkage.linkage import Linkage, check_linkage
@@ -14,6 +14,8 @@ from ..mechanics.kinematics import tip_jacobian, tip_position
 from ..references.reference import reference_of
 from ..simulation.scene import Scene, stacked
 from .losses import controller_of, with_controller
+
+_MOST = 1_000_000  # they are drawn one after another
 
 
 def _bodies(linkage: Linkage) -> tuple[Array, Array, Array]:
@@ -80,7 +82,7 @@ def perturbed(
     **Arguments:**
 
     - `scene`: if `speed` varies, its controller's reference must have a `period`.
-    - `members`: number of variations.
+    - `members`: number of variations, at most a million.
     - `payload`: least and greatest point mass at the tip [kg].
     - `link_error`: greatest relative error of each mass, mass centre and inertia.
     - `start_offset`: greatest distance of the tip from its start [m], in any direction.
@@ -96,6 +98,8 @@ def perturbed(
     """
     instance("scene", scene, Scene)
     members = whole_number("members", members, 1)
+    if members > _MOST:
+        raise refusal("members", f"at most {_MOST:,} variations", members)
     draw = np.random.default_rng(whole_number("seed", seed, 0))
     ranges = {
         name: np.asarray(real_array(name, value, (2,), minimum=least))

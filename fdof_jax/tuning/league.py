@@ -4,6 +4,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from ..checks import refusal
 from ..control.pd import PDController
 from ..linkage.coordinates import State, from_chain
 from ..linkage.linkage import Linkage
@@ -74,6 +75,8 @@ def league_table(results: Mapping[str, TuneResult]) -> str:
 
     **Arguments:** `results`: by name, for instance those of `tune_each`.
 
+    **Raises:** ValueError for malformed arguments.
+
     >>> import fdof_jax as fj
     >>> scenes = fj.tuning.circle_scenes()
     >>> pair = {name: scenes[name]._replace(t1=1.0) for name in ("PPR", "RRR")}
@@ -83,6 +86,9 @@ def league_table(results: Mapping[str, TuneResult]) -> str:
     PPR         15.2       7.671       6.762       14.51       2/6
     RRR        147.9       29.32          13       13.15       6/6
     """
+    held = isinstance(results, Mapping) and len(results) > 0
+    if not held or not all(isinstance(r, TuneResult) for r in results.values()):
+        raise refusal("results", "a TuneResult for each name", results)
     rows = [
         f"{'':4}{'rms tip error [mm]':^24}{'effort [% of limit]':^24}{'gains':>10}",
         f"{'':4}" + 2 * f"{'start':>12}{'tuned':>12}" + f"{'at bounds':>10}",

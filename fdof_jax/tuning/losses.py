@@ -11,11 +11,12 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from ..analysis.tracking import relative_demands, tip_deviation
-from ..checks import is_traced, real_array
+from ..checks import instance, is_traced, real_array, refusal
 from ..control.pd import PDController
 from ..linkage.topology import fixed_pairs
+from ..references.reference import reference_of
 from ..simulation.scene import Scene
-from ..simulation.solution import Solution
+from ..simulation.solution import Solution, check_joints
 from ..xla.array_namespace import namespace
 
 Loss = Callable[[Scene, Solution], Array]
@@ -60,6 +61,8 @@ def tip_errors(scene: Scene, solution: Solution) -> Float[Array, " residual"]:
 
     **Returns:** x and y components [m], divided by the root of the number of times.
 
+    **Raises:** ValueError for malformed arguments.
+
     >>> import fdof_jax as fj
     >>> import numpy as np
     >>> arm, start, forces, _ = fj.scenes.fig7()
@@ -68,7 +71,12 @@ def tip_errors(scene: Scene, solution: Solution) -> Float[Array, " residual"]:
     >>> float((errors**2).sum() ** 0.5)  # rms over the first second [m]
     0.351
     """
+    instance("scene", scene, Scene)
+    instance("solution", solution, Solution)
+    check_joints("solution", solution, scene.linkage)
     task: Any = controller_of(scene).reference
+    if reference_of(task).tip is None:
+        raise refusal("scene", "a controller of a task with a `tip`", task)
     deviation = tip_deviation(scene.linkage, task, solution)
     return deviation.reshape(-1) / solution.ts.size**0.5
 

@@ -1,0 +1,148 @@
+"""Files of a checkpoint that are no good are solved again, and reported."""
+
+import errno
+import os
+import re
+import threading
+
+import jax
+import numpy as np
+import pytest
+from sweep_batch import run
+
+import fdof_jax as fj
+from fdof_jax.simulation import checkpoints
+from fdof_jax.simulation.checkpoints import Checkpoint, Rows
+
+MEMBERS, LIMIT = np.arange(3), 7
+
+
+def arrays():
+    return [np.linspace(0, 1, 6).reshape(3, 2), np.arange(3, dtype=np.int32)]
+
+
+ROWS = Rows(arrays())
+
+
+@pytest.fixture
+def checkpoint(tmp_path):
+    made = Checkpoint(tmp_path, "settings", [np.ones(2)])
+    made.write(MEMBERS, LIMIT, arrays())
+    return made
+
+
+def the_file(checkpoint):
+    (path,) = checkpoint.folder.iterdir()
+    return path
+
+
+def refused(checkpoint, rows=ROWS):
+    path = re.escape(str(the_file(checkpoint)))
+    with pytest.warns(RuntimeWarning, match=f"in {path} an .* 3 members are solved"):
+        return checkpoint.read(MEMBERS, LIMIT, rows) is None
+
+
+def test_a_chunk_is_read_as_it_was_written(checkpoint):
+    assert checkpoint.has(MEMBERS, LIMIT)
+    assert not checkpoint.has(MEMBERS + 1, LIMIT)
+    assert not checkpoint.has(MEMBERS, LIMIT + 1)
+    found = checkpoint.read(MEMBERS, LIMIT, ROWS)
+    for a, b in zip(found, arrays(), strict=True):
+        assert a.dtype == b.dtype
+        np.testing.assert_array_equal(a, b)
+
+
+def test_every_damage_is_found(checkpoint):
+    path = the_file(checkpoint)
+    whole = path.read_bytes()
+    for place in range(len(whole)):
+        flipped = bytearray(whole)
+        flipped[place] ^= 1
+        path.write_bytes(flipped)
+        assert refused(checkpoint)
+        path.write_bytes(whole[:place])
+        assert refused(checkpoint)
+    path.write_bytes(whole + b"0")
+    assert refused(checkpoint)
+
+
+def test_arrays_of_another_kind_are_refused(checkpoint):
+    half = [arrays()[0].astype(np.float16), arrays()[1]]
+    assert refused(checkpoint, Rows(half))  # what was kept is not what is expected
+    checkpoint.write(MEMBERS, LIMIT, half)
+    assert refused(checkpoint)
+    checkpoint.write(MEMBERS, LIMIT, [arrays()[0][:, :1], arrays()[1]])
+    assert refused(checkpoint)
+
+
+def test_another_chunk_and_another_version_are_refused(checkpoint, monkeypatch):
+    path = the_file(checkpoint)
+    checkpoint.write(MEMBERS + 1, LIMIT, arrays())
+    (other,) = set(checkpoint.folder.iterdir()) - {path}
+    os.replace(other, path)
+    assert refused(checkpoint)
+    checkpoint.write(MEMBERS, LIMIT, arrays())
+    monkeypatch.setitem(checkpoints._VERSIONS, "jax", "0.1")
+    assert not checkpoint.has(MEMBERS, LIMIT)
+
+
+def test_a_sweep_solves_again_what_is_damaged(mixed, swept, tmp_path):
+    run(mixed, checkpoint=tmp_path)
+    saved = sorted(tmp_path.iterdir())
+    content = [path.read_bytes() for path in saved]
+    saved[0].write_bytes(content[1])
+    saved[2].write_bytes(b"")
+    with pytest.warns(RuntimeWarning) as warned:
+        again = run(mixed, checkpoint=tmp_path)
+    named = {path for path in saved for w in warned if str(path) in str(w.message)}
+    assert named == {saved[0], saved[2]}
+    assert [path.read_bytes() for path in saved] == content
+    for a, b in zip(*map(jax.tree.leaves, (again, swept)), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_a_full_disk_names_the_path_and_leaves_no_part(checkpoint, monkeypatch):
+    path = the_file(checkpoint)
+    whole = path.read_bytes()
+
+    def full(number):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match=re.escape(str(path))) as raised:
+        checkpoint.write(MEMBERS, LIMIT, arrays())
+    assert raised.value.errno == errno.ENOSPC
+    assert the_file(checkpoint) == path and path.read_bytes() == whole
+
+
+def test_two_writers_of_one_chunk_do_not_meet(checkpoint, monkeypatch):
+    both = threading.Barrier(2, timeout=60)  # both files are open at once
+    monkeypatch.setattr(os, "fsync", lambda number: both.wait())
+    failed = []
+
+    def write():
+        try:
+            checkpoint.write(MEMBERS, LIMIT, arrays())
+        except Exception as error:
+            failed.append(error)
+
+    writers = [threading.Thread(target=write) for _ in range(2)]
+    for writer in writers:
+        writer.start()
+    for writer in writers:
+        writer.join()
+    assert not failed
+    assert checkpoint.read(MEMBERS, LIMIT, ROWS) is not None
+
+
+def test_paths_of_a_folder(tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    Checkpoint("~/kept", "", ())
+    assert (tmp_path / "kept").is_dir()
+    with pytest.raises(ValueError, match="^checkpoint: expected a folder, got ''"):
+        fj.sweep(
+            fj.scenes.fig5().linkage,
+            fj.State(np.zeros((2, 3)), np.zeros(3)),
+            [0, 1],
+            checkpoint="",
+        )

@@ -1,0 +1,73 @@
+"""A reduced sweep keeps of each member what a function of its motion returns."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from sweep_batch import FAILED, SETTINGS, TS, run
+
+import fdof_jax as fj
+from fdof_jax.simulation import chunks
+
+
+def end_and_fastest(motion):
+    return {"end": motion.q[-1], "fastest": jnp.abs(motion.qd).max(0)}, motion.result
+
+
+@pytest.fixture(scope="module")
+def reduced(mixed):
+    return run(mixed, reduce=end_and_fastest)
+
+
+def test_it_equals_what_the_function_makes_of_the_motions(reduced, swept):
+    expected = jax.vmap(end_and_fastest)(swept)
+    assert jax.tree.structure(reduced) == jax.tree.structure(expected)
+    for a, b in zip(*map(jax.tree.leaves, (reduced, expected))):
+        assert (a.shape, a.dtype) == (b.shape, b.dtype)
+        np.testing.assert_allclose(a, b, rtol=1e-8, atol=1e-8)
+    assert np.isnan(reduced[0]["end"]).any(axis=1).nonzero()[0].tolist() == FAILED
+
+
+def test_failures_are_counted(mixed, reduced):
+    with pytest.raises(RuntimeError, match=r"3 of 42 members failed.* member 3\."):
+        run(mixed, reduce=end_and_fastest, throw=True)
+
+
+def test_a_checkpoint_holds_only_what_is_kept(mixed, reduced, tmp_path, monkeypatch):
+    run(mixed, reduce=end_and_fastest, checkpoint=tmp_path)
+    assert sum(path.stat().st_size for path in tmp_path.iterdir()) < 42 * 200
+    monkeypatch.setattr(chunks.Checkpoint, "write", None)
+    # As in another process, where the same function has another address
+    same = lambda motion: end_and_fastest(motion)
+    again = run(mixed, reduce=same, checkpoint=tmp_path)
+    for a, b in zip(*map(jax.tree.leaves, (again, reduced))):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_another_function_has_other_checkpoints(batch):
+    all_of = chunks.Batch(batch, jax.tree.map(lambda leaf: True, batch), 42)
+    scaled = lambda factor: lambda motion: factor * motion.q[-1]
+    one, same, two = (
+        chunks.program_of(scaled(jnp.full(3, f)), all_of, jnp.asarray(TS), SETTINGS)
+        for f in (1.0, 1.0, 2.0)
+    )
+    assert one[0] == same[0]
+    np.testing.assert_array_equal(one[1], same[1])
+    assert not np.array_equal(one[1], two[1])
+
+
+def test_what_is_no_reduction_is_refused(batch):
+    for wrong in (3, "q", fj.Solution):
+        with pytest.raises(ValueError, match="^reduce: expected a callable, got "):
+            run(batch, reduce=wrong)
+    with pytest.raises(ValueError, match="^reduce: expected a function that returns "):
+        run(batch, reduce=lambda motion: "q")
+
+
+def test_it_works_under_transformations(batch):
+    def end(q):
+        linkage, state0, forces = batch
+        moved = linkage, state0._replace(q=q), forces
+        return run(moved, reduce=lambda motion: motion.q[-1])
+
+    assert jax.eval_shape(end, batch[1].q).shape == (42, 3)

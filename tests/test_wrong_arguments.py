@@ -1,0 +1,58 @@
+"""Functions of scenes, motions and results name the argument that is wrong."""
+
+import jax
+import numpy as np
+import pytest
+from sweep_batch import TS, run, successful
+
+import fdof_jax as fj
+from fdof_jax import identification, references, scenes, tuning
+
+FIG7 = scenes.fig7()
+MOTION = fj.Solution(TS, np.zeros((7, 3)), np.zeros((7, 3)), {}, None)
+OTHER = fj.Solution(TS, np.zeros((7, 2)), np.zeros((7, 2)), {}, None)
+STANDING = fj.PDController(1.0, 1.0, 1.0, lambda t, linkage: (np.zeros(3),) * 2)
+PATH = references.Line([0, 0], [1, 1])
+
+
+def refused(name, call, *arguments):
+    with pytest.raises(ValueError, match=rf"(?s)^{name}: expected .*, got "):
+        call(*arguments)
+
+
+@pytest.mark.parametrize("call", [identification.link_ends, tuning.tip_errors])
+def test_scenes_and_motions(call):
+    refused("scene", call, FIG7.linkage, MOTION)
+    refused("scene", call, MOTION, FIG7)
+    refused("solution", call, FIG7, MOTION.q)
+    refused("solution", call, FIG7, OTHER)
+
+
+def test_errors_of_a_tip_need_a_task():
+    standing = FIG7._replace(forces=(STANDING,))
+    refused("scene", tuning.tip_errors, standing, MOTION)
+
+
+@pytest.mark.parametrize("results", [None, {}, [1], {"RRR": FIG7}], ids=type)
+def test_results_of_a_league(results):
+    refused("results", tuning.league_table, results)
+
+
+@pytest.mark.parametrize("reference", [None, PATH, STANDING, references.Laps(1.0)])
+def test_references_within_reach(reference):
+    refused("reference", references.reachable, FIG7.linkage, reference, TS)
+
+
+def test_a_reference_that_returns_something_else():
+    nothing = lambda t, linkage: None
+    refused("reference", references.reachable, FIG7.linkage, nothing, TS)
+
+
+def test_too_many_members():
+    refused("members", tuning.perturbed, FIG7, 10**30)
+
+
+def test_a_sweep_under_a_transfer_guard(batch):
+    with jax.transfer_guard("disallow"):
+        solution = run(batch)
+    assert successful(solution).all()
