@@ -28,7 +28,8 @@ class MotionAnimation(FuncAnimation):
         self, figure: Figure, show: Any, count: int, pause: float, moving: list[Artist]
     ):
         super().__init__(figure, show, count, interval=pause, cache_frame_data=False)  # type: ignore[arg-type]
-        self._figure, self._count, self._moving = figure, count, moving
+        self._figure, self._show = figure, show
+        self._count, self._moving = count, moving
 
     def save(self, filename: Any, *args: Any, **kwargs: Any) -> None:
         """Writes a file, and a progress bar to the standard error output.
@@ -56,12 +57,14 @@ class MotionAnimation(FuncAnimation):
         canvas.draw()
         still = canvas.copy_from_bbox(figure.bbox)
         for frame in range(self._count):
-            self._func(frame)
+            self._show(frame)
             canvas.restore_region(still)
             for artist in self._moving:
                 figure.draw_artist(artist)
             image = Image.fromarray(np.array(canvas.buffer_rgba())).convert("RGB")
-            yield image.quantize(method=Image.Quantize.FASTOCTREE, dither=0)
+            yield image.quantize(
+                method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE
+            )
             if progress is not None:
                 progress(frame, self._count)
         for artist in self._moving:

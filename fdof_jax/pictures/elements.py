@@ -3,6 +3,7 @@
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from matplotlib.path import Path
 
@@ -42,7 +43,7 @@ def element_lines(
     """
     found = elements_on(linkage, forces)
     for element in found:
-        element.check(linkage, ts)
+        element.check(linkage, jnp.asarray(ts))
     arm = in_numpy(linkage)
     kinds = letters(arm.ef)
     f = frames(arm, np.where([kind != "F" for kind in kinds], q, 0))
