@@ -135,7 +135,9 @@ def test_chrono_cyclograph_takes_the_nearest_samples():
     alphas = [line.get_alpha() for line in tips]
     assert alphas == sorted(alphas) and alphas[-1] == 1
     assert len(lines(ax)["tip path"].get_xydata()) == 31
-    assert labels(ax) == ["tip path", "link 1", "link 2", "link 3"]
+    assert set(labels(ax)) == {
+        "ground", "tip path", "link 1", "link 2", "link 3", "pin", "slide", "tip",
+    }  # fmt: skip
 
 
 @pytest.mark.parametrize("until, count", [(None, 11), (5.0, 11), (0.0, 1)])

@@ -24,6 +24,7 @@ from .axes import (
     reached,
     xy,
 )
+from .elements import ELEMENT_STYLES, element_lines, element_marker
 
 
 class Geometry(NamedTuple):
@@ -78,6 +79,15 @@ def geometry(linkage: Linkage, q: np.ndarray) -> Geometry:
     return Geometry(angle, slide, kinds, points)
 
 
+def with_elements(
+    g: Geometry, linkage: Linkage, forces: Any, ts: np.ndarray, q: np.ndarray
+) -> Geometry:
+    """Adds the force elements that have a place, behind the arm."""
+    size = float(max(np.ptp(part) for part in xy(g.all_points)))
+    lines = element_lines(linkage, forces, ts, q, size)
+    return g._replace(points=lines | g.points)
+
+
 def link_color(link: int) -> str:
     return SERIES[(link - 1) % len(SERIES)] if link else BLACK
 
@@ -99,7 +109,8 @@ _STYLES: dict[str, dict[str, Any]] = {
     "pin": dict(color=BLACK, marker="o", markersize=4.5, mfc="white"),
     "slider": dict(markersize=15, mfc="white", mew=0.9),
     "tip": dict(marker="s", markersize=3.5),
-}
+} | ELEMENT_STYLES
+_LABELS = {"pin": "pin", "slider": "slide", "mass": "mass centre", "tip": "tip"}
 
 
 def _place(lines: dict[str, Line2D], g: Geometry, i: int) -> None:
@@ -135,8 +146,12 @@ def draw_arm(
             line.set_color(color)
         if name == "link 0":
             line.set_linewidth(1.2)
-        elif kind == "link" and label:
-            line.set_label(name)
+        elif kind in ELEMENT_STYLES:
+            marker: Any = element_marker(kind)  # a line in the legend would not tell
+            shown = ax.plot([], [], marker=marker, ls="", label=kind, markersize=13)[0]
+            shown.set(color=line.get_color(), mfc="none", mew=line.get_linewidth())
+        elif label and kind != "rail":
+            line.set_label(_LABELS.get(kind, name))
         lines[name] = line
     _place(lines, g, i)
     return lines
@@ -144,7 +159,7 @@ def draw_arm(
 
 def draw_ground(ax: Axes) -> None:
     ground = ax.plot(0, 0, marker=_BEARING, markersize=18, zorder=1, gid="ground")[0]
-    ground.set(mfc="white", mec=GREY, mew=0.8, clip_on=False)
+    ground.set(mfc="white", mec=GREY, mew=0.8, clip_on=False, ls="", label="ground")
 
 
 class DrawnMotion(NamedTuple):
@@ -152,6 +167,10 @@ class DrawnMotion(NamedTuple):
 
     path: Line2D
     arms: list[dict[str, Line2D]]
+
+    @property
+    def lines(self) -> list[Line2D]:
+        return [self.path, *(line for arm in self.arms for line in arm.values())]
 
     def move(self, g: Geometry, indices: np.ndarray) -> None:
         """Moves the lines to a motion of the same topology, at as many samples."""
@@ -194,7 +213,7 @@ def panels_of(
     """A figure with a grid of axes, one per motion."""
     columns = min(4, len(geometries))
     rows = -(-len(geometries) // columns)
-    fig = figure_or_new(fig, 0.3 + 1.75 * columns, 0.4 + 1.9 * rows)
+    fig = figure_or_new(fig, 1.3 + 1.75 * columns, 0.4 + 1.9 * rows)
     panels = []
     for position, (title, (_, g)) in enumerate(geometries.items()):
         ax = plane_axes(fig.add_subplot(rows, columns, position + 1), g.tip)

@@ -66,7 +66,8 @@ def plane_axes(ax: Any, points: np.ndarray, *, beside: float = 0.0) -> Axes:
 
     `beside`: width to reserve beside the axes [inches].
     """
-    width, height = (max(np.ptp(part), 1e-9) for part in xy(points))
+    corners = (part[~np.isnan(part)] for part in xy(points))  # NaN lifts the pen
+    width, height = (max(np.ptp(part), 1e-9) for part in corners)
     ax = axes_or_new(ax, 0.9 + np.clip((2.9 - beside) * height / width, 1.6, 3.6))
     ax.set_aspect("equal")
     ax.margins(0.1, 0.16)  # below, the ground needs room
@@ -85,4 +86,18 @@ def legend(ax: Axes, *others: Axes) -> None:
         list(found.values()), list(found), ncols=columns, fontsize="small",
         frameon=False, handlelength=1.2, columnspacing=1,
         loc="lower left", bbox_to_anchor=(0, 1), borderaxespad=0.2,
+    )  # fmt: skip
+
+
+def figure_legend(fig: Figure) -> None:
+    """Adds one legend of all labels in the figure beside its axes, or replaces it."""
+    for old in fig.legends:
+        old.remove()
+    found = {}
+    for ax in fig.axes:
+        handles, labels = ax.get_legend_handles_labels()
+        found |= dict(zip(labels, handles))
+    fig.legend(
+        list(found.values()), list(found), loc="outside right upper",
+        fontsize="small", frameon=False, handlelength=1.2,
     )  # fmt: skip

@@ -1,5 +1,6 @@
 """The commands of `fdof-jax`, which print results and return the files they write."""
 
+import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -9,13 +10,17 @@ import jax
 import matplotlib
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.animation import FuncAnimation
+from matplotlib.figure import Figure
 
 from .. import scenes
 from ..analysis.tracking import tip_deviation
 from ..checks import real_array
 from ..data.files import save
 from ..forces.joints import JointDamper
+from ..linkage.linkage import Linkage
 from ..pictures import drawing, plotting
+from ..pictures.axes import BLACK, figure_legend
 from ..references.circle import CircleTask
 from ..simulation.scene import Scene, stacked
 from ..simulation.simulate import simulate
@@ -127,13 +132,44 @@ def _tune(output: Path, **options: Any) -> list[Path]:
         late = (t1 / 2 <= motion.ts) & (motion.ts < t1)
         deviation = np.asarray(tip_deviation(arm, task, motion))[late]
         errors.append(1e3 * np.sqrt((deviation**2).sum(axis=1).mean()))
+    still, moving = _arms(scene.linkage, task, motions)
+    pictures = {"circle-arm": still} | pictures
     path = plotting.tracking(scene.linkage, task, motions)
     error = plotting.tracking_error(scene.linkage, task, motions)
     pictures |= {"circle-path": path.figure, "circle-error": error.figure}
     print(f"\n{tuned}")
     print("rms tip error in the second turn [mm]: {:.5g} to {:.5g}".format(*errors))
+    files = _saved(output, pictures)
+    files.insert(1, output / "circle-arm.gif")
+    moving.save(files[1], dpi=80)
+    plt.close("all")
     save(output / "tuned.fdof", tuned)
-    return [*_saved(output, pictures), output / "tuned.fdof"]
+    return [*files, output / "tuned.fdof"]
+
+
+def _arms(
+    arm: Linkage, task: CircleTask, motions: dict[str, Solution]
+) -> tuple[Figure, FuncAnimation]:
+    """The arm on the circle with each set of gains: second turn, still and moving."""
+    period = abs(float(task.period))
+    turns = {}
+    for name, motion in motions.items():
+        later = np.asarray(motion.ts) >= period
+        ts, q, qd = (a[later] for a in (motion.ts - period, motion.q, motion.qd))
+        turns[name] = arm, dataclasses.replace(motion, ts=ts, q=q, qd=qd)
+    still, shown = (
+        plt.figure(figsize=(7.4, 3.4), layout="constrained") for _ in range(2)
+    )
+    drawing.topology_grid(turns, still, configurations=6)
+    moving = drawing.animate_grid(turns, shown, fps=12.5, speed=period / 5)
+    circle = np.stack([task.tip(t) for t in np.linspace(0, period, 101)])
+    for figure in (still, shown):
+        for ax in figure.axes:
+            ax.plot(*circle.T, "--", color=BLACK, lw=0.8, label="commanded", zorder=1)
+        figure_legend(figure)
+    shown.draw_without_rendering()
+    shown.set_layout_engine("none")  # a layout per frame takes half the time
+    return still, moving
 
 
 _COMMANDS: dict[str, Callable[..., list[Path]]] = {

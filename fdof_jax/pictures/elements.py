@@ -1,0 +1,217 @@
+"""Force elements in pictures: each is one line through the points of its symbol."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.path import Path
+
+from ..forces.actuators import LinearActuator
+from ..forces.between_points import SpringDamper, Tension, Wrench
+from ..forces.element import elements_on
+from ..forces.joint_limits import JointStops
+from ..forces.points import Point
+from ..linkage.frames import Frames, frames
+from ..linkage.linkage import Linkage
+from ..linkage.topology import letters
+from ..xla.array_namespace import in_numpy
+from .axes import BLACK, xy
+
+# Widths are in sizes of the arm.
+_WIDTH, _ARROW, _HEAD, _ARC = 0.025, 0.3, 0.05, 0.08
+
+ELEMENT_STYLES: dict[str, dict[str, Any]] = {
+    "spring": dict(color=BLACK, lw=0.8, solid_joinstyle="round"),
+    "damper": dict(color=BLACK, lw=0.8),
+    "bumper": dict(color=BLACK, lw=0.8, solid_joinstyle="round"),
+    "cable": dict(color=BLACK, lw=0.8),
+    "tension": dict(color=BLACK, lw=0.8),
+    "cylinder": dict(color=BLACK, lw=1.0),
+    "wrench": dict(color=BLACK, lw=1.6, solid_joinstyle="miter"),
+    "stops": dict(color=BLACK, lw=1.2),
+}
+
+
+def element_lines(
+    linkage: Linkage, forces: Any, ts: np.ndarray, q: np.ndarray, size: float
+) -> dict[str, np.ndarray]:
+    """Lines (time, points) of the elements that have a place, as x + iy [m].
+
+    A line's name is its kind and the element's index; NaN lifts the pen. `size`: extent
+    of the arm [m]. Arrows show forces of all wrenches on one scale.
+    """
+    found = elements_on(linkage, forces)
+    for element in found:
+        element.check(linkage, jnp.asarray(ts))
+    arm = in_numpy(linkage)
+    kinds = letters(arm.ef)
+    f = frames(arm, np.where([kind != "F" for kind in kinds], q, 0))
+    pushes = {
+        k: _push(element, linkage, f, ts)
+        for k, element in enumerate(found)
+        if isinstance(element, Wrench)
+    }
+    lines = {}
+    for k, element in enumerate(found):
+        kind, strokes = "", []
+        if isinstance(element, SpringDamper | Tension):
+            kind, strokes = _between(element, f, size)
+        elif isinstance(element, LinearActuator):
+            kind, strokes = "cylinder", _cylinder(element, f, size)
+        elif isinstance(element, Wrench):
+            most = [max(np.abs(p[i]).max() for p in pushes.values()) for i in (0, 1)]
+            kind = "wrench"
+            strokes = _arrows(_place(element.point, f), *pushes[k], most, size)
+        elif isinstance(element, JointStops):
+            kind, strokes = "stops", _stops(element, linkage, kinds, f, size)
+        if strokes:
+            lift = np.full((len(ts), 1), np.nan + 0j)
+            parts = [part for stroke in strokes for part in (stroke, lift)]
+            lines[f"{kind} {k}"] = np.hstack(parts[:-1])
+    return lines
+
+
+def _place(point: Point, f: Frames) -> np.ndarray:
+    """Places of a point (time, 1)."""
+    link = int(point.link)
+    offset = float(point.along) + 1j * float(point.across)
+    return (f.start[:, link] + offset * f.direction[:, link])[:, None]
+
+
+def _ends(element: Any, f: Frames) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The first end, the distance of the second, and the direction to it (time, 1)."""
+    a, b = _place(element.ends.a, f), _place(element.ends.b, f)
+    length = np.abs(b - a)
+    return a, length, (b - a) / np.where(length > 0, length, 1)
+
+
+# Symbols between (0, 0) and (1, 0); widths in units of `_WIDTH`.
+_ZIGZAG = [
+    np.array([0, *np.linspace(0.2, 0.8, 14), 1])
+    + 1j * np.array([0, 0, *[1, -1] * 6, 0, 0])
+]
+_DASHPOT = [
+    np.array([0, 0.35]),
+    np.array([0.65 + 0.9j, 0.35 + 0.9j, 0.35 - 0.9j, 0.65 - 0.9j]),
+    np.array([0.52 + 0.6j, 0.52 - 0.6j]),
+    np.array([0.52, 1]),
+]
+_BAR = np.array([0.15 + 1.6j, 0.15 - 1.6j, 0.15, 0])
+_BOTH = [_BAR, 1 - _BAR]  # join a spring and a damper side by side
+for _symbol, _beside in ((_ZIGZAG, 1.6j), (_DASHPOT, -1.6j)):
+    _BOTH += [0.15 + 0.7 * np.real(s) + 0.8j * np.imag(s) + _beside for s in _symbol]
+
+
+# In the legend: a cable hangs, a tension is straight.
+_HANGING = np.linspace(0, 1, 11)
+_SYMBOLS = {
+    "spring": _ZIGZAG,
+    "damper": _DASHPOT,
+    "bumper": [*_ZIGZAG, np.array([1 + 1.5j, 1 - 1.5j])],
+    "cable": [_HANGING - 8j * _HANGING * (1 - _HANGING)],
+    "tension": [np.array([0, 1])],
+    "cylinder": [np.array([0.6, 0.6 + 1j, 1j, -1j, 0.6 - 1j, 0.6, 1])],
+    "wrench": [np.array([0, 1, 0.7 + 1j, 1, 0.7 - 1j])],
+    "stops": [np.array([1.2j, -1.2j, 0, 1, 1 + 1.2j, 1 - 1.2j])],
+}
+
+
+def element_marker(kind: str) -> Path:
+    """The symbol of a kind of element, for the legend."""
+    strokes = _SYMBOLS[kind]
+    points = np.concatenate([2 * np.real(s) - 1 + 0.25j * np.imag(s) for s in strokes])
+    codes = [code for s in strokes for code in [1] + [2] * (len(s) - 1)]
+    return Path(np.column_stack(xy(points)), codes)
+
+
+def _between(element: Any, f: Frames, size: float) -> tuple[str, list[np.ndarray]]:
+    """A spring, a damper or both; a cable, which hangs if slack; a bumper."""
+    a, length, unit = _ends(element, f)
+    if isinstance(element, Tension):
+        return "tension", [a + unit * length * np.array([0, 1])]
+    rest, side = float(element.rest_length), int(element.side)
+    if side == 1:
+        u = np.linspace(0, 1, 21)
+        # The sag of a shallow parabola that is longer than its chord by the slack.
+        sag = np.sqrt(0.375 * length * np.maximum(rest - length, 0))
+        return "cable", [a + unit * length * u - 4j * sag * u * (1 - u)]
+    symbol, kind = _ZIGZAG, "spring"
+    if float(element.damping) > 0:
+        dry = float(element.stiffness) == 0
+        symbol, kind = (_DASHPOT, "damper") if dry else (_BOTH, "spring")
+    if side == -1:  # as long as it is at rest, with a plate at its free end
+        length, kind = np.minimum(length, rest), "bumper"
+        symbol = [*symbol, np.array([1 + 1.5j, 1 - 1.5j])]
+    width = _WIDTH * size
+    place = lambda s: a + unit * (length * np.real(s) + 1j * width * np.imag(s))
+    return kind, [place(s) for s in symbol]
+
+
+def _cylinder(element: LinearActuator, f: Frames, size: float) -> list[np.ndarray]:
+    """A cylinder of constant length, and the rod of its piston."""
+    a, length, unit = _ends(element, f)
+    body, half = min(0.95 * length.min(), 0.6 * length.mean()), 0.8 * _WIDTH * size
+    outline = np.array([0, 0, body, body, 0, 0]) + 1j * half * np.array(
+        [0, 1, 1, -1, -1, 0]
+    )
+    return [a + unit * outline, a + unit * np.hstack([0 * length + body, length])]
+
+
+def _push(
+    element: Wrench, linkage: Linkage, f: Frames, ts: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The force x + iy and the moment of a wrench (time, 1)."""
+    force, moment = jax.vmap(lambda t: element.schedule(t, linkage))(ts)
+    along = f.direction[:, int(element.point.link)] if element.follows else 1
+    return (np.asarray(force) * along)[:, None], np.asarray(moment)[:, None]
+
+
+def _arrows(
+    place: np.ndarray,
+    force: np.ndarray,
+    moment: np.ndarray,
+    most: list[Any],
+    size: float,
+) -> list[np.ndarray]:
+    """A straight arrow for a force, and one around the point for a moment."""
+    strokes = []
+    if most[0] > 0 and np.any(force):
+        shaft = _ARROW * size * force / most[0]
+        strokes += [place + shaft * np.array([0, 1]), _head(place + shaft, shaft, size)]
+    if most[1] > 0 and np.any(moment):
+        sweep = 1.6 * np.pi * moment / most[1]
+        spoke = _ARC * size * np.exp(1j * sweep * np.linspace(0, 1, 41))
+        tip, along = spoke[:, -1:], 1j * spoke[:, -1:] * sweep
+        strokes += [place + spoke, _head(place + tip, along, size)]
+    return strokes
+
+
+def _head(tip: np.ndarray, along: np.ndarray, size: float) -> np.ndarray:
+    """The head of an arrow, smaller for a short one."""
+    length = np.abs(along)
+    back = along / np.where(length > 0, length, 1) * np.minimum(_HEAD * size, length)
+    return tip - back * np.array([1 + 0.5j, 0, 1 - 0.5j])
+
+
+def _stops(
+    element: JointStops, linkage: Linkage, kinds: str, f: Frames, size: float
+) -> list[np.ndarray]:
+    """Bars at the ends of each joint's range, joined by an arc around a pin."""
+    ends = np.broadcast_arrays(element.lower, element.upper, np.zeros(len(kinds)))[:2]
+    strokes = []
+    for k, (kind, low, high) in enumerate(zip(kinds, *ends)):
+        along = f.direction[:, k : k + 1]
+        finite = [end for end in (low, high) if np.isfinite(end)]
+        for end in finite if kind == "R" else ():
+            bar = np.array([0.8, 1.2]) * 1.2 * _ARC * size
+            strokes.append(f.start[:, k + 1 : k + 2] + along * np.exp(1j * end) * bar)
+        if kind == "R" and len(finite) == 2:
+            turns = np.linspace(low, min(high, low + 2 * np.pi), 41)
+            arc = 1.2 * _ARC * size * np.exp(1j * turns)
+            strokes.append(f.start[:, k + 1 : k + 2] + along * arc)
+        if kind == "P" and finite:  # bars across the rail, and the rail between them
+            foot = f.start[:, k : k + 1] + along * float(linkage.length[k])
+            bars = [1j * e + np.array([-2, 2, 0]) * _WIDTH * size for e in finite]
+            strokes.append(foot + along * np.concatenate([bars[0], bars[-1][::-1]]))
+    return strokes
