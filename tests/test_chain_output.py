@@ -163,9 +163,7 @@ def test_values_of_other_chains_are_refused_at_each_door(fault):
 def test_models_of_another_topology_are_refused_and_no_point_is_nowhere():
     model = chains.random_chain("RP", RNG)
     control = fj.control.GravityFeedforward(1, 1, 1, HOLD, model)
-    with pytest.raises(
-        ValueError, match=r"^forces\[0\]\.model: expected the arm"
-    ):
+    with pytest.raises(ValueError, match=r"^forces\[0\]\.model: expected the arm"):
         fj.linearize(TWO, REST, (control,))
     assert control.fits(model, np.zeros(1)) and not control.fits(TWO, np.zeros(1))
     # A link that is traced is not known to be missing.
