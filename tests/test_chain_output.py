@@ -11,7 +11,8 @@ from elements import SHORT
 
 import fdof_jax as fj
 
-TWO = chains.random_chain("RR", np.random.default_rng(0))
+RNG = np.random.default_rng(0)
+TWO = chains.random_chain("RR", RNG)
 REST = fj.State(np.zeros(2), np.zeros(2))
 
 
@@ -110,22 +111,65 @@ def test_states_and_links_of_other_chains_are_refused():
         fj.LinearActuator(*ends),
     ):
         with pytest.raises(
-            ValueError, match=r"^forces\[0\]\.link: expected 0 .* 1 to 2, got"
+            ValueError, match=r"^forces\[0\]\..*link: expected 0 .* 1 to 2, got 3"
         ):
             fj.simulate(TWO, REST, [0, 0.1], (element,))
     armature, zeros = (fj.forces.Armature([1, 2, 3]),), np.zeros(2)
     for call in (fj.forward_dynamics, lambda *row: fj.energy(*row[:3], row[4])):
         with pytest.raises(ValueError, match=r"^forces\[0\]\.inertia: .* 2 joints"):
             call(TWO, zeros, zeros, zeros, armature)
-    # A sweep solves values as they are: such a member fails.
-    both = fj.State(np.zeros((2, 2)), np.zeros((2, 2)))
-    swept = fj.sweep(TWO, both, [0, 0.1], (fj.Wrench(point, [1, 0]),), **SHORT)
-    assert swept.outcome.tolist() == ["not finite"] * 2
     hold = chains.Hold(jnp.zeros(3))
-    with pytest.raises(ValueError, match=r"\.joints: expected 1 to 2, got .*3"):
-        fj.simulate(TWO, REST, [0, 0.1], (fj.PrescribedMotion(3, hold),))
     with pytest.raises(ValueError, match=f"^reference: {words}"):
         fj.simulate(TWO, REST, [0, 0.1], (fj.PDController(1, 1, 1, hold),))
+
+
+HOLD = chains.Hold(jnp.zeros(2))
+OF_THREE = {
+    r"ends\.b\.link: expected 0 .* 1 to 2, got 3": fj.SpringDamper(
+        fj.Point(0, 0.1), fj.Point(3, 0.1)
+    ),
+    "joints: expected 1 to 2, got 3": fj.PrescribedMotion(3, HOLD),
+    "model: expected the arm's own topology": fj.control.GravityFeedforward(
+        *(1, 1, 1, HOLD), chains.random_chain("RRR", RNG)
+    ),
+}
+
+
+@pytest.mark.parametrize("fault", OF_THREE)
+def test_values_of_other_chains_are_refused_at_each_door(fault):
+    forces, zeros, ts = (OF_THREE[fault],), np.zeros(2), [0, 0.1]
+    motion = fj.Solution(
+        *(np.zeros(2), np.zeros((2, 2)), np.zeros((2, 2))),
+        stats={"num_steps": 1, "time_reached": 0.0},
+        result=diffrax.RESULTS.successful,
+    )
+    both = fj.State(np.zeros((2, 2)), np.zeros((2, 2)))
+    batch = jax.tree.map(lambda leaf: np.stack([leaf] * 2), TWO)
+    for call in (
+        lambda: fj.sweep(TWO, both, ts, forces),
+        lambda: fj.sweep(batch, REST, ts, forces),
+        lambda: jax.jit(lambda arm: fj.simulate(arm, REST, ts, forces))(TWO),
+        lambda: fj.linearize(TWO, REST, forces),
+        lambda: fj.joint_efforts(TWO, forces, motion),
+        lambda: fj.joint_reactions(TWO, forces, motion),
+        lambda: fj.analysis.equilibrium(TWO, zeros, forces),
+        lambda: fj.energy(TWO, zeros, zeros, forces),
+        lambda: fj.forward_dynamics(TWO, zeros, zeros, zeros, forces),
+    ):
+        with pytest.raises(ValueError, match=rf"^forces\[0\]\.{fault}"):
+            call()
+
+
+def test_models_of_another_topology_are_refused_and_no_point_is_nowhere():
+    model = chains.random_chain("RP", RNG)
+    control = fj.control.GravityFeedforward(1, 1, 1, HOLD, model)
+    with pytest.raises(ValueError, match=r"^forces\[0\]\.model: expected the arm"):
+        fj.linearize(TWO, REST, (control,))
+    assert control.fits(model, np.zeros(1)) and not control.fits(TWO, np.zeros(1))
+    # A link that is traced is not known to be missing.
+    spring = fj.SpringDamper(fj.Point(0, 0.1), fj.Point(3, 0.1), stiffness=1)
+    stored = lambda spring: spring.potential_energy(np.zeros(2), TWO)
+    assert np.isnan(jax.jit(stored)(spring))
 
 
 def test_motions_of_other_chains_are_refused():

@@ -1,5 +1,7 @@
 """Chains of one to eight pairs of joints: equations, energies and kinematics."""
 
+import itertools
+
 import chains
 import equinox as eqx
 import jax
@@ -217,11 +219,35 @@ def test_topologies_refused(topology, words):
 
 
 def test_the_papers_equations_are_for_three_pairs():
-    rng = np.random.default_rng(4)
-    for topology, words in (("RR", "three pairs"), ("RFR", "no fixed pair")):
-        chain = chains.random_chain(topology, rng)
-        with pytest.raises(ValueError, match=rf"^linkage: expected {words}"):
-            fj.mass_matrix(chain, np.zeros(6))
+    chain = chains.random_chain("RR", np.random.default_rng(4))
+    with pytest.raises(ValueError, match="^linkage: expected three pairs"):
+        fj.mass_matrix(chain, np.zeros(6))
+
+
+def test_the_papers_equations_hold_with_fixed_pairs():
+    """They give the accelerations of the reduced form, and forces that balance (15)."""
+    rng = np.random.default_rng(6)
+    names = ["".join(joints) for joints in itertools.product("RPF", repeat=3)]
+    names = [name for name in names if "F" in name and name != "FFF"]
+    arms = [chains.random_chain(name, rng) for name in names]
+    batch = jax.tree.map(lambda *leaves: np.stack(leaves), *arms)
+    q, qd, tau = rng.normal(size=(3, len(arms), 3))
+
+    @jax.jit
+    @jax.vmap
+    def both(arm, q, qd, tau):
+        x, xd = fj.to_chain(arm, q, qd)
+        force = jnp.repeat(tau, 2)  # those of fictitious joints have no effect
+        xdd = fj.masked_accelerations(arm, x, xd, force)
+        held = fj.constraint_forces(arm, x, xd, force)
+        balance = fj.mass_matrix(arm, x) @ xdd - fj.bias_force(arm, x, xd)
+        total = (force + held).at[1:5:2].add(-(force + held)[3::2])
+        reduced = fj.forward_dynamics(arm, q, qd, tau)
+        return xdd, fj.to_chain(arm, q, reduced)[1], balance, total
+
+    masked, reduced, balance, total = both(batch, q, qd, tau)
+    np.testing.assert_allclose(masked, reduced, rtol=1e-10, atol=1e-10)
+    np.testing.assert_allclose(balance, total, rtol=1e-9, atol=1e-9)
 
 
 def test_shapes_are_those_of_the_chain():

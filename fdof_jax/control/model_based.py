@@ -4,10 +4,10 @@ from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 
 from ..checks import real_array
+from ..forces.part import Condition
 from ..linkage.frames import scalar_frames
 from ..linkage.linkage import Linkage, check_linkage, possible
 from ..mechanics.equations import Scalars, link_constants
@@ -32,14 +32,15 @@ class ModelBased(PDController):
     def _believed(self, linkage: Linkage) -> Linkage:
         return linkage if self.model is None else self.model
 
+    def conditions_on(self, linkage):
+        wanted, found = linkage.ef, self._believed(linkage).ef
+        same = wanted.shape == found.shape and (wanted == found).all()
+        expected = f"the arm's own topology, existence factors {wanted}"
+        yield Condition(same, "model", expected, found)
+
     def check(self, linkage: Linkage, ts: Array) -> None:
         super().check(linkage, ts)
         ModelBased.__check_init__(self)
-        if not np.array_equal(self._believed(linkage).ef, linkage.ef):
-            raise ValueError(
-                "model: expected the arm's own topology, existence factors "
-                f"{linkage.ef.tolist()}, got {self._believed(linkage).ef.tolist()}."
-            )
 
     def possible(self) -> Array:
         own = super().possible()

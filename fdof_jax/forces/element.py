@@ -12,7 +12,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jax import Array
 
-from ..linkage.linkage import Linkage, joints_of
+from ..linkage.linkage import Linkage
 from ..mechanics.equations import Scalars
 from .part import Foreign, Part, check_joints, default, optional
 
@@ -25,7 +25,8 @@ class Element(Part):
     A subclass implements `__call__`, with joint positions, velocities and efforts of
     shape (n,) [m or rad; m/s or rad/s; N or N m]. All else has a default:
 
-    - `conditions`: conditions on values, beside the bounds that `field` declares.
+    - `conditions`: conditions on values, beside the bounds that `field` declares;
+      `conditions_on(linkage)`: those on the arm's joints.
     - `jump_ts`: times at which the efforts jump; steps end there [s]. By default they
       are those of its fields: of a reference, or of a function of time.
     - `check(linkage, ts)`: raises ValueError if the element does not fit the arm;
@@ -114,7 +115,7 @@ def elements_on(linkage: Linkage, forces: Any) -> tuple[Element, ...]:
     """Returns forces as elements, or raises ValueError for values of other chains."""
     found = elements("forces", forces)
     for index, element in enumerate(found):
-        check_joints(f"forces[{index}]", element, joints_of(linkage))
+        check_joints(f"forces[{index}].", element, linkage)
     return found
 
 

@@ -19,7 +19,7 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from ..checks import JOINT, concrete, function, instance, is_traced, real_array
-from ..linkage.linkage import Linkage
+from ..linkage.linkage import Linkage, joints_of
 from ..xla.array_namespace import in_numpy, namespace
 
 
@@ -118,6 +118,10 @@ class Part(eqx.Module, metaclass=_Fields):
         """Yields conditions beside the bounds of fields; also of traced values."""
         return ()
 
+    def conditions_on(self, linkage: Linkage) -> Iterable[Condition]:
+        """Yields conditions on the arm's joints; parts within have their own."""
+        return ()
+
     jump_ts = default(lambda self: jumps_of(*(part for _, part in _within(self))))
 
     def check(self, linkage: Linkage, ts: Array) -> None:
@@ -126,9 +130,10 @@ class Part(eqx.Module, metaclass=_Fields):
             part.check(linkage, ts)
 
     def fits(self, linkage: Linkage, ts: Array) -> Any:
-        """Returns whether `check` would accept an arm and times; also if traced."""
+        """Returns whether an arm and times would be accepted; also if traced."""
+        own = [_all(condition.holds) for condition in self.conditions_on(linkage)]
         parts = [part.fits(linkage, ts) for _, part in _within(self)]
-        return reduce(and_, parts, True)
+        return reduce(and_, [*own, *parts], True)
 
     def possible(self) -> Any:
         """Returns whether the constructor would accept the values; also if traced."""
@@ -146,20 +151,20 @@ class Part(eqx.Module, metaclass=_Fields):
                 instance(name, vars(self)[name], about["kind"])
         for name, value, rules in _declared(self):
             object.__setattr__(self, name, real_array(name, value, **rules))
-        _refuse("", self)
+        _refuse("", in_numpy(self).conditions())
 
 
 def check_values(place: str, part: Part) -> None:
     """Raises ValueError for known values that constructors would not accept."""
     for name, value, rules in _declared(part):
         real_array(f"{place}.{name}", value, **rules)
-    _refuse(f"{place}.", part)
+    _refuse(f"{place}.", in_numpy(part).conditions())
     for name, inner in _within(part):
         check_values(f"{place}.{name}", inner)
 
 
-def _refuse(place: str, part: Part) -> None:
-    for holds, name, expected, got in in_numpy(part).conditions():
+def _refuse(place: str, conditions: Iterable[Condition]) -> None:
+    for holds, name, expected, got in conditions:
         if (known := concrete(_all(holds))) is not None and not known:
             shown = " and ".join(map(str, got)) if isinstance(got, tuple) else got
             raise ValueError(f"{place}{name}: expected {expected}, got {shown}.")
@@ -215,17 +220,23 @@ def sized(part: Any, joints: int) -> Any:
     return copied
 
 
-def check_joints(place: str, part: Part, count: int) -> None:
-    """Raises ValueError unless declared arrays have an entry for each joint."""
+def check_joints(place: str, part: Part, linkage: Linkage) -> None:
+    """Raises ValueError unless arrays and known values suit the arm's joints.
+
+    The number of joints is a shape, and so known while values are traced.
+    """
+    part, linkage = in_numpy((part, linkage))
+    count = joints_of(linkage)
     for name, value, rules in _declared(part):
         for wanted, size in zip(rules["shape"], jnp.shape(value)):
             if wanted == JOINT and size != count:
                 raise ValueError(
-                    f"{place}.{name}: expected numbers for {count} joints, as the "
+                    f"{place}{name}: expected numbers for {count} joints, as the "
                     f"linkage has, got {size}."
                 )
+    _refuse(place, part.conditions_on(linkage))
     for name, inner in _within(part):
-        check_joints(f"{place}.{name}", inner, count)
+        check_joints(f"{place}{name}.", inner, linkage)
 
 
 def value_of(part: Part, name: str, *arguments: Any) -> Array:

@@ -17,13 +17,13 @@ from jax import Array
 from jaxtyping import Complex, Float
 from numpy.typing import ArrayLike
 
-from ..checks import concrete, real_array, whole_number
+from ..checks import real_array, whole_number
 from ..linkage.frames import Frames, cross, frames, scalar_frames
 from ..linkage.linkage import Linkage, joints_of, without_fixed
 from ..linkage.topology import MOST_PAIRS
 from ..mechanics.equations import Scalars
 from .element import ScalarElement
-from .part import Part, Values, field, of_kind
+from .part import Condition, Part, Values, check_joints, field, of_kind
 
 
 def pick(link: Array, choices: list[Array]) -> Array:
@@ -68,19 +68,15 @@ class Point(Part):
 
     def position(self, linkage: Linkage, q: ArrayLike) -> Float[Array, " 2"]:
         """Computes the point's position (x, y) from the ground pivot [m]."""
-        self.check(linkage, jnp.zeros(1))
+        check_joints("", self, linkage)
         q = real_array("q", q, (joints_of(linkage),))
         place = self.place(frames(linkage, without_fixed(linkage, q)))
         return jnp.stack([place.real, place.imag])
 
-    def check(self, linkage: Linkage, ts: Array) -> None:
-        """Raises ValueError if the linkage has no such link."""
-        last, link = joints_of(linkage), concrete(self.link)
-        if link is not None and link > last:
-            raise ValueError(
-                f"link: expected 0 (the ground) or a moving link, 1 to {last}, got "
-                f"{link}."
-            )
+    def conditions_on(self, linkage):
+        expected = f"0 (the ground) or a moving link, 1 to {joints_of(linkage)}"
+        there = self.link <= joints_of(linkage)
+        yield Condition(there, "link", expected, self.link)
 
     def place(self, frames: Frames) -> Complex[Array, ""]:
         """Computes the point's position x + iy [m]."""
@@ -183,10 +179,10 @@ class Separation(Part):
 
 
 def length_of(vector: Array) -> Array:
-    """Length of a vector; 0 with derivative 0 for the zero vector."""
+    """Length of a vector; 0 with derivative 0 for the zero vector, NaN for NaN."""
     square = vector.real**2 + vector.imag**2
-    apart = square > 0
-    return jnp.where(apart, jnp.sqrt(jnp.where(apart, square, 1)), 0)
+    meet = square == 0
+    return jnp.where(meet, 0, jnp.sqrt(jnp.where(meet, 1, square)))
 
 
 def over(length: Array) -> Array:

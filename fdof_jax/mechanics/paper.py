@@ -9,22 +9,16 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
-from ..checks import is_traced
 from ..linkage.linkage import Linkage, compiled, joints_of
-from ..linkage.topology import letters
 from ..xla.trigonometry import sincos
 
 
 def three_pairs(linkage: Linkage, _: Linkage) -> Linkage:
-    """Returns a linkage of three pairs without a fixed one, or raises ValueError."""
+    """Returns a linkage of three pairs of joints, or raises ValueError."""
     if joints_of(linkage) != 3:
         raise ValueError(
-            "linkage: expected three pairs of joints, of which the paper's equations "
-            f"are, got {joints_of(linkage)}."
-        )
-    if not is_traced(linkage.ef) and "F" in (name := letters(linkage.ef)):
-        raise ValueError(
-            f"linkage: expected no fixed pair in the paper's equations, got {name}."
+            "linkage: expected three pairs of joints, as in the paper's equations, got "
+            f"{joints_of(linkage)}."
         )
     return linkage
 
@@ -218,16 +212,19 @@ def masked_accelerations(
     >>> fj.masked_accelerations(arm, level, rest, [0.0] * 6).tolist()  # it falls
     [0.0, -9.81, 0.0, 0.0, 0.0, 0.0]
     """
-    ef1, _, ef3, _, ef5, _ = linkage.ef
     real = linkage.ef > 0.5
     M = mass_matrix(linkage, x)
     # Right side of (15) without constraint efforts.
     right = _generalised(jnp.where(real, force, 0)) + bias_force(linkage, x, xd)
 
+    # The paper prints EF5 for 1 - EF6 and EF3 for 1 - EF4. The same where one joint of
+    # each pair is real, they differ at fixed pairs.
+    _, _, _, ef4, _, ef6 = linkage.ef
+
     def masked(rows: Array) -> Array:
         th4 = rows[5]
-        th3 = rows[3] + ef5 * th4
-        th2 = rows[1] + ef3 * th3
+        th3 = rows[3] + (1 - ef6) * th4
+        th2 = rows[1] + (1 - ef4) * th3
         return jnp.stack([rows[0], th2, rows[2], th3, rows[4], th4])
 
     # Columns of fictitious joints are added up likewise: their rows become those of the

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 
 from ..dynamics import mass_and_bias
 from ..forces.element import Element, Forces
-from ..forces.part import called
+from ..forces.part import Condition, called
 from ..linkage.linkage import Linkage, joints_of, without_fixed
 from ..linkage.topology import MOST_PAIRS, fixed_pairs
 from ..mechanics.equations import equations, zeros
@@ -90,12 +90,9 @@ class PrescribedMotion(Element):
         near = abs(in_numpy(q) - begin) <= 1e-6 * (1 + abs(begin))
         return (near | ~self.of(linkage)).all()
 
-    def check(self, linkage: Linkage, ts: Array) -> None:
-        """Runs the checks of the reference; raises ValueError for joints not there."""
-        super().check(linkage, ts)
-        if np.asarray(self.moved)[(count := joints_of(linkage)) :].any():
-            numbers = [n for n, m in zip(_NUMBERS, np.asarray(self.moved)) if m]
-            raise ValueError(f"joints: expected 1 to {count}, got {numbers}.")
+    def conditions_on(self, linkage):
+        count, last = joints_of(linkage), (self.moved * np.array(_NUMBERS)).max()
+        yield Condition(last <= count, "joints", f"1 to {count}", last)
 
     def __call__(self, t: Array, q: Array, qd: Array, linkage: Linkage) -> Array:
         return jnp.zeros_like(q)  # the real efforts depend on all other elements

@@ -18,7 +18,7 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from ..checks import function, increasing, instance, is_traced, real_array, whole_number
-from ..forces.element import Forces, elements
+from ..forces.element import Forces, elements, elements_on
 from ..linkage.coordinates import State
 from ..linkage.linkage import Linkage
 from .batch_axes import Batch, batch_of
@@ -157,6 +157,13 @@ def sweep(
     )
     del settings["progress_meter"]  # it counts finished members, not time
     batch = batch_of(linkage, state0, forces, forces_axes)
+    moving, shared = batch.split()
+
+    def check_member(moving):
+        linkage, _, forces = eqx.combine(moving, shared)
+        elements_on(linkage, forces)  # what members share is known here
+
+    eqx.filter_eval_shape(eqx.filter_vmap(check_member), moving)
     try:
         eqx.filter_eval_shape(expected_work, ts[0], *batch.split())
     except TypeError as error:
