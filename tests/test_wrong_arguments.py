@@ -52,6 +52,14 @@ def test_too_many_members():
     refused("members", tuning.perturbed, FIG7, 10**30)
 
 
+def test_no_members():
+    """`vmap` over no members has nothing to raise."""
+    linkage, state0, *_ = scenes.fig5()
+    motion = lambda q: fj.simulate(linkage, state0._replace(q=q), TS)
+    solution = jax.eval_shape(jax.vmap(motion), np.zeros((0, 3)))
+    assert solution.q.shape == (0, len(TS), 3)
+
+
 def test_a_sweep_under_a_transfer_guard(batch):
     with jax.transfer_guard("disallow"):
         solution = run(batch)

@@ -225,11 +225,17 @@ def _raising(solution: Solution, inputs: tuple[Any, ...]) -> Solution:
         )
     faults = jnp.stack([fault.any() for fault in wrong.values()])
     messages = [f"simulate: {message}, got others." for message in wrong]
-    solution = eqx.branched_error_if(
-        solution, faults.any(), jnp.argmax(faults), messages
-    )
     failed = solution.result != diffrax.RESULTS.successful
-    return solution.result.error_if(solution, failed)
+    try:
+        raising = eqx.branched_error_if(
+            solution, faults.any(), jnp.argmax(faults), messages
+        )
+        return raising.result.error_if(raising, failed)
+    except ValueError as error:
+        # Under `vmap` over no members equinox takes the maximum of none.
+        if "zero-size array" not in str(error):
+            raise
+        return solution
 
 
 def check_own(
