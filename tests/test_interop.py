@@ -108,12 +108,12 @@ def test_exported_motion_equals_mujoco():
     efforts = fj.joint_efforts(scene.linkage, forces, motion)[1][3]
     assert (np.abs(efforts) >= np.asarray(pd.limit)).any()
     model = mujoco.MjModel.from_xml_string(fj.to_mjcf(scene.linkage, forces))
-    model.opt.integrator, model.opt.timestep = mujoco.mjtIntegrator.mjINT_RK4, 1e-4
+    model.opt.integrator, model.opt.timestep = mujoco.mjtIntegrator.mjINT_RK4, 2e-5
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, 0)
     data.qpos, data.qvel = scene.state0
     for expected in np.asarray(motion.q)[1:]:
-        mujoco.mj_step(model, data, 1000)
+        mujoco.mj_step(model, data, 5000)
         np.testing.assert_allclose(data.qpos, expected, atol=1e-6)
 
 

@@ -279,3 +279,10 @@ def test_lists_and_integers_are_accepted():
     np.testing.assert_array_equal(
         tip, fj.inverse_kinematics(linkage, jnp.ones(2), jnp.asarray(0.0))
     )
+
+
+def test_a_time_axis_is_refused_with_a_hint():
+    arm, q = fj.scenes.fig5().linkage, np.zeros((5, 3))
+    for call in (fj.tip_position, lambda arm, q: fj.energy(arm, q, q)):
+        with pytest.raises(ValueError, match=r"^q: .* shape \(5, 3\); jax.vmap"):
+            call(arm, q)

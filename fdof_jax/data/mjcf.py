@@ -143,7 +143,7 @@ def _of_joints(found: tuple[Any, ...], count: int) -> list[dict[str, str]]:
 def _add_springs(root: Any, bodies: list[Any], found: tuple[Any, ...]) -> None:
     """Springs between points, as tendons between sites."""
     springs = [(k, e) for k, e in enumerate(found) if isinstance(e, SpringDamper)]
-    tendons = ElementTree.SubElement(root, "tendon") if springs else None
+    tendons = ElementTree.SubElement(root, "tendon")
     for k, element in springs:
         rest, side = float(element.rest_length), int(element.side)
         ends = {0: (rest, rest), 1: (0.0, rest), -1: (rest, _FAR)}[side]  # no force

@@ -185,6 +185,11 @@ def compiled(
             check_linkage(linkage)
             for name in per_joint:
                 n = joints_of(linkage)
+                if getattr(arguments[name], "ndim", 1) > 1:
+                    raise ValueError(
+                        f"{name}: expected one instant, numbers for {n} joints, got "
+                        f"shape {np.shape(arguments[name])}; jax.vmap computes many."
+                    )
                 arguments[name] = real_array(
                     name, arguments[name], (n,), of=f"{n} joints"
                 )

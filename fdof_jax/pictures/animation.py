@@ -29,7 +29,7 @@ class MotionAnimation(FuncAnimation):
     ):
         super().__init__(figure, show, count, interval=pause, cache_frame_data=False)  # type: ignore[arg-type]
         self._figure, self._show = figure, show
-        self._count, self._moving = count, moving
+        self._count, self._pause, self._moving = count, pause, moving
 
     def save(self, filename: Any, *args: Any, **kwargs: Any) -> None:
         """Writes a file, and a progress bar to the standard error output.
@@ -42,7 +42,7 @@ class MotionAnimation(FuncAnimation):
             return super().save(filename, *args, **kwargs)
         self._draw_was_started = True  # matplotlib warns of what is never shown
         first, *others = self._images(kwargs["progress_callback"], kwargs.get("dpi"))
-        pause = round(self._interval)
+        pause = round(self._pause)
         first.save(
             filename, save_all=True, append_images=others, duration=pause, loop=0
         )

@@ -275,7 +275,10 @@ def _message(scene, run, history, lower, upper) -> str:
             ", because every actuator is at its limit throughout" if at_limit else ""
         )
     held = np.sum(_at_bound(history.gains[-1], lower, upper))
-    parts = [reason, f"{held} of {np.sum(lower < upper)} gains are at a bound"]
+    bounds = f"{held} of {np.sum(lower < upper)} gains are at a bound"
+    if held:
+        bounds += " (widen the bounds, price the effort, or take another controller)"
+    parts = [reason, bounds]
     for name, share in zip(joint_names(scene.linkage), history.saturated[-1]):
         if share > _MOSTLY:
             parts.append(

@@ -1,0 +1,183 @@
+"""Import of planar chains from MuJoCo's model format (MJCF)."""
+
+import warnings
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..forces.actuators import Armature
+from ..forces.element import Forces
+from ..forces.joints import JointDamper
+from ..linkage.linkage import Linkage
+from ..names import optional_package
+
+_SLIDE, _HINGE = 2, 3  # MuJoCo's mjtJoint
+
+
+def from_mjcf(text: str) -> tuple[Linkage, Forces]:
+    """Reads a planar chain of hinges and slides from a MuJoCo model (MJCF).
+
+    The plane is seen from where the hinges' axes point, with gravity downwards; `q`
+    equals `qpos`. A body with several joints becomes as many links, all but the last
+    without mass. A site `tip` on the last body becomes the tip; without one, the tip is
+    the last joint. Contacts are ignored. MuJoCo reads the model, which needs
+    `pip install "fdof_jax[test]"`.
+
+    **Arguments:** `text`: the XML text.
+
+    **Returns:** the linkage, and its `JointDamper` and `Armature` if it has any.
+
+    **Raises:** ValueError for what a planar chain does not have (branches, other
+    joints, axes out of the plane), for springs, stops and friction of joints, and for
+    actuators, tendons and equality constraints.
+
+    >>> import fdof_jax as fj
+    >>> arm, forces = fj.data.from_mjcf('''
+    ... <mujoco><worldbody><body><joint axis="0 1 0" damping="2"/>
+    ... <geom type="capsule" fromto="0 0 0 0 0 -1" size=".1"/></body></worldbody>
+    ... </mujoco>''')
+    >>> arm.com.shape, forces[0].coefficient.tolist()
+    ((1, 2), [2.0])
+    """
+    mujoco = optional_package("mujoco", "test")
+    try:
+        model = mujoco.MjModel.from_xml_string(text)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"text: expected a MuJoCo model: {error}") from None
+    _refuse_others(model)
+    data = mujoco.MjData(model)
+    data.qpos[:] = 0
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+
+    e1, e2, gravity = _plane(model, data)
+    plane = lambda vector: complex(vector @ e1, vector @ e2)
+    links = _links(model, data, plane, np.cross(e1, e2))
+    tip = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, "tip")
+    on_last = tip >= 0 and model.site_bodyid[tip] == model.jnt_bodyid[-1]
+    end = plane(data.site_xpos[tip]) if on_last else links[-1].start
+    with warnings.catch_warnings():  # of links without mass, which MuJoCo does not have
+        warnings.filterwarnings("ignore", ".*carries no inertia of its own")
+        linkage = _linkage(links, end, gravity)
+    found = (JointDamper, model.dof_damping), (Armature, model.dof_armature)
+    return linkage, tuple(kind(values) for kind, values in found if values.any())
+
+
+class _Link(NamedTuple):
+    slides: bool  # along `axis`, rather than turns
+    axis: complex
+    start: complex  # the hinge, or the start of the link before [m]
+    center: complex
+    mass: float
+    inertia: float
+
+
+def _refuse_others(model: Any) -> None:
+    """Raises ValueError for what the library has not, or has otherwise."""
+    refuse = lambda what: ValueError(f"text: expected a planar chain, got {what}.")
+    for kind, name in zip(model.jnt_type, _names(model)):
+        if kind not in (_HINGE, _SLIDE):
+            raise refuse(f"joint {name}, which is neither a hinge nor a slide")
+    for values, what in (
+        (model.jnt_stiffness, "a spring"),
+        (model.jnt_limited, "a range"),
+        (model.dof_frictionloss, "friction"),
+    ):
+        for name, value in zip(_names(model), values):
+            if np.any(value):
+                raise refuse(f"joint {name} with {what}, which MuJoCo models otherwise")
+    for count, what in (
+        (model.nu, "actuators"),
+        (model.ntendon, "tendons"),
+        (model.neq, "equality constraints"),
+    ):
+        if count:
+            raise refuse(what)
+    if not model.njnt or _HINGE not in model.jnt_type:
+        raise refuse("no hinge")
+    for body in range(1, model.nbody):
+        before = model.body_parentid[body]
+        if model.body_weldid[body] and before != body - 1 and model.body_weldid[before]:
+            raise refuse(f"body {model.body(body).name or body} on a branch")
+    moved = model.body_weldid > 0
+    if (model.body_weldid[model.body_parentid[moved]] == 0).sum() > 1:
+        raise refuse("several chains")
+
+
+def _names(model: Any) -> list[str]:
+    return [model.joint(k).name or str(k) for k in range(model.njnt)]
+
+
+def _plane(model: Any, data: Any) -> tuple[np.ndarray, np.ndarray, float]:
+    """Unit vectors to the right and upwards, and gravity [m/s^2]."""
+    normal = data.xaxis[
+        np.flatnonzero(model.jnt_type == _HINGE)[0]
+    ]  # of the first hinge
+    gravity = np.array(model.opt.gravity)
+    within = gravity - (gravity @ normal) * normal
+    size = np.linalg.norm(within)
+    if size > 1e-9 and abs(gravity @ normal) > 1e-9 * size:
+        raise ValueError("text: expected gravity in the plane or across it, got both.")
+    up = -within / size if size > 1e-9 else np.roll(normal, 1)
+    if size <= 1e-9:
+        size, up = 0.0, up - (up @ normal) * normal
+        if np.linalg.norm(up) < 1e-9:
+            up = np.cross(normal, [1.0, 0.0, 0.0])
+        up = up / np.linalg.norm(up)
+    return np.cross(up, normal), up, float(size)
+
+
+def _links(model: Any, data: Any, plane: Any, normal: np.ndarray) -> list[_Link]:
+    """The link after each joint, in the plane, at joint positions 0."""
+    links, start = [], 0j
+    for k, name in enumerate(_names(model)):
+        slides = model.jnt_type[k] == _SLIDE
+        axis, across = data.xaxis[k], data.xaxis[k] @ normal
+        if abs(across - (0 if slides else 1)) > 1e-9:
+            where = "in the plane" if slides else "along the first hinge's"
+            raise ValueError(f"text: expected the axis of joint {name} {where}.")
+        if not slides:
+            start = plane(data.xanchor[k])
+        body = model.jnt_bodyid[k]
+        last = k + 1 == model.njnt or model.jnt_bodyid[k + 1] != body
+        center, mass, inertia = start, 0.0, 0.0
+        if last:  # with all bodies welded to it
+            welded = np.flatnonzero(model.body_weldid == body)
+            masses = model.body_mass[welded]
+            places = np.array([plane(data.xipos[b]) for b in welded])
+            mass = float(masses.sum())
+            center = complex(masses @ places / mass)
+            turned = data.ximat[welded].reshape(-1, 3, 3)
+            own = (turned.transpose(0, 2, 1) @ normal) ** 2 * model.body_inertia[welded]
+            inertia = float(own.sum() + masses @ np.abs(places - center) ** 2)
+        links.append(_Link(slides, plane(axis), start, center, mass, inertia))
+    return links
+
+
+def _linkage(links: list[_Link], end: complex, gravity: float) -> Linkage:
+    """The linkage with `q` = 0 where the links are.
+
+    A link before a slide is at right angles to it; all others are parallel to the next
+    one, so that positions of hinges are 0 there.
+    """
+    turns = [float(np.angle(end - links[-1].start))]
+    for link in reversed(links):
+        turns.append(float(np.angle(-1j * link.axis)) if link.slides else turns[-1])
+    turns.reverse()  # of the ground and the links
+    starts = [0j, *(link.start for link in links), end]
+    steps = np.diff(starts) * np.exp(-1j * np.array(turns))
+    offsets = [
+        (link.center - link.start) * np.exp(-1j * turn)
+        for link, turn in zip(links, turns[1:])
+    ]
+    slides = [link.slides for link in links]
+    return Linkage(
+        "".join("P" if slide else "R" for slide in slides),
+        length=steps.real,
+        com=np.column_stack([np.real(offsets), np.imag(offsets)]),
+        mass=[link.mass for link in links],
+        inertia=[link.inertia for link in links],
+        locked=np.where(slides, np.diff(turns), steps.imag[:-1]),
+        base_angle=turns[0],
+        gravity=gravity,
+    )

@@ -1,0 +1,69 @@
+"""Chains read from MuJoCo's models accelerate as there."""
+
+import mujoco
+import numpy as np
+import pytest
+from helpers import random_linkage
+
+import fdof_jax as fj
+
+CART_POLE = """<mujoco><worldbody><body name="cart" pos="0 0 1">
+<joint name="slider" type="slide" axis="1 0 0" damping="0.3" armature="0.1"/>
+<geom type="box" size=".2 .1 .1" mass="1"/>
+<body name="pole" pos="0 0 .1"><joint name="hinge" axis="0 1 0" damping=".2"/>
+<geom type="capsule" fromto="0 0 0 .1 0 .6" size=".05" mass=".5"/>
+<site name="tip" pos=".1 0 .6"/></body></body></worldbody></mujoco>"""
+DOUBLE = """<mujoco><option gravity="0 0 -3"/><worldbody><body euler="0 20 0">
+<joint type="slide" axis="1 0 2"/><joint axis="0 -1 0" pos=".1 0 .1"/>
+<geom type="capsule" fromto="0 0 0 0 0 -.5" size=".05"/>
+<body pos="0 0 -.5" euler="0 30 0"><joint axis="0 -1 0" ref="20"/>
+<joint type="slide" axis="1 0 .2"/>
+<geom type="box" size=".3 .1 .2" pos=".1 0 -.1"/>
+<body pos="0 0 -.2"><geom size=".1" mass="2"/></body>
+<site name="tip" pos="0 0 -.4"/></body></body></worldbody></mujoco>"""
+RANDOM = fj.to_mjcf(random_linkage("RPR", np.random.default_rng(2)))
+
+
+@pytest.mark.parametrize("text", [CART_POLE, DOUBLE, RANDOM])
+def test_accelerations_and_tips_equal_mujoco(text):
+    model = mujoco.MjModel.from_xml_string(text)
+    data = mujoco.MjData(model)
+    linkage, forces = fj.data.from_mjcf(text)
+    rng = np.random.default_rng(0)
+    tips, ours = [], []
+    for _ in range(4):
+        data.qpos, data.qvel = q, qd = rng.normal(size=(2, model.nq))
+        mujoco.mj_forward(model, data)
+        tau = sum((force(0.0, q, qd, linkage) for force in forces), np.zeros(len(q)))
+        inertial = tuple(f for f in forces if isinstance(f, fj.forces.Armature))
+        qdd = fj.forward_dynamics(linkage, q, qd, tau, inertial)
+        np.testing.assert_allclose(qdd, data.qacc, rtol=1e-9, atol=1e-9)
+        tips.append(data.site("tip").xpos.copy())
+        ours.append(fj.tip_position(linkage, q))
+    apart = [np.linalg.norm(np.diff(places, axis=0), axis=1) for places in (tips, ours)]
+    np.testing.assert_allclose(*apart, atol=1e-12)
+
+
+BODY = '<body><joint axis="0 1 0"{}/><geom size=".1"/>{}</body>'
+
+
+@pytest.mark.parametrize(
+    "inside, got",
+    [
+        (BODY.format(' stiffness="1"', ""), "joint 0 with a spring"),
+        (BODY.format(' range="-1 1"', ""), "joint 0 with a range"),
+        (BODY.format(' frictionloss="1"', ""), "joint 0 with friction"),
+        ('<body><freejoint name="f"/><geom size=".1"/></body>', "joint f, which is"),
+        (BODY.format("", "") * 2, "several chains"),
+        (BODY.format("", BODY.format("", "") * 2), "body 3 on a branch"),
+        (BODY.format("", BODY.format("", "").replace("0 1 0", "0 0 1")), "of joint 1"),
+        ('<body><joint type="slide"/><geom size=".1"/></body>', "no hinge"),
+        ("<nothing/>", "a MuJoCo model"),
+    ],
+)
+def test_what_is_no_planar_chain_is_refused_by_name(inside, got):
+    with pytest.raises(ValueError, match=f"^text: expected.*{got}"):
+        fj.data.from_mjcf(
+            "<mujoco><compiler autolimits='true'/><worldbody>"
+            f"{inside}</worldbody></mujoco>"
+        )
