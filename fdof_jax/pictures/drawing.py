@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
 from ..checks import real_array, whole_number
-from ..linkage.linkage import Linkage, check_linkage, joints_of
+from ..linkage.linkage import Linkage, check_linkage, per_joint
 from ..simulation.solution import Solution
 from .arms import (
     Geometry,
@@ -65,7 +65,7 @@ def draw_linkage(
     "rail 2", "slider 2", "mass 3", "tip 3", "ground".
     """
     check_linkage(linkage)
-    g = geometry(linkage, np.asarray(real_array("q", q, (joints_of(linkage),)))[None])
+    g = geometry(linkage, np.asarray(per_joint("q", q, linkage))[None])
     ax = plane_axes(ax, g.all_points)
     draw_ground(ax)
     draw_arm(ax, g, 0, mass_centers, alpha, color)
