@@ -2,6 +2,7 @@
 
 import chains
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
@@ -119,7 +120,7 @@ def test_states_and_links_of_other_chains_are_refused():
         with pytest.raises(ValueError, match=r"^forces\[0\]\.inertia: .* 2 joints"):
             call(TWO, zeros, zeros, zeros, armature)
     hold = chains.Hold(jnp.zeros(3))
-    with pytest.raises(ValueError, match=f"^reference: {words}"):
+    with pytest.raises(ValueError, match=f"^reference: {words} for 2 joints"):
         fj.simulate(TWO, REST, [0, 0.1], (fj.PDController(1, 1, 1, hold),))
 
 
@@ -158,6 +159,29 @@ def test_values_of_other_chains_are_refused_at_each_door(fault):
     ):
         with pytest.raises(ValueError, match=rf"^forces\[0\]\.{fault}"):
             call()
+
+
+def test_numbers_of_another_arm_are_refused_by_name():
+    both = fj.State(np.zeros((2, 2)), np.zeros((2, 2)))
+    move = fj.references.JointMove([0] * 3, [1] * 3, fj.references.Travel(1.0))
+    with pytest.raises(ValueError, match=r"^forces\[0\]\.reference\.start: expected"):
+        fj.sweep(TWO, both, [0, 0.1], (fj.PDController(1, 1, 1, move),))
+    plain = lambda t, q, qd, linkage: jnp.zeros(3)
+    for call in fj.linearize, lambda *a: fj.analysis.equilibrium(a[0], a[1].q, a[2]):
+        with pytest.raises(ValueError, match=r"^forces\[0\]: expected it to return"):
+            call(TWO, REST, (plain,))
+    for call in fj.analysis.equilibrium, fj.drawing.draw_linkage:
+        with pytest.raises(ValueError, match=r"^q: .* for 2 joints"):
+            call(TWO, np.zeros(3))
+    for name, value in dict(mass=np.ones(3), length=np.ones(4), locked=1.0).items():
+        arm = eqx.tree_at(lambda arm, name=name: getattr(arm, name), TWO, value)
+        for call in fj.tip_position, jax.jit(fj.tip_position):
+            with pytest.raises(ValueError, match=rf"^linkage\.{name}: .* 2 pairs"):
+                call(arm, np.zeros(2))
+    line = fj.references.Line([9, 0], [9, 1])
+    far = fj.TipTask(line, fj.references.Travel(1.0), orientation=None)
+    with pytest.raises(ValueError, match="reach on branch"):
+        fj.simulate(TWO, REST, [0, 0.1], (fj.PDController(1, 1, 1, far),))
 
 
 def test_models_of_another_topology_are_refused_and_no_point_is_nowhere():

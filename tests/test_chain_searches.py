@@ -1,4 +1,4 @@
-"""Searches on chains of two pairs: gains, parameters, efforts."""
+"""Searches on chains of two pairs: gains and parameters."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -8,16 +8,6 @@ import pytest
 import fdof_jax as fj
 
 pytestmark = pytest.mark.slow
-
-
-class Upright(eqx.Module):
-    """The cart-pole's tip, 1 m above the rail's middle."""
-
-    def __call__(self, t, linkage):
-        return jnp.array([0.0, jnp.pi]), jnp.zeros(2)
-
-    def tip(self, t):
-        return jnp.array([0.0, 1.0])
 
 
 def test_tuning_halves_the_tip_error_of_two_links():
@@ -68,13 +58,3 @@ def test_masses_of_a_double_pendulum_are_found_from_its_motion():
     seen = fj.identification.link_ends(scene, motion)
     result = fj.fit(scene_at, {"mass": [1.0, 1.0]}, ts, seen)
     np.testing.assert_allclose(result.parameters["mass"], true["mass"], rtol=1e-6)
-
-
-def test_optimal_efforts_swing_the_cart_pole_up():
-    arm, start, _, _ = fj.scenes.cart_pole()
-    control = fj.PDController([5.0, 0.0], [1.0, 0.0], [15.0, 0.0], Upright())
-    scene = fj.Scene(arm, start, (control,), 2.0)
-    best = fj.tuning.optimal_efforts(
-        scene, horizon=1.5, knots=16, effort_rate=1e-7, max_steps=100
-    )
-    assert best.tip_error < 0.9 * best.controller_error

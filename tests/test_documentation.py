@@ -79,7 +79,11 @@ NAMES = [
         for name in room.__all__
         if name not in fj.__all__
     ),
-    *(f"scenes.{name}" for name in ("fig3", "fig5", "fig7")),
+    *(
+        f"scenes.{name}"
+        for name, value in inspect.getmembers(fj.scenes, inspect.isfunction)
+        if value.__module__ == fj.scenes.__name__
+    ),
     "interactive.sliders",
     *(
         f"{module.__name__.split('.')[-1]}.{name}"

@@ -22,3 +22,9 @@ def test_examples():
     assert np.isfinite(namespace["effort"]).all()
     assert np.isfinite(namespace["sampled"].q).all()
     assert np.isfinite(namespace["after"].q).all()
+    np.testing.assert_allclose(
+        namespace["traced"].q[-1],
+        namespace["around"](1.0, namespace["pendulum"])[0],
+        atol=0.05,
+    )
+    assert 0.5 < namespace["rolling"].q[-1, 0] < 1.0  # 2 N on 1 to 1.3 kg

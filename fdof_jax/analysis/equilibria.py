@@ -10,10 +10,10 @@ from numpy.typing import ArrayLike
 
 from ..checks import in_order, real_array
 from ..dynamics import inverse_dynamics
-from ..forces.element import Forces
-from ..linkage.linkage import Linkage, joints_of, without_fixed
+from ..forces.element import Element, Forces
+from ..linkage.linkage import Linkage, per_joint, without_fixed
 from ..linkage.topology import fixed_pairs
-from .linearization import checked
+from .linearization import checked, total_effort
 
 
 def equilibrium(
@@ -44,19 +44,19 @@ def equilibrium(
     return _rest(
         linkage,
         forces,
-        real_array("q", q, (joints_of(linkage),)),
+        per_joint("q", q, linkage),
         real_array("t", t, ()),
     )
 
 
 @eqx.filter_jit
-def _rest(linkage: Linkage, forces: Forces, q: Array, t: Array) -> Array:
+def _rest(linkage: Linkage, forces: tuple[Element, ...], q: Array, t: Array) -> Array:
     q = without_fixed(linkage, q)
     still = jnp.zeros_like(q)
 
     def efforts(q, _):
         weight = -inverse_dynamics(linkage, q, still, still, forces)
-        acting = sum((element(t, q, still, linkage) for element in forces), weight)
+        acting = weight + total_effort(linkage, forces, t, q, still)
         # A fixed pair is in equilibrium at 0.
         return jnp.where(jnp.stack(fixed_pairs(linkage.ef)), -q, acting)
 

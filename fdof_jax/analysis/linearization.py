@@ -15,7 +15,7 @@ from ..dynamics import forward_dynamics
 from ..forces.element import Element, Forces, elements_on
 from ..linkage.coordinates import State, real_state
 from ..linkage.linkage import Linkage, check_linkage, without_fixed
-from ..simulation.field import stateful
+from ..simulation.field import element_effort, stateful
 from ..simulation.prescribed import prescribed
 from ..simulation.solution import Solution, check_joints
 
@@ -52,6 +52,15 @@ def checked(linkage: Linkage, forces: Forces) -> tuple[Element, ...]:
     )
 
 
+def total_effort(
+    linkage: Linkage, forces: tuple[Element, ...], t: Array, q: Array, qd: Array
+) -> Array:
+    """Computes the sum of the efforts of elements without a state [N or N m]."""
+    rows = enumerate(forces)
+    efforts = (element_effort(k, e, t, q, qd, linkage, ())[0] for k, e in rows)
+    return sum(efforts, jnp.zeros_like(q))
+
+
 def linearize(
     linkage: Linkage, state: State, forces: Forces = (), t: ArrayLike = 0.0
 ) -> Linearization:
@@ -83,11 +92,11 @@ def linearize(
 
 @eqx.filter_jit
 def _linearized(
-    linkage: Linkage, forces: Forces, q: Array, qd: Array, t: Array
+    linkage: Linkage, forces: tuple[Element, ...], q: Array, qd: Array, t: Array
 ) -> Linearization:
     def rates(y):
         q, qd, tau = (without_fixed(linkage, part) for part in jnp.split(y, 3))
-        tau = sum((element(t, q, qd, linkage) for element in forces), tau)
+        tau = tau + total_effort(linkage, forces, t, q, qd)
         return jnp.concatenate([qd, forward_dynamics(linkage, q, qd, tau, forces)])
 
     slopes = jax.jacfwd(rates)(jnp.concatenate([q, qd, jnp.zeros_like(q)]))

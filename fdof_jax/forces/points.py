@@ -17,9 +17,9 @@ from jax import Array
 from jaxtyping import Complex, Float
 from numpy.typing import ArrayLike
 
-from ..checks import real_array, whole_number
+from ..checks import whole_number
 from ..linkage.frames import Frames, cross, frames, scalar_frames
-from ..linkage.linkage import Linkage, joints_of, without_fixed
+from ..linkage.linkage import Linkage, joints_of, per_joint, without_fixed
 from ..linkage.topology import MOST_PAIRS
 from ..mechanics.equations import Scalars
 from .element import ScalarElement
@@ -69,8 +69,8 @@ class Point(Part):
     def position(self, linkage: Linkage, q: ArrayLike) -> Float[Array, " 2"]:
         """Computes the point's position (x, y) from the ground pivot [m]."""
         check_joints("", self, linkage)
-        q = real_array("q", q, (joints_of(linkage),))
-        place = self.place(frames(linkage, without_fixed(linkage, q)))
+        q = without_fixed(linkage, per_joint("q", q, linkage))
+        place = self.place(frames(linkage, q))
         return jnp.stack([place.real, place.imag])
 
     def conditions_on(self, linkage):

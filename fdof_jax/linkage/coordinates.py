@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from ..checks import concrete, real_array
 from ..xla.array_namespace import in_numpy, namespace
-from .linkage import Linkage, compiled, joints_of
+from .linkage import Linkage, compiled, per_joint
 from .topology import letters, pairs_of, real_joints
 
 
@@ -38,13 +38,8 @@ def real_state(name: str, value: Any, linkage: Linkage) -> State:
         q, qd = value
     except (TypeError, ValueError):
         raise ValueError(f"{name}: expected a State(q, qd), got {value!r}.") from None
-    n = joints_of(linkage)
-    return State(
-        *(
-            real_array(f"{name}.{part}", values, (n,), of=f"{n} joints")
-            for part, values in (("q", q), ("qd", qd))
-        )
-    )
+    parts = ("q", q), ("qd", qd)
+    return State(*(per_joint(f"{name}.{part}", row, linkage) for part, row in parts))
 
 
 @compiled("q", "qd")

@@ -146,6 +146,17 @@ def joints_of(linkage: Linkage) -> int:
     return jnp.size(linkage.ef) // 2
 
 
+def per_joint(name: str, values: Any, linkage: Linkage) -> Array:
+    """Returns values as an array with one per joint (n,), or raises ValueError."""
+    n = joints_of(linkage)
+    if getattr(values, "ndim", 1) > 1:
+        raise ValueError(
+            f"{name}: expected one instant, numbers for {n} joints, got shape "
+            f"{np.shape(values)}; jax.vmap computes many."
+        )
+    return real_array(name, values, (n,), of=f"{n} joints")
+
+
 def without_fixed(linkage: Linkage, values: Array) -> Array:
     """Returns values of the joints (..., joint), 0 at fixed pairs."""
     return jnp.where(jnp.stack(fixed_pairs(linkage.ef)), 0, values)
@@ -155,11 +166,11 @@ _T = TypeVar("_T")
 
 
 def compiled(
-    *per_joint: str, **doors: tuple[int, ...] | Callable[[Linkage, Any], Any]
+    *joint_values: str, **doors: tuple[int, ...] | Callable[[Linkage, Any], Any]
 ) -> Callable[[Callable[..., _T]], Callable[..., _T]]:
     """Decorates a function of a linkage and arrays: checks arguments, then compiles.
 
-    `per_joint` names arguments with a value per joint, which are ignored at fixed
+    `joint_values` names arguments with a value per joint, which are ignored at fixed
     pairs. Each keyword names an argument and gives the shape of its array, or a
     function of linkage and argument that checks and converts it. The decorated function
     accepts anything that converts to such an array. Without compilation, a call outside
@@ -173,7 +184,7 @@ def compiled(
         @functools.wraps(function)
         def inner(*args: Any, **kwargs: Any) -> _T:
             arguments = signature.bind(*args, **kwargs).arguments
-            for name in per_joint:
+            for name in joint_values:
                 moving = without_fixed(arguments["linkage"], arguments[name])
                 arguments[name] = moving
             return function(**arguments)
@@ -183,16 +194,8 @@ def compiled(
             arguments = signature.bind(*args, **kwargs).arguments
             linkage = arguments["linkage"]
             check_linkage(linkage)
-            for name in per_joint:
-                n = joints_of(linkage)
-                if getattr(arguments[name], "ndim", 1) > 1:
-                    raise ValueError(
-                        f"{name}: expected one instant, numbers for {n} joints, got "
-                        f"shape {np.shape(arguments[name])}; jax.vmap computes many."
-                    )
-                arguments[name] = real_array(
-                    name, arguments[name], (n,), of=f"{n} joints"
-                )
+            for name in joint_values:
+                arguments[name] = per_joint(name, arguments[name], linkage)
             for name, door in doors.items():
                 if callable(door):
                     if name in arguments:
@@ -209,7 +212,7 @@ def compiled(
 def check_linkage(linkage: Any) -> None:
     """Raises ValueError unless the argument is one linkage, not a batch.
 
-    Values are checked again, because `equinox.tree_at` bypasses the constructor.
+    Shapes and values are checked again: `equinox.tree_at` bypasses the constructor.
     """
     if not isinstance(linkage, Linkage):
         raise ValueError(f"linkage: expected a Linkage, got {linkage!r}.")
@@ -218,6 +221,14 @@ def check_linkage(linkage: Any) -> None:
             "linkage: expected one linkage (use jax.vmap for a batch), got existence "
             f"factors of shape {jnp.shape(linkage.ef)}."
         )
+    n = joints_of(linkage)
+    shapes = (2 * n,), (n + 1,), (n, 2), (n,), (n,), (n,), (), ()
+    for (name, value), shape in zip(vars(linkage).items(), shapes, strict=True):
+        if np.shape(value) != shape:
+            raise ValueError(
+                f"linkage.{name}: expected an array of shape {shape} for {n} pairs of "
+                f"joints, got shape {np.shape(value)}."
+            )
     if is_traced(linkage):
         return
     values = jax.tree.map(np.asarray, linkage)

@@ -59,13 +59,14 @@ def arm_of(linkage: Linkage, oriented: bool = True) -> tuple[Arm, "Placed"]:
     move, and a third one that turns at the tip takes any direction.
 
     Raises ValueError unless three joints move, or two; for traced existence factors,
-    the tip is NaN instead.
+    all positions are NaN instead.
     """
     wanted, n = 2 + oriented, joints_of(linkage)
     found = None if is_traced(linkage.ef) else int(np.sum(np.asarray(linkage.ef)))
     if n < wanted or found not in (None, wanted):
         also = "" if oriented else " where no orientation is commanded"
-        cure = "; two need orientation=None" if oriented and (found or n) == 2 else ""
+        two = oriented and (found or n) == 2
+        cure = "; two need orientation=None (of a TipTask)" if two else ""
         raise ValueError(
             f"linkage: expected {wanted} joints that move{also}, the others fixed, got "
             f"{found or n}{cure}."
@@ -102,30 +103,33 @@ def arm_of(linkage: Linkage, oriented: bool = True) -> tuple[Arm, "Placed"]:
             xp.concatenate([a, b]) for a, b in ((revolute, one), (angle, angle[:1]))
         )
         vector, tip = xp.concatenate([vector, tip[None]]), xp.zeros_like(tip)
+    valid = 0
     if found is None:
-        tip = xp.where(xp.sum(linkage.ef) == wanted, tip, xp.nan)
+        valid = xp.where(xp.sum(linkage.ef) == wanted, 0, xp.nan)
     arm = Arm(tuple(revolute), angle, base_angle, vector[0], vector[1:], tip)
-    return arm, Placed(place, offset, n)
+    return arm, Placed(place, offset, valid, n)
 
 
 class Placed(NamedTuple):
     """Where the joints of an `Arm` are among the n of a linkage, if not all are.
 
     `offset`: what the positions have beyond those in the linkage [m or rad].
+    `valid`: 0, or NaN if another number of joints moves.
     """
 
     place: Any
     offset: Any
+    valid: Any
     n: int
 
     def __call__(self, q: Any) -> Any:
         """Returns positions in the linkage (..., n), from those of the arm (..., 3)."""
         if self.place is None:
-            return q[..., : self.n]
+            return q[..., : self.n] + self.valid
         xp = namespace(q, self.place, self.offset)
         at = xp.arange(self.n)[:, None] == self.place[None]
         moved = q[..., : len(self.place)] - self.offset
-        return xp.where(at, moved[..., None, :], 0).sum(axis=-1)
+        return xp.where(at, moved[..., None, :], 0).sum(axis=-1) + self.valid
 
 
 class Directions(NamedTuple):

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from ..checks import real_array, whole_number
 from ..forces.element import Forces
-from ..linkage.linkage import Linkage, check_linkage, joints_of
+from ..linkage.linkage import Linkage, check_linkage, per_joint
 from ..simulation.solution import Solution
 from .animation import animation_of, frame_times
 from .arms import (
@@ -72,7 +72,7 @@ def draw_linkage(
     index: "spring 0", "cylinder 1". `ax.legend()` explains the parts.
     """
     check_linkage(linkage)
-    q = np.asarray(real_array("q", q, (joints_of(linkage),)))[None]
+    q = np.asarray(per_joint("q", q, linkage))[None]
     g = with_elements(geometry(linkage, q), linkage, forces, np.zeros(1), q)
     ax = plane_axes(ax, g.all_points)
     draw_ground(ax)

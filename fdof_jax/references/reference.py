@@ -89,9 +89,10 @@ def reference_motion(reference: Any, t: Array, linkage: Linkage) -> tuple[Array,
         raise ValueError(
             f"reference: expected it to return (q_ref, qd_ref), got {motion!r}."
         )
-    shape = (joints_of(linkage),)
+    n = joints_of(linkage)
     q_ref, qd_ref = (
-        real_array("reference", part, shape, broadcast=True) for part in motion
+        real_array("reference", part, (n,), broadcast=True, of=f"{n} joints")
+        for part in motion
     )
     return q_ref, qd_ref
 

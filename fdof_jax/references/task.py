@@ -158,10 +158,11 @@ class TipTask(TipReference):
         q, _ = solve_joints(three, directions, wrist, bearing, task.branch)
         inside = np.isfinite(q).all(axis=1)
         if not inside.all():
+            at = "" if self.orientation is None else f"at {task.direction:g} rad "
             raise ValueError(
-                "reference: expected a path within the linkage's reach at orientation "
-                f"{task.direction:g} rad on branch {task.branch:+g}, got one that "
-                f"leaves it at {times[inside.argmin()]:g} s."
+                f"reference: expected a path within the linkage's reach {at}on branch "
+                f"{task.branch:+g}, got one that leaves it at "
+                f"{times[inside.argmin()]:g} s."
             )
         if not task._ahead(bearing, base):
             raise ValueError(
