@@ -10,7 +10,7 @@ from ..checks import is_traced
 from ..control.pd import PDController
 from ..forces.actuators import Armature
 from ..forces.between_points import SpringDamper
-from ..forces.element import Forces, elements_on
+from ..forces.element import ForeignElement, Forces, elements_on
 from ..forces.joint_limits import JointFriction, JointStops
 from ..forces.joints import JointDamper
 from ..linkage.linkage import Linkage, check_linkage
@@ -97,8 +97,8 @@ def _refuse_others(linkage: Linkage, found: tuple[Any, ...]) -> None:
         name, expected = type(element).__name__, None
         if type(element) not in _KINDS:  # subclasses compute something else
             expected = "one of " + ", ".join(kind.__name__ for kind in _KINDS)
-            name = getattr(element, "called", element)
-            name = type(name).__name__
+            if isinstance(element, ForeignElement):
+                name = type(element.called).__name__
         elif isinstance(element, SpringDamper):
             element.check(linkage, jnp.zeros(1))
             if int(element.side) and float(element.damping) > 0:

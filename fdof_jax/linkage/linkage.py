@@ -149,7 +149,7 @@ def joints_of(linkage: Linkage) -> int:
 def per_joint(name: str, values: Any, linkage: Linkage) -> Array:
     """Returns values as an array with one per joint (n,), or raises ValueError."""
     n = joints_of(linkage)
-    if getattr(values, "ndim", 1) > 1:
+    if isinstance(values, jax.Array | np.ndarray) and values.ndim > 1:
         raise ValueError(
             f"{name}: expected one instant, numbers for {n} joints, got shape "
             f"{np.shape(values)}; jax.vmap computes many."

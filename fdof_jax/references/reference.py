@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from ..checks import function, is_traced, real_array, refusal
 from ..forces.part import Foreign, Part, default, optional
 from ..linkage.linkage import Linkage, check_linkage, joints_of
-from ..xla.array_namespace import in_numpy
+from ..xla.array_namespace import in_numpy, namespace
 
 EXPECTED = "a callable (t, linkage) -> (q, qd), for instance CircleTask()"
 
@@ -153,13 +153,14 @@ def reachable(linkage: Linkage, reference: Any, ts: ArrayLike) -> Bool[Array, " 
     ts = real_array("ts", ts, (None,))
     reference_of(reference)  # refuses what is none
     arguments = reference, linkage, ts
-    near = _finite(*arguments) if is_traced(arguments) else known_reach(*arguments)
-    near = jax.device_put(near)
+    if is_traced(arguments):
+        return _finite(*arguments) & _fits(*arguments)
+    near = known_reach(*arguments)
+    return jax.device_put(near & _fits(*in_numpy(arguments)))
+
+
+def _fits(reference: Any, linkage: Linkage, ts: Any) -> Any:
+    """Returns whether a reference fits from the first to the last of the times."""
     if not isinstance(reference, Part) or not len(ts):
-        return near
-    return near & _fits(reference, linkage, ts)
-
-
-@eqx.filter_jit
-def _fits(reference: Part, linkage: Linkage, ts: Array) -> Array:
-    return jnp.asarray(reference.fits(linkage, jnp.sort(ts)))
+        return True
+    return reference.fits(linkage, namespace(ts).sort(ts))

@@ -178,8 +178,9 @@ class TipTask(TipReference):
 
     def fits(self, linkage, ts):
         _, _, base = self._placed(linkage)
-        seen = lambda t: self.seen(t, base)
-        _, bearing = jax.vmap(seen)(self._times(ts))
+        seen, times = lambda t: self.seen(t, base), self._times(ts)
+        each = seen if namespace(times) is np else jax.vmap(seen)
+        _, bearing = each(times)
         closed = self._gap(lambda t: seen(t)[0], ts) <= _CLOSED
         return super().fits(linkage, ts) & self._ahead(bearing, base) & closed
 
