@@ -21,7 +21,7 @@ def forward_dynamics(
     tau: Float[Array, " joint"],
     forces: Forces = (),
 ) -> Float[Array, " joint"]:
-    """Computes joint accelerations under joint efforts: (14) reduced to 3x3.
+    """Computes joint accelerations under joint efforts: (14), reduced.
 
     The result equals that of the paper's masked equations (17)-(27). It is regular in
     some cases where those are singular, such as a massless revolute tip.
@@ -49,7 +49,7 @@ def inertia_ratios(
 ) -> Float[Array, " joint"]:
     """Computes how well the accelerations are determined, in (0, 1] per joint.
 
-    The ratio 1 / (M_kk (M^-1)_kk) of the 3x3 mass matrix has no unit. It divides the
+    The ratio 1 / (M_kk (M^-1)_kk) of the joint mass matrix has no unit. It divides the
     inertia [kg or kg m^2] of a joint while the others are free to move by its inertia
     while they are locked. The accelerations lose about -log10 of the least ratio in
     digits. Below 1e-11 in float64 or 1e-5 in float32, `simulate` stops and reports it.

@@ -57,7 +57,7 @@ def _weights(element: InertialElement, linkage: Linkage, coordinates: Array) -> 
 def added_inertia(
     linkage: Linkage, forces: Forces, q: Array, qd: Array
 ) -> tuple[Upper, Array] | None:
-    """Computes what elements add to the mass matrix and the bias (3,), if anything.
+    """Computes what elements add to the mass matrix and the bias (n,), if anything.
 
     M = J^T W J and bias = J^T W (dJ/dt) qd + dV/dq, where J is the derivative of the
     coordinates. Forward mode alone keeps the code of further derivatives small.
