@@ -10,7 +10,7 @@ from ..checks import is_traced
 from ..control.pd import PDController
 from ..forces.actuators import Armature
 from ..forces.between_points import SpringDamper
-from ..forces.element import ForeignElement, Forces, elements_on
+from ..forces.element import Forces, ForeignElement, elements_on
 from ..forces.joint_limits import JointFriction, JointStops
 from ..forces.joints import JointDamper
 from ..linkage.linkage import Linkage, check_linkage
