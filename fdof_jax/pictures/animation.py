@@ -37,9 +37,11 @@ class MotionAnimation(FuncAnimation):
         By default a GIF is written by pillow, and only what moves is drawn again.
         """
         name = Path(filename).name
-        kwargs.setdefault("progress_callback", partial(_progress, name))
-        if not name.endswith(".gif") or args or "writer" in kwargs:
+        if args or "writer" in kwargs:  # a notebook's, too, which shows no bar
             return super().save(filename, *args, **kwargs)
+        kwargs.setdefault("progress_callback", partial(_progress, name))
+        if not name.endswith(".gif"):
+            return super().save(filename, **kwargs)
         self._draw_was_started = True  # matplotlib warns of what is never shown
         first, *others = self._images(kwargs["progress_callback"], kwargs.get("dpi"))
         pause = round(self._pause)

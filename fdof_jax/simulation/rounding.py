@@ -39,8 +39,9 @@ class _AboveRounding(Adaptive):
         of_qd = _rounding(revolute, health, y0, y1_candidate)
         of_delta = tuple(jnp.abs(t1 - t0) * noise for noise in of_qd)
 
-        def judged(error: Array, start: Array, rounding: Array) -> Array:
-            tolerance = self.atol + self.rtol * jnp.abs(start)
+        def judged(error: Array, start: Array, end: Array, rounding: Array) -> Array:
+            size = jnp.maximum(jnp.abs(start), jnp.abs(end))
+            tolerance = self.atol + self.rtol * size  # as diffrax's controller has it
             met = rounding > tolerance
             # In healthy equations the division is by a tolerance and has no effect.
             ratio = jnp.abs(error) / jnp.where(met, rounding, tolerance)
@@ -48,7 +49,8 @@ class _AboveRounding(Adaptive):
             return jnp.where(met, tolerance * doubtful, error)
 
         # The elements' own states come last; their rates do not lose accuracy.
-        motion = jax.tree.map(judged, error[:2], y0[:2], (of_delta, of_qd))
+        ends, noise = (y0[:2], y1_candidate[:2]), (of_delta, of_qd)
+        motion = jax.tree.map(judged, error[:2], *ends, noise)
         error = (*motion, *error[2:])
         return super().adapt_step_size(t0, t1, y0, y1_candidate, args, error, *rest)
 

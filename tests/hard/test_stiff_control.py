@@ -71,6 +71,14 @@ def test_the_gradient_in_reverse_mode():
         assert abs(gradient(jnp.log(kp)) - right) <= 1e-4 * abs(right)
 
 
+def test_an_unstable_step_is_not_taken_for_rounding():
+    """The first steps end at 1e17 rad/s, of which rounding errors are large too."""
+    kp = 1e7
+    controller = fj.PDController(kp, 2 * np.sqrt(kp), np.inf, TARGET)
+    motion = fj.simulate(arm(), START, [0, 2e-3], (controller,))
+    assert np.abs(motion.q).max() < 1 and np.abs(motion.qd).max() < 1e4
+
+
 def test_creep_under_heavy_damping():
     """Velocities die at rates of 1e6 to 1e8 per second.
 
