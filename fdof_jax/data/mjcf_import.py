@@ -110,9 +110,8 @@ def _names(model: Any) -> list[str]:
 
 def _plane(model: Any, data: Any) -> tuple[np.ndarray, np.ndarray, float]:
     """Unit vectors to the right and upwards, and gravity [m/s^2]."""
-    normal = data.xaxis[
-        np.flatnonzero(model.jnt_type == _HINGE)[0]
-    ]  # of the first hinge
+    first_hinge = np.flatnonzero(model.jnt_type == _HINGE)[0]
+    normal = data.xaxis[first_hinge]
     gravity = np.array(model.opt.gravity)
     within = gravity - (gravity @ normal) * normal
     size = np.linalg.norm(within)
