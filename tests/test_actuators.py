@@ -4,7 +4,6 @@ import jax
 import mujoco
 import numpy as np
 import pytest
-from elements import SHORT
 from helpers import random_linkage
 
 import fdof_jax as fj
@@ -185,14 +184,3 @@ def test_the_conditioning_sees_the_armature():
     assert (
         fj.analysis.inertia_ratios(linkage, q, (fj.forces.Armature(1e9),)).min() > 0.9
     )
-
-
-@pytest.mark.slow
-def test_a_scene_with_them_is_batched_like_any_other():
-    linkage, q, qd = motion("RPR")
-    many = fj.State(q + np.linspace(-0.1, 0.1, 5)[:, None], qd)
-    ts, forces = [0, 0.2], (ACTUATOR, ARMATURE)
-    swept = fj.sweep(linkage, many, ts, forces, **SHORT)
-    for member, q0 in enumerate(many.q):
-        alone = fj.simulate(linkage, fj.State(q0, qd), ts, forces, **SHORT)
-        np.testing.assert_allclose(swept.q[member], alone.q, atol=1e-9)

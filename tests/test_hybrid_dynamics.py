@@ -188,13 +188,16 @@ def test_gradients_equal_differences(mode):
 
 @pytest.mark.slow
 def test_topologies_are_batched():
+    """A rotor's inertia beside them takes the batch through the looped solver."""
     members = [swinging(topology, 2) for topology in fj.TOPOLOGIES]
+    rotor = (fj.forces.Armature(np.array([0.3, 0.2, 0.1])),)
     stack = lambda trees: jax.tree.map(lambda *a: jnp.stack(a), *trees)
     linkages, starts, forces = map(stack, zip(*members))
     ts = [0, 0.3]
-    swept = fj.sweep(linkages, starts, ts, forces, forces_axes=0, **SHORT)
+    axes = (*(0 for _ in forces), None)
+    swept = fj.sweep(linkages, starts, ts, forces + rotor, forces_axes=axes, **SHORT)
     for k, (linkage, start, forces) in enumerate(members):
-        alone = fj.simulate(linkage, start, ts, forces, **SHORT)
+        alone = fj.simulate(linkage, start, ts, forces + rotor, **SHORT)
         np.testing.assert_allclose(swept.q[k], alone.q, atol=1e-9)
 
 

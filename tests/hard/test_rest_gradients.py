@@ -32,13 +32,9 @@ def test_the_gradient_is_that_of_linear_theory(mode):
     assert error <= 1e-6 * np.abs(exact).max()
 
 
-@pytest.mark.parametrize("steps", ["scaled", "own"])
-def test_other_tolerances_do_not_make_it_wrong(steps):
+def test_other_tolerances_do_not_make_it_wrong():
     """Only an explicit longest step, `dtmax`, is left unchanged."""
-    controller = {
-        "scaled": fj.scale_tolerances(arm()),
-        "own": diffrax.PIDController(rtol=1e-8, atol=1e-8),
-    }[steps]
+    controller = diffrax.PIDController(rtol=1e-8, atol=1e-8)
 
     def end(q0):
         return fj.simulate(
@@ -56,15 +52,15 @@ def test_the_arm_stays():
     assert np.abs(final(HANGING) - HANGING).max() < 1e-12
 
 
-@pytest.mark.parametrize("solver", [diffrax.Dopri8(), diffrax.Kvaerno5()])
-def test_another_solver_does_not_make_it_wrong(solver):
-    """An implicit solver would cross the 10 s in a few steps, with a wrong gradient."""
+def test_an_implicit_solver_does_not_make_it_wrong():
+    """It would cross the 10 s in a few steps, with a wrong gradient."""
 
     def end(q0):
         adjoint = diffrax.ForwardMode()
         return fj.simulate(
-            arm(), fj.State(q0, STILL), [0, END], solver=solver, adjoint=adjoint
-        ).q[-1]
+            arm(), fj.State(q0, STILL), [0, END],
+            solver=diffrax.Kvaerno5(), adjoint=adjoint,
+        ).q[-1]  # fmt: skip
 
     exact = linear_motion(END)
     error = np.abs(jax.jit(jax.jacfwd(end))(HANGING) - exact).max()

@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from modes import ADJOINT
 
 import fdof_jax as fj
 from fdof_jax.analysis.tracking import saturated
@@ -37,25 +36,22 @@ def test_the_derivative_at_the_limit_is_that_of_one_side():
     assert (share == 1).all() or (share == 0).all()
 
 
-def end(log_kp, limit, reference, adjoint):
+def end(log_kp, limit, reference):
     """Returns the sum of joint positions after 0.2 s, and the share at the limit."""
     controller = fj.PDController(KP * jnp.exp(log_kp), 0.0, limit, reference)
     ts = np.linspace(0, 0.2, 11)
+    adjoint = diffrax.ForwardMode()
     solution = fj.simulate(arm(), START, ts, (controller,), adjoint=adjoint)
     share = jnp.mean(saturated(controller, arm(), solution), axis=0)
     return jnp.sum(solution.q[-1]), share
 
 
-@pytest.mark.parametrize("mode", ["forward", "reverse"])
-def test_gradients_at_and_beyond_saturation(mode):
-    """The derivative jumps at the start, or is 0 because gains change nothing."""
-    if mode == "forward":
-        adjoint, derive = diffrax.ForwardMode(), jax.jacfwd
-    else:
-        adjoint, derive = ADJOINT, jax.jacrev
-    gradient = jax.jit(
-        derive(lambda *arguments: end(*arguments, adjoint), has_aux=True)
-    )
+def test_gradients_at_and_beyond_saturation():
+    """The derivative jumps at the start, or is 0 because gains change nothing.
+
+    For reverse mode see tests/test_gradients.py.
+    """
+    gradient = jax.jit(jax.jacfwd(end, has_aux=True))
     # The reference demands exactly the efforts that gravity needs, so the arm rests at
     # its limits.
     load = fj.inverse_dynamics(arm(), START.q, STILL, STILL)
