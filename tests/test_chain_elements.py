@@ -187,7 +187,7 @@ def test_bearings_carry_the_weight_at_rest_and_change_the_momentum(case):
 
 
 def test_prescribed_joints_follow_their_reference(case):
-    chain, q, n = case.chain, case.q, len(case.q)
+    chain, q = case.chain, case.q
     move = fj.references.JointMove(
         q, q + 1, fj.references.Travel(1.0, profile="harmonic")
     )

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from elements import SHORT
 from modes import ADJOINT
+from test_gradient_quality import POINTS, tangents
 
 import fdof_jax as fj
 from fdof_jax import scenes
@@ -112,6 +113,20 @@ def test_forward_reverse_and_differences_agree(kind):
     assert np.abs(tangents - np.array(differences)).max() <= 1e-6 * scale
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("point", POINTS)
+def test_both_modes_are_the_tangents_that_tuning_follows(point):
+    scene = jax.tree.map(jnp.asarray, POINTS[point])
+    problem = scene.linkage, scene.state0, scene.forces[0], TS, STEPS["adaptive"]
+    *_, gradient = tangents(scene, 1e-11, TS)
+    wanted = gradient / 2  # the loss is a mean over both coordinates too
+    (slopes, _), _ = forward(problem, jnp.zeros(12))
+    gradient = reverse(problem, jnp.zeros(12), jnp.array([1.0, 0.0]))
+    near = (1e-5 if point == "saturated" else 1e-6) * np.linalg.norm(wanted)
+    assert np.linalg.norm(slopes[:6] - wanted) < near
+    assert np.linalg.norm(gradient[:6] - wanted) < near
+
+
 def test_both_modes_of_a_damped_arm_equal_differences():
     """Uses fixed steps; derivatives in masses, damping and start."""
     arm, (damper,) = scenes.fig3().linkage, scenes.fig3().forces
@@ -150,6 +165,21 @@ def test_gradients_at_rest_and_at_zero_error_are_finite():
     problem = linkage, fj.State(q, ZERO), controller, ts, steps(1e-11)
     gradient = reverse(problem, jnp.zeros(12), jnp.array([0.0, 1.0]))
     assert np.isfinite(gradient).all() and gradient.any()
+
+
+@pytest.mark.slow
+def test_gradients_at_and_beyond_a_limit_are_finite_and_zero():
+    """The efforts are their limits at the start, or everywhere."""
+    linkage, start, (controller,), _ = jax.tree.map(jnp.asarray, scenes.fig7())
+    demand = jnp.abs(controller.demand(0.0, *start, linkage))
+    slopes = {}
+    for name, limit in (("at", demand), ("beyond", np.full(3, 1e-3))):
+        limited = eqx.tree_at(lambda c: c.limit, controller, limit)
+        problem = linkage, start, limited, np.linspace(0, 0.1, 21), steps(1e-11)
+        slopes[name] = reverse(problem, jnp.zeros(12), jnp.array([0.0, 1.0]))
+    assert np.isfinite(slopes["at"]).all()
+    of_gains, others = slopes["beyond"][:6], slopes["beyond"][6:]
+    assert not of_gains.any() and np.isfinite(others).all() and others.any()
 
 
 HANGING = jnp.array([-jnp.pi / 2, 0.0, 0.0])

@@ -142,6 +142,7 @@ def test_run_time_checks_of_an_own_element_stay(call):
 
 SCRIPT = """
 import json
+import diffrax
 import jax
 import numpy as np
 import equinox as eqx
@@ -159,11 +160,14 @@ arm, start, forces, _ = fj.scenes.fig7()
 more = eqx.tree_at(lambda pd: (pd.kp, pd.kd), pd, (pd.kp * 2, pd.kd * 2))
 heavy = eqx.tree_at(lambda arm: arm.mass, arm, arm.mass * 2)
 scenes = fj.tuning.circle_scenes().values()
+def steps(tolerance):
+    control = diffrax.PIDController(rtol=tolerance, atol=tolerance)
+    return dict(stepsize_controller=control)
 programs.clear()
 
-def compiled(linkage, state0, ts, forces):
+def compiled(linkage, state0, ts, forces, **options):
     before = len(programs)
-    motion = fj.simulate(linkage, state0, ts, forces)
+    motion = fj.simulate(linkage, state0, ts, forces, **options)
     assert motion.q.shape == (len(ts), 3) and motion.outcome == "successful"
     return programs[before:]
 
@@ -174,6 +178,8 @@ print(json.dumps({
     "durations": [compiled(arm, start, np.linspace(0, t1, 7), forces)
                   for t1 in (0.05, 0.2)],
     "gains": compiled(arm, start, np.linspace(0, 0.1, 5), (more,)),
+    "tolerances": [compiled(arm, start, [0, 0.1], forces, **options)
+                   for options in (dict(rtol=1e-8, atol=1e-9), steps(1e-7))],
     "masses": compiled(heavy, start, np.linspace(0, 0.1, 5), forces),
     "topologies": [compiled(scene.linkage, scene.state0, [0, 0.1], scene.forces)
                    for scene in scenes],
@@ -194,6 +200,7 @@ def test_new_numbers_compile_nothing():
         "times": [[]] * 5,
         "durations": [[]] * 2,
         "gains": [],
+        "tolerances": [[]] * 2,
         "masses": [],
         "topologies": [[]] * 7,
     }

@@ -1,5 +1,7 @@
 """Solves a motion: of one arm at a prompt, in a batch, with derivatives."""
 
+import dataclasses
+
 import diffrax
 import equinox as eqx
 import jax
@@ -7,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.flatten_util import ravel_pytree
+from numpy.typing import ArrayLike
 
 from ..checks import is_traced
 from ..forces.added_inertia import inertial
@@ -14,6 +17,8 @@ from ..forces.element import Element, ForeignElement
 from .integrate import integrate
 from .prescribed import prescribed
 from .solution import Solution
+from .step_wrappers import with_pid
+from .steps import default_controller
 from .unrolled_dopri8 import UnrolledDopri8
 
 # All plain calls with at most this many output times share one program.
@@ -48,7 +53,7 @@ def _solve_one(inputs, keywords) -> tuple[Solution, bool] | None:
     size = max(_FEWEST_TIMES, 1 << (count - 1).bit_length())
     filled = np.pad(times, (0, size - count), mode="edge")
     padded = linkage, state0, filled, own0, forces
-    solution, succeeded = _solve_padded(padded, keywords)
+    solution, succeeded = _solve_padded(padded, _of_any_tolerance(keywords))
     if is_traced(solution):
         return None
 
@@ -59,6 +64,24 @@ def _solve_one(inputs, keywords) -> tuple[Solution, bool] | None:
     q, qd, own = cut(solution.q), cut(solution.qd), jax.tree.map(cut, solution.own)
     whole = Solution(ts, q, qd, solution.stats, solution.result, own)
     return whole, bool(succeeded)
+
+
+def _of_any_tolerance(keywords):
+    """Returns the keywords with tolerances as arrays, which programs do not contain."""
+    controller = keywords["stepsize_controller"]
+    if controller is None:
+        if keywords["solver"] is not None:
+            return keywords  # which default it gets depends on the solver
+        controller = default_controller()
+
+    def array(tolerance: ArrayLike) -> Array:
+        return jax.device_put(np.asarray(tolerance, jnp.result_type(float)))
+
+    def opened(pid: diffrax.PIDController) -> diffrax.PIDController:
+        rtol, atol = map(array, (pid.rtol, pid.atol))
+        return dataclasses.replace(pid, rtol=rtol, atol=atol)
+
+    return keywords | {"stepsize_controller": with_pid(opened, controller)}
 
 
 @eqx.filter_jit

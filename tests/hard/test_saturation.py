@@ -8,7 +8,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
 import fdof_jax as fj
 from fdof_jax.analysis.tracking import saturated
