@@ -90,6 +90,7 @@ def test_energy_stays(name):
 
 @pytest.mark.slow
 def test_gradients_of_a_motion_equal_differences():
+    """In reverse mode, with elements in arrays, with inertia and with a state."""
     topology, n = "PRFR", 4
     rng = np.random.default_rng(n)
     chain = chains.random_chain(topology, rng)
@@ -97,22 +98,23 @@ def test_gradients_of_a_motion_equal_differences():
     ends = fj.Point(0, 3.0, -2.0), fj.Point(n, 0.3, 0.1)
 
     def value(arguments):
-        chain, q, qd, damping, stiffness, rest_length = arguments
+        chain, q, qd, damping, stiffness, rest_length, rotors, lag, effort = arguments
         spring = fj.SpringDamper(
             *ends, stiffness=stiffness, damping=0.5, rest_length=rest_length
         )
-        motion = fj.simulate(
-            chain,
-            fj.State(q, qd),
-            [0, 0.1],
-            (fj.JointDamper(damping), spring),
-            adjoint=ADJOINT,
-            **SHORT,
+        forces = (
+            fj.JointDamper(damping),
+            spring,
+            fj.forces.Armature(rotors),
+            fj.control.FirstOrderLag(fj.JointEffort(effort), lag),
         )
+        start = fj.State(q, qd)
+        motion = fj.simulate(chain, start, [0, 0.1], forces, adjoint=ADJOINT, **SHORT)
         return jnp.sum(weights * jnp.stack([motion.q[-1], motion.qd[-1]]))
 
     q, qd = rng.normal(size=(2, n))
-    numbers = chain, q, qd, rng.uniform(0.1, 1, n), 20.0, 0.4
+    damping, rotors, effort = rng.uniform(0.1, 1, (3, n))
+    numbers = chain, q, qd, damping, 20.0, 0.4, rotors, 0.05, effort
     arguments = jax.tree.map(jnp.asarray, numbers)
     direction = jax.tree.map(lambda a: jnp.asarray(rng.normal(size=a.shape)), arguments)
     direction = eqx.tree_at(lambda d: d[0].ef, direction, jnp.zeros(2 * n))

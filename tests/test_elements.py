@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from modes import ADJOINT
 from test_costs import flops
 
 import fdof_jax as fj
@@ -146,7 +145,8 @@ def test_gradients_of_a_motion_equal_differences():
 def test_reverse_mode_at_an_instant_equals_differences(kinds):
     """In all parameters, positions, velocities and own states, of what is integrated.
 
-    The reverse mode of a motion consists of these derivatives: see the next test.
+    The reverse mode of a motion consists of these derivatives: see
+    test_chain_motions.py.
     """
     forces = tuple(elements.ALL[kind] for kind in kinds)
     labels = names(forces)
@@ -177,27 +177,6 @@ def test_reverse_mode_at_an_instant_equals_differences(kinds):
     # All parameters act except those that a limit disables.
     idle = {n for n, s in zip(labels, size) if s < 1e-6}
     assert idle <= IDLE, idle - IDLE
-
-
-@pytest.mark.slow
-def test_reverse_mode_of_a_motion_equals_differences():
-    """Covers elements in scalars, in arrays, with a state and with inertia."""
-    kinds = ("PD", "spring", "lag", "armature")
-    forces = tuple(elements.ALL[kind] for kind in kinds)
-    ones, h = jnp.ones(len(names(forces))), 1e-5
-    weights = jnp.array([1.0, -2.0, 3.0, 0.5, -0.7, 0.3])
-    motion = lambda p: weights @ state_of(end(ARM, scaled(forces, p), ADJOINT))
-    both = jax.jit(jax.value_and_grad(motion))
-    value = lambda p: float(both(p)[0])
-    _, slope = both(ones)
-    differences = np.array(
-        [
-            (value(ones + h * e) - value(ones - h * e)) / (2 * h)
-            for e in np.eye(len(ones))
-        ]
-    )
-    assert (np.abs(differences) > 1e-6).all()
-    np.testing.assert_allclose(slope, differences, rtol=1e-6, atol=1e-8)
 
 
 def test_one_program_for_all_topologies():
@@ -269,32 +248,34 @@ def field_flops(*forces):
     return flops(field, t, y, args)
 
 
-BARE = field_flops()
+@pytest.fixture(scope="module")
+def bare():
+    return field_flops()
 
 
 @pytest.mark.parametrize("name", elements.PLAIN)
-def test_a_plain_element_costs_its_own(name):
+def test_a_plain_element_costs_its_own(name, bare):
     element = elements.PLAIN[name]
     own = flops(lambda e, *a: e(*a), element, jnp.array(0.1), *elements.START, ARM)
-    assert 0 <= field_flops(element) - BARE <= own + 6
+    assert 0 <= field_flops(element) - bare <= own + 6
 
 
 @pytest.mark.parametrize("name", elements.WITH_STATE)
-def test_an_element_with_state_costs_its_own(name):
+def test_an_element_with_state_costs_its_own(name, bare):
     element = elements.WITH_STATE[name]
     state = element.initial_state(ARM)
     own = flops(
         lambda e, *a: e(*a), element, jnp.array(0.1), *elements.START, ARM, state
     )
-    assert 0 < field_flops(element) - BARE <= own + 6
+    assert 0 < field_flops(element) - bare <= own + 6
 
 
 @pytest.mark.parametrize("name", elements.WITH_INERTIA)
-def test_an_element_with_inertia_costs_its_own(name):
+def test_an_element_with_inertia_costs_its_own(name, bare):
     """Adding to the entries of the mass matrix costs six sums more."""
     element = elements.WITH_INERTIA[name]
     own = flops(lambda e, *a: e(*a), element, jnp.array(0.1), *elements.START, ARM)
     own += flops(
         lambda arm, e, *a: added_inertia(arm, (e,), *a), ARM, element, *elements.START
     )
-    assert 0 < field_flops(element) - BARE <= own + 15
+    assert 0 < field_flops(element) - bare <= own + 15

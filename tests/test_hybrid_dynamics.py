@@ -1,6 +1,5 @@
 """Prescribed motion: closed forms, balances, jumps of the velocity, residual swings."""
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -156,34 +155,23 @@ def test_starts_beside_the_reference_and_singular_equations_are_told():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("mode", ["forward", "reverse"])
-def test_gradients_equal_differences(mode):
+def test_gradients_equal_differences():
     linkage, start, (motion, *others) = swinging("RPR", 1)
+    weights = np.array([1.0, -2.0, 0.5])
 
-    def end(p, adjoint):
+    @jax.jit
+    @jax.value_and_grad
+    def both(p):
         reference = Swing(jnp.array([0.3, 0.2, 0.4]) * p[0])
         q, qd = reference(0.0, linkage)
         state0 = fj.State(jnp.where(motion.of(linkage), q, start.q), start.qd)
         forces = fj.PrescribedMotion(1, reference), fj.JointDamper(p[1])
-        return fj.simulate(linkage, state0, [0, 0.5], forces, adjoint=adjoint).q[-1]
+        return weights @ fj.simulate(linkage, state0, [0, 0.5], forces).q[-1]
 
     p = jnp.array([1.0, 0.5])
-    adjoint, derivative = {
-        "forward": (diffrax.ForwardMode(), jax.jacfwd),
-        "reverse": (diffrax.RecursiveCheckpointAdjoint(), jax.jacrev),
-    }[mode]
-
-    @jax.jit
-    @lambda f: derivative(f, has_aux=True)
-    def both(p):
-        q = end(p, adjoint)
-        return q, q
-
-    slope, _ = both(p)
-    columns = [(both(p + h)[1] - both(p - h)[1]) / 2e-4 for h in 1e-4 * np.eye(2)]
-    np.testing.assert_allclose(
-        slope, np.stack(columns, axis=1), atol=1e-6 * np.abs(slope).max()
-    )
+    _, slope = both(p)
+    wanted = [(both(p + h)[0] - both(p - h)[0]) / 2e-4 for h in 1e-4 * np.eye(2)]
+    np.testing.assert_allclose(slope, wanted, atol=1e-6 * np.abs(slope).max())
 
 
 @pytest.mark.slow

@@ -2,10 +2,8 @@
 
 from pathlib import Path
 
-import nbformat
 import pytest
 from helpers import programs
-from nbclient import NotebookClient
 
 FOLDER = Path(__file__).parents[1] / "notebooks"
 INSTALL = '%pip install -q -e "..[notebook]"'
@@ -15,6 +13,13 @@ LARGEST = 1_000_000  # bytes of a notebook
 each_notebook = pytest.mark.parametrize(
     "path", sorted(FOLDER.glob("*.ipynb")), ids=lambda path: path.stem
 )
+
+
+def read(path):
+    # Here, as the import takes seconds in every process that collects tests.
+    import nbformat
+
+    return nbformat.read(path, as_version=4)
 
 
 def code_cells(notebook):
@@ -49,8 +54,7 @@ def test_there_are_notebooks():
 
 @each_notebook
 def test_cells_are_short_and_begin_with_the_install_line(path):
-    notebook = nbformat.read(path, as_version=4)
-    nbformat.validate(notebook)
+    notebook = read(path)  # warns if it is not valid
     for cell in notebook.cells:
         assert cell.source.count("\n") < LONGEST, cell.source
     install, *others = (cell for cell in notebook.cells if cell.cell_type == "code")
@@ -63,7 +67,7 @@ def test_cells_are_short_and_begin_with_the_install_line(path):
 @each_notebook
 def test_committed_outputs_are_there_clean_and_small(path):
     assert path.stat().st_size <= LARGEST
-    notebook = nbformat.read(path, as_version=4)
+    notebook = read(path)
     counts = [cell.execution_count for cell in code_cells(notebook)]
     assert counts == list(range(1, len(counts) + 1))  # one run from top to bottom
     assert pictures(notebook) >= 1
@@ -78,9 +82,11 @@ def test_the_table_of_notebooks_lists_it(path):
 @pytest.mark.slow
 @each_notebook
 def test_it_runs(path, monkeypatch):
+    from nbclient import NotebookClient
+
     for name, value in programs().items():
         monkeypatch.setenv(name, value)
-    notebook = nbformat.read(path, as_version=4)
+    notebook = read(path)
     committed = pictures(notebook)
     client = NotebookClient(
         notebook,

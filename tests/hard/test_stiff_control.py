@@ -27,20 +27,24 @@ IMPLICIT = dict(
 )
 
 
-def held(log_kp, adjoint):
-    """Returns the motion under kp and kd = 2 sqrt(kp)."""
-    kp = jnp.exp(log_kp)
-    controller = fj.PDController(kp, 2 * jnp.sqrt(kp), jnp.inf, TARGET)
+def moved(factor, kp, damping, adjoint):
+    """Returns the motion under factor * kp, its critical kd, and factor * damping."""
+    kp, damping = factor * kp, factor * damping
+    forces = (
+        fj.PDController(kp, 2 * jnp.sqrt(kp), jnp.inf, TARGET),
+        fj.JointDamper(damping),
+    )
     ts = np.linspace(0, 1, 11)
-    solution = fj.simulate(arm(), START, ts, (controller,), adjoint=adjoint, **IMPLICIT)
-    return solution.q[1:], solution
+    solution = fj.simulate(arm(), START, ts, forces, adjoint=adjoint, **IMPLICIT)
+    return (solution.q[1:], solution.qd[1:]), solution
 
 
 @jax.jit
-def motion_and_derivative(kp):
-    adjoint = diffrax.ForwardMode()
-    slope, solution = jax.jacfwd(held, has_aux=True)(jnp.log(kp), adjoint)
-    return solution, slope
+def motion_and_derivative(kp, damping):
+    """Returns a motion and its derivatives in the logarithm of the factor."""
+    derivative = jax.jacfwd(moved, has_aux=True)
+    slopes, solution = derivative(1.0, kp, damping, diffrax.ForwardMode())
+    return solution, slopes
 
 
 def test_stiffness_does_not_cost_steps_or_accuracy():
@@ -48,7 +52,7 @@ def test_stiffness_does_not_cost_steps_or_accuracy():
     steps = []
     for kp in STIFFNESSES:
         exact = DRIVEN[f"stiff-{kp:.0e}"]
-        solution, slope = motion_and_derivative(kp)
+        solution, (slope, _) = motion_and_derivative(kp, 0.0)
         assert solution.outcome == "successful"
         assert np.abs(solution.q[1:] - np.array(exact["q"])).max() <= 1e-6
         right = np.array(exact["dq_dlogkp"])
@@ -63,12 +67,13 @@ def test_the_gradient_in_reverse_mode():
 
     @jax.jit
     @jax.grad
-    def gradient(log_kp):
-        return jnp.sum(held(log_kp, ADJOINT)[0])
+    def gradient(factor, kp):
+        (q, _), _ = moved(factor, kp, 0.0, ADJOINT)
+        return jnp.sum(q)
 
     for kp in STIFFNESSES:
         right = np.sum(DRIVEN[f"stiff-{kp:.0e}"]["dq_dlogkp"])
-        assert abs(gradient(jnp.log(kp)) - right) <= 1e-4 * abs(right)
+        assert abs(gradient(1.0, kp) - right) <= 1e-4 * abs(right)
 
 
 def test_an_unstable_step_is_not_taken_for_rounding():
@@ -85,24 +90,8 @@ def test_creep_under_heavy_damping():
     The balance of damping and gravity remains, 1e-5 rad/s.
     """
     damping = 1e6
-
-    @jax.jit
-    def motion(log_damping):
-        def end(log_damping):
-            solution = fj.simulate(
-                arm(),
-                START,
-                np.linspace(0, 1, 11),
-                (fj.JointDamper(jnp.exp(log_damping)),),
-                adjoint=diffrax.ForwardMode(),
-                **IMPLICIT,
-            )
-            return solution.qd[1:], solution
-
-        slope, solution = jax.jacfwd(end, has_aux=True)(log_damping)
-        return solution, slope
-
-    solution, slope = motion(jnp.log(damping))
+    # A gain of 0, and its critical damping, have no derivative.
+    solution, (_, slope) = motion_and_derivative(1e-300, damping)
     assert solution.outcome == "successful"
     assert solution.stats["num_steps"] <= 1000
     usual = oracle.Arm("RRR", **USUAL, locked=(0,) * 3, base_angle=0, gravity=9.81)
