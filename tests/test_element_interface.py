@@ -105,7 +105,7 @@ class Unequal(fj.forces.InertialElement):
 def test_weights_are_as_many_as_coordinates():
     q = jnp.zeros(3)
     for call in (fj.forward_dynamics, lambda *row: fj.energy(*row[:3], row[4])):
-        with pytest.raises(ValueError, match="^Unequal: .*as many weights .*3,.*2,"):
+        with pytest.raises(ValueError, match=r"^Unequal: .*one shape .*\(2,\).*\(3,\)"):
             call(ARM, q, q, q, (Unequal(),))
 
 

@@ -1,4 +1,4 @@
-"""Joint control of the third example (Fig 7): saturated PD."""
+"""PD control of the joints with limited efforts, as in the third example (Fig 7)."""
 
 from typing import Any, ClassVar
 

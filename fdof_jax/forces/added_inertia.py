@@ -48,8 +48,9 @@ def _weights(element: InertialElement, linkage: Linkage, coordinates: Array) -> 
     weights = jnp.asarray(element.weights(linkage))
     if weights.shape != coordinates.shape or weights.ndim != 1:
         raise ValueError(
-            f"{type(element).__name__}: expected as many weights as coordinates, got "
-            f"shapes {weights.shape} and {coordinates.shape}."
+            f"{type(element).__name__}: expected coordinates and weights of one shape "
+            f"(number,), got coordinates of shape {coordinates.shape} and weights of "
+            f"shape {weights.shape}."
         )
     return weights
 
