@@ -178,13 +178,18 @@ def step_time(points: list[dict]) -> float | None:
     return tightest["time_median"] / count if count else None
 
 
-def _cells(points: list[dict]) -> list[str]:
+def compile_time(points: list[dict]) -> float | None:
+    """Returns the longest time to compile [s]; infinity if it was given up."""
     compiled = [p["compile_time"] for p in points if p["times"]]
-    per_step = step_time(points)
+    return np.inf if None in compiled else max(compiled, default=None)
+
+
+def _cells(points: list[dict]) -> list[str]:
+    per_step, compiled = step_time(points), compile_time(points)
     return [
         number(speed(points)),
         number(per_step and 1e6 * per_step),
-        f"> {ENDLESS:g}" if None in compiled else number(max(compiled, default=None)),
+        f"> {ENDLESS:g}" if compiled == np.inf else number(compiled),
     ]
 
 

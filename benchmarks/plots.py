@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.ticker import NullFormatter
 
-from .joints import speed
+from .joints import compile_time, speed, step_time
 from .measure import OUTCOMES, times_at
 
 # Okabe and Ito's colours suit all colour vision; markers differ as well.
@@ -129,20 +129,37 @@ def batches(points: list[dict], path: Path) -> None:
 
 
 def joints(points: list[dict], path: Path) -> None:
-    """Draws the time of a simulated second against the number of joints."""
+    """Draws times and operations against the number of joints."""
     points = [p for p in points if p["status"] != "skipped"]
-    figure, axes = _axes(2)
-    for axis, batch in zip(axes, dict.fromkeys(p["batch"] for p in points)):
-        for index, solver in enumerate(_solvers(points)):
-            mine = [p for p in points if (p["solver"], p["batch"]) == (solver, batch)]
-            numbers = list(dict.fromkeys(p["joints"] for p in mine))
-            speeds = [speed([p for p in mine if p["joints"] == n]) for n in numbers]
-            times = [np.nan if s is None else 1e6 / s for s in speeds]
-            axis.semilogy(numbers, times, label=solver, **_style(solver, index))
-        axis.set_title(f"batch of {batch}" if batch > 1 else "one chain", fontsize=9)
-        axis.set_xlabel("joints")
+    figure = Figure(figsize=(WIDTH, 5.2), layout="constrained")
+    axes = figure.subplots(2, 2, sharex=True).ravel()
+    quantities = {
+        "time per simulated s at 1e-8 [µs]": lambda own: 1e6 / (speed(own) or np.nan),
+        "time per step of a member [µs]": lambda own: 1e6 * (step_time(own) or np.nan),
+        "time to compile [s]": lambda own: compile_time(own) or np.nan,
+        "operations of the equations [flop]": lambda own: own[0]["flops"],
+    }
+    curves = [(p["solver"], p["batch"]) for p in points]
+    for axis, (label, quantity) in zip(axes, quantities.items()):
+        for solver, batch in dict.fromkeys(curves):
+            if "compile" in label and solver.startswith("MuJoCo"):
+                continue  # nothing is compiled
+            if "flop" in label and (batch > 1 or solver != "fdof_jax"):
+                continue  # the same in a batch; others are not counted
+            by_number = {}
+            for point in points:
+                if (point["solver"], point["batch"]) == (solver, batch):
+                    by_number.setdefault(point["joints"], []).append(point)
+            heights = [quantity(own) for own in by_number.values()]
+            style = _style(solver, 0) | ({"linestyle": "--"} if batch == 1 else {})
+            name = solver + (", one chain" if batch == 1 else f", batch of {batch}")
+            axis.plot(list(by_number), heights, label=name, **style)
+        axis.set_yscale("linear" if "flop" in label else "log")
+        axis.set_ylabel(label, fontsize=8)
+        axis.tick_params(labelsize=7)
         axis.grid(alpha=0.3)
-    axes[0].set_ylabel("time per simulated s [µs]")
+    for axis in axes[2:]:
+        axis.set_xlabel("joints", fontsize=8)
     _save(figure, path)
 
 
