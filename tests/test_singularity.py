@@ -77,19 +77,33 @@ def test_a_single_point_mass_cannot_load_three_joints(topology):
         (
             "RRR",
             dict(mass=[0, 1, 1], inertia=[0, 1, 1]),
-            "link 1 .* may be singular",
+            "link 1: .* may be singular",
         ),
         (
             "RRR",
             dict(com=[[1, 0], [0, 0], [1, 0]], inertia=[1, 0, 1]),
-            "link 2 .* may be singular",
+            "link 2: .* may be singular",
         ),
-        ("PRR", dict(mass=[0, 1, 1]), "link 1 .* may be singular"),
-        ("RPR", dict(mass=[1, 0, 1]), "link 2 .* may be singular"),
+        ("PRR", dict(mass=[0, 1, 1]), "link 1: .* may be singular"),
+        ("RPR", dict(mass=[1, 0, 1]), "link 2: .* may be singular"),
         ("RRR", dict(length=[1, 0, 1, 1], locked=0), "joints 1 and 2 coincide"),
         ("PRR", dict(length=[1, 1, 0, 1], locked=0), "joints 2 and 3 coincide"),
         ("PPR", dict(locked=[0, 0.2, 0.3]), "joints 1 and 2 are parallel"),
         ("RPP", dict(locked=[0.1, np.pi, 0.3]), "joints 2 and 3 are parallel"),
+        # Rigid bodies of two links.
+        (
+            "RFR",
+            dict(mass=[0, 0, 1], inertia=[0, 0, 1]),
+            "links 1 to 2: .* may be singular",
+        ),
+        (  # The mass is at joint 1 but for rounding.
+            "RFR",
+            dict(length=[1, 2, 3, 1], locked=[0, np.pi, 0], inertia=[0, 0, 1])
+            | dict(mass=[0, 1, 1], com=[[1, 0], [2, 0], [1, 0]]),
+            "links 1 to 2: .* may be singular",
+        ),
+        ("RFR", dict(length=[1, 2, 2, 1], locked=[0, np.pi, 0]), "1 and 3 coincide"),
+        ("PFP", dict(locked=[0.3, np.pi - 0.3, 0]), "joints 1 and 3 are parallel"),
     ],
 )
 def test_delicate_linkages_warn_once_at_the_caller(topology, changes, message):
@@ -111,6 +125,9 @@ def test_delicate_linkages_warn_once_at_the_caller(topology, changes, message):
         ("RRR", dict(length=[0, 0, 1, 1])),  # the locked slide keeps the joints apart
         ("RPR", dict(length=[0, 0, 0, 0])),  # no two revolute joints in sequence
         ("PRP", dict(locked=0)),  # nor two prismatic ones
+        ("RFR", dict(mass=[0, 1, 1], inertia=[0, 0, 1])),  # the fixed link carries
+        ("RFR", dict(length=[1, 0, 1, 1], locked=0)),  # and keeps the joints apart
+        ("FRP", dict(mass=[0, 1, 1], inertia=[0, 0, 0])),  # a part of the ground
         ("RRR", dict(mass=[1e3, 1, 1e-3], inertia=[1e-9] * 3, gravity=-9.81)),
     ],
 )

@@ -57,7 +57,7 @@ def from_mjcf(text: str) -> tuple[Linkage, Forces]:
     on_last = tip >= 0 and model.site_bodyid[tip] == model.jnt_bodyid[-1]
     end = plane(data.site_xpos[tip]) if on_last else links[-1].start
     with warnings.catch_warnings():  # of links without mass, which MuJoCo does not have
-        warnings.filterwarnings("ignore", ".*carries no inertia of its own")
+        warnings.filterwarnings("ignore", ".*moves no inertia of link")
         linkage = _linkage(links, end, gravity)
     found = (JointDamper, model.dof_damping), (Armature, model.dof_armature)
     return linkage, tuple(kind(values) for kind, values in found if values.any())

@@ -61,34 +61,45 @@ def check_singularity(linkage: "Linkage") -> None:
                 f"move some inertia of link {k + 1} or of the links beyond it, got "
                 "none in any configuration: its acceleration is undetermined."
             )
-    mass, inertia = np.asarray(linkage.mass), np.asarray(linkage.inertia)
-    own = np.where(
-        revolute, inertia + mass * (np.asarray(linkage.com) ** 2).sum(axis=1), mass
-    )
-    locked, length = np.asarray(linkage.locked), np.asarray(linkage.length)
-    fixed = np.stack(fixed_pairs(np.asarray(linkage.ef)))
-    for k in np.flatnonzero((own == 0) & ~fixed):
-        warnings.warn(
-            f"link {k + 1} carries no inertia of its own about joint {k + 1}: "
-            "the mass matrix may be singular in some configurations.",
-            stacklevel=5,
-        )
-    prismatic = ~revolute & ~fixed
-    for k in range(1, len(names)):
-        if revolute[k - 1] and revolute[k] and np.hypot(length[k], locked[k]) == 0:
+    _warn(jax.tree.map(np.asarray, linkage), revolute)
+
+
+def _warn(linkage: "Linkage", revolute: np.ndarray) -> None:
+    """Warns of joints without inertia of their own and of redundant joints."""
+    mass, locked = linkage.mass, linkage.locked
+    eps, n = 8 * np.finfo(locked.dtype).eps, len(mass)
+    start, along, *_ = frames(linkage, np.zeros(n))
+    centre = start[1:] + linkage.com @ np.array([1, 1j]) * along[1:]
+    lengths = linkage.length, linkage.com, locked[revolute]
+    rounding = eps * sum(np.abs(length).sum() for length in lengths)
+    moving = np.flatnonzero(~np.stack(fixed_pairs(linkage.ef)))
+    # Joint k moves a rigid body: its link and those fixed to it, up to the next joint.
+    for k, following in zip(moving, [*moving[1:], n]):
+        body = slice(k, following)
+        arm = np.abs(centre - start[k + 1])
+        turning = linkage.inertia + mass * np.where(arm > rounding, arm, 0) ** 2
+        if (turning if revolute[k] else mass)[body].sum() == 0:
+            links = f"links {k + 1} to {following}"
+            if following == k + 1:
+                links = f"link {k + 1}"
             warnings.warn(
-                f"revolute joints {k} and {k + 1} coincide (link {k} has no "
-                "length, the paper's rule (i)): one of them is redundant for "
-                "positioning.",
-                stacklevel=5,
+                f"joint {k + 1} moves no inertia of {links}: the mass matrix may be "
+                "singular in some configurations.",
+                stacklevel=6,
             )
-        if (
-            prismatic[k - 1]
-            and prismatic[k]
-            and abs(np.sin(locked[k - 1])) < 8 * np.finfo(locked.dtype).eps
-        ):
+        if following == n or revolute[k] != revolute[following]:
+            continue
+        pair = f"joints {k + 1} and {following + 1}"
+        if revolute[k]:
+            if abs(start[following + 1] - start[k + 1]) <= rounding:
+                warnings.warn(
+                    f"revolute {pair} coincide (no distance between them, the paper's "
+                    "rule (i)): one of them is redundant for positioning.",
+                    stacklevel=6,
+                )
+        elif abs(np.sin(locked[body].sum())) < eps:
             warnings.warn(
-                f"prismatic joints {k} and {k + 1} are parallel (the paper's rule "
-                "(ii)): one of them is redundant for positioning.",
-                stacklevel=5,
+                f"prismatic {pair} are parallel (the paper's rule (ii)): one of them "
+                "is redundant for positioning.",
+                stacklevel=6,
             )

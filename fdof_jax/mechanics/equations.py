@@ -255,6 +255,6 @@ def equations(
     return Equations(mass, tuple(bias[::-1]))
 
 
-def zeros(q: Float[Array, " joint"]) -> Scalars:
+def zeros(q: Float[Array, " joint"] | Scalars) -> Scalars:
     """Returns zero displacements, rates or efforts in the dtype of `q`."""
     return (jnp.zeros_like(q[0]),) * len(q)

@@ -24,12 +24,9 @@ from .equations import (
     directions,
     equations,
     turns,
+    zeros,
 )
 from .solve import Matrix, divided, fused, minus, solver_of, times, with_added
-
-
-def _still(delta: Scalars) -> Scalars:
-    return (jnp.zeros_like(delta[0]),) * len(delta)
 
 
 def _rates(
@@ -73,7 +70,7 @@ def _losses(m: Equations, inverse: Scalars) -> Scalars:
 def _conditioning(
     reciprocal: Callable, c: Constants, delta: Scalars, added: Upper | None
 ) -> Scalars:
-    m = with_added(added, equations(c, delta, _still(delta)))
+    m = with_added(added, equations(c, delta, zeros(delta)))
     _, inverse_diagonal = solver_of(c, m, added, reciprocal)
     return _losses(m, inverse_diagonal())
 
@@ -101,7 +98,7 @@ def _directions_and_inverse(
 ) -> tuple[Directions, Matrix]:
     """Computes the links' directions and the columns of the inverse mass matrix."""
     turned = directions(c, delta)
-    m = with_added(added, equations(c, delta, _still(delta), turned))
+    m = with_added(added, equations(c, delta, zeros(delta), turned))
     solve, _ = solver_of(c, m, added, reciprocal)
     unit = jnp.eye(len(delta), dtype=delta[0].dtype)
     return turned, tuple(solve(tuple(row)) for row in unit)
@@ -261,6 +258,6 @@ def inertia_diagonals(
     c: Constants, delta: Scalars, added: Upper | None = None
 ) -> tuple[Scalars, Scalars]:
     """Diagonals of the mass matrix and its inverse, which is infinite if singular."""
-    m = with_added(added, equations(c, delta, _still(delta)))
+    m = with_added(added, equations(c, delta, zeros(delta)))
     _, inverse_diagonal = solver_of(c, m, added, divided)
     return tuple(row[0] for row in m.mass), inverse_diagonal()
