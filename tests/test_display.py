@@ -65,6 +65,22 @@ def test_a_linkage_shows_its_values():
     assert "ef=None" in repr(jax.tree.map(lambda _: None, arm))
 
 
+def test_elements_show_their_numbers():
+    task = fj.CircleTask()
+    pd = fj.PDController([9, 7, 5], 3, [4, 2, np.inf], task)
+    assert repr(pd) == (
+        f"PDController(kp=[9, 7, 5], kd=3, limit=[4, 2, inf], reference={task})"
+    )
+    assert "radius=0.75" in repr(task)
+    assert repr(fj.Point(2, 0.5)) == "Point(link=2, along=0.5, across=0)"
+    seen = []
+    jax.jit(lambda pd: seen.append(repr(pd)))(pd)
+    assert "kp=f64[3]" in seen[0]
+    batch = jax.tree.map(lambda a: jnp.stack([a] * 20), pd)
+    assert "kp=f64[20,3]" in repr(batch)
+    assert "kp=key<" in repr(eqx.tree_at(lambda pd: pd.kp, pd, jax.random.key(0)))
+
+
 def test_a_tuning_result_is_told_in_a_line_and_in_a_table(tuned):
     line = "TuneResult(RPR, loss 0.04 to 0.01, 1 of 6 gains at a bound, not converged)"
     assert repr(tuned) == line

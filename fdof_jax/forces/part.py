@@ -19,7 +19,7 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from ..checks import JOINT, concrete, function, instance, is_traced, real_array
-from ..linkage.linkage import Linkage, joints_of
+from ..linkage.linkage import Linkage, joints_of, short
 from ..xla.array_namespace import in_numpy, namespace
 
 
@@ -142,6 +142,11 @@ class Part(eqx.Module, metaclass=_Fields):
         parts = [part.possible() for _, part in _within(self)]
         return reduce(and_, [*own, *fields, *parts], True)
 
+    def __repr__(self) -> str:
+        """Shows values on one line; long and traced arrays by their shape."""
+        fields = (f"{name}={_shown(value)}" for name, value in vars(self).items())
+        return f"{type(self).__name__}({', '.join(fields)})"
+
     def __check_init__(self):
         for declared in dataclasses.fields(self):
             name, about = declared.name, declared.metadata
@@ -152,6 +157,15 @@ class Part(eqx.Module, metaclass=_Fields):
         for name, value, rules in _declared(self):
             object.__setattr__(self, name, real_array(name, value, **rules))
         _refuse("", in_numpy(self).conditions())
+
+
+def _shown(value: Any) -> str:
+    if not isinstance(value, jax.Array | np.ndarray):
+        return repr(value)
+    numbers = isinstance(value.dtype, np.dtype)  # not random keys
+    if numbers and value.size <= 12 and not is_traced(value):
+        return short(value)
+    return eqx.tree_pformat(value)
 
 
 def check_values(place: str, part: Part) -> None:

@@ -121,13 +121,13 @@ class Linkage(eqx.Module):
         if np.ndim(self.ef) != 1 or not known(self):
             return super().__repr__()
         topology = letters(self.ef)
-        values = {name: _short(value) for name, value in vars(self).items()}
+        values = {name: short(value) for name, value in vars(self).items()}
         del values["ef"]
         fields = (f"{name}={value}" for name, value in values.items())
         return f"Linkage({topology!r}, {', '.join(fields)})"
 
 
-def _short(value: Array) -> str:
+def short(value: Array | np.ndarray) -> str:
     """Formats the numbers on one line."""
     number: Any = {"float_kind": lambda value: f"{value:.6g}"}
     text = np.array2string(
