@@ -1,5 +1,7 @@
 """Chains read from MuJoCo's models accelerate as there."""
 
+import warnings
+
 import mujoco
 import numpy as np
 import pytest
@@ -44,6 +46,9 @@ def test_accelerations_and_tips_equal_mujoco(text):
     np.testing.assert_allclose(*apart, atol=1e-12)
 
 
+nonlinear = pytest.mark.skipif(
+    not hasattr(mujoco.MjModel, "dof_dampingpoly"), reason="MuJoCo is linear there"
+)
 BODY = '<body><joint axis="0 1 0"{}/><geom size=".1"/>{}</body>'
 
 
@@ -58,6 +63,19 @@ BODY = '<body><joint axis="0 1 0"{}/><geom size=".1"/>{}</body>'
         (BODY.format("", BODY.format("", "") * 2), "body 3 on a branch"),
         (BODY.format("", BODY.format("", "").replace("0 1 0", "0 0 1")), "of joint 1"),
         ('<body><joint type="slide"/><geom size=".1"/></body>', "no hinge"),
+        pytest.param(
+            BODY.format(' damping="1 2"', ""),
+            "joint 0 with nonlinear damping",
+            marks=nonlinear,
+        ),
+        pytest.param(
+            BODY.format(' stiffness="0 2"', ""),
+            "joint 0 with a spring",
+            marks=nonlinear,
+        ),
+        ('</worldbody><option density="1"/><worldbody>' + BODY, "a fluid .density"),
+        ('</worldbody><option viscosity="1"/><worldbody>' + BODY, "a fluid .viscos"),
+        (BODY.replace("<body", '<body gravcomp=".5"'), "body 1 with gravcomp"),
         ("<nothing/>", "a MuJoCo model"),
     ],
 )
@@ -65,5 +83,47 @@ def test_what_is_no_planar_chain_is_refused_by_name(inside, got):
     with pytest.raises(ValueError, match=f"^text: expected.*{got}"):
         fj.data.from_mjcf(
             "<mujoco><compiler autolimits='true'/><worldbody>"
-            f"{inside}</worldbody></mujoco>"
+            f"{inside.format('', '')}</worldbody></mujoco>"
         )
+
+
+@pytest.mark.parametrize(
+    "inside",
+    [
+        "",
+        '<contact><exclude body1="a" body2="c"/></contact>',
+        '<contact><pair geom1="of a" geom2="of b"/></contact>',
+        '<option><flag contact="disable"/></option>',
+        '<default><geom contype="0"/></default>',
+        '<default><geom conaffinity="2"/></default>',
+        '<default><geom contype="2" conaffinity="2"/></default>',
+        '<worldbody><geom size="9"/></worldbody>',
+        '<default><geom contype="0"/></default>'
+        '<worldbody><geom type="plane" size="9 9 9" contype="1"/></worldbody>',
+    ],
+)
+@pytest.mark.parametrize("welded", ["", "b"])
+def test_contacts_are_left_out_with_a_warning(inside, welded):
+    # All geoms overlap, so that MuJoCo reports the contacts that it lets happen.
+    body = '<body name="{0}">{1}<geom name="of {0}" size="5"/>{2}</body>'
+    hinge = '<joint axis="0 1 0"/>'
+    chain = ""
+    for name in "cba":
+        chain = body.format(name, "" if name == welded else hinge, chain)
+    text = f"<mujoco>{inside}<worldbody>{chain}</worldbody></mujoco>"
+    model = mujoco.MjModel.from_xml_string(text)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        fj.data.from_mjcf(text)
+    about = [w for w in caught if "contacts are left out" in str(w.message)]
+    assert len(about) == (data.ncon > 0)
+    assert all(w.filename == __file__ for w in about)
+
+
+def test_gravity_that_a_flag_disables_is_zero():
+    text = CART_POLE.replace(
+        "<mujoco>", '<mujoco><option><flag gravity="disable"/></option>'
+    )
+    assert fj.data.from_mjcf(text)[0].gravity == 0

@@ -1,6 +1,7 @@
 """Import of planar chains from MuJoCo's model format (MJCF)."""
 
 import warnings
+from itertools import combinations
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,16 +21,20 @@ def from_mjcf(text: str) -> tuple[Linkage, Forces]:
     The plane is seen from where the hinges' axes point, with gravity downwards; `q`
     equals `qpos`. A body with several joints becomes as many links, all but the last
     without mass. A site `tip` on the last body becomes the tip; without one, the tip is
-    the last joint. Contacts are ignored. MuJoCo reads the model, which needs
-    `pip install "fdof_jax[test]"`.
+    the last joint. MuJoCo reads the model, which needs `pip install "fdof_jax[test]"`.
+
+    Contacts are left out, with a warning if geoms of two bodies may collide. Such a
+    model is not refused, because geoms may collide by default, and most arms move
+    without contacts. `<flag contact="disable"/>` avoids the warning.
 
     **Arguments:** `text`: the XML text.
 
     **Returns:** the linkage, and its `JointDamper` and `Armature` if it has any.
 
     **Raises:** ValueError for what a planar chain does not have (branches, other
-    joints, axes out of the plane), for springs, stops and friction of joints, and for
-    actuators, tendons and equality constraints.
+    joints, axes out of the plane), for springs, stops, friction and nonlinear
+    damping of joints, and for actuators, tendons, equality constraints, fluids and
+    `gravcomp`.
 
     >>> import fdof_jax as fj
     >>> arm, forces = fj.data.from_mjcf('''
@@ -45,6 +50,16 @@ def from_mjcf(text: str) -> tuple[Linkage, Forces]:
     except (TypeError, ValueError) as error:
         raise ValueError(f"text: expected a MuJoCo model: {error}") from None
     _refuse_others(model)
+    disabled = model.opt.disableflags
+    if disabled & mujoco.mjtDisableBit.mjDSBL_GRAVITY:
+        model.opt.gravity[:] = 0
+    colliding = _colliding(model)
+    if colliding and not disabled & mujoco.mjtDisableBit.mjDSBL_CONTACT:
+        warnings.warn(
+            f"text: contacts are left out, but bodies {colliding} of this model may "
+            "collide.",
+            stacklevel=2,
+        )
     data = mujoco.MjData(model)
     data.qpos[:] = 0
     mujoco.mj_kinematics(model, data)
@@ -75,6 +90,13 @@ class _Link(NamedTuple):
 def _refuse_others(model: Any) -> None:
     """Raises ValueError for what the library has not, or has otherwise."""
     refuse = lambda what: ValueError(f"text: expected a planar chain, got {what}.")
+    try:
+        nonlinear = (
+            (model.jnt_stiffnesspoly, "a spring"),
+            (model.dof_dampingpoly, "nonlinear damping"),
+        )
+    except AttributeError:  # in older versions of MuJoCo
+        nonlinear = ()
     for kind, name in zip(model.jnt_type, _names(model)):
         if kind not in (_HINGE, _SLIDE):
             raise refuse(f"joint {name}, which is neither a hinge nor a slide")
@@ -82,6 +104,7 @@ def _refuse_others(model: Any) -> None:
         (model.jnt_stiffness, "a spring"),
         (model.jnt_limited, "a range"),
         (model.dof_frictionloss, "friction"),
+        *nonlinear,
     ):
         for name, value in zip(_names(model), values):
             if np.any(value):
@@ -90,15 +113,19 @@ def _refuse_others(model: Any) -> None:
         (model.nu, "actuators"),
         (model.ntendon, "tendons"),
         (model.neq, "equality constraints"),
+        (model.opt.density, "a fluid (density)"),
+        (model.opt.viscosity, "a fluid (viscosity)"),
     ):
         if count:
             raise refuse(what)
+    for body in np.flatnonzero(model.body_gravcomp):
+        raise refuse(f"body {_body(model, body)} with gravcomp")
     if not model.njnt or _HINGE not in model.jnt_type:
         raise refuse("no hinge")
     for body in range(1, model.nbody):
         before = model.body_parentid[body]
         if model.body_weldid[body] and before != body - 1 and model.body_weldid[before]:
-            raise refuse(f"body {model.body(body).name or body} on a branch")
+            raise refuse(f"body {_body(model, body)} on a branch")
     moved = model.body_weldid > 0
     if (model.body_weldid[model.body_parentid[moved]] == 0).sum() > 1:
         raise refuse("several chains")
@@ -106,6 +133,32 @@ def _refuse_others(model: Any) -> None:
 
 def _names(model: Any) -> list[str]:
     return [model.joint(k).name or str(k) for k in range(model.njnt)]
+
+
+def _body(model: Any, body: Any) -> str:
+    return model.body(body).name or str(body)
+
+
+def _colliding(model: Any) -> str | None:
+    """Names two bodies whose geoms may collide in MuJoCo, if any.
+
+    Geoms of bodies that are welded together, or next to each other in the chain, do
+    not; the moving bodies next to the ground may collide with it.
+    """
+    name = lambda geom: _body(model, model.geom_bodyid[geom])
+    named = lambda i, j: f"{name(i)} and {name(j)}"
+    if model.npair:
+        return named(model.pair_geom1[0], model.pair_geom2[0])
+    welded, before = model.body_weldid, model.body_weldid[model.body_parentid]
+    for i, j in combinations(range(model.ngeom), 2):
+        bodies = model.geom_bodyid[[i, j]]  # in ascending order, as the geoms are
+        a, b = welded[bodies]
+        next_to = (a and before[b] == a) or (b and before[a] == b)
+        kinds = model.geom_contype[[i, j]] & model.geom_conaffinity[[j, i]]
+        excluded = (bodies[0] << 16) + bodies[1] in model.exclude_signature
+        if a != b and not next_to and kinds.any() and not excluded:
+            return named(i, j)
+    return None
 
 
 def _plane(model: Any, data: Any) -> tuple[np.ndarray, np.ndarray, float]:
