@@ -1,6 +1,7 @@
 """Malformed references are refused, and paths out of reach."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -54,6 +55,25 @@ def test_circles_out_of_reach_are_refused_at_the_door(circle):
     place = r"^forces\[0\]\.reference"
     with pytest.raises(ValueError, match=place + ": expected .* reach .*, got .*"):
         fj.simulate(scene.linkage, scene.state0, [0, 5.0], forces)
+
+
+@pytest.mark.parametrize(
+    "task, words",
+    [
+        (fj.CircleTask([9, 9], radius=0, orientation=0.5), "at orientation 0.5 rad on"),
+        (
+            fj.TipTask(fj.references.Line([1, 1], [9, 9]), lambda t: t, branch=-1),
+            "at orientation 0 rad on branch -1",
+        ),
+    ],
+    ids=["circle", "line"],
+)
+def test_what_a_task_commands_out_of_reach_is_refused_or_nan(task, words):
+    arm = make("RRR")
+    message = rf"^t: expected .* reach {words}.*, got 1 s, at which .* \[9. 9.\] m\.$"
+    with pytest.raises(ValueError, match=message):
+        task(1.0, arm)
+    assert np.isnan(jax.jit(lambda t: task(t, arm))(1.0)).any()
 
 
 def test_points_out_of_reach_are_refused():

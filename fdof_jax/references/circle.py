@@ -44,7 +44,7 @@ class CircleTask(TipReference):
     - `branch`: assembly of the arm, 1 or -1: see `inverse_kinematics`.
 
     **Raises:** ValueError for malformed arguments. `check`, and so `simulate`, raises
-    it for a circle out of the linkage's reach.
+    it for a circle out of the linkage's reach, and a call where the tip is out of it.
 
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig7().linkage
@@ -104,9 +104,8 @@ class CircleTask(TipReference):
         times = np.append(times, np.minimum(extremes, end))
         if not known_reach(self, linkage, times.astype(ts.dtype)).all():
             raise ValueError(
-                "reference: expected a circle within the linkage's reach at "
-                f"orientation {task.orientation:g} rad on branch {task.branch:+g}, got "
-                f"center {task.center.tolist()} and radius {task.radius:g} m."
+                f"reference: expected a circle within {task._reach()}, got center "
+                f"{task.center.tolist()} and radius {task.radius:g} m."
             )
 
 

@@ -9,7 +9,7 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from ..checks import JOINT, real_array
+from ..checks import JOINT, is_traced, real_array
 from ..forces.part import Condition, Values, called, default, field, of_kind
 from ..linkage.frames import cross, dot
 from ..linkage.linkage import Linkage
@@ -82,6 +82,28 @@ class TipReference(Reference):
         q, root = solve_joints(arm, directions, *seen, self.branch)
         return placed(q), root
 
+    def __call__(
+        self, t: ArrayLike, linkage: Linkage
+    ) -> tuple[Float[Array, " joint"], Float[Array, " joint"]]:
+        """Joint positions [m or rad] and velocities [m/s or rad/s] at time `t` [s].
+
+        Out of reach, raises ValueError for known arguments and returns NaN for traced
+        ones. At the edge of the reach the velocities are not finite.
+        """
+        motion = super().__call__(t, linkage)
+        if not (is_traced(motion) or np.isfinite(motion).all()):
+            raise ValueError(
+                f"t: expected a time at which the tip is within {self._reach()}, got "
+                f"{np.asarray(t):g} s, at which it is at {np.asarray(self.tip(t))} m."
+            )
+        return motion
+
+    def _reach(self) -> str:
+        """Names the reach in messages."""
+        commanded = self.orientation is not None
+        at = f" at orientation {self.direction:g} rad" if commanded else ""
+        return f"the linkage's reach{at} on branch {self.branch:+g}"
+
     @property
     def direction(self) -> Any:
         """The last link's absolute angle, or 0 where none is commanded [rad]."""
@@ -105,7 +127,7 @@ class TipTask(TipReference):
     - `branch`: assembly of the arm, 1 or -1: see `inverse_kinematics`.
 
     **Raises:** ValueError for malformed arguments. `check`, and so `simulate`, raises
-    it for a path out of the linkage's reach.
+    it for a path out of the linkage's reach, and a call where the tip is out of it.
 
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig7().linkage
@@ -158,11 +180,9 @@ class TipTask(TipReference):
         q, _ = solve_joints(three, directions, wrist, bearing, task.branch)
         inside = np.isfinite(q).all(axis=1)
         if not inside.all():
-            at = "" if self.orientation is None else f"at {task.direction:g} rad "
             raise ValueError(
-                f"reference: expected a path within the linkage's reach {at}on branch "
-                f"{task.branch:+g}, got one that leaves it at "
-                f"{times[inside.argmin()]:g} s."
+                f"reference: expected a path within {task._reach()}, got one that "
+                f"leaves it at {times[inside.argmin()]:g} s."
             )
         if not task._ahead(bearing, base):
             raise ValueError(
