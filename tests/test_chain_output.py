@@ -120,7 +120,8 @@ def test_states_and_links_of_other_chains_are_refused():
         with pytest.raises(ValueError, match=r"^forces\[0\]\.inertia: .* 2 joints"):
             call(TWO, zeros, zeros, zeros, armature)
     hold = chains.Hold(jnp.zeros(3))
-    with pytest.raises(ValueError, match=f"^reference: {words} for 2 joints"):
+    place = r"^forces\[0\]\.reference"
+    with pytest.raises(ValueError, match=f"{place}: {words} for 2 joints"):
         fj.simulate(TWO, REST, [0, 0.1], (fj.PDController(1, 1, 1, hold),))
 
 

@@ -1,5 +1,7 @@
 """Malformed references are refused, and paths out of reach."""
 
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -41,7 +43,9 @@ def test_references_that_cannot_be_called_are_refused(value):
 def test_references_that_return_no_motion_are_refused(returned):
     element = controller(reference=lambda t, linkage: returned)
     refused("reference", lambda: element(0.0, jnp.zeros(3), jnp.zeros(3), LINKAGE))
-    refused("reference", lambda: simulate(forces=(element,)))
+    for acting in (element, fj.control.FirstOrderLag(element, 0.1)):
+        forces = fj.JointDamper(1.0), acting
+        refused(r"forces\[1\]\.reference", partial(simulate, forces=forces))
 
 
 @pytest.mark.parametrize("circle", [dict(center=[9, 9]), dict(radius=5.0)], ids=str)

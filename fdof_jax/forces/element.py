@@ -6,6 +6,8 @@ library, `elements` adapts other callables, such as plain functions.
 
 import inspect
 from abc import abstractmethod
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import equinox as eqx
@@ -117,6 +119,22 @@ def elements_on(linkage: Linkage, forces: Any) -> tuple[Element, ...]:
     for index, element in enumerate(found):
         check_joints(f"forces[{index}].", element, linkage)
     return found
+
+
+@contextmanager
+def naming(index: int) -> Iterator[None]:
+    """Adds an element's place in `forces` to messages about its values.
+
+    Those about arguments of the call, and those without a name, stay as they are.
+    """
+    try:
+        yield
+    except ValueError as error:
+        name, colon, _ = str(error).partition(": ")
+        first, *_ = name.split(".")
+        if colon and first.isidentifier() and first not in ("linkage", "ts"):
+            raise ValueError(f"forces[{index}].{error}") from error
+        raise
 
 
 class ScalarElement(Element):

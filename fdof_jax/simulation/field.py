@@ -10,7 +10,7 @@ import numpy as np
 from jax import Array
 
 from ..forces.added_inertia import added_inertia, inertial
-from ..forces.element import Element, ScalarElement, StatefulElement
+from ..forces.element import Element, ScalarElement, StatefulElement, naming
 from ..linkage.linkage import Linkage
 from ..mechanics.equations import Constants, Scalars, Upper, link_constants, zeros
 from ..mechanics.rates import conditioning, rates, rates_and_conditioning
@@ -38,7 +38,11 @@ def args_of(linkage: Linkage, q0: Array, forces: tuple[Element, ...]) -> Args:
 @with_checks
 def schedule_of(t: Array, args: Args) -> tuple[Any, ...]:
     """Returns each element's schedule."""
-    return tuple(element.schedule(t, args.linkage) for element in args.forces)
+    schedules = []
+    for index, element in enumerate(args.forces):
+        with naming(index):
+            schedules.append(element.schedule(t, args.linkage))
+    return tuple(schedules)
 
 
 def stateful(forces: tuple[Element, ...]) -> list[StatefulElement]:
@@ -166,7 +170,8 @@ def element_effort(
     expected = (
         f"forces[{index}]: expected it to return tau, an array of {len(q)} real numbers"
     )
-    found: Any = element.act(t, q, qd, linkage, state)
+    with naming(index):
+        found: Any = element.act(t, q, qd, linkage, state)
     if not isinstance(found, tuple) or len(found) != 2:
         raise ValueError(f"{expected}, and the rate of its state, got {_shown(found)}.")
     tau, rate = found

@@ -11,7 +11,7 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from ..checks import increasing, instance, is_traced, real_array, whole_number
-from ..forces.element import Element, Forces, elements, elements_on
+from ..forces.element import Element, Forces, elements, elements_on, naming
 from ..forces.part import check_values, sized
 from ..linkage.coordinates import State, real_state
 from ..linkage.linkage import Linkage, check_linkage, joints_of, possible
@@ -81,12 +81,8 @@ def check_elements(forces: Forces, linkage: Linkage, ts: Array) -> None:
         if is_traced(linkage, ts, element):
             continue
         check_values(place, element)  # `equinox.tree_at` bypasses the constructor
-        try:
+        with naming(index):
             element.check(linkage, ts)
-        except ValueError as error:
-            if str(error).startswith(("linkage", "ts")):  # the arguments of this call
-                raise
-            raise ValueError(f"{place}.{error}") from error
         if not values.possible():
             raise ValueError(
                 f"{place}: expected values that its constructor accepts, got "
