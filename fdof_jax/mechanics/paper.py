@@ -8,22 +8,24 @@ simulations use.
 import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
+from numpy.typing import ArrayLike
 
+from ..checks import real_array
 from ..linkage.linkage import Linkage, compiled, joints_of
 from ..xla.trigonometry import sincos
 
 
-def three_pairs(linkage: Linkage, _: Linkage) -> Linkage:
-    """Returns a linkage of three pairs of joints, or raises ValueError."""
+def of_three_pairs(linkage: Linkage, x: ArrayLike) -> Array:
+    """Returns `x` of a linkage of three pairs of joints, or raises ValueError."""
     if joints_of(linkage) != 3:
         raise ValueError(
             "linkage: expected three pairs of joints, as in the paper's equations, got "
             f"{joints_of(linkage)}."
         )
-    return linkage
+    return real_array("x", x, (6,))
 
 
-@compiled(linkage=three_pairs, x=(6,))
+@compiled(x=of_three_pairs)
 def mass_matrix(
     linkage: Linkage, x: Float[Array, " chain"]
 ) -> Float[Array, "chain chain"]:
@@ -87,7 +89,7 @@ def mass_matrix(
     )
 
 
-@compiled(linkage=three_pairs, x=(6,), xd=(6,))
+@compiled(x=of_three_pairs, xd=(6,))
 def bias_force(
     linkage: Linkage, x: Float[Array, " chain"], xd: Float[Array, " chain"]
 ) -> Float[Array, " chain"]:
@@ -185,7 +187,7 @@ def bias_force(
     return jnp.stack([phi_B1, phi_th2, phi_B2, phi_th3, phi_B3, phi_th4])
 
 
-@compiled(linkage=three_pairs, x=(6,), xd=(6,), force=(6,))
+@compiled(x=of_three_pairs, xd=(6,), force=(6,))
 def masked_accelerations(
     linkage: Linkage,
     x: Float[Array, " chain"],
@@ -242,7 +244,7 @@ def masked_accelerations(
     return jnp.stack([xdd[0], th2, xdd[2], th3, xdd[4], th4])
 
 
-@compiled(linkage=three_pairs, x=(6,), xd=(6,), force=(6,))
+@compiled(x=of_three_pairs, xd=(6,), force=(6,))
 def constraint_forces(
     linkage: Linkage,
     x: Float[Array, " chain"],
