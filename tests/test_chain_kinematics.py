@@ -120,8 +120,8 @@ def test_tasks_without_orientation_are_followed_at_their_exact_rates(topology):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("topology", ["FRFRR", "RPFR"])
-def test_circles_of_three_joints_and_fixed_pairs(topology):
+def test_circles_of_three_joints_and_fixed_pairs():
+    topology = "FRFRR"
     chain = chains.random_chain(topology, np.random.default_rng(11))
     q = np.where(chains.moving(topology), 0.5, 0)
     turns = np.array([joint == "R" for joint in topology])
@@ -138,6 +138,5 @@ def test_circles_of_three_joints_and_fixed_pairs(topology):
     for t, q in zip(motion.ts, motion.q):
         np.testing.assert_allclose(fj.tip_position(chain, q), circle.tip(t), atol=1e-4)
     beyond = fj.PDController(1.0, 1.0, 1.0, fj.CircleTask([50, 50], 0.1))
-    if "P" not in topology:
-        with pytest.raises(ValueError, match="reference: expected a circle within"):
-            fj.simulate(chain, start, [0, 0.1], (beyond,))
+    with pytest.raises(ValueError, match="reference: expected a circle within"):
+        fj.simulate(chain, start, [0, 0.1], (beyond,))

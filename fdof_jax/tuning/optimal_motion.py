@@ -183,9 +183,9 @@ def optimal_efforts(
 
     >>> import fdof_jax as fj
     >>> scene = fj.scenes.fig7()
-    >>> best = fj.tuning.optimal_efforts(scene, horizon=0.3, knots=7, max_steps=20)
+    >>> best = fj.tuning.optimal_efforts(scene, horizon=0.4, knots=6, max_steps=20)
     >>> best.controller_error, best.tip_error  # [m]
-    (0.119, 0.08)
+    (0.151, 0.072)
     """
     check_tuned("scene", scene)
     controller, t1 = controller_of(scene), float(scene.t1)

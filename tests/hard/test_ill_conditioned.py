@@ -50,8 +50,7 @@ def test_a_last_link_without_inertia_is_refused(topology):
         arm(topology, com=[[0.5, 0], [0.5, 0], [0, 0]], inertia=[1 / 12, 1 / 12, 0])
 
 
-@pytest.mark.parametrize("chunked", [False, True], ids=["vmap", "sweep"])
-def test_a_singular_member_is_named_and_harms_no_other(chunked):
+def test_a_singular_member_is_named_and_harms_no_other():
     """Under a transformation that member's values cannot be checked beforehand."""
     usual = arm()
     com = jnp.stack([usual.com] * 3).at[1, 2].set(0)
@@ -63,9 +62,6 @@ def test_a_singular_member_is_named_and_harms_no_other(chunked):
         def linkage(com, inertia):
             return eqx.tree_at(lambda a: (a.com, a.inertia), usual, (com, inertia))
 
-        if chunked:
-            many = eqx.tree_at(lambda a: (a.com, a.inertia), usual, (com, inertia))
-            return fj.sweep(many, fj.State(q, START.qd), TS)
         return jax.vmap(
             lambda com, inertia, q: fj.simulate(
                 linkage(com, inertia), fj.State(q, START.qd), TS, throw=False

@@ -46,10 +46,9 @@ def test_heavy_tip(name, bound, steps):
     assert lost < motion.stats["accuracy"] < 30 * lost
 
 
-@pytest.mark.parametrize("solver", [diffrax.Dopri8(), diffrax.Tsit5()])
-def test_heavy_tip_by_other_solvers(solver):
+def test_heavy_tip_by_another_solver():
     scene = hard.load("heavy-tip-1e6")
-    motion = hard.simulate(scene, hard.TIGHT, solver=solver)
+    motion = hard.simulate(scene, hard.TIGHT, solver=diffrax.Dopri8())
     assert hard.error(motion, scene) <= 1e-6
     assert motion.stats["num_steps"] <= 100_000
 
@@ -69,19 +68,17 @@ def test_heavy_tips_in_a_batch_beside_a_healthy_arm():
     assert accuracy[1] < 1e-13 < 1e-9 < accuracy[0]
 
 
-@pytest.mark.parametrize("adjoint", [diffrax.ForwardMode(), None])
-def test_derivatives_of_a_heavy_tip(adjoint):
+def test_derivatives_of_a_heavy_tip():
     """Over 0.1 s in which nothing grows, against differences over 1e-3 rad."""
     scene = hard.load("heavy-tip-1e6")
-    mode = {} if adjoint is None else dict(adjoint=adjoint)
 
     @jax.jit
     def end(shift):
         start = fj.State(scene.state0.q + shift, scene.state0.qd)
         arm, ts = scene.linkage, jnp.array([0, 0.1])
-        return fj.simulate(arm, start, ts, throw=False, **mode).q[-1, 0]
+        return fj.simulate(arm, start, ts, throw=False).q[-1, 0]
 
-    slope = (jax.grad if adjoint is None else jax.jacfwd)(end)(0.0)
+    slope = jax.grad(end)(0.0)
     h = 1e-3
     difference = lambda h: (end(h) - end(-h)) / (2 * h)
     exact = (4 * difference(h / 2) - difference(h)) / 3
