@@ -51,6 +51,15 @@ def test_motions_equal_the_reference(name):
     assert error.max() <= before
 
 
+def test_the_two_link_arm_on_its_circle_equals_the_reference():
+    arm, start, forces, t1 = fj.scenes.two_link_circle()
+    wanted = REFERENCE["two-link-circle"]
+    np.testing.assert_allclose(start.q, wanted["q0"], atol=1e-15)
+    motion = fj.simulate(arm, start, np.linspace(0, t1, len(wanted["q"])), forces)
+    np.testing.assert_allclose(motion.q, wanted["q"], atol=2e-10)
+    np.testing.assert_allclose(motion.q[-1], wanted["q"][-1], atol=1e-12)
+
+
 # Forward mode for six pairs; reverse mode, which takes long to compile, for two here
 # and for four in `test_gradients_of_a_motion_equal_differences`.
 @pytest.mark.parametrize(

@@ -126,6 +126,18 @@ SCENES = {
     "spin": dict(qd0=[1e3, 0.0, 0.0], t1=0.5),
     "spin-of-the-tip": dict(qd0=[0.0, 0.0, 1e3], t1=0.5),
     "fig5": FIG5,
+    # `fdof_jax.scenes.two_link_circle`, whose efforts stay within their limits.
+    "two-link-circle": chain(
+        "RR",
+        length=[0.0, 1.0, 0.8],
+        com=[[0.5, 0.0], [0.4, 0.0]],
+        mass=[2.0, 1.0],
+        inertia=[1 / 6, 0.8**2 / 12],
+        gravity=0.0,
+        q0=[-0.7761207715657413, 1.8428913788142083],
+        t1=4.0,
+        circling=True,
+    ),
 }
 # Derivatives of q at the end in these arguments.
 DERIVATIVES = {
@@ -203,12 +215,43 @@ def lagrange(topology):
     return int(offsets[-1]), [*q, *qd], [*qd, *qdd]
 
 
+def on_circle(hy, arm, q, qd):
+    """Returns the efforts of PD control (100, 10) of two links on a circle.
+
+    Its centre is (0.7, 0), its radius 0.3 m, its period 2 s.
+    """
+    turn = 2 * np.pi / 2.0
+    c, s = hy.cos(turn * hy.time), hy.sin(turn * hy.time)
+    x, y = 0.7 + 0.3 * c, 0.3 * s
+    vx, vy = -0.3 * turn * s, 0.3 * turn * c
+    first, second = arm["length"][1:]
+    bend = hy.acos((x**2 + y**2 - first**2 - second**2) / (2 * first * second))
+    lever = first + second * hy.cos(bend), second * hy.sin(bend)
+    angle = hy.atan2(y, x) - hy.atan2(lever[1], lever[0])
+    # Rates of the tip per unit of each joint's rate.
+    tip = second * hy.cos(angle + bend), second * hy.sin(angle + bend)
+    determinant = first * second * hy.sin(bend)
+    rates = (tip[0] * vx + tip[1] * vy) / determinant, -(x * vx + y * vy) / determinant
+    return [
+        100 * (wanted - a) + 10 * (rate - u)
+        for wanted, a, rate, u in zip((angle, bend), q, rates, qd)
+    ]
+
+
 @cache
-def integrator(topology, bits):
+def integrator(topology, bits, circling=False):
     import heyoka as hy
 
     count, state, rates = lagrange(topology)
     zero = hy.real(0.0, prec=bits)
+    if circling:
+        sizes = np.cumsum([0, 3, 4, 2, 2, 2, 1, 1, 2])
+        pars = {
+            name: [hy.par[int(i)] for i in range(begin, end)]
+            for name, begin, end in zip(PARAMETERS, sizes, sizes[1:])
+        }
+        efforts = on_circle(hy, pars, state[:2], state[2:])
+        rates = hy.subs(rates, dict(zip(pars["effort"], efforts)))
     return hy.taylor_adaptive(
         list(zip(state, rates)),
         [zero] * len(state),
@@ -231,7 +274,7 @@ def motion(scene, changed=None, by=None, *, bits):
     if changed is not None:
         name, index = changed
         values[name][index] += by
-    solver = integrator(scene["topology"], bits)
+    solver = integrator(scene["topology"], bits, scene.get("circling", False))
     solver.pars[:] = sum((values[name] for name in PARAMETERS), [])
     solver.state[:] = values["q0"] + values["qd0"]
     solver.time = real(0.0)
