@@ -67,7 +67,7 @@ def test_an_application(tmp_path):
     assert first["dtype"] == "float64"
     assert first["early"] == [] and first["kernel"]
     # Options add up.
-    expected = f"{own} {configuration._FLAGS}" if NEEDS_OPTION else own
+    expected = f"{own} {configuration._FLAG}" if NEEDS_OPTION else own
     assert first["flags"] == expected
     if NEEDS_OPTION:
         ((message, file),) = first["late"]
@@ -104,7 +104,7 @@ def settings():
 
 @pytest.fixture(autouse=True)
 def restored(monkeypatch):
-    monkeypatch.setenv("XLA_FLAGS", configuration._FLAGS)  # nothing to be warned of
+    monkeypatch.setenv("XLA_FLAGS", configuration._FLAG)  # nothing to be warned of
     before = settings()
     yield before
     for name, value in before.items():

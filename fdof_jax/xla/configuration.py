@@ -19,16 +19,11 @@ from jaxlib import version
 
 # XLA on CPU compiles a loop as one kernel if its state has fewer bytes than this sets;
 # otherwise it starts a kernel for each operation. XLA reads the option when JAX starts.
-# Versions that do not know it ignore it.
+# Versions that do not know it ignore it, whereas unknown flags end the process.
 _SMALL_LOOPS = "xla_cpu_small_while_loop_byte_threshold"
-_FLAGS = f"--xla_backend_extra_options={_SMALL_LOOPS}=100000"
+_FLAG = f"--xla_backend_extra_options={_SMALL_LOOPS}=100000"
 # From this version of jaxlib on, XLA compiles such loops as one kernel by itself.
 _BY_ITSELF = (0, 12)
-# The emitters of fused kernels of these versions take longer to compile programs that
-# run no faster. An XLA that does not know a flag ends the process: these do, from 0.6
-# on, and 0.12 does not.
-if version.__version_info__ < (0, 11):
-    _FLAGS += " --xla_cpu_use_fusion_emitters=false"
 
 
 def small_loops_are_kernels() -> bool:
@@ -44,8 +39,7 @@ def configure(
 
     Whatever the arguments, `configure` makes XLA compile small loops as one kernel if
     the installed version needs an option for it (JAX before 0.12). Single arms are then
-    simulated up to ten times as fast, and gradients take a third of the time. It also
-    has XLA of JAX before 0.11 compile faster.
+    simulated up to ten times as fast, and gradients take a third of the time.
 
     **Arguments:** None leaves a setting as it is.
 
@@ -77,9 +71,9 @@ def _compile_small_loops_as_kernels() -> None:
     if xla_bridge.backends_are_initialized():
         reason = "JAX had started before; call configure before anything is computed"
     elif flags and not flags.startswith("-"):
-        reason = f"XLA_FLAGS names a file; add {_FLAGS} to it"
+        reason = f"XLA_FLAGS names a file; add {_FLAG} to it"
     else:
-        os.environ["XLA_FLAGS"] = f"{flags} {_FLAGS}".strip()
+        os.environ["XLA_FLAGS"] = f"{flags} {_FLAG}".strip()
         return
     warnings.warn(
         "configure: XLA could not be set to compile small loops as one kernel, so "
