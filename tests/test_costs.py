@@ -88,7 +88,7 @@ def test_a_model_costs_only_the_controllers_that_have_one():
             fj.control.ComputedTorque,
         )
     )
-    assert plain == 33 < held <= 350 and computed <= 850
+    assert plain == 36 < held <= 351 and computed <= 850
 
 
 def test_the_equations_cost_little_and_call_no_transcendental_function():

@@ -31,6 +31,14 @@ def test_gradients():
 
 
 @pytest.mark.slow
+def test_switches():
+    names = run(DOCS / "switches.md")
+    assert names["found"].stats["num_switches"] >= 1
+    assert names["wet"].stats["num_switches"] >= 1
+    assert np.isfinite(names["slope"]).all()
+
+
+@pytest.mark.slow
 def test_tuning(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     names = run(DOCS / "tuning.md")

@@ -203,7 +203,7 @@ def test_a_scalar_loss_is_the_loss_itself():
 
 
 def test_a_gradient_of_zero_is_not_taken_for_convergence():
-    scene = scenes.fig7()._replace(t1=0.2)
+    scene = scenes.fig7()._replace(t1=0.05)
     weak = scene.forces[0]
     weak = fj.PDController(weak.kp, weak.kd, 1e-6, weak.reference)
     result = fj.tune(scene._replace(forces=(weak,)))

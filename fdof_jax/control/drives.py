@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from ..checks import real_array
 from ..forces.element import StatefulElement, element_of
 from ..forces.part import Condition, Values, called, field
+from ..forces.switches import clip
 from ..linkage.linkage import Linkage, joints_of
 from .pd import PDController
 
@@ -68,7 +69,7 @@ class PIDController(StatefulElement):
         position, velocity = self.pd.schedule(t, linkage)
         proportional = self.pd.kp * (position - q)
         demand = proportional + self.pd.kd * (velocity - qd) + state
-        effort = jnp.clip(demand, -self.pd.limit, self.pd.limit)
+        effort = clip(demand, -self.pd.limit, self.pd.limit)
         per_time = self.ki / jnp.where(self.pd.kp > 0, self.pd.kp, 1)
         return effort, per_time * (proportional + effort - demand)
 
@@ -156,9 +157,9 @@ class SpeedLimit(_Drive):
     no_load: Values = field(unit="m/s or rad/s", above=0)
 
     def respond(self, command, qd, own):
-        left = jnp.clip(1 - qd / self.no_load, 0, 1)  # share of the positive limit
-        right = jnp.clip(1 + qd / self.no_load, 0, 1)
-        return jnp.clip(command, -self.stall * right, self.stall * left), ()
+        left = clip(1 - qd / self.no_load, 0, 1)  # share of the positive limit
+        right = clip(1 + qd / self.no_load, 0, 1)
+        return clip(command, -self.stall * right, self.stall * left), ()
 
 
 class DCMotor(_Drive):
@@ -211,7 +212,7 @@ class DCMotor(_Drive):
         unlimited = jnp.isinf(self.current_limit)
         most = self.resistance * jnp.where(unlimited, 0, self.current_limit)
         most = jnp.where(unlimited, jnp.inf, most)
-        voltage = jnp.clip(command, back_emf - most, back_emf + most)
-        voltage = jnp.clip(voltage, -self.voltage_limit, self.voltage_limit)
+        voltage = clip(command, back_emf - most, back_emf + most)
+        voltage = clip(voltage, -self.voltage_limit, self.voltage_limit)
         rate = (voltage - self.resistance * own - back_emf) / self.inductance
         return per_joint * own, rate

@@ -7,6 +7,7 @@ from jax import Array
 
 from ..forces.element import ScalarElement
 from ..forces.part import Values, called, each, field
+from ..forces.switches import clip
 from ..linkage.linkage import Linkage
 from ..references.reference import EXPECTED, reference_motion
 
@@ -50,9 +51,8 @@ class PDController(ScalarElement):
         return reference_motion(self.reference, t, linkage)
 
     def respond(self, scheduled, q, qd, linkage):
-        # At the limit, jnp.clip's derivative would be the mean of both sides.
         return tuple(
-            jnp.where(jnp.abs(effort) <= limit, effort, jnp.clip(effort, -limit, limit))
+            clip(effort, -limit, limit)
             for effort, limit in zip(
                 self.unlimited(scheduled, q, qd, linkage), each(self.limit, q)
             )

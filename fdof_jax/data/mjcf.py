@@ -101,7 +101,7 @@ def _refuse_others(linkage: Linkage, found: tuple[Any, ...]) -> None:
                 name = type(element.called).__name__
         elif isinstance(element, SpringDamper):
             element.check(linkage, jnp.zeros(1))
-            if int(element.side) and float(element.damping) > 0:
+            if element.side and float(element.damping) > 0:
                 expected = (
                     "no damping of a cable or a bumper, which MuJoCo does not have"
                 )
@@ -145,7 +145,7 @@ def _add_springs(root: Any, bodies: list[Any], found: tuple[Any, ...]) -> None:
     springs = [(k, e) for k, e in enumerate(found) if isinstance(e, SpringDamper)]
     tendons = ElementTree.SubElement(root, "tendon")
     for k, element in springs:
-        rest, side = float(element.rest_length), int(element.side)
+        rest, side = float(element.rest_length), int(element.side or 0)
         ends = {0: (rest, rest), 1: (0.0, rest), -1: (rest, _FAR)}[side]  # no force
         tendon = ElementTree.SubElement(
             tendons, "spatial", name=f"spring{k}", stiffness=_text(element.stiffness),

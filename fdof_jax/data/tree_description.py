@@ -37,7 +37,6 @@ _WITHIN = {
     "DriveState": "control.drives",
     "History": "tuning.result",
     "Separation": "forces.points",
-    "_Knots": "tuning.optimal_motion",
 }
 # Classes in files of 0.1 that are no more; their instances are loaded as dictionaries.
 _REMOVED = (f"{_PACKAGE}.tuning_run:Job",)

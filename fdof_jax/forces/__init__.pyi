@@ -17,5 +17,6 @@ from .joints import (
 )
 from .part import Condition as Condition, Values as Values, field as field
 from .points import Load as Load, Point as Point, PointElement as PointElement
+from .switches import clip as clip, switch as switch
 
 __all__: list[str]

@@ -26,6 +26,7 @@ from .points import (
     over,
     pick,
 )
+from .switches import switch
 
 
 class LineElement(PointElement):
@@ -76,7 +77,7 @@ class SpringDamper(LineElement):
     """
 
     ends: Separation
-    side: Int[Array, ""]  # 1: cable, -1: bumper, 0: both
+    side: Int[Array, ""] | None  # 1: cable, -1: bumper, 0 or None: both
     stiffness: Values = field((), unit="N/m", minimum=0)
     damping: Values = field((), unit="N s/m", minimum=0)
     rest_length: Values = field((), unit="m", minimum=0)
@@ -94,26 +95,34 @@ class SpringDamper(LineElement):
         self.ends = Separation(a, b)
         self.stiffness, self.damping = stiffness, damping
         self.rest_length = rest_length
-        sides = {False: 0, "cable": 1, "bumper": -1}
+        sides = {False: None, "cable": 1, "bumper": -1}
         if not isinstance(one_sided, str | bool) or one_sided not in sides:
             raise ValueError(
                 f"one_sided: expected False, 'cable' or 'bumper', got {one_sided!r}."
             )
-        self.side = jax.device_put(np.array(sides[one_sided]))
+        side = sides[one_sided]
+        self.side = None if side is None else jax.device_put(np.array(side))
 
     def pull(self, scheduled, length, rate):
-        tension = self.stiffness * (length - self.rest_length) + self.damping * rate
-        beyond = self.side * (length - self.rest_length) > 0
-        works = (self.side == 0) | (beyond & (self.side * tension > 0))
         # Without a rest length the pull is smooth even where the points meet.
         other = self.damping * rate - self.stiffness * self.rest_length
-        return jnp.where(works, self.stiffness + other * over(length), 0)
+        pull = self.stiffness + other * over(length)
+        if self.side is None:
+            return pull
+        tension = self.stiffness * (length - self.rest_length) + self.damping * rate
+        both = self.side == 0
+        on = switch(self.side * tension, True, both, continuous=True)
+        on = switch(self.side * (length - self.rest_length), on, both)
+        return jnp.where(on, pull, 0)
 
     def potential_energy(self, q: Array, linkage: Linkage) -> Array:
         """Computes the energy of the spring [J]."""
         stretch = self.ends.length(linkage, q) - self.rest_length
+        energy = self.stiffness * stretch**2 / 2
+        if self.side is None:
+            return energy
         works = (self.side == 0) | (self.side * stretch > 0)
-        return jnp.where(works, self.stiffness * stretch**2 / 2, 0)
+        return jnp.where(works, energy, 0)
 
 
 class Tension(LineElement):

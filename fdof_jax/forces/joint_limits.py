@@ -6,6 +6,7 @@ from jax import Array
 from ..linkage.linkage import Linkage
 from .element import ScalarElement
 from .part import Condition, Values, each, field
+from .switches import switch
 
 
 class JointStops(ScalarElement):
@@ -60,7 +61,8 @@ class JointStops(ScalarElement):
 def _push(depth, rate, stiffness, damping, width):
     """Force of a stop at a depth, which is negative outside of the stop."""
     penetration, slope = _penetration(depth, width)
-    return stiffness * penetration * jnp.maximum(1 + damping * slope * rate, 0)
+    damped = 1 + damping * slope * rate
+    return stiffness * penetration * switch(damped, damped, 0, continuous=True)
 
 
 def _penetration(depth, width):
@@ -72,8 +74,10 @@ def _penetration(depth, width):
 def _parts(depth, width):
     """Splits the depth into the parts within the parabola and beyond it."""
     # jnp.clip would multiply the derivative in an infinite end of a range by 0.
-    deep = depth > width
-    near = jnp.where(deep, 2 * width, jnp.where(depth < -width, 0, depth + width))
+    deep, touching = (
+        switch(depth + a, True, False, continuous=True) for a in (-width, width)
+    )
+    near = jnp.where(deep, 2 * width, jnp.where(touching, depth + width, 0))
     return near, jnp.where(deep, depth - width, 0)
 
 

@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+from jax import Array
 
 from ..checks import JOINT
 from .element import ScalarElement
@@ -54,9 +55,7 @@ class JointEffort(ScalarElement):
 class EffortHistory(ScalarElement):
     """Joint efforts given at times: linear in between, constant before and after.
 
-    Steps need not end at the times. Adaptive steps sample the efforts only at their
-    stages, and do not control the error of derivatives. For gradients in `tau`, bound
-    the steps to the distance of two samples (`diffrax.PIDController(..., dtmax=...)`).
+    Adaptive steps end at the times.
 
     **Arguments:** `ts`: increasing times, one or more [s]; `tau`: the efforts at `ts`,
     (time, joint) [N or N m].
@@ -79,6 +78,11 @@ class EffortHistory(ScalarElement):
         yield Condition(rising, "ts", "increasing times", (self.ts,))
         same = times == efforts
         yield Condition(same, "tau", f"{times} rows, one per time", (efforts,))
+
+    @property
+    def jump_ts(self) -> Array:
+        """The times, at which the efforts have kinks [s]."""
+        return self.ts
 
     def schedule(self, t, linkage):
         columns = jax.vmap(lambda tau: jnp.interp(t, self.ts, tau), in_axes=1)(self.tau)

@@ -130,7 +130,7 @@ def _between(element: Any, f: Frames, size: float) -> tuple[str, list[np.ndarray
     a, length, unit = _ends(element, f)
     if isinstance(element, Tension):
         return "tension", [a + unit * length * np.array([0, 1])]
-    rest, side = float(element.rest_length), int(element.side)
+    rest, side = float(element.rest_length), int(element.side or 0)
     if side == 1:
         u = np.linspace(0, 1, 21)
         # The sag of a shallow parabola that is longer than its chord by the slack.

@@ -42,15 +42,20 @@ class ScheduledTerm(diffrax.ODETerm):
     `health(t, y, args)` holds the loss of accuracy in the rates of each joint, at least
     1, or 0 where the equations are singular. `watched_field` returns the rates and
     their health, NaN if they are not finite.
+    `switching` returns the switching functions (n,), and whether anything jumps.
     """
 
     vector_field: Callable[..., PyTree] = eqx.field(static=True)
     schedule: Callable[[Any, Any], PyTree] = eqx.field(static=True)
     health: Callable[..., Health] = eqx.field(static=True)
     watched_field: Callable[..., tuple[PyTree, Health]] = eqx.field(static=True)
+    switching: Callable[..., tuple[Array, bool]] = eqx.field(static=True)
 
     def vf(self, t, y, args):
         return self.vector_field(t, y, args, self.schedule(t, args))
+
+    def switches(self, t, y, args) -> tuple[Array, bool]:
+        return self.switching(t, y, args, self.schedule(t, args))
 
 
 class ScheduledDopri8(diffrax.AbstractAdaptiveSolver):
@@ -87,6 +92,7 @@ class DenseOutput(diffrax.AbstractLocalInterpolation):
     y0: PyTree
     step: Array
     rates: Any
+    scheduled: Any  # what depends on time alone, at all stages
 
     @abstractmethod
     def at(self, theta: Array) -> PyTree:
@@ -123,6 +129,13 @@ class Estimate(NamedTuple):
 
     error: PyTree
     health: Health
+
+
+def with_change(error: Any, change: Callable[[PyTree], PyTree]) -> Any:
+    """Returns an error, or an `Estimate`, with a change of the error."""
+    if isinstance(error, Estimate):
+        return error._replace(error=change(error.error))
+    return change(error)
 
 
 def verdict(error: PyTree, health: Health, h: Array) -> tuple[Estimate, Any]:

@@ -11,6 +11,7 @@ from jax import Array
 
 from ..forces.added_inertia import added_inertia, inertial
 from ..forces.element import Element, ScalarElement, StatefulElement, naming
+from ..forces.switches import Switches
 from ..linkage.linkage import Linkage
 from ..mechanics.equations import Constants, Scalars, Upper, link_constants, zeros
 from ..mechanics.rates import conditioning, rates, rates_and_conditioning
@@ -27,6 +28,7 @@ class Args(NamedTuple):
     q0: Array
     constants: Constants
     forces: tuple[Element, ...]
+    sides: Array | None = None  # (switch,) in force, where switches are located
 
 
 def args_of(linkage: Linkage, q0: Array, forces: tuple[Element, ...]) -> Args:
@@ -80,34 +82,52 @@ def _scalars(tree: Any, dtype: Any) -> tuple[Array, ...]:
 
 
 @with_checks
-def applied(
-    t: Any, y: Any, args: Args, schedule: tuple[Any, ...]
-) -> tuple[Scalars, Scalars, Upper | None]:
-    """Returns efforts of the elements, rates of their states, and inertia they add.
+def _effort(t: Any, y: Any, args: Args, schedule: tuple[Any, ...]) -> tuple[Any, ...]:
+    """Returns efforts of the elements, rates of their states, and their switches.
 
     Builds arrays only where an element needs them.
     """
     delta, qd, *_ = y
     states = iter(own_states(args, y))
     tau, own_rates = None, []
+    switches = Switches(args.sides)
     arrays = lambda: (args.q0 + jnp.stack(delta), jnp.stack(qd))
     for index, (element, scheduled) in enumerate(zip(args.forces, schedule)):
         if isinstance(element, ScalarElement):
             q = tuple(a + b for a, b in zip(args.q0, delta))
-            effort = element.respond(scheduled, q, qd, args.linkage)
+            with switches.dealt():
+                effort = element.respond(scheduled, q, qd, args.linkage)
         else:
             state = next(states) if isinstance(element, StatefulElement) else ()
-            effort, rate = element_effort(
-                index, element, t, *arrays(), args.linkage, state
+            effort, rate, values, jumping = _switched_effort(
+                index, element, t, *arrays(), args.linkage, state, switches.rest()
             )
+            switches.add(values, jumping)
             own_rates += _scalars(rate, args.q0.dtype)
         tau = effort if tau is None else tuple(a + b for a, b in zip(tau, effort))
     tau = zeros(args.q0) if tau is None else tuple(tau)
+    return tau, tuple(own_rates), switches
+
+
+def switching(
+    t: Array, y: Any, args: Args, schedule: tuple[Any, ...]
+) -> tuple[Array, bool]:
+    """Returns the switching functions of all efforts, and whether anything jumps."""
+    *_, switches = _effort(t, y, args, schedule)
+    return switches.all_values(args.q0.dtype), switches.jumping
+
+
+def applied(
+    t: Any, y: Any, args: Args, schedule: tuple[Any, ...]
+) -> tuple[Scalars, Scalars, Upper | None]:
+    """Returns efforts of the elements, rates of their states, and inertia they add."""
+    tau, own_rates, _ = _effort(t, y, args, schedule)
+    delta, qd, *_ = y
     if not inertial(args.forces):
-        return tau, tuple(own_rates), None
-    added, bias = _added(args.linkage, inertial(args.forces), *arrays())
-    tau = tuple(a - b for a, b in zip(tau, bias))
-    return tau, tuple(own_rates), added
+        return tau, own_rates, None
+    q, qd = args.q0 + jnp.stack(delta), jnp.stack(qd)
+    added, bias = _added(args.linkage, inertial(args.forces), q, qd)
+    return tuple(a - b for a, b in zip(tau, bias)), own_rates, added
 
 
 _added: Any = eqx.filter_jit(added_inertia)  # traced once, not at each use by a solver
@@ -153,7 +173,6 @@ def health_of(t, y, args) -> Health:
     return health_at(conditioning(args.constants, delta, added))
 
 
-@eqx.filter_jit  # traced once, not at each use by a solver
 def element_effort(
     index: int,
     element: Element,
@@ -167,10 +186,26 @@ def element_effort(
 
     Raises ValueError unless the effort is a real number for each joint.
     """
+    return _switched_effort(index, element, t, q, qd, linkage, state, None)[:2]
+
+
+@eqx.filter_jit  # traced once, not at each use by a solver
+def _switched_effort(
+    index: int,
+    element: Element,
+    t: Array,
+    q: Array,
+    qd: Array,
+    linkage: Linkage,
+    state: Any,
+    sides: Array | None,
+) -> tuple[Array, Any, list[Array], bool]:
+    """Returns what `element_effort` does, and the switching functions met."""
+    switches = Switches(sides)
     expected = (
         f"forces[{index}]: expected it to return tau, an array of {len(q)} real numbers"
     )
-    with naming(index):
+    with naming(index), switches.dealt():
         found: Any = element.act(t, q, qd, linkage, state)
     if not isinstance(found, tuple) or len(found) != 2:
         raise ValueError(f"{expected}, and the rate of its state, got {_shown(found)}.")
@@ -186,7 +221,7 @@ def element_effort(
         raise ValueError(f"{expected}, got {_shown(tau)}.") from error
     if tau.shape != q.shape or tau.dtype.kind not in "iuf":
         raise ValueError(f"{expected}, got shape {tau.shape} and dtype {tau.dtype}.")
-    return tau.astype(q.dtype), rate
+    return tau.astype(q.dtype), rate, switches.values, switches.jumping
 
 
 def _shown(tree: Any) -> str:

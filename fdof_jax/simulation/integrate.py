@@ -4,10 +4,12 @@ from collections.abc import Callable
 from typing import Any
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import Array
 
+from ..forces.part import jumps_of
 from ..linkage.linkage import possible, without_fixed
 from ..mechanics.equations import zeros
 from ..xla.callbacks import without_checks
@@ -25,8 +27,9 @@ from .looped_dopri8 import LoopedDopri8
 from .prescribed import motion_at, prescribed, start_of, term_of
 from .rounding import Recorded, above_rounding
 from .solution import Solution
-from .step_wrappers import Watched, bounded, landing_on, undifferentiated
+from .step_wrappers import Watched, bounded
 from .steps import default_controller
+from .switching import Located, LocatedImplicit, located, switching_facts
 from .unrolled_dopri8 import UnrolledDopri8
 
 # Longest steps, over the time scale of a mode, that keep its tangents right to 1e-7
@@ -64,7 +67,7 @@ def integrate(
     `padded`: whether the last time may be repeated.
     """
     linkage, state0, asked, own0, forces = inputs
-    solver = keywords["solver"] or LoopedDopri8()
+    solver = _differentiable(keywords["solver"] or LoopedDopri8(), keywords["adjoint"])
     valid, ts, (q0, qd0) = _harmless(inputs, padded)
     args = args_of(linkage, q0, forces)
     own = initial_own(args, own0)
@@ -75,7 +78,13 @@ def integrate(
     controller = _controller(
         keywords["stepsize_controller"], solver, term, bound if derivatives else None
     )
-    controller = landing_on(controller, forces, ts.dtype)
+    y0 = whole(*start_of(args, qd0), own)
+    length = len(y0)
+    implicit = isinstance(solver, diffrax.AbstractImplicitSolver)
+    wrapper: Any = LocatedImplicit if implicit else Located
+    locate = lambda *known: wrapper(*known, derivatives)
+    start = term, ts[0], y0, args, jumps_of(*forces)
+    located_solver, controller, y0 = located(locate, solver, controller, *start)
     adaptive = isinstance(controller, diffrax.AbstractAdaptiveStepSizeController)
     if adaptive:
         controller = Recorded(controller)  # pyright: ignore[reportCallIssue]
@@ -86,20 +95,20 @@ def integrate(
             term,
             t0=ts[0],
             t1=ts[-1],
-            y0=whole(*start_of(args, qd0), own),
+            y0=y0,
             args=args,
             saveat=diffrax.SaveAt(
                 subs=(
-                    diffrax.SubSaveAt(ts=ts),
-                    diffrax.SubSaveAt(t1=True, fn=lambda t, y, args: t),
+                    diffrax.SubSaveAt(ts=ts, fn=lambda t, y, args: y[:length]),
+                    diffrax.SubSaveAt(t1=True, fn=lambda t, y, args: (t, *y[length:])),
                 ),
                 controller_state=adaptive,
             ),
             throw=False,
-            **keywords | {"solver": solver, "stepsize_controller": controller},
+            **keywords | {"solver": located_solver, "stepsize_controller": controller},
         )
     assert found.ys is not None  # because of saveat
-    states, (reached,) = found.ys
+    states, (reached, *known) = found.ys
     at = lambda t, y: (*motion_at(args, t, y), own_states(args, y))
     q, qd, own = jax.vmap(at)(ts, states)
 
@@ -111,6 +120,7 @@ def integrate(
     start = (without_fixed(linkage, value) for value in state0)
     q, qd = (shown(rows).at[0].set(first) for rows, first in zip((q, qd), start))
     # Constant steps go on when the state is no longer finite.
+    (reached,) = reached
     lost = (ts <= reached) & ~jnp.isfinite(q + qd).all(axis=1)
     reached = jnp.where(lost.any(), ts[jnp.argmax(lost) - 1], reached)
     stats = found.stats | {"time_reached": jnp.where(valid, reached, asked[0])}
@@ -118,8 +128,21 @@ def integrate(
         assert found.controller_state is not None  # because of saveat
         _, loss = found.controller_state
         stats["accuracy"] = jnp.finfo(q.dtype).eps * loss
+    stats |= switching_facts(*known)
     result = _judged(valid, found.result, q, qd)
     return Solution(asked, q, qd, stats, result, jax.tree.map(shown, own))
+
+
+def _differentiable(solver: Any, adjoint: diffrax.AbstractAdjoint) -> Any:
+    """Returns the solver with loops that the adjoint can differentiate.
+
+    diffrax sees to that itself, but not for a solver within a wrapper.
+    """
+    kinds = {diffrax.ForwardMode: "lax", diffrax.DirectAdjoint: "bounded"}
+    kind = kinds.get(type(adjoint))
+    if kind is None or not isinstance(solver, diffrax.AbstractRungeKutta):
+        return solver
+    return eqx.tree_at(lambda s: s.scan_kind, solver, kind, is_leaf=lambda x: x is None)
 
 
 def _harmless(inputs, padded: bool) -> tuple[Array, Array, tuple[Array, Array]]:
@@ -163,7 +186,7 @@ def _controller(
     if bound is not None and not trusted:
         fraction = _OF_TIME_SCALE[0 if (solver.order(term) or 0) >= 8 else 1]
         controller = bounded(controller, lambda: bound(fraction))
-    return above_rounding(undifferentiated(controller))
+    return above_rounding(controller)
 
 
 def _judged(valid: Array, result: Any, q: Array, qd: Array) -> Any:

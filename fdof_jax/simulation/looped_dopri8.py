@@ -75,7 +75,8 @@ def _step(term: Any, t0, t1, y0, lost, args):
     health = health_if(finite, health)
     y = jtu.tree_map(lambda a: jnp.where(finite, a, jnp.nan), y)
     error, result = verdict(*constant((error, health)), h)
-    return y, error, dict(y0=y0, step=h, rates=rates), constant(lost), result
+    dense_info = dict(y0=y0, step=h, rates=rates, scheduled=schedule)
+    return y, error, dense_info, constant(lost), result
 
 
 class _Interpolation(DenseOutput):

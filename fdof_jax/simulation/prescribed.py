@@ -29,6 +29,7 @@ from .field import (
     health_of,
     health_with,
     schedule_of,
+    switching,
     vector_field,
     watched_field,
     whole,
@@ -142,8 +143,17 @@ def start_of(args: Args, qd: Array) -> tuple[Any, Any]:
 def term_of(forces: tuple[Element, ...]) -> ScheduledTerm:
     """Returns the equations of velocities or, with a prescribed motion, of momenta."""
     if prescribed(forces) is None:
-        return ScheduledTerm(vector_field, schedule_of, health_of, watched_field)
-    return ScheduledTerm(_hybrid_field, schedule_of, _health, _watched_hybrid_field)
+        return ScheduledTerm(
+            vector_field, schedule_of, health_of, watched_field, switching
+        )
+    return ScheduledTerm(
+        _hybrid_field, schedule_of, _health, _watched_hybrid_field, _hybrid_switching
+    )
+
+
+def _hybrid_switching(t, y, args, schedule) -> tuple[Array, bool]:
+    q, qd = motion_at(args, t, y)
+    return switching(t, (tuple(q - args.q0), tuple(qd), *y[2:]), args, schedule)
 
 
 def _hybrid_field(t, y, args, schedule) -> tuple[Any, ...]:

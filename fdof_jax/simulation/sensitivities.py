@@ -9,18 +9,22 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import Array
 
 from ..forces.element import elements
+from ..forces.part import jumps_of
 from ..xla.callbacks import without_checks
 from .field import args_of, initial_own, own_states, whole
+from .landing import rounding
 from .prescribed import motion_at, start_of, term_of
 from .scene import Scene
 from .solution import Solution
-from .step_wrappers import landing_on
 from .steps import adaptive
+from .switching import Located, located
+from .zeros_in_steps import slope_at_end
 
 # Tolerance of the motion and its derivatives, whichever are larger. The steps that the
 # derivatives need make the loss on Fig 7's circle right to 1e-8.
@@ -36,8 +40,78 @@ class Sensitivities(NamedTuple):
     solution: Solution
 
 
-def _largest(state: Array) -> Array:
+class _Varied(NamedTuple):
+    """Parameters of the equations, and the sides in force."""
+
+    z: Array
+    sides: Array | None = None
+
+
+class _Term(diffrax.ODETerm):
+    switches: Callable[..., tuple[Array, bool]] = eqx.field(static=True)
+
+    def vf(self, t, y, args):
+        return self.vector_field(t, y, args)
+
+
+class _LocatedRows(Located):
+    """Adds what switches and known times change in the derivatives of the motion."""
+
+    count: int = eqx.field(static=True)  # of parameters
+    rates: Callable[..., Array] = eqx.field(static=True)  # (t, row, z, sides)
+    jumps: Array | None
+    slopes: Array | None  # derivatives of the jumps (jump, n)
+
+    def needed(self, count, jumps):
+        # The error control of the derivatives finds kinks of the rates by itself.
+        return self.jumping or jumps is not None
+
+    def none_late(self, t):
+        return jnp.zeros(2, t.dtype)
+
+    def lateness(self, where, seen, switched):
+        """Returns which function switched, and its slope at the end of the step."""
+        _, t0, t1, _, args = where
+        if not self.jumping:
+            return self.none_late(t0)
+        first = jnp.argmin(jnp.where(switched, args.sides * seen[-1], jnp.inf))
+        slope = slope_at_end(seen)[first] / (t1 - t0)
+        return jnp.stack([first.astype(slope.dtype), slope])
+
+    def shifted(self, term, t, y, args, known, made_jump):
+        if not (self.jumping or self.jumps is not None):
+            return y
+        (rows,), time = y, known.until
+        first, slope = known.lateness
+
+        def moved():
+            times = jnp.stack([time, t])
+            sides = jnp.stack([known.sides, args.sides])
+            rates = jax.vmap(self.rates, in_axes=(0, None, None, 0))
+            before, after = rates(times, rows[0], args.z, sides)
+            late = jnp.zeros(self.count, rows.dtype)
+            if self.jumps is not None and self.slopes is not None:
+                distance = jnp.abs(time - self.jumps)
+                index = jnp.argmin(distance)
+                known_time = distance[index] <= 2 * rounding(self.jumps[index])
+                late = jnp.where(known_time, self.slopes[index], late)
+            if self.jumping:
+                before_it = args._replace(sides=known.sides)
+                value = lambda row, z: term.switches(
+                    time, (row[None],), before_it._replace(z=z)
+                )[0][first.astype(int)]
+                _, change = jax.linearize(value, rows[0], args.z)
+                changes = jax.vmap(change)(rows[1:], jnp.eye(self.count))
+                switched = jnp.any((known.sides != args.sides) & (known.sides != 0))
+                late = jnp.where(switched, -changes / slope, late)
+            return rows.at[1:].add(jnp.outer(late, before - after))
+
+        return (jax.lax.cond(made_jump, moved, lambda: rows),)
+
+
+def _largest(y: tuple[Array]) -> Array:
     """Returns the largest rms among the motion and its derivatives."""
+    (state,) = y
     return jnp.sqrt(jnp.max(jnp.mean(state**2, axis=1)))
 
 
@@ -71,16 +145,29 @@ def sensitivities(
     structure = jax.tree.structure(motion_of(z)[1])
     directions = jnp.eye(z.size, dtype=z.dtype)
 
-    @jax.jit  # traced once, not at each use by the solver
-    def field(t, state, z):
-        def rates(row, z):
-            args, _ = motion_of(z)
-            y = jax.tree.unflatten(structure, tuple(row))
-            rates = term_of(args.forces).vf(t, y, args)
-            return jnp.stack(jax.tree.leaves(rates))
+    def rates(t, row, z, sides):
+        args, _ = motion_of(z)
+        y = jax.tree.unflatten(structure, tuple(row))
+        rates = term_of(args.forces).vf(t, y, args._replace(sides=sides))
+        return jnp.stack(jax.tree.leaves(rates))
 
-        value, along = jax.linearize(rates, state[0], z)
-        return jnp.concatenate([value[None], jax.vmap(along)(state[1:], directions)])
+    @jax.jit  # traced once, not at each use by the solver
+    def field(t, y, varied):
+        state, (z, sides) = y[0], varied
+        value, along = jax.linearize(
+            lambda row, z: rates(t, row, z, sides), state[0], z
+        )
+        slopes = jax.vmap(along)(state[1:], directions)
+        return (jnp.concatenate([value[None], slopes]),)
+
+    def switches_of(t, y, varied):
+        args, _ = motion_of(varied.z)
+        y = jax.tree.unflatten(structure, tuple(y[0][0]))
+        args = args._replace(sides=varied.sides)
+        return term_of(args.forces).switches(t, y, args)
+
+    def times_of(z):
+        return jumps_of(*motion_of(z)[0].forces)
 
     def observed(z, t, row):
         args, _ = motion_of(z)
@@ -89,18 +176,25 @@ def sensitivities(
 
     controller = adaptive(tolerance, max(tolerance, TOLERANCE))
     controller = dataclasses.replace(controller, norm=_largest)
-    controller = landing_on(controller, motion_of(z)[0].forces, ts.dtype)
+    term = _Term(field, switches_of)  # pyright: ignore[reportArgumentType, reportCallIssue]
+    jumps, slopes = times_of(z), jax.jacfwd(times_of)(z)
+    y0 = (jnp.concatenate([start[None], jax.vmap(along)(directions)]),)
+    rest = True, z.size, rates, jumps, slopes
+    locate = lambda *known: _LocatedRows(*known, *rest)  # pyright: ignore[reportCallIssue]
+    # A method of few stages, because much of the work lies outside of them.
+    solver, controller, y0 = located(
+        locate, diffrax.Tsit5(), controller, term, ts[0], y0, _Varied(z), jumps
+    )
     with without_checks():
         found = diffrax.diffeqsolve(
-            diffrax.ODETerm(field),  # pyright: ignore[reportArgumentType]
-            # A method of few stages, because much of the work lies outside of them.
-            diffrax.Tsit5(),
+            term,
+            solver,
             t0=ts[0],
             t1=ts[-1],
             dt0=1e-3,
-            y0=jnp.concatenate([start[None], jax.vmap(along)(directions)]),
-            args=z,
-            saveat=diffrax.SaveAt(ts=ts),
+            y0=y0,
+            args=_Varied(z),
+            saveat=diffrax.SaveAt(ts=ts, fn=lambda t, y, args: y[0]),
             stepsize_controller=controller,
             adjoint=diffrax.ForwardMode(),
             max_steps=65536,

@@ -20,7 +20,10 @@ class Solution(eqx.Module):
     - `q`, `qd`: joint positions [m or rad] and velocities at `ts`; NaN after a failure.
     - `stats`: diffrax's statistics, `num_steps` among them; `time_reached` [s]; and,
       with adaptive steps, `accuracy`: the relative rounding error of the accelerations
-      at the worst step. Steps do not chase errors below it.
+      at the worst step. Steps do not chase errors below it. If elements switch, also
+      the number of switches, `num_switches`, and `slowest_crossing`: the least speed at
+      which a switching function passed its zero, as a share of its size in the step.
+      Near 0 a contact grazes, and the motion has no derivative.
     - `result`: diffrax's result, one per trajectory: `diffrax.RESULTS.successful` or
       the reason for the failure. `outcome` states it in words.
     - `own`: the states of the `StatefulElement`s at `ts`, in the order of the forces;
@@ -48,7 +51,8 @@ class Solution(eqx.Module):
         `"successful"`; `"ill-conditioned"`: the mass matrix is singular or nearly so
         (see `inertia_ratios`); `"not finite"`: the accelerations are not finite;
         `"out of steps"`; `"tolerance out of reach"`: rounding keeps even the shortest
-        step from meeting it; or `"solver failed"`.
+        step from meeting it; `"too many switches"`: one after the other, as between
+        branches that push towards each other; or `"solver failed"`.
         """
         results: Any = diffrax.RESULTS
         words = {
@@ -57,6 +61,7 @@ class Solution(eqx.Module):
             "not finite": results.nonfinite,
             "out of steps": results.max_steps_reached,
             "tolerance out of reach": results.dt_min_reached,
+            "too many switches": results.max_steps_rejected,
         }
         return np.select(
             [np.asarray(self.result == result) for result in words.values()],

@@ -10,8 +10,6 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from ..forces.element import Element
-from ..forces.part import jumps_of
 from .dopri8 import Health, constant, health_if, is_singular, verdict
 
 
@@ -49,22 +47,6 @@ def bounded(controller: Any, longest: Callable[[], Array]) -> Any:
     return with_pid(limited, controller)
 
 
-def landing_on(controller: Any, forces: tuple[Element, ...], dtype: Any) -> Any:
-    """Returns the controller with steps that end at the times where efforts jump.
-
-    Raises ValueError if there are such times and its steps are not adaptive.
-    """
-    if (jumps := jumps_of(*forces)) is None:
-        return controller
-    if not isinstance(controller, diffrax.AbstractAdaptiveStepSizeController):
-        raise ValueError(
-            "stepsize_controller: expected an adaptive one, as forces declare times "
-            f"at which they jump (jump_ts), got {controller!r}."
-        )
-    longer = _Longer(controller)  # pyright: ignore[reportCallIssue]
-    return diffrax.ClipStepSizeController(longer, jump_ts=jumps.astype(dtype))
-
-
 class Adaptive(diffrax.AbstractAdaptiveStepSizeController):
     """Wrapper of an adaptive controller; implicit solvers read its tolerances.
 
@@ -95,21 +77,6 @@ class Adaptive(diffrax.AbstractAdaptiveStepSizeController):
     @property
     def norm(self):  # pyright: ignore[reportIncompatibleMethodOverride]
         return self.controller.norm
-
-
-class _Longer(Adaptive):
-    """A controller that lengthens each step by a factor 1 + sqrt(eps).
-
-    A step over the distance between two jumps would otherwise end a rounding error
-    before the second jump, and the next step would be too short to go on.
-    """
-
-    controller: Any
-
-    def adapt_step_size(self, *arguments):
-        keep, next_t0, next_t1, *rest = super().adapt_step_size(*arguments)
-        stretch = 1 + jnp.finfo(next_t1.dtype).eps ** 0.5
-        return keep, next_t0, next_t0 + stretch * (next_t1 - next_t0), *rest
 
 
 def undifferentiated(controller: Any) -> Any:

@@ -74,7 +74,7 @@ class _Step(NamedTuple):
 
 
 @eqx.filter_jit  # traced once, not at each use in a solve
-def _step(term, t0, t1, y0, lost, args, f0) -> tuple[_Step, Rates, Array]:
+def _step(term, t0, t1, y0, lost, args, f0) -> tuple[_Step, dict[str, Any]]:
     # diffrax wraps the term to integrate backward in time too.
     inner, h = term.term, term.contr(t0, t1)
     times = (t0 + (t1 - t0) * jnp.asarray(NODES, t0.dtype)) * term.direction
@@ -91,7 +91,8 @@ def _step(term, t0, t1, y0, lost, args, f0) -> tuple[_Step, Rates, Array]:
     y = jtu.tree_map(lambda a: a + poison, y)
     y, error, lost = in_one_loop((y, error, lost))
     last, health = inner.watched_field(times[-1], y, args, scheduled(-1))
-    return _Step(y, error, lost, last, health), [*rates, last], h
+    dense_info = dict(y0=y0, step=h, rates=[*rates, last], scheduled=schedule)
+    return _Step(y, error, lost, last, health), dense_info
 
 
 class _Interpolation(DenseOutput):
@@ -126,10 +127,9 @@ class UnrolledDopri8(ScheduledDopri8):
             fresh = self._start(terms, t0, y0, args)
             start = jtu.tree_map(lambda a, b: jnp.where(made_jump, a, b), fresh, start)
         f0, health = start
-        end, rates, h = _step(terms, t0, t1, y0, lost, args, f0)
-        dense_info = dict(y0=y0, step=h, rates=rates)
+        end, dense_info = _step(terms, t0, t1, y0, lost, args, f0)
         # A singular start makes the end not finite.
         singular = is_singular(health)
         health = tuple(jnp.where(singular, 0, x) for x in end.health)
-        error, result = verdict(end.error, health, h)
+        error, result = verdict(end.error, health, dense_info["step"])
         return end.y, error, dense_info, ((end.rate, end.health), end.lost), result

@@ -40,14 +40,6 @@ _SMALL_GRADIENT = 1e-2
 _BANDWIDTH = 10.0
 
 
-class _Knots(EffortHistory):
-    """An effort history at whose kinks steps end, as derivatives in efforts need it."""
-
-    @property
-    def jump_ts(self) -> Array:
-        return self.ts
-
-
 class OptimalMotion(eqx.Module):
     """The best open-loop motion found; prints itself in a few lines.
 
@@ -124,11 +116,15 @@ def _lane(z: Array, problem: tuple[Scene, Array, Array, Array]) -> Evaluation:
     limit = jnp.broadcast_to(controller.limit, (1, joints_of(scene.linkage)))
 
     def scene_at(z):
-        return with_controller(scene, _Knots(knots, limit * z.reshape(knots.size, -1)))
+        return with_controller(
+            scene, EffortHistory(knots, limit * z.reshape(knots.size, -1))
+        )
 
     def residuals(trial, solution):
         errors = _deviations(trial, controller.reference, solution)
-        (efforts,) = (force.tau for force in trial.forces if isinstance(force, _Knots))
+        (efforts,) = (
+            force.tau for force in trial.forces if isinstance(force, EffortHistory)
+        )
         changes = jnp.diff(efforts / jnp.where(limit > 0, limit, 1), axis=0)
         gaps = jnp.diff(knots)[:, None] * (knots[-1] - knots[0])
         return jnp.concatenate([errors, (jnp.sqrt(price / gaps) * changes).reshape(-1)])

@@ -1,0 +1,110 @@
+"""Formulas with branches, whose changes the integrator locates.
+
+Outside of a solve a `switch` is a `where`. A step of an adaptive solve keeps to the
+branches in force at its start, so that the equations of the step are smooth, and ends
+where a switching function changes its sign.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import jax.numpy as jnp
+from jax import Array
+from jax.typing import ArrayLike
+
+_open: list["Switches"] = []  # while an element is traced within a solve
+
+
+class Switches:
+    """Deals out the sides in force to the switches of elements, in their order.
+
+    `sides` (n,): 1 above and -1 below zero, 0 for the function's own sign; None: that
+    for all.
+    `values`: the switching functions as they were met; `jumping`: whether something
+    jumps with one of them.
+    """
+
+    def __init__(self, sides: Array | None):
+        self.sides, self.values, self.jumping, self._count = sides, [], False, 0
+
+    def side_of(self, g: Array, continuous: bool) -> Array:
+        self.values.append(g)
+        self.jumping |= not continuous
+        if self.sides is None:
+            return g
+        sides = self.take(g.size).reshape(g.shape)
+        return jnp.where(sides == 0, g, sides)
+
+    def take(self, count: int) -> Any:
+        """Returns the next `count` sides."""
+        begin, self._count = self._count, self._count + count
+        return None if self.sides is None else self.sides[begin : self._count]
+
+    def add(self, values: list[Array], jumping: bool) -> None:
+        """Adds switches that were met elsewhere, with the sides of `rest`."""
+        self.values += values
+        self.jumping |= jumping
+        self.take(sum(g.size for g in values))
+
+    def rest(self) -> Any:
+        return None if self.sides is None else self.sides[self._count :]
+
+    def all_values(self, dtype: Any) -> Array:
+        """Returns all switching functions met, (n,)."""
+        found = [jnp.ravel(g).astype(dtype) for g in self.values]
+        return jnp.concatenate(found) if found else jnp.zeros(0, dtype)
+
+    @contextmanager
+    def dealt(self) -> Iterator[None]:
+        """Deals out sides to the switches traced in this context."""
+        _open.append(self)
+        try:
+            yield
+        finally:
+            _open.pop()
+
+
+def switch(
+    g: ArrayLike, above: ArrayLike, below: ArrayLike, *, continuous: bool = False
+) -> Array:
+    """Returns `above` where the switching function `g` is positive, `below` elsewhere.
+
+    `g` may have any unit [for instance m, rad or N] in which it is not tiny: less than
+    1e-13 counts as 0. Adaptive steps end where `g` changes its sign, and derivatives
+    include the effect of that time. Within a step both branches are continued beyond
+    the zero of `g`, and must be smooth and finite there. For what happens at known
+    times, as in references, declare `jump_ts` instead.
+
+    `continuous`: whether the effort is the same on both sides where `g` is 0, in every
+    use of the result; programs for derivatives then compile faster.
+
+    Not within a function of its own that `jax.jit` or `jax.jvp` transforms.
+
+    >>> import fdof_jax as fj
+    >>> class Drag(fj.Element):  # air on one side, water on the other
+    ...     def __call__(self, t, q, qd, linkage):
+    ...         return -fj.forces.switch(q, 0.1, 20.0) * qd
+    >>> arm = fj.scenes.fig5().linkage
+    >>> import jax.numpy as jnp
+    >>> Drag()(0.0, jnp.array([1.0, -1, 1]), jnp.ones(3), arm).tolist()
+    [-0.1, -20.0, -0.1]
+    """
+    g = jnp.asarray(g)
+    side = _open[-1].side_of(g, continuous) if _open else g
+    return jnp.where(side > 0, above, below)
+
+
+def clip(x: ArrayLike, low: ArrayLike, high: ArrayLike) -> Array:
+    """Returns `x` clipped to [low, high]; adaptive steps end where clipping begins.
+
+    All have one unit [for instance N or N m]. At an end of the interval, the derivative
+    is that within it.
+
+    >>> import fdof_jax as fj
+    >>> fj.forces.clip([-3.0, 0.5, 3.0], -1, 2).tolist()
+    [-1.0, 0.5, 2.0]
+    """
+    x, low, high = jnp.broadcast_arrays(*map(jnp.asarray, (x, low, high)))
+    within = switch(x - high, high, x, continuous=True)
+    return switch(low - x, low, within, continuous=True)

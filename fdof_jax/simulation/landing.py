@@ -1,0 +1,142 @@
+"""Ends of steps at known times and where elements switch."""
+
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from .dopri8 import constant, with_change
+from .step_wrappers import Adaptive
+
+# So many landings in a row, with no other step between, are chatter.
+_MOST_LANDINGS = 100
+# After so many tries, what steps pass is a jump of a switching function itself. It is
+# found by halving the step.
+_MOST_TRIES = 6
+# A step ends so many units of rounding before a known time, and the next one starts as
+# many after it, so that rounding within steps does not pass it.
+_APART = 4
+
+
+def rounding(t: Array) -> Array:
+    """Returns the distance kept from known times."""
+    return _APART * jnp.finfo(t.dtype).eps * constant(jnp.abs(t))
+
+
+class _Landing(NamedTuple):
+    inner: Any
+    target: Array  # where this step is to end, infinity if anywhere
+    resumed: Array  # length of the step after it
+    crossing: Array  # end of the last step that passed a switch, -infinity if none
+    tries: Array  # to end at the next switch, up to here
+    landings: Array  # one after the other up to here
+    last: Array  # times from here on are the end of the solve for diffrax
+
+
+class Landing(Adaptive):
+    """A controller whose steps end at known times and where elements switch.
+
+    Steps that the inner controller chooses have constant lengths for derivatives: up to
+    the tolerance, the motion does not depend on where its steps end.
+    """
+
+    controller: Any
+    jumps: Array | None
+    switches: bool = eqx.field(static=True)
+
+    def _motion(self, y: Any) -> Any:
+        return y[:-1] if self.switches and y is not None else y
+
+    def _found(self, y: Any, end: Array) -> tuple[Any, ...]:
+        """Returns `until`, `soon` and `near`, and whether nothing switches here."""
+        if not self.switches:
+            return end, end, 0, False
+        known = y[-1]
+        idle = jnp.all(known.after == known.sides)
+        return known.until, known.soon, known.near, idle
+
+    def _cut(self, t0: Array, t1: Array) -> tuple[Array, Array]:
+        """Returns the end of a step, and whether it is a known time."""
+        if self.jumps is None:
+            return t1, jnp.array(False)
+        ends = self.jumps - rounding(self.jumps)
+        later = jnp.where(ends > t0 + rounding(self.jumps), ends, jnp.inf)
+        next_one = later[jnp.argmin(later)]
+        # A step must not end just before a known time.
+        reached = t1 + 1e-6 * (t1 - t0) >= next_one
+        return jnp.where(reached, next_one, t1), reached
+
+    def _gap(self, end: Array) -> Array:
+        """Returns the time left out after a step to a known time, 0 after others."""
+        if self.jumps is None:
+            return jnp.zeros_like(end)
+        apart = rounding(self.jumps)
+        return jnp.max(jnp.where(constant(self.jumps) - apart == end, 2 * apart, 0))
+
+    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):  # pyright: ignore[reportIncompatibleMethodOverride]
+        if self.switches:
+            args = args._replace(sides=y0[-1].sides)
+        end, inner = self.controller.init(
+            *constant((terms, t0, t1, self._motion(y0), dt0, args)), func, error_order
+        )
+        end, inner = constant((end, inner))
+        length = end - constant(t0)
+        end, cut = self._cut(t0, t0 + length)
+        if self.switches:  # a step of no length finds the sides
+            end, cut = t0, jnp.array(True)
+        target = jnp.where(cut, constant(end), jnp.inf)
+        # diffrax takes times less than 100 units of rounding before the end for it.
+        last = constant(t1 - 200 * jnp.finfo(t1.dtype).eps * jnp.abs(t1))
+        crossing, none = jnp.full_like(target, -jnp.inf), jnp.zeros((), int)
+        return end, _Landing(inner, target, length, crossing, none, none, last)
+
+    def adapt_step_size(  # pyright: ignore[reportIncompatibleMethodOverride]
+        self, t0, t1, y0, y1, args, y_error, error_order, state
+    ):
+        moved = *map(self._motion, (y0, y1)), with_change(y_error, self._motion)
+        y0_motion, y1_motion, error = constant(moved)
+        begin, end = constant((t0, t1))
+        keep, next0, next1, jumped, inner, result = constant(
+            self.controller.adapt_step_size(
+                begin, end, y0_motion, y1_motion, args, error, error_order, state.inner
+            )
+        )
+        aimed = end == state.target
+        until, soon, near, idle = constant(self._found(y1, end))
+        late = jnp.where(aimed, near, 0)
+        passed = keep & (until < jnp.minimum(end - late, state.last))
+        tiny = (begin < end) & (end - begin <= _APART * rounding(end))
+        passed = passed & ~(aimed & tiny)  # it ends where the switch is
+        # A step that ends before the switch is stretched to it if that is near, because
+        # a tiny second step would tell little of slopes.
+        before = keep & aimed & idle & ~passed & (end < state.crossing)
+        stretched = before & (end < soon) & (soon < state.crossing)
+        crossed, missed = passed | stretched, before & ~stretched
+        lost = state.tries > _MOST_TRIES
+        until = jnp.where(stretched, soon, jnp.where(lost, (begin + end) / 2, until))
+        landed, keep = keep & aimed & ~crossed, keep & ~crossed
+        crossing = jnp.where(keep & ~missed, -jnp.inf, state.crossing)
+        crossing = jnp.where(passed, end, crossing)
+        tries = jnp.where(keep & ~missed, 0, state.tries + crossed)
+        # The error of a step that was cut short says little about the next one.
+        short = crossed & aimed | landed
+        length = jnp.where(short, state.resumed, next1 - next0)
+        next_t0 = jnp.where(keep, t1 + (next0 - end), t0)
+        next_t0 = next_t0 + jnp.where(landed, self._gap(end), 0)
+        next_t1, cut = self._cut(next_t0, next_t0 + length)
+        next_t1 = jnp.where(crossed, until, jnp.where(missed, crossing, next_t1))
+        target = jnp.where(cut | crossed | missed, constant(next_t1), jnp.inf)
+        landings = state.landings * ~(keep & ~aimed) + crossed
+        results: Any = diffrax.RESULTS
+        unknown = crossed | landed
+        inner = jax.tree.map(
+            lambda old, new: jnp.where(unknown, old, new), state.inner, inner
+        )
+        result = results.where(unknown, results.successful, result)
+        chatter = (landings > _MOST_LANDINGS) & (result == results.successful)
+        result = results.where(chatter, results.max_steps_rejected, result)
+        state = _Landing(inner, target, length, crossing, tries, landings, state.last)
+        return keep, next_t0, next_t1, landed | jumped, state, result

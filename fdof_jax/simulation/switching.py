@@ -1,0 +1,234 @@
+"""Steps that end where elements switch between the branches of their formulas.
+
+Within a step the branches are those in force at its start, so the step's equations are
+smooth. A step over the zero of a switching function is replaced by one that ends there.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from .dopri8 import DenseOutput, constant, with_change
+from .landing import Landing, rounding
+from .step_wrappers import undifferentiated, with_pid
+from .switch_derivatives import Moment, gained, lateness_of
+from .zeros_in_steps import SAMPLED, SHARES, at_end, first_zero
+
+# What is zero around the end of a step switches there: within this power of the unit of
+# rounding, as a share of the step (1e-9 in float64).
+_NEAR = 0.575
+
+
+class Switching(NamedTuple):
+    """What is known of the switches: the last entry of the integrated state.
+
+    - `sides` (switch,): those in force in the step that ended here: 1 above and -1
+      below zero, and 0 before the start.
+    - `after`: those after a switch here.
+    - `until`: when the step should have ended; its end if nothing switched before [s].
+    - `soon`: when a switch follows soon after the end, or else the end [s].
+    - `near`: how far from its zero a switching function may switch [s].
+    - `lateness`: time of the switch here less that of the end: 0, with derivatives [s].
+    - `passed`: number of switches up to here.
+    - `grazing`, `grazing_here`: how near to grazing a crossing came so far, and one
+      here: the size of its switching function over its change per step; 0 if none.
+    """
+
+    sides: Array
+    after: Array
+    until: Array
+    soon: Array
+    near: Array
+    lateness: Array
+    passed: Array
+    grazing: Array
+    grazing_here: Array
+
+
+def located(
+    locate: Callable[[Any, bool], "Located"],
+    solver: Any,
+    controller: Any,
+    term: Any,
+    t0: Array,
+    y0: Any,
+    args: Any,
+    jumps: Any,
+) -> tuple[Any, Any, Any]:
+    """Returns solver, controller and start with steps that end where elements switch.
+
+    `jumps`: known times at which steps end too, or None. Raises ValueError if there are
+    any and steps are not adaptive.
+    """
+    if not isinstance(controller, diffrax.AbstractAdaptiveStepSizeController):
+        if jumps is not None:
+            raise ValueError(
+                "stepsize_controller: expected an adaptive one, as forces declare "
+                f"times at which they jump (jump_ts), got {controller!r}."
+            )
+        return solver, controller, y0
+    jumps = None if jumps is None else jnp.asarray(jumps, t0.dtype)
+    found, jumping = eqx.filter_eval_shape(term.switches, t0, y0, args)
+    wrapped = locate(solver, jumping)
+    switches = wrapped.needed(found.size, jumps)
+    if switches:
+        unknown, none = jnp.zeros(found.shape, t0.dtype), jnp.zeros_like(t0)
+        late = wrapped.none_late(t0)
+        known = Switching(unknown, unknown, t0, t0, none, late, none, none, none)
+        solver, y0 = wrapped, (*y0, known)
+    if jumps is None and not switches:
+        return solver, undifferentiated(controller), y0
+    landing = lambda inner: Landing(inner, jumps, switches)  # pyright: ignore[reportCallIssue]
+    return solver, _around(landing, controller), y0
+
+
+def switching_facts(*known: Switching) -> dict[str, Array]:
+    """Returns the statistics of the switches at the end of a solve."""
+    facts = {}
+    for switching in known:
+        facts["num_switches"] = switching.passed[0].astype(int)
+        facts["slowest_crossing"] = 1 / switching.grazing[0]
+    return facts
+
+
+def _around(wrapper: Callable[[Any], Any], controller: Any) -> Any:
+    """Returns a controller with its PID controllers wrapped, or else itself."""
+    wrapped = with_pid(wrapper, controller)
+    same = jax.tree.structure(wrapped) == jax.tree.structure(controller)
+    return wrapper(controller) if same else wrapped
+
+
+class Located(diffrax.AbstractAdaptiveSolver):
+    """A solver whose steps keep to branches, and tell where the first one changes."""
+
+    solver: Any
+    jumping: bool = eqx.field(static=True)  # whether efforts do, at a switch
+    derivatives: bool = eqx.field(static=True)
+
+    @property
+    def term_structure(self):  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.solver.term_structure
+
+    @property
+    def interpolation_cls(self):  # pyright: ignore
+        return self.solver.interpolation_cls
+
+    def order(self, terms):
+        return self.solver.order(terms)
+
+    def error_order(self, terms):
+        return self.solver.error_order(terms)
+
+    def func(self, terms, t0, y0, args):
+        return self.solver.func(terms, t0, y0, args)
+
+    def init(self, terms, t0, t1, y0, args):
+        *y0, known = y0
+        args = args._replace(sides=known.sides)
+        return self.solver.init(terms, t0, t1, tuple(y0), args)
+
+    def step(self, terms, t0: Any, t1: Any, y0, args, solver_state, made_jump):
+        *y0, known = y0
+        kept = lambda after, before: jnp.where(made_jump, after, before)
+        sides = kept(known.after, known.sides)
+        changed = jnp.sum((sides != known.sides) & (known.sides != 0))
+        y0, args = tuple(y0), args._replace(sides=sides)
+        y0 = self.shifted(terms.term, t0, y0, args, known, made_jump)
+        y1, error, dense, solver_state, result = self.solver.step(
+            terms, t0, t1, y0, args, solver_state, made_jump
+        )
+        path = self.interpolation_cls(t0=t0, t1=t1, **dense)
+
+        where = terms.term, t0, t1, path, args
+        seen = _values(*constant(where))
+        margins = sides[None] * seen
+        until, crossed = first_zero(margins)
+        # Lengths of steps to a switch say nothing about the pace of the motion.
+        share = jnp.finfo(t1.dtype).eps ** _NEAR
+        near = jnp.maximum(share * (t1 - t0), known.near / 2)
+        near = jnp.maximum(near, rounding(t1))
+        switched, grazing, soon = at_end(margins, near / (t1 - t0))
+        # Before the first step, whose length is 0, sides are unknown.
+        after = jnp.where(switched, -sides, sides)
+        after = jnp.where(sides == 0, jnp.where(seen[-1] > 0, 1.0, -1.0), after)
+        new = Switching(
+            sides,
+            after.astype(t0.dtype),
+            jnp.where(crossed, t0 + until * (t1 - t0), t1),
+            t1 + soon * (t1 - t0),
+            near,
+            self.lateness(where, seen, switched),
+            known.passed + changed,
+            kept(jnp.maximum(known.grazing, known.grazing_here), known.grazing),
+            grazing,
+        )
+        still = jax.tree.map(jnp.zeros_like, new)
+        if error is not None:  # None: a method without an estimate
+            error = with_change(error, lambda error: (*error, still))
+        return (*y1, new), error, dense, solver_state, result
+
+    def needed(self, count: int, jumps: Array | None) -> bool:
+        """Returns whether steps are to end at this number of switches."""
+        return count > 0
+
+    def none_late(self, t: Array) -> Array:
+        """Returns the lateness before the first step."""
+        return jnp.zeros_like(t)
+
+    def lateness(self, where: tuple, seen: Array, switched: Array) -> Array:
+        """Returns `Switching.lateness` at the end of a step."""
+        _, t0, t1, _, args = where
+        if not self.derivatives:
+            return jnp.zeros_like(t0)
+        margins = lambda: args.sides[None] * _values(*where)
+        return jax.lax.cond(
+            jnp.any(switched),
+            lambda: (t1 - t0) * lateness_of(margins(), switched),
+            lambda: jnp.zeros_like(t0),
+        )
+
+    def shifted(
+        self, term: Any, t: Array, y: Any, args: Any, known: Switching, made_jump: Any
+    ) -> Any:
+        """Returns the state at the start of a step, changed by a switch there."""
+        if not self.derivatives:
+            return y
+        late = jnp.where(made_jump, known.lateness, 0)
+        moment = Moment(t, y, args, known.sides, known.after, jnp.array(made_jump))
+        gain = gained(late, moment, term=term, jumping=self.jumping)
+        return jax.tree.map(jnp.add, y, gain)
+
+
+class LocatedImplicit(Located, diffrax.AbstractImplicitSolver):
+    """An implicit solver with switches, whose tolerances diffrax sets."""
+
+    @property
+    def root_finder(self):  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.solver.root_finder
+
+    @property
+    def root_find_max_steps(self):  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.solver.root_find_max_steps
+
+
+@eqx.filter_jit  # traced once, not at each use in a solve
+def _values(term: Any, t0: Array, t1: Array, path: Any, args: Any) -> Array:
+    """Returns the switching functions at the samples of a step."""
+    shares = jnp.asarray(SHARES, t0.dtype)
+    times = t0 + shares * (t1 - t0)
+    if isinstance(path, DenseOutput):
+        stages = np.array(SAMPLED)
+        scheduled = jax.tree.map(lambda rows: rows[stages], path.scheduled)
+        found = jax.vmap(
+            lambda share, t, row: term.switching(t, path.at(share), args, row)[0]
+        )(shares, times, scheduled)
+    else:
+        found = jax.vmap(lambda t: term.switches(t, path.evaluate(t), args)[0])(times)
+    # An infinite limit is never reached.
+    return jnp.where(jnp.isinf(found), jnp.sign(found), found)

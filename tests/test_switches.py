@@ -1,0 +1,197 @@
+"""Motions whose elements switch: where steps end, and derivatives through switches."""
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import fdof_jax as fj
+from fdof_jax.simulation.looped_dopri8 import LoopedDopri8
+from fdof_jax.simulation.sensitivities import sensitivities
+
+ARM = fj.Linkage(
+    "RRR", length=[0, 1, 1, 1], com=[[0.5, 0]] * 3, mass=[1, 1, 1], inertia=[0.1] * 3
+)
+FORWARD = diffrax.ForwardMode()
+
+
+class Case(eqx.Module):
+    """Numbers of a scene that has all elements: a limited PD and a damped contact."""
+
+    gain: float
+    contact: float
+    side: int
+    rest: float
+    end: float
+
+
+LIMITED = Case(1.0, 0.0, 1, 1.9, 1.0)
+CABLE = Case(0.0, 1.0, 1, 1.9, 0.8)
+BUMPER = Case(0.0, 1.0, -1, 1.6, 0.8)
+CASES = jax.tree.map(lambda *a: np.array(a), LIMITED, CABLE, BUMPER)
+# Of the last positions: Richardson differences of tight solves. What varies is the time
+# at which the limited move begins, or the first angle of a fall to the cable.
+PUBLISHED = [[-0.459781, 0.642768, 0.038107], [0.587835, 0.200989, 0.206584]]
+
+
+def scene(x, case):
+    limited = case.gain > 0
+    q0, qd0 = jnp.array([0.2, 0.4, -0.3]), jnp.array([0.3, -0.5, 0.4])
+    begin = jnp.where(limited, x, 0.1)
+    travel = fj.references.Travel(0.7, begin=begin, profile="trapezoidal")
+    move = fj.references.JointMove(q0, q0 + 0.5, travel)
+    pd = fj.PDController(80 * case.gain, 8 * case.gain, 10, move)
+    spring = fj.SpringDamper(
+        fj.Point(0, 0.0, 1.0), fj.Point(1, 1.0), one_sided="cable",
+        stiffness=200 * case.contact, damping=20 * case.contact, rest_length=case.rest,
+    )  # fmt: skip
+    spring = eqx.tree_at(lambda spring: spring.side, spring, jnp.asarray(case.side))
+    fall = jnp.zeros(3).at[0].set(x)
+    start = fj.State(jnp.where(limited, q0, fall), jnp.where(limited, qd0, 0))
+    return fj.Scene(ARM, start, (pd, spring, fj.JointDamper(case.contact)), case.end)
+
+
+def motion(x, case, **options):
+    arm, start, forces, end = scene(x, case)
+    ts = jnp.stack([jnp.zeros_like(end), jnp.asarray(end)])
+    return fj.simulate(arm, start, ts, forces, **options)
+
+
+@jax.jit
+def slopes(x, tolerance):
+    """Derivatives of the last positions (case, joint), and the motions."""
+
+    def end(x, case):
+        found = motion(x, case, adjoint=FORWARD, rtol=tolerance, atol=tolerance)
+        return found.q[-1], found
+
+    return jax.vmap(lambda case: jax.jacfwd(end, has_aux=True)(x, case))(CASES)
+
+
+def differences(function, x, h):
+    """Returns a derivative by differences, extrapolated from two lengths of step."""
+    slope = lambda h: (function(x + h) - function(x - h)) / (2 * h)
+    return (4 * slope(h / 2) - slope(h)) / 3
+
+
+def test_derivatives_are_those_of_tight_differences():
+    found, motions = slopes(0.1, 1e-11)
+    np.testing.assert_allclose(found[:2], PUBLISHED, atol=1e-6)
+    assert (motions.stats["num_switches"] >= 1).all()
+    tight = lambda x: slopes(x, 1e-13)[1].q[:, -1]
+    exact = differences(tight, 0.1, 1e-4)[1:]  # a move's start is a kink of its own
+    np.testing.assert_allclose(found[1:], exact, atol=1e-8)
+
+
+def test_members_of_a_batch_equal_single_motions_which_tell_of_switches():
+    alone = motion(0.1, CABLE)
+    np.testing.assert_allclose(slopes(0.1, 1e-11)[1].q[1, -1], alone.q[-1], atol=1e-9)
+    assert alone.stats["num_switches"] == 2
+    assert 0.1 < alone.stats["slowest_crossing"] < 10
+    free = fj.simulate(ARM, fj.State(jnp.zeros(3), jnp.zeros(3)), [0, 0.1])
+    assert "num_switches" not in free.stats
+
+
+def test_the_variational_equations_are_those_of_the_motion():
+    found = jax.jit(
+        lambda z: sensitivities(
+            lambda z: scene(z[0], CABLE),
+            lambda scene, solution: solution.q[-1],
+            z,
+            jnp.array([0.0, 0.8]),
+            1e-10,
+        )
+    )(jnp.array([0.1]))
+    np.testing.assert_allclose(found.jacobian[:, 0], PUBLISHED[1], atol=1e-6)
+
+
+class Pulse(eqx.Module):
+    """A torque on the first joint for a time, from a time that it declares."""
+
+    begin: jax.Array
+    length: float = 0.02
+
+    def __call__(self, t, q, qd, linkage):
+        on = (t >= self.begin) & (t < self.begin + self.length)
+        return jnp.where(on, 50.0, 0.0) * jnp.array([1.0, 0, 0])
+
+    @property
+    def jump_ts(self):
+        return self.begin + jnp.array([0, self.length])
+
+
+@pytest.mark.slow
+def test_derivatives_in_the_time_of_a_pulse():
+    start = fj.State(jnp.zeros(3), jnp.zeros(3))
+    scene = lambda begin: fj.Scene(ARM, start, (Pulse(begin),), 0.5)
+    end = lambda x: fj.simulate(
+        ARM, start, [0, 0.5], (Pulse(x),), rtol=1e-12, atol=1e-12
+    ).q[-1]
+    found = sensitivities(
+        lambda z: scene(z[0]),
+        lambda scene, solution: solution.q[-1],
+        jnp.array([0.2]),
+        jnp.array([0.0, 0.5]),
+        1e-10,
+    )
+    exact = differences(end, 0.2, 1e-3)
+    np.testing.assert_allclose(found.jacobian[:, 0], exact, atol=1e-6)
+
+
+class Rough(fj.Element):
+    """Friction that is greater in one half of the range, by a jump."""
+
+    def __call__(self, t, q, qd, linkage):
+        return -fj.forces.switch(q - 0.1, 4.0, 0.5) * qd
+
+
+@pytest.mark.slow
+def test_both_modes_second_derivatives_and_other_solvers():
+    start = fj.State(jnp.zeros(3), jnp.array([1.0, -1, 1]))
+
+    def end(x, tolerance=1e-12, **options):
+        state = start._replace(q=start.q + x)
+        return fj.simulate(
+            ARM, state, [0, 0.5], (Rough(),), rtol=tolerance, atol=tolerance, **options
+        ).q[-1]
+
+    forward = jax.jit(jax.jacfwd(lambda x: end(x, adjoint=FORWARD)))
+    slope = forward(0.0)
+    weights = jnp.array([0.3, -0.5, 0.7])
+    adjoint = diffrax.RecursiveCheckpointAdjoint(checkpoints=200)
+    backward = jax.jit(jax.grad(lambda x: weights @ end(x, adjoint=adjoint)))(0.0)
+    np.testing.assert_allclose(backward, weights @ slope, rtol=1e-10)
+    twice = jax.jit(jax.jacfwd(jax.jacfwd(lambda x: end(x, adjoint=FORWARD))))(0.0)
+    exact = differences(forward, 0.0, 1e-4)
+    np.testing.assert_allclose(twice, exact, rtol=1e-5)
+    other = lambda x: end(x, 1e-9, adjoint=FORWARD, solver=diffrax.Tsit5())
+    found = jax.jit(jax.jacfwd(other))(0.0)
+    np.testing.assert_allclose(found, slope, atol=1e-6)
+
+
+class BangBang(fj.Element):
+    """Efforts that push every joint towards rest, from both sides alike."""
+
+    level: fj.Values = fj.field((), unit="N m", minimum=0)
+
+    def __call__(self, t, q, qd, linkage):
+        return -fj.forces.switch(qd, self.level, -self.level)
+
+
+def test_chatter_is_named_and_spoils_no_other_member():
+    start = fj.State(jnp.array([-1.5, 0, 0]), jnp.array([0.5, 0.1, -0.2]))
+    motion = lambda level: fj.simulate(
+        ARM, start, [0, 0.1], (BangBang(level),), throw=False, solver=LoopedDopri8()
+    )
+    found = jax.jit(jax.vmap(motion))(jnp.array([0.0, 100.0]))
+    assert found.outcome.tolist() == ["successful", "too many switches"]
+    assert jnp.isfinite(found.q[0]).all()
+
+
+def test_outside_of_a_solve_a_switch_is_a_choice():
+    found = fj.forces.switch(jnp.array([-1.0, 0, 1]), 5.0, 7.0)
+    assert found.tolist() == [7, 7, 5]
+    clipped = fj.forces.clip(jnp.array([-3.0, 0.5, 3]), -1, 2)
+    assert clipped.tolist() == [-1, 0.5, 2]
