@@ -171,4 +171,9 @@ def test_league(tmp_path, capsys):
     errors = [float(row.split()[2]) for row in table]
     assert sorted(names) == sorted(fj.TOPOLOGIES) and errors == sorted(errors)
     assert errors[0] < 5 and errors[-1] < 60
-    assert [*fj.load(tmp_path / "league.fdof")] == [*fj.TOPOLOGIES]
+    together = fj.load(tmp_path / "league.fdof")
+    assert [*together] == [*fj.TOPOLOGIES]
+    # One program tunes all, each as it is tuned alone.
+    alone = fj.tune(fj.tuning.circle_scenes()["PPR"])
+    np.testing.assert_allclose(together["PPR"].gains, alone.gains, rtol=1e-3)
+    assert together["PPR"].loss == pytest.approx(alone.loss, rel=1e-4)

@@ -1,5 +1,6 @@
 """Efforts given at times: interpolated between them, constant before and after."""
 
+import diffrax
 import equinox as eqx
 import jax
 import numpy as np
@@ -32,12 +33,14 @@ def momentum(linkage, q, qd):
 def test_the_momentum_gained_is_the_integral_of_the_efforts():
     linkage = eqx.tree_at(lambda k: k.gravity, arm("PRR"), 0.0)
     forces = (fj.forces.EffortHistory(TS, TAU),)
-    solution = fj.simulate(linkage, START, [0, 0.7], forces)
-    end = momentum(linkage, solution.q[-1], solution.qd[-1])
     # Trapezia, and the constant efforts before and after.
     weights = np.array([0.1 + 0.075, 0.1, 0.025 + 0.16, 0.16 + 0.08])
-    gained = end - momentum(linkage, *START)
-    np.testing.assert_allclose(gained, weights @ TAU[:, 0], atol=1e-8)
+    expected = momentum(linkage, *START) + weights @ TAU[:, 0]
+    fixed = dict(stepsize_controller=diffrax.ConstantStepSize(), dt0=0.01)
+    for steps in ({}, fixed):  # those end at the times too, and round
+        solution = fj.simulate(linkage, START, [0, 0.7], forces, **steps)
+        end = momentum(linkage, solution.q[-1], solution.qd[-1])
+        np.testing.assert_allclose(end, expected, atol=1e-8)
 
 
 @pytest.mark.parametrize(

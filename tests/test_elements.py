@@ -86,6 +86,13 @@ def all_acts(linkage, forces, t, q, qd, grown):
     return jnp.concatenate([jnp.ravel(leaf) for leaf in leaves])
 
 
+def acts_of_all():
+    """Returns what all elements do at a moment, by one program."""
+    forces = jax.tree.map(jnp.asarray, tuple(elements.ALL.values()))
+    start = map(jnp.asarray, elements.START)
+    return jax.jit(all_acts)(ARM, forces, jnp.array(0.1), *start, 0.1)
+
+
 def slopes_and_differences(both, ones):
     """Returns derivatives and differences by columns, from one compiled program."""
     h, still = 1e-5, jnp.zeros_like(ones)

@@ -56,18 +56,6 @@ def test_reachable_says_when():
             assert not there
 
 
-@pytest.mark.slow
-def test_all_are_tuned_in_one_program_and_as_they_are_alone():
-    few = {name: SCENES[name]._replace(t1=1.0) for name in ("RPR", "PPR")}
-    together = fj.tuning.tune_each(few, max_steps=4)
-    alone = fj.tune(few["PPR"], max_steps=4)
-    np.testing.assert_allclose(together["PPR"].gains, alone.gains, rtol=1e-3)
-    assert together["PPR"].loss == pytest.approx(alone.loss, rel=1e-4)
-    table = fj.tuning.league_table(together).splitlines()
-    assert [row.split()[0] for row in table[2:]] == ["PPR", "RPR"]
-    assert f"{1e3 * together['RPR'].tip_error:.4g}" in table[3]
-
-
 def test_scenes_that_cannot_be_tuned_together():
     with pytest.raises(ValueError, match="scenes: expected a list"):
         fj.tuning.tune_each(SCENES["RRR"])

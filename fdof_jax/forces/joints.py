@@ -55,7 +55,7 @@ class JointEffort(ScalarElement):
 class EffortHistory(ScalarElement):
     """Joint efforts given at times: linear in between, constant before and after.
 
-    Adaptive steps end at the times.
+    Adaptive steps end at the times; fixed ones may pass over them.
 
     **Arguments:** `ts`: increasing times, one or more [s]; `tau`: the efforts at `ts`,
     (time, joint) [N or N m].

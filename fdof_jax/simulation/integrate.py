@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from ..forces.joints import EffortHistory
 from ..forces.part import jumps_of
 from ..linkage.linkage import possible, without_fixed
 from ..mechanics.equations import zeros
@@ -83,9 +84,11 @@ def integrate(
     implicit = isinstance(solver, diffrax.AbstractImplicitSolver)
     wrapper: Any = LocatedImplicit if implicit else Located
     locate = lambda *known: wrapper(*known, derivatives)
-    start = term, ts[0], y0, args, jumps_of(*forces)
-    located_solver, controller, y0 = located(locate, solver, controller, *start)
     adaptive = isinstance(controller, diffrax.AbstractAdaptiveStepSizeController)
+    # Fixed steps may pass over the kinks of a history, but over no jump.
+    jumping = (e for e in forces if adaptive or not isinstance(e, EffortHistory))
+    start = term, ts[0], y0, args, jumps_of(*jumping)
+    located_solver, controller, y0 = located(locate, solver, controller, *start)
     if adaptive:
         controller = Recorded(controller)  # pyright: ignore[reportCallIssue]
         if not isinstance(solver, UnrolledDopri8 | LoopedDopri8):
