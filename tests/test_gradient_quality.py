@@ -130,6 +130,9 @@ def test_the_report_is_what_it_says(report):
     assert "while actuators are at their limits:" in str(report)
     assert f"{report.error:.1e} of its norm" in str(report)
     assert report.modes.eigenvalues.shape == (101, 6)
+    # The slide leaves its limit, and comes back to it, a few times.
+    assert 1 <= report.switches < 20 and 0.01 < report.slowest_crossing < 100
+    assert f"{report.switches} switches between" in str(report)
 
 
 def test_a_report_says_where_gains_have_no_effect():

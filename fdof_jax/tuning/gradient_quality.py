@@ -20,6 +20,8 @@ _HORIZONS = 10
 # The step of the differences in the log-gains. The error of the extrapolated
 # differences is of fourth order in it; their noise is that of the loss over the step.
 _STEP = 1e-2
+# Slower crossings are near to grazing, where no derivative exists.
+_SLOW = 0.01
 
 
 class GradientReport(eqx.Module):
@@ -39,6 +41,9 @@ class GradientReport(eqx.Module):
       that have a state of their own or prescribe a motion.
     - `at_limit`: whether any actuator is at its limit, and so does not control its
       joint, at each of these times (101,).
+    - `switches`, `slowest_crossing`: how often an element switches to another branch of
+      its formula, and the least speed of a switching function at its zero, over its
+      size in a step (infinite without switches): near 0, a contact grazes.
     - `warnings`: what to beware of, in words.
     """
 
@@ -51,6 +56,8 @@ class GradientReport(eqx.Module):
     modes: Modes | None
     at_limit: Bool[np.ndarray, " time"]
     warnings: list[str]
+    switches: int = 0
+    slowest_crossing: float = np.inf
 
     def __str__(self) -> str:
         along = "  ".join(
@@ -75,6 +82,11 @@ class GradientReport(eqx.Module):
                         f"least damping ratio while actuators are {when} their limits: "
                         f"{np.nanmin(damping[times]):.2g}"
                     )
+        if self.switches:
+            lines.append(
+                f"{self.switches} switches between branches of formulas, the slowest "
+                f"crossing at {self.slowest_crossing:.2g} of its size per step"
+            )
         return "\n".join(lines + self.warnings)
 
 
@@ -88,12 +100,16 @@ def _tangents(scene: Scene) -> tuple[Array, Array, Array, Solution]:
     return found.residuals, found.jacobian, demands, found.solution
 
 
+def _motion(scene: Scene) -> Solution:
+    """The motion by a plain call of `simulate`."""
+    ts = np.linspace(0, float(scene.t1), SAMPLES)
+    return simulate(scene.linkage, scene.state0, ts, scene.forces, throw=False)
+
+
 def _loss(scene: Scene, gains: np.ndarray) -> float:
-    """The mean squared tip error with other gains, by a plain call of `simulate`."""
+    """The mean squared tip error with other gains."""
     trial = with_gains(scene, jnp.asarray(gains))
-    ts = np.linspace(0, float(trial.t1), SAMPLES)
-    solution = simulate(trial.linkage, trial.state0, ts, trial.forces, throw=False)
-    return float(np.sum(np.square(tip_errors(trial, solution))))
+    return float(np.sum(np.square(tip_errors(trial, _motion(trial)))))
 
 
 def gradient_report(scene: Scene) -> GradientReport:
@@ -139,6 +155,8 @@ def gradient_report(scene: Scene) -> GradientReport:
     modes = None
     if depends_on_state_alone(scene.forces):
         modes = closed_loop_modes(scene.linkage, scene.forces, few)
+    stats = _motion(scene).stats
+    slowest = float(stats.get("slowest_crossing", np.inf))
     return GradientReport(
         gradient=gradient,
         differences=differences,
@@ -148,11 +166,13 @@ def gradient_report(scene: Scene) -> GradientReport:
         saturated=saturated,
         modes=modes,
         at_limit=at_limit.any(axis=1)[::10],
-        warnings=_warnings(scene, gradient, saturated, error),
+        switches=int(stats.get("num_switches", 0)),
+        slowest_crossing=slowest,
+        warnings=_warnings(scene, gradient, saturated, error, slowest),
     )
 
 
-def _warnings(scene: Scene, gradient, saturated, error) -> list[str]:
+def _warnings(scene: Scene, gradient, saturated, error, slowest) -> list[str]:
     names, words = joint_names(scene.linkage), []
     for joint, share in enumerate(saturated):
         if share == 1 and not gradient[:, joint].any():
@@ -165,6 +185,10 @@ def _warnings(scene: Scene, gradient, saturated, error) -> list[str]:
                 f"{names[joint]} is at its limit for {100 * share:.3g} % of the time, "
                 "in which its gains have no effect"
             )
+    if slowest < _SLOW:
+        words.append(
+            "a switch nearly grazes: derivatives hold in a small neighbourhood only"
+        )
     if not error < 1e-3:
         words.append(
             "gradient and differences disagree: the loss may not be smooth here, or "
