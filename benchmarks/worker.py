@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 # XLA uses the widest vectors of a processor only when told to.
+# XLA of jaxlib 0.6 to 0.12 knows it. An XLA that does not would end the job.
 XLA_FLAGS = "--xla_cpu_prefer_vector_width=512"
 TWO_DEVICES = "--xla_force_host_platform_device_count=2"
 

@@ -17,7 +17,8 @@ from pathlib import Path
 
 import heyoka as hy
 import numpy as np
-from make_reference import PARAMETERS, USUAL, heavy_tip, lagrange, motion
+from make_reference import PARAMETERS, lagrange, motion
+from reference_scenes import USUAL, heavy_tip
 from scipy.integrate import solve_ivp
 
 TARGET = [-0.4, 0.2, 0.3]  # what the controllers hold [rad]
