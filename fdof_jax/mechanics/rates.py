@@ -28,6 +28,10 @@ from .equations import (
 )
 from .solve import Matrix, divided, fused, minus, solver_of, times, with_added
 
+# So many joints at most have accelerations and conditioning in one loop. XLA on CPU
+# cuts a longer expression into many loops, which evaluate the sines 40 times.
+_MOST_TOGETHER = 7
+
 
 def _rates(
     reciprocal: Callable,
@@ -243,6 +247,9 @@ def rates_and_conditioning(
     The amplifications are 1 over the `inertia_ratios`, 0 at fixed pairs, infinite where
     the mass matrix is not positive definite, and constant for derivatives.
     """
+    if len(delta) > _MOST_TOGETHER:
+        values = fused(_rates)(c, delta, qd, tau, added)
+        return values, conditioning(c, delta, added)
     qd, qdd, losses = fused(_rates_and_conditioning)(c, delta, qd, tau, added)
     return (qd, qdd), losses
 
