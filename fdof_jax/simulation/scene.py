@@ -10,9 +10,10 @@ import numpy as np
 from jax import Array
 
 from ..checks import instance
-from ..forces.element import Forces
+from ..forces.element import Forces, elements
+from ..forces.part import sized
 from ..linkage.coordinates import State
-from ..linkage.linkage import Linkage
+from ..linkage.linkage import Linkage, joints_of
 
 
 class Scene(NamedTuple):
@@ -31,6 +32,15 @@ class Scene(NamedTuple):
     state0: State
     forces: Forces
     t1: float | Array
+
+
+def of_full_size(scene: Scene) -> Scene:
+    """Returns the scene with an entry per joint in all of its elements' fields.
+
+    Programs then do not depend on how the numbers were given.
+    """
+    forces, n = elements("forces", scene.forces), joints_of(scene.linkage)
+    return scene._replace(forces=tuple(sized(element, n) for element in forces))
 
 
 def is_number(leaf: Any) -> bool:
