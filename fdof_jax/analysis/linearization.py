@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from ..checks import in_order, instance, is_traced, real_array
 from ..dynamics import forward_dynamics
-from ..forces.element import Element, Forces, elements_on
+from ..forces.element import Element, Forces, elements_on, of_full_size
 from ..linkage.coordinates import State, real_state
 from ..linkage.linkage import Linkage, check_linkage, without_fixed
 from ..simulation.field import element_effort, stateful
@@ -45,7 +45,7 @@ def checked(linkage: Linkage, forces: Forces) -> tuple[Element, ...]:
     check_linkage(linkage)
     found = elements_on(linkage, forces)
     if depends_on_state_alone(found):
-        return found
+        return of_full_size(linkage, found)
     raise ValueError(
         "forces: expected elements without a state of their own and no "
         f"PrescribedMotion, got {forces!r}."

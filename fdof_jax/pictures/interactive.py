@@ -20,7 +20,7 @@ from ..linkage.linkage import joint_names, joints_of
 from ..names import optional_package
 from ..references.reference import reference_of
 from ..simulation.html_table import html_table
-from ..simulation.scene import Scene, of_full_size
+from ..simulation.scene import Scene, with_full_size
 from ..simulation.simulate import solve_options
 from ..simulation.solution import Solution
 from ..simulation.solve import solve
@@ -68,7 +68,7 @@ def _set(scene: Scene, stretch: Array, factor: Array) -> tuple[Scene, Array, Any
     task: Any = controller_of(scene).reference
     positions, _ = jax.vmap(lambda t: task(t, linkage))(ts)
     possible = jnp.isfinite(positions).all(axis=1)
-    return of_full_size(scene), ts, (jax.vmap(task.tip)(ts), possible)
+    return with_full_size(scene), ts, (jax.vmap(task.tip)(ts), possible)
 
 
 def _moved(scene: Scene, stretch: Array, factor: Array) -> _Moved:

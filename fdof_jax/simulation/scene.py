@@ -10,10 +10,9 @@ import numpy as np
 from jax import Array
 
 from ..checks import instance
-from ..forces.element import Forces, elements
-from ..forces.part import sized
+from ..forces.element import Forces, elements, of_full_size
 from ..linkage.coordinates import State
-from ..linkage.linkage import Linkage, joints_of
+from ..linkage.linkage import Linkage
 
 
 class Scene(NamedTuple):
@@ -34,13 +33,10 @@ class Scene(NamedTuple):
     t1: float | Array
 
 
-def of_full_size(scene: Scene) -> Scene:
-    """Returns the scene with an entry per joint in all of its elements' fields.
-
-    Programs then do not depend on how the numbers were given.
-    """
-    forces, n = elements("forces", scene.forces), joints_of(scene.linkage)
-    return scene._replace(forces=tuple(sized(element, n) for element in forces))
+def with_full_size(scene: Scene) -> Scene:
+    """Returns the scene with forces of full size."""
+    forces = elements("forces", scene.forces)
+    return scene._replace(forces=of_full_size(scene.linkage, forces))
 
 
 def is_number(leaf: Any) -> bool:
