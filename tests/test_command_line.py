@@ -64,18 +64,34 @@ def test_topologies(tmp_path):
 
 @pytest.mark.slow
 def test_tuning_of_an_ensemble(tmp_path, capsys):
-    circle = ["--radius", "0.5", "--period", "1", "--factor", "3", "--price", "0.01"]
-    ensemble = ["--over", "worst", "--members", "2", "--payload", "0", "1"]
+    circle = "--radius 0.5 --period 1 --factor 3 --max-steps 2"
+    # As in test_ensembles.py, whose program it shares.
+    payload, others = "--payload 0 1", "--link-error 0.1 --start-offset 0.3 --speed 1 2"
+    ensemble = f"--over worst --members 3 {payload} {others}"
     folder = ["--output", str(tmp_path)]
-    main(["tune", *folder, *circle, *ensemble, "--max-steps", "2"])
-    assert "over 2 members" in capsys.readouterr().out
+    main(["tune", *folder, *circle.split(), *ensemble.split()])
+    assert "over 3 members" in capsys.readouterr().out
     assert "circle-path.png" in pictures(tmp_path)
     tuned = fj.load(tmp_path / "tuned.fdof")
     task = tuned.scene.forces[0].reference
     assert (task.radius, task.period, tuned.scene.t1) == (0.5, 1, 2)
-    assert tuned.settings["over"] == "worst" and len(tuned.member_loss) == 2
+    assert tuned.settings["over"] == "worst" and len(tuned.member_loss) == 3
     assert len(tuned.history.loss) <= 3
     np.testing.assert_allclose(tuned.upper, 9 * tuned.lower)
+
+
+def test_a_price_of_effort_is_in_the_loss(tmp_path, monkeypatch):
+    losses = []
+
+    def tune(scene, *, loss, **keywords):
+        losses.append(loss)
+        raise ValueError("known by now")
+
+    monkeypatch.setattr("fdof_jax.shell.commands.tune", tune)
+    with pytest.raises(SystemExit):
+        main(["tune", "--output", str(tmp_path), "--price", "0.01"])
+    (loss,) = losses
+    assert isinstance(loss, fj.tuning.Tracking) and loss.effort == 0.01
 
 
 # Calls that need no JAX: the arguments, the exit status and part of the message.

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from ..checks import in_order, instance, is_traced, real_array
 from ..dynamics import forward_dynamics
-from ..forces.element import Element, Forces, elements_on
+from ..forces.element import Element, Forces, elements_on, of_full_size
 from ..linkage.coordinates import State, real_state
 from ..linkage.linkage import Linkage, check_linkage, without_fixed
 from ..simulation.field import element_effort, stateful
@@ -45,7 +45,7 @@ def checked(linkage: Linkage, forces: Forces) -> tuple[Element, ...]:
     check_linkage(linkage)
     found = elements_on(linkage, forces)
     if depends_on_state_alone(found):
-        return found
+        return of_full_size(linkage, found)
     raise ValueError(
         "forces: expected elements without a state of their own and no "
         f"PrescribedMotion, got {forces!r}."
@@ -105,12 +105,11 @@ def _linearized(
 
 @eqx.filter_jit
 def _each_linearized(
-    linkage: Linkage, forces: Forces, solution: Solution
+    linkage: Linkage, forces: Forces, *rows: Array
 ) -> Float[Array, "time state state"]:
-    """Returns A at each time of a motion."""
+    """Returns A for rows of positions, velocities and times."""
     # A loop compiles in two thirds of the time of `jax.vmap`, and runs four times as
     # fast (101 times of Fig 7, one core).
-    rows = solution.q, solution.qd, solution.ts
     return jax.lax.map(lambda row: _linearized(linkage, forces, *row).A, rows)
 
 
@@ -179,7 +178,9 @@ def closed_loop_modes(linkage: Linkage, forces: Forces, solution: Solution) -> M
             f"positions {solution.q}."
         )
     check_joints("solution", solution, linkage)
-    A = np.asarray(_each_linearized(linkage, forces, solution))
+    # Without its statistics: solvers differ in them, and need no program each.
+    rows = solution.q, solution.qd, solution.ts
+    A = np.asarray(_each_linearized(linkage, forces, *rows))
     known = np.isfinite(A).all(axis=(1, 2))
     values = np.full(A.shape[:2], np.nan, complex)
     values[known] = np.linalg.eigvals(A[known])

@@ -14,9 +14,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jax import Array
 
-from ..linkage.linkage import Linkage
+from ..linkage.linkage import Linkage, joints_of
 from ..mechanics.equations import Scalars
-from .part import Foreign, Part, check_joints, default, optional
+from .part import Foreign, Part, check_joints, default, optional, sized
 
 Forces = tuple[Any, ...]  # elements, or callables (t, q, qd, linkage) -> tau
 
@@ -119,6 +119,14 @@ def elements_on(linkage: Linkage, forces: Any) -> tuple[Element, ...]:
     for index, element in enumerate(found):
         check_joints(f"forces[{index}].", element, linkage)
     return found
+
+
+def of_full_size(linkage: Linkage, forces: tuple[Element, ...]) -> tuple[Element, ...]:
+    """Returns elements with an entry per joint where they have one number for all.
+
+    Programs then do not depend on how the numbers were given.
+    """
+    return tuple(sized(element, joints_of(linkage)) for element in forces)
 
 
 @contextmanager

@@ -9,7 +9,13 @@ from jax import Array
 from jaxtyping import Float
 
 from ..checks import instance, place_of
-from ..forces.element import Element, Forces, StatefulElement, elements_on
+from ..forces.element import (
+    Element,
+    Forces,
+    StatefulElement,
+    elements_on,
+    of_full_size,
+)
 from ..linkage.linkage import Linkage, check_linkage, without_fixed
 from .field import element_effort
 from .prescribed import prescribed, prescribed_effort
@@ -56,7 +62,7 @@ def joint_efforts(linkage: Linkage, forces: Forces, solution: Solution) -> Effor
         )
     check_joints("solution", solution, linkage)
     check_own("solution.own", solution.own, forces, linkage, solution.ts.shape)
-    return _efforts(linkage, forces, solution)
+    return _efforts(linkage, of_full_size(linkage, forces), solution)
 
 
 @eqx.filter_jit

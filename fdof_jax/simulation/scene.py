@@ -10,7 +10,7 @@ import numpy as np
 from jax import Array
 
 from ..checks import instance
-from ..forces.element import Forces
+from ..forces.element import Forces, elements, of_full_size
 from ..linkage.coordinates import State
 from ..linkage.linkage import Linkage
 
@@ -31,6 +31,12 @@ class Scene(NamedTuple):
     state0: State
     forces: Forces
     t1: float | Array
+
+
+def with_full_size(scene: Scene) -> Scene:
+    """Returns the scene with forces of full size."""
+    forces = elements("forces", scene.forces)
+    return scene._replace(forces=of_full_size(scene.linkage, forces))
 
 
 def is_number(leaf: Any) -> bool:

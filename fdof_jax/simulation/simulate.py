@@ -11,10 +11,17 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from ..checks import increasing, instance, is_traced, real_array, whole_number
-from ..forces.element import Element, Forces, elements, elements_on, naming
-from ..forces.part import check_values, sized
+from ..forces.element import (
+    Element,
+    Forces,
+    elements,
+    elements_on,
+    naming,
+    of_full_size,
+)
+from ..forces.part import check_values
 from ..linkage.coordinates import State, real_state
-from ..linkage.linkage import Linkage, check_linkage, joints_of, possible
+from ..linkage.linkage import Linkage, check_linkage, possible
 from ..xla.array_namespace import in_numpy
 from .field import initial_states
 from .prescribed import prescribed
@@ -163,7 +170,7 @@ def simulate(
         progress_meter=progress_meter,
     )
     check_elements(forces, linkage, ts)
-    forces = tuple(sized(element, joints_of(linkage)) for element in forces)
+    forces = of_full_size(linkage, forces)
     motion = prescribed(forces)
     if motion is not None and not is_traced(linkage, state0, ts, motion):
         if not motion.agrees(np.asarray(ts)[0], jnp.asarray(state0.q), linkage):

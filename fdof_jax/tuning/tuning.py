@@ -11,7 +11,7 @@ from ..checks import function, keywords_as, one_of, real_array, whole_number
 from ..search.bounded import Row, Run, best_of, minimise
 from ..search.lanes import Lanes
 from ..search.methods import METHODS
-from ..simulation.scene import Scene, stacked, unstacked
+from ..simulation.scene import Scene, stacked, unstacked, with_full_size
 from ..simulation.sensitivities import TOLERANCE
 from .gains import SAMPLES, bounds_of, check_alike, check_tuned, evaluate_gains
 from .losses import Loss, Tracking, tip_errors
@@ -65,7 +65,7 @@ def _search(
                 check_tuned(f"ensemble[{i}]", member, loss)
             check_alike(f"ensemble[{i}]", member, scenes[0])
     problems = [
-        [(member, loss, lower > 0) for member in row]
+        [(with_full_size(member), loss, lower > 0) for member in row]
         for row, loss, (_, lower, _) in zip(members, losses, boxes)
     ]
     lanes = Lanes(evaluate_gains, problems, starts, {"mean": 1, "worst": _WORST}[over])
