@@ -14,15 +14,16 @@ import fdof_jax as fj
 from hard.scenes import START, TARGET, arm
 
 NAN, INF = np.nan, np.inf
+# From NumPy: JAX's arrays full of a plain number would take programs of their own.
 GOOD = dict(
-    ef=fj.existence_factors("RRR"),
-    mass=jnp.ones(3),
-    length=jnp.array([0.0, 1, 1, 1]),
-    q=jnp.asarray(START.q),
-    qd=jnp.zeros(3),
-    ts=jnp.linspace(0, 1, 5),
-    kp=jnp.full(3, 10.0),
-    limit=jnp.full(3, 10.0),
+    ef=np.asarray(fj.existence_factors("RRR")),
+    mass=np.ones(3),
+    length=np.array([0.0, 1, 1, 1]),
+    q=START.q,
+    qd=np.zeros(3),
+    ts=np.linspace(0, 1, 5),
+    kp=np.full(3, 10.0),
+    limit=np.full(3, 10.0),
 )
 
 
@@ -66,7 +67,7 @@ CASES = {
 @pytest.mark.parametrize("name, value", CASES.values(), ids=CASES)
 def test_traced_values_that_no_door_sees(name, value):
     """Nothing can be raised for one member of a batch; its result reports the fault."""
-    solution = traced(**GOOD | {name: jnp.asarray(value, float)})
+    solution = traced(**GOOD | {name: np.asarray(value, float)})
     expected = ["not finite", "ill-conditioned"]
     if name == "ts":
         expected += ["out of steps", "tolerance out of reach", "solver failed"]
