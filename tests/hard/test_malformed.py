@@ -4,6 +4,8 @@ Errors that calls raise, for every function and argument, are in tests/test_bad_
 and tests/test_sweep_input.py; locked velocities are in tests/test_linkage.py.
 """
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -27,15 +29,15 @@ GOOD = dict(
 )
 
 
-def simulate(ef, mass, length, q, qd, ts, kp, limit):
+def simulate(ef, mass, length, q, qd, ts, kp, limit, **options):
     linkage = eqx.tree_at(lambda a: (a.ef, a.mass, a.length), arm(), (ef, mass, length))
     controller = fj.PDController(1.0, 1.0, 1.0, TARGET)
     forces = (eqx.tree_at(lambda c: (c.kp, c.limit), controller, (kp, limit)),)
     start = fj.State(q, qd)
-    return fj.simulate(linkage, start, ts, forces, throw=False, max_steps=2000)
+    return fj.simulate(linkage, start, ts, forces, throw=False, **options)
 
 
-traced = jax.jit(simulate)
+traced = jax.jit(functools.partial(simulate, max_steps=2000))
 
 
 CASES = {
