@@ -171,7 +171,7 @@ def test_gradients_at_rest_and_at_zero_error_are_finite():
 def test_gradients_at_and_beyond_a_limit_are_finite_and_zero():
     """The efforts are their limits at the start, or everywhere."""
     linkage, start, (controller,), _ = jax.tree.map(jnp.asarray, scenes.fig7())
-    demand = jnp.abs(controller.demand(0.0, *start, linkage))
+    demand = jnp.abs(eqx.filter_jit(controller.demand)(0.0, *start, linkage))
     slopes = {}
     for name, limit in (("at", demand), ("beyond", np.full(3, 1e-3))):
         limited = eqx.tree_at(lambda c: c.limit, controller, limit)

@@ -94,10 +94,10 @@ def test_a_step_is_differentiable_and_batched():
     tau = jnp.array([1.0, -2.0, 0.5])
     step = lambda tau: fj.step(ARM, START, tau, 0.1, **STEPS).qd
     known = lambda tau: step(np.asarray(tau))  # by the program of plain calls
-    slope = jax.jit(jax.jacrev(step))(tau)
+    both = jax.jit(jax.vmap(lambda tau: (step(tau), jax.jacrev(step)(tau))))
+    many, (slope, _) = both(jnp.stack([tau, 2 * tau]))
     differences = [(known(tau + h) - known(tau - h)) / 2e-4 for h in 1e-4 * np.eye(3)]
     np.testing.assert_allclose(slope, np.stack(differences, axis=1), atol=1e-8)
-    many = jax.jit(jax.vmap(step))(jnp.stack([tau, 2 * tau]))
     np.testing.assert_allclose(many[0], known(tau), atol=1e-12)
 
 

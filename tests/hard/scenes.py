@@ -51,7 +51,7 @@ class Hold(eqx.Module):
     target: jax.Array
 
     def __call__(self, t, linkage):
-        return self.target, jnp.zeros(3)
+        return self.target, jnp.zeros_like(self.target)
 
 
 # Where the controllers of the scenes hold the arm [rad], as in driven_reference.json.
@@ -134,15 +134,13 @@ def drift(linkage, q, qd):
     return np.abs(total - total[0]).max() / np.max(kinetic)
 
 
-def slopes(scene, steps):
+def slopes(scene):
     """Returns derivatives of the last q in q0, masses and lengths, by forward mode."""
-    return _slopes(
-        scene._replace(rows=None, q=None), steps
-    )  # one form, one compilation
+    return _slopes(scene._replace(rows=None, q=None))  # one form, one compilation
 
 
 @eqx.filter_jit
-def _slopes(scene, steps):
+def _slopes(scene):
 
     def end(q0, mass, length):
         linkage = eqx.tree_at(
@@ -153,7 +151,6 @@ def _slopes(scene, steps):
             fj.State(q0, scene.state0.qd),
             scene.ts[jnp.array([0, -1])],
             scene.forces,
-            stepsize_controller=steps,
             adjoint=diffrax.ForwardMode(),
         )
         return motion.q[-1]
@@ -177,6 +174,39 @@ def _pulled_back(scene, weights):
         return weights @ fj.simulate(scene.linkage, start, ts, scene.forces).q[-1]
 
     return jax.grad(end)(jnp.asarray(scene.state0.q))
+
+
+class Breaking(eqx.Module):
+    """An effort of zero until a time, and NaN afterwards."""
+
+    at: jax.Array
+
+    def __call__(self, t, q, qd, linkage):
+        return jnp.where(t > self.at, jnp.nan, 0.0) * jnp.ones(3)
+
+
+SIZE = 256  # of every batch here: one compilation serves three files
+
+
+def in_a_batch(linkages, q, qd, ts, at=1e9):
+    """Returns motions of `SIZE` members, whose efforts are NaN after times `at`.
+
+    The rows of the arguments are repeated up to that size.
+    """
+    at = np.broadcast_to(at, len(q))
+    members = jax.tree.map(
+        lambda a: np.resize(a, (SIZE, *np.shape(a)[1:])), (linkages, q, qd, at)
+    )
+    return _in_a_batch(*members, ts)
+
+
+@jax.jit
+def _in_a_batch(linkages, q, qd, at, ts):
+    return jax.vmap(
+        lambda linkage, q, qd, at: fj.simulate(
+            linkage, fj.State(q, qd), ts, (Breaking(at),), throw=False
+        )
+    )(linkages, q, qd, at)
 
 
 @eqx.filter_jit

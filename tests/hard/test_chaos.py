@@ -37,7 +37,7 @@ def test_gradient_after_10_s():
     exact = np.array(hard.REFERENCE["fig5"]["dq_dq0"])
     growth = np.abs(exact).max()
     assert 2e4 < growth < 3e4
-    forward, *_ = hard.slopes(scene, hard.DEFAULT)
+    forward, *_ = hard.slopes(scene)
     reverse = np.stack([hard.pulled_back(scene, weights) for weights in np.eye(3)])
     for gradient in (forward, reverse):
         assert np.isfinite(gradient).all()

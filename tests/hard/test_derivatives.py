@@ -74,13 +74,15 @@ def test_a_circle_of_no_radius():
 
 
 def curvature(log_kp, target):
-    """Returns the Hessian in the gains of a held arm's mean squared error, (3, 3)."""
+    """Returns the Hessian in the gains of two held links' mean square error, (2, 2)."""
+    linkage = fj.scenes.double_pendulum().linkage
+    start = fj.State(START.q[:2], STILL[:2])
 
     def loss(log_kp):
         controller = fj.PDController(100 * jnp.exp(log_kp), 20.0, jnp.inf, Hold(target))
         motion = fj.simulate(
-            arm(),
-            START,
+            linkage,
+            start,
             np.linspace(0, 0.5, 6),
             (controller,),
             adjoint=diffrax.ForwardMode(),
@@ -95,7 +97,7 @@ def curvature(log_kp, target):
 def test_hessians_of_a_batch():
     """Second derivatives of a loop whose length depends on the member."""
     rng = np.random.default_rng(3)
-    log_kp, target = rng.uniform(-0.5, 0.5, (2, 4, 3))
+    log_kp, target = rng.uniform(-0.5, 0.5, (2, 4, 2))
     batched = jax.jit(jax.vmap(curvature))
     together = batched(log_kp, target)
     # Alone among members like itself, by the same program.

@@ -3,14 +3,14 @@
 import diffrax
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import fdof_jax as fj
-from hard.scenes import DRIVEN, OUTPUTS, START, TIGHT, arm, behind_the_door
+from hard.scenes import DRIVEN, OUTPUTS, START, TIGHT, arm, behind_the_door, in_a_batch
 
 TS = np.linspace(0, 2, OUTPUTS)
+STILL = np.zeros((3, 3))
 
 
 @pytest.mark.parametrize("steps", [None, TIGHT], ids=["default", "tight"])
@@ -19,13 +19,9 @@ def test_a_tip_of_a_million_tonnes(steps):
 
     Rounding, not the method, determines the error estimate.
     """
-    solution = fj.simulate(
-        arm(mass=[1, 1, 1e9]),
-        START,
-        TS,
-        stepsize_controller=steps,
-        max_steps=10_000,
-    )
+    heavy = arm(mass=[1, 1, 1e9])
+    solution = fj.simulate(heavy, START, TS, stepsize_controller=steps)
+    assert solution.stats["num_steps"] < 10_000
     error = np.abs(solution.q - np.array(DRIVEN["heavy-tip-1e9"]["q"])).max()
     assert error <= 1e-3
 
@@ -53,25 +49,22 @@ def test_a_last_link_without_inertia_is_refused(topology):
 def test_a_singular_member_is_named_and_harms_no_other():
     """Under a transformation that member's values cannot be checked beforehand."""
     usual = arm()
-    com = jnp.stack([usual.com] * 3).at[1, 2].set(0)
-    inertia = jnp.stack([usual.inertia] * 3).at[1, 2].set(0)
+    massless = eqx.tree_at(
+        lambda a: (a.com, a.inertia),
+        usual,
+        (usual.com.at[2].set(0), usual.inertia.at[2].set(0)),
+    )
     q = START.q + np.array([[0.0], [0.1], [0.2]])
 
-    @jax.jit
-    def motions(com, inertia):
-        def linkage(com, inertia):
-            return eqx.tree_at(lambda a: (a.com, a.inertia), usual, (com, inertia))
+    def motions(*arms):
+        stacked = jax.tree.map(lambda *a: np.stack(a), *arms)
+        return in_a_batch(stacked, q, STILL, TS)
 
-        return jax.vmap(
-            lambda com, inertia, q: fj.simulate(
-                linkage(com, inertia), fj.State(q, START.qd), TS, throw=False
-            )
-        )(com, inertia, q)
-
-    broken = motions(com, inertia)
-    clean = motions(com.at[1].set(usual.com), inertia.at[1].set(usual.inertia))
-    assert clean.outcome.tolist() == ["successful"] * 3
-    assert broken.outcome.tolist() == ["successful", "ill-conditioned", "successful"]
+    broken = motions(usual, massless, usual)
+    clean = motions(usual, usual, usual)
+    assert clean.outcome[:3].tolist() == ["successful"] * 3
+    named = ["successful", "ill-conditioned", "successful"]
+    assert broken.outcome[:3].tolist() == named
     assert broken.stats["num_steps"][1] < 100
     assert np.isnan(broken.q[1, 1:]).all()
     for member in (0, 2):

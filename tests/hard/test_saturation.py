@@ -58,10 +58,10 @@ def test_gradients_at_and_beyond_saturation():
     demand = fj.PDController(KP, 0.0, jnp.inf, resting).demand(
         0.0, START.q, STILL, arm()
     )
-    at_limit, _ = gradient(0.0, jnp.abs(demand), resting)
+    at_limit, _ = gradient(0.0, np.abs(demand), resting)
     assert np.isfinite(at_limit)
     # Weak actuators: the gains have no effect, and the share is 1.
-    weak, share = gradient(0.0, jnp.full(3, 1e-3), TARGET)
+    weak, share = gradient(0.0, np.full(3, 1e-3), TARGET)
     assert weak == 0 and (share == 1).all()
-    strong, share = gradient(0.0, jnp.full(3, 1e9), TARGET)
+    strong, share = gradient(0.0, np.full(3, 1e9), TARGET)
     assert abs(strong) > 1e-3 and (share == 0).all()

@@ -86,6 +86,6 @@ def test_a_slide_driven_through_zero():
     np.testing.assert_allclose(motion.qd[:, 1], -2, atol=0.1)
     assert motion.q[0, 1] > 0.9 and motion.q[-1, 1] < -0.9
     assert hard.error(motion, scene) <= 1e-9
-    slope, *_ = hard.slopes(scene, hard.TIGHT)
+    slope, *_ = hard.slopes(scene)
     exact = hard.REFERENCE["driven-through-0-RPR"]["dq_dq0"]
     assert hard.largest_error(slope, exact) <= 1e-6
