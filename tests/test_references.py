@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from elements import SHORT
 from scipy.interpolate import CubicSpline
 
 import fdof_jax as fj
@@ -110,7 +111,8 @@ def test_a_path_behind_the_pivot_or_left_by_laps_fails_where_it_is_traced():
             task = fj.TipTask(path, fj.references.Laps(-2.0))
             forces = (fj.PDController(10.0, 1.0, 100.0, task),)
             start = fj.State(np.zeros(3), np.zeros(3))
-            motion = fj.simulate(ARM, start, [0, 0.1, 2], forces, throw=False)
+            ts = [0, 0.1, 2]
+            motion = fj.simulate(ARM, start, ts, forces, throw=False, **SHORT)
             return motion.result, fj.references.reachable(ARM, task, [0.0, 2.0])
 
         line = fj.references.Line([1, 0], [1 + x, 0.5])
