@@ -10,12 +10,13 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from ..checks import concrete, function, real_array, whole_number
+from ..checks import concrete, function, is_traced, real_array, whole_number
 from ..forces.element import Forces, ScalarElement, element_of, elements
 from ..forces.joints import JointEffort
 from ..linkage.coordinates import State, real_state
 from ..linkage.linkage import Linkage, check_linkage, joints_of, without_fixed
 from .field import initial_states, stateful
+from .looped_dopri8 import LoopedDopri8
 from .simulate import check_elements, simulate
 
 
@@ -169,7 +170,11 @@ def simulate_sampled(
     late = None if known is not None and known == 0 else late
     keys = None if key is None else jax.random.split(key, samples)
     options = dict(throw=False) | options
-    return _motion(linkage, state0, control, times, forces, late, spread, keys, options)
+    given = linkage, state0, control, times, forces, late, spread, keys
+    if not is_traced(given) and options.get("solver") is None:
+        # One arm's, as of plain calls: the default within `jit` is that of batches.
+        options["solver"] = LoopedDopri8()
+    return _motion(*given, options)
 
 
 @eqx.filter_jit  # not traced anew at each call
