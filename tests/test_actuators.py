@@ -1,5 +1,6 @@
 """Elements with inertia: an independent Lagrangian, energy and inverse dynamics."""
 
+import equinox as eqx
 import jax
 import mujoco
 import numpy as np
@@ -52,12 +53,12 @@ def lagrange(linkage, q, qd, qdd, h=1e-4):
     )
 
 
-@jax.jit
+@eqx.filter_jit
 def acting(element, q, qd, linkage):
     return element(0.0, q, qd, linkage)
 
 
-@jax.jit
+@eqx.filter_jit
 def energy_rates(forces, linkage, q, qd, qdd):
     energies = lambda q, qd: fj.energy(linkage, q, qd, forces)
     return jax.jvp(energies, (q, qd), (qd, qdd))[1]
