@@ -65,12 +65,10 @@ def test_one_trace_and_batch_equals_singles(kind):
     traces = []
 
     # The default solver of batches takes long to compile: once is enough. It takes the
-    # same steps as that of single motions.
-    plain = kind == "no elements"
-    solo = LoopedDopri8() if plain else diffrax.Midpoint()
-    many = None if plain else solo
+    # same steps.
+    default = None if kind == "no elements" else LoopedDopri8()
 
-    def motion(linkage, state, forces, solver=solo):
+    def motion(linkage, state, forces, solver=LoopedDopri8()):
         traces.append(1)
         # Fixed steps: adaptive ones may round differently in a batch.
         return fj.simulate(
@@ -86,7 +84,7 @@ def test_one_trace_and_batch_equals_singles(kind):
     single = jax.jit(motion)
     alone = [single(*member) for member in members(kind)]
     assert len(traces) == 1
-    batched = jax.jit(jax.vmap(functools.partial(motion, solver=many)))
+    batched = jax.jit(jax.vmap(functools.partial(motion, solver=default)))
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *members(kind))
     together = batched(*stacked)
     reversed_order = batched(*jax.tree.map(lambda a: a[::-1], stacked))

@@ -131,7 +131,7 @@ def test_energy_stack_rises_by_what_is_put_in():
     put_in = 20 * np.maximum(steps, 0).sum()
     np.testing.assert_allclose(line[-1] - line[0], put_in, rtol=1e-3)
     with pytest.warns(UserWarning, match="energy_stack: the balance is off by"):
-        plotting.energy_stack(LIFT, (*forces[:2], JointEffort(0.0)), solution)
+        plotting.energy_stack(LIFT, (*forces[:2], JointEffort(np.zeros(3))), solution)
 
 
 def test_energy_stack_of_a_free_arm_and_of_what_was_reached():
