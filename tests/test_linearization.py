@@ -47,9 +47,13 @@ def held(linkage, q, kp, kd, others=()):
 
 @jax.jit
 def rest(linkage, controller, guess):
-    """Returns an equilibrium, and its derivative along a change of the guess."""
-    found = lambda q: fj.analysis.equilibrium(linkage, q, (controller,))
-    return jax.jvp(found, (guess,), (jnp.array([1.0, -2.0, 0.5]),))
+    """Returns an equilibrium's derivative in the guess, and the equilibrium."""
+
+    def twice(q):
+        found = fj.analysis.equilibrium(linkage, q, (controller,))
+        return found, found
+
+    return jax.jacfwd(twice, has_aux=True)(guess)
 
 
 def slopes(function, y, h=1e-6):
@@ -104,7 +108,7 @@ def test_a_stiff_controller_of_limited_efforts_has_an_equilibrium():
     reference, _ = controller.reference(0.0, scene.linkage)
     # Compiles faster than a reference that moves.
     controller = eqx.tree_at(lambda c: c.reference, controller, Hold(reference))
-    q, slope = rest(scene.linkage, controller, reference)
+    slope, q = rest(scene.linkage, controller, reference)
     assert np.isfinite(slope).all()
     efforts = controller(0.0, q, STILL, scene.linkage)
     held = fj.analysis.holding_efforts(scene.linkage, q)
@@ -187,7 +191,7 @@ def test_equilibria_are_where_the_efforts_hold_the_arm(topology):
     qdd = fj.forward_dynamics(linkage, q, STILL, tau)
     np.testing.assert_allclose(qdd, 0, atol=1e-9)
     controller = held(linkage, q, [300.0, 200.0, 100.0], np.ones(3))
-    found, _ = rest(linkage, controller, q + 0.05)
+    _, found = rest(linkage, controller, q + 0.05)
     np.testing.assert_allclose(found, q, atol=1e-8)
 
 
