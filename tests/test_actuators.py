@@ -1,5 +1,6 @@
 """Elements with inertia: an independent Lagrangian, energy and inverse dynamics."""
 
+import equinox as eqx
 import jax
 import mujoco
 import numpy as np
@@ -52,6 +53,17 @@ def lagrange(linkage, q, qd, qdd, h=1e-4):
     )
 
 
+@eqx.filter_jit
+def acting(element, q, qd, linkage):
+    return element(0.0, q, qd, linkage)
+
+
+@eqx.filter_jit
+def energy_rates(forces, linkage, q, qd, qdd):
+    energies = lambda q, qd: fj.energy(linkage, q, qd, forces)
+    return jax.jvp(energies, (q, qd), (qd, qdd))[1]
+
+
 @pytest.mark.parametrize("topology", fj.TOPOLOGIES)
 def test_the_actuator_s_bodies_by_another_lagrangian(topology):
     linkage, q, qd = motion(topology)
@@ -68,7 +80,7 @@ def test_the_actuator_s_force_does_its_power(topology):
     linkage, q, qd = motion(topology)
     a, b = (np.array(pins(linkage, q + h * qd)) for h in (1e-6, -1e-6))
     rate = (abs(a[1] - a[0]) - abs(b[1] - b[0])) / 2e-6
-    power = ACTUATOR(0.0, q, qd, linkage) @ qd
+    power = np.asarray(acting(ACTUATOR, q, qd, linkage)) @ qd
     np.testing.assert_allclose(power, 5.0 * rate, atol=1e-8)
 
 
@@ -104,12 +116,11 @@ def test_energy_and_work(topology):
     """Checks that the energy changes at the power of the force between the pins."""
     linkage, q, qd = motion(topology)
     forces = ACTUATOR, ARMATURE
-    tau = sum(element(0.0, q, qd, linkage) for element in forces)
+    tau = sum(np.asarray(acting(element, q, qd, linkage)) for element in forces)
     qdd = np.asarray(fj.forward_dynamics(linkage, q, qd, tau, forces))
-    energies = lambda q, qd: fj.energy(linkage, q, qd, forces)
-    _, (kinetic, potential) = jax.jvp(energies, (q, qd), (qd, qdd))
+    kinetic, potential = map(np.asarray, energy_rates(forces, linkage, q, qd, qdd))
     assert abs(kinetic) > 1e-2
-    power = ACTUATOR(0.0, q, qd, linkage) @ qd
+    power = np.asarray(acting(ACTUATOR, q, qd, linkage)) @ qd
     np.testing.assert_allclose(kinetic + potential, power, atol=1e-11 * abs(kinetic))
 
 
@@ -159,7 +170,7 @@ def test_mujoco_with_a_soft_tie(topology):
     rest = np.zeros(3)
     model, data, arm = in_mujoco(linkage, q, rest)
     mujoco.mj_forward(model, data)
-    tau = ACTUATOR(0.0, q, rest, linkage)
+    tau = acting(ACTUATOR, q, rest, linkage)
     own = fj.forward_dynamics(linkage, q, rest, tau, (ACTUATOR,))
     size = np.abs(own).max()
     bare = fj.forward_dynamics(linkage, q, rest, rest)

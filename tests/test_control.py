@@ -44,6 +44,21 @@ def references(task, linkage, times):
     return jax.vmap(lambda t: task(t, linkage))(times)
 
 
+@jax.jit
+@partial(jax.vmap, in_axes=(None, 0))
+def commanded(task, t):
+    """Returns the commanded tip and its velocity."""
+    return jax.jvp(task.tip, (t,), (jnp.ones_like(t),))
+
+
+@jax.jit
+@partial(jax.vmap, in_axes=(None, 0, 0))
+def tip_motion(linkage, q, qd):
+    """Returns the tip, its velocity and rotation, and the last link's angle."""
+    x, _ = fj.to_chain(linkage, q, qd)
+    return fj.tip_position(linkage, q), fj.tip_jacobian(linkage, q) @ qd, x[5]
+
+
 # The PD law
 
 
@@ -99,11 +114,9 @@ def test_gradients_in_the_gains_stop_where_the_effort_is_limited():
 def test_the_tip_runs_round_the_circle_at_constant_speed(period):
     center, radius, phase = np.array([1.0, -2.0]), 0.7, 0.3
     task = fj.CircleTask(center, radius, period, phase)
-    for t in (0, 0.4, 7.3):
-        arm_vector, velocity = (
-            np.asarray(a) for a in jax.jvp(task.tip, (float(t),), (1.0,))
-        )
-        arm_vector = arm_vector - center
+    times = np.array([0, 0.4, 7.3])
+    for tip, velocity in zip(*map(np.asarray, commanded(task, times))):
+        arm_vector = tip - center
         turn = 2 * np.pi / period
         assert np.hypot(*arm_vector) == pytest.approx(radius)
         np.testing.assert_allclose(
@@ -119,16 +132,14 @@ def test_the_tip_runs_round_the_circle_at_constant_speed(period):
 def test_the_reference_puts_the_tip_on_the_circle(topology, branch):
     linkage = arm(topology)
     task = circle_of(linkage, branch=branch)
-    times = jnp.linspace(-0.3, 5, 23)
+    times = np.linspace(-0.3, 5, 23)
     q, qd = references(task, linkage, times)
-    tips = jax.vmap(partial(fj.tip_position, linkage))(q)
-    np.testing.assert_allclose(tips, jax.vmap(task.tip)(times), atol=1e-12)
-    x = jax.vmap(lambda q: fj.to_chain(linkage, q, jnp.zeros(3))[0])(q)
-    turns = (x[:, 5] - task.orientation) / (2 * np.pi)
+    tips, rate, angle = map(np.asarray, tip_motion(linkage, q, qd))
+    expected, velocity = commanded(task, times)
+    np.testing.assert_allclose(tips, expected, atol=1e-12)
+    turns = (angle - np.asarray(task.orientation)) / (2 * np.pi)
     np.testing.assert_allclose(turns, np.full(23, np.round(turns[0])), atol=1e-12)
     # Its rate moves the tip along the circle without turning the last link.
-    rate = jnp.einsum("tij,tj->ti", jax.vmap(partial(fj.tip_jacobian, linkage))(q), qd)
-    velocity = jax.vmap(jax.jacfwd(task.tip))(times)
     np.testing.assert_allclose(rate[:, :2], velocity, atol=1e-11)
     np.testing.assert_allclose(rate[:, 2], np.zeros(23), atol=1e-11)
 
@@ -137,8 +148,10 @@ def test_the_reference_puts_the_tip_on_the_circle(topology, branch):
 def test_the_rate_of_the_reference_is_its_central_difference(topology):
     linkage = arm(topology)
     task = circle_of(linkage)
-    times, h = jnp.linspace(0, 2.5, 11), 1e-5
-    (after, _), (before, _) = (references(task, linkage, times + s) for s in (h, -h))
+    times, h = np.linspace(0, 2.5, 11), 1e-5
+    after, before = (
+        np.asarray(references(task, linkage, times + s)[0]) for s in (h, -h)
+    )
     _, qd = references(task, linkage, times)
     np.testing.assert_allclose(qd, (after - before) / (2 * h), atol=1e-7)
 
@@ -149,7 +162,7 @@ def test_the_reference_starts_where_inverse_kinematics_says(topology, branch):
     linkage = arm(topology)
     task = circle_of(linkage, branch=branch)
     start = fj.inverse_kinematics(linkage, task.tip(0), task.orientation, branch=branch)
-    first, _ = references(task, linkage, jnp.zeros(1))
+    first, _ = references(task, linkage, np.zeros(1))
     np.testing.assert_allclose(first[0], start, atol=1e-12)
 
 
@@ -188,8 +201,8 @@ def test_the_reference_never_jumps_and_counts_its_turns(
     linkage = wrist_arm(topology)
     task = wrist_circle(hub, radius, period=period, phase=phase)
     step = 0.005
-    times = step * jnp.arange(1201)  # three turns
-    q, qd = references(task, linkage, times)
+    times = step * np.arange(1201)  # three turns
+    q, qd = map(np.asarray, references(task, linkage, times))
     largest = 1.01 * np.abs(qd).max(axis=0) * step + 1e-12
     assert (np.abs(np.diff(q, axis=0)).max(axis=0) <= largest).all()
     turns = (q[-1] - q[0]) / (2 * np.pi)
@@ -206,7 +219,7 @@ def test_no_arm_at_the_start_of_the_circle_is_told_to_unwind(circle, phase, topo
     task = wrist_circle(hub, radius, phase=phase)
     start = fj.inverse_kinematics(linkage, task.tip(0), 0)
     np.testing.assert_allclose(
-        references(task, linkage, jnp.zeros(1))[0][0], start, atol=1e-9
+        references(task, linkage, np.zeros(1))[0][0], start, atol=1e-9
     )
 
 

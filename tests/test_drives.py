@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from elements import Hold
+from elements import SHORT, Hold
 from scipy.linalg import expm
 
 import fdof_jax as fj
@@ -27,6 +27,20 @@ def only_last(value):
     return jnp.array([0.0, 0.0, value])
 
 
+class Reversed(eqx.Module):
+    """A command to the last joint, reversed at a time; all motors share a program."""
+
+    value: jax.Array
+    at: jax.Array
+
+    def __call__(self, t, q, qd, linkage):
+        return only_last(jnp.where(t < self.at, self.value, -self.value))
+
+
+def command(value, at=np.inf):
+    return Reversed(jnp.asarray(value), jnp.asarray(at))
+
+
 def test_a_lag_is_an_exponential():
     lag = fj.control.FirstOrderLag(fj.JointEffort([0, 0, 3.0]), 0.2)
     ts = np.linspace(0, 1, 11)
@@ -42,9 +56,8 @@ def test_a_lag_is_an_exponential():
 
 def test_a_motor_reaches_its_current_and_its_speed():
     motor = fj.control.DCMotor(
-        fj.JointEffort([0, 0, 12.0]), resistance=2.0, inductance=0.5, constant=0.1,
-        gear=3.0,
-    )  # fmt: skip
+        command(12.0), resistance=2.0, inductance=0.5, constant=0.1, gear=3.0
+    )
     wheel = single()
     # L di/dt = v - R i - k n w, J dw/dt = k n i.
     rates = np.array([[-2 / 0.5, -0.3 / 0.5], [0.3 / 2, 0]])
@@ -59,22 +72,20 @@ def test_a_motor_reaches_its_current_and_its_speed():
 
 
 def test_a_motor_s_limits():
-    command = fj.JointEffort([0, 0, 100.0])
     options = dict(resistance=2.0, inductance=0.01, constant=0.1)
     ts = np.linspace(0, 0.2, 21)
-    low = fj.control.DCMotor(command, voltage_limit=4.0, **options)
+    low = fj.control.DCMotor(command(100.0), voltage_limit=4.0, **options)
     current = fj.simulate(single(), STILL, ts, (low,)).own[0].own[:, 2]
     assert current.max() == pytest.approx(2.0, rel=1e-2)  # V / R, less the back-EMF
 
 
 def test_currents_stay_within_their_limit():
     """Covers many windings and a reversed command; i' = (limit - i) R/L."""
-    turning = lambda t, q, qd, linkage: only_last(jnp.where(t < 0.1, 100.0, -100.0))
     ts = np.linspace(0, 0.2, 41)
 
     def current(resistance, limit):
         motor = fj.control.DCMotor(
-            turning, resistance=resistance, inductance=0.01, constant=0.1,
+            command(100.0, 0.1), resistance=resistance, inductance=0.01, constant=0.1,
             current_limit=limit,
         )  # fmt: skip
         return fj.simulate(single(), STILL, ts, (motor,)).own[0].own[:, 2]
@@ -167,7 +178,8 @@ def test_drives_in_a_row():
     drive = fj.control.SpeedLimit(
         fj.control.FirstOrderLag(pid, 0.05), stall=5.0, no_load=3.0
     )
-    solution = fj.simulate(single(), STILL, np.linspace(0, 20, 21), (drive,))
+    ts = np.linspace(0, 20, 21)
+    solution = fj.simulate(single(), STILL, ts, (drive,), **SHORT)
     state = solution.own[0]
     assert state.own == () and state.command.own.shape == (21, 3)
     assert np.abs(state.command.command[:, 2]).max() > 0.1

@@ -1,5 +1,7 @@
 """Identities that hold for every linkage, state and effort."""
 
+import functools
+
 import elements
 import equinox as eqx
 import jax
@@ -22,10 +24,22 @@ def draw(case):
     return random_linkage(topology, rng), *rng.normal(size=(3, 3)), rng
 
 
+@jax.jit
 def joint_mass_matrix(linkage, q):
     """Returns the reduced mass matrix, column by column from inverse dynamics."""
     at_rest = jnp.zeros(3)
     return jax.jacfwd(lambda a: fj.inverse_dynamics(linkage, q, at_rest, a))(at_rest)
+
+
+@jax.jit
+def chain_slopes(linkage, q, qd):
+    return jax.jacfwd(lambda q: fj.to_chain(linkage, q, qd)[0])(q)
+
+
+@jax.jit
+def energy_rate(linkage, q, qd, qdd):
+    energies = lambda q, qd: sum(fj.energy(linkage, q, qd))
+    return jax.jvp(energies, (q, qd), (qd, qdd))[1]
 
 
 def scatter(linkage, values):
@@ -50,9 +64,10 @@ def test_mass_matrices_are_symmetric_and_positive(case):
 def test_reduced_mass_matrix_is_the_projected_one(case):
     linkage, q, qd, _, _ = draw(case)
     x, _ = fj.to_chain(linkage, q, qd)
-    S = jax.jacfwd(lambda q: fj.to_chain(linkage, q, qd)[0])(jnp.asarray(q))
+    S = np.asarray(chain_slopes(linkage, q, qd))
+    full = np.asarray(fj.mass_matrix(linkage, x))
     np.testing.assert_allclose(
-        joint_mass_matrix(linkage, q), S.T @ fj.mass_matrix(linkage, x) @ S, atol=1e-12
+        joint_mass_matrix(linkage, q), S.T @ full @ S, atol=1e-12
     )
 
 
@@ -60,9 +75,9 @@ def test_reduced_mass_matrix_is_the_projected_one(case):
 @identities
 def test_kinetic_energy_is_that_of_the_mass_matrix(case):
     linkage, q, qd, _, _ = draw(case)
-    x, xd = fj.to_chain(linkage, q, qd)
+    x, xd = map(np.asarray, fj.to_chain(linkage, q, qd))
     kinetic, _ = fj.energy(linkage, q, qd)
-    full = xd @ fj.mass_matrix(linkage, x) @ xd / 2
+    full = xd @ np.asarray(fj.mass_matrix(linkage, x)) @ xd / 2
     np.testing.assert_allclose(full, kinetic, rtol=1e-12, atol=1e-13)
 
 
@@ -94,11 +109,7 @@ def test_inverse_after_forward_is_the_identity(case):
 def test_power_balance(case):
     linkage, q, qd, tau, _ = draw(case)
     qdd = fj.forward_dynamics(linkage, q, qd, tau)
-    _, rate = jax.jvp(
-        lambda q, qd: sum(fj.energy(linkage, q, qd)),
-        (jnp.asarray(q), jnp.asarray(qd)),
-        (jnp.asarray(qd), qdd),
-    )
+    rate = energy_rate(linkage, q, qd, qdd)
     np.testing.assert_allclose(rate, tau @ qd, rtol=1e-9, atol=1e-9)
 
 
@@ -110,11 +121,18 @@ def test_constraint_forces_close_the_balance_of_the_chain(case):
     x, xd = fj.to_chain(linkage, q, qd)
     force = rng.normal(size=6)
     xdd = fj.masked_accelerations(linkage, x, xd, force)
-    total = force + fj.constraint_forces(linkage, x, xd, force)
-    generalised = np.array(total)
+    total = force + np.asarray(fj.constraint_forces(linkage, x, xd, force))
+    generalised = total.copy()
     generalised[1:5:2] -= total[3::2]
-    balance = fj.mass_matrix(linkage, x) @ xdd - fj.bias_force(linkage, x, xd)
+    inertial = np.asarray(fj.mass_matrix(linkage, x)) @ np.asarray(xdd)
+    balance = inertial - np.asarray(fj.bias_force(linkage, x, xd))
     np.testing.assert_allclose(balance, generalised, rtol=1e-9, atol=1e-9)
+
+
+@jax.jit
+def accelerations(linkage, mass, length, q, qd, tau):
+    changed = eqx.tree_at(lambda x: (x.mass, x.length), linkage, (mass, length))
+    return fj.forward_dynamics(changed, q, qd, tau)
 
 
 @pytest.mark.parametrize("topology", fj.TOPOLOGIES)
@@ -123,12 +141,10 @@ def test_forward_dynamics_derivatives(topology):
     linkage = random_linkage(topology, rng)
     q, qd, tau = jnp.asarray(rng.normal(size=(3, 3)))
 
-    def accelerations(mass, length, q, qd, tau):
-        changed = eqx.tree_at(lambda x: (x.mass, x.length), linkage, (mass, length))
-        return fj.forward_dynamics(changed, q, qd, tau)
-
     jax.test_util.check_grads(
-        accelerations, (linkage.mass, linkage.length, q, qd, tau), order=1
+        functools.partial(accelerations, linkage),
+        (linkage.mass, linkage.length, q, qd, tau),
+        order=1,
     )
 
 

@@ -141,7 +141,7 @@ def test_starts_beside_the_reference_and_singular_equations_are_told():
     starts = fj.State(np.array([[0.0, 0.1, 0], [0.2, 0.1, 0]]), np.zeros((2, 3)))
     with pytest.raises(ValueError, match="state0.q: expected"):
         fj.simulate(CART, fj.State(starts.q[1], np.zeros(3)), [0, 1], (motion,))
-    swept = fj.sweep(CART, starts, [0, 0.1], (motion,))
+    swept = fj.sweep(CART, starts, [0, 0.1], (motion,), **SHORT)
     assert swept.outcome.tolist() == ["successful", "not finite"]
     # Two stretched links with a heavy tip; the prescribed slide is well-conditioned.
     heavy = fj.Linkage(

@@ -1,5 +1,7 @@
 """One circle that all seven topologies track."""
 
+import functools
+
 import jax
 import numpy as np
 import pytest
@@ -10,20 +12,24 @@ SCENES = fj.tuning.circle_scenes()
 TS = np.linspace(0, 4, 201)
 
 
+@jax.jit
+@functools.partial(jax.vmap, in_axes=(None, None, 0))
+def along(task, linkage, t):
+    q, _ = task(t, linkage)
+    return q, fj.tip_jacobian(linkage, q), fj.tip_position(linkage, q)
+
+
 @pytest.mark.parametrize("topology", fj.TOPOLOGIES)
 def test_the_circle_is_reachable_from_where_the_arm_is(topology):
     scene = SCENES[topology]
     task = scene.forces[0].reference
     assert fj.references.reachable(scene.linkage, task, TS).all()
-    motion = jax.vmap(lambda t: task(t, scene.linkage)[0])
-    q = np.asarray(motion(TS))
+    q, jacobians, tips = map(np.asarray, along(task, scene.linkage, TS))
     # Within reach of the start, without a jump, and away from singularities.
     assert np.abs(q[0] - np.asarray(scene.state0.q)).max() < 0.1
     assert np.abs(np.diff(q, axis=0)).max() < 0.05
-    jacobians = jax.vmap(lambda q: fj.tip_jacobian(scene.linkage, q))(q)
     assert np.abs(np.linalg.det(jacobians)).min() > 0.5
-    tips = jax.vmap(lambda q: fj.tip_position(scene.linkage, q))(q)
-    distance = np.linalg.norm(np.asarray(tips) - np.asarray(task.center), axis=1)
+    distance = np.linalg.norm(tips - np.asarray(task.center), axis=1)
     np.testing.assert_allclose(distance, 0.25, atol=1e-12)
 
 

@@ -41,7 +41,19 @@ def held(linkage, q, kp, kd, others=()):
     """Returns a PD controller under which the arm sags to `q`."""
     load = fj.analysis.holding_efforts(linkage, q, others)
     load = load - sum(element(0.0, q, jnp.zeros(3), linkage) for element in others)
-    return fj.PDController(kp, kd, jnp.inf, Hold(q + load / np.array(kp)))
+    unlimited = [np.inf] * 3  # one per joint, as in the program of limited ones
+    return fj.PDController(kp, kd, unlimited, Hold(q + load / np.array(kp)))
+
+
+@jax.jit
+def rest(linkage, controller, guess):
+    """Returns an equilibrium's derivative in the guess, and the equilibrium."""
+
+    def twice(q):
+        found = fj.analysis.equilibrium(linkage, q, (controller,))
+        return found, found
+
+    return jax.jacfwd(twice, has_aux=True)(guess)
 
 
 def slopes(function, y, h=1e-6):
@@ -94,25 +106,17 @@ def test_a_stiff_controller_of_limited_efforts_has_an_equilibrium():
     scene = scenes.fig7()
     controller = scene.forces[0]
     reference, _ = controller.reference(0.0, scene.linkage)
-
-    @jax.jit
-    def rest(guess):
-        """Returns the equilibrium and its derivative in the guess, from one program."""
-
-        def twice(q):
-            found = fj.analysis.equilibrium(scene.linkage, q, scene.forces)
-            return found, found
-
-        return jax.jacfwd(twice, has_aux=True)(guess)
-
-    slope, q = rest(reference)
+    # Compiles faster than a reference that moves.
+    controller = eqx.tree_at(lambda c: c.reference, controller, Hold(reference))
+    slope, q = rest(scene.linkage, controller, reference)
     assert np.isfinite(slope).all()
     efforts = controller(0.0, q, STILL, scene.linkage)
     held = fj.analysis.holding_efforts(scene.linkage, q)
     np.testing.assert_allclose(efforts, held, rtol=1e-9)
     assert 0.01 < np.abs(q - reference).max() < 0.3
     # No equilibrium is found from a guess at which the slide is at its limit.
-    assert all(np.isnan(found).all() for found in rest(jnp.asarray(scene.state0.q)))
+    saturated = rest(scene.linkage, controller, jnp.asarray(scene.state0.q))
+    assert all(np.isnan(found).all() for found in saturated)
 
 
 # Modes
@@ -122,22 +126,23 @@ def test_a_hanging_chain_of_point_masses_swings_as_is_known():
     """Squared frequencies in g/l are the zeros of Laguerre's L3."""
     linkage = scenes.fig5().linkage
     hanging, failed = ([-np.pi / 2, 0.0, 0.0], STILL), ([0.3, np.nan, 0.0], STILL)
-    modes = modes_at(linkage, (), hanging, failed)
+    free = (fj.JointDamper(0.0),)  # shares the program of Fig 3
+    modes = modes_at(linkage, free, hanging, failed)
     zeros = np.polynomial.laguerre.lagroots([0, 0, 0, 1])
     expected = np.repeat(np.sqrt(9.81 * zeros), 2)
     np.testing.assert_allclose(modes.frequency[0], expected, rtol=1e-9)
     np.testing.assert_allclose(modes.damping[0], 0, atol=1e-9)
     assert np.isnan(modes.eigenvalues[1]).all() and np.isnan(modes.longest_step[1])
-    weightless = eqx.tree_at(lambda k: k.gravity, linkage, 0.0)
-    free = modes_at(weightless, (), (STILL + 0.3, STILL), (STILL + 0.3, STILL))
-    assert (free.longest_step > 10).all()  # nothing to be stable against
+    weightless = eqx.tree_at(lambda k: k.gravity, linkage, jnp.array(0.0))
+    drifting = modes_at(weightless, free, (STILL + 0.3, STILL), (STILL, STILL))
+    assert (drifting.longest_step > 10).all()  # nothing to be stable against
 
 
 def test_the_modes_of_fig_3_at_rest():
     scene = scenes.fig3()
     absolute = np.array([-47.72631099390626, -135, -45]) * np.pi / 180
     q = np.diff(absolute, prepend=0)
-    modes = modes_at(scene.linkage, scene.forces, (q, STILL))
+    modes = modes_at(scene.linkage, scene.forces, (q, STILL), (q, STILL))
     # From an independent computation, to four digits.
     known = [-0.4033, -1.645, -0.3471 - 2.1239j, -0.3471 + 2.1239j, -6.161, -31.36]
     found = modes.eigenvalues[0]
@@ -185,10 +190,9 @@ def test_equilibria_are_where_the_efforts_hold_the_arm(topology):
     tau = fj.analysis.holding_efforts(linkage, q)
     qdd = fj.forward_dynamics(linkage, q, STILL, tau)
     np.testing.assert_allclose(qdd, 0, atol=1e-9)
-    forces = (held(linkage, q, [300.0, 200.0, 100.0], np.ones(3)),)
-    np.testing.assert_allclose(
-        fj.analysis.equilibrium(linkage, q + 0.05, forces), q, atol=1e-8
-    )
+    controller = held(linkage, q, [300.0, 200.0, 100.0], np.ones(3))
+    _, found = rest(linkage, controller, q + 0.05)
+    np.testing.assert_allclose(found, q, atol=1e-8)
 
 
 @pytest.mark.slow
@@ -266,9 +270,14 @@ def test_elements_that_are_no_function_of_the_state_are_refused(element):
 
 
 def test_the_order_of_0_1_is_deprecated():
-    state, forces = fj.State(STILL, STILL), (fj.JointDamper(1.0),)
-    calls = [(fj.linearize, state), (fj.analysis.equilibrium, np.array([-1.6, 0, 0]))]
-    for function, at in calls:
+    # Forces of which other tests have the programs.
+    load = fj.JointEffort(STILL)
+    acting = fj.JointDamper(0.3), load, fj.forces.Armature(0.2)
+    calls = [
+        (fj.linearize, fj.State(STILL, STILL), acting),
+        (fj.analysis.equilibrium, np.array([-1.6, 0, 0]), (load,)),
+    ]
+    for function, at, forces in calls:
         now = function(ROD, at, forces)
         with pytest.warns(DeprecationWarning, match="order of version 0.1") as warned:
             before = function(ROD, forces, at)

@@ -26,23 +26,28 @@ def sample(topology):
     return random_linkage(topology, rng), *rng.uniform(-2, 2, (2, 3))
 
 
+@jax.jit
+def demanded_by(controller, t, q, qd, linkage):
+    return controller.demand(t, q, qd, linkage)
+
+
 # Gravity feed-forward
 
 
 @each_topology
 def test_the_weight_is_held_where_the_arm_is(topology):
     linkage, q, qd = sample(topology)
-    plain = fj.PDController(*FREE).demand(0.4, q, qd, linkage)
+    plain = demanded_by(fj.PDController(*FREE), 0.4, q, qd, linkage)
     for model in None, heavier(linkage):
         controller = fj.control.GravityFeedforward(*FREE, model)
         held = fj.analysis.holding_efforts(linkage if model is None else model, q)
-        found = controller.demand(0.4, q, qd, linkage)
+        found = demanded_by(controller, 0.4, q, qd, linkage)
         np.testing.assert_allclose(found, plain + held, rtol=1e-12, atol=1e-12)
 
 
 def test_the_whole_effort_is_limited():
     linkage, q, qd = sample("RPR")
-    free = fj.control.GravityFeedforward(*FREE).demand(0.4, q, qd, linkage)
+    free = demanded_by(fj.control.GravityFeedforward(*FREE), 0.4, q, qd, linkage)
     limit = np.abs(free) * [0.5, 2, 0.9]
     controller = fj.control.GravityFeedforward(*FREE[:2], limit, MOVE)
     expected = np.clip(free, -limit, limit)
@@ -59,7 +64,7 @@ def fed_forward():
 def test_fig_7_with_gravity_held():
     scene = fed_forward()
     (controller,) = scene.forces
-    raw = controller.demand(0.0, *map(jnp.asarray, scene.state0), scene.linkage)
+    raw = demanded_by(controller, 0.0, *scene.state0, scene.linkage)
     np.testing.assert_allclose(raw, [-82.23, -5009.92, -9.92], atol=5e-3)
     known = {
         0: 0.25, 0.1: 0.126453, 0.2: 0.096059, 0.3: 0.126177, 0.5: 0.067283,
@@ -103,7 +108,7 @@ def test_the_effort_is_the_inverse_dynamics_of_what_is_demanded(topology):
         controller = fj.control.ComputedTorque(*FREE, model)
         believed = linkage if model is None else model
         expected = fj.inverse_dynamics(believed, q, qd, demanded)
-        found = controller.demand(0.4, q, qd, linkage)
+        found = demanded_by(controller, 0.4, q, qd, linkage)
         np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-8)
 
 
@@ -129,7 +134,8 @@ def test_the_acceleration_is_that_of_the_inverse_kinematics():
     linkage, task, t, h = scenes.fig7().linkage, fj.CircleTask(), 0.7, 1e-5
     rates = [task(t + step, linkage)[1] for step in (h, -h)]
     controller = fj.control.ComputedTorque(100.0, 20.0, jnp.inf, task)
-    q_ref, qd_ref, qdd_ref = controller.schedule(t, linkage)
+    schedule = jax.jit(lambda t: controller.schedule(t, linkage))
+    q_ref, qd_ref, qdd_ref = schedule(t)
     np.testing.assert_allclose(qdd_ref, (rates[0] - rates[1]) / (2 * h), atol=1e-7)
     np.testing.assert_allclose((q_ref, qd_ref), task(t, linkage), rtol=1e-12)
 

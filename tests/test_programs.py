@@ -2,6 +2,7 @@
 
 import functools
 import json
+import os
 import subprocess
 import sys
 
@@ -11,6 +12,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from elements import SHORT
+from helpers import programs
 from jax import export
 from jax.experimental import serialize_executable
 from jax.experimental.compilation_cache import compilation_cache
@@ -128,7 +131,7 @@ class Fragile(eqx.Module):
 
 
 def broken(strength):
-    return fj.simulate(ARM, START, TS, (Fragile(strength),)).q
+    return fj.simulate(ARM, START, TS, (Fragile(strength),), **SHORT).q
 
 
 @pytest.mark.parametrize("call", [broken, jax.jit(broken)], ids=["plain", "jit"])
@@ -190,13 +193,17 @@ print(json.dumps({
 def test_new_numbers_compile_nothing():
     """Runs in a new process, as this one may have compiled the programs already."""
     done = subprocess.run(
-        [sys.executable, "-c", SCRIPT], capture_output=True, text=True, check=False
+        [sys.executable, "-c", SCRIPT],
+        env=os.environ | programs(),
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert done.returncode == 0, done.stderr
-    programs = json.loads(done.stdout)
+    compiled = json.loads(done.stdout)
     # Without the event the test would count nothing.
-    assert any("_solve_padded" in name for name in programs.pop("first"))
-    assert programs == {
+    assert any("_solve_padded" in name for name in compiled.pop("first"))
+    assert compiled == {
         "times": [[]] * 5,
         "durations": [[]] * 2,
         "gains": [],

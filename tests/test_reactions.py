@@ -1,5 +1,6 @@
 """Bearing reactions: balance of each link, MuJoCo, the paper's constraint forces."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -42,6 +43,17 @@ def second(function, q, qd, qdd):
     return np.asarray(jax.jvp(rate, (q, qd), (qd, qdd))[1])
 
 
+@eqx.filter_jit
+def loads_of(elements, linkage, q, qd):
+    """Returns the loads, and where they act."""
+    parts = frames(linkage, q)
+    return [
+        (load, load.point.position(linkage, q))
+        for element in elements
+        for load in element.loads(element.schedule(0.0, linkage), parts, qd)
+    ]
+
+
 def cross(a, b):
     return a[0] * b[1] - a[1] * b[0]
 
@@ -55,35 +67,27 @@ def test_each_link_is_in_balance(topology):
     accelerations = second(lambda q: fj.mass_centers(linkage, q), q, qd, qdd)
     angle = lambda q: fj.to_chain(linkage, q, jnp.zeros(3))[0][1::2]
     spins = second(angle, q, qd, qdd)
-    centers, starts = fj.mass_centers(linkage, q), fj.joint_positions(linkage, q)
-    loads = [
-        load
-        for element in (SPRING, ACROSS, PUSH)
-        for load in element.loads(
-            element.schedule(0.0, linkage), frames(linkage, q), qd
-        )
-    ]
+    centers = np.asarray(fj.mass_centers(linkage, q))
+    starts = np.asarray(fj.joint_positions(linkage, q))
+    loads = jax.tree.map(np.asarray, loads_of((SPRING, ACROSS, PUSH), linkage, q, qd))
     weight = np.array([0, -float(linkage.gravity)])
+    mass, inertia = map(np.asarray, (linkage.mass, linkage.inertia))
     for k in range(3):
-        force = linkage.mass[k] * weight + reactions[k, :2]
+        force = mass[k] * weight + reactions[k, :2]
         moment = reactions[k, 2] + cross(starts[k] - centers[k], reactions[k, :2])
         if k < 2:
             force = force - reactions[k + 1, :2]
             arm = starts[k + 1] - centers[k]
             moment = moment - reactions[k + 1, 2] - cross(arm, reactions[k + 1, :2])
-        for load in loads:
+        for load, place in loads:
             if load.point.link == k + 1:
-                place = load.point.position(linkage, q)
-                push = np.array([load.force.real, load.force.imag])
+                total = complex(load.force)
+                push = np.array([total.real, total.imag])
                 force = force + push
-                moment = moment + load.moment + cross(place - centers[k], push)
+                moment = moment + float(load.moment) + cross(place - centers[k], push)
         size = np.abs(reactions).max()
-        np.testing.assert_allclose(
-            force, linkage.mass[k] * accelerations[k], atol=1e-10 * size
-        )
-        np.testing.assert_allclose(
-            moment, linkage.inertia[k] * spins[k], atol=1e-10 * size
-        )
+        np.testing.assert_allclose(force, mass[k] * accelerations[k], atol=1e-10 * size)
+        np.testing.assert_allclose(moment, inertia[k] * spins[k], atol=1e-10 * size)
 
 
 @pytest.mark.parametrize("topology", fj.TOPOLOGIES)

@@ -26,15 +26,13 @@ MOVE = fj.references.JointMove(
 # Soft enough for the longest period: the last link is light.
 KP, KD = np.array([100.0, 50.0, 10.0]), np.array([20.0, 10.0, 1.0])
 CONTROL = fj.PDController(KP, KD, np.inf, MOVE)
-# This solver's program compiles faster than the default.
-SHORT = dict(solver=LoopedDopri8())
 
 
 def test_sampled_control_converges_at_first_order():
     exact = fj.simulate(ARM, START, [0, 0.4], (CONTROL,)).q[-1]
     periods = np.array([4e-3, 2e-3, 1e-3, 5e-4])
     # Equal numbers of samples for all periods, for one program.
-    sampled = lambda p: fj.simulate_sampled(ARM, START, CONTROL, p, 800, **SHORT).q
+    sampled = lambda p: fj.simulate_sampled(ARM, START, CONTROL, p, 800).q
     errors = [np.abs(sampled(p)[round(0.4 / p)] - exact).max() for p in periods]
     slopes = np.diff(np.log(errors)) / np.diff(np.log(periods))
     np.testing.assert_allclose(slopes, 1, atol=0.1)
@@ -46,9 +44,7 @@ def ramp(t, q, qd, linkage):
 
 @pytest.mark.parametrize("delay", [0.0, 0.03])
 def test_efforts_are_held_and_come_late(delay):
-    # One run by the default solver, which takes longer to compile.
-    options = {} if delay else SHORT
-    motion = fj.simulate_sampled(WHEEL, REST, ramp, 0.1, 5, delay=delay, **options)
+    motion = fj.simulate_sampled(WHEEL, REST, ramp, 0.1, 5, delay=delay)
     np.testing.assert_allclose(motion.ts, np.arange(6) * 0.1, atol=1e-15)
     commanded = 1 + motion.ts[:-1]
     np.testing.assert_allclose(motion.tau[:, 2], commanded, rtol=1e-12)
@@ -69,7 +65,7 @@ def test_noise_is_what_the_key_says():
     seen = lambda t, q, qd, linkage: q + 10 * qd
     run = lambda seed: fj.simulate_sampled(
         WHEEL, REST, seen, 1e-6, 400, noise=(0.1, [0.02, 0.0, 0.0]),
-        key=jax.random.key(seed), **SHORT,
+        key=jax.random.key(seed), **STEPS,
     )  # fmt: skip
     first, same, other = run(1), run(1), run(2)
     np.testing.assert_array_equal(first.tau, same.tau)
@@ -128,7 +124,7 @@ def test_a_digital_pid_controller_of_motors():
         fj.JointEffort([0, 0, 12.0]), resistance=2.0, inductance=0.5, constant=0.3
     )
     idle = fj.JointEffort(np.zeros(3))
-    sampled = fj.simulate_sampled(WHEEL, REST, idle, 0.1, 5, (motor,), **SHORT)
+    sampled = fj.simulate_sampled(WHEEL, REST, idle, 0.1, 5, (motor,))
     whole = fj.simulate(WHEEL, REST, sampled.ts, (motor,))
     np.testing.assert_allclose(sampled.own[0].own, whole.own[0].own, atol=1e-8)
 
@@ -136,7 +132,7 @@ def test_a_digital_pid_controller_of_motors():
 @pytest.mark.slow
 def test_a_delay_that_is_too_long_is_told():
     end = lambda delay: fj.simulate_sampled(
-        WHEEL, REST, ramp, 0.1, 2, delay=delay, **SHORT
+        WHEEL, REST, ramp, 0.1, 2, delay=delay, solver=LoopedDopri8()
     )
     motions = jax.jit(jax.vmap(end))(jnp.array([0.05, 0.12]))
     assert np.isfinite(motions.q[0]).all() and np.isnan(motions.q[1, -1]).all()
@@ -144,7 +140,7 @@ def test_a_delay_that_is_too_long_is_told():
 
 def test_a_failure_is_named():
     broken = lambda t, q, qd, linkage: jnp.where(t > 0.15, jnp.nan, 0.0) * q
-    motion = fj.simulate_sampled(ARM, START, broken, 0.1, 4, **SHORT)
+    motion = fj.simulate_sampled(ARM, START, broken, 0.1, 4)
     assert (
         bool(motion.result == diffrax.RESULTS.nonfinite)
         and np.isfinite(motion.q[2]).all()

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from elements import SHORT
 from helpers import random_linkage
 from modes import ADJOINT
 from sweep_batch import (
@@ -186,12 +187,12 @@ def test_arrays_without_the_axis_are_shared():
         TS,
         (damper, stacked, shared),
         forces_axes=(None, 0, None),
-        **SETTINGS,
+        **SHORT,
     )
     assert solution.q.shape == (3, len(TS), 3)
     for member, q in enumerate(starts):
         start, forces = fj.State(q, [0, 0, 1]), (damper, own[member], shared)
-        single = fj.simulate(linkage, start, TS, forces, **SETTINGS)
+        single = fj.simulate(linkage, start, TS, forces, **SHORT)
         np.testing.assert_allclose(solution.q[member], single.q, rtol=1e-8, atol=1e-8)
 
 

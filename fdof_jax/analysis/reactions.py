@@ -87,6 +87,7 @@ def _reactions(
         about = about_pivot - cross(joint, carried)
         return jnp.stack([carried.real, carried.imag, about], axis=1)
 
-    # A loop compiles in three quarters of the time of `jax.vmap`, and is no slower.
+    # A loop compiles in three quarters of the time of `jax.vmap`. Without elements it
+    # takes half as long again (3 ms for 10,001 times), with them less than half.
     rows = solution.ts, solution.q, solution.qd, total
     return jax.lax.map(lambda row: at(*row), rows)

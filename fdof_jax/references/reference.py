@@ -10,7 +10,7 @@ from jax import Array
 from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
-from ..checks import function, is_traced, real_array, refusal
+from ..checks import function, is_traced, known, real_array, refusal
 from ..forces.part import Foreign, Part, default, optional
 from ..linkage.linkage import Linkage, check_linkage, joints_of
 from ..xla.array_namespace import in_numpy, namespace
@@ -61,9 +61,21 @@ class Reference(Part):
     ) -> tuple[Float[Array, " joint"], Float[Array, " joint"]]:
         """Joint positions [m or rad] and velocities [m/s or rad/s] at time `t` [s]."""
         check_linkage(linkage)
-        t, shape = real_array("t", t, ()), (joints_of(linkage),)
-        positions = lambda t: jnp.broadcast_to(self.assembly(t, linkage)[0], shape)
-        return jax.jvp(positions, (t,), (jnp.ones_like(t),))
+        arguments = self, real_array("t", t, ()), linkage
+        at_once = known(*arguments)
+        return (_with_rates_at_once if at_once else _with_rates)(*arguments)
+
+
+def _with_rates(
+    reference: Reference, t: Array, linkage: Linkage
+) -> tuple[Array, Array]:
+    shape = (joints_of(linkage),)
+    positions = lambda t: jnp.broadcast_to(reference.assembly(t, linkage)[0], shape)
+    return jax.jvp(positions, (t,), (jnp.ones_like(t),))
+
+
+# One program for known arguments, instead of one for each of a hundred operations.
+_with_rates_at_once = eqx.filter_jit(_with_rates)
 
 
 class ForeignReference(Foreign, Reference):
