@@ -104,14 +104,6 @@ def run(quick: bool) -> Iterator[dict]:
         yield from measure_batch(problem, _exact(problem), table(batch), budget)
 
 
-def run_xla_flags(quick: bool) -> Iterator[dict]:
-    """Measures on one core, with XLA told to compile faster and use wide vectors."""
-    for batch, budget in ({64: 10} if quick else {1: 10, 1024: 50}).items():
-        problem = fig5_batch(batch)
-        contestants = [row for row in table(batch) if not row[0].startswith("MJX")]
-        yield from measure_batch(problem, reference(problem), contestants, budget)
-
-
 def run_two_cores(quick: bool) -> Iterator[dict]:
     sizes = {64: 10} if quick else {1024: 25, 16384: 25}
     for batch, budget in sizes.items():

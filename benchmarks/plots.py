@@ -236,7 +236,6 @@ def hard_cases(points: list[dict], path: Path) -> None:
 PLOTS = {
     "trajectory": trajectory,
     "batches": batches,
-    "batches-xla-flags": batches,
     "batches-two-cores": batches,
     "batches-two-devices": batches,
     "batches-float32": batches,

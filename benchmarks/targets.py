@@ -53,21 +53,20 @@ def targets(points: dict[str, list[dict]], number: Callable) -> Iterator[tuple]:
     def row(figure: str, ratio, required: str, aim: str) -> tuple:
         return figure, *_quartiles(ratio, number), required, aim
 
-    for protocol, how in (("batches", ""), ("batches-xla-flags", ", XLA_FLAGS")):
-        job = points.get(protocol, ())
-        for name in ("fdof_jax", "fdof_jax sweep") if job else ():
-            yield row(
-                f"batch 1024, worst error 1e-6: {name} over MuJoCo RK4 rollout{how}",
-                ratio_at(job, "MuJoCo RK4", name, 1e-6, batch=1024),
-                "≥ 150",
-                "≥ 500",
-            )
-            yield row(
-                f"batch 1024, worst error 1e-9: {name} over plain diffrax{how}",
-                ratio_at(job, "plain diffrax", name, 1e-9, batch=1024),
-                "≥ 10",
-                "≥ 45",
-            )
+    job = points.get("batches", ())
+    for name in ("fdof_jax", "fdof_jax sweep") if job else ():
+        yield row(
+            f"batch 1024, worst error 1e-6: {name} over MuJoCo RK4 rollout",
+            ratio_at(job, "MuJoCo RK4", name, 1e-6, batch=1024),
+            "≥ 150",
+            "≥ 500",
+        )
+        yield row(
+            f"batch 1024, worst error 1e-9: {name} over plain diffrax",
+            ratio_at(job, "plain diffrax", name, 1e-9, batch=1024),
+            "≥ 10",
+            "≥ 45",
+        )
     for problem in dict.fromkeys(p["problem"] for p in points.get("checks", ())):
         yield row(
             f"{problem}: watched for ill-conditioning over not watched",

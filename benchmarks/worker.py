@@ -9,9 +9,6 @@ import warnings
 from pathlib import Path
 from typing import Any, NamedTuple
 
-# XLA uses the widest vectors of a processor only when told to.
-# XLA of jaxlib 0.6 to 0.12 knows it. An XLA that does not would end the job.
-XLA_FLAGS = "--xla_cpu_prefer_vector_width=512"
 TWO_DEVICES = "--xla_force_host_platform_device_count=2"
 
 
@@ -30,7 +27,6 @@ class Job(NamedTuple):
 
 JOBS = (
     Job("batches", "batches"),
-    Job("batches-xla-flags", "batches", "run_xla_flags", flags=XLA_FLAGS),
     Job("batches-two-cores", "batches", "run_two_cores", cores=2),
     Job(
         "batches-two-devices", "batches", "run_two_devices", cores=2, flags=TWO_DEVICES

@@ -220,10 +220,10 @@ def without_x64():
 def test_double_precision_where_it_is_off(path):
     fj.save(path, {"jax": jnp.ones(3), "numpy": np.ones(3)})
     with without_x64():
-        refused(path, "got float64: .*jax_enable_x64")
+        refused(path, "got float64: .*configure.x64=True")
     fj.save(path, [jnp.array([1, 2])])
     with without_x64():
-        refused(path, "got int64: .*jax_enable_x64")
+        refused(path, "got int64: .*configure.x64=True")
     fj.save(path, np.ones(3))
     with without_x64():
         same(fj.load(path), np.ones(3))

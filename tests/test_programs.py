@@ -172,6 +172,7 @@ def compiled(linkage, state0, ts, forces, **options):
     before = len(programs)
     motion = fj.simulate(linkage, state0, ts, forces, **options)
     assert motion.q.shape == (len(ts), 3) and motion.outcome == "successful"
+    assert fj.joint_efforts(linkage, forces, motion).total.shape == (len(ts), 3)
     return programs[before:]
 
 print(json.dumps({

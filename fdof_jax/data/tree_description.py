@@ -280,7 +280,7 @@ class Restorer:
         if jax.dtypes.canonicalize_dtype(array.dtype) != array.dtype:
             raise Unreadable(
                 f"expected arrays that JAX accepts as configured, got {array.dtype}"
-                ': jax.config.update("jax_enable_x64", True) enables it'
+                ": fj.configure(x64=True) enables it"
             )
         if node["weak"]:
             # A weak type is restored, so that compiled programs are found again.

@@ -5,10 +5,11 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jaxtyping import Float
 
-from ..checks import instance, place_of
+from ..checks import instance, is_traced, place_of
 from ..forces.element import (
     Element,
     Forces,
@@ -18,6 +19,7 @@ from ..forces.element import (
 )
 from ..linkage.linkage import Linkage, check_linkage, without_fixed
 from .field import element_effort
+from .padding import cut, padded
 from .prescribed import prescribed, prescribed_effort
 from .simulate import check_own
 from .solution import Solution, check_joints
@@ -62,23 +64,30 @@ def joint_efforts(linkage: Linkage, forces: Forces, solution: Solution) -> Effor
         )
     check_joints("solution", solution, linkage)
     check_own("solution.own", solution.own, forces, linkage, solution.ts.shape)
-    return _efforts(linkage, of_full_size(linkage, forces), solution)
+    forces = of_full_size(linkage, forces)
+    rows = solution.ts, solution.q, solution.qd, solution.own
+    if not is_traced(linkage, forces, rows):
+        found = _efforts(linkage, forces, *padded(rows))
+        if not is_traced(found):  # by a value in the closure of a function
+            elements = np.asarray(found.elements)[:, : len(solution.ts)]
+            return Efforts(cut(found.total, len(solution.ts)), jax.device_put(elements))
+    return _efforts(linkage, forces, *rows)
 
 
 @eqx.filter_jit
 def _efforts(
-    linkage: Linkage, forces: tuple[Element, ...], solution: Solution
+    linkage: Linkage, forces: tuple[Element, ...], ts: Array, q: Array, qd: Array, own
 ) -> Efforts:
-    motion_rows, own = (solution.ts, solution.q, solution.qd), iter(solution.own)
+    motion_rows, states = (ts, q, qd), iter(own)
     efforts = []
     for index, element in enumerate(forces):
 
         def effort(t, q, qd, state, index=index, element=element):
             return element_effort(index, element, t, q, qd, linkage, state)[0]
 
-        state = next(own) if isinstance(element, StatefulElement) else ()
+        state = next(states) if isinstance(element, StatefulElement) else ()
         efforts.append(jax.vmap(effort)(*motion_rows, state))
-    stacked = jnp.stack(efforts) if efforts else jnp.zeros((0, *solution.q.shape))
+    stacked = jnp.stack(efforts) if efforts else jnp.zeros((0, *q.shape))
     if (motion := prescribed(forces)) is not None:
         demand = lambda *row: prescribed_effort(linkage, forces, *row)
         demanded = jax.vmap(demand)(*motion_rows, jnp.sum(stacked, axis=0))

@@ -188,8 +188,9 @@ def simulate(
             # The caller's `ts` itself keeps derivatives in the times.
             solution = eqx.tree_at(lambda s: s.ts, solution, ts)
             return _raising(solution, inputs) if throw else solution
-    except TypeError as error:
-        if "forward-mode" in str(error):
+    except (TypeError, StopIteration) as error:
+        # After other transformations JAX may find no rule at all, without a word.
+        if "forward-mode" in str(error) or isinstance(error, StopIteration):
             raise TypeError(
                 "forward-mode differentiation of simulate needs "
                 "adjoint=diffrax.ForwardMode(); for second derivatives take "
@@ -227,7 +228,7 @@ def _raising(solution: Solution, inputs: tuple[Any, ...]) -> Solution:
             element.possible()
         )
     faults = jnp.stack([fault.any() for fault in wrong.values()])
-    messages = [f"simulate: {message}, got others." for message in wrong]
+    messages = [f"simulate: {message}." for message in wrong]
     failed = solution.result != diffrax.RESULTS.successful
     try:
         raising = eqx.branched_error_if(

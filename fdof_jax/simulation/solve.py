@@ -15,14 +15,12 @@ from ..checks import is_traced
 from ..forces.added_inertia import inertial
 from ..forces.element import Element, ForeignElement
 from .integrate import integrate
+from .padding import cut, padded
 from .prescribed import prescribed
 from .solution import Solution
 from .step_wrappers import with_pid
 from .steps import default_controller
 from .unrolled_dopri8 import UnrolledDopri8
-
-# All plain calls with at most this many output times share one program.
-_FEWEST_TIMES = 512
 
 
 def solve(inputs, keywords) -> tuple[Solution, bool | None]:
@@ -44,24 +42,14 @@ def solve(inputs, keywords) -> tuple[Solution, bool | None]:
 def _solve_one(inputs, keywords) -> tuple[Solution, bool] | None:
     """Computes the motion of one arm from concrete inputs, and whether it succeeded.
 
-    Output times are padded with the last one to a power of two, so that few programs
-    serve all numbers of them. Returns None if a force element holds a traced value.
+    Returns None if a force element holds a traced value.
     """
     linkage, state0, ts, own0, forces = inputs
-    times = np.asarray(ts)
-    count = len(times)
-    size = max(_FEWEST_TIMES, 1 << (count - 1).bit_length())
-    filled = np.pad(times, (0, size - count), mode="edge")
-    padded = linkage, state0, filled, own0, forces
-    solution, succeeded = _solve_padded(padded, _of_any_tolerance(keywords))
+    known = linkage, state0, padded(ts), own0, forces
+    solution, succeeded = _solve_padded(known, _of_any_tolerance(keywords))
     if is_traced(solution):
         return None
-
-    def cut(rows: Array) -> Array:
-        # JAX slices and jnp.asarray would compile a program for each new shape.
-        return jax.device_put(np.asarray(rows)[:count])
-
-    q, qd, own = cut(solution.q), cut(solution.qd), jax.tree.map(cut, solution.own)
+    q, qd, own = cut((solution.q, solution.qd, solution.own), len(ts))
     whole = Solution(ts, q, qd, solution.stats, solution.result, own)
     return whole, bool(succeeded)
 

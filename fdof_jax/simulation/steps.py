@@ -74,7 +74,7 @@ def within_reach(
             return tolerance
         warnings.warn(
             f"stepsize_controller: {name}={known:g} cannot be met in float32, "
-            f"{_TIGHTEST_SINGLE:g} is used; switch on jax_enable_x64 for more.",
+            f"{_TIGHTEST_SINGLE:g} is used; fj.configure(x64=True) allows more.",
             stacklevel=7,
         )
         return _TIGHTEST_SINGLE

@@ -1,0 +1,29 @@
+"""Rows of output times, padded so that few programs serve all numbers of them."""
+
+from typing import Any
+
+import jax
+import numpy as np
+from numpy.typing import ArrayLike
+
+# All plain calls with at most this many output times share one program.
+_FEWEST_TIMES = 512
+
+
+def padded(rows: Any) -> Any:
+    """Returns arrays (time, ...) with their last row repeated up to a power of two."""
+
+    def longer(row: ArrayLike) -> np.ndarray:
+        known = np.asarray(row)
+        count = len(known)
+        size = max(_FEWEST_TIMES, 1 << (count - 1).bit_length())
+        others = ((0, 0),) * (known.ndim - 1)
+        return np.pad(known, ((0, size - count), *others), mode="edge")
+
+    return jax.tree.map(longer, rows)
+
+
+def cut(rows: Any, count: int) -> Any:
+    """Returns the first `count` rows of arrays (time, ...)."""
+    # JAX slices and jnp.asarray would compile a program for each new shape.
+    return jax.tree.map(lambda row: jax.device_put(np.asarray(row)[:count]), rows)
