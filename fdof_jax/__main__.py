@@ -4,37 +4,74 @@ JAX, whose import takes a second, is imported after the arguments have been pars
 """
 
 import argparse
+import math
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from . import __version__
 
 _COMMANDS = {
     "circle": "track the circle, tune the gains, track it again (the default)",
     "figures": "reproduce the paper's Figs 3 to 7",
-    "topologies": "simulate all seven topologies in one compiled batched call",
+    "topologies": "simulate all seven topologies by one compiled program",
     "league": "tune the gains of all seven topologies on one circle",
     "tune": "tune the gains of Fig 7's arm: circle, bounds, method, robustness",
 }
-# Options of `tune`: type of the numbers, their names if there are two, and the help.
-_ENDS = "LEAST", "GREATEST"
-_OPTIONS = {
-    "center": (float, ("X", "Y"), "middle of the circle [m]; -4 2 by default"),
-    "radius": (float, None, "radius of the circle [m]; 0.75 by default"),
-    "period": (float, None, "time of one turn [s], of two; 5 by default"),
-    "price": (float, None, "price of a joint's constant full effort [m^2]"),
-    "members": (int, None, "number of scenes of an ensemble; 16 by default"),
-    "payload": (float, _ENDS, "ensemble: mass at the tip [kg]"),
-    "start-offset": (float, None, "ensemble: tip's offset at the start [m]"),
-    "speed": (float, _ENDS, "ensemble: factor on the speed"),
-    "link-error": (float, None, "ensemble: relative error of links' mass data"),
-    "over": (str, None, "mean or worst of the ensemble; mean by default"),
-    "factor": (float, None, "bounds of the gains over the paper's; 4 by default"),
-    "method": (str, None, "levenberg-marquardt (the default), l-bfgs or adam"),
-    "starts": (int, None, "runs; later ones from random gains; 1 by default"),
-    "seed": (int, None, "seed of random gains; 0 by default"),
-    "max-steps": (int, None, "steps of a run; 50 by default"),
-}
+
+
+def _number(kind: Callable[[str], Any], least: float, above: bool = False) -> Callable:
+    """Returns a reader of finite numbers of at least `least`, or above it."""
+
+    def read(text: str) -> Any:
+        value = kind(text)
+        if not least <= value < math.inf or (above and value == least):
+            bound = "above" if above else "of at least"
+            expected = f"expected a number {bound} {least}, got {text!r}"
+            raise argparse.ArgumentTypeError(expected)
+        return value
+
+    read.__name__ = kind.__name__  # of messages
+    return read
+
+
+# Options of `tune`, as argparse takes them. The library checks what is left to check.
+_ENDS: dict[str, Any] = dict(nargs=2, metavar=("LEAST", "GREATEST"))
+_AMOUNT, _COUNT = _number(float, 0), _number(int, 1)
+_METHODS = ["levenberg-marquardt", "l-bfgs", "adam"]
+_OPTIONS: dict[str, dict[str, Any]] = {
+    "center": dict(
+        type=float, nargs=2, metavar=("X", "Y"),
+        help="middle of the circle [m]; -4 2 by default",
+    ),
+    "radius": dict(type=_AMOUNT, help="radius of the circle [m]; 0.75 by default"),
+    "period": dict(type=float, help="time of one turn [s], of two; 5 by default"),
+    "price": dict(type=_AMOUNT, help="price of a joint's constant full effort [m^2]"),
+    "members": dict(type=_COUNT, help="scenes of an ensemble; 16 by default"),
+    "payload": dict(type=_AMOUNT, **_ENDS, help="ensemble: mass at the tip [kg]"),
+    "start-offset": dict(type=_AMOUNT, help="ensemble: tip's offset at the start [m]"),
+    "speed": dict(
+        type=_number(float, 0, above=True), **_ENDS,
+        help="ensemble: factor on the speed",
+    ),
+    "link-error": dict(
+        type=_AMOUNT, help="ensemble: relative error of links' mass data"
+    ),
+    "over": dict(
+        choices=["mean", "worst"], help="of the ensemble; mean by default"
+    ),
+    "factor": dict(
+        type=_number(float, 1, above=True),
+        help="bounds of the gains over the paper's; 4 by default",
+    ),
+    "method": dict(choices=_METHODS, help="levenberg-marquardt by default"),
+    "starts": dict(
+        type=_COUNT, help="runs; later ones from random gains; 1 by default"
+    ),
+    "seed": dict(type=_number(int, 0), help="seed of random gains; 0 by default"),
+    "max-steps": dict(type=_COUNT, help="steps of a run; 50 by default"),
+}  # fmt: skip
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -78,14 +115,8 @@ def _parser() -> argparse.ArgumentParser:
         )
         _add_output(command)
         if name == "tune":
-            for option, (kind, parts, words) in _OPTIONS.items():
-                command.add_argument(
-                    f"--{option}",
-                    type=kind,
-                    nargs=len(parts) if parts else None,
-                    metavar=parts,
-                    help=words,
-                )
+            for option, settings in _OPTIONS.items():
+                command.add_argument(f"--{option}", **settings)
     return parser
 
 

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import fdof_jax as fj
-from fdof_jax.__main__ import main
+from fdof_jax.__main__ import _METHODS, main
+from fdof_jax.search.methods import METHODS
 
 
 def pictures(folder):
@@ -107,6 +108,14 @@ AT_ONCE = [
     ("tune --center 0", 2, "--center: expected 2 arguments"),
     ("tune --radius one", 2, "--radius: invalid float value: 'one'"),
     ("tune --starts 1.5", 2, "--starts: invalid int value: '1.5'"),
+    ("tune --radius -1", 2, "--radius: expected a number of at least 0, got '-1'"),
+    ("tune --price nan", 2, "--price: expected a number of at least 0, got 'nan'"),
+    ("tune --factor 1", 2, "--factor: expected a number above 1, got '1'"),
+    ("tune --speed 0 1", 2, "--speed: expected a number above 0, got '0'"),
+    ("tune --members 0", 2, "--members: expected a number of at least 1, got '0'"),
+    ("tune --starts 0", 2, "--starts: expected a number of at least 1, got '0'"),
+    ("tune --seed -1", 2, "--seed: expected a number of at least 0, got '-1'"),
+    ("tune --method newton", 2, "--method: invalid choice: 'newton'"),
 ]
 if os.geteuid() != 0:  # root may write everywhere
     AT_ONCE += [
@@ -153,23 +162,19 @@ def test_answers_without_jax(arguments, status, message, answers):
     assert code == status and message in printed and imported == []
 
 
+def test_the_methods_are_the_library_s():
+    assert list(METHODS) == _METHODS
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
         ("--center -1 2", "expected a circle within the linkage's reach"),
         ("--center 0 inf", "center: expected an array of 2 real numbers, all finite"),
-        ("--radius -1", "radius: expected a real number, finite, at least 0"),
         ("--period 0", "period: expected not zero"),
-        ("--price nan", "price: expected a real number, finite, at least 0"),
-        ("--factor 1", "factor: expected a real number, finite, above 1"),
-        ("--speed 0 1", "speed: expected an array of 2 real numbers"),
         ("--link-error 1", "link_error: expected less than 1"),
         ("--payload 2 1", "payload: expected the least before the greatest"),
-        ("--members 0", "members: expected a whole number of at least 1"),
         ("--over worst", "over: expected an ensemble to take the worst of"),
-        ("--starts 0", "starts: expected a whole number of at least 1"),
-        ("--seed -1", "seed: expected a whole number of at least 0"),
-        ("--method newton", "method: expected one of ('levenberg-marquardt', 'l-bfgs'"),
     ],
 )
 def test_the_library_refuses_options(options, message, tmp_path, capsys):

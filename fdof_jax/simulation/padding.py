@@ -26,4 +26,4 @@ def padded(rows: Any) -> Any:
 def cut(rows: Any, count: int) -> Any:
     """Returns the first `count` rows of arrays (time, ...)."""
     # JAX slices and jnp.asarray would compile a program for each new shape.
-    return jax.tree.map(lambda row: jax.device_put(np.asarray(row)[:count]), rows)
+    return jax.device_put(jax.tree.map(lambda row: np.asarray(row)[:count], rows))

@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.flatten_util import ravel_pytree
-from numpy.typing import ArrayLike
 
 from ..checks import is_traced
 from ..forces.added_inertia import inertial
@@ -62,11 +61,9 @@ def _of_any_tolerance(keywords):
             return keywords  # which default it gets depends on the solver
         controller = default_controller()
 
-    def array(tolerance: ArrayLike) -> Array:
-        return jax.device_put(np.asarray(tolerance, jnp.result_type(float)))
-
     def opened(pid: diffrax.PIDController) -> diffrax.PIDController:
-        rtol, atol = map(array, (pid.rtol, pid.atol))
+        dtype = jnp.result_type(float)
+        rtol, atol = (np.asarray(t, dtype) for t in (pid.rtol, pid.atol))
         return dataclasses.replace(pid, rtol=rtol, atol=atol)
 
     return keywords | {"stepsize_controller": with_pid(opened, controller)}
