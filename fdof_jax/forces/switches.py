@@ -33,19 +33,20 @@ class Switches:
         self.jumping |= not continuous
         if self.sides is None:
             return g
-        sides = self.take(g.size).reshape(g.shape)
-        return jnp.where(sides == 0, g, sides)
+        # No switching function that changes its sign is as large.
+        largest = jnp.finfo(self.sides.dtype).max
+        return g + (largest * self.sides)[self._next(g.size)].reshape(g.shape)
 
-    def take(self, count: int) -> Any:
-        """Returns the next `count` sides."""
+    def _next(self, count: int) -> slice:
+        """Returns the places of the next `count` sides."""
         begin, self._count = self._count, self._count + count
-        return None if self.sides is None else self.sides[begin : self._count]
+        return slice(begin, self._count)
 
     def add(self, values: list[Array], jumping: bool) -> None:
         """Adds switches that were met elsewhere, with the sides of `rest`."""
         self.values += values
         self.jumping |= jumping
-        self.take(sum(g.size for g in values))
+        self._next(sum(g.size for g in values))
 
     def rest(self) -> Any:
         return None if self.sides is None else self.sides[self._count :]

@@ -25,6 +25,7 @@ from .field import (
     whole,
 )
 from .looped_dopri8 import LoopedDopri8
+from .packing import in_arrays
 from .prescribed import motion_at, prescribed, start_of, term_of
 from .rounding import Recorded, above_rounding
 from .solution import Solution
@@ -79,7 +80,10 @@ def integrate(
     controller = _controller(
         keywords["stepsize_controller"], solver, term, bound if derivatives else None
     )
-    y0 = whole(*start_of(args, qd0), own)
+    unpacked, y0 = args, whole(*start_of(args, qd0), own)
+    # In batches without derivatives scalars are faster, in all other cases arrays.
+    if padded or isinstance(solver, LoopedDopri8):
+        term, y0, args = in_arrays(term, y0, args)
     length = len(y0)
     implicit = isinstance(solver, diffrax.AbstractImplicitSolver)
     wrapper: Any = LocatedImplicit if implicit else Located
@@ -112,7 +116,7 @@ def integrate(
         )
     assert found.ys is not None  # because of saveat
     states, (reached, *known) = found.ys
-    at = lambda t, y: (*motion_at(args, t, y), own_states(args, y))
+    at = lambda t, y: (*motion_at(unpacked, t, y), own_states(args, y))
     q, qd, own = jax.vmap(at)(ts, states)
 
     def shown(a):
@@ -156,17 +160,18 @@ def _harmless(inputs, padded: bool) -> tuple[Array, Array, tuple[Array, Array]]:
     that other lanes share.
     """
     linkage, state0, asked, _, forces = inputs
+    if padded:  # a plain call has checked them
+        q0, qd0 = (without_fixed(linkage, a) for a in state0)
+        return jnp.array(True), asked, (q0, qd0)
     growth = jnp.diff(asked)
-    grows = (growth >= 0) if padded else (growth > 0)
-    increasing = (grows & (growth < jnp.inf)).all()
+    increasing = ((growth > 0) & (growth < jnp.inf)).all()
     harmless = 1e-3 * jnp.arange(len(asked), dtype=asked.dtype)
     ts = jnp.where(increasing, asked, harmless)
     finite = (jnp.isfinite(state0.q) & jnp.isfinite(state0.qd)).all()
     valid = possible(linkage) & increasing & finite
     for element in forces:
         valid = valid & element.possible()
-        if not padded:  # a plain call has checked it
-            valid = valid & constant(element).fits(*constant((linkage, ts)))
+        valid = valid & constant(element).fits(*constant((linkage, ts)))
     motion = prescribed(forces)
     if motion is not None:
         valid = valid & motion.agrees(ts[0], jnp.asarray(state0.q), linkage)

@@ -32,8 +32,12 @@ from .dopri8 import (
 
 def _weighted(weights: Array, rates: PyTree) -> PyTree:
     """Sums the rates of all stages, each times its weight."""
-    # For a matrix product XLA would call a library, which costs more at this size.
-    return jtu.tree_map(lambda k: jnp.sum(weights * k), rates)
+
+    def weighted(k):
+        # For a matrix product XLA would call a library, which costs more at this size.
+        return jnp.sum(weights.reshape(-1, *[1] * (k.ndim - 1)) * k, axis=0)
+
+    return jtu.tree_map(weighted, rates)
 
 
 # Reverse mode replays steps with the very code that took them: near a saturation,
@@ -59,7 +63,7 @@ def _step(term: Any, t0, t1, y0, lost, args):
 
     # The first rate is that of the last step's end. To evaluate it again costs a
     # fourteenth; to keep it, a second copy of the equations for the first step.
-    rates = jtu.tree_map(lambda y: jnp.zeros(STAGES, y.dtype), y0)
+    rates = jtu.tree_map(lambda y: jnp.zeros((STAGES, *y.shape), y.dtype), y0)
     weights = jnp.concatenate([jnp.zeros((1, STAGES), h.dtype), lower])
     stages = jnp.arange(STAGES), times, weights, schedule
     rates, healths = jax.lax.scan(stage, rates, stages)
@@ -69,7 +73,7 @@ def _step(term: Any, t0, t1, y0, lost, args):
     error = jtu.tree_map(lambda k: h * k, _weighted(weights, rates))
     # diffrax overlooks an infinity beside a NaN and finds no next step size.
     last = jtu.tree_map(lambda k: k[-1], rates)
-    finite = jnp.isfinite(sum(jtu.tree_leaves((y, last))))
+    finite = jnp.isfinite(sum(map(jnp.sum, jtu.tree_leaves((y, last)))))
     # If the end is not finite, the health at the start shows why.
     health = tuple(jnp.where(finite, x[-1], x[0]) for x in healths)
     health = health_if(finite, health)
@@ -80,6 +84,8 @@ def _step(term: Any, t0, t1, y0, lost, args):
 
 
 class _Interpolation(DenseOutput):
+    looped = True
+
     def at(self, theta):
         change = _weighted(interpolation_weights(theta), self.rates)
         return jtu.tree_map(lambda a, k: a + self.step * k, self.y0, change)

@@ -9,10 +9,12 @@ import functools
 from collections.abc import Sequence
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import Array
 
+from ..linkage.topology import real_joints
 from .dopri8 import Health, constant
 from .step_wrappers import Adaptive, with_judge
 
@@ -35,9 +37,9 @@ class _AboveRounding(Adaptive):
 
     def adapt_step_size(self, *arguments):
         t0, t1, y0, y1_candidate, args, (error, health), *rest = arguments
-        revolute = args.constants.revolute
+        revolute = real_joints(args.linkage.ef)
         of_qd = _rounding(revolute, health, y0, y1_candidate)
-        of_delta = tuple(jnp.abs(t1 - t0) * noise for noise in of_qd)
+        of_delta = jax.tree.map(lambda noise: jnp.abs(t1 - t0) * noise, of_qd)
 
         def judged(error: Array, start: Array, end: Array, rounding: Array) -> Array:
             size = jnp.maximum(jnp.abs(start), jnp.abs(end))
@@ -55,21 +57,31 @@ class _AboveRounding(Adaptive):
         return super().adapt_step_size(t0, t1, y0, y1_candidate, args, error, *rest)
 
 
-def _rounding(revolute: Sequence[Array], health: Health, y0: Any, y1: Any) -> Health:
+def _rounding(revolute: Sequence[Array], health: Health, y0: Any, y1: Any) -> Any:
     """Estimates the rounding errors of a step in each velocity or momentum.
 
     A velocity changes by its acceleration, and its direction turns with the links.
     Joints that lose accuracy disturb those that do not.
     """
-    largest = functools.partial(functools.reduce, jnp.maximum)
+    joints: Any = tuple(revolute), health
+    if eqx.is_array(y0[1]):
+        joints = tuple(map(jnp.stack, joints))
+    revolute, losses = joints
     shift, change = jax.tree.map(lambda a, b: jnp.abs(b - a), y0[:2], y1[:2])
-    turned = sum(jnp.where(r, step, 0) for r, step in zip(revolute, shift))
-    size = jnp.maximum(largest(change), turned * largest(map(jnp.abs, y0[1])))
-    worst = jnp.finfo(size.dtype).eps * jnp.sqrt(largest(health)) * size
-    return tuple(
-        jnp.where(r, _OF_REVOLUTE, _OF_SLIDE) * jnp.sqrt(loss) * worst
-        for r, loss in zip(revolute, health)
-    )
+    turned = jax.tree.map(lambda r, step: jnp.where(r, step, 0), revolute, shift)
+    turned = sum(map(jnp.sum, jax.tree.leaves(turned)))
+    size = jnp.maximum(_largest(change), turned * _largest(y0[1]))
+    worst = jnp.finfo(size.dtype).eps * jnp.sqrt(_largest(losses)) * size
+
+    def noise(revolute: Array, loss: Array) -> Array:
+        return jnp.where(revolute, _OF_REVOLUTE, _OF_SLIDE) * jnp.sqrt(loss) * worst
+
+    return jax.tree.map(noise, revolute, losses)
+
+
+def _largest(tree: Any) -> Array:
+    sizes = [jnp.max(jnp.abs(leaf)) for leaf in jax.tree.leaves(tree)]
+    return functools.reduce(jnp.maximum, sizes)
 
 
 class Recorded(Adaptive):

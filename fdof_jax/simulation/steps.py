@@ -86,7 +86,7 @@ class _Scaled(Adaptive):
     """A controller that measures each coordinate in a unit of its own."""
 
     controller: Any
-    unit: tuple[tuple[Array, ...], tuple[Array, ...]]  # of q and of qd
+    unit: tuple[Array, Array]  # of q and of qd (n,)
 
     def init(self, *arguments):
         if arguments[4] is None:
@@ -100,7 +100,9 @@ class _Scaled(Adaptive):
 
         def scaled(state: Any) -> Any:
             # The elements' own states come last and keep their units.
-            motion = jax.tree.map(lambda a, unit: a / unit, state[:2], self.unit)
+            scalars = isinstance(state[0], tuple)
+            units: Any = tuple(map(tuple, self.unit)) if scalars else self.unit
+            motion = jax.tree.map(jnp.divide, state[:2], units)
             return (*motion, *state[2:])
 
         y0, y1_candidate, error = map(scaled, (y0, y1_candidate, error))
@@ -154,5 +156,4 @@ def scale_tolerances(
         )
         q = jnp.where(jnp.stack(real_joints(linkage.ef)), 1, size)
         qd = q / time
-    unit = tuple(q), tuple(qd)
-    return _Scaled(controller, unit)  # pyright: ignore[reportCallIssue]
+    return _Scaled(controller, (q, qd))  # pyright: ignore[reportCallIssue]

@@ -225,9 +225,9 @@ def _values(term: Any, t0: Array, t1: Array, path: Any, args: Any) -> Array:
     if isinstance(path, DenseOutput):
         stages = np.array(SAMPLED)
         scheduled = jax.tree.map(lambda rows: rows[stages], path.scheduled)
-        found = jax.vmap(
-            lambda share, t, row: term.switching(t, path.at(share), args, row)[0]
-        )(shares, times, scheduled)
+        one = lambda row: term.switching(row[1], path.at(row[0]), args, row[2])[0]
+        rows = shares, times, scheduled
+        found = jax.lax.map(one, rows) if path.looped else jax.vmap(one)(rows)
     else:
         found = jax.vmap(lambda t: term.switches(t, path.evaluate(t), args)[0])(times)
     # An infinite limit is never reached.
