@@ -39,7 +39,7 @@ def _number(kind: Callable[[str], Any], least: float, above: bool = False) -> Ca
 # Options of `tune`, as argparse takes them. The library checks what is left to check.
 _ENDS: dict[str, Any] = dict(nargs=2, metavar=("LEAST", "GREATEST"))
 _AMOUNT, _COUNT = _number(float, 0), _number(int, 1)
-_METHODS = ["levenberg-marquardt", "l-bfgs", "adam"]
+_METHODS = ["levenberg-marquardt", "l-bfgs"]
 _OPTIONS: dict[str, dict[str, Any]] = {
     "center": dict(
         type=float, nargs=2, metavar=("X", "Y"),

@@ -66,7 +66,8 @@ def integrate(
     """Integrates one motion, by default with `LoopedDopri8`.
 
     `derivatives`: whether to bound the steps so that derivatives are accurate too.
-    `padded`: whether the last time may be repeated.
+    `padded`: for a plain call, which has checked its inputs; the last time may be
+    repeated.
     """
     linkage, state0, asked, own0, forces = inputs
     solver = _differentiable(keywords["solver"] or LoopedDopri8(), keywords["adjoint"])

@@ -39,7 +39,7 @@ def configure(
 
     Whatever the arguments, `configure` makes XLA compile small loops as one kernel if
     the installed version needs an option for it (JAX before 0.12). Single arms are then
-    simulated up to ten times as fast, and gradients take a third of the time.
+    simulated up to four times as fast, and gradients take a third of the time.
 
     **Arguments:** None leaves a setting as it is.
 
