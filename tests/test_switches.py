@@ -6,51 +6,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from switching_scenes import BUMPER, CABLE, LIMITED, RODS as ARM, scene
 
 import fdof_jax as fj
 from fdof_jax.simulation.looped_dopri8 import LoopedDopri8
 from fdof_jax.simulation.sensitivities import sensitivities
 
-ARM = fj.Linkage(
-    "RRR", length=[0, 1, 1, 1], com=[[0.5, 0]] * 3, mass=[1, 1, 1], inertia=[0.1] * 3
-)
 FORWARD = diffrax.ForwardMode()
-
-
-class Case(eqx.Module):
-    """Numbers of a scene that has all elements: a limited PD and a damped contact."""
-
-    gain: float
-    contact: float
-    side: int
-    rest: float
-    end: float
-
-
-LIMITED = Case(1.0, 0.0, 1, 1.9, 1.0)
-CABLE = Case(0.0, 1.0, 1, 1.9, 0.8)
-BUMPER = Case(0.0, 1.0, -1, 1.6, 0.8)
 CASES = jax.tree.map(lambda *a: np.array(a), LIMITED, CABLE, BUMPER)
 # Of the last positions: Richardson differences of tight solves. What varies is the time
 # at which the limited move begins, or the first angle of a fall to the cable.
 PUBLISHED = [[-0.459781, 0.642768, 0.038107], [0.587835, 0.200989, 0.206584]]
-
-
-def scene(x, case):
-    limited = case.gain > 0
-    q0, qd0 = jnp.array([0.2, 0.4, -0.3]), jnp.array([0.3, -0.5, 0.4])
-    begin = jnp.where(limited, x, 0.1)
-    travel = fj.references.Travel(0.7, begin=begin, profile="trapezoidal")
-    move = fj.references.JointMove(q0, q0 + 0.5, travel)
-    pd = fj.PDController(80 * case.gain, 8 * case.gain, 10, move)
-    spring = fj.SpringDamper(
-        fj.Point(0, 0.0, 1.0), fj.Point(1, 1.0), one_sided="cable",
-        stiffness=200 * case.contact, damping=20 * case.contact, rest_length=case.rest,
-    )  # fmt: skip
-    spring = eqx.tree_at(lambda spring: spring.side, spring, jnp.asarray(case.side))
-    fall = jnp.zeros(3).at[0].set(x)
-    start = fj.State(jnp.where(limited, q0, fall), jnp.where(limited, qd0, 0))
-    return fj.Scene(ARM, start, (pd, spring, fj.JointDamper(case.contact)), case.end)
 
 
 def motion(x, case, **options):
