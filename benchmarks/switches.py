@@ -32,7 +32,7 @@ PROTOCOL = "switches"
 DEFAULT, TIGHT = 1e-11, 1e-13  # tolerances
 # Rounding weighs more in close differences, and more motions have a switch more or less
 # in wide ones: the better of these counts.
-CLOSE = 1e-4, 4e-6
+CLOSE = 1e-4, 4e-7
 WEIGHTS = np.array([0.6, -0.4, 0.5])
 FORWARD = diffrax.ForwardMode()
 # A number of checkpoints asks for the adjoint, for few parameters too. With as many as
