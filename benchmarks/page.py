@@ -10,7 +10,7 @@ from .joints import joints_table
 from .markdown import number, table
 from .measure import TARGETS, times_at
 from .scaling import slope
-from .switches import switches_table
+from .switch_tables import switches_table
 from .targets import targets
 
 

@@ -21,7 +21,6 @@ from jax import Array
 
 import fdof_jax as fj
 
-from .markdown import number, table
 from .measure import record
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
@@ -220,21 +219,3 @@ def measured(problem: Problem) -> Iterator[dict]:
 def run(quick: bool) -> Iterator[dict]:
     for problem in PROBLEMS[1:2] if quick else PROBLEMS:
         yield from measured(problem)
-
-
-def switches_table(points: list[dict]) -> str:
-    """Returns a row per scene and tolerance: the largest error and mean steps."""
-    rows: dict[tuple, dict[str, dict]] = {}
-    for p in points:
-        rows.setdefault((p["problem"], p["setting"]), {})[p["solver"]] = p
-    body = []
-    for (name, tolerance), by in rows.items():
-        p = by[WAYS[0]]
-        cells = [number(p[key]) for key in ("batch", "parameters", "switches")]
-        for way in WAYS:
-            known = by.get(way, {"error": None, "steps": None})
-            cells += [number(known["error"]), number(known["steps"])]
-        body.append([name, *cells, number(tolerance)])
-    head = ["", "scenes", "parameters", "switches"]
-    head += [cell for way in WAYS for cell in (way, "steps")]
-    return table([*head, "tolerance"], body)
