@@ -124,16 +124,16 @@ def test_a_pulses_time_and_a_cables_length_are_fitted_as_well_as_noise_allows():
         spring = eqx.tree_at(lambda spring: spring.rest_length, spring, p["rest"])
         return fj.Scene(ARM, start, (spring, damper, Pulse(p["begin"])), end)
 
-    ts, true = np.linspace(0, 0.8, 81), {"begin": np.array(0.1), "rest": np.array(1.7)}
+    ts, true = np.linspace(0, 0.8, 81), {"begin": np.array(0.1), "rest": np.array(1.9)}
     arm, start, forces, _ = told = scene_at(true)
     motion = fj.simulate(arm, start, ts, forces)
     seen = np.asarray(fj.identification.link_ends(told, motion))
     noise = 1e-3 * np.random.default_rng(1).normal(size=(60, *seen.shape))
-    # From such lengths a search over the first part alone would lose the cable.
+    # Over its first half alone, one of the recordings wants no cable at all.
     found = fj.identification.fit_each(
-        scene_at, {"begin": 0.15, "rest": 1.65}, ts, seen + noise, noise=1e-3
+        scene_at, {"begin": 0.12, "rest": 1.85}, ts, seen + noise, noise=1e-3
     )
-    assert all(fit.converged for fit in found)
+    assert all(fit.converged and not fit.weak for fit in found)
     for name, value in true.items():
         errors = [
             (fit.parameters[name] - value) / fit.standard_errors[name] for fit in found
