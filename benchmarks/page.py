@@ -10,6 +10,7 @@ from .joints import joints_table
 from .markdown import number, table
 from .measure import TARGETS, times_at
 from .scaling import slope
+from .switch_tables import switches_table
 from .targets import targets
 
 
@@ -273,6 +274,7 @@ def tables(points: dict[str, list[dict]]) -> dict[str, str]:
         "hard_cases": hard_cases,
         "hard_cases-float32": hard_cases_float32,
         "sliders": sliders,
+        "switches": switches_table,
     }
     texts = {}
     for name, own in points.items():

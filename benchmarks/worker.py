@@ -41,6 +41,7 @@ JOBS = (
     Job("generality", "generality"),
     Job("checks", "checks"),
     Job("gradients", "gradients"),
+    Job("switches", "switches"),
     Job("compile_times", "compile_times"),
     Job("scaling", "scaling"),
     Job("joints", "joints"),

@@ -15,6 +15,7 @@ from benchmarks.circle import make_control, make_reference
 from benchmarks.measure import RECORD, Case, envelope, measure, times_at
 from benchmarks.native import Kernel
 from benchmarks.problems import fig7, random_linkage
+from benchmarks.switch_tables import switches_table
 from fdof_jax import State, simulate
 
 ROOT = Path(__file__).parent.parent
@@ -74,6 +75,16 @@ def test_ratios_are_taken_at_equal_error():
     )
     assert points[0]["ratio"] == pytest.approx(1.0)
     assert points[1]["ratio_to"] == "fast" and points[2]["ratio"] is None
+
+
+def test_what_was_not_measured_of_switches_is_a_dash():
+    point = {"problem": "cable", "setting": 1e-11, "solver": "plain", "batch": 1}
+    point |= {"parameters": 1, "switches": 0.0, "error": 0.13, "steps": 138.0}
+    ways = [point | {"solver": "forward mode", "error": 5e-11, "steps": 55}, point]
+    *_, row = switches_table(ways).split("\n")
+    assert row == "| cable | 1 | 1 | 0 | 5.0e-11 | 55 | 0.13 | 140 | 1.0e-11 |"
+    only = switches_table([*ways, ways[0] | {"problem": "move"}]).split("\n")[-1]
+    assert only == "| move | 1 | 1 | 0 | 5.0e-11 | 55 | - | - | 1.0e-11 |"
 
 
 @pytest.fixture(scope="module")

@@ -6,51 +6,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from switching_scenes import BUMPER, CABLE, LIMITED, RODS as ARM, scene
 
 import fdof_jax as fj
 from fdof_jax.simulation.looped_dopri8 import LoopedDopri8
 from fdof_jax.simulation.sensitivities import sensitivities
 
-ARM = fj.Linkage(
-    "RRR", length=[0, 1, 1, 1], com=[[0.5, 0]] * 3, mass=[1, 1, 1], inertia=[0.1] * 3
-)
 FORWARD = diffrax.ForwardMode()
-
-
-class Case(eqx.Module):
-    """Numbers of a scene that has all elements: a limited PD and a damped contact."""
-
-    gain: float
-    contact: float
-    side: int
-    rest: float
-    end: float
-
-
-LIMITED = Case(1.0, 0.0, 1, 1.9, 1.0)
-CABLE = Case(0.0, 1.0, 1, 1.9, 0.8)
-BUMPER = Case(0.0, 1.0, -1, 1.6, 0.8)
 CASES = jax.tree.map(lambda *a: np.array(a), LIMITED, CABLE, BUMPER)
 # Of the last positions: Richardson differences of tight solves. What varies is the time
 # at which the limited move begins, or the first angle of a fall to the cable.
 PUBLISHED = [[-0.459781, 0.642768, 0.038107], [0.587835, 0.200989, 0.206584]]
-
-
-def scene(x, case):
-    limited = case.gain > 0
-    q0, qd0 = jnp.array([0.2, 0.4, -0.3]), jnp.array([0.3, -0.5, 0.4])
-    begin = jnp.where(limited, x, 0.1)
-    travel = fj.references.Travel(0.7, begin=begin, profile="trapezoidal")
-    move = fj.references.JointMove(q0, q0 + 0.5, travel)
-    pd = fj.PDController(80 * case.gain, 8 * case.gain, 10, move)
-    spring = fj.SpringDamper(
-        fj.Point(0, 0.0, 1.0), fj.Point(1, 1.0), one_sided="cable",
-        stiffness=200 * case.contact, damping=20 * case.contact, rest_length=case.rest,
-    )  # fmt: skip
-    spring = eqx.tree_at(lambda spring: spring.side, spring, jnp.asarray(case.side))
-    fall = jnp.zeros(3).at[0].set(x)
-    start = fj.State(jnp.where(limited, q0, fall), jnp.where(limited, qd0, 0))
-    return fj.Scene(ARM, start, (pd, spring, fj.JointDamper(case.contact)), case.end)
 
 
 def motion(x, case, **options):
@@ -149,6 +115,30 @@ def test_derivatives_in_the_time_of_a_pulse():
     )(jnp.array([0.2]))
     exact = differences(end, 0.2, 1e-3)
     np.testing.assert_allclose(found.jacobian[:, 0], exact, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_a_pulses_time_and_a_cables_length_are_fitted_as_well_as_noise_allows():
+    def scene_at(p):
+        _, start, (_, spring, damper), end = scene(0.1, CABLE)
+        spring = eqx.tree_at(lambda spring: spring.rest_length, spring, p["rest"])
+        return fj.Scene(ARM, start, (spring, damper, Pulse(p["begin"])), end)
+
+    ts, true = np.linspace(0, 0.8, 81), {"begin": np.array(0.1), "rest": np.array(1.9)}
+    arm, start, forces, _ = told = scene_at(true)
+    motion = fj.simulate(arm, start, ts, forces)
+    seen = np.asarray(fj.identification.link_ends(told, motion))
+    noise = 1e-3 * np.random.default_rng(1).normal(size=(60, *seen.shape))
+    # Over its first half alone, one of the recordings wants no cable at all.
+    found = fj.identification.fit_each(
+        scene_at, {"begin": 0.12, "rest": 1.85}, ts, seen + noise, noise=1e-3
+    )
+    assert all(fit.converged and not fit.weak for fit in found)
+    for name, value in true.items():
+        errors = [
+            (fit.parameters[name] - value) / fit.standard_errors[name] for fit in found
+        ]
+        assert 0.8 < np.sqrt(np.mean(np.square(errors))) < 1.2
 
 
 class Rough(fj.Element):

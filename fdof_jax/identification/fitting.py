@@ -83,6 +83,11 @@ def _check_scene_at(scene_at: SceneAt, parameters: dict[str, Array], ts: Array) 
     check_scene("scene_at(...)", scene, ts)
 
 
+def _silent(found: Evaluation) -> np.ndarray:
+    """Returns which unknowns have no effect (run, n)."""
+    return np.diagonal(found.curvature, axis1=1, axis2=2) == 0
+
+
 def _longer_and_longer(
     rows: list[list[_Problem]], unknowns: Unknowns, **keywords: Any
 ) -> list[Run]:
@@ -105,10 +110,12 @@ def _longer_and_longer(
 
     for share, longer in zip(_SHARES, _SHARES[1:]):
         runs = minimise(until(share), z, low, high, enough=_ENOUGH_EARLY, **keywords)
-        # Over a short time, noise may lead away from the parameters.
+        # Over a short time, noise may lead away from the parameters, or to where one of
+        # them has no effect: to a cable that never becomes taut.
         better, every = until(longer), np.arange(len(rows))
         found = np.stack([run.z for run in runs])
-        gain = better(found, every).loss < better(z, every).loss
+        there, here = better(found, every), better(z, every)
+        gain = (there.loss < here.loss) & ~(_silent(there) & ~_silent(here)).any(axis=1)
         z = np.where(gain[:, None], found, z)
     return minimise(until(1), z, low, high, enough=_ENOUGH, **keywords)
 
