@@ -82,8 +82,7 @@ def integrate(
         keywords["stepsize_controller"], solver, term, bound if derivatives else None
     )
     unpacked, y0 = args, whole(*start_of(args, qd0), own)
-    # In batches without derivatives scalars are faster, in all other cases arrays.
-    if padded or isinstance(solver, LoopedDopri8):
+    if padded and not derivatives:
         term, y0, args = in_arrays(term, y0, args)
     length = len(y0)
     implicit = isinstance(solver, diffrax.AbstractImplicitSolver)

@@ -1,8 +1,8 @@
 """The equations of motion for arrays instead of tuples of scalars.
 
 XLA compiles a kernel for each array that changes in a loop or is computed for it, in
-much the same time for one number as for many. Batches without derivatives are faster
-with scalars.
+much the same time for one number as for many. Plain calls use arrays. Batches are
+faster with scalars.
 """
 
 import functools
@@ -33,7 +33,7 @@ class _Packed(eqx.Module):
 
 
 def _packed(scalars: Any) -> _Packed:
-    leaves, structure = jax.tree.flatten(scalars)
+    leaves, structure = jax.tree.flatten(jax.tree.map(jnp.asarray, scalars))
     is_flag = tuple(leaf.dtype == bool for leaf in leaves)
     numbers, flags = (
         jnp.stack([leaf for leaf, flag in zip(leaves, is_flag) if flag == kind])
