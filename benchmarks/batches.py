@@ -6,7 +6,7 @@ from functools import partial
 import jax
 import numpy as np
 
-from . import contestants as own, peers
+from . import contestants as own, peers, taylor
 from .contestants import Contestant, cases
 from .measure import Skipped, measure, record, skipped
 from .native import Kernel
@@ -25,14 +25,14 @@ HEYOKA_TOLERANCES = (1e-3, 1e-6, 1e-9, 1e-12, 1e-15)
 Row = tuple[str, Callable[[Problem], Contestant], tuple]
 
 
-def _fast(vmap: tuple, sweep: tuple, rk4: tuple, order8: tuple, taylor: tuple):
+def _fast(vmap: tuple, sweep: tuple, rk4: tuple, order8: tuple, heyoka: tuple):
     """Returns contestants for any size, each with its settings."""
     return [
         ("fdof_jax", own.fdof_jax, vmap),
         ("fdof_jax sweep", own.sweep, sweep),
         ("C RK4", partial(peers.native, method="RK4"), rk4),
         ("C order 8", partial(peers.native, method="order 8"), order8),
-        ("heyoka", taylor.heyoka, taylor),
+        ("heyoka", taylor.heyoka, heyoka),
     ]
 
 

@@ -9,8 +9,6 @@ import warnings
 from pathlib import Path
 from typing import Any, NamedTuple
 
-TWO_DEVICES = "--xla_force_host_platform_device_count=2"
-
 
 class Job(NamedTuple):
     """A measurement of a process: a function of a module, and a number of cores."""
@@ -21,16 +19,14 @@ class Job(NamedTuple):
     cores: int = 1
     x64: bool = True
     cpu: bool = True
-    flags: str = ""  # for XLA
+    devices: int = 1  # of JAX
     asked: bool = False  # whether it runs only when named
 
 
 JOBS = (
     Job("batches", "batches"),
     Job("batches-two-cores", "batches", "run_two_cores", cores=2),
-    Job(
-        "batches-two-devices", "batches", "run_two_devices", cores=2, flags=TWO_DEVICES
-    ),
+    Job("batches-two-devices", "batches", "run_two_devices", cores=2, devices=2),
     Job("batches-float32", "batches", "run_float32", x64=False),
     Job("batches-gpu", "batches", "run_accelerator", cpu=False),
     Job("batches-gpu-float32", "batches", "run_accelerator", x64=False, cpu=False),
@@ -81,7 +77,7 @@ def main() -> None:
     if job.cpu:
         os.sched_setaffinity(0, available[: job.cores])
         os.environ["JAX_PLATFORMS"] = "cpu"
-    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {job.flags}".strip()
+        os.environ["JAX_NUM_CPU_DEVICES"] = str(job.devices)
     import fdof_jax as fj
 
     fj.configure(x64=job.x64)

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks import page, targets
+from benchmarks import batches, page, targets
 from benchmarks.circle import make_control, make_reference
 from benchmarks.measure import RECORD, Case, envelope, measure, times_at
 from benchmarks.native import Kernel
@@ -170,3 +170,8 @@ def test_tables_go_between_their_markers():
     assert page.filled(filled, texts) == filled
     rows = list(targets.targets({"generality": points}, page.number))
     assert len(rows) == 3 and all(len(row) == 5 for row in rows)
+
+
+@pytest.mark.parametrize("batch", [64, 1024, 16384, 131072])
+def test_batches_of_every_size_have_contestants(batch):
+    assert {"fdof_jax", "heyoka"} <= {name for name, _, _ in batches.table(batch)}
