@@ -68,9 +68,11 @@ def main() -> None:
         "\n\n".join(f"## {name}\n\n{text}" for name, text in tables.items()) + "\n"
     )
     if output.resolve() in (RESULTS.resolve(), OLDER.resolve()) and not options.quick:
-        texts = page.tables(load(RESULTS))
-        for name, text in page.tables(load(OLDER)).items():
+        newest, older = load(RESULTS), load(OLDER)
+        texts = page.tables(newest)
+        for name, text in page.tables(older).items():
             texts[f"{name}-older-jax"] = text
+        texts["targets"] = page.reached(newest, older)
         PAGE.write_text(page.filled(PAGE.read_text(), texts))
     if failed:
         sys.exit(f"did not finish: {', '.join(failed)}")

@@ -6,7 +6,7 @@ from functools import partial
 import jax
 import numpy as np
 
-from . import contestants as own, peers, taylor
+from . import contestants as own, one_core, peers, taylor
 from .contestants import Contestant, cases
 from .measure import Skipped, measure, record, skipped
 from .native import Kernel
@@ -97,7 +97,9 @@ def first_members(motion: own.Motion, count: int) -> own.Motion:
 def run(quick: bool) -> Iterator[dict]:
     """Measures all contestants at all sizes, on one core."""
     sizes = (
-        {1: 10, 64: 20} if quick else {1: 10, 64: 20, 1024: 80, 16384: 30, 131072: 20}
+        {1: 10, 16: 10, 64: 20}
+        if quick
+        else {1: 10, 16: 10, 64: 20, 1024: 80, 16384: 30, 131072: 20}
     )
     for batch, budget in sizes.items():
         problem = fig5_batch(batch)
@@ -109,6 +111,7 @@ def run_two_cores(quick: bool) -> Iterator[dict]:
     for batch, budget in sizes.items():
         problem = fig5_batch(batch)
         contestants = [row for row in table(batch) if not row[0].startswith("MJX")]
+        contestants.append(("sweep on one core", one_core.sweep, TOLERANCES))
         yield from measure_batch(problem, reference(problem), contestants, budget)
 
 

@@ -45,7 +45,7 @@ def _arms(each: int) -> tuple[fj.Linkage, fj.State]:
     return linkage, fj.State(q, qd)
 
 
-def _peak() -> float:
+def peak() -> float:
     """Returns the largest resident memory of this process so far [MB]."""
     unit = 1e6 if sys.platform == "darwin" else 1e3
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
@@ -59,12 +59,12 @@ def run(quick: bool) -> Iterator[dict]:
     # The shapes that a sweep needs are compiled by a small one.
     few = jax.tree.map(lambda leaf: leaf[:: max(1, each // 300)], (linkage, state0))
     fj.sweep(*few, TS, stepsize_controller=steps)
-    compiled, before = time.perf_counter() - began, _peak()
+    compiled, before = time.perf_counter() - began, peak()
     began = time.perf_counter()
     solution = fj.sweep(linkage, state0, TS, stepsize_controller=steps)
     jax.block_until_ready(solution.q)
     wall = time.perf_counter() - began
-    peak = _peak()
+    most = peak()
     worst = 0.0
     for member in range(0, 7 * each, each // CHECKED):
         arm, start = jax.tree.map(lambda leaf, i=member: leaf[i], (linkage, state0))
@@ -85,7 +85,7 @@ def run(quick: bool) -> Iterator[dict]:
         "successful": int(jnp.sum(good)),
         "against_singles": worst,
         "memory_before_mb": before,
-        "memory_peak_mb": peak,
+        "memory_peak_mb": most,
         "saved_mb": (solution.q.nbytes + solution.qd.nbytes) / 1e6,
         **environment(),
     }

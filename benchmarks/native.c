@@ -19,7 +19,7 @@ typedef struct {
     double k2, k3, k4;                 /* second moments, the mass beyond included */
 } Arm;
 
-/* The coefficients are those of fdof_jax/xla/trigonometry.py. FMA keeps -ffast-math from
+/* The coefficients are those of fdof_jax/base/trigonometry.py. FMA keeps -ffast-math from
    merging the parts of pi/2. Good for angles up to some thousand turns. */
 static inline void sincos1(double x, double *sine, double *cosine)
 {

@@ -8,68 +8,11 @@ import numpy as np
 from .hard_tables import hard_cases, hard_cases_float32
 from .joints import joints_table
 from .markdown import number, table
-from .measure import TARGETS, times_at
+from .memory import memory_table
+from .rate_tables import batches, on_cores, trajectory
 from .scaling import slope
 from .switch_tables import switches_table
 from .targets import targets
-
-
-def _read_off(points: list[dict], to_value: Callable, sign: str) -> list[str]:
-    """Returns a cell per target error; `sign` marks bounds without looser points."""
-    cells = []
-    loosest = max((p["error"] for p in points if p["times"]), default=0)
-    for target in TARGETS:
-        walls = times_at(points, target)
-        if walls is None:
-            cells.append("-")
-        else:
-            bound = f"{sign} " if target > loosest else ""
-            cells.append(bound + number(to_value(float(np.median(walls)))))
-    return cells
-
-
-def _by_solver(points: list[dict], to_value: Callable, sign: str) -> str:
-    rows, measured = [], [p for p in points if p["status"] != "skipped"]
-    for solver in dict.fromkeys(p["solver"] for p in measured):
-        own = [p for p in points if p["solver"] == solver]
-        first = max((p["compile_time"] or 0 for p in own), default=0)
-        failed = [f"{p['setting']:g}" for p in own if p["status"] == "failed"]
-        rows.append(
-            [solver, *_read_off(own, to_value, sign), number(first), ", ".join(failed)]
-        )
-    errors = map("{:g}".format, TARGETS)
-    text = table(["", *errors, "compile [s]", "failed at"], rows)
-    skips = [p for p in points if p["status"] == "skipped"]
-    return text + "".join(f"\n\nSkipped: {p['solver']}: {p['reason']}." for p in skips)
-
-
-def batches(points: list[dict]) -> str:
-    measured, parts = [p for p in points if p["status"] != "skipped"], []
-    if not measured:
-        return "Not measured: no GPU was at hand."
-    for batch in dict.fromkeys(p["batch"] for p in measured):
-        own = [p for p in measured if p["batch"] == batch]
-        simulated = next((p["simulated"] for p in own if "simulated" in p), None)
-        text = _by_solver(own, lambda wall, s=simulated: s / wall, "≥")
-        parts.append(
-            f"Batch of {batch}, simulated s per s at a worst error of:\n\n{text}"
-        )
-    parts += [
-        f"Skipped: {p['solver']}: {p['reason']}."
-        for p in points
-        if p["status"] == "skipped"
-    ]
-    return "\n\n".join(dict.fromkeys(parts))
-
-
-def trajectory(points: list[dict]) -> str:
-    parts = []
-    for problem in dict.fromkeys(p["problem"] for p in points):
-        own = [p for p in points if p["problem"] == problem]
-        motions = next((p["motions"] for p in own if "motions" in p), 1)
-        text = _by_solver(own, lambda wall, m=motions: 1e3 * wall / m, "≤")
-        parts.append(f"{problem}, ms per motion at an error of:\n\n{text}")
-    return "\n\n".join(parts)
 
 
 def _listed(points: list[dict], columns: list[tuple[str, str | Callable]]) -> str:
@@ -95,7 +38,6 @@ def _quartiles(p: dict) -> str:
 
 _ratio = _number("ratio", 3)
 _FAILED = "failed", lambda p: p["reason"] or ""
-
 
 _COLUMNS: dict[str, list[tuple[str, str | Callable]]] = {
     "gradients": [
@@ -270,6 +212,7 @@ def tables(points: dict[str, list[dict]]) -> dict[str, str]:
         "checks": generality,
         "scaling": scaling,
         "joints": joints_table,
+        "memory": memory_table,
         "tuning": tuning,
         "hard_cases": hard_cases,
         "hard_cases-float32": hard_cases_float32,
@@ -283,11 +226,23 @@ def tables(points: dict[str, list[dict]]) -> dict[str, str]:
         elif own:
             kind = name if name in makers else name.partition("-")[0]
             texts[name] = makers[kind](own)
+    if points.get("batches") and points.get("batches-two-cores"):
+        texts["batches-cores"] = on_cores(points)
     if texts:
-        rows = [[*map(str, row)] for row in targets(points, number)]
-        head = ["figure", "measured", "quartiles", "required", "aim for"]
-        texts = {"targets": table(head, rows), "machine": _machine(points), **texts}
+        texts = {"targets": reached(points), "machine": _machine(points), **texts}
     return texts
+
+
+def reached(*measured: dict[str, list[dict]]) -> str:
+    """Returns the table of targets, each with the version of JAX that it is from."""
+    head = ["figure", "measured", "quartiles", "required", "aim for", "JAX"]
+    rows = [
+        [*map(str, row), own[0]["versions"]["jax"]]
+        for points in measured
+        for name, own in points.items()
+        for row in targets({name: own}, number)
+    ]
+    return table(head, rows)
 
 
 def filled(page: str, texts: dict[str, str]) -> str:

@@ -128,6 +128,21 @@ def batches(points: list[dict], path: Path) -> None:
     _save(figure, path)
 
 
+def memory(points: list[dict], path: Path) -> None:
+    """Draws peak memory and time against the number of members."""
+    figure, axes = _axes(2)
+    labels = {"memory_peak_mb": "largest memory [MB]", "time_median": "time [s]"}
+    for axis, (key, label) in zip(axes, labels.items()):
+        for index, kind in enumerate(_solvers(points)):
+            own = [p for p in points if p["solver"] == kind and p["times"]]
+            sizes, heights = [p["batch"] for p in own], [p[key] for p in own]
+            axis.loglog(sizes, heights, label=kind, **_style(kind, index))
+        axis.set_xlabel("members")
+        axis.set_ylabel(label)
+        axis.grid(alpha=0.3)
+    _save(figure, path)
+
+
 def joints(points: list[dict], path: Path) -> None:
     """Draws times and operations against the number of joints."""
     points = [p for p in points if p["status"] != "skipped"]
@@ -242,6 +257,7 @@ PLOTS = {
     "batches-gpu": batches,
     "batches-gpu-float32": batches,
     "mixed": batches,
+    "memory": memory,
     "joints": joints,
     "generality": generality,
     "gradients": gradients,

@@ -67,6 +67,17 @@ def targets(points: dict[str, list[dict]], number: Callable) -> Iterator[tuple]:
             "≥ 10",
             "≥ 45",
         )
+    if job:
+        yield from _sweep_targets(job, row)
+    if job := points.get("batches-two-cores"):
+        yield row(
+            "batch 16384, worst error 1e-9: sweep on two cores over one",
+            ratio_at(
+                job, "fdof_jax sweep, one core", "fdof_jax sweep", 1e-9, batch=16384
+            ),
+            "≥ 1.3",
+            "≥ 1.7",
+        )
     for problem in dict.fromkeys(p["problem"] for p in points.get("checks", ())):
         yield row(
             f"{problem}: watched for ill-conditioning over not watched",
@@ -151,6 +162,32 @@ def targets(points: dict[str, list[dict]], number: Callable) -> Iterator[tuple]:
                 f"{number(best['time_median'], 3)} s"
             )
             yield figure, number(best["energy_defect"]), "", "≤ 1e-10", "≤ 1e-12"
+
+
+def _sweep_targets(job: list[dict], row: Callable) -> Iterator[tuple]:
+    """Returns the rates of sweeps over others, and what a small sweep costs more."""
+    name = "fdof_jax sweep"
+    for error in (1e-6, 1e-9):
+        yield row(
+            f"batch 1024, worst error {error:g}: sweep over heyoka",
+            ratio_at(job, "heyoka", name, error, batch=1024),
+            "≥ 1",
+            "≥ 1.5",
+        )
+    yield row(
+        "batch 1024, worst error 1e-9: sweep over vmap",
+        ratio_at(job, "fdof_jax", name, 1e-9, batch=1024),
+        "≥ 1",
+        "",
+    )
+    few = [
+        times_at(_points(job, solver, batch=16), 1e-9) for solver in (name, "fdof_jax")
+    ]
+    longer = None
+    if not any(times is None for times in few):
+        rounds = min(map(len, few))
+        longer = 1e3 * (few[0][:rounds] - few[1][:rounds])
+    yield row("batch 16, worst error 1e-9: sweep - vmap [ms]", longer, "≤ 1", "")
 
 
 def _gradient_targets(

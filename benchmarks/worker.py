@@ -32,6 +32,7 @@ JOBS = (
     Job("batches-gpu-float32", "batches", "run_accelerator", x64=False, cpu=False),
     Job("mixed", "mixed"),
     Job("many", "many"),
+    Job("memory", "memory"),
     Job("trajectory", "trajectory"),
     Job("single_arms", "single_arms"),
     Job("generality", "generality"),

@@ -12,6 +12,7 @@ import numpy as np
 
 import fdof_jax as fj
 from fdof_jax import drawing
+from fdof_jax.pictures.axes import figure_legend
 
 fj.configure(x64=True)
 ts = np.linspace(0, 5, 501)  # one turn of the circle
@@ -33,5 +34,6 @@ animation = drawing.animate_grid(
     fps=20,
 )
 circle = np.asarray([scene.forces[0].reference.tip(t) for t in ts[::5]])
-figure.axes[0].plot(*circle.T, "--", color="C0", lw=0.8, zorder=0)
-animation.save(Path(__file__).with_suffix(".gif"), writer="pillow", dpi=80)
+figure.axes[0].plot(*circle.T, "--k", lw=0.8, zorder=1, label="commanded")
+figure_legend(figure)
+animation.save(Path(__file__).with_suffix(".gif"), dpi=80)

@@ -6,7 +6,7 @@ import sys
 import warnings
 from typing import Any
 
-from .names import attach, room_of
+from .base.names import attach, room_of
 
 __version__ = "0.2.0"
 

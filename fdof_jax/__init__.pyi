@@ -10,6 +10,7 @@ from . import (
 )
 from .analysis.linearization import linearize as linearize
 from .analysis.reactions import joint_reactions as joint_reactions
+from .base.configuration import configure as configure
 from .control.pd import PDController as PDController
 from .data.files import load as load, save as save
 from .data.mjcf import to_mjcf as to_mjcf
@@ -74,7 +75,6 @@ from .simulation.steps import scale_tolerances as scale_tolerances
 from .simulation.sweep import sweep as sweep
 from .tuning.result import TuneResult as TuneResult
 from .tuning.tuning import tune as tune
-from .xla.configuration import configure as configure
 
 __version__: str
 __all__: list[str]

@@ -19,6 +19,7 @@ SEARCHES = {
     "fdof_jax.tuning.league.league_table",
     "fdof_jax.tuning.optimal_motion.optimal_efforts",
     "fdof_jax.tuning.tuning.tune_each",
+    "fdof_jax.tuning.within_limits.tune_within",
 }
 # Scripts that need packages which the tests do not need.
 collect_ignore_glob = ["hard/make_*.py"]

@@ -5,6 +5,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from chains import random_chain
 from helpers import random_linkage
 
 import fdof_jax as fj
@@ -43,6 +44,17 @@ def members():
     size = len(linkages)
     state0 = fj.State(rng.uniform(-1, 1, (size, 3)), rng.uniform(-1, 1, (size, 3)))
     push = Push(jnp.asarray(rng.uniform(-1, 1, (size, 3))), jnp.zeros(size))
+    return jax.tree.map(lambda *a: jnp.stack(a), *linkages), state0, (push,)
+
+
+def single_links():
+    """Returns a batch of pendulums and slides, whose programs are the smallest."""
+    rng = np.random.default_rng(6)
+    linkages = [random_chain(topology, rng) for _ in range(21) for topology in "RP"]
+    state0 = fj.State(*rng.uniform(-1, 1, (2, len(linkages), 1)))
+    push = Push(
+        jnp.asarray(rng.uniform(-1, 1, (len(linkages), 1))), jnp.zeros(len(linkages))
+    )
     return jax.tree.map(lambda *a: jnp.stack(a), *linkages), state0, (push,)
 
 

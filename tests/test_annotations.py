@@ -58,10 +58,12 @@ def calls(linkage):
         fj.analysis.equilibrium: (linkage, q, (fj.JointDamper(1.0),)),
         fj.analysis.holding_efforts: (linkage, q, MASSES),
         fj.analysis.inertial_parameters: (linkage,),
+        fj.control.gains_from_frequency: (linkage, q, 5.0, 0.7, MASSES),
         fj.analysis.regressor: (linkage, q, q, q),
         fj.identification.link_ends: (scene, motion),
         fj.references.reachable: (linkage, TASK, jnp.zeros(5)),
         fj.references.shock_against: (fj.references.Travel(1.0), 2.0),
+        fj.tuning.joint_errors: (scene, motion),
         fj.tuning.tip_errors: (scene, motion),
     }
     if n == 3:

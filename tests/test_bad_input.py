@@ -240,9 +240,12 @@ def test_first_steps_that_are_none_are_refused(dt0):
     refused("dt0", lambda: simulate(dt0=dt0))
 
 
-def test_forward_mode_through_the_default_adjoint_names_the_cure():
-    def end(q):
-        return simulate(state0=fj.State(q, ZERO)).q[-1]
+def test_modes_that_the_adjoint_does_not_serve_name_the_cure():
+    def end(q, **settings):
+        return simulate(state0=fj.State(q, ZERO), **settings).q[-1, 0]
 
     with pytest.raises(TypeError, match=r"adjoint=diffrax\.ForwardMode\(\)"):
         jax.jacfwd(end)(jnp.zeros(3))
+    slope = jax.grad(lambda q: end(q, adjoint=diffrax.ForwardMode()))
+    with pytest.raises(RuntimeError, match="^reverse-mode .* default adjoint"):
+        jax.eval_shape(slope, jnp.zeros(3))

@@ -172,6 +172,6 @@ def test_tables_go_between_their_markers():
     assert len(rows) == 3 and all(len(row) == 5 for row in rows)
 
 
-@pytest.mark.parametrize("batch", [64, 1024, 16384, 131072])
+@pytest.mark.parametrize("batch", [16, 64, 1024, 16384, 131072])
 def test_batches_of_every_size_have_contestants(batch):
     assert {"fdof_jax", "heyoka"} <= {name for name, _, _ in batches.table(batch)}

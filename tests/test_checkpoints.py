@@ -14,7 +14,7 @@ import fdof_jax as fj
 from fdof_jax.simulation import checkpoints
 from fdof_jax.simulation.checkpoints import Checkpoint, Rows
 
-MEMBERS, LIMIT = np.arange(3), 7
+MEMBERS, LANES = np.arange(3), 7
 
 
 def arrays():
@@ -26,8 +26,8 @@ ROWS = Rows(arrays())
 
 @pytest.fixture
 def checkpoint(tmp_path):
-    made = Checkpoint(tmp_path, "settings", [np.ones(2)])
-    made.write(MEMBERS, LIMIT, arrays())
+    made = Checkpoint(tmp_path, "digest")
+    made.write(MEMBERS, LANES, arrays())
     return made
 
 
@@ -39,14 +39,14 @@ def the_file(checkpoint):
 def refused(checkpoint, rows=ROWS):
     path = re.escape(str(the_file(checkpoint)))
     with pytest.warns(RuntimeWarning, match=f"in {path} an .* 3 members are solved"):
-        return checkpoint.read(MEMBERS, LIMIT, rows) is None
+        return checkpoint.read(MEMBERS, LANES, rows) is None
 
 
 def test_a_chunk_is_read_as_it_was_written(checkpoint):
-    assert checkpoint.has(MEMBERS, LIMIT)
-    assert not checkpoint.has(MEMBERS + 1, LIMIT)
-    assert not checkpoint.has(MEMBERS, LIMIT + 1)
-    found = checkpoint.read(MEMBERS, LIMIT, ROWS)
+    assert checkpoint.has(MEMBERS, LANES)
+    assert not checkpoint.has(MEMBERS + 1, LANES)
+    assert not checkpoint.has(MEMBERS, LANES + 1)
+    found = checkpoint.read(MEMBERS, LANES, ROWS)
     for a, b in zip(found, arrays(), strict=True):
         assert a.dtype == b.dtype
         np.testing.assert_array_equal(a, b)
@@ -69,21 +69,21 @@ def test_every_damage_is_found(checkpoint):
 def test_arrays_of_another_kind_are_refused(checkpoint):
     half = [arrays()[0].astype(np.float16), arrays()[1]]
     assert refused(checkpoint, Rows(half))  # what was kept is not what is expected
-    checkpoint.write(MEMBERS, LIMIT, half)
+    checkpoint.write(MEMBERS, LANES, half)
     assert refused(checkpoint)
-    checkpoint.write(MEMBERS, LIMIT, [arrays()[0][:, :1], arrays()[1]])
+    checkpoint.write(MEMBERS, LANES, [arrays()[0][:, :1], arrays()[1]])
     assert refused(checkpoint)
 
 
 def test_another_chunk_and_another_version_are_refused(checkpoint, monkeypatch):
     path = the_file(checkpoint)
-    checkpoint.write(MEMBERS + 1, LIMIT, arrays())
+    checkpoint.write(MEMBERS + 1, LANES, arrays())
     (other,) = set(checkpoint.folder.iterdir()) - {path}
     os.replace(other, path)
     assert refused(checkpoint)
-    checkpoint.write(MEMBERS, LIMIT, arrays())
-    monkeypatch.setitem(checkpoints._VERSIONS, "jax", "0.1")
-    assert not checkpoint.has(MEMBERS, LIMIT)
+    checkpoint.write(MEMBERS, LANES, arrays())
+    monkeypatch.setitem(checkpoints.VERSIONS, "jax", "0.1")
+    assert not checkpoint.has(MEMBERS, LANES)
 
 
 def test_a_sweep_solves_again_what_is_damaged(mixed, swept, tmp_path):
@@ -110,7 +110,7 @@ def test_a_full_disk_names_the_path_and_leaves_no_part(checkpoint, monkeypatch):
 
     monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(OSError, match=re.escape(str(path))) as raised:
-        checkpoint.write(MEMBERS, LIMIT, arrays())
+        checkpoint.write(MEMBERS, LANES, arrays())
     assert raised.value.errno == errno.ENOSPC
     assert the_file(checkpoint) == path and path.read_bytes() == whole
 
@@ -122,7 +122,7 @@ def test_two_writers_of_one_chunk_do_not_meet(checkpoint, monkeypatch):
 
     def write():
         try:
-            checkpoint.write(MEMBERS, LIMIT, arrays())
+            checkpoint.write(MEMBERS, LANES, arrays())
         except Exception as error:
             failed.append(error)
 
@@ -132,12 +132,12 @@ def test_two_writers_of_one_chunk_do_not_meet(checkpoint, monkeypatch):
     for writer in writers:
         writer.join()
     assert not failed
-    assert checkpoint.read(MEMBERS, LIMIT, ROWS) is not None
+    assert checkpoint.read(MEMBERS, LANES, ROWS) is not None
 
 
 def test_paths_of_a_folder(tmp_path, monkeypatch):
     monkeypatch.setenv("HOME", str(tmp_path))
-    Checkpoint("~/kept", "", ())
+    Checkpoint("~/kept", "digest")
     assert (tmp_path / "kept").is_dir()
     with pytest.raises(ValueError, match="^checkpoint: expected a folder, got ''"):
         fj.sweep(

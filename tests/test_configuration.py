@@ -12,7 +12,7 @@ from jax.experimental.compilation_cache import compilation_cache
 from jaxlib import version
 
 import fdof_jax as fj
-from fdof_jax.xla import configuration
+from fdof_jax.base import configuration
 
 NEEDS_OPTION = version.__version_info__ < (0, 12)
 
@@ -176,6 +176,12 @@ def test_the_users_cache_folder(system, variables, expected, monkeypatch, tmp_pa
     assert expected.is_dir()
     fj.configure(cache=False)
     assert jax.config.jax_compilation_cache_dir is None
+
+
+def test_the_installed_xla_knows_the_options_of_loops():
+    options = configuration.options_of_loops()
+    assert jax.jit(lambda x: x + 1, compiler_options=options)(1) == 2
+    assert bool(options) == (jax.__version_info__ < (0, 11))
 
 
 @pytest.mark.skipif(not NEEDS_OPTION, reason="this version of XLA needs no option")

@@ -269,12 +269,13 @@ def test_the_reference_is_differentiable_in_circle_and_linkage(hub, radius):
     np.testing.assert_allclose(jacobian @ derivatives[0].center, identity, atol=1e-11)
 
 
+@pytest.mark.parametrize("begin", [0.0, 1.3])
 @pytest.mark.parametrize("excess, refused", [(-1e-6, False), (1e-6, True)])
-def test_circles_out_of_reach_are_refused_to_the_edge(excess, refused):
+def test_circles_out_of_reach_are_refused_to_the_edge(excess, refused, begin):
     # The RRR arm reaches 4.5 m; the circle touches that edge at one point.
     linkage = wrist_arm("RRR")
     task = wrist_circle([3.0 * np.cos(1), 3.0 * np.sin(1)], 1.5 + excess, phase=0.123)
-    ts = np.array([0.0, 20.0])
+    ts = np.array([begin, 20.0])
     if refused:
         with pytest.raises(ValueError, match="^reference: expected .* reach .*, got "):
             task.check(linkage, ts)

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 from elements import Hold
-from jax.extend.core import jaxprs_in_params
+from jax.extend.core import ClosedJaxpr, Jaxpr
 
 import fdof_jax as fj
 from fdof_jax import scenes
@@ -105,13 +105,19 @@ def stacked_in_loops(forces):
         state = fj.State(q, jnp.zeros(3))
         return fj.simulate(linkage, state, [0, 1.0], forces, throw=False).q
 
+    def inner(equation):
+        """Returns the programs in an equation; older versions of JAX do not."""
+        parts = jax.tree.leaves(equation.params)
+        held = [part for part in parts if isinstance(part, Jaxpr | ClosedJaxpr)]
+        return [getattr(part, "jaxpr", part) for part in held]
+
     def found(jaxpr, inside):
         names = {"stack", "concatenate"} if inside else set()
         return any(
             equation.primitive.name in names
             or any(
-                found(inner, inside or equation.primitive.name == "while")
-                for inner in jaxprs_in_params(equation.params)
+                found(part, inside or equation.primitive.name == "while")
+                for part in inner(equation)
             )
             for equation in jaxpr.eqns
         )

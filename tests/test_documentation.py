@@ -104,11 +104,15 @@ RETURNED_BY = {
     "Efforts": "joint_efforts",
     "Linearization": "linearize",
     "Modes": "closed_loop_modes",
+    "NextMotion": "next_motion",
+    "OpenLoop": "open_loop",
     "OptimalMotion": "optimal_efforts",
     "SampledMotion": "simulate_sampled",
     "Solution": "simulate",
+    "StepAndSine": "step_and_sine",
     "TradeOff": "trade_off",
     "TuneResult": "tune",
+    "TunedWithin": "tune_within",
 }
 
 

@@ -52,6 +52,8 @@ def test_a_lag_is_an_exponential():
     np.testing.assert_allclose(solution.qd[:, 2], rate, rtol=3e-6, atol=1e-9)
     found = fj.joint_efforts(single(), (lag,), solution)
     np.testing.assert_array_equal(found.total, effort)
+    started = fj.control.FirstOrderLag(fj.JointEffort([0, 0, 3.0]), 0.2, start=2.0)
+    np.testing.assert_array_equal(started.initial_state(single()).own, np.full(3, 2.0))
 
 
 def test_a_motor_reaches_its_current_and_its_speed():
@@ -241,7 +243,7 @@ def test_malformed_elements_are_refused():
     with pytest.raises(ValueError, match="command: expected an array of 3"):
         fj.simulate(single(), STILL, [0, 1], (short,))
     with pytest.raises(ValueError, match="ki: expected 0 where kp is"):
-        fj.control.PIDController(0.0, 1.0, 1.0, 1.0, Hold(only_last(1.0)))
+        fj.control.PIDController([1, 1, 0.0], 1.0, 1.0, 1.0, Hold(only_last(1.0)))
     with pytest.raises(ValueError, match="time_constant: expected .* above 0"):
         fj.control.FirstOrderLag(fj.JointEffort(np.ones(3)), 0.0)
     with pytest.raises(ValueError, match="resistance: expected"):

@@ -19,6 +19,7 @@ def test_efforts_are_linear_between_the_times_and_held_beyond():
     found = jax.vmap(lambda t: history(t, zero, zero, None))(times)
     expected = np.stack([np.interp(times, TS, column) for column in TAU.T], axis=1)
     np.testing.assert_allclose(found, expected, rtol=1e-12)
+    np.testing.assert_array_equal(history.jump_ts, TS)
     constant = fj.forces.EffortHistory([0.5], TAU[:1])
     np.testing.assert_array_equal(constant(0.7, zero, zero, None), TAU[0])
 

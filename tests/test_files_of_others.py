@@ -48,9 +48,8 @@ def test_classes_of_a_script(path, monkeypatch):
 
 READER = """
 import sys
-import jax
-jax.config.update("jax_enable_x64", True)
 import fdof_jax as fj
+fj.configure(x64=True)
 assert "fdof_jax.tuning.result" not in sys.modules
 run, scene = fj.load(sys.argv[1])
 fj.save(sys.argv[2], (run, scene))
@@ -115,6 +114,24 @@ def test_an_object_of_a_removed_class_is_a_dictionary(path):
     name = {"class": "fdof_jax.tuning_run:Job"}
     describe(path, lambda d: d["tree"]["items"]["job"].update(name))
     assert fj.load(path) == {"job": {"number": 3}}
+
+
+def test_fields_that_version_0_1_did_not_save(path):
+    """Fits that were saved before there was a verdict are not taken for good ones."""
+    array = np.zeros(1)
+    found = fj.FitResult({}, {}, (), array, (), 0.0, 0.0, True, "", array)
+    fj.save(path, found)
+    describe(
+        path, lambda d: [d["tree"]["fields"].pop(n) for n in ("held_out", "faults")]
+    )
+    loaded = fj.load(path)
+    same(loaded, found)
+    assert loaded.held_out == () and not loaded.usable
+    report = fj.tuning.GradientReport(array, array, 0.0, *[array] * 3, None, array, [])
+    fj.save(path, report)
+    added = "switches", "slowest_crossing", "times"
+    describe(path, lambda d: [d["tree"]["fields"].pop(n) for n in added])
+    same(fj.load(path), report)
 
 
 def test_files_name_no_module(path):

@@ -78,7 +78,7 @@ def test_tangents_are_those_of_differences(point):
     # The gradients that tuning uses.
     timed = jax.tree.map(jnp.asarray, scene._replace(t1=3.0))
     residuals, jacobian, *_ = gradient_quality._tangents(timed)
-    coarse = 2 * jacobian.T @ residuals
+    coarse = 2 * jacobian[:, :6].T @ residuals
     assert np.linalg.norm(coarse - gradient) < 1e-3 * size
 
 
@@ -147,6 +147,12 @@ def test_the_report_is_what_it_says(report):
     # The slide leaves its limit, and comes back to it, a few times.
     assert 1 <= report.switches < 20 and 0.01 < report.slowest_crossing < 100
     assert f"{report.switches} switches between" in str(report)
+    # The circle's period is the only time that this scene holds.
+    ((name, (slope, difference)),) = report.times.items()
+    assert name == "forces[0].reference.period" and abs(slope) > 1e-4
+    assert slope == pytest.approx(difference, rel=1e-4)
+    assert f"derivative in {name}: {slope:.3g} m^2/s" in str(report)
+    assert "disagree" not in str(report)
 
 
 def test_a_report_says_where_gains_have_no_effect():
@@ -156,13 +162,34 @@ def test_a_report_says_where_gains_have_no_effect():
     assert "P2 is at its limit throughout" in found.warnings[0]
 
 
+class Pulse(fj.Element):
+    """A torque from a time on, for a while."""
+
+    begin: fj.Values = fj.field((), unit="s")
+    length: fj.Values = fj.field((), unit="s")
+
+    def __call__(self, t, q, qd, linkage):
+        on = (t >= self.begin) & (t < self.begin + self.length)
+        return jnp.where(on, 50.0, 0.0) * jnp.array([1.0, 0, 0])
+
+    @property
+    def jump_ts(self):
+        return jnp.stack([self.begin, self.begin + self.length])
+
+
 @pytest.mark.slow
 def test_a_report_without_modes_for_elements_with_a_state():
     scene = scenes.fig7()._replace(t1=0.2)
     # Whole numbers in lists are a state too.
     scene = scene._replace(state0=fj.State([2, 3, -2], [0, 0, 0]))
     lag = fj.control.FirstOrderLag(fj.JointEffort(np.ones(3)), 0.1)
-    found = fj.tuning.gradient_report(scene._replace(forces=(*scene.forces, lag)))
+    forces = (*scene.forces, lag, Pulse(0.05, 0.07))
+    found = fj.tuning.gradient_report(scene._replace(forces=forces))
     # P2 is at its limit throughout: the gradient is small, and most of it noise.
     assert found.modes is None and found.error < 1e-2
     assert "natural frequencies" not in str(found)
+    # Derivatives in times at which efforts jump.
+    names = ["forces[0].reference.period", "forces[2].begin", "forces[2].length"]
+    assert list(found.times) == names
+    for slope, difference in found.times.values():
+        assert slope == pytest.approx(difference, rel=1e-3)

@@ -228,7 +228,7 @@ def test_without_a_bound_tangents_of_a_hanging_arm_are_wrong():
 
 @pytest.mark.slow
 def test_derivatives_in_the_times_themselves():
-    scene = fj.scenes.fig5()
+    scene = fj.scenes.double_pendulum()
 
     def loss(factor):
         ts = factor * jnp.array([0.0, 0.1, 0.3])
@@ -242,7 +242,7 @@ def test_derivatives_in_the_times_themselves():
 
 @pytest.mark.slow
 def test_a_function_may_close_over_what_is_differentiated():
-    scene = scenes.fig5()
+    scene, zero = scenes.double_pendulum(), jnp.zeros(2)
 
     def end(damping, make):
         forces = (make(damping),)
@@ -259,7 +259,7 @@ def test_a_function_may_close_over_what_is_differentiated():
     np.testing.assert_allclose(slope, difference, rtol=1e-8)
 
     def controller(c):
-        return fj.PDController(1.0, 1.0, 9.0, lambda t, linkage: (c * ZERO, ZERO))
+        return fj.PDController(1.0, 1.0, 9.0, lambda t, linkage: (c * zero, zero))
 
     with pytest.raises(TypeError, match="^forces: expected differentiated arrays"):
         jax.grad(end)(0.5, controller)

@@ -50,10 +50,23 @@ def test_tuning(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
+def test_gains():
+    names = run(DOCS / "gains.md")
+    assert names["loop"].stable
+    assert names["large"].bandwidth[0] < 0.6 * names["small"].bandwidth[0]
+    assert names["found"].met.shape == (12,) and names["found"].met.all()
+
+
+@pytest.mark.slow
 def test_identification():
-    found = run(DOCS / "identification.md")["found"]
-    assert found.converged
-    assert abs(found.parameters["mass"] - 1.3) < 0.05
+    names = run(DOCS / "identification.md")
+    found, both = names["found"], names["both"]
+    assert found.usable and both.usable and not names["alike"].usable
+    assert abs(both.parameters["mass"] - 1.3) < 1e-4
+    # By far the largest relative standard errors are those of the damping.
+    errors = [fit.standard_errors["damping"] / [4, 6, 0.5] for fit in (found, both)]
+    gain = max(errors[0]) / max(errors[1])
+    assert gain > 3 and gain == pytest.approx(names["chosen"].improvement, rel=0.05)
 
 
 @pytest.mark.slow

@@ -218,7 +218,9 @@ def test_malformed_motions_are_refused():
     with pytest.raises(ValueError, match=r"joints: expected 1 to 3, got 4"):
         fj.simulate(CART, REST, [0, 1], (motion,))
     motion = fj.PrescribedMotion(1, lambda t, linkage: (jnp.zeros(2), jnp.zeros(2)))
-    with pytest.raises(ValueError, match="reference: expected an array of 3"):
+    with pytest.raises(
+        ValueError, match=r"^forces\[0\]\.reference: expected an array of 3"
+    ):
         fj.simulate(CART, REST, [0, 1], (motion,))
     motion = fj.PrescribedMotion(1, hold)
     with pytest.raises(ValueError, match="forces: expected one PrescribedMotion"):

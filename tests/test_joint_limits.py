@@ -69,6 +69,14 @@ def test_damping_takes_energy_and_never_pulls():
     assert efforts.min() < -50 and efforts.max() <= 0
     fast = stops(0.0, last(1.1), last(-50.0), SLIDE)
     assert fast[2] == 0
+    # Where the penetration is rounded off, damping acts by its rate.
+    smooth = fj.forces.JointStops(
+        -np.inf, 1.0, stiffness=300.0, damping=0.3, smoothing=0.1
+    )
+    penetration, rate = 0.12**2 / 0.4, 0.12 / 0.2 * 3.0
+    expected = -300 * penetration * (1 + 0.3 * rate)
+    found = smooth(0.0, last(1.02), last(3.0), SLIDE)
+    np.testing.assert_allclose(found[2], expected, rtol=1e-12)
 
 
 @pytest.mark.parametrize("topology", fj.TOPOLOGIES)

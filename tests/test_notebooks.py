@@ -1,5 +1,6 @@
 """The notebooks have short cells, small files and committed outputs, and they run."""
 
+import os
 from pathlib import Path
 
 import pytest
@@ -79,20 +80,32 @@ def test_the_table_of_notebooks_lists_it(path):
     assert f"({path.name})" in (FOLDER / "README.md").read_text()
 
 
+@pytest.fixture(scope="module")
+def kernel():
+    """Returns one kernel for all notebooks, as each would import for seconds."""
+    from jupyter_client.manager import KernelManager
+
+    manager = KernelManager()
+    manager.start_kernel(cwd=FOLDER, env=os.environ | programs())
+    yield manager
+    manager.shutdown_kernel(now=True)
+
+
 @pytest.mark.slow
 @each_notebook
-def test_it_runs(path, monkeypatch):
+def test_it_runs(path, kernel):
+    import nbformat
     from nbclient import NotebookClient
 
-    for name, value in programs().items():
-        monkeypatch.setenv(name, value)
     notebook = read(path)
     committed = pictures(notebook)
+    # The names of other notebooks are forgotten first.
+    notebook.cells.insert(0, nbformat.v4.new_code_cell("%reset -f"))
     client = NotebookClient(
         notebook,
+        km=kernel,
         timeout=600,  # of a cell
         skip_cells_with_tag="install",
-        resources={"metadata": {"path": FOLDER}},
     )
     client.execute()
     assert unwanted(notebook) == []

@@ -15,7 +15,7 @@ def test_examples(tmp_path, monkeypatch):
     namespace = {}
     for block in re.findall(r"```python\n(.*?)```", GUIDE.read_text(), re.DOTALL):
         exec(compile(block, "pictures.md", "exec"), namespace)
-    for name in ("arm.png", "arm.gif", "arms.gif"):
+    for name in ("arm.png", "arm.gif", "arms.gif", "workspace.png"):
         assert (tmp_path / name).stat().st_size > 1000
     table, motion = namespace["table"], namespace["motion"]
     np.testing.assert_array_equal(table["P2 [m]"], motion.q[:, 1])

@@ -14,6 +14,7 @@ A, B = fj.Point(0, 0.3, -0.4), fj.Point(3, 0.5, 0.2)
 ELEMENTS = {
     "spring": fj.SpringDamper(A, B, stiffness=30.0, rest_length=0.4),
     "cable": fj.SpringDamper(A, B, stiffness=30.0, rest_length=0.4, one_sided="cable"),
+    "bumper": fj.SpringDamper(A, B, stiffness=2.0, rest_length=9.0, one_sided="bumper"),
     "spring of no length": fj.SpringDamper(fj.Point(1), B, stiffness=30.0),
     "tension": fj.forces.Tension(A, B, 7.0),
 }

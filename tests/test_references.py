@@ -51,6 +51,23 @@ def test_the_tip_is_on_the_path(path, timing, branch):
     np.testing.assert_allclose(qd, (ahead - behind) / 2e-6, atol=1e-6)
 
 
+def test_a_tilt_is_counter_clockwise():
+    for closed, first in (
+        (fj.references.Ellipse, 0.0),
+        (fj.references.FigureEight, 0.25),
+    ):
+        path = closed([1, 0], [2, 1], tilt=np.pi / 2)
+        np.testing.assert_allclose(path.point(first), [1, 2], atol=1e-15)
+
+
+def test_rounding_beside_the_negative_x_axis_adds_no_turn():
+    for side in (1e-13, -1e-13):
+        line = fj.references.Line([-1.3, side], [-1.5, side])
+        q, _ = fj.TipTask(line, fj.references.Travel(1.0), orientation=np.pi)(0.5, ARM)
+        np.testing.assert_allclose(q.sum(), np.pi, rtol=1e-6)
+        assert q[0] > 0
+
+
 def test_the_circle_as_an_ellipse_is_fig_7_s():
     circle = fj.CircleTask()
     ellipse = fj.references.Ellipse([-4, 2], [0.75, 0.75])

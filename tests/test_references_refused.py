@@ -43,9 +43,12 @@ def test_references_that_cannot_be_called_are_refused(value):
 def test_references_that_return_no_motion_are_refused(returned):
     element = controller(reference=lambda t, linkage: returned)
     refused("reference", lambda: element(0.0, jnp.zeros(3), jnp.zeros(3), LINKAGE))
-    for acting in (element, fj.control.FirstOrderLag(element, 0.1)):
-        forces = fj.JointDamper(1.0), acting
-        refused(r"forces\[1\]\.reference", partial(simulate, forces=forces))
+    place = r"forces\[1\]\."
+    for _ in range(3):  # by itself, in a drive, and in a drive of a drive
+        forces = fj.JointDamper(1.0), element
+        refused(f"{place}reference", partial(simulate, forces=forces))
+        place += r"command\."
+        element = fj.control.FirstOrderLag(element, 0.1)
 
 
 @pytest.mark.parametrize("circle", [dict(center=[9, 9]), dict(radius=5.0)], ids=str)
@@ -59,6 +62,9 @@ def test_circles_out_of_reach_are_refused_at_the_door(circle):
     place = r"^forces\[0\]\.reference"
     with pytest.raises(ValueError, match=place + ": expected .* reach .*, got .*"):
         fj.simulate(scene.linkage, scene.state0, [0, 5.0], forces)
+    drives = (fj.control.FirstOrderLag(forces[0], 0.1),)
+    with pytest.raises(ValueError, match=r"^forces\[0\]\.command\.reference: expected"):
+        fj.simulate(scene.linkage, scene.state0, [0, 5.0], drives)
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from helpers import SCENES, load
 
 import fdof_jax as fj
 from fdof_jax import scenes
-from fdof_jax.xla.trigonometry import sincos
+from fdof_jax.base.trigonometry import sincos
 
 
 def absolute_angles(linkage, solution):

@@ -129,9 +129,10 @@ class Breaking(eqx.Module):
 @pytest.mark.slow
 def test_failed_members_add_nothing_to_a_gradient():
     """Reverse mode adds all members' cotangents to the shared mass; 0 x NaN is NaN."""
-    linkage = chains.random_chain("RP", np.random.default_rng(1))
+    # Of one link, whose program is the smallest.
+    linkage = chains.random_chain("R", np.random.default_rng(1))
     rng = np.random.default_rng(2)
-    q, qd = rng.uniform(-1, 1, (2, 4, 2))
+    q, qd = rng.uniform(-1, 1, (2, 4, 1))
     q[1, 0] = np.nan
     breaking = (Breaking(jnp.array([1e9, 1e9, TS[1], 1e9])),)
 
@@ -158,10 +159,8 @@ def test_failed_members_add_nothing_to_a_gradient():
         ends = [distance(linkage.mass + s * h)[0][0] for s in (1, -1)]
         return (ends[0] - ends[1]) / 2
 
-    expected = [
-        (8 * difference(5e-4 * e) - difference(1e-3 * e)) / 3e-3 for e in np.eye(2)
-    ]
-    assert np.abs(expected).max() > 1e-3
+    expected = (8 * difference(5e-4) - difference(1e-3)) / 3e-3
+    assert np.abs(expected) > 1e-3
     np.testing.assert_allclose(gradient, expected, rtol=1e-7, atol=1e-9)
 
 
@@ -198,8 +197,8 @@ def test_arrays_without_the_axis_are_shared():
 
 @pytest.mark.slow
 def test_an_implicit_solver_finds_its_tolerances():
-    linkage = fj.scenes.double_pendulum().linkage
-    start = fj.State(np.zeros((2, 2)) + [[0.0], [0.1]], np.zeros(2))
+    linkage = chains.random_chain("R", np.random.default_rng(1))
+    start = fj.State(np.array([[0.0], [0.1]]), np.zeros(1))
     steps = diffrax.PIDController(rtol=1e-8, atol=1e-8)
     solution = fj.sweep(
         linkage, start, [0, 0.2], solver=diffrax.Kvaerno5(), stepsize_controller=steps

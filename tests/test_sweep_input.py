@@ -108,6 +108,9 @@ def test_other_axes_are_refused(axes):
         "throw": [1, None, "no"],
         "progress_meter": [None, 3],
         "checkpoint": [3, True],
+        "store": [3, True, ""],
+        "shard": [-1, 1, 0.5, None],
+        "of": [0, 1.5, True, None],
         "stepsize_controller": ["PID", 1e-6],
         "max_steps": [0, -1, 1.5, "1"],
     }.items(),
@@ -115,6 +118,12 @@ def test_other_axes_are_refused(axes):
 def test_malformed_options_are_refused(name, values):
     for value in values:
         refused(name, **{name: value})
+
+
+def test_options_that_contradict_each_other_are_refused(tmp_path):
+    refused("store", shard=1, of=2)
+    refused("shard", shard=2, of=2, store=tmp_path)
+    refused("checkpoint", checkpoint=tmp_path, store=tmp_path)
 
 
 def test_a_misspelt_keyword_is_refused():
@@ -126,6 +135,8 @@ def test_what_a_transformation_cannot_do_is_refused(tmp_path):
     def end(q, **keywords):
         return fj.sweep(TWO, fj.State(q, STATES.qd), TS, **keywords).q
 
-    for keywords in (dict(throw=True), dict(checkpoint=tmp_path)):
-        with pytest.raises(ValueError, match="^throw, checkpoint: expected"):
+    for keywords in (
+        dict(throw=True), dict(checkpoint=tmp_path), dict(store=tmp_path)
+    ):  # fmt: skip
+        with pytest.raises(ValueError, match="^throw, checkpoint, store: expected"):
             jax.eval_shape(functools.partial(end, **keywords), STATES.q)

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from sweep_batch import FAILED, SETTINGS, TS, run
+from sweep_batch import FAILED, run
 
 import fdof_jax as fj
 from fdof_jax.simulation import chunks
@@ -42,18 +42,6 @@ def test_a_checkpoint_holds_only_what_is_kept(mixed, reduced, tmp_path, monkeypa
     again = run(mixed, reduce=same, checkpoint=tmp_path)
     for a, b in zip(*map(jax.tree.leaves, (again, reduced))):
         np.testing.assert_array_equal(a, b)
-
-
-def test_another_function_has_other_checkpoints(batch):
-    all_of = chunks.Batch(batch, jax.tree.map(lambda leaf: True, batch), 42)
-    scaled = lambda factor: lambda motion: factor * motion.q[-1]
-    one, same, two = (
-        chunks.program_of(scaled(jnp.full(3, f)), all_of, jnp.asarray(TS), SETTINGS)
-        for f in (1.0, 1.0, 2.0)
-    )
-    assert one[0] == same[0]
-    np.testing.assert_array_equal(one[1], same[1])
-    assert not np.array_equal(one[1], two[1])
 
 
 def test_what_is_no_reduction_is_refused(batch):

@@ -10,10 +10,12 @@ import diffrax
 import jax
 import numpy as np
 import pytest
+import sweep_batch
+import xarray
 from sweep_batch import CHUNK, run
 
 import fdof_jax as fj
-from fdof_jax.checks import is_traced
+from fdof_jax.base.checks import is_traced
 from fdof_jax.simulation import chunks, prescribed
 
 # Checkpoints
@@ -98,16 +100,29 @@ def test_progress_rises_to_one(mixed):
 
 
 WORKER = """
+import os
 import sys
 import jax
-jax.config.update("jax_enable_x64", True)
+import fdof_jax as fj
+fj.configure(x64=True)
 address, processes, index, devices, path = sys.argv[1:]
 if int(processes) > 1:
     jax.distributed.initialize(address, int(processes), int(index))
 import numpy as np
 import sweep_batch
 assert jax.device_count() == int(devices)
-solution = sweep_batch.run(sweep_batch.members(), chunk=4)
+batch = sweep_batch.single_links()
+solution = sweep_batch.run(batch, chunk=4)
+if hasattr(jax, "set_mesh"):
+    mesh = jax.make_mesh((int(devices),), ("lanes",))
+    lanes = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("lanes"))
+    parts = lambda a: jax.make_array_from_callback(a.shape, lanes, lambda i: a[i])
+    even = len(batch[1].q) // int(devices) * int(devices)
+    spread = jax.tree.map(lambda a: parts(np.asarray(a)[:even]), batch)
+    with jax.set_mesh(mesh):
+        same = sweep_batch.run(spread, chunk=4)
+        sweep_batch.run(spread, chunk=4, store=os.path.dirname(path) + "/store")
+    np.testing.assert_allclose(same.q, solution.q[:even], rtol=1e-8, atol=1e-8)
 steps = solution.stats["num_steps"]
 good = sweep_batch.successful(solution)
 np.savez(path, q=solution.q, qd=solution.qd, steps=steps, good=good)
@@ -120,11 +135,10 @@ def workers(folder, processes, devices):
         port.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{port.getsockname()[1]}"
     here = Path(__file__).parent
-    flag = f"--xla_force_host_platform_device_count={devices // processes}"
     env = dict(
         os.environ,
         JAX_PLATFORMS="cpu",
-        XLA_FLAGS=flag,
+        JAX_NUM_CPU_DEVICES=str(devices // processes),
         PYTHONPATH=os.pathsep.join([str(here), str(here.parent)]),
     )
     started, answers = [], []
@@ -147,8 +161,9 @@ def workers(folder, processes, devices):
 
 
 @pytest.mark.slow
-def test_more_devices_and_processes_change_nothing(clean, tmp_path):
-    """Uses two devices in each of two processes."""
+def test_more_devices_and_processes_change_nothing(tmp_path):
+    """Uses two devices in each of two processes, and inputs spread over them."""
+    clean = run(sweep_batch.single_links())
     for answer in workers(tmp_path, processes=2, devices=4):
         assert answer["good"].all()
         np.testing.assert_allclose(answer["q"], clean.q, rtol=1e-8, atol=1e-8)
@@ -156,6 +171,10 @@ def test_more_devices_and_processes_change_nothing(clean, tmp_path):
         np.testing.assert_allclose(
             answer["steps"], clean.stats["num_steps"], rtol=0, atol=5
         )
+    if hasattr(jax, "set_mesh"):
+        with xarray.open_zarr(tmp_path / "store") as data:
+            even = clean.q[: len(data.q)]
+            np.testing.assert_allclose(data.q, even, rtol=1e-8, atol=1e-8)
 
 
 def test_other_values_need_no_new_trace(batch, clean, monkeypatch):

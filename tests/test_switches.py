@@ -9,6 +9,7 @@ import pytest
 from switching_scenes import BUMPER, CABLE, LIMITED, RODS as ARM, scene
 
 import fdof_jax as fj
+from fdof_jax.forces.switches import Switches
 from fdof_jax.simulation.looped_dopri8 import LoopedDopri8
 from fdof_jax.simulation.sensitivities import sensitivities
 
@@ -81,6 +82,32 @@ def test_the_variational_equations_are_those_of_the_motion():
     np.testing.assert_allclose(found.jacobian[:, 0], PUBLISHED[1], atol=1e-6)
 
 
+class Turning(fj.Element):
+    """A slide that is pulled back, with marks on its way and on its velocity.
+
+    From 3 m/s on, it turns back at 0.45 m.
+    """
+
+    depth: fj.Values = fj.field((), unit="m")
+
+    def __call__(self, t, q, qd, linkage):
+        pace = jnp.sqrt(20 * self.depth)
+        slower = fj.forces.switch(qd - 1.05 * pace, 0.0, 1e-9)
+        return -10 + slower + fj.forces.switch(q - 0.45 + self.depth, 1e-9, 0.0)
+
+
+def test_what_nearly_grazes_is_seen_beside_another_switch():
+    """The velocity passes its mark just before, so that the step is short."""
+    slide = fj.Linkage(
+        "P", length=[0, 1], com=[[0.5, 0]], mass=[1], inertia=[0.1], gravity=0
+    )
+    for depth in (0.1, 1e-2, 3e-4):
+        found = fj.simulate(slide, fj.State([0], [3]), [0, 0.5], (Turning(depth),))
+        assert found.stats["num_switches"] == 3
+        share = np.sqrt(depth / 0.45)
+        assert found.stats["slowest_crossing"] == pytest.approx(share, rel=0.2)
+
+
 class Pulse(eqx.Module):
     """A torque on the first joint for a time, from a time that it declares."""
 
@@ -144,39 +171,53 @@ def test_a_pulses_time_and_a_cables_length_are_fitted_as_well_as_noise_allows():
 class Rough(fj.Element):
     """Friction that is greater in one half of the range, by a jump."""
 
+    level: fj.Values = fj.field((), unit="N m s/rad")
+
     def __call__(self, t, q, qd, linkage):
-        return -fj.forces.switch(q - 0.1, 4.0, 0.5) * qd
+        return -self.level * fj.forces.switch(q - 0.1, 4.0, 0.5) * qd
 
 
 @pytest.mark.slow
-def test_both_modes_second_derivatives_and_other_solvers():
+def test_both_modes_hessians_of_a_batch_and_other_solvers():
+    """Derivatives in a shift of the start and in the friction."""
     # Two links, whose programs compile faster.
     arm = fj.Linkage(
         "RR", length=[0, 1, 1], com=[[0.5, 0]] * 2, mass=[1, 1], inertia=[0.1] * 2
     )
-    start = fj.State(jnp.zeros(2), jnp.array([1.0, -1]))
+    speeds = jnp.array([[1.0, -1], [2, 3], [-4, 5]])  # which take other steps
 
-    def end(x, tolerance=1e-12, **options):
-        state = start._replace(q=start.q + x)
+    def end(z, speed, tolerance=1e-12, **options):
+        start, friction = fj.State(z[0] * jnp.ones(2), speed), Rough(jnp.exp(z[1]))
         return fj.simulate(
-            arm, state, [0, 0.5], (Rough(),), rtol=tolerance, atol=tolerance, **options
+            arm, start, [0, 0.5], (friction,), rtol=tolerance, atol=tolerance, **options
         ).q[-1]
 
-    def slope_twice(x):
-        slope = jax.jacfwd(lambda x: end(x, adjoint=FORWARD))(x)
+    def slope_twice(z, speed):
+        slope = jax.jacfwd(lambda z: end(z, speed, adjoint=FORWARD))(z)
         return slope, slope
 
-    both = jax.jit(jax.jacfwd(slope_twice, has_aux=True))
-    twice, slope = both(0.0)
-    exact = differences(lambda x: both(x)[1], 0.0, 1e-4)
-    np.testing.assert_allclose(twice, exact, rtol=1e-5)
+    hessian = jax.vmap(jax.jacfwd(slope_twice, has_aux=True), (None, 0))
+    both, zero = jax.jit(hessian), jnp.zeros(2)
+    twice, slope = both(zero, speeds)
+    exact = [
+        differences(lambda h, e=e: both(h * e, speeds)[1], 0, 1e-4) for e in np.eye(2)
+    ]
+    exact = np.stack(exact, axis=-1)
+    size = np.abs(exact).max(axis=(1, 2, 3), keepdims=True)
+    assert (np.abs(twice - exact) < 1e-5 * size).all()
+    assert (np.abs(twice - twice.swapaxes(2, 3)) < 1e-8 * size).all()
+    # Alone among members like itself, by the same program.
+    alone = [both(zero, jnp.tile(speed, (3, 1)))[0][0] for speed in speeds]
+    assert (np.abs(twice - np.stack(alone)) < 1e-8 * size).all()
+
     weights = jnp.array([0.3, -0.5])
     adjoint = diffrax.RecursiveCheckpointAdjoint(checkpoints=200)
-    backward = jax.jit(jax.grad(lambda x: weights @ end(x, adjoint=adjoint)))(0.0)
-    np.testing.assert_allclose(backward, weights @ slope, rtol=1e-10)
-    other = lambda x: end(x, 1e-9, adjoint=FORWARD, solver=diffrax.Tsit5())
-    found = jax.jit(jax.jacfwd(other))(0.0)
-    np.testing.assert_allclose(found, slope, atol=1e-6)
+    loss = lambda z: weights @ end(z, speeds[0], adjoint=adjoint)
+    backward = jax.jit(jax.grad(loss))(zero)
+    np.testing.assert_allclose(backward, weights @ slope[0], rtol=1e-10)
+    other = lambda z: end(z, speeds[0], 1e-9, adjoint=FORWARD, solver=diffrax.Tsit5())
+    found = jax.jit(jax.jacfwd(other))(zero)
+    np.testing.assert_allclose(found, slope[0], atol=1e-6)
 
 
 class BangBang(fj.Element):
@@ -203,3 +244,13 @@ def test_outside_of_a_solve_a_switch_is_a_choice():
     assert found.tolist() == [7, 7, 5]
     clipped = fj.forces.clip(jnp.array([-3.0, 0.5, 3]), -1, 2)
     assert clipped.tolist() == [-1, 0.5, 2]
+
+
+def test_whether_efforts_jump_is_known_from_the_switches_met():
+    jumping = []
+    for met in (lambda: fj.forces.clip(1.0, 0, 2), lambda: fj.forces.switch(1.0, 0, 2)):
+        switches = Switches(None)
+        with switches.dealt():
+            met()
+        jumping.append(switches.jumping)
+    assert jumping == [False, True]

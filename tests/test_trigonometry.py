@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from mpmath import mp, mpf
 
-from fdof_jax.xla.trigonometry import sincos
+from fdof_jax.base.trigonometry import sincos
 
 RANGES = {np.float64: 2.0**20, np.float32: 1500.0}
 

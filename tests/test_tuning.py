@@ -10,7 +10,7 @@ import pytest
 import fdof_jax as fj
 from fdof_jax import scenes
 from fdof_jax.search import lanes
-from fdof_jax.tuning.gains import with_gains
+from fdof_jax.tuning.gains import bounds_of, with_gains
 from fdof_jax.tuning.losses import controller_of, gains_of, tip_errors
 
 
@@ -98,10 +98,11 @@ def test_starts_that_fail_are_counted():
     scene = scenes.fig7()._replace(t1=0.2)
     gains = gains_of(scene)
     bounds = (gains, gains * 1e100)  # so stiff that the first steps fail
-    result = fj.tune(scene, bounds=bounds, starts=3, max_steps=1)
+    # As many as in another test, whose program it shares.
+    result = fj.tune(scene, bounds=bounds, starts=6, max_steps=1)
     assert np.isnan(result.losses).sum() >= 1
     failed = np.isnan(result.losses).sum()
-    assert f"{failed} of 3 starts could not be simulated" in str(result)
+    assert f"{failed} of 6 starts could not be simulated" in str(result)
     assert np.isfinite(result.loss)
 
 
@@ -122,7 +123,11 @@ def test_gains_of_zero_stay_zero():
     without = fj.PDController(
         controller.kp, [80.0, 0.0, 50.0], controller.limit, controller.reference
     )
-    result = fj.tune(scene._replace(forces=(without,)), max_steps=2)
+    scene = scene._replace(forces=(without,))
+    gains = gains_of(scene)
+    _, lower, upper = bounds_of(scene, None, (gains / 2, 2 * gains + 1))
+    assert lower[1, 1] == upper[1, 1] == 0 and upper[1, 0] == 161
+    result = fj.tune(scene, max_steps=2)
     assert result.scene.forces[0].kd[1] == 0
     assert result.loss < result.history.loss[0]
     assert "of 5 gains" in result.message

@@ -52,6 +52,27 @@ def test_too_many_members():
     refused("members", tuning.perturbed, FIG7, 10**30)
 
 
+@pytest.mark.parametrize("q", [None, "x", [[1], [1, 2]], [0, 0]], ids=str)
+def test_efforts_that_hold_an_arm(q):
+    refused("q", fj.analysis.holding_efforts, FIG7.linkage, q)
+
+
+def test_states_of_no_elements():
+    """A number has the shape (), which is also what holds no states."""
+    simulate = lambda own0: fj.simulate(FIG7.linkage, FIG7.state0, TS, own0=own0)
+    refused("own0", simulate, 0.0)
+
+
+def test_too_many_steps():
+    simulate = lambda n: fj.simulate(FIG7.linkage, FIG7.state0, TS, max_steps=n)
+    refused("max_steps", simulate, 10**30)
+
+
+def test_recordings_of_unlike_lengths():
+    fit = identification.fit_each
+    refused("observed", fit, lambda p: FIG7, {"a": 1.0}, TS, [[1], [1, 2]])
+
+
 def test_no_members():
     """`vmap` over no members has nothing to raise."""
     linkage, state0, *_ = scenes.fig5()

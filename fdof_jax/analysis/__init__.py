@@ -1,5 +1,5 @@
 """Analysis of configurations and motions: equilibria, linearisation, reactions."""
 
-from ..names import attach
+from ..base.names import attach
 
 __getattr__, __dir__, __all__ = attach(__name__, __file__)

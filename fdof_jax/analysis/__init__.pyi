@@ -6,10 +6,15 @@ from .linearization import (
     closed_loop_modes as closed_loop_modes,
     linearize as linearize,
 )
+from .loops import OpenLoop as OpenLoop, open_loop as open_loop
 from .reactions import joint_reactions as joint_reactions
 from .regression import (
     inertial_parameters as inertial_parameters,
     regressor as regressor,
+)
+from .responses import (
+    StepAndSine as StepAndSine,
+    step_and_sine as step_and_sine,
 )
 
 __all__: list[str]

@@ -8,7 +8,7 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from ..checks import in_order, real_array
+from ..base.checks import JOINT, in_order, real_array
 from ..dynamics import inverse_dynamics
 from ..forces.element import Element, Forces
 from ..linkage.linkage import Linkage, per_joint, without_fixed
@@ -90,5 +90,6 @@ def holding_efforts(
     >>> fj.analysis.holding_efforts(arm, [0, 0, 0]).tolist()
     [58.86, 29.43, 9.81]
     """
-    still = jnp.zeros_like(jnp.asarray(q, float))
+    q = real_array("q", q, (JOINT,))
+    still = jnp.zeros_like(q)
     return inverse_dynamics(linkage, q, still, still, forces)

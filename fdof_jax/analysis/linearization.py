@@ -10,7 +10,7 @@ from jax import Array
 from jaxtyping import Complex, Float
 from numpy.typing import ArrayLike
 
-from ..checks import in_order, instance, is_traced, real_array
+from ..base.checks import in_order, instance, is_traced, real_array
 from ..dynamics import forward_dynamics
 from ..forces.element import Element, Forces, elements_on, of_full_size
 from ..linkage.coordinates import State, real_state

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
+from ..base.array_namespace import plane_vectors
 from ..dynamics import forward_dynamics
 from ..forces.element import Forces, elements
 from ..linkage.frames import cross, frames
@@ -15,7 +16,6 @@ from ..linkage.linkage import Linkage
 from ..mechanics.kinematics import joint_positions, mass_center_velocities, mass_centers
 from ..simulation.efforts import joint_efforts
 from ..simulation.solution import Solution
-from ..xla.array_namespace import plane_vectors
 
 
 def _loads(

@@ -1,5 +1,5 @@
 """Controllers, feedforward and drives."""
 
-from ..names import attach
+from ..base.names import attach
 
 __getattr__, __dir__, __all__ = attach(__name__, __file__)

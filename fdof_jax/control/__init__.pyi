@@ -4,6 +4,7 @@ from .drives import (
     PIDController as PIDController,
     SpeedLimit as SpeedLimit,
 )
+from .gains import gains_from_frequency as gains_from_frequency
 from .model_based import (
     ComputedTorque as ComputedTorque,
     GravityFeedforward as GravityFeedforward,

@@ -11,8 +11,8 @@ import jax.numpy as jnp
 from jax import Array
 from numpy.typing import ArrayLike
 
-from ..checks import real_array
-from ..forces.element import StatefulElement, element_of
+from ..base.checks import real_array
+from ..forces.element import StatefulElement, element_of, naming
 from ..forces.part import Condition, Values, called, field
 from ..forces.switches import clip
 from ..linkage.linkage import Linkage, joints_of
@@ -81,7 +81,7 @@ class DriveState(NamedTuple):
     command: Any
 
 
-class _Drive(StatefulElement):
+class Drive(StatefulElement):
     """A drive: a subclass implements `respond`, and `initial` if it has a state."""
 
     command: Any = called("a force element, a PDController for instance")
@@ -98,14 +98,19 @@ class _Drive(StatefulElement):
         inner = element_of(self.command).initial_state(linkage)
         return DriveState(self.initial(linkage), inner)
 
+    def check(self, linkage, ts):
+        with naming("command"):
+            element_of(self.command).check(linkage, ts)
+
     def __call__(self, t, q, qd, linkage, state):
         own, inner = state
-        command, inner_rate = element_of(self.command).act(t, q, qd, linkage, inner)
+        with naming("command"):
+            command, inner_rate = element_of(self.command).act(t, q, qd, linkage, inner)
         effort, rate = self.respond(real_array("command", command, (len(qd),)), qd, own)
         return effort, DriveState(rate, inner_rate)
 
 
-class FirstOrderLag(_Drive):
+class FirstOrderLag(Drive):
     """A drive whose effort follows its command with a first-order lag.
 
     The rate of the effort is (command - effort) / time_constant.
@@ -133,7 +138,7 @@ class FirstOrderLag(_Drive):
         return own, (command - own) / self.time_constant
 
 
-class SpeedLimit(_Drive):
+class SpeedLimit(Drive):
     """A drive whose effort limit falls with speed: a straight torque-speed curve.
 
     In the direction of motion the effort is at most stall * (1 - |qd| / no_load), not
@@ -162,7 +167,7 @@ class SpeedLimit(_Drive):
         return clip(command, -self.stall * right, self.stall * left), ()
 
 
-class DCMotor(_Drive):
+class DCMotor(Drive):
     """Brushed motors on geared joints: winding, back-EMF, limited voltage and current.
 
     The current i obeys inductance * di/dt = v - resistance * i - constant * gear * qd,

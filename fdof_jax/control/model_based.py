@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from ..checks import real_array
+from ..base.checks import real_array
 from ..forces.part import Condition
 from ..linkage.frames import scalar_frames
 from ..linkage.linkage import Linkage, check_linkage, possible

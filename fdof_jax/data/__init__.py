@@ -1,5 +1,5 @@
 """Tables of motions, files of pytrees, and export to other engines."""
 
-from ..names import attach
+from ..base.names import attach
 
 __getattr__, __dir__, __all__ = attach(__name__, __file__)

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .. import __version__
-from ..whole_files import whole_file
+from ..base.whole_files import whole_file
 from .tree_description import Restorer, Unreadable, described
 
 _FORMAT, _VERSION = "fdof_jax", 1

@@ -6,7 +6,7 @@ from xml.etree import ElementTree
 import jax.numpy as jnp
 import numpy as np
 
-from ..checks import is_traced
+from ..base.checks import is_traced
 from ..control.pd import PDController
 from ..forces.actuators import Armature
 from ..forces.between_points import SpringDamper

@@ -6,11 +6,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..base.names import optional_package
 from ..forces.actuators import Armature
 from ..forces.element import Forces
 from ..forces.joints import JointDamper
 from ..linkage.linkage import Linkage
-from ..names import optional_package
 
 _SLIDE, _HINGE = 2, 3  # MuJoCo's mjtJoint
 

@@ -4,30 +4,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..checks import in_order, instance, known
+from ..base.checks import in_order, instance, known
+from ..base.names import optional_package
 from ..linkage.linkage import Linkage
-from ..linkage.topology import letters
-from ..names import optional_package
+from ..linkage.topology import common_unit, names_and_units, rate_unit
 from ..simulation.solution import Solution, check_joints
 
 if TYPE_CHECKING:
     import pandas
     import xarray
-
-
-def _joints(linkage: Linkage) -> tuple[list[str], list[str]]:
-    """Names and units of the joints; both are neutral if a batch mixes the kinds."""
-    names, units = [], []
-    of_members = np.asarray(linkage.ef).reshape(-1, linkage.ef.shape[-1])
-    for k, kinds in enumerate(map(set, zip(*map(letters, of_members)))):
-        names.append(f"{min(kinds)}{k + 1}" if len(kinds) == 1 else f"{k + 1}")
-        moving = sorted(kinds - {"F"}) or ["R"]
-        units.append(" or ".join({"P": "m", "R": "rad"}[kind] for kind in moving))
-    return names, units
-
-
-def _rate(unit: str) -> str:
-    return " or ".join(f"{one}/s" for one in unit.split(" or "))
 
 
 def _checked(linkage: Linkage, solution: Solution) -> tuple[np.ndarray, list[str]]:
@@ -69,12 +54,12 @@ def to_xarray(linkage: Linkage, solution: Solution) -> "xarray.Dataset":
     swapped = isinstance(linkage, Solution)
     linkage, solution = in_order("linkage, solution", swapped, linkage, solution)
     times, batch = _checked(linkage, solution)
-    names, units = _joints(linkage)
-    common = units[0] if len(set(units)) == 1 else "m or rad"
+    names, units = names_and_units(linkage.ef)
+    common = common_unit(units)
     rows, steps = [*batch, "time", "joint"], solution.stats["num_steps"]
     variables = {
         "q": (rows, solution.q, "joint position", common),
-        "qd": (rows, solution.qd, "joint velocity", _rate(common)),
+        "qd": (rows, solution.qd, "joint velocity", rate_unit(common)),
         "outcome": (batch, solution.outcome, "how the trajectory ended", ""),
         "num_steps": (batch, steps, "number of steps", "1"),
         "time_reached": (batch, solution.stats["time_reached"], "time reached", "s"),
@@ -114,8 +99,8 @@ def to_pandas(linkage: Linkage, solution: Solution) -> "pandas.DataFrame":
     linkage, solution = in_order("linkage, solution", swapped, linkage, solution)
     times, batch = _checked(linkage, solution)
     columns = {}
-    for values, unit_of in ((solution.q, str), (solution.qd, _rate)):
-        for k, (name, unit) in enumerate(zip(*_joints(linkage))):
+    for values, unit_of in ((solution.q, str), (solution.qd, rate_unit)):
+        for k, (name, unit) in enumerate(zip(*names_and_units(linkage.ef))):
             columns[f"{name} [{unit_of(unit)}]"] = np.asarray(values)[..., k].ravel()
     columns["outcome"] = np.repeat(solution.outcome, len(times))
     index = pandas.Index(times, name="time [s]")

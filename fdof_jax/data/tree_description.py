@@ -19,8 +19,8 @@ import numpy as np
 from jax import Array
 
 from .. import __all__ as _NAMES, __name__ as _PACKAGE
-from ..checks import is_traced, refusal
-from ..names import room_of
+from ..base.checks import is_traced, refusal
+from ..base.names import room_of
 
 _RESULT: Any = diffrax.RESULTS.successful
 _Item, _EnumerationMeta = type(_RESULT), type(diffrax.RESULTS)
@@ -40,6 +40,11 @@ _WITHIN = {
 }
 # Classes in files of 0.1 that are no more; their instances are loaded as dictionaries.
 _REMOVED = (f"{_PACKAGE}.tuning_run:Job",)
+# Fields that results in files of 0.1 lack: they get their defaults.
+_ADDED = {
+    f"{_PACKAGE}:FitResult": {"held_out": (), "faults": ("saved without a verdict",)},
+    f"{_PACKAGE}:GradientReport": dict(switches=0, slowest_crossing=np.inf, times={}),
+}
 
 
 def _name(thing: Any) -> str:
@@ -223,12 +228,16 @@ class Restorer:
             return {name: self.tree(item) for name, item in node["fields"].items()}
         cls = _class(node["class"], self.classes)
         names, fields = _fields(cls), node["fields"]
-        if names is None or set(names) != set(fields):
+        added = _ADDED.get(_name(cls), {})
+        if names is None or set(names) != set(fields) | set(added):
             raise Unreadable(
                 f"expected {node['class']} with the fields {names} that this version "
                 f"of it has, got {list(fields)}"
             )
-        values = {name: self.tree(fields[name]) for name in names}
+        values = {
+            name: self.tree(fields[name]) if name in fields else added[name]
+            for name in names
+        }
         if issubclass(cls, tuple):
             return tuple.__new__(cls, values.values())
         # The constructor is bypassed, as it might compute or raise.

@@ -13,7 +13,7 @@ from jax import Array
 from jaxtyping import Int
 from numpy.typing import ArrayLike
 
-from ..checks import instance
+from ..base.checks import instance
 from ..linkage.frames import scalar_frames
 from ..linkage.linkage import Linkage
 from .part import Values, field, of_kind, value_of

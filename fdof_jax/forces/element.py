@@ -22,7 +22,7 @@ Forces = tuple[Any, ...]  # elements, or callables (t, q, qd, linkage) -> tau
 
 
 class Element(Part):
-    """What acts on an arm: a pytree that computes joint efforts.
+    """A force element, which acts on an arm: a pytree that computes joint efforts.
 
     A subclass implements `__call__`, with joint positions, velocities and efforts of
     shape (n,) [m or rad; m/s or rad/s; N or N m]. All else has a default:
@@ -130,8 +130,8 @@ def of_full_size(linkage: Linkage, forces: tuple[Element, ...]) -> tuple[Element
 
 
 @contextmanager
-def naming(index: int) -> Iterator[None]:
-    """Adds an element's place in `forces` to messages about its values.
+def naming(place: str) -> Iterator[None]:
+    """Adds an element's place, such as `forces[0]`, to messages about its values.
 
     Those about arguments of the call, and those without a name, stay as they are.
     """
@@ -141,7 +141,7 @@ def naming(index: int) -> Iterator[None]:
         name, colon, _ = str(error).partition(": ")
         first, *_ = name.split(".")
         if colon and first.isidentifier() and first not in ("linkage", "ts"):
-            raise ValueError(f"forces[{index}].{error}") from error
+            raise ValueError(f"{place}.{error}") from error
         raise
 
 

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from ..checks import JOINT
+from ..base.checks import JOINT
 from .element import ScalarElement
 from .part import Condition, Values, each, field
 

@@ -18,9 +18,9 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
-from ..checks import JOINT, concrete, function, instance, is_traced, real_array
+from ..base.array_namespace import in_numpy, namespace
+from ..base.checks import JOINT, concrete, function, instance, is_traced, real_array
 from ..linkage.linkage import Linkage, joints_of, short
-from ..xla.array_namespace import in_numpy, namespace
 
 
 class Values:

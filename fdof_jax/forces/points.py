@@ -17,7 +17,7 @@ from jax import Array
 from jaxtyping import Complex, Float
 from numpy.typing import ArrayLike
 
-from ..checks import whole_number
+from ..base.checks import whole_number
 from ..linkage.frames import Frames, cross, frames, scalar_frames
 from ..linkage.linkage import Linkage, joints_of, per_joint, without_fixed
 from ..linkage.topology import MOST_PAIRS

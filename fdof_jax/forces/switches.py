@@ -80,7 +80,8 @@ def switch(
     `continuous`: whether the effort is the same on both sides where `g` is 0, in every
     use of the result; programs for derivatives then compile faster.
 
-    Not within a function of its own that `jax.jit` or `jax.jvp` transforms.
+    Not within a function of its own that JAX transforms, by `jax.jit`, `jax.vmap` or
+    `jax.grad` for instance.
 
     >>> import fdof_jax as fj
     >>> class Drag(fj.Element):  # air on one side, water on the other

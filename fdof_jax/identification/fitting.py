@@ -1,30 +1,28 @@
 """Identification: parameters of a scene from recordings of its motion."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jax import Array
 from numpy.typing import ArrayLike
 
-from ..checks import function, keywords_as, real_array
+from ..base.checks import keywords_as, real_array, refusal
 from ..search.bounded import Run, minimise
 from ..search.lanes import Lanes
 from ..search.methods import Evaluation
-from ..search.simulated import check_scene, sum_of_squares
-from ..simulation.scene import Scene, stacked
-from ..simulation.sensitivities import sensitivities
-from ..simulation.solution import Solution
-from .recordings import link_ends, observations
+from .problems import (
+    Observe,
+    Problem,
+    SceneAt,
+    lane,
+    listed,
+    noise_by_changes,
+    problems_of,
+)
+from .recordings import link_ends
 from .result import FitResult, fit_result
-from .unknowns import Shapes, Unknowns, named, unknowns_of
+from .unknowns import Unknowns, unknowns_of
 
-SceneAt = Callable[[dict[str, Array]], Scene]
-Observe = Callable[[Scene, Solution], Array]
-
-_TOLERANCE = 1e-7  # of the derivatives, and of the dense output
 # A search stops when the loss falls by less than this part. One standard error of a
 # parameter changes the loss by about one part in the number of readings, far more.
 _ENOUGH = 1e-8
@@ -35,61 +33,13 @@ _SHARES = (0.25, 0.5, 0.75, 1.0)
 _ENOUGH_EARLY = 1e-3  # only a start for the next part is needed
 
 
-class _Problem(NamedTuple):
-    """A recording, its scene and observation; `weight` is 0 where a sample is missing.
-
-    The parameters, of the given shapes, are `scale` times the unknowns.
-    """
-
-    scene_at: SceneAt
-    observe: Observe
-    shapes: Shapes
-    scale: Any
-    ts: Any
-    observed: Any
-    weight: Any
-
-
-def _lane(z: Array, problem: _Problem) -> Evaluation:
-    """Evaluates a recording's weighted sum of squares and its derivatives in `z`."""
-    weight = problem.weight
-
-    def scene_at(z):
-        return problem.scene_at(named(problem.shapes, problem.scale * z))
-
-    def residuals(scene, solution):
-        seen = jnp.asarray(problem.observe(scene, solution))
-        if seen.shape != problem.observed.shape:
-            raise ValueError(
-                "observed: expected the shape of what `observe` returns, "
-                f"{seen.shape}, got {problem.observed.shape}."
-            )
-        misfit = jnp.where(weight > 0, seen - problem.observed, 0)
-        return (weight * misfit).reshape(-1)
-
-    found = sensitivities(scene_at, residuals, z, problem.ts, _TOLERANCE)
-    unweighted = found.residuals / jnp.where(weight > 0, weight, 1).reshape(-1)
-    return sum_of_squares(found, squares=jnp.sum(unweighted**2))
-
-
-def _check_scene_at(scene_at: SceneAt, parameters: dict[str, Array], ts: Array) -> None:
-    try:
-        scene = scene_at(parameters)
-    except KeyError as error:
-        raise ValueError(
-            f"start: expected a value for {error}, which scene_at may use, got "
-            f"{list(parameters)}."
-        ) from error
-    check_scene("scene_at(...)", scene, ts)
-
-
 def _silent(found: Evaluation) -> np.ndarray:
     """Returns which unknowns have no effect (run, n)."""
     return np.diagonal(found.curvature, axis1=1, axis2=2) == 0
 
 
 def _longer_and_longer(
-    rows: list[list[_Problem]], unknowns: Unknowns, **keywords: Any
+    rows: list[list[Problem]], unknowns: Unknowns, **keywords: Any
 ) -> list[Run]:
     """Searches over growing shares of the time; returns the runs over all of it."""
     keywords |= dict(method="levenberg-marquardt", describe=_squares_so_far)
@@ -101,12 +51,12 @@ def _longer_and_longer(
     def until(share: float) -> Lanes:
         """The lanes with weights for readings up to this share of the time only."""
 
-        def shortened(problem: _Problem) -> _Problem:
+        def shortened(problem: Problem) -> Problem:
             ts, weight = np.asarray(problem.ts), problem.weight
             early = (ts - ts[0]) / (ts[-1] - ts[0]) <= share
             return problem._replace(weight=(weight.T * early).T)
 
-        return Lanes(_lane, [[shortened(problem) for problem in row] for row in rows])
+        return Lanes(lane, [[shortened(problem) for problem in row] for row in rows])
 
     for share, longer in zip(_SHARES, _SHARES[1:]):
         runs = minimise(until(share), z, low, high, enough=_ENOUGH_EARLY, **keywords)
@@ -120,15 +70,50 @@ def _longer_and_longer(
     return minimise(until(1), z, low, high, enough=_ENOUGH, **keywords)
 
 
+def _unseen(validate: Any, shape: tuple[int, ...], *settings: Any) -> list[Problem]:
+    """Checks the argument `validate` of `fit`: recordings of the given shape."""
+    if validate is None:
+        return []
+    if not isinstance(validate, tuple) or len(validate) != 2:
+        raise ValueError(
+            "validate: expected (scene_at, observed), as for the fit itself, got "
+            f"{validate!r}."
+        )
+    names = "validate[0]", "validate[1]"
+    problems = problems_of(names, *listed(names[1], *validate), *settings)
+    if problems[0].observed.shape != shape or not all(p.weight.any() for p in problems):
+        raise ValueError(
+            f"validate[1]: expected recordings like `observed`, of shape {shape}, with "
+            f"some readings each, got shape {problems[0].observed.shape}."
+        )
+    return problems
+
+
+def _judged(
+    runs: list[Run], unseen: list[Problem]
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Mean weighted squares of unseen recordings, and their numbers of readings.
+
+    Returns two arrays (recording,) for each run.
+    """
+    counts = np.array([(problem.weight > 0).sum() for problem in unseen])
+    if not unseen:
+        return [(counts, counts)] * len(runs)
+    lanes = Lanes(lane, [unseen], starts=len(runs))
+    found = lanes(np.stack([run.z for run in runs]), np.arange(len(runs)))
+    return [(squares / counts, counts) for squares in found.facts["member_loss"]]
+
+
 def _search(
     scenes_at: Sequence[Any],
+    observed: Any,
     start: Any,
     ts: ArrayLike,
-    observed: Any,
     together: bool,
     *,
     observe: Observe,
     noise: ArrayLike | None,
+    validate: tuple[Any, ArrayLike] | None,
     bounds: Mapping[str, Any] | None,
     scale: Mapping[str, Any] | None,
     max_steps: int,
@@ -142,18 +127,9 @@ def _search(
     ts = real_array("ts", ts, (None,))
     if ts.size < 2 or not (np.diff(ts) > 0).all():
         raise ValueError(f"ts: expected two or more increasing times, got {ts}.")
-    readings, weights = observations(observed, noise, ts)
-    for scene_at in scenes_at:
-        function("scene_at", scene_at)
-    function("observe", observe)
-    stacked(scenes_at, "scene_at")  # raises unless all are alike
-    first = jax.tree.map(jnp.asarray, named(unknowns.shapes, unknowns.start))
-    for scene_at in scenes_at:
-        _check_scene_at(scene_at, first, ts)
-    problems = [
-        _Problem(scene_at, observe, unknowns.shapes, unknowns.scale, ts, *row)
-        for scene_at, *row in zip(scenes_at, readings, weights)
-    ]
+    settings = unknowns, ts, observe, noise
+    problems = problems_of(("scene_at", "observed"), scenes_at, observed, *settings)
+    unseen = _unseen(validate, problems[0].observed.shape, *settings)
     rows = [problems] if together else [[problem] for problem in problems]
     counts = [sum(int((p.weight > 0).sum()) for p in row) for row in rows]
     if min(counts) <= unknowns.start.size:
@@ -168,9 +144,12 @@ def _search(
             f"got {start!r}."
         )
     return [
-        fit_result(run, row[0].scene_at, unknowns, noise is not None, count)
-        for run, row, count in zip(runs, rows, counts)
-    ]
+        fit_result(
+            run, row[0].scene_at, unknowns, count, noise is not None,
+            noise_by_changes(run, row) if noise is None else (1.0, 0.0), *held_out,
+        )
+        for run, row, count, held_out in zip(runs, rows, counts, _judged(runs, unseen))
+    ]  # fmt: skip
 
 
 def _squares_so_far(runs: list[Run]) -> str:
@@ -186,6 +165,7 @@ def fit(
     *,
     observe: Observe = link_ends,
     noise: ArrayLike | None = None,
+    validate: tuple[SceneAt | Sequence[SceneAt], ArrayLike] | None = None,
     bounds: Mapping[str, Any] | None = None,
     scale: Mapping[str, Any] | None = None,
     max_steps: int = 50,
@@ -213,31 +193,28 @@ def fit(
       `lambda scene, solution: solution.q` for joint encoders.
     - `noise`: standard deviation of a reading [its unit], one number or an array that
       broadcasts to a recording. If None, all readings have the same weight, and the
-      noise is estimated from the residuals.
+      noise is estimated from the residuals: for standard errors from all of them, for
+      the verdict from changes between successive ones, as errors of a model change
+      slowly.
+    - `validate`: (scene_at, observed) of recordings at the same times that the fit must
+      not see, one or a list of them; the result compares their residuals with the
+      noise. Best are motions unlike those that are fitted.
     - `bounds`: (least, greatest) of parameters by name.
     - `scale`: sizes of parameters by name; a step changes a parameter by at most two
       sizes. By default the magnitudes of the start, which then must not be 0.
     - `max_steps`: greatest number of evaluations after the first, of each search.
     - `report`: called with a line of progress after each step, for instance `print`.
 
-    **Returns:** a `FitResult`, with standard errors and the combinations of parameters
-    that the motion does not determine.
+    **Returns:** a `FitResult`: a verdict on whether to use the parameters, their
+    standard errors, and the combinations that the motion does not determine.
 
     **Raises:** ValueError for malformed arguments, and if the scene cannot be simulated
     from the start.
     """
-    scenes_at: Any = scene_at
-    recordings: Any = observed
-    if not isinstance(scene_at, list | tuple):
-        scenes_at, recordings = [scene_at], [observed]
-    elif not scene_at or np.shape(observed)[:1] != (len(scene_at),):
-        raise ValueError(
-            "observed: expected a recording for each of the scenes (one at least), got "
-            f"shape {np.shape(observed)} for {len(scene_at)}."
-        )
     return _search(
-        scenes_at, start, ts, recordings, True, observe=observe, noise=noise,
-        bounds=bounds, scale=scale, max_steps=max_steps, report=report,
+        *listed("observed", scene_at, observed), start, ts, True, observe=observe,
+        noise=noise, validate=validate, bounds=bounds, scale=scale,
+        max_steps=max_steps, report=report,
     )[0]  # fmt: skip
 
 
@@ -271,11 +248,11 @@ def fit_each(
     >>> [float(each.parameters["damping"]) for each in found]
     [15.0, 25.0]
     """
-    recordings = np.shape(observed)[:1]
-    if not recordings or recordings[0] == 0:
-        raise ValueError(
-            "observed: expected recordings along a leading axis, got shape "
-            f"{np.shape(observed)}."
-        )
+    try:
+        shape = np.shape(observed)
+    except ValueError:  # of rows of unlike lengths
+        shape = ()
+    if 0 in shape[:1] or not shape:
+        raise refusal("observed", "recordings along a leading axis", observed)
     keywords = keywords_as(fit, keywords)
-    return _search([scene_at] * recordings[0], start, ts, observed, False, **keywords)
+    return _search([scene_at] * shape[0], observed, start, ts, False, **keywords)

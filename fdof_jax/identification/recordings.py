@@ -8,7 +8,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
-from ..checks import instance, real_array
+from ..base.checks import instance, real_array
 from ..mechanics.kinematics import joint_positions, tip_position
 from ..simulation.scene import Scene
 from ..simulation.solution import Solution, check_joints
@@ -42,16 +42,18 @@ def link_ends(scene: Scene, solution: Solution) -> Float[Array, "time link 2"]:
     return jax.vmap(ends)(solution.q)
 
 
-def observations(observed: Any, noise: Any, ts: Array) -> tuple[np.ndarray, np.ndarray]:
+def observations(
+    name: str, observed: Any, noise: Any, ts: Array
+) -> tuple[np.ndarray, np.ndarray]:
     """Readings (recording, time, ...), 0 where missing, and their weights."""
     try:
         readings = np.asarray(observed, dtype=jnp.result_type(float))
     except (TypeError, ValueError) as error:
         raise ValueError(
-            f"observed: expected an array of real numbers, got {observed!r}."
+            f"{name}: expected an array of real numbers, got {observed!r}."
         ) from error
     if np.isinf(readings).any():
-        raise ValueError("observed: expected finite readings (or NaN), got infinity.")
+        raise ValueError(f"{name}: expected finite readings (or NaN), got infinity.")
     spread = np.ones(()) if noise is None else noise
     spread = np.asarray(real_array("noise", spread, np.shape(spread), above=0))
     try:
@@ -63,7 +65,7 @@ def observations(observed: Any, noise: Any, ts: Array) -> tuple[np.ndarray, np.n
         ) from None
     if readings.shape[1:2] != ts.shape:
         raise ValueError(
-            f"observed: expected a row for each of the {ts.size} times, got shape "
+            f"{name}: expected a row for each of the {ts.size} times, got shape "
             f"{readings.shape[1:]}."
         )
     there = ~np.isnan(readings)

@@ -16,8 +16,11 @@ from .unknowns import Unknowns, named
 
 # A combination is weak if its standard error exceeds this part of its size.
 _WEAK = 1.0
-# The message doubts the scene if the residuals exceed the given noise by this factor.
+# The message doubts the scene if the residuals exceed the noise by this factor.
 _DOUBTED = 1.5
+# Held-out residuals exceed the noise if they are greater by this factor, as few know
+# their noise better, and by this many standard deviations of such a comparison.
+_KNOWN, _SPREAD = 1.1, 3.0
 # Converged: largest change by a further step, in standard errors or in sizes.
 _REMAINING = 0.03
 _REMAINING_PART = 1e-6
@@ -27,6 +30,8 @@ _SHARED = 1e-6
 
 class FitResult(eqx.Module):
     """Identified parameters and their standard errors; prints itself as a table.
+
+    The first line printed is a verdict: whether a fault is known.
 
     - `parameters`: values by name, in the unit of each, as in `start`.
     - `standard_errors`: standard errors by name; infinite for parameters that the
@@ -43,10 +48,17 @@ class FitResult(eqx.Module):
       freedom. This is relative to the given noise [1], or estimates the noise if none
       is given [as observed].
     - `converged`: whether a further step would change the parameters by less than 3 %
-      of their standard errors, or a millionth of their sizes.
+      of their standard errors, or a millionth of their sizes. True also if the motion
+      does not determine some of them (see `weak`), which then stay where they are.
     - `message`: why the search stopped, and what to beware of.
     - `history`: weighted sum of squares over all of the recording, at the start of the
       last search (the result over three quarters of it) and at each accepted point.
+    - `held_out`: root mean square of the residuals of each recording given as
+      `validate`, relative to the noise [1].
+    - `faults`: reasons not to use the parameters, in words: a search that has not
+      converged, combinations that are `weak`, residuals well above the noise, and
+      held-out residuals above it (a tenth and three standard deviations are allowed).
+      The noise is that given, or by changes between successive residuals.
     """
 
     parameters: dict[str, Any]
@@ -59,17 +71,34 @@ class FitResult(eqx.Module):
     converged: bool
     message: str
     history: Float[np.ndarray, " iteration"]
+    held_out: tuple[float, ...] = ()
+    faults: tuple[str, ...] = ("saved without a verdict",)
+
+    @property
+    def usable(self) -> bool:
+        """True if no fault is known. Without held-out recordings that says little."""
+        return not self.faults
 
     def __str__(self) -> str:
         values = np.concatenate([np.ravel(v) for v in self.parameters.values()])
         errors = np.sqrt(np.diag(self.covariance))
         width = max(12, *(len(name) + 2 for name in self.names))
-        rows = [f"{'':{width}}{'value':>12}{'std error':>12}{'relative':>12}"]
+        known = "; ".join(self.faults)
+        tested = "on" if self.held_out else "but not tested on"
+        untold = f"No fault is known, {tested} held-out recordings."
+        rows = [
+            f"Not to be used: {known}." if known else untold,
+            f"{'':{width}}{'value':>12}{'std error':>12}{'relative':>12}",
+        ]
         for name, value, error in zip(self.names, values, errors):
             share = f"{100 * error / abs(value):.3g} %" if value else ""
             rows.append(f"{name:{width}}{value:12.5g}{error:12.3g}{share:>12}")
         rows.append(f"rms residual {self.rms:.4g}")
+        for ratio in self.held_out:
+            rows.append(f"held-out residuals {ratio:.3g} times the noise")
         verdict = "converged" if self.converged else "not converged"
+        if self.converged and np.isinf(errors).any():
+            verdict = "converged in what the motion determines, which is not all"
         rows.append(f"{verdict}, {len(self.history) - 1} iterations: {self.message}")
         return "\n".join([*rows, *self.weak])
 
@@ -139,10 +168,17 @@ def fit_result(
     run: Run,
     scene_at: Callable[[dict[str, Any]], Scene],
     unknowns: Unknowns,
-    noise_given: bool,
     count: int,
+    noise_given: bool,
+    known: tuple[float, float],
+    unseen: np.ndarray,
+    unseen_counts: np.ndarray,
 ) -> FitResult:
-    """The result of a run over `count` readings."""
+    """The result of a run over `count` readings.
+
+    `known`: the noise to judge residuals by, and its relative variance; `unseen`: mean
+    weighted squares of each held-out recording, of `unseen_counts`.
+    """
     shapes, _, scale, low, high = unknowns
     values = np.clip(run.z * scale, low, high)
     sizes = np.maximum(np.abs(values), scale)
@@ -174,29 +210,45 @@ def fit_result(
     for name, value, least, most in zip(unknowns.labels, values, low, high):
         if value in (least, most):
             parts.append(f"{name} is at its bound")
-    if noise_given and noise > _DOUBTED:
+    faults = []
+    known_noise, uncertain = known
+    if noise > _DOUBTED * known_noise:
+        faults.append("the residuals exceed the noise")
         parts.append(
-            f"the residuals are {noise:.3g} times the noise: this scene does not move "
-            "as observed with any such parameters"
+            f"the residuals are {noise / known_noise:.3g} times the noise: this scene "
+            "does not move as observed with any such parameters"
         )
     parameters = named(shapes, values)
     try:
         scene_at(jax.tree.map(jnp.asarray, parameters))
     except ValueError as error:
         # During the search values were traced, so constructors could not check them.
+        faults.append("no scene has these parameters")
         parts.append(f"no scene has these parameters ({error}); set bounds")
     # Print directions in parts of the values, unless these are nearly zero.
     parts_of = np.where(np.abs(values) > 1e-3 * sizes, values, sizes)
     untold = untold * (sizes / parts_of)[:, None]
+    weak = _in_words(unknowns.labels, untold, variance * inverse)
+    converged = bool(small or np.abs(step).max() <= _REMAINING_PART)
+    held_out = np.sqrt(unseen) / known_noise
+    if not converged:
+        faults.append("the search has not converged")
+    if weak:
+        faults.append("the motion does not determine all parameters")
+    deviation = np.sqrt(1 / (2 * unseen_counts) + uncertain)
+    if not (held_out <= _KNOWN + _SPREAD * deviation).all():
+        faults.append("the held-out residuals exceed the noise")
     return FitResult(
         parameters=parameters,
         standard_errors=named(shapes, np.sqrt(np.diag(covariance))),
         names=unknowns.labels,
         covariance=covariance,
-        weak=_in_words(unknowns.labels, untold, variance * inverse),
+        weak=weak,
         rms=float(np.sqrt(np.sum(run.best.facts["squares"]) / count)),
         noise=noise,
-        converged=bool(small or np.abs(step).max() <= _REMAINING_PART),
+        converged=converged,
         message="; ".join(parts),
         history=members * np.array([row.loss for row in run.rows]),
+        held_out=tuple(held_out.tolist()),
+        faults=tuple(faults),
     )

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..checks import real_array
+from ..base.checks import real_array
 
 # Names and shapes of parameters, in pairs: JAX would sort a dict.
 Shapes = tuple[tuple[str, tuple[int, ...]], ...]

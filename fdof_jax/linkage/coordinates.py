@@ -8,8 +8,8 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from ..checks import concrete, real_array
-from ..xla.array_namespace import in_numpy, namespace
+from ..base.array_namespace import in_numpy, namespace
+from ..base.checks import concrete, real_array
 from .linkage import Linkage, compiled, per_joint
 from .topology import letters, pairs_of, real_joints
 

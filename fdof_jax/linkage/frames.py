@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax.numpy as jnp
 
-from ..xla.array_namespace import namespace, plane_vector, sine_and_cosine
+from ..base.array_namespace import namespace, plane_vector, sine_and_cosine
 from .topology import real_joints
 
 if TYPE_CHECKING:

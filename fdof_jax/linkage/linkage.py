@@ -19,7 +19,7 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from ..checks import is_traced, known, real_array
+from ..base.checks import is_traced, known, real_array
 from .singularity import check_singularity
 from .topology import can_move, fixed_pairs, letters, pairs_of
 

@@ -7,7 +7,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
-from ..checks import instance, is_traced
+from ..base.checks import instance, is_traced
 
 TOPOLOGIES = ("RRR", "RRP", "RPR", "PRR", "RPP", "PRP", "PPR")
 MOST_PAIRS = 8
@@ -100,3 +100,27 @@ def existence_factors(topology: str) -> Float[Array, " factor"]:
     pairs = pairs_of(topology)
     assert pairs is not None  # a name is not traced
     return jnp.asarray(pairs.ravel(), dtype=float)
+
+
+def names_and_units(ef: Any) -> tuple[list[str], list[str]]:
+    """Returns names and units of joints; both are neutral if a batch mixes the kinds.
+
+    `ef` holds known existence factors, of one arm or of a batch.
+    """
+    names, units = [], []
+    of_members = np.asarray(ef).reshape(-1, ef.shape[-1])
+    for k, kinds in enumerate(map(set, zip(*map(letters, of_members)))):
+        names.append(f"{min(kinds)}{k + 1}" if len(kinds) == 1 else f"{k + 1}")
+        moving = sorted(kinds - {"F"}) or ["R"]
+        units.append(" or ".join({"P": "m", "R": "rad"}[kind] for kind in moving))
+    return names, units
+
+
+def common_unit(units: list[str]) -> str:
+    """Returns the unit of a variable over joints that have these units."""
+    return units[0] if len(set(units)) == 1 else "m or rad"
+
+
+def rate_unit(unit: str) -> str:
+    """Returns the unit of a velocity from that of the position."""
+    return " or ".join(f"{one}/s" for one in unit.split(" or "))

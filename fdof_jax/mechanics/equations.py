@@ -17,9 +17,9 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
+from ..base.trigonometry import sincos
 from ..linkage.linkage import Linkage
 from ..linkage.topology import fixed_pairs, real_joints
-from ..xla.trigonometry import sincos
 
 Scalars = tuple[Array, ...]
 Vector = tuple[Array, Array]

@@ -8,11 +8,11 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from ..checks import concrete, is_traced, real_array, sign
+from ..base.array_namespace import in_numpy, namespace, plane_vector
+from ..base.checks import concrete, is_traced, real_array, sign
 from ..linkage.frames import cross, dot, frames, unit_vector
 from ..linkage.linkage import Linkage, check_linkage, joints_of
 from ..linkage.topology import fixed_pairs, real_joints
-from ..xla.array_namespace import in_numpy, namespace, plane_vector
 
 
 def plane_angle(y: Array, x: Array) -> Array:
@@ -111,7 +111,7 @@ def arm_of(linkage: Linkage, oriented: bool = True) -> tuple[Arm, "Placed"]:
 
 
 class Placed(NamedTuple):
-    """Where the joints of an `Arm` are among the n of a linkage, if not all are.
+    """Places of an `Arm`'s joints among the n of a linkage that has more.
 
     `offset`: what the positions have beyond those in the linkage [m or rad].
     `valid`: 0, or NaN if another number of joints moves.

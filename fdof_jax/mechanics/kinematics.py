@@ -5,9 +5,9 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
+from ..base.array_namespace import namespace
 from ..linkage.frames import frames
 from ..linkage.linkage import Linkage, compiled, without_fixed
-from ..xla.array_namespace import namespace
 
 
 def as_points(vectors: Array) -> Array:

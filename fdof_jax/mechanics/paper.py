@@ -10,9 +10,9 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from ..checks import real_array
+from ..base.checks import real_array
+from ..base.trigonometry import sincos
 from ..linkage.linkage import Linkage, compiled, joints_of
-from ..xla.trigonometry import sincos
 
 
 def of_three_pairs(linkage: Linkage, x: ArrayLike) -> Array:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ..xla.one_loop import one_loop_on_cpu
+from ..base.one_loop import one_loop_on_cpu
 from .equations import Constants, Equations, Scalars, Upper
 
 Matrix = tuple[Scalars, ...]  # by columns

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 from PIL import Image
 
-from ..checks import real_array, whole_number
+from ..base.checks import real_array, whole_number
 from .arms import Geometry, draw_motion
 from .axes import figure_legend, xy
 
@@ -44,9 +44,11 @@ class MotionAnimation(FuncAnimation):
             return super().save(filename, **kwargs)
         self._draw_was_started = True  # matplotlib warns of what is never shown
         first, *others = self._images(kwargs["progress_callback"], kwargs.get("dpi"))
-        pause = round(self._pause)
+        # The format counts hundredths of a second; rounding each pause would add up.
+        ends = np.round(self._pause / 10 * np.arange(self._count + 1))
+        pauses = (10 * np.diff(ends).astype(int)).tolist()
         first.save(
-            filename, save_all=True, append_images=others, duration=pause, loop=0
+            filename, save_all=True, append_images=others, duration=pauses, loop=0
         )
 
     def _images(self, progress: Any, dpi: float | None) -> Iterator[Image.Image]:
@@ -128,7 +130,7 @@ def animation_of(
     artists = [line for _, drawn, _ in moving for line in drawn.lines] + [show(0)]
     figure = panels[0].get_figure(root=True)
     assert figure is not None  # axes are always in a figure
-    if len(panels) > 1:
+    if new or len(panels) > 1:
         figure_legend(figure)
     figure.draw_without_rendering()
     for ax in panels:

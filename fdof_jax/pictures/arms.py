@@ -9,11 +9,11 @@ from matplotlib.lines import Line2D
 from matplotlib.markers import MarkerStyle
 from matplotlib.path import Path
 
-from ..checks import refusal
+from ..base.array_namespace import in_numpy
+from ..base.checks import refusal
 from ..linkage.frames import frames
 from ..linkage.linkage import Linkage, check_linkage
 from ..linkage.topology import letters
-from ..xla.array_namespace import in_numpy
 from .axes import (
     BLACK,
     GREY,
@@ -133,7 +133,7 @@ def draw_arm(
     label: bool = True,
 ) -> dict[str, Line2D]:
     """Draws sample `i` and returns its lines by name; the name is also the `gid`."""
-    lines = {}
+    lines, labelled = {}, set()  # a kind is labelled once
     for name, points in g.points.items():
         kind, number = name.split()
         if kind == "mass" and not mass_centers:
@@ -146,12 +146,15 @@ def draw_arm(
             line.set_color(color)
         if name == "link 0":
             line.set_linewidth(1.2)
-        elif kind in ELEMENT_STYLES:
+        elif kind in ELEMENT_STYLES and kind not in labelled:
             marker: Any = element_marker(kind)  # a line in the legend would not tell
             shown = ax.plot([], [], marker=marker, ls="", label=kind, markersize=13)[0]
             shown.set(color=line.get_color(), mfc="none", mew=line.get_linewidth())
-        elif label and kind != "rail":
-            line.set_label(_LABELS.get(kind, name))
+        elif label and kind in _LABELS and kind not in labelled:
+            line.set_label(_LABELS[kind])
+        elif label and kind == "link":
+            line.set_label(name)
+        labelled.add(kind)
         lines[name] = line
     _place(lines, g, i)
     return lines

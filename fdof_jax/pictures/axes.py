@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ..checks import refusal
+from ..base.checks import refusal
 from ..linkage.linkage import check_linkage
 from ..simulation.solution import Solution, check_joints
 

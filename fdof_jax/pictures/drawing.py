@@ -16,7 +16,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
-from ..checks import real_array, whole_number
+from ..base.checks import real_array, whole_number
 from ..forces.element import Forces
 from ..linkage.linkage import Linkage, check_linkage, per_joint
 from ..simulation.solution import Solution
@@ -31,10 +31,11 @@ from .arms import (
     with_elements,
 )
 from .axes import BLACK, GREY, SERIES, figure_legend, legend, plane_axes, reached
+from .workspace import force_ellipses, inertia_ellipses, workspace
 
 __all__ = [
     "BLACK", "GREY", "SERIES", "animate", "animate_grid", "chrono_cyclograph",
-    "draw_linkage", "topology_grid",
+    "draw_linkage", "force_ellipses", "inertia_ellipses", "topology_grid", "workspace",
 ]  # fmt: skip
 
 
@@ -161,17 +162,20 @@ def animate(
     twice as fast.
 
     **Returns:** the animation; a notebook plays it if it is the last line of a cell.
-    Keep it until it is shown. `.save("motion.gif")` and `.save("motion.mp4")` write it
-    with a progress bar, the latter with ffmpeg; `.to_jshtml()` returns a player as
-    text, for a web page.
+    In a new figure a legend names every mark. Keep the animation until it is shown.
+    `.save("motion.gif")` and `.save("motion.mp4")` write it with a progress bar, the
+    latter with ffmpeg; `.to_jshtml()` returns a player as text, for a web page.
     """
     ts, q, _ = reached(linkage, solution)
     shown = ts <= _last(ts, until)
     ts, q = ts[shown], q[shown]
     times, pause = frame_times([ts], fps, speed, max_frames)
     g = with_elements(geometry(linkage, q), linkage, forces, ts, q)
-    panel = plane_axes(ax, g.all_points)
-    return animation_of([panel], [(ts, g)], times, pause, panel.set_title, ax is None)
+    panel, new = plane_axes(ax, g.all_points), ax is None
+    figure = panel.get_figure(root=True)
+    if new and figure is not None:
+        figure.set_figwidth(4.8)  # the legend stands beside
+    return animation_of([panel], [(ts, g)], times, pause, panel.set_title, new)
 
 
 def animate_grid(

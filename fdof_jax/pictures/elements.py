@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from matplotlib.path import Path
 
+from ..base.array_namespace import in_numpy
 from ..forces.actuators import LinearActuator
 from ..forces.between_points import SpringDamper, Tension, Wrench
 from ..forces.element import elements_on
@@ -15,7 +16,6 @@ from ..forces.points import Point
 from ..linkage.frames import Frames, frames
 from ..linkage.linkage import Linkage
 from ..linkage.topology import letters
-from ..xla.array_namespace import in_numpy
 from .axes import BLACK, xy
 
 # Widths are in sizes of the arm.

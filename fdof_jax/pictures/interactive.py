@@ -13,9 +13,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.image import imsave
 
-from ..checks import instance, refusal
+from ..base.checks import instance, refusal
+from ..base.names import optional_package
 from ..linkage.linkage import joint_names, joints_of
-from ..names import optional_package
 from ..references.reference import reference_of
 from ..simulation.html_table import html_table
 from ..simulation.looped_dopri8 import LoopedDopri8

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from scipy.integrate import cumulative_simpson
 
 from ..analysis.tracking import saturated
-from ..checks import real_array, refusal
+from ..base.checks import real_array, refusal
 from ..control.pd import PDController
 from ..dynamics import energy, link_energies
 from ..forces.element import Forces, InertialElement, elements
@@ -39,11 +39,13 @@ from .axes import (
     legend,
     reached,
 )
+from .responses import response_profile
 from .tracking import tracking, tracking_by_error, tracking_error
 
 __all__ = [
-    "effort_profile", "energy_profile", "energy_stack", "motion_profile", "tracking",
-    "tracking_by_error", "tracking_error", "work_precision",
+    "effort_profile", "energy_profile", "energy_stack", "motion_profile",
+    "response_profile", "tracking", "tracking_by_error", "tracking_error",
+    "work_precision",
 ]  # fmt: skip
 
 

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.colors import ListedColormap
 
-from ..checks import refusal
+from ..base.checks import refusal
 from ..linkage.linkage import Linkage
 from ..references.circle import CircleTask
 from ..references.reference import reference_of

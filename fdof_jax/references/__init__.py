@@ -1,5 +1,5 @@
 """Reference motions: moves of the joints, tasks along paths, timing."""
 
-from ..names import attach
+from ..base.names import attach
 
 __getattr__, __dir__, __all__ = attach(__name__, __file__)

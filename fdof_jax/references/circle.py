@@ -6,7 +6,8 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from ..checks import real_array
+from ..base.array_namespace import in_numpy, namespace, plane_vector, sine_and_cosine
+from ..base.checks import real_array
 from ..forces.part import Condition, Values, field
 from ..linkage.frames import dot
 from ..linkage.linkage import Linkage
@@ -17,7 +18,6 @@ from ..mechanics.inverse_kinematics import (
     unmoved_part,
     whole_turns,
 )
-from ..xla.array_namespace import in_numpy, namespace, plane_vector, sine_and_cosine
 from .reference import known_reach
 from .task import TipReference, angle_between
 

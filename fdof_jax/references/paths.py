@@ -11,9 +11,9 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from ..checks import instance, real_array
+from ..base.array_namespace import in_numpy, namespace, sine_and_cosine
+from ..base.checks import instance, real_array
 from ..forces.part import Part, Values, default, field
-from ..xla.array_namespace import in_numpy, namespace, sine_and_cosine
 
 
 class Path(Part):

@@ -10,10 +10,10 @@ from jax import Array
 from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
-from ..checks import function, is_traced, known, real_array, refusal
+from ..base.array_namespace import in_numpy, namespace
+from ..base.checks import function, is_traced, known, real_array, refusal
 from ..forces.part import Foreign, Part, default, optional
 from ..linkage.linkage import Linkage, check_linkage, joints_of
-from ..xla.array_namespace import in_numpy, namespace
 
 EXPECTED = "a callable (t, linkage) -> (q, qd), for instance CircleTask()"
 

@@ -9,7 +9,8 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from ..checks import JOINT, is_traced, real_array
+from ..base.array_namespace import in_numpy, namespace, plane_vectors
+from ..base.checks import JOINT, is_traced, real_array
 from ..forces.part import Condition, Values, called, default, field, of_kind
 from ..linkage.frames import cross, dot
 from ..linkage.linkage import Linkage
@@ -21,7 +22,6 @@ from ..mechanics.inverse_kinematics import (
     unmoved_part,
     whole_turns,
 )
-from ..xla.array_namespace import in_numpy, namespace, plane_vectors
 from .paths import Path, points_at
 from .reference import Reference, runs_in_numpy
 from .timing import Laps, Travel

@@ -10,9 +10,9 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from ..checks import concrete, instance, one_of, real_array
+from ..base.array_namespace import namespace
+from ..base.checks import concrete, instance, one_of, real_array
 from ..forces.part import Condition, Part, Values, field
-from ..xla.array_namespace import namespace
 
 _MOST_TURN = 250  # [rad], as far as 48 nodes per piece resolve
 RAMP = 0.25  # share of its time in which a trapezoidal profile speeds up

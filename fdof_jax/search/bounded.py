@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..checks import whole_number
+from ..base.checks import whole_number
 from .methods import METHODS, Evaluation, held_at_bounds
 
 # Greatest change of an unknown in a step: a factor of 7 if unknowns are logarithms.

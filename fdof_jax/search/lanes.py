@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from ..base.configuration import options_of_loops
 from ..simulation.scene import stacked
 from .methods import Evaluation
 
@@ -19,7 +20,7 @@ _LANES = 8
 Evaluate = Callable[[Array, Any], Evaluation]  # (z, problem) of one lane
 
 
-@eqx.filter_jit
+@eqx.filter_jit(compiler_options=options_of_loops())  # pyright: ignore[reportCallIssue]
 def _evaluate(evaluate: Evaluate, z: Array, moving: Any, shared: Any) -> Evaluation:
     """Evaluates lanes, along the leading axis of `z` and `moving`."""
 

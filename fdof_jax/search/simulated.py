@@ -5,7 +5,7 @@ from typing import Any
 import jax.numpy as jnp
 from jax import Array
 
-from ..checks import instance
+from ..base.checks import instance
 from ..forces.element import elements
 from ..linkage.coordinates import real_state
 from ..linkage.linkage import check_linkage

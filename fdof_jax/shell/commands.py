@@ -14,7 +14,8 @@ from matplotlib.figure import Figure
 
 from .. import scenes
 from ..analysis.tracking import tip_deviation
-from ..checks import real_array
+from ..base.checks import real_array
+from ..base.configuration import configure
 from ..data.files import save
 from ..forces.joints import JointDamper
 from ..linkage.linkage import Linkage
@@ -28,7 +29,6 @@ from ..tuning.ensembles import perturbed
 from ..tuning.league import circle_scenes, league_table
 from ..tuning.losses import Tracking, tip_errors
 from ..tuning.tuning import tune, tune_each
-from ..xla.configuration import configure
 
 
 def run(command: str, output: Path, options: dict[str, Any]) -> list[Path]:
@@ -103,7 +103,7 @@ def _tune(output: Path, **options: Any) -> list[Path]:
     loss = tip_errors
     if "price" in options:
         loss = Tracking(real_array("price", options["price"], (), minimum=0))
-    _say("tune the gains (compiling first, some ten seconds)")
+    _say("tune the gains (compiling first)")
     tuned = tune(
         scene,
         loss=loss,

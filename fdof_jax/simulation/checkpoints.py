@@ -14,12 +14,21 @@ import jax
 import numpy as np
 
 from .. import __version__
-from ..checks import refusal
-from ..whole_files import whole_file
+from ..base.checks import refusal
+from ..base.whole_files import whole_file
 
-_VERSIONS = {"fdof_jax": __version__} | {
+VERSIONS = {"fdof_jax": __version__} | {
     module.__name__: module.__version__ for module in (jax, diffrax, eqx, np)
 }
+
+
+def folder_at(name: str, value: str | os.PathLike) -> Path:
+    """Returns the folder that the argument `name` asks for, and makes it if need be."""
+    if not isinstance(value, str | os.PathLike) or not os.fspath(value):
+        raise refusal(name, "a folder", value)
+    folder = Path(os.path.expanduser(value))
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
 
 
 class Rows:
@@ -48,37 +57,30 @@ class Checkpoint:
     the arrays' bytes, which follow.
     """
 
-    def __init__(self, folder: str | os.PathLike, settings: Any, arrays: Any):
-        """Names the sweep by the text of its settings and the values of its arrays."""
-        if not isinstance(folder, str | os.PathLike) or not os.fspath(folder):
-            raise refusal("checkpoint", "a folder", folder)
-        self.folder = Path(os.path.expanduser(folder))
-        self.folder.mkdir(parents=True, exist_ok=True)
-        digest = hashlib.sha256(repr(settings).encode())
-        for leaf in map(np.asarray, jax.tree.leaves(arrays)):
-            digest.update(repr((leaf.shape, leaf.dtype)).encode())
-            digest.update(leaf.tobytes())
-        self.sweep = digest.hexdigest()
+    def __init__(self, folder: str | os.PathLike, sweep: str):
+        """Makes the folder, if need be, for the sweep of this digest."""
+        self.folder = folder_at("checkpoint", folder)
+        self.sweep = sweep
 
-    def _chunk(self, members: np.ndarray, limit: int) -> tuple[Path, dict[str, Any]]:
+    def _chunk(self, members: np.ndarray, lanes: int) -> tuple[Path, dict[str, Any]]:
         """Returns a chunk's file and what it holds; other members have another file."""
         holds = {
-            "versions": _VERSIONS,
+            "versions": VERSIONS,
             "sweep": self.sweep,
             "members": members.tolist(),
-            "limit of steps": limit,
+            "lanes": lanes,
         }
         name = hashlib.sha256(json.dumps(holds).encode()).hexdigest()[:32]
         return self.folder / f"{name}.chunk", holds
 
-    def has(self, members: np.ndarray, limit: int) -> bool:
-        return self._chunk(members, limit)[0].exists()
+    def has(self, members: np.ndarray, lanes: int) -> bool:
+        return self._chunk(members, lanes)[0].exists()
 
     def read(
-        self, members: np.ndarray, limit: int, rows: Rows
+        self, members: np.ndarray, lanes: int, rows: Rows
     ) -> list[np.ndarray] | None:
         """Returns a chunk's arrays; warns and returns None if its file is no good."""
-        path, holds = self._chunk(members, limit)
+        path, holds = self._chunk(members, lanes)
         line, _, data = path.read_bytes().partition(b"\n")
         if line == _line(holds, rows, data):
             return rows.split(len(members), data)
@@ -90,8 +92,8 @@ class Checkpoint:
         )
         return None
 
-    def write(self, members: np.ndarray, limit: int, arrays: list[np.ndarray]) -> None:
-        path, holds = self._chunk(members, limit)
+    def write(self, members: np.ndarray, lanes: int, arrays: list[np.ndarray]) -> None:
+        path, holds = self._chunk(members, lanes)
         data = b"".join(array.tobytes() for array in arrays)
         with whole_file(path) as file:
             file.write(_line(holds, Rows(arrays), data) + b"\n" + data)

@@ -1,7 +1,11 @@
 """Solves a batch in chunks of members that take about equally long."""
 
-import re
-from collections.abc import Callable
+import functools
+import os
+import sys
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import diffrax
@@ -11,87 +15,26 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.experimental import multihost_utils
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jax.sharding import Mesh, NamedSharding
 
-from ..checks import refusal
+from ..base.array_namespace import in_numpy
 from ..dynamics import forward_dynamics
 from ..forces.element import elements
 from ..linkage.topology import real_joints
-from ..xla.array_namespace import in_numpy
 from .batch_axes import Batch
 from .checkpoints import Checkpoint, Rows
+from .chunk_programs import Form, compiled, traced
 from .field import element_effort
-from .simulate import simulate
 from .solution import Solution
-from .step_wrappers import Limited
-from .steps import default_controller
 
-_FIRST_LIMIT = 256  # limit of steps in the first chunk
-_SLACK = 2.0  # a member may take this many times the steps of most others
 _SMALL = 8  # lanes of the chunks for a few slow members
 
 
-def _adaptive(settings: dict) -> bool:
-    controller = settings["stepsize_controller"] or default_controller()
-    return isinstance(controller, diffrax.AbstractAdaptiveStepSizeController)
-
-
-def motion_of(
-    settings: dict, ts: Array, moving: Any, shared: Any, limit: Array | None
-) -> Solution:
-    """Computes one member's motion, with a limit of adaptive steps if it is given."""
-    linkage, state0, forces = eqx.combine(moving, shared)
-    if limit is not None and _adaptive(settings):
-        inner = settings["stepsize_controller"] or default_controller()
-        limited = Limited(inner, limit)  # pyright: ignore[reportCallIssue]
-        settings = settings | {"stepsize_controller": limited}
-    return simulate(linkage, state0, ts, forces, throw=False, **settings)
-
-
-def outcome_of(
-    settings: dict,
-    reduce: Callable[[Solution], Any],
-    ts: Array,
-    moving: Any,
-    shared: Any,
-    limit: Array | None,
-) -> tuple[Any, Array, Array]:
-    """Computes what is kept of one member, its steps, and whether it failed."""
-    solution = motion_of(settings, ts, moving, shared, limit)
-    kept = reduce(solution)
-    if not all(map(eqx.is_array_like, jax.tree.leaves(kept))):
-        raise refusal("reduce", "a function that returns arrays", kept)
-    failed = solution.result != diffrax.RESULTS.successful
-    return kept, solution.stats["num_steps"], failed
-
-
 @eqx.filter_jit
-def _solve_chunk(settings, mesh, reduce, ts, moving, shared, limit):
-    arrays, static = eqx.partition((reduce, ts, shared, limit), eqx.is_array)
+def expected_work(t0: Array, moving: Any, shared: Any) -> Array:
+    """Computes for each member a rate [1/s] that grows with its steps.
 
-    def run(moving, arrays):
-        reduce, ts, shared, limit = eqx.combine(arrays, static)
-        member = lambda m: outcome_of(settings, reduce, ts, m, shared, limit)
-        return jax.vmap(member)(moving)
-
-    if mesh is not None:
-        lanes, same = PartitionSpec("member"), PartitionSpec()
-        # Each device loops only until its own slowest member is done.
-        run = jax.shard_map(
-            run,
-            mesh=mesh,
-            in_specs=(lanes, same),
-            out_specs=lanes,
-            check_vma=False,
-        )
-    return run(moving, arrays)
-
-
-@eqx.filter_jit
-def expected_work(t0: Array, moving: Any, shared: Any) -> tuple[Array, Array]:
-    """Computes each member's topology and a rate [1/s] that grows with its steps.
-
-    The rate combines the joints' initial rates and accelerations.
+    It combines the joints' initial rates and accelerations.
     """
 
     def member(moving):
@@ -105,15 +48,37 @@ def expected_work(t0: Array, moving: Any, shared: Any) -> tuple[Array, Array]:
         rate = jnp.where(turning, qd, 0)
         qdd = forward_dynamics(linkage, q, qd, tau, forces)
         acceleration = jnp.where(turning, qdd, 0)
-        topology = jnp.sum(jnp.where(turning, 2 ** jnp.arange(len(q))[::-1], 0))
         norm = jnp.linalg.norm
-        return topology, norm(rate) + jnp.sqrt(norm(acceleration))
+        return norm(rate) + jnp.sqrt(norm(acceleration))
 
     return jax.vmap(member)(moving)
 
 
+def _cores() -> int:
+    """Returns the number of cores that this process may use."""
+    if sys.platform == "linux":
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def _is_array(leaf: Any) -> bool:
+    return isinstance(leaf, Array | np.ndarray)
+
+
+def _of_jax(leaf: Any) -> Array:
+    return leaf if isinstance(leaf, Array) else jax.device_put(leaf)
+
+
+def _shared_out(rows: np.ndarray, sharding: NamedSharding) -> Array:
+    return jax.make_array_from_callback(rows.shape, sharding, rows.__getitem__)
+
+
+def _solve_chunk(program: Any, moving: list[Any], arrays: list[Array]) -> Any:
+    return jax.block_until_ready(program(moving, arrays))
+
+
 class _Chunks:
-    """Solves chunks; keeps their results in memory and, if given, in a checkpoint."""
+    """Solves chunks, and keeps their results in a checkpoint if there is one."""
 
     def __init__(
         self,
@@ -122,63 +87,96 @@ class _Chunks:
         settings: dict,
         reduce: Callable[[Solution], Any],
         checkpoint: Checkpoint | None,
+        devices: list[Any],
     ):
-        moving, self.shared = batch.split()
-        self.moving = in_numpy(moving)
-        self.ts, self.settings, self.reduce = ts, settings, reduce
-        self.checkpoint = checkpoint
-        devices = jax.devices()
         self.devices = len(devices)
-        self.mesh = Mesh(np.array(devices), ("member",)) if len(devices) > 1 else None
-        self.size = batch.size
-        self.results: list[Any] = []
-        self.structure: Any = None  # of the outcomes
-        self.rows: Rows | None = None
+        mesh = Mesh(np.array(devices), ("member",)) if len(devices) > 1 else None
+        moving, shared = batch.split()
+        arrays, rest = eqx.partition((settings, reduce, ts, shared), _is_array)
+        moving, structure = jax.tree.flatten(moving)
+        arrays, known = jax.tree.flatten(arrays)
+        constants, rest = jax.tree.flatten(rest)
+        moving, self.arrays = (list(map(_of_jax, a)) for a in (moving, arrays))
+        self.moving = in_numpy(moving)  # which is cut faster
+        self.form = Form(structure, known, rest, tuple(constants), ((), ()), mesh)
+        self.checkpoint = checkpoint
 
-    def solve(self, members: np.ndarray, lanes: int, limit: int) -> np.ndarray:
-        """Solves members, at most `lanes` per device; returns their step counts."""
-        padded = np.full(lanes * self.devices, members[0])
+    def solve(
+        self, chunks: list[np.ndarray], lanes: int
+    ) -> Iterator[tuple[list[np.ndarray], Any]]:
+        """Solves chunks of members, on at most so many lanes per device.
+
+        Returns of each chunk the arrays of the outcomes, and the outcomes' structure.
+        """
+        form = self._form(lanes)
+        # XLA splits operations among the cores, which gains little for a chunk, and
+        # runs in turn what one thread sends. While it runs, Python may do other things.
+        threads = self.form.mesh is None and jax.default_backend() == "cpu"
+        workers = min(_cores(), len(chunks)) if threads else 1
+        if workers == 1:
+            yield from (self._begin(form, members, None)() for members in chunks)
+            return
+        with ThreadPoolExecutor(workers) as pool:
+            running = deque()
+            for members in chunks:
+                running.append(self._begin(form, members, pool))
+                if len(running) > 2 * workers:
+                    yield running.popleft()()
+            while running:
+                yield running.popleft()()
+
+    def _form(self, lanes: int) -> Form:
+        """Returns the form of the program for so many lanes."""
+        lanes *= self.devices
+        moving = tuple(((lanes, *leaf.shape[1:]), leaf.dtype) for leaf in self.moving)
+        arrays = tuple((a.shape, a.dtype, a.weak_type) for a in self.arrays)
+        return self.form._replace(kinds=(moving, arrays))
+
+    def _begin(
+        self, form: Form, members: np.ndarray, pool: ThreadPoolExecutor | None
+    ) -> Callable[[], tuple[list[np.ndarray], Any]]:
+        """Begins to solve a chunk; returns a function that waits for the outcomes."""
+        kept = self._kept(form, members)
+        if kept is not None:
+            return lambda: kept
+        padded = np.full(form.lanes, members[-1])
         padded[: len(members)] = members
-        moving = jax.tree.map(lambda leaf: self._place(leaf[padded]), self.moving)
-        arguments = (
-            self.settings, self.mesh, self.reduce, self.ts, moving, self.shared,
-            np.asarray(limit, np.int32),
-        )  # fmt: skip
-        values = self._kept(members, limit, arguments)
-        if values is None:
-            solved, self.structure = jax.tree.flatten(_solve_chunk(*arguments))
-            if jax.process_count() > 1:
-                solved = multihost_utils.process_allgather(solved, tiled=True)
-            values = [np.asarray(leaf)[: len(members)] for leaf in solved]
-            if self.checkpoint is not None and jax.process_index() == 0:
-                self.checkpoint.write(members, limit, values)
-        if not self.results:
-            self.results = [
-                np.empty((self.size, *v.shape[1:]), v.dtype) for v in values
-            ]
-        for kept, value in zip(self.results, values):
-            kept[members] = value
-        _, steps, _ = jax.tree.unflatten(self.structure, values)
-        return steps
+        moving = [leaf[padded] for leaf in self.moving]
+        if form.sharding is not None:
+            moving = [_shared_out(leaf, form.sharding) for leaf in moving]
+        elif pool is not None:  # whose threads do not inherit this one's settings
+            moving = jax.device_put(moving)
+        work = functools.partial(_solve_chunk, compiled(form), moving, self.arrays)
+        outcomes = work if pool is None else pool.submit(work).result
+        return lambda: self._end(form, members, outcomes())
+
+    def _end(
+        self, form: Form, members: np.ndarray, outcomes: Any
+    ) -> tuple[list[np.ndarray], Any]:
+        solved, structure = jax.tree.flatten(outcomes)
+        if jax.process_count() > 1:
+            solved = multihost_utils.process_allgather(solved, tiled=True)
+        values = [np.asarray(leaf)[: len(members)] for leaf in solved]
+        if self.checkpoint is not None and jax.process_index() == 0:
+            self.checkpoint.write(members, form.lanes, values)
+        return values, structure
 
     def _kept(
-        self, members: np.ndarray, limit: int, arguments: tuple
-    ) -> list[np.ndarray] | None:
-        """Returns the arrays of a chunk that the checkpoint holds, or None."""
-        if self.checkpoint is None or not self.checkpoint.has(members, limit):
+        self, form: Form, members: np.ndarray
+    ) -> tuple[list[np.ndarray], Any] | None:
+        """Returns the outcomes of a chunk that the checkpoint holds, or None."""
+        if self.checkpoint is None or not self.checkpoint.has(members, form.lanes):
             return None
-        if self.rows is None:
-            like = eqx.filter_eval_shape(_solve_chunk, *arguments)
-            arrays, self.structure = jax.tree.flatten(like)
-            self.rows = Rows(arrays)
-        return self.checkpoint.read(members, limit, self.rows)
+        arrays, structure = jax.tree.flatten(traced(form).out_info)
+        values = self.checkpoint.read(members, form.lanes, Rows(arrays))
+        return None if values is None else (values, structure)
 
-    def _place(self, rows: np.ndarray) -> np.ndarray | Array:
-        if jax.process_count() == 1:
-            return rows
-        assert self.mesh is not None  # several processes have several devices
-        sharding = NamedSharding(self.mesh, PartitionSpec("member"))
-        return jax.make_array_from_callback(rows.shape, sharding, lambda i: rows[i])
+
+def _lanes(members: int, chunk: int) -> int:
+    """Returns the number of lanes for some members: few numbers serve all batches."""
+    if members == 1:
+        return 1
+    return min(chunk, max(_SMALL, 1 << (members - 1).bit_length()))
 
 
 def in_chunks(
@@ -189,54 +187,37 @@ def in_chunks(
     chunk: int,
     checkpoint: Checkpoint | None,
     meter: diffrax.AbstractProgressMeter,
+    devices: list[Any],
 ) -> tuple[Any, np.ndarray]:
     """Returns what is kept of all members, and which of them failed."""
-    topology, work = map(np.asarray, expected_work(ts[0], *batch.split()))
-    waiting = np.lexsort((work, topology))  # NaN comes last
-    chunks = _Chunks(batch, ts, settings, reduce, checkpoint)
-    max_steps = settings["max_steps"] or np.iinfo(np.int32).max
-    # Members with steps of given lengths take equally many.
-    first = _FIRST_LIMIT if _adaptive(settings) else max_steps
-    # Small batches are cut too, so that a slow member delays few others.
-    share = -(-batch.size // (8 * chunks.devices))
-    lanes, limit = min(chunk, max(share, 8 * _SMALL)), first
-    done, progress = 0, meter.init()
+    chunks = _Chunks(batch, ts, settings, reduce, checkpoint, devices)
+    lanes = _lanes(-(-batch.size // chunks.devices), chunk)
+    waiting = np.arange(batch.size)
+    if batch.size > lanes * chunks.devices:
+        # The longest come first, so that no core waits long for another at the end.
+        work = np.asarray(expected_work(ts[0], *batch.split()))
+        waiting = np.argsort(work)[::-1]
+    done, progress, results, structure = 0, meter.init(), [], None
     while len(waiting):
+        size = lanes * chunks.devices
+        cut = [waiting[start : start + size] for start in range(0, len(waiting), size)]
         late = []
-        for start in range(0, len(waiting), lanes * chunks.devices):
-            members = waiting[start : start + lanes * chunks.devices]
-            while True:
-                limit = min(limit, max_steps)
-                # At max_steps diffrax's own limit lets the last step finish.
-                own = limit if limit < max_steps else np.iinfo(np.int32).max
-                steps = chunks.solve(members, lanes, int(own))
-                out_of_steps = (steps >= limit) & (limit < max_steps)
-                if out_of_steps.sum() <= len(members) // 2:
-                    break
-                limit *= 4  # too low for most members
-            late.append(members[out_of_steps])
-            done += len(members) - out_of_steps.sum()
-            progress = meter.step(progress, jnp.asarray(done / batch.size))
-            typical = np.percentile(steps[~out_of_steps], 90)
-            limit = max(int(_SLACK * typical), first // 4)
+        for members, (values, structure) in zip(cut, chunks.solve(cut, lanes)):
+            if not results:
+                results = [
+                    np.empty((batch.size, *v.shape[1:]), v.dtype) for v in values
+                ]
+            for kept, value in zip(results, values):
+                kept[members] = value
+            _, stopped, _ = jax.tree.unflatten(structure, values)
+            late.append(members[stopped])
+            done += len(members) - len(late[-1])
+            progress = meter.step(progress, np.asarray(done / batch.size))
         waiting = np.concatenate(late)
-        limit = 8 * limit
-        if len(waiting) <= lanes // 2:
-            lanes = min(lanes, _SMALL) if len(waiting) > 1 else 1
+        if len(waiting) <= lanes // _SMALL:
+            lanes = _lanes(min(len(waiting), _SMALL), chunk)
     meter.close(progress)
-    leaves = chunks.results
-    for index, leaf in enumerate(leaves):
-        leaves[index] = jnp.asarray(leaf)  # frees one array before the next is copied
-    kept, _, failed = jax.tree.unflatten(chunks.structure, leaves)
+    for index, leaf in enumerate(results):
+        results[index] = jax.device_put(leaf)  # frees one before the next is copied
+    kept, _, failed = jax.tree.unflatten(structure, results)
     return kept, np.asarray(failed)
-
-
-def program_of(
-    reduce: Callable[[Solution], Any], batch: Batch, ts: Array, settings: dict
-) -> tuple[str, list]:
-    """Returns text and constants that name what `reduce` computes, in any process."""
-    moving, shared = batch.split()
-    first = jax.tree.map(lambda leaf: leaf[0], moving)
-    like = eqx.filter_eval_shape(motion_of, settings, ts, first, shared, None)
-    program, _, _ = eqx.filter_make_jaxpr(reduce)(like)
-    return re.sub(" at 0x[0-9a-f]+", "", str(program)), program.consts

@@ -59,7 +59,7 @@ class ScheduledTerm(diffrax.ODETerm):
 
 
 class ScheduledDopri8(diffrax.AbstractAdaptiveSolver):
-    """What both solvers have in common."""
+    """Base of both solvers: the kind of their terms, and their order."""
 
     term_structure: ClassVar = ScheduledTerm
 

@@ -9,7 +9,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
-from ..checks import instance, is_traced, place_of
+from ..base.checks import instance, is_traced, place_of
 from ..forces.element import (
     Element,
     Forces,

@@ -9,13 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from ..base.callbacks import with_checks
 from ..forces.added_inertia import added_inertia, inertial
 from ..forces.element import Element, ScalarElement, StatefulElement, naming
 from ..forces.switches import Switches
 from ..linkage.linkage import Linkage
 from ..mechanics.equations import Constants, Scalars, Upper, link_constants, zeros
 from ..mechanics.rates import conditioning, rates, rates_and_conditioning
-from ..xla.callbacks import with_checks
 from .dopri8 import Health, health_if
 
 # Below this inertia ratio the accelerations have four correct digits at best (float64)
@@ -42,7 +42,7 @@ def schedule_of(t: Array, args: Args) -> tuple[Any, ...]:
     """Returns each element's schedule."""
     schedules = []
     for index, element in enumerate(args.forces):
-        with naming(index):
+        with naming(f"forces[{index}]"):
             schedules.append(element.schedule(t, args.linkage))
     return tuple(schedules)
 
@@ -205,7 +205,7 @@ def _switched_effort(
     expected = (
         f"forces[{index}]: expected it to return tau, an array of {len(q)} real numbers"
     )
-    with naming(index), switches.dealt():
+    with naming(f"forces[{index}]"), switches.dealt():
         found: Any = element.act(t, q, qd, linkage, state)
     if not isinstance(found, tuple) or len(found) != 2:
         raise ValueError(f"{expected}, and the rate of its state, got {_shown(found)}.")

@@ -9,11 +9,11 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from ..base.callbacks import without_checks
 from ..forces.joints import EffortHistory
 from ..forces.part import jumps_of
 from ..linkage.linkage import possible, without_fixed
 from ..mechanics.equations import zeros
-from ..xla.callbacks import without_checks
 from .dopri8 import ScheduledTerm, constant
 from .field import (
     Args,
@@ -26,7 +26,7 @@ from .field import (
 )
 from .looped_dopri8 import LoopedDopri8
 from .packing import in_arrays
-from .prescribed import motion_at, prescribed, start_of, term_of
+from .prescribed import agrees, motion_at, start_of, term_of
 from .rounding import Recorded, above_rounding
 from .solution import Solution
 from .step_wrappers import Watched, bounded
@@ -172,9 +172,7 @@ def _harmless(inputs, padded: bool) -> tuple[Array, Array, tuple[Array, Array]]:
     for element in forces:
         valid = valid & element.possible()
         valid = valid & constant(element).fits(*constant((linkage, ts)))
-    motion = prescribed(forces)
-    if motion is not None:
-        valid = valid & motion.agrees(ts[0], jnp.asarray(state0.q), linkage)
+    valid = valid & agrees(forces, ts[0], jnp.asarray(state0.q), linkage)
     q0, qd0 = (without_fixed(linkage, jnp.where(finite, a, 0)) for a in state0)
     return valid, ts, (q0, qd0)
 

@@ -12,15 +12,16 @@ import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float
 
+from ..base.array_namespace import in_numpy, namespace
+from ..base.callbacks import with_checks
+from ..base.checks import place_of
 from ..dynamics import mass_and_bias
-from ..forces.element import Element, Forces
+from ..forces.element import Element, Forces, naming
 from ..forces.part import Condition, called
 from ..linkage.linkage import Linkage, joints_of, without_fixed
 from ..linkage.topology import MOST_PAIRS, fixed_pairs
 from ..mechanics.equations import equations, zeros
 from ..references.reference import EXPECTED, positions_at, reference_motion
-from ..xla.array_namespace import in_numpy, namespace
-from ..xla.callbacks import with_checks
 from .dopri8 import Health, ScheduledTerm
 from .field import (
     Args,
@@ -85,12 +86,6 @@ class PrescribedMotion(Element):
     def at(self, t: Array, linkage: Linkage) -> tuple[Array, Array]:
         return reference_motion(self.reference, t, linkage)
 
-    def agrees(self, t: Array, q: Array, linkage: Linkage) -> Array:
-        """Returns whether prescribed joints are at the reference, to 1 in a million."""
-        begin = positions_at(self.reference, t, linkage)
-        near = abs(in_numpy(q) - begin) <= 1e-6 * (1 + abs(begin))
-        return (near | ~self.of(linkage)).all()
-
     def conditions_on(self, linkage):
         count, last = joints_of(linkage), (self.moved * np.array(_NUMBERS)).max()
         yield Condition(last <= count, "joints", f"1 to {count}", last)
@@ -107,6 +102,16 @@ def prescribed(forces: Forces) -> PrescribedMotion | None:
             f"forces: expected one PrescribedMotion at most, got {len(found)}."
         )
     return found[0] if found else None
+
+
+def agrees(forces: Forces, t: Array, q: Array, linkage: Linkage) -> Any:
+    """Returns whether prescribed joints are at the reference, to 1 in a million."""
+    if (motion := prescribed(forces)) is None:
+        return True
+    with naming(f"forces[{place_of(motion, forces)}]"):
+        begin = positions_at(motion.reference, t, linkage)
+    near = abs(in_numpy(q) - begin) <= 1e-6 * (1 + abs(begin))
+    return (near | ~motion.of(linkage)).all()
 
 
 def _mass_and_bias(args: Args, q: Array, qd: Array) -> tuple[Array, Array]:

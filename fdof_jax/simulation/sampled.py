@@ -10,7 +10,7 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from ..checks import concrete, function, is_traced, real_array, whole_number
+from ..base.checks import concrete, function, is_traced, real_array, whole_number
 from ..forces.element import Forces, ScalarElement, element_of, elements
 from ..forces.joints import JointEffort
 from ..linkage.coordinates import State, real_state

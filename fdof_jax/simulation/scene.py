@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ..checks import instance
+from ..base.checks import instance
 from ..forces.element import Forces, elements, of_full_size
 from ..linkage.coordinates import State
 from ..linkage.linkage import Linkage

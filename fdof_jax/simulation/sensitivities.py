@@ -14,9 +14,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from ..base.callbacks import without_checks
 from ..forces.element import elements
 from ..forces.part import jumps_of
-from ..xla.callbacks import without_checks
 from .field import args_of, initial_own, own_states, whole
 from .landing import rounding
 from .prescribed import motion_at, start_of, term_of
@@ -181,9 +181,11 @@ def sensitivities(
     y0 = (jnp.concatenate([start[None], jax.vmap(along)(directions)]),)
     rest = True, z.size, rates, jumps, slopes
     locate = lambda *known: _LocatedRows(*known, *rest)  # pyright: ignore[reportCallIssue]
-    # A method of few stages, because much of the work lies outside of them.
+    # A method of few stages, because much of the work lies outside of them; as a loop
+    # that `next_motion` can differentiate again.
+    solver = diffrax.Tsit5(scan_kind="lax")
     solver, controller, y0 = located(
-        locate, diffrax.Tsit5(), controller, term, ts[0], y0, _Varied(z), jumps
+        locate, solver, controller, term, ts[0], y0, _Varied(z), jumps
     )
     with without_checks():
         found = diffrax.diffeqsolve(

@@ -10,7 +10,8 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
-from ..checks import increasing, instance, is_traced, real_array, whole_number
+from ..base.array_namespace import in_numpy
+from ..base.checks import increasing, instance, is_traced, real_array, whole_number
 from ..forces.element import (
     Element,
     Forces,
@@ -22,9 +23,8 @@ from ..forces.element import (
 from ..forces.part import check_values
 from ..linkage.coordinates import State, real_state
 from ..linkage.linkage import Linkage, check_linkage, possible
-from ..xla.array_namespace import in_numpy
 from .field import initial_states
-from .prescribed import prescribed
+from .prescribed import agrees, prescribed
 from .solution import Solution
 from .solve import solve
 from .steps import at_tolerances, within_reach
@@ -46,7 +46,7 @@ def solve_options(
     if dt0 is not None:
         dt0 = real_array("dt0", dt0, (), above=0)  # an array: new values, no new trace
     if max_steps is not None:
-        whole_number("max_steps", max_steps, 1)
+        whole_number("max_steps", max_steps, 1, np.iinfo(np.int32).max)
     if isinstance(adjoint, diffrax.BacksolveAdjoint):
         raise ValueError(
             "adjoint: expected RecursiveCheckpointAdjoint (reverse mode) or "
@@ -88,7 +88,7 @@ def check_elements(forces: Forces, linkage: Linkage, ts: Array) -> None:
         if is_traced(linkage, ts, element):
             continue
         check_values(place, element)  # `equinox.tree_at` bypasses the constructor
-        with naming(index):
+        with naming(place):
             element.check(linkage, ts)
         if not values.possible():
             raise ValueError(
@@ -173,7 +173,7 @@ def simulate(
     forces = of_full_size(linkage, forces)
     motion = prescribed(forces)
     if motion is not None and not is_traced(linkage, state0, ts, motion):
-        if not motion.agrees(np.asarray(ts)[0], jnp.asarray(state0.q), linkage):
+        if not agrees(forces, np.asarray(ts)[0], jnp.asarray(state0.q), linkage):
             begin, _ = motion.at(ts[0], linkage)
             raise ValueError(
                 f"state0.q: expected {begin.tolist()} at the joints whose motion is "
@@ -216,19 +216,14 @@ def simulate(
 
 def _raising(solution: Solution, inputs: tuple[Any, ...]) -> Solution:
     """Adds run-time errors for bad values and failures to a traced solution."""
-    linkage, state0, ts, _, forces = inputs
-    growth, accepted = jnp.diff(ts), "values that its constructor accepts"
-    wrong = {
-        "ts: expected finite, increasing times": ~((0 < growth) & (growth < jnp.inf)),
-        "state0: expected finite numbers": ~jnp.isfinite(jnp.stack(state0)),
-        f"linkage: expected {accepted}": ~possible(linkage),
-    }
-    for index, element in enumerate(forces):
-        wrong[f"forces[{index}]: expected {accepted}"] = ~jnp.asarray(
-            element.possible()
-        )
-    faults = jnp.stack([fault.any() for fault in wrong.values()])
-    messages = [f"simulate: {message}." for message in wrong]
+    accepted = "expected values that its constructor accepts"
+    messages = [
+        "simulate: ts: expected finite, increasing times.",
+        "simulate: state0: expected finite numbers.",
+        f"simulate: linkage: {accepted}.",
+        *(f"simulate: forces[{k}]: {accepted}." for k in range(len(inputs[-1]))),
+    ]
+    faults = _faults(inputs)
     failed = solution.result != diffrax.RESULTS.successful
     try:
         raising = eqx.branched_error_if(
@@ -242,6 +237,20 @@ def _raising(solution: Solution, inputs: tuple[Any, ...]) -> Solution:
         return solution
 
 
+@eqx.filter_jit  # one program where each of its operations would be one
+def _faults(inputs: tuple[Any, ...]) -> Array:
+    """Returns whether times, start, linkage and each force have bad values."""
+    linkage, state0, ts, _, forces = inputs
+    growth = jnp.diff(ts)
+    wrong = [
+        ~((0 < growth) & (growth < jnp.inf)),
+        ~jnp.isfinite(jnp.stack(state0)),
+        ~possible(linkage),
+        *(~jnp.asarray(element.possible()) for element in forces),
+    ]
+    return jnp.stack([fault.any() for fault in wrong])
+
+
 def check_own(
     name, own, forces: tuple[Element, ...], linkage: Linkage, rows: tuple
 ) -> None:
@@ -249,7 +258,8 @@ def check_own(
     expected = jax.eval_shape(lambda: initial_states(linkage, forces))
     shapes = jax.tree.map(lambda leaf: (*rows, *leaf.shape), expected)
     found = jax.tree.map(jnp.shape, own)
-    if found != shapes:
+    # The shape of a number is (), as the states of no elements are.
+    if jax.tree.structure(own) != jax.tree.structure(expected) or found != shapes:
         raise ValueError(
             f"{name}: expected the states of the forces' elements, of shapes {shapes}, "
             f"got {found}."

@@ -8,9 +8,26 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
-from ..checks import known
+from ..base.checks import known
 from ..linkage.linkage import Linkage
 from .html_table import html_table
+
+# In the order of `outcome_numbers`.
+OUTCOMES = (
+    "successful", "ill-conditioned", "not finite", "out of steps",
+    "tolerance out of reach", "too many switches", "solver failed",
+)  # fmt: skip
+
+
+def outcome_numbers(result: diffrax.RESULTS) -> np.ndarray:
+    """Returns the places of results in `OUTCOMES`."""
+    results: Any = diffrax.RESULTS
+    ordered = (
+        results.successful, results.singular, results.nonfinite,
+        results.max_steps_reached, results.dt_min_reached, results.max_steps_rejected,
+    )  # fmt: skip
+    cases = [np.asarray(result == one) for one in ordered]
+    return np.select(cases, range(len(cases)), default=len(cases))
 
 
 class Solution(eqx.Module):
@@ -22,8 +39,9 @@ class Solution(eqx.Module):
       with adaptive steps, `accuracy`: the relative rounding error of the accelerations
       at the worst step. Steps do not chase errors below it. If elements switch, also
       the number of switches, `num_switches`, and `slowest_crossing`: the least speed at
-      which a switching function passed its zero, as a share of its size in the step.
-      Near 0 a contact grazes, and the motion has no derivative.
+      which a switching function passed its zero, as a share of its size in the step, or
+      of the speed with which it would turn back at its size. Near 0 a contact grazes,
+      and the motion has no derivative.
     - `result`: diffrax's result, one per trajectory: `diffrax.RESULTS.successful` or
       the reason for the failure. `outcome` states it in words.
     - `own`: the states of the `StatefulElement`s at `ts`, in the order of the forces;
@@ -54,20 +72,7 @@ class Solution(eqx.Module):
         step from meeting it; `"too many switches"`: one after the other, as between
         branches that push towards each other; or `"solver failed"`.
         """
-        results: Any = diffrax.RESULTS
-        words = {
-            "successful": results.successful,
-            "ill-conditioned": results.singular,
-            "not finite": results.nonfinite,
-            "out of steps": results.max_steps_reached,
-            "tolerance out of reach": results.dt_min_reached,
-            "too many switches": results.max_steps_rejected,
-        }
-        return np.select(
-            [np.asarray(self.result == result) for result in words.values()],
-            list(words),
-            default="solver failed",
-        )
+        return np.asarray(np.array(OUTCOMES)[outcome_numbers(self.result)])
 
     def __repr__(self) -> str:
         """Summarises the motion in words; traced values show only their shape."""

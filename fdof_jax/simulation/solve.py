@@ -10,7 +10,8 @@ import numpy as np
 from jax import Array
 from jax.flatten_util import ravel_pytree
 
-from ..checks import is_traced
+from ..base.checks import is_traced
+from ..base.configuration import options_of_loops
 from ..forces.added_inertia import inertial
 from ..forces.element import Element, ForeignElement
 from .integrate import integrate
@@ -45,7 +46,10 @@ def _solve_one(inputs, keywords) -> tuple[Solution, bool] | None:
     """
     linkage, state0, ts, own0, forces = inputs
     known = linkage, state0, padded(ts), own0, forces
-    solution, succeeded = _solve_padded(known, _of_any_tolerance(keywords))
+    # A function's closure may hold a traced value, and JAX refuses options then.
+    closed = any(map(callable, jax.tree.leaves(forces)))
+    run = _with_functions if closed else _without_functions
+    solution, succeeded = run(known, _of_any_tolerance(keywords))
     if is_traced(solution):
         return None
     q, qd, own = cut((solution.q, solution.qd, solution.own), len(ts))
@@ -69,13 +73,19 @@ def _of_any_tolerance(keywords):
     return keywords | {"stepsize_controller": with_pid(opened, controller)}
 
 
-@eqx.filter_jit
 def _solve_padded(inputs, keywords) -> tuple[Solution, Array]:
     # The steps are those of the same call with forward-mode derivatives.
     derivatives = isinstance(keywords["adjoint"], diffrax.ForwardMode)
     keywords = keywords | {"adjoint": diffrax.ForwardMode()}
     solution = integrate(inputs, keywords, derivatives, padded=True)
     return solution, solution.result == diffrax.RESULTS.successful
+
+
+_with_functions = eqx.filter_jit(_solve_padded)
+_without_functions = eqx.filter_jit(
+    _solve_padded,
+    compiler_options=options_of_loops(),  # pyright: ignore[reportCallIssue]
+)
 
 
 def _batch_solver(forces: tuple[Element, ...]) -> diffrax.AbstractSolver:
@@ -184,7 +194,15 @@ def _opened(inputs):
 def _solve(inputs, keywords) -> Solution:
     if isinstance(keywords["adjoint"], diffrax.RecursiveCheckpointAdjoint):
         return _integrate_reversibly(_opened(inputs), keywords)
-    return integrate(inputs, keywords, derivatives=True)
+    solution = integrate(inputs, keywords, derivatives=True)
+    if not isinstance(keywords["adjoint"], diffrax.ForwardMode):
+        return solution
+    # Reverse mode is found out behind the call, where JAX would name its loop alone.
+    return eqx.internal.nondifferentiable_backward(
+        solution,
+        msg="reverse-mode differentiation of simulate needs its default adjoint; "
+        "diffrax.ForwardMode() serves jax.jvp and jax.jacfwd alone.",
+    )
 
 
 _solve_compiled = eqx.filter_jit(_solve)

@@ -123,23 +123,35 @@ class Watched(Adaptive):
         return *step, diffrax.RESULTS.where(failed, failure, result)
 
 
-class Limited(Adaptive):
-    """A step size controller that gives up after a number of steps set at run time.
+# A lane stops if it takes so many times the steps in which so large a part of the
+# lanes was done.
+_SLACK, _MOST = 1.5, 7 / 8
 
-    diffrax's own `max_steps` is part of the compiled program.
+
+class Abreast(Adaptive):
+    """A step size controller that gives up when most other lanes are long done.
+
+    It serves a program whose lanes are an axis with a name. Its result is then
+    `max_steps_reached`, before diffrax's own `max_steps`.
     """
 
     controller: Any
-    limit: Array
+    axis: str = eqx.field(static=True)
 
     def init(self, *arguments):
         first, state = super().init(*arguments)
-        return first, (state, jnp.zeros_like(self.limit))
+        none = jnp.zeros((), jnp.int32)
+        return first, (state, none, none)
 
     def adapt_step_size(self, *arguments):
-        *arguments, (state, count) = arguments
+        *arguments, (state, count, typical) = arguments
         *step, state, result = super().adapt_step_size(*arguments, state)
         count = count + 1
-        spent = (count >= self.limit) & (result == diffrax.RESULTS.successful)
+        # The state of a lane that is done stays, so that its count falls behind.
+        behind = count < jax.lax.pmax(count, self.axis)
+        most = jax.lax.pmean(behind.astype(float), self.axis) >= _MOST
+        typical = jnp.where(most & (typical == 0), count, typical)
+        late = (typical > 0) & (count >= _SLACK * typical)
+        spent = late & (result == diffrax.RESULTS.successful)
         result = diffrax.RESULTS.where(spent, diffrax.RESULTS.max_steps_reached, result)
-        return *step, (state, count), result
+        return *step, (state, count, typical), result

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import Array
 from numpy.typing import ArrayLike
 
-from ..checks import concrete, instance, is_traced, real_array
+from ..base.checks import concrete, instance, is_traced, real_array
 from ..linkage.coordinates import State
 from ..linkage.linkage import Linkage, check_linkage, joints_of
 from ..linkage.topology import real_joints

@@ -7,25 +7,38 @@ batch of slow members.
 """
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
-from ..checks import function, increasing, instance, is_traced, real_array, whole_number
+from ..base.checks import (
+    function,
+    increasing,
+    instance,
+    is_traced,
+    real_array,
+    refusal,
+    whole_number,
+)
+from ..base.devices import devices_outside_mesh, uncommitted
 from ..forces.element import Forces, elements, elements_on
 from ..linkage.coordinates import State
 from ..linkage.linkage import Linkage
 from .batch_axes import Batch, batch_of
-from .checkpoints import Checkpoint
-from .chunks import expected_work, in_chunks, outcome_of, program_of
+from .checkpoints import Checkpoint, folder_at
+from .chunk_programs import outcome_of
+from .chunks import expected_work, in_chunks
+from .provenance import outline
 from .simulate import solve_options
 from .solution import Solution
+from .store import Store, in_store
 
 
 def _without_times(solution: Solution) -> Solution:
@@ -42,11 +55,11 @@ def _traced(
 ) -> Any:
     """Solves a traced batch in chunks; failed members enter no derivative."""
     moving, shared = batch.split()
-    order = jnp.lexsort(expected_work(ts[0], moving, shared)[::-1])
+    order = jnp.argsort(expected_work(ts[0], moving, shared))
 
     def solved(moving, shared):
         return jax.lax.map(
-            lambda member: outcome_of(settings, reduce, ts, member, shared, None),
+            lambda member: outcome_of(settings, reduce, ts, member, shared, False),
             moving,
             batch_size=chunk,
         )
@@ -77,6 +90,24 @@ def _traced(
     return jax.tree.map(chosen, again, frozen)
 
 
+def _check_elements(batch: Batch, ts: Array, forces_axes: Any) -> None:
+    """Raises an error unless the force elements suit each member's linkage."""
+    moving, shared = batch.split()
+
+    def check_member(moving):
+        linkage, _, forces = eqx.combine(moving, shared)
+        elements_on(linkage, forces)  # what members share is known here
+
+    eqx.filter_eval_shape(eqx.filter_vmap(check_member), moving)
+    try:
+        eqx.filter_eval_shape(expected_work, ts[0], moving, shared)
+    except TypeError as error:
+        raise TypeError(
+            "forces, forces_axes: expected force elements that work for one member, "
+            f"got an error with forces_axes={forces_axes!r}: {error}"
+        ) from error
+
+
 @jax.transfer_guard("allow")  # its transfers are meant: the batch comes in chunks
 def sweep(
     linkage: Linkage,
@@ -86,9 +117,12 @@ def sweep(
     *,
     forces_axes: Any = None,
     reduce: Callable[[Solution], Any] | None = None,
-    chunk: int = 512,
+    chunk: int = 128,
     throw: bool = False,
     checkpoint: str | os.PathLike | None = None,
+    store: str | os.PathLike | None = None,
+    shard: int = 0,
+    of: int = 1,
     solver: diffrax.AbstractSolver | None = None,
     rtol: ArrayLike | None = None,
     atol: ArrayLike | None = None,
@@ -121,6 +155,12 @@ def sweep(
     - `checkpoint`: a folder for the results of finished chunks. A repeated call resumes
       from them. A file that is damaged, or of another chunk, is reported by a warning,
       and its members are solved again.
+    - `store`: a folder for the results, which are not held in memory: a Zarr group for
+      `xarray.open_zarr`, written in blocks of members. A repeated call solves only the
+      blocks that are missing or damaged; a warning names damaged files. Another sweep
+      needs another folder.
+    - `shard`, `of`: with `store`, solves only each block whose number is `shard` modulo
+      `of`. Any number of processes may fill one store, in any order.
     - `solver`, `rtol`, `atol`, `stepsize_controller`, `dt0`, `adjoint`, `max_steps`,
       `progress_meter`: as in `simulate`.
 
@@ -129,11 +169,12 @@ def sweep(
     NaN, or a `motion.result` in it, marks members that failed. Under `jax.grad` or
     another transformation a failed member adds nothing to any derivative, and
     `solution.result == diffrax.RESULTS.successful` selects the members that count.
-    Finding them takes one more solve, without derivatives.
+    Finding them takes one more solve, without derivatives. With `store`, its path.
 
     **Raises:** ValueError for malformed arguments; RuntimeError, with `throw=True`, if
     a member fails.
     """
+    linkage, state0, forces = uncommitted((linkage, state0, forces))
     instance("linkage", linkage, Linkage)
     try:
         q, qd = map(jnp.asarray, state0)
@@ -144,6 +185,13 @@ def sweep(
     increasing("ts", ts)
     elements("forces", forces)
     whole_number("chunk", chunk, 1)
+    whole_number("of", of, 1)
+    if whole_number("shard", shard, 0) >= of:
+        raise refusal("shard", f"a whole number below of={of}", shard)
+    if store is None and of > 1:
+        raise refusal("store", "a folder, as of is given", store)
+    if store is not None and checkpoint is not None:
+        raise refusal("checkpoint", "None beside a store, which resumes", checkpoint)
     settings = solve_options(
         solver=solver,
         rtol=rtol,
@@ -157,45 +205,45 @@ def sweep(
     )
     del settings["progress_meter"]  # it counts finished members, not time
     batch = batch_of(linkage, state0, forces, forces_axes)
-    moving, shared = batch.split()
-
-    def check_member(moving):
-        linkage, _, forces = eqx.combine(moving, shared)
-        elements_on(linkage, forces)  # what members share is known here
-
-    eqx.filter_eval_shape(eqx.filter_vmap(check_member), moving)
-    try:
-        eqx.filter_eval_shape(expected_work, ts[0], *batch.split())
-    except TypeError as error:
-        raise TypeError(
-            "forces, forces_axes: expected force elements that work for one member, "
-            f"got an error with forces_axes={forces_axes!r}: {error}"
-        ) from error
+    traced = is_traced(batch.inputs, ts, reduce)
+    if forces:
+        _check_elements(batch, ts, forces_axes)
     keep = _without_times if reduce is None else function("reduce", reduce)
+
+    def check(failed: Sequence[int] | np.ndarray) -> None:
+        if throw and len(failed):
+            raise RuntimeError(
+                f"sweep: {len(failed)} of {batch.size} members failed, the first of "
+                f"them member {failed[0]}."
+            )
 
     def whole(kept: Any) -> Any:
         if reduce is not None:
             return kept
-        times = jnp.broadcast_to(ts, (batch.size, *ts.shape))
+        # NumPy's view of the common times is no copy of them for each member.
+        times = (jnp if traced else np).broadcast_to(ts, (batch.size, *ts.shape))
         return eqx.tree_at(lambda s: s.ts, kept, times, is_leaf=lambda x: x is None)
 
-    if is_traced(batch.inputs, ts, reduce):
-        if throw or checkpoint is not None:
+    if traced:
+        if throw or checkpoint is not None or store is not None:
             raise ValueError(
-                "throw, checkpoint: expected their defaults under jit, grad or vmap."
+                "throw, checkpoint, store: expected their defaults under jit, grad or "
+                "vmap."
             )
         return whole(_traced(batch, ts, settings, keep, chunk))
-    folder = None
-    if checkpoint is not None:
-        # The repr of the settings leaves out the values of arrays.
-        arrays = batch.inputs, ts, eqx.filter(settings, eqx.is_array)
-        named = None if reduce is None else program_of(reduce, batch, ts, settings)
-        text = settings, batch.batched, named and named[0]
-        folder = Checkpoint(checkpoint, text, (arrays, named and named[1]))
-    kept, failed = in_chunks(batch, ts, settings, keep, chunk, folder, progress_meter)
-    if throw and failed.any():
-        raise RuntimeError(
-            f"sweep: {failed.sum()} of {batch.size} members failed, the first of them "
-            f"member {failed.argmax()}."
-        )
+    options = batch, ts, settings, keep, chunk
+    with devices_outside_mesh() as devices:
+        if store is not None:
+            folder = folder_at("store", store)
+            like, digest = outline(batch, ts, settings, keep)
+            group = Store(folder, batch, ts, like, chunk, digest)
+            blocks = range(shard, group.count, of)
+            check(in_store(group, blocks, *options, progress_meter, devices))
+            return folder
+        resumed = None
+        if checkpoint is not None:
+            _, digest = outline(batch, ts, settings, keep)
+            resumed = Checkpoint(checkpoint, digest)
+        kept, failed = in_chunks(*options, resumed, progress_meter, devices)
+    check(np.flatnonzero(failed))
     return whole(kept)

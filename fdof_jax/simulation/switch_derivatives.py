@@ -1,4 +1,4 @@
-"""What the time of a switch adds to the derivatives of a motion, to second order.
+"""The part of the time of a switch in the derivatives of a motion, to second order.
 
 Steps have constant lengths for derivatives, but the time of a switch depends on the
 parameters. At the end of the step to a switch, the state moves on to that time on the

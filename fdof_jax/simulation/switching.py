@@ -26,7 +26,7 @@ _NEAR = 0.575
 
 
 class Switching(NamedTuple):
-    """What is known of the switches: the last entry of the integrated state.
+    """The state of the switches: the last entry of the integrated state.
 
     - `sides` (switch,): those in force in the step that ended here: 1 above and -1
       below zero, and 0 before the start.
@@ -34,10 +34,11 @@ class Switching(NamedTuple):
     - `until`: when the step should have ended; its end if nothing switched before [s].
     - `soon`: when a switch follows soon after the end, or else the end [s].
     - `near`: how far from its zero a switching function may switch [s].
+    - `sizes` (switch,): the largest values of the switching functions up to here.
     - `lateness`: time of the switch here less that of the end: 0, with derivatives [s].
     - `passed`: number of switches up to here.
     - `grazing`, `grazing_here`: how near to grazing a crossing came so far, and one
-      here: the size of its switching function over its change per step; 0 if none.
+      here; 0 if none (see `at_end`).
     """
 
     sides: Array
@@ -45,6 +46,7 @@ class Switching(NamedTuple):
     until: Array
     soon: Array
     near: Array
+    sizes: Array
     lateness: Array
     passed: Array
     grazing: Array
@@ -80,7 +82,9 @@ def located(
     if switches:
         unknown, none = jnp.zeros(found.shape, t0.dtype), jnp.zeros_like(t0)
         late = wrapped.none_late(t0)
-        known = Switching(unknown, unknown, t0, t0, none, late, none, none, none)
+        known = Switching(
+            unknown, unknown, t0, t0, none, unknown, late, none, none, none
+        )
         solver, y0 = wrapped, (*y0, known)
     if jumps is None and not switches:
         return solver, undifferentiated(controller), y0
@@ -153,7 +157,8 @@ class Located(diffrax.AbstractAdaptiveSolver):
         share = jnp.finfo(t1.dtype).eps ** _NEAR
         near = jnp.maximum(share * (t1 - t0), known.near / 2)
         near = jnp.maximum(near, rounding(t1))
-        switched, grazing, soon = at_end(margins, near / (t1 - t0))
+        sizes = jnp.maximum(known.sizes, jnp.max(jnp.abs(seen), axis=0))
+        switched, grazing, soon = at_end(margins, sizes, near / (t1 - t0))
         # Before the first step, whose length is 0, sides are unknown.
         after = jnp.where(switched, -sides, sides)
         after = jnp.where(sides == 0, jnp.where(seen[-1] > 0, 1.0, -1.0), after)
@@ -163,6 +168,7 @@ class Located(diffrax.AbstractAdaptiveSolver):
             jnp.where(crossed, t0 + until * (t1 - t0), t1),
             t1 + soon * (t1 - t0),
             near,
+            sizes,
             self.lateness(where, seen, switched),
             known.passed + changed,
             kept(jnp.maximum(known.grazing, known.grazing_here), known.grazing),

@@ -18,7 +18,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import PyTree
 
-from ..xla.one_loop import in_one_loop
+from ..base.one_loop import in_one_loop
 from .dopri8 import (
     DENSE,
     LOWER,

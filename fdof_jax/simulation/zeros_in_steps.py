@@ -1,4 +1,4 @@
-"""Where functions of time become zero within a step: polynomials through samples."""
+"""Zeros of functions of time within a step, by polynomials through samples."""
 
 import equinox as eqx
 import jax
@@ -28,6 +28,7 @@ _SORTED = np.argsort(_FINER)
 # told there to which side the motion goes.
 _BEYOND, _ROUNDING = 0.625, 500
 _SOON = 0.01  # of a step, for extrapolation
+_NOISE = 4 * np.abs(_BEND).sum()  # of the second derivative, in units of rounding
 _ITERATIONS = 6  # of Newton's method within a bracket
 
 
@@ -97,17 +98,23 @@ def _zero(terms: Array, guess: Array, low: Array, high: Array) -> Array:
 
 
 @eqx.filter_jit
-def at_end(margins: Array, near: Array) -> tuple[Array, Array, Array]:
+def at_end(margins: Array, sizes: Array, near: Array) -> tuple[Array, Array, Array]:
     """Returns what is `near` its zero at the end, and how close that is to grazing.
 
     Also returns the share of the step after which something else follows soon, or 0.
+    `sizes`: the largest size of each margin, also in steps before.
     """
     nearer = -slope_at_end(margins)
     moves = nearer != 0  # in a step of some length
-    left = margins[-1] / jnp.where(moves, nearer, 1)
+    speed = jnp.where(moves, nearer, 1)
+    left = margins[-1] / speed
     switched = jnp.where(moves, (nearer > 0) & (left <= near), margins[-1] < 0)
-    size = jnp.max(jnp.abs(margins), axis=0) / jnp.where(moves, nearer, 1)
+    # A small slope for the step, or a zero after which the margin would soon turn back.
+    # The latter shows in short steps too, where the size is that of the slope.
+    bend = bend_at_end(margins) - _NOISE * jnp.finfo(sizes.dtype).eps * sizes
+    turning = jnp.sqrt(2 * sizes * jnp.maximum(bend, 0))
+    grazing = jnp.maximum(jnp.max(jnp.abs(margins), axis=0), turning) / speed
     follows = moves & (nearer > 0) & (left > near) & (left < _SOON)
     soon = jnp.where(follows, left, jnp.inf).min(initial=jnp.inf)
     soon = jnp.where(soon < jnp.inf, soon, 0)
-    return switched, jnp.where(switched & moves, size, 0).max(initial=0), soon
+    return switched, jnp.where(switched & moves, grazing, 0).max(initial=0), soon

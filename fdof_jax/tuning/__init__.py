@@ -1,5 +1,5 @@
 """Gain tuning by gradients, optimal efforts, and checks of the gradients."""
 
-from ..names import attach
+from ..base.names import attach
 
 __getattr__, __dir__, __all__ = attach(__name__, __file__)

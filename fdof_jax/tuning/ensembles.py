@@ -6,7 +6,7 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
-from ..checks import instance, real_array, refusal, whole_number
+from ..base.checks import instance, real_array, whole_number
 from ..control.model_based import ModelBased
 from ..linkage.coordinates import State
 from ..linkage.linkage import Linkage, check_linkage
@@ -97,9 +97,7 @@ def perturbed(
     [2.715, 2.371, 1.783, 1.809]
     """
     instance("scene", scene, Scene)
-    members = whole_number("members", members, 1)
-    if members > _MOST:
-        raise refusal("members", f"at most {_MOST:,} variations", members)
+    members = whole_number("members", members, 1, _MOST)
     draw = np.random.default_rng(whole_number("seed", seed, 0))
     ranges = {
         name: np.asarray(real_array(name, value, (2,), minimum=least))

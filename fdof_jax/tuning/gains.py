@@ -8,13 +8,14 @@ import numpy as np
 from jax import Array
 
 from ..analysis.tracking import relative_demands
-from ..checks import instance, is_traced, real_array
+from ..base.checks import instance, is_traced, real_array
 from ..linkage.linkage import joint_names
 from ..references.reference import reference_of
 from ..search.methods import Evaluation
 from ..search.simulated import check_scene, sum_of_squares
 from ..simulation.scene import Scene
 from ..simulation.sensitivities import Sensitivities, sensitivities
+from ..simulation.solution import Solution
 from .losses import (
     Loss,
     Tracking,
@@ -45,17 +46,19 @@ def gain_sensitivities(
     def scene_at(z):
         return with_gains(scene, jnp.where(tuned, jnp.exp(z.reshape(tuned.shape)), 0))
 
-    def residuals(scene, solution):
-        value = loss(scene, solution)
-        size = np.shape(value) if eqx.is_array_like(value) else ()
-        value = real_array("loss(scene, solution)", value, size)
-        if value.ndim:
-            return value.reshape(-1)
-        # Residuals are squared, so a scalar loss enters as its square root, whose
-        # derivative at 0 does not exist.
-        return jnp.where(value == 0, 0, jnp.sqrt(jnp.where(value == 0, 1, value)))[None]
-
+    residuals = lambda scene, solution: residuals_of(loss, scene, solution)
     return sensitivities(scene_at, residuals, z, jnp.linspace(0, scene.t1, SAMPLES))
+
+
+def residuals_of(loss: Loss, scene: Scene, solution: Solution) -> Array:
+    """Returns what a loss returns as residuals (m,), whose squares are summed."""
+    value = loss(scene, solution)
+    size = np.shape(value) if eqx.is_array_like(value) else ()
+    value = real_array("loss(scene, solution)", value, size)
+    if value.ndim:
+        return value.reshape(-1)
+    # A scalar loss enters as its square root, whose derivative at 0 does not exist.
+    return jnp.where(value == 0, 0, jnp.sqrt(jnp.where(value == 0, 1, value)))[None]
 
 
 def evaluate_gains(z: Array, problem: tuple[Scene, Loss, Array]) -> Evaluation:

@@ -1,5 +1,9 @@
 """Checks of the gradient that gain tuning follows."""
 
+import dataclasses
+from collections.abc import Callable, Iterator
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -10,16 +14,19 @@ from jaxtyping import Bool, Float
 from ..analysis.linearization import Modes, closed_loop_modes, depends_on_state_alone
 from ..analysis.tracking import relative_demands
 from ..linkage.linkage import joint_names
+from ..simulation.prescribed import PrescribedMotion
 from ..simulation.scene import Scene, is_number
+from ..simulation.sensitivities import sensitivities
 from ..simulation.simulate import simulate
 from ..simulation.solution import Solution
-from .gains import SAMPLES, check_tuned, gain_sensitivities, with_gains
+from .gains import SAMPLES, check_tuned, with_gains
 from .losses import controller_of, gains_of, tip_errors
 
 _HORIZONS = 10
 # The step of the differences in the log-gains. The error of the extrapolated
 # differences is of fourth order in it; their noise is that of the loss over the step.
 _STEP = 1e-2
+_OF_TIME = 1e-3  # the step in a time, at most, as a share of the run
 # Slower crossings are near to grazing, where no derivative exists.
 _SLOW = 0.01
 
@@ -42,8 +49,11 @@ class GradientReport(eqx.Module):
     - `at_limit`: whether any actuator is at its limit, and so does not control its
       joint, at each of these times (101,).
     - `switches`, `slowest_crossing`: how often an element switches to another branch of
-      its formula, and the least speed of a switching function at its zero, over its
-      size in a step (infinite without switches): near 0, a contact grazes.
+      its formula, and the least speed of a switching function at its zero, relative to
+      its size as in `Solution` (infinite without switches): near 0, a contact grazes.
+    - `times`: the derivatives of the error [m^2/s] in the times that elements and
+      references declare as single numbers, such as the `begin` of a `Travel`: pairs of
+      the derivative and of differences, by name. Prescribed motions are left out.
     - `warnings`: what to beware of, in words.
     """
 
@@ -58,6 +68,7 @@ class GradientReport(eqx.Module):
     warnings: list[str]
     switches: int = 0
     slowest_crossing: float = np.inf
+    times: dict[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
 
     def __str__(self) -> str:
         along = "  ".join(
@@ -85,17 +96,61 @@ class GradientReport(eqx.Module):
         if self.switches:
             lines.append(
                 f"{self.switches} switches between branches of formulas, the slowest "
-                f"crossing at {self.slowest_crossing:.2g} of its size per step"
+                f"crossing at {self.slowest_crossing:.2g} (near 0 it grazes)"
+            )
+        for name, (slope, difference) in self.times.items():
+            lines.append(
+                f"derivative in {name}: {slope:.3g} m^2/s, by differences "
+                f"{difference:.3g}"
             )
         return "\n".join(lines + self.warnings)
 
 
+def _times_in(part: Any, place: str) -> Iterator[tuple[str, Array]]:
+    """Yields the single numbers that a part declares in seconds, with their names."""
+    # The start is bound to a prescribed motion, and would have to change with it.
+    if not isinstance(part, eqx.Module) or isinstance(part, PrescribedMotion):
+        return
+    for declared in dataclasses.fields(part):
+        value, name = vars(part)[declared.name], f"{place}.{declared.name}"
+        rules = declared.metadata.get("rules", {"unit": ""})
+        if rules["unit"] == "s" and rules["shape"] == ():
+            yield name, value
+        else:
+            yield from _times_in(value, name)
+
+
+def _times(scene: Scene) -> dict[str, Array]:
+    """The times that the scene's elements declare, by name."""
+    return {
+        name: value
+        for index, element in enumerate(scene.forces)
+        for name, value in _times_in(element, f"forces[{index}]")
+    }
+
+
+def _with_times(scene: Scene, times: Any) -> Scene:
+    where = lambda scene: list(_times(scene).values())
+    return eqx.tree_at(where, scene, list(times)) if len(times) else scene
+
+
 @eqx.filter_jit
 def _tangents(scene: Scene) -> tuple[Array, Array, Array, Solution]:
-    """Residuals, their Jacobian in the log-gains, relative demands, and the motion."""
+    """Residuals, their Jacobian, relative demands, and the motion.
+
+    The Jacobian's columns are derivatives in the log-gains, then in the times.
+    """
     controller, gains = controller_of(scene), gains_of(scene)
-    z = jnp.log(jnp.where(gains > 0, gains, 1)).ravel()
-    found = gain_sensitivities(z, scene, tip_errors, gains > 0)
+    logs = jnp.log(jnp.where(gains > 0, gains, 1)).ravel()
+
+    def scene_at(z):
+        changed = jnp.exp(z[: logs.size]).reshape(gains.shape)
+        trial = with_gains(scene, jnp.where(gains > 0, changed, 0))
+        return _with_times(trial, z[logs.size :])
+
+    z = jnp.concatenate([logs, *(jnp.ravel(t) for t in _times(scene).values())])
+    ts = jnp.linspace(0, scene.t1, SAMPLES)
+    found = sensitivities(scene_at, tip_errors, z, ts)
     demands = relative_demands(controller, scene.linkage, found.solution)
     return found.residuals, found.jacobian, demands, found.solution
 
@@ -106,10 +161,26 @@ def _motion(scene: Scene) -> Solution:
     return simulate(scene.linkage, scene.state0, ts, scene.forces, throw=False)
 
 
-def _loss(scene: Scene, gains: np.ndarray) -> float:
-    """The mean squared tip error with other gains."""
-    trial = with_gains(scene, jnp.asarray(gains))
-    return float(np.sum(np.square(tip_errors(trial, _motion(trial)))))
+def _slope(scene_at: Callable[[float], Scene], h: float) -> float:
+    """The derivative of the mean squared tip error by extrapolated differences."""
+
+    def loss(x):
+        trial = scene_at(x)
+        return float(np.sum(np.square(tip_errors(trial, _motion(trial)))))
+
+    far, near = ((loss(x) - loss(-x)) / (2 * x) for x in (h, h / 2))
+    return float((4 * near - far) / 3)
+
+
+def _in_times(scene: Scene, slopes: np.ndarray) -> dict[str, tuple[float, float]]:
+    """The derivatives in the scene's times beside differences, by name."""
+    names, values = _times(scene), np.array(list(_times(scene).values()))
+    moved = lambda unit: lambda x: _with_times(scene, values + x * unit)
+    # Short parts of the run may be given in times, and are not stepped over.
+    steps = np.where(values == 0, np.inf, _STEP * np.abs(values))
+    steps = np.minimum(steps, _OF_TIME * scene.t1)
+    differences = map(_slope, map(moved, np.eye(len(values))), steps)
+    return dict(zip(names, zip(map(float, slopes), differences)))
 
 
 def gradient_report(scene: Scene) -> GradientReport:
@@ -132,43 +203,46 @@ def gradient_report(scene: Scene) -> GradientReport:
     )
     along = 2 * np.cumsum(residuals[:, None] * jacobian, axis=0)
     gains = np.asarray(gains_of(scene))
+    along, in_times = np.split(along, [gains.size], axis=1)
     gradient = along[-1].reshape(gains.shape)
-
-    def difference(unit: np.ndarray, h: float) -> float:
-        after, before = (_loss(scene, gains * np.exp(s * unit)) for s in (h, -h))
-        return (after - before) / (2 * h)
-
+    with_logs = lambda unit: lambda x: with_gains(scene, gains * np.exp(x * unit))
     units = np.eye(gains.size).reshape(-1, *gains.shape)
-    far, near = (
-        np.array([difference(unit, h) for unit in units]) for h in (_STEP, _STEP / 2)
-    )
-    differences = ((4 * near - far) / 3).reshape(gains.shape)
+    differences = np.array([_slope(with_logs(unit), _STEP) for unit in units])
+    differences = differences.reshape(gains.shape)
     size = np.linalg.norm(differences)
     error = float(np.linalg.norm(gradient - differences) / size) if size > 0 else 0.0
     # The error up to a time is the mean over that time, not over the whole run.
-    times = np.linspace(0, SAMPLES - 1, _HORIZONS + 1).astype(int)[1:]
-    shares = (times + 1) / SAMPLES
-    norms = np.linalg.norm(along[2 * times + 1], axis=1) / shares
+    until = np.linspace(0, SAMPLES - 1, _HORIZONS + 1).astype(int)[1:]
+    norms = np.linalg.norm(along[2 * until + 1], axis=1) * SAMPLES / (until + 1)
     few = jax.tree.map(lambda a: a[::10] if np.ndim(a) else a, solution)
     at_limit = np.abs(demands) > 1
     saturated = np.mean(at_limit, axis=0)
     modes = None
     if depends_on_state_alone(scene.forces):
         modes = closed_loop_modes(scene.linkage, scene.forces, few)
-    stats = _motion(scene).stats
+    stats, times = _motion(scene).stats, _in_times(scene, in_times[-1])
     slowest = float(stats.get("slowest_crossing", np.inf))
+    warnings = _warnings(scene, gradient, saturated, error, slowest)
+    pace = np.sum(residuals**2) / scene.t1
+    for name, (slope, difference) in times.items():
+        if not abs(slope - difference) < 1e-3 * max(abs(difference), pace):
+            warnings.append(
+                f"derivative and differences in {name} disagree: the loss may not be "
+                "smooth there"
+            )
     return GradientReport(
         gradient=gradient,
         differences=differences,
         error=error,
-        horizons=np.asarray(solution.ts)[times],
+        horizons=np.asarray(solution.ts)[until],
         gradient_norm=norms,
         saturated=saturated,
         modes=modes,
         at_limit=at_limit.any(axis=1)[::10],
         switches=int(stats.get("num_switches", 0)),
         slowest_crossing=slowest,
-        warnings=_warnings(scene, gradient, saturated, error, slowest),
+        times=times,
+        warnings=warnings,
     )
 
 

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ..checks import refusal
+from ..base.checks import refusal
 from ..control.pd import PDController
 from ..linkage.coordinates import State, from_chain
 from ..linkage.linkage import Linkage

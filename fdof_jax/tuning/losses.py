@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -11,13 +12,14 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from ..analysis.tracking import relative_demands, tip_deviation
-from ..checks import instance, is_traced, real_array, refusal
+from ..base.array_namespace import namespace
+from ..base.checks import instance, is_traced, real_array, refusal
 from ..control.pd import PDController
+from ..linkage.linkage import without_fixed
 from ..linkage.topology import fixed_pairs
-from ..references.reference import reference_of
+from ..references.reference import reference_motion, reference_of
 from ..simulation.scene import Scene
 from ..simulation.solution import Solution, check_joints
-from ..xla.array_namespace import namespace
 
 Loss = Callable[[Scene, Solution], Array]
 
@@ -79,6 +81,39 @@ def tip_errors(scene: Scene, solution: Solution) -> Float[Array, " residual"]:
         raise refusal("scene", "a controller of a task with a `tip`", task)
     deviation = tip_deviation(scene.linkage, task, solution)
     return deviation.reshape(-1) / solution.ts.size**0.5
+
+
+def joint_errors(scene: Scene, solution: Solution) -> Float[Array, " residual"]:
+    """Joint errors at the output times, scaled so that their squares sum to the mean.
+
+    This is a loss for controllers whose reference has no `tip`. It adds errors of
+    slides [m] and angles [rad] as they are.
+
+    **Arguments:**
+
+    - `scene`: must hold exactly one `PDController`.
+    - `solution`: the scene's motion.
+
+    **Returns:** q - q_ref [m or rad], divided by the root of the number of times.
+
+    **Raises:** ValueError for malformed arguments.
+
+    >>> import fdof_jax as fj
+    >>> import numpy as np
+    >>> arm, start, forces, _ = fj.scenes.fig7()
+    >>> motion = fj.simulate(arm, start, np.linspace(0, 1, 101), forces)
+    >>> errors = fj.tuning.joint_errors(fj.scenes.fig7(), motion)
+    >>> float((errors**2).sum() ** 0.5)  # rms over the first second
+    0.097
+    """
+    instance("scene", scene, Scene)
+    instance("solution", solution, Solution)
+    check_joints("solution", solution, scene.linkage)
+    reference = controller_of(scene).reference
+    commanded = lambda t: reference_motion(reference, t, scene.linkage)[0]
+    errors = solution.q - jax.vmap(commanded)(solution.ts)
+    errors = without_fixed(scene.linkage, errors)
+    return errors.reshape(-1) / solution.ts.size**0.5
 
 
 class Tracking(eqx.Module):

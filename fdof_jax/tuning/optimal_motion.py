@@ -11,7 +11,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from ..analysis.tracking import tip_deviation
-from ..checks import place_of, real_array, whole_number
+from ..base.checks import place_of, real_array, whole_number
 from ..control.model_based import ComputedTorque
 from ..forces.joints import EffortHistory
 from ..linkage.linkage import joints_of

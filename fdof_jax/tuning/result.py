@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ..checks import known
+from ..base.checks import known
 from ..linkage.linkage import joint_names
 from ..search.bounded import Run, best_of
 from ..simulation.html_table import html_table

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..checks import function, keywords_as, one_of, real_array, whole_number
+from ..base.checks import function, keywords_as, one_of, real_array, whole_number
 from ..search.bounded import Row, Run, best_of, minimise
 from ..search.lanes import Lanes
 from ..search.methods import METHODS
@@ -51,7 +51,7 @@ def _search(
     one_of("over", over, ("mean", "worst"))
     if over == "worst" and ensemble is None:
         raise ValueError("over: expected an ensemble to take the worst of, got none.")
-    starts = whole_number("starts", starts, 1)
+    starts = whole_number("starts", starts, 1, np.iinfo(np.int32).max)
     draw = np.random.default_rng(whole_number("seed", seed, 0))
     for scene, loss in zip(scenes, losses):
         check_tuned("scene", scene, function("loss", loss))

@@ -20,13 +20,16 @@ from typing import Any
 
 import hypothesis
 import hypothesis.strategies as st
-import jax
+
+import fdof_jax as fj
 
 from .fuzz_accelerations import check_accelerations
 from .fuzz_motions import check_motion, check_sample, check_sweep
 from .fuzz_report import Failure, Report, table
-from .garbage import cases as wrong_arguments, check_argument
 from .random_scenes import scenes
+
+fj.configure(x64=True)  # before the next import makes arrays
+from .garbage import cases as wrong_arguments, check_argument  # noqa: E402
 
 SLOWEST = 20.0  # [s] of the processor, compilation included: more counts as a hang
 
@@ -89,7 +92,6 @@ def main() -> int:
     parser.add_argument("--kind", choices=KINDS, help="only these")
     parser.add_argument("--sample", type=int, default=None, help="states checked")
     arguments = parser.parse_args()
-    jax.config.update("jax_enable_x64", True)
     # A hang in compiled code cannot be interrupted, but it can be shown.
     faulthandler.dump_traceback_later(7200, exit=True)
     report = Report()

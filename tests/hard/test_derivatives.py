@@ -1,6 +1,8 @@
-"""Scenes 28 and 29: derivatives of losses at their minimum, Hessians of a batch."""
+"""Scene 28: derivatives of losses at their minimum.
 
-import diffrax
+Hessians of a batch (scene 29) are in tests/test_switches.py.
+"""
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -9,8 +11,8 @@ import pytest
 
 import fdof_jax as fj
 from fdof_jax.analysis.tracking import tip_deviation
-from fdof_jax.xla.trigonometry import sincos
-from hard.scenes import START, Hold, arm
+from fdof_jax.base.trigonometry import sincos
+from hard.scenes import arm
 
 STILL = np.zeros(3)
 
@@ -71,39 +73,3 @@ def test_a_circle_of_no_radius():
 
     for leaf in jax.tree.leaves(jax.jit(jax.jacfwd(reference))(still)):
         assert np.isfinite(leaf).all()
-
-
-def curvature(log_kp, target):
-    """Returns the Hessian in the gains of two held links' mean square error, (2, 2)."""
-    linkage = fj.scenes.double_pendulum().linkage
-    start = fj.State(START.q[:2], STILL[:2])
-
-    def loss(log_kp):
-        controller = fj.PDController(100 * jnp.exp(log_kp), 20.0, jnp.inf, Hold(target))
-        motion = fj.simulate(
-            linkage,
-            start,
-            np.linspace(0, 0.5, 6),
-            (controller,),
-            adjoint=diffrax.ForwardMode(),
-            throw=False,
-        )
-        return jnp.mean((motion.q - target[None]) ** 2)
-
-    return jax.jacfwd(jax.jacfwd(loss))(log_kp)
-
-
-@pytest.mark.slow
-def test_hessians_of_a_batch():
-    """Second derivatives of a loop whose length depends on the member."""
-    rng = np.random.default_rng(3)
-    log_kp, target = rng.uniform(-0.5, 0.5, (2, 4, 2))
-    batched = jax.jit(jax.vmap(curvature))
-    together = batched(log_kp, target)
-    # Alone among members like itself, by the same program.
-    like = lambda member: (np.tile(a, (4, 1)) for a in member)
-    alone = np.stack([batched(*like(m))[0] for m in zip(log_kp, target)])
-    scale = np.abs(alone).max()
-    assert scale > 1e-3
-    assert np.abs(together - alone).max() <= 1e-8 * scale
-    np.testing.assert_allclose(together, together.transpose(0, 2, 1), atol=1e-8 * scale)

@@ -53,15 +53,19 @@ def test_the_arm_stays():
 
 
 def test_an_implicit_solver_does_not_make_it_wrong():
-    """It would cross the 10 s in a few steps, with a wrong gradient."""
+    """It would cross the 10 s in a few steps, with a wrong gradient.
+
+    Of one link, whose program is the smallest.
+    """
+    rod = fj.Linkage("R", length=[0, 1], com=[[0.5, 0]], mass=[1], inertia=[1 / 12])
 
     def end(q0):
         adjoint = diffrax.ForwardMode()
         return fj.simulate(
-            arm(), fj.State(q0, STILL), [0, END],
+            rod, fj.State(q0, STILL[:1]), [0, END],
             solver=diffrax.Kvaerno5(), adjoint=adjoint,
         ).q[-1]  # fmt: skip
 
-    exact = linear_motion(END)
-    error = np.abs(jax.jit(jax.jacfwd(end))(HANGING) - exact).max()
-    assert error <= 1e-6 * np.abs(exact).max()
+    exact = np.cos(np.sqrt(9.81 * 0.5 / (1 / 3)) * END)
+    error = np.abs(jax.jit(jax.jacfwd(end))(HANGING[:1]) - exact).max()
+    assert error <= 1e-6

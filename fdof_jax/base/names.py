@@ -41,7 +41,7 @@ def room_of(name: str) -> Any:
     """Returns the room that lists a public name, or None."""
     rooms = "analysis control forces identification references tuning".split()
     for room in rooms:
-        module = importlib.import_module(f"..{room}", __name__)
+        module = importlib.import_module(f"...{room}", __name__)
         if name in module.__all__:
             return module
     return None

@@ -140,11 +140,12 @@ def instance(name: str, value: Any, kind: type) -> None:
         raise refusal(name, f"a {kind.__name__}", value)
 
 
-def whole_number(name: str, value: Any, minimum: int) -> int:
-    """Returns `value` if it is an integer of at least `minimum`, not a bool."""
+def whole_number(name: str, value: Any, minimum: int, most: int | None = None) -> int:
+    """Returns `value` if it is an integer from `minimum` to `most`, not a bool."""
     whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
-    if not whole or value < minimum:
-        raise refusal(name, f"a whole number of at least {minimum}", value)
+    if not whole or value < minimum or (most is not None and value > most):
+        upper = "" if most is None else f" and at most {most:,}"
+        raise refusal(name, f"a whole number of at least {minimum}{upper}", value)
     return int(value)
 
 

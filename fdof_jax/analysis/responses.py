@@ -1,0 +1,280 @@
+"""Tests of a controller on its arm: steps and sines of the reference, per joint."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Complex, Float
+from numpy.typing import ArrayLike
+from scipy.interpolate import CubicSpline
+
+from ..base.checks import is_traced, real_array, refusal
+from ..control.drives import Drive
+from ..control.pd import PDController
+from ..forces.element import Element, Forces, elements_on, of_full_size
+from ..forces.part import Values, field
+from ..linkage.coordinates import State
+from ..linkage.linkage import Linkage, check_linkage, joint_names, per_joint
+from ..references.reference import Reference
+from ..simulation.html_table import html_table
+from ..simulation.simulate import simulate
+from .loops import BANDWIDTH, open_loop
+from .tracking import relative_demands
+
+_SAMPLES = 1001
+BAND = 0.02  # around the final value, in which a response has settled
+_SETTLED = 0.9  # part of the duration before which it has to
+# Frequencies of the sines over the bandwidth of the linearised loop.
+_FREQUENCIES = np.geomspace(0.1, 2.5, 12)
+_PERIODS = 2  # in which a sine is measured
+
+
+class _Probe(Reference):
+    """A reference at rest, which steps at a time or swings from the start."""
+
+    base: Values = field(unit="m or rad")
+    step: Values = field(unit="m or rad")
+    begin: Values = field((), unit="s")
+    amplitude: Values = field(unit="m or rad")
+    frequency: Values = field((), unit="rad/s")
+
+    @property
+    def jump_ts(self) -> Array:
+        return self.begin[None]
+
+    def __call__(self, t: Any, linkage: Linkage) -> tuple[Array, Array]:
+        swing = jnp.sin(self.frequency * t), jnp.cos(self.frequency * t)
+        stepped = self.base + jnp.where(t < self.begin, 0, self.step)
+        return (
+            stepped + self.amplitude * swing[0],
+            self.amplitude * self.frequency * swing[1],
+        )
+
+
+class StepAndSine(eqx.Module):
+    """Answers of each joint to steps and sines of its reference; prints itself.
+
+    - `joints`: names of the tested joints, for instance R1.
+    - `step`: height of the steps, and amplitude of the sines (joint,) [m or rad].
+    - `overshoot`: greatest excess of a step response over its final value, as a share
+      of the final change (joint,).
+    - `rise_time`: from 10 to 90 % of the final change (joint,) [s].
+    - `settling_time`: after which the response stays within 2 % of the final change
+      (joint,) [s]; NaN if that is in the last tenth of the test or never.
+    - `bandwidth`: frequency at which the response to a sine is 3 dB below the final
+      response to the step (joint,) [rad/s]; NaN if outside of the tested ones.
+    - `saturated`: share of the time after the step that the actuator spends at its
+      limit (joint,).
+    - `ts`, `response`: times since the step (time,) [s], and the change of the joint's
+      position over the height of its step (joint, time).
+    - `frequency`, `gain`: frequencies of the sines [rad/s], and the first harmonics of
+      the response over those of the reference, (joint, frequency).
+    """
+
+    joints: tuple[str, ...]
+    step: Float[np.ndarray, " joint"]
+    overshoot: Float[np.ndarray, " joint"]
+    rise_time: Float[np.ndarray, " joint"]
+    settling_time: Float[np.ndarray, " joint"]
+    bandwidth: Float[np.ndarray, " joint"]
+    saturated: Float[np.ndarray, " joint"]
+    ts: Float[np.ndarray, " time"]
+    response: Float[np.ndarray, "joint time"]
+    frequency: Float[np.ndarray, "joint frequency"]
+    gain: Complex[np.ndarray, "joint frequency"]
+
+    def _rows(self) -> list[list[str]]:
+        header = ["", "step", "overshoot", "rise", "settling", "bandwidth", "at limit"]
+        units = ["", "[m, rad]", "[%]", "[s]", "[s]", "[rad/s]", "[% of time]"]
+        columns = (
+            self.step, 100 * self.overshoot, self.rise_time, self.settling_time,
+            self.bandwidth, 100 * self.saturated,
+        )  # fmt: skip
+        rows = zip(self.joints, *columns)
+        return [header, units] + [
+            [name, *(f"{value:.4g}" for value in values)] for name, *values in rows
+        ]
+
+    def __str__(self) -> str:
+        rows = (f"{a:4}" + "".join(f"{b:>12}" for b in row) for a, *row in self._rows())
+        return "\n".join(rows)
+
+    def _repr_html_(self) -> str:
+        header, *rows = self._rows()
+        return html_table(rows, header)
+
+
+def _commanding(element: Any) -> PDController | None:
+    """Returns the PD controller that an element is or holds as its command."""
+    while isinstance(element, Drive):
+        element = element.command
+    return element if isinstance(element, PDController) else None
+
+
+def _following(element: Any, reference: Reference) -> Element:
+    """Returns the element with another reference of its PD controller."""
+    if isinstance(element, PDController):
+        return eqx.tree_at(lambda pd: pd.reference, element, reference)
+    inner = _following(element.command, reference)
+    return eqx.tree_at(lambda drive: drive.command, element, inner)
+
+
+@eqx.filter_jit
+def _answers(
+    linkage: Linkage, controller: Element, forces: tuple, probes: _Probe, ts: Any
+) -> tuple[Array, Array]:
+    """Simulates for each probe: positions, and demands over limits."""
+
+    def answer(probe, ts):
+        led = _following(controller, probe)
+        start = State(probe.base, jnp.zeros_like(probe.base))
+        motion = simulate(linkage, start, ts, (led, *forces), throw=False)
+        pd = _commanding(led)
+        assert pd is not None
+        return motion.q, relative_demands(pd, linkage, motion)
+
+    return jax.vmap(answer)(probes, ts)
+
+
+def step_and_sine(
+    linkage: Linkage,
+    q: ArrayLike,
+    controller: Any,
+    forces: Forces = (),
+    *,
+    step: ArrayLike,
+    duration: ArrayLike,
+) -> StepAndSine:
+    """Simulates a step and sines of the reference of each joint, one after the other.
+
+    The reference rests at `q`, and the arm comes to rest there for the `duration`. Then
+    the reference of one joint steps, without a velocity, and the response is recorded
+    for the `duration`. Sines of the reference, with their velocities, have the same
+    time to build up. Their frequencies are 0.1 to 2.5 times the bandwidth of the
+    linearised loop. Small steps show the linear behaviour, large ones the limits.
+
+    **Arguments:**
+
+    - `linkage`, `q`: the arm and its joint positions [m or rad].
+    - `controller`: a `PDController`, or a drive that holds one; its own reference is
+      not used.
+    - `forces`: further elements, without a state of their own.
+    - `step`: one per joint or one for all, positive [m or rad].
+    - `duration`: time for a response to settle [s].
+
+    **Returns:** a `StepAndSine`, NaN where a motion fails. NumPy analyses the motions,
+    so the function cannot be used within JAX's transformations.
+
+    **Raises:** ValueError for malformed arguments, and if a joint does not follow its
+    reference at `q`.
+
+    >>> import fdof_jax as fj
+    >>> arm, _, (pd,), _ = fj.scenes.fig7()
+    >>> q, _ = pd.reference(0.0, arm)
+    >>> kp, kd = fj.control.gains_from_frequency(arm, q, [8, 20, 20], 0.7)
+    >>> pd = fj.PDController(kp, kd, pd.limit, pd.reference)
+    >>> print(fj.analysis.step_and_sine(arm, q, pd, step=0.5, duration=2.0))
+                step   overshoot        rise    settling   bandwidth    at limit
+            [m, rad]         [%]         [s]         [s]     [rad/s] [% of time]
+    R1           0.5       5.161      0.2743      0.7649       7.824         2.2
+    P2           0.5       4.115      0.1168      0.3365       24.37         0.5
+    R3           0.5       3.018      0.1198      0.3513       28.07           0
+    """
+    check_linkage(linkage)
+    q = per_joint("q", q, linkage)
+    n = q.size
+    step = real_array("step", step, (n,), above=0, broadcast=True, unit="m or rad")
+    duration = real_array("duration", duration, (), above=0, unit="s")
+    if _commanding(controller) is None:
+        expected = "a PDController, or a drive that holds one"
+        raise refusal("controller", expected, controller)
+    if is_traced(linkage, controller, forces, q, step, duration):
+        raise ValueError("q: expected known values, outside of JAX's transformations.")
+    (element,) = of_full_size(linkage, elements_on(linkage, (controller,)))
+    zero = jnp.zeros(n)
+    resting = _following(element, _Probe(q, zero, 0.0, zero, 1.0))
+    names = joint_names(linkage)
+    moving = [k for k, name in enumerate(names) if name[0] != "F"]
+    loops = [open_loop(linkage, q, resting, k + 1, forces) for k in moving]
+    bandwidths = np.array([loop.bandwidth for loop in loops])
+    if np.isnan(bandwidths).any():
+        expected = "one with which each joint follows its reference at q"
+        raise refusal("controller", expected, controller)
+    frequency = bandwidths[:, None] * _FREQUENCIES
+    t0, count = float(duration), _SAMPLES - 1
+    probes, times = [], []
+    for k, row in zip(moving, frequency):
+        height, none = np.asarray(step) * np.eye(n)[k], np.zeros(n)
+        probes.append(_Probe(q, height, t0, none, 1.0))
+        times.append(t0 + np.linspace(0, t0, count))
+        for w in row:
+            probes.append(_Probe(q, none, t0, height, w))
+            times.append(t0 + 2 * np.pi / w * _PERIODS * np.arange(count) / count)
+    ts = np.pad(np.stack(times), ((0, 0), (1, 0)))  # from 0
+    stacked = jax.tree.map(lambda *rows: np.stack(rows), *probes)
+    found = _answers(linkage, element, elements_on(linkage, forces), stacked, ts)
+    # (joint, lane, time), of the joint that is tested
+    own = np.repeat(moving, 1 + _FREQUENCIES.size)[:, None, None]
+    positions, demands = (
+        np.take_along_axis(np.asarray(part), own, axis=2)[:, 1:, 0].reshape(
+            len(moving), -1, count
+        )
+        for part in found
+    )
+    step = np.asarray(step)[moving]
+    changes = (positions[:, 0] - positions[:, 0, :1]) / step[:, None]
+    sampled = np.reshape(times, positions.shape)[:, 1:]
+    phase = np.exp(-1j * frequency[:, :, None] * sampled)
+    gain = 2j * (positions[:, 1:] * phase).mean(axis=2) / step[:, None]
+    since = times[0] - t0
+    rows = [_step_measures(since, row) for row in changes]
+    overshoot, rise_time, settling_time = np.array(rows).T
+    saturated = np.mean(np.abs(demands[:, 0]) > 1, axis=1)
+    failed = np.isnan(changes).any(axis=1)
+    return StepAndSine(
+        joints=tuple(names[k] for k in moving),
+        step=step,
+        overshoot=overshoot,
+        rise_time=rise_time,
+        settling_time=settling_time,
+        bandwidth=np.array(list(map(_bandwidth, frequency, gain, changes[:, -1]))),
+        saturated=np.where(failed, np.nan, saturated),
+        ts=since,
+        response=changes,
+        frequency=frequency,
+        gain=gain,
+    )
+
+
+def _step_measures(ts: np.ndarray, change: np.ndarray) -> tuple[float, float, float]:
+    """Overshoot, rise time and settling time of a step response."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        part = change / change[-1]
+    if not np.isfinite(part).all():
+        return np.nan, np.nan, np.nan
+
+    def passing(k: int, level: float, values: np.ndarray) -> float:
+        """Returns when the values pass a level, between samples k and k + 1."""
+        share = (level - values[k]) / (values[k + 1] - values[k])
+        return ts[k] + share * (ts[k + 1] - ts[k])
+
+    low, high = (
+        passing(int(np.argmax(part >= level)) - 1, level, part) for level in (0.1, 0.9)
+    )
+    away = np.abs(part - 1)
+    settled = passing(int(np.flatnonzero(away > BAND)[-1]), BAND, away)
+    in_time = settled <= _SETTLED * ts[-1]
+    return part.max() - 1, high - low, settled if in_time else np.nan
+
+
+def _bandwidth(frequency: np.ndarray, gain: np.ndarray, final: float) -> float:
+    """Returns the first frequency at which |gain| is 3 dB below the final value."""
+    level = np.log(np.abs(gain / final))
+    if not np.isfinite(level).all() or level[0] < np.log(BANDWIDTH):
+        return np.nan
+    curve = CubicSpline(np.log(frequency), level)
+    found = curve.solve(np.log(BANDWIDTH), extrapolate=False)
+    return float(np.exp(found[0])) if found.size else np.nan

@@ -1,0 +1,1 @@
+"""Helpers that know nothing of arms: checks, names, files, XLA and its arithmetic."""

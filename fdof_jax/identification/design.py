@@ -1,0 +1,218 @@
+"""Design of experiments: the motion to record next."""
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import ArrayLike
+
+from ..base.checks import function, increasing, instance, real_array, refusal
+from ..search.bounded import Run, minimise
+from ..search.lanes import Lanes
+from ..search.methods import Evaluation
+from ..search.simulated import check_scene
+from ..simulation.scene import Scene
+from ..simulation.sensitivities import sensitivities
+from ..simulation.solution import Solution
+from .problems import Observe, SceneAt
+from .recordings import link_ends
+from .result import FitResult
+from .unknowns import Shapes, named, unknowns_of
+
+# The largest standard error is smoothed as the norm of this order.
+_ORDER = 8
+# A parameter is known at least to this many sizes, so that an experiment that says
+# nothing of it can be improved.
+_IGNORANCE = 1e3
+# Weight of the barrier before the limits: with a tenth of it, searches end earlier.
+_BARRIER = 0.1
+_ENOUGH = 1e-5  # a search stops when the loss falls by less than this part
+
+
+class NextMotion(eqx.Module):
+    """The motion to record next; prints itself in a few lines.
+
+    - `motion`: its numbers by name, for `experiment`.
+    - `standard_errors`: those expected by name [unit of each parameter], when this
+      motion is recorded and fitted together with the earlier recordings.
+    - `improvement`: the largest relative standard error before, over that expected [1].
+    - `message`: why the search stopped.
+    """
+
+    motion: dict[str, Any]
+    standard_errors: dict[str, Any]
+    improvement: float
+    message: str
+
+    def __str__(self) -> str:
+        rows = [
+            f"{name:12} {np.array2string(np.asarray(errors), precision=3)}"
+            for name, errors in self.standard_errors.items()
+        ]
+        head = (
+            f"expected standard errors, the largest {self.improvement:.3g} times less:"
+        )
+        return "\n".join([head, *rows, self.message])
+
+
+class _Design(NamedTuple):
+    """An experiment, and what is known of its parameters.
+
+    Unknowns are the motion's numbers over `scale`. `information` (n, n) is that of the
+    earlier recordings on the parameters relative to their `sizes`.
+    """
+
+    experiment: Callable[..., SceneAt]
+    observe: Observe
+    within: Callable[[Scene, Solution], Array] | None
+    motion: Shapes
+    scale: Any
+    parameters: Shapes
+    values: Any
+    sizes: Any
+    information: Any
+    ts: Any
+    noise: Any
+
+
+def _errors(z: Array, design: _Design) -> tuple[Array, Array]:
+    """The smoothed largest relative standard error with its barrier, and all (n,)."""
+    scene_at = design.experiment(**named(design.motion, design.scale * z))
+
+    def changed(change: Array) -> Scene:
+        return scene_at(named(design.parameters, design.values + design.sizes * change))
+
+    def readings(scene, solution):
+        seen = jnp.asarray(design.observe(scene, solution))
+        return (seen / jnp.broadcast_to(design.noise, seen.shape)).reshape(-1)
+
+    found = sensitivities(changed, readings, jnp.zeros_like(design.values), design.ts)
+    told = design.information + found.jacobian.T @ found.jacobian
+    errors = jnp.sqrt(jnp.diag(jnp.linalg.inv(told)))
+    top = jax.lax.stop_gradient(errors.max())
+    largest = top * jnp.sum((errors / top) ** _ORDER) ** (1 / _ORDER)
+    if design.within is not None:
+        room = 1 - jnp.asarray(design.within(found.scene, found.solution)) ** 2
+        room = jnp.where(room > 0, room, jnp.nan)  # rejects motions beyond the limits
+        largest = largest * jnp.exp(-_BARRIER * jnp.mean(jnp.log(room)))
+    return largest, errors
+
+
+def _lane(z: Array, design: _Design) -> Evaluation:
+    def loss(z):
+        value, errors = _errors(z, design)
+        return value, (value, errors)
+
+    gradient, (value, errors) = jax.jacfwd(loss, has_aux=True)(z)
+    no_curvature = jnp.zeros((z.size, z.size))  # L-BFGS estimates it
+    return Evaluation(value, gradient, no_curvature, {"errors": errors})
+
+
+def next_motion(
+    experiment: Callable[..., SceneAt],
+    found: FitResult,
+    start: Mapping[str, ArrayLike],
+    ts: ArrayLike,
+    *,
+    noise: ArrayLike,
+    bounds: Mapping[str, Any],
+    within: Callable[[Scene, Solution], Array] | None = None,
+    observe: Observe = link_ends,
+    scale: Mapping[str, ArrayLike] | None = None,
+    max_steps: int = 200,
+    report: Callable[[str], Any] | None = None,
+) -> NextMotion:
+    """Computes the motion that cuts the largest standard error of a fit most.
+
+    A motion is a few named numbers, for instance efforts at knots, or amplitudes and
+    phases. The search follows the gradient of the largest relative standard error,
+    through the inverse of the information matrix: that of the earlier recordings, by
+    the covariance of their fit, plus that of the new one at the parameters found. It
+    finds the best motion near `start`; other starts may lead to better ones.
+
+    **Arguments:**
+
+    - `experiment`: called with the motion's numbers by name, returns the `scene_at` of
+      `fit`, for instance a class of Equinox modules.
+    - `found`: the result for the earlier recordings. Combinations of parameters that
+      these do not determine are taken to be unknown one by one.
+    - `start`: first guess of the motion's numbers, strictly within all limits.
+    - `ts`: increasing times of the new recording (time,) [s].
+    - `noise`: standard deviation of its readings [their unit], as in `fit`.
+    - `bounds`: (least, greatest) of the motion's numbers by name, finite.
+    - `within`: `(scene, solution) -> array` of numbers that have to stay between -1 and
+      1, for instance speeds over their limits.
+    - `observe`: as in `fit`.
+    - `scale`: sizes of parameters by name, to which standard errors are relative; by
+      default the magnitudes found.
+    - `max_steps`: greatest number of evaluations after the first.
+    - `report`: called with a line of progress after each step, for instance `print`.
+
+    **Returns:** a `NextMotion`.
+
+    **Raises:** ValueError for malformed arguments, and if `start` does not stay within
+    the limits or cannot be simulated.
+    """
+    if not callable(experiment):  # which may be a class
+        raise refusal("experiment", "a callable", experiment)
+    instance("found", found, FitResult)
+    instance("start", start, Mapping)
+    ts = real_array("ts", ts, (None,))
+    increasing("ts", ts)
+    noise = np.asarray(real_array("noise", noise, np.shape(noise), above=0))
+    if within is not None:
+        function("within", within)
+    function("observe", observe)
+    motion = unknowns_of(start, bounds, dict.fromkeys(start, 1.0))
+    half = (motion.high - motion.low) / 2
+    if not (np.isfinite(half) & (half > 0)).all():
+        raise ValueError(
+            f"bounds: expected finite ones for all of {list(start)}, got {bounds!r}."
+        )
+    parameters = unknowns_of(found.parameters, None, scale)
+    sizes = parameters.scale
+    first = named(motion.shapes, jnp.asarray(motion.start))
+    scene = experiment(**first)(jax.tree.map(jnp.asarray, found.parameters))
+    check_scene("experiment(...)(...)", scene, ts)
+    known = _information(found.covariance / np.outer(sizes, sizes))
+    design = _Design(
+        experiment, observe, within, motion.shapes, half, parameters.shapes,
+        parameters.start, sizes, known, ts, noise,
+    )  # fmt: skip
+    z, low, high = (a[None] / half for a in (motion.start, motion.low, motion.high))
+    (run,) = minimise(
+        Lanes(_lane, [[design]]), z, low, high, method="l-bfgs", max_steps=max_steps,
+        enough=_ENOUGH, report=report, describe=_largest_so_far,
+    )  # fmt: skip
+    if run.failed:
+        raise ValueError(
+            "start: expected a motion that can be simulated and stays strictly within "
+            f"the limits, got {start!r}."
+        )
+    numbers = np.clip(run.z * half, motion.low, motion.high)
+    errors = run.best.facts["errors"][0]
+    before = np.sqrt(np.diag(found.covariance)) / sizes
+    return NextMotion(
+        motion=named(motion.shapes, numbers),
+        standard_errors=named(parameters.shapes, errors * sizes),
+        improvement=float(before.max() / errors.max()),
+        message=run.reason,
+    )
+
+
+def _information(covariance: np.ndarray) -> np.ndarray:
+    """Inverse of a covariance that may have infinite rows, which say nothing."""
+    known = np.isfinite(np.diag(covariance))
+    information = np.eye(len(covariance)) / _IGNORANCE**2
+    part = np.ix_(known, known)
+    information[part] += np.linalg.inv(covariance[part])
+    return information
+
+
+def _largest_so_far(runs: list[Run]) -> str:
+    errors = runs[0].best.facts["errors"]
+    return f"largest standard error {100 * errors.max():.3g} %"

@@ -1,0 +1,210 @@
+"""Pictures of a tip's reach, and of its forces and inertia along a path."""
+
+from typing import Any
+
+import jax
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import ListedColormap
+from numpy.typing import ArrayLike
+
+from ..base.array_namespace import in_numpy
+from ..base.checks import real_array
+from ..dynamics import joint_mass_matrix
+from ..forces.element import Forces
+from ..linkage.linkage import Linkage, check_linkage, joint_names, joints_of
+from ..linkage.topology import letters
+from ..mechanics.kinematics import tip_jacobian
+from .arms import Geometry, draw_motion, geometry
+from .axes import GREY, SERIES, legend, plane_axes, xy
+from .reach import Ranges, curves, reached_cells
+
+_REACHED = "#D6EAF5"
+
+
+def _ranges(linkage: Linkage, lower: Any, upper: Any, orientation: Any) -> Ranges:
+    check_linkage(linkage)
+    n, kinds = joints_of(linkage), letters(linkage.ef)
+    ends = []
+    for name, value in (("lower", lower), ("upper", upper)):
+        end = real_array(
+            name, value, (n,), finite=False, broadcast=True, unit="m or rad"
+        )
+        ends.append(np.asarray(end))
+        for joint, end in zip(joint_names(linkage), ends[-1]):
+            if joint[0] == "P" and not np.isfinite(end):
+                raise ValueError(
+                    f"{name}: expected a finite end of slide {joint} [m], got {end}."
+                )
+    low, high = ends
+    moves = np.array([kind != "F" for kind in kinds])
+    if not (low < high)[moves].all():
+        raise ValueError(
+            f"lower: expected less than upper, got {low.tolist()} and {high.tolist()}."
+        )
+    around = np.array([kind == "R" for kind in kinds]) & (high - low >= 2 * np.pi)
+    low, high = np.where(around, -np.pi, low), np.where(around, np.pi, high)
+    low, high = np.where(moves, low, 0), np.where(moves, high, 0)
+    if orientation is not None:
+        orientation = float(real_array("orientation", orientation, ()))
+        if "R" not in kinds:
+            raise ValueError(
+                f"orientation: expected None for slides only, got {orientation:g}."
+            )
+    return Ranges(in_numpy(linkage), kinds, low, high, orientation)
+
+
+def workspace(
+    linkage: Linkage,
+    lower: ArrayLike = -np.inf,
+    upper: ArrayLike = np.inf,
+    ax: Axes | None = None,
+    *,
+    orientation: ArrayLike | None = None,
+) -> Axes:
+    """Draws where the tip can be, and its singular configurations.
+
+    Where the arm is singular, its joints move the tip along one line only; with an
+    `orientation`, those motions count that keep it. The edge of the reach consists of
+    such points, and of points that are reached while some joint is at an end of its
+    range. Both are curves in closed form. Holes between them that are narrower than a
+    fiftieth of the reach are filled too.
+
+    **Arguments:** `lower`, `upper`: ends of the ranges, in joint order or one for all
+    [m or rad]; those of slides must be finite; revolute joints without turn all the way
+    round. `orientation`: the last link's absolute angle [rad]; by default any. Each
+    joint with ends takes three times as long.
+
+    **Returns:** the axes. The `gid` of the curves is "singular" or "edge".
+
+    **Raises:** ValueError for malformed arguments, and for an `orientation` at which
+    the tip cannot move.
+    """
+    ranges = _ranges(linkage, lower, upper, orientation)
+    found = list(curves(ranges))
+    if not found:
+        raise ValueError(
+            "orientation: expected an angle at which the tip can move, got "
+            f"{ranges.orientation:g}."
+        )
+    cells = reached_cells(ranges, [q for q, _ in found])
+    ax = plane_axes(ax, cells.corners)
+    (x0, x1), (y0, y1) = xy(cells.corners)
+    ax.imshow(
+        np.ma.masked_equal(cells.reached, False),
+        origin="lower", extent=(x0, x1, y0, y1),
+        cmap=ListedColormap([_REACHED]), interpolation="none", zorder=0,
+    )  # fmt: skip
+    ax.plot([], [], "s", color=_REACHED, markersize=9, label="within reach")
+    labels = {"edge": "edge, joint at end", "singular": "singular"}
+    paths = {name: [] for name in labels}
+    for q, singular in found:
+        tips = np.append(ranges.tips(q), np.nan)  # NaN lifts the pen
+        if singular:
+            paths["singular"].append(tips)
+        else:
+            paths["edge"].append(cells.on_edge(tips))
+    for (name, curve), color in zip(paths.items(), (GREY, SERIES[1])):
+        if curve:
+            points = xy(np.concatenate(curve))
+            ax.plot(*points, color=color, lw=1.4, gid=name, label=labels[name])
+    ax.use_sticky_edges = False  # of the image
+    ax.autoscale_view()
+    legend(ax)
+    return ax
+
+
+def force_ellipses(
+    linkage: Linkage, q: ArrayLike, limit: ArrayLike, ax: Axes | None = None
+) -> Axes:
+    """Draws the forces that the tip can exert, standing, as ellipses along a path.
+
+    An ellipse holds the forces that joint efforts can balance whose shares of the
+    limits have a sum of squares of 1; gravity is left out. The legend gives the scale.
+    Near a singular configuration an ellipse is cut at half the picture's size.
+
+    **Arguments:** `q`: joint positions along the path (configurations, n) [m or rad];
+    `limit`: greatest efforts, one per joint or one for all, positive [N or N m].
+
+    **Returns:** the axes, with the arm at the first and the last configuration. The
+    `gid` of an ellipse is "ellipse 0", "ellipse 1", ...
+    """
+    positions, g = _path(linkage, q)
+    most = real_array(
+        "limit", limit, (joints_of(linkage),),
+        above=0, finite=False, broadcast=True, unit="N or N m",
+    )  # fmt: skip
+    J = _jacobians(linkage, positions)
+    # Efforts J^T F; the axes of the ellipse are those of the singular values.
+    _, sizes, axes = np.linalg.svd(np.swapaxes(J, 1, 2) / np.asarray(most)[:, None])
+    with np.errstate(divide="ignore"):
+        return _ellipses(g, 1 / sizes, np.swapaxes(axes, 1, 2), "force", " N", ax)
+
+
+def inertia_ellipses(
+    linkage: Linkage, q: ArrayLike, ax: Axes | None = None, *, forces: Forces = ()
+) -> Axes:
+    """Draws how easily forces move the tip, as ellipses along a path.
+
+    A force of 1 N in some direction accelerates the tip, from rest and beside gravity,
+    to a point of the ellipse. The semi-axes are the reciprocals of the masses that the
+    tip seems to have along them [1/kg]. In a singular configuration the ellipse is a
+    line. The legend gives the scale.
+
+    **Arguments:** `q`: joint positions along the path (configurations, n) [m or rad];
+    `forces`: elements, of which those with masses count.
+
+    **Returns:** the axes, as in `force_ellipses`.
+    """
+    positions, g = _path(linkage, q)
+    J = _jacobians(linkage, positions)
+    M = jax.vmap(lambda q: joint_mass_matrix(linkage, q, forces))(positions)
+    M = np.asarray(M)
+    mobility = J @ np.linalg.solve(M, np.swapaxes(J, 1, 2))
+    sizes, axes = np.linalg.eigh(mobility)
+    return _ellipses(g, sizes, axes, "inertia", "/kg", ax)
+
+
+def _path(linkage: Linkage, q: ArrayLike) -> tuple[np.ndarray, Geometry]:
+    """Joint positions along a path (configurations, n), and the arm there."""
+    check_linkage(linkage)
+    n = joints_of(linkage)
+    positions = np.asarray(real_array("q", q, (None, n), of=f"{n} joints"))
+    if not len(positions):
+        raise ValueError("q: expected one configuration or more, got none.")
+    return positions, geometry(linkage, positions)
+
+
+def _jacobians(linkage: Linkage, q: np.ndarray) -> np.ndarray:
+    """Derivatives of the tip's x and y in the joint positions (time, 2, n)."""
+    return np.asarray(jax.vmap(lambda q: tip_jacobian(linkage, q))(q))[:, :2]
+
+
+def _ellipses(
+    g: Geometry, sizes: np.ndarray, axes: np.ndarray, what: str, unit: str, ax: Any
+) -> Axes:
+    """Draws ellipses with semi-axes `sizes` (time, 2) along the columns of `axes`.
+
+    Those of neighbours overlap little.
+    """
+    extent = float(max(np.ptp(part) for part in xy(g.all_points)))
+    typical = np.median(sizes.max(axis=1))
+    if not np.isfinite(typical) or typical == 0:
+        typical = 1.0
+    apart = np.median(np.abs(np.diff(g.tip))) if len(g.tip) > 1 else extent
+    length = np.clip(0.6 * apart, 0.03 * extent, 0.1 * extent)
+    # Units per metre of the picture: 1, 2 or 5 times a power of ten.
+    digit, power = f"{typical / length:.0e}".split("e")
+    scale = float(f"{max(d for d in (1, 2, 5) if d <= int(digit))}e{power}")
+    semi = np.minimum(sizes / scale, extent / 2)
+    along = semi * (axes[:, 0] + 1j * axes[:, 1])
+    turn = np.linspace(0, 2 * np.pi, 73)
+    around = g.tip[:, None] + along @ np.array([np.cos(turn), np.sin(turn)])
+    ax = plane_axes(ax, np.append(g.all_points, around))
+    draw_motion(ax, g, np.unique([0, len(sizes) - 1]), mass_centers=False)
+    text = f"{what}, 1 m: {scale:g}{unit}"
+    for k, points in enumerate(around):
+        ax.plot(*xy(points), color=SERIES[4], lw=1, gid=f"ellipse {k}", label=text)
+        text = None
+    legend(ax)
+    return ax

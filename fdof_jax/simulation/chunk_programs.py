@@ -1,0 +1,116 @@
+"""The compiled programs of chunks: the outcomes of many members at once."""
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+from jax import Array
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from ..base.checks import refusal
+from ..base.configuration import wide_vectors
+from .simulate import simulate
+from .solution import Solution
+from .step_wrappers import Abreast
+from .steps import default_controller
+
+# A step of so few lanes takes not much longer than one of a single lane: slow members
+# are not worth another program.
+_ALL_ALIKE = 32
+_AXIS = "lane"
+
+
+def motion_of(
+    settings: dict, ts: Array, moving: Any, shared: Any, abreast: bool
+) -> Solution:
+    """Computes one member's motion, as far as other lanes go if `abreast`."""
+    linkage, state0, forces = eqx.combine(moving, shared)
+    controller = settings["stepsize_controller"] or default_controller()
+    # Members with steps of given lengths take equally many.
+    adaptive = isinstance(controller, diffrax.AbstractAdaptiveStepSizeController)
+    if abreast and adaptive:
+        limited = Abreast(controller, _AXIS)  # pyright: ignore[reportCallIssue]
+        settings = settings | {"stepsize_controller": limited}
+    return simulate(linkage, state0, ts, forces, throw=False, **settings)
+
+
+def outcome_of(
+    settings: dict,
+    reduce: Callable[[Solution], Any],
+    ts: Array,
+    moving: Any,
+    shared: Any,
+    abreast: bool,
+) -> tuple[Any, Array, Array]:
+    """Computes what is kept of one member, whether it was stopped, and if it failed."""
+    solution = motion_of(settings, ts, moving, shared, abreast)
+    kept = reduce(solution)
+    if not all(map(eqx.is_array_like, jax.tree.leaves(kept))):
+        raise refusal("reduce", "a function that returns arrays", kept)
+    results, most = diffrax.RESULTS, settings["max_steps"]
+    stopped = solution.result == results.max_steps_reached
+    if most is not None:
+        stopped &= solution.stats["num_steps"] < most
+    return kept, stopped, solution.result != results.successful
+
+
+class Form(NamedTuple):
+    """The key of a program: structures, constants, kinds of the arrays."""
+
+    moving: Any  # structures
+    arrays: Any
+    rest: Any
+    constants: tuple[Any, ...]
+    kinds: tuple[Any, Any]  # shapes and types of moving and other arrays
+    mesh: Mesh | None
+
+    @property
+    def lanes(self) -> int:
+        """The number of lanes on all devices."""
+        return self.kinds[0][0][0][0]
+
+    @property
+    def sharding(self) -> NamedSharding | None:
+        return self.mesh and NamedSharding(self.mesh, PartitionSpec("member"))
+
+
+def _like(shape: tuple[int, ...], dtype: Any, weak: bool = False) -> Any:
+    return jax.ShapeDtypeStruct(shape, dtype, weak_type=weak)
+
+
+@functools.lru_cache(maxsize=64)
+def traced(form: Form) -> jax.stages.Lowered:
+    """Traces the program that computes the outcomes of a chunk."""
+
+    def run(moving, arrays):
+        known = jax.tree.unflatten(form.arrays, arrays)
+        rest = jax.tree.unflatten(form.rest, form.constants)
+        settings, reduce, ts, shared = eqx.combine(known, rest)
+        abreast = len(moving[0]) > _ALL_ALIKE  # of the lanes of one device
+
+        def member(leaves):
+            member = jax.tree.unflatten(form.moving, leaves)
+            return outcome_of(settings, reduce, ts, member, shared, abreast)
+
+        return jax.vmap(member, axis_name=_AXIS)(moving)
+
+    if form.mesh is not None:
+        lanes, same = PartitionSpec("member"), PartitionSpec()
+        # Each device loops only until its own slowest member is done.
+        run = jax.shard_map(
+            run,
+            mesh=form.mesh,
+            in_specs=(lanes, same),
+            out_specs=lanes,
+            check_vma=False,
+        )
+    like = [[_like(*kind) for kind in kinds] for kinds in form.kinds]
+    return jax.jit(run, in_shardings=(form.sharding, None)).lower(*like)
+
+
+@functools.lru_cache(maxsize=64)
+def compiled(form: Form) -> jax.stages.Compiled:
+    return traced(form).compile(wide_vectors())

@@ -1,0 +1,230 @@
+"""Keeps the results of a sweep in a folder, a Zarr group, block by block of members."""
+
+import hashlib
+import json
+import math
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.experimental import multihost_utils
+
+from ..base.array_namespace import in_numpy
+from ..base.checks import refusal
+from ..base.whole_files import whole_file
+from .batch_axes import Batch
+from .checkpoints import VERSIONS
+from .chunks import in_chunks
+from .solution import Solution
+from .zarr_variables import Variable, coordinates, metadata, values_of, variables_of
+
+_BYTES = 2**26  # of the results in a block
+_CHUNKS = 16  # at most so many in a block, as blocks are what workers share
+
+
+def _sha256(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()
+
+
+def _warn(expected: str, done: str) -> None:
+    message = f"sweep: expected {expected}, got something else; {done}."
+    warnings.warn(message, RuntimeWarning, stacklevel=2)
+
+
+def _text(value: Any) -> bytes:
+    return json.dumps(value, indent=1).encode()
+
+
+class Store:
+    """A folder that is a Zarr group, whose chunks along members are blocks.
+
+    No two blocks share a file. A finished block has a record in the folder `records`:
+    the checksums of its files and of the group's metadata, as `sha256sum` writes them.
+    """
+
+    def __init__(
+        self, folder: Path, batch: Batch, ts: Array, like: Any, chunk: int, sweep: str
+    ):
+        """Writes the metadata of the group, or checks what is there."""
+        self.folder, self.size = folder, batch.size
+        failed = Variable("failed", np.dtype(bool), (), ["member"], {})
+        self.variables = [*variables_of(like, batch.inputs[0]), failed]
+        if len({variable.name for variable in self.variables}) < len(self.variables):
+            raise refusal("reduce", "no part named failed beside a store", like)
+        each = sum(v.dtype.itemsize * math.prod(v.shape) for v in self.variables)
+        most = chunk * min(_CHUNKS, max(1, _BYTES // (chunk * each)))
+        # Nearly equal blocks are solved by the same programs.
+        self.block = -(-self.size // -(-self.size // most))
+        self.count = -(-self.size // self.block)
+        arrays = {
+            v.name: metadata(
+                v.dtype, (self.size, *v.shape), (self.block, *v.shape), *v[3:]
+            )
+            for v in self.variables
+        }
+        known = {}
+        if isinstance(like, Solution):
+            for name, (values, attributes) in coordinates(batch.inputs[0], ts).items():
+                one = values.dtype, values.shape, values.shape, [name], attributes
+                arrays[name] = metadata(*one)
+                known[f"{name}/c/0"] = values.tobytes()
+        provenance = {"versions": VERSIONS, "sweep": sweep, "chunk": chunk}
+        group = {
+            "zarr_format": 3,
+            "node_type": "group",
+            "attributes": provenance | {"sha256": _sha256(_text(provenance))},
+            "consolidated_metadata": {
+                "kind": "inline",
+                "must_understand": False,
+                "metadata": arrays,
+            },
+        }
+        self._refuse_another(group["attributes"])
+        self.named = _sha256(_text(group))
+        known |= {f"{name}/zarr.json": _text(value) for name, value in arrays.items()}
+        for name, data in ({"zarr.json": _text(group)} | known).items():
+            path = folder / name
+            if path.exists():
+                if path.read_bytes() == data:
+                    continue
+                _warn(f"in {path} the metadata of this sweep", "it is written again")
+            self._write(name, data)
+
+    def _refuse_another(self, attributes: dict[str, Any]) -> None:
+        """Raises ValueError if the group is whole, but of another sweep."""
+        try:
+            found = json.loads((self.folder / "zarr.json").read_bytes())["attributes"]
+            provenance = {key: found[key] for key in attributes if key != "sha256"}
+        except (OSError, ValueError, LookupError, TypeError):
+            return  # none, or damaged
+        whole = found["sha256"] == _sha256(_text(provenance))
+        if whole and found != attributes:
+            others = ", ".join(
+                key for key in provenance if found[key] != attributes[key]
+            )
+            raise ValueError(
+                "store: expected a new folder or one of this sweep, got "
+                f"{self.folder}, which has another {others}."
+            )
+
+    def members(self, block: int) -> slice:
+        return slice(block * self.block, min(self.size, (block + 1) * self.block))
+
+    def _files(self, block: int) -> dict[str, Variable]:
+        """Returns the files of a block, with their variables."""
+        axes = lambda variable: "/0" * len(variable.shape)
+        return {f"{v.name}/c/{block}{axes(v)}": v for v in self.variables}
+
+    def _record(self, block: int, sums: list[str]) -> tuple[str, list[str]]:
+        """Returns the name of a block's record and its lines."""
+        files = ["zarr.json", *self._files(block)]
+        lines = [f"{total}  {file}" for total, file in zip([self.named, *sums], files)]
+        return f"records/{block}.sha256", lines
+
+    def failed(self, block: int) -> np.ndarray | None:
+        """Returns which members of a finished block failed, or None if it is to solve.
+
+        Damaged files are reported by a warning.
+        """
+        files = self._files(block)
+        record = self.folder / self._record(block, [])[0]
+        if not record.exists():
+            return None
+        sums = [self._sum(file) for file in files]
+        lines = self._record(block, sums)[1]
+        found, members = record.read_bytes(), self.members(block)
+        if found == "\n".join(lines).encode():
+            flags = np.fromfile(self.folder / list(files)[-1], bool)
+            return flags[: members.stop - members.start]
+        recorded = set(found.decode(errors="replace").split("\n"))
+        damaged = [file for file, line in zip(files, lines[1:]) if line not in recorded]
+        _warn(
+            f"{', '.join(damaged) or 'files'} of {self.folder} with the checksums in "
+            f"{record}",
+            f"{members.stop - members.start} members are solved again",
+        )
+        return None
+
+    def write(self, block: int, kept: Any, failed: np.ndarray) -> None:
+        sums = []
+        for (file, variable), values in zip(
+            self._files(block).items(), [*values_of(kept), failed], strict=True
+        ):
+            # Chunks of one array are equally long, also the last one.
+            rows = np.zeros((self.block, *variable.shape), variable.dtype)
+            rows[: len(values)] = values
+            self._write(file, rows.tobytes())
+            sums.append(_sha256(rows.tobytes()))
+        name, lines = self._record(block, sums)
+        self._write(name, "\n".join(lines).encode())
+
+    def _sum(self, name: str) -> str:
+        try:
+            with (self.folder / name).open("rb") as file:
+                return hashlib.file_digest(file, "sha256").hexdigest()
+        except FileNotFoundError:
+            return "missing"
+
+    def _write(self, name: str, data: bytes) -> None:
+        path = self.folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with whole_file(path) as file:
+            file.write(data)
+
+
+def _known(store: Store, block: int) -> np.ndarray | None:
+    """Returns `store.failed(block)`, in all processes what the first one finds."""
+    if jax.process_count() == 1:
+        return store.failed(block)
+    members = store.members(block)
+    failed = store.failed(block) if jax.process_index() == 0 else None
+    answer = np.zeros(1 + members.stop - members.start, bool)
+    if failed is not None:
+        answer[0], answer[1:] = True, failed
+    answer = np.asarray(multihost_utils.broadcast_one_to_all(answer))
+    return answer[1:] if answer[0] else None
+
+
+def in_store(
+    store: Store,
+    blocks: range,
+    batch: Batch,
+    ts: Array,
+    settings: dict,
+    reduce: Callable[[Solution], Any],
+    chunk: int,
+    meter: diffrax.AbstractProgressMeter,
+    devices: list[Any],
+) -> list[int]:
+    """Solves blocks of members that the store lacks; returns the failed members."""
+    moving, shared = batch.split()
+    moving, found, progress = in_numpy(moving), [], meter.init()
+    for done, block in enumerate(blocks, 1):
+        members, failed = store.members(block), _known(store, block)
+        if failed is None:
+            part = jax.tree.map(lambda leaf, m=members: leaf[m], moving)
+            size = members.stop - members.start
+            some = Batch(eqx.combine(part, shared), batch.batched, size)
+            kept, failed = in_chunks(
+                some,
+                ts,
+                settings,
+                reduce,
+                chunk,
+                None,
+                diffrax.NoProgressMeter(),
+                devices,
+            )
+            if jax.process_index() == 0:
+                store.write(block, kept, failed)
+        found += (members.start + np.flatnonzero(failed)).tolist()
+        progress = meter.step(progress, jnp.asarray(done / len(blocks)))
+    meter.close(progress)
+    return found

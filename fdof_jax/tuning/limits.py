@@ -1,0 +1,155 @@
+"""Limits on overshoot, settling time, effort and margin, and how far they are met."""
+
+from collections.abc import Iterator
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from ..analysis.equilibria import equilibrium
+from ..analysis.linearization import checked
+from ..analysis.loops import closed_loop, open_loop
+from ..analysis.responses import BAND
+from ..control.pd import PDController
+from ..forces.element import Element
+from ..forces.part import Part, Values, field
+from ..linkage.linkage import joint_names, without_fixed
+from ..references.reference import reference_motion
+from ..simulation.scene import Scene
+from ..simulation.solution import Solution
+from .losses import controller_of
+
+_FREQUENCIES = 200
+
+
+class Limits(Part):
+    """Limits on the response to a step, for `tune_within`.
+
+    The step of a joint leads from the start of the motion to where the arm rests at the
+    last set point. A joint whose limit is infinite (for the margin: 0) has none. Give
+    overshoot and settling time only for joints that step.
+
+    **Arguments:** one value per joint or one for all.
+
+    - `overshoot`: greatest excess over the step, as a share of it.
+    - `settling_time`: time after which the joint stays within 2 % of the step [s].
+    - `effort`: greatest effort that the controller demands [N or N m].
+    - `modulus_margin`: least distance of the loop from instability, from 0 to 1, where
+      the step ends; see `OpenLoop`.
+
+    **Raises:** ValueError for malformed arguments.
+
+    >>> import fdof_jax as fj
+    >>> fj.tuning.Limits(overshoot=0.05, settling_time=[0.5, 0.3, 0.3])
+    Limits(overshoot=0.05, settling_time=[0.5, 0.3, 0.3], effort=inf, modulus_margin=0)
+    """
+
+    overshoot: Values = field(unit="", minimum=0, finite=False, default=jnp.inf)
+    settling_time: Values = field(unit="s", minimum=0, finite=False, default=jnp.inf)
+    effort: Values = field(unit="N or N m", above=0, finite=False, default=jnp.inf)
+    modulus_margin: Values = field(unit="", minimum=0, default=0.0)
+
+
+def excess(limits: Limits, scene: Scene, solution: Solution) -> Array:
+    """Excess of a motion over its limits, at all times and frequencies (m,).
+
+    Negative numbers are within. Overshoot and deviation are shares of the step, efforts
+    and margins shares of their limits.
+    """
+    ts, rest = solution.ts, rest_of(scene)
+    share, still = step_shares(solution, rest)
+
+    def at(t, share_now, demand):
+        over = jnp.where(still, -1, share_now - 1 - limits.overshoot)
+        # From the sample before, as the response may settle between both.
+        late = (t + ts[1] > limits.settling_time) & ~still
+        unsettled = jnp.where(late, jnp.abs(share_now - 1) - BAND, -1)
+        return jnp.stack([over, unsettled, jnp.abs(demand) / limits.effort - 1])
+
+    along = jax.vmap(at)(ts, share, demands_of(scene, solution))
+    controller, others = controller_and_others(scene)
+    A, B, C = closed_loop(scene.linkage, controller, others, rest, scene.t1)
+    near = jax.vmap(lambda s: limits.modulus_margin * jnp.abs(s) - 1)
+    return jnp.concatenate([along.reshape(-1), near(sensitivity(A, B, C)).reshape(-1)])
+
+
+def controller_and_others(scene: Scene) -> tuple[PDController, tuple[Element, ...]]:
+    """Returns the controller of a scene and its other forces."""
+    controller = controller_of(scene)
+    others = tuple(force for force in scene.forces if force is not controller)
+    return controller, checked(scene.linkage, others)
+
+
+def rest_of(scene: Scene) -> Array:
+    """Returns where the arm rests at the last set point (n,) [m or rad], or NaN."""
+    reference = controller_of(scene).reference
+    last, _ = reference_motion(reference, jnp.asarray(scene.t1), scene.linkage)
+    return equilibrium(scene.linkage, last, scene.forces, scene.t1)
+
+
+def step_shares(solution: Solution, rest: Array) -> tuple[Array, Array]:
+    """Returns each joint's change as a share of its step (time, joint).
+
+    Also returns which joints have no step (joint,).
+    """
+    height = rest - solution.q[0]
+    still = height == 0
+    height = jnp.where(still, 1, height)
+    return jax.vmap(lambda q: (q - solution.q[0]) / height)(solution.q), still
+
+
+def demands_of(scene: Scene, solution: Solution) -> Array:
+    """Computes the controller's demands along a motion (time, joint) [N or N m]."""
+    demand = jax.vmap(controller_of(scene).demand, in_axes=(0, 0, 0, None))
+    demands = demand(solution.ts, solution.q, solution.qd, scene.linkage)
+    return without_fixed(scene.linkage, demands)
+
+
+def sensitivity(A: Array, B: Array, C: Array) -> Array:
+    """Computes 1 / (1 + L) of each joint's loop (frequency, joint).
+
+    The frequencies reach from far below to far above those of the joints alone.
+    """
+    n = B.shape[1]
+    joints = jnp.arange(n)
+    own = jnp.sqrt(jnp.abs(C[joints, joints] * B[n + joints, joints])) + 1e-3
+    low, high = jnp.log(0.05 * own.min()), jnp.log(30 * own.max())
+    w = jax.lax.stop_gradient(jnp.exp(jnp.linspace(low, high, _FREQUENCIES)))
+
+    def at(w):
+        closed = jnp.linalg.solve(1j * w * jnp.eye(len(A)) - A, B + 0j)
+        return 1 - jnp.diagonal(C @ closed)
+
+    return jax.vmap(at)(w)
+
+
+def measured(
+    scene: Scene, motion: Solution, limits: Limits
+) -> Iterator[tuple[str, str, float, float]]:
+    """Yields a row of `TunedWithin` per limit, measured as reports measure."""
+    controller, others = controller_and_others(scene)
+    ts, rest = np.asarray(motion.ts), rest_of(scene)
+    shares = np.asarray(step_shares(motion, rest)[0])
+    efforts = np.abs(demands_of(scene, motion)).max(axis=0)
+    allowed = jax.tree.map(np.asarray, limits)
+    for k, name in enumerate(joint_names(scene.linkage)):
+        if name[0] == "F":
+            continue
+        away = np.flatnonzero(np.abs(shares[:, k] - 1) > BAND)
+        settled = np.append(ts, np.nan)[away[-1] + 1] if away.size else 0.0
+        found = {
+            "overshoot": (allowed.overshoot[k], max(shares[:, k].max() - 1, 0)),
+            "settling time [s]": (allowed.settling_time[k], settled),
+            f"effort [{'N m' if name[0] == 'R' else 'N'}]": (
+                allowed.effort[k],
+                efforts[k],
+            ),
+        }
+        for label, (most, value) in found.items():
+            if most < np.inf:
+                yield label, name, float(most), float(value)
+        if allowed.modulus_margin[k] > 0:
+            loop = open_loop(scene.linkage, rest, controller, k + 1, others, scene.t1)
+            least = float(allowed.modulus_margin[k])
+            yield "modulus margin", name, least, loop.modulus_margin

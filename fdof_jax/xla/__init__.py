@@ -1,1 +1,0 @@
-"""Helpers for XLA that know nothing of arms: settings, sines, loops, checks."""

@@ -1,0 +1,109 @@
+"""Tuning within limits: a written-out optimum, margins, limits out of reach."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import random_linkage
+from test_gains import PENDULUM, Stand, pd_at
+
+import fdof_jax as fj
+from fdof_jax.analysis.loops import closed_loop
+from fdof_jax.tuning.limits import sensitivity
+
+FREE = PENDULUM.replace(gravity=0)
+INERTIA = 0.3 + 2 * (0.6**2 + 0.2**2)
+
+
+def step(kp=6.0, kd=1.0, limit=np.inf):
+    pd = fj.PDController([kp], [kd], [limit], Stand(np.ones(1)))
+    return fj.Scene(FREE, fj.State([0.0], [0.0]), (pd,), 4.0)
+
+
+def within(scene, **limits):
+    return fj.tuning.tune_within(
+        scene, fj.tuning.Limits(**limits), loss=fj.tuning.joint_errors, factor=8.0
+    )
+
+
+def test_gains_are_at_the_limits_of_overshoot_and_effort():
+    """The mean squared error of a step falls with kp, and is least at a damping ratio
+    of 1/2, which overshoots by 16 %."""
+    found = within(step(), overshoot=0.05, effort=12.0)
+    assert found.met.all() and found.limit == ("overshoot", "effort [N m]")
+    np.testing.assert_allclose(found.reached, [0.05, 12], rtol=0.03)
+    kp, kd = found.gains[:, 0]
+    np.testing.assert_allclose(kp, 12, rtol=3e-3)
+    ratio = np.log(1 / 0.05) / np.hypot(np.pi, np.log(1 / 0.05))
+    np.testing.assert_allclose(kd / (2 * np.sqrt(kp * INERTIA)), ratio, rtol=0.01)
+    # The loss of the tuned scene, without a penalty.
+    scene = found.scene
+    ts = np.linspace(0, 4, 1001)
+    motion = fj.simulate(FREE, scene.state0, ts, scene.forces)
+    np.testing.assert_allclose(found.loss, np.mean((motion.q - 1) ** 2), rtol=1e-6)
+
+
+def test_limits_that_do_not_bind_change_nothing():
+    effort = dict(effort=12.0)
+    few, many = within(step(), **effort), within(step(), **effort, overshoot=0.3)
+    np.testing.assert_allclose(few.gains, many.gains, rtol=1e-3)
+    assert many.met.all() and many.reached[0] < 0.2
+
+
+def test_margins_are_met():
+    found = within(step(), effort=12.0, modulus_margin=0.95)
+    assert found.met.all()
+    _, least = found.reached
+    assert 0.95 <= least < 0.96  # more than at the least error
+    (pd,) = found.scene.forces
+    loop = fj.analysis.open_loop(FREE, [1.0], pd, 1)
+    assert least == pytest.approx(loop.modulus_margin)
+
+
+def test_settling_times_are_met():
+    found = within(step(), effort=12.0, settling_time=1.2)
+    assert found.met.all()
+    (pd,) = found.scene.forces
+    test = fj.analysis.step_and_sine(FREE, [0.3], pd, step=1.0, duration=4.0)
+    assert found.reached[0] == pytest.approx(test.settling_time[0], abs=0.01)
+    # Within 2 % after 1.2 s by less overshoot than is best for the error.
+    kp, kd = found.gains[:, 0]
+    assert kd / (2 * np.sqrt(kp * INERTIA)) > 0.7
+
+
+def test_limits_out_of_reach_are_reported():
+    found = within(step(), settling_time=0.05, effort=12.0)
+    assert not found.met.all()
+    text, html = str(found), found._repr_html_()
+    assert "not met" in text and f"{found.met.sum()} of 2 limits met" in text
+    assert "<th>effort [N m] of R1</th><td>12</td>" in html
+
+
+def test_the_margins_that_are_tuned_are_those_of_the_loops():
+    rng = np.random.default_rng(2)
+    linkage, q = random_linkage("RPR", rng), rng.uniform(-1, 1, 3)
+    gains = fj.control.gains_from_frequency(linkage, q, [8.0, 20.0, 60.0], 0.3)
+    pd = pd_at(q, *gains)
+    found = sensitivity(*closed_loop(linkage, pd, (), jnp.asarray(q), jnp.zeros(())))
+    least = 1 / np.abs(found).max(axis=0)
+    exact = [fj.analysis.open_loop(linkage, q, pd, k).modulus_margin for k in (1, 2, 3)]
+    np.testing.assert_allclose(np.minimum(least, 1), exact, rtol=5e-3)
+
+
+def test_malformed_limits_are_refused():
+    scene, limits = step(), fj.tuning.Limits(overshoot=0.1)
+    lag = fj.control.FirstOrderLag(fj.JointEffort([0.0]), 0.1)
+    with pytest.raises(ValueError, match="limits: expected a Limits, got 0.1"):
+        fj.tuning.tune_within(scene, 0.1)
+    with pytest.raises(ValueError, match="its controller to track a task with a `tip`"):
+        fj.tuning.tune_within(scene, limits)
+    with pytest.raises(ValueError, match="limits.overshoot: .* numbers for 1 joints"):
+        within(scene, overshoot=[0.1, 0.1])
+    weak = step(limit=0.1)
+    pushed = weak._replace(forces=(*weak.forces, fj.JointEffort([1.0])))
+    with pytest.raises(ValueError, match="scene: expected one that .* an equilibrium"):
+        within(pushed, overshoot=0.1)
+    with pytest.raises(ValueError, match="forces: expected elements without a state"):
+        within(scene._replace(forces=(*scene.forces, lag)), overshoot=0.1)
+    for wrong in (dict(overshoot=-1), dict(effort=0), dict(modulus_margin=np.inf)):
+        with pytest.raises(ValueError, match=next(iter(wrong))):
+            fj.tuning.Limits(**wrong)

@@ -1,0 +1,137 @@
+"""The next motion cuts the largest standard error, as the next fit shows."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import fdof_jax as fj
+from fdof_jax.identification import design
+
+TS, KNOTS, NOISE = np.linspace(0, 1, 51), np.linspace(0, 1, 3), 1e-3
+START = fj.State(jnp.array([-1.4, 0.2]), jnp.zeros(2))
+
+
+class Pushed(eqx.Module):
+    """Two links with efforts at knots; the second mass and the damping are sought."""
+
+    efforts: jax.Array
+
+    def __call__(self, p):
+        linkage = fj.Linkage(
+            "RR",
+            length=[0, 1, 0.8],
+            com=[[0.5, 0], [0.4, 0]],
+            mass=jnp.stack([jnp.asarray(2.0), p["mass"]]),
+            inertia=[0.2, 0.05],
+        )
+        efforts = fj.forces.EffortHistory(KNOTS, self.efforts)
+        return fj.Scene(linkage, START, (efforts, fj.JointDamper(p["damping"])), 1.0)
+
+
+def speeds(scene, solution):
+    return solution.qd / 3
+
+
+TRUE = dict(mass=jnp.asarray(1.0), damping=jnp.array([0.5, 0.3]))
+GUESS = dict(mass=0.8, damping=[1.0, 0.5])
+HANGS = {"efforts": np.zeros((3, 2))}
+LIMITS = dict(noise=NOISE, bounds={"efforts": (-4, 4)}, within=speeds)
+
+
+def recorded(pushed, seed):
+    scene = jax.tree.map(jnp.asarray, pushed(TRUE))
+    motion = fj.simulate(scene.linkage, scene.state0, TS, scene.forces)
+    clean = np.asarray(fj.identification.link_ends(scene, motion))
+    return clean + NOISE * np.random.default_rng(seed).normal(size=clean.shape), motion
+
+
+@pytest.fixture(scope="module")
+def found():
+    first = Pushed(HANGS["efforts"])
+    return fj.fit(first, GUESS, TS, recorded(first, 0)[0], noise=NOISE)
+
+
+@pytest.fixture(scope="module")
+def chosen(found):
+    return fj.identification.next_motion(Pushed, found, HANGS, TS, **LIMITS)
+
+
+def relative(found):
+    values = np.concatenate([np.ravel(v) for v in found.parameters.values()])
+    return np.sqrt(np.diag(found.covariance)) / np.abs(values)
+
+
+def test_the_next_fit_has_the_standard_errors_expected(found, chosen):
+    assert chosen.improvement > 3
+    first, then = Pushed(HANGS["efforts"]), Pushed(chosen.motion["efforts"])
+    seen, motion = recorded(then, 1)
+    both = [recorded(first, 0)[0], seen]
+    fitted = fj.fit([first, then], GUESS, TS, np.stack(both), noise=NOISE)
+    for name, errors in chosen.standard_errors.items():
+        np.testing.assert_allclose(fitted.standard_errors[name], errors, rtol=0.05)
+    gain = relative(found).max() / relative(fitted).max()
+    assert gain == pytest.approx(chosen.improvement, rel=0.05)
+    # Within its limits, and at one of them at least
+    efforts, speed = np.abs(chosen.motion["efforts"]), np.abs(speeds(None, motion))
+    assert efforts.max() <= 4 and speed.max() < 1.01
+    assert speed.max() > 0.9 or efforts.max() == 4
+    assert f"the largest {chosen.improvement:.3g} times less" in str(chosen)
+
+
+def test_the_gradient_of_the_largest_standard_error(found, chosen, monkeypatch):
+    """By central differences, half way between the first motion and the chosen one."""
+    seen = []
+    lanes = design.Lanes
+    monkeypatch.setattr(design, "Lanes", lambda *a: seen.append(lanes(*a)) or seen[0])
+    fj.identification.next_motion(Pushed, found, HANGS, TS, max_steps=1, **LIMITS)
+    z = 0.5 * chosen.motion["efforts"].ravel()[None] / 4
+    at = lambda z: seen[0](z, np.zeros(1, int))
+    steps = 1e-3 * np.eye(z.size)
+    ends = [[at(z + sign * step).loss[0] for step in steps] for sign in (1, -1)]
+    differences = (np.array(ends[0]) - ends[1]) / 2e-3
+    np.testing.assert_allclose(
+        at(z).gradient[0], differences, rtol=1e-3, atol=1e-3 * np.abs(differences).max()
+    )
+
+
+def test_parameters_that_nothing_has_told_yet(found):
+    """An infinite standard error of one number leaves what is known of the others."""
+    covariance = found.covariance.copy()
+    covariance[0] = covariance[:, 0] = np.inf
+    sizes = 10.0 ** np.arange(3)
+    known = design._information(covariance / np.outer(sizes, sizes))
+    expected = np.linalg.inv(found.covariance[1:, 1:]) * np.outer(sizes, sizes)[1:, 1:]
+    np.testing.assert_allclose(known[1:, 1:], expected, rtol=1e-4)
+    np.testing.assert_array_equal(known[0], [1e-6, 0, 0])
+    untold = eqx.tree_at(lambda found: found.covariance, found, covariance)
+    chosen = fj.identification.next_motion(
+        Pushed, untold, HANGS, TS, max_steps=5, **LIMITS
+    )
+    assert chosen.improvement == np.inf
+    assert np.isfinite(chosen.standard_errors["mass"])
+
+
+@pytest.mark.parametrize(
+    "changes, message",
+    [
+        (dict(experiment=3), "experiment: expected a callable"),
+        (dict(found=GUESS), "found: expected a FitResult"),
+        (dict(start=[1.0]), "start: expected a Mapping"),
+        (dict(start={"efforts": [[1.0], [2.0, 3.0]]}), r"start\['efforts'\]: expected"),
+        (dict(start={"efforts": np.full((3, 2), 5)}), r"bounds\['efforts'\]: expected"),
+        (dict(bounds={"tau": (-1, 1)}), "bounds: expected a dict with names from"),
+        (dict(bounds={}), "bounds: expected finite ones for all of"),
+        (dict(noise=0), "noise: expected a real number"),
+        (dict(ts=TS[::-1]), "ts: expected increasing times"),
+        (dict(within=3), "within: expected a callable"),
+        (dict(observe=3), "observe: expected a callable"),
+        (dict(scale={"mass": 0}), r"scale\['mass'\]: expected a real number"),
+        (dict(within=lambda scene, motion: motion.q), "strictly within the limits"),
+    ],
+)
+def test_malformed_arguments(changes, message, found):
+    arguments = dict(experiment=Pushed, found=found, start=HANGS, ts=TS) | LIMITS
+    with pytest.raises(ValueError, match=message):
+        fj.identification.next_motion(**arguments | changes)

@@ -1,0 +1,101 @@
+"""Every public callable refuses wrong arguments by an error that is meant.
+
+Each argument in turn is replaced by values of many kinds, as they are and traced, while
+the others are right where the table knows them by name.
+"""
+
+import inspect
+import warnings
+
+import diffrax
+import jax
+import numpy as np
+import pytest
+
+import fdof_jax as fj
+
+ROOMS = (
+    fj, fj.analysis, fj.control, fj.data, fj.forces, fj.identification, fj.references,
+    fj.tuning,
+)  # fmt: skip
+# JAX raises the last one for integers that no array holds.
+MEANT = ValueError, TypeError, ImportError, RuntimeError, OverflowError
+# It changes the whole process; the search takes what is not refused for a long time.
+LEFT_OUT = {"configure", "optimal_efforts"}
+FIG7, TS, ROWS = fj.scenes.fig7(), np.linspace(0, 1, 5), np.zeros((5, 3))
+STATS = {"num_steps": np.array(3), "time_reached": np.array(1.0)}
+MOTION = fj.Solution(TS, ROWS, ROWS, STATS, diffrax.RESULTS.successful)
+TASK, ZERO, CHAIN = fj.CircleTask(), np.zeros(3), np.zeros(6)
+RIGHT = dict(
+    linkage=FIG7.linkage, state0=FIG7.state0, scene=FIG7, solution=MOTION, ts=TS,
+    forces=(), q=ZERO, qd=ZERO, qdd=ZERO, tau=ZERO, x=CHAIN, xd=CHAIN, force=CHAIN,
+    t=0.0, topology="RRR", tip=np.ones(2), orientation=0.0, reference=TASK, task=TASK,
+    controller=FIG7.forces[0], point=fj.Point(1, 0.5), members=2,
+)  # fmt: skip
+WRONG = [
+    None, 3, -1.5, b"x", [], {}, (), object(), FIG7, MOTION, FIG7.linkage, len, 1j,
+    np.zeros((2, 0)), np.zeros(7), np.array(["a"]), float("nan"), [[1], [1, 2]], 10**30,
+]  # fmt: skip
+TRACED = [
+    jax.ShapeDtypeStruct(shape, dtype)
+    for shape in ((), (7,), (2, 3, 3), (0,))
+    for dtype in (float, int, complex, bool)
+]
+
+
+def parameters():
+    """Returns each parameter of each public callable, and right ones for the others."""
+    found = {}
+    for room in ROOMS:
+        for name in set(dir(room)) - LEFT_OUT:
+            value = getattr(room, name)
+            if callable(value) and value not in found.values():
+                found[name] = value
+    for name, value in sorted(found.items()):
+        given = inspect.signature(value).parameters.values()
+        named = [p for p in given if p.kind not in (p.VAR_KEYWORD, p.VAR_POSITIONAL)]
+        others = {p.name: RIGHT.get(p.name) for p in named if p.default is p.empty}
+        for p in named:
+            yield (
+                name,
+                p.name,
+                lambda wrong, f=value, o=others, n=p.name: f(**{**o, n: wrong}),
+            )
+
+
+def unlike_a_refusal(calls):
+    """Returns the calls that raise an error of another kind."""
+    found = []
+    for name, parameter, wrong, call in calls:
+        try:
+            with warnings.catch_warnings(action="ignore"):
+                call()
+        except MEANT:
+            pass
+        except Exception as error:
+            found.append(f"{name}({parameter}={wrong!r}): {error!r}")
+    return found
+
+
+@pytest.mark.slow
+def test_values():
+    assert not unlike_a_refusal(
+        (name, parameter, wrong, lambda call=call, wrong=wrong: call(wrong))
+        for name, parameter, call in parameters()
+        for wrong in WRONG
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("transform", [jax.jit, jax.vmap])
+def test_traced_values(transform):
+    def traced(call, wrong):
+        run = transform(lambda value: jax.tree.leaves(call(value)) and value)
+        lanes = (2, *wrong.shape) if transform is jax.vmap else wrong.shape
+        return lambda: jax.eval_shape(run, jax.ShapeDtypeStruct(lanes, wrong.dtype))
+
+    assert not unlike_a_refusal(
+        (name, parameter, wrong, traced(call, wrong))
+        for name, parameter, call in parameters()
+        for wrong in TRACED
+    )

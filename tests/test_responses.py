@@ -1,0 +1,111 @@
+"""Steps and sines: python-control for small ones, limits for large ones, refusals."""
+
+import control
+import numpy as np
+import pytest
+from helpers import random_linkage
+from test_gains import pd_at
+
+import fdof_jax as fj
+
+STEP, DURATION = 1e-4, 3.0
+
+
+@pytest.fixture(scope="module")
+def arm():
+    rng = np.random.default_rng(3)
+    return random_linkage("RPR", rng), rng.uniform(-1, 1, 3)
+
+
+def controller_of(linkage, q, limit=np.inf):
+    gains = fj.control.gains_from_frequency(linkage, q, [8.0, 15.0, 20.0], 0.5)
+    pd = pd_at(q + 7, *gains)  # whose own reference is not used
+    return fj.PDController(pd.kp, pd.kd, np.full(3, limit), pd.reference)
+
+
+@pytest.fixture(scope="module")
+def small(arm):
+    linkage, q = arm
+    pd = controller_of(linkage, q)
+    return fj.analysis.step_and_sine(linkage, q, pd, step=STEP, duration=DURATION)
+
+
+def test_small_steps_and_sines_agree_with_python_control(arm, small):
+    linkage, q = arm
+    pd = controller_of(linkage, q)
+    # Where the arm rests, sagging.
+    hold = pd_at(q, pd.kp, pd.kd)
+    rest = fj.analysis.equilibrium(linkage, q, (hold,))
+    ts = np.linspace(0, DURATION, 20001)
+    for k in range(3):
+        loop = fj.analysis.open_loop(linkage, rest, hold, k + 1)
+        A = loop.A - np.outer(loop.B, loop.C)
+        position = np.eye(6)[k]
+        # The set point acts through kp alone, and through kd with its velocity.
+        by_kp = control.ss(A, pd.kp[k] * loop.B[:, None], position[None], 0)
+        _, y = control.step_response(by_kp, ts)
+        info = control.step_info(y, ts)
+        spacing = 2 * DURATION / 20000
+        np.testing.assert_allclose(
+            small.overshoot[k], info["Overshoot"] / 100, atol=1e-4
+        )
+        for found, name in [
+            (small.rise_time[k], "RiseTime"), (small.settling_time[k], "SettlingTime"),
+        ]:  # fmt: skip
+            np.testing.assert_allclose(found, info[name], atol=2 * spacing)
+        sampled = np.interp(small.ts, ts, y)
+        np.testing.assert_allclose(small.response[k], sampled, atol=1e-3)
+        closed = control.ss(A, loop.B[:, None], loop.C[None], 0)
+        gain = closed(1j * small.frequency[k])
+        np.testing.assert_allclose(small.gain[k], gain, atol=1e-3)
+        bandwidth = control.bandwidth(closed)
+        np.testing.assert_allclose(small.bandwidth[k], bandwidth, rtol=5e-3)
+        assert small.saturated[k] == 0
+
+
+def test_weak_actuators_are_slower_and_at_their_limits(arm, small):
+    linkage, q = arm
+    light = linkage.replace(gravity=0)
+    pd = controller_of(light, q, limit=30.0)
+    large = fj.analysis.step_and_sine(light, q, pd, step=0.8, duration=DURATION)
+    assert (large.saturated > 0.02).all()
+    assert (large.bandwidth < 0.8 * small.bandwidth).all()
+
+
+def test_an_arm_that_does_not_come_to_rest_is_not_settled(arm):
+    linkage, q = arm
+    undamped = fj.PDController(
+        controller_of(linkage, q).kp,
+        np.zeros(3),
+        np.full(3, np.inf),
+        pd_at(q, 1, 1).reference,
+    )
+    test = fj.analysis.step_and_sine(linkage, q, undamped, step=STEP, duration=DURATION)
+    assert np.isnan(test.settling_time).all()
+
+
+def test_a_report_is_shown(small):
+    text, html = str(small), small._repr_html_()
+    assert text.count("\n") == 4 and "overshoot" in text
+    assert f"<th>R1</th><td>{STEP:.4g}</td>" in html
+    fig = fj.plotting.response_profile(small)
+    above, below = fig.axes
+    assert [line.get_label() for line in above.lines] == ["reference", "R1", "P2", "R3"]
+    assert below.get_xscale() == "log"
+
+
+def test_malformed_tests_are_refused(arm):
+    linkage, q = arm
+    pd = controller_of(linkage, q)
+    pid = fj.control.PIDController(9.0, 1.0, 1.0, np.inf, pd.reference)
+    loose = fj.PDController([9.0, 0.0, 9.0], pd.kd, pd.limit, pd.reference)
+    weightless = linkage.replace(gravity=0)
+    for arguments, step, message in [
+        ((linkage, q, pd), 0, "step: .* above 0"),
+        ((linkage, q, pid), 1, "controller: expected a PDController, or a drive"),
+        ((weightless, q, loose), 1, "controller: expected one with which each joint"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            fj.analysis.step_and_sine(*arguments, step=step, duration=1.0)
+    with pytest.raises(ValueError, match="test: expected a StepAndSine"):
+        fj.plotting.response_profile(pd)

@@ -1,0 +1,103 @@
+"""How a sweep cuts its members into chunks, and what it compiles for them."""
+
+import jax
+import numpy as np
+import pytest
+from sweep_batch import SETTINGS, TS, run, successful
+
+import fdof_jax as fj
+from fdof_jax.base import configuration
+from fdof_jax.simulation import chunk_programs, chunks
+
+LANES = 64  # enough for a slow member to be stopped
+
+
+@pytest.fixture
+def solved(monkeypatch):
+    """Returns a list of the starts of each chunk solved from here on."""
+    found = []
+    original = chunks._solve_chunk
+
+    def recorded(program, moving, arrays):
+        found.append([np.asarray(leaf) for leaf in moving])
+        return original(program, moving, arrays)
+
+    monkeypatch.setattr(chunks, "_solve_chunk", recorded)
+    return found
+
+
+def pendulums(speeds):
+    """Returns double pendulums that start level, at these speeds of the first joint."""
+    linkage = fj.scenes.double_pendulum().linkage
+    qd = np.stack([speeds, np.zeros_like(speeds)], axis=1)
+    return linkage, fj.State(np.zeros_like(qd), qd)
+
+
+def swept(speeds, **keywords):
+    return fj.sweep(*pendulums(speeds), TS, **{**SETTINGS, **keywords})
+
+
+def test_small_batches_of_many_sizes_share_a_program(solved):
+    speeds = np.linspace(0, 1, 8)
+    swept(speeds)
+    before = chunk_programs.compiled.cache_info().misses
+    for size in (2, 5, 7):
+        assert swept(speeds[:size]).q.shape == (size, len(TS), 2)
+    assert chunk_programs.compiled.cache_info().misses == before
+    assert [len(q) for q, _ in solved] == [8] * 4
+
+
+def test_a_batch_of_one_chunk_needs_no_forecast(monkeypatch):
+    monkeypatch.setattr(chunks, "expected_work", None)
+    assert successful(swept(np.linspace(0, 1, 8))).all()
+
+
+def test_the_longest_motions_come_first(solved, monkeypatch):
+    monkeypatch.setattr(chunks, "_cores", lambda: 1)  # several begin chunks in any order
+    speeds = np.array([0.0, 9, 1, 8, 2, 7, 3, 6, 4, 5, 10, 11])
+    swept(speeds, chunk=4)
+    found = [set(qd[:, 0]) for _, qd in solved]
+    assert found == [{8.0, 9, 10, 11}, {4.0, 5, 6, 7}, {0.0, 1, 2, 3}]
+
+
+def test_cores_change_nothing(batch, monkeypatch):
+    """Chunks are the same ones, whatever the number of threads that send them."""
+    motions = []
+    for cores in (1, 3):
+        monkeypatch.setattr(chunks, "_cores", lambda cores=cores: cores)
+        motions.append(run(batch))
+    for a, b in zip(*map(jax.tree.leaves, motions)):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_a_slow_member_is_stopped_and_solved_alone(solved):
+    speeds = np.linspace(0, 1, LANES)
+    speeds[20] = 60
+    motion = swept(speeds)
+    assert [len(q) for q, _ in solved] == [LANES, 1]
+    np.testing.assert_array_equal(solved[1][1], [[60, 0]])
+    assert successful(motion).all()
+    steps = np.asarray(motion.stats["num_steps"])
+    assert steps[20] > 5 * np.delete(steps, 20).max()
+    linkage, (q, qd) = pendulums(speeds)
+    for member in (20, 21):
+        alone = fj.simulate(linkage, fj.State(q[member], qd[member]), TS, **SETTINGS)
+        np.testing.assert_allclose(motion.q[member], alone.q, rtol=1e-6, atol=1e-6)
+
+
+def test_members_out_of_steps_are_not_solved_again(solved):
+    motion = swept(np.linspace(0, 1, LANES), max_steps=3)
+    assert len(solved) == 1
+    assert not successful(motion).any()
+    assert (motion.stats["num_steps"] == 3).all()
+
+
+def test_times_in_common_are_not_copied():
+    times = swept(np.linspace(0, 1, 8)).ts
+    assert times.strides[0] == 0
+    np.testing.assert_array_equal(times, np.tile(TS, (8, 1)))
+
+
+def test_an_option_that_xla_does_not_know_is_left_out(monkeypatch):
+    monkeypatch.setattr(configuration, "_WIDE", {"xla_cpu_no_such_option": 1})
+    assert configuration.wide_vectors.__wrapped__() == {}

@@ -1,0 +1,250 @@
+"""A store keeps the results of a sweep in a Zarr group, in blocks, for any workers."""
+
+import os
+import re
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import xarray
+from sweep_batch import FAILED, SETTINGS, TS, run
+
+import fdof_jax as fj
+from fdof_jax.simulation import store
+from fdof_jax.simulation.provenance import outline
+
+BLOCKS, BLOCK = 6, 7  # members
+
+
+def read(folder):
+    """Returns the bytes of all files of a store."""
+    files = (path for path in Path(folder).rglob("*") if path.is_file())
+    return {str(path.relative_to(folder)): path.read_bytes() for path in files}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def small_blocks():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(store, "_CHUNKS", 1)
+        yield
+
+
+@pytest.fixture(scope="module")
+def undisturbed(mixed, small_blocks, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("undisturbed")
+    assert run(mixed, store=folder) == folder
+    return read(folder)
+
+
+@pytest.fixture
+def stored(undisturbed, tmp_path):
+    """Returns a copy of the undisturbed store."""
+    for name, data in undisturbed.items():
+        path = tmp_path / "copy" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(data)
+    return tmp_path / "copy"
+
+
+@pytest.fixture
+def solved(monkeypatch):
+    """Returns a list of the sizes of the blocks that are solved from here on."""
+    sizes = []
+    original = store.in_chunks
+
+    def recorded(batch, *arguments):
+        sizes.append(batch.size)
+        return original(batch, *arguments)
+
+    monkeypatch.setattr(store, "in_chunks", recorded)
+    return sizes
+
+
+def end(motion):
+    return {"end": motion.q[-1], "result": motion.result, "is new": jnp.array(True)}
+
+
+def test_xarray_opens_it(stored, swept):
+    with xarray.open_zarr(stored) as data:
+        assert data.q.dims == data.qd.dims == ("member", "time", "joint")
+        assert (data.q.units, data.qd.units) == ("m or rad", "m/s or rad/s")
+        assert (data.time.units, data.time_reached.units) == ("s", "s")
+        np.testing.assert_array_equal(data.time, TS)
+        assert data.attrs["versions"]["fdof_jax"] == fj.__version__
+        assert np.flatnonzero(data.failed).tolist() == FAILED
+        words = np.array(data.outcome.flag_meanings.split())[data.outcome]
+        assert [word.replace("_", " ") for word in words] == swept.outcome.tolist()
+        for name in ("q", "qd"):
+            found, expected = data[name].to_numpy(), getattr(swept, name)
+            np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(data.num_steps, swept.stats["num_steps"], atol=5)
+
+
+def test_it_is_solved_once(mixed, stored, undisturbed, solved):
+    run(mixed, store=str(stored))
+    assert not solved and read(stored) == undisturbed
+
+
+def test_shards_in_any_order(mixed, undisturbed, solved, tmp_path):
+    for shard in (2, 0, 1):
+        run(mixed, store=tmp_path, shard=shard, of=3)
+        if shard == 0:
+            with xarray.open_zarr(tmp_path) as data:  # -1 is not solved yet
+                missing = np.flatnonzero(data.outcome == -1) // BLOCK
+                assert set(missing) == {1, 4} and data.failed[BLOCK]
+    run(mixed, store=tmp_path, shard=7, of=8)  # more workers than blocks
+    assert len(solved) == BLOCKS and read(tmp_path) == undisturbed
+
+
+def cast(data):
+    return np.frombuffer(data, float).astype(np.float16).tobytes()
+
+
+DAMAGES = {
+    "empty": lambda data: b"",
+    "cut": lambda data: data[:-1],
+    "longer": lambda data: data + b"0",
+    "flipped": lambda data: data[:5] + bytes([data[5] ^ 1]) + data[6:],
+    "cast": lambda data: cast(data) if len(data) % 8 == 0 else data[::2],
+}
+FILES = ["q/c/2/0/0", "outcome/c/2", "records/2.sha256", "qd/zarr.json", "time/c/0"]
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_damage_is_named_and_solved_again(mixed, stored, undisturbed, solved, damage):
+    for name in (*FILES, "zarr.json"):
+        (stored / name).write_bytes(DAMAGES[damage](undisturbed[name]))
+        with pytest.warns(RuntimeWarning, match=re.escape(name)):
+            run(mixed, store=stored)
+        assert read(stored) == undisturbed
+    assert solved == [BLOCK] * 3
+
+
+def test_files_that_are_swapped_or_missing(mixed, stored, undisturbed, solved):
+    one, other = "q/c/1/0/0", "q/c/4/0/0"
+    (stored / one).write_bytes(undisturbed[other])
+    (stored / other).unlink()
+    with pytest.warns(RuntimeWarning) as warned:
+        run(mixed, store=stored)
+    named = [one in str(w.message) or other in str(w.message) for w in warned]
+    assert named == [True, True] and len(solved) == 2
+    assert read(stored) == undisturbed
+    (stored / "records/3.sha256").unlink()  # as of a block that was not finished
+    run(mixed, store=stored)
+    assert len(solved) == 3 and read(stored) == undisturbed
+
+
+@pytest.mark.parametrize("written", [0, 1, 12, 20, 30])
+def test_a_run_that_ends_early(
+    mixed, undisturbed, solved, tmp_path, monkeypatch, written
+):
+    original, count = os.replace, []
+
+    def stop(*names):
+        count.append(names)
+        if len(count) > written:
+            raise KeyboardInterrupt
+        original(*names)
+
+    monkeypatch.setattr(os, "replace", stop)
+    with pytest.raises(KeyboardInterrupt):
+        run(mixed, store=tmp_path)
+    monkeypatch.setattr(os, "replace", original)
+    run(mixed, store=tmp_path)
+    assert read(tmp_path) == undisturbed
+    assert len(solved) <= BLOCKS + 1
+
+
+def test_another_sweep_needs_another_folder(mixed, stored, undisturbed):
+    linkage, state0, forces = mixed
+    moved = linkage, state0._replace(q=state0.q + 1e-9), forces
+    for batch, options, what in (
+        (moved, {}, "sweep"),
+        (mixed, dict(chunk=4), "chunk"),
+        (mixed, dict(max_steps=1499), "sweep"),
+        (mixed, dict(reduce=end), "sweep"),
+    ):
+        with pytest.raises(
+            ValueError, match=f"^store: expected .*{re.escape(str(stored))}.*{what}"
+        ):
+            run(batch, store=stored, **options)
+    assert read(stored) == undisturbed
+
+
+def test_only_what_is_asked_for(mixed, swept, tmp_path):
+    run(mixed, store=tmp_path, reduce=end)
+    with xarray.open_zarr(tmp_path) as data:
+        assert {*data} == {"end", "result", "is_new", "failed"}
+        assert data.end.dims == ("member", "end_1")
+        np.testing.assert_allclose(data.end, swept.q[:, -1], rtol=1e-6, atol=1e-6)
+        assert np.flatnonzero(data.result).tolist() == FAILED
+    with pytest.raises(RuntimeError, match="3 of 42 members failed.* member 3"):
+        run(mixed, store=tmp_path, reduce=end, throw=True)
+    clash = lambda motion: {"a b": motion.q, "a.b": motion.qd}
+    for reduce in (clash, lambda motion: {"failed": motion.q}):
+        with pytest.raises(ValueError, match="^reduce: expected .*name"):
+            run(mixed, store=tmp_path / "clash", reduce=reduce)
+
+
+def test_a_digest_names_what_functions_compute(batch):
+    linkage, state0, _ = jax.tree.map(lambda leaf: leaf[:2], batch)
+    everything = jax.tree.map(lambda leaf: True, (linkage, state0))
+
+    def digest(factor, reduce=lambda motion: motion.q):
+        force = lambda t, q, qd, linkage: factor * q
+        inputs = linkage, state0, (force,)
+        batch = store.Batch(inputs, (*everything, (False,)), 2)
+        settings = dict(
+            SETTINGS, dt0=1e-3, adjoint=diffrax.RecursiveCheckpointAdjoint()
+        )
+        return outline(batch, jnp.asarray(TS), settings, reduce)[1]
+
+    assert digest(2.0) == digest(2.0)
+    assert digest(2.0) != digest(3.0)
+    assert digest(jnp.full(3, 2.0)) != digest(jnp.full(3, 3.0))
+    assert digest(2.0) != digest(2.0, lambda motion: motion.q + 1)
+
+
+WORKER = """
+import sys
+import time
+import jax
+jax.config.update("jax_enable_x64", True)
+import sweep_batch
+from fdof_jax.simulation import store
+store._CHUNKS = 1
+batch = sweep_batch.with_failures(sweep_batch.members())
+sweep_batch.run(batch, store=sys.argv[1], shard=int(sys.argv[2]), of=3)
+"""
+
+
+@pytest.mark.slow
+def test_workers_that_are_killed(mixed, undisturbed, tmp_path):
+    """Three processes share a store. One of them is killed and started again."""
+    here = Path(__file__).parent
+    path = os.pathsep.join([str(here), str(here.parent)])
+
+    def start(shard):
+        command = [sys.executable, "-c", WORKER, str(tmp_path), str(shard)]
+        return subprocess.Popen(command, env=dict(os.environ, PYTHONPATH=path))
+
+    workers = [start(shard) for shard in range(3)]
+    try:
+        while not any(tmp_path.glob("q/c/*/*/*")) and workers[0].poll() is None:
+            time.sleep(0.01)
+        workers[0].kill()
+        workers[0].wait()
+        workers.append(start(0))
+        assert [worker.wait(timeout=300) for worker in workers[1:]] == [0, 0, 0]
+    finally:
+        for worker in workers:
+            worker.kill()
+    found = read(tmp_path)
+    assert {name: found[name] for name in undisturbed} == undisturbed
+    assert all(name.endswith(".part") for name in found.keys() - undisturbed.keys())
