@@ -16,8 +16,8 @@ from jax import Array
 
 from ..base.callbacks import without_checks
 from ..forces.element import elements
-from ..forces.part import jumps_of
 from .field import args_of, initial_own, own_states, whole
+from .known_times import clocks_apart, known_times
 from .landing import rounding
 from .prescribed import motion_at, start_of, term_of
 from .scene import Scene
@@ -135,6 +135,7 @@ def sensitivities(
         scene = scene_at(z)
         q0, qd0 = (jnp.asarray(a, dtype=float) for a in scene.state0)
         args = args_of(scene.linkage, q0, elements("scene.forces", scene.forces))
+        args = clocks_apart(args, ts)
         return args, whole(*start_of(args, qd0), initial_own(args))
 
     # One array, with the motion as first row and the derivatives below, gives the
@@ -167,7 +168,7 @@ def sensitivities(
         return term_of(args.forces).switches(t, y, args)
 
     def times_of(z):
-        return jumps_of(*motion_of(z)[0].forces)
+        return known_times(motion_of(z)[0])
 
     def observed(z, t, row):
         args, _ = motion_of(z)
