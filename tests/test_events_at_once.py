@@ -56,7 +56,7 @@ class Marks(fj.Element):
 
 
 def both_ways(start, places):
-    """Derivatives of the last position in the places by both integrations, and counts."""
+    """Derivatives of the last position in the places, by both integrations."""
     ts, state = jnp.array([0.0, 0.8]), fj.State(jnp.array([start]), jnp.array([2.0]))
 
     def end(places):
@@ -81,3 +81,32 @@ def test_each_of_coincident_switches_has_its_own_jump_and_is_said_to_coincide():
     apart = slopes(0.0, jnp.array([0.9, 1.0]))
     begun = slopes(1.0, jnp.array([1.0, 1.5]))
     assert [int(found[2]) for found in (together, apart, begun)] == [1, 0, 1]
+
+
+class Wall(fj.Element):
+    """A pull back to the start, and a stiff spring from 0.45 m on."""
+
+    def __call__(self, t, q, qd, linkage):
+        beyond = q - 0.45
+        return -10 + fj.forces.switch(beyond, -1e5 * beyond, 0.0, continuous=True)
+
+
+def test_what_turns_back_just_before_or_beyond_its_zero_is_seen():
+    """Without the wall, the slide would turn back at v^2/20, halfway through a step."""
+
+    def throw(speed, tolerance=1e-9):
+        found = fj.simulate(
+            SLIDE, fj.State([0], [speed]), [0, 0.8], (Wall(),), rtol=tolerance,
+            atol=tolerance,
+        )  # fmt: skip
+        return found.q[-1, 0], int(found.stats["num_switches"]), found.stats
+
+    for speed, switches in ((2.99, 0), (2.9999, 0), (3.0001, 2), (3.01, 2)):
+        _, count, stats = throw(speed)
+        share = np.sqrt(abs(speed**2 / 20 - 0.45) / 0.45)
+        assert count == switches
+        assert abs(stats["slowest_crossing"] / share - 1) < 1e-4
+    assert throw(3.0)[2]["slowest_crossing"] < 1e-4  # exact grazing
+    assert throw(2.9)[2]["slowest_crossing"] == np.inf
+    # The motion does not depend on whether a step happens to end beyond the wall.
+    assert abs(throw(3.001)[0] - throw(3.001, 1e-12)[0]) < 1e-8
