@@ -4,6 +4,7 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import fdof_jax as fj
 from fdof_jax.simulation.sensitivities import sensitivities
@@ -99,14 +100,28 @@ def test_what_turns_back_just_before_or_beyond_its_zero_is_seen():
             SLIDE, fj.State([0], [speed]), [0, 0.8], (Wall(),), rtol=tolerance,
             atol=tolerance,
         )  # fmt: skip
-        return found.q[-1, 0], int(found.stats["num_switches"]), found.stats
+        return found.q[-1, 0], int(found.stats["num_switches"]), found
 
     for speed, switches in ((2.99, 0), (2.9999, 0), (3.0001, 2), (3.01, 2)):
-        _, count, stats = throw(speed)
+        _, count, motion = throw(speed)
         share = np.sqrt(abs(speed**2 / 20 - 0.45) / 0.45)
         assert count == switches
-        assert abs(stats["slowest_crossing"] / share - 1) < 1e-4
-    assert throw(3.0)[2]["slowest_crossing"] < 1e-4  # exact grazing
-    assert throw(2.9)[2]["slowest_crossing"] == np.inf
+        assert abs(motion.stats["slowest_crossing"] / share - 1) < 1e-4
+        assert ("switches: 2" in repr(motion)) == (count == 2)
+        assert ("nearly grazes" in repr(motion)) == (share < 0.01)
+    assert throw(3.0)[2].stats["slowest_crossing"] < 1e-4  # exact grazing
+    free = throw(2.9)[2]
+    assert free.stats["slowest_crossing"] == np.inf
+    assert "switch" not in repr(free)
     # The motion does not depend on whether a step happens to end beyond the wall.
     assert abs(throw(3.001)[0] - throw(3.001, 1e-12)[0]) < 1e-8
+
+
+@pytest.mark.parametrize("transform", [jax.vmap, jax.jit])
+def test_a_switch_that_the_integrator_cannot_see_is_refused(transform):
+    friction = transform(lambda q, qd: -fj.forces.switch(q, 0.1, 2.0) * qd)
+    force = lambda t, q, qd, linkage: friction(q, qd)
+    with pytest.raises(
+        ValueError, match=r"forces\[0\].switch: expected a call outside"
+    ):
+        fj.simulate(SLIDE, fj.State([0], [1]), [0, 0.1], (force,))
