@@ -160,6 +160,10 @@ def test_margins_agree_with_python_control(topology, lagged):
         np.testing.assert_allclose(np.rad2deg(loop.phase_margin), phase, rtol=1e-6)
         np.testing.assert_allclose(loop.crossover, crossover, rtol=1e-6)
         np.testing.assert_allclose(loop.modulus_margin, min(modulus, 1), rtol=1e-6)
+        margins = control.stability_margins(system, returnall=True)
+        phases, crossings = margins[1], margins[4]
+        delays = np.deg2rad(phases % 360) / crossings
+        np.testing.assert_allclose(loop.delay_margin, delays.min(), rtol=1e-6)
         closed = control.ss(system.A - system.B @ system.C, system.B, system.C, 0)
         expected = control.bandwidth(closed)
         np.testing.assert_allclose(loop.bandwidth, expected, rtol=1e-4)
