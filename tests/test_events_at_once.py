@@ -4,6 +4,7 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import fdof_jax as fj
 from fdof_jax.simulation.sensitivities import sensitivities
@@ -56,7 +57,7 @@ class Marks(fj.Element):
 
 
 def both_ways(start, places):
-    """Derivatives of the last position in the places by both integrations, and counts."""
+    """Derivatives of the last position in the places, by both integrations."""
     ts, state = jnp.array([0.0, 0.8]), fj.State(jnp.array([start]), jnp.array([2.0]))
 
     def end(places):
@@ -81,3 +82,46 @@ def test_each_of_coincident_switches_has_its_own_jump_and_is_said_to_coincide():
     apart = slopes(0.0, jnp.array([0.9, 1.0]))
     begun = slopes(1.0, jnp.array([1.0, 1.5]))
     assert [int(found[2]) for found in (together, apart, begun)] == [1, 0, 1]
+
+
+class Wall(fj.Element):
+    """A pull back to the start, and a stiff spring from 0.45 m on."""
+
+    def __call__(self, t, q, qd, linkage):
+        beyond = q - 0.45
+        return -10 + fj.forces.switch(beyond, -1e5 * beyond, 0.0, continuous=True)
+
+
+def test_what_turns_back_just_before_or_beyond_its_zero_is_seen():
+    """Without the wall, the slide would turn back at v^2/20, halfway through a step."""
+
+    def throw(speed, tolerance=1e-9):
+        found = fj.simulate(
+            SLIDE, fj.State([0], [speed]), [0, 0.8], (Wall(),), rtol=tolerance,
+            atol=tolerance,
+        )  # fmt: skip
+        return found.q[-1, 0], int(found.stats["num_switches"]), found
+
+    for speed, switches in ((2.99, 0), (2.9999, 0), (3.0001, 2), (3.01, 2)):
+        _, count, motion = throw(speed)
+        share = np.sqrt(abs(speed**2 / 20 - 0.45) / 0.45)
+        assert count == switches
+        assert abs(motion.stats["slowest_crossing"] / share - 1) < 1e-4
+        assert ("switches: 2" in repr(motion)) == (count == 2)
+        assert ("nearly grazes" in repr(motion)) == (share < 0.01)
+    assert throw(3.0)[2].stats["slowest_crossing"] < 1e-4  # exact grazing
+    free = throw(2.9)[2]
+    assert free.stats["slowest_crossing"] == np.inf
+    assert "switch" not in repr(free)
+    # The motion does not depend on whether a step happens to end beyond the wall.
+    assert abs(throw(3.001)[0] - throw(3.001, 1e-12)[0]) < 1e-8
+
+
+@pytest.mark.parametrize("transform", [jax.vmap, jax.jit])
+def test_a_switch_that_the_integrator_cannot_see_is_refused(transform):
+    friction = transform(lambda q, qd: -fj.forces.switch(q, 0.1, 2.0) * qd)
+    force = lambda t, q, qd, linkage: friction(q, qd)
+    with pytest.raises(
+        ValueError, match=r"forces\[0\].switch: expected a call outside"
+    ):
+        fj.simulate(SLIDE, fj.State([0], [1]), [0, 0.1], (force,))

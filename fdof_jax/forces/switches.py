@@ -9,10 +9,16 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
+import jax.core
+import jax.extend.core
 import jax.numpy as jnp
 from jax import Array
 from jax.typing import ArrayLike
 
+# Before JAX 0.10 it was in `jax.core`.
+_home: Any = (
+    jax.extend.core if hasattr(jax.extend.core, "get_opaque_trace_state") else jax.core
+)
 _open: list["Switches"] = []  # while an element is traced within a solve
 
 
@@ -29,6 +35,12 @@ class Switches:
         self.sides, self.values, self.jumping, self._count = sides, [], False, 0
 
     def side_of(self, g: Array, continuous: bool) -> Array:
+        if self._transformation != _transformation():
+            raise ValueError(
+                "switch: expected a call outside of functions that JAX transforms, as "
+                "by jax.jit or jax.vmap, because steps end at the zeros of g. Both "
+                "`switch` and `clip` take whole arrays."
+            )
         self.values.append(g)
         self.jumping |= not continuous
         if self.sides is None:
@@ -59,11 +71,17 @@ class Switches:
     @contextmanager
     def dealt(self) -> Iterator[None]:
         """Deals out sides to the switches traced in this context."""
+        self._transformation = _transformation()
         _open.append(self)
         try:
             yield
         finally:
             _open.pop()
+
+
+def _transformation() -> Any:
+    """Returns what stands for JAX's transformation that is traced at present."""
+    return _home.get_opaque_trace_state(convention="nnx")
 
 
 def switch(
@@ -80,8 +98,8 @@ def switch(
     `continuous`: whether the effort is the same on both sides where `g` is 0, in every
     use of the result; programs for derivatives then compile faster.
 
-    Not within a function of its own that JAX transforms, by `jax.jit`, `jax.vmap` or
-    `jax.grad` for instance.
+    **Raises:** ValueError within a function that the element itself has transformed by
+    JAX, as by `jax.jit`, `jax.vmap` or `jax.grad`.
 
     >>> import fdof_jax as fj
     >>> class Drag(fj.Element):  # air on one side, water on the other

@@ -38,7 +38,8 @@ class Switching(NamedTuple):
     - `lateness` (2,): times of the first switch here, and of others, less that of the
       end: 0, with derivatives [s].
     - `passed`: number of switches up to here.
-    - `one_sided`: number of places up to here where derivatives may be (see `Located`).
+    - `one_sided`: number of places up to here where derivatives may be (see `Located`);
+      None if nothing jumps at switches.
     - `grazing`, `grazing_here`: how near to grazing a crossing came so far, and one
       here; 0 if none (see `at_end`).
     """
@@ -51,7 +52,7 @@ class Switching(NamedTuple):
     sizes: Array
     lateness: Array
     passed: Array
-    one_sided: Array
+    one_sided: Array | None
     grazing: Array
     grazing_here: Array
 
@@ -86,7 +87,17 @@ def located(
         unknown, none = jnp.zeros(found.shape, t0.dtype), jnp.zeros_like(t0)
         late = wrapped.none_late(t0)
         known = Switching(
-            unknown, unknown, t0, t0, none, unknown, late, none, none, none, none
+            unknown,
+            unknown,
+            t0,
+            t0,
+            none,
+            unknown,
+            late,
+            none,
+            none if jumping else None,
+            none,
+            none,
         )
         solver, y0 = wrapped, (*y0, known)
     if jumps is None and not switches:
@@ -100,7 +111,8 @@ def switching_facts(*known: Switching) -> dict[str, Array]:
     facts = {}
     for switching in known:
         facts["num_switches"] = switching.passed[0].astype(int)
-        facts["one_sided"] = switching.one_sided[0].astype(int)
+        if switching.one_sided is not None:
+            facts["one_sided"] = switching.one_sided[0].astype(int)
         facts["slowest_crossing"] = 1 / switching.grazing[0]
     return facts
 
@@ -160,7 +172,7 @@ class Located(diffrax.AbstractAdaptiveSolver):
         where = terms.term, t0, t1, path, args
         seen = _values(*constant(where))
         margins = sides[None] * seen
-        until, crossed = first_zero(margins)
+        until, crossed, missed = first_zero(margins, known.sizes)
         # Lengths of steps to a switch say nothing about the pace of the motion.
         share = jnp.finfo(t1.dtype).eps ** _NEAR
         near = jnp.maximum(share * (t1 - t0), known.near / 2)
@@ -180,7 +192,9 @@ class Located(diffrax.AbstractAdaptiveSolver):
             self.lateness(where, seen, switched),
             known.passed + changed,
             self.one_sided(known, sides, sizes, changed),
-            kept(jnp.maximum(known.grazing, known.grazing_here), known.grazing),
+            jnp.maximum(
+                missed, jnp.maximum(known.grazing, kept(known.grazing_here, 0))
+            ),
             grazing,
         )
         still = jax.tree.map(jnp.zeros_like, new)
@@ -198,10 +212,10 @@ class Located(diffrax.AbstractAdaptiveSolver):
 
     def one_sided(
         self, known: Switching, sides: Array, sizes: Array, changed: Array
-    ) -> Array:
+    ) -> Array | None:
         """Returns `Switching.one_sided` at the end of a step."""
-        if not self.jumping:
-            return known.one_sided
+        if known.one_sided is None:
+            return None
         # What began on its zero has left it, in one or more steps.
         on_zero = known.sizes <= jnp.finfo(sizes.dtype).eps ** BEYOND * sizes
         begun = jnp.any(on_zero & (sizes > 0) & (sides != 0))
