@@ -26,7 +26,7 @@ _SORTED = np.argsort(_FINER)
 # Steps end where a switching function has passed its zero by this power of the unit of
 # rounding, times its size, and by this multiple of it. At rest on the zero it can be
 # told there to which side the motion goes.
-_BEYOND, _ROUNDING = 0.625, 500
+BEYOND, _ROUNDING = 0.625, 500
 _SOON = 0.01  # of a step, for extrapolation
 _NOISE = 4 * np.abs(_BEND).sum()  # of the second derivative, in units of rounding
 _ITERATIONS = 6  # of Newton's method within a bracket
@@ -55,7 +55,7 @@ def first_zero(margins: Array) -> tuple[Array, Array]:
     if not margins.size:
         return jnp.ones((), margins.dtype), jnp.array(False)
     eps = jnp.finfo(margins.dtype).eps
-    beyond = eps**_BEYOND * jnp.max(jnp.abs(margins), axis=0) + _ROUNDING * eps
+    beyond = eps**BEYOND * jnp.max(jnp.abs(margins), axis=0) + _ROUNDING * eps
     margins = margins + beyond[None]
     finer = jnp.concatenate([margins, _times(_TO_BETWEEN, margins)])[_SORTED]
     # What is on the wrong side from the start on changes at once.
