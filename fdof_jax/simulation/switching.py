@@ -247,8 +247,8 @@ class Located(diffrax.AbstractAdaptiveSolver):
         passed = [before, after]
         if self.jumping and before.size > 1:  # kinks change second derivatives alone
             passed.insert(1, jnp.where(first_of(after != before), after, before))
-        for time, *both in zip(late, passed, passed[1:]):
-            moment = Moment(t, y, args, *both, jnp.array(made_jump))
+        for time, before, after in zip(late, passed, passed[1:]):
+            moment = Moment(t, y, args, before, after, jnp.array(made_jump))
             gain = gained(time, moment, term=term, jumping=self.jumping)
             y = jax.tree.map(jnp.add, y, gain)
         return y
