@@ -53,7 +53,9 @@ def test_a_batch_of_one_chunk_needs_no_forecast(monkeypatch):
 
 
 def test_the_longest_motions_come_first(solved, monkeypatch):
-    monkeypatch.setattr(chunks, "_cores", lambda: 1)  # several begin chunks in any order
+    monkeypatch.setattr(
+        chunks, "_cores", lambda: 1
+    )  # several begin chunks in any order
     speeds = np.array([0.0, 9, 1, 8, 2, 7, 3, 6, 4, 5, 10, 11])
     swept(speeds, chunk=4)
     found = [set(qd[:, 0]) for _, qd in solved]

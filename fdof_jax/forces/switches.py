@@ -13,6 +13,11 @@ import jax.numpy as jnp
 from jax import Array
 from jax.typing import ArrayLike
 
+try:
+    from jax.extend.core import get_opaque_trace_state
+except ImportError:  # before JAX 0.10
+    from jax.core import get_opaque_trace_state  # pyright: ignore
+
 _open: list["Switches"] = []  # while an element is traced within a solve
 
 
@@ -29,6 +34,12 @@ class Switches:
         self.sides, self.values, self.jumping, self._count = sides, [], False, 0
 
     def side_of(self, g: Array, continuous: bool) -> Array:
+        if self._transformation != _transformation():
+            raise ValueError(
+                "switch: expected a call outside of functions that JAX transforms, as "
+                "by jax.jit or jax.vmap, because steps end at the zeros of g. Both "
+                "`switch` and `clip` take whole arrays."
+            )
         self.values.append(g)
         self.jumping |= not continuous
         if self.sides is None:
@@ -59,11 +70,17 @@ class Switches:
     @contextmanager
     def dealt(self) -> Iterator[None]:
         """Deals out sides to the switches traced in this context."""
+        self._transformation = _transformation()
         _open.append(self)
         try:
             yield
         finally:
             _open.pop()
+
+
+def _transformation() -> Any:
+    """Returns what stands for JAX's transformation that is traced at present."""
+    return get_opaque_trace_state(convention="nnx")
 
 
 def switch(
@@ -80,8 +97,8 @@ def switch(
     `continuous`: whether the effort is the same on both sides where `g` is 0, in every
     use of the result; programs for derivatives then compile faster.
 
-    Not within a function of its own that JAX transforms, by `jax.jit`, `jax.vmap` or
-    `jax.grad` for instance.
+    **Raises:** ValueError within a function that the element itself has transformed by
+    JAX, as by `jax.jit`, `jax.vmap` or `jax.grad`.
 
     >>> import fdof_jax as fj
     >>> class Drag(fj.Element):  # air on one side, water on the other

@@ -29,6 +29,11 @@ class Args(NamedTuple):
     constants: Constants
     forces: tuple[Element, ...]
     sides: Array | None = None  # (switch,) in force, where switches are located
+    ahead: Array | None = None  # (element,) by which its clock is ahead, if any [s]
+
+    def clock(self, index: int, t: Any) -> Any:
+        """Returns the time by an element's clock (see `clocks_apart`)."""
+        return t if self.ahead is None else t + self.ahead[index]
 
 
 def args_of(linkage: Linkage, q0: Array, forces: tuple[Element, ...]) -> Args:
@@ -43,7 +48,8 @@ def schedule_of(t: Array, args: Args) -> tuple[Any, ...]:
     schedules = []
     for index, element in enumerate(args.forces):
         with naming(f"forces[{index}]"):
-            schedules.append(element.schedule(t, args.linkage))
+            at = args.clock(index, t)
+            schedules.append(element.schedule(at, args.linkage))
     return tuple(schedules)
 
 
@@ -99,8 +105,9 @@ def _effort(t: Any, y: Any, args: Args, schedule: tuple[Any, ...]) -> tuple[Any,
                 effort = element.respond(scheduled, q, qd, args.linkage)
         else:
             state = next(states) if isinstance(element, StatefulElement) else ()
+            at = args.clock(index, t), *arrays(), args.linkage
             effort, rate, values, jumping = _switched_effort(
-                index, element, t, *arrays(), args.linkage, state, switches.rest()
+                index, element, *at, state, switches.rest()
             )
             switches.add(values, jumping)
             own_rates += _scalars(rate, args.q0.dtype)

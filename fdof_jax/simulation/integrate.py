@@ -11,7 +11,6 @@ from jax import Array
 
 from ..base.callbacks import without_checks
 from ..forces.joints import EffortHistory
-from ..forces.part import jumps_of
 from ..linkage.linkage import possible, without_fixed
 from ..mechanics.equations import zeros
 from .dopri8 import ScheduledTerm, constant
@@ -24,6 +23,7 @@ from .field import (
     vector_field,
     whole,
 )
+from .known_times import clocks_apart, known_times
 from .looped_dopri8 import LoopedDopri8
 from .packing import in_arrays
 from .prescribed import agrees, motion_at, start_of, term_of
@@ -73,6 +73,8 @@ def integrate(
     solver = _differentiable(keywords["solver"] or LoopedDopri8(), keywords["adjoint"])
     valid, ts, (q0, qd0) = _harmless(inputs, padded)
     args = args_of(linkage, q0, forces)
+    if derivatives:
+        args = clocks_apart(args, ts)
     own = initial_own(args, own0)
     known = jnp.isfinite(jnp.array(own)).all()
     valid, own = valid & known, tuple(jnp.where(known, x, 0) for x in own)
@@ -90,8 +92,8 @@ def integrate(
     locate = lambda *known: wrapper(*known, derivatives)
     adaptive = isinstance(controller, diffrax.AbstractAdaptiveStepSizeController)
     # Fixed steps may pass over the kinks of a history, but over no jump.
-    jumping = (e for e in forces if adaptive or not isinstance(e, EffortHistory))
-    start = term, ts[0], y0, args, jumps_of(*jumping)
+    left_out = () if adaptive else (EffortHistory,)
+    start = term, ts[0], y0, args, known_times(args, *left_out)
     located_solver, controller, y0 = located(locate, solver, controller, *start)
     if adaptive:
         controller = Recorded(controller)  # pyright: ignore[reportCallIssue]

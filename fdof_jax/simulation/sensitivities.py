@@ -16,13 +16,14 @@ from jax import Array
 
 from ..base.callbacks import without_checks
 from ..forces.element import elements
-from ..forces.part import jumps_of
 from .field import args_of, initial_own, own_states, whole
+from .known_times import clocks_apart, known_times
 from .landing import rounding
 from .prescribed import motion_at, start_of, term_of
 from .scene import Scene
 from .solution import Solution
 from .steps import adaptive
+from .switch_derivatives import first_of
 from .switching import Located, located
 from .zeros_in_steps import slope_at_end
 
@@ -70,41 +71,51 @@ class _LocatedRows(Located):
         return jnp.zeros(2, t.dtype)
 
     def lateness(self, where, seen, switched):
-        """Returns which function switched, and its slope at the end of the step."""
-        _, t0, t1, _, args = where
+        """Returns the slopes of the first function that switched and of another."""
+        _, t0, t1, *_ = where
         if not self.jumping:
             return self.none_late(t0)
-        first = jnp.argmin(jnp.where(switched, args.sides * seen[-1], jnp.inf))
-        slope = slope_at_end(seen)[first] / (t1 - t0)
-        return jnp.stack([first.astype(slope.dtype), slope])
+        length = t1 - t0
+        slopes = jnp.where(length > 0, slope_at_end(seen), 0)
+        slopes = slopes / jnp.where(length > 0, length, 1)
+        others = switched & ~first_of(switched)
+        return slopes[jnp.stack([jnp.argmax(switched), jnp.argmax(others)])]
 
     def shifted(self, term, t, y, args, known, made_jump):
         if not (self.jumping or self.jumps is not None):
             return y
         (rows,), time = y, known.until
-        first, slope = known.lateness
+        before, after = known.sides, args.sides
 
         def moved():
-            times = jnp.stack([time, t])
-            sides = jnp.stack([known.sides, args.sides])
+            first = first_of(before != after)
+            between = jnp.where(first, after, before)
+            times, sides = [time, t, t, t], [before, before, between, after]
             rates = jax.vmap(self.rates, in_axes=(0, None, None, 0))
-            before, after = rates(times, rows[0], args.z, sides)
-            late = jnp.zeros(self.count, rows.dtype)
+            rates = rates(jnp.stack(times), rows[0], args.z, jnp.stack(sides))
+            none = jnp.zeros(self.count, rows.dtype)
+            late = [none] * 3  # the known time here, a switch, and another one
             if self.jumps is not None and self.slopes is not None:
                 distance = jnp.abs(time - self.jumps)
                 index = jnp.argmin(distance)
                 known_time = distance[index] <= 2 * rounding(self.jumps[index])
-                late = jnp.where(known_time, self.slopes[index], late)
+                late[0] = jnp.where(known_time, self.slopes[index], none)
             if self.jumping:
-                before_it = args._replace(sides=known.sides)
-                value = lambda row, z: term.switches(
+                others = (before != after) & ~first
+                places = jnp.stack([jnp.argmax(first), jnp.argmax(others)])
+                before_it = args._replace(sides=before)
+                values = lambda row, z: term.switches(
                     time, (row[None],), before_it._replace(z=z)
-                )[0][first.astype(int)]
-                _, change = jax.linearize(value, rows[0], args.z)
+                )[0][places]
+                _, change = jax.linearize(values, rows[0], args.z)
                 changes = jax.vmap(change)(rows[1:], jnp.eye(self.count))
-                switched = jnp.any((known.sides != args.sides) & (known.sides != 0))
-                late = jnp.where(switched, -changes / slope, late)
-            return rows.at[1:].add(jnp.outer(late, before - after))
+                # A function that jumps itself does so at a known time.
+                steep = known.lateness != 0
+                slopes = jnp.where(steep, known.lateness, 1)
+                of_zeros = -changes.T / slopes[:, None]
+                late[1:] = jnp.where(steep[:, None], of_zeros, late[0][None])
+            gain = jnp.stack(late, axis=1) @ (rates[:-1] - rates[1:])
+            return rows.at[1:].add(gain)
 
         return (jax.lax.cond(made_jump, moved, lambda: rows),)
 
@@ -135,6 +146,7 @@ def sensitivities(
         scene = scene_at(z)
         q0, qd0 = (jnp.asarray(a, dtype=float) for a in scene.state0)
         args = args_of(scene.linkage, q0, elements("scene.forces", scene.forces))
+        args = clocks_apart(args, ts)
         return args, whole(*start_of(args, qd0), initial_own(args))
 
     # One array, with the motion as first row and the derivatives below, gives the
@@ -167,7 +179,7 @@ def sensitivities(
         return term_of(args.forces).switches(t, y, args)
 
     def times_of(z):
-        return jumps_of(*motion_of(z)[0].forces)
+        return known_times(motion_of(z)[0])
 
     def observed(z, t, row):
         args, _ = motion_of(z)

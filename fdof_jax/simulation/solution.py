@@ -18,6 +18,9 @@ OUTCOMES = (
     "tolerance out of reach", "too many switches", "solver failed",
 )  # fmt: skip
 
+# Slower crossings are near to grazing, where no derivative exists.
+SLOW = 0.01
+
 
 def outcome_numbers(result: diffrax.RESULTS) -> np.ndarray:
     """Returns the places of results in `OUTCOMES`."""
@@ -40,8 +43,11 @@ class Solution(eqx.Module):
       at the worst step. Steps do not chase errors below it. If elements switch, also
       the number of switches, `num_switches`, and `slowest_crossing`: the least speed at
       which a switching function passed its zero, as a share of its size in the step, or
-      of the speed with which it would turn back at its size. Near 0 a contact grazes,
-      and the motion has no derivative.
+      of the speed with which it would turn back at its size. One that turns back within
+      1 % of its size before its zero counts as if it passed as far beyond. Near 0 a
+      contact grazes, and the motion has no derivative. If efforts jump at switches,
+      `one_sided`: the number of places where derivatives may hold on one side only,
+      because the motion starts on a switch or meets two at once.
     - `result`: diffrax's result, one per trajectory: `diffrax.RESULTS.successful` or
       the reason for the failure. `outcome` states it in words.
     - `own`: the states of the `StatefulElement`s at `ts`, in the order of the forces;
@@ -100,10 +106,32 @@ class Solution(eqx.Module):
             f"{number} {word}" if batch else word for word, number in outcomes
         )
         if "num_steps" in self.stats:
-            steps = np.asarray(self.stats["num_steps"])
-            least, most = steps.min(), steps.max()
-            facts["steps"] = f"{least}" if least == most else f"{least} to {most}"
+            facts["steps"] = _span(self.stats["num_steps"])
+        if np.max(self.stats.get("num_switches", 0)) > 0:
+            facts["switches"] = _span(self.stats["num_switches"])
+        if remarks := remarks_on_derivatives(self.stats):
+            facts["derivatives"] = ", ".join(remarks)
         return facts
+
+
+def _span(numbers: Any) -> str:
+    least, most = np.min(numbers), np.max(numbers)
+    return f"{least}" if least == most else f"{least} to {most}"
+
+
+def remarks_on_derivatives(stats: dict[str, Any]) -> list[str]:
+    """Returns what the statistics of one or more motions say about derivatives."""
+    words = []
+    if np.min(stats.get("slowest_crossing", np.inf)) < SLOW:
+        words.append(
+            "a switch nearly grazes: derivatives hold in a small neighbourhood only"
+        )
+    if np.max(stats.get("one_sided", 0)) > 0:
+        words.append(
+            "efforts jump at the start, or at two switches at once: derivatives may "
+            "hold on one side only"
+        )
+    return words
 
 
 def check_joints(name: str, solution: Solution, linkage: Linkage) -> None:

@@ -18,16 +18,20 @@ from .zeros_in_steps import bend_at_end, slope_at_end
 
 @eqx.filter_jit
 def lateness_of(margins: Array, switched: Array) -> Array:
-    """Returns the zero of the switched margins at the end of a step, as a share of it.
+    """Returns the zero of the first margin that `switched`, as a share of the step.
 
-    It is 0 with derivatives, of second order.
+    It is at the end of the step, 0 with derivatives, of second order.
     """
-    first = jnp.argmin(jnp.where(switched, margins[-1], jnp.inf))
-    margin = margins[:, first, None]
+    margin = margins[:, jnp.argmax(switched), None]
     slope, bend = slope_at_end(margin)[0], constant(bend_at_end(margin))[0]
-    slope = jnp.where(slope == 0, 1, slope)
+    slope = jnp.where((slope == 0) | ~switched.any(), 1, slope)
     late = _of_zero(margin[-1, 0] - constant(margin[-1, 0]), -1 / slope)
     return late - _of_zero(late, _of_zero(late, bend / (2 * slope)))
+
+
+def first_of(switched: Array) -> Array:
+    """Returns whether each switch is the first of those that switched."""
+    return switched & (jnp.cumsum(switched) == 1)
 
 
 @jax.custom_jvp

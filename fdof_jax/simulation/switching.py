@@ -17,8 +17,8 @@ from jax import Array
 from .dopri8 import DenseOutput, constant, with_change
 from .landing import Landing, rounding
 from .step_wrappers import undifferentiated, with_pid
-from .switch_derivatives import Moment, gained, lateness_of
-from .zeros_in_steps import SAMPLED, SHARES, at_end, first_zero
+from .switch_derivatives import Moment, first_of, gained, lateness_of
+from .zeros_in_steps import BEYOND, SAMPLED, SHARES, at_end, first_zero
 
 # What is zero around the end of a step switches there: within this power of the unit of
 # rounding, as a share of the step (1e-9 in float64).
@@ -35,8 +35,11 @@ class Switching(NamedTuple):
     - `soon`: when a switch follows soon after the end, or else the end [s].
     - `near`: how far from its zero a switching function may switch [s].
     - `sizes` (switch,): the largest values of the switching functions up to here.
-    - `lateness`: time of the switch here less that of the end: 0, with derivatives [s].
+    - `lateness` (2,): times of the first switch here, and of others, less that of the
+      end: 0, with derivatives [s].
     - `passed`: number of switches up to here.
+    - `one_sided`: number of places up to here where derivatives may be (see `Located`);
+      None if nothing jumps at switches.
     - `grazing`, `grazing_here`: how near to grazing a crossing came so far, and one
       here; 0 if none (see `at_end`).
     """
@@ -49,6 +52,7 @@ class Switching(NamedTuple):
     sizes: Array
     lateness: Array
     passed: Array
+    one_sided: Array | None
     grazing: Array
     grazing_here: Array
 
@@ -83,7 +87,17 @@ def located(
         unknown, none = jnp.zeros(found.shape, t0.dtype), jnp.zeros_like(t0)
         late = wrapped.none_late(t0)
         known = Switching(
-            unknown, unknown, t0, t0, none, unknown, late, none, none, none
+            unknown,
+            unknown,
+            t0,
+            t0,
+            none,
+            unknown,
+            late,
+            none,
+            none if jumping else None,
+            none,
+            none,
         )
         solver, y0 = wrapped, (*y0, known)
     if jumps is None and not switches:
@@ -97,6 +111,8 @@ def switching_facts(*known: Switching) -> dict[str, Array]:
     facts = {}
     for switching in known:
         facts["num_switches"] = switching.passed[0].astype(int)
+        if switching.one_sided is not None:
+            facts["one_sided"] = switching.one_sided[0].astype(int)
         facts["slowest_crossing"] = 1 / switching.grazing[0]
     return facts
 
@@ -109,7 +125,11 @@ def _around(wrapper: Callable[[Any], Any], controller: Any) -> Any:
 
 
 class Located(diffrax.AbstractAdaptiveSolver):
-    """A solver whose steps keep to branches, and tell where the first one changes."""
+    """A solver whose steps keep to branches, and tell where the first one changes.
+
+    Where efforts jump at a switch, derivatives may differ between the sides of motions
+    that start on the switch, or that meet it together with another.
+    """
 
     solver: Any
     jumping: bool = eqx.field(static=True)  # whether efforts do, at a switch
@@ -152,7 +172,7 @@ class Located(diffrax.AbstractAdaptiveSolver):
         where = terms.term, t0, t1, path, args
         seen = _values(*constant(where))
         margins = sides[None] * seen
-        until, crossed = first_zero(margins)
+        until, crossed, missed = first_zero(margins, known.sizes)
         # Lengths of steps to a switch say nothing about the pace of the motion.
         share = jnp.finfo(t1.dtype).eps ** _NEAR
         near = jnp.maximum(share * (t1 - t0), known.near / 2)
@@ -171,7 +191,10 @@ class Located(diffrax.AbstractAdaptiveSolver):
             sizes,
             self.lateness(where, seen, switched),
             known.passed + changed,
-            kept(jnp.maximum(known.grazing, known.grazing_here), known.grazing),
+            self.one_sided(known, sides, sizes, changed),
+            jnp.maximum(
+                missed, jnp.maximum(known.grazing, kept(known.grazing_here, 0))
+            ),
             grazing,
         )
         still = jax.tree.map(jnp.zeros_like, new)
@@ -185,19 +208,33 @@ class Located(diffrax.AbstractAdaptiveSolver):
 
     def none_late(self, t: Array) -> Array:
         """Returns the lateness before the first step."""
-        return jnp.zeros_like(t)
+        return jnp.zeros(2 if self.derivatives else (), t.dtype)
+
+    def one_sided(
+        self, known: Switching, sides: Array, sizes: Array, changed: Array
+    ) -> Array | None:
+        """Returns `Switching.one_sided` at the end of a step."""
+        if known.one_sided is None:
+            return None
+        # What began on its zero has left it, in one or more steps.
+        on_zero = known.sizes <= jnp.finfo(sizes.dtype).eps ** BEYOND * sizes
+        begun = jnp.any(on_zero & (sizes > 0) & (sides != 0))
+        together = (changed > 1) & (known.grazing_here > 0)
+        return jnp.maximum(known.one_sided, begun) + together
 
     def lateness(self, where: tuple, seen: Array, switched: Array) -> Array:
         """Returns `Switching.lateness` at the end of a step."""
         _, t0, t1, _, args = where
         if not self.derivatives:
-            return jnp.zeros_like(t0)
-        margins = lambda: args.sides[None] * _values(*where)
-        return jax.lax.cond(
-            jnp.any(switched),
-            lambda: (t1 - t0) * lateness_of(margins(), switched),
-            lambda: jnp.zeros_like(t0),
-        )
+            return self.none_late(t0)
+
+        def late():
+            margins = args.sides[None] * _values(*where)
+            others = switched & ~first_of(switched)
+            found = lateness_of(margins, switched), lateness_of(margins, others)
+            return (t1 - t0) * jnp.stack(found)
+
+        return jax.lax.cond(jnp.any(switched), late, lambda: self.none_late(t0))
 
     def shifted(
         self, term: Any, t: Array, y: Any, args: Any, known: Switching, made_jump: Any
@@ -206,9 +243,15 @@ class Located(diffrax.AbstractAdaptiveSolver):
         if not self.derivatives:
             return y
         late = jnp.where(made_jump, known.lateness, 0)
-        moment = Moment(t, y, args, known.sides, known.after, jnp.array(made_jump))
-        gain = gained(late, moment, term=term, jumping=self.jumping)
-        return jax.tree.map(jnp.add, y, gain)
+        before, after = known.sides, known.after
+        passed = [before, after]
+        if self.jumping and before.size > 1:  # kinks change second derivatives alone
+            passed.insert(1, jnp.where(first_of(after != before), after, before))
+        for time, before, after in zip(late, passed, passed[1:]):
+            moment = Moment(t, y, args, before, after, jnp.array(made_jump))
+            gain = gained(time, moment, term=term, jumping=self.jumping)
+            y = jax.tree.map(jnp.add, y, gain)
+        return y
 
 
 class LocatedImplicit(Located, diffrax.AbstractImplicitSolver):

@@ -18,16 +18,18 @@ _BASIS = np.polynomial.chebyshev.chebvander
 _TERMS = np.linalg.inv(_BASIS(2 * SHARES - 1, _ORDERS[-1]))
 _SLOPE = 2 * _ORDERS**2 @ _TERMS  # at the end, per step
 _BEND = 4 * _ORDERS**2 * (_ORDERS**2 - 1) / 3 @ _TERMS  # second derivative there
-# Signs are examined at the samples and between those that are far apart.
-_BETWEEN = np.array([0.06, 0.25, 0.79, 0.96])
-_TO_BETWEEN = _BASIS(2 * _BETWEEN - 1, _ORDERS[-1]) @ _TERMS
-_FINER = np.concatenate([SHARES, _BETWEEN])
-_SORTED = np.argsort(_FINER)
+_SLOPES = (
+    2
+    * np.polynomial.chebyshev.chebval(
+        2 * SHARES - 1, np.polynomial.chebyshev.chebder(_TERMS)
+    ).T
+)  # at the samples
 # Steps end where a switching function has passed its zero by this power of the unit of
 # rounding, times its size, and by this multiple of it. At rest on the zero it can be
 # told there to which side the motion goes.
-_BEYOND, _ROUNDING = 0.625, 500
+BEYOND, _ROUNDING = 0.625, 500
 _SOON = 0.01  # of a step, for extrapolation
+_MISSED = 0.01  # of its size from its zero, a function that turns back nearly met it
 _NOISE = 4 * np.abs(_BEND).sum()  # of the second derivative, in units of rounding
 _ITERATIONS = 6  # of Newton's method within a bracket
 
@@ -49,33 +51,62 @@ def bend_at_end(values: Array) -> Array:
     return _times(_BEND, values)
 
 
+def _turns(margins: Array, least: Array) -> tuple[Array, Array]:
+    """Returns where margins turn back to rising between two samples, and their values.
+
+    These are the shares of the step and the values of cubics, infinite if there is no
+    such place. `least`: smaller changes are rounding.
+    """
+    lengths = jnp.asarray(np.diff(SHARES), margins.dtype)[:, None]
+    slopes, change = _times(_SLOPES, margins), margins[1:] - margins[:-1]
+    fall, rise = slopes[:-1] * lengths, slopes[1:] * lengths
+    turning = (-fall > least[None]) & (rise > least[None])
+    fall, rise = jnp.where(turning, fall, -1), jnp.where(turning, rise, 1)
+    mean = fall + rise - 3 * change
+    root = jnp.sqrt(mean**2 - fall * rise)
+    part = (mean + root - fall) / (rise - fall + 2 * root)
+    bend = part * (fall + rise - 2 * change) - mean - fall
+    values = margins[:-1] + part * (fall + part * bend)
+    shares = jnp.asarray(SHARES[:-1], margins.dtype)[:, None] + part * lengths
+    return shares, jnp.where(turning, values, jnp.inf)
+
+
 @eqx.filter_jit
-def first_zero(margins: Array) -> tuple[Array, Array]:
-    """Returns the share of a step where a margin passes 0, and whether one does."""
+def first_zero(margins: Array, sizes: Array) -> tuple[Array, Array, Array]:
+    """Returns the share of a step where a margin passes 0, and whether one does.
+
+    Also returns how near to grazing a margin turned back, 0 if not near (see `at_end`).
+    `sizes`: the largest size of each margin in steps before.
+    """
     if not margins.size:
-        return jnp.ones((), margins.dtype), jnp.array(False)
+        none = jnp.zeros((), margins.dtype)
+        return none + 1, jnp.array(False), none
     eps = jnp.finfo(margins.dtype).eps
-    beyond = eps**_BEYOND * jnp.max(jnp.abs(margins), axis=0) + _ROUNDING * eps
+    beyond = eps**BEYOND * jnp.max(jnp.abs(margins), axis=0) + _ROUNDING * eps
     margins = margins + beyond[None]
-    finer = jnp.concatenate([margins, _times(_TO_BETWEEN, margins)])[_SORTED]
     # What is on the wrong side from the start on changes at once.
-    wrong = jnp.any((finer[0] < 0) & (finer[1] < 0))
-    finer = finer.at[0].set(jnp.abs(finer[0]))
-    passed = (finer < 0).any(axis=1)
-    index = jnp.maximum(jnp.argmax(passed), 1)
-    before, after = finer[index - 1], finer[index]
+    wrong = jnp.any((margins[0] < 0) & (margins[1] < 0))
+    turns, lowest = _turns(margins, beyond)
+    shares = jnp.asarray(SHARES, margins.dtype)
+    ends = jnp.where(lowest < 0, turns, shares[1:, None])
+    after = jnp.where(lowest < 0, lowest, margins[1:])
+    passed = (after < 0).any(axis=1)
+    index = jnp.argmax(passed)
+    before, after, low = jnp.abs(margins[index]), after[index], shares[index]
     chord = jnp.where(after < 0, before / (before - after), jnp.inf)
-    first = jnp.argmin(chord)
-    shares = jnp.asarray(_FINER[_SORTED], margins.dtype)
-    low, high = shares[index - 1], shares[index]
-    guess = low + chord[first] * (high - low)
+    guesses = low + chord * (ends[index] - low)
+    first = jnp.argmin(guesses)
+    guess, high = guesses[first], ends[index, first]
     terms = lambda: _times(_TERMS, margins[:, first, None])[:, 0]
     zero = jax.lax.cond(
         passed.any(),
         lambda: _zero(terms(), guess, low, high),
         lambda: jnp.ones_like(low),
     )
-    return jnp.where(wrong, 0, zero), passed.any()
+    # As far beyond its zero instead, a margin would pass that at this speed.
+    near = jnp.max(jnp.maximum(sizes[None], margins[:-1]) / lowest)
+    near = jnp.where(near * _MISSED > 1, jnp.sqrt(jnp.maximum(near, 0)), 0)
+    return jnp.where(wrong, 0, zero), passed.any(), near
 
 
 def _zero(terms: Array, guess: Array, low: Array, high: Array) -> Array:

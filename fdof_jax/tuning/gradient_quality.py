@@ -13,12 +13,13 @@ from jaxtyping import Bool, Float
 
 from ..analysis.linearization import Modes, closed_loop_modes, depends_on_state_alone
 from ..analysis.tracking import relative_demands
+from ..base.configuration import options_of_loops
 from ..linkage.linkage import joint_names
 from ..simulation.prescribed import PrescribedMotion
 from ..simulation.scene import Scene, is_number
 from ..simulation.sensitivities import sensitivities
 from ..simulation.simulate import simulate
-from ..simulation.solution import Solution
+from ..simulation.solution import Solution, remarks_on_derivatives
 from .gains import SAMPLES, check_tuned, with_gains
 from .losses import controller_of, gains_of, tip_errors
 
@@ -27,8 +28,6 @@ _HORIZONS = 10
 # differences is of fourth order in it; their noise is that of the loss over the step.
 _STEP = 1e-2
 _OF_TIME = 1e-3  # the step in a time, at most, as a share of the run
-# Slower crossings are near to grazing, where no derivative exists.
-_SLOW = 0.01
 
 
 class GradientReport(eqx.Module):
@@ -49,8 +48,8 @@ class GradientReport(eqx.Module):
     - `at_limit`: whether any actuator is at its limit, and so does not control its
       joint, at each of these times (101,).
     - `switches`, `slowest_crossing`: how often an element switches to another branch of
-      its formula, and the least speed of a switching function at its zero, relative to
-      its size as in `Solution` (infinite without switches): near 0, a contact grazes.
+      its formula, and the least speed of a switching function at or near its zero, as
+      in `Solution` (infinite if none came near): near 0, a contact grazes.
     - `times`: the derivatives of the error [m^2/s] in the times that elements and
       references declare as single numbers, such as the `begin` of a `Travel`: pairs of
       the derivative and of differences, by name. Prescribed motions are left out.
@@ -134,7 +133,7 @@ def _with_times(scene: Scene, times: Any) -> Scene:
     return eqx.tree_at(where, scene, list(times)) if len(times) else scene
 
 
-@eqx.filter_jit
+@eqx.filter_jit(compiler_options=options_of_loops())  # pyright: ignore[reportCallIssue]
 def _tangents(scene: Scene) -> tuple[Array, Array, Array, Solution]:
     """Residuals, their Jacobian, relative demands, and the motion.
 
@@ -221,8 +220,8 @@ def gradient_report(scene: Scene) -> GradientReport:
     if depends_on_state_alone(scene.forces):
         modes = closed_loop_modes(scene.linkage, scene.forces, few)
     stats, times = _motion(scene).stats, _in_times(scene, in_times[-1])
-    slowest = float(stats.get("slowest_crossing", np.inf))
-    warnings = _warnings(scene, gradient, saturated, error, slowest)
+    warnings = _warnings(scene, gradient, saturated, error)
+    warnings += remarks_on_derivatives(stats)
     pace = np.sum(residuals**2) / scene.t1
     for name, (slope, difference) in times.items():
         if not abs(slope - difference) < 1e-3 * max(abs(difference), pace):
@@ -240,13 +239,13 @@ def gradient_report(scene: Scene) -> GradientReport:
         modes=modes,
         at_limit=at_limit.any(axis=1)[::10],
         switches=int(stats.get("num_switches", 0)),
-        slowest_crossing=slowest,
+        slowest_crossing=float(stats.get("slowest_crossing", np.inf)),
         times=times,
         warnings=warnings,
     )
 
 
-def _warnings(scene: Scene, gradient, saturated, error, slowest) -> list[str]:
+def _warnings(scene: Scene, gradient, saturated, error) -> list[str]:
     names, words = joint_names(scene.linkage), []
     for joint, share in enumerate(saturated):
         if share == 1 and not gradient[:, joint].any():
@@ -259,10 +258,6 @@ def _warnings(scene: Scene, gradient, saturated, error, slowest) -> list[str]:
                 f"{names[joint]} is at its limit for {100 * share:.3g} % of the time, "
                 "in which its gains have no effect"
             )
-    if slowest < _SLOW:
-        words.append(
-            "a switch nearly grazes: derivatives hold in a small neighbourhood only"
-        )
     if not error < 1e-3:
         words.append(
             "gradient and differences disagree: the loss may not be smooth here, or "

@@ -1,0 +1,48 @@
+"""Known times at which elements jump, told apart where they coincide."""
+
+import jax.numpy as jnp
+from jax import Array
+
+from ..forces.element import Element
+from ..forces.part import jumps_of
+from .dopri8 import constant
+from .field import Args
+from .landing import rounding
+from .prescribed import PrescribedMotion
+
+# Units of `rounding`, beyond the distances that steps keep from each time.
+_APART = 8
+
+
+def clocks_apart(args: Args, ts: Array) -> Args:
+    """Returns the arguments with clocks by which no two elements jump at once.
+
+    One step would end at coincident times, and derivatives would ascribe the jumps of
+    all elements to one of these times. Each clock is ahead of the one before by some
+    units of rounding.
+    """
+    # A prescribed motion also gives positions, and comes first: it keeps the time.
+    places = sorted(
+        (not isinstance(element, PrescribedMotion), place)
+        for place, element in enumerate(args.forces)
+        if element.jump_ts is not None
+    )
+    if len(places) < 2:
+        return args
+    unit = _APART * rounding(constant(jnp.max(jnp.abs(ts))))
+    ahead = [0.0] * len(args.forces)
+    for rank, (_, place) in enumerate(places):
+        ahead[place] = rank
+    return args._replace(ahead=unit * jnp.array(ahead, unit.dtype))
+
+
+def known_times(args: Args, *left_out: type[Element]) -> Array | None:
+    """Returns the times [s] at which elements jump by their clocks, or None.
+
+    `left_out`: kinds of elements whose times do not count.
+    """
+    places = [i for i, e in enumerate(args.forces) if not isinstance(e, left_out)]
+    if args.ahead is None:
+        return jumps_of(*(args.forces[place] for place in places))
+    times = [(args.forces[i].jump_ts, args.ahead[i]) for i in places]
+    return jnp.concatenate([jnp.asarray(t) - by for t, by in times if t is not None])
