@@ -58,8 +58,9 @@ def _save(figure, path: Path) -> None:
             entries.setdefault(label, handle)
     if entries:
         figure.legend(
-            entries.values(), entries, loc="outside lower center", ncols=3, fontsize=7
-        )
+            entries.values(), entries, loc="outside lower center", ncols=3, fontsize=7,
+            handlelength=3.5,  # shows dashes
+        )  # fmt: skip
     figure.savefig(path, dpi=160)
 
 
@@ -105,27 +106,35 @@ def trajectory(points: list[dict], path: Path) -> None:
 
 def batches(points: list[dict], path: Path) -> None:
     """Draws throughput against error at one size, and against size at one error."""
-    figure, (left, right) = _axes(2, height=4.2)
     sizes = sorted({p["batch"] for p in points if p["status"] != "skipped"})
     size = 1024 if 1024 in sizes else sizes[-1]
     own = [p for p in points if p["batch"] == size]
+    rates = {solver: _rates(points, solver, sizes) for solver in _solvers(own)}
+    several = np.isfinite(list(rates.values())).sum(axis=1).max() > 1
+    figure, (left, *others) = _axes(2 if several else 1, height=4.2)
     _curves(left, own, lambda p: p["simulated"] / p["time_median"])
     left.set_title(f"batch of {size}", fontsize=9)
     left.set_xlabel("worst member's error [rad]")
     left.set_ylabel("simulated s per s")
-    for index, solver in enumerate(_solvers(own)):
-        rates = []
-        for batch in sizes:
-            mine = [p for p in points if p["solver"] == solver and p["batch"] == batch]
-            walls = times_at(mine, 1e-6)
-            rates.append(
-                np.nan if walls is None else mine[0]["simulated"] / np.median(walls)
-            )
-        right.loglog(sizes, rates, **_style(solver, index))
-    right.set_title("at a worst error of 1e-6", fontsize=9)
-    right.set_xlabel("batch")
-    right.grid(alpha=0.3)
+    for right in others:
+        for index, (solver, heights) in enumerate(rates.items()):
+            right.loglog(sizes, heights, **_style(solver, index))
+        right.set_title("at a worst error of 1e-6", fontsize=9)
+        right.set_xlabel("batch")
+        right.grid(alpha=0.3)
     _save(figure, path)
+
+
+def _rates(points: list[dict], solver: str, sizes: list[int]) -> list[float]:
+    """Returns throughput at a worst error of 1e-6 for each size; NaN if not reached."""
+    found = []
+    for batch in sizes:
+        mine = [p for p in points if p["solver"] == solver and p["batch"] == batch]
+        walls = times_at(mine, 1e-6)
+        found.append(
+            np.nan if walls is None else mine[0]["simulated"] / np.median(walls)
+        )
+    return found
 
 
 def memory(points: list[dict], path: Path) -> None:

@@ -11,6 +11,7 @@ ROOT = Path(__file__).parents[1]
 NOTEBOOKS = ["notebooks/README.md", *sorted(
     path.relative_to(ROOT).as_posix() for path in ROOT.glob("notebooks/*.ipynb")
 )]  # fmt: skip
+NO_TEXT = 'alt="No description has been provided for this image"'  # nbconvert's
 
 
 def on_config(config):
@@ -43,9 +44,19 @@ def on_page_markdown(markdown, page, **_):
     return re.sub(r"(\]\((?:\.\./)*)docs/", r"\1", markdown)
 
 
+def _with_alternative_text(html):
+    """Describes each picture of a notebook by the title of its section."""
+    parts = re.split(r"(<h[1-6].*?</h[1-6]>)", html, flags=re.DOTALL)
+    for k in range(2, len(parts), 2):
+        title = re.sub(r"<.*?>|¶", "", parts[k - 1]).strip()
+        parts[k] = parts[k].replace(NO_TEXT, f'alt="Picture: {title}"')
+    return "".join(parts)
+
+
 def on_page_content(html, page, **_):
     """Turns links of notebooks to files into links to their pages."""
     if page.file.src_uri.endswith(".ipynb"):
+        html = _with_alternative_text(html)
         html = re.sub(r'(href="(?:\.\./)*)docs/', r"\1", html)
         html = re.sub(r'(href="(?!https?:)[^"]*?)README\.md', r"\1index.html", html)
         html = re.sub(r'(href="(?!https?:)[^"]*?)\.(?:md|ipynb)\b', r"\1.html", html)

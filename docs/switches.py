@@ -62,6 +62,7 @@ for angle, style in ((ANGLE, "C0"), (ANGLE + SHIFT, "C0--")):
     above.plot(TS, beyond, style, label=f"start at {angle:g} rad")
     taut = np.interp(0, beyond[: beyond.argmax()], TS[: beyond.argmax()])
     above.plot(taut, 0, "o", color="C1")
+above.plot([], [], "o", color="C1", label="the cable becomes taut")
 above.axhline(0, color="0.6", lw=0.8)
 above.set(xlim=(0.45, TS[-1]), ylim=(-200, None), ylabel="stretch of the cable [mm]")
 above.legend()

@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 import pytest
 from elements import SHORT
-from modes import ADJOINT
+from modes import ADJOINT, LOOPS
 
 import fdof_jax as fj
 
@@ -80,7 +80,7 @@ def test_derivatives_of_motions_equal_the_reference(name, bound, mode):
         return fj.simulate(linkage, state0, ts[[0, -1]], forces, adjoint=adjoint).q[-1]
 
     transform = jax.jacfwd if mode == "forward" else jax.jacrev
-    slopes = jax.jit(transform(end, (0, 1)))(start.q, arm.mass)
+    slopes = jax.jit(transform(end, (0, 1)), **LOOPS)(start.q, arm.mass)
     for argument, slope in zip(("dq_dq0", "dq_dmass"), slopes):
         if argument in REFERENCE[name]:
             expected = np.asarray(REFERENCE[name][argument])
@@ -130,7 +130,7 @@ def test_gradients_of_a_motion_equal_differences():
     arguments = jax.tree.map(np.asarray, numbers)
     direction = jax.tree.map(lambda a: rng.normal(size=a.shape), arguments)
     direction = eqx.tree_at(lambda d: d[0].ef, direction, np.zeros(2 * n))
-    both = jax.jit(jax.value_and_grad(value))
+    both = jax.jit(jax.value_and_grad(value), **LOOPS)
     _, gradient = both(arguments)
     products = jax.tree.map(np.vdot, gradient, direction)
     slope = float(sum(jax.tree.leaves(products)))

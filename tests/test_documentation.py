@@ -1,8 +1,10 @@
 """Every public name is documented: purpose, units, source; examples run as doctests."""
 
+import importlib.util
 import inspect
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -144,3 +146,24 @@ def test_every_name_has_a_place_in_the_reference():
     pages = "".join(path.read_text() for path in (ROOT / "docs" / "api").glob("*.md"))
     listed = re.findall(r"^::: fdof_jax\.(\S+)$", pages, re.M)
     assert sorted(listed) == sorted(NAMES)
+
+
+def test_names_in_guides_become_links():
+    file = ROOT / "docs" / "name_links.py"
+    spec = importlib.util.spec_from_file_location("name_links", file)
+    links = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(links)
+    guide = SimpleNamespace(file=SimpleNamespace(src_uri="gains.md"))
+    for code, name in [
+        ("tune", "tune"),
+        ("fj.tuning.tune_each(scenes)", "tuning.tune_each"),
+        ("Solution.outcome", "Solution"),
+        ("diffrax.PIDController", None),
+        ("store=", None),
+    ]:
+        html = f"<p><code>{code}</code></p>"
+        link = f'<autoref identifier="fdof_jax.{name}"><code>{code}</code></autoref>'
+        found = links.on_page_content(html, guide)
+        assert found == (html if name is None else f"<p>{link}</p>")
+    linked = '<a href="tuning.html"><code>tune</code></a>'
+    assert links.on_page_content(linked, guide) == linked

@@ -88,6 +88,18 @@ def test_what_is_no_planar_chain_is_refused_by_name(inside, got):
 
 
 @pytest.mark.parametrize(
+    "text, message",
+    [
+        (3, "text: expected a str, got 3."),
+        ("arm.xml", "text: expected a MuJoCo model in XML: XML parse error .*[^\\n]"),
+    ],
+)
+def test_what_is_no_xml_is_refused(text, message):
+    with pytest.raises(ValueError, match=f"^{message}$"):
+        fj.data.from_mjcf(text)
+
+
+@pytest.mark.parametrize(
     "inside",
     [
         "",

@@ -136,6 +136,10 @@ def test_a_controller_at_its_limit_has_no_loop():
     assert (loop([1.0, 2.0]) == 0).all() and not loop.stable  # it falls
     assert np.isnan(loop.crossover) and np.isnan(loop.bandwidth)
     assert loop.phase_margin == loop.gain_margin == loop.delay_margin == np.inf
+    above, _ = fj.plotting.bode_plot(loop).axes
+    assert [line.get_label() for line in above.lines] == ["loop of R1", "L = -1"]
+    with pytest.raises(ValueError, match="loop: expected an OpenLoop"):
+        fj.plotting.bode_plot(limited)
 
 
 @pytest.mark.parametrize("topology", ["RPR", "RRR"])
@@ -156,6 +160,10 @@ def test_margins_agree_with_python_control(topology, lagged):
         np.testing.assert_allclose(np.rad2deg(loop.phase_margin), phase, rtol=1e-6)
         np.testing.assert_allclose(loop.crossover, crossover, rtol=1e-6)
         np.testing.assert_allclose(loop.modulus_margin, min(modulus, 1), rtol=1e-6)
+        margins = control.stability_margins(system, returnall=True)
+        phases, crossings = margins[1], margins[4]
+        delays = np.deg2rad(phases % 360) / crossings
+        np.testing.assert_allclose(loop.delay_margin, delays.min(), rtol=1e-6)
         closed = control.ss(system.A - system.B @ system.C, system.B, system.C, 0)
         expected = control.bandwidth(closed)
         np.testing.assert_allclose(loop.bandwidth, expected, rtol=1e-4)
@@ -163,14 +171,18 @@ def test_margins_agree_with_python_control(topology, lagged):
         np.testing.assert_allclose(loop(w), system(1j * w), rtol=1e-9)
 
 
-def test_at_the_gain_margin_the_closed_loop_becomes_unstable():
+def loops_of_slow_drives():
+    """Returns loops whose phase falls below -180 degrees, one per joint."""
     linkage, q = arm("RPR")
     gains = fj.control.gains_from_frequency(linkage, q, [8.0, 20.0, 60.0], 0.7)
     controller = pd_at(q, *gains)
     for time_constant in (0.004, 0.002):
         controller = fj.control.FirstOrderLag(controller, time_constant)
-    for joint in (1, 2, 3):
-        loop = fj.analysis.open_loop(linkage, q, controller, joint)
+    return [fj.analysis.open_loop(linkage, q, controller, k) for k in (1, 2, 3)]
+
+
+def test_at_the_gain_margin_the_closed_loop_becomes_unstable():
+    for loop in loops_of_slow_drives():
         margin = loop.gain_margin
         decay = lambda factor, loop=loop: np.linalg.eigvals(
             loop.A - factor * np.outer(loop.B, loop.C)
@@ -178,6 +190,31 @@ def test_at_the_gain_margin_the_closed_loop_becomes_unstable():
         assert loop.stable and margin < 100
         nearer, beyond = margin ** np.array([0.999, 1.001])
         assert decay(nearer) < 0 < decay(beyond)
+
+
+def test_a_bode_plot_agrees_with_python_control():
+    for loop in loops_of_slow_drives():
+        fig = fj.plotting.bode_plot(loop)
+        gain_margin, level, _ = fig.axes[0].lines
+        phase_margin, phase, _ = fig.axes[1].lines
+        frequency = level.get_xdata()
+        expected = control.frequency_response(state_space(loop), frequency)
+        decibel = 20 * np.log10(expected.magnitude)
+        np.testing.assert_allclose(level.get_ydata(), decibel, atol=1e-6)
+        turns = (phase.get_ydata() - np.rad2deg(expected.phase)) / 360
+        np.testing.assert_allclose(turns, np.round(turns), atol=1e-6)
+        assert np.abs(np.diff(phase.get_ydata())).max() < 180
+        gain, degrees, _, at_gain, at_phase, _ = control.stability_margins(
+            state_space(loop)
+        )
+        np.testing.assert_allclose(gain_margin.get_xdata(), at_gain, rtol=0.02)
+        np.testing.assert_allclose(phase_margin.get_xdata(), at_phase, rtol=1e-6)
+        decibel = 20 * np.log10(gain)
+        np.testing.assert_allclose(gain_margin.get_ydata(), [0, -decibel], atol=1e-6)
+        ends = [-180, degrees - 180]
+        np.testing.assert_allclose(phase_margin.get_ydata(), ends, atol=1e-4)
+        at = np.interp(at_phase, frequency, phase.get_ydata())
+        np.testing.assert_allclose(at, degrees - 180, atol=0.1)
 
 
 def test_the_closed_loop_is_the_linearised_arm():

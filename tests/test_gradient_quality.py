@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from modes import LOOPS
 
 import fdof_jax as fj
 from fdof_jax import scenes
@@ -36,7 +37,7 @@ def gains_of(scene):
     return jnp.stack([controller.kp, controller.kd])
 
 
-@eqx.filter_jit
+@eqx.filter_jit(**LOOPS)
 def tangents(scene, tolerance, ts):
     at = lambda z: with_gains(scene, gains_of(scene) * jnp.exp(z).reshape(2, 3))
     found = sensitivities(at, tip_errors, jnp.zeros(6), ts, tolerance)
@@ -54,7 +55,6 @@ def loss(scene, z, ts):
         ts,
         trial.forces,
         stepsize_controller=steps,
-        adjoint=diffrax.ForwardMode(),
         throw=False,
     )
     return jnp.sum(tip_errors(trial, solution) ** 2)

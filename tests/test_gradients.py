@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from elements import SHORT
-from modes import ADJOINT
+from modes import ADJOINT, LOOPS
 from test_gradient_quality import POINTS, tangents
 
 import fdof_jax as fj
@@ -47,7 +47,7 @@ def outcome(problem, parameters, adjoint=diffrax.ForwardMode()):
     return jnp.mean(deviation**2), solution.q[-1]
 
 
-@eqx.filter_jit
+@eqx.filter_jit(**LOOPS)
 def forward(problem, at):
     """Returns slopes and values from one program."""
 
@@ -58,7 +58,7 @@ def forward(problem, at):
     return jax.jacfwd(twice, has_aux=True)(at)
 
 
-@eqx.filter_jit
+@eqx.filter_jit(**LOOPS)
 def reverse(problem, at, weights):
     """Returns the gradient of the weighted sum of the deviation and the positions."""
 
@@ -143,7 +143,7 @@ def test_both_modes_of_a_damped_arm_equal_differences():
         return jnp.sum(motion.q[-1] * jnp.array([1.0, -2.0, 0.5]))
 
     at = jnp.array([5.0, 2.0, 1.0, 20.0, 10.0, 5.0, 0.3, -0.2, 0.5])
-    both = jax.jit(jax.value_and_grad(lambda at: end(at, ADJOINT)))
+    both = jax.jit(jax.value_and_grad(lambda at: end(at, ADJOINT)), **LOOPS)
     forward = jax.jit(jax.jacfwd(lambda at: end(at, diffrax.ForwardMode())))(at)
     value = lambda change: float(both(at + change)[0])
     h = 1e-5

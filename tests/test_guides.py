@@ -50,7 +50,8 @@ def test_tuning(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_gains():
+def test_gains(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     names = run(DOCS / "gains.md")
     assert names["loop"].stable
     assert names["large"].bandwidth[0] < 0.6 * names["small"].bandwidth[0]

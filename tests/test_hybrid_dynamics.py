@@ -1,5 +1,7 @@
 """Prescribed motion: closed forms, balances, jumps of the velocity, residual swings."""
 
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -7,6 +9,7 @@ import numpy as np
 import pytest
 from elements import SHORT, Swing
 from helpers import random_linkage
+from modes import LOOPS
 from scipy.integrate import simpson, solve_ivp
 
 import fdof_jax as fj
@@ -159,7 +162,7 @@ def test_gradients_equal_differences():
     linkage, start, (motion, *others) = swinging("RPR", 1)
     weights = np.array([1.0, -2.0, 0.5])
 
-    @jax.jit
+    @partial(jax.jit, **LOOPS)
     @jax.value_and_grad
     def both(p):
         reference = Swing(jnp.array([0.3, 0.2, 0.4]) * p[0])

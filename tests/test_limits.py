@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import random_linkage
+from scipy import signal
 from test_gains import PENDULUM, Stand, pd_at
 
 import fdof_jax as fj
@@ -28,10 +29,16 @@ def within(scene, **limits):
 def test_gains_are_at_the_limits_of_overshoot_and_effort():
     """The mean squared error of a step falls with kp, and is least at a damping ratio
     of 1/2, which overshoots by 16 %."""
-    found = within(step(), overshoot=0.05, effort=12.0)
-    assert found.met.all() and found.limit == ("overshoot", "effort [N m]")
-    np.testing.assert_allclose(found.reached, [0.05, 12], rtol=0.03)
+    found = within(step(), overshoot=0.05, settling_time=4.0, effort=12.0)
+    names = ("overshoot", "settling time [s]", "effort [N m]")
+    assert found.met.all() and found.limit == names
+    np.testing.assert_allclose(found.reached[[0, 2]], [0.05, 12], rtol=0.03)
     kp, kd = found.gains[:, 0]
+    # The reference stands, so that kd damps only.
+    ts, response = signal.step(([kp], [INERTIA, kd, kp]), T=np.linspace(0, 4, 40001))
+    np.testing.assert_allclose(found.reached[0], response.max() - 1, rtol=1e-2)
+    settled = ts[np.abs(response - 1) > 0.02].max()
+    np.testing.assert_allclose(found.reached[1], settled, atol=2 * 4 / 1000)
     np.testing.assert_allclose(kp, 12, rtol=3e-3)
     ratio = np.log(1 / 0.05) / np.hypot(np.pi, np.log(1 / 0.05))
     np.testing.assert_allclose(kd / (2 * np.sqrt(kp * INERTIA)), ratio, rtol=0.01)

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from elements import SHORT as STEPS, Hold
+from modes import LOOPS
 
 import fdof_jax as fj
 from fdof_jax.simulation.looped_dopri8 import LoopedDopri8
@@ -90,7 +91,7 @@ def test_a_step_is_differentiable_and_batched():
     tau = jnp.array([1.0, -2.0, 0.5])
     step = lambda tau: fj.step(ARM, START, tau, 0.1, **STEPS).qd
     known = lambda tau: step(np.asarray(tau))  # by the program of plain calls
-    both = jax.jit(jax.vmap(lambda tau: (step(tau), jax.jacrev(step)(tau))))
+    both = jax.jit(jax.vmap(lambda tau: (step(tau), jax.jacrev(step)(tau))), **LOOPS)
     many, (slope, _) = both(jnp.stack([tau, 2 * tau]))
     differences = [(known(tau + h) - known(tau - h)) / 2e-4 for h in 1e-4 * np.eye(3)]
     np.testing.assert_allclose(slope, np.stack(differences, axis=1), atol=1e-8)
@@ -103,7 +104,7 @@ def test_gains_of_sampled_control_have_gradients():
         control = fj.PDController(factor * KP, KD, np.inf, MOVE)
         return fj.simulate_sampled(ARM, START, control, 0.02, 10, **STEPS).q[-1, 0]
 
-    both = jax.jit(jax.value_and_grad(end))
+    both = jax.jit(jax.value_and_grad(end), **LOOPS)
     difference = (both(1.001)[0] - both(0.999)[0]) / 0.002
     np.testing.assert_allclose(both(1.0)[1], difference, rtol=1e-6)
 

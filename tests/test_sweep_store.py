@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray
+from helpers import programs
 from sweep_batch import FAILED, SETTINGS, TS, run
 
 import fdof_jax as fj
@@ -213,7 +214,6 @@ def test_a_digest_names_what_functions_compute(batch):
 
 WORKER = """
 import sys
-import time
 import jax
 jax.config.update("jax_enable_x64", True)
 import sweep_batch
@@ -232,7 +232,8 @@ def test_workers_that_are_killed(mixed, undisturbed, tmp_path):
 
     def start(shard):
         command = [sys.executable, "-c", WORKER, str(tmp_path), str(shard)]
-        return subprocess.Popen(command, env=dict(os.environ, PYTHONPATH=path))
+        environment = os.environ | programs() | {"PYTHONPATH": path}
+        return subprocess.Popen(command, env=environment)
 
     workers = [start(shard) for shard in range(3)]
     try:

@@ -1,11 +1,14 @@
 """Motions whose elements switch: where steps end, and derivatives through switches."""
 
+from functools import partial
+
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from modes import LOOPS
 from switching_scenes import BUMPER, CABLE, LIMITED, RODS as ARM, scene
 
 import fdof_jax as fj
@@ -26,7 +29,7 @@ def motion(x, case, **options):
     return fj.simulate(arm, start, ts, forces, **options)
 
 
-@jax.jit
+@partial(jax.jit, **LOOPS)
 def slopes(x, tolerance):
     """Derivatives of the last positions (case, joint), and the motions."""
 
@@ -77,7 +80,8 @@ def test_the_variational_equations_are_those_of_the_motion():
             z,
             jnp.array([0.0, 0.8]),
             1e-10,
-        )
+        ),
+        **LOOPS,
     )(jnp.array([0.1]))
     np.testing.assert_allclose(found.jacobian[:, 0], PUBLISHED[1], atol=1e-6)
 
@@ -138,7 +142,8 @@ def test_derivatives_in_the_time_of_a_pulse():
             z,
             jnp.array([0.0, 0.5]),
             1e-10,
-        )
+        ),
+        **LOOPS,
     )(jnp.array([0.2]))
     exact = differences(end, 0.2, 1e-3)
     np.testing.assert_allclose(found.jacobian[:, 0], exact, atol=1e-6)
@@ -197,7 +202,7 @@ def test_both_modes_hessians_of_a_batch_and_other_solvers():
         return slope, slope
 
     hessian = jax.vmap(jax.jacfwd(slope_twice, has_aux=True), (None, 0))
-    both, zero = jax.jit(hessian), jnp.zeros(2)
+    both, zero = jax.jit(hessian, **LOOPS), jnp.zeros(2)
     twice, slope = both(zero, speeds)
     exact = [
         differences(lambda h, e=e: both(h * e, speeds)[1], 0, 1e-4) for e in np.eye(2)
@@ -213,10 +218,10 @@ def test_both_modes_hessians_of_a_batch_and_other_solvers():
     weights = jnp.array([0.3, -0.5])
     adjoint = diffrax.RecursiveCheckpointAdjoint(checkpoints=200)
     loss = lambda z: weights @ end(z, speeds[0], adjoint=adjoint)
-    backward = jax.jit(jax.grad(loss))(zero)
+    backward = jax.jit(jax.grad(loss), **LOOPS)(zero)
     np.testing.assert_allclose(backward, weights @ slope[0], rtol=1e-10)
     other = lambda z: end(z, speeds[0], 1e-9, adjoint=FORWARD, solver=diffrax.Tsit5())
-    found = jax.jit(jax.jacfwd(other))(zero)
+    found = jax.jit(jax.jacfwd(other), **LOOPS)(zero)
     np.testing.assert_allclose(found, slope[0], atol=1e-6)
 
 

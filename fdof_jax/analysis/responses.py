@@ -3,7 +3,6 @@
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -122,21 +121,16 @@ def _following(element: Any, reference: Reference) -> Element:
     return eqx.tree_at(lambda drive: drive.command, element, inner)
 
 
-@eqx.filter_jit
-def _answers(
-    linkage: Linkage, controller: Element, forces: tuple, probes: _Probe, ts: Any
+def _answer(
+    linkage: Linkage, controller: Element, forces: Forces, probe: _Probe, ts: np.ndarray
 ) -> tuple[Array, Array]:
-    """Simulates for each probe: positions, and demands over limits."""
-
-    def answer(probe, ts):
-        led = _following(controller, probe)
-        start = State(probe.base, jnp.zeros_like(probe.base))
-        motion = simulate(linkage, start, ts, (led, *forces), throw=False)
-        pd = _commanding(led)
-        assert pd is not None
-        return motion.q, relative_demands(pd, linkage, motion)
-
-    return jax.vmap(answer)(probes, ts)
+    """Simulates an answer to a probe: positions, and demands over limits."""
+    led = _following(controller, probe)
+    start = State(probe.base, jnp.zeros_like(probe.base))
+    motion = simulate(linkage, start, ts, (led, *forces), throw=False)
+    pd = _commanding(led)
+    assert pd is not None
+    return motion.q, relative_demands(pd, linkage, motion)
 
 
 def step_and_sine(
@@ -214,14 +208,13 @@ def step_and_sine(
             probes.append(_Probe(q, none, t0, height, w))
             times.append(t0 + 2 * np.pi / w * _PERIODS * np.arange(count) / count)
     ts = np.pad(np.stack(times), ((0, 0), (1, 0)))  # from 0
-    stacked = jax.tree.map(lambda *rows: np.stack(rows), *probes)
-    found = _answers(linkage, element, elements_on(linkage, forces), stacked, ts)
+    # One after the other: a batch takes three times as long to compile.
+    answers = [_answer(linkage, element, forces, *row) for row in zip(probes, ts)]
+    found = map(np.stack, zip(*answers))
     # (joint, lane, time), of the joint that is tested
     own = np.repeat(moving, 1 + _FREQUENCIES.size)[:, None, None]
     positions, demands = (
-        np.take_along_axis(np.asarray(part), own, axis=2)[:, 1:, 0].reshape(
-            len(moving), -1, count
-        )
+        np.take_along_axis(part, own, axis=2)[:, 1:, 0].reshape(len(moving), -1, count)
         for part in found
     )
     step = np.asarray(step)[moving]

@@ -13,6 +13,7 @@ from ..references.circle import CircleTask
 from ..simulation.solution import Solution
 
 
+@eqx.filter_jit
 def relative_demands(
     controller: PDController, linkage: Linkage, solution: Solution
 ) -> Float[Array, "time joint"]:

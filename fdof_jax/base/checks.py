@@ -137,7 +137,8 @@ def function(name: str, value: Any, expected: str = "a callable") -> Any:
 def instance(name: str, value: Any, kind: type) -> None:
     """Raises ValueError unless `value` is an instance of `kind`."""
     if not isinstance(value, kind):
-        raise refusal(name, f"a {kind.__name__}", value)
+        article = "an" if kind.__name__[0] in "AEIO" else "a"
+        raise refusal(name, f"{article} {kind.__name__}", value)
 
 
 def whole_number(name: str, value: Any, minimum: int, most: int | None = None) -> int:

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..base.checks import instance
 from ..base.names import optional_package
 from ..forces.actuators import Armature
 from ..forces.element import Forces
@@ -45,10 +46,12 @@ def from_mjcf(text: str) -> tuple[Linkage, Forces]:
     ((1, 2), [2.0])
     """
     mujoco = optional_package("mujoco", "test")
+    instance("text", text, str)
     try:
         model = mujoco.MjModel.from_xml_string(text)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"text: expected a MuJoCo model: {error}") from None
+    except ValueError as error:
+        reason = " ".join(str(error).split())
+        raise ValueError(f"text: expected a MuJoCo model in XML: {reason}") from None
     _refuse_others(model)
     disabled = model.opt.disableflags
     if disabled & mujoco.mjtDisableBit.mjDSBL_GRAVITY:

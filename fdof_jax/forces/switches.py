@@ -9,16 +9,15 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-import jax.core
-import jax.extend.core
 import jax.numpy as jnp
 from jax import Array
 from jax.typing import ArrayLike
 
-# Before JAX 0.10 it was in `jax.core`.
-_home: Any = (
-    jax.extend.core if hasattr(jax.extend.core, "get_opaque_trace_state") else jax.core
-)
+try:
+    from jax.extend.core import get_opaque_trace_state
+except ImportError:  # before JAX 0.10
+    from jax.core import get_opaque_trace_state  # pyright: ignore
+
 _open: list["Switches"] = []  # while an element is traced within a solve
 
 
@@ -81,7 +80,7 @@ class Switches:
 
 def _transformation() -> Any:
     """Returns what stands for JAX's transformation that is traced at present."""
-    return _home.get_opaque_trace_state(convention="nnx")
+    return get_opaque_trace_state(convention="nnx")
 
 
 def switch(

@@ -39,13 +39,13 @@ from .axes import (
     legend,
     reached,
 )
-from .responses import response_profile
+from .responses import bode_plot, response_profile
 from .tracking import tracking, tracking_by_error, tracking_error
 
 __all__ = [
-    "effort_profile", "energy_profile", "energy_stack", "motion_profile",
-    "response_profile", "tracking", "tracking_by_error", "tracking_error",
-    "work_precision",
+    "bode_plot", "effort_profile", "energy_profile", "energy_stack",
+    "motion_profile", "response_profile", "tracking", "tracking_by_error",
+    "tracking_error", "work_precision",
 ]  # fmt: skip
 
 

@@ -92,9 +92,10 @@ class TipReference(Reference):
         """
         motion = super().__call__(t, linkage)
         if not (is_traced(motion) or np.isfinite(motion).all()):
+            tip = np.round(self.tip(t), 6)
             raise ValueError(
                 f"t: expected a time at which the tip is within {self._reach()}, got "
-                f"{np.asarray(t):g} s, at which it is at {np.asarray(self.tip(t))} m."
+                f"{np.asarray(t):g} s, at which it is at {tip.tolist()} m."
             )
         return motion
 

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float
 
 from ..analysis.linearization import Modes, closed_loop_modes, depends_on_state_alone
 from ..analysis.tracking import relative_demands
+from ..base.configuration import options_of_loops
 from ..linkage.linkage import joint_names
 from ..simulation.prescribed import PrescribedMotion
 from ..simulation.scene import Scene, is_number
@@ -132,7 +133,7 @@ def _with_times(scene: Scene, times: Any) -> Scene:
     return eqx.tree_at(where, scene, list(times)) if len(times) else scene
 
 
-@eqx.filter_jit
+@eqx.filter_jit(compiler_options=options_of_loops())  # pyright: ignore[reportCallIssue]
 def _tangents(scene: Scene) -> tuple[Array, Array, Array, Solution]:
     """Residuals, their Jacobian, relative demands, and the motion.
 

@@ -1,12 +1,14 @@
 """Scenes 17, 18 and 20: stiff controllers and dampers; one chatters at its limit."""
 
+from functools import partial
+
 import diffrax
 import jax
 import jax.numpy as jnp
 import mpmath
 import numpy as np
 import pytest
-from modes import ADJOINT
+from modes import ADJOINT, LOOPS
 
 import fdof_jax as fj
 from hard import oracle
@@ -40,7 +42,7 @@ def moved(factor, kp, damping, limit, ts):
     return (solution.q, solution.qd), solution
 
 
-@jax.jit
+@partial(jax.jit, **LOOPS)
 def motion_and_derivative(kp, damping, limit, ts):
     """Returns a motion and its derivatives in the logarithm of the factor."""
     derivative = jax.jacfwd(moved, has_aux=True)
@@ -73,7 +75,7 @@ def test_the_gradient_in_reverse_mode():
     )
     start, target, inertia = fj.State([-0.5], [0.0]), Hold(jnp.array([-0.4])), 1 / 3
 
-    @jax.jit
+    @partial(jax.jit, **LOOPS)
     @jax.grad
     def gradient(log_kp, ts):
         kp = jnp.exp(log_kp)
