@@ -259,6 +259,16 @@ def test_animated_panels_keep_their_limits_silently(caplog):
     assert caplog.text == ""  # matplotlib complains of limits that it cannot keep
 
 
+def test_labels_of_an_animation_lie_inside_its_figure():
+    ts = np.linspace(0, 1, 101)
+    q = np.stack([1 - 3.5 * ts, 0.5 * ts, 0.5 * ts], axis=1)  # ticks of half metres
+    solution = made_up(ts, q, np.gradient(q, ts, axis=0))
+    drawing.animate(make_linkage("RRR"), solution)
+    figure = plt.gcf()
+    figure.draw_without_rendering()
+    assert figure.axes[0].yaxis.label.get_window_extent().x0 >= 0
+
+
 @pytest.mark.parametrize(
     "name, call",
     [

@@ -137,5 +137,6 @@ def animation_of(
         ax.autoscale(False)
         ax.set_adjustable("box")
     if new:
+        figure.draw_without_rendering()  # the layout of the limits just fixed
         figure.set_layout_engine("none")  # a layout per frame takes half the time
     return MotionAnimation(figure, show, len(times), pause, artists)
