@@ -1,6 +1,7 @@
 """Chains read from MuJoCo's models accelerate as there."""
 
 import warnings
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -90,8 +91,9 @@ def test_what_is_no_planar_chain_is_refused_by_name(inside, got):
 @pytest.mark.parametrize(
     "text, message",
     [
-        (3, "text: expected a str, got 3."),
-        ("arm.xml", "text: expected a MuJoCo model in XML: XML parse error .*[^\\n]"),
+        (Path("arm.xml"), "text: expected the XML text of a model, not a .*arm.xml.*"),
+        ("arm.xml", "text: expected the XML text of a model, not a .*'arm.xml'."),
+        ("<arm", "text: expected a MuJoCo model in XML: XML parse error .*[^\\n]"),
     ],
 )
 def test_what_is_no_xml_is_refused(text, message):

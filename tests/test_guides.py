@@ -25,6 +25,14 @@ def test_batches():
 
 
 @pytest.mark.slow
+def test_comparison():
+    names = run(DOCS / "comparison.md")
+    np.testing.assert_allclose(names["data"].qpos, names["motion"].q[-1], atol=1e-5)
+    np.testing.assert_allclose(names["again"].mass, names["arm"].mass)
+    np.testing.assert_allclose(names["dampers"][0].coefficient, 0.5)
+
+
+@pytest.mark.slow
 def test_gradients():
     names = run(DOCS / "gradients.md")
     np.testing.assert_allclose(names["reverse"], names["forward"], rtol=1e-6)

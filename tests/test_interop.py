@@ -35,7 +35,11 @@ def test_massless_tip_is_passed_as_the_smallest_that_mujoco_takes():
         mass=[1, 1, 0],
         inertia=[0.1, 0.1, 0.1],
     )
-    model = mujoco.MjModel.from_xml_string(fj.to_mjcf(linkage))
+    text = fj.to_mjcf(linkage)
+    assert "tendon" not in text  # there is no spring
+    model = mujoco.MjModel.from_xml_string(text)
+    assert model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
+    assert model.opt.timestep == 1e-3
     assert model.body("link3").mass == 1e-15
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)

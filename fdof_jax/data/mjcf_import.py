@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..base.checks import instance
+from ..base.checks import refusal
 from ..base.names import optional_package
 from ..forces.actuators import Armature
 from ..forces.element import Forces
@@ -28,12 +28,16 @@ def from_mjcf(text: str) -> tuple[Linkage, Forces]:
     model is not refused, because geoms may collide by default, and most arms move
     without contacts. `<flag contact="disable"/>` avoids the warning.
 
-    **Arguments:** `text`: the XML text.
+    An arm written by `to_mjcf` moves alike when it is read again, but its numbers may
+    differ: a fixed length may be split otherwise between a link and the slide next to
+    it. Springs, stops, friction and controllers that `to_mjcf` writes are refused here.
+
+    **Arguments:** `text`: the XML text itself, not the name of a file.
 
     **Returns:** the linkage, and its `JointDamper` and `Armature` if it has any.
 
     **Raises:** ValueError for what a planar chain does not have (branches, other
-    joints, axes out of the plane), for springs, stops, friction and nonlinear
+    joints, axes out of the plane), for springs, ranges, friction and nonlinear
     damping of joints, and for actuators, tendons, equality constraints, fluids and
     `gravcomp`.
 
@@ -46,7 +50,8 @@ def from_mjcf(text: str) -> tuple[Linkage, Forces]:
     ((1, 2), [2.0])
     """
     mujoco = optional_package("mujoco", "test")
-    instance("text", text, str)
+    if not isinstance(text, str) or "<" not in text:
+        raise refusal("text", "the XML text of a model, not a file's name", text)
     try:
         model = mujoco.MjModel.from_xml_string(text)
     except ValueError as error:
