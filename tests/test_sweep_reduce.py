@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from sweep_batch import FAILED, run
+from sweep_batch import FAILED, run, single_links
 
 import fdof_jax as fj
 from fdof_jax.simulation import chunks
@@ -59,3 +59,19 @@ def test_it_works_under_transformations(batch):
         return run(moved, reduce=lambda motion: motion.q[-1])
 
     assert jax.eval_shape(end, batch[1].q).shape == (42, 3)
+
+
+@pytest.mark.slow
+def test_a_gradient_is_compiled_once(caplog):
+    batch = jax.tree.map(lambda leaf: leaf[:2], single_links())
+    linkage, state0, forces = batch
+
+    def ends(q):
+        moved = linkage, state0._replace(q=q), forces
+        return run(moved, reduce=end_and_fastest)[0]["end"].sum()
+
+    first = jax.grad(ends)(state0.q)
+    with jax.log_compiles():
+        second = jax.grad(ends)(state0.q)
+    assert "Compiling" not in caplog.text
+    np.testing.assert_array_equal(first, second)

@@ -47,6 +47,7 @@ def _without_times(solution: Solution) -> Solution:
     return eqx.tree_at(lambda s: s.ts, solution, None)
 
 
+@eqx.filter_jit  # under `jax.grad` alone, each call would compile its operations again
 def _traced(
     batch: Batch,
     ts: Array,
