@@ -170,6 +170,17 @@ def test_a_solve_that_runs_out_of_steps_says_so_and_marks_the_rest():
     assert np.isfinite(solution.q).all(axis=1).tolist() == (ts <= reached).tolist()
     with pytest.raises(RuntimeError, match="max_steps"):
         fj.simulate(scene.linkage, scene.state0, ts, max_steps=50)
+    with pytest.raises(RuntimeError, match=r"an implicit solver \(solver="):
+        fj.simulate(scene.linkage, scene.state0, 1e3 * ts, max_steps=50)
+
+
+def test_a_force_that_fails_at_the_start_is_named():
+    linkage, start, *_ = scenes.fig5()
+    few, none = lambda t, q, qd: q, lambda t, q, qd, linkage: q * np.nan
+    with pytest.raises(TypeError, match=r"forces\[1\]: .* \(t, q, qd, linkage\)"):
+        fj.simulate(linkage, start, [0, 1], (fj.JointDamper(1.0), few))
+    with pytest.raises(RuntimeError, match=r"forces\[1\] is not finite at the start"):
+        fj.simulate(linkage, start, [0, 1], (fj.JointDamper(1.0), none))
 
 
 def test_time_need_not_start_at_zero():

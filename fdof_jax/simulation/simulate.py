@@ -23,6 +23,7 @@ from ..forces.element import (
 from ..forces.part import check_values
 from ..linkage.coordinates import State, real_state
 from ..linkage.linkage import Linkage, check_linkage, possible
+from .failures import cause, check_arguments
 from .field import initial_states
 from .prescribed import agrees, prescribed
 from .solution import Solution
@@ -189,6 +190,7 @@ def simulate(
             solution = eqx.tree_at(lambda s: s.ts, solution, ts)
             return _raising(solution, inputs) if throw else solution
     except (TypeError, StopIteration) as error:
+        check_arguments(forces)
         # After other transformations JAX may find no rule at all, without a word.
         if "forward-mode" in str(error) or isinstance(error, StopIteration):
             raise TypeError(
@@ -208,8 +210,7 @@ def simulate(
     if throw and not succeeded:
         raise RuntimeError(
             f"simulate: {solution.outcome} at t = "
-            f"{float(solution.stats['time_reached']):g} s. "
-            f"{diffrax.RESULTS[solution.result].strip()}"
+            f"{float(solution.stats['time_reached']):g} s. {cause(inputs, solution)}"
         )
     return solution
 
