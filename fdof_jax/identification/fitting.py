@@ -91,17 +91,22 @@ def _unseen(validate: Any, shape: tuple[int, ...], *settings: Any) -> list[Probl
 
 def _judged(
     runs: list[Run], unseen: list[Problem]
-) -> list[tuple[np.ndarray, np.ndarray]]:
+) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Mean weighted squares of unseen recordings, and their numbers of readings.
 
-    Returns two arrays (recording,) for each run.
+    Returns two arrays (recording,) for each run, and the Gauss-Newton matrix of the sum
+    of squares (n, n).
     """
     counts = np.array([(problem.weight > 0).sum() for problem in unseen])
     if not unseen:
-        return [(counts, counts)] * len(runs)
+        return [(counts, counts, np.zeros(2 * run.z.shape)) for run in runs]
     lanes = Lanes(lane, [unseen], starts=len(runs))
     found = lanes(np.stack([run.z for run in runs]), np.arange(len(runs)))
-    return [(squares / counts, counts) for squares in found.facts["member_loss"]]
+    normal = len(unseen) * found.curvature / 2  # the loss is a mean over recordings
+    return [
+        (squares / counts, counts, matrix)
+        for squares, matrix in zip(found.facts["member_loss"], normal)
+    ]
 
 
 def _search(

@@ -57,7 +57,8 @@ class FitResult(eqx.Module):
       `validate`, relative to the noise [1].
     - `faults`: reasons not to use the parameters, in words: a search that has not
       converged, combinations that are `weak`, residuals well above the noise, and
-      held-out residuals above it (a tenth and three standard deviations are allowed).
+      held-out residuals above it (a tenth and three standard deviations are allowed;
+      the errors of the parameters add to them, by a factor that is named).
       The noise is that given, or by changes between successive residuals.
     """
 
@@ -173,11 +174,13 @@ def fit_result(
     known: tuple[float, float],
     unseen: np.ndarray,
     unseen_counts: np.ndarray,
+    unseen_normal: np.ndarray,
 ) -> FitResult:
     """The result of a run over `count` readings.
 
     `known`: the noise to judge residuals by, and its relative variance; `unseen`: mean
-    weighted squares of each held-out recording, of `unseen_counts`.
+    weighted squares of each held-out recording, of `unseen_counts`; `unseen_normal`:
+    their Gauss-Newton matrix, whose unknowns are relative to their scales.
     """
     shapes, _, scale, low, high = unknowns
     values = np.clip(run.z * scale, low, high)
@@ -237,7 +240,13 @@ def fit_result(
         faults.append("the motion does not determine all parameters")
     deviation = np.sqrt(1 / (2 * unseen_counts) + uncertain)
     if not (held_out <= _KNOWN + _SPREAD * deviation).all():
-        faults.append("the held-out residuals exceed the noise")
+        spread = variance * inverse * np.outer(relative, relative)
+        excess = np.sum(unseen_normal * spread) / unseen_counts.sum()
+        expected = np.sqrt(1 + excess / known_noise**2)
+        faults.append(
+            f"the held-out residuals exceed the noise ({expected:.3g} times the noise "
+            "is expected from the standard errors alone)"
+        )
     return FitResult(
         parameters=parameters,
         standard_errors=named(shapes, np.sqrt(np.diag(covariance))),
