@@ -69,6 +69,13 @@ class OpenLoop(eqx.Module):
     - `A`, `B`, `C`: matrices (state, state), (state,) and (state,). The state holds
       positions [m or rad], velocities and the controller's own state.
     - `joint`: the joint's name, for instance R1.
+    - `stable`: whether all modes of the closed loop decay.
+    - `crossover`: frequency of the phase margin, at which |L| = 1 [rad/s].
+    - `phase_margin`, `delay_margin`: least change of the phase [rad], and least delay
+      [s], that make the closed loop unstable.
+    - `gain_margin`: factor on the loop, the nearest to 1, that makes it unstable.
+    - `modulus_margin`: least distance |1 + L| at all frequencies.
+    - `bandwidth`: frequency above which the joint follows by less than -3 dB [rad/s].
     """
 
     A: Float[np.ndarray, "state state"]

@@ -13,8 +13,8 @@ from matplotlib.colors import ListedColormap
 
 from ..base.checks import refusal
 from ..linkage.linkage import Linkage
-from ..references.circle import CircleTask
 from ..references.reference import reference_of
+from ..references.task import TipReference
 from ..simulation.solution import Solution
 from .arms import geometry
 from .axes import (
@@ -37,7 +37,7 @@ def _tip(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Times of a solution, and the commanded and actual tip positions."""
     if not callable(task) or (tip := reference_of(task).tip) is None:
-        raise refusal("task", "a CircleTask", task)
+        raise refusal("task", "a CircleTask or a TipTask", task)
     ts, q, _ = reached(linkage, solution, name)
     commanded = np.asarray(jax.vmap(tip)(jnp.asarray(ts))) @ [1, 1j]
     return ts, commanded, geometry(linkage, q).tip
@@ -62,7 +62,7 @@ def _tips(linkage: Any, task: Any, solutions: Any) -> list[tuple]:
 
 def tracking(
     linkage: Linkage,
-    task: CircleTask,
+    task: TipReference,
     solutions: Mapping[str, Solution],
     ax: Axes | None = None,
 ) -> Axes:
@@ -70,8 +70,8 @@ def tracking(
 
     Drawn into the axes of `chrono_cyclograph`, it adds the path of the paper's Fig 7.
 
-    **Arguments:** `task`: `task.tip(t)` is the commanded tip position [m]; `solutions`:
-    one curve per label.
+    **Arguments:** `task`: a `CircleTask` or a `TipTask`, whose `tip(t)` is the
+    commanded tip position [m]; `solutions`: one curve per label.
     """
     curves = _tips(linkage, task, solutions)
     _, _, ts, longest, _ = max(curves, key=lambda curve: len(curve[2]))
@@ -87,14 +87,14 @@ def tracking(
 
 
 def tracking_by_error(
-    linkage: Linkage, task: CircleTask, solution: Solution, ax: Axes | None = None
+    linkage: Linkage, task: TipReference, solution: Solution, ax: Axes | None = None
 ) -> Axes:
     """Plots the path of the tip, coloured by its distance from its set point [mm].
 
     The dashed line is the commanded path; the dot is the tip's start. Later turns cover
     earlier ones.
 
-    **Arguments:** `task`: `task.tip(t)` is the commanded tip position [m].
+    **Arguments:** `task`: as in `tracking`.
 
     **Returns:** the axes, with a colour bar beside them.
     """
@@ -124,7 +124,7 @@ def tracking_by_error(
 
 def tracking_error(
     linkage: Linkage,
-    task: CircleTask,
+    task: TipReference,
     solutions: Mapping[str, Solution],
     ax: Axes | None = None,
 ) -> Axes:
