@@ -261,7 +261,8 @@ def test_animated_panels_keep_their_limits_silently(caplog):
 
 def test_labels_of_an_animation_lie_inside_its_figure():
     ts = np.linspace(0, 1, 101)
-    q = np.stack([1 - 3.5 * ts, 0.5 * ts, 0.5 * ts], axis=1)  # ticks of half metres
+    # The limits that equal scales need have longer ticks than those before.
+    q = [-0.4, -1.2, -1.6] + ts[:, None] * [0.3, -0.8, 0.7]
     solution = made_up(ts, q, np.gradient(q, ts, axis=0))
     drawing.animate(make_linkage("RRR"), solution)
     figure = plt.gcf()
