@@ -1,3 +1,4 @@
+import gc
 from pathlib import Path
 
 import jax
@@ -12,7 +13,23 @@ from fdof_jax.tuning.result import History
 fj.configure(x64=True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
+# Tests are long series of traces, whose objects mostly stay; Python would look through
+# them for cycles again and again.
+gc.set_threshold(50_000)
 HARD = Path(__file__).parent / "hard"
+# Files that take longest, which begin first so that all workers end together.
+LONGEST = {
+    "test_guides",
+    "test_notebooks",
+    "test_gradients",
+    "test_switches_at_random",
+    "test_forces_guide",
+    "test_chain_elements",
+    "test_chain_motions",
+    "test_switches",
+    "test_tuning",
+    "test_public_callables",
+}
 # Doctests that compile searches.
 SEARCHES = {
     "fdof_jax.identification.fitting.fit_each",
@@ -96,7 +113,8 @@ def pytest_report_header(config):
 
 
 def pytest_collection_modifyitems(items):
-    """Marks the hard scenes slow, as most of them compile programs of their own."""
+    """Sorts the tests, and marks the hard scenes slow, as most compile much."""
+    items.sort(key=lambda item: item.path.stem not in LONGEST)
     for item in items:
         hard = item.path.parent == HARD and item.path.stem != "test_fuzz"
         if hard or item.name in SEARCHES:

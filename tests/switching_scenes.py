@@ -48,21 +48,28 @@ def scene(x, case):
     return fj.Scene(RODS, start, (pd, spring, fj.JointDamper(case.contact)), case.end)
 
 
-ELEMENTS = "a limited controller", "a cable", "stops", "a speed limit"
-EACH = 11  # scenes of each topology, for each element
+ELEMENTS = "a limited controller", "a cable", "a bumper", "stops", "a speed limit"
+EACH = 9  # scenes of each topology, for each element
 GOAL = Hold(jnp.array([0.4, -0.3, 0.6]))
 
 
 def elements_of(size, acts):
-    """A limited PD, a cable, stops and a drive; `acts` (4,) is 1 for one of them."""
-    pd, cable, stops, drive = acts
+    """A limited PD, a cable or bumper, stops and a drive.
+
+    `acts` (5,) is 1 for one of `ELEMENTS`.
+    """
+    pd, cable, bumper, stops, drive = acts
+    contact = fj.SpringDamper(
+        HOOK, TIP, one_sided="cable", stiffness=300.0 * size * (cable + bumper),
+        damping=15.0 * size * (cable + bumper),
+        rest_length=size * jnp.where(bumper > 0, 1.95, 1.2),
+    )  # fmt: skip
+    side = jnp.where(bumper > 0, -1, 1)
+    contact = eqx.tree_at(lambda spring: spring.side, contact, side)
     inner = fj.PDController(60.0 * drive, 4.0 * drive, jnp.inf, GOAL)
     return (
         fj.PDController(60.0 * pd, 4.0 * pd, 8.0 * size, GOAL),
-        fj.SpringDamper(
-            HOOK, TIP, one_sided="cable", stiffness=300.0 * size * cable,
-            damping=15.0 * size * cable, rest_length=1.2 * size,
-        ),
+        contact,
         fj.forces.JointStops(
             -0.3, 0.6 * size, stiffness=500.0 * stops + 1e-9,
             damping=0.1, smoothing=0.02,
@@ -79,8 +86,8 @@ def random_members() -> Any:
     ef = np.array([np.array(fj.existence_factors(name)) for name in fj.TOPOLOGIES])
     q, qd = rng.uniform(-0.2, 0.5, (count, 3)), rng.uniform(-2, 2, (count, 3))
     each = np.repeat(ef, EACH, axis=0), q, qd
-    scenes = [np.tile(rows, (4, 1)) for rows in each]
-    acts = np.repeat(np.eye(4), count, axis=0)
+    scenes = [np.tile(rows, (len(ELEMENTS), 1)) for rows in each]
+    acts = np.repeat(np.eye(len(ELEMENTS)), count, axis=0)
     return jax.tree.map(jnp.asarray, (*scenes, acts))
 
 

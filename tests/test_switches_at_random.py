@@ -1,10 +1,13 @@
 """Gradients of random motions through switches, all topologies, by differences."""
 
+from functools import partial
+
 import diffrax
 import jax
 import jax.numpy as jnp
 import pytest
-from switching_scenes import random_members, random_scene
+from modes import LOOPS
+from switching_scenes import ELEMENTS, random_members, random_scene
 
 import fdof_jax as fj
 
@@ -22,8 +25,14 @@ def test_gradients_equal_differences():
         return found.q[-1], (found.q[-1], found.stats["num_switches"])
 
     members = random_members()
-    over_scenes = jax.vmap(jax.jacfwd(end, has_aux=True), (None, None, 0))
-    slopes = jax.jit(lambda x, tolerance: over_scenes(x, tolerance, members))
+    slope = jax.jacfwd(end, has_aux=True)
+
+    @partial(jax.jit, **LOOPS)
+    def slopes(x, tolerance):
+        # One element after the other, as the steps that they need differ.
+        each = len(members[0]) // len(ELEMENTS)
+        of_one = lambda member: slope(x, tolerance, member)
+        return jax.lax.map(of_one, members, batch_size=each)
 
     def differences(h):
         ends = lambda x: slopes(x, 1e-13)[1][0]

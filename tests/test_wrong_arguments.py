@@ -81,7 +81,9 @@ def test_no_members():
     assert solution.q.shape == (0, len(TS), 3)
 
 
-def test_a_sweep_under_a_transfer_guard(batch):
+def test_under_a_transfer_guard(batch):
+    linkage, state0, *_ = scenes.fig5()
     with jax.transfer_guard("disallow"):
         solution = run(batch)
-    assert successful(solution).all()
+        motion = fj.simulate(linkage, state0, TS)
+    assert successful(solution).all() and successful(motion)

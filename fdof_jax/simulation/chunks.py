@@ -28,6 +28,7 @@ from .field import element_effort
 from .solution import Solution
 
 _SMALL = 8  # lanes of the chunks for a few slow members
+_COPIED_AT_ONCE = 2**24  # bytes of results; of more, each array is copied alone
 
 
 @eqx.filter_jit
@@ -103,7 +104,7 @@ class _Chunks:
 
     def solve(
         self, chunks: list[np.ndarray], lanes: int
-    ) -> Iterator[tuple[list[np.ndarray], Any]]:
+    ) -> Iterator[tuple[list[Any], Any]]:
         """Solves chunks of members, on at most so many lanes per device.
 
         Returns of each chunk the arrays of the outcomes, and the outcomes' structure.
@@ -134,7 +135,7 @@ class _Chunks:
 
     def _begin(
         self, form: Form, members: np.ndarray, pool: ThreadPoolExecutor | None
-    ) -> Callable[[], tuple[list[np.ndarray], Any]]:
+    ) -> Callable[[], tuple[list[Any], Any]]:
         """Begins to solve a chunk; returns a function that waits for the outcomes."""
         kept = self._kept(form, members)
         if kept is not None:
@@ -152,18 +153,18 @@ class _Chunks:
 
     def _end(
         self, form: Form, members: np.ndarray, outcomes: Any
-    ) -> tuple[list[np.ndarray], Any]:
-        solved, structure = jax.tree.flatten(outcomes)
+    ) -> tuple[list[Any], Any]:
+        values, structure = jax.tree.flatten(outcomes)
         if jax.process_count() > 1:
-            solved = multihost_utils.process_allgather(solved, tiled=True)
-        values = [np.asarray(leaf)[: len(members)] for leaf in solved]
+            values = multihost_utils.process_allgather(values, tiled=True)
+        if form.mesh is not None or len(members) < form.lanes:
+            values = [np.asarray(leaf)[: len(members)] for leaf in values]
         if self.checkpoint is not None and jax.process_index() == 0:
+            values = [np.asarray(leaf) for leaf in values]
             self.checkpoint.write(members, form.lanes, values)
         return values, structure
 
-    def _kept(
-        self, form: Form, members: np.ndarray
-    ) -> tuple[list[np.ndarray], Any] | None:
+    def _kept(self, form: Form, members: np.ndarray) -> tuple[list[Any], Any] | None:
         """Returns the outcomes of a chunk that the checkpoint holds, or None."""
         if self.checkpoint is None or not self.checkpoint.has(members, form.lanes):
             return None
@@ -203,21 +204,27 @@ def in_chunks(
         cut = [waiting[start : start + size] for start in range(0, len(waiting), size)]
         late = []
         for members, (values, structure) in zip(cut, chunks.solve(cut, lanes)):
-            if not results:
-                results = [
-                    np.empty((batch.size, *v.shape[1:]), v.dtype) for v in values
-                ]
-            for kept, value in zip(results, values):
-                kept[members] = value
             _, stopped, _ = jax.tree.unflatten(structure, values)
-            late.append(members[stopped])
+            late.append(members[np.asarray(stopped)])
+            if len(members) == batch.size and not len(late[-1]):
+                results = values  # nothing is to be sorted or added
+            else:
+                if not results:
+                    results = [
+                        np.empty((batch.size, *v.shape[1:]), v.dtype) for v in values
+                    ]
+                for kept, value in zip(results, values):
+                    kept[members] = value
             done += len(members) - len(late[-1])
             progress = meter.step(progress, np.asarray(done / batch.size))
         waiting = np.concatenate(late)
         if len(waiting) <= lanes // _SMALL:
             lanes = _lanes(min(len(waiting), _SMALL), chunk)
     meter.close(progress)
-    for index, leaf in enumerate(results):
-        results[index] = jax.device_put(leaf)  # frees one before the next is copied
+    if sum(leaf.nbytes for leaf in results) < _COPIED_AT_ONCE:
+        results = jax.device_put(results)
+    else:
+        for index, leaf in enumerate(results):
+            results[index] = jax.device_put(leaf)  # frees one before the next is copied
     kept, _, failed = jax.tree.unflatten(structure, results)
     return kept, np.asarray(failed)

@@ -99,7 +99,8 @@ def integrate(
         controller = Recorded(controller)  # pyright: ignore[reportCallIssue]
         if not isinstance(solver, UnrolledDopri8 | LoopedDopri8):
             controller = Watched(controller, term.health)  # pyright: ignore[reportCallIssue]
-    with without_checks():
+    # diffrax computes a few constants while it is traced.
+    with without_checks(), jax.transfer_guard("allow"):
         found = diffrax.diffeqsolve(
             term,
             t0=ts[0],

@@ -39,6 +39,7 @@ def solve(inputs, keywords) -> tuple[Solution, bool | None]:
     return one or (_solve_compiled(inputs, keywords), None)
 
 
+@jax.transfer_guard("allow")  # the padded times are in NumPy
 def _solve_one(inputs, keywords) -> tuple[Solution, bool] | None:
     """Computes the motion of one arm from concrete inputs, and whether it succeeded.
 

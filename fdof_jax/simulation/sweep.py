@@ -6,6 +6,7 @@ many more steps than its neighbours is stopped and solved again later, in a smal
 batch of slow members.
 """
 
+import dataclasses
 import os
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -117,7 +118,7 @@ def sweep(
     *,
     forces_axes: Any = None,
     reduce: Callable[[Solution], Any] | None = None,
-    chunk: int = 128,
+    chunk: int = 256,
     throw: bool = False,
     checkpoint: str | os.PathLike | None = None,
     store: str | os.PathLike | None = None,
@@ -222,7 +223,7 @@ def sweep(
             return kept
         # NumPy's view of the common times is no copy of them for each member.
         times = (jnp if traced else np).broadcast_to(ts, (batch.size, *ts.shape))
-        return eqx.tree_at(lambda s: s.ts, kept, times, is_leaf=lambda x: x is None)
+        return dataclasses.replace(kept, ts=times)
 
     if traced:
         if throw or checkpoint is not None or store is not None:
