@@ -12,7 +12,7 @@ _ROOMS = "|".join({entry.split(".")[-2] for entry in ENTRIES.values()})
 # Code such as fj.tune(...) or Solution.outcome, if it begins no heading and no link.
 _NAME = re.compile(
     rf'(?<!">)<code>(?:fj\.)?(?:(?:{_ROOMS})\.)?({"|".join(ENTRIES)})'
-    r"(?:\.\w+|\([^<]*\))?</code>"
+    r"(?:\.\w+|\([^<()]*\))?</code>"
 )
 
 

@@ -159,6 +159,7 @@ def test_names_in_guides_become_links():
         ("fj.tuning.tune_each(scenes)", "tuning.tune_each"),
         ("Solution.outcome", "Solution"),
         ("diffrax.PIDController", None),
+        ("Path(file).write_text(html)", None),
         ("store=", None),
     ]:
         html = f"<p><code>{code}</code></p>"

@@ -41,6 +41,7 @@ class Box:
 
 @pytest.fixture(scope="module")
 def all_arms():
+    plt.close("all")  # figures of other tests
     return Box({**CIRCLES, "stiff": STIFF})
 
 
