@@ -51,11 +51,14 @@ class Limits(Part):
     modulus_margin: Values = field(unit="", minimum=0, default=0.0)
 
 
-def excess(limits: Limits, scene: Scene, solution: Solution) -> Array:
+def excess(
+    limits: Limits, scene: Scene, solution: Solution, with_margins: bool
+) -> Array:
     """Excess of a motion over its limits, at all times and frequencies (m,).
 
     Negative numbers are within. Overshoot and deviation are shares of the step, efforts
-    and margins shares of their limits.
+    and margins shares of their limits. Margins, which take a linearisation of the arm,
+    are left out if no joint's is limited.
     """
     ts, rest = solution.ts, rest_of(scene)
     share, still = step_shares(solution, rest)
@@ -67,11 +70,13 @@ def excess(limits: Limits, scene: Scene, solution: Solution) -> Array:
         unsettled = jnp.where(late, jnp.abs(share_now - 1) - BAND, -1)
         return jnp.stack([over, unsettled, jnp.abs(demand) / limits.effort - 1])
 
-    along = jax.vmap(at)(ts, share, demands_of(scene, solution))
+    along = jax.vmap(at)(ts, share, demands_of(scene, solution)).reshape(-1)
+    if not with_margins:
+        return along
     controller, others = controller_and_others(scene)
     A, B, C = closed_loop(scene.linkage, controller, others, rest, scene.t1)
     near = jax.vmap(lambda s: limits.modulus_margin * jnp.abs(s) - 1)
-    return jnp.concatenate([along.reshape(-1), near(sensitivity(A, B, C)).reshape(-1)])
+    return jnp.concatenate([along, near(sensitivity(A, B, C)).reshape(-1)])
 
 
 def controller_and_others(scene: Scene) -> tuple[PDController, tuple[Element, ...]]:

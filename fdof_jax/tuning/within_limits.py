@@ -46,9 +46,11 @@ class _Penalised(eqx.Module):
     limits: Limits
     shift: Array
     weight: Array
+    with_margins: bool = eqx.field(static=True)
 
     def __call__(self, scene: Scene, solution: Solution) -> Array:
-        beyond = excess(self.limits, scene, solution) + _WITHIN + self.shift
+        beyond = excess(self.limits, scene, solution, self.with_margins)
+        beyond = beyond + _WITHIN + self.shift
         penalty = jnp.sqrt(self.weight / SAMPLES) * jnp.maximum(beyond, 0)
         own = residuals_of(self.loss, scene, solution)
         return jnp.concatenate([own, penalty])
@@ -56,11 +58,11 @@ class _Penalised(eqx.Module):
 
 @eqx.filter_jit(compiler_options=options_of_loops())  # pyright: ignore[reportCallIssue]
 def _judged(
-    scene: Scene, motion: Solution, loss: Loss, limits: Limits
+    scene: Scene, motion: Solution, loss: Loss, limits: Limits, with_margins: bool
 ) -> tuple[Array, Array]:
     """Returns the loss of a scene's motion, and how far it is beyond limits."""
     value = jnp.sum(residuals_of(loss, scene, motion) ** 2)
-    return value, excess(limits, scene, motion)
+    return value, excess(limits, scene, motion, with_margins)
 
 
 class TunedWithin(eqx.Module):
@@ -179,6 +181,7 @@ def tune_within(
     controller_and_others(scene)
     _, lower, upper = bounds_of(scene, factor, bounds)
     limits = sized(limits, joints_of(scene.linkage))
+    with_margins = bool(np.any(np.asarray(limits.modulus_margin) > 0))
     start = gains_of(scene)
 
     def judged(scene: Scene) -> tuple[Solution, float, np.ndarray]:
@@ -186,7 +189,7 @@ def tune_within(
         # By a plain call, whose program compiles in a third of the time.
         ts = np.linspace(0, scene.t1, SAMPLES)
         motion = simulate(here.linkage, here.state0, ts, here.forces, throw=False)
-        value, beyond = _judged(here, motion, loss, limits)
+        value, beyond = _judged(here, motion, loss, limits, with_margins)
         return motion, float(value), np.asarray(beyond)
 
     motion, value, beyond = judged(scene)
@@ -199,7 +202,9 @@ def tune_within(
     shift, before = np.zeros_like(beyond), (np.inf, np.inf)
     searches: list[TuneResult] = []
     for _ in range(_SEARCHES):
-        priced = _Penalised(loss, limits, jnp.asarray(shift), jnp.asarray(weight))
+        priced = _Penalised(
+            loss, limits, jnp.asarray(shift), jnp.asarray(weight), with_margins
+        )
         found = tune(
             scene, loss=priced, bounds=(lower, upper), max_steps=max_steps,
             report=report,
