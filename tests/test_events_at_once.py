@@ -8,6 +8,7 @@ import pytest
 
 import fdof_jax as fj
 from fdof_jax.simulation.sensitivities import sensitivities
+from fdof_jax.simulation.zeros_in_steps import SHARES, at_end
 
 SLIDE = fj.Linkage(
     "P", length=[0, 1], com=[[0.5, 0]], mass=[1], inertia=[0.1], gravity=0
@@ -90,6 +91,15 @@ class Wall(fj.Element):
     def __call__(self, t, q, qd, linkage):
         beyond = q - 0.45
         return -10 + fj.forces.switch(beyond, -1e5 * beyond, 0.0, continuous=True)
+
+
+def test_rounding_in_a_step_of_no_length_is_no_switch():
+    """Samples of one instant may differ by rounding, falling to the end."""
+    falls = 1 - 1e-16 * np.arange(len(SHARES))
+    margins = jnp.array([195.0 * falls, -1e-9 * falls]).T
+    switched, grazing, soon = at_end(margins, jnp.array([300.0, 300.0]), jnp.inf)
+    assert switched.tolist() == [False, True]  # the second is past its zero
+    assert grazing == soon == 0
 
 
 def test_what_turns_back_just_before_or_beyond_its_zero_is_seen():

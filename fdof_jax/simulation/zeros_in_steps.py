@@ -133,10 +133,11 @@ def at_end(margins: Array, sizes: Array, near: Array) -> tuple[Array, Array, Arr
     """Returns what is `near` its zero at the end, and how close that is to grazing.
 
     Also returns the share of the step after which something else follows soon, or 0.
-    `sizes`: the largest size of each margin, also in steps before.
+    `sizes`: the largest size of each margin, also in steps before. `near`: a share of
+    the step; not finite for a step of no length, which tells of sides alone.
     """
     nearer = -slope_at_end(margins)
-    moves = nearer != 0  # in a step of some length
+    moves = (nearer != 0) & jnp.isfinite(near)
     speed = jnp.where(moves, nearer, 1)
     left = margins[-1] / speed
     switched = jnp.where(moves, (nearer > 0) & (left <= near), margins[-1] < 0)
