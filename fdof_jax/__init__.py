@@ -1,4 +1,29 @@
-"""Dynamics of planar open-chain linkages in JAX."""
+"""Dynamics of planar open-chain linkages in JAX.
+
+    import fdof_jax as fj
+    fj.configure(x64=True)                     # double precision, before all else
+    arm, start, forces, t1 = fj.scenes.fig7()  # or your own Linkage, State and elements
+    motion = fj.simulate(arm, start, [0, t1], forces)
+
+Units are SI. `help` of a name says the rest; its room holds more of its kind.
+
+- **Arms**: Linkage, State, Scene, TOPOLOGIES, existence_factors, to_chain, from_chain,
+  joint_positions, mass_centers, tip_position, tip_jacobian, inverse_kinematics.
+- **What acts**, room `forces`: JointDamper, JointEffort, SpringDamper, Wrench, Point,
+  LinearActuator. Of your own: Element, field, Values.
+- **Controllers**, rooms `control` and `references`: PDController, TipTask, CircleTask.
+- **Motions**: simulate, sweep for many, simulate_sampled and step for controllers on a
+  clock; Solution, SampledMotion, PrescribedMotion, scale_tolerances.
+- **At one instant**: forward_dynamics, inverse_dynamics, joint_mass_matrix, joint_bias,
+  energy, link_energies; the paper's mass_matrix, bias_force, masked_accelerations and
+  constraint_forces.
+- **Afterwards**, room `analysis`: joint_efforts, Efforts, joint_reactions, linearize.
+- **Gains**, room `tuning`: tune, TuneResult. **Parameters from recordings**, room
+  `identification`: fit, FitResult.
+- **Pictures**: drawing, plotting, interactive. **Files and tables**, room `data`: save,
+  load, to_pandas, to_xarray, to_mjcf, from_mjcf.
+- **The paper's figures**: scenes.
+"""
 
 import importlib
 import importlib.machinery

@@ -14,6 +14,7 @@ from .base.configuration import configure as configure
 from .control.pd import PDController as PDController
 from .data.files import load as load, save as save
 from .data.mjcf import to_mjcf as to_mjcf
+from .data.mjcf_import import from_mjcf as from_mjcf
 from .data.tables import to_pandas as to_pandas, to_xarray as to_xarray
 from .dynamics import (
     energy as energy,

@@ -248,6 +248,15 @@ BATCH = made_up(SOLUTION.ts, jnp.stack([SOLUTION.q] * 2))
 NOWHERE = made_up(SOLUTION.ts, SOLUTION.q * jnp.nan)
 
 
+@pytest.mark.parametrize("angle", [0.0, np.pi / 2])
+def test_a_straight_arm_has_room_around_it(angle):
+    arm = make_linkage("RRR").replace(com=[[0.1, 0]] * 3, base_angle=angle)
+    arm = arm.replace(locked=0.0)
+    ax = drawing.draw_linkage(arm, [0, 0, 0])
+    width, height = np.ptp(ax.dataLim.get_points(), axis=0)
+    assert 0.39 < min(width, height) / max(width, height) < 0.41
+
+
 def test_animated_panels_keep_their_limits_silently(caplog):
     solution = swinging()
     pairs = {t: (make_linkage(t), solution) for t in ("RRR", "PRR", "PPR")}

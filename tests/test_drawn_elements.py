@@ -98,6 +98,30 @@ def test_the_bars_of_stops_are_where_joints_touch_them():
     np.testing.assert_allclose(foot, slide, atol=1e-12)
 
 
+def test_the_path_of_a_controller_is_drawn_once_around():
+    circle = fj.CircleTask()
+    line = fj.references.Line([-4, 2], [-3, 2])
+    there = fj.references.Travel(5.0)  # begins after the configuration drawn
+    laps = fj.references.Laps(2.0)
+    around = fj.TipTask(fj.references.Ellipse([-4, 2], [0.5, 0.2]), laps)
+    gains = dict(kp=1.0, kd=1.0, limit=1.0)
+    found = drawn(
+        fj.PDController(**gains, reference=circle),
+        fj.control.FirstOrderLag(
+            fj.PDController(**gains, reference=fj.TipTask(line, there)), 0.1
+        ),
+        fj.control.PIDController(**gains, ki=1.0, reference=around),
+        fj.PDController(**gains, reference=lambda t, linkage: (Q, 0 * Q)),
+    )
+    commanded = [found[f"commanded {k}"].get_xydata() for k in (0, 1, 2)]
+    assert "commanded 3" not in found
+    turn = np.abs((commanded[0] - np.asarray(circle.center)) @ [1, 1j])
+    np.testing.assert_allclose(turn, circle.radius, rtol=1e-12)
+    np.testing.assert_allclose(commanded[0][0], commanded[0][-1], atol=1e-12)
+    np.testing.assert_allclose(commanded[1][[0, -1]], [[-4, 2], [-3, 2]], atol=1e-12)
+    np.testing.assert_allclose(np.ptp(commanded[2], axis=0), [1, 0.4], rtol=1e-3)
+
+
 def test_what_has_no_place_is_not_drawn_and_points_elsewhere_are_refused():
     ax = drawing.draw_linkage(ARM, Q, forces=(fj.JointDamper(1.0), lambda *_: 0))
     assert "damper 0" not in lines(ax)

@@ -31,7 +31,7 @@ RANDOM = fj.to_mjcf(random_linkage("RPR", np.random.default_rng(2)))
 def test_accelerations_and_tips_equal_mujoco(text):
     model = mujoco.MjModel.from_xml_string(text)
     data = mujoco.MjData(model)
-    linkage, forces = fj.data.from_mjcf(text)
+    linkage, forces = fj.from_mjcf(text)
     rng = np.random.default_rng(0)
     tips, ours = [], []
     for _ in range(4):
@@ -82,7 +82,7 @@ BODY = '<body><joint axis="0 1 0"{}/><geom size=".1"/>{}</body>'
 )
 def test_what_is_no_planar_chain_is_refused_by_name(inside, got):
     with pytest.raises(ValueError, match=f"^text: expected.*{got}"):
-        fj.data.from_mjcf(
+        fj.from_mjcf(
             "<mujoco><compiler autolimits='true'/><worldbody>"
             f"{inside.format('', '')}</worldbody></mujoco>"
         )
@@ -98,7 +98,7 @@ def test_what_is_no_planar_chain_is_refused_by_name(inside, got):
 )
 def test_what_is_no_xml_is_refused(text, message):
     with pytest.raises(ValueError, match=f"^{message}$"):
-        fj.data.from_mjcf(text)
+        fj.from_mjcf(text)
 
 
 @pytest.mark.parametrize(
@@ -130,7 +130,7 @@ def test_contacts_are_left_out_with_a_warning(inside, welded):
     mujoco.mj_forward(model, data)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        fj.data.from_mjcf(text)
+        fj.from_mjcf(text)
     about = [w for w in caught if "contacts are left out" in str(w.message)]
     assert len(about) == (data.ncon > 0)
     assert all(w.filename == __file__ for w in about)
@@ -140,4 +140,4 @@ def test_gravity_that_a_flag_disables_is_zero():
     text = CART_POLE.replace(
         "<mujoco>", '<mujoco><option><flag gravity="disable"/></option>'
     )
-    assert fj.data.from_mjcf(text)[0].gravity == 0
+    assert fj.from_mjcf(text)[0].gravity == 0

@@ -46,6 +46,11 @@ def test_the_top_is_short():
     assert len(dir(fj)) <= 70
 
 
+def test_help_names_all_that_is_at_the_top():
+    named = re.findall(r"\w+", fj.__doc__)
+    assert set(dir(fj)) - {"__version__"} <= set(named)
+
+
 def test_a_name_means_one_thing():
     for room in NAMESPACES[1:]:
         for name in room.__all__:

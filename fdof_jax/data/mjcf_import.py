@@ -42,7 +42,7 @@ def from_mjcf(text: str) -> tuple[Linkage, Forces]:
     `gravcomp`.
 
     >>> import fdof_jax as fj
-    >>> arm, forces = fj.data.from_mjcf('''
+    >>> arm, forces = fj.from_mjcf('''
     ... <mujoco><worldbody><body><joint axis="0 1 0" damping="2"/>
     ... <geom type="capsule" fromto="0 0 0 0 0 -1" size=".1"/></body></worldbody>
     ... </mujoco>''')

@@ -89,11 +89,12 @@ class FitResult(eqx.Module):
         untold = f"No fault is known, {tested} held-out recordings."
         rows = [
             f"Not to be used: {known}." if known else untold,
-            f"{'':{width}}{'value':>12}{'std error':>12}{'relative':>12}",
+            f"{'':{width}}{'value':>14}{'std error':>12}{'relative':>12}",
         ]
         for name, value, error in zip(self.names, values, errors):
             share = f"{100 * error / abs(value):.3g} %" if value else ""
-            rows.append(f"{name:{width}}{value:12.5g}{error:12.3g}{share:>12}")
+            shown = f"{value:.{_digits(value, error)}g}"
+            rows.append(f"{name:{width}}{shown:>14}{error:12.3g}{share:>12}")
         rows.append(f"rms residual {self.rms:.4g}")
         for ratio in self.held_out:
             rows.append(f"held-out residuals {ratio:.3g} times the noise")
@@ -102,6 +103,13 @@ class FitResult(eqx.Module):
             verdict = "converged in what the motion determines, which is not all"
         rows.append(f"{verdict}, {len(self.history) - 1} iterations: {self.message}")
         return "\n".join([*rows, *self.weak])
+
+
+def _digits(value: float, error: float) -> int:
+    """The digits of a value of which its standard error leaves the last two open."""
+    if not (value and 0 < error < np.inf):
+        return 5
+    return int(np.clip(np.ceil(np.log10(abs(value) / error)) + 2, 3, 10))
 
 
 def told_and_untold(normal: np.ndarray, eps: float) -> tuple[np.ndarray, np.ndarray]:

@@ -66,9 +66,14 @@ def plane_axes(ax: Any, points: np.ndarray, *, beside: float = 0.0) -> Axes:
 
     `beside`: width to reserve beside the axes [inches].
     """
-    corners = (part[~np.isnan(part)] for part in xy(points))  # NaN lifts the pen
-    width, height = (max(np.ptp(part), 1e-9) for part in corners)
+    corners = [part[~np.isnan(part)] for part in xy(points)]  # NaN lifts the pen
+    low, high = (np.array([end(part) for part in corners]) for end in (np.min, np.max))
+    # A straight arm has room around it.
+    room = np.maximum(0.4 * max(*(high - low), 1e-9) - (high - low), 0) / 2
+    low, high = low - room, high + room
+    width, height = high - low
     ax = axes_or_new(ax, 0.9 + np.clip((2.9 - beside) * height / width, 1.6, 3.6))
+    ax.update_datalim([low, high])
     ax.set_aspect("equal")
     ax.margins(0.1, 0.16)  # below, the ground needs room
     ax.set(xlabel="x [m]", ylabel="y [m]")

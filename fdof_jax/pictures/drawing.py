@@ -61,8 +61,9 @@ def draw_linkage(
     centre is a dot, joined to its link if it lies beside it.
 
     Of the force elements, those with a place are drawn: springs, dampers, cables (which
-    hang if slack), bumpers, cylinders, wrenches as arrows, and stops as bars at the
-    ends of a joint's range. The longest arrow is that of the greatest force.
+    hang if slack), bumpers, cylinders, wrenches as arrows, stops as bars at the ends
+    of a joint's range, and of a controller the path on which it leads the tip, dashed.
+    The longest arrow is that of the greatest force.
 
     **Arguments:** `q`: joint positions [m or rad]; `forces`: elements, drawn as they
     are at time 0; `color`: common colour of all links, by default one per link;

@@ -16,6 +16,8 @@ from ..forces.points import Point
 from ..linkage.frames import Frames, frames
 from ..linkage.linkage import Linkage
 from ..linkage.topology import letters
+from ..references.reference import Reference
+from ..references.task import TipTask
 from .axes import BLACK, xy
 
 # Widths are in sizes of the arm.
@@ -30,6 +32,7 @@ ELEMENT_STYLES: dict[str, dict[str, Any]] = {
     "cylinder": dict(color=BLACK, lw=1.0),
     "wrench": dict(color=BLACK, lw=1.6, solid_joinstyle="miter"),
     "stops": dict(color=BLACK, lw=1.2),
+    "commanded": dict(color=BLACK, lw=0.8, ls=(0, (5, 3))),
 }
 
 
@@ -65,11 +68,26 @@ def element_lines(
             strokes = _arrows(_place(element.point, f), *pushes[k], most, size)
         elif isinstance(element, JointStops):
             kind, strokes = "stops", _stops(element, linkage, kinds, f, size)
+        elif (path := _commanded(element)) is not None:
+            kind, strokes = "commanded", [np.tile(path, (len(ts), 1))]
         if strokes:
             lift = np.full((len(ts), 1), np.nan + 0j)
             parts = [part for stroke in strokes for part in (stroke, lift)]
             lines[f"{kind} {k}"] = np.hstack(parts[:-1])
     return lines
+
+
+def _commanded(element: Any) -> np.ndarray | None:
+    """The path on which a controller leads the tip, once around, or None."""
+    is_reference = lambda part: isinstance(part, Reference)
+    for part in jax.tree.leaves(element, is_leaf=is_reference):
+        if isinstance(part, TipTask):
+            share = np.linspace(0, 1, 201)
+            return np.asarray(jax.vmap(part.path.point)(share)) @ [1, 1j]
+        if is_reference(part) and part.tip is not None and part.period is not None:
+            turn = float(part.period) * np.linspace(0, 1, 201)
+            return np.asarray(jax.vmap(part.tip)(turn)) @ [1, 1j]
+    return None
 
 
 def _place(point: Point, f: Frames) -> np.ndarray:
@@ -114,6 +132,7 @@ _SYMBOLS = {
     "cylinder": [np.array([0.6, 0.6 + 1j, 1j, -1j, 0.6 - 1j, 0.6, 1])],
     "wrench": [np.array([0, 1, 0.7 + 1j, 1, 0.7 - 1j])],
     "stops": [np.array([1.2j, -1.2j, 0, 1, 1 + 1.2j, 1 - 1.2j])],
+    "commanded": [np.array([0, 0.4]), np.array([0.6, 1])],
 }
 
 

@@ -14,7 +14,7 @@ def response_profile(test: StepAndSine, fig: Figure | None = None) -> Figure:
     """Plots the answers of joints to steps over time, and to sines over frequency.
 
     The upper panel shows each joint's change over the height of its step. The lower
-    one shows the amplitude over that of the reference [dB].
+    one shows the amplitude over that of the reference [dB]; dots are tested frequencies.
 
     **Arguments:** `test`: the result of `step_and_sine`.
     """
@@ -27,10 +27,10 @@ def response_profile(test: StepAndSine, fig: Figure | None = None) -> Figure:
         style = dict(color=link_color(int(name[1:])), lw=1.2)
         above.plot(test.ts, response, label=name, **style)
         level = 20 * np.log10(np.abs(gain))
-        below.semilogx(frequency, level, **style)
+        below.semilogx(frequency, level, marker=".", ms=3, **style)
         at = np.interp(bandwidth, frequency, level)
-        below.plot(bandwidth, at, "o", color=style["color"], ms=4)
-    below.plot([], [], "o", color=GREY, ms=4, label="bandwidth")
+        below.plot(bandwidth, at, "o", color=style["color"], mfc="white", ms=5)
+    below.plot([], [], "o", color=GREY, mfc="white", ms=5, label="bandwidth")
     above.set(xlabel="time since the step [s]", ylabel="change / step")
     below.set(xlabel="frequency [rad/s]", ylabel="amplitude / reference [dB]")
     below.grid(which="both", lw=0.3)
