@@ -14,7 +14,8 @@ def response_profile(test: StepAndSine, fig: Figure | None = None) -> Figure:
     """Plots the answers of joints to steps over time, and to sines over frequency.
 
     The upper panel shows each joint's change over the height of its step. The lower
-    one shows the amplitude over that of the reference [dB]; dots are tested frequencies.
+    one shows the amplitude over that of the reference [dB], with a dot per frequency
+    tested.
 
     **Arguments:** `test`: the result of `step_and_sine`.
     """
