@@ -1,5 +1,7 @@
 """Properties of all force elements: gradients, batches and costs."""
 
+from functools import partial
+
 import diffrax
 import elements
 import equinox as eqx
@@ -91,7 +93,7 @@ def acts_of_all():
     """Returns what all elements do at a moment, by one program."""
     forces = jax.tree.map(jnp.asarray, tuple(elements.ALL.values()))
     start = map(jnp.asarray, elements.START)
-    return jax.jit(all_acts)(ARM, forces, jnp.array(0.1), *start, 0.1)
+    return jax.jit(all_acts, **LOOPS)(ARM, forces, jnp.array(0.1), *start, 0.1)
 
 
 def slopes_and_differences(both, ones):
@@ -125,7 +127,8 @@ def test_slopes_in_all_parameters_equal_differences():
         return all_acts(ARM, scaled(forces, p), *at)
 
     # One direction at a time: many at once take longer to compile than to run.
-    both = jax.jit(lambda p, e, *at: jax.jvp(lambda p: acting(p, *at), (p,), (e,)))
+    slope = lambda p, e, *at: jax.jvp(lambda p: acting(p, *at), (p,), (e,))
+    both = jax.jit(slope, **LOOPS)
     rng = np.random.default_rng(0)
     found = []
     # In each interval of the history, and for most limits on both sides.
@@ -165,7 +168,7 @@ def test_reverse_mode_at_an_instant_equals_differences(kinds):
         y, args = tuple(map(tuple, parts)), arguments(scaled(forces, factors))
         return jnp.stack(jax.tree.leaves((field(t, y, args), initial_own(args))))
 
-    @jax.jit
+    @partial(jax.jit, **LOOPS)
     def both(x, t, weights):
         values, pull_back = jax.vjp(lambda x: found(t, x), x)
         return values, *pull_back(weights)

@@ -1,5 +1,7 @@
 """Linear analysis: differences, known modes, small motions, equilibria, regressor."""
 
+from functools import partial
+
 import diffrax
 import equinox as eqx
 import jax
@@ -9,6 +11,7 @@ import pytest
 import scipy.linalg
 from elements import Hold
 from helpers import random_linkage
+from modes import LOOPS
 from test_reactions import TipLoad
 
 import fdof_jax as fj
@@ -45,7 +48,7 @@ def held(linkage, q, kp, kd, others=()):
     return fj.PDController(kp, kd, unlimited, Hold(q + load / np.array(kp)))
 
 
-@jax.jit
+@partial(jax.jit, **LOOPS)
 def rest(linkage, controller, guess):
     """Returns an equilibrium's derivative in the guess, and the equilibrium."""
 

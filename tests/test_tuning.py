@@ -35,13 +35,13 @@ def residuals_of(scene, gains, loss=tip_errors):
 
 @pytest.mark.slow
 def test_all_starts_agree_and_no_random_gains_do_better():
-    scene = scenes.fig7()
+    scene = scenes.fig7()._replace(t1=4.0)
     result = fj.tune(scene, factor=10.0, starts=6)  # 20 in the benchmarks
     rms = np.sqrt(result.losses)
     assert rms.shape == (6,) and (rms <= 1.01 * rms.min()).all()
     assert result.converged
     low, high = np.log(result.lower), np.log(result.upper)
-    random = np.exp(np.random.default_rng(5).uniform(low, high, (64, 2, 3)))
+    random = np.exp(np.random.default_rng(5).uniform(low, high, (32, 2, 3)))
     *others, tuned = losses_of(scene, np.concatenate([random, result.gains[None]]))
     assert tuned == pytest.approx(result.loss, rel=1e-5)
     assert min(others) > tuned

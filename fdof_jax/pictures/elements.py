@@ -82,7 +82,7 @@ def _commanded(element: Any) -> np.ndarray | None:
     is_reference = lambda part: isinstance(part, Reference)
     for part in jax.tree.leaves(element, is_leaf=is_reference):
         if isinstance(part, TipTask):
-            share = np.linspace(0, 1, 201)
+            share = jnp.linspace(0, 1, 201)
             return np.asarray(jax.vmap(part.path.point)(share)) @ [1, 1j]
         if is_reference(part) and part.tip is not None and part.period is not None:
             turn = float(part.period) * np.linspace(0, 1, 201)

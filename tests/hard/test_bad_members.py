@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from modes import LOOPS
 
 import fdof_jax as fj
 from hard.scenes import (
@@ -80,7 +81,7 @@ def test_a_member_that_starts_nan_adds_nothing_under_vmap():
 
         return jnp.sum(jax.vmap(end)(q0))
 
-    slope = jax.jit(jax.grad(loss))
+    slope = jax.jit(jax.grad(loss), **LOOPS)
     q0, mass = np.array([[-0.5], [0.5]]), np.ones(1)
     # Two of them: the same program.
     first, second = (slope(mass, q0[[k, k]]) / 2 for k in (0, 1))

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from modes import LOOPS
 
 import fdof_jax as fj
 from fdof_jax.analysis.tracking import tip_deviation
@@ -33,7 +34,7 @@ def test_losses_at_zero_error():
         return squares + jnp.mean(deviation**2) + jnp.sum(motion.q), squares
 
     arguments = jnp.full(3, 100.0), q, upright.center
-    both = jax.jit(jax.value_and_grad(losses, (0, 1, 2), has_aux=True))
+    both = jax.jit(jax.value_and_grad(losses, (0, 1, 2), has_aux=True), **LOOPS)
     (_, squares), slopes = both(*arguments)
     assert abs(squares) < 1e-28
     for slope in slopes:
@@ -52,7 +53,7 @@ def everything(linkage, q, qd):
     )
 
 
-slopes = jax.jit(jax.jacrev(everything, (1, 2)))
+slopes = jax.jit(jax.jacrev(everything, (1, 2)), **LOOPS)
 
 
 @pytest.mark.filterwarnings("ignore:prismatic joints .* are parallel")
