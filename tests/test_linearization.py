@@ -50,13 +50,14 @@ def held(linkage, q, kp, kd, others=()):
 
 @partial(jax.jit, **LOOPS)
 def rest(linkage, controller, guess):
-    """Returns an equilibrium's derivative in the guess, and the equilibrium."""
+    """Returns an equilibrium's derivative in kp, and the equilibrium."""
 
-    def twice(q):
-        found = fj.analysis.equilibrium(linkage, q, (controller,))
+    def twice(kp):
+        acting = eqx.tree_at(lambda c: c.kp, controller, kp)
+        found = fj.analysis.equilibrium(linkage, guess, (acting,))
         return found, found
 
-    return jax.jacfwd(twice, has_aux=True)(guess)
+    return jax.jacfwd(twice, has_aux=True)(controller.kp)
 
 
 def slopes(function, y, h=1e-6):
@@ -112,10 +113,13 @@ def test_a_stiff_controller_of_limited_efforts_has_an_equilibrium():
     # Compiles faster than a reference that moves.
     controller = eqx.tree_at(lambda c: c.reference, controller, Hold(reference))
     slope, q = rest(scene.linkage, controller, reference)
-    assert np.isfinite(slope).all()
     efforts = controller(0.0, q, STILL, scene.linkage)
-    held = fj.analysis.holding_efforts(scene.linkage, q)
-    np.testing.assert_allclose(efforts, held, rtol=1e-9)
+    weight = partial(fj.analysis.holding_efforts, scene.linkage)
+    np.testing.assert_allclose(efforts, weight(q), rtol=1e-9)
+    # The efforts kp (reference - q) hold the weight, whatever kp is.
+    stiffness = np.diag(controller.kp) + jax.jacfwd(weight)(q)
+    expected = np.linalg.solve(stiffness, np.diag(reference - q))
+    np.testing.assert_allclose(slope, expected, rtol=1e-7, atol=1e-15)
     assert 0.01 < np.abs(q - reference).max() < 0.3
     # No equilibrium is found from a guess at which the slide is at its limit.
     saturated = rest(scene.linkage, controller, jnp.asarray(scene.state0.q))

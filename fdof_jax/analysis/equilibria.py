@@ -9,7 +9,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from ..base.checks import JOINT, in_order, real_array
-from ..dynamics import inverse_dynamics
+from ..dynamics import joint_bias
 from ..forces.element import Element, Forces
 from ..linkage.linkage import Linkage, per_joint, without_fixed
 from ..linkage.topology import fixed_pairs
@@ -54,25 +54,33 @@ def _rest(linkage: Linkage, forces: tuple[Element, ...], q: Array, t: Array) -> 
     q = without_fixed(linkage, q)
     still = jnp.zeros_like(q)
 
-    def efforts(q, _):
-        weight = -inverse_dynamics(linkage, q, still, still, forces)
-        acting = weight + total_effort(linkage, forces, t, q, still)
+    def efforts(q):
+        acting = total_effort(linkage, forces, t, q, still)
+        acting -= joint_bias(linkage, q, still, forces)
         # A fixed pair is in equilibrium at 0.
         return jnp.where(jnp.stack(fixed_pairs(linkage.ef)), -q, acting)
 
     # Efforts relative to their rounding errors' scale: stiff controllers converge as
     # exactly as soft springs.
-    slopes = jnp.abs(jax.jacfwd(efforts)(q, None))
-    size = jax.lax.stop_gradient(
-        slopes @ (1 + jnp.abs(q)) + jnp.abs(efforts(q, None)) + 1
-    )
+    slopes = jnp.abs(jax.jacfwd(efforts)(q))
+    size = jax.lax.stop_gradient(slopes @ (1 + jnp.abs(q)) + jnp.abs(efforts(q)) + 1)
     tight = 1e3 * float(jnp.finfo(q.dtype).eps)
-    solver = optimistix.LevenbergMarquardt(rtol=tight, atol=tight)
-    relative = lambda q, _: efforts(q, None) / size
-    found = optimistix.root_find(relative, solver, q, throw=False)
-    good = found.result == optimistix.RESULTS.successful
-    # A product, unlike `where`, makes the derivative NaN too if none is found.
-    return found.value * jnp.where(good, 1, jnp.nan)
+    method = optimistix.LevenbergMarquardt(rtol=tight, atol=tight)
+
+    def search(function, q):
+        relative = lambda q, _: function(q)
+        found = optimistix.root_find(relative, method, q, throw=False)
+        good = found.result == optimistix.RESULTS.successful
+        return jnp.where(good, found.value, jnp.nan)
+
+    # optimistix alone would differentiate the least squares that the method minimises,
+    # which takes second derivatives of the efforts.
+    return jax.lax.custom_root(
+        lambda q: efforts(q) / size,
+        q,
+        search,
+        lambda slope, change: jnp.linalg.solve(jax.jacfwd(slope)(change), change),
+    )
 
 
 def holding_efforts(
@@ -91,5 +99,4 @@ def holding_efforts(
     [58.86, 29.43, 9.81]
     """
     q = real_array("q", q, (JOINT,))
-    still = jnp.zeros_like(q)
-    return inverse_dynamics(linkage, q, still, still, forces)
+    return joint_bias(linkage, q, jnp.zeros_like(q), forces)

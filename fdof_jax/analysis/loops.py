@@ -14,14 +14,13 @@ from scipy.linalg import block_diag, eigvals
 from scipy.optimize import minimize_scalar
 
 from ..base.checks import is_traced, one_of, real_array, refusal
-from ..dynamics import inverse_dynamics
+from ..dynamics import joint_bias, joint_mass_matrix
 from ..forces.element import Element, Forces, elements_on, of_full_size
-from ..forces.joints import JointEffort
-from ..linkage.coordinates import State
 from ..linkage.linkage import Linkage, check_linkage, joint_names, per_joint
+from ..linkage.topology import fixed_pairs
 from ..simulation.html_table import html_table
 from ..simulation.prescribed import prescribed
-from .linearization import checked, linearize, total_effort
+from .linearization import checked, total_effort
 
 # A frequency counts as a crossing if the response there is on the curve to this part.
 _ON_CURVE = 1e-6
@@ -40,24 +39,30 @@ def closed_loop(
     tau added to the controller's, which are -C y. In the operating point, constant
     efforts hold the arm at rest.
     """
-    still = jnp.zeros_like(q)
-    held = inverse_dynamics(linkage, q, still, still, forces)
-    held = held - total_effort(linkage, forces, t, q, still)
-    acting = (*forces, JointEffort(held))
-    plant = linearize(linkage, State(q, still), acting, t)
     own, rebuilt = ravel_pytree(controller.initial_state(linkage))
-    n = q.size
+    n, still = q.size, jnp.zeros_like(q)
+    inverse = jnp.linalg.inv(joint_mass_matrix(linkage, q, forces))
+    inverse = jnp.where(jnp.stack(fixed_pairs(linkage.ef)), 0, inverse)
+    B = jnp.concatenate([jnp.zeros((n, n)), inverse, jnp.zeros((own.size, n))])
+
+    def acting(y):
+        q, qd, _ = jnp.split(y, [n, 2 * n])
+        return total_effort(linkage, forces, t, q, qd) - joint_bias(
+            linkage, q, still, forces
+        )
 
     def respond(y):
         q, qd, own = jnp.split(y, [n, 2 * n])
         effort, rate = controller.act(t, q, qd, linkage, rebuilt(own))
         return jnp.concatenate([effort, ravel_pytree(rate)[0]])
 
-    slopes = jax.jacfwd(respond)(jnp.concatenate([q, still, own]))
+    # At rest M^-1 is multiplied by no effort, so its own derivative does not count.
+    # Coriolis forces, quadratic in the velocities, have none.
+    y = jnp.concatenate([q, still, own])
+    alone, slopes = jax.jacfwd(acting)(y), jax.jacfwd(respond)(y)
     efforts, rates = slopes[:n], slopes[n:]
-    B = jnp.concatenate([plant.B, jnp.zeros((own.size, n))])
-    alone = jnp.pad(plant.A, ((0, 0), (0, own.size)))
-    return jnp.concatenate([alone, rates]) + B @ efforts, B, -efforts
+    moved = jnp.concatenate([jnp.eye(n, len(y), n), jnp.zeros((n, len(y))), rates])
+    return moved + B @ (alone + efforts), B, -efforts
 
 
 class OpenLoop(eqx.Module):
