@@ -49,6 +49,7 @@ class Problem(NamedTuple):
     - `names`: of as many equal parts of the members.
     - `together`: whether members run as one batch or one after the other.
     - `phases`: a scene's elements between its switches, where these are known.
+    - `stateful`: whether elements have a state of their own, which `by_diffrax` lacks.
     """
 
     names: tuple[str, ...]
@@ -57,6 +58,7 @@ class Problem(NamedTuple):
     members: Any  # with a leading axis
     together: bool = False
     phases: Callable[[fj.Scene], Phases] | None = None
+    stateful: bool = False
 
 
 def move(p: Array, case: Any) -> fj.Scene:
@@ -107,6 +109,11 @@ PROBLEMS = (
     Problem(
         tuple(f"random: {name}" for name in scenes.ELEMENTS), random,
         np.array([1.0, 1.0, 0.0]), scenes.random_members(), together=True,
+    ),
+    Problem(
+        tuple(f"random: {name}" for name in scenes.MOVING), random,
+        np.array([1.0, 1.0, 0.0]), scenes.random_members(scenes.MOVING), together=True,
+        stateful=True,
     ),
 )  # fmt: skip
 
@@ -178,7 +185,9 @@ def ways(problem: Problem) -> dict[str, Callable]:
 
     forward, reverse = partial(located, FORWARD), partial(located, REVERSE)
     plain = partial(by_diffrax, lambda scene: [(scene.forces, None)])
-    found = [(jax.jacfwd, forward), (jax.grad, reverse), (jax.jacfwd, plain)]
+    found = [(jax.jacfwd, forward), (jax.grad, reverse)]
+    if not problem.stateful:
+        found.append((jax.jacfwd, plain))
     if problem.phases is not None:
         found.append((jax.jacfwd, partial(by_diffrax, problem.phases)))
     return {way: compiled(*how) for way, how in zip(WAYS, found)}

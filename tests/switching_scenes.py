@@ -79,15 +79,34 @@ def elements_of(size, acts):
     )  # fmt: skip
 
 
-def random_members() -> Any:
+MOVING = "a limited PID", "a motor"  # controllers with a state, in a move
+
+
+def moving_elements(size, acts, start):
+    """A limited PID and a DC motor, whose references move; `acts` (2,) is 1 for one."""
+    pid, motor = acts
+    travel = fj.references.Travel(0.25, begin=0.1 * size, profile="trapezoidal")
+    move = fj.references.JointMove(start, start + 0.4, travel)
+    volts = fj.PDController(300.0 * motor, 30.0 * motor, jnp.inf, move)
+    return (
+        fj.control.PIDController(60.0 * pid, 90.0 * pid, 6.0 * pid, 8.0 * size, move),
+        fj.control.DCMotor(
+            volts, resistance=2.0, inductance=0.05, constant=0.2, gear=10.0,
+            voltage_limit=24.0 * size, current_limit=8.0,
+        ),
+        fj.JointDamper(0.2),
+    )  # fmt: skip
+
+
+def random_members(elements=ELEMENTS) -> Any:
     """Existence factors, starts and the acting element: (scene, ...) each."""
     rng = np.random.default_rng(3)
     count = len(fj.TOPOLOGIES) * EACH
     ef = np.array([np.array(fj.existence_factors(name)) for name in fj.TOPOLOGIES])
     q, qd = rng.uniform(-0.2, 0.5, (count, 3)), rng.uniform(-2, 2, (count, 3))
     each = np.repeat(ef, EACH, axis=0), q, qd
-    scenes = [np.tile(rows, (len(ELEMENTS), 1)) for rows in each]
-    acts = np.repeat(np.eye(len(ELEMENTS)), count, axis=0)
+    scenes = [np.tile(rows, (len(elements), 1)) for rows in each]
+    acts = np.repeat(np.eye(len(elements)), count, axis=0)
     return jax.tree.map(jnp.asarray, (*scenes, acts))
 
 
@@ -95,4 +114,8 @@ def random_scene(size, mass, shift, member) -> fj.Scene:
     """Returns a member's scene: size of the element, masses' factor, change of q."""
     ef, q, qd, acts = member
     arm = fj.Linkage(ef, **ARM | {"mass": jnp.array(ARM["mass"]) * mass})
-    return fj.Scene(arm, fj.State(q + shift, qd), elements_of(size, acts), 0.4)
+    if acts.shape[-1] == len(MOVING):
+        forces = moving_elements(size, acts, q)
+    else:
+        forces = elements_of(size, acts)
+    return fj.Scene(arm, fj.State(q + shift, qd), forces, 0.4)
