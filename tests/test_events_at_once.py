@@ -8,7 +8,7 @@ import pytest
 
 import fdof_jax as fj
 from fdof_jax.simulation.sensitivities import sensitivities
-from fdof_jax.simulation.zeros_in_steps import SHARES, at_end
+from fdof_jax.simulation.zeros_in_steps import SHARES, at_end, first_zero, passage
 
 SLIDE = fj.Linkage(
     "P", length=[0, 1], com=[[0.5, 0]], mass=[1], inertia=[0.1], gravity=0
@@ -135,3 +135,30 @@ def test_a_switch_that_the_integrator_cannot_see_is_refused(transform):
         ValueError, match=r"forces\[0\].switch: expected a call outside"
     ):
         fj.simulate(SLIDE, fj.State([0], [1]), [0, 0.1], (force,))
+
+
+def test_far_from_zero_nothing_is_searched_and_nothing_missed():
+    """Polynomials that pass zero, nearly meet it or stay away, in all step lengths."""
+    rng = np.random.default_rng(0)
+    shares = np.asarray(SHARES)
+    roots = rng.uniform(-3, 3, (4000, 3))
+    rows = np.prod(shares[:, None] - roots.T[:, None], axis=0) * rng.choice(
+        [-1, 1], 4000
+    )
+    rows = rows + rng.uniform(-1, 1, 4000) * np.abs(rows).max(axis=0)
+    near = 10.0 ** rng.uniform(-10, 1, 4000)
+    before = np.abs(rows).max(axis=0) * rng.uniform(0, 3, 4000)
+    sizes = np.maximum(before, np.abs(rows).max(axis=0))
+    one = lambda *a: passage(a[0][:, None], a[1][None], a[2][None], a[3])
+    every = jax.jit(jax.vmap(one, (1, 0, 0, 0)))
+    found = every(rows, before, sizes, near)
+
+    def slow(margins, before, sizes, near):
+        margins, before, sizes = margins[:, None], before[None], sizes[None]
+        return *first_zero(margins, before), *at_end(margins, sizes, near)
+
+    expected = jax.jit(jax.vmap(slow, (1, 0, 0, 0)))(rows, before, sizes, near)
+    for a, b in zip(found, expected):
+        np.testing.assert_array_equal(a, b)
+    quiet = ~np.asarray(expected[1]) & ~np.asarray(expected[3])[:, 0]
+    assert 0.2 < quiet.mean() < 0.8

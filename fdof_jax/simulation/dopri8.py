@@ -85,12 +85,8 @@ def interpolation_weights(theta: Array) -> Array:
 
 
 class DenseOutput(diffrax.AbstractLocalInterpolation):
-    """Dense output as in diffrax; a subclass sums the weighted rates.
+    """Dense output as in diffrax; a subclass sums the weighted rates."""
 
-    `looped`: whether several of its states are best computed by a loop.
-    """
-
-    looped: ClassVar[bool] = False
     t0: Any  # pyright: ignore[reportIncompatibleVariableOverride]
     t1: Any  # pyright: ignore[reportIncompatibleVariableOverride]
     y0: PyTree

@@ -84,8 +84,6 @@ def _step(term: Any, t0, t1, y0, lost, args):
 
 
 class _Interpolation(DenseOutput):
-    looped = True
-
     def at(self, theta):
         change = _weighted(interpolation_weights(theta), self.rates)
         return jtu.tree_map(lambda a, k: a + self.step * k, self.y0, change)

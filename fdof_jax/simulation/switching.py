@@ -18,7 +18,7 @@ from .dopri8 import DenseOutput, constant, with_change
 from .landing import Landing, rounding
 from .step_wrappers import undifferentiated, with_pid
 from .switch_derivatives import Moment, first_of, gained, lateness_of
-from .zeros_in_steps import BEYOND, SAMPLED, SHARES, at_end, first_zero
+from .zeros_in_steps import BEYOND, SAMPLED, SHARES, passage
 
 # What is zero around the end of a step switches there: within this power of the unit of
 # rounding, as a share of the step (1e-9 in float64).
@@ -172,13 +172,14 @@ class Located(diffrax.AbstractAdaptiveSolver):
         where = terms.term, t0, t1, path, args
         seen = _values(*constant(where))
         margins = sides[None] * seen
-        until, crossed, missed = first_zero(margins, known.sizes)
         # Lengths of steps to a switch say nothing about the pace of the motion.
         share = jnp.finfo(t1.dtype).eps ** _NEAR
         near = jnp.maximum(share * (t1 - t0), known.near / 2)
         near = jnp.maximum(near, rounding(t1))
         sizes = jnp.maximum(known.sizes, jnp.max(jnp.abs(seen), axis=0))
-        switched, grazing, soon = at_end(margins, sizes, near / (t1 - t0))
+        until, crossed, missed, switched, grazing, soon = passage(
+            margins, known.sizes, sizes, near / (t1 - t0)
+        )
         # Before the first step, whose length is 0, sides are unknown.
         after = jnp.where(switched, -sides, sides)
         after = jnp.where(sides == 0, jnp.where(seen[-1] > 0, 1.0, -1.0), after)
@@ -276,7 +277,7 @@ def _values(term: Any, t0: Array, t1: Array, path: Any, args: Any) -> Array:
         scheduled = jax.tree.map(lambda rows: rows[stages], path.scheduled)
         one = lambda row: term.switching(row[1], path.at(row[0]), args, row[2])[0]
         rows = shares, times, scheduled
-        found = jax.lax.map(one, rows) if path.looped else jax.vmap(one)(rows)
+        found = jax.vmap(one)(rows)
     else:
         found = jax.vmap(lambda t: term.switches(t, path.evaluate(t), args)[0])(times)
     # An infinite limit is never reached.

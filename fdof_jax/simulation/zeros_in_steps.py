@@ -72,6 +72,29 @@ def _turns(margins: Array, least: Array) -> tuple[Array, Array]:
 
 
 @eqx.filter_jit
+def passage(
+    margins: Array, before: Array, sizes: Array, near: Array
+) -> tuple[Array, ...]:
+    """Returns what `first_zero` and `at_end` do: (1, no, 0) and (no, 0, 0) if far.
+
+    `before`, `sizes`: the largest sizes in steps before, and with this one.
+    """
+    # Each slope pulls a cubic by at most 4/27 of its length beyond its ends.
+    slopes = jnp.abs(_times(_SLOPES, margins))
+    lengths = jnp.asarray(np.diff(SHARES), margins.dtype)[:, None]
+    pulled = 4 / 27 * jnp.max(lengths * (slopes[:-1] + slopes[1:]), axis=0)
+    least = jnp.maximum(pulled + _MISSED * sizes, _SOON * slopes[-1])
+    far = jnp.all(margins > least[None]) & (near < _SOON)
+    zero = jnp.zeros((), margins.dtype)
+    no = jnp.zeros(margins.shape[1:], bool)
+    return jax.lax.cond(
+        far,
+        lambda: (zero + 1, no.any(), zero, no, zero, zero),
+        lambda: (*first_zero(margins, before), *at_end(margins, sizes, near)),
+    )
+
+
+@eqx.filter_jit
 def first_zero(margins: Array, sizes: Array) -> tuple[Array, Array, Array]:
     """Returns the share of a step where a margin passes 0, and whether one does.
 
