@@ -8,25 +8,25 @@ import numpy as np
 import pytest
 from elements import SHORT
 from modes import ADJOINT, LOOPS
-from test_gradient_quality import POINTS, tangents
+from test_gradient_quality import ARM, CIRCLE, POINTS, tangents, tracked
 
 import fdof_jax as fj
 from fdof_jax import scenes
 from fdof_jax.analysis.tracking import tip_deviation
 
 TS = np.linspace(0, 1.0, 21)
-ZERO = jnp.zeros(3)
+ZERO = jnp.zeros(2)
 
 
 def outcome(problem, parameters, adjoint=diffrax.ForwardMode()):
     """Returns the mean squared tip deviation and the last positions.
 
     They are functions of log kp, log kd, log masses and a shift of the start,
-    (12,). The problem (arm, start, controller, times, steps) consists of values
+    (8,). The problem (arm, start, controller, times, steps) consists of values
     only, so one program in forward mode and one in reverse mode serve all tests.
     """
     linkage, state0, controller, ts, (steps, dt0) = problem
-    log_kp, log_kd, log_mass, shift = parameters.reshape(4, 3)
+    log_kp, log_kd, log_mass, shift = parameters.reshape(4, 2)
     controller = eqx.tree_at(
         lambda c: (c.kp, c.kd),
         controller,
@@ -85,10 +85,10 @@ STEPS = {"fixed": steps(1e9, 1 / 1024, growth=1.0), "adaptive": steps(1e-13)}
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", STEPS)
 def test_forward_reverse_and_differences_agree(kind):
-    scene = jax.tree.map(jnp.asarray, scenes.fig7())
+    scene = POINTS["start"]
     problem = scene.linkage, scene.state0, scene.forces[0], TS, STEPS[kind]
-    # An ordinary point, away from the paper's gains.
-    at = [0.1, -0.2, 0.3, 0.05, 0.2, -0.1, 0.0, 0.1, -0.1, 0.02, 0.1, -0.03]
+    # An ordinary point.
+    at = [0.1, -0.2, 0.05, 0.2, -0.1, 0.1, 0.02, 0.1]
     at = jnp.array(at)
     (tangents, _), _ = forward(problem, at)
     gradient = reverse(problem, at, jnp.array([1.0, 0.0]))
@@ -116,15 +116,15 @@ def test_forward_reverse_and_differences_agree(kind):
 @pytest.mark.slow
 @pytest.mark.parametrize("point", POINTS)
 def test_both_modes_are_the_tangents_that_tuning_follows(point):
-    scene = jax.tree.map(jnp.asarray, POINTS[point])
+    scene = POINTS[point]
     problem = scene.linkage, scene.state0, scene.forces[0], TS, STEPS["adaptive"]
     *_, gradient = tangents(scene, 1e-11, TS)
     wanted = gradient / 2  # the loss is a mean over both coordinates too
-    (slopes, _), _ = forward(problem, jnp.zeros(12))
-    gradient = reverse(problem, jnp.zeros(12), jnp.array([1.0, 0.0]))
+    (slopes, _), _ = forward(problem, jnp.zeros(8))
+    gradient = reverse(problem, jnp.zeros(8), jnp.array([1.0, 0.0]))
     near = (1e-5 if point == "saturated" else 1e-6) * np.linalg.norm(wanted)
-    assert np.linalg.norm(slopes[:6] - wanted) < near
-    assert np.linalg.norm(gradient[:6] - wanted) < near
+    assert np.linalg.norm(slopes[:4] - wanted) < near
+    assert np.linalg.norm(gradient[:4] - wanted) < near
 
 
 def test_both_modes_of_a_damped_arm_equal_differences():
@@ -135,7 +135,7 @@ def test_both_modes_of_a_damped_arm_equal_differences():
         mass, coefficient, q = at.reshape(3, 3)
         linkage = eqx.tree_at(lambda x: x.mass, arm, mass)
         forces = (eqx.tree_at(lambda d: d.coefficient, damper, coefficient),)
-        start, steps = fj.State(q, ZERO), diffrax.ConstantStepSize()
+        start, steps = fj.State(q, jnp.zeros(3)), diffrax.ConstantStepSize()
         motion = fj.simulate(
             linkage, start, [0, 0.5], forces,
             stepsize_controller=steps, dt0=1 / 64, adjoint=adjoint,
@@ -156,54 +156,54 @@ def test_both_modes_of_a_damped_arm_equal_differences():
 @pytest.mark.slow
 def test_gradients_at_rest_and_at_zero_error_are_finite():
     """The arm hangs still, or is at the start of its circle without an error."""
-    linkage = scenes.fig7().linkage
-    task = fj.CircleTask(center=(-4.0, 2.0), radius=0.5)
-    q = fj.inverse_kinematics(linkage, task.tip(0.0), task.orientation)
-    gains = [1500.0, 20000.0, 800.0], [80.0, 50.0, 50.0]
-    controller = fj.PDController(*gains, [np.inf] * 3, task)
+    q = fj.inverse_kinematics(ARM, CIRCLE.tip(0.0), None)
+    (controller,) = tracked(limit=[np.inf] * 2).forces
     ts = np.linspace(0, 0.1, 21)
-    problem = linkage, fj.State(q, ZERO), controller, ts, steps(1e-11)
-    gradient = reverse(problem, jnp.zeros(12), jnp.array([0.0, 1.0]))
+    problem = ARM, fj.State(q, ZERO), controller, ts, steps(1e-11)
+    gradient = reverse(problem, jnp.zeros(8), jnp.array([0.0, 1.0]))
     assert np.isfinite(gradient).all() and gradient.any()
 
 
 @pytest.mark.slow
 def test_gradients_at_and_beyond_a_limit_are_finite_and_zero():
     """The efforts are their limits at the start, or everywhere."""
-    linkage, start, (controller,), _ = jax.tree.map(jnp.asarray, scenes.fig7())
+    linkage, start, (controller,), _ = tracked()
     demand = jnp.abs(eqx.filter_jit(controller.demand)(0.0, *start, linkage))
     slopes = {}
-    for name, limit in (("at", demand), ("beyond", np.full(3, 1e-3))):
+    for name, limit in (("at", demand), ("beyond", np.full(2, 1e-3))):
         limited = eqx.tree_at(lambda c: c.limit, controller, limit)
         problem = linkage, start, limited, np.linspace(0, 0.1, 21), steps(1e-11)
-        slopes[name] = reverse(problem, jnp.zeros(12), jnp.array([0.0, 1.0]))
+        slopes[name] = reverse(problem, jnp.zeros(8), jnp.array([0.0, 1.0]))
     assert np.isfinite(slopes["at"]).all()
-    of_gains, others = slopes["beyond"][:6], slopes["beyond"][6:]
+    of_gains, others = slopes["beyond"][:4], slopes["beyond"][4:]
     assert not of_gains.any() and np.isfinite(others).all() and others.any()
 
 
-HANGING = jnp.array([-jnp.pi / 2, 0.0, 0.0])
-CHAIN = eqx.tree_at(lambda x: x.inertia, scenes.fig5().linkage, np.full(3, 1 / 12))
+HANGING = jnp.array([-jnp.pi / 2, 0.0])
+RODS = fj.Linkage(
+    "RR", length=[0, 1, 1], com=[[0.5, 0]] * 2, mass=[1, 1], inertia=[1 / 12] * 2
+)
 
 
 def linear_motion(end):
     """Returns the exact derivative of the hanging arm's position in its start."""
-    stiffness = jax.jacfwd(lambda q: fj.forward_dynamics(CHAIN, q, ZERO, ZERO))(HANGING)
-    rates = jnp.block([[jnp.zeros((3, 3)), jnp.eye(3)], [stiffness, jnp.zeros((3, 3))]])
-    return jax.scipy.linalg.expm(rates * end, max_squarings=32)[:3, :3]
+    stiffness = jax.jacfwd(lambda q: fj.forward_dynamics(RODS, q, ZERO, ZERO))(HANGING)
+    rates = jnp.block([[jnp.zeros((2, 2)), jnp.eye(2)], [stiffness, jnp.zeros((2, 2))]])
+    return jax.scipy.linalg.expm(rates * end, max_squarings=32)[:2, :2]
 
 
 @pytest.mark.slow
 def test_tangents_of_a_hanging_arm_are_controlled():
     """At rest the error estimate is 0; steps are bounded by the time scale instead."""
     # In the circle's reach, with a controller that does nothing.
-    task = fj.CircleTask(center=(1.0, 1.0), radius=0.2)
-    idle = fj.PDController(ZERO, ZERO, [np.inf] * 3, task)
+    path = fj.references.Ellipse([1.0, 0.5], [0.2, 0.2])
+    task = eqx.tree_at(lambda task: task.path, CIRCLE, path)
+    idle = fj.PDController(ZERO, ZERO, [np.inf] * 2, task)
     ts = np.linspace(0, 10.0, 21)
-    problem = CHAIN, fj.State(HANGING, ZERO), idle, ts, steps(1e-11)
-    (_, slopes), _ = forward(problem, jnp.zeros(12))
+    problem = RODS, fj.State(HANGING, ZERO), idle, ts, steps(1e-11)
+    (_, slopes), _ = forward(problem, jnp.zeros(8))
     exact = linear_motion(10.0)
-    assert np.abs(slopes[:, 9:] - exact).max() <= 1e-6 * np.abs(exact).max()
+    assert np.abs(slopes[:, 6:] - exact).max() <= 1e-6 * np.abs(exact).max()
 
 
 @pytest.mark.slow
@@ -213,7 +213,7 @@ def test_without_a_bound_tangents_of_a_hanging_arm_are_wrong():
     def final(q0, dtmax):
         steps = diffrax.PIDController(rtol=1e-11, atol=1e-11, dtmax=dtmax)
         return fj.simulate(
-            CHAIN,
+            RODS,
             fj.State(q0, ZERO),
             [0, end],
             stepsize_controller=steps,

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from chains import random_chain
 from elements import SHORT, Swing
 from helpers import random_linkage
 from modes import LOOPS
@@ -25,6 +26,7 @@ with pytest.warns(UserWarning, match="joints 2 and 3 coincide"):
 ROTOR = MASS * LENGTH**2 + INERTIA
 FREQUENCY = np.sqrt(MASS * G * LENGTH / ROTOR)
 REST = fj.State(np.zeros(3), np.zeros(3))
+AMPLITUDE = jnp.array([0.3, 0.2])
 
 
 class Push(eqx.Module):
@@ -75,12 +77,24 @@ def test_a_jump_of_the_velocity_is_a_blow():
     np.testing.assert_allclose(solution.qd[1:, 1], rate[1:], atol=1e-9)
 
 
+class Sway(eqx.Module):
+    """A reference of two joints; the programs of such arms compile faster."""
+
+    amplitude: jax.Array
+
+    def __call__(self, t, linkage):
+        angle = 3 * t + jnp.array([0.0, 1.0])
+        return self.amplitude * jnp.sin(angle), 3 * self.amplitude * jnp.cos(angle)
+
+
 def swinging(topology, joints, forces=()):
-    rng = np.random.default_rng(3)
-    linkage = random_linkage(topology, rng)
-    motion = fj.PrescribedMotion(joints, Swing(jnp.array([0.3, 0.2, 0.4])))
+    rng, n = np.random.default_rng(3), len(topology)
+    linkage = random_linkage(topology, rng) if n == 3 else random_chain(topology, rng)
+    swing = Swing(jnp.array([0.3, 0.2, 0.4])) if n == 3 else Sway(AMPLITUDE)
+    motion = fj.PrescribedMotion(joints, swing)
     q, qd = motion.reference(0.0, linkage)
-    forces = (motion, fj.JointDamper(0.5), fj.JointEffort([1.0, -2.0, 0.7]), *forces)
+    effort = fj.JointEffort([1.0, -2.0, 0.7][:n])
+    forces = (motion, fj.JointDamper(0.5), effort, *forces)
     return linkage, fj.State(q, qd), forces
 
 
@@ -159,13 +173,13 @@ def test_starts_beside_the_reference_and_singular_equations_are_told():
 
 @pytest.mark.slow
 def test_gradients_equal_differences():
-    linkage, start, (motion, *others) = swinging("RPR", 1)
-    weights = np.array([1.0, -2.0, 0.5])
+    linkage, start, (motion, *others) = swinging("PR", 1)
+    weights = np.array([1.0, -2.0])
 
     @partial(jax.jit, **LOOPS)
     @jax.value_and_grad
     def both(p):
-        reference = Swing(jnp.array([0.3, 0.2, 0.4]) * p[0])
+        reference = Sway(AMPLITUDE * p[0])
         q, qd = reference(0.0, linkage)
         state0 = fj.State(jnp.where(motion.of(linkage), q, start.q), start.qd)
         forces = fj.PrescribedMotion(1, reference), fj.JointDamper(p[1])
@@ -180,8 +194,8 @@ def test_gradients_equal_differences():
 @pytest.mark.slow
 def test_topologies_are_batched():
     """A rotor's inertia beside them takes the batch through the looped solver."""
-    members = [swinging(topology, 2) for topology in fj.TOPOLOGIES]
-    rotor = (fj.forces.Armature(np.array([0.3, 0.2, 0.1])),)
+    members = [swinging(topology, 2) for topology in ("RR", "RP", "PR", "PP")]
+    rotor = (fj.forces.Armature(np.array([0.3, 0.2])),)
     stack = lambda trees: jax.tree.map(lambda *a: jnp.stack(a), *trees)
     linkages, starts, forces = map(stack, zip(*members))
     ts = [0, 0.3]

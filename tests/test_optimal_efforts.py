@@ -114,20 +114,22 @@ def test_slides_are_controlled_as_fuller_found():
 
 @pytest.mark.slow
 def test_scipy_finds_no_better_efforts():
-    scene, limit = scenes.fig7(), np.asarray(CONTROLLER.limit)
-    knots = np.linspace(0, 0.4, 6)
+    # Of two joints, whose programs compile faster.
+    scene = scenes.two_link_circle()
+    (controller,), knots = scene.forces, np.linspace(0, 0.4, 6)
     found = fj.tuning.optimal_efforts(scene, horizon=0.4, knots=6, effort_rate=0)
     ts = np.linspace(0, 0.4, 501)
     weights = np.sqrt(np.convolve(np.full(500, 1 / 500), [0.5, 0.5]))
 
     def residuals(z):
-        forces = (fj.forces.EffortHistory(knots, limit * z.reshape(-1, 3)),)
+        efforts = np.asarray(controller.limit) * z.reshape(-1, 2)
+        forces = (fj.forces.EffortHistory(knots, efforts),)
         solution = fj.simulate(scene.linkage, scene.state0, ts, forces)
-        deviation = tip_deviation(scene.linkage, CONTROLLER.reference, solution)
+        deviation = tip_deviation(scene.linkage, controller.reference, solution)
         return np.asarray(weights[:, None] * deviation).ravel()
 
     other = least_squares(
-        residuals, np.zeros(18), bounds=(-1, 1), diff_step=1e-6, ftol=1e-6
+        residuals, np.zeros(12), bounds=(-1, 1), diff_step=1e-6, ftol=1e-6
     )
     assert found.tip_error == pytest.approx(np.sqrt(2 * other.cost), rel=1e-3)
 

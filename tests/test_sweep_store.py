@@ -219,14 +219,22 @@ jax.config.update("jax_enable_x64", True)
 import sweep_batch
 from fdof_jax.simulation import store
 store._CHUNKS = 1
-batch = sweep_batch.with_failures(sweep_batch.members())
-sweep_batch.run(batch, store=sys.argv[1], shard=int(sys.argv[2]), of=3)
+batch = sweep_batch.single_links()
+sweep_batch.run(batch, store=sys.argv[1], shard=int(sys.argv[2]), of=3, chunk=2)
 """
 
 
 @pytest.mark.slow
-def test_workers_that_are_killed(mixed, undisturbed, tmp_path):
-    """Three processes share a store. One of them is killed and started again."""
+def test_workers_that_are_killed(tmp_path):
+    """Three processes share a store. One of them is killed and started again.
+
+    Of single links, whose programs compile faster, in many small blocks.
+    """
+    alone, tmp_path = tmp_path / "alone", tmp_path / "shared"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(store, "_CHUNKS", 1)
+        run(single_links(), store=alone, chunk=2)
+    undisturbed = read(alone)
     here = Path(__file__).parent
     path = os.pathsep.join([str(here), str(here.parent)])
 

@@ -243,20 +243,20 @@ def without_turns(q):
         )
 
 
-def linear_motion(t, upright=False):
-    """Returns the derivative of q(t) in q0 for the usual arm, hanging or upright.
+def linear_motion(t, upright=False, links=3):
+    """Returns the derivative of q(t) in q0 for usual links, hanging or upright.
 
     In absolute angles the energies are sums of M_ij th_i' th_j' / 2 and K_i th_i^2
     / 2.
     """
-    n = np.arange(3)
-    beyond = 2 - n  # links that hang on this one
+    n = np.arange(links)
+    beyond = links - 1 - n  # links that hang on this one
     M = 0.5 + beyond[np.maximum.outer(n, n)]
     M[n, n] = 1 / 12 + 0.25 + beyond
     K = np.diag(9.81 * (0.5 + beyond)) * (-1 if upright else 1)
     squares, modes = np.linalg.eig(np.linalg.solve(M, K))
     grown = modes * np.cos(np.sqrt(squares.astype(complex)) * t) @ np.linalg.inv(modes)
-    absolute = np.tril(np.ones((3, 3)))  # from relative angles
+    absolute = np.tril(np.ones((links, links)))  # from relative angles
     return np.linalg.solve(absolute, grown.real @ absolute)
 
 
