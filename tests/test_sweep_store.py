@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import xarray
 from helpers import programs
-from sweep_batch import FAILED, SETTINGS, TS, run
+from sweep_batch import FAILED, SETTINGS, TS, run, single_links
 
 import fdof_jax as fj
 from fdof_jax.simulation import store
@@ -231,9 +231,7 @@ def test_workers_that_are_killed(tmp_path):
     Of single links, whose programs compile faster, in many small blocks.
     """
     alone, tmp_path = tmp_path / "alone", tmp_path / "shared"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(store, "_CHUNKS", 1)
-        run(single_links(), store=alone, chunk=2)
+    run(single_links(), store=alone, chunk=2)
     undisturbed = read(alone)
     here = Path(__file__).parent
     path = os.pathsep.join([str(here), str(here.parent)])
