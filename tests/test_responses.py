@@ -109,3 +109,18 @@ def test_malformed_tests_are_refused(arm):
             fj.analysis.step_and_sine(*arguments, step=step, duration=1.0)
     with pytest.raises(ValueError, match="test: expected a StepAndSine"):
         fj.plotting.response_profile(pd)
+
+
+@pytest.mark.parametrize("step", [1e-6, 1e-3])
+def test_responses_start_where_the_arm_rests(step):
+    """A soft link sags by 0.4 rad; what it does about there is known in closed form."""
+    rod = fj.Linkage("R", length=[0, 1], com=[[0.5, 0]], mass=[1], inertia=[0.1])
+    kp, kd, weight, inertia = 10.0, 1.5, 0.5 * 9.81, 0.35
+    pd = pd_at(np.zeros(1), np.array([kp]), np.array([kd]))
+    found = fj.analysis.step_and_sine(rod, [0.0], pd, step=step, duration=3.0)
+    (sag,) = fj.analysis.equilibrium(rod, [0.0], (pd,))
+    assert sag < -0.4
+    stiffness = kp - weight * np.sin(sag)
+    damping = kd / (2 * np.sqrt(stiffness * inertia))
+    overshoot = np.exp(-np.pi * damping / np.sqrt(1 - damping**2))
+    np.testing.assert_allclose(found.overshoot, overshoot, rtol=0.02)

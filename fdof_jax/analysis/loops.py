@@ -35,9 +35,8 @@ def closed_loop(
 ) -> tuple[Array, Array, Array]:
     """Linearises an arm under a controller about rest at `q`: A, B and C.
 
-    The state y is (q, qd, the controller's own state): dy/dt = A y + B tau with efforts
-    tau added to the controller's, which are -C y. In the operating point, constant
-    efforts hold the arm at rest.
+    The state y is (q, qd, the controller's own): dy/dt = A y + B tau with efforts tau
+    added to the controller's, which are -C y. Constant efforts hold the arm at rest.
     """
     own, rebuilt = ravel_pytree(controller.initial_state(linkage))
     n, still = q.size, jnp.zeros_like(q)
@@ -47,17 +46,15 @@ def closed_loop(
 
     def acting(y):
         q, qd, _ = jnp.split(y, [n, 2 * n])
-        return total_effort(linkage, forces, t, q, qd) - joint_bias(
-            linkage, q, still, forces
-        )
+        weight = joint_bias(linkage, q, still, forces)
+        return total_effort(linkage, forces, t, q, qd) - weight
 
     def respond(y):
         q, qd, own = jnp.split(y, [n, 2 * n])
         effort, rate = controller.act(t, q, qd, linkage, rebuilt(own))
         return jnp.concatenate([effort, ravel_pytree(rate)[0]])
 
-    # At rest M^-1 is multiplied by no effort, so its own derivative does not count.
-    # Coriolis forces, quadratic in the velocities, have none.
+    # At rest neither M^-1, multiplied by no effort, nor Coriolis forces have a slope.
     y = jnp.concatenate([q, still, own])
     alone, slopes = jax.jacfwd(acting)(y), jax.jacfwd(respond)(y)
     efforts, rates = slopes[:n], slopes[n:]
@@ -74,7 +71,8 @@ class OpenLoop(eqx.Module):
     - `A`, `B`, `C`: matrices (state, state), (state,) and (state,). The state holds
       positions [m or rad], velocities and the controller's own state.
     - `joint`: the joint's name, for instance R1.
-    - `stable`: whether all modes of the closed loop decay.
+    - `stable`: whether all modes of the closed loop decay, none at less than
+      `slowest_decay` [1/s].
     - `crossover`: frequency of the phase margin, at which |L| = 1 [rad/s].
     - `phase_margin`, `delay_margin`: least change of the phase [rad], and least delay
       [s], that make the closed loop unstable.
@@ -97,9 +95,14 @@ class OpenLoop(eqx.Module):
         return self.A - np.outer(self.B, self.C), self.B, self.C
 
     @property
+    def slowest_decay(self) -> float:
+        """Rate at which the closed loop's slowest mode decays [1/s]."""
+        return -float(np.real(np.linalg.eigvals(self._closed[0])).max())
+
+    @property
     def stable(self) -> bool:
         """True if all modes of the closed loop decay; margins mean little otherwise."""
-        return bool(np.real(np.linalg.eigvals(self._closed[0])).max() < 0)
+        return self.slowest_decay > 0
 
     @property
     def _crossing(self) -> tuple[np.ndarray, np.ndarray]:

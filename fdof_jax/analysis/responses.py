@@ -5,23 +5,21 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
 from jaxtyping import Complex, Float
 from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline
 
 from ..base.checks import is_traced, real_array, refusal
-from ..control.drives import Drive
-from ..control.pd import PDController
-from ..forces.element import Element, Forces, elements_on, of_full_size
-from ..forces.part import Values, field
+from ..forces.element import (
+    Forces,
+    elements_on,
+    of_full_size,
+)
 from ..linkage.coordinates import State
 from ..linkage.linkage import Linkage, check_linkage, joint_names, per_joint
-from ..references.reference import Reference
 from ..simulation.html_table import html_table
-from ..simulation.simulate import simulate
 from .loops import BANDWIDTH, open_loop
-from .tracking import relative_demands
+from .probes import Probe, answer, at_rest, commanding, following
 
 _SAMPLES = 1001
 BAND = 0.02  # around the final value, in which a response has settled
@@ -29,28 +27,9 @@ _SETTLED = 0.9  # part of the duration before which it has to
 # Frequencies of the sines over the bandwidth of the linearised loop.
 _FREQUENCIES = np.geomspace(0.1, 2.5, 12)
 _PERIODS = 2  # in which a sine is measured
-
-
-class _Probe(Reference):
-    """A reference at rest, which steps at a time or swings from the start."""
-
-    base: Values = field(unit="m or rad")
-    step: Values = field(unit="m or rad")
-    begin: Values = field((), unit="s")
-    amplitude: Values = field(unit="m or rad")
-    frequency: Values = field((), unit="rad/s")
-
-    @property
-    def jump_ts(self) -> Array:
-        return self.begin[None]
-
-    def __call__(self, t: Any, linkage: Linkage) -> tuple[Array, Array]:
-        swing = jnp.sin(self.frequency * t), jnp.cos(self.frequency * t)
-        stepped = self.base + jnp.where(t < self.begin, 0, self.step)
-        return (
-            stepped + self.amplitude * swing[0],
-            self.amplitude * self.frequency * swing[1],
-        )
+# An arm comes to rest in this many time constants of its slowest mode, for at most so
+# many times the duration of a response.
+_DECAYED, _LONGEST = 30, 50
 
 
 class StepAndSine(eqx.Module):
@@ -106,33 +85,6 @@ class StepAndSine(eqx.Module):
         return html_table(rows, header)
 
 
-def _commanding(element: Any) -> PDController | None:
-    """Returns the PD controller that an element is or holds as its command."""
-    while isinstance(element, Drive):
-        element = element.command
-    return element if isinstance(element, PDController) else None
-
-
-def _following(element: Any, reference: Reference) -> Element:
-    """Returns the element with another reference of its PD controller."""
-    if isinstance(element, PDController):
-        return eqx.tree_at(lambda pd: pd.reference, element, reference)
-    inner = _following(element.command, reference)
-    return eqx.tree_at(lambda drive: drive.command, element, inner)
-
-
-def _answer(
-    linkage: Linkage, controller: Element, forces: Forces, probe: _Probe, ts: np.ndarray
-) -> tuple[Array, Array]:
-    """Simulates an answer to a probe: positions, and demands over limits."""
-    led = _following(controller, probe)
-    start = State(probe.base, jnp.zeros_like(probe.base))
-    motion = simulate(linkage, start, ts, (led, *forces), throw=False)
-    pd = _commanding(led)
-    assert pd is not None
-    return motion.q, relative_demands(pd, linkage, motion)
-
-
 def step_and_sine(
     linkage: Linkage,
     q: ArrayLike,
@@ -144,8 +96,8 @@ def step_and_sine(
 ) -> StepAndSine:
     """Simulates a step and sines of the reference of each joint, one after the other.
 
-    The reference rests at `q`, and the arm comes to rest there for the `duration`. Then
-    the reference of one joint steps, without a velocity, and the response is recorded
+    The reference rests at `q`, and the arm where it sags to under the controller. The
+    reference of one joint then steps, without a velocity, and the response is recorded
     for the `duration`. Sines of the reference, with their velocities, have the same
     time to build up. Their frequencies are 0.1 to 2.5 times the bandwidth of the
     linearised loop. Small steps show the linear behaviour, large ones the limits.
@@ -173,7 +125,7 @@ def step_and_sine(
     >>> print(fj.analysis.step_and_sine(arm, q, pd, step=0.5, duration=2.0))
                 step   overshoot        rise    settling   bandwidth    at limit
             [m, rad]         [%]         [s]         [s]     [rad/s] [% of time]
-    R1           0.5       5.161      0.2743      0.7649       7.824         2.2
+    R1           0.5       5.161      0.2743      0.7649       7.819         2.2
     P2           0.5       4.115      0.1168      0.3365       24.37         0.5
     R3           0.5       3.018      0.1198      0.3513       28.07           0
     """
@@ -182,34 +134,44 @@ def step_and_sine(
     n = q.size
     step = real_array("step", step, (n,), above=0, broadcast=True, unit="m or rad")
     duration = real_array("duration", duration, (), above=0, unit="s")
-    if _commanding(controller) is None:
+    if commanding(controller) is None:
         expected = "a PDController, or a drive that holds one"
         raise refusal("controller", expected, controller)
     if is_traced(linkage, controller, forces, q, step, duration):
         raise ValueError("q: expected known values, outside of JAX's transformations.")
     (element,) = of_full_size(linkage, elements_on(linkage, (controller,)))
     zero = jnp.zeros(n)
-    resting = _following(element, _Probe(q, zero, 0.0, zero, 1.0))
+    resting = following(element, Probe(q, zero, 0.0, zero, 1.0))
     names = joint_names(linkage)
     moving = [k for k, name in enumerate(names) if name[0] != "F"]
-    loops = [open_loop(linkage, q, resting, k + 1, forces) for k in moving]
-    bandwidths = np.array([loop.bandwidth for loop in loops])
-    if np.isnan(bandwidths).any():
+
+    def loops_at(q):
+        return [open_loop(linkage, q, resting, k + 1, forces) for k in moving]
+
+    loops = loops_at(q)
+    if np.isnan([loop.bandwidth for loop in loops]).any():
         expected = "one with which each joint follows its reference at q"
         raise refusal("controller", expected, controller)
+    start = State(q, zero), None
+    if loops[0].slowest_decay > 0:
+        time = min(_DECAYED / loops[0].slowest_decay, _LONGEST * float(duration))
+        start = at_rest(linkage, resting, forces, q, time)
+        loops = loops_at(start[0].q)
+    bandwidths = np.array([loop.bandwidth for loop in loops])
     frequency = bandwidths[:, None] * _FREQUENCIES
     t0, count = float(duration), _SAMPLES - 1
     probes, times = [], []
     for k, row in zip(moving, frequency):
         height, none = np.asarray(step) * np.eye(n)[k], np.zeros(n)
-        probes.append(_Probe(q, height, t0, none, 1.0))
+        probes.append(Probe(q, height, t0, none, 1.0))
         times.append(t0 + np.linspace(0, t0, count))
         for w in row:
-            probes.append(_Probe(q, none, t0, height, w))
+            probes.append(Probe(q, none, t0, height, w))
             times.append(t0 + 2 * np.pi / w * _PERIODS * np.arange(count) / count)
     ts = np.pad(np.stack(times), ((0, 0), (1, 0)))  # from 0
     # One after the other: a batch takes three times as long to compile.
-    answers = [_answer(linkage, element, forces, *row) for row in zip(probes, ts)]
+    rows = zip(probes, ts)
+    answers = [answer(linkage, element, forces, start, *row) for row in rows]
     found = map(np.stack, zip(*answers))
     # (joint, lane, time), of the joint that is tested
     own = np.repeat(moving, 1 + _FREQUENCIES.size)[:, None, None]
