@@ -67,12 +67,12 @@ def at_rest(
         own = (controller.initial_state(linkage),)
     ts = np.linspace(0, time, _SAMPLES)
     sagging = simulate(linkage, start, ts, (controller, *forces), own0=own, throw=False)
-    q, qd = np.asarray(sagging.q[-1]), np.asarray(sagging.qd[-1])
-    if not np.isfinite([q, qd]).all():
+    rest = State(sagging.q[-1], sagging.qd[-1])
+    if not np.isfinite(np.asarray(rest)).all():
         return start, own
     if own is not None:
         own = jax.tree.map(lambda rows: rows[-1], sagging.own)
-    return State(jnp.asarray(q), jnp.asarray(qd)), own
+    return rest, own
 
 
 def answer(
