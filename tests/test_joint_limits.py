@@ -77,6 +77,12 @@ def test_damping_takes_energy_and_never_pulls():
     expected = -300 * penetration * (1 + 0.3 * rate)
     found = smooth(0.0, last(1.02), last(3.0), SLIDE)
     np.testing.assert_allclose(found[2], expected, rtol=1e-12)
+    # The lower stop is the upper one's image.
+    other = fj.forces.JointStops(
+        -1.0, np.inf, stiffness=300.0, damping=0.3, smoothing=0.1
+    )
+    found = other(0.0, last(-1.02), last(-3.0), SLIDE)
+    np.testing.assert_allclose(found[2], -expected, rtol=1e-12)
 
 
 @pytest.mark.parametrize("topology", fj.TOPOLOGIES)

@@ -9,7 +9,7 @@ from test_gains import PENDULUM, Stand, pd_at
 
 import fdof_jax as fj
 from fdof_jax.analysis.loops import closed_loop
-from fdof_jax.tuning.limits import sensitivity
+from fdof_jax.tuning.limits import excess, sensitivity
 
 FREE = PENDULUM.replace(gravity=0)
 INERTIA = 0.3 + 2 * (0.6**2 + 0.2**2)
@@ -114,3 +114,23 @@ def test_malformed_limits_are_refused():
     for wrong in (dict(overshoot=-1), dict(effort=0), dict(modulus_margin=np.inf)):
         with pytest.raises(ValueError, match=next(iter(wrong))):
             fj.tuning.Limits(**wrong)
+
+
+def test_a_response_that_creeps_from_below_has_not_settled():
+    slow = step(kp=1.0, kd=5.0)
+    motion = fj.simulate(slow.linkage, slow.state0, np.linspace(0, 4, 101), slow.forces)
+    assert (motion.q < 0.9).all()
+    limits = fj.tuning.Limits(settling_time=[1.0], overshoot=[np.inf], effort=[np.inf])
+    over, unsettled, _ = excess(limits, slow, motion, False).reshape(101, 3).T
+    assert over.max() <= 0 and unsettled[-1] == pytest.approx(0.98 - motion.q[-1, 0])
+
+
+def test_the_errors_of_a_fixed_pair_count_nothing():
+    arm = fj.Linkage(
+        "RF", length=[0, 1, 1], com=[[0.5, 0]] * 2, mass=[1] * 2, inertia=[0.1] * 2
+    )
+    pd = fj.PDController(5.0, 1.0, np.inf, Stand(np.array([0.2, 0.7])))
+    scene = fj.Scene(arm, fj.State(np.zeros(2), np.zeros(2)), (pd,), 1.0)
+    motion = fj.simulate(arm, scene.state0, [0.0, 1.0], scene.forces)
+    errors = fj.tuning.joint_errors(scene, motion).reshape(2, 2)
+    assert (errors[:, 1] == 0).all() and (errors[:, 0] != 0).all()

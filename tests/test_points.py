@@ -155,6 +155,10 @@ def test_one_sided_springs(side, sign):
         assert np.abs(both).max() > 0.1
         expected = both if shift * sign > 0 else 0 * both
         np.testing.assert_allclose(one, expected, rtol=1e-13)
+        stored = fj.SpringDamper(A, B, one_sided=side, **options)
+        energy = 30.0 * shift**2 / 2 if shift * sign > 0 else 0
+        found = stored.potential_energy(q, linkage)
+        np.testing.assert_allclose(found, energy, rtol=1e-12)
     # A damper alone would push a slackening cable and hold a leaving bumper back.
     held = fj.SpringDamper(
         A, B, damping=9.0, stiffness=1e-9, rest_length=length - 0.1 * sign,

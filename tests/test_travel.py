@@ -87,6 +87,10 @@ def test_malformed_travels_are_refused():
         fj.references.shock_against(fj.references.Travel(1.0), -1.0)
     with pytest.raises(ValueError, match="frequency: expected at most 250 rad"):
         fj.references.shock_against(fj.references.Travel(1.0), 300.0)
+    traced = jax.jit(
+        lambda w: fj.references.shock_against(fj.references.Travel(1.0), w)
+    )
+    assert np.isnan(traced(300.0)) and np.isfinite(traced(200.0))
     with pytest.raises(ValueError, match="period: expected not zero"):
         fj.references.Laps(0.0)
     with pytest.raises(ValueError, match="travel: expected a Travel"):
