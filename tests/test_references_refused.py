@@ -91,3 +91,15 @@ def test_what_a_task_commands_out_of_reach_is_refused_or_nan(task, words):
 def test_points_out_of_reach_are_refused():
     with pytest.raises(ValueError, match=r"^tip: expected .* reach .*, got \[9"):
         fj.inverse_kinematics(LINKAGE, [9, 9], 0.0)
+
+
+def test_circles_are_refused_for_their_nearest_point_alone():
+    arm = fj.Linkage(
+        "RRR", length=[0, 1, 0.6, 0.3], com=[[0, 0]] * 3, mass=[1] * 3, inertia=[1] * 3
+    )
+    ts = np.array([0.0, 5.0])
+    # The wrist comes within 0.4 m of the base, between samples of the circle.
+    circle = lambda radius: fj.CircleTask([1.2, 0.0], radius, 5.0, 0.123, 0.0)
+    circle(0.5 - 1e-7).check(arm, ts)
+    with pytest.raises(ValueError, match="reference: expected a circle within"):
+        circle(0.5 + 1e-7).check(arm, ts)
