@@ -99,7 +99,7 @@ def test_circles_are_refused_for_their_nearest_point_alone():
     )
     ts = np.array([0.0, 5.0])
     # The wrist comes within 0.4 m of the base, between samples of the circle.
-    circle = lambda radius: fj.CircleTask([1.2, 0.0], radius, 5.0, 0.123, 0.0)
+    circle = lambda radius: fj.CircleTask([1.2, 0], radius, 5.0, np.pi / 256, 0.0)
     circle(0.5 - 1e-7).check(arm, ts)
     with pytest.raises(ValueError, match="reference: expected a circle within"):
         circle(0.5 + 1e-7).check(arm, ts)
