@@ -150,8 +150,8 @@ def test_energy_stack_balances_with_elements_of_each_kind():
     That each element's power is what its energy loses is tested in test_points.py.
     """
     arm, start = elements.arm("RPR"), elements.START
-    kinds = "history", "spring", "motor", "armature", "actuator"
-    forces = tuple(elements.ALL[kind] for kind in kinds)
+    kinds = "history", "spring", "cable", "stops", "wrench", "motor", "armature"
+    forces = tuple(elements.ALL[kind] for kind in (*kinds, "actuator"))
     ts = np.linspace(0, 0.075, 501)
     # One step per sample.
     solution = simulate(arm, start, ts, forces, **elements.SHORT | dict(dt0=ts[1]))
