@@ -17,10 +17,13 @@ from PIL import Image
 from fdof_jax import (
     TOPOLOGIES,
     Linkage,
+    Point,
     Solution,
+    SpringDamper,
     drawing,
     joint_positions,
     mass_centers,
+    scenes,
     tip_position,
 )
 
@@ -225,6 +228,20 @@ def test_grid_of_animations_moves_together():
     other._draw_was_started = True  # type: ignore[attr-defined]
 
 
+def test_panels_of_a_grid_have_the_forces_of_their_titles():
+    pairs = {t: (make_linkage(t), swinging(11)) for t in ("RRR", "PPR")}
+    spring = SpringDamper(Point(0, 1, 1), Point(3, 0.6), stiffness=1, damping=0)
+    animation = drawing.animate_grid(pairs, forces={"PPR": (spring,)}, max_frames=2)
+    figures = plt.gcf(), drawing.topology_grid(pairs, forces={"PPR": (spring,)})
+    for figure in figures:
+        assert ["spring 0" in lines(ax) for ax in figure.axes] == [False, True]
+    animation._func(1)  # type: ignore[attr-defined]
+    tip = np.asarray(tip_position(*pairs["PPR"][:1], pairs["PPR"][1].q[-1]))
+    ends = np.asarray(lines(figures[0].axes[1])["spring 0"].get_xydata())[[0, -1]]
+    assert np.isclose(ends, tip).all(axis=1).any()
+    animation._draw_was_started = True  # type: ignore[attr-defined]
+
+
 def test_a_notebook_plays_an_animation_once():
     """Checks that the notebook does not also show the animation's still figure."""
     animation = drawing.animate(make_linkage("RRR"), swinging(), max_frames=2)
@@ -279,6 +296,14 @@ def test_labels_of_an_animation_lie_inside_its_figure():
     assert figure.axes[0].yaxis.label.get_window_extent().x0 >= 0
 
 
+def test_labels_lie_inside_a_new_figure_as_it_is_saved():
+    ts = np.linspace(0, 1, 11)
+    motion = made_up(ts, -0.1 - 3.0 * ts[:, None] * [1, 0, 0])
+    axes = drawing.chrono_cyclograph(scenes.fig5().linkage, motion)
+    axes.figure.draw_without_rendering()  # type: ignore[union-attr]
+    assert axes.xaxis.label.get_window_extent().y0 >= 0
+
+
 @pytest.mark.parametrize(
     "name, call",
     [
@@ -298,6 +323,8 @@ def test_labels_of_an_animation_lie_inside_its_figure():
         ("fps", lambda: drawing.animate(LINKAGE, SOLUTION, fps=0)),
         ("speed", lambda: drawing.animate(LINKAGE, SOLUTION, speed=-1)),
         ("motions", lambda: drawing.animate_grid({})),
+        ("forces", lambda: drawing.topology_grid(
+            {"a": (LINKAGE, SOLUTION)}, forces={"b": ()})),
         ("fps", lambda: drawing.animate_grid({"a": (LINKAGE, SOLUTION)}, fps=-1)),
     ],
 )  # fmt: skip

@@ -57,6 +57,8 @@ BODY = '<body><joint axis="0 1 0"{}/><geom size=".1"/>{}</body>'
     "inside, got",
     [
         (BODY.format(' stiffness="1"', ""), "joint 0 with a spring"),
+        (BODY.format("", BODY.format("", "").replace("1 0", "-1 0")), "reverse it"),
+        (9 * BODY[: BODY.index("{}</")].format("") + 9 * "</body>", "9 joints"),
         (BODY.format(' range="-1 1"', ""), "joint 0 with a range"),
         (BODY.format(' frictionloss="1"', ""), "joint 0 with friction"),
         ('<body><freejoint name="f"/><geom size=".1"/></body>', "joint f, which is"),
@@ -71,7 +73,7 @@ BODY = '<body><joint axis="0 1 0"{}/><geom size=".1"/>{}</body>'
         ),
         pytest.param(
             BODY.format(' stiffness="0 2"', ""),
-            "joint 0 with a spring",
+            "joint 0 with a nonlinear spring",
             marks=nonlinear,
         ),
         ('</worldbody><option density="1"/><worldbody>' + BODY, "a fluid .density"),
@@ -134,6 +136,11 @@ def test_contacts_are_left_out_with_a_warning(inside, welded):
     about = [w for w in caught if "contacts are left out" in str(w.message)]
     assert len(about) == (data.ncon > 0)
     assert all(w.filename == __file__ for w in about)
+
+
+def test_gravity_across_the_plane_has_no_effect():
+    text = CART_POLE.replace("<mujoco>", '<mujoco><option gravity="0 5 -2"/>')
+    assert fj.from_mjcf(text)[0].gravity == 2
 
 
 def test_gravity_that_a_flag_disables_is_zero():

@@ -12,6 +12,7 @@ from ..forces.actuators import Armature
 from ..forces.element import Forces
 from ..forces.joints import JointDamper
 from ..linkage.linkage import Linkage
+from ..linkage.topology import MOST_PAIRS
 
 _SLIDE, _HINGE = 2, 3  # MuJoCo's mjtJoint
 
@@ -20,9 +21,10 @@ def from_mjcf(text: str) -> tuple[Linkage, Forces]:
     """Reads a planar chain of hinges and slides from a MuJoCo model (MJCF).
 
     The plane is seen from where the hinges' axes point, with gravity downwards; `q`
-    equals `qpos`. A body with several joints becomes as many links, all but the last
-    without mass. A site `tip` on the last body becomes the tip; without one, the tip is
-    the last joint. MuJoCo reads the model, which needs `pip install "fdof_jax[test]"`.
+    equals `qpos`. Gravity across the plane has no effect. A body with several joints
+    becomes as many links, all but the last without mass. A site `tip` on the last body
+    becomes the tip; without one, the tip is the last joint. MuJoCo reads the model,
+    which needs `pip install "fdof_jax[test]"`.
 
     Contacts are left out, with a warning if geoms of two bodies may collide. Such a
     model is not refused, because geoms may collide by default, and most arms move
@@ -100,7 +102,7 @@ def _refuse_others(model: Any) -> None:
     refuse = lambda what: ValueError(f"text: expected a planar chain, got {what}.")
     try:
         nonlinear = (
-            (model.jnt_stiffnesspoly, "a spring"),
+            (model.jnt_stiffnesspoly, "a nonlinear spring"),
             (model.dof_dampingpoly, "nonlinear damping"),
         )
     except AttributeError:  # in older versions of MuJoCo
@@ -109,16 +111,18 @@ def _refuse_others(model: Any) -> None:
         if kind not in (_HINGE, _SLIDE):
             raise refuse(f"joint {name}, which is neither a hinge nor a slide")
     for values, what in (
-        (model.jnt_stiffness, "a spring"),
-        (model.jnt_limited, "a range"),
-        (model.dof_frictionloss, "friction"),
+        (model.jnt_stiffness, "a spring (instead, add a PDController without kd)"),
+        (model.jnt_limited, "a range (instead, add JointStops)"),
+        (model.dof_frictionloss, "friction (instead, add a JointFriction)"),
         *nonlinear,
     ):
         for name, value in zip(_names(model), values):
             if np.any(value):
-                raise refuse(f"joint {name} with {what}, which MuJoCo models otherwise")
+                raise refuse(f"joint {name} with {what}")
+    if model.njnt > MOST_PAIRS:
+        raise refuse(f"{model.njnt} joints, above {MOST_PAIRS}")
     for count, what in (
-        (model.nu, "actuators"),
+        (model.nu, "actuators (instead, add force elements, such as a PDController)"),
         (model.ntendon, "tendons"),
         (model.neq, "equality constraints"),
         (model.opt.density, "a fluid (density)"),
@@ -175,9 +179,7 @@ def _plane(model: Any, data: Any) -> tuple[np.ndarray, np.ndarray, float]:
     normal = data.xaxis[first_hinge]
     gravity = np.array(model.opt.gravity)
     within = gravity - (gravity @ normal) * normal
-    size = np.linalg.norm(within)
-    if size > 1e-9 and abs(gravity @ normal) > 1e-9 * size:
-        raise ValueError("text: expected gravity in the plane or across it, got both.")
+    size = np.linalg.norm(within)  # the part across the plane moves nothing
     up = -within / size if size > 1e-9 else np.roll(normal, 1)
     if size <= 1e-9:
         size, up = 0.0, up - (up @ normal) * normal
@@ -195,6 +197,8 @@ def _links(model: Any, data: Any, plane: Any, normal: np.ndarray) -> list[_Link]
         axis, across = data.xaxis[k], data.xaxis[k] @ normal
         if abs(across - (0 if slides else 1)) > 1e-9:
             where = "in the plane" if slides else "along the first hinge's"
+            if across < -1 + 1e-9 and not slides:
+                where += ", got the opposite: reverse it, and the signs of its numbers"
             raise ValueError(f"text: expected the axis of joint {name} {where}.")
         if not slides:
             start = plane(data.xanchor[k])

@@ -1,6 +1,7 @@
 """Results of identification: parameters, their errors, and undetermined directions."""
 
 from collections.abc import Callable
+from html import escape
 from typing import Any
 
 import equinox as eqx
@@ -103,6 +104,9 @@ class FitResult(eqx.Module):
             verdict = "converged in what the motion determines, which is not all"
         rows.append(f"{verdict}, {len(self.history) - 1} iterations: {self.message}")
         return "\n".join([*rows, *self.weak])
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{escape(str(self))}</pre>"
 
 
 def _digits(value: float, error: float) -> int:

@@ -116,6 +116,8 @@ class Linkage(eqx.Module):
                 )
         return Linkage(**now | values)
 
+    __replace__ = replace  # what `copy.replace` calls
+
     def __repr__(self) -> str:
         """Shows the values of a single linkage, or the shapes of a batch."""
         if np.ndim(self.ef) != 1 or not known(self):

@@ -196,9 +196,14 @@ def draw_motion(
     return DrawnMotion(line, arms)
 
 
-def geometries_of(motions: Any) -> dict[str, tuple[np.ndarray, Geometry]]:
-    """Times and geometry of each motion, by title."""
+def geometries_of(motions: Any, forces: Any) -> dict[str, tuple[np.ndarray, Geometry]]:
+    """Times and geometry of each motion, with its force elements, by title."""
     filled_mapping("motions", motions, "(Linkage, Solution)")
+    forces = (
+        {} if forces is None else filled_mapping("forces", forces, "force elements")
+    )
+    if unknown := forces.keys() - motions.keys():
+        raise refusal("forces", f"titles of motions, {list(motions)}", *unknown)
     found = {}
     for title, pair in motions.items():
         name = f"motions[{title!r}]"
@@ -206,7 +211,8 @@ def geometries_of(motions: Any) -> dict[str, tuple[np.ndarray, Geometry]]:
         if not (fits and isinstance(pair[0], Linkage)):
             raise refusal(name, "(Linkage, Solution)", pair)
         ts, q, _ = reached(pair[0], pair[1], name)
-        found[title] = ts, geometry(pair[0], q)
+        g = geometry(pair[0], q)
+        found[title] = ts, with_elements(g, pair[0], forces.get(title, ()), ts, q)
     return found
 
 

@@ -92,6 +92,10 @@ def legend(ax: Axes, *others: Axes) -> None:
         frameon=False, handlelength=1.2, columnspacing=1,
         loc="lower left", bbox_to_anchor=(0, 1), borderaxespad=0.2,
     )  # fmt: skip
+    figure = ax.get_figure(root=True)
+    if ax.get_aspect() != "auto" and figure is not None:
+        # Equal scales shrink the axes after a layout, so that one alone cuts labels.
+        figure.draw_without_rendering()
 
 
 def figure_legend(fig: Figure) -> None:

@@ -1,13 +1,15 @@
 """Pictures and animations of linkages in the plane, with matplotlib.
 
 Every function draws into the given axes (`ax`) or figure (`fig`), or into a new one,
-and returns it; `animate` and `animate_grid` return an animation. Nothing is shown or
+and returns it: pictures of one panel take and return axes, those of several a figure;
+`animate` and `animate_grid` return an animation. Nothing is shown or
 saved, and no global setting changes. A `solution` is that of one `simulate`; of a
 failed one, the samples reached are drawn. Link 0 is the ground, links 1, 2, ... move.
 Malformed arguments raise ValueError. Curves over time are in `plotting`.
 """
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -71,15 +73,17 @@ def draw_linkage(
 
     **Returns:** the axes. The `gid` of a line names its part: "link 1", "pin 1",
     "rail 2", "slider 2", "mass 3", "tip 3", "ground"; of an element, its kind and its
-    index: "spring 0", "cylinder 1". `ax.legend()` explains the parts.
+    index: "spring 0", "cylinder 1". New axes have a legend of the parts above them.
     """
     check_linkage(linkage)
     q = np.asarray(per_joint("q", q, linkage))[None]
     g = with_elements(geometry(linkage, q), linkage, forces, np.zeros(1), q)
-    ax = plane_axes(ax, g.all_points)
-    draw_ground(ax)
-    draw_arm(ax, g, 0, mass_centers, alpha, color)
-    return ax
+    panel = plane_axes(ax, g.all_points)
+    draw_ground(panel)
+    draw_arm(panel, g, 0, mass_centers, alpha, color)
+    if ax is None:
+        legend(panel)
+    return panel
 
 
 def chrono_cyclograph(
@@ -125,15 +129,17 @@ def topology_grid(
     motions: Mapping[str, tuple[Linkage, Solution]],
     fig: Figure | None = None,
     *,
+    forces: Mapping[str, Forces] | None = None,
     configurations: int = 3,
 ) -> Figure:
     """Draws linkages side by side, each with a few configurations and its tip's path.
 
-    **Arguments:** `motions`: title -> (linkage, its solution); `configurations`: number
-    for each, evenly spaced in samples from the first (faint) to the last.
+    **Arguments:** `motions`: title -> (linkage, its solution); `forces`: title ->
+    elements to draw, as in `draw_linkage`; `configurations`: number for each, evenly
+    spaced in samples from the first (faint) to the last.
     """
     whole_number("configurations", configurations, 2)
-    geometries = geometries_of(motions)
+    geometries = geometries_of(motions, forces)
     fig, panels = panels_of(geometries, fig)
     for ax, (ts, g) in zip(panels, geometries.values()):
         indices = np.linspace(0, len(ts) - 1, configurations).round().astype(int)
@@ -183,19 +189,21 @@ def animate_grid(
     motions: Mapping[str, tuple[Linkage, Solution]],
     fig: Figure | None = None,
     *,
+    forces: Mapping[str, Forces] | None = None,
     fps: float = 25,
     speed: float = 1.0,
     max_frames: int = 250,
 ) -> FuncAnimation:
     """Animates linkages side by side; a linkage whose motion has ended stands still.
 
-    **Arguments:** `motions`: title -> (linkage, its solution); the others as in
-    `animate`.
+    **Arguments:** `motions`: title -> (linkage, its solution); `forces`: title ->
+    elements to draw, as in `draw_linkage`; the others as in `animate`.
 
     **Returns:** the animation, as in `animate`.
     """
-    geometries = geometries_of(motions)
+    geometries = geometries_of(motions, forces)
     shown = list(geometries.values())
     times, pause = frame_times([ts for ts, _ in shown], fps, speed, max_frames)
     figure, panels = panels_of(geometries, fig)
-    return animation_of(panels, shown, times, pause, figure.suptitle, fig is None)
+    say = partial(figure.suptitle, x=0.02, ha="left")  # the legend is on the right
+    return animation_of(panels, shown, times, pause, say, fig is None)

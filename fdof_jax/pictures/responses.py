@@ -14,7 +14,7 @@ def response_profile(test: StepAndSine, fig: Figure | None = None) -> Figure:
     """Plots the answers of joints to steps over time, and to sines over frequency.
 
     The upper panel shows each joint's change over the height of its step. The lower
-    one shows the amplitude over that of the reference [dB], with a dot per frequency
+    one shows the amplitude over that of the reference [dB], a dot per frequency
     tested.
 
     **Arguments:** `test`: the result of `step_and_sine`.
@@ -25,12 +25,12 @@ def response_profile(test: StepAndSine, fig: Figure | None = None) -> Figure:
     above.axhline(1, color=BLACK, ls="--", lw=0.8, label="reference")
     rows = zip(test.joints, test.response, test.frequency, test.gain, test.bandwidth)
     for name, response, frequency, gain, bandwidth in rows:
-        style = dict(color=link_color(int(name[1:])), lw=1.2)
-        above.plot(test.ts, response, label=name, **style)
+        color = link_color(int(name[1:]))
+        above.plot(test.ts, response, label=name, color=color, lw=1.2)
         level = 20 * np.log10(np.abs(gain))
-        below.semilogx(frequency, level, marker=".", ms=3, **style)
+        below.semilogx(frequency, level, "o", color=color, ms=2)
         at = np.interp(bandwidth, frequency, level)
-        below.plot(bandwidth, at, "o", color=style["color"], mfc="white", ms=5)
+        below.plot(bandwidth, at, "o", color=color, mfc="white", ms=5)
     below.plot([], [], "o", color=GREY, mfc="white", ms=5, label="bandwidth")
     above.set(xlabel="time since the step [s]", ylabel="change / step")
     below.set(xlabel="frequency [rad/s]", ylabel="amplitude / reference [dB]")
@@ -77,8 +77,8 @@ def bode_plot(loop: OpenLoop, fig: Figure | None = None) -> Figure:
     style = dict(color=link_color(int(loop.joint[1:])), lw=1.2)
     above.semilogx(frequency, level, label=f"loop of {loop.joint}", **style)
     below.semilogx(frequency, phase, label=f"loop of {loop.joint}", **style)
-    for ax, edge in ((above, 0), (below, -180)):
-        ax.axhline(edge, color=BLACK, ls="--", lw=0.8, label="L = -1")
+    for ax, edge, name in ((above, 0, "|L| = 1"), (below, -180, "L < 0")):
+        ax.axhline(edge, color=BLACK, ls="--", lw=0.8, label=name)
         ax.grid(lw=0.3)
         legend(ax)
     above.set(ylabel="amplitude [dB]")

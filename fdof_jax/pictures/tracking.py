@@ -18,7 +18,6 @@ from ..references.task import TipReference
 from ..simulation.solution import Solution
 from .arms import geometry
 from .axes import (
-    BLACK,
     SERIES,
     axes_or_new,
     filled_mapping,
@@ -43,11 +42,10 @@ def _tip(
     return ts, commanded, geometry(linkage, q).tip
 
 
-def _one_turn(task: Any, ts: np.ndarray, path: np.ndarray) -> np.ndarray:
-    """One turn of the commanded path, as overlapping dashes make a solid line."""
-    period = reference_of(task).period
-    turn = np.inf if period is None else abs(float(period))
-    return path[ts - ts[0] <= turn * (1 + 1e-6)]
+def _draw_commanded(ax: Axes, path: np.ndarray) -> None:
+    """Draws the commanded path broad and pale, which shows beneath a good curve."""
+    style = dict(color="#CCCCCC", lw=4, solid_capstyle="butt")
+    ax.plot(*xy(path), label="commanded", **style)  # type: ignore[arg-type]
 
 
 def _tips(linkage: Any, task: Any, solutions: Any) -> list[tuple]:
@@ -66,7 +64,7 @@ def tracking(
     solutions: Mapping[str, Solution],
     ax: Axes | None = None,
 ) -> Axes:
-    """Plots paths of the tip and the commanded path; dots are the starts.
+    """Plots paths of the tip over the commanded path; dots are the starts.
 
     Drawn into the axes of `chrono_cyclograph`, it adds the path of the paper's Fig 7.
 
@@ -74,13 +72,11 @@ def tracking(
     commanded tip position [m]; `solutions`: one curve per label.
     """
     curves = _tips(linkage, task, solutions)
-    _, _, ts, longest, _ = max(curves, key=lambda curve: len(curve[2]))
-    longest = _one_turn(task, ts, longest)
-    paths = [(label, color, "-", actual) for label, color, _, _, actual in curves]
-    paths.append(("commanded", BLACK, "--", longest))
-    ax = plane_axes(ax, np.concatenate([path for *_, path in paths]))
-    for label, color, style, path in paths:
-        ax.plot(*xy(path), style, color=color, lw=1.2, label=label)
+    longest = max((commanded for _, _, _, commanded, _ in curves), key=len)
+    ax = plane_axes(ax, np.concatenate([longest, *(curve[-1] for curve in curves)]))
+    _draw_commanded(ax, longest)
+    for label, color, _, _, path in curves:
+        ax.plot(*xy(path), color=color, lw=1.2, label=label)
         ax.plot(*xy(path[:1]), "o", color=color, markersize=4)
     legend(ax)
     return ax
@@ -91,8 +87,8 @@ def tracking_by_error(
 ) -> Axes:
     """Plots the path of the tip, coloured by its distance from its set point [mm].
 
-    The dashed line is the commanded path; the dot is the tip's start. Later turns cover
-    earlier ones.
+    The broad grey line beneath is the commanded path; the dot is the tip's start. Later
+    turns cover earlier ones.
 
     **Arguments:** `task`: as in `tracking`.
 
@@ -100,9 +96,8 @@ def tracking_by_error(
     """
     ts, commanded, actual = _tip(linkage, task, solution)
     error = 1000 * np.abs(actual - commanded)
-    commanded = _one_turn(task, ts, commanded)
     ax = plane_axes(ax, np.concatenate([commanded, actual]), beside=0.8)
-    ax.plot(*xy(commanded), "--", color=BLACK, lw=0.8, label="commanded")
+    _draw_commanded(ax, commanded)
     corners = np.column_stack(xy(actual))
     pieces = LineCollection(
         list(np.stack([corners[:-1], corners[1:]], axis=1)),

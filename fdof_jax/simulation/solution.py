@@ -73,7 +73,8 @@ class Solution(eqx.Module):
         """Outcome of each trajectory in words, an array of the batch's shape.
 
         `"successful"`; `"ill-conditioned"`: the mass matrix is singular or nearly so
-        (see `inertia_ratios`); `"not finite"`: the accelerations are not finite;
+        (see `inertia_ratios`); `"not finite"`: the accelerations are not finite,
+        as those of an impossible linkage, for instance of a negative mass;
         `"out of steps"`; `"tolerance out of reach"`: rounding keeps even the shortest
         step from meeting it; `"too many switches"`: one after the other, as between
         branches that push towards each other; or `"solver failed"`.
