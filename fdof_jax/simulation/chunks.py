@@ -221,7 +221,9 @@ def in_chunks(
         if len(waiting) <= lanes // _SMALL:
             lanes = _lanes(min(len(waiting), _SMALL), chunk)
     meter.close(progress)
-    if sum(leaf.nbytes for leaf in results) < _COPIED_AT_ONCE:
+    if all(isinstance(leaf, Array) for leaf in results):
+        pass  # of one chunk alone, where they are
+    elif sum(leaf.nbytes for leaf in results) < _COPIED_AT_ONCE:
         results = jax.device_put(results)
     else:
         for index, leaf in enumerate(results):
