@@ -125,7 +125,7 @@ def controller(tolerance: Any) -> diffrax.PIDController:
     tolerance = jnp.asarray(tolerance, dtype=float)
     smallest = 1e-13 if jax.config.jax_enable_x64 else 1e-8  # ends solves gone NaN
     return diffrax.PIDController(
-        rtol=tolerance, atol=tolerance, safety=0.8, dtmin=smallest, force_dtmin=False
+        rtol=tolerance, atol=tolerance, dtmin=smallest, force_dtmin=False
     )
 
 

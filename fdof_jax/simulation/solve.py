@@ -59,7 +59,7 @@ def _solve_one(inputs, keywords) -> tuple[Solution, bool] | None:
 
 
 def _of_any_tolerance(keywords):
-    """Returns the keywords with tolerances as arrays, which no program contains."""
+    """Returns the keywords with tolerances as arrays, which programs do not contain."""
     controller = keywords["stepsize_controller"]
     if controller is None:
         if keywords["solver"] is not None:
@@ -68,9 +68,8 @@ def _of_any_tolerance(keywords):
 
     def opened(pid: diffrax.PIDController) -> diffrax.PIDController:
         dtype = jnp.result_type(float)
-        numbers = pid.rtol, pid.atol, pid.safety
-        rtol, atol, safety = (np.asarray(number, dtype) for number in numbers)
-        return dataclasses.replace(pid, rtol=rtol, atol=atol, safety=safety)
+        rtol, atol = (np.asarray(t, dtype) for t in (pid.rtol, pid.atol))
+        return dataclasses.replace(pid, rtol=rtol, atol=atol)
 
     return keywords | {"stepsize_controller": with_pid(opened, controller)}
 

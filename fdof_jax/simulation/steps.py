@@ -27,9 +27,8 @@ def adaptive(double: float, single: float) -> diffrax.PIDController:
     tolerance = double if x64 else single
     # The shortest step ends solves that rounding keeps from meeting the tolerance.
     shortest = 1e-13 if x64 else 1e-8
-    # At equal errors diffrax's 0.9 takes a twentieth more steps: more are rejected.
     return diffrax.PIDController(
-        rtol=tolerance, atol=tolerance, safety=0.8, dtmin=shortest, force_dtmin=False
+        rtol=tolerance, atol=tolerance, dtmin=shortest, force_dtmin=False
     )
 
 
