@@ -202,6 +202,8 @@ def test_a_copy_with_other_values():
     np.testing.assert_array_equal(heavy.ef, fj.existence_factors("RRP"))
     np.testing.assert_array_equal(heavy.length, arm.length)
     assert jax.tree.structure(heavy) == jax.tree.structure(arm)
+    copied = arm.__replace__(mass=[1, 2, 3])  # by `copy.replace`, from Python 3.13
+    np.testing.assert_array_equal(copied.mass, heavy.mass)
 
 
 @pytest.mark.parametrize(
