@@ -55,6 +55,7 @@ def test_a_wrong_model_is_told_by_another_motion_alone(noisy):
     expected = np.sqrt(1 + excess / 5e-3**2)
     assert f"exceed the noise ({expected:.3g} times the noise is expected" in fault
     assert str(found).startswith("Not to be used: the held-out residuals exceed")
+    assert "Not to be used" in found._repr_html_()
     assert found.held_out[0] > 1.2 > found.held_out[1]
 
 

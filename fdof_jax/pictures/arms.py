@@ -203,7 +203,7 @@ def geometries_of(motions: Any, forces: Any) -> dict[str, tuple[np.ndarray, Geom
         {} if forces is None else filled_mapping("forces", forces, "force elements")
     )
     if unknown := forces.keys() - motions.keys():
-        raise refusal("forces", f"titles of motions, {list(motions)}", *unknown)
+        raise refusal("forces", f"titles of motions, {list(motions)}", sorted(unknown))
     found = {}
     for title, pair in motions.items():
         name = f"motions[{title!r}]"

@@ -180,6 +180,15 @@ def _lanes(members: int, chunk: int) -> int:
     return min(chunk, max(_SMALL, 1 << (members - 1).bit_length()))
 
 
+def _to_device(results: list[Any]) -> None:
+    """Replaces NumPy arrays by JAX's."""
+    if sum(leaf.nbytes for leaf in results) < _COPIED_AT_ONCE:
+        results[:] = jax.device_put(results)
+    else:
+        for index, leaf in enumerate(results):
+            results[index] = jax.device_put(leaf)  # frees one before the next is copied
+
+
 def in_chunks(
     batch: Batch,
     ts: Array,
@@ -221,12 +230,7 @@ def in_chunks(
         if len(waiting) <= lanes // _SMALL:
             lanes = _lanes(min(len(waiting), _SMALL), chunk)
     meter.close(progress)
-    if all(isinstance(leaf, Array) for leaf in results):
-        pass  # of one chunk alone, where they are
-    elif sum(leaf.nbytes for leaf in results) < _COPIED_AT_ONCE:
-        results = jax.device_put(results)
-    else:
-        for index, leaf in enumerate(results):
-            results[index] = jax.device_put(leaf)  # frees one before the next is copied
+    if not all(isinstance(leaf, Array) for leaf in results):  # those of one chunk are
+        _to_device(results)
     kept, _, failed = jax.tree.unflatten(structure, results)
     return kept, np.asarray(failed)
