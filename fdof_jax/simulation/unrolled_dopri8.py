@@ -102,7 +102,7 @@ class _Interpolation(DenseOutput):
         change = _combine(
             [weights[stage] for stage in _USED], [self.rates[stage] for stage in _USED]
         )
-        return _moved(self.y0, self.step, change)
+        return in_one_loop(_moved(self.y0, self.step, change))
 
 
 class UnrolledDopri8(ScheduledDopri8):
