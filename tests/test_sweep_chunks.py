@@ -1,5 +1,6 @@
 """How a sweep cuts its members into chunks, and what it compiles for them."""
 
+import diffrax
 import jax
 import numpy as np
 import pytest
@@ -14,15 +15,15 @@ LANES = 64  # enough for a slow member to be stopped
 
 @pytest.fixture
 def solved(monkeypatch):
-    """Returns a list of the starts of each chunk solved from here on."""
+    """Returns a list of the starts of the chunks in each call from here on."""
     found = []
-    original = chunks._solve_chunk
+    original = chunks._solve
 
-    def recorded(program, moving, arrays):
+    def recorded(program, count, moving, arrays):
         found.append([np.asarray(leaf) for leaf in moving])
-        return original(program, moving, arrays)
+        return original(program, count, moving, arrays)
 
-    monkeypatch.setattr(chunks, "_solve_chunk", recorded)
+    monkeypatch.setattr(chunks, "_solve", recorded)
     return found
 
 
@@ -52,14 +53,33 @@ def test_a_batch_of_one_chunk_needs_no_forecast(monkeypatch):
     assert successful(swept(np.linspace(0, 1, 8))).all()
 
 
-def test_the_longest_motions_come_first(solved, monkeypatch):
-    monkeypatch.setattr(
-        chunks, "_cores", lambda: 1
-    )  # several begin chunks in any order
+@pytest.mark.parametrize(
+    "cores, calls",
+    [
+        (1, [[11, 10, 9, 8, 7, 6, 5, 4, 3, 2, 1, 0]]),
+        (2, [[11, 10, 9, 8, 3, 2, 1, 0], [7, 6, 5, 4]]),
+    ],
+)
+def test_members_are_shared_out_by_their_forecast(solved, monkeypatch, cores, calls):
+    """Each core gets one call for chunks of members that take about equally long."""
+    monkeypatch.setattr(chunks, "_cores", lambda: cores)
     speeds = np.array([0.0, 9, 1, 8, 2, 7, 3, 6, 4, 5, 10, 11])
-    swept(speeds, chunk=4)
-    found = [set(qd[:, 0]) for _, qd in solved]
-    assert found == [{8.0, 9, 10, 11}, {4.0, 5, 6, 7}, {0.0, 1, 2, 3}]
+    motion = swept(speeds, chunk=4)
+    np.testing.assert_array_equal(motion.qd[:, 0, 0], speeds)
+    found = [qd[: len(call), 0].tolist() for call, (_, qd) in zip(calls, solved)]
+    assert sorted(found) == sorted(calls)
+
+
+def test_long_records_are_solved_chunk_by_chunk(solved, monkeypatch):
+    """So do runs that show their progress; a call of many chunks needs more memory."""
+    monkeypatch.setattr(chunks, "_cores", lambda: 1)
+    speeds, both = np.linspace(0, 1, 8), dict(chunk=4)
+    seen = diffrax.TextProgressMeter()
+    swept(speeds, **both)
+    swept(speeds, **both, progress_meter=seen)
+    monkeypatch.setattr(chunks, "_STATES", 4 * len(TS))
+    swept(speeds, **both)
+    assert [len(q) for q, _ in solved] == [32, 32, 32, 4, 4]
 
 
 def test_cores_change_nothing(batch, monkeypatch):

@@ -25,14 +25,14 @@ from fdof_jax.simulation import chunks, prescribed
 def solved(monkeypatch):
     """Returns a list of the chunks solved from here on; traced calls are left out."""
     found = []
-    original = chunks._solve_chunk
+    original = chunks._solve
 
     def recorded(*arguments):
         if not is_traced(arguments):
             found.append(arguments)
         return original(*arguments)
 
-    monkeypatch.setattr(chunks, "_solve_chunk", recorded)
+    monkeypatch.setattr(chunks, "_solve", recorded)
     return found
 
 

@@ -7,6 +7,8 @@ from typing import Any, NamedTuple
 import diffrax
 import equinox as eqx
 import jax
+import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
@@ -65,12 +67,13 @@ class Form(NamedTuple):
     rest: Any
     constants: tuple[Any, ...]
     kinds: tuple[Any, Any]  # shapes and types of moving and other arrays
+    series: int  # the most chunks that a call solves, one after another
     mesh: Mesh | None
 
     @property
     def lanes(self) -> int:
         """The number of lanes on all devices."""
-        return self.kinds[0][0][0][0]
+        return self.kinds[0][0][0][0] // self.series
 
     @property
     def sharding(self) -> NamedSharding | None:
@@ -83,19 +86,34 @@ def _like(shape: tuple[int, ...], dtype: Any, weak: bool = False) -> Any:
 
 @functools.lru_cache(maxsize=64)
 def traced(form: Form) -> jax.stages.Lowered:
-    """Traces the program that computes the outcomes of a chunk."""
+    """Traces the program that computes the outcomes of the first `count` chunks."""
 
-    def run(moving, arrays):
+    def run(count, moving, arrays):
         known = jax.tree.unflatten(form.arrays, arrays)
         rest = jax.tree.unflatten(form.rest, form.constants)
         settings, reduce, ts, shared = eqx.combine(known, rest)
-        abreast = len(moving[0]) > _ALL_ALIKE  # of the lanes of one device
+        chunks = [leaf.reshape(form.series, -1, *leaf.shape[1:]) for leaf in moving]
+        abreast = chunks[0].shape[1] > _ALL_ALIKE  # of the lanes of one device
 
         def member(leaves):
             member = jax.tree.unflatten(form.moving, leaves)
             return outcome_of(settings, reduce, ts, member, shared, abreast)
 
-        return jax.vmap(member, axis_name=_AXIS)(moving)
+        @jax.jit  # traced once, though used twice
+        def solved(chunk):
+            return jax.vmap(member, axis_name=_AXIS)([leaf[chunk] for leaf in chunks])
+
+        def added(chunk, outcomes):
+            return jax.tree.map(
+                lambda all, new: all.at[chunk].set(new), outcomes, solved(chunk)
+            )
+
+        outcomes = jax.tree.map(
+            lambda leaf: jnp.zeros((form.series, *leaf.shape), leaf.dtype),
+            jax.eval_shape(solved, count),
+        )
+        outcomes = jax.lax.fori_loop(0, count, added, outcomes)
+        return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), outcomes)
 
     if form.mesh is not None:
         lanes, same = PartitionSpec("member"), PartitionSpec()
@@ -103,12 +121,13 @@ def traced(form: Form) -> jax.stages.Lowered:
         run = jax.shard_map(
             run,
             mesh=form.mesh,
-            in_specs=(lanes, same),
+            in_specs=(same, lanes, same),
             out_specs=lanes,
             check_vma=False,
         )
     like = [[_like(*kind) for kind in kinds] for kinds in form.kinds]
-    return jax.jit(run, in_shardings=(form.sharding, None)).lower(*like)
+    shardings = None, form.sharding, None
+    return jax.jit(run, in_shardings=shardings).lower(_like((), np.int32), *like)
 
 
 @functools.lru_cache(maxsize=64)

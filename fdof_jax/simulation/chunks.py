@@ -28,6 +28,8 @@ from .field import element_effort
 from .solution import Solution
 
 _SMALL = 8  # lanes of the chunks for a few slow members
+_MOST = 8  # chunks that one call of a program solves, one after another
+_STATES = 2**18  # at output times, of all members of such a call
 _COPIED_AT_ONCE = 2**24  # bytes of results; of more, each array is copied alone
 
 
@@ -74,8 +76,8 @@ def _shared_out(rows: np.ndarray, sharding: NamedSharding) -> Array:
     return jax.make_array_from_callback(rows.shape, sharding, rows.__getitem__)
 
 
-def _solve_chunk(program: Any, moving: list[Any], arrays: list[Array]) -> Any:
-    return jax.block_until_ready(program(moving, arrays))
+def _solve(program: Any, count: int, moving: list[Any], arrays: list[Array]) -> Any:
+    return jax.block_until_ready(program(np.int32(count), moving, arrays))
 
 
 class _Chunks:
@@ -88,8 +90,10 @@ class _Chunks:
         settings: dict,
         reduce: Callable[[Solution], Any],
         checkpoint: Checkpoint | None,
+        apart: bool,
         devices: list[Any],
     ):
+        """Prepares a batch; `apart`: whether each call is to solve a single chunk."""
         self.devices = len(devices)
         mesh = Mesh(np.array(devices), ("member",)) if len(devices) > 1 else None
         moving, shared = batch.split()
@@ -99,21 +103,29 @@ class _Chunks:
         constants, rest = jax.tree.flatten(rest)
         moving, self.arrays = (list(map(_of_jax, a)) for a in (moving, arrays))
         self.moving = in_numpy(moving)  # which is cut faster
-        self.form = Form(structure, known, rest, tuple(constants), ((), ()), mesh)
+        self.form = Form(structure, known, rest, tuple(constants), ((), ()), 1, mesh)
         self.checkpoint = checkpoint
+        self.apart = apart or checkpoint is not None
+        self.times = len(ts)
 
     def solve(
-        self, chunks: list[np.ndarray], lanes: int
-    ) -> Iterator[tuple[list[Any], Any]]:
-        """Solves chunks of members, on at most so many lanes per device.
+        self, form: Form, members: np.ndarray
+    ) -> Iterator[tuple[np.ndarray, list[Any], Any]]:
+        """Solves members in chunks, by a program of this form.
 
-        Returns of each chunk the arrays of the outcomes, and the outcomes' structure.
+        Returns members, the arrays of their outcomes, and the outcomes' structure.
         """
-        form = self._form(lanes)
+        size = form.lanes
+        chunks = [members[i : i + size] for i in range(0, len(members), size)]
         # XLA splits operations among the cores, which gains little for a chunk, and
         # runs in turn what one thread sends. While it runs, Python may do other things.
         threads = self.form.mesh is None and jax.default_backend() == "cpu"
         workers = min(_cores(), len(chunks)) if threads else 1
+        if not self.apart:
+            calls = workers * -(-len(chunks) // (workers * form.series))
+            calls = min(calls, len(chunks))
+            # Each call gets chunks of all lengths, so that all take equally long.
+            chunks = [np.concatenate(chunks[i::calls]) for i in range(calls)]
         if workers == 1:
             yield from (self._begin(form, members, None)() for members in chunks)
             return
@@ -126,51 +138,56 @@ class _Chunks:
             while running:
                 yield running.popleft()()
 
-    def _form(self, lanes: int) -> Form:
-        """Returns the form of the program for so many lanes."""
+    def form_of(self, lanes: int, several: bool) -> Form:
+        """Returns the form of a program for one or several chunks of so many lanes."""
         lanes *= self.devices
-        moving = tuple(((lanes, *leaf.shape[1:]), leaf.dtype) for leaf in self.moving)
+        series = 1
+        if several and self.form.mesh is None:
+            series = max(1, min(_MOST, _STATES // (lanes * self.times)))
+        rows = series * lanes
+        moving = tuple(((rows, *leaf.shape[1:]), leaf.dtype) for leaf in self.moving)
         arrays = tuple((a.shape, a.dtype, a.weak_type) for a in self.arrays)
-        return self.form._replace(kinds=(moving, arrays))
+        return self.form._replace(kinds=(moving, arrays), series=series)
 
     def _begin(
         self, form: Form, members: np.ndarray, pool: ThreadPoolExecutor | None
-    ) -> Callable[[], tuple[list[Any], Any]]:
-        """Begins to solve a chunk; returns a function that waits for the outcomes."""
+    ) -> Callable[[], tuple[np.ndarray, list[Any], Any]]:
+        """Begins to solve chunks; returns a function that waits for the outcomes."""
         kept = self._kept(form, members)
         if kept is not None:
             return lambda: kept
-        padded = np.full(form.lanes, members[-1])
+        count = -(-len(members) // form.lanes)
+        padded = np.full(form.series * form.lanes, members[-1])
         padded[: len(members)] = members
         moving = [leaf[padded] for leaf in self.moving]
         if form.sharding is not None:
             moving = [_shared_out(leaf, form.sharding) for leaf in moving]
         elif pool is not None:  # whose threads do not inherit this one's settings
             moving = jax.device_put(moving)
-        work = functools.partial(_solve_chunk, compiled(form), moving, self.arrays)
+        work = functools.partial(_solve, compiled(form), count, moving, self.arrays)
         outcomes = work if pool is None else pool.submit(work).result
         return lambda: self._end(form, members, outcomes())
 
     def _end(
         self, form: Form, members: np.ndarray, outcomes: Any
-    ) -> tuple[list[Any], Any]:
+    ) -> tuple[np.ndarray, list[Any], Any]:
         values, structure = jax.tree.flatten(outcomes)
         if jax.process_count() > 1:
             values = multihost_utils.process_allgather(values, tiled=True)
-        if form.mesh is not None or len(members) < form.lanes:
+        if form.mesh is not None or len(members) < form.series * form.lanes:
             values = [np.asarray(leaf)[: len(members)] for leaf in values]
         if self.checkpoint is not None and jax.process_index() == 0:
             values = [np.asarray(leaf) for leaf in values]
             self.checkpoint.write(members, form.lanes, values)
-        return values, structure
+        return members, values, structure
 
-    def _kept(self, form: Form, members: np.ndarray) -> tuple[list[Any], Any] | None:
+    def _kept(self, form: Form, members: np.ndarray) -> Any:
         """Returns the outcomes of a chunk that the checkpoint holds, or None."""
         if self.checkpoint is None or not self.checkpoint.has(members, form.lanes):
             return None
         arrays, structure = jax.tree.flatten(traced(form).out_info)
         values = self.checkpoint.read(members, form.lanes, Rows(arrays))
-        return None if values is None else (values, structure)
+        return None if values is None else (members, values, structure)
 
 
 def _lanes(members: int, chunk: int) -> int:
@@ -200,22 +217,24 @@ def in_chunks(
     devices: list[Any],
 ) -> tuple[Any, np.ndarray]:
     """Returns what is kept of all members, and which of them failed."""
-    chunks = _Chunks(batch, ts, settings, reduce, checkpoint, devices)
+    seen = type(meter) is not diffrax.NoProgressMeter
+    chunks = _Chunks(batch, ts, settings, reduce, checkpoint, seen, devices)
     lanes = _lanes(-(-batch.size // chunks.devices), chunk)
     waiting = np.arange(batch.size)
-    if batch.size > lanes * chunks.devices:
+    several = batch.size > lanes * chunks.devices
+    form = chunks.form_of(lanes, several)
+    if several:
         # The longest come first, so that no core waits long for another at the end.
         work = np.asarray(expected_work(ts[0], *batch.split()))
         waiting = np.argsort(work)[::-1]
     done, progress, results, structure = 0, meter.init(), [], None
     while len(waiting):
-        size = lanes * chunks.devices
-        cut = [waiting[start : start + size] for start in range(0, len(waiting), size)]
         late = []
-        for members, (values, structure) in zip(cut, chunks.solve(cut, lanes)):
+        for members, values, structure in chunks.solve(form, waiting):
             _, stopped, _ = jax.tree.unflatten(structure, values)
             late.append(members[np.asarray(stopped)])
-            if len(members) == batch.size and not len(late[-1]):
+            whole = len(members) == batch.size and not len(late[-1])
+            if whole and not several:
                 results = values  # nothing is to be sorted or added
             else:
                 if not results:
@@ -228,7 +247,7 @@ def in_chunks(
             progress = meter.step(progress, np.asarray(done / batch.size))
         waiting = np.concatenate(late)
         if len(waiting) <= lanes // _SMALL:
-            lanes = _lanes(min(len(waiting), _SMALL), chunk)
+            form = chunks.form_of(_lanes(min(len(waiting), _SMALL), chunk), False)
     meter.close(progress)
     if not all(isinstance(leaf, Array) for leaf in results):  # those of one chunk are
         _to_device(results)

@@ -119,7 +119,7 @@ def sweep(
     *,
     forces_axes: Any = None,
     reduce: Callable[[Solution], Any] | None = None,
-    chunk: int = 256,
+    chunk: int = 128,
     throw: bool = False,
     checkpoint: str | os.PathLike | None = None,
     store: str | os.PathLike | None = None,
