@@ -27,6 +27,7 @@ from .chunk_programs import Form, compiled, traced
 from .field import element_effort
 from .solution import Solution
 
+_PILOT_STEPS, _PILOT_ANGLE = 16, 0.3  # the rough steps of a forecast, and their size
 _SMALL = 8  # lanes of the chunks for a few slow members
 _MOST = 8  # chunks that one call of a program solves, one after another
 _STATES = 2**18  # at output times, of all members of such a call
@@ -34,25 +35,43 @@ _COPIED_AT_ONCE = 2**24  # bytes of results; of more, each array is copied alone
 
 
 @eqx.filter_jit
-def expected_work(t0: Array, moving: Any, shared: Any) -> Array:
+def expected_work(ts: Array, moving: Any, shared: Any) -> Array:
     """Computes for each member a rate [1/s] that grows with its steps.
 
-    It combines the joints' initial rates and accelerations.
+    It combines the joints' rates and accelerations, in the mean over the beginning of
+    the motion, which rough steps find.
     """
 
     def member(moving):
         linkage, (q, qd), forces = eqx.combine(moving, shared)
-        tau = jnp.zeros_like(q)
-        for index, element in enumerate(elements("forces", forces)):
-            state = element.initial_state(linkage)
-            tau = tau + element_effort(index, element, t0, q, qd, linkage, state)[0]
         # Revolute joints cause most of the steps, slides hardly any.
         turning = jnp.stack(real_joints(linkage.ef))
-        rate = jnp.where(turning, qd, 0)
-        qdd = forward_dynamics(linkage, q, qd, tau, forces)
-        acceleration = jnp.where(turning, qdd, 0)
-        norm = jnp.linalg.norm
-        return norm(rate) + jnp.sqrt(norm(acceleration))
+
+        def at(t, q, qd):
+            tau = jnp.zeros_like(q)
+            for index, element in enumerate(elements("forces", forces)):
+                state = element.initial_state(linkage)
+                tau = tau + element_effort(index, element, t, q, qd, linkage, state)[0]
+            qdd = forward_dynamics(linkage, q, qd, tau, forces)
+            rate, acceleration = (jnp.where(turning, a, 0) for a in (qd, qdd))
+            norm = jnp.linalg.norm
+            return qdd, norm(rate) + jnp.sqrt(norm(acceleration))
+
+        def moved(_, now):
+            t, q, qd, total, last = now
+            qdd, rate = at(t, q, qd)
+            # A motion that these steps lose stays where it was.
+            found = jnp.isfinite(rate)
+            h = jnp.where(found, step, 0)
+            last = jnp.where(found, rate, last)
+            qd = qd + h * jnp.where(found, qdd, 0)
+            return t + h, q + h * qd, qd, total + last, last
+
+        _, first = at(ts[0], q, qd)
+        step = jnp.minimum((ts[-1] - ts[0]) / _PILOT_STEPS, _PILOT_ANGLE / first)
+        start = ts[0], q, qd, jnp.zeros_like(first), first
+        *_, total, _ = jax.lax.fori_loop(0, _PILOT_STEPS, moved, start)
+        return total
 
     return jax.vmap(member)(moving)
 
@@ -225,7 +244,7 @@ def in_chunks(
     form = chunks.form_of(lanes, several)
     if several:
         # The longest come first, so that no core waits long for another at the end.
-        work = np.asarray(expected_work(ts[0], *batch.split()))
+        work = np.asarray(expected_work(ts, *batch.split()))
         waiting = np.argsort(work)[::-1]
     done, progress, results, structure = 0, meter.init(), [], None
     while len(waiting):

@@ -36,6 +36,7 @@ from .batch_axes import Batch, batch_of
 from .checkpoints import Checkpoint, folder_at
 from .chunk_programs import outcome_of
 from .chunks import expected_work, in_chunks
+from .dopri8 import constant
 from .provenance import outline
 from .simulate import solve_options
 from .solution import Solution
@@ -57,7 +58,7 @@ def _traced(
 ) -> Any:
     """Solves a traced batch in chunks; failed members enter no derivative."""
     moving, shared = batch.split()
-    order = jnp.argsort(expected_work(ts[0], moving, shared))
+    order = jnp.argsort(expected_work(*constant((ts, moving, shared))))
 
     def solved(moving, shared):
         return jax.lax.map(
@@ -102,7 +103,7 @@ def _check_elements(batch: Batch, ts: Array, forces_axes: Any) -> None:
 
     eqx.filter_eval_shape(eqx.filter_vmap(check_member), moving)
     try:
-        eqx.filter_eval_shape(expected_work, ts[0], moving, shared)
+        eqx.filter_eval_shape(expected_work, ts, moving, shared)
     except TypeError as error:
         raise TypeError(
             "forces, forces_axes: expected force elements that work for one member, "
