@@ -1,5 +1,7 @@
 """How a sweep cuts its members into chunks, and what it compiles for them."""
 
+import sys
+
 import diffrax
 import jax
 import numpy as np
@@ -91,6 +93,26 @@ def test_cores_change_nothing(batch, monkeypatch):
         motions.append(run(batch))
     for a, b in zip(*map(jax.tree.leaves, motions)):
         np.testing.assert_array_equal(a, b)
+
+
+def test_only_chunks_that_nothing_keeps_depend_on_the_cores(monkeypatch, tmp_path):
+    sizes = {}
+    for cores in (1, 2):
+        monkeypatch.setattr(chunks, "_cores", lambda cores=cores: cores)
+        sizes[cores] = [chunks.usual_chunk(anywhere=same) for same in (False, True)]
+    assert sizes == {1: [128, 128], 2: [256, 128]}
+    asked = []
+
+    def usual_chunk(anywhere):
+        asked.append(anywhere)
+        return 8
+
+    module = sys.modules["fdof_jax.simulation.sweep"]
+    monkeypatch.setattr(module, "usual_chunk", usual_chunk)
+    speeds = np.linspace(0, 1, 8)
+    for keywords in ({}, {"checkpoint": tmp_path / "a"}, {"store": tmp_path / "b"}):
+        swept(speeds, **keywords)
+    assert asked == [False, True, True]
 
 
 def test_a_slow_member_is_stopped_and_solved_alone(solved):

@@ -107,7 +107,7 @@ def test_other_axes_are_refused(axes):
 @pytest.mark.parametrize(
     "name, values",
     {
-        "chunk": [0, -1, 1.5, True, None, "8"],
+        "chunk": [0, -1, 1.5, True, "8"],
         "throw": [1, None, "no"],
         "progress_meter": [None, 3],
         "checkpoint": [3, True],

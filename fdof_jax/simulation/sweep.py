@@ -35,7 +35,7 @@ from ..linkage.linkage import Linkage
 from .batch_axes import Batch, batch_of
 from .checkpoints import Checkpoint, folder_at
 from .chunk_programs import outcome_of
-from .chunks import expected_work, in_chunks
+from .chunks import expected_work, in_chunks, usual_chunk
 from .dopri8 import constant
 from .provenance import outline
 from .simulate import solve_options
@@ -120,7 +120,7 @@ def sweep(
     *,
     forces_axes: Any = None,
     reduce: Callable[[Solution], Any] | None = None,
-    chunk: int = 128,
+    chunk: int | None = None,
     throw: bool = False,
     checkpoint: str | os.PathLike | None = None,
     store: str | os.PathLike | None = None,
@@ -153,7 +153,9 @@ def sweep(
       `lambda motion: motion.q[-1]`; of each member only the arrays that it returns are
       kept, also in a checkpoint. It is part of the compiled program: pass the same
       function again to use that again.
-    - `chunk`: largest number of members to solve together, per device.
+    - `chunk`: largest number of members to solve together, per device. None stands for
+      128; or 256 where a CPU has several cores, unless the results go to a checkpoint
+      or store, which any machine may resume.
     - `throw`: whether to raise an error if any member fails.
     - `checkpoint`: a folder for the results of finished chunks. A repeated call resumes
       from them. A file that is damaged, or of another chunk, is reported by a warning,
@@ -187,7 +189,8 @@ def sweep(
     ts = real_array("ts", ts, (None,))
     increasing("ts", ts)
     elements("forces", forces)
-    whole_number("chunk", chunk, 1)
+    if chunk is not None:
+        whole_number("chunk", chunk, 1)
     whole_number("of", of, 1)
     if whole_number("shard", shard, 0) >= of:
         raise refusal("shard", f"a whole number below of={of}", shard)
@@ -209,6 +212,9 @@ def sweep(
     del settings["progress_meter"]  # it counts finished members, not time
     batch = batch_of(linkage, state0, forces, forces_axes)
     traced = is_traced(batch.inputs, ts, reduce)
+    if chunk is None:
+        resumable = checkpoint is not None or store is not None
+        chunk = usual_chunk(anywhere=traced or resumable)
     if forces:
         _check_elements(batch, ts, forces_axes)
     keep = _without_times if reduce is None else function("reduce", reduce)
