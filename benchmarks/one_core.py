@@ -22,7 +22,10 @@ def _serve(pipe: Connection, core: int, batch: int) -> None:
     fj.configure(x64=True)
     contestant, result = sweep(fig5_batch(batch)), None
     while True:
-        tolerance = pipe.recv()
+        try:
+            tolerance = pipe.recv()
+        except EOFError:  # the benchmark is done
+            return
         if tolerance is None:
             pipe.send(tuple(contestant.motion(result)))
         else:
