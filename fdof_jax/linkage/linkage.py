@@ -9,6 +9,7 @@ value. In a fixed pair both are fictitious.
 import functools
 import inspect
 from collections.abc import Callable
+from dataclasses import FrozenInstanceError
 from typing import Any, TypeVar
 
 import equinox as eqx
@@ -117,6 +118,15 @@ class Linkage(eqx.Module):
         return Linkage(**now | values)
 
     __replace__ = replace  # what `copy.replace` calls
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        try:
+            super().__setattr__(name, value)
+        except FrozenInstanceError:
+            raise FrozenInstanceError(
+                f"{name}: a linkage does not change; linkage.replace({name}=...) "
+                "returns another."
+            ) from None
 
     def __repr__(self) -> str:
         """Shows the values of a single linkage, or the shapes of a batch."""
