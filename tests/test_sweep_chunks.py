@@ -10,7 +10,7 @@ from sweep_batch import SETTINGS, TS, run, successful
 
 import fdof_jax as fj
 from fdof_jax.base import configuration
-from fdof_jax.simulation import chunk_programs, chunks
+from fdof_jax.simulation import chunk_programs, chunks, forecast
 from fdof_jax.simulation.batch_axes import batch_of
 
 LANES = 64  # enough for a slow member to be stopped
@@ -52,7 +52,7 @@ def test_small_batches_of_many_sizes_share_a_program(solved):
 
 
 def test_a_batch_of_one_chunk_needs_no_forecast(monkeypatch):
-    monkeypatch.setattr(chunks, "expected_work", None)
+    monkeypatch.setattr(chunks, "work_of_chunks", None)
     assert successful(swept(np.linspace(0, 1, 8))).all()
 
 
@@ -151,5 +151,20 @@ def test_an_option_that_xla_does_not_know_is_left_out(monkeypatch):
 def test_the_forecast_follows_the_steps(batch, clean):
     steps = np.asarray(clean.stats["num_steps"])
     moving, shared = batch_of(*batch, 0).split()
-    forecast = chunks.expected_work(jax.numpy.asarray(TS), moving, shared)
-    assert np.corrcoef(forecast, steps)[0, 1] > 0.75
+    found = forecast.expected_work(jax.numpy.asarray(TS), moving, shared)
+    assert np.corrcoef(found, steps)[0, 1] > 0.75
+
+
+def test_one_forecast_serves_batches_of_all_sizes(monkeypatch):
+    traces, original = [], forecast.expected_work
+
+    def counted(*arguments):
+        traces.append(arguments)
+        return original(*arguments)
+
+    monkeypatch.setattr(forecast, "expected_work", counted)
+    swept(np.linspace(0, 1, 11), chunk=3)
+    before = len(traces)
+    assert before
+    swept(np.linspace(0, 1, 40), chunk=3)  # of more than one block
+    assert len(traces) == before

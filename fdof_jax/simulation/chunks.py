@@ -11,69 +11,22 @@ from typing import Any
 import diffrax
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding
 
 from ..base.array_namespace import in_numpy
-from ..dynamics import forward_dynamics
-from ..forces.element import elements
-from ..linkage.topology import real_joints
 from .batch_axes import Batch
 from .checkpoints import Checkpoint, Rows
 from .chunk_programs import Form, compiled, traced
-from .field import element_effort
+from .forecast import work_of_chunks
 from .solution import Solution
 
-_PILOT_STEPS, _PILOT_ANGLE = 16, 0.3  # the rough steps of a forecast, and their size
 _SMALL = 8  # lanes of the chunks for a few slow members
 _MOST = 8  # chunks that one call of a program solves, one after another
 _STATES = 2**18  # at output times, of all members of such a call
 _COPIED_AT_ONCE = 2**24  # bytes of results; of more, each array is copied alone
-
-
-@eqx.filter_jit
-def expected_work(ts: Array, moving: Any, shared: Any) -> Array:
-    """Computes for each member a rate [1/s] that grows with its steps.
-
-    It combines the joints' rates and accelerations, in the mean over the beginning of
-    the motion, which rough steps find.
-    """
-
-    def member(moving):
-        linkage, (q, qd), forces = eqx.combine(moving, shared)
-        # Revolute joints cause most of the steps, slides hardly any.
-        turning = jnp.stack(real_joints(linkage.ef))
-
-        def at(t, q, qd):
-            tau = jnp.zeros_like(q)
-            for index, element in enumerate(elements("forces", forces)):
-                state = element.initial_state(linkage)
-                tau = tau + element_effort(index, element, t, q, qd, linkage, state)[0]
-            qdd = forward_dynamics(linkage, q, qd, tau, forces)
-            rate, acceleration = (jnp.where(turning, a, 0) for a in (qd, qdd))
-            norm = jnp.linalg.norm
-            return qdd, norm(rate) + jnp.sqrt(norm(acceleration))
-
-        def moved(_, now):
-            t, q, qd, total, last = now
-            qdd, rate = at(t, q, qd)
-            # A motion that these steps lose stays where it was.
-            found = jnp.isfinite(rate)
-            h = jnp.where(found, step, 0)
-            last = jnp.where(found, rate, last)
-            qd = qd + h * jnp.where(found, qdd, 0)
-            return t + h, q + h * qd, qd, total + last, last
-
-        _, first = at(ts[0], q, qd)
-        step = jnp.minimum((ts[-1] - ts[0]) / _PILOT_STEPS, _PILOT_ANGLE / first)
-        start = ts[0], q, qd, jnp.zeros_like(first), first
-        *_, total, _ = jax.lax.fori_loop(0, _PILOT_STEPS, moved, start)
-        return total
-
-    return jax.vmap(member)(moving)
 
 
 def _cores() -> int:
@@ -165,6 +118,21 @@ class _Chunks:
             while running:
                 yield running.popleft()()
 
+    def forecast(self, ts: Array, shared: Any, lanes: int) -> np.ndarray:
+        """Returns the `expected_work` of all members; one program serves any number."""
+        (size, *_), rows = self.moving[0].shape, _MOST * lanes
+        work = []
+        for first in range(0, size, rows):
+            block = np.minimum(np.arange(first, first + rows), size - 1)
+            leaves = [
+                leaf[block].reshape(_MOST, lanes, *leaf.shape[1:])
+                for leaf in self.moving
+            ]
+            moving = jax.device_put(jax.tree.unflatten(self.form.moving, leaves))
+            count = jax.device_put(np.int32(-(-min(rows, size - first) // lanes)))
+            work.append(work_of_chunks(count, ts, moving, shared))
+        return np.concatenate(work, axis=None)[:size]
+
     def form_of(self, lanes: int, several: bool) -> Form:
         """Returns the form of a program for one or several chunks of so many lanes."""
         lanes *= self.devices
@@ -252,8 +220,8 @@ def in_chunks(
     form = chunks.form_of(lanes, several)
     if several:
         # The longest come first, so that no core waits long for another at the end.
-        work = np.asarray(expected_work(ts, *batch.split()))
-        waiting = np.argsort(work)[::-1]
+        _, shared = batch.split()
+        waiting = np.argsort(chunks.forecast(ts, shared, lanes))[::-1]
     done, progress, results, structure = 0, meter.init(), [], None
     while len(waiting):
         late = []

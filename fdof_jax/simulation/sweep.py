@@ -35,8 +35,9 @@ from ..linkage.linkage import Linkage
 from .batch_axes import Batch, batch_of
 from .checkpoints import Checkpoint, folder_at
 from .chunk_programs import outcome_of
-from .chunks import expected_work, in_chunks, usual_chunk
+from .chunks import in_chunks, usual_chunk
 from .dopri8 import constant
+from .forecast import expected_work
 from .provenance import outline
 from .simulate import solve_options
 from .solution import Solution
