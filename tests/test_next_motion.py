@@ -79,6 +79,7 @@ def test_the_next_fit_has_the_standard_errors_expected(found, chosen):
     assert efforts.max() <= 4 and speed.max() < 1.01
     assert speed.max() > 0.9 or efforts.max() == 4
     assert f"the largest {chosen.improvement:.3g} times less" in str(chosen)
+    assert f"efforts      {chosen.motion['efforts'][0, 0]:.4g} " in str(chosen)
 
 
 def test_the_gradient_of_the_largest_standard_error(found, chosen, monkeypatch):
@@ -129,7 +130,10 @@ def test_parameters_that_nothing_has_told_yet(found):
         (dict(within=3), "within: expected a callable"),
         (dict(observe=3), "observe: expected a callable"),
         (dict(scale={"mass": 0}), r"scale\['mass'\]: expected a real number"),
-        (dict(within=lambda scene, motion: motion.q), "strictly within the limits"),
+        (
+            dict(within=lambda scene, motion: motion.q),
+            "between -1 and 1 .* got .* entry",
+        ),
     ],
 )
 def test_malformed_arguments(changes, message, found):

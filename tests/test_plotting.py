@@ -1,5 +1,7 @@
 """Curves show the right numbers, labels and units; pixels are not compared."""
 
+import dataclasses
+
 import elements
 import equinox as eqx
 import jax.numpy as jnp
@@ -31,6 +33,7 @@ from fdof_jax import (
     simulate,
     tip_position,
 )
+from fdof_jax.control import PIDController
 from fdof_jax.forces import JointStops
 
 
@@ -42,7 +45,7 @@ def test_motion_profile_shows_absolute_angles_in_degrees_and_slides():
     solution = swinging()
     fig = plotting.motion_profile(make_linkage("RPR"), solution)
     angles, slides = fig.axes
-    assert angles.get_ylabel() == "angle [degrees]"
+    assert angles.get_ylabel() == "absolute angle [degrees]"
     assert slides.get_ylabel() == "slide [m]"
     assert slides.get_xlabel() == "time [s]"
     assert labels(angles) == [r"$\theta_1$", r"$\theta_3$"]
@@ -164,11 +167,20 @@ def hold(t, linkage):
     return jnp.zeros(3), jnp.zeros(3)
 
 
-def test_effort_profile_has_units_limits_and_saturation():
+LIMIT = [1e3, 3e2, np.inf]
+
+
+@pytest.mark.parametrize(
+    "controller",
+    [PDController(1e4, 0, LIMIT, hold), PIDController(1e4, 1, 0, LIMIT, hold)],
+    ids=["PD", "PID"],
+)
+def test_effort_profile_has_units_limits_and_saturation(controller):
     q = np.zeros((11, 3))
     q[:5, 1] = 0.1  # beyond the 0.03 m that saturate
-    forces = (PDController(1e4, 0, [1e3, 3e2, np.inf], hold), JointDamper(1.0))
-    solution = made_up(np.linspace(0, 1, 11), q)
+    forces = controller, JointDamper(1.0)
+    own = (np.zeros((11, 3)),) if isinstance(controller, PIDController) else ()
+    solution = dataclasses.replace(made_up(np.linspace(0, 1, 11), q), own=own)
     fig = plotting.effort_profile(make_linkage("RPR"), forces, solution)
     names = [ax.get_ylabel() for ax in fig.axes]
     assert names == ["$T_1$ [N m]", "$F_2$ [N]", "$T_3$ [N m]"]
@@ -183,6 +195,24 @@ def test_effort_profile_has_units_limits_and_saturation():
         "limit ±300 N",
     ]
     assert set(labels(fig.axes[0])) == {"total", "limits", "saturated"}
+
+
+def test_the_limit_is_written_where_no_curve_is():
+    q = np.zeros((11, 3))
+    q[6:, 1] = 0.1  # a negative effort, late: the lower right corner is taken
+    solution = made_up(np.linspace(0, 1, 11), q)
+    forces = (PDController(1e3, 0, 300, hold),)
+    _, middle, last = plotting.effort_profile(LINKAGE, forces, solution).axes
+    assert middle.texts[0].xy == (1, 1) and last.texts[0].xy in [(1, 0), (1, 1)]
+
+
+def test_a_legend_takes_as_many_rows_as_it_needs():
+    solutions = {"paper gains": swinging(), "tuned gains": swinging()}
+    task = CircleTask([1, 1], 0.5, 2.0, 0.0)
+    for words in (solutions, {2 * name: s for name, s in solutions.items()}):
+        ax = plotting.tracking(make_linkage("RRR"), task, words)
+        assert ax.get_legend().get_window_extent().x1 <= ax.figure.bbox.x1
+        assert len(labels(ax)) == 3
 
 
 def test_effort_profile_without_elements_is_zero():

@@ -17,6 +17,7 @@ from ..search.methods import Evaluation
 from ..search.simulated import check_scene
 from ..simulation.scene import Scene
 from ..simulation.sensitivities import sensitivities
+from ..simulation.simulate import simulate
 from ..simulation.solution import Solution
 from .problems import Observe, SceneAt
 from .recordings import link_ends
@@ -49,14 +50,15 @@ class NextMotion(eqx.Module):
     message: str
 
     def __str__(self) -> str:
-        rows = [
-            f"{name:12} {np.array2string(np.asarray(errors), precision=3)}"
-            for name, errors in self.standard_errors.items()
-        ]
-        head = (
-            f"expected standard errors, the largest {self.improvement:.3g} times less:"
-        )
-        return "\n".join([head, *rows, self.message])
+        largest = f"the largest {self.improvement:.3g} times less"
+        rows = ["motion:", *_rows(self.motion)]
+        rows += [f"expected standard errors, {largest}:", *_rows(self.standard_errors)]
+        return "\n".join([*rows, self.message])
+
+
+def _rows(values: dict[str, Any]) -> list[str]:
+    numbers = lambda value: " ".join(f"{x:.4g}" for x in np.ravel(value))
+    return [f"  {name:12} {numbers(value)}" for name, value in values.items()]
 
 
 class _Design(NamedTuple):
@@ -189,10 +191,7 @@ def next_motion(
         enough=_ENOUGH, report=report, describe=_largest_so_far,
     )  # fmt: skip
     if run.failed:
-        raise ValueError(
-            "start: expected a motion that can be simulated and stays strictly within "
-            f"the limits, got {start!r}."
-        )
+        raise ValueError(f"start: {_refused(scene, ts, within)}.")
     numbers = np.clip(run.z * half, motion.low, motion.high)
     errors = run.best.facts["errors"][0]
     before = np.sqrt(np.diag(found.covariance)) / sizes
@@ -202,6 +201,28 @@ def next_motion(
         improvement=float(before.max() / errors.max()),
         message=run.reason,
     )
+
+
+def _refused(
+    scene: Scene, ts: Array, within: Callable[[Scene, Solution], Array] | None
+) -> str:
+    """Says why a search cannot begin with a motion."""
+    solution = simulate(scene.linkage, scene.state0, ts, scene.forces, throw=False)
+    if str(solution.outcome) != "successful":
+        reached = float(solution.stats["time_reached"])
+        return (
+            f"expected a motion that can be simulated, got {solution.outcome} at "
+            f"t = {reached:g} s"
+        )
+    if within is not None:
+        shares = np.asarray(within(scene, solution))
+        entry = np.unravel_index(np.argmax(np.abs(shares)), shares.shape)
+        if not abs(shares[entry]) < 1:
+            return (
+                "expected a motion that stays strictly between -1 and 1 in `within`, "
+                f"got {shares[entry]:.3g} in entry {[int(i) for i in entry]}"
+            )
+    return "expected a motion with finite readings and derivatives, got others"
 
 
 def _information(covariance: np.ndarray) -> np.ndarray:

@@ -88,7 +88,8 @@ class MotionAnimation(FuncAnimation):
 
 def _progress(name: str, frame: int, frames: int) -> None:
     done = 30 * (frame + 1) // frames
-    if done > 30 * frame // frames:  # otherwise the bar is as before
+    # In a file each new bar would follow the last.
+    if done > 30 * frame // frames and (done == 30 or sys.stderr.isatty()):
         bar, end = "#" * done + "." * (30 - done), "\n" if done == 30 else ""
         print(f"\r{name} [{bar}]", end=end, file=sys.stderr, flush=True)
 

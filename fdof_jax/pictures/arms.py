@@ -1,5 +1,6 @@
 """An arm in pictures: where its parts are, and their lines and markers."""
 
+from textwrap import fill
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -227,7 +228,8 @@ def panels_of(
     for position, (title, (_, g)) in enumerate(geometries.items()):
         ax = plane_axes(fig.add_subplot(rows, columns, position + 1), g.tip)
         ax.set_aspect("equal", adjustable="datalim")
-        ax.set(title=title, xlabel="", ylabel="")
+        ax.set_title(fill(title, 18), fontsize="medium")  # no wider than its panel
+        ax.set(xlabel="", ylabel="")
         ax.tick_params(labelsize="small")
         panels.append(ax)
     fig.supxlabel("x [m]", fontsize="medium")

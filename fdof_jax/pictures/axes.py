@@ -85,17 +85,21 @@ def legend(ax: Axes, *others: Axes) -> None:
     found = {}
     for handles, labels in (a.get_legend_handles_labels() for a in (ax, *others)):
         found |= dict(zip(labels, handles))
-    columns = max(1, 48 // (4 + max(map(len, found))))
-    columns = -(-len(found) // -(-len(found) // columns))  # makes rows of even length
-    ax.legend(
-        list(found.values()), list(found), ncols=columns, fontsize="small",
-        frameon=False, handlelength=1.2, columnspacing=1,
-        loc="lower left", bbox_to_anchor=(0, 1), borderaxespad=0.2,
-    )  # fmt: skip
-    figure = ax.get_figure(root=True)
-    if ax.get_aspect() != "auto" and figure is not None:
+    figure, columns = ax.get_figure(root=True), max(1, 48 // (4 + max(map(len, found))))
+    assert figure is not None  # axes are always in a figure
+    rows = -(-len(found) // columns)
+    while True:
+        columns = -(-len(found) // rows)  # makes rows of even length
+        drawn = ax.legend(
+            list(found.values()), list(found), ncols=columns, fontsize="small",
+            frameon=False, handlelength=1.2, columnspacing=1,
+            loc="lower left", bbox_to_anchor=(0, 1), borderaxespad=0.2,
+        )  # fmt: skip
         # Equal scales shrink the axes after a layout, so that one alone cuts labels.
         figure.draw_without_rendering()
+        if columns == 1 or drawn.get_window_extent().x1 <= figure.bbox.x1:
+            return
+        rows += 1
 
 
 def figure_legend(fig: Figure) -> None:

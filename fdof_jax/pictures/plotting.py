@@ -18,12 +18,11 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 from scipy.integrate import cumulative_simpson
 
-from ..analysis.tracking import saturated
 from ..base.checks import real_array, refusal
+from ..control.drives import PIDController
 from ..control.pd import PDController
 from ..dynamics import energy, link_energies
 from ..forces.element import Forces, InertialElement, elements
-from ..forces.part import each
 from ..linkage.linkage import Linkage
 from ..linkage.topology import letters
 from ..simulation.efforts import joint_efforts
@@ -73,8 +72,9 @@ def motion_profile(
 ) -> Figure:
     """Plots the motion of the real joints over time, as in the paper's Figs 4 and 6.
 
-    One panel shows the absolute angles of links on revolute joints [degrees], another
-    the slides of prismatic joints [m]; theta_k and B_k are those of joint k.
+    One panel shows the angles of links on revolute joints from the x axis, not from the
+    link before as in `q` [degrees], another the slides of prismatic joints [m]; theta_k
+    and B_k are those of joint k.
     """
     ts, q, _ = reached(linkage, solution)
     g = geometry(linkage, q)
@@ -85,7 +85,7 @@ def motion_profile(
             angles.append((rf"$\theta_{k}$", degrees, link_color(k)))
         elif kind == "P":
             slides.append((f"$B_{k}$", g.slide[:, k - 1], link_color(k)))
-    panels = [("angle [degrees]", angles), ("slide [m]", slides)]
+    panels = [("absolute angle [degrees]", angles), ("slide [m]", slides)]
     panels = [panel for panel in panels if panel[1]]
     fig = figure_or_new(fig, 3.5, 0.6 + 1.9 * len(panels))
     for ax in _time_panels(fig, ts, panels):
@@ -193,14 +193,15 @@ def effort_profile(
     """Plots joint efforts over time with their limits, a panel per joint [N or N m].
 
     The curves are total efforts. The grey band lies within the finite limits of a
-    `PDController`; it fills the panel where the efforts stay far from the limits.
-    Orange dots mark samples at which the controller is saturated.
+    `PDController`, `PIDController`, `GravityFeedforward` or `ComputedTorque`; it fills
+    the panel where the efforts stay far from the limits. Orange dots mark samples at
+    which the controller is at its limit.
 
     **Arguments:** `forces`: those of the solution.
     """
     reached(linkage, solution)
     efforts = joint_efforts(linkage, forces, solution)
-    ts, total, elements = (np.asarray(a) for a in (solution.ts, *efforts))
+    ts, total, parts = (np.asarray(a) for a in (solution.ts, *efforts))
     units, panels = [], []
     moving = [k for k, kind in enumerate(letters(linkage.ef)) if kind != "F"]
     for k in moving:
@@ -212,22 +213,50 @@ def effort_profile(
     axes = _time_panels(fig, ts, panels)
     for k, ax, unit in zip(moving, axes, units):
         low, high = ax.get_ylim()  # before the bands, which may be far wider
-        for element, effort in zip(forces, elements):
-            if isinstance(element, PDController) and np.isfinite(
-                limit := float(each(element.limit, total[0])[k])
-            ):
-                ax.axhspan(-limit, limit, color=GREY, alpha=0.15, lw=0, label="limits")
-                at = np.asarray(saturated(element, linkage, solution))[:, k]
-                dots = ax.plot(ts[at], effort[at, k], ".", color=SERIES[1], zorder=3)
-                dots[0].set(label="saturated", gid=f"saturated {k + 1}")
-                if at.any():
-                    low, high = min(low, -1.1 * limit), max(high, 1.1 * limit)
-                text = ax.text(0.98, 0.08, f"limit ±{limit:g} {unit}", ha="right")
-                text.set(fontsize="small", transform=ax.transAxes)
-                text.set_bbox({"fc": "white", "alpha": 0.7, "lw": 0, "pad": 1})
+        texts = []
+        for element, effort in zip(elements("forces", forces), parts[:, :, k]):
+            limit = _limit(element, k, total.shape[1])
+            if not np.isfinite(limit):
+                continue
+            ax.axhspan(-limit, limit, color=GREY, alpha=0.15, lw=0, label="limits")
+            at = (np.abs(effort) >= limit) & (effort != 0)
+            dots = ax.plot(ts[at], effort[at], ".", color=SERIES[1], zorder=3)
+            dots[0].set(label="saturated", gid=f"saturated {k + 1}")
+            if at.any():
+                low, high = min(low, -1.1 * limit), max(high, 1.1 * limit)
+            texts.append(f"limit ±{limit:g} {unit}")
         ax.set_ylim(low, high)
+        _note(ax, "\n".join(texts))
     legend(axes[0], *axes)
     return fig
+
+
+def _limit(element: Any, joint: int, joints: int) -> float:
+    """The limit of a controller's effort at a joint; infinite for other elements."""
+    element = element.pd if isinstance(element, PIDController) else element
+    if not isinstance(element, PDController):
+        return np.inf
+    return float(np.broadcast_to(np.asarray(element.limit), joints)[joint])
+
+
+def _note(ax: Axes, text: str) -> None:
+    """Writes into the first corner of axes that no curve enters, or else the first."""
+    if not text:
+        return
+
+    def hidden(x: float, y: float) -> int:
+        curves = (ax.transLimits.transform(line.get_xydata()) for line in ax.lines)
+        return sum(
+            np.count_nonzero((np.abs(curve - (x, y)) < (0.45, 0.25)).all(axis=1))
+            for curve in curves
+        )
+
+    x, y = min([(1, 0), (1, 1), (0, 0), (0, 1)], key=lambda corner: hidden(*corner))
+    ax.annotate(
+        text, (x, y), (5 - 10 * x, 6 - 12 * y), xycoords="axes fraction",
+        textcoords="offset points", ha=["left", "right"][x], va=["bottom", "top"][y],
+        fontsize="small", bbox={"fc": "white", "alpha": 0.7, "lw": 0, "pad": 1},
+    )  # fmt: skip
 
 
 def work_precision(

@@ -186,7 +186,7 @@ class Cells(NamedTuple):
 
     def on_edge(self, points: np.ndarray) -> np.ndarray:
         """Returns points beside cells that are not reached; others are NaN."""
-        beside = binary_dilation(~self.reached, iterations=2)
+        beside = binary_dilation(~self.reached, np.ones((3, 3)))
         known = np.isfinite(points)
         edge = beside[self.at(np.where(known, points, self.low))]
         return np.where(known & edge, points, np.nan)

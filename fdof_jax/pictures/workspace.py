@@ -95,7 +95,10 @@ def workspace(
         origin="lower", extent=(x0, x1, y0, y1),
         cmap=ListedColormap([_REACHED]), interpolation="none", zorder=0,
     )  # fmt: skip
-    ax.plot([], [], "s", color=_REACHED, markersize=9, label="within reach")
+    label = "within reach"
+    if ranges.orientation is not None:
+        label = f"{label} at {ranges.orientation:.3g} rad"
+    ax.plot([], [], "s", color=_REACHED, markersize=9, label=label)
     labels = {"edge": "edge, joint at end", "singular": "singular"}
     paths = {name: [] for name in labels}
     for q, singular in found:
