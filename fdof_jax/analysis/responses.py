@@ -105,14 +105,15 @@ def step_and_sine(
     **Arguments:**
 
     - `linkage`, `q`: the arm and its joint positions [m or rad].
-    - `controller`: a `PDController`, or a drive that holds one; its own reference is
-      not used.
+    - `controller`: a `PDController`, `GravityFeedforward` or `ComputedTorque`, or a
+      drive that holds one; its own reference is not used.
     - `forces`: further elements, without a state of their own.
     - `step`: one per joint or one for all, positive [m or rad].
     - `duration`: time for a response to settle [s].
 
-    **Returns:** a `StepAndSine`, NaN where a motion fails. NumPy analyses the motions,
-    so the function cannot be used within JAX's transformations.
+    **Returns:** a `StepAndSine`, NaN where a motion fails, and with a bandwidth of NaN
+    where an arm follows all sines, as with `ComputedTorque` within its limits. NumPy
+    analyses the motions, so the function cannot be used within JAX's transformations.
 
     **Raises:** ValueError for malformed arguments, and if a joint does not follow its
     reference at `q`.

@@ -57,8 +57,13 @@ class NextMotion(eqx.Module):
 
 
 def _rows(values: dict[str, Any]) -> list[str]:
-    numbers = lambda value: " ".join(f"{x:.4g}" for x in np.ravel(value))
-    return [f"  {name:12} {numbers(value)}" for name, value in values.items()]
+    """Formats numbers by name, those of a matrix row by row."""
+    found = []
+    for name, value in values.items():
+        for row in np.atleast_2d(value):
+            found.append(f"  {name:12}" + "".join(f"{x:>11.4g}" for x in row.ravel()))
+            name = ""
+    return found
 
 
 class _Design(NamedTuple):

@@ -28,9 +28,10 @@ def controller_of(scene: Scene) -> PDController:
     """The PD controller of a scene; raises ValueError unless there is exactly one."""
     found = [force for force in scene.forces if isinstance(force, PDController)]
     if len(found) != 1:
+        kinds = ", ".join(type(force).__name__ for force in scene.forces)
         raise ValueError(
             "scene: expected exactly one PDController among its forces (not one within "
-            f"a drive), got {len(found)} in {scene.forces!r}."
+            f"a drive or a PIDController), got {len(found)} among ({kinds})."
         )
     return found[0]
 

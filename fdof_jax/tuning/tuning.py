@@ -149,7 +149,7 @@ def tune(
     - `loss`: `(scene, solution) -> residuals`. The sum of squares of an array is
       minimised; a scalar, never negative, is minimised itself, which gives
       Levenberg-Marquardt little to go by. By default `tip_errors`: the mean squared tip
-      error over [0, t1]. `Tracking` puts a price on effort.
+      error at 1001 equally spaced times in [0, t1]. `Tracking` puts a price on effort.
     - `ensemble`: scenes like `scene`, stacked along a leading axis (`stacked`,
       `perturbed`). The loss is then that of the ensemble with common gains, which
       start from those of `scene`.
