@@ -19,6 +19,13 @@ def drawn(*forces):
     return lines(drawing.draw_linkage(ARM, Q, forces=forces))
 
 
+def strokes(line):
+    """Points of each stroke (point, 2); NaN lifts the pen."""
+    xy = line.get_xydata()
+    gaps = np.flatnonzero(np.isnan(xy[:, 0]))
+    return [part[np.isfinite(part[:, 0])] for part in np.split(xy, gaps)]
+
+
 def place(point):
     return np.asarray(point.position(ARM, Q))
 
@@ -49,8 +56,24 @@ def test_a_slack_cable_hangs_and_a_bumper_ends_at_its_rest_length():
     bumper = fj.SpringDamper(
         HOOK, TIP, stiffness=1, rest_length=0.5, one_sided="bumper"
     )
-    plate = drawn(bumper)["bumper 0"].get_xydata()[-2:].mean(axis=0)
+    _, plate, *_ = strokes(drawn(bumper)["bumper 0"])
+    plate = plate.mean(axis=0)
     np.testing.assert_allclose(np.linalg.norm(plate - ends[0]), 0.5, atol=1e-12)
+
+
+def test_brackets_and_ground_hold_points_beside_links():
+    arm = fj.scenes.fig5().linkage  # links of 1 m along x
+    off, on = fj.Point(1, 0.5, 0.3), fj.Point(2, 0.5)
+    nail = fj.Point(0, 0.5, -1.0)
+    ax = drawing.draw_linkage(
+        arm, np.zeros(3),
+        forces=(fj.forces.Tension(off, on, 1.0), fj.forces.Tension(nail, on, 1.0)),
+    )  # fmt: skip
+    held, nailed = (strokes(lines(ax)[f"tension {k}"]) for k in (0, 1))
+    np.testing.assert_allclose(held[0], [[0.5, 0.3], [1.5, 0]], atol=1e-12)
+    np.testing.assert_allclose(held[1], [[0.5, 0], [0.5, 0.3]], atol=1e-12)
+    assert len(held) == 2 and len(nailed) == 5
+    np.testing.assert_allclose(nailed[1].mean(axis=0), [0.5, -1], atol=1e-12)
 
 
 def test_a_cylinder_keeps_its_length_in_motion():

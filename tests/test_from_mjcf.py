@@ -148,3 +148,16 @@ def test_gravity_that_a_flag_disables_is_zero():
         "<mujoco>", '<mujoco><option><flag gravity="disable"/></option>'
     )
     assert fj.from_mjcf(text)[0].gravity == 0
+
+
+def test_dampers_that_a_flag_disables_are_left_out():
+    kinds = mujoco.mjtDisableBit.__members__
+    flag = "damper" if "mjDSBL_DAMPER" in kinds else "passive"
+    text = CART_POLE.replace(
+        "<mujoco>", f'<mujoco><option><flag {flag}="{{}}"/></option>'
+    )
+    kinds = [
+        [type(force).__name__ for force in fj.from_mjcf(text.format(state))[1]]
+        for state in ("enable", "disable")
+    ]
+    assert "JointDamper" in kinds[0] and "JointDamper" not in kinds[1]

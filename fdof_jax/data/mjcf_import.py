@@ -60,11 +60,14 @@ def from_mjcf(text: str) -> tuple[Linkage, Forces]:
         reason = " ".join(str(error).split())
         raise ValueError(f"text: expected a MuJoCo model in XML: {reason}") from None
     _refuse_others(model)
-    disabled = model.opt.disableflags
-    if disabled & mujoco.mjtDisableBit.mjDSBL_GRAVITY:
+    kinds = mujoco.mjtDisableBit.__members__
+    disabled = {kind for kind in kinds if model.opt.disableflags & kinds[kind]}
+    if "mjDSBL_GRAVITY" in disabled:
         model.opt.gravity[:] = 0
+    if disabled & {"mjDSBL_DAMPER", "mjDSBL_PASSIVE"}:  # in newer and older versions
+        model.dof_damping[:] = 0
     colliding = _colliding(model)
-    if colliding and not disabled & mujoco.mjtDisableBit.mjDSBL_CONTACT:
+    if colliding and "mjDSBL_CONTACT" not in disabled:
         warnings.warn(
             f"text: contacts are left out, but bodies {colliding} of this model may "
             "collide.",

@@ -65,7 +65,8 @@ def draw_linkage(
     Of the force elements, those with a place are drawn: springs, dampers, cables (which
     hang if slack), bumpers, cylinders, wrenches as arrows, stops as bars at the ends
     of a joint's range, and of a controller the path on which it leads the tip, dashed.
-    The longest arrow is that of the greatest force.
+    The longest arrow is that of the greatest force. Thin lines join points beside their
+    link to it, and hatched ground holds points of the ground.
 
     **Arguments:** `q`: joint positions [m or rad]; `forces`: elements, drawn as they
     are at time 0; `color`: common colour of all links, by default one per link;

@@ -66,10 +66,14 @@ def element_lines(
             most = [max(np.abs(p[i]).max() for p in pushes.values()) for i in (0, 1)]
             kind = "wrench"
             strokes = _arrows(_place(element.point, f), *pushes[k], most, size)
+            strokes = strokes and [*strokes, *_support(element.point, arm, f, size)]
         elif isinstance(element, JointStops):
             kind, strokes = "stops", _stops(element, linkage, kinds, f, size)
         elif (path := _commanded(element)) is not None:
             kind, strokes = "commanded", [np.tile(path, (len(ts), 1))]
+        if isinstance(element, SpringDamper | Tension | LinearActuator):
+            for point in (element.ends.a, element.ends.b):
+                strokes += _support(point, arm, f, size)
         if strokes:
             lift = np.full((len(ts), 1), np.nan + 0j)
             parts = [part for stroke in strokes for part in (stroke, lift)]
@@ -95,6 +99,19 @@ def _place(point: Point, f: Frames) -> np.ndarray:
     link = int(point.link)
     offset = float(point.along) + 1j * float(point.across)
     return (f.start[:, link] + offset * f.direction[:, link])[:, None]
+
+
+def _support(point: Point, arm: Linkage, f: Frames, size: float) -> list[np.ndarray]:
+    """What holds a point: hatched ground, or a bracket from its link's line."""
+    place, link = _place(point, f), int(point.link)
+    if link == 0:
+        hatches = [np.array([x, x - 0.7 - 0.9j]) for x in (-0.6, 0.4, 1.4)]
+        strokes = [np.array([-1.4, 1.4]), *hatches]
+        return [place + _WIDTH * size * stroke for stroke in strokes]
+    nearest = np.clip(float(point.along), *sorted((0.0, float(arm.length[link]))))
+    foot = _place(Point(link, nearest), f)
+    away = np.abs(foot - place).max() > _WIDTH * size
+    return [np.hstack([foot, place])] if away else []
 
 
 def _ends(element: Any, f: Frames) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
