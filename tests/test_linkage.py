@@ -217,10 +217,3 @@ def test_a_copy_with_other_values():
 def test_a_copy_is_checked_as_a_new_one(values, words):
     with pytest.raises(ValueError, match=words):
         fj.scenes.fig7().linkage.replace(**values)
-
-
-def test_an_assignment_names_the_way():
-    with pytest.raises(
-        AttributeError, match=r"^mass: .* linkage\.replace\(mass=\.\.\.\)"
-    ):
-        fj.scenes.fig5().linkage.mass = 1

@@ -5,7 +5,6 @@ by `jax.jit`, `jax.vmap` or `jax.grad` is not known yet.
 """
 
 import inspect
-import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -15,6 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.core import Tracer
+
+from .user_warnings import warn
 
 # In a shape: any number of joints, which is compared with the arm's where both meet.
 JOINT = "joint"
@@ -103,6 +104,8 @@ def real_array(
         if bad.any():
             shown = np.array2string(np.asarray(array), threshold=20)
             raise refuse(shown.removesuffix("."))  # 1.0 is shown as "1."
+        if unit == "rad":
+            radians(name, kept)
         ready = isinstance(value, Array) and value.dtype == kept.dtype
         if ready and fits and not value.weak_type:
             return value
@@ -111,6 +114,17 @@ def real_array(
     if not fits and JOINT not in shape:
         array = (jnp if traced else np).broadcast_to(array, shape)  # type: ignore[arg-type]
     return jnp.asarray(array, dtype=float)
+
+
+def radians(name: str, angles: np.ndarray) -> None:
+    """Warns of angles that were probably meant in degrees: 30, 45, 60, ... 360."""
+    size = np.abs(angles)
+    found = angles[(size >= 30) & (size <= 360) & (size % 15 == 0)]
+    if found.size:
+        warn(
+            f"{name}: expected angles in radians, got {found[0]:g}, which looks like "
+            "degrees; numpy.deg2rad converts them."
+        )
 
 
 def increasing(name: str, times: Array) -> None:
@@ -185,7 +199,7 @@ def in_order(expected: str, swapped: bool, first: Any, second: Any) -> tuple[Any
     if not swapped:
         return first, second
     message = f"fdof_jax: expected ({expected}), got the order of version 0.1"
-    warnings.warn(message, DeprecationWarning, stacklevel=3)
+    warn(message, DeprecationWarning)
     return second, first
 
 

@@ -9,7 +9,6 @@ import os
 import platform
 import sys
 import tempfile
-import warnings
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,8 @@ import jax
 from jax._src import xla_bridge
 from jax.experimental.compilation_cache import compilation_cache
 from jaxlib import version
+
+from .user_warnings import warn
 
 # XLA on CPU compiles a loop as one kernel if its state has fewer bytes than this sets;
 # otherwise it starts a kernel for each operation. XLA reads the option when JAX starts.
@@ -104,10 +105,9 @@ def _compile_small_loops_as_kernels() -> None:
     else:
         os.environ["XLA_FLAGS"] = f"{flags} {_FLAG}".strip()
         return
-    warnings.warn(
+    warn(
         "configure: XLA could not be set to compile small loops as one kernel, so "
         f"single arms are simulated more slowly: {reason}.",
-        stacklevel=3,  # the line that calls configure
     )
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..base.checks import refusal
 from ..base.names import optional_package
+from ..base.user_warnings import warn
 from ..forces.actuators import Armature
 from ..forces.element import Forces
 from ..forces.joints import JointDamper
@@ -68,10 +69,9 @@ def from_mjcf(text: str) -> tuple[Linkage, Forces]:
         model.dof_damping[:] = 0
     colliding = _colliding(model)
     if colliding and "mjDSBL_CONTACT" not in disabled:
-        warnings.warn(
+        warn(
             f"text: contacts are left out, but bodies {colliding} of this model may "
             "collide.",
-            stacklevel=2,
         )
     data = mujoco.MjData(model)
     data.qpos[:] = 0

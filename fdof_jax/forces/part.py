@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike
 
 from ..base.array_namespace import in_numpy, namespace
 from ..base.checks import JOINT, concrete, function, instance, is_traced, real_array
+from ..base.frozen import Frozen
 from ..linkage.linkage import Linkage, joints_of, short
 
 
@@ -111,7 +112,7 @@ class _Fields(type(eqx.Module)):
     """Tells type checkers and editors the arguments of constructors."""
 
 
-class Part(eqx.Module, metaclass=_Fields):
+class Part(Frozen, metaclass=_Fields):
     """A pytree with declared arrays, conditions on them, and times of jumps."""
 
     def conditions(self) -> Iterable[Condition]:

@@ -17,7 +17,7 @@ from jax import Array
 from jaxtyping import Complex, Float
 from numpy.typing import ArrayLike
 
-from ..base.checks import whole_number
+from ..base.checks import is_traced, whole_number
 from ..linkage.frames import Frames, cross, frames, scalar_frames
 from ..linkage.linkage import Linkage, joints_of, per_joint, without_fixed
 from ..linkage.topology import MOST_PAIRS
@@ -35,6 +35,8 @@ def pick(link: Array, choices: list[Array]) -> Array:
 
 
 def _link(link: Any) -> Array:
+    if isinstance(link, Array) and not is_traced(link) and link.shape == ():
+        link = link.item()  # of another point, by `dataclasses.replace`
     if whole_number("link", link, 0) > MOST_PAIRS:
         raise ValueError(
             f"link: expected 0 (the ground) or a moving link, 1 to {MOST_PAIRS}, got "

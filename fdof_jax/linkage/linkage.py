@@ -9,7 +9,6 @@ value. In a fixed pair both are fictitious.
 import functools
 import inspect
 from collections.abc import Callable
-from dataclasses import FrozenInstanceError
 from typing import Any, TypeVar
 
 import equinox as eqx
@@ -21,11 +20,12 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from ..base.checks import is_traced, known, real_array
+from ..base.frozen import Frozen
 from .singularity import check_singularity
 from .topology import can_move, fixed_pairs, letters, pairs_of
 
 
-class Linkage(eqx.Module):
+class Linkage(Frozen):
     """A planar chain of moving links, as in Fig 1 of the paper.
 
     The paper's chain has three pairs of joints; a linkage has n, from 1 to 8. Link k
@@ -69,6 +69,8 @@ class Linkage(eqx.Module):
     base_angle: Float[Array, ""]
     gravity: Float[Array, ""]
 
+    _other = "linkage.replace({0}=...)"
+
     def __init__(
         self,
         topology: str | ArrayLike,
@@ -92,7 +94,7 @@ class Linkage(eqx.Module):
         self.mass = real_array("mass", mass, (n,), minimum=0, of=links)
         self.inertia = real_array("inertia", inertia, (n,), minimum=0, of=links)
         self.locked = real_array("locked", locked, (n,), broadcast=True, of=pairs)
-        self.base_angle = real_array("base_angle", base_angle, ())
+        self.base_angle = real_array("base_angle", base_angle, (), unit="rad")
         self.gravity = real_array("gravity", gravity, ())
         if not is_traced(list(vars(self).values())):
             check_singularity(self)
@@ -118,15 +120,6 @@ class Linkage(eqx.Module):
         return Linkage(**now | values)
 
     __replace__ = replace  # what `copy.replace` calls
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        try:
-            super().__setattr__(name, value)
-        except FrozenInstanceError:
-            raise FrozenInstanceError(
-                f"{name}: a linkage does not change; linkage.replace({name}=...) "
-                "returns another."
-            ) from None
 
     def __repr__(self) -> str:
         """Shows the values of a single linkage, or the shapes of a batch."""

@@ -1,11 +1,11 @@
 """Detects mass matrices that are singular, always or in some configurations."""
 
-import warnings
 from typing import TYPE_CHECKING
 
 import jax
 import numpy as np
 
+from ..base.user_warnings import warn
 from .frames import frames
 from .topology import fixed_pairs, letters, real_joints
 
@@ -82,24 +82,21 @@ def _warn(linkage: "Linkage", revolute: np.ndarray) -> None:
             links = f"links {k + 1} to {following}"
             if following == k + 1:
                 links = f"link {k + 1}"
-            warnings.warn(
+            warn(
                 f"joint {k + 1} moves no inertia of {links}: the mass matrix may be "
-                "singular in some configurations.",
-                stacklevel=6,
+                "singular in some configurations."
             )
         if following == n or revolute[k] != revolute[following]:
             continue
         pair = f"joints {k + 1} and {following + 1}"
         if revolute[k]:
             if abs(start[following + 1] - start[k + 1]) <= rounding:
-                warnings.warn(
+                warn(
                     f"revolute {pair} coincide (no distance between them, the paper's "
-                    "rule (i)): one of them is redundant for positioning.",
-                    stacklevel=6,
+                    "rule (i)): one of them is redundant for positioning."
                 )
         elif abs(np.sin(locked[body].sum())) < eps:
-            warnings.warn(
+            warn(
                 f"prismatic {pair} are parallel (the paper's rule (ii)): one of them "
-                "is redundant for positioning.",
-                stacklevel=6,
+                "is redundant for positioning."
             )

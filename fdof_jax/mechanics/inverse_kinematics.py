@@ -274,7 +274,8 @@ def inverse_kinematics(
     check_linkage(linkage)
     oriented = orientation is not None
     tip = real_array("tip", tip, (2,))
-    direction = real_array("orientation", orientation if oriented else 0.0, ())
+    direction = orientation if oriented else 0.0
+    direction = real_array("orientation", direction, (), unit="rad")
     side = sign("branch", branch)
     # NumPy computes concrete values, as JAX would compile each single operation.
     known, point, angle, side = in_numpy((linkage, tip, direction, side))

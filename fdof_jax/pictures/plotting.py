@@ -5,7 +5,6 @@ accuracy. Arguments and results are as in `drawing`, which holds the pictures of
 linkage itself.
 """
 
-import warnings
 from collections.abc import Mapping
 from typing import Any
 
@@ -19,6 +18,7 @@ from numpy.typing import ArrayLike
 from scipy.integrate import cumulative_simpson
 
 from ..base.checks import real_array, refusal
+from ..base.user_warnings import warn
 from ..control.drives import PIDController
 from ..control.pd import PDController
 from ..dynamics import energy, link_energies
@@ -171,10 +171,9 @@ def energy_stack(
     line = kinetic[0] + potential[0] + put_in
     gap = np.abs(line - sum(bands.values())).max()
     if gap > 0.01 * line.max():
-        warnings.warn(
+        warn(
             f"energy_stack: the balance is off by {gap:.3g} J of {line.max():.3g} J: "
             "expected the forces of the solution, and samples closer in time.",
-            stacklevel=2,
         )
     ax = axes_or_new(ax, 2.6)
     colors = [*SERIES[3:5], _LIGHT_GREY]

@@ -46,7 +46,7 @@ def _ranges(linkage: Linkage, lower: Any, upper: Any, orientation: Any) -> Range
     low, high = np.where(around, -np.pi, low), np.where(around, np.pi, high)
     low, high = np.where(moves, low, 0), np.where(moves, high, 0)
     if orientation is not None:
-        orientation = float(real_array("orientation", orientation, ()))
+        orientation = float(real_array("orientation", orientation, (), unit="rad"))
         if "R" not in kinds:
             raise ValueError(
                 f"orientation: expected None for slides only, got {orientation:g}."

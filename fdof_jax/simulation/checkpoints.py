@@ -4,7 +4,6 @@ import hashlib
 import json
 import math
 import os
-import warnings
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,7 @@ import numpy as np
 
 from .. import __version__
 from ..base.checks import refusal
+from ..base.user_warnings import warn
 from ..base.whole_files import whole_file
 
 VERSIONS = {"fdof_jax": __version__} | {
@@ -84,11 +84,10 @@ class Checkpoint:
         line, _, data = path.read_bytes().partition(b"\n")
         if line == _line(holds, rows, data):
             return rows.split(len(members), data)
-        warnings.warn(
+        warn(
             f"sweep: expected in {path} an undamaged chunk of this sweep, got another "
             f"file; its {len(members)} members are solved again.",
             RuntimeWarning,
-            stacklevel=2,
         )
         return None
 

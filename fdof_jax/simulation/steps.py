@@ -1,7 +1,6 @@
 """Tolerances of diffrax's step size controllers: defaults, limits and scales."""
 
 import dataclasses
-import warnings
 from typing import Any
 
 import diffrax
@@ -11,6 +10,7 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from ..base.checks import concrete, instance, is_traced, real_array
+from ..base.user_warnings import warn
 from ..linkage.coordinates import State
 from ..linkage.linkage import Linkage, check_linkage, joints_of
 from ..linkage.topology import real_joints
@@ -72,10 +72,9 @@ def within_reach(
         known = concrete(tolerance)
         if known is None or known >= _TIGHTEST_SINGLE / 2:
             return tolerance
-        warnings.warn(
+        warn(
             f"stepsize_controller: {name}={known:g} cannot be met in float32, "
             f"{_TIGHTEST_SINGLE:g} is used; fj.configure(x64=True) allows more.",
-            stacklevel=7,
         )
         return _TIGHTEST_SINGLE
 

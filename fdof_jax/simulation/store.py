@@ -3,7 +3,6 @@
 import hashlib
 import json
 import math
-import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ from jax.experimental import multihost_utils
 
 from ..base.array_namespace import in_numpy
 from ..base.checks import refusal
+from ..base.user_warnings import warn
 from ..base.whole_files import whole_file
 from .batch_axes import Batch
 from .checkpoints import VERSIONS
@@ -35,7 +35,7 @@ def _sha256(data: bytes) -> str:
 
 def _warn(expected: str, done: str) -> None:
     message = f"sweep: expected {expected}, got something else; {done}."
-    warnings.warn(message, RuntimeWarning, stacklevel=2)
+    warn(message, RuntimeWarning)
 
 
 def _text(value: Any) -> bytes:

@@ -1,0 +1,22 @@
+"""Warnings that name the caller's line, however deep in the library they arise."""
+
+import sys
+import warnings
+from pathlib import Path
+
+import equinox as eqx
+import jax
+
+_INNER = (
+    *(str(Path(name).parent) for name in (jax.__file__, eqx.__file__)),
+    str(Path(__file__).parents[1]),
+    "<@",  # functions that beartype makes
+)
+
+
+def warn(message: str, category: type[Warning] = UserWarning) -> None:
+    """Warns at the line outside of this library, equinox and JAX."""
+    frame, level = sys._getframe(1), 2
+    while frame.f_back is not None and frame.f_code.co_filename.startswith(_INNER):
+        frame, level = frame.f_back, level + 1
+    warnings.warn(message, category, stacklevel=level)
