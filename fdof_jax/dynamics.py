@@ -10,8 +10,8 @@ from .forces.element import Forces
 from .linkage.linkage import Linkage, compiled
 from .mechanics.equations import Constants, equations, link_constants, zeros
 from .mechanics.kinematics import mass_center_velocities, mass_centers
-from .mechanics.rates import inertia_diagonals, rates
-from .mechanics.solve import with_added
+from .mechanics.rates import losses, rates
+from .mechanics.solve import divided, with_added
 
 
 @compiled("q", "qd", "tau", forces=inertial_on)
@@ -37,8 +37,7 @@ def forward_dynamics(
     >>> fj.forward_dynamics(arm, [0, 0, 0], [0, 0, 0], tau=[0, 0, 0]).tolist()  # let go
     [-9.81, 9.81, 0.0]
     """
-    more = added_inertia(linkage, forces, q, qd)
-    matrix, bias = (None, 0) if more is None else more
+    matrix, bias = added_inertia(linkage, forces, q, qd)
     constants = link_constants(linkage, q)
     _, qdd = rates(constants, zeros(q), tuple(qd), tuple(tau - bias), matrix)
     return jnp.stack(qdd)
@@ -63,11 +62,8 @@ def inertia_ratios(
     >>> float(fj.analysis.inertia_ratios(arm, [0, 0, 0]).min())  # a digit is lost
     0.04
     """
-    more = added_inertia(linkage, forces, q, jnp.zeros_like(q))
-    matrix = None if more is None else more[0]
-    pairs = zip(*inertia_diagonals(link_constants(linkage, q), zeros(q), matrix))
-    # Divided twice, as a product of zero and infinity would be NaN.
-    return jnp.stack([jnp.where(own > 0, 1 / i / own, 0) for own, i in pairs])
+    matrix, _ = added_inertia(linkage, forces, q, jnp.zeros_like(q))
+    return 1 / jnp.stack(losses(divided, link_constants(linkage, q), zeros(q), matrix))
 
 
 @compiled("q", "qd", "qdd", forces=inertial_on)
@@ -157,8 +153,8 @@ def mass_and_bias(
     q0, constants = start or (q, link_constants(linkage, q))
     m = equations(constants, tuple(q - q0), tuple(qd))
     bias = jnp.stack(m.bias)
-    if (more := added_inertia(linkage, forces, q, qd)) is not None:
-        m, bias = with_added(more[0], m), bias + more[1]
+    added, more = added_inertia(linkage, forces, q, qd)
+    m, bias = with_added(added, m), bias + more
     joints = range(len(m.bias))
     matrix = [[m.mass[min(i, j)][abs(i - j)] for j in joints] for i in joints]
     moves = ~jnp.stack(constants.fixed)
@@ -168,9 +164,7 @@ def mass_and_bias(
 
 @compiled("q", "qd")
 def link_energies(
-    linkage: Linkage,
-    q: Float[Array, " joint"],
-    qd: Float[Array, " joint"],
+    linkage: Linkage, q: Float[Array, " joint"], qd: Float[Array, " joint"]
 ) -> tuple[Float[Array, " link"], Float[Array, " link"]]:
     """Computes the kinetic and potential energy of each moving link, (6) and (7).
 

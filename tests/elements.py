@@ -50,9 +50,7 @@ PD = fj.PDController([9.0, 7.0, 5.0], [3.0, 2.0, 1.0], [4.0, 2.0, 9.0], MOVE)
 
 # For laws of any solver: compiles faster than the default; differences are exact.
 SHORT = dict(
-    solver=diffrax.Midpoint(),
-    stepsize_controller=diffrax.ConstantStepSize(),
-    dt0=0.01,
+    solver=diffrax.Midpoint(), stepsize_controller=diffrax.ConstantStepSize(), dt0=0.01
 )
 
 # Efforts in the joints, between points and from outside

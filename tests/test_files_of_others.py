@@ -15,16 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from saved_trees import (
-    OWN,
-    SCENES,
-    Colour,
-    Plain,
-    Push,
-    describe,
-    refused,
-    same,
-)
+from saved_trees import OWN, SCENES, Colour, Plain, Push, describe, refused, same
 
 import fdof_jax as fj
 

@@ -32,10 +32,7 @@ UNSAVED = {
     "class that only the library uses": (LoopedDopri8(), "LoopedDopri8"),
     "lambda": (lambda t, linkage: (t, t), "equinox.Module.*<lambda>"),
     "function of one's own": (describe, "equinox.Module.*describe"),
-    "lambda of the library": (
-        PROFILES["quintic"],
-        "equinox.Module.*<lambda>",
-    ),
+    "lambda of the library": (PROFILES["quintic"], "equinox.Module.*<lambda>"),
     "function of another library": (jnp.linalg.norm, "norm"),
     "method": (Push(1.0, "").__call__, "bound method"),
     "class": (Push, "class .*Push"),

@@ -187,12 +187,12 @@ def test_directions_of_any_scale_are_told_from_those_that_vanish():
     size = 10.0 ** np.array([-6, 0, 5, 2])
     rows = rng.normal(size=(50, 4)) * size
     normal = rows.T @ rows
-    inverse, untold = fit_result.told_and_untold(normal, 1e-16)
+    inverse, untold = fit_result.inverse_and_null_space(normal, 1e-16)
     assert untold.shape == (4, 0)
     np.testing.assert_allclose(inverse, np.linalg.inv(normal), rtol=1e-6)
     rows[:, 3] = 2 * rows[:, 0]
     rows[:, 2] = 0
-    inverse, untold = fit_result.told_and_untold(rows.T @ rows, 1e-16)
+    inverse, untold = fit_result.inverse_and_null_space(rows.T @ rows, 1e-16)
     sparse = fit_result._sparse(untold)
     assert (np.abs(sparse) > 1e-9).sum(axis=1).tolist() in ([1, 2], [2, 1])
     np.testing.assert_allclose(rows @ sparse.T, 0, atol=1e-12)

@@ -20,11 +20,7 @@ from fdof_jax import scenes
 each_topology = pytest.mark.parametrize("topology", fj.TOPOLOGIES)
 STILL = np.zeros(3)
 ROD = fj.Linkage(
-    "RRR",
-    length=[0, 1, 1, 1],
-    com=[[0.5, 0]] * 3,
-    mass=[1] * 3,
-    inertia=[1 / 12] * 3,
+    "RRR", length=[0, 1, 1, 1], com=[[0.5, 0]] * 3, mass=[1] * 3, inertia=[1 / 12] * 3
 )
 
 

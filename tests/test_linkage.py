@@ -150,9 +150,9 @@ def test_from_chain_refuses_velocities_of_locked_joints(topology, moving):
 def test_from_chain_can_be_traced():
     linkage = make("RPR")
     x, xd = fj.to_chain(linkage, [0.1, 0.2, 0.3], [0.4, 0.5, 0.6])
-    states = jax.vmap(
-        lambda ef, xd: fj.from_chain(ef, x, xd, linkage.base_angle),
-    )(jnp.stack([linkage.ef] * 2), jnp.stack([xd, 2 * xd]))[1]
+    states = jax.vmap(lambda ef, xd: fj.from_chain(ef, x, xd, linkage.base_angle))(
+        jnp.stack([linkage.ef] * 2), jnp.stack([xd, 2 * xd])
+    )[1]
     np.testing.assert_allclose(states.q, [[0.1, 0.2, 0.3]] * 2)
     np.testing.assert_allclose(states.qd, [[0.4, 0.5, 0.6], [0.8, 1.0, 1.2]])
 

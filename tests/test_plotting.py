@@ -235,8 +235,7 @@ def test_tracking_and_its_error():
     error = plotting.tracking_error(linkage, task, solutions)
     assert (error.get_xlabel(), error.get_ylabel()) == ("time [s]", "tip error [m]")
     np.testing.assert_allclose(
-        values(error)[0],
-        np.linalg.norm(curves["paper"] - curves["commanded"], axis=1),
+        values(error)[0], np.linalg.norm(curves["paper"] - curves["commanded"], axis=1)
     )
     assert len({line.get_color() for line in error.lines}) == 2
 

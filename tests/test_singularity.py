@@ -74,11 +74,7 @@ def test_a_single_point_mass_cannot_load_three_joints(topology):
 @pytest.mark.parametrize(
     "topology, changes, message",
     [
-        (
-            "RRR",
-            dict(mass=[0, 1, 1], inertia=[0, 1, 1]),
-            "link 1: .* may be singular",
-        ),
+        ("RRR", dict(mass=[0, 1, 1], inertia=[0, 1, 1]), "link 1: .* may be singular"),
         (
             "RRR",
             dict(com=[[1, 0], [0, 0], [1, 0]], inertia=[1, 0, 1]),

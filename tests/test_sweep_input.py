@@ -33,7 +33,7 @@ def test_a_batch_is_expected():
     # Forces without a leading axis are shared.
     refused(INPUTS, linkage=ONE, state0=STATE, forces_axes=None)
     dampers = (jax.vmap(fj.JointDamper)(np.ones(4)),)
-    with pytest.raises(ValueError, match=r"none on any \(forces_axes=0 says"):
+    with pytest.raises(ValueError, match=r"none on any \(pass forces_axes=0 if"):
         fj.sweep(ONE, STATE, TS, dampers)
     empty = jax.tree.map(lambda a: a[:0], (TWO, STATES))
     refused(INPUTS, linkage=empty[0], state0=empty[1], forces=())

@@ -11,7 +11,7 @@ from test_drawing import labels, lines, make_linkage, named, tidy
 
 import fdof_jax as fj
 from fdof_jax import drawing
-from fdof_jax.pictures.reach import curves, reached_cells
+from fdof_jax.analysis.reach import curves, reached_cells
 from fdof_jax.pictures.workspace import _ranges
 
 __all__ = ["tidy"]  # the fixture holds here too

@@ -12,9 +12,6 @@ from .regression import (
     inertial_parameters as inertial_parameters,
     regressor as regressor,
 )
-from .responses import (
-    StepAndSine as StepAndSine,
-    step_and_sine as step_and_sine,
-)
+from .responses import StepAndSine as StepAndSine, step_and_sine as step_and_sine
 
 __all__: list[str]

@@ -41,12 +41,7 @@ def equilibrium(
     swapped = isinstance(q, tuple) and all(map(callable, q))
     q, forces = in_order("linkage, q, forces", swapped, q, forces)
     forces = checked(linkage, forces)
-    return _rest(
-        linkage,
-        forces,
-        per_joint("q", q, linkage),
-        real_array("t", t, ()),
-    )
+    return _rest(linkage, forces, per_joint("q", q, linkage), real_array("t", t, ()))
 
 
 @eqx.filter_jit

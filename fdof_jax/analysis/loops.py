@@ -14,11 +14,17 @@ from scipy.linalg import block_diag, eigvals
 from scipy.optimize import minimize_scalar
 
 from ..base.checks import is_traced, one_of, real_array, refusal
+from ..base.html_table import html_table
 from ..dynamics import joint_bias, joint_mass_matrix
 from ..forces.element import Element, Forces, elements_on, of_full_size
-from ..linkage.linkage import Linkage, check_linkage, joint_names, per_joint
+from ..linkage.linkage import (
+    Linkage,
+    check_linkage,
+    joint_names,
+    moving_joints,
+    per_joint,
+)
 from ..linkage.topology import fixed_pairs
-from ..simulation.html_table import html_table
 from ..simulation.prescribed import prescribed
 from .linearization import checked, total_effort
 
@@ -244,8 +250,7 @@ def open_loop(
       bandwidth       8.103 rad/s
     """
     check_linkage(linkage)
-    names = joint_names(linkage)
-    moving = [k for k, name in enumerate(names) if name[0] != "F"]
+    names, moving = joint_names(linkage), moving_joints(linkage)
     index = one_of("joint", joint, [k + 1 for k in moving]) - 1
     forces = checked(linkage, forces)
     if not callable(controller) or isinstance(controller, type):

@@ -10,14 +10,16 @@ from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline
 
 from ..base.checks import is_traced, real_array, refusal
-from ..forces.element import (
-    Forces,
-    elements_on,
-    of_full_size,
-)
+from ..base.html_table import html_table
+from ..forces.element import Forces, elements_on, of_full_size
 from ..linkage.coordinates import State
-from ..linkage.linkage import Linkage, check_linkage, joint_names, per_joint
-from ..simulation.html_table import html_table
+from ..linkage.linkage import (
+    Linkage,
+    check_linkage,
+    joint_names,
+    moving_joints,
+    per_joint,
+)
 from .loops import BANDWIDTH, open_loop
 from .probes import Probe, answer, at_rest, commanding, following
 
@@ -143,8 +145,7 @@ def step_and_sine(
     (element,) = of_full_size(linkage, elements_on(linkage, (controller,)))
     zero = jnp.zeros(n)
     resting = following(element, Probe(q, zero, 0.0, zero, 1.0))
-    names = joint_names(linkage)
-    moving = [k for k, name in enumerate(names) if name[0] != "F"]
+    names, moving = joint_names(linkage), moving_joints(linkage)
 
     def loops_at(q):
         return [open_loop(linkage, q, resting, k + 1, forces) for k in moving]

@@ -13,6 +13,15 @@ from ..references.circle import CircleTask
 from ..simulation.solution import Solution
 
 
+def demands(
+    controller: PDController, linkage: Linkage, solution: Solution
+) -> Float[Array, "time joint"]:
+    """Computes a controller's demands along a motion, 0 at fixed pairs [N or N m]."""
+    along = jax.vmap(controller.demand, in_axes=(0, 0, 0, None))
+    found = along(solution.ts, solution.q, solution.qd, linkage)
+    return without_fixed(linkage, found)
+
+
 @eqx.filter_jit
 def relative_demands(
     controller: PDController, linkage: Linkage, solution: Solution
@@ -21,13 +30,10 @@ def relative_demands(
 
     Where a limit is 0, a demand other than 0 gives an infinity of its sign.
     """
-    demands = jax.vmap(controller.demand, in_axes=(0, 0, 0, None))(
-        solution.ts, solution.q, solution.qd, linkage
-    )
-    demands = without_fixed(linkage, demands)
-    limit = jnp.broadcast_to(controller.limit, demands.shape)
-    beyond = jnp.where(demands == 0, 0, jnp.sign(demands) * jnp.inf)
-    return jnp.where(limit > 0, demands / jnp.where(limit > 0, limit, 1), beyond)
+    demanded = demands(controller, linkage, solution)
+    limit = jnp.broadcast_to(controller.limit, demanded.shape)
+    beyond = jnp.where(demanded == 0, 0, jnp.sign(demanded) * jnp.inf)
+    return jnp.where(limit > 0, demanded / jnp.where(limit > 0, limit, 1), beyond)
 
 
 @eqx.filter_jit

@@ -107,7 +107,7 @@ def _compile_small_loops_as_kernels() -> None:
         return
     warn(
         "configure: XLA could not be set to compile small loops as one kernel, so "
-        f"single arms are simulated more slowly: {reason}.",
+        f"single arms are simulated more slowly: {reason}."
     )
 
 

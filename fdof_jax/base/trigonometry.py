@@ -106,9 +106,7 @@ def _polynomial_sincos(x: Array) -> tuple[Array, Array]:
 @jax.custom_jvp
 def _sincos(x: Array) -> tuple[Array, Array]:
     return jax.lax.platform_dependent(
-        x,
-        cpu=_polynomial_sincos,
-        default=lambda x: (jnp.sin(x), jnp.cos(x)),
+        x, cpu=_polynomial_sincos, default=lambda x: (jnp.sin(x), jnp.cos(x))
     )
 
 

@@ -71,7 +71,7 @@ def from_mjcf(text: str) -> tuple[Linkage, Forces]:
     if colliding and "mjDSBL_CONTACT" not in disabled:
         warn(
             f"text: contacts are left out, but bodies {colliding} of this model may "
-            "collide.",
+            "collide."
         )
     data = mujoco.MjData(model)
     data.qpos[:] = 0
@@ -101,7 +101,7 @@ class _Link(NamedTuple):
 
 
 def _refuse_others(model: Any) -> None:
-    """Raises ValueError for what the library has not, or has otherwise."""
+    """Raises ValueError for what the library lacks or models differently."""
     refuse = lambda what: ValueError(f"text: expected a planar chain, got {what}.")
     try:
         nonlinear = (

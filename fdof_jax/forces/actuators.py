@@ -12,13 +12,7 @@ from ..linkage.frames import cross, dot, scalar_frames
 from ..linkage.linkage import Linkage, joints_of
 from .element import InertialElement
 from .part import Values, field, value_of
-from .points import (
-    Load,
-    Point,
-    Separation,
-    length_of,
-    over,
-)
+from .points import Load, Point, Separation, length_of, over
 
 
 class Armature(InertialElement):

@@ -57,14 +57,14 @@ def _weights(element: InertialElement, linkage: Linkage, coordinates: Array) -> 
 
 def added_inertia(
     linkage: Linkage, forces: Forces, q: Array, qd: Array
-) -> tuple[Upper, Array] | None:
-    """Computes what elements add to the mass matrix and the bias (n,), if anything.
+) -> tuple[Upper | None, Any]:
+    """Computes what elements add to the mass matrix and the bias (n,), or (None, 0).
 
     M = J^T W J and bias = J^T W (dJ/dt) qd + dV/dq, where J is the derivative of the
     coordinates. Forward mode alone keeps the code of further derivatives small.
     """
     if not inertial(forces):
-        return None
+        return None, 0
     matrices, biases = [], []
     for element in inertial(forces):
         coordinates = lambda q, e=element: e.coordinates(q, linkage)

@@ -17,15 +17,7 @@ from ..base.checks import instance
 from ..linkage.frames import scalar_frames
 from ..linkage.linkage import Linkage
 from .part import Values, field, of_kind, value_of
-from .points import (
-    Load,
-    Point,
-    PointElement,
-    Separation,
-    length_of,
-    over,
-    pick,
-)
+from .points import Load, Point, PointElement, Separation, length_of, over, pick
 from .switches import switch
 
 

@@ -22,10 +22,10 @@ _open: list["Switches"] = []  # while an element is traced within a solve
 
 
 class Switches:
-    """Deals out the sides in force to the switches of elements, in their order.
+    """Gives each switch of the elements the side in force, in the order of their calls.
 
-    `sides` (n,): 1 above and -1 below zero, 0 for the function's own sign; None: that
-    for all.
+    `sides` (n,): 1 above and -1 below zero, 0 for the function's own sign; None stands
+    for zeros.
     `values`: the switching functions as they were met; `jumping`: whether something
     jumps with one of them.
     """
@@ -44,7 +44,7 @@ class Switches:
         self.jumping |= not continuous
         if self.sides is None:
             return g
-        # No switching function that changes its sign is as large.
+        # Larger than any function that changes sign, so that the side decides the sign.
         largest = jnp.finfo(self.sides.dtype).max
         return g + (largest * self.sides)[self._next(g.size)].reshape(g.shape)
 

@@ -87,9 +87,9 @@ class FitResult(eqx.Module):
         width = max(12, *(len(name) + 2 for name in self.names))
         known = "; ".join(self.faults)
         tested = "on" if self.held_out else "but not tested on"
-        untold = f"No fault is known, {tested} held-out recordings."
+        no_fault = f"No fault is known, {tested} held-out recordings."
         rows = [
-            f"Not to be used: {known}." if known else untold,
+            f"Not to be used: {known}." if known else no_fault,
             f"{'':{width}}{'value':>14}{'std error':>12}{'relative':>12}",
         ]
         for name, value, error in zip(self.names, values, errors):
@@ -110,13 +110,15 @@ class FitResult(eqx.Module):
 
 
 def _digits(value: float, error: float) -> int:
-    """The digits of a value of which its standard error leaves the last two open."""
+    """Returns how many digits to print; the standard error leaves the last two open."""
     if not (value and 0 < error < np.inf):
         return 5
     return int(np.clip(np.ceil(np.log10(abs(value) / error)) + 2, 3, 10))
 
 
-def told_and_untold(normal: np.ndarray, eps: float) -> tuple[np.ndarray, np.ndarray]:
+def inverse_and_null_space(
+    normal: np.ndarray, eps: float
+) -> tuple[np.ndarray, np.ndarray]:
     """A generalised inverse of a semidefinite matrix, and its null space in columns.
 
     Directions are null if, with the diagonal scaled to 1, their curvature is below a
@@ -131,8 +133,8 @@ def told_and_untold(normal: np.ndarray, eps: float) -> tuple[np.ndarray, np.ndar
     told = values > limit * max(values[-1], 1e-300)
     some = vectors[:, told] * unit[:, None]
     # Unknowns without effect are directions by themselves.
-    untold = vectors[:, ~told] * np.where(silent, 1, unit)[:, None]
-    return (some / values[told]) @ some.T, untold / np.linalg.norm(untold, axis=0)
+    null = vectors[:, ~told] * np.where(silent, 1, unit)[:, None]
+    return (some / values[told]) @ some.T, null / np.linalg.norm(null, axis=0)
 
 
 def _sparse(columns: np.ndarray) -> np.ndarray:
@@ -160,12 +162,12 @@ def _together(labels: tuple[str, ...], direction: np.ndarray, least: float) -> s
     return f"{', '.join(changes[:-1])} and {changes[-1]} together"
 
 
-def _in_words(labels, untold, covariance) -> tuple[str, ...]:
+def _in_words(labels, undetermined, covariance) -> tuple[str, ...]:
     """Undetermined directions in words, and weak ones by the relative covariance."""
     words = [
         "Not determined by this motion, which does not change with: "
         f"{_together(labels, row, 1e-3)}."
-        for row in _sparse(untold)
+        for row in _sparse(undetermined)
     ]
     variances, vectors = np.linalg.eigh(covariance)
     for variance, vector in zip(variances[::-1], vectors.T[::-1]):
@@ -206,10 +208,10 @@ def fit_result(
     degrees = count - len(values)
     variance = 1.0 if noise_given else loss / degrees
     eps = float(jnp.finfo(float).eps)
-    inverse, untold = told_and_untold(normal, eps)
+    inverse, undetermined = inverse_and_null_space(normal, eps)
     # Infinite along undetermined directions. As infinities of both signs must not be
     # added up, one projection decides the sign.
-    basis, _ = np.linalg.qr(untold)
+    basis, _ = np.linalg.qr(undetermined)
     shared = basis @ basis.T
     unknown = np.copysign(np.inf, shared)
     covariance = np.where(np.abs(shared) > _SHARED, unknown, variance * inverse)
@@ -217,7 +219,7 @@ def fit_result(
     free = ~held_at_bounds(values, slope, low, high)
     step = np.zeros_like(slope)
     if free.any():
-        within, _ = told_and_untold(normal[np.ix_(free, free)], eps)
+        within, _ = inverse_and_null_space(normal[np.ix_(free, free)], eps)
         step[free] = within @ slope[free]
     small = step @ slope <= _REMAINING**2 * variance
     noise = float(np.sqrt(loss / degrees))
@@ -242,8 +244,8 @@ def fit_result(
         parts.append(f"no scene has these parameters ({error}); set bounds")
     # Print directions in parts of the values, unless these are nearly zero.
     parts_of = np.where(np.abs(values) > 1e-3 * sizes, values, sizes)
-    untold = untold * (sizes / parts_of)[:, None]
-    weak = _in_words(unknowns.labels, untold, variance * inverse)
+    undetermined = undetermined * (sizes / parts_of)[:, None]
+    weak = _in_words(unknowns.labels, undetermined, variance * inverse)
     converged = bool(small or np.abs(step).max() <= _REMAINING_PART)
     held_out = np.sqrt(unseen) / known_noise
     if not converged:

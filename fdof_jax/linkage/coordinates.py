@@ -75,10 +75,7 @@ def to_chain(
 
 
 def from_chain(
-    topology: str | ArrayLike,
-    x: ArrayLike,
-    xd: ArrayLike,
-    base_angle: ArrayLike = 0.0,
+    topology: str | ArrayLike, x: ArrayLike, xd: ArrayLike, base_angle: ArrayLike = 0.0
 ) -> tuple[Float[Array, " joint"], State]:
     """Computes locked positions and joint state from the paper's chain coordinates.
 

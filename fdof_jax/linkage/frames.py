@@ -4,7 +4,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax.numpy as jnp
 
-from ..base.array_namespace import namespace, plane_vector, sine_and_cosine
+from ..base.array_namespace import (
+    namespace,
+    plane_vector,
+    plane_vectors,
+    sine_and_cosine,
+)
 from .topology import real_joints
 
 if TYPE_CHECKING:
@@ -43,6 +48,15 @@ class Frames(NamedTuple):
     angle: Any
     slide: Any
     revolute: Any
+
+    def tip(self, linkage: "Linkage") -> Any:
+        """Returns the end of the last link's vector A [m]."""
+        return self.start[..., -1] + linkage.length[-1] * self.direction[..., -1]
+
+    def mass_centers(self, linkage: "Linkage") -> Any:
+        """Returns the mass centres of the moving links (..., n) [m]."""
+        offset = plane_vectors(linkage.com)
+        return self.start[..., 1:] + offset * self.direction[..., 1:]
 
 
 def frames(linkage: "Linkage", q: Any) -> Frames:

@@ -19,6 +19,7 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from ..base.array_namespace import namespace
 from ..base.checks import is_traced, known, real_array
 from ..base.frozen import Frozen
 from .singularity import check_singularity
@@ -146,6 +147,11 @@ def joint_names(linkage: Linkage) -> list[str]:
     return [f"{kind}{k + 1}" for k, kind in enumerate(letters(linkage.ef))]
 
 
+def moving_joints(linkage: Linkage) -> list[int]:
+    """Returns the places of the joints that are not fixed, from 0."""
+    return [k for k, kind in enumerate(letters(linkage.ef)) if kind != "F"]
+
+
 def joints_of(linkage: Linkage) -> int:
     """Returns the number of pairs of joints."""
     return jnp.size(linkage.ef) // 2
@@ -162,9 +168,10 @@ def per_joint(name: str, values: Any, linkage: Linkage) -> Array:
     return real_array(name, values, (n,), of=f"{n} joints")
 
 
-def without_fixed(linkage: Linkage, values: Array) -> Array:
+def without_fixed(linkage: Linkage, values: Any) -> Any:
     """Returns values of the joints (..., joint), 0 at fixed pairs."""
-    return jnp.where(jnp.stack(fixed_pairs(linkage.ef)), 0, values)
+    xp = namespace(linkage, values)
+    return xp.where(xp.stack(fixed_pairs(linkage.ef)), 0, values)
 
 
 _T = TypeVar("_T")

@@ -30,8 +30,8 @@ def _least_inertia(linkage: "Linkage", configurations: int) -> np.ndarray:
     n, moves = len(revolute), ~np.stack(fixed_pairs(linkage.ef))
     draws = np.random.default_rng(0).uniform(-1, 1, (configurations, 2, n))
     q = np.where(revolute, np.pi * draws[:, 0], (reach or 1) * draws[:, 1] * moves)
-    start, along, *_ = frames(linkage, q)
-    centre = start[:, 1:] + linkage.com @ np.array([1, 1j]) * along[:, 1:]
+    f = frames(linkage, q)
+    start, along, centre = f.start, f.direction, f.mass_centers(linkage)
     moved = np.tri(n) * moves  # a joint moves only the links beyond it
     arm = centre[:, :, None] - start[:, None, 1:]
     J = moved * np.where(revolute, arm, along[:, None, :-1])
@@ -68,8 +68,8 @@ def _warn(linkage: "Linkage", revolute: np.ndarray) -> None:
     """Warns of joints without inertia of their own and of redundant joints."""
     mass, locked = linkage.mass, linkage.locked
     eps, n = 8 * np.finfo(locked.dtype).eps, len(mass)
-    start, along, *_ = frames(linkage, np.zeros(n))
-    centre = start[1:] + linkage.com @ np.array([1, 1j]) * along[1:]
+    f = frames(linkage, np.zeros(n))
+    start, centre = f.start, f.mass_centers(linkage)
     lengths = linkage.length, linkage.com, locked[revolute]
     rounding = eps * sum(np.abs(length).sum() for length in lengths)
     moving = np.flatnonzero(~np.stack(fixed_pairs(linkage.ef)))

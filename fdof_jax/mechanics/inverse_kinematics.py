@@ -81,15 +81,14 @@ def arm_of(linkage: Linkage, oriented: bool = True) -> tuple[Arm, "Placed"]:
     else:
         # Where the chain is with its joints at 0: what is fixed keeps its shape.
         zero = xp.zeros_like(linkage.locked)
-        start, direction, angles, *_ = frames(linkage, zero)
+        f = frames(linkage, zero)
+        start, direction, angles = f.start, f.direction, f.angle
         fixed = xp.stack(fixed_pairs(linkage.ef))
         place = xp.argsort(fixed, stable=True)[:wanted]
         begins = xp.concatenate([xp.zeros_like(place[:1]), place + 1])
         ends = xp.concatenate([place, xp.full_like(place[:1], n)])
         turned = angles[ends] - angles[begins]  # within a rigid part
-        end = xp.concatenate(
-            [start[1:], start[-1:] + linkage.length[-1] * direction[-1:]]
-        )
+        end = xp.concatenate([start[1:], f.tip(linkage)[None]])
         vectors = (end[ends] - start[begins]) * direction[ends].conj()
         vector, tip = vectors[:-1], vectors[-1]
         revolute = revolute[place]
@@ -167,11 +166,7 @@ def unmoved_part(arm: Arm, directions: Directions) -> Array:
 
 
 def solve_joints(
-    arm: Arm,
-    directions: Directions,
-    wrist: Array,
-    bearing: Array,
-    branch: Array,
+    arm: Arm, directions: Directions, wrist: Array, bearing: Array, branch: Array
 ) -> tuple[Array, Array]:
     """Computes positions of the arm (..., 3) from the wrist x + iy, NaN out of reach.
 
@@ -236,11 +231,7 @@ def solve_joints(
 
 
 def inverse_kinematics(
-    linkage: Linkage,
-    tip: ArrayLike,
-    orientation: ArrayLike | None,
-    *,
-    branch: int = 1,
+    linkage: Linkage, tip: ArrayLike, orientation: ArrayLike | None, *, branch: int = 1
 ) -> Float[Array, " joint"]:
     """Computes joint positions for a tip position and a direction of the last link.
 

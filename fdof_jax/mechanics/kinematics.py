@@ -1,11 +1,10 @@
 """Forward kinematics: positions and velocities of points of a linkage."""
 
-import jax
 import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
-from ..base.array_namespace import namespace
+from ..base.array_namespace import namespace, plane_vector, plane_vectors
 from ..linkage.frames import frames
 from ..linkage.linkage import Linkage, compiled, without_fixed
 
@@ -46,9 +45,7 @@ def mass_centers(linkage: Linkage, q: Float[Array, " joint"]) -> Float[Array, "l
     >>> fj.mass_centers(arm, [0.0, 1.5707963, 0.0]).tolist()
     [[1.0, 0.0], [1.0, 1.0], [1.0, 2.0]]
     """
-    start, direction, *_ = frames(linkage, q)
-    offset = jax.lax.complex(linkage.com[:, 0], linkage.com[:, 1])
-    return as_points(start[1:] + offset * direction[1:])
+    return as_points(frames(linkage, q).mass_centers(linkage))
 
 
 @compiled("q", "qd")
@@ -65,9 +62,9 @@ def mass_center_velocities(
     turning = jnp.cumsum(jnp.where(revolute, qd, 0))
     rate = jnp.concatenate([jnp.zeros(1), turning])
     # d/dt (A + iB) e: the link turns, and the slide moves across it.
-    arm = jax.lax.complex(linkage.length[:-1], slide)
+    arm = plane_vector(linkage.length[:-1], slide)
     start = jnp.cumsum(1j * (rate[:-1] * arm + jnp.where(revolute, 0, qd)) * e[:-1])
-    offset = jax.lax.complex(linkage.com[:, 0], linkage.com[:, 1])
+    offset = plane_vectors(linkage.com)
     return as_points(start + 1j * (turning * offset * e[1:])), turning
 
 
@@ -84,8 +81,7 @@ def tip_position(linkage: Linkage, q: Float[Array, " joint"]) -> Float[Array, " 
     >>> fj.tip_position(arm, [0.0, 1.5707963, 0.0]).tolist()
     [1.0, 2.0]
     """
-    start, direction, *_ = frames(linkage, q)
-    return as_points(start[-1] + linkage.length[-1] * direction[-1])
+    return as_points(frames(linkage, q).tip(linkage))
 
 
 @compiled("q")
@@ -103,8 +99,8 @@ def tip_jacobian(
     >>> fj.tip_jacobian(arm, [0.0, 0.0, 0.0]).tolist()  # stretched: no motion along x
     [[0.0, 0.0, 0.0], [3.0, 2.0, 1.0], [1.0, 1.0, 1.0]]
     """
-    start, direction, *_, revolute = frames(linkage, q)
-    tip = start[-1] + linkage.length[-1] * direction[-1]
-    columns = 1j * jnp.where(revolute, tip - start[1:], direction[:-1])
+    f = frames(linkage, q)
+    columns = f.tip(linkage) - f.start[1:]
+    columns = 1j * jnp.where(f.revolute, columns, f.direction[:-1])
     columns = without_fixed(linkage, columns)
-    return jnp.stack([columns.real, columns.imag, jnp.where(revolute, 1.0, 0.0)])
+    return jnp.stack([columns.real, columns.imag, jnp.where(f.revolute, 1.0, 0.0)])

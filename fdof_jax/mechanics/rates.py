@@ -33,6 +33,19 @@ from .solve import Matrix, divided, fused, minus, solver_of, times, with_added
 _MOST_TOGETHER = 7
 
 
+def _solved(
+    reciprocal: Callable,
+    c: Constants,
+    delta: Scalars,
+    qd: Scalars,
+    added: Upper | None,
+    turned: Directions | None = None,
+) -> tuple[Equations, Callable, Callable]:
+    """Returns the equations, and what `solver_of` returns for them."""
+    m = with_added(added, equations(c, delta, qd, turned))
+    return m, *solver_of(c, m, added, reciprocal)
+
+
 def _rates(
     reciprocal: Callable,
     c: Constants,
@@ -41,8 +54,7 @@ def _rates(
     tau: Scalars,
     added: Upper | None,
 ) -> tuple[Scalars, Scalars]:
-    m = with_added(added, equations(c, delta, qd))
-    solve, _ = solver_of(c, m, added, reciprocal)
+    m, solve, _ = _solved(reciprocal, c, delta, qd, added)
     # The velocities pass through the loop because XLA would otherwise copy the buffers
     # of a Runge-Kutta method's stages.
     return qd, solve(minus(tau, m.bias))
@@ -56,8 +68,7 @@ def _rates_and_conditioning(
     tau: Scalars,
     added: Upper | None,
 ) -> tuple[Scalars, Scalars, Scalars]:
-    m = with_added(added, equations(c, delta, qd))
-    solve, inverse_diagonal = solver_of(c, m, added, reciprocal)
+    m, solve, inverse_diagonal = _solved(reciprocal, c, delta, qd, added)
     return qd, solve(minus(tau, m.bias)), _losses(m, inverse_diagonal())
 
 
@@ -71,17 +82,17 @@ def _losses(m: Equations, inverse: Scalars) -> Scalars:
     )
 
 
-def _conditioning(
+def losses(
     reciprocal: Callable, c: Constants, delta: Scalars, added: Upper | None
 ) -> Scalars:
-    m = with_added(added, equations(c, delta, zeros(delta)))
-    _, inverse_diagonal = solver_of(c, m, added, reciprocal)
+    """Computes `conditioning` with a given reciprocal, and with derivatives."""
+    m, _, inverse_diagonal = _solved(reciprocal, c, delta, zeros(delta), added)
     return _losses(m, inverse_diagonal())
 
 
 def conditioning(c: Constants, delta: Scalars, added: Upper | None = None) -> Scalars:
     """Computes the amplification of rounding errors, see `rates_and_conditioning`."""
-    return fused(_conditioning)(c, delta, added)
+    return fused(losses)(c, delta, added)
 
 
 @jax.jit
@@ -102,8 +113,7 @@ def _directions_and_inverse(
 ) -> tuple[Directions, Matrix]:
     """Computes the links' directions and the columns of the inverse mass matrix."""
     turned = directions(c, delta)
-    m = with_added(added, equations(c, delta, zeros(delta), turned))
-    solve, _ = solver_of(c, m, added, reciprocal)
+    _, solve, _ = _solved(reciprocal, c, delta, zeros(delta), added, turned)
     unit = jnp.eye(len(delta), dtype=delta[0].dtype)
     return turned, tuple(solve(tuple(row)) for row in unit)
 
@@ -183,11 +193,7 @@ _sensitivities = jax.jit(_one_loop_sensitivities)  # traced once, not at each us
 
 @jax.custom_jvp
 def rates(
-    c: Constants,
-    delta: Scalars,
-    qd: Scalars,
-    tau: Scalars,
-    added: Upper | None = None,
+    c: Constants, delta: Scalars, qd: Scalars, tau: Scalars, added: Upper | None = None
 ) -> tuple[Scalars, Scalars]:
     """Computes the rates of `delta` and `qd`: velocities and accelerations.
 
@@ -236,11 +242,7 @@ def _rates_jvp(primals, tangents):
 
 @jax.custom_jvp
 def rates_and_conditioning(
-    c: Constants,
-    delta: Scalars,
-    qd: Scalars,
-    tau: Scalars,
-    added: Upper | None = None,
+    c: Constants, delta: Scalars, qd: Scalars, tau: Scalars, added: Upper | None = None
 ) -> tuple[tuple[Scalars, Scalars], Scalars]:
     """Computes `rates` and the amplification of rounding errors in them.
 
@@ -259,12 +261,3 @@ def _rates_and_conditioning_jvp(primals, tangents):
     values, losses = rates_and_conditioning(*primals)
     change = _change(primals, values, tangents)
     return (values, losses), (change, tuple(map(jnp.zeros_like, losses)))
-
-
-def inertia_diagonals(
-    c: Constants, delta: Scalars, added: Upper | None = None
-) -> tuple[Scalars, Scalars]:
-    """Diagonals of the mass matrix and its inverse, which is infinite if singular."""
-    m = with_added(added, equations(c, delta, zeros(delta)))
-    _, inverse_diagonal = solver_of(c, m, added, divided)
-    return tuple(row[0] for row in m.mass), inverse_diagonal()

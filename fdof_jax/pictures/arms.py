@@ -13,7 +13,7 @@ from matplotlib.path import Path
 from ..base.array_namespace import in_numpy
 from ..base.checks import refusal
 from ..linkage.frames import frames
-from ..linkage.linkage import Linkage, check_linkage
+from ..linkage.linkage import Linkage, check_linkage, without_fixed
 from ..linkage.topology import letters
 from .axes import (
     BLACK,
@@ -53,8 +53,8 @@ def geometry(linkage: Linkage, q: np.ndarray) -> Geometry:
     check_linkage(linkage)
     linkage = in_numpy(linkage)
     kinds = letters(linkage.ef)
-    moves = np.array([kind != "F" for kind in kinds])
-    start, direction, angle, slide, _ = frames(linkage, np.where(moves, q, 0))
+    f = frames(linkage, without_fixed(linkage, q))
+    start, direction, angle, slide = f.start, f.direction, f.angle, f.slide
     end = start + linkage.length * direction
     along, across = linkage.com.T
     foot = start[:, 1:] + along * direction[:, 1:]  # mass centre projected on the link

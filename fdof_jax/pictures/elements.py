@@ -14,7 +14,7 @@ from ..forces.element import elements_on
 from ..forces.joint_limits import JointStops
 from ..forces.points import Point
 from ..linkage.frames import Frames, frames
-from ..linkage.linkage import Linkage
+from ..linkage.linkage import Linkage, without_fixed
 from ..linkage.topology import letters
 from ..references.reference import Reference
 from ..references.task import TipTask
@@ -49,7 +49,7 @@ def element_lines(
         element.check(linkage, jnp.asarray(ts))
     arm = in_numpy(linkage)
     kinds = letters(arm.ef)
-    f = frames(arm, np.where([kind != "F" for kind in kinds], q, 0))
+    f = frames(arm, without_fixed(arm, q))
     pushes = {
         k: _push(element, linkage, f, ts)
         for k, element in enumerate(found)
@@ -108,7 +108,8 @@ def _support(point: Point, arm: Linkage, f: Frames, size: float) -> list[np.ndar
         hatches = [np.array([x, x - 0.7 - 0.9j]) for x in (-0.6, 0.4, 1.4)]
         strokes = [np.array([-1.4, 1.4]), *hatches]
         return [place + _WIDTH * size * stroke for stroke in strokes]
-    nearest = np.clip(float(point.along), *sorted((0.0, float(arm.length[link]))))
+    low, high = sorted((0.0, float(arm.length[link])))
+    nearest = min(max(float(point.along), low), high)
     foot = _place(Point(link, nearest), f)
     away = np.abs(foot - place).max() > _WIDTH * size
     return [np.hstack([foot, place])] if away else []

@@ -14,10 +14,10 @@ from matplotlib.figure import Figure
 from matplotlib.image import imsave
 
 from ..base.checks import instance, refusal
+from ..base.html_table import html_table
 from ..base.names import optional_package
 from ..linkage.linkage import joint_names, joints_of
 from ..references.reference import reference_of
-from ..simulation.html_table import html_table
 from ..simulation.looped_dopri8 import LoopedDopri8
 from ..simulation.scene import Scene
 from ..simulation.simulate import simulate
@@ -74,7 +74,7 @@ def _moved(scene: Scene, stretch: Array, factor: Array) -> _Moved:
     return _Moved(scene, solution, commanded, jnp.isfinite(positions).all(axis=1))
 
 
-def _told(moved: _Moved, error: np.ndarray) -> str:
+def _report(moved: _Moved, error: np.ndarray) -> str:
     """HTML text on the motion's end, gains and lengths; `error`: tip errors [m]."""
     solution = moved.solution
     if not np.all(moved.possible):
@@ -227,7 +227,7 @@ def sliders(scenes: Mapping[str, Scene] | None = None) -> Any:
         factor = jnp.array([slider.value for slider in gains]).reshape(2, -1)
         moved = _moved(known[arm.value], stretch, factor)
         image.value, error = pictures[arm.value].draw(moved)
-        words.value = _told(moved, error)
+        words.value = _report(moved, error)
 
     redraw()
     # While a picture is drawn, the browser keeps only the newest value: no queue grows.

@@ -23,8 +23,7 @@ from ..control.drives import PIDController
 from ..control.pd import PDController
 from ..dynamics import energy, link_energies
 from ..forces.element import Forces, InertialElement, elements
-from ..linkage.linkage import Linkage
-from ..linkage.topology import letters
+from ..linkage.linkage import Linkage, joint_names, moving_joints
 from ..simulation.efforts import joint_efforts
 from ..simulation.solution import Solution
 from .arms import geometry, link_color
@@ -173,7 +172,7 @@ def energy_stack(
     if gap > 0.01 * line.max():
         warn(
             f"energy_stack: the balance is off by {gap:.3g} J of {line.max():.3g} J: "
-            "expected the forces of the solution, and samples closer in time.",
+            "expected the forces of the solution, and samples closer in time."
         )
     ax = axes_or_new(ax, 2.6)
     colors = [*SERIES[3:5], _LIGHT_GREY]
@@ -202,9 +201,9 @@ def effort_profile(
     efforts = joint_efforts(linkage, forces, solution)
     ts, total, parts = (np.asarray(a) for a in (solution.ts, *efforts))
     units, panels = [], []
-    moving = [k for k, kind in enumerate(letters(linkage.ef)) if kind != "F"]
+    moving = moving_joints(linkage)
     for k in moving:
-        symbol, unit = ("T", "N m") if letters(linkage.ef)[k] == "R" else ("F", "N")
+        symbol, unit = ("T", "N m") if joint_names(linkage)[k][0] == "R" else ("F", "N")
         curve = "total", total[:, k], SERIES[0]
         panels.append((f"${symbol}_{k + 1}$ [{unit}]", [curve]))
         units.append(unit)
@@ -245,10 +244,8 @@ def _note(ax: Axes, text: str) -> None:
 
     def hidden(x: float, y: float) -> int:
         curves = (ax.transLimits.transform(line.get_xydata()) for line in ax.lines)
-        return sum(
-            np.count_nonzero((np.abs(curve - (x, y)) < (0.45, 0.25)).all(axis=1))
-            for curve in curves
-        )
+        near = [(np.abs(curve - (x, y)) < (0.45, 0.25)).all(axis=1) for curve in curves]
+        return sum(int(found.sum()) for found in near)
 
     x, y = min([(1, 0), (1, 1), (0, 0), (0, 1)], key=lambda corner: hidden(*corner))
     ax.annotate(

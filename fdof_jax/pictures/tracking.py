@@ -17,15 +17,7 @@ from ..references.reference import reference_of
 from ..references.task import TipReference
 from ..simulation.solution import Solution
 from .arms import geometry
-from .axes import (
-    SERIES,
-    axes_or_new,
-    filled_mapping,
-    legend,
-    plane_axes,
-    reached,
-    xy,
-)
+from .axes import SERIES, axes_or_new, filled_mapping, legend, plane_axes, reached, xy
 
 # Without the lightest colours, which are hard to see on white.
 _DARK_TO_LIGHT = ListedColormap(colormaps["plasma"](np.linspace(0, 0.85, 256)))

@@ -8,6 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
 from numpy.typing import ArrayLike
 
+from ..analysis.reach import Ranges, curves, reached_cells
 from ..base.array_namespace import in_numpy
 from ..base.checks import real_array
 from ..dynamics import joint_mass_matrix
@@ -17,7 +18,6 @@ from ..linkage.topology import letters
 from ..mechanics.kinematics import tip_jacobian
 from .arms import Geometry, draw_motion, geometry
 from .axes import GREY, SERIES, legend, plane_axes, xy
-from .reach import Ranges, curves, reached_cells
 
 _REACHED = "#D6EAF5"
 

@@ -70,7 +70,7 @@ class CircleTask(TipReference):
         _, ray = _ray(self, real_array("t", t, ()))
         return self.center + jnp.stack([ray.real, ray.imag])
 
-    def seen(self, t, base):
+    def wrist_seen(self, t, base):
         """The wrist and its angle, which starts within a turn.
 
         The angle of the larger vector, to the centre or from there, is continuous. The

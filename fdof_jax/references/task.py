@@ -69,16 +69,16 @@ class TipReference(Reference):
         yield Condition(abs(self.branch) == 1, "branch", "1 or -1", (self.branch,))
 
     @abstractmethod
-    def seen(self, t: Array, base: Array) -> tuple[Array, Array]:
-        """The wrist as seen from the first joint: vectors x + iy, and their angles.
+    def wrist_seen(self, t: Array, base: Array) -> tuple[Array, Array]:
+        """Returns vectors x + iy from the first joint to the wrist, and their angles.
 
-        `base`: what these vectors lack to the tip. The angles are continuous in time.
+        `base`: the rest of the vector to the tip. The angles are continuous in time.
         """
 
     def assembly(self, t, linkage):
         arm, placed = arm_of(linkage, self.orientation is not None)
         directions = known_directions(arm, self.direction)
-        seen = self.seen(t, unmoved_part(arm, directions))
+        seen = self.wrist_seen(t, unmoved_part(arm, directions))
         q, root = solve_joints(arm, directions, *seen, self.branch)
         return placed(q), root
 
@@ -153,7 +153,7 @@ class TipTask(TipReference):
         """The commanded tip position at time `t` [s]: (x, y) [m]."""
         return self.path.point(self.timing(real_array("t", t, ())))
 
-    def seen(self, t, base):
+    def wrist_seen(self, t, base):
         """The wrist and its angle, as the angle from the path's middle and its own."""
         if namespace(t) is np and not runs_in_numpy(self.path, self.timing):
             with jax.ensure_compile_time_eval():  # also within transformations
@@ -177,7 +177,7 @@ class TipTask(TipReference):
         task, arm, ts = in_numpy((self, linkage, ts))
         three, directions, base = task._placed(arm)
         times = task._times(ts)
-        wrist, bearing = task.seen(times, base)
+        wrist, bearing = task.wrist_seen(times, base)
         q, _ = solve_joints(three, directions, wrist, bearing, task.branch)
         inside = np.isfinite(q).all(axis=1)
         if not inside.all():
@@ -190,7 +190,7 @@ class TipTask(TipReference):
                 "reference: expected a path that does not pass behind the ground "
                 "pivot as seen from its middle, got one that does."
             )
-        gap = task._gap(lambda t: task.seen(t, base)[0], ts)
+        gap = task._gap(lambda t: task.wrist_seen(t, base)[0], ts)
         if gap > _CLOSED:
             raise ValueError(
                 "reference: expected a closed path for `Laps`, got one that ends "
@@ -199,7 +199,7 @@ class TipTask(TipReference):
 
     def fits(self, linkage, ts):
         _, _, base = self._placed(linkage)
-        seen, times = lambda t: self.seen(t, base), self._times(ts)
+        seen, times = lambda t: self.wrist_seen(t, base), self._times(ts)
         each = seen if namespace(times) is np else jax.vmap(seen)
         _, bearing = each(times)
         closed = self._gap(lambda t: seen(t)[0], ts) <= _CLOSED

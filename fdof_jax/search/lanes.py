@@ -105,8 +105,5 @@ def power_mean(members: Evaluation, order: int) -> Evaluation:
         spread -= total[:, :, None] * total[:, None, :] / np.where(whole > 0, whole, 1)
         bent = bent + (order - 1) * spread
     return Evaluation(
-        (mean * largest)[:, 0],
-        total,
-        bent,
-        facts | {"member_loss": loss},
+        (mean * largest)[:, 0], total, bent, facts | {"member_loss": loss}
     )

@@ -82,10 +82,7 @@ class LBFGS:
         return self.share > 1e-8
 
 
-METHODS: dict[str, Any] = {
-    "levenberg-marquardt": LevenbergMarquardt,
-    "l-bfgs": LBFGS,
-}
+METHODS: dict[str, Any] = {"levenberg-marquardt": LevenbergMarquardt, "l-bfgs": LBFGS}
 
 
 def box_minimum(

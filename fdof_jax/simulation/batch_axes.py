@@ -80,7 +80,7 @@ def batch_of(linkage: Linkage, state0: Any, forces: Forces, forces_axes: Any) ->
             f"{name}: {size[0] if size else 'no axis'}" for name, size in sizes.items()
         ]
         unsaid = forces and not (got or jax.tree.leaves(forces_axes))
-        hint = " (forces_axes=0 says that those of `forces` have one)" if unsaid else ""
+        hint = " (pass forces_axes=0 if those of `forces` have one)" if unsaid else ""
         raise ValueError(
             "linkage, state0, forces: expected a leading batch axis of one size on at "
             f"least one array, got {', '.join(got) or 'none on any'}{hint}."

@@ -19,8 +19,8 @@ from .solution import Solution
 from .step_wrappers import Abreast
 from .steps import default_controller
 
-# A step of so few lanes takes not much longer than one of a single lane: slow members
-# are not worth another program.
+# With so few lanes a step takes hardly longer than with one, so that slow members do
+# not pay for another program.
 _ALL_ALIKE = 32
 _AXIS = "lane"
 
@@ -28,7 +28,7 @@ _AXIS = "lane"
 def motion_of(
     settings: dict, ts: Array, moving: Any, shared: Any, abreast: bool
 ) -> Solution:
-    """Computes one member's motion, as far as other lanes go if `abreast`."""
+    """Computes one member's motion; if `abreast`, until most lanes are long done."""
     linkage, state0, forces = eqx.combine(moving, shared)
     controller = settings["stepsize_controller"] or default_controller()
     # Members with steps of given lengths take equally many.

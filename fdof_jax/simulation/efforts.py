@@ -10,15 +10,9 @@ from jax import Array
 from jaxtyping import Float
 
 from ..base.checks import instance, is_traced, place_of
-from ..forces.element import (
-    Element,
-    Forces,
-    StatefulElement,
-    elements_on,
-    of_full_size,
-)
+from ..forces.element import Element, Forces, elements_on, of_full_size
 from ..linkage.linkage import Linkage, check_linkage, without_fixed
-from .field import element_effort
+from .field import element_effort, with_states
 from .padding import cut, padded
 from .prescribed import prescribed, prescribed_effort
 from .simulate import check_own
@@ -78,14 +72,12 @@ def joint_efforts(linkage: Linkage, forces: Forces, solution: Solution) -> Effor
 def _efforts(
     linkage: Linkage, forces: tuple[Element, ...], ts: Array, q: Array, qd: Array, own
 ) -> Efforts:
-    motion_rows, states = (ts, q, qd), iter(own)
-    efforts = []
-    for index, element in enumerate(forces):
+    motion_rows, efforts = (ts, q, qd), []
+    for index, element, state in with_states(forces, own):
 
         def effort(t, q, qd, state, index=index, element=element):
             return element_effort(index, element, t, q, qd, linkage, state)[0]
 
-        state = next(states) if isinstance(element, StatefulElement) else ()
         efforts.append(jax.vmap(effort)(*motion_rows, state))
     stacked = jnp.stack(efforts) if efforts else jnp.zeros((0, *q.shape))
     if (motion := prescribed(forces)) is not None:

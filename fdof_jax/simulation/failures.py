@@ -6,8 +6,8 @@ from typing import Any
 import diffrax
 import numpy as np
 
-from ..forces.element import Element, ForeignElement, StatefulElement
-from .field import element_effort, initial_states
+from ..forces.element import Element, ForeignElement
+from .field import element_effort, initial_states, with_states
 from .solution import Solution
 
 # Steps are tiny if all that are allowed cover less than this part of the time span.
@@ -18,9 +18,8 @@ def cause(inputs: tuple[Any, ...], solution: Solution) -> str:
     """Returns what is known about a failed solve, in a sentence."""
     linkage, (q, qd), ts, own0, forces = inputs
     if solution.outcome == "not finite":
-        own = iter(own0 or initial_states(linkage, forces))
-        for k, element in enumerate(forces):
-            state = next(own) if isinstance(element, StatefulElement) else ()
+        own = own0 or initial_states(linkage, forces)
+        for k, element, state in with_states(forces, own):
             effort, _ = element_effort(k, element, ts[0], q, qd, linkage, state)
             if not np.isfinite(effort).all():
                 return f"The effort of forces[{k}] is not finite at the start."

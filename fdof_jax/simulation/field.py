@@ -1,5 +1,6 @@
 """The vector field of a linkage with force elements, as integrators call it."""
 
+from collections.abc import Iterator
 from itertools import islice
 from typing import Any, NamedTuple
 
@@ -58,6 +59,16 @@ def stateful(forces: tuple[Element, ...]) -> list[StatefulElement]:
     return [element for element in forces if isinstance(element, StatefulElement)]
 
 
+def with_states(
+    forces: tuple[Element, ...], own: Any
+) -> Iterator[tuple[int, Element, Any]]:
+    """Yields each element with its index and its state, () without one."""
+    states = iter(own)
+    for index, element in enumerate(forces):
+        state = next(states) if isinstance(element, StatefulElement) else ()
+        yield index, element, state
+
+
 def initial_states(linkage: Linkage, forces: tuple[Element, ...]) -> tuple[Any, ...]:
     return tuple(element.initial_state(linkage) for element in stateful(forces))
 
@@ -94,17 +105,16 @@ def _effort(t: Any, y: Any, args: Args, schedule: tuple[Any, ...]) -> tuple[Any,
     Builds arrays only where an element needs them.
     """
     delta, qd, *_ = y
-    states = iter(own_states(args, y))
     tau, own_rates = None, []
     switches = Switches(args.sides)
     arrays = lambda: (args.q0 + jnp.stack(delta), jnp.stack(qd))
-    for index, (element, scheduled) in enumerate(zip(args.forces, schedule)):
+    elements = with_states(args.forces, own_states(args, y))
+    for (index, element, state), scheduled in zip(elements, schedule):
         if isinstance(element, ScalarElement):
             q = tuple(a + b for a, b in zip(args.q0, delta))
             with switches.dealt():
                 effort = element.respond(scheduled, q, qd, args.linkage)
         else:
-            state = next(states) if isinstance(element, StatefulElement) else ()
             at = args.clock(index, t), *arrays(), args.linkage
             effort, rate, values, jumping = _switched_effort(
                 index, element, *at, state, switches.rest()

@@ -27,9 +27,9 @@ from .known_times import clocks_apart, known_times
 from .looped_dopri8 import LoopedDopri8
 from .packing import in_arrays
 from .prescribed import agrees, motion_at, start_of, term_of
-from .rounding import Recorded, above_rounding
+from .rounding import AboveRounding, Recorded
 from .solution import Solution
-from .step_wrappers import Watched, bounded
+from .step_wrappers import Watched, bounded, with_judge
 from .steps import default_controller
 from .switching import Located, LocatedImplicit, located, switching_facts
 from .unrolled_dopri8 import UnrolledDopri8
@@ -71,7 +71,7 @@ def integrate(
     """
     linkage, state0, asked, own0, forces = inputs
     solver = _differentiable(keywords["solver"] or LoopedDopri8(), keywords["adjoint"])
-    valid, ts, (q0, qd0) = _harmless(inputs, padded)
+    valid, ts, (q0, qd0) = _valid(inputs, padded)
     args = args_of(linkage, q0, forces)
     if derivatives:
         args = clocks_apart(args, ts)
@@ -146,7 +146,7 @@ def integrate(
 def _differentiable(solver: Any, adjoint: diffrax.AbstractAdjoint) -> Any:
     """Returns the solver with loops that the adjoint can differentiate.
 
-    diffrax sees to that itself, but not for a solver within a wrapper.
+    diffrax does this itself, except for a solver inside a wrapper.
     """
     kinds = {diffrax.ForwardMode: "lax", diffrax.DirectAdjoint: "bounded"}
     kind = kinds.get(type(adjoint))
@@ -155,7 +155,7 @@ def _differentiable(solver: Any, adjoint: diffrax.AbstractAdjoint) -> Any:
     return eqx.tree_at(lambda s: s.scan_kind, solver, kind, is_leaf=lambda x: x is None)
 
 
-def _harmless(inputs, padded: bool) -> tuple[Array, Array, tuple[Array, Array]]:
+def _valid(inputs, padded: bool) -> tuple[Array, Array, tuple[Array, Array]]:
     """Returns whether the inputs are valid, and their times and start.
 
     Traced values were not checked before, so the result reports invalid ones. They are
@@ -195,7 +195,7 @@ def _controller(
     if bound is not None and not trusted:
         fraction = _OF_TIME_SCALE[0 if (solver.order(term) or 0) >= 8 else 1]
         controller = bounded(controller, lambda: bound(fraction))
-    return above_rounding(controller)
+    return with_judge(AboveRounding, controller)
 
 
 def _judged(valid: Array, result: Any, q: Array, qd: Array) -> Any:

@@ -17,9 +17,9 @@ _APART = 8
 def clocks_apart(args: Args, ts: Array) -> Args:
     """Returns the arguments with clocks by which no two elements jump at once.
 
-    One step would end at coincident times, and derivatives would ascribe the jumps of
-    all elements to one of these times. Each clock is ahead of the one before by some
-    units of rounding.
+    If times coincided, one step would end at all of them, and derivatives would
+    attribute the jumps of all elements to one of them. Each clock is ahead of the one
+    before by some units of rounding.
     """
     # A prescribed motion also gives positions, and comes first: it keeps the time.
     places = sorted(

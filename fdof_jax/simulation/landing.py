@@ -13,8 +13,8 @@ from .step_wrappers import Adaptive
 
 # So many landings in a row, with no other step between, are chatter.
 _MOST_LANDINGS = 100
-# After so many tries, what steps pass is a jump of a switching function itself. It is
-# found by halving the step.
+# After so many tries the switching function itself is taken to jump, and the jump is
+# located by halving the step.
 _MOST_TRIES = 6
 # A step ends so many units of rounding before a known time, and the next one starts as
 # many after it, so that rounding within steps does not pass it.
@@ -88,7 +88,7 @@ class Landing(Adaptive):
         if self.switches:  # a step of no length finds the sides
             end, cut = t0, jnp.array(True)
         target = jnp.where(cut, constant(end), jnp.inf)
-        # diffrax takes times less than 100 units of rounding before the end for it.
+        # diffrax treats times within 100 units of rounding of the end as the end.
         last = constant(t1 - 200 * jnp.finfo(t1.dtype).eps * jnp.abs(t1))
         crossing, none = jnp.full_like(target, -jnp.inf), jnp.zeros((), int)
         return end, _Landing(inner, target, length, crossing, none, none, last)

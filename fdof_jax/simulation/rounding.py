@@ -16,7 +16,7 @@ from jax import Array
 
 from ..linkage.topology import real_joints
 from .dopri8 import Health, constant
-from .step_wrappers import Adaptive, with_judge
+from .step_wrappers import Adaptive
 
 # Rounding errors of an acceleration, over its size times eps and the loss of accuracy:
 # less for slides, whose inertia is a sum of masses without levers.
@@ -27,12 +27,9 @@ _DOUBTFUL = 8.0
 _SAME_STEP = 0.43  # the error over its tolerance at which a PID controller keeps a step
 
 
-def above_rounding(controller: Any) -> Any:
-    """Returns an adaptive controller that does not chase rounding errors."""
-    return with_judge(_AboveRounding, controller)  # pyright: ignore[reportArgumentType]
+class AboveRounding(Adaptive):
+    """A controller that does not chase rounding errors."""
 
-
-class _AboveRounding(Adaptive):
     controller: Any
 
     def adapt_step_size(self, *arguments):

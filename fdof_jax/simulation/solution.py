@@ -9,8 +9,8 @@ from jax import Array
 from jaxtyping import Float
 
 from ..base.checks import known
+from ..base.html_table import html_table
 from ..linkage.linkage import Linkage
-from .html_table import html_table
 
 # In the order of `outcome_numbers`.
 OUTCOMES = (
@@ -42,12 +42,13 @@ class Solution(eqx.Module):
       with adaptive steps, `accuracy`: the relative rounding error of the accelerations
       at the worst step. Steps do not chase errors below it. If elements switch, also
       the number of switches, `num_switches`, and `slowest_crossing`: the least speed at
-      which a switching function passed its zero, as a share of its size in the step, or
-      of the speed with which it would turn back at its size. One that turns back within
-      1 % of its size before its zero counts as if it passed as far beyond. Near 0 a
-      contact grazes, and the motion has no derivative. If efforts jump at switches,
-      `one_sided`: the number of places where derivatives may hold on one side only,
-      because the motion starts on a switch or meets two at once.
+      which a switching function passed its zero. It is relative to the function's size
+      in the step, or to the speed at which the function would turn back at its size. A
+      function that turns back within 1 % of its size before its zero counts as if it
+      had gone as far beyond. Near 0 a contact grazes, and the motion has no derivative.
+      If efforts jump at switches, `one_sided`: the number of places where derivatives
+      may hold on one side only, because the motion starts on a switch or meets two at
+      once.
     - `result`: diffrax's result, one per trajectory: `diffrax.RESULTS.successful` or
       the reason for the failure. `outcome` states it in words.
     - `own`: the states of the `StatefulElement`s at `ts`, in the order of the forces;

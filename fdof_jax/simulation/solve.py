@@ -161,8 +161,7 @@ def _integrate_reversibly_fwd(perturbed, inputs, keywords):
 def _integrate_reversibly_bwd(residuals, cotangent, perturbed, inputs, keywords):
     slopes, states = residuals
     wanted = eqx.combine(
-        (cotangent.q, cotangent.qd, cotangent.own),
-        jax.tree.map(jnp.zeros_like, states),
+        (cotangent.q, cotangent.qd, cotangent.own), jax.tree.map(jnp.zeros_like, states)
     )
     moving = eqx.filter(inputs, perturbed)
     if not _few(moving, keywords["adjoint"]):
@@ -172,8 +171,8 @@ def _integrate_reversibly_bwd(residuals, cotangent, perturbed, inputs, keywords)
 
     def part(weight: Array, tangent: Array) -> Array:
         weight, tangent = weight.reshape(1, -1), tangent.reshape(len(start), -1)
-        # States that were not reached are NaN, and constant; nor is a weight of 0 to
-        # pick up a tangent that is not finite.
+        # States that were not reached are NaN and constant. A weight of 0 must not pick
+        # up a tangent that is not finite.
         unused = (weight == 0) | (tangent == 0)
         return jnp.where(unused, 0, weight * tangent).sum(axis=1)
 

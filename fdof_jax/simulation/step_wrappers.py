@@ -24,7 +24,7 @@ def with_pid(change: Callable[[diffrax.PIDController], Any], controller: Any) ->
     )
 
 
-def with_judge(change: Callable[[Any], Any], controller: Any) -> Any:
+def with_judge(change: Callable[..., Any], controller: Any) -> Any:
     """Returns a controller with `change` applied to the one that judges errors."""
 
     def judges(node: Any) -> bool:
@@ -79,15 +79,12 @@ class Adaptive(diffrax.AbstractAdaptiveStepSizeController):
         return self.controller.norm
 
 
-def undifferentiated(controller: Any) -> Any:
-    """Returns the controller with steps that are constant for derivatives.
+class Undifferentiated(Adaptive):
+    """A controller whose steps are constant for derivatives.
 
     Up to the tolerance, the motion does not depend on where its steps end.
     """
-    return with_judge(_Undifferentiated, controller)  # pyright: ignore[reportArgumentType]
 
-
-class _Undifferentiated(Adaptive):
     controller: Any
 
     def init(self, *arguments):
@@ -123,8 +120,8 @@ class Watched(Adaptive):
         return *step, diffrax.RESULTS.where(failed, failure, result)
 
 
-# A lane stops if it takes so many times the steps in which so large a part of the
-# lanes was done.
+# A lane stops once it has taken `_SLACK` times the steps after which `_MOST` of the
+# lanes were done.
 _SLACK, _MOST = 1.5, 7 / 8
 
 

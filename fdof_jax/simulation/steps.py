@@ -74,7 +74,7 @@ def within_reach(
             return tolerance
         warn(
             f"stepsize_controller: {name}={known:g} cannot be met in float32, "
-            f"{_TIGHTEST_SINGLE:g} is used; fj.configure(x64=True) allows more.",
+            f"{_TIGHTEST_SINGLE:g} is used; fj.configure(x64=True) allows more."
         )
         return _TIGHTEST_SINGLE
 

@@ -153,7 +153,7 @@ def sweep(
     - `reduce`: a function of one member's `Solution`, for instance
       `lambda motion: motion.q[-1]`; of each member only the arrays that it returns are
       kept, also in a checkpoint. It is part of the compiled program: pass the same
-      function again to use that again.
+      function object to reuse that program.
     - `chunk`: largest number of members to solve together, per device. None stands for
       128; or 256 where a CPU has several cores, unless the results go to a checkpoint
       or store, which any machine may resume.

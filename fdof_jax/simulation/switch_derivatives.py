@@ -36,7 +36,7 @@ def first_of(switched: Array) -> Array:
 
 @jax.custom_jvp
 def _of_zero(zero: Array, factor: Array) -> Array:
-    """Returns the product of a factor and what is 0 but for its derivatives.
+    """Multiplies `factor` by `zero`, whose value is 0 but whose derivatives are not.
 
     The factor's own derivatives then enter second derivatives alone.
     """
@@ -91,10 +91,10 @@ def _difference(late: Array, moment: Moment, term: Any) -> Any:
 
 @eqx.filter_custom_jvp
 def gained(late: Array, moment: Moment, *, term: Any, jumping: bool) -> Any:
-    """Returns what a switch that is late adds to the state: 0, with derivatives.
+    """Returns how the time of a switch changes the state: 0, with derivatives.
 
-    Only what derivatives need is computed. Without jumps first ones need nothing, and
-    only second ones need derivatives of rates.
+    Where nothing jumps, first derivatives are 0 too; only second ones need derivatives
+    of the rates.
     """
     return jax.tree.map(jnp.zeros_like, moment.y)
 

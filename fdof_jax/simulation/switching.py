@@ -16,12 +16,12 @@ from jax import Array
 
 from .dopri8 import DenseOutput, constant, with_change
 from .landing import Landing, rounding
-from .step_wrappers import undifferentiated, with_pid
+from .step_wrappers import Undifferentiated, with_judge
 from .switch_derivatives import Moment, first_of, gained, lateness_of
 from .zeros_in_steps import BEYOND, SAMPLED, SHARES, passage
 
-# What is zero around the end of a step switches there: within this power of the unit of
-# rounding, as a share of the step (1e-9 in float64).
+# A function whose zero is this close to the end of a step switches there: a share of
+# the step, as a power of the unit of rounding (1e-9 in float64).
 _NEAR = 0.575
 
 
@@ -35,8 +35,8 @@ class Switching(NamedTuple):
     - `soon`: when a switch follows soon after the end, or else the end [s].
     - `near`: how far from its zero a switching function may switch [s].
     - `sizes` (switch,): the largest values of the switching functions up to here.
-    - `lateness` (2,): times of the first switch here, and of others, less that of the
-      end: 0, with derivatives [s].
+    - `lateness` (2,): the times of the first switch here and of another one, minus the
+      step's end [s]. Their values are 0; their derivatives are not.
     - `passed`: number of switches up to here.
     - `one_sided`: number of places up to here where derivatives may be (see `Located`);
       None if nothing jumps at switches.
@@ -101,9 +101,9 @@ def located(
         )
         solver, y0 = wrapped, (*y0, known)
     if jumps is None and not switches:
-        return solver, undifferentiated(controller), y0
+        return solver, with_judge(Undifferentiated, controller), y0
     landing = lambda inner: Landing(inner, jumps, switches)  # pyright: ignore[reportCallIssue]
-    return solver, _around(landing, controller), y0
+    return solver, with_judge(landing, controller), y0
 
 
 def switching_facts(*known: Switching) -> dict[str, Array]:
@@ -117,15 +117,8 @@ def switching_facts(*known: Switching) -> dict[str, Array]:
     return facts
 
 
-def _around(wrapper: Callable[[Any], Any], controller: Any) -> Any:
-    """Returns a controller with its PID controllers wrapped, or else itself."""
-    wrapped = with_pid(wrapper, controller)
-    same = jax.tree.structure(wrapped) == jax.tree.structure(controller)
-    return wrapper(controller) if same else wrapped
-
-
 class Located(diffrax.AbstractAdaptiveSolver):
-    """A solver whose steps keep to branches, and tell where the first one changes.
+    """A solver whose steps keep the branches of their start and report a change.
 
     Where efforts jump at a switch, derivatives may differ between the sides of motions
     that start on the switch, or that meet it together with another.

@@ -25,11 +25,13 @@ _SLOPES = (
     ).T
 )  # at the samples
 # Steps end where a switching function has passed its zero by this power of the unit of
-# rounding, times its size, and by this multiple of it. At rest on the zero it can be
-# told there to which side the motion goes.
+# rounding, times its size, and by this multiple of it. There the side to which the
+# motion goes is known even if it began at rest on the zero.
 BEYOND, _ROUNDING = 0.625, 500
 _SOON = 0.01  # of a step, for extrapolation
-_MISSED = 0.01  # of its size from its zero, a function that turns back nearly met it
+_MISSED = (
+    0.01  # of a function's size: turning back so close to its zero nearly touches it
+)
 _NOISE = 4 * np.abs(_BEND).sum()  # of the second derivative, in units of rounding
 _ITERATIONS = 6  # of Newton's method within a bracket
 
@@ -75,7 +77,10 @@ def _turns(margins: Array, least: Array) -> tuple[Array, Array]:
 def passage(
     margins: Array, before: Array, sizes: Array, near: Array
 ) -> tuple[Array, ...]:
-    """Returns what `first_zero` and `at_end` do: (1, no, 0) and (no, 0, 0) if far.
+    """Returns the results of `first_zero` and of `at_end`.
+
+    If all margins stay far from 0, these are (1, False, 0) and (False, 0, 0), and
+    neither is evaluated.
 
     `before`, `sizes`: the largest sizes in steps before, and with this one.
     """
@@ -96,7 +101,7 @@ def passage(
 
 @eqx.filter_jit
 def first_zero(margins: Array, sizes: Array) -> tuple[Array, Array, Array]:
-    """Returns the share of a step where a margin passes 0, and whether one does.
+    """Returns the share of a step where a margin first passes 0, and whether any does.
 
     Also returns how near to grazing a margin turned back, 0 if not near (see `at_end`).
     `sizes`: the largest size of each margin in steps before.
@@ -153,11 +158,11 @@ def _zero(terms: Array, guess: Array, low: Array, high: Array) -> Array:
 
 @eqx.filter_jit
 def at_end(margins: Array, sizes: Array, near: Array) -> tuple[Array, Array, Array]:
-    """Returns what is `near` its zero at the end, and how close that is to grazing.
+    """Returns which margins are near their zeros at the step's end, and how they graze.
 
     Also returns the share of the step after which something else follows soon, or 0.
     `sizes`: the largest size of each margin, also in steps before. `near`: a share of
-    the step; not finite for a step of no length, which tells of sides alone.
+    the step; not finite for a step of no length, which only finds the sides.
     """
     nearer = -slope_at_end(margins)
     moves = (nearer != 0) & jnp.isfinite(near)

@@ -16,14 +16,7 @@ from ..search.simulated import check_scene, sum_of_squares
 from ..simulation.scene import Scene
 from ..simulation.sensitivities import Sensitivities, sensitivities
 from ..simulation.solution import Solution
-from .losses import (
-    Loss,
-    Tracking,
-    controller_of,
-    gains_of,
-    tip_errors,
-    with_controller,
-)
+from .losses import Loss, Tracking, controller_of, gains_of, tip_errors, with_controller
 
 SAMPLES = 1001
 

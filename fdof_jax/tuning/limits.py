@@ -11,10 +11,11 @@ from ..analysis.equilibria import equilibrium
 from ..analysis.linearization import checked
 from ..analysis.loops import closed_loop, open_loop
 from ..analysis.responses import BAND
+from ..analysis.tracking import demands
 from ..control.pd import PDController
 from ..forces.element import Element
 from ..forces.part import Part, Values, field
-from ..linkage.linkage import joint_names, without_fixed
+from ..linkage.linkage import joint_names
 from ..references.reference import reference_motion
 from ..simulation.scene import Scene
 from ..simulation.solution import Solution
@@ -70,7 +71,8 @@ def excess(
         unsettled = jnp.where(late, jnp.abs(share_now - 1) - BAND, -1)
         return jnp.stack([over, unsettled, jnp.abs(demand) / limits.effort - 1])
 
-    along = jax.vmap(at)(ts, share, demands_of(scene, solution)).reshape(-1)
+    demand = demands(controller_of(scene), scene.linkage, solution)
+    along = jax.vmap(at)(ts, share, demand).reshape(-1)
     if not with_margins:
         return along
     controller, others = controller_and_others(scene)
@@ -104,13 +106,6 @@ def step_shares(solution: Solution, rest: Array) -> tuple[Array, Array]:
     return jax.vmap(lambda q: (q - solution.q[0]) / height)(solution.q), still
 
 
-def demands_of(scene: Scene, solution: Solution) -> Array:
-    """Computes the controller's demands along a motion (time, joint) [N or N m]."""
-    demand = jax.vmap(controller_of(scene).demand, in_axes=(0, 0, 0, None))
-    demands = demand(solution.ts, solution.q, solution.qd, scene.linkage)
-    return without_fixed(scene.linkage, demands)
-
-
 def sensitivity(A: Array, B: Array, C: Array) -> Array:
     """Computes 1 / (1 + L) of each joint's loop (frequency, joint).
 
@@ -136,7 +131,7 @@ def measured(
     controller, others = controller_and_others(scene)
     ts, rest = np.asarray(motion.ts), rest_of(scene)
     shares = np.asarray(step_shares(motion, rest)[0])
-    efforts = np.abs(demands_of(scene, motion)).max(axis=0)
+    efforts = np.abs(demands(controller, scene.linkage, motion)).max(axis=0)
     allowed = jax.tree.map(np.asarray, limits)
     for k, name in enumerate(joint_names(scene.linkage)):
         if name[0] == "F":

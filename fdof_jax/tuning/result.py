@@ -1,6 +1,5 @@
 """Results of gain tuning, and their tables."""
 
-from html import escape
 from typing import Any
 
 import equinox as eqx
@@ -12,8 +11,8 @@ from jaxtyping import Bool, Float
 from ..base.checks import known
 from ..linkage.linkage import joint_names
 from ..search.bounded import Run, best_of
-from ..simulation.html_table import html_table
 from ..simulation.scene import Scene
+from .gain_table import as_html, as_text, gain_rows
 from .gains import with_gains
 from .losses import controller_of
 
@@ -128,11 +127,7 @@ class TuneResult(eqx.Module):
 
     def _rows(self) -> list[list[str]]:
         """Rows of the printed table: a label, up to four numbers, and a remark."""
-        rows = [["", "start", "tuned", "least", "greatest", ""]]
-        for gain, joint, unit, *values, held in zip(*self.table.values()):
-            cells = [f"{value:.5g}" for value in values]
-            mark = "at its bound" if held else ""
-            rows.append([f"{gain} of {joint} [{unit}]", *cells, mark])
+        rows = gain_rows(self.table)
         first, last = self.histories[0], self.history
         compared = [("loss", first.loss[0], last.loss[-1])]
         if np.isfinite(self.tip_error):
@@ -173,11 +168,7 @@ class TuneResult(eqx.Module):
         return "converged" if self.converged else "not converged"
 
     def __str__(self) -> str:
-        lines = [
-            f"{label:24}" + "".join(f"{cell:>12}" for cell in cells) + f"  {mark}"
-            for label, *cells, mark in self._rows()
-        ]
-        return "\n".join([*map(str.rstrip, lines), *self._remarks()])
+        return as_text(self._rows(), self._remarks())
 
     def __repr__(self) -> str:
         """One line, or shapes if values are traced."""
@@ -191,9 +182,7 @@ class TuneResult(eqx.Module):
         )
 
     def _repr_html_(self) -> str:
-        remarks = "".join(f"<p>{escape(remark)}</p>" for remark in self._remarks())
-        header, *rows = self._rows()
-        return html_table(rows, header) + remarks
+        return as_html(self._rows(), self._remarks())
 
 
 class TradeOff(eqx.Module):

@@ -1,7 +1,6 @@
 """Tuning of gains within limits, by augmented Lagrangians."""
 
 from collections.abc import Callable
-from html import escape
 from typing import Any
 
 import equinox as eqx
@@ -15,10 +14,10 @@ from ..base.checks import instance
 from ..base.configuration import options_of_loops
 from ..forces.part import check_joints, sized
 from ..linkage.linkage import joints_of
-from ..simulation.html_table import html_table
 from ..simulation.scene import Scene, with_full_size
 from ..simulation.simulate import simulate
 from ..simulation.solution import Solution
+from .gain_table import as_html, as_text, gain_rows
 from .gains import SAMPLES, bounds_of, check_tuned, residuals_of
 from .limits import Limits, controller_and_others, excess, measured
 from .losses import Loss, gains_of, tip_errors
@@ -94,19 +93,14 @@ class TunedWithin(eqx.Module):
 
     @property
     def met(self) -> Bool[np.ndarray, " limit"]:
-        """Returns whether each limit is met; margins are to be reached, not kept."""
+        """Returns which limits are met; margins are lower limits, all others upper."""
         least = np.array(self.limit) == "modulus margin"
         return np.where(
             least, self.reached >= self.allowed, self.reached <= self.allowed
         )
 
     def _rows(self) -> list[list[str]]:
-        rows = [["", "start", "tuned", "least", "greatest", ""]]
-        columns = self.search.table | {"start": self.start.ravel().tolist()}
-        for gain, joint, unit, *values, held in zip(*columns.values()):
-            mark = "at its bound" if held else ""
-            cells = [f"{value:.5g}" for value in values]
-            rows.append([f"{gain} of {joint} [{unit}]", *cells, mark])
+        rows = gain_rows(self.search.table | {"start": self.start.ravel().tolist()})
         rows.append(["", "limit", "reached", "", "", ""])
         limits = zip(self.limit, self.joint, self.allowed, self.reached, self.met)
         for name, joint, allowed, reached, met in limits:
@@ -122,15 +116,10 @@ class TunedWithin(eqx.Module):
         )
 
     def __str__(self) -> str:
-        lines = [
-            f"{label:24}" + "".join(f"{cell:>12}" for cell in cells) + f"  {mark}"
-            for label, *cells, mark in self._rows()
-        ]
-        return "\n".join([*map(str.rstrip, lines), self._verdict])
+        return as_text(self._rows(), [self._verdict])
 
     def _repr_html_(self) -> str:
-        header, *rows = self._rows()
-        return html_table(rows, header) + f"<p>{escape(self._verdict)}</p>"
+        return as_html(self._rows(), [self._verdict])
 
 
 def tune_within(

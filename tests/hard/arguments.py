@@ -241,12 +241,7 @@ add("simulate state0.q", lambda v: simulate(state0=fj.State(v, ZERO)),
 add("simulate state0.qd", lambda v: simulate(state0=fj.State(ZERO, v)),
     array_of(3), (3,))  # fmt: skip
 add("simulate ts", lambda v: simulate(ts=v), times, (5,))
-add(
-    "simulate forces",
-    lambda v: simulate(forces=v),
-    nothing,
-    only_invalid=True,
-)
+add("simulate forces", lambda v: simulate(forces=v), nothing, only_invalid=True)
 add("simulate dt0", lambda v: simulate(dt0=TS[1] if v is None else v),
     lambda v: v is None or array_of(above=0)(v))  # fmt: skip
 for option, valid in {

@@ -71,8 +71,7 @@ def scenes(draw) -> Scene:
         junk=draw(signed(1, 1e6)),
         damping=draw(
             st.one_of(
-                st.just((0.0,) * 3),
-                TRIPLE(st.one_of(st.just(0.0), sized(1e-3, 1e3))),
+                st.just((0.0,) * 3), TRIPLE(st.one_of(st.just(0.0), sized(1e-3, 1e3)))
             )
         ),
         pace=draw(sized(1e-2, 30)),

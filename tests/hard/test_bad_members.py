@@ -12,15 +12,7 @@ import pytest
 from modes import LOOPS
 
 import fdof_jax as fj
-from hard.scenes import (
-    OUTPUTS,
-    SIZE,
-    START,
-    Breaking,
-    arm,
-    behind_the_door,
-    in_a_batch,
-)
+from hard.scenes import OUTPUTS, SIZE, START, Breaking, arm, behind_the_door, in_a_batch
 
 TS = np.linspace(0, 0.5, OUTPUTS)
 STILL = np.zeros(1)

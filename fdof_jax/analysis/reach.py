@@ -19,11 +19,11 @@ import numpy as np
 from scipy.ndimage import binary_dilation, label
 
 from ..linkage.frames import frames
-from ..linkage.linkage import Linkage
-from .axes import xy
+from ..linkage.linkage import Linkage, moving_joints
 
 _SAMPLES, _CELLS, _ROUNDING = 361, 400, 1e-9
-_LEAST = 40  # cells of a region; chance may not find smaller ones
+# Regions of fewer cells count as reached: random configurations may miss them.
+_LEAST = 40
 
 
 class Ranges(NamedTuple):
@@ -41,7 +41,7 @@ class Ranges(NamedTuple):
 
     @property
     def moving(self) -> list[int]:
-        return [k for k, kind in enumerate(self.kinds) if kind != "F"]
+        return moving_joints(self.linkage)
 
     def ends(self, k: int) -> tuple[float, ...]:
         whole = self.kinds[k] == "R" and self.upper[k] - self.lower[k] >= 2 * np.pi
@@ -56,8 +56,7 @@ class Ranges(NamedTuple):
         return np.where(beyond[..., self.moving].any(axis=-1, keepdims=True), np.nan, q)
 
     def tips(self, q: np.ndarray) -> np.ndarray:
-        start, direction, *_ = frames(self.linkage, q)
-        return start[..., -1] + self.linkage.length[-1] * direction[..., -1]
+        return frames(self.linkage, q).tip(self.linkage)
 
 
 class _Body(NamedTuple):
@@ -202,7 +201,8 @@ def reached_cells(ranges: Ranges, found: list[np.ndarray]) -> Cells:
     """
     paths = [ranges.tips(q) for q in found]
     points = np.concatenate(paths)
-    x, y = xy(points[np.isfinite(points)])
+    points = points[np.isfinite(points)]
+    x, y = np.real(points), np.imag(points)
     low = complex(x.min(), y.min())
     across = complex(x.max(), y.max()) - low
     step = (max(across.real, across.imag) or 1.0) / _CELLS
