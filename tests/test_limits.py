@@ -8,7 +8,7 @@ from scipy import signal
 from test_gains import PENDULUM, Stand, pd_at
 
 import fdof_jax as fj
-from fdof_jax.analysis.loops import closed_loop
+from fdof_jax.analysis.linearization import closed_loop
 from fdof_jax.tuning.limits import excess, sensitivity
 
 FREE = PENDULUM.replace(gravity=0)

@@ -100,10 +100,12 @@ def test_malformed_tests_are_refused(arm):
     pid = fj.control.PIDController(9.0, 1.0, 1.0, np.inf, pd.reference)
     loose = fj.PDController([9.0, 0.0, 9.0], pd.kd, pd.limit, pd.reference)
     weightless = linkage.replace(gravity=0)
+    heavy, weak = linkage.replace(gravity=9.81), controller_of(linkage, q, limit=0.1)
     for arguments, step, message in [
         ((linkage, q, pd), 0, "step: .* above 0"),
         ((linkage, q, pid), 1, "controller: expected a PDController, or a drive"),
         ((weightless, q, loose), 1, "controller: expected one with which each joint"),
+        ((heavy, q, weak), 1, r"controller: .* limits .* got \[0.1, .* needs"),
     ]:
         with pytest.raises(ValueError, match=message):
             fj.analysis.step_and_sine(*arguments, step=step, duration=1.0)

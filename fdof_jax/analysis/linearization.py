@@ -1,20 +1,22 @@
-"""Linear analysis for control: the matrices A and B, and modes along a motion."""
+"""Linear analysis for control: matrices of the arm and its loops, modes of motions."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Complex, Float
 from numpy.typing import ArrayLike
 
 from ..base.checks import in_order, instance, is_traced, real_array
-from ..dynamics import forward_dynamics
+from ..dynamics import forward_dynamics, joint_bias, joint_mass_matrix
 from ..forces.element import Element, Forces, elements_on, of_full_size
 from ..linkage.coordinates import State, real_state
 from ..linkage.linkage import Linkage, check_linkage, without_fixed
+from ..linkage.topology import fixed_pairs
 from ..simulation.field import element_effort, stateful
 from ..simulation.prescribed import prescribed
 from ..simulation.solution import Solution, check_joints
@@ -111,6 +113,39 @@ def _each_linearized(
     # A loop compiles in two thirds of the time of `jax.vmap`, and runs four times as
     # fast (101 times of Fig 7, one core).
     return jax.lax.map(lambda row: _linearized(linkage, forces, *row).A, rows)
+
+
+@eqx.filter_jit
+def closed_loop(
+    linkage: Linkage, controller: Element, forces: tuple[Element, ...], q: Array, t: Any
+) -> tuple[Array, Array, Array]:
+    """Linearises an arm under a controller about rest at `q`: A, B and C.
+
+    The state y is (q, qd, the controller's own): dy/dt = A y + B tau with efforts tau
+    added to the controller's, which are -C y. Constant efforts hold the arm at rest.
+    """
+    own, rebuilt = ravel_pytree(controller.initial_state(linkage))
+    n, still = q.size, jnp.zeros_like(q)
+    inverse = jnp.linalg.inv(joint_mass_matrix(linkage, q, forces))
+    inverse = jnp.where(jnp.stack(fixed_pairs(linkage.ef)), 0, inverse)
+    B = jnp.concatenate([jnp.zeros((n, n)), inverse, jnp.zeros((own.size, n))])
+
+    def acting(y):
+        q, qd, _ = jnp.split(y, [n, 2 * n])
+        weight = joint_bias(linkage, q, still, forces)
+        return total_effort(linkage, forces, t, q, qd) - weight
+
+    def respond(y):
+        q, qd, own = jnp.split(y, [n, 2 * n])
+        effort, rate = controller.act(t, q, qd, linkage, rebuilt(own))
+        return jnp.concatenate([effort, ravel_pytree(rate)[0]])
+
+    # At rest neither M^-1, multiplied by no effort, nor Coriolis forces have a slope.
+    y = jnp.concatenate([q, still, own])
+    alone, slopes = jax.jacfwd(acting)(y), jax.jacfwd(respond)(y)
+    efforts, rates = slopes[:n], slopes[n:]
+    moved = jnp.concatenate([jnp.eye(n, len(y), n), jnp.zeros((n, len(y))), rates])
+    return moved + B @ (alone + efforts), B, -efforts
 
 
 class Modes(eqx.Module):

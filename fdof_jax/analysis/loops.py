@@ -3,11 +3,7 @@
 from typing import Any
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jax import Array
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Complex, Float
 from numpy.typing import ArrayLike
 from scipy.linalg import block_diag, eigvals
@@ -15,8 +11,7 @@ from scipy.optimize import minimize_scalar
 
 from ..base.checks import is_traced, one_of, real_array, refusal
 from ..base.html_table import html_table
-from ..dynamics import joint_bias, joint_mass_matrix
-from ..forces.element import Element, Forces, elements_on, of_full_size
+from ..forces.element import Forces, elements_on, of_full_size
 from ..linkage.linkage import (
     Linkage,
     check_linkage,
@@ -24,48 +19,14 @@ from ..linkage.linkage import (
     moving_joints,
     per_joint,
 )
-from ..linkage.topology import fixed_pairs
 from ..simulation.prescribed import prescribed
-from .linearization import checked, total_effort
+from .linearization import checked, closed_loop
 
 # A frequency counts as a crossing if the response there is on the curve to this part.
 _ON_CURVE = 1e-6
 # Gain margins beyond this are zeros at infinity or poles at rest, rounded.
 _LARGEST_MARGIN = 1e6
 BANDWIDTH = 10 ** (-3 / 20)  # -3 dB
-
-
-@eqx.filter_jit
-def closed_loop(
-    linkage: Linkage, controller: Element, forces: tuple[Element, ...], q: Array, t: Any
-) -> tuple[Array, Array, Array]:
-    """Linearises an arm under a controller about rest at `q`: A, B and C.
-
-    The state y is (q, qd, the controller's own): dy/dt = A y + B tau with efforts tau
-    added to the controller's, which are -C y. Constant efforts hold the arm at rest.
-    """
-    own, rebuilt = ravel_pytree(controller.initial_state(linkage))
-    n, still = q.size, jnp.zeros_like(q)
-    inverse = jnp.linalg.inv(joint_mass_matrix(linkage, q, forces))
-    inverse = jnp.where(jnp.stack(fixed_pairs(linkage.ef)), 0, inverse)
-    B = jnp.concatenate([jnp.zeros((n, n)), inverse, jnp.zeros((own.size, n))])
-
-    def acting(y):
-        q, qd, _ = jnp.split(y, [n, 2 * n])
-        weight = joint_bias(linkage, q, still, forces)
-        return total_effort(linkage, forces, t, q, qd) - weight
-
-    def respond(y):
-        q, qd, own = jnp.split(y, [n, 2 * n])
-        effort, rate = controller.act(t, q, qd, linkage, rebuilt(own))
-        return jnp.concatenate([effort, ravel_pytree(rate)[0]])
-
-    # At rest neither M^-1, multiplied by no effort, nor Coriolis forces have a slope.
-    y = jnp.concatenate([q, still, own])
-    alone, slopes = jax.jacfwd(acting)(y), jax.jacfwd(respond)(y)
-    efforts, rates = slopes[:n], slopes[n:]
-    moved = jnp.concatenate([jnp.eye(n, len(y), n), jnp.zeros((n, len(y))), rates])
-    return moved + B @ (alone + efforts), B, -efforts
 
 
 class OpenLoop(eqx.Module):
@@ -84,7 +45,11 @@ class OpenLoop(eqx.Module):
       [s], that make the closed loop unstable.
     - `gain_margin`: factor on the loop, the nearest to 1, that makes it unstable.
     - `modulus_margin`: least distance |1 + L| at all frequencies.
-    - `bandwidth`: frequency above which the joint follows by less than -3 dB [rad/s].
+    - `bandwidth`: frequency above which the joint follows its reference by 3 dB less
+      than at rest [rad/s].
+
+    The four margins are NaN unless `stable`. Where L is zero, no change makes the
+    closed loop unstable: the margins are infinite, that of the modulus 1.
     """
 
     A: Float[np.ndarray, "state state"]
@@ -107,7 +72,7 @@ class OpenLoop(eqx.Module):
 
     @property
     def stable(self) -> bool:
-        """True if all modes of the closed loop decay; margins mean little otherwise."""
+        """True if all modes of the closed loop decay; otherwise it has no margins."""
         return self.slowest_decay > 0
 
     @property
@@ -126,14 +91,21 @@ class OpenLoop(eqx.Module):
     def phase_margin(self) -> float:
         """Least change of the phase that makes the closed loop unstable [rad].
 
-        Infinite if |L| is nowhere 1.
+        Infinite if |L| is nowhere 1, NaN unless `stable`.
         """
+        if not self.stable:
+            return np.nan
         _, margins = self._crossing
         return float(min(margins, key=abs)) if margins.size else np.inf
 
     @property
     def delay_margin(self) -> float:
-        """Least delay within the loop that makes the closed loop unstable [s]."""
+        """Least delay within the loop that makes the closed loop unstable [s].
+
+        Infinite if none does, NaN unless `stable`.
+        """
+        if not self.stable:
+            return np.nan
         found, margins = self._crossing
         return float(np.min(margins % (2 * np.pi) / found, initial=np.inf))
 
@@ -141,8 +113,11 @@ class OpenLoop(eqx.Module):
     def gain_margin(self) -> float:
         """Factor on the loop, the nearest to 1, that makes the closed loop unstable.
 
-        A factor below 1 belongs to an arm that falls if the gains are too low.
+        A factor below 1 belongs to an arm that falls if the gains are too low. Infinite
+        if no factor makes it unstable, NaN unless `stable`.
         """
+        if not self.stable:
+            return np.nan
         # L(s) - L(-s) is zero where L is real.
         states = 2 * len(self.A)
         pencil = np.zeros((states + 1, states + 1))
@@ -167,8 +142,11 @@ class OpenLoop(eqx.Module):
         """Least distance |1 + L| from instability, at all frequencies.
 
         With m this distance, the loop stays stable for factors from 1 / (1 + m) to
-        1 / (1 - m), and the phase margin is at least 2 arcsin(m / 2).
+        1 / (1 - m), and the phase margin is at least 2 arcsin(m / 2). NaN unless
+        `stable`.
         """
+        if not self.stable:
+            return np.nan
         A, B, C = self._closed
         distance = lambda w: 1 / np.abs(1 - _response(A, B, C, w))
         rates = np.abs(np.linalg.eigvals(A))
@@ -180,18 +158,24 @@ class OpenLoop(eqx.Module):
 
     @property
     def bandwidth(self) -> float:
-        """Frequency above which the joint follows its reference by less than -3 dB.
+        """Frequency above which the joint follows by 3 dB less than at rest [rad/s].
 
-        The response L / (1 + L) is compared with that at rest [rad/s]; NaN if the joint
-        does not follow at rest.
+        The response to the reference is L / (1 + L); NaN if the joint does not follow
+        at rest.
         """
         closed = self._closed
         level = BANDWIDTH * float(np.abs(_response(*closed, 0.0)))
         return float(min(_frequencies_of(*closed, level), default=np.nan))
 
     def _rows(self) -> list[tuple[str, str]]:
+        state = "stable" if self.stable else "not stable, so it has no margins"
+        rows = [("closed loop", state)]
+        if not self(1.0):
+            return [*rows, ("controller", "no response: at its limit, or no gains")]
+        if not self.stable:
+            return rows
         return [
-            ("closed loop", "stable" if self.stable else "not stable"),
+            *rows,
             ("crossover", f"{self.crossover:.4g} rad/s"),
             ("phase margin", f"{np.rad2deg(self.phase_margin):.4g} degrees"),
             ("delay margin", f"{1e3 * self.delay_margin:.4g} ms"),
@@ -263,11 +247,11 @@ def open_loop(
     if is_traced(linkage, element, forces, q, t):
         raise ValueError("q: expected known values, outside of JAX's transformations.")
     A, B, C = map(np.asarray, closed_loop(linkage, element, forces, q, t))
-    # Without the states of fixed pairs, which stand still, and what no state drives.
+    # Without the states of fixed pairs, which stand still, and those of the controller
+    # that never change, as an integral without a gain, or act on nothing.
     n = len(names)
-    kept = np.array([*moving, *(n + k for k in moving), *range(2 * n, len(A))])
-    some = A[np.ix_(kept, kept)] != 0
-    kept = kept[some.any(axis=0) | some.any(axis=1)]
+    own = [k for k in range(2 * n, len(A)) if A[k].any() and A[:, k].any()]
+    kept = np.array([*moving, *(n + k for k in moving), *own])
     b, c = B[kept, index], C[index, kept]
     return OpenLoop(A[np.ix_(kept, kept)] + np.outer(b, c), b, c, names[index])
 

@@ -20,6 +20,7 @@ from ..linkage.linkage import (
     moving_joints,
     per_joint,
 )
+from .equilibria import holding_efforts
 from .loops import BANDWIDTH, open_loop
 from .probes import Probe, answer, at_rest, commanding, following
 
@@ -118,7 +119,7 @@ def step_and_sine(
     analyses the motions, so the function cannot be used within JAX's transformations.
 
     **Raises:** ValueError for malformed arguments, and if a joint does not follow its
-    reference at `q`.
+    reference at `q`, or where the arm comes to rest: its limits may be too low.
 
     >>> import fdof_jax as fj
     >>> arm, _, (pd,), _ = fj.scenes.fig7()
@@ -137,7 +138,7 @@ def step_and_sine(
     n = q.size
     step = real_array("step", step, (n,), above=0, broadcast=True, unit="m or rad")
     duration = real_array("duration", duration, (), above=0, unit="s")
-    if commanding(controller) is None:
+    if (pd := commanding(controller)) is None:
         expected = "a PDController, or a drive that holds one"
         raise refusal("controller", expected, controller)
     if is_traced(linkage, controller, forces, q, step, duration):
@@ -160,6 +161,13 @@ def step_and_sine(
         start = at_rest(linkage, resting, forces, q, time)
         loops = loops_at(start[0].q)
     bandwidths = np.array([loop.bandwidth for loop in loops])
+    if np.isnan(bandwidths).any():  # at a limit, a controller has no gains
+        needed = np.asarray(holding_efforts(linkage, q, forces)).round(6).tolist()
+        raise ValueError(
+            "controller: expected limits within which the arm comes to rest near q, "
+            f"got {pd.limit.tolist()}; to be held there it needs efforts of {needed} "
+            "(`holding_efforts`), and more to be caught as it sags."
+        )
     frequency = bandwidths[:, None] * _FREQUENCIES
     t0, count = float(duration), _SAMPLES - 1
     probes, times = [], []

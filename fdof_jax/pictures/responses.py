@@ -44,7 +44,8 @@ def bode_plot(loop: OpenLoop, fig: Figure | None = None) -> Figure:
 
     The upper panel shows the amplitude of L [dB], the lower one its phase [degrees].
     The gain margin stands where L is real and negative, at the left end if that is at
-    rest, and the phase margin at the crossover. Infinite margins are left out.
+    rest, and the phase margin at the crossover. Margins that are infinite or NaN are
+    left out.
 
     **Arguments:** `loop`: the result of `open_loop`.
     """
@@ -56,7 +57,7 @@ def bode_plot(loop: OpenLoop, fig: Figure | None = None) -> Figure:
     rates = np.abs(np.linalg.eigvals([loop.A, closed]))
     rates = rates[rates > 1e-6 * rates.max()]  # without poles at rest, rounded
     frequency = np.geomspace(rates.min() / 10, rates.max() * 10, 1000)
-    if crossing := np.isfinite(crossover):
+    if crossing := np.isfinite(loop.phase_margin):
         frequency = np.sort(np.append(frequency, crossover))
     response = loop(frequency)
     phase = np.rad2deg(np.unwrap(np.angle(response)))

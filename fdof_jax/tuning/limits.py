@@ -8,8 +8,8 @@ import numpy as np
 from jax import Array
 
 from ..analysis.equilibria import equilibrium
-from ..analysis.linearization import checked
-from ..analysis.loops import closed_loop, open_loop
+from ..analysis.linearization import checked, closed_loop
+from ..analysis.loops import open_loop
 from ..analysis.responses import BAND
 from ..analysis.tracking import demands
 from ..control.pd import PDController
