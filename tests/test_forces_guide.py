@@ -20,6 +20,7 @@ def test_examples():
     assert namespace["reactions"].shape == (101, 3, 3)
     assert namespace["torque"].shape == (101, 3)
     assert np.isfinite(namespace["effort"]).all()
+    assert 0 < namespace["share"][0] < 0.5 and not namespace["share"][1:].any()
     assert np.isfinite(namespace["sampled"].q).all()
     assert np.isfinite(namespace["after"].q).all()
     np.testing.assert_allclose(

@@ -108,6 +108,13 @@ def test_a_path_out_of_reach_is_refused_where_it_is_simulated():
         fj.simulate(ARM, start, [0, 2], forces)
 
 
+def test_a_task_without_an_orientation_needs_an_arm_of_two_joints():
+    line = fj.references.Line([1, 0], [1, 1])
+    task = fj.TipTask(line, fj.references.Travel(2.0), orientation=None)
+    with pytest.raises(ValueError, match="linkage: expected 2 joints .* got 3"):
+        task(0.0, ARM)
+
+
 @pytest.mark.parametrize("x", [0.3, 0.5])
 def test_a_path_behind_the_pivot_is_refused_where_it_is_simulated(x):
     ring = fj.TipTask(

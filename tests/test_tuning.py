@@ -118,7 +118,7 @@ def test_progress_is_reported_and_the_result_prints_itself():
     text = str(result)
     assert "kp of R1 [N m/rad]" in text and "kd of P2 [N s/m]" in text
     assert f"{1e3 * result.tip_error:.5g}" in text
-    assert "not converged, 2 iterations: stopped after 2 evaluations" in text
+    assert "not converged, 2 iterations: stopped after 2 evaluations (max_st" in text
     assert ("at its bound" in text) == result.at_bound.any()
 
 

@@ -130,7 +130,7 @@ def next_motion(
     within: Callable[[Scene, Solution], Array] | None = None,
     observe: Observe = link_ends,
     scale: Mapping[str, ArrayLike] | None = None,
-    max_steps: int = 200,
+    max_steps: int = 1000,
     report: Callable[[str], Any] | None = None,
 ) -> NextMotion:
     """Computes the motion that cuts the largest standard error of a fit most.

@@ -190,7 +190,9 @@ def fit(
       the scene's `t1` is ignored. A list of several, Equinox modules that differ in
       numbers, is fitted together, with one recording each.
     - `start`: first guess of each parameter, in its own SI unit.
-    - `ts`: increasing times (time,), from the start of the motion [s].
+    - `ts`: increasing times (time,) [s]. The motion starts at `ts[0]`, in the scene's
+      state. For a recording that begins later, keep the time of the start, with NaN
+      for its readings.
     - `observed`: the recording, of the shape that `observe` returns; recordings of
       several scenes are stacked along a leading axis. NaN marks a missing sample.
     - `observe`: `(scene, solution) -> readings`, an array with time as first axis. By

@@ -55,12 +55,13 @@ class FitResult(eqx.Module):
     - `history`: weighted sum of squares over all of the recording, at the start of the
       last search (the result over three quarters of it) and at each accepted point.
     - `held_out`: root mean square of the residuals of each recording given as
-      `validate`, relative to the noise [1].
+      `validate`, relative to the noise [1]. Without a given noise this is not `noise`,
+      but the estimate by changes between successive residuals.
     - `faults`: reasons not to use the parameters, in words: a search that has not
       converged, combinations that are `weak`, residuals well above the noise, and
       held-out residuals above it (a tenth and three standard deviations are allowed;
       the errors of the parameters add to them, by a factor that is named).
-      The noise is that given, or by changes between successive residuals.
+      The noise is the same as for `held_out`.
     """
 
     parameters: dict[str, Any]

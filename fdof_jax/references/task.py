@@ -87,11 +87,13 @@ class TipReference(Reference):
     ) -> tuple[Float[Array, " joint"], Float[Array, " joint"]]:
         """Joint positions [m or rad] and velocities [m/s or rad/s] at time `t` [s].
 
-        Out of reach, raises ValueError for known arguments and returns NaN for traced
-        ones. At the edge of the reach the velocities are not finite.
+        Out of reach, or for an arm with another number of joints, raises ValueError for
+        known arguments and returns NaN for traced ones. At the edge of the reach the
+        velocities are not finite.
         """
         motion = super().__call__(t, linkage)
         if not (is_traced(motion) or np.isfinite(motion).all()):
+            arm_of(linkage, self.orientation is not None)  # another number of joints
             tip = np.round(self.tip(t), 6)
             raise ValueError(
                 f"t: expected a time at which the tip is within {self._reach()}, got "

@@ -148,5 +148,8 @@ def minimise(
             report(f"{number:4d}  {describe(runs)}, {active}")
     for run in runs:
         if not run.reason:
-            run.exhausted, run.reason = True, f"stopped after {max_steps} evaluations"
+            run.exhausted, run.reason = (
+                True,
+                f"stopped after {max_steps} evaluations (max_steps)",
+            )
     return runs

@@ -70,7 +70,7 @@ class TunedWithin(eqx.Module):
     - `scene`: the scene with its tuned gains.
     - `loss`: loss with the tuned gains, without any penalty.
     - `start`: kp and kd at the start (2, n).
-    - `search`: the last search, whose loss includes the penalty.
+    - `search`: the search that led there, whose loss includes the penalty.
     - `limit`, `joint`, `allowed`, `reached`: a row per limit: its name, the joint's
       name, and the allowed and the reached value [1, s, N or N m]; NaN if it does
       not settle. Margins are those of `OpenLoop`.
@@ -110,10 +110,10 @@ class TunedWithin(eqx.Module):
 
     @property
     def _verdict(self) -> str:
-        return (
-            f"loss {self.loss:.5g}, {self.met.sum()} of {self.met.size} limits met; "
-            f"last search: {self.search.message}"
-        )
+        count = f"{self.met.sum()} of {self.met.size} limits met"
+        if not self.met.all():
+            count += " (no search met all; this one exceeds them least)"
+        return f"loss {self.loss:.5g}, {count}; its search: {self.search.message}"
 
     def __str__(self) -> str:
         return as_text(self._rows(), [self._verdict])
@@ -146,8 +146,10 @@ def tune_within(
     - `loss`, `factor`, `bounds`, `report`: as in `tune`.
     - `max_steps`: greatest number of evaluations of each search after the first.
 
-    **Returns:** a `TunedWithin`, which says which limits are met. Limits that gains
-    within the bounds cannot meet are reported there.
+    **Returns:** a `TunedWithin`, which says which limits are met. If no search meets
+    all, it holds the one whose greatest excess is least: positions at any time count as
+    shares of the step, efforts and margins as shares of their limits. The excess is
+    then spread over several limits; other gains may meet more of them.
 
     **Raises:** ValueError as `tune`, and if the arm has no equilibrium at the last set
     point.
@@ -189,7 +191,7 @@ def tune_within(
         )
     weight = max(value, 1e-12) / _EXCESS
     shift, before = np.zeros_like(beyond), (np.inf, np.inf)
-    searches: list[TuneResult] = []
+    tried: list[tuple[float, float, Scene, Solution, TuneResult]] = []
     for _ in range(_SEARCHES):
         priced = _Penalised(
             loss, limits, jnp.asarray(shift), jnp.asarray(weight), with_margins
@@ -198,23 +200,24 @@ def tune_within(
             scene, loss=priced, bounds=(lower, upper), max_steps=max_steps,
             report=report,
         )  # fmt: skip
-        searches.append(found)
         scene = found.scene
         motion, value, beyond = judged(scene)
         worst = beyond.max()
+        tried.append((max(worst, 0.0), value, scene, motion, found))
         if worst <= 0 and value > (1 - _SAME) * before[0]:
             break
         shift = np.maximum(beyond + _WITHIN + shift, 0)
         if worst > max(_PROGRESS * before[1], 0):
             weight, shift = weight * _HEAVIER, shift / _HEAVIER
         before = value, worst
+    _, value, scene, motion, found = min(tried, key=lambda row: row[:2])
     rows = list(measured(scene, motion, limits))
     limit, joint, allowed, reached = zip(*rows) if rows else ((),) * 4
     return TunedWithin(
         scene=scene,
         loss=value,
         start=start,
-        search=searches[-1],
+        search=found,
         limit=limit,
         joint=joint,
         allowed=np.array(allowed),
