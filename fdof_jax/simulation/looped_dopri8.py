@@ -52,21 +52,22 @@ def _step(term: Any, t0, t1, y0, lost, args):
     # diffrax wraps the term to integrate backward in time too.
     inner, h = term.term, term.contr(t0, t1)
     times = (t0 + (t1 - t0) * jnp.asarray(NODES, t0.dtype)) * term.direction
-    schedule = jax.vmap(inner.schedule, in_axes=(0, None))(times, args)
     lower = jnp.asarray(LOWER, h.dtype)
 
     def stage(rates, row):
-        index, t, weights, scheduled = row
+        index, t, weights = row
+        scheduled = inner.schedule(t, args)  # of all stages at once it takes longer
         y = jtu.tree_map(lambda a, k: a + h * k, y0, _weighted(weights, rates))
         rate, health = inner.watched_field(t, y, args, scheduled)
-        return jtu.tree_map(lambda ks, k: ks.at[index].set(k), rates, rate), health
+        rates = jtu.tree_map(lambda ks, k: ks.at[index].set(k), rates, rate)
+        return rates, (health, scheduled)
 
     # The first rate is that of the last step's end. To evaluate it again costs a
     # fourteenth; to keep it, a second copy of the equations for the first step.
     rates = jtu.tree_map(lambda y: jnp.zeros((STAGES, *y.shape), y.dtype), y0)
     weights = jnp.concatenate([jnp.zeros((1, STAGES), h.dtype), lower])
-    stages = jnp.arange(STAGES), times, weights, schedule
-    rates, healths = jax.lax.scan(stage, rates, stages)
+    stages = jnp.arange(STAGES), times, weights
+    rates, (healths, schedule) = jax.lax.scan(stage, rates, stages)
     change = jtu.tree_map(lambda k, c: h * k + c, _weighted(lower[-1], rates), lost)
     y, lost = compensated(y0, change)
     weights = jnp.asarray(TABLEAU.b_error, h.dtype)
