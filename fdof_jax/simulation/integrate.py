@@ -1,6 +1,5 @@
 """Integrates the equations of motion with diffrax: free, prescribed, differentiated."""
 
-from collections.abc import Callable
 from typing import Any
 
 import diffrax
@@ -13,7 +12,7 @@ from ..base.callbacks import without_checks
 from ..forces.joints import EffortHistory
 from ..linkage.linkage import possible, without_fixed
 from ..mechanics.equations import zeros
-from .dopri8 import ScheduledTerm, constant
+from .dopri8 import constant
 from .field import (
     Args,
     args_of,
@@ -27,16 +26,9 @@ from .known_times import clocks_apart, known_times
 from .looped_dopri8 import LoopedDopri8
 from .packing import in_arrays
 from .prescribed import agrees, motion_at, start_of, term_of
-from .rounding import AboveRounding, Recorded
 from .solution import Solution
-from .step_wrappers import Watched, bounded, with_judge
-from .steps import default_controller
+from .steps import accounted, step_control
 from .switching import Located, LocatedImplicit, located, switching_facts
-from .unrolled_dopri8 import UnrolledDopri8
-
-# Longest steps, over the time scale of a mode, that keep its tangents right to 1e-7
-# over 10 s: for methods of order 8, and for lower orders down to 5.
-_OF_TIME_SCALE = 0.7, 0.1
 
 
 def _step_for_tangents(t0: Array, args: Args, own: tuple, fraction: float) -> Array:
@@ -80,7 +72,7 @@ def integrate(
     valid, own = valid & known, tuple(jnp.where(known, x, 0) for x in own)
     term = term_of(forces)
     bound = lambda fraction: _step_for_tangents(ts[0], args, own, fraction)
-    controller = _controller(
+    controller = step_control(
         keywords["stepsize_controller"], solver, term, bound if derivatives else None
     )
     unpacked, y0 = args, whole(*start_of(args, qd0), own)
@@ -96,9 +88,7 @@ def integrate(
     start = term, ts[0], y0, args, known_times(args, *left_out)
     located_solver, controller, y0 = located(locate, solver, controller, *start)
     if adaptive:
-        controller = Recorded(controller)  # pyright: ignore[reportCallIssue]
-        if not isinstance(solver, UnrolledDopri8 | LoopedDopri8):
-            controller = Watched(controller, term.health)  # pyright: ignore[reportCallIssue]
+        controller = accounted(controller, solver, term)
     # diffrax computes a few constants while it is traced.
     with without_checks(), jax.transfer_guard("allow"):
         found = diffrax.diffeqsolve(
@@ -178,24 +168,6 @@ def _valid(inputs, padded: bool) -> tuple[Array, Array, tuple[Array, Array]]:
     valid = valid & agrees(forces, ts[0], jnp.asarray(state0.q), linkage)
     q0, qd0 = (without_fixed(linkage, jnp.where(finite, a, 0)) for a in state0)
     return valid, ts, (q0, qd0)
-
-
-def _controller(
-    controller: Any,
-    solver: diffrax.AbstractSolver,
-    term: ScheduledTerm,
-    bound: Callable[[float], Array] | None,
-) -> Any:
-    """Returns the given or default step control, with the bound for derivatives."""
-    # Implicit solvers are chosen for stiff modes, which would bound steps too tightly.
-    implicit = isinstance(solver, diffrax.AbstractImplicitSolver)
-    trusted = controller is not None and implicit
-    if controller is None:
-        controller = default_controller()
-    if bound is not None and not trusted:
-        fraction = _OF_TIME_SCALE[0 if (solver.order(term) or 0) >= 8 else 1]
-        controller = bounded(controller, lambda: bound(fraction))
-    return with_judge(AboveRounding, controller)
 
 
 def _judged(valid: Array, result: Any, q: Array, qd: Array) -> Any:

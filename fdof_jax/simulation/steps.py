@@ -1,6 +1,12 @@
-"""Tolerances of diffrax's step size controllers: defaults, limits and scales."""
+"""Step control: tolerances, their limits and scales, and the wrappers of a controller.
+
+A controller that judges errors stands inside. Around it, in this order, `step_control`
+keeps it from chasing rounding errors, `switching.located` ends its steps at known times
+and switches, and `accounted` records what accuracy is left.
+"""
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import diffrax
@@ -14,11 +20,15 @@ from ..base.user_warnings import warn
 from ..linkage.coordinates import State
 from ..linkage.linkage import Linkage, check_linkage, joints_of
 from ..linkage.topology import real_joints
-from .dopri8 import Estimate
-from .step_wrappers import Adaptive, with_pid
+from .dopri8 import Estimate, ScheduledDopri8, ScheduledTerm
+from .rounding import AboveRounding, Recorded
+from .step_wrappers import Adaptive, Watched, bounded, with_judge, with_pid
 
 # Rounding keeps float32 from meeting a tighter relative or absolute tolerance.
 _TIGHTEST_SINGLE = 1e-6
+# Longest steps, over the time scale of a mode, that keep its tangents right to 1e-7
+# over 10 s: for methods of order 8, and for lower orders down to 5.
+_OF_TIME_SCALE = 0.7, 0.1
 
 
 def adaptive(double: float, single: float) -> diffrax.PIDController:
@@ -79,6 +89,32 @@ def within_reach(
         return _TIGHTEST_SINGLE
 
     return with_pid(mended, controller)
+
+
+def step_control(
+    controller: Any,
+    solver: diffrax.AbstractSolver,
+    term: ScheduledTerm,
+    bound: Callable[[float], Array] | None,
+) -> Any:
+    """Returns the given or default step control, with the bound for derivatives."""
+    # Implicit solvers are chosen for stiff modes, which would bound steps too tightly.
+    implicit = isinstance(solver, diffrax.AbstractImplicitSolver)
+    trusted = controller is not None and implicit
+    if controller is None:
+        controller = default_controller()
+    if bound is not None and not trusted:
+        fraction = _OF_TIME_SCALE[0 if (solver.order(term) or 0) >= 8 else 1]
+        controller = bounded(controller, lambda: bound(fraction))
+    return with_judge(AboveRounding, controller)
+
+
+def accounted(controller: Any, solver: Any, term: ScheduledTerm) -> Any:
+    """Returns an adaptive controller that records the accuracy of the equations."""
+    controller = Recorded(controller)  # pyright: ignore[reportCallIssue]
+    if isinstance(solver, ScheduledDopri8):  # these check the health themselves
+        return controller
+    return Watched(controller, term.health)  # pyright: ignore[reportCallIssue]
 
 
 class _Scaled(Adaptive):
