@@ -15,7 +15,7 @@ from ..base.checks import refusal
 from ..linkage.linkage import Linkage
 from ..references.reference import reference_of
 from ..references.task import TipReference
-from ..simulation.solution import Solution
+from ..simulation.sampled import Motion
 from .arms import geometry
 from .axes import SERIES, axes_or_new, filled_mapping, legend, plane_axes, reached, xy
 
@@ -53,7 +53,7 @@ def _tips(linkage: Any, task: Any, solutions: Any) -> list[tuple]:
 def tracking(
     linkage: Linkage,
     task: TipReference,
-    solutions: Mapping[str, Solution],
+    solutions: Mapping[str, Motion],
     ax: Axes | None = None,
 ) -> Axes:
     """Plots paths of the tip over the commanded path; dots are the starts.
@@ -75,7 +75,7 @@ def tracking(
 
 
 def tracking_by_error(
-    linkage: Linkage, task: TipReference, solution: Solution, ax: Axes | None = None
+    linkage: Linkage, task: TipReference, solution: Motion, ax: Axes | None = None
 ) -> Axes:
     """Plots the path of the tip, coloured by its distance from its set point [mm].
 
@@ -112,7 +112,7 @@ def tracking_by_error(
 def tracking_error(
     linkage: Linkage,
     task: TipReference,
-    solutions: Mapping[str, Solution],
+    solutions: Mapping[str, Motion],
     ax: Axes | None = None,
 ) -> Axes:
     """Plots the distance of the tip from its set point over time [m].
