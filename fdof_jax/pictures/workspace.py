@@ -14,7 +14,7 @@ from ..base.checks import real_array
 from ..dynamics import joint_mass_matrix
 from ..forces.element import Forces
 from ..linkage.linkage import Linkage, check_linkage, joint_names, joints_of
-from ..linkage.topology import letters
+from ..linkage.topology import check_angles, letters
 from ..mechanics.kinematics import tip_jacobian
 from .arms import Geometry, draw_motion, geometry
 from .axes import GREY, SERIES, legend, plane_axes, xy
@@ -31,6 +31,7 @@ def _ranges(linkage: Linkage, lower: Any, upper: Any, orientation: Any) -> Range
             name, value, (n,), finite=False, broadcast=True, unit="m or rad"
         )
         ends.append(np.asarray(end))
+        check_angles(name, end, linkage.ef)
         for joint, end in zip(joint_names(linkage), ends[-1]):
             if joint[0] == "P" and not np.isfinite(end):
                 raise ValueError(
