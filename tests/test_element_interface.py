@@ -225,6 +225,20 @@ def test_a_reference_of_one_s_own():
     assert fj.PDController(1.0, 1.0, 1.0, Hold(q)).jump_ts is None
 
 
+@pytest.mark.parametrize(
+    "function",
+    [
+        lambda t, q, qd, linkage: np.sign(qd),
+        lambda t, q, qd, linkage: q if t < 0.2 else qd,
+        lambda t, q, qd, linkage: -float(q[0]) * qd,
+    ],
+)
+def test_functions_that_cannot_be_traced_are_refused(function):
+    (element,), q = elements("forces", (function,)), np.zeros(3)
+    with pytest.raises(TypeError, match=r"^forces\[0\]: expected jax\.numpy .*, got: "):
+        element_effort(0, element, TS[0], q, q, ARM, ())
+
+
 def test_a_reference_without_a_motion_is_refused():
     class Nothing(fj.references.Reference):
         pass

@@ -141,6 +141,8 @@ class SpringDamper(LineElement):
 class Tension(LineElement):
     """A constant force between two points, along the line that joins them.
 
+    Its potential energy is tension times length, which `energy` includes.
+
     **Arguments:** `a`, `b`: the two `Point`s; `tension`: positive pulls them
     together [N].
 

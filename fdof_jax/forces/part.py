@@ -248,7 +248,7 @@ def check_joints(place: str, part: Part, linkage: Linkage) -> None:
             if wanted == JOINT and size != count:
                 raise ValueError(
                     f"{place}{name}: expected numbers for {count} joints, as the "
-                    f"linkage has, got {size}."
+                    f"linkage has, got {size}; sweep(..., forces_axes=0) takes a batch."
                 )
         if rules["unit"] == "m or rad":
             check_angles(f"{place}{name}", value, linkage.ef)

@@ -165,7 +165,7 @@ def simulate(
     check_linkage(linkage)
     single_precision("linkage", linkage)
     state0 = real_state("state0", state0, linkage)
-    ts = real_array("ts", ts, (None,))
+    ts = real_array("ts", ts, (None,), of="times, for instance [0, 2.0]")
     increasing("ts", ts)
     forces = elements("forces", forces)
     keywords = solve_options(
