@@ -16,6 +16,7 @@ from test_drawing import (
     NOWHERE,
     SOLUTION,
     labels,
+    lines,
     made_up,
     make_linkage,
     named,
@@ -29,6 +30,7 @@ from fdof_jax import (
     JointEffort,
     PDController,
     Solution,
+    drawing,
     plotting,
     simulate,
     tip_position,
@@ -234,6 +236,20 @@ def test_tracking_and_its_error():
     np.testing.assert_allclose(off, 0.5)
     expected = tip_position(linkage, solutions["paper"].q[-1])
     np.testing.assert_allclose(curves["paper"][-1], expected, atol=1e-12)
+
+    arm = drawing.chrono_cyclograph(linkage, solutions["paper"], until=0.5)
+    plotting.tracking(linkage, task, solutions, arm)
+    assert "tip path" not in labels(arm)  # it is the curve
+    color = {line.get_label(): line.get_color() for line in arm.lines}
+    links = {color[f"link {k}"] for k in (1, 2, 3)}
+    assert not links & {color["paper"], color["tuned"]}
+    drawn = drawing.draw_linkage(
+        linkage, [0, 0, 0], forces=(PDController(1, 1, 1, task),)
+    )
+    (path,) = [line for line in arm.lines if line.get_label() == "commanded"]
+    same = lines(drawn)["commanded 0"]
+    assert path.get_linestyle() == same.get_linestyle() == "--"
+    assert path.get_color() == same.get_color()
 
     error = plotting.tracking_error(linkage, task, solutions)
     assert (error.get_xlabel(), error.get_ylabel()) == ("time [s]", "tip error [m]")
