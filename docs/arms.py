@@ -13,6 +13,7 @@ import numpy as np
 import fdof_jax as fj
 from fdof_jax import drawing
 from fdof_jax.pictures.axes import figure_legend
+from fdof_jax.pictures.elements import COMMANDED
 
 fj.configure(x64=True)
 ts = np.linspace(0, 5, 501)  # one turn of the circle
@@ -34,6 +35,6 @@ animation = drawing.animate_grid(
     fps=20,
 )
 circle = np.asarray([scene.forces[0].reference.tip(t) for t in ts[::5]])
-figure.axes[0].plot(*circle.T, "--k", lw=0.8, zorder=1, label="commanded")
+figure.axes[0].plot(*circle.T, zorder=1, label="commanded", **COMMANDED)
 figure_legend(figure)
 animation.save(Path(__file__).with_suffix(".gif"), dpi=80)

@@ -193,8 +193,8 @@ def energy(
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Computes the kinetic and potential energy of the linkage, (6) and (7).
 
-    **Arguments:** `q` [m or rad], `qd` [m/s or rad/s]; `forces`: force elements, whose
-    masses and springs add energy.
+    **Arguments:** `q` [m or rad], `qd` [m/s or rad/s]; `forces`: force elements, of
+    which masses, springs, stops and constant tensions add energy.
 
     **Returns:** two numbers [J]; the potential is zero at the ground pivot's height.
 

@@ -199,6 +199,11 @@ def test_times_that_do_not_increase_are_refused(ts):
     refused("ts", lambda: simulate(ts=ts))
 
 
+def test_a_single_time_is_refused_with_an_example():
+    with pytest.raises(ValueError, match=r"^ts: .* for instance \[0, 2\.0\], .* 2\.0"):
+        simulate(ts=2.0)
+
+
 @pytest.mark.parametrize("state0", [None, 3, [ZERO], (ZERO, ZERO, ZERO)], ids=repr)
 def test_what_is_not_a_state_is_refused(state0):
     refused("state0", lambda: simulate(state0=state0))

@@ -105,6 +105,19 @@ def test_slides_stand_across_their_link():
     np.testing.assert_allclose(turn[:2, 0], rail / 0.4, atol=1e-12)
 
 
+def test_a_slide_is_level_in_the_legend():
+    ax = drawing.draw_linkage(make_linkage("RPR"), [0.3, 0.4, -0.5])
+    (slide,) = [line for line in ax.lines if line.get_label() == "slide"]
+    assert slide.get_xydata().size == 0
+    assert not slide._marker.get_user_transform()
+
+
+def test_a_mass_centre_at_the_tip_hides_nothing():
+    ax = drawing.draw_linkage(make_linkage("RRR"), [0.0, 0, 0])
+    order = [line.get_gid() for line in ax.lines]
+    assert order.index("tip 3") < order.index("mass 3") < order.index("pin 3")
+
+
 def test_linkage_options():
     ax = plt.subplots()[1]
     linkage = make_linkage("RRP")

@@ -16,6 +16,7 @@ from test_drawing import (
     NOWHERE,
     SOLUTION,
     labels,
+    lines,
     made_up,
     make_linkage,
     named,
@@ -29,6 +30,7 @@ from fdof_jax import (
     JointEffort,
     PDController,
     Solution,
+    drawing,
     plotting,
     simulate,
     tip_position,
@@ -133,8 +135,11 @@ def test_energy_stack_rises_by_what_is_put_in():
     assert steps.min() < 0 < steps.max()  # it drives and brakes
     put_in = 20 * np.maximum(steps, 0).sum()
     np.testing.assert_allclose(line[-1] - line[0], put_in, rtol=1e-3)
-    with pytest.warns(UserWarning, match="energy_stack: the balance is off by"):
-        plotting.energy_stack(LIFT, (*forces[:2], JointEffort(np.zeros(3))), solution)
+    forgotten = (*forces[:2], JointEffort(np.zeros(3)))
+    fastest = solution.ts[np.argmax(np.abs(steps))]
+    said = rf"off by .* J, .* most at t = {fastest:.4g} s: .*\(try \d+ times as many\)"
+    with pytest.warns(UserWarning, match=said):
+        plotting.energy_stack(LIFT, forgotten, solution)
 
 
 def test_energy_stack_of_a_free_arm_and_of_what_was_reached():
@@ -231,6 +236,20 @@ def test_tracking_and_its_error():
     np.testing.assert_allclose(off, 0.5)
     expected = tip_position(linkage, solutions["paper"].q[-1])
     np.testing.assert_allclose(curves["paper"][-1], expected, atol=1e-12)
+
+    arm = drawing.chrono_cyclograph(linkage, solutions["paper"], until=0.5)
+    plotting.tracking(linkage, task, solutions, arm)
+    assert "tip path" not in labels(arm)  # it is the curve
+    color = {line.get_label(): line.get_color() for line in arm.lines}
+    links = {color[f"link {k}"] for k in (1, 2, 3)}
+    assert not links & {color["paper"], color["tuned"]}
+    drawn = drawing.draw_linkage(
+        linkage, [0, 0, 0], forces=(PDController(1, 1, 1, task),)
+    )
+    (path,) = [line for line in arm.lines if line.get_label() == "commanded"]
+    same = lines(drawn)["commanded 0"]
+    assert path.get_linestyle() == same.get_linestyle() == "--"
+    assert path.get_color() == same.get_color()
 
     error = plotting.tracking_error(linkage, task, solutions)
     assert (error.get_xlabel(), error.get_ylabel()) == ("time [s]", "tip error [m]")

@@ -35,6 +35,11 @@ def test_a_batch_is_expected():
     dampers = (jax.vmap(fj.JointDamper)(np.ones(4)),)
     with pytest.raises(ValueError, match=r"none on any \(pass forces_axes=0 if"):
         fj.sweep(ONE, STATE, TS, dampers)
+    many = (fj.JointDamper(np.ones(200)),)
+    with pytest.raises(ValueError, match=r"got 200; sweep\(..., forces_axes=0\) takes"):
+        fj.sweep(TWO, STATES, TS, many)
+    with pytest.raises(ValueError, match=r"^linkage: expected one .*\*arms\) stacks"):
+        fj.sweep([ONE, ONE], STATES, TS)
     empty = jax.tree.map(lambda a: a[:0], (TWO, STATES))
     refused(INPUTS, linkage=empty[0], state0=empty[1], forces=())
 

@@ -187,11 +187,21 @@ def test_a_stretched_arm_holds_any_force_along_itself():
     path = [[0.2, 0.0], [0.2, 0.9], [0.2, 1.1]]
     ax = drawing.force_ellipses(arm, path, 5.0)
     tip = np.asarray(fj.tip_position(arm, path[0]))
+    # Cut at a quarter of the arm's extent, open at its ends and dashed.
     x, y = (lines(ax)["ellipse 0"].get_xydata() - tip).T
-    assert np.isfinite(x).all()
-    far = np.hypot(x, y).argmax()
-    np.testing.assert_allclose(np.tan(0.2), y[far] / x[far])
-    assert set(labels(ax)) >= {"pin", "link 1", "tip path", "ground"}
+    along = np.cos(0.2) * x + np.sin(0.2) * y
+    np.testing.assert_allclose(along[[0, 36]], [-tip[0] / 4, tip[0] / 4], rtol=1e-6)
+    np.testing.assert_allclose(np.tan(0.2), (y[36] - y[0]) / (x[36] - x[0]))
+    assert np.isnan(x[37]) and np.isfinite(np.delete(x, 37)).all()
+    assert lines(ax)["ellipse 0"].get_linestyle() == "--"
+    assert lines(ax)["ellipse 1"].get_linestyle() == "-"
+    assert set(labels(ax)) >= {
+        "pin",
+        "link 1",
+        "tip path",
+        "ground",
+        "longer, cut here",
+    }
     flat = drawing.inertia_ellipses(arm, path[:1])
     moved = lines(flat)["ellipse 0"].get_xydata() - tip
     along = moved @ [np.cos(0.2), np.sin(0.2)]

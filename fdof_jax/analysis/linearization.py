@@ -19,7 +19,8 @@ from ..linkage.linkage import Linkage, check_linkage, without_fixed
 from ..linkage.topology import fixed_pairs
 from ..simulation.field import element_effort, stateful
 from ..simulation.prescribed import prescribed
-from ..simulation.solution import Solution, check_joints
+from ..simulation.sampled import check_joints
+from ..simulation.solution import Solution
 
 # Explicit Runge-Kutta methods of order 4 in 4 stages damp every damped mode if the step
 # size times |eigenvalue| is below this (2.8 for undamped and overdamped modes).

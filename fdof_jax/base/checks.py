@@ -118,12 +118,23 @@ def real_array(
 
 def radians(name: str, angles: np.ndarray) -> None:
     """Warns of angles that were probably meant in degrees: 30, 45, 60, ... 360."""
-    size = np.abs(angles)
-    found = angles[(size >= 30) & (size <= 360) & (size % 15 == 0)]
+    size = np.where(np.abs(angles) <= 360, np.abs(angles), 0)  # not infinite
+    found = angles[(size >= 30) & (size % 15 == 0)]
     if found.size:
         warn(
             f"{name}: expected angles in radians, got {found[0]:g}, which looks like "
             "degrees; numpy.deg2rad converts them."
+        )
+
+
+def single_precision(name: str, tree: Any) -> None:
+    """Warns of arrays in single precision while JAX has double precision."""
+    arrays = filter(eqx.is_array, jax.tree.leaves(tree))
+    short = any(leaf.dtype == jnp.float32 for leaf in arrays)
+    if short and jnp.result_type(float) == jnp.float64:
+        warn(
+            f"{name}: expected numbers in double precision, got some in float32, made "
+            "before it was set (fdof_jax.configure(x64=True)); build it again."
         )
 
 

@@ -74,7 +74,7 @@ def configure(
     **Arguments:** None leaves a setting as it is.
 
     - `x64`: whether numbers have double precision. Arms and elements that exist
-      already keep theirs.
+      already keep theirs; `simulate` warns of them.
     - `cache`: a folder that keeps compiled programs for later processes; True for a
       folder in the user's cache directory, False for no folder. Each kind of processor
       has its own subfolder. Programs are deleted only if

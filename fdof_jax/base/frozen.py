@@ -1,22 +1,60 @@
-"""Modules that do not change, and say how to get changed ones."""
+"""Modules that do not change, and return changed copies."""
 
+import inspect
 from dataclasses import FrozenInstanceError
-from typing import Any, ClassVar
+from typing import Any, Self
 
 import equinox as eqx
 
 
 class Frozen(eqx.Module):
-    """A module whose refusal of an assignment names the way to other values."""
+    """A module with a checked `replace`, which refused assignments name."""
 
-    _other: ClassVar[str] = "equinox.tree_at(lambda it: it.{0}, it, ...)"
+    def __init_subclass__(cls, **keywords: Any):
+        super().__init_subclass__(**keywords)
+        # Otherwise that of dataclasses, which does not know constructors.
+        cls.__replace__ = cls.replace
 
     def __setattr__(self, name: str, value: Any) -> None:
         try:
             super().__setattr__(name, value)
         except FrozenInstanceError:
-            way = self._other.format(name)
             raise FrozenInstanceError(
-                f"{name}: a {type(self).__name__} does not change; {way} returns "
-                "another."
+                f"{name}: a {type(self).__name__} does not change; its "
+                f"replace({name}=...) returns another."
             ) from None
+
+    def arguments(self) -> dict[str, Any]:
+        """Returns arguments of the constructor that make an equal one.
+
+        A class with a constructor of its own overrides it, unless each argument has a
+        field of its name.
+        """
+        fields, names = vars(self), inspect.signature(type(self)).parameters
+        if missing := [name for name in names if name not in fields]:
+            raise TypeError(
+                f"{type(self).__name__}: expected a method `arguments`, as the "
+                f"constructor has arguments that are no fields: {', '.join(missing)}."
+            )
+        return {name: fields[name] for name in names}
+
+    def replace(self, **values: Any) -> Self:
+        """Returns a copy with other values of some arguments, checked as a new one.
+
+        From Python 3.13 on `copy.replace` does the same.
+
+        **Arguments:** those of the constructor.
+
+        **Raises:** ValueError for malformed values and for unknown names.
+
+        >>> import fdof_jax as fj
+        >>> fj.scenes.fig5().linkage.replace(mass=[1, 1, 5]).mass.tolist()  # [kg]
+        [1.0, 1.0, 5.0]
+        """
+        now = self.arguments()
+        for name in values:
+            if name not in now:
+                raise ValueError(
+                    f"{name}: expected one of {', '.join(now)}, got another name."
+                )
+        return type(self)(**now | values)

@@ -57,6 +57,9 @@ class PIDController(StatefulElement):
         self.pd = PDController(kp, kd, limit, reference)
         self.ki = ki
 
+    def arguments(self) -> dict[str, Any]:
+        return self.pd.arguments() | {"ki": self.ki}
+
     def conditions(self):
         paired = ((self.ki <= 0) | (self.pd.kp > 0)).all()
         yield Condition(paired, "ki", "0 where kp is", (self.ki, self.pd.kp))

@@ -8,16 +8,16 @@ from ..base.checks import in_order, instance, known
 from ..base.names import optional_package
 from ..linkage.linkage import Linkage
 from ..linkage.topology import common_unit, names_and_units, rate_unit
-from ..simulation.solution import Solution, check_joints
+from ..simulation.sampled import Motion, check_joints
+from ..simulation.solution import Solution
 
 if TYPE_CHECKING:
     import pandas
     import xarray
 
 
-def _checked(linkage: Linkage, solution: Solution) -> tuple[np.ndarray, list[str]]:
+def _checked(linkage: Linkage, solution: Motion) -> tuple[np.ndarray, list[str]]:
     """The common times of all motions, and names of the batch axes."""
-    instance("solution", solution, Solution)
     instance("linkage", linkage, Linkage)
     check_joints("solution", solution, linkage)
     if not known(solution, linkage):
@@ -32,18 +32,20 @@ def _checked(linkage: Linkage, solution: Solution) -> tuple[np.ndarray, list[str
     return ts[0], batch
 
 
-def to_xarray(linkage: Linkage, solution: Solution) -> "xarray.Dataset":
+def to_xarray(linkage: Linkage, solution: Motion) -> "xarray.Dataset":
     """Converts a solution to an xarray Dataset, with names and units.
 
     The Dataset holds joint positions `q` and velocities `qd` over `time` and `joint`,
-    and the solution's `outcome`, `num_steps` and `time_reached` for each trajectory.
+    and the solution's `outcome`, `num_steps` and `time_reached` for each trajectory; a
+    `SampledMotion` has `outcome` alone.
     The joints are named R1, P2 and so on, with the coordinate `unit`; a joint of both
     kinds within a batch is named by its number. Batch axes come first, as `batch` (or
     `batch_1`, `batch_2` and so on). To name an axis and give it values, use
     `.rename(batch="payload").assign_coords(payload=masses)`.
 
     **Arguments:** `linkage`: that of the solution, one or a batch; `solution`: result
-    of `simulate`, of a batch of it, or of `sweep`, all at the same times [s].
+    of `simulate`, of a batch of it, or of `sweep`, all at the same times [s]; or a
+    `SampledMotion`.
 
     **Returns:** the Dataset; the attributes `units` of its variables are SI.
 
@@ -51,19 +53,21 @@ def to_xarray(linkage: Linkage, solution: Solution) -> "xarray.Dataset":
     for malformed arguments.
     """
     xarray = optional_package("xarray", "data")
-    swapped = isinstance(linkage, Solution)
+    swapped = isinstance(linkage, Motion)
     linkage, solution = in_order("linkage, solution", swapped, linkage, solution)
     times, batch = _checked(linkage, solution)
     names, units = names_and_units(linkage.ef)
     common = common_unit(units)
-    rows, steps = [*batch, "time", "joint"], solution.stats["num_steps"]
+    rows = [*batch, "time", "joint"]
     variables = {
         "q": (rows, solution.q, "joint position", common),
         "qd": (rows, solution.qd, "joint velocity", rate_unit(common)),
         "outcome": (batch, solution.outcome, "how the trajectory ended", ""),
-        "num_steps": (batch, steps, "number of steps", "1"),
-        "time_reached": (batch, solution.stats["time_reached"], "time reached", "s"),
     }
+    if isinstance(solution, Solution):
+        for name, unit in (("num_steps", "1"), ("time_reached", "s")):
+            label = name.replace("_", " ")
+            variables[name] = batch, solution.stats[name], label, unit
     coordinates = {
         "time": (["time"], times, "time", "s"),
         "joint": (["joint"], names, "joint", ""),
@@ -79,7 +83,7 @@ def to_xarray(linkage: Linkage, solution: Solution) -> "xarray.Dataset":
     return xarray.Dataset(labelled(variables), labelled(coordinates))
 
 
-def to_pandas(linkage: Linkage, solution: Solution) -> "pandas.DataFrame":
+def to_pandas(linkage: Linkage, solution: Motion) -> "pandas.DataFrame":
     """Converts a solution to a pandas DataFrame with a row per time.
 
     There is a column per joint position and velocity, named `R1 [rad]`, `P2 [m/s]` and
@@ -95,7 +99,7 @@ def to_pandas(linkage: Linkage, solution: Solution) -> "pandas.DataFrame":
     for malformed arguments.
     """
     pandas = optional_package("pandas", "data")
-    swapped = isinstance(linkage, Solution)
+    swapped = isinstance(linkage, Motion)
     linkage, solution = in_order("linkage, solution", swapped, linkage, solution)
     times, batch = _checked(linkage, solution)
     columns = {}

@@ -12,7 +12,7 @@ from ..linkage.frames import cross, dot, scalar_frames
 from ..linkage.linkage import Linkage, joints_of
 from .element import InertialElement
 from .part import Values, field, value_of
-from .points import Load, Point, Separation, length_of, over
+from .points import Load, Point, Separation, arguments_of, length_of, over
 
 
 class Armature(InertialElement):
@@ -88,6 +88,9 @@ class LinearActuator(InertialElement):
     ):
         self.ends = Separation(a, b)
         self.force, self.mass, self.com, self.inertia = force, mass, com, inertia
+
+    def arguments(self) -> dict[str, Any]:
+        return arguments_of(self)
 
     def _bodies(self, linkage: Linkage, q: Array) -> tuple[Array, Array, Array]:
         """Mass centres of cylinder and piston, and the vector between the pins."""

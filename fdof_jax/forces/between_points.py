@@ -17,7 +17,16 @@ from ..base.checks import instance
 from ..linkage.frames import scalar_frames
 from ..linkage.linkage import Linkage
 from .part import Values, field, of_kind, value_of
-from .points import Load, Point, PointElement, Separation, length_of, over, pick
+from .points import (
+    Load,
+    Point,
+    PointElement,
+    Separation,
+    arguments_of,
+    length_of,
+    over,
+    pick,
+)
 from .switches import switch
 
 
@@ -25,6 +34,9 @@ class LineElement(PointElement):
     """A force element that pulls two points together along the line that joins them."""
 
     ends: eqx.AbstractVar[Separation]
+
+    def arguments(self) -> dict[str, Any]:
+        return arguments_of(self)
 
     @abstractmethod
     def pull(self, scheduled: Any, length: Array, rate: Array) -> Array:
@@ -44,6 +56,9 @@ class LineElement(PointElement):
     def respond(self, scheduled, q, qd, linkage):
         _, slopes, pull = self._pull(scheduled, scalar_frames(linkage, q), qd)
         return tuple(-pull * slope for slope in slopes)
+
+
+_SIDES = {False: None, "cable": 1, "bumper": -1}
 
 
 class SpringDamper(LineElement):
@@ -87,13 +102,19 @@ class SpringDamper(LineElement):
         self.ends = Separation(a, b)
         self.stiffness, self.damping = stiffness, damping
         self.rest_length = rest_length
-        sides = {False: None, "cable": 1, "bumper": -1}
-        if not isinstance(one_sided, str | bool) or one_sided not in sides:
+        if not isinstance(one_sided, str | bool) or one_sided not in _SIDES:
             raise ValueError(
                 f"one_sided: expected False, 'cable' or 'bumper', got {one_sided!r}."
             )
-        side = sides[one_sided]
+        side = _SIDES[one_sided]
         self.side = None if side is None else jax.device_put(np.array(side))
+
+    def arguments(self) -> dict[str, Any]:
+        fields = super().arguments()
+        side = fields.pop("side")
+        number = None if side is None else int(side)
+        words = {number: word for word, number in _SIDES.items()}
+        return fields | {"one_sided": words[number]}
 
     def pull(self, scheduled, length, rate):
         # Without a rest length the pull is smooth even where the points meet.
@@ -119,6 +140,8 @@ class SpringDamper(LineElement):
 
 class Tension(LineElement):
     """A constant force between two points, along the line that joins them.
+
+    Its potential energy is tension times length, which `energy` includes.
 
     **Arguments:** `a`, `b`: the two `Point`s; `tension`: positive pulls them
     together [N].
@@ -148,6 +171,8 @@ class Tension(LineElement):
 
 
 def _flag(follows: Any) -> Array:
+    if isinstance(follows, Array) and follows.dtype == bool:
+        return follows  # of another wrench, by `replace`
     instance("follows", follows, bool)
     return jax.device_put(np.array(follows))
 

@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jax import Array
 
@@ -129,6 +130,14 @@ def of_full_size(linkage: Linkage, forces: tuple[Element, ...]) -> tuple[Element
     return tuple(sized(element, joints_of(linkage)) for element in forces)
 
 
+# What JAX raises where traced values meet NumPy, or decide in Python.
+_UNTRACEABLE = (
+    jax.errors.ConcretizationTypeError,
+    jax.errors.TracerArrayConversionError,
+    jax.errors.TracerIntegerConversionError,
+)
+
+
 @contextmanager
 def naming(place: str) -> Iterator[None]:
     """Adds an element's place, such as `forces[0]`, to messages about its values.
@@ -137,6 +146,12 @@ def naming(place: str) -> Iterator[None]:
     """
     try:
         yield
+    except _UNTRACEABLE as error:
+        reason = str(error).partition("\n")[0].rstrip(".")
+        raise TypeError(
+            f"{place}: expected jax.numpy in its functions, and no `if` on t, q or qd "
+            f"(jnp.where and fdof_jax.forces.switch choose), got: {reason}."
+        ) from error
     except ValueError as error:
         name, colon, _ = str(error).partition(": ")
         first, *_ = name.split(".")

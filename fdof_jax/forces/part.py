@@ -22,6 +22,7 @@ from ..base.array_namespace import in_numpy, namespace
 from ..base.checks import JOINT, concrete, function, instance, is_traced, real_array
 from ..base.frozen import Frozen
 from ..linkage.linkage import Linkage, joints_of, short
+from ..linkage.topology import check_angles
 
 
 class Values:
@@ -247,8 +248,10 @@ def check_joints(place: str, part: Part, linkage: Linkage) -> None:
             if wanted == JOINT and size != count:
                 raise ValueError(
                     f"{place}{name}: expected numbers for {count} joints, as the "
-                    f"linkage has, got {size}."
+                    f"linkage has, got {size}; sweep(..., forces_axes=0) takes a batch."
                 )
+        if rules["unit"] == "m or rad":
+            check_angles(f"{place}{name}", value, linkage.ef)
     _refuse(place, part.conditions_on(linkage))
     for name, inner in _within(part):
         check_joints(f"{place}{name}.", inner, linkage)

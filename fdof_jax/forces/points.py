@@ -36,7 +36,7 @@ def pick(link: Array, choices: list[Array]) -> Array:
 
 def _link(link: Any) -> Array:
     if isinstance(link, Array) and not is_traced(link) and link.shape == ():
-        link = link.item()  # of another point, by `dataclasses.replace`
+        link = link.item()  # of another point, by `replace`
     if whole_number("link", link, 0) > MOST_PAIRS:
         raise ValueError(
             f"link: expected 0 (the ground) or a moving link, 1 to {MOST_PAIRS}, got "
@@ -178,6 +178,12 @@ class Separation(Part):
             (beyond(k, self.b) - beyond(k, self.a)) * work
             for k, work in enumerate(works)
         )
+
+
+def arguments_of(element: Any) -> dict[str, Any]:
+    """Returns the fields of an element, with its points in the place of its `ends`."""
+    fields = dict(vars(element))
+    return vars(fields.pop("ends")) | fields
 
 
 def length_of(vector: Array) -> Array:

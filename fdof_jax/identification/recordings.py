@@ -10,8 +10,9 @@ from jaxtyping import Float
 
 from ..base.checks import instance, real_array
 from ..mechanics.kinematics import joint_positions, tip_position
+from ..simulation.sampled import check_joints
 from ..simulation.scene import Scene
-from ..simulation.solution import Solution, check_joints
+from ..simulation.solution import Solution
 
 
 def link_ends(scene: Scene, solution: Solution) -> Float[Array, "time link 2"]:

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from ..base.array_namespace import in_numpy, namespace
-from ..base.checks import concrete, is_traced, radians, real_array
+from ..base.checks import concrete, real_array
 from .linkage import Linkage, compiled, per_joint
 from .topology import letters, pairs_of, real_joints
 
@@ -39,11 +39,7 @@ def real_state(name: str, value: Any, linkage: Linkage) -> State:
     except (TypeError, ValueError):
         raise ValueError(f"{name}: expected a State(q, qd), got {value!r}.") from None
     parts = ("q", q), ("qd", qd)
-    state = State(*(per_joint(f"{name}.{part}", row, linkage) for part, row in parts))
-    if not is_traced(linkage.ef, state.q):
-        angles = np.where(real_joints(np.asarray(linkage.ef)), state.q, 0)
-        radians(f"{name}.q", angles)
-    return state
+    return State(*(per_joint(f"{name}.{part}", row, linkage) for part, row in parts))
 
 
 @compiled("q", "qd")

@@ -20,10 +20,17 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from ..base.array_namespace import namespace
-from ..base.checks import is_traced, known, real_array
+from ..base.checks import is_traced, known, radians, real_array
 from ..base.frozen import Frozen
 from .singularity import check_singularity
-from .topology import can_move, fixed_pairs, letters, pairs_of
+from .topology import (
+    can_move,
+    check_angles,
+    fixed_pairs,
+    letters,
+    pairs_of,
+    real_joints,
+)
 
 
 class Linkage(Frozen):
@@ -70,8 +77,6 @@ class Linkage(Frozen):
     base_angle: Float[Array, ""]
     gravity: Float[Array, ""]
 
-    _other = "linkage.replace({0}=...)"
-
     def __init__(
         self,
         topology: str | ArrayLike,
@@ -98,29 +103,13 @@ class Linkage(Frozen):
         self.base_angle = real_array("base_angle", base_angle, (), unit="rad")
         self.gravity = real_array("gravity", gravity, ())
         if not is_traced(list(vars(self).values())):
+            turn = np.where(real_joints(np.asarray(self.ef)), 0, self.locked)
+            radians("locked", turn)
             check_singularity(self)
 
-    def replace(self, **values: Any) -> "Linkage":
-        """Returns a copy with other values of some fields, checked as a new linkage.
-
-        **Arguments:** those of the constructor.
-
-        **Raises:** ValueError for malformed values and for unknown names.
-
-        >>> import fdof_jax as fj
-        >>> fj.scenes.fig5().linkage.replace(mass=[1, 1, 5]).mass.tolist()  # [kg]
-        [1.0, 1.0, 5.0]
-        """
-        fields = vars(self)
-        now = {"topology": fields["ef"]} | {k: fields[k] for k in fields if k != "ef"}
-        for name in values:
-            if name not in now:
-                raise ValueError(
-                    f"{name}: expected one of {', '.join(now)}, got another name."
-                )
-        return Linkage(**now | values)
-
-    __replace__ = replace  # what `copy.replace` calls
+    def arguments(self) -> dict[str, Any]:
+        fields = dict(vars(self))
+        return {"topology": fields.pop("ef")} | fields
 
     def __repr__(self) -> str:
         """Shows the values of a single linkage, or the shapes of a batch."""
@@ -165,7 +154,10 @@ def per_joint(name: str, values: Any, linkage: Linkage) -> Array:
             f"{name}: expected one instant, numbers for {n} joints, got shape "
             f"{np.shape(values)}; jax.vmap computes many."
         )
-    return real_array(name, values, (n,), of=f"{n} joints")
+    array = real_array(name, values, (n,), of=f"{n} joints")
+    if name.endswith("q"):  # positions, also those of a state
+        check_angles(name, array, linkage.ef)
+    return array
 
 
 def without_fixed(linkage: Linkage, values: Any) -> Any:

@@ -7,7 +7,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
-from ..base.checks import instance, is_traced
+from ..base.checks import instance, is_traced, radians
 
 TOPOLOGIES = ("RRR", "RRP", "RPR", "PRR", "RPP", "PRP", "PPR")
 MOST_PAIRS = 8
@@ -22,6 +22,12 @@ def real_joints(ef: Any) -> tuple[Any, ...]:
     The first axis of `ef` holds the existence factors.
     """
     return tuple(ef[k] > 0.5 for k in range(1, len(ef), 2))
+
+
+def check_angles(name: str, values: Any, ef: Any) -> None:
+    """Warns of known positions of revolute joints that look like degrees."""
+    if not is_traced(ef, values):
+        radians(name, np.where(real_joints(np.asarray(ef)), values, 0))
 
 
 def fixed_pairs(ef: Any) -> tuple[Any, ...]:

@@ -70,13 +70,13 @@ def geometry(linkage: Linkage, q: np.ndarray) -> Geometry:
             link.append(start[:, k + 1])  # across by the fixed B
         points[f"link {k}"] = np.column_stack(link)
     points[f"link {last}"] = np.column_stack([start[:, last], end[:, last]])
-    for k in range(last):
+    points[f"tip {last}"] = end[:, last:]
+    for k in range(last):  # after the tip, where a mass centre may be
         points[f"mass {k + 1}"] = np.column_stack([foot[:, k], center[:, k]])
     for k, kind in enumerate(kinds):
         if kind != "F":
             name = "pin" if kind == "R" else "slider"
             points[f"{name} {k + 1}"] = start[:, k + 1 : k + 2]
-    points[f"tip {last}"] = end[:, last:]
     return Geometry(angle, slide, kinds, points)
 
 
@@ -106,12 +106,12 @@ _BEARING = Path(
 _STYLES: dict[str, dict[str, Any]] = {
     "link": dict(lw=2.2, solid_capstyle="round", solid_joinstyle="round"),
     "rail": dict(lw=0.9),
-    "mass": dict(lw=0.6, marker="o", markersize=4, markevery=[1]),
+    "mass": dict(lw=0.6, marker="o", ms=5, mec="white", mew=0.8, markevery=[1]),
     "pin": dict(color=BLACK, marker="o", markersize=4.5, mfc="white"),
     "slider": dict(markersize=15, mfc="white", mew=0.9),
-    "tip": dict(marker="s", markersize=3.5),
+    "tip": dict(marker="s", markersize=5),
 } | ELEMENT_STYLES
-_LABELS = {"pin": "pin", "slider": "slide", "mass": "mass centre", "tip": "tip"}
+_LABELS = {"pin": "pin", "mass": "mass centre", "tip": "tip"}
 
 
 def _place(lines: dict[str, Line2D], g: Geometry, i: int) -> None:
@@ -151,6 +151,9 @@ def draw_arm(
             marker: Any = element_marker(kind)  # a line in the legend would not tell
             shown = ax.plot([], [], marker=marker, ls="", label=kind, markersize=13)[0]
             shown.set(color=line.get_color(), mfc="none", mew=line.get_linewidth())
+        elif label and kind == "slider" and kind not in labelled:
+            level = ax.plot([], [], marker=_CARRIAGE, ls="", label="slide")[0]
+            level.set(color=line.get_color(), **_STYLES["slider"])
         elif label and kind in _LABELS and kind not in labelled:
             line.set_label(_LABELS[kind])
         elif label and kind == "link":

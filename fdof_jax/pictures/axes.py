@@ -10,18 +10,21 @@ from matplotlib.figure import Figure
 
 from ..base.checks import refusal
 from ..linkage.linkage import check_linkage
-from ..simulation.solution import Solution, check_joints
+from ..simulation.sampled import Motion, check_joints
 
 # Okabe and Ito's colours, distinct under the common kinds of colour blindness.
-BLACK, GREY = "#000000", "#808080"
+BLACK, GREY, LIGHT_GREY = "#000000", "#808080", "#BBBBBB"
 SERIES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 
 
 def reached(linkage: Any, solution: Any, name: str = "solution") -> list[np.ndarray]:
     """Arrays `ts`, `q` and `qd` of one solution, up to the last time reached."""
     check_linkage(linkage)
-    if not isinstance(solution, Solution) or np.ndim(solution.q) != 2:
-        expected = "the Solution of one simulate (of a batch, pass one member)"
+    if not isinstance(solution, Motion) or np.ndim(solution.q) != 2:
+        expected = (
+            "the Solution of one simulate, or a SampledMotion (of a batch, pass one "
+            "member)"
+        )
         raise refusal(name, expected, solution)
     check_joints(name, solution, linkage)
     arrays = [np.asarray(a) for a in (solution.ts, solution.q, solution.qd)]
@@ -54,6 +57,18 @@ def axes_or_new(ax: Any, height: float) -> Axes:
     if not isinstance(ax, Axes):
         raise refusal("ax", "matplotlib Axes or None", ax)
     return ax
+
+
+def time_panels(fig: Figure, ts: np.ndarray, panels: list) -> list[Axes]:
+    """Plots panels (y label, [(label, values, colour), ...]) over time, stacked."""
+    axes = list(fig.subplots(len(panels), squeeze=False, sharex=True)[:, 0])
+    for ax, (ylabel, curves) in zip(axes, panels):
+        for label, values, color in curves:
+            ax.plot(ts, values, color=color, lw=1.2, label=label)
+        ax.set_ylabel(ylabel)
+    axes[-1].set_xlabel("time [s]")
+    fig.align_ylabels(axes)
+    return axes
 
 
 def xy(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -3,8 +3,9 @@
 Every function draws into the given axes (`ax`) or figure (`fig`), or into a new one,
 and returns it: pictures of one panel take and return axes, those of several a figure;
 `animate` and `animate_grid` return an animation. Nothing is shown or
-saved, and no global setting changes. A `solution` is that of one `simulate`; of a
-failed one, the samples reached are drawn. Link 0 is the ground, links 1, 2, ... move.
+saved, and no global setting changes. A `solution` is that of one `simulate`, or a
+`SampledMotion`, whose forces are `(control, *forces)`; of a failed one, the samples
+reached are drawn. Link 0 is the ground, links 1, 2, ... move.
 Malformed arguments raise ValueError. Curves over time are in `plotting`.
 """
 
@@ -21,7 +22,7 @@ from numpy.typing import ArrayLike
 from ..base.checks import real_array, whole_number
 from ..forces.element import Forces
 from ..linkage.linkage import Linkage, check_linkage, per_joint
-from ..simulation.solution import Solution
+from ..simulation.sampled import Motion
 from .animation import animation_of, frame_times
 from .arms import (
     draw_arm,
@@ -89,7 +90,7 @@ def draw_linkage(
 
 def chrono_cyclograph(
     linkage: Linkage,
-    solution: Solution,
+    solution: Motion,
     ax: Axes | None = None,
     *,
     every: float = 0.1,
@@ -127,7 +128,7 @@ def _last(ts: np.ndarray, until: float | None) -> float:
 
 
 def topology_grid(
-    motions: Mapping[str, tuple[Linkage, Solution]],
+    motions: Mapping[str, tuple[Linkage, Motion]],
     fig: Figure | None = None,
     *,
     forces: Mapping[str, Forces] | None = None,
@@ -151,7 +152,7 @@ def topology_grid(
 
 def animate(
     linkage: Linkage,
-    solution: Solution,
+    solution: Motion,
     ax: Axes | None = None,
     *,
     forces: Forces = (),
@@ -187,7 +188,7 @@ def animate(
 
 
 def animate_grid(
-    motions: Mapping[str, tuple[Linkage, Solution]],
+    motions: Mapping[str, tuple[Linkage, Motion]],
     fig: Figure | None = None,
     *,
     forces: Mapping[str, Forces] | None = None,

@@ -23,6 +23,7 @@ from .axes import BLACK, xy
 # Widths are in sizes of the arm.
 _WIDTH, _ARROW, _HEAD, _ARC = 0.025, 0.3, 0.05, 0.08
 
+COMMANDED: dict[str, Any] = dict(color=BLACK, lw=0.8, ls=(0, (5, 3)))
 ELEMENT_STYLES: dict[str, dict[str, Any]] = {
     "spring": dict(color=BLACK, lw=0.8, solid_joinstyle="round"),
     "damper": dict(color=BLACK, lw=0.8),
@@ -32,7 +33,7 @@ ELEMENT_STYLES: dict[str, dict[str, Any]] = {
     "cylinder": dict(color=BLACK, lw=1.0),
     "wrench": dict(color=BLACK, lw=1.6, solid_joinstyle="miter"),
     "stops": dict(color=BLACK, lw=1.2),
-    "commanded": dict(color=BLACK, lw=0.8, ls=(0, (5, 3))),
+    "commanded": COMMANDED,
 }
 
 

@@ -26,7 +26,8 @@ from ..tuning.gains import with_gains
 from ..tuning.league import circle_scenes
 from ..tuning.losses import controller_of, gains_of
 from .arms import draw_motion, geometry
-from .axes import BLACK, SERIES, filled_mapping, legend, plane_axes, reached, xy
+from .axes import SERIES, filled_mapping, legend, plane_axes, reached, xy
+from .elements import COMMANDED
 
 __all__ = ["sliders"]
 
@@ -124,7 +125,7 @@ class _Picture:
         shown = np.linspace(0, len(ts) - 1, _CONFIGURATIONS).round().astype(int)
 
         if self._lines is None:
-            (task,) = self._plane.plot([], "--", color=BLACK, lw=1, label="commanded")
+            (task,) = self._plane.plot([], label="commanded", **COMMANDED)
             arms = draw_motion(self._plane, path, shown, mass_centers=False)
             (errors,) = self._time.plot([], color=SERIES[0], lw=1.2)
             self._lines = task, arms, errors

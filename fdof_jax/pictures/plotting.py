@@ -8,35 +8,31 @@ linkage itself.
 from collections.abc import Mapping
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jax import Array
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
-from scipy.integrate import cumulative_simpson
 
 from ..base.checks import real_array, refusal
-from ..base.user_warnings import warn
 from ..control.drives import PIDController
 from ..control.pd import PDController
-from ..dynamics import energy, link_energies
-from ..forces.element import Forces, InertialElement, elements
+from ..forces.element import Forces, elements
 from ..linkage.linkage import Linkage, joint_names, moving_joints
 from ..simulation.efforts import joint_efforts
-from ..simulation.solution import Solution
+from ..simulation.sampled import Motion
 from .arms import geometry, link_color
 from .axes import (
-    BLACK,
     GREY,
+    LIGHT_GREY,
     SERIES,
     axes_or_new,
     figure_or_new,
     filled_mapping,
     legend,
     reached,
+    time_panels,
 )
+from .energies import energy_profile, energy_stack
 from .responses import bode_plot, response_profile
 from .tracking import tracking, tracking_by_error, tracking_error
 
@@ -51,23 +47,8 @@ def __dir__() -> list[str]:
     return __all__
 
 
-_LIGHT_GREY = "#BBBBBB"
-
-
-def _time_panels(fig: Figure, ts: np.ndarray, panels: list) -> list[Axes]:
-    """Plots panels (y label, [(label, values, colour), ...]) over time, stacked."""
-    axes = list(fig.subplots(len(panels), squeeze=False, sharex=True)[:, 0])
-    for ax, (ylabel, curves) in zip(axes, panels):
-        for label, values, color in curves:
-            ax.plot(ts, values, color=color, lw=1.2, label=label)
-        ax.set_ylabel(ylabel)
-    axes[-1].set_xlabel("time [s]")
-    fig.align_ylabels(axes)
-    return axes
-
-
 def motion_profile(
-    linkage: Linkage, solution: Solution, fig: Figure | None = None
+    linkage: Linkage, solution: Motion, fig: Figure | None = None
 ) -> Figure:
     """Plots the motion of the real joints over time, as in the paper's Figs 4 and 6.
 
@@ -87,106 +68,13 @@ def motion_profile(
     panels = [("absolute angle [degrees]", angles), ("slide [m]", slides)]
     panels = [panel for panel in panels if panel[1]]
     fig = figure_or_new(fig, 3.5, 0.6 + 1.9 * len(panels))
-    for ax in _time_panels(fig, ts, panels):
+    for ax in time_panels(fig, ts, panels):
         legend(ax)
     return fig
 
 
-def energy_profile(
-    linkage: Linkage, solution: Solution, fig: Figure | None = None
-) -> Figure:
-    """Plots kinetic and potential energy of each link and of all over time [J]."""
-    ts, q, qd = reached(linkage, solution)
-    energies = jax.vmap(lambda q, qd: link_energies(linkage, q, qd))(q, qd)
-    kinetic, potential = (np.asarray(each) for each in energies)
-    links = range(1, kinetic.shape[1] + 1)
-    names, colors = [f"link {k}" for k in links], [link_color(k) for k in links]
-    sums = kinetic.sum(axis=1), potential.sum(axis=1), (kinetic + potential).sum(axis=1)
-    whole = zip(("kinetic", "potential", "total"), sums, (*SERIES[3:5], BLACK))
-    panels = [
-        ("kinetic energy [J]", list(zip(names, kinetic.T, colors))),
-        ("potential energy [J]", list(zip(names, potential.T, colors))),
-        ("of all links [J]", list(whole)),
-    ]
-    fig = figure_or_new(fig, 3.5, 6.0)
-    top, _, bottom = _time_panels(fig, ts, panels)
-    legend(top)
-    legend(bottom)
-    return fig
-
-
-def _powers(linkage: Linkage, forces: Forces, solution: Solution) -> np.ndarray:
-    """Power of each element on the arm (element, time) [W].
-
-    Exchange with an element's own potential energy (of a spring) does not count.
-    """
-    efforts = joint_efforts(linkage, forces, solution).elements
-    powers = jnp.einsum("etj,tj->et", efforts, solution.qd)
-    for k, element in enumerate(elements("forces", forces)):
-        # The efforts of an inertial element exclude those of its potential energy.
-        if isinstance(element, InertialElement) or element.potential_energy is None:
-            continue
-
-        def stored(q: Array, qd: Array, element: Any = element) -> Array:
-            energy = lambda q: element.potential_energy(q, linkage)
-            return jax.jvp(energy, (q,), (qd,))[1]
-
-        powers = powers.at[k].add(jax.vmap(stored)(solution.q, solution.qd))
-    return np.asarray(powers)
-
-
-def energy_stack(
-    linkage: Linkage, forces: Forces, solution: Solution, ax: Axes | None = None
-) -> Axes:
-    """Plots the energy balance over time, stacked [J].
-
-    The stack is kinetic energy, potential energy above its least (springs and masses of
-    force elements included), and the energy taken out by the forces since the start.
-    The dashed line is the energy at the start plus the energy put in by the forces; it
-    is level if none is put in. The top of the stack lies on this line up to errors of
-    the motion and of the integrals of power over its samples (Simpson's rule).
-
-    A force element puts energy in while its power is positive, and takes it out while
-    its power is negative. A motor may do both.
-
-    **Arguments:** `forces`: those of the solution.
-
-    **Raises:** ValueError for malformed arguments. Warns if top and line differ by more
-    than a hundredth of the energy: the samples are then too far apart, or the forces
-    are not those of the solution.
-    """
-    ts, q, qd = reached(linkage, solution)
-    powers = _powers(linkage, forces, solution)[:, : len(ts)]
-    energies = jax.vmap(lambda q, qd: energy(linkage, q, qd, forces))(q, qd)
-    kinetic, potential = map(np.asarray, energies)
-    potential = potential - potential.min()
-    put_in, taken_out = (
-        cumulative_simpson(part.sum(axis=0), x=ts, initial=0)
-        for part in (np.maximum(powers, 0), np.maximum(-powers, 0))
-    )
-    bands = {"kinetic": kinetic, "potential": potential}
-    if forces:
-        bands["taken out"] = taken_out
-    line = kinetic[0] + potential[0] + put_in
-    gap = np.abs(line - sum(bands.values())).max()
-    if gap > 0.01 * line.max():
-        warn(
-            f"energy_stack: the balance is off by {gap:.3g} J of {line.max():.3g} J: "
-            "expected the forces of the solution, and samples closer in time."
-        )
-    ax = axes_or_new(ax, 2.6)
-    colors = [*SERIES[3:5], _LIGHT_GREY]
-    ax.stackplot(ts, list(bands.values()), labels=list(bands), colors=colors)
-    driven = put_in.max() > 1e-5 * line.max()  # more than rounding errors
-    label = "start + put in" if driven else "at the start"
-    ax.plot(ts, line, "--", color=BLACK, lw=1.2, label=label)
-    ax.set(xlabel="time [s]", ylabel="energy [J]", xlim=(ts[0], ts[-1]))
-    legend(ax)
-    return ax
-
-
 def effort_profile(
-    linkage: Linkage, forces: Forces, solution: Solution, fig: Figure | None = None
+    linkage: Linkage, forces: Forces, solution: Motion, fig: Figure | None = None
 ) -> Figure:
     """Plots joint efforts over time with their limits, a panel per joint [N or N m].
 
@@ -208,7 +96,7 @@ def effort_profile(
         panels.append((f"${symbol}_{k + 1}$ [{unit}]", [curve]))
         units.append(unit)
     fig = figure_or_new(fig, 3.5, 5.2)
-    axes = _time_panels(fig, ts, panels)
+    axes = time_panels(fig, ts, panels)
     for k, ax, unit in zip(moving, axes, units):
         low, high = ax.get_ylim()  # before the bands, which may be far wider
         texts = []
@@ -283,6 +171,6 @@ def work_precision(
         style = dict(color=SERIES[k % len(SERIES)], marker="osD^v<"[k % 6])
         ax.loglog(*curve, lw=1.2, ms=4, label=label, **style)
     ax.set(xlabel="error", ylabel="time [s]")
-    ax.grid(which="major", lw=0.4, color=_LIGHT_GREY)
+    ax.grid(which="major", lw=0.4, color=LIGHT_GREY)
     legend(ax)
     return ax

@@ -15,9 +15,10 @@ from ..base.checks import refusal
 from ..linkage.linkage import Linkage
 from ..references.reference import reference_of
 from ..references.task import TipReference
-from ..simulation.solution import Solution
+from ..simulation.sampled import Motion
 from .arms import geometry
 from .axes import SERIES, axes_or_new, filled_mapping, legend, plane_axes, reached, xy
+from .elements import COMMANDED
 
 # Without the lightest colours, which are hard to see on white.
 _DARK_TO_LIGHT = ListedColormap(colormaps["plasma"](np.linspace(0, 0.85, 256)))
@@ -35,9 +36,8 @@ def _tip(
 
 
 def _draw_commanded(ax: Axes, path: np.ndarray) -> None:
-    """Draws the commanded path broad and pale, which shows beneath a good curve."""
-    style = dict(color="#CCCCCC", lw=4, solid_capstyle="butt")
-    ax.plot(*xy(path), label="commanded", **style)  # type: ignore[arg-type]
+    """Draws the commanded path dashed above the others, which show in its gaps."""
+    ax.plot(*xy(path), label="commanded", zorder=3, **COMMANDED)
 
 
 def _tips(linkage: Any, task: Any, solutions: Any) -> list[tuple]:
@@ -53,12 +53,13 @@ def _tips(linkage: Any, task: Any, solutions: Any) -> list[tuple]:
 def tracking(
     linkage: Linkage,
     task: TipReference,
-    solutions: Mapping[str, Solution],
+    solutions: Mapping[str, Motion],
     ax: Axes | None = None,
 ) -> Axes:
-    """Plots paths of the tip over the commanded path; dots are the starts.
+    """Plots paths of the tip with the commanded path, dashed; crosses are the starts.
 
-    Drawn into the axes of `chrono_cyclograph`, it adds the path of the paper's Fig 7.
+    Drawn into the axes of `chrono_cyclograph`, it adds the path of the paper's Fig 7,
+    in colours that no link has.
 
     **Arguments:** `task`: a `CircleTask` or a `TipTask`, whose `tip(t)` is the
     commanded tip position [m]; `solutions`: one curve per label.
@@ -67,20 +68,27 @@ def tracking(
     longest = max((commanded for _, _, _, commanded, _ in curves), key=len)
     ax = plane_axes(ax, np.concatenate([longest, *(curve[-1] for curve in curves)]))
     _draw_commanded(ax, longest)
-    for label, color, _, _, path in curves:
+    for line in [line for line in ax.lines if line.get_gid() == "tip path"]:
+        shown = np.asarray(line.get_xydata()) @ [1, 1j]
+        if any(np.array_equal(path[: len(shown)], shown) for *_, path in curves):
+            line.remove()  # drawn again below
+    taken = {line.get_color() for line in ax.lines}
+    free = [color for color in SERIES if color not in taken] or SERIES
+    for k, (label, _, _, _, path) in enumerate(curves):
+        color = free[k % len(free)]
         ax.plot(*xy(path), color=color, lw=1.2, label=label)
-        ax.plot(*xy(path[:1]), "o", color=color, markersize=4)
+        ax.plot(*xy(path[:1]), "x", color=color, markersize=5)
     legend(ax)
     return ax
 
 
 def tracking_by_error(
-    linkage: Linkage, task: TipReference, solution: Solution, ax: Axes | None = None
+    linkage: Linkage, task: TipReference, solution: Motion, ax: Axes | None = None
 ) -> Axes:
     """Plots the path of the tip, coloured by its distance from its set point [mm].
 
-    The broad grey line beneath is the commanded path; the dot is the tip's start. Later
-    turns cover earlier ones.
+    The dashed line is the commanded path; the cross is the tip's start. Later turns
+    cover earlier ones.
 
     **Arguments:** `task`: as in `tracking`.
 
@@ -89,7 +97,6 @@ def tracking_by_error(
     ts, commanded, actual = _tip(linkage, task, solution)
     error = 1000 * np.abs(actual - commanded)
     ax = plane_axes(ax, np.concatenate([commanded, actual]), beside=0.8)
-    _draw_commanded(ax, commanded)
     corners = np.column_stack(xy(actual))
     pieces = LineCollection(
         list(np.stack([corners[:-1], corners[1:]], axis=1)),
@@ -101,7 +108,8 @@ def tracking_by_error(
     pieces.set_clim(0, error.max())
     ax.add_collection(pieces)
     ax.autoscale_view()
-    ax.plot(*corners[0], "o", color=_DARK_TO_LIGHT(pieces.norm(error[0])), ms=4)
+    ax.plot(*corners[0], "x", color=_DARK_TO_LIGHT(pieces.norm(error[0])), ms=5)
+    _draw_commanded(ax, commanded)
     # An inset is as high as the axes, which equal scales may shrink.
     bar = ax.inset_axes((1.04, 0, 0.05, 1))
     ax.figure.colorbar(pieces, cax=bar, label="tip error [mm]")
@@ -112,7 +120,7 @@ def tracking_by_error(
 def tracking_error(
     linkage: Linkage,
     task: TipReference,
-    solutions: Mapping[str, Solution],
+    solutions: Mapping[str, Motion],
     ax: Axes | None = None,
 ) -> Axes:
     """Plots the distance of the tip from its set point over time [m].

@@ -14,7 +14,7 @@ from ..base.checks import real_array
 from ..dynamics import joint_mass_matrix
 from ..forces.element import Forces
 from ..linkage.linkage import Linkage, check_linkage, joint_names, joints_of
-from ..linkage.topology import letters
+from ..linkage.topology import check_angles, letters
 from ..mechanics.kinematics import tip_jacobian
 from .arms import Geometry, draw_motion, geometry
 from .axes import GREY, SERIES, legend, plane_axes, xy
@@ -31,6 +31,7 @@ def _ranges(linkage: Linkage, lower: Any, upper: Any, orientation: Any) -> Range
             name, value, (n,), finite=False, broadcast=True, unit="m or rad"
         )
         ends.append(np.asarray(end))
+        check_angles(name, end, linkage.ef)
         for joint, end in zip(joint_names(linkage), ends[-1]):
             if joint[0] == "P" and not np.isfinite(end):
                 raise ValueError(
@@ -124,7 +125,8 @@ def force_ellipses(
 
     An ellipse holds the forces that joint efforts can balance whose shares of the
     limits have a sum of squares of 1; gravity is left out. The legend gives the scale.
-    Near a singular configuration an ellipse is cut at half the picture's size.
+    Near a singular configuration an ellipse may be far longer than the arm: beyond a
+    quarter of the arm's size it is cut, dashed and open at its ends.
 
     **Arguments:** `q`: joint positions along the path (configurations, n) [m or rad];
     `limit`: greatest efforts, one per joint or one for all, positive [N or N m].
@@ -199,15 +201,33 @@ def _ellipses(
     # Units per metre of the picture: 1, 2 or 5 times a power of ten.
     digit, power = f"{typical / length:.0e}".split("e")
     scale = float(f"{max(d for d in (1, 2, 5) if d <= int(digit))}e{power}")
-    semi = np.minimum(sizes / scale, extent / 2)
-    along = semi * (axes[:, 0] + 1j * axes[:, 1])
-    turn = np.linspace(0, 2 * np.pi, 73)
-    around = g.tip[:, None] + along @ np.array([np.cos(turn), np.sin(turn)])
+    semi = sizes / scale
+    around = g.tip[:, None] + np.stack(
+        [_ellipse(*row, extent / 4) for row in zip(semi, axes[:, 0] + 1j * axes[:, 1])]
+    )
     ax = plane_axes(ax, np.append(g.all_points, around))
     draw_motion(ax, g, np.unique([0, len(sizes) - 1]), mass_centers=False)
-    text = f"{what}, 1 m: {scale:g}{unit}"
     for k, points in enumerate(around):
-        ax.plot(*xy(points), color=SERIES[4], lw=1, gid=f"ellipse {k}", label=text)
-        text = None
+        style = dict(color=SERIES[4], lw=1, label=f"{what}, 1 m: {scale:g}{unit}")
+        if (semi[k] > extent / 4).any():
+            style |= dict(ls=(0, (3, 2)), label="longer, cut here")
+        ax.plot(*xy(points), gid=f"ellipse {k}", **style)
     legend(ax)
     return ax
+
+
+def _ellipse(semi: np.ndarray, axes: np.ndarray, most: float) -> np.ndarray:
+    """Points x + iy of an ellipse; beyond `most` along an axis it is cut.
+
+    `semi`: its semi-axes (2,) [m], which may be infinite; `axes`: their directions. NaN
+    lifts the pen between the two halves of a cut one.
+    """
+    short, long = np.sort(semi)
+    # Both halves go from end to end; steps are fine where the ellipse is round.
+    u = np.sin(np.pi / 2 * np.linspace(-1, 1, 37)) * min(long, most)
+    rise = np.sqrt(np.maximum(1 - (u / long) ** 2, 0)) if long > 0 else 0
+    v = min(short, most) * rise
+    turn = [np.nan if long > most else u[-1]]
+    halves = np.concatenate([u + 1j * v, turn, u[::-1] - 1j * v[::-1]])
+    across, along = axes[np.argsort(semi)]
+    return np.real(halves) * along + np.imag(halves) * across

@@ -20,7 +20,8 @@ from ..data.files import save
 from ..forces.joints import JointDamper
 from ..linkage.linkage import Linkage
 from ..pictures import drawing, plotting
-from ..pictures.axes import BLACK, figure_legend
+from ..pictures.axes import figure_legend
+from ..pictures.elements import COMMANDED
 from ..references.circle import CircleTask
 from ..simulation.scene import Scene
 from ..simulation.simulate import simulate
@@ -154,7 +155,7 @@ def _arms(
     circle = np.stack([task.tip(t) for t in np.linspace(0, period, 101)])
     for figure in (still, shown):
         for ax in figure.axes:
-            ax.plot(*circle.T, "--", color=BLACK, lw=0.8, label="commanded", zorder=1)
+            ax.plot(*circle.T, label="commanded", zorder=1, **COMMANDED)
         figure_legend(figure)
     shown.draw_without_rendering()
     shown.set_layout_engine("none")  # a layout per frame takes half the time

@@ -6,6 +6,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
+from ..base.checks import instance
 from ..forces.element import Forces
 from ..linkage.coordinates import State
 from ..linkage.linkage import Linkage
@@ -26,6 +27,16 @@ class Batch(NamedTuple):
 
     def split(self) -> tuple[Any, Any]:
         return eqx.partition(self.inputs, self.batched)
+
+
+def check_arms(linkage: Any) -> None:
+    """Raises ValueError unless the argument is a linkage, one or a batch."""
+    if isinstance(linkage, list | tuple) and linkage:
+        raise ValueError(
+            f"linkage: expected one Linkage with a batch axis, got {len(linkage)} in a "
+            "sequence; jax.tree.map(lambda *x: jnp.stack(x), *arms) stacks arms."
+        )
+    instance("linkage", linkage, Linkage)
 
 
 def _name(part: Any, *rest: Any) -> str:

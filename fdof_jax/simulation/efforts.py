@@ -9,14 +9,14 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
-from ..base.checks import instance, is_traced, place_of
+from ..base.checks import is_traced, place_of
 from ..forces.element import Element, Forces, elements_on, of_full_size
 from ..linkage.linkage import Linkage, check_linkage, without_fixed
 from .field import element_effort, with_states
 from .padding import cut, padded
 from .prescribed import prescribed, prescribed_effort
+from .sampled import Motion, SampledMotion, check_joints
 from .simulate import check_own
-from .solution import Solution, check_joints
 
 
 class Efforts(NamedTuple):
@@ -30,10 +30,11 @@ class Efforts(NamedTuple):
     elements: Float[Array, "element time joint"]
 
 
-def joint_efforts(linkage: Linkage, forces: Forces, solution: Solution) -> Efforts:
+def joint_efforts(linkage: Linkage, forces: Forces, solution: Motion) -> Efforts:
     """Computes the joint efforts of the force elements along a motion.
 
-    **Arguments:** the linkage, the forces and the solution of one `simulate`.
+    **Arguments:** the linkage, the forces and the solution of one `simulate`; of a
+    `SampledMotion`, the forces are `(control, *forces)`.
 
     **Returns:** `Efforts(total, elements)` [N or N m], of shapes (time, n) and
     (element, time, n).
@@ -49,14 +50,15 @@ def joint_efforts(linkage: Linkage, forces: Forces, solution: Solution) -> Effor
     ([15.873, -300.0, -9.921], (1, 101, 3))
     """
     check_linkage(linkage)
-    instance("solution", solution, Solution)
+    check_joints("solution", solution, linkage)
     forces = elements_on(linkage, forces)
     if solution.q.ndim != 2:
         raise ValueError(
             "solution: expected one motion (use jax.vmap for a batch), got positions "
             f"of shape {solution.q.shape}."
         )
-    check_joints("solution", solution, linkage)
+    if isinstance(solution, SampledMotion):
+        forces = solution.acting(forces)
     check_own("solution.own", solution.own, forces, linkage, solution.ts.shape)
     forces = of_full_size(linkage, forces)
     rows = solution.ts, solution.q, solution.qd, solution.own

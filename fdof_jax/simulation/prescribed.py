@@ -76,6 +76,10 @@ class PrescribedMotion(Element):
         self.moved = jax.device_put(np.isin(_NUMBERS, numbers))
         self.reference = reference
 
+    def arguments(self) -> dict[str, Any]:
+        joints = tuple(n for n, moved in zip(_NUMBERS, self.moved) if moved)
+        return {"joints": joints, "reference": self.reference}
+
     def of(self, linkage: Linkage) -> Array:
         """Returns whether each joint of an arm is prescribed; a fixed pair is not."""
         moved, ef = in_numpy((self.moved, linkage.ef))

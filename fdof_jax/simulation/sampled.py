@@ -1,6 +1,6 @@
 """Control in discrete time, with efforts held constant between samples."""
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import diffrax
 import equinox as eqx
@@ -10,14 +10,22 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from ..base.checks import concrete, function, is_traced, real_array, whole_number
-from ..forces.element import Forces, ScalarElement, element_of, elements
+from ..base.checks import (
+    concrete,
+    function,
+    is_traced,
+    real_array,
+    refusal,
+    whole_number,
+)
+from ..forces.element import Element, Forces, ScalarElement, element_of, elements
 from ..forces.joints import JointEffort
 from ..linkage.coordinates import State, real_state
 from ..linkage.linkage import Linkage, check_linkage, joints_of, without_fixed
 from .field import initial_states, stateful
 from .looped_dopri8 import LoopedDopri8
 from .simulate import check_elements, simulate
+from .solution import Solution, WithOutcome
 
 
 class _Switched(ScalarElement):
@@ -80,7 +88,21 @@ def step(
     return State(solution.q[-1], solution.qd[-1])
 
 
-class SampledMotion(NamedTuple):
+class _Held(ScalarElement):
+    """The efforts of a sampled motion, each held from its sample to the next."""
+
+    ts: Float[Array, " time"]
+    tau: Float[Array, "sample joint"]
+
+    def schedule(self, t, linkage):
+        sample = jnp.searchsorted(self.ts[1:-1], t, side="right")
+        return tuple(self.tau[sample])
+
+    def respond(self, scheduled, q, qd, linkage):
+        return scheduled
+
+
+class SampledMotion(WithOutcome):
     """A motion under sampled control.
 
     - `ts`: sampling times, including the end (samples + 1,) [s].
@@ -88,7 +110,12 @@ class SampledMotion(NamedTuple):
     - `tau`: efforts commanded at each sample (samples, n), 0 at fixed pairs
       [N or N m].
     - `result`: diffrax's result: `successful`, or that of the first failed period.
+      `outcome` states it in words.
     - `own`: the states of the forces' `StatefulElement`s at `ts`.
+
+    Pictures, tables, `joint_efforts` and `joint_reactions` take it as they take a
+    `Solution`. Its `forces` are there `(control, *forces)`, the controller first, whose
+    efforts are `tau`.
     """
 
     ts: Float[Array, " time"]
@@ -97,6 +124,29 @@ class SampledMotion(NamedTuple):
     tau: Float[Array, "sample joint"]
     result: diffrax.RESULTS
     own: tuple[Any, ...]
+
+    def acting(self, forces: tuple[Element, ...]) -> tuple[Element, ...]:
+        """Returns `(control, *forces)` with the held efforts in the first place."""
+        if not forces:
+            raise ValueError(
+                "forces: expected (control, *forces) of a SampledMotion, got ()."
+            )
+        return _Held(self.ts, self.tau), *forces[1:]
+
+
+Motion = Solution | SampledMotion
+
+
+def check_joints(name: str, solution: Any, linkage: Linkage) -> None:
+    """Raises ValueError unless it is a motion with the linkage's number of joints."""
+    if not isinstance(solution, Motion):
+        raise refusal(name, "a Solution or a SampledMotion", solution)
+    count = jnp.shape(linkage.ef)[-1] // 2  # of a batch too
+    if jnp.shape(solution.q)[-1] != count:
+        raise ValueError(
+            f"{name}: expected a motion of {count} joints, as the linkage has, got "
+            f"positions of shape {jnp.shape(solution.q)}."
+        )
 
 
 def simulate_sampled(

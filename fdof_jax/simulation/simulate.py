@@ -11,7 +11,14 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from ..base.array_namespace import in_numpy
-from ..base.checks import increasing, instance, is_traced, real_array, whole_number
+from ..base.checks import (
+    increasing,
+    instance,
+    is_traced,
+    real_array,
+    single_precision,
+    whole_number,
+)
 from ..forces.element import (
     Element,
     Forces,
@@ -86,6 +93,7 @@ def check_elements(forces: Forces, linkage: Linkage, ts: Array) -> None:
         place, values = f"forces[{index}]", in_numpy(element)
         if values.jump_ts is not None:
             real_array(f"{place}.jump_ts", values.jump_ts, (None,))
+        single_precision(place, element)
         if is_traced(linkage, ts, element):
             continue
         check_values(place, element)  # `equinox.tree_at` bypasses the constructor
@@ -155,8 +163,9 @@ def simulate(
     (54.889, -54.889)
     """
     check_linkage(linkage)
+    single_precision("linkage", linkage)
     state0 = real_state("state0", state0, linkage)
-    ts = real_array("ts", ts, (None,))
+    ts = real_array("ts", ts, (None,), of="times, for instance [0, 2.0]")
     increasing("ts", ts)
     forces = elements("forces", forces)
     keywords = solve_options(

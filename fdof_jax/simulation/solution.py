@@ -1,4 +1,4 @@
-"""The results of a simulation."""
+"""The results of a simulation: motions, with their outcomes."""
 
 from typing import Any
 
@@ -10,7 +10,6 @@ from jaxtyping import Float
 
 from ..base.checks import known
 from ..base.html_table import html_table
-from ..linkage.linkage import Linkage
 
 # In the order of `outcome_numbers`.
 OUTCOMES = (
@@ -33,7 +32,54 @@ def outcome_numbers(result: diffrax.RESULTS) -> np.ndarray:
     return np.select(cases, range(len(cases)), default=len(cases))
 
 
-class Solution(eqx.Module):
+class WithOutcome(eqx.Module):
+    """Base of `Solution` and `SampledMotion`: their outcome, and a summary.
+
+    Their fields are declared there alone, because the order is that of arguments.
+    """
+
+    @property
+    def outcome(self: Any) -> np.ndarray:
+        """Outcome of each trajectory in words, an array of the batch's shape.
+
+        `"successful"`; `"ill-conditioned"`: the mass matrix is singular or nearly so
+        (see `inertia_ratios`); `"not finite"`: the accelerations are not finite,
+        as those of an impossible linkage, for instance of a negative mass;
+        `"out of steps"`; `"tolerance out of reach"`: rounding keeps even the shortest
+        step from meeting it; `"too many switches"`: one after the other, as between
+        branches that push towards each other; or `"solver failed"`.
+        """
+        return np.asarray(np.array(OUTCOMES)[outcome_numbers(self.result)])
+
+    def __repr__(self) -> str:
+        """Summarises the motion in words; traced values show only their shape."""
+        facts = "; ".join(f"{name}: {value}" for name, value in self._facts().items())
+        return f"{type(self).__name__}({facts})" if facts else super().__repr__()
+
+    def _repr_html_(self) -> str | None:
+        facts = self._facts()
+        return html_table(facts.items()) if facts else None
+
+    def _facts(self: Any) -> dict[str, str]:
+        """Returns the known facts; none if the leaves are not arrays of a motion."""
+        if len(np.shape(self.q)) < 2:
+            return {}
+        *batch, count, _ = self.q.shape
+        motions = " x ".join(map(str, batch)) if batch else "1"
+        facts = {"motions": motions, "times": f"{count}"}
+        result = isinstance(self.result, diffrax.RESULTS)
+        if not result or not known(self.ts, self.result):
+            return facts
+        ts = np.asarray(self.ts)
+        facts["times"] += f", {ts.min():g} to {ts.max():g} s"
+        outcomes = zip(*np.unique(self.outcome, return_counts=True))
+        facts["outcome"] = ", ".join(
+            f"{number} {word}" if batch else word for word, number in outcomes
+        )
+        return facts
+
+
+class Solution(WithOutcome):
     """A simulated motion, with its statistics and outcome.
 
     - `ts`: output times [s].
@@ -69,44 +115,10 @@ class Solution(eqx.Module):
     result: diffrax.RESULTS
     own: tuple[Any, ...] = ()
 
-    @property
-    def outcome(self) -> np.ndarray:
-        """Outcome of each trajectory in words, an array of the batch's shape.
-
-        `"successful"`; `"ill-conditioned"`: the mass matrix is singular or nearly so
-        (see `inertia_ratios`); `"not finite"`: the accelerations are not finite,
-        as those of an impossible linkage, for instance of a negative mass;
-        `"out of steps"`; `"tolerance out of reach"`: rounding keeps even the shortest
-        step from meeting it; `"too many switches"`: one after the other, as between
-        branches that push towards each other; or `"solver failed"`.
-        """
-        return np.asarray(np.array(OUTCOMES)[outcome_numbers(self.result)])
-
-    def __repr__(self) -> str:
-        """Summarises the motion in words; traced values show only their shape."""
-        facts = "; ".join(f"{name}: {value}" for name, value in self._facts().items())
-        return f"Solution({facts})" if facts else super().__repr__()
-
-    def _repr_html_(self) -> str | None:
-        facts = self._facts()
-        return html_table(facts.items()) if facts else None
-
     def _facts(self) -> dict[str, str]:
-        """Returns the known facts; none if the leaves are not arrays of a motion."""
-        if len(np.shape(self.q)) < 2:
-            return {}
-        *batch, count, _ = self.q.shape
-        motions = " x ".join(map(str, batch)) if batch else "1"
-        facts = {"motions": motions, "times": f"{count}"}
-        result = isinstance(self.result, diffrax.RESULTS)
-        if not result or not known(self.ts, self.result, self.stats):
+        facts = super()._facts()
+        if "outcome" not in facts or not known(self.stats):
             return facts
-        ts = np.asarray(self.ts)
-        facts["times"] += f", {ts.min():g} to {ts.max():g} s"
-        outcomes = zip(*np.unique(self.outcome, return_counts=True))
-        facts["outcome"] = ", ".join(
-            f"{number} {word}" if batch else word for word, number in outcomes
-        )
         if "num_steps" in self.stats:
             facts["steps"] = _span(self.stats["num_steps"])
         if np.max(self.stats.get("num_switches", 0)) > 0:
@@ -134,13 +146,3 @@ def remarks_on_derivatives(stats: dict[str, Any]) -> list[str]:
             "hold on one side only"
         )
     return words
-
-
-def check_joints(name: str, solution: Solution, linkage: Linkage) -> None:
-    """Raises ValueError unless the motions have the linkage's number of joints."""
-    count = np.shape(linkage.ef)[-1] // 2  # of a batch too
-    if np.shape(solution.q)[-1] != count:
-        raise ValueError(
-            f"{name}: expected a motion of {count} joints, as the linkage has, got "
-            f"positions of shape {np.shape(solution.q)}."
-        )

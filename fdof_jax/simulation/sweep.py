@@ -22,7 +22,6 @@ from numpy.typing import ArrayLike
 from ..base.checks import (
     function,
     increasing,
-    instance,
     is_traced,
     real_array,
     refusal,
@@ -32,7 +31,7 @@ from ..base.devices import devices_outside_mesh, uncommitted
 from ..forces.element import Forces, elements, elements_on
 from ..linkage.coordinates import State
 from ..linkage.linkage import Linkage
-from .batch_axes import Batch, batch_of
+from .batch_axes import Batch, batch_of, check_arms
 from .checkpoints import Checkpoint, folder_at
 from .chunk_programs import outcome_of
 from .chunks import in_chunks, usual_chunk
@@ -181,7 +180,7 @@ def sweep(
     a member fails.
     """
     linkage, state0, forces = uncommitted((linkage, state0, forces))
-    instance("linkage", linkage, Linkage)
+    check_arms(linkage)
     try:
         q, qd = map(jnp.asarray, state0)
     except (TypeError, ValueError):

@@ -18,8 +18,9 @@ from ..control.pd import PDController
 from ..linkage.linkage import without_fixed
 from ..linkage.topology import fixed_pairs
 from ..references.reference import reference_motion, reference_of
+from ..simulation.sampled import check_joints
 from ..simulation.scene import Scene
-from ..simulation.solution import Solution, check_joints
+from ..simulation.solution import Solution
 
 Loss = Callable[[Scene, Solution], Array]
 

@@ -1,0 +1,63 @@
+"""A motion under sampled control in pictures, tables and a line of text."""
+
+import diffrax
+import numpy as np
+import pytest
+from test_drawing import lines, tidy as tidy
+from test_plotting import tops, values
+from test_sampled_control import DISC
+
+import fdof_jax as fj
+from fdof_jax import drawing, plotting
+
+TAU = np.array([[4.0], [-8.0], [2.0], [6.0]])  # of an inertia of 2 kg m^2
+
+
+def disc_motion() -> fj.SampledMotion:
+    """Returns the exact motion of a disc from rest under the held efforts."""
+    ts, qdd = np.linspace(0, 2, 5), TAU / 2
+    qd = np.append([[0.0]], np.cumsum(qdd / 2, axis=0), axis=0)
+    q = np.append([[0.0]], np.cumsum((qd[1:] + qd[:-1]) / 4, axis=0), axis=0)
+    return fj.SampledMotion(ts, q, qd, TAU, diffrax.RESULTS.successful, ())
+
+
+CONTROL = fj.PDController(0.0, 0.0, 8.0, lambda t, linkage: (t[None], t[None]))
+
+
+def test_efforts_are_those_held():
+    motion, damper = disc_motion(), fj.JointDamper(0.5)
+    total, (held, damped) = fj.joint_efforts(DISC, (CONTROL, damper), motion)
+    np.testing.assert_array_equal(held, np.append(TAU, TAU[-1:], axis=0))
+    np.testing.assert_array_equal(total, held + damped)
+    with pytest.raises(ValueError, match=r"forces: expected \(control, \*forces\)"):
+        fj.joint_efforts(DISC, (), motion)
+
+
+def test_pictures_take_it():
+    motion, forces = disc_motion(), (CONTROL,)
+    assert lines(drawing.chrono_cyclograph(DISC, motion, every=1.0))["tip path"]
+    (ax,) = plotting.effort_profile(DISC, forces, motion).axes
+    (saturated,) = [line for line in ax.lines if line.get_gid() == "saturated 1"]
+    assert saturated.get_xdata() == 0.5
+    (ax,) = plotting.motion_profile(DISC, motion).axes
+    np.testing.assert_allclose(values(ax)[0], np.rad2deg(motion.q[:, 0]))
+
+
+def test_the_work_of_held_efforts_is_exact():
+    motion = disc_motion()
+    ax = plotting.energy_stack(DISC, (CONTROL,), motion)
+    top, (line,) = tops(ax, motion.ts)["taken out"], values(ax)
+    np.testing.assert_allclose(top, line, rtol=1e-12)
+    assert line[-1] == 1.75  # [J] put in
+
+
+def test_tables_take_it():
+    motion = disc_motion()
+    found = fj.to_pandas(DISC, motion)
+    assert list(found) == ["R1 [rad]", "R1 [rad/s]", "outcome"]
+    assert fj.to_xarray(DISC, motion).outcome == "successful" == motion.outcome
+
+
+def test_it_is_told_in_a_line():
+    expected = "SampledMotion(motions: 1; times: 5, 0 to 2 s; outcome: successful)"
+    assert repr(disc_motion()) == expected
