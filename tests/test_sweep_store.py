@@ -7,18 +7,15 @@ import sys
 import time
 from pathlib import Path
 
-import diffrax
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray
 from helpers import programs
-from sweep_batch import FAILED, SETTINGS, TS, run, single_links
+from sweep_batch import FAILED, TS, run, single_links
 
 import fdof_jax as fj
 from fdof_jax.simulation import store
-from fdof_jax.simulation.provenance import outline
 
 BLOCKS, BLOCK = 6, 7  # members
 
@@ -191,25 +188,6 @@ def test_only_what_is_asked_for(mixed, swept, tmp_path):
     for reduce in (clash, lambda motion: {"failed": motion.q}):
         with pytest.raises(ValueError, match="^reduce: expected .*name"):
             run(mixed, store=tmp_path / "clash", reduce=reduce)
-
-
-def test_a_digest_names_what_functions_compute(batch):
-    linkage, state0, _ = jax.tree.map(lambda leaf: leaf[:2], batch)
-    everything = jax.tree.map(lambda leaf: True, (linkage, state0))
-
-    def digest(factor, reduce=lambda motion: motion.q):
-        force = lambda t, q, qd, linkage: factor * q
-        inputs = linkage, state0, (force,)
-        batch = store.Batch(inputs, (*everything, (False,)), 2)
-        settings = dict(
-            SETTINGS, dt0=1e-3, adjoint=diffrax.RecursiveCheckpointAdjoint()
-        )
-        return outline(batch, jnp.asarray(TS), settings, reduce)[1]
-
-    assert digest(2.0) == digest(2.0)
-    assert digest(2.0) != digest(3.0)
-    assert digest(jnp.full(3, 2.0)) != digest(jnp.full(3, 3.0))
-    assert digest(2.0) != digest(2.0, lambda motion: motion.q + 1)
 
 
 WORKER = """
