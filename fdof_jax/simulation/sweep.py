@@ -186,7 +186,10 @@ def sweep(
         q, qd = map(jnp.asarray, state0)
     except (TypeError, ValueError):
         raise ValueError(f"state0: expected a State(q, qd), got {state0!r}.") from None
-    state0 = State(*(a.astype(float) if a.dtype.kind in "iu" else a for a in (q, qd)))
+    # Other kinds are refused by `batch_of`.
+    state0 = State(
+        *(jnp.asarray(a, float if a.dtype.kind in "iuf" else None) for a in (q, qd))
+    )
     ts = real_array("ts", ts, (None,))
     increasing("ts", ts)
     elements("forces", forces)
