@@ -16,6 +16,7 @@ from sweep_batch import FAILED, TS, run, single_links
 
 import fdof_jax as fj
 from fdof_jax.simulation import store
+from fdof_jax.simulation.batch_axes import batch_of
 
 BLOCKS, BLOCK = 6, 7  # members
 
@@ -173,6 +174,30 @@ def test_another_sweep_needs_another_folder(mixed, stored, undisturbed):
         ):
             run(batch, store=stored, **options)
     assert read(stored) == undisturbed
+
+
+def test_what_others_wrote_is_refused_and_kept(mixed, tmp_path):
+    data = xarray.Dataset({"q": ("member", np.arange(5.0))})
+    contents = {
+        "three": lambda folder: data.to_zarr(folder, zarr_format=3, consolidated=False),
+        "two": lambda folder: data.to_zarr(folder, zarr_format=2),
+        "list": lambda folder: (folder / "zarr.json").write_text("[]"),
+        "notes": lambda folder: (folder / "notes.txt").write_text("mine"),
+        "killed": lambda folder: (folder / "zarr.json.1.part").write_text("{"),
+    }
+    batch, like = batch_of(*mixed, 0), {"q": np.zeros(3)}
+    for name, write in contents.items():
+        folder = tmp_path / name
+        folder.mkdir()
+        write(folder)
+        before = read(folder)
+        arguments = folder, batch, jnp.asarray(TS), like, 8, "digest"
+        if name == "killed":
+            store.Store(*arguments)
+        else:
+            with pytest.raises(ValueError, match="^store: expected a new folder or"):
+                store.Store(*arguments)
+            assert read(folder) == before
 
 
 def test_only_what_is_asked_for(mixed, swept, tmp_path):

@@ -98,21 +98,33 @@ class Store:
             self._write(name, data)
 
     def _refuse_another(self, attributes: dict[str, Any]) -> None:
-        """Raises ValueError if the group is whole, but of another sweep."""
+        """Raises ValueError if the folder holds anything but this sweep, or damage."""
+        # In this order, as another worker may be about to write `zarr.json` first.
+        names = {path.name for path in self.folder.iterdir() if path.suffix != ".part"}
+        path = self.folder / "zarr.json"
+        if not path.exists():
+            if names and "records" not in names:
+                raise self._another(f"holds {min(names)}")
+            return
         try:
-            found = json.loads((self.folder / "zarr.json").read_bytes())["attributes"]
+            group = json.loads(path.read_bytes())
+        except ValueError:
+            return  # damaged
+        try:
+            found = group["attributes"]
             provenance = {key: found[key] for key in attributes if key != "sha256"}
-        except (OSError, ValueError, LookupError, TypeError):
-            return  # none, or damaged
-        whole = found["sha256"] == _sha256(_text(provenance))
+            whole = found["sha256"] == _sha256(_text(provenance))
+        except (LookupError, TypeError):
+            raise self._another("holds a Zarr group from elsewhere") from None
         if whole and found != attributes:
-            others = ", ".join(
-                key for key in provenance if found[key] != attributes[key]
-            )
-            raise ValueError(
-                "store: expected a new folder or one of this sweep, got "
-                f"{self.folder}, which has another {others}."
-            )
+            others = [key for key in provenance if found[key] != attributes[key]]
+            raise self._another(f"has another {', '.join(others)}")
+
+    def _another(self, what: str) -> ValueError:
+        return ValueError(
+            f"store: expected a new folder or one of this sweep, got {self.folder}, "
+            f"which {what}."
+        )
 
     def members(self, block: int) -> slice:
         return slice(block * self.block, min(self.size, (block + 1) * self.block))

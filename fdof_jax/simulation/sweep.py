@@ -163,8 +163,8 @@ def sweep(
       and its members are solved again.
     - `store`: a folder for the results, which are not held in memory: a Zarr group for
       `xarray.open_zarr`, written in blocks of members. A repeated call solves only the
-      blocks that are missing or damaged; a warning names damaged files. Another sweep
-      needs another folder.
+      blocks that are missing or damaged; a warning names damaged files. A folder with
+      another sweep, or anything else, is refused.
     - `shard`, `of`: with `store`, solves only each block whose number is `shard` modulo
       `of`. Any number of processes may fill one store, in any order.
     - `solver`, `rtol`, `atol`, `stepsize_controller`, `dt0`, `adjoint`, `max_steps`,
