@@ -23,7 +23,7 @@ from ..base.checks import (
     function,
     increasing,
     instance,
-    is_traced,
+    is_transformed,
     real_array,
     refusal,
     whole_number,
@@ -57,7 +57,7 @@ def _traced(
     reduce: Callable[[Solution], Any],
     chunk: int,
 ) -> Any:
-    """Solves a traced batch in chunks; failed members enter no derivative."""
+    """Solves a batch under transformations; failed members enter no derivative."""
     moving, shared = batch.split()
     order = jnp.argsort(expected_work(*constant((ts, moving, shared))))
 
@@ -81,7 +81,8 @@ def _traced(
     moving = jax.tree.map(lambda leaf: jnp.asarray(leaf)[order], moving)
     # A first solve finds the members that fail. In the differentiated solve the first
     # good member replaces them, because NaN would spoil derivatives of shared arrays.
-    frozen, _, failed = solved(*where(False, (moving, shared)))
+    # Functions may hold traced values too, so that its results are also constant.
+    frozen, _, failed = constant(solved(*constant((moving, shared))))
     good = ~failed
     source = jnp.where(good, jnp.arange(batch.size), jnp.argmax(good))
     moving, shared = where(jnp.any(good), (moving, shared))
@@ -215,7 +216,7 @@ def sweep(
     )
     del settings["progress_meter"]  # it counts finished members, not time
     batch = batch_of(linkage, state0, forces, forces_axes)
-    traced = is_traced(batch.inputs, ts, reduce)
+    traced = is_transformed()
     if chunk is None:
         resumable = checkpoint is not None or store is not None
         chunk = usual_chunk(anywhere=traced or resumable)
