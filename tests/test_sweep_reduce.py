@@ -1,5 +1,6 @@
 """A reduced sweep keeps of each member what a function of its motion returns."""
 
+import dataclasses
 import sys
 
 import jax
@@ -9,11 +10,12 @@ import pytest
 from sweep_batch import FAILED, run, single_links
 
 import fdof_jax as fj
-from fdof_jax.simulation import chunks
+from fdof_jax.simulation import chunk_programs, chunks
 
 
 def end_and_fastest(motion):
-    return {"end": motion.q[-1], "fastest": jnp.abs(motion.qd).max(0)}, motion.result
+    fastest, none = jnp.abs(motion.qd).max(0), motion.q[:0]
+    return {"end": motion.q[-1], "fastest": fastest, "none": none}, motion.result
 
 
 @pytest.fixture(scope="module")
@@ -46,12 +48,23 @@ def test_a_checkpoint_holds_only_what_is_kept(mixed, reduced, tmp_path, monkeypa
         np.testing.assert_array_equal(a, b)
 
 
+@dataclasses.dataclass
+class Unhashable:
+    def __call__(self, motion):
+        return motion.q
+
+
 def test_what_is_no_reduction_is_refused(batch):
     for wrong in (3, "q", fj.Solution):
         with pytest.raises(ValueError, match="^reduce: expected a callable, got "):
             run(batch, reduce=wrong)
-    with pytest.raises(ValueError, match="^reduce: expected a function that returns "):
-        run(batch, reduce=lambda motion: "q")
+    with pytest.raises(ValueError, match="^reduce: expected what can be hashed"):
+        run(batch, reduce=Unhashable())
+    with pytest.raises(ValueError, match="^reduce: expected a function .*, got 'q'"):
+        run(batch, reduce=lambda motion: (motion.q, "q"))
+    for wrong in (jax.random.key(0), np.array("q")):
+        with pytest.raises(ValueError, match="^reduce: expected a .* returns numbers"):
+            chunk_programs._check_kept((1.0, True, wrong))
 
 
 def test_it_works_under_transformations(batch):

@@ -163,6 +163,18 @@ def function(name: str, value: Any, expected: str = "a callable") -> Any:
     raise refusal(name, expected, value)
 
 
+def hashable(name: str, functions: Any) -> None:
+    """Raises ValueError if a function, or what one holds beside arrays, has no hash."""
+    for leaf in jax.tree.leaves(functions):
+        if eqx.is_array_like(leaf):
+            continue
+        try:
+            hash(leaf)
+        except TypeError:
+            expected = "what can be hashed, as a key of compiled programs"
+            raise refusal(name, expected, leaf) from None
+
+
 def instance(name: str, value: Any, kind: type) -> None:
     """Raises ValueError unless `value` is an instance of `kind`."""
     if not isinstance(value, kind):

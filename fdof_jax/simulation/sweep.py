@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike
 
 from ..base.checks import (
     function,
+    hashable,
     increasing,
     instance,
     is_transformed,
@@ -35,7 +36,7 @@ from ..linkage.linkage import Linkage
 from .batch_axes import Batch, batch_of
 from .checkpoints import Checkpoint, folder_at
 from .chunk_programs import outcome_of
-from .chunks import in_chunks, usual_chunk
+from .chunks import Job, in_chunks, usual_chunk
 from .dopri8 import constant
 from .forecast import expected_work
 from .provenance import outline
@@ -194,6 +195,8 @@ def sweep(
     ts = real_array("ts", ts, (None,))
     increasing("ts", ts)
     elements("forces", forces)
+    hashable("forces", forces)
+    hashable("reduce", reduce)
     if chunk is not None:
         whole_number("chunk", chunk, 1)
     whole_number("of", of, 1)
@@ -245,19 +248,20 @@ def sweep(
                 "vmap."
             )
         return whole(_traced(batch, ts, settings, keep, chunk))
-    options = batch, ts, settings, keep, chunk
     with devices_outside_mesh() as devices:
+        job = Job(batch, ts, settings, keep, chunk, devices)
         if store is not None:
             folder = folder_at("store", store)
             like, digest = outline(batch, ts, settings, keep)
             group = Store(folder, batch, ts, like, chunk, digest)
             blocks = range(shard, group.count, of)
-            check(in_store(group, blocks, *options, progress_meter, devices))
+            check(in_store(group, blocks, job, progress_meter))
             return folder
         resumed = None
         if checkpoint is not None:
+            folder = folder_at("checkpoint", checkpoint)
             _, digest = outline(batch, ts, settings, keep)
-            resumed = Checkpoint(checkpoint, digest)
-        kept, failed = in_chunks(*options, resumed, progress_meter, devices)
+            resumed = Checkpoint(folder, digest)
+        kept, failed = in_chunks(job, resumed, progress_meter)
     check(np.flatnonzero(failed))
     return whole(kept)
