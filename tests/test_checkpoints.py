@@ -3,16 +3,18 @@
 import errno
 import os
 import re
+import sys
 import threading
 
 import jax
 import numpy as np
 import pytest
+import sweep_batch
 from sweep_batch import run
 
 import fdof_jax as fj
 from fdof_jax.simulation import checkpoints
-from fdof_jax.simulation.checkpoints import Checkpoint, Rows
+from fdof_jax.simulation.checkpoints import Checkpoint, Rows, folder_at
 
 MEMBERS, LANES = np.arange(3), 7
 
@@ -94,6 +96,7 @@ def test_a_sweep_solves_again_what_is_damaged(mixed, swept, tmp_path):
     saved[2].write_bytes(b"")
     with pytest.warns(RuntimeWarning) as warned:
         again = run(mixed, checkpoint=tmp_path)
+    assert {w.filename for w in warned} == {sweep_batch.__file__}
     named = {path for path in saved for w in warned if str(path) in str(w.message)}
     assert named == {saved[0], saved[2]}
     assert [path.read_bytes() for path in saved] == content
@@ -137,8 +140,10 @@ def test_two_writers_of_one_chunk_do_not_meet(checkpoint, monkeypatch):
 
 def test_paths_of_a_folder(tmp_path, monkeypatch):
     monkeypatch.setenv("HOME", str(tmp_path))
-    Checkpoint("~/kept", "digest")
+    assert folder_at("checkpoint", "~/kept") == tmp_path / "kept"
     assert (tmp_path / "kept").is_dir()
+    # Refused before anything is traced
+    monkeypatch.setattr(sys.modules["fdof_jax.simulation.sweep"], "outline", None)
     with pytest.raises(ValueError, match="^checkpoint: expected a folder, got ''"):
         fj.sweep(
             fj.scenes.fig5().linkage,

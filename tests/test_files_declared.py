@@ -85,6 +85,15 @@ def test_an_array_is_as_long_as_it_says(shape, path):
     refused_within_20_mb(path, "damaged")
 
 
+def test_an_array_of_structures_is_refused(path):
+    """Its bytes would be taken for numbers of the same size."""
+    fj.save(path, np.zeros(4))
+    member = io.BytesIO()
+    np.save(member, np.zeros(4, [("a", "<f4"), ("b", "<i4")]))
+    archived(path, contents(path) | {"arrays/0.npy": member.getvalue()})
+    refused(path, "damaged.*structures")
+
+
 def test_arrays_in_any_order_of_axes_can_be_changed(path):
     tree = [np.asfortranarray(np.arange(6.0).reshape(2, 3)), np.zeros((0, 3))]
     fj.save(path, tree)

@@ -160,6 +160,8 @@ def test_starts_beside_the_reference_and_singular_equations_are_told():
         fj.simulate(CART, fj.State(starts.q[1], np.zeros(3)), [0, 1], (motion,))
     swept = fj.sweep(CART, starts, [0, 0.1], (motion,), **SHORT)
     assert swept.outcome.tolist() == ["successful", "not finite"]
+    with pytest.raises(ValueError, match="^outcome: expected .* compare `result`"):
+        jax.eval_shape(lambda solution: solution.outcome, swept)
     # Two stretched links with a heavy tip; the prescribed slide is well-conditioned.
     heavy = fj.Linkage(
         "PRR", length=[0, 0, 1, 1], com=[[0, 0], [0.5, 0], [1, 0]], mass=[1, 1, 1e12],

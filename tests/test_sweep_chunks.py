@@ -73,6 +73,20 @@ def test_members_are_shared_out_by_their_forecast(solved, monkeypatch, cores, ca
     assert sorted(map(sorted, found)) == sorted(map(sorted, calls))
 
 
+@pytest.mark.parametrize(
+    "kinds", [(np.float32,) * 2, (np.float32, float), (float, int)]
+)
+def test_starts_of_any_type_are_solved_in_double_precision(kinds):
+    speeds = np.arange(12.0)  # exact in all types
+    linkage, starts = pendulums(speeds)
+    starts = fj.State(*(a.astype(kind) for a, kind in zip(starts, kinds)))
+    motion = fj.sweep(linkage, starts, TS, chunk=4, **SETTINGS)
+    expected = swept(speeds, chunk=4)
+    for a, b in zip(*map(jax.tree.leaves, (motion, expected)), strict=True):
+        assert a.dtype == b.dtype
+        np.testing.assert_array_equal(a, b)
+
+
 def test_long_records_are_solved_chunk_by_chunk(solved, monkeypatch):
     """So do runs that show their progress; a call of many chunks needs more memory."""
     monkeypatch.setattr(chunks, "_cores", lambda: 1)

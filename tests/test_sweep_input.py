@@ -115,7 +115,7 @@ def test_other_axes_are_refused(axes):
         "chunk": [0, -1, 1.5, True, "8"],
         "throw": [1, None, "no"],
         "progress_meter": [None, 3],
-        "checkpoint": [3, True],
+        "checkpoint": [3, True, ""],
         "store": [3, True, ""],
         "shard": [-1, 1, 0.5, None],
         "of": [0, 1.5, True, None],

@@ -123,6 +123,10 @@ if hasattr(jax, "set_mesh"):
         same = sweep_batch.run(spread, chunk=4)
         sweep_batch.run(spread, chunk=4, store=os.path.dirname(path) + "/store")
     np.testing.assert_allclose(same.q, solution.q[:even], rtol=1e-8, atol=1e-8)
+# Each process has a folder of its own, in which only the first one writes.
+for _ in range(2):
+    again = sweep_batch.run(batch, chunk=4, checkpoint=path + ".chunks")
+    np.testing.assert_array_equal(again.q, solution.q)
 steps = solution.stats["num_steps"]
 good = sweep_batch.successful(solution)
 np.savez(path, q=solution.q, qd=solution.qd, steps=steps, good=good)

@@ -5,20 +5,20 @@ import re
 import subprocess
 import sys
 import time
+import tracemalloc
 from pathlib import Path
 
-import diffrax
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import sweep_batch
 import xarray
 from helpers import programs
-from sweep_batch import FAILED, SETTINGS, TS, run, single_links
+from sweep_batch import FAILED, TS, run, single_links
 
 import fdof_jax as fj
 from fdof_jax.simulation import store
-from fdof_jax.simulation.provenance import outline
+from fdof_jax.simulation.batch_axes import batch_of
 
 BLOCKS, BLOCK = 6, 7  # members
 
@@ -59,16 +59,17 @@ def solved(monkeypatch):
     sizes = []
     original = store.in_chunks
 
-    def recorded(batch, *arguments):
-        sizes.append(batch.size)
-        return original(batch, *arguments)
+    def recorded(job, **keywords):
+        sizes.append(job.batch.size)
+        return original(job, **keywords)
 
     monkeypatch.setattr(store, "in_chunks", recorded)
     return sizes
 
 
 def end(motion):
-    return {"end": motion.q[-1], "result": motion.result, "is new": jnp.array(True)}
+    new, none = jnp.array(True), motion.q[:0]
+    return {"end": motion.q[-1], "result": motion.result, "is new": new, "none": none}
 
 
 def test_xarray_opens_it(stored, swept):
@@ -121,8 +122,9 @@ FILES = ["q/c/2/0/0", "outcome/c/2", "records/2.sha256", "qd/zarr.json", "time/c
 def test_damage_is_named_and_solved_again(mixed, stored, undisturbed, solved, damage):
     for name in (*FILES, "zarr.json"):
         (stored / name).write_bytes(DAMAGES[damage](undisturbed[name]))
-        with pytest.warns(RuntimeWarning, match=re.escape(name)):
+        with pytest.warns(RuntimeWarning, match=re.escape(name)) as warned:
             run(mixed, store=stored)
+        assert {w.filename for w in warned} == {sweep_batch.__file__}
         assert read(stored) == undisturbed
     assert solved == [BLOCK] * 3
 
@@ -178,38 +180,59 @@ def test_another_sweep_needs_another_folder(mixed, stored, undisturbed):
     assert read(stored) == undisturbed
 
 
+def test_what_others_wrote_is_refused_and_kept(mixed, tmp_path):
+    data = xarray.Dataset({"q": ("member", np.arange(5.0))})
+    contents = {
+        "three": lambda folder: data.to_zarr(folder, zarr_format=3, consolidated=False),
+        "two": lambda folder: data.to_zarr(folder, zarr_format=2),
+        "list": lambda folder: (folder / "zarr.json").write_text("[]"),
+        "notes": lambda folder: (folder / "notes.txt").write_text("mine"),
+        "killed": lambda folder: (folder / "zarr.json.1.part").write_text("{"),
+    }
+    batch, like = batch_of(*mixed, 0), {"q": np.zeros(3)}
+    for name, write in contents.items():
+        folder = tmp_path / name
+        folder.mkdir()
+        write(folder)
+        before = read(folder)
+        arguments = folder, batch, jnp.asarray(TS), like, 8, "digest"
+        if name == "killed":
+            store.Store(*arguments)
+        else:
+            with pytest.raises(ValueError, match="^store: expected a new folder or"):
+                store.Store(*arguments)
+            assert read(folder) == before
+
+
 def test_only_what_is_asked_for(mixed, swept, tmp_path):
     run(mixed, store=tmp_path, reduce=end)
     with xarray.open_zarr(tmp_path) as data:
-        assert {*data} == {"end", "result", "is_new", "failed"}
+        assert {*data} == {"end", "result", "is_new", "none", "failed"}
+        assert data.none.shape == (42, 0, 3)
         assert data.end.dims == ("member", "end_1")
         np.testing.assert_allclose(data.end, swept.q[:, -1], rtol=1e-6, atol=1e-6)
         assert np.flatnonzero(data.result).tolist() == FAILED
     with pytest.raises(RuntimeError, match="3 of 42 members failed.* member 3"):
         run(mixed, store=tmp_path, reduce=end, throw=True)
-    clash = lambda motion: {"a b": motion.q, "a.b": motion.qd}
-    for reduce in (clash, lambda motion: {"failed": motion.q}):
+
+
+def test_names_of_parts_differ_in_letters(mixed, tmp_path):
+    batch, q = batch_of(*mixed, 0), np.zeros(3)
+    for like in ({"a b": q, "a.b": q}, {"a": q, "A": q}, {"Failed": q}):
         with pytest.raises(ValueError, match="^reduce: expected .*name"):
-            run(mixed, store=tmp_path / "clash", reduce=reduce)
+            store.Store(tmp_path, batch, jnp.asarray(TS), like, 8, "digest")
 
 
-def test_a_digest_names_what_functions_compute(batch):
-    linkage, state0, _ = jax.tree.map(lambda leaf: leaf[:2], batch)
-    everything = jax.tree.map(lambda leaf: True, (linkage, state0))
-
-    def digest(factor, reduce=lambda motion: motion.q):
-        force = lambda t, q, qd, linkage: factor * q
-        inputs = linkage, state0, (force,)
-        batch = store.Batch(inputs, (*everything, (False,)), 2)
-        settings = dict(
-            SETTINGS, dt0=1e-3, adjoint=diffrax.RecursiveCheckpointAdjoint()
-        )
-        return outline(batch, jnp.asarray(TS), settings, reduce)[1]
-
-    assert digest(2.0) == digest(2.0)
-    assert digest(2.0) != digest(3.0)
-    assert digest(jnp.full(3, 2.0)) != digest(jnp.full(3, 3.0))
-    assert digest(2.0) != digest(2.0, lambda motion: motion.q + 1)
+def test_a_block_is_written_without_copies(mixed, tmp_path):
+    batch = batch_of(*mixed, 0)
+    kept = {"q": np.zeros((len(mixed[1].q), 100_000))}
+    like = {"q": kept["q"][0]}
+    group = store.Store(tmp_path, batch, jnp.asarray(TS), like, 64, "digest")
+    tracemalloc.start()
+    group.write(0, kept, np.zeros(len(kept["q"]), bool))
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert most < kept["q"].nbytes / 10
 
 
 WORKER = """

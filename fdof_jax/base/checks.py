@@ -13,7 +13,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.core import Tracer
+from jax.core import Tracer, eval_context
+
+try:
+    from jax.extend.core import get_opaque_trace_state
+except ImportError:  # as in JAX 0.6
+    from jax.core import get_opaque_trace_state  # pyright: ignore
 
 from .user_warnings import warn
 
@@ -24,6 +29,16 @@ JOINT = "joint"
 def is_traced(*trees: Any) -> bool:
     """Returns whether a JAX transformation traces any leaf of `trees`."""
     return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(trees))
+
+
+def is_transformed() -> bool:
+    """Returns whether a JAX transformation is running, whatever it traces.
+
+    Functions may then hold traced values in their closures, where none can be found.
+    """
+    with eval_context():
+        outside = get_opaque_trace_state()
+    return get_opaque_trace_state() != outside
 
 
 def known(*trees: Any) -> bool:
@@ -157,6 +172,18 @@ def function(name: str, value: Any, expected: str = "a callable") -> Any:
     if callable(value) and not isinstance(value, type):
         return value
     raise refusal(name, expected, value)
+
+
+def hashable(name: str, functions: Any) -> None:
+    """Raises ValueError if a function, or what one holds beside arrays, has no hash."""
+    for leaf in jax.tree.leaves(functions):
+        if eqx.is_array_like(leaf):
+            continue
+        try:
+            hash(leaf)
+        except TypeError:
+            expected = "what can be hashed, as a key of compiled programs"
+            raise refusal(name, expected, leaf) from None
 
 
 def instance(name: str, value: Any, kind: type) -> None:

@@ -1,7 +1,7 @@
-"""The devices that chunks run on, whatever devices hold the inputs."""
+"""The devices and processes that chunks run on, whatever devices hold the inputs."""
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
@@ -29,6 +29,22 @@ def devices_outside_mesh() -> Iterator[list[Any]]:
         return
     with jax.set_mesh(_NO_MESH):
         yield list(mesh.devices.flat)
+
+
+def found_by_first(
+    find: Callable[[], list[np.ndarray] | None], like: Callable[[], list[np.ndarray]]
+) -> list[np.ndarray] | None:
+    """Returns what `find` returns in the first process, in all of them.
+
+    `like` returns arrays of the same shapes and types, for the other processes.
+    """
+    if jax.process_count() == 1:
+        return find()
+    found = find() if jax.process_index() == 0 else None
+    send = multihost_utils.broadcast_one_to_all
+    if not send(np.asarray(found is not None)):
+        return None
+    return [np.asarray(array) for array in send(like() if found is None else found)]
 
 
 def uncommitted(tree: Any) -> Any:

@@ -1,5 +1,6 @@
 """Warnings that name the caller's line, however deep in the library they arise."""
 
+import contextlib
 import sys
 import warnings
 from pathlib import Path
@@ -10,12 +11,13 @@ import jax
 _INNER = (
     *(str(Path(name).parent) for name in (jax.__file__, eqx.__file__)),
     str(Path(__file__).parents[1]),
+    contextlib.__file__,  # of decorators such as `jax.transfer_guard`
     "<@",  # functions that beartype makes
 )
 
 
 def warn(message: str, category: type[Warning] = UserWarning) -> None:
-    """Warns at the line outside of this library, equinox and JAX."""
+    """Warns at the line outside of this library, equinox, JAX and contextlib."""
     frame, level = sys._getframe(1), 2
     while frame.f_back is not None and frame.f_code.co_filename.startswith(_INNER):
         frame, level = frame.f_back, level + 1

@@ -10,7 +10,7 @@ from typing import BinaryIO
 
 @contextlib.contextmanager
 def whole_file(path: Path) -> Iterator[BinaryIO]:
-    """Opens a new file for writing, which at the end replaces the one at `path`.
+    """Opens a new file and replaces that at `path` when the block ends without error.
 
     Until then it has a name that no other process uses; after an error it is removed.
     An OSError names `path`.

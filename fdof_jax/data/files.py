@@ -14,13 +14,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import diffrax
-import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .. import __version__
+from ..base.versions import VERSIONS
 from ..base.whole_files import whole_file
 from .tree_description import Restorer, Unreadable, described
 
@@ -100,8 +97,8 @@ def _array(content: bytes) -> np.ndarray:
     if np.lib.format.read_magic(member) != (1, 0):
         raise ValueError("another version of NumPy's format")
     shape, fortran, dtype = np.lib.format.read_array_header_1_0(member)
-    if dtype.hasobject:
-        raise ValueError("an array of objects")
+    if dtype.hasobject or dtype.fields:
+        raise ValueError("an array of objects or structures")
     # `read_array` would reserve what the header declares before it reads.
     order = "F" if fortran else "C"
     return np.ndarray(shape, dtype, content, member.tell(), order=order).copy("K")
@@ -146,12 +143,10 @@ def save(path: str | os.PathLike, tree: Any) -> None:
         raise ValueError(
             "tree: expected one without itself in it, got one nested without end."
         ) from None
-    modules = (jax, diffrax, eqx, np)
     description = {
         "format": _FORMAT,
         "version": _VERSION,
-        "written by": {_FORMAT: __version__}
-        | {module.__name__: module.__version__ for module in modules},
+        "written by": VERSIONS,
         "default dtype": jnp.result_type(float).name,
         "tree": tree_node,
     }

@@ -7,19 +7,12 @@ import os
 from pathlib import Path
 from typing import Any
 
-import diffrax
-import equinox as eqx
-import jax
 import numpy as np
 
-from .. import __version__
 from ..base.checks import refusal
 from ..base.user_warnings import warn
+from ..base.versions import VERSIONS
 from ..base.whole_files import whole_file
-
-VERSIONS = {"fdof_jax": __version__} | {
-    module.__name__: module.__version__ for module in (jax, diffrax, eqx, np)
-}
 
 
 def folder_at(name: str, value: str | os.PathLike) -> Path:
@@ -40,6 +33,9 @@ class Rows:
     def described(self, size: int) -> list[tuple[str, tuple[int, ...]]]:
         return [(dtype.name, (size, *shape)) for shape, dtype in self.kinds]
 
+    def empty(self, size: int) -> list[np.ndarray]:
+        return [np.empty((size, *shape), dtype) for shape, dtype in self.kinds]
+
     def split(self, size: int, data: bytes) -> list[np.ndarray]:
         """Returns the arrays whose bytes follow one another in `data`."""
         arrays, offset = [], 0
@@ -57,13 +53,12 @@ class Checkpoint:
     the arrays' bytes, which follow.
     """
 
-    def __init__(self, folder: str | os.PathLike, sweep: str):
-        """Makes the folder, if need be, for the sweep of this digest."""
-        self.folder = folder_at("checkpoint", folder)
-        self.sweep = sweep
+    def __init__(self, folder: Path, sweep: str):
+        """Uses a folder for the sweep of this digest."""
+        self.folder, self.sweep = folder, sweep
 
     def _chunk(self, members: np.ndarray, lanes: int) -> tuple[Path, dict[str, Any]]:
-        """Returns a chunk's file and what it holds; other members have another file."""
+        """Returns the file of a chunk, named by a digest, and what the digest is of."""
         holds = {
             "versions": VERSIONS,
             "sweep": self.sweep,

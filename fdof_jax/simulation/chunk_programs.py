@@ -39,6 +39,16 @@ def motion_of(
     return simulate(linkage, state0, ts, forces, throw=False, **settings)
 
 
+def _check_kept(kept: Any) -> None:
+    """Raises ValueError unless a reduction returned arrays of numbers."""
+    for leaf in jax.tree.leaves(kept):
+        if not eqx.is_array_like(leaf):
+            raise refusal("reduce", "a function that returns arrays", leaf)
+        kind = getattr(leaf, "dtype", float)
+        if not any(jnp.issubdtype(kind, known) for known in (np.number, np.bool_)):
+            raise refusal("reduce", "a function that returns numbers", kind)
+
+
 def outcome_of(
     settings: dict,
     reduce: Callable[[Solution], Any],
@@ -50,8 +60,7 @@ def outcome_of(
     """Computes what is kept of one member, whether it was stopped, and if it failed."""
     solution = motion_of(settings, ts, moving, shared, abreast)
     kept = reduce(solution)
-    if not all(map(eqx.is_array_like, jax.tree.leaves(kept))):
-        raise refusal("reduce", "a function that returns arrays", kept)
+    _check_kept(kept)
     results, most = diffrax.RESULTS, settings["max_steps"]
     stopped = solution.result == results.max_steps_reached
     if most is not None:
@@ -62,7 +71,7 @@ def outcome_of(
 class Form(NamedTuple):
     """The key of a program: structures, constants, kinds of the arrays."""
 
-    moving: Any  # structures
+    moving: Any  # structures of the three parts of the inputs
     arrays: Any
     rest: Any
     constants: tuple[Any, ...]
@@ -77,6 +86,7 @@ class Form(NamedTuple):
 
     @property
     def sharding(self) -> NamedSharding | None:
+        """How arrays with an axis of lanes are spread over the devices, if several."""
         return self.mesh and NamedSharding(self.mesh, PartitionSpec("member"))
 
 
@@ -92,7 +102,11 @@ def traced(form: Form) -> jax.stages.Lowered:
         known = jax.tree.unflatten(form.arrays, arrays)
         rest = jax.tree.unflatten(form.rest, form.constants)
         settings, reduce, ts, shared = eqx.combine(known, rest)
-        chunks = [leaf.reshape(form.series, -1, *leaf.shape[1:]) for leaf in moving]
+        # In each size, as -1 would be unknown for empty arrays.
+        chunks = [
+            leaf.reshape(form.series, len(leaf) // form.series, *leaf.shape[1:])
+            for leaf in moving
+        ]
         abreast = chunks[0].shape[1] > _ALL_ALIKE  # of the lanes of one device
 
         def member(leaves):
@@ -113,7 +127,10 @@ def traced(form: Form) -> jax.stages.Lowered:
             jax.eval_shape(solved, count),
         )
         outcomes = jax.lax.fori_loop(0, count, added, outcomes)
-        return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), outcomes)
+        lanes = chunks[0].shape[1]
+        return jax.tree.map(
+            lambda leaf: leaf.reshape(form.series * lanes, *leaf.shape[2:]), outcomes
+        )
 
     if form.mesh is not None:
         lanes, same = PartitionSpec("member"), PartitionSpec()
@@ -132,4 +149,5 @@ def traced(form: Form) -> jax.stages.Lowered:
 
 @functools.lru_cache(maxsize=64)
 def compiled(form: Form) -> jax.stages.Compiled:
+    """Compiles the program of this form; the programs used last are kept."""
     return traced(form).compile(wide_vectors())

@@ -6,7 +6,7 @@ import sys
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import Any, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -17,6 +17,7 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding
 
 from ..base.array_namespace import in_numpy
+from ..base.devices import found_by_first
 from .batch_axes import Batch
 from .checkpoints import Checkpoint, Rows
 from .chunk_programs import Form, compiled, traced
@@ -60,20 +61,23 @@ def _solve(program: Any, count: int, moving: list[Any], arrays: list[Array]) -> 
     return jax.block_until_ready(program(np.int32(count), moving, arrays))
 
 
+class Job(NamedTuple):
+    """What a sweep solves, on which devices, and the most members of a chunk."""
+
+    batch: Batch
+    ts: Array
+    settings: dict
+    reduce: Callable[[Solution], Any]
+    chunk: int
+    devices: list[Any]
+
+
 class _Chunks:
     """Solves chunks, and keeps their results in a checkpoint if there is one."""
 
-    def __init__(
-        self,
-        batch: Batch,
-        ts: Array,
-        settings: dict,
-        reduce: Callable[[Solution], Any],
-        checkpoint: Checkpoint | None,
-        apart: bool,
-        devices: list[Any],
-    ):
+    def __init__(self, job: Job, checkpoint: Checkpoint | None, apart: bool):
         """Prepares a batch; `apart`: whether each call is to solve a single chunk."""
+        batch, ts, settings, reduce, _, devices = job
         self.devices = len(devices)
         mesh = Mesh(np.array(devices), ("member",)) if len(devices) > 1 else None
         moving, shared = batch.split()
@@ -178,10 +182,19 @@ class _Chunks:
 
     def _kept(self, form: Form, members: np.ndarray) -> Any:
         """Returns the outcomes of a chunk that the checkpoint holds, or None."""
-        if self.checkpoint is None or not self.checkpoint.has(members, form.lanes):
+        checkpoint, size = self.checkpoint, len(members)
+        if checkpoint is None:
             return None
-        arrays, structure = jax.tree.flatten(traced(form).out_info)
-        values = self.checkpoint.read(members, form.lanes, Rows(arrays))
+
+        def rows() -> Rows:
+            return Rows(jax.tree.leaves(traced(form).out_info))
+
+        def find() -> list[np.ndarray] | None:
+            known = checkpoint.has(members, form.lanes)
+            return checkpoint.read(members, form.lanes, rows()) if known else None
+
+        values = found_by_first(find, lambda: rows().empty(size))
+        structure = jax.tree.structure(traced(form).out_info)
         return None if values is None else (members, values, structure)
 
 
@@ -202,18 +215,18 @@ def _to_device(results: list[Any]) -> None:
 
 
 def in_chunks(
-    batch: Batch,
-    ts: Array,
-    settings: dict,
-    reduce: Callable[[Solution], Any],
-    chunk: int,
-    checkpoint: Checkpoint | None,
-    meter: diffrax.AbstractProgressMeter,
-    devices: list[Any],
+    job: Job,
+    checkpoint: Checkpoint | None = None,
+    meter: diffrax.AbstractProgressMeter = diffrax.NoProgressMeter(),
+    on_device: bool = True,
 ) -> tuple[Any, np.ndarray]:
-    """Returns what is kept of all members, and which of them failed."""
+    """Returns what is kept of all members, and which of them failed.
+
+    Unless `on_device`, the arrays of several chunks are NumPy's.
+    """
+    batch, chunk = job.batch, job.chunk
     seen = type(meter) is not diffrax.NoProgressMeter
-    chunks = _Chunks(batch, ts, settings, reduce, checkpoint, seen, devices)
+    chunks = _Chunks(job, checkpoint, seen)
     lanes = _lanes(-(-batch.size // chunks.devices), chunk)
     waiting = np.arange(batch.size)
     several = batch.size > lanes * chunks.devices
@@ -221,7 +234,7 @@ def in_chunks(
     if several:
         # The longest come first, so that no core waits long for another at the end.
         _, shared = batch.split()
-        waiting = np.argsort(chunks.forecast(ts, shared, lanes))[::-1]
+        waiting = np.argsort(chunks.forecast(job.ts, shared, lanes))[::-1]
     done, progress, results, structure = 0, meter.init(), [], None
     while len(waiting):
         late = []
@@ -244,7 +257,7 @@ def in_chunks(
         if len(waiting) <= lanes // _SMALL:
             form = chunks.form_of(_lanes(min(len(waiting), _SMALL), chunk), False)
     meter.close(progress)
-    if not all(isinstance(leaf, Array) for leaf in results):  # those of one chunk are
+    if on_device and not all(isinstance(leaf, Array) for leaf in results):
         _to_device(results)
     kept, _, failed = jax.tree.unflatten(structure, results)
     return kept, np.asarray(failed)

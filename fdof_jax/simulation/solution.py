@@ -8,7 +8,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
-from ..base.checks import known
+from ..base.checks import is_traced, known
 from ..base.html_table import html_table
 
 # In the order of `outcome_numbers`.
@@ -48,7 +48,14 @@ class WithOutcome(eqx.Module):
         `"out of steps"`; `"tolerance out of reach"`: rounding keeps even the shortest
         step from meeting it; `"too many switches"`: one after the other, as between
         branches that push towards each other; or `"solver failed"`.
+
+        Raises ValueError under transformations, where words do not exist.
         """
+        if is_traced(self.result):
+            raise ValueError(
+                "outcome: expected a computed motion, got one that JAX traces; there, "
+                "compare `result`: motion.result == diffrax.RESULTS.successful."
+            )
         return np.asarray(np.array(OUTCOMES)[outcome_numbers(self.result)])
 
     def __repr__(self) -> str:

@@ -3,7 +3,6 @@
 import hashlib
 import json
 import math
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,15 +12,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.experimental import multihost_utils
 
 from ..base.array_namespace import in_numpy
 from ..base.checks import refusal
+from ..base.devices import found_by_first
 from ..base.user_warnings import warn
+from ..base.versions import VERSIONS
 from ..base.whole_files import whole_file
 from .batch_axes import Batch
-from .checkpoints import VERSIONS
-from .chunks import in_chunks
+from .chunks import Job, in_chunks
 from .solution import Solution
 from .zarr_variables import Variable, coordinates, metadata, values_of, variables_of
 
@@ -29,7 +28,7 @@ _BYTES = 2**26  # of the results in a block
 _CHUNKS = 16  # at most so many in a block, as blocks are what workers share
 
 
-def _sha256(data: bytes) -> str:
+def _sha256(data: bytes | memoryview) -> str:
     return hashlib.sha256(data).hexdigest()
 
 
@@ -40,6 +39,10 @@ def _warn(expected: str, done: str) -> None:
 
 def _text(value: Any) -> bytes:
     return json.dumps(value, indent=1).encode()
+
+
+def _record_name(block: int) -> str:
+    return f"records/{block}.sha256"
 
 
 class Store:
@@ -56,7 +59,7 @@ class Store:
         self.folder, self.size = folder, batch.size
         failed = Variable("failed", np.dtype(bool), (), ["member"], {})
         self.variables = [*variables_of(like, batch.inputs[0]), failed]
-        if len({variable.name for variable in self.variables}) < len(self.variables):
+        if any(v.name.casefold() == "failed" for v in self.variables[:-1]):
             raise refusal("reduce", "no part named failed beside a store", like)
         each = sum(v.dtype.itemsize * math.prod(v.shape) for v in self.variables)
         most = chunk * min(_CHUNKS, max(1, _BYTES // (chunk * each)))
@@ -98,21 +101,33 @@ class Store:
             self._write(name, data)
 
     def _refuse_another(self, attributes: dict[str, Any]) -> None:
-        """Raises ValueError if the group is whole, but of another sweep."""
+        """Raises ValueError if the folder holds anything but this sweep, or damage."""
+        # In this order, as another worker may be about to write `zarr.json` first.
+        names = {path.name for path in self.folder.iterdir() if path.suffix != ".part"}
+        path = self.folder / "zarr.json"
+        if not path.exists():
+            if names and "records" not in names:
+                raise self._another(f"holds {min(names)}")
+            return
         try:
-            found = json.loads((self.folder / "zarr.json").read_bytes())["attributes"]
+            group = json.loads(path.read_bytes())
+        except ValueError:
+            return  # damaged
+        try:
+            found = group["attributes"]
             provenance = {key: found[key] for key in attributes if key != "sha256"}
-        except (OSError, ValueError, LookupError, TypeError):
-            return  # none, or damaged
-        whole = found["sha256"] == _sha256(_text(provenance))
+            whole = found["sha256"] == _sha256(_text(provenance))
+        except (LookupError, TypeError):
+            raise self._another("holds a Zarr group from elsewhere") from None
         if whole and found != attributes:
-            others = ", ".join(
-                key for key in provenance if found[key] != attributes[key]
-            )
-            raise ValueError(
-                "store: expected a new folder or one of this sweep, got "
-                f"{self.folder}, which has another {others}."
-            )
+            others = [key for key in provenance if found[key] != attributes[key]]
+            raise self._another(f"has another {', '.join(others)}")
+
+    def _another(self, what: str) -> ValueError:
+        return ValueError(
+            f"store: expected a new folder or one of this sweep, got {self.folder}, "
+            f"which {what}."
+        )
 
     def members(self, block: int) -> slice:
         return slice(block * self.block, min(self.size, (block + 1) * self.block))
@@ -122,11 +137,10 @@ class Store:
         axes = lambda variable: "/0" * len(variable.shape)
         return {f"{v.name}/c/{block}{axes(v)}": v for v in self.variables}
 
-    def _record(self, block: int, sums: list[str]) -> tuple[str, list[str]]:
-        """Returns the name of a block's record and its lines."""
+    def _record(self, block: int, sums: list[str]) -> list[str]:
+        """Returns the lines of a block's record."""
         files = ["zarr.json", *self._files(block)]
-        lines = [f"{total}  {file}" for total, file in zip([self.named, *sums], files)]
-        return f"records/{block}.sha256", lines
+        return [f"{total}  {file}" for total, file in zip([self.named, *sums], files)]
 
     def failed(self, block: int) -> np.ndarray | None:
         """Returns which members of a finished block failed, or None if it is to solve.
@@ -134,11 +148,11 @@ class Store:
         Damaged files are reported by a warning.
         """
         files = self._files(block)
-        record = self.folder / self._record(block, [])[0]
+        record = self.folder / _record_name(block)
         if not record.exists():
             return None
         sums = [self._sum(file) for file in files]
-        lines = self._record(block, sums)[1]
+        lines = self._record(block, sums)
         found, members = record.read_bytes(), self.members(block)
         if found == "\n".join(lines).encode():
             flags = np.fromfile(self.folder / list(files)[-1], bool)
@@ -157,13 +171,15 @@ class Store:
         for (file, variable), values in zip(
             self._files(block).items(), [*values_of(kept), failed], strict=True
         ):
-            # Chunks of one array are equally long, also the last one.
-            rows = np.zeros((self.block, *variable.shape), variable.dtype)
-            rows[: len(values)] = values
-            self._write(file, rows.tobytes())
-            sums.append(_sha256(rows.tobytes()))
-        name, lines = self._record(block, sums)
-        self._write(name, "\n".join(lines).encode())
+            rows = np.ascontiguousarray(values)
+            if len(rows) < self.block:  # chunks of one array are equally long
+                rows = np.zeros((self.block, *variable.shape), variable.dtype)
+                rows[: len(values)] = values
+            data = rows.reshape(-1).view(np.uint8).data  # without a copy
+            self._write(file, data)
+            sums.append(_sha256(data))
+        lines = self._record(block, sums)
+        self._write(_record_name(block), "\n".join(lines).encode())
 
     def _sum(self, name: str) -> str:
         try:
@@ -172,7 +188,7 @@ class Store:
         except FileNotFoundError:
             return "missing"
 
-    def _write(self, name: str, data: bytes) -> None:
+    def _write(self, name: str, data: bytes | memoryview) -> None:
         path = self.folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
         with whole_file(path) as file:
@@ -180,48 +196,32 @@ class Store:
 
 
 def _known(store: Store, block: int) -> np.ndarray | None:
-    """Returns `store.failed(block)`, in all processes what the first one finds."""
-    if jax.process_count() == 1:
-        return store.failed(block)
+    """Returns `store.failed(block)` as the first process finds it."""
+
+    def find() -> list[np.ndarray] | None:
+        failed = store.failed(block)
+        return None if failed is None else [failed]
+
     members = store.members(block)
-    failed = store.failed(block) if jax.process_index() == 0 else None
-    answer = np.zeros(1 + members.stop - members.start, bool)
-    if failed is not None:
-        answer[0], answer[1:] = True, failed
-    answer = np.asarray(multihost_utils.broadcast_one_to_all(answer))
-    return answer[1:] if answer[0] else None
+    size = members.stop - members.start
+    found = found_by_first(find, lambda: [np.empty(size, bool)])
+    return None if found is None else found[0]
 
 
 def in_store(
-    store: Store,
-    blocks: range,
-    batch: Batch,
-    ts: Array,
-    settings: dict,
-    reduce: Callable[[Solution], Any],
-    chunk: int,
-    meter: diffrax.AbstractProgressMeter,
-    devices: list[Any],
+    store: Store, blocks: range, job: Job, meter: diffrax.AbstractProgressMeter
 ) -> list[int]:
     """Solves blocks of members that the store lacks; returns the failed members."""
-    moving, shared = batch.split()
+    moving, shared = job.batch.split()
     moving, found, progress = in_numpy(moving), [], meter.init()
     for done, block in enumerate(blocks, 1):
-        members, failed = store.members(block), _known(store, block)
+        failed = _known(store, block)
+        members = store.members(block)
         if failed is None:
             part = jax.tree.map(lambda leaf, m=members: leaf[m], moving)
             size = members.stop - members.start
-            some = Batch(eqx.combine(part, shared), batch.batched, size)
-            kept, failed = in_chunks(
-                some,
-                ts,
-                settings,
-                reduce,
-                chunk,
-                None,
-                diffrax.NoProgressMeter(),
-                devices,
-            )
+            some = Batch(eqx.combine(part, shared), job.batch.batched, size)
+            kept, failed = in_chunks(job._replace(batch=some), on_device=False)
             if jax.process_index() == 0:
                 store.write(block, kept, failed)
         found += (members.start + np.flatnonzero(failed)).tolist()

@@ -21,8 +21,9 @@ from numpy.typing import ArrayLike
 
 from ..base.checks import (
     function,
+    hashable,
     increasing,
-    is_traced,
+    is_transformed,
     real_array,
     refusal,
     whole_number,
@@ -34,7 +35,7 @@ from ..linkage.linkage import Linkage
 from .batch_axes import Batch, batch_of, check_arms
 from .checkpoints import Checkpoint, folder_at
 from .chunk_programs import outcome_of
-from .chunks import in_chunks, usual_chunk
+from .chunks import Job, in_chunks, usual_chunk
 from .dopri8 import constant
 from .forecast import expected_work
 from .provenance import outline
@@ -56,7 +57,7 @@ def _traced(
     reduce: Callable[[Solution], Any],
     chunk: int,
 ) -> Any:
-    """Solves a traced batch in chunks; failed members enter no derivative."""
+    """Solves a batch under transformations; failed members enter no derivative."""
     moving, shared = batch.split()
     order = jnp.argsort(expected_work(*constant((ts, moving, shared))))
 
@@ -80,7 +81,8 @@ def _traced(
     moving = jax.tree.map(lambda leaf: jnp.asarray(leaf)[order], moving)
     # A first solve finds the members that fail. In the differentiated solve the first
     # good member replaces them, because NaN would spoil derivatives of shared arrays.
-    frozen, _, failed = solved(*where(False, (moving, shared)))
+    # Functions may hold traced values too, so that its results are also constant.
+    frozen, _, failed = constant(solved(*constant((moving, shared))))
     good = ~failed
     source = jnp.where(good, jnp.arange(batch.size), jnp.argmax(good))
     moving, shared = where(jnp.any(good), (moving, shared))
@@ -162,8 +164,8 @@ def sweep(
       and its members are solved again.
     - `store`: a folder for the results, which are not held in memory: a Zarr group for
       `xarray.open_zarr`, written in blocks of members. A repeated call solves only the
-      blocks that are missing or damaged; a warning names damaged files. Another sweep
-      needs another folder.
+      blocks that are missing or damaged; a warning names damaged files. A folder with
+      another sweep, or anything else, is refused.
     - `shard`, `of`: with `store`, solves only each block whose number is `shard` modulo
       `of`. Any number of processes may fill one store, in any order.
     - `solver`, `rtol`, `atol`, `stepsize_controller`, `dt0`, `adjoint`, `max_steps`,
@@ -185,10 +187,15 @@ def sweep(
         q, qd = map(jnp.asarray, state0)
     except (TypeError, ValueError):
         raise ValueError(f"state0: expected a State(q, qd), got {state0!r}.") from None
-    state0 = State(*(a.astype(float) if a.dtype.kind in "iu" else a for a in (q, qd)))
+    # Other kinds are refused by `batch_of`.
+    state0 = State(
+        *(jnp.asarray(a, float if a.dtype.kind in "iuf" else None) for a in (q, qd))
+    )
     ts = real_array("ts", ts, (None,))
     increasing("ts", ts)
     elements("forces", forces)
+    hashable("forces", forces)
+    hashable("reduce", reduce)
     if chunk is not None:
         whole_number("chunk", chunk, 1)
     whole_number("of", of, 1)
@@ -211,7 +218,7 @@ def sweep(
     )
     del settings["progress_meter"]  # it counts finished members, not time
     batch = batch_of(linkage, state0, forces, forces_axes)
-    traced = is_traced(batch.inputs, ts, reduce)
+    traced = is_transformed()
     if chunk is None:
         resumable = checkpoint is not None or store is not None
         chunk = usual_chunk(anywhere=traced or resumable)
@@ -240,19 +247,20 @@ def sweep(
                 "vmap."
             )
         return whole(_traced(batch, ts, settings, keep, chunk))
-    options = batch, ts, settings, keep, chunk
     with devices_outside_mesh() as devices:
+        job = Job(batch, ts, settings, keep, chunk, devices)
         if store is not None:
             folder = folder_at("store", store)
             like, digest = outline(batch, ts, settings, keep)
             group = Store(folder, batch, ts, like, chunk, digest)
             blocks = range(shard, group.count, of)
-            check(in_store(group, blocks, *options, progress_meter, devices))
+            check(in_store(group, blocks, job, progress_meter))
             return folder
         resumed = None
         if checkpoint is not None:
+            folder = folder_at("checkpoint", checkpoint)
             _, digest = outline(batch, ts, settings, keep)
-            resumed = Checkpoint(checkpoint, digest)
-        kept, failed = in_chunks(*options, resumed, progress_meter, devices)
+            resumed = Checkpoint(folder, digest)
+        kept, failed = in_chunks(job, resumed, progress_meter)
     check(np.flatnonzero(failed))
     return whole(kept)

@@ -35,13 +35,15 @@ def _is_result(leaf: Any) -> bool:
 def _named(kept: Any) -> dict[str, Any]:
     """Returns the arrays of what is kept by names made of their places."""
     leaves, _ = jax.tree_util.tree_flatten_with_path(kept, is_leaf=_is_result)
-    named = {}
+    named, taken = {}, set()
     for path, leaf in leaves:
         name = re.sub(r"\W+", "_", jax.tree_util.keystr(path)).strip("_") or "value"
         if isinstance(kept, Solution):
             name = name.removeprefix("stats_")
-        if name in named:
+        # Some file systems do not tell capitals from small letters.
+        if name.casefold() in taken:
             raise refusal("reduce", "names that differ in letters", name)
+        taken.add(name.casefold())
         named[name] = leaf
     return named
 
@@ -60,8 +62,8 @@ def variables_of(like: Any, linkage: Linkage) -> list[Variable]:
     for name, leaf in _named(like).items():
         result = _is_result(leaf)
         dtype, shape = (np.dtype("int8"), ()) if result else (leaf.dtype, leaf.shape)
-        if not isinstance(dtype, np.dtype) or dtype.kind not in "biufc":
-            raise refusal("reduce", "a function that returns numbers", dtype)
+        if dtype.kind not in "biufc":
+            raise refusal("reduce", "numbers of a type that Zarr has", dtype)
         axes = [f"{name}_{axis + 1}" for axis in range(len(shape))]
         if of_motion and name in ("q", "qd"):
             axes = ["time", "joint"]
