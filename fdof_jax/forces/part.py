@@ -215,10 +215,7 @@ def each(values: Array, joints: Any) -> tuple[Array, ...]:
 
 
 def sized(part: Any, joints: int) -> Any:
-    """Returns the part with an entry per joint where it has one number for all.
-
-    Programs then do not depend on how the numbers were given.
-    """
+    """Returns the part with an entry per joint where it has one number for all."""
     changes = {name: sized(inner, joints) for name, inner in _within(part)}
     for name, value, rules in _declared(part):
         if rules["shape"] == (JOINT,) and jnp.ndim(value) == 0:

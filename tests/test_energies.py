@@ -1,0 +1,123 @@
+"""Plots of energies add up, and their balance holds."""
+
+import elements
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from matplotlib.axes import Axes
+from test_drawing import LINKAGE, labels, made_up, make_linkage, swinging, tidy as tidy
+
+from fdof_jax import JointDamper, JointEffort, Solution, plotting, simulate
+from fdof_jax.forces import JointStops
+
+
+def values(ax: Axes) -> list[np.ndarray]:
+    return [np.asarray(line.get_ydata()) for line in ax.lines]
+
+
+def test_energy_profile_adds_up():
+    fig = plotting.energy_profile(make_linkage("PRR"), swinging())
+    kinetic, potential, whole = fig.axes
+    assert all("[J]" in ax.get_ylabel() for ax in fig.axes)
+    assert labels(kinetic) == ["link 1", "link 2", "link 3"]
+    assert labels(whole) == ["kinetic", "potential", "total"]
+    sums = [sum(values(ax)) for ax in (kinetic, potential)]
+    for total, expected in zip(values(whole), (*sums, sums[0] + sums[1])):
+        np.testing.assert_allclose(total, expected, atol=1e-12)
+
+
+def tops(ax: Axes, ts) -> dict[str, np.ndarray]:
+    """Returns the upper edge of each band of a stack."""
+    found = {}
+    for band in ax.collections:
+        x, y = band.get_paths()[0].vertices.T
+        found[band.get_label()] = np.array([y[x == t].max() for t in ts])
+    return found
+
+
+LIFT = make_linkage("PPR")
+MASS, DAMPING, STIFFNESS = 4.0, 3.0, 50.0
+
+
+def lifted(effort: float, end: float = 2.0) -> tuple[tuple, Solution]:
+    """Returns an exact motion: the first slide on a damped stop under an effort.
+
+    The other joints stand still, and all masses move with the slide.
+    """
+    damper = JointDamper([DAMPING, 0, 0])
+    stops = JointStops([0, -np.inf, -np.inf], np.inf, stiffness=STIFFNESS)
+    weight = MASS * 9.81 * np.cos(0.4)
+    rest = (effort - weight) / STIFFNESS
+    rate = np.roots([MASS, DAMPING, STIFFNESS])[0]
+    swing = 0.2 * (1 + 1j * rate.real / rate.imag)  # starts with no speed
+    ts = np.linspace(0, end, 401)
+    q, qd = np.zeros((2, 401, 3))
+    q[:, 0] = rest + np.real(swing * np.exp(rate * ts))
+    qd[:, 0] = np.real(rate * swing * np.exp(rate * ts))
+    return (damper, stops, JointEffort([effort, 0, 0])), made_up(ts, q, qd)
+
+
+def test_energy_stack_keeps_its_top_where_energy_is_only_taken_out():
+    forces, solution = lifted(0.0)
+    ax = plotting.energy_stack(LIFT, forces, solution)
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("time [s]", "energy [J]")
+    assert labels(ax) == ["kinetic", "potential", "taken out", "at the start"]
+    stack = tops(ax, solution.ts)
+    top, (line,) = stack["taken out"], values(ax)
+    np.testing.assert_allclose(line, line[0], rtol=1e-12)
+    np.testing.assert_allclose(top, line, rtol=1e-7)
+    kinetic = MASS * np.asarray(solution.qd)[:, 0] ** 2 / 2
+    np.testing.assert_allclose(stack["kinetic"], kinetic, atol=1e-12)
+    potential = stack["potential"] - stack["kinetic"]
+    assert potential.min() == 0 and potential.max() > 0.5
+    taken = top - stack["potential"]
+    assert taken[0] == 0 and taken[-1] > 0.5 and np.diff(taken).min() > -1e-9
+    # Simpson's rule, of the third order at least, with eight times the distance.
+    forces, long = lifted(0.0, 16.0)
+    coarse = tops(plotting.energy_stack(LIFT, forces, long), long.ts)["taken out"]
+    worse = np.abs(coarse - line[0]).max() / np.abs(top - line[0]).max()
+    assert worse > 8**3
+
+
+def test_energy_stack_rises_by_what_is_put_in():
+    forces, solution = lifted(20.0)
+    ax = plotting.energy_stack(LIFT, forces, solution)
+    assert labels(ax)[-1] == "start + put in"
+    top, (line,) = tops(ax, solution.ts)["taken out"], values(ax)
+    np.testing.assert_allclose(top, line, rtol=1e-6)
+    steps = np.diff(solution.q[:, 0])
+    assert steps.min() < 0 < steps.max()  # it drives and brakes
+    put_in = 20 * np.maximum(steps, 0).sum()
+    np.testing.assert_allclose(line[-1] - line[0], put_in, rtol=1e-3)
+    forgotten = (*forces[:2], JointEffort(np.zeros(3)))
+    fastest = solution.ts[np.argmax(np.abs(steps))]
+    said = rf"off by .* J, .* most at t = {fastest:.4g} s: .*\(try \d+ times as many\)"
+    with pytest.warns(UserWarning, match=said):
+        plotting.energy_stack(LIFT, forgotten, solution)
+
+
+def test_energy_stack_of_a_free_arm_and_of_what_was_reached():
+    solution = swinging(21)
+    solution = eqx.tree_at(lambda s: s.q, solution, solution.q.at[11:].set(jnp.nan))
+    with pytest.warns(UserWarning, match="the balance is off by"):  # a made-up motion
+        ax = plotting.energy_stack(LINKAGE, (), solution)
+    assert labels(ax) == ["kinetic", "potential", "at the start"]
+    assert ax.get_xlim() == (0, 0.5)
+
+
+@pytest.mark.slow
+def test_energy_stack_balances_with_elements_of_each_kind():
+    """With and without an energy, a state and masses.
+
+    That each element's power is what its energy loses is tested in test_points.py.
+    """
+    arm, start = elements.arm("RPR"), elements.START
+    kinds = "history", "spring", "cable", "stops", "wrench", "motor", "armature"
+    forces = tuple(elements.ALL[kind] for kind in (*kinds, "actuator"))
+    ts = np.linspace(0, 0.075, 501)
+    # One step per sample.
+    solution = simulate(arm, start, ts, forces, **elements.SHORT | dict(dt0=ts[1]))
+    ax = plotting.energy_stack(arm, forces, solution)
+    top, (line,) = tops(ax, solution.ts)["taken out"], values(ax)
+    np.testing.assert_allclose(top, line, rtol=1e-5)
