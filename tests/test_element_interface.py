@@ -248,11 +248,15 @@ def test_a_reference_without_a_motion_is_refused():
 
 
 def test_nothing_else_is_asked_for_attributes():
-    """Only the adapter asks; saved trees are read by the names of their fields."""
+    """Only the adapter asks; trees and JAX's programs are read by names of fields."""
     folder = Path(fj.__file__).parent
     asking = {
         path.relative_to(folder).as_posix()
         for path in folder.rglob("*.py")
         if "hasattr(" in path.read_text() or "getattr(" in path.read_text()
     }
-    assert asking == {"forces/part.py", "data/tree_description.py"}
+    assert asking == {
+        "forces/part.py",
+        "data/tree_description.py",
+        "simulation/provenance.py",
+    }
