@@ -44,7 +44,7 @@ def _check_kept(kept: Any) -> None:
     for leaf in jax.tree.leaves(kept):
         if not eqx.is_array_like(leaf):
             raise refusal("reduce", "a function that returns arrays", leaf)
-        kind = jnp.asarray(leaf).dtype
+        kind = leaf.dtype if eqx.is_array(leaf) else jnp.result_type(leaf)
         if not any(jnp.issubdtype(kind, known) for known in (np.number, np.bool_)):
             raise refusal("reduce", "a function that returns numbers", kind)
 
