@@ -187,11 +187,10 @@ def sweep(
         q, qd = map(jnp.asarray, state0)
     except (TypeError, ValueError):
         raise ValueError(f"state0: expected a State(q, qd), got {state0!r}.") from None
-    # Other kinds are refused by `batch_of`.
-    state0 = State(
-        *(jnp.asarray(a, float if a.dtype.kind in "iuf" else None) for a in (q, qd))
-    )
     ts = real_array("ts", ts, (None,))
+    # Other kinds than real numbers are refused by `batch_of`.
+    other = lambda a: a.dtype != ts.dtype and a.dtype.kind in "iuf"
+    state0 = State(*(a.astype(ts.dtype) if other(a) else a for a in (q, qd)))
     increasing("ts", ts)
     elements("forces", forces)
     hashable("forces", forces)
