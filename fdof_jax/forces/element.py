@@ -25,6 +25,10 @@ Forces = tuple[Any, ...]  # elements, or callables (t, q, qd, linkage) -> tau
 class Element(Part):
     """A force element, which acts on an arm: a pytree that computes joint efforts.
 
+    `replace(name=...)` returns a checked copy with other values of the constructor's
+    arguments. It takes the fields; a class with other arguments has a method
+    `arguments`, which returns a dictionary of them.
+
     A subclass implements `__call__`, with joint positions, velocities and efforts of
     shape (n,) [m or rad; m/s or rad/s; N or N m]. All else has a default:
 

@@ -42,6 +42,7 @@ class Linkage(Frozen):
     counter-clockwise). The mass centre lies p_k along and q_k across the link. Every
     field is an array, so linkages of different topologies share one compilation and can
     be stacked into a batch; fixed pairs make chains of different lengths alike.
+    `replace(mass=...)` returns a checked copy with other values.
 
     **Arguments:**
 
