@@ -14,6 +14,7 @@ from fdof_jax.simulation import chunk_programs, chunks, forecast
 from fdof_jax.simulation.batch_axes import batch_of
 
 LANES = 64  # enough for a slow member to be stopped
+PENDULUM = fj.Linkage("R", length=[0, 1], com=[[0.5, 0]], mass=[1], inertia=[0.1])
 
 
 @pytest.fixture
@@ -31,10 +32,9 @@ def solved(monkeypatch):
 
 
 def pendulums(speeds):
-    """Returns double pendulums that start level, at these speeds of the first joint."""
-    linkage = fj.scenes.double_pendulum().linkage
-    qd = np.stack([speeds, np.zeros_like(speeds)], axis=1)
-    return linkage, fj.State(np.zeros_like(qd), qd)
+    """Returns pendulums that start level, at these speeds."""
+    qd = np.reshape(speeds, (-1, 1))
+    return PENDULUM, fj.State(np.zeros_like(qd), qd)
 
 
 def swept(speeds, **keywords):
@@ -46,7 +46,7 @@ def test_small_batches_of_many_sizes_share_a_program(solved):
     swept(speeds)
     before = chunk_programs.compiled.cache_info().misses
     for size in (2, 5, 7):
-        assert swept(speeds[:size]).q.shape == (size, len(TS), 2)
+        assert swept(speeds[:size]).q.shape == (size, len(TS), 1)
     assert chunk_programs.compiled.cache_info().misses == before
     assert [len(q) for q, _ in solved] == [8] * 4
 
@@ -134,10 +134,10 @@ def test_a_slow_member_is_stopped_and_solved_alone(solved):
     speeds[20] = 60
     motion = swept(speeds)
     assert [len(q) for q, _ in solved] == [LANES, 1]
-    np.testing.assert_array_equal(solved[1][1], [[60, 0]])
+    np.testing.assert_array_equal(solved[1][1], [[60]])
     assert successful(motion).all()
     steps = np.asarray(motion.stats["num_steps"])
-    assert steps[20] > 5 * np.delete(steps, 20).max()
+    assert steps[20] > 3 * np.delete(steps, 20).max()
     linkage, (q, qd) = pendulums(speeds)
     for member in (20, 21):
         alone = fj.simulate(linkage, fj.State(q[member], qd[member]), TS, **SETTINGS)
