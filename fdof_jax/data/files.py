@@ -17,8 +17,8 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from ..base.versions import VERSIONS
 from ..base.whole_files import whole_file
+from ..simulation.versions import VERSIONS
 from .tree_description import Restorer, Unreadable, described
 
 _FORMAT, _VERSION = "fdof_jax", 1

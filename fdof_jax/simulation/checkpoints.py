@@ -11,8 +11,8 @@ import numpy as np
 
 from ..base.checks import refusal
 from ..base.user_warnings import warn
-from ..base.versions import VERSIONS
 from ..base.whole_files import whole_file
+from .versions import VERSIONS
 
 
 def folder_at(name: str, value: str | os.PathLike) -> Path:

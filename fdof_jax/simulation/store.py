@@ -17,11 +17,11 @@ from ..base.array_namespace import in_numpy
 from ..base.checks import refusal
 from ..base.devices import found_by_first
 from ..base.user_warnings import warn
-from ..base.versions import VERSIONS
 from ..base.whole_files import whole_file
 from .batch_axes import Batch
 from .chunks import Job, in_chunks
 from .solution import Solution
+from .versions import VERSIONS
 from .zarr_variables import Variable, coordinates, metadata, values_of, variables_of
 
 _BYTES = 2**26  # of the results in a block
