@@ -31,14 +31,19 @@ def is_traced(*trees: Any) -> bool:
     return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(trees))
 
 
+def transformation() -> Any:
+    """Returns what tells the running JAX transformation from others and from none."""
+    return get_opaque_trace_state(convention="nnx")
+
+
 def is_transformed() -> bool:
     """Returns whether a JAX transformation is running, whatever it traces.
 
     Functions may then hold traced values in their closures, where none can be found.
     """
     with eval_context():
-        outside = get_opaque_trace_state()
-    return get_opaque_trace_state() != outside
+        outside = transformation()
+    return transformation() != outside
 
 
 def known(*trees: Any) -> bool:

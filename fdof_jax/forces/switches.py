@@ -13,10 +13,7 @@ import jax.numpy as jnp
 from jax import Array
 from jax.typing import ArrayLike
 
-try:
-    from jax.extend.core import get_opaque_trace_state
-except ImportError:  # before JAX 0.10
-    from jax.core import get_opaque_trace_state  # pyright: ignore
+from ..base.checks import transformation
 
 _open: list["Switches"] = []  # while an element is traced within a solve
 
@@ -34,7 +31,7 @@ class Switches:
         self.sides, self.values, self.jumping, self._count = sides, [], False, 0
 
     def side_of(self, g: Array, continuous: bool) -> Array:
-        if self._transformation != _transformation():
+        if self._transformation != transformation():
             raise ValueError(
                 "switch: expected a call outside of functions that JAX transforms, as "
                 "by jax.jit or jax.vmap, because steps end at the zeros of g. Both "
@@ -70,17 +67,12 @@ class Switches:
     @contextmanager
     def dealt(self) -> Iterator[None]:
         """Deals out sides to the switches traced in this context."""
-        self._transformation = _transformation()
+        self._transformation = transformation()
         _open.append(self)
         try:
             yield
         finally:
             _open.pop()
-
-
-def _transformation() -> Any:
-    """Returns what stands for JAX's transformation that is traced at present."""
-    return get_opaque_trace_state(convention="nnx")
 
 
 def switch(
