@@ -71,10 +71,9 @@ def outcome_of(
 class Form(NamedTuple):
     """The key of a program: structures, constants, kinds of the arrays."""
 
-    moving: Any  # structures of the three parts of the inputs
-    arrays: Any
+    moving: Any  # structures of what differs between members, and of all else
     rest: Any
-    constants: tuple[Any, ...]
+    constants: tuple[Any, ...]  # leaves of `rest`, None for arrays
     kinds: tuple[Any, Any]  # shapes and types of moving and other arrays
     series: int  # the most chunks that a call solves, one after another
     mesh: Mesh | None
@@ -99,9 +98,9 @@ def traced(form: Form) -> jax.stages.Lowered:
     """Traces the program that computes the outcomes of the first `count` chunks."""
 
     def run(count, moving, arrays):
-        known = jax.tree.unflatten(form.arrays, arrays)
-        rest = jax.tree.unflatten(form.rest, form.constants)
-        settings, reduce, ts, shared = eqx.combine(known, rest)
+        given = iter(arrays)
+        rest = [next(given) if leaf is None else leaf for leaf in form.constants]
+        settings, reduce, ts, shared = jax.tree.unflatten(form.rest, rest)
         # In each size, as -1 would be unknown for empty arrays.
         chunks = [
             leaf.reshape(form.series, len(leaf) // form.series, *leaf.shape[1:])

@@ -9,7 +9,6 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import diffrax
-import equinox as eqx
 import jax
 import numpy as np
 from jax import Array
@@ -81,13 +80,12 @@ class _Chunks:
         self.devices = len(devices)
         mesh = Mesh(np.array(devices), ("member",)) if len(devices) > 1 else None
         moving, shared = batch.split()
-        arrays, rest = eqx.partition((settings, reduce, ts, shared), _is_array)
         moving, structure = jax.tree.flatten(moving)
-        arrays, known = jax.tree.flatten(arrays)
-        constants, rest = jax.tree.flatten(rest)
-        moving, self.arrays = (list(map(_of_jax, a)) for a in (moving, arrays))
-        self.moving = in_numpy(moving)  # which is cut faster
-        self.form = Form(structure, known, rest, tuple(constants), ((), ()), 1, mesh)
+        others, rest = jax.tree.flatten((settings, reduce, ts, shared))
+        self.arrays = [_of_jax(leaf) for leaf in others if _is_array(leaf)]
+        constants = tuple(None if _is_array(leaf) else leaf for leaf in others)
+        self.moving = in_numpy(list(map(_of_jax, moving)))  # NumPy cuts faster
+        self.form = Form(structure, rest, constants, ((), ()), 1, mesh)
         self.checkpoint = checkpoint
         self.apart = apart or checkpoint is not None
         self.times = len(ts)
