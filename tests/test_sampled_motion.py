@@ -4,7 +4,7 @@ import diffrax
 import numpy as np
 import pytest
 from test_drawing import lines, tidy as tidy
-from test_plotting import tops, values
+from test_energies import tops, values
 from test_sampled_control import DISC
 
 import fdof_jax as fj
