@@ -1,5 +1,7 @@
 """Control in discrete time, with efforts held constant between samples."""
 
+import dataclasses
+from collections.abc import Iterator
 from typing import Any
 
 import diffrax
@@ -124,6 +126,14 @@ class SampledMotion(WithOutcome):
     tau: Float[Array, "sample joint"]
     result: diffrax.RESULTS
     own: tuple[Any, ...]
+
+    def __iter__(self) -> Iterator[Any]:
+        """Yields the fields in order; version 0.1 returned a named tuple."""
+        return iter([vars(self)[field.name] for field in dataclasses.fields(self)])
+
+    def __getitem__(self, index: Any) -> Any:
+        """Returns fields by their places, as of a named tuple."""
+        return tuple(self)[index]
 
     def acting(self, forces: tuple[Element, ...]) -> tuple[Element, ...]:
         """Returns `(control, *forces)` with the held efforts in the first place."""
