@@ -53,7 +53,7 @@ def inertia_ratios(
     inertia [kg or kg m^2] of a joint while the others are free to move by its inertia
     while they are locked. The accelerations lose about -log10 of the least ratio in
     digits. Below 1e-11 in float64 or 1e-5 in float32, `simulate` stops and reports it.
-    The ratio is zero where the matrix is not positive definite.
+    It is zero where the matrix is not positive definite, and infinite at fixed pairs.
 
     **Arguments:** `q` [m or rad]; `forces`: force elements that add masses.
 

@@ -156,7 +156,7 @@ def per_joint(name: str, values: Any, linkage: Linkage) -> Array:
             f"{np.shape(values)}; jax.vmap computes many."
         )
     array = real_array(name, values, (n,), of=f"{n} joints")
-    if name.endswith("q"):  # positions, also those of a state
+    if name.rpartition(".")[2] == "q":  # positions, also those of a state
         check_angles(name, array, linkage.ef)
     return array
 
