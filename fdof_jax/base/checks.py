@@ -114,9 +114,7 @@ def real_array(
         raise refuse(f"shape {array.shape}" if array.ndim else repr(value))
     if not traced:
         kept = np.asarray(array, dtype=jnp.result_type(float))
-        bad = np.isnan(kept)
-        if finite:
-            bad |= np.isinf(kept)
+        bad = ~np.isfinite(kept) if finite else np.isnan(kept)
         if minimum is not None:
             bad |= kept < minimum
         if above is not None:
@@ -133,7 +131,7 @@ def real_array(
     # NumPy broadcasts concrete values without compiling a program.
     if not fits and JOINT not in shape:
         array = (jnp if traced else np).broadcast_to(array, shape)  # type: ignore[arg-type]
-    return jnp.asarray(array, dtype=float)
+    return jnp.asarray(array, dtype=float if traced else None)
 
 
 def radians(name: str, angles: np.ndarray) -> None:

@@ -22,11 +22,16 @@ class Batch(NamedTuple):
     """Inputs of all members, which of their leaves have a batch axis, and its size."""
 
     inputs: tuple[Linkage, State, Forces]
-    batched: Any
+    batched: list[bool]
     size: int
 
     def split(self) -> tuple[Any, Any]:
-        return eqx.partition(self.inputs, self.batched)
+        """Returns the inputs with None for what is shared, and those for the rest."""
+        # `equinox.partition` takes four times as long, which small sweeps would feel.
+        leaves, structure = jax.tree.flatten(self.inputs)
+        moving = [leaf if axis else None for leaf, axis in zip(leaves, self.batched)]
+        shared = [None if axis else leaf for leaf, axis in zip(leaves, self.batched)]
+        return structure.unflatten(moving), structure.unflatten(shared)
 
 
 def check_arms(linkage: Any) -> None:
@@ -65,30 +70,29 @@ def _force_has_axis(axis: Any, part: Any) -> Any:
 def batch_of(linkage: Linkage, state0: Any, forces: Forces, forces_axes: Any) -> Batch:
     """Returns the inputs as a batch; raises ValueError if their shapes do not fit."""
     inputs = linkage, state0, forces
-    arm, _ = jax.tree_util.tree_flatten_with_path((linkage, state0))
+    leaves, _ = jax.tree_util.tree_flatten_with_path(inputs)
     joints = linkage.ef.shape[-1] // 2
+    arm = [leaf for leaf in leaves if leaf[0][0].idx < 2]
     batched = [_has_axis(path, array, joints) for path, array in arm]
     try:
-        batched += jax.tree.leaves(
-            jax.tree.map(
-                _force_has_axis, forces_axes, forces, is_leaf=lambda axis: axis is None
-            )
+        of_forces = jax.tree.map(
+            _force_has_axis, forces_axes, forces, is_leaf=lambda axis: axis is None
         )
+        batched += jax.tree.leaves(of_forces)
     except ValueError:
         raise ValueError(
             "forces_axes: expected 0, None or a tuple of these with one entry per "
             f"element, got {forces_axes!r}."
         ) from None
-    leaves, structure = jax.tree_util.tree_flatten_with_path(inputs)
-    sizes = {
-        _name(*path): np.shape(leaf)[:1]
+    sizes = [
+        (path, np.shape(leaf)[:1])
         for (path, leaf), has_axis in zip(leaves, batched)
         if has_axis
-    }
-    different = set(sizes.values())
+    ]
+    different = {size for _, size in sizes}
     if len(different) != 1 or different <= {(), (0,)}:
         got = [
-            f"{name}: {size[0] if size else 'no axis'}" for name, size in sizes.items()
+            f"{_name(*path)}: {size[0] if size else 'no axis'}" for path, size in sizes
         ]
         unsaid = forces and not (got or jax.tree.leaves(forces_axes))
         hint = " (pass forces_axes=0 if those of `forces` have one)" if unsaid else ""
@@ -96,4 +100,4 @@ def batch_of(linkage: Linkage, state0: Any, forces: Forces, forces_axes: Any) ->
             "linkage, state0, forces: expected a leading batch axis of one size on at "
             f"least one array, got {', '.join(got) or 'none on any'}{hint}."
         )
-    return Batch(inputs, jax.tree.unflatten(structure, batched), different.pop()[0])
+    return Batch(inputs, batched, different.pop()[0])

@@ -52,6 +52,13 @@ def _of_jax(leaf: Any) -> Array:
     return leaf if isinstance(leaf, Array) else jax.device_put(leaf)
 
 
+def _of_known_type(leaf: Any) -> Array | np.ndarray:
+    """Returns the array in the type that JAX has for it."""
+    if isinstance(leaf, Array):
+        return leaf
+    return np.asarray(leaf, jax.dtypes.canonicalize_dtype(leaf.dtype))
+
+
 def _shared_out(rows: np.ndarray, sharding: NamedSharding) -> Array:
     return jax.make_array_from_callback(rows.shape, sharding, rows.__getitem__)
 
@@ -84,7 +91,7 @@ class _Chunks:
         others, rest = jax.tree.flatten((settings, reduce, ts, shared))
         self.arrays = [_of_jax(leaf) for leaf in others if _is_array(leaf)]
         constants = tuple(None if _is_array(leaf) else leaf for leaf in others)
-        self.moving = in_numpy(list(map(_of_jax, moving)))  # NumPy cuts faster
+        self.moving = in_numpy(list(map(_of_known_type, moving)))  # NumPy cuts faster
         self.form = Form(structure, rest, constants, ((), ()), 1, mesh)
         self.checkpoint = checkpoint
         self.apart = apart or checkpoint is not None
@@ -233,7 +240,8 @@ def in_chunks(
         # The longest come first, so that no core waits long for another at the end.
         _, shared = batch.split()
         waiting = np.argsort(chunks.forecast(job.ts, shared, lanes))[::-1]
-    done, progress, results, structure = 0, meter.init(), [], None
+    done, results, structure = 0, [], None
+    progress = meter.init() if seen else None
     while len(waiting):
         late = []
         for members, values, structure in chunks.solve(form, waiting):
@@ -250,11 +258,13 @@ def in_chunks(
                 for kept, value in zip(results, values):
                     kept[members] = value
             done += len(members) - len(late[-1])
-            progress = meter.step(progress, np.asarray(done / batch.size))
+            if seen:
+                progress = meter.step(progress, np.asarray(done / batch.size))
         waiting = np.concatenate(late)
-        if len(waiting) <= lanes // _SMALL:
+        if 0 < len(waiting) <= lanes // _SMALL:
             form = chunks.form_of(_lanes(min(len(waiting), _SMALL), chunk), False)
-    meter.close(progress)
+    if seen:
+        meter.close(progress)
     if on_device and not all(isinstance(leaf, Array) for leaf in results):
         _to_device(results)
     kept, _, failed = jax.tree.unflatten(structure, results)

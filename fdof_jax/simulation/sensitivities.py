@@ -22,7 +22,7 @@ from .landing import rounding
 from .prescribed import motion_at, start_of, term_of
 from .scene import Scene
 from .solution import Solution
-from .steps import adaptive
+from .steps import adaptive, of_precision
 from .switch_derivatives import first_of
 from .switching import Located, located
 from .zeros_in_steps import slope_at_end
@@ -186,7 +186,8 @@ def sensitivities(
         y = jax.tree.unflatten(structure, tuple(row))
         return *motion_at(args, t, y), own_states(args, y)
 
-    controller = adaptive(tolerance, max(tolerance, TOLERANCE))
+    tolerance = of_precision(tolerance, max(tolerance, TOLERANCE))
+    controller = adaptive(tolerance, tolerance)
     controller = dataclasses.replace(controller, norm=_largest)
     term = _Term(field, switches_of)  # pyright: ignore[reportArgumentType, reportCallIssue]
     jumps, slopes = times_of(z), jax.jacfwd(times_of)(z)

@@ -31,33 +31,41 @@ _TIGHTEST_SINGLE = 1e-6
 _OF_TIME_SCALE = 0.7, 0.1
 
 
-def adaptive(double: float, single: float) -> diffrax.PIDController:
-    """Returns a controller with the relative and absolute tolerance of the dtype."""
-    x64 = jnp.result_type(float) == jnp.float64
-    tolerance = double if x64 else single
-    # The shortest step ends solves that rounding keeps from meeting the tolerance.
-    shortest = 1e-13 if x64 else 1e-8
-    return diffrax.PIDController(
-        rtol=tolerance, atol=tolerance, dtmin=shortest, force_dtmin=False
-    )
+def of_precision(double: float, single: float) -> float:
+    """Returns the number for the precision that JAX has now."""
+    return double if jnp.result_type(float) == jnp.float64 else single
+
+
+def _default_tolerance() -> float:
+    return of_precision(1e-11, 1e-5)
+
+
+def _shortest_step() -> float:
+    """Returns the step that ends solves that rounding keeps from their tolerance."""
+    return of_precision(1e-13, 1e-8)
+
+
+def adaptive(rtol: ArrayLike, atol: ArrayLike) -> diffrax.PIDController:
+    """Returns a controller with a relative and an absolute tolerance."""
+    shortest = _shortest_step()
+    return diffrax.PIDController(rtol, atol, dtmin=shortest, force_dtmin=False)
 
 
 def default_controller() -> diffrax.PIDController:
     """Returns the default controller of `simulate` and `sweep`."""
-    return adaptive(1e-11, 1e-5)
+    return adaptive(_default_tolerance(), _default_tolerance())
 
 
 def at_tolerances(
     rtol: ArrayLike | None, atol: ArrayLike | None
 ) -> diffrax.PIDController:
     """Returns the default controller with other tolerances; None keeps one."""
-    controller = default_controller()
-    rtol = controller.rtol if rtol is None else rtol
-    atol = controller.atol if atol is None else atol
     # As arrays, new values need no new trace.
-    rtol = real_array("rtol", rtol, (), above=0)
-    atol = real_array("atol", atol, (), above=0)
-    return dataclasses.replace(controller, rtol=rtol, atol=atol)
+    rtol, atol = (
+        real_array(name, _default_tolerance() if value is None else value, (), above=0)
+        for name, value in (("rtol", rtol), ("atol", atol))
+    )
+    return adaptive(rtol, atol)
 
 
 def within_reach(
@@ -71,7 +79,7 @@ def within_reach(
 
     def mended(pid: diffrax.PIDController) -> diffrax.PIDController:
         if pid.dtmin is None:
-            shortest = default_controller().dtmin
+            shortest = _shortest_step()
             pid = dataclasses.replace(pid, dtmin=shortest, force_dtmin=False)
         if x64:
             return pid

@@ -23,6 +23,7 @@ from ..base.checks import (
     function,
     hashable,
     increasing,
+    is_traced,
     is_transformed,
     real_array,
     refusal,
@@ -184,7 +185,7 @@ def sweep(
     linkage, state0, forces = uncommitted((linkage, state0, forces))
     check_arms(linkage)
     try:
-        q, qd = map(jnp.asarray, state0)
+        q, qd = (jnp.asarray(a) if is_traced(a) else np.asarray(a) for a in state0)
     except (TypeError, ValueError):
         raise ValueError(f"state0: expected a State(q, qd), got {state0!r}.") from None
     ts = real_array("ts", ts, (None,))
