@@ -131,7 +131,7 @@ def real_array(
     # NumPy broadcasts concrete values without compiling a program.
     if not fits and JOINT not in shape:
         array = (jnp if traced else np).broadcast_to(array, shape)  # type: ignore[arg-type]
-    return jnp.asarray(array, dtype=float if traced else None)
+    return jnp.asarray(array, dtype=float)  # without, JAX 0.12 compiles for each shape
 
 
 def radians(name: str, angles: np.ndarray) -> None:
