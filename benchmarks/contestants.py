@@ -166,6 +166,7 @@ def fdof_jax(
 
 def sweep(problem: Problem) -> Contestant:
     """Returns `sweep` of a batch as a contestant."""
+    steps = cache(controller)  # made once, as the others' are when they are traced
 
     def run(tolerance: float):
         return fj.sweep(
@@ -174,7 +175,7 @@ def sweep(problem: Problem) -> Contestant:
             problem.ts,
             problem.forces,
             throw=False,
-            stepsize_controller=controller(tolerance),
+            stepsize_controller=steps(tolerance),
         )
 
     return Contestant("fdof_jax sweep", "tolerance", run, _solution)
