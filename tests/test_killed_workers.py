@@ -66,7 +66,7 @@ def test_twenty_kills_at_random_moments(tmp_path, monkeypatch):
     workers = [start(shared, shard) for shard in range(WORKERS)]
     try:
         while kills < KILLS:
-            time.sleep(rng.uniform(0, 0.3))
+            time.sleep(rng.uniform(0, 0.1))
             shard = rng.integers(WORKERS)
             workers[shard].kill()
             workers[shard].join()

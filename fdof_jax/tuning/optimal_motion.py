@@ -178,10 +178,10 @@ def optimal_efforts(
     with the efforts of every first guess.
 
     >>> import fdof_jax as fj
-    >>> scene = fj.scenes.fig7()
-    >>> best = fj.tuning.optimal_efforts(scene, horizon=0.4, knots=6, max_steps=20)
+    >>> scene = fj.scenes.two_link_circle()
+    >>> best = fj.tuning.optimal_efforts(scene, horizon=0.5, knots=26)
     >>> best.controller_error, best.tip_error  # [m]
-    (0.151, 0.072)
+    (0.0501, 0.0222)
     """
     check_tuned("scene", scene)
     controller, t1 = controller_of(scene), float(scene.t1)
