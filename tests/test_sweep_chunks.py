@@ -169,16 +169,11 @@ def test_the_forecast_follows_the_steps(batch, clean):
     assert np.corrcoef(found, steps)[0, 1] > 0.75
 
 
-def test_one_forecast_serves_batches_of_all_sizes(monkeypatch):
-    traces, original = [], forecast.expected_work
-
-    def counted(*arguments):
-        traces.append(arguments)
-        return original(*arguments)
-
-    monkeypatch.setattr(forecast, "expected_work", counted)
+def test_one_forecast_serves_batches_of_all_sizes():
+    misses = lambda: chunk_programs.work_of_chunks.cache_info().misses
+    before = misses()
     swept(np.linspace(0, 1, 11), chunk=3)
-    before = len(traces)
-    assert before
+    assert misses() == before + 1
     swept(np.linspace(0, 1, 40), chunk=3)  # of more than one block
-    assert len(traces) == before
+    swept(np.linspace(0, 1, 11), chunk=3, reduce=lambda motion: motion.q[-1])
+    assert misses() == before + 1

@@ -26,7 +26,10 @@ class Batch(NamedTuple):
     size: int
 
     def split(self) -> tuple[Any, Any]:
-        """Returns the inputs with None for what is shared, and those for the rest."""
+        """Returns what differs between members and what they share, each a whole tree.
+
+        Either has None for the leaves of the other.
+        """
         # `equinox.partition` takes four times as long, which small sweeps would feel.
         leaves, structure = jax.tree.flatten(self.inputs)
         moving = [leaf if axis else None for leaf, axis in zip(leaves, self.batched)]

@@ -14,6 +14,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from ..base.checks import refusal
 from ..base.configuration import wide_vectors
+from .forecast import expected_work
 from .simulate import simulate
 from .solution import Solution
 from .step_wrappers import Abreast
@@ -72,11 +73,30 @@ class Form(NamedTuple):
     """The key of a program: structures, constants, kinds of the arrays."""
 
     moving: Any  # structures of what differs between members, and of all else
-    rest: Any
+    rest: Any  # `(settings, reduce, ts, shared)`, or for a forecast `(ts, shared)`
     constants: tuple[Any, ...]  # leaves of `rest`, None for arrays
     kinds: tuple[Any, Any]  # shapes and types of moving and other arrays
     series: int  # the most chunks that a call solves, one after another
     mesh: Mesh | None
+
+    def chunks(self, rows: list[Array]) -> list[Array]:
+        """Returns arrays (series * lane, ...) of one device as (series, lane, ...)."""
+        # In each size, as -1 would be unknown for empty arrays.
+        return [
+            leaf.reshape(self.series, len(leaf) // self.series, *leaf.shape[1:])
+            for leaf in rows
+        ]
+
+    def others(self, arrays: list[Array]) -> Any:
+        """Returns what all members share."""
+        given = iter(arrays)
+        rest = [next(given) if leaf is None else leaf for leaf in self.constants]
+        return jax.tree.unflatten(self.rest, rest)
+
+    def arguments(self) -> tuple[Any, ...]:
+        """Returns the shapes and types of a count, moving and other arrays."""
+        like = [[_like(*kind) for kind in kinds] for kinds in self.kinds]
+        return _like((), np.int32), *like
 
     @property
     def lanes(self) -> int:
@@ -98,14 +118,8 @@ def traced(form: Form) -> jax.stages.Lowered:
     """Traces the program that computes the outcomes of the first `count` chunks."""
 
     def run(count, moving, arrays):
-        given = iter(arrays)
-        rest = [next(given) if leaf is None else leaf for leaf in form.constants]
-        settings, reduce, ts, shared = jax.tree.unflatten(form.rest, rest)
-        # In each size, as -1 would be unknown for empty arrays.
-        chunks = [
-            leaf.reshape(form.series, len(leaf) // form.series, *leaf.shape[1:])
-            for leaf in moving
-        ]
+        settings, reduce, ts, shared = form.others(arrays)
+        chunks = form.chunks(moving)
         abreast = chunks[0].shape[1] > _ALL_ALIKE  # of the lanes of one device
 
         def member(leaves):
@@ -141,12 +155,33 @@ def traced(form: Form) -> jax.stages.Lowered:
             out_specs=lanes,
             check_vma=False,
         )
-    like = [[_like(*kind) for kind in kinds] for kinds in form.kinds]
     shardings = None, form.sharding, None
-    return jax.jit(run, in_shardings=shardings).lower(_like((), np.int32), *like)
+    return jax.jit(run, in_shardings=shardings).lower(*form.arguments())
 
 
 @functools.lru_cache(maxsize=64)
 def compiled(form: Form) -> jax.stages.Compiled:
     """Compiles the program of this form; the programs used last are kept."""
     return traced(form).compile(wide_vectors())
+
+
+@functools.lru_cache(maxsize=64)
+def work_of_chunks(form: Form) -> jax.stages.Compiled:
+    """Compiles the program of the `expected_work` in the first `count` chunks."""
+
+    def run(count, moving, arrays):
+        ts, shared = form.others(arrays)
+        chunks = form.chunks(moving)
+
+        def work_of(chunk):
+            member = form.moving.unflatten([leaf[chunk] for leaf in chunks])
+            return expected_work(ts, member, shared)
+
+        def added(chunk, work):
+            return work.at[chunk].set(work_of(chunk))
+
+        like = jax.eval_shape(work_of, count)
+        work = jnp.zeros((form.series, *like.shape), like.dtype)
+        return jax.lax.fori_loop(0, count, added, work).ravel()
+
+    return jax.jit(run).lower(*form.arguments()).compile(wide_vectors())

@@ -19,8 +19,7 @@ from ..base.array_namespace import in_numpy
 from ..base.devices import found_by_first
 from .batch_axes import Batch
 from .checkpoints import Checkpoint, Rows
-from .chunk_programs import Form, compiled, traced
-from .forecast import work_of_chunks
+from .chunk_programs import Form, compiled, traced, work_of_chunks
 from .solution import Solution
 
 _SMALL = 8  # lanes of the chunks for a few slow members
@@ -59,6 +58,13 @@ def _of_known_type(leaf: Any) -> Array | np.ndarray:
     return np.asarray(leaf, jax.dtypes.canonicalize_dtype(leaf.dtype))
 
 
+def _parted(tree: Any) -> tuple[list[Array], Any, tuple[Any, ...]]:
+    """Returns the arrays of a tree, its structure, and its leaves, None for arrays."""
+    leaves, structure = jax.tree.flatten(tree)
+    arrays = [_of_jax(leaf) for leaf in leaves if _is_array(leaf)]
+    return arrays, structure, tuple(None if _is_array(x) else x for x in leaves)
+
+
 def _shared_out(rows: np.ndarray, sharding: NamedSharding) -> Array:
     return jax.make_array_from_callback(rows.shape, sharding, rows.__getitem__)
 
@@ -88,11 +94,9 @@ class _Chunks:
         mesh = Mesh(np.array(devices), ("member",)) if len(devices) > 1 else None
         moving, shared = batch.split()
         moving, structure = jax.tree.flatten(moving)
-        others, rest = jax.tree.flatten((settings, reduce, ts, shared))
-        self.arrays = [_of_jax(leaf) for leaf in others if _is_array(leaf)]
-        constants = tuple(None if _is_array(leaf) else leaf for leaf in others)
+        self.arrays, *others = _parted((settings, reduce, ts, shared))
         self.moving = in_numpy(list(map(_of_known_type, moving)))  # NumPy cuts faster
-        self.form = Form(structure, rest, constants, ((), ()), 1, mesh)
+        self.form = Form(structure, *others, ((), ()), 1, mesh)
         self.checkpoint = checkpoint
         self.apart = apart or checkpoint is not None
         self.times = len(ts)
@@ -130,17 +134,20 @@ class _Chunks:
     def forecast(self, ts: Array, shared: Any, lanes: int) -> np.ndarray:
         """Returns the `expected_work` of all members; one program serves any number."""
         (size, *_), rows = self.moving[0].shape, _MOST * lanes
+        arrays, *others = _parted((ts, shared))
+        kinds = self._kinds(rows, arrays)
+        form = Form(self.form.moving, *others, kinds, _MOST, None)
         work = []
         for first in range(0, size, rows):
             block = np.minimum(np.arange(first, first + rows), size - 1)
-            leaves = [
-                leaf[block].reshape(_MOST, lanes, *leaf.shape[1:])
-                for leaf in self.moving
-            ]
-            moving = jax.device_put(jax.tree.unflatten(self.form.moving, leaves))
-            count = jax.device_put(np.int32(-(-min(rows, size - first) // lanes)))
-            work.append(work_of_chunks(count, ts, moving, shared))
-        return np.concatenate(work, axis=None)[:size]
+            moving = [leaf[block] for leaf in self.moving]
+            count = np.int32(-(-min(rows, size - first) // lanes))
+            work.append(work_of_chunks(form)(count, moving, arrays))
+        return np.concatenate(work)[:size]
+
+    def _kinds(self, rows: int, arrays: list[Array]) -> tuple[Any, Any]:
+        moving = tuple(((rows, *leaf.shape[1:]), leaf.dtype) for leaf in self.moving)
+        return moving, tuple((a.shape, a.dtype, a.weak_type) for a in arrays)
 
     def form_of(self, lanes: int, several: bool) -> Form:
         """Returns the form of a program for one or several chunks of so many lanes."""
@@ -148,10 +155,8 @@ class _Chunks:
         series = 1
         if several and self.form.mesh is None:
             series = max(1, min(_MOST, _STATES // (lanes * self.times)))
-        rows = series * lanes
-        moving = tuple(((rows, *leaf.shape[1:]), leaf.dtype) for leaf in self.moving)
-        arrays = tuple((a.shape, a.dtype, a.weak_type) for a in self.arrays)
-        return self.form._replace(kinds=(moving, arrays), series=series)
+        kinds = self._kinds(series * lanes, self.arrays)
+        return self.form._replace(kinds=kinds, series=series)
 
     def _begin(
         self, form: Form, members: np.ndarray, pool: ThreadPoolExecutor | None

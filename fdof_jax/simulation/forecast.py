@@ -55,15 +55,3 @@ def expected_work(ts: Array, moving: Any, shared: Any) -> Array:
         return total
 
     return jax.vmap(member)(moving)
-
-
-@eqx.filter_jit
-def work_of_chunks(count: Array, ts: Array, moving: Any, shared: Any) -> Array:
-    """Computes `expected_work` of the first `count` chunks (chunk, lane, ...)."""
-
-    def added(chunk, work):
-        lanes = jax.tree.map(lambda leaf: leaf[chunk], moving)
-        return work.at[chunk].set(expected_work(ts, lanes, shared))
-
-    like = jax.eval_shape(jax.vmap(lambda m: expected_work(ts, m, shared)), moving)
-    return jax.lax.fori_loop(0, count, added, jnp.zeros_like(like))
