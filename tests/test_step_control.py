@@ -9,6 +9,7 @@ import pytest
 
 import fdof_jax as fj
 from fdof_jax.simulation.looped_dopri8 import LoopedDopri8
+from fdof_jax.simulation.step_wrappers import by_square_roots
 
 LINKS = dict(com=[[0.5, 0]] * 3, mass=[1, 1, 1], inertia=[1 / 12] * 3)
 ARM = fj.Linkage("RRR", length=[0, 1, 1, 1], **LINKS)
@@ -156,3 +157,23 @@ def test_bad_scales_are_refused(arguments, message):
     linkage, controller, scale = (*arguments, None, None)[:3]
     with pytest.raises(ValueError, match=message):
         fj.scale_tolerances(linkage, controller, scale=scale)
+
+
+def test_square_roots_instead_of_powers_change_no_step():
+    pid = diffrax.PIDController(1e-9, 1e-9, dtmin=1e-13, force_dtmin=False)
+    rooted, y = by_square_roots(pid), jnp.array([0.3, 2.0])
+    assert rooted.icoeff == 8
+    ends = {"powers": [], "roots": []}
+    for error in 10.0 ** jnp.arange(-16, -2):
+        at = 0.1, 0.2, y, y, None, error * jnp.array([1.0, -3.0]), 8
+        for name, controller in (("powers", pid), ("roots", rooted)):
+            _, state = controller.init(None, 0.1, 0.2, y, 0.1, None, None, 8)
+            keep, _, end, *_ = controller.adapt_step_size(*at, state)
+            ends[name].append([keep, end])
+    np.testing.assert_allclose(ends["roots"], ends["powers"], rtol=1e-14)
+    assert len(np.unique(ends["powers"], axis=0)) > 5
+
+
+def test_other_controllers_keep_their_powers():
+    changed = diffrax.PIDController(1e-9, 1e-9, pcoeff=0.3, icoeff=0.4)
+    assert by_square_roots(changed) == changed

@@ -17,7 +17,7 @@ from ..base.configuration import wide_vectors
 from .forecast import expected_work
 from .simulate import simulate
 from .solution import Solution
-from .step_wrappers import Abreast
+from .step_wrappers import Abreast, by_square_roots
 from .steps import default_controller
 
 # With so few lanes a step takes hardly longer than with one, so that slow members do
@@ -35,6 +35,9 @@ def motion_of(
     # Members with steps of given lengths take equally many.
     adaptive = isinstance(controller, diffrax.AbstractAdaptiveStepSizeController)
     if abreast and adaptive:
+        # Other solvers, and estimates of a first step, need the error itself.
+        if settings["solver"] is None and settings["dt0"] is not None:
+            controller = by_square_roots(controller)
         limited = Abreast(controller, _AXIS)  # pyright: ignore[reportCallIssue]
         settings = settings | {"stepsize_controller": limited}
     return simulate(linkage, state0, ts, forces, throw=False, **settings)

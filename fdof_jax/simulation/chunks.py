@@ -94,9 +94,9 @@ class _Chunks:
         mesh = Mesh(np.array(devices), ("member",)) if len(devices) > 1 else None
         moving, shared = batch.split()
         moving, structure = jax.tree.flatten(moving)
-        self.arrays, *others = _parted((settings, reduce, ts, shared))
+        self.arrays, rest, constants = _parted((settings, reduce, ts, shared))
         self.moving = in_numpy(list(map(_of_known_type, moving)))  # NumPy cuts faster
-        self.form = Form(structure, *others, ((), ()), 1, mesh)
+        self.form = Form(structure, rest, constants, ((), ()), 1, mesh)
         self.checkpoint = checkpoint
         self.apart = apart or checkpoint is not None
         self.times = len(ts)
@@ -134,9 +134,9 @@ class _Chunks:
     def forecast(self, ts: Array, shared: Any, lanes: int) -> np.ndarray:
         """Returns the `expected_work` of all members; one program serves any number."""
         (size, *_), rows = self.moving[0].shape, _MOST * lanes
-        arrays, *others = _parted((ts, shared))
+        arrays, rest, constants = _parted((ts, shared))
         kinds = self._kinds(rows, arrays)
-        form = Form(self.form.moving, *others, kinds, _MOST, None)
+        form = Form(self.form.moving, rest, constants, kinds, _MOST, None)
         work = []
         for first in range(0, size, rows):
             block = np.minimum(np.arange(first, first + rows), size - 1)

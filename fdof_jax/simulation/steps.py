@@ -45,7 +45,7 @@ def _shortest_step() -> float:
     return of_precision(1e-13, 1e-8)
 
 
-def adaptive(rtol: ArrayLike, atol: ArrayLike) -> diffrax.PIDController:
+def adaptive(rtol: float | Array, atol: float | Array) -> diffrax.PIDController:
     """Returns a controller with a relative and an absolute tolerance."""
     shortest = _shortest_step()
     return diffrax.PIDController(rtol, atol, dtmin=shortest, force_dtmin=False)
