@@ -183,7 +183,9 @@ print(json.dumps({
                   for t1 in (0.05, 0.2)],
     "gains": compiled(arm, start, np.linspace(0, 0.1, 5), (more,)),
     "tolerances": [compiled(arm, start, [0, 0.1], forces, **options)
-                   for options in (dict(rtol=1e-8, atol=1e-9), steps(1e-7))],
+                   for options in (dict(rtol=1e-8, atol=1e-9), dict(rtol=1e-7))],
+    "own controllers": [compiled(arm, start, [0, 0.1], forces, **steps(tolerance))
+                        for tolerance in (1e-6, 1e-7)],
     "masses": compiled(heavy, start, np.linspace(0, 0.1, 5), forces),
     "topologies": [compiled(scene.linkage, scene.state0, [0, 0.1], scene.forces)
                    for scene in scenes],
@@ -203,7 +205,10 @@ def test_new_numbers_compile_nothing():
     assert done.returncode == 0, done.stderr
     compiled = json.loads(done.stdout)
     # Without the event the test would count nothing.
-    assert any("_solve_padded" in name for name in compiled.pop("first"))
+    own, *again = compiled.pop("own controllers")
+    for names in (compiled.pop("first"), own):
+        assert any("_solve_padded" in name for name in names)
+    assert again == [[]]
     assert compiled == {
         "times": [[]] * 5,
         "durations": [[]] * 2,

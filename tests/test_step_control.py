@@ -9,6 +9,7 @@ import pytest
 
 import fdof_jax as fj
 from fdof_jax.simulation.looped_dopri8 import LoopedDopri8
+from fdof_jax.simulation.shortening import Shortening
 from fdof_jax.simulation.step_wrappers import by_square_roots
 
 LINKS = dict(com=[[0.5, 0]] * 3, mass=[1, 1, 1], inertia=[1 / 12] * 3)
@@ -159,8 +160,9 @@ def test_bad_scales_are_refused(arguments, message):
         fj.scale_tolerances(linkage, controller, scale=scale)
 
 
-def test_square_roots_instead_of_powers_change_no_step():
-    pid = diffrax.PIDController(1e-9, 1e-9, dtmin=1e-13, force_dtmin=False)
+@pytest.mark.parametrize("kind", [diffrax.PIDController, Shortening])
+def test_square_roots_instead_of_powers_change_no_step(kind):
+    pid = kind(1e-9, 1e-9, dtmin=1e-13, force_dtmin=False)
     rooted, y = by_square_roots(pid), jnp.array([0.3, 2.0])
     assert rooted.icoeff == 8
     ends = {"powers": [], "roots": []}
@@ -177,3 +179,40 @@ def test_square_roots_instead_of_powers_change_no_step():
 def test_other_controllers_keep_their_powers():
     changed = diffrax.PIDController(1e-9, 1e-9, pcoeff=0.3, icoeff=0.4)
     assert by_square_roots(changed) == changed
+
+
+def test_a_kept_step_near_the_tolerance_shortens_the_next():
+    y, h = jnp.array([0.3]), 0.1
+
+    def after(kind, error):
+        """Returns whether a step with this error over its tolerance is kept, and
+        the length of the next one over its own."""
+        pid = kind(0.0, 1e-9, safety=0.8, dtmin=0.085, force_dtmin=False)
+        at = 0.0, h, y, y, None, jnp.array([error * 1e-9]), 8
+        _, state = pid.init(None, 0.0, h, y, h, None, None, 8)
+        keep, t0, t1, *_ = pid.adapt_step_size(*at, state)
+        return keep, (t1 - t0) / h
+
+    for error in (0.4, 0.6):
+        assert after(diffrax.PIDController, error) == (True, 1)
+        keep, length = after(Shortening, error)
+        assert keep
+        np.testing.assert_allclose(length, 0.8 * error ** (-1 / 8), rtol=1e-13)
+    assert after(Shortening, 0.9)[0]
+    np.testing.assert_allclose(after(Shortening, 0.9)[1], 0.85)  # the shortest step
+    for error in (0.0, 1e-6, 0.1, 1.1, 1e3, np.nan):
+        for found, expected in zip(
+            *(after(k, error) for k in (Shortening, diffrax.PIDController))
+        ):
+            np.testing.assert_allclose(found, expected, rtol=1e-13)
+
+
+def test_few_steps_are_rejected():
+    arm, start, forces, _ = fj.scenes.fig5()
+    ts = np.linspace(0, 5, 3)
+    shortening = fj.simulate(arm, start, ts, forces, rtol=1e-9, atol=1e-9).stats
+    pid = diffrax.PIDController(1e-9, 1e-9)
+    own = fj.simulate(arm, start, ts, forces, stepsize_controller=pid).stats
+    assert shortening["num_steps"] < own["num_steps"]
+    assert 15 * shortening["num_rejected_steps"] < shortening["num_steps"]
+    assert 8 * own["num_rejected_steps"] > own["num_steps"]

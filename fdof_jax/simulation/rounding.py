@@ -9,6 +9,7 @@ import functools
 from collections.abc import Sequence
 from typing import Any
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -21,10 +22,10 @@ from .step_wrappers import Adaptive
 # Rounding errors of an acceleration, over its size times eps and the loss of accuracy:
 # less for slides, whose inertia is a sum of masses without levers.
 _OF_REVOLUTE, _OF_SLIDE = 1.0, 0.5
-# An error estimate sums the noise of all stages. Up to so many rounding errors it does
-# not reject a step, and beyond one it does not shorten the next.
-_DOUBTFUL = 8.0
-_SAME_STEP = 0.43  # the error over its tolerance at which a PID controller keeps a step
+# An error estimate sums the noise of all stages. Up to so many rounding errors it
+# neither rejects a step nor shortens the next, and below a part of one, or of the
+# tolerance if that is larger, the next step may be longer.
+_DOUBTFUL, _HELD = 8.0, 0.43
 
 
 class AboveRounding(Adaptive):
@@ -34,6 +35,9 @@ class AboveRounding(Adaptive):
 
     def adapt_step_size(self, *arguments):
         t0, t1, y0, y1_candidate, args, (error, health), *rest = arguments
+        order, _ = rest
+        # The error over its tolerance after which the next step is as long.
+        same_step = _safety(self.controller) ** order
         revolute = real_joints(args.linkage.ef)
         of_qd = _rounding(revolute, health, y0, y1_candidate)
         of_delta = jax.tree.map(lambda noise: jnp.abs(t1 - t0) * noise, of_qd)
@@ -41,17 +45,27 @@ class AboveRounding(Adaptive):
         def judged(error: Array, start: Array, end: Array, rounding: Array) -> Array:
             size = jnp.maximum(jnp.abs(start), jnp.abs(end))
             tolerance = self.atol + self.rtol * size  # as diffrax's controller has it
-            met = rounding > tolerance
+            met, found = rounding > tolerance, jnp.abs(error)
             # In healthy equations the division is by a tolerance and has no effect.
-            ratio = jnp.abs(error) / jnp.where(met, rounding, tolerance)
-            doubtful = jnp.maximum(jnp.minimum(ratio, _SAME_STEP), ratio / _DOUBTFUL)
-            return jnp.where(met, tolerance * doubtful, error)
+            ratio = found / jnp.where(met, rounding, tolerance)
+            noise = found < _DOUBTFUL * rounding
+            held = same_step * jnp.minimum(ratio / _HELD, 1)
+            beyond = ratio / jnp.where(met, _DOUBTFUL, 1)
+            lessened = jnp.where(noise, held, beyond)
+            return jnp.where(met | noise, tolerance * lessened, error)
 
         # The elements' own states come last; their rates do not lose accuracy.
         ends, noise = (y0[:2], y1_candidate[:2]), (of_delta, of_qd)
         motion = jax.tree.map(judged, error[:2], *ends, noise)
         error = (*motion, *error[2:])
         return super().adapt_step_size(t0, t1, y0, y1_candidate, args, error, *rest)
+
+
+def _safety(controller: Any) -> Any:
+    """Returns the factor by which a PID controller lessens the steps it chooses."""
+    while isinstance(controller, Adaptive):
+        controller = controller.controller
+    return controller.safety if isinstance(controller, diffrax.PIDController) else 0.9
 
 
 def _rounding(revolute: Sequence[Array], health: Health, y0: Any, y1: Any) -> Any:
