@@ -120,7 +120,7 @@ def _simulate(
         chosen.update(max_steps=None, adjoint=diffrax.ForwardMode())
 
     def run(linkage, state0, ts, forces, setting):
-        steps: dict[str, Any] = {"stepsize_controller": controller(setting)}
+        steps: dict[str, Any] = {"rtol": setting, "atol": setting}
         if fixed:
             steps = {"stepsize_controller": diffrax.ConstantStepSize(), "dt0": setting}
 
@@ -166,7 +166,6 @@ def fdof_jax(
 
 def sweep(problem: Problem) -> Contestant:
     """Returns `sweep` of a batch as a contestant."""
-    steps = cache(controller)  # made once, as the others' are when they are traced
 
     def run(tolerance: float):
         return fj.sweep(
@@ -175,7 +174,8 @@ def sweep(problem: Problem) -> Contestant:
             problem.ts,
             problem.forces,
             throw=False,
-            stepsize_controller=steps(tolerance),
+            rtol=tolerance,
+            atol=tolerance,
         )
 
     return Contestant("fdof_jax sweep", "tolerance", run, _solution)

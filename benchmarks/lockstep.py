@@ -18,7 +18,7 @@ from jax import Array
 import fdof_jax as fj
 
 from .measure import Case, measure
-from .problems import Problem, controller, fig5_batch, reference
+from .problems import Problem, fig5_batch, reference
 
 PROTOCOL = "lockstep"
 TOLERANCE = 1e-8
@@ -39,12 +39,7 @@ class TurnsNaN(eqx.Module):
 def _vmapped(linkage, state0, ts, forces):
     def member(state0, forces):
         return fj.simulate(
-            linkage,
-            state0,
-            ts,
-            forces,
-            stepsize_controller=controller(TOLERANCE),
-            throw=False,
+            linkage, state0, ts, forces, rtol=TOLERANCE, atol=TOLERANCE, throw=False
         )
 
     return jax.vmap(member)(state0, forces)
@@ -52,12 +47,7 @@ def _vmapped(linkage, state0, ts, forces):
 
 def _swept(linkage, state0, ts, forces):
     return fj.sweep(
-        linkage,
-        state0,
-        ts,
-        forces,
-        forces_axes=0,
-        stepsize_controller=controller(TOLERANCE),
+        linkage, state0, ts, forces, forces_axes=0, rtol=TOLERANCE, atol=TOLERANCE
     )
 
 

@@ -14,7 +14,6 @@ import numpy as np
 import fdof_jax as fj
 
 from .measure import environment
-from .problems import controller
 
 TOLERANCE = 1e-8
 TS = np.linspace(0.0, 1.0, 11)
@@ -54,21 +53,21 @@ def peak() -> float:
 def run(quick: bool) -> Iterator[dict]:
     each = 100 if quick else 20_000
     linkage, state0 = _arms(each)
-    steps = controller(TOLERANCE)
+    steps = dict(rtol=TOLERANCE, atol=TOLERANCE)
     began = time.perf_counter()
     # The shapes that a sweep needs are compiled by a small one.
     few = jax.tree.map(lambda leaf: leaf[:: max(1, each // 300)], (linkage, state0))
-    fj.sweep(*few, TS, stepsize_controller=steps)
+    fj.sweep(*few, TS, **steps)
     compiled, before = time.perf_counter() - began, peak()
     began = time.perf_counter()
-    solution = fj.sweep(linkage, state0, TS, stepsize_controller=steps)
+    solution = fj.sweep(linkage, state0, TS, **steps)
     jax.block_until_ready(solution.q)
     wall = time.perf_counter() - began
     most = peak()
     worst = 0.0
     for member in range(0, 7 * each, each // CHECKED):
         arm, start = jax.tree.map(lambda leaf, i=member: leaf[i], (linkage, state0))
-        single = fj.simulate(arm, start, TS, stepsize_controller=steps)
+        single = fj.simulate(arm, start, TS, **steps)
         worst = max(worst, float(np.abs(single.q - solution.q[member]).max()))
     good = solution.result == diffrax.RESULTS.successful
     yield {

@@ -17,7 +17,7 @@ from fdof_jax.simulation.solve import solve
 from . import contestants as own, gradients, problems, taylor, trajectory
 from .contestants import Contestant
 from .measure import Case, measure
-from .problems import Problem, controller
+from .problems import Problem
 
 PROTOCOL = "single_arms"
 TOLERANCES = (1e-5, 1e-7, 1e-9, 1e-11)
@@ -35,7 +35,8 @@ def plain_call(
             problem.ts,
             problem.forces,
             solver=solver,
-            stepsize_controller=controller(tolerance),
+            rtol=tolerance,
+            atol=tolerance,
         )
 
     name = "plain call" + ("" if solver is None else f", {type(solver).__name__}")
