@@ -53,8 +53,11 @@ def test_other_tolerances_do_not_make_it_wrong():
 
 
 def test_the_arm_stays():
-    """Every term is 0, apart from the rounding of pi/2."""
-    assert np.abs(final(HANGING) - HANGING).max() < 1e-12
+    """Every term is 0, apart from the rounding of pi/2.
+
+    Steps as long as an oscillation amplify that, to less than the tolerance.
+    """
+    assert np.abs(final(HANGING) - HANGING).max() < 1e-11
 
 
 def test_an_implicit_solver_does_not_make_it_wrong():
