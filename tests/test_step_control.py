@@ -176,9 +176,35 @@ def test_square_roots_instead_of_powers_change_no_step(kind):
     assert len(np.unique(ends["powers"], axis=0)) > 5
 
 
-def test_other_controllers_keep_their_powers():
-    changed = diffrax.PIDController(1e-9, 1e-9, pcoeff=0.3, icoeff=0.4)
-    assert by_square_roots(changed) == changed
+class OwnRule(diffrax.PIDController):
+    """A controller whose formula only its author knows."""
+
+
+@pytest.mark.parametrize(
+    "controller",
+    [diffrax.PIDController(1e-9, 1e-9, pcoeff=0.3, icoeff=0.4), OwnRule(1e-9, 1e-9)],
+    ids=["other coefficients", "subclass"],
+)
+def test_other_controllers_keep_their_powers(controller):
+    assert by_square_roots(controller) is controller
+
+
+class NoOrder(diffrax.Tsit5):
+    """A method that does not know its order."""
+
+    def order(self, terms):
+        return None
+
+
+def test_the_controller_may_give_the_order():
+    controller = diffrax.PIDController(1e-6, 1e-6, error_order=5)
+    found, expected = (
+        fj.simulate(ARM, START, TS, solver=solver, stepsize_controller=controller)
+        for solver in (NoOrder(), diffrax.Tsit5())
+    )
+    np.testing.assert_allclose(found.q, expected.q, atol=1e-12)
+    with pytest.raises(ValueError, match="order of convergence"):
+        fj.simulate(ARM, START, TS, solver=NoOrder(), rtol=1e-6)
 
 
 def test_a_kept_step_near_the_tolerance_shortens_the_next():

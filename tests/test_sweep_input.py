@@ -41,7 +41,8 @@ def test_a_batch_is_expected():
     with pytest.raises(ValueError, match=r"^linkage: expected one .*\*arms\) stacks"):
         fj.sweep([ONE, ONE], STATES, TS)
     empty = jax.tree.map(lambda a: a[:0], (TWO, STATES))
-    refused(INPUTS, linkage=empty[0], state0=empty[1], forces=())
+    with pytest.raises(ValueError, match="expected a batch of at least one member"):
+        fj.sweep(*empty, TS)
 
 
 def test_one_size_is_expected():

@@ -7,6 +7,7 @@ from sweep_batch import TS, run, successful
 
 import fdof_jax as fj
 from fdof_jax import identification, references, scenes, tuning
+from fdof_jax.simulation import chunks
 
 FIG7 = scenes.fig7()
 MOTION = fj.Solution(TS, np.zeros((7, 3)), np.zeros((7, 3)), {}, None)
@@ -81,9 +82,28 @@ def test_no_members():
     assert solution.q.shape == (0, len(TS), 3)
 
 
-def test_under_a_transfer_guard(batch):
+@pytest.fixture
+def guarded():
+    """Lets no array reach or leave JAX unasked, in any thread."""
+    before = jax.config.jax_transfer_guard
+    jax.config.update("jax_transfer_guard", "disallow")
+    yield
+    jax.config.update("jax_transfer_guard", before)
+
+
+def test_under_a_transfer_guard(batch, guarded, monkeypatch):
     linkage, state0, *_ = scenes.fig5()
-    with jax.transfer_guard("disallow"):
-        solution = run(batch)
-        motion = fj.simulate(linkage, state0, TS)
-    assert successful(solution).all() and successful(motion)
+    monkeypatch.setattr(chunks, "_cores", lambda: 2)
+    monkeypatch.setattr(chunks, "_MOST", 1)  # several calls, by two threads
+    solution = run(batch)
+    motion = fj.simulate(linkage, state0, TS)
+    with jax.transfer_guard("allow"):
+        assert successful(solution).all() and successful(motion)
+
+
+@pytest.mark.parametrize("name", ["rtol", "atol"])
+def test_derivatives_with_respect_to_a_tolerance(name):
+    linkage, state0, *_ = scenes.fig5()
+    end = lambda x: fj.simulate(linkage, state0, TS, **{name: x}).q[-1, 0]
+    with pytest.raises(RuntimeError, match=name):
+        jax.eval_shape(jax.grad(end), 1e-6)

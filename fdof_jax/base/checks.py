@@ -62,6 +62,13 @@ def refusal(name: str, expected: str, got: Any) -> ValueError:
     return ValueError(f"{name}: expected {expected}, got {got!r}.")
 
 
+def numpy_array(value: Any) -> np.ndarray:
+    """Returns a value as NumPy's array; a masked one, whose mask this drops, raises."""
+    if isinstance(value, np.ma.MaskedArray):
+        raise TypeError("masked arrays are not supported")
+    return np.asarray(value)
+
+
 def real_array(
     name: str,
     value: Any,
@@ -102,7 +109,7 @@ def real_array(
 
     traced = is_traced(value)
     try:
-        array = jnp.asarray(value) if traced else np.asarray(value)
+        array = jnp.asarray(value) if traced else numpy_array(value)
     except Exception as error:  # whatever a value's own conversion raises
         raise refuse(repr(value)) from error
     if array.dtype.kind not in "iuf":
@@ -131,7 +138,7 @@ def real_array(
     # NumPy broadcasts concrete values without compiling a program.
     if not fits and JOINT not in shape:
         array = (jnp if traced else np).broadcast_to(array, shape)  # type: ignore[arg-type]
-    return jnp.asarray(array, dtype=float)  # without, JAX 0.12 compiles for each shape
+    return jnp.asarray(array, dtype=float)  # else JAX 0.12 compiles for each shape
 
 
 def radians(name: str, angles: np.ndarray) -> None:

@@ -75,8 +75,9 @@ def batch_of(linkage: Linkage, state0: Any, forces: Forces, forces_axes: Any) ->
     inputs = linkage, state0, forces
     leaves, _ = jax.tree_util.tree_flatten_with_path(inputs)
     joints = linkage.ef.shape[-1] // 2
-    arm = [leaf for leaf in leaves if leaf[0][0].idx < 2]
-    batched = [_has_axis(path, array, joints) for path, array in arm]
+    batched = [
+        _has_axis(path, leaf, joints) for path, leaf in leaves if path[0].idx < 2
+    ]
     try:
         of_forces = jax.tree.map(
             _force_has_axis, forces_axes, forces, is_leaf=lambda axis: axis is None
@@ -93,7 +94,11 @@ def batch_of(linkage: Linkage, state0: Any, forces: Forces, forces_axes: Any) ->
         if has_axis
     ]
     different = {size for _, size in sizes}
-    if len(different) != 1 or different <= {(), (0,)}:
+    if different == {(0,)}:
+        raise ValueError(
+            "linkage, state0, forces: expected a batch of at least one member, got 0."
+        )
+    if len(different) != 1 or different == {()}:
         got = [
             f"{_name(*path)}: {size[0] if size else 'no axis'}" for path, size in sizes
         ]

@@ -1,4 +1,4 @@
-"""The compiled programs of chunks: the outcomes of many members at once."""
+"""The compiled programs of chunks: the outcomes of members, and their forecasts."""
 
 import functools
 from collections.abc import Callable

@@ -51,8 +51,8 @@ def _of_jax(leaf: Any) -> Array:
     return leaf if isinstance(leaf, Array) else jax.device_put(leaf)
 
 
-def _of_known_type(leaf: Any) -> Array | np.ndarray:
-    """Returns the array in the type that JAX has for it."""
+def _canonical(leaf: Any) -> Array | np.ndarray:
+    """Returns the array in the dtype that JAX would give it."""
     if isinstance(leaf, Array):
         return leaf
     return np.asarray(leaf, jax.dtypes.canonicalize_dtype(leaf.dtype))
@@ -69,8 +69,8 @@ def _shared_out(rows: np.ndarray, sharding: NamedSharding) -> Array:
     return jax.make_array_from_callback(rows.shape, sharding, rows.__getitem__)
 
 
-def _solve(program: Any, count: int, moving: list[Any], arrays: list[Array]) -> Any:
-    return jax.block_until_ready(program(np.int32(count), moving, arrays))
+def _solve(program: Any, *arguments: Any) -> Any:
+    return jax.block_until_ready(program(*arguments))
 
 
 class Job(NamedTuple):
@@ -95,7 +95,7 @@ class _Chunks:
         moving, shared = batch.split()
         moving, structure = jax.tree.flatten(moving)
         self.arrays, rest, constants = _parted((settings, reduce, ts, shared))
-        self.moving = in_numpy(list(map(_of_known_type, moving)))  # NumPy cuts faster
+        self.moving = in_numpy(list(map(_canonical, moving)))  # NumPy cuts faster
         self.form = Form(structure, rest, constants, ((), ()), 1, mesh)
         self.checkpoint = checkpoint
         self.apart = apart or checkpoint is not None
@@ -165,14 +165,14 @@ class _Chunks:
         kept = self._kept(form, members)
         if kept is not None:
             return lambda: kept
-        count = -(-len(members) // form.lanes)
+        count = np.int32(-(-len(members) // form.lanes))
         padded = np.full(form.series * form.lanes, members[-1])
         padded[: len(members)] = members
         moving = [leaf[padded] for leaf in self.moving]
         if form.sharding is not None:
             moving = [_shared_out(leaf, form.sharding) for leaf in moving]
         elif pool is not None:  # whose threads do not inherit this one's settings
-            moving = jax.device_put(moving)
+            count, moving = jax.device_put((count, moving))
         work = functools.partial(_solve, compiled(form), count, moving, self.arrays)
         outcomes = work if pool is None else pool.submit(work).result
         return lambda: self._end(form, members, outcomes())

@@ -43,7 +43,6 @@ class ScheduledTerm(diffrax.ODETerm):
     1, or 0 where the equations are singular. `watched_field` returns the rates and
     their health, NaN if they are not finite.
     `switching` returns the switching functions (n,), and whether anything jumps.
-    `second_order`: whether the state begins with displacements and their rates.
     """
 
     vector_field: Callable[..., PyTree] = eqx.field(static=True)
@@ -51,7 +50,6 @@ class ScheduledTerm(diffrax.ODETerm):
     health: Callable[..., Health] = eqx.field(static=True)
     watched_field: Callable[..., tuple[PyTree, Health]] = eqx.field(static=True)
     switching: Callable[..., tuple[Array, bool]] = eqx.field(static=True)
-    second_order: bool = eqx.field(static=True, default=False)
 
     def vf(self, t, y, args):
         return self.vector_field(t, y, args, self.schedule(t, args))

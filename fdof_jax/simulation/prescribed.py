@@ -153,7 +153,7 @@ def term_of(forces: tuple[Element, ...]) -> ScheduledTerm:
     """Returns the equations of velocities or, with a prescribed motion, of momenta."""
     if prescribed(forces) is None:
         return ScheduledTerm(
-            vector_field, schedule_of, health_of, watched_field, switching, True
+            vector_field, schedule_of, health_of, watched_field, switching
         )
     return ScheduledTerm(
         _hybrid_field, schedule_of, _health, _watched_hybrid_field, _hybrid_switching

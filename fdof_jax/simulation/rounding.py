@@ -22,10 +22,12 @@ from .step_wrappers import Adaptive
 # Rounding errors of an acceleration, over its size times eps and the loss of accuracy:
 # less for slides, whose inertia is a sum of masses without levers.
 _OF_REVOLUTE, _OF_SLIDE = 1.0, 0.5
-# An error estimate sums the noise of all stages. Up to so many rounding errors it
-# neither rejects a step nor shortens the next, and below a part of one, or of the
-# tolerance if that is larger, the next step may be longer.
-_DOUBTFUL, _HELD = 8.0, 0.43
+# An error estimate sums the noise of all stages: below so many rounding errors it
+# neither rejects a step nor shortens the next.
+_NOISE = 8.0
+# Of the rounding error, or of the tolerance if that is larger: noise beyond this part
+# leaves the next step as long, and less noise lets it be longer.
+_HELD = 0.43
 
 
 class AboveRounding(Adaptive):
@@ -35,9 +37,7 @@ class AboveRounding(Adaptive):
 
     def adapt_step_size(self, *arguments):
         t0, t1, y0, y1_candidate, args, (error, health), *rest = arguments
-        order, _ = rest
-        # The error over its tolerance after which the next step is as long.
-        same_step = _safety(self.controller) ** order
+        same_step = _same_step(self.controller, rest[0])
         revolute = real_joints(args.linkage.ef)
         of_qd = _rounding(revolute, health, y0, y1_candidate)
         of_delta = jax.tree.map(lambda noise: jnp.abs(t1 - t0) * noise, of_qd)
@@ -45,14 +45,13 @@ class AboveRounding(Adaptive):
         def judged(error: Array, start: Array, end: Array, rounding: Array) -> Array:
             size = jnp.maximum(jnp.abs(start), jnp.abs(end))
             tolerance = self.atol + self.rtol * size  # as diffrax's controller has it
-            met, found = rounding > tolerance, jnp.abs(error)
-            # In healthy equations the division is by a tolerance and has no effect.
-            ratio = found / jnp.where(met, rounding, tolerance)
-            noise = found < _DOUBTFUL * rounding
-            held = same_step * jnp.minimum(ratio / _HELD, 1)
-            beyond = ratio / jnp.where(met, _DOUBTFUL, 1)
-            lessened = jnp.where(noise, held, beyond)
-            return jnp.where(met | noise, tolerance * lessened, error)
+            out_of_reach, error_size = rounding > tolerance, jnp.abs(error)
+            ratio = error_size / jnp.where(out_of_reach, rounding, tolerance)
+            is_noise = error_size < _NOISE * rounding
+            as_long = same_step * jnp.minimum(ratio / _HELD, 1)
+            above_noise = ratio / jnp.where(out_of_reach, _NOISE, 1)
+            judged_as = tolerance * jnp.where(is_noise, as_long, above_noise)
+            return jnp.where(out_of_reach | is_noise, judged_as, error)
 
         # The elements' own states come last; their rates do not lose accuracy.
         ends, noise = (y0[:2], y1_candidate[:2]), (of_delta, of_qd)
@@ -61,11 +60,16 @@ class AboveRounding(Adaptive):
         return super().adapt_step_size(t0, t1, y0, y1_candidate, args, error, *rest)
 
 
-def _safety(controller: Any) -> Any:
-    """Returns the factor by which a PID controller lessens the steps it chooses."""
+def _same_step(controller: Any, order: Any) -> Any:
+    """Returns the error, over its tolerance, after which the next step is as long."""
     while isinstance(controller, Adaptive):
         controller = controller.controller
-    return controller.safety if isinstance(controller, diffrax.PIDController) else 0.9
+    if not isinstance(controller, diffrax.PIDController):
+        return _HELD  # what a method of order 8 has with diffrax's safety factor
+    if controller.error_order is not None:
+        order = controller.error_order
+    # Without an order the controller raises an error of its own.
+    return _HELD if order is None else controller.safety**order
 
 
 def _rounding(revolute: Sequence[Array], health: Health, y0: Any, y1: Any) -> Any:

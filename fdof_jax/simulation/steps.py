@@ -11,6 +11,7 @@ from collections.abc import Callable
 from typing import Any
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import Array
@@ -65,26 +66,30 @@ def at_tolerances(
     rtol: ArrayLike | None, atol: ArrayLike | None
 ) -> diffrax.PIDController:
     """Returns the default controller with other tolerances; None keeps one."""
-    known = isinstance(rtol, float | None) and isinstance(atol, float | None)
-    make = _known_controller if known else _new_controller
-    return make(rtol, atol, jnp.result_type(float))
+    if isinstance(rtol, float | None) and isinstance(atol, float | None):
+        return _known_controller(rtol, atol, jnp.result_type(float))
+    return _new_controller(rtol, atol)
 
 
-def _new_controller(rtol: Any, atol: Any, dtype: Any) -> diffrax.PIDController:
-    del dtype  # that of the tolerances, for the cache below
-    # As arrays, new values need no new trace.
-    rtol, atol = (
-        real_array(name, _default_tolerance() if value is None else value, (), above=0)
-        for name, value in (("rtol", rtol), ("atol", atol))
-    )
-    return adaptive(rtol, atol)
+def _new_controller(rtol: Any, atol: Any) -> diffrax.PIDController:
+    return adaptive(_tolerance("rtol", rtol), _tolerance("atol", atol))
+
+
+def _tolerance(name: str, value: Any) -> Array:
+    """Returns a tolerance as an array, of which new values need no new trace."""
+    value = _default_tolerance() if value is None else value
+    array = real_array(name, value, (), above=0)
+    # Else a derivative with respect to it would fail later, without this name.
+    traced = is_traced(array)
+    return eqx.internal.nondifferentiable(array, name=name) if traced else array
 
 
 # Of a sweep of 16 arms, in 1.5 ms, another controller would take 0.15 ms.
 @functools.lru_cache
 def _known_controller(rtol: Any, atol: Any, dtype: Any) -> diffrax.PIDController:
+    del dtype  # that of the tolerances, a part of the cache's key
     with jax.ensure_compile_time_eval():  # no tracer is kept
-        return _new_controller(rtol, atol, dtype)
+        return _new_controller(rtol, atol)
 
 
 def within_reach(

@@ -25,6 +25,7 @@ from ..base.checks import (
     increasing,
     is_traced,
     is_transformed,
+    numpy_array,
     real_array,
     refusal,
     whole_number,
@@ -185,7 +186,7 @@ def sweep(
     linkage, state0, forces = uncommitted((linkage, state0, forces))
     check_arms(linkage)
     try:
-        q, qd = (jnp.asarray(a) if is_traced(a) else np.asarray(a) for a in state0)
+        q, qd = (jnp.asarray(a) if is_traced(a) else numpy_array(a) for a in state0)
     except (TypeError, ValueError):
         raise ValueError(f"state0: expected a State(q, qd), got {state0!r}.") from None
     ts = real_array("ts", ts, (None,))

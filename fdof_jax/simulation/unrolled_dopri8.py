@@ -65,16 +65,12 @@ def _twice(row: np.ndarray) -> np.ndarray:
     return np.where(abs(coefficients) < 1e-14, 0, coefficients)  # up to rounding
 
 
-def _increment(
-    row: np.ndarray, rates: Rates, y0: State, h: Array, second_order: bool
-) -> State:
+def _increment(row: np.ndarray, rates: Rates, y0: State, h: Array) -> State:
     """Sums coefficients times rates.
 
     Velocities at stages are sums of accelerations, so that displacements are too.
     Stages that need no stored velocities take 5 % less time (AMD EPYC, 1024 arms).
     """
-    if not second_order:
-        return _combine(row, rates)
     others = [rate[1:] for rate in rates]
     accelerations = [rate[1] for rate in rates]
     share, twice = float(row.sum()), _twice(row)
@@ -111,12 +107,12 @@ def _step(term, t0, t1, y0, lost, args, f0) -> tuple[_Step, dict[str, Any]]:
     schedule = jax.vmap(inner.schedule, in_axes=(0, None))(times, args)
     scheduled = lambda stage: jtu.tree_map(lambda leaf: leaf[stage], schedule)
     field, rates = eqx.filter_jit(inner.vector_field), [f0]
-    mean = lambda row: _increment(row, rates, y0, h, inner.second_order)
+    weighted = lambda row: _increment(row, rates, y0, h)
     for stage, row in enumerate(LOWER[:-1], 1):
-        y = _moved(y0, h, mean(row))
+        y = _moved(y0, h, weighted(row))
         rates.append(field(times[stage], y, args, scheduled(stage)))
-    y, lost = compensated(y0, _moved(lost, h, mean(LOWER[-1])))
-    error = jtu.tree_map(lambda k: h * k, mean(TABLEAU.b_error))
+    y, lost = compensated(y0, _moved(lost, h, weighted(LOWER[-1])))
+    error = jtu.tree_map(lambda k: h * k, weighted(TABLEAU.b_error))
     # diffrax overlooks an infinity beside a NaN and finds no next step size.
     poison = 0 * sum(jtu.tree_leaves(y))
     y = jtu.tree_map(lambda a: a + poison, y)
@@ -139,7 +135,8 @@ class _Interpolation(DenseOutput):
 class UnrolledDopri8(ScheduledDopri8):
     """The method of `diffrax.Dopri8` up to rounding, for large batches.
 
-    It is not meant for derivatives, which take far longer to compile.
+    It serves states that begin with displacements and their rates. It is not meant for
+    derivatives, which take far longer to compile.
     """
 
     interpolation_cls: ClassVar = _Interpolation
