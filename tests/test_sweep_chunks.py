@@ -23,9 +23,9 @@ def solved(monkeypatch):
     found = []
     original = chunks._solve
 
-    def recorded(program, count, moving, arrays):
+    def recorded(program, count, chosen, moving, arrays):
         found.append([np.asarray(leaf) for leaf in moving])
-        return original(program, count, moving, arrays)
+        return original(program, count, chosen, moving, arrays)
 
     monkeypatch.setattr(chunks, "_solve", recorded)
     return found

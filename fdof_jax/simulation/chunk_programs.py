@@ -107,6 +107,11 @@ class Form(NamedTuple):
         return self.kinds[0][0][0][0] // self.series
 
     @property
+    def rows(self) -> int:
+        """The number of members in a call, on each device."""
+        return self.series * self.lanes // (self.mesh.size if self.mesh else 1)
+
+    @property
     def sharding(self) -> NamedSharding | None:
         """How arrays with an axis of lanes are spread over the devices, if several."""
         return self.mesh and NamedSharding(self.mesh, PartitionSpec("member"))
@@ -118,9 +123,12 @@ def _like(shape: tuple[int, ...], dtype: Any, weak: bool = False) -> Any:
 
 @functools.lru_cache(maxsize=64)
 def traced(form: Form) -> jax.stages.Lowered:
-    """Traces the program that computes the outcomes of the first `count` chunks."""
+    """Traces the program that computes the outcomes of the first `count` chunks.
 
-    def run(count, moving, arrays):
+    It returns those of the `chosen` rows of each device.
+    """
+
+    def run(count, chosen, moving, arrays):
         settings, reduce, ts, shared = form.others(arrays)
         chunks = form.chunks(moving)
         abreast = chunks[0].shape[1] > _ALL_ALIKE  # of the lanes of one device
@@ -143,9 +151,8 @@ def traced(form: Form) -> jax.stages.Lowered:
             jax.eval_shape(solved, count),
         )
         outcomes = jax.lax.fori_loop(0, count, added, outcomes)
-        lanes = chunks[0].shape[1]
         return jax.tree.map(
-            lambda leaf: leaf.reshape(form.series * lanes, *leaf.shape[2:]), outcomes
+            lambda leaf: leaf.reshape(len(chosen), *leaf.shape[2:])[chosen], outcomes
         )
 
     if form.mesh is not None:
@@ -154,12 +161,14 @@ def traced(form: Form) -> jax.stages.Lowered:
         run = jax.shard_map(
             run,
             mesh=form.mesh,
-            in_specs=(same, lanes, same),
+            in_specs=(same, same, lanes, same),
             out_specs=lanes,
             check_vma=False,
         )
-    shardings = None, form.sharding, None
-    return jax.jit(run, in_shardings=shardings).lower(*form.arguments())
+    shardings = None, None, form.sharding, None
+    count, *others = form.arguments()
+    chosen = _like((form.rows,), np.int32)
+    return jax.jit(run, in_shardings=shardings).lower(count, chosen, *others)
 
 
 @functools.lru_cache(maxsize=64)

@@ -99,6 +99,7 @@ class _Chunks:
         self.form = Form(structure, rest, constants, ((), ()), 1, mesh)
         self.checkpoint = checkpoint
         self.apart = apart or checkpoint is not None
+        self.size = batch.size
         self.times = len(ts)
 
     def solve(
@@ -133,7 +134,7 @@ class _Chunks:
 
     def forecast(self, ts: Array, shared: Any, lanes: int) -> np.ndarray:
         """Returns the `expected_work` of all members; one program serves any number."""
-        (size, *_), rows = self.moving[0].shape, _MOST * lanes
+        size, rows = self.size, _MOST * lanes
         arrays, rest, constants = _parted((ts, shared))
         kinds = self._kinds(rows, arrays)
         form = Form(self.form.moving, rest, constants, kinds, _MOST, None)
@@ -168,12 +169,18 @@ class _Chunks:
         count = np.int32(-(-len(members) // form.lanes))
         padded = np.full(form.series * form.lanes, members[-1])
         padded[: len(members)] = members
+        chosen = np.arange(form.rows, dtype=np.int32)
+        if len(members) == self.size and not self.apart and form.mesh is None:
+            # Outcomes in the order of the batch need not be sorted, and copied, here.
+            chosen[members] = np.arange(self.size)
+            members = np.arange(self.size)
         moving = [leaf[padded] for leaf in self.moving]
         if form.sharding is not None:
             moving = [_shared_out(leaf, form.sharding) for leaf in moving]
         elif pool is not None:  # whose threads do not inherit this one's settings
-            count, moving = jax.device_put((count, moving))
-        work = functools.partial(_solve, compiled(form), count, moving, self.arrays)
+            count, chosen, moving = jax.device_put((count, chosen, moving))
+        given = count, chosen, moving, self.arrays
+        work = functools.partial(_solve, compiled(form), *given)
         outcomes = work if pool is None else pool.submit(work).result
         return lambda: self._end(form, members, outcomes())
 
@@ -238,7 +245,7 @@ def in_chunks(
     seen = type(meter) is not diffrax.NoProgressMeter
     chunks = _Chunks(job, checkpoint, seen)
     lanes = _lanes(-(-batch.size // chunks.devices), chunk)
-    waiting = np.arange(batch.size)
+    everyone = waiting = np.arange(batch.size)
     several = batch.size > lanes * chunks.devices
     form = chunks.form_of(lanes, several)
     if several:
@@ -252,8 +259,7 @@ def in_chunks(
         for members, values, structure in chunks.solve(form, waiting):
             _, stopped, _ = jax.tree.unflatten(structure, values)
             late.append(members[np.asarray(stopped)])
-            whole = len(members) == batch.size and not len(late[-1])
-            if whole and not several:
+            if np.array_equal(members, everyone) and not len(late[-1]):
                 results = values  # nothing is to be sorted or added
             else:
                 if not results:
