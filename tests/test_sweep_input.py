@@ -41,8 +41,7 @@ def test_a_batch_is_expected():
     with pytest.raises(ValueError, match=r"^linkage: expected one .*\*arms\) stacks"):
         fj.sweep([ONE, ONE], STATES, TS)
     empty = jax.tree.map(lambda a: a[:0], (TWO, STATES))
-    with pytest.raises(ValueError, match="expected a batch of at least one member"):
-        fj.sweep(*empty, TS)
+    refused(INPUTS, linkage=empty[0], state0=empty[1], forces=())
 
 
 def test_one_size_is_expected():
@@ -78,7 +77,14 @@ def test_states_that_are_not_numbers_of_joints_are_refused(value):
 
 @pytest.mark.parametrize(
     "state0",
-    [None, 3, [STATES.q], (STATES.q,) * 3, ([[0], [0, 1]], STATES.qd)],
+    [
+        None,
+        3,
+        [STATES.q],
+        (STATES.q,) * 3,
+        ([[0], [0, 1]], STATES.qd),
+        (np.ma.masked_less(STATES.q, 0), STATES.qd),
+    ],
     ids=str,
 )
 def test_what_is_not_a_state_is_refused(state0):

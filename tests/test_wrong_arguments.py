@@ -53,7 +53,9 @@ def test_too_many_members():
     refused("members", tuning.perturbed, FIG7, 10**30)
 
 
-@pytest.mark.parametrize("q", [None, "x", [[1], [1, 2]], [0, 0]], ids=str)
+@pytest.mark.parametrize(
+    "q", [None, "x", [[1], [1, 2]], [0, 0], np.ma.masked_less([-1, 0, 0], 0)], ids=str
+)
 def test_efforts_that_hold_an_arm(q):
     refused("q", fj.analysis.holding_efforts, FIG7.linkage, q)
 
