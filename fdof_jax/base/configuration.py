@@ -23,7 +23,7 @@ from .user_warnings import warn
 # otherwise it starts a kernel for each operation. XLA reads the option when JAX starts.
 # Versions that do not know it ignore it, whereas unknown flags end the process.
 _SMALL_LOOPS = "xla_cpu_small_while_loop_byte_threshold"
-_FLAG = f"--xla_backend_extra_options={_SMALL_LOOPS}=100000"
+_FLAG = f"--xla_backend_extra_options={_SMALL_LOOPS}=400000"
 # From this version of jaxlib on, XLA compiles such loops as one kernel by itself.
 _BY_ITSELF = (0, 12)
 # XLA on CPU uses vectors of 256 bits even where the processor has wider ones. With 512,

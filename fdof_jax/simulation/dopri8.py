@@ -62,6 +62,7 @@ class ScheduledDopri8(diffrax.AbstractAdaptiveSolver):
     """Base of both solvers: the kind of their terms, and their order."""
 
     term_structure: ClassVar = ScheduledTerm
+    tableau: ClassVar = TABLEAU
 
     def order(self, terms) -> int:
         return 8
@@ -125,10 +126,14 @@ def health_if(finite: Array, health: Health) -> Health:
 
 
 class Estimate(NamedTuple):
-    """The error of a step and its `Health`, 1 if it is bad, as controllers get them."""
+    """The error of a step and its `Health`, 1 if it is bad, as controllers get them.
+
+    `derivatives`: the error of derivatives over their tolerance.
+    """
 
     error: PyTree
     health: Health
+    derivatives: Array | None = None
 
 
 def with_change(error: Any, change: Callable[[PyTree], PyTree]) -> Any:

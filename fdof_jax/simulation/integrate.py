@@ -11,17 +11,9 @@ from jax import Array
 from ..base.callbacks import without_checks
 from ..forces.joints import EffortHistory
 from ..linkage.linkage import possible, without_fixed
-from ..mechanics.equations import zeros
+from .derivative_control import OfLinearised, OfTangents
 from .dopri8 import constant
-from .field import (
-    Args,
-    args_of,
-    initial_own,
-    own_states,
-    schedule_of,
-    vector_field,
-    whole,
-)
+from .field import args_of, initial_own, own_states, whole
 from .known_times import clocks_apart, known_times
 from .looped_dopri8 import LoopedDopri8
 from .packing import in_arrays
@@ -31,33 +23,17 @@ from .steps import accounted, step_control
 from .switching import Located, LocatedImplicit, located, switching_facts
 
 
-def _step_for_tangents(t0: Array, args: Args, own: tuple, fraction: float) -> Array:
-    """Returns a longest step size [s] that keeps derivatives accurate.
-
-    Adaptive steps control the error of the motion alone, which is zero for an arm that
-    hangs at rest. The bound is a fraction of the time scale 1/omega of the fastest mode
-    about the start. The trace of the squared linearisation bounds omega^2 in any units.
-    """
-    t0, args, own = constant((t0, args, own))
-    still = zeros(args.q0)
-    scheduled = schedule_of(t0, args)
-
-    def accelerations(delta):
-        y = whole(tuple(delta), still, own)
-        return jnp.stack(vector_field(t0, y, args, scheduled)[1])
-
-    linearised = jax.jacfwd(accelerations)(jnp.zeros_like(args.q0))
-    omega2 = jnp.sqrt(jnp.abs(jnp.sum(linearised * linearised.T)))
-    step = fraction / jnp.sqrt(omega2)
-    return jnp.where(step > 0, step, jnp.inf)
-
-
 def integrate(
-    inputs, keywords, derivatives: bool = False, padded: bool = False
+    inputs,
+    keywords,
+    derivatives: bool = False,
+    padded: bool = False,
+    tangents: bool = False,
 ) -> Solution:
     """Integrates one motion, by default with `LoopedDopri8`.
 
-    `derivatives`: whether to bound the steps so that derivatives are accurate too.
+    `derivatives`: whether steps are as short as accurate derivatives need.
+    `tangents`: whether these are the tangents of this call, along the axis `TANGENTS`.
     `padded`: for a plain call, which has checked its inputs; the last time may be
     repeated.
     """
@@ -71,10 +47,7 @@ def integrate(
     known = jnp.isfinite(jnp.array(own)).all()
     valid, own = valid & known, tuple(jnp.where(known, x, 0) for x in own)
     term = term_of(forces)
-    bound = lambda fraction: _step_for_tangents(ts[0], args, own, fraction)
-    controller = step_control(
-        keywords["stepsize_controller"], solver, term, bound if derivatives else None
-    )
+    controller = step_control(keywords["stepsize_controller"])
     unpacked, y0 = args, whole(*start_of(args, qd0), own)
     if padded and not derivatives:
         term, y0, args = in_arrays(term, y0, args)
@@ -88,6 +61,11 @@ def integrate(
     start = term, ts[0], y0, args, known_times(args, *left_out)
     located_solver, controller, y0 = located(locate, solver, controller, *start)
     if adaptive:
+        if tangents:
+            controller = OfTangents(controller)  # pyright: ignore[reportCallIssue]
+        elif derivatives:
+            tableau = getattr(solver, "tableau", diffrax.Heun.tableau)
+            controller = OfLinearised(controller, term, tableau)  # pyright: ignore[reportCallIssue]
         controller = accounted(controller, solver, term)
     # diffrax computes a few constants while it is traced.
     with without_checks(), jax.transfer_guard("allow"):

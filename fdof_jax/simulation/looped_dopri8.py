@@ -79,7 +79,7 @@ def _step(term: Any, t0, t1, y0, lost, args):
     health = tuple(jnp.where(finite, x[-1], x[0]) for x in healths)
     health = health_if(finite, health)
     y = jtu.tree_map(lambda a: jnp.where(finite, a, jnp.nan), y)
-    error, result = verdict(*constant((error, health)), h)
+    error, result = verdict(error, constant(health), h)
     dense_info = dict(y0=y0, step=h, rates=rates, scheduled=schedule)
     return y, error, dense_info, constant(lost), result
 

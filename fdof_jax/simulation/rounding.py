@@ -36,7 +36,7 @@ class AboveRounding(Adaptive):
     controller: Any
 
     def adapt_step_size(self, *arguments):
-        t0, t1, y0, y1_candidate, args, (error, health), *rest = arguments
+        t0, t1, y0, y1_candidate, args, (error, health, tangents), *rest = arguments
         same_step = _same_step(self.controller, rest[0])
         revolute = real_joints(args.linkage.ef)
         of_qd = _rounding(revolute, health, y0, y1_candidate)
@@ -51,7 +51,10 @@ class AboveRounding(Adaptive):
             as_long = same_step * jnp.minimum(ratio / _HELD, 1)
             above_noise = ratio / jnp.where(out_of_reach, _NOISE, 1)
             judged_as = tolerance * jnp.where(is_noise, as_long, above_noise)
-            return jnp.where(out_of_reach | is_noise, judged_as, error)
+            judged = jnp.where(out_of_reach | is_noise, judged_as, error)
+            if tangents is None:
+                return judged
+            return jnp.maximum(jnp.abs(judged), tangents * tolerance)
 
         # The elements' own states come last; their rates do not lose accuracy.
         ends, noise = (y0[:2], y1_candidate[:2]), (of_delta, of_qd)

@@ -14,6 +14,7 @@ from ..base.checks import is_traced
 from ..base.configuration import options_of_loops
 from ..forces.added_inertia import inertial
 from ..forces.element import Element, ForeignElement
+from .derivative_control import TANGENTS
 from .integrate import integrate
 from .padding import cut, padded
 from .prescribed import prescribed
@@ -134,8 +135,12 @@ def _with_tangents(motion, moving):
         shifted = lambda numbers: motion(whole(numbers))
         return jax.jvp(shifted, (start,), (direction,), has_aux=True)
 
-    directions = jnp.eye(len(start), dtype=start.dtype)
-    return jax.vmap(along, out_axes=(None, 0, None))(directions)
+    # Along changes of each number by itself, tangents have the size of the motion.
+    sizes = jnp.where(start == 0, 1, jnp.abs(start))
+    each = jax.vmap(along, out_axes=(None, 0, None), axis_name=TANGENTS)
+    states, tangents, solution = each(jnp.diag(sizes))
+    tangents = jax.tree.map(lambda rows: (rows.T / sizes).T, tangents)
+    return states, tangents, solution
 
 
 @_integrate_reversibly.def_fwd
@@ -147,7 +152,7 @@ def _integrate_reversibly_fwd(perturbed, inputs, keywords):
 
     def motion(moving):
         inputs = eqx.combine(moving, fixed)
-        solution = integrate(inputs, keywords, derivatives=True)
+        solution = integrate(inputs, keywords, derivatives=True, tangents=few)
         return (solution.q, solution.qd, solution.own), solution
 
     if few:

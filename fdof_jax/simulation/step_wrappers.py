@@ -61,16 +61,6 @@ def by_square_roots(controller: Any) -> Any:
     return with_pid(without_powers, controller)
 
 
-def bounded(controller: Any, longest: Callable[[], Array]) -> Any:
-    """Returns the controller with a longest step, unless it has one."""
-
-    def limited(pid: diffrax.PIDController) -> diffrax.PIDController:
-        own = pid.dtmax is not None
-        return pid if own else dataclasses.replace(pid, dtmax=longest())
-
-    return with_pid(limited, controller)
-
-
 class Adaptive(diffrax.AbstractAdaptiveStepSizeController):
     """Wrapper of an adaptive controller; implicit solvers read its tolerances.
 

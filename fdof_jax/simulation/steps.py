@@ -7,7 +7,6 @@ and switches, and `accounted` records what accuracy is left.
 
 import dataclasses
 import functools
-from collections.abc import Callable
 from typing import Any
 
 import diffrax
@@ -22,16 +21,13 @@ from ..base.user_warnings import warn
 from ..linkage.coordinates import State
 from ..linkage.linkage import Linkage, check_linkage, joints_of
 from ..linkage.topology import real_joints
-from .dopri8 import Estimate, ScheduledDopri8, ScheduledTerm
+from .dopri8 import ScheduledDopri8, ScheduledTerm
 from .rounding import AboveRounding, Recorded
 from .shortening import Shortening
-from .step_wrappers import Adaptive, Watched, bounded, with_judge, with_pid
+from .step_wrappers import Adaptive, Watched, with_judge, with_pid
 
 # Rounding keeps float32 from meeting a tighter relative or absolute tolerance.
 _TIGHTEST_SINGLE = 1e-6
-# Longest steps, over the time scale of a mode, that keep its tangents right to 1e-7
-# over 10 s: for methods of order 8, and for lower orders down to 5.
-_OF_TIME_SCALE = 0.7, 0.1
 
 
 def of_precision(double: Any, single: Any) -> Any:
@@ -123,22 +119,9 @@ def within_reach(
     return with_pid(mended, controller)
 
 
-def step_control(
-    controller: Any,
-    solver: diffrax.AbstractSolver,
-    term: ScheduledTerm,
-    bound: Callable[[float], Array] | None,
-) -> Any:
-    """Returns the given or default step control, with the bound for derivatives."""
-    # Implicit solvers are chosen for stiff modes, which would bound steps too tightly.
-    implicit = isinstance(solver, diffrax.AbstractImplicitSolver)
-    trusted = controller is not None and implicit
-    if controller is None:
-        controller = default_controller()
-    if bound is not None and not trusted:
-        fraction = _OF_TIME_SCALE[0 if (solver.order(term) or 0) >= 8 else 1]
-        controller = bounded(controller, lambda: bound(fraction))
-    return with_judge(AboveRounding, controller)
+def step_control(controller: Any) -> Any:
+    """Returns the given or default step control, which does not chase rounding."""
+    return with_judge(AboveRounding, controller or default_controller())
 
 
 def accounted(controller: Any, solver: Any, term: ScheduledTerm) -> Any:
@@ -163,7 +146,7 @@ class _Scaled(Adaptive):
         return super().init(*arguments)
 
     def adapt_step_size(self, *arguments):
-        t0, t1, y0, y1_candidate, args, (error, health), *rest = arguments
+        t0, t1, y0, y1_candidate, args, estimate, *rest = arguments
 
         def scaled(state: Any) -> Any:
             # The elements' own states come last and keep their units.
@@ -172,8 +155,8 @@ class _Scaled(Adaptive):
             motion = jax.tree.map(jnp.divide, state[:2], units)
             return (*motion, *state[2:])
 
-        y0, y1_candidate, error = map(scaled, (y0, y1_candidate, error))
-        estimate = Estimate(error, health)
+        y0, y1_candidate, error = map(scaled, (y0, y1_candidate, estimate.error))
+        estimate = estimate._replace(error=error)
         return super().adapt_step_size(t0, t1, y0, y1_candidate, args, estimate, *rest)
 
 
