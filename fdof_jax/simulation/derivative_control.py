@@ -19,10 +19,10 @@ from .dopri8 import ScheduledTerm, constant
 from .step_wrappers import Adaptive
 from .switching import Switching
 
-# The relative tolerance of tangents is this power of that of the motion, 9e-8 by
-# default: what undamped tangents need to be right to 1e-6 after 100 rad. It is no
-# tighter than so many rounding errors.
-_POWER, _NOISE = 0.64, 64.0
+# The relative tolerance of tangents is so many times that of the motion, at most so
+# much, and no tighter than so many rounding errors. At 1e-8, the default, undamped
+# tangents are right to 1e-6 after 1000 rad.
+_LOOSER, _LOOSEST, _NOISE = 1e3, 1e-4, 64.0
 # A tangent below this part of the largest one is judged as if it were as large.
 _WEAK = 0.1
 TANGENTS = "tangents"  # the name of their axis
@@ -32,7 +32,8 @@ def _tolerances(controller: Any, health: Any) -> tuple[Array, Array]:
     """Returns the relative tolerance of tangents, and their relative rounding error."""
     loss = constant(jnp.max(jnp.stack(health)))
     noise = _NOISE * jnp.finfo(loss.dtype).eps * loss
-    return jnp.maximum(controller.rtol**_POWER, noise), noise
+    tolerance = jnp.minimum(_LOOSER * controller.rtol, _LOOSEST)
+    return jnp.maximum(tolerance, noise), noise
 
 
 def _motion(y: Any) -> Any:
@@ -75,8 +76,10 @@ class OfTangents(Adaptive):
     def adapt_step_size(self, *arguments):
         t0, t1, y0, y1, args, estimate, *rest = arguments
         tolerances = constant(_tolerances(self, estimate.health))
-        parts = map(_motion, (estimate.error, y0, y1))
-        ratio = constant(_error_of_tangents(*parts, tolerances))
+        error, *ends = map(_motion, (estimate.error, y0, y1))
+        # Tangents of displacements lack that of the start.
+        ends = [(args.q0 + jnp.stack(q), *others) for q, *others in ends]
+        ratio = constant(_error_of_tangents(error, *ends, tolerances))
         estimate = estimate._replace(derivatives=ratio)
         return super().adapt_step_size(t0, t1, y0, y1, args, estimate, *rest)
 
