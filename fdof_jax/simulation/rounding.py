@@ -54,7 +54,8 @@ class AboveRounding(Adaptive):
             judged = jnp.where(out_of_reach | is_noise, judged_as, error)
             if tangents is None:
                 return judged
-            return jnp.maximum(jnp.abs(judged), tangents * tolerance)
+            # A step that is not finite has no tolerance, and an infinite error.
+            return jnp.fmax(jnp.abs(judged), tangents * tolerance)
 
         # The elements' own states come last; their rates do not lose accuracy.
         ends, noise = (y0[:2], y1_candidate[:2]), (of_delta, of_qd)

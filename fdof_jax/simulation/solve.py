@@ -139,7 +139,8 @@ def _with_tangents(motion, moving):
     sizes = jnp.where(start == 0, 1, jnp.abs(start))
     each = jax.vmap(along, out_axes=(None, 0, None), axis_name=TANGENTS)
     states, tangents, solution = each(jnp.diag(sizes))
-    tangents = jax.tree.map(lambda rows: (rows.T / sizes).T, tangents)
+    by_size = lambda rows: rows / sizes.reshape(-1, *[1] * (rows.ndim - 1))
+    tangents = jax.tree.map(by_size, tangents)
     return states, tangents, solution
 
 
