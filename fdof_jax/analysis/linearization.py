@@ -15,7 +15,13 @@ from ..base.checks import in_order, instance, is_traced, real_array
 from ..dynamics import forward_dynamics, joint_bias, joint_mass_matrix
 from ..forces.element import Element, Forces, elements_on, of_full_size
 from ..linkage.coordinates import State, real_state
-from ..linkage.linkage import Linkage, check_linkage, without_fixed
+from ..linkage.linkage import (
+    Linkage,
+    check_linkage,
+    joints_of,
+    moving_joints,
+    without_fixed,
+)
 from ..linkage.topology import fixed_pairs
 from ..simulation.field import element_effort, stateful
 from ..simulation.prescribed import prescribed
@@ -154,7 +160,8 @@ class Modes(eqx.Module):
 
     Prints the natural frequencies and damping ratios, each from its least to its most.
 
-    - `eigenvalues`: (time, 2n) [1/s]; NaN where the motion is NaN.
+    - `eigenvalues`: (time, mode) [1/s], two for each joint that moves; NaN where the
+      motion is NaN.
     """
 
     eigenvalues: Complex[np.ndarray, "time mode"]
@@ -229,7 +236,9 @@ def closed_loop_modes(linkage: Linkage, forces: Forces, solution: Solution) -> M
     check_joints("solution", solution, linkage)
     # Without its statistics: solvers differ in them, and need no program each.
     rows = solution.q, solution.qd, solution.ts
-    A = np.asarray(_each_linearized(linkage, forces, *rows))
+    moving = np.array(moving_joints(linkage), int)
+    kept = np.append(moving, joints_of(linkage) + moving)  # fixed pairs have no modes
+    A = np.asarray(_each_linearized(linkage, forces, *rows))[:, kept[:, None], kept]
     known = np.isfinite(A).all(axis=(1, 2))
     values = np.full(A.shape[:2], np.nan, complex)
     values[known] = np.linalg.eigvals(A[known])
