@@ -29,8 +29,9 @@ from .probes import Probe, answer, at_rest, commanding, following
 _LEAST, _MOST, _TURN = 1000, 2**20, 0.25
 BAND = 0.02  # around the final value, in which a response has settled
 _SETTLED = 0.9  # part of the duration before which it has to
-# Frequencies of the sines over the bandwidth of the linearised loop.
-_FREQUENCIES = np.geomspace(0.1, 2.5, 12)
+# Frequencies of the sines over the bandwidth of the linearised loop. Small sines pass
+# -3 dB between the two that are added, also beside the narrow peaks of other joints.
+_FREQUENCIES = np.sort([*np.geomspace(0.1, 2.5, 12), 0.98, 1.02])
 _PERIODS = 2  # in which a sine is measured
 # An arm comes to rest in this many time constants of its slowest mode, for at most so
 # many times the duration of a response.
@@ -134,7 +135,7 @@ def step_and_sine(
     >>> print(fj.analysis.step_and_sine(arm, q, pd, step=0.5, duration=2.0))
                 step   overshoot        rise    settling   bandwidth    at limit
             [m, rad]         [%]         [s]         [s]     [rad/s] [% of time]
-    R1           0.5       5.161      0.2743      0.7649       7.819         2.2
+    R1           0.5       5.161      0.2743      0.7649       7.822         2.2
     P2           0.5       4.115      0.1168      0.3365       24.37         0.5
     R3           0.5       3.018      0.1198      0.3513       28.07           0
     """
