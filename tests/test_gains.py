@@ -249,6 +249,10 @@ def test_a_bode_plot_shows_narrow_peaks():
         near = np.abs(frequency - mode.imag) < 2 * np.abs(mode.real)
         peak = 20 * np.log10(np.abs(loop(mode.imag)))
         assert shown[near].max() > peak - 0.1
+    free = pd_at(q, gains[0], 0 * gains[1])  # where L is infinite at the others' modes
+    undamped = fj.analysis.open_loop(linkage, q, free, 1)
+    for ax in fj.plotting.bode_plot(undamped, Figure()).axes:
+        assert all(np.isfinite(line.get_ydata()).all() for line in ax.lines)
 
 
 def test_the_closed_loop_is_the_linearised_arm():

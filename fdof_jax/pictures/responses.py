@@ -58,12 +58,14 @@ def bode_plot(loop: OpenLoop, fig: Figure | None = None) -> Figure:
     closed = loop.A - np.outer(loop.B, loop.C)
     modes = np.linalg.eigvals([loop.A, closed]).ravel()
     rates = np.abs(modes)
-    modes, rates = (
-        a[rates > 1e-6 * rates.max()] for a in (modes, rates)
-    )  # not at rest
+    frequent = rates > 1e-6 * rates.max()  # without poles at rest, rounded
+    rates, sway, decay = rates[frequent], modes.imag[frequent], modes.real[frequent]
     frequency = np.geomspace(rates.min() / 10, rates.max() * 10, 1000)
-    # Peaks of lightly damped modes are narrower than these are apart.
-    near = np.abs(modes.imag) + np.multiply.outer(_BESIDE, modes.real)
+    # Peaks of lightly damped modes are narrower than these are apart. At an undamped
+    # one, the response is infinite.
+    damped = np.abs(decay) > 1e-6 * rates
+    near = np.abs(sway) + np.multiply.outer(_BESIDE, decay)
+    near = near[:, damped]
     near = near[(near > frequency[0]) & (near < frequency[-1])]
     if crossing := np.isfinite(loop.phase_margin):
         near = np.append(near, crossover)
