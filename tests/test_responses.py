@@ -7,6 +7,7 @@ from helpers import random_linkage
 from test_gains import pd_at
 
 import fdof_jax as fj
+from fdof_jax.analysis.responses import share_beyond
 
 STEP, DURATION = 1e-4, 3.0
 
@@ -108,6 +109,14 @@ def test_weak_actuators_are_slower_and_at_their_limits(arm, small):
     large = fj.analysis.step_and_sine(light, q, pd, step=0.8, duration=DURATION)
     assert (large.saturated > 0.02).all()
     assert (large.bandwidth < 0.8 * small.bandwidth).all()
+
+
+def test_the_time_at_a_limit_is_counted_between_samples():
+    demand = 2 * np.sin(np.linspace(0, 2 * np.pi, 31))  # above 1 for two thirds
+    assert share_beyond(demand) == pytest.approx(2 / 3, abs=3e-3)
+    assert abs(np.mean(np.abs(demand) > 1) - 2 / 3) > 0.02
+    assert share_beyond(np.array([0.0, np.inf, -np.inf, 0.0, 0.5])) == 1 / 4
+    assert share_beyond(np.ones(3)) == 0
 
 
 def test_an_arm_that_does_not_come_to_rest_is_not_settled(arm):

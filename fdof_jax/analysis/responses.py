@@ -135,8 +135,8 @@ def step_and_sine(
     >>> print(fj.analysis.step_and_sine(arm, q, pd, step=0.5, duration=2.0))
                 step   overshoot        rise    settling   bandwidth    at limit
             [m, rad]         [%]         [s]         [s]     [rad/s] [% of time]
-    R1           0.5       5.161      0.2743      0.7649       7.822         2.2
-    P2           0.5       4.115      0.1168      0.3365       24.37         0.5
+    R1           0.5       5.161      0.2743      0.7649       7.822       2.145
+    P2           0.5       4.115      0.1168      0.3365       24.37      0.4195
     R3           0.5       3.018      0.1198      0.3513       28.07           0
     """
     check_linkage(linkage)
@@ -204,7 +204,7 @@ def step_and_sine(
     rows = [step_measures(since, *row) for row in zip(*shares)]
     overshoot, rise_time, settling_time = np.array(rows).T
     settled = settling_time <= _SETTLED * t0
-    saturated = np.mean(np.abs(demands) > 1, axis=1)
+    saturated = np.array(list(map(share_beyond, demands)))
     failed = np.isnan(changes).any(axis=1)
     return StepAndSine(
         joints=tuple(names[k] for k in moving),
@@ -256,6 +256,16 @@ def step_measures(
     settled = np.append(passing(1 - BAND), passing(1 + BAND)).max(initial=0.0)
     inside = np.abs(part[-1] - 1) <= BAND
     return max(most - 1, 0.0), rise, settled if inside else np.nan
+
+
+def share_beyond(demand: np.ndarray) -> float:
+    """Returns the share of the time at which samples, and lines between, exceed 1."""
+    above = np.abs(demand) - 1
+    before, after = above[:-1], above[1:]
+    with np.errstate(divide="ignore", invalid="ignore"):  # equal or infinite
+        share = np.maximum(before, after) / np.abs(after - before)
+    share = np.clip(np.nan_to_num(share), 0, 1)
+    return float(np.mean(np.where((before > 0) & (after > 0), 1, share)))
 
 
 def _bandwidth(frequency: np.ndarray, gain: np.ndarray, final: float) -> float:
