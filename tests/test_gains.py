@@ -235,6 +235,26 @@ def test_a_bode_plot_agrees_with_python_control():
         np.testing.assert_allclose(at, degrees - 180, atol=0.1)
 
 
+def test_a_bode_plot_shows_narrow_peaks():
+    """Those of the other joints' modes, of which the phase turns by half a turn."""
+    linkage, q = arm("RRR")
+    linkage = linkage.replace(gravity=0)
+    gains = fj.control.gains_from_frequency(linkage, q, [8, 20, 60], 1e-4)
+    loop = fj.analysis.open_loop(linkage, q, pd_at(q, *gains), 1)
+    fig = fj.plotting.bode_plot(loop, Figure())
+    level = next(x for x in fig.axes[0].lines if x.get_label() == "loop of R1")
+    frequency, shown = level.get_xdata(), level.get_ydata()
+    modes = np.linalg.eigvals(loop.A)
+    for mode in modes[modes.imag > 1]:
+        near = np.abs(frequency - mode.imag) < 2 * np.abs(mode.real)
+        peak = 20 * np.log10(np.abs(loop(mode.imag)))
+        assert shown[near].max() > peak - 0.1
+    free = pd_at(q, gains[0], 0 * gains[1])  # where L is infinite at the others' modes
+    undamped = fj.analysis.open_loop(linkage, q, free, 1)
+    for ax in fj.plotting.bode_plot(undamped, Figure()).axes:
+        assert all(np.isfinite(line.get_ydata()).all() for line in ax.lines)
+
+
 def test_the_closed_loop_is_the_linearised_arm():
     linkage, q = arm("RPR")
     gains = fj.control.gains_from_frequency(linkage, q, 20.0, 0.7)

@@ -153,6 +153,26 @@ def encoders(scene, solution):
 LINK = dict(m=jnp.asarray(3.0), p=jnp.asarray(0.5), J=jnp.asarray(1.1))
 
 
+def test_the_encoder_of_a_fixed_pair_is_no_reading():
+    """It is right without noise, and would make the noise of the others seem less."""
+    scene_at = FirstLink(fj.existence_factors("RRF"))
+    readings = recorded(scene_at(LINK), TS, encoders).copy()
+    assert not readings[:, 2].any()
+    readings[:, :2] += 1e-3 * np.random.default_rng(0).normal(size=(len(TS), 2))
+    unread = readings.copy()
+    unread[:, 2] = np.nan
+    found, expected = (
+        fj.fit(
+            scene_at, dict(m=3.1, p=0.5, J=1.12), TS, seen, observe=encoders,
+            validate=(scene_at, seen),
+        )
+        for seen in (readings, unread)
+    )  # fmt: skip
+    assert found.noise == pytest.approx(1e-3, rel=0.05)
+    for name in ("noise", "rms", "held_out", "standard_errors"):
+        assert getattr(found, name) == pytest.approx(getattr(expected, name), rel=1e-6)
+
+
 @pytest.mark.parametrize(
     "topology, untold, told, words",
     [

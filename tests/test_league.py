@@ -1,12 +1,15 @@
 """One circle that all seven topologies track."""
 
 import functools
+from types import SimpleNamespace
 
+import equinox as eqx
 import jax
 import numpy as np
 import pytest
 
 import fdof_jax as fj
+from fdof_jax.tuning.result import _message
 
 SCENES = fj.tuning.circle_scenes()
 TS = np.linspace(0, 4, 201)
@@ -68,3 +71,45 @@ def test_scenes_that_cannot_be_tuned_together():
     other = SCENES["RRR"]._replace(forces=(*SCENES["RRR"].forces, fj.JointDamper(1.0)))
     with pytest.raises(ValueError, match=r"scenes\[1\]: expected one like scenes\[0\]"):
         fj.tuning.tune_each([SCENES["RRR"], other])
+
+
+def with_fixed(tuned, topology):
+    """Returns a result of tuning as of an arm whose other joints are fixed."""
+    moves = np.array([kind != "F" for kind in topology])
+    scene = tuned.scene._replace(linkage=tuned.scene.linkage.replace(topology=topology))
+    history = tuned.history
+    arrays = lambda h: (h.gains, h.saturated, h.effort)
+    masked = [values * moves for values in arrays(history)]
+    parts = lambda r: (r.scene, r.histories[0], r.lower, r.upper)
+    changed = eqx.tree_at(arrays, history, masked)
+    new = scene, changed, tuned.lower * moves, tuned.upper * moves
+    return eqx.tree_at(parts, tuned, new)
+
+
+def test_fixed_pairs_count_nothing_in_results_of_tuning(tuned):
+    assert tuned.effort == pytest.approx(0.5)
+    for topology in ("RPF", "RFF", "FPR"):
+        result = with_fixed(tuned, topology)
+        assert result.effort == pytest.approx(0.5)
+        count = 2 * sum(kind != "F" for kind in topology)
+        held = result.at_bound.sum()
+        assert f"{held} of {count} gains at a bound" in repr(result)
+        *_, row = fj.tuning.league_table({topology: result}).splitlines()
+        assert row.split() == [topology, "200", "100", "50", "50", f"{held}/{count}"]
+
+
+def test_gains_held_by_their_bounds_are_not_counted(tuned):
+    lower = tuned.lower.copy()
+    lower[1, 0] = tuned.upper[1, 0]
+    held = eqx.tree_at(lambda r: r.lower, tuned, lower)
+    assert fj.tuning.league_table({"RPR": held}).endswith("1/5")
+
+
+def test_a_flat_start_of_an_arm_with_a_fixed_pair_is_explained(tuned):
+    """All actuators that there are are at their limits."""
+    result = with_fixed(tuned, "RPF")
+    saturated = np.array([[1.0, 1.0, 0.0]])
+    history = eqx.tree_at(lambda h: h.saturated, result.history, saturated)
+    run = SimpleNamespace(reason="", flat=True)
+    text = _message(result.scene, run, history, result.lower, result.upper)
+    assert "because every actuator is at its limit throughout" in text

@@ -10,7 +10,7 @@ from test_gains import PENDULUM, Stand, pd_at
 import fdof_jax as fj
 from fdof_jax.analysis.linearization import closed_loop
 from fdof_jax.tuning import within_limits
-from fdof_jax.tuning.limits import excess, sensitivity
+from fdof_jax.tuning.limits import excess, measured, sensitivity
 
 FREE = PENDULUM.replace(gravity=0)
 INERTIA = 0.3 + 2 * (0.6**2 + 0.2**2)
@@ -78,6 +78,24 @@ def test_settling_times_are_met():
     assert kd / (2 * np.sqrt(kp * INERTIA)) > 0.7
 
 
+def test_limits_of_a_joint_that_is_faster_than_the_samples_are_measured():
+    frequency, ratio = 190.0, 0.3
+    kp, kd = frequency**2 * INERTIA, 2 * ratio * frequency * INERTIA
+    limits = fj.tuning.Limits(
+        overshoot=[0.4], settling_time=[1.0], effort=[1e6], modulus_margin=[0.0]
+    )
+    rows = measured(step(kp, kd)._replace(t1=20.0), limits)
+    overshoot, settling, effort = (reached for *_, reached in rows)
+    damped = np.sqrt(1 - ratio**2)
+    np.testing.assert_allclose(overshoot, np.exp(-np.pi * ratio / damped), rtol=1e-3)
+    np.testing.assert_allclose(effort, kp, rtol=1e-6)
+    ts = np.linspace(0, 0.2, 200_001)
+    angle = damped * frequency * ts + np.arccos(ratio)
+    away = np.exp(-ratio * frequency * ts) * np.sin(angle) / damped
+    settled = ts[np.abs(away) > 0.02].max()
+    np.testing.assert_allclose(settling, settled, rtol=1e-3)
+
+
 def test_limits_out_of_reach_are_reported(monkeypatch):
     judged, seen = within_limits._judged, []
     monkeypatch.setattr(
@@ -99,7 +117,8 @@ def test_the_margins_that_are_tuned_are_those_of_the_loops():
     linkage, q = random_linkage("RPR", rng), rng.uniform(-1, 1, 3)
     gains = fj.control.gains_from_frequency(linkage, q, [8.0, 20.0, 60.0], 0.3)
     pd = pd_at(q, *gains)
-    found = sensitivity(*closed_loop(linkage, pd, (), jnp.asarray(q), jnp.zeros(())))
+    A, B, C, _ = closed_loop(linkage, pd, (), jnp.asarray(q), jnp.zeros(()))
+    found = sensitivity(A, B, C)
     least = 1 / np.abs(found).max(axis=0)
     exact = [fj.analysis.open_loop(linkage, q, pd, k).modulus_margin for k in (1, 2, 3)]
     np.testing.assert_allclose(np.minimum(least, 1), exact, rtol=5e-3)

@@ -83,3 +83,15 @@ def test_modes_are_refused_of_what_is_traced_or_stacked():
     for call in jax.jit(of), lambda q: of(q[None]):
         with pytest.raises(ValueError, match="solution: expected one motion"):
             call(jnp.zeros((1, 3)))
+
+
+def test_fixed_pairs_have_no_modes():
+    linkage = ROD.replace(topology="RFR")
+    forces = (held(linkage, STILL, [400.0, 0.0, 200.0], [10.0, 0.0, 6.0]),)
+    modes = modes_at(linkage, forces, (STILL, STILL), (STILL, STILL))
+    assert modes.eigenvalues.shape == (2, 4)
+    full = np.asarray(fj.linearize(linkage, fj.State(STILL, STILL), forces).A)
+    moving = np.array([0, 2, 3, 5])
+    expected = np.abs(np.linalg.eigvals(full[np.ix_(moving, moving)]))
+    np.testing.assert_allclose(modes.frequency[0], np.sort(expected), rtol=1e-9)
+    assert modes.frequency.min() > 1 and (modes.damping > 0).all()

@@ -178,6 +178,23 @@ def test_a_joint_without_a_limit_above_zero_has_no_effort():
     assert found.efforts[:, 0].any() and not found.efforts[:, 1].any()
 
 
+class Beside(fj.references.Reference):
+    """A tip position that an arm with one joint need not reach."""
+
+    def tip(self, t):
+        return np.ones(2)
+
+    def __call__(self, t, linkage):
+        return np.zeros(2), np.zeros(2)
+
+
+def test_a_fixed_pair_has_no_effort_whatever_its_limit():
+    scene = changed(limit=[60, np.inf], reference=Beside())
+    scene = scene._replace(linkage=SCENE.linkage.replace(topology="RF"))
+    found = fj.tuning.optimal_efforts(scene, horizon=HORIZON, knots=KNOTS, max_steps=1)
+    assert found.efforts[:, 0].any() and not found.efforts[:, 1].any()
+
+
 @pytest.mark.parametrize(
     "scene, keywords, message",
     [

@@ -127,6 +127,62 @@ def test_a_path_behind_the_pivot_is_refused_where_it_is_simulated(x):
     assert not fj.references.reachable(ARM, ring, [0.0, 0.4, 2.0]).any()
 
 
+RING = fj.references.Ellipse([0.5, 0], [1.2, 1.2])  # round the pivot
+
+
+class Ramp(eqx.Module):
+    """A timing of a user's own."""
+
+    begin: float
+
+    def __call__(self, t):
+        return jnp.clip(t - self.begin, 0, 1)
+
+
+@eqx.filter_jit
+def reached(task, ts):
+    return fj.references.reachable(ARM, task, ts)
+
+
+@pytest.mark.parametrize("begin, end", [(0.0, 1.0), (0.0, 400.0), (0.7, 3e4)])
+def test_a_short_travel_is_checked_in_runs_of_any_length(begin, end):
+    """Of so few samples of a run, none or two would lie within the second."""
+    ts = jnp.array([0.0, end + begin])
+    for timing in fj.references.Travel(1.0, begin=begin), Ramp(np.array(begin)):
+        ring = fj.TipTask(RING, timing)
+        with pytest.raises(ValueError, match="behind the ground pivot"):
+            ring.check(ARM, ts)
+        assert not fj.references.reachable(ARM, ring, ts).any()
+        assert not reached(ring, ts).any()
+        # Its most distant point is out of reach for a moment.
+        line = fj.references.Spline([[1, 0], [2.5, 0], [1, 0.1]])
+        with pytest.raises(ValueError, match="within the linkage's reach") as raised:
+            fj.TipTask(line, timing).check(ARM, ts)
+        when = float(str(raised.value).split()[-2])
+        assert begin < when < begin + 1
+        beside = fj.TipTask(fj.references.Ellipse([1.3, 0], [0.4, 0.4]), timing)
+        beside.check(ARM, ts)
+        assert reached(beside, ts).all()
+
+
+def test_only_the_part_of_a_travel_within_the_run_is_checked():
+    ring = fj.TipTask(RING, fj.references.Travel(1.0, profile="harmonic"))
+    ring.check(ARM, jnp.array([0.0, 0.4]))
+    ring.check(ARM, jnp.array([5.0, 9.0]))
+    with pytest.raises(ValueError, match="behind the ground pivot"):
+        ring.check(ARM, jnp.array([0.4, 0.6]))
+
+
+def test_a_spline_of_many_points_is_checked_between_all():
+    """One of its points is behind the pivot, between points that are not."""
+    points = np.tile([1.0, 0.0], (3000, 1))
+    points[::2, 1] = 0.1
+    points[1801:1805] = [[0.5, 1.0], [-1.0, 0.5], [-1.0, -0.5], [0.5, -1.0]]
+    task = fj.TipTask(fj.references.Spline(points), fj.references.Travel(1.0))
+    with pytest.raises(ValueError, match="behind the ground pivot"):
+        task.check(ARM, jnp.array([0.0, 1.0]))
+
+
 def test_a_path_behind_the_pivot_or_left_by_laps_fails_where_it_is_traced():
     """Its joints would jump by a turn, which the motion would follow."""
 

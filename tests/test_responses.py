@@ -7,6 +7,7 @@ from helpers import random_linkage
 from test_gains import pd_at
 
 import fdof_jax as fj
+from fdof_jax.analysis.responses import share_beyond
 
 STEP, DURATION = 1e-4, 3.0
 
@@ -59,8 +60,46 @@ def test_small_steps_and_sines_agree_with_python_control(arm, small):
         gain = closed(1j * small.frequency[k])
         np.testing.assert_allclose(small.gain[k], gain, atol=1e-3)
         bandwidth = control.bandwidth(closed)
-        np.testing.assert_allclose(small.bandwidth[k], bandwidth, rtol=5e-3)
+        np.testing.assert_allclose(small.bandwidth[k], bandwidth, rtol=2e-4)
         assert small.saturated[k] == 0
+
+
+def test_a_joint_that_is_faster_than_a_thousand_samples():
+    """A slow joint needs the time; the response of a fast one is over in 30 ms."""
+    duration = 12.0
+    linkage = fj.Linkage(
+        "RR", length=[0, 1, 1], com=[[0.5, 0]] * 2, mass=[1] * 2, inertia=[1 / 12] * 2,
+        gravity=0,
+    )  # fmt: skip
+    q = np.array([0.3, 0.8])
+    gains = fj.control.gains_from_frequency(linkage, q, [1, 150], [0.7, 0.3])
+    pd = pd_at(q, *gains)
+    found = fj.analysis.step_and_sine(linkage, q, pd, step=1e-4, duration=duration)
+    loop = fj.analysis.open_loop(linkage, q, pd, joint=2)
+    modes, vectors = np.linalg.eig(loop.A - np.outer(loop.B, loop.C))
+    # y = C A^-1 (e^(A t) - 1) B
+    parts = vectors[1] * np.linalg.solve(vectors, pd.kp[1] * loop.B + 0j) / modes
+    response = lambda t: np.real(np.expm1(np.multiply.outer(t, modes)) @ parts)
+    ts = np.linspace(0, 0.2, 400_001)
+    share = response(ts) / response(duration)
+    overshoot, settling = share.max() - 1, ts[np.abs(share - 1) > 0.02].max()
+    rise = ts[np.argmax(share >= 0.9)] - ts[np.argmax(share >= 0.1)]
+    np.testing.assert_allclose(found.overshoot[1], overshoot, rtol=1e-3)
+    np.testing.assert_allclose(found.rise_time[1], rise, rtol=1e-3)
+    np.testing.assert_allclose(found.settling_time[1], settling, rtol=1e-3)
+    np.testing.assert_allclose(found.bandwidth[1], loop.bandwidth, rtol=2e-4)
+    assert len(found.ts) > 4 * duration * 150 and (np.diff(found.ts) > 0).all()
+    with pytest.raises(ValueError, match="duration: expected at most .* rad/s, got"):
+        fj.analysis.step_and_sine(linkage, q, pd, step=1e-4, duration=1e5)
+
+
+def test_an_arm_that_follows_all_sines_has_no_bandwidth():
+    rod = fj.Linkage("R", length=[0, 1], com=[[0.5, 0]], mass=[1], inertia=[0.1])
+    stand = pd_at(np.zeros(1), 1, 1).reference
+    torque = fj.control.ComputedTorque([90.0], [6.0], [np.inf], stand)
+    test = fj.analysis.step_and_sine(rod, [0.0], torque, step=0.1, duration=3.0)
+    np.testing.assert_allclose(test.gain, 1, rtol=1e-3)
+    assert np.isnan(test.bandwidth).all() and (test.overshoot > 0.1).all()
 
 
 def test_weak_actuators_are_slower_and_at_their_limits(arm, small):
@@ -70,6 +109,14 @@ def test_weak_actuators_are_slower_and_at_their_limits(arm, small):
     large = fj.analysis.step_and_sine(light, q, pd, step=0.8, duration=DURATION)
     assert (large.saturated > 0.02).all()
     assert (large.bandwidth < 0.8 * small.bandwidth).all()
+
+
+def test_the_time_at_a_limit_is_counted_between_samples():
+    demand = 2 * np.sin(np.linspace(0, 2 * np.pi, 31))  # above 1 for two thirds
+    assert share_beyond(demand) == pytest.approx(2 / 3, abs=3e-3)
+    assert abs(np.mean(np.abs(demand) > 1) - 2 / 3) > 0.02
+    assert share_beyond(np.array([0.0, np.inf, -np.inf, 0.0, 0.5])) == 1 / 4
+    assert share_beyond(np.ones(3)) == 0
 
 
 def test_an_arm_that_does_not_come_to_rest_is_not_settled(arm):

@@ -1,5 +1,6 @@
 """Linear analysis for control: matrices of the arm and its loops, modes of motions."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -12,11 +13,19 @@ from jaxtyping import Complex, Float
 from numpy.typing import ArrayLike
 
 from ..base.checks import in_order, instance, is_traced, real_array
+from ..control.pd import PDController
 from ..dynamics import forward_dynamics, joint_bias, joint_mass_matrix
 from ..forces.element import Element, Forces, elements_on, of_full_size
 from ..linkage.coordinates import State, real_state
-from ..linkage.linkage import Linkage, check_linkage, without_fixed
+from ..linkage.linkage import (
+    Linkage,
+    check_linkage,
+    joints_of,
+    moving_joints,
+    without_fixed,
+)
 from ..linkage.topology import fixed_pairs
+from ..references.reference import Reference, reference_motion
 from ..simulation.field import element_effort, stateful
 from ..simulation.prescribed import prescribed
 from ..simulation.sampled import check_joints
@@ -116,14 +125,28 @@ def _each_linearized(
     return jax.lax.map(lambda row: _linearized(linkage, forces, *row).A, rows)
 
 
+def _with_references(element: Element, changed: Callable[[Any], Any]) -> Element:
+    """Returns an element with its references changed, also those of commands."""
+
+    def of(part: Any) -> Any:
+        if isinstance(part, PDController):  # whose reference may be a plain function
+            return eqx.tree_at(lambda pd: pd.reference, part, changed(part.reference))
+        return changed(part) if isinstance(part, Reference) else part
+
+    held = lambda part: isinstance(part, PDController | Reference)
+    return jax.tree.map(of, element, is_leaf=held)
+
+
 @eqx.filter_jit
 def closed_loop(
     linkage: Linkage, controller: Element, forces: tuple[Element, ...], q: Array, t: Any
-) -> tuple[Array, Array, Array]:
-    """Linearises an arm under a controller about rest at `q`: A, B and C.
+) -> tuple[Array, Array, Array, Array]:
+    """Linearises an arm under a controller about rest at `q`: A, B, C and F.
 
     The state y is (q, qd, the controller's own): dy/dt = A y + B tau with efforts tau
     added to the controller's, which are -C y. Constant efforts hold the arm at rest.
+    Changes of the reference's positions, velocities and accelerations at the time add
+    F (3, state, n) to dy/dt.
     """
     own, rebuilt = ravel_pytree(controller.initial_state(linkage))
     n, still = q.size, jnp.zeros_like(q)
@@ -136,17 +159,32 @@ def closed_loop(
         weight = joint_bias(linkage, q, still, forces)
         return total_effort(linkage, forces, t, q, qd) - weight
 
-    def respond(y):
+    def respond(y, change):
         q, qd, own = jnp.split(y, [n, 2 * n])
-        effort, rate = controller.act(t, q, qd, linkage, rebuilt(own))
+
+        def moved(reference):
+            def at(time, linkage):
+                position, velocity = reference_motion(reference, time, linkage)
+                by, rate, growth = change
+                since = time - t
+                position = position + by + since * (rate + since / 2 * growth)
+                return position, velocity + rate + since * growth
+
+            return at
+
+        led = _with_references(controller, moved)
+        effort, rate = led.act(t, q, qd, linkage, rebuilt(own))
         return jnp.concatenate([effort, ravel_pytree(rate)[0]])
 
     # At rest neither M^-1, multiplied by no effort, nor Coriolis forces have a slope.
     y = jnp.concatenate([q, still, own])
-    alone, slopes = jax.jacfwd(acting)(y), jax.jacfwd(respond)(y)
+    alone = jax.jacfwd(acting)(y)
+    slopes, by_reference = jax.jacfwd(respond, (0, 1))(y, jnp.zeros((3, n)))
     efforts, rates = slopes[:n], slopes[n:]
     moved = jnp.concatenate([jnp.eye(n, len(y), n), jnp.zeros((n, len(y))), rates])
-    return moved + B @ (alone + efforts), B, -efforts
+    F = jnp.concatenate([jnp.zeros((3, 2 * n, n)), by_reference[n:].swapaxes(0, 1)], 1)
+    F = F + B @ by_reference[:n].swapaxes(0, 1)
+    return moved + B @ (alone + efforts), B, -efforts, F
 
 
 class Modes(eqx.Module):
@@ -154,7 +192,8 @@ class Modes(eqx.Module):
 
     Prints the natural frequencies and damping ratios, each from its least to its most.
 
-    - `eigenvalues`: (time, 2n) [1/s]; NaN where the motion is NaN.
+    - `eigenvalues`: (time, mode) [1/s], two for each joint that moves; NaN where the
+      motion is NaN.
     """
 
     eigenvalues: Complex[np.ndarray, "time mode"]
@@ -229,7 +268,9 @@ def closed_loop_modes(linkage: Linkage, forces: Forces, solution: Solution) -> M
     check_joints("solution", solution, linkage)
     # Without its statistics: solvers differ in them, and need no program each.
     rows = solution.q, solution.qd, solution.ts
-    A = np.asarray(_each_linearized(linkage, forces, *rows))
+    moving = np.array(moving_joints(linkage), int)
+    kept = np.append(moving, joints_of(linkage) + moving)  # fixed pairs have no modes
+    A = np.asarray(_each_linearized(linkage, forces, *rows))[:, kept[:, None], kept]
     known = np.isfinite(A).all(axis=(1, 2))
     values = np.full(A.shape[:2], np.nan, complex)
     values[known] = np.linalg.eigvals(A[known])

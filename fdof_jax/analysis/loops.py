@@ -7,7 +7,6 @@ import numpy as np
 from jaxtyping import Complex, Float
 from numpy.typing import ArrayLike
 from scipy.linalg import block_diag, eigvals
-from scipy.optimize import minimize_scalar
 
 from ..base.checks import is_traced, one_of, real_array, refusal
 from ..base.html_table import html_table
@@ -21,9 +20,10 @@ from ..linkage.linkage import (
 )
 from ..simulation.prescribed import prescribed
 from .linearization import checked, closed_loop
+from .transfer import Transfer
 
-# A frequency counts as a crossing if the response there is on the curve to this part.
-_ON_CURVE = 1e-6
+# A response counts as real if its imaginary part is below this part of it.
+_REAL = 1e-6
 # Gain margins beyond this are zeros at infinity or poles at rest, rounded.
 _LARGEST_MARGIN = 1e6
 BANDWIDTH = 10 ** (-3 / 20)  # -3 dB
@@ -33,10 +33,14 @@ class OpenLoop(eqx.Module):
     """The loop of a controller, broken at one joint's effort; prints its margins.
 
     The loop's transfer function is L(s) = C (s I - A)^-1 B. Where the loop is closed
-    again, the eigenvalues are those of A - B C.
+    again, the eigenvalues are those of A - B C, and the joint's position follows its
+    reference by T(s) = G (s I - A + B C)^-1 F + D. That is L / (1 + L) only where the
+    controller acts on nothing but the error and its rate.
 
     - `A`, `B`, `C`: matrices (state, state), (state,) and (state,). The state holds
       positions [m or rad], velocities and the controller's own state.
+    - `F`, `G`, `D`: matrices (state,), (state,) and (); 0 for a controller without a
+      reference that is known, such as a plain function.
     - `joint`: the joint's name, for instance R1.
     - `stable`: whether all modes of the closed loop decay, none at less than
       `slowest_decay` [1/s].
@@ -46,7 +50,7 @@ class OpenLoop(eqx.Module):
     - `gain_margin`: factor on the loop, the nearest to 1, that makes it unstable.
     - `modulus_margin`: least distance |1 + L| at all frequencies.
     - `bandwidth`: frequency above which the joint follows its reference by 3 dB less
-      than at rest [rad/s].
+      than at rest, |T| = 0.708 |T(0)| [rad/s]; infinite if it always follows.
 
     The four margins are NaN unless `stable`. Where L is zero, no change makes the
     closed loop unstable: the margins are infinite, that of the modulus 1.
@@ -55,20 +59,32 @@ class OpenLoop(eqx.Module):
     A: Float[np.ndarray, "state state"]
     B: Float[np.ndarray, " state"]
     C: Float[np.ndarray, " state"]
+    F: Float[np.ndarray, " state"]
+    G: Float[np.ndarray, " state"]
+    D: float
     joint: str
 
     def __call__(self, frequency: ArrayLike) -> Complex[np.ndarray, "..."]:
         """The frequency response L(i frequency), at frequencies [rad/s]."""
-        return _response(self.A, self.B, self.C, frequency)
+        return self._loop(frequency)
 
     @property
-    def _closed(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        return self.A - np.outer(self.B, self.C), self.B, self.C
+    def _loop(self) -> Transfer:
+        return Transfer(self.A, self.B, self.C)
+
+    @property
+    def _closed(self) -> np.ndarray:
+        return self.A - np.outer(self.B, self.C)
 
     @property
     def slowest_decay(self) -> float:
         """Rate at which the closed loop's slowest mode decays [1/s]."""
-        return -float(np.real(np.linalg.eigvals(self._closed[0])).max())
+        return -float(np.real(np.linalg.eigvals(self._closed)).max())
+
+    @property
+    def fastest(self) -> float:
+        """Magnitude of the closed loop's fastest mode [rad/s]."""
+        return float(np.abs(np.linalg.eigvals(self._closed)).max())
 
     @property
     def stable(self) -> bool:
@@ -78,7 +94,7 @@ class OpenLoop(eqx.Module):
     @property
     def _crossing(self) -> tuple[np.ndarray, np.ndarray]:
         """Frequencies at which |L| = 1, and the phase margins there."""
-        found = _frequencies_of(self.A, self.B, self.C, 1.0)
+        found = self._loop.crossings(1.0)
         return found, np.angle(-self(found))
 
     @property
@@ -122,16 +138,16 @@ class OpenLoop(eqx.Module):
         states = 2 * len(self.A)
         pencil = np.zeros((states + 1, states + 1))
         pencil[:-1, :-1] = block_diag(self.A, -self.A)
-        pencil[:-1, -1] = np.tile(_balanced(self.B, self.C)[0], 2)
-        pencil[-1, :-1] = np.tile(_balanced(self.B, self.C)[1], 2)
+        pencil[:-1, -1] = np.tile(self._loop.balanced[0], 2)
+        pencil[-1, :-1] = np.tile(self._loop.balanced[1], 2)
         zeros = eigvals(pencil, np.diag([1.0] * states + [0.0]))
         found = np.abs(np.imag(zeros[np.isfinite(zeros)]))
         # An undamped arm's response is real at all frequencies.
         values = self(np.concatenate([found[found > 0], self._crossing[0]]))
-        at_rest = np.real(_response(*self._closed, 0.0))
-        if _ON_CURVE < abs(1 - at_rest) < np.inf:  # otherwise L(0) is infinite
+        at_rest = np.real(Transfer(self._closed, self.B, self.C)(0.0))
+        if _REAL < abs(1 - at_rest) < np.inf:  # otherwise L(0) is infinite
             values = np.append(values, at_rest / (1 - at_rest))
-        real = np.abs(np.imag(values)) <= _ON_CURVE * np.abs(values)
+        real = np.abs(np.imag(values)) <= _REAL * np.abs(values)
         factors = -1 / np.real(values[real & (np.real(values) < 0)])
         distances = np.abs(np.log(factors))
         found = distances < np.log(_LARGEST_MARGIN)
@@ -147,25 +163,21 @@ class OpenLoop(eqx.Module):
         """
         if not self.stable:
             return np.nan
-        A, B, C = self._closed
-        distance = lambda w: 1 / np.abs(1 - _response(A, B, C, w))
-        rates = np.abs(np.linalg.eigvals(A))
-        grid = np.geomspace(rates.min() / 100 + 1e-9, rates.max() * 100, 2000)
-        least = int(distance(grid).argmin())
-        ends = grid[max(least - 1, 0)], grid[min(least + 1, len(grid) - 1)]
-        refined = minimize_scalar(distance, bounds=ends, method="bounded").fun
-        return float(min(refined, 1.0))
+        return 1 / Transfer(self._closed, self.B, -self.C, 1.0).peak()
 
     @property
     def bandwidth(self) -> float:
         """Frequency above which the joint follows by 3 dB less than at rest [rad/s].
 
-        The response to the reference is L / (1 + L); NaN if the joint does not follow
-        at rest.
+        It is infinite if the joint follows at all frequencies, as with computed torque
+        and an exact model. NaN if the joint does not follow at rest, or if no reference
+        is known.
         """
-        closed = self._closed
-        level = BANDWIDTH * float(np.abs(_response(*closed, 0.0)))
-        return float(min(_frequencies_of(*closed, level), default=np.nan))
+        response = Transfer(self._closed, self.F, self.G, self.D)
+        level = BANDWIDTH * float(np.abs(response(0.0)))
+        if not 0 < level < np.inf:
+            return np.nan
+        return float(min(response.crossings(level), default=np.inf))
 
     def _rows(self) -> list[tuple[str, str]]:
         state = "stable" if self.stable else "not stable, so it has no margins"
@@ -182,7 +194,7 @@ class OpenLoop(eqx.Module):
             ("gain margin", f"{self.gain_margin:.4g}"),
             ("modulus margin", f"{self.modulus_margin:.4g}"),
             ("bandwidth", f"{self.bandwidth:.4g} rad/s"),
-        ]
+        ][: -1 if np.isnan(self.bandwidth) else None]
 
     def __str__(self) -> str:
         rows = [f"  {label:16}{value}" for label, value in self._rows()]
@@ -246,43 +258,32 @@ def open_loop(
     q, t = per_joint("q", q, linkage), real_array("t", t, ())
     if is_traced(linkage, element, forces, q, t):
         raise ValueError("q: expected known values, outside of JAX's transformations.")
-    A, B, C = map(np.asarray, closed_loop(linkage, element, forces, q, t))
-    # Without the states of fixed pairs, which stand still, and those of the controller
-    # that never change, as an integral without a gain, or act on nothing.
-    n = len(names)
-    own = [k for k in range(2 * n, len(A)) if A[k].any() and A[:, k].any()]
-    kept = np.array([*moving, *(n + k for k in moving), *own])
-    b, c = B[kept, index], C[index, kept]
-    return OpenLoop(A[np.ix_(kept, kept)] + np.outer(b, c), b, c, names[index])
+    A, B, C, F = (
+        np.asarray(part, float) for part in closed_loop(linkage, element, forces, q, t)
+    )
+    kept = np.array(_kept(A, len(names), moving))
+    A, B, C, F = A[np.ix_(kept, kept)], B[kept, index], C[index, kept], F[:, kept]
+    # Rates and accelerations of the reference act as s and s^2 times its positions; of
+    # s (s I - A)^-1 = I + A (s I - A)^-1 the first part reaches no position at once.
+    acting = F[0, :, index] + A @ (F[1, :, index] + A @ F[2, :, index])
+    position = (kept == index).astype(float)
+    through = float(position @ A @ F[2, :, index])
+    return OpenLoop(A + np.outer(B, C), B, C, acting, position, through, names[index])
 
 
-def _response(A: Any, B: Any, C: Any, frequency: ArrayLike) -> np.ndarray:
-    """Computes C (i frequency - A)^-1 B; infinite at undamped modes."""
-    unit = np.eye(len(A))
-    at = np.asarray(frequency, float)[..., None, None] * 1j * unit - A
-    undamped = np.linalg.det(at) == 0
-    at = np.where(undamped[..., None, None], unit, at)
-    values = (np.linalg.solve(at, B[:, None]) * C[:, None]).sum(axis=(-2, -1))
-    return np.where(undamped, np.inf, values)
+def _kept(A: np.ndarray, n: int, moving: list[int]) -> list[int]:
+    """Returns the states of the loops of a closed loop's matrix.
 
-
-def _balanced(B: np.ndarray, C: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Moves a factor between B and C that makes them equally large."""
-    factor = np.sqrt(np.linalg.norm(C) / np.linalg.norm(B)) if C.any() else 1.0
-    return B * factor, C / (factor or 1.0)
-
-
-def _frequencies_of(A: Any, B: Any, C: Any, level: float) -> np.ndarray:
-    """Finds the frequencies at which |C (i w - A)^-1 B| is a level, above 0.
-
-    They are the imaginary eigenvalues of a Hamiltonian matrix (Boyd, Balakrishnan and
-    Kabamba, 1989).
+    Left out are those of fixed pairs, which stand still, and those of the controller
+    that act on no joint, such as an integral of a fixed pair, or that never change, as
+    an integral without a gain.
     """
-    if not 0 < level < np.inf or not C.any():
-        return np.zeros(0)
-    b, c = (part / np.sqrt(level) for part in _balanced(B, C))
-    matrix = np.block([[A, np.outer(b, b)], [-np.outer(c, c), -A.T]])
-    found = np.imag(np.linalg.eigvals(matrix))
-    found = np.unique(found[found > 0])
-    error = np.abs(np.abs(_response(A, B, C, found)) / level - 1)
-    return found[error <= _ON_CURVE]
+    joints = [*moving, *(n + k for k in moving)]
+    acting: list[int] = []
+    own = list(range(2 * n, len(A)))
+    while found := [k for k in own if A[np.ix_(joints + acting, [k])].any()]:
+        acting += found
+        own = [k for k in own if k not in found]
+    while still := [k for k in acting if not A[k, joints + acting].any()]:
+        acting = [k for k in acting if k not in still]
+    return joints + sorted(acting)

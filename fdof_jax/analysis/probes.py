@@ -16,9 +16,13 @@ from ..linkage.coordinates import State
 from ..linkage.linkage import Linkage
 from ..references.reference import Reference
 from ..simulation.simulate import simulate
+from ..simulation.solution import Solution
 from .tracking import relative_demands
 
-_SAMPLES = 1001  # as of the answers, so that one program serves both
+# As of most answers, so that one program serves both.
+_SAMPLES = 1001
+# A slow joint may take as long to settle as a fast one takes for so many steps.
+_STEPS = 2**20
 
 
 class Probe(Reference):
@@ -58,6 +62,12 @@ def following(element: Any, reference: Reference) -> Element:
     return eqx.tree_at(lambda drive: drive.command, element, inner)
 
 
+def _moved(
+    linkage: Linkage, start: State, ts: np.ndarray, forces: Forces, own: Any
+) -> Solution:
+    return simulate(linkage, start, ts, forces, own0=own, throw=False, max_steps=_STEPS)
+
+
 def at_rest(
     linkage: Linkage, controller: Element, forces: Forces, q: Array, time: float
 ) -> tuple[State, Any]:
@@ -66,7 +76,7 @@ def at_rest(
     if isinstance(controller, StatefulElement):
         own = (controller.initial_state(linkage),)
     ts = np.linspace(0, time, _SAMPLES)
-    sagging = simulate(linkage, start, ts, (controller, *forces), own0=own, throw=False)
+    sagging = _moved(linkage, start, ts, (controller, *forces), own)
     rest = State(sagging.q[-1], sagging.qd[-1])
     if not np.isfinite(np.asarray(rest)).all():
         return start, own
@@ -82,10 +92,10 @@ def answer(
     start: tuple[State, Any],
     probe: Probe,
     ts: np.ndarray,
-) -> tuple[Array, Array]:
-    """Simulates an answer to a probe: positions, and demands over limits."""
+) -> tuple[Array, Array, Array]:
+    """Simulates an answer to a probe: positions, speeds, and demands over limits."""
     led = following(controller, probe)
-    motion = simulate(linkage, start[0], ts, (led, *forces), own0=start[1], throw=False)
+    motion = _moved(linkage, start[0], ts, (led, *forces), start[1])
     pd = commanding(led)
     assert pd is not None
-    return motion.q, relative_demands(pd, linkage, motion)
+    return motion.q, motion.qd, relative_demands(pd, linkage, motion)

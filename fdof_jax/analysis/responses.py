@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Complex, Float
 from numpy.typing import ArrayLike
-from scipy.interpolate import CubicSpline
+from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
 from ..base.checks import is_traced, real_array, refusal
 from ..base.html_table import html_table
@@ -24,11 +24,14 @@ from .equilibria import holding_efforts
 from .loops import BANDWIDTH, open_loop
 from .probes import Probe, answer, at_rest, commanding, following
 
-_SAMPLES = 1001
+# Samples of a response: at least so many, so that most arms share a program, and one
+# for each part of a radian of the fastest mode, between which cubics are exact to 1e-5.
+_LEAST, _MOST, _TURN = 1000, 2**20, 0.25
 BAND = 0.02  # around the final value, in which a response has settled
 _SETTLED = 0.9  # part of the duration before which it has to
-# Frequencies of the sines over the bandwidth of the linearised loop.
-_FREQUENCIES = np.geomspace(0.1, 2.5, 12)
+# Frequencies of the sines over the bandwidth of the linearised loop. Small sines pass
+# -3 dB between the two that are added, also beside the narrow peaks of other joints.
+_FREQUENCIES = np.sort([*np.geomspace(0.1, 2.5, 12), 0.98, 1.02])
 _PERIODS = 2  # in which a sine is measured
 # An arm comes to rest in this many time constants of its slowest mode, for at most so
 # many times the duration of a response.
@@ -103,7 +106,9 @@ def step_and_sine(
     reference of one joint then steps, without a velocity, and the response is recorded
     for the `duration`. Sines of the reference, with their velocities, have the same
     time to build up. Their frequencies are 0.1 to 2.5 times the bandwidth of the
-    linearised loop. Small steps show the linear behaviour, large ones the limits.
+    linearised loop, or its crossover where the arm follows all sines. Small steps show
+    the linear behaviour, large ones the limits. Responses are sampled as finely as the
+    fastest mode asks for, a thousand times at least.
 
     **Arguments:**
 
@@ -118,8 +123,9 @@ def step_and_sine(
     where an arm follows all sines, as with `ComputedTorque` within its limits. NumPy
     analyses the motions, so the function cannot be used within JAX's transformations.
 
-    **Raises:** ValueError for malformed arguments, and if a joint does not follow its
-    reference at `q`, or where the arm comes to rest: its limits may be too low.
+    **Raises:** ValueError for malformed arguments, if a joint does not follow its
+    reference at `q`, or where the arm comes to rest: its limits may be too low; and for
+    a duration of more than a quarter of a million radians of the fastest mode.
 
     >>> import fdof_jax as fj
     >>> arm, _, (pd,), _ = fj.scenes.fig7()
@@ -129,8 +135,8 @@ def step_and_sine(
     >>> print(fj.analysis.step_and_sine(arm, q, pd, step=0.5, duration=2.0))
                 step   overshoot        rise    settling   bandwidth    at limit
             [m, rad]         [%]         [s]         [s]     [rad/s] [% of time]
-    R1           0.5       5.161      0.2743      0.7649       7.819         2.2
-    P2           0.5       4.115      0.1168      0.3365       24.37         0.5
+    R1           0.5       5.161      0.2743      0.7649       7.822       2.145
+    P2           0.5       4.115      0.1168      0.3365       24.37      0.4195
     R3           0.5       3.018      0.1198      0.3513       28.07           0
     """
     check_linkage(linkage)
@@ -168,43 +174,44 @@ def step_and_sine(
             f"got {pd.limit.tolist()}; to be held there it needs efforts of {needed} "
             "(`holding_efforts`), and more to be caught as it sags."
         )
-    frequency = bandwidths[:, None] * _FREQUENCIES
-    t0, count = float(duration), _SAMPLES - 1
-    probes, times = [], []
-    for k, row in zip(moving, frequency):
-        height, none = np.asarray(step) * np.eye(n)[k], np.zeros(n)
-        probes.append(Probe(q, height, t0, none, 1.0))
-        times.append(t0 + np.linspace(0, t0, count))
-        for w in row:
-            probes.append(Probe(q, none, t0, height, w))
-            times.append(t0 + 2 * np.pi / w * _PERIODS * np.arange(count) / count)
-    ts = np.pad(np.stack(times), ((0, 0), (1, 0)))  # from 0
+    crossovers = [loop.crossover for loop in loops]  # where an arm follows all sines
+    scale = np.where(np.isinf(bandwidths), crossovers, bandwidths)
+    frequency = scale[:, None] * _FREQUENCIES
+    t0 = float(duration)
+    since = np.linspace(0, t0, samples_of(t0, loops[0].fastest))
+    steps, gain = [], np.zeros(frequency.shape, complex)
     # One after the other: a batch takes three times as long to compile.
-    rows = zip(probes, ts)
-    answers = [answer(linkage, element, forces, start, *row) for row in rows]
-    found = map(np.stack, zip(*answers))
-    # (joint, lane, time), of the joint that is tested
-    own = np.repeat(moving, 1 + _FREQUENCIES.size)[:, None, None]
-    positions, demands = (
-        np.take_along_axis(part, own, axis=2)[:, 1:, 0].reshape(len(moving), -1, count)
-        for part in found
-    )
+    for row, k in enumerate(moving):
+        height, none = np.asarray(step) * np.eye(n)[k], np.zeros(n)
+
+        def moved(probe, times, k=k):
+            ts = np.append(0, t0 + times)
+            found = answer(linkage, element, forces, start, probe, ts)
+            return [np.asarray(part)[1:, k] for part in found]
+
+        steps.append(moved(Probe(q, height, t0, none, 1.0), since))
+        for column, w in enumerate(frequency[row]):
+            times = 2 * np.pi / w * _PERIODS * np.arange(_LEAST) / _LEAST
+            position, *_ = moved(Probe(q, none, t0, height, w), times)
+            phase = np.exp(-1j * w * (t0 + times))
+            gain[row, column] = 2j * np.mean(position * phase) / height[k]
     step = np.asarray(step)[moving]
-    changes = (positions[:, 0] - positions[:, 0, :1]) / step[:, None]
-    sampled = np.reshape(times, positions.shape)[:, 1:]
-    phase = np.exp(-1j * frequency[:, :, None] * sampled)
-    gain = 2j * (positions[:, 1:] * phase).mean(axis=2) / step[:, None]
-    since = times[0] - t0
-    rows = [_step_measures(since, row) for row in changes]
+    positions, rates, demands = (np.stack(part) for part in zip(*steps))
+    changes = (positions - positions[:, :1]) / step[:, None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        final = changes[:, -1:]
+        shares = changes / final, rates / (step[:, None] * final)
+    rows = [step_measures(since, *row) for row in zip(*shares)]
     overshoot, rise_time, settling_time = np.array(rows).T
-    saturated = np.mean(np.abs(demands[:, 0]) > 1, axis=1)
+    settled = settling_time <= _SETTLED * t0
+    saturated = np.array(list(map(share_beyond, demands)))
     failed = np.isnan(changes).any(axis=1)
     return StepAndSine(
         joints=tuple(names[k] for k in moving),
         step=step,
         overshoot=overshoot,
         rise_time=rise_time,
-        settling_time=settling_time,
+        settling_time=np.where(settled, settling_time, np.nan),
         bandwidth=np.array(list(map(_bandwidth, frequency, gain, changes[:, -1]))),
         saturated=np.where(failed, np.nan, saturated),
         ts=since,
@@ -214,25 +221,51 @@ def step_and_sine(
     )
 
 
-def _step_measures(ts: np.ndarray, change: np.ndarray) -> tuple[float, float, float]:
-    """Overshoot, rise time and settling time of a step response."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        part = change / change[-1]
-    if not np.isfinite(part).all():
+def samples_of(duration: float, fastest: float) -> int:
+    """Returns how many samples of a response resolve the fastest mode [rad/s]."""
+    count = duration * fastest / _TURN
+    if not count < _MOST:
+        raise ValueError(
+            f"duration: expected at most {_MOST * _TURN / fastest:.3g} s for modes as "
+            f"fast as {fastest:.3g} rad/s, got {duration:g} s."
+        )
+    return max(int(count), _LEAST)
+
+
+def step_measures(
+    ts: np.ndarray, part: np.ndarray, speed: np.ndarray
+) -> tuple[float, float, float]:
+    """Measures a response as a part of its step, with its rate of change.
+
+    Returns the overshoot, the rise time (NaN if 90 % is not reached), and the time
+    after which the response is settled (NaN if it is not at the end).
+    """
+    if not np.isfinite([part, speed]).all():
         return np.nan, np.nan, np.nan
+    curve = CubicHermiteSpline(ts, part, speed)
 
-    def passing(k: int, level: float, values: np.ndarray) -> float:
-        """Returns when the values pass a level, between samples k and k + 1."""
-        share = (level - values[k]) / (values[k + 1] - values[k])
-        return ts[k] + share * (ts[k + 1] - ts[k])
+    def passing(level: float) -> np.ndarray:
+        """Returns when the response passes a level."""
+        found = curve.solve(level, extrapolate=False)
+        return found[np.isfinite(found)]  # NaN follows a part on the level
 
-    low, high = (
-        passing(int(np.argmax(part >= level)) - 1, level, part) for level in (0.1, 0.9)
-    )
-    away = np.abs(part - 1)
-    settled = passing(int(np.flatnonzero(away > BAND)[-1]), BAND, away)
-    in_time = settled <= _SETTLED * ts[-1]
-    return part.max() - 1, high - low, settled if in_time else np.nan
+    turns = curve.derivative().roots(extrapolate=False)
+    most = curve(turns[np.isfinite(turns)]).max(initial=part.max())
+    low, high = passing(0.1), passing(0.9)
+    rise = high[0] - low[0] if high.size and low.size else np.nan
+    settled = np.append(passing(1 - BAND), passing(1 + BAND)).max(initial=0.0)
+    inside = np.abs(part[-1] - 1) <= BAND
+    return max(most - 1, 0.0), rise, settled if inside else np.nan
+
+
+def share_beyond(demand: np.ndarray) -> float:
+    """Returns the share of the time at which samples, and lines between, exceed 1."""
+    above = np.abs(demand) - 1
+    before, after = above[:-1], above[1:]
+    with np.errstate(divide="ignore", invalid="ignore"):  # equal or infinite
+        share = np.maximum(before, after) / np.abs(after - before)
+    share = np.clip(np.nan_to_num(share), 0, 1)
+    return float(np.mean(np.where((before > 0) & (after > 0), 1, share)))
 
 
 def _bandwidth(frequency: np.ndarray, gain: np.ndarray, final: float) -> float:

@@ -97,15 +97,15 @@ def _judged(
     Returns two arrays (recording,) for each run, and the Gauss-Newton matrix of the sum
     of squares (n, n).
     """
-    counts = np.array([(problem.weight > 0).sum() for problem in unseen])
     if not unseen:
-        return [(counts, counts, np.zeros(2 * run.z.shape)) for run in runs]
+        return [(np.zeros(0), np.zeros(0), np.zeros(2 * run.z.shape)) for run in runs]
     lanes = Lanes(lane, [unseen], starts=len(runs))
     found = lanes(np.stack([run.z for run in runs]), np.arange(len(runs)))
     normal = len(unseen) * found.curvature / 2  # the loss is a mean over recordings
+    columns = found.facts["member_loss"], found.facts["readings"], normal
     return [
-        (squares / counts, counts, matrix)
-        for squares, matrix in zip(found.facts["member_loss"], normal)
+        (squares / np.maximum(counts, 1), np.maximum(counts, 1), matrix)
+        for squares, counts, matrix in zip(*columns)
     ]
 
 
@@ -148,6 +148,8 @@ def _search(
             "start: expected parameters at which the scene can be simulated over ts, "
             f"got {start!r}."
         )
+    least = unknowns.start.size + 1
+    counts = [max(int(run.best.facts["readings"].sum()), least) for run in runs]
     return [
         fit_result(
             run, row[0].scene_at, unknowns, count, noise is not None,
@@ -202,7 +204,7 @@ def fit(
       broadcasts to a recording. If None, all readings have the same weight, and the
       noise is estimated from the residuals: for standard errors from all of them, for
       the verdict from changes between successive ones, as errors of a model change
-      slowly.
+      slowly. Readings that can only be right, as of a fixed pair, do not count.
     - `validate`: (scene_at, observed) of recordings at the same times that the fit must
       not see, one or a list of them; the result compares their residuals with the
       noise. Best are motions unlike those that are fitted.

@@ -60,10 +60,16 @@ def lane(z: Array, problem: Problem) -> Evaluation:
     found = sensitivities(scene_at, residuals, z, problem.ts, _TOLERANCE)
     unweighted = found.residuals / jnp.where(weight > 0, weight, 1).reshape(-1)
     change = jnp.diff(found.residuals.reshape(weight.shape), axis=0)
+    # What is always read as it must be, as the encoder of a fixed pair, has no noise.
+    misfit = jnp.abs(unweighted.reshape(weight.shape))
+    rounding = 8 * jnp.finfo(misfit.dtype).eps * jnp.abs(problem.observed)
+    noisy = (misfit > rounding).any(axis=0, keepdims=True)
     return sum_of_squares(
         found,
         squares=jnp.sum(unweighted**2),
         changes=jnp.sum(jnp.where(_successive(weight), change, 0) ** 2),
+        readings=jnp.sum(noisy & (weight > 0)),
+        pairs=jnp.sum(noisy & _successive(weight)),
     )
 
 
@@ -78,14 +84,14 @@ def noise_by_changes(run: Run, problems: list[Problem]) -> tuple[float, float]:
     The errors of a model change slowly, so that they hardly count. Returns the estimate
     [as observed], and its relative variance.
     """
-    pairs = sum(_successive(problem.weight).sum() for problem in problems)
+    facts = {name: values.sum() for name, values in run.best.facts.items()}
+    pairs, count = facts["pairs"], max(facts["readings"], 1)
     readings = np.concatenate([p.observed[p.weight > 0] for p in problems])
     if not pairs:  # nothing better than all of the residuals
-        mean = run.best.facts["squares"].sum() / readings.size
-        return mean**0.5, 0.5 / readings.size
+        return (facts["squares"] / count) ** 0.5, 0.5 / count
     # Without noise, residuals are errors of the integration.
     least = _ACCURACY * np.sqrt(np.mean(readings**2))
-    noise = np.sqrt(run.best.facts["changes"].sum() / (2 * pairs))
+    noise = np.sqrt(facts["changes"] / (2 * pairs))
     return max(noise, least), 0.75 / pairs
 
 

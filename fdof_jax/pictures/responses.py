@@ -9,6 +9,8 @@ from ..base.checks import instance
 from .arms import link_color
 from .axes import BLACK, GREY, figure_or_new, legend
 
+_BESIDE = np.linspace(-3, 3, 13)  # frequencies beside a mode, over its decay
+
 
 def response_profile(test: StepAndSine, fig: Figure | None = None) -> Figure:
     """Plots the answers of joints to steps over time, and to sines over frequency.
@@ -54,11 +56,20 @@ def bode_plot(loop: OpenLoop, fig: Figure | None = None) -> Figure:
     above, below = fig.subplots(2, sharex=True)
     crossover, factor = loop.crossover, loop.gain_margin
     closed = loop.A - np.outer(loop.B, loop.C)
-    rates = np.abs(np.linalg.eigvals([loop.A, closed]))
-    rates = rates[rates > 1e-6 * rates.max()]  # without poles at rest, rounded
+    modes = np.linalg.eigvals([loop.A, closed]).ravel()
+    rates = np.abs(modes)
+    frequent = rates > 1e-6 * rates.max()  # without poles at rest, rounded
+    rates, sway, decay = rates[frequent], modes.imag[frequent], modes.real[frequent]
     frequency = np.geomspace(rates.min() / 10, rates.max() * 10, 1000)
+    # Peaks of lightly damped modes are narrower than these are apart. At an undamped
+    # one, the response is infinite.
+    damped = np.abs(decay) > 1e-6 * rates
+    near = np.abs(sway) + np.multiply.outer(_BESIDE, decay)
+    near = near[:, damped]
+    near = near[(near > frequency[0]) & (near < frequency[-1])]
     if crossing := np.isfinite(loop.phase_margin):
-        frequency = np.sort(np.append(frequency, crossover))
+        near = np.append(near, crossover)
+    frequency = np.unique(np.append(frequency, near))
     response = loop(frequency)
     phase = np.rad2deg(np.unwrap(np.angle(response)))
     with np.errstate(divide="ignore"):  # a controller at its limit does not respond

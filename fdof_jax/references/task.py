@@ -4,6 +4,7 @@ from abc import abstractmethod
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jaxtyping import Float
@@ -22,10 +23,12 @@ from ..mechanics.inverse_kinematics import (
     unmoved_part,
     whole_turns,
 )
-from .paths import Path, points_at
+from .paths import Path, Spline, points_at
 from .reference import Reference, runs_in_numpy
-from .timing import Laps, Travel
+from .timing import Laps, Travel, times_of_moves
 
+# Times at which a path is checked, and those of each cubic of a long spline.
+_TIMES, _OF_CUBIC = 1000, 10
 _CLOSED = 1e-3  # laps that end as near to their start are closed [m]
 
 
@@ -172,8 +175,10 @@ class TipTask(TipReference):
     def check(self, linkage: Linkage, ts: Array) -> None:
         """Raises ValueError if the tip leaves the reach or the wrist's angle jumps.
 
-        Both are checked at 1000 times between `ts[0]` and `ts[-1]`, at most one lap.
-        The path of `Laps` has to be closed.
+        Both are checked at 1000 times or more between `ts[0]` and `ts[-1]`: those of
+        a `Travel`, at most one lap of `Laps`. For a timing of another kind, they are
+        1000 times of all of the run, and as many at which the share of the way changes
+        between these. The path of `Laps` has to be closed.
         """
         super().check(linkage, ts)
         task, arm, ts = in_numpy((self, linkage, ts))
@@ -213,11 +218,24 @@ class TipTask(TipReference):
         directions = known_directions(arm, self.direction)
         return arm, directions, unmoved_part(arm, directions)
 
-    def _times(self, ts: Array) -> Array:
-        xp, end = namespace(self, ts), ts[-1]
-        if isinstance(self.timing, Laps):  # all laps are alike
-            end = xp.minimum(end, ts[0] + abs(self.timing.period))
-        return xp.linspace(ts[0], end, 1000, dtype=ts.dtype)
+    def _times(self, ts: Array) -> Any:
+        """Returns times between the first and the last at which the path is checked."""
+        timing, xp, count = self.timing, namespace(self, ts), _TIMES
+        begin, end = ts[0], ts[-1]
+        if isinstance(timing, Laps):  # all laps are alike
+            end = xp.minimum(end, begin + abs(timing.period))
+        if type(timing) is Travel:  # it rests before and after
+            travel = timing.begin, timing.begin + timing.duration
+            begin, end = (xp.clip(t, begin, end) for t in travel)
+        if isinstance(self.path, Spline):
+            count = max(count, _OF_CUBIC * len(self.path.points))
+        times = xp.linspace(begin, end, count, dtype=ts.dtype)
+        if runs_in_numpy(timing):
+            return times
+        if xp is jnp:
+            return times_of_moves(timing, times)
+        with jax.ensure_compile_time_eval():
+            return np.asarray(times_of_moves(timing, jax.device_put(times)))
 
     def _ahead(self, bearing: Array, base: Array) -> Any:
         """Returns whether the wrist never passes behind the ground pivot."""

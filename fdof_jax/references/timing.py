@@ -15,6 +15,7 @@ from ..base.checks import concrete, instance, one_of, real_array
 from ..forces.part import Condition, Part, Values, field
 
 _MOST_TURN = 250  # [rad], as far as 48 nodes per piece resolve
+_PASSES = 3
 RAMP = 0.25  # share of its time in which a trapezoidal profile speeds up
 
 
@@ -103,6 +104,21 @@ class Laps(Part):
 
     def __call__(self, t: Array) -> Array:
         return self.phase + t / self.period
+
+
+@eqx.filter_jit
+def times_of_moves(timing: Callable[[Array], Array], times: Array) -> Array:
+    """Adds as many times, at which the share of the way changes between the given ones.
+
+    A short move in a long run may lie between two times. Each pass finds it a thousand
+    times as closely.
+    """
+    found = times
+    for _ in range(_PASSES):
+        moves = jnp.abs(jnp.diff(jax.vmap(timing)(found)))
+        way = jnp.append(0, jnp.cumsum(jnp.where(jnp.isfinite(moves), moves, 0)))
+        found = jnp.interp(jnp.linspace(0, way[-1], len(times)), way, found)
+    return jnp.sort(jnp.concatenate([times, found]))
 
 
 def shock_against(travel: Travel, frequency: ArrayLike) -> Float[Array, ""]:

@@ -16,6 +16,7 @@ from jax import Array
 
 from ..base.callbacks import without_checks
 from ..forces.element import elements
+from ..linkage.linkage import without_fixed
 from .field import args_of, initial_own, own_states, whole
 from .known_times import clocks_apart, known_times
 from .landing import rounding
@@ -144,7 +145,10 @@ def sensitivities(
 
     def motion_of(z):
         scene = scene_at(z)
-        q0, qd0 = (jnp.asarray(a, dtype=float) for a in scene.state0)
+        q0, qd0 = (
+            without_fixed(scene.linkage, jnp.asarray(a, dtype=float))
+            for a in scene.state0
+        )
         args = args_of(scene.linkage, q0, elements("scene.forces", scene.forces))
         args = clocks_apart(args, ts)
         return args, whole(*start_of(args, qd0), initial_own(args))

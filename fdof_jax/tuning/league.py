@@ -11,7 +11,7 @@ from ..linkage.linkage import Linkage
 from ..linkage.topology import TOPOLOGIES
 from ..references.circle import CircleTask
 from ..simulation.scene import Scene
-from .result import TuneResult
+from .result import TuneResult, mean_effort
 
 # The common start in chain coordinates B1, th2, B2, th3, B3, th4. From here every
 # topology follows the circle away from its singularities.
@@ -95,12 +95,12 @@ def league_table(results: Mapping[str, TuneResult]) -> str:
     ]
     for name, result in sorted(results.items(), key=lambda item: item[1].tip_error):
         first = result.histories[0]
-        effort = np.sqrt(np.mean(first.effort[0] ** 2)), result.effort
+        at_start = mean_effort(result.scene.linkage, first.effort[0])
         error = first.tip_error[0], result.tip_error
-        cells = *(1e3 * e for e in error), *(1e2 * e for e in effort)
+        cells = *(1e3 * e for e in error), 1e2 * at_start, 1e2 * result.effort
         rows.append(
             f"{name:4}"
             + "".join(f"{cell:12.4g}" for cell in cells)
-            + f"{result.at_bound.sum():8d}/6"
+            + f"{result.at_bound.sum():8d}/{result.tuned_gains}"
         )
     return "\n".join(rows)

@@ -10,14 +10,15 @@ from jax import Array
 from ..analysis.equilibria import equilibrium
 from ..analysis.linearization import checked, closed_loop
 from ..analysis.loops import open_loop
-from ..analysis.responses import BAND
+from ..analysis.responses import BAND, samples_of, step_measures
 from ..analysis.tracking import demands
 from ..control.pd import PDController
 from ..forces.element import Element
 from ..forces.part import Part, Values, field
-from ..linkage.linkage import joint_names
+from ..linkage.linkage import moving_joints
 from ..references.reference import reference_motion
 from ..simulation.scene import Scene
+from ..simulation.simulate import simulate
 from ..simulation.solution import Solution
 from .losses import controller_of
 
@@ -76,7 +77,7 @@ def excess(
     if not with_margins:
         return along
     controller, others = controller_and_others(scene)
-    A, B, C = closed_loop(scene.linkage, controller, others, rest, scene.t1)
+    A, B, C, _ = closed_loop(scene.linkage, controller, others, rest, scene.t1)
     near = jax.vmap(lambda s: limits.modulus_margin * jnp.abs(s) - 1)
     return jnp.concatenate([along, near(sensitivity(A, B, C)).reshape(-1)])
 
@@ -124,22 +125,29 @@ def sensitivity(A: Array, B: Array, C: Array) -> Array:
     return jax.vmap(at)(w)
 
 
-def measured(
-    scene: Scene, motion: Solution, limits: Limits
-) -> Iterator[tuple[str, str, float, float]]:
-    """Yields a row of `TunedWithin` per limit, measured as reports measure."""
+def measured(scene: Scene, limits: Limits) -> Iterator[tuple[str, str, float, float]]:
+    """Yields a row of `TunedWithin` per limit, measured as reports measure.
+
+    The motion is sampled as finely as its fastest mode asks for.
+    """
     controller, others = controller_and_others(scene)
-    ts, rest = np.asarray(motion.ts), rest_of(scene)
-    shares = np.asarray(step_shares(motion, rest)[0])
+    moving, t1, rest = moving_joints(scene.linkage), float(scene.t1), rest_of(scene)
+    loops = {
+        k: open_loop(scene.linkage, rest, controller, k + 1, others, t1) for k in moving
+    }
+    count = samples_of(t1, loops[moving[0]].fastest)
+    ts = np.linspace(0, t1, count + 1)
+    motion = simulate(scene.linkage, scene.state0, ts, scene.forces, throw=False)
+    shares, _ = map(np.asarray, step_shares(motion, rest))
+    height = np.asarray(rest - motion.q[0])
+    speeds = np.asarray(motion.qd) / np.where(height == 0, 1, height)
     efforts = np.abs(demands(controller, scene.linkage, motion)).max(axis=0)
     allowed = jax.tree.map(np.asarray, limits)
-    for k, name in enumerate(joint_names(scene.linkage)):
-        if name[0] == "F":
-            continue
-        away = np.flatnonzero(np.abs(shares[:, k] - 1) > BAND)
-        settled = np.append(ts, np.nan)[away[-1] + 1] if away.size else 0.0
+    for k, loop in loops.items():
+        name = loop.joint
+        overshoot, _, settled = step_measures(ts, shares[:, k], speeds[:, k])
         found = {
-            "overshoot": (allowed.overshoot[k], max(shares[:, k].max() - 1, 0)),
+            "overshoot": (allowed.overshoot[k], overshoot),
             "settling time [s]": (allowed.settling_time[k], settled),
             f"effort [{'N m' if name[0] == 'R' else 'N'}]": (
                 allowed.effort[k],
@@ -150,6 +158,5 @@ def measured(
             if most < np.inf:
                 yield label, name, float(most), float(value)
         if allowed.modulus_margin[k] > 0:
-            loop = open_loop(scene.linkage, rest, controller, k + 1, others, scene.t1)
             least = float(allowed.modulus_margin[k])
             yield "modulus margin", name, least, loop.modulus_margin

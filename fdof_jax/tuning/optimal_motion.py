@@ -14,7 +14,7 @@ from ..analysis.tracking import tip_deviation
 from ..base.checks import place_of, real_array, whole_number
 from ..control.model_based import ComputedTorque
 from ..forces.joints import EffortHistory
-from ..linkage.linkage import joints_of
+from ..linkage.linkage import joints_of, without_fixed
 from ..search.bounded import Run, best_of, minimise
 from ..search.lanes import Lanes
 from ..search.methods import Evaluation
@@ -114,6 +114,7 @@ def _lane(z: Array, problem: tuple[Scene, Array, Array, Array]) -> Evaluation:
     scene, knots, price, ts = problem
     controller = controller_of(scene)
     limit = jnp.broadcast_to(controller.limit, (1, joints_of(scene.linkage)))
+    limit = without_fixed(scene.linkage, limit)
 
     def scene_at(z):
         return with_controller(
@@ -187,6 +188,7 @@ def optimal_efforts(
     controller, t1 = controller_of(scene), float(scene.t1)
     task = controller.reference
     limit = np.broadcast_to(controller.limit, joints_of(scene.linkage))
+    limit = np.asarray(without_fixed(scene.linkage, limit))
     if not np.isfinite(limit).all():
         raise ValueError(
             "scene: expected finite limits of its controller, as unlimited efforts "

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ..base.checks import known
-from ..linkage.linkage import joint_names
+from ..linkage.linkage import Linkage, joint_names, moving_joints
 from ..search.bounded import Run, best_of
 from ..simulation.scene import Scene
 from .gain_table import as_html, as_text, gain_rows
@@ -100,8 +100,16 @@ class TuneResult(eqx.Module):
 
     @property
     def effort(self) -> float:
-        """Root mean square of the efforts over their limits, over time and joints."""
-        return float(np.sqrt(np.mean(self.history.effort[-1] ** 2)))
+        """Root mean square of the efforts over their limits, over time and joints.
+
+        Fixed pairs do not count.
+        """
+        return mean_effort(self.scene.linkage, self.history.effort[-1])
+
+    @property
+    def tuned_gains(self) -> int:
+        """Number of gains that are tuned: all but zeros and those held by bounds."""
+        return int(np.sum(self.lower < self.upper))
 
     @property
     def table(self) -> dict[str, list]:
@@ -178,7 +186,7 @@ class TuneResult(eqx.Module):
         first, held = self.histories[0], int(self.at_bound.sum())
         return (
             f"TuneResult({topology}, loss {first.loss[0]:.5g} to {self.loss:.5g}, "
-            f"{held} of {self.at_bound.size} gains at a bound, {self._verdict})"
+            f"{held} of {self.tuned_gains} gains at a bound, {self._verdict})"
         )
 
     def _repr_html_(self) -> str:
@@ -206,6 +214,11 @@ class TradeOff(eqx.Module):
             mark = "" if result.converged else "  not converged"
             rows.append(f"{price:12.3g}{1e3 * error:16.4g}{1e2 * effort:12.4g}{mark}")
         return "\n".join(rows)
+
+
+def mean_effort(linkage: Linkage, efforts: np.ndarray) -> float:
+    """Returns the root mean square of efforts (n,) over the joints that move."""
+    return float(np.sqrt(np.mean(efforts[moving_joints(linkage)] ** 2)))
 
 
 def _at_bound(gains, lower, upper) -> np.ndarray:
@@ -259,7 +272,8 @@ def _message(scene, run, history, lower, upper) -> str:
     """The reason for stopping, and what may look like convergence but is not."""
     reason = run.reason
     if run.flat:
-        at_limit = history.saturated[0].min() == 1
+        moving = moving_joints(scene.linkage)
+        at_limit = history.saturated[0, moving].min() == 1
         reason = "the gradient is zero at the start" + (
             ", because every actuator is at its limit throughout" if at_limit else ""
         )
