@@ -13,7 +13,6 @@ from jax import Array
 from jaxtyping import Bool, Float
 
 from ..base.array_namespace import in_numpy, namespace
-from ..base.callbacks import with_checks
 from ..base.checks import place_of
 from ..dynamics import mass_and_bias
 from ..forces.element import Element, Forces, naming
@@ -86,7 +85,6 @@ class PrescribedMotion(Element):
         fixed = namespace(moved, ef).stack(fixed_pairs(ef))
         return moved[: joints_of(linkage)] & ~fixed
 
-    @with_checks
     def at(self, t: Array, linkage: Linkage) -> tuple[Array, Array]:
         return reference_motion(self.reference, t, linkage)
 
