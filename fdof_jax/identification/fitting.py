@@ -182,7 +182,7 @@ def fit(
     in a scene. The fit uses the Levenberg-Marquardt method with exact derivatives. It
     fits the first quarter of the time, continues with the first half, and so on, up to
     all of it. A second call with other numbers compiles nothing, if `scene_at` and
-    `observe` are the same functions or Equinox modules of the same structure.
+    `observe` are functions of equal code or Equinox modules of the same structure.
 
     **Arguments:**
 

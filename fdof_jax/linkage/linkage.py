@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike
 from ..base.array_namespace import namespace
 from ..base.checks import is_traced, known, radians, real_array
 from ..base.frozen import Frozen
+from ..base.functions import sharing_functions
 from .singularity import check_singularity
 from .topology import (
     can_move,
@@ -207,7 +208,8 @@ def compiled(
                         arguments[name] = door(linkage, arguments[name])
                 else:
                     arguments[name] = real_array(name, arguments[name], door)
-            return inner(**arguments)
+            run = lambda *values: inner(**dict(zip(arguments, values)))
+            return sharing_functions(run, **arguments)
 
         return checked
 

@@ -36,6 +36,15 @@ class Batch(NamedTuple):
         shared = [None if axis else leaf for leaf, axis in zip(leaves, self.batched)]
         return structure.unflatten(moving), structure.unflatten(shared)
 
+    def with_forces(self, forces: Forces) -> "Batch":
+        """Returns the batch with the same forces, whose functions have another form."""
+        flags = jax.tree.structure(self.inputs).unflatten(self.batched)
+        inputs = *self.inputs[:2], forces
+        batched = jax.tree.map(
+            lambda flag, part: jax.tree.map(lambda _: flag, part), flags, inputs
+        )
+        return self._replace(inputs=inputs, batched=jax.tree.leaves(batched))
+
 
 def check_arms(linkage: Any) -> None:
     """Raises ValueError unless the argument is a linkage, one or a batch."""

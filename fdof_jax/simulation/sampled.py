@@ -20,6 +20,7 @@ from ..base.checks import (
     refusal,
     whole_number,
 )
+from ..base.functions import sharing_functions
 from ..forces.element import Element, Forces, ScalarElement, element_of, elements
 from ..forces.joints import JointEffort
 from ..linkage.coordinates import State, real_state
@@ -234,7 +235,12 @@ def simulate_sampled(
     if options.get("solver") is None and not is_traced(inputs):
         # Traced in `_motion`, `simulate` would take the solver of large batches.
         options["solver"] = LoopedDopri8()
-    return _motion(*inputs, options)
+
+    def run(control, forces):
+        rest = late, spread, keys, options
+        return _motion(linkage, state0, control, times, forces, *rest)
+
+    return sharing_functions(run, control=control, forces=forces)
 
 
 @eqx.filter_jit  # not traced anew at each call

@@ -31,6 +31,7 @@ from ..base.checks import (
     whole_number,
 )
 from ..base.devices import devices_outside_mesh, uncommitted
+from ..base.functions import sharing_functions
 from ..forces.element import Forces, elements, elements_on
 from ..linkage.coordinates import State
 from ..linkage.linkage import Linkage
@@ -155,8 +156,7 @@ def sweep(
       tuple of these with one entry per element.
     - `reduce`: a function of one member's `Solution`, for instance
       `lambda motion: motion.q[-1]`; of each member only the arrays that it returns are
-      kept, also in a checkpoint. It is part of the compiled program: pass the same
-      function object to reuse that program.
+      kept, also in a checkpoint. Functions of equal code share a compiled program.
     - `chunk`: largest number of members to solve together, per device. None stands for
       128; or 256 where a CPU has several cores, unless the results go to a checkpoint
       or store, which any machine may resume.
@@ -249,19 +249,25 @@ def sweep(
             )
         return whole(_traced(batch, ts, settings, keep, chunk))
     with devices_outside_mesh() as devices:
-        job = Job(batch, ts, settings, keep, chunk, devices)
+        solved = lambda solve: sharing_functions(
+            lambda forces, reduce: solve(
+                Job(batch.with_forces(forces), ts, settings, reduce, chunk, devices)
+            ),
+            forces=batch.inputs[2],
+            reduce=keep,
+        )
         if store is not None:
             folder = folder_at("store", store)
             like, digest = outline(batch, ts, settings, keep)
             group = Store(folder, batch, ts, like, chunk, digest)
             blocks = range(shard, group.count, of)
-            check(in_store(group, blocks, job, progress_meter))
+            check(solved(lambda job: in_store(group, blocks, job, progress_meter)))
             return folder
         resumed = None
         if checkpoint is not None:
             folder = folder_at("checkpoint", checkpoint)
             _, digest = outline(batch, ts, settings, keep)
             resumed = Checkpoint(folder, digest)
-        kept, failed = in_chunks(job, resumed, progress_meter)
+        kept, failed = solved(lambda job: in_chunks(job, resumed, progress_meter))
     check(np.flatnonzero(failed))
     return whole(kept)

@@ -15,28 +15,43 @@ from typing import Any
 import diffrax
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 from jax import Array
 
 from .step_wrappers import Adaptive
 
 
 def diffeqsolve(
-    *arguments: Any, dt0: Any, saveat: Any, stepsize_controller: Any, **keywords: Any
+    *arguments: Any,
+    dt0: Any,
+    saveat: diffrax.SaveAt,
+    stepsize_controller: diffrax.AbstractStepSizeController,
+    max_steps: Any,
+    **keywords: Any,
 ) -> diffrax.Solution:
-    """Calls `diffrax.diffeqsolve` without its checks of `dt0` and of output times."""
-    if dt0 is not None:
-        adaptive = isinstance(
-            stepsize_controller, diffrax.AbstractAdaptiveStepSizeController
-        )
-        first: Any = _AdaptiveFirstStep if adaptive else _FirstStep
-        stepsize_controller = first(stepsize_controller, dt0)
-    return diffrax.diffeqsolve(
+    """Calls `diffrax.diffeqsolve` without its checks of `dt0` and of output times.
+
+    `max_steps` may also be an array, of which new values need no new program.
+    """
+    kind = diffrax.AbstractAdaptiveStepSizeController
+    adaptive = isinstance(stepsize_controller, kind)
+    framed: Any = _FramedAdaptive if adaptive else _Framed
+    counted = max_steps is not None and not isinstance(max_steps, int)
+    found = diffrax.diffeqsolve(
         *arguments,
         dt0=None,
         saveat=eqx.tree_at(_output_times, saveat, replace_fn=_Times),
-        stepsize_controller=stepsize_controller,
+        stepsize_controller=framed(
+            stepsize_controller, dt0, max_steps if counted else None
+        ),
+        max_steps=None if counted else max_steps,
         **keywords,
     )
+    if not saveat.controller_state:
+        return found
+    assert found.controller_state is not None
+    state, *_ = found.controller_state
+    return eqx.tree_at(lambda found: found.controller_state, found, state)
 
 
 def _output_times(saveat: diffrax.SaveAt) -> list[Array]:
@@ -73,25 +88,39 @@ class _Times(eqx.Module):
     __gt__ = __lt__
 
 
-class _FirstStep(diffrax.AbstractStepSizeController):
-    """A controller that brings its first step size [s]."""
+class _Framed(diffrax.AbstractStepSizeController):
+    """A controller that brings its first step size [s] and greatest number of steps."""
 
     controller: Any
     dt0: Any
+    most: Any
 
     def wrap(self, direction):
         inner = self.controller.wrap(direction)
         return eqx.tree_at(lambda c: c.controller, self, inner)
 
-    def init(self, terms, t0, t1, y0, dt0, *rest):
-        return self.controller.init(terms, t0, t1, y0, self.dt0, *rest)
+    def init(self, *arguments):  # pyright: ignore[reportIncompatibleMethodOverride]
+        *before, _, args, func, order = arguments
+        first, state = self.controller.init(*before, self.dt0, args, func, order)
+        _, _, end, *_ = arguments
+        return first, (state, jnp.zeros((), jnp.int32), end)
 
     def adapt_step_size(self, *arguments):  # pyright: ignore[reportIncompatibleMethodOverride]
-        return self.controller.adapt_step_size(*arguments)
+        *arguments, (state, count, end) = arguments
+        *step, state, result = self.controller.adapt_step_size(*arguments, state)
+        _, start, *_ = step
+        if self.most is not None:
+            count = count + 1
+            spent = (count >= self.most) & (start < end)
+            spent = spent & (result == diffrax.RESULTS.successful)
+            reached = diffrax.RESULTS.max_steps_reached
+            result = diffrax.RESULTS.where(spent, reached, result)
+        return *step, (state, count, end), result
 
 
-class _AdaptiveFirstStep(_FirstStep, Adaptive):
-    """An adaptive controller that brings its first step size [s]."""
+class _FramedAdaptive(_Framed, Adaptive):  # pyright: ignore[reportIncompatibleMethodOverride]
+    """As `_Framed`, of an adaptive controller."""
 
     controller: Any
     dt0: Any
+    most: Any
