@@ -28,7 +28,7 @@ def _number(kind: Callable[[str], Any], least: float, above: bool = False) -> Ca
         value = kind(text)
         if not least <= value < math.inf or (above and value == least):
             bound = "above" if above else "of at least"
-            expected = f"expected a number {bound} {least}, got {text!r}"
+            expected = f"expected a number {bound} {least}, got {text[:200]!r}"
             raise argparse.ArgumentTypeError(expected)
         return value
 
@@ -83,7 +83,9 @@ def main(arguments: list[str] | None = None) -> None:
         output.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=output).close()
     except OSError as error:
-        parser.error(f"--output: cannot write into {str(output)!r}: {error.strerror}.")
+        parser.error(
+            f"--output: cannot write into {str(output)[:200]!r}: {error.strerror}."
+        )
 
     from .shell import commands
 

@@ -13,8 +13,9 @@ import sweep_batch
 from sweep_batch import run
 
 import fdof_jax as fj
+from fdof_jax.base.whole_files import folder_path
 from fdof_jax.simulation import checkpoints
-from fdof_jax.simulation.checkpoints import Checkpoint, Rows, folder_at
+from fdof_jax.simulation.checkpoints import Checkpoint, Rows
 
 MEMBERS, LANES = np.arange(3), 7
 
@@ -140,7 +141,7 @@ def test_two_writers_of_one_chunk_do_not_meet(checkpoint, monkeypatch):
 
 def test_paths_of_a_folder(tmp_path, monkeypatch):
     monkeypatch.setenv("HOME", str(tmp_path))
-    assert folder_at("checkpoint", "~/kept") == tmp_path / "kept"
+    assert folder_path("checkpoint", "~/kept") == tmp_path / "kept"
     assert (tmp_path / "kept").is_dir()
     # Refused before anything is traced
     monkeypatch.setattr(sys.modules["fdof_jax.simulation.sweep"], "outline", None)

@@ -201,6 +201,9 @@ def _links(model: Any, data: Any, plane: Any, normal: np.ndarray) -> list[_Link]
             where = "in the plane" if slides else "along the first hinge's"
             if across < -1 + 1e-9 and not slides:
                 where += ", got the opposite: reverse it, and the signs of its numbers"
+            else:
+                angle = np.arcsin(across) if slides else np.arccos(across)
+                where += f", got one {abs(angle):.2g} rad off"
             raise ValueError(f"text: expected the axis of joint {name} {where}.")
         if not slides:
             start = plane(data.xanchor[k])

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from ..base.checks import instance
+from ..base.checks import instance, shown
 from ..forces.element import Forces
 from ..linkage.coordinates import State
 from ..linkage.linkage import Linkage
@@ -95,7 +95,7 @@ def batch_of(linkage: Linkage, state0: Any, forces: Forces, forces_axes: Any) ->
     except ValueError:
         raise ValueError(
             "forces_axes: expected 0, None or a tuple of these with one entry per "
-            f"element, got {forces_axes!r}."
+            f"element, got {shown(forces_axes)}."
         ) from None
     sizes = [
         (path, np.shape(leaf)[:1])

@@ -13,7 +13,7 @@ from jax import Array
 from jaxtyping import Bool, Float
 
 from ..base.array_namespace import in_numpy, namespace
-from ..base.checks import place_of
+from ..base.checks import place_of, shown
 from ..dynamics import mass_and_bias
 from ..forces.element import Element, Forces, naming
 from ..forces.part import Condition, called
@@ -70,7 +70,7 @@ class PrescribedMotion(Element):
         ):
             raise ValueError(
                 f"joints: expected a number of 1 to {_NUMBERS[-1]}, or a tuple of "
-                f"such, got {joints!r}."
+                f"such, got {shown(joints)}."
             )
         self.moved = jax.device_put(np.isin(_NUMBERS, numbers))
         self.reference = reference

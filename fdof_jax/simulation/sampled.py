@@ -18,6 +18,7 @@ from ..base.checks import (
     is_traced,
     real_array,
     refusal,
+    shown,
     whole_number,
 )
 from ..base.functions import sharing_functions
@@ -80,7 +81,7 @@ def step(
         raise ValueError(
             "forces: expected elements without a state of their own, which would be "
             "lost (simulate takes such states as own0 and returns them), got "
-            f"{forces!r}."
+            f"{shown(forces)}."
         )
     check_linkage(linkage)
     state = real_state("state", state, linkage)
@@ -217,7 +218,7 @@ def simulate_sampled(
         if not isinstance(noise, tuple | list) or len(noise) != 2:
             raise ValueError(
                 "noise: expected a pair of standard deviations, of positions and of "
-                f"velocities, got {noise!r}."
+                f"velocities, got {shown(noise)}."
             )
         spread = State(
             *(

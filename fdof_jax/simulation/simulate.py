@@ -15,7 +15,9 @@ from ..base.checks import (
     increasing,
     instance,
     is_traced,
+    plain,
     real_array,
+    shown,
     single_precision,
     whole_number,
 )
@@ -70,7 +72,7 @@ def solve_options(
         if stepsize_controller is not None:
             raise ValueError(
                 "rtol, atol: expected none beside a stepsize_controller, which has "
-                f"its own tolerances, got rtol={rtol!r} and atol={atol!r}."
+                f"its own tolerances, got rtol={shown(rtol)} and atol={shown(atol)}."
             )
         stepsize_controller = at_tolerances(rtol, atol)
     if stepsize_controller is not None:
@@ -91,8 +93,8 @@ def check_elements(forces: Forces, linkage: Linkage, ts: Array) -> None:
     """Checks the elements' values, where known, and runs their own checks."""
     for index, element in enumerate(elements_on(linkage, forces)):
         place, values = f"forces[{index}]", in_numpy(element)
-        if values.jump_ts is not None:
-            real_array(f"{place}.jump_ts", values.jump_ts, (None,))
+        if (jumps := values.jump_ts) is not None:
+            real_array(f"{place}.jump_ts", jumps, (None,) if np.ndim(jumps) else ())
         single_precision(place, element)
         if is_traced(linkage, ts, element):
             continue
@@ -102,7 +104,7 @@ def check_elements(forces: Forces, linkage: Linkage, ts: Array) -> None:
         if not values.possible():
             raise ValueError(
                 f"{place}: expected values that its constructor accepts, got "
-                f"{eqx.tree_pformat(element, short_arrays=False)}."
+                f"{plain(eqx.tree_pformat(element, short_arrays=False))}."
             )
 
 

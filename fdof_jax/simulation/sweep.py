@@ -28,15 +28,17 @@ from ..base.checks import (
     numpy_array,
     real_array,
     refusal,
+    shown,
     whole_number,
 )
 from ..base.devices import devices_outside_mesh, uncommitted
 from ..base.functions import sharing_functions
+from ..base.whole_files import folder_path
 from ..forces.element import Forces, elements, elements_on
 from ..linkage.coordinates import State
 from ..linkage.linkage import Linkage
 from .batch_axes import Batch, batch_of, check_arms
-from .checkpoints import Checkpoint, folder_at
+from .checkpoints import Checkpoint
 from .chunk_programs import outcome_of
 from .chunks import Job, in_chunks, usual_chunk
 from .dopri8 import constant
@@ -112,7 +114,7 @@ def _check_elements(batch: Batch, ts: Array, forces_axes: Any) -> None:
     except TypeError as error:
         raise TypeError(
             "forces, forces_axes: expected force elements that work for one member, "
-            f"got an error with forces_axes={forces_axes!r}: {error}"
+            f"got an error with forces_axes={shown(forces_axes)}: {error}"
         ) from error
 
 
@@ -188,7 +190,9 @@ def sweep(
     try:
         q, qd = (jnp.asarray(a) if is_traced(a) else numpy_array(a) for a in state0)
     except (TypeError, ValueError):
-        raise ValueError(f"state0: expected a State(q, qd), got {state0!r}.") from None
+        raise ValueError(
+            f"state0: expected a State(q, qd), got {shown(state0)}."
+        ) from None
     ts = real_array("ts", ts, (None,))
     # Other kinds than real numbers are refused by `batch_of`.
     other = lambda a: a.dtype != ts.dtype and a.dtype.kind in "iuf"
@@ -257,7 +261,7 @@ def sweep(
             reduce=keep,
         )
         if store is not None:
-            folder = folder_at("store", store)
+            folder = folder_path("store", store)
             like, digest = outline(batch, ts, settings, keep)
             group = Store(folder, batch, ts, like, chunk, digest)
             blocks = range(shard, group.count, of)
@@ -265,7 +269,7 @@ def sweep(
             return folder
         resumed = None
         if checkpoint is not None:
-            folder = folder_at("checkpoint", checkpoint)
+            folder = folder_path("checkpoint", checkpoint)
             _, digest = outline(batch, ts, settings, keep)
             resumed = Checkpoint(folder, digest)
         kept, failed = solved(lambda job: in_chunks(job, resumed, progress_meter))
