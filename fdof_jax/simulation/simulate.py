@@ -32,10 +32,10 @@ from ..forces.element import (
 from ..forces.part import check_values
 from ..linkage.coordinates import State, real_state
 from ..linkage.linkage import Linkage, check_linkage, possible
-from .failures import cause, check_arguments
+from .failures import cause, check_arguments, reason
 from .field import initial_states
 from .prescribed import agrees, prescribed
-from .solution import Solution
+from .solution import OUTCOMES, Solution, outcome_numbers
 from .solve import solve
 from .steps import at_tolerances, within_reach
 
@@ -219,10 +219,9 @@ def simulate(
             ) from error
         raise
     if throw and not succeeded:
-        raise RuntimeError(
-            f"simulate: {solution.outcome} at t = "
-            f"{float(solution.stats['time_reached']):g} s. {cause(inputs, solution)}"
-        )
+        reached = float(solution.stats["time_reached"])
+        why = cause(inputs, keywords, solution)
+        raise RuntimeError(f"simulate: {solution.outcome} at t = {reached:g} s. {why}")
     return solution
 
 
@@ -241,7 +240,9 @@ def _raising(solution: Solution, inputs: tuple[Any, ...]) -> Solution:
         raising = eqx.branched_error_if(
             solution, faults.any(), jnp.argmax(faults), messages
         )
-        return raising.result.error_if(raising, failed)
+        number = outcome_numbers(raising.result)
+        words = [f"simulate: {outcome}. {reason(outcome)}" for outcome in OUTCOMES]
+        return eqx.branched_error_if(raising, failed, number, words)
     except ValueError as error:
         # Under `vmap` over no members equinox takes the maximum of none.
         if "zero-size array" not in str(error):
