@@ -5,6 +5,7 @@ import os
 import re
 import sys
 import threading
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -137,6 +138,23 @@ def test_two_writers_of_one_chunk_do_not_meet(checkpoint, monkeypatch):
         writer.join()
     assert not failed
     assert checkpoint.read(MEMBERS, LANES, ROWS) is not None
+
+
+@pytest.mark.parametrize("argument", ["store", "checkpoint"])
+def test_what_cannot_be_a_folder(argument, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").write_text("kept")
+    linkage, states = fj.scenes.fig5().linkage, fj.State(np.zeros((2, 3)), np.zeros(3))
+    for value, words in (
+        ("file", "can be made, got 'file': File exists"),
+        ("file/below", "can be made, got 'file/below': Not a directory"),
+        ("a\0b", "a folder, got"),
+        ("s3://bucket/x", "a folder on this machine, no address, got"),
+        (Path("s3://bucket/x"), "a folder on this machine, no address, got"),
+    ):
+        with pytest.raises(ValueError, match=f"^{argument}: expected .*{words}"):
+            fj.sweep(linkage, states, [0, 1], **{argument: value})
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
 def test_paths_of_a_folder(tmp_path, monkeypatch):
