@@ -35,8 +35,8 @@ _REASONS: dict[str, str] = dict(
             "Not even the shortest step meets the tolerance: rounding keeps it from "
             "that, or an effort jumps there (forces.switch makes steps end at jumps).",
             "Elements switch there without end, as between branches that push towards "
-            "each other: let the effort change continuously, for instance with a wider "
-            "`speed` of a JointFriction or a clipped gain in place of a sign.",
+            "each other: let the effort change continuously, as by a JointFriction, or "
+            "by a clipped gain in place of a sign.",
         ),
     )
 )
