@@ -112,6 +112,17 @@ def of_object(k):
     return lambda x: -held.k * x
 
 
+def counting(k):
+    def force(x):
+        CALLS.append(k)
+        return -k * x
+
+    return force
+
+
+CALLS = []
+
+
 def partial(k):
     return functools.partial(lambda k, x: -k * x, k)
 
@@ -120,7 +131,7 @@ SHARED = [
     damping, by_default, with_array, with_helper, nested, of_global, of_arm,
     of_whole_number, with_length,
 ]  # fmt: skip
-OWN = [by_range, chosen, in_numpy, of_object, partial]
+OWN = [by_range, counting, chosen, in_numpy, of_object, partial]
 
 
 @pytest.mark.parametrize("make", SHARED + OWN)
@@ -138,6 +149,8 @@ def test_numbers_of_functions_are_right(make):
             float(sharing_functions(run, forces=(make(k),))) for k in (1.0, 2.0, 3.0)
         ]
     assert found == [-2, -4, -6]
+    assert CALLS == [1, 2, 3] * (make is counting)
+    CALLS.clear()
     if make in SHARED:
         assert len(traced) == 1 + (make is with_length) and not caught
     else:

@@ -56,7 +56,11 @@ class SharedFunction(eqx.Module):
         names = names | {"__builtins__": builtins}
         function = types.FunctionType(self.code, names, None, defaults, cells)
         function.__kwdefaults__ = of_keywords
-        return function(*arguments, **keywords)
+        before = jax.tree.structure(self.reach)
+        returned = function(*arguments, **keywords)
+        if jax.tree.structure(self.reach) != before:
+            raise TypeError("it changes a list or a dict outside, here a copy")
+        return returned
 
 
 def sharing_functions(run: Callable[..., Any], **trees: Any) -> Any:
