@@ -162,9 +162,13 @@ _alike: Counter[Any] = Counter()  # by their code or type
 
 
 def _warn_of_third(trees: dict[str, Any]) -> None:
+    nodes = jax.tree.leaves(trees, is_leaf=_is_shared)
+    new = [node for node in nodes if callable(node) and _is_new(node)]
+    if not new:
+        return
     leaves, _ = jax.tree_util.tree_flatten_with_path(trees, is_leaf=_is_shared)
     for (tree, *path), leaf in leaves:
-        if not callable(leaf) or not _is_new(leaf):
+        if not any(leaf is node for node in new):
             continue
         inner = inspect.unwrap(leaf)
         code = inner.__code__ if inspect.isfunction(inner) else None
@@ -185,8 +189,8 @@ def _warn_of_third(trees: dict[str, Any]) -> None:
 def _is_new(leaf: Any) -> bool:
     """Returns whether a callable needs a program that none before it needed."""
     if _is_shared(leaf):
-        constants, structure = jax.tree.flatten(eqx.filter(leaf, eqx.is_array, True))
-        key = hash((structure, *constants))
+        leaves, structure = jax.tree.flatten(leaf)
+        key = hash((structure, *(x for x in leaves if not eqx.is_array(x))))
         new = key not in _keys
         _keys.add(key)
         return new
