@@ -122,10 +122,17 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
+def _folder(text: str) -> Path:
+    if "://" in text:  # which `Path` would take for a folder
+        expected = f"expected a folder on this machine, got {text[:200]!r}"
+        raise argparse.ArgumentTypeError(expected)
+    return Path(text)
+
+
 def _add_output(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--output",
-        type=Path,
+        type=_folder,
         metavar="FOLDER",
         help="where to write the files; fdof-output by default",
     )
