@@ -47,7 +47,7 @@ def diffeqsolve(
         max_steps=None if counted else max_steps,
         **keywords,
     )
-    if not saveat.controller_state:
+    if not (counted and saveat.controller_state):
         return found
     assert found.controller_state is not None
     state, *_ = found.controller_state
@@ -102,19 +102,22 @@ class _Framed(diffrax.AbstractStepSizeController):
     def init(self, *arguments):  # pyright: ignore[reportIncompatibleMethodOverride]
         *before, _, args, func, order = arguments
         first, state = self.controller.init(*before, self.dt0, args, func, order)
+        if self.most is None:
+            return first, state
         _, _, end, *_ = arguments
-        return first, (state, jnp.zeros((), jnp.int32), end)
+        return first, (state, jnp.zeros((), jnp.int32), jax.lax.stop_gradient(end))
 
     def adapt_step_size(self, *arguments):  # pyright: ignore[reportIncompatibleMethodOverride]
+        if self.most is None:
+            return self.controller.adapt_step_size(*arguments)
         *arguments, (state, count, end) = arguments
         *step, state, result = self.controller.adapt_step_size(*arguments, state)
         _, start, *_ = step
-        if self.most is not None:
-            count = count + 1
-            spent = (count >= self.most) & (start < end)
-            spent = spent & (result == diffrax.RESULTS.successful)
-            reached = diffrax.RESULTS.max_steps_reached
-            result = diffrax.RESULTS.where(spent, reached, result)
+        count = count + 1
+        spent = (count >= self.most) & (start < end)
+        spent = spent & (result == diffrax.RESULTS.successful)
+        reached = diffrax.RESULTS.max_steps_reached
+        result = diffrax.RESULTS.where(spent, reached, result)
         return *step, (state, count, end), result
 
 
