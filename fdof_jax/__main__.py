@@ -28,7 +28,7 @@ def _number(kind: Callable[[str], Any], least: float, above: bool = False) -> Ca
         value = kind(text)
         if not least <= value < math.inf or (above and value == least):
             bound = "above" if above else "of at least"
-            expected = f"expected a number {bound} {least}, got {text!r}"
+            expected = f"expected a number {bound} {least}, got {text[:200]!r}"
             raise argparse.ArgumentTypeError(expected)
         return value
 
@@ -83,7 +83,9 @@ def main(arguments: list[str] | None = None) -> None:
         output.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=output).close()
     except OSError as error:
-        parser.error(f"--output: cannot write into {str(output)!r}: {error.strerror}.")
+        parser.error(
+            f"--output: cannot write into {str(output)[:200]!r}: {error.strerror}."
+        )
 
     from .shell import commands
 
@@ -120,10 +122,17 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
+def _folder(text: str) -> Path:
+    if "://" in text:  # which `Path` would take for a folder
+        expected = f"expected a folder on this machine, got {text[:200]!r}"
+        raise argparse.ArgumentTypeError(expected)
+    return Path(text)
+
+
 def _add_output(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--output",
-        type=Path,
+        type=_folder,
         metavar="FOLDER",
         help="where to write the files; fdof-output by default",
     )

@@ -254,3 +254,71 @@ def test_modes_that_the_adjoint_does_not_serve_name_the_cure():
     slope = jax.grad(lambda q: end(q, adjoint=diffrax.ForwardMode()))
     with pytest.raises(RuntimeError, match="^reverse-mode .* default adjoint"):
         jax.eval_shape(slope, jnp.zeros(3))
+
+
+def test_one_effort_for_all_joints():
+    one, each = fj.JointEffort(1.5), fj.JointEffort([1.5] * 3)
+    for effort in (one, each):
+        np.testing.assert_array_equal(effort(0.0, ZERO, ZERO, LINKAGE), [1.5] * 3)
+    np.testing.assert_array_equal(simulate(forces=(one,)).q, simulate(forces=(each,)).q)
+
+
+@pytest.mark.parametrize(
+    "coefficient, batch", [(np.ones(2), False), (np.ones((4, 3)), True)], ids=str
+)
+def test_a_batch_is_hinted_at_only_where_one_may_be_meant(coefficient, batch):
+    if batch:  # as `jax.vmap` makes them; the constructor takes one element
+        damper = jax.vmap(fj.JointDamper)(coefficient)
+    else:
+        damper = fj.JointDamper(coefficient)
+    with pytest.raises(
+        ValueError, match=r"coefficient: expected .* 3 joints"
+    ) as raised:
+        simulate(forces=(damper,))
+    assert ("forces_axes" in str(raised.value)) == batch
+
+
+# Messages are short
+
+
+class Long:
+    def __repr__(self):
+        return "Long(" + 200_000 * "9" + "\x1b[31m\x00)"
+
+
+LONG = {
+    "text": 1_000_000 * "x" + "\x1b[31m\x07",
+    "list": ["9"] * 100_000,
+    "array": np.full(100_000, "a"),
+    "object": Long(),
+    "dict": {f"key {i}\n": i for i in range(10_000)},
+}
+
+
+@pytest.mark.parametrize("kind", LONG)
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda value: fj.Linkage(value, length=0, com=0, mass=1, inertia=1),
+        lambda value: fj.JointDamper(value),
+        lambda value: simulate(state0=value),
+        lambda value: simulate(forces=value),
+        lambda value: simulate(solver=value),
+        lambda value: simulate(rtol=value),
+        lambda value: fj.sweep(LINKAGE, value, [0, 1]),
+        lambda value: fj.energy(value, ZERO, ZERO),
+        lambda value: fj.PDController(1.0, 1.0, 1.0, value),
+        lambda value: fj.forces.SpringDamper(value, value, 1.0, 1.0),
+        lambda value: fj.tune(value),
+        lambda value: fj.tuning.stacked(value),
+        lambda value: fj.identification.fit(lambda p: p, value, [0, 1], value),
+        lambda value: fj.configure(cache=[value]),
+        lambda value: fj.references.JointMove(value, 0, value),
+    ],
+)
+def test_messages_repeat_little_of_what_was_given(call, kind):
+    with pytest.raises((ValueError, TypeError)) as raised:
+        call(LONG[kind])
+    words = str(raised.value)
+    assert len(words) < 600
+    assert all(letter.isprintable() for letter in words)

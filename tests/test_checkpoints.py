@@ -5,6 +5,7 @@ import os
 import re
 import sys
 import threading
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -13,8 +14,9 @@ import sweep_batch
 from sweep_batch import run
 
 import fdof_jax as fj
+from fdof_jax.base.whole_files import folder_path
 from fdof_jax.simulation import checkpoints
-from fdof_jax.simulation.checkpoints import Checkpoint, Rows, folder_at
+from fdof_jax.simulation.checkpoints import Checkpoint, Rows
 
 MEMBERS, LANES = np.arange(3), 7
 
@@ -138,9 +140,26 @@ def test_two_writers_of_one_chunk_do_not_meet(checkpoint, monkeypatch):
     assert checkpoint.read(MEMBERS, LANES, ROWS) is not None
 
 
+@pytest.mark.parametrize("argument", ["store", "checkpoint"])
+def test_what_cannot_be_a_folder(argument, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").write_text("kept")
+    linkage, states = fj.scenes.fig5().linkage, fj.State(np.zeros((2, 3)), np.zeros(3))
+    for value, words in (
+        ("file", "can be made, got 'file': File exists"),
+        ("file/below", "can be made, got 'file/below': Not a directory"),
+        ("a\0b", "a folder, got"),
+        ("s3://bucket/x", "a folder on this machine, no address, got"),
+        (Path("s3://bucket/x"), "a folder on this machine, no address, got"),
+    ):
+        with pytest.raises(ValueError, match=f"^{argument}: expected .*{words}"):
+            fj.sweep(linkage, states, [0, 1], **{argument: value})
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
 def test_paths_of_a_folder(tmp_path, monkeypatch):
     monkeypatch.setenv("HOME", str(tmp_path))
-    assert folder_at("checkpoint", "~/kept") == tmp_path / "kept"
+    assert folder_path("checkpoint", "~/kept") == tmp_path / "kept"
     assert (tmp_path / "kept").is_dir()
     # Refused before anything is traced
     monkeypatch.setattr(sys.modules["fdof_jax.simulation.sweep"], "outline", None)

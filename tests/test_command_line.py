@@ -104,6 +104,7 @@ AT_ONCE = [
     ("square", 2, "invalid choice: 'square'"),
     ("--output", 2, "expected one argument"),
     ("--output file", 2, "--output: cannot write into 'file': File exists"),
+    ("--output s3://a/b", 2, "--output: expected a folder on this machine, got 's3:"),
     ("figures --output file/in/it", 2, "cannot write into 'file/in/it': Not a dir"),
     ("tune --center 0", 2, "--center: expected 2 arguments"),
     ("tune --radius one", 2, "--radius: invalid float value: 'one'"),

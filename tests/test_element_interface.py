@@ -11,7 +11,8 @@ from elements import PD, Hold, arm
 
 import fdof_jax as fj
 from fdof_jax.forces.element import elements
-from fdof_jax.simulation.field import element_effort
+from fdof_jax.simulation.field import args_of, element_effort
+from fdof_jax.simulation.known_times import clocks_apart, known_times
 from fdof_jax.simulation.simulate import check_elements
 
 ARM, TS = arm("RRR"), jnp.array([0.0, 1.0])
@@ -144,6 +145,27 @@ def test_jumps_are_passed_on():
     for part in (travel, move, path, pd, drive, fj.PrescribedMotion(1, move)):
         np.testing.assert_array_equal(part.jump_ts, [1, 3])
     assert PD.jump_ts is None and fj.JointDamper(1.0).jump_ts is None
+
+
+class Raised(fj.references.Reference):
+    """A reference that jumps, of which one time or several are given."""
+
+    jump_ts: jax.Array
+
+    def __call__(self, t, linkage):
+        raised = jnp.where(t < jnp.max(self.jump_ts), 0.0, 0.3)
+        return jnp.full(3, raised), jnp.zeros(3)
+
+
+def test_one_time_of_a_jump_needs_no_list():
+    ends = []
+    for time in (jnp.array(0.05), jnp.array([0.05])):
+        pd = fj.PDController(10.0, 1.0, 100.0, Raised(time))
+        check_elements((pd,), ARM, TS)
+        np.testing.assert_array_equal(pd.jump_ts, [0.05])
+        args = args_of(ARM, jnp.zeros(3), (pd, Raised(time)))
+        ends.append(known_times(clocks_apart(args, jnp.array([0, 1.0]))))
+    np.testing.assert_array_equal(*ends)
 
 
 class Foreign(eqx.Module):

@@ -4,6 +4,7 @@ import contextlib
 import json
 import sys
 import zipfile
+from pathlib import Path
 from typing import Any
 
 import diffrax
@@ -33,11 +34,26 @@ def path(tmp_path):
     return tmp_path / "tree.fdof"
 
 
-@pytest.mark.parametrize("value", [None, 3, ["a"], b"a"])
+@pytest.mark.parametrize("value", [None, 3, ["a"], b"a", "", "a\0b"])
 def test_paths(value):
     for call in (lambda: fj.save(value, 1), lambda: fj.load(value)):
         with pytest.raises(ValueError, match="^path: expected a path, got "):
             call()
+
+
+@pytest.mark.parametrize("value", [".", "..", "/", Path("."), "{}", "{}/"])
+def test_paths_of_folders(value, tmp_path):
+    value = value.format(tmp_path) if isinstance(value, str) else value
+    for call in (lambda: fj.save(value, 1), lambda: fj.load(value)):
+        with pytest.raises(ValueError, match="^path: expected the path of a file, not"):
+            call()
+    assert not list(tmp_path.iterdir())
+
+
+def test_addresses_are_no_paths():
+    for value in ("s3://bucket/x", Path("gs://bucket/x")):
+        with pytest.raises(ValueError, match="^path: expected .* no address, got"):
+            fj.save(value, 1)
 
 
 def test_a_missing_file(path):

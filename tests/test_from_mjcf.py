@@ -161,3 +161,10 @@ def test_dampers_that_a_flag_disables_are_left_out():
         for state in ("enable", "disable")
     ]
     assert "JointDamper" in kinds[0] and "JointDamper" not in kinds[1]
+
+
+@pytest.mark.parametrize("axis, off", [("1 4e-6 0", "4e-06"), ("1 .3 0", "0.29")])
+def test_a_slide_out_of_the_plane_says_by_how_much(axis, off):
+    tilted = CART_POLE.replace('axis="1 0 0"', f'axis="{axis}"')
+    with pytest.raises(ValueError, match=f"slider in the plane, got one {off} rad off"):
+        fj.from_mjcf(tilted)

@@ -166,3 +166,10 @@ def test_versions_agree_wherever_they_are_written():
     basedpyright = re.search(r"basedpyright==([\d.]+)", hooks)[1]
     assert f'"ruff=={ruff}"' in project
     assert f'"basedpyright=={basedpyright}"' in project
+
+
+def test_messages_show_values_through_one_function():
+    """It keeps them short and free of control codes."""
+    allowed = {"__main__.py", "names.py", "linkage.py", "optimal_motion.py"}
+    showing = {path.name for path in FOLDER.rglob("*.py") if "!r}" in path.read_text()}
+    assert showing == allowed

@@ -1,10 +1,12 @@
 """Compiled programs: when another is needed, how one fails, where they are kept."""
 
 import functools
+import itertools
 import json
 import os
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import diffrax
 import equinox as eqx
@@ -49,6 +51,20 @@ def same_bits(found, expected):
 
 def test_a_program_that_raises_nothing_calls_nothing():
     text = lowered().as_text()
+    assert "while" in text and "callback" not in text
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        dict(solver=diffrax.Kvaerno5()),
+        dict(solver=diffrax.Tsit5(), stepsize_controller=diffrax.ConstantStepSize()),
+        dict(dt0=None, adjoint=diffrax.ForwardMode()),
+    ],
+)
+def test_programs_of_other_steps_call_nothing(options):
+    moved = lambda q: fj.simulate(ARM, fj.State(q, q), TS, throw=False, **options).q
+    text = str(jax.make_jaxpr(moved)(START.q))
     assert "while" in text and "callback" not in text
 
 
@@ -138,6 +154,40 @@ def broken(strength):
 def test_run_time_checks_of_an_own_element_stay(call):
     with pytest.raises(Exception, match="it broke"):
         jax.block_until_ready(call(jnp.array(1.0)))
+
+
+def decay(size, **options):
+    """A user's own solve, traced anew for each size."""
+    term = diffrax.ODETerm(lambda t, y, args: -y)
+    start = jnp.ones(size)
+    return diffrax.diffeqsolve(term, diffrax.Tsit5(), 0.0, 1.0, 0.1, start, **options)
+
+
+def test_a_motion_leaves_later_checks_on():
+    """JAX traces a check once for equal shapes, as those of the padded times."""
+    fj.simulate(ARM, START, TS)
+    times = jnp.linspace(0, 1, 512).at[2].set(0.9)
+    with pytest.raises(Exception, match="must be increasing"):
+        decay(2, saveat=diffrax.SaveAt(ts=times))
+
+
+def test_motions_traced_in_threads_leave_checks_on():
+    def motion(count):
+        times = jnp.linspace(0, 0.1, count)
+        simulated = lambda q: fj.simulate(ARM, fj.State(q, START.qd), times).q
+        return jax.eval_shape(simulated, START.q)
+
+    def stopped(size):
+        with pytest.raises(Exception, match="maximum number of solver steps"):
+            decay(size, max_steps=3)
+
+    with ThreadPoolExecutor(2) as threads:
+        traced = [threads.submit(motion, count) for count in range(20, 30)]
+        sizes = itertools.count(3)
+        while not all(one.done() for one in traced):
+            stopped(next(sizes))
+    assert {one.result().shape[1] for one in traced} == {3} and next(sizes) > 5
+    stopped(next(sizes))
 
 
 # New numbers, no new program

@@ -19,7 +19,25 @@ import fdof_jax as fj
         ("RPR", dict(com=[[1, 0], [1, 0], [0, 0]], inertia=[1, 1, 0]), 3, 3),
         ("RRP", dict(mass=[1, 1, 0]), 3, 3),
         ("PRP", dict(mass=[1, 1, 0]), 3, 3),
-        # The middle joint moves nothing that the last does not move.
+        ("RPR", dict(mass=[1, 0, 0]), 2, 2),
+    ],
+)
+def test_joints_that_move_nothing_are_refused(topology, changes, joint, link):
+    kind = {"R": "revolute", "P": "prismatic"}[topology[joint - 1]]
+    message = (
+        rf"(?s)^mass, inertia, com: expected joint {joint} \({kind}\) of {topology} "
+        rf".*link {link} .*, got none"
+    )
+    with pytest.raises(ValueError, match=message):
+        make(topology, **changes)
+
+
+ALONG = " along the same line"
+
+
+@pytest.mark.parametrize(
+    "topology, changes, joints, how",
+    [
         (
             "RRR",
             dict(
@@ -28,27 +46,24 @@ import fdof_jax as fj
                 com=[[1, 0], [0, 0], [1, 0]],
                 inertia=[1, 0, 1],
             ),
-            2,
-            2,
+            "2 and 3",
+            "",
         ),
-        ("RPR", dict(mass=[1, 0, 0]), 2, 2),
-        ("RPP", dict(mass=[1, 0, 1], locked=[0.1, 0, 0.2]), 2, 2),
-        # The first joint does not either.
+        ("RPP", dict(mass=[1, 0, 1], locked=[0.1, 0, 0.2]), "2 and 3", ALONG),
         (
             "RRP",
             dict(length=[0, 0, 1, 1], locked=0, mass=[0, 1, 1], inertia=[0, 1, 1]),
-            1,
-            1,
+            "1 and 2",
+            "",
         ),
-        ("PPR", dict(mass=[0, 1, 1], locked=[np.pi, 0.2, 0.3]), 1, 1),
-        ("PPR", dict(mass=[0, 0, 1], inertia=[1, 1, 0]), 1, 1),
+        ("PPR", dict(mass=[0, 1, 1], locked=[np.pi, 0.2, 0.3]), "1 and 2", ALONG),
+        ("PPR", dict(mass=[0, 0, 1], inertia=[1, 1, 0]), "1 and 2 and 3", ""),
     ],
 )
-def test_always_singular_linkages_are_refused(topology, changes, joint, link):
-    kind = {"R": "revolute", "P": "prismatic"}[topology[joint - 1]]
+def test_joints_that_move_nothing_together_are_refused(topology, changes, joints, how):
     message = (
-        rf"(?s)^mass, inertia, com: expected joint {joint} \({kind}\) of {topology} "
-        rf".*link {link} .*, got "
+        f"^mass, inertia, com: expected joints {joints} of {topology} to move some "
+        f"inertia however .* against each other{how} and move none"
     )
     with pytest.raises(ValueError, match=message):
         make(topology, **changes)

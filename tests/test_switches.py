@@ -1,5 +1,7 @@
 """Motions whose elements switch: where steps end, and derivatives through switches."""
 
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
 import diffrax
@@ -265,3 +267,21 @@ def test_whether_efforts_jump_is_known_from_the_switches_met():
             met()
         jumping.append(switches.jumping)
     assert jumping == [False, True]
+
+
+def test_switches_of_elements_traced_in_two_threads_stay_apart():
+    def other():
+        theirs.append(Switches(None))
+        with theirs[0].dealt():
+            inside.wait(60)  # until this thread's switch has been met, too
+            fj.forces.switch(jnp.array(-2.0), 1, 0)
+            inside.wait(60)
+
+    theirs, inside, mine = [], threading.Barrier(2), Switches(None)
+    with ThreadPoolExecutor(1) as pool, mine.dealt():
+        done = pool.submit(other)
+        inside.wait(60)
+        fj.forces.switch(jnp.array(3.0), 1, 0)
+        inside.wait(60)
+        done.result()
+    assert [*map(float, mine.values)] == [3] and [*map(float, theirs[0].values)] == [-2]

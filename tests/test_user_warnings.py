@@ -1,6 +1,8 @@
 """Warnings and refusals that name the caller's line, or the way to go."""
 
 import dataclasses
+import warnings
+from concurrent.futures import ThreadPoolExecutor
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +11,7 @@ import numpy as np
 import pytest
 
 import fdof_jax as fj
+from fdof_jax.base.user_warnings import warn, without_warning
 from fdof_jax.forces.element import elements_on
 from fdof_jax.linkage.coordinates import real_state
 
@@ -90,3 +93,15 @@ def test_what_is_older_than_double_precision():
         with pytest.warns(UserWarning, match=f"^{name}: .* in float32") as caught:
             solve(*scene)
         assert [warning.filename for warning in caught] == [__file__]
+
+
+def test_a_warning_is_omitted_in_one_thread_alone():
+    with warnings.catch_warnings(record=True) as caught, ThreadPoolExecutor(1) as other:
+        warnings.simplefilter("always")
+        with without_warning("joint 2"):
+            warn("joint 2 is here")
+            warn("joint 3 is here")
+            other.submit(warn, "joint 2 is there").result()
+        warn("joint 2 is here again")
+    said = [str(one.message) for one in caught]
+    assert said == ["joint 3 is here", "joint 2 is there", "joint 2 is here again"]

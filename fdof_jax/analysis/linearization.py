@@ -12,7 +12,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Complex, Float
 from numpy.typing import ArrayLike
 
-from ..base.checks import in_order, instance, is_traced, real_array
+from ..base.checks import in_order, instance, is_traced, real_array, shown
 from ..control.pd import PDController
 from ..dynamics import forward_dynamics, joint_bias, joint_mass_matrix
 from ..forces.element import Element, Forces, elements_on, of_full_size
@@ -60,7 +60,7 @@ def checked(linkage: Linkage, forces: Forces) -> tuple[Element, ...]:
         return of_full_size(linkage, found)
     raise ValueError(
         "forces: expected elements without a state of their own and no "
-        f"PrescribedMotion, got {forces!r}."
+        f"PrescribedMotion, got {shown(forces)}."
     )
 
 

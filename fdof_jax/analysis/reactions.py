@@ -9,6 +9,7 @@ from jax import Array
 from jaxtyping import Float
 
 from ..base.array_namespace import plane_vectors
+from ..base.checks import shown
 from ..dynamics import forward_dynamics
 from ..forces.element import Forces, elements
 from ..linkage.frames import cross, frames
@@ -30,7 +31,7 @@ def _loads(
             raise ValueError(
                 f"forces[{index}]: expected an element that moves masses to have a "
                 "method `loads` that says which points of links carry them, got "
-                f"{element!r}."
+                f"{shown(element)}."
             )
         for load in loads:
             about_pivot = load.moment + cross(load.point.place(parts), load.vector())

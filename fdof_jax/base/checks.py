@@ -57,9 +57,27 @@ def concrete(value: Any) -> np.ndarray | None:
     return None if is_traced(value) else np.asarray(value)
 
 
+_MOST_SHOWN = 200  # characters of a message that repeat what was given
+
+
+def plain(text: str) -> str:
+    """Returns a text on one line, without control codes, cut if it is long."""
+    text = " ".join(text.split())
+    if len(text) > _MOST_SHOWN:
+        text = f"{text[: _MOST_SHOWN - 3]}..."
+    return "".join(
+        c if c.isprintable() else c.encode("unicode_escape").decode() for c in text
+    )
+
+
+def shown(value: Any) -> str:
+    """Returns how messages show a value that was given."""
+    return plain(repr(value))
+
+
 def refusal(name: str, expected: str, got: Any) -> ValueError:
     """Returns the error to raise for a malformed argument."""
-    return ValueError(f"{name}: expected {expected}, got {got!r}.")
+    return ValueError(f"{name}: expected {expected}, got {shown(got)}.")
 
 
 def numpy_array(value: Any) -> np.ndarray:
@@ -111,14 +129,14 @@ def real_array(
     try:
         array = jnp.asarray(value) if traced else numpy_array(value)
     except Exception as error:  # whatever a value's own conversion raises
-        raise refuse(repr(value)) from error
+        raise refuse(shown(value)) from error
     if array.dtype.kind not in "iuf":
-        raise refuse(repr(value))
+        raise refuse(shown(value))
     fits = array.ndim == len(shape) and all(
         want in (None, JOINT, have) for want, have in zip(shape, array.shape)
     )
     if not fits and not (broadcast and array.ndim == 0):
-        raise refuse(f"shape {array.shape}" if array.ndim else repr(value))
+        raise refuse(f"shape {array.shape}" if array.ndim else shown(value))
     if not traced:
         kept = np.asarray(array, dtype=jnp.result_type(float))
         bad = ~np.isfinite(kept) if finite else np.isnan(kept)
@@ -127,8 +145,8 @@ def real_array(
         if above is not None:
             bad |= kept <= above
         if bad.any():
-            shown = np.array2string(np.asarray(array), threshold=20)
-            raise refuse(shown.removesuffix("."))  # 1.0 is shown as "1."
+            text = plain(np.array2string(np.asarray(array), threshold=20))
+            raise refuse(text.removesuffix("."))  # 1.0 is shown as "1."
         if unit == "rad":
             radians(name, kept)
         ready = isinstance(value, Array) and value.dtype == kept.dtype

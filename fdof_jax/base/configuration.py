@@ -17,6 +17,7 @@ from jax._src import xla_bridge
 from jax.experimental.compilation_cache import compilation_cache
 from jaxlib import version
 
+from .checks import shown
 from .user_warnings import warn
 
 # XLA on CPU compiles a loop as one kernel if its state has fewer bytes than this sets;
@@ -87,7 +88,7 @@ def configure(
     >>> fj.configure(x64=True)
     """
     if x64 is not None and not isinstance(x64, bool):
-        raise ValueError(f"x64: expected True or False, got {x64!r}.")
+        raise ValueError(f"x64: expected True or False, got {shown(x64)}.")
     if cache is not None:
         _keep_programs(cache)
     if x64 is not None:
@@ -120,7 +121,9 @@ def _keep_programs(cache: Any) -> None:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
         jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
     else:
-        raise ValueError(f"cache: expected a folder, True or False, got {cache!r}.")
+        raise ValueError(
+            f"cache: expected a folder, True or False, got {shown(cache)}."
+        )
     jax.config.update("jax_compilation_cache_dir", folder)
     compilation_cache.reset_cache()  # JAX opens it only once, with the first program
 
@@ -138,7 +141,8 @@ def _writable_folder(cache: Any) -> str:
     # RuntimeError: no home directory; ValueError: not a path
     except (OSError, RuntimeError, ValueError) as error:
         raise ValueError(
-            f"cache: expected a folder that can be written, got {cache!r} ({error})."
+            f"cache: expected a folder that can be written, got {shown(cache)} "
+            f"({error})."
         ) from error
     return str(folder)
 

@@ -3,6 +3,8 @@
 import contextlib
 import sys
 import warnings
+from collections.abc import Iterator
+from contextvars import ContextVar
 from pathlib import Path
 
 import equinox as eqx
@@ -16,8 +18,26 @@ _INNER = (
 )
 
 
+_OMITTED: ContextVar[str | None] = ContextVar("omitted", default=None)
+
+
+@contextlib.contextmanager
+def without_warning(words: str) -> Iterator[None]:
+    """Omits this library's warnings with these words, in the calling thread alone.
+
+    `warnings.catch_warnings` would change the filters of all threads.
+    """
+    before = _OMITTED.set(words)
+    try:
+        yield
+    finally:
+        _OMITTED.reset(before)
+
+
 def warn(message: str, category: type[Warning] = UserWarning) -> None:
     """Warns at the line outside of this library, equinox, JAX and contextlib."""
+    if (omitted := _OMITTED.get()) is not None and omitted in message:
+        return
     frame, level = sys._getframe(1), 2
     while frame.f_back is not None and frame.f_code.co_filename.startswith(_INNER):
         frame, level = frame.f_back, level + 1

@@ -1,11 +1,51 @@
-"""Writes files that appear under their name only when they are complete."""
+"""Paths that arguments give, and files that appear only when they are complete."""
 
 import contextlib
 import os
+import re
 import secrets
 from collections.abc import Iterator
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
+
+from .checks import refusal, shown
+
+# Of an address such as s3://bucket/name, which `Path` would take for a folder.
+_SCHEME = re.compile("[A-Za-z][A-Za-z0-9+.-]+:/")
+
+
+def local_path(name: str, value: Any, expected: str) -> Path:
+    """Returns the path on this machine that the argument `name` gives.
+
+    Raises ValueError for what is no path, an empty one, and an address.
+    """
+    path = os.fspath(value) if isinstance(value, str | os.PathLike) else None
+    if not isinstance(path, str) or not path or "\0" in path:
+        raise refusal(name, expected, value)
+    if _SCHEME.match(path):
+        raise refusal(name, f"{expected} on this machine, no address", value)
+    return Path(path)
+
+
+def file_path(name: str, value: Any) -> Path:
+    """Returns the path of a file that the argument `name` gives."""
+    path = local_path(name, value, "a path")
+    if not path.name or path.is_dir():
+        raise refusal(name, "the path of a file, not of a folder", value)
+    return path
+
+
+def folder_path(name: str, value: Any) -> Path:
+    """Returns the folder that the argument `name` gives, and makes it if need be."""
+    folder = local_path(name, value, "a folder").expanduser()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ValueError(
+            f"{name}: expected a folder, or a path where one can be made, got "
+            f"{shown(value)}: {error.strerror}."
+        ) from error
+    return folder
 
 
 @contextlib.contextmanager

@@ -11,13 +11,13 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
-from ..base.whole_files import whole_file
+from ..base.checks import plain, shown
+from ..base.whole_files import file_path, whole_file
 from ..simulation.versions import VERSIONS
 from .tree_description import Restorer, Unreadable, described
 
@@ -104,13 +104,6 @@ def _array(content: bytes) -> np.ndarray:
     return np.ndarray(shape, dtype, content, member.tell(), order=order).copy("K")
 
 
-def _checked(path: Any) -> Path:
-    try:
-        return Path(path)
-    except TypeError:
-        raise ValueError(f"path: expected a path, got {path!r}.") from None
-
-
 def save(path: str | os.PathLike, tree: Any) -> None:
     """Writes a pytree of the library to a file, for `load`.
 
@@ -135,7 +128,7 @@ def save(path: str | os.PathLike, tree: Any) -> None:
     >>> fj.load(path).linkage.length.tolist()
     [0.0, 1.0, 2.5, 1.0]
     """
-    path = _checked(path)
+    path = file_path("path", path)
     arrays: list[np.ndarray] = []
     try:
         tree_node = described("tree", tree, arrays)
@@ -178,18 +171,18 @@ def load(path: str | os.PathLike, classes: Sequence[type] = ()) -> Any:
     disabled; the message names the file and the reason. A file that holds far
     more than its size is refused before it is read.
     """
-    path = _checked(path)
+    path = file_path("path", path)
     if not isinstance(classes, tuple | list) or not all(
         isinstance(c, type) for c in classes
     ):
-        raise ValueError(f"classes: expected a tuple of classes, got {classes!r}.")
+        raise ValueError(f"classes: expected a tuple of classes, got {shown(classes)}.")
     with path.open("rb") as file:
         try:
             return _read(file, classes)
         except Unreadable as problem:
-            raise ValueError(f"{path}: {problem}.") from None
+            raise ValueError(f"{plain(str(path))}: {problem}.") from None
         except _DAMAGED as error:
             raise ValueError(
-                f"{path}: expected a whole file, got one that is damaged or cut short "
-                f"({type(error).__name__}: {error})."
+                f"{plain(str(path))}: expected a whole file, got one that is damaged "
+                f"or cut short ({type(error).__name__}: {error})."
             ) from error

@@ -1,6 +1,5 @@
 """Import of planar chains from MuJoCo's model format (MJCF)."""
 
-import warnings
 from itertools import combinations
 from typing import Any, NamedTuple
 
@@ -8,7 +7,7 @@ import numpy as np
 
 from ..base.checks import refusal
 from ..base.names import optional_package
-from ..base.user_warnings import warn
+from ..base.user_warnings import warn, without_warning
 from ..forces.actuators import Armature
 from ..forces.element import Forces
 from ..forces.joints import JointDamper
@@ -84,8 +83,8 @@ def from_mjcf(text: str) -> tuple[Linkage, Forces]:
     tip = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, "tip")
     on_last = tip >= 0 and model.site_bodyid[tip] == model.jnt_bodyid[-1]
     end = plane(data.site_xpos[tip]) if on_last else links[-1].start
-    with warnings.catch_warnings():  # of links without mass, which MuJoCo does not have
-        warnings.filterwarnings("ignore", ".*moves no inertia of link")
+    # MuJoCo does not have links without mass.
+    with without_warning("moves no inertia of link"):
         linkage = _linkage(links, end, gravity)
     found = (JointDamper, model.dof_damping), (Armature, model.dof_armature)
     return linkage, tuple(kind(values) for kind, values in found if values.any())
@@ -202,6 +201,9 @@ def _links(model: Any, data: Any, plane: Any, normal: np.ndarray) -> list[_Link]
             where = "in the plane" if slides else "along the first hinge's"
             if across < -1 + 1e-9 and not slides:
                 where += ", got the opposite: reverse it, and the signs of its numbers"
+            else:
+                angle = np.arcsin(across) if slides else np.arccos(across)
+                where += f", got one {abs(angle):.2g} rad off"
             raise ValueError(f"text: expected the axis of joint {name} {where}.")
         if not slides:
             start = plane(data.xanchor[k])

@@ -19,7 +19,7 @@ import numpy as np
 from jax import Array
 
 from .. import __all__ as _NAMES, __name__ as _PACKAGE
-from ..base.checks import is_traced, refusal
+from ..base.checks import is_traced, refusal, shown
 from ..base.names import room_of
 
 _RESULT: Any = diffrax.RESULTS.successful
@@ -129,7 +129,9 @@ def described(place: str, value: Any, arrays: list[np.ndarray]) -> Any:
     if kind is dict:
         if not all(type(key) is str for key in value):
             raise refusal(place, "strings as keys", list(value)[:20])
-        items = {k: described(f"{place}[{k!r}]", v, arrays) for k, v in value.items()}
+        items = {
+            k: described(f"{place}[{shown(k)}]", v, arrays) for k, v in value.items()
+        }
         return {"kind": "dict", "items": items}
     if isinstance(value, Array) or kind is np.ndarray or isinstance(value, np.generic):
         return _described_array(place, value, arrays)
@@ -166,8 +168,8 @@ def described(place: str, value: Any, arrays: list[np.ndarray]) -> Any:
 def _described_array(place: str, value: Any, arrays: list[np.ndarray]) -> dict:
     if is_traced(value):
         raise ValueError(
-            f"{place}: expected a known value, got {value!r}: save outside of jit, "
-            "vmap and grad."
+            f"{place}: expected a known value, got {shown(value)}: save outside of "
+            "jit, vmap and grad."
         )
     if jnp.issubdtype(value.dtype, jax.dtypes.prng_key):
         node = {"kind": "key", "implementation": str(jax.random.key_impl(value))}

@@ -13,7 +13,7 @@ from jax import Array
 from jaxtyping import Int
 from numpy.typing import ArrayLike
 
-from ..base.checks import instance
+from ..base.checks import instance, refusal
 from ..linkage.frames import scalar_frames
 from ..linkage.linkage import Linkage
 from .part import Values, field, of_kind, value_of
@@ -103,9 +103,7 @@ class SpringDamper(LineElement):
         self.stiffness, self.damping = stiffness, damping
         self.rest_length = rest_length
         if not isinstance(one_sided, str | bool) or one_sided not in _SIDES:
-            raise ValueError(
-                f"one_sided: expected False, 'cable' or 'bumper', got {one_sided!r}."
-            )
+            raise refusal("one_sided", "False, 'cable' or 'bumper'", one_sided)
         side = _SIDES[one_sided]
         self.side = None if side is None else jax.device_put(np.array(side))
 

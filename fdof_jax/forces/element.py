@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from ..base.checks import shown
 from ..linkage.linkage import Linkage, joints_of
 from ..mechanics.equations import Scalars
 from .part import Foreign, Part, check_joints, default, optional, sized
@@ -114,7 +115,7 @@ def elements(name: str, forces: Any) -> tuple[Element, ...]:
         return tuple(map(element_of, forces))
     raise ValueError(
         f"{name}: expected a tuple of callables (t, q, qd, linkage) -> tau, for "
-        f"instance (JointDamper(1.0),), got {forces!r}."
+        f"instance (JointDamper(1.0),), got {shown(forces)}."
     )
 
 

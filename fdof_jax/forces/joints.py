@@ -35,7 +35,7 @@ class JointDamper(ScalarElement):
 class JointEffort(ScalarElement):
     """Constant joint efforts, the paper's F and T inputs.
 
-    **Arguments:** `tau`: one per joint [N or N m].
+    **Arguments:** `tau`: one for all joints or one per joint [N or N m].
 
     **Raises:** ValueError for malformed efforts.
 
@@ -46,10 +46,10 @@ class JointEffort(ScalarElement):
     [58.86, 29.43, 9.81]
     """
 
-    tau: Values = field((JOINT,), unit="N or N m")
+    tau: Values = field(unit="N or N m")
 
     def respond(self, scheduled, q, qd, linkage):
-        return tuple(self.tau)
+        return each(self.tau, q)
 
 
 class EffortHistory(ScalarElement):

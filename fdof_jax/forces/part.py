@@ -19,7 +19,15 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from ..base.array_namespace import in_numpy, namespace
-from ..base.checks import JOINT, concrete, function, instance, is_traced, real_array
+from ..base.checks import (
+    JOINT,
+    concrete,
+    function,
+    instance,
+    is_traced,
+    plain,
+    real_array,
+)
 from ..base.frozen import Frozen
 from ..linkage.linkage import Linkage, joints_of, short
 from ..linkage.topology import check_angles
@@ -182,8 +190,9 @@ def check_values(place: str, part: Part) -> None:
 def _refuse(place: str, conditions: Iterable[Condition]) -> None:
     for holds, name, expected, got in conditions:
         if (known := concrete(_all(holds))) is not None and not known:
-            shown = " and ".join(map(str, got)) if isinstance(got, tuple) else got
-            raise ValueError(f"{place}{name}: expected {expected}, got {shown}.")
+            parts = got if isinstance(got, tuple) else (got,)
+            text = plain(" and ".join(map(str, parts)))
+            raise ValueError(f"{place}{name}: expected {expected}, got {text}.")
 
 
 def _all(holds: Any) -> Any:
@@ -243,9 +252,11 @@ def check_joints(place: str, part: Part, linkage: Linkage) -> None:
     for name, value, rules in _declared(part):
         for wanted, size in zip(rules["shape"], jnp.shape(value)):
             if wanted == JOINT and size != count:
+                more = jnp.ndim(value) > len(rules["shape"])
+                hint = "; sweep(..., forces_axes=0) takes a batch" if more else ""
                 raise ValueError(
                     f"{place}{name}: expected numbers for {count} joints, as the "
-                    f"linkage has, got {size}; sweep(..., forces_axes=0) takes a batch."
+                    f"linkage has, got {size}{hint}."
                 )
         if rules["unit"] == "m or rad":
             check_angles(f"{place}{name}", value, linkage.ef)
@@ -279,7 +290,7 @@ def jumps_of(*parts: Part) -> Array | None:
     found = [part.jump_ts for part in parts]
     times = [jumps for jumps in found if jumps is not None]
     numpy = namespace(times)  # JAX would compile a program for known times
-    return numpy.concatenate([numpy.asarray(t) for t in times]) if times else None
+    return numpy.concatenate([numpy.ravel(t) for t in times]) if times else None
 
 
 def optional(name: str, absent: Any = None) -> Any:

@@ -17,7 +17,7 @@ from jax import Array
 from jaxtyping import Complex, Float
 from numpy.typing import ArrayLike
 
-from ..base.checks import is_traced, whole_number
+from ..base.checks import is_traced, shown, whole_number
 from ..linkage.frames import Frames, cross, frames, scalar_frames
 from ..linkage.linkage import Linkage, joints_of, per_joint, without_fixed
 from ..linkage.topology import MOST_PAIRS
@@ -40,7 +40,7 @@ def _link(link: Any) -> Array:
     if whole_number("link", link, 0) > MOST_PAIRS:
         raise ValueError(
             f"link: expected 0 (the ground) or a moving link, 1 to {MOST_PAIRS}, got "
-            f"{link!r}."
+            f"{shown(link)}."
         )
     return jax.device_put(np.array(link))
 

@@ -7,6 +7,7 @@ where a switching function changes its sign.
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import Any
 
 import jax.numpy as jnp
@@ -15,7 +16,8 @@ from jax.typing import ArrayLike
 
 from ..base.checks import transformation
 
-_open: list["Switches"] = []  # while an element is traced within a solve
+# While an element is traced within a solve; of each thread its own.
+_DEALING: ContextVar["Switches | None"] = ContextVar("dealing", default=None)
 
 
 class Switches:
@@ -68,11 +70,11 @@ class Switches:
     def dealt(self) -> Iterator[None]:
         """Deals out sides to the switches traced in this context."""
         self._transformation = transformation()
-        _open.append(self)
+        before = _DEALING.set(self)
         try:
             yield
         finally:
-            _open.pop()
+            _DEALING.reset(before)
 
 
 def switch(
@@ -102,7 +104,8 @@ def switch(
     [-0.1, -20.0, -0.1]
     """
     g = jnp.asarray(g)
-    side = _open[-1].side_of(g, continuous) if _open else g
+    switches = _DEALING.get()
+    side = g if switches is None else switches.side_of(g, continuous)
     return jnp.where(side > 0, above, below)
 
 

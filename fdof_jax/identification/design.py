@@ -10,7 +10,7 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
-from ..base.checks import function, increasing, instance, real_array, refusal
+from ..base.checks import function, increasing, instance, real_array, refusal, shown
 from ..search.bounded import Run, minimise
 from ..search.lanes import Lanes
 from ..search.methods import Evaluation
@@ -177,9 +177,8 @@ def next_motion(
     motion = unknowns_of(start, bounds, dict.fromkeys(start, 1.0))
     half = (motion.high - motion.low) / 2
     if not (np.isfinite(half) & (half > 0)).all():
-        raise ValueError(
-            f"bounds: expected finite ones for all of {list(start)}, got {bounds!r}."
-        )
+        names = shown(list(start))
+        raise refusal("bounds", f"finite ones for all of {names}", bounds)
     parameters = unknowns_of(found.parameters, None, scale)
     sizes = parameters.scale
     first = named(motion.shapes, jnp.asarray(motion.start))

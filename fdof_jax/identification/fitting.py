@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..base.checks import keywords_as, real_array, refusal
+from ..base.checks import keywords_as, plain, real_array, refusal, shown
 from ..search.bounded import Run, minimise
 from ..search.lanes import Lanes
 from ..search.methods import Evaluation
@@ -77,7 +77,7 @@ def _unseen(validate: Any, shape: tuple[int, ...], *settings: Any) -> list[Probl
     if not isinstance(validate, tuple) or len(validate) != 2:
         raise ValueError(
             "validate: expected (scene_at, observed), as for the fit itself, got "
-            f"{validate!r}."
+            f"{shown(validate)}."
         )
     names = "validate[0]", "validate[1]"
     problems = problems_of(names, *listed(names[1], *validate), *settings)
@@ -131,7 +131,9 @@ def _search(
     unknowns = unknowns_of(start, bounds, scale)
     ts = real_array("ts", ts, (None,))
     if ts.size < 2 or not (np.diff(ts) > 0).all():
-        raise ValueError(f"ts: expected two or more increasing times, got {ts}.")
+        raise ValueError(
+            f"ts: expected two or more increasing times, got {plain(str(ts))}."
+        )
     settings = unknowns, ts, observe, noise
     problems = problems_of(("scene_at", "observed"), scenes_at, observed, *settings)
     unseen = _unseen(validate, problems[0].observed.shape, *settings)
@@ -146,7 +148,7 @@ def _search(
     if any(run.failed for run in runs):
         raise ValueError(
             "start: expected parameters at which the scene can be simulated over ts, "
-            f"got {start!r}."
+            f"got {shown(start)}."
         )
     least = unknowns.start.size + 1
     counts = [max(int(run.best.facts["readings"].sum()), least) for run in runs]
@@ -184,7 +186,7 @@ def fit(
     in a scene. The fit uses the Levenberg-Marquardt method with exact derivatives. It
     fits the first quarter of the time, continues with the first half, and so on, up to
     all of it. A second call with other numbers compiles nothing, if `scene_at` and
-    `observe` are the same functions or Equinox modules of the same structure.
+    `observe` are functions of equal code or Equinox modules of the same structure.
 
     **Arguments:**
 

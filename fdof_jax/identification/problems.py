@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ..base.checks import function
+from ..base.checks import function, shown
 from ..search.bounded import Run
 from ..search.methods import Evaluation
 from ..search.simulated import check_scene, sum_of_squares
@@ -103,7 +103,7 @@ def _check_scene_at(
     except KeyError as error:
         raise ValueError(
             f"start: expected a value for {error}, which {name} may use, got "
-            f"{list(parameters)}."
+            f"{shown(list(parameters))}."
         ) from error
     check_scene(f"{name}(...)", scene, ts)
 

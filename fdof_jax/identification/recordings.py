@@ -8,7 +8,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
-from ..base.checks import instance, real_array
+from ..base.checks import instance, real_array, shown
 from ..mechanics.kinematics import joint_positions, tip_position
 from ..simulation.sampled import check_joints
 from ..simulation.scene import Scene
@@ -51,7 +51,7 @@ def observations(
         readings = np.asarray(observed, dtype=jnp.result_type(float))
     except (TypeError, ValueError) as error:
         raise ValueError(
-            f"{name}: expected an array of real numbers, got {observed!r}."
+            f"{name}: expected an array of real numbers, got {shown(observed)}."
         ) from error
     if np.isinf(readings).any():
         raise ValueError(f"{name}: expected finite readings (or NaN), got infinity.")

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..base.checks import real_array
+from ..base.checks import real_array, refusal, shown
 
 # Names and shapes of parameters, in pairs: JAX would sort a dict.
 Shapes = tuple[tuple[str, tuple[int, ...]], ...]
@@ -49,35 +49,32 @@ def unknowns_of(start: Any, bounds: Any, scale: Any) -> Unknowns:
     if not isinstance(start, Mapping) or not start:
         raise ValueError(
             "start: expected a dict of named parameters to find, for instance "
-            f"{{'mass': 2.0}}, got {start!r}."
+            f"{{'mass': 2.0}}, got {shown(start)}."
         )
     for argument, given in (("bounds", bounds), ("scale", scale)):
         known = given is None or isinstance(given, Mapping) and set(given) <= set(start)
         if not known:
-            raise ValueError(
-                f"{argument}: expected a dict with names from {list(start)}, got "
-                f"{given!r}."
-            )
+            names = shown(list(start))
+            raise refusal(argument, f"a dict with names from {names}", given)
     shapes, columns = [], []
     for name, value in start.items():
         if not isinstance(name, str):
-            raise ValueError(f"start: expected names for keys, got {name!r}.")
+            raise ValueError(f"start: expected names for keys, got {shown(name)}.")
         shape = np.asarray(value, dtype=object).shape
-        first = np.asarray(real_array(f"start[{name!r}]", value, shape))
+        first = np.asarray(real_array(f"start[{shown(name)}]", value, shape))
         if name in (scale or {}):
             size = real_array(
-                f"scale[{name!r}]", scale[name], shape, above=0, broadcast=True
+                f"scale[{shown(name)}]", scale[name], shape, above=0, broadcast=True
             )
         elif not first.any():
-            raise ValueError(
-                f"scale: expected a size for {name!r}, whose start is 0, got {scale!r}."
-            )
+            missing = f"a size for {shown(name)}, whose start is 0"
+            raise refusal("scale", missing, scale)
         else:
             size = np.where(first == 0, np.abs(first).max(), np.abs(first))
         pair = (bounds or {}).get(name, (-np.inf, np.inf))
-        place = f"bounds[{name!r}]"
+        place = f"bounds[{shown(name)}]"
         if not isinstance(pair, tuple | list) or len(pair) != 2:
-            raise ValueError(f"{place}: expected (least, greatest), got {pair!r}.")
+            raise ValueError(f"{place}: expected (least, greatest), got {shown(pair)}.")
         low, high = (
             np.asarray(
                 real_array(f"{place}[{i}]", b, shape, finite=False, broadcast=True)
@@ -86,8 +83,8 @@ def unknowns_of(start: Any, bounds: Any, scale: Any) -> Unknowns:
         )
         if not ((low <= first) & (first <= high)).all():
             raise ValueError(
-                f"{place}: expected the start between them, got {pair!r} around "
-                f"{first.tolist()}."
+                f"{place}: expected the start between them, got {shown(pair)} around "
+                f"{shown(first.tolist())}."
             )
         shapes.append((name, shape))
         columns.append([np.ravel(array) for array in (first, size, low, high)])

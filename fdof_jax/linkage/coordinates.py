@@ -9,7 +9,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from ..base.array_namespace import in_numpy, namespace
-from ..base.checks import concrete, real_array
+from ..base.checks import concrete, real_array, shown
 from .linkage import Linkage, compiled, per_joint
 from .topology import letters, pairs_of, real_joints
 
@@ -37,7 +37,9 @@ def real_state(name: str, value: Any, linkage: Linkage) -> State:
     try:
         q, qd = value
     except (TypeError, ValueError):
-        raise ValueError(f"{name}: expected a State(q, qd), got {value!r}.") from None
+        raise ValueError(
+            f"{name}: expected a State(q, qd), got {shown(value)}."
+        ) from None
     parts = ("q", q), ("qd", qd)
     return State(*(per_joint(f"{name}.{part}", row, linkage) for part, row in parts))
 

@@ -20,8 +20,9 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from ..base.array_namespace import namespace
-from ..base.checks import is_traced, known, radians, real_array
+from ..base.checks import is_traced, known, radians, real_array, shown
 from ..base.frozen import Frozen
+from ..base.functions import sharing_functions
 from .singularity import check_singularity
 from .topology import (
     can_move,
@@ -207,7 +208,8 @@ def compiled(
                         arguments[name] = door(linkage, arguments[name])
                 else:
                     arguments[name] = real_array(name, arguments[name], door)
-            return inner(**arguments)
+            run = lambda *values: inner(**dict(zip(arguments, values)))
+            return sharing_functions(run, **arguments)
 
         return checked
 
@@ -220,7 +222,7 @@ def check_linkage(linkage: Any) -> None:
     Shapes and values are checked again: `equinox.tree_at` bypasses the constructor.
     """
     if not isinstance(linkage, Linkage):
-        raise ValueError(f"linkage: expected a Linkage, got {linkage!r}.")
+        raise ValueError(f"linkage: expected a Linkage, got {shown(linkage)}.")
     if jnp.ndim(linkage.ef) != 1:
         raise ValueError(
             "linkage: expected one linkage (use jax.vmap for a batch), got existence "

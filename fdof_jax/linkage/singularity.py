@@ -16,12 +16,12 @@ if TYPE_CHECKING:
 _SINGULAR = 1e-14
 
 
-def _least_inertia(linkage: "Linkage", configurations: int) -> np.ndarray:
-    """Measures how far from singular the joints from k outwards are.
+def _scaled_inertia(linkage: "Linkage", configurations: int) -> np.ndarray:
+    """Computes mass matrices at random configurations (configurations, n, n).
 
-    Returns, at random configurations, the least eigenvalue of the joints' block of the
-    mass matrix (configurations, n), fixed pairs left out. Scaling to a diagonal of ones
-    makes it free of units and sizes. NumPy avoids compilation in the constructor.
+    Scaling to a diagonal of ones makes them free of units and sizes; it is 0 where a
+    joint moves nothing, and 1 at fixed pairs. NumPy avoids compilation in the
+    constructor.
     """
     linkage = jax.tree.map(lambda a: np.asarray(a, dtype=float), linkage)
     revolute = np.stack(real_joints(linkage.ef))
@@ -44,18 +44,29 @@ def _least_inertia(linkage: "Linkage", configurations: int) -> np.ndarray:
     # The diagonal of ones, at fixed pairs too, leaves the least eigenvalue as it is.
     diagonal = np.arange(n)
     scaled[:, diagonal, diagonal] = np.where(moves, scaled[:, diagonal, diagonal], 1)
-    least = [np.linalg.eigvalsh(scaled[:, k:, k:])[:, 0] for k in range(n)]
-    return np.stack(least, axis=1)
+    return scaled
 
 
 def check_singularity(linkage: "Linkage") -> None:
     """Rejects linkages that are always singular; warns of those that may become so."""
     revolute = np.stack(real_joints(np.asarray(linkage.ef)))
     names = letters(linkage.ef)
-    best = _least_inertia(linkage, configurations=5).max(axis=0)
+    scaled = _scaled_inertia(linkage, configurations=5)
     for k in reversed(range(len(names))):
-        if best[k] <= _SINGULAR:
+        # Of the joints from k outwards, how far from singular they are.
+        least, modes = np.linalg.eigh(scaled[:, k:, k:])
+        if least[:, 0].max() <= _SINGULAR:
             kind = "revolute" if revolute[k] else "prismatic"
+            if scaled[:, k, k].max() > 0:  # it moves some, but others can undo that
+                parts = k + np.flatnonzero(np.abs(modes[:, :, 0]).max(axis=0) > 1e-3)
+                joints = " and ".join(str(joint + 1) for joint in parts)
+                line = "" if revolute[parts].any() else " along the same line"
+                raise ValueError(
+                    f"mass, inertia, com: expected joints {joints} of {names} to move "
+                    "some inertia however they move together, got joints that can move "
+                    f"against each other{line} and move none, in any configuration: "
+                    "their accelerations are undetermined."
+                )
             raise ValueError(
                 f"mass, inertia, com: expected joint {k + 1} ({kind}) of {names} to "
                 f"move some inertia of link {k + 1} or of the links beyond it, got "

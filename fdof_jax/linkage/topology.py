@@ -7,7 +7,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
-from ..base.checks import instance, is_traced, radians
+from ..base.checks import instance, is_traced, radians, shown
 
 TOPOLOGIES = ("RRR", "RRP", "RPR", "PRR", "RPP", "PRP", "PPR")
 MOST_PAIRS = 8
@@ -49,7 +49,7 @@ def pairs_of(topology: Any) -> np.ndarray | None:
     )
     if isinstance(topology, str):
         if not 0 < len(topology) <= MOST_PAIRS or set(topology) - set(_FACTORS):
-            raise ValueError(f"{expected}, got {topology!r}.")
+            raise ValueError(f"{expected}, got {shown(topology)}.")
         pairs = np.array([_FACTORS[joint] for joint in topology], dtype=float)
     elif is_traced(topology):
         if jnp.ndim(topology) != 1 or jnp.size(topology) not in _SIZES:
@@ -62,12 +62,13 @@ def pairs_of(topology: Any) -> np.ndarray | None:
         except (TypeError, ValueError):
             ef = np.empty(0)
         if ef.ndim != 1 or ef.size not in _SIZES or not np.isin(ef, (0, 1)).all():
-            raise ValueError(f"{expected}, got {topology!r}.")
+            raise ValueError(f"{expected}, got {shown(topology)}.")
         pairs = ef.reshape(-1, 2)
     if (pairs.sum(axis=1) > 1).any():
         raise ValueError(
             "topology: expected one real joint at most in each (prismatic, revolute) "
-            f"pair of existence factors (equation 4), got {pairs.astype(int).tolist()}."
+            f"pair of existence factors (equation 4), got "
+            f"{shown(pairs.astype(int).tolist())}."
         )
     if not can_move(pairs):
         raise ValueError(

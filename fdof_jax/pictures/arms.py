@@ -11,7 +11,7 @@ from matplotlib.markers import MarkerStyle
 from matplotlib.path import Path
 
 from ..base.array_namespace import in_numpy
-from ..base.checks import refusal
+from ..base.checks import refusal, shown
 from ..linkage.frames import frames
 from ..linkage.linkage import Linkage, check_linkage, without_fixed
 from ..linkage.topology import letters
@@ -210,7 +210,7 @@ def geometries_of(motions: Any, forces: Any) -> dict[str, tuple[np.ndarray, Geom
         raise refusal("forces", f"titles of motions, {list(motions)}", sorted(unknown))
     found = {}
     for title, pair in motions.items():
-        name = f"motions[{title!r}]"
+        name = f"motions[{shown(title)}]"
         fits = isinstance(pair, tuple) and len(pair) == 2
         if not (fits and isinstance(pair[0], Linkage)):
             raise refusal(name, "(Linkage, Solution)", pair)

@@ -13,7 +13,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.image import imsave
 
-from ..base.checks import instance, refusal
+from ..base.checks import instance, refusal, shown
 from ..base.html_table import html_table
 from ..base.names import optional_package
 from ..linkage.linkage import joint_names, joints_of
@@ -193,11 +193,11 @@ def sliders(scenes: Mapping[str, Scene] | None = None) -> Any:
     known = {}
     scenes = circle_scenes() if scenes is None else scenes
     for name, scene in filled_mapping("scenes", scenes, "Scene").items():
-        instance(f"scenes[{name!r}]", scene, Scene)
+        instance(f"scenes[{shown(name)}]", scene, Scene)
         task = controller_of(scene).reference
         if reference_of(task).tip is None:
             raise refusal(
-                f"scenes[{name!r}]", "a controller of a task with a tip", task
+                f"scenes[{shown(name)}]", "a controller of a task with a tip", task
             )
         # As an array, so that other times do not compile again.
         known[name] = scene._replace(t1=jnp.asarray(scene.t1, float))

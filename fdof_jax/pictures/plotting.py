@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
-from ..base.checks import real_array, refusal
+from ..base.checks import real_array, refusal, shown
 from ..control.drives import PIDController
 from ..control.pd import PDController
 from ..forces.element import Forces, elements
@@ -155,7 +155,7 @@ def work_precision(
     """
     curves = {}
     for label, pair in filled_mapping("measured", measured, "(errors, times)").items():
-        name = f"measured[{label!r}]"
+        name = f"measured[{shown(label)}]"
         if not isinstance(pair, tuple) or len(pair) != 2:
             raise refusal(name, "(errors, times)", pair)
         errors, times = (

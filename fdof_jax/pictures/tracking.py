@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.colors import ListedColormap
 
-from ..base.checks import refusal
+from ..base.checks import refusal, shown
 from ..linkage.linkage import Linkage
 from ..references.reference import reference_of
 from ..references.task import TipReference
@@ -45,7 +45,7 @@ def _tips(linkage: Any, task: Any, solutions: Any) -> list[tuple]:
     filled_mapping("solutions", solutions, "Solution")
     return [
         (str(label), SERIES[k % len(SERIES)])
-        + _tip(linkage, task, solution, f"solutions[{label!r}]")
+        + _tip(linkage, task, solution, f"solutions[{shown(label)}]")
         for k, (label, solution) in enumerate(solutions.items())
     ]
 

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
 from ..base.array_namespace import in_numpy, namespace
-from ..base.checks import function, is_traced, known, real_array, refusal
+from ..base.checks import function, is_traced, known, real_array, refusal, shown
 from ..forces.part import Foreign, Part, default, optional
 from ..linkage.linkage import Linkage, check_linkage, joints_of
 
@@ -99,7 +99,7 @@ def reference_motion(reference: Any, t: Array, linkage: Linkage) -> tuple[Array,
     motion = reference(t, linkage)
     if not isinstance(motion, tuple) or len(motion) != 2:
         raise ValueError(
-            f"reference: expected it to return (q_ref, qd_ref), got {motion!r}."
+            f"reference: expected it to return (q_ref, qd_ref), got {shown(motion)}."
         )
     n = joints_of(linkage)
     q_ref, qd_ref = (

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..base.checks import whole_number
+from ..base.checks import shown, whole_number
 from .methods import METHODS, Evaluation, held_at_bounds
 
 # Greatest change of an unknown in a step: a factor of 7 if unknowns are logarithms.
@@ -131,7 +131,7 @@ def minimise(
     """
     max_steps = whole_number("max_steps", max_steps, 1)
     if not (report is None or callable(report)):
-        raise ValueError(f"report: expected a callable or None, got {report!r}.")
+        raise ValueError(f"report: expected a callable or None, got {shown(report)}.")
     began = time.perf_counter()
     runs = [Run(METHODS[method], enough, *row) for row in zip(start, low, high)]
     for number in range(max_steps + 1):

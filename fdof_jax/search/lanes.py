@@ -10,6 +10,7 @@ import numpy as np
 from jax import Array
 
 from ..base.configuration import options_of_loops
+from ..base.functions import sharing_functions
 from ..simulation.scene import stacked
 from .methods import Evaluation
 
@@ -73,7 +74,8 @@ class Lanes:
             there = run[lanes], member[lanes]
             moving = jax.tree.map(lambda a: jnp.asarray(a[there]), self.moving)
             here = jnp.asarray(points[lanes])
-            found = _evaluate(self.evaluate, here, moving, self.shared)
+            evaluate = lambda shared: _evaluate(self.evaluate, here, moving, shared)
+            found = sharing_functions(evaluate, _=self.shared)
             return jax.tree.map(np.asarray, found)
 
         # Copies fill the last group.

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from ..base.checks import instance
+from ..base.checks import instance, shown
 from ..forces.element import Forces
 from ..linkage.coordinates import State
 from ..linkage.linkage import Linkage
@@ -35,6 +35,15 @@ class Batch(NamedTuple):
         moving = [leaf if axis else None for leaf, axis in zip(leaves, self.batched)]
         shared = [None if axis else leaf for leaf, axis in zip(leaves, self.batched)]
         return structure.unflatten(moving), structure.unflatten(shared)
+
+    def with_forces(self, forces: Forces) -> "Batch":
+        """Returns the batch with the same forces, whose functions have another form."""
+        flags = jax.tree.structure(self.inputs).unflatten(self.batched)
+        inputs = *self.inputs[:2], forces
+        batched = jax.tree.map(
+            lambda flag, part: jax.tree.map(lambda _: flag, part), flags, inputs
+        )
+        return self._replace(inputs=inputs, batched=jax.tree.leaves(batched))
 
 
 def check_arms(linkage: Any) -> None:
@@ -86,7 +95,7 @@ def batch_of(linkage: Linkage, state0: Any, forces: Forces, forces_axes: Any) ->
     except ValueError:
         raise ValueError(
             "forces_axes: expected 0, None or a tuple of these with one entry per "
-            f"element, got {forces_axes!r}."
+            f"element, got {shown(forces_axes)}."
         ) from None
     sizes = [
         (path, np.shape(leaf)[:1])

@@ -3,25 +3,14 @@
 import hashlib
 import json
 import math
-import os
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..base.checks import refusal
 from ..base.user_warnings import warn
 from ..base.whole_files import whole_file
 from .versions import VERSIONS
-
-
-def folder_at(name: str, value: str | os.PathLike) -> Path:
-    """Returns the folder that the argument `name` asks for, and makes it if need be."""
-    if not isinstance(value, str | os.PathLike) or not os.fspath(value):
-        raise refusal(name, "a folder", value)
-    folder = Path(os.path.expanduser(value))
-    folder.mkdir(parents=True, exist_ok=True)
-    return folder
 
 
 class Rows:

@@ -10,6 +10,7 @@ from jax import Array
 from jaxtyping import Float
 
 from ..base.checks import is_traced, place_of
+from ..base.functions import sharing_functions
 from ..forces.element import Element, Forces, elements_on, of_full_size
 from ..linkage.linkage import Linkage, check_linkage, without_fixed
 from .field import element_effort, with_states
@@ -63,7 +64,8 @@ def joint_efforts(linkage: Linkage, forces: Forces, solution: Motion) -> Efforts
     forces = of_full_size(linkage, forces)
     rows = solution.ts, solution.q, solution.qd, solution.own
     if not is_traced(linkage, forces, rows):
-        found = _efforts(linkage, forces, *padded(rows))
+        run = lambda forces: _efforts(linkage, forces, *padded(rows))
+        found = sharing_functions(run, forces=forces)
         if not is_traced(found):  # by a value in the closure of a function
             elements = np.asarray(found.elements)[:, : len(solution.ts)]
             return Efforts(cut(found.total, len(solution.ts)), jax.device_put(elements))

@@ -4,33 +4,120 @@ import inspect
 from typing import Any
 
 import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jax import Array
+from jax.flatten_util import ravel_pytree
 
 from ..forces.element import Element, ForeignElement
-from .field import element_effort, initial_states, with_states
-from .solution import Solution
+from .field import (
+    args_of,
+    element_effort,
+    initial_own,
+    initial_states,
+    whole,
+    with_states,
+)
+from .prescribed import start_of, term_of
+from .solution import OUTCOMES, Solution
+from .solve import solve
 
-# Steps are tiny if all that are allowed cover less than this part of the time span.
-_SMALL_PART = 0.1
+# What an outcome means, and what helps.
+_REASONS: dict[str, str] = dict(
+    zip(
+        OUTCOMES[1:],
+        (
+            "The mass matrix is singular there, or nearly so (see inertia_ratios).",
+            "The accelerations are not finite there.",
+            "All max_steps were taken before the end.",
+            "Not even the shortest step meets the tolerance: rounding keeps it from "
+            "that, or an effort jumps there (forces.switch makes steps end at jumps).",
+            "Elements switch there without end, as between branches that push towards "
+            "each other: let the effort change continuously, as by a JointFriction, or "
+            "by a clipped gain in place of a sign.",
+        ),
+    )
+)
+# An explicit method of order 8 is stable for steps up to some 3 to 6 times the time
+# scale of a mode. Where accuracy decides, steps are shorter than twice that.
+_STABLE = 2.0
 
 
-def cause(inputs: tuple[Any, ...], solution: Solution) -> str:
+def reason(outcome: str) -> str:
+    """Returns what is known from the outcome alone, in a sentence."""
+    return _REASONS.get(outcome, "The method itself failed.")
+
+
+def cause(inputs: tuple[Any, ...], keywords: dict[str, Any], solution: Solution) -> str:
     """Returns what is known about a failed solve, in a sentence."""
     linkage, (q, qd), ts, own0, forces = inputs
-    if solution.outcome == "not finite":
+    outcome = str(solution.outcome)
+    if outcome == "not finite":
         own = own0 or initial_states(linkage, forces)
         for k, element, state in with_states(forces, own):
             effort, _ = element_effort(k, element, ts[0], q, qd, linkage, state)
             if not np.isfinite(effort).all():
                 return f"The effort of forces[{k}] is not finite at the start."
-    covered = solution.stats["time_reached"] - ts[0]
-    if solution.outcome == "out of steps" and covered < _SMALL_PART * (ts[-1] - ts[0]):
+    if outcome == "out of steps":
+        return _of_steps(inputs, keywords, solution)
+    return reason(outcome)
+
+
+def _of_steps(inputs, keywords, solution: Solution) -> str:
+    """Compares the steps of a motion with the fastest mode where it stopped."""
+    linkage, state0, ts, own0, forces = inputs
+    steps = int(solution.stats["num_steps"])
+    covered = float(solution.stats["time_reached"] - ts[0])
+    if covered == 0:
+        return "Not one of them met the tolerance."
+    mean = covered / max(int(solution.stats["num_accepted_steps"]), 1)
+    # A little earlier, as rounding may shift the last step.
+    share = 1 - 1e3 * float(jnp.finfo(ts.dtype).eps)
+    before = jnp.stack([ts[0], ts[0] + share * covered])
+    again, _ = solve((linkage, state0, before, own0, forces), keywords)
+    last = jax.tree.map(lambda rows: rows[-1], (again.q, again.qd, again.own))
+    fastest = _fastest_mode(linkage, forces, before[-1], *last)
+    rate, grows = abs(fastest), fastest.real > abs(fastest) / 2
+    implicit = isinstance(keywords["solver"], diffrax.AbstractImplicitSolver)
+    if grows and rate * mean > _STABLE:
         return (
-            "Where steps are so short, more max_steps hardly help: a stiff arm needs "
-            "an implicit solver (solver=diffrax.Kvaerno5()), and a force that feeds "
-            "itself diverges."
+            f"There the motion grows by a rate of {rate:.3g}/s, as under a force that "
+            "feeds itself: it diverges, and more max_steps hardly help."
         )
-    return diffrax.RESULTS[solution.result].strip()
+    if rate * mean > _STABLE and not implicit:
+        return (
+            f"A mode of {rate:.3g}/s keeps the steps of an explicit method at "
+            f"{mean:.2g} s, whatever the tolerance: such a stiff arm needs an implicit "
+            "solver (solver=diffrax.Kvaerno5())."
+        )
+    needed = float(f"{steps * float(ts[-1] - ts[0]) / covered:.2g}")
+    return (
+        f"At {mean:.2g} s a step, the whole time takes some {needed:,.0f} steps: "
+        "raise max_steps, or loosen the tolerance (rtol, atol)."
+    )
+
+
+def _fastest_mode(*scene_and_state: Any) -> complex:
+    """Returns the fastest eigenvalue of the linearised equations [1/s], or 0."""
+    try:
+        modes = np.linalg.eigvals(_linearised(*scene_and_state))
+    except Exception:  # of a user's function without derivatives, or not finite
+        return 0j
+    return complex(modes[np.argmax(np.abs(modes))])
+
+
+@eqx.filter_jit
+def _linearised(
+    linkage: Any, forces: tuple[Element, ...], t: Array, q: Array, qd: Array, own: Any
+) -> Array:
+    """Returns the matrix of the linearised equations of first order."""
+    args, term = args_of(linkage, q, forces), term_of(forces)
+    start = whole(*start_of(args, qd), initial_own(args, own))
+    flat, rebuilt = ravel_pytree(start)
+    rates = lambda y: ravel_pytree(term.vf(t, rebuilt(y), args))[0]
+    return jax.jacfwd(rates)(flat)
 
 
 def check_arguments(forces: tuple[Element, ...]) -> None:

@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ..base.callbacks import with_checks
 from ..forces.added_inertia import added_inertia, inertial
 from ..forces.element import Element, ScalarElement, StatefulElement, naming
 from ..forces.switches import Switches
@@ -43,7 +42,6 @@ def args_of(linkage: Linkage, q0: Array, forces: tuple[Element, ...]) -> Args:
     return Args(linkage, q0, constants, forces)
 
 
-@with_checks
 def schedule_of(t: Array, args: Args) -> tuple[Any, ...]:
     """Returns each element's schedule."""
     schedules = []
@@ -98,7 +96,6 @@ def _scalars(tree: Any, dtype: Any) -> tuple[Array, ...]:
     return tuple(jnp.concatenate(leaves)) if leaves else ()
 
 
-@with_checks
 def _effort(t: Any, y: Any, args: Args, schedule: tuple[Any, ...]) -> tuple[Any, ...]:
     """Returns efforts of the elements, rates of their states, and their switches.
 

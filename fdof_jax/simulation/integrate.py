@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from ..base.callbacks import without_checks
 from ..forces.joints import EffortHistory
 from ..linkage.linkage import possible, without_fixed
 from .derivative_control import OfLinearised, OfTangents
@@ -21,6 +20,7 @@ from .prescribed import agrees, motion_at, start_of, term_of
 from .solution import Solution
 from .steps import accounted, step_control
 from .switching import Located, LocatedImplicit, located, switching_facts
+from .unchecked import diffeqsolve
 
 
 def integrate(
@@ -68,8 +68,8 @@ def integrate(
             controller = OfLinearised(controller, term, tableau)  # pyright: ignore[reportCallIssue]
         controller = accounted(controller, solver, term)
     # diffrax computes a few constants while it is traced.
-    with without_checks(), jax.transfer_guard("allow"):
-        found = diffrax.diffeqsolve(
+    with jax.transfer_guard("allow"):
+        found = diffeqsolve(
             term,
             t0=ts[0],
             t1=ts[-1],

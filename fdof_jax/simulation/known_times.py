@@ -45,4 +45,4 @@ def known_times(args: Args, *left_out: type[Element]) -> Array | None:
     if args.ahead is None:
         return jumps_of(*(args.forces[place] for place in places))
     times = [(args.forces[i].jump_ts, args.ahead[i]) for i in places]
-    return jnp.concatenate([jnp.asarray(t) - by for t, by in times if t is not None])
+    return jnp.concatenate([jnp.ravel(t) - by for t, by in times if t is not None])

@@ -13,8 +13,7 @@ from jax import Array
 from jaxtyping import Bool, Float
 
 from ..base.array_namespace import in_numpy, namespace
-from ..base.callbacks import with_checks
-from ..base.checks import place_of
+from ..base.checks import place_of, shown
 from ..dynamics import mass_and_bias
 from ..forces.element import Element, Forces, naming
 from ..forces.part import Condition, called
@@ -71,7 +70,7 @@ class PrescribedMotion(Element):
         ):
             raise ValueError(
                 f"joints: expected a number of 1 to {_NUMBERS[-1]}, or a tuple of "
-                f"such, got {joints!r}."
+                f"such, got {shown(joints)}."
             )
         self.moved = jax.device_put(np.isin(_NUMBERS, numbers))
         self.reference = reference
@@ -86,7 +85,6 @@ class PrescribedMotion(Element):
         fixed = namespace(moved, ef).stack(fixed_pairs(ef))
         return moved[: joints_of(linkage)] & ~fixed
 
-    @with_checks
     def at(self, t: Array, linkage: Linkage) -> tuple[Array, Array]:
         return reference_motion(self.reference, t, linkage)
 

@@ -18,8 +18,10 @@ from ..base.checks import (
     is_traced,
     real_array,
     refusal,
+    shown,
     whole_number,
 )
+from ..base.functions import sharing_functions
 from ..forces.element import Element, Forces, ScalarElement, element_of, elements
 from ..forces.joints import JointEffort
 from ..linkage.coordinates import State, real_state
@@ -79,7 +81,7 @@ def step(
         raise ValueError(
             "forces: expected elements without a state of their own, which would be "
             "lost (simulate takes such states as own0 and returns them), got "
-            f"{forces!r}."
+            f"{shown(forces)}."
         )
     check_linkage(linkage)
     state = real_state("state", state, linkage)
@@ -216,7 +218,7 @@ def simulate_sampled(
         if not isinstance(noise, tuple | list) or len(noise) != 2:
             raise ValueError(
                 "noise: expected a pair of standard deviations, of positions and of "
-                f"velocities, got {noise!r}."
+                f"velocities, got {shown(noise)}."
             )
         spread = State(
             *(
@@ -234,7 +236,12 @@ def simulate_sampled(
     if options.get("solver") is None and not is_traced(inputs):
         # Traced in `_motion`, `simulate` would take the solver of large batches.
         options["solver"] = LoopedDopri8()
-    return _motion(*inputs, options)
+
+    def run(control, forces):
+        rest = late, spread, keys, options
+        return _motion(linkage, state0, control, times, forces, *rest)
+
+    return sharing_functions(run, control=control, forces=forces)
 
 
 @eqx.filter_jit  # not traced anew at each call

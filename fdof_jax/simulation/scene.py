@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ..base.checks import instance
+from ..base.checks import instance, shown
 from ..forces.element import Forces, elements, of_full_size
 from ..linkage.coordinates import State
 from ..linkage.linkage import Linkage
@@ -70,7 +70,7 @@ def stacked(scenes: Sequence[Any], name: str = "scenes") -> Any:
     (2, 3)
     """
     if not isinstance(scenes, list | tuple) or isinstance(scenes, Scene) or not scenes:
-        raise ValueError(f"{name}: expected a list of scenes, got {scenes!r}.")
+        raise ValueError(f"{name}: expected a list of scenes, got {shown(scenes)}.")
     first, *others = map(_parts, scenes)
     for index, other in enumerate(others, start=1):
         if not eqx.tree_equal(other[1], first[1]) or jax.tree.map(
@@ -78,7 +78,7 @@ def stacked(scenes: Sequence[Any], name: str = "scenes") -> Any:
         ) != jax.tree.map(np.shape, first[0]):
             raise ValueError(
                 f"{name}[{index}]: expected one like {name}[0] except for numbers, got "
-                f"{scenes[index]!r} and {scenes[0]!r}."
+                f"{shown(scenes[index])} and {shown(scenes[0])}."
             )
     rows = [first[0], *(other[0] for other in others)]
     arrays = jax.tree.map(lambda *a: np.stack([_as_array(x) for x in a]), *rows)
@@ -93,7 +93,7 @@ def unstacked(name: str, scenes: Scene) -> list[Scene]:
     if len(sizes) != 1 or sizes <= {(), (0,)}:
         raise ValueError(
             f"{name}: expected scenes stacked along a leading axis of one size (see "
-            f"`stacked`), got axes {sorted(sizes)}."
+            f"`stacked`), got axes {shown(sorted(sizes))}."
         )
     leaves, structure = jax.tree.flatten(arrays)
     return [

@@ -14,7 +14,6 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from ..base.callbacks import without_checks
 from ..forces.element import elements
 from ..linkage.linkage import without_fixed
 from .field import args_of, initial_own, own_states, whole
@@ -26,6 +25,7 @@ from .solution import Solution
 from .steps import adaptive, of_precision
 from .switch_derivatives import first_of
 from .switching import Located, located
+from .unchecked import diffeqsolve
 from .zeros_in_steps import slope_at_end
 
 # Tolerance of the motion and its derivatives, whichever are larger. The steps that the
@@ -204,21 +204,20 @@ def sensitivities(
     solver, controller, y0 = located(
         locate, solver, controller, term, ts[0], y0, _Varied(z), jumps
     )
-    with without_checks():
-        found = diffrax.diffeqsolve(
-            term,
-            solver,
-            t0=ts[0],
-            t1=ts[-1],
-            dt0=1e-3,
-            y0=y0,
-            args=_Varied(z),
-            saveat=diffrax.SaveAt(ts=ts, fn=lambda t, y, args: y[0]),
-            stepsize_controller=controller,
-            adjoint=diffrax.ForwardMode(),
-            max_steps=65536,
-            throw=False,
-        )
+    found = diffeqsolve(
+        term,
+        solver,
+        t0=ts[0],
+        t1=ts[-1],
+        dt0=1e-3,
+        y0=y0,
+        args=_Varied(z),
+        saveat=diffrax.SaveAt(ts=ts, fn=lambda t, y, args: y[0]),
+        stepsize_controller=controller,
+        adjoint=diffrax.ForwardMode(),
+        max_steps=65536,
+        throw=False,
+    )
     assert found.ys is not None  # because of saveat
     # diffrax leaves infinity at times that it did not reach.
     states = jnp.where(jnp.isinf(found.ys), jnp.nan, found.ys)

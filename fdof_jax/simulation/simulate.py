@@ -15,7 +15,9 @@ from ..base.checks import (
     increasing,
     instance,
     is_traced,
+    plain,
     real_array,
+    shown,
     single_precision,
     whole_number,
 )
@@ -30,10 +32,10 @@ from ..forces.element import (
 from ..forces.part import check_values
 from ..linkage.coordinates import State, real_state
 from ..linkage.linkage import Linkage, check_linkage, possible
-from .failures import cause, check_arguments
+from .failures import cause, check_arguments, reason
 from .field import initial_states
 from .prescribed import agrees, prescribed
-from .solution import Solution
+from .solution import OUTCOMES, Solution, outcome_numbers
 from .solve import solve
 from .steps import at_tolerances, within_reach
 
@@ -70,7 +72,7 @@ def solve_options(
         if stepsize_controller is not None:
             raise ValueError(
                 "rtol, atol: expected none beside a stepsize_controller, which has "
-                f"its own tolerances, got rtol={rtol!r} and atol={atol!r}."
+                f"its own tolerances, got rtol={shown(rtol)} and atol={shown(atol)}."
             )
         stepsize_controller = at_tolerances(rtol, atol)
     if stepsize_controller is not None:
@@ -91,8 +93,8 @@ def check_elements(forces: Forces, linkage: Linkage, ts: Array) -> None:
     """Checks the elements' values, where known, and runs their own checks."""
     for index, element in enumerate(elements_on(linkage, forces)):
         place, values = f"forces[{index}]", in_numpy(element)
-        if values.jump_ts is not None:
-            real_array(f"{place}.jump_ts", values.jump_ts, (None,))
+        if (jumps := values.jump_ts) is not None:
+            real_array(f"{place}.jump_ts", jumps, (None,) if np.ndim(jumps) else ())
         single_precision(place, element)
         if is_traced(linkage, ts, element):
             continue
@@ -102,7 +104,7 @@ def check_elements(forces: Forces, linkage: Linkage, ts: Array) -> None:
         if not values.possible():
             raise ValueError(
                 f"{place}: expected values that its constructor accepts, got "
-                f"{eqx.tree_pformat(element, short_arrays=False)}."
+                f"{plain(eqx.tree_pformat(element, short_arrays=False))}."
             )
 
 
@@ -217,10 +219,9 @@ def simulate(
             ) from error
         raise
     if throw and not succeeded:
-        raise RuntimeError(
-            f"simulate: {solution.outcome} at t = "
-            f"{float(solution.stats['time_reached']):g} s. {cause(inputs, solution)}"
-        )
+        reached = float(solution.stats["time_reached"])
+        why = cause(inputs, keywords, solution)
+        raise RuntimeError(f"simulate: {solution.outcome} at t = {reached:g} s. {why}")
     return solution
 
 
@@ -239,7 +240,9 @@ def _raising(solution: Solution, inputs: tuple[Any, ...]) -> Solution:
         raising = eqx.branched_error_if(
             solution, faults.any(), jnp.argmax(faults), messages
         )
-        return raising.result.error_if(raising, failed)
+        number = outcome_numbers(raising.result)
+        words = [f"simulate: {outcome}. {reason(outcome)}" for outcome in OUTCOMES]
+        return eqx.branched_error_if(raising, failed, number, words)
     except ValueError as error:
         # Under `vmap` over no members equinox takes the maximum of none.
         if "zero-size array" not in str(error):

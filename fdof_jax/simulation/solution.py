@@ -4,6 +4,7 @@ from typing import Any
 
 import diffrax
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jaxtyping import Float
@@ -21,15 +22,16 @@ OUTCOMES = (
 SLOW = 0.01
 
 
-def outcome_numbers(result: diffrax.RESULTS) -> np.ndarray:
-    """Returns the places of results in `OUTCOMES`."""
+def outcome_numbers(result: diffrax.RESULTS) -> Any:
+    """Returns the places of results in `OUTCOMES`, by NumPy unless they are traced."""
     results: Any = diffrax.RESULTS
     ordered = (
         results.successful, results.singular, results.nonfinite,
         results.max_steps_reached, results.dt_min_reached, results.max_steps_rejected,
     )  # fmt: skip
-    cases = [np.asarray(result == one) for one in ordered]
-    return np.select(cases, range(len(cases)), default=len(cases))
+    xp = jnp if is_traced(result) else np
+    cases = [xp.asarray(result == one) for one in ordered]
+    return xp.select(cases, [*range(len(cases))], default=len(cases))
 
 
 class WithOutcome(eqx.Module):

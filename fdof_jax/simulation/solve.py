@@ -12,6 +12,7 @@ from jax.flatten_util import ravel_pytree
 
 from ..base.checks import is_traced
 from ..base.configuration import options_of_loops
+from ..base.functions import sharing_functions
 from ..forces.added_inertia import inertial
 from ..forces.element import Element, ForeignElement
 from .derivative_control import TANGENTS
@@ -47,15 +48,27 @@ def _solve_one(inputs, keywords) -> tuple[Solution, bool] | None:
     Returns None if a force element holds a traced value.
     """
     linkage, state0, ts, own0, forces = inputs
-    known = linkage, state0, padded(ts), own0, forces
-    # A function's closure may hold a traced value, and JAX refuses options then.
-    closed = any(map(callable, jax.tree.leaves(forces)))
-    run = _with_functions if closed else _without_functions
-    solution, succeeded = run(known, _of_any_tolerance(keywords))
-    if is_traced(solution):
+    keywords = _of_any_tolerance(keywords)
+    if (most := keywords["max_steps"]) is not None:
+        keywords |= {
+            "max_steps": np.int32(most)
+        }  # as data, of which programs know none
+
+    def run(forces):
+        if is_traced(forces):  # by the closure of a function
+            return None, None
+        known = linkage, state0, padded(ts), own0, forces
+        # Another function's closure may hold one too, and JAX refuses options then.
+        closed = any(map(callable, jax.tree.leaves(forces)))
+        solve = _with_functions if closed else _without_functions
+        return solve(known, keywords)
+
+    solution, succeeded = sharing_functions(run, forces=forces)
+    if solution is None or is_traced(solution):
         return None
     q, qd, own = cut((solution.q, solution.qd, solution.own), len(ts))
-    whole = Solution(ts, q, qd, solution.stats, solution.result, own)
+    stats = solution.stats | {"max_steps": most}
+    whole = Solution(ts, q, qd, stats, solution.result, own)
     return whole, bool(succeeded)
 
 

@@ -28,14 +28,17 @@ from ..base.checks import (
     numpy_array,
     real_array,
     refusal,
+    shown,
     whole_number,
 )
 from ..base.devices import devices_outside_mesh, uncommitted
+from ..base.functions import sharing_functions
+from ..base.whole_files import folder_path
 from ..forces.element import Forces, elements, elements_on
 from ..linkage.coordinates import State
 from ..linkage.linkage import Linkage
 from .batch_axes import Batch, batch_of, check_arms
-from .checkpoints import Checkpoint, folder_at
+from .checkpoints import Checkpoint
 from .chunk_programs import outcome_of
 from .chunks import Job, in_chunks, usual_chunk
 from .dopri8 import constant
@@ -111,7 +114,7 @@ def _check_elements(batch: Batch, ts: Array, forces_axes: Any) -> None:
     except TypeError as error:
         raise TypeError(
             "forces, forces_axes: expected force elements that work for one member, "
-            f"got an error with forces_axes={forces_axes!r}: {error}"
+            f"got an error with forces_axes={shown(forces_axes)}: {error}"
         ) from error
 
 
@@ -155,8 +158,7 @@ def sweep(
       tuple of these with one entry per element.
     - `reduce`: a function of one member's `Solution`, for instance
       `lambda motion: motion.q[-1]`; of each member only the arrays that it returns are
-      kept, also in a checkpoint. It is part of the compiled program: pass the same
-      function object to reuse that program.
+      kept, also in a checkpoint. Functions of equal code share a compiled program.
     - `chunk`: largest number of members to solve together, per device. None stands for
       128; or 256 where a CPU has several cores, unless the results go to a checkpoint
       or store, which any machine may resume.
@@ -188,7 +190,9 @@ def sweep(
     try:
         q, qd = (jnp.asarray(a) if is_traced(a) else numpy_array(a) for a in state0)
     except (TypeError, ValueError):
-        raise ValueError(f"state0: expected a State(q, qd), got {state0!r}.") from None
+        raise ValueError(
+            f"state0: expected a State(q, qd), got {shown(state0)}."
+        ) from None
     ts = real_array("ts", ts, (None,))
     # Other kinds than real numbers are refused by `batch_of`.
     other = lambda a: a.dtype != ts.dtype and a.dtype.kind in "iuf"
@@ -249,19 +253,25 @@ def sweep(
             )
         return whole(_traced(batch, ts, settings, keep, chunk))
     with devices_outside_mesh() as devices:
-        job = Job(batch, ts, settings, keep, chunk, devices)
+        solved = lambda solve: sharing_functions(
+            lambda forces, reduce: solve(
+                Job(batch.with_forces(forces), ts, settings, reduce, chunk, devices)
+            ),
+            forces=batch.inputs[2],
+            reduce=keep,
+        )
         if store is not None:
-            folder = folder_at("store", store)
+            folder = folder_path("store", store)
             like, digest = outline(batch, ts, settings, keep)
             group = Store(folder, batch, ts, like, chunk, digest)
             blocks = range(shard, group.count, of)
-            check(in_store(group, blocks, job, progress_meter))
+            check(solved(lambda job: in_store(group, blocks, job, progress_meter)))
             return folder
         resumed = None
         if checkpoint is not None:
-            folder = folder_at("checkpoint", checkpoint)
+            folder = folder_path("checkpoint", checkpoint)
             _, digest = outline(batch, ts, settings, keep)
             resumed = Checkpoint(folder, digest)
-        kept, failed = in_chunks(job, resumed, progress_meter)
+        kept, failed = solved(lambda job: in_chunks(job, resumed, progress_meter))
     check(np.flatnonzero(failed))
     return whole(kept)

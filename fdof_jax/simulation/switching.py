@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from ..base.checks import shown
 from .dopri8 import DenseOutput, constant, with_change
 from .landing import Landing, rounding
 from .step_wrappers import Undifferentiated, with_judge
@@ -76,7 +77,7 @@ def located(
         if jumps is not None:
             raise ValueError(
                 "stepsize_controller: expected an adaptive one, as forces declare "
-                f"times at which they jump (jump_ts), got {controller!r}."
+                f"times at which they jump (jump_ts), got {shown(controller)}."
             )
         return solver, controller, y0
     jumps = None if jumps is None else jnp.asarray(jumps, t0.dtype)

@@ -6,7 +6,7 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
-from ..base.checks import instance, real_array, whole_number
+from ..base.checks import instance, real_array, refusal, whole_number
 from ..control.model_based import ModelBased
 from ..linkage.coordinates import State
 from ..linkage.linkage import Linkage, check_linkage
@@ -119,9 +119,7 @@ def perturbed(
     linkage, controller = scene.linkage, controller_of(scene)
     varied = bool((ranges["speed"] != 1).any())
     if varied and reference_of(controller.reference).period is None:
-        raise ValueError(
-            f"speed: expected (1, 1) for a reference without a `period`, got {speed!r}."
-        )
+        raise refusal("speed", "(1, 1) for a reference without a `period`", speed)
     if isinstance(controller, ModelBased) and controller.model is None:
         none = lambda node: node is None
         known = eqx.tree_at(lambda c: c.model, controller, linkage, is_leaf=none)

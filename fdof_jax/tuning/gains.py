@@ -8,7 +8,7 @@ import numpy as np
 from jax import Array
 
 from ..analysis.tracking import relative_demands
-from ..base.checks import instance, is_traced, real_array
+from ..base.checks import instance, is_traced, real_array, shown
 from ..linkage.linkage import joint_names
 from ..references.reference import reference_of
 from ..search.methods import Evaluation
@@ -82,8 +82,8 @@ def check_tuned(name: str, scene: Any, loss: Any = tip_errors) -> None:
     instance(name, scene, Scene)
     if is_traced(scene):
         raise ValueError(
-            f"{name}: expected known values, got {scene!r}: gains are tuned outside of "
-            "JAX's transformations."
+            f"{name}: expected known values, got {shown(scene)}: gains are tuned "
+            "outside of JAX's transformations."
         )
     t1 = real_array(f"{name}.t1", scene.t1, (), above=0)
     check_scene(name, scene, jnp.stack([jnp.zeros_like(t1), t1]))
@@ -94,7 +94,7 @@ def check_tuned(name: str, scene: Any, loss: Any = tip_errors) -> None:
         if reference_of(reference).tip is None:
             raise ValueError(
                 f"{name}: expected its controller to track a task with a `tip`, which "
-                f"the tip error needs, got {reference!r}."
+                f"the tip error needs, got {shown(reference)}."
             )
 
 
@@ -119,9 +119,9 @@ def bounds_of(scene: Scene, factor: Any, bounds: Any) -> tuple[np.ndarray, ...]:
         factor = float(real_array("factor", factor, (), above=1))
         return start, start / factor, start * factor
     if factor is not None:
-        raise ValueError(f"factor: expected none beside bounds, got {factor!r}.")
+        raise ValueError(f"factor: expected none beside bounds, got {shown(factor)}.")
     if not isinstance(bounds, tuple | list | np.ndarray) or len(bounds) != 2:
-        raise ValueError(f"bounds: expected (lower, upper), got {bounds!r}.")
+        raise ValueError(f"bounds: expected (lower, upper), got {shown(bounds)}.")
     lower, upper = (
         np.asarray(real_array(f"bounds[{i}]", b, start.shape, minimum=0))
         for i, b in enumerate(bounds)

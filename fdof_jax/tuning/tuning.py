@@ -138,7 +138,7 @@ def tune(
     are integrated beside the motion at a tolerance of 1e-5. Their relative error is
     about 1e-6, and some 1e-4 where actuators are at their limits for long;
     `gradient_report` measures it. A second call with other numbers or another method
-    compiles nothing; a call with another loss function does.
+    compiles nothing; a call with a loss function of other code does.
 
     **Arguments:**
 

@@ -1,0 +1,200 @@
+"""Plain functions as data, so that functions of equal code share compiled programs.
+
+JAX knows a function by its identity: each `lambda` of a loop would need a program of
+its own, which JAX keeps for good. Here a function is its code and what it reaches: the
+values of its closure, defaults and global names. Numbers among them are arrays, of
+which new values need no new program. A function that reaches anything that may change
+unseen, such as an object or a module of the user, stays as it is.
+"""
+
+import builtins
+import dis
+import functools
+import inspect
+import types
+import weakref
+from collections import Counter
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .user_warnings import warn
+
+# Packages whose functions, classes and constants do not change.
+_FIXED = {
+    "builtins", "cmath", "diffrax", "equinox", "fdof_jax", "functools", "itertools",
+    "jax", "jaxlib", "math", "numpy", "operator", "optimistix", "scipy",
+}  # fmt: skip
+_JITTED = type(jax.jit(lambda: None))
+_CONSTANTS = bool | int | str | bytes | np.dtype | np.ufunc | jnp.ufunc | _JITTED
+# What these do depends on more than the names in the code.
+_OPAQUE = {"eval", "exec", "globals", "locals", "vars", "super"}
+
+# Kinds of numbers that are data. Code that uses them in Python, as lengths or where it
+# decides, is known by fewer of them, at last by none.
+_DATA = (float, np.floating, int), (float, np.floating)
+_fewer: Counter[types.CodeType] = Counter()
+
+
+class _Unknown(Exception):
+    """Raised for a function that reaches what may change unseen."""
+
+
+class SharedFunction(eqx.Module):
+    """A function in parts; equal but for numbers with all functions of equal code."""
+
+    reach: Any  # values of the closure, defaults, keyword defaults, global names
+    code: types.CodeType = eqx.field(static=True)
+
+    def __call__(self, *arguments: Any, **keywords: Any) -> Any:
+        closure, defaults, of_keywords, names = self.reach
+        cells = tuple(map(types.CellType, closure))
+        names = names | {"__builtins__": builtins}
+        function = types.FunctionType(self.code, names, None, defaults, cells)
+        function.__kwdefaults__ = of_keywords
+        before = jax.tree.structure(self.reach)
+        returned = function(*arguments, **keywords)
+        if jax.tree.structure(self.reach) != before:
+            raise TypeError("it changes a list or a dict outside, here a copy")
+        return returned
+
+
+def sharing_functions(run: Callable[..., Any], **trees: Any) -> Any:
+    """Returns `run(*trees)`, with plain functions in the trees in their shared form.
+
+    The third callable alike that needs a program of its own brings a warning that names
+    its tree.
+    """
+    if not any(map(callable, jax.tree.leaves(trees))):
+        return run(*trees.values())
+    while True:
+        shared = jax.tree.map(_shared, trees)
+        nodes = jax.tree.leaves(shared, is_leaf=_is_shared)
+        codes = {node.code for node in nodes if _is_shared(node)}
+        try:
+            found = run(*shared.values())
+            break
+        except (TypeError, ValueError, AttributeError, IndexError):
+            if not codes:
+                raise
+        _fewer.update(codes)
+    _warn_of_third(shared)
+    return found
+
+
+def _is_shared(node: Any) -> bool:
+    return isinstance(node, SharedFunction)
+
+
+def _shared(leaf: Any) -> Any:
+    """Returns a plain function in its shared form if possible; else the leaf itself."""
+    if not inspect.isfunction(leaf) or leaf.__closure__ is None and _is_fixed(leaf):
+        return leaf
+    try:
+        return _parts_of(leaf)
+    except (_Unknown, TypeError, ValueError):  # such as keys that cannot be sorted
+        return leaf
+
+
+def _parts_of(function: Any, within: tuple[Any, ...] = ()) -> SharedFunction:
+    code = function.__code__
+    if function.__dict__ or function in within or _fewer[code] >= len(_DATA):
+        raise _Unknown
+    among = function.__globals__
+    names = {name: among[name] for name in _global_names(code) if name in among}
+    try:
+        closure = tuple(cell.cell_contents for cell in function.__closure__ or ())
+    except ValueError:  # an empty cell
+        raise _Unknown from None
+    numbers, within = _DATA[_fewer[code]], (*within, function)
+
+    def part(leaf: Any) -> Any:
+        if isinstance(leaf, numbers) and not isinstance(leaf, bool):
+            return np.asarray(leaf, jnp.result_type(type(leaf)))
+        if isinstance(leaf, jax.Array) or type(leaf) is np.ndarray:
+            return leaf
+        if isinstance(leaf, _CONSTANTS) or _is_fixed(leaf):
+            return leaf
+        if inspect.isfunction(leaf):
+            return _parts_of(leaf, within)
+        raise _Unknown
+
+    reach = closure, function.__defaults__, function.__kwdefaults__, names
+    return SharedFunction(jax.tree.map(part, reach), code)
+
+
+@functools.lru_cache(maxsize=1024)
+def _global_names(code: types.CodeType) -> frozenset[str]:
+    """Returns the global names that code reads; raises _Unknown if it writes any."""
+    names = set()
+    for instruction in dis.get_instructions(code):
+        if instruction.opname in ("STORE_GLOBAL", "DELETE_GLOBAL", "IMPORT_NAME"):
+            raise _Unknown
+        if instruction.opname in ("LOAD_GLOBAL", "LOAD_NAME"):
+            names.add(instruction.argval)
+        if isinstance(instruction.argval, types.CodeType):
+            names |= _global_names(instruction.argval)
+    if names & _OPAQUE:
+        raise _Unknown
+    return frozenset(names)
+
+
+def _is_fixed(value: Any) -> bool:
+    """Returns whether it is a module of a known package, or its function or class."""
+    home = None
+    if inspect.ismodule(value):
+        home = value.__name__
+    elif inspect.isfunction(value) or inspect.isclass(value):
+        home = value.__module__
+    elif inspect.isbuiltin(value):  # without one if bound to an object
+        home = value.__module__
+    return home is not None and home.partition(".")[0] in _FIXED
+
+
+# Callables that JAX knows by identity, and keys of the others: each has a program.
+_known: weakref.WeakSet[Any] = weakref.WeakSet()
+_keys: set[int] = set()
+_alike: Counter[Any] = Counter()  # by their code or type
+
+
+def _warn_of_third(trees: dict[str, Any]) -> None:
+    nodes = jax.tree.leaves(trees, is_leaf=_is_shared)
+    new = [node for node in nodes if callable(node) and _is_new(node)]
+    if not new:
+        return
+    leaves, _ = jax.tree_util.tree_flatten_with_path(trees, is_leaf=_is_shared)
+    for (tree, *path), leaf in leaves:
+        if not any(leaf is node for node in new):
+            continue
+        inner = inspect.unwrap(leaf)
+        code = inner.__code__ if inspect.isfunction(inner) else None
+        if isinstance(leaf, SharedFunction):
+            code = leaf.code
+        _alike[code or type(leaf)] += 1
+        if _alike[code or type(leaf)] == 3:
+            place = (tree.key + jax.tree_util.keystr(tuple(path[:1]))).lstrip("_.")
+            name = code.co_qualname if code else type(leaf).__qualname__
+            warn(
+                f"{place}: expected the same function at each call, got a third one "
+                f"like {name}; each needs a program of its own, compiled in seconds "
+                "and tens of megabytes. Define it once, outside of loops, or as an "
+                "Equinox module (an Element), whose arrays are data."
+            )
+
+
+def _is_new(leaf: Any) -> bool:
+    """Returns whether a callable needs a program that none before it needed."""
+    if _is_shared(leaf):
+        leaves, structure = jax.tree.flatten(leaf)
+        key = hash((structure, *(x for x in leaves if not eqx.is_array(x))))
+        new = key not in _keys
+        _keys.add(key)
+        return new
+    if isinstance(leaf, _CONSTANTS) and not isinstance(leaf, _JITTED) or leaf in _known:
+        return False
+    _known.add(leaf)
+    return True

@@ -1,0 +1,129 @@
+"""diffrax's `diffeqsolve` without run-time checks, which call back into Python.
+
+JAX 0.10 keeps no program with such calls in its persistent cache, and no version can
+export one. diffrax makes them to check that the first step has the right sign, and that
+output times increase and lie within the solve. `simulate` ensures this itself, or
+reports it in its result. Here both arguments reach diffrax in a form that leaves
+nothing to check; checks by a user's own code stay.
+
+Equinox has a switch for all its checks, but one for the whole process. It would also
+switch off those of other threads, and those that JAX has traced once for equal shapes.
+"""
+
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from .step_wrappers import Adaptive
+
+
+def diffeqsolve(
+    *arguments: Any,
+    dt0: Any,
+    saveat: diffrax.SaveAt,
+    stepsize_controller: diffrax.AbstractStepSizeController,
+    max_steps: Any,
+    **keywords: Any,
+) -> diffrax.Solution:
+    """Calls `diffrax.diffeqsolve` without its checks of `dt0` and of output times.
+
+    `max_steps` may also be an array, of which new values need no new program.
+    """
+    kind = diffrax.AbstractAdaptiveStepSizeController
+    adaptive = isinstance(stepsize_controller, kind)
+    framed: Any = _FramedAdaptive if adaptive else _Framed
+    counted = max_steps is not None and not isinstance(max_steps, int)
+    found = diffrax.diffeqsolve(
+        *arguments,
+        dt0=None,
+        saveat=eqx.tree_at(_output_times, saveat, replace_fn=_Times),
+        stepsize_controller=framed(
+            stepsize_controller, dt0, max_steps if counted else None
+        ),
+        max_steps=None if counted else max_steps,
+        **keywords,
+    )
+    if not (counted and saveat.controller_state):
+        return found
+    assert found.controller_state is not None
+    state, *_ = found.controller_state
+    return eqx.tree_at(lambda found: found.controller_state, found, state)
+
+
+def _output_times(saveat: diffrax.SaveAt) -> list[Array]:
+    one = lambda node: isinstance(node, diffrax.SubSaveAt)
+    found = [sub.ts for sub in jax.tree.leaves(saveat.subs, is_leaf=one)]
+    return [ts for ts in found if ts is not None]
+
+
+class _Times(eqx.Module):
+    """An array of output times of which comparisons as a whole find no fault."""
+
+    values: Array
+
+    @property
+    def dtype(self):
+        return self.values.dtype
+
+    def astype(self, dtype):
+        return _Times(self.values.astype(dtype))
+
+    def __len__(self):
+        return len(self.values)
+
+    def __mul__(self, direction):
+        return _Times(self.values * direction)
+
+    def __getitem__(self, index):
+        found = self.values[index]
+        return found if found.ndim == 0 else _Times(found)
+
+    def __lt__(self, other):
+        return False
+
+    __gt__ = __lt__
+
+
+class _Framed(diffrax.AbstractStepSizeController):
+    """A controller that brings its first step size [s] and greatest number of steps."""
+
+    controller: Any
+    dt0: Any
+    most: Any
+
+    def wrap(self, direction):
+        inner = self.controller.wrap(direction)
+        return eqx.tree_at(lambda c: c.controller, self, inner)
+
+    def init(self, *arguments):  # pyright: ignore[reportIncompatibleMethodOverride]
+        *before, _, args, func, order = arguments
+        first, state = self.controller.init(*before, self.dt0, args, func, order)
+        if self.most is None:
+            return first, state
+        _, _, end, *_ = arguments
+        return first, (state, jnp.zeros((), jnp.int32), jax.lax.stop_gradient(end))
+
+    def adapt_step_size(self, *arguments):  # pyright: ignore[reportIncompatibleMethodOverride]
+        if self.most is None:
+            return self.controller.adapt_step_size(*arguments)
+        *arguments, (state, count, end) = arguments
+        *step, state, result = self.controller.adapt_step_size(*arguments, state)
+        _, start, *_ = step
+        count = count + 1
+        spent = (count >= self.most) & (start < end)
+        spent = spent & (result == diffrax.RESULTS.successful)
+        reached = diffrax.RESULTS.max_steps_reached
+        result = diffrax.RESULTS.where(spent, reached, result)
+        return *step, (state, count, end), result
+
+
+class _FramedAdaptive(_Framed, Adaptive):  # pyright: ignore[reportIncompatibleMethodOverride]
+    """As `_Framed`, of an adaptive controller."""
+
+    controller: Any
+    dt0: Any
+    most: Any

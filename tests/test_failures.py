@@ -1,0 +1,76 @@
+"""Messages of failed motions: what stopped them, from facts, and what helps."""
+
+import re
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import fdof_jax as fj
+
+PENDULUM = fj.Linkage(
+    "R",
+    length=[0, 1],
+    com=[[0.5, 0]],
+    mass=[1],
+    inertia=[1 / 12],
+    base_angle=-np.pi / 2,
+)
+START = fj.State([1.0], [0.0])
+
+
+def message(ts, forces=(), state0=START, **options):
+    with pytest.raises(RuntimeError) as raised:
+        fj.simulate(PENDULUM, state0, ts, forces, **options)
+    return str(raised.value)
+
+
+@pytest.mark.parametrize("tolerance", [1e-11, 1e-6])
+def test_an_overdamped_arm_needs_an_implicit_solver(tolerance):
+    damper, few = fj.JointDamper(3e4), dict(rtol=tolerance, atol=tolerance)
+    words = message([0, 5.0], (damper,), max_steps=2000, **few)
+    assert "implicit solver (solver=diffrax.Kvaerno5())" in words
+    assert "raise max_steps" not in words
+    # The mode of the damper: 3e4 N m s over 1/3 kg m^2.
+    rate = float(re.search(r"mode of (\S+)/s", words).group(1))
+    assert rate == pytest.approx(9e4, rel=1e-2)
+    implicit = dict(solver=diffrax.Kvaerno5(), rtol=1e-6, atol=1e-6)
+    fj.simulate(PENDULUM, START, [0, 5.0], (damper,), max_steps=2000, **implicit)
+
+
+def test_a_long_motion_needs_more_steps():
+    words = message([0, 400.0], max_steps=500)
+    assert "short" not in words and "implicit" not in words
+    needed = re.search(r"some ([\d,]+) steps: raise max_steps", words).group(1)
+    needed = int(needed.replace(",", ""))
+    motion = fj.simulate(PENDULUM, START, [0, 400.0])
+    assert needed == pytest.approx(int(motion.stats["num_steps"]), rel=0.1)
+
+
+def test_an_effort_that_feeds_itself_diverges():
+    feeds = lambda t, q, qd, linkage: qd**3
+    words = message([0, 5.0], (feeds,), fj.State([1.0], [1.0]), max_steps=150)
+    assert "grows by a rate of" in words and "Kvaerno5" not in words
+
+
+def test_a_function_without_derivatives_may_run_out_of_steps():
+    def called(t, q, qd, linkage):
+        return jax.pure_callback(lambda q: -np.asarray(q), q, q)
+
+    assert "raise max_steps" in message([0, 9.0], (called,), max_steps=20)
+
+
+def test_branches_that_push_towards_each_other():
+    pushed = lambda t, q, qd, linkage: -fj.forces.switch(qd, 10.0, -10.0)
+    words = message([0, 1.0], (pushed,))
+    assert "too many switches" in words and "push towards each other" in words
+    assert "ClipStepSizeController" not in words
+
+    @jax.jit
+    def traced(q):
+        return fj.simulate(PENDULUM, fj.State(q, 0 * q), [0, 1.0], (pushed,)).q
+
+    with pytest.raises(Exception, match="too many switches. Elements switch"):
+        traced(jnp.ones(1)).block_until_ready()

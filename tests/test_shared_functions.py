@@ -1,0 +1,254 @@
+"""Functions of equal code share a program; what they close over is data."""
+
+import functools
+import types
+import warnings
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import fdof_jax as fj
+from fdof_jax.base.functions import sharing_functions
+from fdof_jax.identification import problems
+from fdof_jax.simulation import chunk_programs, solve
+
+ARM, START, *_ = fj.scenes.fig5()
+TS = np.linspace(0, 0.1, 4)
+
+
+@pytest.fixture
+def traces(monkeypatch):
+    """Counts the calls of a module's function, which are made while JAX traces."""
+
+    def of(module, name):
+        counted, function = [], vars(module)[name]
+
+        def counting(*arguments, **keywords):
+            counted.append(name)
+            return function(*arguments, **keywords)
+
+        monkeypatch.setattr(module, name, counting)
+        return counted
+
+    return of
+
+
+# Of a function called on 2
+
+
+def damping(k):
+    return lambda x: -k * x
+
+
+def by_default(k):
+    return lambda x, k=k, *, scale=k: -k * x + 0 * scale
+
+
+def with_array(k):
+    row = k * np.ones(2)
+    return lambda x: -row[0] * x
+
+
+def scaled(k, x):
+    return FACTOR * k * x
+
+
+FACTOR = -1.0
+
+
+def with_helper(k):
+    return lambda x: scaled(k, jnp.asarray(x))
+
+
+def nested(k):
+    return lambda x: jax.vmap(lambda y: -k * y)(x[None])[0]
+
+
+def of_global(k):
+    global RATE
+    RATE = k
+    return lambda x: -RATE * x
+
+
+def of_arm(k):
+    arm = ARM.replace(gravity=k)
+    return lambda x: -arm.gravity * x
+
+
+def of_whole_number(k):
+    k = int(k)
+    return lambda x: -k * x
+
+
+def with_length(k):
+    n = 2
+    return lambda x: -k * jnp.ones(n)[0] * x
+
+
+def by_range(k):
+    n = int(k) - 1
+    return lambda x: -x * (1 + sum(1 for _ in range(n)))
+
+
+def chosen(k):
+    def force(x):
+        if k > 2.5:  # decided in Python
+            return -k * x
+        return x * -k
+
+    return force
+
+
+def in_numpy(k):
+    return lambda x: x * np.linalg.norm([k, 0.0]) * -1
+
+
+def of_object(k):
+    held = types.SimpleNamespace(k=k)
+    return lambda x: -held.k * x
+
+
+def counting(k):
+    def force(x):
+        CALLS.append(k)
+        return -k * x
+
+    return force
+
+
+CALLS = []
+
+
+def partial(k):
+    return functools.partial(lambda k, x: -k * x, k)
+
+
+SHARED = [
+    damping, by_default, with_array, with_helper, nested, of_global, of_arm,
+    of_whole_number, with_length,
+]  # fmt: skip
+OWN = [by_range, counting, chosen, in_numpy, of_object, partial]
+
+
+@pytest.mark.parametrize("make", SHARED + OWN)
+def test_numbers_of_functions_are_right(make):
+    traced = []
+
+    @eqx.filter_jit
+    def run(functions):
+        traced.append(make)
+        return functions[0](jnp.array(2.0))
+
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        found = [
+            float(sharing_functions(run, forces=(make(k),))) for k in (1.0, 2.0, 3.0)
+        ]
+    assert found == [-2, -4, -6]
+    assert CALLS == [1, 2, 3] * (make is counting)
+    CALLS.clear()
+    if make in SHARED:
+        assert len(traced) == 1 + (make is with_length) and not caught
+    else:
+        (warning,) = caught
+        words = str(warning.message)
+        assert words.startswith("forces[0]: ") and make.__name__ in words
+        assert "Equinox module" in words and warning.filename == __file__
+
+
+def test_functions_of_equal_code_that_call_others_share_nothing():
+    run = eqx.filter_jit(lambda function: function(jnp.array(2.0)))
+    for helper in (jnp.cos, lambda x: 3 * x):
+        force = lambda x, helper=helper: helper(x)
+        assert float(sharing_functions(run, force=force)) == float(helper(2.0))
+
+
+def test_a_function_that_fails_says_so_itself():
+    run = eqx.filter_jit(lambda function: function(jnp.array(2.0)))
+    for k in (1.0, 2.0):
+        with pytest.raises(TypeError, match="unexpected keyword"):
+            sharing_functions(run, force=lambda x, k=k: jnp.sin(x, k=k))
+
+
+# In the library
+
+
+def drag(k):
+    return lambda t, q, qd, linkage: -k * qd
+
+
+def test_motions_in_a_loop_share_a_program(traces):
+    counted = traces(solve, "integrate")
+    for k in (1.0, 4.0):
+        found = fj.simulate(ARM, START, TS, (drag(k),))
+        expected = fj.simulate(ARM, START, TS, (fj.JointDamper(k),))
+        np.testing.assert_allclose(found.q, expected.q, atol=1e-9)
+        total = fj.joint_efforts(ARM, (drag(k),), found).total
+        np.testing.assert_allclose(total, -k * found.qd, atol=1e-12)
+    assert len(counted) <= 2
+
+
+def test_the_number_of_steps_is_data(traces):
+    most = int(fj.simulate(ARM, START, TS).stats["num_steps"])
+    counted = traces(solve, "integrate")
+    for allowed in (most + 1, most):
+        motion = fj.simulate(ARM, START, TS, max_steps=allowed)
+        assert motion.stats["num_steps"] == most
+        assert motion.stats["max_steps"] == allowed
+    for allowed in (most - 1, 1):
+        motion = fj.simulate(ARM, START, TS, max_steps=allowed, throw=False)
+        assert motion.outcome == "out of steps"
+        assert motion.stats["num_steps"] == allowed
+        assert 0 < motion.stats["time_reached"] < TS[-1]
+    assert not counted
+
+
+@pytest.mark.parametrize(
+    "steps",
+    [
+        dict(stepsize_controller=diffrax.ConstantStepSize(), dt0=0.01),
+        dict(dt0=None, rtol=1e-6),
+    ],
+)
+def test_the_last_allowed_step_may_reach_the_end(steps):
+    solver = diffrax.Tsit5()
+    most = int(fj.simulate(ARM, START, TS, solver=solver, **steps).stats["num_steps"])
+    allowed = lambda n: fj.simulate(
+        ARM, START, TS, solver=solver, max_steps=n, throw=False, **steps
+    )
+    assert allowed(most).outcome == "successful"
+    assert allowed(most - 1).outcome == "out of steps"
+
+
+def test_sweeps_in_a_loop_share_a_program(traces):
+    counted, starts = traces(chunk_programs, "simulate"), []
+    for k in (1.0, 4.0):
+        states = fj.State(np.stack([START.q, START.q + 0.1]), START.qd)
+        ends = fj.sweep(
+            ARM, states, TS, (drag(k),), reduce=lambda motion, k=k: k * motion.q[-1]
+        )
+        one = fj.simulate(ARM, START, TS, (fj.JointDamper(k),))
+        np.testing.assert_allclose(ends[0], k * one.q[-1], atol=1e-8)
+        starts.append(len(counted))
+    assert starts[0] == starts[1] > 0
+
+
+def test_fits_in_a_loop_share_a_program(traces):
+    motion = fj.simulate(ARM, START, TS, (fj.JointDamper(2.0),))
+    counted, totals = traces(problems, "sensitivities"), []
+    for k in (2.0, 4.0):
+
+        def scene_at(parameters, k=k):
+            damper = fj.JointDamper(k * parameters["share"])
+            return fj.Scene(ARM, START, (damper,), 0.1)
+
+        found = fj.identification.fit(
+            scene_at, {"share": 0.8}, TS, motion.q, observe=lambda scene, m: m.q
+        )
+        np.testing.assert_allclose(found.parameters["share"], 2 / k, rtol=1e-6)
+        totals.append(len(counted))
+    assert totals[0] == totals[1] > 0
