@@ -15,7 +15,7 @@ from ..linkage.linkage import Linkage, check_linkage, without_fixed
 from .field import element_effort, with_states
 from .padding import cut, padded
 from .prescribed import prescribed, prescribed_effort
-from .sampled import Motion, SampledMotion, check_joints
+from .sampled import Motion, acting_in, check_joints
 from .simulate import check_own
 
 
@@ -57,8 +57,7 @@ def joint_efforts(linkage: Linkage, forces: Forces, solution: Motion) -> Efforts
             "solution: expected one motion (use jax.vmap for a batch), got positions "
             f"of shape {solution.q.shape}."
         )
-    if isinstance(solution, SampledMotion):
-        forces = solution.acting(forces)
+    forces = acting_in(solution, forces)
     check_own("solution.own", solution.own, forces, linkage, solution.ts.shape)
     forces = of_full_size(linkage, forces)
     rows = solution.ts, solution.q, solution.qd, solution.own
