@@ -23,7 +23,8 @@ class Efforts(NamedTuple):
     """Joint efforts along a motion, 0 at fixed pairs [N or N m].
 
     - `total`: sum over all force elements (time, n).
-    - `elements`: efforts of each force element (element, time, n).
+    - `elements`: efforts of each force element (element, time, n). The effort of a
+      motor is that of its element; the total has dampers, springs and loads as well.
     """
 
     total: Float[Array, "time joint"]

@@ -116,7 +116,7 @@ class SampledMotion(WithOutcome):
     result: diffrax.RESULTS
     own: tuple[Any, ...]
 
-    delay: ArrayLike = 0.0
+    delay: Float[Array, ""] | float = 0.0
     q_begin: Float[Array, "sample joint"] | None = None
 
     def __iter__(self) -> Iterator[Any]:
