@@ -76,7 +76,9 @@ def _push(depth, rate, stiffness, damping, width):
 def _penetration(depth, width):
     """Penetration at a depth, and its derivative where it is not 0."""
     if width is None:
-        return switch(depth, depth, 0, continuous=True), 1
+        # Not called continuous: derivatives then correct even what the time of the
+        # contact, as located, is off by, which matters at stiff stops.
+        return switch(depth, depth, 0), 1
     near, beyond = _parts(depth, width)
     return near**2 / (4 * width) + beyond, near / (2 * width)
 
