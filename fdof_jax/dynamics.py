@@ -28,7 +28,7 @@ def forward_dynamics(
     some cases where those are singular, such as a massless revolute tip.
 
     **Arguments:** `q` [m or rad], `qd` [m/s or rad/s], `tau` [N or N m]; `forces`:
-    force elements that add masses; their efforts count only if `tau` includes them.
+    elements, of which those with masses count; efforts count only if `tau` has them.
 
     **Returns:** `qdd` [m/s^2 or rad/s^2].
 
@@ -55,7 +55,7 @@ def inertia_ratios(
     digits. Below 1e-11 in float64 or 1e-5 in float32, `simulate` stops and reports it.
     It is zero where the matrix is not positive definite, and infinite at fixed pairs.
 
-    **Arguments:** `q` [m or rad]; `forces`: force elements that add masses.
+    **Arguments:** `q` [m or rad]; `forces`: elements, of which those with masses count.
 
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig5().linkage
@@ -77,9 +77,9 @@ def inverse_dynamics(
     """Computes joint efforts for given joint accelerations, from (14) reduced.
 
     **Arguments:** `q` [m or rad], `qd` [m/s or rad/s], `qdd` [m/s^2 or rad/s^2];
-    `forces`: force elements that add masses; their efforts are ignored.
+    `forces`: elements, of which those with masses count.
 
-    **Returns:** `tau` [N or N m].
+    **Returns:** `tau` [N or N m], the sum of the efforts of all elements.
 
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig5().linkage
@@ -99,7 +99,7 @@ def joint_mass_matrix(
     M is (8)-(13) projected on the real joints: symmetric, and positive definite unless
     the arm is singular.
 
-    **Arguments:** `q` [m or rad]; `forces`: force elements that add masses.
+    **Arguments:** `q` [m or rad]; `forces`: elements, of which those with masses count.
 
     **Returns:** M [kg, kg m or kg m^2].
 
@@ -126,8 +126,8 @@ def joint_bias(
     In M qdd + bias = tau, the bias is the effort of zero acceleration. The paper's phi
     (`bias_force`) has the other sign and is in chain coordinates.
 
-    **Arguments:** `q` [m or rad], `qd` [m/s or rad/s]; `forces`: force elements that
-    add masses.
+    **Arguments:** `q` [m or rad], `qd` [m/s or rad/s]; `forces`: elements, of which
+    those with masses count. The efforts of springs and others belong to tau.
 
     **Returns:** the bias [N or N m].
 

@@ -58,6 +58,18 @@ def test_arms_of_two_joints_reach_a_tip(moving):
         reached(with_fixed_pairs(moving, rng), rng, orientation=False)
 
 
+@pytest.mark.parametrize("topology", ["RR", "FRFRF"])
+def test_straight_arms_of_two_joints_reach_their_tip(topology):
+    rng, n = np.random.default_rng(12), len(topology)
+    first = topology.index("R")
+    for angle in rng.uniform(-3, 3, 20):
+        chain = chains.random_chain(topology, rng).replace(locked=np.zeros(n))
+        q = np.where(np.arange(n) == first, angle, 0)
+        tip = fj.tip_position(chain, q)
+        found = fj.inverse_kinematics(chain, tip, None)
+        np.testing.assert_allclose(fj.tip_position(chain, found), tip, atol=1e-14)
+
+
 @pytest.mark.parametrize("orientation, wanted", [(0.3, 3), (None, 2)])
 @pytest.mark.parametrize("topology", ["R", "RFP", "RRR", "RRRR", "FRRFPR"])
 def test_chains_of_other_numbers_of_joints_are_refused(topology, orientation, wanted):

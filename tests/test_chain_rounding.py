@@ -79,6 +79,17 @@ def test_a_million_turns_cost_no_digits(n):
     np.testing.assert_allclose(turned, plain, rtol=1e-12)
 
 
+def test_a_motion_states_how_far_rounding_errors_are_amplified():
+    arm, eps = rods(3, 1e3), 2.0**-52
+    start = fj.State(np.array([0.3, -0.5, 0.4]), np.zeros(3))
+    motion = fj.simulate(arm, start, np.linspace(0, 1, 101))
+    q, stated = np.asarray(motion.q), motion.stats["accuracy"] / eps
+    inverse = [(mass, mass**-1) for mass in (exact(arm, row, 0 * row)[0] for row in q)]
+    losses = [[float(m[k, k] * i[k, k]) for k in range(3)] for m, i in inverse]
+    # The steps and the samples meet the largest loss at other times.
+    np.testing.assert_allclose(stated, np.max(losses), rtol=0.1)
+
+
 @pytest.mark.parametrize("n", [2, 3, 5])
 def test_health_states_the_loss_of_digits(n):
     # All joints of a straight arm move a heavy tip alike.

@@ -58,6 +58,14 @@ with warnings.catch_warnings(record=True) as caught:
 assert any("rtol=1e-08 cannot be met in float32" in str(w.message) for w in caught)
 print("float32 holds on", len(ordinary), "scenes", flush=True)
 
+arm, traced = load("fig3").linkage, jax.jit(fj.inverse_kinematics)
+for angle in np.linspace(-3, 3, 20):  # with two links in line
+    q = np.float32([angle, 0, 0.3])
+    tip = fj.tip_position(arm, q)
+    for found in (f(arm, tip, q.sum()) for f in (fj.inverse_kinematics, traced)):
+        assert found.dtype == np.float32
+        np.testing.assert_allclose(fj.tip_position(arm, found), tip, atol=1e-6)
+
 result = fj.tune(fj.scenes.fig7()._replace(t1=2.0), max_steps=15)
 norms = result.history.gradient_norm
 assert norms[-1] < 1e-2 * norms[0], norms

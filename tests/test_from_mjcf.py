@@ -1,6 +1,7 @@
 """Chains read from MuJoCo's models accelerate as there."""
 
 import warnings
+from itertools import product
 from pathlib import Path
 
 import mujoco
@@ -45,6 +46,31 @@ def test_accelerations_and_tips_equal_mujoco(text):
         ours.append(fj.tip_position(linkage, q))
     apart = [np.linalg.norm(np.diff(places, axis=0), axis=1) for places in (tips, ours)]
     np.testing.assert_allclose(*apart, atol=1e-12)
+
+
+def test_arms_with_fixed_pairs_come_back_as_they_were():
+    rng = np.random.default_rng(1)
+    q, qd, tau = rng.normal(size=(3, 3))
+    for kinds in product("RPF", repeat=3):
+        if "R" not in kinds:  # a chain without a hinge is refused
+            continue
+        arm, moves = random_linkage("".join(kinds), rng), np.array(kinds) != "F"
+        again, _ = fj.from_mjcf(fj.to_mjcf(arm))
+        tip = fj.tip_position(again, q[moves])
+        np.testing.assert_allclose(tip, fj.tip_position(arm, q), atol=1e-12)
+        qdd = fj.forward_dynamics(again, q[moves], qd[moves], tau[moves])
+        right = fj.forward_dynamics(arm, q, qd, tau)[moves]
+        np.testing.assert_allclose(qdd, right, rtol=1e-9, atol=1e-9)
+
+
+def test_a_tip_on_another_body_is_refused():
+    site = '<site name="tip" pos=".1 0 .6"/>'
+    pole = '<body name="pole"'
+    moved = CART_POLE.replace(site, "").replace(pole, site + pole)
+    with pytest.raises(
+        ValueError, match="^text: expected the site tip on .* body cart"
+    ):
+        fj.from_mjcf(moved)
 
 
 nonlinear = pytest.mark.skipif(

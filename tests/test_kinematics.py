@@ -217,6 +217,61 @@ def test_out_of_reach_is_refused_or_nan(topology, inside, path, branch):
     assert np.isnan(traced(jnp.asarray(beyond))).any()
 
 
+@pytest.mark.parametrize("topology", ["RRR", "RRP", "RPR", "PRR"])
+def test_poses_at_the_edge_of_the_reach_are_within(topology):
+    linkages, q, _ = samples(topology, 7)
+    q, targets = at_the_edge(topology, linkages, q)
+    found = solutions(linkages, targets, 1)
+    reached = jax.vmap(pose)(linkages, found)
+    np.testing.assert_allclose(reached[:, :2], targets[:, :2], atol=1e-14)
+    np.testing.assert_array_less(joint_distance(topology, found, q), 1e-6)
+    arms = [jax.tree.map(lambda leaf, i=i: leaf[i], linkages) for i in range(SAMPLES)]
+    known = [solution(arm, target, -1) for arm, target in zip(arms, targets)]
+    np.testing.assert_array_less(joint_distance(topology, known, q), 1e-6)
+
+
+def at_the_edge(topology, linkages, q):
+    """Returns positions at which the middle joint makes the arm singular, and poses."""
+
+    def volume(middle):
+        jacobian = jax.vmap(fj.tip_jacobian)(linkages, q.at[:, 1].set(middle))
+        return np.linalg.det(jacobian)
+
+    if topology[1] == "P":  # linear in the slide
+        slope = volume(1.0) - volume(0.0)
+        middle = -volume(0.0) / slope
+    else:  # a sine of the angle
+        middle = np.arctan2(-volume(0.0), volume(np.pi / 2))
+    q = q.at[:, 1].set(middle)
+    return q, jax.vmap(pose)(linkages, q)
+
+
+UNIT = fj.Linkage(
+    "RRR", length=[0, 1, 1, 1], com=[[0.5, 0]] * 3, mass=[1] * 3, inertia=[1] * 3
+)
+
+
+def test_no_number_stands_for_a_derivative_at_the_edge_of_the_reach():
+    linkages = stack([UNIT] * SAMPLES)
+    reach = jnp.linspace(3 - 1e-6, 3 + 1e-6, SAMPLES)
+    reach = reach.at[:3].set(jnp.array([3 - 1e-15, 3, 3 + 1e-15]))
+    targets = jnp.stack([reach, 0 * reach, 0 * reach], axis=1)
+    found = solutions(linkages, targets, 1)
+    within = np.array([True] * 3 + [False] * 9) | (reach < 3)
+    np.testing.assert_array_equal(np.isfinite(found).all(axis=1), within)
+    slopes, _ = derivatives(linkages, targets, 1)
+    finite = np.isfinite(slopes).all(axis=(1, 2))
+    np.testing.assert_array_equal(finite, reach < 3)
+
+
+def test_a_folded_arm_is_back_at_its_pivot():
+    """Links of equal length reach the pivot; beside it, digits might cancel."""
+    for away in (0, 1e-16, 1e-12, 1e-8, 1e-4):
+        tip = np.array([1 + 0.6 * away, 0.8 * away])
+        q = fj.inverse_kinematics(UNIT, tip, 0.0)
+        np.testing.assert_allclose(fj.tip_position(UNIT, q), tip, atol=1e-15)
+
+
 @pytest.mark.parametrize("base_angle", [0.0, 0.3, np.pi])
 @pytest.mark.parametrize("lock", [0.0, np.pi])
 @pytest.mark.parametrize("topology", ["PPR", "RPP", "PRP"])

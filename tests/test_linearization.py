@@ -40,8 +40,6 @@ def modes_at(linkage, forces, *states, ts=0.0):
 def held(linkage, q, kp, kd, others=()):
     """Returns a PD controller under which the arm sags to `q`."""
     load = fj.analysis.holding_efforts(linkage, q, others)
-    still = jnp.zeros(len(q))
-    load = load - sum(element(0.0, q, still, linkage) for element in others)
     unlimited = [np.inf] * len(q)  # one per joint, as in the program of limited ones
     return fj.PDController(kp, kd, unlimited, Hold(q + load / np.array(kp)))
 
@@ -137,6 +135,17 @@ def test_equilibria_are_where_the_efforts_hold_the_arm(topology):
     controller = held(linkage, q, [300.0, 200.0, 100.0], np.ones(3))
     _, found = rest(linkage, controller, q + 0.05)
     np.testing.assert_allclose(found, q, atol=1e-8)
+
+
+@pytest.mark.parametrize("q", [-1.2, 0.4])
+def test_forces_carry_their_part_of_the_load(q):
+    rod = fj.Linkage("R", length=[0, 1], com=[[0.5, 0]], mass=[1], inertia=[1 / 12])
+    # A spring of no length balances a pendulum at any angle.
+    ends = fj.Point(0, 0, 1), fj.Point(1, 0.5)
+    spring = fj.SpringDamper(*ends, stiffness=9.81, damping=3.0)
+    push = fj.forces.EffortHistory([0.0, 1.0], [[0.0], [2.0]])
+    found = fj.analysis.holding_efforts(rod, [q], (spring, push), 0.5)
+    np.testing.assert_allclose(found, [-1.0], atol=1e-12)
 
 
 @pytest.mark.slow

@@ -86,7 +86,14 @@ def test_effort_profile_has_units_limits_and_saturation(controller):
         "limit ±1000 N m",
         "limit ±300 N",
     ]
-    assert set(labels(fig.axes[0])) == {"total", "limits", "saturated"}
+    expected = {"total", "controller", "limits", "saturated"}
+    assert set(labels(fig.axes[0])) == expected
+    # The limits are those of the controller, not of what the damper adds.
+    moved = dataclasses.replace(solution, qd=solution.qd + 1)
+    fig = plotting.effort_profile(make_linkage("RPR"), forces, moved)
+    total, own = values(fig.axes[1])[:2]
+    np.testing.assert_allclose(total, own - 1)
+    np.testing.assert_array_equal(own[:5], -300)
 
 
 def test_the_limit_is_written_where_no_curve_is():

@@ -93,6 +93,15 @@ def test_points_out_of_reach_are_refused():
         fj.inverse_kinematics(LINKAGE, [9, 9], 0.0)
 
 
+def test_paths_that_begin_at_the_edge_of_the_reach_are_refused():
+    """The joints' velocities are not finite there."""
+    length, com = [0, 1, 1, 1], [[0.5, 0]] * 3
+    arm = fj.Linkage("RRR", length=length, com=com, mass=[1] * 3, inertia=[1] * 3)
+    line, travel = fj.references.Line([3, 0], [1, 1]), fj.references.Travel(1.0)
+    with pytest.raises(ValueError, match="reference: .* that leaves it at 0 s"):
+        fj.TipTask(line, travel, orientation=0.0).check(arm, np.array([0.0, 1.0]))
+
+
 def test_circles_are_refused_for_their_nearest_point_alone():
     arm = fj.Linkage(
         "RRR", length=[0, 1, 0.6, 0.3], com=[[0, 0]] * 3, mass=[1] * 3, inertia=[1] * 3

@@ -61,6 +61,12 @@ def test_efforts_are_held_and_come_late(delay):
     held = np.append(0, commanded)
     gained = ((0.1 - delay) * held[1:] + delay * held[:-1]) / 2
     np.testing.assert_allclose(motion.qd[1:, 2], np.cumsum(gained), rtol=1e-7)
+    acting = held[:-1] if delay else held[1:]
+    acting = np.append(acting, held[-1])  # at the end the last command acts
+    efforts = fj.joint_efforts(WHEEL, (ramp,), motion).elements[0]
+    np.testing.assert_allclose(efforts[:, 2], acting, rtol=1e-12)
+    reactions = fj.joint_reactions(WHEEL, (ramp,), motion)
+    np.testing.assert_allclose(reactions[:, 2, 2], acting, rtol=1e-12)
 
 
 def test_no_delay_is_known_within_jit():
@@ -140,14 +146,25 @@ def test_a_digital_pid_controller_of_motors():
     np.testing.assert_allclose(sampled.own[0].own, whole.own[0].own, atol=1e-8)
 
 
-@pytest.mark.slow
-def test_a_delay_that_is_too_long_is_told():
+@pytest.mark.parametrize("delay", [0.0, 0.05, 0.12])
+def test_delays_may_be_traced(delay):
+    motion = delayed(delay)
+    if delay > 0.1:
+        assert np.isnan(motion.q[-1])
+        return
+    # An inertia of 2 under 1 N m, and under 1.1 N m a period later.
+    np.testing.assert_allclose(motion.qd[-1], 0.105 - 0.55 * delay, rtol=1e-7)
+    begun = (0.1 - delay) * delay / 2 + delay**2 / 4
+    found = motion.q_begin[1] - motion.q[1]
+    np.testing.assert_allclose(found, [begun], rtol=1e-6, atol=1e-15)
+
+
+@jax.jit
+def delayed(delay):
     rise = lambda t, q, qd, linkage: jnp.stack([1 + t])
-    end = lambda delay: fj.simulate_sampled(
+    return fj.simulate_sampled(
         DISC, STILL, rise, 0.1, 2, delay=delay, solver=LoopedDopri8()
     )
-    motions = jax.jit(jax.vmap(end))(jnp.array([0.05, 0.12]))
-    assert np.isfinite(motions.q[0]).all() and np.isnan(motions.q[1, -1]).all()
 
 
 def test_a_failure_is_named():

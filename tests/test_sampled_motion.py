@@ -2,11 +2,12 @@
 
 import diffrax
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from test_drawing import lines, tidy as tidy
 from test_energies import tops, values
-from test_sampled_control import DISC
+from test_sampled_control import DISC, STILL
 
 import fdof_jax as fj
 from fdof_jax import drawing, plotting
@@ -59,6 +60,19 @@ def test_the_work_of_held_efforts_is_exact():
     top, (line,) = tops(ax, motion.ts)["taken out"], values(ax)
     np.testing.assert_allclose(top, line, rtol=1e-12)
     assert line[-1] == 1.75  # [J] put in
+
+
+def test_the_work_of_late_efforts_is_exact():
+    noisy = lambda t, q, qd, linkage: 5 * jnp.sin(40 * t + jnp.zeros(1))
+    motion = fj.simulate_sampled(DISC, STILL, noisy, 0.1, 5, delay=0.03)
+    ax = plotting.energy_stack(DISC, (noisy,), motion)
+    top, (line,) = tops(ax, motion.ts)["taken out"], values(ax)
+    np.testing.assert_allclose(top, line, rtol=1e-12)
+    assert line[-1] > 1.2 * motion.qd[-1, 0] ** 2 > 0  # [J], as some is taken out
+    # The spring pulls as it did at a sample, and stores nothing.
+    spring = fj.SpringDamper(fj.Point(0, 1), fj.Point(1, 0, 1), stiffness=9.0)
+    ax = plotting.energy_stack(DISC, (spring,), disc_motion())
+    np.testing.assert_allclose(values(ax)[0][-1], 1.75)  # as above
 
 
 def test_tables_take_it():

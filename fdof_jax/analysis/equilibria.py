@@ -8,7 +8,7 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from ..base.checks import JOINT, in_order, real_array
+from ..base.checks import in_order, real_array
 from ..dynamics import joint_bias
 from ..forces.element import Element, Forces
 from ..linkage.linkage import Linkage, per_joint, without_fixed
@@ -47,13 +47,11 @@ def equilibrium(
 @eqx.filter_jit
 def _rest(linkage: Linkage, forces: tuple[Element, ...], q: Array, t: Array) -> Array:
     q = without_fixed(linkage, q)
-    still = jnp.zeros_like(q)
 
     def efforts(q):
-        acting = total_effort(linkage, forces, t, q, still)
-        acting -= joint_bias(linkage, q, still, forces)
+        lacking = _lacking(linkage, forces, q, t)
         # A fixed pair is in equilibrium at 0.
-        return jnp.where(jnp.stack(fixed_pairs(linkage.ef)), -q, acting)
+        return jnp.where(jnp.stack(fixed_pairs(linkage.ef)), -q, -lacking)
 
     # Efforts relative to their rounding errors' scale: stiff controllers converge as
     # exactly as soft springs.
@@ -78,13 +76,28 @@ def _rest(linkage: Linkage, forces: tuple[Element, ...], q: Array, t: Array) -> 
     )
 
 
-def holding_efforts(
-    linkage: Linkage, q: ArrayLike, forces: Forces = ()
-) -> Float[Array, " joint"]:
-    """The joint efforts that hold the arm at rest against gravity [N or N m].
+@eqx.filter_jit
+def _lacking(
+    linkage: Linkage, forces: tuple[Element, ...], q: Array, t: Array
+) -> Array:
+    """Efforts that the arm needs beside the forces to stay at rest."""
+    q, still = without_fixed(linkage, q), jnp.zeros_like(q)
+    acting = total_effort(linkage, forces, t, q, still)
+    return without_fixed(linkage, joint_bias(linkage, q, still, forces) - acting)
 
-    **Arguments:** `linkage`; `q`: joint positions [m or rad]; `forces`: elements whose
-    masses are held too.
+
+def holding_efforts(
+    linkage: Linkage, q: ArrayLike, forces: Forces = (), t: ArrayLike = 0.0
+) -> Float[Array, " joint"]:
+    """The joint efforts that, together with the forces, hold the arm at rest.
+
+    Without forces they balance gravity. Springs and stops carry their part, and masses
+    of elements are held too.
+
+    **Arguments:** `linkage`; `q`: joint positions [m or rad]; `forces`: elements
+    without a state of their own; `t`: time at which they are evaluated [s].
+
+    **Returns:** efforts (n,), 0 at fixed pairs [N or N m].
 
     **Raises:** ValueError for malformed arguments.
 
@@ -92,6 +105,10 @@ def holding_efforts(
     >>> arm = fj.scenes.fig5().linkage
     >>> fj.analysis.holding_efforts(arm, [0, 0, 0]).tolist()
     [58.86, 29.43, 9.81]
+    >>> rope = fj.forces.Tension(fj.Point(0, 3, 1), fj.Point(3, 1), tension=9.81)
+    >>> fj.analysis.holding_efforts(arm, [0, 0, 0], (rope,)).tolist()  # lifts the tip
+    [29.43, 9.81, 0.0]
     """
-    q = real_array("q", q, (JOINT,))
-    return joint_bias(linkage, q, jnp.zeros_like(q), forces)
+    forces = checked(linkage, forces)
+    q, t = per_joint("q", q, linkage), real_array("t", t, ())
+    return _lacking(linkage, forces, q, t)

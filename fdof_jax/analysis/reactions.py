@@ -16,7 +16,7 @@ from ..linkage.frames import cross, frames
 from ..linkage.linkage import Linkage
 from ..mechanics.kinematics import joint_positions, mass_center_velocities, mass_centers
 from ..simulation.efforts import joint_efforts
-from ..simulation.solution import Solution
+from ..simulation.sampled import Motion, acting_in
 
 
 def _loads(
@@ -41,7 +41,7 @@ def _loads(
 
 
 def joint_reactions(
-    linkage: Linkage, forces: Forces, solution: Solution
+    linkage: Linkage, forces: Forces, solution: Motion
 ) -> Float[Array, "time joint 3"]:
     """Force and moment of each joint's bearing on the next link, along a motion.
 
@@ -49,7 +49,8 @@ def joint_reactions(
     joint's free direction, the reaction is the effort of dampers, controllers, drives
     and armatures. Loads on points act on the links themselves.
 
-    **Arguments:** `linkage`, `forces` and `solution` of one `simulate`.
+    **Arguments:** `linkage`, `forces` and `solution` of one `simulate`; of a
+    `SampledMotion`, the forces are `(control, *forces)`.
 
     **Returns:** force (x, y) [N] and moment [N m] on the moving link, at its
     characteristic point (see `joint_positions`). The previous link gets the opposite.
@@ -66,13 +67,14 @@ def joint_reactions(
     """
     forces = elements("forces", forces)
     efforts = joint_efforts(linkage, forces, solution)
-    return _reactions(linkage, forces, solution, efforts.total)
+    rows = solution.ts, solution.q, solution.qd, efforts.total
+    return _reactions(linkage, acting_in(solution, forces), rows)
 
 
 @eqx.filter_jit
 def _reactions(
-    linkage: Linkage, forces: Forces, solution: Solution, total: Array
-) -> Array:
+    linkage: Linkage, forces: Forces, rows: tuple[Array, ...]
+) -> Float[Array, "time joint 3"]:
     def at(t, q, qd, tau):
         qdd = forward_dynamics(linkage, q, qd, tau, forces)
         motion = lambda q, qd: mass_center_velocities(linkage, q, qd)
@@ -90,5 +92,4 @@ def _reactions(
 
     # A loop compiles in three quarters of the time of `jax.vmap`. Without elements it
     # takes half as long again (3 ms for 10,001 times), with them less than half.
-    rows = solution.ts, solution.q, solution.qd, total
     return jax.lax.map(lambda row: at(*row), rows)

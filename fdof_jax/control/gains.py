@@ -21,16 +21,17 @@ def gains_from_frequency(
 
     The gains are kp = frequency^2 M_kk and kd = 2 damping_ratio frequency M_kk, with
     the inertia M_kk that joint k moves at `q` while the other joints stand still. A
-    joint then has exactly this frequency and damping if it moves alone and without
-    gravity. `closed_loop_modes` shows the modes of all joints together. The gains of
-    `ComputedTorque` are frequency^2 and 2 damping_ratio frequency themselves.
+    joint then has exactly this frequency and damping if it moves alone, without gravity
+    and without springs or dampers. `closed_loop_modes` shows the modes of all joints
+    together, under all forces. The gains of `ComputedTorque` are frequency^2 and
+    2 damping_ratio frequency themselves.
 
     **Arguments:**
 
     - `linkage`, `q`: the arm and its joint positions [m or rad].
     - `frequency`: natural frequencies, one per joint or one for all, positive [rad/s].
     - `damping_ratio`: one per joint or one for all, not negative.
-    - `forces`: force elements that add masses.
+    - `forces`: elements, of which those with masses count.
 
     **Returns:** `kp` [N/m or N m/rad] and `kd` [N s/m or N m s/rad], 0 at fixed pairs.
 

@@ -22,9 +22,9 @@ def from_mjcf(text: str) -> tuple[Linkage, Forces]:
 
     The plane is seen from where the hinges' axes point, with gravity downwards; `q`
     equals `qpos`. Gravity across the plane has no effect. A body with several joints
-    becomes as many links, all but the last without mass. A site `tip` on the last body
-    becomes the tip; without one, the tip is the last joint. MuJoCo reads the model,
-    which needs `pip install "fdof_jax[test]"`.
+    becomes as many links, all but the last without mass. A site `tip` on the last body,
+    or on one welded to it, becomes the tip; without one, the tip is the last joint.
+    MuJoCo reads the model, which needs `pip install "fdof_jax[test]"`.
 
     Contacts are left out, with a warning if geoms of two bodies may collide. Such a
     model is not refused, because geoms may collide by default, and most arms move
@@ -39,9 +39,9 @@ def from_mjcf(text: str) -> tuple[Linkage, Forces]:
     **Returns:** the linkage, and its `JointDamper` and `Armature` if it has any.
 
     **Raises:** ValueError for what a planar chain does not have (branches, other
-    joints, axes out of the plane), for springs, ranges, friction and nonlinear
-    damping of joints, and for actuators, tendons, equality constraints, fluids and
-    `gravcomp`.
+    joints, axes out of the plane), for a site `tip` on another body, for springs,
+    ranges, friction and nonlinear damping of joints, and for actuators, tendons,
+    equality constraints, fluids and `gravcomp`.
 
     >>> import fdof_jax as fj
     >>> arm, forces = fj.from_mjcf('''
@@ -81,8 +81,14 @@ def from_mjcf(text: str) -> tuple[Linkage, Forces]:
     plane = lambda vector: complex(vector @ e1, vector @ e2)
     links = _links(model, data, plane, np.cross(e1, e2))
     tip = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, "tip")
-    on_last = tip >= 0 and model.site_bodyid[tip] == model.jnt_bodyid[-1]
-    end = plane(data.site_xpos[tip]) if on_last else links[-1].start
+    end = links[-1].start
+    if tip >= 0:
+        body, end = model.site_bodyid[tip], plane(data.site_xpos[tip])
+        if model.body_weldid[body] != model.jnt_bodyid[-1]:
+            raise ValueError(
+                "text: expected the site tip on the last body that moves or on one "
+                f"welded to it, got it on body {_body(model, body)}."
+            )
     # MuJoCo does not have links without mass.
     with without_warning("moves no inertia of link"):
         linkage = _linkage(links, end, gravity)

@@ -44,6 +44,7 @@ _REMOVED = (f"{_PACKAGE}.tuning_run:Job",)
 _ADDED = {
     f"{_PACKAGE}:FitResult": {"held_out": (), "faults": ("saved without a verdict",)},
     f"{_PACKAGE}:GradientReport": dict(switches=0, slowest_crossing=np.inf, times={}),
+    f"{_PACKAGE}:SampledMotion": dict(delay=0.0, q_begin=None),
 }
 
 

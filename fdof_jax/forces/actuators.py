@@ -8,11 +8,11 @@ import jax.numpy as jnp
 from jax import Array
 from numpy.typing import ArrayLike
 
-from ..linkage.frames import cross, dot, scalar_frames
+from ..linkage.frames import cross, dot, length_of, scalar_frames
 from ..linkage.linkage import Linkage, joints_of
 from .element import InertialElement
 from .part import Values, field, value_of
-from .points import Load, Point, Separation, arguments_of, length_of, over
+from .points import Load, Point, Separation, arguments_of, over
 
 
 class Armature(InertialElement):

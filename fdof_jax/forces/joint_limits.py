@@ -13,15 +13,19 @@ class JointStops(ScalarElement):
     """Stops at the ends of the joints' ranges: stiff springs that push one way.
 
     At a penetration p the force is stiffness * p * (1 + damping * dp/dt), and never
-    less than 0. Within `smoothing` of the end of the range, on both sides, p is rounded
-    off to a parabola; at the end itself p is a quarter of `smoothing`.
+    less than 0. Steps end where the contact begins and ends.
+
+    With `smoothing`, p is rounded off to a parabola within so much of the end of the
+    range, on both sides; at the end itself p is a quarter of `smoothing`. Where the
+    whole penetration is no deeper, p and so dp/dt are other than the joint's, and a
+    blow loses less energy.
 
     **Arguments:** all in joint order, one per joint or one for all.
 
     - `lower`, `upper`: ends of the range [m or rad]; may be infinite.
     - `stiffness`: positive [N/m or N m/rad].
     - `damping`: not negative [s/m or s/rad].
-    - `smoothing`: positive [m or rad].
+    - `smoothing`: positive [m or rad]; by default the law is not rounded off.
 
     **Raises:** ValueError for malformed arguments, and unless lower < upper.
 
@@ -36,7 +40,9 @@ class JointStops(ScalarElement):
     upper: Values = field(unit="m or rad", finite=False)
     stiffness: Values = field(unit="N/m or N m/rad", above=0, default=1e4, kw_only=True)
     damping: Values = field(unit="s/m or s/rad", minimum=0, default=0.0, kw_only=True)
-    smoothing: Values = field(unit="m or rad", above=0, default=1e-3, kw_only=True)
+    smoothing: Values | None = field(
+        unit="m or rad", above=0, optional=True, default=None, kw_only=True
+    )
 
     def conditions(self):
         ends = self.lower, self.upper
@@ -44,8 +50,10 @@ class JointStops(ScalarElement):
         yield Condition(apart, "lower", "less than upper", ends)
 
     def respond(self, scheduled, q, qd, linkage):
-        values = self.lower, self.upper, self.stiffness, self.damping, self.smoothing
-        rows = zip(q, qd, *(each(value, q) for value in values))
+        values = self.lower, self.upper, self.stiffness, self.damping
+        width = self.smoothing
+        widths = [None] * len(q) if width is None else each(width, q)
+        rows = zip(q, qd, *(each(value, q) for value in values), widths)
         return tuple(
             _push(low - x, -rate, k, d, width) - _push(x - high, rate, k, d, width)
             for x, rate, low, high, k, d, width in rows
@@ -66,7 +74,11 @@ def _push(depth, rate, stiffness, damping, width):
 
 
 def _penetration(depth, width):
-    """Rounded depth and its derivative, 0 before the parabola and 1 beyond it."""
+    """Penetration at a depth, and its derivative where it is not 0."""
+    if width is None:
+        # Not called continuous: derivatives then correct even what the time of the
+        # contact, as located, is off by, which matters at stiff stops.
+        return switch(depth, depth, 0), 1
     near, beyond = _parts(depth, width)
     return near**2 / (4 * width) + beyond, near / (2 * width)
 
@@ -82,7 +94,9 @@ def _parts(depth, width):
 
 
 def _stored(depth, width):
-    """Integral of the rounded depth."""
+    """Integral of the penetration over the depth."""
+    if width is None:
+        return jnp.where(depth > 0, depth, 0) ** 2 / 2
     near, beyond = _parts(depth, width)
     return near**3 / (12 * width) + beyond * (beyond / 2 + width)
 

@@ -18,7 +18,7 @@ from jaxtyping import Complex, Float
 from numpy.typing import ArrayLike
 
 from ..base.checks import is_traced, shown, whole_number
-from ..linkage.frames import Frames, cross, frames, scalar_frames
+from ..linkage.frames import Frames, cross, frames, length_of, scalar_frames
 from ..linkage.linkage import Linkage, joints_of, per_joint, without_fixed
 from ..linkage.topology import MOST_PAIRS
 from ..mechanics.equations import Scalars
@@ -184,13 +184,6 @@ def arguments_of(element: Any) -> dict[str, Any]:
     """Returns the fields of an element, with its points in the place of its `ends`."""
     fields = dict(vars(element))
     return vars(fields.pop("ends")) | fields
-
-
-def length_of(vector: Array) -> Array:
-    """Length of a vector; 0 with derivative 0 for the zero vector, NaN for NaN."""
-    square = vector.real**2 + vector.imag**2
-    meet = square == 0
-    return jnp.where(meet, 0, jnp.sqrt(jnp.where(meet, 1, square)))
 
 
 def over(length: Array) -> Array:

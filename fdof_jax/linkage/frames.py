@@ -35,6 +35,13 @@ def cross(a: Any, b: Any) -> Any:
     return a.real * b.imag - a.imag * b.real
 
 
+def length_of(vector: Any) -> Any:
+    """Length of a vector; 0 with derivative 0 for the zero vector, NaN for NaN."""
+    xp, square = namespace(vector), dot(vector, vector)
+    meet = square == 0
+    return xp.where(meet, 0, xp.sqrt(xp.where(meet, 1, square)))
+
+
 class Frames(NamedTuple):
     """The ground (0) and the moving links (1 to n), in the last axis of arrays.
 

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from ..base.array_namespace import in_numpy, namespace, plane_vector
 from ..base.checks import concrete, is_traced, real_array, sign
-from ..linkage.frames import cross, dot, frames, unit_vector
+from ..linkage.frames import cross, dot, frames, length_of, unit_vector
 from ..linkage.linkage import Linkage, check_linkage, joints_of
 from ..linkage.topology import fixed_pairs, real_joints
 
@@ -170,8 +170,8 @@ def solve_joints(
 ) -> tuple[Array, Array]:
     """Computes positions of the arm (..., 3) from the wrist x + iy, NaN out of reach.
 
-    The second result is a root that is 0 just at the edge of the reach, where
-    velocities are infinite.
+    The second result is a root that is 0 just at the edge of the reach, or beyond it by
+    rounding. Velocities are not finite there.
 
     `bearing` is the direction angle of `wrist`. As an argument it can be continuous
     along a path that winds around the pivot.
@@ -192,7 +192,7 @@ def solve_joints(
     e1, e2, e3, _ = directions.vector
 
     d = arm.links
-    reach2, reach3 = dot(d, d)
+    square2, square3 = dot(d, d)
     own2, own3 = plane_angle(d.imag, d.real)
 
     # What the known vectors leave of the wrist vector, along the directions a and b:
@@ -208,16 +208,28 @@ def solve_joints(
 
     # A turning vector is known by its length and its component along a. For two, the
     # same holds of their product, one conjugated, by the law of cosines.
-    square = dot(wrist, wrist)
-    inner = (square - reach2 - reach3) / 2
+    inner = (dot(wrist, wrist) - square2 - square3) / 2
     component = dot(a, rest)
     along = xp.where(two_turning, inner, component)
-    size = xp.where(turning2, reach2, 1) * xp.where(turning3, reach3, 1)
-    size = xp.where(framed, square, size)
-    with np.errstate(invalid="ignore"):  # NaN out of reach is intended
-        root = branch * xp.sqrt(xp.where(two_slides, 1, size - along**2))
+    # What is left across a is a root, of a product of what is left to each edge of the
+    # reach. Its factors are exact where they vanish, as differences of squares are not.
+    length2, length3 = length_of(d)
+    away = length_of(wrist)
+    longest = xp.where(turning2, length2, 0) + xp.where(turning3, length3, 0)
+    longest = xp.where(framed, away, longest)
+    needed = xp.where(two_turning, away, component)
+    apart = length2 - length3
+    # Computed positions of tips are off by less.
+    rounding = 16 * np.finfo(away.dtype).eps * (1 + abs(th4))
+    rounding *= length2 + length3 + away + length_of(arm.ground) + length_of(arm.tip)
+    edges, product = [longest - needed, longest + needed], 1 / 4
+    edges += [xp.where(two_turning, part, 2) for part in (away - apart, away + apart)]
+    for left in edges:
+        left = xp.where(two_slides, 1, left)
+        product *= xp.where(left < -rounding, xp.nan, xp.maximum(left, 0))
+    root = branch * xp.sqrt(product)
 
-    angle = plane_angle(root, along + xp.where(two_turning, reach2, 0))
+    angle = plane_angle(root, along + xp.where(two_turning, square2, 0))
     second = xp.where(whole, bearing - angle, xp.where(turning2, th3 + angle, th2))
     second = second - xp.where(turning2, own2, 0)
     bend = xp.where(r2, own2 + plane_angle(root, inner) - own3, arm.angle[1])
@@ -251,7 +263,10 @@ def inverse_kinematics(
       turns at the tip. Ignored where there is only one assembly.
 
     **Returns:** `q` [m or rad], 0 at fixed pairs; NaN for traced arguments if the point
-    is out of reach.
+    is out of reach. A point beyond the reach by rounding is on its edge. There the two
+    assemblies meet, and derivatives in the point do not exist: they are not finite.
+    Close to it, joints move as the root of the distance from the edge, so that a point
+    known to 1e-16 m may leave them known to 1e-8 rad.
 
     **Raises:** ValueError for malformed arguments, for a linkage of another number of
     joints, and for concrete arguments if the point is out of reach.

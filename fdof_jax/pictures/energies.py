@@ -15,7 +15,7 @@ from ..dynamics import energy, link_energies
 from ..forces.element import Forces, InertialElement, elements
 from ..linkage.linkage import Linkage
 from ..simulation.efforts import joint_efforts
-from ..simulation.sampled import Motion, SampledMotion
+from ..simulation.sampled import Motion, SampledMotion, acting_in
 from .arms import link_color
 from .axes import (
     BLACK,
@@ -59,7 +59,7 @@ def _powers(linkage: Linkage, forces: Forces, solution: Motion) -> np.ndarray:
     """
     efforts = joint_efforts(linkage, forces, solution).elements
     powers = jnp.einsum("etj,tj->et", efforts, solution.qd)
-    for k, element in enumerate(elements("forces", forces)):
+    for k, element in enumerate(forces):
         # The efforts of an inertial element exclude those of its potential energy.
         if isinstance(element, InertialElement) or element.potential_energy is None:
             continue
@@ -80,12 +80,16 @@ def _works(
     signs = (1, -1)
     if not isinstance(solution, SampledMotion):
         return [_integral(np.maximum(sign * powers, 0), ts) for sign in signs]
-    # The power of held efforts jumps at each sample, but their work is known.
-    steps = np.diff(np.asarray(solution.q)[: len(ts)], axis=0)
-    held = (np.asarray(solution.tau)[: len(steps)] * steps).sum(axis=1)
+    # The power of held efforts jumps, but their work is known: in each period that of
+    # the last command, until the next one begins to act, and that of the next.
+    q, tau = np.asarray(solution.q)[: len(ts)], np.asarray(solution.tau)[: len(ts) - 1]
+    begin = q if solution.q_begin is None else np.asarray(solution.q_begin)
+    begin = begin[: len(tau)]
+    last = np.append(np.zeros_like(tau[:1]), tau[:-1], axis=0)
+    works = np.sum([last * (begin - q[:-1]), tau * (q[1:] - begin)], axis=-1)
     return [
         _integral(np.maximum(sign * powers[1:], 0), ts)
-        + np.append(0, np.maximum(sign * held, 0).cumsum())
+        + np.append(0, np.maximum(sign * works, 0).sum(axis=0).cumsum())
         for sign in signs
     ]
 
@@ -115,6 +119,7 @@ def energy_stack(
     are then too far apart there, or the forces are not those of the solution.
     """
     ts, q, qd = reached(linkage, solution)
+    forces = acting_in(solution, elements("forces", forces))
     put_in, taken_out = _works(linkage, forces, solution, ts)
     energies = jax.vmap(lambda q, qd: energy(linkage, q, qd, forces))(q, qd)
     kinetic, potential = map(np.asarray, energies)

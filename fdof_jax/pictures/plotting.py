@@ -78,10 +78,11 @@ def effort_profile(
 ) -> Figure:
     """Plots joint efforts over time with their limits, a panel per joint [N or N m].
 
-    The curves are total efforts. The grey band lies within the finite limits of a
-    `PDController`, `PIDController`, `GravityFeedforward` or `ComputedTorque`; it fills
-    the panel where the efforts stay far from the limits. Orange dots mark samples at
-    which the controller is at its limit.
+    One curve is the total effort, of dampers and springs too. The grey band lies within
+    the finite limits of a `PDController`, `PIDController`, `GravityFeedforward` or
+    `ComputedTorque`; it fills the panel where the efforts stay far from the limits.
+    Where other elements act beside such a controller, a second curve is its own effort.
+    Orange dots mark samples at which the controller is at its limit.
 
     **Arguments:** `forces`: those of the solution.
     """
@@ -98,12 +99,14 @@ def effort_profile(
     fig = figure_or_new(fig, 3.5, 5.2)
     axes = time_panels(fig, ts, panels)
     for k, ax, unit in zip(moving, axes, units):
+        rows = zip(elements("forces", forces), parts[:, :, k])
+        limits = [(_limit(element, k, total.shape[1]), row) for element, row in rows]
+        limits = [(limit, effort) for limit, effort in limits if np.isfinite(limit)]
+        for _, effort in limits if len(parts) > 1 else ():
+            ax.plot(ts, effort, color=SERIES[2], lw=1.2, label="controller")
         low, high = ax.get_ylim()  # before the bands, which may be far wider
         texts = []
-        for element, effort in zip(elements("forces", forces), parts[:, :, k]):
-            limit = _limit(element, k, total.shape[1])
-            if not np.isfinite(limit):
-                continue
+        for limit, effort in limits:
             ax.axhspan(-limit, limit, color=GREY, alpha=0.15, lw=0, label="limits")
             at = (np.abs(effort) >= limit) & (effort != 0)
             dots = ax.plot(ts[at], effort[at], ".", color=SERIES[1], zorder=3)

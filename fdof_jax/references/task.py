@@ -185,8 +185,8 @@ class TipTask(TipReference):
         three, directions, base = task._placed(arm)
         times = task._times(ts)
         wrist, bearing = task.wrist_seen(times, base)
-        q, _ = solve_joints(three, directions, wrist, bearing, task.branch)
-        inside = np.isfinite(q).all(axis=1)
+        q, root = solve_joints(three, directions, wrist, bearing, task.branch)
+        inside = np.isfinite(q).all(axis=1) & (root != 0)
         if not inside.all():
             raise ValueError(
                 f"reference: expected a path within {task._reach()}, got one that "

@@ -16,7 +16,7 @@ from ..linkage.linkage import Linkage, check_linkage, without_fixed
 from .field import element_effort, with_states
 from .padding import cut, padded
 from .prescribed import prescribed, prescribed_effort
-from .sampled import Motion, SampledMotion, check_joints
+from .sampled import Motion, acting_in, check_joints
 from .simulate import check_own
 
 
@@ -24,7 +24,8 @@ class Efforts(NamedTuple):
     """Joint efforts along a motion, 0 at fixed pairs [N or N m].
 
     - `total`: sum over all force elements (time, n).
-    - `elements`: efforts of each force element (element, time, n).
+    - `elements`: efforts of each force element (element, time, n). The effort of a
+      motor is that of its element; the total has dampers, springs and loads as well.
     """
 
     total: Float[Array, "time joint"]
@@ -58,8 +59,7 @@ def joint_efforts(linkage: Linkage, forces: Forces, solution: Motion) -> Efforts
             "solution: expected one motion (use jax.vmap for a batch), got positions "
             f"of shape {solution.q.shape}."
         )
-    if isinstance(solution, SampledMotion):
-        forces = solution.acting(forces)
+    forces = acting_in(solution, forces)
     check_own("solution.own", solution.own, forces, linkage, solution.ts.shape)
     forces = of_full_size(linkage, forces)
     rows = solution.ts, solution.q, solution.qd, solution.own

@@ -42,7 +42,8 @@ class PrescribedMotion(Element):
     """Joints that follow a reference exactly, whatever effort that takes.
 
     Where the reference's velocity jumps, an impulse makes the velocities of the other
-    joints jump too. `joint_efforts` returns the effort [N or N m] without impulses.
+    joints jump too. `joint_efforts` returns the effort [N or N m] without impulses,
+    among its `elements`.
 
     The velocities of `state0` are those before the first time. If they differ from the
     reference's, the motion starts with an impulse. Adaptive steps control the errors of

@@ -1,4 +1,4 @@
-"""Step control that does not chase rounding errors, and the accuracy that they leave.
+"""Step control that does not chase rounding errors, and how far they are amplified.
 
 Equations that lose accuracy amplify rounding errors in the rates. The error estimate of
 a step is then this noise times the step size: no shorter step brings it below a tight

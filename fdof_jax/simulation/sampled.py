@@ -1,6 +1,5 @@
 """Control in discrete time, with efforts held constant between samples."""
 
-import dataclasses
 from collections.abc import Iterator
 from typing import Any
 
@@ -32,22 +31,22 @@ from .simulate import check_elements, simulate
 from .solution import Solution, WithOutcome
 
 
-class _Switched(ScalarElement):
-    """Efforts that switch from one constant to another at a time."""
+class _Held(ScalarElement):
+    """Efforts each held until the next one begins to act, and 0 before the first."""
 
-    before: Float[Array, " joint"]
-    after: Float[Array, " joint"]
-    switch: Float[Array, ""]
+    begin: Float[Array, " sample"]
+    tau: Float[Array, "sample joint"]
 
     def schedule(self, t, linkage):
-        return tuple(jnp.where(t < self.switch, self.before, self.after))
+        begun = jnp.searchsorted(self.begin, t, side="right", method="scan_unrolled")
+        return tuple(jnp.where(begun > 0, self.tau[begun - 1], 0))
 
     def respond(self, scheduled, q, qd, linkage):
         return scheduled
 
     @property
     def jump_ts(self) -> Array:
-        return self.switch[None]
+        return self.begin
 
 
 def step(
@@ -92,34 +91,24 @@ def step(
     return State(solution.q[-1], solution.qd[-1])
 
 
-class _Held(ScalarElement):
-    """The efforts of a sampled motion, each held from its sample to the next."""
-
-    ts: Float[Array, " time"]
-    tau: Float[Array, "sample joint"]
-
-    def schedule(self, t, linkage):
-        sample = jnp.searchsorted(self.ts[1:-1], t, side="right")
-        return tuple(self.tau[sample])
-
-    def respond(self, scheduled, q, qd, linkage):
-        return scheduled
-
-
 class SampledMotion(WithOutcome):
     """A motion under sampled control.
 
     - `ts`: sampling times, including the end (samples + 1,) [s].
     - `q`, `qd`: joint positions and velocities at `ts`; NaN after a failure.
     - `tau`: efforts commanded at each sample (samples, n), 0 at fixed pairs
-      [N or N m].
+      [N or N m]. Each acts from `delay` after its sample until the next one acts.
     - `result`: diffrax's result: `successful`, or that of the first failed period.
       `outcome` states it in words.
     - `own`: the states of the forces' `StatefulElement`s at `ts`.
+    - `delay`: time from a sample to the action of its command [s].
+    - `q_begin`: joint positions at which each command begins to act (samples, n); None
+      without a delay, where these are `q[:-1]`.
 
     Pictures, tables, `joint_efforts` and `joint_reactions` take it as they take a
-    `Solution`. Its `forces` are there `(control, *forces)`, the controller first, whose
-    efforts are `tau`.
+    `Solution`. Its `forces` are there `(control, *forces)`, the controller first. The
+    controller's efforts are those that act: with a delay, a sample has the command of
+    the sample before, and the first one has none.
     """
 
     ts: Float[Array, " time"]
@@ -129,24 +118,33 @@ class SampledMotion(WithOutcome):
     result: diffrax.RESULTS
     own: tuple[Any, ...]
 
+    delay: Float[Array, ""] | float = 0.0
+    q_begin: Float[Array, "sample joint"] | None = None
+
     def __iter__(self) -> Iterator[Any]:
-        """Yields the fields in order; version 0.1 returned a named tuple."""
-        return iter([vars(self)[field.name] for field in dataclasses.fields(self)])
+        """Yields the fields of the named tuple that version 0.1 returned."""
+        return iter((self.ts, self.q, self.qd, self.tau, self.result, self.own))
 
     def __getitem__(self, index: Any) -> Any:
-        """Returns fields by their places, as of a named tuple."""
+        """Returns fields by their places, as of that named tuple."""
         return tuple(self)[index]
-
-    def acting(self, forces: tuple[Element, ...]) -> tuple[Element, ...]:
-        """Returns `(control, *forces)` with the held efforts in the first place."""
-        if not forces:
-            raise ValueError(
-                "forces: expected (control, *forces) of a SampledMotion, got ()."
-            )
-        return _Held(self.ts, self.tau), *forces[1:]
 
 
 Motion = Solution | SampledMotion
+
+
+def acting_in(motion: Motion, forces: tuple[Element, ...]) -> tuple[Element, ...]:
+    """Returns the elements that acted: held efforts in the place of a sampled control.
+
+    Raises ValueError if a `SampledMotion` comes without its control.
+    """
+    if isinstance(motion, Solution):
+        return forces
+    if not forces:
+        raise ValueError(
+            "forces: expected (control, *forces) of a SampledMotion, got ()."
+        )
+    return _Held(motion.ts[:-1] + motion.delay, motion.tau), *forces[1:]
 
 
 def check_joints(name: str, solution: Any, linkage: Linkage) -> None:
@@ -266,16 +264,21 @@ def _motion(
         tau, rates = control.act(begin, *seen, linkage, memory)
         tau = without_fixed(linkage, real_array("control", tau, seen.q.shape))
         memory = jax.tree.map(lambda m, rate: m + period * rate, memory, rates)
-        effort = (
-            JointEffort(tau) if delay is None else _Switched(held, tau, begin + delay)
-        )
-        acting, two = (*forces, effort), jnp.stack([begin, end])
-        solution = simulate(linkage, state, two, acting, own0=own, **options)
+        effort, at = JointEffort(tau), [begin, end]
+        if delay is not None:
+            starts = begin + delay + jnp.stack([-period, 0 * period])
+            effort = _Held(starts, jnp.stack([held, tau]))
+            # Beside both ends, as output times have to increase.
+            edge = jnp.finfo(times.dtype).eps * jnp.maximum(abs(begin), abs(end))
+            at.insert(1, jnp.clip(begin + delay, begin + edge, end - edge))
+        acting = *forces, effort
+        solution = simulate(linkage, state, jnp.stack(at), acting, own0=own, **options)
         rows = State(solution.q, solution.qd), solution.own
         last = jax.tree.map(lambda rows: rows[-1], rows)
         good = result == diffrax.RESULTS.successful
         result = diffrax.RESULTS.where(good, solution.result, result)
-        return (last, memory, tau, result), (last, tau)
+        begun = None if delay is None else solution.q[1]
+        return (last, memory, tau, result), (last, tau, begun)
 
     own0 = initial_states(linkage, forces), control.initial_state(linkage)
     own0, memory0 = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), own0)
@@ -283,11 +286,12 @@ def _motion(
     if delay is not None:
         held = jnp.where(delay < period, held, jnp.nan)
     first = jax.tree.map(jnp.asarray, state0), own0
-    (*_, result), (later, tau) = jax.lax.scan(
+    (*_, result), (later, tau, begun) = jax.lax.scan(
         one,
         (first, memory0, held, diffrax.RESULTS.successful),
         (times[:-1], times[1:], keys),
     )
     rows = lambda first, later: jnp.concatenate([first[None], later])
     (q, qd), own = jax.tree.map(rows, first, later)
-    return SampledMotion(times, q, qd, tau, result, own)
+    late = 0.0 if delay is None else delay
+    return SampledMotion(times, q, qd, tau, result, own, late, begun)
