@@ -15,6 +15,7 @@ from .derivative_control import OfLinearised, OfTangents
 from .dopri8 import constant
 from .field import args_of, initial_own, own_states, whole
 from .known_times import clocks_apart, known_times
+from .landing import end_of_run
 from .looped_dopri8 import LoopedDopri8
 from .packing import in_arrays
 from .prescribed import agrees, motion_at, start_of, term_of
@@ -58,7 +59,8 @@ def integrate(
     adaptive = isinstance(controller, diffrax.AbstractAdaptiveStepSizeController)
     # Fixed steps may pass over the kinks of a history, but over no jump.
     left_out = () if adaptive else (EffortHistory,)
-    start = term, ts[0], y0, args, known_times(args, *left_out)
+    jumps = known_times(args, *left_out)
+    start = term, ts, y0, args, jumps
     located_solver, controller, y0 = located(locate, solver, controller, *start)
     if adaptive:
         if tangents:
@@ -72,7 +74,7 @@ def integrate(
         found = diffrax.diffeqsolve(
             term,
             t0=ts[0],
-            t1=ts[-1],
+            t1=end_of_run(ts, jumps),
             y0=y0,
             args=args,
             saveat=diffrax.SaveAt(
@@ -98,7 +100,7 @@ def integrate(
     start = (without_fixed(linkage, value) for value in state0)
     q, qd = (shown(rows).at[0].set(first) for rows, first in zip((q, qd), start))
     # Constant steps go on when the state is no longer finite.
-    (reached,) = reached
+    reached = jnp.minimum(reached[0], ts[-1])
     lost = (ts <= reached) & ~jnp.isfinite(q + qd).all(axis=1)
     reached = jnp.where(lost.any(), ts[jnp.argmax(lost) - 1], reached)
     stats = found.stats | {"time_reached": jnp.where(valid, reached, asked[0])}
