@@ -50,6 +50,7 @@ def integrate(
     term = term_of(forces)
     controller = step_control(keywords["stepsize_controller"])
     unpacked, y0 = args, whole(*start_of(args, qd0), own)
+    at_start = motion_at(args, ts[0], y0)  # after a blow there, like all that follows
     if padded and not derivatives:
         term, y0, args = in_arrays(term, y0, args)
     length = len(y0)
@@ -97,8 +98,9 @@ def integrate(
         return jnp.where(jnp.isinf(a) | ~valid, jnp.nan, a)
 
     # diffrax saves the start only with the first step.
-    start = (without_fixed(linkage, value) for value in state0)
-    q, qd = (shown(rows).at[0].set(first) for rows, first in zip((q, qd), start))
+    given = (without_fixed(linkage, value) for value in state0)
+    first = (jnp.where(valid, a, b) for a, b in zip(at_start, given))
+    q, qd = (shown(rows).at[0].set(row) for rows, row in zip((q, qd), first))
     # Constant steps go on when the state is no longer finite.
     reached = jnp.minimum(reached[0], ts[-1])
     lost = (ts <= reached) & ~jnp.isfinite(q + qd).all(axis=1)

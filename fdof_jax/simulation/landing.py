@@ -160,7 +160,9 @@ class Landing(Adaptive):
         inner = jax.tree.map(
             lambda old, new: jnp.where(unknown, old, new), state.inner, inner
         )
-        result = results.where(unknown, results.successful, result)
+        # After the last step, which may be shorter than others may, none is asked for.
+        done = keep & (end >= state.last)
+        result = results.where(unknown | done, results.successful, result)
         chatter = (landings > _MOST_LANDINGS) & (result == results.successful)
         result = results.where(chatter, results.max_steps_rejected, result)
         state = _Landing(

@@ -67,8 +67,9 @@ def _rate(function: Any, arrival: Arrival, term: Any) -> Array:
 
 
 def _change(function: Any, arrival: Arrival, term: Any, change: Any) -> Array:
-    """Returns a function of an arrival, and its change with the arrival."""
-    return eqx.filter_jvp(lambda a: function(a, term), (arrival,), (change,))[1]
+    """Returns how a function of an arrival changes with it."""
+    _, found = eqx.filter_jvp(lambda a: function(a, term), (arrival,), (change,))
+    return jnp.zeros_like(arrival.t) if found is None else found
 
 
 def _quotient(change: Array, slope: Array) -> Array:

@@ -36,7 +36,7 @@ class Switching(NamedTuple):
     - `near`: how far from its zero a switching function may switch [s].
     - `sizes` (switch,): the largest values of the switching functions up to here.
     - `length`: that of the step that ended here [s].
-    - `ahead`: 1 if the first function that switches here is yet to reach its zero.
+    - `ahead`: 1 if a function that switches here is yet to reach its zero, or else 0.
     - `passed`: number of switches up to here.
     - `one_sided`: number of places up to here where derivatives may be (see `Located`);
       None if nothing jumps at switches.
@@ -187,7 +187,7 @@ class Located(diffrax.AbstractAdaptiveSolver):
             near,
             sizes,
             t1 - t0,
-            (margins[-1] > 0)[jnp.argmax(switched)].astype(t0.dtype),
+            jnp.any(switched & (margins[-1] > 0)).astype(t0.dtype),
             known.passed + changed,
             self.one_sided(known, sides, sizes, changed),
             jnp.maximum(
