@@ -105,8 +105,8 @@ class _LocatedRows(Located):
                 # known time.
                 some = jnp.stack([first.any(), others.any()])
                 steep = some & (known.length > 0) & (slopes != 0)
-                of_zeros = -changes / jnp.where(steep, slopes, 1)
-                lates = jnp.where(steep, of_zeros, late[:, None])
+                of_zeros = -changes / jnp.where(steep, slopes, 1)[None]
+                lates = jnp.where(steep[None], of_zeros, late[:, None])
                 gain += lates @ (rates[2:4] - rates[3:])
             return rows.at[1:].add(gain)
 
