@@ -14,6 +14,7 @@ from .derivative_control import OfLinearised, OfTangents
 from .dopri8 import constant
 from .field import args_of, initial_own, own_states, whole
 from .known_times import clocks_apart, known_times
+from .landing import end_of_run
 from .looped_dopri8 import LoopedDopri8
 from .packing import in_arrays
 from .prescribed import agrees, motion_at, start_of, term_of
@@ -49,6 +50,7 @@ def integrate(
     term = term_of(forces)
     controller = step_control(keywords["stepsize_controller"])
     unpacked, y0 = args, whole(*start_of(args, qd0), own)
+    at_start = motion_at(args, ts[0], y0)  # after a blow there, like all that follows
     if padded and not derivatives:
         term, y0, args = in_arrays(term, y0, args)
     length = len(y0)
@@ -58,7 +60,8 @@ def integrate(
     adaptive = isinstance(controller, diffrax.AbstractAdaptiveStepSizeController)
     # Fixed steps may pass over the kinks of a history, but over no jump.
     left_out = () if adaptive else (EffortHistory,)
-    start = term, ts[0], y0, args, known_times(args, *left_out)
+    jumps = known_times(args, *left_out)
+    start = term, ts, y0, args, jumps
     located_solver, controller, y0 = located(locate, solver, controller, *start)
     if adaptive:
         if tangents:
@@ -72,7 +75,7 @@ def integrate(
         found = diffeqsolve(
             term,
             t0=ts[0],
-            t1=ts[-1],
+            t1=end_of_run(ts, jumps),
             y0=y0,
             args=args,
             saveat=diffrax.SaveAt(
@@ -95,10 +98,11 @@ def integrate(
         return jnp.where(jnp.isinf(a) | ~valid, jnp.nan, a)
 
     # diffrax saves the start only with the first step.
-    start = (without_fixed(linkage, value) for value in state0)
-    q, qd = (shown(rows).at[0].set(first) for rows, first in zip((q, qd), start))
+    given = (without_fixed(linkage, value) for value in state0)
+    first = (jnp.where(valid, a, b) for a, b in zip(at_start, given))
+    q, qd = (shown(rows).at[0].set(row) for rows, row in zip((q, qd), first))
     # Constant steps go on when the state is no longer finite.
-    (reached,) = reached
+    reached = jnp.minimum(reached[0], ts[-1])
     lost = (ts <= reached) & ~jnp.isfinite(q + qd).all(axis=1)
     reached = jnp.where(lost.any(), ts[jnp.argmax(lost) - 1], reached)
     stats = found.stats | {"time_reached": jnp.where(valid, reached, asked[0])}

@@ -5,7 +5,6 @@ from jax import Array
 
 from ..forces.element import Element
 from ..forces.part import jumps_of
-from .dopri8 import constant
 from .field import Args
 from .landing import rounding
 from .prescribed import PrescribedMotion
@@ -29,7 +28,7 @@ def clocks_apart(args: Args, ts: Array) -> Args:
     )
     if len(places) < 2:
         return args
-    unit = _APART * rounding(constant(jnp.max(jnp.abs(ts))))
+    unit = _APART * rounding(ts)
     ahead = [0.0] * len(args.forces)
     for rank, (_, place) in enumerate(places):
         ahead[place] = rank

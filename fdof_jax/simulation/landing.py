@@ -21,19 +21,46 @@ _MOST_TRIES = 6
 _APART = 4
 
 
-def rounding(t: Array) -> Array:
-    """Returns the distance kept from known times."""
-    return _APART * jnp.finfo(t.dtype).eps * constant(jnp.abs(t))
+def rounding(ts: Array) -> Array:
+    """Returns the distance kept from known times in a run over the times `ts`.
+
+    It is relative to the largest of them, because one that is 0 has rounding too where
+    steps begin at others.
+    """
+    return _APART * jnp.finfo(ts.dtype).eps * constant(jnp.max(jnp.abs(ts)))
+
+
+def end_of_run(ts: Array, jumps: Array | None) -> Array:
+    """Returns the end of the last step: the last time, or a little later with a jump.
+
+    diffrax moves ends of steps to the end of a run if they are near, so that a step
+    would end on the known time instead of before it.
+    """
+    end = ts[-1]
+    if jumps is None:
+        return end
+    apart = rounding(ts)
+    there = (jumps >= _last(end) - apart) & (jumps <= end + apart)
+    return end + jnp.where(jnp.any(constant(there)), 64 * apart, 0)
+
+
+def _last(end: Array) -> Array:
+    """Returns the time from which on diffrax may take the end of a step for the end.
+
+    It does so within 100 units of rounding.
+    """
+    return constant(end - 200 * jnp.finfo(end.dtype).eps * jnp.abs(end))
 
 
 class _Landing(NamedTuple):
     inner: Any
     target: Array  # where this step is to end, infinity if anywhere
+    gap: Array  # time left out after it, 0 unless it ends at a known time
     resumed: Array  # length of the step after it
     crossing: Array  # end of the last step that passed a switch, -infinity if none
     tries: Array  # to end at the next switch, up to here
     landings: Array  # one after the other up to here
-    last: Array  # times from here on are the end of the solve for diffrax
+    last: Array  # see `_last`
 
 
 class Landing(Adaptive):
@@ -45,6 +72,7 @@ class Landing(Adaptive):
 
     controller: Any
     jumps: Array | None
+    apart: Array  # see `rounding`
     switches: bool = eqx.field(static=True)
 
     def _motion(self, y: Any) -> Any:
@@ -58,23 +86,21 @@ class Landing(Adaptive):
         idle = jnp.all(known.after == known.sides)
         return known.until, known.soon, known.near, idle
 
-    def _cut(self, t0: Array, t1: Array) -> tuple[Array, Array]:
-        """Returns the end of a step, and whether it is a known time."""
+    def _cut(self, t0: Array, t1: Array, last: Array) -> tuple[Array, Array, Array]:
+        """Returns the end of a step, the gap after it, and if it is at a known time."""
         if self.jumps is None:
-            return t1, jnp.array(False)
-        ends = self.jumps - rounding(self.jumps)
-        later = jnp.where(ends > t0 + rounding(self.jumps), ends, jnp.inf)
-        next_one = later[jnp.argmin(later)]
+            return t1, jnp.zeros_like(t1), jnp.array(False)
+        jumps = constant(self.jumps)
+        ends = jnp.maximum(jumps - self.apart, t0)
+        ends = jnp.where((jumps > t0) & (ends < last), ends, jnp.inf)
+        index = jnp.argmin(ends)
+        next_one, jump = ends[index], jumps[index]
         # A step must not end just before a known time.
         reached = t1 + 1e-6 * (t1 - t0) >= next_one
-        return jnp.where(reached, next_one, t1), reached
-
-    def _gap(self, end: Array) -> Array:
-        """Returns the time left out after a step to a known time, 0 after others."""
-        if self.jumps is None:
-            return jnp.zeros_like(end)
-        apart = rounding(self.jumps)
-        return jnp.max(jnp.where(constant(self.jumps) - apart == end, 2 * apart, 0))
+        # With the derivatives of the known time.
+        end = self.jumps[index] - (jump - next_one)
+        gap = jnp.where(reached, jump + self.apart - next_one, 0)
+        return jnp.where(reached, end, t1), gap, reached
 
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):  # pyright: ignore[reportIncompatibleMethodOverride]
         if self.switches:
@@ -83,15 +109,13 @@ class Landing(Adaptive):
             *constant((terms, t0, t1, self._motion(y0), dt0, args)), func, error_order
         )
         end, inner = constant((end, inner))
-        length = end - constant(t0)
-        end, cut = self._cut(t0, t0 + length)
+        length, last = end - constant(t0), _last(t1)
+        end, gap, cut = self._cut(constant(t0), t0 + length, last)
         if self.switches:  # a step of no length finds the sides
-            end, cut = t0, jnp.array(True)
+            end, gap, cut = t0, jnp.zeros_like(t0), jnp.array(True)
         target = jnp.where(cut, constant(end), jnp.inf)
-        # diffrax treats times within 100 units of rounding of the end as the end.
-        last = constant(t1 - 200 * jnp.finfo(t1.dtype).eps * jnp.abs(t1))
         crossing, none = jnp.full_like(target, -jnp.inf), jnp.zeros((), int)
-        return end, _Landing(inner, target, length, crossing, none, none, last)
+        return end, _Landing(inner, target, gap, length, crossing, none, none, last)
 
     def adapt_step_size(  # pyright: ignore[reportIncompatibleMethodOverride]
         self, t0, t1, y0, y1, args, y_error, error_order, state
@@ -108,7 +132,7 @@ class Landing(Adaptive):
         until, soon, near, idle = constant(self._found(y1, end))
         late = jnp.where(aimed, near, 0)
         passed = keep & (until < jnp.minimum(end - late, state.last))
-        tiny = (begin < end) & (end - begin <= _APART * rounding(end))
+        tiny = (begin < end) & (end - begin <= _APART * self.apart)
         passed = passed & ~(aimed & tiny)  # it ends where the switch is
         # A step that ends before the switch is stretched to it if that is near, because
         # a tiny second step would tell little of slopes.
@@ -125,9 +149,10 @@ class Landing(Adaptive):
         short = crossed & aimed | landed
         length = jnp.where(short, state.resumed, next1 - next0)
         next_t0 = jnp.where(keep, t1 + (next0 - end), t0)
-        next_t0 = next_t0 + jnp.where(landed, self._gap(end), 0)
-        next_t1, cut = self._cut(next_t0, next_t0 + length)
-        next_t1 = jnp.where(crossed, until, jnp.where(missed, crossing, next_t1))
+        next_t0 = next_t0 + jnp.where(landed, state.gap, 0)
+        next_t1 = jnp.where(missed, crossing, next_t0 + length)
+        next_t1, gap, cut = self._cut(constant(next_t0), next_t1, state.last)
+        next_t1, gap = jnp.where(crossed, until, next_t1), jnp.where(crossed, 0, gap)
         target = jnp.where(cut | crossed | missed, constant(next_t1), jnp.inf)
         landings = state.landings * ~(keep & ~aimed) + crossed
         results: Any = diffrax.RESULTS
@@ -135,8 +160,12 @@ class Landing(Adaptive):
         inner = jax.tree.map(
             lambda old, new: jnp.where(unknown, old, new), state.inner, inner
         )
-        result = results.where(unknown, results.successful, result)
+        # After the last step, which may be shorter than others may, none is asked for.
+        done = keep & (end >= state.last)
+        result = results.where(unknown | done, results.successful, result)
         chatter = (landings > _MOST_LANDINGS) & (result == results.successful)
         result = results.where(chatter, results.max_steps_rejected, result)
-        state = _Landing(inner, target, length, crossing, tries, landings, state.last)
+        state = _Landing(
+            inner, target, gap, length, crossing, tries, landings, state.last
+        )
         return keep, next_t0, next_t1, landed | jumped, state, result

@@ -46,8 +46,9 @@ class PrescribedMotion(Element):
     among its `elements`.
 
     The velocities of `state0` are those before the first time. If they differ from the
-    reference's, the motion starts with an impulse. Adaptive steps control the errors of
-    the other joints' displacements and momenta.
+    reference's, the motion starts with an impulse, and its first velocities are those
+    after it. Adaptive steps control the errors of the other joints' displacements and
+    momenta.
 
     **Arguments:**
 

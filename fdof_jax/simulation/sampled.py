@@ -274,11 +274,12 @@ def _motion(
         acting = *forces, effort
         solution = simulate(linkage, state, jnp.stack(at), acting, own0=own, **options)
         rows = State(solution.q, solution.qd), solution.own
+        begun = jax.tree.map(lambda rows: rows[0], rows)
         last = jax.tree.map(lambda rows: rows[-1], rows)
         good = result == diffrax.RESULTS.successful
         result = diffrax.RESULTS.where(good, solution.result, result)
-        begun = None if delay is None else solution.q[1]
-        return (last, memory, tau, result), (last, tau, begun)
+        acts = None if delay is None else solution.q[1]
+        return (last, memory, tau, result), (begun, tau, acts)
 
     own0 = initial_states(linkage, forces), control.initial_state(linkage)
     own0, memory0 = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), own0)
@@ -286,12 +287,12 @@ def _motion(
     if delay is not None:
         held = jnp.where(delay < period, held, jnp.nan)
     first = jax.tree.map(jnp.asarray, state0), own0
-    (*_, result), (later, tau, begun) = jax.lax.scan(
+    (last, *_, result), (begun, tau, acts) = jax.lax.scan(
         one,
         (first, memory0, held, diffrax.RESULTS.successful),
         (times[:-1], times[1:], keys),
     )
-    rows = lambda first, later: jnp.concatenate([first[None], later])
-    (q, qd), own = jax.tree.map(rows, first, later)
+    rows = lambda begun, last: jnp.concatenate([begun, last[None]])
+    (q, qd), own = jax.tree.map(rows, begun, last)
     late = 0.0 if delay is None else delay
-    return SampledMotion(times, q, qd, tau, result, own, late, begun)
+    return SampledMotion(times, q, qd, tau, result, own, late, acts)

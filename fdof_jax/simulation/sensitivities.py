@@ -18,7 +18,7 @@ from ..forces.element import elements
 from ..linkage.linkage import without_fixed
 from .field import args_of, initial_own, own_states, whole
 from .known_times import clocks_apart, known_times
-from .landing import rounding
+from .landing import end_of_run
 from .prescribed import motion_at, start_of, term_of
 from .scene import Scene
 from .solution import Solution
@@ -26,7 +26,6 @@ from .steps import adaptive, of_precision
 from .switch_derivatives import first_of
 from .switching import Located, located
 from .unchecked import diffeqsolve
-from .zeros_in_steps import slope_at_end
 
 # Tolerance of the motion and its derivatives, whichever are larger. The steps that the
 # derivatives need make the loss on Fig 7's circle right to 1e-8.
@@ -68,20 +67,6 @@ class _LocatedRows(Located):
         # The error control of the derivatives finds kinks of the rates by itself.
         return self.jumping or jumps is not None
 
-    def none_late(self, t):
-        return jnp.zeros(2, t.dtype)
-
-    def lateness(self, where, seen, switched):
-        """Returns the slopes of the first function that switched and of another."""
-        _, t0, t1, *_ = where
-        if not self.jumping:
-            return self.none_late(t0)
-        length = t1 - t0
-        slopes = jnp.where(length > 0, slope_at_end(seen), 0)
-        slopes = slopes / jnp.where(length > 0, length, 1)
-        others = switched & ~first_of(switched)
-        return slopes[jnp.stack([jnp.argmax(switched), jnp.argmax(others)])]
-
     def shifted(self, term, t, y, args, known, made_jump):
         if not (self.jumping or self.jumps is not None):
             return y
@@ -89,33 +74,41 @@ class _LocatedRows(Located):
         before, after = known.sides, args.sides
 
         def moved():
-            first = first_of(before != after)
-            between = jnp.where(first, after, before)
-            times, sides = [time, t, t, t], [before, before, between, after]
+            switched = before != after
+            first = first_of(switched)
+            between, others = jnp.where(first, after, before), switched & ~first
+            # A known time may be here too, before the switches or after them.
+            ahead = known.ahead > 0
+            when, beside = jnp.where(ahead, t, time), jnp.where(ahead, before, after)
+            times = jnp.stack([time, t, when, when, when])
+            sides = jnp.stack([beside, beside, before, between, after])
             rates = jax.vmap(self.rates, in_axes=(0, None, None, 0))
-            rates = rates(jnp.stack(times), rows[0], args.z, jnp.stack(sides))
-            none = jnp.zeros(self.count, rows.dtype)
-            late = [none] * 3  # the known time here, a switch, and another one
+            rates = rates(times, rows[0], args.z, sides)
+            late = jnp.zeros(self.count, rows.dtype)  # of the known time
             if self.jumps is not None and self.slopes is not None:
                 distance = jnp.abs(time - self.jumps)
                 index = jnp.argmin(distance)
-                known_time = distance[index] <= 2 * rounding(self.jumps[index])
-                late[0] = jnp.where(known_time, self.slopes[index], none)
+                known_time = distance[index] <= 2 * self.apart
+                late = jnp.where(known_time, self.slopes[index], late)
+            gain = jnp.outer(late, rates[0] - rates[1])
             if self.jumping:
-                others = (before != after) & ~first
                 places = jnp.stack([jnp.argmax(first), jnp.argmax(others)])
                 before_it = args._replace(sides=before)
-                values = lambda row, z: term.switches(
-                    time, (row[None],), before_it._replace(z=z)
+                values = lambda t, row, z: term.switches(
+                    t, (row[None],), before_it._replace(z=z)
                 )[0][places]
-                _, change = jax.linearize(values, rows[0], args.z)
-                changes = jax.vmap(change)(rows[1:], jnp.eye(self.count))
-                # A function that jumps itself does so at a known time.
-                steep = known.lateness != 0
-                slopes = jnp.where(steep, known.lateness, 1)
-                of_zeros = -changes.T / slopes[:, None]
-                late[1:] = jnp.where(steep[:, None], of_zeros, late[0][None])
-            gain = jnp.stack(late, axis=1) @ (rates[:-1] - rates[1:])
+                _, change = jax.linearize(values, when, rows[0], args.z)
+                slopes = change(jnp.ones_like(t), rates[2], jnp.zeros_like(args.z))
+                in_z = lambda row, z: change(jnp.zeros_like(t), row, z)
+                seen = rows[1:] + jnp.where(ahead, gain, 0)
+                changes = jax.vmap(in_z)(seen, jnp.eye(self.count))
+                # In a step of no length nothing comes to its zero: it has jumped, at a
+                # known time.
+                some = jnp.stack([first.any(), others.any()])
+                steep = some & (known.length > 0) & (slopes != 0)
+                of_zeros = -changes / jnp.where(steep, slopes, 1)[None]
+                lates = jnp.where(steep[None], of_zeros, late[:, None])
+                gain += lates @ (rates[2:4] - rates[3:])
             return rows.at[1:].add(gain)
 
         return (jax.lax.cond(made_jump, moved, lambda: rows),)
@@ -202,13 +195,13 @@ def sensitivities(
     # that `next_motion` can differentiate again.
     solver = diffrax.Tsit5(scan_kind="lax")
     solver, controller, y0 = located(
-        locate, solver, controller, term, ts[0], y0, _Varied(z), jumps
+        locate, solver, controller, term, ts, y0, _Varied(z), jumps
     )
     found = diffeqsolve(
         term,
         solver,
         t0=ts[0],
-        t1=ts[-1],
+        t1=end_of_run(ts, jumps),
         dt0=1e-3,
         y0=y0,
         args=_Varied(z),

@@ -13,20 +13,6 @@ import jax.numpy as jnp
 from jax import Array
 
 from .dopri8 import constant
-from .zeros_in_steps import bend_at_end, slope_at_end
-
-
-@eqx.filter_jit
-def lateness_of(margins: Array, switched: Array) -> Array:
-    """Returns the zero of the first margin that `switched`, as a share of the step.
-
-    It is at the end of the step, 0 with derivatives, of second order.
-    """
-    margin = margins[:, jnp.argmax(switched), None]
-    slope, bend = slope_at_end(margin)[0], constant(bend_at_end(margin))[0]
-    slope = jnp.where((slope == 0) | ~switched.any(), 1, slope)
-    late = _of_zero(margin[-1, 0] - constant(margin[-1, 0]), -1 / slope)
-    return late - _of_zero(late, _of_zero(late, bend / (2 * slope)))
 
 
 def first_of(switched: Array) -> Array:
@@ -48,6 +34,95 @@ def _(primals, tangents):
     (zero, factor), (change, factor_change) = primals, tangents
     product = _of_zero(zero, factor)
     return product, change * factor + _of_zero(zero, factor_change)
+
+
+class Arrival(NamedTuple):
+    """The end of a step at which the first function that `switched` is zero."""
+
+    t: Array
+    y: Any
+    args: Any
+    switched: Array  # none: nothing is zero
+
+
+@eqx.filter_jit  # traced once, not at each use in a solve
+def _value(arrival: Arrival, term: Any) -> Array:
+    t, y, args, switched = arrival
+    return term.switches(t, y, args)[0][jnp.argmax(switched)]
+
+
+@eqx.filter_jit
+def _slope(arrival: Arrival, term: Any) -> Array:
+    return _rate(_value, arrival, term)
+
+
+def _rate(function: Any, arrival: Arrival, term: Any) -> Array:
+    """Returns the rate of a function of an arrival along the motion.
+
+    It is exact, where differences of samples are lost in rounding if steps are short.
+    """
+    t, y, args, _ = arrival
+    moved = lambda t, y: function(arrival._replace(t=t, y=y), term)
+    return jax.jvp(moved, (t, y), (jnp.ones_like(t), term.vf(t, y, args)))[1]
+
+
+def _change(function: Any, arrival: Arrival, term: Any, change: Any) -> Array:
+    """Returns how a function of an arrival changes with it."""
+    _, found = eqx.filter_jvp(lambda a: function(a, term), (arrival,), (change,))
+    return jnp.zeros_like(arrival.t) if found is None else found
+
+
+def _quotient(change: Array, slope: Array) -> Array:
+    """Returns how much later a value is zero after a change; 0 without a slope."""
+    steep = slope != 0
+    return jnp.where(steep, -change / jnp.where(steep, slope, 1), 0)
+
+
+@eqx.filter_custom_jvp
+def lateness(arrival: Arrival, *, term: Any) -> Array:
+    """Returns when the function that switched is zero, less the time of arrival.
+
+    This is 0, with derivatives of first and second order.
+    """
+    return jnp.zeros_like(arrival.t)
+
+
+@lateness.def_jvp
+def _(primals, tangents, *, term):
+    (arrival,), (change,) = primals, tangents
+    late = lateness(arrival, term=term)
+    if not jax.tree.leaves(change):
+        return late, late
+
+    def first():
+        change_here = _change(_value, arrival, term, change)
+        return _quotient(change_here, _slope(arrival, term))
+
+    none = lambda: jnp.zeros_like(late)
+    first = jax.lax.cond(jnp.any(arrival.switched), first, none)
+    return late, first + _later(late, arrival, first, change, term=term)
+
+
+@eqx.filter_custom_jvp
+def _later(late, arrival, first, change, *, term):
+    """Second-order part of `lateness`: its value is 0; only its derivative matters."""
+    return jnp.zeros_like(late)
+
+
+@_later.def_jvp
+def _(primals, tangents, *, term):
+    (_, arrival, first, change), (along, *_) = primals, tangents
+    nothing = _later(*primals, term=term)
+    if along is None:
+        return nothing, nothing
+
+    def second():
+        slope_change = _change(_slope, arrival, term, change)
+        slope_change += first * _rate(_slope, arrival, term)
+        return _quotient(along * slope_change, _slope(arrival, term))
+
+    none = lambda: jnp.zeros_like(nothing)
+    return nothing, jax.lax.cond(jnp.any(arrival.switched), second, none)
 
 
 class Moment(NamedTuple):

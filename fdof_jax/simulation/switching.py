@@ -18,7 +18,7 @@ from ..base.checks import shown
 from .dopri8 import DenseOutput, constant, with_change
 from .landing import Landing, rounding
 from .step_wrappers import Undifferentiated, with_judge
-from .switch_derivatives import Moment, first_of, gained, lateness_of
+from .switch_derivatives import Arrival, Moment, first_of, gained, lateness
 from .zeros_in_steps import BEYOND, SAMPLED, SHARES, passage
 
 # A function whose zero is this close to the end of a step switches there: a share of
@@ -36,8 +36,8 @@ class Switching(NamedTuple):
     - `soon`: when a switch follows soon after the end, or else the end [s].
     - `near`: how far from its zero a switching function may switch [s].
     - `sizes` (switch,): the largest values of the switching functions up to here.
-    - `lateness` (2,): the times of the first switch here and of another one, minus the
-      step's end [s]. Their values are 0; their derivatives are not.
+    - `length`: that of the step that ended here [s].
+    - `ahead`: 1 if a function that switches here is yet to reach its zero, or else 0.
     - `passed`: number of switches up to here.
     - `one_sided`: number of places up to here where derivatives may be (see `Located`);
       None if nothing jumps at switches.
@@ -51,7 +51,8 @@ class Switching(NamedTuple):
     soon: Array
     near: Array
     sizes: Array
-    lateness: Array
+    length: Array
+    ahead: Array
     passed: Array
     one_sided: Array | None
     grazing: Array
@@ -59,19 +60,19 @@ class Switching(NamedTuple):
 
 
 def located(
-    locate: Callable[[Any, bool], "Located"],
+    locate: Callable[[Any, bool, Array], "Located"],
     solver: Any,
     controller: Any,
     term: Any,
-    t0: Array,
+    ts: Array,
     y0: Any,
     args: Any,
     jumps: Any,
 ) -> tuple[Any, Any, Any]:
     """Returns solver, controller and start with steps that end where elements switch.
 
-    `jumps`: known times at which steps end too, or None. Raises ValueError if there are
-    any and steps are not adaptive.
+    `ts`: the times of the run. `jumps`: known times at which steps end too, or None.
+    Raises ValueError if there are any and steps are not adaptive.
     """
     if not isinstance(controller, diffrax.AbstractAdaptiveStepSizeController):
         if jumps is not None:
@@ -80,13 +81,13 @@ def located(
                 f"times at which they jump (jump_ts), got {shown(controller)}."
             )
         return solver, controller, y0
+    t0, apart = ts[0], rounding(ts)
     jumps = None if jumps is None else jnp.asarray(jumps, t0.dtype)
     found, jumping = eqx.filter_eval_shape(term.switches, t0, y0, args)
-    wrapped = locate(solver, jumping)
+    wrapped = locate(solver, jumping, apart)
     switches = wrapped.needed(found.size, jumps)
     if switches:
         unknown, none = jnp.zeros(found.shape, t0.dtype), jnp.zeros_like(t0)
-        late = wrapped.none_late(t0)
         known = Switching(
             unknown,
             unknown,
@@ -94,7 +95,8 @@ def located(
             t0,
             none,
             unknown,
-            late,
+            none,
+            none,
             none,
             none if jumping else None,
             none,
@@ -103,7 +105,7 @@ def located(
         solver, y0 = wrapped, (*y0, known)
     if jumps is None and not switches:
         return solver, with_judge(Undifferentiated, controller), y0
-    landing = lambda inner: Landing(inner, jumps, switches)  # pyright: ignore[reportCallIssue]
+    landing = lambda inner: Landing(inner, jumps, apart, switches)  # pyright: ignore[reportCallIssue]
     return solver, with_judge(landing, controller), y0
 
 
@@ -127,6 +129,7 @@ class Located(diffrax.AbstractAdaptiveSolver):
 
     solver: Any
     jumping: bool = eqx.field(static=True)  # whether efforts do, at a switch
+    apart: Array  # see `rounding`
     derivatives: bool = eqx.field(static=True)
 
     @property
@@ -169,7 +172,7 @@ class Located(diffrax.AbstractAdaptiveSolver):
         # Lengths of steps to a switch say nothing about the pace of the motion.
         share = jnp.finfo(t1.dtype).eps ** _NEAR
         near = jnp.maximum(share * (t1 - t0), known.near / 2)
-        near = jnp.maximum(near, rounding(t1))
+        near = jnp.maximum(near, self.apart)
         sizes = jnp.maximum(known.sizes, jnp.max(jnp.abs(seen), axis=0))
         until, crossed, missed, switched, grazing, soon = passage(
             margins, known.sizes, sizes, near / (t1 - t0)
@@ -184,7 +187,8 @@ class Located(diffrax.AbstractAdaptiveSolver):
             t1 + soon * (t1 - t0),
             near,
             sizes,
-            self.lateness(where, seen, switched),
+            t1 - t0,
+            jnp.any(switched & (margins[-1] > 0)).astype(t0.dtype),
             known.passed + changed,
             self.one_sided(known, sides, sizes, changed),
             jnp.maximum(
@@ -201,10 +205,6 @@ class Located(diffrax.AbstractAdaptiveSolver):
         """Returns whether steps are to end at this number of switches."""
         return count > 0
 
-    def none_late(self, t: Array) -> Array:
-        """Returns the lateness before the first step."""
-        return jnp.zeros(2 if self.derivatives else (), t.dtype)
-
     def one_sided(
         self, known: Switching, sides: Array, sizes: Array, changed: Array
     ) -> Array | None:
@@ -217,34 +217,27 @@ class Located(diffrax.AbstractAdaptiveSolver):
         together = (changed > 1) & (known.grazing_here > 0)
         return jnp.maximum(known.one_sided, begun) + together
 
-    def lateness(self, where: tuple, seen: Array, switched: Array) -> Array:
-        """Returns `Switching.lateness` at the end of a step."""
-        _, t0, t1, _, args = where
-        if not self.derivatives:
-            return self.none_late(t0)
-
-        def late():
-            margins = args.sides[None] * _values(*where)
-            others = switched & ~first_of(switched)
-            found = lateness_of(margins, switched), lateness_of(margins, others)
-            return (t1 - t0) * jnp.stack(found)
-
-        return jax.lax.cond(jnp.any(switched), late, lambda: self.none_late(t0))
-
     def shifted(
         self, term: Any, t: Array, y: Any, args: Any, known: Switching, made_jump: Any
     ) -> Any:
         """Returns the state at the start of a step, changed by a switch there."""
         if not self.derivatives:
             return y
-        late = jnp.where(made_jump, known.lateness, 0)
         before, after = known.sides, known.after
         passed = [before, after]
         if self.jumping and before.size > 1:  # kinks change second derivatives alone
             passed.insert(1, jnp.where(first_of(after != before), after, before))
-        for time, before, after in zip(late, passed, passed[1:]):
+        # A known time may be here too, just before the zeros or just after them.
+        t = jnp.where(known.ahead > 0, t, known.until)
+        # In a step of no length nothing comes to its zero: it has jumped, and when that
+        # was is known.
+        arrived = made_jump & (known.length > 0)
+        for before, after in zip(passed, passed[1:]):
+            here = args._replace(sides=before)
+            arrival = Arrival(t, y, here, (before != after) & arrived)
+            late = lateness(arrival, term=term)
             moment = Moment(t, y, args, before, after, jnp.array(made_jump))
-            gain = gained(time, moment, term=term, jumping=self.jumping)
+            gain = gained(late, moment, term=term, jumping=self.jumping)
             y = jax.tree.map(jnp.add, y, gain)
         return y
 
