@@ -64,7 +64,8 @@ def _(primals, tangents):
     allowed = tolerance * size + noise * _largest(motion)
     ratio = jnp.where(allowed > 0, error / allowed, 0)
     # Shorter steps do not mend a tangent that is not a number.
-    ratio = jax.lax.pmax(jnp.where(jnp.isnan(ratio), 0, ratio), TANGENTS)
+    ratio = constant(jnp.where(jnp.isnan(ratio), 0, ratio))
+    ratio = jax.lax.pmax(ratio, TANGENTS)
     return ratio, jnp.zeros_like(ratio)
 
 

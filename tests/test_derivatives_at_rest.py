@@ -1,0 +1,237 @@
+"""Derivatives of arms that rest, whose motion has no error that would bound a step.
+
+An arm at rest obeys its linearised equations, whose matrix exponential is exact. The
+linearisation is that of the equations at one instant, not of any integrator.
+"""
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from modes import ADJOINT, LOOPS
+from scipy.linalg import expm
+
+import fdof_jax as fj
+
+# For `jax.grad`: by tangents in a few numbers, by the adjoint with checkpoints.
+DEFAULT, FORWARD = diffrax.RecursiveCheckpointAdjoint(), diffrax.ForwardMode()
+MODES = "tangents", "adjoint", "forward"
+
+
+class Hold(eqx.Module):
+    target: jax.Array
+
+    def __call__(self, t, linkage):
+        return self.target, jnp.zeros_like(self.target)
+
+
+class Pushes(eqx.Module):
+    """Efforts that grow with the time from the first of the times to the second."""
+
+    times: jax.Array
+    rate: jax.Array
+
+    @property
+    def jump_ts(self):
+        return self.times
+
+    def __call__(self, t, q, qd, linkage):
+        begin, end = self.times
+        return jnp.where((begin <= t) & (t < end), self.rate * (t - begin), 0)
+
+
+def changed(numbers, scene):
+    """Returns arm and forces with other efforts and masses, and the start."""
+    arm, forces = scene[:2]
+    tau, log_mass, q0, qd0 = numbers
+    arm = eqx.tree_at(lambda a: a.mass, arm, arm.mass * jnp.exp(log_mass))
+    forces = eqx.tree_at(lambda f: f[0].tau, forces, forces[0].tau + tau)
+    return arm, forces, fj.State(q0, qd0)
+
+
+def end(numbers, scene, adjoint, rtol=None):
+    """Returns a weighted sum of the last positions and velocities, and steps."""
+    arm, forces, start = changed(numbers, scene)
+    motion = fj.simulate(
+        arm, start, jnp.stack([0.0, scene[2]]), forces,
+        adjoint=adjoint, throw=False, rtol=rtol, atol=rtol,
+    )  # fmt: skip
+    last = jnp.concatenate([motion.q[-1], motion.qd[-1]])
+    # Of a failed motion nothing may count.
+    good = motion.result == diffrax.RESULTS.successful
+    return jnp.where(good, scene[3] @ last, jnp.nan), motion.stats["num_steps"]
+
+
+def gradients(mode):
+    if mode == "forward":
+        of = lambda numbers, scene: jax.jacfwd(
+            lambda numbers: end(numbers, scene, FORWARD), has_aux=True
+        )(numbers)
+    else:
+        adjoint = {"tangents": DEFAULT, "adjoint": ADJOINT}[mode]
+        of = jax.grad(lambda *at: end(*at, adjoint), has_aux=True)
+    return eqx.filter_jit(of, **LOOPS)
+
+
+@pytest.fixture(scope="module")
+def gradient():
+    """Returns the gradient of `end` by each mode, each compiled once."""
+    return {mode: gradients(mode) for mode in MODES}
+
+
+@eqx.filter_jit
+def linearised(numbers, scene):
+    """Returns the rates at the start, and their derivatives in state and numbers."""
+
+    def rates(state, numbers):
+        arm, forces, (q, _) = changed(numbers, scene)
+        q, qd = state[: len(q)], state[len(q) :]
+        tau = sum(element(0.0, q, qd, arm) for element in forces)
+        return jnp.concatenate([qd, fj.forward_dynamics(arm, q, qd, tau)])
+
+    state = jnp.concatenate(numbers[2:])
+    in_state, in_numbers = jax.jacfwd(rates, (0, 1))(state, numbers)
+    return rates(state, numbers), in_state, jnp.hstack(in_numbers[:2])
+
+
+def exact(numbers, scene):
+    """Returns the gradient of `end`, by a matrix exponential, and the fastest rate."""
+    rates, in_state, in_numbers = map(np.asarray, linearised(numbers, scene))
+    assert np.abs(rates).max() < 1e-11  # at rest
+    size, count = in_numbers.shape
+    matrix = np.block(
+        [[in_state, in_numbers], [np.zeros((count, size)), np.zeros((count, count))]]
+    )
+    whole = expm(float(scene[2]) * matrix)[:size]
+    modes = np.linalg.eigvals(in_state)
+    columns = np.hstack([whole[:, size:], whole[:, :size]])
+    return np.asarray(scene[3]) @ columns, modes
+
+
+def flat(gradient):
+    return np.concatenate([np.asarray(part) for part in gradient])
+
+
+def error(found, wanted):
+    return np.linalg.norm(found - wanted) / np.linalg.norm(wanted)
+
+
+# One structure for all arms of as many joints: elements of no effect have coefficients
+# of 0, so that one program in each mode serves all.
+
+
+def held_by(kind, rng, topology):
+    """Returns a random arm at rest, which something of this kind holds or damps."""
+    n, none = len(topology), np.zeros(len(topology))
+    arm = fj.Linkage(
+        topology, length=rng.uniform(0.3, 1, n + 1), com=rng.uniform(0.1, 0.5, (n, 2)),
+        mass=rng.uniform(0.5, 2, n), inertia=rng.uniform(0.05, 0.3, n),
+        base_angle=rng.uniform(-3, 3),
+    )  # fmt: skip
+    q = rng.uniform(-1, 1, n)
+    moved = lambda qdd: fj.inverse_dynamics(arm, q, none, qdd)
+    inertia = np.diag(jax.jacfwd(moved)(jnp.zeros(n)))
+    damping, kp, kd, friction, stiffness = (none for _ in range(5))
+    speed, touching = 0.01, rng.random(n) < 0.5
+    if kind == "damper":
+        damping = inertia * 10 ** rng.uniform(0, 4)
+    if kind == "PD":  # critically damped and overdamped
+        frequency = 10 ** rng.uniform(0.3, 1.7, n)
+        kp = inertia * frequency**2
+        kd = 2 * inertia * frequency * 10 ** rng.uniform(0, 1.5)
+    if kind == "friction":
+        friction, speed = inertia * rng.uniform(0.1, 3, n), 10 ** rng.uniform(-2.5, -1)
+    if kind == "stops":
+        damping, stiffness = 3 * inertia, inertia * 10 ** rng.uniform(1, 4)
+    acting = (
+        fj.JointDamper(damping),
+        fj.PDController(kp, kd, none + np.inf, Hold(jnp.asarray(q - 0.05))),
+        fj.forces.JointFriction(friction, speed),
+        fj.forces.JointStops(
+            np.where(touching, q + 0.01, q - 1), q + 5, stiffness=stiffness + 1e-9,
+            damping=0.3, smoothing=1e-3,
+        ),
+    )  # fmt: skip
+    given = sum(np.asarray(e(0.0, jnp.asarray(q), none, arm)) for e in acting)
+    balance = fj.JointEffort(np.asarray(moved(jnp.zeros(n))) - given)
+    time, weights = rng.choice([0.5, 2.0, 10.0]), rng.standard_normal(2 * n)
+    numbers = tuple(map(jnp.asarray, (none, none, q, none)))
+    return numbers, (arm, (balance, *acting), *map(jnp.asarray, (time, weights)))
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_an_arm_that_hangs_in_damping_of_any_strength(mode, gradient):
+    hanging = fj.Linkage(
+        "R", length=[0, 1], com=[[0.5, 0]], mass=[1], inertia=[1 / 12],
+        base_angle=-np.pi / 2,
+    )  # fmt: skip
+    numbers, (_, (balance, damper, *others), *_) = held_by(
+        "nothing", np.random.default_rng(0), "R"
+    )
+    numbers = tuple(map(jnp.zeros_like, numbers))
+    balance = eqx.tree_at(lambda b: b.tau, balance, jnp.zeros(1))
+    # The other elements are taken from an arm in another pose, with no coefficients.
+    for damping in (1.0, 10.0, 30.0, 100.0, 1e3, 1e4):
+        damper = eqx.tree_at(lambda d: d.coefficient, damper, jnp.array([damping]))
+        scene = hanging, (balance, damper, *others), jnp.array(2.0), jnp.array([1.0, 0])
+        wanted, _ = exact(numbers, scene)
+        found, _ = gradient[mode](numbers, scene)
+        assert error(flat(found), wanted) < 1e-7, damping
+
+
+@pytest.mark.parametrize("kind", ["damper", "PD", "friction", "stops"])
+@pytest.mark.parametrize("mode", MODES)
+def test_one_joint_at_rest(mode, kind, gradient):
+    rng = np.random.default_rng(5)
+    for _ in range(4):
+        numbers, scene = held_by(kind, rng, "R")
+        wanted, _ = exact(numbers, scene)
+        found, _ = gradient[mode](numbers, scene)
+        assert error(flat(found), wanted) < 1e-6
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:prismatic joints")
+@pytest.mark.parametrize("count", [1, 2, 3, 5])
+def test_random_arms_at_rest(count, gradient):
+    """80 scenes of each number of joints, in each mode."""
+    rng, solved = np.random.default_rng(count), 0
+    while solved < 80:
+        kind = rng.choice(["damper", "PD", "friction", "stops"])
+        numbers, scene = held_by(kind, rng, "".join(rng.choice([*"RRP"], count)))
+        wanted, rates = exact(numbers, scene)
+        time = float(scene[2])
+        # Rounding errors make unstable arms leave their pose; many steps take minutes.
+        if rates.real.max() * time > 5 or np.abs(rates).max() * time > 3e4:
+            continue
+        for mode in MODES[1:] if count > 3 else MODES:
+            found, steps = gradient[mode](numbers, scene)
+            assert error(flat(found), wanted) < 1e-6, (mode, kind, int(steps))
+        solved += 1
+
+
+def test_second_derivatives_of_an_arm_at_rest():
+    """The derivative in effort and damping, whose exact value is a difference."""
+    rng = np.random.default_rng(5)
+    numbers, scene = held_by("damper", rng, "R")
+
+    def effort_at(damping, adjoint):
+        damped = eqx.tree_at(lambda s: s[1][1].coefficient, scene, damping)
+        slope = jax.grad if adjoint is DEFAULT else jax.jacfwd
+        first = lambda tau: end((tau, *numbers[1:]), damped, adjoint)[0]
+        return slope(first)(numbers[0])[0]
+
+    damping = scene[1][1].coefficient
+
+    def wanted(change):
+        damped = eqx.tree_at(lambda s: s[1][1].coefficient, scene, damping + change)
+        return exact(numbers, damped)[0][0]
+
+    h = 1e-3 * damping
+    wide, near = ((wanted(k * h) - wanted(-k * h)) / (2 * k * h) for k in (2, 1))
+    for adjoint in (DEFAULT, FORWARD):
+        mixed = jax.jit(jax.jacfwd(effort_at), static_argnums=1, **LOOPS)
+        found = mixed(damping, adjoint)
+        assert found == pytest.approx((4 * near - wide) / 3, rel=1e-6)
