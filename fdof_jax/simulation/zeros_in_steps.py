@@ -94,15 +94,23 @@ def _uncertainty(margins: Array, checks: Array, sizes: Array) -> Array:
     return _ELSEWHERE * jnp.maximum(error - rounding, 0)
 
 
+def _beyond(margins: Array) -> tuple[Array, Array]:
+    """Returns margins from the places where steps end beyond zeros, and how far."""
+    eps = jnp.finfo(margins.dtype).eps
+    beyond = eps**BEYOND * jnp.max(jnp.abs(margins), axis=0) + _ROUNDING * eps
+    return margins + beyond[None], beyond
+
+
 def _hiding_place(margins: Array, unsure: Array, begun: Array, near: Array) -> Array:
     """Returns a share of the step where a margin may pass 0 unseen, or else 1.
 
     It is in the middle of two samples. `unsure`: see `_uncertainty`; `begun`: which
     margins begin on their zeros, as after a switch.
     """
-    _, lowest = _turns(margins, jnp.zeros_like(unsure))
     # Margins on their zeros at the ends do not turn back within.
     ending = jnp.abs(margins[-1]) <= -slope_at_end(margins) * near
+    margins, beyond = _beyond(margins)
+    _, lowest = _turns(margins, beyond)  # as in `first_zero`; XLA computes them once
     inner = margins.at[0].add(jnp.where(begun, jnp.inf, 0))
     inner = inner.at[-1].add(jnp.where(ending, jnp.inf, 0))
     lowest = jnp.minimum(lowest, jnp.minimum(inner[:-1], inner[1:]))
@@ -164,9 +172,7 @@ def first_zero(
     if not margins.size:
         none = jnp.zeros((), margins.dtype)
         return none + 1, jnp.array(False), none
-    eps = jnp.finfo(margins.dtype).eps
-    beyond = eps**BEYOND * jnp.max(jnp.abs(margins), axis=0) + _ROUNDING * eps
-    margins = margins + beyond[None]
+    margins, beyond = _beyond(margins)
     # What is on the wrong side from the start on changes at once.
     wrong = jnp.any((margins[0] < 0) & (margins[1] < 0))
     turns, lowest = _turns(margins, beyond)
