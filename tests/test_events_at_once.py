@@ -8,7 +8,13 @@ import pytest
 
 import fdof_jax as fj
 from fdof_jax.simulation.sensitivities import sensitivities
-from fdof_jax.simulation.zeros_in_steps import SHARES, at_end, first_zero, passage
+from fdof_jax.simulation.zeros_in_steps import (
+    CHECKS,
+    SHARES,
+    at_end,
+    first_zero,
+    passage,
+)
 
 SLIDE = fj.Linkage(
     "P", length=[0, 1], com=[[0.5, 0]], mass=[1], inertia=[0.1], gravity=0
@@ -283,22 +289,34 @@ def test_a_switch_that_the_integrator_cannot_see_is_refused(transform):
 def test_far_from_zero_nothing_is_searched_and_nothing_missed():
     """Polynomials that pass zero, nearly meet it or stay away, in all step lengths."""
     rng = np.random.default_rng(0)
-    shares = np.asarray(SHARES)
+    shares = np.append(SHARES, CHECKS)
     roots = rng.uniform(-3, 3, (4000, 3))
     rows = np.prod(shares[:, None] - roots.T[:, None], axis=0) * rng.choice(
         [-1, 1], 4000
     )
     rows = rows + rng.uniform(-1, 1, 4000) * np.abs(rows).max(axis=0)
+    rows, checks = rows[: len(SHARES)], rows[len(SHARES) :]
     near = 10.0 ** rng.uniform(-10, 1, 4000)
     before = np.abs(rows).max(axis=0) * rng.uniform(0, 3, 4000)
     sizes = np.maximum(before, np.abs(rows).max(axis=0))
-    one = lambda *a: passage(a[0][:, None], a[1][None], a[2][None], a[3])
-    every = jax.jit(jax.vmap(one, (1, 0, 0, 0)))
-    found = every(rows, before, sizes, near)
+    new, brief = jnp.array([False]), jnp.array(False)
+
+    def quick(margins, checks, before, sizes, near):
+        margins, checks = margins[:, None], checks[:, None]
+        before, sizes = before[None], sizes[None]
+        *found, hidden, a, b, c = passage(
+            margins, checks, new, before, sizes, near, brief
+        )
+        return *found, a, b, c, hidden
+
+    every = jax.jit(jax.vmap(quick, (1, 1, 0, 0, 0)))
+    *found, hidden = every(rows, checks, before, sizes, near)
+    assert (hidden == 1).all()  # cubic polynomials are known exactly
 
     def slow(margins, before, sizes, near):
         margins, before, sizes = margins[:, None], before[None], sizes[None]
-        return *first_zero(margins, before), *at_end(margins, sizes, near)
+        sure = jnp.zeros(1)
+        return *first_zero(margins, before, sure), *at_end(margins, sizes, near)
 
     expected = jax.jit(jax.vmap(slow, (1, 0, 0, 0)))(rows, before, sizes, near)
     for a, b in zip(found, expected):

@@ -271,7 +271,7 @@ def test_tolerances_are_as_exact_as_those_of_a_controller_of_ones_own():
         ({"atol": [1e-6]}, "^atol: expected a real number"),
         (
             {"rtol": 1e-6, "stepsize_controller": diffrax.ConstantStepSize()},
-            "^rtol, atol: expected none beside a stepsize_controller",
+            "^rtol, atol, max_step: expected none beside a stepsize_controller",
         ),
     ],
 )

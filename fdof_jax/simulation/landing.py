@@ -11,8 +11,8 @@ from jax import Array
 from .dopri8 import constant, with_change
 from .step_wrappers import Adaptive
 
-# So many landings in a row, with no other step between, are chatter.
-_MOST_LANDINGS = 100
+# So many landings within this share of the motion's time are chatter.
+_MOST_LANDINGS, _CHATTER = 100, 1e-5
 # After so many tries the switching function itself is taken to jump, and the jump is
 # located by halving the step.
 _MOST_TRIES = 6
@@ -59,7 +59,9 @@ class _Landing(NamedTuple):
     resumed: Array  # length of the step after it
     crossing: Array  # end of the last step that passed a switch, -infinity if none
     tries: Array  # to end at the next switch, up to here
-    landings: Array  # one after the other up to here
+    landings: Array  # since the time `since`
+    since: Array
+    pace: Array  # time within which so many landings are chatter
     last: Array  # see `_last`
 
 
@@ -79,12 +81,15 @@ class Landing(Adaptive):
         return y[:-1] if self.switches and y is not None else y
 
     def _found(self, y: Any, end: Array) -> tuple[Any, ...]:
-        """Returns `until`, `soon` and `near`, and whether nothing switches here."""
+        """Returns times and `near` of `Switching`, and whether nothing switches here.
+
+        The times are `until`, `unseen` and `soon`.
+        """
         if not self.switches:
-            return end, end, 0, False
+            return end, end, end, 0, False
         known = y[-1]
         idle = jnp.all(known.after == known.sides)
-        return known.until, known.soon, known.near, idle
+        return known.until, known.unseen, known.soon, known.near, idle
 
     def _cut(self, t0: Array, t1: Array, last: Array) -> tuple[Array, Array, Array]:
         """Returns the end of a step, the gap after it, and if it is at a known time."""
@@ -115,7 +120,10 @@ class Landing(Adaptive):
             end, gap, cut = t0, jnp.zeros_like(t0), jnp.array(True)
         target = jnp.where(cut, constant(end), jnp.inf)
         crossing, none = jnp.full_like(target, -jnp.inf), jnp.zeros((), int)
-        return end, _Landing(inner, target, gap, length, crossing, none, none, last)
+        since, pace = constant((jnp.asarray(t0), _CHATTER * (t1 - t0)))
+        return end, _Landing(
+            inner, target, gap, length, crossing, none, none, since, pace, last
+        )
 
     def adapt_step_size(  # pyright: ignore[reportIncompatibleMethodOverride]
         self, t0, t1, y0, y1, args, y_error, error_order, state
@@ -129,11 +137,14 @@ class Landing(Adaptive):
             )
         )
         aimed = end == state.target
-        until, soon, near, idle = constant(self._found(y1, end))
+        until, unseen, soon, near, idle = constant(self._found(y1, end))
         late = jnp.where(aimed, near, 0)
         passed = keep & (until < jnp.minimum(end - late, state.last))
         tiny = (begin < end) & (end - begin <= _APART * self.apart)
         passed = passed & ~(aimed & tiny)  # it ends where the switch is
+        # A shorter step sees what may have been passed over.
+        unsure = keep & ~passed & (unseen < end)
+        keep = keep & ~unsure
         # A step that ends before the switch is stretched to it if that is near, because
         # a tiny second step would tell little of slopes.
         before = keep & aimed & idle & ~passed & (end < state.crossing)
@@ -146,17 +157,22 @@ class Landing(Adaptive):
         crossing = jnp.where(passed, end, crossing)
         tries = jnp.where(keep & ~missed, 0, state.tries + crossed)
         # The error of a step that was cut short says little about the next one.
-        short = crossed & aimed | landed
+        short = (crossed | unsure) & aimed | landed
         length = jnp.where(short, state.resumed, next1 - next0)
         next_t0 = jnp.where(keep, t1 + (next0 - end), t0)
         next_t0 = next_t0 + jnp.where(landed, state.gap, 0)
         next_t1 = jnp.where(missed, crossing, next_t0 + length)
         next_t1, gap, cut = self._cut(constant(next_t0), next_t1, state.last)
-        next_t1, gap = jnp.where(crossed, until, next_t1), jnp.where(crossed, 0, gap)
-        target = jnp.where(cut | crossed | missed, constant(next_t1), jnp.inf)
-        landings = state.landings * ~(keep & ~aimed) + crossed
+        shortened = crossed | unsure
+        next_t1 = jnp.where(shortened, jnp.where(crossed, until, unseen), next_t1)
+        gap, aims = jnp.where(shortened, 0, gap), (cut | crossed | missed) & ~unsure
+        target = jnp.where(aims, constant(next_t1), jnp.inf)
+        # Time that passes meanwhile tells fast switching from chatter.
+        paced = begin - state.since > state.pace
+        landings = jnp.where(paced, 0, state.landings + crossed)
+        since = jnp.where(paced, begin, state.since)
         results: Any = diffrax.RESULTS
-        unknown = crossed | landed
+        unknown = crossed | landed | unsure
         inner = jax.tree.map(
             lambda old, new: jnp.where(unknown, old, new), state.inner, inner
         )
@@ -165,7 +181,14 @@ class Landing(Adaptive):
         result = results.where(unknown | done, results.successful, result)
         chatter = (landings > _MOST_LANDINGS) & (result == results.successful)
         result = results.where(chatter, results.max_steps_rejected, result)
-        state = _Landing(
-            inner, target, gap, length, crossing, tries, landings, state.last
+        state = state._replace(
+            inner=inner,
+            target=target,
+            gap=gap,
+            resumed=length,
+            crossing=crossing,
+            tries=tries,
+            landings=landings,
+            since=since,
         )
         return keep, next_t0, next_t1, landed | jumped, state, result

@@ -64,8 +64,7 @@ class _LocatedRows(Located):
     slopes: Array | None  # derivatives of the jumps (jump, n)
 
     def needed(self, count, jumps):
-        # The error control of the derivatives finds kinks of the rates by itself.
-        return self.jumping or jumps is not None
+        return count > 0 or jumps is not None
 
     def shifted(self, term, t, y, args, known, made_jump):
         if not (self.jumping or self.jumps is not None):

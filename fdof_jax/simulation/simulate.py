@@ -37,7 +37,7 @@ from .field import initial_states
 from .prescribed import agrees, prescribed
 from .solution import OUTCOMES, Solution, outcome_numbers
 from .solve import solve
-from .steps import at_tolerances, within_reach
+from .steps import at_tolerances, with_longest, within_reach
 
 
 def solve_options(
@@ -45,6 +45,7 @@ def solve_options(
     solver: diffrax.AbstractSolver | None,
     rtol: ArrayLike | None,
     atol: ArrayLike | None,
+    max_step: ArrayLike | None,
     stepsize_controller: diffrax.AbstractStepSizeController | None,
     dt0: ArrayLike | None,
     adjoint: diffrax.AbstractAdjoint,
@@ -68,13 +69,17 @@ def solve_options(
     instance("progress_meter", progress_meter, diffrax.AbstractProgressMeter)
     if solver is not None:
         instance("solver", solver, diffrax.AbstractSolver)
-    if rtol is not None or atol is not None:
+    if not (rtol is atol is max_step is None):
         if stepsize_controller is not None:
             raise ValueError(
-                "rtol, atol: expected none beside a stepsize_controller, which has "
-                f"its own tolerances, got rtol={shown(rtol)} and atol={shown(atol)}."
+                "rtol, atol, max_step: expected none beside a stepsize_controller, "
+                "which has its own (rtol, atol and dtmax of diffrax.PIDController), "
+                f"got rtol={shown(rtol)}, atol={shown(atol)} and "
+                f"max_step={shown(max_step)}."
             )
         stepsize_controller = at_tolerances(rtol, atol)
+    if max_step is not None:
+        stepsize_controller = with_longest(stepsize_controller, max_step)
     if stepsize_controller is not None:
         kind = diffrax.AbstractStepSizeController
         instance("stepsize_controller", stepsize_controller, kind)
@@ -118,6 +123,7 @@ def simulate(
     solver: diffrax.AbstractSolver | None = None,
     rtol: ArrayLike | None = None,
     atol: ArrayLike | None = None,
+    max_step: ArrayLike | None = None,
     stepsize_controller: diffrax.AbstractStepSizeController | None = None,
     dt0: ArrayLike | None = 1e-3,
     adjoint: diffrax.AbstractAdjoint = diffrax.RecursiveCheckpointAdjoint(),
@@ -142,6 +148,9 @@ def simulate(
       `Solution.own`; by default each element's `initial_state`.
     - `rtol`, `atol`: relative and absolute tolerance of a step, by default 1e-11 in
       float64 and 1e-5 in float32; not allowed beside a `stepsize_controller`.
+    - `max_step`: longest step [s], by default none. It serves efforts with features so
+      brief that adaptive steps would pass over them. Not allowed beside a
+      `stepsize_controller`, which has one of its own (`dtmax`).
     - `solver`, `stepsize_controller`, `dt0`, `adjoint`, `max_steps`, `throw`,
       `progress_meter`: as in `diffrax.diffeqsolve`. The default solver and controller,
       also selected by `None`, are Dopri8 and adaptive steps. The first step `dt0` is
@@ -174,6 +183,7 @@ def simulate(
         solver=solver,
         rtol=rtol,
         atol=atol,
+        max_step=max_step,
         stepsize_controller=stepsize_controller,
         dt0=dt0,
         adjoint=adjoint,

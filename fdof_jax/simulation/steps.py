@@ -73,7 +73,10 @@ def _new_controller(rtol: Any, atol: Any) -> diffrax.PIDController:
 
 def _tolerance(name: str, value: Any) -> Array:
     """Returns a tolerance as an array, of which new values need no new trace."""
-    value = _default_tolerance() if value is None else value
+    return _constant(name, _default_tolerance() if value is None else value)
+
+
+def _constant(name: str, value: Any) -> Array:
     array = real_array(name, value, (), above=0)
     # Else a derivative with respect to it would fail later, without this name.
     traced = is_traced(array)
@@ -86,6 +89,12 @@ def _known_controller(rtol: Any, atol: Any, dtype: Any) -> diffrax.PIDController
     del dtype  # that of the tolerances, a part of the cache's key
     with jax.ensure_compile_time_eval():  # no tracer is kept
         return _new_controller(rtol, atol)
+
+
+def with_longest(controller: Any, max_step: ArrayLike) -> Any:
+    """Returns the controller with a longest step [s]."""
+    longest = _constant("max_step", max_step)
+    return with_pid(lambda pid: dataclasses.replace(pid, dtmax=longest), controller)
 
 
 def within_reach(

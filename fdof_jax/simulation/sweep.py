@@ -136,6 +136,7 @@ def sweep(
     solver: diffrax.AbstractSolver | None = None,
     rtol: ArrayLike | None = None,
     atol: ArrayLike | None = None,
+    max_step: ArrayLike | None = None,
     stepsize_controller: diffrax.AbstractStepSizeController | None = None,
     dt0: ArrayLike | None = 1e-3,
     adjoint: diffrax.AbstractAdjoint = diffrax.RecursiveCheckpointAdjoint(),
@@ -172,8 +173,8 @@ def sweep(
       another sweep, or anything else, is refused.
     - `shard`, `of`: with `store`, solves only each block whose number is `shard` modulo
       `of`. Any number of processes may fill one store, in any order.
-    - `solver`, `rtol`, `atol`, `stepsize_controller`, `dt0`, `adjoint`, `max_steps`,
-      `progress_meter`: as in `simulate`.
+    - `solver`, `rtol`, `atol`, `max_step`, `stepsize_controller`, `dt0`, `adjoint`,
+      `max_steps`, `progress_meter`: as in `simulate`.
 
     **Returns:** a `Solution` with a leading batch axis everywhere; `result` reports how
     each member ended. With `reduce`, what that returns, with a leading batch axis:
@@ -214,6 +215,7 @@ def sweep(
         solver=solver,
         rtol=rtol,
         atol=atol,
+        max_step=max_step,
         stepsize_controller=stepsize_controller,
         dt0=dt0,
         adjoint=adjoint,

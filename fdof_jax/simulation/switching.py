@@ -15,15 +15,17 @@ import numpy as np
 from jax import Array
 
 from ..base.checks import shown
-from .dopri8 import DenseOutput, constant, with_change
+from .dopri8 import SHORTEST, DenseOutput, constant, with_change
 from .landing import Landing, rounding
 from .step_wrappers import Undifferentiated, with_judge
 from .switch_derivatives import Arrival, Moment, first_of, gained, lateness
-from .zeros_in_steps import BEYOND, SAMPLED, SHARES, passage
+from .zeros_in_steps import BEYOND, CHECKED, CHECKS, SAMPLED, SHARES, passage
 
 # A function whose zero is this close to the end of a step switches there: a share of
 # the step, as a power of the unit of rounding (1e-9 in float64).
 _NEAR = 0.575
+# What happens within so many of these distances may be passed over.
+_BRIEF = 10
 
 
 class Switching(NamedTuple):
@@ -33,6 +35,8 @@ class Switching(NamedTuple):
       below zero, and 0 before the start.
     - `after`: those after a switch here.
     - `until`: when the step should have ended; its end if nothing switched before [s].
+    - `unseen`: a time before which a switching function may have passed 0 unseen; the
+      step's end if none may [s].
     - `soon`: when a switch follows soon after the end, or else the end [s].
     - `near`: how far from its zero a switching function may switch [s].
     - `sizes` (switch,): the largest values of the switching functions up to here.
@@ -48,6 +52,7 @@ class Switching(NamedTuple):
     sides: Array
     after: Array
     until: Array
+    unseen: Array
     soon: Array
     near: Array
     sizes: Array
@@ -91,6 +96,7 @@ def located(
         known = Switching(
             unknown,
             unknown,
+            t0,
             t0,
             t0,
             none,
@@ -158,7 +164,7 @@ class Located(diffrax.AbstractAdaptiveSolver):
         *y0, known = y0
         kept = lambda after, before: jnp.where(made_jump, after, before)
         sides = kept(known.after, known.sides)
-        changed = jnp.sum((sides != known.sides) & (known.sides != 0))
+        changed = (sides != known.sides) & (known.sides != 0)
         y0, args = tuple(y0), args._replace(sides=sides)
         y0 = self.shifted(terms.term, t0, y0, args, known, made_jump)
         y1, error, dense, solver_state, result = self.solver.step(
@@ -167,16 +173,24 @@ class Located(diffrax.AbstractAdaptiveSolver):
         path = self.interpolation_cls(t0=t0, t1=t1, **dense)
 
         where = terms.term, t0, t1, path, args
-        seen = _values(*constant(where))
+        seen, checks = _values(*constant(where))
         margins = sides[None] * seen
         # Lengths of steps to a switch say nothing about the pace of the motion.
         share = jnp.finfo(t1.dtype).eps ** _NEAR
         near = jnp.maximum(share * (t1 - t0), known.near / 2)
         near = jnp.maximum(near, self.apart)
         sizes = jnp.maximum(known.sizes, jnp.max(jnp.abs(seen), axis=0))
-        until, crossed, missed, switched, grazing, soon = passage(
-            margins, known.sizes, sizes, near / (t1 - t0)
+        until, crossed, missed, unseen, switched, grazing, soon = passage(
+            margins,
+            sides[None] * checks,
+            sides != known.sides,
+            known.sizes,
+            sizes,
+            near / (t1 - t0),
+            t1 - t0 <= jnp.maximum(SHORTEST[t1.dtype], _BRIEF * near),
         )
+        # What began on its zero has left it, in one or more steps.
+        on_zero = known.sizes <= jnp.finfo(sizes.dtype).eps ** BEYOND * sizes
         # Before the first step, whose length is 0, sides are unknown.
         after = jnp.where(switched, -sides, sides)
         after = jnp.where(sides == 0, jnp.where(seen[-1] > 0, 1.0, -1.0), after)
@@ -184,13 +198,14 @@ class Located(diffrax.AbstractAdaptiveSolver):
             sides,
             after.astype(t0.dtype),
             jnp.where(crossed, t0 + until * (t1 - t0), t1),
+            jnp.where(unseen < 1, t0 + unseen * (t1 - t0), t1),
             t1 + soon * (t1 - t0),
             near,
             sizes,
             t1 - t0,
             jnp.any(switched & (margins[-1] > 0)).astype(t0.dtype),
-            known.passed + changed,
-            self.one_sided(known, sides, sizes, changed),
+            known.passed + jnp.sum(changed & ~on_zero),
+            self.one_sided(known, on_zero, sides, sizes, jnp.sum(changed)),
             jnp.maximum(
                 missed, jnp.maximum(known.grazing, kept(known.grazing_here, 0))
             ),
@@ -206,13 +221,16 @@ class Located(diffrax.AbstractAdaptiveSolver):
         return count > 0
 
     def one_sided(
-        self, known: Switching, sides: Array, sizes: Array, changed: Array
+        self,
+        known: Switching,
+        on_zero: Array,
+        sides: Array,
+        sizes: Array,
+        changed: Array,
     ) -> Array | None:
         """Returns `Switching.one_sided` at the end of a step."""
         if known.one_sided is None:
             return None
-        # What began on its zero has left it, in one or more steps.
-        on_zero = known.sizes <= jnp.finfo(sizes.dtype).eps ** BEYOND * sizes
         begun = jnp.any(on_zero & (sizes > 0) & (sides != 0))
         together = (changed > 1) & (known.grazing_here > 0)
         return jnp.maximum(known.one_sided, begun) + together
@@ -255,17 +273,25 @@ class LocatedImplicit(Located, diffrax.AbstractImplicitSolver):
 
 
 @eqx.filter_jit  # traced once, not at each use in a solve
-def _values(term: Any, t0: Array, t1: Array, path: Any, args: Any) -> Array:
-    """Returns the switching functions at the samples of a step."""
-    shares = jnp.asarray(SHARES, t0.dtype)
+def _values(
+    term: Any, t0: Array, t1: Array, path: Any, args: Any
+) -> tuple[Array, Array]:
+    """Returns the switching functions at the samples of a step, and at its checks."""
+    shares = jnp.asarray([*SHARES, *CHECKS], t0.dtype)
     times = t0 + shares * (t1 - t0)
     if isinstance(path, DenseOutput):
-        stages = np.array(SAMPLED)
-        scheduled = jax.tree.map(lambda rows: rows[stages], path.scheduled)
+        stages = np.array((*SAMPLED, *CHECKED))
+        last = term.schedule(times[-1], args)
+        scheduled = jax.tree.map(
+            lambda rows, row: jnp.concatenate([rows[stages], row[None]]),
+            path.scheduled,
+            last,
+        )
         one = lambda row: term.switching(row[1], path.at(row[0]), args, row[2])[0]
         rows = shares, times, scheduled
         found = jax.vmap(one)(rows)
     else:
         found = jax.vmap(lambda t: term.switches(t, path.evaluate(t), args)[0])(times)
     # An infinite limit is never reached.
-    return jnp.where(jnp.isinf(found), jnp.sign(found), found)
+    found = jnp.where(jnp.isinf(found), jnp.sign(found), found)
+    return found[: len(SHARES)], found[len(SHARES) :]

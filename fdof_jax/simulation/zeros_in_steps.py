@@ -12,12 +12,17 @@ from .dopri8 import NODES
 # evaluated what depends on time alone.
 SAMPLED = 0, 3, 5, 7, 8, 9, 10, -1
 SHARES = NODES[list(SAMPLED)]  # of the step
+# Between them, further samples show whether the polynomials hold: at two more stages,
+# and within the longest gap.
+CHECKED = 1, 4
+CHECKS = np.append(NODES[list(CHECKED)], 0.8)
 # The polynomials are sums of Chebyshev's, in x from -1 to 1 along the step.
 _ORDERS = np.arange(len(SHARES))
 _BASIS = np.polynomial.chebyshev.chebvander
 _TERMS = np.linalg.inv(_BASIS(2 * SHARES - 1, _ORDERS[-1]))
 _SLOPE = 2 * _ORDERS**2 @ _TERMS  # at the end, per step
 _BEND = 4 * _ORDERS**2 * (_ORDERS**2 - 1) / 3 @ _TERMS  # second derivative there
+_AT_CHECKS = _BASIS(2 * CHECKS - 1, _ORDERS[-1]) @ _TERMS
 _SLOPES = (
     2
     * np.polynomial.chebyshev.chebval(
@@ -34,6 +39,9 @@ _MISSED = (
 )
 _NOISE = 4 * np.abs(_BEND).sum()  # of the second derivative, in units of rounding
 _ITERATIONS = 6  # of Newton's method within a bracket
+# Elsewhere the error of polynomials is less than so many times what is seen of it. A
+# distance that falls and rises within a step needs 10, wherever it turns.
+_ELSEWHERE = 12
 
 
 def _times(weights: np.ndarray, values: Array) -> Array:
@@ -73,51 +81,105 @@ def _turns(margins: Array, least: Array) -> tuple[Array, Array]:
     return shares, jnp.where(turning, values, jnp.inf)
 
 
+def _uncertainty(margins: Array, checks: Array, sizes: Array) -> Array:
+    """Returns how far the margins may be from polynomials between samples.
+
+    The error shows in the polynomials' last terms and at the further samples `checks`.
+    What may be rounding does not count, as shorter steps have it too.
+    """
+    last = jnp.abs(_times(_TERMS[-2:], margins))
+    wrong = jnp.abs(checks - _times(_AT_CHECKS, margins))
+    error = jnp.maximum(jnp.max(last, axis=0), jnp.max(wrong, axis=0))
+    rounding = _ROUNDING * jnp.finfo(margins.dtype).eps * (1 + sizes)
+    return _ELSEWHERE * jnp.maximum(error - rounding, 0)
+
+
+def _beyond(margins: Array) -> tuple[Array, Array]:
+    """Returns margins from the places where steps end beyond zeros, and how far."""
+    eps = jnp.finfo(margins.dtype).eps
+    beyond = eps**BEYOND * jnp.max(jnp.abs(margins), axis=0) + _ROUNDING * eps
+    return margins + beyond[None], beyond
+
+
+def _hiding_place(margins: Array, unsure: Array, begun: Array, near: Array) -> Array:
+    """Returns a share of the step where a margin may pass 0 unseen, or else 1.
+
+    It is in the middle of two samples. `unsure`: see `_uncertainty`; `begun`: which
+    margins begin on their zeros, as after a switch.
+    """
+    # Margins on their zeros at the ends do not turn back within.
+    ending = jnp.abs(margins[-1]) <= -slope_at_end(margins) * near
+    margins, beyond = _beyond(margins)
+    _, lowest = _turns(margins, beyond)  # as in `first_zero`; XLA computes them once
+    inner = margins.at[0].add(jnp.where(begun, jnp.inf, 0))
+    inner = inner.at[-1].add(jnp.where(ending, jnp.inf, 0))
+    lowest = jnp.minimum(lowest, jnp.minimum(inner[:-1], inner[1:]))
+    lowest = jnp.where(unsure[None] > 0, lowest - unsure[None], jnp.inf)
+    lowest = jnp.min(lowest, axis=1, initial=jnp.inf)
+    middles = jnp.asarray((SHARES[1:] + SHARES[:-1]) / 2, margins.dtype)
+    return jnp.where(jnp.min(lowest) < 0, middles[jnp.argmin(lowest)], 1)
+
+
 @eqx.filter_jit
 def passage(
-    margins: Array, before: Array, sizes: Array, near: Array
+    margins: Array,
+    checks: Array,
+    begun: Array,
+    before: Array,
+    sizes: Array,
+    near: Array,
+    brief: Array,
 ) -> tuple[Array, ...]:
-    """Returns the results of `first_zero` and of `at_end`.
+    """Returns the results of `first_zero`, `_hiding_place` and `at_end`.
 
-    If all margins stay far from 0, these are (1, False, 0) and (False, 0, 0), and
-    neither is evaluated.
+    If all margins stay far from 0, these are (1, False, 0), 1 and (False, 0, 0), and
+    none is evaluated.
 
-    `before`, `sizes`: the largest sizes in steps before, and with this one.
+    `checks`: the margins at further places of the step; `begun`: which began on their
+    zeros; `before`, `sizes`: the largest sizes in steps before, and with this one;
+    `brief`: whether the step is so short that nothing is looked for in between.
     """
+    unsure = jnp.where(brief, 0, _uncertainty(margins, checks, sizes))
     # Each slope pulls a cubic by at most 4/27 of its length beyond its ends.
     slopes = jnp.abs(_times(_SLOPES, margins))
     lengths = jnp.asarray(np.diff(SHARES), margins.dtype)[:, None]
     pulled = 4 / 27 * jnp.max(lengths * (slopes[:-1] + slopes[1:]), axis=0)
     least = jnp.maximum(pulled + _MISSED * sizes, _SOON * slopes[-1])
-    far = jnp.all(margins > least[None]) & (near < _SOON)
+    far = jnp.all(margins > (least + unsure)[None]) & (near < _SOON)
     zero = jnp.zeros((), margins.dtype)
     no = jnp.zeros(margins.shape[1:], bool)
     return jax.lax.cond(
         far,
-        lambda: (zero + 1, no.any(), zero, no, zero, zero),
-        lambda: (*first_zero(margins, before), *at_end(margins, sizes, near)),
+        lambda: (zero + 1, no.any(), zero, zero + 1, no, zero, zero),
+        lambda: (
+            *first_zero(margins, before, unsure),
+            _hiding_place(margins, unsure, begun, near),
+            *at_end(margins, sizes, near),
+        ),
     )
 
 
 @eqx.filter_jit
-def first_zero(margins: Array, sizes: Array) -> tuple[Array, Array, Array]:
+def first_zero(
+    margins: Array, sizes: Array, unsure: Array
+) -> tuple[Array, Array, Array]:
     """Returns the share of a step where a margin first passes 0, and whether any does.
 
     Also returns how near to grazing a margin turned back, 0 if not near (see `at_end`).
-    `sizes`: the largest size of each margin in steps before.
+    `sizes`: the largest size of each margin in steps before; `unsure`: a margin that
+    falls by less between two samples is left to `_hiding_place`.
     """
     if not margins.size:
         none = jnp.zeros((), margins.dtype)
         return none + 1, jnp.array(False), none
-    eps = jnp.finfo(margins.dtype).eps
-    beyond = eps**BEYOND * jnp.max(jnp.abs(margins), axis=0) + _ROUNDING * eps
-    margins = margins + beyond[None]
+    margins, beyond = _beyond(margins)
     # What is on the wrong side from the start on changes at once.
     wrong = jnp.any((margins[0] < 0) & (margins[1] < 0))
     turns, lowest = _turns(margins, beyond)
     shares = jnp.asarray(SHARES, margins.dtype)
     ends = jnp.where(lowest < 0, turns, shares[1:, None])
     after = jnp.where(lowest < 0, lowest, margins[1:])
+    after = jnp.where(margins[:-1] - after < unsure[None], jnp.inf, after)
     passed = (after < 0).any(axis=1)
     index = jnp.argmax(passed)
     before, after, low = jnp.abs(margins[index]), after[index], shares[index]
