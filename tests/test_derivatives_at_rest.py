@@ -233,5 +233,5 @@ def test_second_derivatives_of_an_arm_at_rest():
     wide, near = ((wanted(k * h) - wanted(-k * h)) / (2 * k * h) for k in (2, 1))
     for adjoint in (DEFAULT, FORWARD):
         mixed = jax.jit(jax.jacfwd(effort_at), static_argnums=1, **LOOPS)
-        found = mixed(damping, adjoint)
-        assert found == pytest.approx((4 * near - wide) / 3, rel=1e-6)
+        found = mixed(damping, adjoint).item()
+        assert found == pytest.approx(((4 * near - wide) / 3).item(), rel=1e-6)
