@@ -235,3 +235,31 @@ def test_second_derivatives_of_an_arm_at_rest():
         mixed = jax.jit(jax.jacfwd(effort_at), static_argnums=1, **LOOPS)
         found = mixed(damping, adjoint).item()
         assert found == pytest.approx(((4 * near - wide) / 3).item(), rel=1e-6)
+
+
+def test_an_implicit_method_in_strong_damping():
+    """A pendulum that hangs, in dampers that take explicit methods 1e3 to 1e8 steps."""
+    hanging = fj.Linkage(
+        "R", length=[0, 1], com=[[0.5, 0]], mass=[1], inertia=[1 / 12],
+        base_angle=-np.pi / 2,
+    )  # fmt: skip
+    settings = dict(solver=diffrax.Kvaerno5(), dt0=1e-6, rtol=1e-9, atol=1e-9)
+
+    def last(tau, damping, adjoint):
+        forces = (fj.JointDamper(damping), fj.JointEffort(tau))
+        motion = fj.simulate(
+            hanging, fj.State([0.0], [0.0]), [0, 100.0], forces, adjoint=adjoint,
+            **settings,
+        )  # fmt: skip
+        return motion.q[-1, 0], motion.stats["num_steps"]
+
+    reverse = jax.jit(jax.grad(lambda *at: last(*at, DEFAULT), has_aux=True), **LOOPS)
+    forward = jax.jit(jax.jacfwd(lambda *at: last(*at, FORWARD), has_aux=True), **LOOPS)
+    inertia, stiffness = 1 / 3, 9.81 / 2
+    for damping in (30.0, 1e3, 1e5, 1e6):
+        linear = [[0, 1, 0], [-stiffness / inertia, -damping / inertia, 1 / inertia]]
+        wanted = expm(100.0 * np.array([*linear, [0, 0, 0]]))[0, 2]
+        for slope in (reverse, forward):
+            found, steps = slope(jnp.zeros(1), damping)
+            assert found.item() == pytest.approx(wanted, rel=1e-6)
+            assert steps < 200

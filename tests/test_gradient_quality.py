@@ -212,3 +212,10 @@ def test_a_report_without_modes_for_elements_with_a_state():
     assert list(found.times) == names
     for slope, difference in found.times.values():
         assert slope == pytest.approx(difference, rel=1e-3)
+
+
+def test_a_mode_too_fast_for_explicit_methods_is_told():
+    at = lambda rate: fj.analysis.Modes(np.array([[-1.0, -rate, np.nan]]))
+    (words,) = gradient_quality._stiffness(at(2e5), 10.0)
+    assert "2e+05 rad/s takes some 500,000 steps" in words and "Kvaerno5" in words
+    assert gradient_quality._stiffness(at(100.0), 10.0) == []

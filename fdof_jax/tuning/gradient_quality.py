@@ -27,6 +27,9 @@ _HORIZONS = 10
 # The step of the differences in the log-gains. The error of the extrapolated
 # differences is of fourth order in it; their noise is that of the loss over the step.
 _STEP = 1e-2
+# An explicit method of order 8 is stable for steps of some 4 times the time scale of a
+# mode; beyond so many steps an implicit one is faster.
+_STABLE, _MANY_STEPS = 4.0, 1e4
 _OF_TIME = 1e-3  # the step in a time, at most, as a share of the run
 
 
@@ -216,11 +219,12 @@ def gradient_report(scene: Scene) -> GradientReport:
     few = jax.tree.map(lambda a: a[::10] if np.ndim(a) else a, solution)
     at_limit = np.abs(demands) > 1
     saturated = np.mean(at_limit, axis=0)
-    modes = None
+    modes, stiff = None, []
     if depends_on_state_alone(scene.forces):
         modes = closed_loop_modes(scene.linkage, scene.forces, few)
+        stiff = _stiffness(modes, scene.t1)
     stats, times = _motion(scene).stats, _in_times(scene, in_times[-1])
-    warnings = _warnings(scene, gradient, saturated, error)
+    warnings = _warnings(scene, gradient, saturated, error) + stiff
     warnings += remarks_on_derivatives(stats)
     pace = np.sum(residuals**2) / scene.t1
     for name, (slope, difference) in times.items():
@@ -243,6 +247,18 @@ def gradient_report(scene: Scene) -> GradientReport:
         times=times,
         warnings=warnings,
     )
+
+
+def _stiffness(modes: Modes, t1: float) -> list[str]:
+    """Returns what there is to say about modes that are fast for a run up to `t1`."""
+    fastest = np.nanmax(modes.frequency)
+    steps = fastest * t1 / _STABLE
+    if not steps > _MANY_STEPS:
+        return []
+    return [
+        f"a mode of {fastest:.3g} rad/s takes some {steps:,.0f} steps of an explicit "
+        "method: an implicit solver is faster (solver=diffrax.Kvaerno5())"
+    ]
 
 
 def _warnings(scene: Scene, gradient, saturated, error) -> list[str]:
