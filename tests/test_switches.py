@@ -285,3 +285,27 @@ def test_switches_of_elements_traced_in_two_threads_stay_apart():
         inside.wait(60)
         done.result()
     assert [*map(float, mine.values)] == [3] and [*map(float, theirs[0].values)] == [-2]
+
+
+def test_kinks_of_high_gains_are_exact_in_derivatives():
+    """A slide under a limited controller of 1e7 N/m for each kg switches five times."""
+    slide = fj.Linkage(
+        "P", length=[0, 1], com=[[0, 0]], mass=[0.1], inertia=[0.1], gravity=0.0
+    )
+    reference = lambda t, linkage: (jnp.ones(1), jnp.zeros(1))
+
+    def end(speed, damping, tolerance):
+        controller = fj.PDController(1e6, damping, 5.0, reference)
+        motion = fj.simulate(
+            slide, fj.State([0.9], jnp.stack([speed])), [0, 0.35], (controller,),
+            rtol=tolerance, atol=tolerance,
+        )  # fmt: skip
+        return motion.q[-1, 0] + 0.1 * motion.qd[-1, 0], motion.stats["num_switches"]
+
+    both = jax.jit(jax.value_and_grad(end, has_aux=True), **LOOPS)
+    for damping in (60.0, 2.0):
+        (_, switches), slope = both(2.0, damping, 1e-11)
+        assert switches >= 5
+        value = lambda speed: float(both(speed, damping, 1e-13)[0][0])
+        wide, near = ((value(2 + h) - value(2 - h)) / (2 * h) for h in (5e-5, 2.5e-5))
+        assert slope == pytest.approx((4 * near - wide) / 3, rel=1e-6)

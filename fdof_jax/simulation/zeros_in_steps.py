@@ -32,7 +32,7 @@ _SLOPES = (
 # Steps end where a switching function has passed its zero by this power of the unit of
 # rounding, times its size, and by this multiple of it. There the side to which the
 # motion goes is known even if it began at rest on the zero.
-BEYOND, _ROUNDING = 0.625, 500
+BEYOND, _ROUNDING = 0.75, 500
 _SOON = 0.01  # of a step, for extrapolation
 _MISSED = (
     0.01  # of a function's size: turning back so close to its zero nearly touches it
