@@ -310,7 +310,7 @@ LONG = {
         lambda value: fj.PDController(1.0, 1.0, 1.0, value),
         lambda value: fj.forces.SpringDamper(value, value, 1.0, 1.0),
         lambda value: fj.tune(value),
-        lambda value: fj.tuning.stacked(value),
+        lambda value: fj.tuning.stacked([value, 1.0]),
         lambda value: fj.identification.fit(lambda p: p, value, [0, 1], value),
         lambda value: fj.configure(cache=[value]),
         lambda value: fj.references.JointMove(value, 0, value),

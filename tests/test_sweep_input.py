@@ -28,6 +28,13 @@ TWO, STATES = jax.tree.map(lambda a: a[:2], members()[:2])
 INPUTS = "linkage, state0, forces"
 
 
+class Rows(fj.Element):
+    rows: jax.Array
+
+    def __call__(self, t, q, qd, linkage):
+        return -qd / len(self.rows)
+
+
 def test_a_batch_is_expected():
     refused(INPUTS, linkage=ONE, state0=STATE, forces=())
     # Forces without a leading axis are shared.
@@ -36,7 +43,7 @@ def test_a_batch_is_expected():
     with pytest.raises(ValueError, match=r"none on any \(pass forces_axes=0 if"):
         fj.sweep(ONE, STATE, TS, dampers)
     many = (fj.JointDamper(np.ones(200)),)
-    with pytest.raises(ValueError, match=r"got 200; sweep\(..., forces_axes=0\) takes"):
+    with pytest.raises(ValueError, match="3 joints, as the linkage has, got 200"):
         fj.sweep(TWO, STATES, TS, many)
     with pytest.raises(ValueError, match=r"^linkage: expected one .*\*arms\) stacks"):
         fj.sweep([ONE, ONE], STATES, TS)
@@ -53,9 +60,9 @@ def test_one_size_is_expected():
     sizes = r"state0\.q: 2, .*forces\[0\]\.coefficient: 3\.$"
     with pytest.raises(ValueError, match=sizes):
         fj.sweep(TWO, STATES, TS, damper, forces_axes=0)
-    effort = (fj.JointEffort([1.0, 2.0, 3.0]),)  # a member's would be one number
+    rows = (Rows(np.ones(2)),)  # a member's is one number
     with pytest.raises(TypeError, match="^forces, forces_axes: .*forces_axes=0"):
-        fj.sweep(ONE, three, TS, effort, forces_axes=0)
+        fj.sweep(TWO, STATES, TS, rows, forces_axes=0)
 
 
 @pytest.mark.parametrize("field", ["ef", "com", "mass", "gravity"])

@@ -306,6 +306,7 @@ def test_kinks_of_high_gains_are_exact_in_derivatives():
     for damping in (60.0, 2.0):
         (_, switches), slope = both(2.0, damping, 1e-11)
         assert switches >= 5
-        value = lambda speed: float(both(speed, damping, 1e-13)[0][0])
-        wide, near = ((value(2 + h) - value(2 - h)) / (2 * h) for h in (5e-5, 2.5e-5))
+        values = [both(2 + h, damping, 1e-13)[0][0] for h in (5e-5, 2.5e-5)]
+        before = [both(2 - h, damping, 1e-13)[0][0] for h in (5e-5, 2.5e-5)]
+        wide, near = (np.array(values) - before) / [1e-4, 5e-5]
         assert slope == pytest.approx((4 * near - wide) / 3, rel=1e-6)

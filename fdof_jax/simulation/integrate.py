@@ -11,7 +11,7 @@ from jax import Array
 from ..forces.joints import EffortHistory
 from ..linkage.linkage import possible, without_fixed
 from .derivative_control import OfLinearised, OfTangents
-from .dopri8 import constant
+from .dopri8 import ScheduledDopri8, constant
 from .field import args_of, initial_own, own_states, whole
 from .known_times import clocks_apart, known_times
 from .landing import end_of_run
@@ -67,7 +67,8 @@ def integrate(
         if tangents:
             controller = OfTangents(controller)  # pyright: ignore[reportCallIssue]
         elif derivatives:
-            tableau = getattr(solver, "tableau", diffrax.Heun.tableau)
+            known = isinstance(solver, ScheduledDopri8 | diffrax.AbstractRungeKutta)
+            tableau = solver.tableau if known else diffrax.Heun.tableau
             controller = OfLinearised(controller, term, tableau)  # pyright: ignore[reportCallIssue]
         controller = accounted(controller, solver, term)
     # diffrax computes a few constants while it is traced.
