@@ -222,7 +222,7 @@ def gradient_report(scene: Scene) -> GradientReport:
     modes, stiff = None, []
     if depends_on_state_alone(scene.forces):
         modes = closed_loop_modes(scene.linkage, scene.forces, few)
-        stiff = _stiffness(modes, scene.t1)
+        stiff = _stiffness(modes, float(scene.t1))
     stats, times = _motion(scene).stats, _in_times(scene, in_times[-1])
     warnings = _warnings(scene, gradient, saturated, error) + stiff
     warnings += remarks_on_derivatives(stats)
