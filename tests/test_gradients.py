@@ -194,7 +194,6 @@ def linear_motion(end):
 
 @pytest.mark.slow
 def test_tangents_of_a_hanging_arm_are_controlled():
-    """At rest the error estimate is 0; steps are bounded by the time scale instead."""
     # In the circle's reach, with a controller that does nothing.
     path = fj.references.Ellipse([1.0, 0.5], [0.2, 0.2])
     task = eqx.tree_at(lambda task: task.path, CIRCLE, path)
@@ -207,7 +206,7 @@ def test_tangents_of_a_hanging_arm_are_controlled():
 
 
 @pytest.mark.slow
-def test_without_a_bound_tangents_of_a_hanging_arm_are_wrong():
+def test_a_controller_of_ones_own_judges_tangents_of_a_hanging_arm():
     end = 10.0
 
     def final(q0, dtmax):
@@ -221,9 +220,9 @@ def test_without_a_bound_tangents_of_a_hanging_arm_are_wrong():
         ).q[-1]
 
     exact, gradient = linear_motion(end), jax.jit(jax.jacfwd(final))
-    scale = np.abs(exact).max()
-    assert np.abs(gradient(HANGING, 0.1) - exact).max() <= 1e-6 * scale
-    assert np.abs(gradient(HANGING, 10.0) - exact).max() > scale
+    for dtmax in (0.1, 10.0):
+        error = np.abs(gradient(HANGING, dtmax) - exact).max()
+        assert error <= 1e-6 * np.abs(exact).max()
 
 
 @pytest.mark.slow
