@@ -41,7 +41,7 @@ def test_paths(value):
             call()
 
 
-@pytest.mark.parametrize("value", [".", "..", "/", Path("."), "{}", "{}/"])
+@pytest.mark.parametrize("value", [".", "..", "/", Path("."), "{}", "{}/", "{}/new/"])
 def test_paths_of_folders(value, tmp_path):
     value = value.format(tmp_path) if isinstance(value, str) else value
     for call in (lambda: fj.save(value, 1), lambda: fj.load(value)):

@@ -61,6 +61,23 @@ def test_peaks_and_crossings_of_written_out_functions():
     np.testing.assert_allclose(high.crossings(0.6), 1.5)
 
 
+@pytest.mark.parametrize("kp, ki, kd, lag, fall", [
+    (185270.0, 3800916.0, 455.15, 4.8744e-4, 0.55),
+    (1e6, 3e7, 1e3, 2e-4, 0.0),
+])  # fmt: skip
+def test_the_gain_margin_of_stiff_loops(kp, ki, kd, lag, fall):
+    """With J s^2 - fall = u, Routh's border is at kp = fall + J ki / (kd - lag kp)."""
+    A = np.array([
+        [0, 1, 0, 0], [fall / 4.4, 0, 0, 0],
+        [-kp / lag, -kd / lag, -1 / lag, 1 / lag], [-ki, 0, 0, 0],
+    ])  # fmt: skip
+    none = np.zeros(4)
+    B, C = np.array([0, 1 / 4.4, 0, 0]), np.array([0, 0, -1.0, 0])
+    loop = fj.analysis.OpenLoop(A, B, C, none, none, 0.0, "R1")
+    expected = (fall + 4.4 * ki / (kd - lag * kp)) / kp
+    assert loop.gain_margin == pytest.approx(expected, rel=1e-8)
+
+
 @pytest.mark.parametrize("gains", [(80.0, 40.0), ([80.0, 0.0], [40.0, 0.0])])
 @pytest.mark.parametrize("speed", [False, True])
 def test_an_integral_of_a_fixed_pair_within_a_drive_is_no_state(gains, speed):

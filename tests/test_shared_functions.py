@@ -123,6 +123,35 @@ def counting(k):
 CALLS = []
 
 
+def in_order(k):
+    rates = {"slow": k, "fast": 0.0}  # JAX would sort the names
+    return lambda x: -next(iter(rates.values())) * x
+
+
+def by_type(k):
+    return lambda x: -k * x if isinstance(k, float) else 0 * x
+
+
+def by_name(k):
+    rates = {str(k): k}
+    return lambda x: -rates.get(f"{k}", 0.0) * x
+
+
+def beyond_64_bits(k):
+    whole = int(k) * 10**30
+    return lambda x: -(whole / 10**30) * x
+
+
+class Slotted:
+    __slots__ = ("k",)
+
+    def __init__(self, k):
+        self.k = k
+
+    def __call__(self, x):
+        return -self.k * x
+
+
 def partial(k):
     return functools.partial(lambda k, x: -k * x, k)
 
@@ -131,7 +160,10 @@ SHARED = [
     damping, by_default, with_array, with_helper, nested, of_global, of_arm,
     of_whole_number, with_length,
 ]  # fmt: skip
-OWN = [by_range, counting, chosen, in_numpy, of_object, partial]
+OWN = [
+    beyond_64_bits, by_name, by_range, by_type, chosen, counting, in_numpy, in_order,
+    of_object, partial,
+]  # fmt: skip
 
 
 @pytest.mark.parametrize("make", SHARED + OWN)
@@ -158,6 +190,38 @@ def test_numbers_of_functions_are_right(make):
         words = str(warning.message)
         assert words.startswith("forces[0]: ") and make.__name__ in words
         assert "Equinox module" in words and warning.filename == __file__
+
+
+def test_what_functions_change_outside_is_changed():
+    run = eqx.filter_jit(lambda functions: functions[0](jnp.array(2.0)))
+    calls, last = {"number": 0}, 0
+
+    def in_dict(x):
+        calls["number"] += 1
+        return -x
+
+    def in_closure(x):
+        nonlocal last
+        last += 1
+        return -x
+
+    for function in (in_dict, in_closure):
+        assert float(sharing_functions(run, forces=(function,))) == -2
+    assert calls == {"number": 1} and last == 1
+
+
+def test_callables_that_cannot_be_referred_to_weakly_are_called():
+    run = eqx.filter_jit(lambda functions: functions[0](jnp.array(2.0)))
+    assert float(sharing_functions(run, forces=(Slotted(3.0),))) == -6
+
+
+def test_numbers_that_are_data_leave_the_types_of_others():
+    factor, whole = 2.0, 3
+    scaled = lambda x: (factor * x, whole * x)
+    for one in (jnp.float32(1), jnp.int32(1), jnp.float16(1)):
+        run = eqx.filter_jit(lambda function, one=one: function(one))
+        found = sharing_functions(run, function=scaled)
+        assert [a.dtype for a in found] == [a.dtype for a in scaled(one)]
 
 
 def test_functions_of_equal_code_that_call_others_share_nothing():

@@ -6,7 +6,6 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Complex, Float
 from numpy.typing import ArrayLike
-from scipy.linalg import block_diag, eigvals
 
 from ..base.checks import is_traced, one_of, real_array, refusal
 from ..base.html_table import html_table
@@ -134,16 +133,8 @@ class OpenLoop(eqx.Module):
         """
         if not self.stable:
             return np.nan
-        # L(s) - L(-s) is zero where L is real.
-        states = 2 * len(self.A)
-        pencil = np.zeros((states + 1, states + 1))
-        pencil[:-1, :-1] = block_diag(self.A, -self.A)
-        pencil[:-1, -1] = np.tile(self._loop.balanced[0], 2)
-        pencil[-1, :-1] = np.tile(self._loop.balanced[1], 2)
-        zeros = eigvals(pencil, np.diag([1.0] * states + [0.0]))
-        found = np.abs(np.imag(zeros[np.isfinite(zeros)]))
         # An undamped arm's response is real at all frequencies.
-        values = self(np.concatenate([found[found > 0], self._crossing[0]]))
+        values = self(np.append(self._loop.real_at(), self._crossing[0]))
         at_rest = np.real(Transfer(self._closed, self.B, self.C)(0.0))
         if _REAL < abs(1 - at_rest) < np.inf:  # otherwise L(0) is infinite
             values = np.append(values, at_rest / (1 - at_rest))

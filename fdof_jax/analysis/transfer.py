@@ -1,10 +1,11 @@
 """Transfer functions of one input and one output: crossings and peaks, exactly."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.linalg import eigvals
+from scipy.linalg import block_diag, eigvals
 from scipy.optimize import brentq
 
 # A peak is known to this part.
@@ -43,8 +44,7 @@ class Transfer(NamedTuple):
         """Finds the frequencies above 0 at which the magnitude passes a level.
 
         They are the imaginary eigenvalues of a Hamiltonian matrix (Boyd, Balakrishnan
-        and Kabamba, 1989). Rounding moves eigenvalues off the axis, so all of them only
-        divide the frequencies into parts, and signs tell in which it passes.
+        and Kabamba, 1989), or with rounding eigenvalues beside the imaginary axis.
         """
         room = level**2 - self.D**2
         if not 0 < level < np.inf or not room or not (self.B.any() and self.C.any()):
@@ -53,17 +53,20 @@ class Transfer(NamedTuple):
         own = self.A + self.D / room * np.outer(b, c)
         across = np.outer(b, b) / room, -(level**2) / room * np.outer(c, c)
         found = np.imag(eigvals(np.block([[own, across[0]], [across[1], -own.T]])))
-        found = np.unique(found[found > 0])
-        if not found.size:
-            return found
-        between = np.sqrt(found[:-1] * found[1:])
-        parts = np.concatenate([[found[0] / 2], between, [2 * found[-1]]])
-        above = lambda w: float(np.abs(self(np.exp(w))) / level - 1)
-        signs = np.array([above(w) > 0 for w in np.log(parts)])
-        passed = np.flatnonzero(signs[1:] != signs[:-1])
-        limited = lambda w: min(above(w), 1.0)  # it may be infinite
-        roots = [brentq(limited, *np.log(parts[[k, k + 1]])) for k in passed]
-        return np.exp(np.array(roots))
+        limited = lambda w: min(float(np.abs(self(w))) / level - 1, 1.0)  # if infinite
+        return _changes_of_sign(limited, found[found > 0])
+
+    def real_at(self) -> np.ndarray:
+        """Finds the frequencies above 0 at which the response is real."""
+        # H(s) - H(-s) is zero there.
+        states = 2 * len(self.A)
+        pencil = np.zeros((states + 1, states + 1))
+        pencil[:-1, :-1] = block_diag(self.A, -self.A)
+        pencil[:-1, -1], pencil[-1, :-1] = (np.tile(part, 2) for part in self.balanced)
+        zeros = eigvals(pencil, np.diag([1.0] * states + [0.0]))
+        found = np.abs(np.imag(zeros[np.isfinite(zeros)]))
+        angle = lambda w: float(np.sin(np.angle(self(w))))
+        return _changes_of_sign(angle, found[found > 0])
 
     def peak(self) -> float:
         """Finds the largest magnitude of a stable function at all frequencies.
@@ -79,3 +82,19 @@ class Transfer(NamedTuple):
             found = np.append(0.0, self.crossings(most * (1 + _EXACT)))
             beyond = np.abs(self((found[1:] + found[:-1]) / 2)).max(initial=0.0)
         return most
+
+
+def _changes_of_sign(of: Callable[[float], float], found: np.ndarray) -> np.ndarray:
+    """Returns the frequencies at which `of` changes its sign, roughly `found`.
+
+    Rounding moves eigenvalues, so that they only divide the frequencies into parts.
+    """
+    found = np.unique(found)
+    if not found.size:
+        return found
+    between = np.sqrt(found[:-1] * found[1:])
+    parts = np.log(np.concatenate([[found[0] / 2], between, [2 * found[-1]]]))
+    at = lambda log: of(np.exp(log))
+    signs = np.array([at(log) > 0 for log in parts])
+    passed = np.flatnonzero(signs[1:] != signs[:-1])
+    return np.exp(np.array([brentq(at, *parts[[k, k + 1]]) for k in passed]))

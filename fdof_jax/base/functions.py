@@ -33,6 +33,12 @@ _JITTED = type(jax.jit(lambda: None))
 _CONSTANTS = bool | int | str | bytes | np.dtype | np.ufunc | jnp.ufunc | _JITTED
 # What these do depends on more than the names in the code.
 _OPAQUE = {"eval", "exec", "globals", "locals", "vars", "super"}
+# These, and text made of values, tell a number from an array without an error.
+_OPAQUE |= {"format", "getattr", "hasattr", "isinstance", "repr", "str", "type"}
+_OPAQUE_STEPS = {
+    "STORE_GLOBAL", "DELETE_GLOBAL", "IMPORT_NAME", "MATCH_CLASS", "FORMAT_VALUE",
+    "FORMAT_SIMPLE", "FORMAT_WITH_SPEC",
+}  # fmt: skip
 
 # Kinds of numbers that are data. Code that uses them in Python, as lengths or where it
 # decides, is known by fewer of them, at last by none.
@@ -56,9 +62,10 @@ class SharedFunction(eqx.Module):
         names = names | {"__builtins__": builtins}
         function = types.FunctionType(self.code, names, None, defaults, cells)
         function.__kwdefaults__ = of_keywords
-        before = jax.tree.structure(self.reach)
+        before, structure = jax.tree.flatten(self.reach)
         returned = function(*arguments, **keywords)
-        if jax.tree.structure(self.reach) != before:
+        after, now = jax.tree.flatten(self.reach)
+        if now != structure or any(a is not b for a, b in zip(after, before)):
             raise TypeError("it changes a list or a dict outside, here a copy")
         return returned
 
@@ -96,7 +103,8 @@ def _shared(leaf: Any) -> Any:
         return leaf
     try:
         return _parts_of(leaf)
-    except (_Unknown, TypeError, ValueError):  # such as keys that cannot be sorted
+    # Such as keys that cannot be sorted, or a whole number of more than 64 bits.
+    except (_Unknown, TypeError, ValueError, OverflowError):
         return leaf
 
 
@@ -106,6 +114,7 @@ def _parts_of(function: Any, within: tuple[Any, ...] = ()) -> SharedFunction:
         raise _Unknown
     among = function.__globals__
     names = {name: among[name] for name in _global_names(code) if name in among}
+    of_keywords = function.__kwdefaults__ or {}
     try:
         closure = tuple(cell.cell_contents for cell in function.__closure__ or ())
     except ValueError:  # an empty cell
@@ -114,7 +123,8 @@ def _parts_of(function: Any, within: tuple[Any, ...] = ()) -> SharedFunction:
 
     def part(leaf: Any) -> Any:
         if isinstance(leaf, numbers) and not isinstance(leaf, bool):
-            return np.asarray(leaf, jnp.result_type(type(leaf)))
+            # Of Python's numbers an array that leaves the types of others, too.
+            return jax.device_put(leaf)
         if isinstance(leaf, jax.Array) or type(leaf) is np.ndarray:
             return leaf
         if isinstance(leaf, _CONSTANTS) or _is_fixed(leaf):
@@ -123,17 +133,32 @@ def _parts_of(function: Any, within: tuple[Any, ...] = ()) -> SharedFunction:
             return _parts_of(leaf, within)
         raise _Unknown
 
-    reach = closure, function.__defaults__, function.__kwdefaults__, names
-    return SharedFunction(jax.tree.map(part, reach), code)
+    reach = closure, function.__defaults__, _in_order(of_keywords), _in_order(names)
+    return SharedFunction(jax.tree.map(part, reach, is_leaf=_out_of_order), code)
+
+
+def _in_order(named: dict[str, Any]) -> dict[str, Any]:
+    return dict(sorted(named.items()))
+
+
+def _out_of_order(node: Any) -> bool:
+    """Returns whether it is a dict whose values come in another order than JAX's."""
+    return isinstance(node, dict) and list(node) != sorted(node)
 
 
 @functools.lru_cache(maxsize=1024)
 def _global_names(code: types.CodeType) -> frozenset[str]:
-    """Returns the global names that code reads; raises _Unknown if it writes any."""
+    """Returns the global names that code reads.
+
+    Raises _Unknown if it writes names outside, or may tell a number from an array.
+    """
     names = set()
     for instruction in dis.get_instructions(code):
-        if instruction.opname in ("STORE_GLOBAL", "DELETE_GLOBAL", "IMPORT_NAME"):
+        if instruction.opname in _OPAQUE_STEPS:
             raise _Unknown
+        if instruction.opname in ("STORE_DEREF", "DELETE_DEREF"):
+            if instruction.argval in code.co_freevars:
+                raise _Unknown
         if instruction.opname in ("LOAD_GLOBAL", "LOAD_NAME"):
             names.add(instruction.argval)
         if isinstance(instruction.argval, types.CodeType):
@@ -196,5 +221,8 @@ def _is_new(leaf: Any) -> bool:
         return new
     if isinstance(leaf, _CONSTANTS) and not isinstance(leaf, _JITTED) or leaf in _known:
         return False
-    _known.add(leaf)
+    try:
+        _known.add(leaf)
+    except TypeError:  # of a class with slots; it cannot be known again
+        return False
     return True

@@ -30,7 +30,7 @@ def local_path(name: str, value: Any, expected: str) -> Path:
 def file_path(name: str, value: Any) -> Path:
     """Returns the path of a file that the argument `name` gives."""
     path = local_path(name, value, "a path")
-    if not path.name or path.is_dir():
+    if not os.path.basename(value) or path.is_dir():  # such as a/
         raise refusal(name, "the path of a file, not of a folder", value)
     return path
 
