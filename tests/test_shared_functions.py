@@ -256,6 +256,14 @@ def test_motions_in_a_loop_share_a_program(traces):
     assert len(counted) <= 2
 
 
+def test_arguments_beside_functions_keep_their_places():
+    q, spring = np.array([0.1, -0.2, 0.3]), lambda t, q, qd, linkage: -stiffness * q
+    stiffness = 3.0
+    found = fj.analysis.holding_efforts(ARM, q, (spring,))
+    alone = fj.analysis.holding_efforts(ARM, q)
+    np.testing.assert_allclose(found, alone + 3 * q, rtol=1e-12)
+
+
 def test_the_number_of_steps_is_data(traces):
     most = int(fj.simulate(ARM, START, TS).stats["num_steps"])
     counted = traces(solve, "integrate")

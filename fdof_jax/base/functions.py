@@ -79,7 +79,8 @@ def sharing_functions(run: Callable[..., Any], **trees: Any) -> Any:
     if not any(map(callable, jax.tree.leaves(trees))):
         return run(*trees.values())
     while True:
-        shared = jax.tree.map(_shared, trees)
+        # Of a dict, JAX would return the values in the order of its keys.
+        shared = {name: jax.tree.map(_shared, tree) for name, tree in trees.items()}
         nodes = jax.tree.leaves(shared, is_leaf=_is_shared)
         codes = {node.code for node in nodes if _is_shared(node)}
         try:
