@@ -117,7 +117,8 @@ class OfLinearised(Adaptive):
             t0, t1, y0, y1, args, estimate, order, state
         )
         moved = moved / _largest(moved)
-        moved = jnp.where(finite & ~jumped, moved, _new_probe(y1))
+        # Some controllers return a Python bool here.
+        moved = jnp.where(jnp.array(jumped) | ~finite, _new_probe(y1), moved)
         return keep, *step, jumped, (state, jnp.where(keep, moved, probe)), result
 
     def _linearised(self, t: Array, y: Any, args: Any) -> Array:
