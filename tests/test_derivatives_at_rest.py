@@ -263,3 +263,27 @@ def test_an_implicit_method_in_strong_damping():
             found, steps = slope(jnp.zeros(1), damping)
             assert found.item() == pytest.approx(wanted, rel=1e-6)
             assert steps < 200
+
+
+def test_numbers_of_very_different_size_have_exact_derivatives():
+    """On the second of two slides at right angles; the first one does not move it."""
+    arm = fj.Linkage(
+        "PP", length=[0, 0, 1], com=[[0, 0]] * 2, mass=[1, 1], inertia=[0.1, 0.1],
+        locked=[np.pi / 2, 0], gravity=0,
+    )  # fmt: skip
+    damper = fj.JointDamper([0.1, 100.0])
+
+    def second(tau, repelled, place, end):
+        push = lambda t, q, qd, linkage: repelled * q * jnp.array([1.0, 0.0])
+        start, ts = fj.State(place, jnp.zeros(2)), jnp.stack([0.0, end])
+        forces = push, damper, fj.JointEffort(tau)
+        return fj.simulate(arm, start, ts, forces).q[-1, 1]
+
+    slope = jax.jit(jax.grad(second), **LOOPS)
+    exact = lambda t: (t - (1 - np.exp(-100 * t)) / 100) / 100
+    for tau in (1e-3, 1e-9, 6e-17, 0.0):
+        found = slope(jnp.array([1.0, tau]), 0.0, jnp.full(2, 0.5), 2.0)
+        np.testing.assert_allclose(found, [0, exact(2.0)], rtol=1e-7, atol=1e-15)
+    # The derivative of the first position in its effort grows to 1e12.
+    found = slope(jnp.zeros(2), 18.0, jnp.zeros(2), 10.0)
+    np.testing.assert_allclose(found[1], exact(10.0), rtol=1e-7)

@@ -25,6 +25,8 @@ from .switching import Switching
 _LOOSER, _LOOSEST, _NOISE = 1e3, 1e-4, 64.0
 # A tangent below this part of the largest one is judged as if it were as large.
 _WEAK = 0.1
+# No tangent has a tolerance of more than so many times that of one which is large.
+_LEAST = 30.0
 TANGENTS = "tangents"  # the name of their axis
 
 
@@ -46,22 +48,29 @@ def _largest(tree: Any) -> Array:
 
 
 @jax.custom_jvp
-def _error_of_tangents(error: Any, y0: Any, y1: Any, tolerances: Any) -> Array:
+def _error_of_tangents(
+    error: Any, y0: Any, y1: Any, integrated: Any, tolerances: Any
+) -> Array:
     """Returns the largest error of a tangent over what its tolerance allows.
 
     Without tangents this is 0. They must be those along one axis, `TANGENTS`.
+    `integrated`: the end, with displacements in place of positions.
     """
     return jnp.zeros_like(tolerances[0])
 
 
 @_error_of_tangents.defjvp
 def _(primals, tangents):
-    _, *motion, (tolerance, noise) = primals
-    error, *sizes = constant(tuple(map(_largest, tangents[:3])))
-    size = jnp.maximum(*sizes)
-    size = jnp.maximum(size, _WEAK * jax.lax.pmax(size, TANGENTS))
+    _, *motion, _, (tolerance, noise) = primals
+    error, *sizes, integrated = constant(tuple(map(_largest, tangents[:4])))
+    own = jnp.maximum(*sizes)
+    size = jnp.maximum(own, _WEAK * jax.lax.pmax(own, TANGENTS))
     # Where the terms of a tangent cancel, its rounding errors are those of the motion.
     allowed = tolerance * size + noise * _largest(motion)
+    # A tangent that is far smaller than the largest or the motion is exact, too, but
+    # for its own rounding.
+    own = _LEAST * tolerance * own + noise * integrated
+    allowed = jnp.minimum(allowed, own)
     ratio = jnp.where(allowed > 0, error / allowed, 0)
     # Shorter steps do not mend a tangent that is not a number.
     ratio = constant(jnp.where(jnp.isnan(ratio), 0, ratio))
@@ -80,7 +89,7 @@ class OfTangents(Adaptive):
         error, *ends = map(_motion, (estimate.error, y0, y1))
         # Tangents of displacements lack that of the start.
         ends = [(args.q0 + jnp.stack(q), *others) for q, *others in ends]
-        ratio = constant(_error_of_tangents(error, *ends, tolerances))
+        ratio = constant(_error_of_tangents(error, *ends, _motion(y1), tolerances))
         estimate = estimate._replace(derivatives=ratio)
         return super().adapt_step_size(t0, t1, y0, y1, args, estimate, *rest)
 
