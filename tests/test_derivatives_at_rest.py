@@ -200,7 +200,9 @@ def test_random_arms_at_rest(count, gradient):
     rng, solved = np.random.default_rng(count), 0
     while solved < 80:
         kind = rng.choice(["damper", "PD", "friction", "stops"])
-        numbers, scene = held_by(kind, rng, "".join(rng.choice([*"RRP"], count)))
+        # An arm of slides alone is refused.
+        topology = "R" + "".join(rng.choice([*"RRP"], count - 1))
+        numbers, scene = held_by(kind, rng, topology)
         wanted, rates = exact(numbers, scene)
         time = float(scene[2])
         # Rounding errors make unstable arms leave their pose; many steps take minutes.
@@ -245,24 +247,22 @@ def test_an_implicit_method_in_strong_damping():
     )  # fmt: skip
     settings = dict(solver=diffrax.Kvaerno5(), dt0=1e-6, rtol=1e-9, atol=1e-9)
 
-    def last(tau, damping, adjoint):
+    def last(tau, damping):
         forces = (fj.JointDamper(damping), fj.JointEffort(tau))
         motion = fj.simulate(
-            hanging, fj.State([0.0], [0.0]), [0, 100.0], forces, adjoint=adjoint,
+            hanging, fj.State([0.0], [0.0]), [0, 100.0], forces,
             **settings,
         )  # fmt: skip
         return motion.q[-1, 0], motion.stats["num_steps"]
 
-    reverse = jax.jit(jax.grad(lambda *at: last(*at, DEFAULT), has_aux=True), **LOOPS)
-    forward = jax.jit(jax.jacfwd(lambda *at: last(*at, FORWARD), has_aux=True), **LOOPS)
+    slope = jax.jit(jax.grad(last, has_aux=True), **LOOPS)
     inertia, stiffness = 1 / 3, 9.81 / 2
     for damping in (30.0, 1e3, 1e5, 1e6):
         linear = [[0, 1, 0], [-stiffness / inertia, -damping / inertia, 1 / inertia]]
         wanted = expm(100.0 * np.array([*linear, [0, 0, 0]]))[0, 2]
-        for slope in (reverse, forward):
-            found, steps = slope(jnp.zeros(1), damping)
-            assert found.item() == pytest.approx(wanted, rel=1e-6)
-            assert steps < 200
+        found, steps = slope(jnp.zeros(1), damping)
+        assert found.item() == pytest.approx(wanted, rel=1e-6)
+        assert steps < 200
 
 
 def test_numbers_of_very_different_size_have_exact_derivatives():

@@ -20,9 +20,12 @@ from .step_wrappers import Adaptive
 from .switching import Switching
 
 # The relative tolerance of tangents is so many times that of the motion, at most so
-# much, and no tighter than so many rounding errors. At 1e-8, the default, undamped
-# tangents are right to 1e-6 after 1000 rad.
-_LOOSER, _LOOSEST, _NOISE = 1e3, 1e-4, 64.0
+# much, and no tighter than so many rounding errors.
+_LOOSER, _LOOSEST, _NOISE = 1e3, 1e-5, 64.0
+# That of a probe, whatever the motion's: undamped tangents are right to 1e-6 after 1000
+# rad.
+_OF_PROBE = 1e-8
+_GROWN = 1e3  # size of a probe that is replaced by a new one, of size 1
 # A tangent below this part of the largest one is judged as if it were as large.
 _WEAK = 0.1
 # No tangent has a tolerance of more than so many times that of one which is large.
@@ -30,12 +33,10 @@ _LEAST = 30.0
 TANGENTS = "tangents"  # the name of their axis
 
 
-def _tolerances(controller: Any, health: Any) -> tuple[Array, Array]:
-    """Returns the relative tolerance of tangents, and their relative rounding error."""
+def _noise(health: Any) -> Array:
+    """Returns the relative rounding error of tangents."""
     loss = constant(jnp.max(jnp.stack(health)))
-    noise = _NOISE * jnp.finfo(loss.dtype).eps * loss
-    tolerance = jnp.minimum(_LOOSER * controller.rtol, _LOOSEST)
-    return jnp.maximum(tolerance, noise), noise
+    return _NOISE * jnp.finfo(loss.dtype).eps * loss
 
 
 def _motion(y: Any) -> Any:
@@ -49,28 +50,26 @@ def _largest(tree: Any) -> Array:
 
 @jax.custom_jvp
 def _error_of_tangents(
-    error: Any, y0: Any, y1: Any, integrated: Any, tolerances: Any
+    error: Any, ends: Any, integrated: Any, tolerance: Array, noise: Array
 ) -> Array:
     """Returns the largest error of a tangent over what its tolerance allows.
 
     Without tangents this is 0. They must be those along one axis, `TANGENTS`.
-    `integrated`: the end, with displacements in place of positions.
+    `ends`, `integrated`: the state at both ends of a step, with positions and, as it is
+    integrated, with displacements.
     """
-    return jnp.zeros_like(tolerances[0])
+    return jnp.zeros_like(tolerance)
 
 
 @_error_of_tangents.defjvp
 def _(primals, tangents):
-    _, *motion, _, (tolerance, noise) = primals
-    error, *sizes, integrated = constant(tuple(map(_largest, tangents[:4])))
-    own = jnp.maximum(*sizes)
+    _, _, motion, tolerance, noise = primals
+    error, own, integrated = constant(tuple(map(_largest, tangents[:3])))
     size = jnp.maximum(own, _WEAK * jax.lax.pmax(own, TANGENTS))
-    # Where the terms of a tangent cancel, its rounding errors are those of the motion.
-    allowed = tolerance * size + noise * _largest(motion)
-    # A tangent that is far smaller than the largest or the motion is exact, too, but
-    # for its own rounding.
-    own = _LEAST * tolerance * own + noise * integrated
-    allowed = jnp.minimum(allowed, own)
+    # A tangent far smaller than the largest is exact, too.
+    allowed = tolerance * jnp.minimum(size, _LEAST * own)
+    # Terms of a tangent may cancel, and leave rounding errors of the motion.
+    allowed += noise * (_largest(motion) + integrated)
     ratio = jnp.where(allowed > 0, error / allowed, 0)
     # Shorter steps do not mend a tangent that is not a number.
     ratio = constant(jnp.where(jnp.isnan(ratio), 0, ratio))
@@ -85,12 +84,14 @@ class OfTangents(Adaptive):
 
     def adapt_step_size(self, *arguments):
         t0, t1, y0, y1, args, estimate, *rest = arguments
-        tolerances = constant(_tolerances(self, estimate.health))
-        error, *ends = map(_motion, (estimate.error, y0, y1))
+        noise = _noise(estimate.health)
+        tolerance = jnp.minimum(_LOOSER * self.rtol, _LOOSEST)
+        tolerance = constant(jnp.maximum(tolerance, noise))
+        error, *integrated = map(_motion, (estimate.error, y0, y1))
         # Tangents of displacements lack that of the start.
-        ends = [(args.q0 + jnp.stack(q), *others) for q, *others in ends]
-        ratio = constant(_error_of_tangents(error, *ends, _motion(y1), tolerances))
-        estimate = estimate._replace(derivatives=ratio)
+        ends = [(args.q0 + jnp.stack(q), *others) for q, *others in integrated]
+        ratio = _error_of_tangents(error, ends, integrated, tolerance, noise)
+        estimate = estimate._replace(derivatives=constant(ratio))
         return super().adapt_step_size(t0, t1, y0, y1, args, estimate, *rest)
 
 
@@ -113,21 +114,23 @@ class OfLinearised(Adaptive):
     def adapt_step_size(self, *arguments):
         *arguments, (state, probe) = arguments
         t0, t1, y0, y1, args, estimate, order = arguments
-        matrix = self._linearised(*constant((t1, y1, args)))
-        change, error = self._step(constant(t1 - t0) * matrix, probe)
+        matrix = constant(t1 - t0) * self._linearised(*constant((t1, y1, args)))
+        change, error = self._step(matrix, probe)
         moved = probe + change
-        tolerance, _ = _tolerances(self, estimate.health)
-        allowed = tolerance * jnp.maximum(_largest(probe), _largest(moved))
-        ratio = _largest(error) / allowed
+        tolerance = jnp.maximum(_OF_PROBE, _noise(estimate.health))
+        size = jnp.maximum(_largest(probe), _largest(moved))
+        ratio = _largest(error) / (tolerance * size)
         finite = jnp.isfinite(ratio)
         ratio = constant(jnp.where(finite, ratio, 0))
         estimate = estimate._replace(derivatives=ratio)
         keep, *step, jumped, state, result = super().adapt_step_size(
             t0, t1, y0, y1, args, estimate, order, state
         )
-        moved = moved / _largest(moved)
-        # Some controllers return a Python bool here.
-        moved = jnp.where(jnp.array(jumped) | ~finite, _new_probe(y1), moved)
+        # A new one shows again what an unstable mode has come to hide.
+        jumped = jnp.array(jumped)
+        new = jumped | ~finite | (_largest(moved) > _GROWN)
+        moved = moved / jnp.minimum(_largest(moved), 1)
+        moved = jnp.where(new, _new_probe(y1), moved)
         return keep, *step, jumped, (state, jnp.where(keep, moved, probe)), result
 
     def _linearised(self, t: Array, y: Any, args: Any) -> Array:

@@ -63,10 +63,13 @@ def integrate(
     jumps = known_times(args, *left_out)
     start = term, ts, y0, args, jumps
     located_solver, controller, y0 = located(locate, solver, controller, *start)
+    # With tolerances of one's own, an implicit solver is for modes too fast to resolve,
+    # which a probe would resolve.
+    trusted = implicit and keywords["stepsize_controller"] is not None
     if adaptive:
         if tangents:
             controller = OfTangents(controller)  # pyright: ignore[reportCallIssue]
-        elif derivatives:
+        elif derivatives and not trusted:
             known = isinstance(solver, ScheduledDopri8 | diffrax.AbstractRungeKutta)
             tableau = solver.tableau if known else diffrax.Heun.tableau
             controller = OfLinearised(controller, term, tableau)  # pyright: ignore[reportCallIssue]

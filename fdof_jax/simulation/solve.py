@@ -149,7 +149,9 @@ def _with_tangents(motion, moving):
         return jax.jvp(shifted, (start,), (direction,), has_aux=True)
 
     # Along changes of each number by itself, tangents have the size of the motion.
-    sizes = jnp.where(start == 0, 1, jnp.abs(start))
+    # What may be a rounding error says nothing about the size of changes.
+    tiny = jnp.abs(start) < jnp.finfo(start.dtype).eps ** 0.5
+    sizes = jnp.where(tiny, 1, jnp.abs(start))
     each = jax.vmap(along, out_axes=(None, 0, None), axis_name=TANGENTS)
     states, tangents, solution = each(jnp.diag(sizes))
     by_size = lambda rows: rows / sizes.reshape(-1, *[1] * (rows.ndim - 1))
