@@ -19,11 +19,13 @@ from .dopri8 import SHORTEST, DenseOutput, constant, with_change
 from .landing import Landing, rounding
 from .step_wrappers import Undifferentiated, with_judge
 from .switch_derivatives import Arrival, Moment, first_of, gained, lateness
-from .zeros_in_steps import BEYOND, CHECKED, CHECKS, SAMPLED, SHARES, passage
+from .zeros_in_steps import CHECKED, CHECKS, SAMPLED, SHARES, passage
 
 # A function whose zero is this close to the end of a step switches there: a share of
 # the step, as a power of the unit of rounding (1e-9 in float64).
 _NEAR = 0.575
+# What was no larger, over its size, began on its zero: this power of rounding, too.
+_ON_ZERO = 0.625
 # What happens within so many of these distances may be passed over.
 _BRIEF = 10
 
@@ -190,7 +192,7 @@ class Located(diffrax.AbstractAdaptiveSolver):
             t1 - t0 <= jnp.maximum(SHORTEST[t1.dtype], _BRIEF * near),
         )
         # What began on its zero has left it, in one or more steps.
-        on_zero = known.sizes <= jnp.finfo(sizes.dtype).eps ** BEYOND * sizes
+        on_zero = known.sizes <= jnp.finfo(sizes.dtype).eps ** _ON_ZERO * sizes
         # Before the first step, whose length is 0, sides are unknown.
         after = jnp.where(switched, -sides, sides)
         after = jnp.where(sides == 0, jnp.where(seen[-1] > 0, 1.0, -1.0), after)
