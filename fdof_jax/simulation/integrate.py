@@ -71,7 +71,8 @@ def integrate(
             controller = OfTangents(controller)  # pyright: ignore[reportCallIssue]
         elif derivatives and not trusted:
             known = isinstance(solver, ScheduledDopri8 | diffrax.AbstractRungeKutta)
-            tableau = solver.tableau if known else diffrax.Heun.tableau
+            other = diffrax.Heun.tableau
+            tableau = solver.tableau if known else other  # pyright: ignore[reportAttributeAccessIssue]
             controller = OfLinearised(controller, term, tableau)  # pyright: ignore[reportCallIssue]
         controller = accounted(controller, solver, term)
     # diffrax computes a few constants while it is traced.
