@@ -196,7 +196,11 @@ def first_zero(
     # As far beyond its zero instead, a margin would pass that at this speed.
     near = jnp.max(jnp.maximum(sizes[None], margins[:-1]) / lowest)
     near = jnp.where(near * _MISSED > 1, jnp.sqrt(jnp.maximum(near, 0)), 0)
-    return jnp.where(wrong, 0, zero), passed.any(), near
+    # Far on the wrong side it is after a jump, however little is known of the rest.
+    size = jnp.max(jnp.abs(margins), axis=0)
+    far = -margins[0] > jnp.finfo(margins.dtype).eps ** 0.375 * size
+    jumped = jnp.any(far & (margins[1] < 0))
+    return jnp.where(wrong, 0, zero), passed.any() | jumped, near
 
 
 def _zero(terms: Array, guess: Array, low: Array, high: Array) -> Array:
