@@ -310,3 +310,28 @@ def test_kinks_of_high_gains_are_exact_in_derivatives():
         before = [both(2 - h, damping, 1e-13)[0][0] for h in (5e-5, 2.5e-5)]
         wide, near = (np.array(values) - before) / [1e-4, 5e-5]
         assert slope == pytest.approx((4 * near - wide) / 3, rel=1e-6)
+
+
+class Step(fj.references.Reference):
+    """A target for the slide that jumps by 1 m at a known time."""
+
+    begin: fj.Values = fj.field((), unit="s")
+
+    @property
+    def jump_ts(self):
+        return self.begin[None]
+
+    def __call__(self, t, linkage):
+        return jnp.where(t < self.begin, 0, 1.0)[None], jnp.zeros(1)
+
+
+@pytest.mark.parametrize("begin", [0.0, 0.1])
+def test_a_limit_that_a_jump_exceeds_acts_at_once(begin):
+    """A slide of 1 kg, at rest until then, is pushed by 5 N for 0.1 s."""
+    slide = fj.Linkage(
+        "P", length=[0, 1], com=[[0, 0]], mass=[1], inertia=[0.1], gravity=0.0
+    )
+    for kp in (6.0, 100.0, 1e4, 1e6):  # from a limit that is soon left to a high gain
+        controller = fj.PDController(kp, 0.0, 5.0, Step(begin))
+        motion = fj.simulate(slide, fj.State([0], [0]), [0, begin + 0.1], (controller,))
+        assert abs(motion.q[-1, 0] - 2.5 * 0.1**2) < 1e-12, kp

@@ -33,6 +33,7 @@ _SLOPES = (
 # rounding, times its size, and by this multiple of it. There the side to which the
 # motion goes is known even if it began at rest on the zero.
 BEYOND, _ROUNDING = 0.75, 500
+_WRONG = 0.375  # power of it, over a size: so far from zero no step has ended
 _SOON = 0.01  # of a step, for extrapolation
 _MISSED = (
     0.01  # of a function's size: turning back so close to its zero nearly touches it
@@ -173,8 +174,11 @@ def first_zero(
         none = jnp.zeros((), margins.dtype)
         return none + 1, jnp.array(False), none
     margins, beyond = _beyond(margins)
-    # What is on the wrong side from the start on changes at once.
-    wrong = jnp.any((margins[0] < 0) & (margins[1] < 0))
+    # What is on the wrong side from the start on, as after a jump, changes at once,
+    # however little is known of the rest of the step.
+    size = jnp.max(jnp.abs(margins), axis=0)
+    far = -margins[0] > jnp.finfo(size.dtype).eps ** _WRONG * size
+    wrong = jnp.any(far & (margins[1] < 0))
     turns, lowest = _turns(margins, beyond)
     shares = jnp.asarray(SHARES, margins.dtype)
     ends = jnp.where(lowest < 0, turns, shares[1:, None])
@@ -196,11 +200,7 @@ def first_zero(
     # As far beyond its zero instead, a margin would pass that at this speed.
     near = jnp.max(jnp.maximum(sizes[None], margins[:-1]) / lowest)
     near = jnp.where(near * _MISSED > 1, jnp.sqrt(jnp.maximum(near, 0)), 0)
-    # Far on the wrong side it is after a jump, however little is known of the rest.
-    size = jnp.max(jnp.abs(margins), axis=0)
-    far = -margins[0] > jnp.finfo(margins.dtype).eps ** 0.375 * size
-    jumped = jnp.any(far & (margins[1] < 0))
-    return jnp.where(wrong, 0, zero), passed.any() | jumped, near
+    return jnp.where(wrong, 0, zero), passed.any() | wrong, near
 
 
 def _zero(terms: Array, guess: Array, low: Array, high: Array) -> Array:
