@@ -132,6 +132,20 @@ def by_type(k):
     return lambda x: -k * x if isinstance(k, float) else 0 * x
 
 
+def by_failure(k):
+    def force(x):
+        try:
+            return -float(k) * x
+        except TypeError:  # not of a number, but of a traced array
+            return 0 * x
+
+    return force
+
+
+def by_kind(k):
+    return lambda x: -k * x if np.isscalar(k) else 0 * x
+
+
 def by_name(k):
     rates = {str(k): k}
     return lambda x: -rates.get(f"{k}", 0.0) * x
@@ -161,8 +175,8 @@ SHARED = [
     of_whole_number, with_length,
 ]  # fmt: skip
 OWN = [
-    beyond_64_bits, by_name, by_range, by_type, chosen, counting, in_numpy, in_order,
-    of_object, partial,
+    beyond_64_bits, by_failure, by_kind, by_name, by_range, by_type, chosen, counting,
+    in_numpy, in_order, of_object, partial,
 ]  # fmt: skip
 
 

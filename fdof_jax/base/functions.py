@@ -31,13 +31,14 @@ _FIXED = {
 }  # fmt: skip
 _JITTED = type(jax.jit(lambda: None))
 _CONSTANTS = bool | int | str | bytes | np.dtype | np.ufunc | jnp.ufunc | _JITTED
+_OF_NUMPY = {"pi", "inf", "nan", "e", "newaxis"}
 # What these do depends on more than the names in the code.
 _OPAQUE = {"eval", "exec", "globals", "locals", "vars", "super"}
-# These, and text made of values, tell a number from an array without an error.
+# These, text made of values and what catches errors tell a number from an array.
 _OPAQUE |= {"format", "getattr", "hasattr", "isinstance", "repr", "str", "type"}
 _OPAQUE_STEPS = {
     "STORE_GLOBAL", "DELETE_GLOBAL", "IMPORT_NAME", "MATCH_CLASS", "FORMAT_VALUE",
-    "FORMAT_SIMPLE", "FORMAT_WITH_SPEC",
+    "FORMAT_SIMPLE", "FORMAT_WITH_SPEC", "PUSH_EXC_INFO",
 }  # fmt: skip
 
 # Kinds of numbers that are data. Code that uses them in Python, as lengths or where it
@@ -115,6 +116,10 @@ def _parts_of(function: Any, within: tuple[Any, ...] = ()) -> SharedFunction:
         raise _Unknown
     among = function.__globals__
     names = {name: among[name] for name in _global_names(code) if name in among}
+    # NumPy's functions may take an array for no number, or draw random ones.
+    if any(value is np for value in names.values()):
+        if not set(code.co_names) <= {*names, *_OF_NUMPY}:
+            raise _Unknown
     of_keywords = function.__kwdefaults__ or {}
     try:
         closure = tuple(cell.cell_contents for cell in function.__closure__ or ())
