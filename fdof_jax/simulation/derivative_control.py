@@ -95,6 +95,13 @@ class OfTangents(Adaptive):
         return super().adapt_step_size(t0, t1, y0, y1, args, estimate, *rest)
 
 
+def linearised(term: ScheduledTerm, t: Array, y: Any, args: Any) -> Array:
+    """Returns the derivative of the rates in the state's numbers, a square matrix."""
+    numbers, state_of = ravel_pytree(y)
+    rates = lambda numbers: term.vf(t, state_of(numbers), args)
+    return jax.jacfwd(lambda numbers: ravel_pytree(rates(numbers))[0])(numbers)
+
+
 class OfLinearised(Adaptive):
     """A controller that judges a step by what it does to the linearised motion.
 
@@ -114,7 +121,10 @@ class OfLinearised(Adaptive):
     def adapt_step_size(self, *arguments):
         *arguments, (state, probe) = arguments
         t0, t1, y0, y1, args, estimate, order = arguments
-        matrix = constant(t1 - t0) * self._linearised(*constant((t1, y1, args)))
+        if isinstance(y1[-1], Switching):
+            args = args._replace(sides=y1[-1].sides)
+        at_end = constant((t1, _motion(y1), args))
+        matrix = constant(t1 - t0) * linearised(self.term, *at_end)
         change, error = self._step(matrix, probe)
         moved = probe + change
         tolerance = jnp.maximum(_OF_PROBE, _noise(estimate.health))
@@ -132,14 +142,6 @@ class OfLinearised(Adaptive):
         moved = moved / jnp.minimum(_largest(moved), 1)
         moved = jnp.where(new, _new_probe(y1), moved)
         return keep, *step, jumped, (state, jnp.where(keep, moved, probe)), result
-
-    def _linearised(self, t: Array, y: Any, args: Any) -> Array:
-        """Returns the derivative of the rates in the state, a square matrix."""
-        if isinstance(y[-1], Switching):
-            args = args._replace(sides=y[-1].sides)
-        numbers, state_of = ravel_pytree(_motion(y))
-        rates = lambda numbers: self.term.vf(t, state_of(numbers), args)
-        return jax.jacfwd(lambda numbers: ravel_pytree(rates(numbers))[0])(numbers)
 
     def _step(self, matrix: Array, probe: Array) -> tuple[Array, Array]:
         """Returns the change of y' = A y in a step of length h from y, and its error.

@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.flatten_util import ravel_pytree
 
 from ..forces.element import Element, ForeignElement
+from .derivative_control import linearised
 from .field import (
     args_of,
     element_effort,
@@ -115,9 +115,7 @@ def _linearised(
     """Returns the matrix of the linearised equations of first order."""
     args, term = args_of(linkage, q, forces), term_of(forces)
     start = whole(*start_of(args, qd), initial_own(args, own))
-    flat, rebuilt = ravel_pytree(start)
-    rates = lambda y: ravel_pytree(term.vf(t, rebuilt(y), args))[0]
-    return jax.jacfwd(rates)(flat)
+    return linearised(term, t, start, args)
 
 
 def check_arguments(forces: tuple[Element, ...]) -> None:
