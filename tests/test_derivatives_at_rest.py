@@ -273,11 +273,11 @@ def test_numbers_of_very_different_size_have_exact_derivatives():
     )  # fmt: skip
     damper = fj.JointDamper([0.1, 100.0])
 
-    def second(tau, repelled, place, end):
+    def second(tau, repelled, place, end, adjoint=DEFAULT):
         push = lambda t, q, qd, linkage: repelled * q * jnp.array([1.0, 0.0])
         start, ts = fj.State(place, jnp.zeros(2)), jnp.stack([0.0, end])
         forces = push, damper, fj.JointEffort(tau)
-        return fj.simulate(arm, start, ts, forces).q[-1, 1]
+        return fj.simulate(arm, start, ts, forces, adjoint=adjoint).q[-1, 1]
 
     slope = jax.jit(jax.grad(second), **LOOPS)
     exact = lambda t: (t - (1 - np.exp(-100 * t)) / 100) / 100
@@ -285,5 +285,26 @@ def test_numbers_of_very_different_size_have_exact_derivatives():
         found = slope(jnp.array([1.0, tau]), 0.0, jnp.full(2, 0.5), 2.0)
         np.testing.assert_allclose(found, [0, exact(2.0)], rtol=1e-7, atol=1e-15)
     # The derivative of the first position in its effort grows to 1e12.
-    found = slope(jnp.zeros(2), 18.0, jnp.zeros(2), 10.0)
-    np.testing.assert_allclose(found[1], exact(10.0), rtol=1e-7)
+    # A probe grows with it, and would hide the other joint.
+    forward = jax.jacfwd(lambda *at: second(*at, FORWARD))
+    for of in (slope, jax.jit(forward, **LOOPS)):
+        found = of(jnp.zeros(2), 18.0, jnp.zeros(2), 10.0)
+        np.testing.assert_allclose(found[1], exact(10.0), rtol=1e-7)
+
+
+def test_a_motion_that_keeps_moving_takes_hardly_more_steps():
+    """In the six gains of Fig 7: the counts of docs/gradients.md."""
+    scene = fj.scenes.fig7()
+
+    def end(gains, tolerance):
+        controller = scene.forces[0].replace(kp=gains[0], kd=gains[1])
+        motion = fj.simulate(
+            scene.linkage, scene.state0, [0, 4.0], (controller,), rtol=tolerance,
+            atol=tolerance,
+        )  # fmt: skip
+        return jnp.sum(motion.q[-1]), motion.stats["num_steps"]
+
+    gains = jnp.stack([scene.forces[0].kp, scene.forces[0].kd])
+    slope = jax.jit(jax.grad(end, has_aux=True), **LOOPS)
+    for tolerance, more in ((1e-11, 1.1), (1e-8, 1.15)):
+        assert slope(gains, tolerance)[1] <= more * end(gains, tolerance)[1]
