@@ -53,6 +53,9 @@ def test_an_effort_that_feeds_itself_diverges():
     feeds = lambda t, q, qd, linkage: qd**3
     words = message([0, 5.0], (feeds,), fj.State([1.0], [1.0]), max_steps=150)
     assert "grows by a rate of" in words and "Kvaerno5" not in words
+    # It is infinite before the end, whatever the number of steps.
+    words = message([0, 50.0], (lambda t, q, qd, linkage: 5 * q**3,))
+    assert "tolerance out of reach" in words and "grows by a rate of" in words
 
 
 def test_a_function_without_derivatives_may_run_out_of_steps():

@@ -35,6 +35,7 @@ def test_a_copy_has_other_numbers_of_an_element():
     for values, words in [
         ({"stiffness": -1}, "^stiffness: expected .* at least 0"),
         ({"ends": None}, "^ends: expected one of a, b, .*, one_sided, got another"),
+        ({300 * "z": 1}, r"^z{197}\.\.\.: expected one of"),
     ]:
         with pytest.raises(ValueError, match=words):
             stiff.replace(**values)

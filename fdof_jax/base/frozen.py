@@ -6,6 +6,8 @@ from typing import Any, Self
 
 import equinox as eqx
 
+from .checks import plain
+
 
 class Frozen(eqx.Module):
     """A module with a checked `replace`, which refused assignments name."""
@@ -54,7 +56,8 @@ class Frozen(eqx.Module):
         now = self.arguments()
         for name in values:
             if name not in now:
+                names = ", ".join(now)
                 raise ValueError(
-                    f"{name}: expected one of {', '.join(now)}, got another name."
+                    f"{plain(name)}: expected one of {names}, got another name."
                 )
         return type(self)(**now | values)

@@ -207,7 +207,7 @@ def _warn_of_third(trees: dict[str, Any]) -> None:
             code = leaf.code
         _alike[code or type(leaf)] += 1
         if _alike[code or type(leaf)] == 3:
-            place = (tree.key + jax.tree_util.keystr(tuple(path[:1]))).lstrip("_.")
+            place = tree.key + jax.tree_util.keystr(tuple(path[:1]))
             name = code.co_qualname if code else type(leaf).__qualname__
             warn(
                 f"{place}: expected the same function at each call, got a third one "

@@ -75,7 +75,7 @@ class Lanes:
             moving = jax.tree.map(lambda a: jnp.asarray(a[there]), self.moving)
             here = jnp.asarray(points[lanes])
             evaluate = lambda shared: _evaluate(self.evaluate, here, moving, shared)
-            found = sharing_functions(evaluate, _=self.shared)
+            found = sharing_functions(evaluate, problem=self.shared)
             return jax.tree.map(np.asarray, found)
 
         # Copies fill the last group.

@@ -60,7 +60,7 @@ def cause(inputs: tuple[Any, ...], keywords: dict[str, Any], solution: Solution)
             effort, _ = element_effort(k, element, ts[0], q, qd, linkage, state)
             if not np.isfinite(effort).all():
                 return f"The effort of forces[{k}] is not finite at the start."
-    if outcome == "out of steps":
+    if outcome in ("out of steps", "tolerance out of reach"):
         return _of_steps(inputs, keywords, solution)
     return reason(outcome)
 
@@ -86,6 +86,8 @@ def _of_steps(inputs, keywords, solution: Solution) -> str:
             f"There the motion grows by a rate of {rate:.3g}/s, as under a force that "
             "feeds itself: it diverges, and more max_steps hardly help."
         )
+    if solution.outcome != "out of steps":
+        return reason(str(solution.outcome))
     if rate * mean > _STABLE and not implicit:
         return (
             f"A mode of {rate:.3g}/s keeps the steps of an explicit method at "
