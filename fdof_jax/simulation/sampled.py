@@ -117,7 +117,6 @@ class SampledMotion(WithOutcome):
     tau: Float[Array, "sample joint"]
     result: diffrax.RESULTS
     own: tuple[Any, ...]
-
     delay: Float[Array, ""] | float = 0.0
     q_begin: Float[Array, "sample joint"] | None = None
 

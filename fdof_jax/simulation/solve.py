@@ -50,9 +50,8 @@ def _solve_one(inputs, keywords) -> tuple[Solution, bool] | None:
     linkage, state0, ts, own0, forces = inputs
     keywords = _of_any_tolerance(keywords)
     if (most := keywords["max_steps"]) is not None:
-        keywords |= {
-            "max_steps": np.int32(most)
-        }  # as data, of which programs know none
+        # As data, of which programs know none.
+        keywords |= {"max_steps": np.int32(most)}
 
     def run(forces):
         if is_traced(forces):  # by the closure of a function
