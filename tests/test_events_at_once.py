@@ -242,12 +242,13 @@ class Wall(fj.Element):
         return -10 + fj.forces.switch(beyond, -1e5 * beyond, 0.0, continuous=True)
 
 
-def test_rounding_in_a_step_of_no_length_is_no_switch():
+@pytest.mark.parametrize("near", [np.inf, 6e3])  # no length, and 3e-16 s of 2e-12
+def test_rounding_in_a_step_of_almost_no_length_is_no_switch(near):
     """Samples of one instant may differ by rounding, falling to the end."""
     falls = 1 - 1e-16 * np.arange(len(SHARES))
-    margins = jnp.array([195.0 * falls, -1e-9 * falls]).T
-    switched, grazing, soon = at_end(margins, jnp.array([300.0, 300.0]), jnp.inf)
-    assert switched.tolist() == [False, True]  # the second is past its zero
+    margins = jnp.array([195.0 * falls, -1e-9 * falls, 3e-13 * falls]).T
+    switched, grazing, soon = at_end(margins, jnp.array([300.0, 300.0, 1.0]), near)
+    assert switched.tolist() == [False, True, False]  # the second is past its zero
     assert grazing == soon == 0
 
 

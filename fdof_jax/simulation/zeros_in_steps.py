@@ -38,7 +38,8 @@ _SOON = 0.01  # of a step, for extrapolation
 _MISSED = (
     0.01  # of a function's size: turning back so close to its zero nearly touches it
 )
-_NOISE = 4 * np.abs(_BEND).sum()  # of the second derivative, in units of rounding
+# Of slopes and second derivatives, in units of rounding.
+_SLOPE_NOISE, _NOISE = (4 * np.abs(weights).sum() for weights in (_SLOPE, _BEND))
 _ITERATIONS = 6  # of Newton's method within a bracket
 # Elsewhere the error of polynomials is less than so many times what is seen of it. A
 # distance that falls and rises within a step needs 10, wherever it turns.
@@ -228,10 +229,11 @@ def at_end(margins: Array, sizes: Array, near: Array) -> tuple[Array, Array, Arr
 
     Also returns the share of the step after which something else follows soon, or 0.
     `sizes`: the largest size of each margin, also in steps before. `near`: a share of
-    the step; not finite for a step of no length, which only finds the sides.
+    the step.
     """
     nearer = -slope_at_end(margins)
-    moves = (nearer != 0) & jnp.isfinite(near)
+    # Where the slope is rounding, as in a step of almost no length, the side counts.
+    moves = jnp.abs(nearer) > _SLOPE_NOISE * jnp.finfo(sizes.dtype).eps * sizes
     speed = jnp.where(moves, nearer, 1)
     left = margins[-1] / speed
     switched = jnp.where(moves, (nearer > 0) & (left <= near), margins[-1] < 0)
