@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import equinox as eqx
 import jax.numpy as jnp
 
-from fdof_jax.simulation.unrolled_dopri8 import UnrolledDopri8
+from fdof_jax.steps.unrolled_dopri8 import UnrolledDopri8
 
 from . import problems
 from .contestants import cases, fdof_jax

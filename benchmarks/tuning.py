@@ -22,7 +22,7 @@ from fdof_jax import scenes
 from fdof_jax.search.bounded import minimise
 from fdof_jax.search.lanes import Lanes
 from fdof_jax.search.methods import METHODS
-from fdof_jax.simulation.steps import adaptive
+from fdof_jax.steps.tolerances import adaptive
 from fdof_jax.tuning.gains import evaluate_gains, with_gains
 from fdof_jax.tuning.losses import tip_errors
 

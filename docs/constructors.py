@@ -9,7 +9,7 @@ from typing import Any
 
 import griffe
 
-from fdof_jax.forces.part import Part
+from fdof_jax.linkage.fields import Part
 
 KINDS = {
     inspect.Parameter.POSITIONAL_OR_KEYWORD: griffe.ParameterKind.positional_or_keyword,

@@ -11,6 +11,7 @@ from . import (
 from .analysis.linearization import linearize as linearize
 from .analysis.reactions import joint_reactions as joint_reactions
 from .base.configuration import configure as configure
+from .batches.sweep import sweep as sweep
 from .control.pd import PDController as PDController
 from .data.files import load as load, save as save
 from .data.mjcf import to_mjcf as to_mjcf
@@ -28,7 +29,6 @@ from .forces.actuators import LinearActuator as LinearActuator
 from .forces.between_points import SpringDamper as SpringDamper, Wrench as Wrench
 from .forces.element import Element as Element
 from .forces.joints import JointDamper as JointDamper, JointEffort as JointEffort
-from .forces.part import Values as Values, field as field
 from .forces.points import Point as Point
 from .identification.fitting import fit as fit
 from .identification.result import FitResult as FitResult
@@ -37,6 +37,7 @@ from .linkage.coordinates import (
     from_chain as from_chain,
     to_chain as to_chain,
 )
+from .linkage.fields import Values as Values, field as field
 from .linkage.linkage import Linkage as Linkage
 from .linkage.topology import (
     TOPOLOGIES as TOPOLOGIES,
@@ -72,8 +73,7 @@ from .simulation.sampled import (
 from .simulation.scene import Scene as Scene
 from .simulation.simulate import simulate as simulate
 from .simulation.solution import Solution as Solution
-from .simulation.steps import scale_tolerances as scale_tolerances
-from .simulation.sweep import sweep as sweep
+from .steps.tolerances import scale_tolerances as scale_tolerances
 from .tuning.result import TuneResult as TuneResult
 from .tuning.tuning import tune as tune
 

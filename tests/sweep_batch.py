@@ -9,7 +9,7 @@ from chains import random_chain
 from helpers import random_linkage
 
 import fdof_jax as fj
-from fdof_jax.simulation.looped_dopri8 import LoopedDopri8
+from fdof_jax.steps.looped_dopri8 import LoopedDopri8
 
 # Compilations dominate: nearly all tests share these shapes and settings.
 TS = np.linspace(0, 1.5, 7)

@@ -9,8 +9,8 @@ from modes import LOOPS
 from scipy.integrate import solve_ivp
 
 import fdof_jax as fj
-from fdof_jax.simulation.looped_dopri8 import LoopedDopri8
 from fdof_jax.simulation.sensitivities import sensitivities
+from fdof_jax.steps.looped_dopri8 import LoopedDopri8
 
 SLIDE = fj.Linkage(
     "P", length=[0, 1], com=[[0.5, 0]], mass=[1], inertia=[0.1], gravity=0

@@ -15,8 +15,8 @@ from sweep_batch import run
 
 import fdof_jax as fj
 from fdof_jax.base.whole_files import folder_path
-from fdof_jax.simulation import checkpoints
-from fdof_jax.simulation.checkpoints import Checkpoint, Rows
+from fdof_jax.batches import checkpoints
+from fdof_jax.batches.checkpoints import Checkpoint, Rows
 
 MEMBERS, LANES = np.arange(3), 7
 
@@ -162,7 +162,7 @@ def test_paths_of_a_folder(tmp_path, monkeypatch):
     assert folder_path("checkpoint", "~/kept") == tmp_path / "kept"
     assert (tmp_path / "kept").is_dir()
     # Refused before anything is traced
-    monkeypatch.setattr(sys.modules["fdof_jax.simulation.sweep"], "outline", None)
+    monkeypatch.setattr(sys.modules["fdof_jax.batches.sweep"], "outline", None)
     with pytest.raises(ValueError, match="^checkpoint: expected a folder, got ''"):
         fj.sweep(
             fj.scenes.fig5().linkage,

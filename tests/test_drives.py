@@ -9,7 +9,7 @@ from elements import SHORT, Hold
 from scipy.linalg import expm
 
 import fdof_jax as fj
-from fdof_jax.simulation.looped_dopri8 import LoopedDopri8
+from fdof_jax.steps.looped_dopri8 import LoopedDopri8
 
 # The joints do not affect each other: slides at right angles carry point masses.
 STILL = fj.State(np.zeros(3), np.zeros(3))

@@ -278,7 +278,7 @@ def test_nothing_else_is_asked_for_attributes():
         if "hasattr(" in path.read_text() or "getattr(" in path.read_text()
     }
     assert asking == {
-        "forces/part.py",
+        "linkage/fields.py",
         "data/tree_description.py",
-        "simulation/provenance.py",
+        "batches/provenance.py",
     }

@@ -8,13 +8,7 @@ import pytest
 
 import fdof_jax as fj
 from fdof_jax.simulation.sensitivities import sensitivities
-from fdof_jax.simulation.zeros_in_steps import (
-    CHECKS,
-    SHARES,
-    at_end,
-    first_zero,
-    passage,
-)
+from fdof_jax.steps.zeros_in_steps import CHECKS, SHARES, at_end, first_zero, passage
 
 SLIDE = fj.Linkage(
     "P", length=[0, 1], com=[[0.5, 0]], mass=[1], inertia=[0.1], gravity=0

@@ -27,7 +27,7 @@ from saved_trees import (
 import fdof_jax as fj
 from fdof_jax import scenes
 from fdof_jax.simulation import prescribed
-from fdof_jax.simulation.looped_dopri8 import LoopedDopri8
+from fdof_jax.steps.looped_dopri8 import LoopedDopri8
 from fdof_jax.tuning import tuning
 
 TS = np.linspace(0, 0.1, 4)

@@ -11,7 +11,7 @@ from saved_trees import SCENES, Plain, Push, describe, saved_and_loaded
 
 import fdof_jax as fj
 from fdof_jax.references.timing import PROFILES
-from fdof_jax.simulation.looped_dopri8 import LoopedDopri8
+from fdof_jax.steps.looped_dopri8 import LoopedDopri8
 
 
 @pytest.fixture

@@ -13,9 +13,9 @@ import pytest
 from chains import random_chain
 
 import fdof_jax as fj
-from fdof_jax.simulation import store
-from fdof_jax.simulation.batch_axes import batch_of
-from fdof_jax.simulation.chunks import Job
+from fdof_jax.batches import store
+from fdof_jax.batches.batch_axes import batch_of
+from fdof_jax.batches.chunks import Job
 
 KILLS, WORKERS, BLOCKS = 20, 3, 1500
 

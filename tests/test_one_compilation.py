@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import fdof_jax as fj
-from fdof_jax.simulation.looped_dopri8 import LoopedDopri8
+from fdof_jax.steps.looped_dopri8 import LoopedDopri8
 
 TS = np.linspace(0, 0.5, 6)
 # A common start and links for which all topologies reach a small circle.

@@ -11,8 +11,8 @@ import pytest
 from sweep_batch import SETTINGS, TS, single_links
 
 import fdof_jax as fj
-from fdof_jax.simulation.batch_axes import batch_of
-from fdof_jax.simulation.provenance import outline
+from fdof_jax.batches.batch_axes import batch_of
+from fdof_jax.batches.provenance import outline
 
 
 @functools.cache

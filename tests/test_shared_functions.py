@@ -13,8 +13,9 @@ import pytest
 
 import fdof_jax as fj
 from fdof_jax.base.functions import sharing_functions
+from fdof_jax.batches import chunk_programs
 from fdof_jax.identification import problems
-from fdof_jax.simulation import chunk_programs, solve
+from fdof_jax.simulation import solve
 
 ARM, START, *_ = fj.scenes.fig5()
 TS = np.linspace(0, 0.1, 4)

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import fdof_jax as fj
-from fdof_jax.simulation.looped_dopri8 import LoopedDopri8
-from fdof_jax.simulation.unrolled_dopri8 import UnrolledDopri8
+from fdof_jax.steps.looped_dopri8 import LoopedDopri8
+from fdof_jax.steps.unrolled_dopri8 import UnrolledDopri8
 
 START = fj.State(np.array([0.3]), np.array([0.5]))
 # Elements written in scalars and in arrays, one with a state.

@@ -24,7 +24,7 @@ from sweep_batch import (
 )  # fmt: skip
 
 import fdof_jax as fj
-from fdof_jax.simulation.looped_dopri8 import LoopedDopri8
+from fdof_jax.steps.looped_dopri8 import LoopedDopri8
 
 
 def reason(solution, member):

@@ -10,8 +10,8 @@ from sweep_batch import SETTINGS, TS, run, successful
 
 import fdof_jax as fj
 from fdof_jax.base import configuration
-from fdof_jax.simulation import chunk_programs, chunks, forecast
-from fdof_jax.simulation.batch_axes import batch_of
+from fdof_jax.batches import chunk_programs, chunks, forecast
+from fdof_jax.batches.batch_axes import batch_of
 
 LANES = 64  # enough for a slow member to be stopped
 PENDULUM = fj.Linkage("R", length=[0, 1], com=[[0.5, 0]], mass=[1], inertia=[0.1])
@@ -121,7 +121,7 @@ def test_only_chunks_that_nothing_keeps_depend_on_the_cores(monkeypatch, tmp_pat
         asked.append(anywhere)
         return 8
 
-    module = sys.modules["fdof_jax.simulation.sweep"]
+    module = sys.modules["fdof_jax.batches.sweep"]
     monkeypatch.setattr(module, "usual_chunk", usual_chunk)
     speeds = np.linspace(0, 1, 8)
     for keywords in ({}, {"checkpoint": tmp_path / "a"}, {"store": tmp_path / "b"}):

@@ -10,7 +10,7 @@ import pytest
 from sweep_batch import FAILED, run, single_links
 
 import fdof_jax as fj
-from fdof_jax.simulation import chunk_programs, chunks
+from fdof_jax.batches import chunk_programs, chunks
 
 
 def end_and_fastest(motion):
@@ -88,7 +88,7 @@ def test_traced_values_may_be_out_of_sight(monkeypatch):
         batches.append(batch)
         return jnp.ones(batch.size)
 
-    monkeypatch.setattr(sys.modules["fdof_jax.simulation.sweep"], "_traced", traced)
+    monkeypatch.setattr(sys.modules["fdof_jax.batches.sweep"], "_traced", traced)
 
     def total(w):
         return w * run(two_links(), reduce=lambda motion: w * motion.q[-1]).sum()

@@ -16,7 +16,8 @@ from sweep_batch import CHUNK, run
 
 import fdof_jax as fj
 from fdof_jax.base.checks import is_traced
-from fdof_jax.simulation import chunks, prescribed
+from fdof_jax.batches import chunks
+from fdof_jax.simulation import prescribed
 
 # Checkpoints
 

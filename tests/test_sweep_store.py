@@ -17,8 +17,8 @@ from helpers import programs
 from sweep_batch import FAILED, TS, run, single_links
 
 import fdof_jax as fj
-from fdof_jax.simulation import store
-from fdof_jax.simulation.batch_axes import batch_of
+from fdof_jax.batches import store
+from fdof_jax.batches.batch_axes import batch_of
 
 BLOCKS, BLOCK = 6, 7  # members
 
@@ -240,7 +240,7 @@ import sys
 import jax
 jax.config.update("jax_enable_x64", True)
 import sweep_batch
-from fdof_jax.simulation import store
+from fdof_jax.batches import store
 store._CHUNKS = 1
 batch = sweep_batch.single_links()
 sweep_batch.run(batch, store=sys.argv[1], shard=int(sys.argv[2]), of=3, chunk=2)

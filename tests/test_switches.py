@@ -15,8 +15,8 @@ from switching_scenes import BUMPER, CABLE, LIMITED, RODS as ARM, scene
 
 import fdof_jax as fj
 from fdof_jax.forces.switches import Switches
-from fdof_jax.simulation.looped_dopri8 import LoopedDopri8
 from fdof_jax.simulation.sensitivities import sensitivities
+from fdof_jax.steps.looped_dopri8 import LoopedDopri8
 
 FORWARD = diffrax.ForwardMode()
 CASES = jax.tree.map(lambda *a: np.array(a), LIMITED, CABLE, BUMPER)

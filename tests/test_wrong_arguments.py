@@ -7,7 +7,7 @@ from sweep_batch import TS, run, successful
 
 import fdof_jax as fj
 from fdof_jax import identification, references, scenes, tuning
-from fdof_jax.simulation import chunks
+from fdof_jax.batches import chunks
 
 FIG7 = scenes.fig7()
 MOTION = fj.Solution(TS, np.zeros((7, 3)), np.zeros((7, 3)), {}, None)

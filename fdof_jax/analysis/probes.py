@@ -11,8 +11,8 @@ from jax import Array
 from ..control.drives import Drive
 from ..control.pd import PDController
 from ..forces.element import Element, Forces, StatefulElement
-from ..forces.part import Values, field
 from ..linkage.coordinates import State
+from ..linkage.fields import Values, field
 from ..linkage.linkage import Linkage
 from ..references.reference import Reference
 from ..simulation.simulate import simulate

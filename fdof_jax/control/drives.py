@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike
 
 from ..base.checks import real_array
 from ..forces.element import StatefulElement, element_of, naming
-from ..forces.part import Condition, Values, called, field
 from ..forces.switches import clip
+from ..linkage.fields import Condition, Values, called, field
 from ..linkage.linkage import Linkage, joints_of
 from .pd import PDController
 

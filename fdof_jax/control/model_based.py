@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ..base.checks import real_array
-from ..forces.part import Condition
+from ..linkage.fields import Condition
 from ..linkage.frames import scalar_frames
 from ..linkage.linkage import Linkage, check_linkage, possible
 from ..mechanics.equations import Scalars, link_constants

@@ -6,8 +6,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from ..forces.element import ScalarElement
-from ..forces.part import Values, called, each, field
 from ..forces.switches import clip
+from ..linkage.fields import Values, called, each, field
 from ..linkage.linkage import Linkage
 from ..references.reference import EXPECTED, reference_motion
 

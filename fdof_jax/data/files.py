@@ -18,7 +18,7 @@ import numpy as np
 
 from ..base.checks import plain, shown
 from ..base.whole_files import file_path, whole_file
-from ..simulation.versions import VERSIONS
+from ..batches.versions import VERSIONS
 from .tree_description import Restorer, Unreadable, described
 
 _FORMAT, _VERSION = "fdof_jax", 1

@@ -1,3 +1,4 @@
+from ..linkage.fields import Condition as Condition, Values as Values, field as field
 from .actuators import Armature as Armature, LinearActuator as LinearActuator
 from .between_points import (
     SpringDamper as SpringDamper,
@@ -15,7 +16,6 @@ from .joints import (
     JointDamper as JointDamper,
     JointEffort as JointEffort,
 )
-from .part import Condition as Condition, Values as Values, field as field
 from .points import Load as Load, Point as Point, PointElement as PointElement
 from .switches import clip as clip, switch as switch
 

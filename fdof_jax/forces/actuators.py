@@ -8,10 +8,10 @@ import jax.numpy as jnp
 from jax import Array
 from numpy.typing import ArrayLike
 
+from ..linkage.fields import Values, field, value_of
 from ..linkage.frames import cross, dot, length_of, scalar_frames
 from ..linkage.linkage import Linkage, joints_of
 from .element import InertialElement
-from .part import Values, field, value_of
 from .points import Load, Point, Separation, arguments_of, over
 
 

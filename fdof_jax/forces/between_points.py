@@ -14,9 +14,9 @@ from jaxtyping import Int
 from numpy.typing import ArrayLike
 
 from ..base.checks import instance, refusal
+from ..linkage.fields import Values, field, of_kind, value_of
 from ..linkage.frames import length_of, scalar_frames
 from ..linkage.linkage import Linkage
-from .part import Values, field, of_kind, value_of
 from .points import Load, Point, PointElement, Separation, arguments_of, over, pick
 from .switches import switch
 

@@ -16,9 +16,9 @@ import jax.numpy as jnp
 from jax import Array
 
 from ..base.checks import shown
+from ..linkage.fields import Foreign, Part, check_joints, default, optional, sized
 from ..linkage.linkage import Linkage, joints_of
 from ..mechanics.equations import Scalars
-from .part import Foreign, Part, check_joints, default, optional, sized
 
 Forces = tuple[Any, ...]  # elements, or callables (t, q, qd, linkage) -> tau
 

@@ -3,9 +3,9 @@
 import jax.numpy as jnp
 from jax import Array
 
+from ..linkage.fields import Condition, Values, each, field
 from ..linkage.linkage import Linkage
 from .element import ScalarElement
-from .part import Condition, Values, each, field
 from .switches import switch
 
 

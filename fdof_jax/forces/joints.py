@@ -5,8 +5,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from ..base.checks import JOINT
+from ..linkage.fields import Condition, Values, each, field
 from .element import ScalarElement
-from .part import Condition, Values, each, field
 
 
 class JointDamper(ScalarElement):

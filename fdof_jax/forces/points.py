@@ -18,12 +18,12 @@ from jaxtyping import Complex, Float
 from numpy.typing import ArrayLike
 
 from ..base.checks import is_traced, shown, whole_number
+from ..linkage.fields import Condition, Part, Values, check_joints, field, of_kind
 from ..linkage.frames import Frames, cross, frames, length_of, scalar_frames
 from ..linkage.linkage import Linkage, joints_of, per_joint, without_fixed
 from ..linkage.topology import MOST_PAIRS
 from ..mechanics.equations import Scalars
 from .element import ScalarElement
-from .part import Condition, Part, Values, check_joints, field, of_kind
 
 
 def pick(link: Array, choices: list[Array]) -> Array:

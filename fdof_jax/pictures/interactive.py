@@ -18,10 +18,10 @@ from ..base.html_table import html_table
 from ..base.names import optional_package
 from ..linkage.linkage import joint_names, joints_of
 from ..references.reference import reference_of
-from ..simulation.looped_dopri8 import LoopedDopri8
 from ..simulation.scene import Scene
 from ..simulation.simulate import simulate
 from ..simulation.solution import Solution
+from ..steps.looped_dopri8 import LoopedDopri8
 from ..tuning.gains import with_gains
 from ..tuning.league import circle_scenes
 from ..tuning.losses import controller_of, gains_of

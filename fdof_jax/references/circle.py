@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from ..base.array_namespace import in_numpy, namespace, plane_vector, sine_and_cosine
 from ..base.checks import real_array
-from ..forces.part import Condition, Values, field
+from ..linkage.fields import Condition, Values, field
 from ..linkage.frames import dot
 from ..linkage.linkage import Linkage
 from ..mechanics.inverse_kinematics import (

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from ..base.array_namespace import in_numpy, namespace, sine_and_cosine
 from ..base.checks import instance, real_array
-from ..forces.part import Part, Values, default, field
+from ..linkage.fields import Part, Values, default, field
 
 
 class Path(Part):

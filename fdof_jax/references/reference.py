@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from ..base.array_namespace import in_numpy, namespace
 from ..base.checks import function, is_traced, known, real_array, refusal, shown
-from ..forces.part import Foreign, Part, default, optional
+from ..linkage.fields import Foreign, Part, default, optional
 from ..linkage.linkage import Linkage, check_linkage, joints_of
 
 EXPECTED = "a callable (t, linkage) -> (q, qd), for instance CircleTask()"

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from ..base.array_namespace import in_numpy, namespace, plane_vectors
 from ..base.checks import JOINT, is_traced, real_array
-from ..forces.part import Condition, Values, called, default, field, of_kind
+from ..linkage.fields import Condition, Values, called, default, field, of_kind
 from ..linkage.frames import cross, dot
 from ..linkage.linkage import Linkage
 from ..mechanics.inverse_kinematics import (

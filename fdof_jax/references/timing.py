@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from ..base.array_namespace import namespace
 from ..base.checks import concrete, instance, one_of, real_array
-from ..forces.part import Condition, Part, Values, field
+from ..linkage.fields import Condition, Part, Values, field
 
 _MOST_TURN = 250  # [rad], as far as 48 nodes per piece resolve
 _PASSES = 3

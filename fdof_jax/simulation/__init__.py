@@ -1,1 +1,1 @@
-"""Motion in time: integration, its steps, and batches of motions."""
+"""Motion in time: the equations that are integrated, and what is read from them."""

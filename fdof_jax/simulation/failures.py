@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array
 
 from ..forces.element import Element, ForeignElement
-from .derivative_control import linearised
+from ..steps.derivative_control import linearised
 from .field import (
     args_of,
     element_effort,

@@ -16,7 +16,7 @@ from ..forces.switches import Switches
 from ..linkage.linkage import Linkage
 from ..mechanics.equations import Constants, Scalars, Upper, link_constants, zeros
 from ..mechanics.rates import conditioning, rates, rates_and_conditioning
-from .dopri8 import Health, health_if
+from ..steps.dopri8 import Health, health_if
 
 # Below this inertia ratio the accelerations have four correct digits at best (float64)
 # or two (float32).

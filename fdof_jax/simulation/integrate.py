@@ -10,18 +10,18 @@ from jax import Array
 
 from ..forces.joints import EffortHistory
 from ..linkage.linkage import possible, without_fixed
-from .derivative_control import OfLinearised, OfTangents
-from .dopri8 import ScheduledDopri8, constant
+from ..steps.derivative_control import OfLinearised, OfTangents
+from ..steps.dopri8 import ScheduledDopri8, constant
+from ..steps.landing import end_of_run
+from ..steps.looped_dopri8 import LoopedDopri8
+from ..steps.switching import Located, LocatedImplicit, located, switching_facts
+from ..steps.tolerances import accounted, step_control
+from ..steps.unchecked import diffeqsolve
 from .field import args_of, initial_own, own_states, whole
 from .known_times import clocks_apart, known_times
-from .landing import end_of_run
-from .looped_dopri8 import LoopedDopri8
 from .packing import in_arrays
 from .prescribed import agrees, motion_at, start_of, term_of
 from .solution import Solution
-from .steps import accounted, step_control
-from .switching import Located, LocatedImplicit, located, switching_facts
-from .unchecked import diffeqsolve
 
 
 def integrate(

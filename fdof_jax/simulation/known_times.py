@@ -4,9 +4,9 @@ import jax.numpy as jnp
 from jax import Array
 
 from ..forces.element import Element
-from ..forces.part import jumps_of
+from ..linkage.fields import jumps_of
+from ..steps.landing import rounding
 from .field import Args
-from .landing import rounding
 from .prescribed import PrescribedMotion
 
 # Units of `rounding`, beyond the distances that steps keep from each time.

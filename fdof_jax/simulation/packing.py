@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from .dopri8 import ScheduledTerm
+from ..steps.dopri8 import ScheduledTerm
 from .field import Args
 
 

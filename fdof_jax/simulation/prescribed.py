@@ -16,12 +16,12 @@ from ..base.array_namespace import in_numpy, namespace
 from ..base.checks import place_of, shown
 from ..dynamics import mass_and_bias
 from ..forces.element import Element, Forces, naming
-from ..forces.part import Condition, called
+from ..linkage.fields import Condition, called
 from ..linkage.linkage import Linkage, joints_of, without_fixed
 from ..linkage.topology import MOST_PAIRS, fixed_pairs
 from ..mechanics.equations import equations, zeros
 from ..references.reference import EXPECTED, positions_at, reference_motion
-from .dopri8 import Health, ScheduledTerm
+from ..steps.dopri8 import Health, ScheduledTerm
 from .field import (
     Args,
     applied,

@@ -25,8 +25,8 @@ from ..forces.element import Element, Forces, ScalarElement, element_of, element
 from ..forces.joints import JointEffort
 from ..linkage.coordinates import State, real_state
 from ..linkage.linkage import Linkage, check_linkage, joints_of, without_fixed
+from ..steps.looped_dopri8 import LoopedDopri8
 from .field import initial_states, stateful
-from .looped_dopri8 import LoopedDopri8
 from .simulate import check_elements, simulate
 from .solution import Solution, WithOutcome
 

@@ -16,16 +16,16 @@ from jax import Array
 
 from ..forces.element import elements
 from ..linkage.linkage import without_fixed
+from ..steps.landing import end_of_run
+from ..steps.switch_derivatives import first_of
+from ..steps.switching import Located, located
+from ..steps.tolerances import adaptive, of_precision
+from ..steps.unchecked import diffeqsolve
 from .field import args_of, initial_own, own_states, whole
 from .known_times import clocks_apart, known_times
-from .landing import end_of_run
 from .prescribed import motion_at, start_of, term_of
 from .scene import Scene
 from .solution import Solution
-from .steps import adaptive, of_precision
-from .switch_derivatives import first_of
-from .switching import Located, located
-from .unchecked import diffeqsolve
 
 # Tolerance of the motion and its derivatives, whichever are larger. The steps that the
 # derivatives need make the loss on Fig 7's circle right to 1e-8.

@@ -29,15 +29,15 @@ from ..forces.element import (
     naming,
     of_full_size,
 )
-from ..forces.part import check_values
 from ..linkage.coordinates import State, real_state
+from ..linkage.fields import check_values
 from ..linkage.linkage import Linkage, check_linkage, possible
+from ..steps.tolerances import at_tolerances, with_longest, within_reach
 from .failures import cause, check_arguments, reason
 from .field import initial_states
 from .prescribed import agrees, prescribed
 from .solution import OUTCOMES, Solution, outcome_numbers
 from .solve import solve
-from .steps import at_tolerances, with_longest, within_reach
 
 
 def solve_options(

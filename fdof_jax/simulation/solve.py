@@ -15,14 +15,14 @@ from ..base.configuration import options_of_loops
 from ..base.functions import sharing_functions
 from ..forces.added_inertia import inertial
 from ..forces.element import Element, ForeignElement
-from .derivative_control import TANGENTS
+from ..steps.derivative_control import TANGENTS
+from ..steps.step_wrappers import with_pid
+from ..steps.tolerances import default_controller
+from ..steps.unrolled_dopri8 import UnrolledDopri8
 from .integrate import integrate
 from .padding import cut, padded
 from .prescribed import prescribed
 from .solution import Solution
-from .step_wrappers import with_pid
-from .steps import default_controller
-from .unrolled_dopri8 import UnrolledDopri8
 
 
 def solve(inputs, keywords) -> tuple[Solution, bool | None]:

@@ -14,7 +14,7 @@ from ..analysis.responses import BAND, samples_of, step_measures
 from ..analysis.tracking import demands
 from ..control.pd import PDController
 from ..forces.element import Element
-from ..forces.part import Part, Values, field
+from ..linkage.fields import Part, Values, field
 from ..linkage.linkage import moving_joints
 from ..references.reference import reference_motion
 from ..simulation.scene import Scene

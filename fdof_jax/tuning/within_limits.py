@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from ..base.checks import instance
 from ..base.configuration import options_of_loops
-from ..forces.part import check_joints, sized
+from ..linkage.fields import check_joints, sized
 from ..linkage.linkage import joints_of
 from ..simulation.scene import Scene, with_full_size
 from ..simulation.simulate import simulate

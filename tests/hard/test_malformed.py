@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import fdof_jax as fj
-from fdof_jax.simulation.looped_dopri8 import LoopedDopri8
+from fdof_jax.steps.looped_dopri8 import LoopedDopri8
 from hard.scenes import START, TARGET, arm
 
 NAN, INF = np.nan, np.inf

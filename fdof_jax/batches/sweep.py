@@ -37,15 +37,15 @@ from ..base.whole_files import folder_path
 from ..forces.element import Forces, elements, elements_on
 from ..linkage.coordinates import State
 from ..linkage.linkage import Linkage
+from ..simulation.simulate import solve_options
+from ..simulation.solution import Solution
+from ..steps.dopri8 import constant
 from .batch_axes import Batch, batch_of, check_arms
 from .checkpoints import Checkpoint
 from .chunk_programs import outcome_of
 from .chunks import Job, in_chunks, usual_chunk
-from .dopri8 import constant
 from .forecast import expected_work
 from .provenance import outline
-from .simulate import solve_options
-from .solution import Solution
 from .store import Store, in_store
 
 

@@ -18,9 +18,9 @@ from ..base.checks import refusal
 from ..base.devices import found_by_first
 from ..base.user_warnings import warn
 from ..base.whole_files import whole_file
+from ..simulation.solution import Solution
 from .batch_axes import Batch
 from .chunks import Job, in_chunks
-from .solution import Solution
 from .versions import VERSIONS
 from .zarr_variables import Variable, coordinates, metadata, values_of, variables_of
 

@@ -10,7 +10,7 @@ from jax import Array
 from ..dynamics import forward_dynamics
 from ..forces.element import elements
 from ..linkage.topology import real_joints
-from .field import element_effort
+from ..simulation.field import element_effort
 
 _STEPS, _ANGLE = 16, 0.3  # of the rough motion: number and size
 

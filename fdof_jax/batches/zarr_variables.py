@@ -10,7 +10,7 @@ import numpy as np
 from ..base.checks import refusal
 from ..linkage.linkage import Linkage
 from ..linkage.topology import common_unit, names_and_units, rate_unit
-from .solution import OUTCOMES, Solution, outcome_numbers
+from ..simulation.solution import OUTCOMES, Solution, outcome_numbers
 
 _FLAGS = {
     "flag_values": [*range(len(OUTCOMES))],

@@ -14,11 +14,11 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from ..base.checks import refusal
 from ..base.configuration import wide_vectors
+from ..simulation.simulate import simulate
+from ..simulation.solution import Solution
+from ..steps.step_wrappers import Abreast, by_square_roots
+from ..steps.tolerances import default_controller
 from .forecast import expected_work
-from .simulate import simulate
-from .solution import Solution
-from .step_wrappers import Abreast, by_square_roots
-from .steps import default_controller
 
 # With so few lanes a step takes hardly longer than with one, so that slow members do
 # not pay for another program.

@@ -29,8 +29,8 @@ from ..base.checks import (
     real_array,
 )
 from ..base.frozen import Frozen
-from ..linkage.linkage import Linkage, joints_of, short
-from ..linkage.topology import check_angles
+from .linkage import Linkage, joints_of, short
+from .topology import check_angles
 
 
 class Values:

@@ -17,10 +17,10 @@ from jax.sharding import Mesh, NamedSharding
 
 from ..base.array_namespace import in_numpy
 from ..base.devices import found_by_first
+from ..simulation.solution import Solution
 from .batch_axes import Batch
 from .checkpoints import Checkpoint, Rows
 from .chunk_programs import Form, compiled, traced, work_of_chunks
-from .solution import Solution
 
 _SMALL = 8  # lanes of the chunks for a few slow members
 _MOST = 8  # chunks that one call of a program solves, one after another

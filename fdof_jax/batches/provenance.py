@@ -13,9 +13,9 @@ from jax import Array
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn
 
 from ..base.checks import refusal
+from ..simulation.solution import Solution
 from .batch_axes import Batch
 from .chunk_programs import outcome_of
-from .solution import Solution
 
 
 def _check_callback(operation: JaxprEqn) -> None:

@@ -1,0 +1,1 @@
+"""Batches of motions: members, chunks, and where results are kept."""

@@ -1,0 +1,1 @@
+"""Steps of integrations: methods, their control, and ends where elements switch."""
