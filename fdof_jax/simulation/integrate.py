@@ -1,6 +1,9 @@
-"""Integrates the equations of motion with diffrax: free, prescribed, differentiated."""
+"""Integrates the equations of motion with diffrax: free, prescribed, differentiated.
 
-from typing import Any
+`integrate` is the one way in: it prepares, controls, solves and reads.
+"""
+
+from typing import Any, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -8,20 +11,50 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from ..base.checks import shown
 from ..forces.joints import EffortHistory
 from ..linkage.linkage import possible, without_fixed
 from ..steps.derivative_control import OfLinearised, OfTangents
-from ..steps.dopri8 import ScheduledDopri8, constant
+from ..steps.dopri8 import ScheduledDopri8, ScheduledTerm, constant
 from ..steps.landing import end_of_run
 from ..steps.looped_dopri8 import LoopedDopri8
+from ..steps.step_control import StepControl, largest_loss
+from ..steps.step_wrappers import with_judge
 from ..steps.switching import Located, LocatedImplicit, located, switching_facts
-from ..steps.tolerances import accounted, step_control
+from ..steps.tolerances import default_controller
 from ..steps.unchecked import diffeqsolve
-from .field import args_of, initial_own, own_states, whole
+from .field import Args, args_of, initial_own, own_states, whole
 from .known_times import clocks_apart, known_times
 from .packing import in_arrays
 from .prescribed import agrees, motion_at, start_of, term_of
 from .solution import Solution
+
+
+class _Problem(NamedTuple):
+    """What is integrated.
+
+    - `valid`: whether the inputs were; otherwise harmless ones replace them.
+    - `ts`: output times of the solve; `given`: positions and velocities at the first.
+    - `start`: the integrated state there; `term`, `args`: its equations.
+    - `path`: the arguments with which `motion_at` reads joint states.
+    """
+
+    valid: Array
+    ts: Array
+    given: tuple[Array, Array]
+    start: Any
+    term: ScheduledTerm
+    args: Any
+    path: Args
+
+
+class _Control(NamedTuple):
+    """How it is integrated: a start that may include switches, solver and steps."""
+
+    start: Any
+    solver: Any
+    steps: Any
+    jumps: Array | None
 
 
 def integrate(
@@ -38,86 +71,118 @@ def integrate(
     `padded`: for a plain call, which has checked its inputs; the last time may be
     repeated.
     """
-    linkage, state0, asked, own0, forces = inputs
-    solver = _differentiable(keywords["solver"] or LoopedDopri8(), keywords["adjoint"])
+    problem = _prepare(inputs, derivatives, padded)
+    control = _control(problem, keywords, derivatives, tangents)
+    return _read(inputs, problem, _solve(problem, control, keywords))
+
+
+def _prepare(inputs, derivatives: bool, padded: bool) -> _Problem:
+    """States the equations and their start."""
+    linkage, _, _, own0, forces = inputs
     valid, ts, (q0, qd0) = _valid(inputs, padded)
-    args = args_of(linkage, q0, forces)
+    path = args_of(linkage, q0, forces)
     if derivatives:
-        args = clocks_apart(args, ts)
-    own = initial_own(args, own0)
-    known = jnp.isfinite(jnp.array(own)).all()
-    valid, own = valid & known, tuple(jnp.where(known, x, 0) for x in own)
-    term = term_of(forces)
-    controller = step_control(keywords["stepsize_controller"])
-    unpacked, y0 = args, whole(*start_of(args, qd0), own)
-    at_start = motion_at(args, ts[0], y0)  # after a blow there, like all that follows
+        path = clocks_apart(path, ts)
+    own = initial_own(path, own0)
+    finite = jnp.isfinite(jnp.array(own)).all()
+    own = tuple(jnp.where(finite, x, 0) for x in own)
+    term, args, start = term_of(forces), path, whole(*start_of(path, qd0), own)
+    given = motion_at(path, ts[0], start)  # after a blow there, like all that follows
     if padded and not derivatives:
-        term, y0, args = in_arrays(term, y0, args)
-    length = len(y0)
+        term, start, args = in_arrays(term, start, args)
+    return _Problem(valid & finite, ts, given, start, term, args, path)
+
+
+def _control(
+    problem: _Problem, keywords, derivatives: bool, tangents: bool
+) -> _Control:
+    """Chooses the steps: what they judge, and where they end."""
+    solver: Any = _differentiable(
+        keywords["solver"] or LoopedDopri8(), keywords["adjoint"]
+    )
+    given = keywords["stepsize_controller"]
+    steps, (_, ts, _, start, term, args, _) = given or default_controller(), problem
+    if not isinstance(steps, diffrax.AbstractAdaptiveStepSizeController):
+        # Fixed steps may pass over the kinks of a history, but over no jump.
+        if known_times(args, EffortHistory) is not None:
+            raise ValueError(
+                "stepsize_controller: expected an adaptive one, as forces declare "
+                f"times at which they jump (jump_ts), got {shown(steps)}."
+            )
+        return _Control(start, solver, steps, None)
+    jumps = known_times(args)
     implicit = isinstance(solver, diffrax.AbstractImplicitSolver)
-    wrapper: Any = LocatedImplicit if implicit else Located
-    locate = lambda *known: wrapper(*known, derivatives)
-    adaptive = isinstance(controller, diffrax.AbstractAdaptiveStepSizeController)
-    # Fixed steps may pass over the kinks of a history, but over no jump.
-    left_out = () if adaptive else (EffortHistory,)
-    jumps = known_times(args, *left_out)
-    start = term, ts, y0, args, jumps
-    located_solver, controller, y0 = located(locate, solver, controller, *start)
+    kind: Any = LocatedImplicit if implicit else Located
+    locate = lambda *found: kind(*found, derivatives)
+    seeing, landing, start = located(locate, solver, term, ts, start, args, jumps)
+    scheduled = isinstance(solver, ScheduledDopri8)  # it checks the health itself
+    judge = None
+    if tangents:
+        judge = OfTangents()
     # With tolerances of one's own, an implicit solver is for modes too fast to resolve,
     # which a probe would resolve.
-    trusted = implicit and keywords["stepsize_controller"] is not None
-    if adaptive:
-        if tangents:
-            controller = OfTangents(controller)  # pyright: ignore[reportCallIssue]
-        elif derivatives and not trusted:
-            known = isinstance(solver, ScheduledDopri8 | diffrax.AbstractRungeKutta)
-            other = diffrax.Heun.tableau
-            tableau = solver.tableau if known else other  # pyright: ignore[reportAttributeAccessIssue]
-            controller = OfLinearised(controller, term, tableau)  # pyright: ignore[reportCallIssue]
-        controller = accounted(controller, solver, term)
+    elif derivatives and not (implicit and given is not None):
+        known = isinstance(solver, ScheduledDopri8 | diffrax.AbstractRungeKutta)
+        tableau: Any = solver.tableau if known else diffrax.Heun.tableau
+        judge = OfLinearised(term, tableau)
+    control = lambda steps: StepControl(steps, term, not scheduled, landing, judge)  # pyright: ignore[reportCallIssue]
+    return _Control(start, seeing, with_judge(control, steps), jumps)
+
+
+def _solve(problem: _Problem, control: _Control, keywords) -> diffrax.Solution:
+    """Integrates; also saves the last time that was reached, and the switches there."""
+    ts, size = problem.ts, len(problem.start)
+    adaptive = isinstance(control.steps, diffrax.AbstractAdaptiveStepSizeController)
+    outputs = (
+        diffrax.SubSaveAt(ts=ts, fn=lambda t, y, args: y[:size]),
+        diffrax.SubSaveAt(t1=True, fn=lambda t, y, args: (t, *y[size:])),
+    )
+    keywords = keywords | {
+        "solver": control.solver,
+        "stepsize_controller": control.steps,
+    }
     # diffrax computes a few constants while it is traced.
     with jax.transfer_guard("allow"):
-        found = diffeqsolve(
-            term,
+        return diffeqsolve(
+            problem.term,
             t0=ts[0],
-            t1=end_of_run(ts, jumps),
-            y0=y0,
-            args=args,
-            saveat=diffrax.SaveAt(
-                subs=(
-                    diffrax.SubSaveAt(ts=ts, fn=lambda t, y, args: y[:length]),
-                    diffrax.SubSaveAt(t1=True, fn=lambda t, y, args: (t, *y[length:])),
-                ),
-                controller_state=adaptive,
-            ),
+            t1=end_of_run(ts, control.jumps),
+            y0=control.start,
+            args=problem.args,
+            saveat=diffrax.SaveAt(subs=outputs, controller_state=adaptive),
             throw=False,
-            **keywords | {"solver": located_solver, "stepsize_controller": controller},
+            **keywords,
         )
-    assert found.ys is not None  # because of saveat
-    states, (reached, *known) = found.ys
-    at = lambda t, y: (*motion_at(unpacked, t, y), own_states(args, y))
+
+
+def _read(inputs, problem: _Problem, solve: diffrax.Solution) -> Solution:
+    """Reads joint states, statistics and the result."""
+    linkage, state0, asked, *_ = inputs
+    valid, ts = problem.valid, problem.ts
+    assert solve.ys is not None  # because of saveat
+    states, (reached, *switches) = solve.ys
+    at = lambda t, y: (*motion_at(problem.path, t, y), own_states(problem.path, y))
     q, qd, own = jax.vmap(at)(ts, states)
 
-    def shown(a):
+    def shown_at(a):
         """Replaces the infinity that diffrax leaves at times not reached by NaN."""
         return jnp.where(jnp.isinf(a) | ~valid, jnp.nan, a)
 
     # diffrax saves the start only with the first step.
-    given = (without_fixed(linkage, value) for value in state0)
-    first = (jnp.where(valid, a, b) for a, b in zip(at_start, given))
-    q, qd = (shown(rows).at[0].set(row) for rows, row in zip((q, qd), first))
+    asked_start = (without_fixed(linkage, value) for value in state0)
+    first = (jnp.where(valid, a, b) for a, b in zip(problem.given, asked_start))
+    q, qd = (shown_at(rows).at[0].set(row) for rows, row in zip((q, qd), first))
     # Constant steps go on when the state is no longer finite.
     reached = jnp.minimum(reached[0], ts[-1])
     lost = (ts <= reached) & ~jnp.isfinite(q + qd).all(axis=1)
     reached = jnp.where(lost.any(), ts[jnp.argmax(lost) - 1], reached)
-    stats = found.stats | {"time_reached": jnp.where(valid, reached, asked[0])}
-    if adaptive:
-        assert found.controller_state is not None  # because of saveat
-        _, loss = found.controller_state
+    stats = solve.stats | {"time_reached": jnp.where(valid, reached, asked[0])}
+    if solve.controller_state is not None:
+        loss = largest_loss(solve.controller_state)
         stats["accuracy"] = jnp.finfo(q.dtype).eps * loss
-    stats |= switching_facts(*known)
-    result = _judged(valid, found.result, q, qd)
-    return Solution(asked, q, qd, stats, result, jax.tree.map(shown, own))
+    stats |= switching_facts(*switches)
+    result = _judged(valid, solve.result, q, qd)
+    return Solution(asked, q, qd, stats, result, jax.tree.map(shown_at, own))
 
 
 def _differentiable(solver: Any, adjoint: diffrax.AbstractAdjoint) -> Any:

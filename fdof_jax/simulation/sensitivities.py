@@ -17,6 +17,7 @@ from jax import Array
 from ..forces.element import elements
 from ..linkage.linkage import without_fixed
 from ..steps.landing import end_of_run
+from ..steps.step_control import StepControl
 from ..steps.switch_derivatives import first_of
 from ..steps.switching import Located, located
 from ..steps.tolerances import adaptive, of_precision
@@ -193,9 +194,8 @@ def sensitivities(
     # A method of few stages, because much of the work lies outside of them; as a loop
     # that `next_motion` can differentiate again.
     solver = diffrax.Tsit5(scan_kind="lax")
-    solver, controller, y0 = located(
-        locate, solver, controller, term, ts, y0, _Varied(z), jumps
-    )
+    solver, landing, y0 = located(locate, solver, term, ts, y0, _Varied(z), jumps)
+    controller = StepControl(controller, None, False, landing, None)  # pyright: ignore[reportCallIssue]
     found = diffeqsolve(
         term,
         solver,

@@ -15,9 +15,8 @@ import numpy as np
 from jax import Array
 from jax.flatten_util import ravel_pytree
 
-from .dopri8 import ScheduledTerm, constant
-from .step_wrappers import Adaptive
-from .switching import Switching
+from .dopri8 import Estimate, ScheduledTerm, constant
+from .switching import Switching, motion_of
 
 # The relative tolerance of tangents is so many times that of the motion, at most so
 # much, and no tighter than so many rounding errors.
@@ -37,11 +36,6 @@ def _noise(health: Any) -> Array:
     """Returns the relative rounding error of tangents."""
     loss = constant(jnp.max(jnp.stack(health)))
     return _NOISE * jnp.finfo(loss.dtype).eps * loss
-
-
-def _motion(y: Any) -> Any:
-    """Returns the state without that of the switches."""
-    return y[:-1] if isinstance(y[-1], Switching) else y
 
 
 def _largest(tree: Any) -> Array:
@@ -77,22 +71,25 @@ def _(primals, tangents):
     return ratio, jnp.zeros_like(ratio)
 
 
-class OfTangents(Adaptive):
-    """A controller that judges tangents with the motion; all take the same steps."""
+class OfTangents(eqx.Module):
+    """Judges tangents of the motion; all of them take the same steps."""
 
-    controller: Any
+    def start(self, y0: Any) -> tuple[()]:
+        return ()
 
-    def adapt_step_size(self, *arguments):
-        t0, t1, y0, y1, args, estimate, *rest = arguments
+    def __call__(
+        self, control: Any, t0: Any, t1: Any, y0: Any, y1: Any, args: Any,
+        estimate: Estimate, probe: tuple[()],
+    ) -> tuple[Array, tuple[()]]:  # fmt: skip
+        """Returns the largest error of a tangent over its tolerance, and no probe."""
         noise = _noise(estimate.health)
-        tolerance = jnp.minimum(_LOOSER * self.rtol, _LOOSEST)
+        tolerance = jnp.minimum(_LOOSER * control.rtol, _LOOSEST)
         tolerance = constant(jnp.maximum(tolerance, noise))
-        error, *integrated = map(_motion, (estimate.error, y0, y1))
+        error, *integrated = map(motion_of, (estimate.error, y0, y1))
         # Tangents of displacements lack that of the start.
         ends = [(args.q0 + jnp.stack(q), *others) for q, *others in integrated]
         ratio = _error_of_tangents(error, ends, integrated, tolerance, noise)
-        estimate = estimate._replace(derivatives=constant(ratio))
-        return super().adapt_step_size(t0, t1, y0, y1, args, estimate, *rest)
+        return constant(ratio), probe
 
 
 def linearised(term: ScheduledTerm, t: Array, y: Any, args: Any) -> Array:
@@ -102,28 +99,31 @@ def linearised(term: ScheduledTerm, t: Array, y: Any, args: Any) -> Array:
     return jax.jacfwd(lambda numbers: ravel_pytree(rates(numbers))[0])(numbers)
 
 
-class OfLinearised(Adaptive):
-    """A controller that judges a step by what it does to the linearised motion.
+class OfLinearised(eqx.Module):
+    """Judges a step by what it does to the linearised motion.
 
     A probe stands for all tangents. It moves as a tangent does whose linearisation at
     the end of a step holds in the whole step, and is a new one after each jump. This
     costs one linearisation of the rates a step.
     """
 
-    controller: Any
     term: ScheduledTerm
     tableau: diffrax.ButcherTableau = eqx.field(static=True)
 
-    def init(self, *arguments):
-        first, state = super().init(*arguments)
-        return first, (state, _new_probe(arguments[3]))
+    def start(self, y0: Any) -> Array:
+        """Returns a new probe."""
+        numbers, _ = ravel_pytree(motion_of(y0))
+        probe = np.random.default_rng(0).standard_normal(numbers.size)
+        return jnp.asarray(probe, numbers.dtype)
 
-    def adapt_step_size(self, *arguments):
-        *arguments, (state, probe) = arguments
-        t0, t1, y0, y1, args, estimate, order = arguments
+    def __call__(
+        self, control: Any, t0: Any, t1: Any, y0: Any, y1: Any, args: Any,
+        estimate: Estimate, probe: Array,
+    ) -> tuple[Array, Array]:  # fmt: skip
+        """Returns the error of the probe over its tolerance, and the moved probe."""
         if isinstance(y1[-1], Switching):
             args = args._replace(sides=y1[-1].sides)
-        at_end = constant((t1, _motion(y1), args))
+        at_end = constant((t1, motion_of(y1), args))
         matrix = constant(t1 - t0) * linearised(self.term, *at_end)
         change, error = self._step(matrix, probe)
         moved = probe + change
@@ -132,16 +132,10 @@ class OfLinearised(Adaptive):
         ratio = _largest(error) / (tolerance * size)
         finite = jnp.isfinite(ratio)
         ratio = constant(jnp.where(finite, ratio, 0))
-        estimate = estimate._replace(derivatives=ratio)
-        keep, *step, jumped, state, result = super().adapt_step_size(
-            t0, t1, y0, y1, args, estimate, order, state
-        )
         # A new one shows again what an unstable mode has come to hide.
-        jumped = jnp.array(jumped)
-        new = jumped | ~finite | (_largest(moved) > _GROWN)
+        new = ~finite | (_largest(moved) > _GROWN)
         moved = moved / jnp.minimum(_largest(moved), 1)
-        moved = jnp.where(new, _new_probe(y1), moved)
-        return keep, *step, jumped, (state, jnp.where(keep, moved, probe)), result
+        return ratio, jnp.where(new, self.start(y1), moved)
 
     def _step(self, matrix: Array, probe: Array) -> tuple[Array, Array]:
         """Returns the change of y' = A y in a step of length h from y, and its error.
@@ -169,9 +163,3 @@ class OfLinearised(Adaptive):
         whole, error = numbers([self.tableau.b_sol, self.tableau.b_error])
         summed = lambda weights: jnp.sum(weights[:, None] * changes, axis=0)
         return summed(whole), summed(error)
-
-
-def _new_probe(y: Any) -> Array:
-    numbers, _ = ravel_pytree(_motion(y))
-    probe = np.random.default_rng(0).standard_normal(numbers.size)
-    return jnp.asarray(probe, numbers.dtype)

@@ -126,14 +126,10 @@ def health_if(finite: Array, health: Health) -> Health:
 
 
 class Estimate(NamedTuple):
-    """The error of a step and its `Health`, 1 if it is bad, as controllers get them.
-
-    `derivatives`: the error of derivatives over their tolerance.
-    """
+    """The error of a step and its `Health`, 1 if it is bad, as controllers get them."""
 
     error: PyTree
     health: Health
-    derivatives: Array | None = None
 
 
 def with_change(error: Any, change: Callable[[PyTree], PyTree]) -> Any:

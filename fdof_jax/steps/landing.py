@@ -4,12 +4,10 @@ from typing import Any, NamedTuple
 
 import diffrax
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jax import Array
 
-from .dopri8 import constant, with_change
-from .step_wrappers import Adaptive
+from .dopri8 import constant
 
 # So many landings within this share of the motion's time are chatter.
 _MOST_LANDINGS, _CHATTER = 100, 1e-5
@@ -52,8 +50,17 @@ def _last(end: Array) -> Array:
     return constant(end - 200 * jnp.finfo(end.dtype).eps * jnp.abs(end))
 
 
+class NextStep(NamedTuple):
+    """What a controller returns after a step, but for its state."""
+
+    keep: Array
+    t0: Array
+    t1: Array
+    jumped: Any
+    result: Any
+
+
 class _Landing(NamedTuple):
-    inner: Any
     target: Array  # where this step is to end, infinity if anywhere
     gap: Array  # time left out after it, 0 unless it ends at a known time
     resumed: Array  # length of the step after it
@@ -65,20 +72,20 @@ class _Landing(NamedTuple):
     last: Array  # see `_last`
 
 
-class Landing(Adaptive):
-    """A controller whose steps end at known times and where elements switch.
+class Landing(eqx.Module):
+    """Ends of steps at known times and where elements switch.
 
-    Steps that the inner controller chooses have constant lengths for derivatives: up to
-    the tolerance, the motion does not depend on where its steps end.
+    Steps that the controller chooses have constant lengths for derivatives: up to the
+    tolerance, the motion does not depend on where its steps end.
     """
 
-    controller: Any
     jumps: Array | None
     apart: Array  # see `rounding`
     switches: bool = eqx.field(static=True)
 
-    def _motion(self, y: Any) -> Any:
-        return y[:-1] if self.switches and y is not None else y
+    def in_force(self, args: Any, y: Any) -> Any:
+        """Returns the arguments with the sides in force at a state."""
+        return args._replace(sides=y[-1].sides) if self.switches else args
 
     def _found(self, y: Any, end: Array) -> tuple[Any, ...]:
         """Returns times and `near` of `Switching`, and whether nothing switches here.
@@ -107,13 +114,8 @@ class Landing(Adaptive):
         gap = jnp.where(reached, jump + self.apart - next_one, 0)
         return jnp.where(reached, end, t1), gap, reached
 
-    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):  # pyright: ignore[reportIncompatibleMethodOverride]
-        if self.switches:
-            args = args._replace(sides=y0[-1].sides)
-        end, inner = self.controller.init(
-            *constant((terms, t0, t1, self._motion(y0), dt0, args)), func, error_order
-        )
-        end, inner = constant((end, inner))
+    def start(self, t0: Array, t1: Array, end: Array) -> tuple[Array, _Landing]:
+        """Returns the end of the first step, where the controller ends it at `end`."""
         length, last = end - constant(t0), _last(t1)
         end, gap, cut = self._cut(constant(t0), t0 + length, last)
         if self.switches:  # a step of no length finds the sides
@@ -122,20 +124,18 @@ class Landing(Adaptive):
         crossing, none = jnp.full_like(target, -jnp.inf), jnp.zeros((), int)
         since, pace = constant((jnp.asarray(t0), _CHATTER * (t1 - t0)))
         return end, _Landing(
-            inner, target, gap, length, crossing, none, none, since, pace, last
+            target, gap, length, crossing, none, none, since, pace, last
         )
 
-    def adapt_step_size(  # pyright: ignore[reportIncompatibleMethodOverride]
-        self, t0, t1, y0, y1, args, y_error, error_order, state
-    ):
-        moved = *map(self._motion, (y0, y1)), with_change(y_error, self._motion)
-        y0_motion, y1_motion, error = constant(moved)
+    def after(
+        self, t0: Array, t1: Array, y1: Any, planned: NextStep, state: _Landing
+    ) -> tuple[NextStep, Array, _Landing]:
+        """Returns the next step, and whether the controller resumes its old state.
+
+        `planned`: what the controller would do.
+        """
+        keep, next0, next1, jumped, result = planned
         begin, end = constant((t0, t1))
-        keep, next0, next1, jumped, inner, result = constant(
-            self.controller.adapt_step_size(
-                begin, end, y0_motion, y1_motion, args, error, error_order, state.inner
-            )
-        )
         aimed = end == state.target
         until, unseen, soon, near, idle = constant(self._found(y1, end))
         late = jnp.where(aimed, near, 0)
@@ -166,29 +166,24 @@ class Landing(Adaptive):
         shortened = crossed | unsure
         next_t1 = jnp.where(shortened, jnp.where(crossed, until, unseen), next_t1)
         gap, aims = jnp.where(shortened, 0, gap), (cut | crossed | missed) & ~unsure
-        target = jnp.where(aims, constant(next_t1), jnp.inf)
         # Time that passes meanwhile tells fast switching from chatter.
         paced = begin - state.since > state.pace
         landings = jnp.where(paced, 0, state.landings + crossed)
-        since = jnp.where(paced, begin, state.since)
         results: Any = diffrax.RESULTS
-        unknown = crossed | landed | unsure
-        inner = jax.tree.map(
-            lambda old, new: jnp.where(unknown, old, new), state.inner, inner
-        )
+        resumes = crossed | landed | unsure
         # After the last step, which may be shorter than others may, none is asked for.
         done = keep & (end >= state.last)
-        result = results.where(unknown | done, results.successful, result)
+        result = results.where(resumes | done, results.successful, result)
         chatter = (landings > _MOST_LANDINGS) & (result == results.successful)
         result = results.where(chatter, results.max_steps_rejected, result)
         state = state._replace(
-            inner=inner,
-            target=target,
+            target=jnp.where(aims, constant(next_t1), jnp.inf),
             gap=gap,
             resumed=length,
             crossing=crossing,
             tries=tries,
             landings=landings,
-            since=since,
+            since=jnp.where(paced, begin, state.since),
         )
-        return keep, next_t0, next_t1, landed | jumped, state, result
+        step = NextStep(keep, next_t0, next_t1, landed | jumped, result)
+        return step, resumes, state

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ..linkage.topology import real_joints
-from .dopri8 import Health, constant
+from .dopri8 import Estimate, Health
 from .step_wrappers import Adaptive
 
 # Rounding errors of an acceleration, over its size times eps and the loss of accuracy:
@@ -30,38 +30,43 @@ _NOISE = 8.0
 _HELD = 0.43
 
 
-class AboveRounding(Adaptive):
-    """A controller that does not chase rounding errors."""
+def above_rounding(
+    control: Adaptive,
+    h: Array,
+    y0: Any,
+    y1: Any,
+    args: Any,
+    estimate: Estimate,
+    of_derivatives: Array | None,
+    order: Any,
+) -> Any:
+    """Returns the error of a step of length `h` without what is rounding.
 
-    controller: Any
+    `of_derivatives`: the error of derivatives over their tolerance, which counts too.
+    """
+    error, health = estimate
+    same_step = _same_step(control.controller, order)
+    of_qd = _rounding(real_joints(args.linkage.ef), health, y0, y1)
+    of_delta = jax.tree.map(lambda noise: jnp.abs(h) * noise, of_qd)
 
-    def adapt_step_size(self, *arguments):
-        t0, t1, y0, y1_candidate, args, (error, health, tangents), *rest = arguments
-        same_step = _same_step(self.controller, rest[0])
-        revolute = real_joints(args.linkage.ef)
-        of_qd = _rounding(revolute, health, y0, y1_candidate)
-        of_delta = jax.tree.map(lambda noise: jnp.abs(t1 - t0) * noise, of_qd)
+    def judged(error: Array, start: Array, end: Array, rounding: Array) -> Array:
+        size = jnp.maximum(jnp.abs(start), jnp.abs(end))
+        tolerance = control.atol + control.rtol * size  # as diffrax's controller has it
+        out_of_reach, error_size = rounding > tolerance, jnp.abs(error)
+        ratio = error_size / jnp.where(out_of_reach, rounding, tolerance)
+        is_noise = error_size < _NOISE * rounding
+        as_long = same_step * jnp.minimum(ratio / _HELD, 1)
+        above_noise = ratio / jnp.where(out_of_reach, _NOISE, 1)
+        judged_as = tolerance * jnp.where(is_noise, as_long, above_noise)
+        judged = jnp.where(out_of_reach | is_noise, judged_as, error)
+        if of_derivatives is None:
+            return judged
+        # A step that is not finite has no tolerance, and an infinite error.
+        return jnp.fmax(jnp.abs(judged), of_derivatives * tolerance)
 
-        def judged(error: Array, start: Array, end: Array, rounding: Array) -> Array:
-            size = jnp.maximum(jnp.abs(start), jnp.abs(end))
-            tolerance = self.atol + self.rtol * size  # as diffrax's controller has it
-            out_of_reach, error_size = rounding > tolerance, jnp.abs(error)
-            ratio = error_size / jnp.where(out_of_reach, rounding, tolerance)
-            is_noise = error_size < _NOISE * rounding
-            as_long = same_step * jnp.minimum(ratio / _HELD, 1)
-            above_noise = ratio / jnp.where(out_of_reach, _NOISE, 1)
-            judged_as = tolerance * jnp.where(is_noise, as_long, above_noise)
-            judged = jnp.where(out_of_reach | is_noise, judged_as, error)
-            if tangents is None:
-                return judged
-            # A step that is not finite has no tolerance, and an infinite error.
-            return jnp.fmax(jnp.abs(judged), tangents * tolerance)
-
-        # The elements' own states come last; their rates do not lose accuracy.
-        ends, noise = (y0[:2], y1_candidate[:2]), (of_delta, of_qd)
-        motion = jax.tree.map(judged, error[:2], *ends, noise)
-        error = (*motion, *error[2:])
-        return super().adapt_step_size(t0, t1, y0, y1_candidate, args, error, *rest)
+    # The elements' own states come last; their rates do not lose accuracy.
+    motion = jax.tree.map(judged, error[:2], y0[:2], y1[:2], (of_delta, of_qd))
+    return *motion, *error[2:]
 
 
 def _same_step(controller: Any, order: Any) -> Any:
@@ -101,20 +106,3 @@ def _rounding(revolute: Sequence[Array], health: Health, y0: Any, y1: Any) -> An
 def _largest(tree: Any) -> Array:
     sizes = [jnp.max(jnp.abs(leaf)) for leaf in jax.tree.leaves(tree)]
     return functools.reduce(jnp.maximum, sizes)
-
-
-class Recorded(Adaptive):
-    """A controller whose state includes the largest loss of accuracy so far."""
-
-    controller: Any
-
-    def init(self, *arguments):
-        first, state = super().init(*arguments)
-        return first, (state, jnp.zeros_like(first))
-
-    def adapt_step_size(self, *arguments):
-        *arguments, (state, largest) = arguments
-        loss = constant(functools.reduce(jnp.maximum, arguments[5].health))
-        keep, *step, state, result = super().adapt_step_size(*arguments, state)
-        largest = jnp.where(keep, jnp.maximum(largest, loss), largest)
-        return keep, *step, (state, largest), result

@@ -10,7 +10,6 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from .dopri8 import Health, constant, health_if, is_singular, verdict
 from .shortening import Shortening
 
 
@@ -29,7 +28,7 @@ def with_judge(change: Callable[..., Any], controller: Any) -> Any:
     """Returns a controller with `change` applied to the one that judges errors."""
 
     def judges(node: Any) -> bool:
-        wrapper = isinstance(node, Adaptive | diffrax.ClipStepSizeController)
+        wrapper = isinstance(node, Abreast | diffrax.ClipStepSizeController)
         adaptive = isinstance(node, diffrax.AbstractAdaptiveStepSizeController)
         return adaptive and not wrapper
 
@@ -93,45 +92,27 @@ class Adaptive(diffrax.AbstractAdaptiveStepSizeController):
         return self.controller.norm
 
 
-class Undifferentiated(Adaptive):
-    """A controller whose steps are constant for derivatives.
+class Scaled(Adaptive):
+    """A controller that measures each coordinate in a unit of its own.
 
-    Up to the tolerance, the motion does not depend on where its steps end.
+    `StepControl` scales what it gets.
     """
 
     controller: Any
+    unit: tuple[Array, Array]  # of q and of qd (n,)
 
     def init(self, *arguments):
-        return constant(super().init(*arguments))
+        if arguments[4] is None:
+            raise ValueError(
+                "dt0: expected a first step [s] with scaled tolerances, got None."
+            )
+        return super().init(*arguments)
 
-    def adapt_step_size(self, *arguments):
-        return constant(super().adapt_step_size(*constant(arguments)))
-
-
-class Watched(Adaptive):
-    """A controller that shortens steps that end in bad health, then gives up.
-
-    It serves solvers that do not check `ScheduledTerm.health` themselves.
-    """
-
-    controller: Any
-    health: Callable[[Any, Any, Any], Health] = eqx.field(static=True)  # (t, y, args)
-
-    def adapt_step_size(self, *arguments):
-        t0, t1, y0, y1_candidate, args, y_error, *rest = arguments
-        # Rates that are not finite make the error not finite.
-        leaves = jax.tree.leaves((y1_candidate, y_error))
-        finite = jnp.isfinite(sum(map(jnp.sum, leaves)))
-        # If the end is not finite, the health at the start shows why.
-        judged = jax.tree.map(lambda a, b: jnp.where(finite, a, b), y1_candidate, y0)
-        health = health_if(finite, self.health(*constant((t1, judged, args))))
-        bad = jnp.isnan(sum(health)) | is_singular(health)
-        estimate, failure = verdict(y_error, health, t1 - t0)
-        # The error is scaled by the state, which must be finite for that.
-        end = jax.tree.map(lambda a, b: jnp.where(bad, a, b), y0, y1_candidate)
-        *step, result = super().adapt_step_size(t0, t1, y0, end, args, estimate, *rest)
-        failed = failure != diffrax.RESULTS.successful
-        return *step, diffrax.RESULTS.where(failed, failure, result)
+    def scaled(self, state: Any) -> Any:
+        """Returns a state in these units; the elements' own states keep theirs."""
+        scalars = isinstance(state[0], tuple)
+        units: Any = tuple(map(tuple, self.unit)) if scalars else self.unit
+        return (*jax.tree.map(jnp.divide, state[:2], units), *state[2:])
 
 
 # A lane stops once it has taken `_SLACK` times the steps after which `_MOST` of the

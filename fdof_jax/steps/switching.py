@@ -14,10 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ..base.checks import shown
 from .dopri8 import SHORTEST, DenseOutput, constant, with_change
 from .landing import Landing, rounding
-from .step_wrappers import Undifferentiated, with_judge
 from .switch_derivatives import Arrival, Moment, first_of, gained, lateness
 from .zeros_in_steps import CHECKED, CHECKS, SAMPLED, SHARES, passage
 
@@ -66,55 +64,51 @@ class Switching(NamedTuple):
     grazing_here: Array
 
 
+def motion_of(y: Any) -> Any:
+    """Returns a state without that of the switches."""
+    return y[:-1] if y is not None and isinstance(y[-1], Switching) else y
+
+
 def located(
     locate: Callable[[Any, bool, Array], "Located"],
     solver: Any,
-    controller: Any,
     term: Any,
     ts: Array,
     y0: Any,
     args: Any,
     jumps: Any,
-) -> tuple[Any, Any, Any]:
-    """Returns solver, controller and start with steps that end where elements switch.
+) -> tuple[Any, Landing | None, Any]:
+    """Returns a solver whose steps see where elements switch, and what ends them there.
 
-    `ts`: the times of the run. `jumps`: known times at which steps end too, or None.
-    Raises ValueError if there are any and steps are not adaptive.
+    Also returns the start for this solver. Without switches and known times `jumps`,
+    solver and start stay as they are. `ts`: the times of the run.
     """
-    if not isinstance(controller, diffrax.AbstractAdaptiveStepSizeController):
-        if jumps is not None:
-            raise ValueError(
-                "stepsize_controller: expected an adaptive one, as forces declare "
-                f"times at which they jump (jump_ts), got {shown(controller)}."
-            )
-        return solver, controller, y0
     t0, apart = ts[0], rounding(ts)
     jumps = None if jumps is None else jnp.asarray(jumps, t0.dtype)
     found, jumping = eqx.filter_eval_shape(term.switches, t0, y0, args)
     wrapped = locate(solver, jumping, apart)
     switches = wrapped.needed(found.size, jumps)
+    if jumps is None and not switches:
+        return solver, None, y0
     if switches:
         unknown, none = jnp.zeros(found.shape, t0.dtype), jnp.zeros_like(t0)
         known = Switching(
-            unknown,
-            unknown,
-            t0,
-            t0,
-            t0,
-            none,
-            unknown,
-            none,
-            none,
-            none,
-            none if jumping else None,
-            none,
-            none,
+            sides=unknown,
+            after=unknown,
+            until=t0,
+            unseen=t0,
+            soon=t0,
+            near=none,
+            sizes=unknown,
+            length=none,
+            ahead=none,
+            passed=none,
+            one_sided=none if jumping else None,
+            grazing=none,
+            grazing_here=none,
         )
         solver, y0 = wrapped, (*y0, known)
-    if jumps is None and not switches:
-        return solver, with_judge(Undifferentiated, controller), y0
-    landing = lambda inner: Landing(inner, jumps, apart, switches)  # pyright: ignore[reportCallIssue]
-    return solver, with_judge(landing, controller), y0
+    return solver, Landing(jumps, apart, switches), y0
 
 
 def switching_facts(*known: Switching) -> dict[str, Array]:
@@ -196,22 +190,21 @@ class Located(diffrax.AbstractAdaptiveSolver):
         # Before the first step, whose length is 0, sides are unknown.
         after = jnp.where(switched, -sides, sides)
         after = jnp.where(sides == 0, jnp.where(seen[-1] > 0, 1.0, -1.0), after)
+        grazed = jnp.maximum(known.grazing, kept(known.grazing_here, 0))
         new = Switching(
-            sides,
-            after.astype(t0.dtype),
-            jnp.where(crossed, t0 + until * (t1 - t0), t1),
-            jnp.where(unseen < 1, t0 + unseen * (t1 - t0), t1),
-            t1 + soon * (t1 - t0),
-            near,
-            sizes,
-            t1 - t0,
-            jnp.any(switched & (margins[-1] > 0)).astype(t0.dtype),
-            known.passed + jnp.sum(changed & ~on_zero),
-            self.one_sided(known, on_zero, sides, sizes, jnp.sum(changed)),
-            jnp.maximum(
-                missed, jnp.maximum(known.grazing, kept(known.grazing_here, 0))
-            ),
-            grazing,
+            sides=sides,
+            after=after.astype(t0.dtype),
+            until=jnp.where(crossed, t0 + until * (t1 - t0), t1),
+            unseen=jnp.where(unseen < 1, t0 + unseen * (t1 - t0), t1),
+            soon=t1 + soon * (t1 - t0),
+            near=near,
+            sizes=sizes,
+            length=t1 - t0,
+            ahead=jnp.any(switched & (margins[-1] > 0)).astype(t0.dtype),
+            passed=known.passed + jnp.sum(changed & ~on_zero),
+            one_sided=self.one_sided(known, on_zero, sides, sizes, jnp.sum(changed)),
+            grazing=jnp.maximum(missed, grazed),
+            grazing_here=grazing,
         )
         still = jax.tree.map(jnp.zeros_like, new)
         if error is not None:  # None: a method without an estimate

@@ -1,9 +1,4 @@
-"""Step control: tolerances, their limits and scales, and the wrappers of a controller.
-
-A controller that judges errors stands inside. Around it, in this order, `step_control`
-keeps it from chasing rounding errors, `switching.located` ends its steps at known times
-and switches, and `accounted` records what accuracy is left.
-"""
+"""Tolerances of steps: defaults, limits and units."""
 
 import dataclasses
 import functools
@@ -21,10 +16,8 @@ from ..base.user_warnings import warn
 from ..linkage.coordinates import State
 from ..linkage.linkage import Linkage, check_linkage, joints_of
 from ..linkage.topology import real_joints
-from .dopri8 import ScheduledDopri8, ScheduledTerm
-from .rounding import AboveRounding, Recorded
 from .shortening import Shortening
-from .step_wrappers import Adaptive, Watched, with_judge, with_pid
+from .step_wrappers import Scaled, with_judge, with_pid
 
 # Rounding keeps float32 from meeting a tighter relative or absolute tolerance.
 _TIGHTEST_SINGLE = 1e-6
@@ -128,47 +121,6 @@ def within_reach(
     return with_pid(mended, controller)
 
 
-def step_control(controller: Any) -> Any:
-    """Returns the given or default step control, which does not chase rounding."""
-    return with_judge(AboveRounding, controller or default_controller())
-
-
-def accounted(controller: Any, solver: Any, term: ScheduledTerm) -> Any:
-    """Returns an adaptive controller that records the accuracy of the equations."""
-    controller = Recorded(controller)  # pyright: ignore[reportCallIssue]
-    if isinstance(solver, ScheduledDopri8):  # these check the health themselves
-        return controller
-    return Watched(controller, term.health)  # pyright: ignore[reportCallIssue]
-
-
-class _Scaled(Adaptive):
-    """A controller that measures each coordinate in a unit of its own."""
-
-    controller: Any
-    unit: tuple[Array, Array]  # of q and of qd (n,)
-
-    def init(self, *arguments):
-        if arguments[4] is None:
-            raise ValueError(
-                "dt0: expected a first step [s] with scaled tolerances, got None."
-            )
-        return super().init(*arguments)
-
-    def adapt_step_size(self, *arguments):
-        t0, t1, y0, y1_candidate, args, estimate, *rest = arguments
-
-        def scaled(state: Any) -> Any:
-            # The elements' own states come last and keep their units.
-            scalars = isinstance(state[0], tuple)
-            units: Any = tuple(map(tuple, self.unit)) if scalars else self.unit
-            motion = jax.tree.map(jnp.divide, state[:2], units)
-            return (*motion, *state[2:])
-
-        y0, y1_candidate, error = map(scaled, (y0, y1_candidate, estimate.error))
-        estimate = estimate._replace(error=error)
-        return super().adapt_step_size(t0, t1, y0, y1_candidate, args, estimate, *rest)
-
-
 def scale_tolerances(
     linkage: Linkage,
     controller: diffrax.AbstractAdaptiveStepSizeController | None = None,
@@ -215,4 +167,4 @@ def scale_tolerances(
         )
         q = jnp.where(jnp.stack(real_joints(linkage.ef)), 1, size)
         qd = q / time
-    return _Scaled(controller, (q, qd))  # pyright: ignore[reportCallIssue]
+    return with_judge(lambda judge: Scaled(judge, (q, qd)), controller)  # pyright: ignore[reportCallIssue]

@@ -1,0 +1,144 @@
+"""One control of adaptive steps around a controller of diffrax."""
+
+import functools
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from .derivative_control import OfLinearised, OfTangents
+from .dopri8 import (
+    Estimate,
+    Health,
+    ScheduledTerm,
+    constant,
+    health_if,
+    is_singular,
+    verdict,
+    with_change,
+)
+from .landing import Landing, NextStep
+from .rounding import above_rounding
+from .step_wrappers import Adaptive, Scaled
+from .switching import motion_of
+
+
+class _State(NamedTuple):
+    inner: Any  # of diffrax's controller
+    landing: Any
+    probe: Any  # of derivatives
+    loss: Array  # the largest loss of accuracy in steps so far
+
+
+class StepControl(Adaptive):
+    """Judges the steps of an integration, and ends them where something happens.
+
+    `controller` is one of diffrax that judges errors. After each step, in this order:
+
+    | question | if so |
+    |---|---|
+    | Is its end singular, or not finite? | a shorter step; once that is tiny, the end |
+    | Would derivatives be less exact than they may be? | a larger error |
+    | Is its error rounding? | none: shorter steps would have it too |
+    | Is the error within the tolerance? | `controller` keeps or rejects the step |
+    | Did it pass a known time or a switch? | a step that ends there (see `Landing`) |
+    | How much accuracy did it lose? | recorded, for `Solution.stats` |
+
+    Up to the tolerance, a motion does not depend on where its steps end: the lengths of
+    steps are constant for derivatives, but for ends at known times.
+
+    - `term`: the equations; None if rates are trusted and errors are no rounding.
+    - `watches`: whether the health of the ends is asked here, not by the solver.
+    """
+
+    controller: Any
+    term: ScheduledTerm | None
+    watches: bool = eqx.field(static=True)
+    landing: Landing | None
+    judge: OfTangents | OfLinearised | None
+
+    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):  # pyright: ignore[reportIncompatibleMethodOverride]
+        if self.landing is not None:
+            args = self.landing.in_force(args, y0)
+        start = terms, t0, t1, motion_of(y0), dt0, args
+        first, inner = constant(
+            self.controller.init(*constant(start), func, error_order)
+        )
+        probe = None if self.judge is None else self.judge.start(y0)
+        loss, landing = jnp.zeros_like(first), None
+        if self.landing is not None:
+            first, landing = self.landing.start(t0, t1, first)
+        return first, _State(inner, landing, probe, loss)
+
+    def adapt_step_size(  # pyright: ignore[reportIncompatibleMethodOverride]
+        self, t0, t1, y0, y1, args, y_error, error_order, state
+    ):
+        failure = diffrax.RESULTS.successful
+        if self.term is not None and self.watches:
+            y1, y_error, failure = self._healthy(t0, t1, y0, y1, args, y_error)
+        ratio, probe = None, None
+        if self.judge is not None:
+            ratio, probe = self.judge(self, t0, t1, y0, y1, args, y_error, state.probe)
+        step: Any = *map(motion_of, (y0, y1)), with_change(y_error, motion_of)
+        controller = self.controller
+        if isinstance(controller, Scaled):
+            scaled, controller = controller.scaled, controller.controller
+            step = *map(scaled, step[:2]), with_change(step[2], scaled)
+        start, end, error = constant(step)
+        begin, stop, args = constant((t0, t1, args))
+        loss = state.loss
+        if self.term is not None:
+            loss = functools.reduce(jnp.maximum, error.health)
+            error = above_rounding(
+                self, stop - begin, start, end, args, error, ratio, error_order
+            )
+        keep, next0, next1, jumped, inner, result = constant(
+            controller.adapt_step_size(
+                begin, stop, start, end, args, error, error_order, state.inner
+            )
+        )
+        step, landing = NextStep(keep, next0, next1, jumped, result), None
+        if self.landing is not None:
+            step, resumes, landing = self.landing.after(t0, t1, y1, step, state.landing)
+            inner = jax.tree.map(
+                lambda old, new: jnp.where(resumes, old, new), state.inner, inner
+            )
+        kept = lambda new, old: jax.tree.map(
+            lambda new, old: jnp.where(step.keep, new, old), new, old
+        )
+        if self.judge is not None:
+            jumped, fresh = jnp.array(step.jumped), self.judge.start(y1)
+            probe = jax.tree.map(lambda a, b: jnp.where(jumped, a, b), fresh, probe)
+            probe = kept(probe, state.probe)
+        loss = kept(jnp.maximum(state.loss, loss), state.loss)
+        failed = failure != diffrax.RESULTS.successful
+        result = diffrax.RESULTS.where(failed, failure, step.result)
+        state = _State(inner, landing, probe, loss)
+        return *step[:4], state, result
+
+    def _healthy(
+        self, t0: Any, t1: Any, y0: Any, y1: Any, args: Any, error: Any
+    ) -> tuple[Any, Estimate, Any]:
+        """Returns a finite end, the error and health of a step, and its result."""
+        assert self.term is not None
+        # Rates that are not finite make the error not finite.
+        finite = jnp.isfinite(sum(map(jnp.sum, jax.tree.leaves((y1, error)))))
+        # If the end is not finite, the health at the start shows why.
+        end = jax.tree.map(lambda a, b: jnp.where(finite, a, b), y1, y0)
+        health: Health = self.term.health(*constant((t1, end, args)))
+        health = health_if(finite, health)
+        bad = jnp.isnan(sum(health)) | is_singular(health)
+        estimate, failure = verdict(error, health, t1 - t0)
+        # The error is scaled by the state, which must be finite for that.
+        end = jax.tree.map(lambda a, b: jnp.where(bad, a, b), y0, y1)
+        return end, estimate, failure
+
+
+def largest_loss(controller_state: Any) -> Array:
+    """Returns the largest loss of accuracy in a solve, from its controllers' state."""
+    mine = lambda node: isinstance(node, _State)
+    (state,) = filter(mine, jax.tree.leaves(controller_state, is_leaf=mine))
+    return state.loss
