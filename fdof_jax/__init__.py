@@ -28,7 +28,6 @@ Units are SI. `help` of a name says the rest; its room holds more of its kind.
 __version__ = "0.2.0"  # above the imports: rooms read it
 
 import importlib
-from types import ModuleType
 from typing import TYPE_CHECKING
 
 from . import (
@@ -118,8 +117,10 @@ def __dir__() -> list[str]:
     return [*__all__, "__version__"]
 
 
-def __getattr__(name: str) -> ModuleType:
-    # Pictures are imported on first use, as they need matplotlib.
-    if name in ("drawing", "interactive", "plotting"):
-        return importlib.import_module(f".pictures.{name}", __name__)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+if not TYPE_CHECKING:  # a checker of types would then accept any name
+
+    def __getattr__(name):
+        # Pictures are imported on first use, as they need matplotlib.
+        if name in ("drawing", "interactive", "plotting"):
+            return importlib.import_module(f".pictures.{name}", __name__)
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
