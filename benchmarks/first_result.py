@@ -5,7 +5,7 @@
 prints seconds as JSON. `imported` and `first` are seconds of CPU from the start of the
 process to the import of the library and to the first result; `again` is the wall time
 of the same call with other numbers. With a folder, `configure` keeps compiled programs
-there. Modules that a case does not need are not imported.
+there.
 """
 
 import json
@@ -21,9 +21,8 @@ TS = np.linspace(0, 2, 201)
 
 
 def _simulate(scene: fj.Scene) -> Callable:
-    simulate = fj.simulate  # imported here, not with the first motion
     linkage, state0, forces, _ = scene
-    return lambda scale: simulate(linkage, state0, scale * TS, forces)
+    return lambda scale: fj.simulate(linkage, state0, scale * TS, forces)
 
 
 def fig5() -> Callable:

@@ -26,7 +26,7 @@ MOVES, QUICK_MOVES = 200, 20
 PATIENCE = 180.0  # for a server, a page or the first compilation [s]
 CELL = """import fdof_jax as fj
 fj.configure(x64=True)
-from fdof_jax.interactive import sliders
+from fdof_jax.pictures.interactive import sliders
 sliders()"""
 
 # The page records [time stamp of the event, time of the frame] per picture.

@@ -25,56 +25,102 @@ Units are SI. `help` of a name says the rest; its room holds more of its kind.
 - **The paper's figures**: scenes.
 """
 
+__version__ = "0.2.0"  # above the imports: rooms read it
+
 import importlib
-import importlib.machinery
-import sys
-import warnings
-from typing import Any
+from typing import TYPE_CHECKING
 
-from .base.names import attach, room_of
+from . import (
+    analysis,
+    control,
+    data,
+    forces,
+    identification,
+    references,
+    scenes,
+    tuning,
+)
+from .analysis.linearization import linearize
+from .analysis.reactions import joint_reactions
+from .base.configuration import configure
+from .batches.sweep import sweep
+from .control.pd import PDController
+from .data.files import load, save
+from .data.mjcf import to_mjcf
+from .data.mjcf_import import from_mjcf
+from .data.tables import to_pandas, to_xarray
+from .dynamics import (
+    energy,
+    forward_dynamics,
+    inverse_dynamics,
+    joint_bias,
+    joint_mass_matrix,
+    link_energies,
+)
+from .forces.actuators import LinearActuator
+from .forces.between_points import SpringDamper, Wrench
+from .forces.element import Element
+from .forces.joints import JointDamper, JointEffort
+from .forces.points import Point
+from .identification.fitting import fit
+from .identification.result import FitResult
+from .linkage.coordinates import State, from_chain, to_chain
+from .linkage.fields import Values, field
+from .linkage.linkage import Linkage
+from .linkage.topology import TOPOLOGIES, existence_factors
+from .mechanics.inverse_kinematics import inverse_kinematics
+from .mechanics.kinematics import (
+    joint_positions,
+    mass_centers,
+    tip_jacobian,
+    tip_position,
+)
+from .mechanics.paper import (
+    bias_force,
+    constraint_forces,
+    masked_accelerations,
+    mass_matrix,
+)
+from .references.circle import CircleTask
+from .references.task import TipTask
+from .simulation.efforts import Efforts, joint_efforts
+from .simulation.prescribed import PrescribedMotion
+from .simulation.sampled import SampledMotion, simulate_sampled, step
+from .simulation.scene import Scene
+from .simulation.simulate import simulate
+from .simulation.solution import Solution
+from .steps.tolerances import scale_tolerances
+from .tuning.result import TuneResult
+from .tuning.tuning import tune
 
-__version__ = "0.2.0"
+if TYPE_CHECKING:
+    from .pictures import drawing, interactive, plotting
 
-# A name is imported at its first use, so that what needs no JAX starts at once.
-_find, _names, __all__ = attach(__name__, __file__)
+__all__ = [
+    "analysis", "bias_force", "CircleTask", "configure", "constraint_forces",
+    "control", "data", "drawing", "Efforts", "Element", "energy",
+    "existence_factors", "field", "fit", "FitResult", "forces", "forward_dynamics",
+    "from_chain", "from_mjcf", "identification", "interactive", "inverse_dynamics",
+    "inverse_kinematics", "joint_bias", "joint_efforts", "joint_mass_matrix",
+    "joint_positions", "joint_reactions", "JointDamper", "JointEffort",
+    "LinearActuator", "linearize", "link_energies", "Linkage", "load",
+    "masked_accelerations", "mass_centers", "mass_matrix", "PDController",
+    "plotting", "Point", "PrescribedMotion", "references", "SampledMotion", "save",
+    "scale_tolerances", "Scene", "scenes", "simulate", "simulate_sampled",
+    "Solution", "SpringDamper", "State", "step", "sweep", "tip_jacobian",
+    "tip_position", "TipTask", "to_chain", "to_mjcf", "to_pandas", "to_xarray",
+    "TOPOLOGIES", "tune", "TuneResult", "tuning", "Values", "Wrench",
+]  # fmt: skip
 
 
 def __dir__() -> list[str]:
-    return [*_names(), "__version__"]
+    return [*__all__, "__version__"]
 
 
-def __getattr__(name: str) -> Any:
-    if name not in __all__ and (room := room_of(name)):
-        message = f"{__name__}.{name} is now {room.__name__}.{name}"
-        warnings.warn(message, DeprecationWarning, stacklevel=2)
-        return room.__getattr__(name)
-    return _find(name)
+if not TYPE_CHECKING:  # a checker of types would then accept any name
 
-
-class _Moved:
-    """Finds the modules that users import where version 0.1 had them."""
-
-    PLACES = {
-        f"{__name__}.drawing": f"{__name__}.pictures.drawing",
-        f"{__name__}.files": f"{__name__}.data.files",
-        f"{__name__}.interactive": f"{__name__}.pictures.interactive",
-        f"{__name__}.plotting": f"{__name__}.pictures.plotting",
-    }
-
-    @classmethod
-    def find_spec(cls, name: str, path: Any = None, target: Any = None) -> Any:
-        if name not in cls.PLACES:
-            return None
-        own = importlib.import_module(cls.PLACES[name]).__spec__
-        return importlib.machinery.ModuleSpec(name, cls, loader_state=own)  # pyright: ignore
-
-    @staticmethod
-    def create_module(spec: Any) -> Any:
-        return sys.modules[spec.loader_state.name]
-
-    @staticmethod
-    def exec_module(module: Any) -> None:
-        module.__spec__ = module.__spec__.loader_state
-
-
-sys.meta_path.append(_Moved)  # pyright: ignore
+    def __getattr__(name):
+        # Pictures are imported on first use, as they need matplotlib.
+        if name in ("drawing", "interactive", "plotting"):
+            return importlib.import_module(f".pictures.{name}", __name__)
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -169,7 +169,7 @@ def test_one_time_of_a_jump_needs_no_list():
 
 
 class Foreign(eqx.Module):
-    """A callable with the attributes that version 0.1 read."""
+    """A callable of another kind, with some of an element's attributes."""
 
     jump_ts: jax.Array
     size: jax.Array

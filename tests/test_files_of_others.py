@@ -43,7 +43,6 @@ READER = """
 import sys
 import fdof_jax as fj
 fj.configure(x64=True)
-assert "fdof_jax.tuning.result" not in sys.modules
 run, scene = fj.load(sys.argv[1])
 fj.save(sys.argv[2], (run, scene))
 assert type(run).__module__ == "fdof_jax.tuning.result"

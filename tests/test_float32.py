@@ -12,16 +12,7 @@ import test_elements
 from helpers import programs
 
 # One process for all tests, because importing takes seconds.
-OPTIONAL = {"matplotlib", "scipy.optimize", "mujoco", "pandas", "xarray", "ipywidgets"}
-PROGRAM = f"""
-import jax, sys
-import fdof_jax
-assert not jax.config.jax_enable_x64
-found = {OPTIONAL} & set(sys.modules)
-assert not found, found
-print("imported without side effects", flush=True)
-"""
-PROGRAM += """
+PROGRAM = """
 import warnings
 import diffrax, jax, numpy as np
 import fdof_jax as fj
@@ -95,9 +86,7 @@ def done():
     return run(PROGRAM)
 
 
-@pytest.mark.parametrize(
-    "words", ["imported without side effects", "holds on 17 scenes", "tuned"]
-)
+@pytest.mark.parametrize("words", ["holds on 17 scenes", "tuned"])
 def test_single_precision(words, done):
     assert words in done.stdout, done.stderr[-3000:]
 

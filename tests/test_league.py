@@ -73,6 +73,19 @@ def test_scenes_that_cannot_be_tuned_together():
         fj.tuning.tune_each([SCENES["RRR"], other])
 
 
+@pytest.mark.slow
+def test_one_program_tunes_all_topologies_each_as_it_is_tuned_alone():
+    together = fj.tuning.tune_each(SCENES)
+    assert [*together] == [*fj.TOPOLOGIES]
+    rows = fj.tuning.league_table(together).splitlines()[2:]
+    errors = [float(row.split()[2]) for row in rows]
+    assert sorted(row.split()[0] for row in rows) == sorted(fj.TOPOLOGIES)
+    assert errors == sorted(errors) and errors[0] < 5 and errors[-1] < 60
+    alone = fj.tune(SCENES["PPR"])
+    np.testing.assert_allclose(together["PPR"].gains, alone.gains, rtol=1e-3)
+    assert together["PPR"].loss == pytest.approx(alone.loss, rel=1e-4)
+
+
 def with_fixed(tuned, topology):
     """Returns a result of tuning as of an arm whose other joints are fixed."""
     moves = np.array([kind != "F" for kind in topology])

@@ -220,19 +220,3 @@ def test_elements_that_are_no_function_of_the_state_are_refused(element):
     ):
         with pytest.raises(ValueError, match="forces: expected elements without"):
             call()
-
-
-def test_the_order_of_0_1_is_deprecated():
-    # Forces of which other tests have the programs.
-    load = fj.JointEffort(STILL)
-    acting = fj.JointDamper(0.3), load, fj.forces.Armature(0.2)
-    calls = [
-        (fj.linearize, fj.State(STILL, STILL), acting),
-        (fj.analysis.equilibrium, np.array([-1.6, 0, 0]), (load,)),
-    ]
-    for function, at, forces in calls:
-        now = function(ROD, at, forces)
-        with pytest.warns(DeprecationWarning, match="order of version 0.1") as warned:
-            before = function(ROD, forces, at)
-        assert [warning.filename for warning in warned] == [__file__]
-        assert all(map(np.array_equal, now, before))

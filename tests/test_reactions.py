@@ -194,14 +194,6 @@ class CarriedTipLoad(TipLoad):
         return (fj.forces.Load(fj.Point(3, 1.0), push),)
 
 
-class CarriedAsBefore(CarriedTipLoad):
-    """A load whose force is a complex number, as in version 0.1."""
-
-    def loads(self, t, q, qd, qdd, linkage):
-        (load,) = super().loads(t, q, qd, qdd, linkage)
-        return (load._replace(force=jax.lax.complex(*load.force)),)
-
-
 def test_an_element_of_one_s_own_is_carried_or_refused():
     arm = fj.Linkage(
         "RRR", length=[0, 1, 1, 1], com=[[0.5, 0]] * 3, mass=[1, 1, 1],
@@ -220,10 +212,6 @@ def test_an_element_of_one_s_own_is_carried_or_refused():
         fj.joint_reactions(arm, forces, solution),
         fj.joint_reactions(tip, (), same),
         atol=1e-8,
-    )
-    np.testing.assert_array_equal(
-        fj.joint_reactions(arm, (CarriedAsBefore(),), solution),
-        fj.joint_reactions(arm, forces, solution),
     )
     with pytest.raises(ValueError, match=r"forces\[0\]: expected .* `loads`"):
         fj.joint_reactions(arm, (TipLoad(),), solution)

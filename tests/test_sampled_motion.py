@@ -1,7 +1,6 @@
 """A motion under sampled control in pictures, tables and a line of text."""
 
 import diffrax
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -21,15 +20,6 @@ def disc_motion() -> fj.SampledMotion:
     qd = np.append([[0.0]], np.cumsum(qdd / 2, axis=0), axis=0)
     q = np.append([[0.0]], np.cumsum((qd[1:] + qd[:-1]) / 4, axis=0), axis=0)
     return fj.SampledMotion(ts, q, qd, TAU, diffrax.RESULTS.successful, ())
-
-
-def test_it_is_unpacked_as_the_named_tuple_of_0_1():
-    motion = jax.tree.map(lambda leaf: leaf, disc_motion())
-    ts, q, qd, tau, result, own = motion
-    assert own == () and result is motion.result
-    for found, field in zip((ts, q, qd, tau), ("ts", "q", "qd", "tau")):
-        assert found is vars(motion)[field]
-    assert all(a is b for a, b in zip(motion[:3], (ts, q, qd), strict=True))
 
 
 CONTROL = fj.PDController(0.0, 0.0, 8.0, lambda t, linkage: (t[None], t[None]))

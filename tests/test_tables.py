@@ -115,14 +115,6 @@ def test_malformed_arguments_are_named(convert):
         jax.jit(lambda arm: convert(arm, solution()))(arm)
 
 
-@pytest.mark.parametrize("convert", [fj.to_xarray, fj.to_pandas])
-def test_the_order_of_0_1_is_deprecated(convert):
-    motion, arm = solution(), make_linkage("RRR")
-    with pytest.warns(DeprecationWarning, match=r"expected \(linkage, solution\)") as w:
-        assert convert(motion, arm).equals(convert(arm, motion))
-    assert [warning.filename for warning in w] == [__file__]
-
-
 @pytest.mark.parametrize("name", ["xarray", "pandas"])
 def test_a_package_that_is_missing_is_named_with_the_extra(name, monkeypatch):
     monkeypatch.setitem(sys.modules, name, None)

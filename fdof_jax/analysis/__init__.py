@@ -1,5 +1,19 @@
 """Analysis of configurations and motions: equilibria, linearisation, reactions."""
 
-from ..base.names import attach
+from ..dynamics import inertia_ratios
+from .equilibria import equilibrium, holding_efforts
+from .linearization import Linearization, Modes, closed_loop_modes, linearize
+from .loops import OpenLoop, open_loop
+from .reactions import joint_reactions
+from .regression import inertial_parameters, regressor
+from .responses import StepAndSine, step_and_sine
 
-__getattr__, __dir__, __all__ = attach(__name__, __file__)
+__all__ = [
+    "closed_loop_modes", "equilibrium", "holding_efforts", "inertia_ratios",
+    "inertial_parameters", "joint_reactions", "Linearization", "linearize", "Modes",
+    "open_loop", "OpenLoop", "regressor", "step_and_sine", "StepAndSine",
+]  # fmt: skip
+
+
+def __dir__() -> list[str]:
+    return __all__

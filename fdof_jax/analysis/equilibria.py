@@ -8,7 +8,7 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from ..base.checks import in_order, real_array
+from ..base.checks import real_array
 from ..dynamics import joint_bias
 from ..forces.element import Element, Forces
 from ..linkage.linkage import Linkage, per_joint, without_fixed
@@ -38,8 +38,6 @@ def equilibrium(
     >>> fj.analysis.equilibrium(arm, [-1.0, 0.1, 0.1]).tolist()  # it hangs
     [-1.571, 0.0, 0.0]
     """
-    swapped = isinstance(q, tuple) and all(map(callable, q))
-    q, forces = in_order("linkage, q, forces", swapped, q, forces)
     forces = checked(linkage, forces)
     return _rest(linkage, forces, per_joint("q", q, linkage), real_array("t", t, ()))
 

@@ -12,7 +12,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Complex, Float
 from numpy.typing import ArrayLike
 
-from ..base.checks import in_order, instance, is_traced, real_array, shown
+from ..base.checks import instance, is_traced, real_array, shown
 from ..control.pd import PDController
 from ..dynamics import forward_dynamics, joint_bias, joint_mass_matrix
 from ..forces.element import Element, Forces, elements_on, of_full_size
@@ -95,8 +95,6 @@ def linearize(
     >>> np.sort(abs(np.linalg.eigvals(linear.A)))[::2].tolist()  # modes [rad/s]
     [2.02, 4.744, 7.855]
     """
-    swapped = isinstance(state, tuple) and all(map(callable, state))
-    state, forces = in_order("linkage, state, forces", swapped, state, forces)
     forces = checked(linkage, forces)
     q, qd = map(jnp.asarray, real_state("state", state, linkage))
     return _linearized(linkage, forces, q, qd, real_array("t", t, ()))

@@ -16,7 +16,7 @@ from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.ndimage import binary_dilation, label
+import scipy
 
 from ..linkage.frames import frames
 from ..linkage.linkage import Linkage, moving_joints
@@ -185,7 +185,7 @@ class Cells(NamedTuple):
 
     def on_edge(self, points: np.ndarray) -> np.ndarray:
         """Returns points beside cells that are not reached; others are NaN."""
-        beside = binary_dilation(~self.reached, np.ones((3, 3)))
+        beside = scipy.ndimage.binary_dilation(~self.reached, np.ones((3, 3)))
         known = np.isfinite(points)
         edge = beside[self.at(np.where(known, points, self.low))]
         return np.where(known & edge, points, np.nan)
@@ -216,11 +216,13 @@ def reached_cells(ranges: Ranges, found: list[np.ndarray]) -> Cells:
         parts = np.linspace(0, 1, 2 + int(2 * longest / step))
         between = path[:-1, None] + np.diff(path)[:, None] * parts
         walls[cells.at(between[np.isfinite(between)])] = True
-    split: Any = label(~walls)  # not across corners, as walls may be diagonal
+    split: Any = scipy.ndimage.label(
+        ~walls
+    )  # not across corners, as walls may be diagonal
     regions, count = split
     tips = ranges.tips(_configurations(ranges, found))
     # A cell beside a wall may be on both sides of the curve.
-    inner = np.where(binary_dilation(walls, np.ones((3, 3))), 0, regions)
+    inner = np.where(scipy.ndimage.binary_dilation(walls, np.ones((3, 3))), 0, regions)
     tried = np.bincount(inner[cells.at(tips[np.isfinite(tips)])], minlength=count + 1)
     inside = (tried > 0) | (np.bincount(inner.ravel(), minlength=count + 1) < _LEAST)
     inside[regions[0, 0]] = False

@@ -5,9 +5,9 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Complex, Float
 from numpy.typing import ArrayLike
-from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
 from ..base.checks import is_traced, real_array, refusal
 from ..base.html_table import html_table
@@ -242,7 +242,7 @@ def step_measures(
     """
     if not np.isfinite([part, speed]).all():
         return np.nan, np.nan, np.nan
-    curve = CubicHermiteSpline(ts, part, speed)
+    curve = scipy.interpolate.CubicHermiteSpline(ts, part, speed)
 
     def passing(level: float) -> np.ndarray:
         """Returns when the response passes a level."""
@@ -273,6 +273,6 @@ def _bandwidth(frequency: np.ndarray, gain: np.ndarray, final: float) -> float:
     level = np.log(np.abs(gain / final))
     if not np.isfinite(level).all() or level[0] < np.log(BANDWIDTH):
         return np.nan
-    curve = CubicSpline(np.log(frequency), level)
+    curve = scipy.interpolate.CubicSpline(np.log(frequency), level)
     found = curve.solve(np.log(BANDWIDTH), extrapolate=False)
     return float(np.exp(found[0])) if found.size else np.nan

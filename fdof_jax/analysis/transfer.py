@@ -4,9 +4,8 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy.linalg import block_diag, eigvals
-from scipy.optimize import brentq
 
 # A peak is known to this part.
 _EXACT = 1e-8
@@ -52,7 +51,9 @@ class Transfer(NamedTuple):
         b, c = self.balanced
         own = self.A + self.D / room * np.outer(b, c)
         across = np.outer(b, b) / room, -(level**2) / room * np.outer(c, c)
-        found = np.imag(eigvals(np.block([[own, across[0]], [across[1], -own.T]])))
+        found = np.imag(
+            scipy.linalg.eigvals(np.block([[own, across[0]], [across[1], -own.T]]))
+        )
         limited = lambda w: min(float(np.abs(self(w))) / level - 1, 1.0)  # if infinite
         return _changes_of_sign(limited, found[found > 0])
 
@@ -61,9 +62,9 @@ class Transfer(NamedTuple):
         # H(s) - H(-s) is zero there.
         states = 2 * len(self.A)
         pencil = np.zeros((states + 1, states + 1))
-        pencil[:-1, :-1] = block_diag(self.A, -self.A)
+        pencil[:-1, :-1] = scipy.linalg.block_diag(self.A, -self.A)
         pencil[:-1, -1], pencil[-1, :-1] = (np.tile(part, 2) for part in self.balanced)
-        zeros = eigvals(pencil, np.diag([1.0] * states + [0.0]))
+        zeros = scipy.linalg.eigvals(pencil, np.diag([1.0] * states + [0.0]))
         found = np.abs(np.imag(zeros[np.isfinite(zeros)]))
         angle = lambda w: float(np.sin(np.angle(self(w))))
         return _changes_of_sign(angle, found[found > 0])
@@ -74,7 +75,7 @@ class Transfer(NamedTuple):
         Each pass looks between the frequencies at which the magnitude passes the
         largest value so far (Bruinsma and Steinbuch, 1990).
         """
-        poles = eigvals(self.A)
+        poles = scipy.linalg.eigvals(self.A)
         tried = np.concatenate([[0.0], np.abs(poles), np.abs(np.imag(poles))])
         most, beyond = 0.0, np.append(np.abs(self(tried)), abs(self.D)).max()
         while beyond > most * (1 + _EXACT):
@@ -97,4 +98,6 @@ def _changes_of_sign(of: Callable[[float], float], found: np.ndarray) -> np.ndar
     at = lambda log: of(np.exp(log))
     signs = np.array([at(log) > 0 for log in parts])
     passed = np.flatnonzero(signs[1:] != signs[:-1])
-    return np.exp(np.array([brentq(at, *parts[[k, k + 1]]) for k in passed]))
+    return np.exp(
+        np.array([scipy.optimize.brentq(at, *parts[[k, k + 1]]) for k in passed])
+    )

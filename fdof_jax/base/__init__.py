@@ -1,1 +1,1 @@
-"""Helpers that know nothing of arms: checks, names, files, XLA and its arithmetic."""
+"""Helpers that know nothing of arms: checks, files, XLA and its arithmetic."""

@@ -4,6 +4,7 @@ Shapes and types are always checked, values only where they are concrete: a valu
 by `jax.jit`, `jax.vmap` or `jax.grad` is not known yet.
 """
 
+import importlib
 import inspect
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -257,21 +258,19 @@ def keywords_as(
     return allowed | given
 
 
-def in_order(expected: str, swapped: bool, first: Any, second: Any) -> tuple[Any, Any]:
-    """Returns two arguments in the `expected` order, and warns if they are swapped.
-
-    Version 0.1 had the other order in some functions.
-    """
-    if not swapped:
-        return first, second
-    message = f"fdof_jax: expected ({expected}), got the order of version 0.1"
-    warn(message, DeprecationWarning)
-    return second, first
-
-
 def sign(name: str, value: Any) -> Array:
     """Returns `value` as an array if it is 1 or -1, or raises ValueError."""
     array = real_array(name, value, ())
     if (given := concrete(array)) is not None and abs(given) != 1:
         raise refusal(name, "1 or -1", value)
     return array
+
+
+def optional_package(name: str, extra: str) -> Any:
+    """Returns the package, or raises ImportError that names the extra to install."""
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise ImportError(
+            f"{name} is not installed: pip install 'fdof_jax[{extra}]' installs it."
+        ) from error

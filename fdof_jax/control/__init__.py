@@ -1,5 +1,15 @@
 """Controllers, feedforward and drives."""
 
-from ..base.names import attach
+from .drives import DCMotor, FirstOrderLag, PIDController, SpeedLimit
+from .gains import gains_from_frequency
+from .model_based import ComputedTorque, GravityFeedforward
+from .pd import PDController
 
-__getattr__, __dir__, __all__ = attach(__name__, __file__)
+__all__ = [
+    "ComputedTorque", "DCMotor", "FirstOrderLag", "gains_from_frequency",
+    "GravityFeedforward", "PDController", "PIDController", "SpeedLimit",
+]  # fmt: skip
+
+
+def __dir__() -> list[str]:
+    return __all__

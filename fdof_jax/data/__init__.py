@@ -1,5 +1,14 @@
 """Tables of motions, files of pytrees, and export to other engines."""
 
-from ..base.names import attach
+from .files import load, save
+from .mjcf import to_mjcf
+from .mjcf_import import from_mjcf
+from .tables import to_pandas, to_xarray
 
-__getattr__, __dir__, __all__ = attach(__name__, __file__)
+__all__ = [
+    "from_mjcf", "load", "save", "to_mjcf", "to_pandas", "to_xarray",
+]  # fmt: skip
+
+
+def __dir__() -> list[str]:
+    return __all__

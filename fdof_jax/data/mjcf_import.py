@@ -5,8 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..base.checks import refusal
-from ..base.names import optional_package
+from ..base.checks import optional_package, refusal
 from ..base.user_warnings import warn, without_warning
 from ..forces.actuators import Armature
 from ..forces.element import Forces

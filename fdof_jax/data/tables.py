@@ -4,8 +4,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..base.checks import in_order, instance, known
-from ..base.names import optional_package
+from ..base.checks import instance, known, optional_package
 from ..linkage.linkage import Linkage
 from ..linkage.topology import common_unit, names_and_units, rate_unit
 from ..simulation.sampled import Motion, check_joints
@@ -53,8 +52,6 @@ def to_xarray(linkage: Linkage, solution: Motion) -> "xarray.Dataset":
     for malformed arguments.
     """
     xarray = optional_package("xarray", "data")
-    swapped = isinstance(linkage, Motion)
-    linkage, solution = in_order("linkage, solution", swapped, linkage, solution)
     times, batch = _checked(linkage, solution)
     names, units = names_and_units(linkage.ef)
     common = common_unit(units)
@@ -99,8 +96,6 @@ def to_pandas(linkage: Linkage, solution: Motion) -> "pandas.DataFrame":
     for malformed arguments.
     """
     pandas = optional_package("pandas", "data")
-    swapped = isinstance(linkage, Motion)
-    linkage, solution = in_order("linkage, solution", swapped, linkage, solution)
     times, batch = _checked(linkage, solution)
     columns = {}
     for values, unit_of in ((solution.q, str), (solution.qd, rate_unit)):

@@ -18,10 +18,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from .. import __all__ as _NAMES, __name__ as _PACKAGE
 from ..base.checks import is_traced, refusal, shown
-from ..base.names import room_of
 
+_PACKAGE = "fdof_jax"
 _RESULT: Any = diffrax.RESULTS.successful
 _Item, _EnumerationMeta = type(_RESULT), type(diffrax.RESULTS)
 
@@ -70,11 +69,13 @@ def _found(name: str) -> Any:
 
 def _of_the_library(name: str) -> Any:
     """Returns the class or function of the library with the given name, or None."""
-    if name in (*_NAMES, *_WITHIN):
-        place = ".".join(filter(None, [_PACKAGE, _WITHIN.get(name)]))
-        module = importlib.import_module(place)
+    if name in _WITHIN:
+        module = importlib.import_module(f"{_PACKAGE}.{_WITHIN[name]}")
     else:
-        module = room_of(name)
+        rooms = "analysis control forces identification references tuning".split()
+        places = [_PACKAGE, *(f"{_PACKAGE}.{room}" for room in rooms)]
+        listing = map(importlib.import_module, places)
+        module = next((m for m in listing if name in m.__all__), None)
     found = getattr(module, name, None)
     return found if isinstance(found, type | types.FunctionType) else None
 

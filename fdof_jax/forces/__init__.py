@@ -1,5 +1,21 @@
 """Force elements: joint efforts, springs, dampers, stops, actuators."""
 
-from ..base.names import attach
+from ..linkage.fields import Condition, Values, field
+from .actuators import Armature, LinearActuator
+from .between_points import SpringDamper, Tension, Wrench
+from .element import Element, InertialElement, StatefulElement
+from .joint_limits import JointFriction, JointStops
+from .joints import EffortHistory, JointDamper, JointEffort
+from .points import Load, Point, PointElement
+from .switches import clip, switch
 
-__getattr__, __dir__, __all__ = attach(__name__, __file__)
+__all__ = [
+    "Armature", "clip", "Condition", "EffortHistory", "Element", "field",
+    "InertialElement", "JointDamper", "JointEffort", "JointFriction", "JointStops",
+    "LinearActuator", "Load", "Point", "PointElement", "SpringDamper",
+    "StatefulElement", "switch", "Tension", "Values", "Wrench",
+]  # fmt: skip
+
+
+def __dir__() -> list[str]:
+    return __all__

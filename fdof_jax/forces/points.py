@@ -101,7 +101,7 @@ class Load(NamedTuple):
         """Returns the force x + iy [N]."""
         try:
             x, y = self.force
-        except TypeError:  # the library's own loads, and those of version 0.1
+        except TypeError:  # complex, as in the library's own loads
             return self.force
         return jax.lax.complex(*(jnp.asarray(part, float) for part in (x, y)))
 

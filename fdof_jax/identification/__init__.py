@@ -1,5 +1,14 @@
 """Identification of an arm's parameters from recorded motions."""
 
-from ..base.names import attach
+from .design import NextMotion, next_motion
+from .fitting import fit, fit_each
+from .recordings import link_ends
+from .result import FitResult
 
-__getattr__, __dir__, __all__ = attach(__name__, __file__)
+__all__ = [
+    "fit", "fit_each", "FitResult", "link_ends", "next_motion", "NextMotion",
+]  # fmt: skip
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -5,10 +5,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jax import Array
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from scipy.integrate import cumulative_simpson
 
 from ..base.user_warnings import warn
 from ..dynamics import energy, link_energies
@@ -95,7 +95,7 @@ def _works(
 
 
 def _integral(powers: np.ndarray, ts: np.ndarray) -> np.ndarray:
-    return cumulative_simpson(powers.sum(axis=0), x=ts, initial=0)
+    return scipy.integrate.cumulative_simpson(powers.sum(axis=0), x=ts, initial=0)
 
 
 def energy_stack(

@@ -13,9 +13,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.image import imsave
 
-from ..base.checks import instance, refusal, shown
+from ..base.checks import instance, optional_package, refusal, shown
 from ..base.html_table import html_table
-from ..base.names import optional_package
 from ..linkage.linkage import joint_names, joints_of
 from ..references.reference import reference_of
 from ..simulation.scene import Scene

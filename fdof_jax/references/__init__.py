@@ -1,5 +1,16 @@
 """Reference motions: moves of the joints, tasks along paths, timing."""
 
-from ..base.names import attach
+from .circle import CircleTask
+from .paths import Ellipse, FigureEight, Line, Path, Spline
+from .reference import Reference, reachable
+from .task import JointMove, TipTask
+from .timing import Laps, Travel, shock_against
 
-__getattr__, __dir__, __all__ = attach(__name__, __file__)
+__all__ = [
+    "CircleTask", "Ellipse", "FigureEight", "JointMove", "Laps", "Line", "Path",
+    "reachable", "Reference", "shock_against", "Spline", "TipTask", "Travel",
+]  # fmt: skip
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
+import scipy
 
 
 class Evaluation(NamedTuple):
@@ -123,8 +123,8 @@ def _by_sets(normal, slope, low, high) -> np.ndarray | None:
         x = np.where(below, low, np.where(above, high, 0.0))
         free = ~(below | above)
         if free.any():
-            factor = cho_factor(normal[np.ix_(free, free)])
-            x[free] = cho_solve(factor, -(slope + normal @ x)[free])
+            factor = scipy.linalg.cho_factor(normal[np.ix_(free, free)])
+            x[free] = scipy.linalg.cho_solve(factor, -(slope + normal @ x)[free])
         rise = slope + normal @ x
         sets = (x < low) | below & (rise > 0), (x > high) | above & (rise < 0)
         if (sets[0] == below).all() and (sets[1] == above).all():
@@ -134,11 +134,11 @@ def _by_sets(normal, slope, low, high) -> np.ndarray | None:
 
 
 def _by_bvls(normal, slope, low, high) -> np.ndarray:
-    from scipy.optimize import lsq_linear  # rarely needed, and slow to import
-
-    factor = cholesky(normal)
-    target = -solve_triangular(factor, slope, trans=1)
-    return lsq_linear(factor, target, (low, high), method="bvls", tol=1e-12).x
+    factor = scipy.linalg.cholesky(normal)
+    target = -scipy.linalg.solve_triangular(factor, slope, trans=1)
+    return scipy.optimize.lsq_linear(
+        factor, target, (low, high), method="bvls", tol=1e-12
+    ).x
 
 
 def held_at_bounds(z, gradient, low, high) -> np.ndarray:

@@ -1,6 +1,5 @@
 """Control in discrete time, with efforts held constant between samples."""
 
-from collections.abc import Iterator
 from typing import Any
 
 import diffrax
@@ -119,14 +118,6 @@ class SampledMotion(WithOutcome):
     own: tuple[Any, ...]
     delay: Float[Array, ""] | float = 0.0
     q_begin: Float[Array, "sample joint"] | None = None
-
-    def __iter__(self) -> Iterator[Any]:
-        """Yields the fields of the named tuple that version 0.1 returned."""
-        return iter((self.ts, self.q, self.qd, self.tau, self.result, self.own))
-
-    def __getitem__(self, index: Any) -> Any:
-        """Returns fields by their places, as of that named tuple."""
-        return tuple(self)[index]
 
 
 Motion = Solution | SampledMotion

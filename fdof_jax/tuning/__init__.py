@@ -1,5 +1,23 @@
 """Gain tuning by gradients, optimal efforts, and checks of the gradients."""
 
-from ..base.names import attach
+from ..simulation.scene import stacked
+from .ensembles import perturbed, with_payload
+from .gradient_quality import GradientReport, gradient_report
+from .league import circle_scenes, league_table
+from .limits import Limits
+from .losses import Tracking, joint_errors, tip_errors
+from .optimal_motion import OptimalMotion, optimal_efforts
+from .result import TradeOff, TuneResult
+from .tuning import trade_off, tune, tune_each
+from .within_limits import TunedWithin, tune_within
 
-__getattr__, __dir__, __all__ = attach(__name__, __file__)
+__all__ = [
+    "circle_scenes", "gradient_report", "GradientReport", "joint_errors",
+    "league_table", "Limits", "optimal_efforts", "OptimalMotion", "perturbed",
+    "stacked", "tip_errors", "Tracking", "trade_off", "TradeOff", "tune",
+    "tune_each", "tune_within", "TunedWithin", "TuneResult", "with_payload",
+]  # fmt: skip
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -1,1 +1,0 @@
-"""The runs behind the command line."""
