@@ -16,7 +16,7 @@ from ..base.checks import refusal
 from ..base.configuration import wide_vectors
 from ..simulation.simulate import simulate
 from ..simulation.solution import Solution
-from ..steps.step_wrappers import Abreast, by_square_roots
+from ..steps.controllers import Abreast, by_square_roots
 from ..steps.tolerances import default_controller
 from .forecast import expected_work
 

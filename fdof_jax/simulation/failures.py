@@ -20,7 +20,7 @@ from .field import (
     whole,
     with_states,
 )
-from .prescribed import start_of, term_of
+from .prescribed import formulation
 from .solution import OUTCOMES, Solution
 from .solve import solve
 
@@ -115,7 +115,7 @@ def _linearised(
     linkage: Any, forces: tuple[Element, ...], t: Array, q: Array, qd: Array, own: Any
 ) -> Array:
     """Returns the matrix of the linearised equations of first order."""
-    args, term = args_of(linkage, q, forces), term_of(forces)
+    args, (term, start_of, _) = args_of(linkage, q, forces), formulation(forces)
     start = whole(*start_of(args, qd), initial_own(args, own))
     return linearised(term, t, start, args)
 

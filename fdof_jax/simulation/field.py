@@ -1,6 +1,7 @@
 """The vector field of a linkage with force elements, as integrators call it."""
 
-from collections.abc import Iterator
+import functools
+from collections.abc import Callable, Iterator
 from itertools import islice
 from typing import Any, NamedTuple
 
@@ -16,7 +17,7 @@ from ..forces.switches import Switches
 from ..linkage.linkage import Linkage
 from ..mechanics.equations import Constants, Scalars, Upper, link_constants, zeros
 from ..mechanics.rates import conditioning, rates, rates_and_conditioning
-from ..steps.dopri8 import Health, health_if
+from ..steps.dopri8 import Health, ScheduledTerm, health_if
 
 # Below this inertia ratio the accelerations have four correct digits at best (float64)
 # or two (float32).
@@ -240,3 +241,64 @@ def _switched_effort(
 
 def _shown(tree: Any) -> str:
     return eqx.tree_pformat(tree)  # arrays by dtype and shape, traced ones too
+
+
+class _Packed(eqx.Module):
+    """A tree of scalars as one array of numbers and one of flags."""
+
+    numbers: Array
+    flags: Array
+    structure: Any = eqx.field(static=True)
+    is_flag: tuple[bool, ...] = eqx.field(static=True)
+
+    def scalars(self) -> Any:
+        numbers, flags = iter(self.numbers), iter(self.flags)
+        leaves = [next(flags if flag else numbers) for flag in self.is_flag]
+        return jax.tree.unflatten(self.structure, leaves)
+
+
+def _packed(scalars: Any) -> _Packed:
+    leaves, structure = jax.tree.flatten(jax.tree.map(jnp.asarray, scalars))
+    is_flag = tuple(leaf.dtype == bool for leaf in leaves)
+    numbers, flags = (
+        jnp.stack([leaf for leaf, flag in zip(leaves, is_flag) if flag == kind])
+        for kind in (False, True)
+    )
+    return _Packed(numbers, flags, structure, is_flag)
+
+
+def in_arrays(
+    term: ScheduledTerm, y: Any, args: Args
+) -> tuple[ScheduledTerm, Any, Any]:
+    """Returns term, state and arguments in arrays instead of tuples of scalars.
+
+    XLA compiles a kernel for each array that changes in a loop or is computed for it,
+    in much the same time for one number as for many. Plain calls use arrays; batches
+    are faster with scalars.
+    """
+    packed = args._replace(constants=_packed(args.constants))  # pyright: ignore[reportArgumentType]
+    return _of_arrays(term), tuple(map(jnp.stack, y)), packed
+
+
+@functools.cache  # for the same term, so that its functions are traced once
+def _of_arrays(term: ScheduledTerm) -> ScheduledTerm:
+    def of_scalars(function: Callable) -> Callable:
+        def unpacked(t, y, args, *schedule):
+            args = args._replace(constants=args.constants.scalars())
+            return function(t, tuple(map(tuple, y)), args, *schedule)
+
+        return unpacked
+
+    field, watched = map(of_scalars, (term.vector_field, term.watched_field))
+
+    def watched_field(*at):
+        rates, health = watched(*at)
+        return tuple(map(jnp.stack, rates)), health
+
+    return ScheduledTerm(
+        lambda *at: tuple(map(jnp.stack, field(*at))),
+        term.schedule,
+        of_scalars(term.health),
+        watched_field,
+        of_scalars(term.switching),
+    )

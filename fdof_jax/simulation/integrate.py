@@ -3,6 +3,7 @@
 `integrate` is the one way in: it prepares, controls, solves and reads.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import diffrax
@@ -14,19 +15,18 @@ from jax import Array
 from ..base.checks import shown
 from ..forces.joints import EffortHistory
 from ..linkage.linkage import possible, without_fixed
+from ..steps.controllers import with_judge
 from ..steps.derivative_control import OfLinearised, OfTangents
 from ..steps.dopri8 import ScheduledDopri8, ScheduledTerm, constant
 from ..steps.landing import end_of_run
 from ..steps.looped_dopri8 import LoopedDopri8
 from ..steps.step_control import StepControl, largest_loss
-from ..steps.step_wrappers import with_judge
 from ..steps.switching import Located, LocatedImplicit, located, switching_facts
 from ..steps.tolerances import default_controller
 from ..steps.unchecked import diffeqsolve
-from .field import Args, args_of, initial_own, own_states, whole
+from .field import args_of, in_arrays, initial_own, own_states, whole
 from .known_times import clocks_apart, known_times
-from .packing import in_arrays
-from .prescribed import agrees, motion_at, start_of, term_of
+from .prescribed import agrees, formulation
 from .solution import Solution
 
 
@@ -36,7 +36,7 @@ class _Problem(NamedTuple):
     - `valid`: whether the inputs were; otherwise harmless ones replace them.
     - `ts`: output times of the solve; `given`: positions and velocities at the first.
     - `start`: the integrated state there; `term`, `args`: its equations.
-    - `path`: the arguments with which `motion_at` reads joint states.
+    - `joints(t, y)`: reads positions, velocities and the elements' own states.
     """
 
     valid: Array
@@ -45,7 +45,7 @@ class _Problem(NamedTuple):
     start: Any
     term: ScheduledTerm
     args: Any
-    path: Args
+    joints: Callable[[Any, Any], tuple[Array, Array, Any]]
 
 
 class _Control(NamedTuple):
@@ -80,17 +80,23 @@ def _prepare(inputs, derivatives: bool, padded: bool) -> _Problem:
     """States the equations and their start."""
     linkage, _, _, own0, forces = inputs
     valid, ts, (q0, qd0) = _valid(inputs, padded)
-    path = args_of(linkage, q0, forces)
+    arguments = args_of(linkage, q0, forces)
     if derivatives:
-        path = clocks_apart(path, ts)
-    own = initial_own(path, own0)
+        arguments = clocks_apart(arguments, ts)
+    own = initial_own(arguments, own0)
     finite = jnp.isfinite(jnp.array(own)).all()
     own = tuple(jnp.where(finite, x, 0) for x in own)
-    term, args, start = term_of(forces), path, whole(*start_of(path, qd0), own)
-    given = motion_at(path, ts[0], start)  # after a blow there, like all that follows
+    term, start_of, joints_of = formulation(forces)
+    start = whole(*start_of(arguments, qd0), own)
+
+    def joints(t, y):
+        return *joints_of(arguments, t, y), own_states(arguments, y)
+
+    q, qd, _ = joints(ts[0], start)  # after a blow there, like all that follows
+    args = arguments
     if padded and not derivatives:
         term, start, args = in_arrays(term, start, args)
-    return _Problem(valid & finite, ts, given, start, term, args, path)
+    return _Problem(valid & finite, ts, (q, qd), start, term, args, joints)
 
 
 def _control(
@@ -161,8 +167,7 @@ def _read(inputs, problem: _Problem, solve: diffrax.Solution) -> Solution:
     valid, ts = problem.valid, problem.ts
     assert solve.ys is not None  # because of saveat
     states, (reached, *switches) = solve.ys
-    at = lambda t, y: (*motion_at(problem.path, t, y), own_states(problem.path, y))
-    q, qd, own = jax.vmap(at)(ts, states)
+    q, qd, own = jax.vmap(problem.joints)(ts, states)
 
     def shown_at(a):
         """Replaces the infinity that diffrax leaves at times not reached by NaN."""

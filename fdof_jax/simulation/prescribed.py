@@ -4,7 +4,8 @@ The state holds the momenta of the driven joints instead of their velocities, be
 momenta are continuous where a prescribed velocity jumps.
 """
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -130,38 +131,51 @@ def _split(moved: Array, matrix: Array, known: Array, right: Array) -> Array:
     return jnp.linalg.solve(free, jnp.where(moved, known, right - matrix @ known))
 
 
-def motion_at(args: Args, t: Any, y: Any) -> tuple[Array, Array]:
-    """Joint positions and velocities at an integrated state."""
-    q, rates = args.q0 + jnp.stack(y[0]), jnp.stack(y[1])
-    if (motion := prescribed(args.forces)) is None:
-        return q, rates
+class Formulation(NamedTuple):
+    """What is integrated for a motion, and how joint states are read from it.
+
+    - `term`: the equations.
+    - `start(args, qd)`: displacements, and velocities or momenta, at the start, before
+      any jump there.
+    - `joints(args, t, y)`: joint positions and velocities at an integrated state.
+    """
+
+    term: ScheduledTerm
+    start: Callable[[Args, Array], tuple[Any, Any]]
+    joints: Callable[[Args, Any, Any], tuple[Array, Array]]
+
+
+def formulation(forces: Forces) -> Formulation:
+    """Returns that of velocities or, with a prescribed motion, of momenta."""
+    return FREE if prescribed(forces) is None else HYBRID
+
+
+def _free_joints(args: Args, t: Any, y: Any) -> tuple[Array, Array]:
+    return args.q0 + jnp.stack(y[0]), jnp.stack(y[1])
+
+
+def _hybrid_joints(args: Args, t: Any, y: Any) -> tuple[Array, Array]:
+    motion, (q, momenta) = _motion(args), _free_joints(args, t, y)
     position, velocity = motion.at(t, args.linkage)
     q = jnp.where(motion.of(args.linkage), position, q)
     matrix, _ = _mass_and_bias(args, q, jnp.zeros_like(q))
-    return q, _split(motion.of(args.linkage), matrix, velocity, rates)
+    return q, _split(motion.of(args.linkage), matrix, velocity, momenta)
 
 
-def start_of(args: Args, qd: Array) -> tuple[Any, Any]:
-    """Displacements and velocities or momenta at the start, before any jump there."""
-    if (motion := prescribed(args.forces)) is None:
-        return zeros(args.q0), tuple(qd)
+def _hybrid_start(args: Args, qd: Array) -> tuple[Any, Any]:
     matrix, _ = _mass_and_bias(args, args.q0, jnp.zeros_like(args.q0))
-    return zeros(args.q0), tuple(jnp.where(motion.of(args.linkage), 0, matrix @ qd))
+    momenta = jnp.where(_motion(args).of(args.linkage), 0, matrix @ qd)
+    return zeros(args.q0), tuple(momenta)
 
 
-def term_of(forces: tuple[Element, ...]) -> ScheduledTerm:
-    """Returns the equations of velocities or, with a prescribed motion, of momenta."""
-    if prescribed(forces) is None:
-        return ScheduledTerm(
-            vector_field, schedule_of, health_of, watched_field, switching
-        )
-    return ScheduledTerm(
-        _hybrid_field, schedule_of, _health, _watched_hybrid_field, _hybrid_switching
-    )
+def _motion(args: Args) -> PrescribedMotion:
+    motion = prescribed(args.forces)
+    assert motion is not None  # the functions of `HYBRID` serve no other motions
+    return motion
 
 
 def _hybrid_switching(t, y, args, schedule) -> tuple[Array, bool]:
-    q, qd = motion_at(args, t, y)
+    q, qd = _hybrid_joints(args, t, y)
     return switching(t, (tuple(q - args.q0), tuple(qd), *y[2:]), args, schedule)
 
 
@@ -170,9 +184,7 @@ def _hybrid_field(t, y, args, schedule) -> tuple[Any, ...]:
 
     The rate of the momenta is M' qd - bias + tau, where M' is the mass matrix's rate.
     """
-    motion = prescribed(args.forces)
-    assert motion is not None  # this field serves prescribed motions only
-    q, qd = motion_at(args, t, y)
+    motion, (q, qd) = _motion(args), _hybrid_joints(args, t, y)
     moving = tuple(q - args.q0), tuple(qd)
     tau, own_rates, _ = applied(t, (*moving, *y[2:]), args, schedule)
     # The efforts already include the bias of masses that elements move.
@@ -192,14 +204,26 @@ def _watched_hybrid_field(t, y, args, schedule) -> tuple[tuple[Any, ...], Health
 
 def _health(t, y, args) -> Health:
     """Health of the driven joints' equations, as in `field.health_of`."""
-    motion = prescribed(args.forces)
-    assert motion is not None
-    q, _ = motion_at(args, t, y)
+    q, _ = _hybrid_joints(args, t, y)
     matrix, _ = _mass_and_bias(args, q, jnp.zeros_like(q))
-    driven = ~motion.of(args.linkage)
+    driven = ~_motion(args).of(args.linkage)
     free = jnp.where(jnp.outer(driven, driven), matrix, jnp.eye(len(q)))
     losses = jnp.diag(free) * jnp.diag(jnp.linalg.inv(free))
     return health_at(tuple(jnp.where(losses > 0, losses, jnp.inf)))
+
+
+FREE = Formulation(
+    ScheduledTerm(vector_field, schedule_of, health_of, watched_field, switching),
+    lambda args, qd: (zeros(args.q0), tuple(qd)),
+    _free_joints,
+)
+HYBRID = Formulation(
+    ScheduledTerm(
+        _hybrid_field, schedule_of, _health, _watched_hybrid_field, _hybrid_switching
+    ),
+    _hybrid_start,
+    _hybrid_joints,
+)
 
 
 def prescribed_effort(

@@ -24,7 +24,7 @@ from ..steps.tolerances import adaptive, of_precision
 from ..steps.unchecked import diffeqsolve
 from .field import args_of, initial_own, own_states, whole
 from .known_times import clocks_apart, known_times
-from .prescribed import motion_at, start_of, term_of
+from .prescribed import formulation
 from .scene import Scene
 from .solution import Solution
 
@@ -144,7 +144,8 @@ def sensitivities(
         )
         args = args_of(scene.linkage, q0, elements("scene.forces", scene.forces))
         args = clocks_apart(args, ts)
-        return args, whole(*start_of(args, qd0), initial_own(args))
+        start = formulation(args.forces).start(args, qd0)
+        return args, whole(*start, initial_own(args))
 
     # One array, with the motion as first row and the derivatives below, gives the
     # integrator fewer and larger operations.
@@ -157,7 +158,7 @@ def sensitivities(
     def rates(t, row, z, sides):
         args, _ = motion_of(z)
         y = jax.tree.unflatten(structure, tuple(row))
-        rates = term_of(args.forces).vf(t, y, args._replace(sides=sides))
+        rates = formulation(args.forces).term.vf(t, y, args._replace(sides=sides))
         return jnp.stack(jax.tree.leaves(rates))
 
     @jax.jit  # traced once, not at each use by the solver
@@ -173,7 +174,7 @@ def sensitivities(
         args, _ = motion_of(varied.z)
         y = jax.tree.unflatten(structure, tuple(y[0][0]))
         args = args._replace(sides=varied.sides)
-        return term_of(args.forces).switches(t, y, args)
+        return formulation(args.forces).term.switches(t, y, args)
 
     def times_of(z):
         return known_times(motion_of(z)[0])
@@ -181,7 +182,7 @@ def sensitivities(
     def observed(z, t, row):
         args, _ = motion_of(z)
         y = jax.tree.unflatten(structure, tuple(row))
-        return *motion_at(args, t, y), own_states(args, y)
+        return *formulation(args.forces).joints(args, t, y), own_states(args, y)
 
     tolerance = of_precision(tolerance, max(tolerance, TOLERANCE))
     controller = adaptive(tolerance, tolerance)

@@ -15,8 +15,8 @@ from ..base.configuration import options_of_loops
 from ..base.functions import sharing_functions
 from ..forces.added_inertia import inertial
 from ..forces.element import Element, ForeignElement
+from ..steps.controllers import with_pid
 from ..steps.derivative_control import TANGENTS
-from ..steps.step_wrappers import with_pid
 from ..steps.tolerances import default_controller
 from ..steps.unrolled_dopri8 import UnrolledDopri8
 from .integrate import integrate

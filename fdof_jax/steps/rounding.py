@@ -16,8 +16,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from ..linkage.topology import real_joints
+from .controllers import Adaptive
 from .dopri8 import Estimate, Health
-from .step_wrappers import Adaptive
 
 # Rounding errors of an acceleration, over its size times eps and the loss of accuracy:
 # less for slides, whose inertia is a sum of masses without levers.

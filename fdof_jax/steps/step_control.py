@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from .controllers import Adaptive, Scaled
 from .derivative_control import OfLinearised, OfTangents
 from .dopri8 import (
     Estimate,
@@ -22,7 +23,6 @@ from .dopri8 import (
 )
 from .landing import Landing, NextStep
 from .rounding import above_rounding
-from .step_wrappers import Adaptive, Scaled
 from .switching import motion_of
 
 

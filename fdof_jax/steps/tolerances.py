@@ -16,8 +16,7 @@ from ..base.user_warnings import warn
 from ..linkage.coordinates import State
 from ..linkage.linkage import Linkage, check_linkage, joints_of
 from ..linkage.topology import real_joints
-from .shortening import Shortening
-from .step_wrappers import Scaled, with_judge, with_pid
+from .controllers import Scaled, Shortening, with_judge, with_pid
 
 # Rounding keeps float32 from meeting a tighter relative or absolute tolerance.
 _TIGHTEST_SINGLE = 1e-6

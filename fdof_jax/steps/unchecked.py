@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from .step_wrappers import Adaptive
+from .controllers import Adaptive
 
 
 def diffeqsolve(
