@@ -42,7 +42,7 @@ def test_the_circle_is_the_default(tmp_path, capsys):
     assert "gains are at a bound" in printed
     assert "/: circle-arm.png, circle-arm.gif, circle-motion-paper.png" in printed
     assert (tmp_path / "circle-arm.gif").stat().st_size > 50_000
-    assert f"{fj.load(tmp_path / 'tuned.fdof')}" in printed
+    assert f"{fj.load(tmp_path / 'tuned.json')}" in printed
 
 
 def test_figures(tmp_path, capsys):
@@ -73,7 +73,7 @@ def test_tuning_of_an_ensemble(tmp_path, capsys):
     main(["tune", *folder, *circle.split(), *ensemble.split()])
     assert "over 3 members" in capsys.readouterr().out
     assert "circle-path.png" in pictures(tmp_path)
-    tuned = fj.load(tmp_path / "tuned.fdof")
+    tuned = fj.load(tmp_path / "tuned.json")
     task = tuned.scene.forces[0].reference
     assert (task.radius, task.period, tuned.scene.t1) == (0.5, 1, 2)
     assert tuned.settings["over"] == "worst" and len(tuned.member_loss) == 3
@@ -193,7 +193,7 @@ def test_league(tmp_path, capsys):
     errors = [float(row.split()[2]) for row in table]
     assert sorted(names) == sorted(fj.TOPOLOGIES) and errors == sorted(errors)
     assert errors[0] < 5 and errors[-1] < 60
-    together = fj.load(tmp_path / "league.fdof")
+    together = fj.load(tmp_path / "league.json")
     assert [*together] == [*fj.TOPOLOGIES]
     # One program tunes all, each as it is tuned alone.
     alone = fj.tune(fj.tuning.circle_scenes()["PPR"])

@@ -79,8 +79,8 @@ def _league(output: Path) -> list[Path]:
     _say("tune all seven topologies in one compiled program")
     results = tune_each(circle_scenes(), report=print)
     print(f"\n{league_table(results)}")
-    save(output / "league.fdof", results)
-    return [output / "league.fdof"]
+    save(output / "league.json", results)
+    return [output / "league.json"]
 
 
 def _tune(output: Path, **options: Any) -> list[Path]:
@@ -133,8 +133,8 @@ def _tune(output: Path, **options: Any) -> list[Path]:
     files.insert(1, output / "circle-arm.gif")
     moving.save(files[1], dpi=80)
     plt.close("all")
-    save(output / "tuned.fdof", tuned)
-    return [*files, output / "tuned.fdof"]
+    save(output / "tuned.json", tuned)
+    return [*files, output / "tuned.json"]
 
 
 def _arms(
