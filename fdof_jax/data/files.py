@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .. import __name__ as _PACKAGE, __version__
+from .. import __version__
 from ..base.checks import is_traced, plain, refusal, shown
 from ..base.frozen import Frozen
 from ..base.user_warnings import without_warning
@@ -23,6 +23,7 @@ from ..linkage.topology import letters
 from ..simulation.sampled import Motion
 from ..simulation.scene import stacked
 
+_PACKAGE = __name__.partition(".")[0]
 # Where classes are looked up. The package comes last, as it warns of names in rooms;
 # the states of drives and the histories of tuning are in no room's list.
 _PLACES = (

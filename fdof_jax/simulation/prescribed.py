@@ -67,7 +67,8 @@ class PrescribedMotion(Element):
     reference: Any = called(EXPECTED)
 
     def __init__(self, joints: ArrayLike | Sequence[int], reference: Any):
-        given = joints.tolist() if isinstance(joints, Array | np.ndarray) else joints
+        array = isinstance(joints, Array | np.ndarray)
+        given: Any = joints.tolist() if array else joints
         numbers = given if isinstance(given, list | tuple) else (given,)
         if not numbers or any(
             isinstance(n, bool) or not isinstance(n, int) or n not in _NUMBERS
