@@ -263,7 +263,7 @@ def _parsed(content: bytes) -> Any:
         raise refusal(f'"{_PACKAGE}"', 'the version of the library, as "0.2"', version)
     if [*map(int, parts.groups())] > [*map(int, __version__.split(".")[:2])]:
         raise refusal(f'"{_PACKAGE}"', f"{__version__} or an older version", version)
-    return file
+    return file["value"] if [*file] == ["value"] else file
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -293,8 +293,6 @@ def _value(place: str, node: Any, classes: Sequence[type]) -> Any:
     if len(node) != 1:
         raise refusal(place, "an object by its name alone", list(node)[:20])
     [(name, inner)] = node.items()
-    if name == "value" and place == "tree":
-        return at("", inner)
     if name in ("tuple", "batch") and isinstance(inner, list):
         items = tuple(at(f"[{i}]", item) for i, item in enumerate(inner))
         return items if name == "tuple" else _batch(place, items)
