@@ -50,7 +50,7 @@ class Half(fj.Element):
         return self.twice
 
 
-class Told(Half):
+class Explicit(Half):
     def arguments(self):
         return {"once": self.twice / 2}
 
@@ -65,7 +65,7 @@ class Plain:
     number: Any
 
 
-OWN = elements.Swing, elements.Hold, Push, Told, Pair, Plain
+OWN = elements.Swing, elements.Hold, Push, Explicit, Pair, Plain
 
 
 @pytest.fixture
@@ -169,7 +169,7 @@ TREES = {
     "limits": fj.tuning.Limits(overshoot=0.05),
     "prices": fj.tuning.Tracking(effort=0.1),
     "state of a drive": DriveState(jnp.array([0.1]), ()),
-    "own": Pair(Push(jnp.ones(3), "own"), Told(jnp.array([1.0, 2.0]))),
+    "own": Pair(Push(jnp.ones(3), "own"), Explicit(jnp.array([1.0, 2.0]))),
     "nested": {"b": (), "a": ({"": None}, ((1,), "x"), (2, None))},
     "text": 'a "\n\u2202\ud800',
 }
@@ -336,7 +336,7 @@ UNSAVED = {
     "objects": (np.array([None]), "real numbers"),
     "texts": (np.array(["a"]), "real numbers"),
     "structured": (np.zeros(2, [("a", "f8")]), "real numbers"),
-    "masked": (np.ma.zeros(2), "real numbers.*masked_array"),
+    "masked": (np.ma.zeros(2), "real numbers.*masked"),
     "empty": (np.zeros((0, 3)), "at least one"),
     "deleted": (deleted, "real numbers"),
     "random key": (jax.random.key(3), "real numbers"),

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .. import __version__
-from ..base.checks import is_traced, plain, refusal, shown
+from ..base.checks import is_traced, numpy_array, plain, refusal, shown
 from ..base.frozen import Frozen
 from ..base.user_warnings import without_warning
 from ..base.whole_files import file_path, whole_file
@@ -180,13 +180,12 @@ def _numbers(place: str, value: Any) -> Any:
     if is_traced(value):
         raise refusal(place, _KNOWN, value)
     try:
-        array = np.asarray(value)
-    except (RuntimeError, TypeError) as error:  # deleted, elsewhere, or random keys
+        array = numpy_array(value)
+    except (RuntimeError, TypeError) as error:  # deleted, masked, or random keys
         raise refusal(place, "real numbers", error) from error
     if jnp.issubdtype(array.dtype, jnp.floating):  # also bfloat16
         array = array.astype(float)
-    masked = isinstance(value, np.ma.MaskedArray)
-    if array.dtype.kind not in _DTYPES or not array.size or masked:
+    if array.dtype.kind not in _DTYPES or not array.size:
         raise refusal(place, "real numbers, at least one", value)
     if array.dtype.kind == "f" and not np.isfinite(array).all():
         finite = np.isfinite(array)
@@ -310,9 +309,8 @@ def _value(place: str, node: Any, classes: Sequence[type]) -> Any:
     except ValueError as error:  # whose text begins with the argument
         raise ValueError(f"{place}.{error}") from error
     except _MEANT as error:
-        expected = f"the arguments of {name}"
-        problem = f"{place}: expected {expected}, got {plain(str(error))}."
-        raise ValueError(problem) from error
+        problem = f"the arguments of {name}, got {plain(str(error))}"
+        raise ValueError(f"{place}: expected {problem}.") from error
 
 
 def _batch(place: str, members: tuple[Any, ...]) -> Any:
