@@ -277,8 +277,4 @@ def test_nothing_else_is_asked_for_attributes():
         for path in folder.rglob("*.py")
         if "hasattr(" in path.read_text() or "getattr(" in path.read_text()
     }
-    assert asking == {
-        "linkage/fields.py",
-        "data/tree_description.py",
-        "batches/provenance.py",
-    }
+    assert asking == {"linkage/fields.py", "data/files.py", "batches/provenance.py"}

@@ -237,7 +237,7 @@ def test_the_shock_removes_residual_vibration():
 
 def test_malformed_motions_are_refused():
     hold = Push(jnp.array(0.0), jnp.array(0.0))
-    for joints in (0, 9, (1, 0), 1.0, (), [1, 2], True):
+    for joints in (0, 9, (1, 0), 1.0, (), [1, 2.0], True):
         with pytest.raises(ValueError, match="joints: expected"):
             fj.PrescribedMotion(joints, hold)
     with pytest.raises(ValueError, match="reference: expected a callable"):

@@ -4,6 +4,7 @@ import contextlib
 import os
 import re
 import secrets
+import stat
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -15,7 +16,7 @@ _SCHEME = re.compile("[A-Za-z][A-Za-z0-9+.-]+:/")
 
 
 def local_path(name: str, value: Any, expected: str) -> Path:
-    """Returns the path on this machine that the argument `name` gives.
+    """Returns the path on this machine that the argument `name` gives; `~` is a home.
 
     Raises ValueError for what is no path, an empty one, and an address.
     """
@@ -24,7 +25,10 @@ def local_path(name: str, value: Any, expected: str) -> Path:
         raise refusal(name, expected, value)
     if _SCHEME.match(path):
         raise refusal(name, f"{expected} on this machine, no address", value)
-    return Path(path)
+    try:
+        return Path(path).expanduser()
+    except RuntimeError:
+        raise refusal(name, f"{expected} in a home that exists", value) from None
 
 
 def file_path(name: str, value: Any) -> Path:
@@ -32,12 +36,14 @@ def file_path(name: str, value: Any) -> Path:
     path = local_path(name, value, "a path")
     if not os.path.basename(value) or path.is_dir():  # such as a/
         raise refusal(name, "the path of a file, not of a folder", value)
+    if path.exists() and not path.is_file():
+        raise refusal(name, "the path of a file, not of a pipe or a device", value)
     return path
 
 
 def folder_path(name: str, value: Any) -> Path:
     """Returns the folder that the argument `name` gives, and makes it if need be."""
-    folder = local_path(name, value, "a folder").expanduser()
+    folder = local_path(name, value, "a folder")
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -53,15 +59,19 @@ def whole_file(path: Path) -> Iterator[BinaryIO]:
     """Opens a new file and replaces that at `path` when the block ends without error.
 
     Until then it has a name that no other process uses; after an error it is removed.
-    An OSError names `path`.
+    The new file has the permissions of the old one, and a link at `path` stays. An
+    OSError names `path`.
     """
-    unfinished = path.with_name(f"{path.name}.{secrets.token_hex(4)}.part")
+    target = Path(os.path.realpath(path))
+    unfinished = target.with_name(f"{target.name}.{secrets.token_hex(4)}.part")
     try:
         with unfinished.open("xb") as file:
+            with contextlib.suppress(FileNotFoundError):
+                unfinished.chmod(stat.S_IMODE(path.stat().st_mode))
             yield file
             file.flush()
             os.fsync(file.fileno())
-        os.replace(unfinished, path)
+        os.replace(unfinished, target)
     except OSError as error:
         if error.errno is None:  # not of the system
             raise

@@ -1,188 +1,337 @@
-"""Saving the library's pytrees in a file, and loading them without a template.
+"""Files of JSON that hold scenes, elements and results as a person would write them."""
 
-A file is a zip archive. Its `description.json` holds the tree and the versions that
-wrote it; each array is a member in NumPy's `.npy` format.
-"""
-
-import io
+import dataclasses
+import importlib
 import json
+import math
 import os
-import struct
-import zipfile
-import zlib
+import re
 from collections.abc import Sequence
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..base.checks import plain, shown
+from .. import __version__
+from ..base.checks import is_traced, numpy_array, plain, refusal, shown
+from ..base.frozen import Frozen
+from ..base.user_warnings import without_warning
 from ..base.whole_files import file_path, whole_file
-from ..batches.versions import VERSIONS
-from .tree_description import Restorer, Unreadable, described
+from ..linkage.linkage import Linkage
+from ..linkage.topology import letters
+from ..simulation.sampled import Motion
+from ..simulation.scene import stacked
 
-_FORMAT, _VERSION = "fdof_jax", 1
-_DESCRIPTION = "description.json"
-# `save` does not compress, but another program may have compressed a file afterwards.
-_EXPANSION = 16
-# What zipfile, NumPy, JSON and `Restorer` raise for a damaged file. Other errors, for
-# instance of a device or of memory, say nothing about the file.
-_DAMAGED = (
-    zipfile.BadZipFile, EOFError, LookupError, ValueError, TypeError, AttributeError,
-    struct.error, zlib.error, RecursionError, NotImplementedError,
-)  # fmt: skip
-
-
-def _read(file: Any, classes: Sequence[type]) -> Any:
-    if file.read(2) != b"PK":
-        raise Unreadable("expected a file that fdof_jax.save has written, got another")
-    with zipfile.ZipFile(file) as archive:
-        if _DESCRIPTION not in archive.namelist():
-            raise Unreadable(
-                "expected a file that fdof_jax.save has written, got another archive"
-            )
-        _check_sizes(file, archive.infolist())
-        description = json.loads(_content(archive, _DESCRIPTION))
-        if description["format"] != _FORMAT:
-            raise Unreadable(
-                f"expected the format {_FORMAT}, got {description['format']}"
-            )
-        if description["version"] > _VERSION:
-            writer = description["written by"][_FORMAT]
-            raise Unreadable(
-                f"expected version {_VERSION} of the format, got "
-                f"{description['version']}: fdof_jax {writer}, which wrote it, "
-                "or a newer version can read it"
-            )
-
-        unread = set(archive.namelist())
-
-        def array(index: int) -> np.ndarray:
-            # Each array has one place, which limits their memory.
-            unread.remove(name := f"arrays/{index}.npy")
-            return _array(_content(archive, name))
-
-        return Restorer(array, classes).tree(description["tree"])
-
-
-def _check_sizes(file: Any, members: Sequence[zipfile.ZipInfo]) -> None:
-    """Raises Unreadable if the members may take much more memory than the file."""
-    size = os.stat(file.fileno()).st_size
-    known, encrypted = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED), 1
-    for member in members:
-        within = 0 <= member.header_offset < size
-        plain = member.compress_type in known and not member.flag_bits & encrypted
-        if not within or not plain:
-            raise Unreadable(
-                "expected contents that fdof_jax.save has written, got "
-                f"{member.filename} encrypted, compressed in another way or damaged"
-            )
-    declared = sum(member.file_size for member in members)
-    if declared > _EXPANSION * size:
-        raise Unreadable(
-            f"expected contents of at most {_EXPANSION} times the {size} bytes of the "
-            f"file, got {declared} bytes: it is damaged"
-        )
-
-
-def _content(archive: zipfile.ZipFile, name: str) -> bytes:
-    with archive.open(name) as member:
-        # Without a number zipfile would inflate more than the member declares.
-        return member.read(archive.getinfo(name).file_size)
-
-
-def _array(content: bytes) -> np.ndarray:
-    """Returns the array of a `.npy` file of the version that `save` writes."""
-    member = io.BytesIO(content)
-    if np.lib.format.read_magic(member) != (1, 0):
-        raise ValueError("another version of NumPy's format")
-    shape, fortran, dtype = np.lib.format.read_array_header_1_0(member)
-    if dtype.hasobject or dtype.fields:
-        raise ValueError("an array of objects or structures")
-    # `read_array` would reserve what the header declares before it reads.
-    order = "F" if fortran else "C"
-    return np.ndarray(shape, dtype, content, member.tell(), order=order).copy("K")
+_PACKAGE = __name__.partition(".")[0]
+# Where classes are looked up. The package comes last, as it warns of names in rooms;
+# the states of drives and the histories of tuning are in no room's list.
+_PLACES = (
+    "forces control references analysis tuning identification control.drives "
+    "tuning.result".split()
+)
+_NOT_FINITE = {"inf": math.inf, "-inf": -math.inf, "nan": math.nan}
+_DTYPES = {"b": bool, "i": int, "u": np.uint64, "f": float}
+_KNOWN = "a known value: save outside of jit, vmap and grad"
+# What constructors raise for arguments of another kind. Errors of a device or of memory
+# say nothing about the file.
+_MEANT = ValueError, TypeError, LookupError, AttributeError, ArithmeticError
 
 
 def save(path: str | os.PathLike, tree: Any) -> None:
-    """Writes a pytree of the library to a file, for `load`.
+    """Writes scenes, elements, results or numbers to a file of JSON, for `load`.
 
-    An existing file is replaced atomically, when the new one is complete.
+    An object stands by its public name and the arguments of its constructor, so that
+    the file can be read, compared, sent, and written by hand:
+
+        {"fdof_jax": "0.2",
+         "State": {"q": [0.5, 0.0], "qd": [0.0, 0.0]}}
+
+    - An argument with a default may be absent.
+    - A list that begins with a number is an array; `"inf"`, `"-inf"` and `"nan"` are
+      numbers. Any other list is a tuple.
+    - `{"tuple": [...]}` is a tuple that begins with a number or an array,
+      `{"dict": {...}}` a dictionary, and `{"batch": [...]}` the members of an object
+      whose arrays all have a further leading axis.
+    - At the top, `"value"` names what is no object.
+
+    An existing file is replaced when the new one is complete. It keeps its permissions,
+    and a link to it stays.
 
     **Arguments:**
 
-    - `path`: path of the file; no suffix is added.
-    - `tree`: a `Scene`, a `Linkage`, force elements, a `Solution`, a `TuneResult`, an
-      `equinox.Module` of your own, or nested lists, tuples, dicts with strings as keys,
-      NamedTuples and dataclasses of these. Leaves are arrays of NumPy and JAX, numbers,
-      strings, None, random keys and functions of the library.
+    - `path`: path of the file, such as "scene.json"; no suffix is added.
+    - `tree`: a `Scene`, a `Linkage`, force elements, references, a `TuneResult`, a
+      `FitResult`, or tuples and dicts of these and of numbers, texts and arrays.
+      Instances of your own `Element`, `equinox.Module`, dataclass or NamedTuple are
+      saved if their constructor's arguments are fields, or a method `arguments` returns
+      them.
 
-    **Raises:** ValueError for parts that cannot be saved, with their place in the tree:
-    a lambda or another function of your own, a traced value, an object of another kind.
-    No file is then written, and an existing one is kept.
+    **Raises:** ValueError for what cannot be saved, with its place in the tree: a
+    function, a traced value, a `Solution` (use `to_xarray`), an object of another kind.
+    No file is then written, and an existing one is unchanged.
 
     >>> import fdof_jax as fj
     >>> import os, tempfile
-    >>> path = os.path.join(tempfile.mkdtemp(), "fig7.fdof")
-    >>> fj.save(path, fj.scenes.fig7())
-    >>> fj.load(path).linkage.length.tolist()
-    [0.0, 1.0, 2.5, 1.0]
+    >>> path = os.path.join(tempfile.mkdtemp(), "damper.json")
+    >>> fj.save(path, fj.JointDamper([1, 2, 3]))
+    >>> open(path).read()
+    '{"fdof_jax": "0.2", "JointDamper": {"coefficient": [1.0, 2.0, 3.0]}}\\n'
+    >>> fj.load(path)
+    JointDamper(coefficient=[1, 2, 3])
     """
     path = file_path("path", path)
-    arrays: list[np.ndarray] = []
     try:
-        tree_node = described("tree", tree, arrays)
+        node = _node("tree", tree)
     except RecursionError:
         raise ValueError(
             "tree: expected one without itself in it, got one nested without end."
         ) from None
-    description = {
-        "format": _FORMAT,
-        "version": _VERSION,
-        "written by": VERSIONS,
-        "default dtype": jnp.result_type(float).name,
-        "tree": tree_node,
-    }
-    text = json.dumps(description, allow_nan=False, indent=1)
-    with whole_file(path) as file, zipfile.ZipFile(file, "w") as archive:
-        archive.writestr(zipfile.ZipInfo(_DESCRIPTION), text)
-        for index, array in enumerate(arrays):
-            info = zipfile.ZipInfo(f"arrays/{index}.npy")
-            with archive.open(info, "w", force_zip64=True) as member:
-                np.lib.format.write_array(member, array, allow_pickle=False)
+    version = {_PACKAGE: ".".join(__version__.split(".")[:2])}
+    text = _text(version | (node if isinstance(node, dict) else {"value": node}))
+    with whole_file(path) as file:
+        file.write(text.encode() + b"\n")
 
 
 def load(path: str | os.PathLike, classes: Sequence[type] = ()) -> Any:
-    """Loads the pytree that `save` wrote to a file, equal to the last bit.
+    """Loads what `save` or a person wrote to a file.
 
-    Its structure is also equal, so that programs compiled for the saved tree serve the
-    loaded one. Nothing in the file is executed, and no constructor is called.
+    Objects are made by their constructors, which check their arguments. Nothing else is
+    executed, and the memory is a small multiple of the file's size.
 
     **Arguments:**
 
     - `path`: path of the file.
-    - `classes`: a tuple of your own classes with saved instances.
+    - `classes`: a tuple of your own classes that the file names.
 
-    **Returns:** the tree; its JAX arrays are on the default device.
+    **Returns:** the tree, on the default device. Numbers are equal to the last bit.
+    Arrays have JAX's default dtypes: float64 with double precision, float32 without,
+    integers and booleans. An array without axes is a Python number, and a list a tuple,
+    unless the constructor converts it.
 
-    **Raises:** FileNotFoundError if there is no file. ValueError if the file was not
-    written by `save`, is damaged or cut short, has a newer format, holds a class that
-    is unknown or has other fields, or holds arrays in double precision while JAX has it
-    disabled; the message names the file and the reason. A file that holds far
-    more than its size is refused before it is read.
+    **Raises:** FileNotFoundError if there is no file. ValueError, with the file and
+    the place in it, if it is no JSON or cut short, is of a newer version, names unknown
+    classes or arguments, or if a constructor raises it.
     """
     path = file_path("path", path)
     if not isinstance(classes, tuple | list) or not all(
         isinstance(c, type) for c in classes
     ):
-        raise ValueError(f"classes: expected a tuple of classes, got {shown(classes)}.")
-    with path.open("rb") as file:
+        raise refusal("classes", "a tuple of classes", classes)
+    content = path.read_bytes()
+    try:
+        return _value("tree", _parsed(content), classes)
+    except RecursionError:
+        problem = "expected less nesting."
+    except ValueError as error:
+        problem = str(error)
+    raise ValueError(f"{plain(str(path))}: {problem}")
+
+
+def _public(name: str) -> Any:
+    """Returns the library's class of that name, if its instances can be saved."""
+    for place in (*_PLACES, ""):
+        module = importlib.import_module(f"{_PACKAGE}.{place}".rstrip("."))
+        # Other names than those of classes might import the pictures.
+        kind = getattr(module, name, None) if re.match(r"[A-Z]\w*$", name) else None
+        if isinstance(kind, type) and kind.__module__.startswith(f"{_PACKAGE}."):
+            return kind if _is_record(kind) else None
+    return None
+
+
+def _is_record(kind: type) -> bool:
+    fields = dataclasses.is_dataclass(kind) or hasattr(kind, "_asdict")
+    return fields and not issubclass(kind, Motion)
+
+
+def _begins_with_number(items: Any) -> bool:
+    while isinstance(items, list) and items:
+        items = items[0]
+    return isinstance(items, int | float) or items in ("inf", "-inf", "nan")
+
+
+# From the tree to JSON
+
+
+def _node(place: str, value: Any) -> Any:
+    kind = type(value)
+    if value is None or kind in (bool, int) or kind is str and value not in _NOT_FINITE:
+        return value
+    if kind in (list, tuple):
+        items = [_node(f"{place}[{i}]", item) for i, item in enumerate(value)]
+        return {"tuple": items} if _begins_with_number(items) else items
+    if kind is dict and all(isinstance(key, str) for key in value):
+        items = {k: _node(f"{place}[{shown(k)}]", v) for k, v in value.items()}
+        return {"dict": items}
+    if kind is float or isinstance(value, jax.Array | np.ndarray | np.generic):
+        return _numbers(place, value)
+    if isinstance(value, Motion):
+        expected = "no motion: to_xarray makes a Dataset of it, which to_netcdf saves"
+        raise refusal(place, expected, value)
+    if not _is_record(kind):
+        expected = "numbers, arrays, texts, or tuples, dicts by text, objects of such"
+        if callable(value):
+            expected += "; an equinox.Module with a __call__ in place of a function"
+        raise refusal(place, expected, value)
+    return _object(place, value)
+
+
+def _numbers(place: str, value: Any) -> Any:
+    if is_traced(value):
+        raise refusal(place, _KNOWN, value)
+    try:
+        array = numpy_array(value)
+    except (RuntimeError, TypeError) as error:  # deleted, masked, or random keys
+        raise refusal(place, "real numbers", error) from error
+    if jnp.issubdtype(array.dtype, jnp.floating):  # also bfloat16
+        array = array.astype(float)
+    if array.dtype.kind not in _DTYPES or not array.size:
+        raise refusal(place, "real numbers, at least one", value)
+    if array.dtype.kind == "f" and not np.isfinite(array).all():
+        finite = np.isfinite(array)
+        array = np.where(finite, array.astype(object), array.astype(str))
+    return array.tolist()
+
+
+def _object(place: str, value: Any) -> dict[str, Any]:
+    kind, name = type(value), type(value).__name__
+    public = _public(name)
+    if public is not kind and (public or kind.__module__.startswith(f"{_PACKAGE}.")):
+        expected = "an object of a public class, or of your own of another name"
+        raise refusal(place, expected, kind)
+    if isinstance(value, tuple):
+        arguments = value._asdict()  # pyright: ignore[reportAttributeAccessIssue]
+    else:
+        for keys, leaf in jax.tree_util.tree_leaves_with_path(value):
+            if is_traced(leaf):
+                raise refusal(f"{place}{jax.tree_util.keystr(keys)}", _KNOWN, leaf)
         try:
-            return _read(file, classes)
-        except Unreadable as problem:
-            raise ValueError(f"{plain(str(path))}: {problem}.") from None
-        except _DAMAGED as error:
-            raise ValueError(
-                f"{plain(str(path))}: expected a whole file, got one that is damaged "
-                f"or cut short ({type(error).__name__}: {error})."
-            ) from error
+            arguments = getattr(kind, "arguments", Frozen.arguments)(value)
+            with without_warning(""):  # which came when it was made
+                kind(**arguments)  # as `load` does
+        except _MEANT as error:
+            if not (members := _members(value)):
+                expected = f"a {name} that its constructor accepts, or a batch with a"
+                problem = f"{expected} leading axis on every array; {plain(str(error))}"
+                raise ValueError(f"{place}: expected {problem}") from error
+            rows = enumerate(members)
+            return {"batch": [_object(f"{place}[{i}]", member) for i, member in rows]}
+    if isinstance(value, Linkage):
+        arguments["topology"] = letters(value.ef)
+    return {name: {k: _node(f"{place}.{k}", v) for k, v in arguments.items()}}
+
+
+def _members(batch: Any) -> list[Any]:
+    """Returns the members of a batch; none unless all leaves have a common axis."""
+    leaves, structure = jax.tree.flatten(batch)
+    sizes = {np.shape(leaf)[:1] for leaf in leaves}
+    if len(sizes) != 1 or sizes <= {(), (0,)}:
+        return []
+    rows = zip(*map(np.asarray, leaves))
+    return [structure.unflatten(jax.device_put(list(row))) for row in rows]
+
+
+def _text(node: Any, indent: str = "", before: str = "") -> str:
+    """Returns JSON in which all that fits into a line stands on one."""
+    line = before + json.dumps(node)
+    if len(indent + line) < 88 or not isinstance(node, dict | list):
+        return line
+    inner = f"{indent}  "
+    if isinstance(node, dict):
+        rows = [_text(v, inner, f"{json.dumps(k)}: ") for k, v in node.items()]
+    else:
+        rows = [_text(item, inner) for item in node]
+    body, first = f",\n{inner}".join(rows), line[len(before)]
+    return f"{before}{first}\n{inner}{body}\n{indent}{line[-1]}"
+
+
+# From JSON to the tree
+
+
+def _parsed(content: bytes) -> Any:
+    try:
+        file = json.loads(
+            content.decode("utf-8-sig"), object_pairs_hook=_unique,
+            parse_float=_finite, parse_constant=_finite,
+        )  # fmt: skip
+    except ValueError as error:
+        raise ValueError(f"expected JSON, got {plain(str(error))}.") from None
+    version = file.pop(_PACKAGE, None) if isinstance(file, dict) else None
+    parts = re.match(r"(\d{1,9})\.(\d{1,9})", version if type(version) is str else "")
+    if parts is None:
+        raise refusal(f'"{_PACKAGE}"', 'the version of the library, as "0.2"', version)
+    if [*map(int, parts.groups())] > [*map(int, __version__.split(".")[:2])]:
+        raise refusal(f'"{_PACKAGE}"', f"{__version__} or an older version", version)
+    return file["value"] if [*file] == ["value"] else file
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    members = dict(pairs)
+    if len(members) < len(pairs):
+        names = shown([name for name, _ in pairs])
+        raise ValueError(f"a name twice in one object, of {names}")
+    return members
+
+
+def _finite(text: str) -> float:
+    if not math.isfinite(value := float(text)):
+        raise ValueError(f'{plain(text)}, which is no number ("inf" and "nan" are)')
+    return value
+
+
+def _value(place: str, node: Any, classes: Sequence[type]) -> Any:
+    at = lambda step, inner: _value(f"{place}{step}", inner, classes)
+    if isinstance(node, list):
+        if _begins_with_number(node):
+            return _array(place, node)
+        return tuple(at(f"[{i}]", item) for i, item in enumerate(node))
+    if isinstance(node, str):
+        return _NOT_FINITE.get(node, node)
+    if not isinstance(node, dict):
+        return node
+    if len(node) != 1:
+        raise refusal(place, "an object by its name alone", list(node)[:20])
+    [(name, inner)] = node.items()
+    if name in ("tuple", "batch") and isinstance(inner, list):
+        items = tuple(at(f"[{i}]", item) for i, item in enumerate(inner))
+        return items if name == "tuple" else _batch(place, items)
+    if not isinstance(inner, dict):
+        raise refusal(f"{place}.{plain(name)}", "named arguments", inner)
+    if name == "dict":
+        return {key: at(f"[{shown(key)}]", item) for key, item in inner.items()}
+    own = [kind for kind in classes if kind.__name__ == name]
+    if not (kind := _public(name)) and len(own) != 1:
+        expected = "a class of fdof_jax, or one of load(path, classes=(MyElement,))"
+        raise refusal(place, expected, name)
+    arguments = {key: at(f".{plain(key)}", item) for key, item in inner.items()}
+    try:
+        return (kind or own[0])(**arguments)
+    except ValueError as error:  # whose text begins with the argument
+        raise ValueError(f"{place}.{error}") from error
+    except _MEANT as error:
+        problem = f"the arguments of {name}, got {plain(str(error))}"
+        raise ValueError(f"{place}: expected {problem}.") from error
+
+
+def _batch(place: str, members: tuple[Any, ...]) -> Any:
+    arrays = lambda leaf: jax.device_put(leaf) if isinstance(leaf, np.ndarray) else leaf
+    return jax.tree.map(arrays, stacked(members, place))
+
+
+def _array(place: str, node: list[Any]) -> jax.Array:
+    try:
+        numbers = _floats(node)
+        dtype = jnp.result_type(_DTYPES[np.asarray(numbers).dtype.kind])
+        return jax.device_put(np.asarray(numbers, dtype))
+    except (ValueError, LookupError, OverflowError):
+        raise refusal(place, "numbers in lists of one length", node) from None
+
+
+def _floats(node: Any) -> Any:
+    """Returns nested lists of numbers with floats in the place of their names."""
+    if isinstance(node, list):
+        return [_floats(item) for item in node]
+    if isinstance(node, int | float):
+        return node
+    # NumPy would reserve the longest text for each number.
+    return _NOT_FINITE[node if isinstance(node, str) else ""]

@@ -137,16 +137,18 @@ class Spline(Path):
         if count < 3:
             raise ValueError(f"points: expected three or more, got {count}.")
         # The slopes of neighbouring cubics meet: b[k-1] + 4 b[k] + b[k+1] = 6 d2[k].
-        rows = np.eye(count)
-        matrix = 4 * rows + np.roll(rows, 1, axis=1) + np.roll(rows, -1, axis=1)
         p = in_numpy(self.points)
         xp = namespace(p)
         right = 6 * (xp.roll(p, 1, axis=0) - 2 * p + xp.roll(p, -1, axis=0))
-        if not closed:
+        if not closed:  # no bend at the ends: half of a closed one that turns over
             ends = np.isin(np.arange(count), [0, count - 1])[:, None]
-            matrix = np.where(ends, rows, matrix)
             right = xp.where(ends, 0, right)
-        self.bends = jnp.asarray(xp.linalg.solve(matrix, right), dtype=float)
+            right = xp.concatenate([right, -right[-2:0:-1]])
+        waves = xp.fft.rfft(right, axis=0)
+        turns = 2 * np.pi * np.arange(len(waves))[:, None] / len(right)
+        waves = waves / (4 + 2 * np.cos(turns)).astype(waves.dtype)
+        bends = xp.fft.irfft(waves, len(right), axis=0)[:count]
+        self.bends = jnp.asarray(bends, dtype=float)
 
     @property
     def middle(self) -> Array:

@@ -4,7 +4,7 @@ The state holds the momenta of the driven joints instead of their velocities, be
 momenta are continuous where a prescribed velocity jumps.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float
+from numpy.typing import ArrayLike
 
 from ..base.array_namespace import in_numpy, namespace
 from ..base.checks import place_of, shown
@@ -53,7 +54,7 @@ class PrescribedMotion(Element):
 
     **Arguments:**
 
-    - `joints`: the number of a prescribed joint, from 1, or a tuple of such numbers.
+    - `joints`: the number of a prescribed joint, from 1, or several such numbers.
     - `reference`: `(t, linkage) -> (q, qd)`, as for a `PDController`; values for other
       joints and for fixed pairs are ignored. The positions must be continuous and equal
       those of `state0` at the start of a simulation; the velocities must be their
@@ -65,22 +66,24 @@ class PrescribedMotion(Element):
     moved: Bool[Array, " number"]
     reference: Any = called(EXPECTED)
 
-    def __init__(self, joints: int | tuple[int, ...], reference: Any):
-        numbers = joints if isinstance(joints, tuple) else (joints,)
+    def __init__(self, joints: ArrayLike | Sequence[int], reference: Any):
+        array = isinstance(joints, Array | np.ndarray)
+        given: Any = joints.tolist() if array else joints
+        numbers = given if isinstance(given, list | tuple) else (given,)
         if not numbers or any(
             isinstance(n, bool) or not isinstance(n, int) or n not in _NUMBERS
             for n in numbers
         ):
             raise ValueError(
-                f"joints: expected a number of 1 to {_NUMBERS[-1]}, or a tuple of "
+                f"joints: expected a number of 1 to {_NUMBERS[-1]}, or several "
                 f"such, got {shown(joints)}."
             )
         self.moved = jax.device_put(np.isin(_NUMBERS, numbers))
         self.reference = reference
 
     def arguments(self) -> dict[str, Any]:
-        joints = tuple(n for n, moved in zip(_NUMBERS, self.moved) if moved)
-        return {"joints": joints, "reference": self.reference}
+        joints = [n for n, moved in zip(_NUMBERS, self.moved) if moved]
+        return {"joints": np.array(joints), "reference": self.reference}
 
     def of(self, linkage: Linkage) -> Array:
         """Returns whether each joint of an arm is prescribed; a fixed pair is not."""
