@@ -19,6 +19,7 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
+from ..base.array_namespace import in_numpy
 from ..base.checks import (
     function,
     hashable,
@@ -31,7 +32,6 @@ from ..base.checks import (
     shown,
     whole_number,
 )
-from ..base.devices import devices_outside_mesh, uncommitted
 from ..base.functions import sharing_functions
 from ..base.whole_files import folder_path
 from ..forces.element import Forces, elements, elements_on
@@ -41,12 +41,9 @@ from ..simulation.simulate import solve_options
 from ..simulation.solution import Solution
 from ..steps.dopri8 import constant
 from .batch_axes import Batch, batch_of, check_arms
-from .checkpoints import Checkpoint
-from .chunk_programs import outcome_of
-from .chunks import Job, in_chunks, usual_chunk
-from .forecast import expected_work
-from .provenance import outline
-from .store import Store, in_store
+from .chunk_programs import expected_work, outcome_of
+from .chunks import Job, devices_outside_mesh, in_chunks, usual_chunk
+from .store import Store, in_store, outline
 
 
 def _without_times(solution: Solution) -> Solution:
@@ -129,7 +126,6 @@ def sweep(
     reduce: Callable[[Solution], Any] | None = None,
     chunk: int | None = None,
     throw: bool = False,
-    checkpoint: str | os.PathLike | None = None,
     store: str | os.PathLike | None = None,
     shard: int = 0,
     of: int = 1,
@@ -146,8 +142,7 @@ def sweep(
     """Computes many motions, as `jax.vmap(simulate)` does, but faster.
 
     A member that fails ends early with a result of its own, and slow members delay few
-    others. Runs on all devices that JAX sees. With `jax.distributed`, call `sweep` with
-    the same arguments in every process; each returns the whole solution.
+    others. Runs on all devices of this process.
 
     **Arguments:**
 
@@ -159,18 +154,15 @@ def sweep(
       tuple of these with one entry per element.
     - `reduce`: a function of one member's `Solution`, for instance
       `lambda motion: motion.q[-1]`; of each member only the arrays that it returns are
-      kept, also in a checkpoint. Functions of equal code share a compiled program.
+      kept. Functions of equal code share a compiled program.
     - `chunk`: largest number of members to solve together, per device. None stands for
-      128; or 256 where a CPU has several cores, unless the results go to a checkpoint
-      or store, which any machine may resume.
+      128; or 256 where a CPU has several cores, unless the results go to a store,
+      which any machine may resume.
     - `throw`: whether to raise an error if any member fails.
-    - `checkpoint`: a folder for the results of finished chunks. A repeated call resumes
-      from them. A file that is damaged, or of another chunk, is reported by a warning,
-      and its members are solved again.
     - `store`: a folder for the results, which are not held in memory: a Zarr group for
-      `xarray.open_zarr`, written in blocks of members. A repeated call solves only the
-      blocks that are missing or damaged; a warning names damaged files. A folder with
-      another sweep, or anything else, is refused.
+      `xarray.open_zarr`, written in blocks of members (`fdof_jax[data]` brings zarr). A
+      repeated call solves only the blocks that are missing or damaged; a warning names
+      damaged files. A folder with another sweep, or anything else, is refused.
     - `shard`, `of`: with `store`, solves only each block whose number is `shard` modulo
       `of`. Any number of processes may fill one store, in any order.
     - `solver`, `rtol`, `atol`, `max_step`, `stepsize_controller`, `dt0`, `adjoint`,
@@ -184,9 +176,10 @@ def sweep(
     Finding them takes one more solve, without derivatives. With `store`, its path.
 
     **Raises:** ValueError for malformed arguments; RuntimeError, with `throw=True`, if
-    a member fails.
+    a member fails; ImportError, with `store`, where zarr is not installed.
     """
-    linkage, state0, forces = uncommitted((linkage, state0, forces))
+    # Arrays may be on any devices; chunks of them go to those of the sweep.
+    linkage, state0, forces = in_numpy((linkage, state0, forces))
     check_arms(linkage)
     try:
         q, qd = (jnp.asarray(a) if is_traced(a) else numpy_array(a) for a in state0)
@@ -209,8 +202,6 @@ def sweep(
         raise refusal("shard", f"a whole number below of={of}", shard)
     if store is None and of > 1:
         raise refusal("store", "a folder, as of is given", store)
-    if store is not None and checkpoint is not None:
-        raise refusal("checkpoint", "None beside a store, which resumes", checkpoint)
     settings = solve_options(
         solver=solver,
         rtol=rtol,
@@ -227,8 +218,7 @@ def sweep(
     batch = batch_of(linkage, state0, forces, forces_axes)
     traced = is_transformed()
     if chunk is None:
-        resumable = checkpoint is not None or store is not None
-        chunk = usual_chunk(anywhere=traced or resumable)
+        chunk = usual_chunk(anywhere=traced or store is not None)
     if forces:
         _check_elements(batch, ts, forces_axes)
     keep = _without_times if reduce is None else function("reduce", reduce)
@@ -248,10 +238,9 @@ def sweep(
         return dataclasses.replace(kept, ts=times)
 
     if traced:
-        if throw or checkpoint is not None or store is not None:
+        if throw or store is not None:
             raise ValueError(
-                "throw, checkpoint, store: expected their defaults under jit, grad or "
-                "vmap."
+                "throw, store: expected their defaults under jit, grad or vmap."
             )
         return whole(_traced(batch, ts, settings, keep, chunk))
     with devices_outside_mesh() as devices:
@@ -269,11 +258,6 @@ def sweep(
             blocks = range(shard, group.count, of)
             check(solved(lambda job: in_store(group, blocks, job, progress_meter)))
             return folder
-        resumed = None
-        if checkpoint is not None:
-            folder = folder_path("checkpoint", checkpoint)
-            _, digest = outline(batch, ts, settings, keep)
-            resumed = Checkpoint(folder, digest)
-        kept, failed = solved(lambda job: in_chunks(job, resumed, progress_meter))
+        kept, failed = solved(lambda job: in_chunks(job, progress_meter))
     check(np.flatnonzero(failed))
     return whole(kept)
