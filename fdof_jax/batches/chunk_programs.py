@@ -94,18 +94,22 @@ class Form(NamedTuple):
         return jax.vmap(member, axis_name=_AXIS)(lanes)
 
 
-def form_of(moving: Any, lanes: int, rest: Any) -> Form:
-    """Returns the form of the program that solves so many members at once."""
+def form_of(moving: Any, lanes: int, rest: Any) -> tuple[Form, list[Any]]:
+    """Returns the form of the program for so many members, and the arrays of `rest`."""
 
     def kind(array: Any, shape: tuple[int, ...]) -> jax.ShapeDtypeStruct:
+        dtype = jax.dtypes.canonicalize_dtype(array.dtype, allow_extended_dtype=True)
         weak = getattr(array, "weak_type", False)
-        return jax.ShapeDtypeStruct(shape, array.dtype, weak_type=weak)
+        return jax.ShapeDtypeStruct(shape, dtype, weak_type=weak)
 
-    arrays, structure = jax.tree.flatten(moving)
-    kinds = (kind(a, (lanes, *a.shape[1:])) for a in arrays)
+    members, structure = jax.tree.flatten(moving)
+    kinds = tuple(kind(a, (lanes, *a.shape[1:])) for a in members)
     leaves, others = jax.tree.flatten(rest)
-    leaves = (kind(x, x.shape) if eqx.is_array(x) else x for x in leaves)
-    return Form(structure, tuple(kinds), others, tuple(leaves))
+    arrays = [leaf for leaf in leaves if isinstance(leaf, Array | np.ndarray)]
+    for index, leaf in enumerate(leaves):
+        if isinstance(leaf, Array | np.ndarray):
+            leaves[index] = kind(leaf, leaf.shape)
+    return Form(structure, kinds, others, tuple(leaves)), arrays
 
 
 def _is_kind(leaf: Any) -> bool:

@@ -9,7 +9,6 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import diffrax
-import equinox as eqx
 import jax
 import numpy as np
 from jax import Array
@@ -72,17 +71,6 @@ def _lanes(members: int, chunk: int) -> int:
     return min(chunk, max(_SMALL, 1 << (members - 1).bit_length()))
 
 
-def _canonical(leaf: Any) -> Any:
-    """Returns an array of the dtype that JAX would give it."""
-    if isinstance(leaf, np.ndarray):
-        return np.asarray(leaf, jax.dtypes.canonicalize_dtype(leaf.dtype))
-    return leaf
-
-
-def _of_jax(leaf: Any) -> Any:
-    return jax.device_put(leaf) if isinstance(leaf, np.ndarray) else leaf
-
-
 def _forecast(job: Job, moving: Any, shared: Any) -> np.ndarray:
     """Returns the `expected_work` of all members; one program serves any number."""
     work = []
@@ -109,22 +97,30 @@ def _solved(
     if len(devices) == 1 and jax.default_backend() == "cpu":
         devices = devices * _cores()
     devices = devices[: len(chunks)]
-    arrays = list(filter(eqx.is_array, jax.tree.leaves(rest)))
-    form = form_of(moving, lanes, rest)
+    form, arrays = form_of(moving, lanes, rest)
+    leaves = jax.tree.leaves(moving)
+
+    def lanes_of(members: np.ndarray, device: Any) -> list[Array]:
+        rows = np.append(members, np.full(lanes - len(members), members[-1]))
+        return jax.device_put([leaf[rows] for leaf in leaves], device)
+
+    # Traces and transfers depend on settings that no other thread has.
+    programs = [lowered(form, device) for device in devices]
+    shared = [jax.device_put(arrays, device) for device in devices]
+    if len(devices) == 1:
+        program = compiled(programs[0])
+        for some in chunks:
+            yield some, _solve(program, lanes_of(some, devices[0]), shared[0])
+        return
     running: deque[tuple[np.ndarray, Future]] = deque()
     with ThreadPoolExecutor(len(devices)) as pool:
-        # The threads do not inherit this one's settings, such as the precision, on
-        # which tracing and transfers depend.
-        traces = [lowered(form, device) for device in dict.fromkeys(devices)]
-        programs = list(pool.map(compiled, traces)) * len(devices)
-        shared = [jax.device_put(arrays, device) for device in devices]
+        different = dict.fromkeys(programs)  # cores have one program in common
+        different = dict(zip(different, pool.map(compiled, different)))
         for number, some in enumerate(chunks):
             worker = number % len(devices)
-            rows = np.append(some, np.full(lanes - len(some), some[-1]))
-            own = [leaf[rows] for leaf in jax.tree.leaves(moving)]
-            own = jax.device_put(own, devices[worker])
-            future = pool.submit(_solve, programs[worker], own, shared[worker])
-            running.append((some, future))
+            own = lanes_of(some, devices[worker])
+            program = different[programs[worker]]
+            running.append((some, pool.submit(_solve, program, own, shared[worker])))
             if len(running) > 2 * len(devices):
                 some, future = running.popleft()
                 yield some, future.result()
@@ -143,13 +139,13 @@ def in_chunks(
     """
     size = job.batch.size
     moving, shared = job.batch.split()
-    moving = jax.tree.map(_canonical, in_numpy(moving))  # NumPy cuts faster
-    rest = jax.tree.map(_of_jax, (job.settings, job.reduce, job.ts, shared))
+    moving = in_numpy(moving)  # NumPy cuts faster
+    rest = job.settings, job.reduce, job.ts, shared
     lanes = _lanes(-(-size // len(job.devices)), job.chunk)
     waiting = np.arange(size)
     if size > lanes:
         # The longest come first, so that no core waits long for another at the end.
-        waiting = np.argsort(_forecast(job, moving, rest[-1]))[::-1]
+        waiting = np.argsort(_forecast(job, moving, shared))[::-1]
     done, results, structure = 0, [], None
     progress = meter.init()
     while len(waiting):
