@@ -101,16 +101,6 @@ def _variables(like: Any, linkage: Linkage) -> list[Variable]:
     return [*variables, Variable("failed", np.dtype(bool), (), ["member"], {})]
 
 
-def _coordinates(linkage: Linkage, ts: Any) -> dict[str, tuple[np.ndarray, dict]]:
-    """Returns the coordinates of motions by their dimension, with attributes."""
-    names, units = names_and_units(linkage.ef)
-    joints = {"long_name": "joint", "names": names, "units_of_positions": units}
-    return {
-        "time": (np.asarray(ts), {"long_name": "time", "units": "s"}),
-        "joint": (np.arange(1, 1 + len(names), dtype="int32"), joints),
-    }
-
-
 class Store:
     """A folder that is a Zarr group, whose chunks along members are blocks.
 
@@ -154,29 +144,35 @@ class Store:
         self, zarr: Any, attributes: dict, linkage: Linkage, ts: Array, like: Any
     ) -> dict[str, bytes]:
         """Returns the files of the group without any member, the group's own first."""
-        memory, checked = {}, [zarr.codecs.Crc32cCodec()]
+        memory = {}
         group = zarr.create_group(zarr.storage.MemoryStore(memory))
-        for v in self.variables:
+
+        def create(name: str, axes: list[str], labels: dict, **given: Any) -> None:
             group.create_array(
+                name,
+                compressors=[zarr.codecs.Crc32cCodec()],
+                dimension_names=axes,
+                attributes=labels,
+                **given,
+            )
+
+        for v in self.variables:
+            create(
                 v.name,
+                v.dimensions,
+                v.attributes,
                 shape=(self.size, *v.shape),
                 chunks=(self.block, *(max(1, length) for length in v.shape)),
                 dtype=v.dtype,
                 fill_value=_FILL[v.dtype.kind],
-                compressors=checked,
-                dimension_names=v.dimensions,
-                attributes=v.attributes,
             )
         if isinstance(like, Solution):
-            for name, (values, labels) in _coordinates(linkage, ts).items():
-                group.create_array(
-                    name,
-                    data=values,
-                    chunks=values.shape,
-                    compressors=checked,
-                    dimension_names=[name],
-                    attributes=labels,
-                )
+            names, units = names_and_units(linkage.ef)
+            time = {"long_name": "time", "units": "s"}
+            create("time", ["time"], time, data=np.asarray(ts), chunks=ts.shape)
+            joint = {"long_name": "joint", "names": names, "units_of_positions": units}
+            numbers = np.arange(1, 1 + len(names), dtype="int32")
+            create("joint", ["joint"], joint, data=numbers, chunks=numbers.shape)
         files = {name: buffer.to_bytes() for name, buffer in memory.items()}
         # As `zarr.consolidate_metadata` does, which warns. xarray looks for it.
         arrays = {

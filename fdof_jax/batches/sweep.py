@@ -34,7 +34,7 @@ from ..base.checks import (
 )
 from ..base.functions import sharing_functions
 from ..base.whole_files import folder_path
-from ..forces.element import Forces, elements, elements_on
+from ..forces.element import Forces, elements
 from ..linkage.coordinates import State
 from ..linkage.linkage import Linkage
 from ..simulation.simulate import solve_options
@@ -70,16 +70,6 @@ def _traced(
             batch_size=chunk,
         )
 
-    def where(condition, tree):
-        """Returns the tree, constant for derivatives where `condition` is false."""
-
-        def guarded(leaf):
-            if not eqx.is_inexact_array(leaf):
-                return leaf
-            return jnp.where(condition, leaf, jax.lax.stop_gradient(leaf))
-
-        return jax.tree.map(guarded, tree)
-
     moving = jax.tree.map(lambda leaf: jnp.asarray(leaf)[order], moving)
     # A first solve finds the members that fail. In the differentiated solve the first
     # good member replaces them, because NaN would spoil derivatives of shared arrays.
@@ -87,7 +77,10 @@ def _traced(
     frozen, _, failed = constant(solved(*constant((moving, shared))))
     good = ~failed
     source = jnp.where(good, jnp.arange(batch.size), jnp.argmax(good))
-    moving, shared = where(jnp.any(good), (moving, shared))
+    moving, shared = jax.tree.map(
+        lambda a, b: jnp.where(jnp.any(good), a, b) if eqx.is_inexact_array(a) else a,
+        *((moving, shared), constant((moving, shared))),
+    )
     again, _, _ = solved(jax.tree.map(lambda leaf: leaf[source], moving), shared)
     back = jnp.argsort(order)
 
@@ -99,15 +92,8 @@ def _traced(
 
 def _check_elements(batch: Batch, ts: Array, forces_axes: Any) -> None:
     """Raises an error unless the force elements suit each member's linkage."""
-    moving, shared = batch.split()
-
-    def check_member(moving):
-        linkage, _, forces = eqx.combine(moving, shared)
-        elements_on(linkage, forces)  # what members share is known here
-
-    eqx.filter_eval_shape(eqx.filter_vmap(check_member), moving)
     try:
-        eqx.filter_eval_shape(expected_work, ts, moving, shared)
+        eqx.filter_eval_shape(expected_work, ts, *batch.split())
     except TypeError as error:
         raise TypeError(
             "forces, forces_axes: expected force elements that work for one member, "
