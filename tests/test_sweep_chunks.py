@@ -96,26 +96,6 @@ def test_cores_change_nothing(batch, monkeypatch):
         np.testing.assert_array_equal(a, b)
 
 
-def test_only_chunks_that_nothing_keeps_depend_on_the_cores(monkeypatch, tmp_path):
-    sizes = {}
-    for cores in (1, 2):
-        monkeypatch.setattr(chunks, "_cores", lambda cores=cores: cores)
-        sizes[cores] = [chunks.usual_chunk(anywhere=same) for same in (False, True)]
-    assert sizes == {1: [128, 128], 2: [256, 128]}
-    asked = []
-
-    def usual_chunk(anywhere):
-        asked.append(anywhere)
-        return 8
-
-    module = sys.modules["fdof_jax.batches.sweep"]
-    monkeypatch.setattr(module, "usual_chunk", usual_chunk)
-    speeds = np.linspace(0, 1, 8)
-    for keywords in ({}, {"store": tmp_path}):
-        swept(speeds, **keywords)
-    assert asked == [False, True]
-
-
 def test_a_slow_member_is_stopped_and_solved_alone(solved):
     speeds = np.linspace(0, 1, LANES)
     speeds[20] = 60

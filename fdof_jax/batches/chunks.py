@@ -31,14 +31,6 @@ def _cores() -> int:
     return os.cpu_count() or 1
 
 
-def usual_chunk(*, anywhere: bool) -> int:
-    """Returns the lanes of a chunk; `anywhere`: the same on every machine."""
-    # One core is fastest with 128. XLA splits operations among several, and what that
-    # costs pays only with more lanes.
-    several = jax.default_backend() == "cpu" and _cores() > 1
-    return 256 if several and not anywhere else 128
-
-
 @contextlib.contextmanager
 def devices_outside_mesh() -> Iterator[list[Any]]:
     """Yields this process's devices, of the mesh that is set or all; None if just one.

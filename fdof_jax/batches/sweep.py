@@ -42,8 +42,10 @@ from ..simulation.solution import Solution
 from ..steps.dopri8 import constant
 from .batch_axes import Batch, batch_of, check_arms
 from .chunk_programs import expected_work, outcome_of
-from .chunks import Job, devices_outside_mesh, in_chunks, usual_chunk
+from .chunks import Job, devices_outside_mesh, in_chunks
 from .store import Store, in_store, outline
+
+_CHUNK = 256  # on CPUs twice as many gain little
 
 
 def _without_times(solution: Solution) -> Solution:
@@ -141,9 +143,8 @@ def sweep(
     - `reduce`: a function of one member's `Solution`, for instance
       `lambda motion: motion.q[-1]`; of each member only the arrays that it returns are
       kept. Functions of equal code share a compiled program.
-    - `chunk`: largest number of members to solve together, per device. None stands for
-      128; or 256 where a CPU has several cores, unless the results go to a store,
-      which any machine may resume.
+    - `chunk`: largest number of members to solve together, per device; None stands for
+      256.
     - `throw`: whether to raise an error if any member fails.
     - `store`: a folder for the results, which are not held in memory: a Zarr group for
       `xarray.open_zarr`, written in blocks of members (`fdof_jax[data]` brings zarr). A
@@ -181,8 +182,7 @@ def sweep(
     elements("forces", forces)
     hashable("forces", forces)
     hashable("reduce", reduce)
-    if chunk is not None:
-        whole_number("chunk", chunk, 1)
+    chunk = _CHUNK if chunk is None else whole_number("chunk", chunk, 1)
     whole_number("of", of, 1)
     if whole_number("shard", shard, 0) >= of:
         raise refusal("shard", f"a whole number below of={of}", shard)
@@ -203,8 +203,6 @@ def sweep(
     del settings["progress_meter"]  # it counts finished members, not time
     batch = batch_of(linkage, state0, forces, forces_axes)
     traced = is_transformed()
-    if chunk is None:
-        chunk = usual_chunk(anywhere=traced or store is not None)
     if forces:
         _check_elements(batch, ts, forces_axes)
     keep = _without_times if reduce is None else function("reduce", reduce)
