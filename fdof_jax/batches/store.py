@@ -193,8 +193,7 @@ class Store:
         what = f"holds {min(names)}" if names else ""
         if path.exists():
             try:
-                group = json.loads(path.read_bytes())
-                there = group["attributes"]
+                there = json.loads(path.read_bytes())["attributes"]
                 others = [key for key in attributes if there[key] != attributes[key]]
                 what = f"has another {', '.join(others)}" if others else ""
             except ValueError:
@@ -221,23 +220,24 @@ class Store:
         """
         if not (self.folder / f"failed/c/{block}").exists():
             return None
-        damaged, values = [], np.empty(0)
+        damage, failed = [], None
         for variable, array in zip(self.variables, self.arrays):
-            if 0 in variable.shape:  # without a file
+            if not array.size:  # without a file
                 continue
-            path = self.folder / variable.name / "c" / str(block)
-            path = path.joinpath(*"0" * len(variable.shape))
+            file = "/".join(
+                [variable.name, "c", str(block), *"0" * len(variable.shape)]
+            )
             try:
-                values = array.blocks[block] if path.exists() else None
-            except ValueError:
-                values = None
-            if values is None:
-                damaged.append(str(path))
-        if not damaged:
-            return values
-        what = f"in {', '.join(damaged)} the results of block {block}"
-        self._warn(what, "solved again")
-        return None
+                if not (self.folder / file).exists():
+                    raise FileNotFoundError
+                failed = array.blocks[block]  # at last the flags of that name
+            except (ValueError, FileNotFoundError):  # ValueError: another checksum
+                damage.append(file)
+        if damage:
+            what = f"in {self.folder} the results of block {block}: {', '.join(damage)}"
+            self._warn(what, "solved again")
+            return None
+        return failed
 
     def write(self, block: int, kept: Any, failed: np.ndarray) -> None:
         values = [

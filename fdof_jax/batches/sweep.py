@@ -40,7 +40,7 @@ from ..linkage.linkage import Linkage
 from ..simulation.simulate import solve_options
 from ..simulation.solution import Solution
 from ..steps.dopri8 import constant
-from .batch_axes import Batch, batch_of, check_arms
+from .batch_axes import Batch, batch_of
 from .chunk_programs import expected_work, outcome_of
 from .chunks import Job, devices_outside_mesh, in_chunks
 from .store import Store, in_store, outline
@@ -167,7 +167,6 @@ def sweep(
     """
     # Arrays may be on any devices; chunks of them go to those of the sweep.
     linkage, state0, forces = in_numpy((linkage, state0, forces))
-    check_arms(linkage)
     try:
         q, qd = (jnp.asarray(a) if is_traced(a) else numpy_array(a) for a in state0)
     except (TypeError, ValueError):
