@@ -78,7 +78,7 @@ def _solve(program: Any, *arguments: Any) -> Any:
     return jax.block_until_ready(program(*arguments))
 
 
-def _solved(
+def _outcomes(
     job: Job, moving: Any, rest: Any, members: np.ndarray, lanes: int
 ) -> Iterator[tuple[np.ndarray, Any]]:
     """Solves members in chunks; yields members and their outcomes."""
@@ -142,7 +142,7 @@ def in_chunks(
     progress = meter.init()
     while len(waiting):
         late = []
-        for members, outcomes in _solved(job, moving, rest, waiting, lanes):
+        for members, outcomes in _outcomes(job, moving, rest, waiting, lanes):
             values, structure = jax.tree.flatten(outcomes)
             if not results:
                 results = [np.empty((size, *v.shape[1:]), v.dtype) for v in values]
