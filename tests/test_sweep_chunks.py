@@ -1,17 +1,24 @@
-"""How a sweep cuts its members into chunks, and what it compiles for them."""
+"""How a sweep cuts its members into chunks, on which devices, and what it compiles."""
 
+import functools
+import os
+import socket
+import subprocess
 import sys
+from pathlib import Path
 
 import diffrax
 import jax
 import numpy as np
 import pytest
-from sweep_batch import SETTINGS, TS, run, successful
+import xarray
+from sweep_batch import CHUNK, SETTINGS, TS, run, single_links, successful
 
 import fdof_jax as fj
 from fdof_jax.base import configuration
-from fdof_jax.batches import chunk_programs, chunks, forecast
+from fdof_jax.batches import chunk_programs, chunks
 from fdof_jax.batches.batch_axes import batch_of
+from fdof_jax.simulation import prescribed
 
 LANES = 64  # enough for a slow member to be stopped
 PENDULUM = fj.Linkage("R", length=[0, 1], com=[[0.5, 0]], mass=[1], inertia=[0.1])
@@ -19,16 +26,16 @@ PENDULUM = fj.Linkage("R", length=[0, 1], com=[[0.5, 0]], mass=[1], inertia=[0.1
 
 @pytest.fixture
 def solved(monkeypatch):
-    """Returns a list of the starts of the chunks in each call from here on."""
-    found = []
+    """Returns a list of the starts in each chunk from here on."""
+    starts = []
     original = chunks._solve
 
-    def recorded(program, count, chosen, moving, arrays):
-        found.append([np.asarray(leaf) for leaf in moving])
-        return original(program, count, chosen, moving, arrays)
+    def recorded(program, moving, shared):
+        starts.append([np.asarray(leaf) for leaf in moving])
+        return original(program, moving, shared)
 
     monkeypatch.setattr(chunks, "_solve", recorded)
-    return found
+    return starts
 
 
 def pendulums(speeds):
@@ -52,25 +59,17 @@ def test_small_batches_of_many_sizes_share_a_program(solved):
 
 
 def test_a_batch_of_one_chunk_needs_no_forecast(monkeypatch):
-    monkeypatch.setattr(chunks, "work_of_chunks", None)
+    monkeypatch.setattr(chunks, "expected_work", None)
     assert successful(swept(np.linspace(0, 1, 8))).all()
 
 
-@pytest.mark.parametrize(
-    "cores, calls",
-    [
-        (1, [[11, 10, 9, 8, 7, 6, 5, 4, 3, 2, 1, 0]]),
-        (2, [[11, 10, 9, 8, 3, 2, 1, 0], [7, 6, 5, 4]]),
-    ],
-)
-def test_members_are_shared_out_by_their_forecast(solved, monkeypatch, cores, calls):
-    """Each core gets one call for chunks of members that take about equally long."""
-    monkeypatch.setattr(chunks, "_cores", lambda: cores)
+def test_members_are_sorted_by_their_forecast(solved, monkeypatch):
+    monkeypatch.setattr(chunks, "_cores", lambda: 1)
     speeds = 3 * np.array([0.0, 9, 1, 8, 2, 7, 3, 6, 4, 5, 10, 11])
     motion = swept(speeds, chunk=4)
     np.testing.assert_array_equal(motion.qd[:, 0, 0], speeds)
-    found = [set(qd[:, 0] / 3) for _, qd in solved]
-    assert sorted(map(sorted, found)) == sorted(map(sorted, calls))
+    found = [sorted(qd[:, 0] / 3) for _, qd in solved]
+    assert found == [[8, 9, 10, 11], [4, 5, 6, 7], [0, 1, 2, 3]]
 
 
 @pytest.mark.parametrize(
@@ -87,18 +86,6 @@ def test_starts_of_any_type_are_solved_in_double_precision(kinds):
         np.testing.assert_array_equal(a, b)
 
 
-def test_long_records_are_solved_chunk_by_chunk(solved, monkeypatch):
-    """So do runs that show their progress; a call of many chunks needs more memory."""
-    monkeypatch.setattr(chunks, "_cores", lambda: 1)
-    speeds, both = np.linspace(0, 1, 8), dict(chunk=4)
-    seen = diffrax.TextProgressMeter()
-    swept(speeds, **both)
-    swept(speeds, **both, progress_meter=seen)
-    monkeypatch.setattr(chunks, "_STATES", 4 * len(TS))
-    swept(speeds, **both)
-    assert [len(q) for q, _ in solved] == [32, 32, 32, 4, 4]
-
-
 def test_cores_change_nothing(batch, monkeypatch):
     """Chunks are the same ones, whatever the number of threads that send them."""
     motions = []
@@ -107,26 +94,6 @@ def test_cores_change_nothing(batch, monkeypatch):
         motions.append(run(batch))
     for a, b in zip(*map(jax.tree.leaves, motions)):
         np.testing.assert_array_equal(a, b)
-
-
-def test_only_chunks_that_nothing_keeps_depend_on_the_cores(monkeypatch, tmp_path):
-    sizes = {}
-    for cores in (1, 2):
-        monkeypatch.setattr(chunks, "_cores", lambda cores=cores: cores)
-        sizes[cores] = [chunks.usual_chunk(anywhere=same) for same in (False, True)]
-    assert sizes == {1: [128, 128], 2: [256, 128]}
-    asked = []
-
-    def usual_chunk(anywhere):
-        asked.append(anywhere)
-        return 8
-
-    module = sys.modules["fdof_jax.batches.sweep"]
-    monkeypatch.setattr(module, "usual_chunk", usual_chunk)
-    speeds = np.linspace(0, 1, 8)
-    for keywords in ({}, {"checkpoint": tmp_path / "a"}, {"store": tmp_path / "b"}):
-        swept(speeds, **keywords)
-    assert asked == [False, True, True]
 
 
 def test_a_slow_member_is_stopped_and_solved_alone(solved):
@@ -165,15 +132,122 @@ def test_an_option_that_xla_does_not_know_is_left_out(monkeypatch):
 def test_the_forecast_follows_the_steps(batch, clean):
     steps = np.asarray(clean.stats["num_steps"])
     moving, shared = batch_of(*batch, 0).split()
-    found = forecast.expected_work(jax.numpy.asarray(TS), moving, shared)
+    found = chunk_programs.expected_work(jax.numpy.asarray(TS), moving, shared)
     assert np.corrcoef(found, steps)[0, 1] > 0.75
 
 
-def test_one_forecast_serves_batches_of_all_sizes():
-    misses = lambda: chunk_programs.work_of_chunks.cache_info().misses
-    before = misses()
+def test_one_forecast_serves_batches_of_all_sizes(monkeypatch):
+    traces = []
+    original = chunk_programs.forward_dynamics
+
+    def counted(*arguments):
+        traces.append(1)
+        return original(*arguments)
+
+    monkeypatch.setattr(chunk_programs, "forward_dynamics", counted)
+    monkeypatch.setattr(chunks, "_FORECASTS", 16)
     swept(np.linspace(0, 1, 11), chunk=3)
-    assert misses() == before + 1
-    swept(np.linspace(0, 1, 40), chunk=3)  # of more than one block
-    swept(np.linspace(0, 1, 11), chunk=3, reduce=lambda motion: motion.q[-1])
-    assert misses() == before + 1
+    before = len(traces)
+    swept(np.linspace(0, 1, 40), chunk=3)
+    assert len(traces) == before > 0
+
+
+class Recorder(diffrax.NoProgressMeter):
+    seen: list
+
+    def step(self, state, progress):
+        self.seen.append(float(progress))
+        return state
+
+
+def test_progress_rises_to_one(mixed):
+    recorder = Recorder([])
+    run(mixed, progress_meter=recorder)
+    assert len(recorder.seen) >= len(mixed[1].q) // CHUNK
+    assert 0 <= recorder.seen[0] < 1 and recorder.seen[-1] == 1
+    assert (np.diff(recorder.seen) >= 0).all()
+
+
+def test_other_values_need_no_new_trace(batch, clean, monkeypatch):
+    calls = []
+    original = prescribed.vector_field
+
+    def counted(*arguments):
+        calls.append(1)
+        return original(*arguments)
+
+    monkeypatch.setattr(prescribed, "vector_field", counted)
+    linkage, (q, qd), forces = batch
+    other = run((linkage, fj.State(q + 0.1, qd), forces))
+    assert not calls
+    assert not np.array_equal(other.q, clean.q)
+    # Fewer members need no compilation either; a new number of times needs one.
+    run(jax.tree.map(lambda a: a[:11], batch))
+    assert not calls
+    linkage, state0, forces = jax.tree.map(lambda a: a[0], batch)
+    ts = np.linspace(0, 1, 4001)  # as many as in no other test
+    jax.eval_shape(lambda q: fj.simulate(linkage, fj.State(q, q), ts), state0.q)
+    assert calls
+
+
+WORKER = """
+import sys
+import jax
+import fdof_jax as fj
+fj.configure(x64=True)
+address, index, folder = sys.argv[1:]
+jax.distributed.initialize(address, 2, int(index))
+import numpy as np
+import sweep_batch
+assert (jax.device_count(), jax.local_device_count()) == (4, 2)
+batch = sweep_batch.single_links()
+solution = sweep_batch.run(batch, chunk=4)
+sweep_batch.run(batch, chunk=4, store=folder + "/store", shard=int(index), of=2)
+if hasattr(jax, "set_mesh"):
+    lanes = jax.sharding.PartitionSpec("lanes")
+    mesh = jax.sharding.Mesh(jax.local_devices(), ("lanes",))
+    spread = jax.device_put(batch, jax.sharding.NamedSharding(mesh, lanes))
+    with jax.set_mesh(mesh):
+        same = sweep_batch.run(spread, chunk=4)
+    np.testing.assert_array_equal(same.q, solution.q)
+steps = solution.stats["num_steps"]
+good = sweep_batch.successful(solution)
+np.savez(f"{folder}/{index}.npz", q=solution.q, qd=solution.qd, steps=steps, good=good)
+"""
+
+
+@pytest.mark.slow
+def test_more_devices_and_processes_change_nothing(tmp_path):
+    """Uses two devices in each of two processes, and inputs spread over them."""
+    clean = run(single_links())
+    with socket.socket() as port:
+        port.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{port.getsockname()[1]}"
+    here = Path(__file__).parent
+    environment = os.environ | dict(
+        JAX_PLATFORMS="cpu",
+        JAX_NUM_CPU_DEVICES="2",
+        PYTHONPATH=os.pathsep.join([str(here), str(here.parent)]),
+    )
+    workers = []
+    try:
+        for index in range(2):
+            command = [sys.executable, "-c", WORKER, address, str(index), str(tmp_path)]
+            pipe = subprocess.PIPE
+            workers.append(subprocess.Popen(command, env=environment, stderr=pipe))
+        for worker in workers:
+            _, errors = worker.communicate(timeout=300)
+            assert worker.returncode == 0, errors.decode()[-3000:]
+    finally:
+        for worker in workers:
+            worker.kill()
+    close = functools.partial(np.testing.assert_allclose, rtol=1e-8, atol=1e-8)
+    for index in range(2):
+        answer = np.load(tmp_path / f"{index}.npz")
+        assert answer["good"].all()
+        close(answer["q"], clean.q)
+        close(answer["qd"], clean.qd, rtol=1e-7, atol=1e-7)
+        close(answer["steps"], clean.stats["num_steps"], rtol=0, atol=5)
+    with xarray.open_zarr(tmp_path / "store") as data:
+        assert not data.failed.any()
+        close(data.q, clean.q)

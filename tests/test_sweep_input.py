@@ -131,7 +131,6 @@ def test_other_axes_are_refused(axes):
         "chunk": [0, -1, 1.5, True, "8"],
         "throw": [1, None, "no"],
         "progress_meter": [None, 3],
-        "checkpoint": [3, True, ""],
         "store": [3, True, ""],
         "shard": [-1, 1, 0.5, None],
         "of": [0, 1.5, True, None],
@@ -147,7 +146,6 @@ def test_malformed_options_are_refused(name, values):
 def test_options_that_contradict_each_other_are_refused(tmp_path):
     refused("store", shard=1, of=2)
     refused("shard", shard=2, of=2, store=tmp_path)
-    refused("checkpoint", checkpoint=tmp_path, store=tmp_path)
 
 
 def test_a_misspelt_keyword_is_refused():
@@ -159,8 +157,6 @@ def test_what_a_transformation_cannot_do_is_refused(tmp_path):
     def end(q, **keywords):
         return fj.sweep(TWO, fj.State(q, STATES.qd), TS, **keywords).q
 
-    for keywords in (
-        dict(throw=True), dict(checkpoint=tmp_path), dict(store=tmp_path)
-    ):  # fmt: skip
-        with pytest.raises(ValueError, match="^throw, checkpoint, store: expected"):
+    for keywords in (dict(throw=True), dict(store=tmp_path)):
+        with pytest.raises(ValueError, match="^throw, store: expected"):
             jax.eval_shape(functools.partial(end, **keywords), STATES.q)

@@ -10,7 +10,7 @@ import pytest
 from sweep_batch import FAILED, run, single_links
 
 import fdof_jax as fj
-from fdof_jax.batches import chunk_programs, chunks
+from fdof_jax.batches import chunk_programs
 
 
 def end_and_fastest(motion):
@@ -35,17 +35,6 @@ def test_it_equals_what_the_function_makes_of_the_motions(reduced, swept):
 def test_failures_are_counted(mixed, reduced):
     with pytest.raises(RuntimeError, match=r"3 of 42 members failed.* member 3\."):
         run(mixed, reduce=end_and_fastest, throw=True)
-
-
-def test_a_checkpoint_holds_only_what_is_kept(mixed, reduced, tmp_path, monkeypatch):
-    run(mixed, reduce=end_and_fastest, checkpoint=tmp_path)
-    assert sum(path.stat().st_size for path in tmp_path.iterdir()) < 42 * 200
-    monkeypatch.setattr(chunks.Checkpoint, "write", None)
-    # As in another process, where the same function has another address
-    same = lambda motion: end_and_fastest(motion)
-    again = run(mixed, reduce=same, checkpoint=tmp_path)
-    for a, b in zip(*map(jax.tree.leaves, (again, reduced))):
-        np.testing.assert_array_equal(a, b)
 
 
 @dataclasses.dataclass

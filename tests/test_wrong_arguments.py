@@ -96,7 +96,6 @@ def guarded():
 def test_under_a_transfer_guard(batch, guarded, monkeypatch):
     linkage, state0, *_ = scenes.fig5()
     monkeypatch.setattr(chunks, "_cores", lambda: 2)
-    monkeypatch.setattr(chunks, "_MOST", 1)  # several calls, by two threads
     solution = run(batch)
     motion = fj.simulate(linkage, state0, TS)
     with jax.transfer_guard("allow"):

@@ -46,16 +46,6 @@ class Batch(NamedTuple):
         return self._replace(inputs=inputs, batched=jax.tree.leaves(batched))
 
 
-def check_arms(linkage: Any) -> None:
-    """Raises ValueError unless the argument is a linkage, one or a batch."""
-    if isinstance(linkage, list | tuple) and linkage:
-        raise ValueError(
-            f"linkage: expected one Linkage with a batch axis, got {len(linkage)} in a "
-            "sequence; jax.tree.map(lambda *x: jnp.stack(x), *arms) stacks arms."
-        )
-    instance("linkage", linkage, Linkage)
-
-
 def _name(part: Any, *rest: Any) -> str:
     """Returns the name of a leaf of the inputs from its path."""
     return ("linkage", "state0", "forces")[part.idx] + jax.tree_util.keystr(rest)
@@ -81,6 +71,12 @@ def _force_has_axis(axis: Any, part: Any) -> Any:
 
 def batch_of(linkage: Linkage, state0: Any, forces: Forces, forces_axes: Any) -> Batch:
     """Returns the inputs as a batch; raises ValueError if their shapes do not fit."""
+    if isinstance(linkage, list | tuple) and linkage:
+        raise ValueError(
+            f"linkage: expected one Linkage with a batch axis, got {len(linkage)} in a "
+            "sequence; jax.tree.map(lambda *x: jnp.stack(x), *arms) stacks arms."
+        )
+    instance("linkage", linkage, Linkage)
     inputs = linkage, state0, forces
     leaves, _ = jax.tree_util.tree_flatten_with_path(inputs)
     joints = linkage.ef.shape[-1] // 2

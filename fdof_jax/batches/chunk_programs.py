@@ -1,4 +1,4 @@
-"""The compiled programs of chunks: the outcomes of members, and their forecasts."""
+"""The programs of chunks: the outcomes of members, and the work expected of them."""
 
 import functools
 from collections.abc import Callable
@@ -10,37 +10,24 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jax.sharding import SingleDeviceSharding
 
 from ..base.checks import refusal
 from ..base.configuration import wide_vectors
+from ..dynamics import forward_dynamics
+from ..forces.element import elements_on
+from ..linkage.topology import real_joints
+from ..simulation.field import element_effort
 from ..simulation.simulate import simulate
 from ..simulation.solution import Solution
 from ..steps.controllers import Abreast, by_square_roots
 from ..steps.tolerances import default_controller
-from .forecast import expected_work
 
 # With so few lanes a step takes hardly longer than with one, so that slow members do
 # not pay for another program.
 _ALL_ALIKE = 32
 _AXIS = "lane"
-
-
-def motion_of(
-    settings: dict, ts: Array, moving: Any, shared: Any, abreast: bool
-) -> Solution:
-    """Computes one member's motion; if `abreast`, until most lanes are long done."""
-    linkage, state0, forces = eqx.combine(moving, shared)
-    controller = settings["stepsize_controller"] or default_controller()
-    # Members with steps of given lengths take equally many.
-    adaptive = isinstance(controller, diffrax.AbstractAdaptiveStepSizeController)
-    if abreast and adaptive:
-        # Other solvers, and estimates of a first step, need the error itself.
-        if settings["solver"] is None and settings["dt0"] is not None:
-            controller = by_square_roots(controller)
-        limited = Abreast(controller, _AXIS)  # pyright: ignore[reportCallIssue]
-        settings = settings | {"stepsize_controller": limited}
-    return simulate(linkage, state0, ts, forces, throw=False, **settings)
+_STEPS, _ANGLE = 16, 0.3  # of the rough motion in a forecast: number and size
 
 
 def _check_kept(kept: Any) -> None:
@@ -61,8 +48,21 @@ def outcome_of(
     shared: Any,
     abreast: bool,
 ) -> tuple[Any, Array, Array]:
-    """Computes what is kept of one member, whether it was stopped, and if it failed."""
-    solution = motion_of(settings, ts, moving, shared, abreast)
+    """Computes what is kept of one member, whether it was stopped, and if it failed.
+
+    If `abreast`, a member is stopped when most lanes are long done.
+    """
+    linkage, state0, forces = eqx.combine(moving, shared)
+    controller = settings["stepsize_controller"] or default_controller()
+    # Members with steps of given lengths take equally many.
+    adaptive = isinstance(controller, diffrax.AbstractAdaptiveStepSizeController)
+    if abreast and adaptive:
+        # Other solvers, and estimates of a first step, need the error itself.
+        if settings["solver"] is None and settings["dt0"] is not None:
+            controller = by_square_roots(controller)
+        limited = Abreast(controller, _AXIS)  # pyright: ignore[reportCallIssue]
+        settings = settings | {"stepsize_controller": limited}
+    solution = simulate(linkage, state0, ts, forces, throw=False, **settings)
     kept = reduce(solution)
     _check_kept(kept)
     results, most = diffrax.RESULTS, settings["max_steps"]
@@ -73,127 +73,110 @@ def outcome_of(
 
 
 class Form(NamedTuple):
-    """The key of a program: structures, constants, kinds of the arrays."""
+    """The key of a program: structures, kinds of the arrays, constants."""
 
-    moving: Any  # structures of what differs between members, and of all else
-    rest: Any  # `(settings, reduce, ts, shared)`, or for a forecast `(ts, shared)`
-    constants: tuple[Any, ...]  # leaves of `rest`, None for arrays
-    kinds: tuple[Any, Any]  # shapes and types of moving and other arrays
-    series: int  # the most chunks that a call solves, one after another
-    mesh: Mesh | None
+    moving: Any  # structure of what differs between members
+    lanes: tuple[jax.ShapeDtypeStruct, ...]  # its arrays
+    rest: Any  # structure of `(settings, reduce, ts, shared)`
+    leaves: tuple[Any, ...]  # of `rest`: kinds of arrays, and constants
 
-    def chunks(self, rows: list[Array]) -> list[Array]:
-        """Returns arrays (series * lane, ...) of one device as (series, lane, ...)."""
-        # In each size, as -1 would be unknown for empty arrays.
-        return [
-            leaf.reshape(self.series, len(leaf) // self.series, *leaf.shape[1:])
-            for leaf in rows
-        ]
-
-    def others(self, arrays: list[Array]) -> Any:
-        """Returns what all members share."""
+    def outcomes(self, lanes: list[Array], arrays: list[Array]) -> Any:
+        """Computes the outcomes of all lanes of a chunk."""
         given = iter(arrays)
-        rest = [next(given) if leaf is None else leaf for leaf in self.constants]
-        return jax.tree.unflatten(self.rest, rest)
-
-    def arguments(self) -> tuple[Any, ...]:
-        """Returns the shapes and types of a count, moving and other arrays."""
-        like = [[_like(*kind) for kind in kinds] for kinds in self.kinds]
-        return _like((), np.int32), *like
-
-    @property
-    def lanes(self) -> int:
-        """The number of lanes on all devices."""
-        return self.kinds[0][0][0][0] // self.series
-
-    @property
-    def rows(self) -> int:
-        """The number of members in a call, on each device."""
-        return self.series * self.lanes // (self.mesh.size if self.mesh else 1)
-
-    @property
-    def sharding(self) -> NamedSharding | None:
-        """How arrays with an axis of lanes are spread over the devices, if several."""
-        return self.mesh and NamedSharding(self.mesh, PartitionSpec("member"))
-
-
-def _like(shape: tuple[int, ...], dtype: Any, weak: bool = False) -> Any:
-    return jax.ShapeDtypeStruct(shape, dtype, weak_type=weak)
-
-
-@functools.lru_cache(maxsize=64)
-def traced(form: Form) -> jax.stages.Lowered:
-    """Traces the program that computes the outcomes of the first `count` chunks.
-
-    It returns those of the `chosen` rows of each device.
-    """
-
-    def run(count, chosen, moving, arrays):
-        settings, reduce, ts, shared = form.others(arrays)
-        chunks = form.chunks(moving)
-        abreast = chunks[0].shape[1] > _ALL_ALIKE  # of the lanes of one device
+        leaves = [next(given) if _is_kind(leaf) else leaf for leaf in self.leaves]
+        settings, reduce, ts, shared = self.rest.unflatten(leaves)
 
         def member(leaves):
-            member = jax.tree.unflatten(form.moving, leaves)
-            return outcome_of(settings, reduce, ts, member, shared, abreast)
+            moving = self.moving.unflatten(leaves)
+            abreast = self.lanes[0].shape[0] > _ALL_ALIKE
+            return outcome_of(settings, reduce, ts, moving, shared, abreast)
 
-        @jax.jit  # traced once, though used twice
-        def solved(chunk):
-            return jax.vmap(member, axis_name=_AXIS)([leaf[chunk] for leaf in chunks])
+        return jax.vmap(member, axis_name=_AXIS)(lanes)
 
-        def added(chunk, outcomes):
-            return jax.tree.map(
-                lambda all, new: all.at[chunk].set(new), outcomes, solved(chunk)
-            )
 
-        outcomes = jax.tree.map(
-            lambda leaf: jnp.zeros((form.series, *leaf.shape), leaf.dtype),
-            jax.eval_shape(solved, count),
-        )
-        outcomes = jax.lax.fori_loop(0, count, added, outcomes)
-        return jax.tree.map(
-            lambda leaf: leaf.reshape(len(chosen), *leaf.shape[2:])[chosen], outcomes
-        )
+def form_of(moving: Any, lanes: int, rest: Any) -> tuple[Form, list[Any]]:
+    """Returns the form of the program for so many members, and the arrays of `rest`."""
 
-    if form.mesh is not None:
-        lanes, same = PartitionSpec("member"), PartitionSpec()
-        # Each device loops only until its own slowest member is done.
-        run = jax.shard_map(
-            run,
-            mesh=form.mesh,
-            in_specs=(same, same, lanes, same),
-            out_specs=lanes,
-            check_vma=False,
-        )
-    shardings = None, None, form.sharding, None
-    count, *others = form.arguments()
-    chosen = _like((form.rows,), np.int32)
-    return jax.jit(run, in_shardings=shardings).lower(count, chosen, *others)
+    def kind(array: Any, shape: tuple[int, ...]) -> jax.ShapeDtypeStruct:
+        dtype = jax.dtypes.canonicalize_dtype(array.dtype, allow_extended_dtype=True)
+        weak = getattr(array, "weak_type", False)
+        return jax.ShapeDtypeStruct(shape, dtype, weak_type=weak)
+
+    members, structure = jax.tree.flatten(moving)
+    kinds = tuple(kind(a, (lanes, *a.shape[1:])) for a in members)
+    leaves, others = jax.tree.flatten(rest)
+    arrays = [leaf for leaf in leaves if isinstance(leaf, Array | np.ndarray)]
+    for index, leaf in enumerate(leaves):
+        if isinstance(leaf, Array | np.ndarray):
+            leaves[index] = kind(leaf, leaf.shape)
+    return Form(structure, kinds, others, tuple(leaves)), arrays
+
+
+def _is_kind(leaf: Any) -> bool:
+    return isinstance(leaf, jax.ShapeDtypeStruct)
 
 
 @functools.lru_cache(maxsize=64)
-def compiled(form: Form) -> jax.stages.Compiled:
-    """Compiles the program of this form; the programs used last are kept."""
-    return traced(form).compile(wide_vectors())
+def _jitted(form: Form) -> Any:
+    return jax.jit(form.outcomes)  # traced once for all devices
 
 
 @functools.lru_cache(maxsize=64)
-def work_of_chunks(form: Form) -> jax.stages.Compiled:
-    """Compiles the program of the `expected_work` in the first `count` chunks."""
+def lowered(form: Form, device: Any) -> jax.stages.Lowered:
+    """Traces the program of this form for a device, or for the default one (None).
 
-    def run(count, moving, arrays):
-        ts, shared = form.others(arrays)
-        chunks = form.chunks(moving)
+    It computes outcomes from the arrays of the lanes and of the rest.
+    """
+    arguments = list(form.lanes), list(filter(_is_kind, form.leaves))
+    if device is not None:
+        there = SingleDeviceSharding(device)
+        arguments = jax.tree.map(lambda kind: kind.update(sharding=there), arguments)
+    return _jitted(form).lower(*arguments)
 
-        def work_of(chunk):
-            member = form.moving.unflatten([leaf[chunk] for leaf in chunks])
-            return expected_work(ts, member, shared)
 
-        def added(chunk, work):
-            return work.at[chunk].set(work_of(chunk))
+@functools.lru_cache(maxsize=64)
+def compiled(program: jax.stages.Lowered) -> jax.stages.Compiled:
+    """Compiles a program; those used last are kept."""
+    return program.compile(wide_vectors())
 
-        like = jax.eval_shape(work_of, count)
-        work = jnp.zeros((form.series, *like.shape), like.dtype)
-        return jax.lax.fori_loop(0, count, added, work).ravel()
 
-    return jax.jit(run).lower(*form.arguments()).compile(wide_vectors())
+@eqx.filter_jit
+def expected_work(ts: Array, moving: Any, shared: Any) -> Array:
+    """Computes for each member a rate [1/s] that grows with its steps.
+
+    It combines the joints' rates and accelerations, in the mean over the beginning of
+    the motion, which rough steps find.
+    """
+
+    def member(moving):
+        linkage, (q, qd), forces = eqx.combine(moving, shared)
+        # Revolute joints cause most of the steps, slides hardly any.
+        turning = jnp.stack(real_joints(linkage.ef))
+
+        def at(t, q, qd):
+            tau = jnp.zeros_like(q)
+            for index, element in enumerate(elements_on(linkage, forces)):
+                state = element.initial_state(linkage)
+                tau = tau + element_effort(index, element, t, q, qd, linkage, state)[0]
+            qdd = forward_dynamics(linkage, q, qd, tau, forces)
+            rate, acceleration = (jnp.where(turning, a, 0) for a in (qd, qdd))
+            norm = jnp.linalg.norm
+            return qdd, norm(rate) + jnp.sqrt(norm(acceleration))
+
+        def advance(_, now):
+            t, q, qd, total, last = now
+            qdd, rate = at(t, q, qd)
+            # A motion that these steps lose stays where it was.
+            finite = jnp.isfinite(rate)
+            h = jnp.where(finite, step, 0)
+            last = jnp.where(finite, rate, last)
+            qd = qd + h * jnp.where(finite, qdd, 0)
+            return t + h, q + h * qd, qd, total + last, last
+
+        _, first = at(ts[0], q, qd)
+        step = jnp.minimum((ts[-1] - ts[0]) / _STEPS, _ANGLE / first)
+        start = ts[0], q, qd, jnp.zeros_like(first), first
+        *_, total, _ = jax.lax.fori_loop(0, _STEPS, advance, start)
+        return total
+
+    return jax.vmap(member)(moving)

@@ -1,10 +1,16 @@
-"""Keeps the results of a sweep in a folder, a Zarr group, block by block of members."""
+"""Keeps the results of a sweep in a folder, a Zarr group, block by block of members.
+
+zarr-python writes each file under another name and then renames it, so that a process
+that is killed leaves no file in part; a checksum ends each file of numbers.
+"""
 
 import hashlib
 import json
 import math
+import re
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -12,200 +18,235 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.extend.core import ClosedJaxpr, Jaxpr
 
 from ..base.array_namespace import in_numpy
 from ..base.checks import refusal
-from ..base.devices import found_by_first
+from ..base.names import optional_package
 from ..base.user_warnings import warn
 from ..base.whole_files import whole_file
-from ..simulation.solution import Solution
+from ..linkage.linkage import Linkage
+from ..linkage.topology import common_unit, names_and_units, rate_unit
+from ..simulation.solution import OUTCOMES, Solution, outcome_numbers
 from .batch_axes import Batch
+from .chunk_programs import outcome_of
 from .chunks import Job, in_chunks
 from .versions import VERSIONS
-from .zarr_variables import Variable, coordinates, metadata, values_of, variables_of
 
 _BYTES = 2**26  # of the results in a block
 _CHUNKS = 16  # at most so many in a block, as blocks are what workers share
+# Members that are not solved yet, by the kind of the numbers
+_FILL = dict(f=np.nan, c=complex(np.nan, np.nan), i=-1, u=0, b=True)
+_FLAGS = {
+    "flag_values": [*range(len(OUTCOMES))],
+    "flag_meanings": " ".join(word.replace(" ", "_") for word in OUTCOMES),
+}
 
 
-def _sha256(data: bytes | memoryview) -> str:
-    return hashlib.sha256(data).hexdigest()
+class Variable(NamedTuple):
+    """An array over members; its shape is that of one member."""
+
+    name: str
+    dtype: np.dtype
+    shape: tuple[int, ...]
+    dimensions: list[str]
+    attributes: dict[str, Any]
 
 
-def _warn(expected: str, done: str) -> None:
-    message = f"sweep: expected {expected}, got something else; {done}."
-    warn(message, RuntimeWarning)
+def _is_result(leaf: Any) -> bool:
+    return isinstance(leaf, diffrax.RESULTS)
 
 
-def _text(value: Any) -> bytes:
-    return json.dumps(value, indent=1).encode()
+def _named(kept: Any) -> dict[str, Any]:
+    """Returns the arrays of what is kept by names made of their places."""
+    leaves, _ = jax.tree_util.tree_flatten_with_path(kept, is_leaf=_is_result)
+    named, taken = {}, {"failed"}
+    for path, leaf in leaves:
+        name = re.sub(r"\W+", "_", jax.tree_util.keystr(path)).strip("_") or "value"
+        if isinstance(kept, Solution):
+            name = name.removeprefix("stats_")
+        # Some file systems do not tell capitals from small letters.
+        if name.casefold() in taken:
+            expected = "parts whose names differ in letters, none of them failed"
+            raise refusal("reduce", expected, name)
+        taken.add(name.casefold())
+        named[name] = leaf
+    return named
 
 
-def _record_name(block: int) -> str:
-    return f"records/{block}.sha256"
+def _variables(like: Any, linkage: Linkage) -> list[Variable]:
+    """Returns the variables of a store from the shapes of what is kept of a member."""
+    of_motion = isinstance(like, Solution)
+    unit = common_unit(names_and_units(linkage.ef)[1])
+    labels = {
+        "q": {"long_name": "joint position", "units": unit},
+        "qd": {"long_name": "joint velocity", "units": rate_unit(unit)},
+        "num_steps": {"long_name": "number of steps", "units": "1"},
+        "time_reached": {"long_name": "time reached", "units": "s"},
+    }
+    variables = []
+    for name, leaf in _named(like).items():
+        result = _is_result(leaf)
+        dtype, shape = (np.dtype("int8"), ()) if result else (leaf.dtype, leaf.shape)
+        if dtype.kind not in _FILL:
+            raise refusal("reduce", "numbers of a type that Zarr has", dtype)
+        axes = [f"{name}_{axis + 1}" for axis in range(len(shape))]
+        if of_motion and name in ("q", "qd"):
+            axes = ["time", "joint"]
+        elif of_motion and name.startswith("own_"):
+            axes[0] = "time"
+        attributes = _FLAGS if result else labels.get(name, {}) if of_motion else {}
+        name = "outcome" if of_motion and result else name
+        variables.append(Variable(name, dtype, shape, ["member", *axes], attributes))
+    return [*variables, Variable("failed", np.dtype(bool), (), ["member"], {})]
 
 
 class Store:
     """A folder that is a Zarr group, whose chunks along members are blocks.
 
-    No two blocks share a file. A finished block has a record in the folder `records`:
-    the checksums of its files and of the group's metadata, as `sha256sum` writes them.
+    No two blocks share a file. The file of `failed` ends a block: it comes last.
     """
 
     def __init__(
         self, folder: Path, batch: Batch, ts: Array, like: Any, chunk: int, sweep: str
     ):
-        """Writes the metadata of the group, or checks what is there."""
+        """Writes the metadata of the group, or checks what is there.
+
+        Raises ValueError if the folder holds anything but this sweep.
+        """
+        zarr = optional_package("zarr", "data")
         self.folder, self.size = folder, batch.size
-        failed = Variable("failed", np.dtype(bool), (), ["member"], {})
-        self.variables = [*variables_of(like, batch.inputs[0]), failed]
-        if any(v.name.casefold() == "failed" for v in self.variables[:-1]):
-            raise refusal("reduce", "no part named failed beside a store", like)
+        self.variables = _variables(like, batch.inputs[0])
         each = sum(v.dtype.itemsize * math.prod(v.shape) for v in self.variables)
         most = chunk * min(_CHUNKS, max(1, _BYTES // (chunk * each)))
         # Nearly equal blocks are solved by the same programs.
         self.block = -(-self.size // -(-self.size // most))
         self.count = -(-self.size // self.block)
-        arrays = {
-            v.name: metadata(
-                v.dtype, (self.size, *v.shape), (self.block, *v.shape), *v[3:]
-            )
-            for v in self.variables
-        }
-        known = {}
-        if isinstance(like, Solution):
-            for name, (values, attributes) in coordinates(batch.inputs[0], ts).items():
-                one = values.dtype, values.shape, values.shape, [name], attributes
-                arrays[name] = metadata(*one)
-                known[f"{name}/c/0"] = values.tobytes()
-        provenance = {"versions": VERSIONS, "sweep": sweep, "chunk": chunk}
-        group = {
-            "zarr_format": 3,
-            "node_type": "group",
-            "attributes": provenance | {"sha256": _sha256(_text(provenance))},
-            "consolidated_metadata": {
-                "kind": "inline",
-                "must_understand": False,
-                "metadata": arrays,
-            },
-        }
-        self._refuse_another(group["attributes"])
-        self.named = _sha256(_text(group))
-        known |= {f"{name}/zarr.json": _text(value) for name, value in arrays.items()}
-        for name, data in ({"zarr.json": _text(group)} | known).items():
+        versions = VERSIONS | {"zarr": zarr.__version__}
+        attributes = {"versions": versions, "sweep": sweep, "chunk": chunk}
+        self._refuse_another(attributes)
+        files = self._empty(zarr, attributes, batch.inputs[0], ts, like)
+        for name, data in files.items():
             path = folder / name
             if path.exists():
                 if path.read_bytes() == data:
                     continue
-                _warn(f"in {path} the metadata of this sweep", "it is written again")
-            self._write(name, data)
+                self._warn(f"in {path} the metadata of this sweep", "written again")
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with whole_file(path) as file:
+                file.write(data)
+        group = zarr.open_group(folder, mode="r+", use_consolidated=False)
+        # Numbers that equal the fill value are written, too: no file means not solved.
+        everything = {"write_empty_chunks": True}
+        self.arrays = [group[v.name].with_config(everything) for v in self.variables]
+
+    def _empty(
+        self, zarr: Any, attributes: dict, linkage: Linkage, ts: Array, like: Any
+    ) -> dict[str, bytes]:
+        """Returns the files of the group without any member, the group's own first."""
+        memory = {}
+        group = zarr.create_group(zarr.storage.MemoryStore(memory))
+
+        def create(name: str, axes: list[str], labels: dict, **given: Any) -> None:
+            group.create_array(
+                name,
+                compressors=[zarr.codecs.Crc32cCodec()],
+                dimension_names=axes,
+                attributes=labels,
+                **given,
+            )
+
+        for v in self.variables:
+            create(
+                v.name,
+                v.dimensions,
+                v.attributes,
+                shape=(self.size, *v.shape),
+                chunks=(self.block, *(max(1, length) for length in v.shape)),
+                dtype=v.dtype,
+                fill_value=_FILL[v.dtype.kind],
+            )
+        if isinstance(like, Solution):
+            names, units = names_and_units(linkage.ef)
+            time = {"long_name": "time", "units": "s"}
+            create("time", ["time"], time, data=np.asarray(ts), chunks=ts.shape)
+            joint = {"long_name": "joint", "names": names, "units_of_positions": units}
+            numbers = np.arange(1, 1 + len(names), dtype="int32")
+            create("joint", ["joint"], joint, data=numbers, chunks=numbers.shape)
+        files = {name: buffer.to_bytes() for name, buffer in memory.items()}
+        # As `zarr.consolidate_metadata` does, which warns. xarray looks for it.
+        arrays = {
+            name.removesuffix("/zarr.json"): json.loads(data)
+            for name, data in files.items()
+            if name.endswith("/zarr.json")
+        }
+        whole = {"kind": "inline", "must_understand": False, "metadata": arrays}
+        own = {"attributes": attributes, "consolidated_metadata": whole}
+        own = json.loads(files["zarr.json"]) | own
+        return files | {"zarr.json": json.dumps(own, indent=1).encode()}
 
     def _refuse_another(self, attributes: dict[str, Any]) -> None:
-        """Raises ValueError if the folder holds anything but this sweep, or damage."""
         # In this order, as another worker may be about to write `zarr.json` first.
-        names = {path.name for path in self.folder.iterdir() if path.suffix != ".part"}
+        endings = ".part", ".partial"  # of files that a killed process leaves
+        names = {p.name for p in self.folder.iterdir() if p.suffix not in endings}
         path = self.folder / "zarr.json"
-        if not path.exists():
-            if names and "records" not in names:
-                raise self._another(f"holds {min(names)}")
-            return
-        try:
-            group = json.loads(path.read_bytes())
-        except ValueError:
-            return  # damaged
-        try:
-            found = group["attributes"]
-            provenance = {key: found[key] for key in attributes if key != "sha256"}
-            whole = found["sha256"] == _sha256(_text(provenance))
-        except (LookupError, TypeError):
-            raise self._another("holds a Zarr group from elsewhere") from None
-        if whole and found != attributes:
-            others = [key for key in provenance if found[key] != attributes[key]]
-            raise self._another(f"has another {', '.join(others)}")
+        what = f"holds {min(names)}" if names else ""
+        if path.exists():
+            try:
+                there = json.loads(path.read_bytes())["attributes"]
+                others = [key for key in attributes if there[key] != attributes[key]]
+                what = f"has another {', '.join(others)}" if others else ""
+            except ValueError:
+                what = ""  # damaged
+            except (LookupError, TypeError):
+                what = "holds a Zarr group from elsewhere"
+        if what:
+            raise ValueError(
+                "store: expected a new folder or one of this sweep, got "
+                f"{self.folder}, which {what}."
+            )
 
-    def _another(self, what: str) -> ValueError:
-        return ValueError(
-            f"store: expected a new folder or one of this sweep, got {self.folder}, "
-            f"which {what}."
-        )
+    def _warn(self, expected: str, done: str) -> None:
+        message = f"sweep: expected {expected}, got something else; it is {done}."
+        warn(message, RuntimeWarning)
 
     def members(self, block: int) -> slice:
         return slice(block * self.block, min(self.size, (block + 1) * self.block))
-
-    def _files(self, block: int) -> dict[str, Variable]:
-        """Returns the files of a block, with their variables."""
-        axes = lambda variable: "/0" * len(variable.shape)
-        return {f"{v.name}/c/{block}{axes(v)}": v for v in self.variables}
-
-    def _record(self, block: int, sums: list[str]) -> list[str]:
-        """Returns the lines of a block's record."""
-        files = ["zarr.json", *self._files(block)]
-        return [f"{total}  {file}" for total, file in zip([self.named, *sums], files)]
 
     def failed(self, block: int) -> np.ndarray | None:
         """Returns which members of a finished block failed, or None if it is to solve.
 
         Damaged files are reported by a warning.
         """
-        files = self._files(block)
-        record = self.folder / _record_name(block)
-        if not record.exists():
+        if not (self.folder / f"failed/c/{block}").exists():
             return None
-        sums = [self._sum(file) for file in files]
-        lines = self._record(block, sums)
-        found, members = record.read_bytes(), self.members(block)
-        if found == "\n".join(lines).encode():
-            flags = np.fromfile(self.folder / list(files)[-1], bool)
-            return flags[: members.stop - members.start]
-        recorded = set(found.decode(errors="replace").split("\n"))
-        damaged = [file for file, line in zip(files, lines[1:]) if line not in recorded]
-        _warn(
-            f"{', '.join(damaged) or 'files'} of {self.folder} with the checksums in "
-            f"{record}",
-            f"{members.stop - members.start} members are solved again",
-        )
-        return None
+        damage, failed = [], None
+        for variable, array in zip(self.variables, self.arrays):
+            if not array.size:  # without a file
+                continue
+            file = "/".join(
+                [variable.name, "c", str(block), *"0" * len(variable.shape)]
+            )
+            try:
+                if not (self.folder / file).exists():
+                    raise FileNotFoundError
+                failed = array.blocks[block]  # at last the flags of that name
+            except (ValueError, FileNotFoundError):  # ValueError: another checksum
+                damage.append(file)
+        if damage:
+            what = f"in {self.folder} the results of block {block}: {', '.join(damage)}"
+            self._warn(what, "solved again")
+            return None
+        return failed
 
     def write(self, block: int, kept: Any, failed: np.ndarray) -> None:
-        sums = []
-        for (file, variable), values in zip(
-            self._files(block).items(), [*values_of(kept), failed], strict=True
-        ):
-            rows = np.ascontiguousarray(values)
-            if len(rows) < self.block:  # chunks of one array are equally long
-                rows = np.zeros((self.block, *variable.shape), variable.dtype)
-                rows[: len(values)] = values
-            data = rows.reshape(-1).view(np.uint8).data  # without a copy
-            self._write(file, data)
-            sums.append(_sha256(data))
-        lines = self._record(block, sums)
-        self._write(_record_name(block), "\n".join(lines).encode())
-
-    def _sum(self, name: str) -> str:
-        try:
-            with (self.folder / name).open("rb") as file:
-                return hashlib.file_digest(file, "sha256").hexdigest()
-        except FileNotFoundError:
-            return "missing"
-
-    def _write(self, name: str, data: bytes | memoryview) -> None:
-        path = self.folder / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with whole_file(path) as file:
-            file.write(data)
-
-
-def _known(store: Store, block: int) -> np.ndarray | None:
-    """Returns `store.failed(block)` as the first process finds it."""
-
-    def find() -> list[np.ndarray] | None:
-        failed = store.failed(block)
-        return None if failed is None else [failed]
-
-    members = store.members(block)
-    size = members.stop - members.start
-    found = found_by_first(find, lambda: [np.empty(size, bool)])
-    return None if found is None else found[0]
+        values = [
+            outcome_numbers(leaf).astype("int8") if _is_result(leaf) else leaf
+            for leaf in _named(kept).values()
+        ]
+        for array, rows in zip(self.arrays, [*values, failed], strict=True):
+            if array.size:
+                array.blocks[block] = np.asarray(rows)
 
 
 def in_store(
@@ -213,18 +254,70 @@ def in_store(
 ) -> list[int]:
     """Solves blocks of members that the store lacks; returns the failed members."""
     moving, shared = job.batch.split()
-    moving, found, progress = in_numpy(moving), [], meter.init()
+    moving, failures, progress = in_numpy(moving), [], meter.init()
     for done, block in enumerate(blocks, 1):
-        failed = _known(store, block)
+        failed = store.failed(block)
         members = store.members(block)
         if failed is None:
             part = jax.tree.map(lambda leaf, m=members: leaf[m], moving)
             size = members.stop - members.start
             some = Batch(eqx.combine(part, shared), job.batch.batched, size)
             kept, failed = in_chunks(job._replace(batch=some), on_device=False)
-            if jax.process_index() == 0:
-                store.write(block, kept, failed)
-        found += (members.start + np.flatnonzero(failed)).tolist()
+            store.write(block, kept, failed)
+        failures += (members.start + np.flatnonzero(failed)).tolist()
         progress = meter.step(progress, jnp.asarray(done / len(blocks)))
     meter.close(progress)
-    return found
+    return failures
+
+
+def _constants(program: ClosedJaxpr | Jaxpr) -> Iterator[Any]:
+    """Yields the arrays that a program holds, and the programs within it.
+
+    Raises ValueError if it calls a Python function, which no digest can name.
+    """
+    yield from getattr(program, "consts", ())  # an open Jaxpr has none in JAX 0.10
+    programs = ClosedJaxpr, Jaxpr
+    for operation in program.eqns:
+        if operation.primitive.name in ("pure_callback", "io_callback"):
+            function = operation.params["callback"].callback_func
+            # Run-time checks by equinox add nothing to results.
+            if not str(getattr(function, "__module__", "")).startswith("equinox."):
+                expected = "a sweep without functions that only Python can call"
+                raise refusal("store", expected, function)
+        leaves = jax.tree.leaves(
+            operation.params, is_leaf=lambda leaf: isinstance(leaf, programs)
+        )
+        for leaf in leaves:
+            if isinstance(leaf, programs):
+                yield from _constants(leaf)
+
+
+def outline(
+    batch: Batch, ts: Array, settings: dict, keep: Callable[[Solution], Any]
+) -> tuple[Any, str]:
+    """Returns shapes and types of what is kept of a member, and the sweep's digest.
+
+    The digest is of the program and of all arrays, and the same in every process. The
+    program names functions, such as force elements, by what they compute. Raises
+    ValueError for callbacks into Python.
+    """
+
+    def kept(ts, moving, shared, settings, keep):
+        outcome, _, _ = outcome_of(settings, keep, ts, moving, shared, False)
+        return jax.tree.map(jnp.asarray, outcome)
+
+    moving, shared = batch.split()
+    first = jax.tree.map(lambda leaf: leaf[0], moving)
+    arguments = ts, first, shared, settings, keep
+    program, arrays, others = eqx.filter_make_jaxpr(kept)(*arguments)
+    # Functions are printed with addresses, which differ between processes.
+    text = re.sub(" at 0x[0-9a-f]+", "", str(program))
+    digest = hashlib.sha256(text.encode())
+    inputs = eqx.filter((batch.inputs, ts, settings, keep), eqx.is_array_like)
+    for leaf in [*_constants(program), *jax.tree.leaves(inputs)]:
+        if isinstance(leaf, Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+            leaf = jax.random.key_data(leaf)
+        values = np.ascontiguousarray(leaf)
+        digest.update(repr((values.shape, values.dtype)).encode())
+        digest.update(values.data.cast("B") if values.size else b"")
+    return eqx.combine(arrays, others), digest.hexdigest()

@@ -19,6 +19,7 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
+from ..base.array_namespace import in_numpy
 from ..base.checks import (
     function,
     hashable,
@@ -31,22 +32,20 @@ from ..base.checks import (
     shown,
     whole_number,
 )
-from ..base.devices import devices_outside_mesh, uncommitted
 from ..base.functions import sharing_functions
 from ..base.whole_files import folder_path
-from ..forces.element import Forces, elements, elements_on
+from ..forces.element import Forces, elements
 from ..linkage.coordinates import State
 from ..linkage.linkage import Linkage
 from ..simulation.simulate import solve_options
 from ..simulation.solution import Solution
 from ..steps.dopri8 import constant
-from .batch_axes import Batch, batch_of, check_arms
-from .checkpoints import Checkpoint
-from .chunk_programs import outcome_of
-from .chunks import Job, in_chunks, usual_chunk
-from .forecast import expected_work
-from .provenance import outline
-from .store import Store, in_store
+from .batch_axes import Batch, batch_of
+from .chunk_programs import expected_work, outcome_of
+from .chunks import Job, devices_outside_mesh, in_chunks
+from .store import Store, in_store, outline
+
+_CHUNK = 256  # on CPUs twice as many gain little
 
 
 def _without_times(solution: Solution) -> Solution:
@@ -73,16 +72,6 @@ def _traced(
             batch_size=chunk,
         )
 
-    def where(condition, tree):
-        """Returns the tree, constant for derivatives where `condition` is false."""
-
-        def guarded(leaf):
-            if not eqx.is_inexact_array(leaf):
-                return leaf
-            return jnp.where(condition, leaf, jax.lax.stop_gradient(leaf))
-
-        return jax.tree.map(guarded, tree)
-
     moving = jax.tree.map(lambda leaf: jnp.asarray(leaf)[order], moving)
     # A first solve finds the members that fail. In the differentiated solve the first
     # good member replaces them, because NaN would spoil derivatives of shared arrays.
@@ -90,7 +79,10 @@ def _traced(
     frozen, _, failed = constant(solved(*constant((moving, shared))))
     good = ~failed
     source = jnp.where(good, jnp.arange(batch.size), jnp.argmax(good))
-    moving, shared = where(jnp.any(good), (moving, shared))
+    moving, shared = jax.tree.map(
+        lambda a, b: jnp.where(jnp.any(good), a, b) if eqx.is_inexact_array(a) else a,
+        *((moving, shared), constant((moving, shared))),
+    )
     again, _, _ = solved(jax.tree.map(lambda leaf: leaf[source], moving), shared)
     back = jnp.argsort(order)
 
@@ -102,15 +94,8 @@ def _traced(
 
 def _check_elements(batch: Batch, ts: Array, forces_axes: Any) -> None:
     """Raises an error unless the force elements suit each member's linkage."""
-    moving, shared = batch.split()
-
-    def check_member(moving):
-        linkage, _, forces = eqx.combine(moving, shared)
-        elements_on(linkage, forces)  # what members share is known here
-
-    eqx.filter_eval_shape(eqx.filter_vmap(check_member), moving)
     try:
-        eqx.filter_eval_shape(expected_work, ts, moving, shared)
+        eqx.filter_eval_shape(expected_work, ts, *batch.split())
     except TypeError as error:
         raise TypeError(
             "forces, forces_axes: expected force elements that work for one member, "
@@ -129,7 +114,6 @@ def sweep(
     reduce: Callable[[Solution], Any] | None = None,
     chunk: int | None = None,
     throw: bool = False,
-    checkpoint: str | os.PathLike | None = None,
     store: str | os.PathLike | None = None,
     shard: int = 0,
     of: int = 1,
@@ -146,8 +130,7 @@ def sweep(
     """Computes many motions, as `jax.vmap(simulate)` does, but faster.
 
     A member that fails ends early with a result of its own, and slow members delay few
-    others. Runs on all devices that JAX sees. With `jax.distributed`, call `sweep` with
-    the same arguments in every process; each returns the whole solution.
+    others. Runs on all devices of this process.
 
     **Arguments:**
 
@@ -159,18 +142,14 @@ def sweep(
       tuple of these with one entry per element.
     - `reduce`: a function of one member's `Solution`, for instance
       `lambda motion: motion.q[-1]`; of each member only the arrays that it returns are
-      kept, also in a checkpoint. Functions of equal code share a compiled program.
-    - `chunk`: largest number of members to solve together, per device. None stands for
-      128; or 256 where a CPU has several cores, unless the results go to a checkpoint
-      or store, which any machine may resume.
+      kept. Functions of equal code share a compiled program.
+    - `chunk`: largest number of members to solve together, per device; None stands for
+      256.
     - `throw`: whether to raise an error if any member fails.
-    - `checkpoint`: a folder for the results of finished chunks. A repeated call resumes
-      from them. A file that is damaged, or of another chunk, is reported by a warning,
-      and its members are solved again.
     - `store`: a folder for the results, which are not held in memory: a Zarr group for
-      `xarray.open_zarr`, written in blocks of members. A repeated call solves only the
-      blocks that are missing or damaged; a warning names damaged files. A folder with
-      another sweep, or anything else, is refused.
+      `xarray.open_zarr`, written in blocks of members (`fdof_jax[data]` brings zarr). A
+      repeated call solves only the blocks that are missing or damaged; a warning names
+      damaged files. A folder with another sweep, or anything else, is refused.
     - `shard`, `of`: with `store`, solves only each block whose number is `shard` modulo
       `of`. Any number of processes may fill one store, in any order.
     - `solver`, `rtol`, `atol`, `max_step`, `stepsize_controller`, `dt0`, `adjoint`,
@@ -184,10 +163,10 @@ def sweep(
     Finding them takes one more solve, without derivatives. With `store`, its path.
 
     **Raises:** ValueError for malformed arguments; RuntimeError, with `throw=True`, if
-    a member fails.
+    a member fails; ImportError, with `store`, where zarr is not installed.
     """
-    linkage, state0, forces = uncommitted((linkage, state0, forces))
-    check_arms(linkage)
+    # Arrays may be on any devices; chunks of them go to those of the sweep.
+    linkage, state0, forces = in_numpy((linkage, state0, forces))
     try:
         q, qd = (jnp.asarray(a) if is_traced(a) else numpy_array(a) for a in state0)
     except (TypeError, ValueError):
@@ -202,15 +181,12 @@ def sweep(
     elements("forces", forces)
     hashable("forces", forces)
     hashable("reduce", reduce)
-    if chunk is not None:
-        whole_number("chunk", chunk, 1)
+    chunk = _CHUNK if chunk is None else whole_number("chunk", chunk, 1)
     whole_number("of", of, 1)
     if whole_number("shard", shard, 0) >= of:
         raise refusal("shard", f"a whole number below of={of}", shard)
     if store is None and of > 1:
         raise refusal("store", "a folder, as of is given", store)
-    if store is not None and checkpoint is not None:
-        raise refusal("checkpoint", "None beside a store, which resumes", checkpoint)
     settings = solve_options(
         solver=solver,
         rtol=rtol,
@@ -226,9 +202,6 @@ def sweep(
     del settings["progress_meter"]  # it counts finished members, not time
     batch = batch_of(linkage, state0, forces, forces_axes)
     traced = is_transformed()
-    if chunk is None:
-        resumable = checkpoint is not None or store is not None
-        chunk = usual_chunk(anywhere=traced or resumable)
     if forces:
         _check_elements(batch, ts, forces_axes)
     keep = _without_times if reduce is None else function("reduce", reduce)
@@ -248,10 +221,9 @@ def sweep(
         return dataclasses.replace(kept, ts=times)
 
     if traced:
-        if throw or checkpoint is not None or store is not None:
+        if throw or store is not None:
             raise ValueError(
-                "throw, checkpoint, store: expected their defaults under jit, grad or "
-                "vmap."
+                "throw, store: expected their defaults under jit, grad or vmap."
             )
         return whole(_traced(batch, ts, settings, keep, chunk))
     with devices_outside_mesh() as devices:
@@ -269,11 +241,6 @@ def sweep(
             blocks = range(shard, group.count, of)
             check(solved(lambda job: in_store(group, blocks, job, progress_meter)))
             return folder
-        resumed = None
-        if checkpoint is not None:
-            folder = folder_path("checkpoint", checkpoint)
-            _, digest = outline(batch, ts, settings, keep)
-            resumed = Checkpoint(folder, digest)
-        kept, failed = solved(lambda job: in_chunks(job, resumed, progress_meter))
+        kept, failed = solved(lambda job: in_chunks(job, progress_meter))
     check(np.flatnonzero(failed))
     return whole(kept)
