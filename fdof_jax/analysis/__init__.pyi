@@ -6,7 +6,13 @@ from .linearization import (
     closed_loop_modes as closed_loop_modes,
     linearize as linearize,
 )
-from .loops import OpenLoop as OpenLoop, open_loop as open_loop
+from .loops import (
+    Margins as Margins,
+    bandwidth as bandwidth,
+    closed_loop as closed_loop,
+    margins as margins,
+    open_loop as open_loop,
+)
 from .reactions import joint_reactions as joint_reactions
 from .regression import (
     inertial_parameters as inertial_parameters,

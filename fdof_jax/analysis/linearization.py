@@ -138,7 +138,7 @@ def _with_references(element: Element, changed: Callable[[Any], Any]) -> Element
 
 
 @eqx.filter_jit
-def closed_loop(
+def loop_matrices(
     linkage: Linkage, controller: Element, forces: tuple[Element, ...], q: Array, t: Any
 ) -> tuple[Array, Array, Array, Array]:
     """Linearises an arm under a controller about rest at `q`: A, B, C and F.

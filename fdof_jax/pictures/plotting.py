@@ -33,11 +33,11 @@ from .axes import (
     time_panels,
 )
 from .energies import energy_profile, energy_stack
-from .responses import bode_plot, response_profile
+from .responses import response_profile
 from .tracking import tracking, tracking_by_error, tracking_error
 
 __all__ = [
-    "bode_plot", "effort_profile", "energy_profile", "energy_stack",
+    "effort_profile", "energy_profile", "energy_stack",
     "motion_profile", "response_profile", "tracking", "tracking_by_error",
     "tracking_error", "work_precision",
 ]  # fmt: skip
