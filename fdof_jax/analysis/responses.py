@@ -6,10 +6,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jax import Array
 from jaxtyping import Complex, Float
 from numpy.typing import ArrayLike
-from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
 from ..base.checks import is_traced, real_array, refusal
 from ..control.drives import Drive
@@ -29,7 +29,7 @@ from ..simulation.simulate import simulate
 from ..simulation.solution import Solution
 from .equilibria import holding_efforts
 from .loops import BANDWIDTH, bandwidth, closed_loop, margins, open_loop
-from .tracking import saturated
+from .tracking import relative_demands
 
 # Samples of a response: at least so many, so that most arms share a program, and one
 # for each part of a radian of the fastest mode, between which cubics are exact to 1e-5.
@@ -48,23 +48,15 @@ _STEPS = 2**20
 
 
 class Probe(Reference):
-    """A reference at rest, which steps at a time or swings from the start."""
+    """A reference that swings from the start, or stands."""
 
-    base: Values = field(unit="m or rad")
-    step: Values = field(unit="m or rad")
-    begin: Values = field((), unit="s")
+    center: Values = field(unit="m or rad")
     amplitude: Values = field(unit="m or rad")
     frequency: Values = field((), unit="rad/s")
 
-    @property
-    def jump_ts(self) -> Array:
-        return self.begin[None]
-
     def __call__(self, t: Any, linkage: Linkage) -> tuple[Array, Array]:
-        angle = self.frequency * t
-        position = self.base + jnp.where(t < self.begin, 0, self.step)
-        position = position + self.amplitude * jnp.sin(angle)
-        return position, self.amplitude * self.frequency * jnp.cos(angle)
+        angle, rate = self.frequency * t, self.frequency * self.amplitude
+        return self.center + self.amplitude * jnp.sin(angle), rate * jnp.cos(angle)
 
 
 def _commanding(element: Any) -> Any:
@@ -183,21 +175,19 @@ def step_and_sine(
     names, moving = joint_names(linkage), moving_joints(linkage)
     heights, t0, still = np.asarray(step), float(duration), np.zeros(n)
 
-    def probing(
-        step: Any = still, amplitude: Any = still, frequency: Any = 1.0
-    ) -> Element:
+    def with_probe(center: Any, amplitude: Any = still, frequency: Any = 1) -> Element:
         """Returns the controller with a probe for its reference."""
-        probe = Probe(q, step, t0, amplitude, frequency)
+        probe = Probe(center, amplitude, frequency)
         return eqx.tree_at(lambda part: _commanding(part).reference, element, probe)
 
-    def run(element: Element, start: State, own: Any, ts: np.ndarray) -> Solution:
-        acting = element, *forces
-        return simulate(
-            linkage, start, ts, acting, own0=own, throw=False, max_steps=_STEPS
-        )
+    def motion(acting: Element, start: State, own: Any, ts: np.ndarray) -> Solution:
+        keywords: Any = dict(own0=own, throw=False, max_steps=_STEPS)
+        return simulate(linkage, start, ts, (acting, *forces), **keywords)
 
-    def responses_at(q: Any) -> tuple[list[Any], np.ndarray]:
-        loops = [closed_loop(linkage, q, probing(), k + 1, forces) for k in moving]
+    def responses_at(here: Any) -> tuple[list[Any], np.ndarray]:
+        loops = [
+            closed_loop(linkage, here, with_probe(q), k + 1, forces) for k in moving
+        ]
         return loops, np.array(list(map(bandwidth, loops)))
 
     loops, bandwidths = responses_at(q)
@@ -205,16 +195,15 @@ def step_and_sine(
         expected = "one with which each joint follows its reference at q"
         raise refusal("controller", expected, controller)
     start, own = State(q, jnp.asarray(still)), None
-    poles = loops[0].poles()
-    if (decay := -poles.real.max()) > 0:
+    if (decay := -loops[0].poles().real.max()) > 0:
         if isinstance(element, StatefulElement):
             own = (element.initial_state(linkage),)
         # As many times as of most answers, so that one program serves both.
-        ts = np.linspace(0, min(_DECAYED / decay, _LONGEST * t0), _LEAST + 1)
-        sagging = run(probing(), start, own, ts)
-        if np.isfinite([sagging.q[-1], sagging.qd[-1]]).all():
-            start = State(sagging.q[-1], sagging.qd[-1])
-            own = own and jax.tree.map(lambda rows: rows[-1], sagging.own)
+        ts = np.linspace(0, min(_DECAYED / decay, _LONGEST * t0), _LEAST)
+        sag = motion(with_probe(q), start, own, ts)
+        if np.isfinite([sag.q[-1], sag.qd[-1]]).all():
+            start = State(sag.q[-1], sag.qd[-1])
+            own = own and jax.tree.map(lambda rows: rows[-1], sag.own)
         loops, bandwidths = responses_at(start.q)
     if np.isnan(bandwidths).any():  # at a limit, a controller has no gains
         needed = np.asarray(holding_efforts(linkage, q, forces)).round(6).tolist()
@@ -224,41 +213,37 @@ def step_and_sine(
             "(`holding_efforts`), and more to be caught as it sags."
         )
     since = np.linspace(0, t0, samples_of(t0, np.abs(loops[0].poles()).max()))
-    steps, frequencies, gains = [], [], []
+    rows = []
     # One after the other: a batch takes three times as long to compile.
     for k, scale in zip(moving, bandwidths):
         height = heights * np.eye(n)[k]
-        controlled = probing(step=height)
-        motion = run(controlled, start, own, np.append(0, t0 + since))
-        at_limit = saturated(_commanding(controlled), linkage, motion)[1:, k].mean()
-        change, rate = (
-            np.asarray(x)[1:, k] / heights[k] for x in (motion.q, motion.qd)
-        )
-        change = change - change[0]
-        steps.append(
-            (change, at_limit, *step_measures(since, change, rate, change[-1]))
-        )
+        acting = with_probe(q + height)
+        run = motion(acting, start, own, since)
+        change = np.asarray(run.q[:, k] - run.q[0, k]) / heights[k]
+        rate = np.asarray(run.qd[:, k]) / heights[k]
+        measures = step_measures(since, change, rate, change[-1])
+        demand = relative_demands(_commanding(acting), linkage, run)[:, k]
         if np.isinf(scale):  # the arm follows all sines
-            loop = open_loop(linkage, start.q, probing(), k + 1, forces)
+            loop = open_loop(linkage, start.q, with_probe(q), k + 1, forces)
             scale = margins(loop).crossover
-        frequencies.append(scale * _FREQUENCIES)
-        gains.append([])
-        for w in frequencies[-1]:
-            ts = t0 + 2 * np.pi / w * _PERIODS * np.arange(_LEAST) / _LEAST
-            motion = run(
-                probing(amplitude=height, frequency=w), start, own, np.append(0, ts)
-            )
-            harmonic = np.mean(np.asarray(motion.q)[1:, k] * np.exp(-1j * w * ts))
-            gains[-1].append(2j * harmonic / heights[k])
-    response, at_limit, overshoot, rise_time, settling_time = map(np.array, zip(*steps))
-    frequency, gain = np.array(frequencies), np.array(gains)
+        frequency, gain = scale * _FREQUENCIES, []
+        for w in frequency:
+            ts = t0 + 2 * np.pi / w * _PERIODS * np.arange(_LEAST - 1) / (_LEAST - 1)
+            run = motion(with_probe(q, height, w), start, own, np.append(0, ts))
+            harmonic = np.mean(run.q[1:, k] * np.exp(-1j * w * ts))
+            gain.append(2j * harmonic / heights[k])
+        width = _bandwidth(frequency, np.array(gain), change[-1])
+        at_limit = np.mean(np.abs(demand) > 1)
+        rows.append((*measures, width, at_limit, change, frequency, gain))
+    overshoot, rise_time, settling_time, *others = map(np.array, zip(*rows))
+    widths, at_limit, response, frequency, gain = others
     return StepAndSine(
         joints=tuple(names[k] for k in moving),
         step=heights[moving],
         overshoot=overshoot,
         rise_time=rise_time,
         settling_time=np.where(settling_time <= _SETTLED * t0, settling_time, np.nan),
-        bandwidth=np.array(list(map(_bandwidth, frequency, gain, response[:, -1]))),
+        bandwidth=widths,
         saturated=np.where(np.isnan(overshoot), np.nan, at_limit),
         ts=since,
         response=response,
@@ -294,7 +279,7 @@ def step_measures(
     # `step_info` measures to the nearest sample: these are 3e-4 of it apart at most.
     fine = np.union1d(ts, np.geomspace(ts[1] / 100, ts[-1], 2**16))
     fine = fine[fine <= ts[-1]]
-    part = CubicHermiteSpline(ts, change, rate)(fine) / final
+    part = scipy.interpolate.CubicHermiteSpline(ts, change, rate)(fine) / final
     rises = part.max() >= 0.9  # else `step_info` raises IndexError
     limits = (0.1, 0.9) if rises else (-np.inf, -np.inf)
     info: Any = control.step_info(
@@ -309,6 +294,6 @@ def _bandwidth(frequency: np.ndarray, gain: np.ndarray, final: float) -> float:
     level = np.log(np.abs(gain / final))
     if not np.isfinite(level).all() or level[0] < np.log(BANDWIDTH):
         return np.nan
-    curve = CubicSpline(np.log(frequency), level)
+    curve = scipy.interpolate.CubicSpline(np.log(frequency), level)
     crossings = curve.solve(np.log(BANDWIDTH), extrapolate=False)
     return float(np.exp(crossings[0])) if crossings.size else np.nan
