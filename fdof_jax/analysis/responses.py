@@ -278,7 +278,6 @@ def step_measures(
         return np.nan, np.nan, np.nan
     # `step_info` measures to the nearest sample: these are 3e-4 of it apart at most.
     fine = np.union1d(ts, np.geomspace(ts[1] / 100, ts[-1], 2**16))
-    fine = fine[fine <= ts[-1]]
     part = scipy.interpolate.CubicHermiteSpline(ts, change, rate)(fine) / final
     rises = part.max() >= 0.9  # else `step_info` raises IndexError
     limits = (0.1, 0.9) if rises else (-np.inf, -np.inf)
