@@ -7,6 +7,7 @@ from helpers import random_linkage
 from test_gains import pd_at
 
 import fdof_jax as fj
+from fdof_jax.analysis.responses import step_measures
 
 STEP, DURATION = 1e-4, 3.0
 
@@ -121,6 +122,16 @@ def test_an_arm_that_does_not_come_to_rest_is_not_settled(arm):
     )
     test = fj.analysis.step_and_sine(linkage, q, undamped, step=STEP, duration=DURATION)
     assert np.isnan(test.settling_time).all()
+
+
+def test_a_response_that_creeps_or_fails_has_no_rise_time():
+    ts = np.linspace(0, 2, 1001)
+    change, rate = 1 - np.exp(-ts), np.exp(-ts)  # 0.86 at the end
+    assert str(step_measures(ts, change, rate, 1.0)) == str((0.0, np.nan, np.nan))
+    rise = step_measures(ts, change, rate, change[-1])[1]
+    part = lambda share: -np.log1p(-share * change[-1])
+    np.testing.assert_allclose(rise, part(0.9) - part(0.1), rtol=1e-3)
+    assert np.isnan(step_measures(ts, np.full(1001, np.nan), rate, np.nan)).all()
 
 
 def test_a_report_is_shown(small):

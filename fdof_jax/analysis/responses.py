@@ -276,7 +276,7 @@ def step_measures(
 
     if not (final and np.isfinite([change, rate]).all()):
         return np.nan, np.nan, np.nan
-    # `step_info` measures to the nearest sample: these are 3e-4 of it apart at most.
+    # `step_info` measures to the nearest sample: within 3e-4 of a time with these.
     fine = np.union1d(ts, np.geomspace(ts[1] / 100, ts[-1], 2**16))
     part = scipy.interpolate.CubicHermiteSpline(ts, change, rate)(fine) / final
     rises = part.max() >= 0.9  # else `step_info` raises IndexError
