@@ -61,7 +61,7 @@ def test_tuning(tmp_path, monkeypatch):
 def test_gains(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     names = run(DOCS / "gains.md")
-    assert names["loop"].stable
+    assert np.isfinite(names["fj"].analysis.margins(names["slower"])).all()
     assert names["large"].bandwidth[0] < 0.6 * names["small"].bandwidth[0]
     assert names["found"].met.shape == (12,) and names["found"].met.all()
 

@@ -1,12 +1,14 @@
-"""Loops: peaks, hidden states of drives, and how joints follow their references."""
+"""Loops of controllers: closed forms, margins, and how joints follow references."""
 
+import control
 import numpy as np
 import pytest
+from chains import random_chain
 from scipy.optimize import brentq, minimize_scalar
-from test_gains import PENDULUM, Stand, arm, pd_at, state_space
+from test_gains import PENDULUM, Stand, arm, pd_at, poles
 
 import fdof_jax as fj
-from fdof_jax.analysis.transfer import Transfer
+from fdof_jax.analysis import bandwidth, closed_loop, margins, open_loop
 
 # A pendulum's inertia about its pivot, and the slope of its weight, at 0.8 rad.
 INERTIA = 0.3 + 2 * (0.6**2 + 0.2**2)
@@ -14,18 +16,95 @@ FALL = -2 * 9.81 * (0.6 * np.sin(0.8) + 0.2 * np.cos(0.8))
 POSITION = np.array([0.8])
 
 
+def test_the_loop_of_a_pendulum_is_as_written_out():
+    kp, kd = 50.0, 6.0
+    loop = open_loop(PENDULUM, POSITION, pd_at(POSITION, kp, kd), joint=1)
+    s = 1j * np.geomspace(0.1, 100, 7)
+    expected = (kp + kd * s) / (INERTIA * s**2 + FALL)
+    np.testing.assert_allclose(loop(s), expected, rtol=1e-10)
+    assert loop.name == "loop of R1"
+    found = margins(loop)
+    # It falls over if the gains are too low.
+    np.testing.assert_allclose(found.gain, -FALL / kp, rtol=1e-9)
+    # |kp + kd s|^2 = (inertia w^2 - fall)^2
+    squares = np.roots([INERTIA**2, -2 * INERTIA * FALL - kd**2, FALL**2 - kp**2])
+    crossover = np.sqrt(squares.max())
+    np.testing.assert_allclose(found.crossover, crossover, rtol=1e-9)
+    phase = np.arctan(kd * crossover / kp)
+    np.testing.assert_allclose(found.phase, phase, rtol=1e-9)
+    np.testing.assert_allclose(found.delay, phase / crossover, rtol=1e-9)
+
+
+def test_without_gravity_no_factor_makes_a_damped_loop_unstable():
+    weightless = PENDULUM.replace(gravity=0)  # L is infinite at rest
+    loop = open_loop(weightless, POSITION, pd_at(POSITION, 50.0, 6.0), joint=1)
+    assert margins(loop).gain == np.inf
+
+
+def test_a_controller_at_its_limit_has_no_loop():
+    pd = pd_at(POSITION + 1, 50.0, 6.0)
+    limited = fj.PDController(pd.kp, pd.kd, [10.0], pd.reference)
+    calls = PENDULUM, POSITION, limited, 1
+    loop = open_loop(*calls)
+    assert (loop([1j, 2j]) == 0).all() and np.isnan(margins(loop)).all()  # it falls
+    assert np.isnan(bandwidth(closed_loop(*calls)))
+    # No change of the loop makes an arm unstable that hangs.
+    damped = fj.JointDamper(0.1)
+    hangs = margins(open_loop(PENDULUM, POSITION - np.pi, limited, 1, (damped,)))
+    assert hangs.phase == hangs.gain == hangs.delay == np.inf and hangs.modulus == 1
+
+
+@pytest.mark.parametrize("kp, kd", [(1.0, 1.0), (50.0, 0.0)])
+def test_a_loop_that_is_not_stable_has_no_margins(kp, kd):
+    """It falls, as its gains are too low, or swings without end."""
+    loop = open_loop(PENDULUM, POSITION, pd_at(POSITION, kp, kd), joint=1)
+    assert np.isnan(margins(loop)).all()
+
+
+def lagged(chain, seed, spread, ratio, lag, base=8.0):
+    """Returns a random arm without weight, a configuration and a controller."""
+    linkage = random_chain(chain, np.random.default_rng(seed)).replace(gravity=0)
+    q = np.random.default_rng(seed).uniform(-1, 1, len(chain))
+    frequency = base * np.geomspace(1, spread, len(chain))
+    pd = pd_at(q, *fj.control.gains_from_frequency(linkage, q, frequency, ratio))
+    return linkage, q, fj.control.FirstOrderLag(pd, lag)
+
+
+@pytest.mark.parametrize("chain, spread, ratio, lag", [
+    ("RPR", 7.5, 0.7, 4e-3), ("RRR", 7.5, 0.7, 4e-3), ("RPR", 100.0, 0.7, 1e-4),
+])  # fmt: skip
+def test_loops_are_unstable_beyond_their_margins(chain, spread, ratio, lag):
+    linkage, q, controller = lagged(chain, 0, spread, ratio, lag)
+    for joint in (1, len(chain)):
+        loop = open_loop(linkage, q, controller, joint)
+        found = margins(loop)
+        decay = lambda k, loop=loop: loop.A - k * loop.B @ loop.C
+        decay = lambda k, f=decay: np.linalg.eigvals(f(k)).real.max()
+        assert decay(1.0) < 0
+        if np.isfinite(found.gain):
+            nearer, beyond = found.gain ** np.array([0.999, 1.001])
+            assert decay(nearer) < 0 < decay(beyond)
+        else:
+            assert decay(1e-3) < 0 and decay(1e3) < 0
+        response = loop(1j * found.crossover)
+        for turn in (found.phase, found.delay * found.crossover):
+            assert response * np.exp(-1j * turn) == pytest.approx(-1, abs=1e-6)
+        np.testing.assert_allclose(found.modulus, least_distance(loop), rtol=1e-5)
+
+
 def least_distance(loop):
     """Returns the least |1 + L| by fine samples around each mode of the closed loop."""
-    system, found = state_space(loop), [1.0]
-    distance = lambda w: np.abs(1 + system(1j * w))
-    for mode in np.linalg.eigvals(system.A - system.B @ system.C):
-        near = np.abs(mode.imag) - 20 * mode.real * np.linspace(-1, 1, 2001)
+    least = [1.0]
+    distance = lambda w: np.abs(1 + loop(1j * w))
+    for mode in loop.feedback().poles():
+        near = np.abs(mode.imag) - 20 * mode.real * np.linspace(-1, 1, 501)
         near = near[near > 0]
         k = np.clip(distance(near).argmin(), 1, len(near) - 2)
         ends = near[k - 1], near[k + 1]
-        exact = dict(xatol=1e-9)
-        found.append(minimize_scalar(distance, bounds=ends, options=exact).fun)
-    return min(found)
+        least.append(
+            minimize_scalar(distance, bounds=ends, options=dict(xatol=1e-9)).fun
+        )
+    return min(least)
 
 
 @pytest.mark.parametrize("seed, ratio", [(3, 5e-4), (9, 5e-5)])
@@ -35,30 +114,9 @@ def test_the_modulus_margin_of_a_lightly_damped_loop(seed, ratio):
     linkage = linkage.replace(gravity=0)
     gains = fj.control.gains_from_frequency(linkage, q, [8, 8.8, 60], ratio)
     for joint in (1, 2, 3):
-        loop = fj.analysis.open_loop(linkage, q, pd_at(q, *gains), joint)
+        loop = open_loop(linkage, q, pd_at(q, *gains), joint)
         expected = least_distance(loop)
-        np.testing.assert_allclose(loop.modulus_margin, expected, rtol=1e-5)
-
-
-def test_peaks_and_crossings_of_written_out_functions():
-    w, z = 50.0, 1e-4  # w^2 / (s^2 + 2 z w s + w^2)
-    low = Transfer(np.array([[0, 1], [-(w**2), -2 * z * w]]), np.array([0, w**2]),
-                   np.array([1.0, 0]))  # fmt: skip
-    np.testing.assert_allclose(low.peak(), 1 / (2 * z * np.sqrt(1 - z**2)), rtol=1e-8)
-    # With x = (frequency / w)^2, (1 - x)^2 + 4 z^2 x = 1 / level^2.
-    (x,) = [x for x in np.roots([1, 4 * z**2 - 2, 1 - 4]) if x > 0]
-    np.testing.assert_allclose(low.crossings(0.5), w * np.sqrt(x))
-    below, above = low.crossings(100.0)
-    np.testing.assert_allclose(below**2 + above**2, 2 * w**2 * (1 - 2 * z**2))
-    assert not low.crossings(1e4).size and not low.crossings(0.0).size
-    # What is left of 1 has its peak beside the zero's mode, and goes to 1.
-    rest = low._replace(C=-low.C, D=1.0)
-    s = 1j * np.array([1.0, 50.0, 1e3])
-    np.testing.assert_allclose(rest(s.imag), 1 - low(s.imag), rtol=1e-9)
-    assert rest.peak() == pytest.approx(np.abs(1 - low(w)), rel=1e-3)
-    high = Transfer(np.array([[-2.0]]), np.array([2.0]), np.array([-1.0]), 1.0)
-    assert high.peak() == pytest.approx(1)  # s / (s + 2), at no finite frequency
-    np.testing.assert_allclose(high.crossings(0.6), 1.5)
+        np.testing.assert_allclose(margins(loop).modulus, expected, rtol=1e-5)
 
 
 @pytest.mark.parametrize("kp, ki, kd, lag, fall", [
@@ -71,11 +129,38 @@ def test_the_gain_margin_of_stiff_loops(kp, ki, kd, lag, fall):
         [0, 1, 0, 0], [fall / 4.4, 0, 0, 0],
         [-kp / lag, -kd / lag, -1 / lag, 1 / lag], [-ki, 0, 0, 0],
     ])  # fmt: skip
-    none = np.zeros(4)
-    B, C = np.array([0, 1 / 4.4, 0, 0]), np.array([0, 0, -1.0, 0])
-    loop = fj.analysis.OpenLoop(A, B, C, none, none, 0.0, "R1")
+    loop = control.ss(A, [[0], [1 / 4.4], [0], [0]], [[0, 0, -1, 0]], 0)
     expected = (fall + 4.4 * ki / (kd - lag * kp)) / kp
-    assert loop.gain_margin == pytest.approx(expected, rel=1e-8)
+    assert margins(loop).gain == pytest.approx(expected, rel=1e-8)
+
+
+def test_the_phase_margin_of_a_stiff_loop_of_high_order():
+    """Its polynomials overflow in seconds: L = 9 (1 + s) / s^2 behind 22 fast lags."""
+    rates = np.geomspace(1e5, 1e6, 22)
+    loop = control.ss([[0, 1], [0, 0]], [[0], [1]], [[9, 9]], 0)
+    for rate in rates:
+        loop = loop * control.ss(-rate, rate, 1, 0)
+    with pytest.raises(np.linalg.LinAlgError), np.errstate(all="ignore"):
+        control.stability_margins(loop)
+    crossover = brentq(lambda w: 9 * np.hypot(1, w) / w**2 - 1, 1, 100)
+    phase = np.arctan(crossover) - np.arctan(crossover / rates).sum()
+    found = margins(loop)
+    np.testing.assert_allclose(found.crossover, crossover, rtol=1e-6)
+    np.testing.assert_allclose(found.phase, phase, rtol=1e-6)
+
+
+def test_the_closed_loop_is_the_linearised_arm():
+    linkage, q = arm("RPR")
+    gains = fj.control.gains_from_frequency(linkage, q, 20.0, 0.7)
+    load = fj.analysis.holding_efforts(linkage, q)
+    pd = pd_at(q + load / gains[0], *gains)  # sags to q
+    loop, response = (of(linkage, q, pd, joint=2) for of in (open_loop, closed_loop))
+    for closed in (loop.feedback(), response):
+        found = np.poly(closed.poles())
+        np.testing.assert_allclose(found, np.poly(poles(linkage, q, pd)), rtol=1e-9)
+    # Constant efforts hold what a controller without its load would not.
+    other = open_loop(linkage, q, pd_at(q, *gains), joint=2)
+    np.testing.assert_allclose(other.A, loop.A, rtol=1e-12)
 
 
 @pytest.mark.parametrize("gains", [(80.0, 40.0), ([80.0, 0.0], [40.0, 0.0])])
@@ -91,15 +176,26 @@ def test_an_integral_of_a_fixed_pair_within_a_drive_is_no_state(gains, speed):
     controller = fj.control.PIDController(kp, ki, 9.0, np.inf, Stand(q))
     if speed:
         controller = fj.control.SpeedLimit(controller, stall=1e3, no_load=1e3)
-    lagged = fj.control.FirstOrderLag(controller, 0.002)
-    loop = fj.analysis.open_loop(longer, q, lagged, joint=1)
-    assert loop.A.shape == (4, 4) and loop.stable
+    slow = fj.control.FirstOrderLag(controller, 0.002)
+    loop = open_loop(longer, q, slow, joint=1)
+    assert loop.A.shape == (4, 4) and loop.feedback().poles().real.max() < 0
     inertia = float(fj.joint_mass_matrix(longer, q)[0, 0])
     fall = float(fj.analysis.holding_efforts(longer, q + [1e-6, 0])[0])
     fall = (fall - float(fj.analysis.holding_efforts(longer, q - [1e-6, 0])[0])) / 2e-6
     s = 1j * np.geomspace(0.1, 1000, 9)
     expected = (80 + 40 / s + 9 * s) / (0.002 * s + 1) / (inertia * s**2 + fall)
-    np.testing.assert_allclose(loop(s.imag), expected, rtol=1e-6)
+    np.testing.assert_allclose(loop(s), expected, rtol=1e-6)
+
+
+def test_an_integral_without_a_gain_is_no_state():
+    q = np.array([0.8, 0.0])
+    two = fj.Linkage(
+        "RR", length=[0, 1, 1], com=[[0.6, 0.2], [0.5, 0]], mass=[2, 1],
+        inertia=[0.3, 0.1],
+    )  # fmt: skip
+    pid = fj.control.PIDController(80.0, [40.0, 0.0], 9.0, np.inf, Stand(q))
+    loop = open_loop(two, q, pid, joint=1)
+    assert loop.A.shape == (5, 5) and np.isfinite(margins(loop).phase)
 
 
 # How joints follow their references
@@ -150,29 +246,38 @@ FOLLOWERS = {
 @pytest.mark.parametrize("name", FOLLOWERS)
 def test_the_bandwidth_is_that_of_the_response_to_the_reference(name):
     controller, response = FOLLOWERS[name]
-    loop = fj.analysis.open_loop(PENDULUM, POSITION, controller, joint=1)
-    following = Transfer(loop.A - np.outer(loop.B, loop.C), loop.F, loop.G, loop.D)
-    w = np.geomspace(0.1, 1e3, 9)
-    np.testing.assert_allclose(following(w), response(1j * w), rtol=1e-8)
-    np.testing.assert_allclose(loop.bandwidth, bandwidth_of(response), rtol=1e-9)
+    following = closed_loop(PENDULUM, POSITION, controller, joint=1)
+    s = 1j * np.geomspace(0.1, 1e3, 9)
+    np.testing.assert_allclose(following(s), response(s), rtol=1e-8)
+    np.testing.assert_allclose(bandwidth(following), bandwidth_of(response), rtol=1e-9)
+
+
+def test_the_bandwidth_ends_at_a_narrow_dip():
+    """That of another joint's mode, between samples of the frequency."""
+    linkage, q = arm("RRR", 3)
+    linkage = linkage.replace(gravity=0)
+    gains = fj.control.gains_from_frequency(linkage, q, [8, 8.8, 60], 5e-4)
+    response = closed_loop(linkage, q, pd_at(q, *gains), joint=3)
+    edge = bandwidth(response)
+    below, above = np.abs(response(1j * edge * np.array([1 - 1e-6, 1 + 1e-6])))
+    assert above < 10 ** (-3 / 20) < below
+    assert control.bandwidth(response) > 3 * edge
 
 
 def test_computed_torque_follows_at_all_frequencies():
     """With an error of the model it does not: its inertia is that of its own model."""
-    loop = fj.analysis.open_loop(
-        PENDULUM, POSITION, follower(fj.control.ComputedTorque), joint=1
-    )
-    assert loop.bandwidth == np.inf and "bandwidth       inf rad/s" in str(loop)
+    torque = follower(fj.control.ComputedTorque)
+    assert bandwidth(closed_loop(PENDULUM, POSITION, torque, joint=1)) == np.inf
     light = PENDULUM.replace(mass=[0.5], inertia=[0.1])
-    control = follower(fj.control.ComputedTorque, model=light)
-    loop = fj.analysis.open_loop(PENDULUM, POSITION, control, joint=1)
+    torque = follower(fj.control.ComputedTorque, model=light)
+    following = closed_loop(PENDULUM, POSITION, torque, joint=1)
     believed, fall = 0.1 + 0.5 * (0.6**2 + 0.2**2), 0.25 * FALL
 
     def response(s):
         gained = believed * (s**2 + 6 * s + 90)
         return gained / (INERTIA * s**2 + believed * (6 * s + 90) + FALL - fall)
 
-    np.testing.assert_allclose(loop.bandwidth, bandwidth_of(response), rtol=1e-9)
+    np.testing.assert_allclose(bandwidth(following), bandwidth_of(response), rtol=1e-9)
 
 
 def test_joints_follow_while_others_hold():
@@ -180,12 +285,30 @@ def test_joints_follow_while_others_hold():
     linkage, q = arm("RPR")
     torque = fj.control.ComputedTorque(90.0, 6.0, np.inf, Stand(q))
     for joint in (1, 2, 3):
-        loop = fj.analysis.open_loop(linkage, q, torque, joint)
-        following = Transfer(loop.A - np.outer(loop.B, loop.C), loop.F, loop.G, loop.D)
-        np.testing.assert_allclose(following([0.0, 1.0, 30.0, 1e3]), 1, rtol=1e-8)
+        following = closed_loop(linkage, q, torque, joint)
+        s = 1j * np.array([0.0, 1.0, 30.0, 1e3])
+        np.testing.assert_allclose(following(s), 1, rtol=1e-8)
 
 
 def test_a_controller_without_a_reference_has_no_bandwidth():
     plain = lambda t, q, qd, linkage: -90 * (q - 0.8) - 6 * qd
-    loop = fj.analysis.open_loop(PENDULUM, POSITION, plain, joint=1)
-    assert loop.stable and np.isnan(loop.bandwidth) and "bandwidth" not in str(loop)
+    assert np.isfinite(margins(open_loop(PENDULUM, POSITION, plain, joint=1))).all()
+    assert np.isnan(bandwidth(closed_loop(PENDULUM, POSITION, plain, joint=1)))
+
+
+def test_loops_of_malformed_arguments_are_refused():
+    linkage, q = arm("RRF")
+    pd = pd_at(q, 1.0, 1.0)
+    for controller, joint, forces, message in [
+        (pd, 0, (), r"joint: expected one of \(1, 2\), got 0"),
+        (pd, 3, (), r"joint: expected one of \(1, 2\), got 3"),
+        (pd, 1, (fj.control.FirstOrderLag(pd, 0.1),), "forces: expected elements"),
+        (3.0, 1, (), "controller: expected a force element"),
+        (fj.PrescribedMotion(1, pd.reference), 1, (), "controller: expected one that"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            open_loop(linkage, q, controller, joint, forces)
+    with pytest.raises(ValueError, match="loop: expected a StateSpace, got"):
+        margins(pd)
+    with pytest.raises(ValueError, match="response: expected a StateSpace, got"):
+        bandwidth(pd)

@@ -41,9 +41,6 @@ def test_the_modes_of_fig_3_at_rest():
     np.testing.assert_allclose(found, known, rtol=2e-4)
     np.testing.assert_allclose(modes.damping[0, [0, 5]], 1)
     np.testing.assert_allclose(modes.damping[0, 2], 0.3471 / abs(known[2]), rtol=2e-4)
-    first, _, slowest, *_ = str(modes).splitlines()
-    assert first == "modes at 2 times"
-    assert slowest.split() == ["0.4033", "to", "0.4033", "1", "to", "1"]
 
 
 @pytest.mark.parametrize("kd", [0.5, 10.0, 40.0])

@@ -3,15 +3,16 @@
 from ..dynamics import inertia_ratios
 from .equilibria import equilibrium, holding_efforts
 from .linearization import Linearization, Modes, closed_loop_modes, linearize
-from .loops import OpenLoop, open_loop
+from .loops import Margins, bandwidth, closed_loop, margins, open_loop
 from .reactions import joint_reactions
 from .regression import inertial_parameters, regressor
 from .responses import StepAndSine, step_and_sine
 
 __all__ = [
-    "closed_loop_modes", "equilibrium", "holding_efforts", "inertia_ratios",
-    "inertial_parameters", "joint_reactions", "Linearization", "linearize", "Modes",
-    "open_loop", "OpenLoop", "regressor", "step_and_sine", "StepAndSine",
+    "bandwidth", "closed_loop", "closed_loop_modes", "equilibrium", "holding_efforts",
+    "inertia_ratios", "inertial_parameters", "joint_reactions", "Linearization",
+    "linearize", "Margins", "margins", "Modes", "open_loop", "regressor",
+    "step_and_sine", "StepAndSine",
 ]  # fmt: skip
 
 

@@ -136,7 +136,7 @@ def _with_references(element: Element, changed: Callable[[Any], Any]) -> Element
 
 
 @eqx.filter_jit
-def closed_loop(
+def loop_matrices(
     linkage: Linkage, controller: Element, forces: tuple[Element, ...], q: Array, t: Any
 ) -> tuple[Array, Array, Array, Array]:
     """Linearises an arm under a controller about rest at `q`: A, B, C and F.
@@ -185,10 +185,8 @@ def closed_loop(
     return moved + B @ (alone + efforts), B, -efforts, F
 
 
-class Modes(eqx.Module):
+class Modes(NamedTuple):
     """Eigenvalues of the matrix A along a motion, the fastest last.
-
-    Prints the natural frequencies and damping ratios, each from its least to its most.
 
     - `eigenvalues`: (time, mode) [1/s], two for each joint that moves; NaN where the
       motion is NaN.
@@ -215,17 +213,6 @@ class Modes(eqx.Module):
         """
         with np.errstate(divide="ignore"):
             return _STABLE / self.frequency.max(axis=1)
-
-    def __str__(self) -> str:
-        rows = [f"modes at {len(self.eigenvalues)} times"]
-        rows.append(f"{'frequency [rad/s]':>24}{'damping ratio':>24}")
-        for values in zip(self.frequency.T, self.damping.T):
-            spans = (value[np.isfinite(value)] for value in values)
-            cells = (
-                f"{s.min():.4g} to {s.max():.4g}" if s.size else "-" for s in spans
-            )
-            rows.append("".join(f"{cell:>24}" for cell in cells))
-        return "\n".join(rows)
 
 
 def closed_loop_modes(linkage: Linkage, forces: Forces, solution: Solution) -> Modes:

@@ -1,14 +1,11 @@
-"""Loops of a controller about a configuration: frequency response and margins."""
+"""Loops of a controller about a configuration, as systems of python-control."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-import equinox as eqx
 import numpy as np
-from jaxtyping import Complex, Float
 from numpy.typing import ArrayLike
 
-from ..base.checks import is_traced, one_of, real_array, refusal
-from ..base.html_table import html_table
+from ..base.checks import instance, is_traced, one_of, real_array, refusal
 from ..forces.element import Forces, elements_on, of_full_size
 from ..linkage.linkage import (
     Linkage,
@@ -18,181 +15,14 @@ from ..linkage.linkage import (
     per_joint,
 )
 from ..simulation.prescribed import prescribed
-from .linearization import checked, closed_loop
-from .transfer import Transfer
+from .linearization import checked, loop_matrices
 
-# A response counts as real if its imaginary part is below this part of it.
-_REAL = 1e-6
-# Gain margins beyond this are zeros at infinity or poles at rest, rounded.
-_LARGEST_MARGIN = 1e6
+if TYPE_CHECKING:
+    import control
+
+_LARGEST_MARGIN = 1e6  # factors beyond belong to zeros at infinity or poles at rest
+_EXACT = 1e-8  # to this part a peak is known
 BANDWIDTH = 10 ** (-3 / 20)  # -3 dB
-
-
-class OpenLoop(eqx.Module):
-    """The loop of a controller, broken at one joint's effort; prints its margins.
-
-    The loop's transfer function is L(s) = C (s I - A)^-1 B. Where the loop is closed
-    again, the eigenvalues are those of A - B C, and the joint's position follows its
-    reference by T(s) = G (s I - A + B C)^-1 F + D. That is L / (1 + L) only where the
-    controller acts on nothing but the error and its rate.
-
-    - `A`, `B`, `C`: matrices (state, state), (state,) and (state,). The state holds
-      positions [m or rad], velocities and the controller's own state.
-    - `F`, `G`, `D`: matrices (state,), (state,) and (); 0 for a controller without a
-      reference that is known, such as a plain function.
-    - `joint`: the joint's name, for instance R1.
-    - `stable`: whether all modes of the closed loop decay, none at less than
-      `slowest_decay` [1/s].
-    - `crossover`: frequency of the phase margin, at which |L| = 1 [rad/s].
-    - `phase_margin`, `delay_margin`: least change of the phase [rad], and least delay
-      [s], that make the closed loop unstable.
-    - `gain_margin`: factor on the loop, the nearest to 1, that makes it unstable.
-    - `modulus_margin`: least distance |1 + L| at all frequencies.
-    - `bandwidth`: frequency above which the joint follows its reference by 3 dB less
-      than at rest, |T| = 0.708 |T(0)| [rad/s]; infinite if it always follows.
-
-    The four margins are NaN unless `stable`. Where L is zero, no change makes the
-    closed loop unstable: the margins are infinite, that of the modulus 1.
-    """
-
-    A: Float[np.ndarray, "state state"]
-    B: Float[np.ndarray, " state"]
-    C: Float[np.ndarray, " state"]
-    F: Float[np.ndarray, " state"]
-    G: Float[np.ndarray, " state"]
-    D: float
-    joint: str
-
-    def __call__(self, frequency: ArrayLike) -> Complex[np.ndarray, "..."]:
-        """The frequency response L(i frequency), at frequencies [rad/s]."""
-        return self._loop(frequency)
-
-    @property
-    def _loop(self) -> Transfer:
-        return Transfer(self.A, self.B, self.C)
-
-    @property
-    def _closed(self) -> np.ndarray:
-        return self.A - np.outer(self.B, self.C)
-
-    @property
-    def slowest_decay(self) -> float:
-        """Rate at which the closed loop's slowest mode decays [1/s]."""
-        return -float(np.real(np.linalg.eigvals(self._closed)).max())
-
-    @property
-    def fastest(self) -> float:
-        """Magnitude of the closed loop's fastest mode [rad/s]."""
-        return float(np.abs(np.linalg.eigvals(self._closed)).max())
-
-    @property
-    def stable(self) -> bool:
-        """True if all modes of the closed loop decay; otherwise it has no margins."""
-        return self.slowest_decay > 0
-
-    @property
-    def _crossing(self) -> tuple[np.ndarray, np.ndarray]:
-        """Frequencies at which |L| = 1, and the phase margins there."""
-        found = self._loop.crossings(1.0)
-        return found, np.angle(-self(found))
-
-    @property
-    def crossover(self) -> float:
-        """Frequency of the phase margin, at which |L| = 1 [rad/s]; NaN if none."""
-        found, margins = self._crossing
-        return float(found[np.abs(margins).argmin()]) if found.size else np.nan
-
-    @property
-    def phase_margin(self) -> float:
-        """Least change of the phase that makes the closed loop unstable [rad].
-
-        Infinite if |L| is nowhere 1, NaN unless `stable`.
-        """
-        if not self.stable:
-            return np.nan
-        _, margins = self._crossing
-        return float(min(margins, key=abs)) if margins.size else np.inf
-
-    @property
-    def delay_margin(self) -> float:
-        """Least delay within the loop that makes the closed loop unstable [s].
-
-        Infinite if none does, NaN unless `stable`.
-        """
-        if not self.stable:
-            return np.nan
-        found, margins = self._crossing
-        return float(np.min(margins % (2 * np.pi) / found, initial=np.inf))
-
-    @property
-    def gain_margin(self) -> float:
-        """Factor on the loop, the nearest to 1, that makes the closed loop unstable.
-
-        A factor below 1 belongs to an arm that falls if the gains are too low. Infinite
-        if no factor makes it unstable, NaN unless `stable`.
-        """
-        if not self.stable:
-            return np.nan
-        # An undamped arm's response is real at all frequencies.
-        values = self(np.append(self._loop.real_at(), self._crossing[0]))
-        at_rest = np.real(Transfer(self._closed, self.B, self.C)(0.0))
-        if _REAL < abs(1 - at_rest) < np.inf:  # otherwise L(0) is infinite
-            values = np.append(values, at_rest / (1 - at_rest))
-        real = np.abs(np.imag(values)) <= _REAL * np.abs(values)
-        factors = -1 / np.real(values[real & (np.real(values) < 0)])
-        distances = np.abs(np.log(factors))
-        found = distances < np.log(_LARGEST_MARGIN)
-        return float(factors[distances.argmin()]) if found.any() else np.inf
-
-    @property
-    def modulus_margin(self) -> float:
-        """Least distance |1 + L| from instability, at all frequencies.
-
-        With m this distance, the loop stays stable for factors from 1 / (1 + m) to
-        1 / (1 - m), and the phase margin is at least 2 arcsin(m / 2). NaN unless
-        `stable`.
-        """
-        if not self.stable:
-            return np.nan
-        return 1 / Transfer(self._closed, self.B, -self.C, 1.0).peak()
-
-    @property
-    def bandwidth(self) -> float:
-        """Frequency above which the joint follows by 3 dB less than at rest [rad/s].
-
-        It is infinite if the joint follows at all frequencies, as with computed torque
-        and an exact model. NaN if the joint does not follow at rest, or if no reference
-        is known.
-        """
-        response = Transfer(self._closed, self.F, self.G, self.D)
-        level = BANDWIDTH * float(np.abs(response(0.0)))
-        if not 0 < level < np.inf:
-            return np.nan
-        return float(min(response.crossings(level), default=np.inf))
-
-    def _rows(self) -> list[tuple[str, str]]:
-        state = "stable" if self.stable else "not stable, so it has no margins"
-        rows = [("closed loop", state)]
-        if not self(1.0):
-            return [*rows, ("controller", "no response: at its limit, or no gains")]
-        if not self.stable:
-            return rows
-        return [
-            *rows,
-            ("crossover", f"{self.crossover:.4g} rad/s"),
-            ("phase margin", f"{np.rad2deg(self.phase_margin):.4g} degrees"),
-            ("delay margin", f"{1e3 * self.delay_margin:.4g} ms"),
-            ("gain margin", f"{self.gain_margin:.4g}"),
-            ("modulus margin", f"{self.modulus_margin:.4g}"),
-            ("bandwidth", f"{self.bandwidth:.4g} rad/s"),
-        ][: -1 if np.isnan(self.bandwidth) else None]
-
-    def __str__(self) -> str:
-        rows = [f"  {label:16}{value}" for label, value in self._rows()]
-        return "\n".join([f"loop of {self.joint}", *rows])
-
-    def _repr_html_(self) -> str:
-        return html_table(self._rows(), ("loop of", self.joint))
 
 
 def open_loop(
@@ -202,7 +32,7 @@ def open_loop(
     joint: int,
     forces: Forces = (),
     t: ArrayLike = 0.0,
-) -> OpenLoop:
+) -> "control.StateSpace":
     """Breaks the loop of a controller at one joint's effort, about a configuration.
 
     The controller's efforts in the other joints stay. The arm is at rest at `q`, where
@@ -218,26 +48,64 @@ def open_loop(
     - `forces`: further elements, without a state of their own.
     - `t`: time at which controller and forces are evaluated [s].
 
-    **Returns:** an `OpenLoop`. NumPy analyses it, so the function cannot be used within
-    JAX's transformations.
+    **Returns:** the loop L(s) as a `control.StateSpace` with one input and one output,
+    for instance for `margins`, `control.bode_plot` or `control.nyquist_plot`. The state
+    holds positions [m or rad], velocities and the controller's own state. Where the
+    loop is closed again, the system is `loop.feedback()`.
 
-    **Raises:** ValueError for malformed arguments.
+    **Raises:** ValueError for malformed arguments and within JAX's transformations.
 
     >>> import fdof_jax as fj
     >>> arm, _, (pd,), _ = fj.scenes.fig7()
     >>> q, _ = pd.reference(0.0, arm)
-    >>> print(fj.analysis.open_loop(arm, q, pd, joint=1))
-    loop of R1
-      closed loop     stable
-      crossover       5.278 rad/s
-      phase margin    15.86 degrees
-      delay margin    52.45 ms
-      gain margin     0.02625
-      modulus margin  0.276
-      bandwidth       8.103 rad/s
+    >>> loop = fj.analysis.open_loop(arm, q, pd, joint=1)
+    >>> complex(loop(5.278j))  # at 5.278 rad/s, where |L| = 1
+    (-0.962-0.273j)
     """
+    return _loops(linkage, q, controller, joint, forces, t)[0]
+
+
+def closed_loop(
+    linkage: Linkage,
+    q: ArrayLike,
+    controller: Any,
+    joint: int,
+    forces: Forces = (),
+    t: ArrayLike = 0.0,
+) -> "control.StateSpace":
+    """Linearises how a joint follows its reference, about a configuration.
+
+    The reference changes in this joint, with its velocities and accelerations; the
+    controller holds the other joints. The response is L / (1 + L) only where the
+    controller acts on nothing but the error and its rate.
+
+    **Arguments:** as in `open_loop`.
+
+    **Returns:** the response T(s) of the joint's position to its reference as a
+    `control.StateSpace`, for instance for `bandwidth` or `control.step_response`. T is
+    0 for a controller without a reference that is known, such as a plain function.
+
+    **Raises:** ValueError as `open_loop`.
+
+    >>> import fdof_jax as fj
+    >>> arm, _, (pd,), _ = fj.scenes.fig7()
+    >>> q, _ = pd.reference(0.0, arm)
+    >>> response = fj.analysis.closed_loop(arm, q, pd, joint=1)
+    >>> float(response.poles().real.max())  # its slowest mode decays [1/s]
+    -0.735
+    >>> fj.analysis.bandwidth(response)
+    8.103
+    """
+    return _loops(linkage, q, controller, joint, forces, t)[1]
+
+
+def _loops(
+    linkage: Linkage, q: Any, controller: Any, joint: int, forces: Forces, t: Any
+) -> tuple[Any, Any]:
+    import control
+
     check_linkage(linkage)
-    names, moving = joint_names(linkage), moving_joints(linkage)
+    n, moving = len(joint_names(linkage)), moving_joints(linkage)
     index = one_of("joint", joint, [k + 1 for k in moving]) - 1
     forces = checked(linkage, forces)
     if not callable(controller) or isinstance(controller, type):
@@ -249,32 +117,156 @@ def open_loop(
     q, t = per_joint("q", q, linkage), real_array("t", t, ())
     if is_traced(linkage, element, forces, q, t):
         raise ValueError("q: expected known values, outside of JAX's transformations.")
-    A, B, C, F = (
-        np.asarray(part, float) for part in closed_loop(linkage, element, forces, q, t)
-    )
-    kept = np.array(_kept(A, len(names), moving))
-    A, B, C, F = A[np.ix_(kept, kept)], B[kept, index], C[index, kept], F[:, kept]
+    matrices = loop_matrices(linkage, element, forces, q, t)
+    A, B, C, F = (np.asarray(matrix, float) for matrix in matrices)
+    # Left out are states of fixed pairs, and those of the controller that act on no
+    # joint, such as an integral of a fixed pair, or that nothing changes.
+    paths = np.linalg.matrix_power((A != 0) + np.eye(len(A)), len(A)) > 0
+    joints = [*moving, *(n + k for k in moving)]
+    driven = paths[:, joints].any(axis=1) | (paths @ F.any(axis=(0, 2)))
+    states = np.flatnonzero(paths[joints].any(axis=0) & driven)
+    A, B, C = A[np.ix_(states, states)], B[states, index], C[index, states]
     # Rates and accelerations of the reference act as s and s^2 times its positions; of
     # s (s I - A)^-1 = I + A (s I - A)^-1 the first part reaches no position at once.
-    acting = F[0, :, index] + A @ (F[1, :, index] + A @ F[2, :, index])
-    position = (kept == index).astype(float)
-    through = float(position @ A @ F[2, :, index])
-    return OpenLoop(A + np.outer(B, C), B, C, acting, position, through, names[index])
+    position, rate, acceleration = F[:, states, index]
+    position = position + A @ (rate + A @ acceleration)
+    at_joint = (states == index).astype(float)
+    through = float(at_joint @ A @ acceleration)
+    name = joint_names(linkage)[index]
+    column, row = B[:, None], C[None]
+    return (
+        control.ss(A + column @ row, column, row, 0, name=f"loop of {name}"),
+        control.ss(
+            A, position[:, None], at_joint[None], through, name=f"response of {name}"
+        ),
+    )
 
 
-def _kept(A: np.ndarray, n: int, moving: list[int]) -> list[int]:
-    """Returns the states of the loops of a closed loop's matrix.
+class Margins(NamedTuple):
+    """How far a loop is from instability.
 
-    Left out are those of fixed pairs, which stand still, and those of the controller
-    that act on no joint, such as an integral of a fixed pair, or that never change, as
-    an integral without a gain.
+    - `gain`: factor on the loop, the nearest to 1, that makes it unstable. Below 1 it
+      belongs to an arm that falls if the gains are too low.
+    - `phase`, `delay`: least change of the phase [rad], and least delay [s], that make
+      it unstable.
+    - `modulus`: least distance |1 + L| at all frequencies. With m this distance, the
+      loop stays stable for factors from 1 / (1 + m) to 1 / (1 - m), and the phase
+      margin is at least 2 arcsin(m / 2).
+    - `crossover`: frequency of the phase margin, at which |L| = 1 [rad/s].
     """
-    joints = [*moving, *(n + k for k in moving)]
-    acting: list[int] = []
-    own = list(range(2 * n, len(A)))
-    while found := [k for k in own if A[np.ix_(joints + acting, [k])].any()]:
-        acting += found
-        own = [k for k in own if k not in found]
-    while still := [k for k in acting if not A[k, joints + acting].any()]:
-        acting = [k for k in acting if k not in still]
-    return joints + sorted(acting)
+
+    gain: float
+    phase: float
+    delay: float
+    modulus: float
+    crossover: float
+
+
+def margins(loop: "control.StateSpace") -> Margins:
+    """Computes the margins of an open loop with python-control.
+
+    **Arguments:** `loop`: the result of `open_loop`.
+
+    **Returns:** `Margins` [1, rad, s, 1, rad/s], NaN if the closed loop is not stable.
+    Where no change makes it unstable, they are infinite, that of the modulus is 1.
+
+    **Raises:** ValueError if `loop` is not a `control.StateSpace`.
+
+    >>> import fdof_jax as fj
+    >>> arm, _, (pd,), _ = fj.scenes.fig7()
+    >>> q, _ = pd.reference(0.0, arm)
+    >>> fj.analysis.margins(fj.analysis.open_loop(arm, q, pd, joint=1))
+    Margins(gain=0.026, phase=0.277, delay=0.052, modulus=0.276, crossover=5.278)
+    """
+    import control
+
+    instance("loop", loop, control.StateSpace)
+    closed: Any = loop.feedback()
+    if closed.poles().real.max() >= 0:
+        return Margins(*[np.nan] * 5)
+    unit = _unit(closed)
+    slower = _slower(loop, unit)
+    with np.errstate(all="ignore"):  # infinite at poles
+        gains, phases, _, _, crossings, _ = control.stability_margins(slower, True)
+    gains = gains[(gains > 1 / _LARGEST_MARGIN) & (gains < _LARGEST_MARGIN)]
+    phases, crossings = np.deg2rad(phases), crossings * unit
+    at_crossings = zip(phases, crossings)
+    nearest = min(at_crossings, key=lambda row: abs(row[0]), default=(np.inf, np.nan))
+    return Margins(
+        gain=float(np.exp(min(np.log(gains), key=abs, default=np.inf))),
+        phase=float(nearest[0]),
+        delay=float(min(phases % (2 * np.pi) / crossings, default=np.inf)),
+        modulus=_modulus_margin(slower),
+        crossover=float(nearest[1]),
+    )
+
+
+def bandwidth(response: "control.StateSpace") -> float:
+    """Frequency above which a joint follows its reference by 3 dB less than at rest.
+
+    **Arguments:** `response`: the result of `closed_loop`.
+
+    **Returns:** the least frequency at which |T| = 0.708 |T(0)| [rad/s]. It is infinite
+    if the joint follows at all frequencies, as with computed torque and an exact model,
+    and NaN if it does not follow at rest.
+
+    **Raises:** ValueError if `response` is not a `control.StateSpace`.
+    """
+    import control
+
+    instance("response", response, control.StateSpace)
+    level = BANDWIDTH * float(np.abs(response.dcgain()))
+    if not 0 < level < np.inf:
+        return np.nan
+    # `control.bandwidth` looks at 1000 frequencies, and misses dips beside the lightly
+    # damped modes of other joints: 20.3 for 6.18 rad/s at a damping ratio of 5e-4.
+    unit = _unit(response)
+    return unit * min(_crossings(_slower(response, unit) / level), default=np.inf)
+
+
+def _unit(system: Any) -> float:
+    """Returns the geometric mean of the magnitudes of a system's poles [rad/s]."""
+    rates = np.abs(system.poles())
+    return float(np.exp(np.log(rates[rates > 0]).mean()))
+
+
+def _slower(system: Any, unit: float) -> Any:
+    """Returns a system in units of time in which its poles are around 1.
+
+    Polynomials of python-control else overflow: 11 of 58 loops of eight joints with
+    lags raised `LinAlgError`.
+    """
+    import control
+
+    return control.ss(system.A / unit, system.B / unit, system.C, system.D)
+
+
+def _crossings(system: Any) -> list[float]:
+    """Returns the frequencies above 0 at which the magnitude is 1, in order."""
+    import control
+
+    with np.errstate(all="ignore"):
+        return control.stability_margins(system, True)[4].tolist()
+
+
+def _modulus_margin(loop: Any) -> float:
+    """Returns the least |1 + L| of a loop that is stable when closed.
+
+    Each pass looks between the frequencies at which 1 / |1 + L| passes its largest
+    value so far (Bruinsma and Steinbuch, 1990). Of 780 random loops of three joints, as
+    compared with eigenvalues of Hamiltonian matrices, none was wrong by more than 1e-5.
+    `control.stability_margins`, whose polynomial has twice the degree, missed the
+    minimum of 3 in 429 (0.99 for 0.14), and `control.norm` was wrong for 195 of 780.
+    """
+    import control
+
+    sensitivity: Any = control.feedback(1, loop)
+    size = lambda w: np.abs(sensitivity(1j * w))
+    poles = sensitivity.poles()
+    tried = np.append(np.abs(poles), np.abs(poles.imag))
+    largest, peak = 0.0, size(tried).max(initial=1.0)  # 1 at infinity
+    while peak > largest * (1 + _EXACT):
+        largest = float(peak)
+        ends = np.array([0.0, *_crossings(sensitivity / (largest * (1 + _EXACT)))])
+        peak = size((ends[1:] + ends[:-1]) / 2).max(initial=0.0)
+    return 1 / largest

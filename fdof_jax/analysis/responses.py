@@ -3,16 +3,20 @@
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy
+from jax import Array
 from jaxtyping import Complex, Float
 from numpy.typing import ArrayLike
 
 from ..base.checks import is_traced, real_array, refusal
-from ..base.html_table import html_table
-from ..forces.element import Forces, elements_on, of_full_size
+from ..control.drives import Drive
+from ..control.pd import PDController
+from ..forces.element import Element, Forces, StatefulElement, elements_on, of_full_size
 from ..linkage.coordinates import State
+from ..linkage.fields import Values, field
 from ..linkage.linkage import (
     Linkage,
     check_linkage,
@@ -20,9 +24,12 @@ from ..linkage.linkage import (
     moving_joints,
     per_joint,
 )
+from ..references.reference import Reference
+from ..simulation.simulate import simulate
+from ..simulation.solution import Solution
 from .equilibria import holding_efforts
-from .loops import BANDWIDTH, open_loop
-from .probes import Probe, answer, at_rest, commanding, following
+from .loops import BANDWIDTH, bandwidth, closed_loop, margins, open_loop
+from .tracking import relative_demands
 
 # Samples of a response: at least so many, so that most arms share a program, and one
 # for each part of a radian of the fastest mode, between which cubics are exact to 1e-5.
@@ -36,6 +43,27 @@ _PERIODS = 2  # in which a sine is measured
 # An arm comes to rest in this many time constants of its slowest mode, for at most so
 # many times the duration of a response.
 _DECAYED, _LONGEST = 30, 50
+# A slow joint may take as long to settle as a fast one takes for so many steps.
+_STEPS = 2**20
+
+
+class Probe(Reference):
+    """A reference that swings from the start, or stands."""
+
+    center: Values = field(unit="m or rad")
+    amplitude: Values = field(unit="m or rad")
+    frequency: Values = field((), unit="rad/s")
+
+    def __call__(self, t: Any, linkage: Linkage) -> tuple[Array, Array]:
+        angle, rate = self.frequency * t, self.frequency * self.amplitude
+        return self.center + self.amplitude * jnp.sin(angle), rate * jnp.cos(angle)
+
+
+def _commanding(element: Any) -> Any:
+    """Returns the PD controller that an element is or holds as its command, or None."""
+    while isinstance(element, Drive):
+        element = element.command
+    return element if isinstance(element, PDController) else None
 
 
 class StepAndSine(eqx.Module):
@@ -50,7 +78,7 @@ class StepAndSine(eqx.Module):
       (joint,) [s]; NaN if that is in the last tenth of the test or never.
     - `bandwidth`: frequency at which the response to a sine is 3 dB below the final
       response to the step (joint,) [rad/s]; NaN if outside of the tested ones.
-    - `saturated`: share of the time after the step that the actuator spends at its
+    - `saturated`: share of the samples after the step at which the actuator is at its
       limit (joint,).
     - `ts`, `response`: times since the step (time,) [s], and the change of the joint's
       position over the height of its step (joint, time).
@@ -70,25 +98,19 @@ class StepAndSine(eqx.Module):
     frequency: Float[np.ndarray, "joint frequency"]
     gain: Complex[np.ndarray, "joint frequency"]
 
-    def _rows(self) -> list[list[str]]:
+    def __repr__(self) -> str:
         header = ["", "step", "overshoot", "rise", "settling", "bandwidth", "at limit"]
         units = ["", "[m, rad]", "[%]", "[s]", "[s]", "[rad/s]", "[% of time]"]
         columns = (
             self.step, 100 * self.overshoot, self.rise_time, self.settling_time,
             self.bandwidth, 100 * self.saturated,
         )  # fmt: skip
-        rows = zip(self.joints, *columns)
-        return [header, units] + [
-            [name, *(f"{value:.4g}" for value in values)] for name, *values in rows
-        ]
-
-    def __str__(self) -> str:
-        rows = (f"{a:4}" + "".join(f"{b:>12}" for b in row) for a, *row in self._rows())
-        return "\n".join(rows)
-
-    def _repr_html_(self) -> str:
-        header, *rows = self._rows()
-        return html_table(rows, header)
+        rows = [header, units]
+        for name, *values in zip(self.joints, *columns):
+            rows.append([name, *(f"{value:.4g}" for value in values)])
+        return "\n".join(
+            f"{a:4}" + "".join(f"{b:>12}" for b in row) for a, *row in rows
+        )
 
 
 def step_and_sine(
@@ -135,8 +157,8 @@ def step_and_sine(
     >>> print(fj.analysis.step_and_sine(arm, q, pd, step=0.5, duration=2.0))
                 step   overshoot        rise    settling   bandwidth    at limit
             [m, rad]         [%]         [s]         [s]     [rad/s] [% of time]
-    R1           0.5       5.161      0.2743      0.7649       7.822       2.145
-    P2           0.5       4.115      0.1168      0.3365       24.37      0.4195
+    R1           0.5       5.161      0.2743      0.7649       7.822         2.2
+    P2           0.5       4.115      0.1168      0.3365       24.37         0.5
     R3           0.5       3.018      0.1198      0.3513       28.07           0
     """
     check_linkage(linkage)
@@ -144,29 +166,45 @@ def step_and_sine(
     n = q.size
     step = real_array("step", step, (n,), above=0, broadcast=True, unit="m or rad")
     duration = real_array("duration", duration, (), above=0, unit="s")
-    if (pd := commanding(controller)) is None:
+    if (pd := _commanding(controller)) is None:
         expected = "a PDController, or a drive that holds one"
         raise refusal("controller", expected, controller)
     if is_traced(linkage, controller, forces, q, step, duration):
         raise ValueError("q: expected known values, outside of JAX's transformations.")
     (element,) = of_full_size(linkage, elements_on(linkage, (controller,)))
-    zero = jnp.zeros(n)
-    resting = following(element, Probe(q, zero, 0.0, zero, 1.0))
     names, moving = joint_names(linkage), moving_joints(linkage)
+    heights, t0, still = np.asarray(step), float(duration), np.zeros(n)
 
-    def loops_at(q):
-        return [open_loop(linkage, q, resting, k + 1, forces) for k in moving]
+    def with_probe(center: Any, amplitude: Any = still, frequency: Any = 1) -> Element:
+        """Returns the controller with a probe for its reference."""
+        probe = Probe(center, amplitude, frequency)
+        return eqx.tree_at(lambda part: _commanding(part).reference, element, probe)
 
-    loops = loops_at(q)
-    if np.isnan([loop.bandwidth for loop in loops]).any():
+    def motion(acting: Element, start: State, own: Any, ts: np.ndarray) -> Solution:
+        keywords: Any = dict(own0=own, throw=False, max_steps=_STEPS)
+        return simulate(linkage, start, ts, (acting, *forces), **keywords)
+
+    def responses_at(here: Any) -> tuple[list[Any], np.ndarray]:
+        loops = [
+            closed_loop(linkage, here, with_probe(q), k + 1, forces) for k in moving
+        ]
+        return loops, np.array(list(map(bandwidth, loops)))
+
+    loops, bandwidths = responses_at(q)
+    if np.isnan(bandwidths).any():
         expected = "one with which each joint follows its reference at q"
         raise refusal("controller", expected, controller)
-    start = State(q, zero), None
-    if loops[0].slowest_decay > 0:
-        time = min(_DECAYED / loops[0].slowest_decay, _LONGEST * float(duration))
-        start = at_rest(linkage, resting, forces, q, time)
-        loops = loops_at(start[0].q)
-    bandwidths = np.array([loop.bandwidth for loop in loops])
+    start, own = State(q, jnp.asarray(still)), None
+    if (decay := -loops[0].poles().real.max()) > 0:
+        if isinstance(element, StatefulElement):
+            own = (element.initial_state(linkage),)
+        # As many times as of most answers, so that one program serves both.
+        ts = np.linspace(0, min(_DECAYED / decay, _LONGEST * t0), _LEAST)
+        sag = motion(with_probe(q), start, own, ts)
+        if np.isfinite([sag.q[-1], sag.qd[-1]]).all():
+            start = State(sag.q[-1], sag.qd[-1])
+            own = own and jax.tree.map(lambda rows: rows[-1], sag.own)
+        loops, bandwidths = responses_at(start.q)
     if np.isnan(bandwidths).any():  # at a limit, a controller has no gains
         needed = np.asarray(holding_efforts(linkage, q, forces)).round(6).tolist()
         raise ValueError(
@@ -174,48 +212,41 @@ def step_and_sine(
             f"got {pd.limit.tolist()}; to be held there it needs efforts of {needed} "
             "(`holding_efforts`), and more to be caught as it sags."
         )
-    crossovers = [loop.crossover for loop in loops]  # where an arm follows all sines
-    scale = np.where(np.isinf(bandwidths), crossovers, bandwidths)
-    frequency = scale[:, None] * _FREQUENCIES
-    t0 = float(duration)
-    since = np.linspace(0, t0, samples_of(t0, loops[0].fastest))
-    steps, gain = [], np.zeros(frequency.shape, complex)
+    since = np.linspace(0, t0, samples_of(t0, np.abs(loops[0].poles()).max()))
+    rows = []
     # One after the other: a batch takes three times as long to compile.
-    for row, k in enumerate(moving):
-        height, none = np.asarray(step) * np.eye(n)[k], np.zeros(n)
-
-        def moved(probe, times, k=k):
-            ts = np.append(0, t0 + times)
-            found = answer(linkage, element, forces, start, probe, ts)
-            return [np.asarray(part)[1:, k] for part in found]
-
-        steps.append(moved(Probe(q, height, t0, none, 1.0), since))
-        for column, w in enumerate(frequency[row]):
-            times = 2 * np.pi / w * _PERIODS * np.arange(_LEAST) / _LEAST
-            position, *_ = moved(Probe(q, none, t0, height, w), times)
-            phase = np.exp(-1j * w * (t0 + times))
-            gain[row, column] = 2j * np.mean(position * phase) / height[k]
-    step = np.asarray(step)[moving]
-    positions, rates, demands = (np.stack(part) for part in zip(*steps))
-    changes = (positions - positions[:, :1]) / step[:, None]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        final = changes[:, -1:]
-        shares = changes / final, rates / (step[:, None] * final)
-    rows = [step_measures(since, *row) for row in zip(*shares)]
-    overshoot, rise_time, settling_time = np.array(rows).T
-    settled = settling_time <= _SETTLED * t0
-    saturated = np.array(list(map(share_beyond, demands)))
-    failed = np.isnan(changes).any(axis=1)
+    for k, scale in zip(moving, bandwidths):
+        height = heights * np.eye(n)[k]
+        acting = with_probe(q + height)
+        run = motion(acting, start, own, since)
+        change = np.asarray(run.q[:, k] - run.q[0, k]) / heights[k]
+        rate = np.asarray(run.qd[:, k]) / heights[k]
+        measures = step_measures(since, change, rate, change[-1])
+        demand = relative_demands(_commanding(acting), linkage, run)[:, k]
+        if np.isinf(scale):  # the arm follows all sines
+            loop = open_loop(linkage, start.q, with_probe(q), k + 1, forces)
+            scale = margins(loop).crossover
+        frequency, gain = scale * _FREQUENCIES, []
+        for w in frequency:
+            ts = t0 + 2 * np.pi / w * _PERIODS * np.arange(_LEAST - 1) / (_LEAST - 1)
+            run = motion(with_probe(q, height, w), start, own, np.append(0, ts))
+            harmonic = np.mean(run.q[1:, k] * np.exp(-1j * w * ts))
+            gain.append(2j * harmonic / heights[k])
+        width = _bandwidth(frequency, np.array(gain), change[-1])
+        at_limit = np.mean(np.abs(demand) > 1)
+        rows.append((*measures, width, at_limit, change, frequency, gain))
+    overshoot, rise_time, settling_time, *others = map(np.array, zip(*rows))
+    widths, at_limit, response, frequency, gain = others
     return StepAndSine(
         joints=tuple(names[k] for k in moving),
-        step=step,
+        step=heights[moving],
         overshoot=overshoot,
         rise_time=rise_time,
-        settling_time=np.where(settled, settling_time, np.nan),
-        bandwidth=np.array(list(map(_bandwidth, frequency, gain, changes[:, -1]))),
-        saturated=np.where(failed, np.nan, saturated),
+        settling_time=np.where(settling_time <= _SETTLED * t0, settling_time, np.nan),
+        bandwidth=widths,
+        saturated=np.where(np.isnan(overshoot), np.nan, at_limit),
         ts=since,
-        response=changes,
+        response=response,
         frequency=frequency,
         gain=gain,
     )
@@ -233,39 +264,28 @@ def samples_of(duration: float, fastest: float) -> int:
 
 
 def step_measures(
-    ts: np.ndarray, part: np.ndarray, speed: np.ndarray
+    ts: np.ndarray, change: np.ndarray, rate: np.ndarray, final: float
 ) -> tuple[float, float, float]:
-    """Measures a response as a part of its step, with its rate of change.
+    """Measures a response and its rate of change by python-control's `step_info`.
 
-    Returns the overshoot, the rise time (NaN if 90 % is not reached), and the time
-    after which the response is settled (NaN if it is not at the end).
+    Returns the overshoot as a share of the final change, the rise time (NaN if 90 % is
+    not reached), and the time after which the response is settled (NaN if it is not at
+    the end).
     """
-    if not np.isfinite([part, speed]).all():
+    import control
+
+    if not (final and np.isfinite([change, rate]).all()):
         return np.nan, np.nan, np.nan
-    curve = scipy.interpolate.CubicHermiteSpline(ts, part, speed)
-
-    def passing(level: float) -> np.ndarray:
-        """Returns when the response passes a level."""
-        found = curve.solve(level, extrapolate=False)
-        return found[np.isfinite(found)]  # NaN follows a part on the level
-
-    turns = curve.derivative().roots(extrapolate=False)
-    most = curve(turns[np.isfinite(turns)]).max(initial=part.max())
-    low, high = passing(0.1), passing(0.9)
-    rise = high[0] - low[0] if high.size and low.size else np.nan
-    settled = np.append(passing(1 - BAND), passing(1 + BAND)).max(initial=0.0)
-    inside = np.abs(part[-1] - 1) <= BAND
-    return max(most - 1, 0.0), rise, settled if inside else np.nan
-
-
-def share_beyond(demand: np.ndarray) -> float:
-    """Returns the share of the time at which samples, and lines between, exceed 1."""
-    above = np.abs(demand) - 1
-    before, after = above[:-1], above[1:]
-    with np.errstate(divide="ignore", invalid="ignore"):  # equal or infinite
-        share = np.maximum(before, after) / np.abs(after - before)
-    share = np.clip(np.nan_to_num(share), 0, 1)
-    return float(np.mean(np.where((before > 0) & (after > 0), 1, share)))
+    # `step_info` measures to the nearest sample: within 3e-4 of a time with these.
+    fine = np.union1d(ts, np.geomspace(ts[1] / 100, ts[-1], 2**16))
+    part = scipy.interpolate.CubicHermiteSpline(ts, change, rate)(fine) / final
+    rises = part.max() >= 0.9  # else `step_info` raises IndexError
+    limits = (0.1, 0.9) if rises else (-np.inf, -np.inf)
+    info: Any = control.step_info(
+        part, fine, None, 1.0, SettlingTimeThreshold=BAND, RiseTimeLimits=limits
+    )
+    rise_time = info["RiseTime"] if rises else np.nan
+    return info["Overshoot"] / 100, rise_time, info["SettlingTime"]
 
 
 def _bandwidth(frequency: np.ndarray, gain: np.ndarray, final: float) -> float:
@@ -274,5 +294,5 @@ def _bandwidth(frequency: np.ndarray, gain: np.ndarray, final: float) -> float:
     if not np.isfinite(level).all() or level[0] < np.log(BANDWIDTH):
         return np.nan
     curve = scipy.interpolate.CubicSpline(np.log(frequency), level)
-    found = curve.solve(np.log(BANDWIDTH), extrapolate=False)
-    return float(np.exp(found[0])) if found.size else np.nan
+    crossings = curve.solve(np.log(BANDWIDTH), extrapolate=False)
+    return float(np.exp(crossings[0])) if crossings.size else np.nan

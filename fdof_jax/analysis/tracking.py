@@ -4,7 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import Array
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from ..control.pd import PDController
 from ..linkage.linkage import Linkage, without_fixed
@@ -34,14 +34,6 @@ def relative_demands(
     limit = jnp.broadcast_to(controller.limit, demanded.shape)
     beyond = jnp.where(demanded == 0, 0, jnp.sign(demanded) * jnp.inf)
     return jnp.where(limit > 0, demanded / jnp.where(limit > 0, limit, 1), beyond)
-
-
-@eqx.filter_jit
-def saturated(
-    controller: PDController, linkage: Linkage, solution: Solution
-) -> Bool[Array, "time joint"]:
-    """Returns whether each actuator is at its limit, along a motion."""
-    return jnp.abs(relative_demands(controller, linkage, solution)) > 1
 
 
 @eqx.filter_jit

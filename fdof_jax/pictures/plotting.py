@@ -13,7 +13,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
-from ..base.checks import real_array, refusal, shown
+from ..analysis.responses import StepAndSine
+from ..base.checks import instance, real_array, refusal, shown
 from ..control.drives import PIDController
 from ..control.pd import PDController
 from ..forces.element import Forces, elements
@@ -22,6 +23,7 @@ from ..simulation.efforts import joint_efforts
 from ..simulation.sampled import Motion
 from .arms import geometry, link_color
 from .axes import (
+    BLACK,
     GREY,
     LIGHT_GREY,
     SERIES,
@@ -33,11 +35,10 @@ from .axes import (
     time_panels,
 )
 from .energies import energy_profile, energy_stack
-from .responses import bode_plot, response_profile
 from .tracking import tracking, tracking_by_error, tracking_error
 
 __all__ = [
-    "bode_plot", "effort_profile", "energy_profile", "energy_stack",
+    "effort_profile", "energy_profile", "energy_stack",
     "motion_profile", "response_profile", "tracking", "tracking_by_error",
     "tracking_error", "work_precision",
 ]  # fmt: skip
@@ -144,6 +145,35 @@ def _note(ax: Axes, text: str) -> None:
         textcoords="offset points", ha=["left", "right"][x], va=["bottom", "top"][y],
         fontsize="small", bbox={"fc": "white", "alpha": 0.7, "lw": 0, "pad": 1},
     )  # fmt: skip
+
+
+def response_profile(test: StepAndSine, fig: Figure | None = None) -> Figure:
+    """Plots the answers of joints to steps over time, and to sines over frequency.
+
+    The upper panel shows each joint's change over the height of its step. The lower
+    one shows the amplitude over that of the reference [dB], a dot per frequency
+    tested.
+
+    **Arguments:** `test`: the result of `step_and_sine`.
+    """
+    instance("test", test, StepAndSine)
+    fig = figure_or_new(fig, 3.5, 4.8)
+    above, below = fig.subplots(2)
+    above.axhline(1, color=BLACK, ls="--", lw=0.8, label="reference")
+    rows = zip(test.joints, test.response, test.frequency, test.gain, test.bandwidth)
+    for name, response, frequency, gain, bandwidth in rows:
+        color = link_color(int(name[1:]))
+        above.plot(test.ts, response, label=name, color=color, lw=1.2)
+        level = 20 * np.log10(np.abs(gain))
+        below.semilogx(frequency, level, "o", color=color, ms=2)
+        at = np.interp(bandwidth, frequency, level)
+        below.plot(bandwidth, at, "o", color=color, mfc="white", ms=5)
+    below.plot([], [], "o", color=GREY, mfc="white", ms=5, label="bandwidth")
+    above.set(xlabel="time since the step [s]", ylabel="change / step")
+    below.set(xlabel="frequency [rad/s]", ylabel="amplitude / reference [dB]")
+    below.grid(which="both", lw=0.3)
+    legend(above, below)
+    return fig
 
 
 def work_precision(

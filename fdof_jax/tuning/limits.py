@@ -1,6 +1,7 @@
 """Limits on overshoot, settling time, effort and margin, and how far they are met."""
 
 from collections.abc import Iterator
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -8,14 +9,14 @@ import numpy as np
 from jax import Array
 
 from ..analysis.equilibria import equilibrium
-from ..analysis.linearization import checked, closed_loop
-from ..analysis.loops import open_loop
+from ..analysis.linearization import checked, loop_matrices
+from ..analysis.loops import margins, open_loop
 from ..analysis.responses import BAND, samples_of, step_measures
 from ..analysis.tracking import demands
 from ..control.pd import PDController
 from ..forces.element import Element
 from ..linkage.fields import Part, Values, field
-from ..linkage.linkage import moving_joints
+from ..linkage.linkage import joint_names, moving_joints
 from ..references.reference import reference_motion
 from ..simulation.scene import Scene
 from ..simulation.simulate import simulate
@@ -38,7 +39,7 @@ class Limits(Part):
     - `settling_time`: time after which the joint stays within 2 % of the step [s].
     - `effort`: greatest effort that the controller demands [N or N m].
     - `modulus_margin`: least distance of the loop from instability, from 0 to 1, where
-      the step ends; see `OpenLoop`.
+      the step ends; see `analysis.Margins`.
 
     **Raises:** ValueError for malformed arguments.
 
@@ -77,7 +78,7 @@ def excess(
     if not with_margins:
         return along
     controller, others = controller_and_others(scene)
-    A, B, C, _ = closed_loop(scene.linkage, controller, others, rest, scene.t1)
+    A, B, C, _ = loop_matrices(scene.linkage, controller, others, rest, scene.t1)
     near = jax.vmap(lambda s: limits.modulus_margin * jnp.abs(s) - 1)
     return jnp.concatenate([along, near(sensitivity(A, B, C)).reshape(-1)])
 
@@ -132,10 +133,11 @@ def measured(scene: Scene, limits: Limits) -> Iterator[tuple[str, str, float, fl
     """
     controller, others = controller_and_others(scene)
     moving, t1, rest = moving_joints(scene.linkage), float(scene.t1), rest_of(scene)
-    loops = {
+    loops: dict[int, Any] = {
         k: open_loop(scene.linkage, rest, controller, k + 1, others, t1) for k in moving
     }
-    count = samples_of(t1, loops[moving[0]].fastest)
+    poles = loops[moving[0]].feedback().poles()
+    count = samples_of(t1, np.abs(poles).max())
     ts = np.linspace(0, t1, count + 1)
     motion = simulate(scene.linkage, scene.state0, ts, scene.forces, throw=False)
     shares, _ = map(np.asarray, step_shares(motion, rest))
@@ -144,8 +146,8 @@ def measured(scene: Scene, limits: Limits) -> Iterator[tuple[str, str, float, fl
     efforts = np.abs(demands(controller, scene.linkage, motion)).max(axis=0)
     allowed = jax.tree.map(np.asarray, limits)
     for k, loop in loops.items():
-        name = loop.joint
-        overshoot, _, settled = step_measures(ts, shares[:, k], speeds[:, k])
+        name = joint_names(scene.linkage)[k]
+        overshoot, _, settled = step_measures(ts, shares[:, k], speeds[:, k], 1.0)
         found = {
             "overshoot": (allowed.overshoot[k], overshoot),
             "settling time [s]": (allowed.settling_time[k], settled),
@@ -159,4 +161,4 @@ def measured(scene: Scene, limits: Limits) -> Iterator[tuple[str, str, float, fl
                 yield label, name, float(most), float(value)
         if allowed.modulus_margin[k] > 0:
             least = float(allowed.modulus_margin[k])
-            yield "modulus margin", name, least, loop.modulus_margin
+            yield "modulus margin", name, least, margins(loop).modulus

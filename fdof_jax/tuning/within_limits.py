@@ -73,7 +73,7 @@ class TunedWithin(eqx.Module):
     - `search`: the search that led there, whose loss includes the penalty.
     - `limit`, `joint`, `allowed`, `reached`: a row per limit: its name, the joint's
       name, and the allowed and the reached value [1, s, N or N m]; NaN if it does
-      not settle. Margins are those of `OpenLoop`.
+      not settle. Margins are those of `analysis.margins`.
     - `met`: whether each limit is met.
     """
 
