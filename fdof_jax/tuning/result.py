@@ -118,20 +118,8 @@ class TuneResult(eqx.Module):
         The columns are `gain` and `joint`, for instance kp and R1; `unit`; the values
         `start` and `tuned`; the bounds `least` and `greatest`; and `at_bound`.
         """
-        names = joint_names(self.scene.linkage)
-        units = {"F": ("", "")} | controller_of(self.scene).gain_units
-        values = {
-            "start": self.histories[0].gains[0],
-            "tuned": self.gains,
-            "least": self.lower,
-            "greatest": self.upper,
-            "at_bound": self.at_bound,
-        }
-        return {
-            "gain": ["kp"] * len(names) + ["kd"] * len(names),
-            "joint": names * 2,
-            "unit": [units[name[0]][kind] for kind in range(2) for name in names],
-        } | {name: np.ravel(value).tolist() for name, value in values.items()}
+        start = self.histories[0].gains[0]
+        return gain_table(self.scene, start, self.gains, self.lower, self.upper)
 
     def _rows(self) -> list[list[str]]:
         """Rows of the printed table: a label, up to four numbers, and a remark."""
@@ -214,6 +202,30 @@ class TradeOff(eqx.Module):
             mark = "" if result.converged else "  not converged"
             rows.append(f"{price:12.3g}{1e3 * error:16.4g}{1e2 * effort:12.4g}{mark}")
         return "\n".join(rows)
+
+
+def gain_table(
+    scene: Scene,
+    start: np.ndarray,
+    tuned: np.ndarray,
+    lower: np.ndarray,
+    upper: np.ndarray,
+) -> dict[str, list]:
+    """Returns the columns of `TuneResult.table`."""
+    names = joint_names(scene.linkage)
+    units = {"F": ("", "")} | controller_of(scene).gain_units
+    values = {
+        "start": start,
+        "tuned": tuned,
+        "least": lower,
+        "greatest": upper,
+        "at_bound": _at_bound(tuned, lower, upper),
+    }
+    return {
+        "gain": ["kp"] * len(names) + ["kd"] * len(names),
+        "joint": names * 2,
+        "unit": [units[name[0]][kind] for kind in range(2) for name in names],
+    } | {name: np.ravel(value).tolist() for name, value in values.items()}
 
 
 def mean_effort(linkage: Linkage, efforts: np.ndarray) -> float:
