@@ -13,6 +13,7 @@ from jaxtyping import Complex, Float
 from numpy.typing import ArrayLike
 
 from ..base.checks import in_order, instance, is_traced, real_array, shown
+from ..base.report import Report
 from ..control.pd import PDController
 from ..dynamics import forward_dynamics, joint_bias, joint_mass_matrix
 from ..forces.element import Element, Forces, elements_on, of_full_size
@@ -187,7 +188,7 @@ def closed_loop(
     return moved + B @ (alone + efforts), B, -efforts, F
 
 
-class Modes(eqx.Module):
+class Modes(Report):
     """Eigenvalues of the matrix A along a motion, the fastest last.
 
     Prints the natural frequencies and damping ratios, each from its least to its most.
@@ -218,16 +219,18 @@ class Modes(eqx.Module):
         with np.errstate(divide="ignore"):
             return _STABLE / self.frequency.max(axis=1)
 
-    def __str__(self) -> str:
-        rows = [f"modes at {len(self.eigenvalues)} times"]
-        rows.append(f"{'frequency [rad/s]':>24}{'damping ratio':>24}")
+    def _verdict(self) -> list[str]:
+        return [f"modes at {len(self.eigenvalues)} times"]
+
+    def _rows(self) -> list[list[str]]:
+        rows = [["frequency [rad/s]", "damping ratio"]]
         for values in zip(self.frequency.T, self.damping.T):
             spans = (value[np.isfinite(value)] for value in values)
-            cells = (
+            cells = [
                 f"{s.min():.4g} to {s.max():.4g}" if s.size else "-" for s in spans
-            )
-            rows.append("".join(f"{cell:>24}" for cell in cells))
-        return "\n".join(rows)
+            ]
+            rows.append(cells)
+        return rows
 
 
 def closed_loop_modes(linkage: Linkage, forces: Forces, solution: Solution) -> Modes:

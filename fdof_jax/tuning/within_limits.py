@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,17 +12,17 @@ from numpy.typing import ArrayLike
 from scipy.optimize import minimize
 
 from ..base.checks import function, instance, whole_number
+from ..base.report import Report
 from ..linkage.fields import check_joints, sized
 from ..linkage.linkage import joints_of
 from ..search.lanes import Lanes
 from ..search.methods import Evaluation
 from ..search.simulated import sum_of_squares
 from ..simulation.scene import Scene, with_full_size
-from .gain_table import as_html, as_text, gain_rows
 from .gains import bounds_of, check_tuned, gain_sensitivities, residuals_of, with_gains
 from .limits import Limits, controller_and_others, excess, measured
 from .losses import Loss, gains_of, tip_errors
-from .result import gain_table
+from .result import gain_rows, gain_table
 from .tuning import unusable_loss
 
 # The search aims this far within the limits, so that motions sampled more finely are
@@ -60,7 +59,7 @@ def _lane(z: Array, problem: tuple[Scene, Loss, Array, Limits, bool]) -> Evaluat
     )
 
 
-class TunedWithin(eqx.Module):
+class TunedWithin(Report):
     """A scene tuned within limits, and which limits it meets; prints itself.
 
     - `scene`: the scene with its tuned gains.
@@ -109,18 +108,11 @@ class TunedWithin(eqx.Module):
             rows.append([f"{name} of {joint}", *cells, "met" if met else "not met"])
         return rows
 
-    @property
-    def _verdict(self) -> str:
+    def _remarks(self) -> list[str]:
         count = f"{self.met.sum()} of {self.met.size} limits met"
         if not self.met.all():
             count += " (none found that meet all; these exceed them least)"
-        return f"loss {self.loss:.5g}, {count}; {self.message}"
-
-    def __str__(self) -> str:
-        return as_text(self._rows(), [self._verdict])
-
-    def _repr_html_(self) -> str:
-        return as_html(self._rows(), [self._verdict])
+        return [f"loss {self.loss:.5g}, {count}; {self.message}"]
 
 
 def tune_within(
