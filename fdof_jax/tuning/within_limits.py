@@ -59,6 +59,79 @@ def _lane(z: Array, problem: tuple[Scene, Loss, Array, Limits, bool]) -> Evaluat
     )
 
 
+def _search(
+    lanes: Lanes,
+    first: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
+    max_steps: int,
+    report: Callable[[str], Any] | None,
+) -> tuple[np.ndarray, float, str]:
+    """Returns the best log-gains (2n,), their loss, and why the search stopped.
+
+    Its unknowns are the scaled log-gains between their bounds, and the greatest excess
+    over the limits. As this has a price, limits that cannot be met are exceeded least.
+    """
+    free = low < high
+    points: list[tuple[np.ndarray, Evaluation]] = []
+
+    def evaluated(z: np.ndarray) -> Evaluation:
+        if not points or (points[-1][0] != z).any():
+            points.append((z, lanes(z[None], np.zeros(1, int)).row(0)))
+            if report is not None:
+                here = points[-1][1]
+                worst = max(here.facts["excess"].max(), 0.0)
+                report(f"{len(points):4d}  loss {here.loss:.6g}, excess {worst:.3g}")
+        return points[-1][1]
+
+    start = evaluated(first)
+    if np.isnan(start.facts["excess"]).any():
+        raise ValueError(
+            "scene: expected one that can be simulated with its own gains, and has an "
+            "equilibrium at its last set point, got one without."
+        )
+    if not (np.isfinite(start.loss) and np.isfinite(start.gradient).all()):
+        raise unusable_loss()
+    unit = max(float(start.loss), 1e-12)
+    scale = 1 / np.sqrt(np.diag(start.curvature)[free] / unit + _FLAT)
+
+    def at(x: np.ndarray) -> Evaluation:
+        z = first.copy()
+        z[free] = scale * x[:-1]
+        return evaluated(z)
+
+    def priced(x: np.ndarray) -> tuple[float, np.ndarray]:
+        value = np.nan_to_num(at(x).loss / unit, nan=_FAILED) + _PRICE * x[-1]
+        return value, np.append(scale * at(x).gradient[free] / unit, _PRICE)
+
+    def room(x: np.ndarray) -> np.ndarray:
+        beyond = np.nan_to_num(at(x).facts["excess"][0], nan=_FAILED)
+        return x[-1] - beyond - _WITHIN
+
+    def room_slopes(x: np.ndarray) -> np.ndarray:
+        slopes = at(x).facts["slopes"][0][:, free]
+        return np.column_stack([-scale * slopes, np.ones(len(slopes))])
+
+    worst = max(start.facts["excess"].max() + _WITHIN, 0.0)
+    result = minimize(
+        priced,
+        np.append(first[free] / scale, worst),
+        jac=True,
+        method="SLSQP",
+        bounds=[*zip(low[free] / scale, high[free] / scale), (0, None)],
+        constraints={"type": "ineq", "fun": room, "jac": room_slopes},
+        options={"maxiter": max_steps, "ftol": _ENOUGH},
+    )
+
+    def rank(point: tuple[np.ndarray, Evaluation]) -> tuple[float, float]:
+        loss, worst = point[1].loss, point[1].facts["excess"].max() + _WITHIN
+        excess, value = np.nan_to_num([worst, loss], nan=np.inf)
+        return max(excess, 2 * _ENOUGH), value
+
+    z, best = min(points, key=rank)
+    return z, float(best.loss), f"{result.message}, {len(points)} evaluations"
+
+
 class TunedWithin(Report):
     """A scene tuned within limits, and which limits it meets; prints itself.
 
@@ -173,70 +246,12 @@ def tune_within(
     limits = sized(limits, joints_of(scene.linkage))
     with_margins = bool(np.any(np.asarray(limits.modulus_margin) > 0))
     problem = with_full_size(scene), loss, lower > 0, limits, with_margins
-    lanes = Lanes(_lane, [[problem]])
     first, low, high = (
         np.log(np.where(lower > 0, gains, 1)).ravel() for gains in (start, lower, upper)
     )
-    free = low < high
-    points: list[tuple[np.ndarray, Evaluation]] = []
-
-    def at(z: np.ndarray) -> Evaluation:
-        if not points or (points[-1][0] != z).any():
-            points.append((z, lanes(z[None], np.zeros(1, int)).row(0)))
-            if report is not None:
-                here = points[-1][1]
-                worst = max(here.facts["excess"].max(), 0.0)
-                report(f"{len(points):4d}  loss {here.loss:.6g}, excess {worst:.3g}")
-        return points[-1][1]
-
-    here = at(first)
-    if np.isnan(here.facts["excess"]).any():
-        raise ValueError(
-            "scene: expected one that can be simulated with its own gains, and has an "
-            "equilibrium at its last set point, got one without."
-        )
-    if not (np.isfinite(here.loss) and np.isfinite(here.gradient).all()):
-        raise unusable_loss()
-    whole = max(float(here.loss), 1e-12)
-    scale = 1 / np.sqrt(np.diag(here.curvature)[free] / whole + _FLAT)
-
-    # The unknowns are the free log-gains and the greatest excess over the limits, which
-    # has a price: so the search has somewhere to go if it cannot meet all.
-    def here_at(x: np.ndarray) -> Evaluation:
-        z = first.copy()
-        z[free] = scale * x[:-1]
-        return at(z)
-
-    def priced(x: np.ndarray) -> tuple[float, np.ndarray]:
-        here = here_at(x)
-        value = np.nan_to_num(here.loss / whole, nan=_FAILED) + _PRICE * x[-1]
-        return value, np.append(scale * here.gradient[free] / whole, _PRICE)
-
-    def room(x: np.ndarray) -> np.ndarray:
-        excess = np.nan_to_num(here_at(x).facts["excess"][0], nan=_FAILED)
-        return x[-1] - excess - _WITHIN
-
-    def room_slopes(x: np.ndarray) -> np.ndarray:
-        slopes = here_at(x).facts["slopes"][0][:, free]
-        return np.column_stack([-scale * slopes, np.ones(len(slopes))])
-
-    worst = max(here.facts["excess"].max() + _WITHIN, 0.0)
-    search = minimize(
-        priced,
-        np.append(first[free] / scale, worst),
-        jac=True,
-        method="SLSQP",
-        bounds=[*zip(low[free] / scale, high[free] / scale), (0, None)],
-        constraints={"type": "ineq", "fun": room, "jac": room_slopes},
-        options={"maxiter": max_steps, "ftol": _ENOUGH},
+    z, value, message = _search(
+        Lanes(_lane, [[problem]]), first, low, high, max_steps, report
     )
-
-    def rank(point: tuple[np.ndarray, Evaluation]) -> tuple[float, float]:
-        here = point[1]
-        worst = np.nan_to_num(here.facts["excess"].max() + _WITHIN, nan=np.inf)
-        return max(worst, 2 * _ENOUGH), np.nan_to_num(here.loss, nan=np.inf)
-
-    z, here = min(points, key=rank)
     gains = np.where(
         lower > 0, np.clip(np.exp(z).reshape(lower.shape), lower, upper), 0
     )
@@ -245,11 +260,11 @@ def tune_within(
     limit, joint, allowed, reached = zip(*rows) if rows else ((),) * 4
     return TunedWithin(
         scene=scene,
-        loss=float(here.loss),
+        loss=value,
         start=start,
         lower=lower,
         upper=upper,
-        message=f"{search.message}, {len(points)} evaluations",
+        message=message,
         limit=limit,
         joint=joint,
         allowed=np.array(allowed),
