@@ -21,8 +21,7 @@ from jax import Array
 from jax.extend.core import ClosedJaxpr, Jaxpr
 
 from ..base.array_namespace import in_numpy
-from ..base.checks import refusal
-from ..base.names import optional_package
+from ..base.checks import optional_package, refusal
 from ..base.user_warnings import warn
 from ..base.whole_files import whole_file
 from ..linkage.linkage import Linkage

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +10,7 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from ..base.checks import function, increasing, instance, real_array, refusal, shown
+from ..base.report import Report
 from ..search.bounded import Run, minimise
 from ..search.lanes import Lanes
 from ..search.methods import Evaluation
@@ -34,7 +34,7 @@ _BARRIER = 0.1
 _ENOUGH = 1e-5  # a search stops when the loss falls by less than this part
 
 
-class NextMotion(eqx.Module):
+class NextMotion(Report):
     """The motion to record next; prints itself in a few lines.
 
     - `motion`: its numbers by name, for `experiment`.
@@ -49,21 +49,20 @@ class NextMotion(eqx.Module):
     improvement: float
     message: str
 
-    def __str__(self) -> str:
-        largest = f"the largest {self.improvement:.3g} times less"
-        rows = ["motion:", *_rows(self.motion)]
-        rows += [f"expected standard errors, {largest}:", *_rows(self.standard_errors)]
-        return "\n".join([*rows, self.message])
+    def _rows(self) -> list[list[str]]:
+        errors = {f"error of {k}": v for k, v in self.standard_errors.items()}
+        rows = []
+        for name, value in (self.motion | errors).items():
+            for row in np.atleast_2d(value):
+                rows.append([name, *(f"{x:.4g}" for x in row.ravel())])
+                name = ""
+        return [["", "numbers"], *rows]
 
-
-def _rows(values: dict[str, Any]) -> list[str]:
-    """Formats numbers by name, those of a matrix row by row."""
-    found = []
-    for name, value in values.items():
-        for row in np.atleast_2d(value):
-            found.append(f"  {name:12}" + "".join(f"{x:>11.4g}" for x in row.ravel()))
-            name = ""
-    return found
+    def _remarks(self) -> list[str]:
+        return [
+            f"expected standard errors, the largest {self.improvement:.3g} times less",
+            self.message,
+        ]
 
 
 class _Design(NamedTuple):

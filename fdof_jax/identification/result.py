@@ -1,15 +1,14 @@
 """Results of identification: parameters, their errors, and undetermined directions."""
 
 from collections.abc import Callable
-from html import escape
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from ..base.report import Report
 from ..search.bounded import Run
 from ..search.methods import held_at_bounds
 from ..simulation.scene import Scene
@@ -29,7 +28,7 @@ _REMAINING_PART = 1e-6
 _SHARED = 1e-6
 
 
-class FitResult(eqx.Module):
+class FitResult(Report):
     """Identified parameters and their standard errors; prints itself as a table.
 
     The first line printed is a verdict: whether a fault is known.
@@ -82,32 +81,31 @@ class FitResult(eqx.Module):
         """True if no fault is known. Without held-out recordings that says little."""
         return not self.faults
 
-    def __str__(self) -> str:
-        values = np.concatenate([np.ravel(v) for v in self.parameters.values()])
-        errors = np.sqrt(np.diag(self.covariance))
-        width = max(12, *(len(name) + 2 for name in self.names))
+    def _verdict(self) -> list[str]:
         known = "; ".join(self.faults)
         tested = "on" if self.held_out else "but not tested on"
         no_fault = f"No fault is known, {tested} held-out recordings."
-        rows = [
-            f"Not to be used: {known}." if known else no_fault,
-            f"{'':{width}}{'value':>14}{'std error':>12}{'relative':>12}",
-        ]
+        return [f"Not to be used: {known}." if known else no_fault]
+
+    def _rows(self) -> list[list[str]]:
+        values = np.concatenate([np.ravel(v) for v in self.parameters.values()])
+        errors = np.sqrt(np.diag(self.covariance))
+        rows = [["", "value", "std error", "relative"]]
         for name, value, error in zip(self.names, values, errors):
             share = f"{100 * error / abs(value):.3g} %" if value else ""
             shown = f"{value:.{_digits(value, error)}g}"
-            rows.append(f"{name:{width}}{shown:>14}{error:12.3g}{share:>12}")
-        rows.append(f"rms residual {self.rms:.4g}")
-        for ratio in self.held_out:
-            rows.append(f"held-out residuals {ratio:.3g} times the noise")
-        verdict = "converged" if self.converged else "not converged"
-        if self.converged and np.isinf(errors).any():
-            verdict = "converged in what the motion determines, which is not all"
-        rows.append(f"{verdict}, {len(self.history) - 1} iterations: {self.message}")
-        return "\n".join([*rows, *self.weak])
+            rows.append([name, shown, f"{error:.3g}", share])
+        return rows
 
-    def _repr_html_(self) -> str:
-        return f"<pre>{escape(str(self))}</pre>"
+    def _remarks(self) -> list[str]:
+        lines = [f"rms residual {self.rms:.4g}"]
+        for ratio in self.held_out:
+            lines.append(f"held-out residuals {ratio:.3g} times the noise")
+        verdict = "converged" if self.converged else "not converged"
+        if self.converged and np.isinf(np.diag(self.covariance)).any():
+            verdict = "converged in what the motion determines, which is not all"
+        lines.append(f"{verdict}, {len(self.history) - 1} iterations: {self.message}")
+        return [*lines, *self.weak]
 
 
 def _digits(value: float, error: float) -> int:

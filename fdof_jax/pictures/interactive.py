@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import imsave
 
 from ..base.checks import instance, optional_package, refusal, shown
-from ..base.html_table import html_table
+from ..base.report import html_table
 from ..linkage.linkage import joint_names, joints_of
 from ..references.reference import reference_of
 from ..simulation.scene import Scene

@@ -10,7 +10,7 @@ from jax import Array
 from jaxtyping import Float
 
 from ..base.checks import is_traced, known
-from ..base.html_table import html_table
+from ..base.report import html_table
 
 # In the order of `outcome_numbers`.
 OUTCOMES = (

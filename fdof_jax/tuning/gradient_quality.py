@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float
 from ..analysis.linearization import Modes, closed_loop_modes, depends_on_state_alone
 from ..analysis.tracking import relative_demands
 from ..base.configuration import options_of_loops
+from ..base.report import Report
 from ..linkage.linkage import joint_names
 from ..simulation.prescribed import PrescribedMotion
 from ..simulation.scene import Scene, is_number
@@ -33,7 +34,7 @@ _STABLE, _MANY_STEPS = 4.0, 1e4
 _OF_TIME = 1e-3  # the step in a time, at most, as a share of the run
 
 
-class GradientReport(eqx.Module):
+class GradientReport(Report):
     """The gradient of the mean squared tip error [m^2] at a scene's gains.
 
     Derivatives are in the logarithms of kp and kd (2, n). The error is that of this
@@ -72,7 +73,7 @@ class GradientReport(eqx.Module):
     slowest_crossing: float = np.inf
     times: dict[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
 
-    def __str__(self) -> str:
+    def _remarks(self) -> list[str]:
         along = "  ".join(
             f"{t:.3g} s: {norm:.2g}"
             for t, norm in zip(self.horizons, self.gradient_norm)
@@ -105,7 +106,7 @@ class GradientReport(eqx.Module):
                 f"derivative in {name}: {slope:.3g} m^2/s, by differences "
                 f"{difference:.3g}"
             )
-        return "\n".join(lines + self.warnings)
+        return lines + self.warnings
 
 
 def _times_in(part: Any, place: str) -> Iterator[tuple[str, Array]]:

@@ -23,6 +23,9 @@ from ..simulation.simulate import simulate
 from ..simulation.solution import Solution
 from .losses import controller_of
 
+# Excesses count by their largest in each span of times and in each band of frequencies:
+# one largest of all would jump between peaks, which a search cannot follow.
+_SPANS, _BANDS = 13, 8
 _FREQUENCIES = 200
 
 
@@ -57,11 +60,11 @@ class Limits(Part):
 def excess(
     limits: Limits, scene: Scene, solution: Solution, with_margins: bool
 ) -> Array:
-    """Excess of a motion over its limits, at all times and frequencies (m,).
+    """Largest excesses of a motion over its limits (m,), negative within them.
 
-    Negative numbers are within. Overshoot and deviation are shares of the step, efforts
-    and margins shares of their limits. Margins, which take a linearisation of the arm,
-    are left out if no joint's is limited.
+    Overshoot and deviation are shares of the step, efforts and margins shares of their
+    limits. Margins, which take a linearisation of the arm, are left out if no joint's
+    is limited. The number of times is a multiple of 13.
     """
     ts, rest = solution.ts, rest_of(scene)
     share, still = step_shares(solution, rest)
@@ -74,13 +77,19 @@ def excess(
         return jnp.stack([over, unsettled, jnp.abs(demand) / limits.effort - 1])
 
     demand = demands(controller_of(scene), scene.linkage, solution)
-    along = jax.vmap(at)(ts, share, demand).reshape(-1)
+    along = _largest(jax.vmap(at)(ts, share, demand), _SPANS)
     if not with_margins:
         return along
     controller, others = controller_and_others(scene)
     A, B, C, _ = loop_matrices(scene.linkage, controller, others, rest, scene.t1)
     near = jax.vmap(lambda s: limits.modulus_margin * jnp.abs(s) - 1)
-    return jnp.concatenate([along, near(sensitivity(A, B, C)).reshape(-1)])
+    return jnp.concatenate([along, _largest(near(sensitivity(A, B, C)), _BANDS)])
+
+
+def _largest(values: Array, blocks: int) -> Array:
+    """Returns the largest of each block of rows, at least -1, as one row."""
+    parts = values.reshape(blocks, -1, *values.shape[1:])
+    return jnp.maximum(parts.max(axis=1), -1).reshape(-1)  # finite without a limit
 
 
 def controller_and_others(scene: Scene) -> tuple[PDController, tuple[Element, ...]]:

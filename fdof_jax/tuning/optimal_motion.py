@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from ..analysis.tracking import tip_deviation
 from ..base.checks import place_of, real_array, whole_number
+from ..base.report import Report
 from ..control.model_based import ComputedTorque
 from ..forces.joints import EffortHistory
 from ..linkage.linkage import joints_of, without_fixed
@@ -40,7 +41,7 @@ _SMALL_GRADIENT = 1e-2
 _BANDWIDTH = 10.0
 
 
-class OptimalMotion(eqx.Module):
+class OptimalMotion(Report):
     """The best open-loop motion found; prints itself in a few lines.
 
     - `scene`: the scene with an `EffortHistory` in place of its controller, up to the
@@ -84,17 +85,15 @@ class OptimalMotion(eqx.Module):
         t1 = float(real_array("t1", t1, (), minimum=horizon))
         return self.tip_error * (horizon / t1) ** 0.5
 
-    def __str__(self) -> str:
-        found = ", ".join(f"{1e3 * error:.5g}" for error in self.guess_errors)
-        return "\n".join(
-            [
-                f"rms tip error over {self.ts[-1]:g} s: {1e3 * self.tip_error:.5g} mm, "
-                f"with {len(self.ts)} knots",
-                f"of the controller: {1e3 * self.controller_error:.5g} mm",
-                f"from each first guess: {found} mm",
-                f"{'converged' if self.converged else 'not converged'}: {self.message}",
-            ]
-        )
+    def _remarks(self) -> list[str]:
+        errors = ", ".join(f"{1e3 * error:.5g}" for error in self.guess_errors)
+        return [
+            f"rms tip error over {self.ts[-1]:g} s: {1e3 * self.tip_error:.5g} mm, "
+            f"with {len(self.ts)} knots",
+            f"of the controller: {1e3 * self.controller_error:.5g} mm",
+            f"from each first guess: {errors} mm",
+            f"{'converged' if self.converged else 'not converged'}: {self.message}",
+        ]
 
 
 @eqx.filter_jit

@@ -9,10 +9,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ..base.checks import known
+from ..base.report import Report
 from ..linkage.linkage import Linkage, joint_names, moving_joints
 from ..search.bounded import Run, best_of
 from ..simulation.scene import Scene
-from .gain_table import as_html, as_text, gain_rows
 from .gains import with_gains
 from .losses import controller_of
 
@@ -46,7 +46,7 @@ class History(eqx.Module):
     wall_time: Float[np.ndarray, " iteration"]
 
 
-class TuneResult(eqx.Module):
+class TuneResult(Report):
     """A tuned scene and how it was reached; prints itself as a table.
 
     - `scene`: the scene with its tuned gains.
@@ -118,20 +118,8 @@ class TuneResult(eqx.Module):
         The columns are `gain` and `joint`, for instance kp and R1; `unit`; the values
         `start` and `tuned`; the bounds `least` and `greatest`; and `at_bound`.
         """
-        names = joint_names(self.scene.linkage)
-        units = {"F": ("", "")} | controller_of(self.scene).gain_units
-        values = {
-            "start": self.histories[0].gains[0],
-            "tuned": self.gains,
-            "least": self.lower,
-            "greatest": self.upper,
-            "at_bound": self.at_bound,
-        }
-        return {
-            "gain": ["kp"] * len(names) + ["kd"] * len(names),
-            "joint": names * 2,
-            "unit": [units[name[0]][kind] for kind in range(2) for name in names],
-        } | {name: np.ravel(value).tolist() for name, value in values.items()}
+        start = self.histories[0].gains[0]
+        return gain_table(self.scene, start, self.gains, self.lower, self.upper)
 
     def _rows(self) -> list[list[str]]:
         """Rows of the printed table: a label, up to four numbers, and a remark."""
@@ -168,15 +156,12 @@ class TuneResult(eqx.Module):
                 f"{values.max():.5g}"
             )
         iterations = len(self.history.loss) - 1
-        rows.append(f"{self._verdict}, {iterations} iterations: {self.message}")
+        rows.append(f"{self._outcome}, {iterations} iterations: {self.message}")
         return rows
 
     @property
-    def _verdict(self) -> str:
+    def _outcome(self) -> str:
         return "converged" if self.converged else "not converged"
-
-    def __str__(self) -> str:
-        return as_text(self._rows(), self._remarks())
 
     def __repr__(self) -> str:
         """One line, or shapes if values are traced."""
@@ -186,14 +171,11 @@ class TuneResult(eqx.Module):
         first, held = self.histories[0], int(self.at_bound.sum())
         return (
             f"TuneResult({topology}, loss {first.loss[0]:.5g} to {self.loss:.5g}, "
-            f"{held} of {self.tuned_gains} gains at a bound, {self._verdict})"
+            f"{held} of {self.tuned_gains} gains at a bound, {self._outcome})"
         )
 
-    def _repr_html_(self) -> str:
-        return as_html(self._rows(), self._remarks())
 
-
-class TradeOff(eqx.Module):
+class TradeOff(Report):
     """The least tip errors for given efforts: one tuning run per price of effort.
 
     - `prices`: prices of effort, see `Tracking` (price,) [m^2].
@@ -207,13 +189,48 @@ class TradeOff(eqx.Module):
     effort: Float[np.ndarray, " price"]
     results: list[TuneResult]
 
-    def __str__(self) -> str:
-        rows = [f"{'price [m^2]':>12}{'tip error [mm]':>16}{'effort [%]':>12}"]
+    def _rows(self) -> list[list[str]]:
+        rows = [["price [m^2]", "tip error [mm]", "effort [%]", ""]]
         columns = self.prices, self.tip_error, self.effort, self.results
         for price, error, effort, result in zip(*columns):
-            mark = "" if result.converged else "  not converged"
-            rows.append(f"{price:12.3g}{1e3 * error:16.4g}{1e2 * effort:12.4g}{mark}")
-        return "\n".join(rows)
+            mark = "" if result.converged else "not converged"
+            numbers = f"{price:.3g}", f"{1e3 * error:.4g}", f"{1e2 * effort:.4g}"
+            rows.append([*numbers, mark])
+        return rows
+
+
+def gain_rows(table: dict[str, list]) -> list[list[str]]:
+    """Returns a header and a row per gain of a `TuneResult.table`."""
+    rows = [["", "start", "tuned", "least", "greatest", ""]]
+    for gain, joint, unit, *values, held in zip(*table.values()):
+        cells = [f"{value:.5g}" for value in values]
+        mark = "at its bound" if held else ""
+        rows.append([f"{gain} of {joint} [{unit}]", *cells, mark])
+    return rows
+
+
+def gain_table(
+    scene: Scene,
+    start: np.ndarray,
+    tuned: np.ndarray,
+    lower: np.ndarray,
+    upper: np.ndarray,
+) -> dict[str, list]:
+    """Returns the columns of `TuneResult.table`."""
+    names = joint_names(scene.linkage)
+    units = {"F": ("", "")} | controller_of(scene).gain_units
+    values = {
+        "start": start,
+        "tuned": tuned,
+        "least": lower,
+        "greatest": upper,
+        "at_bound": _at_bound(tuned, lower, upper),
+    }
+    return {
+        "gain": ["kp"] * len(names) + ["kd"] * len(names),
+        "joint": names * 2,
+        "unit": [units[name[0]][kind] for kind in range(2) for name in names],
+    } | {name: np.ravel(value).tolist() for name, value in values.items()}
 
 
 def mean_effort(linkage: Linkage, efforts: np.ndarray) -> float:

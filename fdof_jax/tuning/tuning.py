@@ -96,16 +96,21 @@ def _failure(members: list[Scene], first: Row, ensemble: bool) -> ValueError:
     """The error to raise if no start can be evaluated, judged by the first start."""
     failing = np.flatnonzero(~first.facts["simulated"])
     if failing.size == 0:
-        return ValueError(
-            "loss: expected finite numbers, not negative if only one, with finite "
-            "derivatives, got others at the scene's own gains."
-        )
+        return unusable_loss()
     index = int(failing[0])
     name = f"ensemble[{index}]" if ensemble else "scene"
     return ValueError(
         f"{name}: expected one that can be simulated up to t1 = "
         f"{float(members[index].t1):g} s with the scene's own gains, got one that "
         "fails before."
+    )
+
+
+def unusable_loss() -> ValueError:
+    """The error to raise for a loss that is not finite at the start."""
+    return ValueError(
+        "loss: expected finite numbers, not negative if only one, with finite "
+        "derivatives, got others at the scene's own gains."
     )
 
 
