@@ -70,7 +70,7 @@ REFERENCES = {
 
 @pytest.mark.parametrize("name", REFERENCES)
 def test_references_with_static_fields(name, path):
-    saved_and_loaded(path, fj.PrescribedMotion((1, 3), REFERENCES[name]))
+    saved_and_loaded(path, fj.simulation.PrescribedMotion((1, 3), REFERENCES[name]))
 
 
 @pytest.fixture(scope="module")
@@ -206,7 +206,7 @@ trees = st.recursive(
         | st.dictionaries(st.text(), inner, max_size=3)
         | st.builds(Pair, inner, inner)
         | st.builds(Push, inner, st.text())
-        | st.builds(fj.Efforts, inner, inner)
+        | st.builds(fj.simulation.Efforts, inner, inner)
     ),
     max_leaves=8,
 )

@@ -125,7 +125,7 @@ def test_fields_that_version_0_1_did_not_save(path):
     added = "switches", "slowest_crossing", "times"
     describe(path, lambda d: [d["tree"]["fields"].pop(n) for n in added])
     same(fj.load(path), report)
-    motion = fj.SampledMotion(*[array] * 4, diffrax.RESULTS.successful, ())
+    motion = fj.simulation.SampledMotion(*[array] * 4, diffrax.RESULTS.successful, ())
     fj.save(path, motion)
     describe(path, lambda d: [d["tree"]["fields"].pop(n) for n in ("delay", "q_begin")])
     same(fj.load(path), motion)

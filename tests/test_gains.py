@@ -277,7 +277,7 @@ def test_pid_and_fixed_pairs_have_loops():
     pid = fj.control.PIDController(80.0, 40.0, 9.0, np.inf, Stand(q))
     loop = fj.analysis.open_loop(longer, q, pid, joint=1)
     assert loop.stable
-    inertia = fj.joint_mass_matrix(longer, q)[0, 0]
+    inertia = fj.mass_matrix(longer, q)[0, 0]
     # At high frequencies the plant is an inertia alone.
     np.testing.assert_allclose(abs(loop(1e5)) * 1e5, 9.0 / inertia, rtol=1e-6)
     assert abs(loop(1e-6)) > 1e6  # the integral leaves no error
@@ -304,7 +304,12 @@ def test_loops_of_malformed_arguments_are_refused():
         (pd, 0, (), r"joint: expected one of \(1, 2, 3\), got 0"),
         (pd, 1, (fj.control.FirstOrderLag(pd, 0.1),), "forces: expected elements"),
         (3.0, 1, (), "controller: expected a force element"),
-        (fj.PrescribedMotion(1, pd.reference), 1, (), "controller: expected one that"),
+        (
+            fj.simulation.PrescribedMotion(1, pd.reference),
+            1,
+            (),
+            "controller: expected one that",
+        ),
     ]:
         with pytest.raises(ValueError, match=message):
             fj.analysis.open_loop(linkage, q, controller, joint, forces)

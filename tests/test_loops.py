@@ -94,7 +94,7 @@ def test_an_integral_of_a_fixed_pair_within_a_drive_is_no_state(gains, speed):
     lagged = fj.control.FirstOrderLag(controller, 0.002)
     loop = fj.analysis.open_loop(longer, q, lagged, joint=1)
     assert loop.A.shape == (4, 4) and loop.stable
-    inertia = float(fj.joint_mass_matrix(longer, q)[0, 0])
+    inertia = float(fj.mass_matrix(longer, q)[0, 0])
     fall = float(fj.analysis.holding_efforts(longer, q + [1e-6, 0])[0])
     fall = (fall - float(fj.analysis.holding_efforts(longer, q - [1e-6, 0])[0])) / 2e-6
     s = 1j * np.geomspace(0.1, 1000, 9)

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from ..base.checks import instance, is_traced, real_array, shown
 from ..control.pd import PDController
-from ..dynamics import forward_dynamics, joint_bias, joint_mass_matrix
+from ..dynamics import bias_force, forward_dynamics, mass_matrix
 from ..forces.element import Element, Forces, elements_on, of_full_size
 from ..linkage.coordinates import State, real_state
 from ..linkage.linkage import (
@@ -148,13 +148,13 @@ def closed_loop(
     """
     own, rebuilt = ravel_pytree(controller.initial_state(linkage))
     n, still = q.size, jnp.zeros_like(q)
-    inverse = jnp.linalg.inv(joint_mass_matrix(linkage, q, forces))
+    inverse = jnp.linalg.inv(mass_matrix(linkage, q, forces))
     inverse = jnp.where(jnp.stack(fixed_pairs(linkage.ef)), 0, inverse)
     B = jnp.concatenate([jnp.zeros((n, n)), inverse, jnp.zeros((own.size, n))])
 
     def acting(y):
         q, qd, _ = jnp.split(y, [n, 2 * n])
-        weight = joint_bias(linkage, q, still, forces)
+        weight = bias_force(linkage, q, still, forces)
         return total_effort(linkage, forces, t, q, qd) - weight
 
     def respond(y, change):

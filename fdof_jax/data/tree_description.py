@@ -72,8 +72,8 @@ def _of_the_library(name: str) -> Any:
     if name in _WITHIN:
         module = importlib.import_module(f"{_PACKAGE}.{_WITHIN[name]}")
     else:
-        rooms = "analysis control forces identification references tuning".split()
-        places = [_PACKAGE, *(f"{_PACKAGE}.{room}" for room in rooms)]
+        rooms = "analysis control forces identification references simulation tuning"
+        places = [_PACKAGE, *(f"{_PACKAGE}.{room}" for room in rooms.split())]
         listing = map(importlib.import_module, places)
         module = next((m for m in listing if name in m.__all__), None)
     found = getattr(module, name, None)
