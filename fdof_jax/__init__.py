@@ -2,8 +2,8 @@
 
     import fdof_jax as fj
     fj.configure(x64=True)                     # double precision, before all else
-    arm, start, forces, t1 = fj.scenes.fig7()  # or your own Linkage, State and elements
-    motion = fj.simulate(arm, start, [0, t1], forces)
+    scene = fj.scenes.fig7()                   # or your own Linkage, State and elements
+    motion = fj.simulate(scene, [0, scene.t1])
 
 Units are SI. `help` of a name says the rest; its room holds more of its kind.
 

@@ -29,6 +29,7 @@ from ..references.reference import Reference, reference_motion
 from ..simulation.field import element_effort, stateful
 from ..simulation.prescribed import prescribed
 from ..simulation.sampled import check_joints
+from ..simulation.scene import accepts_scene
 from ..simulation.solution import Solution
 
 # Explicit Runge-Kutta methods of order 4 in 4 stages damp every damped mode if the step
@@ -73,13 +74,16 @@ def total_effort(
     return sum(efforts, jnp.zeros_like(q))
 
 
+@accepts_scene
 def linearize(
     linkage: Linkage, state: State, forces: Forces = (), t: ArrayLike = 0.0
 ) -> Linearization:
     """Linearises the equations of motion about a state, at a time.
 
     **Arguments:** `linkage`; `state`: joint positions and velocities; `forces`:
-    elements without a state of their own; `t`: time at which they are evaluated [s].
+    elements without a state of their own; `t`: time at which they are evaluated [s]. A
+    `Scene` may stand for linkage and forces: `linearize(scene, state, t)`. By default
+    the state is then the scene's start.
 
     **Returns:** `A` and `B` of d(q, qd)/dt = A (q, qd) + B tau, for small changes. The
     efforts tau act in the joints in addition to the forces [N or N m]. For a force with
