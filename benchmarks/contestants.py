@@ -248,7 +248,9 @@ def _textbook_field(t, y, args):
 def _masked_field(t, y, args):
     linkage, _ = args
     x, xd = y[:6], y[6:]
-    return jnp.concatenate([xd, fj.masked_accelerations(linkage, x, xd, jnp.zeros(6))])
+    return jnp.concatenate(
+        [xd, fj.paper.masked_accelerations(linkage, x, xd, jnp.zeros(6))]
+    )
 
 
 def _masked_joints(linkage, y):
@@ -276,7 +278,7 @@ textbook_form = Form("plain diffrax", _textbook_field, _stacked, _halves)
 masked_form = Form(
     "plain diffrax, masked 6x6",
     _masked_field,
-    lambda linkage, state0: jnp.concatenate(fj.to_chain(linkage, *state0)),
+    lambda linkage, state0: jnp.concatenate(fj.paper.to_chain(linkage, *state0)),
     _masked_joints,
 )
 reduced_form = Form("plain diffrax, reduced", _reduced_field, _stacked, _halves)

@@ -31,9 +31,11 @@ from switching_scenes import ELEMENTS, MOVING, random_members, random_scene
 
 FILE = Path(__file__).parent / "results" / "frozen.json"
 ROOMS = (
+    "paper",
     "forces",
     "control",
     "references",
+    "simulation",
     "analysis",
     "tuning",
     "identification",

@@ -48,7 +48,7 @@ def fdof_jax(scene: HardScene) -> Callable[[], Run]:
             forces = (controller, fj.JointEffort(effort))
     steps: Any = diffrax.PIDController(rtol=scene.tolerance, atol=scene.tolerance)
     if scene.scaled:
-        steps = fj.scale_tolerances(scene.linkage, steps)
+        steps = fj.simulation.scale_tolerances(scene.linkage, steps)
     if scene.derivative:
         steps = None  # the default, which bounds the error of derivatives too
     keywords: dict[str, Any] = dict(

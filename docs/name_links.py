@@ -3,15 +3,22 @@
 import re
 from pathlib import Path
 
-ENTRIES = {
-    entry.rpartition(".")[2]: entry
-    for page in Path(__file__).parent.glob("api/*.md")
-    for entry in re.findall(r"^::: (\S+)", page.read_text(), re.MULTILINE)
-}
-_ROOMS = "|".join({entry.split(".")[-2] for entry in ENTRIES.values()})
+_LISTED = sorted(
+    (
+        entry
+        for page in Path(__file__).parent.glob("api/*.md")
+        for entry in re.findall(r"^::: (\S+)", page.read_text(), re.MULTILINE)
+    ),
+    key=len,
+    reverse=True,
+)
+# A name alone is that of the shortest entry: `mass_matrix` is not `paper.mass_matrix`.
+ENTRIES = {entry.removeprefix("fdof_jax."): entry for entry in _LISTED}
+ENTRIES |= {entry.rpartition(".")[2]: entry for entry in _LISTED}
+_ROOMS = "|".join({entry.split(".")[-2] for entry in _LISTED})
 # Code such as fj.tune(...) or Solution.outcome, if it begins no heading and no link.
 _NAME = re.compile(
-    rf'(?<!">)<code>(?:fj\.)?(?:(?:{_ROOMS})\.)?({"|".join(ENTRIES)})'
+    rf'(?<!">)<code>(?:fj\.)?(?:(?:{_ROOMS})\.)??({"|".join(ENTRIES)})'
     r"(?:\.\w+|\([^<()]*\))?</code>"
 )
 

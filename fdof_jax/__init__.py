@@ -2,22 +2,21 @@
 
     import fdof_jax as fj
     fj.configure(x64=True)                     # double precision, before all else
-    arm, start, forces, t1 = fj.scenes.fig7()  # or your own Linkage, State and elements
-    motion = fj.simulate(arm, start, [0, t1], forces)
+    scene = fj.scenes.fig7()                   # or your own Linkage, State and elements
+    motion = fj.simulate(scene, [0, scene.t1])
 
 Units are SI. `help` of a name says the rest; its room holds more of its kind.
 
-- **Arms**: Linkage, State, Scene, TOPOLOGIES, existence_factors, to_chain, from_chain,
-  joint_positions, mass_centers, tip_position, tip_jacobian, inverse_kinematics.
+- **Arms**: Linkage, State, Scene, TOPOLOGIES, existence_factors, joint_positions,
+  mass_centers, tip_position, tip_jacobian, inverse_kinematics.
 - **What acts**, room `forces`: JointDamper, JointEffort, SpringDamper, Wrench, Point,
   LinearActuator. Of your own: Element, field, Values.
 - **Controllers**, rooms `control` and `references`: PDController, TipTask, CircleTask.
-- **Motions**: simulate, sweep for many, simulate_sampled and step for controllers on a
-  clock; Solution, SampledMotion, PrescribedMotion, scale_tolerances.
-- **At one instant**: forward_dynamics, inverse_dynamics, joint_mass_matrix, joint_bias,
-  energy, link_energies; the paper's mass_matrix, bias_force, masked_accelerations and
-  constraint_forces.
-- **Afterwards**, room `analysis`: joint_efforts, Efforts, joint_reactions, linearize.
+- **Motions**, room `simulation`: simulate, sweep for many, simulate_sampled and step
+  for controllers on a clock; Solution.
+- **At one instant**: forward_dynamics, inverse_dynamics, mass_matrix, bias_force,
+  energy, link_energies. The paper's six equations: paper.
+- **Afterwards**, room `analysis`: joint_efforts, joint_reactions, linearize.
 - **Gains**, room `tuning`: tune, TuneResult. **Parameters from recordings**, room
   `identification`: fit, FitResult.
 - **Pictures**: drawing, plotting, interactive. **Files and tables**, room `data`: save,
@@ -36,8 +35,10 @@ from . import (
     data,
     forces,
     identification,
+    paper,
     references,
     scenes,
+    simulation,
     tuning,
 )
 from .analysis.linearization import linearize
@@ -50,12 +51,12 @@ from .data.mjcf import to_mjcf
 from .data.mjcf_import import from_mjcf
 from .data.tables import to_pandas, to_xarray
 from .dynamics import (
+    bias_force,
     energy,
     forward_dynamics,
     inverse_dynamics,
-    joint_bias,
-    joint_mass_matrix,
     link_energies,
+    mass_matrix,
 )
 from .forces.actuators import LinearActuator
 from .forces.between_points import SpringDamper, Wrench
@@ -64,7 +65,7 @@ from .forces.joints import JointDamper, JointEffort
 from .forces.points import Point
 from .identification.fitting import fit
 from .identification.result import FitResult
-from .linkage.coordinates import State, from_chain, to_chain
+from .linkage.coordinates import State
 from .linkage.fields import Values, field
 from .linkage.linkage import Linkage
 from .linkage.topology import TOPOLOGIES, existence_factors
@@ -75,21 +76,13 @@ from .mechanics.kinematics import (
     tip_jacobian,
     tip_position,
 )
-from .mechanics.paper import (
-    bias_force,
-    constraint_forces,
-    masked_accelerations,
-    mass_matrix,
-)
 from .references.circle import CircleTask
 from .references.task import TipTask
-from .simulation.efforts import Efforts, joint_efforts
-from .simulation.prescribed import PrescribedMotion
-from .simulation.sampled import SampledMotion, simulate_sampled, step
+from .simulation.efforts import joint_efforts
+from .simulation.sampled import simulate_sampled, step
 from .simulation.scene import Scene
 from .simulation.simulate import simulate
 from .simulation.solution import Solution
-from .steps.tolerances import scale_tolerances
 from .tuning.result import TuneResult
 from .tuning.tuning import tune
 
@@ -97,19 +90,16 @@ if TYPE_CHECKING:
     from .pictures import drawing, interactive, plotting
 
 __all__ = [
-    "analysis", "bias_force", "CircleTask", "configure", "constraint_forces",
-    "control", "data", "drawing", "Efforts", "Element", "energy",
-    "existence_factors", "field", "fit", "FitResult", "forces", "forward_dynamics",
-    "from_chain", "from_mjcf", "identification", "interactive", "inverse_dynamics",
-    "inverse_kinematics", "joint_bias", "joint_efforts", "joint_mass_matrix",
-    "joint_positions", "joint_reactions", "JointDamper", "JointEffort",
-    "LinearActuator", "linearize", "link_energies", "Linkage", "load",
-    "masked_accelerations", "mass_centers", "mass_matrix", "PDController",
-    "plotting", "Point", "PrescribedMotion", "references", "SampledMotion", "save",
-    "scale_tolerances", "Scene", "scenes", "simulate", "simulate_sampled",
-    "Solution", "SpringDamper", "State", "step", "sweep", "tip_jacobian",
-    "tip_position", "TipTask", "to_chain", "to_mjcf", "to_pandas", "to_xarray",
-    "TOPOLOGIES", "tune", "TuneResult", "tuning", "Values", "Wrench",
+    "analysis", "bias_force", "CircleTask", "configure", "control", "data", "drawing",
+    "Element", "energy", "existence_factors", "field", "fit", "FitResult", "forces",
+    "forward_dynamics", "from_mjcf", "identification", "interactive",
+    "inverse_dynamics", "inverse_kinematics", "joint_efforts", "joint_positions",
+    "joint_reactions", "JointDamper", "JointEffort", "LinearActuator", "linearize",
+    "link_energies", "Linkage", "load", "mass_centers", "mass_matrix", "paper",
+    "PDController", "plotting", "Point", "references", "save", "Scene", "scenes",
+    "simulate", "simulate_sampled", "simulation", "Solution", "SpringDamper", "State",
+    "step", "sweep", "tip_jacobian", "tip_position", "TipTask", "to_mjcf", "to_pandas",
+    "to_xarray", "TOPOLOGIES", "tune", "TuneResult", "tuning", "Values", "Wrench",
 ]  # fmt: skip
 
 

@@ -100,7 +100,7 @@ def _topologies() -> Iterator[tuple[str, Any]]:
 def _motion(scene: Scene) -> Solution:
     """Simulates a scene, with output times every hundredth of a second."""
     ts = np.arange(round(float(scene.t1) / 0.01) + 1) * 0.01
-    return simulate(scene.linkage, scene.state0, ts, scene.forces)
+    return simulate(scene, ts)
 
 
 _COMMANDS = {"figures": _figures, "topologies": _topologies}

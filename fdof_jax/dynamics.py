@@ -91,7 +91,7 @@ def inverse_dynamics(
 
 
 @compiled("q", forces=inertial_on)
-def joint_mass_matrix(
+def mass_matrix(
     linkage: Linkage, q: Float[Array, " joint"], forces: Forces = ()
 ) -> Float[Array, "joint joint"]:
     """Computes the mass matrix M in joint coordinates, in M qdd + bias = tau.
@@ -105,7 +105,7 @@ def joint_mass_matrix(
 
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig5().linkage
-    >>> fj.joint_mass_matrix(arm, [0, 0, 0]).tolist()  # 1 kg each at 1, 2 and 3 m
+    >>> fj.mass_matrix(arm, [0, 0, 0]).tolist()  # 1 kg each at 1, 2 and 3 m
     [[14.0, 8.0, 3.0], [8.0, 5.0, 2.0], [3.0, 2.0, 1.0]]
     """
     matrix, _ = mass_and_bias(linkage, forces, q, jnp.zeros_like(q))
@@ -115,7 +115,7 @@ def joint_mass_matrix(
 
 
 @compiled("q", "qd", forces=inertial_on)
-def joint_bias(
+def bias_force(
     linkage: Linkage,
     q: Float[Array, " joint"],
     qd: Float[Array, " joint"],
@@ -123,8 +123,8 @@ def joint_bias(
 ) -> Float[Array, " joint"]:
     """Computes the bias: gravity, centrifugal and Coriolis forces on the joints.
 
-    In M qdd + bias = tau, the bias is the effort of zero acceleration. The paper's phi
-    (`bias_force`) has the other sign and is in chain coordinates.
+    In M qdd + bias = tau, the bias is the effort of zero acceleration. It is minus phi
+    of (14), projected on the real joints.
 
     **Arguments:** `q` [m or rad], `qd` [m/s or rad/s]; `forces`: elements, of which
     those with masses count. The efforts of springs and others belong to tau.
@@ -133,7 +133,7 @@ def joint_bias(
 
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig5().linkage
-    >>> fj.joint_bias(arm, [0, 0, 0], [0, 0, 0]).tolist()  # at rest: gravity
+    >>> fj.bias_force(arm, [0, 0, 0], [0, 0, 0]).tolist()  # at rest: gravity
     [58.86, 29.43, 9.81]
     """
     return mass_and_bias(linkage, forces, q, qd)[1]

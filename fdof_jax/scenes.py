@@ -4,9 +4,10 @@ import numpy as np
 
 from .control.pd import PDController
 from .forces.joints import JointDamper
-from .linkage.coordinates import State, from_chain
+from .linkage.coordinates import State
 from .linkage.linkage import Linkage
 from .mechanics.inverse_kinematics import inverse_kinematics
+from .paper import from_chain
 from .references.circle import CircleTask
 from .references.paths import Ellipse
 from .references.task import TipTask

@@ -50,7 +50,7 @@ def to_joint(scene, values):
 
 def load(name):
     scene = SCENES[name]
-    locked, state0 = fj.from_chain(
+    locked, state0 = fj.paper.from_chain(
         scene["topology"], scene["q0"], scene["v0"], scene["theta1"]
     )
     with warnings.catch_warnings():
@@ -65,7 +65,7 @@ def load(name):
             base_angle=scene["theta1"],
             gravity=scene["g"],
         )
-    x, xd = (np.asarray(a) for a in fj.to_chain(linkage, *state0))
+    x, xd = (np.asarray(a) for a in fj.paper.to_chain(linkage, *state0))
     damping = np.stack([scene["cP"], scene["cR"]], axis=1).reshape(6)
     rates = np.stack([xd[0::2], np.diff(xd[1::2], prepend=0)], axis=1).reshape(6)
     force = np.asarray(scene["F"]) - damping * rates

@@ -24,7 +24,7 @@ def motion(topology, seed=0):
 
 def pins(linkage, q):
     """Returns the two pins as complex numbers, written out."""
-    x, _ = fj.to_chain(linkage, q, np.zeros(3))
+    x, _ = fj.paper.to_chain(linkage, q, np.zeros(3))
     x = np.asarray(x)
     turn = np.exp(1j * np.array([linkage.base_angle, *x[1::2]]))
     start = np.cumsum((np.asarray(linkage.length)[:3] + 1j * x[0::2]) * turn[:3])

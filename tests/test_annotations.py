@@ -45,10 +45,10 @@ def calls(linkage):
         fj.energy: (linkage, q, q, MASSES),
         fj.forward_dynamics: (linkage, q, q, q, MASSES),
         fj.inverse_dynamics: (linkage, q, q, q, MASSES),
-        fj.joint_bias: (linkage, q, q, MASSES),
-        fj.joint_mass_matrix: (linkage, q, MASSES),
+        fj.bias_force: (linkage, q, q, MASSES),
+        fj.mass_matrix: (linkage, q, MASSES),
         fj.link_energies: (linkage, q, q),
-        fj.to_chain: (linkage, q, q),
+        fj.paper.to_chain: (linkage, q, q),
         fj.inverse_kinematics: (linkage, jnp.ones(2), 0.3),
         fj.joint_positions: (linkage, q),
         fj.mass_centers: (linkage, q),
@@ -70,10 +70,10 @@ def calls(linkage):
     if n == 3:
         x = jnp.zeros(6)
         found |= {
-            fj.bias_force: (linkage, x, x),
-            fj.constraint_forces: (linkage, x, x, x),
-            fj.masked_accelerations: (linkage, x, x, x),
-            fj.mass_matrix: (linkage, x),
+            fj.paper.bias_force: (linkage, x, x),
+            fj.paper.constraint_forces: (linkage, x, x, x),
+            fj.paper.masked_accelerations: (linkage, x, x, x),
+            fj.paper.mass_matrix: (linkage, x),
         }
     return found
 
@@ -82,7 +82,10 @@ TASK = fj.CircleTask([0.2, 0.2], 0.05)
 PD = fj.PDController(1.0, 1.0, 1.0, TASK)
 MASSES = (fj.forces.Armature(0.1),)
 # Their arguments are names or lists of the paper's.
-OTHERS = {fj.existence_factors: ("RFPR",), fj.from_chain: ("RR", [0, 0, 0, 0], [0] * 4)}
+OTHERS = {
+    fj.existence_factors: ("RFPR",),
+    fj.paper.from_chain: ("RR", [0, 0, 0, 0], [0] * 4),
+}
 
 
 @pytest.mark.parametrize("linkage", ARMS, ids=["RPR", "PRFR"])

@@ -53,17 +53,17 @@ AT, IN_CHAIN = dict(linkage=LINKAGE, q=ZERO), dict(linkage=LINKAGE, x=CHAIN)
 CALLS = [
     (make, dict(length=[0, 1, 1, 1], com=[[0.5, 0]] * 3, mass=[1] * 3)),
     (make, dict(inertia=[1] * 3, locked=ZERO, base_angle=0.0, gravity=9.81)),
-    (fj.to_chain, AT | dict(qd=ZERO)),
-    (fj.from_chain, dict(topology="RRR", x=CHAIN, xd=CHAIN, base_angle=0.0)),
+    (fj.paper.to_chain, AT | dict(qd=ZERO)),
+    (fj.paper.from_chain, dict(topology="RRR", x=CHAIN, xd=CHAIN, base_angle=0.0)),
     (fj.joint_positions, AT),
     (fj.mass_centers, AT),
     (fj.tip_position, AT),
     (fj.tip_jacobian, AT),
     (fj.inverse_kinematics, dict(linkage=LINKAGE, tip=[1, 1], orientation=0.0)),
-    (fj.mass_matrix, IN_CHAIN),
-    (fj.bias_force, IN_CHAIN | dict(xd=CHAIN)),
-    (fj.masked_accelerations, IN_CHAIN | dict(xd=CHAIN, force=CHAIN)),
-    (fj.constraint_forces, IN_CHAIN | dict(xd=CHAIN, force=CHAIN)),
+    (fj.paper.mass_matrix, IN_CHAIN),
+    (fj.paper.bias_force, IN_CHAIN | dict(xd=CHAIN)),
+    (fj.paper.masked_accelerations, IN_CHAIN | dict(xd=CHAIN, force=CHAIN)),
+    (fj.paper.constraint_forces, IN_CHAIN | dict(xd=CHAIN, force=CHAIN)),
     (fj.forward_dynamics, AT | dict(qd=ZERO, tau=ZERO)),
     (fj.inverse_dynamics, AT | dict(qd=ZERO, qdd=ZERO)),
     (fj.energy, AT | dict(qd=ZERO)),
@@ -162,7 +162,7 @@ def test_negative_values_are_refused(argument):
 )  # fmt: skip
 def test_unknown_topologies_are_refused(topology):
     refused("topology", make, topology)
-    refused("topology", fj.from_chain, topology, CHAIN, CHAIN)
+    refused("topology", fj.paper.from_chain, topology, CHAIN, CHAIN)
     refused("topology", fj.existence_factors, topology)
 
 

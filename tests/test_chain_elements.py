@@ -192,7 +192,7 @@ def test_prescribed_joints_follow_their_reference(case):
         q, q + 1, fj.references.Travel(1.0, profile="harmonic")
     )
     # A fixed pair among the joints is ignored.
-    forces = fj.PrescribedMotion((2, 3), move), fj.JointDamper(case.gain)
+    forces = fj.simulation.PrescribedMotion((2, 3), move), fj.JointDamper(case.gain)
     ts = [0, 0.1, 0.2]
     motion = fj.simulate(chain, fj.State(q, 0 * q), ts, forces, rtol=1e-9)
     assert (np.asarray(motion.q)[:, ~case.real] == 0).all()

@@ -130,7 +130,7 @@ OF_THREE = {
     r"ends\.b\.link: expected 0 .* 1 to 2, got 3": fj.SpringDamper(
         fj.Point(0, 0.1), fj.Point(3, 0.1)
     ),
-    "joints: expected 1 to 2, got 3": fj.PrescribedMotion(3, HOLD),
+    "joints: expected 1 to 2, got 3": fj.simulation.PrescribedMotion(3, HOLD),
     "model: expected the arm's own topology": fj.control.GravityFeedforward(
         *(1, 1, 1, HOLD), chains.random_chain("RRR", RNG)
     ),

@@ -66,7 +66,7 @@ def test_nearly_equal_rates_keep_their_digits(n):
     # Only differences of the links' rates load the ground.
     loads = [float(x) for x in bias]
     assert abs(loads[0]) < 1e-10 * abs(loads[1])
-    np.testing.assert_allclose(fj.joint_bias(arm, q, qd), loads, rtol=1e-12)
+    np.testing.assert_allclose(fj.bias_force(arm, q, qd), loads, rtol=1e-12)
 
 
 @pytest.mark.parametrize("n", [2, 5])

@@ -33,8 +33,8 @@ def everything(chain, q, qd, tau):
     return dict(
         qdd=qdd,
         tau=fj.inverse_dynamics(chain, q, qd, qdd),
-        bias=fj.joint_bias(chain, q, qd),
-        matrix=fj.joint_mass_matrix(chain, q),
+        bias=fj.bias_force(chain, q, qd),
+        matrix=fj.mass_matrix(chain, q),
         energy=fj.energy(chain, q, qd),
         centers=fj.mass_centers(chain, q),
         tip=fj.tip_position(chain, q),
@@ -221,7 +221,7 @@ def test_topologies_refused(topology, words):
 def test_the_papers_equations_are_for_three_pairs():
     chain = chains.random_chain("RR", np.random.default_rng(4))
     with pytest.raises(ValueError, match="^linkage: expected three pairs"):
-        fj.mass_matrix(chain, np.zeros(6))
+        fj.paper.mass_matrix(chain, np.zeros(6))
 
 
 def test_the_papers_equations_hold_with_fixed_pairs():
@@ -236,14 +236,14 @@ def test_the_papers_equations_hold_with_fixed_pairs():
     @jax.jit
     @jax.vmap
     def both(arm, q, qd, tau):
-        x, xd = fj.to_chain(arm, q, qd)
+        x, xd = fj.paper.to_chain(arm, q, qd)
         force = jnp.repeat(tau, 2)  # those of fictitious joints have no effect
-        xdd = fj.masked_accelerations(arm, x, xd, force)
-        held = fj.constraint_forces(arm, x, xd, force)
-        balance = fj.mass_matrix(arm, x) @ xdd - fj.bias_force(arm, x, xd)
+        xdd = fj.paper.masked_accelerations(arm, x, xd, force)
+        held = fj.paper.constraint_forces(arm, x, xd, force)
+        balance = fj.paper.mass_matrix(arm, x) @ xdd - fj.paper.bias_force(arm, x, xd)
         total = (force + held).at[1:5:2].add(-(force + held)[3::2])
         reduced = fj.forward_dynamics(arm, q, qd, tau)
-        return xdd, fj.to_chain(arm, q, reduced)[1], balance, total
+        return xdd, fj.paper.to_chain(arm, q, reduced)[1], balance, total
 
     masked, reduced, balance, total = both(batch, q, qd, tau)
     np.testing.assert_allclose(masked, reduced, rtol=1e-10, atol=1e-10)

@@ -28,7 +28,7 @@ def arm(topology, **changes):
 def circle_of(linkage, **changes):
     """Returns a circle around a bent posture's tip, reachable for its topology."""
     q = [0.8, 1.5, 0.4]
-    x, _ = fj.to_chain(linkage, q, [0, 0, 0])
+    x, _ = fj.paper.to_chain(linkage, q, [0, 0, 0])
     task = dict(
         center=fj.tip_position(linkage, q),
         radius=0.1,
@@ -55,7 +55,7 @@ def commanded(task, t):
 @partial(jax.vmap, in_axes=(None, 0, 0))
 def tip_motion(linkage, q, qd):
     """Returns the tip, its velocity and rotation, and the last link's angle."""
-    x, _ = fj.to_chain(linkage, q, qd)
+    x, _ = fj.paper.to_chain(linkage, q, qd)
     return fj.tip_position(linkage, q), fj.tip_jacobian(linkage, q) @ qd, x[5]
 
 

@@ -14,11 +14,11 @@ from fdof_jax import drawing, plotting, scenes
 ROOT = Path(__file__).parents[1]
 
 ROOMS = [
-    fj.analysis, fj.control, fj.data, fj.forces, fj.identification, fj.references,
-    fj.tuning,
+    fj.analysis, fj.control, fj.data, fj.forces, fj.identification, fj.paper,
+    fj.references, fj.simulation, fj.tuning,
 ]  # fmt: skip
 PUBLIC = {
-    name: value
+    f"paper.{name}" if module is fj.paper else name: value
     for module in (fj, *ROOMS, scenes)
     for name in dir(module)
     if callable(value := getattr(module, name))
@@ -32,10 +32,12 @@ UNITLESS = {
 }  # fmt: skip
 # Names that implement something printed in the paper.
 SOURCES = {
+    "paper.mass_matrix": "(8)-(13)",
+    "paper.bias_force": "(14)",
+    "paper.masked_accelerations": "(17)-(27)",
+    "paper.constraint_forces": "(16)-(26)",
     "mass_matrix": "(8)-(13)",
     "bias_force": "(14)",
-    "masked_accelerations": "(17)-(27)",
-    "constraint_forces": "(16)-(26)",
     "forward_dynamics": "(17)-(27)",
     "inverse_dynamics": "(14)",
     "energy": "(6) and (7)",
@@ -63,13 +65,18 @@ def test_docstring(name):
 
 
 def test_the_front_door_is_complete():
-    names = """TOPOLOGIES existence_factors Linkage State to_chain from_chain
-    mass_matrix bias_force masked_accelerations constraint_forces forward_dynamics
-    inverse_dynamics
-    energy link_energies joint_positions mass_centers tip_position tip_jacobian
-    inverse_kinematics JointDamper JointEffort PDController CircleTask simulate Solution
-    joint_efforts to_mjcf Scene scenes tune TuneResult __version__""".split()
+    names = """configure TOPOLOGIES existence_factors Linkage State Scene Solution
+    scenes joint_positions mass_centers tip_position tip_jacobian inverse_kinematics
+    forward_dynamics inverse_dynamics mass_matrix bias_force energy link_energies
+    Element JointDamper JointEffort PDController CircleTask TipTask Point SpringDamper
+    Wrench LinearActuator simulate sweep step simulate_sampled joint_efforts
+    joint_reactions linearize tune TuneResult fit FitResult save load to_mjcf from_mjcf
+    to_pandas to_xarray paper forces control references analysis tuning identification
+    drawing plotting interactive data""".split()
     assert not [name for name in names if not hasattr(fj, name)]
+    equations = """mass_matrix bias_force masked_accelerations constraint_forces
+    to_chain from_chain""".split()
+    assert sorted(equations) == fj.paper.__all__
 
 
 # Every name that a user may import, with its module unless that is `fdof_jax`.
@@ -79,7 +86,7 @@ NAMES = [
         f"{room.__name__.removeprefix('fdof_jax.')}.{name}"
         for room in ROOMS
         for name in room.__all__
-        if name not in fj.__all__
+        if getattr(fj, name, None) is not getattr(room, name)
     ),
     *(
         f"scenes.{name}"
@@ -157,6 +164,9 @@ def test_names_in_guides_become_links():
     for code, name in [
         ("tune", "tune"),
         ("fj.tuning.tune_each(scenes)", "tuning.tune_each"),
+        ("mass_matrix", "mass_matrix"),
+        ("paper.mass_matrix", "paper.mass_matrix"),
+        ("fj.tuning.tune", "tune"),
         ("Solution.outcome", "Solution"),
         ("diffrax.PIDController", None),
         ("Path(file).write_text(html)", None),

@@ -127,7 +127,7 @@ def compiled_programs():
     for reference in references().values():
         forces = (
             fj.PDController(10.0, 1.0, np.inf, reference),
-            fj.PrescribedMotion((1, 3), reference),
+            fj.simulation.PrescribedMotion((1, 3), reference),
         )
         check_elements(forces, arm, times)
         agrees(forces, 0.0, START, arm)

@@ -25,7 +25,7 @@ def draw(case):
 
 
 @jax.jit
-def joint_mass_matrix(linkage, q):
+def projected(linkage, q):
     """Returns the reduced mass matrix, column by column from inverse dynamics."""
     at_rest = jnp.zeros(3)
     return jax.jacfwd(lambda a: fj.inverse_dynamics(linkage, q, at_rest, a))(at_rest)
@@ -33,7 +33,7 @@ def joint_mass_matrix(linkage, q):
 
 @jax.jit
 def chain_slopes(linkage, q, qd):
-    return jax.jacfwd(lambda q: fj.to_chain(linkage, q, qd)[0])(q)
+    return jax.jacfwd(lambda q: fj.paper.to_chain(linkage, q, qd)[0])(q)
 
 
 @jax.jit
@@ -51,10 +51,10 @@ def scatter(linkage, values):
 @identities
 def test_mass_matrices_are_symmetric_and_positive(case):
     linkage, q, qd, _, rng = draw(case)
-    x, _ = fj.to_chain(linkage, q, qd)
-    M = np.asarray(fj.mass_matrix(linkage, x))
+    x, _ = fj.paper.to_chain(linkage, q, qd)
+    M = np.asarray(fj.paper.mass_matrix(linkage, x))
     np.testing.assert_array_equal(M, M.T)
-    reduced = np.asarray(fj.joint_mass_matrix(linkage, q))
+    reduced = np.asarray(fj.mass_matrix(linkage, q))
     np.testing.assert_array_equal(reduced, reduced.T)
     assert np.linalg.eigvalsh(reduced).min() > 0
 
@@ -63,10 +63,10 @@ def test_mass_matrices_are_symmetric_and_positive(case):
 @identities
 def test_reduced_mass_matrix_is_the_projected_one(case):
     linkage, q, qd, _, _ = draw(case)
-    x, _ = fj.to_chain(linkage, q, qd)
+    x, _ = fj.paper.to_chain(linkage, q, qd)
     S = np.asarray(chain_slopes(linkage, q, qd))
-    full = np.asarray(fj.mass_matrix(linkage, x))
-    for reduced in (joint_mass_matrix(linkage, q), fj.joint_mass_matrix(linkage, q)):
+    full = np.asarray(fj.paper.mass_matrix(linkage, x))
+    for reduced in (projected(linkage, q), fj.mass_matrix(linkage, q)):
         np.testing.assert_allclose(reduced, S.T @ full @ S, atol=1e-12)
 
 
@@ -74,9 +74,9 @@ def test_reduced_mass_matrix_is_the_projected_one(case):
 @identities
 def test_kinetic_energy_is_that_of_the_mass_matrix(case):
     linkage, q, qd, _, _ = draw(case)
-    x, xd = map(np.asarray, fj.to_chain(linkage, q, qd))
+    x, xd = map(np.asarray, fj.paper.to_chain(linkage, q, qd))
     kinetic, _ = fj.energy(linkage, q, qd)
-    full = xd @ np.asarray(fj.mass_matrix(linkage, x)) @ xd / 2
+    full = xd @ np.asarray(fj.paper.mass_matrix(linkage, x)) @ xd / 2
     np.testing.assert_allclose(full, kinetic, rtol=1e-12, atol=1e-13)
 
 
@@ -84,11 +84,11 @@ def test_kinetic_energy_is_that_of_the_mass_matrix(case):
 @identities
 def test_masked_equals_reduced(case):
     linkage, q, qd, tau, _ = draw(case)
-    x, xd = fj.to_chain(linkage, q, qd)
-    masked = fj.masked_accelerations(linkage, x, xd, scatter(linkage, tau))
+    x, xd = fj.paper.to_chain(linkage, q, qd)
+    masked = fj.paper.masked_accelerations(linkage, x, xd, scatter(linkage, tau))
     qdd = fj.forward_dynamics(linkage, q, qd, tau)
     # Joint to chain accelerations is linear, with the same map as the rates.
-    _, expected = fj.to_chain(linkage, q, qdd)
+    _, expected = fj.paper.to_chain(linkage, q, qdd)
     scale = 1 + np.abs(expected).max()
     np.testing.assert_allclose(masked, expected, atol=1e-11 * scale)
 
@@ -117,14 +117,14 @@ def test_power_balance(case):
 def test_constraint_forces_close_the_balance_of_the_chain(case):
     """With constraint forces, (15) gives the same accelerations without masks."""
     linkage, q, qd, tau, rng = draw(case)
-    x, xd = fj.to_chain(linkage, q, qd)
+    x, xd = fj.paper.to_chain(linkage, q, qd)
     force = rng.normal(size=6)
-    xdd = fj.masked_accelerations(linkage, x, xd, force)
-    total = force + np.asarray(fj.constraint_forces(linkage, x, xd, force))
+    xdd = fj.paper.masked_accelerations(linkage, x, xd, force)
+    total = force + np.asarray(fj.paper.constraint_forces(linkage, x, xd, force))
     generalised = total.copy()
     generalised[1:5:2] -= total[3::2]
-    inertial = np.asarray(fj.mass_matrix(linkage, x)) @ np.asarray(xdd)
-    balance = inertial - np.asarray(fj.bias_force(linkage, x, xd))
+    inertial = np.asarray(fj.paper.mass_matrix(linkage, x)) @ np.asarray(xdd)
+    balance = inertial - np.asarray(fj.paper.bias_force(linkage, x, xd))
     np.testing.assert_allclose(balance, generalised, rtol=1e-9, atol=1e-9)
 
 
@@ -164,9 +164,9 @@ def test_mass_matrix_and_bias_are_those_of_the_accelerations():
         arm = elements.arm(topology)
         forces = tuple(elements.WITH_INERTIA.values())
         q, qd, tau = rng.uniform(-1, 1, (3, 3))
-        matrix = np.asarray(fj.joint_mass_matrix(arm, q, forces))
+        matrix = np.asarray(fj.mass_matrix(arm, q, forces))
         qdd = fj.forward_dynamics(arm, q, qd, tau, forces)
-        bias = fj.joint_bias(arm, q, qd, forces)
+        bias = fj.bias_force(arm, q, qd, forces)
         np.testing.assert_allclose(matrix @ qdd + bias, tau, atol=1e-11)
         np.testing.assert_array_equal(matrix, matrix.T)
         assert np.linalg.eigvalsh(matrix).min() > 0

@@ -142,7 +142,14 @@ def test_jumps_are_passed_on():
     pd = fj.PDController(1.0, 1.0, 1.0, move)
     path = fj.TipTask(fj.references.Line([1, 0], [1, 1]), travel)
     drive = fj.control.FirstOrderLag(pd, 0.1)
-    for part in (travel, move, path, pd, drive, fj.PrescribedMotion(1, move)):
+    for part in (
+        travel,
+        move,
+        path,
+        pd,
+        drive,
+        fj.simulation.PrescribedMotion(1, move),
+    ):
         np.testing.assert_array_equal(part.jump_ts, [1, 3])
     assert PD.jump_ts is None and fj.JointDamper(1.0).jump_ts is None
 

@@ -135,5 +135,5 @@ def test_a_payload_is_a_point_mass_at_the_tip():
     q = np.array([0.3, -0.7, 1.1])
     jacobian = np.asarray(fj.tip_jacobian(arm, q))[:2]
     loaded = fj.tuning.with_payload(arm, 1.5)
-    more = fj.joint_mass_matrix(loaded, q) - fj.joint_mass_matrix(arm, q)
+    more = fj.mass_matrix(loaded, q) - fj.mass_matrix(arm, q)
     np.testing.assert_allclose(more, 1.5 * jacobian.T @ jacobian, atol=1e-14)

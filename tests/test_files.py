@@ -160,7 +160,7 @@ TREES = {
         "RPFRRPFR", length=[1] * 9, com=[[1, 0]] * 8, mass=[1] * 8, inertia=[1] * 8
     ),
     **{name: (element,) for name, element in elements.ALL.items()},
-    "prescribed": fj.PrescribedMotion((1, 3), MOVE),
+    "prescribed": fj.simulation.PrescribedMotion((1, 3), MOVE),
     "model": fj.control.GravityFeedforward(1, 1, np.inf, fj.CircleTask(), ARM),
     **{
         name: fj.TipTask(curve, fj.references.Laps(2.0), orientation=None)

@@ -22,7 +22,7 @@ assert not jax.config.jax_enable_x64
 ordinary = [name for name in SCENES if not name.startswith("hard")]
 for name in ordinary:
     scene, r = SCENES[name], load(name)
-    masked = fj.masked_accelerations(r.linkage, r.x, r.xd, r.force)
+    masked = fj.paper.masked_accelerations(r.linkage, r.x, r.xd, r.force)
     assert masked.dtype == np.float32
     assert relative_error(masked, scene["acc0"]) <= 1e-5, name
     exact = to_joint(scene, [float(a) for a in scene["acc0_str"]])
@@ -35,7 +35,7 @@ for name in ordinary:
         # A step ends at the last time only; states before are interpolated.
         exact = name.startswith("fig") and i == len(times)
         bound = 1e-5 if exact else 1e-4
-        x, xd = fj.to_chain(r.linkage, solution.q[i], solution.qd[i])
+        x, xd = fj.paper.to_chain(r.linkage, solution.q[i], solution.qd[i])
         assert relative_error(x, state["q"]) <= bound, (name, state["t"])
         assert relative_error(xd, state["v"]) <= bound, (name, state["t"])
 

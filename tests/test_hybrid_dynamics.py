@@ -56,7 +56,9 @@ def pendulum(angle, rate, acceleration, ts):
 
 @pytest.mark.parametrize("acceleration", [0.0, 4.0])
 def test_a_pendulum_on_a_cart_that_accelerates(acceleration):
-    moving = fj.PrescribedMotion((1, 3), Push(jnp.array(0.0), jnp.array(acceleration)))
+    moving = fj.simulation.PrescribedMotion(
+        (1, 3), Push(jnp.array(0.0), jnp.array(acceleration))
+    )
     ts = np.linspace(0, 3, 13)
     solution = fj.simulate(CART, fj.State([0, 0.7, 0], np.zeros(3)), ts, (moving,))
     angle, rate = pendulum(0.7, 0.0, acceleration, ts)
@@ -68,7 +70,9 @@ def test_a_pendulum_on_a_cart_that_accelerates(acceleration):
 
 def test_a_jump_of_the_velocity_is_a_blow():
     """Checks that the pendulum's momentum about its pivot does not change."""
-    moving = fj.PrescribedMotion((1, 3), Push(jnp.array(0.6), jnp.array(0.0)))
+    moving = fj.simulation.PrescribedMotion(
+        (1, 3), Push(jnp.array(0.6), jnp.array(0.0))
+    )
     ts = np.linspace(0, 1, 6)
     start = fj.State([0, 0.4, 0], [0, 0.2, 0])
     solution = fj.simulate(CART, start, ts, (moving,))
@@ -100,7 +104,7 @@ def swinging(topology, joints, forces=()):
     rng, n = np.random.default_rng(3), len(topology)
     linkage = random_linkage(topology, rng) if n == 3 else random_chain(topology, rng)
     swing = Swing(jnp.array([0.3, 0.2, 0.4])) if n == 3 else Sway(AMPLITUDE)
-    motion = fj.PrescribedMotion(joints, swing)
+    motion = fj.simulation.PrescribedMotion(joints, swing)
     q, qd = motion.reference(0.0, linkage)
     effort = fj.JointEffort([1.0, -2.0, 0.7][:n])
     forces = (motion, fj.JointDamper(0.5), effort, *forces)
@@ -145,7 +149,7 @@ def test_a_motion_prescribed_as_it_is_takes_no_effort():
         inertia=[1, 1, 1], gravity=G,
     )  # fmt: skip
     # Its rail is upright.
-    motion = fj.PrescribedMotion(1, Push(jnp.array(0.0), jnp.array(-G)))
+    motion = fj.simulation.PrescribedMotion(1, Push(jnp.array(0.0), jnp.array(-G)))
     ts = np.linspace(0, 1, 5)
     start = fj.State([0, 0.3, 0.2], np.zeros(3))
     bound = fj.simulate(falling, start, ts, (motion,))
@@ -163,7 +167,7 @@ def test_a_motion_prescribed_as_it_is_takes_no_effort():
 
 def test_starts_beside_the_reference_and_singular_equations_are_told():
     hold = Push(jnp.array(0.0), jnp.array(0.0))
-    motion = fj.PrescribedMotion((1, 3), hold)
+    motion = fj.simulation.PrescribedMotion((1, 3), hold)
     starts = fj.State(np.array([[0.0, 0.1, 0], [0.2, 0.1, 0]]), np.zeros((2, 3)))
     with pytest.raises(ValueError, match="state0.q: expected"):
         fj.simulate(CART, fj.State(starts.q[1], np.zeros(3)), [0, 1], (motion,))
@@ -176,7 +180,7 @@ def test_starts_beside_the_reference_and_singular_equations_are_told():
         "PRR", length=[0, 0, 1, 1], com=[[0, 0], [0.5, 0], [1, 0]], mass=[1, 1, 1e12],
         inertia=[1, 0.1, 0], gravity=0,
     )  # fmt: skip
-    moving = fj.PrescribedMotion(1, hold)
+    moving = fj.simulation.PrescribedMotion(1, hold)
     start = fj.State(np.array([0, 0.3, 0.0]), np.zeros(3))
     ended = fj.simulate(heavy, start, [0, 0.1], (moving,), throw=False)
     assert str(ended.outcome) == "ill-conditioned"
@@ -193,7 +197,7 @@ def test_gradients_equal_differences():
         reference = Sway(AMPLITUDE * p[0])
         q, qd = reference(0.0, linkage)
         state0 = fj.State(jnp.where(motion.of(linkage), q, start.q), start.qd)
-        forces = fj.PrescribedMotion(1, reference), fj.JointDamper(p[1])
+        forces = fj.simulation.PrescribedMotion(1, reference), fj.JointDamper(p[1])
         return weights @ fj.simulate(linkage, state0, [0, 0.5], forces).q[-1]
 
     p = jnp.array([1.0, 0.5])
@@ -220,7 +224,7 @@ def test_topologies_are_batched():
 def residual(travel, stroke=0.05):
     """Returns the load's swing after the travel, divided by the stroke."""
     move = fj.references.JointMove(np.zeros(3), [stroke, 0, 0], travel)
-    motion = fj.PrescribedMotion((1, 3), move)
+    motion = fj.simulation.PrescribedMotion((1, 3), move)
     ts = np.append(0.0, travel.duration + np.linspace(0.01, 2.5, 200))
     swing = fj.simulate(CART, REST, ts, (motion,)).q[1:, 1]
     reach = ROTOR / (MASS * LENGTH)  # of the equivalent simple pendulum
@@ -239,18 +243,20 @@ def test_malformed_motions_are_refused():
     hold = Push(jnp.array(0.0), jnp.array(0.0))
     for joints in (0, 9, (1, 0), 1.0, (), [1, 2.0], True):
         with pytest.raises(ValueError, match="joints: expected"):
-            fj.PrescribedMotion(joints, hold)
+            fj.simulation.PrescribedMotion(joints, hold)
     with pytest.raises(ValueError, match="reference: expected a callable"):
-        fj.PrescribedMotion(1, 3.0)
-    motion = fj.PrescribedMotion(4, hold)
+        fj.simulation.PrescribedMotion(1, 3.0)
+    motion = fj.simulation.PrescribedMotion(4, hold)
     with pytest.raises(ValueError, match=r"joints: expected 1 to 3, got 4"):
         fj.simulate(CART, REST, [0, 1], (motion,))
-    motion = fj.PrescribedMotion(1, lambda t, linkage: (jnp.zeros(2), jnp.zeros(2)))
+    motion = fj.simulation.PrescribedMotion(
+        1, lambda t, linkage: (jnp.zeros(2), jnp.zeros(2))
+    )
     with pytest.raises(
         ValueError, match=r"^forces\[0\]\.reference: expected an array of 3"
     ):
         fj.simulate(CART, REST, [0, 1], (motion,))
-    motion = fj.PrescribedMotion(1, hold)
+    motion = fj.simulation.PrescribedMotion(1, hold)
     with pytest.raises(ValueError, match="forces: expected one PrescribedMotion"):
         fj.simulate(CART, REST, [0, 1], (motion, motion))
     with pytest.raises(ValueError, match=r"state0\.q: expected \[0.0, .*prescribed"):

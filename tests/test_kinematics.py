@@ -37,7 +37,7 @@ def samples(topology, seed=0):
 @jax.jit
 def pose(linkage, q):
     """Returns the tip and the orientation, (3,)."""
-    x, _ = fj.to_chain(linkage, q, jnp.zeros(3))
+    x, _ = fj.paper.to_chain(linkage, q, jnp.zeros(3))
     return jnp.append(fj.tip_position(linkage, q), x[5])
 
 
@@ -98,7 +98,7 @@ def test_mass_center_velocities_are_the_rates_of_mass_centers(topology):
     velocity, rate = jax.vmap(mass_center_velocities)(linkages, q, qd)
 
     def positions(linkage, q):
-        x, _ = fj.to_chain(linkage, q, jnp.zeros(3))
+        x, _ = fj.paper.to_chain(linkage, q, jnp.zeros(3))
         return fj.mass_centers(linkage, q), x[1::2]
 
     rates = jax.vmap(lambda k, q, qd: jax.jvp(lambda q: positions(k, q), (q,), (qd,)))

@@ -37,7 +37,7 @@ def test_the_circle_is_reachable_from_where_the_arm_is(topology):
 
 
 def test_all_start_alike():
-    chains = [fj.to_chain(s.linkage, *s.state0)[0] for s in SCENES.values()]
+    chains = [fj.paper.to_chain(s.linkage, *s.state0)[0] for s in SCENES.values()]
     np.testing.assert_allclose(chains, np.tile(chains[0], (7, 1)), atol=1e-14)
     tips = [fj.tip_position(s.linkage, s.state0.q) for s in SCENES.values()]
     np.testing.assert_allclose(tips, np.tile(tips[0], (7, 1)), atol=1e-12)

@@ -207,7 +207,7 @@ def test_nine_combinations_of_the_parameters_of_an_rpr_arm_are_identified():
     "element",
     [
         fj.control.FirstOrderLag(fj.JointEffort(np.ones(3)), 0.1),
-        fj.PrescribedMotion(1, Hold(jnp.zeros(3))),
+        fj.simulation.PrescribedMotion(1, Hold(jnp.zeros(3))),
     ],
     ids=["state", "prescribed"],
 )

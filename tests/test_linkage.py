@@ -101,7 +101,7 @@ def test_chain_coordinates_written_out(topology):
     rng = np.random.default_rng(1)
     linkage = random_linkage(topology, rng)
     q, qd = rng.normal(size=(2, 3))
-    x, xd = fj.to_chain(linkage, q, qd)
+    x, xd = fj.paper.to_chain(linkage, q, qd)
     angle, rate = float(linkage.base_angle), 0.0
     for k, joint in enumerate(topology):
         slide, slide_rate = float(linkage.locked[k]), 0.0
@@ -122,9 +122,9 @@ def test_from_chain_inverts_to_chain(topology):
     for _ in range(5):
         linkage = random_linkage(topology, rng)
         q, qd = 10 * rng.normal(size=(2, 3))
-        x, xd = fj.to_chain(linkage, q, qd)
+        x, xd = fj.paper.to_chain(linkage, q, qd)
         for given in (topology, linkage.ef):
-            locked, state = fj.from_chain(given, x, xd, linkage.base_angle)
+            locked, state = fj.paper.from_chain(given, x, xd, linkage.base_angle)
             np.testing.assert_allclose(locked, linkage.locked, atol=1e-13)
             np.testing.assert_allclose(state.q, q, atol=1e-13)
             np.testing.assert_allclose(state.qd, qd, atol=1e-13)
@@ -135,7 +135,7 @@ def test_from_chain_inverts_to_chain(topology):
 def test_from_chain_refuses_velocities_of_locked_joints(topology, moving):
     rng = np.random.default_rng(3)
     linkage = random_linkage(topology, rng)
-    x, xd = fj.to_chain(linkage, rng.normal(size=3), rng.normal(size=3))
+    x, xd = fj.paper.to_chain(linkage, rng.normal(size=3), rng.normal(size=3))
     xd = np.array(xd)
     if topology[moving] == "R":
         xd[2 * moving] = 1e-6
@@ -144,15 +144,15 @@ def test_from_chain_refuses_velocities_of_locked_joints(topology, moving):
         xd[2 * moving + 1 :: 2] += 1e-6  # this and all later links turn on
         name = f"th{moving + 2} rate"
     with pytest.raises(ValueError, match=rf"^xd: expected {name}.*, got .*1e-06"):
-        fj.from_chain(topology, x, xd, linkage.base_angle)
+        fj.paper.from_chain(topology, x, xd, linkage.base_angle)
 
 
 def test_from_chain_can_be_traced():
     linkage = make("RPR")
-    x, xd = fj.to_chain(linkage, [0.1, 0.2, 0.3], [0.4, 0.5, 0.6])
-    states = jax.vmap(lambda ef, xd: fj.from_chain(ef, x, xd, linkage.base_angle))(
-        jnp.stack([linkage.ef] * 2), jnp.stack([xd, 2 * xd])
-    )[1]
+    x, xd = fj.paper.to_chain(linkage, [0.1, 0.2, 0.3], [0.4, 0.5, 0.6])
+    states = jax.vmap(
+        lambda ef, xd: fj.paper.from_chain(ef, x, xd, linkage.base_angle)
+    )(jnp.stack([linkage.ef] * 2), jnp.stack([xd, 2 * xd]))[1]
     np.testing.assert_allclose(states.q, [[0.1, 0.2, 0.3]] * 2)
     np.testing.assert_allclose(states.qd, [[0.4, 0.5, 0.6], [0.8, 1.0, 1.2]])
 

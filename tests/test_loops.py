@@ -179,7 +179,7 @@ def test_an_integral_of_a_fixed_pair_within_a_drive_is_no_state(gains, speed):
     slow = fj.control.FirstOrderLag(controller, 0.002)
     loop = open_loop(longer, q, slow, joint=1)
     assert loop.A.shape == (4, 4) and loop.feedback().poles().real.max() < 0
-    inertia = float(fj.joint_mass_matrix(longer, q)[0, 0])
+    inertia = float(fj.mass_matrix(longer, q)[0, 0])
     fall = float(fj.analysis.holding_efforts(longer, q + [1e-6, 0])[0])
     fall = (fall - float(fj.analysis.holding_efforts(longer, q - [1e-6, 0])[0])) / 2e-6
     s = 1j * np.geomspace(0.1, 1000, 9)
@@ -304,7 +304,12 @@ def test_loops_of_malformed_arguments_are_refused():
         (pd, 3, (), r"joint: expected one of \(1, 2\), got 3"),
         (pd, 1, (fj.control.FirstOrderLag(pd, 0.1),), "forces: expected elements"),
         (3.0, 1, (), "controller: expected a force element"),
-        (fj.PrescribedMotion(1, pd.reference), 1, (), "controller: expected one that"),
+        (
+            fj.simulation.PrescribedMotion(1, pd.reference),
+            1,
+            (),
+            "controller: expected one that",
+        ),
     ]:
         with pytest.raises(ValueError, match=message):
             open_loop(linkage, q, controller, joint, forces)

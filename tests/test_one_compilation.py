@@ -20,7 +20,7 @@ START = np.array([0.1, 0.7, 0.3, 1.5, 0.2, 2.2])
 
 
 def linkage_and_state(topology):
-    locked, state = fj.from_chain(topology, START, np.zeros(6), base_angle=0.2)
+    locked, state = fj.paper.from_chain(topology, START, np.zeros(6), base_angle=0.2)
     linkage = fj.Linkage(
         topology,
         length=[0.1, 1.0, 0.8, 0.5],
@@ -36,7 +36,7 @@ def linkage_and_state(topology):
 def circle(linkage, state):
     """Returns a small circle around the tip's start, on the start's assembly."""
     tip = np.asarray(fj.tip_position(linkage, state.q))
-    orientation = float(fj.to_chain(linkage, state.q, np.zeros(3))[0][5])
+    orientation = float(fj.paper.to_chain(linkage, state.q, np.zeros(3))[0][5])
     for branch in (1, -1):
         q = fj.inverse_kinematics(linkage, tip, orientation, branch=branch)
         if np.abs(q - state.q).max() < 1e-9:

@@ -61,7 +61,7 @@ def energy_rates(element, q, qd, qdd, linkage):
 def test_a_point_lies_where_the_links_are(topology, link):
     linkage, q, _ = motion(topology)
     point = fj.Point(link, 0.3, -0.2)
-    x, _ = fj.to_chain(linkage, q, np.zeros(3))
+    x, _ = fj.paper.to_chain(linkage, q, np.zeros(3))
     angle = [linkage.base_angle, *x[1::2]][link]
     start = [np.zeros(2), *fj.joint_positions(linkage, q)][link]
     along = np.array([np.cos(angle), np.sin(angle)])
@@ -77,7 +77,7 @@ def test_a_wrench_does_the_power_of_force_and_moment(topology, follows):
     wrench = fj.Wrench(tip, [3.0, -2.0], 1.5, follows=follows)
     force = np.array([3.0, -2.0])
     if follows:
-        angle = fj.to_chain(linkage, q, qd)[0][5]
+        angle = fj.paper.to_chain(linkage, q, qd)[0][5]
         turn = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
         force = np.array(turn) @ force
     exact = np.asarray(fj.tip_jacobian(linkage, q)).T @ [*force, 1.5]

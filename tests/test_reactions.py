@@ -65,7 +65,7 @@ def test_each_link_is_in_balance(topology):
     forces = SPRING, ACROSS, PUSH, *JOINTS
     reactions, qdd = instant(linkage, q, qd, forces)
     accelerations = second(lambda q: fj.mass_centers(linkage, q), q, qd, qdd)
-    angle = lambda q: fj.to_chain(linkage, q, jnp.zeros(3))[0][1::2]
+    angle = lambda q: fj.paper.to_chain(linkage, q, jnp.zeros(3))[0][1::2]
     spins = second(angle, q, qd, qdd)
     centers = np.asarray(fj.mass_centers(linkage, q))
     starts = np.asarray(fj.joint_positions(linkage, q))
@@ -95,7 +95,7 @@ def test_the_free_component_is_the_joint_s_effort(topology):
     linkage, q, qd = motion(topology)
     forces = SPRING, ACTUATOR, fj.forces.Armature(0.3), *JOINTS
     reactions, qdd = instant(linkage, q, qd, forces)
-    x, _ = fj.to_chain(linkage, q, qd)
+    x, _ = fj.paper.to_chain(linkage, q, qd)
     before = np.array([linkage.base_angle, *x[1:5:2]])
     across = np.stack([-np.sin(before), np.cos(before)], axis=1)
     slide = np.sum(across * reactions[:, :2], axis=1)
@@ -108,12 +108,12 @@ def test_the_free_component_is_the_joint_s_effort(topology):
 def test_fictitious_components_are_the_paper_s_constraint_forces(topology):
     linkage, q, qd = motion(topology)
     reactions, _ = instant(linkage, q, qd, JOINTS)
-    x, xd = fj.to_chain(linkage, q, qd)
+    x, xd = fj.paper.to_chain(linkage, q, qd)
     effort = sum(e(0.0, q, qd, linkage) for e in JOINTS)
     force = np.zeros(6)
     real = np.asarray(linkage.ef) > 0.5
     force[real] = effort
-    exact = np.asarray(fj.constraint_forces(linkage, x, xd, force))
+    exact = np.asarray(fj.paper.constraint_forces(linkage, x, xd, force))
     before = np.array([linkage.base_angle, *x[1:5:2]])
     across = np.stack([-np.sin(before), np.cos(before)], axis=1)
     found = np.stack([np.sum(across * reactions[:, :2], axis=1), reactions[:, 2]], 1)

@@ -21,7 +21,7 @@ def bound(name):
 @pytest.mark.parametrize("name", ALL)
 def test_accelerations(name):
     scene, r = SCENES[name], load(name)
-    masked = fj.masked_accelerations(r.linkage, r.x, r.xd, r.force)
+    masked = fj.paper.masked_accelerations(r.linkage, r.x, r.xd, r.force)
     assert relative_error(masked, scene["acc0"]) <= bound(name)
     reduced = fj.forward_dynamics(r.linkage, *r.state0, r.tau)
     # Exact accelerations are subtracted, as the printed doubles would cancel.
@@ -32,7 +32,7 @@ def test_accelerations(name):
 @pytest.mark.parametrize("name", ALL)
 def test_constraint_forces(name):
     scene, r = SCENES[name], load(name)
-    constraint = fj.constraint_forces(r.linkage, r.x, r.xd, r.force)
+    constraint = fj.paper.constraint_forces(r.linkage, r.x, r.xd, r.force)
     assert relative_error(constraint, scene["con0"]) <= bound(name)
     assert (real_part(scene, constraint) == 0).all()
 
@@ -59,7 +59,7 @@ def solve(name, rtol=1e-12, atol=1e-12):
             diffrax.PIDController(rtol=rtol, atol=atol), step_ts=np.array(times)
         ),
     )
-    chain = jax.vmap(fj.to_chain, in_axes=(None, 0, 0))
+    chain = jax.vmap(fj.paper.to_chain, in_axes=(None, 0, 0))
     x, xd = chain(r.linkage, solution.q, solution.qd)
     energies = jax.vmap(fj.energy, in_axes=(None, 0, 0))
     return x[1:], xd[1:], sum(energies(r.linkage, solution.q, solution.qd))[1:]
@@ -92,12 +92,12 @@ def test_efforts_on_fictitious_joints_have_no_effect(name):
     fictitious = np.asarray(r.linkage.ef) == 0
     with_junk = np.where(fictitious, 1e30, r.force)
     np.testing.assert_array_equal(
-        fj.masked_accelerations(r.linkage, r.x, r.xd, with_junk),
-        fj.masked_accelerations(r.linkage, r.x, r.xd, r.force),
+        fj.paper.masked_accelerations(r.linkage, r.x, r.xd, with_junk),
+        fj.paper.masked_accelerations(r.linkage, r.x, r.xd, r.force),
     )
     shifted = np.where(fictitious, r.force + 7.0, r.force)
     np.testing.assert_allclose(
-        fj.constraint_forces(r.linkage, r.x, r.xd, shifted),
-        fj.constraint_forces(r.linkage, r.x, r.xd, r.force) - 7.0 * fictitious,
+        fj.paper.constraint_forces(r.linkage, r.x, r.xd, shifted),
+        fj.paper.constraint_forces(r.linkage, r.x, r.xd, r.force) - 7.0 * fictitious,
         atol=1e-10,
     )

@@ -17,7 +17,7 @@ EIGHT = fj.references.FigureEight([1.6, 0.4], [0.5, 0.3])
         fj.TipTask(EIGHT, fj.references.Laps(period=4.0)),
         fj.references.Spline([[0, 0], [1, 1], [2, 0]], closed=True),
         fj.Wrench(fj.Point(1), force=[1, 0], follows=True),
-        fj.PrescribedMotion((1, 3), lambda t, linkage: 0),
+        fj.simulation.PrescribedMotion((1, 3), lambda t, linkage: 0),
     ],
     ids=lambda part: type(part).__name__,
 )

@@ -14,12 +14,12 @@ from fdof_jax import drawing, plotting
 TAU = np.array([[4.0], [-8.0], [2.0], [6.0]])  # of an inertia of 2 kg m^2
 
 
-def disc_motion() -> fj.SampledMotion:
+def disc_motion() -> fj.simulation.SampledMotion:
     """Returns the exact motion of a disc from rest under the held efforts."""
     ts, qdd = np.linspace(0, 2, 5), TAU / 2
     qd = np.append([[0.0]], np.cumsum(qdd / 2, axis=0), axis=0)
     q = np.append([[0.0]], np.cumsum((qd[1:] + qd[:-1]) / 4, axis=0), axis=0)
-    return fj.SampledMotion(ts, q, qd, TAU, diffrax.RESULTS.successful, ())
+    return fj.simulation.SampledMotion(ts, q, qd, TAU, diffrax.RESULTS.successful, ())
 
 
 CONTROL = fj.PDController(0.0, 0.0, 8.0, lambda t, linkage: (t[None], t[None]))

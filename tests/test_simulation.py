@@ -12,7 +12,7 @@ from fdof_jax.base.trigonometry import sincos
 
 
 def absolute_angles(linkage, solution):
-    chain = jax.vmap(fj.to_chain, in_axes=(None, 0, 0))
+    chain = jax.vmap(fj.paper.to_chain, in_axes=(None, 0, 0))
     return np.asarray(chain(linkage, solution.q, solution.qd)[0])[:, 1::2]
 
 
@@ -73,7 +73,7 @@ def test_default_accuracy_to_two_seconds(name):
     r = load(name)
     ts = [0, *(state["t"] for state in states)]
     solution = fj.simulate(r.linkage, r.state0, ts, r.forces)
-    chain = jax.vmap(fj.to_chain, in_axes=(None, 0, 0))
+    chain = jax.vmap(fj.paper.to_chain, in_axes=(None, 0, 0))
     x, _ = chain(r.linkage, solution.q, solution.qd)
     for state, coordinates in zip(states, x[1:]):
         np.testing.assert_allclose(coordinates, state["q"], rtol=0, atol=1e-8)

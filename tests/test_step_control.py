@@ -129,14 +129,14 @@ def test_tolerances_in_sizes_of_the_arm():
     expected = fj.simulate(large, START, TS).q
     scaled = fj.simulate(
         small, fj.State(START.q * unit, [0, 0, 0]), TS * time, dt0=1e-3 * time,
-        stepsize_controller=fj.scale_tolerances(small),
+        stepsize_controller=fj.simulation.scale_tolerances(small),
     )  # fmt: skip
     np.testing.assert_allclose(scaled.q / unit[None], expected, atol=1e-8)
 
 
 def test_a_scale_of_ones_changes_nothing():
     ones = fj.State([1, 1, 1], [1, 1, 1])
-    scaled = fj.scale_tolerances(ARM, scale=ones)
+    scaled = fj.simulation.scale_tolerances(ARM, scale=ones)
     solutions = [
         fj.simulate(ARM, START, TS, stepsize_controller=c) for c in (None, scaled)
     ]
@@ -156,7 +156,7 @@ def test_a_scale_of_ones_changes_nothing():
 def test_bad_scales_are_refused(arguments, message):
     linkage, controller, scale = (*arguments, None, None)[:3]
     with pytest.raises(ValueError, match=message):
-        fj.scale_tolerances(linkage, controller, scale=scale)
+        fj.simulation.scale_tolerances(linkage, controller, scale=scale)
 
 
 @pytest.mark.parametrize("kind", [diffrax.PIDController, Shortening])

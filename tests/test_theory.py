@@ -53,7 +53,7 @@ def test_the_mass_matrix():
     for n in (2, 3):
         M[th[n], B[n]] = mu[n + 1] * linkage.length[n - 1]
     M = M + M.T - np.diag(np.diag(M))
-    np.testing.assert_allclose(fj.mass_matrix(linkage, x), M, rtol=1e-13)
+    np.testing.assert_allclose(fj.paper.mass_matrix(linkage, x), M, rtol=1e-13)
 
 
 def test_velocities_and_gravity():
@@ -71,7 +71,7 @@ def test_velocities_and_gravity():
         phi.append(dot(1j * e[n], beyond[n]))
         own = dot(1j * c[n + 1], f[n + 1])
         phi.append(own + dot(1j * d[n + 1], beyond[n + 1]))
-    np.testing.assert_allclose(fj.bias_force(linkage, x, xd), phi, rtol=1e-12)
+    np.testing.assert_allclose(fj.paper.bias_force(linkage, x, xd), phi, rtol=1e-12)
 
 
 def test_the_recursion_for_any_number_of_joints():
@@ -82,7 +82,7 @@ def test_the_recursion_for_any_number_of_joints():
         locked=rng.normal(size=5), base_angle=0.4,
     )  # fmt: skip
     q = rng.normal(size=5)
-    x, _ = fj.to_chain(linkage, q, q)
+    x, _ = fj.paper.to_chain(linkage, q, q)
     e, _, d, _, mu, s, J = vectors(linkage, x)
     F, H = np.zeros(8, complex), np.zeros(8)
     for n in reversed(range(2, 7)):
@@ -97,19 +97,21 @@ def test_the_recursion_for_any_number_of_joints():
             if i < k:
                 h = h + dot(d[i + 1], p)
             M[i - 1, k - 1] = M[k - 1, i - 1] = h if turns[i] else dot(e[i], p)
-    np.testing.assert_allclose(fj.joint_mass_matrix(linkage, q), M, rtol=1e-13)
+    np.testing.assert_allclose(fj.mass_matrix(linkage, q), M, rtol=1e-13)
 
 
 def test_the_reduced_equations():
     linkage, x, xd = random_case(2)
-    x, xd = fj.to_chain(linkage, x[:3], xd[:3])
-    S = jax.jacobian(lambda qd: fj.to_chain(linkage, np.zeros(3), qd)[1])(np.zeros(3))
+    x, xd = fj.paper.to_chain(linkage, x[:3], xd[:3])
+    S = jax.jacobian(lambda qd: fj.paper.to_chain(linkage, np.zeros(3), qd)[1])(
+        np.zeros(3)
+    )
     assert set(np.unique(S)) == {0.0, 1.0}
     tau = np.array([1.0, -2.0, 3.0])
-    M, phi = fj.mass_matrix(linkage, x), fj.bias_force(linkage, x, xd)
+    M, phi = fj.paper.mass_matrix(linkage, x), fj.paper.bias_force(linkage, x, xd)
     qdd = np.linalg.solve(S.T @ M @ S, tau + S.T @ phi)
     force = np.where(linkage.ef > 0.5, np.repeat(tau, 2), 0)
-    masked = fj.masked_accelerations(linkage, x, xd, force)
+    masked = fj.paper.masked_accelerations(linkage, x, xd, force)
     np.testing.assert_allclose(masked, S @ qdd, rtol=1e-11, atol=1e-12)
     # Efforts from the tip inwards; real joints carry their commands.
     rho = M @ masked - phi
@@ -117,5 +119,5 @@ def test_the_reduced_equations():
     T3 = rho[3] + T4
     efforts = np.array([rho[0], rho[1] + T3, rho[2], T3, rho[4], T4])
     constraint = efforts - force
-    known = fj.constraint_forces(linkage, x, xd, force)
+    known = fj.paper.constraint_forces(linkage, x, xd, force)
     np.testing.assert_allclose(known, constraint, rtol=1e-11, atol=1e-11)

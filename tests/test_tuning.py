@@ -250,7 +250,7 @@ def test_own_loss_and_all_kinds_of_elements_beside_the_controller():
     push = Indexed(1, True, jnp.array([1, 0]))
     wind = lambda strength: lambda t, q, qd, linkage: [0, strength]
     hold = lambda t, linkage: (jnp.asarray(scene.state0.q), jnp.zeros(2))
-    held = fj.PrescribedMotion(1, hold)
+    held = fj.simulation.PrescribedMotion(1, hold)
     trial = scene._replace(forces=(controller, push, wind(10), held))
     result = fj.tune(trial, loss=twice, max_steps=2)
 

@@ -173,7 +173,7 @@ def test_forces_accelerate_the_tip_to_the_ellipse(topology):
         )
         J = np.asarray(fj.tip_jacobian(linkage, Q))[:2]
         rest = np.zeros(3)
-        held = fj.joint_bias(linkage, Q, rest, forces)
+        held = fj.bias_force(linkage, Q, rest, forces)
         moved = []
         for push in ([1.0, 0.0], [0.0, 1.0]):
             tau = held + J.T @ push

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from ..base.checks import real_array
-from ..dynamics import joint_bias
+from ..dynamics import bias_force
 from ..forces.element import Element, Forces
 from ..linkage.linkage import Linkage, per_joint, without_fixed
 from ..linkage.topology import fixed_pairs
@@ -81,7 +81,7 @@ def _lacking(
     """Efforts that the arm needs beside the forces to stay at rest."""
     q, still = without_fixed(linkage, q), jnp.zeros_like(q)
     acting = total_effort(linkage, forces, t, q, still)
-    return without_fixed(linkage, joint_bias(linkage, q, still, forces) - acting)
+    return without_fixed(linkage, bias_force(linkage, q, still, forces) - acting)
 
 
 def holding_efforts(

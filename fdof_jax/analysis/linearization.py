@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from ..base.checks import instance, is_traced, real_array, shown
 from ..control.pd import PDController
-from ..dynamics import forward_dynamics, joint_bias, joint_mass_matrix
+from ..dynamics import bias_force, forward_dynamics, mass_matrix
 from ..forces.element import Element, Forces, elements_on, of_full_size
 from ..linkage.coordinates import State, real_state
 from ..linkage.linkage import (
@@ -29,6 +29,7 @@ from ..references.reference import Reference, reference_motion
 from ..simulation.field import element_effort, stateful
 from ..simulation.prescribed import prescribed
 from ..simulation.sampled import check_joints
+from ..simulation.scene import accepts_scene
 from ..simulation.solution import Solution
 
 # Explicit Runge-Kutta methods of order 4 in 4 stages damp every damped mode if the step
@@ -73,13 +74,16 @@ def total_effort(
     return sum(efforts, jnp.zeros_like(q))
 
 
+@accepts_scene
 def linearize(
     linkage: Linkage, state: State, forces: Forces = (), t: ArrayLike = 0.0
 ) -> Linearization:
     """Linearises the equations of motion about a state, at a time.
 
     **Arguments:** `linkage`; `state`: joint positions and velocities; `forces`:
-    elements without a state of their own; `t`: time at which they are evaluated [s].
+    elements without a state of their own; `t`: time at which they are evaluated [s]. A
+    `Scene` may stand for linkage and forces: `linearize(scene, state, t)`. By default
+    the state is then the scene's start.
 
     **Returns:** `A` and `B` of d(q, qd)/dt = A (q, qd) + B tau, for small changes. The
     efforts tau act in the joints in addition to the forces [N or N m]. For a force with
@@ -148,13 +152,13 @@ def loop_matrices(
     """
     own, rebuilt = ravel_pytree(controller.initial_state(linkage))
     n, still = q.size, jnp.zeros_like(q)
-    inverse = jnp.linalg.inv(joint_mass_matrix(linkage, q, forces))
+    inverse = jnp.linalg.inv(mass_matrix(linkage, q, forces))
     inverse = jnp.where(jnp.stack(fixed_pairs(linkage.ef)), 0, inverse)
     B = jnp.concatenate([jnp.zeros((n, n)), inverse, jnp.zeros((own.size, n))])
 
     def acting(y):
         q, qd, _ = jnp.split(y, [n, 2 * n])
-        weight = joint_bias(linkage, q, still, forces)
+        weight = bias_force(linkage, q, still, forces)
         return total_effort(linkage, forces, t, q, qd) - weight
 
     def respond(y, change):

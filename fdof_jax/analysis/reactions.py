@@ -17,6 +17,7 @@ from ..linkage.linkage import Linkage
 from ..mechanics.kinematics import joint_positions, mass_center_velocities, mass_centers
 from ..simulation.efforts import joint_efforts
 from ..simulation.sampled import Motion, acting_in
+from ..simulation.scene import accepts_scene
 
 
 def _loads(
@@ -40,6 +41,7 @@ def _loads(
     return force, moment
 
 
+@accepts_scene
 def joint_reactions(
     linkage: Linkage, forces: Forces, solution: Motion
 ) -> Float[Array, "time joint 3"]:
@@ -50,7 +52,8 @@ def joint_reactions(
     and armatures. Loads on points act on the links themselves.
 
     **Arguments:** `linkage`, `forces` and `solution` of one `simulate`; of a
-    `SampledMotion`, the forces are `(control, *forces)`.
+    `SampledMotion`, the forces are `(control, *forces)`. A `Scene` may stand for
+    linkage and forces: `joint_reactions(scene, solution)`.
 
     **Returns:** force (x, y) [N] and moment [N m] on the moving link, at its
     characteristic point (see `joint_positions`). The previous link gets the opposite.

@@ -20,6 +20,7 @@ import numpy as np
 from jax import Array
 from jax.extend.core import ClosedJaxpr, Jaxpr
 
+from .. import __version__
 from ..base.array_namespace import in_numpy
 from ..base.checks import optional_package, refusal
 from ..base.user_warnings import warn
@@ -30,8 +31,10 @@ from ..simulation.solution import OUTCOMES, Solution, outcome_numbers
 from .batch_axes import Batch
 from .chunk_programs import outcome_of
 from .chunks import Job, in_chunks
-from .versions import VERSIONS
 
+VERSIONS = {"fdof_jax": __version__} | {
+    module.__name__: module.__version__ for module in (jax, diffrax, eqx, np)
+}
 _BYTES = 2**26  # of the results in a block
 _CHUNKS = 16  # at most so many in a block, as blocks are what workers share
 # Members that are not solved yet, by the kind of the numbers

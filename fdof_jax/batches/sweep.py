@@ -37,6 +37,7 @@ from ..base.whole_files import folder_path
 from ..forces.element import Forces, elements
 from ..linkage.coordinates import State
 from ..linkage.linkage import Linkage
+from ..simulation.scene import accepts_scene
 from ..simulation.simulate import solve_options
 from ..simulation.solution import Solution
 from ..steps.dopri8 import constant
@@ -103,6 +104,7 @@ def _check_elements(batch: Batch, ts: Array, forces_axes: Any) -> None:
         ) from error
 
 
+@accepts_scene
 @jax.transfer_guard("allow")  # its transfers are meant: the batch comes in chunks
 def sweep(
     linkage: Linkage,
@@ -135,7 +137,8 @@ def sweep(
     **Arguments:**
 
     - `linkage`, `state0`: as in `simulate`, any of their arrays with a leading batch
-      axis; arrays without it are shared by all members.
+      axis; arrays without it are shared by all members. A `Scene` may stand for
+      linkage, state0 and forces: `sweep(scene, ts)`.
     - `ts`: increasing output times, common to all members, of shape (time,) [s].
     - `forces`: force elements; `forces_axes`: which of their arrays carry the batch
       axis, as `in_axes` of `jax.vmap`: 0 for all, None (the default) for none, or a

@@ -5,7 +5,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from ..base.checks import real_array
-from ..dynamics import joint_mass_matrix
+from ..dynamics import mass_matrix
 from ..forces.element import Forces
 from ..linkage.linkage import Linkage, joints_of, without_fixed
 
@@ -44,7 +44,7 @@ def gains_from_frequency(
     >>> kp.tolist(), kd.tolist()  # of 14, 5 and 1 kg m^2
     ([350.0, 125.0, 100.0], [98.0, 35.0, 14.0])
     """
-    inertia = joint_mass_matrix(linkage, q, forces).diagonal()
+    inertia = mass_matrix(linkage, q, forces).diagonal()
     n = joints_of(linkage)
     frequency = real_array(
         "frequency", frequency, (n,), above=0, broadcast=True, unit="rad/s",

@@ -27,8 +27,8 @@ _PACKAGE = __name__.partition(".")[0]
 # Where classes are looked up. The package comes last, as it warns of names in rooms;
 # the states of drives and the histories of tuning are in no room's list.
 _PLACES = (
-    "forces control references analysis tuning identification control.drives "
-    "tuning.result".split()
+    "forces control references simulation analysis tuning identification "
+    "control.drives tuning.result".split()
 )
 _NOT_FINITE = {"inf": math.inf, "-inf": -math.inf, "nan": math.nan}
 _DTYPES = {"b": bool, "i": int, "u": np.uint64, "f": float}

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from ..analysis.reach import Ranges, curves, reached_cells
 from ..base.array_namespace import in_numpy
 from ..base.checks import real_array
-from ..dynamics import joint_mass_matrix
+from ..dynamics import mass_matrix
 from ..forces.element import Forces
 from ..linkage.linkage import Linkage, check_linkage, joint_names, joints_of
 from ..linkage.topology import check_angles, letters
@@ -163,7 +163,7 @@ def inertia_ellipses(
     """
     positions, g = _path(linkage, q)
     J = _jacobians(linkage, positions)
-    M = jax.vmap(lambda q: joint_mass_matrix(linkage, q, forces))(positions)
+    M = jax.vmap(lambda q: mass_matrix(linkage, q, forces))(positions)
     M = np.asarray(M)
     mobility = J @ np.linalg.solve(M, np.swapaxes(J, 1, 2))
     sizes, axes = np.linalg.eigh(mobility)

@@ -1,1 +1,12 @@
 """Motion in time: the equations that are integrated, and what is read from them."""
+
+from ..steps.tolerances import scale_tolerances
+from .efforts import Efforts
+from .prescribed import PrescribedMotion
+from .sampled import SampledMotion
+
+__all__ = ["Efforts", "PrescribedMotion", "SampledMotion", "scale_tolerances"]
+
+
+def __dir__() -> list[str]:
+    return __all__

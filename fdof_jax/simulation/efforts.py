@@ -17,6 +17,7 @@ from .field import element_effort, with_states
 from .padding import cut, padded
 from .prescribed import prescribed, prescribed_effort
 from .sampled import Motion, acting_in, check_joints
+from .scene import accepts_scene
 from .simulate import check_own
 
 
@@ -32,11 +33,13 @@ class Efforts(NamedTuple):
     elements: Float[Array, "element time joint"]
 
 
+@accepts_scene
 def joint_efforts(linkage: Linkage, forces: Forces, solution: Motion) -> Efforts:
     """Computes the joint efforts of the force elements along a motion.
 
     **Arguments:** the linkage, the forces and the solution of one `simulate`; of a
-    `SampledMotion`, the forces are `(control, *forces)`.
+    `SampledMotion`, the forces are `(control, *forces)`. A `Scene` may stand for
+    linkage and forces: `joint_efforts(scene, solution)`.
 
     **Returns:** `Efforts(total, elements)` [N or N m], of shapes (time, n) and
     (element, time, n).
@@ -45,9 +48,9 @@ def joint_efforts(linkage: Linkage, forces: Forces, solution: Motion) -> Efforts
 
     >>> import fdof_jax as fj
     >>> import numpy as np
-    >>> arm, start, forces, _ = fj.scenes.fig7()
-    >>> motion = fj.simulate(arm, start, np.linspace(0, 1, 101), forces)
-    >>> total, elements = fj.joint_efforts(arm, forces, motion)
+    >>> scene = fj.scenes.fig7()
+    >>> motion = fj.simulate(scene, np.linspace(0, 1, 101))
+    >>> total, elements = fj.joint_efforts(scene, motion)
     >>> total[0].tolist(), elements.shape
     ([15.873, -300.0, -9.921], (1, 101, 3))
     """

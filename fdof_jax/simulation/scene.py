@@ -1,7 +1,9 @@
 """Scenes: a linkage, its initial state, its forces and its end time; stacks of them."""
 
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+import functools
+import inspect
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, ParamSpec, Protocol, TypeVar, overload
 
 import equinox as eqx
 import jax
@@ -18,6 +20,9 @@ from ..linkage.linkage import Linkage
 class Scene(NamedTuple):
     """A linkage, its initial state, the forces on it and the end time.
 
+    `simulate`, `sweep`, `joint_efforts`, `joint_reactions` and `linearize` accept a
+    scene in place of its parts.
+
     - `linkage`, `state0`, `forces`: the arguments of `simulate`.
     - `t1`: end time [s]; a scene starts at 0.
 
@@ -31,6 +36,57 @@ class Scene(NamedTuple):
     state0: State
     forces: Forces
     t1: float | Array
+
+
+_Arguments = ParamSpec("_Arguments")
+_Result = TypeVar("_Result", covariant=True)
+
+
+class OfScene(Protocol[_Arguments, _Result]):
+    """A function of a linkage, forces and more, or of a scene and more."""
+
+    @overload
+    def __call__(
+        self, *args: _Arguments.args, **kwargs: _Arguments.kwargs
+    ) -> _Result: ...
+
+    @overload
+    def __call__(self, scene: Scene, /, *args: Any, **kwargs: Any) -> _Result: ...
+
+
+def accepts_scene(
+    function: Callable[_Arguments, _Result],
+) -> OfScene[_Arguments, _Result]:
+    """Decorates a function to accept a `Scene` in place of the arguments it holds.
+
+    Other arguments follow in their order; a `state` is by default the scene's start.
+    """
+    parameters = inspect.signature(function).parameters.values()
+    names = [p.name for p in parameters if p.kind is p.POSITIONAL_OR_KEYWORD]
+    others = [name for name in names if name not in Scene._fields]
+
+    @functools.wraps(function)
+    def resolved(*args: Any, **kwargs: Any) -> Any:
+        if not args or not isinstance(args[0], Scene):
+            return function(*args, **kwargs)
+        scene, *more = args
+        for name in Scene._fields:
+            if name in kwargs:
+                raise ValueError(
+                    f"{name}: expected none beside a Scene, which has its own, got "
+                    f"{shown(kwargs[name])}."
+                )
+        if len(more) > len(others):
+            raise ValueError(
+                f"scene: expected {function.__name__}(scene, {', '.join(others)}), as "
+                "a Scene has its own linkage, state and forces, got "
+                f"{len(args)} positional arguments."
+            )
+        parts = scene._asdict() | {"state": scene.state0}
+        own = {n: parts[n] for n in names if n in parts and n not in kwargs}
+        return function(**own | dict(zip(others, more)), **kwargs)  # type: ignore
+
+    return resolved
 
 
 def with_full_size(scene: Scene) -> Scene:

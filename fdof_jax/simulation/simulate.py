@@ -36,6 +36,7 @@ from ..steps.tolerances import at_tolerances, with_longest, within_reach
 from .failures import cause, check_arguments, reason
 from .field import initial_states
 from .prescribed import agrees, prescribed
+from .scene import accepts_scene
 from .solution import OUTCOMES, Solution, outcome_numbers
 from .solve import solve
 
@@ -113,6 +114,7 @@ def check_elements(forces: Forces, linkage: Linkage, ts: Array) -> None:
             )
 
 
+@accepts_scene
 def simulate(
     linkage: Linkage,
     state0: State,
@@ -139,7 +141,8 @@ def simulate(
 
     **Arguments:**
 
-    - `linkage`, `state0`: the arm, and its joint positions and velocities.
+    - `linkage`, `state0`: the arm, and its joint positions and velocities. A
+      `Scene` may stand for linkage, state0 and forces: `simulate(scene, ts)`.
     - `ts`: increasing output times, of shape (time,) [s]. A step ends at the last time.
       States at the other times are interpolated and may be a hundred times less exact;
       `diffrax.ClipStepSizeController` makes steps end at all of `ts`.

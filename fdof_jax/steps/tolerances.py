@@ -144,7 +144,7 @@ def scale_tolerances(
 
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig5().linkage
-    >>> controller = fj.scale_tolerances(arm)
+    >>> controller = fj.simulation.scale_tolerances(arm)
     >>> [float(unit) for unit in controller.unit[1]]  # of rates: 1 / sqrt(L/g) [1/s]
     [1.279, 1.279, 1.279]
     """

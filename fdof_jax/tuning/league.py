@@ -6,9 +6,10 @@ import numpy as np
 
 from ..base.checks import refusal
 from ..control.pd import PDController
-from ..linkage.coordinates import State, from_chain
+from ..linkage.coordinates import State
 from ..linkage.linkage import Linkage
 from ..linkage.topology import TOPOLOGIES
+from ..paper import from_chain
 from ..references.circle import CircleTask
 from ..simulation.scene import Scene
 from .result import TuneResult, mean_effort

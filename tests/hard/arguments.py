@@ -149,7 +149,12 @@ def add(label, *args, **keywords):
 
 
 add("Linkage topology", arm, topology, (6,))
-add("from_chain topology", lambda v: fj.from_chain(v, CHAIN, CHAIN), topology, (6,))
+add(
+    "from_chain topology",
+    lambda v: fj.paper.from_chain(v, CHAIN, CHAIN),
+    topology,
+    (6,),
+)
 add("existence_factors topology", fj.existence_factors,
     lambda v: isinstance(v, str) and topology(v))  # fmt: skip
 for field, shape, keywords in (
@@ -168,12 +173,12 @@ for field, shape, keywords in (
         shape,
         may_refuse=field in ("mass", "inertia", "com"),
     )
-add("from_chain x", lambda v: fj.from_chain("RRR", v, CHAIN), array_of(6), (6,))
-add("from_chain xd", lambda v: fj.from_chain("RRR", CHAIN, v), chain_rates, (6,))
-add("from_chain base_angle", lambda v: fj.from_chain("RRR", CHAIN, CHAIN, v),
+add("from_chain x", lambda v: fj.paper.from_chain("RRR", v, CHAIN), array_of(6), (6,))
+add("from_chain xd", lambda v: fj.paper.from_chain("RRR", CHAIN, v), chain_rates, (6,))
+add("from_chain base_angle", lambda v: fj.paper.from_chain("RRR", CHAIN, CHAIN, v),
     array_of())  # fmt: skip
 OF_A_LINKAGE = {
-    "to_chain": (fj.to_chain, "q qd", 3),
+    "to_chain": (fj.paper.to_chain, "q qd", 3),
     "joint_positions": (fj.joint_positions, "q", 3),
     "mass_centers": (fj.mass_centers, "q", 3),
     "tip_position": (fj.tip_position, "q", 3),
@@ -182,10 +187,10 @@ OF_A_LINKAGE = {
     "inverse_dynamics": (fj.inverse_dynamics, "q qd qdd", 3),
     "energy": (fj.energy, "q qd", 3),
     "link_energies": (fj.link_energies, "q qd", 3),
-    "mass_matrix": (fj.mass_matrix, "x", 6),
-    "bias_force": (fj.bias_force, "x xd", 6),
-    "masked_accelerations": (fj.masked_accelerations, "x xd force", 6),
-    "constraint_forces": (fj.constraint_forces, "x xd force", 6),
+    "mass_matrix": (fj.paper.mass_matrix, "x", 6),
+    "bias_force": (fj.paper.bias_force, "x xd", 6),
+    "masked_accelerations": (fj.paper.masked_accelerations, "x xd force", 6),
+    "constraint_forces": (fj.paper.constraint_forces, "x xd force", 6),
 }
 for label, (function, names, size) in OF_A_LINKAGE.items():
     names = names.split()

@@ -63,12 +63,14 @@ def check_accelerations(scene: Scene, report: Report) -> str:
     told = _told_ill_conditioned(linkage, scene, exact)
     outcome = _judge("reduced", reduced, exact, told, scene, report)
 
-    x, xd = (np.asarray(v).tolist() for v in fj.to_chain(linkage, scene.q, scene.qd))
+    x, xd = (
+        np.asarray(v).tolist() for v in fj.paper.to_chain(linkage, scene.q, scene.qd)
+    )
     exact = oracle.acceleration_of_chain(arm, x, xd, scene.tau)
     force = []
     for joint, tau in zip(arm.topology, scene.tau):
         force += [scene.junk, tau] if joint == "R" else [tau, scene.junk]
-    xdd = np.asarray(fj.masked_accelerations(linkage, x, xd, force))
+    xdd = np.asarray(fj.paper.masked_accelerations(linkage, x, xd, force))
     slide, turn = xdd[0::2], np.diff(xdd[1::2], prepend=0)
     real = [joint == "R" for joint in arm.topology]
     if np.isfinite(xdd).all():

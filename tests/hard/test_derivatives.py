@@ -44,7 +44,7 @@ def test_losses_at_zero_error():
 def everything(linkage, q, qd):
     return dict(
         tip=fj.tip_position(linkage, q),
-        x=fj.to_chain(linkage, q, qd),
+        x=fj.paper.to_chain(linkage, q, qd),
         centres=fj.mass_centers(linkage, q),
         energy=fj.energy(linkage, q, qd),
         qdd=fj.forward_dynamics(linkage, q, qd, STILL),

@@ -12,7 +12,7 @@ TS = np.linspace(0, 5, 11)
 
 @eqx.filter_jit
 def scaled_motion(linkage, state0, ts, dt0):
-    steps = fj.scale_tolerances(linkage)
+    steps = fj.simulation.scale_tolerances(linkage)
     return fj.simulate(linkage, state0, ts, stepsize_controller=steps, dt0=dt0)
 
 

@@ -17,7 +17,7 @@ def test_only_the_paper_s_matrix_is_singular(name):
     """A fictitious joint that moves no inertia is a row of zeros in the 6x6 matrix."""
     assert SCENES[name]["paper_masked_singular"]
     r = load(name)
-    masked = fj.masked_accelerations(r.linkage, r.x, r.xd, r.force)
+    masked = fj.paper.masked_accelerations(r.linkage, r.x, r.xd, r.force)
     assert relative_error(masked, SCENES[name]["acc0"]) <= 1e-9
     scene = hard.load_common(name)
     assert hard.error(hard.simulate(scene, hard.TIGHT), scene) <= 1e-9
@@ -30,8 +30,8 @@ def test_a_slide_through_a_pivot_is_singular_only_in_the_paper_s_matrix():
     for q, qd, qdd in zip(*(reference[key] for key in ("q", "qd", "qdd"))):
         reduced = fj.forward_dynamics(scene.linkage, q, qd, np.zeros(3))
         assert relative_error(reduced, qdd) <= 1e-9
-        masked = fj.masked_accelerations(
-            scene.linkage, *fj.to_chain(scene.linkage, q, qd), np.zeros(6)
+        masked = fj.paper.masked_accelerations(
+            scene.linkage, *fj.paper.to_chain(scene.linkage, q, qd), np.zeros(6)
         )
         turn, slide, last = qdd
         exact = [0, turn, slide, turn, 0, turn + last]

@@ -44,7 +44,7 @@ def masked(linkage, x, xd, force):
 
     def accelerations(mass, x):
         changed = eqx.tree_at(lambda a: a.mass, linkage, mass)
-        return fj.masked_accelerations(changed, x, xd, force)
+        return fj.paper.masked_accelerations(changed, x, xd, force)
 
     arguments = linkage.mass, x
     return accelerations(*arguments), jax.jacrev(accelerations, (0, 1))(*arguments)
@@ -54,7 +54,7 @@ def masked(linkage, x, xd, force):
 def test_efforts_of_fictitious_joints(topology):
     """The paper's equations add them and subtract them again."""
     linkage = arm(topology, locked=0.2)
-    x, xd = fj.to_chain(linkage, START.q, START.qd)
+    x, xd = fj.paper.to_chain(linkage, START.q, START.qd)
     force = jnp.arange(1.0, 7.0)
     clean = masked(linkage, x, xd, with_junk(force, fictitious(topology), 0.0))
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(clean))
@@ -63,7 +63,7 @@ def test_efforts_of_fictitious_joints(topology):
         for a, b in zip(*map(jax.tree.leaves, (masked(linkage, x, xd, dirty), clean))):
             np.testing.assert_array_equal(a, b, err_msg=str(junk))
     with pytest.raises(ValueError, match="^force: expected .*finite"):
-        fj.masked_accelerations(linkage, x, xd, dirty)
+        fj.paper.masked_accelerations(linkage, x, xd, dirty)
 
 
 def motion(linkage):

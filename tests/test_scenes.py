@@ -1,0 +1,81 @@
+"""A scene is accepted whole in place of its linkage, state and forces."""
+
+import jax
+import numpy as np
+import pytest
+from elements import SHORT
+
+import fdof_jax as fj
+
+SCENE = fj.scenes.fig3()
+ARM, START, FORCES, _ = SCENE
+TS = np.linspace(0, 0.05, 6)
+OTHER = fj.State(np.array([0.3, 2.0, 0.1]), np.array([0.1, 0.2, 0.3]))
+MOTION = fj.Solution(TS, np.full((6, 3), 0.7), np.ones((6, 3)), {}, None)
+
+
+def sweep(*problem):
+    return fj.sweep(*problem, forces_axes=0, **SHORT)
+
+
+MANY = fj.tuning.stacked([SCENE, SCENE._replace(state0=OTHER)])
+CALLS = {
+    "simulate": [
+        lambda: fj.simulate(SCENE, TS, **SHORT),
+        lambda: fj.simulate(ARM, START, TS, FORCES, **SHORT),
+    ],
+    "simulate, by keyword": [
+        lambda: fj.simulate(SCENE, ts=TS, **SHORT),
+        lambda: fj.simulate(ARM, START, TS, FORCES, **SHORT),
+    ],
+    "sweep": [
+        lambda: sweep(MANY, TS),
+        lambda: sweep(MANY.linkage, MANY.state0, TS, MANY.forces),
+    ],
+    "efforts": [
+        lambda: fj.joint_efforts(SCENE, MOTION),
+        lambda: fj.joint_efforts(ARM, FORCES, MOTION),
+    ],
+    "reactions": [
+        lambda: fj.joint_reactions(SCENE, MOTION),
+        lambda: fj.joint_reactions(ARM, FORCES, MOTION),
+    ],
+    "start": [
+        lambda: fj.linearize(SCENE, t=0.3),
+        lambda: fj.linearize(ARM, START, FORCES, 0.3),
+    ],
+    "state": [
+        lambda: fj.linearize(SCENE, OTHER, 0.3),
+        lambda: fj.linearize(ARM, OTHER, FORCES, 0.3),
+    ],
+}
+
+
+@pytest.mark.parametrize("whole, parts", CALLS.values(), ids=CALLS)
+def test_a_scene_stands_for_its_parts(whole, parts):
+    jax.tree.map(np.testing.assert_array_equal, whole(), parts())
+
+
+@pytest.mark.parametrize(
+    "name, call",
+    [
+        ("forces", lambda: fj.simulate(SCENE, TS, forces=FORCES)),
+        ("state0", lambda: fj.simulate(SCENE, ts=TS, state0=START)),
+        ("linkage", lambda: fj.sweep(SCENE, TS, linkage=ARM)),
+        ("scene", lambda: fj.simulate(SCENE, TS, FORCES)),
+        ("scene", lambda: fj.sweep(SCENE, START, TS)),
+        ("scene", lambda: fj.joint_efforts(SCENE, FORCES, MOTION)),
+        ("scene", lambda: fj.joint_reactions(SCENE, FORCES, MOTION)),
+        ("forces", lambda: fj.linearize(SCENE, OTHER, forces=FORCES)),
+    ],
+)
+def test_a_scene_beside_its_parts_is_refused(name, call):
+    with pytest.raises(ValueError, match=rf"(?s)^{name}: expected .* Scene.*, got "):
+        call()
+
+
+def test_arguments_beside_a_scene_are_those_of_the_function():
+    with pytest.raises(TypeError, match="missing .* 'ts'"):
+        fj.simulate(SCENE)
+    with pytest.raises(TypeError, match="multiple values .* 'ts'"):
+        fj.simulate(SCENE, TS, ts=TS)
