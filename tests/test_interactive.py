@@ -88,7 +88,7 @@ def test_the_error_is_that_of_a_simulation(box):
 
 
 def test_nothing_is_compiled_after_the_first_picture(box, monkeypatch):
-    monkeypatch.setattr(prescribed, "vector_field", None)  # no second trace
+    monkeypatch.setattr(prescribed, "FREE", None)  # no second trace
     shown = {name: box.move(arm=name, link_1=1.1).tobytes() for name in fj.TOPOLOGIES}
     assert len(set(shown.values())) == 7
 

@@ -19,6 +19,7 @@ from fdof_jax.base import configuration
 from fdof_jax.batches import chunk_programs, chunks
 from fdof_jax.batches.batch_axes import batch_of
 from fdof_jax.simulation import prescribed
+from fdof_jax.steps.dopri8 import ScheduledTerm
 
 LANES = 64  # enough for a slow member to be stopped
 PENDULUM = fj.Linkage("R", length=[0, 1], com=[[0.5, 0]], mass=[1], inertia=[0.1])
@@ -170,13 +171,14 @@ def test_progress_rises_to_one(mixed):
 
 def test_other_values_need_no_new_trace(batch, clean, monkeypatch):
     calls = []
-    original = prescribed.vector_field
+    field, *others = vars(prescribed.FREE.term).values()
 
     def counted(*arguments):
         calls.append(1)
-        return original(*arguments)
+        return field(*arguments)
 
-    monkeypatch.setattr(prescribed, "vector_field", counted)
+    term = ScheduledTerm(counted, *others)
+    monkeypatch.setattr(prescribed, "FREE", prescribed.FREE._replace(term=term))
     linkage, (q, qd), forces = batch
     other = run((linkage, fj.State(q + 0.1, qd), forces))
     assert not calls

@@ -20,6 +20,7 @@ from .batch_axes import Batch
 from .chunk_programs import compiled, expected_work, form_of, lowered
 
 _SMALL = 8  # lanes of the chunks for a few slow members
+_COPIED_AT_ONCE = 2**24  # bytes of an array to a device
 _FORECASTS = 1024  # computed at once
 _NO_MESH = Mesh(np.empty((), object), ())
 
@@ -92,25 +93,25 @@ def _outcomes(
     form, arrays = form_of(moving, lanes, rest)
     leaves = jax.tree.leaves(moving)
 
-    def lanes_of(members: np.ndarray, device: Any) -> list[Array]:
+    def rows_of(members: np.ndarray) -> list[np.ndarray]:
         rows = np.append(members, np.full(lanes - len(members), members[-1]))
-        return jax.device_put([leaf[rows] for leaf in leaves], device)
+        return [leaf[rows] for leaf in leaves]
 
     # Traces and transfers depend on settings that no other thread has.
     programs = [lowered(form, device) for device in devices]
-    shared = [jax.device_put(arrays, device) for device in devices]
-    if len(devices) == 1:
+    if devices == [None]:
         program = compiled(programs[0])
         for some in chunks:
-            yield some, _solve(program, lanes_of(some, devices[0]), shared[0])
+            yield some, _solve(program, rows_of(some), arrays)
         return
+    shared = [jax.device_put(arrays, device) for device in devices]
     running: deque[tuple[np.ndarray, Future]] = deque()
     with ThreadPoolExecutor(len(devices)) as pool:
         different = dict.fromkeys(programs)  # cores have one program in common
         different = dict(zip(different, pool.map(compiled, different)))
         for number, some in enumerate(chunks):
             worker = number % len(devices)
-            own = lanes_of(some, devices[worker])
+            own = jax.device_put(rows_of(some), devices[worker])
             program = different[programs[worker]]
             running.append((some, pool.submit(_solve, program, own, shared[worker])))
             if len(running) > 2 * len(devices):
@@ -138,16 +139,13 @@ def in_chunks(
     if size > lanes:
         # The longest come first, so that no core waits long for another at the end.
         waiting = np.argsort(_forecast(job, moving, shared))[::-1]
-    done, results, structure = 0, [], None
+    done, solved, structure = 0, [], None
     progress = meter.init()
     while len(waiting):
         late = []
         for members, outcomes in _outcomes(job, moving, rest, waiting, lanes):
             values, structure = jax.tree.flatten(outcomes)
-            if not results:
-                results = [np.empty((size, *v.shape[1:]), v.dtype) for v in values]
-            for result, value in zip(results, values):
-                result[members] = np.asarray(value)[: len(members)]
+            solved.append((members, values))
             _, stopped, _ = outcomes
             late.append(members[np.asarray(stopped)[: len(members)]])
             done += len(members) - len(late[-1])
@@ -156,12 +154,27 @@ def in_chunks(
         if 0 < len(waiting) <= lanes // _SMALL:
             lanes = _lanes(min(len(waiting), _SMALL), job.chunk)
     meter.close(progress)
-    kept, _, failed = jax.tree.unflatten(structure, results)
-    del results
-    if on_device:
-        leaves, structure = jax.tree.flatten(kept)
-        del kept
-        for index, leaf in enumerate(leaves):
-            leaves[index] = jax.device_put(leaf)  # frees one before the next is copied
-        kept = structure.unflatten(leaves)
-    return kept, failed
+    leaves = _in_order(solved, size, on_device)
+    kept, _, failed = jax.tree.unflatten(structure, leaves)
+    return kept, np.asarray(failed)
+
+
+def _in_order(
+    solved: list[tuple[np.ndarray, list[Any]]], size: int, on_device: bool
+) -> list[Any]:
+    """Returns the outcomes of all members, the last ones of each."""
+    (members, values), *others = solved
+    if not others and all(len(leaf) == size for leaf in values):
+        return values  # a single chunk, in order
+    members = np.concatenate([members for members, _ in solved])
+    place = np.empty(size, int)
+    place[members] = np.arange(len(members))
+    leaves = []
+    for index in range(len(values)):
+        rows = [np.asarray(v[index])[: len(some)] for some, v in solved]
+        for _, values in solved:
+            values[index] = None  # frees it before the next is copied
+        leaves.append(np.concatenate(rows)[place])
+        if on_device and leaves[-1].nbytes > _COPIED_AT_ONCE:
+            leaves[-1] = jax.device_put(leaves[-1])
+    return jax.device_put(leaves) if on_device else leaves

@@ -46,7 +46,7 @@ from .chunk_programs import expected_work, outcome_of
 from .chunks import Job, devices_outside_mesh, in_chunks
 from .store import Store, in_store, outline
 
-_CHUNK = 256  # on CPUs twice as many gain little
+_CHUNK = 512  # half as many take 15 % longer on two cores: each call costs 0.5 ms
 
 
 def _without_times(solution: Solution) -> Solution:
@@ -147,7 +147,7 @@ def sweep(
       `lambda motion: motion.q[-1]`; of each member only the arrays that it returns are
       kept. Functions of equal code share a compiled program.
     - `chunk`: largest number of members to solve together, per device; None stands for
-      256.
+      512.
     - `throw`: whether to raise an error if any member fails.
     - `store`: a folder for the results, which are not held in memory: a Zarr group for
       `xarray.open_zarr`, written in blocks of members (`fdof_jax[data]` brings zarr). A

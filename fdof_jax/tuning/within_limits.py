@@ -6,10 +6,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jax import Array
 from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
-from scipy.optimize import minimize
 
 from ..base.checks import function, instance, whole_number
 from ..base.report import Report
@@ -113,7 +113,7 @@ def _search(
         return np.column_stack([-scale * slopes, np.ones(len(slopes))])
 
     worst = max(start.facts["excess"].max() + _WITHIN, 0.0)
-    result = minimize(
+    result = scipy.optimize.minimize(
         priced,
         np.append(first[free] / scale, worst),
         jac=True,
