@@ -15,7 +15,7 @@ from jax.sharding import SingleDeviceSharding
 from ..base.checks import refusal
 from ..base.configuration import wide_vectors
 from ..dynamics import forward_dynamics
-from ..forces.element import elements_on
+from ..forces.element import elements
 from ..linkage.topology import real_joints
 from ..simulation.field import element_effort
 from ..simulation.simulate import simulate
@@ -155,7 +155,7 @@ def expected_work(ts: Array, moving: Any, shared: Any) -> Array:
 
         def at(t, q, qd):
             tau = jnp.zeros_like(q)
-            for index, element in enumerate(elements_on(linkage, forces)):
+            for index, element in enumerate(elements("forces", forces)):
                 state = element.initial_state(linkage)
                 tau = tau + element_effort(index, element, t, q, qd, linkage, state)[0]
             qdd = forward_dynamics(linkage, q, qd, tau, forces)

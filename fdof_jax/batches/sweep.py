@@ -34,7 +34,7 @@ from ..base.checks import (
 )
 from ..base.functions import sharing_functions
 from ..base.whole_files import folder_path
-from ..forces.element import Forces, elements
+from ..forces.element import Forces, elements, elements_on
 from ..linkage.coordinates import State
 from ..linkage.linkage import Linkage
 from ..simulation.scene import accepts_scene
@@ -95,8 +95,15 @@ def _traced(
 
 def _check_elements(batch: Batch, ts: Array, forces_axes: Any) -> None:
     """Raises an error unless the force elements suit each member's linkage."""
+    moving, shared = batch.split()
+
+    def check_member(moving):
+        linkage, _, forces = eqx.combine(moving, shared)
+        elements_on(linkage, forces)  # what members share is known here
+
+    eqx.filter_eval_shape(eqx.filter_vmap(check_member), moving)
     try:
-        eqx.filter_eval_shape(expected_work, ts, *batch.split())
+        eqx.filter_eval_shape(expected_work, ts, moving, shared)
     except TypeError as error:
         raise TypeError(
             "forces, forces_axes: expected force elements that work for one member, "

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import fdof_jax as fj
-from fdof_jax.analysis.tracking import saturated
+from fdof_jax.analysis.tracking import relative_demands
 from hard.scenes import START, TARGET, Hold, arm
 
 STILL = np.zeros(3)
@@ -41,7 +41,8 @@ def end(log_kp, limit, reference):
     ts = np.linspace(0, 0.2, 11)
     adjoint = diffrax.ForwardMode()
     solution = fj.simulate(arm(), START, ts, (controller,), adjoint=adjoint)
-    share = jnp.mean(saturated(controller, arm(), solution), axis=0)
+    demands = relative_demands(controller, arm(), solution)
+    share = jnp.mean(jnp.abs(demands) > 1, axis=0)
     return jnp.sum(solution.q[-1]), share
 
 
