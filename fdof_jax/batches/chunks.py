@@ -20,7 +20,7 @@ from .batch_axes import Batch
 from .chunk_programs import compiled, expected_work, form_of, lowered
 
 _SMALL = 8  # lanes of the chunks for a few slow members
-_COPIED_AT_ONCE = 2**24  # bytes of an array to a device
+_COPIED_AT_ONCE = 2**24  # bytes to a device
 _FORECASTS = 1024  # computed at once
 _NO_MESH = Mesh(np.empty((), object), ())
 
@@ -135,46 +135,43 @@ def in_chunks(
     moving = in_numpy(moving)  # NumPy cuts faster
     rest = job.settings, job.reduce, job.ts, shared
     lanes = _lanes(-(-size // len(job.devices)), job.chunk)
-    waiting = np.arange(size)
+    order = np.arange(size)
     if size > lanes:
         # The longest come first, so that no core waits long for another at the end.
-        waiting = np.argsort(_forecast(job, moving, shared))[::-1]
-    done, solved, structure = 0, [], None
+        order = np.argsort(_forecast(job, moving, shared))[::-1]
+    place = np.arange(size)  # of members in the results
+    if on_device:  # in the order in which they come: faster, and more memory
+        place[order] = np.arange(size)
+    done, results, structure, waiting = 0, [], None, order
     progress = meter.init()
     while len(waiting):
         late = []
         for members, outcomes in _outcomes(job, moving, rest, waiting, lanes):
-            values, structure = jax.tree.flatten(outcomes)
-            solved.append((members, values))
             _, stopped, _ = outcomes
             late.append(members[np.asarray(stopped)[: len(members)]])
+            values, structure = jax.tree.flatten(outcomes)
+            if len(members) == size == lanes and not len(late[-1]):
+                results = values  # a single chunk, in order
+            elif not results:
+                results = [np.empty((size, *v.shape[1:]), v.dtype) for v in values]
+            if results is not values:
+                rows = place[members]
+                if rows[-1] - rows[0] == len(rows) - 1:  # a slice is faster
+                    rows = slice(rows[0], rows[-1] + 1)
+                for result, value in zip(results, values):
+                    result[rows] = np.asarray(value)[: len(members)]
             done += len(members) - len(late[-1])
             progress = meter.step(progress, np.asarray(done / size))
         waiting = np.concatenate(late)
         if 0 < len(waiting) <= lanes // _SMALL:
             lanes = _lanes(min(len(waiting), _SMALL), job.chunk)
     meter.close(progress)
-    leaves = _in_order(solved, size, on_device)
-    kept, _, failed = jax.tree.unflatten(structure, leaves)
+    if on_device:
+        for index, leaf in enumerate(results):
+            if isinstance(leaf, np.ndarray):
+                results[index] = leaf[place]
+            if leaf.nbytes > _COPIED_AT_ONCE:  # frees one before the next is copied
+                results[index] = jax.device_put(results[index])
+        results = jax.device_put(results)
+    kept, _, failed = jax.tree.unflatten(structure, results)
     return kept, np.asarray(failed)
-
-
-def _in_order(
-    solved: list[tuple[np.ndarray, list[Any]]], size: int, on_device: bool
-) -> list[Any]:
-    """Returns the outcomes of all members, the last ones of each."""
-    (members, values), *others = solved
-    if not others and all(len(leaf) == size for leaf in values):
-        return values  # a single chunk, in order
-    members = np.concatenate([members for members, _ in solved])
-    place = np.empty(size, int)
-    place[members] = np.arange(len(members))
-    leaves = []
-    for index in range(len(values)):
-        rows = [np.asarray(v[index])[: len(some)] for some, v in solved]
-        for _, values in solved:
-            values[index] = None  # frees it before the next is copied
-        leaves.append(np.concatenate(rows)[place])
-        if on_device and leaves[-1].nbytes > _COPIED_AT_ONCE:
-            leaves[-1] = jax.device_put(leaves[-1])
-    return jax.device_put(leaves) if on_device else leaves
