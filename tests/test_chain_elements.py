@@ -218,7 +218,8 @@ def test_sampled_control_steps_and_sweeps_agree(case):
         state = fj.step(chain, state, tau, 0.05, **SHORT)
     same(state.q, sampled.q[-1])
     same(state.qd, sampled.qd[-1])
-    rows = fj.Solution(*sampled[:3], stats={}, result=sampled.result)
+    motion = sampled.ts, sampled.q, sampled.qd
+    rows = fj.Solution(*motion, stats={}, result=sampled.result)
     weak = fj.PDController(case.gain, case.gain, 1e-6, case.hold)
     at_limit = np.asarray(jnp.abs(relative_demands(weak, chain, rows)) > 1)
     assert at_limit[:, real].any() and not at_limit[:, ~real].any()
