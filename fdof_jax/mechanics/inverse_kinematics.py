@@ -208,26 +208,25 @@ def solve_joints(
 
     # A turning vector is known by its length and its component along a. For two, the
     # same holds of their product, one conjugated, by the law of cosines.
-    inner = (dot(wrist, wrist) - square2 - square3) / 2
+    square = dot(wrist, wrist)
+    inner = (square - square2 - square3) / 2
     component = dot(a, rest)
     along = xp.where(two_turning, inner, component)
-    # What is left across a is a root, of a product of what is left to each edge of the
-    # reach. Its factors are exact where they vanish, as differences of squares are not.
+    # What is left across a is a root. For two it is that of a product of what is left
+    # to both edges of the reach, which are exact where the arm folds.
     length2, length3 = length_of(d)
-    away = length_of(wrist)
-    longest = xp.where(turning2, length2, 0) + xp.where(turning3, length3, 0)
-    longest = xp.where(framed, away, longest)
-    needed = xp.where(two_turning, away, component)
-    apart = length2 - length3
+    longest = xp.where(turning2, square2, 0) + xp.where(turning3, square3, 0)
+    longest = xp.where(framed, square, longest)
+    longest = xp.where(two_turning, (length2 + length3) ** 2, longest)
+    outer = longest - xp.where(two_turning, square, component**2)
+    outer = xp.where(two_slides, 1, outer)
+    inmost = xp.where(two_turning, square - (length2 - length3) ** 2, 4)
     # Computed positions of tips are off by less.
-    rounding = 16 * np.finfo(away.dtype).eps * (1 + abs(th4))
-    rounding *= length2 + length3 + away + length_of(arm.ground) + length_of(arm.tip)
-    edges, product = [longest - needed, longest + needed], 1 / 4
-    edges += [xp.where(two_turning, part, 2) for part in (away - apart, away + apart)]
-    for left in edges:
-        left = xp.where(two_slides, 1, left)
-        product *= xp.where(left < -rounding, xp.nan, xp.maximum(left, 0))
-    root = branch * xp.sqrt(product)
+    sizes = dot(arm.ground, arm.ground) + dot(arm.tip, arm.tip) + square2 + square3
+    rounding = 64 * np.finfo(square.dtype).eps * (1 + abs(th4)) * (sizes + square)
+    beyond = xp.minimum(outer, inmost) < -rounding
+    product = xp.maximum(outer, 0) * xp.maximum(inmost, 0) / 4
+    root = branch * xp.sqrt(xp.where(beyond, xp.nan, product))
 
     angle = plane_angle(root, along + xp.where(two_turning, square2, 0))
     second = xp.where(whole, bearing - angle, xp.where(turning2, th3 + angle, th2))
