@@ -3,6 +3,7 @@
 import re
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -25,6 +26,33 @@ def message(ts, forces=(), state0=START, **options):
     with pytest.raises(RuntimeError) as raised:
         fj.simulate(PENDULUM, state0, ts, forces, **options)
     return str(raised.value)
+
+
+def _impossible():
+    """Yields motions that cannot go on, and the beginning of what is said of each."""
+    arm, start, (control,), _ = fj.scenes.fig7()
+    wide = fj.CircleTask(center=[-1, 2], radius=0.75)
+    ring = fj.references.Ellipse([0.5, 1.0], [4.0, 4.0])  # round the pivot
+    task = fj.TipTask(ring, fj.references.Laps(4.0), orientation=1.5)
+    for reference in (wide, task):
+        control = control.replace(reference=reference)
+        yield (
+            (arm, start, (control,)),
+            r"forces\[0\].reference: expected a (circle|path)",
+        )
+    changed = eqx.tree_at(lambda d: d.coefficient, fj.JointDamper(1.0), jnp.array(-1.0))
+    yield (arm, start, (changed,)), r"forces\[0\].coefficient: expected"
+    still = fj.simulation.PrescribedMotion(1, lambda t, arm: (0 * arm.mass,) * 2)
+    yield (arm, start, (still,)), r"state0.q: expected"
+
+
+@pytest.mark.parametrize("inputs, words", list(_impossible()))
+def test_a_motion_that_cannot_go_on_is_a_result_that_names_its_cause(inputs, words):
+    arm, start, forces = inputs
+    motion = fj.simulate(arm, start, [0, 4.0], forces, throw=False)
+    assert motion.outcome == "not finite" and np.isnan(motion.q[-1]).all()
+    with pytest.raises(ValueError, match=words):
+        fj.simulate(arm, start, [0, 4.0], forces)
 
 
 @pytest.mark.parametrize("tolerance", [1e-11, 1e-6])

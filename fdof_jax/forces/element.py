@@ -38,7 +38,7 @@ class Element(Part):
     - `jump_ts`: times at which the efforts jump; steps end there [s]. By default they
       are those of its fields: of a reference, or of a function of time.
     - `check(linkage, ts)`: raises ValueError if the element does not fit the arm;
-      `simulate` calls it where values are known.
+      `simulate` calls it for words after a motion that failed.
     - `potential_energy(q, linkage)`: energy that it stores, () [J]; by default None.
 
     An element with a state is a `StatefulElement`, one that moves masses is an

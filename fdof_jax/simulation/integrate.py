@@ -205,20 +205,17 @@ def _differentiable(solver: Any, adjoint: diffrax.AbstractAdjoint) -> Any:
 def _valid(inputs, padded: bool) -> tuple[Array, Array, tuple[Array, Array]]:
     """Returns whether the inputs are valid, and their times and start.
 
-    Traced values were not checked before, so the result reports invalid ones. They are
-    replaced by harmless values, because derivatives of NaN would spoil those of arrays
-    that other lanes share.
+    The result reports invalid ones. They are replaced by harmless values, because
+    derivatives of NaN would spoil those of arrays that other lanes share.
     """
-    linkage, state0, asked, _, forces = inputs
-    if padded:  # a plain call has checked them
-        q0, qd0 = (without_fixed(linkage, a) for a in state0)
-        return jnp.array(True), asked, (q0, qd0)
-    growth = jnp.diff(asked)
-    increasing = ((growth > 0) & (growth < jnp.inf)).all()
-    harmless = 1e-3 * jnp.arange(len(asked), dtype=asked.dtype)
-    ts = jnp.where(increasing, asked, harmless)
+    linkage, state0, ts, _, forces = inputs
     finite = (jnp.isfinite(state0.q) & jnp.isfinite(state0.qd)).all()
-    valid = possible(linkage) & increasing & finite
+    valid = possible(linkage) & finite
+    if not padded:  # a plain call has checked them
+        growth = jnp.diff(ts)
+        increasing = ((growth > 0) & (growth < jnp.inf)).all()
+        harmless = 1e-3 * jnp.arange(len(ts), dtype=ts.dtype)
+        ts, valid = jnp.where(increasing, ts, harmless), valid & increasing
     for element in forces:
         valid = valid & element.possible()
         valid = valid & constant(element).fits(*constant((linkage, ts)))

@@ -95,13 +95,24 @@ def solve_options(
     )
 
 
-def check_elements(forces: Forces, linkage: Linkage, ts: Array) -> None:
-    """Checks the elements' values, where known, and runs their own checks."""
-    for index, element in enumerate(elements_on(linkage, forces)):
-        place, values = f"forces[{index}]", in_numpy(element)
-        if (jumps := values.jump_ts) is not None:
+def elements_at_door(linkage: Linkage, forces: Forces) -> tuple[Element, ...]:
+    """Returns forces as elements of full size; their values are not looked at.
+
+    Raises ValueError for other shapes and kinds, and warns of single precision.
+    """
+    adapted = elements_on(linkage, forces)
+    for index, element in enumerate(adapted):
+        place = f"forces[{index}]"
+        if (jumps := in_numpy(element).jump_ts) is not None:
             real_array(f"{place}.jump_ts", jumps, (None,) if np.ndim(jumps) else ())
         single_precision(place, element)
+    return of_full_size(linkage, adapted)
+
+
+def check_elements(forces: Forces, linkage: Linkage, ts: Array) -> None:
+    """Raises ValueError for known values of elements, and elements that do not fit."""
+    for index, element in enumerate(elements_at_door(linkage, forces)):
+        place, values = f"forces[{index}]", in_numpy(element)
         if is_traced(linkage, ts, element):
             continue
         check_values(place, element)  # `equinox.tree_at` bypasses the constructor
@@ -112,6 +123,21 @@ def check_elements(forces: Forces, linkage: Linkage, ts: Array) -> None:
                 f"{place}: expected values that its constructor accepts, got "
                 f"{plain(eqx.tree_pformat(element, short_arrays=False))}."
             )
+
+
+def check_start(
+    forces: tuple[Element, ...], linkage: Linkage, state0: State, ts: Array
+) -> None:
+    """Raises ValueError unless known prescribed joints start at their reference."""
+    motion = prescribed(forces)
+    if motion is None or is_traced(linkage, state0, ts, motion):
+        return
+    if not agrees(forces, ts[0], jnp.asarray(state0.q), linkage):
+        begin, _ = motion.at(ts[0], linkage)
+        raise ValueError(
+            f"state0.q: expected {begin.tolist()} at the joints whose motion is "
+            f"prescribed, got {np.asarray(state0.q).tolist()}."
+        )
 
 
 @accepts_scene
@@ -164,8 +190,8 @@ def simulate(
     **Returns:** a `Solution`. With `throw=False` its `result` reports a failed solve,
     and states that were not reached are NaN.
 
-    **Raises:** ValueError for malformed arguments; whatever the force elements' own
-    `check(linkage, ts)` raises; with `throw=True` a RuntimeError if the solve fails.
+    **Raises:** ValueError for malformed arguments; with `throw=True`, if the solve
+    fails, what the force elements' own `check(linkage, ts)` raises, or a RuntimeError.
     Warns in float32 if the tolerance cannot be met.
 
     >>> import fdof_jax as fj
@@ -181,7 +207,7 @@ def simulate(
     state0 = real_state("state0", state0, linkage)
     ts = real_array("ts", ts, (None,), of="times, for instance [0, 2.0]")
     increasing("ts", ts)
-    forces = elements("forces", forces)
+    elements("forces", forces)
     keywords = solve_options(
         solver=solver,
         rtol=rtol,
@@ -194,16 +220,8 @@ def simulate(
         throw=throw,
         progress_meter=progress_meter,
     )
-    check_elements(forces, linkage, ts)
-    forces = of_full_size(linkage, forces)
-    motion = prescribed(forces)
-    if motion is not None and not is_traced(linkage, state0, ts, motion):
-        if not agrees(forces, np.asarray(ts)[0], jnp.asarray(state0.q), linkage):
-            begin, _ = motion.at(ts[0], linkage)
-            raise ValueError(
-                f"state0.q: expected {begin.tolist()} at the joints whose motion is "
-                f"prescribed, got {np.asarray(state0.q).tolist()}."
-            )
+    forces = elements_at_door(linkage, forces)
+    prescribed(forces)  # refuses several
     if own0 is not None:
         check_own("own0", own0, forces, linkage, ())
     inputs = linkage, state0, ts, own0, forces
@@ -232,6 +250,8 @@ def simulate(
             ) from error
         raise
     if throw and not succeeded:
+        check_elements(forces, linkage, ts)
+        check_start(forces, linkage, state0, ts)
         reached = float(solution.stats["time_reached"])
         why = cause(inputs, keywords, solution)
         raise RuntimeError(f"simulate: {solution.outcome} at t = {reached:g} s. {why}")
