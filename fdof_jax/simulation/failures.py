@@ -20,6 +20,7 @@ from .field import (
     whole,
     with_states,
 )
+from .integrate import Inputs
 from .prescribed import formulation
 from .solution import OUTCOMES, Solution
 from .solve import solve
@@ -50,7 +51,7 @@ def reason(outcome: str) -> str:
     return _REASONS.get(outcome, "The method itself failed.")
 
 
-def cause(inputs: tuple[Any, ...], keywords: dict[str, Any], solution: Solution) -> str:
+def cause(inputs: Inputs, keywords: dict[str, Any], solution: Solution) -> str:
     """Returns what is known about a failed solve, in a sentence."""
     linkage, (q, qd), ts, own0, forces = inputs
     outcome = str(solution.outcome)
@@ -65,9 +66,9 @@ def cause(inputs: tuple[Any, ...], keywords: dict[str, Any], solution: Solution)
     return reason(outcome)
 
 
-def _of_steps(inputs, keywords, solution: Solution) -> str:
+def _of_steps(inputs: Inputs, keywords, solution: Solution) -> str:
     """Compares the steps of a motion with the fastest mode where it stopped."""
-    linkage, state0, ts, own0, forces = inputs
+    linkage, _, ts, _, forces = inputs
     steps = int(solution.stats["num_steps"])
     covered = float(solution.stats["time_reached"] - ts[0])
     if covered == 0:
@@ -76,8 +77,8 @@ def _of_steps(inputs, keywords, solution: Solution) -> str:
     # A little earlier, as rounding may shift the last step.
     share = 1 - 1e3 * float(jnp.finfo(ts.dtype).eps)
     before = jnp.stack([ts[0], ts[0] + share * covered])
-    again, _ = solve((linkage, state0, before, own0, forces), keywords)
-    last = jax.tree.map(lambda rows: rows[-1], (again.q, again.qd, again.own))
+    motion, _ = solve(inputs._replace(ts=before), keywords)
+    last = jax.tree.map(lambda rows: rows[-1], (motion.q, motion.qd, motion.own))
     fastest = _fastest_mode(linkage, forces, before[-1], *last)
     rate, grows = abs(fastest), fastest.real > abs(fastest) / 2
     implicit = isinstance(keywords["solver"], diffrax.AbstractImplicitSolver)

@@ -13,8 +13,9 @@ import jax.numpy as jnp
 from jax import Array
 
 from ..base.checks import shown
+from ..forces.element import Element
 from ..forces.joints import EffortHistory
-from ..linkage.linkage import possible, without_fixed
+from ..linkage.linkage import Linkage, possible, without_fixed
 from ..steps.controllers import with_judge
 from ..steps.derivative_control import OfLinearised, OfTangents
 from ..steps.dopri8 import ScheduledDopri8, ScheduledTerm, constant
@@ -30,18 +31,31 @@ from .prescribed import agrees, formulation
 from .solution import Solution
 
 
+class Inputs(NamedTuple):
+    """What determines a motion, as `simulate` gets it.
+
+    `own0`: initial states of the elements, or None for their defaults.
+    """
+
+    linkage: Linkage
+    state0: Any  # a State of arrays
+    ts: Array
+    own0: tuple[Any, ...] | None
+    forces: tuple[Element, ...]
+
+
 class _Problem(NamedTuple):
     """What is integrated.
 
     - `valid`: whether the inputs were; otherwise harmless ones replace them.
-    - `ts`: output times of the solve; `given`: positions and velocities at the first.
+    - `ts`: output times of the solve; `first`: positions and velocities at the first.
     - `start`: the integrated state there; `term`, `args`: its equations.
     - `joints(t, y)`: reads positions, velocities and the elements' own states.
     """
 
     valid: Array
     ts: Array
-    given: tuple[Array, Array]
+    first: tuple[Array, Array]
     start: Any
     term: ScheduledTerm
     args: Any
@@ -58,8 +72,8 @@ class _Control(NamedTuple):
 
 
 def integrate(
-    inputs,
-    keywords,
+    inputs: Inputs,
+    keywords: dict[str, Any],
     derivatives: bool = False,
     padded: bool = False,
     tangents: bool = False,
@@ -76,7 +90,7 @@ def integrate(
     return _read(inputs, problem, _solve(problem, control, keywords))
 
 
-def _prepare(inputs, derivatives: bool, padded: bool) -> _Problem:
+def _prepare(inputs: Inputs, derivatives: bool, padded: bool) -> _Problem:
     """States the equations and their start."""
     linkage, _, _, own0, forces = inputs
     valid, ts, (q0, qd0) = _valid(inputs, padded)
@@ -106,8 +120,8 @@ def _control(
     solver: Any = _differentiable(
         keywords["solver"] or LoopedDopri8(), keywords["adjoint"]
     )
-    given = keywords["stepsize_controller"]
-    steps, (_, ts, _, start, term, args, _) = given or default_controller(), problem
+    users = keywords["stepsize_controller"]
+    steps, (_, ts, _, start, term, args, _) = users or default_controller(), problem
     if not isinstance(steps, diffrax.AbstractAdaptiveStepSizeController):
         # Fixed steps may pass over the kinks of a history, but over no jump.
         if known_times(args, EffortHistory) is not None:
@@ -119,7 +133,7 @@ def _control(
     jumps = known_times(args)
     implicit = isinstance(solver, diffrax.AbstractImplicitSolver)
     kind: Any = LocatedImplicit if implicit else Located
-    locate = lambda *found: kind(*found, derivatives)
+    locate = lambda *settings: kind(*settings, derivatives)
     seeing, landing, start = located(locate, solver, term, ts, start, args, jumps)
     scheduled = isinstance(solver, ScheduledDopri8)  # it checks the health itself
     judge = None
@@ -127,9 +141,9 @@ def _control(
         judge = OfTangents()
     # With tolerances of one's own, an implicit solver is for modes too fast to resolve,
     # which a probe would resolve.
-    elif derivatives and not (implicit and given is not None):
-        known = isinstance(solver, ScheduledDopri8 | diffrax.AbstractRungeKutta)
-        tableau: Any = solver.tableau if known else diffrax.Heun.tableau
+    elif derivatives and not (implicit and users is not None):
+        has_tableau = isinstance(solver, ScheduledDopri8 | diffrax.AbstractRungeKutta)
+        tableau: Any = solver.tableau if has_tableau else diffrax.Heun.tableau
         judge = OfLinearised(term, tableau)
     control = lambda steps: StepControl(steps, term, not scheduled, landing, judge)  # pyright: ignore[reportCallIssue]
     return _Control(start, seeing, with_judge(control, steps), jumps)
@@ -161,9 +175,9 @@ def _solve(problem: _Problem, control: _Control, keywords) -> diffrax.Solution:
         )
 
 
-def _read(inputs, problem: _Problem, solve: diffrax.Solution) -> Solution:
+def _read(inputs: Inputs, problem: _Problem, solve: diffrax.Solution) -> Solution:
     """Reads joint states, statistics and the result."""
-    linkage, state0, asked, *_ = inputs
+    linkage, state0, times, *_ = inputs
     valid, ts = problem.valid, problem.ts
     assert solve.ys is not None  # because of saveat
     states, (reached, *switches) = solve.ys
@@ -174,20 +188,21 @@ def _read(inputs, problem: _Problem, solve: diffrax.Solution) -> Solution:
         return jnp.where(jnp.isinf(a) | ~valid, jnp.nan, a)
 
     # diffrax saves the start only with the first step.
-    asked_start = (without_fixed(linkage, value) for value in state0)
-    first = (jnp.where(valid, a, b) for a, b in zip(problem.given, asked_start))
+    start = (without_fixed(linkage, value) for value in state0)
+    first = (jnp.where(valid, a, b) for a, b in zip(problem.first, start))
     q, qd = (shown_at(rows).at[0].set(row) for rows, row in zip((q, qd), first))
     # Constant steps go on when the state is no longer finite.
     reached = jnp.minimum(reached[0], ts[-1])
-    lost = (ts <= reached) & ~jnp.isfinite(q + qd).all(axis=1)
-    reached = jnp.where(lost.any(), ts[jnp.argmax(lost) - 1], reached)
-    stats = solve.stats | {"time_reached": jnp.where(valid, reached, asked[0])}
+    not_finite = (ts <= reached) & ~jnp.isfinite(q + qd).all(axis=1)
+    last_finite = ts[jnp.argmax(not_finite) - 1]
+    reached = jnp.where(not_finite.any(), last_finite, reached)
+    stats = solve.stats | {"time_reached": jnp.where(valid, reached, times[0])}
     if solve.controller_state is not None:
         loss = largest_loss(solve.controller_state)
         stats["accuracy"] = jnp.finfo(q.dtype).eps * loss
     stats |= switching_facts(*switches)
     result = _judged(valid, solve.result, q, qd)
-    return Solution(asked, q, qd, stats, result, jax.tree.map(shown_at, own))
+    return Solution(times, q, qd, stats, result, jax.tree.map(shown_at, own))
 
 
 def _differentiable(solver: Any, adjoint: diffrax.AbstractAdjoint) -> Any:
@@ -202,7 +217,7 @@ def _differentiable(solver: Any, adjoint: diffrax.AbstractAdjoint) -> Any:
     return eqx.tree_at(lambda s: s.scan_kind, solver, kind, is_leaf=lambda x: x is None)
 
 
-def _valid(inputs, padded: bool) -> tuple[Array, Array, tuple[Array, Array]]:
+def _valid(inputs: Inputs, padded: bool) -> tuple[Array, Array, tuple[Array, Array]]:
     """Returns whether the inputs are valid, and their times and start.
 
     The result reports invalid ones. They are replaced by harmless values, because
@@ -228,6 +243,6 @@ def _judged(valid: Array, result: Any, q: Array, qd: Array) -> Any:
     """Returns the result of a solve: not finite for invalid inputs and for NaN."""
     results: Any = diffrax.RESULTS
     # Constant steps, if too long, end in NaN and still report success.
-    lost = ~(jnp.isfinite(q[-1]) & jnp.isfinite(qd[-1])).all()
-    lost = lost & (result == results.successful)
-    return results.where(valid & ~lost, result, results.nonfinite)
+    finite = (jnp.isfinite(q[-1]) & jnp.isfinite(qd[-1])).all()
+    finite = finite | (result != results.successful)
+    return results.where(valid & finite, result, results.nonfinite)

@@ -35,6 +35,7 @@ from ..linkage.linkage import Linkage, check_linkage, possible
 from ..steps.tolerances import at_tolerances, with_longest, within_reach
 from .failures import cause, check_arguments, reason
 from .field import initial_states
+from .integrate import Inputs
 from .prescribed import agrees, prescribed
 from .scene import accepts_scene
 from .solution import OUTCOMES, Solution, outcome_numbers
@@ -224,7 +225,7 @@ def simulate(
     prescribed(forces)  # refuses several
     if own0 is not None:
         check_own("own0", own0, forces, linkage, ())
-    inputs = linkage, state0, ts, own0, forces
+    inputs = Inputs(linkage, state0, ts, own0, forces)
     try:
         solution, succeeded = solve(inputs, keywords)
         if succeeded is None:
@@ -258,14 +259,14 @@ def simulate(
     return solution
 
 
-def _raising(solution: Solution, inputs: tuple[Any, ...]) -> Solution:
+def _raising(solution: Solution, inputs: Inputs) -> Solution:
     """Adds run-time errors for bad values and failures to a traced solution."""
     accepted = "expected values that its constructor accepts"
     messages = [
         "simulate: ts: expected finite, increasing times.",
         "simulate: state0: expected finite numbers.",
         f"simulate: linkage: {accepted}.",
-        *(f"simulate: forces[{k}]: {accepted}." for k in range(len(inputs[-1]))),
+        *(f"simulate: forces[{k}]: {accepted}." for k in range(len(inputs.forces))),
     ]
     faults = _faults(inputs)
     failed = solution.result != diffrax.RESULTS.successful
@@ -284,7 +285,7 @@ def _raising(solution: Solution, inputs: tuple[Any, ...]) -> Solution:
 
 
 @eqx.filter_jit  # one program where each of its operations would be one
-def _faults(inputs: tuple[Any, ...]) -> Array:
+def _faults(inputs: Inputs) -> Array:
     """Returns whether times, start, linkage and each force have bad values."""
     linkage, state0, ts, _, forces = inputs
     growth = jnp.diff(ts)
@@ -303,10 +304,11 @@ def check_own(
     """Raises ValueError unless `own` holds rows of the stateful elements' states."""
     expected = jax.eval_shape(lambda: initial_states(linkage, forces))
     shapes = jax.tree.map(lambda leaf: (*rows, *leaf.shape), expected)
-    found = jax.tree.map(jnp.shape, own)
+    own_shapes = jax.tree.map(jnp.shape, own)
     # The shape of a number is (), as the states of no elements are.
-    if jax.tree.structure(own) != jax.tree.structure(expected) or found != shapes:
+    alike = jax.tree.structure(own) == jax.tree.structure(expected)
+    if not alike or own_shapes != shapes:
         raise ValueError(
             f"{name}: expected the states of the forces' elements, of shapes {shapes}, "
-            f"got {found}."
+            f"got {own_shapes}."
         )

@@ -19,22 +19,22 @@ from ..steps.controllers import with_pid
 from ..steps.derivative_control import TANGENTS
 from ..steps.tolerances import default_controller
 from ..steps.unrolled_dopri8 import UnrolledDopri8
-from .integrate import integrate
+from .integrate import Inputs, integrate
 from .padding import cut, padded
 from .prescribed import prescribed
 from .solution import Solution
 
 
-def solve(inputs, keywords) -> tuple[Solution, bool | None]:
+def solve(inputs: Inputs, keywords) -> tuple[Solution, bool | None]:
     """Computes a motion, and whether it succeeded: None within transformations."""
     # A new constant is traced only inside `jax.jit`, where a program of its own would
     # also be traced without derivatives.
     if is_traced(jax.device_put(np.zeros(()))):
         # Within `vmap` even a tracer may hold a NumPy array, which rules of derivatives
         # refuse in JAX 0.10.
-        known = jax.Array, np.ndarray, np.generic
+        arrays = jax.Array, np.ndarray, np.generic
         inputs = jax.tree.map(
-            lambda x: jax.device_put(x) if isinstance(x, known) else x, inputs
+            lambda x: jax.device_put(x) if isinstance(x, arrays) else x, inputs
         )
         return _solve(inputs, keywords), None
     one = None if is_traced(inputs, keywords) else _solve_one(inputs, keywords)
@@ -42,13 +42,12 @@ def solve(inputs, keywords) -> tuple[Solution, bool | None]:
 
 
 @jax.transfer_guard("allow")  # the padded times are in NumPy
-def _solve_one(inputs, keywords) -> tuple[Solution, bool] | None:
+def _solve_one(inputs: Inputs, keywords) -> tuple[Solution, bool] | None:
     """Computes the motion of one arm from concrete inputs, and whether it succeeded.
 
     Returns None if a force element holds a traced value.
     """
-    linkage, state0, ts, own0, forces = inputs
-    keywords = _of_any_tolerance(keywords)
+    ts, keywords = inputs.ts, _of_any_tolerance(keywords)
     if (most := keywords["max_steps"]) is not None:
         # As data, of which programs know none.
         keywords |= {"max_steps": np.int32(most)}
@@ -56,19 +55,18 @@ def _solve_one(inputs, keywords) -> tuple[Solution, bool] | None:
     def run(forces):
         if is_traced(forces):  # by the closure of a function
             return None, None
-        known = linkage, state0, padded(ts), own0, forces
+        longer = inputs._replace(ts=padded(ts), forces=forces)
         # Another function's closure may hold one too, and JAX refuses options then.
-        closed = any(map(callable, jax.tree.leaves(forces)))
-        solve = _with_functions if closed else _without_functions
-        return solve(known, keywords)
+        functions = any(map(callable, jax.tree.leaves(forces)))
+        solve = _with_functions if functions else _without_functions
+        return solve(longer, keywords)
 
-    solution, succeeded = sharing_functions(run, forces=forces)
+    solution, succeeded = sharing_functions(run, forces=inputs.forces)
     if solution is None or is_traced(solution):
         return None
     q, qd, own = cut((solution.q, solution.qd, solution.own), len(ts))
     stats = solution.stats | {"max_steps": most}
-    whole = Solution(ts, q, qd, stats, solution.result, own)
-    return whole, bool(succeeded)
+    return Solution(ts, q, qd, stats, solution.result, own), bool(succeeded)
 
 
 def _of_any_tolerance(keywords):
@@ -79,15 +77,15 @@ def _of_any_tolerance(keywords):
             return keywords  # which default it gets depends on the solver
         controller = default_controller()
 
-    def opened(pid: diffrax.PIDController) -> diffrax.PIDController:
+    def of_arrays(pid: diffrax.PIDController) -> diffrax.PIDController:
         dtype = jnp.result_type(float)
         rtol, atol = (np.asarray(t, dtype) for t in (pid.rtol, pid.atol))
         return dataclasses.replace(pid, rtol=rtol, atol=atol)
 
-    return keywords | {"stepsize_controller": with_pid(opened, controller)}
+    return keywords | {"stepsize_controller": with_pid(of_arrays, controller)}
 
 
-def _solve_padded(inputs, keywords) -> tuple[Solution, Array]:
+def _solve_padded(inputs: Inputs, keywords) -> tuple[Solution, Array]:
     # The steps are those of the same call with forward-mode derivatives.
     derivatives = isinstance(keywords["adjoint"], diffrax.ForwardMode)
     keywords = keywords | {"adjoint": diffrax.ForwardMode()}
@@ -110,14 +108,14 @@ def _batch_solver(forces: tuple[Element, ...]) -> diffrax.AbstractSolver:
 
 
 @eqx.filter_custom_vjp
-def _integrate_reversibly(inputs, keywords) -> Solution:
+def _integrate_reversibly(inputs: Inputs, keywords) -> Solution:
     """Integrates a motion that may be differentiated by `jax.grad`.
 
     Unrolled stages compile differently with and without derivatives, and the replay of
     the backward pass must reproduce the same bits: they serve the plain solve alone.
     """
     # The plain solve needs no loops for reverse mode, which take longer to compile.
-    solver = keywords["solver"] or _batch_solver(inputs[-1])
+    solver = keywords["solver"] or _batch_solver(inputs.forces)
     return integrate(
         inputs, keywords | {"solver": solver, "adjoint": diffrax.ForwardMode()}
     )
@@ -200,18 +198,17 @@ def _integrate_reversibly_bwd(residuals, cotangent, perturbed, inputs, keywords)
     return whole(jnp.sum(jnp.stack(parts), axis=0))
 
 
-def _opened(inputs):
+def _opened(inputs: Inputs) -> Inputs:
     """Returns the inputs, with the closures of plain functions as leaves."""
-    linkage, state0, ts, own0, forces = inputs
-    arguments = ts[0], *state0, linkage
-    opened = tuple(
+    arguments = inputs.ts[0], *inputs.state0, inputs.linkage
+    forces = tuple(
         element.opened(*arguments) if isinstance(element, ForeignElement) else element
-        for element in forces
+        for element in inputs.forces
     )
-    return linkage, state0, ts, own0, opened
+    return inputs._replace(forces=forces)
 
 
-def _solve(inputs, keywords) -> Solution:
+def _solve(inputs: Inputs, keywords) -> Solution:
     if isinstance(keywords["adjoint"], diffrax.RecursiveCheckpointAdjoint):
         return _integrate_reversibly(_opened(inputs), keywords)
     solution = integrate(inputs, keywords, derivatives=True)
