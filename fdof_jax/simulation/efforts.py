@@ -68,10 +68,12 @@ def joint_efforts(linkage: Linkage, forces: Forces, solution: Motion) -> Efforts
     rows = solution.ts, solution.q, solution.qd, solution.own
     if not is_traced(linkage, forces, rows):
         run = lambda forces: _efforts(linkage, forces, *padded(rows))
-        found = sharing_functions(run, forces=forces)
-        if not is_traced(found):  # by a value in the closure of a function
-            elements = np.asarray(found.elements)[:, : len(solution.ts)]
-            return Efforts(cut(found.total, len(solution.ts)), jax.device_put(elements))
+        efforts = sharing_functions(run, forces=forces)
+        if not is_traced(efforts):  # by a value in the closure of a function
+            elements = np.asarray(efforts.elements)[:, : len(solution.ts)]
+            return Efforts(
+                cut(efforts.total, len(solution.ts)), jax.device_put(elements)
+            )
     return _efforts(linkage, forces, *rows)
 
 

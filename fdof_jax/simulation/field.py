@@ -221,10 +221,12 @@ def _switched_effort(
         f"forces[{index}]: expected it to return tau, an array of {len(q)} real numbers"
     )
     with naming(f"forces[{index}]"), switches.dealt():
-        found: Any = element.act(t, q, qd, linkage, state)
-    if not isinstance(found, tuple) or len(found) != 2:
-        raise ValueError(f"{expected}, and the rate of its state, got {_shown(found)}.")
-    tau, rate = found
+        answer: Any = element.act(t, q, qd, linkage, state)
+    if not isinstance(answer, tuple) or len(answer) != 2:
+        raise ValueError(
+            f"{expected}, and the rate of its state, got {_shown(answer)}."
+        )
+    tau, rate = answer
     if jax.tree.map(jnp.shape, rate) != jax.tree.map(jnp.shape, state):
         raise ValueError(
             f"forces[{index}]: expected the rate of its state to be like the state, "

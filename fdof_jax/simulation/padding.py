@@ -14,11 +14,11 @@ def padded(rows: Any) -> Any:
     """Returns arrays (time, ...) with their last row repeated up to a power of two."""
 
     def longer(row: ArrayLike) -> np.ndarray:
-        known = np.asarray(row)
-        count = len(known)
+        array = np.asarray(row)
+        count = len(array)
         size = max(_FEWEST_TIMES, 1 << (count - 1).bit_length())
-        others = ((0, 0),) * (known.ndim - 1)
-        return np.pad(known, ((0, size - count), *others), mode="edge")
+        others = ((0, 0),) * (array.ndim - 1)
+        return np.pad(array, ((0, size - count), *others), mode="edge")
 
     return jax.tree.map(longer, rows)
 

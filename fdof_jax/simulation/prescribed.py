@@ -104,12 +104,12 @@ class PrescribedMotion(Element):
 
 def prescribed(forces: Forces) -> PrescribedMotion | None:
     """Returns the `PrescribedMotion` among the elements, or None."""
-    found = [e for e in forces if isinstance(e, PrescribedMotion)]
-    if len(found) > 1:
+    motions = [e for e in forces if isinstance(e, PrescribedMotion)]
+    if len(motions) > 1:
         raise ValueError(
-            f"forces: expected one PrescribedMotion at most, got {len(found)}."
+            f"forces: expected one PrescribedMotion at most, got {len(motions)}."
         )
-    return found[0] if found else None
+    return motions[0] if motions else None
 
 
 def agrees(forces: Forces, t: Array, q: Array, linkage: Linkage) -> Any:
@@ -127,11 +127,11 @@ def _mass_and_bias(args: Args, q: Array, qd: Array) -> tuple[Array, Array]:
     return mass_and_bias(args.linkage, args.forces, q, qd, start)
 
 
-def _split(moved: Array, matrix: Array, known: Array, right: Array) -> Array:
+def _split(moved: Array, matrix: Array, given: Array, right: Array) -> Array:
     """Solves the rows of the driven joints, given those of the prescribed ones."""
     free = jnp.where(jnp.outer(~moved, ~moved), matrix, jnp.eye(len(moved)))
-    known = jnp.where(moved, known, 0)
-    return jnp.linalg.solve(free, jnp.where(moved, known, right - matrix @ known))
+    given = jnp.where(moved, given, 0)
+    return jnp.linalg.solve(free, jnp.where(moved, given, right - matrix @ given))
 
 
 class Formulation(NamedTuple):
@@ -188,10 +188,10 @@ def _hybrid_field(t, y, args, schedule) -> tuple[Any, ...]:
     The rate of the momenta is M' qd - bias + tau, where M' is the mass matrix's rate.
     """
     motion, (q, qd) = _motion(args), _hybrid_joints(args, t, y)
-    moving = tuple(q - args.q0), tuple(qd)
-    tau, own_rates, _ = applied(t, (*moving, *y[2:]), args, schedule)
+    displaced = tuple(q - args.q0), tuple(qd)
+    tau, own_rates, _ = applied(t, (*displaced, *y[2:]), args, schedule)
     # The efforts already include the bias of masses that elements move.
-    bias = jnp.stack(equations(args.constants, *moving).bias)
+    bias = jnp.stack(equations(args.constants, *displaced).bias)
     momenta = lambda q: _mass_and_bias(args, q, jnp.zeros_like(q))[0] @ qd
     _, change = jax.jvp(momenta, (q,), (qd,))
     moved, change = motion.of(args.linkage), change - bias + jnp.stack(tau)

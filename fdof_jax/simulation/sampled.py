@@ -37,8 +37,8 @@ class _Held(ScalarElement):
     tau: Float[Array, "sample joint"]
 
     def schedule(self, t, linkage):
-        begun = jnp.searchsorted(self.begin, t, side="right", method="scan_unrolled")
-        return tuple(jnp.where(begun > 0, self.tau[begun - 1], 0))
+        count = jnp.searchsorted(self.begin, t, side="right", method="scan_unrolled")
+        return tuple(jnp.where(count > 0, self.tau[count - 1], 0))
 
     def respond(self, scheduled, q, qd, linkage):
         return scheduled
@@ -192,12 +192,12 @@ def simulate_sampled(
     every = real_array("period", period, (), above=0)
     t0 = real_array("t0", t0, ())
     whole_number("samples", samples, 1)
-    late = real_array("delay", delay, (), minimum=0)
+    lag = real_array("delay", delay, (), minimum=0)
     # Within `jax.jit`, arrays made of known numbers are traced.
-    known, longest = concrete(delay), concrete(period)
-    if known is not None and longest is not None and not known < longest:
+    known_delay, longest = concrete(delay), concrete(period)
+    if known_delay is not None and longest is not None and not known_delay < longest:
         raise ValueError(
-            f"delay: expected less than the period of {longest} s, got {known} s."
+            f"delay: expected less than the period of {longest} s, got {known_delay} s."
         )
     if (noise is None) != (key is None):
         raise ValueError("noise, key: expected both or none of them, got one.")
@@ -217,17 +217,17 @@ def simulate_sampled(
     state0 = real_state("state0", state0, linkage)
     times = t0 + every * jnp.arange(samples + 1)
     check_elements((control, *forces), linkage, times)
-    late = None if known is not None and known == 0 else late
+    lag = None if known_delay is not None and known_delay == 0 else lag
     keys = None if key is None else jax.random.split(key, samples)
     options = dict(throw=False) | options
-    inputs = linkage, state0, control, times, forces, late, spread, keys
+    inputs = linkage, state0, control, times, forces, lag, spread, keys
     if options.get("solver") is None and not is_traced(inputs):
         # Traced in `_motion`, `simulate` would take the solver of large batches.
         options["solver"] = LoopedDopri8()
 
     def run(control, forces):
-        rest = late, spread, keys, options
-        return _motion(linkage, state0, control, times, forces, *rest)
+        others = lag, spread, keys, options
+        return _motion(linkage, state0, control, times, forces, *others)
 
     return sharing_functions(run, control=control, forces=forces)
 
@@ -243,16 +243,16 @@ def _motion(
     def one(carry, inputs):
         (state, own), memory, held, result = carry
         begin, end, key = inputs
-        seen = state
+        measured = state
         if spread is not None:
-            seen = jax.tree.map(
+            measured = jax.tree.map(
                 lambda value, size, key: (
                     value + size * jax.random.normal(key, size.shape)
                 ),
                 *(state, spread, State(*jax.random.split(key))),
             )
-        tau, rates = control.act(begin, *seen, linkage, memory)
-        tau = without_fixed(linkage, real_array("control", tau, seen.q.shape))
+        tau, rates = control.act(begin, *measured, linkage, memory)
+        tau = without_fixed(linkage, real_array("control", tau, measured.q.shape))
         memory = jax.tree.map(lambda m, rate: m + period * rate, memory, rates)
         effort, at = JointEffort(tau), [begin, end]
         if delay is not None:
@@ -264,12 +264,12 @@ def _motion(
         acting = *forces, effort
         solution = simulate(linkage, state, jnp.stack(at), acting, own0=own, **options)
         rows = State(solution.q, solution.qd), solution.own
-        begun = jax.tree.map(lambda rows: rows[0], rows)
+        starts = jax.tree.map(lambda rows: rows[0], rows)
         last = jax.tree.map(lambda rows: rows[-1], rows)
         good = result == diffrax.RESULTS.successful
         result = diffrax.RESULTS.where(good, solution.result, result)
         acts = None if delay is None else solution.q[1]
-        return (last, memory, tau, result), (begun, tau, acts)
+        return (last, memory, tau, result), (starts, tau, acts)
 
     own0 = initial_states(linkage, forces), control.initial_state(linkage)
     own0, memory0 = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), own0)
@@ -277,12 +277,12 @@ def _motion(
     if delay is not None:
         held = jnp.where(delay < period, held, jnp.nan)
     first = jax.tree.map(jnp.asarray, state0), own0
-    (last, *_, result), (begun, tau, acts) = jax.lax.scan(
+    (last, *_, result), (starts, tau, acts) = jax.lax.scan(
         one,
         (first, memory0, held, diffrax.RESULTS.successful),
         (times[:-1], times[1:], keys),
     )
-    rows = lambda begun, last: jnp.concatenate([begun, last[None]])
-    (q, qd), own = jax.tree.map(rows, begun, last)
-    late = 0.0 if delay is None else delay
-    return SampledMotion(times, q, qd, tau, result, own, late, acts)
+    rows = lambda starts, last: jnp.concatenate([starts, last[None]])
+    (q, qd), own = jax.tree.map(rows, starts, last)
+    lag = 0.0 if delay is None else delay
+    return SampledMotion(times, q, qd, tau, result, own, lag, acts)

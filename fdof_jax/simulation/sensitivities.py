@@ -67,24 +67,24 @@ class _LocatedRows(Located):
     def needed(self, count, jumps):
         return count > 0 or jumps is not None
 
-    def shifted(self, term, t, y, args, known, made_jump):
+    def shifted(self, term, t, y, args, switching, made_jump):
         if not (self.jumping or self.jumps is not None):
             return y
-        (rows,), time = y, known.until
-        before, after = known.sides, args.sides
+        (rows,), time = y, switching.until
+        before, after = switching.sides, args.sides
 
-        def moved():
+        def after_jump():
             switched = before != after
             first = first_of(switched)
             between, others = jnp.where(first, after, before), switched & ~first
             # A known time may be here too, before the switches or after them.
-            ahead = known.ahead > 0
+            ahead = switching.ahead > 0
             when, beside = jnp.where(ahead, t, time), jnp.where(ahead, before, after)
             times = jnp.stack([time, t, when, when, when])
             sides = jnp.stack([beside, beside, before, between, after])
             rates = jax.vmap(self.rates, in_axes=(0, None, None, 0))
             rates = rates(times, rows[0], args.z, sides)
-            late = jnp.zeros(self.count, rows.dtype)  # of the known time
+            late = jnp.zeros(self.count, rows.dtype)  # the known time
             if self.jumps is not None and self.slopes is not None:
                 distance = jnp.abs(time - self.jumps)
                 index = jnp.argmin(distance)
@@ -100,18 +100,18 @@ class _LocatedRows(Located):
                 _, change = jax.linearize(values, when, rows[0], args.z)
                 slopes = change(jnp.ones_like(t), rates[2], jnp.zeros_like(args.z))
                 in_z = lambda row, z: change(jnp.zeros_like(t), row, z)
-                seen = rows[1:] + jnp.where(ahead, gain, 0)
-                changes = jax.vmap(in_z)(seen, jnp.eye(self.count))
+                arrived = rows[1:] + jnp.where(ahead, gain, 0)
+                changes = jax.vmap(in_z)(arrived, jnp.eye(self.count))
                 # In a step of no length nothing comes to its zero: it has jumped, at a
                 # known time.
                 some = jnp.stack([first.any(), others.any()])
-                steep = some & (known.length > 0) & (slopes != 0)
+                steep = some & (switching.length > 0) & (slopes != 0)
                 of_zeros = -changes / jnp.where(steep, slopes, 1)[None]
-                lates = jnp.where(steep[None], of_zeros, late[:, None])
-                gain += lates @ (rates[2:4] - rates[3:])
+                times = jnp.where(steep[None], of_zeros, late[:, None])
+                gain += times @ (rates[2:4] - rates[3:])
             return rows.at[1:].add(gain)
 
-        return (jax.lax.cond(made_jump, moved, lambda: rows),)
+        return (jax.lax.cond(made_jump, after_jump, lambda: rows),)
 
 
 def _largest(y: tuple[Array]) -> Array:
@@ -190,14 +190,14 @@ def sensitivities(
     term = _Term(field, switches_of)  # pyright: ignore[reportArgumentType, reportCallIssue]
     jumps, slopes = times_of(z), jax.jacfwd(times_of)(z)
     y0 = (jnp.concatenate([start[None], jax.vmap(along)(directions)]),)
-    rest = True, z.size, rates, jumps, slopes
-    locate = lambda *known: _LocatedRows(*known, *rest)  # pyright: ignore[reportCallIssue]
+    of_rows = True, z.size, rates, jumps, slopes
+    locate = lambda *settings: _LocatedRows(*settings, *of_rows)  # pyright: ignore[reportCallIssue]
     # A method of few stages, because much of the work lies outside of them; as a loop
     # that `next_motion` can differentiate again.
     solver = diffrax.Tsit5(scan_kind="lax")
     solver, landing, y0 = located(locate, solver, term, ts, y0, _Varied(z), jumps)
     controller = StepControl(controller, None, False, landing, None)  # pyright: ignore[reportCallIssue]
-    found = diffeqsolve(
+    raw = diffeqsolve(
         term,
         solver,
         t0=ts[0],
@@ -211,14 +211,14 @@ def sensitivities(
         max_steps=65536,
         throw=False,
     )
-    assert found.ys is not None  # because of saveat
+    assert raw.ys is not None  # because of saveat
     # diffrax leaves infinity at times that it did not reach.
-    states = jnp.where(jnp.isinf(found.ys), jnp.nan, found.ys)
+    states = jnp.where(jnp.isinf(raw.ys), jnp.nan, raw.ys)
 
     def judged(z, rows):
         scene = scene_at(z)
         q, qd, own = jax.vmap(observed, in_axes=(None, 0, 0))(z, ts, rows)
-        solution = Solution(ts, q, qd, found.stats, found.result, own)
+        solution = Solution(ts, q, qd, raw.stats, raw.result, own)
         return residuals(scene, solution), (scene, solution)
 
     value, change, (scene, solution) = jax.linearize(

@@ -46,10 +46,10 @@ def by_square_roots(controller: Any) -> Any:
 
     def without_powers(pid: diffrax.PIDController) -> diffrax.PIDController:
         used = pid.pcoeff, pid.icoeff, pid.dcoeff, pid.error_order
-        known = all(isinstance(number, int | float | None) for number in used)
+        plain = all(isinstance(number, int | float | None) for number in used)
         # Subclasses of a user may have another formula.
         diffrax_rule = type(pid) in (diffrax.PIDController, Shortening)
-        if not (diffrax_rule and known and used == (0, 1, 0, None)):
+        if not (diffrax_rule and plain and used == (0, 1, 0, None)):
             return pid
 
         def norm(error: Any) -> Array:
@@ -168,7 +168,7 @@ class Abreast(Adaptive):
         behind = count < jax.lax.pmax(count, self.axis)
         most = jax.lax.pmean(behind.astype(float), self.axis) >= _MOST
         typical = jnp.where(most & (typical == 0), count, typical)
-        late = (typical > 0) & (count >= _SLACK * typical)
-        spent = late & (result == diffrax.RESULTS.successful)
+        behind_most = (typical > 0) & (count >= _SLACK * typical)
+        spent = behind_most & (result == diffrax.RESULTS.successful)
         result = diffrax.RESULTS.where(spent, diffrax.RESULTS.max_steps_reached, result)
         return *step, (state, count, typical), result

@@ -126,16 +126,16 @@ class OfLinearised(eqx.Module):
         at_end = constant((t1, motion_of(y1), args))
         matrix = constant(t1 - t0) * linearised(self.term, *at_end)
         change, error = self._step(matrix, probe)
-        moved = probe + change
+        end = probe + change
         tolerance = jnp.maximum(_OF_PROBE, _noise(estimate.health))
-        size = jnp.maximum(_largest(probe), _largest(moved))
+        size = jnp.maximum(_largest(probe), _largest(end))
         ratio = _largest(error) / (tolerance * size)
         finite = jnp.isfinite(ratio)
         ratio = constant(jnp.where(finite, ratio, 0))
         # A new one shows again what an unstable mode has come to hide.
-        new = ~finite | (_largest(moved) > _GROWN)
-        moved = moved / jnp.minimum(_largest(moved), 1)
-        return ratio, jnp.where(new, self.start(y1), moved)
+        new = ~finite | (_largest(end) > _GROWN)
+        end = end / jnp.minimum(_largest(end), 1)
+        return ratio, jnp.where(new, self.start(y1), end)
 
     def _step(self, matrix: Array, probe: Array) -> tuple[Array, Array]:
         """Returns the change of y' = A y in a step of length h from y, and its error.

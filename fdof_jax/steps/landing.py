@@ -94,9 +94,9 @@ class Landing(eqx.Module):
         """
         if not self.switches:
             return end, end, end, 0, False
-        known = y[-1]
-        idle = jnp.all(known.after == known.sides)
-        return known.until, known.unseen, known.soon, known.near, idle
+        switching = y[-1]
+        idle = jnp.all(switching.after == switching.sides)
+        return switching.until, switching.unseen, switching.soon, switching.near, idle
 
     def _cut(self, t0: Array, t1: Array, last: Array) -> tuple[Array, Array, Array]:
         """Returns the end of a step, the gap after it, and if it is at a known time."""
@@ -138,8 +138,8 @@ class Landing(eqx.Module):
         begin, end = constant((t0, t1))
         aimed = end == state.target
         until, unseen, soon, near, idle = constant(self._found(y1, end))
-        late = jnp.where(aimed, near, 0)
-        passed = keep & (until < jnp.minimum(end - late, state.last))
+        allowance = jnp.where(aimed, near, 0)
+        passed = keep & (until < jnp.minimum(end - allowance, state.last))
         tiny = (begin < end) & (end - begin <= _APART * self.apart)
         passed = passed & ~(aimed & tiny)  # it ends where the switch is
         # A shorter step sees what may have been passed over.
@@ -150,8 +150,10 @@ class Landing(eqx.Module):
         before = keep & aimed & idle & ~passed & (end < state.crossing)
         stretched = before & (end < soon) & (soon < state.crossing)
         crossed, missed = passed | stretched, before & ~stretched
-        lost = state.tries > _MOST_TRIES
-        until = jnp.where(stretched, soon, jnp.where(lost, (begin + end) / 2, until))
+        hopeless = state.tries > _MOST_TRIES
+        until = jnp.where(
+            stretched, soon, jnp.where(hopeless, (begin + end) / 2, until)
+        )
         landed, keep = keep & aimed & ~crossed, keep & ~crossed
         crossing = jnp.where(keep & ~missed, -jnp.inf, state.crossing)
         crossing = jnp.where(passed, end, crossing)

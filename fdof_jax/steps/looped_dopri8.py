@@ -44,7 +44,7 @@ def _weighted(weights: Array, rates: PyTree) -> PyTree:
 # different rounding leads to different steps and to a wrong gradient.
 @eqx.filter_jit  # traced once, not at each use in a solve
 @eqx.filter_checkpoint
-def _step(term: Any, t0, t1, y0, lost, args):
+def _step(term: Any, t0, t1, y0, residue, args):
     """Takes a step; returns what `diffrax.AbstractSolver.step` does.
 
     The solver's state is the rounding error of `y`, which the next step adds (Kahan).
@@ -68,8 +68,8 @@ def _step(term: Any, t0, t1, y0, lost, args):
     weights = jnp.concatenate([jnp.zeros((1, STAGES), h.dtype), lower])
     stages = jnp.arange(STAGES), times, weights
     rates, (healths, schedule) = jax.lax.scan(stage, rates, stages)
-    change = jtu.tree_map(lambda k, c: h * k + c, _weighted(lower[-1], rates), lost)
-    y, lost = compensated(y0, change)
+    change = jtu.tree_map(lambda k, c: h * k + c, _weighted(lower[-1], rates), residue)
+    y, residue = compensated(y0, change)
     weights = jnp.asarray(TABLEAU.b_error, h.dtype)
     error = jtu.tree_map(lambda k: h * k, _weighted(weights, rates))
     # diffrax overlooks an infinity beside a NaN and finds no next step size.
@@ -81,7 +81,7 @@ def _step(term: Any, t0, t1, y0, lost, args):
     y = jtu.tree_map(lambda a: jnp.where(finite, a, jnp.nan), y)
     error, result = verdict(error, constant(health), h)
     dense_info = dict(y0=y0, step=h, rates=rates, scheduled=schedule)
-    return y, error, dense_info, constant(lost), result
+    return y, error, dense_info, constant(residue), result
 
 
 class _Interpolation(DenseOutput):

@@ -106,14 +106,14 @@ class StepControl(Adaptive):
             inner = jax.tree.map(
                 lambda old, new: jnp.where(resumes, old, new), state.inner, inner
             )
-        kept = lambda new, old: jax.tree.map(
+        if_kept = lambda new, old: jax.tree.map(
             lambda new, old: jnp.where(step.keep, new, old), new, old
         )
         if self.judge is not None:
             jumped, fresh = jnp.array(step.jumped), self.judge.start(y1)
             probe = jax.tree.map(lambda a, b: jnp.where(jumped, a, b), fresh, probe)
-            probe = kept(probe, state.probe)
-        loss = kept(jnp.maximum(state.loss, loss), state.loss)
+            probe = if_kept(probe, state.probe)
+        loss = if_kept(jnp.maximum(state.loss, loss), state.loss)
         failed = failure != diffrax.RESULTS.successful
         result = diffrax.RESULTS.where(failed, failure, step.result)
         state = _State(inner, landing, probe, loss)

@@ -62,14 +62,14 @@ def _rate(function: Any, arrival: Arrival, term: Any) -> Array:
     It is exact, where differences of samples are lost in rounding if steps are short.
     """
     t, y, args, _ = arrival
-    moved = lambda t, y: function(arrival._replace(t=t, y=y), term)
-    return jax.jvp(moved, (t, y), (jnp.ones_like(t), term.vf(t, y, args)))[1]
+    along = lambda t, y: function(arrival._replace(t=t, y=y), term)
+    return jax.jvp(along, (t, y), (jnp.ones_like(t), term.vf(t, y, args)))[1]
 
 
 def _change(function: Any, arrival: Arrival, term: Any, change: Any) -> Array:
     """Returns how a function of an arrival changes with it."""
-    _, found = eqx.filter_jvp(lambda a: function(a, term), (arrival,), (change,))
-    return jnp.zeros_like(arrival.t) if found is None else found
+    _, tangent = eqx.filter_jvp(lambda a: function(a, term), (arrival,), (change,))
+    return jnp.zeros_like(arrival.t) if tangent is None else tangent
 
 
 def _quotient(change: Array, slope: Array) -> Array:
@@ -157,8 +157,8 @@ def _difference(late: Array, moment: Moment, term: Any) -> Any:
     def difference():
         twice = jax.tree.map(lambda a: jnp.stack([a, a]), y)
         between = jax.tree.map(halfway, y, rates(*constant((t, twice, args)), both))  # pyright: ignore[reportCallIssue]
-        found = rates(t + _of_zero(late, jnp.full_like(t, 0.5)), between, args, both)
-        return jax.tree.map(lambda rate: rate[0] - rate[1], found)
+        there = rates(t + _of_zero(late, jnp.full_like(t, 0.5)), between, args, both)
+        return jax.tree.map(lambda rate: rate[0] - rate[1], there)
 
     nothing = lambda: jax.tree.map(jnp.zeros_like, y)
     return jax.lax.cond(is_one, difference, nothing)
@@ -183,13 +183,13 @@ def _(primals, tangents, *, term, jumping):
     gain = _gained_twice(late, moment, change, changes, term=term, jumping=jumping)
     if jumping:
         rates = _difference(late, moment, term)
-        gain = jax.tree.map(lambda rate, rest: change * rate + rest, rates, gain)
+        gain = jax.tree.map(lambda rate, more: change * rate + more, rates, gain)
     return nothing, gain
 
 
 @eqx.filter_custom_jvp
 def _gained_twice(late, moment, change, changes, *, term, jumping):
-    """Returns the part of a derivative of `gained` that is 0, with derivatives."""
+    """Second-order part of `gained`: its value is 0; only its derivative matters."""
     return jax.tree.map(jnp.zeros_like, moment.y)
 
 
@@ -202,8 +202,8 @@ def _(primals, tangents, *, term, jumping):
         return nothing, nothing
 
     def along(directions):
-        found = lambda late, moment: _difference(late, moment, term)
-        return eqx.filter_jvp(found, (late, moment), tuple(directions))[1]
+        difference = lambda late, moment: _difference(late, moment, term)
+        return eqx.filter_jvp(difference, (late, moment), tuple(directions))[1]
 
     gain = jax.tree.map(lambda rate: second[0] * rate, along(first))
     if not jumping:  # the rates are 0, but their derivatives are not

@@ -85,14 +85,14 @@ def located(
     """
     t0, apart = ts[0], rounding(ts)
     jumps = None if jumps is None else jnp.asarray(jumps, t0.dtype)
-    found, jumping = eqx.filter_eval_shape(term.switches, t0, y0, args)
-    wrapped = locate(solver, jumping, apart)
-    switches = wrapped.needed(found.size, jumps)
+    functions, jumping = eqx.filter_eval_shape(term.switches, t0, y0, args)
+    locating = locate(solver, jumping, apart)
+    switches = locating.needed(functions.size, jumps)
     if jumps is None and not switches:
         return solver, None, y0
     if switches:
-        unknown, none = jnp.zeros(found.shape, t0.dtype), jnp.zeros_like(t0)
-        known = Switching(
+        unknown, none = jnp.zeros(functions.shape, t0.dtype), jnp.zeros_like(t0)
+        at_start = Switching(
             sides=unknown,
             after=unknown,
             until=t0,
@@ -107,14 +107,14 @@ def located(
             grazing=none,
             grazing_here=none,
         )
-        solver, y0 = wrapped, (*y0, known)
+        solver, y0 = locating, (*y0, at_start)
     return solver, Landing(jumps, apart, switches), y0
 
 
-def switching_facts(*known: Switching) -> dict[str, Array]:
+def switching_facts(*states: Switching) -> dict[str, Array]:
     """Returns the statistics of the switches at the end of a solve."""
     facts = {}
-    for switching in known:
+    for switching in states:
         facts["num_switches"] = switching.passed[0].astype(int)
         if switching.one_sided is not None:
             facts["one_sided"] = switching.one_sided[0].astype(int)
@@ -152,45 +152,45 @@ class Located(diffrax.AbstractAdaptiveSolver):
         return self.solver.func(terms, t0, y0, args)
 
     def init(self, terms, t0, t1, y0, args):
-        *y0, known = y0
-        args = args._replace(sides=known.sides)
+        *y0, switching = y0
+        args = args._replace(sides=switching.sides)
         return self.solver.init(terms, t0, t1, tuple(y0), args)
 
     def step(self, terms, t0: Any, t1: Any, y0, args, solver_state, made_jump):
-        *y0, known = y0
-        kept = lambda after, before: jnp.where(made_jump, after, before)
-        sides = kept(known.after, known.sides)
-        changed = (sides != known.sides) & (known.sides != 0)
+        *y0, switching = y0
+        if_jumped = lambda after, before: jnp.where(made_jump, after, before)
+        sides = if_jumped(switching.after, switching.sides)
+        changed = (sides != switching.sides) & (switching.sides != 0)
         y0, args = tuple(y0), args._replace(sides=sides)
-        y0 = self.shifted(terms.term, t0, y0, args, known, made_jump)
+        y0 = self.shifted(terms.term, t0, y0, args, switching, made_jump)
         y1, error, dense, solver_state, result = self.solver.step(
             terms, t0, t1, y0, args, solver_state, made_jump
         )
         path = self.interpolation_cls(t0=t0, t1=t1, **dense)
 
         where = terms.term, t0, t1, path, args
-        seen, checks = _values(*constant(where))
-        margins = sides[None] * seen
+        values, checks = _values(*constant(where))
+        margins = sides[None] * values
         # Lengths of steps to a switch say nothing about the pace of the motion.
         share = jnp.finfo(t1.dtype).eps ** _NEAR
-        near = jnp.maximum(share * (t1 - t0), known.near / 2)
+        near = jnp.maximum(share * (t1 - t0), switching.near / 2)
         near = jnp.maximum(near, self.apart)
-        sizes = jnp.maximum(known.sizes, jnp.max(jnp.abs(seen), axis=0))
+        sizes = jnp.maximum(switching.sizes, jnp.max(jnp.abs(values), axis=0))
         until, crossed, missed, unseen, switched, grazing, soon = passage(
             margins,
             sides[None] * checks,
-            sides != known.sides,
-            known.sizes,
+            sides != switching.sides,
+            switching.sizes,
             sizes,
             near / (t1 - t0),
             t1 - t0 <= jnp.maximum(SHORTEST[t1.dtype], _BRIEF * near),
         )
         # What began on its zero has left it, in one or more steps.
-        on_zero = known.sizes <= jnp.finfo(sizes.dtype).eps ** _ON_ZERO * sizes
+        on_zero = switching.sizes <= jnp.finfo(sizes.dtype).eps ** _ON_ZERO * sizes
         # Before the first step, whose length is 0, sides are unknown.
         after = jnp.where(switched, -sides, sides)
-        after = jnp.where(sides == 0, jnp.where(seen[-1] > 0, 1.0, -1.0), after)
-        grazed = jnp.maximum(known.grazing, kept(known.grazing_here, 0))
+        after = jnp.where(sides == 0, jnp.where(values[-1] > 0, 1.0, -1.0), after)
+        grazed = jnp.maximum(switching.grazing, if_jumped(switching.grazing_here, 0))
         new = Switching(
             sides=sides,
             after=after.astype(t0.dtype),
@@ -201,8 +201,10 @@ class Located(diffrax.AbstractAdaptiveSolver):
             sizes=sizes,
             length=t1 - t0,
             ahead=jnp.any(switched & (margins[-1] > 0)).astype(t0.dtype),
-            passed=known.passed + jnp.sum(changed & ~on_zero),
-            one_sided=self.one_sided(known, on_zero, sides, sizes, jnp.sum(changed)),
+            passed=switching.passed + jnp.sum(changed & ~on_zero),
+            one_sided=self.one_sided(
+                switching, on_zero, sides, sizes, jnp.sum(changed)
+            ),
             grazing=jnp.maximum(missed, grazed),
             grazing_here=grazing,
         )
@@ -217,34 +219,40 @@ class Located(diffrax.AbstractAdaptiveSolver):
 
     def one_sided(
         self,
-        known: Switching,
+        switching: Switching,
         on_zero: Array,
         sides: Array,
         sizes: Array,
         changed: Array,
     ) -> Array | None:
         """Returns `Switching.one_sided` at the end of a step."""
-        if known.one_sided is None:
+        if switching.one_sided is None:
             return None
-        begun = jnp.any(on_zero & (sizes > 0) & (sides != 0))
-        together = (changed > 1) & (known.grazing_here > 0)
-        return jnp.maximum(known.one_sided, begun) + together
+        at_once = jnp.any(on_zero & (sizes > 0) & (sides != 0))
+        together = (changed > 1) & (switching.grazing_here > 0)
+        return jnp.maximum(switching.one_sided, at_once) + together
 
     def shifted(
-        self, term: Any, t: Array, y: Any, args: Any, known: Switching, made_jump: Any
+        self,
+        term: Any,
+        t: Array,
+        y: Any,
+        args: Any,
+        switching: Switching,
+        made_jump: Any,
     ) -> Any:
         """Returns the state at the start of a step, changed by a switch there."""
         if not self.derivatives:
             return y
-        before, after = known.sides, known.after
+        before, after = switching.sides, switching.after
         passed = [before, after]
         if self.jumping and before.size > 1:  # kinks change second derivatives alone
             passed.insert(1, jnp.where(first_of(after != before), after, before))
         # A known time may be here too, just before the zeros or just after them.
-        t = jnp.where(known.ahead > 0, t, known.until)
+        t = jnp.where(switching.ahead > 0, t, switching.until)
         # In a step of no length nothing comes to its zero: it has jumped, and when that
         # was is known.
-        arrived = made_jump & (known.length > 0)
+        arrived = made_jump & (switching.length > 0)
         for before, after in zip(passed, passed[1:]):
             here = args._replace(sides=before)
             arrival = Arrival(t, y, here, (before != after) & arrived)
@@ -284,9 +292,9 @@ def _values(
         )
         one = lambda row: term.switching(row[1], path.at(row[0]), args, row[2])[0]
         rows = shares, times, scheduled
-        found = jax.vmap(one)(rows)
+        values = jax.vmap(one)(rows)
     else:
-        found = jax.vmap(lambda t: term.switches(t, path.evaluate(t), args)[0])(times)
+        values = jax.vmap(lambda t: term.switches(t, path.evaluate(t), args)[0])(times)
     # An infinite limit is never reached.
-    found = jnp.where(jnp.isinf(found), jnp.sign(found), found)
-    return found[: len(SHARES)], found[len(SHARES) :]
+    values = jnp.where(jnp.isinf(values), jnp.sign(values), values)
+    return values[: len(SHARES)], values[len(SHARES) :]

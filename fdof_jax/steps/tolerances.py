@@ -98,7 +98,7 @@ def within_reach(
     """
     x64 = jnp.result_type(float) == jnp.float64
 
-    def mended(pid: diffrax.PIDController) -> diffrax.PIDController:
+    def with_limits(pid: diffrax.PIDController) -> diffrax.PIDController:
         if pid.dtmin is None:
             shortest = _shortest_step()
             pid = dataclasses.replace(pid, dtmin=shortest, force_dtmin=False)
@@ -108,16 +108,16 @@ def within_reach(
         return dataclasses.replace(pid, rtol=rtol, atol=atol)
 
     def met(tolerance: Any, name: str) -> Any:
-        known = concrete(tolerance)
-        if known is None or known >= _TIGHTEST_SINGLE / 2:
+        value = concrete(tolerance)
+        if value is None or value >= _TIGHTEST_SINGLE / 2:
             return tolerance
         warn(
-            f"stepsize_controller: {name}={known:g} cannot be met in float32, "
+            f"stepsize_controller: {name}={value:g} cannot be met in float32, "
             f"{_TIGHTEST_SINGLE:g} is used; fj.configure(x64=True) allows more."
         )
         return _TIGHTEST_SINGLE
 
-    return with_pid(mended, controller)
+    return with_pid(with_limits, controller)
 
 
 def scale_tolerances(

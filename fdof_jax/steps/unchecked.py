@@ -35,29 +35,29 @@ def diffeqsolve(
     """
     kind = diffrax.AbstractAdaptiveStepSizeController
     adaptive = isinstance(stepsize_controller, kind)
-    framed: Any = _FramedAdaptive if adaptive else _Framed
+    frame: Any = _FramedAdaptive if adaptive else _Framed
     counted = max_steps is not None and not isinstance(max_steps, int)
-    found = diffrax.diffeqsolve(
+    solution = diffrax.diffeqsolve(
         *arguments,
         dt0=None,
         saveat=eqx.tree_at(_output_times, saveat, replace_fn=_Times),
-        stepsize_controller=framed(
+        stepsize_controller=frame(
             stepsize_controller, dt0, max_steps if counted else None
         ),
         max_steps=None if counted else max_steps,
         **keywords,
     )
     if not (counted and saveat.controller_state):
-        return found
-    assert found.controller_state is not None
-    state, *_ = found.controller_state
-    return eqx.tree_at(lambda found: found.controller_state, found, state)
+        return solution
+    assert solution.controller_state is not None
+    state, *_ = solution.controller_state
+    return eqx.tree_at(lambda s: s.controller_state, solution, state)
 
 
 def _output_times(saveat: diffrax.SaveAt) -> list[Array]:
     one = lambda node: isinstance(node, diffrax.SubSaveAt)
-    found = [sub.ts for sub in jax.tree.leaves(saveat.subs, is_leaf=one)]
-    return [ts for ts in found if ts is not None]
+    times = [sub.ts for sub in jax.tree.leaves(saveat.subs, is_leaf=one)]
+    return [ts for ts in times if ts is not None]
 
 
 class _Times(eqx.Module):
@@ -79,8 +79,8 @@ class _Times(eqx.Module):
         return _Times(self.values * direction)
 
     def __getitem__(self, index):
-        found = self.values[index]
-        return found if found.ndim == 0 else _Times(found)
+        entry = self.values[index]
+        return entry if entry.ndim == 0 else _Times(entry)
 
     def __lt__(self, other):
         return False

@@ -42,11 +42,11 @@ Rates = Sequence[State]  # one per stage
 
 def _combine(coefficients: Sequence[Any] | np.ndarray, rates: Rates) -> PyTree:
     """Sums coefficients times rates, without terms that are known to be 0."""
-    known = isinstance(coefficients, np.ndarray)
+    constants = isinstance(coefficients, np.ndarray)
     terms = [
-        (float(c) if known else c, rate)
+        (float(c) if constants else c, rate)
         for c, rate in zip(coefficients, rates)
-        if not (known and c == 0)
+        if not (constants and c == 0)
     ]
     factors = [c for c, _ in terms]
     return jtu.tree_map(
@@ -87,20 +87,20 @@ def _moved(y: State, h: Array, rate: State) -> State:
 class _Step(NamedTuple):
     """The end of a step, the step's error and what the next step needs.
 
-    `rate` and its `health` are those at the end. `lost` is the rounding error of `y`,
-    which the next step adds (Kahan): over 1000 s of Fig 5 in steps of 2.5 ms the energy
-    drifts by 3e-11 J, not 1.5e-10 J.
+    `rate` and its `health` are those at the end. `residue` is the rounding error of
+    `y`, which the next step adds (Kahan): over 1000 s of Fig 5 in steps of 2.5 ms the
+    energy drifts by 3e-11 J, not 1.5e-10 J.
     """
 
     y: State
     error: State
-    lost: State
+    residue: State
     rate: State
     health: Health
 
 
 @eqx.filter_jit  # traced once, not at each use in a solve
-def _step(term, t0, t1, y0, lost, args, f0) -> tuple[_Step, dict[str, Any]]:
+def _step(term, t0, t1, y0, residue, args, f0) -> tuple[_Step, dict[str, Any]]:
     # diffrax wraps the term to integrate backward in time too.
     inner, h = term.term, term.contr(t0, t1)
     times = (t0 + (t1 - t0) * jnp.asarray(NODES, t0.dtype)) * term.direction
@@ -111,15 +111,15 @@ def _step(term, t0, t1, y0, lost, args, f0) -> tuple[_Step, dict[str, Any]]:
     for stage, row in enumerate(LOWER[:-1], 1):
         y = _moved(y0, h, weighted(row))
         rates.append(field(times[stage], y, args, scheduled(stage)))
-    y, lost = compensated(y0, _moved(lost, h, weighted(LOWER[-1])))
+    y, residue = compensated(y0, _moved(residue, h, weighted(LOWER[-1])))
     error = jtu.tree_map(lambda k: h * k, weighted(TABLEAU.b_error))
     # diffrax overlooks an infinity beside a NaN and finds no next step size.
     poison = 0 * sum(jtu.tree_leaves(y))
     y = jtu.tree_map(lambda a: a + poison, y)
-    y, error, lost = in_one_loop((y, error, lost))
+    y, error, residue = in_one_loop((y, error, residue))
     last, health = inner.watched_field(times[-1], y, args, scheduled(-1))
     dense_info = dict(y0=y0, step=h, rates=[*rates, last], scheduled=schedule)
-    return _Step(y, error, lost, last, health), dense_info
+    return _Step(y, error, residue, last, health), dense_info
 
 
 class _Interpolation(DenseOutput):
@@ -150,14 +150,14 @@ class UnrolledDopri8(ScheduledDopri8):
         return term.watched_field(t, y0, args, term.schedule(t, args))
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        start, lost = solver_state
+        start, residue = solver_state
         if made_jump is not False:  # the stored rates are outdated after a jump
             fresh = self._start(terms, t0, y0, args)
             start = jtu.tree_map(lambda a, b: jnp.where(made_jump, a, b), fresh, start)
         f0, health = start
-        end, dense_info = _step(terms, t0, t1, y0, lost, args, f0)
+        end, dense_info = _step(terms, t0, t1, y0, residue, args, f0)
         # A singular start makes the end not finite.
         singular = is_singular(health)
         health = tuple(jnp.where(singular, 0, x) for x in end.health)
         error, result = verdict(end.error, health, dense_info["step"])
-        return end.y, error, dense_info, ((end.rate, end.health), end.lost), result
+        return end.y, error, dense_info, ((end.rate, end.health), end.residue), result
