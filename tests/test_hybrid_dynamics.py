@@ -131,7 +131,7 @@ def test_efforts_make_the_motion_and_do_its_work(topology, joints):
     ts = np.linspace(0, 1, 101)
     solution = fj.simulate(linkage, start, ts, forces)
     efforts = fj.joint_efforts(linkage, forces, solution)
-    moved = np.asarray(forces[0].of(linkage))
+    moved = np.asarray(forces[0].prescribes(linkage))
     assert (np.asarray(efforts.elements[0])[:, ~moved] == 0).all()
     # Under these efforts the prescribed joints accelerate as they should.
     qdd, demanded, energy = along(linkage, forces, solution, efforts.total)
@@ -196,7 +196,7 @@ def test_gradients_equal_differences():
     def both(p):
         reference = Sway(AMPLITUDE * p[0])
         q, qd = reference(0.0, linkage)
-        state0 = fj.State(jnp.where(motion.of(linkage), q, start.q), start.qd)
+        state0 = fj.State(jnp.where(motion.prescribes(linkage), q, start.q), start.qd)
         forces = fj.simulation.PrescribedMotion(1, reference), fj.JointDamper(p[1])
         return weights @ fj.simulate(linkage, state0, [0, 0.5], forces).q[-1]
 

@@ -25,30 +25,9 @@ from .prescribed import formulation
 from .solution import OUTCOMES, Solution
 from .solve import solve
 
-# What an outcome means, and what helps.
-_REASONS: dict[str, str] = dict(
-    zip(
-        OUTCOMES[1:],
-        (
-            "The mass matrix is singular there, or nearly so (see inertia_ratios).",
-            "The accelerations are not finite there.",
-            "All max_steps were taken before the end.",
-            "Not even the shortest step meets the tolerance: rounding keeps it from "
-            "that, or an effort jumps there (forces.switch makes steps end at jumps).",
-            "Elements switch there without end, as between branches that push towards "
-            "each other: let the effort change continuously, as by a JointFriction, or "
-            "by a clipped gain in place of a sign.",
-        ),
-    )
-)
 # An explicit method of order 8 is stable for steps up to some 3 to 6 times the time
 # scale of a mode. Where accuracy decides, steps are shorter than twice that.
 _STABLE = 2.0
-
-
-def reason(outcome: str) -> str:
-    """Returns what is known from the outcome alone, in a sentence."""
-    return _REASONS.get(outcome, "The method itself failed.")
 
 
 def cause(inputs: Inputs, keywords: dict[str, Any], solution: Solution) -> str:
@@ -63,7 +42,7 @@ def cause(inputs: Inputs, keywords: dict[str, Any], solution: Solution) -> str:
                 return f"The effort of forces[{k}] is not finite at the start."
     if outcome in ("out of steps", "tolerance out of reach"):
         return _of_steps(inputs, keywords, solution)
-    return reason(outcome)
+    return OUTCOMES[outcome]
 
 
 def _of_steps(inputs: Inputs, keywords, solution: Solution) -> str:
@@ -88,7 +67,7 @@ def _of_steps(inputs: Inputs, keywords, solution: Solution) -> str:
             "feeds itself: it diverges, and more max_steps hardly help."
         )
     if solution.outcome != "out of steps":
-        return reason(str(solution.outcome))
+        return OUTCOMES[str(solution.outcome)]
     if rate * mean > _STABLE and not implicit:
         return (
             f"A mode of {rate:.3g}/s keeps the steps of an explicit method at "

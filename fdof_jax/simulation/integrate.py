@@ -92,8 +92,12 @@ def integrate(
 
 def _prepare(inputs: Inputs, derivatives: bool, padded: bool) -> _Problem:
     """States the equations and their start."""
-    linkage, _, _, own0, forces = inputs
-    valid, ts, (q0, qd0) = _valid(inputs, padded)
+    linkage, state0, ts, own0, forces = inputs
+    valid = ~faults(inputs, times=not padded).any()
+    # Harmless values replace invalid ones, because derivatives of NaN would spoil those
+    # of arrays that other lanes share.
+    q0, qd0 = (without_fixed(linkage, jnp.where(valid, a, 0)) for a in state0)
+    ts = jnp.where(valid, ts, 1e-3 * jnp.arange(len(ts), dtype=ts.dtype))
     arguments = args_of(linkage, q0, forces)
     if derivatives:
         arguments = clocks_apart(arguments, ts)
@@ -117,14 +121,14 @@ def _control(
     problem: _Problem, keywords, derivatives: bool, tangents: bool
 ) -> _Control:
     """Chooses the steps: what they judge, and where they end."""
-    solver: Any = _differentiable(
-        keywords["solver"] or LoopedDopri8(), keywords["adjoint"]
-    )
-    users = keywords["stepsize_controller"]
-    steps, (_, ts, _, start, term, args, _) = users or default_controller(), problem
+    solver: Any = keywords["solver"] or LoopedDopri8()
+    solver = _differentiable(solver, keywords["adjoint"])
+    own_controller = keywords["stepsize_controller"]  # the user's
+    steps = own_controller or default_controller()
+    _, ts, _, start, term, args, _ = problem
     if not isinstance(steps, diffrax.AbstractAdaptiveStepSizeController):
         # Fixed steps may pass over the kinks of a history, but over no jump.
-        if known_times(args, EffortHistory) is not None:
+        if known_times(args, without=EffortHistory) is not None:
             raise ValueError(
                 "stepsize_controller: expected an adaptive one, as forces declare "
                 f"times at which they jump (jump_ts), got {shown(steps)}."
@@ -141,7 +145,7 @@ def _control(
         judge = OfTangents()
     # With tolerances of one's own, an implicit solver is for modes too fast to resolve,
     # which a probe would resolve.
-    elif derivatives and not (implicit and users is not None):
+    elif derivatives and not (implicit and own_controller is not None):
         has_tableau = isinstance(solver, ScheduledDopri8 | diffrax.AbstractRungeKutta)
         tableau: Any = solver.tableau if has_tableau else diffrax.Heun.tableau
         judge = OfLinearised(term, tableau)
@@ -217,26 +221,20 @@ def _differentiable(solver: Any, adjoint: diffrax.AbstractAdjoint) -> Any:
     return eqx.tree_at(lambda s: s.scan_kind, solver, kind, is_leaf=lambda x: x is None)
 
 
-def _valid(inputs: Inputs, padded: bool) -> tuple[Array, Array, tuple[Array, Array]]:
-    """Returns whether the inputs are valid, and their times and start.
+def faults(inputs: Inputs, times: bool = True) -> Array:
+    """Returns whether times, start, linkage and each element are at fault.
 
-    The result reports invalid ones. They are replaced by harmless values, because
-    derivatives of NaN would spoil those of arrays that other lanes share.
+    `times`: whether those are looked at; an array made for a plain call may repeat the
+    last one.
     """
     linkage, state0, ts, _, forces = inputs
+    growth = jnp.diff(ts)
+    increasing = ((growth > 0) & (growth < jnp.inf)).all() | (not times)
     finite = (jnp.isfinite(state0.q) & jnp.isfinite(state0.qd)).all()
-    valid = possible(linkage) & finite
-    if not padded:  # a plain call has checked them
-        growth = jnp.diff(ts)
-        increasing = ((growth > 0) & (growth < jnp.inf)).all()
-        harmless = 1e-3 * jnp.arange(len(ts), dtype=ts.dtype)
-        ts, valid = jnp.where(increasing, ts, harmless), valid & increasing
-    for element in forces:
-        valid = valid & element.possible()
-        valid = valid & constant(element).fits(*constant((linkage, ts)))
-    valid = valid & agrees(forces, ts[0], jnp.asarray(state0.q), linkage)
-    q0, qd0 = (without_fixed(linkage, jnp.where(finite, a, 0)) for a in state0)
-    return valid, ts, (q0, qd0)
+    start = finite & agrees(forces, ts[0], jnp.asarray(state0.q), linkage)
+    arm = constant((linkage, ts))
+    fit = [jnp.asarray(e.possible() & constant(e).fits(*arm)) for e in forces]
+    return ~jnp.stack([increasing, start, possible(linkage), *fit])
 
 
 def _judged(valid: Array, result: Any, q: Array, qd: Array) -> Any:

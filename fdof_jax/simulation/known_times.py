@@ -35,12 +35,14 @@ def clocks_apart(args: Args, ts: Array) -> Args:
     return args._replace(ahead=unit * jnp.array(ahead, unit.dtype))
 
 
-def known_times(args: Args, *left_out: type[Element]) -> Array | None:
+def known_times(
+    args: Args, without: tuple[type[Element], ...] | type[Element] = ()
+) -> Array | None:
     """Returns the times [s] at which elements jump by their clocks, or None.
 
-    `left_out`: kinds of elements whose times do not count.
+    `without`: kinds of elements whose times do not count.
     """
-    places = [i for i, e in enumerate(args.forces) if not isinstance(e, left_out)]
+    places = [i for i, e in enumerate(args.forces) if not isinstance(e, without)]
     if args.ahead is None:
         return jumps_of(*(args.forces[place] for place in places))
     times = [(args.forces[i].jump_ts, args.ahead[i]) for i in places]

@@ -85,7 +85,7 @@ class PrescribedMotion(Element):
         joints = [n for n, moved in zip(_NUMBERS, self.moved) if moved]
         return {"joints": np.array(joints), "reference": self.reference}
 
-    def of(self, linkage: Linkage) -> Array:
+    def prescribes(self, linkage: Linkage) -> Array:
         """Returns whether each joint of an arm is prescribed; a fixed pair is not."""
         moved, ef = in_numpy((self.moved, linkage.ef))
         fixed = namespace(moved, ef).stack(fixed_pairs(ef))
@@ -119,7 +119,7 @@ def agrees(forces: Forces, t: Array, q: Array, linkage: Linkage) -> Any:
     with naming(f"forces[{place_of(motion, forces)}]"):
         begin = positions_at(motion.reference, t, linkage)
     near = abs(in_numpy(q) - begin) <= 1e-6 * (1 + abs(begin))
-    return (near | ~motion.of(linkage)).all()
+    return (near | ~motion.prescribes(linkage)).all()
 
 
 def _mass_and_bias(args: Args, q: Array, qd: Array) -> tuple[Array, Array]:
@@ -160,14 +160,14 @@ def _free_joints(args: Args, t: Any, y: Any) -> tuple[Array, Array]:
 def _hybrid_joints(args: Args, t: Any, y: Any) -> tuple[Array, Array]:
     motion, (q, momenta) = _motion(args), _free_joints(args, t, y)
     position, velocity = motion.at(t, args.linkage)
-    q = jnp.where(motion.of(args.linkage), position, q)
+    q = jnp.where(motion.prescribes(args.linkage), position, q)
     matrix, _ = _mass_and_bias(args, q, jnp.zeros_like(q))
-    return q, _split(motion.of(args.linkage), matrix, velocity, momenta)
+    return q, _split(motion.prescribes(args.linkage), matrix, velocity, momenta)
 
 
 def _hybrid_start(args: Args, qd: Array) -> tuple[Any, Any]:
     matrix, _ = _mass_and_bias(args, args.q0, jnp.zeros_like(args.q0))
-    momenta = jnp.where(_motion(args).of(args.linkage), 0, matrix @ qd)
+    momenta = jnp.where(_motion(args).prescribes(args.linkage), 0, matrix @ qd)
     return zeros(args.q0), tuple(momenta)
 
 
@@ -194,7 +194,7 @@ def _hybrid_field(t, y, args, schedule) -> tuple[Any, ...]:
     bias = jnp.stack(equations(args.constants, *displaced).bias)
     momenta = lambda q: _mass_and_bias(args, q, jnp.zeros_like(q))[0] @ qd
     _, change = jax.jvp(momenta, (q,), (qd,))
-    moved, change = motion.of(args.linkage), change - bias + jnp.stack(tau)
+    moved, change = motion.prescribes(args.linkage), change - bias + jnp.stack(tau)
     driven = jnp.where(moved, 0, without_fixed(args.linkage, change))
     return whole(tuple(jnp.where(moved, 0, qd)), tuple(driven), own_rates)
 
@@ -209,7 +209,7 @@ def _health(t, y, args) -> Health:
     """Health of the driven joints' equations, as in `field.health_of`."""
     q, _ = _hybrid_joints(args, t, y)
     matrix, _ = _mass_and_bias(args, q, jnp.zeros_like(q))
-    driven = ~_motion(args).of(args.linkage)
+    driven = ~_motion(args).prescribes(args.linkage)
     free = jnp.where(jnp.outer(driven, driven), matrix, jnp.eye(len(q)))
     losses = jnp.diag(free) * jnp.diag(jnp.linalg.inv(free))
     return health_at(tuple(jnp.where(losses > 0, losses, jnp.inf)))
@@ -238,6 +238,6 @@ def prescribed_effort(
     matrix, bias = mass_and_bias(linkage, forces, q, qd)
     velocity = lambda t: motion.at(t, linkage)[1]
     _, demanded = jax.jvp(velocity, (t,), (jnp.ones_like(t),))
-    moved = motion.of(linkage)
+    moved = motion.prescribes(linkage)
     qdd = _split(moved, matrix, demanded, tau - bias)
     return jnp.where(moved, matrix @ qdd + bias - tau, 0)

@@ -59,7 +59,6 @@ class _Term(diffrax.ODETerm):
 class _LocatedRows(Located):
     """Adds what switches and known times change in the derivatives of the motion."""
 
-    count: int = eqx.field(static=True)  # of parameters
     rates: Callable[..., Array] = eqx.field(static=True)  # (t, row, z, sides)
     jumps: Array | None
     slopes: Array | None  # derivatives of the jumps (jump, n)
@@ -84,7 +83,7 @@ class _LocatedRows(Located):
             sides = jnp.stack([beside, beside, before, between, after])
             rates = jax.vmap(self.rates, in_axes=(0, None, None, 0))
             rates = rates(times, rows[0], args.z, sides)
-            late = jnp.zeros(self.count, rows.dtype)  # the known time
+            late = jnp.zeros(args.z.size, rows.dtype)  # the known time
             if self.jumps is not None and self.slopes is not None:
                 distance = jnp.abs(time - self.jumps)
                 index = jnp.argmin(distance)
@@ -101,20 +100,20 @@ class _LocatedRows(Located):
                 slopes = change(jnp.ones_like(t), rates[2], jnp.zeros_like(args.z))
                 in_z = lambda row, z: change(jnp.zeros_like(t), row, z)
                 arrived = rows[1:] + jnp.where(ahead, gain, 0)
-                changes = jax.vmap(in_z)(arrived, jnp.eye(self.count))
+                changes = jax.vmap(in_z)(arrived, jnp.eye(args.z.size))
                 # In a step of no length nothing comes to its zero: it has jumped, at a
                 # known time.
                 some = jnp.stack([first.any(), others.any()])
                 steep = some & (switching.length > 0) & (slopes != 0)
                 of_zeros = -changes / jnp.where(steep, slopes, 1)[None]
-                times = jnp.where(steep[None], of_zeros, late[:, None])
-                gain += times @ (rates[2:4] - rates[3:])
+                delays = jnp.where(steep[None], of_zeros, late[:, None])
+                gain += delays @ (rates[2:4] - rates[3:])
             return rows.at[1:].add(gain)
 
         return (jax.lax.cond(made_jump, after_jump, lambda: rows),)
 
 
-def _largest(y: tuple[Array]) -> Array:
+def _largest_rms(y: tuple[Array]) -> Array:
     """Returns the largest rms among the motion and its derivatives."""
     (state,) = y
     return jnp.sqrt(jnp.max(jnp.mean(state**2, axis=1)))
@@ -136,7 +135,7 @@ def sensitivities(
     absolute tolerance of each step in float64.
     """
 
-    def motion_of(z):
+    def start_at(z):
         scene = scene_at(z)
         q0, qd0 = (
             without_fixed(scene.linkage, jnp.asarray(a, dtype=float))
@@ -150,13 +149,13 @@ def sensitivities(
     # One array, with the motion as first row and the derivatives below, gives the
     # integrator fewer and larger operations.
     start, along = jax.linearize(
-        lambda z: jnp.stack(jax.tree.leaves(motion_of(z)[1])), z
+        lambda z: jnp.stack(jax.tree.leaves(start_at(z)[1])), z
     )
-    structure = jax.tree.structure(motion_of(z)[1])
+    structure = jax.tree.structure(start_at(z)[1])
     directions = jnp.eye(z.size, dtype=z.dtype)
 
     def rates(t, row, z, sides):
-        args, _ = motion_of(z)
+        args, _ = start_at(z)
         y = jax.tree.unflatten(structure, tuple(row))
         rates = formulation(args.forces).term.vf(t, y, args._replace(sides=sides))
         return jnp.stack(jax.tree.leaves(rates))
@@ -171,26 +170,26 @@ def sensitivities(
         return (jnp.concatenate([value[None], slopes]),)
 
     def switches_of(t, y, varied):
-        args, _ = motion_of(varied.z)
+        args, _ = start_at(varied.z)
         y = jax.tree.unflatten(structure, tuple(y[0][0]))
         args = args._replace(sides=varied.sides)
         return formulation(args.forces).term.switches(t, y, args)
 
     def times_of(z):
-        return known_times(motion_of(z)[0])
+        return known_times(start_at(z)[0])
 
     def observed(z, t, row):
-        args, _ = motion_of(z)
+        args, _ = start_at(z)
         y = jax.tree.unflatten(structure, tuple(row))
         return *formulation(args.forces).joints(args, t, y), own_states(args, y)
 
     tolerance = of_precision(tolerance, max(tolerance, TOLERANCE))
     controller = adaptive(tolerance, tolerance)
-    controller = dataclasses.replace(controller, norm=_largest)
+    controller = dataclasses.replace(controller, norm=_largest_rms)
     term = _Term(field, switches_of)  # pyright: ignore[reportArgumentType, reportCallIssue]
     jumps, slopes = times_of(z), jax.jacfwd(times_of)(z)
     y0 = (jnp.concatenate([start[None], jax.vmap(along)(directions)]),)
-    of_rows = True, z.size, rates, jumps, slopes
+    of_rows = True, rates, jumps, slopes
     locate = lambda *settings: _LocatedRows(*settings, *of_rows)  # pyright: ignore[reportCallIssue]
     # A method of few stages, because much of the work lies outside of them; as a loop
     # that `next_motion` can differentiate again.

@@ -21,21 +21,14 @@ from ..base.checks import (
     single_precision,
     whole_number,
 )
-from ..forces.element import (
-    Element,
-    Forces,
-    elements,
-    elements_on,
-    naming,
-    of_full_size,
-)
+from ..forces.element import Element, Forces, elements_on, naming, of_full_size
 from ..linkage.coordinates import State, real_state
 from ..linkage.fields import check_values
-from ..linkage.linkage import Linkage, check_linkage, possible
+from ..linkage.linkage import Linkage, check_linkage
 from ..steps.tolerances import at_tolerances, with_longest, within_reach
-from .failures import cause, check_arguments, reason
+from .failures import cause, check_arguments
 from .field import initial_states
-from .integrate import Inputs
+from .integrate import Inputs, faults
 from .prescribed import agrees, prescribed
 from .scene import accepts_scene
 from .solution import OUTCOMES, Solution, outcome_numbers
@@ -208,7 +201,6 @@ def simulate(
     state0 = real_state("state0", state0, linkage)
     ts = real_array("ts", ts, (None,), of="times, for instance [0, 2.0]")
     increasing("ts", ts)
-    elements("forces", forces)
     keywords = solve_options(
         solver=solver,
         rtol=rtol,
@@ -262,11 +254,12 @@ def simulate(
 def _raising(solution: Solution, inputs: Inputs) -> Solution:
     """Adds run-time errors for bad values and failures to a traced solution."""
     accepted = "expected values that its constructor accepts"
+    fitting = f"{accepted} and that fit the arm"
     messages = [
         "simulate: ts: expected finite, increasing times.",
-        "simulate: state0: expected finite numbers.",
+        "simulate: state0: expected finite numbers, and those of a prescribed motion.",
         f"simulate: linkage: {accepted}.",
-        *(f"simulate: forces[{k}]: {accepted}." for k in range(len(inputs.forces))),
+        *(f"simulate: forces[{k}]: {fitting}." for k in range(len(inputs.forces))),
     ]
     faults = _faults(inputs)
     failed = solution.result != diffrax.RESULTS.successful
@@ -275,7 +268,7 @@ def _raising(solution: Solution, inputs: Inputs) -> Solution:
             solution, faults.any(), jnp.argmax(faults), messages
         )
         number = outcome_numbers(raising.result)
-        words = [f"simulate: {outcome}. {reason(outcome)}" for outcome in OUTCOMES]
+        words = [f"simulate: {word}. {why}" for word, why in OUTCOMES.items()]
         return eqx.branched_error_if(raising, failed, number, words)
     except ValueError as error:
         # Under `vmap` over no members equinox takes the maximum of none.
@@ -284,18 +277,7 @@ def _raising(solution: Solution, inputs: Inputs) -> Solution:
         return solution
 
 
-@eqx.filter_jit  # one program where each of its operations would be one
-def _faults(inputs: Inputs) -> Array:
-    """Returns whether times, start, linkage and each force have bad values."""
-    linkage, state0, ts, _, forces = inputs
-    growth = jnp.diff(ts)
-    wrong = [
-        ~((0 < growth) & (growth < jnp.inf)),
-        ~jnp.isfinite(jnp.stack(state0)),
-        ~possible(linkage),
-        *(~jnp.asarray(element.possible()) for element in forces),
-    ]
-    return jnp.stack([fault.any() for fault in wrong])
+_faults = eqx.filter_jit(faults)  # one program, not one for each of its operations
 
 
 def check_own(

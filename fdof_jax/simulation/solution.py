@@ -12,11 +12,21 @@ from jaxtyping import Float
 from ..base.checks import is_traced, known
 from ..base.report import html_table
 
-# In the order of `outcome_numbers`.
-OUTCOMES = (
-    "successful", "ill-conditioned", "not finite", "out of steps",
-    "tolerance out of reach", "too many switches", "solver failed",
-)  # fmt: skip
+# In the order of `outcome_numbers`: what an outcome means, and what helps.
+OUTCOMES = {
+    "successful": "",
+    "ill-conditioned": "The mass matrix is singular there, or nearly so (see "
+    "inertia_ratios).",
+    "not finite": "The accelerations are not finite there.",
+    "out of steps": "All max_steps were taken before the end.",
+    "tolerance out of reach": "Not even the shortest step meets the tolerance: "
+    "rounding keeps it from that, or an effort jumps there (forces.switch makes steps "
+    "end at jumps).",
+    "too many switches": "Elements switch there without end, as between branches that "
+    "push towards each other: let the effort change continuously, as by a "
+    "JointFriction, or by a clipped gain in place of a sign.",
+    "solver failed": "The method itself failed.",
+}
 
 # Slower crossings are near to grazing, where no derivative exists.
 SLOW = 0.01
@@ -58,7 +68,7 @@ class WithOutcome(eqx.Module):
                 "outcome: expected a computed motion, got one that JAX traces; there, "
                 "compare `result`: motion.result == diffrax.RESULTS.successful."
             )
-        return np.asarray(np.array(OUTCOMES)[outcome_numbers(self.result)])
+        return np.asarray(np.array([*OUTCOMES])[outcome_numbers(self.result)])
 
     def __repr__(self) -> str:
         """Summarises the motion in words; traced values show only their shape."""

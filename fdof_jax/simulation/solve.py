@@ -27,8 +27,8 @@ from .solution import Solution
 
 def solve(inputs: Inputs, keywords) -> tuple[Solution, bool | None]:
     """Computes a motion, and whether it succeeded: None within transformations."""
-    # A new constant is traced only inside `jax.jit`, where a program of its own would
-    # also be traced without derivatives.
+    # JAX traces even constants inside `jax.jit`, where a jitted function of our own
+    # would only be traced once more.
     if is_traced(jax.device_put(np.zeros(()))):
         # Within `vmap` even a tracer may hold a NumPy array, which rules of derivatives
         # refuse in JAX 0.10.
@@ -214,7 +214,7 @@ def _solve(inputs: Inputs, keywords) -> Solution:
     solution = integrate(inputs, keywords, derivatives=True)
     if not isinstance(keywords["adjoint"], diffrax.ForwardMode):
         return solution
-    # Reverse mode is found out behind the call, where JAX would name its loop alone.
+    # JAX notices reverse mode only after this call, and would name its loop alone.
     return eqx.internal.nondifferentiable_backward(
         solution,
         msg="reverse-mode differentiation of simulate needs its default adjoint; "

@@ -5,7 +5,7 @@ Where the tangents are known, `OfTangents` judges them. Where they are not, beca
 caller differentiates or the adjoint follows, `OfLinearised` judges a probe.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -15,11 +15,12 @@ import numpy as np
 from jax import Array
 from jax.flatten_util import ravel_pytree
 
-from .dopri8 import Estimate, ScheduledTerm, constant
+from .dopri8 import Estimate, ScheduledTerm, constant, lower_triangle
+from .rounding import largest
 from .switching import Switching, motion_of
 
-# The relative tolerance of tangents is so many times that of the motion, at most so
-# much, and no tighter than so many rounding errors.
+# The relative tolerance of tangents: over that of the motion, its upper limit, and its
+# lower limit in rounding errors.
 _LOOSER, _LOOSEST, _NOISE = 1e3, 1e-5, 64.0
 # That of a probe, whatever the motion's: undamped tangents are right to 1e-6 after 1000
 # rad.
@@ -38,10 +39,6 @@ def _noise(health: Any) -> Array:
     return _NOISE * jnp.finfo(loss.dtype).eps * loss
 
 
-def _largest(tree: Any) -> Array:
-    return jnp.max(jnp.abs(ravel_pytree(tree)[0]))
-
-
 @jax.custom_jvp
 def _error_of_tangents(
     error: Any, ends: Any, integrated: Any, tolerance: Array, noise: Array
@@ -58,17 +55,27 @@ def _error_of_tangents(
 @_error_of_tangents.defjvp
 def _(primals, tangents):
     _, _, motion, tolerance, noise = primals
-    error, own, integrated = constant(tuple(map(_largest, tangents[:3])))
+    error, own, integrated = constant(tuple(map(largest, tangents[:3])))
     size = jnp.maximum(own, _WEAK * jax.lax.pmax(own, TANGENTS))
     # A tangent far smaller than the largest is exact, too.
     allowed = tolerance * jnp.minimum(size, _LEAST * own)
     # Terms of a tangent may cancel, and leave rounding errors of the motion.
-    allowed += noise * (_largest(motion) + integrated)
+    allowed += noise * (largest(motion) + integrated)
     ratio = jnp.where(allowed > 0, error / allowed, 0)
     # Shorter steps do not mend a tangent that is not a number.
     ratio = constant(jnp.where(jnp.isnan(ratio), 0, ratio))
     ratio = jax.lax.pmax(ratio, TANGENTS)
     return ratio, jnp.zeros_like(ratio)
+
+
+class Step(NamedTuple):
+    """A step, with the integrated state at both ends and the arguments in it."""
+
+    t0: Array
+    t1: Array
+    y0: Any
+    y1: Any
+    args: Any
 
 
 class OfTangents(eqx.Module):
@@ -78,16 +85,18 @@ class OfTangents(eqx.Module):
         return ()
 
     def __call__(
-        self, control: Any, t0: Any, t1: Any, y0: Any, y1: Any, args: Any,
-        estimate: Estimate, probe: tuple[()],
-    ) -> tuple[Array, tuple[()]]:  # fmt: skip
-        """Returns the largest error of a tangent over its tolerance, and no probe."""
+        self, step: Step, estimate: Estimate, probe: tuple[()], rtol: Any
+    ) -> tuple[Array, tuple[()]]:
+        """Returns the largest error of a tangent over its tolerance, and no probe.
+
+        `rtol`: the relative tolerance of the motion.
+        """
         noise = _noise(estimate.health)
-        tolerance = jnp.minimum(_LOOSER * control.rtol, _LOOSEST)
+        tolerance = jnp.minimum(_LOOSER * rtol, _LOOSEST)
         tolerance = constant(jnp.maximum(tolerance, noise))
-        error, *integrated = map(motion_of, (estimate.error, y0, y1))
+        error, *integrated = map(motion_of, (estimate.error, step.y0, step.y1))
         # Tangents of displacements lack that of the start.
-        ends = [(args.q0 + jnp.stack(q), *others) for q, *others in integrated]
+        ends = [(step.args.q0 + jnp.stack(q), *others) for q, *others in integrated]
         ratio = _error_of_tangents(error, ends, integrated, tolerance, noise)
         return constant(ratio), probe
 
@@ -102,8 +111,8 @@ def linearised(term: ScheduledTerm, t: Array, y: Any, args: Any) -> Array:
 class OfLinearised(eqx.Module):
     """Judges a step by what it does to the linearised motion.
 
-    A probe stands for all tangents. It moves as a tangent does whose linearisation at
-    the end of a step holds in the whole step, and is a new one after each jump. This
+    A probe stands for all tangents. It moves like a tangent, with the linearisation at
+    the end of a step held for the whole step. A jump replaces it by a new one. This
     costs one linearisation of the rates a step.
     """
 
@@ -117,10 +126,10 @@ class OfLinearised(eqx.Module):
         return jnp.asarray(probe, numbers.dtype)
 
     def __call__(
-        self, control: Any, t0: Any, t1: Any, y0: Any, y1: Any, args: Any,
-        estimate: Estimate, probe: Array,
-    ) -> tuple[Array, Array]:  # fmt: skip
+        self, step: Step, estimate: Estimate, probe: Array, rtol: Any
+    ) -> tuple[Array, Array]:
         """Returns the error of the probe over its tolerance, and the moved probe."""
+        t0, t1, _, y1, args = step
         if isinstance(y1[-1], Switching):
             args = args._replace(sides=y1[-1].sides)
         at_end = constant((t1, motion_of(y1), args))
@@ -128,13 +137,13 @@ class OfLinearised(eqx.Module):
         change, error = self._step(matrix, probe)
         end = probe + change
         tolerance = jnp.maximum(_OF_PROBE, _noise(estimate.health))
-        size = jnp.maximum(_largest(probe), _largest(end))
-        ratio = _largest(error) / (tolerance * size)
+        size = jnp.maximum(largest(probe), largest(end))
+        ratio = largest(error) / (tolerance * size)
         finite = jnp.isfinite(ratio)
         ratio = constant(jnp.where(finite, ratio, 0))
         # A new one shows again what an unstable mode has come to hide.
-        new = ~finite | (_largest(end) > _GROWN)
-        end = end / jnp.minimum(_largest(end), 1)
+        new = ~finite | (largest(end) > _GROWN)
+        end = end / jnp.minimum(largest(end), 1)
         return ratio, jnp.where(new, self.start(y1), end)
 
     def _step(self, matrix: Array, probe: Array) -> tuple[Array, Array]:
@@ -145,9 +154,6 @@ class OfLinearised(eqx.Module):
         count, size = len(self.tableau.b_sol), len(probe)
         implicit = self.tableau.a_diagonal is not None
         diagonal = self.tableau.a_diagonal if implicit else np.zeros(count)
-        lower = np.zeros((count, count))
-        for row, entries in zip(lower[1:], self.tableau.a_lower):
-            row[: len(entries)] = entries
 
         def stage(changes, row):
             index, weights, own = row
@@ -158,7 +164,11 @@ class OfLinearised(eqx.Module):
             return changes.at[index].set(change), None
 
         numbers = lambda rows: jnp.asarray(rows, probe.dtype)
-        rows = jnp.arange(count), numbers(lower), numbers(diagonal)
+        rows = (
+            jnp.arange(count),
+            numbers(lower_triangle(self.tableau)),
+            numbers(diagonal),
+        )
         changes, _ = jax.lax.scan(stage, jnp.zeros((count, size), probe.dtype), rows)
         whole, error = numbers([self.tableau.b_sol, self.tableau.b_error])
         summed = lambda weights: jnp.sum(weights[:, None] * changes, axis=0)

@@ -43,7 +43,7 @@ def end_of_run(ts: Array, jumps: Array | None) -> Array:
 
 
 def _last(end: Array) -> Array:
-    """Returns the time from which on diffrax may take the end of a step for the end.
+    """Returns the time after which diffrax may move the end of a step to that of a run.
 
     It does so within 100 units of rounding.
     """
@@ -87,7 +87,7 @@ class Landing(eqx.Module):
         """Returns the arguments with the sides in force at a state."""
         return args._replace(sides=y[-1].sides) if self.switches else args
 
-    def _found(self, y: Any, end: Array) -> tuple[Any, ...]:
+    def _seen(self, y: Any, end: Array) -> tuple[Any, ...]:
         """Returns times and `near` of `Switching`, and whether nothing switches here.
 
         The times are `until`, `unseen` and `soon`.
@@ -132,12 +132,21 @@ class Landing(eqx.Module):
     ) -> tuple[NextStep, Array, _Landing]:
         """Returns the next step, and whether the controller resumes its old state.
 
-        `planned`: what the controller would do.
+        `planned`: what the controller would do. A step that it keeps is one of these:
+
+        | step | flag | next step |
+        |---|---|---|
+        | passed a switch | `passed` | the same again, up to the switch |
+        | may have passed one unseen | `unsure` | the same again, up to that place |
+        | ends just before its switch | `stretched` | the same again, up to the switch |
+        | ends well before its switch | `missed` | up to where the switch was passed |
+        | ends at a switch or known time | `landed` | as long as planned before |
+        | any other | | as planned, or up to the next known time |
         """
         keep, next0, next1, jumped, result = planned
         begin, end = constant((t0, t1))
         aimed = end == state.target
-        until, unseen, soon, near, idle = constant(self._found(y1, end))
+        until, unseen, soon, near, idle = constant(self._seen(y1, end))
         allowance = jnp.where(aimed, near, 0)
         passed = keep & (until < jnp.minimum(end - allowance, state.last))
         tiny = (begin < end) & (end - begin <= _APART * self.apart)

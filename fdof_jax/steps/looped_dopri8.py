@@ -49,9 +49,8 @@ def _step(term: Any, t0, t1, y0, residue, args):
 
     The solver's state is the rounding error of `y`, which the next step adds (Kahan).
     """
-    # diffrax wraps the term to integrate backward in time too.
-    inner, h = term.term, term.contr(t0, t1)
-    times = (t0 + (t1 - t0) * jnp.asarray(NODES, t0.dtype)) * term.direction
+    inner, h = term.term, term.contr(t0, t1)  # within a wrapper of diffrax
+    times = t0 + (t1 - t0) * jnp.asarray(NODES, t0.dtype)
     lower = jnp.asarray(LOWER, h.dtype)
 
     def stage(rates, row):
@@ -65,8 +64,7 @@ def _step(term: Any, t0, t1, y0, residue, args):
     # The first rate is that of the last step's end. To evaluate it again costs a
     # fourteenth; to keep it, a second copy of the equations for the first step.
     rates = jtu.tree_map(lambda y: jnp.zeros((STAGES, *y.shape), y.dtype), y0)
-    weights = jnp.concatenate([jnp.zeros((1, STAGES), h.dtype), lower])
-    stages = jnp.arange(STAGES), times, weights
+    stages = jnp.arange(STAGES), times, lower
     rates, (healths, schedule) = jax.lax.scan(stage, rates, stages)
     change = jtu.tree_map(lambda k, c: h * k + c, _weighted(lower[-1], rates), residue)
     y, residue = compensated(y0, change)

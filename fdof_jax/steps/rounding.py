@@ -94,8 +94,8 @@ def _rounding(revolute: Sequence[Array], health: Health, y0: Any, y1: Any) -> An
     shift, change = jax.tree.map(lambda a, b: jnp.abs(b - a), y0[:2], y1[:2])
     turned = jax.tree.map(lambda r, step: jnp.where(r, step, 0), revolute, shift)
     turned = sum(map(jnp.sum, jax.tree.leaves(turned)))
-    size = jnp.maximum(_largest(change), turned * _largest(y0[1]))
-    worst = jnp.finfo(size.dtype).eps * jnp.sqrt(_largest(losses)) * size
+    size = jnp.maximum(largest(change), turned * largest(y0[1]))
+    worst = jnp.finfo(size.dtype).eps * jnp.sqrt(largest(losses)) * size
 
     def noise(revolute: Array, loss: Array) -> Array:
         return jnp.where(revolute, _OF_REVOLUTE, _OF_SLIDE) * jnp.sqrt(loss) * worst
@@ -103,6 +103,7 @@ def _rounding(revolute: Sequence[Array], health: Health, y0: Any, y1: Any) -> An
     return jax.tree.map(noise, revolute, losses)
 
 
-def _largest(tree: Any) -> Array:
+def largest(tree: Any) -> Array:
+    """Returns the size of the largest number in a tree."""
     sizes = [jnp.max(jnp.abs(leaf)) for leaf in jax.tree.leaves(tree)]
     return functools.reduce(jnp.maximum, sizes)

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from .controllers import Adaptive, Scaled
-from .derivative_control import OfLinearised, OfTangents
+from .derivative_control import OfLinearised, OfTangents, Step
 from .dopri8 import (
     Estimate,
     Health,
@@ -81,7 +81,8 @@ class StepControl(Adaptive):
             y1, y_error, failure = self._healthy(t0, t1, y0, y1, args, y_error)
         ratio, probe = None, None
         if self.judge is not None:
-            ratio, probe = self.judge(self, t0, t1, y0, y1, args, y_error, state.probe)
+            taken = Step(t0, t1, y0, y1, args)
+            ratio, probe = self.judge(taken, y_error, state.probe, self.rtol)
         step: Any = *map(motion_of, (y0, y1)), with_change(y_error, motion_of)
         controller = self.controller
         if isinstance(controller, Scaled):

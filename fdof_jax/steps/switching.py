@@ -22,7 +22,8 @@ from .zeros_in_steps import CHECKED, CHECKS, SAMPLED, SHARES, passage
 # A function whose zero is this close to the end of a step switches there: a share of
 # the step, as a power of the unit of rounding (1e-9 in float64).
 _NEAR = 0.575
-# What was no larger, over its size, began on its zero: this power of rounding, too.
+# A function began on its zero if its values before were below this share of its size,
+# also a power of the unit of rounding.
 _ON_ZERO = 0.625
 # What happens within so many of these distances may be passed over.
 _BRIEF = 10

@@ -123,7 +123,3 @@ class _Framed(diffrax.AbstractStepSizeController):
 
 class _FramedAdaptive(_Framed, Adaptive):  # pyright: ignore[reportIncompatibleMethodOverride]
     """As `_Framed`, of an adaptive controller."""
-
-    controller: Any
-    dt0: Any
-    most: Any

@@ -23,7 +23,6 @@ from .dopri8 import (
     DENSE,
     LOWER,
     NODES,
-    STAGES,
     TABLEAU,
     DenseOutput,
     Health,
@@ -55,13 +54,9 @@ def _combine(coefficients: Sequence[Any] | np.ndarray, rates: Rates) -> PyTree:
     )
 
 
-# Row i gives the increment before stage i.
-_TABLEAU = np.vstack([np.zeros(STAGES), LOWER])
-
-
 def _twice(row: np.ndarray) -> np.ndarray:
     """Returns the coefficients of accelerations for those of velocities at stages."""
-    coefficients = row @ _TABLEAU
+    coefficients = row @ LOWER
     return np.where(abs(coefficients) < 1e-14, 0, coefficients)  # up to rounding
 
 
@@ -101,14 +96,13 @@ class _Step(NamedTuple):
 
 @eqx.filter_jit  # traced once, not at each use in a solve
 def _step(term, t0, t1, y0, residue, args, f0) -> tuple[_Step, dict[str, Any]]:
-    # diffrax wraps the term to integrate backward in time too.
-    inner, h = term.term, term.contr(t0, t1)
-    times = (t0 + (t1 - t0) * jnp.asarray(NODES, t0.dtype)) * term.direction
+    inner, h = term.term, term.contr(t0, t1)  # within a wrapper of diffrax
+    times = t0 + (t1 - t0) * jnp.asarray(NODES, t0.dtype)
     schedule = jax.vmap(inner.schedule, in_axes=(0, None))(times, args)
     scheduled = lambda stage: jtu.tree_map(lambda leaf: leaf[stage], schedule)
     field, rates = eqx.filter_jit(inner.vector_field), [f0]
     weighted = lambda row: _increment(row, rates, y0, h)
-    for stage, row in enumerate(LOWER[:-1], 1):
+    for stage, row in enumerate(LOWER[1:-1], 1):
         y = _moved(y0, h, weighted(row))
         rates.append(field(times[stage], y, args, scheduled(stage)))
     y, residue = compensated(y0, _moved(residue, h, weighted(LOWER[-1])))
@@ -146,8 +140,8 @@ class UnrolledDopri8(ScheduledDopri8):
 
     def _start(self, terms, t0, y0, args):
         """Returns the rates and their health at the start of a step."""
-        term, t = terms.term, t0 * terms.direction
-        return term.watched_field(t, y0, args, term.schedule(t, args))
+        term = terms.term
+        return term.watched_field(t0, y0, args, term.schedule(t0, args))
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         start, residue = solver_state

@@ -32,12 +32,11 @@ _SLOPES = (
 # Steps end where a switching function has passed its zero by this power of the unit of
 # rounding, times its size, and by this multiple of it. There the side to which the
 # motion goes is known even if it began at rest on the zero.
-BEYOND, _ROUNDING = 0.75, 500
+_BEYOND, _ROUNDING = 0.75, 500
 _WRONG = 0.375  # power of it, over a size: so far from zero no step has ended
 _SOON = 0.01  # of a step, for extrapolation
-_MISSED = (
-    0.01  # of a function's size: turning back so close to its zero nearly touches it
-)
+# A function that turns back within this share of its size nearly touches its zero.
+_MISSED = 0.01
 # Of slopes and second derivatives, in units of rounding.
 _SLOPE_NOISE, _NOISE = (4 * np.abs(weights).sum() for weights in (_SLOPE, _BEND))
 _ITERATIONS = 6  # of Newton's method within a bracket
@@ -51,16 +50,6 @@ def _times(weights: np.ndarray, values: Array) -> Array:
     factors = jnp.asarray(weights, values.dtype)[..., None]
     values = jnp.broadcast_to(values, (*factors.shape[:-1], values.shape[-1]))
     return jnp.sum(factors * values, axis=-2)
-
-
-def slope_at_end(values: Array) -> Array:
-    """Returns the slopes at the end, per step, of values at the samples."""
-    return _times(_SLOPE, values)
-
-
-def bend_at_end(values: Array) -> Array:
-    """Returns the second derivatives at the end, per step squared."""
-    return _times(_BEND, values)
 
 
 def _turns(margins: Array, least: Array) -> tuple[Array, Array]:
@@ -99,7 +88,7 @@ def _uncertainty(margins: Array, checks: Array, sizes: Array) -> Array:
 def _beyond(margins: Array) -> tuple[Array, Array]:
     """Returns margins from the places where steps end beyond zeros, and how far."""
     eps = jnp.finfo(margins.dtype).eps
-    beyond = eps**BEYOND * jnp.max(jnp.abs(margins), axis=0) + _ROUNDING * eps
+    beyond = eps**_BEYOND * jnp.max(jnp.abs(margins), axis=0) + _ROUNDING * eps
     return margins + beyond[None], beyond
 
 
@@ -110,7 +99,7 @@ def _hiding_place(margins: Array, unsure: Array, begun: Array, near: Array) -> A
     margins begin on their zeros, as after a switch.
     """
     # Margins on their zeros at the ends do not turn back within.
-    ending = jnp.abs(margins[-1]) <= -slope_at_end(margins) * near
+    ending = jnp.abs(margins[-1]) <= -_times(_SLOPE, margins) * near
     margins, beyond = _beyond(margins)
     _, lowest = _turns(margins, beyond)  # as in `first_zero`; XLA computes them once
     inner = margins.at[0].add(jnp.where(begun, jnp.inf, 0))
@@ -161,7 +150,6 @@ def passage(
     )
 
 
-@eqx.filter_jit
 def first_zero(
     margins: Array, sizes: Array, unsure: Array
 ) -> tuple[Array, Array, Array]:
@@ -198,7 +186,8 @@ def first_zero(
         lambda: _zero(terms(), guess, low, high),
         lambda: jnp.ones_like(low),
     )
-    # As far beyond its zero instead, a margin would pass that at this speed.
+    # A margin that turns back just before its zero counts as if it had gone as far
+    # beyond: this is the speed of that crossing.
     near = jnp.max(jnp.maximum(sizes[None], margins[:-1]) / lowest)
     near = jnp.where(near * _MISSED > 1, jnp.sqrt(jnp.maximum(near, 0)), 0)
     return jnp.where(wrong, 0, zero), passed.any() | wrong, near
@@ -223,7 +212,6 @@ def _zero(terms: Array, guess: Array, low: Array, high: Array) -> Array:
     return jax.lax.fori_loop(0, _ITERATIONS, nearer, (guess, low, high))[0]
 
 
-@eqx.filter_jit
 def at_end(margins: Array, sizes: Array, near: Array) -> tuple[Array, Array, Array]:
     """Returns which margins are near their zeros at the step's end, and how they graze.
 
@@ -231,7 +219,7 @@ def at_end(margins: Array, sizes: Array, near: Array) -> tuple[Array, Array, Arr
     `sizes`: the largest size of each margin, also in steps before. `near`: a share of
     the step.
     """
-    nearer = -slope_at_end(margins)
+    nearer = -_times(_SLOPE, margins)
     # Where the slope is rounding, as in a step of almost no length, the side counts.
     moves = jnp.abs(nearer) > _SLOPE_NOISE * jnp.finfo(sizes.dtype).eps * sizes
     speed = jnp.where(moves, nearer, 1)
@@ -239,7 +227,7 @@ def at_end(margins: Array, sizes: Array, near: Array) -> tuple[Array, Array, Arr
     switched = jnp.where(moves, (nearer > 0) & (left <= near), margins[-1] < 0)
     # A small slope for the step, or a zero after which the margin would soon turn back.
     # The latter shows in short steps too, where the size is that of the slope.
-    bend = bend_at_end(margins) - _NOISE * jnp.finfo(sizes.dtype).eps * sizes
+    bend = _times(_BEND, margins) - _NOISE * jnp.finfo(sizes.dtype).eps * sizes
     turning = jnp.sqrt(2 * sizes * jnp.maximum(bend, 0))
     grazing = jnp.maximum(jnp.max(jnp.abs(margins), axis=0), turning) / speed
     follows = moves & (nearer > 0) & (left > near) & (left < _SOON)
