@@ -40,7 +40,7 @@ def effort(element, q, qd, linkage, t=0.0):
 
 @eqx.filter_jit
 def length_and_rate(element, q, qd, linkage):
-    return jax.jvp(lambda q: element.ends.length(linkage, q), (q,), (qd,))
+    return jax.jvp(lambda q: element.length(linkage, q), (q,), (qd,))
 
 
 @eqx.filter_jit
