@@ -27,7 +27,7 @@ from ..linkage.fields import (
     of_kind,
     value_of,
 )
-from ..linkage.frames import Frames, cross, frames, length_of, scalar_frames
+from ..linkage.frames import Frames, cross, length_of, scalar_frames
 from ..linkage.linkage import Linkage, joints_of, per_joint, without_fixed
 from ..linkage.topology import MOST_PAIRS
 from ..mechanics.equations import Scalars
@@ -81,7 +81,7 @@ class Point(Part):
         """Computes the point's position (x, y) from the ground pivot [m]."""
         check_joints("", self, linkage)
         q = without_fixed(linkage, per_joint("q", q, linkage))
-        place = self.place(frames(linkage, q))
+        place = self.place(scalar_frames(linkage, tuple(q)))
         return jnp.stack([place.real, place.imag])
 
     def conditions_on(self, linkage):
@@ -161,8 +161,8 @@ class PointElement(ScalarElement):
         return tuple(reduce(add, rows) for rows in zip(*efforts))
 
     def loads_on_points(self, t, q, qd, qdd, linkage):
-        scheduled = self.schedule(t, linkage)
-        return self.loads(scheduled, frames(linkage, q), tuple(qd))
+        frames = scalar_frames(linkage, tuple(q))
+        return self.loads(self.schedule(t, linkage), frames, tuple(qd))
 
 
 class Between(Element):
