@@ -33,7 +33,8 @@ ARM = elements.arm("RPR")
 # Numbers without which elements keep the energy. That of an actuator adds energy: see
 # test_actuators.py.
 LOSSES = {"coefficient", "level", "damping"}
-SHORT_SPRING = fj.SpringDamper(fj.Point(1), elements.TIP, stiffness=30.0, damping=0.5)
+BETWEEN = fj.Point(1, 0.4, 0.1), elements.TIP  # of two links that move
+SHORT_SPRING = fj.SpringDamper(*BETWEEN, stiffness=30.0, damping=0.5)
 PASSIVE = {
     name: part
     for name, part in (elements.ALL | {"short spring": SHORT_SPRING}).items()

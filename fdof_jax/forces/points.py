@@ -80,8 +80,8 @@ class Point(Part):
     def position(self, linkage: Linkage, q: ArrayLike) -> Float[Array, " 2"]:
         """Computes the point's position (x, y) from the ground pivot [m]."""
         check_joints("", self, linkage)
-        q = without_fixed(linkage, per_joint("q", q, linkage))
-        place = self.place(scalar_frames(linkage, tuple(q)))
+        positions = without_fixed(linkage, per_joint("q", q, linkage))
+        place = self.place(scalar_frames(linkage, tuple(positions)))
         return jnp.stack([place.real, place.imag])
 
     def conditions_on(self, linkage):
