@@ -156,11 +156,19 @@ def test_states_of_elements_are_swept():
 
 
 ONES = fj.JointEffort([1.0])
+OTHER = fj.PDController(1.0, 1.0, 1.0, Hold(jnp.zeros(2)))  # for two joints
+
+
+def run_by(command):
+    fj.simulate(WHEEL, STILL, [0, 1], (LAG.replace(command=command),))
+
+
 REFUSED = {
     "command: expected a force element": lambda: LAG.replace(command=3.0),
-    r"forces\[0\]\.command: expected an array of 1": lambda: fj.simulate(
-        WHEEL, STILL, [0, 1], (LAG.replace(command=lambda t, q, qd, linkage: 5.0),)
+    r"forces\[0\]\.command: expected an array of 1": lambda: run_by(
+        lambda t, q, qd, linkage: 5.0
     ),
+    r"forces\[0\]\.command\.reference: expected an .* of 1": lambda: run_by(OTHER),
     "ki: expected 0 where kp is": lambda: fj.control.PIDController(
         [1, 1, 0.0], 1.0, 1.0, 1.0, Hold(jnp.zeros(3))
     ),
