@@ -97,7 +97,13 @@ def double_pendulum() -> Scene:
     >>> fj.scenes.double_pendulum().linkage.mass.tolist()  # [kg]
     [1.0, 1.0]
     """
-    linkage = _rods(length=[1, 1], mass=[1, 1])
+    linkage = Linkage(
+        "RR",
+        length=[0, 1, 1],
+        com=[[0.5, 0], [0.5, 0]],
+        mass=[1, 1],
+        inertia=[1 / 12, 1 / 12],
+    )
     return Scene(linkage, State([0.5, 0.5], [0, 0]), (), 10.0)
 
 
@@ -134,7 +140,14 @@ def two_link_circle() -> Scene:
     >>> fj.tip_position(arm, start.q).tolist()  # 0.1 m beside the circle's start
     [1.1, 0.0]
     """
-    linkage = _rods(length=[1, 0.8], mass=[2, 1]).replace(gravity=0)
+    linkage = Linkage(
+        "RR",
+        length=[0, 1, 0.8],
+        com=[[0.5, 0], [0.4, 0]],
+        mass=[2, 1],
+        inertia=[1 / 6, 0.8**2 / 12],
+        gravity=0,
+    )
     circle = Ellipse([0.7, 0], [0.3, 0.3])
     task = TipTask(circle, Laps(period=2.0), orientation=None)
     controller = PDController(kp=100, kd=10, limit=[60, 30], reference=task)
@@ -149,16 +162,11 @@ def five_links() -> Scene:
     >>> fj.scenes.five_links().linkage.mass.shape
     (5,)
     """
-    linkage = _rods(length=[0.5] * 5, mass=[1] * 5)
-    return Scene(linkage, State([-0.5, 0.3, 0.2, -0.4, 0.6], np.zeros(5)), (), 10.0)
-
-
-def _rods(length: list[float], mass: list[float]) -> Linkage:
-    """Returns uniform rods in a chain of revolute joints."""
-    return Linkage(
-        "R" * len(length),
-        length=[0, *length],
-        com=[[a / 2, 0] for a in length],
-        mass=mass,
-        inertia=[m * a**2 / 12 for m, a in zip(mass, length)],
+    linkage = Linkage(
+        "RRRRR",
+        length=[0, *[0.5] * 5],
+        com=[[0.25, 0]] * 5,
+        mass=[1] * 5,
+        inertia=[0.25 / 12] * 5,
     )
+    return Scene(linkage, State([-0.5, 0.3, 0.2, -0.4, 0.6], np.zeros(5)), (), 10.0)
