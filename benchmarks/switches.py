@@ -77,7 +77,7 @@ def contact(scene: fj.Scene) -> Phases:
     """The phases of a fall: without the spring, then with one of both sides."""
     spring, damper = scene.forces
     both = eqx.tree_at(lambda spring: spring.side, spring, jnp.array(0))
-    stretch = lambda q, _: spring.ends.length(scene.linkage, q) - spring.rest_length
+    stretch = lambda q, _: spring.length(scene.linkage, q) - spring.rest_length
     return [((damper,), stretch), ((both, damper), None)]
 
 

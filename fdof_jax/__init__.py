@@ -59,10 +59,9 @@ from .dynamics import (
     mass_matrix,
 )
 from .forces.actuators import LinearActuator
-from .forces.between_points import SpringDamper, Wrench
 from .forces.element import Element
 from .forces.joints import JointDamper, JointEffort
-from .forces.points import Point
+from .forces.points import Point, SpringDamper, Wrench
 from .identification.fitting import fit
 from .identification.result import FitResult
 from .linkage.coordinates import State

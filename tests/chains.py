@@ -3,13 +3,11 @@
 The MJCF here shares no line with `fdof_jax.to_mjcf`.
 """
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
+from helpers import Hold as Hold, random_linkage as random_chain
 
-import fdof_jax as fj
+__all__ = ["Hold", "in_mujoco", "moving", "random_chain", "random_topology"]
 
 
 def random_topology(pairs, rng):
@@ -19,20 +17,6 @@ def random_topology(pairs, rng):
         moving = name.replace("F", "")
         if moving and ("R" in moving or len(moving) < 3):
             return name
-
-
-def random_chain(topology, rng):
-    n = len(topology)
-    return fj.Linkage(
-        topology,
-        length=rng.uniform(0, 1.5, n + 1),
-        com=rng.uniform(-1, 1, (n, 2)),
-        mass=rng.uniform(0.5, 3, n),
-        inertia=rng.uniform(0.05, 1, n),
-        locked=rng.uniform(-1, 1, n),
-        base_angle=rng.uniform(-3, 3),
-        gravity=rng.uniform(0, 10),
-    )
 
 
 def moving(topology):
@@ -73,12 +57,3 @@ def in_mujoco(topology, chain):
         </worldbody>
       </mujoco>""")
     return model, mujoco.MjData(model)
-
-
-class Hold(eqx.Module):
-    """A reference that stands still."""
-
-    target: jax.Array
-
-    def __call__(self, t, linkage):
-        return self.target, jnp.zeros_like(self.target)

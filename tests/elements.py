@@ -5,6 +5,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from helpers import Hold as Hold
 
 import fdof_jax as fj
 
@@ -31,18 +32,9 @@ class Swing(eqx.Module):
     amplitude: jax.Array
 
     def __call__(self, t, linkage):
-        phase = jnp.array([0.0, 1.0, 2.0])
+        phase = jnp.arange(float(self.amplitude.size))
         rate = 3 * jnp.cos(3 * t + phase)
         return self.amplitude * jnp.sin(3 * t + phase), self.amplitude * rate
-
-
-class Hold(eqx.Module):
-    """A reference that stands still."""
-
-    target: jax.Array
-
-    def __call__(self, t, linkage):
-        return self.target, jnp.zeros(3)
 
 
 MOVE = Swing(jax.device_put(np.array([0.3, 0.5, 0.2])))
@@ -86,7 +78,7 @@ PLAIN = {
     "friction": fj.forces.JointFriction([0.4, 0.3, 0.2], 0.5),
 }  # fmt: skip
 WITH_STATE = {
-    "speed limit": fj.control.SpeedLimit(PD, stall=3.0, no_load=4.0),
+    "speed limit": fj.control.SpeedLimit(PD, stall=[1.0, 3.0, 0.5], no_load=4.0),
     "PID": fj.control.PIDController(8.0, [4.0, 3.0, 2.0], 2.0, [3.0, 9.0, 1.0], MOVE),
     "lag": fj.control.FirstOrderLag(PD, 0.2, start=[0.5, 0.0, 0.0]),
     "motor": fj.control.DCMotor(

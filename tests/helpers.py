@@ -1,11 +1,13 @@
-"""Reference scenes and random linkages, shared by the tests."""
+"""Reference scenes, random linkages and references, shared by the tests."""
 
 import json
 import warnings
 from pathlib import Path
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 import fdof_jax as fj
@@ -24,6 +26,15 @@ def programs():
         "JAX_COMPILATION_CACHE_DIR": folder,
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
     }
+
+
+class Hold(eqx.Module):
+    """A reference that stands still."""
+
+    target: jax.Array
+
+    def __call__(self, t, linkage):
+        return self.target, jnp.zeros_like(self.target)
 
 
 class ReferenceScene(NamedTuple):
@@ -84,13 +95,14 @@ def relative_error(value, reference):
 
 
 def random_linkage(topology, rng):
+    n = len(topology)
     return fj.Linkage(
         topology,
-        length=rng.uniform(0, 1.5, 4),
-        com=rng.uniform(-1, 1, (3, 2)),
-        mass=rng.uniform(0.5, 3, 3),
-        inertia=rng.uniform(0.05, 1, 3),
-        locked=rng.uniform(-1, 1, 3),
+        length=rng.uniform(0, 1.5, n + 1),
+        com=rng.uniform(-1, 1, (n, 2)),
+        mass=rng.uniform(0.5, 3, n),
+        inertia=rng.uniform(0.05, 1, n),
+        locked=rng.uniform(-1, 1, n),
         base_angle=rng.uniform(-3, 3),
         gravity=rng.uniform(0, 10),
     )

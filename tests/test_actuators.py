@@ -1,8 +1,10 @@
-"""Elements with inertia: an independent Lagrangian, energy and inverse dynamics."""
+"""Elements with inertia: an independent Lagrangian of the actuator's bodies.
+
+Their energies are tested with those of all elements, in test_elements.py, and the
+armature against MuJoCo's in test_interop.py.
+"""
 
 import equinox as eqx
-import jax
-import mujoco
 import numpy as np
 import pytest
 from helpers import random_linkage
@@ -13,8 +15,6 @@ PINS = fj.Point(0, -0.6, -0.8), fj.Point(2, 0.4, 0.3)
 ACTUATOR = fj.LinearActuator(
     *PINS, force=5.0, mass=[1.2, 0.7], com=[0.2, 0.3], inertia=[0.05, 0.03]
 )
-ARMATURE = fj.forces.Armature([0.3, 0.2, 0.1])
-ELEMENTS = {"armature": ARMATURE, "actuator": ACTUATOR}
 
 
 def motion(topology, seed=0):
@@ -58,12 +58,6 @@ def acting(element, q, qd, linkage):
     return element(0.0, q, qd, linkage)
 
 
-@eqx.filter_jit
-def energy_rates(forces, linkage, q, qd, qdd):
-    energies = lambda q, qd: fj.energy(linkage, q, qd, forces)
-    return jax.jvp(energies, (q, qd), (qd, qdd))[1]
-
-
 @pytest.mark.parametrize("topology", fj.TOPOLOGIES)
 def test_the_actuator_s_bodies_by_another_lagrangian(topology):
     linkage, q, qd = motion(topology)
@@ -91,97 +85,6 @@ def test_the_actuator_s_force_may_depend_on_its_length():
     np.testing.assert_allclose(
         spring(0.0, q, qd, linkage), same(0.0, q, qd, linkage), rtol=1e-12
     )
-
-
-def test_armature_adds_to_the_diagonal():
-    linkage, q, qd = motion("RPR")
-    qdd = np.array([0.3, -0.7, 1.1])
-    bare = fj.inverse_dynamics(linkage, q, qd, qdd)
-    full = fj.inverse_dynamics(linkage, q, qd, qdd, (ARMATURE,))
-    np.testing.assert_allclose(full - bare, [0.09, -0.14, 0.11], rtol=1e-10)
-
-
-@pytest.mark.parametrize("topology", fj.TOPOLOGIES)
-@pytest.mark.parametrize("name", ELEMENTS)
-def test_inverse_after_forward(topology, name):
-    linkage, q, qd = motion(topology)
-    tau, forces = np.array([1.0, -2.0, 0.5]), (ELEMENTS[name],)
-    qdd = fj.forward_dynamics(linkage, q, qd, tau, forces)
-    back = fj.inverse_dynamics(linkage, q, qd, qdd, forces)
-    np.testing.assert_allclose(back, tau, rtol=1e-10)
-
-
-@pytest.mark.parametrize("topology", fj.TOPOLOGIES)
-def test_energy_and_work(topology):
-    """Checks that the energy changes at the power of the force between the pins."""
-    linkage, q, qd = motion(topology)
-    forces = ACTUATOR, ARMATURE
-    tau = sum(np.asarray(acting(element, q, qd, linkage)) for element in forces)
-    qdd = np.asarray(fj.forward_dynamics(linkage, q, qd, tau, forces))
-    kinetic, potential = map(np.asarray, energy_rates(forces, linkage, q, qd, qdd))
-    assert abs(kinetic) > 1e-2
-    power = np.asarray(acting(ACTUATOR, q, qd, linkage)) @ qd
-    np.testing.assert_allclose(kinetic + potential, power, atol=1e-11 * abs(kinetic))
-
-
-def in_mujoco(linkage, q, qd):
-    """Returns the actuator as two MuJoCo bodies, with the rod tied to its pin."""
-    text = fj.to_mjcf(linkage)
-    third = text.index('<body name="link3"')
-    text = f'{text[:third]}<site name="pin" pos="0.4 0.3 0"/>{text[third:]}'
-    bodies = """
-      <body pos="-0.6 -0.8 0">
-        <joint name="swing" type="hinge" axis="0 0 1"/>
-        <inertial pos="0.2 0 0" mass="1.2" diaginertia="0.05 0.05 0.05"/>
-        <body>
-          <joint name="stroke" type="slide" axis="1 0 0"/>
-          <inertial pos="-0.3 0 0" mass="0.7" diaginertia="0.03 0.03 0.03"/>
-          <site name="rod"/>
-        </body>
-      </body>"""
-    ground = text.index(">", text.index('<body name="ground"')) + 1
-    tie = """
-      <option timestep="1e-4" integrator="RK4" tolerance="1e-15"/>
-      <equality>
-        <connect site1="rod" site2="pin" solref="2e-3 1"
-          solimp="0.9999 0.9999 1 0.5 2"/>
-      </equality></mujoco>"""
-    text = (text[:ground] + bodies + text[ground:]).replace("</mujoco>", tie)
-    model = mujoco.MjModel.from_xml_string(text)
-    data = mujoco.MjData(model)
-
-    def place(q):
-        a, b = pins(linkage, q)
-        return np.array([np.angle(b - a) - linkage.base_angle, abs(b - a)])
-
-    joints = lambda *names: [model.joint(name).qposadr[0] for name in names]
-    arm, own = joints("joint1", "joint2", "joint3"), joints("swing", "stroke")
-    data.qpos[arm], data.qvel[arm] = q, qd
-    data.qpos[own] = place(q)
-    data.qvel[own] = (place(q + 1e-6 * qd) - place(q - 1e-6 * qd)) / 2e-6
-    data.qfrc_applied[own[1]] = 5.0
-    return model, data, arm
-
-
-@pytest.mark.parametrize("topology", fj.TOPOLOGIES)
-def test_mujoco_with_a_soft_tie(topology):
-    """The tie changes accelerations by up to 1e-4, and the motion hardly at all."""
-    linkage, q, qd = motion(topology)
-    rest = np.zeros(3)
-    model, data, arm = in_mujoco(linkage, q, rest)
-    mujoco.mj_forward(model, data)
-    tau = acting(ACTUATOR, q, rest, linkage)
-    own = fj.forward_dynamics(linkage, q, rest, tau, (ACTUATOR,))
-    size = np.abs(own).max()
-    bare = fj.forward_dynamics(linkage, q, rest, rest)
-    assert np.abs(own - bare).max() > 0.1 * size
-    np.testing.assert_allclose(data.qacc[arm], own, atol=2e-4 * size)
-
-    model, data, arm = in_mujoco(linkage, q, qd)
-    for _ in range(2000):
-        mujoco.mj_step(model, data)
-    end = fj.simulate(linkage, fj.State(q, qd), [0, 0.2], (ACTUATOR,)).q[-1]
-    np.testing.assert_allclose(data.qpos[arm], end, atol=1e-8)
 
 
 def test_the_conditioning_sees_the_armature():

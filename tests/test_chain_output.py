@@ -127,7 +127,7 @@ def test_states_and_links_of_other_chains_are_refused():
 
 HOLD = chains.Hold(jnp.zeros(2))
 OF_THREE = {
-    r"ends\.b\.link: expected 0 .* 1 to 2, got 3": fj.SpringDamper(
+    r"b\.link: expected 0 .* 1 to 2, got 3": fj.SpringDamper(
         fj.Point(0, 0.1), fj.Point(3, 0.1)
     ),
     "joints: expected 1 to 2, got 3": fj.simulation.PrescribedMotion(3, HOLD),

@@ -15,14 +15,8 @@ def pictures(folder):
 
 def test_figures(tmp_path, capsys):
     main(["figures", "--output", str(tmp_path)])
-    names = [
-        "fig3.png",
-        "fig4.png",
-        "fig5.png",
-        "fig6-angles.png",
-        "fig6-energies.png",
-        "fig7.png",
-    ]
+    figures = "fig3 fig4 fig5 fig6-angles fig6-energies fig7".split()
+    names = [f"{figure}.png" for figure in figures]
     assert pictures(tmp_path) == names
     assert capsys.readouterr().out.split() == [str(tmp_path / name) for name in names]
 

@@ -1,4 +1,4 @@
-"""The base of elements and references: declared values, conditions, jumps, adapters."""
+"""The base of elements and references: values, conditions, jumps, adapters, copies."""
 
 from pathlib import Path
 
@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from elements import PD, Hold, arm
+from elements import ALL, PD, Hold, arm
 
 import fdof_jax as fj
 from fdof_jax.forces.element import elements
@@ -15,7 +15,9 @@ from fdof_jax.simulation.field import args_of, element_effort
 from fdof_jax.simulation.known_times import clocks_apart, known_times
 from fdof_jax.simulation.simulate import check_elements
 
-ARM, TS = arm("RRR"), jnp.array([0.0, 1.0])
+ARM, TS, ZERO = arm("RRR"), jnp.array([0.0, 1.0]), jnp.zeros(3)
+
+# Values
 
 
 class Pulse(fj.Element):
@@ -35,39 +37,6 @@ class Pulse(fj.Element):
         return jnp.where(on, self.torque, 0.0) * jnp.array([1.0, 0.0, 0.0])
 
 
-def moved(element, where, value):
-    return eqx.tree_at(where, element, jnp.asarray(value, float))
-
-
-def test_a_fault_is_told_by_constructor_door_and_program():
-    pulse = Pulse([0.1, 0.2], 3)
-    assert pulse.torque.dtype == float and pulse.possible()
-    for times, torque, words in (
-        ([0.2, 0.1], 3, "jump_ts: expected increasing times, got 0.2 and 0.1"),
-        (
-            [0.1, 0.2],
-            -1,
-            r"torque: expected a real number, .*at least 0 \[N m\], got -1",
-        ),
-        ([0.1, 0.2], np.nan, "torque: expected a real number"),
-    ):
-        with pytest.raises(ValueError, match="^" + words):
-            Pulse(times, torque)
-        spoilt = moved(
-            moved(pulse, lambda p: p.jump_ts, times), lambda p: p.torque, torque
-        )
-        with pytest.raises(ValueError, match=r"^forces\[1\]\." + words):
-            check_elements((fj.JointDamper(1.0), spoilt), ARM, TS)
-        assert not jax.jit(lambda p: p.possible())(spoilt)
-        jax.jit(Pulse)(jnp.array(times), jnp.array(torque))  # unknown: not refused
-
-
-def test_every_element_tells_a_program_what_is_impossible():
-    effort = fj.JointEffort([1.0, 2.0, 3.0])
-    assert effort.possible()
-    assert not moved(effort, lambda e: e.tau, [1.0, np.inf, 3.0]).possible()
-
-
 class Graded(fj.Element):
     """Numbers that must fall: a condition on an array, which shows one value."""
 
@@ -81,18 +50,31 @@ class Graded(fj.Element):
         return self.levels
 
 
-def test_a_condition_may_be_an_array_and_show_one_value():
-    graded = Graded([3, 2, 1])
-    assert graded.possible()
-    with pytest.raises(ValueError, match=r"^levels: expected falling .*\[3\. 2\. 4"):
-        Graded([3, 2, 4])
-    spoilt = moved(graded, lambda g: g.levels, [3, 2, 4])
-    assert not jax.jit(lambda g: g.possible())(spoilt)
+FAULTS = [
+    (Pulse, dict(jump_ts=[0.2, 0.1]), "expected increasing times, got 0.2 and 0.1"),
+    (Pulse, dict(torque=-1.0), r"expected a real number, .*at least 0 \[N m\], got -1"),
+    (Pulse, dict(torque=np.nan), "expected a real number"),
+    (Graded, dict(levels=[3.0, 2, 4]), r"expected falling .*\[3\. 2\. 4"),
+]
 
 
-def test_a_number_is_shown_without_a_second_stop():
-    with pytest.raises(ValueError, match=r"got -1\.$"):
-        fj.JointDamper(np.array(-1.0))
+@pytest.mark.parametrize("kind, values, words", FAULTS)
+def test_a_fault_is_told_by_constructor_door_and_program(kind, values, words):
+    right = (
+        dict(jump_ts=[0.1, 0.2], torque=3) if kind is Pulse else dict(levels=[3, 2, 1])
+    )
+    part, ((name, value),) = kind(**right), values.items()
+    assert part.possible() and all(
+        leaf.dtype == float for leaf in jax.tree.leaves(part)
+    )
+    with pytest.raises(ValueError, match=f"^{name}: {words}"):
+        kind(**right | values)
+    spoilt = eqx.tree_at(lambda e: getattr(e, name), part, jnp.asarray(value))
+    with pytest.raises(ValueError, match=rf"^forces\[1\]\.{name}: {words}"):
+        check_elements((fj.JointDamper(1.0), spoilt), ARM, TS)
+    assert not jax.jit(lambda e: e.possible())(spoilt)
+    traced = {name: jnp.array(value, float) for name, value in (right | values).items()}
+    jax.jit(lambda values: kind(**values))(traced)  # unknown: not refused
 
 
 class Unequal(fj.forces.InertialElement):
@@ -101,13 +83,6 @@ class Unequal(fj.forces.InertialElement):
 
     def weights(self, linkage):
         return jnp.ones(3)
-
-
-def test_weights_are_as_many_as_coordinates():
-    q = jnp.zeros(3)
-    for call in (fj.forward_dynamics, lambda *row: fj.energy(*row[:3], row[4])):
-        with pytest.raises(ValueError, match=r"^Unequal: .*one shape .*\(2,\).*\(3,\)"):
-            call(ARM, q, q, q, (Unequal(),))
 
 
 class Lost(fj.forces.StatefulElement):
@@ -120,20 +95,51 @@ class Lost(fj.forces.StatefulElement):
         return q, state[:2]
 
 
-def test_messages_on_states_show_shapes():
-    q = jnp.zeros(3)
-    with pytest.raises(ValueError, match=r"rate .*state, f64\[3\], got f64\[2\]\."):
-        element_effort(0, Lost(), 0.0, q, q, ARM, q)
+def effort_of(element, state=()):
+    return element_effort(0, element, TS[0], ZERO, ZERO, ARM, state)
 
 
-def test_a_fault_within_is_told_with_its_place():
-    lag = fj.control.FirstOrderLag(fj.control.SpeedLimit(PD, 1.0, 2.0), 0.1)
-    spoilt = eqx.tree_at(lambda e: e.command.command.kp, lag, -PD.kp)
-    with pytest.raises(
-        ValueError, match=r"^forces\[0\]\.command\.command\.kp: expected"
-    ):
-        check_elements((spoilt,), ARM, TS)
-    assert lag.possible() and not spoilt.possible()
+one_shape = r"^Unequal: .*one shape .*\(2,\).*\(3,\)"
+REFUSED = [
+    (lambda: fj.JointDamper(np.array(-1.0)), r"got -1\.$"),  # not two full stops
+    (lambda: fj.mass_matrix(ARM, ZERO, (Unequal(),)), one_shape),
+    (lambda: fj.energy(ARM, ZERO, ZERO, (Unequal(),)), one_shape),
+    (
+        lambda: effort_of(Lost(), ZERO),
+        r"^forces\[0\]: .*rate .*state, f64\[3\], got f64\[2\]\.",
+    ),
+    (
+        lambda: fj.Wrench(fj.Point(3, 1.0), lambda t: ZERO)(0.0, ZERO, ZERO, ARM),
+        "^force: expected an array of 2 real numbers",
+    ),
+    (
+        lambda: fj.SpringDamper(fj.Point(0), fj.Point(1), stiffness=lambda t: 1.0),
+        "^stiffness: expected",
+    ),
+]
+
+
+@pytest.mark.parametrize("call, words", REFUSED)
+def test_what_elements_return_is_checked(call, words):
+    with pytest.raises(ValueError, match=words):
+        call()
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        lambda t, q, qd, linkage: np.sign(qd),
+        lambda t, q, qd, linkage: q if t < 0.2 else qd,
+        lambda t, q, qd, linkage: -float(q[0]) * qd,
+    ],
+)
+def test_functions_that_cannot_be_traced_are_refused(function):
+    (element,) = elements("forces", (function,))
+    with pytest.raises(TypeError, match=r"^forces\[0\]: expected jax\.numpy .*, got: "):
+        effort_of(element)
+
+
+# Jumps
 
 
 def test_jumps_are_passed_on():
@@ -142,14 +148,8 @@ def test_jumps_are_passed_on():
     pd = fj.PDController(1.0, 1.0, 1.0, move)
     path = fj.TipTask(fj.references.Line([1, 0], [1, 1]), travel)
     drive = fj.control.FirstOrderLag(pd, 0.1)
-    for part in (
-        travel,
-        move,
-        path,
-        pd,
-        drive,
-        fj.simulation.PrescribedMotion(1, move),
-    ):
+    prescribed = fj.simulation.PrescribedMotion(1, move)
+    for part in (travel, move, path, pd, drive, prescribed):
         np.testing.assert_array_equal(part.jump_ts, [1, 3])
     assert PD.jump_ts is None and fj.JointDamper(1.0).jump_ts is None
 
@@ -170,9 +170,12 @@ def test_one_time_of_a_jump_needs_no_list():
         pd = fj.PDController(10.0, 1.0, 100.0, Raised(time))
         check_elements((pd,), ARM, TS)
         np.testing.assert_array_equal(pd.jump_ts, [0.05])
-        args = args_of(ARM, jnp.zeros(3), (pd, Raised(time)))
-        ends.append(known_times(clocks_apart(args, jnp.array([0, 1.0]))))
+        args = args_of(ARM, ZERO, (pd, Raised(time)))
+        ends.append(known_times(clocks_apart(args, TS)))
     np.testing.assert_array_equal(*ends)
+
+
+# Callables of other kinds
 
 
 class Foreign(eqx.Module):
@@ -222,7 +225,7 @@ def test_an_opened_function_keeps_its_jumps():
 
         pushed.jump_ts = jnp.array([1.0])
         (element,) = elements("forces", (pushed,))
-        at = jnp.array(0.0), jnp.ones(3), jnp.zeros(3), ARM
+        at = jnp.array(0.0), jnp.ones(3), ZERO, ARM
         opened = element.opened(*at)
         np.testing.assert_array_equal(opened.jump_ts, [1.0])
         assert any(leaf is level for leaf in jax.tree.leaves(opened))
@@ -231,12 +234,20 @@ def test_an_opened_function_keeps_its_jumps():
     assert jax.grad(found)(2.0) == 3.0
 
 
-def test_a_function_in_place_of_an_array_is_checked_where_it_is_called():
-    wrench = fj.Wrench(fj.Point(3, 1.0), lambda t: jnp.zeros(3))
-    with pytest.raises(ValueError, match="^force: expected an array of 2 real numbers"):
-        wrench(0.0, jnp.zeros(3), jnp.zeros(3), ARM)
-    with pytest.raises(ValueError, match="^stiffness: expected"):
-        fj.SpringDamper(fj.Point(0), fj.Point(1), stiffness=lambda t: 1.0)
+def test_nothing_else_is_asked_for_attributes():
+    """Only the adapter asks; trees and JAX's programs are read by names of fields."""
+    folder = Path(fj.__file__).parent
+    asking = {
+        path.relative_to(folder).as_posix()
+        for path in folder.rglob("*.py")
+        if "hasattr(" in path.read_text() or "getattr(" in path.read_text()
+    }
+    # These of a sweep ask arrays and programs.
+    of_sweeps = {"batches/chunk_programs.py", "batches/store.py"}
+    assert asking == {"linkage/fields.py", "data/files.py"} | of_sweeps
+
+
+# References
 
 
 def test_a_reference_of_one_s_own():
@@ -252,38 +263,55 @@ def test_a_reference_of_one_s_own():
     assert (q.tolist(), qd.tolist()) == ([12.0] * 3, [12.0] * 3)
     assert Parabola(3).tip is None and fj.CircleTask().tip is not None
     assert fj.PDController(1.0, 1.0, 1.0, Hold(q)).jump_ts is None
+    with pytest.raises(TypeError, match="^Nothing: expected a method `__call__`"):
+        type("Nothing", (fj.references.Reference,), {})()
+
+
+# Copies
+
+EIGHT = fj.references.FigureEight([1.6, 0.4], [0.5, 0.3])
 
 
 @pytest.mark.parametrize(
-    "function",
+    "part",
     [
-        lambda t, q, qd, linkage: np.sign(qd),
-        lambda t, q, qd, linkage: q if t < 0.2 else qd,
-        lambda t, q, qd, linkage: -float(q[0]) * qd,
+        *ALL.values(),
+        fj.CircleTask(),
+        fj.TipTask(EIGHT, fj.references.Laps(period=4.0)),
+        fj.references.Spline([[0, 0], [1, 1], [2, 0]], closed=True),
+        fj.simulation.PrescribedMotion((1, 3), lambda t, linkage: 0),
     ],
+    ids=lambda part: type(part).__name__,
 )
-def test_functions_that_cannot_be_traced_are_refused(function):
-    (element,), q = elements("forces", (function,)), np.zeros(3)
-    with pytest.raises(TypeError, match=r"^forces\[0\]: expected jax\.numpy .*, got: "):
-        element_effort(0, element, TS[0], q, q, ARM, ())
+def test_a_copy_is_equal_in_values_and_structure(part):
+    assert eqx.tree_equal(part.replace(), part, typematch=True)
 
 
-def test_a_reference_without_a_motion_is_refused():
-    class Nothing(fj.references.Reference):
-        pass
+def test_a_copy_has_other_numbers_of_an_element():
+    spring = fj.SpringDamper(fj.Point(0), fj.Point(1, 1), stiffness=2, damping=3)
+    stiff = spring.__replace__(stiffness=4.0, one_sided="cable")  # by `copy.replace`
+    assert (float(stiff.stiffness), float(stiff.damping), int(stiff.side)) == (4, 3, 1)
+    assert stiff.replace(one_sided=False, stiffness=2.0).side is None
+    pid = fj.control.PIDController(1.0, 2.0, 3.0, 4.0, fj.CircleTask())
+    assert float(pid.replace(kp=5.0).pd.kp) == 5
+    for values, words in [
+        ({"stiffness": -1}, "^stiffness: expected .* at least 0"),
+        ({"ends": None}, "^ends: expected one of a, b, .*, one_sided, got another"),
+        ({300 * "z": 1}, r"^z{197}\.\.\.: expected one of"),
+    ]:
+        with pytest.raises(ValueError, match=words):
+            stiff.replace(**values)
 
-    with pytest.raises(TypeError, match="^Nothing: expected a method `__call__`"):
-        Nothing()
 
+def test_a_copy_needs_the_arguments_of_its_constructor():
+    class Doubled(fj.Element):
+        gain: fj.Values = fj.field(unit="N m")
 
-def test_nothing_else_is_asked_for_attributes():
-    """Only the adapter asks; trees and JAX's programs are read by names of fields."""
-    folder = Path(fj.__file__).parent
-    asking = {
-        path.relative_to(folder).as_posix()
-        for path in folder.rglob("*.py")
-        if "hasattr(" in path.read_text() or "getattr(" in path.read_text()
-    }
-    # These of a sweep ask arrays and programs.
-    of_sweeps = {"batches/chunk_programs.py", "batches/store.py"}
-    assert asking == {"linkage/fields.py", "data/files.py"} | of_sweeps
+        def __init__(self, half):
+            self.gain = 2 * half
+
+        def __call__(self, t, q, qd, linkage):
+            return self.gain * q
+
+    with pytest.raises(TypeError, match="^Doubled: .* `arguments`, .* no fields: half"):
+        Doubled(1.0).replace(half=2.0)

@@ -110,7 +110,7 @@ def test_energy_stack_of_a_free_arm_and_of_what_was_reached():
 def test_energy_stack_balances_with_elements_of_each_kind():
     """With and without an energy, a state and masses.
 
-    That each element's power is what its energy loses is tested in test_points.py.
+    That each element's power is what its energy loses is tested in test_elements.py.
     """
     arm, start = elements.arm("RPR"), elements.START
     kinds = "history", "spring", "cable", "stops", "wrench", "motor", "armature"

@@ -1,31 +1,19 @@
 """The examples of docs/forces.md run, in order, as written."""
 
-import re
-from pathlib import Path
-
 import numpy as np
 import pytest
-
-GUIDE = Path(__file__).parents[1] / "docs" / "forces.md"
+from test_guides import DOCS, run
 
 
 @pytest.mark.slow
 def test_examples():
-    blocks = re.findall(r"```python\n(.*?)```", GUIDE.read_text(), re.DOTALL)
-    namespace = {}
-    for block in blocks:
-        exec(compile(block, "forces.md", "exec"), namespace)
-        if "motion" in namespace:
-            assert np.isfinite(namespace["motion"].q).all()
-    assert namespace["reactions"].shape == (101, 3, 3)
-    assert namespace["torque"].shape == (101, 3)
-    assert np.isfinite(namespace["effort"]).all()
-    assert 0 < namespace["share"][0] < 0.5 and not namespace["share"][1:].any()
-    assert np.isfinite(namespace["sampled"].q).all()
-    assert np.isfinite(namespace["after"].q).all()
-    np.testing.assert_allclose(
-        namespace["traced"].q[-1],
-        namespace["around"](1.0, namespace["pendulum"])[0],
-        atol=0.05,
-    )
-    assert 0.5 < namespace["rolling"].q[-1, 0] < 1.0  # 2 N on 1 to 1.3 kg
+    names = run(DOCS / "forces.md")
+    assert names["reactions"].shape == (101, 3, 3)
+    assert names["torque"].shape == (101, 3)
+    assert np.isfinite(names["effort"]).all()
+    assert 0 < names["share"][0] < 0.5 and not names["share"][1:].any()
+    for motion in ("motion", "sampled", "after"):
+        assert np.isfinite(names[motion].q).all()
+    circle, _ = names["around"](1.0, names["pendulum"])
+    np.testing.assert_allclose(names["traced"].q[-1], circle, atol=0.05)
+    assert 0.5 < names["rolling"].q[-1, 0] < 1.0  # 2 N on 1 to 1.3 kg

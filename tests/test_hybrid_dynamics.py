@@ -1,4 +1,4 @@
-"""Prescribed motion: closed forms, balances, jumps of the velocity, residual swings."""
+"""Prescribed motion: closed forms, balances and jumps of the velocity."""
 
 from functools import partial
 
@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from chains import random_chain
 from elements import SHORT, Swing
 from helpers import random_linkage
 from modes import LOOPS
@@ -24,23 +23,26 @@ with pytest.warns(UserWarning, match="joints 2 and 3 coincide"):
         base_angle=-np.pi / 2, gravity=G,
     )  # fmt: skip
 ROTOR = MASS * LENGTH**2 + INERTIA
-FREQUENCY = np.sqrt(MASS * G * LENGTH / ROTOR)
 REST = fj.State(np.zeros(3), np.zeros(3))
 NONE = fj.JointEffort(np.zeros(3))
-AMPLITUDE = jnp.array([0.3, 0.2])
+AMPLITUDE = jnp.array([0.3, 0.2, 0.4])
 
 
-class Push(eqx.Module):
+class Push(fj.references.Reference):
     """The cart starts with a velocity and accelerates at a constant rate."""
 
-    velocity: jax.Array
-    acceleration: jax.Array
+    velocity: fj.Values = fj.field((), unit="m/s")
+    acceleration: fj.Values = fj.field((), unit="m/s^2")
 
     def __call__(self, t, linkage):
         x = self.velocity * t + self.acceleration * t**2 / 2
-        zero = jnp.zeros_like(x)
         rate = self.velocity + self.acceleration * t
-        return jnp.stack([x, zero, zero]), jnp.stack([rate, zero, zero])
+        along = jnp.array([1.0, 0.0, 0.0])
+        return x * along, rate * along
+
+
+def pushed(velocity, acceleration=0.0, joints=(1, 3)):
+    return fj.simulation.PrescribedMotion(joints, Push(velocity, acceleration))
 
 
 def pendulum(angle, rate, acceleration, ts):
@@ -56,30 +58,26 @@ def pendulum(angle, rate, acceleration, ts):
 
 @pytest.mark.parametrize("acceleration", [0.0, 4.0])
 def test_a_pendulum_on_a_cart_that_accelerates(acceleration):
-    moving = fj.simulation.PrescribedMotion(
-        (1, 3), Push(jnp.array(0.0), jnp.array(acceleration))
-    )
+    moving = pushed(0.0, acceleration)
     ts = np.linspace(0, 3, 13)
     solution = fj.simulate(CART, fj.State([0, 0.7, 0], np.zeros(3)), ts, (moving,))
     angle, rate = pendulum(0.7, 0.0, acceleration, ts)
-    np.testing.assert_allclose(solution.q[:, 1], angle, atol=1e-9)
-    np.testing.assert_allclose(solution.qd[:, 1], rate, atol=1e-9)
+    found = solution.q[:, 1], solution.qd[:, 1]
+    np.testing.assert_allclose(found, [angle, rate], atol=1e-9)
     np.testing.assert_allclose(solution.q[:, 0], acceleration * ts**2 / 2, atol=1e-12)
     np.testing.assert_array_equal(solution.q[:, 2], 0)
 
 
 def test_a_jump_of_the_velocity_is_a_blow():
     """Checks that the pendulum's momentum about its pivot does not change."""
-    moving = fj.simulation.PrescribedMotion(
-        (1, 3), Push(jnp.array(0.6), jnp.array(0.0))
-    )
+    moving = pushed(0.6)
     ts = np.linspace(0, 1, 6)
     start = fj.State([0, 0.4, 0], [0, 0.2, 0])
     solution = fj.simulate(CART, start, ts, (moving,))
     after = 0.2 - MASS * LENGTH * np.cos(0.4) * 0.6 / ROTOR
     angle, rate = pendulum(0.4, after, 0.0, ts)
-    np.testing.assert_allclose(solution.q[:, 1], angle, atol=1e-9)
-    np.testing.assert_allclose(solution.qd[:, 1], rate, atol=1e-9)
+    found = solution.q[:, 1], solution.qd[:, 1]
+    np.testing.assert_allclose(found, [angle, rate], atol=1e-9)
     np.testing.assert_allclose(solution.qd[:, 0], 0.6)
     # The effort, too, is that after the blow: it moves the pendulum's mass centre.
     turning = -MASS * LENGTH * G * np.sin(angle) / ROTOR
@@ -90,21 +88,9 @@ def test_a_jump_of_the_velocity_is_a_blow():
     np.testing.assert_allclose(sampled.qd, solution.qd, atol=1e-9)
 
 
-class Sway(eqx.Module):
-    """A reference of two joints; the programs of such arms compile faster."""
-
-    amplitude: jax.Array
-
-    def __call__(self, t, linkage):
-        angle = 3 * t + jnp.array([0.0, 1.0])
-        return self.amplitude * jnp.sin(angle), 3 * self.amplitude * jnp.cos(angle)
-
-
 def swinging(topology, joints, forces=()):
-    rng, n = np.random.default_rng(3), len(topology)
-    linkage = random_linkage(topology, rng) if n == 3 else random_chain(topology, rng)
-    swing = Swing(jnp.array([0.3, 0.2, 0.4])) if n == 3 else Sway(AMPLITUDE)
-    motion = fj.simulation.PrescribedMotion(joints, swing)
+    n, linkage = len(topology), random_linkage(topology, np.random.default_rng(3))
+    motion = fj.simulation.PrescribedMotion(joints, Swing(AMPLITUDE[:n]))
     q, qd = motion.reference(0.0, linkage)
     effort = fj.JointEffort([1.0, -2.0, 0.7][:n])
     forces = (motion, fj.JointDamper(0.5), effort, *forces)
@@ -142,34 +128,10 @@ def test_efforts_make_the_motion_and_do_its_work(topology, joints):
     np.testing.assert_allclose(energy[-1] - energy[0], work, atol=1e-6 * np.ptp(power))
 
 
-def test_a_motion_prescribed_as_it_is_takes_no_effort():
-    """A cart and the pendulum that hangs on it fall together, weightless."""
-    falling = fj.Linkage(
-        "PRR", length=[0, 0, 1, 1], com=[[0, 0], [0.5, 0], [0.5, 0]], mass=[1, 1, 1],
-        inertia=[1, 1, 1], gravity=G,
-    )  # fmt: skip
-    # Its rail is upright.
-    motion = fj.simulation.PrescribedMotion(1, Push(jnp.array(0.0), jnp.array(-G)))
-    ts = np.linspace(0, 1, 5)
-    start = fj.State([0, 0.3, 0.2], np.zeros(3))
-    bound = fj.simulate(falling, start, ts, (motion,))
-    free = fj.simulate(falling, start, ts)
-    np.testing.assert_allclose(bound.q, free.q, atol=1e-9)
-    np.testing.assert_allclose(free.q[:, 1:], np.tile([0.3, 0.2], (5, 1)), atol=1e-9)
-    effort = fj.joint_efforts(falling, (motion,), bound).total
-    np.testing.assert_allclose(effort, 0, atol=1e-9)
-    # A turning pendulum pulls at the cart.
-    turning = fj.State([0, 0.3, 0.2], [0, 1.0, -0.4])
-    pulled = fj.simulate(falling, turning, ts, (motion,))
-    effort = fj.joint_efforts(falling, (motion,), pulled).total[:, 0]
-    assert np.abs(effort).max() > 0.1
-
-
 def test_starts_beside_the_reference_and_singular_equations_are_told():
-    hold = Push(jnp.array(0.0), jnp.array(0.0))
-    motion = fj.simulation.PrescribedMotion((1, 3), hold)
+    motion = pushed(0.0)
     starts = fj.State(np.array([[0.0, 0.1, 0], [0.2, 0.1, 0]]), np.zeros((2, 3)))
-    with pytest.raises(ValueError, match="state0.q: expected"):
+    with pytest.raises(ValueError, match=r"state0\.q: expected \[0.0, .*prescribed"):
         fj.simulate(CART, fj.State(starts.q[1], np.zeros(3)), [0, 1], (motion,))
     swept = fj.sweep(CART, starts, [0, 0.1], (motion,), **SHORT)
     assert swept.outcome.tolist() == ["successful", "not finite"]
@@ -180,9 +142,9 @@ def test_starts_beside_the_reference_and_singular_equations_are_told():
         "PRR", length=[0, 0, 1, 1], com=[[0, 0], [0.5, 0], [1, 0]], mass=[1, 1, 1e12],
         inertia=[1, 0.1, 0], gravity=0,
     )  # fmt: skip
-    moving = fj.simulation.PrescribedMotion(1, hold)
     start = fj.State(np.array([0, 0.3, 0.0]), np.zeros(3))
-    ended = fj.simulate(heavy, start, [0, 0.1], (moving,), throw=False)
+    slide = pushed(0.0, joints=1)
+    ended = fj.simulate(heavy, start, [0, 0.1], (slide,), throw=False)
     assert str(ended.outcome) == "ill-conditioned"
 
 
@@ -194,7 +156,7 @@ def test_gradients_equal_differences():
     @partial(jax.jit, **LOOPS)
     @jax.value_and_grad
     def both(p):
-        reference = Sway(AMPLITUDE * p[0])
+        reference = Swing(AMPLITUDE[:2] * p[0])
         q, qd = reference(0.0, linkage)
         state0 = fj.State(jnp.where(motion.prescribes(linkage), q, start.q), start.qd)
         forces = fj.simulation.PrescribedMotion(1, reference), fj.JointDamper(p[1])
@@ -209,55 +171,40 @@ def test_gradients_equal_differences():
 @pytest.mark.slow
 def test_topologies_are_batched():
     """A rotor's inertia beside them takes the batch through the looped solver."""
-    members = [swinging(topology, 2) for topology in ("RR", "RP", "PR", "PP")]
     rotor = (fj.forces.Armature(np.array([0.3, 0.2])),)
-    stack = lambda trees: jax.tree.map(lambda *a: jnp.stack(a), *trees)
-    linkages, starts, forces = map(stack, zip(*members))
-    ts = [0, 0.3]
-    axes = (*(0 for _ in forces), None)
-    swept = fj.sweep(linkages, starts, ts, forces + rotor, forces_axes=axes, **SHORT)
-    for k, (linkage, start, forces) in enumerate(members):
-        alone = fj.simulate(linkage, start, ts, forces + rotor, **SHORT)
+    names = "RR", "RP", "PR", "PP"
+    members = [fj.Scene(*swinging(name, 2, rotor), 0.3) for name in names]
+    options = dict(forces_axes=0, **SHORT)
+    swept = fj.sweep(fj.tuning.stacked(members), [0, 0.3], **options)
+    for k, member in enumerate(members):
+        alone = fj.simulate(member, [0, 0.3], **SHORT)
         np.testing.assert_allclose(swept.q[k], alone.q, atol=1e-9)
 
 
-def residual(travel, stroke=0.05):
-    """Returns the load's swing after the travel, divided by the stroke."""
-    move = fj.references.JointMove(np.zeros(3), [stroke, 0, 0], travel)
-    motion = fj.simulation.PrescribedMotion((1, 3), move)
-    ts = np.append(0.0, travel.duration + np.linspace(0.01, 2.5, 200))
-    swing = fj.simulate(CART, REST, ts, (motion,)).q[1:, 1]
-    reach = ROTOR / (MASS * LENGTH)  # of the equivalent simple pendulum
-    return float(np.abs(swing).max() * reach / stroke)
+HOLD = pushed(0.0)
+SHORTER = lambda t, linkage: (jnp.zeros(2), jnp.zeros(2))
+REFUSED = [
+    *(
+        ("joints: expected", lambda joints=joints: HOLD.replace(joints=joints))
+        for joints in (0, 9, (1, 0), 1.0, (), [1, 2.0], True)
+    ),
+    ("reference: expected a callable", lambda: HOLD.replace(reference=3.0)),
+    (
+        r"forces\[0\]\.joints: expected 1 to 3, got 4",
+        lambda: fj.simulate(CART, REST, [0, 1], (HOLD.replace(joints=4),)),
+    ),
+    (
+        r"forces\[0\]\.reference: expected an array of 3",
+        lambda: fj.simulate(CART, REST, [0, 1], (HOLD.replace(reference=SHORTER),)),
+    ),
+    (
+        "forces: expected one PrescribedMotion",
+        lambda: fj.simulate(CART, REST, [0, 1], (HOLD, HOLD)),
+    ),
+]
 
 
-def test_the_shock_removes_residual_vibration():
-    plain = fj.references.Travel(1.6, profile="harmonic")
-    shock = fj.references.shock_against(plain, FREQUENCY)
-    shocked = fj.references.Travel(1.6, profile="harmonic", shock=shock)
-    before, after = residual(plain), residual(shocked)
-    assert before >= 0.1 and after <= before / 20
-
-
-def test_malformed_motions_are_refused():
-    hold = Push(jnp.array(0.0), jnp.array(0.0))
-    for joints in (0, 9, (1, 0), 1.0, (), [1, 2.0], True):
-        with pytest.raises(ValueError, match="joints: expected"):
-            fj.simulation.PrescribedMotion(joints, hold)
-    with pytest.raises(ValueError, match="reference: expected a callable"):
-        fj.simulation.PrescribedMotion(1, 3.0)
-    motion = fj.simulation.PrescribedMotion(4, hold)
-    with pytest.raises(ValueError, match=r"joints: expected 1 to 3, got 4"):
-        fj.simulate(CART, REST, [0, 1], (motion,))
-    motion = fj.simulation.PrescribedMotion(
-        1, lambda t, linkage: (jnp.zeros(2), jnp.zeros(2))
-    )
-    with pytest.raises(
-        ValueError, match=r"^forces\[0\]\.reference: expected an array of 3"
-    ):
-        fj.simulate(CART, REST, [0, 1], (motion,))
-    motion = fj.simulation.PrescribedMotion(1, hold)
-    with pytest.raises(ValueError, match="forces: expected one PrescribedMotion"):
-        fj.simulate(CART, REST, [0, 1], (motion, motion))
-    with pytest.raises(ValueError, match=r"state0\.q: expected \[0.0, .*prescribed"):
-        fj.simulate(CART, fj.State([0.1, 0, 0], np.zeros(3)), [0, 1], (motion,))
+@pytest.mark.parametrize("message, call", REFUSED)
+def test_malformed_motions_are_refused(message, call):
+    with pytest.raises(ValueError, match=f"^{message}"):
+        call()

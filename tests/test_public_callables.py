@@ -46,23 +46,19 @@ TRACED = [
 
 
 def parameters():
-    """Returns each parameter of each public callable, and right ones for the others."""
-    found = {}
-    for room in ROOMS:
-        for name in set(dir(room)) - LEFT_OUT:
-            value = getattr(room, name)
-            if callable(value) and value not in found.values():
-                found[name] = value
-    for name, value in sorted(found.items()):
-        given = inspect.signature(value).parameters.values()
+    """Yields each parameter of each public callable, with a call that sets it alone."""
+    names = {
+        getattr(room, name): name
+        for room in reversed(ROOMS)  # the first room's name stands
+        for name in set(dir(room)) - LEFT_OUT
+    }
+    for function in sorted(filter(callable, names), key=names.__getitem__):
+        given = inspect.signature(function).parameters.values()
         named = [p for p in given if p.kind not in (p.VAR_KEYWORD, p.VAR_POSITIONAL)]
-        others = {p.name: RIGHT.get(p.name) for p in named if p.default is p.empty}
+        right = {p.name: RIGHT.get(p.name) for p in named if p.default is p.empty}
         for p in named:
-            yield (
-                name,
-                p.name,
-                lambda wrong, f=value, o=others, n=p.name: f(**{**o, n: wrong}),
-            )
+            call = lambda wrong, f=function, r=right, n=p.name: f(**r | {n: wrong})
+            yield names[function], p.name, call
 
 
 def unlike_a_refusal(calls):

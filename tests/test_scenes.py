@@ -14,46 +14,27 @@ OTHER = fj.State(np.array([0.3, 2.0, 0.1]), np.array([0.1, 0.2, 0.3]))
 MOTION = fj.Solution(TS, np.full((6, 3), 0.7), np.ones((6, 3)), {}, None)
 
 
-def sweep(*problem):
-    return fj.sweep(*problem, forces_axes=0, **SHORT)
-
-
 MANY = fj.tuning.stacked([SCENE, SCENE._replace(state0=OTHER)])
-CALLS = {
-    "simulate": [
-        lambda: fj.simulate(SCENE, TS, **SHORT),
-        lambda: fj.simulate(ARM, START, TS, FORCES, **SHORT),
-    ],
-    "simulate, by keyword": [
-        lambda: fj.simulate(SCENE, ts=TS, **SHORT),
-        lambda: fj.simulate(ARM, START, TS, FORCES, **SHORT),
-    ],
-    "sweep": [
-        lambda: sweep(MANY, TS),
-        lambda: sweep(MANY.linkage, MANY.state0, TS, MANY.forces),
-    ],
-    "efforts": [
-        lambda: fj.joint_efforts(SCENE, MOTION),
-        lambda: fj.joint_efforts(ARM, FORCES, MOTION),
-    ],
-    "reactions": [
-        lambda: fj.joint_reactions(SCENE, MOTION),
-        lambda: fj.joint_reactions(ARM, FORCES, MOTION),
-    ],
-    "start": [
-        lambda: fj.linearize(SCENE, t=0.3),
-        lambda: fj.linearize(ARM, START, FORCES, 0.3),
-    ],
-    "state": [
-        lambda: fj.linearize(SCENE, OTHER, 0.3),
-        lambda: fj.linearize(ARM, OTHER, FORCES, 0.3),
-    ],
-}
+MEMBERS = MANY.linkage, MANY.state0, TS, MANY.forces
 
 
-@pytest.mark.parametrize("whole, parts", CALLS.values(), ids=CALLS)
-def test_a_scene_stands_for_its_parts(whole, parts):
-    jax.tree.map(np.testing.assert_array_equal, whole(), parts())
+@pytest.mark.parametrize(
+    "function, whole, parts, options",
+    [
+        (fj.simulate, (SCENE, TS), (ARM, START, TS, FORCES), SHORT),
+        (fj.sweep, (MANY, TS), MEMBERS, dict(forces_axes=0, **SHORT)),
+        (fj.joint_efforts, (SCENE, MOTION), (ARM, FORCES, MOTION), {}),
+        (fj.joint_reactions, (SCENE, MOTION), (ARM, FORCES, MOTION), {}),
+        (fj.linearize, (SCENE,), (ARM, START, FORCES), dict(t=0.3)),
+        (fj.linearize, (SCENE, OTHER), (ARM, OTHER, FORCES), dict(t=0.3)),
+    ],
+)
+def test_a_scene_stands_for_its_parts(function, whole, parts, options):
+    found, expected = function(*whole, **options), function(*parts, **options)
+    jax.tree.map(np.testing.assert_array_equal, found, expected)
+    if function is fj.simulate:
+        by_keyword = function(SCENE, ts=TS, **options)
+        jax.tree.map(np.testing.assert_array_equal, by_keyword, expected)
 
 
 @pytest.mark.parametrize(

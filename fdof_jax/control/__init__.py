@@ -1,9 +1,8 @@
 """Controllers, feedforward and drives."""
 
 from .drives import DCMotor, FirstOrderLag, PIDController, SpeedLimit
-from .gains import gains_from_frequency
 from .model_based import ComputedTorque, GravityFeedforward
-from .pd import PDController
+from .pd import PDController, gains_from_frequency
 
 __all__ = [
     "ComputedTorque", "DCMotor", "FirstOrderLag", "gains_from_frequency",

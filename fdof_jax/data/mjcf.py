@@ -9,10 +9,9 @@ import numpy as np
 from ..base.checks import is_traced
 from ..control.pd import PDController
 from ..forces.actuators import Armature
-from ..forces.between_points import SpringDamper
 from ..forces.element import Forces, ForeignElement, elements_on
-from ..forces.joint_limits import JointFriction, JointStops
-from ..forces.joints import JointDamper
+from ..forces.joints import JointDamper, JointFriction, JointStops
+from ..forces.points import SpringDamper
 from ..linkage.linkage import Linkage, check_linkage
 from ..linkage.topology import letters
 
@@ -157,7 +156,7 @@ def _add_springs(root: Any, bodies: list[Any], found: tuple[Any, ...]) -> None:
             tendons, "spatial", name=f"spring{k}", stiffness=_text(element.stiffness),
             damping=_text(element.damping), springlength=_text(*ends),
         )  # fmt: skip
-        for end, point in (("a", element.ends.a), ("b", element.ends.b)):
+        for end, point in (("a", element.a), ("b", element.b)):
             place = _text(point.along, point.across, 0)
             site = dict(name=f"spring{k}{end}", pos=place)
             ElementTree.SubElement(bodies[int(point.link)], "site", site)

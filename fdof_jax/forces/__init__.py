@@ -2,11 +2,9 @@
 
 from ..linkage.fields import Condition, Values, field
 from .actuators import Armature, LinearActuator
-from .between_points import SpringDamper, Tension, Wrench
 from .element import Element, InertialElement, StatefulElement
-from .joint_limits import JointFriction, JointStops
-from .joints import EffortHistory, JointDamper, JointEffort
-from .points import Load, Point, PointElement
+from .joints import EffortHistory, JointDamper, JointEffort, JointFriction, JointStops
+from .points import Load, Point, PointElement, SpringDamper, Tension, Wrench
 from .switches import clip, switch
 
 __all__ = [

@@ -1,18 +1,16 @@
 """Actuators with masses of their own."""
 
-from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import Array
-from numpy.typing import ArrayLike
 
 from ..linkage.fields import Values, field, value_of
 from ..linkage.frames import cross, dot, length_of, scalar_frames
 from ..linkage.linkage import Linkage, joints_of
 from .element import InertialElement
-from .points import Load, Point, Separation, arguments_of, over
+from .points import Between, Load, over
 
 
 class Armature(InertialElement):
@@ -43,7 +41,7 @@ class Armature(InertialElement):
         return ()
 
 
-class LinearActuator(InertialElement):
+class LinearActuator(Between, InertialElement):
     """A cylinder and a piston between two points, and the force between them.
 
     Both bodies lie along the line between their pins. They follow the pins exactly and
@@ -70,35 +68,20 @@ class LinearActuator(InertialElement):
     [70.711, 0.0, 0.0]
     """
 
-    ends: Separation
-    force: Any = field((), unit="N", function=True)
-    mass: Values = field((2,), unit="kg", minimum=0)
-    com: Values = field((2,), unit="m")
-    inertia: Values = field((2,), unit="kg m^2", minimum=0)
-
-    def __init__(
-        self,
-        a: Point,
-        b: Point,
-        *,
-        force: ArrayLike | Callable[[Array, Array, Array], ArrayLike] = 0.0,
-        mass: ArrayLike = (0.0, 0.0),
-        com: ArrayLike = (0.0, 0.0),
-        inertia: ArrayLike = (0.0, 0.0),
-    ):
-        self.ends = Separation(a, b)
-        self.force, self.mass, self.com, self.inertia = force, mass, com, inertia
-
-    def arguments(self) -> dict[str, Any]:
-        return arguments_of(self)
+    force: Any = field((), unit="N", function=True, default=0.0, kw_only=True)
+    mass: Values = field((2,), unit="kg", minimum=0, default=(0.0, 0.0), kw_only=True)
+    com: Values = field((2,), unit="m", default=(0.0, 0.0), kw_only=True)
+    inertia: Values = field(
+        (2,), unit="kg m^2", minimum=0, default=(0.0, 0.0), kw_only=True
+    )
 
     def _bodies(self, linkage: Linkage, q: Array) -> tuple[Array, Array, Array]:
         """Mass centres of cylinder and piston, and the vector between the pins."""
         frames = scalar_frames(linkage, tuple(q))
-        vector = self.ends.vector(frames)
+        vector = self.vector(frames)
         unit = vector * over(length_of(vector))
-        cylinder = self.ends.a.place(frames) + self.com[0] * unit
-        return cylinder, self.ends.b.place(frames) - self.com[1] * unit, vector
+        cylinder = self.a.place(frames) + self.com[0] * unit
+        return cylinder, self.b.place(frames) - self.com[1] * unit, vector
 
     def coordinates(self, q, linkage):
         cylinder, piston, vector = self._bodies(linkage, q)
@@ -116,9 +99,9 @@ class LinearActuator(InertialElement):
 
     def __call__(self, t, q, qd, linkage):
         frames = scalar_frames(linkage, tuple(q))
-        vector = self.ends.vector(frames)
+        vector = self.vector(frames)
         length = length_of(vector)
-        slopes = jnp.stack(self.ends.slopes(frames, vector)) * over(length)
+        slopes = jnp.stack(self.slopes(frames, vector)) * over(length)
         return value_of(self, "force", t, length, slopes @ qd) * slopes
 
     def loads(
@@ -147,4 +130,4 @@ class LinearActuator(InertialElement):
         held = dot(unit, piston) - push
         on_b = (held + 1j * about_a / length) * unit  # by the link on the piston
         on_a = cylinder + piston - on_b
-        return Load(self.ends.a, -on_a), Load(self.ends.b, -on_b)
+        return Load(self.a, -on_a), Load(self.b, -on_b)

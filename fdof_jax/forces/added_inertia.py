@@ -25,16 +25,16 @@ def inertial_on(linkage: Linkage, forces: Any) -> tuple[InertialElement, ...]:
 
 def energetic_on(linkage: Linkage, forces: Any) -> tuple[Element, ...]:
     """Checks the tuple of elements and returns those with energy, springs included."""
-    found = elements_on(linkage, forces)
-    return tuple(e for e in found if e.potential_energy is not None)
+    parts = elements_on(linkage, forces)
+    return tuple(e for e in parts if e.potential_energy is not None)
 
 
 def added_energy(
     linkage: Linkage, forces: Forces, q: Array, qd: Array
 ) -> tuple[Array, Array]:
-    """Computes the kinetic and the potential energy of the elements [J]."""
+    """Computes the kinetic and the potential energy of `energetic_on` elements [J]."""
     kinetic, potential = jnp.zeros(()), jnp.zeros(())
-    for element in energetic_on(linkage, forces):
+    for element in forces:
         potential = potential + element.potential_energy(q, linkage)
         if isinstance(element, InertialElement):
             coordinates = lambda q, e=element: e.coordinates(q, linkage)
@@ -70,11 +70,8 @@ def added_inertia(
         coordinates = lambda q, e=element: e.coordinates(q, linkage)
         along = lambda q, c=coordinates: jax.jvp(c, (q,), (qd,))[1]
         _, turning = jax.jvp(along, (q,), (qd,))
-        jacobian, weights = (
-            jax.jacfwd(coordinates)(q),
-            _weights(element, linkage, turning),
-        )
-        weighted = weights[:, None] * jacobian
+        jacobian = jax.jacfwd(coordinates)(q)
+        weighted = _weights(element, linkage, turning)[:, None] * jacobian
         matrices.append(jnp.sum(weighted[:, :, None] * jacobian[:, None, :], axis=0))
         slope = jax.jacfwd(lambda q, e=element: e.potential_energy(q, linkage))(q)
         biases.append(jnp.sum(weighted * turning[:, None], axis=0) + slope)

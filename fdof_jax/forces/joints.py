@@ -1,4 +1,7 @@
-"""Efforts in the joints themselves: damping, constant efforts, histories."""
+"""Force elements in the joints: dampers, efforts, stops and friction.
+
+Stops and friction are not part of the paper's model.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -6,7 +9,9 @@ from jax import Array
 
 from ..base.checks import JOINT
 from ..linkage.fields import Condition, Values, each, field
+from ..linkage.linkage import Linkage
 from .element import ScalarElement
+from .switches import switch
 
 
 class JointDamper(ScalarElement):
@@ -90,3 +95,126 @@ class EffortHistory(ScalarElement):
 
     def respond(self, scheduled, q, qd, linkage):
         return scheduled
+
+
+class JointStops(ScalarElement):
+    """Stops at the ends of the joints' ranges: stiff springs that push one way.
+
+    At a penetration p the force is stiffness * p * (1 + damping * dp/dt), and never
+    less than 0. Steps end where the contact begins and ends.
+
+    With `smoothing`, p is rounded off to a parabola within so much of the end of the
+    range, on both sides; at the end itself p is a quarter of `smoothing`. Where the
+    whole penetration is no deeper, p and so dp/dt are other than the joint's, and a
+    blow loses less energy.
+
+    **Arguments:** all in joint order, one per joint or one for all.
+
+    - `lower`, `upper`: ends of the range [m or rad]; may be infinite.
+    - `stiffness`: positive [N/m or N m/rad].
+    - `damping`: not negative [s/m or s/rad].
+    - `smoothing`: positive [m or rad]; by default the law is not rounded off.
+
+    **Raises:** ValueError for malformed arguments, and unless lower < upper.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig5().linkage
+    >>> stops = fj.forces.JointStops(-1.0, 1.0, stiffness=1e4)
+    >>> stops(0.0, [0.0, 1.01, -1.01], [0, 0, 0], arm).tolist()
+    [0.0, -100.0, 100.0]
+    """
+
+    lower: Values = field(unit="m or rad", finite=False)
+    upper: Values = field(unit="m or rad", finite=False)
+    stiffness: Values = field(unit="N/m or N m/rad", above=0, default=1e4, kw_only=True)
+    damping: Values = field(unit="s/m or s/rad", minimum=0, default=0.0, kw_only=True)
+    smoothing: Values | None = field(
+        unit="m or rad", above=0, optional=True, default=None, kw_only=True
+    )
+
+    def conditions(self):
+        ends = self.lower, self.upper
+        apart = (self.lower < self.upper).all()
+        yield Condition(apart, "lower", "less than upper", ends)
+
+    def respond(self, scheduled, q, qd, linkage):
+        values = self.lower, self.upper, self.stiffness, self.damping
+        width = self.smoothing
+        widths = [None] * len(q) if width is None else each(width, q)
+        rows = zip(q, qd, *(each(value, q) for value in values), widths)
+        return tuple(
+            _push(low - x, -rate, k, d, width) - _push(x - high, rate, k, d, width)
+            for x, rate, low, high, k, d, width in rows
+        )
+
+    def potential_energy(self, q: Array, linkage: Linkage) -> Array:
+        """Computes the energy of the springs [J]."""
+        below = _stored(self.lower - q, self.smoothing)
+        above = _stored(q - self.upper, self.smoothing)
+        return jnp.sum(self.stiffness * (below + above))
+
+
+def _push(depth, rate, stiffness, damping, width):
+    """Force of a stop at a depth, which is negative outside of the stop."""
+    penetration, slope = _penetration(depth, width)
+    damped = 1 + damping * slope * rate
+    return stiffness * penetration * switch(damped, damped, 0, continuous=True)
+
+
+def _penetration(depth, width):
+    """Penetration at a depth, and its derivative where it is not 0."""
+    if width is None:
+        # Not called continuous: derivatives then correct even what the time of the
+        # contact, as located, is off by, which matters at stiff stops.
+        return switch(depth, depth, 0), 1
+    near, beyond = _parts(depth, width)
+    return near**2 / (4 * width) + beyond, near / (2 * width)
+
+
+def _parts(depth, width):
+    """Splits the depth into the parts within the parabola and beyond it."""
+    # jnp.clip would multiply the derivative in an infinite end of a range by 0.
+    deep, touching = (
+        switch(depth + a, True, False, continuous=True) for a in (-width, width)
+    )
+    near = jnp.where(deep, 2 * width, jnp.where(touching, depth + width, 0))
+    return near, jnp.where(deep, depth - width, 0)
+
+
+def _stored(depth, width):
+    """Integral of the penetration over the depth."""
+    if width is None:
+        return jnp.where(depth > 0, depth, 0) ** 2 / 2
+    near, beyond = _parts(depth, width)
+    return near**3 / (12 * width) + beyond * (beyond / 2 + width)
+
+
+class JointFriction(ScalarElement):
+    """Coulomb friction of the joints, rounded off around standstill.
+
+    The effort is -level * tanh(qd / speed). Under loads below the level, joints creep
+    at a fraction of `speed`. The smaller `speed`, the stiffer the equations.
+
+    **Arguments:** one per joint or one for all.
+
+    - `level`: not negative [N or N m].
+    - `speed`: positive [m/s or rad/s].
+
+    **Raises:** ValueError for malformed arguments.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig5().linkage
+    >>> fj.forces.JointFriction(5)(0.0, [0, 0, 0], [0.0, 0.01, -1.0], arm).tolist()
+    [0.0, -3.808, 5.0]
+    """
+
+    level: Values = field(unit="N or N m", minimum=0)
+    speed: Values = field(unit="m/s or rad/s", above=0, default=1e-2)
+
+    def respond(self, scheduled, q, qd, linkage):
+        return tuple(
+            -level * jnp.tanh(rate / speed)
+            for level, speed, rate in zip(
+                each(self.level, qd), each(self.speed, qd), qd
+            )
+        )

@@ -9,10 +9,9 @@ from matplotlib.path import Path
 
 from ..base.array_namespace import in_numpy
 from ..forces.actuators import LinearActuator
-from ..forces.between_points import SpringDamper, Tension, Wrench
 from ..forces.element import elements_on
-from ..forces.joint_limits import JointStops
-from ..forces.points import Point
+from ..forces.joints import JointStops
+from ..forces.points import Point, SpringDamper, Tension, Wrench
 from ..linkage.frames import Frames, frames
 from ..linkage.linkage import Linkage, without_fixed
 from ..linkage.topology import letters
@@ -73,7 +72,7 @@ def element_lines(
         elif (path := _commanded(element)) is not None:
             kind, strokes = "commanded", [np.tile(path, (len(ts), 1))]
         if isinstance(element, SpringDamper | Tension | LinearActuator):
-            for point in (element.ends.a, element.ends.b):
+            for point in (element.a, element.b):
                 strokes += _support(point, arm, f, size)
         if strokes:
             lift = np.full((len(ts), 1), np.nan + 0j)
@@ -118,7 +117,7 @@ def _support(point: Point, arm: Linkage, f: Frames, size: float) -> list[np.ndar
 
 def _ends(element: Any, f: Frames) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The first end, the distance of the second, and the direction to it (time, 1)."""
-    a, b = _place(element.ends.a, f), _place(element.ends.b, f)
+    a, b = _place(element.a, f), _place(element.b, f)
     length = np.abs(b - a)
     return a, length, (b - a) / np.where(length > 0, length, 1)
 

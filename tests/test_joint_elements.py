@@ -1,0 +1,195 @@
+"""Stops, friction and histories of efforts: closed forms, and finite derivatives."""
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from elements import START, arm
+from scipy.optimize import brentq
+
+import fdof_jax as fj
+from fdof_jax.forces import EffortHistory, JointFriction, JointStops
+
+# A point mass of 2 kg that slides along y.
+SLIDE = fj.Linkage("P", length=[0, 0], com=[[0, 0]], mass=[2], inertia=[1], gravity=0.0)
+
+
+def slides(start, ts, *forces):
+    """Returns positions and velocities of the slide from a start."""
+    state0 = fj.State(*np.array(start, float)[:, None])
+    motion = fj.simulate(SLIDE, state0, ts, forces)
+    return np.asarray(motion.q)[:, 0], np.asarray(motion.qd)[:, 0]
+
+
+def stored(stops, x):
+    return jax.vmap(lambda q: stops.potential_energy(q, SLIDE))(x[:, None])
+
+
+# Stops
+
+
+def test_a_bounce_keeps_the_energy():
+    """The penetration is (d + w)^2 / 4w up to a depth w, and the depth beyond."""
+    k, w, end = 300.0, 0.02, 1.0
+    stops = JointStops(-np.inf, end, stiffness=k, smoothing=w)
+    x, v = slides([0.5, 3.0], np.linspace(0, 1, 101), stops)
+    d = x - end
+    potential = k * np.where(
+        d < -w, 0, np.where(d < w, (d + w) ** 3 / (12 * w), d**2 / 2 + w**2 / 6)
+    )
+    assert (np.abs(d) < w).any() and (d > w).any()
+    np.testing.assert_allclose(stored(stops, x), potential, atol=1e-12)
+    energy = v**2 + potential  # of 2 kg
+    assert d.max() > 0.1 and v[-1] < -2.9
+    # Between steps positions are interpolated.
+    np.testing.assert_allclose(energy, energy[0], rtol=3e-8)
+    np.testing.assert_allclose(energy[-1], energy[0], rtol=1e-9)
+
+
+def test_deep_in_a_stop_the_spring_is_linear():
+    """A contact lasts half a period of sqrt(k/m)."""
+    k, speed = 800.0, 2.0
+    stops = JointStops(-1.0, np.inf, stiffness=k)
+    half, depth = np.pi / np.sqrt(k / 2), speed / np.sqrt(k / 2)
+    x, v = slides([-1.0, -speed], [0, half / 2, half], stops)
+    np.testing.assert_allclose(x, [-1, -1 - depth, -1], atol=1e-8)
+    np.testing.assert_allclose(v, [-speed, 0, speed], atol=1e-7)
+    np.testing.assert_allclose(stored(stops, x), [0, speed**2, 0], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "mass, stiffness, damping, speed",
+    [(0.1, 1e6, 0.6, 2.0), (0.01, 1e7, 0.5, 5.0), (2.0, 3e2, 0.3, 3.0)],
+)
+def test_a_rebound_loses_what_the_law_says(mass, stiffness, damping, speed):
+    """v dv / (1 + d v) = -k/m p dp: its integral is equal before and after a blow."""
+    back, slope = rebound(speed, mass, stiffness, damping)
+    integral = lambda v: v / damping - np.log1p(damping * v) / damping**2
+    lost = lambda back: integral(-back) - integral(speed)
+    expected = brentq(lost, 1e-9, min(speed, (1 - 1e-12) / damping), xtol=1e-14)
+    np.testing.assert_allclose(back, expected, rtol=1e-8)
+    change = lambda v: v / (1 + damping * v)  # of the integral
+    np.testing.assert_allclose(slope, change(speed) / -change(-expected), rtol=1e-5)
+
+
+@jax.jit
+@jax.value_and_grad
+def rebound(speed, mass, stiffness, damping):
+    slide = eqx.tree_at(lambda arm: arm.mass, SLIDE, mass[None])
+    start = fj.State(jnp.array([0.9]), speed[None])
+    stops = JointStops(-np.inf, 1.0, stiffness=stiffness, damping=damping)
+    return -fj.simulate(slide, start, [0, 1.0], (stops,)).qd[-1, 0]
+
+
+def test_damped_stops_push_by_their_law_and_never_pull():
+    options = dict(stiffness=300.0, damping=0.3)
+    ends = JointStops([-np.inf, -1.0], [1.0, np.inf], **options)
+    rounded = ends.replace(smoothing=0.1)
+    # Where the penetration is rounded off, damping acts by its rate.
+    push = 300 * 0.12**2 / 0.4 * (1 + 0.3 * 0.12 / 0.2 * 3.0)
+    for stops, depth, rate, expected in (
+        (ends, 0.1, -50.0, 0),
+        (ends, 0.02, 3.0, 300 * 0.02 * (1 + 0.3 * 3.0)),
+        (rounded, 0.02, 3.0, push),
+    ):
+        out = np.array([1.0, -1.0])  # the lower stop is the upper one's image
+        found = stops(0.0, (1 + depth) * out, rate * out, None)
+        np.testing.assert_allclose(found, -expected * out, rtol=1e-12)
+
+
+def test_within_the_range_stops_do_nothing_and_outside_they_push_back():
+    stops = JointStops([-1, -np.inf, -2], [1, 2, np.inf])
+    for q, expected in (
+        ([0.5, -1e30, 1e30], [0, 0, 0]),
+        ([-1.5, 3.0, -2.5], [5e3, -1e4, 5e3]),
+    ):
+        found = stops(0.0, np.array(q), np.zeros(3), None)
+        np.testing.assert_allclose(found, expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize("smoothing", [None, 1e-3])
+def test_stops_have_finite_derivatives_everywhere(smoothing):
+    push = jax.jit(lambda q, qd, stops: stops(0.0, q, qd, None))
+    reverse, forward = jax.jit(jax.jacrev(push, (0, 1))), jax.jit(jax.jacfwd(push))
+    ends = -1.0, [1.0, np.inf, 1e300]
+    stops = JointStops(*ends, damping=0.5, smoothing=smoothing)
+    for x in (-1e30, -1.0, 0.0, 1.0, 1e12):
+        slopes = reverse(np.full(3, x), np.ones(3), stops)
+        assert all(np.isfinite(s).all() for s in slopes)
+    finite = eqx.tree_at(lambda s: s.upper, stops, jnp.ones(3))
+    for k in range(5):
+        if smoothing is None and k == 2:
+            continue  # at the end itself the slope jumps
+        q, h, ones = np.full(3, 0.9995 + 2.5e-4 * k), 1e-7, np.ones(3)
+        slope = forward(q, ones, finite)
+        ends = [np.asarray(push(q + s, ones, finite)) for s in (h, -h)]
+        difference = (ends[0] - ends[1]) / (2 * h)
+        np.testing.assert_allclose(np.diag(slope), difference, rtol=1e-5, atol=1e-3)
+
+
+# Friction
+
+
+def test_friction_stops_a_slide():
+    """From 2 dv/dt = -F tanh(v/s) it follows that sinh(v/s) falls exponentially."""
+    level, speed, v0 = 4.0, 0.05, 1.5
+    ts = np.linspace(0, 1.2, 25)
+    _, v = slides([0, v0], ts, JointFriction(level, speed))
+    exact = speed * np.arcsinh(np.sinh(v0 / speed) * np.exp(-level / 2 * ts / speed))
+    np.testing.assert_allclose(v, exact, rtol=1e-7, atol=1e-10)
+
+
+# Histories
+
+TS = np.array([0.1, 0.25, 0.3, 0.62])
+TAU = np.random.default_rng(0).normal(size=(4, 3))
+
+
+def test_efforts_are_linear_between_the_times_and_held_beyond():
+    history, zero = EffortHistory(TS, TAU), np.zeros(3)
+    times = np.array([-1, 0.1, 0.17, 0.25, 0.299, 0.5, 0.62, 3])
+    found = jax.vmap(lambda t: history(t, zero, zero, None))(times)
+    expected = np.stack([np.interp(times, TS, column) for column in TAU.T], axis=1)
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
+    np.testing.assert_array_equal(history.jump_ts, TS)
+    constant = EffortHistory([0.5], TAU[:1])
+    np.testing.assert_array_equal(constant(0.7, zero, zero, None), TAU[0])
+
+
+@pytest.mark.slow
+def test_the_momentum_gained_is_the_integral_of_the_efforts():
+    """Of the slide on the ground, whose momentum only efforts change."""
+    linkage = eqx.tree_at(lambda k: k.gravity, arm("PRR"), 0.0)
+    momentum = lambda q, qd: fj.inverse_dynamics(linkage, q, 0 * q, qd)[0]
+    # Trapezia, and the constant efforts before and after.
+    weights = np.array([0.1 + 0.075, 0.1, 0.025 + 0.16, 0.16 + 0.08])
+    expected = momentum(*START) + weights @ TAU[:, 0]
+    fixed = dict(stepsize_controller=diffrax.ConstantStepSize(), dt0=0.01)
+    for steps in ({}, fixed):  # those end at the times too, and round
+        forces = (EffortHistory(TS, TAU),)
+        solution = fj.simulate(linkage, START, [0, 0.7], forces, **steps)
+        end = momentum(solution.q[-1], solution.qd[-1])
+        np.testing.assert_allclose(end, expected, atol=1e-8)
+
+
+REFUSED = [
+    (lambda: JointStops(1, 1), "lower: expected less than upper"),
+    (lambda: JointStops(np.nan, 1), "lower: expected"),
+    (lambda: JointStops(0, 1, stiffness=0), "stiffness: expected .* above 0"),
+    (lambda: JointStops(0, 1, smoothing=0), "smoothing: expected .* above 0"),
+    (lambda: JointStops(0, 1, damping=-1), "damping: expected .* at least 0"),
+    (lambda: JointFriction(-1), "level: expected .* at least 0"),
+    (lambda: JointFriction(1, 0), "speed: expected .* above 0"),
+    (lambda: EffortHistory([0, 0], TAU[:2]), "ts: expected increasing"),
+    (lambda: EffortHistory([], np.zeros((0, 3))), "ts: expected increasing"),
+    (lambda: EffortHistory(TS, TAU[:3]), "tau: expected 4 rows"),
+    (lambda: EffortHistory(TS, TAU[:, 0]), "tau: expected an array"),
+]
+
+
+@pytest.mark.parametrize("make, message", REFUSED)
+def test_malformed_arguments_are_refused(make, message):
+    with pytest.raises(ValueError, match=f"^{message}"):
+        make()
