@@ -12,8 +12,7 @@ import fdof_jax as fj
 from fdof_jax import scenes
 from fdof_jax.simulation.sensitivities import sensitivities
 from fdof_jax.tuning import gradient_quality
-from fdof_jax.tuning.gains import with_gains
-from fdof_jax.tuning.losses import controller_of, tip_errors
+from fdof_jax.tuning.losses import controller_of, tip_errors, with_gains
 
 # The arm of Fig 7 up to its slide, as programs of two joints compile faster. There too
 # the slide's controller starts at its limit, to which it comes back.
