@@ -84,14 +84,9 @@ def fuller(offset, push):
 def two_slides():
     """Returns two crossed slides without gravity, and a point as their path."""
     linkage = fj.Linkage(
-        "PP",
-        length=[0, 1, 1],
-        com=[[0, 0], [0, 0]],
-        mass=[1, 5],
-        inertia=[1, 1],
-        locked=[np.pi / 2, 0],
-        gravity=0,
-    )
+        "PP", length=[0, 1, 1], com=[[0, 0], [0, 0]], mass=[1, 5], inertia=[1, 1],
+        locked=[np.pi / 2, 0], gravity=0,
+    )  # fmt: skip
     start = fj.inverse_kinematics(linkage, [-2.0, 3.0], None)
     point = fj.references.Ellipse([-2.3, 3.2], [0.0, 0.0])
     task = fj.TipTask(point, fj.references.Laps(period=2.0), orientation=None)

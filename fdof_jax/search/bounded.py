@@ -21,6 +21,7 @@ _LONGEST_STEP = 2.0
 _GRADIENT_OF_LOSS = 1e-6
 # The loss may vanish, so its gradient is also compared with that at the start.
 _GRADIENT_DECREASE = 1e-10
+_PATIENCE = 10  # guesses of the active bounds of a step that are no better
 # A stop for another reason counts as convergence if the projected gradient is at most
 # this part of the loss.
 _CONVERGED = 1e-2
@@ -107,22 +108,29 @@ def box_minimum(
 ) -> np.ndarray:
     """Minimises slope @ x + x @ matrix @ x / 2 in a box, for a definite matrix.
 
-    It guesses the active bounds until a guess proves right, which takes a few
-    factorisations; SciPy's BVLS takes one per bound. Guesses may cycle in theory: the
-    last one then is a trial step like others, which the search may reject.
+    It guesses which bounds are active until a guess proves right: block principal
+    pivoting (Judice and Pires, 1994). That mostly takes a few factorisations, where
+    SciPy's BVLS takes one per bound. Of hundreds of unknowns that nearly depend on each
+    other the result may be no minimum: a trial step, which the search then rejects.
     """
     x, below, above = np.zeros_like(slope), *np.zeros((2, slope.size), bool)
-    for _ in range(20):
+    least, patience = np.inf, _PATIENCE
+    for _ in range(100 + 10 * slope.size):
         x = np.where(below, low, np.where(above, high, 0.0))
         free = ~(below | above)
         if free.any():
             factor = scipy.linalg.cho_factor(matrix[np.ix_(free, free)])
             x[free] = scipy.linalg.cho_solve(factor, -(slope + matrix @ x)[free])
         rise = slope + matrix @ x
-        guess = (x < low) | below & (rise > 0), (x > high) | above & (rise < 0)
-        if (guess[0] == below).all() and (guess[1] == above).all():
+        sets = (x < low) | below & (rise > 0), (x > high) | above & (rise < 0)
+        wrong = (sets[0] != below) | (sets[1] != above)
+        if not wrong.any():
             break
-        below, above = guess
+        better = wrong.sum() < least
+        least, patience = (wrong.sum(), _PATIENCE) if better else (least, patience - 1)
+        if patience < 0:  # all changes at once may cycle; the first one alone does not
+            wrong[wrong.argmax() + 1 :] = False
+        below, above = np.where(wrong, sets, (below, above))
     return np.clip(x, low, high)
 
 

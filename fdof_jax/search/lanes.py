@@ -122,12 +122,11 @@ def power_mean(members: Evaluation, order: int) -> Evaluation:
     weight = (part / np.where(mean > 0, mean, 1)) ** (order - 1) / loss.shape[1]
     total = np.einsum("rm,rmn->rn", weight, gradient)
     bent = np.einsum("rm,rmij->rij", weight, curvature)
+    whole = mean * largest
     if order > 1:
         value = np.where(loss > 0, loss, 1)
         spread = np.einsum("rm,rmi,rmj->rij", weight / value, gradient, gradient)
-        whole = (mean * largest)[:, :, None]
-        spread -= total[:, :, None] * total[:, None, :] / np.where(whole > 0, whole, 1)
+        outer = total[:, :, None] * total[:, None, :]
+        spread -= outer / np.where(whole > 0, whole, 1)[:, :, None]
         bent = bent + (order - 1) * spread
-    return Evaluation(
-        (mean * largest)[:, 0], total, bent, facts | {"member_loss": loss}
-    )
+    return Evaluation(whole[:, 0], total, bent, facts | {"member_loss": loss})

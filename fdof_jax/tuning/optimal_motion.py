@@ -11,7 +11,6 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from ..analysis.tracking import tip_deviation
-from ..base.array_namespace import in_numpy, namespace
 from ..base.checks import place_of, real_array, whole_number
 from ..base.report import Report
 from ..control.model_based import ComputedTorque
@@ -90,7 +89,7 @@ class OptimalMotion(Report):
             f"with {len(self.ts)} knots",
             f"of the controller: {1e3 * self.controller_error:.5g} mm",
             f"from each first guess: {errors} mm",
-            f"{'converged' if self.converged else 'not converged'}: {self.message}",
+            f"{'' if self.converged else 'not '}converged: {self.message}",
         ]
 
 
@@ -128,12 +127,10 @@ def _lane(z: Array, problem: tuple[Scene, Array, Array, Array]) -> Evaluation:
     return sum_of_squares(found, tip_error=jnp.linalg.norm(errors))
 
 
-def _limit_of(scene: Scene) -> Any:
+def _limit_of(scene: Scene) -> Array:
     """Limits of a scene's controller (n,), 0 at fixed pairs."""
-    limit, linkage = in_numpy((controller_of(scene).limit, scene.linkage))
-    return without_fixed(
-        linkage, namespace(limit).broadcast_to(limit, joints_of(linkage))
-    )
+    limit = jnp.broadcast_to(controller_of(scene).limit, joints_of(scene.linkage))
+    return without_fixed(scene.linkage, limit)
 
 
 def optimal_efforts(
@@ -186,7 +183,8 @@ def optimal_efforts(
     (0.0501, 0.0222)
     """
     check_tuned("scene", scene)
-    task, t1, limit = tracked_task(scene), float(scene.t1), _limit_of(scene)
+    task, t1 = tracked_task(scene), float(scene.t1)
+    limit = np.asarray(_limit_of(scene))
     if not np.isfinite(limit).all():
         raise ValueError(
             "scene: expected finite limits of its controller, as unlimited efforts "

@@ -163,7 +163,7 @@ class TuneResult(Report):
 
     @property
     def _outcome(self) -> str:
-        return "converged" if self.converged else "not converged"
+        return f"{'' if self.converged else 'not '}converged"
 
     def __repr__(self) -> str:
         """One line, or shapes if values are traced."""

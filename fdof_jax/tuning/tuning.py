@@ -46,19 +46,9 @@ def _members(ensemble: Any, scene: Scene, losses: Sequence[Any]) -> list[Scene]:
 
 
 def _search(
-    scenes: Sequence[Scene],
-    losses: Sequence[Any],
-    *,
-    factor: ArrayLike | None,
-    bounds: tuple[ArrayLike, ArrayLike] | None,
-    ensemble: Scene | None,
-    over: str,
-    method: str,
-    starts: int,
-    seed: int,
-    max_steps: int,
-    report: Callable[[str], Any] | None,
-) -> list[TuneResult]:
+    scenes: Sequence[Scene], losses: Sequence[Any], *, factor, bounds, ensemble, over,
+    method, starts, seed, max_steps, report,
+) -> list[TuneResult]:  # fmt: skip
     """One result per scene and loss; the keywords are those of `tune`."""
     one_of("method", method, tuple(METHODS))
     one_of("over", over, tuple(_ORDERS))
