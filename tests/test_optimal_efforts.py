@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from scipy.optimize import least_squares
 
 import fdof_jax as fj
 from fdof_jax import scenes
@@ -103,28 +102,6 @@ def test_slides_are_controlled_as_fuller_found():
     assert max(t_up, t_left) < HORIZON
     least = np.sqrt((up + left) / HORIZON)
     assert least < found.tip_error < 1.01 * least
-
-
-@pytest.mark.slow
-def test_scipy_finds_no_better_efforts():
-    limit, task = np.array([12.0, 6.0]), CONTROLLER.reference
-    scene = SCENE._replace(forces=(fj.PDController(100.0, 10.0, limit, task),))
-    knots = np.linspace(0, 0.4, 6)
-    found = fj.tuning.optimal_efforts(scene, horizon=0.4, knots=6, effort_rate=0)
-    ts = np.linspace(0, 0.4, 501)
-    weights = np.sqrt(np.convolve(np.full(500, 1 / 500), [0.5, 0.5]))
-
-    def residuals(z):
-        forces = (fj.forces.EffortHistory(knots, limit * z.reshape(-1, 2)),)
-        solution = fj.simulate(scene.linkage, scene.state0, ts, forces)
-        deviation = tip_deviation(scene.linkage, task, solution)
-        return np.asarray(weights[:, None] * deviation).ravel()
-
-    other = least_squares(
-        residuals, np.zeros(12), bounds=(-1, 1), diff_step=1e-6, ftol=1e-6
-    )
-    assert (np.abs(found.efforts) == limit).any()
-    assert found.tip_error == pytest.approx(np.sqrt(2 * other.cost), rel=1e-3)
 
 
 class Beside(fj.references.Reference):

@@ -164,14 +164,6 @@ class TestTracking:
             assert result.loss == pytest.approx(residuals @ residuals, rel=1e-5)
         assert f"{1e3 * front.tip_error[1]:.4g}" in str(front)
 
-    @pytest.mark.slow
-    def test_a_price_among_others_gives_what_it_gives_alone(self):
-        # Of two joints, whose programs compile faster.
-        scene = scenes.two_link_circle()._replace(t1=1.0)
-        front = fj.tuning.trade_off(scene, [0.0, 1e-2, 1.0], max_steps=15)
-        alone = fj.tune(scene, loss=fj.tuning.Tracking(effort=1e-2), max_steps=15)
-        assert front.results[1].loss == pytest.approx(alone.loss, rel=1e-4)
-
 
 class MeanSquare(eqx.Module):
     """A scalar loss, the mean square."""

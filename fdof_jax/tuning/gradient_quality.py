@@ -1,7 +1,6 @@
 """Checks of the gradient that gain tuning follows."""
 
 import dataclasses
-from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -142,14 +141,14 @@ def _with_times(scene: Scene, times: Any) -> Scene:
     return eqx.tree_at(where, scene, list(times)) if len(times) else scene
 
 
-def _scene_at(scene: Scene, tuned: np.ndarray, z: Array) -> Scene:
+def _scene_at(scene: Scene, tuned: Any, z: Any) -> Scene:
     """The scene with gains of the logarithms in `z`, which its times follow."""
     logs, times = jnp.split(jnp.asarray(z), [tuned.size])
     return _with_times(with_log_gains(scene, logs, tuned), times)
 
 
 @eqx.filter_jit(compiler_options=options_of_loops())  # pyright: ignore[reportCallIssue]
-def _tangents(scene: Scene, tuned: Array, z: Array) -> tuple[Sensitivities, Array]:
+def _tangents(scene: Scene, tuned: Any, z: Any) -> tuple[Sensitivities, Array]:
     """Residuals with their derivatives in `z`, and relative demands."""
     ts = jnp.linspace(0, scene.t1, SAMPLES)
     found = sensitivities(lambda z: _scene_at(scene, tuned, z), tip_errors, z, ts)
@@ -162,15 +161,16 @@ def _motion(scene: Scene) -> Solution:
     return simulate(scene, np.linspace(0, float(scene.t1), SAMPLES), throw=False)
 
 
-def _slope(scene_at: Callable[[float], Scene], h: float) -> float:
-    """The derivative of the mean squared tip error by extrapolated differences."""
+def _slopes(scene: Scene, tuned: Any, z: np.ndarray, steps: Any) -> np.ndarray:
+    """Derivatives of the mean squared tip error by extrapolated differences."""
 
-    def loss(x):
-        trial = scene_at(x)
+    def loss(z: np.ndarray) -> float:
+        trial = _scene_at(scene, tuned, z)
         return float(np.sum(np.square(tip_errors(trial, _motion(trial)))))
 
-    far, near = ((loss(x) - loss(-x)) / (2 * x) for x in (h, h / 2))
-    return float((4 * near - far) / 3)
+    rise = lambda h: loss(z + h) - loss(z - h)
+    changes = np.diag(steps)
+    return np.array([8 * rise(h / 2) - rise(h) for h in changes]) / (6 * steps)
 
 
 def gradient_report(scene: Scene) -> GradientReport:
@@ -188,18 +188,14 @@ def gradient_report(scene: Scene) -> GradientReport:
     as_array = lambda leaf: jnp.asarray(leaf) if is_number(leaf) else leaf
     scene = jax.tree.map(as_array, scene._replace(t1=t1))
     box, moments = bounds_of(scene, None, None), _times(scene)
-    values = np.array([float(moment) for moment in moments.values()])
+    values = np.array(list(moments.values()), float)
     z, tuned = np.concatenate([box.logs()[0], values]), box.tuned
     found, demands = in_numpy(_tangents(scene, tuned, z))
     residuals, solution = found.residuals, found.solution
     # Short parts of the run may be given in times, and are not stepped over.
     steps = np.where(values == 0, np.inf, _STEP * np.abs(values))
-    steps = [*np.full(tuned.size, _STEP), *np.minimum(steps, _OF_TIME * t1)]
-
-    def difference(unit: np.ndarray, step: float) -> float:
-        return _slope(lambda x: _scene_at(scene, tuned, z + x * unit), step)
-
-    slopes = np.array(list(map(difference, np.eye(z.size), steps)))
+    steps = np.append(np.full(tuned.size, _STEP), np.minimum(steps, _OF_TIME * t1))
+    slopes = _slopes(scene, tuned, z, steps)
     along = 2 * np.cumsum(residuals[:, None] * found.jacobian, axis=0)
     both = np.stack([along[-1], slopes])
     gradient, differences = both[:, : tuned.size].reshape(2, *tuned.shape)

@@ -305,4 +305,4 @@ def bounds_of(scene: Scene, factor: Any, bounds: Any) -> GainBox:
         )
     if (lower[start > 0] == 0).any():
         raise ValueError("bounds: expected positive least gains, got 0.")
-    return GainBox(start, np.where(start > 0, lower, 0), np.where(start > 0, upper, 0))
+    return GainBox(start, lower, np.where(start > 0, upper, 0))

@@ -100,7 +100,7 @@ def excess(
     """
     ts, rest = solution.ts, rest_of(scene)
     controller, others = controller_and_others(scene)
-    share, still = step_shares(solution, rest)
+    share, _, still = step_shares(solution, rest)
 
     def at(t, share_now, demand):
         over = jnp.where(still, -1, share_now - 1 - limits.overshoot)
@@ -138,15 +138,16 @@ def rest_of(scene: Scene) -> Array:
     return equilibrium(scene.linkage, last, scene.forces, scene.t1)
 
 
-def step_shares(solution: Solution, rest: Array) -> tuple[Array, Array]:
-    """Returns each joint's change as a share of its step (time, joint).
+def step_shares(solution: Solution, rest: Array) -> tuple[Array, Array, Array]:
+    """Returns joints' changes and speeds as shares of their steps (time, joint).
 
     Also returns which joints have no step (joint,).
     """
     height = rest - solution.q[0]
     still = height == 0
     height = jnp.where(still, 1, height)
-    return jax.vmap(lambda q: (q - solution.q[0]) / height)(solution.q), still
+    changes = jax.vmap(lambda q: (q - solution.q[0]) / height)(solution.q)
+    return changes, jax.vmap(lambda qd: qd / height)(solution.qd), still
 
 
 def sensitivity(A: Array, B: Array, C: Array) -> Array:
@@ -182,9 +183,7 @@ def measured(scene: Scene, limits: Limits) -> Iterator[tuple[str, str, float, fl
     poles = next(iter(loops.values())).feedback().poles()
     ts = np.linspace(0, t1, samples_of(t1, np.abs(poles).max()) + 1)
     motion = simulate(linkage, scene.state0, ts, scene.forces, throw=False)
-    shares, _ = map(np.asarray, step_shares(motion, rest))
-    height = np.asarray(rest - motion.q[0])
-    speeds = np.asarray(motion.qd) / np.where(height == 0, 1, height)
+    shares, speeds, _ = map(np.asarray, step_shares(motion, rest))
     efforts = np.abs(demands(controller, linkage, motion)).max(axis=0)
     for k, loop in loops.items():
         joint = joint_names(linkage)[k]
@@ -207,15 +206,12 @@ def _lane(z: Array, problem: tuple[Scene, Loss, Array, Limits, bool]) -> Evaluat
     """Evaluates a loss and the excess over limits in the log-gains `z` (2n,)."""
     scene, loss, tuned, limits, with_margins = problem
 
-    def beyond(scene, solution):
-        return excess(limits, scene, solution, with_margins)
-
     def residuals(scene, solution):
-        own = residuals_of(loss, scene, solution)
-        return jnp.concatenate([beyond(scene, solution), own])
+        beyond = excess(limits, scene, solution, with_margins)
+        return jnp.concatenate([beyond, residuals_of(loss, scene, solution)])
 
     found = gain_sensitivities(z, scene, residuals, tuned)
-    count = jax.eval_shape(beyond, found.scene, found.solution).size
+    count = joints_of(scene.linkage) * (3 * _SPANS + with_margins * _BANDS)
     excesses, own = (
         found._replace(residuals=found.residuals[rows], jacobian=found.jacobian[rows])
         for rows in (slice(count), slice(count, None))
