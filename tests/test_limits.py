@@ -123,10 +123,14 @@ def test_a_response_that_creeps_from_below_has_not_settled():
     slow = step(kp=1.0, kd=5.0)
     motion = fj.simulate(slow, np.linspace(0, 4, 1001))
     assert (motion.q < 0.9).all()
-    limits = fj.tuning.Limits(settling_time=[1.0], overshoot=[np.inf], effort=[np.inf])
+    limits = fj.tuning.Limits(
+        settling_time=[1.002], overshoot=[np.inf], effort=[np.inf]
+    )
     over, unsettled, _ = excess(limits, slow, motion, False).reshape(13, 3).T
-    # Farthest from 1 at the first of the last 77 times.
+    # Farthest from 1 at the first of each 77 times, and at the last one before 1.002 s.
     assert over.max() <= 0 and unsettled[-1] == pytest.approx(0.98 - motion.q[-77, 0])
+    assert motion.ts[250] == 1 and (unsettled[:3] == -1).all()
+    assert unsettled[3] == pytest.approx(0.98 - float(motion.q[250, 0]), rel=1e-5)
 
 
 def test_the_errors_of_a_fixed_pair_count_nothing():
