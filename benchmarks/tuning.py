@@ -19,12 +19,10 @@ import scipy.optimize
 
 import fdof_jax as fj
 from fdof_jax import scenes
-from fdof_jax.search.bounded import minimise
+from fdof_jax.search.bounded import METHODS, minimise
 from fdof_jax.search.lanes import Lanes
-from fdof_jax.search.methods import METHODS
 from fdof_jax.steps.tolerances import adaptive
-from fdof_jax.tuning.gains import evaluate_gains, with_gains
-from fdof_jax.tuning.losses import tip_errors
+from fdof_jax.tuning.losses import evaluate_gains, tip_errors, with_gains
 
 from .measure import record, skipped
 

@@ -17,7 +17,7 @@ from .pictures import drawing, plotting
 from .simulation.scene import Scene
 from .simulation.simulate import simulate
 from .simulation.solution import Solution
-from .tuning.league import circle_scenes
+from .tuning.ensembles import circle_scenes
 
 
 def main(arguments: list[str] | None = None) -> None:

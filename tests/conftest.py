@@ -33,7 +33,7 @@ LONGEST = {
 # Doctests that compile searches.
 SEARCHES = {
     "fdof_jax.identification.fitting.fit_each",
-    "fdof_jax.tuning.league.league_table",
+    "fdof_jax.tuning.result.league_table",
     "fdof_jax.tuning.optimal_motion.optimal_efforts",
     "fdof_jax.tuning.tuning.tune_each",
     "fdof_jax.tuning.within_limits.tune_within",

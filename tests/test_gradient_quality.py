@@ -1,6 +1,5 @@
 """The gradients that tuning follows, compared with differences and other modes."""
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -12,8 +11,7 @@ import fdof_jax as fj
 from fdof_jax import scenes
 from fdof_jax.simulation.sensitivities import sensitivities
 from fdof_jax.tuning import gradient_quality
-from fdof_jax.tuning.gains import with_gains
-from fdof_jax.tuning.losses import controller_of, tip_errors
+from fdof_jax.tuning.losses import gains_of, tip_errors, with_gains
 
 # The arm of Fig 7 up to its slide, as programs of two joints compile faster. There too
 # the slide's controller starts at its limit, to which it comes back.
@@ -30,11 +28,9 @@ CIRCLE = fj.references.TipTask(
 
 def tracked(kp=(1500.0, 20000.0), kd=(80.0, 50.0), limit=(1000.0, 300.0)):
     """Returns a scene whose tip moves to the circle and along it."""
-    start, forces = (
-        fj.State(np.array([np.pi / 2, 2.5]), np.zeros(2)),
-        fj.PDController(kp, kd, limit, CIRCLE),
-    )
-    return jax.tree.map(jnp.asarray, fj.Scene(ARM, start, (forces,), 1.0))
+    start = fj.State(np.array([np.pi / 2, 2.5]), np.zeros(2))
+    forces = (fj.PDController(kp, kd, limit, CIRCLE),)
+    return jax.tree.map(jnp.asarray, fj.Scene(ARM, start, forces, 1.0))
 
 
 # At gains like those of Fig 7, at higher ones, and with a slide at its limit half of
@@ -46,34 +42,35 @@ POINTS = {
 }
 
 
-def gains_of(scene):
-    controller = controller_of(scene)
-    return jnp.stack([controller.kp, controller.kd])
+def scaled(scene, z):
+    """Returns the scene with gains by the factors exp(z)."""
+    gains = gains_of(scene)
+    return with_gains(scene, gains * jnp.exp(z).reshape(gains.shape))
 
 
 @eqx.filter_jit(**LOOPS)
 def tangents(scene, tolerance, ts):
-    gains = gains_of(scene)
-    at = lambda z: with_gains(scene, gains * jnp.exp(z).reshape(gains.shape))
-    found = sensitivities(at, tip_errors, jnp.zeros(gains.size), ts, tolerance)
+    at = lambda z: scaled(scene, z)
+    zero = jnp.zeros(gains_of(scene).size)
+    found = sensitivities(at, tip_errors, zero, ts, tolerance)
     gradient = 2 * found.jacobian.T @ found.residuals
     return found.residuals, found.jacobian, gradient
 
 
-def loss(scene, z, ts):
-    """Returns the sum of squares, by the plain calls' program."""
-    steps = diffrax.PIDController(rtol=1e-13, atol=1e-13)
-    gains = gains_of(scene)
-    trial = with_gains(scene, gains * jnp.exp(z).reshape(gains.shape))
-    solution = fj.simulate(
-        trial.linkage,
-        trial.state0,
-        ts,
-        trial.forces,
-        stepsize_controller=steps,
-        throw=False,
-    )
-    return jnp.sum(tip_errors(trial, solution) ** 2)
+def losses(scene, z, ts):
+    """Returns sums of squares up to the half and the end, by a plain motion."""
+    motion = fj.simulate(scaled(scene, z)._replace(t1=0.0), ts, rtol=1e-13, atol=1e-13)
+    squares = np.square(tip_errors(scene, motion))
+    return np.array([squares[: len(ts) + 1].sum(), squares.sum()])
+
+
+def by_differences(scene, ts, h=4e-4):
+    """Returns the gradients of both sums in the log-gains (2, n)."""
+    slope = lambda e: (losses(scene, e, ts) - losses(scene, -e, ts)) / 2
+    units = np.eye(gains_of(scene).size)
+    near = np.stack([slope(h / 2 * e) / (h / 2) for e in units], axis=1)
+    far = np.stack([slope(h * e) / h for e in units], axis=1)
+    return (4 * near - far) / 3
 
 
 @pytest.mark.slow
@@ -81,20 +78,16 @@ def loss(scene, z, ts):
 def test_tangents_are_those_of_differences(point):
     scene, ts = POINTS[point], np.linspace(0, 3, 1001)
     residuals, _, gradient = tangents(scene, 1e-10, ts)
-
-    def difference(e, h):
-        return float(loss(scene, h * e, ts) - loss(scene, -h * e, ts)) / (2 * h)
-
-    h = 4e-4
-    wanted = [(4 * difference(e, h / 2) - difference(e, h)) / 3 for e in np.eye(4)]
+    _, wanted = by_differences(scene, ts)
     size = np.linalg.norm(wanted)
-    assert np.linalg.norm(gradient - np.array(wanted)) < 1e-6 * size
-    value = float(loss(scene, jnp.zeros(4), ts))
+    assert np.linalg.norm(gradient - wanted) < 1e-6 * size
+    _, value = losses(scene, np.zeros(4), ts)
     assert float(residuals @ residuals) == pytest.approx(value, rel=1e-8)
     # The gradients that tuning uses.
     timed = jax.tree.map(jnp.asarray, scene._replace(t1=3.0))
-    residuals, jacobian, *_ = gradient_quality._tangents(timed)
-    coarse = 2 * jacobian[:, :4].T @ residuals
+    z = np.log(gains_of(timed)).ravel()
+    found, _ = gradient_quality._tangents(timed, np.ones((2, 2), bool), z)
+    coarse = 2 * found.jacobian.T @ found.residuals
     assert np.linalg.norm(coarse - gradient) < 1e-3 * size
 
 
@@ -119,21 +112,6 @@ def test_nothing_is_nan_at_rest_at_zero_error_or_at_saturation():
             assert np.isfinite(residuals).all() and np.isfinite(gradient).all()
             if gravity == 0:
                 assert not residuals.any() and not gradient.any()
-
-
-def by_differences(scene, ts, h=4e-4):
-    """Returns gradients of the sums of squares up to the half and the end (2, 6)."""
-
-    def squares(z):
-        trial = with_gains(scene, gains_of(scene) * np.exp(z).reshape(2, 3))
-        tight = dict(rtol=1e-13, atol=1e-13)
-        motion = fj.simulate(trial.linkage, trial.state0, ts, trial.forces, **tight)
-        errors = np.asarray(tip_errors(trial, motion)) ** 2
-        return np.array([errors[: len(ts) + 1].sum(), errors.sum()])
-
-    difference = lambda e, h: (squares(h * e) - squares(-h * e)) / (2 * h)
-    slopes = [(4 * difference(e, h / 2) - difference(e, h)) / 3 for e in np.eye(6)]
-    return np.stack(slopes, axis=1)
 
 
 @pytest.fixture(scope="module")
@@ -173,10 +151,8 @@ def test_the_report_is_what_it_says(report):
 
 def test_a_report_says_where_gains_have_no_effect():
     scene = scenes.fig7()
-    limit = jnp.array([1000.0, 1e-6, 400.0])
-    controller = eqx.tree_at(lambda c: c.limit, scene.forces[0], limit)
-    scene = scene._replace(forces=(controller,), t1=0.5)
-    found = fj.tuning.gradient_report(scene)
+    weak = scene.forces[0].replace(limit=[1000.0, 1e-6, 400.0])
+    found = fj.tuning.gradient_report(scene._replace(forces=(weak,), t1=0.5))
     assert not found.gradient[:, 1].any() and found.saturated[1] == 1
     assert "P2 is at its limit throughout" in found.warnings[0]
 

@@ -12,7 +12,7 @@ import fdof_jax as fj
 from fdof_jax import scenes
 from fdof_jax.pictures.interactive import sliders
 from fdof_jax.simulation import prescribed
-from fdof_jax.tuning.gains import with_gains
+from fdof_jax.tuning.losses import with_gains
 
 CIRCLES = fj.tuning.circle_scenes()
 CONTROLLER = CIRCLES["RRR"].forces[0]

@@ -2,6 +2,7 @@
 
 import functools
 from types import SimpleNamespace
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -46,31 +47,13 @@ def test_all_start_alike():
 
 
 def test_reachable_says_when():
-    scene = SCENES["RRR"]
-    task = fj.CircleTask(
-        center=(1.99, 0.95), radius=0.75, period=4.0, orientation=0.8, branch=-1
-    )
-    found = np.asarray(fj.references.reachable(scene.linkage, task, TS))
-    # With known values, and with traced ones within a transformation.
-    known = jax.jit(lambda x: x + fj.references.reachable(scene.linkage, task, TS))(0)
-    np.testing.assert_array_equal(known, found)
-    traced = jax.jit(lambda ts: fj.references.reachable(scene.linkage, task, ts))(TS)
-    np.testing.assert_array_equal(traced, found)
+    arm = SCENES["RRR"].linkage
+    task = SCENES["RRR"].forces[0].reference.replace(radius=0.75)
+    found = np.asarray(fj.references.reachable(arm, task, TS))
     assert found.any() and not found.all()
-    for t, there in zip(TS[::25], found[::25]):
-        try:
-            fj.inverse_kinematics(scene.linkage, task.tip(t), 0.8, branch=-1)
-            assert there
-        except ValueError:
-            assert not there
-
-
-def test_scenes_that_cannot_be_tuned_together():
-    with pytest.raises(ValueError, match="scenes: expected a list"):
-        fj.tuning.tune_each(SCENES["RRR"])
-    other = SCENES["RRR"]._replace(forces=(*SCENES["RRR"].forces, fj.JointDamper(1.0)))
-    with pytest.raises(ValueError, match=r"scenes\[1\]: expected one like scenes\[0\]"):
-        fj.tuning.tune_each([SCENES["RRR"], other])
+    assembled = lambda t: fj.inverse_kinematics(arm, task.tip(t), 0.8, branch=-1)
+    q = np.asarray(jax.vmap(assembled)(TS))
+    np.testing.assert_array_equal(np.isfinite(q).all(axis=1), found)
 
 
 @pytest.mark.slow
@@ -109,6 +92,12 @@ def test_fixed_pairs_count_nothing_in_results_of_tuning(tuned):
         assert f"{held} of {count} gains at a bound" in repr(result)
         *_, row = fj.tuning.league_table({topology: result}).splitlines()
         assert row.split() == [topology, "200", "100", "50", "50", f"{held}/{count}"]
+        # A flat start is explained by all actuators that there are.
+        saturated = np.array([[kind != "F" for kind in topology]], float)
+        history = eqx.tree_at(lambda h: h.saturated, result.history, saturated)
+        run: Any = SimpleNamespace(reason="", flat=True)
+        text = _message(result.scene, run, history, result._box)
+        assert "because every actuator is at its limit throughout" in text
 
 
 def test_gains_held_by_their_bounds_are_not_counted(tuned):
@@ -116,13 +105,3 @@ def test_gains_held_by_their_bounds_are_not_counted(tuned):
     lower[1, 0] = tuned.upper[1, 0]
     held = eqx.tree_at(lambda r: r.lower, tuned, lower)
     assert fj.tuning.league_table({"RPR": held}).endswith("1/5")
-
-
-def test_a_flat_start_of_an_arm_with_a_fixed_pair_is_explained(tuned):
-    """All actuators that there are are at their limits."""
-    result = with_fixed(tuned, "RPF")
-    saturated = np.array([[1.0, 1.0, 0.0]])
-    history = eqx.tree_at(lambda h: h.saturated, result.history, saturated)
-    run = SimpleNamespace(reason="", flat=True)
-    text = _message(result.scene, run, history, result.lower, result.upper)
-    assert "because every actuator is at its limit throughout" in text

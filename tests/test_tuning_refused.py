@@ -1,80 +1,139 @@
 """Gain tuning raises errors for scenes and settings that it cannot tune."""
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from test_limits import step
 
 import fdof_jax as fj
-from fdof_jax import scenes
-from fdof_jax.tuning import losses
+from fdof_jax import scenes, tuning
+from fdof_jax.tuning.losses import tip_errors
+
+FIG7, TWO, FIG5 = scenes.fig7(), scenes.two_link_circle(), scenes.fig5()
+RRR = tuning.circle_scenes()["RRR"]
+ONES, PRICED = np.ones((2, 3)), tuning.Tracking(effort=1.0)
+LAG = fj.control.FirstOrderLag(fj.JointEffort([0.0]), 0.1)
+STILL = fj.PDController(1, 1, 1, lambda t, arm: (jnp.zeros(3), jnp.zeros(3)))
+WEAK, HELD = step(limit=0.1), FIG5._replace(forces=(STILL,))
+PUSHED = WEAK._replace(forces=(*WEAK.forces, fj.JointEffort([1.0])))
+LATE = WEAK._replace(forces=(*WEAK.forces, LAG))
+DAMPED = RRR._replace(forces=(*RRR.forces, fj.JointDamper(1.0)))
+
+
+def with_limit(scene, limit):
+    values = jnp.broadcast_to(jnp.asarray(limit, float), scene.forces[0].kp.shape)
+    return eqx.tree_at(lambda scene: scene.forces[0].limit, scene, values)
+
+
+def within(scene, loss=tuning.joint_errors, **limits):
+    return tuning.tune_within(scene, tuning.Limits(**limits), loss=loss)
+
+
+FREE, NO_FORCE = with_limit(FIG7, np.inf), with_limit(FIG7, [0, 1, 1])
+MIXED = tuning.stacked([FIG7, FREE])
+
+CASES = {
+    fj.tune: [
+        (FIG7, dict(factor=1.0), "factor"),
+        (FIG7, dict(factor="4"), "factor"),
+        (FIG7, dict(factor=2.0, bounds=(ONES, ONES)), "factor"),
+        (FIG7, dict(method="adam"), "method: expected one of"),
+        (FIG7, dict(max_steps=0), "max_steps"),
+        (FIG7, dict(max_steps=2.5), "max_steps"),
+        (FIG7, dict(max_steps=True), "max_steps"),
+        (FIG7, dict(starts=0), "starts"),
+        (FIG7, dict(seed=-1), "seed"),
+        (FIG7, dict(report=3), "report"),
+        (FIG7, dict(over="best"), "over"),
+        (FIG7, dict(over="worst"), "over: expected an ensemble"),
+        (FIG7, dict(ensemble=3), "ensemble"),
+        (FIG7, dict(ensemble=FIG7), "ensemble: expected scenes stacked"),
+        (FIG7, dict(ensemble=tuning.stacked([RRR])), r"ensemble\[0\]: expected joints"),
+        (FIG7, dict(loss=3), "loss"),
+        (FIG7, dict(loss=tuning.Tracking), "loss: expected a callable"),
+        (FREE, dict(loss=PRICED), "loss: expected finite limits"),
+        (NO_FORCE, dict(loss=PRICED), "loss: expected finite limits"),
+        (FIG7, dict(bounds=(1, 2, 3)), "bounds"),
+        (FIG7, dict(bounds=(ONES, np.ones((2, 2)))), "bounds"),
+        (FIG7, dict(bounds=(9 * ONES, ONES)), "bounds: expected the scene's"),
+        (FIG7, dict(bounds=(ONES, 2 * ONES)), "bounds"),
+        (FIG7, dict(bounds=(0 * ONES, 1e9 * ONES)), "bounds"),
+        (FIG5, {}, "scene: expected exactly one PDController"),
+        (5, {}, "scene"),
+        (FIG7._replace(t1=-1.0), {}, r"scene\.t1"),
+        (FIG7._replace(t1=np.nan), {}, r"scene\.t1"),
+        (FIG7._replace(t1="a"), {}, r"scene\.t1"),
+        (FIG7._replace(linkage=None), {}, "linkage"),
+        (FIG7._replace(forces=FIG7.forces[0]), {}, r"scene\.forces"),
+    ],
+    tuning.trade_off: [
+        (FIG7, dict(prices=[]), "prices"),
+        (FIG7, dict(prices=[0.0, 0.1], ensemble=MIXED), "loss: expected finite limits"),
+    ],
+    tuning.tune_each: [
+        (RRR, {}, "scenes: expected a list"),
+        ([RRR, DAMPED], {}, r"scenes\[1\]: expected one like scenes\[0\]"),
+    ],
+    tuning.stacked: [([FIG7, FIG5], {}, r"scenes\[1\]: expected one like")],
+    tuning.perturbed: [
+        (HELD, dict(members=2, start_offset=100.0), "start_offset: expected one with"),
+        (HELD, dict(members=2, speed=(1, 2)), "speed: .* without a `period`"),
+        (FIG7, dict(members=2, speed=(2.0, 0.0)), "speed"),
+        (FIG7, dict(members=2, payload=(2.0, 0.0)), "payload: expected the least bef"),
+        (FIG7, dict(members=2, link_error=1.5), "link_error: expected less than 1"),
+    ],
+    tuning.optimal_efforts: [
+        (5, {}, "scene: expected a Scene"),
+        (FIG5, {}, "scene: expected exactly one PDController"),
+        (with_limit(TWO, np.inf), {}, "scene: expected finite limits"),
+        (HELD, {}, "scene: expected its controller to track a task with a `tip`"),
+        (TWO, dict(horizon=0), "horizon: expected"),
+        (TWO, dict(horizon=5), "horizon: expected at most"),
+        (TWO, dict(knots=1), "knots: expected"),
+        (TWO, dict(knots=20.0), "knots: expected"),
+        (TWO, dict(effort_rate=-1), "effort_rate: expected"),
+        (TWO, dict(max_steps=0), "max_steps: expected"),
+        (TWO, dict(report=3), "report: expected"),
+    ],
+    tuning.tune_within: [(step(), dict(limits=0.1), "limits: expected a Limits")],
+    within: [
+        (step(), dict(loss=tip_errors), "its controller to track a task with a `tip`"),
+        (step(), dict(overshoot=[0.1, 0.1]), "limits.overshoot: .* for 1 joints"),
+        (step(), dict(overshoot=-1), "overshoot"),
+        (step(), dict(effort=0), "effort"),
+        (step(), dict(modulus_margin=np.inf), "modulus_margin"),
+        (PUSHED, dict(overshoot=0.1), "scene: expected one that .* an equilibrium"),
+        (LATE, dict(overshoot=0.1), "forces: expected elements without a state"),
+    ],
+}
 
 
 @pytest.mark.parametrize(
-    ("keywords", "message"),
-    [
-        (dict(factor=1.0), "factor"),
-        (dict(factor="4"), "factor"),
-        (dict(method="adam"), "method: expected one of"),
-        (dict(max_steps=0), "max_steps"),
-        (dict(max_steps=2.5), "max_steps"),
-        (dict(max_steps=True), "max_steps"),
-        (dict(starts=0), "starts"),
-        (dict(seed=-1), "seed"),
-        (dict(over="best"), "over"),
-        (dict(over="worst"), "over: expected an ensemble"),
-        (dict(factor=2.0, bounds=(np.ones((2, 3)), np.ones((2, 3)))), "factor"),
-        (dict(report=3), "report"),
-        (dict(ensemble=3), "ensemble"),
-        (dict(loss=3), "loss"),
-        (dict(loss=losses.Tracking), "loss: expected a callable"),
-        (dict(bounds=(1, 2, 3)), "bounds"),
-        (dict(bounds=(np.ones((2, 3)), np.ones((2, 2)))), "bounds"),
-        (dict(bounds=(np.full((2, 3), 9), np.ones((2, 3)))), "bounds: expected the sc"),
-        (dict(bounds=(np.ones((2, 3)), 2 * np.ones((2, 3)))), "bounds"),
-        (dict(bounds=(np.zeros((2, 3)), np.full((2, 3), 1e9))), "bounds"),
-    ],
+    "call, scene, keywords, message",
+    [(call, *case) for call, cases in CASES.items() for case in cases],
 )
-def test_malformed_arguments(keywords, message):
+def test_malformed_arguments(call, scene, keywords, message):
     with pytest.raises(ValueError, match=message):
-        fj.tune(scenes.fig7(), **keywords)
-
-
-@pytest.mark.parametrize(
-    "scene",
-    [
-        scenes.fig5(),
-        5,
-        None,
-        scenes.fig7()._replace(t1=-1.0),
-        scenes.fig7()._replace(t1=np.nan),
-        scenes.fig7()._replace(t1="a"),
-        scenes.fig7()._replace(linkage=None),
-        scenes.fig7()._replace(forces=scenes.fig7().forces[0]),
-    ],
-)
-def test_malformed_scenes(scene):
-    """Covers values that are no scene, and scenes without exactly one controller."""
-    with pytest.raises(ValueError, match="scene|linkage"):
-        fj.tune(scene)
+        call(scene, **keywords)
 
 
 def test_tuning_is_not_for_transformations():
-    scene = scenes.fig7()
     with pytest.raises(ValueError, match="scene: expected known values"):
-        jax.jit(lambda t1: fj.tune(scene._replace(t1=t1)).gains)(1.0)
+        jax.jit(lambda t1: fj.tune(FIG7._replace(t1=t1)).gains)(1.0)
 
 
 @pytest.mark.parametrize("value", ["a", None, 1j, (1.0, 2.0, "b")])
 def test_a_loss_that_is_no_number_is_refused(value):
     with pytest.raises(ValueError, match=r"loss\(scene, solution\): expected a"):
-        fj.tune(scenes.fig7(), loss=lambda scene, solution: value)
+        fj.tune(FIG7, loss=lambda scene, solution: value)
 
 
 def test_keywords_of_tune_are_those_of_its_relatives():
-    scene = scenes.fig7()
     with pytest.raises(TypeError, match="step: expected a keyword among factor, "):
-        fj.tuning.tune_each([scene], step=3)
+        tuning.tune_each([FIG7], step=3)
     with pytest.raises(TypeError, match="ensemble: expected a keyword"):
-        fj.tuning.tune_each([scene], ensemble=scene)
+        tuning.tune_each([FIG7], ensemble=FIG7)
     with pytest.raises(TypeError, match="loss: expected a keyword"):
-        fj.tuning.trade_off(scene, [0.0], loss=losses.tip_errors)
+        tuning.trade_off(FIG7, [0.0], loss=tip_errors)

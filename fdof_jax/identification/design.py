@@ -11,10 +11,8 @@ from numpy.typing import ArrayLike
 
 from ..base.checks import function, increasing, instance, real_array, refusal, shown
 from ..base.report import Report
-from ..search.bounded import Run, minimise
-from ..search.lanes import Lanes
-from ..search.methods import Evaluation
-from ..search.simulated import check_scene
+from ..search.bounded import Evaluation, Run, minimise
+from ..search.lanes import Lanes, check_scene
 from ..simulation.scene import Scene
 from ..simulation.sensitivities import sensitivities
 from ..simulation.simulate import simulate

@@ -7,9 +7,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..base.checks import keywords_as, plain, real_array, refusal, shown
-from ..search.bounded import Run, minimise
+from ..search.bounded import Evaluation, Run, minimise
 from ..search.lanes import Lanes
-from ..search.methods import Evaluation
 from .problems import (
     Observe,
     Problem,

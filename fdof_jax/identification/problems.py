@@ -9,9 +9,8 @@ import numpy as np
 from jax import Array
 
 from ..base.checks import function, shown
-from ..search.bounded import Run
-from ..search.methods import Evaluation
-from ..search.simulated import check_scene, sum_of_squares
+from ..search.bounded import Evaluation, Run
+from ..search.lanes import check_scene, sum_of_squares
 from ..simulation.scene import Scene, stacked
 from ..simulation.sensitivities import sensitivities
 from ..simulation.solution import Solution

@@ -9,8 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..base.report import Report
-from ..search.bounded import Run
-from ..search.methods import held_at_bounds
+from ..search.bounded import Run, held_at_bounds
 from ..simulation.scene import Scene
 from .unknowns import Unknowns, named
 

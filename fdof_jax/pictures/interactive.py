@@ -21,9 +21,8 @@ from ..simulation.scene import Scene
 from ..simulation.simulate import simulate
 from ..simulation.solution import Solution
 from ..steps.looped_dopri8 import LoopedDopri8
-from ..tuning.gains import with_gains
-from ..tuning.league import circle_scenes
-from ..tuning.losses import controller_of, gains_of
+from ..tuning.ensembles import circle_scenes
+from ..tuning.losses import controller_of, gains_of, with_gains
 from .arms import draw_motion, geometry
 from .axes import SERIES, filled_mapping, legend, plane_axes, reached, xy
 from .elements import COMMANDED

@@ -8,10 +8,12 @@ import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+import scipy
 
-from ..base.checks import shown, whole_number
-from .methods import METHODS, Evaluation, held_at_bounds
+from ..base.checks import function, whole_number
 
 # Greatest change of an unknown in a step: a factor of 7 if unknowns are logarithms.
 _LONGEST_STEP = 2.0
@@ -19,9 +21,121 @@ _LONGEST_STEP = 2.0
 _GRADIENT_OF_LOSS = 1e-6
 # The loss may vanish, so its gradient is also compared with that at the start.
 _GRADIENT_DECREASE = 1e-10
+_PATIENCE = 10  # guesses of the active bounds of a step that are no better
 # A stop for another reason counts as convergence if the projected gradient is at most
 # this part of the loss.
 _CONVERGED = 1e-2
+
+
+class Evaluation(NamedTuple):
+    """A function and its derivatives at one point per run.
+
+    Loss (run,), gradient (run, n), semidefinite curvature (run, n, n), for instance
+    Gauss-Newton's; `facts`: arrays (run, ...) kept with the point.
+    """
+
+    loss: Any
+    gradient: Any
+    curvature: Any
+    facts: dict[str, Any]
+
+    def row(self, index: int) -> "Evaluation":
+        return jax.tree.map(lambda a: a[index], self)
+
+
+class LevenbergMarquardt:
+    """The Levenberg-Marquardt method: steps to its model's minimum in the box."""
+
+    def __init__(self, z: np.ndarray):
+        self.damping, self.growth = 1e-3, 4
+
+    def step(self, z, here: Evaluation, low, high) -> np.ndarray:
+        normal = here.curvature.copy()
+        scale = np.diag(normal)
+        normal += np.diag(self.damping * scale + 1e-12 * scale.sum() + 1e-300)
+        return box_minimum(normal, here.gradient, low - z, high - z)
+
+    def accepted(self) -> None:
+        self.damping, self.growth = max(self.damping / 4, 1e-9), 4
+
+    def refused(self) -> bool:
+        """Shortens the next step, and returns whether one is left to try."""
+        self.damping *= self.growth
+        self.growth *= 2
+        return self.damping <= 1e8
+
+
+class LBFGS:
+    """optax's L-BFGS directions, projected into the box, shortened until descent."""
+
+    def __init__(self, z: np.ndarray):
+        import optax  # slow to import, and not needed by the default method
+
+        self.optimiser = optax.scale_by_lbfgs()
+        self.update = jax.jit(self.optimiser.update)
+        self.state: Any = self.optimiser.init(jnp.asarray(z))
+        self.direction: np.ndarray | None = None
+        self.share = 1.0
+
+    def step(self, z, here: Evaluation, low, high) -> np.ndarray:
+        held = held_at_bounds(z, here.gradient, low, high)
+        if self.direction is None:
+            update, self.state = self.update(
+                jnp.asarray(here.gradient), self.state, jnp.asarray(z)
+            )
+            self.direction = -np.asarray(update)
+        direction = np.where(held, 0, self.direction)
+        if direction @ here.gradient >= 0:
+            direction = np.where(held, 0, -here.gradient)
+        # The first direction is the gradient itself, whose length is arbitrary.
+        if int(self.state.count) == 1:
+            direction = 0.3 * direction / np.abs(direction).max()
+        return np.clip(z + self.share * direction, low, high) - z
+
+    def accepted(self) -> None:
+        self.direction, self.share = None, 1.0
+
+    def refused(self) -> bool:
+        self.share /= 4
+        return self.share > 1e-8
+
+
+METHODS: dict[str, Any] = {"levenberg-marquardt": LevenbergMarquardt, "l-bfgs": LBFGS}
+
+
+def box_minimum(
+    matrix: np.ndarray, slope: np.ndarray, low: np.ndarray, high: np.ndarray
+) -> np.ndarray:
+    """Minimises slope @ x + x @ matrix @ x / 2 in a box, for a definite matrix.
+
+    It guesses which bounds are active until a guess proves right: block principal
+    pivoting (Judice and Pires, 1994). That mostly takes a few factorisations, where
+    SciPy's BVLS takes one per bound. Of hundreds of unknowns that nearly depend on each
+    other the result may be no minimum: a trial step, which the search then rejects.
+    """
+    x, below, above = np.zeros_like(slope), *np.zeros((2, slope.size), bool)
+    least, patience = np.inf, _PATIENCE
+    for _ in range(100 + 10 * slope.size):
+        x = np.where(below, low, np.where(above, high, 0.0))
+        free = ~(below | above)
+        if free.any():
+            factor = scipy.linalg.cho_factor(matrix[np.ix_(free, free)])
+            x[free] = scipy.linalg.cho_solve(factor, -(slope + matrix @ x)[free])
+        rise = slope + matrix @ x
+        sets = (x < low) | below & (rise > 0), (x > high) | above & (rise < 0)
+        wrong = (sets[0] != below) | (sets[1] != above)
+        if not wrong.any():
+            break
+        better = wrong.sum() < least
+        least, patience = (wrong.sum(), _PATIENCE) if better else (least, patience - 1)
+        if patience < 0:  # all changes at once may cycle; the first one alone does not
+            wrong[wrong.argmax() + 1 :] = False
+        below, above = np.where(wrong, sets, (below, above))
+    return np.clip(x, low, high)
+
+
+def held_at_bounds(z, gradient, low, high) -> np.ndarray:
+    return ((z <= low) & (gradient > 0)) | ((z >= high) & (gradient < 0))
 
 
 class Row(NamedTuple):
@@ -74,7 +188,7 @@ class Run:
             self.reason = "the loss decreases no further"
 
     def _small(self, of_loss: float) -> bool:
-        """Returns whether the projected gradient is at most this part of the loss."""
+        # Whether the projected gradient is at most this part of the loss.
         least = _GRADIENT_DECREASE * self.rows[0].gradient_norm
         return self.best.gradient_norm <= max(least, of_loss * self.best.loss)
 
@@ -92,8 +206,7 @@ class Run:
         return self.rows[-1]
 
     @property
-    def failed(self) -> bool:
-        """Returns whether the function could not be evaluated at the start."""
+    def failed(self) -> bool:  # at the start
         return not np.isfinite(self.best.loss)
 
     @property
@@ -105,6 +218,13 @@ class Run:
 def best_of(runs: list[Run]) -> Run:
     """Returns the run of least loss, a failed one only if all have failed."""
     return min(runs, key=lambda run: (run.failed, run.best.loss))
+
+
+def check_search(max_steps: Any, report: Any) -> int:
+    """Returns `max_steps`; raises ValueError for malformed arguments of a search."""
+    if report is not None:
+        function("report", report, "a callable or None")
+    return whole_number("max_steps", max_steps, 1)
 
 
 def minimise(
@@ -126,12 +246,9 @@ def minimise(
     first; `enough`: a run stops when its loss falls by less than this part; `report`:
     called after each step with a line in which `describe` says where the runs are.
 
-    **Raises:** ValueError unless `max_steps` is a whole number of at least 1, and
-    `report` a callable or None.
+    **Raises:** ValueError as `check_search`.
     """
-    max_steps = whole_number("max_steps", max_steps, 1)
-    if not (report is None or callable(report)):
-        raise ValueError(f"report: expected a callable or None, got {shown(report)}.")
+    max_steps = check_search(max_steps, report)
     began = time.perf_counter()
     runs = [Run(METHODS[method], enough, *row) for row in zip(start, low, high)]
     for number in range(max_steps + 1):
@@ -148,8 +265,6 @@ def minimise(
             report(f"{number:4d}  {describe(runs)}, {active}")
     for run in runs:
         if not run.reason:
-            run.exhausted, run.reason = (
-                True,
-                f"stopped after {max_steps} evaluations (max_steps)",
-            )
+            run.exhausted = True
+            run.reason = f"stopped after {max_steps} evaluations (max_steps)"
     return runs

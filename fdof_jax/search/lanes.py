@@ -1,4 +1,4 @@
-"""One compiled evaluation for many runs, each of one problem or several."""
+"""One compiled evaluation for many runs, each of one scene or several."""
 
 from collections.abc import Callable
 from typing import Any
@@ -9,16 +9,38 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from ..base.checks import instance
 from ..base.configuration import options_of_loops
 from ..base.functions import sharing_functions
-from ..simulation.scene import stacked
-from .methods import Evaluation
+from ..forces.element import elements
+from ..linkage.coordinates import real_state
+from ..linkage.linkage import check_linkage
+from ..simulation.scene import Scene, stacked
+from ..simulation.sensitivities import Sensitivities
+from ..simulation.simulate import check_elements
+from .bounded import Evaluation
 
 # Greatest number of lanes in a compiled batch: fewer do not fill the processor, and
 # more wait for each other.
 _LANES = 8
 
 Evaluate = Callable[[Array, Any], Evaluation]  # (z, problem) of one lane
+
+
+def check_scene(name: str, scene: Any, ts: Array) -> None:
+    """Raises ValueError unless `scene` can be simulated over the times `ts`."""
+    instance(name, scene, Scene)
+    check_linkage(scene.linkage)
+    real_state(f"{name}.state0", scene.state0, scene.linkage)
+    elements(f"{name}.forces", scene.forces)
+    check_elements(scene.forces, scene.linkage, ts)
+
+
+def sum_of_squares(found: Sensitivities, **facts: Any) -> Evaluation:
+    """The sum of squared residuals, its gradient and Gauss-Newton's curvature."""
+    value, jacobian, *_ = found
+    loss, curvature = jnp.sum(value**2), 2 * jacobian.T @ jacobian
+    return Evaluation(loss, 2 * jacobian.T @ value, curvature, facts)
 
 
 @eqx.filter_jit(compiler_options=options_of_loops())  # pyright: ignore[reportCallIssue]
@@ -100,12 +122,11 @@ def power_mean(members: Evaluation, order: int) -> Evaluation:
     weight = (part / np.where(mean > 0, mean, 1)) ** (order - 1) / loss.shape[1]
     total = np.einsum("rm,rmn->rn", weight, gradient)
     bent = np.einsum("rm,rmij->rij", weight, curvature)
+    whole = mean * largest
     if order > 1:
         value = np.where(loss > 0, loss, 1)
         spread = np.einsum("rm,rmi,rmj->rij", weight / value, gradient, gradient)
-        whole = (mean * largest)[:, :, None]
-        spread -= total[:, :, None] * total[:, None, :] / np.where(whole > 0, whole, 1)
+        outer = total[:, :, None] * total[:, None, :]
+        spread -= outer / np.where(whole > 0, whole, 1)[:, :, None]
         bent = bent + (order - 1) * spread
-    return Evaluation(
-        (mean * largest)[:, 0], total, bent, facts | {"member_loss": loss}
-    )
+    return Evaluation(whole[:, 0], total, bent, facts | {"member_loss": loss})

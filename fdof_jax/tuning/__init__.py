@@ -1,15 +1,13 @@
 """Gain tuning by gradients, optimal efforts, and checks of the gradients."""
 
 from ..simulation.scene import stacked
-from .ensembles import perturbed, with_payload
+from .ensembles import circle_scenes, perturbed, with_payload
 from .gradient_quality import GradientReport, gradient_report
-from .league import circle_scenes, league_table
-from .limits import Limits
 from .losses import Tracking, joint_errors, tip_errors
 from .optimal_motion import OptimalMotion, optimal_efforts
-from .result import TradeOff, TuneResult
+from .result import TradeOff, TuneResult, league_table
 from .tuning import trade_off, tune, tune_each
-from .within_limits import TunedWithin, tune_within
+from .within_limits import Limits, TunedWithin, tune_within
 
 __all__ = [
     "circle_scenes", "gradient_report", "GradientReport", "joint_errors",

@@ -1,4 +1,4 @@
-"""Ensembles: scenes that differ in numbers, stacked along a leading axis."""
+"""Scenes to tune: variations of one, stacked, and one circle for all topologies."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -8,14 +8,26 @@ from numpy.typing import ArrayLike
 
 from ..base.checks import instance, real_array, refusal, whole_number
 from ..control.model_based import ModelBased
+from ..control.pd import PDController
 from ..linkage.coordinates import State
 from ..linkage.linkage import Linkage, check_linkage
+from ..linkage.topology import TOPOLOGIES
 from ..mechanics.kinematics import tip_jacobian, tip_position
+from ..paper import from_chain
+from ..references.circle import CircleTask
 from ..references.reference import reference_of
 from ..simulation.scene import Scene, stacked
 from .losses import controller_of, with_controller
 
 _MOST = 1_000_000  # they are drawn one after another
+# The common start in chain coordinates B1, th2, B2, th3, B3, th4. From here every
+# topology follows the circle away from its singularities.
+_START = np.array([0.0, 1.0, -0.1, -1.0, 0.7, 0.8])
+_BASE = np.pi / 2  # a slide on the ground is level
+_CENTER = [1.99, 0.95]
+# The assembly (of two) that each arm starts in.
+_BRANCH = dict(zip(TOPOLOGIES, (-1, 1, -1, -1, 1, 1, 1)))
+_KP, _KD = {"R": 500.0, "P": 2000.0}, {"R": 50.0, "P": 200.0}
 
 
 def _bodies(linkage: Linkage) -> tuple[Array, Array, Array]:
@@ -99,16 +111,7 @@ def perturbed(
     instance("scene", scene, Scene)
     members = whole_number("members", members, 1, _MOST)
     draw = np.random.default_rng(whole_number("seed", seed, 0))
-    ranges = {
-        name: np.asarray(real_array(name, value, (2,), minimum=least))
-        for name, value, least in (("payload", payload, 0), ("speed", speed, 1e-3))
-    }
-    for name, (least, greatest) in ranges.items():
-        if least > greatest:
-            raise ValueError(
-                f"{name}: expected the least before the greatest, got {least:g} and "
-                f"{greatest:g}."
-            )
+    payloads, speeds = _range("payload", payload, 0), _range("speed", speed, 1e-3)
     error = float(real_array("link_error", link_error, (), minimum=0))
     if error >= 1:
         raise ValueError(
@@ -117,13 +120,14 @@ def perturbed(
         )
     reach = float(real_array("start_offset", start_offset, (), minimum=0))
     linkage, controller = scene.linkage, controller_of(scene)
-    varied = bool((ranges["speed"] != 1).any())
-    if varied and reference_of(controller.reference).period is None:
-        raise refusal("speed", "(1, 1) for a reference without a `period`", speed)
+    period = None
+    if speeds != (1, 1):
+        period = reference_of(controller.reference).period
+        if period is None:
+            raise refusal("speed", "(1, 1) for a reference without a `period`", speed)
     if isinstance(controller, ModelBased) and controller.model is None:
         none = lambda node: node is None
-        known = eqx.tree_at(lambda c: c.model, controller, linkage, is_leaf=none)
-        scene = with_controller(scene, known)
+        controller = eqx.tree_at(lambda c: c.model, controller, linkage, is_leaf=none)
 
     def member() -> Scene:
         bodies = [
@@ -131,18 +135,67 @@ def perturbed(
             for values in _bodies(linkage)
         ]
         arm = eqx.tree_at(_bodies, linkage, bodies)
-        arm = with_payload(arm, draw.uniform(*ranges["payload"]))
+        arm = with_payload(arm, draw.uniform(*payloads))
         distance, angle = reach * draw.uniform(), draw.uniform(0, 2 * np.pi)
         offset = distance * np.array([np.cos(angle), np.sin(angle)])
-        rate = draw.uniform(*ranges["speed"])
-        q, found = np.asarray(scene.state0.q), scene
+        rate = draw.uniform(*speeds)
+        q, own = np.asarray(scene.state0.q), controller
         if reach > 0:
             q = _displaced(linkage, q, offset)
-        if varied:
-            period = lambda controller: controller.reference.period
-            known = controller_of(scene)
-            faster = eqx.tree_at(period, known, period(known) / rate)
-            found = with_controller(scene, faster)
-        return found._replace(linkage=arm, state0=State(q, scene.state0.qd))
+        if period is not None:
+            own = eqx.tree_at(lambda c: c.reference.period, own, period / rate)
+        varied = scene._replace(linkage=arm, state0=State(q, scene.state0.qd))
+        return with_controller(varied, own)
 
     return stacked([member() for _ in range(members)])
+
+
+def _range(name: str, value: ArrayLike, minimum: float) -> tuple[float, float]:
+    least, greatest = np.asarray(real_array(name, value, (2,), minimum=minimum))
+    if least > greatest:
+        raise ValueError(
+            f"{name}: expected the least before the greatest, got {least:g} and "
+            f"{greatest:g}."
+        )
+    return least, greatest
+
+
+def circle_scenes() -> dict[str, Scene]:
+    """The same circle for an arm of each topology, under PD control and gravity.
+
+    All arms have links of 1 m, 0.8 m and 0.5 m with masses of 2 kg, 1.5 kg and 1 kg.
+    They start at rest in the same configuration, with their tip 5 cm inside the circle
+    of 0.25 m radius, and keep the angle of their last link. Only the choice of the real
+    joint of each pair differs. All joints of a kind have the same gains and limits
+    (150 N m or N).
+
+    >>> import fdof_jax as fj
+    >>> scenes = fj.tuning.circle_scenes()
+    >>> starts = [fj.tip_position(s.linkage, s.state0.q) for s in scenes.values()]
+    >>> starts[0].tolist(), starts[-1].tolist()  # the same for all
+    ([1.994, 1.151], [1.994, 1.151])
+    """
+    found = {}
+    for topology in TOPOLOGIES:
+        locked, state0 = from_chain(topology, _START, np.zeros(6), base_angle=_BASE)
+        linkage = Linkage(
+            topology,
+            length=[0.3, 1.0, 0.8, 0.5],
+            com=[[0.5, 0], [0.4, 0], [0.25, 0]],
+            mass=[2, 1.5, 1],
+            inertia=[0.2, 0.1, 0.05],
+            locked=locked,
+            base_angle=_BASE,
+        )
+        task = CircleTask(
+            center=_CENTER,
+            radius=0.25,
+            period=4.0,
+            phase=np.pi / 2,
+            orientation=_START[5],
+            branch=_BRANCH[topology],
+        )
+        kp, kd = ([of[kind] for kind in topology] for of in (_KP, _KD))
+        controller = PDController(kp, kd, 150.0, task)
+        found[topology] = Scene(linkage, state0, (controller,), 4.0)
+    return found

@@ -1,7 +1,6 @@
 """Checks of the gradient that gain tuning follows."""
 
 import dataclasses
-from collections.abc import Callable, Iterator
 from typing import Any
 
 import equinox as eqx
@@ -13,16 +12,23 @@ from jaxtyping import Bool, Float
 
 from ..analysis.linearization import Modes, closed_loop_modes, depends_on_state_alone
 from ..analysis.tracking import relative_demands
+from ..base.array_namespace import in_numpy
 from ..base.configuration import options_of_loops
 from ..base.report import Report
 from ..linkage.linkage import joint_names
 from ..simulation.prescribed import PrescribedMotion
 from ..simulation.scene import Scene, is_number
-from ..simulation.sensitivities import sensitivities
+from ..simulation.sensitivities import Sensitivities, sensitivities
 from ..simulation.simulate import simulate
 from ..simulation.solution import Solution, remarks_on_derivatives
-from .gains import SAMPLES, check_tuned, with_gains
-from .losses import controller_of, gains_of, tip_errors
+from .losses import (
+    SAMPLES,
+    bounds_of,
+    check_tuned,
+    controller_of,
+    tip_errors,
+    with_log_gains,
+)
 
 _HORIZONS = 10
 # The step of the differences in the log-gains. The error of the extrapolated
@@ -109,27 +115,25 @@ class GradientReport(Report):
         return lines + self.warnings
 
 
-def _times_in(part: Any, place: str) -> Iterator[tuple[str, Array]]:
-    """Yields the single numbers that a part declares in seconds, with their names."""
-    # The start is bound to a prescribed motion, and would have to change with it.
-    if not isinstance(part, eqx.Module) or isinstance(part, PrescribedMotion):
-        return
-    for declared in dataclasses.fields(part):
-        value, name = vars(part)[declared.name], f"{place}.{declared.name}"
-        rules = declared.metadata.get("rules", {"unit": ""})
-        if rules["unit"] == "s" and rules["shape"] == ():
-            yield name, value
-        else:
-            yield from _times_in(value, name)
-
-
 def _times(scene: Scene) -> dict[str, Array]:
-    """The times that the scene's elements declare, by name."""
-    return {
-        name: value
-        for index, element in enumerate(scene.forces)
-        for name, value in _times_in(element, f"forces[{index}]")
-    }
+    """The single numbers that the scene's elements declare in seconds, by name."""
+    times = {}
+
+    def collect(part: Any, place: str) -> None:
+        # The start is bound to a prescribed motion, and would have to change with it.
+        if not isinstance(part, eqx.Module) or isinstance(part, PrescribedMotion):
+            return
+        for declared in dataclasses.fields(part):
+            value, name = vars(part)[declared.name], f"{place}.{declared.name}"
+            rules = declared.metadata.get("rules", {"unit": ""})
+            if rules["unit"] == "s" and rules["shape"] == ():
+                times[name] = value
+            else:
+                collect(value, name)
+
+    for index, element in enumerate(scene.forces):
+        collect(element, f"forces[{index}]")
+    return times
 
 
 def _with_times(scene: Scene, times: Any) -> Scene:
@@ -137,53 +141,36 @@ def _with_times(scene: Scene, times: Any) -> Scene:
     return eqx.tree_at(where, scene, list(times)) if len(times) else scene
 
 
+def _scene_at(scene: Scene, tuned: Any, z: Any) -> Scene:
+    """The scene with gains of the logarithms in `z`, which its times follow."""
+    logs, times = jnp.split(jnp.asarray(z), [tuned.size])
+    return _with_times(with_log_gains(scene, logs, tuned), times)
+
+
 @eqx.filter_jit(compiler_options=options_of_loops())  # pyright: ignore[reportCallIssue]
-def _tangents(scene: Scene) -> tuple[Array, Array, Array, Solution]:
-    """Residuals, their Jacobian, relative demands, and the motion.
-
-    The Jacobian's columns are derivatives in the log-gains, then in the times.
-    """
-    controller, gains = controller_of(scene), gains_of(scene)
-    logs = jnp.log(jnp.where(gains > 0, gains, 1)).ravel()
-
-    def scene_at(z):
-        changed = jnp.exp(z[: logs.size]).reshape(gains.shape)
-        trial = with_gains(scene, jnp.where(gains > 0, changed, 0))
-        return _with_times(trial, z[logs.size :])
-
-    z = jnp.concatenate([logs, *(jnp.ravel(t) for t in _times(scene).values())])
+def _tangents(scene: Scene, tuned: Any, z: Any) -> tuple[Sensitivities, Array]:
+    """Residuals with their derivatives in `z`, and relative demands."""
     ts = jnp.linspace(0, scene.t1, SAMPLES)
-    found = sensitivities(scene_at, tip_errors, z, ts)
-    demands = relative_demands(controller, scene.linkage, found.solution)
-    return found.residuals, found.jacobian, demands, found.solution
+    found = sensitivities(lambda z: _scene_at(scene, tuned, z), tip_errors, z, ts)
+    controller = controller_of(scene)
+    return found, relative_demands(controller, scene.linkage, found.solution)
 
 
 def _motion(scene: Scene) -> Solution:
     """The motion by a plain call of `simulate`."""
-    ts = np.linspace(0, float(scene.t1), SAMPLES)
-    return simulate(scene.linkage, scene.state0, ts, scene.forces, throw=False)
+    return simulate(scene, np.linspace(0, float(scene.t1), SAMPLES), throw=False)
 
 
-def _slope(scene_at: Callable[[float], Scene], h: float) -> float:
-    """The derivative of the mean squared tip error by extrapolated differences."""
+def _slopes(scene: Scene, tuned: Any, z: np.ndarray, steps: Any) -> np.ndarray:
+    """Derivatives of the mean squared tip error by extrapolated differences."""
 
-    def loss(x):
-        trial = scene_at(x)
+    def loss(z: np.ndarray) -> float:
+        trial = _scene_at(scene, tuned, z)
         return float(np.sum(np.square(tip_errors(trial, _motion(trial)))))
 
-    far, near = ((loss(x) - loss(-x)) / (2 * x) for x in (h, h / 2))
-    return float((4 * near - far) / 3)
-
-
-def _in_times(scene: Scene, slopes: np.ndarray) -> dict[str, tuple[float, float]]:
-    """The derivatives in the scene's times beside differences, by name."""
-    names, values = _times(scene), np.array(list(_times(scene).values()))
-    moved = lambda unit: lambda x: _with_times(scene, values + x * unit)
-    # Short parts of the run may be given in times, and are not stepped over.
-    steps = np.where(values == 0, np.inf, _STEP * np.abs(values))
-    steps = np.minimum(steps, _OF_TIME * scene.t1)
-    differences = map(_slope, map(moved, np.eye(len(values))), steps)
-    return dict(zip(names, zip(map(float, slopes), differences)))
+    rise = lambda h: loss(z + h) - loss(z - h)
+    changes = np.diag(steps)
+    return np.array([8 * rise(h / 2) - rise(h) for h in changes]) / (6 * steps)
 
 
 def gradient_report(scene: Scene) -> GradientReport:
@@ -197,21 +184,23 @@ def gradient_report(scene: Scene) -> GradientReport:
     **Raises:** ValueError as `tune`.
     """
     check_tuned("scene", scene)
-    scene = jax.tree.map(
-        lambda a: jnp.asarray(a) if is_number(a) else a,
-        scene._replace(t1=float(scene.t1)),
-    )
-    residuals, jacobian, demands, solution = jax.tree.map(
-        lambda a: np.asarray(a) if eqx.is_array(a) else a, _tangents(scene)
-    )
-    along = 2 * np.cumsum(residuals[:, None] * jacobian, axis=0)
-    gains = np.asarray(gains_of(scene))
-    along, in_times = np.split(along, [gains.size], axis=1)
-    gradient = along[-1].reshape(gains.shape)
-    with_logs = lambda unit: lambda x: with_gains(scene, gains * np.exp(x * unit))
-    units = np.eye(gains.size).reshape(-1, *gains.shape)
-    differences = np.array([_slope(with_logs(unit), _STEP) for unit in units])
-    differences = differences.reshape(gains.shape)
+    t1 = float(scene.t1)
+    as_array = lambda leaf: jnp.asarray(leaf) if is_number(leaf) else leaf
+    scene = jax.tree.map(as_array, scene._replace(t1=t1))
+    box, moments = bounds_of(scene, None, None), _times(scene)
+    values = np.array(list(moments.values()), float)
+    z, tuned = np.concatenate([box.logs()[0], values]), box.tuned
+    found, demands = in_numpy(_tangents(scene, tuned, z))
+    residuals, solution = found.residuals, found.solution
+    # Short parts of the run may be given in times, and are not stepped over.
+    steps = np.where(values == 0, np.inf, _STEP * np.abs(values))
+    steps = np.append(np.full(tuned.size, _STEP), np.minimum(steps, _OF_TIME * t1))
+    slopes = _slopes(scene, tuned, z, steps)
+    along = 2 * np.cumsum(residuals[:, None] * found.jacobian, axis=0)
+    both = np.stack([along[-1], slopes])
+    gradient, differences = both[:, : tuned.size].reshape(2, *tuned.shape)
+    times = dict(zip(moments, map(tuple, both[:, tuned.size :].T.tolist())))
+    along = along[:, : tuned.size]
     size = np.linalg.norm(differences)
     error = float(np.linalg.norm(gradient - differences) / size) if size > 0 else 0.0
     # The error up to a time is the mean over that time, not over the whole run.
@@ -223,11 +212,16 @@ def gradient_report(scene: Scene) -> GradientReport:
     modes, stiff = None, []
     if depends_on_state_alone(scene.forces):
         modes = closed_loop_modes(scene.linkage, scene.forces, few)
-        stiff = _stiffness(modes, float(scene.t1))
-    stats, times = _motion(scene).stats, _in_times(scene, in_times[-1])
-    warnings = _warnings(scene, gradient, saturated, error) + stiff
-    warnings += remarks_on_derivatives(stats)
-    pace = np.sum(residuals**2) / scene.t1
+        stiff = _stiffness(modes, t1)
+    stats = _motion(scene).stats
+    warnings = _remarks_on_gains(scene, gradient, saturated)
+    if not error < 1e-3:
+        warnings.append(
+            "gradient and differences disagree: the loss may not be smooth here, or "
+            "chaotic over this horizon"
+        )
+    warnings += stiff + remarks_on_derivatives(stats)
+    pace = np.sum(residuals**2) / t1
     for name, (slope, difference) in times.items():
         if not abs(slope - difference) < 1e-3 * max(abs(difference), pace):
             warnings.append(
@@ -251,7 +245,7 @@ def gradient_report(scene: Scene) -> GradientReport:
 
 
 def _stiffness(modes: Modes, t1: float) -> list[str]:
-    """Returns what there is to say about modes that are fast for a run up to `t1`."""
+    """Warns of modes that are fast for a run up to `t1`."""
     fastest = np.nanmax(modes.frequency)
     steps = fastest * t1 / _STABLE
     if not steps > _MANY_STEPS:
@@ -262,22 +256,17 @@ def _stiffness(modes: Modes, t1: float) -> list[str]:
     ]
 
 
-def _warnings(scene: Scene, gradient, saturated, error) -> list[str]:
-    names, words = joint_names(scene.linkage), []
-    for joint, share in enumerate(saturated):
-        if share == 1 and not gradient[:, joint].any():
+def _remarks_on_gains(scene: Scene, gradient, saturated) -> list[str]:
+    words = []
+    for k, (name, share) in enumerate(zip(joint_names(scene.linkage), saturated)):
+        if share == 1 and not gradient[:, k].any():
             words.append(
-                f"{names[joint]} is at its limit throughout: the gradient in its gains "
-                "is zero, and tuning cannot change them"
+                f"{name} is at its limit throughout: the gradient in its gains is "
+                "zero, and tuning cannot change them"
             )
         elif share > 0:
             words.append(
-                f"{names[joint]} is at its limit for {100 * share:.3g} % of the time, "
-                "in which its gains have no effect"
+                f"{name} is at its limit for {100 * share:.3g} % of the time, in which "
+                "its gains have no effect"
             )
-    if not error < 1e-3:
-        words.append(
-            "gradient and differences disagree: the loss may not be smooth here, or "
-            "chaotic over this horizon"
-        )
     return words

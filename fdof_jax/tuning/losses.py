@@ -1,7 +1,7 @@
-"""Losses for gain tuning: tip error, effort, rate of effort."""
+"""Losses of a scene's motion, and their derivatives in its controller's gains."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -9,19 +9,22 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jaxtyping import Float
-from numpy.typing import ArrayLike
 
 from ..analysis.tracking import relative_demands, tip_deviation
-from ..base.array_namespace import namespace
-from ..base.checks import instance, is_traced, real_array, refusal
+from ..base.array_namespace import in_numpy, namespace
+from ..base.checks import function, instance, is_traced, real_array, refusal
 from ..control.pd import PDController
+from ..linkage.fields import Part, Values, field
 from ..linkage.linkage import without_fixed
-from ..linkage.topology import fixed_pairs
 from ..references.reference import reference_motion, reference_of
+from ..search.bounded import Evaluation
+from ..search.lanes import check_scene, sum_of_squares
 from ..simulation.sampled import check_joints
 from ..simulation.scene import Scene
+from ..simulation.sensitivities import Sensitivities, sensitivities
 from ..simulation.solution import Solution
 
+SAMPLES = 1001
 Loss = Callable[[Scene, Solution], Array]
 
 
@@ -44,24 +47,42 @@ def with_controller(scene: Scene, element: Any) -> Scene:
     return scene._replace(forces=tuple(forces))
 
 
+def tracked_task(scene: Scene, name: str = "scene") -> Any:
+    """The task of a scene's controller; raises ValueError if it has no `tip`."""
+    task = controller_of(scene).reference
+    if reference_of(task).tip is None:
+        expected = "its controller to track a task with a `tip`, for the tip error"
+        raise refusal(name, expected, task)
+    return task
+
+
 def gains_of(scene: Scene) -> Any:
     """kp and kd of a scene's controller (2, n), 0 at fixed pairs."""
     controller = controller_of(scene)
-    kp, kd, ef = controller.kp, controller.kd, scene.linkage.ef
-    if not is_traced(kp, kd, ef):  # JAX would compile programs for known numbers
-        kp, kd, ef = map(np.asarray, (kp, kd, ef))
-    xp = namespace(kp, kd, ef)
-    fixed = xp.stack(fixed_pairs(ef))
-    return xp.stack([xp.where(fixed, 0, kp), xp.where(fixed, 0, kd)])
+    # In NumPy if known: JAX would compile programs.
+    linkage, *gains = in_numpy((scene.linkage, controller.kp, controller.kd))
+    rows = [without_fixed(linkage, row) for row in gains]
+    return namespace(rows).stack(rows)
+
+
+def with_gains(scene: Scene, gains: Array) -> Scene:
+    """The scene with the rows of `gains` as its controller's kp and kd."""
+    controller = controller_of(scene)
+    changed = eqx.tree_at(lambda c: (c.kp, c.kd), controller, (gains[0], gains[1]))
+    return with_controller(scene, changed)
+
+
+def _check_motion(scene: Any, solution: Any) -> None:
+    instance("scene", scene, Scene)
+    instance("solution", solution, Solution)
+    check_joints("solution", solution, scene.linkage)
 
 
 def tip_errors(scene: Scene, solution: Solution) -> Float[Array, " residual"]:
     """Tip errors at the output times, scaled so that their squares sum to the mean.
 
-    **Arguments:**
-
-    - `scene`: its PD controller must track a task with a `tip`.
-    - `solution`: the scene's motion.
+    **Arguments:** `scene`, whose PD controller must track a task with a `tip`;
+    `solution`: its motion.
 
     **Returns:** x and y components [m], divided by the root of the number of times.
 
@@ -69,19 +90,14 @@ def tip_errors(scene: Scene, solution: Solution) -> Float[Array, " residual"]:
 
     >>> import fdof_jax as fj
     >>> import numpy as np
-    >>> arm, start, forces, _ = fj.scenes.fig7()
-    >>> motion = fj.simulate(arm, start, np.linspace(0, 1, 101), forces)
-    >>> errors = fj.tuning.tip_errors(fj.scenes.fig7(), motion)
+    >>> scene = fj.scenes.fig7()
+    >>> motion = fj.simulate(scene, np.linspace(0, 1, 101))
+    >>> errors = fj.tuning.tip_errors(scene, motion)
     >>> float((errors**2).sum() ** 0.5)  # rms over the first second [m]
     0.351
     """
-    instance("scene", scene, Scene)
-    instance("solution", solution, Solution)
-    check_joints("solution", solution, scene.linkage)
-    task: Any = controller_of(scene).reference
-    if reference_of(task).tip is None:
-        raise refusal("scene", "a controller of a task with a `tip`", task)
-    deviation = tip_deviation(scene.linkage, task, solution)
+    _check_motion(scene, solution)
+    deviation = tip_deviation(scene.linkage, tracked_task(scene), solution)
     return deviation.reshape(-1) / solution.ts.size**0.5
 
 
@@ -91,10 +107,7 @@ def joint_errors(scene: Scene, solution: Solution) -> Float[Array, " residual"]:
     This is a loss for controllers whose reference has no `tip`. It adds errors of
     slides [m] and angles [rad] as they are.
 
-    **Arguments:**
-
-    - `scene`: must hold exactly one `PDController`.
-    - `solution`: the scene's motion.
+    **Arguments:** `scene`, with exactly one `PDController`; `solution`: its motion.
 
     **Returns:** q - q_ref [m or rad], divided by the root of the number of times.
 
@@ -102,15 +115,13 @@ def joint_errors(scene: Scene, solution: Solution) -> Float[Array, " residual"]:
 
     >>> import fdof_jax as fj
     >>> import numpy as np
-    >>> arm, start, forces, _ = fj.scenes.fig7()
-    >>> motion = fj.simulate(arm, start, np.linspace(0, 1, 101), forces)
-    >>> errors = fj.tuning.joint_errors(fj.scenes.fig7(), motion)
+    >>> scene = fj.scenes.fig7()
+    >>> motion = fj.simulate(scene, np.linspace(0, 1, 101))
+    >>> errors = fj.tuning.joint_errors(scene, motion)
     >>> float((errors**2).sum() ** 0.5)  # rms over the first second
     0.097
     """
-    instance("scene", scene, Scene)
-    instance("solution", solution, Solution)
-    check_joints("solution", solution, scene.linkage)
+    _check_motion(scene, solution)
     reference = controller_of(scene).reference
     commanded = lambda t: reference_motion(reference, t, scene.linkage)[0]
     errors = solution.q - jax.vmap(commanded)(solution.ts)
@@ -118,7 +129,16 @@ def joint_errors(scene: Scene, solution: Solution) -> Float[Array, " residual"]:
     return errors.reshape(-1) / solution.ts.size**0.5
 
 
-class Tracking(eqx.Module):
+def _demands_and_efforts(scene: Scene, solution: Solution) -> tuple[Array, Array]:
+    """The controller's demands and efforts over its limits, (time, joint) each."""
+    controller = controller_of(scene)
+    demands = relative_demands(controller, scene.linkage, solution)
+    # An actuator with a limit of 0 makes no effort, whatever its demand.
+    most = jnp.broadcast_to(jnp.where(controller.limit > 0, 1, 0), demands.shape)
+    return demands, jnp.clip(demands, -most, most)
+
+
+class Tracking(Part):
     """Mean squared tip error plus prices of effort, a loss for `tune`.
 
     The loss adds effort * mean((tau / limit)^2) and
@@ -134,24 +154,18 @@ class Tracking(eqx.Module):
 
     >>> import fdof_jax as fj
     >>> import numpy as np
-    >>> arm, start, forces, _ = fj.scenes.fig7()
-    >>> motion = fj.simulate(arm, start, np.linspace(0, 1, 101), forces)
-    >>> residuals = fj.tuning.Tracking(effort=0.1)(fj.scenes.fig7(), motion)
+    >>> scene = fj.scenes.fig7()
+    >>> motion = fj.simulate(scene, np.linspace(0, 1, 101))
+    >>> residuals = fj.tuning.Tracking(effort=0.1)(scene, motion)
     >>> float((residuals**2).sum())  # [m^2]
     0.15
     """
 
-    effort: Float[Array, ""]
-    effort_rate: Float[Array, ""]
-
-    def __init__(self, effort: ArrayLike = 0.0, effort_rate: ArrayLike = 0.0):
-        self.effort = real_array("effort", effort, (), minimum=0)
-        self.effort_rate = real_array("effort_rate", effort_rate, (), minimum=0)
+    effort: Values = field((), unit="m^2", minimum=0, default=0.0)
+    effort_rate: Values = field((), unit="m^2 s^2", minimum=0, default=0.0)
 
     def __call__(self, scene: Scene, solution: Solution) -> Float[Array, " residual"]:
-        controller = controller_of(scene)
-        demands = relative_demands(controller, scene.linkage, solution)
-        efforts = jnp.clip(demands, -1, 1)
+        _, efforts = _demands_and_efforts(scene, solution)
         rates = jnp.diff(efforts, axis=0) / jnp.diff(solution.ts)[:, None]
         parts = [tip_errors(scene, solution)]
         for price, values in ((self.effort, efforts), (self.effort_rate, rates)):
@@ -161,12 +175,134 @@ class Tracking(eqx.Module):
             parts.append(scaled.reshape(-1))
         return jnp.concatenate(parts)
 
-    def check(self, scene: Scene) -> None:
-        """Raises ValueError if efforts have a price but no limit."""
-        limit = np.asarray(controller_of(scene).limit)
-        possible = (np.isfinite(limit) & (limit > 0)).all()
-        if self.effort + self.effort_rate > 0 and not possible:
+
+class GainBox(NamedTuple):
+    """kp and kd of a start, their least and greatest values: (2, n) each."""
+
+    start: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+
+    @property
+    def tuned(self) -> np.ndarray:
+        """Returns which gains are not 0 (2, n): 0 has no logarithm, and stays."""
+        return self.lower > 0
+
+    @property
+    def free(self) -> int:
+        """Returns how many gains the bounds leave free."""
+        return int(np.sum(self.lower < self.upper))
+
+    def at_bound(self, gains: np.ndarray) -> np.ndarray:
+        """Returns which of the free gains are held by a bound (2, n)."""
+        # By rounding, exp(log(bound)) may lie just inside the bound.
+        hair = 100 * np.finfo(jnp.result_type(float)).eps
+        held = (gains <= self.lower * (1 + hair)) | (gains >= self.upper * (1 - hair))
+        return held & (self.lower < self.upper)
+
+    def logs(self) -> tuple[np.ndarray, ...]:
+        """Returns the logarithms of start and bounds, (2n,) each; 0 for gains of 0."""
+        return tuple(np.log(np.where(self.tuned, gains, 1)).ravel() for gains in self)
+
+    def gains(self, z: np.ndarray) -> np.ndarray:
+        """Returns the gains (..., 2, n) of their logarithms (..., 2n)."""
+        gains = np.exp(z).reshape(*z.shape[:-1], *self.lower.shape)
+        return np.clip(gains, self.lower, self.upper)
+
+
+def with_log_gains(scene: Scene, z: Array, tuned: Array) -> Scene:
+    """The scene with the gains whose logarithms are `z` (2n,), where `tuned` (2, n)."""
+    return with_gains(scene, jnp.where(tuned, jnp.exp(z.reshape(tuned.shape)), 0))
+
+
+def gain_sensitivities(
+    z: Array, scene: Scene, loss: Loss, tuned: Array
+) -> Sensitivities:
+    """Residuals of a loss and their derivatives in the log-gains `z` (2n,)."""
+    scene_at = lambda z: with_log_gains(scene, z, tuned)
+    residuals = lambda scene, solution: residuals_of(loss, scene, solution)
+    return sensitivities(scene_at, residuals, z, jnp.linspace(0, scene.t1, SAMPLES))
+
+
+def residuals_of(loss: Loss, scene: Scene, solution: Solution) -> Array:
+    """Returns what a loss returns as residuals (m,), whose squares are summed."""
+    value = loss(scene, solution)
+    size = np.shape(value) if eqx.is_array_like(value) else ()
+    value = real_array("loss(scene, solution)", value, size)
+    if value.ndim:
+        return value.reshape(-1)
+    # A scalar loss enters as its square root, whose derivative at 0 does not exist.
+    return jnp.where(value == 0, 0, jnp.sqrt(jnp.where(value == 0, 1, value)))[None]
+
+
+def unusable_loss() -> ValueError:
+    """The error to raise for a loss that is not finite at the start."""
+    return ValueError(
+        "loss: expected finite numbers, not negative if only one, with finite "
+        "derivatives, got others at the scene's own gains."
+    )
+
+
+def evaluate_gains(z: Array, problem: tuple[Scene, Loss, Array]) -> Evaluation:
+    """Evaluates a scene's loss and its derivatives in the log-gains `z`.
+
+    `problem`: the other arguments of `gain_sensitivities`.
+    """
+    found = gain_sensitivities(z, *problem)
+    scene, solution = found.scene, found.solution
+    demands, efforts = _demands_and_efforts(scene, solution)
+    square_error = jnp.full((), jnp.nan)
+    if reference_of(controller_of(scene).reference).tip is not None:
+        square_error = jnp.sum(tip_errors(scene, solution) ** 2)
+    return sum_of_squares(
+        found,
+        saturated=jnp.mean(jnp.abs(demands) > 1, axis=0),
+        effort=jnp.sqrt(jnp.mean(efforts**2, axis=0)),
+        square_error=square_error,
+        simulated=jnp.isfinite(solution.q[-1]).all(),
+    )
+
+
+def check_tuned(name: str, scene: Any, loss: Any = tip_errors) -> None:
+    """Raises ValueError unless the scene can be tuned by the loss."""
+    instance(name, scene, Scene)
+    function("loss", loss)
+    if is_traced(scene):
+        expected = "known values, as gains are tuned outside of JAX's transformations"
+        raise refusal(name, expected, scene)
+    t1 = real_array(f"{name}.t1", scene.t1, (), above=0)
+    check_scene(name, scene, jnp.stack([jnp.zeros_like(t1), t1]))
+    controller = controller_of(scene)
+    if isinstance(loss, Tracking) or loss is tip_errors:
+        tracked_task(scene, name)
+    if isinstance(loss, Tracking) and loss.effort + loss.effort_rate > 0:
+        limit = np.asarray(controller.limit)
+        if not (np.isfinite(limit) & (limit > 0)).all():
             raise ValueError(
                 "loss: expected finite limits of the controller, above 0, where effort "
                 f"has a price, got {limit.tolist()}."
             )
+
+
+def bounds_of(scene: Scene, factor: Any, bounds: Any) -> GainBox:
+    """Checks `factor` and `bounds` of `tune`; gains of 0 stay 0."""
+    start = gains_of(scene)
+    if bounds is None:
+        factor = real_array("factor", 4.0 if factor is None else factor, (), above=1)
+        return GainBox(start, start / float(factor), start * float(factor))
+    if factor is not None:
+        raise refusal("factor", "none beside bounds", factor)
+    if not isinstance(bounds, tuple | list | np.ndarray) or len(bounds) != 2:
+        raise refusal("bounds", "(lower, upper)", bounds)
+    lower, upper = (
+        np.asarray(real_array(f"bounds[{i}]", b, start.shape, minimum=0))
+        for i, b in enumerate(bounds)
+    )
+    if not ((lower <= start) & (start <= upper)).all():
+        raise ValueError(
+            "bounds: expected the scene's gains between them, got "
+            f"{lower.tolist()} and {upper.tolist()} around {start.tolist()}."
+        )
+    if (lower[start > 0] == 0).any():
+        raise ValueError("bounds: expected positive least gains, got 0.")
+    return GainBox(start, lower, np.where(start > 0, upper, 0))

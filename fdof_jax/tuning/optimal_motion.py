@@ -16,17 +16,14 @@ from ..base.report import Report
 from ..control.model_based import ComputedTorque
 from ..forces.joints import EffortHistory
 from ..linkage.linkage import joints_of, without_fixed
-from ..search.bounded import Run, best_of, minimise
-from ..search.lanes import Lanes
-from ..search.methods import Evaluation
-from ..search.simulated import sum_of_squares
+from ..search.bounded import Evaluation, Run, best_of, minimise
+from ..search.lanes import Lanes, sum_of_squares
 from ..simulation.efforts import joint_efforts
 from ..simulation.scene import Scene
 from ..simulation.sensitivities import sensitivities
 from ..simulation.simulate import simulate
 from ..simulation.solution import Solution
-from .gains import check_tuned
-from .losses import controller_of, with_controller
+from .losses import check_tuned, controller_of, tracked_task, with_controller
 
 _SAMPLES = 501
 # The tolerance of derivatives and motion. Their errors make the loss uneven: at 1e-5,
@@ -92,7 +89,7 @@ class OptimalMotion(Report):
             f"with {len(self.ts)} knots",
             f"of the controller: {1e3 * self.controller_error:.5g} mm",
             f"from each first guess: {errors} mm",
-            f"{'converged' if self.converged else 'not converged'}: {self.message}",
+            f"{'' if self.converged else 'not '}converged: {self.message}",
         ]
 
 
@@ -111,27 +108,29 @@ def _lane(z: Array, problem: tuple[Scene, Array, Array, Array]) -> Evaluation:
     `problem`: the scene, the knots, the price, and the times of the tip errors.
     """
     scene, knots, price, ts = problem
-    controller = controller_of(scene)
-    limit = jnp.broadcast_to(controller.limit, (1, joints_of(scene.linkage)))
-    limit = without_fixed(scene.linkage, limit)
+    task, place = tracked_task(scene), place_of(controller_of(scene), scene.forces)
+    limit = _limit_of(scene)[None]
 
     def scene_at(z):
-        return with_controller(
-            scene, EffortHistory(knots, limit * z.reshape(knots.size, -1))
-        )
+        efforts = EffortHistory(knots, limit * z.reshape(knots.size, -1))
+        return with_controller(scene, efforts)
 
     def residuals(trial, solution):
-        errors = _deviations(trial, controller.reference, solution)
-        (efforts,) = (
-            force.tau for force in trial.forces if isinstance(force, EffortHistory)
-        )
-        changes = jnp.diff(efforts / jnp.where(limit > 0, limit, 1), axis=0)
+        errors = _deviations(trial, task, solution)
+        efforts = trial.forces[place].tau / jnp.where(limit > 0, limit, 1)
         gaps = jnp.diff(knots)[:, None] * (knots[-1] - knots[0])
-        return jnp.concatenate([errors, (jnp.sqrt(price / gaps) * changes).reshape(-1)])
+        changes = jnp.sqrt(price / gaps) * jnp.diff(efforts, axis=0)
+        return jnp.concatenate([errors, changes.reshape(-1)])
 
     found = sensitivities(scene_at, residuals, z, ts, _TOLERANCE)
     errors = found.residuals[: 2 * ts.size]
     return sum_of_squares(found, tip_error=jnp.linalg.norm(errors))
+
+
+def _limit_of(scene: Scene) -> Array:
+    """Limits of a scene's controller (n,), 0 at fixed pairs."""
+    limit = jnp.broadcast_to(controller_of(scene).limit, joints_of(scene.linkage))
+    return without_fixed(scene.linkage, limit)
 
 
 def optimal_efforts(
@@ -184,10 +183,8 @@ def optimal_efforts(
     (0.0501, 0.0222)
     """
     check_tuned("scene", scene)
-    controller, t1 = controller_of(scene), float(scene.t1)
-    task = controller.reference
-    limit = np.broadcast_to(controller.limit, joints_of(scene.linkage))
-    limit = np.asarray(without_fixed(scene.linkage, limit))
+    task, t1 = tracked_task(scene), float(scene.t1)
+    limit = np.asarray(_limit_of(scene))
     if not np.isfinite(limit).all():
         raise ValueError(
             "scene: expected finite limits of its controller, as unlimited efforts "
@@ -202,28 +199,23 @@ def optimal_efforts(
     price = real_array("effort_rate", effort_rate, (), minimum=0)
     ts, times = np.linspace(0, end, _SAMPLES), np.linspace(0, end, knots)
 
-    def moved(scene: Scene) -> Solution:
+    def motion_of(scene: Scene) -> Solution:
         return simulate(scene.linkage, scene.state0, ts, scene.forces, throw=False)
 
     def error_of(scene: Scene, solution: Solution) -> float:
         return float(np.linalg.norm(_deviations(scene, task, solution)))
 
-    known = ComputedTorque(_BANDWIDTH**2, 2 * _BANDWIDTH, limit, task)
-    guides = [scene, with_controller(scene, known)]
-    solutions = [moved(guide) for guide in guides]
+    torque = ComputedTorque(_BANDWIDTH**2, 2 * _BANDWIDTH, limit, task)
+    guides = [scene, with_controller(scene, torque)]
+    motions = [motion_of(guide) for guide in guides]
+    efforts = np.stack([_efforts_at(times, *pair) for pair in zip(guides, motions)])
     # Efforts without a limit above zero are zero, whatever the unknowns.
-    bound = np.tile(np.where(limit > 0, 1.0, 0.0), knots)
-    start = np.stack(
-        [
-            (_efforts_at(times, *motion) / np.where(limit > 0, limit, 1)).ravel()
-            for motion in zip(guides, solutions)
-        ]
-    )
-    start = np.clip(np.nan_to_num(start), -bound, bound)
-    lanes = Lanes(_lane, [[(scene, times, price, ts)]], starts=len(start))
-    high = np.broadcast_to(bound, start.shape)
+    most = np.broadcast_to(np.where(limit > 0, 1.0, 0.0), efforts.shape)
+    start = np.clip(np.nan_to_num(efforts / np.where(limit > 0, limit, 1)), -most, most)
+    start, most = start.reshape(len(guides), -1), most.reshape(len(guides), -1)
     runs = minimise(
-        lanes, start, -high, high, method="levenberg-marquardt", max_steps=max_steps,
+        Lanes(_lane, [[(scene, times, price, ts)]], starts=len(start)),
+        start, -most, most, method="levenberg-marquardt", max_steps=max_steps,
         enough=_ENOUGH, report=report, describe=_errors_so_far,
     )  # fmt: skip
     runs = [run for run in runs if not run.failed]
@@ -235,13 +227,13 @@ def optimal_efforts(
     run = best_of(runs)
     efforts = limit * run.z.reshape(knots, -1)
     found = with_controller(scene, EffortHistory(times, efforts))._replace(t1=end)
-    solution = moved(found)
+    solution = motion_of(found)
     return OptimalMotion(
         scene=found,
         ts=times,
         efforts=efforts,
         tip_error=error_of(found, solution),
-        controller_error=error_of(scene, solutions[0]),
+        controller_error=error_of(scene, motions[0]),
         solution=solution,
         guess_errors=np.array([_tip_error(run) for run in runs]),
         converged=run.best.gradient_norm <= _SMALL_GRADIENT * run.best.loss,
@@ -251,10 +243,9 @@ def optimal_efforts(
 
 def _efforts_at(times: np.ndarray, scene: Scene, solution: Solution) -> np.ndarray:
     """Efforts of a scene's controller along its motion, (time, n)."""
-    controller = controller_of(scene)
-    efforts = joint_efforts(scene.linkage, scene.forces, solution).elements
-    mine = np.asarray(efforts[place_of(controller, scene.forces)])
-    return np.stack([np.interp(times, solution.ts, column) for column in mine.T], 1)
+    place = place_of(controller_of(scene), scene.forces)
+    own = np.asarray(joint_efforts(scene, solution).elements[place])
+    return np.stack([np.interp(times, solution.ts, column) for column in own.T], axis=1)
 
 
 def _tip_error(run: Run) -> float:

@@ -1,5 +1,6 @@
 """Results of gain tuning, and their tables."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import equinox as eqx
@@ -8,13 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ..base.checks import known
+from ..base.checks import known, refusal
 from ..base.report import Report
 from ..linkage.linkage import Linkage, joint_names, moving_joints
 from ..search.bounded import Run, best_of
 from ..simulation.scene import Scene
-from .gains import with_gains
-from .losses import controller_of
+from .losses import GainBox, controller_of, with_gains
 
 # Joints with actuators at their limits for a larger share of the time are hardly
 # controlled.
@@ -74,6 +74,10 @@ class TuneResult(Report):
     settings: dict[str, Any]
 
     @property
+    def _box(self) -> GainBox:
+        return GainBox(self.histories[0].gains[0], self.lower, self.upper)
+
+    @property
     def history(self) -> History:
         """The history of the best run."""
         return self.histories[int(np.nanargmin(self.losses))]
@@ -90,8 +94,8 @@ class TuneResult(Report):
 
     @property
     def at_bound(self) -> Bool[np.ndarray, "2 joint"]:
-        """Returns whether each gain is held by a bound."""
-        return _at_bound(self.gains, self.lower, self.upper)
+        """Whether each gain is held by a bound."""
+        return self._box.at_bound(self.gains)
 
     @property
     def tip_error(self) -> float:
@@ -104,12 +108,12 @@ class TuneResult(Report):
 
         Fixed pairs do not count.
         """
-        return mean_effort(self.scene.linkage, self.history.effort[-1])
+        return _mean_effort(self.scene.linkage, self.history.effort[-1])
 
     @property
     def tuned_gains(self) -> int:
         """Number of gains that are tuned: all but zeros and those held by bounds."""
-        return int(np.sum(self.lower < self.upper))
+        return self._box.free
 
     @property
     def table(self) -> dict[str, list]:
@@ -118,11 +122,9 @@ class TuneResult(Report):
         The columns are `gain` and `joint`, for instance kp and R1; `unit`; the values
         `start` and `tuned`; the bounds `least` and `greatest`; and `at_bound`.
         """
-        start = self.histories[0].gains[0]
-        return gain_table(self.scene, start, self.gains, self.lower, self.upper)
+        return gain_table(self.scene, self._box, self.gains)
 
     def _rows(self) -> list[list[str]]:
-        """Rows of the printed table: a label, up to four numbers, and a remark."""
         rows = gain_rows(self.table)
         first, last = self.histories[0], self.history
         compared = [("loss", first.loss[0], last.loss[-1])]
@@ -132,16 +134,16 @@ class TuneResult(Report):
         shares = 100 * first.saturated[0], 100 * last.saturated[-1]
         for name, *share in zip(joint_names(self.scene.linkage), *shares):
             compared.append((f"{name} at its limit [%]", *share))
-        for label, before, after in compared:
-            rows.append([label, f"{before:.5g}", f"{after:.5g}", "", "", ""])
-        return rows
+        return rows + [
+            [label, f"{before:.5g}", f"{after:.5g}", "", "", ""]
+            for label, before, after in compared
+        ]
 
     def _remarks(self) -> list[str]:
-        """Lines below the table."""
         rows, losses = [], self.losses
+        if failed := np.isnan(losses).sum():
+            rows.append(f"{failed} of {len(losses)} starts could not be simulated")
         if len(losses) > 1:
-            if failed := np.isnan(losses).sum():
-                rows.append(f"{failed} of {len(losses)} starts could not be simulated")
             near = np.sum(losses**0.5 <= 1.01 * self.loss**0.5)
             rows.append(
                 f"{near} of {len(losses)} starts within 1 % of the best in the root of "
@@ -161,7 +163,7 @@ class TuneResult(Report):
 
     @property
     def _outcome(self) -> str:
-        return "converged" if self.converged else "not converged"
+        return f"{'' if self.converged else 'not '}converged"
 
     def __repr__(self) -> str:
         """One line, or shapes if values are traced."""
@@ -209,23 +211,13 @@ def gain_rows(table: dict[str, list]) -> list[list[str]]:
     return rows
 
 
-def gain_table(
-    scene: Scene,
-    start: np.ndarray,
-    tuned: np.ndarray,
-    lower: np.ndarray,
-    upper: np.ndarray,
-) -> dict[str, list]:
+def gain_table(scene: Scene, box: GainBox, tuned: np.ndarray) -> dict[str, list]:
     """Returns the columns of `TuneResult.table`."""
     names = joint_names(scene.linkage)
     units = {"F": ("", "")} | controller_of(scene).gain_units
-    values = {
-        "start": start,
-        "tuned": tuned,
-        "least": lower,
-        "greatest": upper,
-        "at_bound": _at_bound(tuned, lower, upper),
-    }
+    start, lower, upper = box
+    values = dict(start=start, tuned=tuned, least=lower, greatest=upper)
+    values["at_bound"] = box.at_bound(tuned)
     return {
         "gain": ["kp"] * len(names) + ["kd"] * len(names),
         "joint": names * 2,
@@ -233,27 +225,19 @@ def gain_table(
     } | {name: np.ravel(value).tolist() for name, value in values.items()}
 
 
-def mean_effort(linkage: Linkage, efforts: np.ndarray) -> float:
+def _mean_effort(linkage: Linkage, efforts: np.ndarray) -> float:
     """Returns the root mean square of efforts (n,) over the joints that move."""
     return float(np.sqrt(np.mean(efforts[moving_joints(linkage)] ** 2)))
 
 
-def _at_bound(gains, lower, upper) -> np.ndarray:
-    # By rounding, exp(log(bound)) may lie just inside the bound.
-    hair = 100 * np.finfo(jnp.result_type(float)).eps
-    held = (gains <= lower * (1 + hair)) | (gains >= upper * (1 - hair))
-    return held & (lower < upper)
-
-
-def _history(run: Run, lower: np.ndarray, upper: np.ndarray) -> History:
+def _history(run: Run, box: GainBox) -> History:
     rows: Any = jax.tree.map(lambda *values: np.stack(values), *run.rows)
-    gains = np.clip(np.exp(rows.z).reshape(-1, *lower.shape), lower, upper)
     # Means over the members.
     mean = {name: np.mean(values, axis=1) for name, values in rows.facts.items()}
     return History(
         loss=rows.loss,
         gradient_norm=rows.gradient_norm,
-        gains=gains,
+        gains=box.gains(rows.z),
         saturated=mean["saturated"],
         effort=mean["effort"],
         tip_error=np.sqrt(mean["square_error"]),
@@ -262,40 +246,34 @@ def _history(run: Run, lower: np.ndarray, upper: np.ndarray) -> History:
 
 
 def result_of(
-    scene: Scene,
-    runs: list[Run],
-    lower: np.ndarray,
-    upper: np.ndarray,
-    settings: dict[str, Any],
+    scene: Scene, runs: list[Run], box: GainBox, settings: dict[str, Any]
 ) -> TuneResult:
     """The result of one scene's runs, taken from the best."""
-    run = best_of(runs)
-    history = _history(run, lower, upper)
+    run, histories = best_of(runs), [_history(run, box) for run in runs]
+    history = histories[runs.index(run)]
     return TuneResult(
         scene=with_gains(scene, jnp.asarray(history.gains[-1])),
         loss=run.best.loss,
-        histories=[_history(run, lower, upper) for run in runs],
-        lower=lower,
-        upper=upper,
+        histories=histories,
+        lower=box.lower,
+        upper=box.upper,
         converged=run.converged and history.saturated[-1].max() <= _MOSTLY,
-        message=_message(scene, run, history, lower, upper),
+        message=_message(scene, run, history, box),
         member_loss=run.best.facts["member_loss"],
         member_tip_error=np.sqrt(run.best.facts["square_error"]),
         settings=settings,
     )
 
 
-def _message(scene, run, history, lower, upper) -> str:
+def _message(scene: Scene, run: Run, history: History, box: GainBox) -> str:
     """The reason for stopping, and what may look like convergence but is not."""
     reason = run.reason
     if run.flat:
-        moving = moving_joints(scene.linkage)
-        at_limit = history.saturated[0, moving].min() == 1
-        reason = "the gradient is zero at the start" + (
-            ", because every actuator is at its limit throughout" if at_limit else ""
-        )
-    held = np.sum(_at_bound(history.gains[-1], lower, upper))
-    bounds = f"{held} of {np.sum(lower < upper)} gains are at a bound"
+        reason = "the gradient is zero at the start"
+        if history.saturated[0, moving_joints(scene.linkage)].min() == 1:
+            reason += ", because every actuator is at its limit throughout"
+    held = np.sum(box.at_bound(history.gains[-1]))
+    bounds = f"{held} of {box.free} gains are at a bound"
     if held:
         bounds += " (widen the bounds, price the effort, or take another controller)"
     parts = [reason, bounds]
@@ -306,3 +284,39 @@ def _message(scene, run, history, lower, upper) -> str:
                 "gains have hardly any effect"
             )
     return "; ".join(parts)
+
+
+def league_table(results: Mapping[str, TuneResult]) -> str:
+    """A table of tip errors and efforts before and after tuning, best first.
+
+    **Arguments:** `results`: by name, for instance those of `tune_each`.
+
+    **Raises:** ValueError for malformed arguments.
+
+    >>> import fdof_jax as fj
+    >>> scenes = fj.tuning.circle_scenes()
+    >>> pair = {name: scenes[name]._replace(t1=1.0) for name in ("PPR", "RRR")}
+    >>> print(fj.tuning.league_table(fj.tuning.tune_each(pair, max_steps=2)))
+           rms tip error [mm]     effort [% of limit]        gains
+               start       tuned       start       tuned at bounds
+    PPR         15.2       7.671       6.762       14.51       2/6
+    RRR        147.9       29.32          13       13.15       6/6
+    """
+    held = isinstance(results, Mapping) and len(results) > 0
+    if not held or not all(isinstance(r, TuneResult) for r in results.values()):
+        raise refusal("results", "a TuneResult for each name", results)
+    rows = [
+        f"{'':4}{'rms tip error [mm]':^24}{'effort [% of limit]':^24}{'gains':>10}",
+        f"{'':4}" + 2 * f"{'start':>12}{'tuned':>12}" + f"{'at bounds':>10}",
+    ]
+    for name, result in sorted(results.items(), key=lambda item: item[1].tip_error):
+        first = result.histories[0]
+        effort = _mean_effort(result.scene.linkage, first.effort[0]), result.effort
+        error = first.tip_error[0], result.tip_error
+        cells = *(1e3 * e for e in error), *(1e2 * e for e in effort)
+        rows.append(
+            f"{name:4}"
+            + "".join(f"{cell:12.4g}" for cell in cells)
+            + f"{result.at_bound.sum():8d}/{result.tuned_gains}"
+        )
+    return "\n".join(rows)

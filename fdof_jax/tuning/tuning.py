@@ -7,73 +7,74 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..base.checks import function, keywords_as, one_of, real_array, whole_number
-from ..search.bounded import Row, Run, best_of, minimise
+from ..base.checks import keywords_as, one_of, real_array, refusal, whole_number
+from ..linkage.linkage import joint_names
+from ..search.bounded import METHODS, Row, Run, best_of, minimise
 from ..search.lanes import Lanes
-from ..search.methods import METHODS
 from ..simulation.scene import Scene, stacked, unstacked, with_full_size
 from ..simulation.sensitivities import TOLERANCE
-from .gains import SAMPLES, bounds_of, check_alike, check_tuned, evaluate_gains
-from .losses import Loss, Tracking, tip_errors
+from .losses import (
+    SAMPLES,
+    Loss,
+    Tracking,
+    bounds_of,
+    check_tuned,
+    controller_of,
+    evaluate_gains,
+    tip_errors,
+    unusable_loss,
+)
 from .result import TradeOff, TuneResult, result_of
 
 _ENOUGH = 1e-4  # relative decrease of the loss; half of it in the rms error
 # The worst of an ensemble is smoothed to a power mean of this order. With n members it
 # is at most a factor of n^(1/32) below the worst.
-_WORST = 32
+_ORDERS = {"mean": 1, "worst": 32}
 
 
-def _started(box, starts: int, draw: np.random.Generator) -> tuple[np.ndarray, ...]:
-    """Starts, lower and upper bounds in the log-gains, (start, 2n) each."""
-    real = (box[0] > 0).ravel()
-    here, least, most = (np.log(np.where(real, b.ravel(), 1)) for b in box)
-    others = draw.uniform(least, most, (starts - 1, least.size))
-    same = (np.broadcast_to(a, (starts, a.size)) for a in (least, most))
-    return np.concatenate([here[None], others]), *same
+def _members(ensemble: Any, scene: Scene, losses: Sequence[Any]) -> list[Scene]:
+    """Checks the argument `ensemble` of `tune`, and returns its scenes."""
+    alike = lambda s: (joint_names(s.linkage), type(controller_of(s)).__name__)
+    members = unstacked("ensemble", ensemble)
+    for i, member in enumerate(members):
+        for loss in losses:
+            check_tuned(f"ensemble[{i}]", member, loss)
+        if alike(member) != alike(scene):
+            expected = f"joints and a controller like the scene's, {alike(scene)}"
+            raise refusal(f"ensemble[{i}]", expected, alike(member))
+    return members
 
 
 def _search(
-    scenes: Sequence[Scene],
-    losses: Sequence[Any],
-    *,
-    factor: ArrayLike | None,
-    bounds: tuple[ArrayLike, ArrayLike] | None,
-    ensemble: Scene | None,
-    over: str,
-    method: str,
-    starts: int,
-    seed: int,
-    max_steps: int,
-    report: Callable[[str], Any] | None,
-) -> list[TuneResult]:
+    scenes: Sequence[Scene], losses: Sequence[Any], *, factor, bounds, ensemble, over,
+    method, starts, seed, max_steps, report,
+) -> list[TuneResult]:  # fmt: skip
     """One result per scene and loss; the keywords are those of `tune`."""
     one_of("method", method, tuple(METHODS))
-    one_of("over", over, ("mean", "worst"))
+    one_of("over", over, tuple(_ORDERS))
     if over == "worst" and ensemble is None:
         raise ValueError("over: expected an ensemble to take the worst of, got none.")
     starts = whole_number("starts", starts, 1, np.iinfo(np.int32).max)
     draw = np.random.default_rng(whole_number("seed", seed, 0))
     for scene, loss in zip(scenes, losses):
-        check_tuned("scene", scene, function("loss", loss))
+        check_tuned("scene", scene, loss)
     boxes = [bounds_of(scene, factor, bounds) for scene in scenes]
     if ensemble is None:
         members = [[scene] for scene in scenes]
     else:
-        members = [unstacked("ensemble", ensemble)] * len(losses)
-        for i, member in enumerate(members[0]):
-            for loss in losses:
-                check_tuned(f"ensemble[{i}]", member, loss)
-            check_alike(f"ensemble[{i}]", member, scenes[0])
+        members = [_members(ensemble, scenes[0], losses)] * len(losses)
     problems = [
-        [(with_full_size(member), loss, lower > 0) for member in row]
-        for row, loss, (_, lower, _) in zip(members, losses, boxes)
+        [(with_full_size(member), loss, box.tuned) for member in row]
+        for row, loss, box in zip(members, losses, boxes)
     ]
-    lanes = Lanes(evaluate_gains, problems, starts, {"mean": 1, "worst": _WORST}[over])
-    columns = zip(*(_started(box, starts, draw) for box in boxes))
-    z, low, high = map(np.concatenate, columns)
+    z, low, high = np.repeat([b.logs() for b in boxes], starts, axis=0).swapaxes(0, 1)
+    # The first run of each scene starts from its gains, the others at random.
+    random = np.arange(len(z)) % starts > 0
+    z[random] = draw.uniform(low[random], high[random])
     runs = minimise(
-        lanes, z, low, high, method=method, max_steps=max_steps, enough=_ENOUGH,
-        report=report, describe=_best_so_far,
+        Lanes(evaluate_gains, problems, starts, _ORDERS[over]), z, low, high,
+        method=method, max_steps=max_steps, enough=_ENOUGH, report=report,
+        describe=_best_so_far,
     )  # fmt: skip
     settings = dict(
         method=method,
@@ -84,11 +85,11 @@ def _search(
         dtype=str(jnp.result_type(float)),
     )
     results = []
-    for i, (scene, (_, lower, upper)) in enumerate(zip(scenes, boxes)):
+    for i, (scene, box) in enumerate(zip(scenes, boxes)):
         mine = runs[i * starts : (i + 1) * starts]
         if all(run.failed for run in mine):
             raise _failure(members[i], mine[0].rows[0], ensemble is not None)
-        results.append(result_of(scene, mine, lower, upper, settings))
+        results.append(result_of(scene, mine, box, settings))
     return results
 
 
@@ -97,7 +98,7 @@ def _failure(members: list[Scene], first: Row, ensemble: bool) -> ValueError:
     failing = np.flatnonzero(~first.facts["simulated"])
     if failing.size == 0:
         return unusable_loss()
-    index = int(failing[0])
+    index = failing[0]
     name = f"ensemble[{index}]" if ensemble else "scene"
     return ValueError(
         f"{name}: expected one that can be simulated up to t1 = "
@@ -106,21 +107,11 @@ def _failure(members: list[Scene], first: Row, ensemble: bool) -> ValueError:
     )
 
 
-def unusable_loss() -> ValueError:
-    """The error to raise for a loss that is not finite at the start."""
-    return ValueError(
-        "loss: expected finite numbers, not negative if only one, with finite "
-        "derivatives, got others at the scene's own gains."
-    )
-
-
 def _best_so_far(runs: list[Run]) -> str:
     best = best_of(runs).best
     error = 1e3 * np.sqrt(np.mean(best.facts["square_error"]))
-    what = f"loss {best.loss:.6g}"
-    if np.isfinite(error):
-        what += f", rms tip error {error:.5g} mm"
-    return f"{what}, projected gradient {best.gradient_norm:.2g}"
+    tip = f", rms tip error {error:.5g} mm" if np.isfinite(error) else ""
+    return f"loss {best.loss:.6g}{tip}, projected gradient {best.gradient_norm:.2g}"
 
 
 def tune(

@@ -1,6 +1,6 @@
 """Tuning of gains within limits, by SciPy's sequential quadratic programming."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
@@ -11,20 +11,44 @@ from jax import Array
 from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
-from ..base.checks import function, instance, whole_number
+from ..analysis.equilibria import equilibrium
+from ..analysis.linearization import checked, loop_matrices
+from ..analysis.loops import margins, open_loop
+from ..analysis.responses import BAND, samples_of, step_measures
+from ..analysis.tracking import demands
+from ..base.array_namespace import in_numpy
+from ..base.checks import instance
 from ..base.report import Report
-from ..linkage.fields import check_joints, sized
-from ..linkage.linkage import joints_of
-from ..search.lanes import Lanes
-from ..search.methods import Evaluation
-from ..search.simulated import sum_of_squares
+from ..control.pd import PDController
+from ..forces.element import Element
+from ..linkage.fields import Part, Values, check_joints, field, sized
+from ..linkage.linkage import joint_names, joints_of, moving_joints
+from ..references.reference import reference_motion
+from ..search.bounded import Evaluation, check_search
+from ..search.lanes import Lanes, sum_of_squares
 from ..simulation.scene import Scene, with_full_size
-from .gains import bounds_of, check_tuned, gain_sensitivities, residuals_of, with_gains
-from .limits import Limits, controller_and_others, excess, measured
-from .losses import Loss, gains_of, tip_errors
+from ..simulation.simulate import simulate
+from ..simulation.solution import Solution
+from .losses import (
+    GainBox,
+    Loss,
+    bounds_of,
+    check_tuned,
+    controller_of,
+    gain_sensitivities,
+    gains_of,
+    residuals_of,
+    tip_errors,
+    unusable_loss,
+    with_gains,
+)
 from .result import gain_rows, gain_table
-from .tuning import unusable_loss
 
+# Excesses count by their largest in each span of times and in each band of frequencies:
+# one largest of all would jump between peaks, which a search cannot follow.
+_SPANS, _BANDS = 13, 8
+_FREQUENCIES = 200
+_MARGIN = "modulus margin"
 # The search aims this far within the limits, so that motions sampled more finely are
 # within them too.
 _WITHIN = 5e-4
@@ -37,41 +61,173 @@ _FLAT = 1e-2
 _FAILED = 1e6  # loss and excess where the simulation fails
 
 
+class Limits(Part):
+    """Limits on the response to a step, for `tune_within`.
+
+    The step of a joint leads from the start of the motion to where the arm rests at the
+    last set point. A joint whose limit is infinite (for the margin: 0) has none. Give
+    overshoot and settling time only for joints that step.
+
+    **Arguments:** one value per joint or one for all.
+
+    - `overshoot`: greatest excess over the step, as a share of it.
+    - `settling_time`: time after which the joint stays within 2 % of the step [s].
+    - `effort`: greatest effort that the controller demands [N or N m].
+    - `modulus_margin`: least distance of the loop from instability, from 0 to 1, where
+      the step ends; see `analysis.Margins`.
+
+    **Raises:** ValueError for malformed arguments.
+
+    >>> import fdof_jax as fj
+    >>> fj.tuning.Limits(overshoot=0.05, settling_time=[0.5, 0.3, 0.3])
+    Limits(overshoot=0.05, settling_time=[0.5, 0.3, 0.3], effort=inf, modulus_margin=0)
+    """
+
+    overshoot: Values = field(unit="", minimum=0, finite=False, default=jnp.inf)
+    settling_time: Values = field(unit="s", minimum=0, finite=False, default=jnp.inf)
+    effort: Values = field(unit="N or N m", above=0, finite=False, default=jnp.inf)
+    modulus_margin: Values = field(unit="", minimum=0, default=0.0)
+
+
+def excess(
+    limits: Limits, scene: Scene, solution: Solution, with_margins: bool
+) -> Array:
+    """Largest excesses of a motion over its limits (m,), negative within them.
+
+    Overshoot and deviation are shares of the step, efforts and margins shares of their
+    limits. Margins, which take a linearisation of the arm, are left out if no joint's
+    is limited. The number of times is a multiple of 13.
+    """
+    ts, rest = solution.ts, rest_of(scene)
+    controller, others = controller_and_others(scene)
+    share, _, still = step_shares(solution, rest)
+
+    def at(t, share_now, demand):
+        over = jnp.where(still, -1, share_now - 1 - limits.overshoot)
+        # From the sample before, as the response may settle between both.
+        late = (t + ts[1] > limits.settling_time) & ~still
+        unsettled = jnp.where(late, jnp.abs(share_now - 1) - BAND, -1)
+        return jnp.stack([over, unsettled, jnp.abs(demand) / limits.effort - 1])
+
+    demand = demands(controller, scene.linkage, solution)
+    along = _largest(jax.vmap(at)(ts, share, demand), _SPANS)
+    if not with_margins:
+        return along
+    A, B, C, _ = loop_matrices(scene.linkage, controller, others, rest, scene.t1)
+    near = jax.vmap(lambda s: limits.modulus_margin * jnp.abs(s) - 1)
+    return jnp.concatenate([along, _largest(near(sensitivity(A, B, C)), _BANDS)])
+
+
+def _largest(values: Array, blocks: int) -> Array:
+    """Returns the largest of each block of rows, at least -1, as one row."""
+    parts = values.reshape(blocks, -1, *values.shape[1:])
+    return jnp.maximum(parts.max(axis=1), -1).reshape(-1)  # finite without a limit
+
+
+def controller_and_others(scene: Scene) -> tuple[PDController, tuple[Element, ...]]:
+    """Returns the controller of a scene and its other forces."""
+    controller = controller_of(scene)
+    others = tuple(force for force in scene.forces if force is not controller)
+    return controller, checked(scene.linkage, others)
+
+
+def rest_of(scene: Scene) -> Array:
+    """Returns where the arm rests at the last set point (n,) [m or rad], or NaN."""
+    reference = controller_of(scene).reference
+    last, _ = reference_motion(reference, jnp.asarray(scene.t1), scene.linkage)
+    return equilibrium(scene.linkage, last, scene.forces, scene.t1)
+
+
+def step_shares(solution: Solution, rest: Array) -> tuple[Array, Array, Array]:
+    """Returns joints' changes and speeds as shares of their steps (time, joint).
+
+    Also returns which joints have no step (joint,).
+    """
+    height = rest - solution.q[0]
+    still = height == 0
+    height = jnp.where(still, 1, height)
+    changes = jax.vmap(lambda q: (q - solution.q[0]) / height)(solution.q)
+    return changes, jax.vmap(lambda qd: qd / height)(solution.qd), still
+
+
+def sensitivity(A: Array, B: Array, C: Array) -> Array:
+    """Computes 1 / (1 + L) of each joint's loop (frequency, joint).
+
+    The frequencies reach from far below to far above those of the joints alone.
+    """
+    n = B.shape[1]
+    joints = jnp.arange(n)
+    own = jnp.sqrt(jnp.abs(C[joints, joints] * B[n + joints, joints])) + 1e-3
+    low, high = jnp.log(0.05 * own.min()), jnp.log(30 * own.max())
+    w = jax.lax.stop_gradient(jnp.exp(jnp.linspace(low, high, _FREQUENCIES)))
+
+    def at(w):
+        closed = jnp.linalg.solve(1j * w * jnp.eye(len(A)) - A, B + 0j)
+        return 1 - jnp.diagonal(C @ closed)
+
+    return jax.vmap(at)(w)
+
+
+def measured(scene: Scene, limits: Limits) -> Iterator[tuple[str, str, float, float]]:
+    """Yields a row of `TunedWithin` per limit, measured as reports measure.
+
+    The motion is sampled as finely as its fastest mode asks for.
+    """
+    controller, others = controller_and_others(scene)
+    limits = in_numpy(limits)
+    linkage, t1, rest = scene.linkage, float(scene.t1), rest_of(scene)
+    loops: dict[int, Any] = {
+        k: open_loop(linkage, rest, controller, k + 1, others, t1)
+        for k in moving_joints(linkage)
+    }
+    poles = next(iter(loops.values())).feedback().poles()
+    ts = np.linspace(0, t1, samples_of(t1, np.abs(poles).max()) + 1)
+    motion = simulate(linkage, scene.state0, ts, scene.forces, throw=False)
+    shares, speeds, _ = map(np.asarray, step_shares(motion, rest))
+    efforts = np.abs(demands(controller, linkage, motion)).max(axis=0)
+    for k, loop in loops.items():
+        joint = joint_names(linkage)[k]
+        overshoot, _, settled = step_measures(ts, shares[:, k], speeds[:, k], 1.0)
+        unit = "N m" if joint[0] == "R" else "N"
+        rows = (
+            ("overshoot", limits.overshoot, overshoot),
+            ("settling time [s]", limits.settling_time, settled),
+            (f"effort [{unit}]", limits.effort, efforts[k]),
+        )
+        for label, most, value in rows:
+            if most[k] < np.inf:
+                yield label, joint, float(most[k]), float(value)
+        if limits.modulus_margin[k] > 0:
+            least = float(limits.modulus_margin[k])
+            yield _MARGIN, joint, least, margins(loop).modulus
+
+
 def _lane(z: Array, problem: tuple[Scene, Loss, Array, Limits, bool]) -> Evaluation:
     """Evaluates a loss and the excess over limits in the log-gains `z` (2n,)."""
     scene, loss, tuned, limits, with_margins = problem
 
-    def beyond(scene, solution):
-        return excess(limits, scene, solution, with_margins)
-
     def residuals(scene, solution):
-        own = residuals_of(loss, scene, solution)
-        return jnp.concatenate([beyond(scene, solution), own])
+        beyond = excess(limits, scene, solution, with_margins)
+        return jnp.concatenate([beyond, residuals_of(loss, scene, solution)])
 
     found = gain_sensitivities(z, scene, residuals, tuned)
-    count = jax.eval_shape(beyond, found.scene, found.solution).size
-    return sum_of_squares(
-        found._replace(
-            residuals=found.residuals[count:], jacobian=found.jacobian[count:]
-        ),
-        excess=found.residuals[:count],
-        slopes=found.jacobian[:count],
+    count = joints_of(scene.linkage) * (3 * _SPANS + with_margins * _BANDS)
+    excesses, own = (
+        found._replace(residuals=found.residuals[rows], jacobian=found.jacobian[rows])
+        for rows in (slice(count), slice(count, None))
     )
+    return sum_of_squares(own, excess=excesses.residuals, slopes=excesses.jacobian)
 
 
 def _search(
-    lanes: Lanes,
-    first: np.ndarray,
-    low: np.ndarray,
-    high: np.ndarray,
-    max_steps: int,
-    report: Callable[[str], Any] | None,
+    lanes: Lanes, box: GainBox, max_steps: int, report: Callable[[str], Any] | None
 ) -> tuple[np.ndarray, float, str]:
     """Returns the best log-gains (2n,), their loss, and why the search stopped.
 
     Its unknowns are the scaled log-gains between their bounds, and the greatest excess
     over the limits. As this has a price, limits that cannot be met are exceeded least.
     """
+    first, low, high = box.logs()
     free = low < high
     points: list[tuple[np.ndarray, Evaluation]] = []
 
@@ -164,21 +320,19 @@ class TunedWithin(Report):
 
     @property
     def met(self) -> Bool[np.ndarray, " limit"]:
-        """Returns which limits are met; margins are lower limits, all others upper."""
-        least = np.array(self.limit) == "modulus margin"
-        return np.where(
-            least, self.reached >= self.allowed, self.reached <= self.allowed
-        )
+        """Whether each limit is met; margins are lower limits, all others upper."""
+        sign = np.where(np.array(self.limit) == _MARGIN, -1, 1)
+        return sign * self.reached <= sign * self.allowed
 
     def _rows(self) -> list[list[str]]:
-        rows = gain_rows(
-            gain_table(self.scene, self.start, self.gains, self.lower, self.upper)
-        )
+        box = GainBox(self.start, self.lower, self.upper)
+        rows = gain_rows(gain_table(self.scene, box, self.gains))
         rows.append(["", "limit", "reached", "", "", ""])
         limits = zip(self.limit, self.joint, self.allowed, self.reached, self.met)
-        for name, joint, allowed, reached, met in limits:
-            cells = [f"{allowed:.5g}", f"{reached:.5g}", "", ""]
-            rows.append([f"{name} of {joint}", *cells, "met" if met else "not met"])
+        for name, joint, *values, met in limits:
+            cells = [f"{value:.5g}" for value in values]
+            mark = "met" if met else "not met"
+            rows.append([f"{name} of {joint}", *cells, "", "", mark])
         return rows
 
     def _remarks(self) -> list[str]:
@@ -236,34 +390,24 @@ def tune_within(
     [True, True]
     """
     instance("limits", limits, Limits)
-    check_tuned("scene", scene, function("loss", loss))
+    check_tuned("scene", scene, loss)
     check_joints("limits.", limits, scene.linkage)
-    controller_and_others(scene)
-    start, lower, upper = bounds_of(scene, factor, bounds)
-    max_steps = whole_number("max_steps", max_steps, 1)
-    if report is not None:
-        function("report", report, "a callable or None")
+    controller_and_others(scene)  # raises for elements with a state
+    box = bounds_of(scene, factor, bounds)
+    max_steps = check_search(max_steps, report)
     limits = sized(limits, joints_of(scene.linkage))
     with_margins = bool(np.any(np.asarray(limits.modulus_margin) > 0))
-    problem = with_full_size(scene), loss, lower > 0, limits, with_margins
-    first, low, high = (
-        np.log(np.where(lower > 0, gains, 1)).ravel() for gains in (start, lower, upper)
-    )
-    z, value, message = _search(
-        Lanes(_lane, [[problem]]), first, low, high, max_steps, report
-    )
-    gains = np.where(
-        lower > 0, np.clip(np.exp(z).reshape(lower.shape), lower, upper), 0
-    )
-    scene = with_gains(scene, jnp.asarray(gains))
+    problem = with_full_size(scene), loss, box.tuned, limits, with_margins
+    z, value, message = _search(Lanes(_lane, [[problem]]), box, max_steps, report)
+    scene = with_gains(scene, jnp.asarray(box.gains(z)))
     rows = list(measured(scene, limits))
     limit, joint, allowed, reached = zip(*rows) if rows else ((),) * 4
     return TunedWithin(
         scene=scene,
         loss=value,
-        start=start,
-        lower=lower,
-        upper=upper,
+        start=box.start,
+        lower=box.lower,
+        upper=box.upper,
         message=message,
         limit=limit,
         joint=joint,
