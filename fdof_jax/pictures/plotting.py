@@ -6,7 +6,6 @@ linkage itself.
 """
 
 from collections.abc import Mapping
-from functools import partial
 from itertools import cycle
 from typing import Any, NamedTuple
 
@@ -120,8 +119,8 @@ def _powers(linkage: Linkage, forces: Forces, solution: Motion) -> np.ndarray:
         # The efforts of an inertial element exclude those of its potential energy.
         if isinstance(element, InertialElement) or element.potential_energy is None:
             continue
-        stored = jax.vmap(partial(element.potential_energy, linkage=linkage))
-        _, rates = jax.jvp(stored, (solution.q,), (solution.qd,))
+        stored = lambda q, of=element.potential_energy: of(q, linkage)
+        _, rates = jax.jvp(jax.vmap(stored), (solution.q,), (solution.qd,))
         powers = powers.at[k].add(rates)
     return np.asarray(powers)
 
