@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from chains import random_chain
 from test_drawing import (
     LINKAGE,
     labels,
@@ -157,3 +158,23 @@ def test_work_precision_is_logarithmic_and_sorted():
     assert first.get_marker() != second.get_marker()
     assert first.get_color() != second.get_color()
     assert labels(ax) == ["a", "b"]
+
+
+@pytest.mark.parametrize("topology", ["R", "RP", "RFPRR"])
+def test_chains_of_any_length_show_all_joints_that_move(topology):
+    n, moving = len(topology), len(topology.replace("F", ""))
+    chain = random_chain(topology, np.random.default_rng(n))
+    motion = made_up(np.linspace(0, 1, 3), np.linspace(0.2, 1, 3)[:, None] * np.ones(n))
+    curves = lambda fig: [len(ax.lines) for ax in fig.axes]
+    assert sum(curves(plotting.motion_profile(chain, motion))) == moving
+    forces = (fj.JointDamper(np.ones(n)),)
+    assert sum(curves(plotting.effort_profile(chain, forces, motion))) == moving
+    kinetic, potential, _ = curves(plotting.energy_profile(chain, motion))
+    assert kinetic == potential == n
+    still = drawing.draw_linkage(chain, motion.q[0])
+    film = drawing.animate(chain, motion)
+    film._init_draw()  # the first frame
+    tip = np.asarray(fj.tip_position(chain, motion.q[0]))
+    for ax in (still, film._fig.axes[0]):  # type: ignore[attr-defined]
+        points = np.concatenate([line.get_xydata() for line in ax.lines])
+        assert np.nanmin(np.linalg.norm(points - tip, axis=1)) < 1e-9
