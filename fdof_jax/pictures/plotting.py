@@ -18,6 +18,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
+from matplotlib.legend import Legend
 from numpy.typing import ArrayLike
 
 from ..analysis.responses import StepAndSine
@@ -219,59 +220,44 @@ def effort_profile(
     reached(linkage, solution)
     efforts = joint_efforts(linkage, forces, solution)
     ts, total, parts = (np.asarray(a) for a in (solution.ts, *efforts))
-    units, panels, moving = [], [], moving_joints(linkage)
+    limits = [_limits(element, total) for element in elements("forces", forces)]
+    panels, bands, moving = [], [], moving_joints(linkage)
     for k in moving:
         symbol, unit = ("T", "N m") if joint_names(linkage)[k][0] == "R" else ("F", "N")
-        units.append(unit)
-        curve = "total", total[:, k], SERIES[0]
-        panels.append((f"${symbol}_{k + 1}$ [{unit}]", [curve]))
+        own = [(row[k], part[:, k]) for row, part in zip(limits, parts)]
+        own = [(limit, effort) for limit, effort in own if np.isfinite(limit)]
+        curves = [("total", total[:, k], SERIES[0])]
+        if len(parts) > 1:
+            curves += [("controller", effort, SERIES[2]) for _, effort in own]
+        panels.append((f"${symbol}_{k + 1}$ [{unit}]", curves))
+        bands.append((own, unit))
     fig, axes = time_panels(fig, 5.2, ts, panels)
-    for k, ax, unit in zip(moving, axes, units):
-        rows = zip(elements("forces", forces), parts[:, :, k])
-        limits = [(_limit(element, k, total.shape[1]), row) for element, row in rows]
-        limits = [(limit, effort) for limit, effort in limits if np.isfinite(limit)]
-        for _, effort in limits if len(parts) > 1 else ():
-            ax.plot(ts, effort, color=SERIES[2], lw=1.2, label="controller")
+    for k, ax, (own, unit) in zip(moving, axes, bands):
         low, high = ax.get_ylim()  # before the bands, which may be far wider
-        texts = []
-        for limit, effort in limits:
+        for limit, effort in own:
             ax.axhspan(-limit, limit, color=GREY, alpha=0.15, lw=0, label="limits")
             at = (np.abs(effort) >= limit) & (effort != 0)
             dots = ax.plot(ts[at], effort[at], ".", color=SERIES[1], zorder=3)
             dots[0].set(label="saturated", gid=f"saturated {k + 1}")
             if at.any():
                 low, high = min(low, -1.1 * limit), max(high, 1.1 * limit)
-            texts.append(f"limit ±{limit:g} {unit}")
         ax.set_ylim(low, high)
-        _note(ax, "\n".join(texts))
+        if own:  # as the title of a legend, which moves out of the curves' way
+            text = "\n".join(f"limit ±{limit:g} {unit}" for limit, _ in own)
+            note = Legend(
+                ax, [], [], title=text, title_fontsize="small", loc="best",
+                framealpha=0.7, edgecolor="none", borderaxespad=0.3, borderpad=0.1,
+            )  # fmt: skip
+            ax.add_artist(note)
     legend(axes[0], *axes)
     return fig
 
 
-def _limit(element: Any, joint: int, joints: int) -> float:
-    """The limit of a controller's effort at a joint; infinite for other elements."""
-    element = element.pd if isinstance(element, PIDController) else element
-    if not isinstance(element, PDController):
-        return np.inf
-    return float(np.broadcast_to(np.asarray(element.limit), joints)[joint])
-
-
-def _note(ax: Axes, text: str) -> None:
-    """Writes into the first corner of axes that no curve enters, or else the first."""
-    if not text:
-        return
-
-    def hidden(x: float, y: float) -> int:
-        curves = (ax.transLimits.transform(line.get_xydata()) for line in ax.lines)
-        near = [(np.abs(curve - (x, y)) < (0.45, 0.25)).all(axis=1) for curve in curves]
-        return sum(int(found.sum()) for found in near)
-
-    x, y = min([(1, 0), (1, 1), (0, 0), (0, 1)], key=lambda corner: hidden(*corner))
-    ax.annotate(
-        text, (x, y), (5 - 10 * x, 6 - 12 * y), xycoords="axes fraction",
-        textcoords="offset points", ha=["left", "right"][x], va=["bottom", "top"][y],
-        fontsize="small", bbox={"fc": "white", "alpha": 0.7, "lw": 0, "pad": 1},
-    )  # fmt: skip
+def _limits(element: Any, total: np.ndarray) -> np.ndarray:
+    """Limits of a controller's efforts (n,); infinite for other elements."""
+    pd = element.pd if isinstance(element, PIDController) else element
+    limit = pd.limit if isinstance(pd, PDController) else np.inf
+    return np.broadcast_to(np.asarray(limit), total.shape[1])
 
 
 def response_profile(test: StepAndSine, fig: Figure | None = None) -> Figure:
