@@ -86,6 +86,7 @@ def test_arrows_are_along_the_forces_and_as_long_as_they_are_large():
     close(first[0], place(TIP))
     long, short = first[1] - first[0], second[1] - second[0]
     close(long / np.linalg.norm(long), [0.6, 0.8])
+    assert 0.1 < np.linalg.norm(long) < 1.0  # the arm is 1.7 m long
     close(short, [0, -np.linalg.norm(long) / 5])
     around = around[:41] - place(TIP)
     close(np.ptp(np.hypot(*around.T)), 0)

@@ -43,20 +43,20 @@ def element_lines(
     frames at times `ts` [s]; `size`: its extent [m]. Arrows show forces of all wrenches
     on one scale.
     """
-    checked = elements_on(linkage, forces)
-    for element in checked:
+    given = elements_on(linkage, forces)
+    for element in given:
         element.check(linkage, jnp.asarray(ts))
-    found = in_numpy(checked)
+    acting = in_numpy(given)
     pushes = {
         k: _push(element, linkage, f, ts)
-        for k, element in enumerate(found)
+        for k, element in enumerate(acting)
         if isinstance(element, Wrench)
     }
     most = [
         max(np.abs(part).max() for part in parts) for parts in zip(*pushes.values())
     ]
     lines = {}
-    for k, element in enumerate(found):
+    for k, element in enumerate(acting):
         kind, strokes, points = "", [], []
         if isinstance(element, SpringDamper | Tension):
             kind, strokes = _between(element, f, size)
@@ -67,7 +67,7 @@ def element_lines(
             strokes = _arrows(_place(element.point, f), *pushes[k], most, size)
         elif isinstance(element, JointStops):
             kind, strokes = "stops", _stops(element, linkage, f, size)
-        elif (path := _commanded(checked[k])) is not None:
+        elif (path := _commanded(given[k])) is not None:
             kind, strokes = "commanded", [np.tile(path, (len(ts), 1))]
         if isinstance(element, SpringDamper | Tension | LinearActuator):
             points = [element.ends.a, element.ends.b]
