@@ -84,6 +84,7 @@ def bits(leaf):
 
 
 def same(a, b):
+    """Checks that one tree may stand for the other, also in a compiled program."""
     assert jax.tree.structure(a) == jax.tree.structure(b)
     assert [*map(bits, jax.tree.leaves(a))] == [*map(bits, jax.tree.leaves(b))]
 
@@ -284,19 +285,6 @@ def test_results(path, tuned):
             np.testing.assert_array_equal(a, b)
     assert loaded["PPR"].history.gains.shape == (2, 2, 3)
     assert loaded["fit"].usable == FIT.usable
-
-
-def test_a_loaded_scene_compiles_nothing(path):
-    calls = []
-
-    @eqx.filter_jit
-    def efforts(scene):
-        calls.append(1)
-        return scene.forces[0](0.0, *scene.state0, scene.linkage)
-
-    loaded = saved_and_loaded(path, SCENE)
-    np.testing.assert_array_equal(efforts(SCENE), efforts(loaded))
-    assert len(calls) == 1
 
 
 # Paths, and files that appear whole or not at all

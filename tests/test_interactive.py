@@ -1,7 +1,5 @@
 """Sliders: the effect of a move, which compiles nothing, and messages on failures."""
 
-import subprocess
-import sys
 from io import BytesIO
 
 import matplotlib.pyplot as plt
@@ -118,11 +116,3 @@ def test_a_slider_starts_on_one_of_its_steps(box):
         start = 0 if name.startswith("k") else 1  # factors of gains are logarithmic
         steps = np.array([start - part.min, part.max - start]) / part.step
         np.testing.assert_allclose(steps, steps.round(), atol=1e-9)
-
-
-def test_importing_the_module_imports_no_ipywidgets():
-    code = "import sys, fdof_jax; fdof_jax.interactive; print(*sys.modules)"
-    command = [sys.executable, "-c", code]
-    run = subprocess.run(command, capture_output=True, text=True, check=True)
-    modules = run.stdout.split()
-    assert "matplotlib" in modules and "ipywidgets" not in modules

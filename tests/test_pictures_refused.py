@@ -1,5 +1,6 @@
 """Malformed arguments of pictures are named, and no figure is left open."""
 
+import importlib
 import sys
 from functools import partial
 
@@ -91,5 +92,7 @@ def test_malformed_arguments_are_named():
 
 def test_without_ipywidgets_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "ipywidgets", None)
+    monkeypatch.delitem(sys.modules, interactive.__name__)
+    again = importlib.import_module(interactive.__name__)  # imports it on use alone
     with pytest.raises(ImportError, match=r"fdof_jax\[notebook\]"):
-        interactive.sliders()
+        again.sliders()

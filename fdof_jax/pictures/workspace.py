@@ -13,7 +13,7 @@ from ..base.array_namespace import in_numpy
 from ..base.checks import real_array
 from ..dynamics import mass_matrix
 from ..forces.element import Forces
-from ..linkage.linkage import Linkage, check_linkage, joint_names, joints_of
+from ..linkage.linkage import Linkage, check_linkage, joints_of
 from ..linkage.topology import check_angles, letters
 from ..mechanics.kinematics import tip_jacobian
 from .arms import Geometry, draw_motion, geometry
@@ -24,35 +24,33 @@ _REACHED = "#D6EAF5"
 
 def _ranges(linkage: Linkage, lower: Any, upper: Any, orientation: Any) -> Ranges:
     check_linkage(linkage)
-    n, kinds = joints_of(linkage), letters(linkage.ef)
-    ends = []
-    for name, value in (("lower", lower), ("upper", upper)):
+    name, ends = letters(linkage.ef), []
+    kinds = np.array([*name])
+    for argument, value in (("lower", lower), ("upper", upper)):
         end = real_array(
-            name, value, (n,), finite=False, broadcast=True, unit="m or rad"
+            argument, value, kinds.shape, finite=False, broadcast=True, unit="m or rad"
         )
+        check_angles(argument, end, linkage.ef)
+        for k in np.flatnonzero((kinds == "P") & ~np.isfinite(end)):
+            raise ValueError(
+                f"{argument}: expected a finite end of slide P{k + 1} [m], "
+                f"got {end[k]}."
+            )
         ends.append(np.asarray(end))
-        check_angles(name, end, linkage.ef)
-        for joint, end in zip(joint_names(linkage), ends[-1]):
-            if joint[0] == "P" and not np.isfinite(end):
-                raise ValueError(
-                    f"{name}: expected a finite end of slide {joint} [m], got {end}."
-                )
     low, high = ends
-    moves = np.array([kind != "F" for kind in kinds])
-    if not (low < high)[moves].all():
+    if not (low < high)[kinds != "F"].all():
         raise ValueError(
             f"lower: expected less than upper, got {low.tolist()} and {high.tolist()}."
         )
-    around = np.array([kind == "R" for kind in kinds]) & (high - low >= 2 * np.pi)
-    low, high = np.where(around, -np.pi, low), np.where(around, np.pi, high)
-    low, high = np.where(moves, low, 0), np.where(moves, high, 0)
+    cases = [kinds == "F", (kinds == "R") & (high - low >= 2 * np.pi)]
+    low, high = np.select(cases, [0, -np.pi], low), np.select(cases, [0, np.pi], high)
     if orientation is not None:
         orientation = float(real_array("orientation", orientation, (), unit="rad"))
-        if "R" not in kinds:
+        if "R" not in name:
             raise ValueError(
                 f"orientation: expected None for slides only, got {orientation:g}."
             )
-    return Ranges(in_numpy(linkage), kinds, low, high, orientation)
+    return Ranges(in_numpy(linkage), name, low, high, orientation)
 
 
 def workspace(
