@@ -184,7 +184,7 @@ def _text(*numbers: Any) -> str:
     return " ".join(repr(float(number)) for number in numbers)
 
 
-def _turn(angle: float) -> str:
+def _turn(angle: Any) -> str:
     """The quaternion of a turn about z."""
     return _text(np.cos(angle / 2), 0, 0, np.sin(angle / 2))
 

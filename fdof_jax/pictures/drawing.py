@@ -234,7 +234,7 @@ def _geometries(motions: Any, forces: Any) -> dict[str, tuple[np.ndarray, Geomet
         fits = isinstance(pair, tuple) and len(pair) == 2
         if not (fits and isinstance(pair[0], Linkage)):
             raise refusal(name, "(Linkage, Solution)", pair)
-        ts, q, _ = reached(*pair, name)
+        ts, q, _ = reached(pair[0], pair[1], name)
         geometries[title] = ts, geometry(pair[0], q, ts, forces.get(title, ()))
     return geometries
 

@@ -245,8 +245,9 @@ def effort_profile(
         if own:  # as the title of a legend, which moves out of the curves' way
             text = "\n".join(f"limit ±{limit:g} {unit}" for limit, _ in own)
             note = Legend(
-                ax, [], [], title=text, title_fontsize="small", loc="best",
+                ax, [], [], title=text, title_fontproperties={"size": "small"},
                 framealpha=0.7, edgecolor="none", borderaxespad=0.3, borderpad=0.1,
+                loc="best",
             )  # fmt: skip
             ax.add_artist(note)
     legend(axes[0], *axes)
