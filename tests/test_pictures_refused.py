@@ -69,7 +69,6 @@ REFUSED = [
     ("solutions", plotting.tracking_error, LINKAGE, TASK, SOLUTION),
     ("task", plotting.tracking_by_error, LINKAGE, None, SOLUTION),
     ("solution", plotting.tracking_by_error, LINKAGE, TASK, BATCH),
-    ("test", plotting.response_profile, SOLUTION),
     ("measured", plotting.work_precision, {}),
     (OF_MEASURED, plotting.work_precision, {"a": [1, 2]}),
     (OF_MEASURED, plotting.work_precision, {"a": ([1, 2], [1])}),
