@@ -270,3 +270,9 @@ def test_contacts_are_left_out_with_a_warning(inside, welded):
     about = [w for w in caught if "contacts are left out" in str(w.message)]
     assert len(about) == (data.ncon > 0)
     assert all(w.filename == __file__ for w in about)
+
+
+def test_the_first_link_may_collide_with_the_ground():
+    ground = '<geom type="plane" size="9 9 9"/>'
+    with pytest.warns(UserWarning, match="contacts are left out, but bodies world and"):
+        fj.from_mjcf(f"{WORLD}{ground}{PLAIN}</worldbody></mujoco>")
