@@ -2,12 +2,13 @@
 
 from io import BytesIO
 
+import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
 import fdof_jax as fj
-from fdof_jax.pictures.interactive import sliders
+from fdof_jax.pictures.interactive import _moved, sliders
 from fdof_jax.simulation import prescribed
 from fdof_jax.tuning.gains import with_gains
 
@@ -116,3 +117,12 @@ def test_a_slider_starts_on_one_of_its_steps(box):
         start = 0 if name.startswith("k") else 1  # factors of gains are logarithmic
         steps = np.array([start - part.min, part.max - start]) / part.step
         np.testing.assert_allclose(steps, steps.round(), atol=1e-9)
+        np.testing.assert_allclose(part.max, 1.5 if start else np.log10(4))
+
+
+def test_a_link_is_stretched_with_its_mass_centre():
+    scene = CIRCLES["RRR"]
+    scene = scene._replace(t1=jnp.asarray(scene.t1, float))  # as the sliders do
+    arm = _moved(scene, jnp.array([1.2, 1, 1]), jnp.ones((2, 3))).scene.linkage
+    np.testing.assert_allclose(arm.com[0], scene.linkage.com[0] * np.array([1.2, 1]))
+    np.testing.assert_allclose(arm.length[1], 1.2 * scene.linkage.length[1])
