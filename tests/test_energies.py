@@ -29,11 +29,11 @@ def test_energy_profile_adds_up():
 
 def tops(ax: Axes, ts) -> dict[str, np.ndarray]:
     """Returns the upper edge of each band of a stack."""
-    found = {}
+    edges = {}
     for band in ax.collections:
         x, y = band.get_paths()[0].vertices.T
-        found[band.get_label()] = np.array([y[x == t].max() for t in ts])
-    return found
+        edges[band.get_label()] = np.array([y[x == t].max() for t in ts])
+    return edges
 
 
 LIFT = make_linkage("PPR")

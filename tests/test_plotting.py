@@ -2,17 +2,15 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
-from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
+from chains import random_chain
+from matplotlib.legend import Legend
 from test_drawing import (
-    BATCH,
     LINKAGE,
-    NOWHERE,
-    SOLUTION,
     labels,
     lines,
     made_up,
@@ -21,20 +19,12 @@ from test_drawing import (
     swinging,
     tidy as tidy,
 )
+from test_energies import values
 
-from fdof_jax import (
-    CircleTask,
-    JointDamper,
-    PDController,
-    drawing,
-    plotting,
-    tip_position,
-)
-from fdof_jax.control import PIDController
+import fdof_jax as fj
+from fdof_jax import drawing, plotting
 
-
-def values(ax: Axes) -> list[np.ndarray]:
-    return [np.asarray(line.get_ydata()) for line in ax.lines]
+TASK = fj.CircleTask([1, 1], 0.5, 2.0, 0.0)
 
 
 def test_motion_profile_shows_absolute_angles_in_degrees_and_slides():
@@ -62,16 +52,15 @@ def hold(t, linkage):
 LIMIT = [1e3, 3e2, np.inf]
 
 
-@pytest.mark.parametrize(
-    "controller",
-    [PDController(1e4, 0, LIMIT, hold), PIDController(1e4, 1, 0, LIMIT, hold)],
-    ids=["PD", "PID"],
-)
-def test_effort_profile_has_units_limits_and_saturation(controller):
+@pytest.mark.parametrize("kind", ["PD", "PID"])
+def test_effort_profile_has_units_limits_and_saturation(kind):
     q = np.zeros((11, 3))
     q[:5, 1] = 0.1  # beyond the 0.03 m that saturate
-    forces = controller, JointDamper(1.0)
-    own = (np.zeros((11, 3)),) if isinstance(controller, PIDController) else ()
+    controller, own = fj.PDController(1e4, 0, LIMIT, hold), ()
+    if kind == "PID":
+        controller = fj.control.PIDController(1e4, 1, 0, LIMIT, hold)
+        own = (np.zeros((11, 3)),)
+    forces = controller, fj.JointDamper(1.0)
     solution = dataclasses.replace(made_up(np.linspace(0, 1, 11), q), own=own)
     fig = plotting.effort_profile(make_linkage("RPR"), forces, solution)
     names = [ax.get_ylabel() for ax in fig.axes]
@@ -82,102 +71,87 @@ def test_effort_profile_has_units_limits_and_saturation(controller):
     assert [len(ax.patches) for ax in fig.axes] == [1, 1, 0]
     low, high = fig.axes[1].get_ylim()
     assert low < -300 and high > 300
-    assert [text.get_text() for ax in fig.axes for text in ax.texts] == [
-        "limit ±1000 N m",
-        "limit ±300 N",
-    ]
-    expected = {"total", "controller", "limits", "saturated"}
-    assert set(labels(fig.axes[0])) == expected
+    texts = [note.get_title().get_text() for ax in fig.axes for note in notes(ax)]
+    assert texts == ["limit ±1000 N m", "limit ±300 N"]
+    parts = {"total", "controller", "limits", "saturated"}
+    assert set(labels(fig.axes[0])) == parts
     # The limits are those of the controller, not of what the damper adds.
-    moved = dataclasses.replace(solution, qd=solution.qd + 1)
-    fig = plotting.effort_profile(make_linkage("RPR"), forces, moved)
+    fast = dataclasses.replace(solution, qd=solution.qd + 1)
+    fig = plotting.effort_profile(make_linkage("RPR"), forces, fast)
     total, own = values(fig.axes[1])[:2]
     np.testing.assert_allclose(total, own - 1)
     np.testing.assert_array_equal(own[:5], -300)
 
 
+def notes(ax):
+    return [note for note in ax.findobj(Legend) if note is not ax.get_legend()]
+
+
 def test_the_limit_is_written_where_no_curve_is():
-    q = np.zeros((11, 3))
-    q[6:, 1] = 0.1  # a negative effort, late: the lower right corner is taken
-    solution = made_up(np.linspace(0, 1, 11), q)
-    forces = (PDController(1e3, 0, 300, hold),)
-    _, middle, last = plotting.effort_profile(LINKAGE, forces, solution).axes
-    assert middle.texts[0].xy == (1, 1) and last.texts[0].xy in [(1, 0), (1, 1)]
+    ts, q = np.linspace(0, 1, 101), np.zeros((101, 3))
+    q[60:, 1] = 0.1  # a negative effort, late
+    q[:, 2] = 0.1 * np.sign(ts - 0.5)
+    solution, forces = made_up(ts, q), (fj.PDController(1e3, 0, 300, hold),)
+    for ax in plotting.effort_profile(LINKAGE, forces, solution).axes:
+        (note,) = notes(ax)
+        place = note.get_window_extent().transformed(ax.transData.inverted())
+        assert not place.count_contains(ax.lines[0].get_xydata())
+    free = plotting.effort_profile(LINKAGE, (), solution)
+    assert not any(np.any(values(ax)) or notes(ax) for ax in free.axes)
 
 
 def test_a_legend_takes_as_many_rows_as_it_needs():
     solutions = {"paper gains": swinging(), "tuned gains": swinging()}
-    task = CircleTask([1, 1], 0.5, 2.0, 0.0)
     for words in (solutions, {2 * name: s for name, s in solutions.items()}):
-        ax = plotting.tracking(make_linkage("RRR"), task, words)
+        ax = plotting.tracking(LINKAGE, TASK, words)
         assert ax.get_legend().get_window_extent().x1 <= ax.figure.bbox.x1
         assert len(labels(ax)) == 3
 
 
-def test_effort_profile_without_elements_is_zero():
-    fig = plotting.effort_profile(make_linkage("PRR"), (), swinging())
-    assert not any(np.any(values(ax)) for ax in fig.axes)
-
-
 def test_tracking_and_its_error():
-    linkage, task = make_linkage("RRR"), CircleTask([1, 1], 0.5, 2.0, 0.0)
     solutions = {"paper": swinging(), "tuned": swinging(51, 0.5)}
-    ax = plotting.tracking(linkage, task, solutions)
+    ax = plotting.tracking(LINKAGE, TASK, solutions)
     assert labels(ax) == ["commanded", "paper", "tuned"]
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("x [m]", "y [m]")
     curves = {line.get_label(): np.asarray(line.get_xydata()) for line in ax.lines}
-    off = np.linalg.norm(curves["commanded"] - [1, 1], axis=1)
-    np.testing.assert_allclose(off, 0.5)
-    expected = tip_position(linkage, solutions["paper"].q[-1])
-    np.testing.assert_allclose(curves["paper"][-1], expected, atol=1e-12)
+    np.testing.assert_allclose(np.hypot(*(curves["commanded"] - [1, 1]).T), 0.5)
+    tips = np.asarray(jax.vmap(lambda q: fj.tip_position(LINKAGE, q))(swinging().q))
+    np.testing.assert_allclose(curves["paper"], tips, atol=1e-12)
 
-    arm = drawing.chrono_cyclograph(linkage, solutions["paper"], until=0.5)
-    plotting.tracking(linkage, task, solutions, arm)
-    assert "tip path" not in labels(arm)  # it is the curve
-    color = {line.get_label(): line.get_color() for line in arm.lines}
-    links = {color[f"link {k}"] for k in (1, 2, 3)}
-    assert not links & {color["paper"], color["tuned"]}
-    drawn = drawing.draw_linkage(
-        linkage, [0, 0, 0], forces=(PDController(1, 1, 1, task),)
-    )
-    (path,) = [line for line in arm.lines if line.get_label() == "commanded"]
-    same = lines(drawn)["commanded 0"]
-    assert path.get_linestyle() == same.get_linestyle() == "--"
-    assert path.get_color() == same.get_color()
-
-    error = plotting.tracking_error(linkage, task, solutions)
+    error = plotting.tracking_error(LINKAGE, TASK, solutions)
     assert (error.get_xlabel(), error.get_ylabel()) == ("time [s]", "tip error [m]")
-    np.testing.assert_allclose(
-        values(error)[0], np.linalg.norm(curves["paper"] - curves["commanded"], axis=1)
-    )
+    errors = np.hypot(*(tips - curves["commanded"]).T)
+    np.testing.assert_allclose(values(error)[0], errors)
     assert len({line.get_color() for line in error.lines}) == 2
 
-
-def test_tracking_by_error_colours_the_path():
-    linkage, task, solution = (
-        make_linkage("RRR"),
-        CircleTask([1, 1], 0.5, 2.0),
-        swinging(),
-    )
     given = plt.subplots()[1]
-    ax = plotting.tracking_by_error(linkage, task, solution, given)
-    assert ax is given and (ax.get_xlabel(), ax.get_ylabel()) == ("x [m]", "y [m]")
-    (path,) = (c for c in ax.collections if isinstance(c, LineCollection))
-    tips = [tip_position(linkage, q) for q in solution.q]
+    ax = plotting.tracking_by_error(LINKAGE, TASK, swinging(), given)
+    assert ax is given and labels(ax) == ["commanded"]
+    (path,) = ax.collections
     pieces = np.stack([tips[:-1], tips[1:]], axis=1)
     np.testing.assert_allclose(path.get_segments(), pieces, atol=1e-12)
-    errors = values(plotting.tracking_error(linkage, task, {"a": solution}))[0]
-    shown = path.get_array()
-    np.testing.assert_allclose(shown, 500 * (errors[:-1] + errors[1:]))
-    assert path.get_clim() == (0, 1000 * errors.max())
+    np.testing.assert_allclose(path.get_array(), 500 * (errors[:-1] + errors[1:]))
     (bar,) = ax.child_axes
     assert bar.get_ylabel() == "tip error [mm]"
-    assert bar.get_ylim() == path.get_clim()
+    assert bar.get_ylim() == path.get_clim() == (0, 1000 * errors.max())
     left, right, bottom, top = ax.axis()
     assert ((pieces > [left, bottom]) & (pieces < [right, top])).all()
-    assert labels(ax) == ["commanded"]
     lightest = path.cmap(1.0)[:3] @ np.array([0.2126, 0.7152, 0.0722])
     assert lightest < 0.75  # seen on white
+
+
+def test_tracking_in_the_picture_of_an_arm_has_colours_of_its_own():
+    arm = drawing.chrono_cyclograph(LINKAGE, swinging(), until=0.5)
+    plotting.tracking(LINKAGE, TASK, {"a": swinging(), "b": swinging(51)}, arm)
+    assert "tip path" not in labels(arm)  # it is the curve
+    drawn = {line.get_label(): line for line in arm.lines}
+    links = {drawn[f"link {k}"].get_color() for k in (1, 2, 3)}
+    assert not links & {drawn["a"].get_color(), drawn["b"].get_color()}
+    controller = fj.PDController(1, 1, 1, TASK)
+    ax = drawing.draw_linkage(LINKAGE, [0, 0, 0], forces=(controller,))
+    path, same = drawn["commanded"], lines(ax)["commanded 0"]
+    assert path.get_linestyle() == same.get_linestyle() == "--"
+    assert path.get_color() == same.get_color()
 
 
 def test_work_precision_is_logarithmic_and_sorted():
@@ -193,34 +167,34 @@ def test_work_precision_is_logarithmic_and_sorted():
     assert labels(ax) == ["a", "b"]
 
 
-TASK = CircleTask()
+@pytest.mark.parametrize("topology", ["R", "RP", "RFPRR"])
+def test_chains_of_any_length_show_all_joints_that_move(topology):
+    n, moving = len(topology), len(topology.replace("F", ""))
+    chain = random_chain(topology, np.random.default_rng(n))
+    motion = made_up(np.linspace(0, 1, 3), np.linspace(0.2, 1, 3)[:, None] * np.ones(n))
+    curves = lambda fig: [len(ax.lines) for ax in fig.axes]
+    assert sum(curves(plotting.motion_profile(chain, motion))) == moving
+    forces = (fj.JointDamper(np.ones(n)),)
+    assert sum(curves(plotting.effort_profile(chain, forces, motion))) == moving
+    kinetic, potential, _ = curves(plotting.energy_profile(chain, motion))
+    assert kinetic == potential == n
+    still = drawing.draw_linkage(chain, motion.q[0])
+    film = drawing.animate(chain, motion)
+    film._init_draw()  # the first frame
+    tip = np.asarray(fj.tip_position(chain, motion.q[0]))
+    for ax in (still, film._fig.axes[0]):  # type: ignore[attr-defined]
+        points = np.concatenate([line.get_xydata() for line in ax.lines])
+        assert np.nanmin(np.linalg.norm(points - tip, axis=1)) < 1e-9
 
 
-@pytest.mark.parametrize(
-    "name, call",
-    [
-        ("linkage", lambda: plotting.motion_profile("RRR", SOLUTION)),  # type: ignore
-        ("linkage", lambda: plotting.energy_profile(None, SOLUTION)),  # type: ignore
-        ("linkage", lambda: plotting.effort_profile(None, (), SOLUTION)),  # type: ignore
-        ("solution", lambda: plotting.motion_profile(LINKAGE, BATCH)),
-        ("solution", lambda: plotting.energy_profile(LINKAGE, NOWHERE)),
-        ("fig", lambda: plotting.energy_profile(LINKAGE, SOLUTION, 1)),  # type: ignore
-        ("forces", lambda: plotting.effort_profile(LINKAGE, [], SOLUTION)),  # type: ignore
-        ("task", lambda: plotting.tracking(LINKAGE, None, {"a": SOLUTION})),  # type: ignore
-        ("solutions", lambda: plotting.tracking(LINKAGE, TASK, {})),
-        ("solutions", lambda: plotting.tracking_error(LINKAGE, TASK, SOLUTION)),  # type: ignore
-        (r"solutions\['a'\]", lambda: plotting.tracking(LINKAGE, TASK, {"a": BATCH})),
-        ("task", lambda: plotting.tracking_by_error(LINKAGE, None, SOLUTION)),  # type: ignore
-        ("solution", lambda: plotting.tracking_by_error(LINKAGE, TASK, BATCH)),
-        ("solution", lambda: plotting.energy_stack(LINKAGE, (), NOWHERE)),
-        ("forces", lambda: plotting.energy_stack(LINKAGE, [], SOLUTION)),  # type: ignore
-        ("measured", lambda: plotting.work_precision({})),
-        (r"measured\['a'\]", lambda: plotting.work_precision({"a": [1, 2]})),  # type: ignore
-        (r"measured\['a'\]", lambda: plotting.work_precision({"a": ([1, 2], [1])})),
-        (r"measured\['a'\]", lambda: plotting.work_precision({"a": ([0], [1])})),
-    ],
-)  # fmt: skip
-def test_malformed_arguments_are_named(name, call):
-    with pytest.raises(ValueError, match=f"^{name}: expected"):
-        call()
-    assert not plt.get_fignums()
+def test_a_response_is_shown_in_decibels():
+    ts, one = np.linspace(0, 1, 11), np.ones(1)
+    test = fj.analysis.StepAndSine(
+        joints=("P2",), step=one, overshoot=one, rise_time=one, settling_time=one,
+        bandwidth=10 * one, saturated=one, ts=ts, response=1 - np.exp(-5 * ts)[None],
+        frequency=np.array([[1.0, 10.0, 100.0]]), gain=np.array([[1, 0.1j, 0.01]]),
+    )  # fmt: skip
+    above, below = plotting.response_profile(test).axes
+    np.testing.assert_array_equal(above.lines[1].get_xydata().T, [ts, test.response[0]])
+    level, bandwidth, _ = (line.get_xydata().tolist() for line in below.lines)
+    assert level == [[1, 0], [10, -20], [100, -40]] and bandwidth == [[10, -20]]

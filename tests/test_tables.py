@@ -3,11 +3,13 @@
 import sys
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
+from chains import random_chain
 from test_drawing import make_linkage
 
 import fdof_jax as fj
@@ -61,9 +63,7 @@ def test_a_batch_has_axes_and_says_what_failed():
 
 
 def test_joints_of_two_kinds_are_numbers():
-    arms = jax.tree.map(
-        lambda *a: jnp.stack(a), make_linkage("RRP"), make_linkage("RPP")
-    )
+    arms = jax.tree.map(lambda *a: jnp.stack(a), *map(make_linkage, ("RRP", "RPP")))
     found = fj.to_xarray(arms, solution(2))
     assert found.joint.values.tolist() == ["R1", "2", "P3"]
     assert found.unit.values.tolist() == ["rad", "m or rad", "m"]
@@ -92,10 +92,8 @@ def test_a_table_of_a_batch():
     assert row["P1 [m/s]"] == motion.qd[2, 1, 3, 0]
     failed = found[found.outcome != "successful"]
     assert set(failed.index.droplevel("time [s]")) == {(1, 0)}
-    assert list(fj.to_pandas(make_linkage("PRR"), solution(2)).index.names) == [
-        "batch",
-        "time [s]",
-    ]
+    one = fj.to_pandas(make_linkage("PRR"), solution(2))
+    assert one.index.names == ["batch", "time [s]"]
 
 
 @pytest.mark.parametrize("convert", [fj.to_xarray, fj.to_pandas])
@@ -106,13 +104,24 @@ def test_malformed_arguments_are_named(convert):
     with pytest.raises(ValueError, match="^linkage: expected a Linkage"):
         convert("RRR", solution())
     other = solution(2)
-    other = fj.Solution(
-        other.ts.at[1].add(1.0), other.q, other.qd, other.stats, other.result
-    )
+    other = eqx.tree_at(lambda s: s.ts, other, other.ts.at[1].add(1.0))
     with pytest.raises(ValueError, match="^solution.ts: expected the same times"):
         convert(arm, other)
     with pytest.raises(ValueError, match="traced"):
         jax.jit(lambda arm: convert(arm, solution()))(arm)
+
+
+def test_names_of_joints_of_any_number():
+    for topology in ("R", "RP", "RFPRR"):
+        n = len(topology)
+        arm = random_chain(topology, np.random.default_rng(n))
+        motion = solution()
+        rows = [np.ones((5, n))] * 2
+        motion = fj.Solution(motion.ts, *rows, motion.stats, motion.result)
+        names = [f"{kind}{k + 1}" for k, kind in enumerate(topology)]
+        columns = list(fj.to_pandas(arm, motion).columns)
+        assert [column.split()[0] for column in columns[:n]] == names
+        assert fj.to_xarray(arm, motion).joint.values.tolist() == names
 
 
 @pytest.mark.parametrize("name", ["xarray", "pandas"])

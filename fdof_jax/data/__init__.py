@@ -1,8 +1,7 @@
 """Tables of motions, files of pytrees, and export to other engines."""
 
 from .files import load, save
-from .mjcf import to_mjcf
-from .mjcf_import import from_mjcf
+from .mjcf import from_mjcf, to_mjcf
 from .tables import to_pandas, to_xarray
 
 __all__ = [

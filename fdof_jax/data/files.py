@@ -114,9 +114,8 @@ def load(path: str | os.PathLike, classes: Sequence[type] = ()) -> Any:
     classes or arguments, or if a constructor raises it.
     """
     path = file_path("path", path)
-    if not isinstance(classes, tuple | list) or not all(
-        isinstance(c, type) for c in classes
-    ):
+    several = isinstance(classes, tuple | list)
+    if not (several and all(isinstance(kind, type) for kind in classes)):
         raise refusal("classes", "a tuple of classes", classes)
     content = path.read_bytes()
     try:
@@ -144,10 +143,16 @@ def _is_record(kind: type) -> bool:
     return fields and not issubclass(kind, Motion)
 
 
+def _is_number(node: Any) -> bool:
+    return (
+        isinstance(node, int | float) or isinstance(node, str) and node in _NOT_FINITE
+    )
+
+
 def _begins_with_number(items: Any) -> bool:
     while isinstance(items, list) and items:
         items = items[0]
-    return isinstance(items, int | float) or items in ("inf", "-inf", "nan")
+    return _is_number(items)
 
 
 # From the tree to JSON
@@ -331,7 +336,6 @@ def _floats(node: Any) -> Any:
     """Returns nested lists of numbers with floats in the place of their names."""
     if isinstance(node, list):
         return [_floats(item) for item in node]
-    if isinstance(node, int | float):
-        return node
-    # NumPy would reserve the longest text for each number.
-    return _NOT_FINITE[node if isinstance(node, str) else ""]
+    if not _is_number(node):  # NumPy would reserve the longest text for each number
+        raise ValueError
+    return _NOT_FINITE.get(node, node)

@@ -1,6 +1,6 @@
 """Motions as xarray Datasets and pandas DataFrames (optional packages)."""
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -36,10 +36,10 @@ def to_xarray(linkage: Linkage, solution: Motion) -> "xarray.Dataset":
 
     The Dataset holds joint positions `q` and velocities `qd` over `time` and `joint`,
     and the solution's `outcome`, `num_steps` and `time_reached` for each trajectory; a
-    `SampledMotion` has `outcome` alone.
-    The joints are named R1, P2 and so on, with the coordinate `unit`; a joint of both
-    kinds within a batch is named by its number. Batch axes come first, as `batch` (or
-    `batch_1`, `batch_2` and so on). To name an axis and give it values, use
+    `SampledMotion` has `outcome` alone. The joints are named R1, P2 and so on, with the
+    coordinate `unit`; a joint of both kinds within a batch is named by its number.
+    Batch axes come first, as `batch` (or `batch_1`, `batch_2` and so on). To name an
+    axis and give it values, use
     `.rename(batch="payload").assign_coords(payload=masses)`.
 
     **Arguments:** `linkage`: that of the solution, one or a batch; `solution`: result
@@ -55,29 +55,26 @@ def to_xarray(linkage: Linkage, solution: Motion) -> "xarray.Dataset":
     times, batch = _checked(linkage, solution)
     names, units = names_and_units(linkage.ef)
     common = common_unit(units)
+
+    def variable(dims: list[str], values: Any, label: str, unit: str) -> tuple:
+        return dims, np.asarray(values), {"long_name": label, "units": unit}
+
     rows = [*batch, "time", "joint"]
     variables = {
-        "q": (rows, solution.q, "joint position", common),
-        "qd": (rows, solution.qd, "joint velocity", rate_unit(common)),
-        "outcome": (batch, solution.outcome, "how the trajectory ended", ""),
+        "q": variable(rows, solution.q, "joint position", common),
+        "qd": variable(rows, solution.qd, "joint velocity", rate_unit(common)),
+        "outcome": variable(batch, solution.outcome, "how the trajectory ended", ""),
     }
     if isinstance(solution, Solution):
         for name, unit in (("num_steps", "1"), ("time_reached", "s")):
-            label = name.replace("_", " ")
-            variables[name] = batch, solution.stats[name], label, unit
+            values, label = solution.stats[name], name.replace("_", " ")
+            variables[name] = variable(batch, values, label, unit)
     coordinates = {
-        "time": (["time"], times, "time", "s"),
-        "joint": (["joint"], names, "joint", ""),
-        "unit": (["joint"], units, "unit of the joint's position", ""),
+        "time": variable(["time"], times, "time", "s"),
+        "joint": variable(["joint"], names, "joint", ""),
+        "unit": variable(["joint"], units, "unit of the joint's position", ""),
     }
-
-    def labelled(found: dict[str, tuple]) -> dict[str, tuple]:
-        return {
-            name: (dims, np.asarray(values), {"long_name": label, "units": unit})
-            for name, (dims, values, label, unit) in found.items()
-        }
-
-    return xarray.Dataset(labelled(variables), labelled(coordinates))
+    return xarray.Dataset(variables, coordinates)
 
 
 def to_pandas(linkage: Linkage, solution: Motion) -> "pandas.DataFrame":

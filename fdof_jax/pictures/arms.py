@@ -1,30 +1,18 @@
 """An arm in pictures: where its parts are, and their lines and markers."""
 
-from textwrap import fill
 from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.markers import MarkerStyle
 from matplotlib.path import Path
 
 from ..base.array_namespace import in_numpy
-from ..base.checks import refusal, shown
 from ..linkage.frames import frames
 from ..linkage.linkage import Linkage, check_linkage, without_fixed
 from ..linkage.topology import letters
-from .axes import (
-    BLACK,
-    GREY,
-    SERIES,
-    figure_or_new,
-    filled_mapping,
-    plane_axes,
-    reached,
-    xy,
-)
+from .axes import BLACK, GREY, SERIES, xy
 from .elements import ELEMENT_STYLES, element_lines, element_marker
 
 
@@ -35,7 +23,6 @@ class Geometry(NamedTuple):
     """
 
     angle: np.ndarray  # absolute angles of links 0 to n [rad]: (time, n + 1)
-    slide: np.ndarray  # B_1 to B_n [m]: (time, n)
     kinds: str  # R, P or F of each joint
     points: dict[str, np.ndarray]  # by name of the part, in drawing order: (time, ...)
 
@@ -47,18 +34,27 @@ class Geometry(NamedTuple):
     def all_points(self) -> np.ndarray:
         return np.hstack(list(self.points.values()))
 
+    @property
+    def extent(self) -> float:
+        return float(max(np.ptp(part) for part in xy(self.all_points)))
 
-def geometry(linkage: Linkage, q: np.ndarray) -> Geometry:
-    """The `Geometry` of a linkage at joint positions (time, n)."""
+
+def geometry(
+    linkage: Linkage, q: np.ndarray, ts: np.ndarray | None = None, forces: Any = ()
+) -> Geometry:
+    """The `Geometry` of a linkage at joint positions (time, n).
+
+    With the times `ts` [s], the force elements that have a place are behind the arm.
+    """
     check_linkage(linkage)
-    linkage = in_numpy(linkage)
-    kinds = letters(linkage.ef)
-    f = frames(linkage, without_fixed(linkage, q))
-    start, direction, angle, slide = f.start, f.direction, f.angle, f.slide
-    end = start + linkage.length * direction
-    along, across = linkage.com.T
-    foot = start[:, 1:] + along * direction[:, 1:]  # mass centre projected on the link
-    center = foot + 1j * across * direction[:, 1:]
+    arm = in_numpy(linkage)
+    kinds = letters(arm.ef)
+    f = frames(arm, without_fixed(arm, q))
+    start, direction = f.start, f.direction
+    end = start + arm.length * direction
+    # Mass centres, projected on their links and in their places.
+    foot = start[:, 1:] + arm.com[:, 0] * direction[:, 1:]
+    center = f.mass_centers(arm)
 
     points = {}
     last = len(kinds)
@@ -77,16 +73,10 @@ def geometry(linkage: Linkage, q: np.ndarray) -> Geometry:
         if kind != "F":
             name = "pin" if kind == "R" else "slider"
             points[f"{name} {k + 1}"] = start[:, k + 1 : k + 2]
-    return Geometry(angle, slide, kinds, points)
-
-
-def with_elements(
-    g: Geometry, linkage: Linkage, forces: Any, ts: np.ndarray, q: np.ndarray
-) -> Geometry:
-    """Adds the force elements that have a place, behind the arm."""
-    size = float(max(np.ptp(part) for part in xy(g.all_points)))
-    lines = element_lines(linkage, forces, ts, q, size)
-    return g._replace(points=lines | g.points)
+    g = Geometry(f.angle, kinds, points)
+    if ts is None:
+        return g
+    return g._replace(points=element_lines(linkage, forces, f, ts, g.extent) | points)
 
 
 def link_color(link: int) -> str:
@@ -111,7 +101,13 @@ _STYLES: dict[str, dict[str, Any]] = {
     "slider": dict(markersize=15, mfc="white", mew=0.9),
     "tip": dict(marker="s", markersize=5),
 } | ELEMENT_STYLES
-_LABELS = {"pin": "pin", "mass": "mass centre", "tip": "tip"}
+# In a legend, where a carriage is level, and a line would not show an element.
+_SYMBOLS: dict[str, dict[str, Any]] = {
+    "slider": dict(marker=_CARRIAGE) | _STYLES["slider"]
+} | {
+    kind: dict(marker=element_marker(kind), markersize=13, mfc="none", mew=style["lw"])
+    for kind, style in ELEMENT_STYLES.items()
+}
 
 
 def _place(lines: dict[str, Line2D], g: Geometry, i: int) -> None:
@@ -134,7 +130,7 @@ def draw_arm(
     label: bool = True,
 ) -> dict[str, Line2D]:
     """Draws sample `i` and returns its lines by name; the name is also the `gid`."""
-    lines, labelled = {}, set()  # a kind is labelled once
+    lines, labels = {}, set()
     for name, points in g.points.items():
         kind, number = name.split()
         if kind == "mass" and not mass_centers:
@@ -145,21 +141,17 @@ def draw_arm(
         line.set(**_STYLES[kind])
         if color is not None:
             line.set_color(color)
+        lines[name] = line
+        names = {"link": name, "mass": "mass centre", "slider": "slide", "rail": None}
+        text = names.get(kind, kind)
         if name == "link 0":
             line.set_linewidth(1.2)
-        elif kind in ELEMENT_STYLES and kind not in labelled:
-            marker: Any = element_marker(kind)  # a line in the legend would not tell
-            shown = ax.plot([], [], marker=marker, ls="", label=kind, markersize=13)[0]
-            shown.set(color=line.get_color(), mfc="none", mew=line.get_linewidth())
-        elif label and kind == "slider" and kind not in labelled:
-            level = ax.plot([], [], marker=_CARRIAGE, ls="", label="slide")[0]
-            level.set(color=line.get_color(), **_STYLES["slider"])
-        elif label and kind in _LABELS and kind not in labelled:
-            line.set_label(_LABELS[kind])
-        elif label and kind == "link":
-            line.set_label(name)
-        labelled.add(kind)
-        lines[name] = line
+        elif label and text and text not in labels:
+            labels.add(text)
+            if kind in _SYMBOLS:
+                (line,) = ax.plot([], [], ls="", color=line.get_color())
+                line.set(**_SYMBOLS[kind])
+            line.set_label(text)
     _place(lines, g, i)
     return lines
 
@@ -198,43 +190,3 @@ def draw_motion(
         for i, alpha in zip(indices, np.linspace(1, 0.15, len(indices))[::-1])
     ]
     return DrawnMotion(line, arms)
-
-
-def geometries_of(motions: Any, forces: Any) -> dict[str, tuple[np.ndarray, Geometry]]:
-    """Times and geometry of each motion, with its force elements, by title."""
-    filled_mapping("motions", motions, "(Linkage, Solution)")
-    forces = (
-        {} if forces is None else filled_mapping("forces", forces, "force elements")
-    )
-    if unknown := forces.keys() - motions.keys():
-        raise refusal("forces", f"titles of motions, {list(motions)}", sorted(unknown))
-    found = {}
-    for title, pair in motions.items():
-        name = f"motions[{shown(title)}]"
-        fits = isinstance(pair, tuple) and len(pair) == 2
-        if not (fits and isinstance(pair[0], Linkage)):
-            raise refusal(name, "(Linkage, Solution)", pair)
-        ts, q, _ = reached(pair[0], pair[1], name)
-        g = geometry(pair[0], q)
-        found[title] = ts, with_elements(g, pair[0], forces.get(title, ()), ts, q)
-    return found
-
-
-def panels_of(
-    geometries: dict[str, tuple[np.ndarray, Geometry]], fig: Figure | None
-) -> tuple[Figure, list[Axes]]:
-    """A figure with a grid of axes, one per motion."""
-    columns = min(4, len(geometries))
-    rows = -(-len(geometries) // columns)
-    fig = figure_or_new(fig, 1.3 + 1.75 * columns, 0.4 + 1.9 * rows)
-    panels = []
-    for position, (title, (_, g)) in enumerate(geometries.items()):
-        ax = plane_axes(fig.add_subplot(rows, columns, position + 1), g.tip)
-        ax.set_aspect("equal", adjustable="datalim")
-        ax.set_title(fill(title, 18), fontsize="medium")  # no wider than its panel
-        ax.set(xlabel="", ylabel="")
-        ax.tick_params(labelsize="small")
-        panels.append(ax)
-    fig.supxlabel("x [m]", fontsize="medium")
-    fig.supylabel("y [m]", fontsize="medium")
-    return fig, panels

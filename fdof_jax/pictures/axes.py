@@ -1,6 +1,6 @@
 """Colours, figures, axes, legends and argument checks shared by all pictures."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -59,8 +59,14 @@ def axes_or_new(ax: Any, height: float) -> Axes:
     return ax
 
 
-def time_panels(fig: Figure, ts: np.ndarray, panels: list) -> list[Axes]:
-    """Plots panels (y label, [(label, values, colour), ...]) over time, stacked."""
+def time_panels(
+    fig: Any, height: float, ts: np.ndarray, panels: list
+) -> tuple[Figure, list[Axes]]:
+    """Plots panels (y label, [(label, values, colour), ...]) over time, stacked.
+
+    A new figure has the given `height` [inches].
+    """
+    fig = figure_or_new(fig, 3.5, height)
     axes = list(fig.subplots(len(panels), squeeze=False, sharex=True)[:, 0])
     for ax, (ylabel, curves) in zip(axes, panels):
         for label, values, color in curves:
@@ -68,7 +74,7 @@ def time_panels(fig: Figure, ts: np.ndarray, panels: list) -> list[Axes]:
         ax.set_ylabel(ylabel)
     axes[-1].set_xlabel("time [s]")
     fig.align_ylabels(axes)
-    return axes
+    return fig, axes
 
 
 def xy(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -95,20 +101,34 @@ def plane_axes(ax: Any, points: np.ndarray, *, beside: float = 0.0) -> Axes:
     return ax
 
 
+def figure_of(ax: Axes) -> Figure:
+    figure = ax.get_figure(root=True)
+    assert figure is not None  # axes are always in a figure
+    return figure
+
+
+def _entries(axes: Iterable[Axes]) -> dict[str, Any]:
+    """Handles of a legend by label; of equal labels, the last one's."""
+    entries = {}
+    for ax in axes:
+        handles, labels = ax.get_legend_handles_labels()
+        entries |= dict(zip(labels, handles))
+    return entries
+
+
+_LEGEND: dict[str, Any] = dict(fontsize="small", frameon=False, handlelength=1.2)
+
+
 def legend(ax: Axes, *others: Axes) -> None:
     """Adds a legend of all labels above the axes, where it hides nothing."""
-    found = {}
-    for handles, labels in (a.get_legend_handles_labels() for a in (ax, *others)):
-        found |= dict(zip(labels, handles))
-    figure, columns = ax.get_figure(root=True), max(1, 48 // (4 + max(map(len, found))))
-    assert figure is not None  # axes are always in a figure
-    rows = -(-len(found) // columns)
+    entries, figure = _entries((ax, *others)), figure_of(ax)
+    columns = max(1, 48 // (4 + max(map(len, entries))))
+    rows = -(-len(entries) // columns)
     while True:
-        columns = -(-len(found) // rows)  # makes rows of even length
+        columns = -(-len(entries) // rows)  # makes rows of even length
         drawn = ax.legend(
-            list(found.values()), list(found), ncols=columns, fontsize="small",
-            frameon=False, handlelength=1.2, columnspacing=1,
-            loc="lower left", bbox_to_anchor=(0, 1), borderaxespad=0.2,
+            entries.values(), entries.keys(), ncols=columns, columnspacing=1,
+            loc="lower left", bbox_to_anchor=(0, 1), borderaxespad=0.2, **_LEGEND,
         )  # fmt: skip
         # Equal scales shrink the axes after a layout, so that one alone cuts labels.
         figure.draw_without_rendering()
@@ -121,11 +141,5 @@ def figure_legend(fig: Figure) -> None:
     """Adds one legend of all labels in the figure beside its axes, or replaces it."""
     for old in fig.legends:
         old.remove()
-    found = {}
-    for ax in fig.axes:
-        handles, labels = ax.get_legend_handles_labels()
-        found |= dict(zip(labels, handles))
-    fig.legend(
-        list(found.values()), list(found), loc="outside right upper",
-        fontsize="small", frameon=False, handlelength=1.2,
-    )  # fmt: skip
+    entries = _entries(fig.axes)
+    fig.legend(entries.values(), entries.keys(), loc="outside right upper", **_LEGEND)

@@ -9,31 +9,41 @@ reached are drawn. Link 0 is the ground, links 1, 2, ... move.
 Malformed arguments raise ValueError. Curves over time are in `plotting`.
 """
 
-from collections.abc import Mapping
+import sys
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
+from pathlib import Path
+from textwrap import fill
 from typing import Any
 
+import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.animation import FuncAnimation
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
+from PIL import Image
 
-from ..base.checks import real_array, whole_number
+from ..base.checks import real_array, refusal, shown, whole_number
 from ..forces.element import Forces
 from ..linkage.linkage import Linkage, check_linkage, per_joint
 from ..simulation.sampled import Motion
-from .animation import animation_of, frame_times
-from .arms import (
-    draw_arm,
-    draw_ground,
-    draw_motion,
-    geometries_of,
-    geometry,
-    panels_of,
-    with_elements,
+from .arms import Geometry, draw_arm, draw_ground, draw_motion, geometry
+from .axes import (
+    BLACK,
+    GREY,
+    SERIES,
+    figure_legend,
+    figure_of,
+    figure_or_new,
+    filled_mapping,
+    legend,
+    plane_axes,
+    reached,
+    xy,
 )
-from .axes import BLACK, GREY, SERIES, figure_legend, legend, plane_axes, reached
 from .workspace import force_ellipses, inertia_ellipses, workspace
 
 __all__ = [
@@ -79,7 +89,7 @@ def draw_linkage(
     """
     check_linkage(linkage)
     q = np.asarray(per_joint("q", q, linkage))[None]
-    g = with_elements(geometry(linkage, q), linkage, forces, np.zeros(1), q)
+    g = geometry(linkage, q, np.zeros(1), forces)
     panel = plane_axes(ax, g.all_points)
     draw_ground(panel)
     draw_arm(panel, g, 0, mass_centers, alpha, color)
@@ -141,8 +151,8 @@ def topology_grid(
     spaced in samples from the first (faint) to the last.
     """
     whole_number("configurations", configurations, 2)
-    geometries = geometries_of(motions, forces)
-    fig, panels = panels_of(geometries, fig)
+    geometries = _geometries(motions, forces)
+    fig, panels = _panels(geometries, fig)
     for ax, (ts, g) in zip(panels, geometries.values()):
         indices = np.linspace(0, len(ts) - 1, configurations).round().astype(int)
         draw_motion(ax, g, np.unique(indices), mass_centers=False)
@@ -178,13 +188,12 @@ def animate(
     ts, q, _ = reached(linkage, solution)
     shown = ts <= _last(ts, until)
     ts, q = ts[shown], q[shown]
-    times, pause = frame_times([ts], fps, speed, max_frames)
-    g = with_elements(geometry(linkage, q), linkage, forces, ts, q)
-    panel, new = plane_axes(ax, g.all_points), ax is None
-    figure = panel.get_figure(root=True)
-    if new and figure is not None:
-        figure.set_figwidth(4.8)  # the legend stands beside
-    return animation_of([panel], [(ts, g)], times, pause, panel.set_title, new)
+    times, pause = _frame_times([ts], fps, speed, max_frames)
+    g = geometry(linkage, q, ts, forces)
+    panel = plane_axes(ax, g.all_points)
+    if ax is None:
+        figure_of(panel).set_figwidth(4.8)  # the legend stands beside
+    return _animation([panel], [(ts, g)], times, pause, panel.set_title, ax is None)
 
 
 def animate_grid(
@@ -203,9 +212,169 @@ def animate_grid(
 
     **Returns:** the animation, as in `animate`.
     """
-    geometries = geometries_of(motions, forces)
-    shown = list(geometries.values())
-    times, pause = frame_times([ts for ts, _ in shown], fps, speed, max_frames)
-    figure, panels = panels_of(geometries, fig)
+    geometries = _geometries(motions, forces)
+    pairs = list(geometries.values())
+    times, pause = _frame_times([ts for ts, _ in pairs], fps, speed, max_frames)
+    figure, panels = _panels(geometries, fig)
     say = partial(figure.suptitle, x=0.02, ha="left")  # the legend is on the right
-    return animation_of(panels, shown, times, pause, say, fig is None)
+    return _animation(panels, pairs, times, pause, say, fig is None)
+
+
+def _geometries(motions: Any, forces: Any) -> dict[str, tuple[np.ndarray, Geometry]]:
+    """Times and geometry of each motion, with its force elements, by title."""
+    filled_mapping("motions", motions, "(Linkage, Solution)")
+    if forces is not None:
+        filled_mapping("forces", forces, "force elements")
+    forces = forces or {}
+    if unknown := forces.keys() - motions.keys():
+        raise refusal("forces", f"titles of motions, {list(motions)}", sorted(unknown))
+    geometries = {}
+    for title, pair in motions.items():
+        name = f"motions[{shown(title)}]"
+        fits = isinstance(pair, tuple) and len(pair) == 2
+        if not (fits and isinstance(pair[0], Linkage)):
+            raise refusal(name, "(Linkage, Solution)", pair)
+        ts, q, _ = reached(pair[0], pair[1], name)
+        geometries[title] = ts, geometry(pair[0], q, ts, forces.get(title, ()))
+    return geometries
+
+
+def _panels(
+    geometries: dict[str, tuple[np.ndarray, Geometry]], fig: Figure | None
+) -> tuple[Figure, list[Axes]]:
+    """A figure with a grid of axes, one per motion."""
+    columns = min(4, len(geometries))
+    rows = -(-len(geometries) // columns)
+    fig = figure_or_new(fig, 1.3 + 1.75 * columns, 0.4 + 1.9 * rows)
+    panels = []
+    for position, (title, (_, g)) in enumerate(geometries.items()):
+        ax = plane_axes(fig.add_subplot(rows, columns, position + 1), g.tip)
+        ax.set_aspect("equal", adjustable="datalim")
+        ax.set_title(fill(title, 18), fontsize="medium")  # no wider than its panel
+        ax.set(xlabel="", ylabel="")
+        ax.tick_params(labelsize="small")
+        panels.append(ax)
+    fig.supxlabel("x [m]", fontsize="medium")
+    fig.supylabel("y [m]", fontsize="medium")
+    return fig, panels
+
+
+def _frame_times(
+    timelines: list[np.ndarray], fps: ArrayLike, speed: ArrayLike, max_frames: int
+) -> tuple[np.ndarray, float]:
+    """Times of the frames, and the pause between two frames [ms]."""
+    fps = float(real_array("fps", fps, (), above=0))
+    speed = float(real_array("speed", speed, (), above=0))
+    most = whole_number("max_frames", max_frames, 1)
+    begin, end = min(ts[0] for ts in timelines), max(ts[-1] for ts in timelines)
+    duration = (end - begin) / speed
+    frames = min(most, int(np.ceil(duration * fps)) + 1)
+    pause = duration / (frames - 1) if frames > 1 else 1 / fps
+    return np.linspace(begin, end, frames), 1000 * pause
+
+
+def _animation(
+    panels: list[Axes],
+    motions: list[tuple[np.ndarray, Geometry]],
+    times: np.ndarray,
+    pause: float,
+    say: Callable[..., Any],
+    new: bool,
+) -> FuncAnimation:
+    """Animates motions in panels of a `new` or given figure; `say` writes the time."""
+    moving = []
+    for ax, (ts, g) in zip(panels, motions):
+        samples = np.array([np.abs(ts - t).argmin() for t in times])
+        moving.append((g, draw_motion(ax, g, samples[:1], mass_centers=True), samples))
+        ax.update_datalim(np.column_stack(xy(g.all_points)))  # of all samples
+
+    def show(frame: int) -> Artist:
+        for g, drawn, samples in moving:
+            drawn.move(g, samples[frame : frame + 1])
+        return say(f"t = {times[frame]:.2f} s", fontsize="medium")
+
+    artists = [line for _, drawn, _ in moving for line in drawn.lines] + [show(0)]
+    figure = figure_of(panels[0])
+    if new or len(panels) > 1:
+        figure_legend(figure)
+    figure.draw_without_rendering()
+    for ax in panels:
+        ax.autoscale(False)
+        ax.set_adjustable("box")
+    if new:
+        figure.draw_without_rendering()  # the layout of the limits just fixed
+        figure.set_layout_engine("none")  # a layout per frame takes half the time
+    return _MotionAnimation(figure, show, len(times), pause, artists)
+
+
+class _MotionAnimation(FuncAnimation):
+    """An animation that a notebook plays if it is the last line of a cell."""
+
+    def __init__(
+        self, figure: Figure, show: Any, count: int, pause: float, moving: list[Artist]
+    ):
+        super().__init__(figure, show, count, interval=pause, cache_frame_data=False)  # type: ignore[arg-type]
+        self._figure, self._show = figure, show
+        self._count, self._pause, self._moving = count, pause, moving
+
+    def save(self, filename: Any, *args: Any, **kwargs: Any) -> None:
+        """Writes a file, and a progress bar to the standard error output.
+
+        By default a GIF is written by pillow, and only what moves is drawn again.
+        """
+        name = Path(filename).name
+        if args or "writer" in kwargs:  # a notebook's, too, which shows no bar
+            return super().save(filename, *args, **kwargs)
+        kwargs.setdefault("progress_callback", partial(_progress, name))
+        if not name.endswith(".gif"):
+            return super().save(filename, **kwargs)
+        self._draw_was_started = True  # matplotlib warns of what is never shown
+        first, *others = self._images(kwargs["progress_callback"], kwargs.get("dpi"))
+        # The format counts hundredths of a second; rounding each pause would add up.
+        ends = np.round(self._pause / 10 * np.arange(self._count + 1))
+        pauses = (10 * np.diff(ends).astype(int)).tolist()
+        first.save(
+            filename, save_all=True, append_images=others, duration=pauses, loop=0
+        )
+
+    def _images(self, progress: Any, dpi: float | None) -> Iterator[Image.Image]:
+        """Draws the frames over one picture of what stands still."""
+        figure = self._figure
+        before, figure.dpi = figure.dpi, dpi or figure.dpi
+        canvas = FigureCanvasAgg(figure)
+        for artist in self._moving:
+            artist.set_animated(True)
+        canvas.draw()
+        still = canvas.copy_from_bbox(figure.bbox)
+        for frame in range(self._count):
+            self._show(frame)
+            canvas.restore_region(still)
+            for artist in self._moving:
+                figure.draw_artist(artist)
+            image = Image.fromarray(np.array(canvas.buffer_rgba())).convert("RGB")
+            yield image.quantize(
+                method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE
+            )
+            if progress is not None:
+                progress(frame, self._count)
+        for artist in self._moving:
+            artist.set_animated(False)
+        figure.dpi = before
+
+    def to_jshtml(self, *args: Any, **kwargs: Any) -> str:
+        plt.close(self._figure)  # otherwise a notebook also shows the still figure
+        return super().to_jshtml(*args, **kwargs)
+
+    def __repr__(self) -> str:
+        return "an animation"  # without an address, the same in each run of a notebook
+
+    def _repr_html_(self) -> str:
+        return self.to_jshtml()
+
+
+def _progress(name: str, frame: int, frames: int) -> None:
+    done = 30 * (frame + 1) // frames
+    # In a file each new bar would follow the last.
+    if done > 30 * frame // frames and (done == 30 or sys.stderr.isatty()):
+        bar, end = "#" * done + "." * (30 - done), "\n" if done == 30 else ""
+        print(f"\r{name} [{bar}]", end=end, file=sys.stderr, flush=True)

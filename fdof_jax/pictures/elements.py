@@ -12,8 +12,8 @@ from ..forces.actuators import LinearActuator
 from ..forces.element import elements_on
 from ..forces.joints import JointStops
 from ..forces.points import Point, SpringDamper, Tension, Wrench
-from ..linkage.frames import Frames, frames
-from ..linkage.linkage import Linkage, without_fixed
+from ..linkage.frames import Frames
+from ..linkage.linkage import Linkage
 from ..linkage.topology import letters
 from ..references.reference import Reference
 from ..references.task import TipTask
@@ -23,12 +23,9 @@ from .axes import BLACK, xy
 _WIDTH, _ARROW, _HEAD, _ARC = 0.025, 0.3, 0.05, 0.08
 
 COMMANDED: dict[str, Any] = dict(color=BLACK, lw=0.8, ls=(0, (5, 3)))
+_THIN: dict[str, Any] = dict(color=BLACK, lw=0.8)
 ELEMENT_STYLES: dict[str, dict[str, Any]] = {
-    "spring": dict(color=BLACK, lw=0.8, solid_joinstyle="round"),
-    "damper": dict(color=BLACK, lw=0.8),
-    "bumper": dict(color=BLACK, lw=0.8, solid_joinstyle="round"),
-    "cable": dict(color=BLACK, lw=0.8),
-    "tension": dict(color=BLACK, lw=0.8),
+    **dict.fromkeys(("spring", "damper", "bumper", "cable", "tension"), _THIN),
     "cylinder": dict(color=BLACK, lw=1.0),
     "wrench": dict(color=BLACK, lw=1.6, solid_joinstyle="miter"),
     "stops": dict(color=BLACK, lw=1.2),
@@ -37,44 +34,45 @@ ELEMENT_STYLES: dict[str, dict[str, Any]] = {
 
 
 def element_lines(
-    linkage: Linkage, forces: Any, ts: np.ndarray, q: np.ndarray, size: float
+    linkage: Linkage, forces: Any, f: Frames, ts: np.ndarray, size: float
 ) -> dict[str, np.ndarray]:
     """Lines (time, points) of the elements that have a place, as x + iy [m].
 
-    A line's name is its kind and the element's index; NaN lifts the pen. `size`: extent
-    of the arm [m]. Arrows show forces of all wrenches on one scale.
+    A line's name is its kind and the element's index; NaN lifts the pen. `f`: the arm's
+    frames at times `ts` [s]; `size`: its extent [m]. Arrows show forces of all wrenches
+    on one scale.
     """
-    found = elements_on(linkage, forces)
-    for element in found:
+    given = elements_on(linkage, forces)
+    for element in given:
         element.check(linkage, jnp.asarray(ts))
-    arm = in_numpy(linkage)
-    kinds = letters(arm.ef)
-    f = frames(arm, without_fixed(arm, q))
+    acting = in_numpy(given)
     pushes = {
         k: _push(element, linkage, f, ts)
-        for k, element in enumerate(found)
+        for k, element in enumerate(acting)
         if isinstance(element, Wrench)
     }
+    most = [
+        max(np.abs(part).max() for part in parts) for parts in zip(*pushes.values())
+    ]
     lines = {}
-    for k, element in enumerate(found):
-        kind, strokes = "", []
+    for k, element in enumerate(acting):
+        kind, strokes, points = "", [], []
         if isinstance(element, SpringDamper | Tension):
             kind, strokes = _between(element, f, size)
         elif isinstance(element, LinearActuator):
             kind, strokes = "cylinder", _cylinder(element, f, size)
         elif isinstance(element, Wrench):
-            most = [max(np.abs(p[i]).max() for p in pushes.values()) for i in (0, 1)]
-            kind = "wrench"
+            kind, points = "wrench", [element.point]
             strokes = _arrows(_place(element.point, f), *pushes[k], most, size)
-            strokes = strokes and [*strokes, *_support(element.point, arm, f, size)]
         elif isinstance(element, JointStops):
-            kind, strokes = "stops", _stops(element, linkage, kinds, f, size)
-        elif (path := _commanded(element)) is not None:
+            kind, strokes = "stops", _stops(element, linkage, f, size)
+        elif (path := _commanded(given[k])) is not None:
             kind, strokes = "commanded", [np.tile(path, (len(ts), 1))]
         if isinstance(element, SpringDamper | Tension | LinearActuator):
-            for point in (element.a, element.b):
-                strokes += _support(point, arm, f, size)
+            points = [element.a, element.b]
         if strokes:
+            for point in points:
+                strokes += _support(point, linkage, f, size)
             lift = np.full((len(ts), 1), np.nan + 0j)
             parts = [part for stroke in strokes for part in (stroke, lift)]
             lines[f"{kind} {k}"] = np.hstack(parts[:-1])
@@ -83,34 +81,32 @@ def element_lines(
 
 def _commanded(element: Any) -> np.ndarray | None:
     """The path on which a controller leads the tip, once around, or None."""
+    share = jnp.linspace(0, 1, 201)
     is_reference = lambda part: isinstance(part, Reference)
     for part in jax.tree.leaves(element, is_leaf=is_reference):
         if isinstance(part, TipTask):
-            share = jnp.linspace(0, 1, 201)
             return np.asarray(jax.vmap(part.path.point)(share)) @ [1, 1j]
         if is_reference(part) and part.tip is not None and part.period is not None:
-            turn = float(part.period) * np.linspace(0, 1, 201)
-            return np.asarray(jax.vmap(part.tip)(turn)) @ [1, 1j]
+            return np.asarray(jax.vmap(part.tip)(part.period * share)) @ [1, 1j]
     return None
 
 
 def _place(point: Point, f: Frames) -> np.ndarray:
     """Places of a point (time, 1)."""
-    link = int(point.link)
-    offset = float(point.along) + 1j * float(point.across)
-    return (f.start[:, link] + offset * f.direction[:, link])[:, None]
+    offset = point.along + 1j * point.across
+    return (f.start[:, point.link] + offset * f.direction[:, point.link])[:, None]
 
 
 def _support(point: Point, arm: Linkage, f: Frames, size: float) -> list[np.ndarray]:
     """What holds a point: hatched ground, or a bracket from its link's line."""
-    place, link = _place(point, f), int(point.link)
+    place, link = _place(point, f), point.link
     if link == 0:
         hatches = [np.array([x, x - 0.7 - 0.9j]) for x in (-0.6, 0.4, 1.4)]
         strokes = [np.array([-1.4, 1.4]), *hatches]
         return [place + _WIDTH * size * stroke for stroke in strokes]
     low, high = sorted((0.0, float(arm.length[link])))
-    nearest = min(max(float(point.along), low), high)
-    foot = _place(Point(link, nearest), f)
+    along = np.clip(point.along, low, high)
+    foot = (f.start[:, link] + along * f.direction[:, link])[:, None]
     away = np.abs(foot - place).max() > _WIDTH * size
     return [np.hstack([foot, place])] if away else []
 
@@ -167,17 +163,17 @@ def _between(element: Any, f: Frames, size: float) -> tuple[str, list[np.ndarray
     a, length, unit = _ends(element, f)
     if isinstance(element, Tension):
         return "tension", [a + unit * length * np.array([0, 1])]
-    rest, side = float(element.rest_length), int(element.side or 0)
-    if side == 1:
+    rest = element.rest_length
+    if element.side == 1:
         u = np.linspace(0, 1, 21)
         # The sag of a shallow parabola that is longer than its chord by the slack.
         sag = np.sqrt(0.375 * length * np.maximum(rest - length, 0))
         return "cable", [a + unit * length * u - 4j * sag * u * (1 - u)]
     symbol, kind = _ZIGZAG, "spring"
-    if float(element.damping) > 0:
-        dry = float(element.stiffness) == 0
+    if element.damping > 0:
+        dry = element.stiffness == 0
         symbol, kind = (_DASHPOT, "damper") if dry else (_BOTH, "spring")
-    if side == -1:  # as long as it is at rest, with a plate at its free end
+    if element.side == -1:  # as long as it is at rest, with a plate at its free end
         length, kind = np.minimum(length, rest), "bumper"
         symbol = [*symbol, np.array([1 + 1.5j, 1 - 1.5j])]
     width = _WIDTH * size
@@ -200,7 +196,7 @@ def _push(
 ) -> tuple[np.ndarray, np.ndarray]:
     """The force x + iy and the moment of a wrench (time, 1)."""
     force, moment = jax.vmap(lambda t: element.schedule(t, linkage))(ts)
-    along = f.direction[:, int(element.point.link)] if element.follows else 1
+    along = f.direction[:, element.point.link] if element.follows else 1
     return (np.asarray(force) * along)[:, None], np.asarray(moment)[:, None]
 
 
@@ -213,10 +209,10 @@ def _arrows(
 ) -> list[np.ndarray]:
     """A straight arrow for a force, and one around the point for a moment."""
     strokes = []
-    if most[0] > 0 and np.any(force):
+    if np.any(force):
         shaft = _ARROW * size * force / most[0]
         strokes += [place + shaft * np.array([0, 1]), _head(place + shaft, shaft, size)]
-    if most[1] > 0 and np.any(moment):
+    if np.any(moment):
         sweep = 1.6 * np.pi * moment / most[1]
         spoke = _ARC * size * np.exp(1j * sweep * np.linspace(0, 1, 41))
         tip, along = spoke[:, -1:], 1j * spoke[:, -1:] * sweep
@@ -232,21 +228,20 @@ def _head(tip: np.ndarray, along: np.ndarray, size: float) -> np.ndarray:
 
 
 def _stops(
-    element: JointStops, linkage: Linkage, kinds: str, f: Frames, size: float
+    element: JointStops, linkage: Linkage, f: Frames, size: float
 ) -> list[np.ndarray]:
     """Bars at the ends of each joint's range, joined by an arc around a pin."""
+    kinds, radius, strokes = letters(linkage.ef), 1.2 * _ARC * size, []
     ends = np.broadcast_arrays(element.lower, element.upper, np.zeros(len(kinds)))[:2]
-    strokes = []
     for k, (kind, low, high) in enumerate(zip(kinds, *ends)):
-        along = f.direction[:, k : k + 1]
+        along, pin = f.direction[:, k : k + 1], f.start[:, k + 1 : k + 2]
         finite = [end for end in (low, high) if np.isfinite(end)]
-        for end in finite if kind == "R" else ():
-            bar = np.array([0.8, 1.2]) * 1.2 * _ARC * size
-            strokes.append(f.start[:, k + 1 : k + 2] + along * np.exp(1j * end) * bar)
+        if kind == "R":
+            bar = radius * np.array([0.8, 1.2])
+            strokes += [pin + along * np.exp(1j * end) * bar for end in finite]
         if kind == "R" and len(finite) == 2:
             turns = np.linspace(low, min(high, low + 2 * np.pi), 41)
-            arc = 1.2 * _ARC * size * np.exp(1j * turns)
-            strokes.append(f.start[:, k + 1 : k + 2] + along * arc)
+            strokes.append(pin + along * radius * np.exp(1j * turns))
         if kind == "P" and finite:  # bars across the rail, and the rail between them
             foot = f.start[:, k : k + 1] + along * float(linkage.length[k])
             bars = [1j * e + np.array([-2, 2, 0]) * _WIDTH * size for e in finite]

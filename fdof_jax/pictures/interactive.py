@@ -59,15 +59,14 @@ def _moved(scene: Scene, stretch: Array, factor: Array) -> _Moved:
     linkage = scene.linkage.replace(
         length=length.at[1:].multiply(stretch), com=com.at[:, 0].multiply(stretch)
     )
-    controller = controller_of(scene)
     gains = factor * gains_of(scene)
     scene = with_gains(scene._replace(linkage=linkage), gains)
     ts = jnp.linspace(0, scene.t1, _SAMPLES)
     solution = simulate(
-        linkage, scene.state0, ts, scene.forces, solver=LoopedDopri8(),
-        rtol=_TOLERANCE, atol=_TOLERANCE, max_steps=_MAX_STEPS, throw=False,
+        scene, ts, solver=LoopedDopri8(), rtol=_TOLERANCE, atol=_TOLERANCE,
+        max_steps=_MAX_STEPS, throw=False,
     )  # fmt: skip
-    task: Any = controller.reference
+    task: Any = controller_of(scene).reference
     positions, _ = jax.vmap(lambda t: task(t, linkage))(ts)
     commanded = jax.vmap(task.tip)(ts)
     return _Moved(scene, solution, commanded, jnp.isfinite(positions).all(axis=1))
@@ -85,12 +84,12 @@ def _report(moved: _Moved, error: np.ndarray) -> str:
     else:
         text = f"Tip error: rms {1e3 * np.sqrt(np.mean(error**2)):.3g} mm."
     linkage, controller = moved.scene.linkage, controller_of(moved.scene)
+    columns = joint_names(linkage), gains_of(moved.scene).T, linkage.length[1:]
     rows = []
-    for k, joint in enumerate(joint_names(linkage)):
-        p_unit, d_unit = controller.gain_units[joint[0]]
-        (kp, kd), length = gains_of(moved.scene)[:, k], linkage.length[k + 1]
-        gains = f"{float(kp):.4g} {p_unit}", f"{float(kd):.4g} {d_unit}"
-        rows.append((joint, *gains, f"link {k + 1}: {float(length):.3g} m"))
+    for k, (joint, gains, length) in enumerate(zip(*columns), start=1):
+        units = controller.gain_units[joint[0]]
+        texts = [f"{float(gain):.4g} {unit}" for gain, unit in zip(gains, units)]
+        rows.append((joint, *texts, f"link {k}: {float(length):.3g} m"))
     return text + html_table(rows, ("joint", "kp", "kd", "length after it"))
 
 
@@ -188,23 +187,22 @@ def sliders(scenes: Mapping[str, Scene] | None = None) -> Any:
     **Raises:** ImportError without ipywidgets; ValueError for malformed arguments.
     """
     widgets = optional_package("ipywidgets", "notebook")
-    known = {}
+    options = {}
     scenes = circle_scenes() if scenes is None else scenes
     for name, scene in filled_mapping("scenes", scenes, "Scene").items():
-        instance(f"scenes[{shown(name)}]", scene, Scene)
+        place = f"scenes[{shown(name)}]"
+        instance(place, scene, Scene)
         task = controller_of(scene).reference
         if reference_of(task).tip is None:
-            raise refusal(
-                f"scenes[{shown(name)}]", "a controller of a task with a tip", task
-            )
+            raise refusal(place, "a controller of a task with a tip", task)
         # As an array, so that other times do not compile again.
-        known[name] = scene._replace(t1=jnp.asarray(scene.t1, float))
+        options[name] = scene._replace(t1=jnp.asarray(scene.t1, float))
 
-    sizes = {joints_of(scene.linkage) for scene in known.values()}
+    sizes = {joints_of(scene.linkage) for scene in options.values()}
     if len(sizes) > 1:
         raise refusal("scenes", "arms of one number of joints", sizes)
     numbers = range(1, sizes.pop() + 1)
-    arm = widgets.Dropdown(options=list(known), description="arm")
+    arm = widgets.Dropdown(options=list(options), description="arm")
     lengths = [
         widgets.FloatSlider(1.0, min=0.5, max=1.5, step=0.01, description=f"link {n}")
         for n in numbers
@@ -219,12 +217,12 @@ def sliders(scenes: Mapping[str, Scene] | None = None) -> Any:
         for k in numbers
     ]
     image, words = widgets.Image(format="png"), widgets.HTML()
-    pictures = {name: _Picture() for name in known}
+    pictures = {name: _Picture() for name in options}
 
     def redraw(change: Any = None) -> None:
         stretch = jnp.array([slider.value for slider in lengths])
         factor = jnp.array([slider.value for slider in gains]).reshape(2, -1)
-        moved = _moved(known[arm.value], stretch, factor)
+        moved = _moved(options[arm.value], stretch, factor)
         image.value, error = pictures[arm.value].draw(moved)
         words.value = _report(moved, error)
 

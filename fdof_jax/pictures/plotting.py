@@ -6,21 +6,33 @@ linkage itself.
 """
 
 from collections.abc import Mapping
-from typing import Any
+from itertools import cycle
+from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+import scipy
+from matplotlib import colormaps
 from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
+from matplotlib.legend import Legend
 from numpy.typing import ArrayLike
 
 from ..analysis.responses import StepAndSine
 from ..base.checks import instance, real_array, refusal, shown
+from ..base.user_warnings import warn
 from ..control.drives import PIDController
 from ..control.pd import PDController
-from ..forces.element import Forces, elements
+from ..dynamics import energy, link_energies
+from ..forces.element import Forces, InertialElement, elements
 from ..linkage.linkage import Linkage, joint_names, moving_joints
+from ..references.reference import reference_of
+from ..references.task import TipReference
 from ..simulation.efforts import joint_efforts
-from ..simulation.sampled import Motion
+from ..simulation.sampled import Motion, SampledMotion, acting_in
 from .arms import geometry, link_color
 from .axes import (
     BLACK,
@@ -31,11 +43,12 @@ from .axes import (
     figure_or_new,
     filled_mapping,
     legend,
+    plane_axes,
     reached,
     time_panels,
+    xy,
 )
-from .energies import energy_profile, energy_stack
-from .tracking import tracking, tracking_by_error, tracking_error
+from .elements import COMMANDED
 
 __all__ = [
     "effort_profile", "energy_profile", "energy_stack",
@@ -65,13 +78,130 @@ def motion_profile(
             degrees = np.rad2deg(g.angle[:, k])
             angles.append((rf"$\theta_{k}$", degrees, link_color(k)))
         elif kind == "P":
-            slides.append((f"$B_{k}$", g.slide[:, k - 1], link_color(k)))
+            slides.append((f"$B_{k}$", q[:, k - 1], link_color(k)))
     panels = [("absolute angle [degrees]", angles), ("slide [m]", slides)]
     panels = [panel for panel in panels if panel[1]]
-    fig = figure_or_new(fig, 3.5, 0.6 + 1.9 * len(panels))
-    for ax in time_panels(fig, ts, panels):
+    fig, axes = time_panels(fig, 0.6 + 1.9 * len(panels), ts, panels)
+    for ax in axes:
         legend(ax)
     return fig
+
+
+def energy_profile(
+    linkage: Linkage, solution: Motion, fig: Figure | None = None
+) -> Figure:
+    """Plots kinetic and potential energy of each link and of all over time [J]."""
+    ts, q, qd = reached(linkage, solution)
+    energies = jax.vmap(lambda q, qd: link_energies(linkage, q, qd))(q, qd)
+    kinetic, potential = map(np.asarray, energies)
+    links = range(1, kinetic.shape[1] + 1)
+    names, colors = [f"link {k}" for k in links], [link_color(k) for k in links]
+    sums = kinetic.sum(axis=1), potential.sum(axis=1), (kinetic + potential).sum(axis=1)
+    whole = zip(("kinetic", "potential", "total"), sums, (*SERIES[3:5], BLACK))
+    panels = [
+        ("kinetic energy [J]", list(zip(names, kinetic.T, colors))),
+        ("potential energy [J]", list(zip(names, potential.T, colors))),
+        ("of all links [J]", list(whole)),
+    ]
+    fig, (top, _, bottom) = time_panels(fig, 6.0, ts, panels)
+    legend(top)
+    legend(bottom)
+    return fig
+
+
+def _powers(linkage: Linkage, forces: Forces, solution: Motion) -> np.ndarray:
+    """Power of each element on the arm (element, time) [W].
+
+    Exchange with an element's own potential energy (of a spring) does not count.
+    """
+    efforts = joint_efforts(linkage, forces, solution).elements
+    powers = jnp.einsum("etj,tj->et", efforts, solution.qd)
+    for k, element in enumerate(forces):
+        # The efforts of an inertial element exclude those of its potential energy.
+        if isinstance(element, InertialElement) or element.potential_energy is None:
+            continue
+        stored = lambda q, of=element.potential_energy: of(q, linkage)
+        _, rates = jax.jvp(jax.vmap(stored), (solution.q,), (solution.qd,))
+        powers = powers.at[k].add(rates)
+    return np.asarray(powers)
+
+
+def _works(
+    linkage: Linkage, forces: Forces, solution: Motion, ts: np.ndarray
+) -> list[np.ndarray]:
+    """Energies put in and taken out by the elements up to each of `ts` (time,) [J]."""
+    powers = _powers(linkage, forces, solution)[:, : len(ts)]
+    signs = (1, -1)
+    if not isinstance(solution, SampledMotion):
+        return [_integral(np.maximum(sign * powers, 0), ts) for sign in signs]
+    # The power of held efforts jumps, but their work is known: in each period that of
+    # the last command, until the next one begins to act, and that of the next.
+    q, tau = np.asarray(solution.q)[: len(ts)], np.asarray(solution.tau)[: len(ts) - 1]
+    begin = q if solution.q_begin is None else np.asarray(solution.q_begin)
+    begin = begin[: len(tau)]
+    last = np.append(np.zeros_like(tau[:1]), tau[:-1], axis=0)
+    works = np.sum([last * (begin - q[:-1]), tau * (q[1:] - begin)], axis=-1)
+    return [
+        _integral(np.maximum(sign * powers[1:], 0), ts)
+        + np.append(0, np.maximum(sign * works, 0).sum(axis=0).cumsum())
+        for sign in signs
+    ]
+
+
+def _integral(powers: np.ndarray, ts: np.ndarray) -> np.ndarray:
+    return scipy.integrate.cumulative_simpson(powers.sum(axis=0), x=ts, initial=0)
+
+
+def energy_stack(
+    linkage: Linkage, forces: Forces, solution: Motion, ax: Axes | None = None
+) -> Axes:
+    """Plots the energy balance over time, stacked [J].
+
+    The stack is kinetic energy, potential energy above its least (springs and masses of
+    force elements included), and the energy taken out by the forces since the start.
+    The dashed line is the energy at the start plus the energy put in by the forces; it
+    is level if none is put in. The top of the stack lies on this line up to errors of
+    the motion and of the integrals of power over its samples (Simpson's rule).
+
+    A force element puts energy in while its power is positive, and takes it out while
+    its power is negative. A motor may do both.
+
+    **Arguments:** `forces`: those of the solution.
+
+    **Raises:** ValueError for malformed arguments. Warns if top and line differ by more
+    than a hundredth of the energy, with the time at which they part most: the samples
+    are then too far apart there, or the forces are not those of the solution.
+    """
+    ts, q, qd = reached(linkage, solution)
+    forces = acting_in(solution, elements("forces", forces))
+    put_in, taken_out = _works(linkage, forces, solution, ts)
+    energies = jax.vmap(lambda q, qd: energy(linkage, q, qd, forces))(q, qd)
+    kinetic, potential = map(np.asarray, energies)
+    potential = potential - potential.min()
+    bands = {"kinetic": kinetic, "potential": potential}
+    if forces:
+        bands["taken out"] = taken_out
+    line = kinetic[0] + potential[0] + put_in
+    gaps = line - sum(bands.values())
+    gap, accepted = np.abs(gaps).max(), 0.01 * line.max()
+    if gap > accepted:
+        worst = ts[np.abs(np.diff(gaps)).argmax()]
+        # At a kink of the power, Simpson's rule is of the second order.
+        factor = max(2, int(np.ceil(np.sqrt(gap / accepted))))
+        warn(
+            f"energy_stack: the balance is off by {gap:.3g} J of {line.max():.3g} J, "
+            f"and the error grows most at t = {worst:.4g} s: expected the forces of "
+            f"the solution, and samples closer in time (try {factor} times as many)."
+        )
+    ax = axes_or_new(ax, 2.6)
+    colors = [*SERIES[3:5], LIGHT_GREY]
+    ax.stackplot(ts, list(bands.values()), labels=list(bands), colors=colors)
+    driven = put_in.max() > 1e-5 * line.max()  # more than rounding errors
+    label = "start + put in" if driven else "at the start"
+    ax.plot(ts, line, "--", color=BLACK, lw=1.2, label=label)
+    ax.set(xlabel="time [s]", ylabel="energy [J]", xlim=(ts[0], ts[-1]))
+    legend(ax)
+    return ax
 
 
 def effort_profile(
@@ -90,61 +220,45 @@ def effort_profile(
     reached(linkage, solution)
     efforts = joint_efforts(linkage, forces, solution)
     ts, total, parts = (np.asarray(a) for a in (solution.ts, *efforts))
-    units, panels = [], []
-    moving = moving_joints(linkage)
+    limits = [_limits(element, total) for element in elements("forces", forces)]
+    panels, bands, moving = [], [], moving_joints(linkage)
     for k in moving:
         symbol, unit = ("T", "N m") if joint_names(linkage)[k][0] == "R" else ("F", "N")
-        curve = "total", total[:, k], SERIES[0]
-        panels.append((f"${symbol}_{k + 1}$ [{unit}]", [curve]))
-        units.append(unit)
-    fig = figure_or_new(fig, 3.5, 5.2)
-    axes = time_panels(fig, ts, panels)
-    for k, ax, unit in zip(moving, axes, units):
-        rows = zip(elements("forces", forces), parts[:, :, k])
-        limits = [(_limit(element, k, total.shape[1]), row) for element, row in rows]
-        limits = [(limit, effort) for limit, effort in limits if np.isfinite(limit)]
-        for _, effort in limits if len(parts) > 1 else ():
-            ax.plot(ts, effort, color=SERIES[2], lw=1.2, label="controller")
+        own = [(row[k], part[:, k]) for row, part in zip(limits, parts)]
+        own = [(limit, effort) for limit, effort in own if np.isfinite(limit)]
+        curves = [("total", total[:, k], SERIES[0])]
+        if len(parts) > 1:
+            curves += [("controller", effort, SERIES[2]) for _, effort in own]
+        panels.append((f"${symbol}_{k + 1}$ [{unit}]", curves))
+        bands.append((own, unit))
+    fig, axes = time_panels(fig, 5.2, ts, panels)
+    for k, ax, (own, unit) in zip(moving, axes, bands):
         low, high = ax.get_ylim()  # before the bands, which may be far wider
-        texts = []
-        for limit, effort in limits:
+        for limit, effort in own:
             ax.axhspan(-limit, limit, color=GREY, alpha=0.15, lw=0, label="limits")
             at = (np.abs(effort) >= limit) & (effort != 0)
             dots = ax.plot(ts[at], effort[at], ".", color=SERIES[1], zorder=3)
             dots[0].set(label="saturated", gid=f"saturated {k + 1}")
             if at.any():
                 low, high = min(low, -1.1 * limit), max(high, 1.1 * limit)
-            texts.append(f"limit ±{limit:g} {unit}")
         ax.set_ylim(low, high)
-        _note(ax, "\n".join(texts))
+        if own:  # as the title of a legend, which moves out of the curves' way
+            text = "\n".join(f"limit ±{limit:g} {unit}" for limit, _ in own)
+            note = Legend(
+                ax, [], [], title=text, title_fontproperties={"size": "small"},
+                framealpha=0.7, edgecolor="none", borderaxespad=0.3, borderpad=0.1,
+                loc="best",
+            )  # fmt: skip
+            ax.add_artist(note)
     legend(axes[0], *axes)
     return fig
 
 
-def _limit(element: Any, joint: int, joints: int) -> float:
-    """The limit of a controller's effort at a joint; infinite for other elements."""
-    element = element.pd if isinstance(element, PIDController) else element
-    if not isinstance(element, PDController):
-        return np.inf
-    return float(np.broadcast_to(np.asarray(element.limit), joints)[joint])
-
-
-def _note(ax: Axes, text: str) -> None:
-    """Writes into the first corner of axes that no curve enters, or else the first."""
-    if not text:
-        return
-
-    def hidden(x: float, y: float) -> int:
-        curves = (ax.transLimits.transform(line.get_xydata()) for line in ax.lines)
-        near = [(np.abs(curve - (x, y)) < (0.45, 0.25)).all(axis=1) for curve in curves]
-        return sum(int(found.sum()) for found in near)
-
-    x, y = min([(1, 0), (1, 1), (0, 0), (0, 1)], key=lambda corner: hidden(*corner))
-    ax.annotate(
-        text, (x, y), (5 - 10 * x, 6 - 12 * y), xycoords="axes fraction",
-        textcoords="offset points", ha=["left", "right"][x], va=["bottom", "top"][y],
-        fontsize="small", bbox={"fc": "white", "alpha": 0.7, "lw": 0, "pad": 1},
-    )  # fmt: skip
+def _limits(element: Any, total: np.ndarray) -> np.ndarray:
+    """Limits of a controller's efforts (n,); infinite for other elements."""
+    pd = element.pd if isinstance(element, PIDController) else element
+    limit = pd.limit if isinstance(pd, PDController) else np.inf
+    return np.broadcast_to(np.asarray(limit), total.shape[1])
 
 
 def response_profile(test: StepAndSine, fig: Figure | None = None) -> Figure:
@@ -176,6 +290,124 @@ def response_profile(test: StepAndSine, fig: Figure | None = None) -> Figure:
     return fig
 
 
+# Without the lightest colours, which are hard to see on white.
+_DARK_TO_LIGHT = ListedColormap(colormaps["plasma"](np.linspace(0, 0.85, 256)))
+
+
+class _Tip(NamedTuple):
+    """Times [s] and positions x + iy of a tip [m]: (time,)."""
+
+    ts: np.ndarray
+    commanded: np.ndarray
+    path: np.ndarray
+
+
+def _tip(linkage: Any, task: Any, solution: Any, name: str = "solution") -> _Tip:
+    if not callable(task) or (tip := reference_of(task).tip) is None:
+        raise refusal("task", "a CircleTask or a TipTask", task)
+    ts, q, _ = reached(linkage, solution, name)
+    commanded = np.asarray(jax.vmap(tip)(jnp.asarray(ts))) @ [1, 1j]
+    return _Tip(ts, commanded, geometry(linkage, q).tip)
+
+
+def _tips(linkage: Any, task: Any, solutions: Any) -> dict[Any, _Tip]:
+    filled_mapping("solutions", solutions, "Solution")
+    return {
+        label: _tip(linkage, task, solution, f"solutions[{shown(label)}]")
+        for label, solution in solutions.items()
+    }
+
+
+def _draw_commanded(ax: Axes, path: np.ndarray) -> None:
+    """Draws the commanded path dashed above the others, which show in its gaps."""
+    ax.plot(*xy(path), label="commanded", zorder=3, **COMMANDED)
+
+
+def tracking(
+    linkage: Linkage,
+    task: TipReference,
+    solutions: Mapping[str, Motion],
+    ax: Axes | None = None,
+) -> Axes:
+    """Plots paths of the tip with the commanded path, dashed; crosses are the starts.
+
+    Drawn into the axes of `chrono_cyclograph`, it adds the path of the paper's Fig 7,
+    in colours that no link has.
+
+    **Arguments:** `task`: a `CircleTask` or a `TipTask`, whose `tip(t)` is the
+    commanded tip position [m]; `solutions`: one curve per label.
+    """
+    tips = _tips(linkage, task, solutions)
+    longest = max((tip.commanded for tip in tips.values()), key=len)
+    paths = {label: tip.path for label, tip in tips.items()}
+    ax = plane_axes(ax, np.concatenate([longest, *paths.values()]))
+    _draw_commanded(ax, longest)
+    for line in [line for line in ax.lines if line.get_gid() == "tip path"]:
+        drawn = np.asarray(line.get_xydata()) @ [1, 1j]
+        if any(np.array_equal(path[: len(drawn)], drawn) for path in paths.values()):
+            line.remove()  # drawn again below
+    taken = {line.get_color() for line in ax.lines}
+    free = [color for color in SERIES if color not in taken] or SERIES
+    for (label, path), color in zip(paths.items(), cycle(free)):
+        ax.plot(*xy(path), color=color, lw=1.2, label=label)
+        ax.plot(*xy(path[:1]), "x", color=color, markersize=5)
+    legend(ax)
+    return ax
+
+
+def tracking_by_error(
+    linkage: Linkage, task: TipReference, solution: Motion, ax: Axes | None = None
+) -> Axes:
+    """Plots the path of the tip, coloured by its distance from its set point [mm].
+
+    The dashed line is the commanded path; the cross is the tip's start. Later turns
+    cover earlier ones.
+
+    **Arguments:** `task`: as in `tracking`.
+
+    **Returns:** the axes, with a colour bar beside them.
+    """
+    _, commanded, path = _tip(linkage, task, solution)
+    error = 1000 * np.abs(path - commanded)
+    ax = plane_axes(ax, np.concatenate([commanded, path]), beside=0.8)
+    corners = np.column_stack(xy(path))
+    pieces = LineCollection(
+        list(np.stack([corners[:-1], corners[1:]], axis=1)),
+        array=(error[:-1] + error[1:]) / 2, cmap=_DARK_TO_LIGHT, lw=2, capstyle="round",
+    )  # fmt: skip
+    pieces.set_clim(0, error.max())
+    ax.add_collection(pieces)
+    ax.autoscale_view()
+    ax.plot(*corners[0], "x", color=_DARK_TO_LIGHT(pieces.norm(error[0])), ms=5)
+    _draw_commanded(ax, commanded)
+    # An inset is as high as the axes, which equal scales may shrink.
+    bar = ax.inset_axes((1.04, 0, 0.05, 1))
+    ax.figure.colorbar(pieces, cax=bar, label="tip error [mm]")
+    legend(ax)
+    return ax
+
+
+def tracking_error(
+    linkage: Linkage,
+    task: TipReference,
+    solutions: Mapping[str, Motion],
+    ax: Axes | None = None,
+) -> Axes:
+    """Plots the distance of the tip from its set point over time [m].
+
+    **Arguments:** as in `tracking`.
+    """
+    tips = _tips(linkage, task, solutions)
+    ax = axes_or_new(ax, 2.6)
+    for (label, tip), color in zip(tips.items(), cycle(SERIES)):
+        error = np.abs(tip.path - tip.commanded)
+        ax.plot(tip.ts, error, color=color, lw=1.2, label=label)
+    ax.set(xlabel="time [s]", ylabel="tip error [m]")
+    ax.set_ylim(bottom=0)
+    legend(ax)
+    return ax
+
+
 def work_precision(
     measured: Mapping[str, tuple[ArrayLike, ArrayLike]], ax: Axes | None = None
 ) -> Axes:
@@ -191,18 +423,18 @@ def work_precision(
         name = f"measured[{shown(label)}]"
         if not isinstance(pair, tuple) or len(pair) != 2:
             raise refusal(name, "(errors, times)", pair)
-        errors, times = (
-            np.asarray(real_array(name, p, (None,), above=0)) for p in pair
-        )
+        rows = (real_array(name, row, (None,), above=0) for row in pair)
+        errors, times = map(np.asarray, rows)
         if len(errors) != len(times):
             got = f"{len(errors)} errors and {len(times)} times"
             raise ValueError(f"{name}: expected as many errors as times, got {got}.")
         order = np.argsort(errors)
-        curves[str(label)] = errors[order], times[order]
+        curves[label] = errors[order], times[order]
     ax = axes_or_new(ax, 2.8)
-    for k, (label, curve) in enumerate(curves.items()):
-        style = dict(color=SERIES[k % len(SERIES)], marker="osD^v<"[k % 6])
-        ax.loglog(*curve, lw=1.2, ms=4, label=label, **style)
+    for (label, curve), color, marker in zip(
+        curves.items(), cycle(SERIES), cycle("osD^v<")
+    ):
+        ax.loglog(*curve, lw=1.2, ms=4, label=label, color=color, marker=marker)
     ax.set(xlabel="error", ylabel="time [s]")
     ax.grid(which="major", lw=0.4, color=LIGHT_GREY)
     legend(ax)

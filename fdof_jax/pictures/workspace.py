@@ -13,7 +13,7 @@ from ..base.array_namespace import in_numpy
 from ..base.checks import real_array
 from ..dynamics import mass_matrix
 from ..forces.element import Forces
-from ..linkage.linkage import Linkage, check_linkage, joint_names, joints_of
+from ..linkage.linkage import Linkage, check_linkage, joints_of
 from ..linkage.topology import check_angles, letters
 from ..mechanics.kinematics import tip_jacobian
 from .arms import Geometry, draw_motion, geometry
@@ -24,35 +24,33 @@ _REACHED = "#D6EAF5"
 
 def _ranges(linkage: Linkage, lower: Any, upper: Any, orientation: Any) -> Ranges:
     check_linkage(linkage)
-    n, kinds = joints_of(linkage), letters(linkage.ef)
-    ends = []
-    for name, value in (("lower", lower), ("upper", upper)):
+    name, ends = letters(linkage.ef), []
+    kinds = np.array([*name])
+    for argument, value in (("lower", lower), ("upper", upper)):
         end = real_array(
-            name, value, (n,), finite=False, broadcast=True, unit="m or rad"
+            argument, value, kinds.shape, finite=False, broadcast=True, unit="m or rad"
         )
+        check_angles(argument, end, linkage.ef)
+        for k in np.flatnonzero((kinds == "P") & ~np.isfinite(end)):
+            raise ValueError(
+                f"{argument}: expected a finite end of slide P{k + 1} [m], "
+                f"got {end[k]}."
+            )
         ends.append(np.asarray(end))
-        check_angles(name, end, linkage.ef)
-        for joint, end in zip(joint_names(linkage), ends[-1]):
-            if joint[0] == "P" and not np.isfinite(end):
-                raise ValueError(
-                    f"{name}: expected a finite end of slide {joint} [m], got {end}."
-                )
     low, high = ends
-    moves = np.array([kind != "F" for kind in kinds])
-    if not (low < high)[moves].all():
+    if not (low < high)[kinds != "F"].all():
         raise ValueError(
             f"lower: expected less than upper, got {low.tolist()} and {high.tolist()}."
         )
-    around = np.array([kind == "R" for kind in kinds]) & (high - low >= 2 * np.pi)
-    low, high = np.where(around, -np.pi, low), np.where(around, np.pi, high)
-    low, high = np.where(moves, low, 0), np.where(moves, high, 0)
+    cases = [kinds == "F", (kinds == "R") & (high - low >= 2 * np.pi)]
+    low, high = np.select(cases, [0, -np.pi], low), np.select(cases, [0, np.pi], high)
     if orientation is not None:
         orientation = float(real_array("orientation", orientation, (), unit="rad"))
-        if "R" not in kinds:
+        if "R" not in name:
             raise ValueError(
                 f"orientation: expected None for slides only, got {orientation:g}."
             )
-    return Ranges(in_numpy(linkage), kinds, low, high, orientation)
+    return Ranges(in_numpy(linkage), name, low, high, orientation)
 
 
 def workspace(
@@ -82,13 +80,13 @@ def workspace(
     the tip cannot move.
     """
     ranges = _ranges(linkage, lower, upper, orientation)
-    found = list(curves(ranges))
-    if not found:
+    bounds = list(curves(ranges))
+    if not bounds:
         raise ValueError(
             "orientation: expected an angle at which the tip can move, got "
             f"{ranges.orientation:g}."
         )
-    cells = reached_cells(ranges, [q for q, _ in found])
+    cells = reached_cells(ranges, [q for q, _ in bounds])
     ax = plane_axes(ax, cells.corners)
     (x0, x1), (y0, y1) = xy(cells.corners)
     ax.imshow(
@@ -100,18 +98,20 @@ def workspace(
     if ranges.orientation is not None:
         label = f"{label} at {ranges.orientation:.3g} rad"
     ax.plot([], [], "s", color=_REACHED, markersize=9, label=label)
-    labels = {"edge": "edge, joint at end", "singular": "singular"}
-    paths = {name: [] for name in labels}
-    for q, singular in found:
+    edge, singular = [], []
+    for q, is_singular in bounds:
         tips = np.append(ranges.tips(q), np.nan)  # NaN lifts the pen
-        if singular:
-            paths["singular"].append(tips)
+        if is_singular:
+            singular.append(tips)
         else:
-            paths["edge"].append(cells.on_edge(tips))
-    for (name, curve), color in zip(paths.items(), (GREY, SERIES[1])):
-        if curve:
-            points = xy(np.concatenate(curve))
-            ax.plot(*points, color=color, lw=1.4, gid=name, label=labels[name])
+            edge.append(cells.on_edge(tips))
+    for name, label, color, lines in (
+        ("edge", "edge, joint at end", GREY, edge),
+        ("singular", "singular", SERIES[1], singular),
+    ):
+        if lines:
+            points = xy(np.concatenate(lines))
+            ax.plot(*points, color=color, lw=1.4, gid=name, label=label)
     ax.use_sticky_edges = False  # of the image
     ax.autoscale_view()
     legend(ax)
@@ -134,12 +134,11 @@ def force_ellipses(
     **Returns:** the axes, with the arm at the first and the last configuration. The
     `gid` of an ellipse is "ellipse 0", "ellipse 1", ...
     """
-    positions, g = _path(linkage, q)
+    g, J, _ = _path(linkage, q)
     most = real_array(
         "limit", limit, (joints_of(linkage),),
         above=0, finite=False, broadcast=True, unit="N or N m",
     )  # fmt: skip
-    J = _jacobians(linkage, positions)
     # Efforts J^T F; the axes of the ellipse are those of the singular values.
     _, sizes, axes = np.linalg.svd(np.swapaxes(J, 1, 2) / np.asarray(most)[:, None])
     with np.errstate(divide="ignore"):
@@ -161,28 +160,22 @@ def inertia_ellipses(
 
     **Returns:** the axes, as in `force_ellipses`.
     """
-    positions, g = _path(linkage, q)
-    J = _jacobians(linkage, positions)
-    M = jax.vmap(lambda q: mass_matrix(linkage, q, forces))(positions)
-    M = np.asarray(M)
+    g, J, positions = _path(linkage, q)
+    M = np.asarray(jax.vmap(lambda q: mass_matrix(linkage, q, forces))(positions))
     mobility = J @ np.linalg.solve(M, np.swapaxes(J, 1, 2))
     sizes, axes = np.linalg.eigh(mobility)
     return _ellipses(g, sizes, axes, "inertia", "/kg", ax)
 
 
-def _path(linkage: Linkage, q: ArrayLike) -> tuple[np.ndarray, Geometry]:
-    """Joint positions along a path (configurations, n), and the arm there."""
+def _path(linkage: Linkage, q: ArrayLike) -> tuple[Geometry, np.ndarray, np.ndarray]:
+    """The arm along a path, its tip's Jacobians (time, 2, n), and `q` (time, n)."""
     check_linkage(linkage)
     n = joints_of(linkage)
     positions = np.asarray(real_array("q", q, (None, n), of=f"{n} joints"))
     if not len(positions):
         raise ValueError("q: expected one configuration or more, got none.")
-    return positions, geometry(linkage, positions)
-
-
-def _jacobians(linkage: Linkage, q: np.ndarray) -> np.ndarray:
-    """Derivatives of the tip's x and y in the joint positions (time, 2, n)."""
-    return np.asarray(jax.vmap(lambda q: tip_jacobian(linkage, q))(q))[:, :2]
+    J = jax.vmap(lambda q: tip_jacobian(linkage, q))(positions)
+    return geometry(linkage, positions), np.asarray(J)[:, :2], positions
 
 
 def _ellipses(
@@ -192,7 +185,7 @@ def _ellipses(
 
     Those of neighbours overlap little.
     """
-    extent = float(max(np.ptp(part) for part in xy(g.all_points)))
+    extent = g.extent
     typical = np.median(sizes.max(axis=1))
     if not np.isfinite(typical) or typical == 0:
         typical = 1.0
