@@ -149,28 +149,27 @@ def test_negative_values_are_refused(argument):
 # Topologies
 
 
-@pytest.mark.parametrize(
-    "topology",
-    [
-        "PPP", "PFPP", "FFF", "R" * 9, "rrr", "XRR", "", None, 3,
-        [0, 1, 0], [0, 1, 0, 1, 1, 1], [0] * 6, [1, 0, 1, 0, 1, 0], [0, 1] * 9,
-        [0, 1, 0, 1, 0, 0.5], [0, 1, 0, 1, 0, np.nan], [0, 1, 0, 1, 0, 1j],
-        np.array([0, 1, 0, 1, 0, 1 + 0j]), ["0", "1", "0", "1", "0", "1"],
-        [[0, 1], [0, 1], [0, 1]],
+LETTERS = "1 to 8 letters"
+TOPOLOGY_WORDS = {
+    LETTERS: [
+        "R" * 9, "rrr", "RXR", "", None, 3, [0, 1, 0], [0, 1] * 9, [[0, 1]] * 3,
+        [0, 1, 0, 0.5], [0, 1, 0, np.nan], [0, 1, 0, 1j], np.array([0, 1 + 0j]),
+        ["0", "1"],
     ],
-    ids=repr,
-)  # fmt: skip
-def test_unknown_topologies_are_refused(topology):
-    refused("topology", make, topology)
-    refused("topology", fj.paper.from_chain, topology, CHAIN, CHAIN)
-    refused("topology", fj.existence_factors, topology)
+    "one real joint at most in each": [[0, 1, 1, 1], [1, 1, 0, 1]],
+    "a joint that moves, got fixed pairs": ["FFF", [0] * 6],
+    r"one joint that turns among .*PPP cannot": ["PPP", "PFPP", [1, 0] * 3],
+}  # fmt: skip
 
 
-def test_the_refusal_of_ppp_says_why():
-    with pytest.raises(ValueError, match="PPP.*cannot orient its last link"):
-        make("PPP")
-    with pytest.raises(ValueError, match="PPP.*cannot orient its last link"):
-        make([1, 0] * 3)
+@pytest.mark.parametrize("words", TOPOLOGY_WORDS)
+def test_unknown_topologies_are_refused(words):
+    for topology in TOPOLOGY_WORDS[words]:
+        with pytest.raises(ValueError, match=f"^topology: expected.* {words}"):
+            make(topology)
+        refused("topology", make, topology)
+        refused("topology", fj.existence_factors, topology)
+        refused("topology", fj.paper.from_chain, topology, CHAIN, CHAIN)
 
 
 # Linkages

@@ -10,9 +10,9 @@ from matplotlib.lines import Line2D
 from matplotlib.markers import MarkerStyle
 from matplotlib.path import Path
 
-from ..base.array_namespace import in_numpy
 from ..base.checks import refusal, shown
-from ..linkage.frames import frames
+from ..base.known_values import in_numpy
+from ..linkage.frames import known_frames
 from ..linkage.linkage import Linkage, check_linkage, without_fixed
 from ..linkage.topology import letters
 from .axes import (
@@ -53,7 +53,7 @@ def geometry(linkage: Linkage, q: np.ndarray) -> Geometry:
     check_linkage(linkage)
     linkage = in_numpy(linkage)
     kinds = letters(linkage.ef)
-    f = frames(linkage, without_fixed(linkage, q))
+    f = known_frames(linkage, without_fixed(linkage, q))
     start, direction, angle, slide = f.start, f.direction, f.angle, f.slide
     end = start + linkage.length * direction
     along, across = linkage.com.T

@@ -7,13 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 from matplotlib.path import Path
 
-from ..base.array_namespace import in_numpy
+from ..base.known_values import in_numpy
 from ..forces.actuators import LinearActuator
 from ..forces.between_points import SpringDamper, Tension, Wrench
 from ..forces.element import elements_on
 from ..forces.joint_limits import JointStops
 from ..forces.points import Point
-from ..linkage.frames import Frames, frames
+from ..linkage.frames import Frames, known_frames
 from ..linkage.linkage import Linkage, without_fixed
 from ..linkage.topology import letters
 from ..references.reference import Reference
@@ -50,7 +50,7 @@ def element_lines(
         element.check(linkage, jnp.asarray(ts))
     arm = in_numpy(linkage)
     kinds = letters(arm.ef)
-    f = frames(arm, without_fixed(arm, q))
+    f = known_frames(arm, without_fixed(arm, q))
     pushes = {
         k: _push(element, linkage, f, ts)
         for k, element in enumerate(found)

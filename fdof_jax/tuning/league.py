@@ -10,7 +10,7 @@ from ..linkage.coordinates import State
 from ..linkage.linkage import Linkage
 from ..linkage.topology import TOPOLOGIES
 from ..paper import from_chain
-from ..references.circle import CircleTask
+from ..references.task import CircleTask
 from ..simulation.scene import Scene
 from .result import TuneResult, mean_effort
 

@@ -12,11 +12,9 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from ..analysis.tracking import relative_demands, tip_deviation
-from ..base.array_namespace import namespace
-from ..base.checks import instance, is_traced, real_array, refusal
+from ..base.checks import instance, real_array, refusal
 from ..control.pd import PDController
 from ..linkage.linkage import without_fixed
-from ..linkage.topology import fixed_pairs
 from ..references.reference import reference_motion, reference_of
 from ..simulation.sampled import check_joints
 from ..simulation.scene import Scene
@@ -47,12 +45,8 @@ def with_controller(scene: Scene, element: Any) -> Scene:
 def gains_of(scene: Scene) -> Any:
     """kp and kd of a scene's controller (2, n), 0 at fixed pairs."""
     controller = controller_of(scene)
-    kp, kd, ef = controller.kp, controller.kd, scene.linkage.ef
-    if not is_traced(kp, kd, ef):  # JAX would compile programs for known numbers
-        kp, kd, ef = map(np.asarray, (kp, kd, ef))
-    xp = namespace(kp, kd, ef)
-    fixed = xp.stack(fixed_pairs(ef))
-    return xp.stack([xp.where(fixed, 0, kp), xp.where(fixed, 0, kd)])
+    gains = controller.kp, controller.kd
+    return jnp.stack([without_fixed(scene.linkage, value) for value in gains])
 
 
 def tip_errors(scene: Scene, solution: Solution) -> Float[Array, " residual"]:
