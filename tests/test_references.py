@@ -267,13 +267,9 @@ def test_a_path_without_middle_is_refused():
 
 
 def test_many_laps_are_as_good_as_one():
-    arm = fj.Linkage(
-        "RRR", length=[0, 1, 1, 0.3], com=[[0.5, 0]] * 3, mass=[1] * 3,
-        inertia=[0.1] * 3,
-    )  # fmt: skip
     task = fj.TipTask(Swinging(), fj.references.Laps(1.0))
     for end in (1.0, 400.0):
-        task.check(arm, jnp.array([0.0, end]))
+        task.check(ARM, jnp.array([0.0, end]))
 
 
 _reachable = jax.jit(fj.references.reachable)
@@ -312,23 +308,14 @@ def test_a_circle_is_reachable_where_inverse_kinematics_find_the_joints(topology
 # Refused
 
 
-@pytest.mark.parametrize("branch", [0, 2, -1.5, "1", None, True, np.nan, [1]], ids=repr)
-def test_branches_other_than_plus_and_minus_one_are_refused(branch):
-    refused("branch", lambda: fj.CircleTask(branch=branch))
-    refused(
-        "branch", lambda: fj.inverse_kinematics(LINKAGE, [1, 1], 0.0, branch=branch)
-    )
-
-
-@pytest.mark.parametrize("branch", [1, -1.0, np.int64(-1), np.float32(1), jnp.array(1)])
-def test_numbers_of_any_kind_name_a_branch(branch):
-    assert fj.CircleTask(branch=branch).branch == float(branch)
-    fj.inverse_kinematics(LINKAGE, [1, 1], 0.0, branch=branch)
-
-
-@pytest.mark.parametrize("value", [None, 3.0, (ZERO, ZERO), fj.CircleTask])
-def test_references_that_cannot_be_called_are_refused(value):
-    refused("reference", lambda: controller(reference=value))
+def test_branches_are_plus_or_minus_one_in_numbers_of_any_kind():
+    solve = lambda side: fj.inverse_kinematics(LINKAGE, [1, 1], 0.0, branch=side)
+    for branch in (0, 2, -1.5, "1", None, True, np.nan, [1]):
+        refused("branch", lambda side: fj.CircleTask(branch=side), branch)
+        refused("branch", solve, branch)
+    for branch in (1, -1.0, np.int64(-1), np.float32(1), jnp.array(1)):
+        assert fj.CircleTask(branch=branch).branch == float(branch)
+        solve(branch)
 
 
 @pytest.mark.parametrize(
@@ -405,6 +392,8 @@ def test_circles_are_refused_for_their_nearest_point_alone():
 
 
 def test_malformed_references_are_refused():
+    for value in (None, 3.0, (ZERO, ZERO), fj.CircleTask):
+        refused("reference", lambda v: controller(reference=v), value)
     refused("period", lambda: fj.CircleTask(period=0))
     with pytest.raises(ValueError, match="points: expected three or more"):
         fj.references.Spline(POINTS[:2])
