@@ -127,7 +127,7 @@ def arm_of(linkage: Linkage, orientation: Array | float | None) -> Arm:
         revolute, locked = jnp.append(revolute, True), jnp.append(locked, locked[0])
         vector = jnp.append(vector, 0)
     r1, _, r3 = revolute
-    last = orientation if oriented else 0.0
+    last = 0.0 if orientation is None else orientation
     from_tip = last - locked[2]
     second = jnp.where(r1, from_tip - locked[1], ground + locked[0])
     third = jnp.where(r3, second + locked[1], from_tip)
