@@ -167,9 +167,7 @@ class TipTask(TipReference):
         """
         super().check(linkage, ts)
         check_moving_joints(linkage, self.orientation is not None)
-        way = _way(self, linkage, ts)
-        within = in_numpy(reach(self, linkage, way[0]))
-        times, ahead, gap = in_numpy(way)
+        times, within, ahead, gap = in_numpy(_survey(self, linkage, ts))
         if not within.all():
             raise ValueError(
                 f"reference: expected a path within {self._reach()}, got one that "
@@ -187,7 +185,7 @@ class TipTask(TipReference):
             )
 
     def fits(self, linkage, ts):
-        _, ahead, gap = _way(self, linkage, ts)
+        ahead, gap = _way(self, linkage, _times(self, ts))
         return super().fits(linkage, ts) & ahead & (gap <= _CLOSED)
 
 
@@ -214,20 +212,26 @@ def _times(task: TipTask, ts: Array) -> Array:
 
 
 @at_once
-def _way(task: TipTask, linkage: Linkage, ts: Array) -> tuple[Array, Array, Array]:
-    """Returns times, whether the wrist never passes behind the pivot, and a gap [m].
+def _survey(task: TipTask, linkage: Linkage, ts: Array) -> tuple[Array, ...]:
+    """Returns times, whether the tip is within reach at each, and the `_way`."""
+    times = _times(task, ts)
+    return times, reach(task, linkage, times), *_way(task, linkage, times)
+
+
+def _way(task: TipTask, linkage: Linkage, times: Array) -> tuple[Array, Array]:
+    """Returns whether the wrist never passes behind the pivot, and a gap [m].
 
     The gap is between the end of a lap and its start, 0 without laps.
     """
-    times, gap = _times(task, ts), jnp.zeros(())
+    gap = jnp.zeros(())
     base = arm_of(linkage, task.orientation).base
     wrist = lambda t: task.wrist_seen(t, base)
     _, bearing = jax.vmap(wrist)(times)
     jumps = abs(jnp.diff(bearing)) > np.pi
     ahead = ~jumps.any() & (plane_vectors(task.path.middle) != base)
     if isinstance(task.timing, Laps):
-        gap = abs(wrist(ts[0] + task.timing.period)[0] - wrist(ts[0])[0])
-    return times, ahead, gap
+        gap = abs(wrist(times[0] + task.timing.period)[0] - wrist(times[0])[0])
+    return ahead, gap
 
 
 class CircleTask(TipReference):
@@ -295,8 +299,7 @@ class CircleTask(TipReference):
     def check(self, linkage: Linkage, ts: Array) -> None:
         """Raises ValueError if the tip leaves the linkage's reach between the times."""
         check_moving_joints(linkage, oriented=True)
-        within = reach(self, linkage, _turn_times(self, linkage, ts))
-        if not in_numpy(within).all():
+        if not in_numpy(_within(self, linkage, ts)):
             raise ValueError(
                 f"reference: expected a circle within {self._reach()}, got center "
                 f"{self.center.tolist()} and radius {self.radius:g} m."
@@ -318,8 +321,8 @@ def _circle_tip(circle: CircleTask, t: Array) -> Array:
 
 
 @at_once
-def _turn_times(circle: CircleTask, linkage: Linkage, ts: Array) -> Array:
-    """Returns times of one turn, or of the run, at which a circle is checked.
+def _within(circle: CircleTask, linkage: Linkage, ts: Array) -> Array:
+    """Returns whether a circle is within reach for one turn, or the run if shorter.
 
     The reach ends first where the wrist is nearest to or farthest from the base, or
     along a direction that the ground or the last link fixes.
@@ -332,4 +335,5 @@ def _turn_times(circle: CircleTask, linkage: Linkage, ts: Array) -> Array:
     lead = jnp.append(directions, directions + np.pi) - circle.phase
     extremes = begin + (lead / (2 * np.pi) * circle.period - begin) % turn
     times = jnp.linspace(begin, jnp.minimum(ts[-1], begin + turn), 257)
-    return jnp.append(times, jnp.minimum(extremes, ts[-1]))
+    times = jnp.append(times, jnp.minimum(extremes, ts[-1]))
+    return reach(circle, linkage, times).all()
