@@ -74,8 +74,7 @@ from .mechanics.kinematics import (
     tip_jacobian,
     tip_position,
 )
-from .references.circle import CircleTask
-from .references.task import TipTask
+from .references.task import CircleTask, TipTask
 from .simulation.efforts import joint_efforts
 from .simulation.sampled import simulate_sampled, step
 from .simulation.scene import Scene

@@ -11,8 +11,8 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from .base.array_namespace import in_numpy, namespace
-from .base.checks import concrete, real_array
+from .base.checks import is_traced, real_array
+from .base.known_values import at_once
 from .base.trigonometry import sincos
 from .linkage.coordinates import State
 from .linkage.linkage import Linkage, compiled, joints_of
@@ -85,20 +85,14 @@ def from_chain(
             f"{letters(pairs)}."
         )
     ef = jnp.asarray(topology) if pairs is None else pairs.ravel()
-    given = (
-        real_array("x", x, (ef.size,)),
-        real_array("xd", xd, (ef.size,)),
-        real_array("base_angle", base_angle, ()),
-    )
-    chain, chain_rate, ground = in_numpy(given)
-    xp = namespace(ef, chain, chain_rate, ground)
-    revolute = xp.stack(real_joints(ef))
-    slide, turn = chain[0::2], xp.diff(chain[1::2], prepend=ground)
-    slide_rate, turn_rate = chain_rate[0::2], xp.diff(chain_rate[1::2], prepend=0)
-    held = concrete(xp.where(revolute, slide_rate, turn_rate))
-    if held is not None and pairs is not None:
+    x = real_array("x", x, (ef.size,))
+    xd = real_array("xd", xd, (ef.size,))
+    base_angle = real_array("base_angle", base_angle, ())
+    locked, held, state = _joints_of_chain(jnp.asarray(ef, float), x, xd, base_angle)
+    if pairs is not None and not is_traced(held):
         # Differences of absolute rates carry rounding errors.
-        scale = np.abs(np.asarray(chain_rate)).max()
+        held = np.asarray(held)
+        scale = np.abs(np.asarray(xd)).max()
         for k in np.flatnonzero(np.abs(held) > 8 * np.finfo(held.dtype).eps * scale):
             rate = (
                 f"B{k + 1} rate 0"
@@ -109,10 +103,20 @@ def from_chain(
                 f"xd: expected {rate}, because that joint is fictitious, got a "
                 f"difference of {held[k]:g}."
             )
-    locked = jnp.asarray(xp.where(revolute, slide, turn), dtype=float)
-    q = jnp.asarray(xp.where(revolute, turn, slide), dtype=float)
-    qd = jnp.asarray(xp.where(revolute, turn_rate, slide_rate), dtype=float)
-    return locked, State(q, qd)
+    return locked, state
+
+
+@at_once
+def _joints_of_chain(
+    ef: Array, x: Array, xd: Array, base_angle: Array
+) -> tuple[Array, Array, State]:
+    """Returns positions and rates of the fictitious joints, and those of the real."""
+    revolute = jnp.stack(real_joints(ef))
+    slide, turn = x[0::2], jnp.diff(x[1::2], prepend=base_angle)
+    slide_rate, turn_rate = xd[0::2], jnp.diff(xd[1::2], prepend=0)
+    pick = lambda first, second: jnp.where(revolute, first, second)
+    state = State(pick(turn, slide), pick(turn_rate, slide_rate))
+    return pick(slide, turn), pick(slide_rate, turn_rate), state
 
 
 def of_three_pairs(linkage: Linkage, x: ArrayLike) -> Array:

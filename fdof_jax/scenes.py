@@ -8,9 +8,8 @@ from .linkage.coordinates import State
 from .linkage.linkage import Linkage
 from .mechanics.inverse_kinematics import inverse_kinematics
 from .paper import from_chain
-from .references.circle import CircleTask
 from .references.paths import Ellipse
-from .references.task import TipTask
+from .references.task import CircleTask, TipTask
 from .references.timing import Laps
 from .simulation.scene import Scene as Scene
 

@@ -13,7 +13,7 @@ ARM = dict(
     length=[0.1, 1.0, 0.8, 0.6], com=[[0.5, 0.1], [0.4, 0.0], [0.3, 0.05]],
     mass=[2.0, 1.5, 1.0], inertia=[0.3, 0.2, 0.1],
 )  # fmt: skip
-# From NumPy, so that only what the library compiles is compiled: see `test_door`.
+# From NumPy, which compiles nothing.
 START = fj.State(
     *jax.device_put((np.array([0.3, -0.2, 0.5]), np.array([0.5, -0.7, 0.9])))
 )

@@ -8,7 +8,6 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 import pytest
 from elements import SHORT
@@ -88,18 +87,6 @@ def test_derivatives_of_motions_equal_the_reference(name, bound, mode):
             np.testing.assert_allclose(slope, expected, rtol=0, atol=within)
 
 
-@pytest.mark.parametrize("name", ["double_pendulum", "cart_pole", "five_links"])
-def test_energy_stays(name):
-    arm, start, _, t1 = getattr(fj.scenes, name)()
-    # By the programs of the references.
-    none = np.zeros(len(start.q))
-    idle = fj.JointEffort(none), fj.JointDamper(none)
-    motion = fj.simulate(arm, start, np.linspace(0, t1, 101), idle)
-    kinetic, potential = jax.vmap(fj.energy, (None, 0, 0))(arm, motion.q, motion.qd)
-    assert kinetic.max() > 0.01  # [J]
-    np.testing.assert_allclose(kinetic + potential, potential[0], rtol=0, atol=1e-7)
-
-
 @pytest.mark.slow
 def test_gradients_of_a_motion_equal_differences():
     """In reverse mode, with elements in arrays, with inertia and with a state."""
@@ -144,10 +131,6 @@ def test_gradients_of_a_motion_equal_differences():
     assert slope == pytest.approx((4 * fine - coarse) / 3, rel=1e-8)
 
 
-def stacked(members):
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *members)
-
-
 def test_one_trace_serves_all_chains_of_a_length_and_batches_equal_their_members():
     rng = np.random.default_rng(4)
     names = "RRRR", "RFRP", "FPRF"
@@ -165,36 +148,11 @@ def test_one_trace_serves_all_chains_of_a_length_and_batches_equal_their_members
 
     single = jax.jit(motion)
     alone = [single(*member) for member in members]
-    together = jax.jit(jax.vmap(motion.__wrapped__))(*stacked(members))
+    batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *members)
+    together = jax.jit(jax.vmap(motion.__wrapped__))(*batch)
     for i, solution in enumerate(alone):
         for a, b in ((together.q, solution.q), (together.qd, solution.qd)):
             np.testing.assert_allclose(a[i], b, rtol=1e-12, atol=1e-12)
-
-
-def pendulum(links, pairs):
-    """Returns so many rods as a chain of at least as many pairs, and a start."""
-    rng = np.random.default_rng(links)
-    sizes = lambda values: [*values, *[0] * (pairs - links)]
-    chain = fj.Linkage(
-        "R" * links + "F" * (pairs - links),
-        length=[0, *sizes([1] * links)],
-        com=[[0.5, 0]] * pairs,
-        mass=sizes(range(1, links + 1)),
-        inertia=sizes([1 / 12] * links),
-    )
-    start = [sizes(row) for row in rng.normal(size=(2, links))]
-    return chain, fj.State(*jnp.asarray(start))
-
-
-def test_a_batch_mixes_chains_of_different_lengths():
-    motion = lambda *member: fj.simulate(*member, TS, **SHORT)
-    members = [pendulum(links, 3) for links in (1, 2, 3)]
-    together = jax.jit(jax.vmap(motion))(*stacked(members))
-    for links in (1, 2):  # three are in a batch of their equals above
-        alone = motion(*pendulum(links, links))
-        mixed = together.q[links - 1]
-        np.testing.assert_allclose(mixed[:, :links], alone.q, atol=1e-12)
-        np.testing.assert_array_equal(mixed[:, links:], 0)
 
 
 def test_what_is_given_at_fixed_pairs_does_not_move_them():
@@ -221,23 +179,3 @@ def test_what_is_given_at_fixed_pairs_does_not_move_them():
         np.testing.assert_array_equal(found, getattr(zero, name))
         np.testing.assert_array_equal(found[:, ~real], 0)
     assert np.abs(seven.q[-1] - seven.q[0])[real].min() > 1e-3
-
-
-@pytest.mark.parametrize("pairs", range(1, 9))
-def test_exported_models_move_alike(pairs):
-    rng = np.random.default_rng(pairs)
-    for _ in range(4):
-        topology = chains.random_topology(pairs, rng)
-        chain = chains.random_chain(topology, rng)
-        real = chains.moving(topology)
-        model = mujoco.MjModel.from_xml_string(fj.to_mjcf(chain))
-        data = mujoco.MjData(model)
-        names = [model.joint(k).name for k in range(model.njnt)]
-        assert names == [f"joint{k + 1}" for k in np.flatnonzero(real)]
-        q, qd, tau = rng.normal(size=(3, pairs))
-        data.qpos, data.qvel, data.qfrc_applied = q[real], qd[real], tau[real]
-        mujoco.mj_forward(model, data)
-        qdd = np.asarray(fj.forward_dynamics(chain, q, qd, tau))[real]
-        np.testing.assert_allclose(qdd, data.qacc, atol=1e-10 * (1 + np.abs(qdd).max()))
-        tip = data.site("tip").xpos[:2]
-        np.testing.assert_allclose(fj.tip_position(chain, q), tip, atol=1e-12)

@@ -1,25 +1,24 @@
-"""Points of the chain, their derivatives, and inverse kinematics."""
+"""Inverse kinematics, and tasks of arms of two joints and with fixed pairs."""
 
+import itertools
 from functools import partial
 
+import chains
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from elements import SHORT
 from helpers import random_linkage
 
 import fdof_jax as fj
-from fdof_jax.mechanics.inverse_kinematics import (
-    arm_of,
-    known_directions,
-    plane_angle,
-    solve_joints,
-)
-from fdof_jax.mechanics.kinematics import mass_center_velocities
 
 SAMPLES = 12
-
-each_topology = pytest.mark.parametrize("topology", fj.TOPOLOGIES)
+TS = np.linspace(0, 0.2, 5)
+WORDS = "^linkage: expected {} joints that move.*, the others fixed, got {}"
+UNIT = fj.Linkage(
+    "RRR", length=[0, 1, 1, 1], com=[[0.5, 0]] * 3, mass=[1] * 3, inertia=[1] * 3
+)
 
 
 def stack(linkages):
@@ -27,87 +26,25 @@ def stack(linkages):
 
 
 def samples(topology, seed=0):
-    """Returns stacked random linkages of one topology, with random motions."""
+    """Returns stacked random linkages of one topology, and random positions."""
     rng = np.random.default_rng(seed)
     linkages = stack([random_linkage(topology, rng) for _ in range(SAMPLES)])
-    q, qd = rng.uniform(-3, 3, (2, SAMPLES, 3))
-    return linkages, jnp.asarray(q), jnp.asarray(qd)
+    return linkages, jnp.asarray(rng.uniform(-3, 3, (SAMPLES, 3)))
 
 
 @jax.jit
 def pose(linkage, q):
     """Returns the tip and the orientation, (3,)."""
-    x, _ = fj.paper.to_chain(linkage, q, jnp.zeros(3))
-    return jnp.append(fj.tip_position(linkage, q), x[5])
-
-
-def turns(angle):
-    """Returns the distance of an angle from the nearest whole number of turns."""
-    return np.abs(np.angle(np.exp(1j * np.asarray(angle))))
+    x, _ = fj.paper.to_chain(linkage, q, jnp.zeros_like(q))
+    return jnp.append(fj.tip_position(linkage, q), x[-1])
 
 
 def joint_distance(topology, q, other):
     """Returns the largest difference of joint positions, angles modulo whole turns."""
     difference = np.asarray(q) - np.asarray(other)
+    turned = np.abs(np.angle(np.exp(1j * difference)))
     revolute = np.array([joint == "R" for joint in topology])
-    return np.where(revolute, turns(difference), np.abs(difference)).max(axis=-1)
-
-
-# Forward
-
-
-@each_topology
-def test_points_follow_the_chain_link_by_link(topology):
-    rng = np.random.default_rng(5)
-    for _ in range(3):
-        linkage = random_linkage(topology, rng)
-        q = rng.uniform(-3, 3, 3)
-        length, com, locked = (
-            np.asarray(a) for a in (linkage.length, linkage.com, linkage.locked)
-        )
-        angle, origin = float(linkage.base_angle), np.zeros(2)
-        joints, centers = [], []
-        for k, joint in enumerate(topology):
-            slide, turn = (locked[k], q[k]) if joint == "R" else (q[k], locked[k])
-            along = np.array([np.cos(angle), np.sin(angle)])
-            across = np.array([-np.sin(angle), np.cos(angle)])
-            # origin_{n+1} = origin_n + A_n e_n + B_n ep_n
-            origin = origin + length[k] * along + slide * across
-            angle = angle + turn
-            along = np.array([np.cos(angle), np.sin(angle)])
-            across = np.array([-np.sin(angle), np.cos(angle)])
-            joints.append(origin)
-            centers.append(origin + com[k, 0] * along + com[k, 1] * across)
-        tip = origin + length[3] * along
-        np.testing.assert_allclose(fj.joint_positions(linkage, q), joints, atol=1e-14)
-        np.testing.assert_allclose(fj.mass_centers(linkage, q), centers, atol=1e-14)
-        np.testing.assert_allclose(fj.tip_position(linkage, q), tip, atol=1e-14)
-
-
-@each_topology
-def test_tip_jacobian_is_the_derivative_of_the_pose(topology):
-    linkages, q, _ = samples(topology, 1)
-    jacobian = jax.vmap(fj.tip_jacobian)(linkages, q)
-    derivative = jax.vmap(jax.jacfwd(pose, argnums=1))(linkages, q)
-    np.testing.assert_allclose(jacobian, derivative, atol=1e-13)
-
-
-@each_topology
-def test_mass_center_velocities_are_the_rates_of_mass_centers(topology):
-    linkages, q, qd = samples(topology, 2)
-    velocity, rate = jax.vmap(mass_center_velocities)(linkages, q, qd)
-
-    def positions(linkage, q):
-        x, _ = fj.paper.to_chain(linkage, q, jnp.zeros(3))
-        return fj.mass_centers(linkage, q), x[1::2]
-
-    rates = jax.vmap(lambda k, q, qd: jax.jvp(lambda q: positions(k, q), (q,), (qd,)))
-    _, (expected_velocity, expected_rate) = rates(linkages, q, qd)
-    np.testing.assert_allclose(velocity, expected_velocity, atol=1e-13)
-    np.testing.assert_allclose(rate, expected_rate, atol=1e-13)
-
-
-# Inverse
+    return np.where(revolute, turned, np.abs(difference)).max(axis=-1)
 
 
 def solution(linkage, target, branch=1):
@@ -133,34 +70,48 @@ def derivatives(linkages, targets, branch):
     return jax.vmap(one)(linkages, targets)
 
 
-@each_topology
-def test_both_branches_reach_the_pose_and_one_is_the_original(topology):
-    linkages, q, _ = samples(topology, 3)
-    target = jax.vmap(pose)(linkages, q)
-    distances = []
-    for branch in (1, -1):
-        found = solutions(linkages, target, branch)
-        reached = jax.vmap(pose)(linkages, found)
-        np.testing.assert_allclose(reached[:, :2], target[:, :2], atol=1e-10)
-        assert turns(reached[:, 2] - target[:, 2]).max() < 1e-10
-        distances.append(joint_distance(topology, found, q))
-    distances = np.array(distances)
-    assert distances.min(axis=0).max() < 1e-7  # a square root near its zero
+def with_fixed_pairs(moving, rng):
+    """Returns the letters with fixed pairs inserted anywhere."""
+    letters = list(moving)
+    for _ in range(rng.integers(1, 4)):
+        letters.insert(rng.integers(len(letters) + 1), "F")
+    return "".join(letters)
+
+
+@pytest.mark.parametrize("moving", [*fj.TOPOLOGIES, "RR", "RP", "PR", "PP"])
+def test_both_branches_reach_the_pose_and_one_is_the_original(moving):
+    rng = np.random.default_rng(7)
+    names = [moving] * 8 + [with_fixed_pairs(moving, rng) for _ in range(4)]
+    apart = []
+    for topology in names:
+        chain, real = chains.random_chain(topology, rng), chains.moving(topology)
+        q = np.where(real, rng.normal(size=len(topology)), 0)
+        *tip, angle = pose(chain, q)
+        angle = angle if len(moving) == 3 else None
+        distances = []
+        for branch in (1, -1):
+            found = fj.inverse_kinematics(chain, tip, angle, branch=branch)
+            np.testing.assert_allclose(fj.tip_position(chain, found), tip, atol=1e-12)
+            np.testing.assert_array_equal(found[~real], 0)
+            if angle is not None:
+                assert float(pose(chain, found)[2]) == pytest.approx(
+                    float(angle), abs=1e-12
+                )
+            distances.append(joint_distance(topology, found, q))
+        assert min(distances) < 1e-10, topology
+        apart.append(max(distances) > 1e-3)
     # Two slides make the solution unique; otherwise the branches are two assemblies.
-    two = topology.count("P") < 2
-    assert (
-        (distances.max(axis=0) > 1e-3).mean() > 0.7 if two else distances.max() < 1e-7
-    )
+    assert np.mean(apart) > 0.7 if moving.count("P") < 2 else not any(apart)
 
 
-@each_topology
 @pytest.mark.parametrize("branch", [1, -1])
-def test_derivatives_of_inverse_kinematics_invert_the_jacobian(topology, branch):
-    linkages, q, _ = samples(topology, 4)
-    target = jax.vmap(pose)(linkages, q)
-    inverse, jacobian = derivatives(linkages, target, branch)
-    identity = np.broadcast_to(np.eye(3), jacobian.shape)
-    np.testing.assert_allclose(jacobian @ inverse, identity, atol=1e-8)
+def test_derivatives_of_inverse_kinematics_invert_the_jacobian(branch):
+    for topology in fj.TOPOLOGIES:
+        linkages, q = samples(topology, 4)
+        target = jax.vmap(pose)(linkages, q)
+        inverse, jacobian = derivatives(linkages, target, branch)
+        identity = np.broadcast_to(np.eye(3), jacobian.shape)
+        np.testing.assert_allclose(jacobian @ inverse, identity, atol=1e-8)
 
 
 def test_gradients_in_the_linkage_leave_a_fixed_pose_fixed():
@@ -185,41 +136,33 @@ def test_inverse_kinematics_of_the_arm_of_figure_7():
     np.testing.assert_allclose(q, [np.pi / 2, 2.5, -np.pi / 2], atol=1e-15)
 
 
-@pytest.mark.parametrize("branch", [1, -1])
 @pytest.mark.parametrize(
     "topology, inside, path",
     [
         ("RRR", -1, lambda s: [s * np.cos(1), s * np.sin(1)]),  # arm outstretched
         ("RPR", 1, lambda s: [s * np.cos(1), s * np.sin(1)]),  # within its own offset
         ("PRR", -1, lambda s: [s, 0.3]),  # link 3 level
-        (
-            "RRP",
-            -1,
-            lambda s: [s * np.cos(0.2), s * np.sin(0.2)],
-        ),  # link 2 along link 3
+        ("RRP", -1, lambda s: [s * np.cos(0.2), s * np.sin(0.2)]),  # link 2 along it
     ],
 )
-def test_out_of_reach_is_refused_or_nan(topology, inside, path, branch):
-    linkage = fj.Linkage(
-        topology, length=[0, 1, 1, 0], com=[[0.5, 0]] * 3, mass=[1] * 3, inertia=[1] * 3
-    )
+def test_out_of_reach_is_refused_or_nan(topology, inside, path):
+    linkage = UNIT.replace(topology=topology, length=[0, 1, 1, 0])
     edge = 2  # the two lengths together
-    traced = jax.jit(
-        lambda tip: fj.inverse_kinematics(linkage, tip, 0.2, branch=branch)
-    )
-    reachable = path(edge + 1e-6 * inside)
-    q = fj.inverse_kinematics(linkage, reachable, 0.2, branch=branch)
-    np.testing.assert_allclose(fj.tip_position(linkage, q), reachable, atol=1e-12)
-    np.testing.assert_allclose(traced(jnp.asarray(reachable)), q, atol=1e-12)
-    beyond = path(edge - 1e-6 * inside)
-    with pytest.raises(ValueError, match=r"^tip: expected .* within reach .*, got \["):
-        fj.inverse_kinematics(linkage, beyond, 0.2, branch=branch)
-    assert np.isnan(traced(jnp.asarray(beyond))).any()
+    within, beyond = path(edge + 1e-6 * inside), path(edge - 1e-6 * inside)
+    for branch in (1, -1):
+        q = fj.inverse_kinematics(linkage, within, 0.2, branch=branch)
+        np.testing.assert_allclose(fj.tip_position(linkage, q), within, atol=1e-12)
+        targets = jnp.array([[*within, 0.2], [*beyond, 0.2]])
+        traced, unreached = solutions(stack([linkage] * 2), targets, branch)
+        np.testing.assert_allclose(traced, q, atol=1e-12)
+        with pytest.raises(ValueError, match=r"^tip: .* within reach .*, got \["):
+            fj.inverse_kinematics(linkage, beyond, 0.2, branch=branch)
+        assert np.isnan(unreached).any()
 
 
 @pytest.mark.parametrize("topology", ["RRR", "RRP", "RPR", "PRR"])
 def test_poses_at_the_edge_of_the_reach_are_within(topology):
-    linkages, q, _ = samples(topology, 7)
+    linkages, q = samples(topology, 7)
     q, targets = at_the_edge(topology, linkages, q)
     found = solutions(linkages, targets, 1)
     reached = jax.vmap(pose)(linkages, found)
@@ -246,11 +189,6 @@ def at_the_edge(topology, linkages, q):
     return q, jax.vmap(pose)(linkages, q)
 
 
-UNIT = fj.Linkage(
-    "RRR", length=[0, 1, 1, 1], com=[[0.5, 0]] * 3, mass=[1] * 3, inertia=[1] * 3
-)
-
-
 def test_no_number_stands_for_a_derivative_at_the_edge_of_the_reach():
     linkages = stack([UNIT] * SAMPLES)
     reach = jnp.linspace(3 - 1e-6, 3 + 1e-6, SAMPLES)
@@ -272,56 +210,18 @@ def test_a_folded_arm_is_back_at_its_pivot():
         np.testing.assert_allclose(fj.tip_position(UNIT, q), tip, atol=1e-15)
 
 
-@pytest.mark.parametrize("base_angle", [0.0, 0.3, np.pi])
-@pytest.mark.parametrize("lock", [0.0, np.pi])
 @pytest.mark.parametrize("topology", ["PPR", "RPP", "PRP"])
 @pytest.mark.filterwarnings("ignore::UserWarning")
-def test_parallel_slides_reach_no_given_point(topology, lock, base_angle):
-    linkage = fj.Linkage(
-        topology,
-        length=[0, 1, 1, 1],
-        com=[[0.5, 0]] * 3,
-        mass=[1] * 3,
-        inertia=[1] * 3,
-        locked={"PPR": [lock, 0, 0], "RPP": [0, lock, 0.3], "PRP": [0, 0, 0]}[topology],
-        base_angle=base_angle,
-    )
-    # The slides of PRP are parallel if the tip keeps the direction of the ground.
-    orientation = base_angle + lock if topology == "PRP" else 0.2
-    with pytest.raises(ValueError, match="^tip: expected .* within reach"):
-        fj.inverse_kinematics(linkage, [0.5, 0.7], orientation)
-
-
-@jax.jit
-def wrists_solved(linkage, wrists, orientation, branch):
-    arm, _ = arm_of(linkage)
-    directions = known_directions(arm, orientation)
-    one = lambda w, bearing: solve_joints(arm, directions, w, bearing, branch)
-    return jax.vmap(one)(wrists, plane_angle(wrists.imag, wrists.real))
-
-
-@each_topology
-@pytest.mark.parametrize("branch", [1, -1])
-def test_numpy_solves_the_joints_as_jax_does(topology, branch):
-    rng = np.random.default_rng(7)
-    unreached = 0
-    for _ in range(4):
-        linkage = random_linkage(topology, rng)
-        wrists = rng.uniform(-2.5, 2.5, (1000, 2)) @ [1, 1j]
-        orientation = rng.uniform(-3, 3)
-        known, sides = jax.tree.map(np.asarray, linkage), np.asarray(float(branch))
-        bearing = plane_angle(wrists.imag, wrists.real)
-        angle = np.asarray(orientation)
-        three, _ = arm_of(known)
-        directions = known_directions(three, angle)
-        q, root = solve_joints(three, directions, wrists, bearing, sides)
-        expected, _ = wrists_solved(linkage, wrists, angle, sides)
-        assert isinstance(q, np.ndarray) and isinstance(root, np.ndarray)
-        # Near the edge of the reach a root enlarges rounding to its square root.
-        off_edge = ~(np.abs(root) < 1e-6)
-        np.testing.assert_allclose(q[off_edge], expected[off_edge], atol=1e-8)
-        unreached += np.isnan(q).any(axis=1).sum()
-    assert unreached or topology.count("P") == 2
+def test_parallel_slides_reach_no_given_point(topology):
+    for base_angle, lock in itertools.product((0.0, 0.3, np.pi), (0.0, np.pi)):
+        locked = {"PPR": [lock, 0, 0], "RPP": [0, lock, 0.3], "PRP": [0, 0, 0]}
+        linkage = UNIT.replace(
+            topology=topology, locked=locked[topology], base_angle=base_angle
+        )
+        # The slides of PRP are parallel if the tip keeps the direction of the ground.
+        orientation = base_angle + lock if topology == "PRP" else 0.2
+        with pytest.raises(ValueError, match="^tip: expected .* within reach"):
+            fj.inverse_kinematics(linkage, [0.5, 0.7], orientation)
 
 
 def test_lists_and_integers_are_accepted():
@@ -341,3 +241,81 @@ def test_a_time_axis_is_refused_with_a_hint():
     for call in (fj.tip_position, lambda arm, q: fj.energy(arm, q, q)):
         with pytest.raises(ValueError, match=r"^q: .* shape \(5, 3\); jax.vmap"):
             call(arm, q)
+
+
+# Fewer joints than three, and fixed pairs
+
+
+@pytest.mark.parametrize("topology", ["RR", "FRFRF"])
+def test_straight_arms_of_two_joints_reach_their_tip(topology):
+    rng, n = np.random.default_rng(12), len(topology)
+    first = topology.index("R")
+    for angle in rng.uniform(-3, 3, 20):
+        chain = chains.random_chain(topology, rng).replace(locked=np.zeros(n))
+        q = np.where(np.arange(n) == first, angle, 0)
+        tip = fj.tip_position(chain, q)
+        found = fj.inverse_kinematics(chain, tip, None)
+        np.testing.assert_allclose(fj.tip_position(chain, found), tip, atol=1e-14)
+
+
+@pytest.mark.parametrize("orientation, wanted", [(0.3, 3), (None, 2)])
+@pytest.mark.parametrize("topology", ["R", "RFP", "RRR", "RRRR", "FRRFPR"])
+def test_chains_of_other_numbers_of_joints_are_refused(topology, orientation, wanted):
+    count = len(topology.replace("F", ""))
+    if count == wanted:
+        return
+    n = len(topology)
+    chain = chains.random_chain(topology, np.random.default_rng(9))
+    words = WORDS.format(wanted, count)
+    with pytest.raises(ValueError, match=words):
+        fj.inverse_kinematics(chain, [0.5, 0.5], orientation)
+    if n >= wanted:  # what a program does not know ends as NaN
+        found = jax.jit(fj.inverse_kinematics)(chain, [0.5, 0.5], orientation)
+        assert np.isnan(found).all()
+    circle = fj.references.Ellipse([0.5, 0.5], [0.1, 0.1])
+    laps = fj.references.Laps(1.0)
+    tasks = [fj.TipTask(circle, laps, orientation=orientation)]
+    tasks += [fj.CircleTask([0.5, 0.5], 0.1)] * (wanted == 3)
+    for task in tasks:
+        pd = fj.PDController(10.0, 1.0, 50.0, task)
+        with pytest.raises(ValueError, match=words):
+            fj.simulate(chain, fj.State(np.zeros(n), np.zeros(n)), [0, 0.1], (pd,))
+
+
+@pytest.mark.parametrize(
+    "topology", ["RR", "RP", "PR", pytest.param("RFP", marks=pytest.mark.slow)]
+)
+def test_tasks_without_orientation_are_followed_at_their_exact_rates(topology):
+    chain = chains.random_chain(topology, np.random.default_rng(10))
+    chain = chain.replace(length=np.linspace(0.4, 1, len(topology) + 1))
+    middle = fj.tip_position(chain, np.full(len(topology), 1.5))
+    path = fj.references.Ellipse(middle, [0.02, 0.01])
+    task = fj.TipTask(path, fj.references.Laps(2.0), orientation=None)
+
+    @jax.jit
+    def along(t):
+        q, qd = task(t, chain)
+        _, rate = jax.jvp(lambda t: task(t, chain)[0], (t,), (1.0,))
+        tip = lambda q: fj.tip_position(chain, q)
+        _, commanded = jax.jvp(task.tip, (t,), (1.0,))
+        return (
+            q,
+            qd - rate,
+            tip(q) - task.tip(t),
+            jax.jvp(tip, (q,), (qd,))[1] - commanded,
+        )
+
+    for t in (0.1, 0.9):
+        q, *differences = along(t)
+        assert np.isfinite(q).all()
+        for difference in differences:
+            np.testing.assert_allclose(difference, 0, atol=1e-12)
+        h = 1e-4
+        slope = (along(t + h)[0] - along(t - h)[0]) / (2 * h)
+        np.testing.assert_allclose(task(t, chain)[1], slope, atol=1e-5)
+    # From there, a controller keeps the tip on the path.
+    start = fj.State(*task(0.0, chain))
+    pd = fj.control.ComputedTorque(400.0, 40.0, np.inf, task)
+    motion = fj.simulate(chain, start, TS, (pd,), **SHORT)
+    for t, q in zip(motion.ts, motion.q):
+        np.testing.assert_allclose(fj.tip_position(chain, q), task.tip(t), atol=1e-4)

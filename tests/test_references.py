@@ -1,5 +1,9 @@
 """References: tip paths by inverse kinematics, and moves in joint space."""
 
+import re
+from functools import partial
+
+import chains
 import diffrax
 import equinox as eqx
 import jax
@@ -8,6 +12,7 @@ import numpy as np
 import pytest
 from elements import SHORT
 from scipy.interpolate import CubicSpline
+from test_bad_input import LINKAGE, ZERO, controller, make, refused, simulate
 
 import fdof_jax as fj
 
@@ -23,6 +28,7 @@ PATHS = {
     "spline": fj.references.Spline(POINTS),
     "closed spline": fj.references.Spline(POINTS, closed=True),
 }
+TS = np.linspace(0, 3, 61)
 TIMINGS = {"travel": fj.references.Travel(2.0), "laps": fj.references.Laps(2.0)}
 
 
@@ -152,7 +158,6 @@ def test_a_short_travel_is_checked_in_runs_of_any_length(begin, end):
         ring = fj.TipTask(RING, timing)
         with pytest.raises(ValueError, match="behind the ground pivot"):
             ring.check(ARM, ts)
-        assert not fj.references.reachable(ARM, ring, ts).any()
         assert not reached(ring, ts).any()
         # Its most distant point is out of reach for a moment.
         line = fj.references.Spline([[1, 0], [2.5, 0], [1, 0.1]])
@@ -163,6 +168,21 @@ def test_a_short_travel_is_checked_in_runs_of_any_length(begin, end):
         beside = fj.TipTask(fj.references.Ellipse([1.3, 0], [0.4, 0.4]), timing)
         beside.check(ARM, ts)
         assert reached(beside, ts).all()
+
+
+def test_known_references_are_checked_within_transformations():
+    line = fj.references.Line([1, 0], [4, 0])
+    task, circle = fj.TipTask(line, TIMINGS["travel"]), fj.CircleTask([9.0, 9.0])
+    ts = jnp.array([0.0, 2.0])
+
+    @jax.jit
+    def inside(x):
+        for reference in task, circle:
+            with pytest.raises(ValueError, match="within the linkage's reach"):
+                reference.check(ARM, ts)
+        return x
+
+    inside(1.0)
 
 
 def test_only_the_part_of_a_travel_within_the_run_is_checked():
@@ -247,16 +267,134 @@ def test_a_path_without_middle_is_refused():
 
 
 def test_many_laps_are_as_good_as_one():
-    arm = fj.Linkage(
-        "RRR", length=[0, 1, 1, 0.3], com=[[0.5, 0]] * 3, mass=[1] * 3,
-        inertia=[0.1] * 3,
-    )  # fmt: skip
     task = fj.TipTask(Swinging(), fj.references.Laps(1.0))
     for end in (1.0, 400.0):
-        task.check(arm, jnp.array([0.0, end]))
+        task.check(ARM, jnp.array([0.0, end]))
+
+
+_reachable = jax.jit(fj.references.reachable)
+
+
+@jax.jit
+def followed(arm, circle, ts):
+    """Returns whether inverse kinematics find joints, and the tip's errors in reach."""
+
+    def at(t):
+        place, (q, _) = circle.tip(t), circle(t, arm)
+        error = fj.tip_position(arm, q) - place
+        q = fj.inverse_kinematics(arm, place, circle.orientation, branch=circle.branch)
+        within = jnp.isfinite(q).all()
+        return within, jnp.where(within, error, 0)
+
+    return jax.vmap(at)(ts)
+
+
+@pytest.mark.parametrize("topology", [*fj.TOPOLOGIES, "RFRR"])
+def test_a_circle_is_reachable_where_inverse_kinematics_find_the_joints(topology):
+    arm = chains.random_chain(topology, np.random.default_rng(0))
+    some = 0
+    for seed in range(20):
+        random = np.random.default_rng(seed)
+        center, (radius, phase, angle) = random.normal(size=2), random.uniform(size=3)
+        circle = fj.CircleTask(center, radius, 2.0, phase, angle, (-1) ** seed)
+        within, errors = followed(arm, circle, TS)
+        np.testing.assert_allclose(errors, 0, atol=1e-12)
+        for reachable in fj.references.reachable, _reachable:
+            np.testing.assert_array_equal(reachable(arm, circle, TS), within)
+        some += within.any() and not within.all()
+    assert some or topology.count("P") == 2  # of which none is out of reach
+
+
+# Refused
+
+
+def test_branches_are_plus_or_minus_one_in_numbers_of_any_kind():
+    solve = lambda side: fj.inverse_kinematics(LINKAGE, [1, 1], 0.0, branch=side)
+    for branch in (0, 2, -1.5, "1", None, True, np.nan, [1]):
+        refused("branch", lambda side: fj.CircleTask(branch=side), branch)
+        refused("branch", solve, branch)
+    for branch in (1, -1.0, np.int64(-1), np.float32(1), jnp.array(1)):
+        assert fj.CircleTask(branch=branch).branch == float(branch)
+        solve(branch)
+
+
+@pytest.mark.parametrize(
+    "returned",
+    [None, ZERO, (np.zeros(2), np.zeros(2)), (ZERO, None)] + [(ZERO * 1j, ZERO)],
+    ids=repr,
+)
+def test_references_that_return_no_motion_are_refused(returned):
+    element = controller(reference=lambda t, linkage: returned)
+    refused("reference", lambda: element(0.0, jnp.zeros(3), jnp.zeros(3), LINKAGE))
+    place = r"forces\[1\]\."
+    for _ in range(3):  # by itself, in a drive, and in a drive of a drive
+        forces = fj.JointDamper(1.0), element
+        refused(f"{place}reference", partial(simulate, forces=forces))
+        place += r"command\."
+        element = fj.control.FirstOrderLag(element, 0.1)
+
+
+@pytest.mark.parametrize("circle", [dict(center=[9, 9]), dict(radius=5.0)], ids=str)
+def test_circles_out_of_reach_are_refused_at_the_door(circle):
+    scene = fj.scenes.fig7()
+    forces = eqx.tree_at(
+        lambda f: f[0].reference, scene.forces, fj.CircleTask(branch=1, **circle)
+    )
+    if "center" in circle:  # this arm's slide has no end: only too near is out of reach
+        scene = scene._replace(linkage=make("RRR"))
+    place = r"^forces\[0\]\.reference"
+    with pytest.raises(ValueError, match=place + ": expected .* reach .*, got .*"):
+        fj.simulate(scene.linkage, scene.state0, [0, 5.0], forces)
+    drives = (fj.control.FirstOrderLag(forces[0], 0.1),)
+    with pytest.raises(ValueError, match=r"^forces\[0\]\.command\.reference: expected"):
+        fj.simulate(scene.linkage, scene.state0, [0, 5.0], drives)
+
+
+@pytest.mark.parametrize(
+    "task, words",
+    [
+        (fj.CircleTask([9, 9], radius=0, orientation=0.5), "at orientation 0.5 rad on"),
+        (
+            fj.TipTask(fj.references.Line([1, 1], [9, 9]), lambda t: t, branch=-1),
+            "at orientation 0 rad on branch -1",
+        ),
+    ],
+    ids=["circle", "line"],
+)
+def test_what_a_task_commands_out_of_reach_is_refused_or_nan(task, words):
+    arm = make("RRR")
+    place = re.escape("[9.0, 9.0] m.")
+    message = f"^t: expected .* reach {words}.*, got 1 s, at which .* {place}$"
+    with pytest.raises(ValueError, match=message):
+        task(1.0, arm)
+    assert np.isnan(jax.jit(lambda t: task(t, arm))(1.0)).any()
+
+
+def test_paths_that_begin_at_the_edge_of_the_reach_are_refused():
+    """The joints' velocities are not finite there."""
+    line, travel = fj.references.Line([3, 0], [1, 1]), fj.references.Travel(1.0)
+    with pytest.raises(ValueError, match="reference: .* that leaves it at 0 s"):
+        fj.TipTask(line, travel).check(LINKAGE, np.array([0.0, 1.0]))
+    touching = fj.CircleTask([1.0, 0], 2.0, 2.0, 0.0, 0.0)
+    with pytest.raises(ValueError, match="reference: expected a circle within"):
+        touching.check(LINKAGE, np.linspace(0, 3, 61))
+    assert not fj.references.reachable(LINKAGE, touching, [0.0, 0.5])[0]
+
+
+def test_circles_are_refused_for_their_nearest_point_alone():
+    arm = make("RRR", length=[0, 1, 0.6, 0.3], com=[[0, 0]] * 3)
+    ts = np.array([0.0, 5.0])
+    # The wrist comes within 0.4 m of the base, between samples of the circle.
+    circle = lambda radius: fj.CircleTask([1.2, 0], radius, 5.0, np.pi / 256, 0.0)
+    circle(0.5 - 1e-7).check(arm, ts)
+    with pytest.raises(ValueError, match="reference: expected a circle within"):
+        circle(0.5 + 1e-7).check(arm, ts)
 
 
 def test_malformed_references_are_refused():
+    for value in (None, 3.0, (ZERO, ZERO), fj.CircleTask):
+        refused("reference", lambda v: controller(reference=v), value)
+    refused("period", lambda: fj.CircleTask(period=0))
     with pytest.raises(ValueError, match="points: expected three or more"):
         fj.references.Spline(POINTS[:2])
     with pytest.raises(ValueError, match="path: expected a Path"):

@@ -1,6 +1,5 @@
 """The vector formulas of docs/theory.md equal the printed equations."""
 
-import jax
 import numpy as np
 
 import fdof_jax as fj
@@ -98,26 +97,3 @@ def test_the_recursion_for_any_number_of_joints():
                 h = h + dot(d[i + 1], p)
             M[i - 1, k - 1] = M[k - 1, i - 1] = h if turns[i] else dot(e[i], p)
     np.testing.assert_allclose(fj.mass_matrix(linkage, q), M, rtol=1e-13)
-
-
-def test_the_reduced_equations():
-    linkage, x, xd = random_case(2)
-    x, xd = fj.paper.to_chain(linkage, x[:3], xd[:3])
-    S = jax.jacobian(lambda qd: fj.paper.to_chain(linkage, np.zeros(3), qd)[1])(
-        np.zeros(3)
-    )
-    assert set(np.unique(S)) == {0.0, 1.0}
-    tau = np.array([1.0, -2.0, 3.0])
-    M, phi = fj.paper.mass_matrix(linkage, x), fj.paper.bias_force(linkage, x, xd)
-    qdd = np.linalg.solve(S.T @ M @ S, tau + S.T @ phi)
-    force = np.where(linkage.ef > 0.5, np.repeat(tau, 2), 0)
-    masked = fj.paper.masked_accelerations(linkage, x, xd, force)
-    np.testing.assert_allclose(masked, S @ qdd, rtol=1e-11, atol=1e-12)
-    # Efforts from the tip inwards; real joints carry their commands.
-    rho = M @ masked - phi
-    T4 = rho[5]
-    T3 = rho[3] + T4
-    efforts = np.array([rho[0], rho[1] + T3, rho[2], T3, rho[4], T4])
-    constraint = efforts - force
-    known = fj.paper.constraint_forces(linkage, x, xd, force)
-    np.testing.assert_allclose(known, constraint, rtol=1e-11, atol=1e-11)

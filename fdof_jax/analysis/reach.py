@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy
 
-from ..linkage.frames import frames
+from ..linkage.frames import known_frames
 from ..linkage.linkage import Linkage, moving_joints
 
 _SAMPLES, _CELLS, _ROUNDING = 361, 400, 1e-9
@@ -56,7 +56,7 @@ class Ranges(NamedTuple):
         return np.where(beyond[..., self.moving].any(axis=-1, keepdims=True), np.nan, q)
 
     def tips(self, q: np.ndarray) -> np.ndarray:
-        return frames(self.linkage, q).tip(self.linkage)
+        return known_frames(self.linkage, q).tip(self.linkage)
 
 
 class _Body(NamedTuple):
@@ -96,7 +96,7 @@ def curves(ranges: Ranges) -> Iterator[tuple[np.ndarray, bool]]:
 
 def _bodies(ranges: Ranges, q: np.ndarray, free: list[int]) -> tuple[list, float]:
     """The bodies from the ground to the tip, and the last link's direction [rad]."""
-    start, direction, angle, *_ = frames(ranges.linkage, q)
+    start, direction, angle, *_ = known_frames(ranges.linkage, q)
     places = [*(start[k + 1] for k in free), ranges.tips(q)]
     bodies = [_Body(None, 0j, [])]
     for k, here, there in zip(free, places, places[1:]):
@@ -242,5 +242,5 @@ def _configurations(ranges: Ranges, found: list[np.ndarray]) -> np.ndarray:
     if ranges.orientation is not None:
         last = max(k for k in ranges.moving if ranges.kinds[k] == "R")
         q[:, last] = 0
-        q[:, last] = ranges.orientation - frames(ranges.linkage, q).angle[:, -1]
+        q[:, last] = ranges.orientation - known_frames(ranges.linkage, q).angle[:, -1]
     return ranges.within(q)

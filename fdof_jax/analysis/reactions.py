@@ -8,11 +8,10 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
-from ..base.array_namespace import plane_vectors
 from ..base.checks import shown
 from ..dynamics import forward_dynamics
 from ..forces.element import Forces, elements
-from ..linkage.frames import cross, frames
+from ..linkage.frames import cross, frames, plane_vectors
 from ..linkage.linkage import Linkage
 from ..mechanics.kinematics import joint_positions, mass_center_velocities, mass_centers
 from ..simulation.efforts import joint_efforts

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from ..control.pd import PDController
 from ..linkage.linkage import Linkage, without_fixed
 from ..mechanics.kinematics import tip_position
-from ..references.circle import CircleTask
+from ..references.task import CircleTask
 from ..simulation.solution import Solution
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from jax import Array
 from jax.sharding import Mesh
 
-from ..base.array_namespace import in_numpy
+from ..base.known_values import in_numpy
 from ..simulation.solution import Solution
 from .batch_axes import Batch
 from .chunk_programs import compiled, expected_work, form_of, lowered

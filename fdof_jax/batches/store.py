@@ -21,8 +21,8 @@ from jax import Array
 from jax.extend.core import ClosedJaxpr, Jaxpr
 
 from .. import __version__
-from ..base.array_namespace import in_numpy
 from ..base.checks import optional_package, refusal
+from ..base.known_values import in_numpy
 from ..base.user_warnings import warn
 from ..base.whole_files import whole_file
 from ..linkage.linkage import Linkage

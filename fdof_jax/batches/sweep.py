@@ -19,7 +19,6 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
-from ..base.array_namespace import in_numpy
 from ..base.checks import (
     function,
     hashable,
@@ -33,6 +32,7 @@ from ..base.checks import (
     whole_number,
 )
 from ..base.functions import sharing_functions
+from ..base.known_values import in_numpy
 from ..base.whole_files import folder_path
 from ..forces.element import Forces, elements, elements_on
 from ..linkage.coordinates import State

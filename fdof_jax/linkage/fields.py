@@ -18,7 +18,6 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
-from ..base.array_namespace import in_numpy, namespace
 from ..base.checks import (
     JOINT,
     concrete,
@@ -29,6 +28,7 @@ from ..base.checks import (
     real_array,
 )
 from ..base.frozen import Frozen
+from ..base.known_values import in_numpy
 from .linkage import Linkage, joints_of, short
 from .topology import check_angles
 
@@ -84,15 +84,12 @@ def of_kind(kind: type) -> Any:
     return dataclasses.field(metadata={"kind": kind})
 
 
-def default(compute: Callable[[Any], Any]) -> Any:
+class default:
     """Decorates a method that computes an attribute unless a subclass has its own.
 
     Unlike a property, it does not stand in the way of a field of the same name.
     """
-    return _Default(compute)
 
-
-class _Default:
     def __init__(self, compute: Callable[[Any], Any]):
         self.compute = compute
 
@@ -196,7 +193,7 @@ def _refuse(place: str, conditions: Iterable[Condition]) -> None:
 
 
 def _all(holds: Any) -> Any:
-    return namespace(holds).all(holds)
+    return jnp.all(holds) if is_traced(holds) else np.all(holds)
 
 
 def _declared(part: Part) -> Iterator[tuple[str, Any, dict[str, Any]]]:
@@ -289,8 +286,7 @@ def jumps_of(*parts: Part) -> Array | None:
     """Returns all times at which the parts jump, or None."""
     found = [part.jump_ts for part in parts]
     times = [jumps for jumps in found if jumps is not None]
-    numpy = namespace(times)  # JAX would compile a program for known times
-    return numpy.concatenate([numpy.ravel(t) for t in times]) if times else None
+    return jnp.concatenate([jnp.ravel(t) for t in times]) if times else None
 
 
 def optional(name: str, absent: Any = None) -> Any:

@@ -2,26 +2,30 @@
 
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.lax import complex as plane_vector
 
-from ..base.array_namespace import (
-    namespace,
-    plane_vector,
-    plane_vectors,
-    sine_and_cosine,
-)
+from ..base.known_values import in_numpy
+from ..base.trigonometry import sincos
 from .topology import real_joints
 
 if TYPE_CHECKING:
     from .linkage import Linkage
 
 # Vectors of the plane are complex numbers x + iy. A product with exp(i th) turns them
-# by th, a product with i by 90 degrees. The functions also take NumPy arrays.
+# by th, a product with i by 90 degrees.
+
+
+def plane_vectors(points: Any) -> Any:
+    """Returns x + iy of points (..., 2)."""
+    return plane_vector(points[..., 0], points[..., 1])
 
 
 def unit_vector(angle: Any) -> Any:
     """Returns exp(i angle)."""
-    sin, cos = sine_and_cosine(angle)
+    sin, cos = sincos(angle)
     return plane_vector(cos, sin)
 
 
@@ -37,9 +41,9 @@ def cross(a: Any, b: Any) -> Any:
 
 def length_of(vector: Any) -> Any:
     """Length of a vector; 0 with derivative 0 for the zero vector, NaN for NaN."""
-    xp, square = namespace(vector), dot(vector, vector)
+    square = dot(vector, vector)
     meet = square == 0
-    return xp.where(meet, 0, xp.sqrt(xp.where(meet, 1, square)))
+    return jnp.where(meet, 0, jnp.sqrt(jnp.where(meet, 1, square)))
 
 
 class Frames(NamedTuple):
@@ -67,19 +71,30 @@ class Frames(NamedTuple):
 
 
 def frames(linkage: "Linkage", q: Any) -> Frames:
-    """Computes the frames at joint positions (..., n), 0 at fixed pairs."""
-    xp = namespace(linkage, q)
-    revolute = xp.stack(real_joints(linkage.ef))
-    slide = xp.where(revolute, linkage.locked, q)
-    turn = xp.cumsum(xp.where(revolute, q, linkage.locked), axis=-1)
-    base = xp.broadcast_to(linkage.base_angle, turn[..., :1].shape)
-    angle = xp.concatenate([base, base + turn], axis=-1)
+    """Computes the frames at joint positions (n,), 0 at fixed pairs."""
+    revolute = jnp.stack(real_joints(linkage.ef))
+    slide = jnp.where(revolute, linkage.locked, q)
+    turn = jnp.cumsum(jnp.where(revolute, q, linkage.locked))
+    angle = jnp.append(linkage.base_angle, linkage.base_angle + turn)
     direction = unit_vector(angle)
     # The length A runs along a link, the slide B across it.
-    length = xp.broadcast_to(linkage.length[:-1], slide.shape)
-    steps = plane_vector(length, slide) * direction[..., :-1]
-    start = xp.concatenate([xp.zeros_like(base), xp.cumsum(steps, axis=-1)], axis=-1)
-    return Frames(start, direction, angle, slide, revolute)
+    steps = plane_vector(linkage.length[:-1], slide) * direction[:-1]
+    return Frames(jnp.append(0, jnp.cumsum(steps)), direction, angle, slide, revolute)
+
+
+def known_frames(linkage: "Linkage", q: Any) -> Frames:
+    """Computes frames in NumPy at known positions (..., n), 0 at fixed pairs."""
+    *shape, n = np.shape(q)
+    count = int(np.prod(shape))
+    # Powers of two: each number of rows needs a program.
+    rows = np.resize(q, (1 << count.bit_length(), n))
+    shaped = lambda leaf: np.reshape(leaf[:count], (*shape, -1))
+    return jax.tree.map(shaped, in_numpy(_frames_of_each(linkage, rows)))
+
+
+@jax.jit
+def _frames_of_each(linkage: "Linkage", q: Any) -> Frames:
+    return jax.vmap(frames, (None, 0))(linkage, q)
 
 
 def scalar_frames(linkage: "Linkage", q: tuple) -> Frames:

@@ -19,7 +19,6 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from ..base.array_namespace import namespace
 from ..base.checks import is_traced, known, radians, real_array, shown
 from ..base.frozen import Frozen
 from ..base.functions import sharing_functions
@@ -164,8 +163,7 @@ def per_joint(name: str, values: Any, linkage: Linkage) -> Array:
 
 def without_fixed(linkage: Linkage, values: Any) -> Any:
     """Returns values of the joints (..., joint), 0 at fixed pairs."""
-    xp = namespace(linkage, values)
-    return xp.where(xp.stack(fixed_pairs(linkage.ef)), 0, values)
+    return jnp.where(jnp.stack(fixed_pairs(linkage.ef)), 0, values)
 
 
 _T = TypeVar("_T")

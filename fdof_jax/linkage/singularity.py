@@ -6,7 +6,6 @@ import jax
 import numpy as np
 
 from ..base.user_warnings import warn
-from .frames import frames
 from .topology import fixed_pairs, letters, real_joints
 
 if TYPE_CHECKING:
@@ -16,12 +15,30 @@ if TYPE_CHECKING:
 _SINGULAR = 1e-14
 
 
+def _frames(linkage: "Linkage", q: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Computes starts and directions of the links, and mass centres, all as x + iy.
+
+    Of the plain arrays of a constructor, which compiles nothing, and in double
+    precision also where JAX has none; all else uses `frames`.
+    """
+    revolute = np.stack(real_joints(linkage.ef))
+    summed = lambda parts: np.insert(np.cumsum(parts, axis=-1), 0, 0, axis=-1)
+    turn = summed(np.where(revolute, q, linkage.locked))
+    along = np.exp(1j * (linkage.base_angle + turn))
+    slide = np.where(revolute, linkage.locked, q)
+    start = summed((linkage.length[:-1] + 1j * slide) * along[..., :-1])
+    return (
+        start,
+        along,
+        start[..., 1:] + np.asarray(linkage.com) @ [1, 1j] * along[..., 1:],
+    )
+
+
 def _scaled_inertia(linkage: "Linkage", configurations: int) -> np.ndarray:
     """Computes mass matrices at random configurations (configurations, n, n).
 
     Scaling to a diagonal of ones makes them free of units and sizes; it is 0 where a
-    joint moves nothing, and 1 at fixed pairs. NumPy avoids compilation in the
-    constructor.
+    joint moves nothing, and 1 at fixed pairs.
     """
     linkage = jax.tree.map(lambda a: np.asarray(a, dtype=float), linkage)
     revolute = np.stack(real_joints(linkage.ef))
@@ -30,8 +47,7 @@ def _scaled_inertia(linkage: "Linkage", configurations: int) -> np.ndarray:
     n, moves = len(revolute), ~np.stack(fixed_pairs(linkage.ef))
     draws = np.random.default_rng(0).uniform(-1, 1, (configurations, 2, n))
     q = np.where(revolute, np.pi * draws[:, 0], (reach or 1) * draws[:, 1] * moves)
-    f = frames(linkage, q)
-    start, along, centre = f.start, f.direction, f.mass_centers(linkage)
+    start, along, centre = _frames(linkage, q)
     moved = np.tri(n) * moves  # a joint moves only the links beyond it
     arm = centre[:, :, None] - start[:, None, 1:]
     J = moved * np.where(revolute, arm, along[:, None, :-1])
@@ -79,8 +95,7 @@ def _warn(linkage: "Linkage", revolute: np.ndarray) -> None:
     """Warns of joints without inertia of their own and of redundant joints."""
     mass, locked = linkage.mass, linkage.locked
     eps, n = 8 * np.finfo(locked.dtype).eps, len(mass)
-    f = frames(linkage, np.zeros(n))
-    start, centre = f.start, f.mass_centers(linkage)
+    start, _, centre = _frames(linkage, np.zeros(n))
     lengths = linkage.length, linkage.com, locked[revolute]
     rounding = eps * sum(np.abs(length).sum() for length in lengths)
     moving = np.flatnonzero(~np.stack(fixed_pairs(linkage.ef)))

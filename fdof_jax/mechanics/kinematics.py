@@ -4,14 +4,13 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
-from ..base.array_namespace import namespace, plane_vector, plane_vectors
-from ..linkage.frames import frames
+from ..linkage.frames import frames, plane_vector, plane_vectors
 from ..linkage.linkage import Linkage, compiled, without_fixed
 
 
 def as_points(vectors: Array) -> Array:
     """Returns x + iy as points (..., 2)."""
-    return namespace(vectors).stack([vectors.real, vectors.imag], axis=-1)
+    return jnp.stack([vectors.real, vectors.imag], axis=-1)
 
 
 @compiled("q")

@@ -8,8 +8,8 @@ from matplotlib.lines import Line2D
 from matplotlib.markers import MarkerStyle
 from matplotlib.path import Path
 
-from ..base.array_namespace import in_numpy
-from ..linkage.frames import frames
+from ..base.known_values import in_numpy
+from ..linkage.frames import known_frames
 from ..linkage.linkage import Linkage, check_linkage, without_fixed
 from ..linkage.topology import letters
 from .axes import BLACK, GREY, SERIES, xy
@@ -49,7 +49,7 @@ def geometry(
     check_linkage(linkage)
     arm = in_numpy(linkage)
     kinds = letters(arm.ef)
-    f = frames(arm, without_fixed(arm, q))
+    f = known_frames(arm, without_fixed(arm, q))
     start, direction = f.start, f.direction
     end = start + arm.length * direction
     # Mass centres, projected on their links and in their places.

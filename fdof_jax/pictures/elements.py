@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from matplotlib.path import Path
 
-from ..base.array_namespace import in_numpy
+from ..base.known_values import in_numpy
 from ..forces.actuators import LinearActuator
 from ..forces.element import elements_on
 from ..forces.joints import JointStops

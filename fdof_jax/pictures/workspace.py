@@ -9,8 +9,8 @@ from matplotlib.colors import ListedColormap
 from numpy.typing import ArrayLike
 
 from ..analysis.reach import Ranges, curves, reached_cells
-from ..base.array_namespace import in_numpy
 from ..base.checks import real_array
+from ..base.known_values import in_numpy
 from ..dynamics import mass_matrix
 from ..forces.element import Forces
 from ..linkage.linkage import Linkage, check_linkage, joints_of

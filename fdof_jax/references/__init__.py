@@ -1,9 +1,8 @@
 """Reference motions: moves of the joints, tasks along paths, timing."""
 
-from .circle import CircleTask
 from .paths import Ellipse, FigureEight, Line, Path, Spline
 from .reference import Reference, reachable
-from .task import JointMove, TipTask
+from .task import CircleTask, JointMove, TipTask
 from .timing import Laps, Travel, shock_against
 
 __all__ = [

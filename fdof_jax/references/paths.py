@@ -1,18 +1,17 @@
 """Paths of the tip."""
 
 from abc import abstractmethod
-from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from ..base.array_namespace import in_numpy, namespace, sine_and_cosine
 from ..base.checks import instance, real_array
+from ..base.known_values import at_once
+from ..base.trigonometry import sincos
 from ..linkage.fields import Part, Values, default, field
 
 
@@ -56,8 +55,7 @@ class Line(Path):
         return (self.start + self.end) / 2
 
     def point(self, share):
-        share = namespace(self.start, share).asarray(share)
-        return self.start + share[..., None] * (self.end - self.start)
+        return self.start + share * (self.end - self.start)
 
 
 class _Closed(Path):
@@ -68,10 +66,9 @@ class _Closed(Path):
     tilt: Values = field((), unit="rad", default=0.0, kw_only=True)
 
     def _placed(self, along: Array, across: Array) -> Array:
-        sin, cos = sine_and_cosine(self.tilt)
+        sin, cos = sincos(self.tilt)
         a, b = self.sizes[0] * along, self.sizes[1] * across
-        turned = [a * cos - b * sin, a * sin + b * cos]
-        return self.middle + namespace(*turned).stack(turned, axis=-1)
+        return self.middle + jnp.stack([a * cos - b * sin, a * sin + b * cos])
 
 
 class Ellipse(_Closed):
@@ -89,7 +86,7 @@ class Ellipse(_Closed):
     """
 
     def point(self, share):
-        sin, cos = sine_and_cosine(2 * np.pi * share)
+        sin, cos = sincos(2 * np.pi * share)
         return self._placed(cos, sin)
 
 
@@ -108,7 +105,7 @@ class FigureEight(_Closed):
     """
 
     def point(self, share):
-        sin, cos = sine_and_cosine(2 * np.pi * share)
+        sin, cos = sincos(2 * np.pi * share)
         return self._placed(sin, 2 * sin * cos)
 
 
@@ -136,39 +133,36 @@ class Spline(Path):
         count = len(self.points)
         if count < 3:
             raise ValueError(f"points: expected three or more, got {count}.")
-        # The slopes of neighbouring cubics meet: b[k-1] + 4 b[k] + b[k+1] = 6 d2[k].
-        p = in_numpy(self.points)
-        xp = namespace(p)
-        right = 6 * (xp.roll(p, 1, axis=0) - 2 * p + xp.roll(p, -1, axis=0))
-        if not closed:  # no bend at the ends: half of a closed one that turns over
-            ends = np.isin(np.arange(count), [0, count - 1])[:, None]
-            right = xp.where(ends, 0, right)
-            right = xp.concatenate([right, -right[-2:0:-1]])
-        waves = xp.fft.rfft(right, axis=0)
-        turns = 2 * np.pi * np.arange(len(waves))[:, None] / len(right)
-        waves = waves / (4 + 2 * np.cos(turns)).astype(waves.dtype)
-        bends = xp.fft.irfft(waves, len(right), axis=0)[:count]
-        self.bends = jnp.asarray(bends, dtype=float)
+        self.bends = _bends(self.points, closed)
 
     @property
     def middle(self) -> Array:
         return self.points.mean(axis=0)
 
     def point(self, share):
-        xp, count = namespace(self.points, share), len(self.points)
-        share = xp.asarray(share)[..., None]
+        count = len(self.points)
         if self.closed:
-            place = xp.mod(share, 1) * count
-            first = xp.minimum(xp.floor(place), count - 1)
+            place = jnp.mod(share, 1) * count
+            first = jnp.minimum(jnp.floor(place), count - 1)
         else:
             place = share * (count - 1)
-            first = xp.clip(xp.floor(place), 0, count - 2)
-        b, k = place - first, first[..., 0].astype(int)
+            first = jnp.clip(jnp.floor(place), 0, count - 2)
+        b, k = place - first, first.astype(int)
         a, after = 1 - b, (k + 1) % count
         bend = (a**3 - a) * self.bends[k] + (b**3 - b) * self.bends[after]
         return a * self.points[k] + b * self.points[after] + bend / 6
 
 
-@eqx.filter_jit
-def points_at(path: Path, timing: Any, times: Array) -> Array:
-    return jax.vmap(lambda t: path.point(timing(t)))(times)
+@at_once
+def _bends(points: Array, closed: bool) -> Array:
+    """Solves b[k-1] + 4 b[k] + b[k+1] = 6 d2[k]: slopes of neighbours meet."""
+    right = 6 * (
+        jnp.roll(points, 1, axis=0) - 2 * points + jnp.roll(points, -1, axis=0)
+    )
+    if not closed:  # no bend at the ends: half of a closed one that turns over
+        right = right.at[jnp.array([0, -1])].set(0)
+        right = jnp.concatenate([right, -right[-2:0:-1]])
+    waves = jnp.fft.rfft(right, axis=0)
+    turns = 2 * np.pi * np.arange(len(waves))[:, None] / len(right)
+    waves = waves / (4 + 2 * np.cos(turns)).astype(waves.dtype)
+    return jnp.fft.irfft(waves, len(right), axis=0)[: len(points)]

@@ -1,4 +1,4 @@
-"""References along paths of the tip, and moves of the joints."""
+"""References along paths of the tip or on a circle, and moves of the joints."""
 
 from abc import abstractmethod
 from typing import Any
@@ -10,21 +10,21 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from ..base.array_namespace import in_numpy, namespace, plane_vectors
 from ..base.checks import JOINT, is_traced, real_array
+from ..base.known_values import at_once, in_numpy
+from ..base.trigonometry import sincos
 from ..linkage.fields import Condition, Values, called, default, field, of_kind
-from ..linkage.frames import cross, dot
+from ..linkage.frames import cross, dot, plane_vector, plane_vectors
 from ..linkage.linkage import Linkage
 from ..mechanics.inverse_kinematics import (
     arm_of,
-    known_directions,
+    check_moving_joints,
     plane_angle,
     solve_joints,
-    unmoved_part,
     whole_turns,
 )
-from .paths import Path, Spline, points_at
-from .reference import Reference, runs_in_numpy
+from .paths import Path, Spline
+from .reference import Reference, reach
 from .timing import Laps, Travel, times_of_moves
 
 # Times at which a path is checked, and those of each cubic of a long spline.
@@ -53,8 +53,7 @@ class JointMove(Reference):
 
     def assembly(self, t: Array, linkage: Linkage) -> tuple[Array, float]:
         """Joint positions, and 1 as the root: a joint move has no edge of a reach."""
-        share = self.travel(t)[..., None]
-        return self.start + share * (self.end - self.start), 1.0
+        return self.start + self.travel(t) * (self.end - self.start), 1.0
 
 
 def angle_between(a: Array, b: Array) -> Array:
@@ -79,11 +78,8 @@ class TipReference(Reference):
         """
 
     def assembly(self, t, linkage):
-        arm, placed = arm_of(linkage, self.orientation is not None)
-        directions = known_directions(arm, self.direction)
-        seen = self.wrist_seen(t, unmoved_part(arm, directions))
-        q, root = solve_joints(arm, directions, *seen, self.branch)
-        return placed(q), root
+        arm = arm_of(linkage, self.orientation)
+        return solve_joints(arm, *self.wrist_seen(t, arm.base), self.branch)
 
     def __call__(
         self, t: ArrayLike, linkage: Linkage
@@ -96,7 +92,7 @@ class TipReference(Reference):
         """
         motion = super().__call__(t, linkage)
         if not (is_traced(motion) or np.isfinite(motion).all()):
-            arm_of(linkage, self.orientation is not None)  # another number of joints
+            check_moving_joints(linkage, self.orientation is not None)
             tip = np.round(self.tip(t), 6)
             raise ValueError(
                 f"t: expected a time at which the tip is within {self._reach()}, got "
@@ -107,13 +103,8 @@ class TipReference(Reference):
     def _reach(self) -> str:
         """Names the reach in messages."""
         commanded = self.orientation is not None
-        at = f" at orientation {self.direction:g} rad" if commanded else ""
+        at = f" at orientation {self.orientation:g} rad" if commanded else ""
         return f"the linkage's reach{at} on branch {self.branch:+g}"
-
-    @property
-    def direction(self) -> Any:
-        """The last link's absolute angle, or 0 where none is commanded [rad]."""
-        return 0.0 if self.orientation is None else self.orientation
 
 
 class TipTask(TipReference):
@@ -156,18 +147,12 @@ class TipTask(TipReference):
 
     def tip(self, t: ArrayLike) -> Float[Array, " 2"]:
         """The commanded tip position at time `t` [s]: (x, y) [m]."""
-        return self.path.point(self.timing(real_array("t", t, ())))
+        return _tip(self, real_array("t", t, ()))
 
     def wrist_seen(self, t, base):
         """The wrist and its angle, as the angle from the path's middle and its own."""
-        if namespace(t) is np and not runs_in_numpy(self.path, self.timing):
-            with jax.ensure_compile_time_eval():  # also within transformations
-                points = points_at(self.path, self.timing, jax.device_put(np.ravel(t)))
-            tip: Any = np.asarray(points).reshape(*np.shape(t), 2)
-        else:
-            tip = self.path.point(self.timing(t))
-        wrist = plane_vectors(tip) - base
-        hub = plane_vectors(in_numpy(self.path.middle)) - base
+        wrist = plane_vectors(self.path.point(self.timing(t))) - base
+        hub = plane_vectors(self.path.middle) - base
         middle = plane_angle(hub.imag, hub.real)
         middle = middle - 2 * np.pi * whole_turns(middle)
         return wrist, middle + angle_between(hub, wrist)
@@ -181,23 +166,18 @@ class TipTask(TipReference):
         between these. The path of `Laps` has to be closed.
         """
         super().check(linkage, ts)
-        task, arm, ts = in_numpy((self, linkage, ts))
-        three, directions, base = task._placed(arm)
-        times = task._times(ts)
-        wrist, bearing = task.wrist_seen(times, base)
-        q, root = solve_joints(three, directions, wrist, bearing, task.branch)
-        inside = np.isfinite(q).all(axis=1) & (root != 0)
-        if not inside.all():
+        check_moving_joints(linkage, self.orientation is not None)
+        times, within, ahead, gap = in_numpy(_survey(self, linkage, ts))
+        if not within.all():
             raise ValueError(
-                f"reference: expected a path within {task._reach()}, got one that "
-                f"leaves it at {times[inside.argmin()]:g} s."
+                f"reference: expected a path within {self._reach()}, got one that "
+                f"leaves it at {times[within.argmin()]:g} s."
             )
-        if not task._ahead(bearing, base):
+        if not ahead:
             raise ValueError(
                 "reference: expected a path that does not pass behind the ground "
                 "pivot as seen from its middle, got one that does."
             )
-        gap = task._gap(lambda t: task.wrist_seen(t, base)[0], ts)
         if gap > _CLOSED:
             raise ValueError(
                 "reference: expected a closed path for `Laps`, got one that ends "
@@ -205,45 +185,155 @@ class TipTask(TipReference):
             )
 
     def fits(self, linkage, ts):
-        _, _, base = self._placed(linkage)
-        seen, times = lambda t: self.wrist_seen(t, base), self._times(ts)
-        each = seen if namespace(times) is np else jax.vmap(seen)
-        _, bearing = each(times)
-        closed = self._gap(lambda t: seen(t)[0], ts) <= _CLOSED
-        return super().fits(linkage, ts) & self._ahead(bearing, base) & closed
+        ahead, gap = _way(self, linkage, _times(self, ts))
+        return super().fits(linkage, ts) & ahead & (gap <= _CLOSED)
 
-    def _placed(self, linkage: Linkage) -> tuple[Any, Any, Array]:
-        """Returns the arm, its known directions, and what a wrist lacks to the tip."""
-        arm, _ = arm_of(linkage, self.orientation is not None)
-        directions = known_directions(arm, self.direction)
-        return arm, directions, unmoved_part(arm, directions)
 
-    def _times(self, ts: Array) -> Any:
-        """Returns times between the first and the last at which the path is checked."""
-        timing, xp, count = self.timing, namespace(self, ts), _TIMES
-        begin, end = ts[0], ts[-1]
-        if isinstance(timing, Laps):  # all laps are alike
-            end = xp.minimum(end, begin + abs(timing.period))
-        if type(timing) is Travel:  # it rests before and after
-            travel = timing.begin, timing.begin + timing.duration
-            begin, end = (xp.clip(t, begin, end) for t in travel)
-        if isinstance(self.path, Spline):
-            count = max(count, _OF_CUBIC * len(self.path.points))
-        times = xp.linspace(begin, end, count, dtype=ts.dtype)
-        if runs_in_numpy(timing):
-            return times
-        if xp is jnp:
-            return times_of_moves(timing, times)
-        with jax.ensure_compile_time_eval():
-            return np.asarray(times_of_moves(timing, jax.device_put(times)))
+@at_once
+def _tip(task: TipTask, t: Array) -> Array:
+    return task.path.point(task.timing(t))
 
-    def _ahead(self, bearing: Array, base: Array) -> Any:
-        """Returns whether the wrist never passes behind the ground pivot."""
-        jumps = abs(namespace(bearing).diff(bearing)) > np.pi
-        return ~jumps.any() & (plane_vectors(in_numpy(self.path.middle)) != base)
 
-    def _gap(self, wrist: Any, ts: Array) -> Any:
-        """Returns how far a lap ends from its start [m], 0 without laps."""
-        if not isinstance(self.timing, Laps):
-            return 0.0
-        return abs(wrist(ts[0] + self.timing.period) - wrist(ts[0]))
+def _times(task: TipTask, ts: Array) -> Array:
+    """Returns times between the first and the last at which the path is checked."""
+    timing, count = task.timing, _TIMES
+    begin, end = ts[0], ts[-1]
+    if isinstance(timing, Laps):  # all laps are alike
+        end = jnp.minimum(end, begin + abs(timing.period))
+    if type(timing) is Travel:  # it rests before and after
+        travel = timing.begin, timing.begin + timing.duration
+        begin, end = (jnp.clip(t, begin, end) for t in travel)
+    if isinstance(task.path, Spline):
+        count = max(count, _OF_CUBIC * len(task.path.points))
+    times = jnp.linspace(begin, end, count)
+    if type(timing) in (Laps, Travel):
+        return times
+    return times_of_moves(timing, times)
+
+
+@at_once
+def _survey(task: TipTask, linkage: Linkage, ts: Array) -> tuple[Array, ...]:
+    """Returns times, whether the tip is within reach at each, and the `_way`."""
+    times = _times(task, ts)
+    return times, reach(task, linkage, times), *_way(task, linkage, times)
+
+
+def _way(task: TipTask, linkage: Linkage, times: Array) -> tuple[Array, Array]:
+    """Returns whether the wrist never passes behind the pivot, and a gap [m].
+
+    The gap is between the end of a lap and its start, 0 without laps.
+    """
+    gap = jnp.zeros(())
+    base = arm_of(linkage, task.orientation).base
+    wrist = lambda t: task.wrist_seen(t, base)
+    _, bearing = jax.vmap(wrist)(times)
+    jumps = abs(jnp.diff(bearing)) > np.pi
+    ahead = ~jumps.any() & (plane_vectors(task.path.middle) != base)
+    if isinstance(task.timing, Laps):
+        gap = abs(wrist(times[0] + task.timing.period)[0] - wrist(times[0])[0])
+    return ahead, gap
+
+
+class CircleTask(TipReference):
+    """A circle traced by the tip at constant speed; the last link keeps its angle.
+
+    A call with `(t, linkage)` returns the joint reference, computed by the closed-form
+    inverse kinematics and its exact rate. The reference is continuous in time, also
+    where the path winds around the base, which no `TipTask` may do. At t = 0 it equals
+    that of `inverse_kinematics`.
+
+    The circle of Fig 7 is not printed in the paper: the default is our choice. It lies
+    inside the reach of the figure's arm and starts 0.25 m from the arm's tip, because
+    the text mentions an initial offset.
+
+    **Arguments:**
+
+    - `center`: (x, y) [m].
+    - `radius`: not negative [m].
+    - `period`: time of one turn, counter-clockwise if positive, not zero [s].
+    - `phase`: direction of the starting point as seen from the centre [rad].
+    - `orientation`: th4, the absolute angle of the last link [rad].
+    - `branch`: assembly of the arm, 1 or -1: see `inverse_kinematics`.
+
+    **Raises:** ValueError for malformed arguments. `check`, and so `simulate`, raises
+    it for a circle out of the linkage's reach, and a call where the tip is out of it.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig7().linkage
+    >>> circle = fj.CircleTask(center=[-4, 2], radius=0.75, period=5)
+    >>> q, qd = circle(0.0, arm)
+    >>> circle.tip(0.0).tolist(), fj.tip_position(arm, q).tolist()
+    ([-4.75, 2.0], [-4.75, 2.0])
+    """
+
+    center: Values = field((2,), unit="m", default=(-4.0, 2.0))
+    radius: Values = field((), unit="m", minimum=0, default=0.75)
+    period: Values = field((), unit="s", default=5.0)
+    phase: Values = field((), unit="rad", default=np.pi)
+    orientation: Values = field((), unit="rad", default=np.pi / 2)
+    branch: Values = field((), unit="", default=1)
+
+    def conditions(self):
+        yield from super().conditions()
+        yield Condition(self.period != 0, "period", "not zero", (self.period,))
+
+    def tip(self, t: ArrayLike) -> Float[Array, " 2"]:
+        """The commanded tip position at time `t` [s]: (x, y) [m]."""
+        return _circle_tip(self, real_array("t", t, ()))
+
+    def wrist_seen(self, t, base):
+        """The wrist and its angle, which starts within a turn.
+
+        The angle of the larger vector, to the centre or from there, is continuous. The
+        smaller one adds at most a quarter turn.
+        """
+        hub = plane_vector(*self.center) - base
+        angle, ray = _ray(self, jnp.stack([t, jnp.zeros_like(t)]))
+        around = self.radius**2 > dot(hub, hub)
+        larger = jnp.where(around, ray, hub)
+        angle = jnp.where(around, angle, plane_angle(hub.imag, hub.real))
+        wrist = hub + ray
+        bearing = angle + angle_between(larger, wrist)
+        return wrist[0], bearing[0] - 2 * np.pi * whole_turns(bearing[1])
+
+    def check(self, linkage: Linkage, ts: Array) -> None:
+        """Raises ValueError if the tip leaves the linkage's reach between the times."""
+        check_moving_joints(linkage, oriented=True)
+        if not in_numpy(_within(self, linkage, ts)):
+            raise ValueError(
+                f"reference: expected a circle within {self._reach()}, got center "
+                f"{self.center.tolist()} and radius {self.radius:g} m."
+            )
+
+
+# A function, because each access to a method of an equinox module creates an object.
+def _ray(circle: CircleTask, t: Array) -> tuple[Array, Array]:
+    """Angle and vector from the centre to the tip."""
+    angle = circle.phase + 2 * np.pi * t / circle.period
+    sin, cos = sincos(angle)
+    return angle, plane_vector(circle.radius * cos, circle.radius * sin)
+
+
+@at_once
+def _circle_tip(circle: CircleTask, t: Array) -> Array:
+    _, ray = _ray(circle, t)
+    return circle.center + jnp.stack([ray.real, ray.imag])
+
+
+@at_once
+def _within(circle: CircleTask, linkage: Linkage, ts: Array) -> Array:
+    """Returns whether a circle is within reach for one turn, or the run if shorter.
+
+    The reach ends first where the wrist is nearest to or farthest from the base, or
+    along a direction that the ground or the last link fixes.
+    """
+    begin, turn = ts[0], abs(circle.period)
+    arm = arm_of(linkage, circle.orientation)
+    hub = plane_vector(*circle.center) - arm.base
+    fixed = arm.angle[0], circle.orientation - arm.locked[2]
+    directions = jnp.stack([jnp.angle(hub), *fixed])
+    lead = jnp.append(directions, directions + np.pi) - circle.phase
+    extremes = begin + (lead / (2 * np.pi) * circle.period - begin) % turn
+    times = jnp.linspace(begin, jnp.minimum(ts[-1], begin + turn), 257)
+    times = jnp.append(times, jnp.minimum(extremes, ts[-1]))
+    return reach(circle, linkage, times).all()

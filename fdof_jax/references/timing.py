@@ -10,7 +10,6 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from ..base.array_namespace import namespace
 from ..base.checks import concrete, instance, one_of, real_array
 from ..linkage.fields import Condition, Part, Values, field
 
@@ -20,18 +19,17 @@ RAMP = 0.25  # share of its time in which a trapezoidal profile speeds up
 
 
 def _trapezoidal(x: Array) -> Array:
-    xp = namespace(x)
     scale = 2 * RAMP * (1 - RAMP)
-    cruising = xp.where(
+    cruising = jnp.where(
         x > 1 - RAMP, 1 - (1 - x) ** 2 / scale, (x - RAMP / 2) / (1 - RAMP)
     )
-    return xp.where(x < RAMP, x**2 / scale, cruising)
+    return jnp.where(x < RAMP, x**2 / scale, cruising)
 
 
 # The share of the way as a function of the share of the time, both from 0 to 1.
 PROFILES: dict[str, Callable[[Array], Array]] = {
-    "harmonic": lambda x: (1 - namespace(x).cos(np.pi * x)) / 2,
-    "cycloidal": lambda x: x - namespace(x).sin(2 * np.pi * x) / (2 * np.pi),
+    "harmonic": lambda x: (1 - jnp.cos(np.pi * x)) / 2,
+    "cycloidal": lambda x: x - jnp.sin(2 * np.pi * x) / (2 * np.pi),
     "quintic": lambda x: x**3 * (10 - 15 * x + 6 * x**2),
     "trapezoidal": _trapezoidal,
 }
@@ -70,8 +68,7 @@ class Travel(Part):
         """The share of the way at time `t` [s], from 0 to 1."""
         x = (t - self.begin) / self.duration
         # At a jump the derivative is that after it; jnp.clip's would be the mean.
-        xp = namespace(x)
-        x = xp.where(x < 0, 0, xp.where(x < 1, x, 1))
+        x = jnp.where(x < 0, 0, jnp.where(x < 1, x, 1))
         return (1 - self.shock) * PROFILES[self.profile](x) + self.shock * x
 
     @property
@@ -106,7 +103,6 @@ class Laps(Part):
         return self.phase + t / self.period
 
 
-@eqx.filter_jit
 def times_of_moves(timing: Callable[[Array], Array], times: Array) -> Array:
     """Adds as many times, at which the share of the way changes between the given ones.
 

@@ -14,7 +14,6 @@ from jax import Array
 from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
-from ..base.array_namespace import in_numpy, namespace
 from ..base.checks import place_of, shown
 from ..dynamics import mass_and_bias
 from ..forces.element import Element, Forces, naming
@@ -22,7 +21,7 @@ from ..linkage.fields import Condition, called
 from ..linkage.linkage import Linkage, joints_of, without_fixed
 from ..linkage.topology import MOST_PAIRS, fixed_pairs
 from ..mechanics.equations import equations, zeros
-from ..references.reference import EXPECTED, positions_at, reference_motion
+from ..references.reference import EXPECTED, reference_motion
 from ..steps.dopri8 import Health, ScheduledTerm
 from .field import (
     Args,
@@ -87,9 +86,8 @@ class PrescribedMotion(Element):
 
     def prescribes(self, linkage: Linkage) -> Array:
         """Returns whether each joint of an arm is prescribed; a fixed pair is not."""
-        moved, ef = in_numpy((self.moved, linkage.ef))
-        fixed = namespace(moved, ef).stack(fixed_pairs(ef))
-        return moved[: joints_of(linkage)] & ~fixed
+        fixed = jnp.stack(fixed_pairs(linkage.ef))
+        return self.moved[: joints_of(linkage)] & ~fixed
 
     def at(self, t: Array, linkage: Linkage) -> tuple[Array, Array]:
         return reference_motion(self.reference, t, linkage)
@@ -117,8 +115,8 @@ def agrees(forces: Forces, t: Array, q: Array, linkage: Linkage) -> Any:
     if (motion := prescribed(forces)) is None:
         return True
     with naming(f"forces[{place_of(motion, forces)}]"):
-        begin = positions_at(motion.reference, t, linkage)
-    near = abs(in_numpy(q) - begin) <= 1e-6 * (1 + abs(begin))
+        begin, _ = motion.at(t, linkage)
+    near = abs(q - begin) <= 1e-6 * (1 + abs(begin))
     return (near | ~motion.prescribes(linkage)).all()
 
 

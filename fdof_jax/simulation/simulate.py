@@ -10,7 +10,6 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
-from ..base.array_namespace import in_numpy
 from ..base.checks import (
     increasing,
     instance,
@@ -21,6 +20,7 @@ from ..base.checks import (
     single_precision,
     whole_number,
 )
+from ..base.known_values import in_numpy
 from ..forces.element import Element, Forces, elements_on, naming, of_full_size
 from ..linkage.coordinates import State, real_state
 from ..linkage.fields import check_values

@@ -14,8 +14,8 @@ from ..linkage.linkage import Linkage, check_linkage
 from ..linkage.topology import TOPOLOGIES
 from ..mechanics.kinematics import tip_jacobian, tip_position
 from ..paper import from_chain
-from ..references.circle import CircleTask
 from ..references.reference import reference_of
+from ..references.task import CircleTask
 from ..simulation.scene import Scene, stacked
 from .losses import controller_of, with_controller
 

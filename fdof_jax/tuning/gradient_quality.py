@@ -12,8 +12,8 @@ from jaxtyping import Bool, Float
 
 from ..analysis.linearization import Modes, closed_loop_modes, depends_on_state_alone
 from ..analysis.tracking import relative_demands
-from ..base.array_namespace import in_numpy
 from ..base.configuration import options_of_loops
+from ..base.known_values import in_numpy
 from ..base.report import Report
 from ..linkage.linkage import joint_names
 from ..simulation.prescribed import PrescribedMotion

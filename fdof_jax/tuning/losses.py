@@ -11,7 +11,6 @@ from jax import Array
 from jaxtyping import Float
 
 from ..analysis.tracking import relative_demands, tip_deviation
-from ..base.array_namespace import in_numpy, namespace
 from ..base.checks import function, instance, is_traced, real_array, refusal
 from ..control.pd import PDController
 from ..linkage.fields import Part, Values, field
@@ -59,10 +58,8 @@ def tracked_task(scene: Scene, name: str = "scene") -> Any:
 def gains_of(scene: Scene) -> Any:
     """kp and kd of a scene's controller (2, n), 0 at fixed pairs."""
     controller = controller_of(scene)
-    # In NumPy if known: JAX would compile programs.
-    linkage, *gains = in_numpy((scene.linkage, controller.kp, controller.kd))
-    rows = [without_fixed(linkage, row) for row in gains]
-    return namespace(rows).stack(rows)
+    gains = controller.kp, controller.kd
+    return jnp.stack([without_fixed(scene.linkage, row) for row in gains])
 
 
 def with_gains(scene: Scene, gains: Array) -> Scene:

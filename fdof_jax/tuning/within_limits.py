@@ -16,8 +16,8 @@ from ..analysis.linearization import checked, loop_matrices
 from ..analysis.loops import margins, open_loop
 from ..analysis.responses import BAND, samples_of, step_measures
 from ..analysis.tracking import demands
-from ..base.array_namespace import in_numpy
 from ..base.checks import instance
+from ..base.known_values import in_numpy
 from ..base.report import Report
 from ..control.pd import PDController
 from ..forces.element import Element

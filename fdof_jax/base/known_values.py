@@ -1,0 +1,41 @@
+"""Known values: as NumPy arrays, and functions of them as one compiled program."""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+from jax.core import Tracer
+
+from .checks import is_traced
+
+
+def in_numpy(tree: Any) -> Any:
+    """Returns `tree` with its concrete JAX arrays as NumPy arrays."""
+
+    def converted(leaf: Any) -> Any:
+        # NumPy has no dtype for random keys.
+        numbers = isinstance(leaf, jax.Array) and isinstance(leaf.dtype, np.dtype)
+        return np.asarray(leaf) if numbers and not isinstance(leaf, Tracer) else leaf
+
+    return jax.tree.map(converted, tree)
+
+
+def at_once(function: Callable) -> Callable:
+    """Decorates a function, which then runs as one program if arguments are known.
+
+    Otherwise JAX would compile each of its operations. The results are known too, also
+    within transformations.
+    """
+    program = eqx.filter_jit(function)
+
+    @functools.wraps(function)
+    def run(*arguments: Any) -> Any:
+        if is_traced(arguments):
+            return function(*arguments)
+        with jax.ensure_compile_time_eval():
+            return program(*arguments)
+
+    return run
