@@ -54,7 +54,7 @@ def geometry(
     end = start + arm.length * direction
     # Mass centres, projected on their links and in their places.
     foot = start[:, 1:] + arm.com[:, 0] * direction[:, 1:]
-    center = f.mass_centers(arm)
+    center = foot + 1j * arm.com[:, 1] * direction[:, 1:]
 
     points = {}
     last = len(kinds)
