@@ -8,8 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ..analysis.equilibria import equilibrium
-from ..analysis.linearization import checked, loop_matrices
+from ..analysis.linearization import checked, equilibrium, loop_matrices
 from ..analysis.loops import margins, open_loop
 from ..analysis.responses import BAND, samples_of, step_measures
 from ..analysis.tracking import demands
