@@ -14,28 +14,18 @@ each_topology = pytest.mark.parametrize("topology", fj.TOPOLOGIES)
 
 def arm(topology, **changes):
     arguments = dict(
-        length=[0.2, 1.1, 1.3, 0.4],
-        com=[[0.5, 0.1]] * 3,
-        mass=[1, 1, 1],
-        inertia=[1, 1, 1],
-        locked=[0.2, 0.7, -0.5],
-        base_angle=0.4,
-    )
-    return fj.Linkage(topology, **{**arguments, **changes})
+        length=[0.2, 1.1, 1.3, 0.4], com=[[0.5, 0.1]] * 3, mass=[1, 1, 1],
+        inertia=[1, 1, 1], locked=[0.2, 0.7, -0.5], base_angle=0.4,
+    )  # fmt: skip
+    return fj.Linkage(topology, **arguments | changes)
 
 
 def circle_of(linkage, **changes):
     """Returns a circle around a bent posture's tip, reachable for its topology."""
     q = [0.8, 1.5, 0.4]
     x, _ = fj.paper.to_chain(linkage, q, [0, 0, 0])
-    task = dict(
-        center=fj.tip_position(linkage, q),
-        radius=0.1,
-        period=2.5,
-        phase=0.6,
-        orientation=x[5],
-    )
-    return fj.CircleTask(**{**task, **changes})
+    center = fj.tip_position(linkage, q)
+    return fj.CircleTask(center, 0.1, 2.5, phase=0.6, orientation=x[5], **changes)
 
 
 @jax.jit
