@@ -229,7 +229,11 @@ def _each_linearized(
     linkage: Linkage, forces: Forces, rows: tuple[Array, Array, Array]
 ) -> Float[Array, "time state state"]:
     """Returns A for rows of positions, velocities and times."""
-    at = lambda row: _linearized(linkage, forces, *row, jnp.zeros_like(row[0])).A
+
+    def at(row):
+        q, qd, t = row
+        return _linearized(linkage, forces, q, qd, t, jnp.zeros_like(q)).A
+
     # A loop compiles in two thirds of the time of `jax.vmap`, and runs four times as
     # fast (101 times of Fig 7, one core).
     return jax.lax.map(at, rows)
