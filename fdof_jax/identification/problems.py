@@ -94,7 +94,7 @@ def unknowns_of(start: Any, bounds: Any, scale: Any) -> Unknowns:
             size = real_array(f"scale{label}", scale[name], shape, **keywords)
         elif not first.any():
             expected = f"a size for {shown(name)}, whose start is 0"
-            raise refusal("scale", expected, scale)
+            raise refusal("scale", expected, scale or None)
         else:
             size = np.where(first == 0, np.abs(first).max(), np.abs(first))
         pair, place = bounds.get(name, (-np.inf, np.inf)), f"bounds{label}"
