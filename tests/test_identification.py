@@ -109,6 +109,11 @@ def test_masses_inertias_offsets_and_damping_are_recovered(seen):
     np.testing.assert_allclose(errors_of(result), 0, atol=1e-7)
     assert result.names[2:] == ("offset", "damping[0]", "damping[1]", "damping[2]")
     assert (np.diff(result.history) < 0).all()
+    # Errors by a given noise, whatever the residuals are.
+    given = fj.fit(MIXED, FIRST, TS, seen, noise=1e-3)
+    slopes = jacobian(MIXED, TRUE)
+    bound = 1e-6 * np.linalg.inv(slopes.T @ slopes)
+    np.testing.assert_allclose(given.covariance, bound, rtol=1e-3, atol=1e-9)
 
 
 def test_a_sparse_recording_with_noise_and_its_standard_errors(seen):
