@@ -146,6 +146,13 @@ def test_the_phase_margin_of_a_stiff_loop_of_high_order():
     np.testing.assert_allclose(found.phase, phase, rtol=1e-6)
 
 
+def test_the_delay_margin_of_a_loop_that_leads():
+    """L = 2 s / (s + 1) leads by 60 degrees where |L| = 1."""
+    found = margins(control.ss(-1, 1, -2, 2))
+    lags = found.phase, found.delay * found.crossover
+    np.testing.assert_allclose(lags, (-2 * np.pi / 3, 4 * np.pi / 3), rtol=1e-9)
+
+
 def test_the_closed_loop_is_the_linearised_arm():
     linkage, q = arm("RPR")
     gains = fj.control.gains_from_frequency(linkage, q, 20.0, 0.7)
