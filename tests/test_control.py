@@ -1,62 +1,45 @@
-"""The saturated PD law, and the circle's joint reference over many turns."""
-
-from functools import partial
+"""Controllers: the saturated PD law, feed-forward, computed torque, gains."""
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.linalg
+from elements import MOVE, arm as small_arm
+from helpers import random_linkage
 
 import fdof_jax as fj
+from fdof_jax.analysis.tracking import relative_demands, tip_deviation
 
 each_topology = pytest.mark.parametrize("topology", fj.TOPOLOGIES)
+FREE = (8.0, 5.0, jnp.inf, MOVE)  # gains, limit and reference
+PENDULUM = fj.Linkage(
+    "R", length=[0, 1], com=[[0.6, 0.2]], mass=[2], inertia=[0.3], gravity=9.81
+)
 
 
-def arm(topology, **changes):
-    arguments = dict(
-        length=[0.2, 1.1, 1.3, 0.4],
-        com=[[0.5, 0.1]] * 3,
-        mass=[1, 1, 1],
-        inertia=[1, 1, 1],
-        locked=[0.2, 0.7, -0.5],
-        base_angle=0.4,
-    )
-    return fj.Linkage(topology, **{**arguments, **changes})
+class Stand(fj.references.Reference):
+    target: fj.Values = fj.field(unit="m or rad")
+
+    def __call__(self, t, linkage):
+        return self.target, 0 * self.target
 
 
-def circle_of(linkage, **changes):
-    """Returns a circle around a bent posture's tip, reachable for its topology."""
-    q = [0.8, 1.5, 0.4]
-    x, _ = fj.paper.to_chain(linkage, q, [0, 0, 0])
-    task = dict(
-        center=fj.tip_position(linkage, q),
-        radius=0.1,
-        period=2.5,
-        phase=0.6,
-        orientation=x[5],
-    )
-    return fj.CircleTask(**{**task, **changes})
+def arm(topology, seed=0):
+    rng = np.random.default_rng(seed)
+    return random_linkage(topology, rng), rng.uniform(-1, 1, 3)
 
 
-@jax.jit
-def references(task, linkage, times):
-    return jax.vmap(lambda t: task(t, linkage))(times)
+def pd_at(q, kp, kd):
+    n = len(q)
+    full = lambda value: np.broadcast_to(value, n).astype(float)
+    return fj.PDController(full(kp), full(kd), full(np.inf), Stand(q))
 
 
-@jax.jit
-@partial(jax.vmap, in_axes=(None, 0))
-def commanded(task, t):
-    """Returns the commanded tip and its velocity."""
-    return jax.jvp(task.tip, (t,), (jnp.ones_like(t),))
-
-
-@jax.jit
-@partial(jax.vmap, in_axes=(None, 0, 0))
-def tip_motion(linkage, q, qd):
-    """Returns the tip, its velocity and rotation, and the last link's angle."""
-    x, _ = fj.paper.to_chain(linkage, q, qd)
-    return fj.tip_position(linkage, q), fj.tip_jacobian(linkage, q) @ qd, x[5]
+def poles(linkage, q, *forces):
+    A, _ = fj.linearize(linkage, fj.State(q, 0 * q), forces)
+    return np.linalg.eigvals(A)
 
 
 # The PD law
@@ -65,35 +48,27 @@ def tip_motion(linkage, q, qd):
 @pytest.mark.parametrize("limit", [[3.0, 4.0, 5.0], [1e9, 0.0, np.inf]])
 def test_the_controller_is_the_clipped_sum_of_both_errors(limit):
     rng = np.random.default_rng(0)
-    linkage = arm("RPR")
+    linkage, _ = arm("RPR")
     q_ref, qd_ref = rng.normal(size=(2, 3))
     kp, kd = rng.uniform(0, 10, (2, 3))
     controller = fj.PDController(kp, kd, limit, lambda t, k: (q_ref * t, qd_ref))
+    one = fj.PDController(2, 3, np.inf, lambda t, k: (jnp.ones(3), jnp.ones(3)))
+    still = jnp.zeros(3)
+    np.testing.assert_array_equal(one(0.0, still, still, linkage), [5, 5, 5])
     saturated = []
     for _ in range(50):
         q, qd = rng.normal(size=(2, 3))
         demand = kp * (2 * q_ref - q) + kd * (qd_ref - qd)
-        effort = controller(2.0, q, qd, linkage)
+        limited = np.maximum(-np.array(limit), np.minimum(limit, demand))
         np.testing.assert_allclose(controller.demand(2.0, q, qd, linkage), demand)
-        np.testing.assert_allclose(
-            effort, np.maximum(-np.array(limit), np.minimum(limit, demand))
-        )
+        np.testing.assert_allclose(controller(2.0, q, qd, linkage), limited)
         saturated.append(np.abs(demand) > limit)
     assert 0 < np.mean(saturated) < 1
 
 
-def test_one_gain_serves_all_joints():
-    controller = fj.PDController(2, 3, np.inf, lambda t, k: (jnp.ones(3), jnp.ones(3)))
-    for field in (controller.kp, controller.kd, controller.limit):
-        assert field.shape == () and field.dtype == jnp.result_type(float)
-    np.testing.assert_array_equal(
-        controller(0.0, jnp.zeros(3), jnp.zeros(3), arm("RRR")), [5, 5, 5]
-    )
-
-
 def test_gradients_in_the_gains_stop_where_the_effort_is_limited():
     error, rate = jnp.array([2.0, -3.0, 0.5]), jnp.array([0.1, 0.2, -0.3])
-    linkage = arm("RRR")
+    linkage, _ = arm("RRR")
     controller = fj.PDController(
         [100, 1, 1], [1, 1, 1], [5, 50, 50], lambda t, k: (error, rate)
     )
@@ -107,177 +82,181 @@ def test_gradients_in_the_gains_stop_where_the_effort_is_limited():
     np.testing.assert_allclose(gradient.limit, [1, 0, 0])
 
 
-# The circle
+def heavier(linkage):
+    return eqx.tree_at(lambda k: k.mass, linkage, 1.3 * linkage.mass)
 
 
-@pytest.mark.parametrize("period", [5.0, -3.0])
-def test_the_tip_runs_round_the_circle_at_constant_speed(period):
-    center, radius, phase = np.array([1.0, -2.0]), 0.7, 0.3
-    task = fj.CircleTask(center, radius, period, phase)
-    times = np.array([0, 0.4, 7.3])
-    for tip, velocity in zip(*map(np.asarray, commanded(task, times))):
-        arm_vector = tip - center
-        turn = 2 * np.pi / period
-        assert np.hypot(*arm_vector) == pytest.approx(radius)
-        np.testing.assert_allclose(
-            velocity, turn * np.array([-arm_vector[1], arm_vector[0]]), atol=1e-13
-        )
-    start = center + radius * np.array([np.cos(phase), np.sin(phase)])
-    np.testing.assert_allclose(task.tip(0), start)
-    np.testing.assert_allclose(task.tip(3 * period), start)
-
-
-@each_topology
-@pytest.mark.parametrize("branch", [1, -1])
-def test_the_reference_puts_the_tip_on_the_circle(topology, branch):
-    linkage = arm(topology)
-    task = circle_of(linkage, branch=branch)
-    times = np.linspace(-0.3, 5, 23)
-    q, qd = references(task, linkage, times)
-    tips, rate, angle = map(np.asarray, tip_motion(linkage, q, qd))
-    expected, velocity = commanded(task, times)
-    np.testing.assert_allclose(tips, expected, atol=1e-12)
-    turns = (angle - np.asarray(task.orientation)) / (2 * np.pi)
-    np.testing.assert_allclose(turns, np.full(23, np.round(turns[0])), atol=1e-12)
-    # Its rate moves the tip along the circle without turning the last link.
-    np.testing.assert_allclose(rate[:, :2], velocity, atol=1e-11)
-    np.testing.assert_allclose(rate[:, 2], np.zeros(23), atol=1e-11)
-
-
-@each_topology
-def test_the_rate_of_the_reference_is_its_central_difference(topology):
-    linkage = arm(topology)
-    task = circle_of(linkage)
-    times, h = np.linspace(0, 2.5, 11), 1e-5
-    after, before = (
-        np.asarray(references(task, linkage, times + s)[0]) for s in (h, -h)
-    )
-    _, qd = references(task, linkage, times)
-    np.testing.assert_allclose(qd, (after - before) / (2 * h), atol=1e-7)
-
-
-@each_topology
-@pytest.mark.parametrize("branch", [1, -1])
-def test_the_reference_starts_where_inverse_kinematics_says(topology, branch):
-    linkage = arm(topology)
-    task = circle_of(linkage, branch=branch)
-    start = fj.inverse_kinematics(linkage, task.tip(0), task.orientation, branch=branch)
-    first, _ = references(task, linkage, np.zeros(1))
-    np.testing.assert_allclose(first[0], start, atol=1e-12)
-
-
-# Continuity. The arms' wrists see the base at the origin; the hub is the circle's
-# centre as the wrist sees it: the tip runs 0.4 m to the right of the wrist.
-
-
-def wrist_arm(topology):
-    """Returns an arm of long reach; the RPR one has its slide through the base."""
-    length = [0, 2, 2.5, 0.4] if topology == "RRR" else [0, 0.1, 0.1, 0.4]
-    return arm(topology, length=length, locked=0, base_angle=0)
-
-
-def wrist_circle(hub, radius, **keywords):
-    center = np.array(hub) + [0.4, 0]
-    return fj.CircleTask(center, radius, orientation=0, **keywords)
-
-
-CIRCLES = {
-    "beside": ([1.8, 0.1], 0.7, 0),
-    "across the negative x axis": ([-1.8, 0.1], 0.7, 0),
-    "on the negative x axis": ([-1.8, 0.0], 0.7, 0),
-    "around the base": ([0.3, -0.2], 1.7, 1),
-    "centred on the base": ([0.0, 0.0], 1.7, 1),
-}
-
-
-@pytest.mark.parametrize("topology", ["RRR", "RPR"])
-@pytest.mark.parametrize("period", [2.0, -2.0])
-@pytest.mark.parametrize("phase", [0.0, 2.0, -np.pi])
-@pytest.mark.parametrize("circle", CIRCLES)
-def test_the_reference_never_jumps_and_counts_its_turns(
-    circle, phase, period, topology
-):
-    hub, radius, winding = CIRCLES[circle]
-    linkage = wrist_arm(topology)
-    task = wrist_circle(hub, radius, period=period, phase=phase)
-    step = 0.005
-    times = step * np.arange(1201)  # three turns
-    q, qd = map(np.asarray, references(task, linkage, times))
-    largest = 1.01 * np.abs(qd).max(axis=0) * step + 1e-12
-    assert (np.abs(np.diff(q, axis=0)).max(axis=0) <= largest).all()
-    turns = (q[-1] - q[0]) / (2 * np.pi)
-    expected = 3 * winding * np.sign(period)
-    np.testing.assert_allclose(turns, [expected, 0, -expected], atol=1e-9)
-
-
-@pytest.mark.parametrize("topology", ["RRR", "RPR"])
-@pytest.mark.parametrize("phase", [0.0, 0.2, -0.2, np.pi, -np.pi, 3 * np.pi, 20.0])
-@pytest.mark.parametrize("circle", CIRCLES)
-def test_no_arm_at_the_start_of_the_circle_is_told_to_unwind(circle, phase, topology):
-    hub, radius, _ = CIRCLES[circle]
-    linkage = wrist_arm(topology)
-    task = wrist_circle(hub, radius, phase=phase)
-    start = fj.inverse_kinematics(linkage, task.tip(0), 0)
-    np.testing.assert_allclose(
-        references(task, linkage, np.zeros(1))[0][0], start, atol=1e-9
-    )
-
-
-def test_a_start_one_turn_away_unwinds():
-    linkage = arm("RPR")
-    task = circle_of(linkage)
-    controller = fj.PDController(40, 40, np.inf, task)
-    q, qd = task(0, linkage)
-    turn = jnp.array([2 * np.pi, 0, 0])
-    at_rest = controller(0, q, qd, linkage)
-    np.testing.assert_allclose(at_rest, np.zeros(3), atol=1e-12)
-    for start, effort in (q + turn, -40 * turn), (q - turn, 40 * turn):
-        np.testing.assert_allclose(
-            controller(0, start, qd, linkage), effort, atol=1e-12
-        )
+def sample(topology):
+    rng = np.random.default_rng(3)
+    return random_linkage(topology, rng), *rng.uniform(-2, 2, (2, 3))
 
 
 @jax.jit
-def reference_derivatives(task, linkage):
-    """Returns derivatives in the circle and the linkage, and the tip Jacobian."""
+def demanded_by(controller, t, q, qd, linkage):
+    return controller.demand(t, q, qd, linkage)
 
-    def positions(task, linkage):
-        return task(0.7, linkage)[0]
 
-    return (
-        jax.jacrev(positions, argnums=(0, 1))(task, linkage),
-        fj.tip_jacobian(linkage, positions(task, linkage)),
-    )
+# Gravity feed-forward
+
+
+@each_topology
+def test_the_weight_is_held_where_the_arm_is(topology):
+    linkage, q, qd = sample(topology)
+    plain = demanded_by(fj.PDController(*FREE), 0.4, q, qd, linkage)
+    for model in None, heavier(linkage):
+        controller = fj.control.GravityFeedforward(*FREE, model)
+        held = fj.analysis.holding_efforts(linkage if model is None else model, q)
+        found = demanded_by(controller, 0.4, q, qd, linkage)
+        np.testing.assert_allclose(found, plain + held, rtol=1e-12, atol=1e-12)
+    # The whole effort is limited.
+    limit = np.abs(found) * [0.5, 2, 0.9]
+    limited = fj.control.GravityFeedforward(*FREE[:2], limit, MOVE, model)
+    expected = np.clip(found, -limit, limit)
+    np.testing.assert_allclose(limited(0.4, q, qd, linkage), expected, atol=1e-12)
+
+
+def fed_forward():
+    scene = fj.scenes.fig7()
+    pd = scene.forces[0]
+    controller = fj.control.GravityFeedforward(pd.kp, pd.kd, pd.limit, pd.reference)
+    return scene._replace(forces=(controller,))
+
+
+def test_fig_7_with_gravity_held():
+    scene = fed_forward()
+    (controller,) = scene.forces
+    raw = demanded_by(controller, 0.0, *scene.state0, scene.linkage)
+    np.testing.assert_allclose(raw, [-82.23, -5009.92, -9.92], atol=5e-3)
+    known = {
+        0: 0.25, 0.1: 0.126453, 0.2: 0.096059, 0.3: 0.126177, 0.5: 0.067283,
+        0.75: 0.090121, 1: 0.106396, 1.5: 0.016605, 2: 0.029890, 3: 0.023419,
+        5: 0.012562, 10: 0.011217,
+    }  # fmt: skip
+    early = [t for t in known if t < 5]
+    ts = np.array([*early, *np.linspace(5, 10, 501)])
+    solution = fj.simulate(scene.linkage, scene.state0, ts, scene.forces)
+    deviation = tip_deviation(scene.linkage, controller.reference, solution)
+    error = np.linalg.norm(deviation, axis=1)
+    table = [*error[: len(early) + 1], error[-1]]
+    np.testing.assert_allclose(table, list(known.values()), atol=2e-6)
+    turn = error[len(early) :]
+    assert np.sqrt(np.mean(turn**2)) == pytest.approx(0.024625, abs=2e-5)
+    assert turn.max() == pytest.approx(0.036390, abs=2e-6)
+    # The slide is at its limit until 0.25 s, the turning joints never.
+    at_limit = jnp.abs(relative_demands(controller, scene.linkage, solution)) > 1
+    assert at_limit[ts < 0.2, 1].any() and not at_limit[:, [0, 2]].any()
+    assert not at_limit[ts > 0.26].any()
+
+
+@pytest.mark.slow
+def test_its_gains_are_tuned():
+    scene = fed_forward()._replace(t1=1.0)
+    result = fj.tune(scene, max_steps=3)
+    assert isinstance(result.scene.forces[0], fj.control.GravityFeedforward)
+    assert result.loss < 0.8 * result.history.loss[0]
+
+
+# Computed torque
+
+
+@each_topology
+def test_the_effort_is_the_inverse_dynamics_of_what_is_demanded(topology):
+    linkage, q, qd = sample(topology)
+    (q_ref, qd_ref), h = MOVE(0.4, linkage), 1e-6
+    qdd_ref = (MOVE(0.4 + h, linkage)[1] - MOVE(0.4 - h, linkage)[1]) / (2 * h)
+    demanded = qdd_ref + 8 * (q_ref - q) + 5 * (qd_ref - qd)
+    for model in None, heavier(linkage):
+        controller = fj.control.ComputedTorque(*FREE, model)
+        believed = linkage if model is None else model
+        expected = fj.inverse_dynamics(believed, q, qd, demanded)
+        found = demanded_by(controller, 0.4, q, qd, linkage)
+        np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-8)
+
+
+def test_errors_of_an_exact_model_are_linear():
+    """d2e/dt2 + kd de/dt + kp e = 0, critically damped, underdamped and overdamped."""
+    linkage, ts = small_arm("RPR"), np.linspace(0, 1.5, 4)
+    kp, kd = np.array([9.0, 25.0, 16.0]), np.array([6.0, 4.0, 10.0])
+    controller = fj.control.ComputedTorque(kp, kd, jnp.inf, MOVE)
+    error, rate = np.array([0.2, -0.1, 0.3]), np.array([-0.5, 0.4, 0.1])
+    q, qd = MOVE(0.0, linkage)
+    solution = fj.simulate(linkage, fj.State(q - error, qd - rate), ts, (controller,))
+    q_ref, _ = jax.vmap(lambda t: MOVE(t, linkage))(ts)
+    # Eigenvalues of each joint's companion matrix.
+    matrices = [[[0, 1], [-p, -d]] for p, d in zip(kp, kd)]
+    grown = scipy.linalg.expm(ts[:, None, None, None] * np.array(matrices))
+    start = np.stack([error, rate], axis=1)
+    expected = np.einsum("tjab,jb->tja", grown, start)[..., 0]
+    np.testing.assert_allclose(q_ref - solution.q, expected, atol=1e-8)
+
+
+def test_the_acceleration_is_that_of_the_inverse_kinematics():
+    linkage, task, t, h = fj.scenes.fig7().linkage, fj.CircleTask(), 0.7, 1e-5
+    rates = [task(t + step, linkage)[1] for step in (h, -h)]
+    controller = fj.control.ComputedTorque(100.0, 20.0, jnp.inf, task)
+    schedule = jax.jit(lambda t: controller.schedule(t, linkage))
+    q_ref, qd_ref, qdd_ref = schedule(t)
+    np.testing.assert_allclose(qdd_ref, (rates[0] - rates[1]) / (2 * h), atol=1e-7)
+    np.testing.assert_allclose((q_ref, qd_ref), task(t, linkage), rtol=1e-12)
+
+
+# Models
 
 
 @pytest.mark.parametrize(
-    "hub, radius",
-    [
-        ([0.0, 0.0], 1.7),  # the bearing of this hub is undefined
-        ([0.3, -0.2], 1.7),
-        ([-1.8, 0.1], 0.7),
-        ([-1.8, 0.1], 0.0),  # a point
-    ],
+    "kind", [fj.control.GravityFeedforward, fj.control.ComputedTorque]
 )
-def test_the_reference_is_differentiable_in_circle_and_linkage(hub, radius):
-    derivatives, jacobian = reference_derivatives(
-        wrist_circle(hub, radius), wrist_arm("RRR")
-    )
-    for leaf in jax.tree.leaves(derivatives):
-        assert np.isfinite(leaf).all()
-    identity = np.eye(3)[:, :2]  # the tip moves as the centre does
-    np.testing.assert_allclose(jacobian @ derivatives[0].center, identity, atol=1e-11)
+def test_models_are_checked(kind):
+    linkage = small_arm("RPR")
+    for model, message in (
+        ("RPR", "model: expected a Linkage, got 'RPR'"),
+        (eqx.tree_at(lambda k: k.mass, linkage, -linkage.mass), "model.mass: expected"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            kind(*FREE, model)
+    controller = kind(*FREE, small_arm("RRR"))
+    state = fj.State(np.zeros(3), np.zeros(3))
+    with pytest.raises(ValueError, match="model: expected the arm's own topology"):
+        fj.simulate(linkage, state, [0, 0.1], (controller,))
+    assert isinstance(controller, fj.PDController) and controller.possible()
 
 
-@pytest.mark.parametrize("begin", [0.0, 1.3])
-@pytest.mark.parametrize("excess, refused", [(-1e-6, False), (1e-6, True)])
-def test_circles_out_of_reach_are_refused_to_the_edge(excess, refused, begin):
-    # The RRR arm reaches 4.5 m; the circle touches that edge at one point.
-    linkage = wrist_arm("RRR")
-    task = wrist_circle([3.0 * np.cos(1), 3.0 * np.sin(1)], 1.5 + excess, phase=0.123)
-    ts = np.array([begin, 20.0])
-    if refused:
-        with pytest.raises(ValueError, match="^reference: expected .* reach .*, got "):
-            task.check(linkage, ts)
-    else:
-        task.check(linkage, ts)
+# Gains
+
+
+@pytest.mark.parametrize("joint", range(3))
+def test_a_joint_that_moves_alone_has_the_frequency_and_the_damping(joint):
+    linkage, q = arm("RRR")
+    linkage = linkage.replace(gravity=0, locked=0)
+    frequency, ratio = np.array([3.0, 5.0, 8.0]), np.array([0.2, 0.7, 1.0])
+    gains = fj.control.gains_from_frequency(linkage, q, frequency, ratio)
+    others = "".join("R" if k == joint else "F" for k in range(3))
+    alone = linkage.replace(topology=others, locked=q)
+    found = poles(alone, q, pd_at(q, *gains))
+    omega, zeta = frequency[joint], ratio[joint]
+    expected = np.roots([1, 2 * zeta * omega, omega**2])
+    found = found[np.abs(found) > 1e-6]  # without those of the fixed pairs
+    np.testing.assert_allclose(np.poly(found), np.poly(expected), rtol=1e-9)
+    fixed = fj.control.gains_from_frequency(alone, q, frequency, ratio)
+    np.testing.assert_allclose(fixed, np.eye(3)[joint] * gains, rtol=1e-12)
+
+
+def test_gains_count_masses_of_elements():
+    linkage, q = arm("RPR")
+    bare = fj.control.gains_from_frequency(linkage, q, 4.0, 0.5)
+    more = np.array([1.0, 2.0, 3.0])
+    forces = (fj.forces.Armature(more),)
+    geared = fj.control.gains_from_frequency(linkage, q, 4.0, 0.5, forces)
+    np.testing.assert_allclose(geared[0] - bare[0], 16 * more, rtol=1e-12)
+    np.testing.assert_allclose(geared[1] - bare[1], 4 * more, rtol=1e-12)
+
+
+def test_impossible_frequencies_are_refused():
+    linkage, q = arm("RRR")
+    for frequency, ratio, message in (
+        ([1, 2], 1, "frequency: expected an array of 3 real numbers for 3 joints"),
+        (0, 1, r"frequency: .* above 0 \[rad/s\]"),
+        (1, -0.1, "damping_ratio: .* at least 0"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            fj.control.gains_from_frequency(linkage, q, frequency, ratio)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from helpers import random_linkage
 from scipy import signal
-from test_gains import PENDULUM, Stand, pd_at
+from test_control import PENDULUM, Stand, pd_at
 
 import fdof_jax as fj
 from fdof_jax.analysis.linearization import loop_matrices

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from chains import random_chain
 from scipy.optimize import brentq, minimize_scalar
-from test_gains import PENDULUM, Stand, arm, pd_at, poles
+from test_control import PENDULUM, Stand, arm, pd_at, poles
 
 import fdof_jax as fj
 from fdof_jax.analysis import bandwidth, closed_loop, margins, open_loop
@@ -35,30 +35,27 @@ def test_the_loop_of_a_pendulum_is_as_written_out():
     np.testing.assert_allclose(found.delay, phase / crossover, rtol=1e-9)
 
 
-def test_without_gravity_no_factor_makes_a_damped_loop_unstable():
-    weightless = PENDULUM.replace(gravity=0)  # L is infinite at rest
-    loop = open_loop(weightless, POSITION, pd_at(POSITION, 50.0, 6.0), joint=1)
+def test_loops_without_margins_have_none():
+    kp, kd = 50.0, 6.0
+    # Without gravity, where L is infinite at rest, no factor makes it unstable.
+    weightless = PENDULUM.replace(gravity=0)
+    loop = open_loop(weightless, POSITION, pd_at(POSITION, kp, kd), joint=1)
     assert margins(loop).gain == np.inf
-
-
-def test_a_controller_at_its_limit_has_no_loop():
-    pd = pd_at(POSITION + 1, 50.0, 6.0)
+    # Loops are not stable that fall, as gains are too low, or swing without end.
+    for gains in ((1.0, 1.0), (50.0, 0.0)):
+        loop = open_loop(PENDULUM, POSITION, pd_at(POSITION, *gains), joint=1)
+        assert np.isnan(margins(loop)).all()
+    # A controller at its limit has no loop, and the arm falls.
+    pd = pd_at(POSITION + 1, kp, kd)
     limited = fj.PDController(pd.kp, pd.kd, [10.0], pd.reference)
     calls = PENDULUM, POSITION, limited, 1
     loop = open_loop(*calls)
-    assert (loop([1j, 2j]) == 0).all() and np.isnan(margins(loop)).all()  # it falls
+    assert (loop([1j, 2j]) == 0).all() and np.isnan(margins(loop)).all()
     assert np.isnan(bandwidth(closed_loop(*calls)))
     # No change of the loop makes an arm unstable that hangs.
     damped = fj.JointDamper(0.1)
     hangs = margins(open_loop(PENDULUM, POSITION - np.pi, limited, 1, (damped,)))
     assert hangs.phase == hangs.gain == hangs.delay == np.inf and hangs.modulus == 1
-
-
-@pytest.mark.parametrize("kp, kd", [(1.0, 1.0), (50.0, 0.0)])
-def test_a_loop_that_is_not_stable_has_no_margins(kp, kd):
-    """It falls, as its gains are too low, or swings without end."""
-    loop = open_loop(PENDULUM, POSITION, pd_at(POSITION, kp, kd), joint=1)
-    assert np.isnan(margins(loop)).all()
 
 
 def lagged(chain, seed, spread, ratio, lag, base=8.0):
@@ -149,6 +146,13 @@ def test_the_phase_margin_of_a_stiff_loop_of_high_order():
     np.testing.assert_allclose(found.phase, phase, rtol=1e-6)
 
 
+def test_the_delay_margin_of_a_loop_that_leads():
+    """L = 2 s / (s + 1) leads by 60 degrees where |L| = 1."""
+    found = margins(control.ss(-1, 1, -2, 2))
+    lags = found.phase, found.delay * found.crossover
+    np.testing.assert_allclose(lags, (-2 * np.pi / 3, 4 * np.pi / 3), rtol=1e-9)
+
+
 def test_the_closed_loop_is_the_linearised_arm():
     linkage, q = arm("RPR")
     gains = fj.control.gains_from_frequency(linkage, q, 20.0, 0.7)
@@ -163,16 +167,19 @@ def test_the_closed_loop_is_the_linearised_arm():
     np.testing.assert_allclose(other.A, loop.A, rtol=1e-12)
 
 
-@pytest.mark.parametrize("gains", [(80.0, 40.0), ([80.0, 0.0], [40.0, 0.0])])
-@pytest.mark.parametrize("speed", [False, True])
-def test_an_integral_of_a_fixed_pair_within_a_drive_is_no_state(gains, speed):
-    """It integrates without end, but acts on nothing that moves."""
-    q = np.array([0.8, 0.0])
-    longer = fj.Linkage(
-        "RF", length=[0, 1, 1], com=[[0.6, 0.2], [0.5, 0]], mass=[2, 1],
+def linkage_of_two(topology):
+    return fj.Linkage(
+        topology, length=[0, 1, 1], com=[[0.6, 0.2], [0.5, 0]], mass=[2, 1],
         inertia=[0.3, 0.1],
     )  # fmt: skip
-    kp, ki = gains
+
+
+@pytest.mark.parametrize("kp, ki, speed", [
+    (80.0, 40.0, False), ([80.0, 0.0], [40.0, 0.0], True),
+])  # fmt: skip
+def test_an_integral_of_a_fixed_pair_within_a_drive_is_no_state(kp, ki, speed):
+    """It integrates without end, but acts on nothing that moves."""
+    q, longer = np.array([0.8, 0.0]), linkage_of_two("RF")
     controller = fj.control.PIDController(kp, ki, 9.0, np.inf, Stand(q))
     if speed:
         controller = fj.control.SpeedLimit(controller, stall=1e3, no_load=1e3)
@@ -180,8 +187,8 @@ def test_an_integral_of_a_fixed_pair_within_a_drive_is_no_state(gains, speed):
     loop = open_loop(longer, q, slow, joint=1)
     assert loop.A.shape == (4, 4) and loop.feedback().poles().real.max() < 0
     inertia = float(fj.mass_matrix(longer, q)[0, 0])
-    fall = float(fj.analysis.holding_efforts(longer, q + [1e-6, 0])[0])
-    fall = (fall - float(fj.analysis.holding_efforts(longer, q - [1e-6, 0])[0])) / 2e-6
+    A, B = fj.linearize(longer, fj.State(q, 0 * q))
+    fall = -A[2, 0] / B[2, 0]
     s = 1j * np.geomspace(0.1, 1000, 9)
     expected = (80 + 40 / s + 9 * s) / (0.002 * s + 1) / (inertia * s**2 + fall)
     np.testing.assert_allclose(loop(s), expected, rtol=1e-6)
@@ -189,12 +196,8 @@ def test_an_integral_of_a_fixed_pair_within_a_drive_is_no_state(gains, speed):
 
 def test_an_integral_without_a_gain_is_no_state():
     q = np.array([0.8, 0.0])
-    two = fj.Linkage(
-        "RR", length=[0, 1, 1], com=[[0.6, 0.2], [0.5, 0]], mass=[2, 1],
-        inertia=[0.3, 0.1],
-    )  # fmt: skip
     pid = fj.control.PIDController(80.0, [40.0, 0.0], 9.0, np.inf, Stand(q))
-    loop = open_loop(two, q, pid, joint=1)
+    loop = open_loop(linkage_of_two("RR"), q, pid, joint=1)
     assert loop.A.shape == (5, 5) and np.isfinite(margins(loop).phase)
 
 
@@ -215,11 +218,17 @@ def follower(kind, **others):
     )
 
 
+def pd_response(s):
+    return (90 + 6 * s) / (INERTIA * s**2 + 6 * s + 90 + FALL)
+
+
+PD = follower(fj.PDController)
 MOTOR = dict(resistance=1.0, inductance=1e-3, constant=3.0)
 FOLLOWERS = {
-    "PD": (
-        follower(fj.PDController),
-        lambda s: (90 + 6 * s) / (INERTIA * s**2 + 6 * s + 90 + FALL),
+    "PD": (PD, pd_response),
+    "plain reference": (
+        fj.PDController([90.0], [6.0], [np.inf], lambda t, k: (POSITION, 0 * POSITION)),
+        pd_response,
     ),
     "gravity feedforward": (
         follower(fj.control.GravityFeedforward),
@@ -231,14 +240,10 @@ FOLLOWERS = {
         / (INERTIA * s**3 + 6 * s**2 + (90 + FALL) * s + 50),
     ),
     "motor": (
-        fj.control.DCMotor(follower(fj.PDController), **MOTOR),
+        fj.control.DCMotor(PD, **MOTOR),
         # The back-EMF acts on speeds, but not on those of the reference.
         lambda s: 3 * (90 + 6 * s)
         / ((INERTIA * s**2 + FALL) * (1e-3 * s + 1) + 9 * s + 3 * (90 + 6 * s)),
-    ),
-    "plain reference": (
-        fj.PDController([90.0], [6.0], [np.inf], lambda t, k: (POSITION, 0 * POSITION)),
-        lambda s: (90 + 6 * s) / (INERTIA * s**2 + 6 * s + 90 + FALL),
     ),
 }  # fmt: skip
 
@@ -299,17 +304,13 @@ def test_a_controller_without_a_reference_has_no_bandwidth():
 def test_loops_of_malformed_arguments_are_refused():
     linkage, q = arm("RRF")
     pd = pd_at(q, 1.0, 1.0)
+    prescribed = fj.simulation.PrescribedMotion(1, pd.reference)
     for controller, joint, forces, message in [
         (pd, 0, (), r"joint: expected one of \(1, 2\), got 0"),
         (pd, 3, (), r"joint: expected one of \(1, 2\), got 3"),
         (pd, 1, (fj.control.FirstOrderLag(pd, 0.1),), "forces: expected elements"),
         (3.0, 1, (), "controller: expected a force element"),
-        (
-            fj.simulation.PrescribedMotion(1, pd.reference),
-            1,
-            (),
-            "controller: expected one that",
-        ),
+        (prescribed, 1, (), "controller: expected one that"),
     ]:
         with pytest.raises(ValueError, match=message):
             open_loop(linkage, q, controller, joint, forces)

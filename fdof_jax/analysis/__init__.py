@@ -1,11 +1,16 @@
 """Analysis of configurations and motions: equilibria, linearisation, reactions."""
 
 from ..dynamics import inertia_ratios
-from .equilibria import equilibrium, holding_efforts
-from .linearization import Linearization, Modes, closed_loop_modes, linearize
+from .linearization import (
+    Linearization,
+    Modes,
+    closed_loop_modes,
+    equilibrium,
+    holding_efforts,
+    linearize,
+)
 from .loops import Margins, bandwidth, closed_loop, margins, open_loop
-from .reactions import joint_reactions
-from .regression import inertial_parameters, regressor
+from .reactions import inertial_parameters, joint_reactions, regressor
 from .responses import StepAndSine, step_and_sine
 
 __all__ = [

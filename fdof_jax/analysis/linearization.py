@@ -1,4 +1,4 @@
-"""Linear analysis for control: matrices of the arm and its loops, modes of motions."""
+"""Arms at rest, and linear analysis about them: matrices, loops, modes of motions."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix
 from jax import Array
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Complex, Float
@@ -14,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from ..base.checks import instance, is_traced, real_array, shown
 from ..control.pd import PDController
-from ..dynamics import bias_force, forward_dynamics, mass_matrix
+from ..dynamics import bias_force, forward_dynamics
 from ..forces.element import Element, Forces, elements_on, of_full_size
 from ..linkage.coordinates import State, real_state
 from ..linkage.linkage import (
@@ -22,6 +23,7 @@ from ..linkage.linkage import (
     check_linkage,
     joints_of,
     moving_joints,
+    per_joint,
     without_fixed,
 )
 from ..linkage.topology import fixed_pairs
@@ -56,9 +58,9 @@ def depends_on_state_alone(forces: tuple[Element, ...]) -> bool:
 def checked(linkage: Linkage, forces: Forces) -> tuple[Element, ...]:
     """Returns the forces as elements, which may have no state."""
     check_linkage(linkage)
-    found = elements_on(linkage, forces)
-    if depends_on_state_alone(found):
-        return of_full_size(linkage, found)
+    acting = elements_on(linkage, forces)
+    if depends_on_state_alone(acting):
+        return of_full_size(linkage, acting)
     raise ValueError(
         "forces: expected elements without a state of their own and no "
         f"PrescribedMotion, got {shown(forces)}."
@@ -72,6 +74,102 @@ def total_effort(
     rows = enumerate(forces)
     efforts = (element_effort(k, e, t, q, qd, linkage, ())[0] for k, e in rows)
     return sum(efforts, jnp.zeros_like(q))
+
+
+def equilibrium(
+    linkage: Linkage, q: ArrayLike, forces: Forces = (), t: ArrayLike = 0.0
+) -> Float[Array, " joint"]:
+    """Joint positions near `q` at which the arm stays at rest under its forces.
+
+    An equilibrium is an operating point for `linearize`. Under a PD controller it is
+    the position held while the reference stands still, including the sag.
+
+    **Arguments:** `linkage`; `q`: first guess [m or rad]; `forces`: elements without a
+    state of their own; `t`: time at which they are evaluated [s].
+
+    **Returns:** positions (n,); NaN if the Levenberg-Marquardt method finds none, for
+    instance from a guess at which actuators are at their limits. The equilibrium need
+    not be stable: see `linearize`.
+
+    **Raises:** ValueError for malformed arguments.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig5().linkage
+    >>> fj.analysis.equilibrium(arm, [-1.0, 0.1, 0.1]).tolist()  # it hangs
+    [-1.571, 0.0, 0.0]
+    """
+    forces = checked(linkage, forces)
+    return _rest(linkage, forces, per_joint("q", q, linkage), real_array("t", t, ()))
+
+
+@eqx.filter_jit
+def _rest(linkage: Linkage, forces: tuple[Element, ...], q: Array, t: Array) -> Array:
+    q = without_fixed(linkage, q)
+
+    def efforts(q):
+        lacking = _lacking(linkage, forces, q, t)
+        # A fixed pair is in equilibrium at 0.
+        return jnp.where(jnp.stack(fixed_pairs(linkage.ef)), -q, -lacking)
+
+    # Efforts relative to their rounding errors' scale: stiff controllers converge as
+    # exactly as soft springs.
+    slopes = jnp.abs(jax.jacfwd(efforts)(q))
+    size = jax.lax.stop_gradient(slopes @ (1 + jnp.abs(q)) + jnp.abs(efforts(q)) + 1)
+    tight = 1e3 * float(jnp.finfo(q.dtype).eps)
+    method = optimistix.LevenbergMarquardt(rtol=tight, atol=tight)
+
+    def search(function, q):
+        relative = lambda q, _: function(q)
+        root = optimistix.root_find(relative, method, q, throw=False)
+        good = root.result == optimistix.RESULTS.successful
+        return jnp.where(good, root.value, jnp.nan)
+
+    # optimistix alone would differentiate the least squares that the method minimises,
+    # which takes second derivatives of the efforts.
+    return jax.lax.custom_root(
+        lambda q: efforts(q) / size,
+        q,
+        search,
+        lambda slope, change: jnp.linalg.solve(jax.jacfwd(slope)(change), change),
+    )
+
+
+@eqx.filter_jit
+def _lacking(
+    linkage: Linkage, forces: tuple[Element, ...], q: Array, t: Array
+) -> Array:
+    """Efforts that the arm needs beside the forces to stay at rest."""
+    q, still = without_fixed(linkage, q), jnp.zeros_like(q)
+    acting = total_effort(linkage, forces, t, q, still)
+    return without_fixed(linkage, bias_force(linkage, q, still, forces) - acting)
+
+
+def holding_efforts(
+    linkage: Linkage, q: ArrayLike, forces: Forces = (), t: ArrayLike = 0.0
+) -> Float[Array, " joint"]:
+    """The joint efforts that, together with the forces, hold the arm at rest.
+
+    Without forces they balance gravity. Springs and stops carry their part, and masses
+    of elements are held too.
+
+    **Arguments:** `linkage`; `q`: joint positions [m or rad]; `forces`: elements
+    without a state of their own; `t`: time at which they are evaluated [s].
+
+    **Returns:** efforts (n,), 0 at fixed pairs [N or N m].
+
+    **Raises:** ValueError for malformed arguments.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig5().linkage
+    >>> fj.analysis.holding_efforts(arm, [0, 0, 0]).tolist()
+    [58.86, 29.43, 9.81]
+    >>> rope = fj.forces.Tension(fj.Point(0, 3, 1), fj.Point(3, 1), tension=9.81)
+    >>> fj.analysis.holding_efforts(arm, [0, 0, 0], (rope,)).tolist()  # lifts the tip
+    [29.43, 9.81, 0.0]
+    """
+    forces = checked(linkage, forces)
+    q, t = per_joint("q", q, linkage), real_array("t", t, ())
+    return _lacking(linkage, forces, q, t)
 
 
 @accepts_scene
@@ -101,30 +199,44 @@ def linearize(
     """
     forces = checked(linkage, forces)
     q, qd = map(jnp.asarray, real_state("state", state, linkage))
-    return _linearized(linkage, forces, q, qd, real_array("t", t, ()))
+    return _linearized(
+        linkage, forces, q, qd, real_array("t", t, ()), jnp.zeros_like(q)
+    )
 
 
 @eqx.filter_jit
 def _linearized(
-    linkage: Linkage, forces: tuple[Element, ...], q: Array, qd: Array, t: Array
+    linkage: Linkage,
+    forces: tuple[Element, ...],
+    q: Array,
+    qd: Array,
+    t: Any,
+    tau: Array,
 ) -> Linearization:
+    """Linearises the equations under the forces and the efforts `tau`."""
+
     def rates(y):
         q, qd, tau = (without_fixed(linkage, part) for part in jnp.split(y, 3))
         tau = tau + total_effort(linkage, forces, t, q, qd)
         return jnp.concatenate([qd, forward_dynamics(linkage, q, qd, tau, forces)])
 
-    slopes = jax.jacfwd(rates)(jnp.concatenate([q, qd, jnp.zeros_like(q)]))
+    slopes = jax.jacfwd(rates)(jnp.concatenate([q, qd, tau]))
     return Linearization(*jnp.split(slopes, [2 * q.size], axis=1))
 
 
 @eqx.filter_jit
 def _each_linearized(
-    linkage: Linkage, forces: Forces, *rows: Array
+    linkage: Linkage, forces: Forces, rows: tuple[Array, Array, Array]
 ) -> Float[Array, "time state state"]:
     """Returns A for rows of positions, velocities and times."""
+
+    def at(row):
+        q, qd, t = row
+        return _linearized(linkage, forces, q, qd, t, jnp.zeros_like(q)).A
+
     # A loop compiles in two thirds of the time of `jax.vmap`, and runs four times as
     # fast (101 times of Fig 7, one core).
-    return jax.lax.map(lambda row: _linearized(linkage, forces, *row).A, rows)
+    return jax.lax.map(at, rows)
 
 
 def _with_references(element: Element, changed: Callable[[Any], Any]) -> Element:
@@ -135,8 +247,8 @@ def _with_references(element: Element, changed: Callable[[Any], Any]) -> Element
             return eqx.tree_at(lambda pd: pd.reference, part, changed(part.reference))
         return changed(part) if isinstance(part, Reference) else part
 
-    held = lambda part: isinstance(part, PDController | Reference)
-    return jax.tree.map(of, element, is_leaf=held)
+    whole = lambda part: isinstance(part, PDController | Reference)
+    return jax.tree.map(of, element, is_leaf=whole)
 
 
 @eqx.filter_jit
@@ -152,19 +264,13 @@ def loop_matrices(
     """
     own, rebuilt = ravel_pytree(controller.initial_state(linkage))
     n, still = q.size, jnp.zeros_like(q)
-    inverse = jnp.linalg.inv(mass_matrix(linkage, q, forces))
-    inverse = jnp.where(jnp.stack(fixed_pairs(linkage.ef)), 0, inverse)
-    B = jnp.concatenate([jnp.zeros((n, n)), inverse, jnp.zeros((own.size, n))])
-
-    def acting(y):
-        q, qd, _ = jnp.split(y, [n, 2 * n])
-        weight = bias_force(linkage, q, still, forces)
-        return total_effort(linkage, forces, t, q, qd) - weight
+    hold = _lacking(linkage, forces, q, t)
+    arm = _linearized(linkage, forces, q, still, t, hold)
 
     def respond(y, change):
         q, qd, own = jnp.split(y, [n, 2 * n])
 
-        def moved(reference):
+        def displaced(reference):
             def at(time, linkage):
                 position, velocity = reference_motion(reference, time, linkage)
                 by, rate, growth = change
@@ -174,19 +280,17 @@ def loop_matrices(
 
             return at
 
-        led = _with_references(controller, moved)
-        effort, rate = led.act(t, q, qd, linkage, rebuilt(own))
+        element = _with_references(controller, displaced)
+        effort, rate = element.act(t, q, qd, linkage, rebuilt(own))
         return jnp.concatenate([effort, ravel_pytree(rate)[0]])
 
-    # At rest neither M^-1, multiplied by no effort, nor Coriolis forces have a slope.
     y = jnp.concatenate([q, still, own])
-    alone = jax.jacfwd(acting)(y)
     slopes, by_reference = jax.jacfwd(respond, (0, 1))(y, jnp.zeros((3, n)))
-    efforts, rates = slopes[:n], slopes[n:]
-    moved = jnp.concatenate([jnp.eye(n, len(y), n), jnp.zeros((n, len(y))), rates])
-    F = jnp.concatenate([jnp.zeros((3, 2 * n, n)), by_reference[n:].swapaxes(0, 1)], 1)
-    F = F + B @ by_reference[:n].swapaxes(0, 1)
-    return moved + B @ (alone + efforts), B, -efforts, F
+    by_reference = by_reference.swapaxes(0, 1)
+    A = jnp.pad(arm.A, (0, own.size)).at[2 * n :].set(slopes[n:])
+    B = jnp.pad(arm.B, ((0, own.size), (0, 0)))
+    F = jnp.pad(by_reference[:, n:], ((0, 0), (2 * n, 0), (0, 0)))
+    return A + B @ slopes[:n], B, -slopes[:n], F + B @ by_reference[:, :n]
 
 
 class Modes(NamedTuple):
@@ -258,10 +362,10 @@ def closed_loop_modes(linkage: Linkage, forces: Forces, solution: Solution) -> M
     # Without its statistics: solvers differ in them, and need no program each.
     rows = solution.q, solution.qd, solution.ts
     moving = np.array(moving_joints(linkage), int)
-    kept = np.append(moving, joints_of(linkage) + moving)  # fixed pairs have no modes
-    A = np.asarray(_each_linearized(linkage, forces, *rows))[:, kept[:, None], kept]
-    known = np.isfinite(A).all(axis=(1, 2))
+    free = np.append(moving, joints_of(linkage) + moving)  # fixed pairs have no modes
+    A = np.asarray(_each_linearized(linkage, forces, rows))[:, free[:, None], free]
+    finite = np.isfinite(A).all(axis=(1, 2))
     values = np.full(A.shape[:2], np.nan, complex)
-    values[known] = np.linalg.eigvals(A[known])
+    values[finite] = np.linalg.eigvals(A[finite])
     order = np.argsort(np.abs(values), axis=1)
     return Modes(np.take_along_axis(values, order, axis=1))

@@ -13,7 +13,7 @@ parallel to it. Where the last link's direction is commanded, the tip is anywher
 
 from collections.abc import Iterator
 from itertools import product
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import scipy
@@ -80,18 +80,14 @@ def curves(ranges: Ranges) -> Iterator[tuple[np.ndarray, bool]]:
 
     Positions out of range are NaN. If all joints are free, the arm is singular there.
     """
-    choices = [(None, *ranges.ends(k)) for k in ranges.moving]
-    for chosen in product(*choices):
-        q, free = np.zeros(len(ranges.kinds)), []
-        for k, end in zip(ranges.moving, chosen):
-            if end is None:
-                free.append(k)
-            else:
-                q[k] = end
-        for found in _curves(ranges, q, free):
-            found = ranges.within(found)
-            if np.isfinite(found).any():
-                yield found, len(free) == len(chosen)
+    moving, q = ranges.moving, np.zeros(len(ranges.kinds))
+    for choice in product(*((None, *ranges.ends(k)) for k in moving)):
+        free = [k for k, end in zip(moving, choice) if end is None]
+        q[moving] = [0.0 if end is None else end for end in choice]
+        for curve in _curves(ranges, q, free):
+            curve = ranges.within(curve)
+            if np.isfinite(curve).any():
+                yield curve, free == moving
 
 
 def _bodies(ranges: Ranges, q: np.ndarray, free: list[int]) -> tuple[list, float]:
@@ -216,10 +212,8 @@ def reached_cells(ranges: Ranges, found: list[np.ndarray]) -> Cells:
         parts = np.linspace(0, 1, 2 + int(2 * longest / step))
         between = path[:-1, None] + np.diff(path)[:, None] * parts
         walls[cells.at(between[np.isfinite(between)])] = True
-    split: Any = scipy.ndimage.label(
-        ~walls
-    )  # not across corners, as walls may be diagonal
-    regions, count = split
+    # Regions do not extend across corners, as walls may be diagonal.
+    regions, count = cast(Any, scipy.ndimage.label(~walls))
     tips = ranges.tips(_configurations(ranges, found))
     # A cell beside a wall may be on both sides of the curve.
     inner = np.where(scipy.ndimage.binary_dilation(walls, np.ones((3, 3))), 0, regions)

@@ -12,6 +12,7 @@ from jaxtyping import Complex, Float
 from numpy.typing import ArrayLike
 
 from ..base.checks import is_traced, real_array, refusal
+from ..base.report import Report
 from ..control.drives import Drive
 from ..control.pd import PDController
 from ..forces.element import Element, Forces, StatefulElement, elements_on, of_full_size
@@ -27,7 +28,7 @@ from ..linkage.linkage import (
 from ..references.reference import Reference
 from ..simulation.simulate import simulate
 from ..simulation.solution import Solution
-from .equilibria import holding_efforts
+from .linearization import holding_efforts
 from .loops import BANDWIDTH, bandwidth, closed_loop, margins, open_loop
 from .tracking import relative_demands
 
@@ -66,7 +67,7 @@ def _commanding(element: Any) -> Any:
     return element if isinstance(element, PDController) else None
 
 
-class StepAndSine(eqx.Module):
+class StepAndSine(Report):
     """Answers of each joint to steps and sines of its reference; prints itself.
 
     - `joints`: names of the tested joints, for instance R1.
@@ -98,19 +99,16 @@ class StepAndSine(eqx.Module):
     frequency: Float[np.ndarray, "joint frequency"]
     gain: Complex[np.ndarray, "joint frequency"]
 
-    def __repr__(self) -> str:
+    def _rows(self) -> list[list[str]]:
         header = ["", "step", "overshoot", "rise", "settling", "bandwidth", "at limit"]
         units = ["", "[m, rad]", "[%]", "[s]", "[s]", "[rad/s]", "[% of time]"]
         columns = (
             self.step, 100 * self.overshoot, self.rise_time, self.settling_time,
             self.bandwidth, 100 * self.saturated,
         )  # fmt: skip
-        rows = [header, units]
-        for name, *values in zip(self.joints, *columns):
-            rows.append([name, *(f"{value:.4g}" for value in values)])
-        return "\n".join(
-            f"{a:4}" + "".join(f"{b:>12}" for b in row) for a, *row in rows
-        )
+        numbers = ([f"{value:.4g}" for value in row] for row in zip(*columns))
+        rows = [[name, *row] for name, row in zip(self.joints, numbers)]
+        return [header, units, *rows]
 
 
 def step_and_sine(
@@ -155,11 +153,11 @@ def step_and_sine(
     >>> kp, kd = fj.control.gains_from_frequency(arm, q, [8, 20, 20], 0.7)
     >>> pd = fj.PDController(kp, kd, pd.limit, pd.reference)
     >>> print(fj.analysis.step_and_sine(arm, q, pd, step=0.5, duration=2.0))
-                step   overshoot        rise    settling   bandwidth    at limit
-            [m, rad]         [%]         [s]         [s]     [rad/s] [% of time]
-    R1           0.5       5.161      0.2743      0.7649       7.822         2.2
-    P2           0.5       4.115      0.1168      0.3365       24.37         0.5
-    R3           0.5       3.018      0.1198      0.3513       28.07           0
+            step  overshoot    rise  settling  bandwidth     at limit
+        [m, rad]        [%]     [s]       [s]    [rad/s]  [% of time]
+    R1       0.5      5.161  0.2743    0.7649      7.822          2.2
+    P2       0.5      4.115  0.1168    0.3365      24.37          0.5
+    R3       0.5      3.018  0.1198    0.3513      28.07            0
     """
     check_linkage(linkage)
     q = per_joint("q", q, linkage)
@@ -185,9 +183,8 @@ def step_and_sine(
         return simulate(linkage, start, ts, (acting, *forces), **keywords)
 
     def responses_at(here: Any) -> tuple[list[Any], np.ndarray]:
-        loops = [
-            closed_loop(linkage, here, with_probe(q), k + 1, forces) for k in moving
-        ]
+        calls = ((linkage, here, with_probe(q), k + 1, forces) for k in moving)
+        loops = [closed_loop(*call) for call in calls]
         return loops, np.array(list(map(bandwidth, loops)))
 
     loops, bandwidths = responses_at(q)

@@ -2,7 +2,7 @@
 
 from .design import NextMotion, next_motion
 from .fitting import fit, fit_each
-from .recordings import link_ends
+from .problems import link_ends
 from .result import FitResult
 
 __all__ = [

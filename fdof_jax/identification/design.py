@@ -9,7 +9,7 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
-from ..base.checks import function, increasing, instance, real_array, refusal, shown
+from ..base.checks import function, instance, real_array, refusal, shown
 from ..base.report import Report
 from ..search.bounded import Evaluation, Run, minimise
 from ..search.lanes import Lanes, check_scene
@@ -17,10 +17,16 @@ from ..simulation.scene import Scene
 from ..simulation.sensitivities import sensitivities
 from ..simulation.simulate import simulate
 from ..simulation.solution import Solution
-from .problems import Observe, SceneAt
-from .recordings import link_ends
+from .problems import (
+    Observe,
+    SceneAt,
+    Unknowns,
+    check_times,
+    link_ends,
+    named,
+    unknowns_of,
+)
 from .result import FitResult
-from .unknowns import Shapes, named, unknowns_of
 
 # The largest standard error is smoothed as the norm of this order.
 _ORDER = 8
@@ -64,52 +70,45 @@ class NextMotion(Report):
 
 
 class _Design(NamedTuple):
-    """An experiment, and what is known of its parameters.
+    """An experiment, and what earlier recordings say of its parameters.
 
-    Unknowns are the motion's numbers over `scale`. `information` (n, n) is that of the
-    earlier recordings on the parameters relative to their `sizes`.
+    `information` (n, n) is that on the parameters relative to their sizes.
     """
 
     experiment: Callable[..., SceneAt]
     observe: Observe
     within: Callable[[Scene, Solution], Array] | None
-    motion: Shapes
-    scale: Any
-    parameters: Shapes
-    values: Any
-    sizes: Any
+    motion: Unknowns
+    parameters: Unknowns
     information: Any
     ts: Any
     noise: Any
 
 
-def _errors(z: Array, design: _Design) -> tuple[Array, Array]:
-    """The smoothed largest relative standard error with its barrier, and all (n,)."""
-    scene_at = design.experiment(**named(design.motion, design.scale * z))
-
-    def changed(change: Array) -> Scene:
-        return scene_at(named(design.parameters, design.values + design.sizes * change))
-
-    def readings(scene, solution):
-        seen = jnp.asarray(design.observe(scene, solution))
-        return (seen / jnp.broadcast_to(design.noise, seen.shape)).reshape(-1)
-
-    found = sensitivities(changed, readings, jnp.zeros_like(design.values), design.ts)
-    told = design.information + found.jacobian.T @ found.jacobian
-    errors = jnp.sqrt(jnp.diag(jnp.linalg.inv(told)))
-    top = jax.lax.stop_gradient(errors.max())
-    largest = top * jnp.sum((errors / top) ** _ORDER) ** (1 / _ORDER)
-    if design.within is not None:
-        room = 1 - jnp.asarray(design.within(found.scene, found.solution)) ** 2
-        room = jnp.where(room > 0, room, jnp.nan)  # rejects motions beyond the limits
-        largest = largest * jnp.exp(-_BARRIER * jnp.mean(jnp.log(room)))
-    return largest, errors
-
-
 def _lane(z: Array, design: _Design) -> Evaluation:
+    """Evaluates the largest relative standard error, smoothed, with its barrier."""
+
     def loss(z):
-        value, errors = _errors(z, design)
-        return value, (value, errors)
+        scene_at = design.experiment(**design.motion.at(z))
+        shapes, values, sizes, *_ = design.parameters
+
+        def changed(change: Array) -> Scene:
+            return scene_at(named(shapes, values + sizes * change))
+
+        def readings(scene, solution):
+            seen = jnp.asarray(design.observe(scene, solution))
+            return (seen / jnp.broadcast_to(design.noise, seen.shape)).reshape(-1)
+
+        found = sensitivities(changed, readings, jnp.zeros_like(values), design.ts)
+        information = design.information + found.jacobian.T @ found.jacobian
+        errors = jnp.sqrt(jnp.diag(jnp.linalg.inv(information)))
+        top = jax.lax.stop_gradient(errors.max())
+        largest = top * jnp.sum((errors / top) ** _ORDER) ** (1 / _ORDER)
+        if design.within is not None:
+            room = 1 - jnp.asarray(design.within(found.scene, found.solution)) ** 2
+            room = jnp.where(room > 0, room, jnp.nan)  # rejects motions beyond limits
+            largest = largest * jnp.exp(-_BARRIER * jnp.mean(jnp.log(room)))
+        return largest, (largest, errors)
 
     gradient, (value, errors) = jax.jacfwd(loss, has_aux=True)(z)
     no_curvature = jnp.zeros((z.size, z.size))  # L-BFGS estimates it
@@ -165,56 +164,53 @@ def next_motion(
         raise refusal("experiment", "a callable", experiment)
     instance("found", found, FitResult)
     instance("start", start, Mapping)
-    ts = real_array("ts", ts, (None,))
-    increasing("ts", ts)
+    ts = check_times(ts)
     noise = np.asarray(real_array("noise", noise, np.shape(noise), above=0))
     if within is not None:
         function("within", within)
     function("observe", observe)
     motion = unknowns_of(start, bounds, dict.fromkeys(start, 1.0))
-    half = (motion.high - motion.low) / 2
-    if not (np.isfinite(half) & (half > 0)).all():
-        names = shown(list(start))
-        raise refusal("bounds", f"finite ones for all of {names}", bounds)
+    motion = motion._replace(scale=(motion.high - motion.low) / 2)
+    if not (np.isfinite(motion.scale) & (motion.scale > 0)).all():
+        expected = f"finite ones for all of {shown(list(start))}"
+        raise refusal("bounds", expected, bounds)
     parameters = unknowns_of(found.parameters, None, scale)
     sizes = parameters.scale
     first = named(motion.shapes, jnp.asarray(motion.start))
     scene = experiment(**first)(jax.tree.map(jnp.asarray, found.parameters))
     check_scene("experiment(...)(...)", scene, ts)
-    known = _information(found.covariance / np.outer(sizes, sizes))
+    information = _information(found.covariance / np.outer(sizes, sizes))
     design = _Design(
-        experiment, observe, within, motion.shapes, half, parameters.shapes,
-        parameters.start, sizes, known, ts, noise,
-    )  # fmt: skip
-    z, low, high = (a[None] / half for a in (motion.start, motion.low, motion.high))
+        experiment, observe, within, motion, parameters, information, ts, noise
+    )
+
+    def largest_so_far(runs: list[Run]) -> str:
+        errors = runs[0].best.facts["errors"]
+        return f"largest standard error {100 * errors.max():.3g} %"
+
     (run,) = minimise(
-        Lanes(_lane, [[design]]), z, low, high, method="l-bfgs", max_steps=max_steps,
-        enough=_ENOUGH, report=report, describe=_largest_so_far,
+        Lanes(_lane, [[design]]), *motion.box(1), method="l-bfgs", max_steps=max_steps,
+        enough=_ENOUGH, report=report, describe=largest_so_far,
     )  # fmt: skip
     if run.failed:
         raise ValueError(f"start: {_refused(scene, ts, within)}.")
-    numbers = np.clip(run.z * half, motion.low, motion.high)
     errors = run.best.facts["errors"][0]
     before = np.sqrt(np.diag(found.covariance)) / sizes
     return NextMotion(
-        motion=named(motion.shapes, numbers),
+        motion=named(motion.shapes, motion.numbers(run.z)),
         standard_errors=named(parameters.shapes, errors * sizes),
         improvement=float(before.max() / errors.max()),
         message=run.reason,
     )
 
 
-def _refused(
-    scene: Scene, ts: Array, within: Callable[[Scene, Solution], Array] | None
-) -> str:
+def _refused(scene: Scene, ts: Array, within: Any) -> str:
     """Says why a search cannot begin with a motion."""
     solution = simulate(scene.linkage, scene.state0, ts, scene.forces, throw=False)
     if str(solution.outcome) != "successful":
         reached = float(solution.stats["time_reached"])
-        return (
-            f"expected a motion that can be simulated, got {solution.outcome} at "
-            f"t = {reached:g} s"
-        )
+        got = f"{solution.outcome} at t = {reached:g} s"
+        return f"expected a motion that can be simulated, got {got}"
     if within is not None:
         shares = np.asarray(within(scene, solution))
         entry = np.unravel_index(np.argmax(np.abs(shares)), shares.shape)
@@ -228,13 +224,8 @@ def _refused(
 
 def _information(covariance: np.ndarray) -> np.ndarray:
     """Inverse of a covariance that may have infinite rows, which say nothing."""
-    known = np.isfinite(np.diag(covariance))
+    finite = np.isfinite(np.diag(covariance))
     information = np.eye(len(covariance)) / _IGNORANCE**2
-    part = np.ix_(known, known)
+    part = np.ix_(finite, finite)
     information[part] += np.linalg.inv(covariance[part])
     return information
-
-
-def _largest_so_far(runs: list[Run]) -> str:
-    errors = runs[0].best.facts["errors"]
-    return f"largest standard error {100 * errors.max():.3g} %"

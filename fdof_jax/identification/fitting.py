@@ -6,21 +6,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..base.checks import keywords_as, plain, real_array, refusal, shown
+from ..base.checks import keywords_as, refusal
 from ..search.bounded import Evaluation, Run, minimise
 from ..search.lanes import Lanes
 from .problems import (
     Observe,
     Problem,
     SceneAt,
+    Unknowns,
+    check_times,
     lane,
-    listed,
-    noise_by_changes,
+    link_ends,
     problems_of,
+    unknowns_of,
 )
-from .recordings import link_ends
 from .result import FitResult, fit_result
-from .unknowns import Unknowns, unknowns_of
 
 # A search stops when the loss falls by less than this part. One standard error of a
 # parameter changes the loss by about one part in the number of readings, far more.
@@ -41,11 +41,13 @@ def _longer_and_longer(
     rows: list[list[Problem]], unknowns: Unknowns, **keywords: Any
 ) -> list[Run]:
     """Searches over growing shares of the time; returns the runs over all of it."""
-    keywords |= dict(method="levenberg-marquardt", describe=_squares_so_far)
-    z, low, high = (
-        np.broadcast_to(numbers / unknowns.scale, (len(rows), numbers.size))
-        for numbers in (unknowns.start, unknowns.low, unknowns.high)
-    )
+
+    def squares_so_far(runs: list[Run]) -> str:
+        squares = sum(run.best.facts["squares"].sum() for run in runs)
+        return f"sum of squares {squares:.6g}"
+
+    keywords |= dict(method="levenberg-marquardt", describe=squares_so_far)
+    z, low, high = unknowns.box(len(rows))
 
     def until(share: float) -> Lanes:
         """The lanes with weights for readings up to this share of the time only."""
@@ -74,12 +76,9 @@ def _unseen(validate: Any, shape: tuple[int, ...], *settings: Any) -> list[Probl
     if validate is None:
         return []
     if not isinstance(validate, tuple) or len(validate) != 2:
-        raise ValueError(
-            "validate: expected (scene_at, observed), as for the fit itself, got "
-            f"{shown(validate)}."
-        )
-    names = "validate[0]", "validate[1]"
-    problems = problems_of(names, *listed(names[1], *validate), *settings)
+        expected = "(scene_at, observed), as for the fit itself"
+        raise refusal("validate", expected, validate)
+    problems = problems_of(("validate[0]", "validate[1]"), *validate, *settings)
     if problems[0].observed.shape != shape or not all(p.weight.any() for p in problems):
         raise ValueError(
             f"validate[1]: expected recordings like `observed`, of shape {shape}, with "
@@ -88,81 +87,48 @@ def _unseen(validate: Any, shape: tuple[int, ...], *settings: Any) -> list[Probl
     return problems
 
 
-def _judged(
-    runs: list[Run], unseen: list[Problem]
-) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Mean weighted squares of unseen recordings, and their numbers of readings.
-
-    Returns two arrays (recording,) for each run, and the Gauss-Newton matrix of the sum
-    of squares (n, n).
-    """
-    if not unseen:
-        return [(np.zeros(0), np.zeros(0), np.zeros(2 * run.z.shape)) for run in runs]
-    lanes = Lanes(lane, [unseen], starts=len(runs))
-    found = lanes(np.stack([run.z for run in runs]), np.arange(len(runs)))
-    normal = len(unseen) * found.curvature / 2  # the loss is a mean over recordings
-    columns = found.facts["member_loss"], found.facts["readings"], normal
-    return [
-        (squares / np.maximum(counts, 1), np.maximum(counts, 1), matrix)
-        for squares, counts, matrix in zip(*columns)
-    ]
-
-
 def _search(
-    scenes_at: Sequence[Any],
+    scene_at: Any,
     observed: Any,
     start: Any,
-    ts: ArrayLike,
+    ts: Any,
     together: bool,
     *,
-    observe: Observe,
-    noise: ArrayLike | None,
-    validate: tuple[Any, ArrayLike] | None,
-    bounds: Mapping[str, Any] | None,
-    scale: Mapping[str, Any] | None,
-    max_steps: int,
-    report: Callable[[str], Any] | None,
+    observe: Any,
+    noise: Any,
+    validate: Any,
+    bounds: Any,
+    scale: Any,
+    **search: Any,
 ) -> list[FitResult]:
     """Fits all recordings `together` in one result, or returns one result for each.
 
-    The keywords are those of `fit`; `observed` has recordings as first axis.
+    The keywords are those of `fit`.
     """
     unknowns = unknowns_of(start, bounds, scale)
-    ts = real_array("ts", ts, (None,))
-    if ts.size < 2 or not (np.diff(ts) > 0).all():
-        raise ValueError(
-            f"ts: expected two or more increasing times, got {plain(str(ts))}."
-        )
-    settings = unknowns, ts, observe, noise
-    problems = problems_of(("scene_at", "observed"), scenes_at, observed, *settings)
+    settings = unknowns, check_times(ts), observe, 1.0 if noise is None else noise
+    problems = problems_of(("scene_at", "observed"), scene_at, observed, *settings)
     unseen = _unseen(validate, problems[0].observed.shape, *settings)
     rows = [problems] if together else [[problem] for problem in problems]
-    counts = [sum(int((p.weight > 0).sum()) for p in row) for row in rows]
-    if min(counts) <= unknowns.start.size:
+    least = min(sum(int((p.weight > 0).sum()) for p in row) for row in rows)
+    if least <= unknowns.start.size:
         raise ValueError(
             f"observed: expected more readings than the {unknowns.start.size} "
-            f"unknowns, got {min(counts)}."
+            f"unknowns, got {least}."
         )
-    runs = _longer_and_longer(rows, unknowns, max_steps=max_steps, report=report)
+    runs = _longer_and_longer(rows, unknowns, **search)
     if any(run.failed for run in runs):
-        raise ValueError(
-            "start: expected parameters at which the scene can be simulated over ts, "
-            f"got {shown(start)}."
-        )
-    least = unknowns.start.size + 1
-    counts = [max(int(run.best.facts["readings"].sum()), least) for run in runs]
+        expected = "parameters at which the scene can be simulated over ts"
+        raise refusal("start", expected, start)
+    judged = [None] * len(runs)
+    if unseen:
+        lanes = Lanes(lane, [unseen], starts=len(runs))
+        found = lanes(np.stack([run.z for run in runs]), np.arange(len(runs)))
+        judged = [found.row(index) for index in range(len(runs))]
     return [
-        fit_result(
-            run, row[0].scene_at, unknowns, count, noise is not None,
-            noise_by_changes(run, row) if noise is None else (1.0, 0.0), *held_out,
-        )
-        for run, row, count, held_out in zip(runs, rows, counts, _judged(runs, unseen))
-    ]  # fmt: skip
-
-
-def _squares_so_far(runs: list[Run]) -> str:
-    squares = sum(run.best.facts["squares"].sum() for run in runs)
-    return f"sum of squares {squares:.6g}"
+        fit_result(run, row, unknowns, noise is not None, held_out)
+        for run, row, held_out in zip(runs, rows, judged)
+    ]
 
 
 def fit(
@@ -222,9 +188,9 @@ def fit(
     from the start.
     """
     return _search(
-        *listed("observed", scene_at, observed), start, ts, True, observe=observe,
-        noise=noise, validate=validate, bounds=bounds, scale=scale,
-        max_steps=max_steps, report=report,
+        scene_at, observed, start, ts, True, observe=observe, noise=noise,
+        validate=validate, bounds=bounds, scale=scale, max_steps=max_steps,
+        report=report,
     )[0]  # fmt: skip
 
 

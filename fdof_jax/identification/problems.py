@@ -1,39 +1,153 @@
-"""Recordings with their scenes, and their misfit at given parameters."""
+"""What is fitted: named unknowns, recordings of motions, and their misfit."""
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jaxtyping import Float
 
-from ..base.checks import function, shown
-from ..search.bounded import Evaluation, Run
+from ..base.checks import function, instance, real_array, refusal, shown
+from ..mechanics.kinematics import joint_positions, tip_position
+from ..search.bounded import Evaluation
 from ..search.lanes import check_scene, sum_of_squares
+from ..simulation.sampled import check_joints
 from ..simulation.scene import Scene, stacked
 from ..simulation.sensitivities import sensitivities
 from ..simulation.solution import Solution
-from .recordings import observations
-from .unknowns import Shapes, Unknowns, named
 
 SceneAt = Callable[[dict[str, Array]], Scene]
 Observe = Callable[[Scene, Solution], Array]
+# Names and shapes of parameters, in pairs: JAX would sort a dict.
+Shapes = tuple[tuple[str, tuple[int, ...]], ...]
 
-_TOLERANCE = 1e-7  # of the derivatives, and of the dense output
-_ACCURACY = 1e-5  # of simulated readings at that tolerance, at least
+_TOLERANCE = 1e-7  # of the derivatives
+
+
+class Unknowns(NamedTuple):
+    """First guess, size and bounds of all numbers, (n,) each.
+
+    A search's own unknowns z are numbers over their sizes. `shapes` holds the name and
+    the shape of each parameter.
+    """
+
+    shapes: Shapes
+    start: np.ndarray
+    scale: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """The name of each number; `mass[0]` for an entry of an array."""
+        return tuple(
+            name + (str(list(index)) if index else "")
+            for name, shape in self.shapes
+            for index in np.ndindex(shape)
+        )
+
+    def at(self, z: Any) -> dict[str, Any]:
+        """Returns the parameters by name."""
+        return named(self.shapes, self.scale * z)
+
+    def numbers(self, z: np.ndarray) -> np.ndarray:
+        """Returns all numbers, within their bounds in spite of rounding."""
+        return np.clip(z * self.scale, self.low, self.high)
+
+    def box(self, runs: int) -> Iterator[np.ndarray]:
+        """Yields z at the first guess and at both bounds, (run, n) each."""
+        for numbers in (self.start, self.low, self.high):
+            yield np.tile(numbers / self.scale, (runs, 1))
+
+
+def named(shapes: Shapes, numbers: Any) -> dict[str, Any]:
+    """Splits all numbers (n,) into arrays by name."""
+    arrays, place = {}, 0
+    for name, shape in shapes:
+        size = math.prod(shape)
+        arrays[name] = numbers[place : place + size].reshape(shape)[()]
+        place += size
+    return arrays
+
+
+def unknowns_of(start: Any, bounds: Any, scale: Any) -> Unknowns:
+    """Checks and completes the arguments `start`, `bounds` and `scale` of `fit`."""
+    if not isinstance(start, Mapping) or not start:
+        expected = "a dict of named parameters to find, for instance {'mass': 2.0}"
+        raise refusal("start", expected, start)
+    bounds, scale = ({} if given is None else given for given in (bounds, scale))
+    for argument, given in (("bounds", bounds), ("scale", scale)):
+        if not isinstance(given, Mapping) or not set(given) <= set(start):
+            names = shown(list(start))
+            raise refusal(argument, f"a dict with names from {names}", given)
+    shapes, columns = [], []
+    for name, value in start.items():
+        if not isinstance(name, str):
+            raise refusal("start", "names for keys", name)
+        shape, label = np.asarray(value, dtype=object).shape, f"[{shown(name)}]"
+        first = np.asarray(real_array(f"start{label}", value, shape))
+        if name in scale:
+            keywords: Any = dict(above=0, broadcast=True)
+            size = real_array(f"scale{label}", scale[name], shape, **keywords)
+        elif not first.any():
+            expected = f"a size for {shown(name)}, whose start is 0"
+            raise refusal("scale", expected, scale or None)
+        else:
+            size = np.where(first == 0, np.abs(first).max(), np.abs(first))
+        pair, place = bounds.get(name, (-np.inf, np.inf)), f"bounds{label}"
+        if not isinstance(pair, tuple | list) or len(pair) != 2:
+            raise refusal(place, "(least, greatest)", pair)
+        keywords = dict(finite=False, broadcast=True)
+        low, high = (
+            np.asarray(real_array(f"{place}[{i}]", end, shape, **keywords))
+            for i, end in enumerate(pair)
+        )
+        if not ((low <= first) & (first <= high)).all():
+            raise ValueError(
+                f"{place}: expected the start between them, got {shown(pair)} around "
+                f"{shown(first.tolist())}."
+            )
+        shapes.append((name, shape))
+        columns.append([np.ravel(array) for array in (first, size, low, high)])
+    return Unknowns(tuple(shapes), *map(np.concatenate, zip(*columns)))
+
+
+def link_ends(scene: Scene, solution: Solution) -> Float[Array, "time link 2"]:
+    """Positions of markers at the ends of the links: the next joints, and the tip.
+
+    **Arguments:** `scene`; `solution`: its motion.
+
+    **Returns:** points (x, y) from the ground pivot [m].
+
+    **Raises:** ValueError for malformed arguments.
+
+    >>> import fdof_jax as fj
+    >>> import numpy as np
+    >>> arm, start, *_ = fj.scenes.fig5()
+    >>> motion = fj.simulate(arm, start, np.linspace(0, 1, 101))
+    >>> fj.identification.link_ends(fj.scenes.fig5(), motion)[0].tolist()
+    [[1.0, 0.0], [2.0, 0.0], [3.0, 0.0]]
+    """
+    instance("scene", scene, Scene)
+    instance("solution", solution, Solution)
+    check_joints("solution", solution, scene.linkage)
+
+    def ends(q):
+        tip = tip_position(scene.linkage, q)
+        return jnp.concatenate([joint_positions(scene.linkage, q)[1:], tip[None]])
+
+    return jax.vmap(ends)(solution.q)
 
 
 class Problem(NamedTuple):
-    """A recording, its scene and observation; `weight` is 0 where a sample is missing.
-
-    The parameters, of the given shapes, are `scale` times the unknowns.
-    """
+    """A recording with its scene; `weight` is 0 where a sample is missing."""
 
     scene_at: SceneAt
     observe: Observe
-    shapes: Shapes
-    scale: Any
+    unknowns: Unknowns
     ts: Any
     observed: Any
     weight: Any
@@ -42,9 +156,6 @@ class Problem(NamedTuple):
 def lane(z: Array, problem: Problem) -> Evaluation:
     """Evaluates a recording's weighted sum of squares and its derivatives in `z`."""
     weight = problem.weight
-
-    def scene_at(z):
-        return problem.scene_at(named(problem.shapes, problem.scale * z))
 
     def residuals(scene, solution):
         seen = jnp.asarray(problem.observe(scene, solution))
@@ -56,6 +167,7 @@ def lane(z: Array, problem: Problem) -> Evaluation:
         misfit = jnp.where(weight > 0, seen - problem.observed, 0)
         return (weight * misfit).reshape(-1)
 
+    scene_at = lambda z: problem.scene_at(problem.unknowns.at(z))
     found = sensitivities(scene_at, residuals, z, problem.ts, _TOLERANCE)
     unweighted = found.residuals / jnp.where(weight > 0, weight, 1).reshape(-1)
     change = jnp.diff(found.residuals.reshape(weight.shape), axis=0)
@@ -77,23 +189,6 @@ def _successive(weight: Any) -> Any:
     return (weight[1:] > 0) & (weight[:-1] > 0)
 
 
-def noise_by_changes(run: Run, problems: list[Problem]) -> tuple[float, float]:
-    """Estimates the noise from changes between successive residuals of a fit.
-
-    The errors of a model change slowly, so that they hardly count. Returns the estimate
-    [as observed], and its relative variance.
-    """
-    facts = {name: values.sum() for name, values in run.best.facts.items()}
-    pairs, count = facts["pairs"], max(facts["readings"], 1)
-    readings = np.concatenate([p.observed[p.weight > 0] for p in problems])
-    if not pairs:  # nothing better than all of the residuals
-        return (facts["squares"] / count) ** 0.5, 0.5 / count
-    # Without noise, residuals are errors of the integration.
-    least = _ACCURACY * np.sqrt(np.mean(readings**2))
-    noise = np.sqrt(facts["changes"] / (2 * pairs))
-    return max(noise, least), 0.75 / pairs
-
-
 def _check_scene_at(
     name: str, scene_at: SceneAt, parameters: dict[str, Array], ts: Array
 ) -> None:
@@ -107,37 +202,57 @@ def _check_scene_at(
     check_scene(f"{name}(...)", scene, ts)
 
 
-def listed(name: str, scene_at: Any, observed: Any) -> tuple[Sequence[Any], Any]:
-    """Returns the scenes and their recordings, of which there may be one, as lists."""
-    if not isinstance(scene_at, list | tuple):
-        return [scene_at], [observed]
-    if not scene_at or np.shape(observed)[:1] != (len(scene_at),):
-        raise ValueError(
-            f"{name}: expected a recording for each of the scenes (one at least), got "
-            f"shape {np.shape(observed)} for {len(scene_at)}."
-        )
-    return scene_at, observed
+def check_times(ts: Any) -> Array:
+    ts = real_array("ts", ts, (None,))
+    if ts.size < 2 or not (np.diff(ts) > 0).all():
+        raise refusal("ts", "increasing times, two at least", ts.tolist()[:20])
+    return ts
 
 
 def problems_of(
     names: tuple[str, str],
-    scenes_at: Sequence[Any],
+    scene_at: Any,
     observed: Any,
     unknowns: Unknowns,
     ts: Array,
     observe: Observe,
     noise: Any,
 ) -> list[Problem]:
-    """Checks scenes and their recordings, arguments of the given names."""
-    readings, weights = observations(names[1], observed, noise, ts)
-    for scene_at in scenes_at:
-        function(names[0], scene_at)
+    """Checks a scene and its recording, or lists of both, arguments of given names."""
+    try:
+        readings = np.asarray(observed, dtype=jnp.result_type(float))
+    except (TypeError, ValueError) as error:
+        raise refusal(names[1], "an array of real numbers", observed) from error
+    if np.isinf(readings).any():
+        raise ValueError(f"{names[1]}: expected finite readings or NaN, got infinity.")
+    if not isinstance(scene_at, list | tuple):
+        scene_at, readings = [scene_at], readings[None]
+    elif not scene_at or readings.shape[:1] != (len(scene_at),):
+        raise ValueError(
+            f"{names[1]}: expected a recording for each of the scenes (one at least), "
+            f"got shape {readings.shape} for {len(scene_at)}."
+        )
+    shape = readings.shape[1:]
+    if shape[:1] != ts.shape:
+        raise ValueError(
+            f"{names[1]}: expected a row for each of the {ts.size} times, got shape "
+            f"{shape}."
+        )
+    noise = np.asarray(real_array("noise", noise, np.shape(noise), above=0))
+    try:
+        weights = np.broadcast_to(1 / noise, shape)
+    except ValueError:
+        raise ValueError(
+            "noise: expected one number, or an array that broadcasts to a recording, "
+            f"{shape}, got shape {noise.shape}."
+        ) from None
+    for each in scene_at:
+        function(names[0], each)
     function("observe", observe)
-    stacked(scenes_at, names[0])  # raises unless all are alike
+    stacked(scene_at, names[0])  # raises unless all are alike
     first = jax.tree.map(jnp.asarray, named(unknowns.shapes, unknowns.start))
-    for scene_at in scenes_at:
-        _check_scene_at(names[0], scene_at, first, ts)
-    return [
-        Problem(scene_at, observe, unknowns.shapes, unknowns.scale, ts, *row)
-        for scene_at, *row in zip(scenes_at, readings, weights)
-    ]
+    for each in scene_at:
+        _check_scene_at(names[0], each, first, ts)
+    seen = ~np.isnan(readings)
+    rows = zip(scene_at, np.where(seen, readings, 0), np.where(seen, weights, 0))
+    return [Problem(scene, observe, unknowns, ts, *row) for scene, *row in rows]

@@ -1,17 +1,16 @@
 """Results of identification: parameters, their errors, and undetermined directions."""
 
-from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Float
 
 from ..base.report import Report
-from ..search.bounded import Run, held_at_bounds
-from ..simulation.scene import Scene
-from .unknowns import Unknowns, named
+from ..search.bounded import Evaluation, Run, held_at_bounds
+from .problems import Problem, Unknowns, named
 
 # A combination is weak if its standard error exceeds this part of its size.
 _WEAK = 1.0
@@ -23,6 +22,8 @@ _KNOWN, _SPREAD = 1.1, 3.0
 # Converged: largest change by a further step, in standard errors or in sizes.
 _REMAINING = 0.03
 _REMAINING_PART = 1e-6
+# Noise of simulated readings, at least, as a part of them.
+_ACCURACY = 1e-5
 # Part of an undetermined direction above which a parameter belongs to it.
 _SHARED = 1e-6
 
@@ -114,38 +115,32 @@ def _digits(value: float, error: float) -> int:
     return int(np.clip(np.ceil(np.log10(abs(value) / error)) + 2, 3, 10))
 
 
-def inverse_and_null_space(
-    normal: np.ndarray, eps: float
-) -> tuple[np.ndarray, np.ndarray]:
+def inverse_and_null_space(normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """A generalised inverse of a semidefinite matrix, and its null space in columns.
 
     Directions are null if, with the diagonal scaled to 1, their curvature is below a
-    thousand times `eps` of the greatest.
+    thousand rounding errors of the greatest.
     """
-    limit = 1e3 * eps
+    limit = 1e3 * float(jnp.finfo(float).eps)
     diagonal = np.diag(normal)
     # By rounding, unknowns without any effect have a small one.
     silent = diagonal <= limit**2 * diagonal.max()
     unit = np.where(silent, 0, 1 / np.sqrt(np.where(silent, 1, diagonal)))
     values, vectors = np.linalg.eigh(unit[:, None] * normal * unit)
-    told = values > limit * max(values[-1], 1e-300)
-    some = vectors[:, told] * unit[:, None]
+    steep = values > limit * max(values[-1], 1e-300)
+    some = vectors[:, steep] * unit[:, None]
     # Unknowns without effect are directions by themselves.
-    null = vectors[:, ~told] * np.where(silent, 1, unit)[:, None]
-    return (some / values[told]) @ some.T, null / np.linalg.norm(null, axis=0)
+    null = vectors[:, ~steep] * np.where(silent, 1, unit)[:, None]
+    return (some / values[steep]) @ some.T, null / np.linalg.norm(null, axis=0)
 
 
 def _sparse(columns: np.ndarray) -> np.ndarray:
     """Directions that span the same space, in echelon form: few numbers in each row."""
-    rows = columns.T.copy()
-    for index in range(len(rows)):
-        rest = np.abs(rows[index:])
-        row, pivot = np.unravel_index(rest.argmax(), rest.shape)
-        rows[[index, index + row]] = rows[[index + row, index]]
-        rows[index] /= rows[index, pivot]
-        others = np.arange(len(rows)) != index
-        rows[others] -= np.outer(rows[others, pivot], rows[index])
-    return rows
+    if not columns.size:
+        return columns.T
+    _, rows, order = scipy.linalg.qr(columns.T, pivoting=True)
+    rows = scipy.linalg.solve_triangular(rows[:, : len(rows)], rows)
+    return rows[:, np.argsort(order)]
 
 
 def _together(labels: tuple[str, ...], direction: np.ndarray, least: float) -> str:
@@ -153,10 +148,10 @@ def _together(labels: tuple[str, ...], direction: np.ndarray, least: float) -> s
     # The first of equally large parts leads; otherwise rounding would choose the signs.
     leading = np.argmax(np.abs(direction) > 0.99 * np.abs(direction).max())
     parts = direction / direction[leading]
-    kept = np.flatnonzero(np.abs(parts) > least)
-    if len(kept) == 1:
-        return labels[kept[0]]
-    changes = [f"{labels[i]} by {parts[i]:+.3g} %" for i in kept]
+    large = np.flatnonzero(np.abs(parts) > least)
+    if len(large) == 1:
+        return labels[large[0]]
+    changes = [f"{labels[i]} by {parts[i]:+.3g} %" for i in large]
     return f"{', '.join(changes[:-1])} and {changes[-1]} together"
 
 
@@ -177,98 +172,111 @@ def _in_words(labels, undetermined, covariance) -> tuple[str, ...]:
     return tuple(words)
 
 
+def _noise_by_changes(run: Run, problems: list[Problem]) -> tuple[float, float]:
+    """Estimates the noise from changes between successive residuals of a fit.
+
+    The errors of a model change slowly, so that they hardly count. Returns the estimate
+    [as observed], and its relative variance.
+    """
+    facts = {name: values.sum() for name, values in run.best.facts.items()}
+    pairs, count = facts["pairs"], max(facts["readings"], 1)
+    if not pairs:  # nothing better than all of the residuals
+        return (facts["squares"] / count) ** 0.5, 0.5 / count
+    # Without noise, residuals are errors of the integration.
+    readings = np.concatenate([p.observed[p.weight > 0] for p in problems])
+    least = _ACCURACY * np.sqrt(np.mean(readings**2))
+    return max(np.sqrt(facts["changes"] / (2 * pairs)), least), 0.75 / pairs
+
+
 def fit_result(
     run: Run,
-    scene_at: Callable[[dict[str, Any]], Scene],
+    problems: list[Problem],
     unknowns: Unknowns,
-    count: int,
     noise_given: bool,
-    known: tuple[float, float],
-    unseen: np.ndarray,
-    unseen_counts: np.ndarray,
-    unseen_normal: np.ndarray,
+    unseen: Evaluation | None,
 ) -> FitResult:
-    """The result of a run over `count` readings.
-
-    `known`: the noise to judge residuals by, and its relative variance; `unseen`: mean
-    weighted squares of each held-out recording, of `unseen_counts`; `unseen_normal`:
-    their Gauss-Newton matrix, whose unknowns are relative to their scales.
-    """
+    """Judges the end of a run, where `unseen` evaluates the held-out recordings."""
     shapes, _, scale, low, high = unknowns
-    values = np.clip(run.z * scale, low, high)
+    values = unknowns.numbers(run.z)
     sizes = np.maximum(np.abs(values), scale)
+    facts = run.best.facts
+    count = max(int(facts["readings"].sum()), len(values) + 1)
     # The loss is a mean over recordings, but a sum is needed. From here on, parameters
     # are relative to their sizes.
-    members, relative = len(run.best.facts["squares"]), sizes / scale
+    members, relative = len(problems), sizes / scale
     loss = members * run.at.loss
     normal = members * run.at.curvature / 2 * np.outer(relative, relative)
     slope = members * run.at.gradient / 2 * relative
-    degrees = count - len(values)
-    variance = 1.0 if noise_given else loss / degrees
-    eps = float(jnp.finfo(float).eps)
-    inverse, undetermined = inverse_and_null_space(normal, eps)
+    noise = float(np.sqrt(loss / (count - len(values))))
+    variance = 1.0 if noise_given else noise**2
+    inverse, undetermined = inverse_and_null_space(normal)
+    inverse *= variance
     # Infinite along undetermined directions. As infinities of both signs must not be
     # added up, one projection decides the sign.
     basis, _ = np.linalg.qr(undetermined)
     shared = basis @ basis.T
-    unknown = np.copysign(np.inf, shared)
-    covariance = np.where(np.abs(shared) > _SHARED, unknown, variance * inverse)
+    unlimited = np.copysign(np.inf, shared)
+    covariance = np.where(np.abs(shared) > _SHARED, unlimited, inverse)
     covariance *= np.outer(sizes, sizes)
     free = ~held_at_bounds(values, slope, low, high)
     step = np.zeros_like(slope)
     if free.any():
-        within, _ = inverse_and_null_space(normal[np.ix_(free, free)], eps)
+        within, _ = inverse_and_null_space(normal[np.ix_(free, free)])
         step[free] = within @ slope[free]
     small = step @ slope <= _REMAINING**2 * variance
-    noise = float(np.sqrt(loss / degrees))
-    parts = [run.reason]
+    converged = bool(small or np.abs(step).max() <= _REMAINING_PART)
+
+    faults, message = [], [run.reason]
     for name, value, least, most in zip(unknowns.labels, values, low, high):
         if value in (least, most):
-            parts.append(f"{name} is at its bound")
-    faults = []
-    known_noise, uncertain = known
-    if noise > _DOUBTED * known_noise:
+            message.append(f"{name} is at its bound")
+    usual, uncertain = (1.0, 0.0) if noise_given else _noise_by_changes(run, problems)
+    if noise > _DOUBTED * usual:
         faults.append("the residuals exceed the noise")
-        parts.append(
-            f"the residuals are {noise / known_noise:.3g} times the noise: this scene "
-            "does not move as observed with any such parameters"
+        message.append(
+            f"the residuals are {noise / usual:.3g} times the noise: this scene does "
+            "not move as observed with any such parameters"
         )
     parameters = named(shapes, values)
     try:
-        scene_at(jax.tree.map(jnp.asarray, parameters))
+        problems[0].scene_at(jax.tree.map(jnp.asarray, parameters))
     except ValueError as error:
         # During the search values were traced, so constructors could not check them.
         faults.append("no scene has these parameters")
-        parts.append(f"no scene has these parameters ({error}); set bounds")
+        message.append(f"no scene has these parameters ({error}); set bounds")
+    if not converged:
+        faults.append("the search has not converged")
     # Print directions in parts of the values, unless these are nearly zero.
     parts_of = np.where(np.abs(values) > 1e-3 * sizes, values, sizes)
     undetermined = undetermined * (sizes / parts_of)[:, None]
-    weak = _in_words(unknowns.labels, undetermined, variance * inverse)
-    converged = bool(small or np.abs(step).max() <= _REMAINING_PART)
-    held_out = np.sqrt(unseen) / known_noise
-    if not converged:
-        faults.append("the search has not converged")
+    weak = _in_words(unknowns.labels, undetermined, inverse)
     if weak:
         faults.append("the motion does not determine all parameters")
-    deviation = np.sqrt(1 / (2 * unseen_counts) + uncertain)
-    if not (held_out <= _KNOWN + _SPREAD * deviation).all():
-        spread = variance * inverse * np.outer(relative, relative)
-        excess = np.sum(unseen_normal * spread) / unseen_counts.sum()
-        expected = np.sqrt(1 + excess / known_noise**2)
-        faults.append(
-            f"the held-out residuals exceed the noise ({expected:.3g} times the noise "
-            "is expected from the standard errors alone)"
-        )
+    held_out = np.zeros(0)
+    if unseen is not None:
+        readings = np.maximum(unseen.facts["readings"], 1)
+        held_out = np.sqrt(unseen.facts["member_loss"] / readings) / usual
+        deviation = np.sqrt(1 / (2 * readings) + uncertain)
+        if not (held_out <= _KNOWN + _SPREAD * deviation).all():
+            # Their sum of squares grows with the errors of the parameters.
+            normal = len(readings) * unseen.curvature / 2
+            spread = inverse * np.outer(relative, relative)
+            excess = np.sum(normal * spread) / readings.sum()
+            faults.append(
+                "the held-out residuals exceed the noise "
+                f"({np.sqrt(1 + excess / usual**2):.3g} times the noise is expected "
+                "from the standard errors alone)"
+            )
     return FitResult(
         parameters=parameters,
         standard_errors=named(shapes, np.sqrt(np.diag(covariance))),
         names=unknowns.labels,
         covariance=covariance,
         weak=weak,
-        rms=float(np.sqrt(np.sum(run.best.facts["squares"]) / count)),
+        rms=float(np.sqrt(np.sum(facts["squares"]) / count)),
         noise=noise,
         converged=converged,
-        message="; ".join(parts),
+        message="; ".join(message),
         history=members * np.array([row.loss for row in run.rows]),
         held_out=tuple(held_out.tolist()),
         faults=tuple(faults),

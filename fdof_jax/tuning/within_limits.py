@@ -11,8 +11,7 @@ from jax import Array
 from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
-from ..analysis.equilibria import equilibrium
-from ..analysis.linearization import checked, loop_matrices
+from ..analysis.linearization import checked, equilibrium, loop_matrices
 from ..analysis.loops import margins, open_loop
 from ..analysis.responses import BAND, samples_of, step_measures
 from ..analysis.tracking import demands
