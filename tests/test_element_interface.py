@@ -285,5 +285,5 @@ def test_nothing_else_is_asked_for_attributes():
         if "hasattr(" in path.read_text() or "getattr(" in path.read_text()
     }
     # These of a sweep ask arrays and programs.
-    of_sweeps = {"batches/chunk_programs.py", "batches/store.py"}
+    of_sweeps = {"batches/chunks.py", "batches/store.py"}
     assert asking == {"linkage/fields.py", "data/files.py"} | of_sweeps

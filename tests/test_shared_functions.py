@@ -13,7 +13,7 @@ import pytest
 
 import fdof_jax as fj
 from fdof_jax.base.functions import sharing_functions
-from fdof_jax.batches import chunk_programs
+from fdof_jax.batches import chunks
 from fdof_jax.identification import problems
 from fdof_jax.simulation import solve
 
@@ -312,7 +312,7 @@ def test_the_last_allowed_step_may_reach_the_end(steps):
 
 
 def test_sweeps_in_a_loop_share_a_program(traces):
-    counted, starts = traces(chunk_programs, "simulate"), []
+    counted, starts = traces(chunks, "simulate"), []
     for k in (1.0, 4.0):
         states = fj.State(np.stack([START.q, START.q + 0.1]), START.qd)
         ends = fj.sweep(
