@@ -157,7 +157,7 @@ def beyond_64_bits(k):
     return lambda x: -(whole / 10**30) * x
 
 
-class Slotted:
+class Slotted:  # which nothing refers to weakly
     __slots__ = ("k",)
 
     def __init__(self, k):
@@ -177,7 +177,7 @@ SHARED = [
 ]  # fmt: skip
 OWN = [
     beyond_64_bits, by_failure, by_kind, by_name, by_range, by_type, chosen, counting,
-    in_numpy, in_order, of_object, partial,
+    in_numpy, in_order, of_object, partial, Slotted,
 ]  # fmt: skip
 
 
@@ -223,11 +223,6 @@ def test_what_functions_change_outside_is_changed():
     for function in (in_dict, in_closure):
         assert float(sharing_functions(run, forces=(function,))) == -2
     assert calls == {"number": 1} and last == 1
-
-
-def test_callables_that_cannot_be_referred_to_weakly_are_called():
-    run = eqx.filter_jit(lambda functions: functions[0](jnp.array(2.0)))
-    assert float(sharing_functions(run, forces=(Slotted(3.0),))) == -6
 
 
 def test_numbers_that_are_data_leave_the_types_of_others():

@@ -233,8 +233,8 @@ def test_what_cannot_be_a_folder(tmp_path, monkeypatch):
     monkeypatch.setattr(sys.modules["fdof_jax.batches.sweep"], "outline", None)
     for value, words in (
         ("", "a folder, got ''"),
-        ("file", "can be made, got 'file': File exists"),
-        ("file/below", "can be made, got 'file/below': Not a directory"),
+        ("file", "can be written, got 'file': File exists"),
+        ("file/below", "can be written, got 'file/below': Not a directory"),
         ("a\0b", "a folder, got"),
         ("s3://bucket/x", "a folder on this machine, no address, got"),
         (Path("s3://bucket/x"), "a folder on this machine, no address, got"),
