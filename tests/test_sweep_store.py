@@ -133,7 +133,6 @@ def test_files_that_are_missing(mixed, stored, undisturbed, solved):
     (stored / "q/c/4/0/0").unlink()
     with pytest.warns(RuntimeWarning, match="q/c/4/0/0"):
         run(mixed, store=stored)
-    assert len(solved) == 1 and read(stored) == undisturbed
     (stored / "failed/c/3").unlink()  # as of a block that was not finished
     run(mixed, store=stored)
     assert len(solved) == 2 and read(stored) == undisturbed

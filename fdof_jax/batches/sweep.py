@@ -232,24 +232,27 @@ def sweep(
         raise ValueError(
             "throw, store: expected their defaults under jit, grad or vmap."
         )
-    folder = None if store is None else folder_path("store", store)
+    folder: Any = None if store is None else folder_path("store", store)
+
+    def fill(job: Job) -> list[int]:
+        group = Store(folder, batch, ts, *outline(moving, common), chunk)
+        return in_store(group, range(shard, group.count, of), job, progress_meter)
 
     def solved(solve: Callable[[Job], Any]) -> Any:
         def run(forces, reduce):
             own = Common((*shared[:2], forces), ts, settings, reduce)
             return solve(Job(moving, own, size, chunk, devices))
 
-        return sharing_functions(run, forces=shared[2], reduce=keep)
+        with devices_outside_mesh() as devices:
+            return sharing_functions(run, forces=shared[2], reduce=keep)
 
-    value, failures = None, []
-    of_devices = contextlib.nullcontext if traced else devices_outside_mesh
-    with _naming_axes(batch, ts, forces_axes), of_devices() as devices:
+    value: Any = None
+    failures: Any = []
+    with _naming_axes(batch, ts, forces_axes):
         if traced:
             value = _traced(moving, common, size, chunk)
         elif folder is not None:
-            group = Store(folder, batch, ts, *outline(moving, common), chunk)
-            blocks = range(shard, group.count, of)
-            failures = solved(lambda job: in_store(group, blocks, job, progress_meter))
+            failures = solved(fill)
         else:
             outcome = solved(lambda job: in_chunks(job, progress_meter))
             value, failures = outcome.value, np.flatnonzero(outcome.failed)
