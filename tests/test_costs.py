@@ -134,20 +134,16 @@ def test_the_dynamics_outputs_are_not_stacked():
     assert stacked_in_loops((lambda t, q, qd, linkage: -qd,))
 
 
-def solve_of(ts):
-    """Returns the compiled batch solve of Fig 5, and its text."""
-    linkage = scenes.fig5().linkage
+@pytest.fixture(scope="module")
+def compiled_solve():
+    """Returns the text of the compiled batch solve of Fig 5."""
+    linkage, ts = scenes.fig5().linkage, jnp.linspace(0, 1, 12)
 
     def motion(q):
         state = fj.State(q, jnp.zeros(3))
         return fj.simulate(linkage, state, ts, throw=False).q
 
     return jax.jit(jax.vmap(motion)).lower(jnp.zeros((16, 3))).compile().as_text()
-
-
-@pytest.fixture(scope="module")
-def compiled_solve():
-    return solve_of(jnp.linspace(0, 1, 12))
 
 
 def test_each_stage_is_one_loop(compiled_solve):

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from chains import random_chain
+from sweep_batch import read
 
 import fdof_jax as fj
 from fdof_jax.batches import store
@@ -39,11 +40,6 @@ def fill(folder, shard, begun):
     blocks = range(shard, group.count, WORKERS)
     begun.set()
     store.in_store(group, blocks, job, diffrax.NoProgressMeter())
-
-
-def read(folder):
-    files = (path for path in folder.rglob("*") if path.is_file())
-    return {str(path.relative_to(folder)): path.read_bytes() for path in files}
 
 
 @pytest.mark.slow

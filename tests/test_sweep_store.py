@@ -16,7 +16,7 @@ import pytest
 import sweep_batch
 import xarray
 from helpers import programs
-from sweep_batch import FAILED, SETTINGS, TS, run, single_links
+from sweep_batch import FAILED, SETTINGS, TS, read, run, single_links
 
 import fdof_jax as fj
 from fdof_jax.base.whole_files import folder_path
@@ -25,12 +25,6 @@ from fdof_jax.batches.batch_axes import batch_of
 from fdof_jax.batches.chunks import Common
 
 BLOCKS, BLOCK = 6, 7  # members
-
-
-def read(folder):
-    """Returns the bytes of all files of a store."""
-    files = (path for path in Path(folder).rglob("*") if path.is_file())
-    return {str(path.relative_to(folder)): path.read_bytes() for path in files}
 
 
 @pytest.fixture(scope="module", autouse=True)
