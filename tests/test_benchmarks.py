@@ -15,7 +15,7 @@ from benchmarks.circle import make_control, make_reference
 from benchmarks.measure import RECORD, Case, envelope, measure, times_at
 from benchmarks.native import Kernel
 from benchmarks.problems import fig7, random_linkage
-from benchmarks.switch_tables import switches_table
+from benchmarks.tables import switches_table
 from fdof_jax import State, simulate
 
 ROOT = Path(__file__).parent.parent
