@@ -149,3 +149,11 @@ def test_what_a_transformation_cannot_do_is_refused(tmp_path):
     for keywords in (dict(throw=True), dict(store=tmp_path)):
         with pytest.raises(ValueError, match="^throw, store: expected"):
             jax.eval_shape(functools.partial(end, **keywords), Q)
+
+
+def test_what_members_share_is_checked():
+    """Warnings are errors in these tests, so that nothing is solved."""
+    stops = fj.forces.JointStops([-1, -1, -1], [1, 1, 90])
+    arm = fj.scenes.fig5().linkage
+    with pytest.raises(UserWarning, match=r"^forces\[0\]\.upper: .* radians, got 90"):
+        fj.sweep(arm, STATES, TS, (stops,))
