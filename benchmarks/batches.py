@@ -1,4 +1,4 @@
-"""Batches of Fig 5's arm: simulated seconds per wall second at the worst error."""
+"""Batches of arms: simulated seconds per wall second at the worst error."""
 
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -10,7 +10,7 @@ from . import contestants as own, one_core, peers, taylor
 from .contestants import Contestant, cases
 from .measure import Skipped, measure, record, skipped
 from .native import Kernel
-from .problems import Problem, fig5_batch, reference
+from .problems import Problem, fig5_batch, mixed_batch, reference
 
 PROTOCOL = "batches"
 SLOW = 1024  # the largest batch of slow peers
@@ -115,12 +115,19 @@ def run_two_cores(quick: bool) -> Iterator[dict]:
         yield from measure_batch(problem, reference(problem), contestants, budget)
 
 
-def run_two_devices(quick: bool) -> Iterator[dict]:
-    """Measures with every core a device of JAX; a sweep uses both, plain vmap one."""
-    for batch, budget in ({64: 10} if quick else {1024: 10, 16384: 10}).items():
-        problem = fig5_batch(batch)
-        rows = [row for row in table(batch) if row[0].startswith("fdof_jax")]
-        yield from measure_batch(problem, reference(problem), rows, budget)
+def run_mixed(quick: bool) -> Iterator[dict]:
+    """Measures random arms of all topologies, from random states."""
+    tolerances = (1e-4, 1e-6, 1e-8, 1e-10)
+    rows = [
+        ("fdof_jax", own.fdof_jax, tolerances),
+        ("fdof_jax sweep", own.sweep, tolerances),
+        ("plain diffrax, reduced", own.plain_reduced, tolerances),
+        ("plain diffrax, masked 6x6", own.plain_masked, tolerances[1::2]),
+    ]
+    problem = mixed_batch(64 if quick else 1024)
+    budget = 5 if quick else 60
+    for point in measure_batch(problem, reference(problem), rows, budget):
+        yield {**point, "protocol": "mixed"}
 
 
 def run_float32(quick: bool) -> Iterator[dict]:

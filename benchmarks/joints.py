@@ -13,9 +13,9 @@ from fdof_jax.mechanics.rates import rates
 
 from . import contestants as own, peers, taylor
 from .contestants import Contestant, cases
-from .markdown import number, table
 from .measure import ENDLESS, Skipped, measure, skipped, times_at
 from .problems import Problem, reference
+from .tables import number, table
 
 PROTOCOL = "joints"
 ERROR = 1e-8  # at which times are read off [rad]

@@ -15,9 +15,9 @@ import numpy as np
 import fdof_jax as fj
 
 from .many import peak
-from .markdown import number, table
 from .measure import record
 from .problems import fig5_batch
+from .tables import number, table
 
 PROTOCOL = "memory"
 TOLERANCE = 1e-6

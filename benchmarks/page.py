@@ -5,13 +5,19 @@ from collections.abc import Callable
 
 import numpy as np
 
-from .hard_tables import hard_cases, hard_cases_float32
 from .joints import joints_table
-from .markdown import number, table
 from .memory import memory_table
-from .rate_tables import batches, on_cores, trajectory
 from .scaling import slope
-from .switch_tables import switches_table
+from .tables import (
+    batches,
+    hard_cases,
+    hard_cases_float32,
+    number,
+    on_cores,
+    switches_table,
+    table,
+    trajectory,
+)
 from .targets import targets
 
 

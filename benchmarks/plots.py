@@ -261,7 +261,6 @@ PLOTS = {
     "trajectory": trajectory,
     "batches": batches,
     "batches-two-cores": batches,
-    "batches-two-devices": batches,
     "batches-float32": batches,
     "batches-gpu": batches,
     "batches-gpu-float32": batches,

@@ -19,18 +19,16 @@ class Job(NamedTuple):
     cores: int = 1
     x64: bool = True
     cpu: bool = True
-    devices: int = 1  # of JAX
     asked: bool = False  # whether it runs only when named
 
 
 JOBS = (
     Job("batches", "batches"),
     Job("batches-two-cores", "batches", "run_two_cores", cores=2),
-    Job("batches-two-devices", "batches", "run_two_devices", cores=2, devices=2),
     Job("batches-float32", "batches", "run_float32", x64=False),
     Job("batches-gpu", "batches", "run_accelerator", cpu=False),
     Job("batches-gpu-float32", "batches", "run_accelerator", x64=False, cpu=False),
-    Job("mixed", "mixed"),
+    Job("mixed", "batches", "run_mixed"),
     Job("many", "many"),
     Job("memory", "memory"),
     Job("trajectory", "trajectory"),
@@ -78,7 +76,6 @@ def main() -> None:
     if job.cpu:
         os.sched_setaffinity(0, available[: job.cores])
         os.environ["JAX_PLATFORMS"] = "cpu"
-        os.environ["JAX_NUM_CPU_DEVICES"] = str(job.devices)
     import fdof_jax as fj
 
     fj.configure(x64=job.x64)

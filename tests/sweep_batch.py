@@ -1,5 +1,7 @@
 """A batch of all topologies for sweeps, and members of it that fail."""
 
+from pathlib import Path
+
 import diffrax
 import equinox as eqx
 import jax
@@ -67,6 +69,12 @@ def run(batch, **keywords):
 def alone(batch, member):
     linkage, state0, forces = jax.tree.map(lambda a: a[member], batch)
     return fj.simulate(linkage, state0, TS, forces, throw=False, **SETTINGS)
+
+
+def read(folder):
+    """Returns the bytes of all files of a store."""
+    files = (path for path in Path(folder).rglob("*") if path.is_file())
+    return {str(path.relative_to(folder)): path.read_bytes() for path in files}
 
 
 def successful(solution):

@@ -15,64 +15,48 @@ from benchmarks.circle import make_control, make_reference
 from benchmarks.measure import RECORD, Case, envelope, measure, times_at
 from benchmarks.native import Kernel
 from benchmarks.problems import fig7, random_linkage
-from benchmarks.switch_tables import switches_table
+from benchmarks.tables import switches_table
 from fdof_jax import State, simulate
 
 ROOT = Path(__file__).parent.parent
 
 
-def test_envelope_between_points_is_a_line_on_logarithmic_axes():
-    errors, times = [1e-2, 1e-6], [1.0, 100.0]
-    assert envelope(errors, times, 1e-4) == pytest.approx(10.0)
-    assert envelope(errors, times, 1e-6) == pytest.approx(100.0)
-
-
-def test_envelope_ignores_points_that_another_beats_in_both():
+def test_envelope():
+    """It is a line on logarithmic axes, of the points that no other beats in both."""
     errors, times = [1e-2, 1e-4, 1e-6], [1.0, 500.0, 100.0]
     assert envelope(errors, times, 1e-4) == pytest.approx(10.0)
-
-
-def test_envelope_does_not_extrapolate():
-    errors, times = [1e-3, 1e-6], [1.0, 2.0]
+    assert envelope(errors, times, 1e-6) == pytest.approx(100.0)
     assert envelope(errors, times, 1e-1) == pytest.approx(1.0)  # a bound
-    assert np.isnan(envelope(errors, times, 1e-7))
+    assert np.isnan(envelope(errors, times, 1e-7))  # it does not extrapolate
     assert np.isnan(envelope([], [], 1e-3))
 
 
-def _case(solver, error, **known):
-    return Case(solver, 1e-3, lambda: None, lambda result: {"error": error, **known})
+def _case(solver, error):
+    return Case(solver, 1e-3, lambda: error, lambda error: {"error": error})
 
 
-@pytest.mark.parametrize("error", [np.nan, np.inf, 0.2])
-def test_a_failed_run_is_never_a_win(error):
-    good, bad = measure(
-        "test", [_case("good", 1e-3), _case("bad", error)], budget=0, rounds=3
-    )
-    assert good["status"] == "ok" and len(good["times"]) == 3
-    assert bad["status"] == "failed" and bad["times"] is None
-    assert times_at([bad], 0.5) is None
+def measured(*cases, **options):
+    return measure("test", cases, budget=0, rounds=3, **options)
 
 
-def test_a_contestant_that_raises_has_failed_and_the_others_go_on():
+def test_a_failed_run_is_never_a_win():
     def fall():
         raise RuntimeError("no")
 
-    bad, good = measure(
-        "test", [Case("bad", 1.0, fall), _case("good", 0.0)], budget=0, rounds=3
-    )
-    assert bad["status"] == "failed" and "no" in bad["reason"]
-    assert good["status"] == "ok"
+    for bad in (
+        *(_case("bad", e) for e in (np.nan, np.inf, 0.2)),
+        Case("b", 1.0, fall),
+    ):
+        good, failed = measured(_case("good", 1e-3), bad)
+        assert good["status"] == "ok" and len(good["times"]) == 3
+        assert failed["status"] == "failed" and failed["times"] is None
+        assert times_at([failed], 0.5) is None
+    assert "no" in failed["reason"]
 
 
 def test_ratios_are_taken_at_equal_error():
-    slow = _case("slow", 1e-3)
-    points = measure(
-        "test",
-        [_case("fast", 1e-3), slow, _case("unreachable", 1e-9)],
-        budget=0,
-        rounds=3,
-        ratio_to="fast",
-    )
+    cases = _case("fast", 1e-3), _case("slow", 1e-3), _case("unreachable", 1e-9)
+    points = measured(*cases, ratio_to="fast")
     assert points[0]["ratio"] == pytest.approx(1.0)
     assert points[1]["ratio_to"] == "fast" and points[2]["ratio"] is None
 
@@ -125,15 +109,11 @@ def test_the_circle_in_scalars_is_that_of_the_library():
 
 
 def points_of(folder, name):
-    lines = (folder / f"{name}.jsonl").read_text().splitlines()
-    return list(map(_valid, lines))
-
-
-def _valid(text):
     def refuse(constant):
         raise ValueError(f"not JSON: {constant}")
 
-    return json.loads(text, parse_constant=refuse)
+    lines = (folder / f"{name}.jsonl").read_text().splitlines()
+    return [json.loads(line, parse_constant=refuse) for line in lines]
 
 
 @pytest.mark.slow

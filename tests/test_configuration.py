@@ -112,48 +112,45 @@ def restored(monkeypatch):
     compilation_cache.reset_cache()
 
 
-def test_what_is_not_given_stays(restored):
+def test_precision_alone_is_set(restored):
     fj.configure()
     assert settings() == restored
+    for x64 in (False, True):
+        fj.configure(x64=x64)
+        assert settings() == restored | {"jax_enable_x64": x64}
 
 
-def test_double_precision():
-    fj.configure(x64=False)
-    assert not jax.config.jax_enable_x64
-    fj.configure(x64=True)
-    assert jax.config.jax_enable_x64
-
-
-@pytest.mark.parametrize("value", [1, 0, "yes", 64, [True]])
-def test_precision_refused(value, restored, tmp_path):
-    with pytest.raises(ValueError, match=r"^x64: expected True or False, got .*\.$"):
-        fj.configure(x64=value, cache=tmp_path)
-    assert settings() == restored
-
-
-@pytest.mark.parametrize("value", ["", 0, 1, 2.5, b"folder", ["folder"]])
-def test_cache_refused(value, restored):
-    words = r"^cache: expected a folder, True or False, got .*\.$"
-    with pytest.raises(ValueError, match=words):
-        fj.configure(cache=value, x64=False)
-    assert settings() == restored
-
-
-def test_cache_that_cannot_be_written(restored, tmp_path):
-    words = r"^cache: expected a folder that can be written, got .*\.$"
-    file = tmp_path / "file"
-    file.touch()
-    places = file, file / "below", "~no-such-user/cache", "gs://bucket", "null\0byte"
-    for value in places:
-        with pytest.raises(ValueError, match=words):
-            fj.configure(cache=value)
-    closed = tmp_path / "closed"
-    (closed / configuration._processor()).mkdir(parents=True)
-    (closed / configuration._processor()).chmod(0o500)
-    if not os.access(closed / configuration._processor(), os.W_OK):  # root may
-        with pytest.raises(ValueError, match=words):
-            fj.configure(cache=closed)
-    assert settings() == restored
+@pytest.mark.parametrize(
+    "name, expected, values",
+    [
+        ("x64", "True or False", [1, 0, "yes", 64, [True]]),
+        (
+            "cache",
+            "a folder, True or False",
+            [
+                *("", 0, 1, 2.5, b"folder", ["folder"], "file", "file/below"),
+                *("~no-such-user/cache", "gs://bucket", "null\0byte", "closed"),
+            ],
+        ),
+    ],
+)
+def test_refusals_change_nothing(
+    name, expected, values, restored, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    Path("file").touch()
+    closed = Path("closed") / configuration._processor()
+    closed.mkdir(parents=True)
+    closed.chmod(0o500)
+    for value in values:
+        if value == "closed" and os.access(closed, os.W_OK):  # root may
+            continue
+        sound = {"x64": False, "cache": tmp_path / "new"}
+        with pytest.raises(
+            ValueError, match=rf"^{name}: expected {expected}.*, got .*"
+        ):
+            fj.configure(**(sound | {name: value}))
+        assert settings() == restored
 
 
 @pytest.mark.parametrize(

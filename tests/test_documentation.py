@@ -3,20 +3,15 @@
 import importlib.util
 import inspect
 import re
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from test_package import NAMESPACES, ROOT
 
 import fdof_jax as fj
 from fdof_jax import drawing, plotting, scenes
 
-ROOT = Path(__file__).parents[1]
-
-ROOMS = [
-    fj.analysis, fj.control, fj.data, fj.forces, fj.identification, fj.paper,
-    fj.references, fj.simulation, fj.tuning,
-]  # fmt: skip
+_, *ROOMS = NAMESPACES
 PUBLIC = {
     f"paper.{name}" if module is fj.paper else name: value
     for module in (fj, *ROOMS, scenes)
@@ -62,21 +57,6 @@ def test_docstring(name):
         assert re.search(r"\[[^\]]*(m|rad|N|J|kg|s|degrees)[^\]]*\]", doc), doc
     if name in SOURCES:
         assert SOURCES[name] in doc
-
-
-def test_the_front_door_is_complete():
-    names = """configure TOPOLOGIES existence_factors Linkage State Scene Solution
-    scenes joint_positions mass_centers tip_position tip_jacobian inverse_kinematics
-    forward_dynamics inverse_dynamics mass_matrix bias_force energy link_energies
-    Element JointDamper JointEffort PDController CircleTask TipTask Point SpringDamper
-    Wrench LinearActuator simulate sweep step simulate_sampled joint_efforts
-    joint_reactions linearize tune TuneResult fit FitResult save load to_mjcf from_mjcf
-    to_pandas to_xarray paper forces control references analysis tuning identification
-    drawing plotting interactive data""".split()
-    assert not [name for name in names if not hasattr(fj, name)]
-    equations = """mass_matrix bias_force masked_accelerations constraint_forces
-    to_chain from_chain""".split()
-    assert sorted(equations) == fj.paper.__all__
 
 
 # Every name that a user may import, with its module unless that is `fdof_jax`.

@@ -242,9 +242,9 @@ def test_nothing_else_is_asked_for_attributes():
         for path in folder.rglob("*.py")
         if "hasattr(" in path.read_text() or "getattr(" in path.read_text()
     }
-    # These of a sweep ask arrays and programs.
-    of_sweeps = {"batches/chunk_programs.py", "batches/store.py"}
-    assert asking == {"linkage/fields.py", "data/files.py"} | of_sweeps
+    # These ask arrays, programs, and MuJoCo's models of all versions.
+    others = {"batches/chunks.py", "batches/store.py", "data/mjcf.py"}
+    assert asking == {"linkage/fields.py", "data/files.py"} | others
 
 
 # References

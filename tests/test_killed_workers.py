@@ -11,19 +11,20 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from chains import random_chain
+from sweep_batch import read
 
 import fdof_jax as fj
 from fdof_jax.batches import store
 from fdof_jax.batches.batch_axes import batch_of
-from fdof_jax.batches.chunks import Job
+from fdof_jax.batches.chunks import Common, Job, Outcome
 
 KILLS, WORKERS, BLOCKS = 20, 3, 1500
 
 
 def made(job, on_device):
     """Stands for solving, during which a kill leaves nothing behind."""
-    (_, (q, _), _), *_ = job.batch
-    return {"q": np.asarray(q) * np.arange(100)}, np.asarray(q)[:, 0] > 0.5
+    _, (q, _), _ = job.moving
+    return Outcome({"q": q * np.arange(100)}, None, q[:, 0] > 0.5)
 
 
 def fill(folder, shard, begun):
@@ -33,16 +34,12 @@ def fill(folder, shard, begun):
     q, ts = np.linspace(0, 1, BLOCKS)[:, None], jnp.zeros(1)
     linkage = random_chain("R", np.random.default_rng(1))
     batch = batch_of(linkage, fj.State(q, q), (), None)
-    group = store.Store(folder, batch, ts, {"q": np.zeros(100)}, 1, "digest")
-    job = Job(batch, ts, {}, lambda motion: motion, 1, [])
+    group = store.Store(folder, batch, ts, {"q": np.zeros(100)}, "digest", 1)
+    common = Common(batch.shared, ts, {}, lambda motion: motion)
+    job = Job(batch.moving, common, batch.size, 1, [])
     blocks = range(shard, group.count, WORKERS)
     begun.set()
     store.in_store(group, blocks, job, diffrax.NoProgressMeter())
-
-
-def read(folder):
-    files = (path for path in folder.rglob("*") if path.is_file())
-    return {str(path.relative_to(folder)): path.read_bytes() for path in files}
 
 
 @pytest.mark.slow

@@ -1,4 +1,6 @@
-"""A sweep equals jax.vmap(simulate), member by member."""
+"""A sweep equals jax.vmap(simulate), member by member, or keeps what is asked for."""
+
+import sys
 
 import chains
 import diffrax
@@ -20,6 +22,7 @@ from sweep_batch import (
     TS,
     alone,
     run,
+    single_links,
     successful,
 )  # fmt: skip
 
@@ -27,31 +30,19 @@ import fdof_jax as fj
 from fdof_jax.steps.looped_dopri8 import LoopedDopri8
 
 
-def reason(solution, member):
-    return jax.tree.map(lambda a: a[member], solution.result)
-
-
-def assert_equal(solution, other, tolerance=1e-9):
-    for a, b in ((solution.q, other.q), (solution.qd, other.qd)):
-        np.testing.assert_allclose(a, b, rtol=tolerance, atol=tolerance)
-
-
-def test_a_solution_is_made_as_that_of_vmap(batch, clean):
-    plain = jax.eval_shape(
-        jax.vmap(
-            lambda linkage, state0, forces: fj.simulate(
-                linkage, state0, TS, forces, throw=False, **SETTINGS
-            )
-        ),
-        *batch,
-    )
-    assert jax.tree.structure(clean) == jax.tree.structure(plain)
-    for a, b in zip(jax.tree.leaves(clean), jax.tree.leaves(plain)):
+def assert_alike(tree, other):
+    """Asserts that two trees have equal structures, shapes and types."""
+    assert jax.tree.structure(tree) == jax.tree.structure(other)
+    for a, b in zip(*map(jax.tree.leaves, (tree, other))):
         assert (a.shape, a.dtype) == (b.shape, b.dtype)
 
 
 def test_members_equal_single_simulations(batch, clean):
     """That vmap equals single motions is in test_one_compilation.py."""
+    simulate = lambda linkage, state0, forces: fj.simulate(
+        linkage, state0, TS, forces, throw=False, **SETTINGS
+    )
+    assert_alike(clean, jax.eval_shape(jax.vmap(simulate), *batch))
     assert successful(clean).all()
     for member in range(len(clean.q)):
         single = alone(batch, member)
@@ -68,13 +59,17 @@ def test_members_equal_single_simulations(batch, clean):
 
 
 def test_failed_members_have_their_own_results(mixed, swept):
+    results = diffrax.RESULTS
     assert np.flatnonzero(~successful(swept)).tolist() == FAILED
-    assert reason(swept, NAN_START) == diffrax.RESULTS.nonfinite
-    assert reason(swept, NAN_LATER) == diffrax.RESULTS.nonfinite
-    assert reason(swept, SPENT) == diffrax.RESULTS.max_steps_reached
+    for member, result in (
+        (NAN_START, results.nonfinite),
+        (NAN_LATER, results.nonfinite),
+        (SPENT, results.max_steps_reached),
+    ):
+        assert jax.tree.map(lambda a, m=member: a[m], swept.result) == result
+        if member != NAN_START:  # alone, a start of NaN is refused
+            assert alone(mixed, member).result == result
     assert swept.stats["num_steps"][SPENT] == SETTINGS["max_steps"]
-    for member in (NAN_LATER, SPENT):  # alone, a start of NaN is refused
-        assert reason(swept, member) == alone(mixed, member).result
 
 
 def test_failed_members_are_nan_from_there_on(swept, clean):
@@ -90,31 +85,75 @@ def test_failed_members_are_nan_from_there_on(swept, clean):
     assert np.isfinite(swept.q[SPENT][0]).all()
 
 
-def test_the_others_do_not_notice(swept, clean):
+def test_the_others_do_not_notice_and_a_fast_member_is_right(mixed, swept, clean):
     others = np.delete(np.arange(len(clean.q)), [*FAILED, FAST])
-    assert_equal(*[jax.tree.map(lambda a: a[others], s) for s in (swept, clean)], 1e-9)
+    for a, b in ((swept.q, clean.q), (swept.qd, clean.qd)):
+        np.testing.assert_allclose(a[others], b[others], rtol=1e-9, atol=1e-9)
     for name in ("num_steps", "num_accepted_steps"):
         np.testing.assert_array_equal(
             swept.stats[name][others], clean.stats[name][others]
         )
-
-
-def test_a_fast_member_is_right(mixed, swept):
-    steps = np.delete(swept.stats["num_steps"], [*FAILED, FAST])
-    assert swept.stats["num_steps"][FAST] > 2 * steps.max()
-    single = alone(mixed, FAST)
-    assert swept.stats["num_steps"][FAST] == pytest.approx(
-        single.stats["num_steps"], abs=4
-    )
+    single, steps = alone(mixed, FAST), swept.stats["num_steps"]
+    assert steps[FAST] > 2 * steps[others].max()
+    assert steps[FAST] == pytest.approx(single.stats["num_steps"], abs=4)
     np.testing.assert_allclose(swept.q[FAST], single.q, rtol=1e-6, atol=1e-6)
 
 
-def test_throw_tells_how_many_failed(mixed):
+# What is kept of members
+
+
+def end_and_fastest(motion):
+    fastest, none = jnp.abs(motion.qd).max(0), motion.q[:0]
+    return {"end": motion.q[-1], "fastest": fastest, "none": none}, motion.result
+
+
+def test_a_reduction_sees_each_motion(mixed, swept):
+    reduced = run(mixed, reduce=end_and_fastest)
+    expected = jax.vmap(end_and_fastest)(swept)
+    assert_alike(reduced, expected)
+    for a, b in zip(*map(jax.tree.leaves, (reduced, expected))):
+        np.testing.assert_allclose(a, b, rtol=1e-8, atol=1e-8)
+    assert np.isnan(reduced[0]["end"]).any(axis=1).nonzero()[0].tolist() == FAILED
+
+
+@pytest.mark.parametrize("reduce", [None, end_and_fastest])
+def test_throw_tells_how_many_failed(mixed, reduce):
     with pytest.raises(RuntimeError, match=r"3 of 42 members failed.* member 3\."):
-        run(mixed, throw=True)
+        run(mixed, reduce=reduce, throw=True)
 
 
-# Derivatives
+# Under transformations
+
+
+def two_links():
+    return jax.tree.map(lambda leaf: leaf[:2], single_links())
+
+
+def test_it_works_under_transformations(batch):
+    def end(q):
+        linkage, state0, forces = batch
+        moved = linkage, state0._replace(q=q), forces
+        return run(moved, reduce=lambda motion: motion.q[-1])
+
+    assert jax.eval_shape(end, batch[1].q).shape == (42, 3)
+
+
+def test_traced_values_may_be_out_of_sight(monkeypatch):
+    """Functions of the user's hold them, or they have nothing to do with the sweep."""
+    sizes = []
+
+    def traced(moving, common, size, chunk):
+        sizes.append(size)
+        return jnp.ones(size)
+
+    monkeypatch.setattr(sys.modules["fdof_jax.batches.sweep"], "_traced", traced)
+
+    def total(w):
+        return w * run(two_links(), reduce=lambda motion: w * motion.q[-1]).sum()
+
+    assert jax.grad(total)(1.0) == 2
+    assert jax.vmap(total)(jnp.ones(3)).tolist() == [2, 2, 2]
+    assert sizes == [2, 2]
 
 
 class Breaking(eqx.Module):
@@ -162,6 +201,39 @@ def test_failed_members_add_nothing_to_a_gradient():
     expected = (8 * difference(5e-4) - difference(1e-3)) / 3e-3
     assert np.abs(expected) > 1e-3
     np.testing.assert_allclose(gradient, expected, rtol=1e-7, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_a_failed_member_adds_nothing_to_a_gradient_in_a_held_value():
+    linkage, state0, forces = jax.tree.map(lambda leaf: leaf[:3], single_links())
+    state0.q[1] = np.nan
+
+    def total(w):
+        reduce = lambda motion: w * motion.q[-1]
+        return jnp.nansum(run((linkage, state0, forces), reduce=reduce))
+
+    np.testing.assert_allclose(jax.grad(total)(1.0), total(1.0), rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_a_gradient_is_compiled_once():
+    linkage, state0, forces = two_links()
+    traces = []
+
+    def end(motion):
+        traces.append(motion)
+        return motion.q[-1]
+
+    def ends(q):
+        moved = linkage, state0._replace(q=q), forces
+        return run(moved, reduce=end).sum()
+
+    first = jax.grad(ends)(state0.q)
+    assert traces
+    traces.clear()
+    second = jax.grad(ends)(state0.q)
+    assert not traces
+    np.testing.assert_array_equal(first, second)
 
 
 # Shared arrays

@@ -16,7 +16,7 @@ from sweep_batch import CHUNK, SETTINGS, TS, run, single_links, successful
 
 import fdof_jax as fj
 from fdof_jax.base import configuration
-from fdof_jax.batches import chunk_programs, chunks
+from fdof_jax.batches import chunks
 from fdof_jax.batches.batch_axes import batch_of
 from fdof_jax.simulation import prescribed
 from fdof_jax.steps.dopri8 import ScheduledTerm
@@ -49,19 +49,18 @@ def swept(speeds, **keywords):
     return fj.sweep(*pendulums(speeds), TS, **{**SETTINGS, **keywords})
 
 
-def test_small_batches_of_many_sizes_share_a_program(solved):
+def test_small_batches_share_a_program_and_need_no_forecast(solved, monkeypatch):
+    monkeypatch.setattr(chunks, "expected_work", None)
     speeds = np.linspace(0, 1, 8)
-    swept(speeds)
-    before = chunk_programs.compiled.cache_info().misses
+    motion = swept(speeds)
+    # Times in common are not copied.
+    assert successful(motion).all() and motion.ts.strides[0] == 0
+    np.testing.assert_array_equal(motion.ts, np.tile(TS, (8, 1)))
+    before = chunks._compiled.cache_info().misses
     for size in (2, 5, 7):
         assert swept(speeds[:size]).q.shape == (size, len(TS), 1)
-    assert chunk_programs.compiled.cache_info().misses == before
+    assert chunks._compiled.cache_info().misses == before
     assert [len(q) for q, _ in solved] == [8] * 4
-
-
-def test_a_batch_of_one_chunk_needs_no_forecast(monkeypatch):
-    monkeypatch.setattr(chunks, "expected_work", None)
-    assert successful(swept(np.linspace(0, 1, 8))).all()
 
 
 def test_members_are_sorted_by_their_forecast(solved, monkeypatch):
@@ -71,6 +70,29 @@ def test_members_are_sorted_by_their_forecast(solved, monkeypatch):
     np.testing.assert_array_equal(motion.qd[:, 0, 0], speeds)
     found = [sorted(qd[:, 0] / 3) for _, qd in solved]
     assert found == [[8, 9, 10, 11], [4, 5, 6, 7], [0, 1, 2, 3]]
+
+
+def test_the_forecast_follows_the_steps(batch, clean):
+    steps = np.asarray(clean.stats["num_steps"])
+    moving, shared, _ = batch_of(*batch, 0)
+    found = chunks.expected_work(jax.numpy.asarray(TS), moving, shared)
+    assert np.corrcoef(found, steps)[0, 1] > 0.75
+
+
+def test_one_forecast_serves_batches_of_all_sizes(monkeypatch):
+    traces = []
+    original = chunks.forward_dynamics
+
+    def counted(*arguments):
+        traces.append(1)
+        return original(*arguments)
+
+    monkeypatch.setattr(chunks, "forward_dynamics", counted)
+    monkeypatch.setattr(chunks, "_FORECASTS", 16)
+    swept(np.linspace(0, 1, 11), chunk=3)
+    before = len(traces)
+    swept(np.linspace(0, 1, 40), chunk=3)
+    assert len(traces) == before > 0
 
 
 @pytest.mark.parametrize(
@@ -87,14 +109,13 @@ def test_starts_of_any_type_are_solved_in_double_precision(kinds):
         np.testing.assert_array_equal(a, b)
 
 
-def test_cores_change_nothing(batch, monkeypatch):
+def test_cores_change_nothing(batch, clean, monkeypatch):
     """Chunks are the same ones, whatever the number of threads that send them."""
-    motions = []
     for cores in (1, 3):
         monkeypatch.setattr(chunks, "_cores", lambda cores=cores: cores)
-        motions.append(run(batch))
-    for a, b in zip(*map(jax.tree.leaves, motions)):
-        np.testing.assert_array_equal(a, b)
+        motion = run(batch)
+        for a, b in zip(*map(jax.tree.leaves, (motion, clean))):
+            np.testing.assert_array_equal(a, b)
 
 
 def test_a_slow_member_is_stopped_and_solved_alone(solved):
@@ -119,38 +140,9 @@ def test_members_out_of_steps_are_not_solved_again(solved):
     assert (motion.stats["num_steps"] == 3).all()
 
 
-def test_times_in_common_are_not_copied():
-    times = swept(np.linspace(0, 1, 8)).ts
-    assert times.strides[0] == 0
-    np.testing.assert_array_equal(times, np.tile(TS, (8, 1)))
-
-
 def test_an_option_that_xla_does_not_know_is_left_out(monkeypatch):
     monkeypatch.setattr(configuration, "_WIDE", {"xla_cpu_no_such_option": 1})
     assert configuration.wide_vectors.__wrapped__() == {}
-
-
-def test_the_forecast_follows_the_steps(batch, clean):
-    steps = np.asarray(clean.stats["num_steps"])
-    moving, shared = batch_of(*batch, 0).split()
-    found = chunk_programs.expected_work(jax.numpy.asarray(TS), moving, shared)
-    assert np.corrcoef(found, steps)[0, 1] > 0.75
-
-
-def test_one_forecast_serves_batches_of_all_sizes(monkeypatch):
-    traces = []
-    original = chunk_programs.forward_dynamics
-
-    def counted(*arguments):
-        traces.append(1)
-        return original(*arguments)
-
-    monkeypatch.setattr(chunk_programs, "forward_dynamics", counted)
-    monkeypatch.setattr(chunks, "_FORECASTS", 16)
-    swept(np.linspace(0, 1, 11), chunk=3)
-    before = len(traces)
-    swept(np.linspace(0, 1, 40), chunk=3)
-    assert len(traces) == before > 0
 
 
 class Recorder(diffrax.NoProgressMeter):

@@ -63,19 +63,11 @@ def test_a_warning_within_a_transformation_names_the_line():
     assert caught[0].filename == __file__
 
 
-@pytest.mark.parametrize(
-    "changed, name, way",
-    [
-        (ARM, "mass", r"its replace\(mass=\.\.\.\)"),
-        (fj.JointDamper(1.0), "coefficient", r"its replace\(coefficient=\.\.\.\)"),
-    ],
-)
-def test_an_assignment_names_the_way(changed, name, way):
-    with pytest.raises(dataclasses.FrozenInstanceError, match=f"^{name}: .* {way}"):
-        setattr(changed, name, 1)
-
-
-def test_a_point_can_be_replaced():
+def test_an_assignment_names_the_way():
+    for value, name in ((ARM, "mass"), (fj.JointDamper(1.0), "coefficient")):
+        way = rf"^{name}: .* its replace\({name}=\.\.\.\)"
+        with pytest.raises(dataclasses.FrozenInstanceError, match=way):
+            setattr(value, name, 1)
     moved = dataclasses.replace(fj.Point(1, 0.5), along=0.7)
     assert (int(moved.link), float(moved.along)) == (1, 0.7)
 

@@ -8,7 +8,6 @@ import hashlib
 import os
 import platform
 import sys
-import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +18,7 @@ from jaxlib import version
 
 from .checks import shown
 from .user_warnings import warn
+from .whole_files import folder_path
 
 # XLA on CPU compiles a loop as one kernel if its state has fewer bytes than this sets;
 # otherwise it starts a kernel for each operation. XLA reads the option when JAX starts.
@@ -113,38 +113,16 @@ def _compile_small_loops_as_kernels() -> None:
 
 
 def _keep_programs(cache: Any) -> None:
-    if cache is False:
-        folder = None
-    elif cache is True or (isinstance(cache, str | os.PathLike) and os.fspath(cache)):
-        folder = _writable_folder(cache)
+    folder = None
+    if cache is not False:
+        place = _user_cache() if cache is True else cache
+        expected = "a folder, True or False"
+        folder = folder_path("cache", place, expected, within=_processor()).resolve()
         # By default JAX does not keep programs that compile in less than a second.
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
         jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
-    else:
-        raise ValueError(
-            f"cache: expected a folder, True or False, got {shown(cache)}."
-        )
-    jax.config.update("jax_compilation_cache_dir", folder)
+    jax.config.update("jax_compilation_cache_dir", folder and str(folder))
     compilation_cache.reset_cache()  # JAX opens it only once, with the first program
-
-
-def _writable_folder(cache: Any) -> str:
-    """Returns the subfolder of this kind of processor, created if missing."""
-    try:
-        if "://" in str(cache):
-            raise ValueError("an address, not a folder")
-        folder = _user_cache() if cache is True else Path(cache).expanduser()
-        folder = folder.resolve() / _processor()
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    # RuntimeError: no home directory; ValueError: not a path
-    except (OSError, RuntimeError, ValueError) as error:
-        raise ValueError(
-            f"cache: expected a folder that can be written, got {shown(cache)} "
-            f"({error})."
-        ) from error
-    return str(folder)
 
 
 def _user_cache() -> Path:
@@ -154,7 +132,7 @@ def _user_cache() -> Path:
         folder = "~/Library/Caches"
     else:
         folder = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
-    return Path(folder).expanduser() / "fdof_jax"
+    return Path(folder) / "fdof_jax"
 
 
 def _processor() -> str:

@@ -12,7 +12,6 @@ import dis
 import functools
 import inspect
 import types
-import weakref
 from collections import Counter
 from collections.abc import Callable
 from typing import Any
@@ -83,16 +82,16 @@ def sharing_functions(run: Callable[..., Any], **trees: Any) -> Any:
         # Of a dict, JAX would return the values in the order of its keys.
         shared = {name: jax.tree.map(_shared, tree) for name, tree in trees.items()}
         nodes = jax.tree.leaves(shared, is_leaf=_is_shared)
-        codes = {node.code for node in nodes if _is_shared(node)}
         try:
-            found = run(*shared.values())
+            result = run(*shared.values())
             break
         except (TypeError, ValueError, AttributeError, IndexError):
+            codes = {node.code for node in nodes if _is_shared(node)}
             if not codes:
                 raise
-        _fewer.update(codes)
+            _fewer.update(codes)
     _warn_of_third(shared)
-    return found
+    return result
 
 
 def _is_shared(node: Any) -> bool:
@@ -105,7 +104,7 @@ def _shared(leaf: Any) -> Any:
         return leaf
     try:
         return _parts_of(leaf)
-    # Such as keys that cannot be sorted, or a whole number of more than 64 bits.
+    # Such as an empty cell, keys without an order, or an integer of more than 64 bits.
     except (_Unknown, TypeError, ValueError, OverflowError):
         return leaf
 
@@ -120,11 +119,7 @@ def _parts_of(function: Any, within: tuple[Any, ...] = ()) -> SharedFunction:
     if any(value is np for value in names.values()):
         if not set(code.co_names) <= {*names, *_OF_NUMPY}:
             raise _Unknown
-    of_keywords = function.__kwdefaults__ or {}
-    try:
-        closure = tuple(cell.cell_contents for cell in function.__closure__ or ())
-    except ValueError:  # an empty cell
-        raise _Unknown from None
+    closure = tuple(cell.cell_contents for cell in function.__closure__ or ())
     numbers, within = _DATA[_fewer[code]], (*within, function)
 
     def part(leaf: Any) -> Any:
@@ -139,12 +134,9 @@ def _parts_of(function: Any, within: tuple[Any, ...] = ()) -> SharedFunction:
             return _parts_of(leaf, within)
         raise _Unknown
 
-    reach = closure, function.__defaults__, _in_order(of_keywords), _in_order(names)
+    named = (dict(sorted(d.items())) for d in (function.__kwdefaults__ or {}, names))
+    reach = closure, function.__defaults__, *named
     return SharedFunction(jax.tree.map(part, reach, is_leaf=_out_of_order), code)
-
-
-def _in_order(named: dict[str, Any]) -> dict[str, Any]:
-    return dict(sorted(named.items()))
 
 
 def _out_of_order(node: Any) -> bool:
@@ -179,28 +171,24 @@ def _is_fixed(value: Any) -> bool:
     home = None
     if inspect.ismodule(value):
         home = value.__name__
-    elif inspect.isfunction(value) or inspect.isclass(value):
-        home = value.__module__
-    elif inspect.isbuiltin(value):  # without one if bound to an object
-        home = value.__module__
+    elif (
+        inspect.isfunction(value) or inspect.isclass(value) or inspect.isbuiltin(value)
+    ):
+        home = value.__module__  # None of a builtin that is bound to an object
     return home is not None and home.partition(".")[0] in _FIXED
 
 
-# Callables that JAX knows by identity, and keys of the others: each has a program.
-_known: weakref.WeakSet[Any] = weakref.WeakSet()
-_keys: set[int] = set()
-_alike: Counter[Any] = Counter()  # by their code or type
+_keys: set[int] = set()  # of callables, each of which has a program
+_alike: Counter[Any] = Counter()  # the same, by their code or type
 
 
 def _warn_of_third(trees: dict[str, Any]) -> None:
-    nodes = jax.tree.leaves(trees, is_leaf=_is_shared)
-    new = [node for node in nodes if callable(node) and _is_new(node)]
-    if not new:
-        return
     leaves, _ = jax.tree_util.tree_flatten_with_path(trees, is_leaf=_is_shared)
     for (tree, *path), leaf in leaves:
-        if not any(leaf is node for node in new):
+        compiled = not isinstance(leaf, _CONSTANTS) or isinstance(leaf, _JITTED)
+        if not (callable(leaf) and compiled) or (key := _key(leaf)) in _keys:
             continue
+        _keys.add(key)
         inner = inspect.unwrap(leaf)
         code = inner.__code__ if inspect.isfunction(inner) else None
         if isinstance(leaf, SharedFunction):
@@ -217,18 +205,9 @@ def _warn_of_third(trees: dict[str, Any]) -> None:
             )
 
 
-def _is_new(leaf: Any) -> bool:
-    """Returns whether a callable needs a program that none before it needed."""
-    if _is_shared(leaf):
-        leaves, structure = jax.tree.flatten(leaf)
-        key = hash((structure, *(x for x in leaves if not eqx.is_array(x))))
-        new = key not in _keys
-        _keys.add(key)
-        return new
-    if isinstance(leaf, _CONSTANTS) and not isinstance(leaf, _JITTED) or leaf in _known:
-        return False
-    try:
-        _known.add(leaf)
-    except TypeError:  # of a class with slots; it cannot be known again
-        return False
-    return True
+def _key(leaf: Any) -> int:
+    """Returns the identity of a callable, which JAX keeps, or that of its parts."""
+    if not _is_shared(leaf):
+        return id(leaf)
+    leaves, structure = jax.tree.flatten(leaf)
+    return hash((structure, *(x for x in leaves if not eqx.is_array(x))))

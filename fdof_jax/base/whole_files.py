@@ -5,6 +5,7 @@ import os
 import re
 import secrets
 import stat
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -41,17 +42,20 @@ def file_path(name: str, value: Any) -> Path:
     return path
 
 
-def folder_path(name: str, value: Any) -> Path:
-    """Returns the folder that the argument `name` gives, and makes it if need be."""
-    folder = local_path(name, value, "a folder")
+def folder_path(
+    name: str, value: Any, expected: str = "a folder", within: str = ""
+) -> Path:
+    """Returns the folder `within` that of the argument `name`, made if need be."""
+    folder = local_path(name, value, expected) / within
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder, suffix=".part"):
+            return folder
     except OSError as error:
         raise ValueError(
-            f"{name}: expected a folder, or a path where one can be made, got "
-            f"{shown(value)}: {error.strerror}."
+            f"{name}: expected {expected} that can be written, got {shown(value)}: "
+            f"{error.strerror}."
         ) from error
-    return folder
 
 
 @contextlib.contextmanager

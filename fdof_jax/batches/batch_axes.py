@@ -19,31 +19,11 @@ _RANKS = dict(
 
 
 class Batch(NamedTuple):
-    """Inputs of all members, which of their leaves have a batch axis, and its size."""
+    """Linkage, state and forces of all members."""
 
-    inputs: tuple[Linkage, State, Forces]
-    batched: list[bool]
+    moving: Any  # their arrays with a batch axis, and None for other leaves
+    shared: Any  # their other leaves, and None for these
     size: int
-
-    def split(self) -> tuple[Any, Any]:
-        """Returns what differs between members and what they share, each a whole tree.
-
-        Either has None for the leaves of the other.
-        """
-        # `equinox.partition` takes four times as long, which small sweeps would feel.
-        leaves, structure = jax.tree.flatten(self.inputs)
-        moving = [leaf if axis else None for leaf, axis in zip(leaves, self.batched)]
-        shared = [None if axis else leaf for leaf, axis in zip(leaves, self.batched)]
-        return structure.unflatten(moving), structure.unflatten(shared)
-
-    def with_forces(self, forces: Forces) -> "Batch":
-        """Returns the batch with the same forces, whose functions have another form."""
-        flags = jax.tree.structure(self.inputs).unflatten(self.batched)
-        inputs = *self.inputs[:2], forces
-        batched = jax.tree.map(
-            lambda flag, part: jax.tree.map(lambda _: flag, part), flags, inputs
-        )
-        return self._replace(inputs=inputs, batched=jax.tree.leaves(batched))
 
 
 def _name(part: Any, *rest: Any) -> str:
@@ -78,7 +58,7 @@ def batch_of(linkage: Linkage, state0: Any, forces: Forces, forces_axes: Any) ->
         )
     instance("linkage", linkage, Linkage)
     inputs = linkage, state0, forces
-    leaves, _ = jax.tree_util.tree_flatten_with_path(inputs)
+    leaves, structure = jax.tree_util.tree_flatten_with_path(inputs)
     joints = linkage.ef.shape[-1] // 2
     batched = [
         _has_axis(path, leaf, joints) for path, leaf in leaves if path[0].idx < 2
@@ -93,19 +73,19 @@ def batch_of(linkage: Linkage, state0: Any, forces: Forces, forces_axes: Any) ->
             "forces_axes: expected 0, None or a tuple of these with one entry per "
             f"element, got {shown(forces_axes)}."
         ) from None
-    sizes = [
-        (path, np.shape(leaf)[:1])
+    sizes = {
+        _name(*path): np.shape(leaf)[:1]
         for (path, leaf), has_axis in zip(leaves, batched)
         if has_axis
-    ]
-    different = {size for _, size in sizes}
+    }
+    different = set(sizes.values())
     if different == {(0,)}:
         raise ValueError(
             "linkage, state0, forces: expected a batch of at least one member, got 0."
         )
     if len(different) != 1 or different == {()}:
         got = [
-            f"{_name(*path)}: {size[0] if size else 'no axis'}" for path, size in sizes
+            f"{name}: {size[0] if size else 'no axis'}" for name, size in sizes.items()
         ]
         unsaid = forces and not (got or jax.tree.leaves(forces_axes))
         hint = " (pass forces_axes=0 if those of `forces` have one)" if unsaid else ""
@@ -113,4 +93,8 @@ def batch_of(linkage: Linkage, state0: Any, forces: Forces, forces_axes: Any) ->
             "linkage, state0, forces: expected a leading batch axis of one size on at "
             f"least one array, got {', '.join(got) or 'none on any'}{hint}."
         )
-    return Batch(inputs, batched, different.pop()[0])
+    # `equinox.partition` takes four times as long, which small sweeps would feel.
+    moving = [leaf if axis else None for (_, leaf), axis in zip(leaves, batched)]
+    shared = [None if axis else leaf for (_, leaf), axis in zip(leaves, batched)]
+    whole = structure.unflatten
+    return Batch(whole(moving), whole(shared), different.pop()[0])

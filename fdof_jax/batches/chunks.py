@@ -1,6 +1,7 @@
 """Solves a batch in chunks of members that take about equally long."""
 
 import contextlib
+import functools
 import os
 import sys
 from collections import deque
@@ -9,20 +10,222 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import diffrax
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.sharding import Mesh
+from jax.sharding import Mesh, SingleDeviceSharding
 
-from ..base.known_values import in_numpy
+from ..base.checks import refusal
+from ..base.configuration import wide_vectors
+from ..dynamics import forward_dynamics
+from ..forces.element import elements
+from ..linkage.topology import real_joints
+from ..simulation.field import element_effort
+from ..simulation.simulate import simulate
 from ..simulation.solution import Solution
-from .batch_axes import Batch
-from .chunk_programs import compiled, expected_work, form_of, lowered
+from ..steps.controllers import Abreast, by_square_roots
+from ..steps.tolerances import default_controller
 
+# With so few lanes a step takes hardly longer than with one, so that slow members do
+# not pay for another program.
+_ALL_ALIKE = 32
+_AXIS = "lane"
 _SMALL = 8  # lanes of the chunks for a few slow members
 _COPIED_AT_ONCE = 2**24  # bytes to a device
 _FORECASTS = 1024  # computed at once
+_STEPS, _ANGLE = 16, 0.3  # of the rough motion in a forecast: number and size
 _NO_MESH = Mesh(np.empty((), object), ())
+
+
+class Common(NamedTuple):
+    """What all members of a sweep have in common."""
+
+    shared: Any  # of a `Batch`
+    ts: Array
+    settings: dict
+    reduce: Callable[[Solution], Any]
+
+
+class Job(NamedTuple):
+    """What a sweep solves, on which devices, and the most members of a chunk."""
+
+    moving: Any  # of a `Batch`
+    common: Common
+    size: int
+    chunk: int
+    devices: list[Any]
+
+
+class Outcome(NamedTuple):
+    """The outcome of a member, or of several with a leading axis."""
+
+    value: Any  # what the reduction returns
+    stopped: Array  # because most lanes were long done
+    failed: Array
+
+
+def _check_value(value: Any) -> None:
+    """Raises ValueError unless a reduction returned arrays of numbers."""
+    for leaf in jax.tree.leaves(value):
+        if not eqx.is_array_like(leaf):
+            raise refusal("reduce", "a function that returns arrays", leaf)
+        dtype = leaf.dtype if eqx.is_array(leaf) else jnp.result_type(leaf)
+        if not any(jnp.issubdtype(dtype, kind) for kind in (np.number, np.bool_)):
+            raise refusal("reduce", "a function that returns numbers", dtype)
+
+
+def outcome_of(common: Common, moving: Any, abreast: bool = False) -> Outcome:
+    """Computes the outcome of one member.
+
+    If `abreast`, a member is stopped when most lanes are long done.
+    """
+    linkage, state0, forces = eqx.combine(moving, common.shared)
+    settings = common.settings
+    controller = settings["stepsize_controller"] or default_controller()
+    # Members with steps of given lengths take equally many.
+    adaptive = isinstance(controller, diffrax.AbstractAdaptiveStepSizeController)
+    if abreast and adaptive:
+        # Other solvers, and estimates of a first step, need the error itself.
+        if settings["solver"] is None and settings["dt0"] is not None:
+            controller = by_square_roots(controller)
+        limited = Abreast(controller, _AXIS)  # pyright: ignore[reportCallIssue]
+        settings = settings | {"stepsize_controller": limited}
+    solution = simulate(linkage, state0, common.ts, forces, throw=False, **settings)
+    value = common.reduce(solution)
+    _check_value(value)
+    results, most = diffrax.RESULTS, settings["max_steps"]
+    stopped = solution.result == results.max_steps_reached
+    if most is not None:
+        stopped &= solution.stats["num_steps"] < most
+    return Outcome(value, stopped, solution.result != results.successful)
+
+
+# Programs of chunks
+
+
+class Form(NamedTuple):
+    """The key of a program: structures, kinds of the arrays, constants."""
+
+    moving: Any  # structure of what differs between members
+    lanes: tuple[jax.ShapeDtypeStruct, ...]  # its arrays
+    common: Any  # structure
+    leaves: tuple[Any, ...]  # of `common`: kinds of arrays, and constants
+
+    def outcomes(self, lanes: list[Array], arrays: list[Array]) -> Outcome:
+        """Computes the outcomes of all lanes of a chunk."""
+        given = iter(arrays)
+        leaves = [next(given) if _is_kind(leaf) else leaf for leaf in self.leaves]
+        common = self.common.unflatten(leaves)
+        abreast = self.lanes[0].shape[0] > _ALL_ALIKE
+
+        def member(leaves):
+            return outcome_of(common, self.moving.unflatten(leaves), abreast)
+
+        return jax.vmap(member, axis_name=_AXIS)(lanes)
+
+
+def _is_kind(leaf: Any) -> bool:
+    return isinstance(leaf, jax.ShapeDtypeStruct)
+
+
+def _form_of(job: Job, lanes: int) -> tuple[Form, list[Any]]:
+    """Returns the form of the program for so many lanes, and the common arrays."""
+
+    def kind(array: Any, shape: tuple[int, ...]) -> jax.ShapeDtypeStruct:
+        dtype = jax.dtypes.canonicalize_dtype(array.dtype, allow_extended_dtype=True)
+        weak = getattr(array, "weak_type", False)
+        return jax.ShapeDtypeStruct(shape, dtype, weak_type=weak)
+
+    members, structure = jax.tree.flatten(job.moving)
+    kinds = tuple(kind(a, (lanes, *a.shape[1:])) for a in members)
+    leaves, others = jax.tree.flatten(job.common)
+    arrays = list(filter(eqx.is_array, leaves))
+    leaves = tuple(kind(x, x.shape) if eqx.is_array(x) else x for x in leaves)
+    return Form(structure, kinds, others, leaves), arrays
+
+
+@functools.lru_cache(maxsize=64)
+def _jitted(form: Form) -> Any:
+    return jax.jit(form.outcomes)  # traced once for all devices
+
+
+@functools.lru_cache(maxsize=64)
+def _lowered(form: Form, device: Any) -> jax.stages.Lowered:
+    """Traces the program of this form for a device, or for the default one (None)."""
+    arguments = list(form.lanes), list(filter(_is_kind, form.leaves))
+    if device is not None:
+        there = SingleDeviceSharding(device)
+        arguments = jax.tree.map(lambda kind: kind.update(sharding=there), arguments)
+    return _jitted(form).lower(*arguments)
+
+
+@functools.lru_cache(maxsize=64)
+def _compiled(program: jax.stages.Lowered) -> jax.stages.Compiled:
+    return program.compile(wide_vectors())
+
+
+def _solve(program: Any, *arguments: Any) -> Any:
+    return jax.block_until_ready(program(*arguments))
+
+
+# Forecasts
+
+
+@eqx.filter_jit
+def expected_work(ts: Array, moving: Any, shared: Any) -> Array:
+    """Computes for each member a rate [1/s] that grows with its steps.
+
+    It combines the joints' rates and accelerations, in the mean over the beginning of
+    the motion, which rough steps find.
+    """
+
+    def member(moving):
+        linkage, (q, qd), forces = eqx.combine(moving, shared)
+        # Revolute joints cause most of the steps, slides hardly any.
+        turning = jnp.stack(real_joints(linkage.ef))
+
+        def at(t, q, qd):
+            tau = jnp.zeros_like(q)
+            for index, element in enumerate(elements("forces", forces)):
+                state = element.initial_state(linkage)
+                tau = tau + element_effort(index, element, t, q, qd, linkage, state)[0]
+            qdd = forward_dynamics(linkage, q, qd, tau, forces)
+            rate, acceleration = (jnp.where(turning, a, 0) for a in (qd, qdd))
+            norm = jnp.linalg.norm
+            return qdd, norm(rate) + jnp.sqrt(norm(acceleration))
+
+        def advance(_, now):
+            t, q, qd, total, last = now
+            qdd, rate = at(t, q, qd)
+            # A motion that these steps lose stays where it was.
+            finite = jnp.isfinite(rate)
+            h = jnp.where(finite, step, 0)
+            last = jnp.where(finite, rate, last)
+            qd = qd + h * jnp.where(finite, qdd, 0)
+            return t + h, q + h * qd, qd, total + last, last
+
+        _, first = at(ts[0], q, qd)
+        step = jnp.minimum((ts[-1] - ts[0]) / _STEPS, _ANGLE / first)
+        start = ts[0], q, qd, jnp.zeros_like(first), first
+        *_, total, _ = jax.lax.fori_loop(0, _STEPS, advance, start)
+        return total
+
+    return jax.vmap(member)(moving)
+
+
+def _forecast(job: Job) -> np.ndarray:
+    """Returns the `expected_work` of all members; one program serves any number."""
+    work = []
+    for first in range(0, job.size, _FORECASTS):
+        rows = np.minimum(np.arange(first, first + _FORECASTS), job.size - 1)
+        some = jax.tree.map(lambda leaf, rows=rows: leaf[rows], job.moving)
+        work.append(expected_work(job.common.ts, some, job.common.shared))
+    return np.concatenate(work)[: job.size]
+
+
+# Chunks
 
 
 def _cores() -> int:
@@ -46,17 +249,6 @@ def devices_outside_mesh() -> Iterator[list[Any]]:
         yield devices if len(devices) > 1 or not mesh.empty else [None]
 
 
-class Job(NamedTuple):
-    """What a sweep solves, on which devices, and the most members of a chunk."""
-
-    batch: Batch
-    ts: Array
-    settings: dict
-    reduce: Callable[[Solution], Any]
-    chunk: int
-    devices: list[Any]
-
-
 def _lanes(members: int, chunk: int) -> int:
     """Returns the number of lanes for some members: few numbers serve all batches."""
     if members == 1:
@@ -64,24 +256,9 @@ def _lanes(members: int, chunk: int) -> int:
     return min(chunk, max(_SMALL, 1 << (members - 1).bit_length()))
 
 
-def _forecast(job: Job, moving: Any, shared: Any) -> np.ndarray:
-    """Returns the `expected_work` of all members; one program serves any number."""
-    work = []
-    for first in range(0, job.batch.size, _FORECASTS):
-        rows = np.arange(first, first + _FORECASTS)
-        rows = np.minimum(rows, job.batch.size - 1)
-        some = jax.tree.map(lambda leaf, rows=rows: leaf[rows], moving)
-        work.append(expected_work(job.ts, some, shared))
-    return np.concatenate(work)[: job.batch.size]
-
-
-def _solve(program: Any, *arguments: Any) -> Any:
-    return jax.block_until_ready(program(*arguments))
-
-
 def _outcomes(
-    job: Job, moving: Any, rest: Any, members: np.ndarray, lanes: int
-) -> Iterator[tuple[np.ndarray, Any]]:
+    job: Job, members: np.ndarray, lanes: int
+) -> Iterator[tuple[np.ndarray, Outcome]]:
     """Solves members in chunks; yields members and their outcomes."""
     chunks = [members[i : i + lanes] for i in range(0, len(members), lanes)]
     devices = job.devices
@@ -90,17 +267,17 @@ def _outcomes(
     if len(devices) == 1 and jax.default_backend() == "cpu":
         devices = devices * _cores()
     devices = devices[: len(chunks)]
-    form, arrays = form_of(moving, lanes, rest)
-    leaves = jax.tree.leaves(moving)
+    form, arrays = _form_of(job, lanes)
+    leaves = jax.tree.leaves(job.moving)
 
     def rows_of(members: np.ndarray) -> list[np.ndarray]:
         rows = np.append(members, np.full(lanes - len(members), members[-1]))
         return [leaf[rows] for leaf in leaves]
 
     # Traces and transfers depend on settings that no other thread has.
-    programs = [lowered(form, device) for device in devices]
+    programs = [_lowered(form, device) for device in devices]
     if devices == [None]:
-        program = compiled(programs[0])
+        program = _compiled(programs[0])
         for some in chunks:
             yield some, _solve(program, rows_of(some), arrays)
         return
@@ -108,7 +285,7 @@ def _outcomes(
     running: deque[tuple[np.ndarray, Future]] = deque()
     with ThreadPoolExecutor(len(devices)) as pool:
         different = dict.fromkeys(programs)  # cores have one program in common
-        different = dict(zip(different, pool.map(compiled, different)))
+        different = dict(zip(different, pool.map(_compiled, different)))
         for number, some in enumerate(chunks):
             worker = number % len(devices)
             own = jax.device_put(rows_of(some), devices[worker])
@@ -125,53 +302,44 @@ def in_chunks(
     job: Job,
     meter: diffrax.AbstractProgressMeter = diffrax.NoProgressMeter(),
     on_device: bool = True,
-) -> tuple[Any, np.ndarray]:
-    """Returns what is kept of all members, and which of them failed.
-
-    Unless `on_device`, the arrays are NumPy's.
-    """
-    size = job.batch.size
-    moving, shared = job.batch.split()
-    moving = in_numpy(moving)  # NumPy cuts faster
-    rest = job.settings, job.reduce, job.ts, shared
+) -> Outcome:
+    """Returns the outcomes of all members; unless `on_device`, in NumPy's arrays."""
+    size = job.size
     lanes = _lanes(-(-size // len(job.devices)), job.chunk)
     order = np.arange(size)
     if size > lanes:
         # The longest come first, so that no core waits long for another at the end.
-        order = np.argsort(_forecast(job, moving, shared))[::-1]
-    place = np.arange(size)  # of members in the results
-    if on_device:  # in the order in which they come: faster, and more memory
-        place[order] = np.arange(size)
+        order = np.argsort(_forecast(job))[::-1]
+    # Rows of the members in the results. In the order in which members come, results
+    # are written faster, and then take their own order in more memory.
+    place = np.argsort(order) if on_device else np.arange(size)
     done, results, structure, waiting = 0, [], None, order
     progress = meter.init()
     while len(waiting):
         late = []
-        for members, outcomes in _outcomes(job, moving, rest, waiting, lanes):
-            _, stopped, _ = outcomes
-            late.append(members[np.asarray(stopped)[: len(members)]])
-            values, structure = jax.tree.flatten(outcomes)
-            if len(members) == size == lanes and not len(late[-1]):
-                results = values  # a single chunk, in order
-            elif not results:
-                results = [np.empty((size, *v.shape[1:]), v.dtype) for v in values]
-            if results is not values:
-                rows = place[members]
-                if rows[-1] - rows[0] == len(rows) - 1:  # a slice is faster
-                    rows = slice(rows[0], rows[-1] + 1)
-                for result, value in zip(results, values):
-                    result[rows] = np.asarray(value)[: len(members)]
+        for members, outcome in _outcomes(job, waiting, lanes):
+            late.append(members[np.asarray(outcome.stopped)[: len(members)]])
             done += len(members) - len(late[-1])
             progress = meter.step(progress, np.asarray(done / size))
+            values, structure = jax.tree.flatten(outcome)
+            if not results:
+                if done == size == lanes:  # a single chunk, in order
+                    meter.close(progress)
+                    return outcome
+                results = [np.empty((size, *v.shape[1:]), v.dtype) for v in values]
+            rows = place[members]
+            if rows[-1] - rows[0] == len(rows) - 1:  # a slice is faster
+                rows = slice(rows[0], rows[-1] + 1)
+            for result, value in zip(results, values):
+                result[rows] = np.asarray(value)[: len(members)]
         waiting = np.concatenate(late)
         if 0 < len(waiting) <= lanes // _SMALL:
             lanes = _lanes(min(len(waiting), _SMALL), job.chunk)
     meter.close(progress)
     if on_device:
         for index, leaf in enumerate(results):
-            if isinstance(leaf, np.ndarray):
-                results[index] = leaf[place]
+            results[index] = leaf[place]
             if leaf.nbytes > _COPIED_AT_ONCE:  # frees one before the next is copied
                 results[index] = jax.device_put(results[index])
         results = jax.device_put(results)
-    kept, _, failed = jax.tree.unflatten(structure, results)
-    return kept, np.asarray(failed)
+    return jax.tree.unflatten(structure, results)

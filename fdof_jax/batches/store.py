@@ -8,7 +8,7 @@ import hashlib
 import json
 import math
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,15 +22,13 @@ from jax.extend.core import ClosedJaxpr, Jaxpr
 
 from .. import __version__
 from ..base.checks import optional_package, refusal
-from ..base.known_values import in_numpy
 from ..base.user_warnings import warn
 from ..base.whole_files import whole_file
 from ..linkage.linkage import Linkage
 from ..linkage.topology import common_unit, names_and_units, rate_unit
 from ..simulation.solution import OUTCOMES, Solution, outcome_numbers
 from .batch_axes import Batch
-from .chunk_programs import outcome_of
-from .chunks import Job, in_chunks
+from .chunks import Common, Job, Outcome, in_chunks, outcome_of
 
 VERSIONS = {"fdof_jax": __version__} | {
     module.__name__: module.__version__ for module in (jax, diffrax, eqx, np)
@@ -59,13 +57,13 @@ def _is_result(leaf: Any) -> bool:
     return isinstance(leaf, diffrax.RESULTS)
 
 
-def _named(kept: Any) -> dict[str, Any]:
-    """Returns the arrays of what is kept by names made of their places."""
-    leaves, _ = jax.tree_util.tree_flatten_with_path(kept, is_leaf=_is_result)
+def _named(value: Any) -> dict[str, Any]:
+    """Returns the arrays of a member's value by names made of their places."""
+    leaves, _ = jax.tree_util.tree_flatten_with_path(value, is_leaf=_is_result)
     named, taken = {}, {"failed"}
     for path, leaf in leaves:
         name = re.sub(r"\W+", "_", jax.tree_util.keystr(path)).strip("_") or "value"
-        if isinstance(kept, Solution):
+        if isinstance(value, Solution):
             name = name.removeprefix("stats_")
         # Some file systems do not tell capitals from small letters.
         if name.casefold() in taken:
@@ -77,7 +75,7 @@ def _named(kept: Any) -> dict[str, Any]:
 
 
 def _variables(like: Any, linkage: Linkage) -> list[Variable]:
-    """Returns the variables of a store from the shapes of what is kept of a member."""
+    """Returns the variables of a store from the shapes of a member's value."""
     of_motion = isinstance(like, Solution)
     unit = common_unit(names_and_units(linkage.ef)[1])
     labels = {
@@ -110,7 +108,7 @@ class Store:
     """
 
     def __init__(
-        self, folder: Path, batch: Batch, ts: Array, like: Any, chunk: int, sweep: str
+        self, folder: Path, batch: Batch, ts: Array, like: Any, sweep: str, chunk: int
     ):
         """Writes the metadata of the group, or checks what is there.
 
@@ -118,7 +116,8 @@ class Store:
         """
         zarr = optional_package("zarr", "data")
         self.folder, self.size = folder, batch.size
-        self.variables = _variables(like, batch.inputs[0])
+        linkage = eqx.combine(batch.moving[0], batch.shared[0])
+        self.variables = _variables(like, linkage)
         each = sum(v.dtype.itemsize * math.prod(v.shape) for v in self.variables)
         most = chunk * min(_CHUNKS, max(1, _BYTES // (chunk * each)))
         # Nearly equal blocks are solved by the same programs.
@@ -127,7 +126,7 @@ class Store:
         versions = VERSIONS | {"zarr": zarr.__version__}
         attributes = {"versions": versions, "sweep": sweep, "chunk": chunk}
         self._refuse_another(attributes)
-        files = self._empty(zarr, attributes, batch.inputs[0], ts, like)
+        files = self._empty(zarr, attributes, linkage, ts, like)
         for name, data in files.items():
             path = folder / name
             if path.exists():
@@ -241,12 +240,12 @@ class Store:
             return None
         return failed
 
-    def write(self, block: int, kept: Any, failed: np.ndarray) -> None:
+    def write(self, block: int, outcome: Outcome) -> None:
         values = [
             outcome_numbers(leaf).astype("int8") if _is_result(leaf) else leaf
-            for leaf in _named(kept).values()
+            for leaf in jax.tree.leaves(outcome.value, is_leaf=_is_result)
         ]
-        for array, rows in zip(self.arrays, [*values, failed], strict=True):
+        for array, rows in zip(self.arrays, [*values, outcome.failed], strict=True):
             if array.size:
                 array.blocks[block] = np.asarray(rows)
 
@@ -255,19 +254,18 @@ def in_store(
     store: Store, blocks: range, job: Job, meter: diffrax.AbstractProgressMeter
 ) -> list[int]:
     """Solves blocks of members that the store lacks; returns the failed members."""
-    moving, shared = job.batch.split()
-    moving, failures, progress = in_numpy(moving), [], meter.init()
+    failures, progress = [], meter.init()
     for done, block in enumerate(blocks, 1):
         failed = store.failed(block)
         members = store.members(block)
         if failed is None:
-            part = jax.tree.map(lambda leaf, m=members: leaf[m], moving)
-            size = members.stop - members.start
-            some = Batch(eqx.combine(part, shared), job.batch.batched, size)
-            kept, failed = in_chunks(job._replace(batch=some), on_device=False)
-            store.write(block, kept, failed)
+            part = jax.tree.map(lambda leaf, m=members: leaf[m], job.moving)
+            some = job._replace(moving=part, size=members.stop - members.start)
+            outcome = in_chunks(some, on_device=False)
+            store.write(block, outcome)
+            failed = outcome.failed
         failures += (members.start + np.flatnonzero(failed)).tolist()
-        progress = meter.step(progress, jnp.asarray(done / len(blocks)))
+        progress = meter.step(progress, np.asarray(done / len(blocks)))
     meter.close(progress)
     return failures
 
@@ -294,28 +292,20 @@ def _constants(program: ClosedJaxpr | Jaxpr) -> Iterator[Any]:
                 yield from _constants(leaf)
 
 
-def outline(
-    batch: Batch, ts: Array, settings: dict, keep: Callable[[Solution], Any]
-) -> tuple[Any, str]:
-    """Returns shapes and types of what is kept of a member, and the sweep's digest.
+def outline(moving: Any, common: Common) -> tuple[Any, str]:
+    """Returns shapes and types of a member's value, and the digest of the sweep.
 
     The digest is of the program and of all arrays, and the same in every process. The
     program names functions, such as force elements, by what they compute. Raises
     ValueError for callbacks into Python.
     """
-
-    def kept(ts, moving, shared, settings, keep):
-        outcome, _, _ = outcome_of(settings, keep, ts, moving, shared, False)
-        return jax.tree.map(jnp.asarray, outcome)
-
-    moving, shared = batch.split()
+    value = lambda *member: jax.tree.map(jnp.asarray, outcome_of(*member).value)
     first = jax.tree.map(lambda leaf: leaf[0], moving)
-    arguments = ts, first, shared, settings, keep
-    program, arrays, others = eqx.filter_make_jaxpr(kept)(*arguments)
+    program, arrays, others = eqx.filter_make_jaxpr(value)(common, first)
     # Functions are printed with addresses, which differ between processes.
     text = re.sub(" at 0x[0-9a-f]+", "", str(program))
     digest = hashlib.sha256(text.encode())
-    inputs = eqx.filter((batch.inputs, ts, settings, keep), eqx.is_array_like)
+    inputs = eqx.filter((moving, common), eqx.is_array_like)
     for leaf in [*_constants(program), *jax.tree.leaves(inputs)]:
         if isinstance(leaf, Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
             leaf = jax.random.key_data(leaf)

@@ -6,9 +6,10 @@ many more steps than its neighbours is stopped and solved again later, in a smal
 batch of slow members.
 """
 
+import contextlib
 import dataclasses
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import diffrax
@@ -42,8 +43,14 @@ from ..simulation.simulate import solve_options
 from ..simulation.solution import Solution
 from ..steps.dopri8 import constant
 from .batch_axes import Batch, batch_of
-from .chunk_programs import expected_work, outcome_of
-from .chunks import Job, devices_outside_mesh, in_chunks
+from .chunks import (
+    Common,
+    Job,
+    devices_outside_mesh,
+    expected_work,
+    in_chunks,
+    outcome_of,
+)
 from .store import Store, in_store, outline
 
 _CHUNK = 512  # half as many take 15 % longer on two cores: each call costs 0.5 ms
@@ -55,60 +62,64 @@ def _without_times(solution: Solution) -> Solution:
 
 
 @eqx.filter_jit  # under `jax.grad` alone, each call would compile its operations again
-def _traced(
-    batch: Batch,
-    ts: Array,
-    settings: dict,
-    reduce: Callable[[Solution], Any],
-    chunk: int,
-) -> Any:
+def _traced(moving: Any, common: Common, size: int, chunk: int) -> Any:
     """Solves a batch under transformations; failed members enter no derivative."""
-    moving, shared = batch.split()
-    order = jnp.argsort(expected_work(*constant((ts, moving, shared))))
+    order = jnp.argsort(expected_work(*constant((common.ts, moving, common.shared))))
 
     def solved(moving, shared):
-        return jax.lax.map(
-            lambda member: outcome_of(settings, reduce, ts, member, shared, False),
-            moving,
-            batch_size=chunk,
-        )
+        members = common._replace(shared=shared)
+        member = lambda moving: outcome_of(members, moving)
+        return jax.lax.map(member, moving, batch_size=chunk)
 
     moving = jax.tree.map(lambda leaf: jnp.asarray(leaf)[order], moving)
+    inputs = moving, common.shared
     # A first solve finds the members that fail. In the differentiated solve the first
     # good member replaces them, because NaN would spoil derivatives of shared arrays.
     # Functions may hold traced values too, so that its results are also constant.
-    frozen, _, failed = constant(solved(*constant((moving, shared))))
-    good = ~failed
-    source = jnp.where(good, jnp.arange(batch.size), jnp.argmax(good))
+    frozen = constant(solved(*constant(inputs)))
+    good = ~frozen.failed
+    source = jnp.where(good, jnp.arange(size), jnp.argmax(good))
     moving, shared = jax.tree.map(
         lambda a, b: jnp.where(jnp.any(good), a, b) if eqx.is_inexact_array(a) else a,
-        *((moving, shared), constant((moving, shared))),
+        *(inputs, constant(inputs)),
     )
-    again, _, _ = solved(jax.tree.map(lambda leaf: leaf[source], moving), shared)
+    again = solved(jax.tree.map(lambda leaf: leaf[source], moving), shared)
     back = jnp.argsort(order)
 
     def chosen(a, b):
         return jnp.where(good.reshape(-1, *[1] * (a.ndim - 1)), a, b)[back]
 
-    return jax.tree.map(chosen, again, frozen)
+    return jax.tree.map(chosen, again.value, frozen.value)
 
 
-def _check_elements(batch: Batch, ts: Array, forces_axes: Any) -> None:
-    """Raises an error unless the force elements suit each member's linkage."""
-    moving, shared = batch.split()
+def _check_elements(batch: Batch) -> None:
+    """Raises ValueError unless the force elements suit each member's linkage."""
 
     def check_member(moving):
-        linkage, _, forces = eqx.combine(moving, shared)
+        linkage, _, forces = eqx.combine(moving, batch.shared)
         elements_on(linkage, forces)  # what members share is known here
 
-    eqx.filter_eval_shape(eqx.filter_vmap(check_member), moving)
+    linkage, _, forces = batch.moving
+    if jax.tree.leaves((linkage, forces)):
+        jax.eval_shape(jax.vmap(check_member), batch.moving)
+    else:
+        check_member(batch.moving)
+
+
+@contextlib.contextmanager
+def _naming_axes(batch: Batch, ts: Array, forces_axes: Any) -> Iterator[None]:
+    """Names `forces_axes` in errors of elements that do not work for one member."""
     try:
-        eqx.filter_eval_shape(expected_work, ts, moving, shared)
-    except TypeError as error:
-        raise TypeError(
-            "forces, forces_axes: expected force elements that work for one member, "
-            f"got an error with forces_axes={shown(forces_axes)}: {error}"
-        ) from error
+        yield
+    except TypeError:
+        try:
+            eqx.filter_eval_shape(expected_work, ts, *batch[:2])
+        except TypeError as error:
+            raise TypeError(
+                "forces, forces_axes: expected force elements that work for one "
+                f"member, got an error with forces_axes={shown(forces_axes)}: {error}"
+            ) from error
+        raise
 
 
 @accepts_scene
@@ -211,46 +222,49 @@ def sweep(
     )
     del settings["progress_meter"]  # it counts finished members, not time
     batch = batch_of(linkage, state0, forces, forces_axes)
-    traced = is_transformed()
+    moving, shared, size = batch
     if forces:
-        _check_elements(batch, ts, forces_axes)
+        _check_elements(batch)
     keep = _without_times if reduce is None else function("reduce", reduce)
-
-    def check(failed: Sequence[int] | np.ndarray) -> None:
-        if throw and len(failed):
-            raise RuntimeError(
-                f"sweep: {len(failed)} of {batch.size} members failed, the first of "
-                f"them member {failed[0]}."
-            )
-
-    def whole(kept: Any) -> Any:
-        if reduce is not None:
-            return kept
-        # NumPy's view of the common times is no copy of them for each member.
-        times = (jnp if traced else np).broadcast_to(ts, (batch.size, *ts.shape))
-        return dataclasses.replace(kept, ts=times)
-
-    if traced:
-        if throw or store is not None:
-            raise ValueError(
-                "throw, store: expected their defaults under jit, grad or vmap."
-            )
-        return whole(_traced(batch, ts, settings, keep, chunk))
-    with devices_outside_mesh() as devices:
-        solved = lambda solve: sharing_functions(
-            lambda forces, reduce: solve(
-                Job(batch.with_forces(forces), ts, settings, reduce, chunk, devices)
-            ),
-            forces=batch.inputs[2],
-            reduce=keep,
+    common = Common(shared, ts, settings, keep)
+    traced = is_transformed()
+    if traced and (throw or store is not None):
+        raise ValueError(
+            "throw, store: expected their defaults under jit, grad or vmap."
         )
-        if store is not None:
-            folder = folder_path("store", store)
-            like, digest = outline(batch, ts, settings, keep)
-            group = Store(folder, batch, ts, like, chunk, digest)
-            blocks = range(shard, group.count, of)
-            check(solved(lambda job: in_store(group, blocks, job, progress_meter)))
-            return folder
-        kept, failed = solved(lambda job: in_chunks(job, progress_meter))
-    check(np.flatnonzero(failed))
-    return whole(kept)
+    folder: Any = None if store is None else folder_path("store", store)
+
+    def fill(job: Job) -> list[int]:
+        group = Store(folder, batch, ts, *outline(moving, common), chunk)
+        return in_store(group, range(shard, group.count, of), job, progress_meter)
+
+    def solved(solve: Callable[[Job], Any]) -> Any:
+        def run(forces, reduce):
+            own = Common((*shared[:2], forces), ts, settings, reduce)
+            return solve(Job(moving, own, size, chunk, devices))
+
+        with devices_outside_mesh() as devices:
+            return sharing_functions(run, forces=shared[2], reduce=keep)
+
+    value: Any = None
+    failures: Any = []
+    with _naming_axes(batch, ts, forces_axes):
+        if traced:
+            value = _traced(moving, common, size, chunk)
+        elif folder is not None:
+            failures = solved(fill)
+        else:
+            outcome = solved(lambda job: in_chunks(job, progress_meter))
+            value, failures = outcome.value, np.flatnonzero(outcome.failed)
+    if throw and len(failures):
+        raise RuntimeError(
+            f"sweep: {len(failures)} of {size} members failed, the first of "
+            f"them member {failures[0]}."
+        )
+    if folder is not None:
+        return folder
+    if reduce is not None:
+        return value
+    # NumPy's view of the common times is no copy of them for each member.
+    times = (jnp if traced else np).broadcast_to(ts, (size, *ts.shape))
+    return dataclasses.replace(value, ts=times)
