@@ -144,7 +144,7 @@ def test_a_state_that_is_not_a_number_is_told():
     assert int(solution.stats["num_steps"]) < 100
     broken = eqx.tree_at(lambda x: x.start, LAG, jnp.full(1, jnp.nan))
     with pytest.raises(ValueError, match=r"forces\[0\]\.start: expected .* finite"):
-        fj.simulate(WHEEL, STILL, [0, 1.0], (broken,), throw=False)
+        fj.simulate(WHEEL, STILL, [0, 1.0], (broken,))
 
 
 def test_states_of_elements_are_swept():

@@ -133,7 +133,7 @@ def test_tracking_and_its_error():
     np.testing.assert_allclose(path.get_array(), 500 * (errors[:-1] + errors[1:]))
     (bar,) = ax.child_axes
     assert bar.get_ylabel() == "tip error [mm]"
-    assert bar.get_ylim() == path.get_clim() == (0, 1000 * errors.max())
+    assert bar.get_ylim() == path.get_clim() == pytest.approx((0, 1000 * errors.max()))
     left, right, bottom, top = ax.axis()
     assert ((pieces > [left, bottom]) & (pieces < [right, top])).all()
     lightest = path.cmap(1.0)[:3] @ np.array([0.2126, 0.7152, 0.0722])

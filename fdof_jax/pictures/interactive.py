@@ -59,7 +59,7 @@ def _moved(scene: Scene, stretch: Array, factor: Array) -> _Moved:
     linkage = scene.linkage.replace(
         length=length.at[1:].multiply(stretch), com=com.at[:, 0].multiply(stretch)
     )
-    gains = factor * gains_of(scene)
+    gains = factor * np.asarray(gains_of(scene))
     scene = with_gains(scene._replace(linkage=linkage), gains)
     ts = jnp.linspace(0, scene.t1, _SAMPLES)
     solution = simulate(
@@ -84,7 +84,11 @@ def _report(moved: _Moved, error: np.ndarray) -> str:
     else:
         text = f"Tip error: rms {1e3 * np.sqrt(np.mean(error**2)):.3g} mm."
     linkage, controller = moved.scene.linkage, controller_of(moved.scene)
-    columns = joint_names(linkage), gains_of(moved.scene).T, linkage.length[1:]
+    columns = (
+        joint_names(linkage),
+        np.asarray(gains_of(moved.scene)).T,
+        linkage.length[1:],
+    )
     rows = []
     for k, (joint, gains, length) in enumerate(zip(*columns), start=1):
         units = controller.gain_units[joint[0]]

@@ -93,11 +93,13 @@ def integrate(
 def _prepare(inputs: Inputs, derivatives: bool, padded: bool) -> _Problem:
     """States the equations and their start."""
     linkage, state0, ts, own0, forces = inputs
-    valid = ~faults(inputs, times=not padded).any()
+    wrong_times, wrong_start, *others = faults(inputs, times=not padded)
+    valid = ~jnp.stack([wrong_times, wrong_start, *others]).any()
     # Harmless values replace invalid ones, because derivatives of NaN would spoil those
     # of arrays that other lanes share.
-    q0, qd0 = (without_fixed(linkage, jnp.where(valid, a, 0)) for a in state0)
-    ts = jnp.where(valid, ts, 1e-3 * jnp.arange(len(ts), dtype=ts.dtype))
+    q0, qd0 = (without_fixed(linkage, jnp.where(wrong_start, 0, a)) for a in state0)
+    harmless = 1e-3 * jnp.arange(len(ts), dtype=ts.dtype)
+    ts = jnp.where(wrong_times, harmless, ts)
     arguments = args_of(linkage, q0, forces)
     if derivatives:
         arguments = clocks_apart(arguments, ts)
@@ -221,7 +223,7 @@ def _differentiable(solver: Any, adjoint: diffrax.AbstractAdjoint) -> Any:
     return eqx.tree_at(lambda s: s.scan_kind, solver, kind, is_leaf=lambda x: x is None)
 
 
-def faults(inputs: Inputs, times: bool = True) -> Array:
+def faults(inputs: Inputs, times: bool = True) -> list[Array]:
     """Returns whether times, start, linkage and each element are at fault.
 
     `times`: whether those are looked at; an array made for a plain call may repeat the
@@ -234,7 +236,7 @@ def faults(inputs: Inputs, times: bool = True) -> Array:
     start = finite & agrees(forces, ts[0], jnp.asarray(state0.q), linkage)
     arm = constant((linkage, ts))
     fit = [jnp.asarray(e.possible() & constant(e).fits(*arm)) for e in forces]
-    return ~jnp.stack([increasing, start, possible(linkage), *fit])
+    return [~fine for fine in (increasing, start, possible(linkage), *fit)]
 
 
 def _judged(valid: Array, result: Any, q: Array, qd: Array) -> Any:

@@ -277,7 +277,9 @@ def _raising(solution: Solution, inputs: Inputs) -> Solution:
         return solution
 
 
-_faults = eqx.filter_jit(faults)  # one program, not one for each of its operations
+@eqx.filter_jit  # one program, not one for each of its operations
+def _faults(inputs: Inputs) -> Array:
+    return jnp.stack(faults(inputs))
 
 
 def check_own(

@@ -283,7 +283,7 @@ def check_tuned(name: str, scene: Any, loss: Any = tip_errors) -> None:
 
 def bounds_of(scene: Scene, factor: Any, bounds: Any) -> GainBox:
     """Checks `factor` and `bounds` of `tune`; gains of 0 stay 0."""
-    start = gains_of(scene)
+    start = np.asarray(gains_of(scene))
     if bounds is None:
         factor = real_array("factor", 4.0 if factor is None else factor, (), above=1)
         return GainBox(start, start / float(factor), start * float(factor))

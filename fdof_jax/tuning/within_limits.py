@@ -315,7 +315,7 @@ class TunedWithin(Report):
     @property
     def gains(self) -> Float[np.ndarray, "2 joint"]:
         """The tuned kp and kd."""
-        return gains_of(self.scene)
+        return np.asarray(gains_of(self.scene))
 
     @property
     def met(self) -> Bool[np.ndarray, " limit"]:
