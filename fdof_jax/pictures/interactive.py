@@ -59,7 +59,7 @@ def _moved(scene: Scene, stretch: Array, factor: Array) -> _Moved:
     linkage = scene.linkage.replace(
         length=length.at[1:].multiply(stretch), com=com.at[:, 0].multiply(stretch)
     )
-    gains = factor * np.asarray(gains_of(scene))
+    gains = factor * gains_of(scene)
     scene = with_gains(scene._replace(linkage=linkage), gains)
     ts = jnp.linspace(0, scene.t1, _SAMPLES)
     solution = simulate(
