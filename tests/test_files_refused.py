@@ -194,7 +194,7 @@ def test_classes_of_a_user(path):
 
 
 def test_a_file_cut_or_changed_anywhere(path):
-    """What is no error is another file as a person might have written it."""
+    """A change that is no error is another file as a person might have written it."""
     fj.save(path, fj.PDController([1, 2, 3], 0.5, np.inf, fj.CircleTask()))
     content = path.read_bytes()
     cuts = [content[:length] for length in range(len(content) - 1)]

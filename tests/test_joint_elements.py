@@ -160,7 +160,7 @@ def test_efforts_are_linear_between_the_times_and_held_beyond():
 
 @pytest.mark.slow
 def test_the_momentum_gained_is_the_integral_of_the_efforts():
-    """Of the slide on the ground, whose momentum only efforts change."""
+    """The slide on the ground has a momentum that only efforts change."""
     linkage = eqx.tree_at(lambda k: k.gravity, arm("PRR"), 0.0)
     momentum = lambda q, qd: fj.inverse_dynamics(linkage, q, 0 * q, qd)[0]
     # Trapezia, and the constant efforts before and after.

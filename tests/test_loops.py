@@ -258,7 +258,7 @@ def test_the_bandwidth_is_that_of_the_response_to_the_reference(name):
 
 
 def test_the_bandwidth_ends_at_a_narrow_dip():
-    """That of another joint's mode, between samples of the frequency."""
+    """The dip of another joint's mode, between samples of the frequency."""
     linkage, q = arm("RRR", 3)
     linkage = linkage.replace(gravity=0)
     gains = fj.control.gains_from_frequency(linkage, q, [8, 8.8, 60], 5e-4)
@@ -286,7 +286,7 @@ def test_computed_torque_follows_at_all_frequencies():
 
 
 def test_joints_follow_while_others_hold():
-    """Of three joints under computed torque each moves as if it were alone."""
+    """Each of three joints under computed torque moves as if it were alone."""
     linkage, q = arm("RPR")
     torque = fj.control.ComputedTorque(90.0, 6.0, np.inf, Stand(q))
     for joint in (1, 2, 3):

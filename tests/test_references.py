@@ -152,7 +152,7 @@ def reached(task, ts):
 
 @pytest.mark.parametrize("begin, end", [(0.0, 1.0), (0.0, 400.0), (0.7, 3e4)])
 def test_a_short_travel_is_checked_in_runs_of_any_length(begin, end):
-    """Of so few samples of a run, none or two would lie within the second."""
+    """So few samples of a run would leave none or two within the second."""
     ts = jnp.array([0.0, end + begin])
     for timing in fj.references.Travel(1.0, begin=begin), Ramp(np.array(begin)):
         ring = fj.TipTask(RING, timing)

@@ -38,7 +38,7 @@ def assert_alike(tree, other):
 
 
 def test_members_equal_single_simulations(batch, clean):
-    """That vmap equals single motions is in test_one_compilation.py."""
+    """Equality of vmap with single motions is in test_one_compilation.py."""
     simulate = lambda linkage, state0, forces: fj.simulate(
         linkage, state0, TS, forces, throw=False, **SETTINGS
     )

@@ -1,4 +1,4 @@
-"""How a sweep cuts its members into chunks, on which devices, and what it compiles."""
+"""Chunks of a sweep, the devices that solve them, and the programs compiled."""
 
 import functools
 import os

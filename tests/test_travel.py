@@ -102,7 +102,7 @@ def test_laps_go_on():
 
 @pytest.mark.parametrize("profile", PROFILES)
 def test_steps_end_where_the_acceleration_jumps(profile):
-    """Of a quintic only the third derivative jumps, at both ends."""
+    """Only the third derivative of a quintic jumps, at both ends."""
     travel = fj.references.Travel(2.0, begin=0.5, profile=profile)
     inside = [1.0, 2.0] if profile == "trapezoidal" else []
     np.testing.assert_allclose(travel.jump_ts, [0.5, *inside, 2.5], rtol=1e-15)

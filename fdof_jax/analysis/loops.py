@@ -143,7 +143,7 @@ def _loops(
 
 
 class Margins(NamedTuple):
-    """How far a loop is from instability.
+    """Distances of a loop from instability.
 
     - `gain`: factor on the loop, the nearest to 1, that makes it unstable. Below 1 it
       belongs to an arm that falls if the gains are too low.

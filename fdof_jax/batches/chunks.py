@@ -40,7 +40,7 @@ _NO_MESH = Mesh(np.empty((), object), ())
 
 
 class Common(NamedTuple):
-    """What all members of a sweep have in common."""
+    """The arguments that all members of a sweep have in common."""
 
     shared: Any  # of a `Batch`
     ts: Array
@@ -49,7 +49,7 @@ class Common(NamedTuple):
 
 
 class Job(NamedTuple):
-    """What a sweep solves, on which devices, and the most members of a chunk."""
+    """The members that a sweep solves, its devices, and the size of its chunks."""
 
     moving: Any  # of a `Batch`
     common: Common

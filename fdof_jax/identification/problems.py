@@ -1,4 +1,4 @@
-"""What is fitted: named unknowns, recordings of motions, and their misfit."""
+"""Problems of fitting: named unknowns, recordings of motions, and their misfit."""
 
 import math
 from collections.abc import Callable, Iterator, Mapping

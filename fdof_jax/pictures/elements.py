@@ -98,7 +98,7 @@ def _place(point: Point, f: Frames) -> np.ndarray:
 
 
 def _support(point: Point, arm: Linkage, f: Frames, size: float) -> list[np.ndarray]:
-    """What holds a point: hatched ground, or a bracket from its link's line."""
+    """Lines of a support: hatched ground, or a bracket from the link's line."""
     place, link = _place(point, f), point.link
     if link == 0:
         hatches = [np.array([x, x - 0.7 - 0.9j]) for x in (-0.6, 0.4, 1.4)]

@@ -32,7 +32,7 @@ from .solution import Solution
 
 
 class Inputs(NamedTuple):
-    """What determines a motion, as `simulate` gets it.
+    """The arguments that determine a motion, as `simulate` gets them.
 
     `own0`: initial states of the elements, or None for their defaults.
     """
@@ -45,7 +45,7 @@ class Inputs(NamedTuple):
 
 
 class _Problem(NamedTuple):
-    """What is integrated.
+    """The equations to integrate, their start and output times.
 
     - `valid`: whether the inputs were; otherwise harmless ones replace them.
     - `ts`: output times of the solve; `first`: positions and velocities at the first.
@@ -63,7 +63,7 @@ class _Problem(NamedTuple):
 
 
 class _Control(NamedTuple):
-    """How it is integrated: a start that may include switches, solver and steps."""
+    """The start, which may include switches, the solver and the step control."""
 
     start: Any
     solver: Any

@@ -133,7 +133,7 @@ def _split(moved: Array, matrix: Array, given: Array, right: Array) -> Array:
 
 
 class Formulation(NamedTuple):
-    """What is integrated for a motion, and how joint states are read from it.
+    """The equations of a motion, their start, and the reading of joint states.
 
     - `term`: the equations.
     - `start(args, qd)`: displacements, and velocities or momenta, at the start, before

@@ -51,7 +51,7 @@ def _last(end: Array) -> Array:
 
 
 class NextStep(NamedTuple):
-    """What a controller returns after a step, but for its state."""
+    """The answer of a controller after a step, without its state."""
 
     keep: Array
     t0: Array

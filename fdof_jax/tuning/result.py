@@ -94,7 +94,7 @@ class TuneResult(Report):
 
     @property
     def at_bound(self) -> Bool[np.ndarray, "2 joint"]:
-        """Whether each gain is held by a bound."""
+        """Flags of the gains that a bound holds."""
         return self._box.at_bound(self.gains)
 
     @property

@@ -319,7 +319,7 @@ class TunedWithin(Report):
 
     @property
     def met(self) -> Bool[np.ndarray, " limit"]:
-        """Whether each limit is met; margins are lower limits, all others upper."""
+        """Flags of the limits met; margins are lower limits, all others upper."""
         sign = np.where(np.array(self.limit) == _MARGIN, -1, 1)
         return sign * self.reached <= sign * self.allowed
 
