@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from ..base.checks import function, instance, real_array, refusal, shown
 from ..base.report import Report
 from ..search.bounded import Evaluation, Run, minimise
-from ..search.lanes import Lanes, check_scene
+from ..search.lanes import Lanes, check_motion, check_scene
 from ..simulation.scene import Scene
 from ..simulation.sensitivities import sensitivities
 from ..simulation.simulate import simulate
@@ -178,7 +178,7 @@ def next_motion(
     sizes = parameters.scale
     first = named(motion.shapes, jnp.asarray(motion.start))
     scene = experiment(**first)(jax.tree.map(jnp.asarray, found.parameters))
-    check_scene("experiment(...)(...)", scene, ts)
+    check_scene("experiment(...)(...)", scene)
     information = _information(found.covariance / np.outer(sizes, sizes))
     design = _Design(
         experiment, observe, within, motion, parameters, information, ts, noise
@@ -206,11 +206,8 @@ def next_motion(
 
 def _refused(scene: Scene, ts: Array, within: Any) -> str:
     """Says why a search cannot begin with a motion."""
-    solution = simulate(scene.linkage, scene.state0, ts, scene.forces, throw=False)
-    if str(solution.outcome) != "successful":
-        reached = float(solution.stats["time_reached"])
-        got = f"{solution.outcome} at t = {reached:g} s"
-        return f"expected a motion that can be simulated, got {got}"
+    check_motion("experiment(...)(...)", scene, ts)
+    solution = simulate(scene.linkage, scene.state0, ts, scene.forces)
     if within is not None:
         shares = np.asarray(within(scene, solution))
         entry = np.unravel_index(np.argmax(np.abs(shares)), shares.shape)

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from ..base.checks import keywords_as, refusal
 from ..search.bounded import Evaluation, Run, minimise
-from ..search.lanes import Lanes
+from ..search.lanes import Lanes, check_motion
 from .problems import (
     Observe,
     Problem,
@@ -117,7 +117,11 @@ def _search(
             f"unknowns, got {least}."
         )
     runs = _longer_and_longer(rows, unknowns, **search)
-    if any(run.failed for run in runs):
+    failed = [row for run, row in zip(runs, rows) if run.failed]
+    for problem in failed[0] if failed else ():
+        scene = problem.scene_at(unknowns.at(unknowns.start / unknowns.scale))
+        check_motion("scene_at(...)", scene, problem.ts)
+    if failed:
         expected = "parameters at which the scene can be simulated over ts"
         raise refusal("start", expected, start)
     judged = [None] * len(runs)

@@ -189,9 +189,7 @@ def _successive(weight: Any) -> Any:
     return (weight[1:] > 0) & (weight[:-1] > 0)
 
 
-def _check_scene_at(
-    name: str, scene_at: SceneAt, parameters: dict[str, Array], ts: Array
-) -> None:
+def _check_scene_at(name: str, scene_at: SceneAt, parameters: dict[str, Array]) -> None:
     try:
         scene = scene_at(parameters)
     except KeyError as error:
@@ -199,7 +197,7 @@ def _check_scene_at(
             f"start: expected a value for {error}, which {name} may use, got "
             f"{shown(list(parameters))}."
         ) from error
-    check_scene(f"{name}(...)", scene, ts)
+    check_scene(f"{name}(...)", scene)
 
 
 def check_times(ts: Any) -> Array:
@@ -252,7 +250,7 @@ def problems_of(
     stacked(scene_at, names[0])  # raises unless all are alike
     first = jax.tree.map(jnp.asarray, named(unknowns.shapes, unknowns.start))
     for each in scene_at:
-        _check_scene_at(names[0], each, first, ts)
+        _check_scene_at(names[0], each, first)
     seen = ~np.isnan(readings)
     rows = zip(scene_at, np.where(seen, readings, 0), np.where(seen, weights, 0))
     return [Problem(scene, observe, unknowns, ts, *row) for scene, *row in rows]

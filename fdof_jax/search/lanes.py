@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from numpy.typing import ArrayLike
 
 from ..base.checks import instance
 from ..base.configuration import options_of_loops
@@ -17,7 +18,7 @@ from ..linkage.coordinates import real_state
 from ..linkage.linkage import check_linkage
 from ..simulation.scene import Scene, stacked
 from ..simulation.sensitivities import Sensitivities
-from ..simulation.simulate import check_elements
+from ..simulation.simulate import elements_at_door, simulate
 from .bounded import Evaluation
 
 # Greatest number of lanes in a compiled batch: fewer do not fill the processor, and
@@ -27,13 +28,25 @@ _LANES = 8
 Evaluate = Callable[[Array, Any], Evaluation]  # (z, problem) of one lane
 
 
-def check_scene(name: str, scene: Any, ts: Array) -> None:
-    """Raises ValueError unless `scene` can be simulated over the times `ts`."""
+def check_scene(name: str, scene: Any) -> None:
+    """Raises ValueError for shapes and kinds with which nothing can be simulated."""
     instance(name, scene, Scene)
     check_linkage(scene.linkage)
     real_state(f"{name}.state0", scene.state0, scene.linkage)
     elements(f"{name}.forces", scene.forces)
-    check_elements(scene.forces, scene.linkage, ts)
+    elements_at_door(scene.linkage, scene.forces)
+
+
+def check_motion(name: str, scene: Scene, ts: ArrayLike) -> None:
+    """Raises ValueError with the reason if a scene cannot be simulated over `ts`.
+
+    Searches call it after a failure, as a check beforehand would have to compile.
+    """
+    try:
+        simulate(scene.linkage, scene.state0, ts, scene.forces)
+    except RuntimeError as error:
+        message = f"{name}: expected one that can be simulated from its start. {error}"
+        raise ValueError(message) from error
 
 
 def sum_of_squares(found: Sensitivities, **facts: Any) -> Evaluation:

@@ -16,6 +16,7 @@ from ..base.configuration import options_of_loops
 from ..base.known_values import in_numpy
 from ..base.report import Report
 from ..linkage.linkage import joint_names
+from ..search.lanes import check_motion
 from ..simulation.prescribed import PrescribedMotion
 from ..simulation.scene import Scene, is_number
 from ..simulation.sensitivities import Sensitivities, sensitivities
@@ -192,6 +193,8 @@ def gradient_report(scene: Scene) -> GradientReport:
     z, tuned = np.concatenate([box.logs()[0], values]), box.tuned
     found, demands = in_numpy(_tangents(scene, tuned, z))
     residuals, solution = found.residuals, found.solution
+    if not np.isfinite(residuals).all():
+        check_motion("scene", scene, [0.0, t1])
     # Short parts of the run may be given in times, and are not stepped over.
     steps = np.where(values == 0, np.inf, _STEP * np.abs(values))
     steps = np.append(np.full(tuned.size, _STEP), np.minimum(steps, _OF_TIME * t1))

@@ -267,8 +267,8 @@ def check_tuned(name: str, scene: Any, loss: Any = tip_errors) -> None:
     if is_traced(scene):
         expected = "known values, as gains are tuned outside of JAX's transformations"
         raise refusal(name, expected, scene)
-    t1 = real_array(f"{name}.t1", scene.t1, (), above=0)
-    check_scene(name, scene, jnp.stack([jnp.zeros_like(t1), t1]))
+    real_array(f"{name}.t1", scene.t1, (), above=0)
+    check_scene(name, scene)
     controller = controller_of(scene)
     if isinstance(loss, Tracking) or loss is tip_errors:
         tracked_task(scene, name)

@@ -17,7 +17,7 @@ from ..control.model_based import ComputedTorque
 from ..forces.joints import EffortHistory
 from ..linkage.linkage import joints_of, without_fixed
 from ..search.bounded import Evaluation, Run, best_of, minimise
-from ..search.lanes import Lanes, sum_of_squares
+from ..search.lanes import Lanes, check_motion, sum_of_squares
 from ..simulation.efforts import joint_efforts
 from ..simulation.scene import Scene
 from ..simulation.sensitivities import sensitivities
@@ -220,6 +220,7 @@ def optimal_efforts(
     )  # fmt: skip
     runs = [run for run in runs if not run.failed]
     if not runs:
+        check_motion("scene", scene, ts)
         raise RuntimeError(
             "optimal_efforts: the simulation fails with the efforts of every first "
             "guess; use a shorter horizon."

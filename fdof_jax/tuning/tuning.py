@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from ..base.checks import keywords_as, one_of, real_array, refusal, whole_number
 from ..linkage.linkage import joint_names
 from ..search.bounded import METHODS, Row, Run, best_of, minimise
-from ..search.lanes import Lanes
+from ..search.lanes import Lanes, check_motion
 from ..simulation.scene import Scene, stacked, unstacked, with_full_size
 from ..simulation.sensitivities import TOLERANCE
 from .losses import (
@@ -100,10 +100,11 @@ def _failure(members: list[Scene], first: Row, ensemble: bool) -> ValueError:
         return unusable_loss()
     index = failing[0]
     name = f"ensemble[{index}]" if ensemble else "scene"
+    end = float(members[index].t1)
+    check_motion(name, members[index], [0.0, end])
     return ValueError(
-        f"{name}: expected one that can be simulated up to t1 = "
-        f"{float(members[index].t1):g} s with the scene's own gains, got one that "
-        "fails before."
+        f"{name}: expected derivatives up to t1 = {end:g} s with its own gains, "
+        "got a motion that can be simulated, but whose derivatives fail."
     )
 
 

@@ -24,7 +24,7 @@ from ..linkage.fields import Part, Values, check_joints, field, sized
 from ..linkage.linkage import joint_names, joints_of, moving_joints
 from ..references.reference import reference_motion
 from ..search.bounded import Evaluation, check_search
-from ..search.lanes import Lanes, sum_of_squares
+from ..search.lanes import Lanes, check_motion, sum_of_squares
 from ..simulation.scene import Scene, with_full_size
 from ..simulation.simulate import simulate
 from ..simulation.solution import Solution
@@ -219,7 +219,11 @@ def _lane(z: Array, problem: tuple[Scene, Loss, Array, Limits, bool]) -> Evaluat
 
 
 def _search(
-    lanes: Lanes, box: GainBox, max_steps: int, report: Callable[[str], Any] | None
+    scene: Scene,
+    lanes: Lanes,
+    box: GainBox,
+    max_steps: int,
+    report: Callable[[str], Any] | None,
 ) -> tuple[np.ndarray, float, str]:
     """Returns the best log-gains (2n,), their loss, and why the search stopped.
 
@@ -241,9 +245,9 @@ def _search(
 
     start = evaluated(first)
     if np.isnan(start.facts["excess"]).any():
+        check_motion("scene", scene, [0.0, float(scene.t1)])
         raise ValueError(
-            "scene: expected one that can be simulated with its own gains, and has an "
-            "equilibrium at its last set point, got one without."
+            "scene: expected an equilibrium at its last set point, got none."
         )
     if not (np.isfinite(start.loss) and np.isfinite(start.gradient).all()):
         raise unusable_loss()
@@ -397,7 +401,9 @@ def tune_within(
     limits = sized(limits, joints_of(scene.linkage))
     with_margins = bool(np.any(np.asarray(limits.modulus_margin) > 0))
     problem = with_full_size(scene), loss, box.tuned, limits, with_margins
-    z, value, message = _search(Lanes(_lane, [[problem]]), box, max_steps, report)
+    z, value, message = _search(
+        scene, Lanes(_lane, [[problem]]), box, max_steps, report
+    )
     scene = with_gains(scene, jnp.asarray(box.gains(z)))
     rows = list(measured(scene, limits))
     limit, joint, allowed, reached = zip(*rows) if rows else ((),) * 4
