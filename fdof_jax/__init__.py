@@ -47,7 +47,8 @@ from .base.configuration import configure
 from .batches.sweep import sweep
 from .control.pd import PDController
 from .data.files import load, save
-from .data.mjcf import from_mjcf, to_mjcf
+from .data.mjcf_reading import from_mjcf
+from .data.mjcf_writing import to_mjcf
 from .data.tables import to_pandas, to_xarray
 from .dynamics import (
     bias_force,

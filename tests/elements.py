@@ -88,6 +88,18 @@ WITH_STATE = {
         current_limit=[0.3, 9.0, 0.1],
     ),
 }  # fmt: skip
+WITH_STATE["actuators"] = fj.control.Actuators(
+    gear=[[2.0, 0.0, 0.0], [0.0, 1.0, -0.5]],
+    gain=[[0.0, 0.0, 0.0], [4.0, 0.5, -0.3]],
+    bias=[[0.1, -3.0, -0.4], [0.2, -2.0, -0.6]],
+    control=[0.4, 0.7],
+    upper=[0.6, 9.0],
+    effort_lower=[-9.0, -0.5, -9.0],
+    activation=fj.control.Activation(
+        gain=[3.0, 0.0], rate=[[4.0, -4.0, 0.1, -0.2], [0.0, 0.0, 0.0, 0.0]],
+        start=[0.1, 0.0],
+    ),
+)  # fmt: skip
 WITH_STATE["motor with PID"] = fj.control.FirstOrderLag(WITH_STATE["PID"], 0.1)
 WITH_INERTIA = {
     "armature": fj.forces.Armature([0.3, 0.2, 0.1]),

@@ -30,6 +30,19 @@ def test_comparison():
     np.testing.assert_allclose(names["data"].qpos, names["motion"].q[-1], atol=1e-5)
     np.testing.assert_allclose(names["again"].mass, names["arm"].mass)
     np.testing.assert_allclose(names["dampers"][0].coefficient, 0.5)
+    np.testing.assert_allclose(names["start"].q, 0)
+
+
+@pytest.mark.slow
+def test_models(monkeypatch):
+    monkeypatch.chdir(DOCS.parent)
+    page = (DOCS / "models.md").read_text()
+    names = run(DOCS / "models.md")
+    np.testing.assert_allclose(names["motion"].q[-1], 0, atol=0.02)
+    assert names["tuned"].tip_error < 0.02
+    assert names["step"].met.all()
+    first = str(names["fj"].from_mjcf("docs/models/cart_pole.xml").account)
+    assert first in page  # which shows what it prints
 
 
 @pytest.mark.slow

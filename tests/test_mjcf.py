@@ -1,16 +1,19 @@
 """MuJoCo's models, written and read: both engines accelerate alike."""
 
+import importlib.util
 import warnings
 from itertools import product
 from pathlib import Path
 
 import equinox as eqx
 import jax
+import mjcf_oracle
 import mujoco
 import numpy as np
 import pytest
 from elements import Hold
 from helpers import random_linkage
+from mjcf_texts import REFUSED, TEXTS, random_text
 
 import fdof_jax as fj
 
@@ -113,8 +116,11 @@ def test_exported_motion_equals_mujoco():
 
 
 WET = dict(damping=1, one_sided="cable", rest_length=1)
+STATE = fj.control.Activation([1], [[1, 0, 1, 0]], [0])
+LAW = dict(gain=[[0, 0, 0]], bias=[[0, 0, 0]], control=[1])
 UNWRITTEN = {
-    "got JointEffort": fj.JointEffort([1, 2, 3]),
+    "got GravityFeedforward": fj.control.GravityFeedforward(1, 1, 1, fj.CircleTask()),
+    "states that follow": fj.control.Actuators([[1, 0, 0]], **LAW, activation=STATE),
     "got function": lambda t, q, qd, linkage: q,
     "expected one JointDamper": fj.JointDamper(1.0),
     "expected no damping of a cable": fj.SpringDamper(fj.Point(0), fj.Point(1), **WET),
@@ -133,7 +139,211 @@ def test_what_mujoco_does_not_have_is_refused_by_name():
         jax.jit(fj.to_mjcf)(linkage)
 
 
+# Both ways
+
+
+def accelerations(linkage, forces, q, qd):
+    return mjcf_oracle.accelerations(linkage, forces, q[None], qd[None])[0]
+
+
+def everything(rng, n, servo):
+    """Returns one of each element that both engines have, for n joints."""
+    positive = lambda: rng.uniform(0.1, 2, size=n)
+    points = fj.Point(0, 0.3, -0.9), fj.Point(n, 0.2, 0.1)
+    spring = lambda **rest: fj.SpringDamper(*points, stiffness=3.0, **rest)
+    parts = [
+        fj.JointDamper(positive()),
+        fj.forces.Armature(positive()),
+        fj.forces.JointSpring(positive(), rng.normal(size=n)),
+        fj.forces.JointStops(np.full(n, -50.5), np.full(n, 60.5)),
+        fj.forces.JointFriction(positive()),
+        spring(damping=0.3, rest_length=0.4),
+        spring(rest_length=0.4, one_sided="cable"),
+        spring(rest_length=5.0, one_sided="bumper"),
+    ]
+    if servo:
+        limit = np.where(rng.random(n) < 0.5, np.inf, positive())
+        point = fj.references.SetPoint(*rng.normal(size=(2, n)))
+        return parts + [fj.PDController(positive(), positive(), limit, point)]
+    gear, (gain, bias) = rng.normal(size=(3, n)), rng.normal(size=(2, 3, 3))
+    gain[1:] = 0  # those with states
+    states = fj.control.Activation(
+        [0, 2, 3], [[0] * 4, [1, 0, 0, 0], [5, -5, 0, 0]], [0, 0.3, 0.1],
+        lower=[-np.inf, -1, -np.inf], upper=[np.inf, 1, np.inf],
+    )  # fmt: skip
+    limits = dict(lower=[-1, -np.inf, -np.inf], upper=[0.5, np.inf, 0.8])
+    actuators = fj.control.Actuators(
+        gear, gain, bias, rng.normal(size=3), **limits, activation=states
+    )
+    return [*parts, actuators, fj.JointEffort(rng.normal(size=n))]
+
+
+def back_and_forth(seed, n):
+    rng = np.random.default_rng(seed)
+    kinds = "".join(rng.choice(list("RRRPPF"), size=n - 1)) + "R"
+    arm, moves = random_linkage(kinds, rng), np.array(list(kinds)) != "F"
+    parts = everything(rng, n, servo=seed % 2)
+    forces = tuple(parts[k] for k in rng.permutation(len(parts)))
+    start = fj.State(*rng.normal(size=(2, n)))
+    again = fj.from_mjcf(fj.to_mjcf(arm, forces, start))
+    equal(again.state0, np.array(start)[:, moves], 1e-15)
+    for q, qd in rng.normal(size=(2, 2, n)) * moves:
+        expected = accelerations(arm, forces, q, qd)[moves]
+        ours = accelerations(again.linkage, again.forces, q[moves], qd[moves])
+        equal(ours / (1 + abs(expected).max()), expected / (1 + abs(expected).max()))
+        tips = fj.tip_position(arm, q), fj.tip_position(again.linkage, q[moves])
+        equal(*tips, 1e-12)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_what_is_written_is_read(seed):
+    back_and_forth(seed, n=3)
+
+
+@pytest.mark.slow
+def test_what_is_written_of_many_arms_is_read():
+    for seed in range(2, 200):
+        back_and_forth(seed, n=1 + seed % 8)
+
+
+def test_a_scene_is_written_whole():
+    scene = fj.scenes.fig7()
+    again = fj.from_mjcf(fj.to_mjcf(scene))
+    (pd,), (expected,) = again.forces, scene.forces
+    equal(again.state0, scene.state0)
+    for name in ("kp", "kd", "limit"):
+        equal(getattr(pd, name), getattr(expected, name))
+    start = lambda pd: pd.schedule(np.zeros(()), scene.linkage)
+    equal(np.array(start(pd)), np.array(start(expected)))
+
+
+def test_arms_with_fixed_pairs_come_back_as_they_were():
+    rng = np.random.default_rng(1)
+    q, qd, tau = rng.normal(size=(3, 3))
+    for kinds in product("RPF", repeat=3):
+        if "R" not in kinds:
+            continue
+        arm, moves = random_linkage("".join(kinds), rng), np.array(kinds) != "F"
+        again = fj.from_mjcf(fj.to_mjcf(arm)).linkage
+        equal(fj.tip_position(again, q[moves]), fj.tip_position(arm, q), 1e-12)
+        qdd = fj.forward_dynamics(again, q[moves], qd[moves], tau[moves])
+        equal(qdd, fj.forward_dynamics(arm, q, qd, tau)[moves], 1e-9)
+
+
 # Read
+
+NEVER = "ignore:source. contacts are left out"
+REDUNDANT = "ignore:revolute joints . and . coincide"
+
+
+def check(text, folder, states):
+    source, model = text.source(folder), text.model(folder)
+    read = lambda controls: fj.from_mjcf(source, controls=controls, **text.options)
+    drop, rng = text.options.get("drop", ()), np.random.default_rng(0)
+    error = mjcf_oracle.compare(model, read, rng, states, drop)
+    assert error <= text.tolerance, text.name
+    return model, read, drop
+
+
+# Of each style one; the slow test has them all.
+SHORT = {
+    "rail cart-pole", "reacher with a target", "opposite elbow with everything",
+    "limited joints", "integrated velocities", "dc motors with currents", "pid",
+    "slack spring", "included pole", "urdf cart-pole", "hinge before its slides",
+}  # fmt: skip
+
+
+@pytest.mark.filterwarnings(NEVER)
+@pytest.mark.parametrize("text", TEXTS, ids=lambda text: text.name)
+def test_models_are_read(text, tmp_path):
+    arm, start, forces, account = fj.from_mjcf(text.source(tmp_path), **text.options)
+    assert len(arm.mass) == text.joints == len(start.q)
+    assert str(account).count("joint ") >= text.joints
+    if text.name in SHORT:
+        check(text, tmp_path, states=4)
+
+
+def test_a_mass_off_by_a_part_in_a_thousand_is_seen():
+    text = next(text.text for text in TEXTS if text.name == "vertical xz")
+    model = mujoco.MjModel.from_xml_string(text)
+    model.body_mass[2] *= 1.001
+    read = lambda controls: fj.from_mjcf(text)
+    assert mjcf_oracle.compare(model, read, np.random.default_rng(0), 4) > 1e-5
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings(NEVER)
+@pytest.mark.parametrize("text", TEXTS, ids=lambda text: text.name)
+def test_models_move_as_in_mujoco(text, tmp_path):
+    model, read, drop = check(text, tmp_path, states=20)
+    exact = 1e-5 if "stateful" in text.features else 1e-7
+    assert mjcf_oracle.compare_motion(model, read, drop=drop) < exact
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings(NEVER)
+def test_random_models_accelerate_as_in_mujoco():
+    rng = np.random.default_rng(0)
+    for _ in range(300):
+        text, features = random_text(rng)
+        model = mujoco.MjModel.from_xml_string(text)
+        read = lambda controls, text=text: fj.from_mjcf(text, controls=controls)
+        assert mjcf_oracle.compare(model, read, rng, states=4) < 1e-11, features
+
+
+def test_models_and_specifications_are_sources_and_stay_as_they_are(tmp_path):
+    text = next(text for text in TEXTS if text.name == "opposite elbow with everything")
+    file = tmp_path / "arm.xml"
+    file.write_text(text.text)
+    model = mujoco.MjModel.from_xml_string(text.text)
+    before = model.opt.gravity.copy(), model.dof_damping.copy()
+    first = fj.from_mjcf(text.text)
+    spec = mujoco.MjSpec.from_string(text.text)
+    for source in (model, spec, str(file), file):
+        other = fj.from_mjcf(source)
+        assert eqx.tree_equal(tuple(first[:3]), tuple(other[:3]))
+    equal(model.opt.gravity, before[0])
+    equal(model.dof_damping, before[1])
+
+
+def test_numbers_of_the_account_and_of_the_elements():
+    """Of an arm whose second hinge turns against the first."""
+    arm = fj.from_mjcf(
+        """<mujoco><compiler angle="radian" autolimits="true"/><worldbody><body>
+        <joint name="a" axis="0 1 0" frictionloss=".3"/><geom size=".1" pos=".5 0 0"/>
+        <body pos="1 0 0"><joint name="b" axis="0 -1 0" range="-1 .5" stiffness="4"
+        springref=".2" armature=".1"/><geom type="capsule" fromto="0 0 0 .7 0 0"
+        size=".01" contype="0"/></body></body></worldbody>
+        <actuator><position joint="b" kp="9" kv="2" gear="3" forcerange="-4 4"/>
+        </actuator><keyframe><key qpos=".1 .2" qvel=".3 .4" ctrl=".6"/></keyframe>
+        </mujoco>"""
+    )
+    armature, spring, friction, stops, pd = arm.forces
+    equal(arm.state0, [[0.1, -0.2], [0.3, -0.4]])
+    equal(armature.inertia, [0, 0.1])
+    equal((spring.stiffness, spring.rest), [[0, 4], [0, -0.2]])
+    equal(friction.level, [0.3, 0])
+    equal((stops.lower, stops.upper), [[-np.inf, -0.5], [np.inf, 1]])
+    equal((pd.kp, pd.kd, pd.limit), [[0, 81], [0, 18], [np.inf, 12]])
+    equal(pd.reference.q, [0, -0.2])
+    equal(fj.tip_position(arm.linkage, [0, 0]), [-1.7, 0])
+    words = str(arm.account)
+    for part in ("q = -qpos", "range -0.5 to 1", "JointFriction, which creeps", "0.6"):
+        assert part in words, words
+
+
+def test_a_stop_is_about_as_stiff_as_in_mujoco():
+    text = """<mujoco><compiler autolimits="true"/><option gravity="0 0 0"/><worldbody>
+    <body><joint name="s" type="slide" axis="1 0 0" range="-1 1"
+    solreflimit=".05 1"/><geom size=".1" mass="2"/></body></worldbody>
+    <actuator><motor joint="s"/></actuator></mujoco>"""
+    model, data = in_mujoco(text)
+    arm = fj.from_mjcf(text, controls=[40])
+    data.ctrl[:], data.qpos[:] = 40, 1
+    for _ in range(2000):
+        mujoco.mj_step(model, data)
+    ours = fj.simulate(arm.linkage, fj.State([1.0], [0.0]), [0, 20.0], arm.forces)
+    np.testing.assert_allclose(ours.q[-1] - 1, data.qpos - 1, rtol=0.2)
 
 
 CART_POLE = """<mujoco><worldbody><body name="cart" pos="0 0 1">
@@ -142,101 +352,59 @@ CART_POLE = """<mujoco><worldbody><body name="cart" pos="0 0 1">
 <body name="pole" pos="0 0 .1"><joint name="hinge" axis="0 1 0" damping=".2"/>
 <geom type="capsule" fromto="0 0 0 .1 0 .6" size=".05" mass=".5"/>
 <site name="tip" pos=".1 0 .6"/></body></body></worldbody></mujoco>"""
-DOUBLE = """<mujoco><option gravity="0 0 -3"/><worldbody><body euler="0 20 0">
-<joint type="slide" axis="1 0 2"/><joint axis="0 -1 0" pos=".1 0 .1"/>
-<geom type="capsule" fromto="0 0 0 0 0 -.5" size=".05"/>
-<body pos="0 0 -.5" euler="0 30 0"><joint axis="0 -1 0" ref="20"/>
-<joint type="slide" axis="1 0 .2"/>
-<geom type="box" size=".3 .1 .2" pos=".1 0 -.1"/>
-<body pos="0 0 -.2"><geom size=".1" mass="2"/></body>
-<site name="tip" pos="0 0 -.4"/></body></body></worldbody></mujoco>"""
 
 
 def with_option(option):
     return CART_POLE.replace("<mujoco>", f"<mujoco><option {option}</option>")
 
 
-@pytest.mark.parametrize("text", [CART_POLE, DOUBLE])
-def test_accelerations_and_tips_of_an_arm_read_equal_mujoco(text):
-    model, data = in_mujoco(text)
-    linkage, forces = fj.from_mjcf(text)
-    rng = np.random.default_rng(0)
-    tips, ours = [], []
-    for _ in range(4):
-        data.qpos, data.qvel = q, qd = rng.normal(size=(2, model.nq))
-        mujoco.mj_forward(model, data)
-        tau = sum((force(0.0, q, qd, linkage) for force in forces), np.zeros(len(q)))
-        inertial = tuple(f for f in forces if isinstance(f, fj.forces.Armature))
-        equal(fj.forward_dynamics(linkage, q, qd, tau, inertial), data.qacc, 1e-9)
-        tips.append(data.site("tip").xpos.copy())
-        ours.append(fj.tip_position(linkage, q))
-    apart = [np.linalg.norm(np.diff(places, axis=0), axis=1) for places in (tips, ours)]
-    np.testing.assert_allclose(*apart, atol=1e-12)
-
-
-def test_arms_with_fixed_pairs_come_back_as_they_were():
-    rng = np.random.default_rng(1)
-    q, qd, tau = rng.normal(size=(3, 3))
-    for kinds in product("RPF", repeat=3):
-        if "R" not in kinds:  # a chain without a hinge is refused
-            continue
-        arm, moves = random_linkage("".join(kinds), rng), np.array(kinds) != "F"
-        again, _ = fj.from_mjcf(fj.to_mjcf(arm))
-        equal(fj.tip_position(again, q[moves]), fj.tip_position(arm, q), 1e-12)
-        qdd = fj.forward_dynamics(again, q[moves], qd[moves], tau[moves])
-        equal(qdd, fj.forward_dynamics(arm, q, qd, tau)[moves], 1e-9)
-
-
 def test_options_of_a_model():
-    assert fj.from_mjcf(with_option('gravity="0 5 -2">'))[0].gravity == 2
-    assert fj.from_mjcf(with_option('><flag gravity="disable"/>'))[0].gravity == 0
+    assert fj.from_mjcf(with_option('gravity="0 5 -2">')).linkage.gravity == 2
+    assert fj.from_mjcf(with_option('><flag gravity="disable"/>')).linkage.gravity == 0
     newer = "mjDSBL_DAMPER" in mujoco.mjtDisableBit.__members__
     flag = f'><flag {"damper" if newer else "passive"}="{{}}"/>'
     for state, count in (("enable", 1), ("disable", 0)):
-        _, forces = fj.from_mjcf(with_option(flag.format(state)))
+        forces = fj.from_mjcf(with_option(flag.format(state))).forces
         assert [type(force) for force in forces].count(fj.JointDamper) == count
 
 
 BODY = '<body><joint axis="0 1 0"{}/><geom size=".1"/>{}</body>'
 PLAIN, WORLD = BODY.format("", ""), "<mujoco><compiler autolimits='true'/><worldbody>"
 UNREAD = {
-    BODY.format(' stiffness="1"', ""): "joint 0 with a spring",
-    BODY.format("", PLAIN.replace("1 0", "-1 0")): "reverse it",
-    9 * PLAIN[: PLAIN.index("</")] + 9 * "</body>": "9 joints",
-    BODY.format(' range="-1 1"', ""): "joint 0 with a range",
-    BODY.format(' frictionloss="1"', ""): "joint 0 with friction",
-    '<body><freejoint name="f"/><geom size=".1"/></body>': "joint f, which is",
-    PLAIN * 2: "several chains",
-    BODY.format("", PLAIN * 2): "body 3 on a branch",
-    BODY.format("", PLAIN.replace("0 1 0", "0 0 1")): "of joint 1",
-    '<body><joint type="slide"/><geom size=".1"/></body>': "no hinge",
-    f'</worldbody><option density="1"/><worldbody>{PLAIN}': "a fluid .density",
-    f'</worldbody><option viscosity="1"/><worldbody>{PLAIN}': "a fluid .viscos",
-    PLAIN.replace("<body", '<body gravcomp=".5"'): "body 1 with gravcomp",
-    "<nothing/>": "a MuJoCo model",
+    '<geom size=".1"/>': "without joints",
+    PLAIN.replace("<body", '<body gravcomp=".5"'): "body 1 with compensated gravity",
+    "<nothing/>": "a model that MuJoCo accepts",
 }
 if hasattr(mujoco.MjModel, "dof_dampingpoly"):
     UNREAD[BODY.format(' damping="1 2"', "")] = "joint 0 with nonlinear damping"
     UNREAD[BODY.format(' stiffness="0 2"', "")] = "joint 0 with a nonlinear spring"
 
 
-def test_what_is_no_planar_chain_is_refused_by_name():
+def test_what_is_no_planar_chain_is_refused_by_name(tmp_path):
     for inside, words in UNREAD.items():
-        with pytest.raises(ValueError, match=f"^text: expected.*{words}"):
+        with pytest.raises(ValueError, match=f"^source: expected.*{words}"):
             fj.from_mjcf(f"{WORLD}{inside}</worldbody></mujoco>")
-    site, pole = '<site name="tip" pos=".1 0 .6"/>', '<body name="pole"'
-    on_cart = CART_POLE.replace(site, "").replace(pole, site + pole)
-    tilted = lambda axis: CART_POLE.replace('axis="1 0 0"', f'axis="{axis}"')
-    for text, words in (
-        (on_cart, "the site tip on .* body cart"),
-        (tilted("1 4e-6 0"), "slider in the plane, got one 4e-06 rad off"),
-        (tilted("1 .3 0"), "slider in the plane, got one 0.29 rad off"),
-        (Path("arm.xml"), "the XML text of a model, not a .*arm.xml.*$"),
-        ("arm.xml", "the XML text of a model, not a .*'arm.xml'.$"),
-        ("<arm", "a MuJoCo model in XML: XML parse error .*[^\\n]$"),
+    for case in REFUSED:
+        with pytest.raises(ValueError, match=f"^source: expected .*({case.words})"):
+            fj.from_mjcf(case.text)
+    (tmp_path / "empty.xml").write_text("")
+    for source, words in (
+        ("arm.xml", "an XML text, the path .* 'arm.xml'.$"),
+        (tmp_path, "and the file to be there"),
+        (tmp_path / "empty.xml", "a model that MuJoCo accepts"),
+        (12, "an XML text, the path"),
+        ("<arm", "a model in XML: .*[^\\n]$"),
+        ("<a>" * 9999, "a model in XML: .{,200}$"),
     ):
-        with pytest.raises(ValueError, match=f"^text: expected .*{words}"):
-            fj.from_mjcf(text)
+        with pytest.raises(ValueError, match=f"^source: expected .*{words}"):
+            fj.from_mjcf(source)
+    for name, keywords in {
+        "drop: expected kinds among": dict(drop=("wheels",)),
+        "tip: expected one of the sites": dict(tip="nose"),
+        "controls: expected an array of 0": dict(controls=[1]),
+    }.items():
+        with pytest.raises(ValueError, match=name):
+            fj.from_mjcf(CART_POLE, **keywords)
 
 
 @pytest.mark.parametrize(
@@ -255,24 +423,55 @@ def test_what_is_no_planar_chain_is_refused_by_name():
     ],
 )
 @pytest.mark.parametrize("welded", ["", "b"])
-def test_contacts_are_left_out_with_a_warning(inside, welded):
+@pytest.mark.filterwarnings(REDUNDANT)
+def test_contacts_are_refused_at_the_start_and_told_where_they_may_come(inside, welded):
+    geom = '<geom name="of {0}" size=".5"/>'
+    body = f'<body name="{{0}}" pos="{{2}} 0 {{2}}">{{1}}{geom}{{3}}</body>'
+    hinge = '<joint axis="0 1 0"/>'
+
+    def chain(distance):
+        bodies = ""
+        for name in "cba":
+            joint = "" if name == welded else hinge
+            bodies = body.format(name, joint, distance, bodies)
+        return f"<mujoco>{inside}<worldbody>{bodies}</worldbody></mujoco>"
+
     # All geoms overlap, so that MuJoCo reports the contacts that it lets happen.
-    body = '<body name="{0}">{1}<geom name="of {0}" size="5"/>{2}</body>'
-    hinge, chain = '<joint axis="0 1 0"/>', ""
-    for name in "cba":
-        chain = body.format(name, "" if name == welded else hinge, chain)
-    text = f"<mujoco>{inside}<worldbody>{chain}</worldbody></mujoco>"
-    model, data = in_mujoco(text)
+    model, data = in_mujoco(chain(0))
     mujoco.mj_forward(model, data)
+    if data.ncon:
+        with pytest.raises(ValueError, match="a contact; drop=.'contacts',"):
+            fj.from_mjcf(chain(0))
+    apart = chain(0 if 'size="9"' in inside else 9)
+    drop = ("contacts",) if 'size="9"' in inside else ()
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        fj.from_mjcf(text)
+        account = str(fj.from_mjcf(apart, drop=drop).account)
     about = [w for w in caught if "contacts are left out" in str(w.message)]
-    assert len(about) == (data.ncon > 0)
+    assert len(about) == (data.ncon > 0 and not drop)
     assert all(w.filename == __file__ for w in about)
+    assert ("contact" in account) == (data.ncon > 0)
 
 
-def test_the_first_link_may_collide_with_the_ground():
-    ground = '<geom type="plane" size="9 9 9"/>'
-    with pytest.warns(UserWarning, match="contacts are left out, but bodies world and"):
-        fj.from_mjcf(f"{WORLD}{ground}{PLAIN}</worldbody></mujoco>")
+PACKAGES = {
+    "gymnasium": ("envs/mujoco/assets",
+        ("inverted_pendulum", "inverted_double_pendulum", "reacher", "hopper")),
+    "dm_control": ("suite", ("cartpole", "acrobot", "pendulum", "hopper")),
+}  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings(NEVER)
+@pytest.mark.parametrize("package", PACKAGES)
+def test_models_of_other_packages_move_as_in_mujoco(package):
+    spec = importlib.util.find_spec(package)
+    if spec is None or spec.origin is None:
+        pytest.skip(f"{package} is not installed")
+    (folder, names), drop = PACKAGES[package], ("contacts", "fluid")
+    for name in names:
+        path = Path(spec.origin).parent / folder / f"{name}.xml"
+        model = mujoco.MjModel.from_xml_path(str(path))
+        read = lambda controls, p=path: fj.from_mjcf(p, controls=controls, drop=drop)
+        rng = np.random.default_rng(0)
+        assert mjcf_oracle.compare(model, read, rng, 10, drop) < 1e-11, name
+        assert mjcf_oracle.compare_motion(model, read, 0.5, drop=drop) < 1e-6, name

@@ -12,7 +12,8 @@ Rows = Sequence[Sequence[str]]
 class Report(eqx.Module):
     """A result that prints itself: a verdict, a table, and remarks.
 
-    The first row of a table is its header. Columns without one hold words.
+    The first row of a table is its header. Columns without one hold words; an empty
+    header is left out.
     """
 
     def _verdict(self) -> list[str]:
@@ -35,6 +36,7 @@ class Report(eqx.Module):
             for lines in (self._verdict(), self._remarks())
         )
         header, *rows = self._rows() or [[]]
+        header = header if any(header) else []
         return above + (html_table(rows, header) if rows else "") + below
 
 
@@ -50,7 +52,7 @@ def _lines(rows: Rows) -> list[str]:
         )
         return "  ".join(cells).rstrip()
 
-    return [line(row) for row in rows]
+    return [line(row) for row in rows if row is not rows[0] or any(row)]
 
 
 def html_table(rows: Iterable[Iterable[str]], header: Iterable[str] = ()) -> str:

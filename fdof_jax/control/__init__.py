@@ -1,12 +1,14 @@
 """Controllers, feedforward and drives."""
 
+from .actuators import Activation, Actuators
 from .drives import DCMotor, FirstOrderLag, PIDController, SpeedLimit
 from .model_based import ComputedTorque, GravityFeedforward
 from .pd import PDController, gains_from_frequency
 
 __all__ = [
-    "ComputedTorque", "DCMotor", "FirstOrderLag", "gains_from_frequency",
-    "GravityFeedforward", "PDController", "PIDController", "SpeedLimit",
+    "Activation", "Actuators", "ComputedTorque", "DCMotor", "FirstOrderLag",
+    "gains_from_frequency", "GravityFeedforward", "PDController", "PIDController",
+    "SpeedLimit",
 ]  # fmt: skip
 
 

@@ -1,11 +1,13 @@
 """Tables of motions, files of pytrees, and export to other engines."""
 
 from .files import load, save
-from .mjcf import from_mjcf, to_mjcf
+from .mjcf_reading import Account, MjcfModel, from_mjcf
+from .mjcf_writing import to_mjcf
 from .tables import to_pandas, to_xarray
 
 __all__ = [
-    "from_mjcf", "load", "save", "to_mjcf", "to_pandas", "to_xarray",
+    "Account", "from_mjcf", "load", "MjcfModel", "save", "to_mjcf", "to_pandas",
+    "to_xarray",
 ]  # fmt: skip
 
 

@@ -2,12 +2,13 @@
 
 from .paths import Ellipse, FigureEight, Line, Path, Spline
 from .reference import Reference, reachable
-from .task import CircleTask, JointMove, TipTask
+from .task import CircleTask, JointMove, SetPoint, TipTask
 from .timing import Laps, Travel, shock_against
 
 __all__ = [
     "CircleTask", "Ellipse", "FigureEight", "JointMove", "Laps", "Line", "Path",
-    "reachable", "Reference", "shock_against", "Spline", "TipTask", "Travel",
+    "reachable", "Reference", "SetPoint", "shock_against", "Spline", "TipTask",
+    "Travel",
 ]  # fmt: skip
 
 

@@ -15,7 +15,7 @@ from ..base.known_values import at_once, in_numpy
 from ..base.trigonometry import sincos
 from ..linkage.fields import Condition, Values, called, default, field, of_kind
 from ..linkage.frames import cross, dot, plane_vector, plane_vectors
-from ..linkage.linkage import Linkage
+from ..linkage.linkage import Linkage, joints_of
 from ..mechanics.inverse_kinematics import (
     arm_of,
     check_moving_joints,
@@ -54,6 +54,31 @@ class JointMove(Reference):
     def assembly(self, t: Array, linkage: Linkage) -> tuple[Array, float]:
         """Joint positions, and 1 as the root: a joint move has no edge of a reach."""
         return self.start + self.travel(t) * (self.end - self.start), 1.0
+
+
+class SetPoint(Reference):
+    """A constant demand: positions to hold, and velocities if there are any.
+
+    **Arguments:** one per joint, or one for all.
+
+    - `q`: [m or rad].
+    - `qd`: by default 0 [m/s or rad/s]. Servos take it beside `q`.
+
+    **Raises:** ValueError for malformed arguments.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig5().linkage
+    >>> hold = fj.PDController(100, 10, 30, fj.references.SetPoint([0.1, 0.2, 0.3]))
+    >>> hold(0.0, [0, 0, 0], [0, 0, 0], arm).tolist()
+    [10.0, 20.0, 30.0]
+    """
+
+    q: Values = field(unit="m or rad")
+    qd: Values = field(unit="m/s or rad/s", default=0.0)
+
+    def __call__(self, t, linkage):
+        joints = (joints_of(linkage),)
+        return jnp.broadcast_to(self.q, joints), jnp.broadcast_to(self.qd, joints)
 
 
 def angle_between(a: Array, b: Array) -> Array:

@@ -1,0 +1,141 @@
+"""Actuators as simulators and data sheets describe them: affine laws with limits."""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from ..base.checks import JOINT
+from ..forces.element import StatefulElement
+from ..forces.switches import clip, switch
+from ..linkage.fields import Condition, Part, Values, field, value_of
+
+
+class Activation(Part):
+    """States s of `Actuators`, one each: a lag, an integrator, a current.
+
+    A state adds gain * s to the force, and ds/dt = rate . (control, s, length, speed),
+    which becomes 0 where it would leave [lower, upper].
+
+    **Arguments:** per actuator, in units that the control and the state decide.
+
+    - `gain`: (actuator,) [N or N m per unit of s]; `start`: s at the start (actuator,).
+    - `rate`: (actuator, 4).
+    - `lower`, `upper`: (actuator,); by default infinite.
+
+    **Raises:** ValueError for malformed arguments.
+
+    >>> import fdof_jax as fj
+    >>> lag = fj.control.Activation(gain=[10], rate=[[20, -20, 0, 0]], start=[0])
+    >>> lagging = dict(gain=[[0, 0, 0]], bias=[[0, 0, 0]], activation=lag)
+    >>> motor = fj.control.Actuators([[1, 0]], control=[0.5], **lagging)
+    >>> arm = fj.scenes.two_link_circle().linkage
+    >>> motor(0.0, [0, 0], [0, 0], arm, motor.initial_state(arm))[1].tolist()
+    [10.0]
+    """
+
+    gain: Values = field((None,), unit="N or N m per unit of the state")
+    rate: Values = field((None, 4), unit="1/s and others")
+    start: Values = field((None,), unit="that of the state")
+    lower: Values | None = field(
+        (None,), unit="that of the state", finite=False, optional=True, default=None
+    )
+    upper: Values | None = field(
+        (None,), unit="that of the state", finite=False, optional=True, default=None
+    )
+
+    def conditions(self):
+        values = self.gain, self.rate, self.start, self.lower, self.upper
+        sizes = [len(value) for value in values if value is not None]
+        alike = len(set(sizes)) == 1
+        yield Condition(alike, "gain", "as many actuators in all fields", tuple(sizes))
+
+
+class Actuators(StatefulElement):
+    """Motors and servos that act on joints through gears, with limits of their own.
+
+    An actuator's length is gear . q, its speed gear . qd, and its force
+
+        (gain . (1, length, speed)) control + bias . (1, length, speed)
+
+    clipped to [lower, upper]. The joints feel gear^T force, clipped to
+    [effort_lower, effort_upper]. These are the general actuators of MuJoCo, as
+    `from_mjcf` reads them. A `PDController` is simpler where it will do, and `tune` can
+    change it.
+
+    **Arguments:** per actuator, in the units of its control.
+
+    - `gear`: (actuator, joint), ratios of length to joint positions.
+    - `gain`, `bias`: (actuator, 3).
+    - `control`: (actuator,), or a function of time that returns it.
+    - `lower`, `upper`: (actuator,) [N or N m]; by default infinite.
+    - `effort_lower`, `effort_upper`: per joint [N or N m]; by default infinite.
+    - `activation`: an `Activation`; by default the actuators have no states.
+
+    **Raises:** ValueError for malformed arguments.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.two_link_circle().linkage
+    >>> law = dict(gain=[[8, 0, 0]], bias=[[0, -8, -2]])  # kp = 8, kv = 2
+    >>> servo = fj.control.Actuators([[0, 1]], **law, control=[0.5], upper=[3])
+    >>> efforts, _ = servo(0.0, [0.0, 0.0], [0.0, 0.1], arm, ())
+    >>> efforts.tolist()
+    [0.0, 3.0]
+    """
+
+    gear: Values = field((None, JOINT), unit="1, m or 1/m")
+    gain: Values = field((None, 3), unit="N or N m per unit of the control")
+    bias: Values = field((None, 3), unit="N or N m")
+    control: Any = field((None,), unit="that of the actuator", function=True)
+    lower: Values | None = field(
+        (None,), unit="N or N m", finite=False, optional=True, default=None
+    )
+    upper: Values | None = field(
+        (None,), unit="N or N m", finite=False, optional=True, default=None
+    )
+    effort_lower: Values | None = field(
+        (JOINT,), unit="N or N m", finite=False, optional=True, default=None
+    )
+    effort_upper: Values | None = field(
+        (JOINT,), unit="N or N m", finite=False, optional=True, default=None
+    )
+    activation: Activation | None = None
+
+    def conditions(self):
+        fixed = () if callable(self.control) else (self.control,)
+        states = () if self.activation is None else (self.activation.gain,)
+        values = self.gear, self.gain, self.bias, self.lower, self.upper
+        sizes = [len(v) for v in (*values, *fixed, *states) if v is not None]
+        alike = len(set(sizes)) == 1
+        yield Condition(alike, "gear", "as many actuators in all fields", tuple(sizes))
+
+    def initial_state(self, linkage):
+        """The activations' states at the start, (actuator,); () without."""
+        return () if self.activation is None else self.activation.start
+
+    def __call__(self, t, q, qd, linkage, state):
+        length, speed = (self.gear @ jnp.asarray(values) for values in (q, qd))
+        control = value_of(self, "control", t)
+        affine = lambda rows: rows[:, 0] + rows[:, 1] * length + rows[:, 2] * speed
+        force, rate = affine(self.gain) * control + affine(self.bias), ()
+        if (own := self.activation) is not None:
+            force = force + own.gain * state
+            signals = jnp.stack([control, state, length, speed], axis=1)
+            rate = jnp.sum(own.rate * signals, axis=1)
+            if own.upper is not None:
+                rate = switch(state - own.upper, jnp.minimum(rate, 0), rate)
+            if own.lower is not None:
+                rate = switch(own.lower - state, jnp.maximum(rate, 0), rate)
+        efforts = self.gear.T @ _within(force, self.lower, self.upper)
+        return _within(efforts, self.effort_lower, self.effort_upper), rate
+
+
+def _within(values: Any, lower: Any, upper: Any) -> Any:
+    """Clips to the limits that there are."""
+    if lower is None and upper is None:
+        return values
+    low, high = (
+        default if limit is None else limit
+        for limit, default in ((lower, -np.inf), (upper, np.inf))
+    )
+    return clip(values, low, high)

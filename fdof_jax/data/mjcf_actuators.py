@@ -1,0 +1,317 @@
+"""Actuators of a MuJoCo model: their laws, and the elements that act alike."""
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..base.checks import real_array
+from ..control.actuators import Activation, Actuators
+from ..control.pd import PDController
+from ..forces.joints import JointEffort
+from ..references.task import SetPoint
+from .mjcf_chain import Reader, name_of, path_of_tendon
+
+
+class _Affine(NamedTuple):
+    """A law constant + length * actuator's length + speed * its speed."""
+
+    constant: float = 0.0
+    length: float = 0.0
+    speed: float = 0.0
+
+
+class _OwnState(NamedTuple):
+    """An actuator's state, in the terms of `Activation`."""
+
+    gain: float
+    rate: tuple[float, ...]
+    start: float = 0.0
+    lower: float = -np.inf
+    upper: float = np.inf
+
+
+class _Law(NamedTuple):
+    gain: _Affine
+    bias: _Affine
+    state: _OwnState | None = None
+
+
+class _Row(NamedTuple):
+    """An actuator, in the terms of `Actuators`."""
+
+    name: str
+    gear: np.ndarray  # (n,)
+    control: float
+    lower: float
+    upper: float
+    gain: _Affine
+    bias: _Affine
+    state: _OwnState | None
+
+    @property
+    def joint(self) -> int:
+        """The joint that it acts on most."""
+        return int(np.argmax(abs(self.gear)))
+
+
+def _gear(read: Reader, actuator: int) -> np.ndarray | None:
+    """Ratios of an actuator to the joint positions q; None if it acts elsewhere."""
+    model, chain, kinds = read.model, read.chain, read.mujoco.mjtTrn
+    target = model.actuator_trnid[actuator, 0]
+    kind = kinds(int(model.actuator_trntype[actuator]))
+    coefficients = np.zeros(model.njnt)
+    if kind in (kinds.mjTRN_JOINT, kinds.mjTRN_JOINTINPARENT):
+        coefficients[target] = 1
+    elif kind == kinds.mjTRN_TENDON:
+        wraps = path_of_tendon(model, target)
+        if (model.wrap_type[wraps] != int(read.mujoco.mjtWrap.mjWRAP_JOINT)).any():
+            return None
+        np.add.at(coefficients, model.wrap_objid[wraps], model.wrap_prm[wraps])
+    else:
+        return None
+    beside = np.delete(coefficients, chain.joints)
+    here = coefficients[chain.joints] * chain.signs
+    if here.any() and beside.any():
+        return None
+    return here * model.actuator_gear[actuator, 0]
+
+
+def inertias_of_actuators(read: Reader) -> Iterator[tuple[np.ndarray, Any]]:
+    """Yields gears and (damping, armature) of actuators, in newer versions."""
+    model = read.model
+    if not hasattr(model, "actuator_armature"):
+        return
+    for actuator in range(len(model.actuator_trntype)):
+        values = model.actuator_damping[actuator], model.actuator_armature[actuator]
+        poly = getattr(model, "actuator_dampingpoly", None)
+        bent = poly is not None and np.any(poly[actuator])
+        if not any(values) and not bent:
+            continue
+        name = f"actuator {name_of(model, 'actuator', actuator)}"
+        gear = _gear(read, actuator)
+        if bent or gear is None or np.count_nonzero(gear) > 1:
+            read.leave("actuators", name, "damping or armature that joints do not have")
+        else:
+            yield gear, values
+
+
+def actuators(read: Reader, controls: Any, drop: tuple[str, ...]) -> list[Any]:
+    """The actuators: PD controllers and efforts where these will do, or `Actuators`."""
+    model, chain = read.model, read.chain
+    count = len(model.actuator_trntype)
+    if controls is None:
+        controls = model.key_ctrl[0] if model.nkey else np.zeros(model.nu)
+    controls = np.array(real_array("controls", controls, (model.nu,)))
+    limited = np.asarray(model.actuator_ctrllimited).astype(bool).ravel()
+    if limited.size == model.nu and not read.disabled("CLAMPCTRL"):
+        ends = np.asarray(model.actuator_ctrlrange).reshape(model.nu, 2)
+        controls = np.where(limited, np.clip(controls, *ends.T), controls)
+    states = model.key_act[0] if model.nkey else np.zeros(model.na)
+    rows = []
+    for actuator in range(count):
+        name = name_of(model, "actuator", actuator)
+        group = int(model.actuator_group[actuator])
+        off = 0 <= group < 31 and model.opt.disableactuator & (1 << group)
+        if off or read.disabled("ACTUATION"):
+            read.note(f"actuator {name}", "left out, switched off")
+            continue
+        if "actuators" in drop:
+            read.note(f"actuator {name}", "left out, as asked")
+            continue
+        gear = _gear(read, actuator)
+        if gear is None:
+            kind = read.mujoco.mjtTrn(int(model.actuator_trntype[actuator]))
+            what = f"a transmission ({kind.name[6:].lower()}) beyond the chain's joints"
+            read.leave("actuators", f"actuator {name}", what)
+        elif not gear.any():
+            read.note(
+                f"actuator {name}", "left out, as it acts on nothing of the chain"
+            )
+        else:
+            law = _law(read, actuator, controls, states)
+            if isinstance(law, str):
+                read.leave("actuators", f"actuator {name}", law)
+                continue
+            lower, upper = -np.inf, np.inf
+            if model.actuator_forcelimited[actuator]:
+                lower, upper = map(float, model.actuator_forcerange[actuator])
+            control = float(controls[_places(model, actuator)[0]])
+            rows.append(_Row(name, gear, control, lower, upper, *law))
+    effort_limited = model.jnt_actfrclimited[chain.joints].astype(bool)
+    ends = model.jnt_actfrcrange[chain.joints] * chain.signs[:, None]
+    lower = np.where(effort_limited, ends.min(axis=1), -np.inf)
+    upper = np.where(effort_limited, ends.max(axis=1), np.inf)
+    if not rows:
+        return []
+    forces = _simple(rows, lower, upper)
+    if forces is None:
+        forces = [_general(rows, lower, upper)]
+    kinds = " and ".join(type(force).__name__ for force in forces)
+    for row in rows:
+        if len(forces) > 1:
+            servo = row.bias.length or row.bias.speed
+            kinds = "PDController" if servo else "JointEffort"
+        read.note(f"actuator {row.name}", f"{kinds}, at a control of {row.control:.4g}")
+    return forces
+
+
+def _places(model: Any, actuator: int) -> range:
+    """Where the controls of an actuator are; newer versions have several of one."""
+    if not hasattr(model, "actuator_ctrladr"):
+        return range(actuator, actuator + 1)
+    first = int(model.actuator_ctrladr[actuator])
+    return range(first, first + int(model.actuator_ctrlnum[actuator]))
+
+
+def _law(read: Reader, actuator: int, controls: Any, states: Any) -> _Law | str:
+    """The law of an actuator, or what it has that `Actuators` do not."""
+    model, mujoco = read.model, read.mujoco
+    kind = lambda names, value: names(int(value)).name.rpartition("_")[2]
+    dynamics = kind(mujoco.mjtDyn, model.actuator_dyntype[actuator])
+    gain_kind = kind(mujoco.mjtGain, model.actuator_gaintype[actuator])
+    bias_kind = kind(mujoco.mjtBias, model.actuator_biastype[actuator])
+    if model.actuator_plugin[actuator] >= 0:
+        return "a plugin"
+    if hasattr(model, "actuator_delay") and model.actuator_delay[actuator]:
+        return "a delay"
+    dynprm, gainprm, biasprm = (
+        array[actuator].tolist()
+        for array in (
+            model.actuator_dynprm,
+            model.actuator_gainprm,
+            model.actuator_biasprm,
+        )
+    )
+    state = _OwnState(0.0, (0.0,) * 4)
+    if (place := model.actuator_actadr[actuator]) >= 0:
+        state = state._replace(start=float(states[place]))
+        if model.actuator_actlimited[actuator]:
+            lower, upper = map(float, model.actuator_actrange[actuator])
+            state = state._replace(lower=lower, upper=upper)
+    if gain_kind == "DCMOTOR":
+        return _dc_motor(dynprm, gainprm, biasprm, state)
+    bias = _Affine(*biasprm[:3]) if bias_kind == "AFFINE" else _Affine()
+    if gain_kind == "PID":
+        given = [float(controls[k]) for k in _places(model, actuator)]
+        inputs = int(model.actuator_ctrlspec[actuator])
+        own = state if dynamics == "PID" else None
+        return _pid(dynprm, gainprm, bias, own, given, inputs)
+    if gain_kind not in ("FIXED", "AFFINE") or bias_kind not in ("NONE", "AFFINE"):
+        return f"a law of the kind {gain_kind.lower()}"
+    gain = _Affine(*gainprm[: 3 if gain_kind == "AFFINE" else 1])
+    if dynamics == "NONE":
+        return _Law(gain, bias)
+    if dynamics not in ("INTEGRATOR", "FILTER", "FILTEREXACT") or any(gain[1:]):
+        return f"dynamics of the kind {dynamics.lower()}"
+    rate = 1 / max(dynprm[0], 1e-15)
+    rates = (1.0, 0.0) if dynamics == "INTEGRATOR" else (rate, -rate)
+    own = state._replace(gain=gain.constant, rate=(*rates, 0.0, 0.0))
+    return _Law(_Affine(), bias, own)
+
+
+def _pid(
+    dynprm: list[float], gainprm: list[float], bias: _Affine, state: _OwnState | None,
+    given: list[float], inputs: int,
+) -> _Law | str:  # fmt: skip
+    """A PID controller: its own state is the integral of the position's error."""
+    limit, slew, *_ = dynprm
+    if slew > 0:
+        return "a limit of the slew rate"
+    # The inputs are bits: a position, a velocity and an effort, in this order.
+    if not inputs & 1:
+        return "no position among the inputs of its controller"
+    target = dict(zip([bit for bit in (1, 2, 4) if inputs & bit], given))
+    known = -bias.speed * target.get(2, 0.0) + target.get(4, 0.0)
+    law = _Law(_Affine(-bias.length), bias._replace(constant=known))
+    if state is None:
+        return law
+    state = state._replace(gain=gainprm[0], rate=(1.0, 0.0, -1.0, 0.0))
+    if limit > 0:
+        state = state._replace(lower=-limit, upper=limit)
+    return law._replace(state=state)
+
+
+def _dc_motor(
+    dynprm: list[float], gainprm: list[float], biasprm: list[float], state: _OwnState
+) -> _Law | str:
+    """A DC motor: with inductance, its own state is the current."""
+    resistance, constant, *others = gainprm
+    time, *more = dynprm  # of the winding [s]
+    if any(others) or any(more) or any(biasprm):
+        return "a DC motor with more than winding, constant and inductance"
+    if time == 0:
+        drag = constant**2 / resistance
+        return _Law(_Affine(constant / resistance), _Affine(speed=-drag))
+    inductance = time * resistance
+    rate = 1 / inductance, -1 / time, 0.0, -constant / inductance
+    return _Law(_Affine(), _Affine(), state._replace(gain=constant, rate=rate))
+
+
+def _general(rows: list[_Row], lower: np.ndarray, upper: np.ndarray) -> Actuators:
+    column = lambda name: np.array([getattr(row, name) for row in rows])
+    finite = lambda values: values if np.isfinite(values).any() else None
+    activation = None
+    if any(row.state for row in rows):
+        none = _OwnState(0.0, (0.0,) * 4)
+        gain, rate, start, low, high = zip(*(row.state or none for row in rows))
+        ends = finite(np.array(low)), finite(np.array(high))
+        activation = Activation(gain, rate, start, *ends)
+    return Actuators(
+        gear=column("gear"),
+        gain=column("gain"),
+        bias=column("bias"),
+        control=column("control"),
+        lower=finite(column("lower")),
+        upper=finite(column("upper")),
+        effort_lower=finite(lower),
+        effort_upper=finite(upper),
+        activation=activation,
+    )
+
+
+def _simple(rows: list[_Row], lower: np.ndarray, upper: np.ndarray) -> list[Any] | None:
+    """The actuators as efforts and a PD controller, or None where these will not do."""
+    count = len(lower)
+    kp, kd, effort = np.zeros(count), np.zeros(count), np.zeros(count)
+    at, speed = np.zeros(count), np.zeros(count)
+    limit = np.full(count, np.inf)
+    servos, motors = (
+        [row for row in rows if bool(row.bias.length or row.bias.speed) == servo]
+        for servo in (True, False)
+    )
+    for row in rows:
+        if np.count_nonzero(row.gear) > 1 or row.state or any(row.gain[1:]):
+            return None
+    for row in servos:
+        k, gear = row.joint, float(row.gear[row.joint])
+        several = sum(other.joint == k for other in servos) > 1
+        bounded = np.isfinite([row.lower, row.upper]).any()
+        if bounded and (several or row.lower != -row.upper):
+            return None
+        if bounded:
+            limit[k] = min(limit[k], abs(gear) * row.upper)
+        if any(other.joint == k for other in motors) and np.isfinite(upper[k]):
+            return None
+        kp[k] -= gear**2 * row.bias.length
+        kd[k] -= gear**2 * row.bias.speed
+        push = gear * (row.gain.constant * row.control + row.bias.constant)
+        (at if row.bias.length else speed)[k] += push
+    for row in motors:
+        push = np.clip(
+            row.gain.constant * row.control + row.bias.constant, row.lower, row.upper
+        )
+        effort[row.joint] += row.gear[row.joint] * push
+    if (kp < 0).any() or (kd < 0).any() or (lower != -upper).any():
+        return None
+    driven = np.isin(np.arange(count), [row.joint for row in servos])
+    effort = np.where(driven, effort, np.clip(effort, lower, upper))
+    forces: list[Any] = []
+    if servos:
+        limit = np.where(driven, np.minimum(limit, upper), np.inf)
+        target = np.divide(at, kp, out=np.zeros(count), where=kp > 0)
+        rate = np.divide(speed, kd, out=np.zeros(count), where=kd > 0)
+        forces.append(PDController(kp, kd, limit, SetPoint(target, rate)))
+    if motors:
+        forces.append(JointEffort(effort))
+    return forces

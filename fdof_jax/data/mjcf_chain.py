@@ -1,0 +1,301 @@
+"""The planar chain in a MuJoCo model: its joints, its plane, its links and its tip."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..base.checks import refusal
+from ..base.user_warnings import without_warning
+from ..linkage.linkage import Linkage
+from ..linkage.topology import MOST_PAIRS
+
+SLIDE, HINGE = 2, 3  # MuJoCo's mjtJoint
+_EXACT = 1e-9  # what is as far out of the plane is taken for rounding
+_FLAT = 1e-5  # and what is as far [rad] is laid into the plane, with a remark
+_TIPS = ("tip", "ee", "tool", "hand", "end_effector")
+
+
+class Chain(NamedTuple):
+    """Where a model's chain is, and what its plane is.
+
+    - `joints`: their ids; `names`, `places` (in qpos) and `rates` (in qvel), (n,).
+    - `links`: by body: 0 for the ground, 1, 2, ... for the link that it belongs to, -1
+      for what is beside the chain.
+    - `signs`: (n,), -1 for hinges that turn against the first; q = signs * qpos.
+    - `right`, `up`, `normal`: unit vectors; `gravity` [m/s^2] points against `up`.
+    - `starts`: characteristic points of ground and links, (n + 1,); `turns`: angles
+      [rad], both at qpos = 0.
+    """
+
+    joints: np.ndarray
+    names: list[str]
+    places: np.ndarray
+    rates: np.ndarray
+    links: np.ndarray
+    signs: np.ndarray
+    right: np.ndarray
+    up: np.ndarray
+    normal: np.ndarray
+    gravity: float
+    starts: np.ndarray
+    turns: np.ndarray
+
+    def plane(self, vector: Any) -> complex:
+        """A vector's components to the right and upwards."""
+        return complex(vector @ self.right, vector @ self.up)
+
+
+def name_of(model: Any, kind: str, index: Any) -> str:
+    """The name of a part, such as a body, or its number."""
+    return getattr(model, kind)(int(index)).name or str(int(index))
+
+
+def switched_off(mujoco: Any, model: Any, *names: str) -> bool:
+    """Whether a flag of the model, under one of its names, switches something off."""
+    flags = mujoco.mjtDisableBit.__members__  # some only in older or newer versions
+    bits = [int(flags[f"mjDSBL_{n}"]) for n in names if f"mjDSBL_{n}" in flags]
+    return any(model.opt.disableflags & bit for bit in bits)
+
+
+class Reader(NamedTuple):
+    """What the readers of elements need.
+
+    `leave(kind, part, what)`: notes what is left out, or raises ValueError unless that
+    kind is to be dropped; `note(part, words)`: a line of the account.
+    """
+
+    mujoco: Any
+    model: Any
+    chain: Chain
+    leave: Callable[[str, str, str], None]
+    note: Callable[[str, str], None]
+
+    def disabled(self, *names: str) -> bool:
+        return switched_off(self.mujoco, self.model, *names)
+
+
+def path_of_tendon(model: Any, tendon: int) -> slice:
+    """Where the parts of a tendon's path are."""
+    begin = int(model.tendon_adr[tendon])
+    return slice(begin, begin + int(model.tendon_num[tendon]))
+
+
+def planar_chain(
+    mujoco: Any, model: Any, tip: str | None
+) -> tuple[Linkage, Chain, list[tuple[str, str]]]:
+    """Reads the chain and its masses; also remarks, as pairs of part and words.
+
+    Raises ValueError for what is no planar chain.
+    """
+    if tip is not None and mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, tip) < 0:
+        names = [name_of(model, "site", k) for k in range(model.nsite)]
+        raise refusal("tip", f"one of the sites {names}", tip)
+    joints, links, remarks = _joints_of_arm(mujoco, model, tip)
+    data = mujoco.MjData(model)
+    places = model.jnt_qposadr[joints]
+    data.qpos[places] = 0
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    axes, slides = data.xaxis[joints], model.jnt_type[joints] == SLIDE
+    names = [name_of(model, "joint", k) for k in joints]
+    right, up, normal, gravity = _plane(axes, slides, model.opt.gravity)
+    signs = np.where(slides, 1, np.sign(axes @ normal))
+    remarks += _flatness(names, axes, slides, normal)
+    chain = Chain(
+        joints, names, places, model.jnt_dofadr[joints], links, signs, right, up,
+        normal, gravity, np.zeros(0), np.zeros(0),
+    )  # fmt: skip
+    starts = [0j]
+    for joint, slide in zip(joints, slides):
+        start = starts[-1] if slide else chain.plane(data.xanchor[joint])
+        starts.append(start)
+    place, words = _tip(mujoco, model, data, chain, starts[-1], tip)
+    linkage, turns = _linkage(model, data, chain, np.array(starts), slides, place)
+    return (
+        linkage,
+        chain._replace(starts=np.array(starts), turns=turns),
+        [*remarks, ("tip", words)],
+    )
+
+
+def _joints_of_arm(
+    mujoco: Any, model: Any, tip: str | None
+) -> tuple[np.ndarray, np.ndarray, list[tuple[str, str]]]:
+    """The joints of the arm, the link of each body, and what is left out beside it."""
+    welded, parent = model.body_weldid, model.body_parentid
+    # Bodies that are welded together are one; of each, the one before it that moves.
+    before = {int(b): int(welded[parent[b]]) for b in np.unique(welded[welded > 0])}
+
+    def root(body: int) -> int:
+        while before.get(body, 0):
+            body = before[body]
+        return body
+
+    roots = {body: root(body) for body in before}
+    trees = {name: [b for b in before if roots[b] == name] for name in roots.values()}
+    if not trees:
+        raise ValueError("source: expected a planar chain, got a model without joints.")
+    of_joint = np.array([roots[int(welded[b])] for b in model.jnt_bodyid])
+    site = -1
+    if tip is not None:
+        site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, tip)
+        chosen = roots.get(int(welded[model.site_bodyid[site]]), -1)
+        if chosen < 0:
+            raise refusal("tip", "a site on a body that moves", tip)
+    else:
+        moved = model.actuator_trnid[model.actuator_trntype == 0, 0]
+        driven = [int(of_joint[k]) for k in moved]
+        simple = {
+            t: np.isin(model.jnt_type[of_joint == t], (SLIDE, HINGE)).all()
+            for t in trees
+        }
+        rank = lambda t: (simple[t], driven.count(t), int((of_joint == t).sum()), -t)
+        chosen = max(trees, key=rank)
+    remarks = [
+        (f"chain of body {name_of(model, 'body', tree)}", "left out, beside the arm")
+        for tree in trees
+        if tree != chosen
+    ]
+    joints = np.flatnonzero(of_joint == chosen)
+    refuse = lambda what: ValueError(f"source: expected a planar chain, got {what}.")
+    for joint in joints:
+        if model.jnt_type[joint] not in (HINGE, SLIDE):
+            name = name_of(model, "joint", joint)
+            raise refuse(f"joint {name}, which is neither a hinge nor a slide")
+    for body in trees[chosen]:
+        following = [other for other in trees[chosen] if before[other] == body]
+        if len(following) > 1:
+            both = " and ".join(name_of(model, "body", b) for b in following[:2])
+            name = name_of(model, "body", body)
+            raise refuse(f"branches: bodies {both} both follow body {name}")
+    if len(joints) > MOST_PAIRS:
+        raise refuse(f"{len(joints)} joints, above {MOST_PAIRS}")
+    last = {int(model.jnt_bodyid[joint]): k + 1 for k, joint in enumerate(joints)}
+    links = np.array([last.get(int(b), -1 if b else 0) for b in welded])
+    return joints, links, remarks
+
+
+def _plane(
+    axes: np.ndarray, slides: np.ndarray, pull: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    """Unit vectors to the right, upwards and out of the plane, and gravity [m/s^2]."""
+    unit = lambda vector: vector / np.linalg.norm(vector)
+    if not slides.all():
+        normal = axes[np.argmin(slides)]
+    else:  # out of the plane of two slides, or of a slide and gravity
+        across = np.cross(axes[0], [*axes[1:], -pull, *np.eye(3)])
+        normal = across[np.argmax(np.linalg.norm(across, axis=1) > _EXACT)]
+    normal = unit(normal)
+    within = lambda vector: vector - (vector @ normal) * normal
+    gravity = float(np.linalg.norm(within(pull)))  # what is across moves nothing
+    gravity = gravity if gravity > _EXACT else 0.0
+    # Without gravity, some direction in the plane is upwards.
+    choices = (-pull, np.roll(normal, 1), np.cross(normal, [1, 0, 0]))
+    up = unit(next(w for w in map(within, choices) if np.linalg.norm(w) > _EXACT))
+    return np.cross(up, normal), up, normal, gravity
+
+
+def _flatness(
+    names: list[str], axes: np.ndarray, slides: np.ndarray, normal: np.ndarray
+) -> list[tuple[str, str]]:
+    """Remarks on axes that are nearly right; raises ValueError for others."""
+    remarks = []
+    for name, axis, slide in zip(names, axes, slides):
+        across = np.cross(axis, normal)
+        sine = abs(axis @ normal) if slide else float(np.linalg.norm(across))
+        angle = np.arcsin(min(sine, 1.0))
+        if not slide and abs(axis @ normal) < 0.5:
+            angle = np.arccos(abs(axis @ normal))
+        if angle > _FLAT:
+            where = "in the plane" if slide else "along the first hinge's"
+            raise ValueError(
+                f"source: expected the axis of joint {name} {where}, got one "
+                f"{angle:.2g} rad off."
+            )
+        if angle > _EXACT:
+            remarks.append((name, f"axis laid into the plane, {angle:.1g} rad off"))
+    return remarks
+
+
+def _tip(
+    mujoco: Any, model: Any, data: Any, chain: Chain, start: complex, tip: str | None
+) -> tuple[complex, str]:
+    """The place of the tip, and words on what it is."""
+    count = len(chain.joints)
+    for name in _TIPS if tip is None else (tip,):
+        site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, name)
+        if site < 0:
+            continue
+        body = model.site_bodyid[site]
+        if chain.links[body] == count:
+            return chain.plane(data.site_xpos[site]), f"the site {name}"
+        if tip is not None:
+            raise ValueError(
+                f"tip: expected a site on the last body that moves or on one welded to "
+                f"it, got one on body {name_of(model, 'body', body)}."
+            )
+    geoms = np.flatnonzero(chain.links[model.geom_bodyid] == count)
+    if geoms.size == 0:
+        return start, "the last joint, as there is neither a site nor a geom"
+    geom = geoms[-1]
+    center = data.geom_xpos[geom]
+    kinds = mujoco.mjtGeom
+    kind = kinds(int(model.geom_type[geom]))
+    if kind in (kinds.mjGEOM_CAPSULE, kinds.mjGEOM_CYLINDER):
+        reach = model.geom_size[geom, 1] * data.geom_xmat[geom].reshape(3, 3)[:, 2]
+        ends = [chain.plane(center + side * reach) for side in (1, -1)]
+        return max(ends, key=lambda end: abs(end - start)), "the end of the last geom"
+    return chain.plane(center), "the centre of the last geom"
+
+
+def _linkage(
+    model: Any,
+    data: Any,
+    chain: Chain,
+    starts: np.ndarray,
+    slides: np.ndarray,
+    tip: complex,
+) -> tuple[Linkage, np.ndarray]:
+    """The linkage with `q` = 0 where the links are, and the angles of its links.
+
+    A link before a slide is at right angles to it; all others are parallel to the next
+    one, so that positions of hinges are 0 there.
+    """
+    turns = [float(np.angle(tip - starts[-1]))]
+    for joint, slide in zip(chain.joints[::-1], slides[::-1]):
+        axis = chain.plane(data.xaxis[joint])
+        turns.append(float(np.angle(-1j * axis)) if slide else turns[-1])
+    turns = np.array(turns[::-1])
+    steps = np.diff([*starts, tip]) * np.exp(-1j * turns)
+    count = len(chain.joints)
+    offsets, masses, inertias = (
+        np.zeros(count, complex),
+        np.zeros(count),
+        np.zeros(count),
+    )
+    for k in range(count):
+        bodies = np.flatnonzero(chain.links == k + 1)  # none between joints of one body
+        mass = model.body_mass[bodies]
+        if not mass.sum() > 0:
+            continue
+        places = np.array([chain.plane(data.xipos[b]) for b in bodies])
+        center = complex(mass @ places / mass.sum())
+        frames = data.ximat[bodies].reshape(-1, 3, 3)
+        own = (frames.transpose(0, 2, 1) @ chain.normal) ** 2
+        inertia = (own * model.body_inertia[bodies]).sum()
+        masses[k] = mass.sum()
+        inertias[k] = inertia + mass @ np.abs(places - center) ** 2
+        offsets[k] = (center - starts[k + 1]) * np.exp(-1j * turns[k + 1])
+    with without_warning("moves no inertia of link"):
+        linkage = Linkage(
+            "".join("P" if slide else "R" for slide in slides),
+            length=steps.real,
+            com=np.column_stack([np.real(offsets), np.imag(offsets)]),
+            mass=masses,
+            inertia=inertias,
+            locked=np.where(slides, np.diff(turns), steps.imag[:-1]),
+            base_angle=turns[0],
+            gravity=chain.gravity,
+        )
+    return linkage, turns

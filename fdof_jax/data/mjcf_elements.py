@@ -1,0 +1,178 @@
+"""Force elements of a MuJoCo model: those of its joints and its tendons."""
+
+from typing import Any
+
+import numpy as np
+
+from ..forces.actuators import Armature
+from ..forces.joints import JointDamper, JointFriction, JointSpring, JointStops
+from ..forces.points import Point, SpringDamper
+from .mjcf_actuators import inertias_of_actuators
+from .mjcf_chain import Reader, name_of, path_of_tendon
+
+FAR = 1e9  # stands for infinity where MuJoCo wants a number
+# A stop of MuJoCo is close to plastic; this damping [s/m or s/rad] returns a tenth of
+# the speed of 1 m/s or 1 rad/s.
+_STOP_DAMPING = 10.0
+
+
+def elements_in_joints(read: Reader, drop: tuple[str, ...]) -> list[Any]:
+    """Dampers, armatures, springs, stops and friction of the joints."""
+    model, chain = read.model, read.chain
+    joints, rates = chain.joints, chain.rates
+    passive = read.disabled("PASSIVE")
+    for name, joint, rate in zip(chain.names, joints, rates):
+        for array, index, kind, what in (
+            ("jnt_stiffnesspoly", joint, "springs", "a nonlinear spring"),
+            ("jnt_springyield", joint, "springs", "a spring that yields"),
+            ("dof_dampingpoly", rate, "damping", "nonlinear damping"),
+        ):
+            # The arrays are absent from older versions of MuJoCo.
+            values = getattr(model, array, None)
+            if values is not None and np.any(values[index]):
+                read.leave(kind, f"joint {name}", what)
+    forces: list[Any] = []
+
+    def add(kind: str, values: np.ndarray, words: str, element: Any) -> None:
+        """Adds an element with values, unless none is there or it is to be dropped."""
+        there = np.flatnonzero(values)
+        for k in there:
+            left = "left out, as asked" if kind in drop else words
+            read.note(f"joint {chain.names[k]}", f"{kind} {values[k]:.4g}: {left}")
+        if there.size and kind not in drop:
+            forces.append(element())
+
+    damping = np.array(model.dof_damping[rates])
+    armature = np.array(model.dof_armature[rates])
+    for gears, added in inertias_of_actuators(read):
+        damping += gears**2 * added[0]
+        armature += gears**2 * added[1]
+    if passive or read.disabled("DAMPER"):
+        damping[:] = 0
+    add("damping", damping, "JointDamper", lambda: JointDamper(damping))
+    add("armature", armature, "Armature", lambda: Armature(armature))
+    stiffness = np.array(model.jnt_stiffness[joints])
+    if passive or read.disabled("SPRING"):
+        stiffness[:] = 0
+    rest = chain.signs * model.qpos_spring[chain.places]
+    add("springs", stiffness, "JointSpring", lambda: JointSpring(stiffness, rest))
+    friction = np.array(model.dof_frictionloss[rates])
+    if read.disabled("FRICTIONLOSS", "CONSTRAINT"):
+        friction[:] = 0
+    words = "JointFriction, which creeps where MuJoCo's sticks"
+    add("friction", friction, words, lambda: JointFriction(friction))
+    limited = model.jnt_limited[joints].astype(bool)
+    if limited.any() and not read.disabled("LIMIT", "CONSTRAINT"):
+        forces += _stops(read, limited, "limits" in drop)
+    return forces
+
+
+def _stops(read: Reader, limited: np.ndarray, dropped: bool) -> list[Any]:
+    """Stops in the place of ranges, as stiff as MuJoCo's constraints are at qpos0."""
+    model, chain = read.model, read.chain
+    ends = np.where(chain.signs[:, None] > 0, 1, -1) * model.jnt_range[chain.joints]
+    margin = model.jnt_margin[chain.joints]
+    lower = np.where(limited, ends.min(axis=1) - margin, -np.inf)
+    upper = np.where(limited, ends.max(axis=1) + margin, np.inf)
+    stiffness = np.ones(len(limited))
+    for k, joint in enumerate(chain.joints):
+        # What a constraint with the reference (time, damping ratio), or (-stiffness,
+        # -damping), gives way under a steady load, at its greatest impedance.
+        time, ratio = model.jnt_solref[joint]
+        impedance = min(max(model.jnt_solimp[joint, 1], 1e-4), 1 - 1e-4)
+        rate = -time if time < 0 else 1 / (time * ratio) ** 2
+        mass = 1 / max(float(model.dof_invweight0[chain.rates[k]]), 1e-15)
+        stiffness[k] = max(mass * rate / (1 - impedance), 1e-9)
+        if limited[k]:
+            read.note(
+                f"joint {chain.names[k]}",
+                f"range {lower[k]:.4g} to {upper[k]:.4g}: "
+                + (
+                    "left out, as asked"
+                    if dropped
+                    else f"JointStops of {stiffness[k]:.3g} N/m or N m/rad, about as "
+                    "stiff as MuJoCo's soft constraint"
+                ),
+            )
+    if dropped:
+        return []
+    return [JointStops(lower, upper, stiffness=stiffness, damping=_STOP_DAMPING)]
+
+
+# Tendons
+
+
+def springs_of_tendons(read: Reader, drop: tuple[str, ...]) -> list[Any]:
+    """Springs and dampers between two sites."""
+    model, forces = read.model, []
+    for tendon in range(model.ntendon):
+        name = f"tendon {name_of(model, 'tendon', tendon)}"
+        for array, kind, what in (
+            ("tendon_limited", "limits", "a range"),
+            ("tendon_frictionloss", "friction", "friction"),
+            ("tendon_armature", "tendons", "an armature"),
+            ("tendon_stiffnesspoly", "tendons", "a nonlinear spring"),
+            ("tendon_springyield", "tendons", "a spring that yields"),
+            ("tendon_dampingpoly", "tendons", "nonlinear damping"),
+        ):
+            values = getattr(model, array, None)
+            if values is not None and np.any(values[tendon]):
+                read.leave(kind, name, what)
+        stiffness, damping = (
+            model.tendon_stiffness[tendon],
+            model.tendon_damping[tendon],
+        )
+        if read.disabled("PASSIVE", "SPRING"):
+            stiffness = 0.0
+        if read.disabled("PASSIVE", "DAMPER"):
+            damping = 0.0
+        if not stiffness and not damping:
+            continue
+        points = _ends(read, tendon)
+        if points is None:
+            read.leave("tendons", name, "a spring that is not between two sites of it")
+        elif "tendons" in drop:
+            read.note(name, "left out, as asked")
+        else:
+            low, high = map(float, model.tendon_lengthspring[tendon])
+            forces += _springs(points, float(stiffness), float(damping), low, high)
+            read.note(name, "SpringDamper")
+    return forces
+
+
+def _springs(
+    points: tuple[Point, Point], k: float, damping: float, low: float, high: float
+) -> list[SpringDamper]:
+    """Springs that are slack between two lengths; the damper always acts."""
+    if low == high:
+        keywords: Any = dict(stiffness=k, damping=damping, rest_length=low)
+        return [SpringDamper(*points, **keywords)]
+    springs = [SpringDamper(*points, damping=damping)] if damping else []
+    for side, length, there in (("bumper", low, low > 0), ("cable", high, high < FAR)):
+        if there and k:
+            keywords = dict(stiffness=k, rest_length=length, one_sided=side)
+            springs.append(SpringDamper(*points, **keywords))
+    return springs
+
+
+def _ends(read: Reader, tendon: int) -> tuple[Point, Point] | None:
+    """The points of a tendon between two sites of the arm, in its plane."""
+    model, chain = read.model, read.chain
+    wraps = path_of_tendon(model, tendon)
+    sites, kinds = model.wrap_objid[wraps], model.wrap_type[wraps]
+    if len(sites) != 2 or (kinds != int(read.mujoco.mjtWrap.mjWRAP_SITE)).any():
+        return None
+    links = chain.links[model.site_bodyid[sites]]
+    data = read.mujoco.MjData(model)
+    data.qpos[chain.places] = 0
+    read.mujoco.mj_kinematics(model, data)
+    places = data.site_xpos[sites]
+    if (links < 0).any() or abs((places[1] - places[0]) @ chain.normal) > 1e-9:
+        return None
+    turned = np.exp(-1j * chain.turns[links])
+    local = [
+        (chain.plane(place) - chain.starts[link]) * turn
+        for place, link, turn in zip(places, links, turned)
+    ]
+    a, b = (Point(int(link), p.real, p.imag) for link, p in zip(links, local))
+    return a, b

@@ -1,0 +1,261 @@
+"""Import of planar chains from MuJoCo's models: MJCF and URDF."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..base.checks import optional_package, refusal
+from ..base.report import Report
+from ..base.user_warnings import warn
+from ..forces.element import Forces
+from ..linkage.coordinates import State
+from ..linkage.linkage import Linkage, joint_names
+from .mjcf_actuators import actuators
+from .mjcf_chain import Chain, Reader, name_of, planar_chain, switched_off
+from .mjcf_elements import elements_in_joints, springs_of_tendons
+from .mjcf_source import compiled_model
+
+KINDS = (
+    "actuators", "armature", "contacts", "damping", "equalities", "fluid", "friction",
+    "gravcomp", "limits", "plugins", "springs", "tendons",
+)  # fmt: skip
+_SITE = 6  # MuJoCo's mjtObj
+# A fluid whose forces are this part of all others at a rate of 1 rad/s or 1 m/s is
+# taken for none.
+_NEGLIGIBLE = 1e-9
+
+
+class Account(Report):
+    """What `from_mjcf` made of each part of a model: a table that prints itself.
+
+    - `lines`: pairs of a part of the model, and of what it became or why it was left
+      out.
+    """
+
+    lines: list[tuple[str, str]]
+
+    def _rows(self) -> list[list[str]]:
+        return [["", ""], *map(list, self.lines)]
+
+
+class MjcfModel(NamedTuple):
+    """A model as `from_mjcf` reads it.
+
+    - `linkage`, `state0` [m or rad; m/s or rad/s], `forces`: what `simulate` takes.
+    - `account`: an `Account` of what became of each part.
+    """
+
+    linkage: Linkage
+    state0: State
+    forces: Forces
+    account: Account
+
+
+def from_mjcf(
+    source: Any,
+    *,
+    controls: ArrayLike | None = None,
+    tip: str | None = None,
+    drop: tuple[str, ...] = (),
+) -> MjcfModel:
+    """Reads a planar chain of hinges and slides from a model of MuJoCo (MJCF or URDF).
+
+    The plane is seen from where the first hinge's axis points, with gravity downwards;
+    gravity across the plane has no effect. `q` equals `qpos`, with the opposite sign at
+    hinges that turn the other way. A body with several joints becomes as many links,
+    all but the last without mass. What is welded belongs to its link. Chains beside the
+    arm are left out: the arm is the chain with most actuators, or else most joints.
+    MuJoCo reads the model, which needs `pip install "fdof_jax[test]"`.
+
+    Damping, armature, springs, actuators and spatial tendons between two sites become
+    elements that act alike: position and velocity servos a `PDController`, motors a
+    `JointEffort`, others `Actuators`. MuJoCo's soft ranges become `JointStops` that are
+    about as stiff, and its friction loss `JointFriction`, which creeps where MuJoCo's
+    sticks. What the library does not have is refused, or left out on purpose by `drop`.
+    The `account` says all of it.
+
+    **Arguments:**
+
+    - `source`: an XML text, which may name no other files; the path of a file, an
+      `mujoco.MjModel` or an `mujoco.MjSpec`.
+    - `controls`: of the actuators, in MuJoCo's order and units; by default those of the
+      first key frame, or 0. `replace` changes them in the elements.
+    - `tip`: name of the site that is the tip; by default one named tip, ee, tool, hand
+      or end_effector on the last link, or else the end of its last geom.
+    - `drop`: kinds of parts to leave out: "actuators", "armature", "contacts",
+      "damping", "equalities", "fluid", "friction", "gravcomp", "limits", "plugins",
+      "springs", "tendons".
+
+    **Returns:** an `MjcfModel`: linkage, start (of the first key frame, or `qpos0`),
+    forces and account.
+
+    **Raises:** ValueError for what is no planar chain (trees, loops, other joints, axes
+    out of the plane), for parts that are neither known nor to be dropped, and for
+    bodies that touch at the start. Warns of bodies that may touch later.
+
+    >>> import fdof_jax as fj
+    >>> arm, start, forces, account = fj.from_mjcf('''
+    ... <mujoco><worldbody><body><joint name="j" axis="0 1 0" damping="2"/>
+    ... <geom type="capsule" fromto="0 0 0 0 0 -1" size=".1"/></body></worldbody>
+    ... <actuator><position joint="j" kp="9" kv="1"/></actuator></mujoco>''')
+    >>> print(account)
+    joint j     R1, a hinge, q = qpos
+    tip         the end of the last geom
+    joint j     damping 2: JointDamper
+    actuator 0  PDController, at a control of 0
+    """
+    mujoco = optional_package("mujoco", "test")
+    drop = (drop,) if isinstance(drop, str) else tuple(drop)
+    for kind in drop:
+        if kind not in KINDS:
+            raise refusal("drop", f"kinds among {KINDS}", kind)
+    if tip is not None and not isinstance(tip, str):
+        raise refusal("tip", "the name of a site", tip)
+    model, left = compiled_model(mujoco, source)
+    lines: list[tuple[str, str]] = [("source", f"left out: {what}") for what in left]
+
+    def note(part: str, words: str) -> None:
+        lines.append((part, words))
+
+    def leave(kind: str, part: str, what: str) -> None:
+        if kind not in drop:
+            raise ValueError(
+                f"source: expected a planar chain with elements of this library, got "
+                f"{part} with {what}; drop=('{kind}',) leaves it out."
+            )
+        note(part, f"{what}: left out, as asked")
+
+    if switched_off(mujoco, model, "GRAVITY"):
+        model.opt.gravity[:] = 0
+    linkage, chain, remarks = planar_chain(mujoco, model, tip)
+    read = Reader(mujoco, model, chain, leave, note)
+    _note_joints(read, linkage)
+    lines += remarks
+    forces = [
+        *elements_in_joints(read, drop),
+        *springs_of_tendons(read, drop),
+        *actuators(read, controls, drop),
+    ]
+    _check_rest(read)
+    start = _start(model, chain)
+    _check_contacts(read, drop)
+    return MjcfModel(linkage, start, tuple(forces), Account(lines))
+
+
+def _note_joints(read: Reader, linkage: Linkage) -> None:
+    names = joint_names(linkage)
+    for theirs, ours, sign in zip(read.chain.names, names, read.chain.signs):
+        kind = "a hinge" if ours.startswith("R") else "a slide"
+        minus = "-" if sign < 0 else ""
+        read.note(f"joint {theirs}", f"{ours}, {kind}, q = {minus}qpos")
+
+
+def _start(model: Any, chain: Chain) -> State:
+    keys = model.nkey > 0
+    qpos, qvel = (model.key_qpos[0], model.key_qvel[0]) if keys else (model.qpos0, None)
+    q = chain.signs * qpos[chain.places]
+    qd = np.zeros(len(q)) if qvel is None else chain.signs * qvel[chain.rates]
+    return State(q, qd)
+
+
+def _check_rest(read: Reader) -> None:
+    """Leaves out constraints, compensated gravity and fluids, or raises ValueError."""
+    model, mujoco, chain = read.model, read.mujoco, read.chain
+    if model.neq and not read.disabled("EQUALITY", "CONSTRAINT"):
+        for index in range(model.neq):
+            name = f"equality {name_of(model, 'equality', index)}"
+            kind = mujoco.mjtEq(int(model.eq_type[index]))
+            of_bodies = kind in (mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD)
+            ends = np.array([model.eq_obj1id[index], model.eq_obj2id[index]])
+            if of_bodies and int(model.eq_objtype[index]) == _SITE:
+                ends = model.site_bodyid[ends]
+            if not model.eq_active0[index]:
+                read.note(name, "left out, as it is not active")
+            elif of_bodies and (chain.links[ends] <= 0).all():
+                read.note(name, "left out, beside the arm")
+            else:
+                read.leave("equalities", name, "a loop or another constraint")
+    for body in np.flatnonzero(model.body_plugin >= 0):
+        if chain.links[body] > 0:
+            name = f"body {name_of(model, 'body', body)}"
+            read.leave("plugins", name, "a plugin")
+    for body in np.flatnonzero(model.body_gravcomp):
+        if chain.links[body] > 0:
+            name = f"body {name_of(model, 'body', body)}"
+            read.leave("gravcomp", name, "compensated gravity (gravcomp)")
+    for name in ("density", "viscosity"):
+        value = float(getattr(model.opt, name))
+        if value and _drag(read) > _NEGLIGIBLE:
+            read.leave("fluid", "the model", f"a fluid of {name} {value:g}")
+        elif value:
+            read.note("fluid", f"{name} {value:g} left out, without effect on the arm")
+
+
+def _drag(read: Reader) -> float:
+    """Greatest force of the fluid over that of inertia, at random rates of size 1."""
+    model, mujoco, rates = read.model, read.mujoco, read.chain.rates
+    data, draw, ratios = mujoco.MjData(model), np.random.default_rng(0), [0.0]
+    for _ in range(5):
+        data.qpos[read.chain.places] = draw.normal(size=len(rates))
+        data.qvel[rates] = draw.normal(size=len(rates))
+        mujoco.mj_forward(model, data)
+        others = abs(data.qfrc_bias[rates]).max() + model.dof_M0[rates].max()
+        ratios.append(abs(data.qfrc_fluid[rates]).max() / others)
+    return max(ratios)
+
+
+def _check_contacts(read: Reader, drop: tuple[str, ...]) -> None:
+    """Raises ValueError for bodies that touch at the start, warns of those that may."""
+    model, mujoco, links = read.model, read.mujoco, read.chain.links
+    if read.disabled("CONTACT", "CONSTRAINT"):
+        return
+    data = mujoco.MjData(model)
+    if model.nkey:
+        mujoco.mj_resetDataKeyframe(model, data, 0)
+    mujoco.mj_fwdPosition(model, data)
+    of_geom = links[model.geom_bodyid]
+    name = lambda geom: name_of(model, "body", model.geom_bodyid[geom])
+    for contact in data.contact[: data.ncon]:
+        a, b = (int(geom) for geom in contact.geom)
+        if min(a, b) >= 0 and contact.dist <= 0 and max(of_geom[a], of_geom[b]) > 0:
+            read.leave("contacts", f"bodies {name(a)} and {name(b)}", "a contact")
+            return
+    pair = _may_collide(model, links)
+    if pair is None:
+        return
+    both = " and ".join(name_of(model, "body", body) for body in pair)
+    read.note("contacts", f"left out, though bodies {both} may collide")
+    if "contacts" not in drop:
+        warn(
+            f"source: contacts are left out, but bodies {both} of this model may "
+            "collide; drop=('contacts',) omits this warning."
+        )
+
+
+def _may_collide(model: Any, links: np.ndarray) -> tuple[int, int] | None:
+    """Two bodies, one of the arm, whose geoms may collide in MuJoCo, if any.
+
+    Geoms of bodies that are welded together, or next to each other in the chain, do
+    not; the moving bodies next to the ground may collide with it.
+    """
+    bodies = model.geom_bodyid
+    pairs = [
+        (int(bodies[a]), int(bodies[b]))
+        for a, b in zip(model.pair_geom1, model.pair_geom2)
+    ]
+    welded, before = model.body_weldid, model.body_weldid[model.body_parentid]
+    kinds = np.stack([bodies, model.geom_contype, model.geom_conaffinity], axis=1)
+    kinds = np.unique(kinds, axis=0)  # there may be thousands of geoms
+    body = kinds[:, 0]
+    a, b = np.triu_indices(len(kinds), 1)
+    meet = (kinds[a, 1] & kinds[b, 2]) | (kinds[b, 1] & kinds[a, 2])
+    u, v = welded[body[a]], welded[body[b]]
+    next_to = ((u > 0) & (before[v] == u)) | ((v > 0) & (before[u] == v))
+    excluded = np.isin((body[a] << 16) + body[b], model.exclude_signature)
+    for k in np.flatnonzero((meet != 0) & (u != v) & ~next_to & ~excluded):
+        pairs.append((int(body[a[k]]), int(body[b[k]])))
+    for pair in pairs:
+        if max(links[list(pair)]) > 0:
+            return pair
+    return None

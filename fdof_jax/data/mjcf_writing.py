@@ -1,0 +1,347 @@
+"""Export to MuJoCo's model format (MJCF)."""
+
+from collections import Counter
+from collections.abc import Callable, Iterator
+from typing import Any
+from xml.etree import ElementTree
+
+import jax.numpy as jnp
+import numpy as np
+
+from ..base.checks import is_traced
+from ..control.actuators import Actuators
+from ..control.pd import PDController
+from ..forces.actuators import Armature
+from ..forces.element import Forces, ForeignElement, elements_on
+from ..forces.joints import (
+    JointDamper,
+    JointEffort,
+    JointFriction,
+    JointSpring,
+    JointStops,
+)
+from ..forces.points import SpringDamper
+from ..linkage.coordinates import State, real_state
+from ..linkage.fields import value_of
+from ..linkage.linkage import Linkage, check_linkage
+from ..linkage.topology import letters
+from ..simulation.scene import accepts_scene
+from .mjcf_elements import FAR
+
+# MuJoCo rejects smaller masses and inertias of moving bodies (its mjMINVAL).
+_SMALLEST = 1e-15
+_IN_JOINTS = JointDamper, Armature, JointSpring, JointStops, JointFriction
+_ACTUATORS = JointEffort, PDController, Actuators
+_KINDS = (*_IN_JOINTS, SpringDamper, *_ACTUATORS)
+_THICK = 0.03  # radius of the drawn links, over the length of the arm
+
+
+@accepts_scene
+def to_mjcf(linkage: Linkage, forces: Forces = (), state0: State | None = None) -> str:
+    """Exports a linkage and its force elements, or a scene, as a MuJoCo model (MJCF).
+
+    Joints `joint1`, `joint2`, ... are hinges about z and slides in the plane z = 0,
+    with `qpos` equal to this library's `q` without fixed pairs. A site `tip` marks the
+    tip. Links are drawn, and nothing collides. Masses and moments of inertia below
+    1e-15, in particular zero, become 1e-15, the smallest that MuJoCo accepts.
+
+    `JointDamper`, `JointSpring`, `Armature`, `JointEffort` (motors `effort1`, ...),
+    `SpringDamper` (a spatial tendon; one-sided ones without damping), `Actuators` and
+    `PDController` act as they do here. The latter becomes actuators `position1`,
+    `velocity1`, ..., whose sum the joint limits. The controls at time 0, those of a
+    reference for instance, are in the key frame `start`, which also has `state0`; set
+    `data.ctrl` as a moving reference demands. The model asks for MuJoCo's RK4 with
+    steps of 1 ms, as its own default, Euler with 2 ms, is far less exact. MuJoCo has
+    other models of stops and friction: of `JointStops` it takes the range alone and
+    stops softly by its own `solref`; of `JointFriction` the level alone, and joints
+    stick at rest. `from_mjcf` reads all of it.
+
+    **Arguments:** `linkage`: one linkage with concrete values; `forces`: elements;
+    `state0`: the start. Or a scene, which holds all of them.
+
+    **Returns:** the XML text.
+
+    **Raises:** ValueError for traced or batched values, and for elements that MuJoCo
+    does not have.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig7().linkage
+    >>> text = fj.to_mjcf(arm, (fj.JointDamper(2.0),))
+    >>> text.count('type="hinge"'), text.count('type="slide"'), text.count("damping")
+    (2, 1, 3)
+    """
+    check_linkage(linkage)
+    if is_traced(linkage, forces):
+        raise ValueError("linkage: expected concrete values, got traced ones.")
+    length, com, locked = map(np.asarray, (linkage.length, linkage.com, linkage.locked))
+    mass = np.maximum(linkage.mass, _SMALLEST)
+    inertia = np.maximum(linkage.inertia, _SMALLEST)
+    kinds, acting = letters(linkage.ef), elements_on(linkage, forces)
+    _check_elements(linkage, acting)
+    attributes = _of_joints(acting, len(kinds))
+
+    add = ElementTree.SubElement
+    root = ElementTree.Element("mujoco", model="linkage")
+    add(root, "compiler", angle="radian")
+    gravity = _text(0, -linkage.gravity, 0)
+    steps = dict(integrator="RK4", timestep="0.001")  # MuJoCo's Euler is far less exact
+    add(add(root, "option", steps, gravity=gravity), "flag", contact="disable")
+    world = add(root, "worldbody")
+    bodies = [add(world, "body", name="ground", quat=_turn(linkage.base_angle))]
+    for k, joint in enumerate(kinds):
+        side, turn = (locked[k], 0.0) if joint == "R" else (0.0, locked[k])
+        place, name = _text(length[k], side, 0), f"link{k + 1}"
+        bodies.append(add(bodies[k], "body", name=name, pos=place, quat=_turn(turn)))
+        # Joint axes are given in the frame of the moving body.
+        axis = (0, 0, 1) if joint == "R" else (np.sin(turn), np.cos(turn), 0)
+        own = dict(type="hinge" if joint == "R" else "slide", axis=_text(*axis))
+        if joint != "F":
+            name = dict(name=f"joint{k + 1}")
+            add(bodies[-1], "joint", name | own | attributes[k])
+        own = dict(mass=_text(mass[k]), diaginertia=_text(*[inertia[k]] * 3))
+        add(bodies[-1], "inertial", dict(pos=_text(*com[k], 0)) | own)
+    add(bodies[-1], "site", name="tip", pos=_text(length[-1], 0, 0))
+    _draw(bodies, kinds, length, locked)
+    springs = {k: e for k, e in enumerate(acting) if isinstance(e, SpringDamper)}
+    if springs:
+        _add_springs(add(root, "tendon"), bodies, springs)
+    controls, states = _add_actuators(root, linkage, kinds, acting)
+    if controls or state0 is not None:
+        start = State(np.zeros(len(kinds)), np.zeros(len(kinds)))
+        if state0 is not None:
+            start = real_state("state0", state0, linkage)
+        moving = [k for k, kind in enumerate(kinds) if kind != "F"]
+        qpos, qvel = (_text(*np.asarray(values)[moving]) for values in start)
+        frame = dict(name="start", qpos=qpos, qvel=qvel, ctrl=_text(*controls))
+        frame |= dict(act=_text(*states)) if states else {}
+        add(add(root, "keyframe"), "key", frame)
+    ElementTree.indent(root)
+    return ElementTree.tostring(root, encoding="unicode")
+
+
+def _check_elements(linkage: Linkage, acting: tuple[Any, ...]) -> None:
+    """Raises ValueError for elements that MuJoCo does not have."""
+    for k, element in enumerate(acting):
+        name, expected = type(element).__name__, None
+        if type(element) not in _KINDS:  # subclasses compute something else
+            expected = "one of " + ", ".join(kind.__name__ for kind in _KINDS)
+            if isinstance(element, ForeignElement):
+                name = type(element.called).__name__
+        elif isinstance(element, SpringDamper):
+            element.check(linkage, jnp.zeros(1))
+            if element.side and float(element.damping) > 0:
+                expected = (
+                    "no damping of a cable or a bumper, which MuJoCo does not have"
+                )
+        elif type(element) in (*_IN_JOINTS, PDController) and _count(acting, name) > 1:
+            expected = f"one {name}, as a joint of MuJoCo has"
+        elif _limits_joints(element) and sum(type(e) in _ACTUATORS for e in acting) > 1:
+            expected = (
+                "no limits of joint efforts beside other actuators, as a joint of "
+                "MuJoCo limits their sum"
+            )
+        if expected:
+            raise ValueError(f"forces[{k}]: expected {expected}, got {name}.")
+
+
+def _count(acting: tuple[Any, ...], name: str) -> int:
+    return sum(type(element).__name__ == name for element in acting)
+
+
+def _limits_joints(element: Any) -> bool:
+    """Whether a joint's total effort is limited."""
+    if isinstance(element, PDController):
+        return bool(np.isfinite(element.limit).any())
+    if not isinstance(element, Actuators):
+        return False
+    return element.effort_lower is not None or element.effort_upper is not None
+
+
+def _draw(bodies: list[Any], kinds: str, length: Any, locked: Any) -> None:
+    """Capsules along the links, which neither weigh nor collide."""
+    size = _text(_THICK * max(float(np.abs(length).sum()), 1e-3))
+    # A link ends where the next hinge is, or where the next slide begins.
+    sides = [locked[k] if kind == "R" else 0.0 for k, kind in enumerate(kinds)]
+    for body, end, side in zip(bodies, length, [*sides, 0.0]):
+        own = dict(type="sphere")
+        if abs(end) + abs(side) > 0:
+            own = dict(type="capsule", fromto=_text(0, 0, 0, end, side, 0))
+        free = dict(contype="0", conaffinity="0", mass="0", group="1")
+        ElementTree.SubElement(body, "geom", own | free, size=size)
+
+
+def _of_joints(acting: tuple[Any, ...], count: int) -> list[dict[str, str]]:
+    """Attributes of the joints that stand for elements."""
+    joints: list[dict[str, str]] = [{} for _ in range(count)]
+
+    def add(name: str, *columns: Any, where: Any = True) -> None:
+        columns = np.broadcast_arrays(*columns, where, np.zeros(count))[:-1]
+        for joint, (*values, there) in zip(joints, zip(*columns)):
+            if there:
+                joint[name] = _text(*values)
+                if name.endswith("range"):
+                    joint[name.replace("range", "limited")] = "true"
+
+    for element in acting:
+        if isinstance(element, JointDamper):
+            add("damping", element.coefficient)
+        elif isinstance(element, Armature):
+            add("armature", element.inertia)
+        elif isinstance(element, JointSpring):
+            add("stiffness", element.stiffness)
+            add("springref", element.rest)
+        elif isinstance(element, JointFriction):
+            add("frictionloss", element.level)
+        elif isinstance(element, JointStops):
+            low, high = (np.clip(e, -FAR, FAR) for e in (element.lower, element.upper))
+            add("range", low, high, where=np.minimum(abs(low), abs(high)) < FAR)
+        elif isinstance(element, PDController):
+            limit = np.asarray(element.limit)
+            add("actuatorfrcrange", -limit, limit, where=(0 < limit) & (limit < np.inf))
+        elif isinstance(element, Actuators) and _limits_joints(element):
+            low, high = _ends(element.effort_lower, element.effort_upper, count)
+            bounded = np.minimum(abs(low), abs(high)) < FAR
+            add("actuatorfrcrange", low, high, where=bounded)
+    return joints
+
+
+def _ends(lower: Any, upper: Any, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Both ends of ranges, in numbers that MuJoCo takes."""
+    low = np.full(count, -np.inf) if lower is None else np.asarray(lower)
+    high = np.full(count, np.inf) if upper is None else np.asarray(upper)
+    return np.clip(low, -FAR, FAR), np.clip(high, -FAR, FAR)
+
+
+def _add_springs(tendons: Any, bodies: list[Any], springs: dict[int, Any]) -> None:
+    """Springs between points, as tendons between sites."""
+    for k, element in springs.items():
+        rest, side = float(element.rest_length), int(element.side or 0)
+        ends = {0: (rest, rest), 1: (0.0, rest), -1: (rest, FAR)}[side]  # no force
+        tendon = ElementTree.SubElement(
+            tendons, "spatial", name=f"spring{k}", stiffness=_text(element.stiffness),
+            damping=_text(element.damping), springlength=_text(*ends),
+        )  # fmt: skip
+        for end, point in (("a", element.a), ("b", element.b)):
+            place = _text(point.along, point.across, 0)
+            site = dict(name=f"spring{k}{end}", pos=place)
+            ElementTree.SubElement(bodies[int(point.link)], "site", site)
+            ElementTree.SubElement(tendon, "site", site=site["name"])
+
+
+def _add_actuators(
+    root: Any, linkage: Linkage, kinds: str, acting: tuple[Any, ...]
+) -> tuple[list[float], list[float]]:
+    """Adds actuators; returns their controls and states at time 0."""
+    controls: list[float] = []
+    states: list[float] = []
+    if not any(isinstance(element, _ACTUATORS) for element in acting):
+        return controls, states
+    actuators = ElementTree.SubElement(root, "actuator")
+    count, names = len(kinds), _counted()
+
+    def add(kind: str, name: str, joint: int, control: Any, **values: Any) -> None:
+        own = dict(name=names(name), joint=f"joint{joint + 1}")
+        texts = {key: _text(value) for key, value in values.items()}
+        ElementTree.SubElement(actuators, kind, own | texts)
+        controls.append(float(control))
+
+    for place, element in enumerate(acting):
+        if isinstance(element, JointEffort):
+            for k, tau in enumerate(np.broadcast_to(element.tau, count)):
+                if kinds[k] != "F":
+                    add("motor", f"effort{k + 1}", k, tau)
+        elif isinstance(element, PDController):
+            target, velocity = element.schedule(jnp.zeros(()), linkage)
+            gains = element.kp, element.kd, element.limit
+            rows = zip(*np.broadcast_arrays(*gains, np.zeros(count))[:3])
+            for k, (kp, kd, limit) in enumerate(rows):
+                if kinds[k] != "F" and limit != 0:
+                    add("position", f"position{k + 1}", k, target[k], kp=kp)
+                    add("velocity", f"velocity{k + 1}", k, velocity[k], kv=kd)
+        elif isinstance(element, Actuators):
+            laws = _general(element, f"forces[{place}]", linkage)
+            for number, (gear, attributes, control, start) in enumerate(laws):
+                own = dict(name=names(f"actuator{number + 1}"))
+                ratios = {k: gear[k] for k in np.flatnonzero(gear) if kinds[k] != "F"}
+                if not ratios:
+                    continue
+                if len(ratios) == 1:
+                    ((k, ratio),) = ratios.items()
+                    own |= dict(joint=f"joint{k + 1}", gear=_text(ratio))
+                else:
+                    name = names(f"gear{number + 1}")
+                    own |= dict(tendon=_tendon(root, name, ratios))
+                ElementTree.SubElement(actuators, "general", own | attributes)
+                controls.append(control)
+                states += start
+    return controls, states
+
+
+def _counted() -> Callable[[str], str]:
+    """Returns a function that makes names unique."""
+    counts: Counter[str] = Counter()
+
+    def unique(name: str) -> str:
+        counts[name] += 1
+        return name if counts[name] == 1 else f"{name}_{counts[name]}"
+
+    return unique
+
+
+def _tendon(root: Any, name: str, ratios: dict[Any, Any]) -> str:
+    """Adds a tendon whose length is a sum of joint positions; returns its name."""
+    tendons = root.find("tendon")
+    if tendons is None:
+        tendons = ElementTree.Element("tendon")
+        root.insert(list(root).index(root.find("actuator")), tendons)
+    tendon = ElementTree.SubElement(tendons, "fixed", name=name)
+    for k, ratio in ratios.items():
+        own = dict(joint=f"joint{k + 1}", coef=_text(ratio))
+        ElementTree.SubElement(tendon, "joint", own)
+    return name
+
+
+def _general(
+    element: Actuators, place: str, linkage: Linkage
+) -> Iterator[tuple[np.ndarray, dict[str, str], float, list[float]]]:
+    """Yields gears, attributes of general actuators, controls and states, if any."""
+    gears, gains, bias = map(np.asarray, (element.gear, element.gain, element.bias))
+    control = np.asarray(value_of(element, "control", jnp.zeros(())))
+    low, high = _ends(element.lower, element.upper, len(gears))
+    own = element.activation
+    for k, gear in enumerate(gears):
+        gain, attributes = gains[k], dict(biastype="affine", biasprm=_text(*bias[k]))
+        start: list[float] = []
+        if np.minimum(abs(low[k]), abs(high[k])) < FAR:
+            ends = _text(low[k], high[k])
+            attributes |= dict(forcelimited="true", forcerange=ends)
+        if own is not None and np.any(np.asarray(own.rate)[k]):
+            rate, time = np.asarray(own.rate)[k], 0.0
+            if rate[1] < 0:
+                time = -1 / rate[1]
+            kind = "filterexact" if time else "integrator"
+            expected = [1 / time, -1 / time, 0, 0] if time else [1, 0, 0, 0]
+            if gain.any() or (rate != expected).any():
+                raise ValueError(
+                    f"{place}: expected states that follow or integrate their control, "
+                    f"as MuJoCo's general actuators have them, got {rate.tolist()}."
+                )
+            gain = [float(np.asarray(own.gain)[k]), 0.0, 0.0]
+            start = [float(np.asarray(own.start)[k])]
+            attributes |= dict(dyntype=kind)
+            attributes |= dict(dynprm=_text(time)) if time else {}
+            bottom, top = _ends(own.lower, own.upper, len(gears))
+            if np.minimum(abs(bottom[k]), abs(top[k])) < FAR:
+                ends = _text(bottom[k], top[k])
+                attributes |= dict(actlimited="true", actrange=ends)
+        attributes |= dict(gaintype="affine", gainprm=_text(*gain))
+        yield gear, attributes, float(control[k]), start
+
+
+def _text(*numbers: Any) -> str:
+    return " ".join(repr(float(number)) for number in numbers)
+
+
+def _turn(angle: Any) -> str:
+    """The quaternion of a turn about z."""
+    return _text(np.cos(angle / 2), 0, 0, np.sin(angle / 2))
