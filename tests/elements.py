@@ -48,6 +48,7 @@ SHORT = dict(
 # Efforts in the joints, between points and from outside
 PLAIN = {
     "damper": fj.JointDamper([0.3, 0.2, 0.1]),
+    "joint spring": fj.forces.JointSpring([0.9, 0.6, 0.4], rest=[0.4, 0.0, -0.3]),
     "effort": fj.JointEffort([1.0, -0.5, 0.3]),
     "PD": PD,
     "history": fj.forces.EffortHistory(

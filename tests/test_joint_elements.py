@@ -1,9 +1,10 @@
-"""Stops, friction and histories of efforts: closed forms, and finite derivatives."""
+"""Springs, stops, friction and histories of efforts: closed forms, derivatives."""
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 from elements import START, arm
@@ -25,6 +26,34 @@ def slides(start, ts, *forces):
 
 def stored(stops, x):
     return jax.vmap(lambda q: stops.potential_energy(q, SLIDE))(x[:, None])
+
+
+# Springs
+
+
+@pytest.mark.parametrize("topology", ["RRR", "PRP"])
+def test_mujoco_has_the_same_springs(topology):
+    linkage, q = arm(topology), np.array([3.9, -1.2, 0.4])  # beyond half a turn
+    springs = fj.forces.JointSpring([30.0, 0.0, 7.0], rest=[-0.5, 0.2, 0.1])
+    model = mujoco.MjModel.from_xml_string(fj.to_mjcf(linkage))
+    model.jnt_stiffness[:], model.qpos_spring[:] = springs.stiffness, springs.rest
+    data = mujoco.MjData(model)
+    model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_ENERGY
+    model.opt.gravity[:] = 0
+    data.qpos[:] = q
+    mujoco.mj_forward(model, data)
+    found = springs(0.0, q, np.zeros(3), linkage)
+    np.testing.assert_allclose(found, data.qfrc_passive, rtol=1e-12)
+    energy = springs.potential_energy(q, linkage)
+    np.testing.assert_allclose(energy, data.energy[0], rtol=1e-12)
+
+
+def test_a_mass_swings_on_a_spring():
+    """One number serves all joints, and the period is 2 pi sqrt(m / k)."""
+    ts = np.pi * np.sqrt(2 / 8) * np.arange(4)  # half periods
+    x, v = slides([1.5, 0.0], ts, fj.forces.JointSpring(8.0, 0.5))
+    np.testing.assert_allclose(x, [1.5, -0.5, 1.5, -0.5], atol=1e-8)
+    np.testing.assert_allclose(v, 0, atol=1e-7)
 
 
 # Stops
@@ -175,6 +204,8 @@ def test_the_momentum_gained_is_the_integral_of_the_efforts():
 
 
 REFUSED = [
+    (lambda: fj.forces.JointSpring(-1), "stiffness: expected .* at least 0"),
+    (lambda: fj.forces.JointSpring(1, np.inf), "rest: expected"),
     (lambda: JointStops(1, 1), "lower: expected less than upper"),
     (lambda: JointStops(np.nan, 1), "lower: expected"),
     (lambda: JointStops(0, 1, stiffness=0), "stiffness: expected .* above 0"),

@@ -3,14 +3,21 @@
 from ..linkage.fields import Condition, Values, field
 from .actuators import Armature, LinearActuator
 from .element import Element, InertialElement, StatefulElement
-from .joints import EffortHistory, JointDamper, JointEffort, JointFriction, JointStops
+from .joints import (
+    EffortHistory,
+    JointDamper,
+    JointEffort,
+    JointFriction,
+    JointSpring,
+    JointStops,
+)
 from .points import Load, Point, PointElement, SpringDamper, Tension, Wrench
 from .switches import clip, switch
 
 __all__ = [
     "Armature", "clip", "Condition", "EffortHistory", "Element", "field",
-    "InertialElement", "JointDamper", "JointEffort", "JointFriction", "JointStops",
-    "LinearActuator", "Load", "Point", "PointElement", "SpringDamper",
+    "InertialElement", "JointDamper", "JointEffort", "JointFriction", "JointSpring",
+    "JointStops", "LinearActuator", "Load", "Point", "PointElement", "SpringDamper",
     "StatefulElement", "switch", "Tension", "Values", "Wrench",
 ]  # fmt: skip
 

@@ -1,4 +1,4 @@
-"""Force elements in the joints: dampers, efforts, stops and friction.
+"""Force elements in the joints: dampers, springs, efforts, stops and friction.
 
 Stops and friction are not part of the paper's model.
 """
@@ -35,6 +35,38 @@ class JointDamper(ScalarElement):
 
     def respond(self, scheduled, q, qd, linkage):
         return tuple(-c * rate for c, rate in zip(each(self.coefficient, qd), qd))
+
+
+class JointSpring(ScalarElement):
+    """Linear springs in the joints: -stiffness * (q - rest).
+
+    At a revolute joint, `q` is the relative angle, never wrapped: a spring that is
+    wound up by a turn unwinds. The preceding link takes the reaction.
+
+    **Arguments:** one value per joint or one for all.
+
+    - `stiffness`: not negative [N/m or N m/rad].
+    - `rest`: positions at which the springs are slack [m or rad].
+
+    **Raises:** ValueError for malformed arguments and negative stiffnesses.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig5().linkage
+    >>> springs = fj.forces.JointSpring([10, 20, 30], rest=0.5)
+    >>> springs(0.0, [0.0, 1.0, 0.5], [0.0, 0.0, 0.0], arm).tolist()
+    [5.0, -10.0, 0.0]
+    """
+
+    stiffness: Values = field(unit="N/m or N m/rad", minimum=0)
+    rest: Values = field(unit="m or rad", default=0.0)
+
+    def respond(self, scheduled, q, qd, linkage):
+        rows = zip(each(self.stiffness, q), each(self.rest, q), q)
+        return tuple(-stiffness * (x - rest) for stiffness, rest, x in rows)
+
+    def potential_energy(self, q: Array, linkage: Linkage) -> Array:
+        """Computes the energy of the springs [J]."""
+        return jnp.sum(self.stiffness * (q - self.rest) ** 2) / 2
 
 
 class JointEffort(ScalarElement):
