@@ -88,6 +88,7 @@ WITH_STATE = {
         current_limit=[0.3, 9.0, 0.1],
     ),
 }  # fmt: skip
+WITH_STATE["static motor"] = WITH_STATE["motor"].replace(inductance=0)
 WITH_STATE["motor with PID"] = fj.control.FirstOrderLag(WITH_STATE["PID"], 0.1)
 WITH_INERTIA = {
     "armature": fj.forces.Armature([0.3, 0.2, 0.1]),
