@@ -18,8 +18,9 @@ class Armature(InertialElement):
     """Rotors geared to the joints: inertia that turns with a joint's relative rate.
 
     This is the usual approximation, which MuJoCo has too: the rate of the link that
-    carries the rotor is left out. From gear ratios of about 50 on, the difference does
-    not matter. For direct drives and low ratios take `Rotor`, which is exact.
+    carries the rotor is left out. At gear ratios of 50 and more, accelerations differ
+    by about half a percent. For direct drives and low ratios take `Rotor`, the exact
+    one.
 
     **Arguments:** `inertia`: the rotor's inertia times the square of the gear ratio,
     one per joint or one for all, not negative [kg m^2; kg for a prismatic joint].
@@ -54,9 +55,8 @@ class Rotor(InertialElement):
     inertia * rate^2 / 2. Its mass belongs to the link that carries it. A fixed pair has
     no rotor.
 
-    Take it for direct drives and low gear ratios. From ratios of about 50 on, an
-    `Armature` of gear^2 * inertia is as good: the terms that couple the joints are
-    1 / gear of its own.
+    Take it for direct drives and low gear ratios. At ratios of 50 and more, an
+    `Armature` of gear^2 * inertia is as good: what it leaves out is 1 / gear of it.
 
     **Arguments:** one value per joint or one for all.
 
