@@ -100,9 +100,11 @@ WITH_STATE["actuators"] = fj.control.Actuators(
         start=[0.1, 0.0],
     ),
 )  # fmt: skip
+WITH_STATE["static motor"] = WITH_STATE["motor"].replace(inductance=0)
 WITH_STATE["motor with PID"] = fj.control.FirstOrderLag(WITH_STATE["PID"], 0.1)
 WITH_INERTIA = {
     "armature": fj.forces.Armature([0.3, 0.2, 0.1]),
+    "rotor": fj.forces.Rotor([0.05, 0.03, 0.02], gear=[2.0, -3.0, 1.5]),
     "actuator": fj.LinearActuator(
         HOOK, ELBOW, force=5.0, mass=[1.2, 0.7], com=[0.2, 0.3], inertia=[0.05, 0.03]
     ),

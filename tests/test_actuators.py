@@ -87,6 +87,29 @@ def test_the_actuator_s_force_may_depend_on_its_length():
     )
 
 
+def test_a_rotor_of_a_direct_drive_turns_as_the_link_beyond():
+    linkage, q, qd = motion("RRR")
+    rotors, inertia = fj.forces.Rotor([0.3, 0.2, 0.1], 1.0), [0.3, 0.2, 0.1]
+    heavy = linkage.replace(inertia=linkage.inertia + np.array(inertia))
+    for of, *at in ((fj.mass_matrix, q), (fj.bias_force, q, qd), (fj.energy, q, qd)):
+        found, expected = of(linkage, *at, (rotors,)), of(heavy, *at)
+        np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
+
+
+def test_a_rotor_of_a_high_ratio_is_an_armature():
+    """The coupling of the joints is 1 / gear of the armature's own."""
+    linkage, q, _ = motion("RPR")
+    matrix = lambda element: fj.mass_matrix(linkage, q, (element,))
+    own = np.array([0.3, 0.2, 0.4])
+    for gear in (5.0, 50.0):
+        found = matrix(fj.forces.Rotor(own / gear**2, gear))
+        coupling = np.zeros((3, 3))
+        coupling[0] = coupling[:, 0] = [0, *own[1:] / gear]
+        coupling[0, 0] = own[1:].sum() / gear**2
+        expected = matrix(fj.forces.Armature(own)) + coupling
+        np.testing.assert_allclose(found, expected, atol=1e-13)
+
+
 def test_the_conditioning_sees_the_armature():
     """Checks that a heavy rotor makes a light tip on a heavy arm well-conditioned."""
     linkage = fj.Linkage(

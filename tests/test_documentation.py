@@ -23,7 +23,7 @@ PUBLIC = {
 UNITLESS = {
     "existence_factors", "to_mjcf", "fig3", "fig5", "fig7", "load", "save", "stacked",
     "tune_each", "gradient_report", "league_table", "circle_scenes", "configure",
-    "Account", "Condition", "Values", "field",
+    "Condition", "Values", "field",
 }  # fmt: skip
 # Names that implement something printed in the paper.
 SOURCES = {
@@ -88,7 +88,6 @@ NAMES = [
 ]  # fmt: skip
 # Classes of results: the function that returns each.
 RETURNED_BY = {
-    "Account": "from_mjcf",
     "FitResult": "fit",
     "GradientReport": "gradient_report",
     "Efforts": "joint_efforts",

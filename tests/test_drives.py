@@ -86,15 +86,71 @@ def test_currents_stay_within_their_limits():
     assert current(2.0, np.inf, 4.0).max() == pytest.approx(2.0, rel=1e-2)
 
 
-@pytest.mark.parametrize(
-    "qd, expected",
-    [([0, 0, 0], [6, 6, -6]), ([1, -1, 1], [3, 6, -6]), ([3, -3, -1], [0, 6, -3])],
-)
-def test_a_speed_limit_is_a_line(qd, expected):
-    asked = fj.JointEffort([9.0, 9.0, -9.0])
-    drive, arm = fj.control.SpeedLimit(asked, 6.0, 2.0), fj.scenes.fig5().linkage
-    at = 0.0, np.zeros(3), np.array(qd, float), arm
-    np.testing.assert_allclose(drive(*at, drive.initial_state(arm))[0], expected)
+# A resistance of 2 ohm, and 0.3 N m/A at the joint.
+STATIC = fj.control.DCMotor(command(12.0), resistance=2.0, constant=0.1, gear=3.0)
+
+
+def test_a_motor_without_inductance_runs_up_as_an_exponential():
+    decay, top = 0.3**2 / (2 * 2.0), 12 / 0.3  # of an inertia of 2
+    ts = np.linspace(0, 100, 11)
+    motion = fj.simulate(WHEEL, STILL, ts, (STATIC,))
+    assert not jax.tree.leaves(motion.own)
+    speed = top * (1 - np.exp(-decay * ts))
+    np.testing.assert_allclose(motion.qd[:, 0], speed, rtol=1e-8, atol=1e-9)
+    after = fj.step(WHEEL, STILL, [0.0], ts[1], (STATIC,))
+    np.testing.assert_allclose(after.qd, motion.qd[1], rtol=1e-8)
+    A, B = fj.linearize(WHEEL, STILL, (STATIC,))
+    np.testing.assert_allclose(A, [[0, 1], [0, -decay]], atol=1e-14)
+    np.testing.assert_allclose(B, [[0], [0.5]], atol=1e-14)
+
+
+# Commands and speeds in all pairs, to 1.5 times the speed without load at 40 V.
+TOP = 40 / 0.3
+GRID = np.meshgrid([-1e3, -30.0, -2, 0, 5, 60], TOP * np.linspace(-1.5, 1.5, 13))
+COMMANDS, SPEEDS = (rows.ravel() for rows in GRID)
+
+
+@pytest.mark.parametrize("volts, amps", [(np.inf, np.inf), (40, 3.0), (40, np.inf)])
+def test_without_inductance_currents_are_those_at_which_others_would_end(volts, amps):
+    motor = STATIC.replace(voltage_limit=volts, current_limit=amps)
+    effort, rate = motor.respond(COMMANDS, SPEEDS, ())
+    current, back_emf = np.asarray(effort) / 0.3, 0.3 * SPEEDS
+    assert rate == ()
+    exact = np.clip((COMMANDS - back_emf) / 2, -amps, amps)
+    least, most = ((sign * volts - back_emf) / 2 for sign in (-1, 1))
+    np.testing.assert_allclose(current, np.clip(exact, least, most), atol=1e-12)
+    slow = motor.replace(inductance=0.5)
+    same, rate = slow.respond(COMMANDS, SPEEDS, current)
+    np.testing.assert_allclose(same, effort, rtol=1e-12)
+    np.testing.assert_allclose(rate, 0, atol=1e-11)
+    if volts == np.inf:  # the power heats the winding and moves the joint
+        power = 2 * current**2 + effort * SPEEDS
+        np.testing.assert_allclose(COMMANDS * current, power, rtol=1e-9, atol=1e-9)
+
+
+def test_an_inductance_is_of_all_joints_or_of_none():
+    for zero in (0, [0.0, 0.0], None):
+        assert STATIC.replace(inductance=zero).inductance is None
+    assert STATIC.replace(inductance=0.1).initial(WHEEL).shape == (1,)
+    within = jax.vmap(lambda value: STATIC.replace(inductance=value))(np.zeros(2))
+    assert not within.possible()  # while it is traced, it is taken for positive
+
+
+def test_a_speed_limit_in_four_quadrants():
+    """Driving, it falls with the speed; braking, the whole effort is left."""
+    drive = fj.control.SpeedLimit(fj.JointEffort([1.0]), 6.0, TOP)
+    effort, _ = drive.respond(COMMANDS, SPEEDS, ())
+    driving = COMMANDS * SPEEDS > 0
+    most = 6 * np.where(driving, np.maximum(1 - np.abs(SPEEDS) / TOP, 0), 1)
+    exact = np.sign(COMMANDS) * np.minimum(np.abs(COMMANDS), most)
+    np.testing.assert_allclose(effort, exact, atol=1e-12)
+    # So does a motor at its limits, up to that speed: 40 V and the current of stall.
+    motor = STATIC.replace(voltage_limit=40, current_limit=20)
+    full = 1e3 * np.sign(COMMANDS)[COMMANDS != 0], SPEEDS[COMMANDS != 0]
+    below = np.abs(full[1]) <= TOP
+    same, other = (part.respond(*full, ())[0] for part in (motor, drive))
+    np.testing.assert_allclose(same[below], other[below], atol=1e-12)
+    assert (np.abs(same - other)[~below] > 1).any()
 
 
 @pytest.mark.parametrize("ki", [0.0, 3.0])
@@ -176,6 +232,8 @@ REFUSED = {
     "resistance: expected": lambda: fj.control.DCMotor(
         ONES, resistance=-1, inductance=1, constant=1
     ),
+    "inductance: expected .* at least 0": lambda: STATIC.replace(inductance=-1),
+    "inductance: expected above 0 in all": lambda: STATIC.replace(inductance=[0, 1]),
 }
 
 

@@ -245,6 +245,11 @@ FOLLOWERS = {
         lambda s: 3 * (90 + 6 * s)
         / ((INERTIA * s**2 + FALL) * (1e-3 * s + 1) + 9 * s + 3 * (90 + 6 * s)),
     ),
+    "motor without inductance": (
+        fj.control.DCMotor(PD, **MOTOR | dict(inductance=0)),
+        lambda s: 3 * (90 + 6 * s)
+        / (INERTIA * s**2 + FALL + 9 * s + 3 * (90 + 6 * s)),
+    ),
 }  # fmt: skip
 
 

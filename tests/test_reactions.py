@@ -1,11 +1,14 @@
 """Bearing reactions: balance of each link, MuJoCo, the paper's constraint forces."""
 
+from xml.etree import ElementTree
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from chains import moving
 from helpers import random_linkage
 
 import fdof_jax as fj
@@ -134,6 +137,47 @@ def test_mujoco_has_the_same_reactions(topology):
         center = data.subtree_com[model.body_rootid[body], :2]
         moment = moment + cross(center - starts[k], force)
         size = np.abs(reactions).max()
+        np.testing.assert_allclose(reactions[k], [*force, moment], atol=1e-9 * size)
+
+
+@pytest.mark.parametrize("topology", [*fj.TOPOLOGIES, "RFR"])
+def test_mujoco_s_rotors_have_the_same_dynamics_and_reactions(topology):
+    """Bodies that spin on the links before; the gears give their rates and efforts."""
+    linkage, q, qd = motion(topology)
+    real = moving(topology)
+    q, qd = np.where(real, q, 0), np.where(real, qd, 0)
+    inertia, gear = np.array([0.3, 0.2, 0.4]), np.array([2.0, -1.5, 3.0])
+    forces = fj.forces.Rotor(inertia, gear), *JOINTS
+    reactions, qdd = instant(linkage, q, qd, forces)
+
+    root = ElementTree.fromstring(fj.to_mjcf(linkage))
+    for k in np.flatnonzero(real):
+        before = root.find(f".//body[@name='{f'link{k}' if k else 'ground'}']")
+        rotor = ElementTree.SubElement(before, "body")
+        ElementTree.SubElement(rotor, "joint", name=f"rotor{k + 1}", axis="0 0 1")
+        own = dict(mass="1e-13", diaginertia=" ".join([str(inertia[k])] * 3))
+        ElementTree.SubElement(rotor, "inertial", own, pos="0 0 0")
+    model = mujoco.MjModel.from_xml_string(ElementTree.tostring(root, "unicode"))
+    data = mujoco.MjData(model)
+    for k in np.flatnonzero(real):
+        for name, ratio in ((f"joint{k + 1}", 1.0), (f"rotor{k + 1}", gear[k])):
+            joint = data.joint(name)
+            joint.qpos, joint.qvel, joint.qacc = ratio * np.array([q, qd, qdd])[:, k]
+    mujoco.mj_inverse(model, data)
+    mujoco.mj_rnePostConstraint(model, data)
+
+    size = np.abs(reactions).max()
+    for k in np.flatnonzero(real):
+        needed = data.joint(f"joint{k + 1}").qfrc_inverse
+        needed = needed + gear[k] * data.joint(f"rotor{k + 1}").qfrc_inverse
+        effort = sum(e(0.0, q, qd, linkage)[k] for e in JOINTS)
+        np.testing.assert_allclose(needed, effort, atol=1e-10 * size)
+    starts = np.asarray(fj.joint_positions(linkage, q))
+    for k in np.flatnonzero(real):
+        body = model.body(f"link{k + 1}").id
+        moment, force = data.cfrc_int[body, 2], data.cfrc_int[body, 3:5]
+        center = data.subtree_com[model.body_rootid[body], :2]
+        moment = moment + cross(center - starts[k], force)
         np.testing.assert_allclose(reactions[k], [*force, moment], atol=1e-9 * size)
 
 

@@ -28,7 +28,7 @@ from ..linkage.linkage import (
 )
 from ..linkage.topology import fixed_pairs
 from ..references.reference import Reference, reference_motion
-from ..simulation.field import element_effort, stateful
+from ..simulation.field import element_effort, has_states
 from ..simulation.prescribed import prescribed
 from ..simulation.sampled import check_joints
 from ..simulation.scene import accepts_scene
@@ -50,16 +50,16 @@ class Linearization(NamedTuple):
     B: Float[Array, "state joint"]
 
 
-def depends_on_state_alone(forces: tuple[Element, ...]) -> bool:
+def depends_on_state_alone(linkage: Linkage, forces: tuple[Element, ...]) -> bool:
     """Returns whether no element has a state of its own or prescribes a motion."""
-    return not stateful(forces) and prescribed(forces) is None
+    return not has_states(linkage, forces) and prescribed(forces) is None
 
 
 def checked(linkage: Linkage, forces: Forces) -> tuple[Element, ...]:
     """Returns the forces as elements, which may have no state."""
     check_linkage(linkage)
     acting = elements_on(linkage, forces)
-    if depends_on_state_alone(acting):
+    if depends_on_state_alone(linkage, acting):
         return of_full_size(linkage, acting)
     raise ValueError(
         "forces: expected elements without a state of their own and no "
@@ -71,9 +71,11 @@ def total_effort(
     linkage: Linkage, forces: tuple[Element, ...], t: Array, q: Array, qd: Array
 ) -> Array:
     """Computes the sum of the efforts of elements without a state [N or N m]."""
-    rows = enumerate(forces)
-    efforts = (element_effort(k, e, t, q, qd, linkage, ())[0] for k, e in rows)
-    return sum(efforts, jnp.zeros_like(q))
+    total = jnp.zeros_like(q)
+    for k, element in enumerate(forces):
+        empty = element.initial_state(linkage)
+        total = total + element_effort(k, element, t, q, qd, linkage, empty)[0]
+    return total
 
 
 def equilibrium(

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax import Array
 from numpy.typing import ArrayLike
 
-from ..base.checks import real_array
+from ..base.checks import is_traced, real_array
 from ..forces.element import StatefulElement, element_of, naming
 from ..forces.switches import clip
 from ..linkage.fields import Condition, Values, called, field
@@ -145,7 +145,12 @@ class SpeedLimit(Drive):
     """A drive whose effort limit falls with speed: a straight torque-speed curve.
 
     In the direction of motion the effort is at most stall * (1 - |qd| / no_load), not
-    below 0. Against the motion it is at most stall.
+    below 0. Against the motion it is at most stall, at any speed.
+
+    This is the curve in data sheets of servo drives, whose amplifiers limit the current
+    to that of stall. A motor on a limited voltage alone brakes with more than stall, as
+    its back-EMF adds to the voltage, and is braked above the no-load speed: take a
+    `DCMotor` where that matters.
 
     **Arguments:** `command`: a force element; `stall` [N or N m] and `no_load` [m/s or
     rad/s]: one per joint or one for all, positive.
@@ -177,14 +182,21 @@ class DCMotor(Drive):
     and the effort is constant * gear * i. The command returns the voltages v. They are
     clipped such that the current stays within its limit, then to +-voltage_limit. At
     speeds whose back-EMF exceeds that limit, the back-EMF drives the current. The
-    inertia of the rotors is a separate `Armature`.
+    inertia of the rotors is a separate `Rotor` or `Armature`.
+
+    Without inductance the current is (v - constant * gear * qd) / resistance at once,
+    and the motor has no state. Take that where inductance / resistance, often about a
+    millisecond, is short beside the motion: explicit steps are otherwise as short.
 
     **Arguments:** one value per joint or one for all, positive.
 
     - `command`: a force element, read as voltages [V].
-    - `resistance` [ohm], `inductance` [H]: values of the winding.
-    - `constant`: torque and back-EMF constant [N m/A = V s/rad; N/A for a slide].
-    - `gear`: turns of the motor per turn of the joint (per metre of a slide).
+    - `resistance`: of the winding [ohm].
+    - `inductance`: of the winding, in all joints or in none [H]. Zeros are stored as
+      None; while it is traced, it is taken for positive.
+    - `constant`: torque and back-EMF constant [N m/A = V s/rad; N/A of a linear motor].
+    - `gear`: angle of the motor per angle of the joint [1] or per metre of a slide
+      [rad/m].
     - `voltage_limit` [V], `current_limit` [A]: may be infinite.
 
     **Raises:** ValueError for malformed arguments.
@@ -197,12 +209,17 @@ class DCMotor(Drive):
     >>> speeds, state = jnp.array([0.0, 120, 240]), motor.initial_state(arm)
     >>> motor(0.0, [0, 0, 0], speeds, arm, state)[1].own.tolist()  # rates [A/s]
     [2400.0, 1200.0, 0.0]
+    >>> static = motor.replace(inductance=0)
+    >>> static(0.0, [0, 0, 0], speeds, arm, static.initial_state(arm))[0].tolist()
+    [1.2, 0.6, 0.0]
     """
 
     resistance: Values = field(unit="ohm", above=0, kw_only=True)
-    inductance: Values = field(unit="H", above=0, kw_only=True)
+    inductance: Values | None = field(
+        unit="H", minimum=0, optional=True, default=0.0, kw_only=True
+    )
     constant: Values = field(unit="N m/A or N/A", above=0, kw_only=True)
-    gear: Values = field(unit="1 or 1/m", above=0, default=1.0, kw_only=True)
+    gear: Values = field(unit="1 or rad/m", above=0, default=1.0, kw_only=True)
     voltage_limit: Values = field(
         unit="V", above=0, finite=False, default=jnp.inf, kw_only=True
     )
@@ -210,8 +227,22 @@ class DCMotor(Drive):
         unit="A", above=0, finite=False, default=jnp.inf, kw_only=True
     )
 
+    def __check_init__(self):
+        # Whether currents are states has to be known where the numbers are traced.
+        if self.inductance is not None and not is_traced(self.inductance):
+            rules = type(self).__dataclass_fields__["inductance"].metadata["rules"]
+            if not real_array("inductance", self.inductance, **rules).any():
+                object.__setattr__(self, "inductance", None)
+
+    def conditions(self):
+        if self.inductance is not None:
+            expected = "above 0 in all joints, or 0 in all"
+            positive = (self.inductance > 0).all()
+            yield Condition(positive, "inductance", expected, self.inductance)
+
     def initial(self, linkage):
-        return jnp.zeros(joints_of(linkage))  # currents [A]
+        """The currents at the start [A], which are no state without inductance."""
+        return () if self.inductance is None else jnp.zeros(joints_of(linkage))
 
     def respond(self, command, qd, own):
         per_joint = self.constant * self.gear
@@ -222,5 +253,7 @@ class DCMotor(Drive):
         most = jnp.where(unlimited, jnp.inf, most)
         voltage = clip(command, back_emf - most, back_emf + most)
         voltage = clip(voltage, -self.voltage_limit, self.voltage_limit)
+        if self.inductance is None:
+            return per_joint * (voltage - back_emf) / self.resistance, ()
         rate = (voltage - self.resistance * own - back_emf) / self.inductance
         return per_joint * own, rate

@@ -1,13 +1,12 @@
 """Tables of motions, files of pytrees, and export to other engines."""
 
 from .files import load, save
-from .mjcf_reading import Account, MjcfModel, from_mjcf
+from .mjcf_reading import MjcfModel, from_mjcf
 from .mjcf_writing import to_mjcf
 from .tables import to_pandas, to_xarray
 
 __all__ = [
-    "Account", "from_mjcf", "load", "MjcfModel", "save", "to_mjcf", "to_pandas",
-    "to_xarray",
+    "from_mjcf", "load", "MjcfModel", "save", "to_mjcf", "to_pandas", "to_xarray",
 ]  # fmt: skip
 
 

@@ -43,7 +43,7 @@ class MjcfModel(NamedTuple):
     """A model as `from_mjcf` reads it.
 
     - `linkage`, `state0` [m or rad; m/s or rad/s], `forces`: what `simulate` takes.
-    - `account`: an `Account` of what became of each part.
+    - `account`: a table of what became of each part; `account.lines` has its rows.
     """
 
     linkage: Linkage

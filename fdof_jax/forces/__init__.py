@@ -1,7 +1,7 @@
 """Force elements: joint efforts, springs, dampers, stops, actuators."""
 
 from ..linkage.fields import Condition, Values, field
-from .actuators import Armature, LinearActuator
+from .actuators import Armature, LinearActuator, Rotor
 from .element import Element, InertialElement, StatefulElement
 from .joints import (
     EffortHistory,
@@ -17,8 +17,8 @@ from .switches import clip, switch
 __all__ = [
     "Armature", "clip", "Condition", "EffortHistory", "Element", "field",
     "InertialElement", "JointDamper", "JointEffort", "JointFriction", "JointSpring",
-    "JointStops", "LinearActuator", "Load", "Point", "PointElement", "SpringDamper",
-    "StatefulElement", "switch", "Tension", "Values", "Wrench",
+    "JointStops", "LinearActuator", "Load", "Point", "PointElement", "Rotor",
+    "SpringDamper", "StatefulElement", "switch", "Tension", "Values", "Wrench",
 ]  # fmt: skip
 
 

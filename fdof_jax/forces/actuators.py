@@ -9,12 +9,18 @@ from jax import Array
 from ..linkage.fields import Values, field, value_of
 from ..linkage.frames import cross, dot, length_of, scalar_frames
 from ..linkage.linkage import Linkage, joints_of
+from ..linkage.topology import fixed_pairs, real_joints
 from .element import InertialElement
-from .points import Between, Load, over
+from .points import Between, Load, Point, over
 
 
 class Armature(InertialElement):
     """Rotors geared to the joints: inertia that turns with a joint's relative rate.
+
+    This is the usual approximation, which MuJoCo has too: the rate of the link that
+    carries the rotor is left out. At gear ratios of 50 and more, accelerations differ
+    by about half a percent. For direct drives and low ratios take `Rotor`, the exact
+    one.
 
     **Arguments:** `inertia`: the rotor's inertia times the square of the gear ratio,
     one per joint or one for all, not negative [kg m^2; kg for a prismatic joint].
@@ -39,6 +45,52 @@ class Armature(InertialElement):
     def loads(self, t, q, qd, qdd, linkage):
         """Returns no loads: the rotors act in the joints."""
         return ()
+
+
+class Rotor(InertialElement):
+    """Rotors of the joints' motors, on the links before the joints: exact coupling.
+
+    A rotor turns about an axis at right angles to the plane. Its absolute rate is that
+    of the link before the joint plus gear * qd, and its kinetic energy is
+    inertia * rate^2 / 2. Its mass belongs to the link that carries it. A fixed pair has
+    no rotor.
+
+    Take it for direct drives and low gear ratios. At ratios of 50 and more, an
+    `Armature` of gear^2 * inertia is as good: what it leaves out is 1 / gear of it.
+
+    **Arguments:** one value per joint or one for all.
+
+    - `inertia`: of the rotor itself, not negative [kg m^2].
+    - `gear`: angle of the rotor, relative to the link before, per angle of the joint
+      [1] or per metre of a slide [rad/m]; negative if it turns the other way. The gear
+      of a `DCMotor` is its magnitude.
+
+    **Raises:** ValueError for malformed arguments and negative inertias.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.Linkage(
+    ...     "RR", length=[0, 1, 1], com=[[0.5, 0]] * 2, mass=[1, 1], inertia=[0.1] * 2)
+    >>> direct = fj.forces.Rotor(inertia=[0, 0.2], gear=1)  # turns as the second link
+    >>> (fj.mass_matrix(arm, [0, 0], (direct,)) - fj.mass_matrix(arm, [0, 0])).tolist()
+    [[0.2, 0.2], [0.2, 0.2]]
+    """
+
+    inertia: Values = field(unit="kg m^2", minimum=0)
+    gear: Values = field(unit="1 or rad/m")
+
+    def coordinates(self, q, linkage):
+        turns = jnp.where(jnp.stack(real_joints(linkage.ef)), q, 0)
+        before = jnp.cumsum(turns) - turns  # by which the link before has turned
+        return before + self.gear * q
+
+    def weights(self, linkage):
+        return jnp.where(jnp.stack(fixed_pairs(linkage.ef)), 0, self.inertia)
+
+    def loads(self, t, q, qd, qdd, linkage):
+        """Returns the moments of the rotors on the links that carry them."""
+        spin_up = self.coordinates(qdd, linkage)  # as they are linear
+        moments = -self.weights(linkage) * spin_up
+        return tuple(Load(Point(k), (0, 0), moment) for k, moment in enumerate(moments))
 
 
 class LinearActuator(Between, InertialElement):

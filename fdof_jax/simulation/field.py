@@ -54,8 +54,17 @@ def schedule_of(t: Array, args: Args) -> tuple[Any, ...]:
 
 
 def stateful(forces: tuple[Element, ...]) -> list[StatefulElement]:
-    """Returns the elements that have a state of their own."""
+    """Returns the elements that have a state of their own, which may be empty."""
     return [element for element in forces if isinstance(element, StatefulElement)]
+
+
+def has_states(linkage: Linkage, forces: tuple[Element, ...]) -> bool:
+    """Returns whether there is a number in any element's state; some drives have none.
+
+    A `SpeedLimit`, for instance, has no state but that of its command.
+    """
+    states = jax.eval_shape(lambda: initial_states(linkage, forces))
+    return bool(jax.tree.leaves(states))
 
 
 def with_states(

@@ -20,12 +20,19 @@ from ..base.checks import (
     whole_number,
 )
 from ..base.functions import sharing_functions
-from ..forces.element import Element, Forces, ScalarElement, element_of, elements
+from ..forces.element import (
+    Element,
+    Forces,
+    ScalarElement,
+    element_of,
+    elements,
+    elements_on,
+)
 from ..forces.joints import JointEffort
 from ..linkage.coordinates import State, real_state
 from ..linkage.linkage import Linkage, check_linkage, joints_of, without_fixed
 from ..steps.looped_dopri8 import LoopedDopri8
-from .field import initial_states, stateful
+from .field import has_states, initial_states
 from .simulate import check_elements, simulate
 from .solution import Solution, WithOutcome
 
@@ -75,13 +82,13 @@ def step(
 
     **Raises:** ValueError for malformed arguments.
     """
-    if stateful(elements("forces", forces)):
+    check_linkage(linkage)
+    if has_states(linkage, elements_on(linkage, forces)):
         raise ValueError(
             "forces: expected elements without a state of their own, which would be "
             "lost (simulate takes such states as own0 and returns them), got "
             f"{shown(forces)}."
         )
-    check_linkage(linkage)
     state = real_state("state", state, linkage)
     dt, t = real_array("dt", dt, (), above=0), real_array("t", t, ())
     ts, acting = jnp.stack([t, t + dt]), (*forces, JointEffort(tau))

@@ -213,7 +213,7 @@ def gradient_report(scene: Scene) -> GradientReport:
     at_limit = np.abs(demands) > 1
     saturated = np.mean(at_limit, axis=0)
     modes, stiff = None, []
-    if depends_on_state_alone(scene.forces):
+    if depends_on_state_alone(scene.linkage, scene.forces):
         modes = closed_loop_modes(scene.linkage, scene.forces, few)
         stiff = _stiffness(modes, t1)
     stats = _motion(scene).stats
