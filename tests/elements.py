@@ -96,8 +96,8 @@ WITH_STATE["actuators"] = fj.control.Actuators(
     upper=[0.6, 9.0],
     effort_lower=[-9.0, -0.5, -9.0],
     activation=fj.control.Activation(
-        gain=[3.0, 0.0], rate=[[4.0, -4.0, 0.1, -0.2], [0.0, 0.0, 0.0, 0.0]],
-        start=[0.1, 0.0],
+        gain=[3.0, -2.0], rate=[[4.0, -4.0, 0.1, -0.2], [1.0, -0.5, 0.3, 0.2]],
+        start=[0.1, 0.2],
     ),
 )  # fmt: skip
 WITH_STATE["static motor"] = WITH_STATE["motor"].replace(inductance=0)

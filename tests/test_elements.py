@@ -111,7 +111,7 @@ def is_number(path, leaf):
 
 
 # Parameters that other limits hide.
-IDLE = {"DCMotor.command.limit"}
+IDLE = {"DCMotor.command.limit", "Actuators.upper", "Actuators.effort_lower"}
 
 
 def scaled(forces, factors):
