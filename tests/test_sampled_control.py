@@ -9,7 +9,6 @@ from elements import SHORT as STEPS
 from modes import LOOPS
 
 import fdof_jax as fj
-from fdof_jax.steps.looped_dopri8 import LoopedDopri8
 
 # I qdd = tau.
 DISC = fj.Linkage(
@@ -38,40 +37,108 @@ def ramp(t, q, qd, linkage):
     return jnp.stack([1 + t])
 
 
-@pytest.mark.parametrize("delay", [0.0, 0.03])
+# Of no, one, two and three whole periods; 0.3 / 0.1 is 2.9999999999999996.
+@pytest.mark.parametrize("delay", [0.0, 0.03, 0.17, 0.3])
 def test_efforts_are_held_and_come_late(delay):
     motion = fj.simulate_sampled(DISC, STILL, ramp, 0.1, 5, delay=delay)
     np.testing.assert_allclose(motion.ts, np.arange(6) * 0.1, atol=1e-15)
     commanded = 1 + motion.ts[:-1]
     np.testing.assert_allclose(motion.tau[:, 0], commanded, rtol=1e-12)
-    held = np.append(0, commanded)
-    gained = ((0.1 - delay) * held[1:] + delay * held[:-1]) / 2
+    whole, part = divmod(round(100 * delay), 10)
+    late = np.concatenate([np.zeros(whole + 1), commanded, commanded[-1:]])
+    before, after = late[:5], late[1:6]  # what acts first and last in each period
+    gained = ((10 - part) * after + part * before) / 200
     np.testing.assert_allclose(motion.qd[1:, 0], np.cumsum(gained), rtol=1e-7)
-    acting = held[:-1] if delay else held[1:]
-    acting = np.append(acting, held[-1])  # at the end the last command acts
+    acting = late[:6] if part else late[1:7]  # at the end the last command acts
     efforts = fj.joint_efforts(DISC, (ramp,), motion).elements[0]
     np.testing.assert_allclose(efforts[:, 0], acting, rtol=1e-12)
     reactions = fj.joint_reactions(DISC, (ramp,), motion)
     np.testing.assert_allclose(reactions[:, 0, 2], acting, rtol=1e-12)
 
 
-@pytest.mark.parametrize("delay", [0.0, 0.05, 0.12])
-def test_delays_may_be_traced(delay):
-    motion = delayed(delay)
-    if delay > 0.1:
-        assert np.isnan(motion.q[-1])
-        return
-    # An inertia of 2 under 1 N m, and under 1.1 N m a period later.
-    np.testing.assert_allclose(motion.qd[-1], 0.105 - 0.55 * delay, rtol=1e-7)
-    begun = (0.1 - delay) * delay / 2 + delay**2 / 4
-    found = motion.q_begin[1] - motion.q[1]
-    np.testing.assert_allclose(found, [begun], rtol=1e-6, atol=1e-15)
+def test_efforts_come_late_in_the_pieces_of_a_motion():
+    motion = fj.simulate_sampled(RODS, BENT, CONTROL, 0.02, 6, delay=0.03)
+    commanded = [CONTROL(*row, RODS) for row in zip(motion.ts, motion.q, motion.qd)]
+    np.testing.assert_allclose(motion.tau, commanded[:6], rtol=1e-12)
+    state, late = BENT, [np.zeros(2), np.zeros(2), *commanded]
+    for k in range(6):
+        middle = fj.step(RODS, state, late[k], 0.01)
+        np.testing.assert_allclose(motion.q_begin[k], middle.q, rtol=1e-10)
+        state = fj.step(RODS, middle, late[k + 1], 0.01)
+        reached = motion.q[k + 1], motion.qd[k + 1]
+        np.testing.assert_allclose(reached, state, rtol=1e-9, atol=1e-10)
 
 
-@jax.jit
-def delayed(delay):
-    options = dict(delay=delay, solver=LoopedDopri8())
-    return fj.simulate_sampled(DISC, STILL, ramp, 0.1, 2, **options)
+def advance(x, delay, gains):
+    """Advances a disc under delayed feedback by a period of 0.1 s, in closed form.
+
+    The state `x` is its position, velocity, and commands under way, the newest first.
+    Returns it with the effort at the start and the position at the change of effort.
+    """
+    whole = int(delay / 0.1 + 1e-9)
+    commands = [-gains @ x[:2], *x[2:]]
+    part, (new, last) = delay - 0.1 * whole, commands[whole : whole + 2]
+    if part < 1e-9:
+        last = new
+    q, qd = x[0] + part * x[1] + part**2 * last / 4, x[1] + part * last / 2
+    begin, rest = q, 0.1 - part
+    q, qd = q + rest * qd + rest**2 * new / 4, qd + rest * new / 2
+    after = np.array([q, qd, *commands[: whole + 1]])
+    return after, last, begin if part > 1e-9 else q
+
+
+def sampled(delay, gains):
+    """Returns rows of 60 samples, and the last position.
+
+    Rows are position, velocity, effort, position at its change, and command.
+    """
+    x, rows = np.array([1, *np.zeros(2 + int(delay / 0.1 + 1e-9))]), []
+    for _ in range(60):
+        after, *others = advance(x, delay, gains)
+        rows.append([*x[:2], *others, after[2]])
+        x = after
+    return np.array(rows), x[0]
+
+
+def delayed(delay, gains):
+    feedback = lambda t, q, qd, linkage: -gains[0] * q - gains[1] * qd
+    start = fj.State(jnp.ones(1), jnp.zeros(1))
+    motion = fj.simulate_sampled(DISC, start, feedback, 0.1, 60, delay=delay)
+    return motion.q[-1, 0], motion
+
+
+def test_delayed_feedback_follows_its_transition_matrix():
+    """For traced delays and gains, some of which are stable, with derivatives."""
+    delays = 0.1 * np.array([0, 0.3, 1, 1.5, 2, 3.7, 1e6, -0.1])
+    gains = np.array([[8.0, 6.0], [30.0, 12.0]])
+    both = jax.value_and_grad(delayed, (0, 1), has_aux=True)
+    pairs = jax.vmap(jax.vmap(both, (None, 0)), (0, None))
+    (_, motions), slopes = jax.jit(pairs, **LOOPS)(delays, gains)
+    for i, j in np.ndindex(6, 2):
+        delay, gain = delays[i], gains[j]
+        one = lambda leaf, i=i, j=j: leaf[i, j]
+        motion, of_delay, of_gains = jax.tree.map(one, (motions, *slopes))
+        rows, _ = sampled(delay, gain)
+        found = motion.q[:-1], motion.qd[:-1], motion.acting[:-1], motion.q_begin
+        size = np.abs(rows).max()
+        found = np.concatenate([*found, motion.tau], axis=1)
+        np.testing.assert_allclose(found, rows, atol=1e-9 * size, rtol=0)
+        # The matrix has a column for each state and command under way.
+        units = np.eye(len(advance(np.zeros(9), delay, gain)[0]))
+        columns = [advance(unit, delay, gain)[0] for unit in units]
+        stable = np.abs(np.linalg.eigvals(np.transpose(columns))).max() < 1
+        assert (np.abs(motion.q[-10:]).max() < 1) == stable
+        # To one side, as there is a kink where a delay is a whole number of periods.
+        end = lambda delay, gain: sampled(delay, gain)[1]
+        ends = [end(delay + h, gain) for h in (0, 1e-5, 2e-5)]
+        difference = np.array([-3, 4, -1]) @ ends / 2e-5
+        np.testing.assert_allclose(of_delay, difference, rtol=1e-5, atol=1e-9 * size)
+        steps = 1e-4 * np.eye(2)
+        change = [(end(delay, gain + h) - end(delay, gain - h)) / 2e-4 for h in steps]
+        np.testing.assert_allclose(of_gains, change, rtol=1e-5, atol=1e-9 * size)
+    np.testing.assert_array_equal(motions.q[6], 1)  # no command arrives
+    np.testing.assert_array_equal(motions.acting[6], 0)
+    assert np.isnan(motions.q[7, :, -1]).all()  # a delay below 0
 
 
 def test_no_delay_is_known_within_jit():
@@ -155,7 +222,7 @@ LAG = fj.control.FirstOrderLag(fj.JointEffort(np.ones(2)), 0.1)
 REFUSED = {
     "period: expected": dict(period=0.0),
     "samples: expected": dict(samples=0),
-    "delay: expected": dict(delay=0.1),
+    "delay: expected": dict(delay=-0.1),
     "control: expected": dict(control=3.0),
     "forces: expected": dict(forces=[LAG]),
     "noise, key: expected": dict(noise=(0.1, 0.1)),

@@ -52,9 +52,10 @@ def test_the_work_of_held_efforts_is_exact():
     assert line[-1] == 1.75  # [J] put in
 
 
-def test_the_work_of_late_efforts_is_exact():
+@pytest.mark.parametrize("delay", [0.03, 0.1, 0.17])
+def test_the_work_of_late_efforts_is_exact(delay):
     noisy = lambda t, q, qd, linkage: 5 * jnp.sin(40 * t + jnp.zeros(1))
-    motion = fj.simulate_sampled(DISC, STILL, noisy, 0.1, 5, delay=0.03)
+    motion = fj.simulate_sampled(DISC, STILL, noisy, 0.1, 5, delay=delay)
     ax = plotting.energy_stack(DISC, (noisy,), motion)
     top, (line,) = tops(ax, motion.ts)["taken out"], values(ax)
     np.testing.assert_allclose(top, line, rtol=1e-12)

@@ -135,12 +135,13 @@ def _works(
     if not isinstance(solution, SampledMotion):
         return [_integral(np.maximum(sign * powers, 0), ts) for sign in signs]
     # The power of held efforts jumps, but their work is known: in each period that of
-    # the last command, until the next one begins to act, and that of the next.
-    q, tau = np.asarray(solution.q)[: len(ts)], np.asarray(solution.tau)[: len(ts) - 1]
-    begin = q if solution.q_begin is None else np.asarray(solution.q_begin)
-    begin = begin[: len(tau)]
-    last = np.append(np.zeros_like(tau[:1]), tau[:-1], axis=0)
-    works = np.sum([last * (begin - q[:-1]), tau * (q[1:] - begin)], axis=-1)
+    # what acts at its sample, until the next command begins to act, and that of this.
+    q, acting = (np.asarray(rows)[: len(ts)] for rows in (solution.q, forces[0].tau))
+    acting = np.nan_to_num(acting)  # a command that ends the motion does no work
+    begin = q[1:] if solution.q_begin is None else np.asarray(solution.q_begin)
+    begin = begin[: len(ts) - 1]
+    works = acting[:-1] * (begin - q[:-1]), acting[1:] * (q[1:] - begin)
+    works = np.sum(works, axis=-1)
     return [
         _integral(np.maximum(sign * powers[1:], 0), ts)
         + np.append(0, np.maximum(sign * works, 0).sum(axis=0).cumsum())

@@ -1,24 +1,17 @@
 """Control in discrete time, with efforts held constant between samples."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from ..base.checks import (
-    concrete,
-    function,
-    is_traced,
-    real_array,
-    refusal,
-    shown,
-    whole_number,
-)
+from ..base.checks import function, is_traced, real_array, refusal, shown, whole_number
 from ..base.functions import sharing_functions
 from ..forces.element import (
     Element,
@@ -108,13 +101,14 @@ class SampledMotion(WithOutcome):
       `outcome` states it in words.
     - `own`: the states of the forces' `StatefulElement`s at `ts`.
     - `delay`: time from a sample to the action of its command [s].
-    - `q_begin`: joint positions at which each command begins to act (samples, n); None
-      without a delay, where these are `q[:-1]`.
+    - `q_begin`: joint positions at which, within each period, the next command begins
+      to act (samples, n); None if commands begin to act at samples only.
+    - `acting`: efforts that act at `ts`, or begin to act there (samples + 1, n)
+      [N or N m]. None without a delay, where these are `tau` and, at the end, its last.
 
     Pictures, tables, `joint_efforts` and `joint_reactions` take it as they take a
     `Solution`. Its `forces` are there `(control, *forces)`, the controller first. The
-    controller's efforts are those that act: with a delay, a sample has the command of
-    the sample before, and the first one has none.
+    controller's efforts are those that act, 0 before the first command has arrived.
     """
 
     ts: Float[Array, " time"]
@@ -125,6 +119,7 @@ class SampledMotion(WithOutcome):
     own: tuple[Any, ...]
     delay: Float[Array, ""] | float = 0.0
     q_begin: Float[Array, "sample joint"] | None = None
+    acting: Float[Array, "time joint"] | None = None
 
 
 Motion = Solution | SampledMotion
@@ -141,7 +136,10 @@ def acting_in(motion: Motion, forces: tuple[Element, ...]) -> tuple[Element, ...
         raise ValueError(
             "forces: expected (control, *forces) of a SampledMotion, got ()."
         )
-    return _Held(motion.ts[:-1] + motion.delay, motion.tau), *forces[1:]
+    acting = motion.acting
+    if acting is None:
+        acting = jnp.concatenate([motion.tau, motion.tau[-1:]])
+    return _Held(motion.ts, acting), *forces[1:]
 
 
 def check_joints(name: str, solution: Any, linkage: Linkage) -> None:
@@ -154,6 +152,38 @@ def check_joints(name: str, solution: Any, linkage: Linkage) -> None:
             f"{name}: expected a motion of {count} joints, as the linkage has, got "
             f"positions of shape {jnp.shape(solution.q)}."
         )
+
+
+class _Delay(NamedTuple):
+    """A delay in periods.
+
+    - `time`: the delay [s].
+    - `whole`: number of whole periods, an array where the delay is traced.
+    - `rest`: time beyond them [s]; None if it is known to be 0.
+    - `most`: upper bound of `whole`.
+    """
+
+    time: Array
+    whole: Array | int
+    rest: Array | None
+    most: int
+
+
+def _in_periods(delay: Any, period: Any, samples: int) -> _Delay:
+    """Splits a delay into periods of a motion of so many samples."""
+    traced = is_traced(delay, period)
+    xp: Any = jnp if traced else np
+    delay, period = xp.asarray(delay, float), xp.asarray(period, float)
+    time = jnp.asarray(delay, float)
+    rounding = 4 * float(jnp.finfo(time.dtype).eps) * delay
+    whole = xp.floor((delay + rounding) / period)  # 2.9999999999999996 is 3
+    rest = delay - whole * period
+    most = samples + 1  # then no command arrives, as with all longer delays
+    whole = xp.minimum(whole, most).astype(int)
+    if traced:
+        return _Delay(time, whole, rest, most)
+    rest = jnp.asarray(rest, float) if rest > rounding else None
+    return _Delay(time, int(whole), rest, int(whole))
 
 
 def simulate_sampled(
@@ -181,9 +211,11 @@ def simulate_sampled(
     - `period`: time between samples [s]; `samples`: number of samples.
     - `forces`: other force elements.
     - `t0`: time of the first sample [s].
-    - `delay`: time from measurement to action, less than a period [s]. The effort is
-      zero until the first command acts. A traced delay that is too long ends the motion
-      as not finite.
+    - `delay`: time from measurement to action [s], which may be longer than a period.
+      The effort is zero until the first command acts. The motion has a kink where the
+      delay is a whole number of periods; derivatives there are those of longer delays.
+      Each number of whole periods takes a program of its own, all traced delays take
+      one. A traced delay below 0 ends the motion as not finite.
     - `noise`: standard deviations of the measured positions and velocities (each (n,)
       or one for all), with a `jax.random` `key`.
     - `options`: keywords of `simulate`.
@@ -191,6 +223,14 @@ def simulate_sampled(
     **Returns:** a `SampledMotion`.
 
     **Raises:** ValueError for malformed arguments.
+
+    >>> import fdof_jax as fj
+    >>> arm, start, (pd,), _ = fj.scenes.fig7()
+    >>> motion = fj.simulate_sampled(arm, start, pd, 0.01, 4, delay=0.02)
+    >>> motion.tau[:, 0].tolist()  # commanded at the samples
+    [15.873, 17.236, 18.321, 13.740]
+    >>> motion.acting[:, 0].tolist()  # at the samples and the end
+    [0.0, 0.0, 15.873, 17.236, 18.321]
     """
     check_linkage(linkage)
     forces, n = elements("forces", forces), joints_of(linkage)
@@ -199,13 +239,7 @@ def simulate_sampled(
     every = real_array("period", period, (), above=0)
     t0 = real_array("t0", t0, ())
     whole_number("samples", samples, 1)
-    lag = real_array("delay", delay, (), minimum=0)
-    # Within `jax.jit`, arrays made of known numbers are traced.
-    known_delay, longest = concrete(delay), concrete(period)
-    if known_delay is not None and longest is not None and not known_delay < longest:
-        raise ValueError(
-            f"delay: expected less than the period of {longest} s, got {known_delay} s."
-        )
+    real_array("delay", delay, (), minimum=0)
     if (noise is None) != (key is None):
         raise ValueError("noise, key: expected both or none of them, got one.")
     spread = None
@@ -224,16 +258,16 @@ def simulate_sampled(
     state0 = real_state("state0", state0, linkage)
     times = t0 + every * jnp.arange(samples + 1)
     check_elements((control, *forces), linkage, times)
-    lag = None if known_delay is not None and known_delay == 0 else lag
+    late = _in_periods(delay, period, samples)
     keys = None if key is None else jax.random.split(key, samples)
     options = dict(throw=False) | options
-    inputs = linkage, state0, control, times, forces, lag, spread, keys
+    inputs = linkage, state0, control, times, forces, late, spread, keys
     if options.get("solver") is None and not is_traced(inputs):
         # Traced in `_motion`, `simulate` would take the solver of large batches.
         options["solver"] = LoopedDopri8()
 
     def run(control, forces):
-        others = lag, spread, keys, options
+        others = late, spread, keys, options
         return _motion(linkage, state0, control, times, forces, *others)
 
     return sharing_functions(run, control=control, forces=forces)
@@ -241,15 +275,23 @@ def simulate_sampled(
 
 @eqx.filter_jit  # not traced anew at each call
 def _motion(
-    linkage, state0, control, times, forces, delay, spread, keys, options
+    linkage, state0, control, times, forces, late, spread, keys, options
 ) -> SampledMotion:
-    """Simulates period by period; `delay` and the noise's `spread` may be None."""
+    """Simulates period by period; the noise's `spread` may be None."""
 
-    period = times[1] - times[0]
+    delay, whole, rest, most = late
+    period, within = times[1] - times[0], False  # whether commands arrive within it
+    if rest is not None:
+        # Beside both ends of a period, as output times have to increase, and a jump at
+        # the very start of a solve has no derivative.
+        latest = jnp.maximum(abs(times[0]), abs(times[-1]))
+        edge = 4 * jnp.finfo(times.dtype).eps * latest
+        within = rest > edge
+        rest += jax.lax.stop_gradient(jnp.clip(rest, edge, period - edge) - rest)
 
     def one(carry, inputs):
-        (state, own), memory, held, result = carry
-        begin, end, key = inputs
+        (state, own), memory, under_way, held, result = carry
+        k, begin, end, key = inputs
         measured = state
         if spread is not None:
             measured = jax.tree.map(
@@ -261,13 +303,16 @@ def _motion(
         tau, rates = control.act(begin, *measured, linkage, memory)
         tau = without_fixed(linkage, real_array("control", tau, measured.q.shape))
         memory = jax.tree.map(lambda m, rate: m + period * rate, memory, rates)
-        effort, at = JointEffort(tau), [begin, end]
-        if delay is not None:
-            starts = begin + delay + jnp.stack([-period, 0 * period])
-            effort = _Held(starts, jnp.stack([held, tau]))
-            # Beside both ends, as output times have to increase.
-            edge = jnp.finfo(times.dtype).eps * jnp.maximum(abs(begin), abs(end))
-            at.insert(1, jnp.clip(begin + delay, begin + edge, end - edge))
+        arrives = tau
+        if most > 0:  # a ring: shifting all commands may cost as much as the solves
+            under_way = under_way.at[k % (most + 1)].set(tau)
+            arrives = under_way[(k - whole) % (most + 1)]
+        effort, at = JointEffort(arrives), [begin, end]
+        if rest is not None:
+            start = begin + rest
+            begins = jnp.stack([start - period, start])
+            effort = _Held(begins, jnp.stack([held, arrives]))
+            at.insert(1, start)
         acting = *forces, effort
         solution = simulate(linkage, state, jnp.stack(at), acting, own0=own, **options)
         rows = State(solution.q, solution.qd), solution.own
@@ -275,21 +320,28 @@ def _motion(
         last = jax.tree.map(lambda rows: rows[-1], rows)
         good = result == diffrax.RESULTS.successful
         result = diffrax.RESULTS.where(good, solution.result, result)
-        acts = None if delay is None else solution.q[1]
-        return (last, memory, tau, result), (starts, tau, acts)
+        q_begin = None
+        if rest is not None:
+            q_begin = jnp.where(within, *solution.q[1:])
+        return (last, memory, under_way, arrives, result), (starts, tau, q_begin)
 
     own0 = initial_states(linkage, forces), control.initial_state(linkage)
     own0, memory0 = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), own0)
     held = jnp.zeros(joints_of(linkage))
-    if delay is not None:
-        held = jnp.where(delay < period, held, jnp.nan)
-    first = jax.tree.map(jnp.asarray, state0), own0
-    (last, *_, result), (starts, tau, acts) = jax.lax.scan(
+    under_way = jnp.zeros((most + 1, held.size)) if most > 0 else None
+    if rest is not None:
+        held = jnp.where(delay >= 0, held, jnp.nan)
+    start = jax.tree.map(jnp.asarray, state0), own0
+    (last, *_, result), (starts, tau, q_begin) = jax.lax.scan(
         one,
-        (first, memory0, held, diffrax.RESULTS.successful),
-        (times[:-1], times[1:], keys),
+        (start, memory0, under_way, held, diffrax.RESULTS.successful),
+        (jnp.arange(len(times) - 1), times[:-1], times[1:], keys),
     )
     rows = lambda starts, last: jnp.concatenate([starts, last[None]])
     (q, qd), own = jax.tree.map(rows, starts, last)
-    lag = 0.0 if delay is None else delay
-    return SampledMotion(times, q, qd, tau, result, own, lag, acts)
+    acting = None
+    if rest is not None or whole > 0:
+        commands = jnp.concatenate([jnp.zeros((most + 1, held.size)), tau, tau[-1:]])
+        first = most + 1 - whole - within
+        acting = jax.lax.dynamic_slice_in_dim(commands, first, len(times))
+    return SampledMotion(times, q, qd, tau, result, own, delay, q_begin, acting)
