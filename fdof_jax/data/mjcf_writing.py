@@ -33,7 +33,8 @@ _SMALLEST = 1e-15
 _IN_JOINTS = JointDamper, Armature, JointSpring, JointStops, JointFriction
 _ACTUATORS = JointEffort, PDController, Actuators
 _KINDS = (*_IN_JOINTS, SpringDamper, *_ACTUATORS)
-_THICK = 0.03  # radius of the drawn links, over the length of the arm
+_THICK = 0.02  # radius of the drawn links, over the length of the arm
+_COLOURS = "0.2 0.4 0.7 1", "0.8 0.5 0.2 1"  # of links in turn
 
 
 @accepts_scene
@@ -101,10 +102,10 @@ def to_mjcf(linkage: Linkage, forces: Forces = (), state0: State | None = None) 
         own = dict(mass=_text(mass[k]), diaginertia=_text(*[inertia[k]] * 3))
         add(bodies[-1], "inertial", dict(pos=_text(*com[k], 0)) | own)
     add(bodies[-1], "site", name="tip", pos=_text(length[-1], 0, 0))
-    _draw(bodies, kinds, length, locked)
+    _draw(root, bodies, kinds, length, locked)
     springs = {k: e for k, e in enumerate(acting) if isinstance(e, SpringDamper)}
     if springs:
-        _add_springs(add(root, "tendon"), bodies, springs)
+        _add_springs(_tendons(root), bodies, springs)
     controls, states = _add_actuators(root, linkage, kinds, acting)
     if controls or state0 is not None:
         start = State(np.zeros(len(kinds)), np.zeros(len(kinds)))
@@ -157,17 +158,44 @@ def _limits_joints(element: Any) -> bool:
     return element.effort_lower is not None or element.effort_upper is not None
 
 
-def _draw(bodies: list[Any], kinds: str, length: Any, locked: Any) -> None:
-    """Capsules along the links, which neither weigh nor collide."""
-    size = _text(_THICK * max(float(np.abs(length).sum()), 1e-3))
+def _draw(root: Any, bodies: list[Any], kinds: str, length: Any, locked: Any) -> None:
+    """Capsules along the links, and lines along the slides, seen from above.
+
+    They neither weigh nor collide.
+    """
+    add = ElementTree.SubElement
+    visual = add(root, "visual")
+    add(visual, "global", azimuth="90", elevation="-90")
+    add(visual, "headlight", ambient="0.5 0.5 0.5", diffuse="0.6 0.6 0.6")
+    size = _THICK * max(float(np.abs(length).sum()), 1e-3)
     # A link ends where the next hinge is, or where the next slide begins.
     sides = [locked[k] if kind == "R" else 0.0 for k, kind in enumerate(kinds)]
-    for body, end, side in zip(bodies, length, [*sides, 0.0]):
+    for k, (end, side) in enumerate(zip(length, [*sides, 0.0])):
         own = dict(type="sphere")
         if abs(end) + abs(side) > 0:
             own = dict(type="capsule", fromto=_text(0, 0, 0, end, side, 0))
         free = dict(contype="0", conaffinity="0", mass="0", group="1")
-        ElementTree.SubElement(body, "geom", own | free, size=size)
+        free |= dict(size=_text(size), rgba=_COLOURS[k % 2])
+        add(bodies[k], "geom", own | free)
+        if k < len(kinds) and kinds[k] == "P":
+            ends = (bodies[k], end, side), (bodies[k + 1], 0, 0)
+            line = dict(name=f"slide{k + 1}", width=_text(size / 3))
+            _add_spatial(_tendons(root), line, ends)
+
+
+def _tendons(root: Any) -> Any:
+    """The model's list of tendons."""
+    tendons = root.find("tendon")
+    return ElementTree.SubElement(root, "tendon") if tendons is None else tendons
+
+
+def _add_spatial(tendons: Any, attributes: dict[str, str], ends: Any) -> None:
+    """A tendon between two places, (body, along, across) each."""
+    tendon = ElementTree.SubElement(tendons, "spatial", attributes)
+    for letter, (body, along, across) in zip("ab", ends):
+        name = f"{attributes['name']}{letter}"
+        ElementTree.SubElement(body, "site", name=name, pos=_text(along, across, 0))
+        ElementTree.SubElement(tendon, "site", site=name)
 
 
 def _of_joints(acting: tuple[Any, ...], count: int) -> list[dict[str, str]]:
@@ -217,15 +245,12 @@ def _add_springs(tendons: Any, bodies: list[Any], springs: dict[int, Any]) -> No
     for k, element in springs.items():
         rest, side = float(element.rest_length), int(element.side or 0)
         ends = {0: (rest, rest), 1: (0.0, rest), -1: (rest, FAR)}[side]  # no force
-        tendon = ElementTree.SubElement(
-            tendons, "spatial", name=f"spring{k}", stiffness=_text(element.stiffness),
-            damping=_text(element.damping), springlength=_text(*ends),
-        )  # fmt: skip
-        for end, point in (("a", element.a), ("b", element.b)):
-            place = _text(point.along, point.across, 0)
-            site = dict(name=f"spring{k}{end}", pos=place)
-            ElementTree.SubElement(bodies[int(point.link)], "site", site)
-            ElementTree.SubElement(tendon, "site", site=site["name"])
+        attributes = dict(name=f"spring{k}", stiffness=_text(element.stiffness))
+        attributes |= dict(damping=_text(element.damping), springlength=_text(*ends))
+        places = [
+            (bodies[int(p.link)], p.along, p.across) for p in (element.a, element.b)
+        ]
+        _add_spatial(tendons, attributes, places)
 
 
 def _add_actuators(
@@ -290,11 +315,7 @@ def _counted() -> Callable[[str], str]:
 
 def _tendon(root: Any, name: str, ratios: dict[Any, Any]) -> str:
     """Adds a tendon whose length is a sum of joint positions; returns its name."""
-    tendons = root.find("tendon")
-    if tendons is None:
-        tendons = ElementTree.Element("tendon")
-        root.insert(list(root).index(root.find("actuator")), tendons)
-    tendon = ElementTree.SubElement(tendons, "fixed", name=name)
+    tendon = ElementTree.SubElement(_tendons(root), "fixed", name=name)
     for k, ratio in ratios.items():
         own = dict(joint=f"joint{k + 1}", coef=_text(ratio))
         ElementTree.SubElement(tendon, "joint", own)
