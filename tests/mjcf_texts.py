@@ -29,6 +29,7 @@ class Text(NamedTuple):
         home = Path(folder) / self.name.replace(" ", "_")
         home.mkdir(exist_ok=True)
         for name, content in self.files.items():
+            (home / name).parent.mkdir(exist_ok=True)
             write = Path.write_bytes if isinstance(content, bytes) else Path.write_text
             write(home / name, content)
         path = home / ("arm.urdf" if "<robot" in self.text else "arm.xml")
@@ -335,6 +336,10 @@ add("hinge before its slides", "several joints, slide, floating base", 4, arm(
 
 # Bodies
 
+BODIES = arm()[len("<mujoco><worldbody>"):-len("</worldbody></mujoco>")]
+add("on a mocap body", "mocap marker, key frame", 2, mjcf(
+    f'<body mocap="true">{BODIES}</body>', tail='<keyframe><key mpos="0 0 1" '
+    'mquat=".9 0 .4 0" qpos=".1 .2"/></keyframe>'))
 BALL = '<body pos="0 0 3"><freejoint/><geom size=".1"/></body>'
 add("ball beside", "unattached free joint", 2, arm(world=BALL))
 add("ornaments", "ornament, mocap marker, welded, hand site", 2, arm(world='<body '
@@ -361,6 +366,8 @@ def actuated(name, features, *actuators, joints="", tail="", **rest):
 
 
 FIRST, SECOND = 'joint="shoulder"', 'joint="elbow"'
+actuated("stiffnesses that cancel", "position", f'position {FIRST} kp="5"', f'position '
+    f'{FIRST} kp="-5"', f'position {SECOND} kp="0"')
 actuated("motors with limits", "motor, forcerange, ctrlrange, gear", f'motor {FIRST} '
     f'gear=' '"30" ctrlrange="-1 1" forcerange="-.5 .3"', f'motor {SECOND} gear="-2.5"')
 actuated("limited joints", "motor, actuatorfrcrange, position", f'motor {FIRST} '
@@ -415,6 +422,16 @@ tied("cable", "tendon stiffness, one-sided spring", 'stiffness="50" springlength
     '.6"')
 tied("bumper", "tendon stiffness, one-sided spring", 'stiffness="50" springlength=".5 '
     '9"')
+PAIR = '<body pos="0 {} 0"><joint name="{}" axis="0 1 0"/><geom size=".1"/></body>'
+add("tied beside", "unattached hinges, tendon beside, equality beside", 2, arm(
+    axes=("0 1 0", "0 1 0"), world=PAIR.format(2, "u") + PAIR.format(4, "v"),
+    tail='<tendon><fixed name="t" limited="true" range="-1 1"><joint joint="u" '
+    'coef="1"/><joint joint="v" coef="1"/></fixed></tendon><equality><joint joint1="u" '
+    'joint2="v"/></equality>'))
+add("dropped tendon", "tendon, dropped tendon", 2, arm(
+    world='<site name="anchor"/>', last='<site name="far"/>', tail='<tendon><spatial '
+    'limited="true" range="0 9" frictionloss="1" stiffness="4"><site site="anchor"/>'
+    '<site site="far"/></spatial></tendon>'), options=dict(drop=("tendons",)))
 tied("slack spring", "tendon stiffness, dead band", 'stiffness="50" springlength=".4 '
     '.6"')
 tied("spring from its first length", "tendon stiffness, springlength -1",
@@ -540,6 +557,19 @@ refuse("file of the machine", "include|file", arm(
 refuse("mesh of the machine", "mesh|file", arm(
     head='<asset><mesh file="/tmp/part.stl"/></asset>'))
 refuse("tilted hinge", "axis.*elbow", arm(axes=("0 1 0", "0 .995 .0998")))
+refuse("limited gear", "limit of actuator forces", arm(tail='<tendon><fixed name="t" '
+    'actuatorfrclimited="true" actuatorfrcrange="-1 1"><joint joint="elbow" coef="1"/>'
+    '</fixed></tendon><actuator><motor tendon="t"/></actuator>'))
+refuse("nothing but a marker", "without joints", mjcf(
+    '<body mocap="true"><geom size=".1"/></body>'))
+refuse("endless gravity", "finite gravity", arm(head='<option gravity="0 0 nan"/>'))
+refuse("start that is no number", "finite start|MuJoCo accepts", arm(
+    tail='<keyframe><key qpos="nan 0"/></keyframe>'))
+refuse("another document", "without joints|MuJoCo accepts|XML", '<!DOCTYPE mujoco ['
+    '<!ENTITY a "><mujoco><include file=\'/etc/hostname\'/></mujoco><!--"> ]>'
+    "<mujoco/><!-- -->")
+refuse("deep robot", "nested too deep|MuJoCo accepts", "<robot>" + 20000 * "<a>" +
+    20000 * "</a>" + "</robot>")
 refuse("slide across", "axis.*elbow", arm(second='type="slide"'))
 refuse("contact at the start", "contact|touch|collide", arm(
     world='<geom type="plane" size="9 9 .1"/>', turn='pos="0 0 .02"'))

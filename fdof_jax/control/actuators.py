@@ -1,5 +1,6 @@
 """Actuators as simulators and data sheets describe them: affine laws with limits."""
 
+from collections.abc import Iterator
 from typing import Any
 
 import jax.numpy as jnp
@@ -9,6 +10,11 @@ from ..base.checks import JOINT
 from ..forces.element import StatefulElement
 from ..forces.switches import clip, switch
 from ..linkage.fields import Condition, Part, Values, field, value_of
+
+
+def _apart(name: str, lower: Any, upper: Any) -> Iterator[Condition]:
+    if lower is not None and upper is not None:
+        yield Condition((lower < upper).all(), name, "less than upper", (lower, upper))
 
 
 class Activation(Part):
@@ -49,6 +55,7 @@ class Activation(Part):
         sizes = [len(value) for value in values if value is not None]
         alike = len(set(sizes)) == 1
         yield Condition(alike, "gain", "as many actuators in all fields", tuple(sizes))
+        yield from _apart("lower", self.lower, self.upper)
 
 
 class Actuators(StatefulElement):
@@ -108,6 +115,8 @@ class Actuators(StatefulElement):
         sizes = [len(v) for v in (*values, *fixed, *states) if v is not None]
         alike = len(set(sizes)) == 1
         yield Condition(alike, "gear", "as many actuators in all fields", tuple(sizes))
+        yield from _apart("lower", self.lower, self.upper)
+        yield from _apart("effort_lower", self.effort_lower, self.effort_upper)
 
     def initial_state(self, linkage):
         """The activations' states at the start, (actuator,); () without."""

@@ -10,7 +10,7 @@ from ..control.actuators import Activation, Actuators
 from ..control.pd import PDController
 from ..forces.joints import JointEffort
 from ..references.task import SetPoint
-from .mjcf_chain import Reader, name_of, path_of_tendon
+from .mjcf_chain import FAR, Reader, name_of, path_of_tendon
 
 
 class _Affine(NamedTuple):
@@ -48,11 +48,17 @@ class _Row(NamedTuple):
     gain: _Affine
     bias: _Affine
     state: _OwnState | None
+    control_range: tuple[float, float] | None = None
 
     @property
     def joint(self) -> int:
         """The joint that it acts on most."""
         return int(np.argmax(abs(self.gear)))
+
+    @property
+    def is_servo(self) -> bool:
+        """Whether it pushes by itself against a position or a velocity."""
+        return bool(self.bias.length or self.bias.speed)
 
 
 def _gear(read: Reader, actuator: int) -> np.ndarray | None:
@@ -103,10 +109,10 @@ def actuators(read: Reader, controls: Any, drop: tuple[str, ...]) -> list[Any]:
     if controls is None:
         controls = model.key_ctrl[0] if model.nkey else np.zeros(model.nu)
     controls = np.array(real_array("controls", controls, (model.nu,)))
-    limited = np.asarray(model.actuator_ctrllimited).astype(bool).ravel()
-    if limited.size == model.nu and not read.disabled("CLAMPCTRL"):
-        ends = np.asarray(model.actuator_ctrlrange).reshape(model.nu, 2)
-        controls = np.where(limited, np.clip(controls, *ends.T), controls)
+    clamped = np.asarray(model.actuator_ctrllimited).astype(bool).ravel()
+    clamped &= not read.disabled("CLAMPCTRL")
+    ranges = np.asarray(model.actuator_ctrlrange).reshape(-1, 2)
+    controls = np.where(clamped, np.clip(controls, *ranges.T), controls)
     states = model.key_act[0] if model.nkey else np.zeros(model.na)
     rows = []
     for actuator in range(count):
@@ -133,11 +139,20 @@ def actuators(read: Reader, controls: Any, drop: tuple[str, ...]) -> list[Any]:
             if isinstance(law, str):
                 read.leave("actuators", f"actuator {name}", law)
                 continue
+            if not any(law.gain) and not any(law.bias) and law.state is None:
+                read.note(f"actuator {name}", "left out, as its gains are 0")
+                continue
             lower, upper = -np.inf, np.inf
             if model.actuator_forcelimited[actuator]:
                 lower, upper = map(float, model.actuator_forcerange[actuator])
-            control = float(controls[_places(model, actuator)[0]])
-            rows.append(_Row(name, gear, control, lower, upper, *law))
+                lower = lower if lower > -FAR else -np.inf
+                upper = upper if upper < FAR else np.inf
+            place = _places(model, actuator)[0]
+            control = float(controls[place])
+            row = _Row(name, gear, control, lower, upper, *law)
+            if clamped[place]:
+                row = row._replace(control_range=tuple(map(float, ranges[place])))
+            rows.append(row)
     effort_limited = model.jnt_actfrclimited[chain.joints].astype(bool)
     ends = model.jnt_actfrcrange[chain.joints] * chain.signs[:, None]
     lower = np.where(effort_limited, ends.min(axis=1), -np.inf)
@@ -150,9 +165,12 @@ def actuators(read: Reader, controls: Any, drop: tuple[str, ...]) -> list[Any]:
     kinds = " and ".join(type(force).__name__ for force in forces)
     for row in rows:
         if len(forces) > 1:
-            servo = row.bias.length or row.bias.speed
-            kinds = "PDController" if servo else "JointEffort"
-        read.note(f"actuator {row.name}", f"{kinds}, at a control of {row.control:.4g}")
+            kinds = "PDController" if row.is_servo else "JointEffort"
+        words = f"{kinds}, at a control of {row.control:.4g}"
+        if row.control_range:
+            low, high = row.control_range
+            words += f"; its range, {low:.4g} to {high:.4g}, is not kept for others"
+        read.note(f"actuator {row.name}", words)
     return forces
 
 
@@ -198,12 +216,14 @@ def _law(read: Reader, actuator: int, controls: Any, states: Any) -> _Law | str:
         own = state if dynamics == "PID" else None
         return _pid(dynprm, gainprm, bias, own, given, inputs)
     if gain_kind not in ("FIXED", "AFFINE") or bias_kind not in ("NONE", "AFFINE"):
-        return f"a law of the kind {gain_kind.lower()}"
+        return f"a law of the kinds {gain_kind.lower()} and {bias_kind.lower()}"
     gain = _Affine(*gainprm[: 3 if gain_kind == "AFFINE" else 1])
     if dynamics == "NONE":
         return _Law(gain, bias)
-    if dynamics not in ("INTEGRATOR", "FILTER", "FILTEREXACT") or any(gain[1:]):
+    if dynamics not in ("INTEGRATOR", "FILTER", "FILTEREXACT"):
         return f"dynamics of the kind {dynamics.lower()}"
+    if any(gain[1:]):
+        return "a state whose gain depends on its length or speed"
     rate = 1 / max(dynprm[0], 1e-15)
     rates = (1.0, 0.0) if dynamics == "INTEGRATOR" else (rate, -rate)
     own = state._replace(gain=gain.constant, rate=(*rates, 0.0, 0.0))
@@ -272,46 +292,50 @@ def _general(rows: list[_Row], lower: np.ndarray, upper: np.ndarray) -> Actuator
 
 def _simple(rows: list[_Row], lower: np.ndarray, upper: np.ndarray) -> list[Any] | None:
     """The actuators as efforts and a PD controller, or None where these will not do."""
-    count = len(lower)
-    kp, kd, effort = np.zeros(count), np.zeros(count), np.zeros(count)
-    at, speed = np.zeros(count), np.zeros(count)
-    limit = np.full(count, np.inf)
-    servos, motors = (
-        [row for row in rows if bool(row.bias.length or row.bias.speed) == servo]
-        for servo in (True, False)
-    )
     for row in rows:
         if np.count_nonzero(row.gear) > 1 or row.state or any(row.gain[1:]):
             return None
-    for row in servos:
-        k, gear = row.joint, float(row.gear[row.joint])
-        several = sum(other.joint == k for other in servos) > 1
-        bounded = np.isfinite([row.lower, row.upper]).any()
-        if bounded and (several or row.lower != -row.upper):
-            return None
-        if bounded:
-            limit[k] = min(limit[k], abs(gear) * row.upper)
-        if any(other.joint == k for other in motors) and np.isfinite(upper[k]):
-            return None
-        kp[k] -= gear**2 * row.bias.length
-        kd[k] -= gear**2 * row.bias.speed
-        push = gear * (row.gain.constant * row.control + row.bias.constant)
-        (at if row.bias.length else speed)[k] += push
-    for row in motors:
-        push = np.clip(
-            row.gain.constant * row.control + row.bias.constant, row.lower, row.upper
-        )
-        effort[row.joint] += row.gear[row.joint] * push
-    if (kp < 0).any() or (kd < 0).any() or (lower != -upper).any():
+    if (lower != -upper).any():
         return None
-    driven = np.isin(np.arange(count), [row.joint for row in servos])
-    effort = np.where(driven, effort, np.clip(effort, lower, upper))
+    joints = [
+        _of_joint([row for row in rows if row.joint == k], most)
+        for k, most in enumerate(upper)
+    ]
+    if None in joints:
+        return None
+    kp, kd, limit, target, rate, effort = np.array(joints).T
+    servos = [row.is_servo for row in rows]
     forces: list[Any] = []
-    if servos:
-        limit = np.where(driven, np.minimum(limit, upper), np.inf)
-        target = np.divide(at, kp, out=np.zeros(count), where=kp > 0)
-        rate = np.divide(speed, kd, out=np.zeros(count), where=kd > 0)
+    if any(servos):
         forces.append(PDController(kp, kd, limit, SetPoint(target, rate)))
-    if motors:
+    if not all(servos):
         forces.append(JointEffort(effort))
     return forces
+
+
+def _of_joint(rows: list[_Row], most: float) -> tuple[float, ...] | None:
+    """kp, kd, limit, position, velocity and effort of the actuators on a joint.
+
+    `most`: the limit of their sum. None if they are more than a PD controller and a
+    motor that no limit couples.
+    """
+    ratio = lambda row: float(row.gear[row.joint])
+    push = lambda row: row.gain.constant * row.control + row.bias.constant
+    servos = [row for row in rows if row.is_servo]
+    motors = [row for row in rows if not row.is_servo]
+    effort = sum(ratio(r) * np.clip(push(r), r.lower, r.upper) for r in motors)
+    if not servos:
+        return 0.0, 0.0, np.inf, 0.0, 0.0, np.clip(effort, -most, most)
+    bounded = [row for row in servos if np.isfinite([row.lower, row.upper]).any()]
+    if bounded and (len(servos) > 1 or bounded[0].lower != -bounded[0].upper):
+        return None
+    if motors and np.isfinite(most):
+        return None
+    kp = -sum(ratio(row) ** 2 * row.bias.length for row in servos)
+    kd = -sum(ratio(row) ** 2 * row.bias.speed for row in servos)
+    at = sum(ratio(row) * push(row) for row in servos if row.bias.length)
+    speed = sum(ratio(row) * push(row) for row in servos if not row.bias.length)
+    if min(kp, kd) < 0 or (at and not kp) or (speed and not kd):
+        return None
+    limit = min(most, *(abs(ratio(row)) * row.upper for row in bounded), np.inf)
+    return kp, kd, limit, at / kp if kp else 0.0, speed / kd if kd else 0.0, effort

@@ -5,12 +5,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..base.checks import refusal
+from ..base.checks import refusal, shown
 from ..base.user_warnings import without_warning
 from ..linkage.linkage import Linkage
 from ..linkage.topology import MOST_PAIRS
 
 SLIDE, HINGE = 2, 3  # MuJoCo's mjtJoint
+FAR = 1e9  # stands for infinity where MuJoCo wants a number
 _EXACT = 1e-9  # what is as far out of the plane is taken for rounding
 _FLAT = 1e-5  # and what is as far [rad] is laid into the plane, with a remark
 _TIPS = ("tip", "ee", "tool", "hand", "end_effector")
@@ -88,11 +89,15 @@ def planar_chain(
 
     Raises ValueError for what is no planar chain.
     """
-    if tip is not None and mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, tip) < 0:
-        names = [name_of(model, "site", k) for k in range(model.nsite)]
-        raise refusal("tip", f"one of the sites {names}", tip)
+    if tip is not None and _named(mujoco, model, tip) is None:
+        sites = [model.site(k).name for k in range(model.nsite)]
+        bodies = [model.body(k).name for k in range(1, model.nbody)]
+        names = shown([name for name in sites + bodies if name])
+        raise refusal("tip", f"a site or a body among {names}", tip)
+    if not np.isfinite(model.opt.gravity).all():
+        raise refusal("source", "finite gravity", model.opt.gravity.tolist())
     joints, links, remarks = _joints_of_arm(mujoco, model, tip)
-    data = mujoco.MjData(model)
+    data = data_at_start(mujoco, model)
     places = model.jnt_qposadr[joints]
     data.qpos[places] = 0
     mujoco.mj_kinematics(model, data)
@@ -119,13 +124,34 @@ def planar_chain(
     )
 
 
+def data_at_start(mujoco: Any, model: Any) -> Any:
+    """MuJoCo's data in the first key frame, if there is one, or at qpos0."""
+    data = mujoco.MjData(model)
+    if model.nkey:
+        mujoco.mj_resetDataKeyframe(model, data, 0)
+    return data
+
+
+def _named(mujoco: Any, model: Any, name: str) -> tuple[int, str, int] | None:
+    """The body that a site or a body of this name is on, and which of both it is."""
+    site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, name)
+    if site >= 0:
+        return int(model.site_bodyid[site]), "site", site
+    body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name)
+    return (body, "body", body) if body > 0 else None
+
+
 def _joints_of_arm(
     mujoco: Any, model: Any, tip: str | None
 ) -> tuple[np.ndarray, np.ndarray, list[tuple[str, str]]]:
     """The joints of the arm, the link of each body, and what is left out beside it."""
     welded, parent = model.body_weldid, model.body_parentid
     # Bodies that are welded together are one; of each, the one before it that moves.
-    before = {int(b): int(welded[parent[b]]) for b in np.unique(welded[welded > 0])}
+    moving = {int(body) for body in welded if model.body_dofnum[body]}
+    before = {
+        b: int(welded[parent[b]]) if int(welded[parent[b]]) in moving else 0
+        for b in sorted(moving)
+    }
 
     def root(body: int) -> int:
         while before.get(body, 0):
@@ -137,12 +163,11 @@ def _joints_of_arm(
     if not trees:
         raise ValueError("source: expected a planar chain, got a model without joints.")
     of_joint = np.array([roots[int(welded[b])] for b in model.jnt_bodyid])
-    site = -1
-    if tip is not None:
-        site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, tip)
-        chosen = roots.get(int(welded[model.site_bodyid[site]]), -1)
+    at = None if tip is None else _named(mujoco, model, tip)
+    if at is not None:
+        chosen = roots.get(int(welded[at[0]]), -1)
         if chosen < 0:
-            raise refusal("tip", "a site on a body that moves", tip)
+            raise refusal("tip", "a site or a body that moves", tip)
     else:
         moved = model.actuator_trnid[model.actuator_trntype == 0, 0]
         driven = [int(of_joint[k]) for k in moved]
@@ -172,7 +197,7 @@ def _joints_of_arm(
     if len(joints) > MOST_PAIRS:
         raise refuse(f"{len(joints)} joints, above {MOST_PAIRS}")
     last = {int(model.jnt_bodyid[joint]): k + 1 for k, joint in enumerate(joints)}
-    links = np.array([last.get(int(b), -1 if b else 0) for b in welded])
+    links = np.array([last.get(int(b), -1 if int(b) in moving else 0) for b in welded])
     return joints, links, remarks
 
 
@@ -214,7 +239,9 @@ def _flatness(
                 f"{angle:.2g} rad off."
             )
         if angle > _EXACT:
-            remarks.append((name, f"axis laid into the plane, {angle:.1g} rad off"))
+            remarks.append(
+                (f"joint {name}", f"axis laid into the plane, {angle:.1g} rad off")
+            )
     return remarks
 
 
@@ -224,20 +251,25 @@ def _tip(
     """The place of the tip, and words on what it is."""
     count = len(chain.joints)
     for name in _TIPS if tip is None else (tip,):
-        site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, name)
-        if site < 0:
+        if (at := _named(mujoco, model, name)) is None:
             continue
-        body = model.site_bodyid[site]
+        body, kind, index = at
         if chain.links[body] == count:
-            return chain.plane(data.site_xpos[site]), f"the site {name}"
+            place = data.site_xpos[index] if kind == "site" else data.xpos[index]
+            return chain.plane(place), f"the {kind} {name}"
         if tip is not None:
             raise ValueError(
-                f"tip: expected a site on the last body that moves or on one welded to "
+                "tip: expected a place on the last body that moves or on one welded to "
                 f"it, got one on body {name_of(model, 'body', body)}."
             )
     geoms = np.flatnonzero(chain.links[model.geom_bodyid] == count)
     if geoms.size == 0:
-        return start, "the last joint, as there is neither a site nor a geom"
+        body = np.flatnonzero(chain.links == count)[-1]
+        if body != model.jnt_bodyid[chain.joints[-1]]:
+            return chain.plane(
+                data.xpos[body]
+            ), f"the body {name_of(model, 'body', body)}"
+        return start, "the last joint, as there is nothing beyond it"
     geom = geoms[-1]
     center = data.geom_xpos[geom]
     kinds = mujoco.mjtGeom
@@ -287,15 +319,18 @@ def _linkage(
         masses[k] = mass.sum()
         inertias[k] = inertia + mass @ np.abs(places - center) ** 2
         offsets[k] = (center - starts[k + 1]) * np.exp(-1j * turns[k + 1])
-    with without_warning("moves no inertia of link"):
-        linkage = Linkage(
-            "".join("P" if slide else "R" for slide in slides),
-            length=steps.real,
-            com=np.column_stack([np.real(offsets), np.imag(offsets)]),
-            mass=masses,
-            inertia=inertias,
-            locked=np.where(slides, np.diff(turns), steps.imag[:-1]),
-            base_angle=turns[0],
-            gravity=chain.gravity,
-        )
+    try:
+        with without_warning("moves no inertia of link"):
+            linkage = Linkage(
+                "".join("P" if slide else "R" for slide in slides),
+                length=steps.real,
+                com=np.column_stack([np.real(offsets), np.imag(offsets)]),
+                mass=masses,
+                inertia=inertias,
+                locked=np.where(slides, np.diff(turns), steps.imag[:-1]),
+                base_angle=turns[0],
+                gravity=chain.gravity,
+            )
+    except ValueError as error:
+        raise ValueError(f"source: {error}") from error
     return linkage, turns

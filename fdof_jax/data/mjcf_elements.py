@@ -8,9 +8,8 @@ from ..forces.actuators import Armature
 from ..forces.joints import JointDamper, JointFriction, JointSpring, JointStops
 from ..forces.points import Point, SpringDamper
 from .mjcf_actuators import inertias_of_actuators
-from .mjcf_chain import Reader, name_of, path_of_tendon
+from .mjcf_chain import FAR, Reader, data_at_start, name_of, path_of_tendon
 
-FAR = 1e9  # stands for infinity where MuJoCo wants a number
 # A stop of MuJoCo is close to plastic; this damping [s/m or s/rad] returns a tenth of
 # the speed of 1 m/s or 1 rad/s.
 _STOP_DAMPING = 10.0
@@ -44,7 +43,7 @@ def elements_in_joints(read: Reader, drop: tuple[str, ...]) -> list[Any]:
 
     damping = np.array(model.dof_damping[rates])
     armature = np.array(model.dof_armature[rates])
-    for gears, added in inertias_of_actuators(read):
+    for gears, added in () if "actuators" in drop else inertias_of_actuators(read):
         damping += gears**2 * added[0]
         armature += gears**2 * added[1]
     if passive or read.disabled("DAMPER"):
@@ -72,15 +71,22 @@ def _stops(read: Reader, limited: np.ndarray, dropped: bool) -> list[Any]:
     model, chain = read.model, read.chain
     ends = np.where(chain.signs[:, None] > 0, 1, -1) * model.jnt_range[chain.joints]
     margin = model.jnt_margin[chain.joints]
-    lower = np.where(limited, ends.min(axis=1) - margin, -np.inf)
-    upper = np.where(limited, ends.max(axis=1) + margin, np.inf)
+    # MuJoCo's constraint acts from the margin within the range on.
+    lower, upper = ends.min(axis=1) + margin, ends.max(axis=1) - margin
+    lower = np.where(limited & (lower > -FAR), lower, -np.inf)
+    upper = np.where(limited & (upper < FAR), upper, np.inf)
     stiffness = np.ones(len(limited))
     for k, joint in enumerate(chain.joints):
         # What a constraint with the reference (time, damping ratio), or (-stiffness,
         # -damping), gives way under a steady load, at its greatest impedance.
         time, ratio = model.jnt_solref[joint]
+        if limited[k] and time >= 0 and not ratio > 0:
+            read.leave("limits", f"joint {chain.names[k]}", "a damping ratio of 0")
+            return []
+        if time >= 0 and not read.disabled("REFSAFE"):
+            time = max(time, 2 * model.opt.timestep)
         impedance = min(max(model.jnt_solimp[joint, 1], 1e-4), 1 - 1e-4)
-        rate = -time if time < 0 else 1 / (time * ratio) ** 2
+        rate = -time if time < 0 else 1 / max(time * ratio, 1e-9) ** 2
         mass = 1 / max(float(model.dof_invweight0[chain.rates[k]]), 1e-15)
         stiffness[k] = max(mass * rate / (1 - impedance), 1e-9)
         if limited[k]:
@@ -105,10 +111,18 @@ def _stops(read: Reader, limited: np.ndarray, dropped: bool) -> list[Any]:
 def springs_of_tendons(read: Reader, drop: tuple[str, ...]) -> list[Any]:
     """Springs and dampers between two sites."""
     model, forces = read.model, []
+    no_limits = read.disabled("LIMIT", "CONSTRAINT")
     for tendon in range(model.ntendon):
         name = f"tendon {name_of(model, 'tendon', tendon)}"
+        if not (read.chain.links[_bodies_of(read, tendon)] > 0).any():
+            read.note(name, "left out, beside the arm")
+            continue
+        if "tendons" in drop:
+            read.note(name, "left out, as asked")
+            continue
         for array, kind, what in (
             ("tendon_limited", "limits", "a range"),
+            ("tendon_actfrclimited", "tendons", "a limit of actuator forces"),
             ("tendon_frictionloss", "friction", "friction"),
             ("tendon_armature", "tendons", "an armature"),
             ("tendon_stiffnesspoly", "tendons", "a nonlinear spring"),
@@ -116,7 +130,8 @@ def springs_of_tendons(read: Reader, drop: tuple[str, ...]) -> list[Any]:
             ("tendon_dampingpoly", "tendons", "nonlinear damping"),
         ):
             values = getattr(model, array, None)
-            if values is not None and np.any(values[tendon]):
+            off = kind == "limits" and no_limits
+            if values is not None and np.any(values[tendon]) and not off:
                 read.leave(kind, name, what)
         stiffness, damping = (
             model.tendon_stiffness[tendon],
@@ -131,8 +146,6 @@ def springs_of_tendons(read: Reader, drop: tuple[str, ...]) -> list[Any]:
         points = _ends(read, tendon)
         if points is None:
             read.leave("tendons", name, "a spring that is not between two sites of it")
-        elif "tendons" in drop:
-            read.note(name, "left out, as asked")
         else:
             low, high = map(float, model.tendon_lengthspring[tendon])
             forces += _springs(points, float(stiffness), float(damping), low, high)
@@ -155,6 +168,23 @@ def _springs(
     return springs
 
 
+def _bodies_of(read: Reader, tendon: int) -> list[int]:
+    """The bodies on which a tendon acts."""
+    model, kinds = read.model, read.mujoco.mjtWrap
+    owners = {
+        int(kinds.mjWRAP_JOINT): model.jnt_bodyid,
+        int(kinds.mjWRAP_SITE): model.site_bodyid,
+        int(kinds.mjWRAP_SPHERE): model.geom_bodyid,
+        int(kinds.mjWRAP_CYLINDER): model.geom_bodyid,
+    }
+    path = path_of_tendon(model, tendon)
+    return [
+        int(owners[int(kind)][thing])
+        for kind, thing in zip(model.wrap_type[path], model.wrap_objid[path])
+        if int(kind) in owners
+    ]
+
+
 def _ends(read: Reader, tendon: int) -> tuple[Point, Point] | None:
     """The points of a tendon between two sites of the arm, in its plane."""
     model, chain = read.model, read.chain
@@ -163,7 +193,7 @@ def _ends(read: Reader, tendon: int) -> tuple[Point, Point] | None:
     if len(sites) != 2 or (kinds != int(read.mujoco.mjtWrap.mjWRAP_SITE)).any():
         return None
     links = chain.links[model.site_bodyid[sites]]
-    data = read.mujoco.MjData(model)
+    data = data_at_start(read.mujoco, model)
     data.qpos[chain.places] = 0
     read.mujoco.mj_kinematics(model, data)
     places = data.site_xpos[sites]

@@ -5,14 +5,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..base.checks import optional_package, refusal
+from ..base.checks import optional_package, plain, refusal
 from ..base.report import Report
 from ..base.user_warnings import warn
 from ..forces.element import Forces
 from ..linkage.coordinates import State
 from ..linkage.linkage import Linkage, joint_names
 from .mjcf_actuators import actuators
-from .mjcf_chain import Chain, Reader, name_of, planar_chain, switched_off
+from .mjcf_chain import Reader, data_at_start, name_of, planar_chain, switched_off
 from .mjcf_elements import elements_in_joints, springs_of_tendons
 from .mjcf_source import compiled_model
 
@@ -20,7 +20,6 @@ KINDS = (
     "actuators", "armature", "contacts", "damping", "equalities", "fluid", "friction",
     "gravcomp", "limits", "plugins", "springs", "tendons",
 )  # fmt: skip
-_SITE = 6  # MuJoCo's mjtObj
 # A fluid whose forces are this part of all others at a rate of 1 rad/s or 1 m/s is
 # taken for none.
 _NEGLIGIBLE = 1e-9
@@ -104,9 +103,12 @@ def from_mjcf(
     tip         the end of the last geom
     joint j     damping 2: JointDamper
     actuator 0  PDController, at a control of 0
+    start       qpos0, at rest
     """
     mujoco = optional_package("mujoco", "test")
-    drop = (drop,) if isinstance(drop, str) else tuple(drop)
+    drop = (drop,) if isinstance(drop, str) else drop
+    if not isinstance(drop, tuple | list):
+        raise refusal("drop", f"a tuple of kinds among {KINDS}", drop)
     for kind in drop:
         if kind not in KINDS:
             raise refusal("drop", f"kinds among {KINDS}", kind)
@@ -116,13 +118,13 @@ def from_mjcf(
     lines: list[tuple[str, str]] = [("source", f"left out: {what}") for what in left]
 
     def note(part: str, words: str) -> None:
-        lines.append((part, words))
+        lines.append((plain(part), plain(words)))
 
     def leave(kind: str, part: str, what: str) -> None:
         if kind not in drop:
             raise ValueError(
                 f"source: expected a planar chain with elements of this library, got "
-                f"{part} with {what}; drop=('{kind}',) leaves it out."
+                f"{plain(part)} with {plain(what)}; drop=('{kind}',) leaves it out."
             )
         note(part, f"{what}: left out, as asked")
 
@@ -138,7 +140,7 @@ def from_mjcf(
         *actuators(read, controls, drop),
     ]
     _check_rest(read)
-    start = _start(model, chain)
+    start = _start(read)
     _check_contacts(read, drop)
     return MjcfModel(linkage, start, tuple(forces), Account(lines))
 
@@ -151,25 +153,34 @@ def _note_joints(read: Reader, linkage: Linkage) -> None:
         read.note(f"joint {theirs}", f"{ours}, {kind}, q = {minus}qpos")
 
 
-def _start(model: Any, chain: Chain) -> State:
-    keys = model.nkey > 0
-    qpos, qvel = (model.key_qpos[0], model.key_qvel[0]) if keys else (model.qpos0, None)
-    q = chain.signs * qpos[chain.places]
-    qd = np.zeros(len(q)) if qvel is None else chain.signs * qvel[chain.rates]
-    return State(q, qd)
+def _start(read: Reader) -> State:
+    model, chain = read.model, read.chain
+    data = data_at_start(read.mujoco, model)
+    frames = [name_of(model, "key", k) for k in range(model.nkey)]
+    words = f"key frame {frames[0]}" if frames else "qpos0, at rest"
+    others = f", not {', '.join(frames[1:])}" if frames[1:] else ""
+    read.note("start", words + others)
+    q, qd = data.qpos[chain.places], data.qvel[chain.rates]
+    if not (np.isfinite(q).all() and np.isfinite(qd).all()):
+        raise refusal("source", "a finite start", [q.tolist(), qd.tolist()])
+    return State(chain.signs * q, chain.signs * qd)
 
 
 def _check_rest(read: Reader) -> None:
     """Leaves out constraints, compensated gravity and fluids, or raises ValueError."""
     model, mujoco, chain = read.model, read.mujoco, read.chain
+    things = mujoco.mjtObj
     if model.neq and not read.disabled("EQUALITY", "CONSTRAINT"):
         for index in range(model.neq):
             name = f"equality {name_of(model, 'equality', index)}"
             kind = mujoco.mjtEq(int(model.eq_type[index]))
             of_bodies = kind in (mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD)
             ends = np.array([model.eq_obj1id[index], model.eq_obj2id[index]])
-            if of_bodies and int(model.eq_objtype[index]) == _SITE:
+            ends = ends[ends >= 0]
+            if of_bodies and things(int(model.eq_objtype[index])) == things.mjOBJ_SITE:
                 ends = model.site_bodyid[ends]
+            elif kind == mujoco.mjtEq.mjEQ_JOINT:
+                ends, of_bodies = model.jnt_bodyid[ends], True
             if not model.eq_active0[index]:
                 read.note(name, "left out, as it is not active")
             elif of_bodies and (chain.links[ends] <= 0).all():
@@ -181,7 +192,7 @@ def _check_rest(read: Reader) -> None:
             name = f"body {name_of(model, 'body', body)}"
             read.leave("plugins", name, "a plugin")
     for body in np.flatnonzero(model.body_gravcomp):
-        if chain.links[body] > 0:
+        if chain.links[body] > 0 and chain.gravity > 0:
             name = f"body {name_of(model, 'body', body)}"
             read.leave("gravcomp", name, "compensated gravity (gravcomp)")
     for name in ("density", "viscosity"):
@@ -195,7 +206,8 @@ def _check_rest(read: Reader) -> None:
 def _drag(read: Reader) -> float:
     """Greatest force of the fluid over that of inertia, at random rates of size 1."""
     model, mujoco, rates = read.model, read.mujoco, read.chain.rates
-    data, draw, ratios = mujoco.MjData(model), np.random.default_rng(0), [0.0]
+    data, ratios = data_at_start(mujoco, model), [0.0]
+    draw = np.random.default_rng(0)
     for _ in range(5):
         data.qpos[read.chain.places] = draw.normal(size=len(rates))
         data.qvel[rates] = draw.normal(size=len(rates))
@@ -210,10 +222,12 @@ def _check_contacts(read: Reader, drop: tuple[str, ...]) -> None:
     model, mujoco, links = read.model, read.mujoco, read.chain.links
     if read.disabled("CONTACT", "CONSTRAINT"):
         return
-    data = mujoco.MjData(model)
-    if model.nkey:
-        mujoco.mj_resetDataKeyframe(model, data, 0)
-    mujoco.mj_fwdPosition(model, data)
+    data = data_at_start(mujoco, model)
+    if "contacts" not in drop:
+        try:
+            mujoco.mj_fwdPosition(model, data)
+        except mujoco.FatalError as error:  # thousands of contacts
+            read.leave("contacts", "the model", str(error))
     of_geom = links[model.geom_bodyid]
     name = lambda geom: name_of(model, "body", model.geom_bodyid[geom])
     for contact in data.contact[: data.ncon]:
@@ -221,7 +235,7 @@ def _check_contacts(read: Reader, drop: tuple[str, ...]) -> None:
         if min(a, b) >= 0 and contact.dist <= 0 and max(of_geom[a], of_geom[b]) > 0:
             read.leave("contacts", f"bodies {name(a)} and {name(b)}", "a contact")
             return
-    pair = _may_collide(model, links)
+    pair = _may_collide(mujoco, model, links)
     if pair is None:
         return
     both = " and ".join(name_of(model, "body", body) for body in pair)
@@ -233,7 +247,7 @@ def _check_contacts(read: Reader, drop: tuple[str, ...]) -> None:
         )
 
 
-def _may_collide(model: Any, links: np.ndarray) -> tuple[int, int] | None:
+def _may_collide(mujoco: Any, model: Any, links: np.ndarray) -> tuple[int, int] | None:
     """Two bodies, one of the arm, whose geoms may collide in MuJoCo, if any.
 
     Geoms of bodies that are welded together, or next to each other in the chain, do
@@ -245,13 +259,17 @@ def _may_collide(model: Any, links: np.ndarray) -> tuple[int, int] | None:
         for a, b in zip(model.pair_geom1, model.pair_geom2)
     ]
     welded, before = model.body_weldid, model.body_weldid[model.body_parentid]
-    kinds = np.stack([bodies, model.geom_contype, model.geom_conaffinity], axis=1)
-    kinds = np.unique(kinds, axis=0)  # there may be thousands of geoms
+    # There may be thousands of geoms, of which few are different.
+    owner = bodies if model.nexclude else welded[bodies]
+    kinds = np.stack([owner, model.geom_contype, model.geom_conaffinity], axis=1)
+    kinds = np.unique(kinds, axis=0)
     body = kinds[:, 0]
     a, b = np.triu_indices(len(kinds), 1)
     meet = (kinds[a, 1] & kinds[b, 2]) | (kinds[b, 1] & kinds[a, 2])
     u, v = welded[body[a]], welded[body[b]]
+    filtered = not switched_off(mujoco, model, "FILTERPARENT")
     next_to = ((u > 0) & (before[v] == u)) | ((v > 0) & (before[u] == v))
+    next_to &= filtered
     excluded = np.isin((body[a] << 16) + body[b], model.exclude_signature)
     for k in np.flatnonzero((meet != 0) & (u != v) & ~next_to & ~excluded):
         pairs.append((int(body[a[k]]), int(body[b[k]])))

@@ -2,6 +2,7 @@
 
 import copy
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -9,6 +10,8 @@ from xml.etree import ElementTree
 from ..base.checks import plain, refusal
 
 _EXPECTED = "an XML text, the path of a file, an mujoco.MjModel or an mujoco.MjSpec"
+# Parts of a URDF that MuJoCo does not read.
+_UNREAD = "transmission", "gazebo", "ros2_control", "safety_controller"
 
 
 def compiled_model(mujoco: Any, source: Any) -> tuple[Any, list[str]]:
@@ -21,24 +24,31 @@ def compiled_model(mujoco: Any, source: Any) -> tuple[Any, list[str]]:
     if isinstance(source, mujoco.MjSpec):
         return _compiled(source.copy().compile), []
     if isinstance(source, str) and "<" in source:
-        return _of_text(mujoco, source, None)
-    if not isinstance(source, str | os.PathLike):
-        raise refusal("source", _EXPECTED, source)
-    path = Path(source)
-    try:
-        path = path.expanduser()
-        there = path.is_file()
-    except (ValueError, OSError, RuntimeError):  # such as a null byte
-        there = False
-    if not there:
-        raise refusal("source", f"{_EXPECTED}, and the file to be there", str(source))
-    text = path.read_text(encoding="utf-8", errors="replace")
-    if "<robot" in text:
-        return _of_text(mujoco, text, path.parent)
+        # What was checked is compiled, not the text: parsers differ in what they skip.
+        root = _root(source)
+        _check_without_files(root)
+        return _of_root(mujoco, root, None)
+    path = _path(source)
+    if b"<robot" in path.read_bytes():
+        root = _root(path.read_bytes())
+        if root.tag == "robot":
+            return _of_root(mujoco, root, path.parent)
     return _compiled(lambda: mujoco.MjModel.from_xml_path(str(path))), []
 
 
-def _compiled(compile_model: Any) -> Any:
+def _path(source: Any) -> Path:
+    if not isinstance(source, str | os.PathLike):
+        raise refusal("source", _EXPECTED, source)
+    try:
+        path = Path(source).expanduser()
+        if path.is_file():
+            return path
+    except (TypeError, ValueError, OSError, RuntimeError):  # such as a null byte
+        pass
+    raise refusal("source", f"{_EXPECTED}, and the file to be there", str(source))
+
+
+def _compiled(compile_model: Callable[[], Any]) -> Any:
     try:
         return compile_model()
     except ValueError as error:
@@ -47,45 +57,94 @@ def _compiled(compile_model: Any) -> Any:
         ) from None
 
 
-def _of_text(mujoco: Any, text: str, folder: Path | None) -> tuple[Any, list[str]]:
-    """A text's model; what it names in a folder is passed on as bytes."""
+def _root(text: str | bytes) -> ElementTree.Element:
     try:
-        # Also for safety: what this parser refuses, MuJoCo's own might still open.
-        root = ElementTree.fromstring(text.strip())
-    except ElementTree.ParseError as error:
-        raise ValueError(f"source: expected a model in XML: {error}.") from None
-    remarks, assets = [], {}
+        return ElementTree.fromstring(text.strip())
+    except (ElementTree.ParseError, ValueError) as error:
+        reason = plain(str(error))
+        raise ValueError(f"source: expected a model in XML: {reason}.") from None
+
+
+def _files(root: ElementTree.Element) -> list[tuple[ElementTree.Element, str]]:
+    """Elements that name files, and the attributes that do."""
+    return [
+        (part, name)
+        for part in root.iter()
+        for name in part.attrib
+        if name.startswith("file")
+    ]
+
+
+def _check_without_files(root: ElementTree.Element) -> None:
+    if root.tag == "robot":
+        _without_shapes(root)
+    for part, name in _files(root):
+        raise ValueError(
+            "source: expected a text that names no other files, as a text has no "
+            f"folder, got {plain(repr(part.get(name)))}; give the path of the file."
+        )
+
+
+def _of_root(
+    mujoco: Any, root: ElementTree.Element, folder: Path | None
+) -> tuple[Any, list[str]]:
+    """A model; the files that a URDF names in its folder are passed on as bytes."""
+    remarks: list[str] = []
+    assets: dict[str, bytes] = {}
     if root.tag == "robot":
         remarks = _without_shapes(root)
+        compiler = _compiler(root)
+        compiler.attrib.setdefault("fusestatic", "false")  # keeps names of fixed links
+        meshes = compiler.attrib.pop("meshdir", "")
+        for part, name in _files(root):
+            file = _found(folder, meshes, part.get(name, ""))
+            if file is not None:  # under a name of its own, as folders are left out
+                unique = f"{len(assets)}_{file.name}"
+                assets[unique] = file.read_bytes()
+                part.set(name, unique)
+    try:
         text = ElementTree.tostring(root, encoding="unicode")
-    for part in root.iter():
-        for name, value in part.attrib.items():
-            if not name.startswith("file"):
-                continue
-            if folder is None:
-                raise ValueError(
-                    "source: expected a text that names no other files, as a text has "
-                    f"no folder, got {plain(repr(value))}; give the path of the file."
-                )
-            file = folder / value.removeprefix("package://")
-            if file.is_file():
-                assets[file.name] = file.read_bytes()
+    except RecursionError:
+        raise ValueError("source: expected a model, got one nested too deep.") from None
     return _compiled(lambda: mujoco.MjModel.from_xml_string(text, assets)), remarks
+
+
+def _compiler(robot: ElementTree.Element) -> ElementTree.Element:
+    """MuJoCo's own settings in a URDF."""
+    own = robot.find("mujoco")
+    own = ElementTree.SubElement(robot, "mujoco") if own is None else own
+    compiler = own.find("compiler")
+    return ElementTree.SubElement(own, "compiler") if compiler is None else compiler
+
+
+def _found(folder: Path | None, meshes: str, name: str) -> Path | None:
+    if folder is None:
+        return None
+    name = name.removeprefix("package://")
+    places = folder / name, folder / meshes / name, folder / meshes / Path(name).name
+    return next((place for place in places if place.is_file()), None)
 
 
 def _without_shapes(robot: ElementTree.Element) -> list[str]:
     """Takes shapes out of a URDF that do not decide its masses; returns remarks."""
     remarks = []
+    settings = robot.find("mujoco/compiler")
+    by_shape = settings is not None and settings.get("inertiafromgeom") == "true"
     for link in robot.iter("link"):
-        weighed = link.find("inertial") is not None
+        weighed = link.find("inertial") is not None and not by_shape
         for shape in [*link.findall("visual"), *link.findall("collision")]:
             meshes = next(shape.iter("mesh"), None) is not None
             if shape.tag == "visual" or (weighed and meshes):
                 link.remove(shape)
                 if meshes:
                     name = link.get("name", "")
-                    remarks.append(f"meshes of link {name}, which has its inertia")
-    for transmission in robot.iter("transmission"):
-        name = transmission.get("name", "")
-        remarks.append(f"transmission {name}, which MuJoCo does not read")
-    return list(dict.fromkeys(remarks))
+                    remarks.append(f"shapes of link {name}, which has its inertia")
+    for material in robot.findall("material"):
+        robot.remove(material)
+    for tag in _UNREAD:
+        for part in robot.iter(tag):
+            name = part.get("name") or part.get("reference") or ""
+            remarks.append(f"{tag} {name}".strip() + ", which MuJoCo does not read")
+    if any("velocity" in limit.attrib for limit in robot.iter("limit")):
+        remarks.append("limits of velocities")
+    return list(dict.fromkeys(map(plain, remarks)))

@@ -23,10 +23,10 @@ from ..forces.joints import (
 from ..forces.points import SpringDamper
 from ..linkage.coordinates import State, real_state
 from ..linkage.fields import value_of
-from ..linkage.linkage import Linkage, check_linkage
+from ..linkage.linkage import Linkage, check_linkage, joints_of
 from ..linkage.topology import letters
 from ..simulation.scene import accepts_scene
-from .mjcf_elements import FAR
+from .mjcf_chain import FAR
 
 # MuJoCo rejects smaller masses and inertias of moving bodies (its mjMINVAL).
 _SMALLEST = 1e-15
@@ -136,11 +136,14 @@ def _check_elements(linkage: Linkage, acting: tuple[Any, ...]) -> None:
                 )
         elif type(element) in (*_IN_JOINTS, PDController) and _count(acting, name) > 1:
             expected = f"one {name}, as a joint of MuJoCo has"
-        elif _limits_joints(element) and sum(type(e) in _ACTUATORS for e in acting) > 1:
-            expected = (
-                "no limits of joint efforts beside other actuators, as a joint of "
-                "MuJoCo limits their sum"
-            )
+        elif type(element) in _ACTUATORS:
+            others = [e for e in acting if e is not element and type(e) in _ACTUATORS]
+            limits, _ = _limits_and_acts(element, linkage)
+            if any((limits & _limits_and_acts(e, linkage)[1]).any() for e in others):
+                expected = (
+                    "no limit of efforts in a joint with other actuators, as a joint "
+                    "of MuJoCo limits their sum"
+                )
         if expected:
             raise ValueError(f"forces[{k}]: expected {expected}, got {name}.")
 
@@ -149,13 +152,18 @@ def _count(acting: tuple[Any, ...], name: str) -> int:
     return sum(type(element).__name__ == name for element in acting)
 
 
-def _limits_joints(element: Any) -> bool:
-    """Whether a joint's total effort is limited."""
+def _limits_and_acts(element: Any, linkage: Linkage) -> tuple[np.ndarray, np.ndarray]:
+    """In which joints an element of `_ACTUATORS` limits the effort, and acts, (n,)."""
+    none = np.zeros(joints_of(linkage), bool)
+    if isinstance(element, JointEffort):
+        return none, none | (np.asarray(element.tau) != 0)
     if isinstance(element, PDController):
-        return bool(np.isfinite(element.limit).any())
-    if not isinstance(element, Actuators):
-        return False
-    return element.effort_lower is not None or element.effort_upper is not None
+        kp, kd, limit = map(np.asarray, (element.kp, element.kd, element.limit))
+        acts = none | ((kp > 0) | (kd > 0)) & (limit > 0)
+        return acts & np.isfinite(limit), acts
+    ends = _ends(element.effort_lower, element.effort_upper, len(none))
+    bounded = none | (np.min(np.abs(ends), axis=0) < FAR)
+    return bounded, none | np.asarray(element.gear).any(axis=0)
 
 
 def _draw(root: Any, bodies: list[Any], kinds: str, length: Any, locked: Any) -> None:
@@ -166,6 +174,8 @@ def _draw(root: Any, bodies: list[Any], kinds: str, length: Any, locked: Any) ->
     add = ElementTree.SubElement
     visual = add(root, "visual")
     add(visual, "global", azimuth="90", elevation="-90")
+    reach = float(np.abs(length).sum() + np.abs(locked).sum())
+    add(root, "statistic", center="0 0 0", extent=_text(1.2 * max(reach, 1e-3)))
     add(visual, "headlight", ambient="0.5 0.5 0.5", diffuse="0.6 0.6 0.6")
     size = _THICK * max(float(np.abs(length).sum()), 1e-3)
     # A link ends where the next hinge is, or where the next slide begins.
@@ -226,7 +236,7 @@ def _of_joints(acting: tuple[Any, ...], count: int) -> list[dict[str, str]]:
         elif isinstance(element, PDController):
             limit = np.asarray(element.limit)
             add("actuatorfrcrange", -limit, limit, where=(0 < limit) & (limit < np.inf))
-        elif isinstance(element, Actuators) and _limits_joints(element):
+        elif isinstance(element, Actuators):
             low, high = _ends(element.effort_lower, element.effort_upper, count)
             bounded = np.minimum(abs(low), abs(high)) < FAR
             add("actuatorfrcrange", low, high, where=bounded)
@@ -272,8 +282,12 @@ def _add_actuators(
 
     for place, element in enumerate(acting):
         if isinstance(element, JointEffort):
+            limited = np.zeros(count, bool)
+            for other in acting:
+                if isinstance(other, _ACTUATORS):
+                    limited |= _limits_and_acts(other, linkage)[0]
             for k, tau in enumerate(np.broadcast_to(element.tau, count)):
-                if kinds[k] != "F":
+                if kinds[k] != "F" and not (limited[k] and tau == 0):
                     add("motor", f"effort{k + 1}", k, tau)
         elif isinstance(element, PDController):
             target, velocity = element.schedule(jnp.zeros(()), linkage)
@@ -331,12 +345,14 @@ def _general(
     low, high = _ends(element.lower, element.upper, len(gears))
     own = element.activation
     for k, gear in enumerate(gears):
-        gain, attributes = gains[k], dict(biastype="affine", biasprm=_text(*bias[k]))
+        gain, law, attributes = gains[k], bias[k].copy(), {}
         start: list[float] = []
         if np.minimum(abs(low[k]), abs(high[k])) < FAR:
             ends = _text(low[k], high[k])
             attributes |= dict(forcelimited="true", forcerange=ends)
-        if own is not None and np.any(np.asarray(own.rate)[k]):
+        if own is not None and not np.any(np.asarray(own.rate)[k]):
+            law[0] += float(own.gain[k] * own.start[k])  # a state that stays
+        elif own is not None:
             rate, time = np.asarray(own.rate)[k], 0.0
             if rate[1] < 0:
                 time = -1 / rate[1]
@@ -356,6 +372,7 @@ def _general(
                 ends = _text(bottom[k], top[k])
                 attributes |= dict(actlimited="true", actrange=ends)
         attributes |= dict(gaintype="affine", gainprm=_text(*gain))
+        attributes |= dict(biastype="affine", biasprm=_text(*law))
         yield gear, attributes, float(control[k]), start
 
 
