@@ -210,9 +210,7 @@ def test_random_arms_at_rest(count, gradient):
             continue
         for mode in MODES[1:] if count > 3 else MODES:
             found, steps = gradient[mode](numbers, scene)
-            # The adjoint's steps follow the linearised motion, not the derivatives.
-            most = 5e-6 if mode == "adjoint" else 1e-6
-            assert error(flat(found), wanted) < most, (mode, kind, int(steps))
+            assert error(flat(found), wanted) < 1e-6, (mode, kind, int(steps))
         solved += 1
 
 

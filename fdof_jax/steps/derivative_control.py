@@ -22,9 +22,9 @@ from .switching import Switching, motion_of
 # The relative tolerance of tangents: over that of the motion, its upper limit, and its
 # lower limit in rounding errors.
 _LOOSER, _LOOSEST, _NOISE = 1e3, 1e-5, 64.0
-# That of a probe, whatever the motion's: undamped tangents are right to 1e-6 after 1000
-# rad.
-_OF_PROBE = 1e-8
+# That of a probe, whatever the motion's: undamped tangents are right to 3e-7 after 1000
+# rad, and those of stops and slides at rest to 1e-6.
+_OF_PROBE = 3e-9
 _GROWN = 1e3  # size of a probe that is replaced by a new one, of size 1
 # A tangent below this part of the largest one is judged as if it were as large.
 _WEAK = 0.1
