@@ -50,15 +50,21 @@ def padded(tree):
             return leaf.replace(link=leaf.link + (leaf.link > PLACE))
         if isinstance(leaf, elements.Swing | elements.Hold):
             return Padded(leaf)
+        if isinstance(leaf, fj.control.Actuators):  # most of it is per actuator
+            rows = dict(gear=of(leaf.gear), effort_lower=of(leaf.effort_lower))
+            return leaf.replace(**rows)
         per_joint = jnp.shape(leaf)[-1:] == (3,)
         return jnp.insert(leaf, PLACE, leaf[..., PLACE], axis=-1) if per_joint else leaf
 
-    whole = fj.Linkage, fj.Point, elements.Swing, elements.Hold
+    whole = fj.Linkage, fj.Point, elements.Swing, elements.Hold, fj.control.Actuators
     return jax.tree.map(of, tree, is_leaf=lambda part: isinstance(part, whole))
 
 
 def without_fixed(tree):
-    return jax.tree.map(lambda row: np.delete(row, PLACE, axis=-1), tree)
+    """Returns values of the shorter arm; those that are not per joint stay."""
+    return jax.tree.map(
+        lambda row: np.delete(row, PLACE, axis=-1) if row.shape[-1] == 4 else row, tree
+    )
 
 
 Q, QD, QDD, TAU = jnp.asarray(np.random.default_rng(0).uniform(-1, 1, (4, 3)))
