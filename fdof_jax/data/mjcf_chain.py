@@ -10,7 +10,7 @@ from ..base.user_warnings import without_warning
 from ..linkage.linkage import Linkage
 from ..linkage.topology import MOST_PAIRS
 
-SLIDE, HINGE = 2, 3  # MuJoCo's mjtJoint
+_SLIDE, _HINGE = 2, 3  # MuJoCo's mjtJoint
 FAR = 1e9  # stands for infinity where MuJoCo wants a number
 _EXACT = 1e-9  # what is as far out of the plane is taken for rounding
 _FLAT = 1e-5  # and what is as far [rad] is laid into the plane, with a remark
@@ -102,7 +102,7 @@ def planar_chain(
     data.qpos[places] = 0
     mujoco.mj_kinematics(model, data)
     mujoco.mj_comPos(model, data)
-    axes, slides = data.xaxis[joints], model.jnt_type[joints] == SLIDE
+    axes, slides = data.xaxis[joints], model.jnt_type[joints] == _SLIDE
     names = [name_of(model, "joint", k) for k in joints]
     right, up, normal, gravity = _plane(axes, slides, model.opt.gravity)
     signs = np.where(slides, 1, np.sign(axes @ normal))
@@ -172,7 +172,7 @@ def _joints_of_arm(
         moved = model.actuator_trnid[model.actuator_trntype == 0, 0]
         driven = [int(of_joint[k]) for k in moved]
         simple = {
-            t: np.isin(model.jnt_type[of_joint == t], (SLIDE, HINGE)).all()
+            t: np.isin(model.jnt_type[of_joint == t], (_SLIDE, _HINGE)).all()
             for t in trees
         }
         rank = lambda t: (simple[t], driven.count(t), int((of_joint == t).sum()), -t)
@@ -185,7 +185,7 @@ def _joints_of_arm(
     joints = np.flatnonzero(of_joint == chosen)
     refuse = lambda what: ValueError(f"source: expected a planar chain, got {what}.")
     for joint in joints:
-        if model.jnt_type[joint] not in (HINGE, SLIDE):
+        if model.jnt_type[joint] not in (_HINGE, _SLIDE):
             name = name_of(model, "joint", joint)
             raise refuse(f"joint {name}, which is neither a hinge nor a slide")
     for body in trees[chosen]:
@@ -227,11 +227,8 @@ def _flatness(
     """Remarks on axes that are nearly right; raises ValueError for others."""
     remarks = []
     for name, axis, slide in zip(names, axes, slides):
-        across = np.cross(axis, normal)
-        sine = abs(axis @ normal) if slide else float(np.linalg.norm(across))
-        angle = np.arcsin(min(sine, 1.0))
-        if not slide and abs(axis @ normal) < 0.5:
-            angle = np.arccos(abs(axis @ normal))
+        along, across = abs(axis @ normal), np.linalg.norm(np.cross(axis, normal))
+        angle = np.arctan2(along, across) if slide else np.arctan2(across, along)
         if angle > _FLAT:
             where = "in the plane" if slide else "along the first hinge's"
             raise ValueError(

@@ -80,8 +80,9 @@ def from_mjcf(
       `mujoco.MjModel` or an `mujoco.MjSpec`.
     - `controls`: of the actuators, in MuJoCo's order and units; by default those of the
       first key frame, or 0. `replace` changes them in the elements.
-    - `tip`: name of the site that is the tip; by default one named tip, ee, tool, hand
-      or end_effector on the last link, or else the end of its last geom.
+    - `tip`: name of the site or body that is the tip; by default one named tip, ee,
+      tool, hand or end_effector on the last link, or else the end of its last geom, or
+      its last body.
     - `drop`: kinds of parts to leave out: "actuators", "armature", "contacts",
       "damping", "equalities", "fluid", "friction", "gravcomp", "limits", "plugins",
       "springs", "tendons".
@@ -113,7 +114,7 @@ def from_mjcf(
         if kind not in KINDS:
             raise refusal("drop", f"kinds among {KINDS}", kind)
     if tip is not None and not isinstance(tip, str):
-        raise refusal("tip", "the name of a site", tip)
+        raise refusal("tip", "the name of a site or a body", tip)
     model, left = compiled_model(mujoco, source)
     lines: list[tuple[str, str]] = [("source", f"left out: {what}") for what in left]
 
@@ -195,12 +196,12 @@ def _check_rest(read: Reader) -> None:
         if chain.links[body] > 0 and chain.gravity > 0:
             name = f"body {name_of(model, 'body', body)}"
             read.leave("gravcomp", name, "compensated gravity (gravcomp)")
-    for name in ("density", "viscosity"):
-        value = float(getattr(model.opt, name))
-        if value and _drag(read) > _NEGLIGIBLE:
-            read.leave("fluid", "the model", f"a fluid of {name} {value:g}")
-        elif value:
-            read.note("fluid", f"{name} {value:g} left out, without effect on the arm")
+    density, viscosity = float(model.opt.density), float(model.opt.viscosity)
+    fluid = f"density {density:g}, viscosity {viscosity:g}"
+    if (density or viscosity) and _drag(read) > _NEGLIGIBLE:
+        read.leave("fluid", "the model", f"a fluid of {fluid}")
+    elif density or viscosity:
+        read.note("fluid", f"{fluid}: left out, without effect on the arm")
 
 
 def _drag(read: Reader) -> float:
