@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 from elements import Hold
 from helpers import random_linkage
-from mjcf_texts import REFUSED, TEXTS, box_stl, random_text
+from mjcf_random import random_text
+from mjcf_texts import REFUSED, TEXTS, box_stl
 
 import fdof_jax as fj
 
