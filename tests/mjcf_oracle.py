@@ -186,3 +186,13 @@ def compare_motion(model, read, seconds=1.0, controls=None, drop=()):
     scene = fj.Scene(mine.linkage, mine.state0, exact(mine.forces), seconds)
     q = np.asarray(fj.simulate(scene, ts, rtol=1e-10, atol=1e-11).q)[1:]
     return float(np.abs(q - expected).max() / (1 + np.abs(expected).max()))
+
+
+def in_mujoco(text):
+    model = mujoco.MjModel.from_xml_string(text)
+    model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_ENERGY
+    return model, mujoco.MjData(model)
+
+
+def equal(values, expected, tolerance=1e-10):
+    np.testing.assert_allclose(values, expected, rtol=tolerance, atol=tolerance)
