@@ -76,7 +76,7 @@ PLAIN = {
         [-1.0, -0.12, -np.inf], [0.22, 2.0, 0.35], stiffness=40.0, damping=0.5,
         smoothing=0.1,
     ),
-    "friction": fj.forces.JointFriction([0.4, 0.3, 0.2], 0.5),
+    "friction": fj.forces.JointFriction([0.4, 0.3, 0.2], speed=0.5),
 }  # fmt: skip
 WITH_STATE = {
     "speed limit": fj.control.SpeedLimit(PD, stall=[1.0, 3.0, 0.5], no_load=4.0),

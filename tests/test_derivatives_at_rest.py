@@ -148,7 +148,7 @@ def held_by(kind, rng, topology):
     acting = (
         fj.JointDamper(damping),
         fj.PDController(kp, kd, none + np.inf, Hold(jnp.asarray(q - 0.05))),
-        fj.forces.JointFriction(friction, speed),
+        fj.forces.JointFriction(friction, speed=speed),
         fj.forces.JointStops(
             np.where(touching, q + 0.01, q - 1), q + 5, stiffness=stiffness + 1e-9,
             damping=0.3, smoothing=1e-3,

@@ -165,7 +165,7 @@ def test_friction_stops_a_slide():
     """From 2 dv/dt = -F tanh(v/s) it follows that sinh(v/s) falls exponentially."""
     level, speed, v0 = 4.0, 0.05, 1.5
     ts = np.linspace(0, 1.2, 25)
-    _, v = slides([0, v0], ts, JointFriction(level, speed))
+    _, v = slides([0, v0], ts, JointFriction(level, speed=speed))
     exact = speed * np.arcsinh(np.sinh(v0 / speed) * np.exp(-level / 2 * ts / speed))
     np.testing.assert_allclose(v, exact, rtol=1e-7, atol=1e-10)
 
@@ -212,7 +212,7 @@ REFUSED = [
     (lambda: JointStops(0, 1, smoothing=0), "smoothing: expected .* above 0"),
     (lambda: JointStops(0, 1, damping=-1), "damping: expected .* at least 0"),
     (lambda: JointFriction(-1), "level: expected .* at least 0"),
-    (lambda: JointFriction(1, 0), "speed: expected .* above 0"),
+    (lambda: JointFriction(1, speed=0), "speed: expected .* above 0"),
     (lambda: EffortHistory([0, 0], TAU[:2]), "ts: expected increasing"),
     (lambda: EffortHistory([], np.zeros((0, 3))), "ts: expected increasing"),
     (lambda: EffortHistory(TS, TAU[:3]), "tau: expected 4 rows"),

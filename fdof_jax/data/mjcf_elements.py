@@ -5,7 +5,8 @@ from typing import Any
 import numpy as np
 
 from ..forces.actuators import Armature
-from ..forces.joints import JointDamper, JointFriction, JointSpring, JointStops
+from ..forces.holders import JointFriction
+from ..forces.joints import JointDamper, JointSpring, JointStops
 from ..forces.points import Point, SpringDamper
 from .mjcf_actuators import inertias_of_actuators
 from .mjcf_chain import FAR, Reader, data_at_start, name_of, path_of_tendon

@@ -13,13 +13,8 @@ from ..control.actuators import Actuators
 from ..control.pd import PDController
 from ..forces.actuators import Armature
 from ..forces.element import Forces, ForeignElement, elements_on
-from ..forces.joints import (
-    JointDamper,
-    JointEffort,
-    JointFriction,
-    JointSpring,
-    JointStops,
-)
+from ..forces.holders import JointFriction
+from ..forces.joints import JointDamper, JointEffort, JointSpring, JointStops
 from ..forces.points import SpringDamper
 from ..linkage.coordinates import State, real_state
 from ..linkage.fields import value_of

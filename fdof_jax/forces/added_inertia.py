@@ -18,6 +18,11 @@ def inertial(forces: Forces) -> tuple[InertialElement, ...]:
     return tuple(e for e in forces if isinstance(e, InertialElement))
 
 
+def present(forces: Forces, t: Array) -> Forces:
+    """Returns the elements as they are at a time."""
+    return tuple(e.at(t) if isinstance(e, InertialElement) else e for e in forces)
+
+
 def inertial_on(linkage: Linkage, forces: Any) -> tuple[InertialElement, ...]:
     """Checks the tuple of elements and returns those that move masses."""
     return inertial(elements_on(linkage, forces))

@@ -208,8 +208,12 @@ class InertialElement(Element):
 
     Its kinetic energy is the sum of weight * (d coordinate/dt)^2 / 2 [J]. For a body,
     the coordinates of the mass centre have the mass as weight, and the angle has the
-    inertia. A subclass implements `coordinates` and `weights`.
+    inertia. A subclass implements `coordinates` and `weights`. `at(t)` returns the
+    element at a time; masses that come and go have none there while they are away.
     """
+
+    def at(self, t: Array) -> "InertialElement":
+        return self
 
     @abstractmethod
     def coordinates(self, q: Array, linkage: Linkage) -> Array:

@@ -1,6 +1,6 @@
-"""Force elements in the joints: dampers, springs, efforts, stops and friction.
+"""Force elements in the joints: dampers, springs, efforts and stops.
 
-Stops and friction are not part of the paper's model.
+Stops are not part of the paper's model.
 """
 
 import jax
@@ -219,34 +219,3 @@ def _stored(depth, width):
         return jnp.where(depth > 0, depth, 0) ** 2 / 2
     near, beyond = _parts(depth, width)
     return near**3 / (12 * width) + beyond * (beyond / 2 + width)
-
-
-class JointFriction(ScalarElement):
-    """Coulomb friction of the joints, rounded off around standstill.
-
-    The effort is -level * tanh(qd / speed). Under loads below the level, joints creep
-    at a fraction of `speed`. The smaller `speed`, the stiffer the equations.
-
-    **Arguments:** one per joint or one for all.
-
-    - `level`: not negative [N or N m].
-    - `speed`: positive [m/s or rad/s].
-
-    **Raises:** ValueError for malformed arguments.
-
-    >>> import fdof_jax as fj
-    >>> arm = fj.scenes.fig5().linkage
-    >>> fj.forces.JointFriction(5)(0.0, [0, 0, 0], [0.0, 0.01, -1.0], arm).tolist()
-    [0.0, -3.808, 5.0]
-    """
-
-    level: Values = field(unit="N or N m", minimum=0)
-    speed: Values = field(unit="m/s or rad/s", above=0, default=1e-2)
-
-    def respond(self, scheduled, q, qd, linkage):
-        return tuple(
-            -level * jnp.tanh(rate / speed)
-            for level, speed, rate in zip(
-                each(self.level, qd), each(self.speed, qd), qd
-            )
-        )

@@ -95,6 +95,33 @@ def conditioning(c: Constants, delta: Scalars, added: Upper | None = None) -> Sc
     return fused(losses)(c, delta, added)
 
 
+def _holding(
+    reciprocal: Callable,
+    c: Constants,
+    delta: Scalars,
+    qd: Scalars,
+    tau: Scalars,
+    added: Upper | None,
+) -> Scalars:
+    m, solve, _ = _solved(reciprocal, c, delta, qd, added)
+    net = minus(tau, m.bias)
+    return minus(times(m.mass, solve(net)), net)
+
+
+@jax.custom_jvp
+def holding_efforts(
+    c: Constants, delta: Scalars, qd: Scalars, tau: Scalars, added: Upper | None = None
+) -> Scalars:
+    """Computes what holds the pairs that are fixed in `c`: M qdd + bias - tau."""
+    return fused(_holding)(c, delta, qd, tau, added)
+
+
+@holding_efforts.defjvp
+def _(primals, tangents):
+    _, change = jax.jvp(functools.partial(_holding, divided), primals, tangents)
+    return holding_efforts(*primals), change
+
+
 @jax.jit
 def required_efforts(
     c: Constants,

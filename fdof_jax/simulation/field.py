@@ -12,7 +12,14 @@ import numpy as np
 from jax import Array
 
 from ..forces.added_inertia import added_inertia, inertial
-from ..forces.element import Element, ScalarElement, StatefulElement, naming
+from ..forces.element import (
+    Element,
+    InertialElement,
+    ScalarElement,
+    StatefulElement,
+    naming,
+)
+from ..forces.holders import Holder
 from ..forces.switches import Switches
 from ..linkage.linkage import Linkage
 from ..mechanics.equations import Constants, Scalars, Upper, link_constants, zeros
@@ -31,10 +38,29 @@ class Args(NamedTuple):
     forces: tuple[Element, ...]
     sides: Array | None = None  # (switch,) in force, where switches are located
     ahead: Array | None = None  # (element,) by which its clock is ahead, if any [s]
+    modes: Any = None  # those of the joints, where elements hold some (see `Modes`)
 
     def clock(self, index: int, t: Any) -> Any:
         """Returns the time by an element's clock (see `clocks_apart`)."""
         return t if self.ahead is None else t + self.ahead[index]
+
+    def masses(self, t: Any) -> tuple[InertialElement, ...]:
+        """Returns the elements that move masses, as they are at a time."""
+        rows = enumerate(self.forces)
+        masses = [(k, e) for k, e in rows if isinstance(e, InertialElement)]
+        return tuple(element.at(self.clock(k, t)) for k, element in masses)
+
+    def moving(self) -> "Args":
+        """Returns the arguments with the joints that are held as fixed pairs."""
+        if self.modes is None:
+            return self
+        pairs = enumerate(self.constants.fixed)
+        fixed = tuple(pair | self.modes.held[k] for k, pair in pairs)
+        return self._replace(constants=self.constants._replace(fixed=fixed))
+
+    def sliding(self, qd: Scalars) -> Scalars:
+        """Returns the directions in which joints slide; by default those of rates."""
+        return qd if self.modes is None else tuple(self.modes.direction)
 
 
 def args_of(linkage: Linkage, q0: Array, forces: tuple[Element, ...]) -> Args:
@@ -117,7 +143,10 @@ def _effort(t: Any, y: Any, args: Args, schedule: tuple[Any, ...]) -> tuple[Any,
     arrays = lambda: (args.q0 + jnp.stack(delta), jnp.stack(qd))
     elements = with_states(args.forces, own_states(args, y))
     for (index, element, state), scheduled in zip(elements, schedule):
-        if isinstance(element, ScalarElement):
+        if isinstance(element, Holder) and element.holds:
+            sliding = args.sliding(qd)
+            effort = element.respond(scheduled, delta, sliding, args.linkage)
+        elif isinstance(element, ScalarElement):
             q = tuple(a + b for a, b in zip(args.q0, delta))
             with switches.dealt():
                 effort = element.respond(scheduled, q, qd, args.linkage)
@@ -145,13 +174,21 @@ def applied(
     t: Any, y: Any, args: Args, schedule: tuple[Any, ...]
 ) -> tuple[Scalars, Scalars, Upper | None]:
     """Returns efforts of the elements, rates of their states, and inertia they add."""
-    tau, own_rates, _ = _effort(t, y, args, schedule)
+    return switched(t, y, args, schedule)[:3]
+
+
+def switched(
+    t: Any, y: Any, args: Args, schedule: tuple[Any, ...]
+) -> tuple[Scalars, Scalars, Upper | None, Switches]:
+    """Returns what `applied` does, and the switches of the efforts."""
+    tau, own_rates, switches = _effort(t, y, args, schedule)
     delta, qd, *_ = y
     if not inertial(args.forces):
-        return tau, own_rates, None
+        return tau, own_rates, None, switches
     q, qd = args.q0 + jnp.stack(delta), jnp.stack(qd)
-    added, bias = _added(args.linkage, inertial(args.forces), q, qd)
-    return tuple(a - b for a, b in zip(tau, bias)), own_rates, added
+    added, bias = _added(args.linkage, args.masses(t), q, qd)
+    tau = tuple(a - b for a, b in zip(tau, bias))
+    return tau, own_rates, added, switches
 
 
 _added: Any = eqx.filter_jit(added_inertia)  # traced once, not at each use by a solver
@@ -174,14 +211,16 @@ def vector_field(t, y, args, schedule) -> tuple[Any, ...]:
     """Rates of joint displacements, of velocities and of the elements' own states."""
     delta, qd, *_ = y
     tau, own_rates, added = applied(t, y, args, schedule)
-    return whole(*rates(args.constants, delta, qd, tau, added), own_rates)
+    constants = args.moving().constants
+    return whole(*rates(constants, delta, qd, tau, added), own_rates)
 
 
 def watched_field(t, y, args, schedule) -> tuple[tuple[Any, ...], Health]:
     """Rates of `vector_field` and their health, which `ScheduledTerm` defines."""
     delta, qd, *_ = y
     tau, own_rates, added = applied(t, y, args, schedule)
-    (qd, qdd), losses = rates_and_conditioning(args.constants, delta, qd, tau, added)
+    constants = args.moving().constants
+    (qd, qdd), losses = rates_and_conditioning(constants, delta, qd, tau, added)
     health = health_with((qdd, own_rates), health_at(losses))
     return whole(qd, qdd, own_rates), health
 
@@ -193,8 +232,8 @@ def health_of(t, y, args) -> Health:
     if inertial(args.forces):
         q = args.q0 + jnp.stack(delta)
         still = jnp.zeros_like(q)
-        added, _ = _added(args.linkage, inertial(args.forces), q, still)
-    return health_at(conditioning(args.constants, delta, added))
+        added, _ = _added(args.linkage, args.masses(t), q, still)
+    return health_at(conditioning(args.moving().constants, delta, added))
 
 
 def element_effort(
@@ -306,10 +345,18 @@ def _of_arrays(term: ScheduledTerm) -> ScheduledTerm:
         rates, health = watched(*at)
         return tuple(map(jnp.stack, rates)), health
 
+    def resolve(event, y, args):
+        assert term.resolve is not None
+        args = args._replace(constants=args.constants.scalars())
+        y, modes = term.resolve(event, tuple(map(tuple, y)), args)
+        return tuple(map(jnp.stack, y)), modes
+
     return ScheduledTerm(
         lambda *at: tuple(map(jnp.stack, field(*at))),
         term.schedule,
         of_scalars(term.health),
         watched_field,
         of_scalars(term.switching),
+        term.unknown_modes,
+        term.resolve and resolve,
     )

@@ -22,10 +22,17 @@ from ..steps.dopri8 import ScheduledDopri8, ScheduledTerm, constant
 from ..steps.landing import end_of_run
 from ..steps.looped_dopri8 import LoopedDopri8
 from ..steps.step_control import StepControl, largest_loss
-from ..steps.switching import Located, LocatedImplicit, located, switching_facts
+from ..steps.switching import (
+    Located,
+    LocatedImplicit,
+    Switching,
+    located,
+    switching_facts,
+)
 from ..steps.tolerances import default_controller
 from ..steps.unchecked import diffeqsolve
 from .field import args_of, in_arrays, initial_own, own_states, whole
+from .holding import Modes, changes, in_order, taken_at
 from .known_times import clocks_apart, known_times
 from .prescribed import agrees, formulation
 from .solution import Solution
@@ -135,6 +142,11 @@ def _control(
                 "stepsize_controller: expected an adaptive one, as forces declare "
                 f"times at which they jump (jump_ts), got {shown(steps)}."
             )
+        if changes(args.forces):
+            raise ValueError(
+                "stepsize_controller: expected an adaptive one, as forces hold joints "
+                f"or take payloads, got {shown(steps)}."
+            )
         return _Control(start, solver, steps, None)
     jumps = known_times(args)
     implicit = isinstance(solver, diffrax.AbstractImplicitSolver)
@@ -159,8 +171,14 @@ def _solve(problem: _Problem, control: _Control, keywords) -> diffrax.Solution:
     """Integrates; also saves the last time that was reached, and the switches there."""
     ts, size = problem.ts, len(problem.start)
     adaptive = isinstance(control.steps, diffrax.AbstractAdaptiveStepSizeController)
+
+    def row(t, y, args):
+        """Returns the state, and the modes if joints are held."""
+        last = y[-1].modes if isinstance(y[-1], Switching) else y[-1]
+        return (*y[:size], *last[:4]) if isinstance(last, Modes) else y[:size]
+
     outputs = (
-        diffrax.SubSaveAt(ts=ts, fn=lambda t, y, args: y[:size]),
+        diffrax.SubSaveAt(ts=ts, fn=row),
         diffrax.SubSaveAt(t1=True, fn=lambda t, y, args: (t, *y[size:])),
     )
     keywords = keywords | {
@@ -187,6 +205,7 @@ def _read(inputs: Inputs, problem: _Problem, solve: diffrax.Solution) -> Solutio
     valid, ts = problem.valid, problem.ts
     assert solve.ys is not None  # because of saveat
     states, (reached, *switches) = solve.ys
+    states, modes = states[: len(problem.start)], states[len(problem.start) :]
     q, qd, own = jax.vmap(problem.joints)(ts, states)
 
     def shown_at(a):
@@ -208,7 +227,14 @@ def _read(inputs: Inputs, problem: _Problem, solve: diffrax.Solution) -> Solutio
         stats["accuracy"] = jnp.finfo(q.dtype).eps * loss
     stats |= switching_facts(*switches)
     result = _judged(valid, solve.result, q, qd)
-    return Solution(times, q, qd, stats, result, jax.tree.map(shown_at, own))
+    holding = ()
+    if modes:
+        (last,) = switches
+        modes = Modes(*modes, jax.tree.map(lambda rows: rows[0], last.modes.events))
+        taken = taken_at(problem.args, ts, modes, q - problem.args.q0)
+        holding = shown_at(modes.mode), shown_at(taken), in_order(modes.events)
+    own = jax.tree.map(shown_at, own)
+    return Solution(times, q, qd, stats, result, own, *holding)
 
 
 def _differentiable(solver: Any, adjoint: diffrax.AbstractAdjoint) -> Any:

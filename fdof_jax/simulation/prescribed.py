@@ -23,6 +23,7 @@ from ..linkage.topology import MOST_PAIRS, fixed_pairs
 from ..mechanics.equations import equations, zeros
 from ..references.reference import EXPECTED, reference_motion
 from ..steps.dopri8 import Health, ScheduledTerm
+from .holding import changes, guarded_switching, resolve, unknown_modes
 from .field import (
     Args,
     applied,
@@ -148,7 +149,15 @@ class Formulation(NamedTuple):
 
 def formulation(forces: Forces) -> Formulation:
     """Returns that of velocities or, with a prescribed motion, of momenta."""
-    return FREE if prescribed(forces) is None else HYBRID
+    if prescribed(forces) is None:
+        return HOLDING if changes(forces) else FREE
+    if changes(forces):
+        raise ValueError(
+            "forces: expected no element that holds joints (JointFriction without "
+            "speed, HardStops, Brake) or takes a Payload beside a PrescribedMotion, "
+            "got both."
+        )
+    return HYBRID
 
 
 def _free_joints(args: Args, t: Any, y: Any) -> tuple[Array, Array]:
@@ -218,6 +227,12 @@ FREE = Formulation(
     lambda args, qd: (zeros(args.q0), tuple(qd)),
     _free_joints,
 )
+HOLDING = FREE._replace(
+    term=ScheduledTerm(
+        vector_field, schedule_of, health_of, watched_field,
+        guarded_switching, unknown_modes, resolve,
+    )
+)  # fmt: skip
 HYBRID = Formulation(
     ScheduledTerm(
         _hybrid_field, schedule_of, _health, _watched_hybrid_field, _hybrid_switching

@@ -6,7 +6,7 @@ motion. Differentiation through the integrator would take twice as long to compi
 
 import dataclasses
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -43,25 +43,74 @@ class Sensitivities(NamedTuple):
 
 
 class _Varied(NamedTuple):
-    """Parameters of the equations, and the sides in force."""
+    """Parameters of the equations, and the sides and modes in force."""
 
     z: Array
     sides: Array | None = None
+    modes: Any = None
 
 
 class _Term(diffrax.ODETerm):
+    """The equations of a motion, or of one and its derivatives (see `ScheduledTerm`).
+
+    Their state is (row,) or (rows,): a motion, and below it its derivatives.
+    """
+
     switches: Callable[..., tuple[Array, bool]] = eqx.field(static=True)
+    unknown_modes: Callable | None = eqx.field(static=True)
+    resolve: Callable | None = eqx.field(static=True)
 
     def vf(self, t, y, args):
         return self.vector_field(t, y, args)
 
 
+class _LocatedRow(Located):
+    """Of the motion alone, as a function of the parameters."""
+
+    known_lateness: Callable[[Array, Array], Array]
+
+    def lateness(self, arrival, term):
+        known = self.known_lateness(arrival.t, arrival.args.z)
+        return super().lateness(arrival, term) + known
+
+
 class _LocatedRows(Located):
     """Adds what switches and known times change in the derivatives of the motion."""
 
-    rates: Callable[..., Array] = eqx.field(static=True)  # (t, row, z, sides)
+    motion: _Term  # of the motion alone
+    rates: Callable[..., Array] = eqx.field(static=True)  # (t, row, varied)
     jumps: Array | None
     slopes: Array | None  # derivatives of the jumps (jump, n)
+
+    def resolved(self, term, t, y, args, *here):
+        (rows,) = y
+        one = _LocatedRow(
+            self.solver, self.jumping, self.apart, self.guards, True, self.known_late
+        )  # pyright: ignore[reportCallIssue]
+
+        def resolved(row, z):
+            (row,), modes = one.resolved(
+                self.motion, t, (row,), args._replace(z=z), *here
+            )
+            return row, modes
+
+        row, along, modes = jax.linearize(resolved, rows[0], args.z, has_aux=True)
+        slopes = jax.vmap(along)(rows[1:], jnp.eye(args.z.size, dtype=rows.dtype))
+        return (jnp.concatenate([row[None], slopes]),), modes
+
+    def kept(self, held, y1, y0):
+        ((new,), (old,)) = y1, y0
+        held = jnp.zeros(new.shape[1], bool).at[: 2 * held.size].set(jnp.tile(held, 2))
+        return (jnp.where(held[None], old, new),)
+
+    def known_late(self, time: Array, z: Array) -> Array:
+        """Returns how much later a known time here is: 0, with derivatives in `z`."""
+        if self.jumps is None or self.slopes is None:
+            return jnp.zeros_like(time)
+        distance = jnp.abs(time - self.jumps)
+        index = jnp.argmin(distance)
+        late = self.slopes[index] @ (z - jax.lax.stop_gradient(z))
+        return jnp.where(distance[index] <= 2 * self.apart, late, 0)
 
     def needed(self, count, jumps):
         return count > 0 or jumps is not None
@@ -81,8 +130,10 @@ class _LocatedRows(Located):
             when, beside = jnp.where(ahead, t, time), jnp.where(ahead, before, after)
             times = jnp.stack([time, t, when, when, when])
             sides = jnp.stack([beside, beside, before, between, after])
-            rates = jax.vmap(self.rates, in_axes=(0, None, None, 0))
-            rates = rates(times, rows[0], args.z, sides)
+            rates = jax.vmap(
+                lambda t, sides: self.rates(t, rows[0], args._replace(sides=sides))
+            )
+            rates = rates(times, sides)
             late = jnp.zeros(args.z.size, rows.dtype)  # the known time
             if self.jumps is not None and self.slopes is not None:
                 distance = jnp.abs(time - self.jumps)
@@ -154,26 +205,39 @@ def sensitivities(
     structure = jax.tree.structure(start_at(z)[1])
     directions = jnp.eye(z.size, dtype=z.dtype)
 
-    def rates(t, row, z, sides):
-        args, _ = start_at(z)
+    def instant(row, varied):
+        """Returns term, state and arguments of the motion."""
+        args, _ = start_at(varied.z)
+        args = args._replace(sides=varied.sides, modes=varied.modes)
         y = jax.tree.unflatten(structure, tuple(row))
-        rates = formulation(args.forces).term.vf(t, y, args._replace(sides=sides))
-        return jnp.stack(jax.tree.leaves(rates))
+        return formulation(args.forces).term, y, args
+
+    def rates(t, row, varied):
+        term, *at = instant(row, varied)
+        return jnp.stack(jax.tree.leaves(term.vf(t, *at)))
 
     @jax.jit  # traced once, not at each use by the solver
     def field(t, y, varied):
-        state, (z, sides) = y[0], varied
-        value, along = jax.linearize(
-            lambda row, z: rates(t, row, z, sides), state[0], z
-        )
+        state, at = y[0], lambda row, z: rates(t, row, varied._replace(z=z))
+        value, along = jax.linearize(at, state[0], varied.z)
         slopes = jax.vmap(along)(state[1:], directions)
         return (jnp.concatenate([value[None], slopes]),)
 
+    def switches_of_row(t, y, varied):
+        term, *at = instant(y[0], varied)
+        return term.switches(t, *at)
+
     def switches_of(t, y, varied):
-        args, _ = start_at(varied.z)
-        y = jax.tree.unflatten(structure, tuple(y[0][0]))
-        args = args._replace(sides=varied.sides)
-        return formulation(args.forces).term.switches(t, y, args)
+        return switches_of_row(t, (y[0][0],), varied)
+
+    def unknown_modes(varied):
+        term, _, args = instant(start, varied)
+        return term.unknown_modes(args)
+
+    def resolve(event, y, varied):
+        term, *at = instant(y[0], varied)
+        state, modes = term.resolve(event, *at)
+        return (jnp.stack(jax.tree.leaves(state)),), modes
 
     def times_of(z):
         return known_times(start_at(z)[0])
@@ -186,10 +250,13 @@ def sensitivities(
     tolerance = of_precision(tolerance, max(tolerance, TOLERANCE))
     controller = adaptive(tolerance, tolerance)
     controller = dataclasses.replace(controller, norm=_largest_rms)
-    term = _Term(field, switches_of)  # pyright: ignore[reportArgumentType, reportCallIssue]
     jumps, slopes = times_of(z), jax.jacfwd(times_of)(z)
     y0 = (jnp.concatenate([start[None], jax.vmap(along)(directions)]),)
-    of_rows = True, rates, jumps, slopes
+    changing = formulation(start_at(z)[0].forces).term.resolve is not None
+    events = (unknown_modes, resolve) if changing else (None, None)
+    term = _Term(field, switches_of, *events)  # pyright: ignore[reportArgumentType, reportCallIssue]
+    motion = _Term(lambda t, y, varied: (rates(t, y[0], varied),), switches_of_row, *events)  # pyright: ignore[reportArgumentType, reportCallIssue]
+    of_rows = True, motion, rates, jumps, slopes
     locate = lambda *settings: _LocatedRows(*settings, *of_rows)  # pyright: ignore[reportCallIssue]
     # A method of few stages, because much of the work lies outside of them; as a loop
     # that `next_motion` can differentiate again.

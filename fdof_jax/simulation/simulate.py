@@ -98,7 +98,8 @@ def elements_at_door(linkage: Linkage, forces: Forces) -> tuple[Element, ...]:
     for index, element in enumerate(adapted):
         place = f"forces[{index}]"
         if (jumps := in_numpy(element).jump_ts) is not None:
-            real_array(f"{place}.jump_ts", jumps, (None,) if np.ndim(jumps) else ())
+            shape = (None,) if np.ndim(jumps) else ()
+            real_array(f"{place}.jump_ts", jumps, shape, finite=False)
         single_precision(place, element)
     return of_full_size(linkage, adapted)
 

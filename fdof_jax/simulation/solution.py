@@ -136,6 +136,14 @@ class Solution(WithOutcome):
     stats: dict[str, Any]
     result: diffrax.RESULTS
     own: tuple[Any, ...] = ()
+    modes: Float[Array, "time joint"] | None = None
+    taken: Float[Array, " time"] | None = None
+    events: Any = None
+
+    @property
+    def states(self) -> tuple[Any, ...]:
+        """What depends on the inputs smoothly, and has derivatives."""
+        return self.q, self.qd, self.own, self.taken, self.events
 
     def _facts(self) -> dict[str, str]:
         facts = super()._facts()

@@ -64,9 +64,12 @@ def _solve_one(inputs: Inputs, keywords) -> tuple[Solution, bool] | None:
     solution, succeeded = sharing_functions(run, forces=inputs.forces)
     if solution is None or is_traced(solution):
         return None
-    q, qd, own = cut((solution.q, solution.qd, solution.own), len(ts))
-    stats = solution.stats | {"max_steps": most}
-    return Solution(ts, q, qd, stats, solution.result, own), bool(succeeded)
+    rows = solution.q, solution.qd, solution.own, solution.modes, solution.taken
+    q, qd, own, *modes = cut(rows, len(ts))
+    stats, result = solution.stats | {"max_steps": most}, solution.result
+    return Solution(ts, q, qd, stats, result, own, *modes, solution.events), bool(
+        succeeded
+    )
 
 
 def _of_any_tolerance(keywords):
@@ -166,7 +169,7 @@ def _integrate_reversibly_fwd(perturbed, inputs, keywords):
     def motion(moving):
         inputs = eqx.combine(moving, fixed)
         solution = integrate(inputs, keywords, derivatives=True, tangents=few)
-        return (solution.q, solution.qd, solution.own), solution
+        return solution.states, solution
 
     if few:
         states, tangents, solution = _with_tangents(motion, moving)
@@ -178,9 +181,7 @@ def _integrate_reversibly_fwd(perturbed, inputs, keywords):
 @_integrate_reversibly.def_bwd
 def _integrate_reversibly_bwd(residuals, cotangent, perturbed, inputs, keywords):
     slopes, states = residuals
-    wanted = eqx.combine(
-        (cotangent.q, cotangent.qd, cotangent.own), jax.tree.map(jnp.zeros_like, states)
-    )
+    wanted = eqx.combine(cotangent.states, jax.tree.map(jnp.zeros_like, states))
     moving = eqx.filter(inputs, perturbed)
     if not _few(moving, keywords["adjoint"]):
         (gradient,) = slopes(wanted)

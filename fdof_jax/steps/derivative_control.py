@@ -131,7 +131,7 @@ class OfLinearised(eqx.Module):
         """Returns the error of the probe over its tolerance, and the moved probe."""
         t0, t1, _, y1, args = step
         if isinstance(y1[-1], Switching):
-            args = args._replace(sides=y1[-1].sides)
+            args = y1[-1].in_force(args)
         at_end = constant((t1, motion_of(y1), args))
         matrix = constant(t1 - t0) * linearised(self.term, *at_end)
         change, error = self._step(matrix, probe)

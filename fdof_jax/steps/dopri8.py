@@ -50,6 +50,11 @@ class ScheduledTerm(diffrax.ODETerm):
     1, or 0 where the equations are singular. `watched_field` returns the rates and
     their health, NaN if they are not finite.
     `switching` returns the switching functions (n,), and whether anything jumps.
+
+    Where joints are held for a while, `args.modes` says which. `unknown_modes(args)`
+    returns the modes before the start, and how many of the last switching functions
+    guard them: positive while a mode lasts. `resolve(event, y, args)` returns the state
+    and the modes after an event.
     """
 
     vector_field: Callable[..., PyTree] = eqx.field(static=True)
@@ -57,6 +62,8 @@ class ScheduledTerm(diffrax.ODETerm):
     health: Callable[..., Health] = eqx.field(static=True)
     watched_field: Callable[..., tuple[PyTree, Health]] = eqx.field(static=True)
     switching: Callable[..., tuple[Array, bool]] = eqx.field(static=True)
+    unknown_modes: Callable | None = eqx.field(static=True, default=None)
+    resolve: Callable | None = eqx.field(static=True, default=None)
 
     def vf(self, t, y, args):
         return self.vector_field(t, y, args, self.schedule(t, args))

@@ -85,7 +85,7 @@ class Landing(eqx.Module):
 
     def in_force(self, args: Any, y: Any) -> Any:
         """Returns the arguments with the sides in force at a state."""
-        return args._replace(sides=y[-1].sides) if self.switches else args
+        return y[-1].in_force(args) if self.switches else args
 
     def _seen(self, y: Any, end: Array) -> tuple[Any, ...]:
         """Returns times and `near` of `Switching`, and whether nothing switches here.

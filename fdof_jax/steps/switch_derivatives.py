@@ -125,6 +125,58 @@ def _(primals, tangents, *, term):
     return nothing, jax.lax.cond(jnp.any(arrival.switched), second, none)
 
 
+class Event(NamedTuple):
+    """The instant at which the modes of joints may change.
+
+    - `before`, `t`: times just before it and just after it [s].
+    - `fired` (kind, joint): which guards of modes came to their zeros.
+    - `late`: 0, whose derivatives are those of the time of the event less `before`.
+    """
+
+    before: Array
+    t: Array
+    fired: Array
+    late: Array
+
+
+class Instant(NamedTuple):
+    """A time, the state and the arguments of the equations there."""
+
+    t: Array
+    y: Any
+    args: Any
+
+
+@eqx.filter_custom_jvp
+def moved_on(late: Array, instant: Instant, *, term: Any) -> Any:
+    """Returns the state a time `late` later, which is 0, with derivatives."""
+    return instant.y
+
+
+@moved_on.def_jvp
+def _(primals, tangents, *, term):
+    (late, instant), (change, changes) = primals, tangents
+    there = moved_on(late, instant, term=term)
+    field = lambda instant: term.vf(*instant)
+    rates = field(Instant(instant.t + late, there, instant.args))
+    start = _filled(changes.y, instant.y)
+    if change is None:
+        return there, start
+    # Of second order: how the rates change with the start.
+    _, turned = eqx.filter_jvp(field, (instant,), (changes,))
+    moved = lambda dy, rate, turn: dy + change * rate + _of_zero(late, turn)
+    return there, jax.tree.map(moved, start, rates, _filled(turned, rates))
+
+
+def _filled(tangents: Any, values: Any) -> Any:
+    """Returns tangents, zeros where equinox leaves None because nothing changes."""
+    return jax.tree.map(
+        lambda value, tangent: jnp.zeros_like(value) if tangent is None else tangent,
+        values,
+        tangents,
+    )
+
+
 class Moment(NamedTuple):
     """A switch: time, state, arguments, and the sides before and after it."""
 

@@ -4,6 +4,7 @@ Within a step the branches are those in force at its start, so the step's equati
 smooth. A step over the zero of a switching function is replaced by one that ends there.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -16,7 +17,16 @@ from jax import Array
 
 from .dopri8 import SHORTEST, DenseOutput, constant, with_change
 from .landing import Landing, rounding
-from .switch_derivatives import Arrival, Moment, first_of, gained, lateness
+from .switch_derivatives import (
+    Arrival,
+    Event,
+    Instant,
+    Moment,
+    first_of,
+    gained,
+    lateness,
+    moved_on,
+)
 from .zeros_in_steps import CHECKED, CHECKS, SAMPLED, SHARES, passage
 
 # A function whose zero is this close to the end of a step switches there: a share of
@@ -48,6 +58,7 @@ class Switching(NamedTuple):
       None if nothing jumps at switches.
     - `grazing`, `grazing_here`: how near to grazing a crossing came so far, and one
       here; 0 if none (see `at_end`).
+    - `modes`: those of the joints (see `ScheduledTerm`), None if elements hold none.
     """
 
     sides: Array
@@ -63,6 +74,16 @@ class Switching(NamedTuple):
     one_sided: Array | None
     grazing: Array
     grazing_here: Array
+    modes: Any = None
+
+    def in_force(self, args: Any) -> Any:
+        """Returns the arguments with the sides, and any modes, in force here."""
+        return _in_force(args, self.sides, self.modes)
+
+
+def _in_force(args: Any, sides: Array, modes: Any) -> Any:
+    args = args._replace(sides=sides)
+    return args if modes is None else args._replace(modes=modes)
 
 
 def motion_of(y: Any) -> Any:
@@ -86,16 +107,21 @@ def located(
     """
     t0, apart = ts[0], rounding(ts)
     jumps = None if jumps is None else jnp.asarray(jumps, t0.dtype)
+    modes, guards = None, 0
+    if term.unknown_modes is not None:
+        modes, guards = term.unknown_modes(args)
+        args = args._replace(modes=modes)
     functions, jumping = eqx.filter_eval_shape(term.switches, t0, y0, args)
-    locating = locate(solver, jumping, apart)
+    locating = locate(solver, jumping, apart, guards)
     switches = locating.needed(functions.size, jumps)
     if jumps is None and not switches:
         return solver, None, y0
     if switches:
         unknown, none = jnp.zeros(functions.shape, t0.dtype), jnp.zeros_like(t0)
+        known = unknown.at[functions.size - guards :].set(1)
         at_start = Switching(
-            sides=unknown,
-            after=unknown,
+            sides=known,
+            after=known,
             until=t0,
             unseen=t0,
             soon=t0,
@@ -107,6 +133,7 @@ def located(
             one_sided=none if jumping else None,
             grazing=none,
             grazing_here=none,
+            modes=modes,
         )
         solver, y0 = locating, (*y0, at_start)
     return solver, Landing(jumps, apart, switches), y0
@@ -133,6 +160,7 @@ class Located(diffrax.AbstractAdaptiveSolver):
     solver: Any
     jumping: bool = eqx.field(static=True)  # whether efforts do, at a switch
     apart: Array  # see `rounding`
+    guards: int = eqx.field(static=True)  # switching functions that guard modes
     derivatives: bool = eqx.field(static=True)
 
     @property
@@ -141,7 +169,8 @@ class Located(diffrax.AbstractAdaptiveSolver):
 
     @property
     def interpolation_cls(self):  # pyright: ignore
-        return self.solver.interpolation_cls
+        kind = self.solver.interpolation_cls
+        return functools.partial(_WithModes, kind) if self.guards else kind
 
     def order(self, terms):
         return self.solver.order(terms)
@@ -154,20 +183,37 @@ class Located(diffrax.AbstractAdaptiveSolver):
 
     def init(self, terms, t0, t1, y0, args):
         *y0, switching = y0
-        args = args._replace(sides=switching.sides)
+        args = switching.in_force(args)
         return self.solver.init(terms, t0, t1, tuple(y0), args)
 
     def step(self, terms, t0: Any, t1: Any, y0, args, solver_state, made_jump):
         *y0, switching = y0
         if_jumped = lambda after, before: jnp.where(made_jump, after, before)
         sides = if_jumped(switching.after, switching.sides)
-        changed = (sides != switching.sides) & (switching.sides != 0)
-        y0, args = tuple(y0), args._replace(sides=sides)
-        y0 = self.shifted(terms.term, t0, y0, args, switching, made_jump)
+        begun = sides != switching.sides
+        changed = begun & (switching.sides != 0)
+        y0, modes, earlier = tuple(y0), switching.modes, switching.sizes
+        if self.guards:
+            sides = sides.at[-self.guards :].set(1)
+            here = terms.term, t0, y0, args, switching, sides, changed
+            y0, modes = self.resolved(*here, made_jump)
+            # Other modes have other guards.
+            other = changed[-self.guards :].any() | ~_same(modes, switching.modes).all()
+            guards = jnp.arange(sides.size) >= sides.size - self.guards
+            begun = begun | (other & guards)
+            earlier = jnp.where(other & guards, 0, earlier)
+            args = _in_force(args, sides, modes)
+        else:
+            args = args._replace(sides=sides)
+            y0 = self.shifted(terms.term, t0, y0, args, switching, made_jump)
         y1, error, dense, solver_state, result = self.solver.step(
             terms, t0, t1, y0, args, solver_state, made_jump
         )
-        path = self.interpolation_cls(t0=t0, t1=t1, **dense)
+        path = self.solver.interpolation_cls(t0=t0, t1=t1, **dense)
+        if self.guards:
+            # What is held does not even catch up with rounding errors of before.
+            y1 = self.kept(modes.held, y1, y0)
+            dense = dict(path=dense, modes=modes)
 
         where = terms.term, t0, t1, path, args
         values, checks = _values(*constant(where))
@@ -176,12 +222,12 @@ class Located(diffrax.AbstractAdaptiveSolver):
         share = jnp.finfo(t1.dtype).eps ** _NEAR
         near = jnp.maximum(share * (t1 - t0), switching.near / 2)
         near = jnp.maximum(near, self.apart)
-        sizes = jnp.maximum(switching.sizes, jnp.max(jnp.abs(values), axis=0))
+        sizes = jnp.maximum(earlier, jnp.max(jnp.abs(values), axis=0))
         until, crossed, missed, unseen, switched, grazing, soon = passage(
             margins,
             sides[None] * checks,
-            sides != switching.sides,
-            switching.sizes,
+            begun,
+            earlier,
             sizes,
             near / (t1 - t0),
             t1 - t0 <= jnp.maximum(SHORTEST[t1.dtype], _BRIEF * near),
@@ -203,11 +249,10 @@ class Located(diffrax.AbstractAdaptiveSolver):
             length=t1 - t0,
             ahead=jnp.any(switched & (margins[-1] > 0)).astype(t0.dtype),
             passed=switching.passed + jnp.sum(changed & ~on_zero),
-            one_sided=self.one_sided(
-                switching, on_zero, sides, sizes, jnp.sum(changed)
-            ),
+            one_sided=self.one_sided(switching, on_zero, sides, sizes, changed),
             grazing=jnp.maximum(missed, grazed),
             grazing_here=grazing,
+            modes=modes,
         )
         still = jax.tree.map(jnp.zeros_like, new)
         if error is not None:  # None: a method without an estimate
@@ -229,9 +274,53 @@ class Located(diffrax.AbstractAdaptiveSolver):
         """Returns `Switching.one_sided` at the end of a step."""
         if switching.one_sided is None:
             return None
-        at_once = jnp.any(on_zero & (sizes > 0) & (sides != 0))
-        together = (changed > 1) & (switching.grazing_here > 0)
+        at_once = on_zero & (sizes > 0) & (sides != 0)
+        at_once = jnp.any(at_once[: sides.size - self.guards])
+        together = (jnp.sum(changed) > 1) & (switching.grazing_here > 0)
         return jnp.maximum(switching.one_sided, at_once) + together
+
+    def resolved(
+        self, term: Any, t: Array, y: Any, args: Any, switching: Switching,
+        sides: Array, changed: Array, made_jump: Any,
+    ) -> tuple[Any, Any]:  # fmt: skip
+        """Returns state and modes at the start of a step, after an event there.
+
+        The state moves on to the time of the event in the modes before, and back in
+        those after: this changes nothing but derivatives.
+        """
+        before = switching.in_force(args)
+        fired = changed[-self.guards :].reshape(-1, switching.modes.mode.size)
+
+        def event() -> tuple[Any, Any]:
+            time = jnp.where(switching.ahead > 0, t, switching.until)
+            late, there = jnp.zeros_like(t), y
+            if self.derivatives:
+                arrived = changed & made_jump & (switching.length > 0)
+                late = self.lateness(Arrival(time, y, before, arrived), term)
+                there = moved_on(late, Instant(time, y, before), term=term)
+            happens = Event(switching.until, t, fired, late)
+            there, modes = term.resolve(happens, there, before._replace(sides=sides))
+            if self.derivatives:
+                after = Instant(t + late, there, _in_force(args, sides, modes))
+                there = moved_on(-late, after, term=term)
+            return there, modes
+
+        start = jnp.any(switching.modes.mode < 0)
+        return jax.lax.cond(made_jump | start, event, lambda: (y, switching.modes))
+
+    def kept(self, held: Array, y1: Any, y0: Any) -> Any:
+        """Returns the end of a step, positions and rates of held joints as before."""
+
+        def still(new: Any, old: Any) -> Any:
+            if eqx.is_array(new):
+                return jnp.where(held, old, new)
+            return tuple(jnp.where(*row) for row in zip(held, old, new))
+
+        return (*map(still, y1[:2], y0[:2]), *y1[2:])
+
+    def lateness(self, arrival: Arrival, term: Any) -> Array:
+        """Returns how much later the event is: 0, with derivatives."""
+        return lateness(arrival, term=term)
 
     def shifted(
         self,
@@ -274,6 +363,24 @@ class LocatedImplicit(Located, diffrax.AbstractImplicitSolver):
     @property
     def root_find_max_steps(self):  # pyright: ignore[reportIncompatibleVariableOverride]
         return self.solver.root_find_max_steps
+
+
+class _WithModes(diffrax.AbstractLocalInterpolation):
+    """The path of a step, with the modes in it as the last entry of its states."""
+
+    kind: Any = eqx.field(static=True)
+    t0: Any  # pyright: ignore[reportIncompatibleVariableOverride]
+    t1: Any  # pyright: ignore[reportIncompatibleVariableOverride]
+    path: Any
+    modes: Any
+
+    def evaluate(self, t0, t1=None, left=True):
+        path = self.kind(t0=self.t0, t1=self.t1, **self.path)
+        return *path.evaluate(t0, t1, left), self.modes
+
+
+def _same(modes: Any, others: Any) -> Array:
+    return (modes.mode == others.mode) & (modes.direction == others.direction)
 
 
 @eqx.filter_jit  # traced once, not at each use in a solve

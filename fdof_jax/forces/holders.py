@@ -1,0 +1,230 @@
+"""Elements that hold joints for a while: dry friction, hard stops, brakes.
+
+A fictitious joint of the paper is held at rest by a generalised constraint force. What
+an element here holds is held by one too, for as long as the element's law allows.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Bool
+from numpy.typing import ArrayLike
+
+from ..base.checks import shown
+from ..linkage.fields import Condition, Values, each, field
+from ..linkage.linkage import Linkage, joints_of
+from ..linkage.topology import MOST_PAIRS
+from .element import Forces, ScalarElement
+
+_NUMBERS = tuple(range(1, MOST_PAIRS + 1))
+
+
+class Holder(ScalarElement):
+    """Base of elements that hold joints; a motion has the modes of its joints.
+
+    Called by itself, an element returns its efforts at joints that are not held.
+    """
+
+    @property
+    def holds(self) -> bool:
+        """Whether the law has joints that stand still exactly."""
+        return True
+
+    def levels(self, joints: int) -> tuple[Array, Array]:
+        """Returns the sliding and the static friction of each joint, (2, n)."""
+        return jnp.zeros(joints), jnp.zeros(joints)
+
+    def braking(self, t: Array, linkage: Linkage) -> Array:
+        """Returns which joints a brake holds at a time, (n,)."""
+        return jnp.zeros(joints_of(linkage), bool)
+
+    def respond(self, scheduled, q, qd, linkage):
+        return tuple(jnp.zeros_like(rate) for rate in qd)
+
+
+class JointFriction(Holder):
+    """Coulomb friction of the joints: one that sticks, or one that is rounded off.
+
+    While a joint slides, the effort is -level * sign(qd). Where its rate comes to zero
+    and no more than the static friction would hold it, it stands still, exactly, until
+    its load exceeds the static friction.
+
+    With `speed`, the effort is -level * tanh(qd / speed) instead: joints never stick,
+    and creep at a fraction of `speed` under loads below the level. The smaller `speed`,
+    the stiffer the equations.
+
+    **Arguments:** one per joint or one for all.
+
+    - `level`: of sliding friction, not negative [N or N m].
+    - `static`: friction up to which a joint at rest is held, at least the level; by
+      default equal to it [N or N m].
+    - `speed`: positive [m/s or rad/s].
+
+    **Raises:** ValueError for malformed arguments, and for `static` beside `speed`.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig5().linkage
+    >>> fj.forces.JointFriction(5)(0.0, [0, 0, 0], [0.0, 0.01, -1.0], arm).tolist()
+    [0.0, -5.0, 5.0]
+    >>> level = fj.Linkage("R", length=[0, 1], com=[[0.5, 0]], mass=[1], inertia=[0.1])
+    >>> holds = fj.forces.JointFriction(1.5 * 9.81 * 0.5)
+    >>> fj.simulate(level, fj.State([0.0], [0.0]), [0, 10.0], (holds,)).q[-1].tolist()
+    [0.0]
+    """
+
+    level: Values = field(unit="N or N m", minimum=0)
+    static: Values | None = field(
+        unit="N or N m", minimum=0, optional=True, default=None
+    )
+    speed: Values | None = field(
+        unit="m/s or rad/s", above=0, optional=True, default=None, kw_only=True
+    )
+
+    @property
+    def holds(self):
+        return self.speed is None
+
+    def conditions(self):
+        if self.static is not None:
+            alone = self.speed is None
+            yield Condition(alone, "static", "none beside speed", self.static)
+            enough = (self.static >= self.level).all()
+            yield Condition(
+                enough, "static", "at least the level", (self.static, self.level)
+            )
+
+    def levels(self, joints):
+        static = self.level if self.static is None else self.static
+        return jnp.broadcast_to(self.level, joints), jnp.broadcast_to(static, joints)
+
+    def respond(self, scheduled, q, qd, linkage):
+        if self.speed is None:
+            signs = map(jnp.sign, qd)
+        else:
+            rates = zip(each(self.speed, qd), qd)
+            signs = (jnp.tanh(rate / speed) for speed, rate in rates)
+        return tuple(-x * sign for x, sign in zip(each(self.level, qd), signs))
+
+
+class HardStops(Holder):
+    """Rigid stops at the ends of the joints' ranges: impacts, bouncing and resting.
+
+    A joint that reaches its stop at a rate v leaves it at -restitution * v; the blow
+    also changes the rates of the other joints. Blows knock frictions loose, and brakes
+    hold. A joint that bounces lower than can be told from the stop rests there, until
+    something pulls it away: the time and the height that are left out are about 1e-5 s
+    and 1e-11 m or rad (in float32, 1e-3 and 1e-5). `JointStops` are soft: take those
+    where the give of the stop matters, or where several contacts at a time share loads.
+
+    **Arguments:** all in joint order, one per joint or one for all.
+
+    - `lower`, `upper`: ends of the range [m or rad]; may be infinite.
+    - `restitution`: at least 0 and less than 1; by default blows take all of the rate.
+
+    **Raises:** ValueError for malformed arguments, and unless lower < upper.
+
+    >>> import fdof_jax as fj
+    >>> mass = fj.Linkage("P", length=[0, 1], com=[[0, 0]], mass=[1], inertia=[1])
+    >>> floor = fj.forces.HardStops(0.0, float("inf"), restitution=0.5)
+    >>> motion = fj.simulate(mass, fj.State([1.0], [0.0]), [0, 2.0], (floor,))
+    >>> motion.q[-1].tolist(), motion.modes[-1].tolist()  # it rests on the lower stop
+    ([0.0], [2.0])
+    """
+
+    lower: Values = field(unit="m or rad", finite=False)
+    upper: Values = field(unit="m or rad", finite=False)
+    restitution: Values = field(unit="1", minimum=0, default=0.0, kw_only=True)
+
+    def conditions(self):
+        apart = (self.lower < self.upper).all()
+        yield Condition(apart, "lower", "less than upper", (self.lower, self.upper))
+        e = self.restitution
+        yield Condition((e < 1).all(), "restitution", "less than 1", e)
+
+
+class Brake(Holder):
+    """A brake that holds joints between two known times, whatever that takes.
+
+    Where it takes hold, a blow stops its joints and changes the rates of the others.
+    One that acts at the start of a motion, or before, holds from the start on.
+
+    **Arguments:**
+
+    - `joints`: the number of a joint, from 1, or several such numbers.
+    - `begin`, `end`: times at which it takes hold and lets go [s]; by default it always
+      has, and never does.
+
+    **Raises:** ValueError for malformed arguments, and unless begin < end.
+
+    >>> import fdof_jax as fj
+    >>> arm, start, *_ = fj.scenes.fig5()
+    >>> brake = fj.forces.Brake([2, 3], begin=0.5)
+    >>> motion = fj.simulate(arm, start, [0, 0.5, 1.0], (brake,))
+    >>> motion.modes[-1].tolist()  # the first joint is free, a brake holds the others
+    [0.0, 4.0, 4.0]
+    """
+
+    joints: Bool[Array, " number"]
+    begin: Values = field((), unit="s", finite=False, default=-np.inf)
+    end: Values = field((), unit="s", finite=False, default=np.inf)
+
+    def __init__(
+        self,
+        joints: ArrayLike | Sequence[int],
+        begin: ArrayLike = -np.inf,
+        end: ArrayLike = np.inf,
+    ):
+        self.joints = numbered(joints)
+        self.begin: Any = begin
+        self.end: Any = end
+
+    def arguments(self) -> dict[str, Any]:
+        numbers = np.flatnonzero(self.joints) + 1
+        return {"joints": numbers, "begin": self.begin, "end": self.end}
+
+    def conditions(self):
+        ends = self.begin, self.end
+        yield Condition(self.begin < self.end, "begin", "less than end", ends)
+
+    def conditions_on(self, linkage):
+        count, last = joints_of(linkage), (self.joints * np.array(_NUMBERS)).max()
+        yield Condition(last <= count, "joints", f"1 to {count}", last)
+
+    @property
+    def jump_ts(self) -> Array:
+        """The times at which it takes hold and lets go [s]."""
+        return jnp.stack([self.begin, self.end])
+
+    def braking(self, t, linkage):
+        return self.joints[: joints_of(linkage)] & (self.begin <= t) & (t < self.end)
+
+
+def numbered(joints: Any) -> Array:
+    """Returns whether each number of a joint is among those given.
+
+    Raises ValueError for what are no numbers of joints.
+    """
+    array = isinstance(joints, Array | np.ndarray)
+    given = joints.tolist() if array else joints
+    numbers = given if isinstance(given, list | tuple) else (given,)
+    if not numbers or any(
+        isinstance(n, bool) or not isinstance(n, int) or n not in _NUMBERS
+        for n in numbers
+    ):
+        raise ValueError(
+            f"joints: expected a number of 1 to {_NUMBERS[-1]}, or several such, got "
+            f"{shown(joints)}."
+        )
+    return jax.device_put(np.isin(_NUMBERS, numbers))
+
+
+def holders(forces: Forces) -> tuple[Holder, ...]:
+    """Returns the elements that hold joints; raises ValueError for several stops."""
+    found = tuple(e for e in forces if isinstance(e, Holder) and e.holds)
+    if sum(isinstance(e, HardStops) for e in found) > 1:
+        raise ValueError("forces: expected one HardStops at most, got several.")
+    return found

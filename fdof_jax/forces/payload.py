@@ -1,0 +1,108 @@
+"""Masses that an arm takes and lets go."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from ..linkage.fields import Condition, Values, field, of_kind
+from ..linkage.frames import scalar_frames
+from .element import InertialElement
+from .points import Load, Point
+
+
+class Payload(InertialElement):
+    """A body that is fixed to a link between two known times.
+
+    Where it is taken, a blow changes the rates of all joints: the momenta of arm and
+    body before are those of both together after. Where it is let go, rates do not jump.
+    Functions of one instant, such as `mass_matrix` and `energy`, count it as taken;
+    `at(t)` is the payload at a time.
+
+    **Arguments:**
+
+    - `place`: the `Point` of the link at which its mass centre is fixed.
+    - `mass`, `inertia`: not negative [kg, kg m^2].
+    - `begin`, `end`: times at which it is taken and let go [s]; by default it is there
+      from the start on, and stays. One that is taken at the start of a motion, or
+      before, is part of the arm from the start.
+    - `velocity`: that of the body before it is taken, (x, y) [m/s], or with its angular
+      rate (x, y, rate) [rad/s]; by default it is at rest.
+
+    **Raises:** ValueError for malformed arguments, and unless begin < end.
+
+    >>> import fdof_jax as fj
+    >>> bar = fj.Linkage(
+    ...     "R", length=[0, 1], com=[[0.5, 0]], mass=[1], inertia=[1 / 12], gravity=0)
+    >>> load = fj.forces.Payload(fj.Point(1, along=1), 1.5, begin=0.5)
+    >>> motion = fj.simulate(bar, fj.State([0.0], [2.0]), [0, 1.0], (load,))
+    >>> float(motion.qd[-1, 0])  # 4/11 rad/s
+    0.364
+    """
+
+    place: Point = of_kind(Point)
+    mass: Values = field((), unit="kg", minimum=0)
+    inertia: Values = field((), unit="kg m^2", minimum=0, default=0.0)
+    begin: Values | None = field(
+        (), unit="s", optional=True, default=None, kw_only=True
+    )
+    end: Values | None = field((), unit="s", optional=True, default=None, kw_only=True)
+    velocity: Values = field(
+        (None,), unit="m/s and rad/s", default=(0.0, 0.0), kw_only=True
+    )
+
+    def conditions(self):
+        count = len(self.velocity)
+        yield Condition(count in (2, 3), "velocity", "two or three numbers", count)
+        if self.begin is not None and self.end is not None:
+            times = self.begin, self.end
+            yield Condition(self.begin < self.end, "begin", "less than end", times)
+
+    @property
+    def jump_ts(self) -> Array | None:
+        """The times at which it is taken and let go [s]."""
+        times = [t for t in (self.begin, self.end) if t is not None]
+        return jnp.stack(times) if times else None
+
+    def there(self, t: Array) -> Any:
+        """Returns whether it is taken at a time."""
+        after = True if self.begin is None else self.begin <= t
+        return after & (True if self.end is None else t < self.end)
+
+    def at(self, t: Array) -> "Payload":
+        """Returns the payload at a time, without mass where it is not taken."""
+        if self.jump_ts is None:
+            return self
+        there = self.there(t)
+        scaled = jnp.where(there, self.mass, 0), jnp.where(there, self.inertia, 0)
+        return eqx.tree_at(lambda p: (p.mass, p.inertia), self, scaled)
+
+    def coordinates(self, q, linkage):
+        frames = scalar_frames(linkage, tuple(q))
+        place = self.place.place(frames)
+        turns = jnp.where(jnp.stack(frames.revolute), q, 0)
+        turned = jnp.sum(jnp.where(jnp.arange(q.size) < self.place.link, turns, 0))
+        return jnp.stack([place.real, place.imag, turned])
+
+    def weights(self, linkage):
+        return jnp.stack([self.mass, self.mass, self.inertia])
+
+    def potential_energy(self, q, linkage):
+        _, height, _ = self.coordinates(q, linkage)
+        return self.mass * linkage.gravity * height
+
+    @property
+    def arriving(self) -> Array:
+        """The rates of its coordinates before it is taken, (3,)."""
+        return jnp.zeros(3).at[: len(self.velocity)].set(self.velocity)
+
+    def loads(self, t, q, qd, qdd, linkage):
+        """Returns its weight and inertia as a load on its place."""
+        along = lambda q, qd: jax.jvp(
+            lambda q: self.coordinates(q, linkage), (q,), (qd,)
+        )[1]
+        _, (x, y, turning) = jax.jvp(along, (q, qd), (qd, qdd))
+        force = -self.mass * (jax.lax.complex(x, y) + 1j * linkage.gravity)
+        return (Load(self.place, force, -self.inertia * turning),)

@@ -1,0 +1,422 @@
+"""Joints that are held for a while: their modes, what ends them, and what then jumps.
+
+H are the joints held, F the others; tau holds the efforts of all but the holders:
+
+    qdd_H = 0,   M_FF qdd_F = tau_F - b_F,   c_H = M_HF qdd_F + b_H - tau_H
+
+c is the effort of the holders, the paper's generalised constraint force. A mode lasts
+while its guards are positive; they are switching functions, so that steps end where
+one comes to its zero. There `resolve` finds the modes that follow.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from ..dynamics import mass_and_bias
+from ..forces.element import Forces
+from ..forces.holders import HardStops, Holder, holders
+from ..forces.payload import Payload
+from ..linkage.linkage import joints_of
+from ..linkage.topology import fixed_pairs
+from ..mechanics.equations import equations
+from ..mechanics.rates import holding_efforts
+from ..steps.dopri8 import constant
+from ..steps.switch_derivatives import Event
+from .field import Args, applied, schedule_of, switched, whole
+
+# Modes of a joint: not held, or what holds it.
+FREE, FRICTION, LOWER, UPPER, BRAKE = range(5)
+MODES = "free", "friction", "lower stop", "upper stop", "brake"
+# What happens to a joint, in the order of their numbers.
+HAPPENINGS = (
+    "sticks", "slips", "bounces", "rests on stop", "leaves stop", "is braked",
+    "is let go",
+)  # fmt: skip
+_STICKS, _SLIPS, _BOUNCES, _RESTS, _LEAVES, _BRAKED, _LET_GO = range(len(HAPPENINGS))
+MOST_EVENTS = 64  # recorded; of more, the last ones
+# A flight that is lower than this power of the unit of rounding is left out [m or rad].
+_LOW = 0.7
+# Distances from stops are in this part of a metre or rad, so that the distance by which
+# steps end beyond zeros is short even for a joint that bounces slowly.
+_STOPS_IN = 100
+# What was found at its limit is held only if it needs this much less, as a share.
+_SURE = 1e-7
+
+
+class Events(NamedTuple):
+    """The last events of a motion: what happened to which joint, and when.
+
+    - `t`: times [s]; `joint`: numbers of joints, from 1; `kind`: places in
+      `HAPPENINGS`. Each is of shape (event,).
+    - `count`: how many there were in all.
+    """
+
+    t: Array
+    joint: Array
+    kind: Array
+    count: Array
+
+
+class Modes(NamedTuple):
+    """The modes of the joints, as part of the integrated state.
+
+    - `mode` (n,): FREE, FRICTION, LOWER, UPPER or BRAKE; negative before the start.
+    - `direction` (n,): of the sliding that friction resists: 1, -1, or 0 if held.
+    - `origin` (n,): displacements at which these slides began [m or rad].
+    - `taken`: the energy that holders have taken before [J].
+    """
+
+    mode: Array
+    direction: Array
+    origin: Array
+    taken: Array
+    events: Events
+
+    @property
+    def held(self) -> Array:
+        return self.mode > FREE
+
+
+class Laws(NamedTuple):
+    """The laws of all holders, in joint order: (n,) each."""
+
+    level: Array
+    static: Array
+    lower: Array
+    upper: Array
+    restitution: Array
+    braked: Array
+
+
+def laws(args: Args, t: Any) -> Laws:
+    """Returns the laws of all holders at a time."""
+    joints = joints_of(args.linkage)
+    fixed = jnp.stack(fixed_pairs(args.linkage.ef))
+    level, static = jnp.zeros(joints), jnp.zeros(joints)
+    lower, upper = jnp.full(joints, -jnp.inf), jnp.full(joints, jnp.inf)
+    restitution, braked = jnp.zeros(joints), jnp.zeros(joints, bool)
+    for index, element in enumerate(args.forces):
+        if not (isinstance(element, Holder) and element.holds):
+            continue
+        more, most = element.levels(joints)
+        level, static = level + more, static + most
+        braked = braked | element.braking(args.clock(index, t), args.linkage)
+        if isinstance(element, HardStops):
+            whole_size = lambda x: jnp.broadcast_to(x, joints)
+            ends = element.lower, element.upper, element.restitution
+            lower, upper, restitution = map(whole_size, ends)
+    none = lambda x, value=0.0: jnp.where(fixed, value, x)
+    return Laws(
+        none(level),
+        none(static),
+        none(lower, -jnp.inf),
+        none(upper, jnp.inf),
+        restitution,
+        braked & ~fixed,
+    )
+
+
+def unknown_modes(args: Args) -> tuple[Modes, int]:
+    """Returns the modes before the start, and the number of guards."""
+    q0 = args.q0
+    stops = any(isinstance(e, HardStops) for e in args.forces)
+    none, zero = jnp.zeros(MOST_EVENTS, q0.dtype), jnp.zeros((), q0.dtype)
+    events = Events(none, none, none, zero)
+    zeros = jnp.zeros_like(q0)
+    return Modes(zeros - 1, zeros, zeros, zero, events), q0.size * (4 if stops else 2)
+
+
+def box(law: Laws, mode: Array) -> tuple[Array, Array]:
+    """Returns the least and the greatest effort by which joints are held in a mode."""
+    most = jnp.where(mode == BRAKE, jnp.inf, law.static)
+    return (
+        jnp.where(mode == UPPER, -jnp.inf, -most),
+        jnp.where(mode == LOWER, jnp.inf, most),
+    )
+
+
+def guarded_switching(
+    t: Array, y: Any, args: Args, schedule: tuple[Any, ...]
+) -> tuple[Array, bool]:
+    """Returns the switching functions of all efforts, and after them the guards.
+
+    For each joint that is held: its effort above the least and below the greatest. For
+    the others: the sliding rate, and a number that never is 0. With stops, for each
+    joint that is free: the distances from them.
+    """
+    tau, _, added, switches = switched(t, y, args, schedule)
+    constants = args.moving().constants
+    effort = jnp.stack(holding_efforts(constants, *y[:2], tau, added))
+    law, modes = laws(args, t), args.modes
+    held, direction = modes.held, modes.direction
+    least, most = box(law, modes.mode)
+    rubs = (law.static > 0) & ~held & (direction != 0)
+    sliding = jnp.where(rubs, direction * jnp.stack(y[1]), 1)
+    guards = [
+        jnp.where(held, effort - least, sliding),
+        jnp.where(held, most - effort, 1),
+    ]
+    if any(isinstance(e, HardStops) for e in args.forces):
+        delta = jnp.stack(y[0])
+        room = delta - (law.lower - args.q0), law.upper - args.q0 - delta
+        guards += [jnp.where(held, 1, _STOPS_IN * distance) for distance in room]
+    return jnp.concatenate([switches.all_values(args.q0.dtype), *guards]), True
+
+
+def _accelerations(matrix: Array, efforts: Array, held: Array) -> Array:
+    """Returns those of joints that are not held, 0 at the others."""
+    free = jnp.where(jnp.outer(~held, ~held), matrix, jnp.eye(held.size))
+    return jnp.linalg.solve(free, jnp.where(held, 0, efforts))
+
+
+def _caught(matrix: Array, qd: Array, held: Array) -> Array:
+    """Returns the rates after joints were stopped: M_FF qd+ = M_FF qd + M_FB qd_B."""
+    change = _accelerations(matrix, matrix @ jnp.where(held, qd, 0), held)
+    return jnp.where(held, 0, qd + change)
+
+
+def resolve(event: Event, y: Any, args: Args) -> tuple[Any, Modes]:
+    """Returns the state and the modes after an event, `args.modes` being those before.
+
+    In this order: brakes take hold, joints hit their stops, and what then is at rest
+    is held or begins to slide.
+    """
+    delta, rates_before, *own = y
+    q, qd = args.q0 + jnp.stack(delta), jnp.stack(rates_before)
+    before, law = args.modes, laws(args, event.t)
+    first = before.mode < 0
+    fired = jnp.zeros((4, q.size), bool)
+    fired = fired.at[: len(event.fired)].set(event.fired)
+    slides = ~before.held
+    # Rates that came to zero; what is at its stop.
+    qd = jnp.where(fired[0] & slides, 0, qd)
+    at_lower = (before.mode == LOWER) | fired[2] | (first & (q <= law.lower))
+    at_upper = (before.mode == UPPER) | fired[3] | (first & (q >= law.upper))
+    touched = jnp.where(at_lower, -1.0, jnp.where(at_upper, 1.0, 0.0))
+    stop = jnp.where(at_lower, law.lower, jnp.where(at_upper, law.upper, 0))
+    q = jnp.where(touched != 0, stop, q)
+
+    matrix, qd, taken_over = _taken(event, q, qd, first, args, law)
+    energy = lambda qd: qd @ matrix @ qd / 2
+    arrived = qd
+    qd = _caught(matrix, qd, law.braked)
+    hit, left_out = jnp.zeros(q.size, bool), jnp.zeros(q.size)
+    net = lambda qd: _net_efforts(event.t, q, qd, own, args, law)
+    if len(event.fired) > 2:
+        qd, hit = _after_blows(qd, touched, law, matrix)
+        qd, left_out = _settled(qd, touched, law, matrix, net)
+    modes = _at_rest(qd, touched * (qd == 0), args.modes, law, matrix, net, fired[:2])
+    slid = law.level * before.direction * (jnp.stack(delta) - before.origin)
+    lost = jnp.sum(jnp.where(first, 0, slid)) + energy(arrived) - energy(qd)
+    lost += taken_over
+    origin = q - args.q0
+    kind = _happenings(before, modes, hit & (modes.mode == FREE))
+    at = event.t + event.late + left_out
+    events = _recorded(before.events, at, jnp.where(first, -1, kind))
+    qd = jnp.where(modes.mode > FREE, 0, qd)
+    modes = modes._replace(
+        origin=origin, taken=before.taken + lost, events=events
+    )
+    state = tuple(origin), tuple(qd), *own
+    return state, modes
+
+
+def _taken(
+    event: Event, q: Array, qd: Array, first: Array, args: Args, law: Laws
+) -> tuple[Array, Array, Any]:
+    """Returns mass matrix and rates after payloads were taken, and the energy lost.
+
+    M+ qd+ = M- qd- + J^T W v, over the joints that no brake holds.
+    """
+    still = jnp.zeros_like(q)
+    matrix, _ = mass_and_bias(args.linkage, args.masses(event.t), q, still)
+    impulse, lost, taken = jnp.zeros_like(q), jnp.zeros_like(event.t), jnp.array(False)
+    for index, element in enumerate(args.forces):
+        if not (isinstance(element, Payload) and element.begin is not None):
+            continue
+        before, after = (
+            element.there(args.clock(index, t)) for t in (event.before, event.t)
+        )
+        new = after & ~before & ~first.any()
+        coordinates = lambda q, e=element: e.coordinates(q, args.linkage)
+        jacobian, weights = jax.jacfwd(coordinates)(q), element.weights(args.linkage)
+        own, carried = element.arriving, jacobian @ qd
+        impulse += jnp.where(new, weights * (own - carried) @ jacobian, 0)
+        lost += jnp.where(new, weights @ (own**2 - carried**2) / 2, 0)
+        taken = taken | new
+    # With the masses after it, M+ (qd+ - qd-) = J^T W (v - J qd-).
+    after = qd + jnp.where(taken, _accelerations(matrix, impulse, law.braked), 0)
+    lost += (qd @ matrix @ qd - after @ matrix @ after) / 2
+    return matrix, after, jnp.where(taken, lost, 0)
+
+
+def changes(forces: Forces) -> bool:
+    """Returns whether elements hold joints or take masses, so that rates may jump."""
+    taking = (isinstance(e, Payload) and e.begin is not None for e in forces)
+    return bool(holders(forces)) or any(taking)
+
+
+def _net_efforts(
+    t: Array, q: Array, qd: Array, own: Any, args: Args, law: Laws
+) -> Array:
+    """Returns the efforts less the bias, with friction where joints slide (n,)."""
+    t, q, qd, own, args, law = constant((t, q, qd, own, args, law))
+    args = args._replace(modes=args.modes._replace(direction=jnp.sign(qd)))
+    y = whole(tuple(q - args.q0), tuple(qd), own)
+    tau, *_ = applied(t, y, args, schedule_of(t, args))
+    bias = equations(args.constants, *y[:2]).bias
+    return jnp.stack(tau) - jnp.stack(bias)
+
+
+def _after_blows(
+    qd: Array, touched: Array, law: Laws, matrix: Array
+) -> tuple[Array, Array]:
+    """Returns the rates after all blows, and which joints were hit.
+
+    Blow by blow, that of the fastest joint first; what is left after one for each joint
+    is taken at once, without restitution.
+    """
+    moves = ~law.braked
+    free = jnp.where(jnp.outer(moves, moves), matrix, jnp.eye(qd.size))
+    inverse = jnp.where(jnp.outer(moves, moves), jnp.linalg.inv(free), 0)
+
+    def blow(state, _):
+        qd, hit = state
+        outward = constant(jnp.where(moves, touched * qd, 0))
+        k = jnp.argmax(outward)
+        one = (jnp.arange(qd.size) == k) & (outward[k] > 0)
+        e = law.restitution[k]
+        column = inverse[k] / jnp.where(one.any(), inverse[k, k], 1)
+        flying = jnp.where(one, -e * qd, qd - (1 + e) * column * qd[k])
+        return (jnp.where(one.any(), flying, qd), hit | one), None
+
+    hit = jnp.zeros(qd.size, bool)
+    (qd, hit), _ = jax.lax.scan(blow, (qd, hit), length=qd.size)
+    caught = law.braked
+    for _ in range(qd.size):
+        caught = caught | moves & (constant(touched * qd) > 0)
+        qd = _caught(matrix, qd, caught)
+    return qd, hit | caught & moves
+
+
+def _settled(
+    qd: Array, touched: Array, law: Laws, matrix: Array, net: Callable
+) -> tuple[Array, Array]:
+    """Returns the rates with joints stopped that bounce too low, and times left out."""
+    rests = law.braked | ((touched != 0) & (constant(qd) == 0))
+    towards = constant(touched * _accelerations(matrix, net(qd), rests))
+    pulled = (touched * qd < 0) & (towards > 0)
+    towards, e = jnp.where(pulled, towards, 1), law.restitution
+    low = pulled & (constant(qd**2) <= 2 * towards * jnp.finfo(qd.dtype).eps ** _LOW)
+    left_out = jnp.where(low, 2 * jnp.abs(qd) / (towards * (1 - e)), 0)
+    return jnp.where(low.any(), _caught(matrix, qd, law.braked | low), qd), left_out
+
+
+def _at_rest(
+    qd: Array, touched: Array, before: Modes, law: Laws, matrix: Array,
+    net: Callable, fired: Array,
+) -> Modes:  # fmt: skip
+    """Returns the modes of joints with these rates, and directions of sliding.
+
+    Their accelerations solve a convex problem: minimise (qdd - a)^T M (qdd - a) / 2 +
+    sum level abs(qdd) over the joints at rest. One joint after the other changes its
+    mode, until all agree with their laws (Murty's principal pivoting).
+    """
+    qd, touched, law, matrix = constant((qd, touched, law, matrix))
+    tau = net(qd)
+    rest = (qd == 0) & ((law.static > 0) | (touched != 0) | law.braked)
+    held_as = jnp.where(touched < 0, LOWER, jnp.where(touched > 0, UPPER, FRICTION))
+    held_as = jnp.where(law.braked, BRAKE, held_as)
+    least, most = box(law, held_as)
+    size = jnp.abs(tau) + law.static
+    was_held = before.held
+    forced = jnp.where(was_held & fired[0], 1.0, jnp.where(was_held & fired[1], -1, 0))
+    count, joints = qd.size, jnp.arange(qd.size)
+
+    def solved(slide):
+        held = rest & (slide == 0)
+        qdd = _accelerations(matrix, tau - law.level * slide, held)
+        effort = jnp.where(held, matrix @ qdd - tau, 0)
+        low, high = (effort - least) / size, (most - effort) / size
+        # A joint that slides must not accelerate the other way.
+        back = slide * qdd * jnp.diag(matrix) / size
+        wrong = jnp.where(held, jnp.minimum(low, high), jnp.where(rest, back, 0))
+        wrong = jnp.where(size > 0, wrong, 0)
+        limit = jnp.where(held, 0, -_SURE * jnp.abs(slide))
+        return jnp.where(wrong < limit, wrong, 0), jnp.where(low < high, 1.0, -1.0), held
+
+    def changed(state):
+        slide, tries, wrong, towards, held = state
+        worst, lowest = jnp.argmin(wrong), jnp.argmax(wrong < 0)
+        k = jnp.where(tries < 2 * count, worst, lowest)
+        new = jnp.where(held, towards, 0)
+        slide = jnp.where(joints == k, new, slide)
+        return slide, tries + 1, *solved(slide)
+
+    unsettled = lambda state: (state[2] < 0).any() & (state[1] < 8 * count)
+    start = jnp.where(rest, forced, 0)
+    slide, *_ = jax.lax.while_loop(unsettled, changed, (start, 0, *solved(start)))
+    held = rest & (slide == 0)
+    direction = jnp.where(held, 0, jnp.where(rest, slide, jnp.sign(qd)))
+    return before._replace(
+        mode=jnp.where(held, held_as, FREE).astype(qd.dtype),
+        direction=jnp.where(law.static > 0, direction, 0),
+    )
+
+
+def _happenings(before: Modes, after: Modes, bounced: Array) -> Array:
+    """Returns what happens to each joint, -1 if nothing."""
+    was, now = before.mode, after.mode
+    at_stop = lambda mode: (mode == LOWER) | (mode == UPPER)
+    cases = [
+        (bounced, _BOUNCES),
+        (was == now, -1),
+        (now == FRICTION, _STICKS),
+        (at_stop(now), _RESTS),
+        (now == BRAKE, _BRAKED),
+        (was == FRICTION, _SLIPS),
+        (at_stop(was), _LEAVES),
+        (was == BRAKE, _LET_GO),
+    ]
+    return jnp.select(*map(list, zip(*[(c, jnp.full(was.shape, k)) for c, k in cases])))
+
+
+def _recorded(events: Events, t: Array, kind: Array) -> Events:
+    """Returns the events with those of all joints to which something happens."""
+    happens = kind >= 0
+    places = (events.count + jnp.cumsum(happens) - 1) % MOST_EVENTS
+    places = jnp.where(happens, places.astype(int), MOST_EVENTS)  # dropped
+    numbers = jnp.arange(1.0, kind.size + 1)
+    put = lambda rows, new: rows.at[places].set(
+        jnp.broadcast_to(new, kind.shape).astype(rows.dtype), mode="drop"
+    )
+    return Events(
+        put(events.t, t),
+        put(events.joint, numbers),
+        put(events.kind, kind),
+        events.count + jnp.sum(happens),
+    )
+
+
+def in_order(events: Events) -> Events:
+    """Returns the events in the order of time, NaN beyond the last of them."""
+    *rows, count = events
+    first = jnp.where(count > MOST_EVENTS, count % MOST_EVENTS, 0).astype(int)
+    none = jnp.arange(MOST_EVENTS) >= count
+    ordered = (jnp.where(none, jnp.nan, jnp.roll(row, -first)) for row in rows)
+    return Events(*ordered, count)
+
+
+def taken_at(args: Args, ts: Array, modes: Modes, delta: Array) -> Array:
+    """Returns the energy that holders have taken (time,), from modes at times [J]."""
+
+    def taken(t, direction, origin, before, delta):
+        return before + jnp.sum(laws(args, t).level * direction * (delta - origin))
+
+    _, *rows, _ = modes
+    return jax.vmap(taken)(ts, *rows, delta)
