@@ -14,6 +14,7 @@ from ..base.functions import sharing_functions
 from ..forces.element import Element, Forces, elements_on, of_full_size
 from ..linkage.linkage import Linkage, check_linkage, without_fixed
 from .field import element_effort, with_states
+from .holding import changes, efforts_of_holders
 from .padding import cut, padded
 from .prescribed import prescribed, prescribed_effort
 from .sampled import Motion, acting_in, check_joints
@@ -94,5 +95,9 @@ def _efforts(
         demanded = jax.vmap(demand)(*motion_rows, jnp.sum(stacked, axis=0))
         place = place_of(motion, forces)
         stacked = stacked.at[place].set(demanded)
+    if changes(forces):
+        held = lambda *row: efforts_of_holders(linkage, forces, *row)
+        total = jnp.sum(stacked, axis=0)
+        stacked += jax.vmap(held, out_axes=1)(*motion_rows, total)
     stacked = without_fixed(linkage, stacked)
     return Efforts(jnp.sum(stacked, axis=0), stacked)

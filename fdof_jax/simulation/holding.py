@@ -17,26 +17,22 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ..dynamics import mass_and_bias
+from ..base.one_loop import in_one_loop
+from ..forces.added_inertia import added_inertia
 from ..forces.element import Forces
-from ..forces.holders import HardStops, Holder, holders
+from ..forces.holders import Brake, HardStops, Holder, holders
 from ..forces.payload import Payload
-from ..linkage.linkage import joints_of
+from ..linkage.linkage import Linkage, joints_of
 from ..linkage.topology import fixed_pairs
-from ..mechanics.equations import equations
+from ..mechanics.equations import Constants, Equations, equations
 from ..mechanics.rates import holding_efforts
+from ..mechanics.solve import divided, minus, solver_of, times, with_added
 from ..steps.dopri8 import constant
 from ..steps.switch_derivatives import Event
-from .field import Args, applied, schedule_of, switched, whole
+from .field import Args, applied, args_of, schedule_of, switched, whole
+from .solution import HAPPENINGS, MODES, Events
 
-# Modes of a joint: not held, or what holds it.
-FREE, FRICTION, LOWER, UPPER, BRAKE = range(5)
-MODES = "free", "friction", "lower stop", "upper stop", "brake"
-# What happens to a joint, in the order of their numbers.
-HAPPENINGS = (
-    "sticks", "slips", "bounces", "rests on stop", "leaves stop", "is braked",
-    "is let go",
-)  # fmt: skip
+FREE, FRICTION, LOWER, UPPER, BRAKE = range(len(MODES))
 _STICKS, _SLIPS, _BOUNCES, _RESTS, _LEAVES, _BRAKED, _LET_GO = range(len(HAPPENINGS))
 MOST_EVENTS = 64  # recorded; of more, the last ones
 # A flight that is lower than this power of the unit of rounding is left out [m or rad].
@@ -46,20 +42,6 @@ _LOW = 0.7
 _STOPS_IN = 100
 # What was found at its limit is held only if it needs this much less, as a share.
 _SURE = 1e-7
-
-
-class Events(NamedTuple):
-    """The last events of a motion: what happened to which joint, and when.
-
-    - `t`: times [s]; `joint`: numbers of joints, from 1; `kind`: places in
-      `HAPPENINGS`. Each is of shape (event,).
-    - `count`: how many there were in all.
-    """
-
-    t: Array
-    joint: Array
-    kind: Array
-    count: Array
 
 
 class Modes(NamedTuple):
@@ -168,16 +150,41 @@ def guarded_switching(
     return jnp.concatenate([switches.all_values(args.q0.dtype), *guards]), True
 
 
-def _accelerations(matrix: Array, efforts: Array, held: Array) -> Array:
-    """Returns those of joints that are not held, 0 at the others."""
-    free = jnp.where(jnp.outer(~held, ~held), matrix, jnp.eye(held.size))
-    return jnp.linalg.solve(free, jnp.where(held, 0, efforts))
+class _System(NamedTuple):
+    """The linear system of the joints at one configuration."""
+
+    constants: Constants
+    equations: Equations
+    added: Any
+
+    def accelerations(
+        self, efforts: Array, held: Array, once: Callable = lambda x: x
+    ) -> Array:
+        """Returns those of joints that are not held, 0 at the others."""
+        fixed = (pair | held[k] for k, pair in enumerate(self.constants.fixed))
+        constants = self.constants._replace(fixed=tuple(fixed))
+        solve, _ = solver_of(constants, self.equations, self.added, divided)
+        return jnp.stack(once(solve(tuple(efforts))))
+
+    def momenta(self, qd: Array) -> Array:
+        return jnp.stack(times(self.equations.mass, tuple(qd)))
+
+    def caught(self, qd: Array, held: Array) -> Array:
+        """Returns the rates after a blow that stops joints.
+
+        M_FF qd_F+ = M_FF qd_F + M_FB qd_B, with B the joints that are stopped.
+        """
+        change = self.accelerations(self.momenta(jnp.where(held, qd, 0)), held)
+        return jnp.where(held, 0, qd + change)
 
 
-def _caught(matrix: Array, qd: Array, held: Array) -> Array:
-    """Returns the rates after joints were stopped: M_FF qd+ = M_FF qd + M_FB qd_B."""
-    change = _accelerations(matrix, matrix @ jnp.where(held, qd, 0), held)
-    return jnp.where(held, 0, qd + change)
+def _system(t: Array, q: Array, qd: Array, args: Args) -> _System:
+    """Returns the system at a configuration, with the bias at these rates."""
+    added = None
+    if masses := args.masses(t):
+        added, _ = added_inertia(args.linkage, masses, q, qd)
+    m = equations(args.constants, tuple(q - args.q0), tuple(qd))
+    return _System(args.constants, with_added(added, m), added)
 
 
 def resolve(event: Event, y: Any, args: Args) -> tuple[Any, Modes]:
@@ -201,19 +208,24 @@ def resolve(event: Event, y: Any, args: Args) -> tuple[Any, Modes]:
     stop = jnp.where(at_lower, law.lower, jnp.where(at_upper, law.upper, 0))
     q = jnp.where(touched != 0, stop, q)
 
-    matrix, qd, taken_over = _taken(event, q, qd, first, args, law)
-    energy = lambda qd: qd @ matrix @ qd / 2
-    arrived = qd
-    qd = _caught(matrix, qd, law.braked)
-    hit, left_out = jnp.zeros(q.size, bool), jnp.zeros(q.size)
-    net = lambda qd: _net_efforts(event.t, q, qd, own, args, law)
-    if len(event.fired) > 2:
-        qd, hit = _after_blows(qd, touched, law, matrix)
-        qd, left_out = _settled(qd, touched, law, matrix, net)
-    modes = _at_rest(qd, touched * (qd == 0), args.modes, law, matrix, net, fired[:2])
+    kinds = {kind for e in args.forces for kind in type(e).__mro__}
+    lost, hit, left_out = jnp.zeros_like(event.t), jnp.zeros(q.size, bool), 0.0
+    if kinds & {Brake, HardStops, Payload}:
+        system = _system(event.t, q, jnp.zeros_like(q), args)
+        if Payload in kinds:
+            qd, lost = _taken(event, q, qd, first, args, law, system)
+        energy = lambda qd: qd @ system.momenta(qd) / 2
+        lost += energy(qd)
+        qd = system.caught(qd, law.braked)
+        if HardStops in kinds:
+            qd, hit = _after_blows(qd, touched, law, system)
+            net = _net_efforts(event.t, q, qd, own, args)
+            qd, left_out = _settled(qd, touched, law, *net)
+        lost -= energy(qd)
+    net = _net_efforts(event.t, q, qd, own, args)
+    modes = _at_rest(qd, touched * (qd == 0), args.modes, law, *net, fired[:2])
     slid = law.level * before.direction * (jnp.stack(delta) - before.origin)
-    lost = jnp.sum(jnp.where(first, 0, slid)) + energy(arrived) - energy(qd)
-    lost += taken_over
+    lost += jnp.sum(jnp.where(first, 0, slid))
     origin = q - args.q0
     kind = _happenings(before, modes, hit & (modes.mode == FREE))
     at = event.t + event.late + left_out
@@ -226,15 +238,22 @@ def resolve(event: Event, y: Any, args: Args) -> tuple[Any, Modes]:
     return state, modes
 
 
+def within_stops(forces: Forces, q: Array) -> Any:
+    """Returns whether an arm is within its hard stops, but for rounding."""
+    near = jnp.sqrt(jnp.finfo(q.dtype).eps)
+    stops = (e for e in forces if isinstance(e, HardStops))
+    inside = [(q >= e.lower - near) & (q <= e.upper + near) for e in stops]
+    return jnp.stack(inside).all() if inside else True
+
+
 def _taken(
-    event: Event, q: Array, qd: Array, first: Array, args: Args, law: Laws
-) -> tuple[Array, Array, Any]:
-    """Returns mass matrix and rates after payloads were taken, and the energy lost.
+    event: Event, q: Array, qd: Array, first: Array, args: Args, law: Laws,
+    system: _System,
+) -> tuple[Array, Array]:  # fmt: skip
+    """Returns the rates after payloads were taken, and the energy lost.
 
     M+ qd+ = M- qd- + J^T W v, over the joints that no brake holds.
     """
-    still = jnp.zeros_like(q)
-    matrix, _ = mass_and_bias(args.linkage, args.masses(event.t), q, still)
     impulse, lost, taken = jnp.zeros_like(q), jnp.zeros_like(event.t), jnp.array(False)
     for index, element in enumerate(args.forces):
         if not (isinstance(element, Payload) and element.begin is not None):
@@ -250,9 +269,9 @@ def _taken(
         lost += jnp.where(new, weights @ (own**2 - carried**2) / 2, 0)
         taken = taken | new
     # With the masses after it, M+ (qd+ - qd-) = J^T W (v - J qd-).
-    after = qd + jnp.where(taken, _accelerations(matrix, impulse, law.braked), 0)
-    lost += (qd @ matrix @ qd - after @ matrix @ after) / 2
-    return matrix, after, jnp.where(taken, lost, 0)
+    after = qd + jnp.where(taken, system.accelerations(impulse, law.braked), 0)
+    lost += (qd @ system.momenta(qd) - after @ system.momenta(after)) / 2
+    return after, jnp.where(taken, lost, 0)
 
 
 def changes(forces: Forces) -> bool:
@@ -262,64 +281,69 @@ def changes(forces: Forces) -> bool:
 
 
 def _net_efforts(
-    t: Array, q: Array, qd: Array, own: Any, args: Args, law: Laws
-) -> Array:
-    """Returns the efforts less the bias, with friction where joints slide (n,)."""
-    t, q, qd, own, args, law = constant((t, q, qd, own, args, law))
+    t: Array, q: Array, qd: Array, own: Any, args: Args
+) -> tuple[_System, Array]:
+    """Returns the system, and the efforts less the bias, with friction of sliding."""
+    t, q, qd, own, args = constant((t, q, qd, own, args))
     args = args._replace(modes=args.modes._replace(direction=jnp.sign(qd)))
     y = whole(tuple(q - args.q0), tuple(qd), own)
     tau, *_ = applied(t, y, args, schedule_of(t, args))
-    bias = equations(args.constants, *y[:2]).bias
-    return jnp.stack(tau) - jnp.stack(bias)
+    system = _system(t, q, qd, args)
+    m, net = in_one_loop((system.equations, minus(tau, system.equations.bias)))
+    return system._replace(equations=m), jnp.stack(net)
 
 
 def _after_blows(
-    qd: Array, touched: Array, law: Laws, matrix: Array
+    qd: Array, touched: Array, law: Laws, system: _System
 ) -> tuple[Array, Array]:
     """Returns the rates after all blows, and which joints were hit.
 
     Blow by blow, that of the fastest joint first; what is left after one for each joint
     is taken at once, without restitution.
     """
-    moves = ~law.braked
-    free = jnp.where(jnp.outer(moves, moves), matrix, jnp.eye(qd.size))
-    inverse = jnp.where(jnp.outer(moves, moves), jnp.linalg.inv(free), 0)
+    joints, moves = jnp.arange(qd.size), ~law.braked
+    outward = lambda qd: constant(jnp.where(moves, touched * qd, 0))
 
     def blow(state, _):
         qd, hit = state
-        outward = constant(jnp.where(moves, touched * qd, 0))
-        k = jnp.argmax(outward)
-        one = (jnp.arange(qd.size) == k) & (outward[k] > 0)
+        k = jnp.argmax(outward(qd))
+        one = (joints == k) & (outward(qd) > 0)
         e = law.restitution[k]
-        column = inverse[k] / jnp.where(one.any(), inverse[k, k], 1)
+        column = system.accelerations(one.astype(qd.dtype), law.braked)
+        column = column / jnp.where(one.any(), column[k], 1)
         flying = jnp.where(one, -e * qd, qd - (1 + e) * column * qd[k])
         return (jnp.where(one.any(), flying, qd), hit | one), None
 
-    hit = jnp.zeros(qd.size, bool)
-    (qd, hit), _ = jax.lax.scan(blow, (qd, hit), length=qd.size)
-    caught = law.braked
-    for _ in range(qd.size):
-        caught = caught | moves & (constant(touched * qd) > 0)
-        qd = _caught(matrix, qd, caught)
-    return qd, hit | caught & moves
+    def stop(state, _):
+        qd, caught = state
+        caught = caught | (outward(qd) > 0)
+        return (system.caught(qd, caught | law.braked), caught), None
+
+    none = jnp.zeros(qd.size, bool)
+    (qd, hit), _ = jax.lax.scan(blow, (qd, none), length=qd.size)
+    (qd, caught), _ = jax.lax.scan(stop, (qd, none), length=qd.size)
+    return qd, hit | caught
 
 
 def _settled(
-    qd: Array, touched: Array, law: Laws, matrix: Array, net: Callable
+    qd: Array, touched: Array, law: Laws, system: _System, net: Array
 ) -> tuple[Array, Array]:
-    """Returns the rates with joints stopped that bounce too low, and times left out."""
+    """Returns the rates with joints stopped that bounce too low, and times left out.
+
+    `net`: the efforts less the bias.
+    """
     rests = law.braked | ((touched != 0) & (constant(qd) == 0))
-    towards = constant(touched * _accelerations(matrix, net(qd), rests))
+    towards = touched * system.accelerations(net, rests)
     pulled = (touched * qd < 0) & (towards > 0)
     towards, e = jnp.where(pulled, towards, 1), law.restitution
     low = pulled & (constant(qd**2) <= 2 * towards * jnp.finfo(qd.dtype).eps ** _LOW)
     left_out = jnp.where(low, 2 * jnp.abs(qd) / (towards * (1 - e)), 0)
-    return jnp.where(low.any(), _caught(matrix, qd, law.braked | low), qd), left_out
+    return jnp.where(low.any(), system.caught(qd, law.braked | low), qd), left_out
 
 
 def _at_rest(
-    qd: Array, touched: Array, before: Modes, law: Laws, matrix: Array,
-    net: Callable, fired: Array,
+    qd: Array, touched: Array, before: Modes, law: Laws, system: _System, net: Array,
+    fired: Array,
 ) -> Modes:  # fmt: skip
     """Returns the modes of joints with these rates, and directions of sliding.
 
@@ -327,24 +351,24 @@ def _at_rest(
     sum level abs(qdd) over the joints at rest. One joint after the other changes its
     mode, until all agree with their laws (Murty's principal pivoting).
     """
-    qd, touched, law, matrix = constant((qd, touched, law, matrix))
-    tau = net(qd)
+    qd, touched, law = constant((qd, touched, law))
+    inertia = jnp.stack([row[0] for row in system.equations.mass])
     rest = (qd == 0) & ((law.static > 0) | (touched != 0) | law.braked)
     held_as = jnp.where(touched < 0, LOWER, jnp.where(touched > 0, UPPER, FRICTION))
     held_as = jnp.where(law.braked, BRAKE, held_as)
     least, most = box(law, held_as)
-    size = jnp.abs(tau) + law.static
+    size = jnp.abs(net) + law.static
     was_held = before.held
     forced = jnp.where(was_held & fired[0], 1.0, jnp.where(was_held & fired[1], -1, 0))
     count, joints = qd.size, jnp.arange(qd.size)
 
     def solved(slide):
         held = rest & (slide == 0)
-        qdd = _accelerations(matrix, tau - law.level * slide, held)
-        effort = jnp.where(held, matrix @ qdd - tau, 0)
+        qdd = system.accelerations(net - law.level * slide, held, in_one_loop)
+        effort = jnp.where(held, system.momenta(qdd) - net, 0)
         low, high = (effort - least) / size, (most - effort) / size
         # A joint that slides must not accelerate the other way.
-        back = slide * qdd * jnp.diag(matrix) / size
+        back = slide * qdd * inertia / size
         wrong = jnp.where(held, jnp.minimum(low, high), jnp.where(rest, back, 0))
         wrong = jnp.where(size > 0, wrong, 0)
         limit = jnp.where(held, 0, -_SURE * jnp.abs(slide))
@@ -405,7 +429,7 @@ def _recorded(events: Events, t: Array, kind: Array) -> Events:
 
 def in_order(events: Events) -> Events:
     """Returns the events in the order of time, NaN beyond the last of them."""
-    *rows, count = events
+    count, rows = events.count, (events.t, events.joint, events.kind)
     first = jnp.where(count > MOST_EVENTS, count % MOST_EVENTS, 0).astype(int)
     none = jnp.arange(MOST_EVENTS) >= count
     ordered = (jnp.where(none, jnp.nan, jnp.roll(row, -first)) for row in rows)
@@ -420,3 +444,38 @@ def taken_at(args: Args, ts: Array, modes: Modes, delta: Array) -> Array:
 
     _, *rows, _ = modes
     return jax.vmap(taken)(ts, *rows, delta)
+
+
+def efforts_of_holders(
+    linkage: Linkage, forces: Forces, t: Array, q: Array, qd: Array, tau: Array
+) -> Array:
+    """Computes the effort of each element by which it holds joints, (element, n).
+
+    `tau`: the sum of all efforts without these. What is held is at rest, exactly. A
+    stop pushes, and friction takes what would pull at it.
+    """
+    args = args_of(linkage, q, forces)
+    law, near = laws(args, t), jnp.sqrt(jnp.finfo(q.dtype).eps)
+    at_lower, at_upper = q <= law.lower + near, q >= law.upper - near
+    held = (qd == 0) & ((law.static > 0) | at_lower | at_upper | law.braked)
+    system = _system(t, q, qd, args)
+    net = tau - jnp.stack(system.equations.bias)
+    c = system.momenta(system.accelerations(net, held)) - net
+    c = jnp.where(held, c, 0)
+    pushes = ~law.braked & (at_lower & (c > 0) | at_upper & (c < 0))
+    # Where more than static friction is needed, a joint begins to slide.
+    rubs = jnp.where(jnp.abs(c) > law.static, law.level * jnp.sign(c), c)
+    rubs = jnp.where(pushes | law.braked, 0, rubs)
+    braked, rows = law.braked, []
+    for index, element in enumerate(forces):
+        share = jnp.zeros_like(q)
+        if isinstance(element, HardStops):
+            share = jnp.where(pushes, c, 0)
+        elif isinstance(element, Brake):
+            holds = element.braking(args.clock(index, t), linkage)
+            share, braked = jnp.where(braked & holds, c, 0), braked & ~holds
+        elif isinstance(element, Holder) and element.holds:
+            _, static = element.levels(q.size)
+            share = rubs * static / jnp.where(law.static > 0, law.static, 1)
+        rows.append(share)
+    return jnp.stack(rows)

@@ -32,7 +32,7 @@ from ..steps.switching import (
 from ..steps.tolerances import default_controller
 from ..steps.unchecked import diffeqsolve
 from .field import args_of, in_arrays, initial_own, own_states, whole
-from .holding import Modes, changes, in_order, taken_at
+from .holding import Modes, changes, in_order, taken_at, within_stops
 from .known_times import clocks_apart, known_times
 from .prescribed import agrees, formulation
 from .solution import Solution
@@ -259,7 +259,8 @@ def faults(inputs: Inputs, times: bool = True) -> list[Array]:
     growth = jnp.diff(ts)
     increasing = ((growth > 0) & (growth < jnp.inf)).all() | (not times)
     finite = (jnp.isfinite(state0.q) & jnp.isfinite(state0.qd)).all()
-    start = finite & agrees(forces, ts[0], jnp.asarray(state0.q), linkage)
+    q0 = jnp.asarray(state0.q)
+    start = finite & agrees(forces, ts[0], q0, linkage) & within_stops(forces, q0)
     arm = constant((linkage, ts))
     fit = [jnp.asarray(e.possible() & constant(e).fits(*arm)) for e in forces]
     return [~fine for fine in (increasing, start, possible(linkage), *fit)]

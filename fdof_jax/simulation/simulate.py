@@ -28,6 +28,7 @@ from ..linkage.linkage import Linkage, check_linkage
 from ..steps.tolerances import at_tolerances, with_longest, within_reach
 from .failures import cause, check_arguments
 from .field import initial_states
+from .holding import within_stops
 from .integrate import Inputs, faults
 from .prescribed import agrees, prescribed
 from .scene import accepts_scene
@@ -123,11 +124,16 @@ def check_elements(forces: Forces, linkage: Linkage, ts: Array) -> None:
 def check_start(
     forces: tuple[Element, ...], linkage: Linkage, state0: State, ts: Array
 ) -> None:
-    """Raises ValueError unless known prescribed joints start at their reference."""
-    motion = prescribed(forces)
-    if motion is None or is_traced(linkage, state0, ts, motion):
+    """Raises ValueError unless known starts agree with references and stops."""
+    if is_traced(linkage, state0, ts, forces):
         return
-    if not agrees(forces, ts[0], jnp.asarray(state0.q), linkage):
+    if not within_stops(forces, jnp.asarray(state0.q)):
+        raise ValueError(
+            "state0.q: expected positions between the hard stops, got "
+            f"{np.asarray(state0.q).tolist()}."
+        )
+    motion = prescribed(forces)
+    if motion is not None and not agrees(forces, ts[0], jnp.asarray(state0.q), linkage):
         begin, _ = motion.at(ts[0], linkage)
         raise ValueError(
             f"state0.q: expected {begin.tolist()} at the joints whose motion is "

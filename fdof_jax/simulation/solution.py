@@ -28,6 +28,14 @@ OUTCOMES = {
     "solver failed": "The method itself failed.",
 }
 
+# Modes of a joint, in the order of their numbers: free, or held by what.
+MODES = "free", "friction", "lower stop", "upper stop", "brake"
+# What happens to a joint, in the order of its number.
+HAPPENINGS = (
+    "sticks", "slips", "bounces", "rests on its stop", "leaves its stop",
+    "is braked", "is let go",
+)  # fmt: skip
+
 # Slower crossings are near to grazing, where no derivative exists.
 SLOW = 0.01
 
@@ -98,6 +106,33 @@ class WithOutcome(eqx.Module):
         return facts
 
 
+class Events(eqx.Module):
+    """What happened to joints that elements hold, and when: the last 64 events.
+
+    - `t`: times [s]; `joint`: numbers of joints, from 1; `kind`: places of the words in
+      `table`. Each has an entry per event, NaN beyond the last one.
+    - `count`: how many there were in all.
+    """
+
+    t: Float[Array, " event"]
+    joint: Float[Array, " event"]
+    kind: Float[Array, " event"]
+    count: Float[Array, ""]
+
+    @property
+    def table(self) -> dict[str, np.ndarray]:
+        """The events as columns, for instance for `pandas.DataFrame`.
+
+        Of a batch, the first column tells the motion.
+        """
+        t, joint, kind = map(np.asarray, (self.t, self.joint, self.kind))
+        there = np.isfinite(t)
+        words = np.array(HAPPENINGS)[kind[there].astype(int)]
+        columns = {"t [s]": t[there], "joint": joint[there].astype(int), "event": words}
+        batch = np.nonzero(there)[:-1]
+        return dict(zip(("motion",), batch)) | columns
+
+
 class Solution(WithOutcome):
     """A simulated motion, with its statistics and outcome.
 
@@ -122,6 +157,15 @@ class Solution(WithOutcome):
     - `own`: the states of the `StatefulElement`s at `ts`, in the order of the forces;
       each like its `initial_state`, with a leading time axis.
 
+    If elements hold joints for a while (`JointFriction`, `HardStops`, `Brake`) or take
+    a `Payload`, else None:
+
+    - `modes`: what holds each joint at `ts`, as numbers: 0 nothing, 1 friction, 2 its
+      lower stop, 3 its upper stop, 4 a brake. At the time of an event it is the mode
+      before.
+    - `taken`: energy that friction, blows and brakes have taken up to `ts` [J].
+    - `events`: what happened to which joint, and when; its times have derivatives.
+
     >>> import fdof_jax as fj
     >>> import numpy as np
     >>> arm, start, *_ = fj.scenes.fig5()
@@ -138,7 +182,7 @@ class Solution(WithOutcome):
     own: tuple[Any, ...] = ()
     modes: Float[Array, "time joint"] | None = None
     taken: Float[Array, " time"] | None = None
-    events: Any = None
+    events: Events | None = None
 
     @property
     def states(self) -> tuple[Any, ...]:
