@@ -170,6 +170,11 @@ def switching(
     return switches.all_values(args.q0.dtype), switches.jumping
 
 
+def efforts(t: Any, y: Any, args: Args, schedule: tuple[Any, ...]) -> Scalars:
+    """Returns the sum of the elements' efforts."""
+    return _effort(t, y, args, schedule)[0]
+
+
 def applied(
     t: Any, y: Any, args: Args, schedule: tuple[Any, ...]
 ) -> tuple[Scalars, Scalars, Upper | None]:

@@ -29,7 +29,7 @@ from ..mechanics.rates import holding_efforts
 from ..mechanics.solve import divided, minus, solver_of, times, with_added
 from ..steps.dopri8 import constant
 from ..steps.switch_derivatives import Event
-from .field import Args, applied, args_of, schedule_of, switched, whole
+from .field import Args, args_of, efforts, schedule_of, switched, whole
 from .solution import HAPPENINGS, MODES, Events
 
 FREE, FRICTION, LOWER, UPPER, BRAKE = range(len(MODES))
@@ -180,11 +180,10 @@ class _System(NamedTuple):
 
 def _system(t: Array, q: Array, qd: Array, args: Args) -> _System:
     """Returns the system at a configuration, with the bias at these rates."""
-    added = None
-    if masses := args.masses(t):
-        added, _ = added_inertia(args.linkage, masses, q, qd)
-    m = equations(args.constants, tuple(q - args.q0), tuple(qd))
-    return _System(args.constants, with_added(added, m), added)
+    added, more = added_inertia(args.linkage, args.masses(t), q, qd)
+    m = with_added(added, equations(args.constants, tuple(q - args.q0), tuple(qd)))
+    bias = tuple(jnp.stack(m.bias) + more)
+    return _System(args.constants, m._replace(bias=bias), added)
 
 
 def resolve(event: Event, y: Any, args: Args) -> tuple[Any, Modes]:
@@ -287,7 +286,7 @@ def _net_efforts(
     t, q, qd, own, args = constant((t, q, qd, own, args))
     args = args._replace(modes=args.modes._replace(direction=jnp.sign(qd)))
     y = whole(tuple(q - args.q0), tuple(qd), own)
-    tau, *_ = applied(t, y, args, schedule_of(t, args))
+    tau = efforts(t, y, args, schedule_of(t, args))
     system = _system(t, q, qd, args)
     m, net = in_one_loop((system.equations, minus(tau, system.equations.bias)))
     return system._replace(equations=m), jnp.stack(net)
@@ -455,17 +454,19 @@ def efforts_of_holders(
     stop pushes, and friction takes what would pull at it.
     """
     args = args_of(linkage, q, forces)
+    modes, _ = unknown_modes(args)
     law, near = laws(args, t), jnp.sqrt(jnp.finfo(q.dtype).eps)
-    at_lower, at_upper = q <= law.lower + near, q >= law.upper - near
-    held = (qd == 0) & ((law.static > 0) | at_lower | at_upper | law.braked)
+    touched = 1.0 * (q >= law.upper - near) - 1.0 * (q <= law.lower + near)
     system = _system(t, q, qd, args)
     net = tau - jnp.stack(system.equations.bias)
-    c = system.momenta(system.accelerations(net, held)) - net
-    c = jnp.where(held, c, 0)
-    pushes = ~law.braked & (at_lower & (c > 0) | at_upper & (c < 0))
-    # Where more than static friction is needed, a joint begins to slide.
-    rubs = jnp.where(jnp.abs(c) > law.static, law.level * jnp.sign(c), c)
-    rubs = jnp.where(pushes | law.braked, 0, rubs)
+    none = jnp.zeros((2, q.size), bool)
+    modes = _at_rest(qd, touched * (qd == 0), modes, law, system, net, none)
+    starts = -law.level * jnp.where(qd == 0, modes.direction, 0)
+    qdd = system.accelerations(net + starts, modes.held)
+    c = jnp.where(modes.held, system.momenta(qdd) - net, 0)
+    mode = modes.mode
+    pushes = (mode == LOWER) & (c > 0) | (mode == UPPER) & (c < 0)
+    rubs = jnp.where(pushes | (mode == BRAKE), 0, c + starts)
     braked, rows = law.braked, []
     for index, element in enumerate(forces):
         share = jnp.zeros_like(q)
@@ -476,6 +477,7 @@ def efforts_of_holders(
             share, braked = jnp.where(braked & holds, c, 0), braked & ~holds
         elif isinstance(element, Holder) and element.holds:
             _, static = element.levels(q.size)
-            share = rubs * static / jnp.where(law.static > 0, law.static, 1)
+            part = static / jnp.where(law.static > 0, law.static, 1)
+            share = part * rubs
         rows.append(share)
     return jnp.stack(rows)
