@@ -1,8 +1,11 @@
 """Derivatives of arms that rest, whose motion has no error that would bound a step.
 
 An arm at rest obeys its linearised equations, whose matrix exponential is exact. The
-linearisation is that of the equations at one instant, not of any integrator.
+linearisation is that of the equations at one instant, not of any integrator. A slide
+under linear forces obeys them wherever it is: from a lively start, at rest, and after.
 """
+
+from functools import partial
 
 import diffrax
 import equinox as eqx
@@ -11,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from modes import ADJOINT, LOOPS
+from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 import fdof_jax as fj
@@ -237,6 +241,180 @@ def test_second_derivatives_of_an_arm_at_rest():
         mixed = jax.jit(jax.jacfwd(effort_at), static_argnums=1, **LOOPS)
         found = mixed(damping, adjoint).item()
         assert found == pytest.approx(((4 * near - wide) / 3).item(), rel=1e-6)
+
+
+# A slide with drives and a bumper: its motion is a matrix exponential.
+SLIDE = fj.Linkage(
+    "P", length=[0, 1], com=[[0.5, 0]], mass=[1], inertia=[0.1], gravity=0
+)
+TARGET, VOLTS, RESISTANCE, INDUCTANCE, CONSTANT = 0.5, (30.0, 1.0), 0.5, 0.02, 2.0
+ANCHOR, REST_LENGTH = 2.0, 9.0  # the bumper is never left
+ENDS = 1.0, 10.0, 100.0
+BUMPERS = (0.0, 0.0), (50.0, 5.0)  # stiffness and damping
+
+
+def driven(end):
+    """Returns kp, ki, kd, lag, mass, start, the push's rate, begin and length, end."""
+    return jnp.array([40.0, 30, 12, 0.05, 1.5, 0.3, 2, 40, end - 0.4, 0.2, end])
+
+
+def driven_scene(x, bumper):
+    """A PID controller behind a lag, a motor, a bumper, and a push before the end."""
+    kp, ki, kd, lag, mass, q, qd, rate, begin, length, _ = x
+    target = fj.references.SetPoint([TARGET])
+    pid = fj.control.PIDController(kp, ki, kd, np.inf, target)
+    motor = fj.control.DCMotor(
+        fj.PDController(*VOLTS, np.inf, target), resistance=RESISTANCE,
+        inductance=INDUCTANCE, constant=CONSTANT,
+    )  # fmt: skip
+    spring = fj.SpringDamper(
+        fj.Point(0, 0, ANCHOR), fj.Point(1), stiffness=bumper[0], damping=bumper[1],
+        rest_length=REST_LENGTH, one_sided="bumper",
+    )  # fmt: skip
+    push = Pushes(jnp.stack([begin, begin + length]), rate[None])
+    arm = eqx.tree_at(lambda a: a.mass, SLIDE, mass[None])
+    forces = fj.control.FirstOrderLag(pid, lag), motor, spring, push
+    return arm, fj.State(q[None], qd[None]), forces
+
+
+def last_place(x, bumper, adjoint):
+    arm, start, forces = driven_scene(x, bumper)
+    ts = jnp.stack([0.0, x[-1]])
+    motion = fj.simulate(arm, start, ts, forces, adjoint=adjoint)
+    return motion.q[-1, 0] + 0.1 * motion.qd[-1, 0]
+
+
+@jax.jit
+def exact_last_place(x, bumper):
+    """Of position, velocity, lagged effort, integral, current, push, its rate and 1."""
+    kp, ki, kd, lag, mass, q, qd, rate, begin, length, end = x
+    (stiffness, damping), (volts, per_speed) = bumper, VOLTS
+    far = stiffness * (ANCHOR - REST_LENGTH)
+    rows = [
+        [0, 1, 0, 0, 0, 0, 0, 0],
+        [-stiffness, -damping, 1, 0, CONSTANT, 1, 0, far],
+        [-kp, -kd, -1, 1, 0, 0, 0, kp * TARGET],
+        [-ki, 0, 0, 0, 0, 0, 0, ki * TARGET],
+        [-volts, -per_speed - CONSTANT, 0, 0, -RESISTANCE, 0, 0, volts * TARGET],
+        [0, 0, 0, 0, 0, 0, 1, 0],
+    ]
+    rows = jnp.stack([jnp.stack([jnp.asarray(a, float) for a in r]) for r in rows])
+    rows = rows / jnp.stack([1.0, mass, lag, 1.0, INDUCTANCE, 1.0])[:, None]
+    matrix = jnp.concatenate([rows, jnp.zeros((2, 8))])
+    after = lambda time: jax.scipy.linalg.expm(time * matrix, max_squarings=40)
+    state = jnp.zeros(8).at[:2].set(jnp.stack([q, qd])).at[7].set(1)
+    state = (after(begin) @ state).at[6].set(rate)
+    state = (after(length) @ state).at[5:7].set(0)
+    state = after(end - begin - length) @ state
+    return state[0] + 0.1 * state[1]
+
+
+exact_slope = jax.jit(jax.grad(exact_last_place))
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_slide_that_comes_to_rest_and_is_pushed_again(mode):
+    """Derivatives in gains, lag, mass, start, push and times."""
+    adjoint = {"tangents": DEFAULT, "adjoint": ADJOINT, "forward": FORWARD}[mode]
+    derivative = jax.jacfwd if mode == "forward" else jax.grad
+    slope = jax.jit(derivative(lambda *at: last_place(*at, adjoint)), **LOOPS)
+    for end in ENDS:
+        for bumper in map(jnp.array, BUMPERS):
+            wanted = exact_slope(driven(end), bumper)
+            assert error(slope(driven(end), bumper), wanted) < 1e-8, (end, bumper)
+
+
+@pytest.mark.slow
+def test_second_derivatives_of_a_slide_that_is_pushed_at_rest():
+    last, bumper = partial(last_place, adjoint=FORWARD), jnp.array(BUMPERS[1])
+    twice = jax.jit(jax.jacfwd(jax.jacfwd(last)), **LOOPS)
+    for end in ENDS[1:]:
+        wanted = jax.hessian(exact_last_place)(driven(end), bumper)
+        assert error(twice(driven(end), bumper), wanted) < 1e-7
+
+
+@pytest.mark.slow
+def test_batches_of_slides_that_are_pushed_at_rest():
+    """Of different ends under `jax.vmap`, and of different bumpers in a sweep."""
+    rows, bumper = jnp.stack([driven(end) for end in ENDS]), jnp.array(BUMPERS[1])
+    slope = jax.grad(partial(last_place, adjoint=DEFAULT))
+    found = jax.jit(jax.vmap(slope, (0, None)), **LOOPS)(rows, bumper)
+    for row, at in zip(found, rows):
+        assert error(row, exact_slope(at, bumper)) < 1e-8
+
+    def swept(x):
+        scenes = [driven_scene(x, bumper) for bumper in jnp.array(BUMPERS)]
+        arms, starts, forces = jax.tree.map(lambda *a: jnp.stack(a), *scenes)
+        motion = fj.sweep(
+            arms, starts, jnp.stack([0.0, x[-1]]), forces, forces_axes=0
+        )  # fmt: skip
+        return jnp.sum(motion.q[:, -1, 0] + 0.1 * motion.qd[:, -1, 0])
+
+    found = jax.jit(jax.grad(swept), **LOOPS)(rows[1])
+    wanted = sum(exact_slope(rows[1], bumper) for bumper in jnp.array(BUMPERS))
+    assert error(found, wanted) < 1e-8
+
+
+def damped_links(x):
+    """Two links with rounded friction, a PD controller, and stops that hold one."""
+    kp, kd, mass, level, q, qd = x
+    arm = fj.Linkage(
+        "RR", length=[0, 1, 1], com=[[0.5, 0]] * 2, mass=[1, 1], inertia=[1 / 12] * 2,
+        base_angle=-np.pi / 2,
+    )  # fmt: skip
+    with_first = lambda first, second: jnp.stack([first, jnp.asarray(second)])
+    arm = eqx.tree_at(lambda a: a.mass, arm, with_first(mass, 1.2))
+    target = fj.references.SetPoint([0.3, -0.2])
+    forces = (
+        fj.PDController(with_first(kp, 20.0), with_first(kd, 3.0), np.inf, target),
+        fj.forces.JointFriction(with_first(level, 0.5), 0.01),
+        fj.forces.JointStops(
+            [-1, -0.3], [0.1, 1], stiffness=1e3, damping=0.3, smoothing=1e-3
+        ),
+    )
+    return arm, fj.State(with_first(q, 0.2), with_first(qd, 2.0)), forces
+
+
+@jax.jit
+def varied_rates(rows, x):
+    """Returns the rates of a state and of its derivatives in x, which are rows."""
+
+    def rates(state, x):
+        arm, _, forces = damped_links(x)
+        q, qd = jnp.split(state, 2)
+        tau = sum(element(0.0, q, qd, arm) for element in forces)
+        return jnp.concatenate([qd, fj.forward_dynamics(arm, q, qd, tau)])
+
+    state, *varied = rows.reshape(len(x) + 1, -1)
+    in_state, in_x = jax.jacfwd(rates, (0, 1))(state, x)
+    varied = jnp.stack(varied) @ in_state.T + in_x.T
+    return jnp.concatenate([rates(state, x), varied.ravel()])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", MODES)
+def test_links_that_friction_and_a_stop_bring_to_rest(mode):
+    """Against SciPy's integration of the variational equations."""
+    adjoint = {"tangents": DEFAULT, "adjoint": ADJOINT, "forward": FORWARD}[mode]
+    weights = np.array([1, -2, 0.1, 0.1])
+
+    def last(x, end):
+        arm, start, forces = damped_links(x)
+        ts = jnp.stack([0.0, end])
+        motion = fj.simulate(arm, start, ts, forces, adjoint=adjoint)
+        return weights @ jnp.concatenate([motion.q[-1], motion.qd[-1]])
+
+    derivative = jax.jacfwd if mode == "forward" else jax.grad
+    slope, x = jax.jit(derivative(last), **LOOPS), jnp.array([40, 6, 1, 1, -0.5, 1.0])
+    start = lambda x: jnp.concatenate(damped_links(x)[1])
+    rows = np.concatenate([start(x), jax.jacfwd(start)(x).T.ravel()])
+    for end in (1.0, 10.0):
+        found = solve_ivp(
+            lambda t, rows: np.asarray(varied_rates(rows, x)), (0, end), rows, "LSODA",
+            rtol=1e-11, atol=1e-13, max_step=0.05,
+        )  # fmt: skip
+        wanted = found.y[:, -1].reshape(len(x) + 1, -1)[1:] @ weights
+        assert error(slope(x, end), wanted) < 1e-7
 
 
 def test_an_implicit_method_in_strong_damping():

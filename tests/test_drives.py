@@ -131,7 +131,10 @@ def test_without_inductance_currents_are_those_at_which_others_would_end(volts, 
 def test_an_inductance_is_of_all_joints_or_of_none():
     for zero in (0, [0.0, 0.0], None):
         assert STATIC.replace(inductance=zero).inductance is None
-    assert STATIC.replace(inductance=0.1).initial(WHEEL).shape == (1,)
+    currents = lambda value: STATIC.replace(inductance=value).initial(WHEEL)
+    for value, count in ((0.1, 1), (np.array([0.1]), 1), (0, 0), (jnp.zeros(1), 0)):
+        within = jax.jit(lambda value=value: currents(value))
+        assert np.size(currents(value)) == np.size(within()) == count
     within = jax.vmap(lambda value: STATIC.replace(inductance=value))(np.zeros(2))
     assert not within.possible()  # while it is traced, it is taken for positive
 

@@ -8,6 +8,7 @@ from abc import abstractmethod
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
@@ -231,7 +232,9 @@ class DCMotor(Drive):
         # Whether currents are states has to be known where the numbers are traced.
         if self.inductance is not None and not is_traced(self.inductance):
             rules = type(self).__dataclass_fields__["inductance"].metadata["rules"]
-            if not real_array("inductance", self.inductance, **rules).any():
+            real_array("inductance", self.inductance, **rules)  # refuses
+            # An `any` of JAX would be traced within `jax.jit`.
+            if not np.asarray(self.inductance).any():
                 object.__setattr__(self, "inductance", None)
 
     def conditions(self):
