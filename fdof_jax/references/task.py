@@ -312,14 +312,19 @@ class CircleTask(TipReference):
         The angle of the larger vector, to the centre or from there, is continuous. The
         smaller one adds at most a quarter turn.
         """
-        hub = plane_vector(*self.center) - base
-        angle, ray = _ray(self, jnp.stack([t, jnp.zeros_like(t)]))
+        # Two calls: in a motion, XLA computes what is the same in all steps once.
+        _, first = self._unwound(jnp.zeros_like(t), base)
+        wrist, bearing = self._unwound(t, base)
+        return wrist, bearing - 2 * np.pi * whole_turns(first)
+
+    def _unwound(self, t: Array, base: Array) -> tuple[Array, Array]:
+        """The wrist and its angle, to any number of turns."""
+        hub, (angle, ray) = plane_vector(*self.center) - base, _ray(self, t)
         around = self.radius**2 > dot(hub, hub)
         larger = jnp.where(around, ray, hub)
         angle = jnp.where(around, angle, plane_angle(hub.imag, hub.real))
         wrist = hub + ray
-        bearing = angle + angle_between(larger, wrist)
-        return wrist[0], bearing[0] - 2 * np.pi * whole_turns(bearing[1])
+        return wrist, angle + angle_between(larger, wrist)
 
     def check(self, linkage: Linkage, ts: Array) -> None:
         """Raises ValueError if the tip leaves the linkage's reach between the times."""
