@@ -435,14 +435,15 @@ def in_order(events: Events) -> Events:
     return Events(*ordered, count)
 
 
-def taken_at(args: Args, ts: Array, modes: Modes, delta: Array) -> Array:
+def taken_at(args: Args, ts: Array, modes: Modes, q: Array) -> Array:
     """Returns the energy that holders have taken (time,), from modes at times [J]."""
 
-    def taken(t, direction, origin, before, delta):
-        return before + jnp.sum(laws(args, t).level * direction * (delta - origin))
+    def taken(t, direction, origin, before, q):
+        slide = direction * (q - args.q0 - origin)
+        return before + jnp.sum(laws(args, t).level * slide)
 
     _, *rows, _ = modes
-    return jax.vmap(taken)(ts, *rows, delta)
+    return jax.vmap(taken)(ts, *rows, q)
 
 
 def efforts_of_holders(

@@ -231,7 +231,7 @@ def _read(inputs: Inputs, problem: _Problem, solve: diffrax.Solution) -> Solutio
     if modes:
         (last,) = switches
         modes = Modes(*modes, jax.tree.map(lambda rows: rows[0], last.modes.events))
-        taken = taken_at(problem.args, ts, modes, q - problem.args.q0)
+        taken = taken_at(problem.args, ts, modes, q)
         holding = shown_at(modes.mode), shown_at(taken), in_order(modes.events)
     own = jax.tree.map(shown_at, own)
     return Solution(times, q, qd, stats, result, own, *holding)

@@ -54,7 +54,8 @@ def _times(weights: np.ndarray, values: Array) -> Array:
     For small ones XLA would call a library.
     """
     factors = jnp.asarray(weights, values.dtype)[..., None]
-    terms = (factors[..., k, :] * row for k, row in enumerate(values))
+    rows = jnp.broadcast_to(values, (*factors.shape[:-1], values.shape[-1]))
+    terms = (factors[..., k, :] * rows[..., k, :] for k in range(len(values)))
     return functools.reduce(operator.add, terms)
 
 
