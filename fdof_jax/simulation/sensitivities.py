@@ -82,21 +82,25 @@ class _LocatedRows(Located):
     jumps: Array | None
     slopes: Array | None  # derivatives of the jumps (jump, n)
 
-    def resolved(self, term, t, y, args, *here):
+    def resolved(self, term, t, y, args, switching, sides, changed, made_jump):
         (rows,) = y
         one = _LocatedRow(
             self.solver, self.jumping, self.apart, self.guards, True, self.known_late
         )  # pyright: ignore[reportCallIssue]
 
-        def resolved(row, z):
-            (row,), modes = one.resolved(
-                self.motion, t, (row,), args._replace(z=z), *here
-            )
+        def of_row(row, z):
+            (row,), modes = one.after_event(
+                self.motion, t, (row,), args._replace(z=z), switching, sides, changed,
+                made_jump,
+            )  # fmt: skip
             return row, modes
 
-        row, along, modes = jax.linearize(resolved, rows[0], args.z, has_aux=True)
-        slopes = jax.vmap(along)(rows[1:], jnp.eye(args.z.size, dtype=rows.dtype))
-        return (jnp.concatenate([row[None], slopes]),), modes
+        def after_event():
+            row, along, modes = jax.linearize(of_row, rows[0], args.z, has_aux=True)
+            slopes = jax.vmap(along)(rows[1:], jnp.eye(args.z.size, dtype=rows.dtype))
+            return (jnp.concatenate([row[None], slopes]),), modes
+
+        return self.if_event(switching, made_jump, after_event, y)
 
     def kept(self, held, y1, y0):
         ((new,), (old,)) = y1, y0
@@ -255,7 +259,9 @@ def sensitivities(
     changing = formulation(start_at(z)[0].forces).term.resolve is not None
     events = (unknown_modes, resolve) if changing else (None, None)
     term = _Term(field, switches_of, *events)  # pyright: ignore[reportArgumentType, reportCallIssue]
-    motion = _Term(lambda t, y, varied: (rates(t, y[0], varied),), switches_of_row, *events)  # pyright: ignore[reportArgumentType, reportCallIssue]
+    motion = _Term(
+        lambda t, y, varied: (rates(t, y[0], varied),), switches_of_row, *events
+    )  # pyright: ignore[reportArgumentType, reportCallIssue]
     of_rows = True, motion, rates, jumps, slopes
     locate = lambda *settings: _LocatedRows(*settings, *of_rows)  # pyright: ignore[reportCallIssue]
     # A method of few stages, because much of the work lies outside of them; as a loop

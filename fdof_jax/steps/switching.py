@@ -288,25 +288,36 @@ class Located(diffrax.AbstractAdaptiveSolver):
         The state moves on to the time of the event in the modes before, and back in
         those after: this changes nothing but derivatives.
         """
+        here = term, t, y, args, switching, sides, changed, made_jump
+        return self.if_event(switching, made_jump, lambda: self.after_event(*here), y)
+
+    def if_event(
+        self, switching: Switching, made_jump: Any, after_event: Any, y: Any
+    ) -> tuple[Any, Any]:
+        """Returns state and modes after an event, or as they are if there is none."""
+        start = jnp.any(switching.modes.mode < 0)
+        otherwise = lambda: (y, switching.modes)
+        return jax.lax.cond(made_jump | start, after_event, otherwise)
+
+    def after_event(
+        self, term: Any, t: Array, y: Any, args: Any, switching: Switching,
+        sides: Array, changed: Array, made_jump: Any,
+    ) -> tuple[Any, Any]:  # fmt: skip
+        """Returns state and modes after an event at the start of a step."""
         before = switching.in_force(args)
         fired = changed[-self.guards :].reshape(-1, switching.modes.mode.size)
-
-        def event() -> tuple[Any, Any]:
-            time = jnp.where(switching.ahead > 0, t, switching.until)
-            late, there = jnp.zeros_like(t), y
-            if self.derivatives:
-                arrived = changed & made_jump & (switching.length > 0)
-                late = self.lateness(Arrival(time, y, before, arrived), term)
-                there = moved_on(late, Instant(time, y, before), term=term)
-            happens = Event(switching.until, t, fired, late)
-            there, modes = term.resolve(happens, there, before._replace(sides=sides))
-            if self.derivatives:
-                after = Instant(t + late, there, _in_force(args, sides, modes))
-                there = moved_on(-late, after, term=term)
-            return there, modes
-
-        start = jnp.any(switching.modes.mode < 0)
-        return jax.lax.cond(made_jump | start, event, lambda: (y, switching.modes))
+        time = jnp.where(switching.ahead > 0, t, switching.until)
+        late, there = jnp.zeros_like(t), y
+        if self.derivatives:
+            arrived = changed & made_jump & (switching.length > 0)
+            late = self.lateness(Arrival(time, y, before, arrived), term)
+            there = moved_on(late, Instant(time, y, before), term=term)
+        happens = Event(switching.until, t, fired, late)
+        there, modes = term.resolve(happens, there, before._replace(sides=sides))
+        if self.derivatives:
+            after = Instant(t + late, there, _in_force(args, sides, modes))
+            there = moved_on(-late, after, term=term)
+        return there, modes
 
     def kept(self, held: Array, y1: Any, y0: Any) -> Any:
         """Returns the end of a step, positions and rates of held joints as before."""
