@@ -105,6 +105,19 @@ def link_constants(
     )
 
 
+def with_held(c: Constants, held: Scalars) -> Constants:
+    """Returns the constants with the joints that are held as fixed pairs.
+
+    A slide whose one slide beyond is held has the pivot of a single one.
+    """
+    fixed = tuple(pair | own for pair, own in zip(c.fixed, held))
+    ends = list(c.ends_in_slides)
+    for k in range(len(ends)):
+        for own in held[k + 1 :]:
+            ends[k] = ends[k] & ~own
+    return c._replace(fixed=fixed, ends_in_slides=tuple(ends))
+
+
 def _pairs_of_slides(
     revolute: Scalars, fixed: Scalars, mass: Scalars, turned: list[Vector]
 ) -> tuple[Scalars, Scalars]:

@@ -22,7 +22,14 @@ from ..forces.element import (
 from ..forces.holders import Holder
 from ..forces.switches import Switches
 from ..linkage.linkage import Linkage
-from ..mechanics.equations import Constants, Scalars, Upper, link_constants, zeros
+from ..mechanics.equations import (
+    Constants,
+    Scalars,
+    Upper,
+    link_constants,
+    with_held,
+    zeros,
+)
 from ..mechanics.rates import conditioning, rates, rates_and_conditioning
 from ..steps.dopri8 import Health, ScheduledTerm, health_if
 
@@ -54,9 +61,8 @@ class Args(NamedTuple):
         """Returns the arguments with the joints that are held as fixed pairs."""
         if self.modes is None:
             return self
-        pairs = enumerate(self.constants.fixed)
-        fixed = tuple(pair | self.modes.held[k] for k, pair in pairs)
-        return self._replace(constants=self.constants._replace(fixed=fixed))
+        held = tuple(self.modes.held)
+        return self._replace(constants=with_held(self.constants, held))
 
     def sliding(self, qd: Scalars) -> Scalars:
         """Returns the directions in which joints slide; by default those of rates."""

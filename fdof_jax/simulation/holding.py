@@ -24,7 +24,7 @@ from ..forces.holders import Brake, HardStops, Holder, holders
 from ..forces.payload import Payload
 from ..linkage.linkage import Linkage, joints_of
 from ..linkage.topology import fixed_pairs
-from ..mechanics.equations import Constants, Equations, equations
+from ..mechanics.equations import Constants, Equations, equations, with_held
 from ..mechanics.rates import holding_efforts
 from ..mechanics.solve import divided, minus, solver_of, times, with_added
 from ..steps.dopri8 import constant
@@ -161,8 +161,7 @@ class _System(NamedTuple):
         self, efforts: Array, held: Array, once: Callable = lambda x: x
     ) -> Array:
         """Returns those of joints that are not held, 0 at the others."""
-        fixed = (pair | held[k] for k, pair in enumerate(self.constants.fixed))
-        constants = self.constants._replace(fixed=tuple(fixed))
+        constants = with_held(self.constants, tuple(held))
         solve, _ = solver_of(constants, self.equations, self.added, divided)
         return jnp.stack(once(solve(tuple(efforts))))
 
