@@ -171,9 +171,9 @@ def test_motions_and_analyses(name):
     compare(shorter, without_fixed(longer))
 
 
-@pytest.mark.parametrize("name", elements.ALL)
+@pytest.mark.parametrize("name", elements.ALL | elements.HOLDING)
 def test_elements_act_alike(name):
-    forces, run = (elements.ALL[name],), eqx.filter_jit(acts)
+    forces, run = ((elements.ALL | elements.HOLDING)[name],), eqx.filter_jit(acts)
     q, qd = (padded(row).at[PLACE].set(0) for row in (Q, QD))  # as programs do
     longer = run(LONGER, q, qd, padded(forces))
     compare(run(ARM, Q, QD, forces), without_fixed(longer))

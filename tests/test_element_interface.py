@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from elements import ALL, PD, Hold, arm
+from elements import ALL, HOLDING, PD, Hold, arm
 
 import fdof_jax as fj
 from fdof_jax.forces.element import elements
@@ -276,7 +276,7 @@ EIGHT = fj.references.FigureEight([1.6, 0.4], [0.5, 0.3])
 @pytest.mark.parametrize(
     "part",
     [
-        *ALL.values(),
+        *(ALL | HOLDING).values(),
         fj.CircleTask(),
         fj.TipTask(EIGHT, fj.references.Laps(period=4.0)),
         fj.references.Spline([[0, 0], [1, 1], [2, 0]], closed=True),

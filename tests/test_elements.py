@@ -27,6 +27,7 @@ from fdof_jax.simulation.field import (
 from fdof_jax.simulation.simulate import check_elements
 
 ARM = elements.arm("RPR")
+EVERY = elements.ALL | elements.HOLDING
 
 # Energy
 
@@ -283,9 +284,9 @@ def bounded(element):
             yield declared.name
 
 
-@pytest.mark.parametrize("name", elements.ALL)
+@pytest.mark.parametrize("name", EVERY)
 def test_values_that_no_constructor_saw_are_told_where_they_are(name):
-    element, ts = elements.ALL[name], jnp.array([0.0, 0.1])
+    element, ts = EVERY[name], jnp.array([0.0, 0.1])
     within = {"computed torque": "model.mass", "motor with PID": "command.pd.kd"}
     places = [*bounded(element), *([within[name]] if name in within else [])]
     possible = jax.jit(lambda e: e.possible())
@@ -311,13 +312,14 @@ def field_flops(*forces):
 bare = cache(field_flops)
 
 
-@pytest.mark.parametrize("name", elements.ALL)
+@pytest.mark.parametrize("name", EVERY)
 def test_an_element_costs_its_own(name):
     """Besides adding its efforts, and six entries of the mass matrix if it has any."""
-    element, at = elements.ALL[name], (jnp.array(0.1), *elements.START, ARM)
+    element, at = EVERY[name], (jnp.array(0.1), *elements.START, ARM)
     state = element.initial_state(ARM)
     own = 6 + flops(lambda e, *a: e.act(*a), element, *at, state)
-    if name in elements.WITH_INERTIA:
+    if isinstance(element, fj.forces.InertialElement):
         added = lambda arm, e, *a: added_inertia(arm, (e,), *a)
         own += 9 + flops(added, ARM, element, *elements.START)
+        own += flops(lambda e, t: e.at(t), element, at[0])
     assert 0 <= field_flops(element) - bare() <= own

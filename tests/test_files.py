@@ -165,7 +165,7 @@ TREES = {
     "eight joints": fj.Linkage(
         "RPFRRPFR", length=[1] * 9, com=[[1, 0]] * 8, mass=[1] * 8, inertia=[1] * 8
     ),
-    **{name: (element,) for name, element in elements.ALL.items()},
+    **{name: (element,) for name, element in (elements.ALL | elements.HOLDING).items()},
     "prescribed": fj.simulation.PrescribedMotion((1, 3), MOVE),
     "model": fj.control.GravityFeedforward(1, 1, np.inf, fj.CircleTask(), ARM),
     **{
@@ -190,7 +190,7 @@ def test_trees_and_batches(name, path):
     """Arrays of a batch have a leading axis, those of a batch of batches two."""
     tree = TREES[name]
     assert type(saved_and_loaded(path, tree)) is type(tree)
-    if name in (*elements.ALL, "prescribed", "model", "spline"):
+    if name in (*elements.ALL, *elements.HOLDING, "prescribed", "model", "spline"):
         pair = stack(tree, jax.tree.map(lambda a: jnp.asarray(np.array(a)), tree))
         saved_and_loaded(path, pair)
         saved_and_loaded(path, stack(pair, pair, pair))
