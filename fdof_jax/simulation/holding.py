@@ -328,15 +328,23 @@ def _settled(
 ) -> tuple[Array, Array]:
     """Returns the rates with joints stopped that bounce too low, and times left out.
 
-    `net`: the efforts less the bias.
+    What rests already stays at rest. One joint that rests may hold another at its stop,
+    so this is repeated once for each joint. `net`: the efforts less the bias.
     """
-    rests = law.braked | ((touched != 0) & (constant(qd) == 0))
-    towards = touched * system.accelerations(net, rests)
-    pulled = (touched * qd < 0) & (towards > 0)
-    towards, e = jnp.where(pulled, towards, 1), law.restitution
-    low = pulled & (constant(qd**2) <= 2 * towards * jnp.finfo(qd.dtype).eps ** _LOW)
-    left_out = jnp.where(low, 2 * jnp.abs(qd) / (towards * (1 - e)), 0)
-    return jnp.where(low.any(), system.caught(qd, law.braked | low), qd), left_out
+    e, lowest = law.restitution, jnp.finfo(qd.dtype).eps ** _LOW
+
+    def settle(state, _):
+        qd, left_out = state
+        rests = law.braked | ((touched != 0) & (constant(qd) == 0))
+        towards = touched * system.accelerations(net, rests)
+        pulled = (touched * qd < 0) & (towards > 0)
+        towards = jnp.where(pulled, towards, 1)
+        low = pulled & (constant(qd**2) <= 2 * towards * lowest)
+        left_out += jnp.where(low, 2 * jnp.abs(qd) / (towards * (1 - e)), 0)
+        return (jnp.where(low.any(), system.caught(qd, rests | low), qd), left_out), None
+
+    settled, _ = jax.lax.scan(settle, (qd, jnp.zeros_like(qd)), length=qd.size)
+    return settled
 
 
 def _at_rest(
