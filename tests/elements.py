@@ -112,8 +112,12 @@ WITH_INERTIA = {
 WITH_INERTIA["payload"] = fj.forces.Payload(TIP, 0.4, 0.05, velocity=[0.1, 0.2])
 # Those that hold joints for a while, or take a mass: not for fixed steps
 HOLDING = {
-    "sticking friction": fj.forces.JointFriction([0.4, 0.3, 0.2], static=[0.5, 0.3, 0.4]),
-    "hard stops": fj.forces.HardStops([-1.0, -0.5, -np.inf], 0.9, restitution=[0.3, 0.1, 0]),
+    "sticking friction": fj.forces.JointFriction(
+        [0.4, 0.3, 0.2], static=[0.5, 0.3, 0.4]
+    ),
+    "hard stops": fj.forces.HardStops(
+        [-1.0, -0.5, -np.inf], 0.9, restitution=[0.3, 0.1, 0]
+    ),
     "brake": fj.forces.Brake([2, 3], begin=0.03, end=0.06),
     "taken": fj.forces.Payload(TIP, 0.4, 0.05, begin=0.02, end=0.07),
 }  # fmt: skip

@@ -115,7 +115,7 @@ def test_numbers_of_the_account_and_of_the_elements():
     for part in (
         "q = -qpos",
         "range -0.4 to 0.9",
-        "JointFriction, which creeps",
+        "JointFriction, which holds still",
         "0.6",
     ):
         assert part in words, words

@@ -59,7 +59,7 @@ def elements_in_joints(read: Reader, drop: tuple[str, ...]) -> list[Any]:
     friction = np.array(model.dof_frictionloss[rates])
     if read.disabled("FRICTIONLOSS", "CONSTRAINT"):
         friction[:] = 0
-    words = "JointFriction, which creeps where MuJoCo's sticks"
+    words = "JointFriction, which holds still where MuJoCo's creeps"
     add("friction", friction, words, lambda: JointFriction(friction))
     limited = model.jnt_limited[joints].astype(bool)
     if limited.any() and not read.disabled("LIMIT", "CONSTRAINT"):

@@ -70,9 +70,9 @@ def from_mjcf(
     Damping, armature, springs, actuators and spatial tendons between two sites become
     elements that act alike: position and velocity servos a `PDController`, motors a
     `JointEffort`, others `Actuators`. MuJoCo's soft ranges become `JointStops` that are
-    about as stiff, and its friction loss `JointFriction`, which creeps where MuJoCo's
-    sticks. What the library does not have is refused, or left out on purpose by `drop`.
-    The `account` says all of it.
+    about as stiff, and its friction loss `JointFriction`, which holds still where
+    MuJoCo's creeps. What the library does not have is refused, or left out on purpose
+    by `drop`. The `account` says all of it.
 
     **Arguments:**
 

@@ -13,7 +13,7 @@ from ..control.actuators import Actuators
 from ..control.pd import PDController
 from ..forces.actuators import Armature
 from ..forces.element import Forces, ForeignElement, elements_on
-from ..forces.holders import JointFriction
+from ..forces.holders import HardStops, JointFriction
 from ..forces.joints import JointDamper, JointEffort, JointSpring, JointStops
 from ..forces.points import SpringDamper
 from ..linkage.coordinates import State, real_state
@@ -25,7 +25,7 @@ from .mjcf_chain import FAR
 
 # MuJoCo rejects smaller masses and inertias of moving bodies (its mjMINVAL).
 _SMALLEST = 1e-15
-_IN_JOINTS = JointDamper, Armature, JointSpring, JointStops, JointFriction
+_IN_JOINTS = JointDamper, Armature, JointSpring, JointStops, HardStops, JointFriction
 _ACTUATORS = JointEffort, PDController, Actuators
 _KINDS = (*_IN_JOINTS, SpringDamper, *_ACTUATORS)
 _THICK = 0.02  # radius of the drawn links, over the length of the arm
@@ -48,9 +48,9 @@ def to_mjcf(linkage: Linkage, forces: Forces = (), state0: State | None = None) 
     reference for instance, are in the key frame `start`, which also has `state0`; set
     `data.ctrl` as a moving reference demands. The model asks for MuJoCo's RK4 with
     steps of 1 ms, as its own default, Euler with 2 ms, is far less exact. MuJoCo has
-    other models of stops and friction: of `JointStops` it takes the range alone and
-    stops softly by its own `solref`; of `JointFriction` the level alone, and joints
-    stick at rest. `from_mjcf` reads all of it.
+    other models of stops and friction: of `JointStops` and `HardStops` it takes the
+    range alone and stops softly by its own `solref`; of `JointFriction` the level
+    alone, and joints that stick creep. `from_mjcf` reads all of it.
 
     **Arguments:** `linkage`: one linkage with concrete values; `forces`: elements;
     `state0`: the start. Or a scene, which holds all of them.
@@ -225,7 +225,7 @@ def _of_joints(acting: tuple[Any, ...], count: int) -> list[dict[str, str]]:
             add("springref", element.rest)
         elif isinstance(element, JointFriction):
             add("frictionloss", element.level)
-        elif isinstance(element, JointStops):
+        elif isinstance(element, JointStops | HardStops):
             low, high = (np.clip(e, -FAR, FAR) for e in (element.lower, element.upper))
             add("range", low, high, where=np.minimum(abs(low), abs(high)) < FAR)
         elif isinstance(element, PDController):

@@ -8,7 +8,7 @@ from ..base.checks import instance, known, optional_package
 from ..linkage.linkage import Linkage
 from ..linkage.topology import common_unit, names_and_units, rate_unit
 from ..simulation.sampled import Motion, check_joints
-from ..simulation.solution import Solution
+from ..simulation.solution import MODES, Solution
 
 if TYPE_CHECKING:
     import pandas
@@ -36,10 +36,11 @@ def to_xarray(linkage: Linkage, solution: Motion) -> "xarray.Dataset":
 
     The Dataset holds joint positions `q` and velocities `qd` over `time` and `joint`,
     and the solution's `outcome`, `num_steps` and `time_reached` for each trajectory; a
-    `SampledMotion` has `outcome` alone. The joints are named R1, P2 and so on, with the
-    coordinate `unit`; a joint of both kinds within a batch is named by its number.
-    Batch axes come first, as `batch` (or `batch_1`, `batch_2` and so on). To name an
-    axis and give it values, use
+    `SampledMotion` has `outcome` alone. Where elements hold joints, it also holds the
+    `mode` of each joint, as numbers, and the energy `taken` (see `Solution`). The
+    joints are named R1, P2 and so on, with the coordinate `unit`; a joint of both kinds
+    within a batch is named by its number. Batch axes come first, as `batch` (or
+    `batch_1`, `batch_2` and so on). To name an axis and give it values, use
     `.rename(batch="payload").assign_coords(payload=masses)`.
 
     **Arguments:** `linkage`: that of the solution, one or a batch; `solution`: result
@@ -69,6 +70,11 @@ def to_xarray(linkage: Linkage, solution: Motion) -> "xarray.Dataset":
         for name, unit in (("num_steps", "1"), ("time_reached", "s")):
             values, label = solution.stats[name], name.replace("_", " ")
             variables[name] = variable(batch, values, label, unit)
+        if solution.modes is not None and solution.taken is not None:
+            label = "what holds the joint: nothing, friction, lower, upper stop, brake"
+            variables["mode"] = variable(rows, solution.modes, label, "1")
+            label = "energy taken by what holds joints"
+            variables["taken"] = variable(rows[:-1], solution.taken, label, "J")
     coordinates = {
         "time": variable(["time"], times, "time", "s"),
         "joint": variable(["joint"], names, "joint", ""),
@@ -81,7 +87,8 @@ def to_pandas(linkage: Linkage, solution: Motion) -> "pandas.DataFrame":
     """Converts a solution to a pandas DataFrame with a row per time.
 
     There is a column per joint position and velocity, named `R1 [rad]`, `P2 [m/s]` and
-    so on; the last column is the `outcome` of the row's trajectory. The index is the
+    so on; where elements hold joints, `R1 held by` tells by what (`free` if by
+    nothing). The last column is the `outcome` of the row's trajectory. The index is the
     time, `time [s]`. For a batch, the levels before it are `batch` (or `batch_1`,
     `batch_2` and so on).
 
@@ -98,6 +105,10 @@ def to_pandas(linkage: Linkage, solution: Motion) -> "pandas.DataFrame":
     for values, unit_of in ((solution.q, str), (solution.qd, rate_unit)):
         for k, (name, unit) in enumerate(zip(*names_and_units(linkage.ef))):
             columns[f"{name} [{unit_of(unit)}]"] = np.asarray(values)[..., k].ravel()
+    if isinstance(solution, Solution) and solution.modes is not None:
+        for k, name in enumerate(names_and_units(linkage.ef)[0]):
+            modes = np.nan_to_num(np.asarray(solution.modes)[..., k].ravel())
+            columns[f"{name} held by"] = np.array(MODES)[modes.astype(int)]
     columns["outcome"] = np.repeat(solution.outcome, len(times))
     index = pandas.Index(times, name="time [s]")
     if batch:

@@ -4,22 +4,17 @@ from ..linkage.fields import Condition, Values, field
 from .actuators import Armature, LinearActuator, Rotor
 from .element import Element, InertialElement, StatefulElement
 from .holders import Brake, HardStops, JointFriction
-from .joints import (
-    EffortHistory,
-    JointDamper,
-    JointEffort,
-    JointSpring,
-    JointStops,
-)
+from .joints import EffortHistory, JointDamper, JointEffort, JointSpring, JointStops
 from .payload import Payload
 from .points import Load, Point, PointElement, SpringDamper, Tension, Wrench
 from .switches import clip, switch
 
 __all__ = [
     "Armature", "Brake", "clip", "Condition", "EffortHistory", "Element", "field",
-    "HardStops", "InertialElement", "JointDamper", "JointEffort", "JointFriction", "JointSpring",
-    "JointStops", "LinearActuator", "Load", "Payload", "Point", "PointElement", "Rotor",
-    "SpringDamper", "StatefulElement", "switch", "Tension", "Values", "Wrench",
+    "HardStops", "InertialElement", "JointDamper", "JointEffort", "JointFriction",
+    "JointSpring", "JointStops", "LinearActuator", "Load", "Payload", "Point",
+    "PointElement", "Rotor", "SpringDamper", "StatefulElement", "switch", "Tension",
+    "Values", "Wrench",
 ]  # fmt: skip
 
 

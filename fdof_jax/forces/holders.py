@@ -179,8 +179,7 @@ class Brake(Holder):
         end: ArrayLike = np.inf,
     ):
         self.joints = numbered(joints)
-        self.begin: Any = begin
-        self.end: Any = end
+        self.begin, self.end = begin, end  # pyright: ignore[reportAttributeAccessIssue]
 
     def arguments(self) -> dict[str, Any]:
         numbers = np.flatnonzero(self.joints) + 1

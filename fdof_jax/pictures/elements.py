@@ -10,7 +10,9 @@ from matplotlib.path import Path
 from ..base.known_values import in_numpy
 from ..forces.actuators import LinearActuator
 from ..forces.element import elements_on
+from ..forces.holders import HardStops
 from ..forces.joints import JointStops
+from ..forces.payload import Payload
 from ..forces.points import Point, SpringDamper, Tension, Wrench
 from ..linkage.frames import Frames
 from ..linkage.linkage import Linkage
@@ -21,6 +23,7 @@ from .axes import BLACK, xy
 
 # Widths are in sizes of the arm.
 _WIDTH, _ARROW, _HEAD, _ARC = 0.025, 0.3, 0.05, 0.08
+_BOX = _WIDTH * np.array([1 + 1j, -1 + 1j, -1 - 1j, 1 - 1j, 1 + 1j])  # of a payload
 
 COMMANDED: dict[str, Any] = dict(color=BLACK, lw=0.8, ls=(0, (5, 3)))
 _THIN: dict[str, Any] = dict(color=BLACK, lw=0.8)
@@ -29,6 +32,7 @@ ELEMENT_STYLES: dict[str, dict[str, Any]] = {
     "cylinder": dict(color=BLACK, lw=1.0),
     "wrench": dict(color=BLACK, lw=1.6, solid_joinstyle="miter"),
     "stops": dict(color=BLACK, lw=1.2),
+    "payload": dict(color=BLACK, lw=1.6),
     "commanded": COMMANDED,
 }
 
@@ -64,7 +68,9 @@ def element_lines(
         elif isinstance(element, Wrench):
             kind, points = "wrench", [element.point]
             strokes = _arrows(_place(element.point, f), *pushes[k], most, size)
-        elif isinstance(element, JointStops):
+        elif isinstance(element, Payload):
+            kind, strokes = "payload", [_place(element.place, f) + _BOX * size]
+        elif isinstance(element, JointStops | HardStops):
             kind, strokes = "stops", _stops(element, linkage, f, size)
         elif (path := _commanded(given[k])) is not None:
             kind, strokes = "commanded", [np.tile(path, (len(ts), 1))]
@@ -145,6 +151,7 @@ _SYMBOLS = {
     "tension": [np.array([0, 1])],
     "cylinder": [np.array([0.6, 0.6 + 1j, 1j, -1j, 0.6 - 1j, 0.6, 1])],
     "wrench": [np.array([0, 1, 0.7 + 1j, 1, 0.7 - 1j])],
+    "payload": [0.5 + _BOX / _WIDTH / 3],
     "stops": [np.array([1.2j, -1.2j, 0, 1, 1 + 1.2j, 1 - 1.2j])],
     "commanded": [np.array([0, 0.4]), np.array([0.6, 1])],
 }
@@ -228,7 +235,7 @@ def _head(tip: np.ndarray, along: np.ndarray, size: float) -> np.ndarray:
 
 
 def _stops(
-    element: JointStops, linkage: Linkage, f: Frames, size: float
+    element: JointStops | HardStops, linkage: Linkage, f: Frames, size: float
 ) -> list[np.ndarray]:
     """Bars at the ends of each joint's range, joined by an arc around a pin."""
     kinds, radius, strokes = letters(linkage.ef), 1.2 * _ARC * size, []

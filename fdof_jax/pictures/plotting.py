@@ -33,6 +33,7 @@ from ..references.reference import reference_of
 from ..references.task import TipReference
 from ..simulation.efforts import joint_efforts
 from ..simulation.sampled import Motion, SampledMotion, acting_in
+from ..simulation.solution import Solution
 from .arms import geometry, link_color
 from .axes import (
     BLACK,
@@ -68,7 +69,7 @@ def motion_profile(
 
     One panel shows the angles of links on revolute joints from the x axis, not from the
     link before as in `q` [degrees], another the slides of prismatic joints [m]; theta_k
-    and B_k are those of joint k.
+    and B_k are those of joint k. A thick line marks where something holds a joint.
     """
     ts, q, _ = reached(linkage, solution)
     g = geometry(linkage, q)
@@ -84,6 +85,14 @@ def motion_profile(
     fig, axes = time_panels(fig, 0.6 + 1.9 * len(panels), ts, panels)
     for ax in axes:
         legend(ax)
+    if isinstance(solution, Solution) and solution.modes is not None:
+        held = np.asarray(solution.modes)[: len(ts)] > 0
+        numbered = list(enumerate(g.kinds))
+        joints = ([k for k, kind in numbered if kind == one] for one in "RP")
+        for ax, of in zip(axes, filter(None, joints)):
+            for line, k in zip(ax.lines, of):
+                values = np.where(held[:, k], line.get_ydata(), np.nan)
+                ax.plot(ts, values, color=line.get_color(), lw=4, alpha=0.5)
     return fig
 
 

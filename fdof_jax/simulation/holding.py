@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 
 from ..base.one_loop import in_one_loop
@@ -229,9 +228,7 @@ def resolve(event: Event, y: Any, args: Args) -> tuple[Any, Modes]:
     at = event.t + event.late + left_out
     events = _recorded(before.events, at, jnp.where(first, -1, kind))
     qd = jnp.where(modes.mode > FREE, 0, qd)
-    modes = modes._replace(
-        origin=origin, taken=before.taken + lost, events=events
-    )
+    modes = modes._replace(origin=origin, taken=before.taken + lost, events=events)
     state = tuple(origin), tuple(qd), *own
     return state, modes
 
@@ -341,7 +338,8 @@ def _settled(
         towards = jnp.where(pulled, towards, 1)
         low = pulled & (constant(qd**2) <= 2 * towards * lowest)
         left_out += jnp.where(low, 2 * jnp.abs(qd) / (towards * (1 - e)), 0)
-        return (jnp.where(low.any(), system.caught(qd, rests | low), qd), left_out), None
+        qd = jnp.where(low.any(), system.caught(qd, rests | low), qd)
+        return (qd, left_out), None
 
     settled, _ = jax.lax.scan(settle, (qd, jnp.zeros_like(qd)), length=qd.size)
     return settled
@@ -378,7 +376,8 @@ def _at_rest(
         wrong = jnp.where(held, jnp.minimum(low, high), jnp.where(rest, back, 0))
         wrong = jnp.where(size > 0, wrong, 0)
         limit = jnp.where(held, 0, -_SURE * jnp.abs(slide))
-        return jnp.where(wrong < limit, wrong, 0), jnp.where(low < high, 1.0, -1.0), held
+        towards = jnp.where(low < high, 1.0, -1.0)
+        return jnp.where(wrong < limit, wrong, 0), towards, held
 
     def changed(state):
         slide, tries, wrong, towards, held = state
@@ -403,17 +402,18 @@ def _happenings(before: Modes, after: Modes, bounced: Array) -> Array:
     """Returns what happens to each joint, -1 if nothing."""
     was, now = before.mode, after.mode
     at_stop = lambda mode: (mode == LOWER) | (mode == UPPER)
-    cases = [
-        (bounced, _BOUNCES),
-        (was == now, -1),
-        (now == FRICTION, _STICKS),
-        (at_stop(now), _RESTS),
-        (now == BRAKE, _BRAKED),
-        (was == FRICTION, _SLIPS),
-        (at_stop(was), _LEAVES),
-        (was == BRAKE, _LET_GO),
-    ]
-    return jnp.select(*map(list, zip(*[(c, jnp.full(was.shape, k)) for c, k in cases])))
+    cases = {
+        _BOUNCES: bounced,
+        -1: was == now,
+        _STICKS: now == FRICTION,
+        _RESTS: at_stop(now),
+        _BRAKED: now == BRAKE,
+        _SLIPS: was == FRICTION,
+        _LEAVES: at_stop(was),
+        _LET_GO: was == BRAKE,
+    }
+    kinds = [jnp.full(was.shape, kind) for kind in cases]
+    return jnp.select([*cases.values()], kinds, -1)
 
 
 def _recorded(events: Events, t: Array, kind: Array) -> Events:
@@ -435,11 +435,12 @@ def _recorded(events: Events, t: Array, kind: Array) -> Events:
 
 def in_order(events: Events) -> Events:
     """Returns the events in the order of time, NaN beyond the last of them."""
-    count, rows = events.count, (events.t, events.joint, events.kind)
+    count = events.count
     first = jnp.where(count > MOST_EVENTS, count % MOST_EVENTS, 0).astype(int)
     none = jnp.arange(MOST_EVENTS) >= count
-    ordered = (jnp.where(none, jnp.nan, jnp.roll(row, -first)) for row in rows)
-    return Events(*ordered, count)
+    ordered = lambda row: jnp.where(none, jnp.nan, jnp.roll(row, -first))
+    t, joint, kind = map(ordered, (events.t, events.joint, events.kind))
+    return Events(t, joint, kind, count)
 
 
 def taken_at(args: Args, ts: Array, modes: Modes, q: Array) -> Array:
@@ -449,7 +450,7 @@ def taken_at(args: Args, ts: Array, modes: Modes, q: Array) -> Array:
         slide = direction * (q - args.q0 - origin)
         return before + jnp.sum(laws(args, t).level * slide)
 
-    _, *rows, _ = modes
+    rows = modes.direction, modes.origin, modes.taken
     return jax.vmap(taken)(ts, *rows, q)
 
 

@@ -227,14 +227,17 @@ def _read(inputs: Inputs, problem: _Problem, solve: diffrax.Solution) -> Solutio
         stats["accuracy"] = jnp.finfo(q.dtype).eps * loss
     stats |= switching_facts(*switches)
     result = _judged(valid, solve.result, q, qd)
-    holding = ()
-    if modes:
-        (last,) = switches
-        modes = Modes(*modes, jax.tree.map(lambda rows: rows[0], last.modes.events))
-        taken = taken_at(problem.args, ts, modes, q)
-        holding = shown_at(modes.mode), shown_at(taken), in_order(modes.events)
-    own = jax.tree.map(shown_at, own)
-    return Solution(times, q, qd, stats, result, own, *holding)
+    solution = Solution(times, q, qd, stats, result, jax.tree.map(shown_at, own))
+    if not modes:
+        return solution
+    (last,), (mode, direction, origin, before) = switches, modes
+    events = in_order(jax.tree.map(lambda rows: rows[0], last.modes.events))
+    taken = taken_at(
+        problem.args, ts, Modes(mode, direction, origin, before, events), q
+    )
+    holding = shown_at(mode), shown_at(taken), events
+    where = lambda s: (s.modes, s.taken, s.events)
+    return eqx.tree_at(where, solution, holding, is_leaf=lambda x: x is None)
 
 
 def _differentiable(solver: Any, adjoint: diffrax.AbstractAdjoint) -> Any:

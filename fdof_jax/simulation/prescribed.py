@@ -23,7 +23,6 @@ from ..linkage.topology import MOST_PAIRS, fixed_pairs
 from ..mechanics.equations import equations, zeros
 from ..references.reference import EXPECTED, reference_motion
 from ..steps.dopri8 import Health, ScheduledTerm
-from .holding import changes, guarded_switching, resolve, unknown_modes
 from .field import (
     Args,
     applied,
@@ -36,6 +35,7 @@ from .field import (
     watched_field,
     whole,
 )
+from .holding import changes, guarded_switching, resolve, unknown_modes
 
 _NUMBERS = tuple(range(1, MOST_PAIRS + 1))
 

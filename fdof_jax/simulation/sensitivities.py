@@ -236,10 +236,12 @@ def sensitivities(
 
     def unknown_modes(varied):
         term, _, args = instant(start, varied)
+        assert term.unknown_modes is not None  # of scenes that change modes
         return term.unknown_modes(args)
 
     def resolve(event, y, varied):
         term, *at = instant(y[0], varied)
+        assert term.resolve is not None
         state, modes = term.resolve(event, *at)
         return (jnp.stack(jax.tree.leaves(state)),), modes
 

@@ -23,8 +23,8 @@ OUTCOMES = {
     "rounding keeps it from that, or an effort jumps there (forces.switch makes steps "
     "end at jumps).",
     "too many switches": "Elements switch there without end, as between branches that "
-    "push towards each other: let the effort change continuously, as by a "
-    "JointFriction, or by a clipped gain in place of a sign.",
+    "push towards each other: let joints stick by a JointFriction, or let the effort "
+    "change continuously, as by a clipped gain in place of a sign.",
     "solver failed": "The method itself failed.",
 }
 

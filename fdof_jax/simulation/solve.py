@@ -65,11 +65,10 @@ def _solve_one(inputs: Inputs, keywords) -> tuple[Solution, bool] | None:
     if solution is None or is_traced(solution):
         return None
     rows = solution.q, solution.qd, solution.own, solution.modes, solution.taken
-    q, qd, own, *modes = cut(rows, len(ts))
+    q, qd, own, modes, taken = cut(rows, len(ts))
     stats, result = solution.stats | {"max_steps": most}, solution.result
-    return Solution(ts, q, qd, stats, result, own, *modes, solution.events), bool(
-        succeeded
-    )
+    solution = Solution(ts, q, qd, stats, result, own, modes, taken, solution.events)
+    return solution, bool(succeeded)
 
 
 def _of_any_tolerance(keywords):

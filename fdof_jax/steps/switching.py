@@ -92,7 +92,7 @@ def motion_of(y: Any) -> Any:
 
 
 def located(
-    locate: Callable[[Any, bool, Array], "Located"],
+    locate: Callable[[Any, bool, Array, int], "Located"],
     solver: Any,
     term: Any,
     ts: Array,
