@@ -161,8 +161,8 @@ class Solution(WithOutcome):
     a `Payload`, else None:
 
     - `modes`: what holds each joint at `ts`, as numbers: 0 nothing, 1 friction, 2 its
-      lower stop, 3 its upper stop, 4 a brake. At the time of an event it is the mode
-      before.
+      lower stop, 3 its upper stop, 4 a brake. At the very time of an event it may be
+      the mode before it or after it.
     - `taken`: energy that friction, blows and brakes have taken up to `ts` [J].
     - `events`: what happened to which joint, and when; its times have derivatives.
 

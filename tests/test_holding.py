@@ -1,0 +1,294 @@
+"""Joints that are held for a while: laws, modes, events, batches, refusals."""
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pandas
+import pytest
+from elements import START, arm
+from held_scenes import books, random_scene
+from modes import LOOPS
+
+import fdof_jax as fj
+from fdof_jax.forces import Brake, HardStops, JointFriction, Payload
+
+inf = np.inf
+BAR = fj.Linkage("R", length=[0, 1], com=[[0.5, 0]], mass=[1], inertia=[1 / 12])
+SLIDE = fj.Linkage("P", length=[0, 1], com=[[0, 0]], mass=[1], inertia=[1], gravity=0.0)
+REST = fj.State([0.0], [0.0])
+LOAD = 9.81 * 0.5  # of the bar, level
+
+
+def run(linkage, state0, ts, *forces, **options):
+    return fj.simulate(linkage, state0, ts, forces, **options)
+
+
+# Friction
+
+
+def test_friction_above_the_load_holds_to_the_last_bit():
+    motion = run(BAR, REST, [0, 5, 10.0], JointFriction(1.5 * LOAD))
+    np.testing.assert_array_equal(motion.q, 0)
+    np.testing.assert_array_equal(motion.modes, 1)
+    assert motion.events.count == 0
+
+
+def test_static_friction_holds_what_has_come_to_rest_only():
+    """It is above the load, which sliding friction is not: at rest the bar stays."""
+    friction = JointFriction(0.9 * LOAD, static=1.1 * LOAD)
+    assert run(BAR, REST, [0, 1.0], friction).q[-1, 0] == 0
+    falling = run(BAR, fj.State([0.0], [-0.1]), [0, 0.1], friction)
+    assert falling.q[-1, 0] < -0.01
+
+
+def test_a_sprung_slide_stops_short_and_derivatives_tell_where():
+    """13 half swings, each shorter by 4 cm: the slide stops at 1 cm."""
+    ts, spring = np.linspace(0, 6, 7), fj.forces.JointSpring(100.0)
+
+    def end(numbers, **options):
+        start, level = numbers
+        state0 = fj.State(jnp.stack([start]), jnp.zeros(1))
+        motion = run(SLIDE, state0, ts, JointFriction(level), spring, **options)
+        return motion.q[-1, 0], motion.events.t[0]
+
+    numbers = jnp.array([0.51, 2.0])
+    x, t = end(numbers)
+    np.testing.assert_allclose([x, t], [0.01, 1.3 * np.pi], rtol=0, atol=1e-9)
+    right = [[-1, 0.26], [0, 0]]
+    forward = jax.jacfwd(lambda n: jnp.stack(end(n, adjoint=diffrax.ForwardMode())))
+    np.testing.assert_allclose(jax.jit(forward, **LOOPS)(numbers), right, atol=1e-8)
+    reverse = jax.jit(jax.jacrev(lambda n: jnp.stack(end(n))), **LOOPS)
+    np.testing.assert_allclose(reverse(numbers), right, atol=1e-8)
+
+
+def test_a_mass_on_a_belt_sticks_and_slips_for_a_hundred_periods():
+    """As seen from the belt, the spring's other end moves."""
+    pull = lambda t, q, qd, linkage: -100 * (q + 0.1 * t)
+    period = 0.2 + 0.47123889803846897
+    ts = np.linspace(0, 100 * period, 11)
+    motion = run(SLIDE, REST, ts, JointFriction(2.0, static=3.0), pull)
+    t, kind = np.asarray(motion.events.t), np.asarray(motion.events.kind)
+    assert motion.events.count == 199 and len(t) == 64
+    np.testing.assert_allclose(t[2:] - t[:-2], period, rtol=0, atol=1e-10)
+    sticks = np.diff(t)[kind[:-1] == 0]  # until it slips
+    np.testing.assert_allclose(sticks, 0.2, rtol=0, atol=1e-10)
+
+
+# Stops
+
+
+def test_a_mass_bounces_to_rest_at_a_known_time():
+    """The times of endlessly many bounces add up to it."""
+    drop = SLIDE.replace(gravity=9.81)
+    floor = HardStops(0.0, inf, restitution=0.5)
+
+    def rests(height, **options):
+        start = fj.State(jnp.stack([height]), jnp.zeros(1))
+        motion = run(drop, start, [0, 2.0], floor, **options)
+        last = motion.events.count.astype(int) - 1
+        return motion.events.t[last], motion
+
+    forward = lambda h: rests(h, adjoint=diffrax.ForwardMode())
+    slope, motion = jax.jit(jax.jacfwd(forward, has_aux=True), **LOOPS)(1.0)
+    time, _ = rests(jnp.array(1.0))
+    np.testing.assert_allclose(time, 1.3545709229571927, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(slope, 0.6772854614785964, rtol=0, atol=1e-9)
+    assert motion.q[-1, 0] == 0 and motion.modes[-1, 0] == 2
+    effort = fj.joint_efforts(drop, (floor,), motion).total[-1, 0]
+    np.testing.assert_allclose(effort, 9.81, rtol=1e-15)
+    np.testing.assert_allclose(motion.taken[-1], 9.81, rtol=1e-9)
+
+
+def test_a_start_outside_of_stops_is_refused():
+    stops = HardStops(-1.0, 1.0)
+    with pytest.raises(ValueError, match="^state0.q: expected .* between the hard"):
+        run(BAR, fj.State([1.5], [0.0]), [0, 1.0], stops)
+    motion = run(BAR, fj.State([1.5], [0.0]), [0, 1.0], stops, throw=False)
+    assert motion.outcome == "not finite"
+
+
+# Brakes and payloads
+
+PAIR = fj.Linkage(
+    "RR", length=[0, 1, 1], com=[[0.5, 0]] * 2, mass=[1, 1], inertia=[1 / 12] * 2,
+    gravity=0.0,
+)  # fmt: skip
+MOVING = fj.State([0.3, 0.8], [1.0, 2.0])
+
+
+@pytest.mark.parametrize("begin", [-1.0, 0.0])
+def test_a_brake_that_acts_already_holds_from_the_start(begin):
+    motion = run(PAIR, MOVING, [0, 1e-12], Brake(2, begin))
+    expected = [1.5768759984566454, 0]
+    np.testing.assert_allclose(motion.qd[-1], expected, rtol=1e-12)
+
+
+def test_a_hinge_that_hits_its_stop_moves_the_other():
+    motion = run(PAIR, MOVING, [0, 1e-12], HardStops(-inf, [inf, 0.8], restitution=0.4))
+    np.testing.assert_allclose(motion.qd[-1], [1.8076264, -0.8], rtol=1e-7)
+
+
+def test_a_bar_takes_a_mass_at_rest_or_one_that_moves_along():
+    bar, start = BAR.replace(gravity=0.0), fj.State([0.0], [2.0])
+    along = -2 * np.sin(2.0), 2 * np.cos(2.0)  # of the tip at 1 s
+    for velocity, rate, taken in (([0, 0], 4 / 11, 6 / 11), (along, 2.0, 0.0)):
+        load = Payload(fj.Point(1, 1.0), 1.5, begin=1.0, velocity=velocity)
+        motion = run(bar, start, [0, 2.0], load)
+        np.testing.assert_allclose(motion.qd[-1], [rate], rtol=1e-9)
+        np.testing.assert_allclose(motion.taken[-1], taken, atol=1e-9)
+
+
+def test_a_payload_of_all_time_is_a_link_of_more_mass():
+    load = Payload(fj.Point(3, 0.3, 0.05), 0.7)
+    heavy = arm("RPR")
+    mass, com, inertia = 1.7, heavy.com[2], heavy.inertia[2]
+    center = (com + 0.7 * jnp.array([0.3, 0.05])) / mass
+    inertia += jnp.sum((com - center) ** 2)
+    inertia += 0.7 * jnp.sum((jnp.array([0.3, 0.05]) - center) ** 2)
+    heavy = heavy.replace(
+        mass=heavy.mass.at[2].set(mass), com=heavy.com.at[2].set(center),
+        inertia=heavy.inertia.at[2].set(inertia),
+    )  # fmt: skip
+    ts = np.linspace(0, 0.5, 6)
+    found, right = run(arm("RPR"), START, ts, load), run(heavy, START, ts)
+    np.testing.assert_allclose(found.q, right.q, atol=1e-9)
+    assert found.modes is None
+
+
+# Batches, tables, costs
+
+
+def test_modes_and_topologies_share_one_program_in_a_batch():
+    """Members equal single motions, by `jax.vmap` and by `sweep`."""
+    arms = [arm(topology) for topology in ("RRR", "RPR", "PRR", "RPP")]
+    batch = jax.tree.map(lambda *rows: jnp.stack(rows), *arms)
+    starts = fj.State(jnp.tile(START.q, (4, 1)), jnp.tile(START.qd, (4, 1)))
+    forces = (
+        JointFriction([2.0, 9.0, 0.5], static=[2.5, 9.5, 0.6]),
+        HardStops(-0.6, [0.6, 0.3, 0.7], restitution=0.3),
+        Brake(3, 0.3, 0.6),
+    )
+    ts = np.linspace(0, 1.5, 7)
+    single = lambda linkage, q, qd: run(linkage, fj.State(q, qd), ts, *forces)
+    mapped = eqx.filter_jit(jax.vmap(single), **LOOPS)(batch, *starts)
+    swept = fj.sweep(batch, starts, ts, forces)
+    for k, linkage in enumerate(arms):
+        alone = single(linkage, START.q, START.qd)
+        for motion in (mapped, swept):
+            np.testing.assert_allclose(motion.q[k], alone.q, atol=1e-9)
+            np.testing.assert_array_equal(motion.modes[k], alone.modes)
+            assert motion.events.count[k] == alone.events.count
+    assert len(np.unique(np.asarray(mapped.modes))) == 5
+    table = pandas.DataFrame(mapped.events.table)
+    assert [*table.columns] == ["motion", "t [s]", "joint", "event"]
+    assert len(table) == mapped.events.count.sum()
+    frame = fj.to_pandas(arms[0], alone)
+    assert set(frame["R3 held by"]) <= {
+        "free",
+        "friction",
+        "brake",
+        "upper stop",
+        "lower stop",
+    }
+
+
+def test_what_holds_nothing_has_no_modes():
+    motion = run(BAR, REST, [0, 1.0], JointFriction(1.0, speed=0.1))
+    assert motion.modes is motion.taken is motion.events is None
+
+
+@pytest.mark.parametrize(
+    "make, words",
+    [
+        (lambda: JointFriction(2.0, static=1.0), "static: expected at least the level"),
+        (lambda: JointFriction(1, static=2, speed=1), "static: expected none beside"),
+        (lambda: HardStops(1.0, -1.0), "lower: expected less than upper"),
+        (lambda: HardStops(-1, 1, restitution=1), "restitution: expected less than 1"),
+        (lambda: Brake(0), "joints: expected a number of 1 to 8"),
+        (lambda: Brake(1, 2.0, 1.0), "begin: expected less than end"),
+        (lambda: Payload(fj.Point(1), -1), "mass: expected .* at least 0"),
+        (lambda: Payload(fj.Point(1), 1, begin=2, end=1), "begin: expected less than"),
+        (lambda: Payload(fj.Point(1), 1, velocity=[1]), "velocity: expected two or"),
+    ],
+)
+def test_malformed_elements_are_refused(make, words):
+    with pytest.raises(ValueError, match=f"^{words}"):
+        make()
+
+
+def test_what_cannot_go_together_is_refused():
+    fixed = dict(stepsize_controller=diffrax.ConstantStepSize(), dt0=0.01)
+    move = lambda t, linkage: (jnp.zeros(1), jnp.zeros(1))
+    for forces, options, words in [
+        ((JointFriction(1.0),), fixed, "stepsize_controller: expected an adaptive one"),
+        ((HardStops(-1, 1),) * 2, {}, "forces: expected one HardStops"),
+        ((Brake(2),), {}, r"forces\[0\].joints: expected 1 to 1"),
+        (
+            (Brake(1), fj.simulation.PrescribedMotion(1, move)), {},
+            "forces: expected no element that holds",
+        ),
+    ]:  # fmt: skip
+        with pytest.raises(ValueError, match=f"^{words}"):
+            run(BAR, REST, [0, 1.0], *forces, **options)
+
+
+# Laws, in scenes at random
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(16))
+def test_laws_of_random_scenes(seed):
+    """The books of energy close, held joints stand still, efforts stay in bounds."""
+    scene = random_scene(np.random.default_rng(seed), most_joints=5)
+    ts = np.linspace(0, 2, 41)
+    motion = fj.simulate(scene.linkage, scene.state0, ts, scene.forces)
+    total, size = books(scene, motion)
+    np.testing.assert_allclose(total[-1], total[0], rtol=0, atol=1e-9 * size)
+    # Between ends of steps, states are less exact.
+    np.testing.assert_allclose(total, total[0], rtol=0, atol=1e-8 * size)
+    held = np.asarray(motion.modes) > 0
+    assert (np.asarray(motion.qd)[held] == 0).all()
+    efforts = fj.joint_efforts(scene.linkage, scene.forces, motion)
+    qdd = jax.vmap(lambda t, *at: fj.forward_dynamics(scene.linkage, *at, scene.at(t)))
+    qdd = qdd(motion.ts, motion.q, motion.qd, efforts.total)
+    np.testing.assert_allclose(np.asarray(qdd)[held], 0, atol=1e-8)
+    for element, effort in zip(scene.forces, np.asarray(efforts.elements)):
+        if isinstance(element, JointFriction):
+            most = np.where(held, element.static, element.level)
+            assert (np.abs(effort) <= most + 1e-9).all()
+        if isinstance(element, HardStops):
+            q, lower = np.asarray(motion.q), np.asarray(element.lower)
+            assert (q >= lower - 1e-12).all()
+            assert (q <= np.asarray(element.upper) + 1e-12).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(6))
+def test_derivatives_in_random_scenes(seed):
+    """They equal extrapolated differences of tight solves."""
+    rng = np.random.default_rng(100 + seed)
+    scene = random_scene(rng, most_joints=3, moving=True)
+    numbers, of_numbers = scene.numbers()
+    ts = np.array([0, 0.7, 1.3])
+
+    def end(x, **options):
+        varied = of_numbers(x)
+        motion = fj.simulate(
+            varied.linkage, varied.state0, ts, varied.forces, throw=False, **options
+        )
+        return jnp.concatenate([motion.q[-1], motion.qd[-1]])
+
+    forward = dict(adjoint=diffrax.ForwardMode())
+    found = jax.jit(jax.jacfwd(lambda x: end(x, **forward)), **LOOPS)(numbers)
+    tight = jax.jit(lambda x: end(x, rtol=1e-13, atol=1e-13, **forward), **LOOPS)
+    direction = rng.standard_normal(numbers.size)
+
+    def difference(h):
+        ends = (tight(numbers + h * sign * direction) for sign in (1, -1))
+        return np.subtract(*map(np.asarray, ends)) / (2 * h)
+
+    right = (4 * difference(1e-5) - difference(2e-5)) / 3
+    size = max(1, np.abs(np.asarray(found)).max()) * np.sqrt(numbers.size)
+    np.testing.assert_allclose(found @ direction, right, rtol=0, atol=1e-6 * size)
