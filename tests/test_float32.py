@@ -14,7 +14,7 @@ from helpers import programs
 # One process for all tests, because importing takes seconds.
 PROGRAM = """
 import warnings
-import diffrax, jax, numpy as np
+import diffrax, jax, jax.numpy as jnp, numpy as np
 import fdof_jax as fj
 from helpers import SCENES, load, relative_error, to_joint
 
@@ -38,6 +38,26 @@ for name in ordinary:
         x, xd = fj.paper.to_chain(r.linkage, solution.q[i], solution.qd[i])
         assert relative_error(x, state["q"]) <= bound, (name, state["t"])
         assert relative_error(xd, state["v"]) <= bound, (name, state["t"])
+
+# An arm that hangs in damping, at rest; from matrix exponentials
+bar = dict(length=[0, 1], com=[[0.5, 0]], mass=[1], inertia=[1 / 12])
+hanging, rest = fj.Linkage("R", base_angle=-np.pi / 2, **bar), fj.State([0.0], [0.0])
+def end(tau, damping):
+    forces = fj.JointDamper(damping), fj.JointEffort(jnp.stack([tau]))
+    return fj.simulate(hanging, rest, [0, 2.0], forces).q[-1, 0]
+slope = jax.jit(jax.grad(end))
+for damping, exact in (1, 0.193616566), (10, 0.127398437), (1000, 0.001989895):
+    assert abs(slope(0.0, float(damping)) - exact) <= 1e-5 * exact + 4e-6, damping
+
+# Joints that are held, exactly
+level = fj.Linkage("R", **bar)
+motion = fj.simulate(level, rest, [0, 10.0], (fj.forces.JointFriction(7.0),))
+assert motion.q.tolist() == [[0], [0]] and motion.modes.dtype == np.float32
+mass = fj.Linkage("P", length=[0, 1], com=[[0, 0]], mass=[1], inertia=[1])
+floor = fj.forces.HardStops(0.0, np.inf, restitution=0.5)
+motion = fj.simulate(mass, fj.State([1.0], [0.0]), [0, 2.0], (floor,))
+assert motion.q[-1, 0] == 0 and motion.modes[-1, 0] == 2
+assert abs(np.nanmax(motion.events.t) - 1.35457) < 1e-3
 
 with warnings.catch_warnings(record=True) as caught:
     warnings.simplefilter("always")

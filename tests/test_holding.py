@@ -120,9 +120,22 @@ MOVING = fj.State([0.3, 0.8], [1.0, 2.0])
 
 @pytest.mark.parametrize("begin", [-1.0, 0.0])
 def test_a_brake_that_acts_already_holds_from_the_start(begin):
-    motion = run(PAIR, MOVING, [0, 1e-12], Brake(2, begin))
+    motion = run(PAIR, MOVING, [0, 1.0], Brake(2, begin))
     expected = [1.5768759984566454, 0]
-    np.testing.assert_allclose(motion.qd[-1], expected, rtol=1e-12)
+    np.testing.assert_allclose(motion.qd, [expected] * 2, rtol=1e-12)
+    energy = fj.energy(PAIR, *MOVING)[0]
+    np.testing.assert_allclose(
+        fj.energy(PAIR, motion.q[-1], motion.qd[-1])[0] + motion.taken,
+        energy,
+        rtol=1e-9,
+    )
+
+
+def test_a_brake_that_lets_go_at_a_stop_leaves_the_joint_there():
+    forces = HardStops(-0.5, 0.5), Brake(1, 1.0, 1.5)
+    motion = run(BAR, REST, [0, 0.9, 1.2, 2.0], *forces)
+    assert motion.modes[:, 0].tolist() == [0, 2, 4, 2]
+    assert motion.q[1:, 0].tolist() == [-0.5] * 3 and motion.events.count == 3
 
 
 def test_a_hinge_that_hits_its_stop_moves_the_other():

@@ -11,6 +11,7 @@ import numpy as np
 from jax import Array
 
 from ..forces.element import Element, ForeignElement
+from ..linkage.linkage import Linkage, joint_names
 from ..steps.derivative_control import linearised
 from .field import (
     args_of,
@@ -42,7 +43,15 @@ def cause(inputs: Inputs, keywords: dict[str, Any], solution: Solution) -> str:
                 return f"The effort of forces[{k}] is not finite at the start."
     if outcome in ("out of steps", "tolerance out of reach"):
         return _of_steps(inputs, keywords, solution)
-    return OUTCOMES[outcome]
+    return _of_joints(linkage, solution) + OUTCOMES[outcome]
+
+
+def _of_joints(linkage: Linkage, solution: Solution) -> str:
+    """Names the last joint that was held or let go, if any was."""
+    if solution.events is None or not (table := solution.events.table)["joint"].size:
+        return ""
+    joint, event = table["joint"][-1], table["event"][-1]
+    return f"Last, joint {joint_names(linkage)[joint - 1]} {event}. "
 
 
 def _of_steps(inputs: Inputs, keywords, solution: Solution) -> str:

@@ -199,8 +199,10 @@ def resolve(event: Event, y: Any, args: Args) -> tuple[Any, Modes]:
     slides = ~before.held
     # Rates that came to zero; what is at its stop.
     qd = jnp.where(fired[0] & slides, 0, qd)
-    at_lower = (before.mode == LOWER) | fired[2] | (first & (q <= law.lower))
-    at_upper = (before.mode == UPPER) | fired[3] | (first & (q >= law.upper))
+    still = first | before.held  # perhaps at a stop, but held by a brake
+    near = jnp.finfo(q.dtype).eps ** _LOW
+    at_lower = fired[2] | (still & (q <= law.lower + near))
+    at_upper = fired[3] | (still & (q >= law.upper - near))
     touched = jnp.where(at_lower, -1.0, jnp.where(at_upper, 1.0, 0.0))
     stop = jnp.where(at_lower, law.lower, jnp.where(at_upper, law.upper, 0))
     q = jnp.where(touched != 0, stop, q)

@@ -215,6 +215,9 @@ def _read(inputs: Inputs, problem: _Problem, solve: diffrax.Solution) -> Solutio
     # diffrax saves the start only with the first step.
     start = (without_fixed(linkage, value) for value in state0)
     first = (jnp.where(valid, a, b) for a, b in zip(problem.first, start))
+    if modes:  # after blows at the start
+        there = jnp.isfinite(qd[0]) & valid
+        first = (jnp.where(there, a[0], b) for a, b in zip((q, qd), first))
     q, qd = (shown_at(rows).at[0].set(row) for rows, row in zip((q, qd), first))
     # Constant steps go on when the state is no longer finite.
     reached = jnp.minimum(reached[0], ts[-1])
