@@ -101,6 +101,27 @@ def test_a_mass_bounces_to_rest_at_a_known_time():
     np.testing.assert_allclose(motion.taken[-1], 9.81, rtol=1e-9)
 
 
+@pytest.mark.slow
+def test_second_derivatives_through_a_blow():
+    drop = SLIDE.replace(gravity=9.81)
+
+    def height(numbers):
+        start, restitution = numbers
+        state0 = fj.State(jnp.stack([start]), jnp.zeros(1))
+        floor = HardStops(0.0, inf, restitution=restitution)
+        forward = diffrax.ForwardMode()
+        return run(drop, state0, [0, 0.6], floor, adjoint=forward).q[-1, 0]
+
+    def closed_form(numbers):
+        start, restitution = numbers
+        hit = jnp.sqrt(2 * start / 9.81)
+        left = 0.6 - hit
+        return 9.81 * left * (restitution * hit - left / 2)
+
+    twice = lambda f: jax.jit(jax.jacfwd(jax.jacfwd(f)), **LOOPS)(jnp.array([1, 0.5]))
+    np.testing.assert_allclose(twice(height), twice(closed_form), rtol=0, atol=1e-8)
+
+
 def test_a_start_outside_of_stops_is_refused():
     stops = HardStops(-1.0, 1.0)
     with pytest.raises(ValueError, match="^state0.q: expected .* between the hard"):
