@@ -128,6 +128,16 @@ def test_a_start_outside_of_stops_is_refused():
         run(BAR, fj.State([1.5], [0.0]), [0, 1.0], stops)
     motion = run(BAR, fj.State([1.5], [0.0]), [0, 1.0], stops, throw=False)
     assert motion.outcome == "not finite"
+    assert motion.events.count == 0 and np.isnan(motion.events.t).all()
+
+
+def test_a_fixed_pair_has_no_stops():
+    """Its position is 0, which need not lie within a range that others have."""
+    start = fj.State([0.7, 0.0], [0.0, 0.0])
+    stops = HardStops(0.5, 1.0, restitution=0.5)
+    linkage = PAIR.replace(topology="RF", gravity=9.81)
+    motion = run(linkage, start, [0, 1.0], stops)
+    assert motion.outcome == "successful" and 0.5 <= motion.q[-1, 0] <= 0.7
 
 
 # Brakes and payloads

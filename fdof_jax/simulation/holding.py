@@ -235,12 +235,18 @@ def resolve(event: Event, y: Any, args: Args) -> tuple[Any, Modes]:
     return state, modes
 
 
-def within_stops(forces: Forces, q: Array) -> Any:
-    """Returns whether an arm is within its hard stops, but for rounding."""
+def within_stops(forces: Forces, q: Array, linkage: Linkage) -> Any:
+    """Returns whether an arm is within its hard stops, but for rounding.
+
+    Fixed pairs have no stops.
+    """
     near = jnp.sqrt(jnp.finfo(q.dtype).eps)
-    stops = (e for e in forces if isinstance(e, HardStops))
-    inside = [(q >= e.lower - near) & (q <= e.upper + near) for e in stops]
-    return jnp.stack(inside).all() if inside else True
+    stops = [e for e in forces if isinstance(e, HardStops)]
+    if not stops:
+        return True
+    fixed = jnp.stack(fixed_pairs(linkage.ef))
+    inside = [fixed | (q >= e.lower - near) & (q <= e.upper + near) for e in stops]
+    return jnp.stack(inside).all()
 
 
 def _taken(
@@ -435,9 +441,12 @@ def _recorded(events: Events, t: Array, kind: Array) -> Events:
     )
 
 
-def in_order(events: Events) -> Events:
-    """Returns the events in the order of time, NaN beyond the last of them."""
-    count = events.count
+def in_order(events: Events, valid: Array) -> Events:
+    """Returns the events in the order of time, NaN beyond the last of them.
+
+    Those of invalid inputs are none: they belong to values put in their place.
+    """
+    count = jnp.where(valid, events.count, 0)
     first = jnp.where(count > MOST_EVENTS, count % MOST_EVENTS, 0).astype(int)
     none = jnp.arange(MOST_EVENTS) >= count
     ordered = lambda row: jnp.where(none, jnp.nan, jnp.roll(row, -first))

@@ -234,7 +234,7 @@ def _read(inputs: Inputs, problem: _Problem, solve: diffrax.Solution) -> Solutio
     if not modes:
         return solution
     (last,), (mode, direction, origin, before) = switches, modes
-    events = in_order(jax.tree.map(lambda rows: rows[0], last.modes.events))
+    events = in_order(jax.tree.map(lambda rows: rows[0], last.modes.events), valid)
     taken = taken_at(
         problem.args, ts, Modes(mode, direction, origin, before, events), q
     )
@@ -266,7 +266,8 @@ def faults(inputs: Inputs, times: bool = True) -> list[Array]:
     increasing = ((growth > 0) & (growth < jnp.inf)).all() | (not times)
     finite = (jnp.isfinite(state0.q) & jnp.isfinite(state0.qd)).all()
     q0 = jnp.asarray(state0.q)
-    start = finite & agrees(forces, ts[0], q0, linkage) & within_stops(forces, q0)
+    start = finite & agrees(forces, ts[0], q0, linkage)
+    start = start & within_stops(forces, q0, linkage)
     arm = constant((linkage, ts))
     fit = [jnp.asarray(e.possible() & constant(e).fits(*arm)) for e in forces]
     return [~fine for fine in (increasing, start, possible(linkage), *fit)]

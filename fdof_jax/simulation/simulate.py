@@ -127,7 +127,7 @@ def check_start(
     """Raises ValueError unless known starts agree with references and stops."""
     if is_traced(linkage, state0, ts, forces):
         return
-    if not within_stops(forces, jnp.asarray(state0.q)):
+    if not within_stops(forces, jnp.asarray(state0.q), linkage):
         raise ValueError(
             "state0.q: expected positions between the hard stops, got "
             f"{np.asarray(state0.q).tolist()}."
