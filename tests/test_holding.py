@@ -184,6 +184,15 @@ def test_a_bar_takes_a_mass_at_rest_or_one_that_moves_along():
         np.testing.assert_allclose(motion.taken[-1], taken, atol=1e-9)
 
 
+def test_reactions_count_a_payload_while_it_is_there():
+    load = Payload(fj.Point(1, 1.0), 2.0, begin=0.2, end=0.6)
+    forces = load, JointFriction(100.0)
+    motion = run(BAR, REST, [0, 0.4, 1.0], *forces)
+    reactions = fj.joint_reactions(BAR, forces, motion)
+    right = [[0, 9.81 * m, 9.81 * (0.5 + m - 1)] for m in (1, 3, 1)]
+    np.testing.assert_allclose(reactions[:, 0], right, atol=1e-12)
+
+
 def test_a_payload_of_all_time_is_a_link_of_more_mass():
     load = Payload(fj.Point(3, 0.3, 0.05), 0.7)
     heavy = arm("RPR")
@@ -272,6 +281,10 @@ def test_what_cannot_go_together_is_refused():
         (
             (Brake(1), fj.simulation.PrescribedMotion(1, move)), {},
             "forces: expected no element that holds",
+        ),
+        (
+            (Payload(fj.Point(1), 1, end=1), fj.simulation.PrescribedMotion(1, move)),
+            {}, "forces: expected .* no Payload with begin or end",
         ),
     ]:  # fmt: skip
         with pytest.raises(ValueError, match=f"^{words}"):

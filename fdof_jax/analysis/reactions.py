@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from ..base.checks import shown
 from ..dynamics import forward_dynamics, inverse_dynamics
+from ..forces.added_inertia import present
 from ..forces.element import Forces, elements
 from ..linkage.frames import cross, frames, plane_vectors
 from ..linkage.linkage import Linkage, check_linkage, compiled
@@ -78,14 +79,15 @@ def _reactions(
     linkage: Linkage, forces: Forces, rows: tuple[Array, ...]
 ) -> Float[Array, "time joint 3"]:
     def at(t, q, qd, tau):
-        qdd = forward_dynamics(linkage, q, qd, tau, forces)
+        acting = present(forces, t)
+        qdd = forward_dynamics(linkage, q, qd, tau, acting)
         motion = lambda q, qd: mass_center_velocities(linkage, q, qd)
         _, (acceleration, spin_up) = jax.jvp(motion, (q, qd), (qd, qdd))
         needed = linkage.mass * (plane_vectors(acceleration) + 1j * linkage.gravity)
         center = plane_vectors(mass_centers(linkage, q))
         joint = plane_vectors(joint_positions(linkage, q))
         turning = linkage.inertia * spin_up + cross(center, needed)
-        force, moment = _loads(linkage, forces, t, q, qd, qdd)
+        force, moment = _loads(linkage, acting, t, q, qd, qdd)
         # Each joint carries all links beyond it.
         beyond = lambda rows: jnp.cumsum(rows[::-1])[::-1]
         carried, about_pivot = beyond(needed - force[1:]), beyond(turning - moment[1:])

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 from ..base.checks import place_of, shown
 from ..dynamics import mass_and_bias
 from ..forces.element import Element, Forces, naming
+from ..forces.payload import Payload
 from ..linkage.fields import Condition, called
 from ..linkage.linkage import Linkage, joints_of, without_fixed
 from ..linkage.topology import MOST_PAIRS, fixed_pairs
@@ -151,11 +152,13 @@ def formulation(forces: Forces) -> Formulation:
     """Returns that of velocities or, with a prescribed motion, of momenta."""
     if prescribed(forces) is None:
         return HOLDING if changes(forces) else FREE
-    if changes(forces):
+    # Momenta would have to jump where a mass is let go, too.
+    timed = any(isinstance(e, Payload) and e.jump_ts is not None for e in forces)
+    if changes(forces) or timed:
         raise ValueError(
             "forces: expected no element that holds joints (JointFriction without "
-            "speed, HardStops, Brake) or takes a Payload beside a PrescribedMotion, "
-            "got both."
+            "speed, HardStops, Brake), and no Payload with begin or end, beside a "
+            "PrescribedMotion, got both."
         )
     return HYBRID
 
