@@ -31,7 +31,7 @@ class Holder(ScalarElement):
 
     @property
     def holds(self) -> bool:
-        """Whether the law has joints that stand still exactly."""
+        """True if joints stand still exactly by its law."""
         return True
 
     def levels(self, joints: int) -> tuple[Array, Array]:

@@ -31,8 +31,9 @@ from ..steps.switching import (
 )
 from ..steps.tolerances import default_controller
 from ..steps.unchecked import diffeqsolve
+from .events import in_order
 from .field import args_of, in_arrays, initial_own, own_states, whole
-from .holding import Modes, changes, in_order, taken_at, within_stops
+from .holding import Modes, changes, taken_at, within_stops
 from .known_times import clocks_apart, known_times
 from .prescribed import agrees, formulation
 from .solution import Solution

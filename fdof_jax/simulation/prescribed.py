@@ -14,9 +14,10 @@ from jax import Array
 from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
-from ..base.checks import place_of, shown
+from ..base.checks import place_of
 from ..dynamics import mass_and_bias
 from ..forces.element import Element, Forces, naming
+from ..forces.holders import numbered
 from ..forces.payload import Payload
 from ..linkage.fields import Condition, called
 from ..linkage.linkage import Linkage, joints_of, without_fixed
@@ -24,6 +25,7 @@ from ..linkage.topology import MOST_PAIRS, fixed_pairs
 from ..mechanics.equations import equations, zeros
 from ..references.reference import EXPECTED, reference_motion
 from ..steps.dopri8 import Health, ScheduledTerm
+from .events import resolve
 from .field import (
     Args,
     applied,
@@ -36,7 +38,7 @@ from .field import (
     watched_field,
     whole,
 )
-from .holding import changes, guarded_switching, resolve, unknown_modes
+from .holding import changes, guarded_switching, unknown_modes
 
 _NUMBERS = tuple(range(1, MOST_PAIRS + 1))
 
@@ -68,18 +70,7 @@ class PrescribedMotion(Element):
     reference: Any = called(EXPECTED)
 
     def __init__(self, joints: ArrayLike | Sequence[int], reference: Any):
-        array = isinstance(joints, Array | np.ndarray)
-        given: Any = joints.tolist() if array else joints
-        numbers = given if isinstance(given, list | tuple) else (given,)
-        if not numbers or any(
-            isinstance(n, bool) or not isinstance(n, int) or n not in _NUMBERS
-            for n in numbers
-        ):
-            raise ValueError(
-                f"joints: expected a number of 1 to {_NUMBERS[-1]}, or several "
-                f"such, got {shown(joints)}."
-            )
-        self.moved = jax.device_put(np.isin(_NUMBERS, numbers))
+        self.moved = numbered(joints)
         self.reference = reference
 
     def arguments(self) -> dict[str, Any]:

@@ -65,7 +65,7 @@ class _Term(diffrax.ODETerm):
 
 
 class _LocatedRow(Located):
-    """Of the motion alone, as a function of the parameters."""
+    """Locates events of the motion alone, as a function of the parameters."""
 
     known_lateness: Callable[[Array, Array], Array]
 

@@ -107,7 +107,7 @@ class WithOutcome(eqx.Module):
 
 
 class Events(eqx.Module):
-    """What happened to joints that elements hold, and when: the last 64 events.
+    """The last 64 events of joints that elements hold: to which, when and what.
 
     - `t`: times [s]; `joint`: numbers of joints, from 1; `kind`: places of the words in
       `table`. Each has an entry per event, NaN beyond the last one.
@@ -186,7 +186,7 @@ class Solution(WithOutcome):
 
     @property
     def states(self) -> tuple[Any, ...]:
-        """What depends on the inputs smoothly, and has derivatives."""
+        """The results that have derivatives in the inputs."""
         return self.q, self.qd, self.own, self.taken, self.events
 
     def _facts(self) -> dict[str, str]:

@@ -1,0 +1,231 @@
+"""Events of joints that are held: what jumps there, which modes follow, the record."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from ..base.one_loop import in_one_loop
+from ..forces.holders import Brake, HardStops
+from ..forces.payload import Payload
+from ..mechanics.solve import minus
+from ..steps.dopri8 import constant
+from ..steps.switch_derivatives import Event
+from .field import Args, efforts, schedule_of, whole
+from .holding import (
+    BRAKE,
+    FREE,
+    FRICTION,
+    LOW,
+    LOWER,
+    MOST_EVENTS,
+    UPPER,
+    Laws,
+    Modes,
+    System,
+    at_rest,
+    laws,
+    system_at,
+)
+from .solution import HAPPENINGS, Events
+
+_STICKS, _SLIPS, _BOUNCES, _RESTS, _LEAVES, _BRAKED, _LET_GO = range(len(HAPPENINGS))
+
+
+def resolve(event: Event, y: Any, args: Args) -> tuple[Any, Modes]:
+    """Returns the state and the modes after an event, `args.modes` being those before.
+
+    In this order: brakes take hold, joints hit their stops, and what then is at rest
+    is held or begins to slide.
+    """
+    delta, rates_before, *own = y
+    q, qd = args.q0 + jnp.stack(delta), jnp.stack(rates_before)
+    before, law = args.modes, laws(args, event.t)
+    first = before.mode < 0
+    fired = jnp.zeros((4, q.size), bool)
+    fired = fired.at[: len(event.fired)].set(event.fired)
+    slides = ~before.held
+    # Rates that came to zero; what is at its stop.
+    qd = jnp.where(fired[0] & slides, 0, qd)
+    # Also those that are as near as a flight that is left out: otherwise joints whose
+    # blows throw each other at their stops would hit them in turn without end.
+    near = jnp.finfo(q.dtype).eps ** LOW
+    at_lower = fired[2] | (q <= law.lower + near)
+    at_upper = fired[3] | (q >= law.upper - near)
+    touched = jnp.where(at_lower, -1.0, jnp.where(at_upper, 1.0, 0.0))
+    stop = jnp.where(at_lower, law.lower, jnp.where(at_upper, law.upper, 0))
+    q = jnp.where(touched != 0, stop, q)
+
+    kinds = {kind for e in args.forces for kind in type(e).__mro__}
+    lost, hit, left_out = jnp.zeros_like(event.t), jnp.zeros(q.size, bool), 0.0
+    if kinds & {Brake, HardStops, Payload}:
+        system = system_at(event.t, q, jnp.zeros_like(q), args)
+        if Payload in kinds:
+            qd, lost = _taken(event, q, qd, first, args, law, system)
+        energy = lambda qd: qd @ system.momenta(qd) / 2
+        lost += energy(qd)
+        qd = system.caught(qd, law.braked)
+        if HardStops in kinds:
+            qd, hit = _after_blows(qd, touched, law, system)
+            net = _net_efforts(event.t, q, qd, own, args)
+            qd, left_out = _settled(qd, touched, law, *net)
+        lost -= energy(qd)
+    net = _net_efforts(event.t, q, qd, own, args)
+    modes = at_rest(qd, touched * (qd == 0), args.modes, law, *net, fired[:2])
+    slid = law.level * before.direction * (jnp.stack(delta) - before.origin)
+    lost += jnp.sum(jnp.where(first, 0, slid))
+    origin = q - args.q0
+    kind = _happenings(before, modes, hit & (modes.mode == FREE))
+    at = event.t + event.late + left_out
+    events = _recorded(before.events, at, jnp.where(first, -1, kind))
+    qd = jnp.where(modes.mode > FREE, 0, qd)
+    modes = modes._replace(origin=origin, taken=before.taken + lost, events=events)
+    state = tuple(origin), tuple(qd), *own
+    return state, modes
+
+
+def _taken(
+    event: Event, q: Array, qd: Array, first: Array, args: Args, law: Laws,
+    system: System,
+) -> tuple[Array, Array]:  # fmt: skip
+    """Returns the rates after payloads were taken, and the energy lost.
+
+    M+ qd+ = M- qd- + J^T W v, over the joints that no brake holds.
+    """
+    impulse, lost, taken = jnp.zeros_like(q), jnp.zeros_like(event.t), jnp.array(False)
+    for index, element in enumerate(args.forces):
+        if not (isinstance(element, Payload) and element.begin is not None):
+            continue
+        before, after = (
+            element.there(args.clock(index, t)) for t in (event.before, event.t)
+        )
+        new = after & ~before & ~first.any()
+        coordinates = lambda q, e=element: e.coordinates(q, args.linkage)
+        jacobian, weights = jax.jacfwd(coordinates)(q), element.weights(args.linkage)
+        own, carried = element.arriving, jacobian @ qd
+        impulse += jnp.where(new, weights * (own - carried) @ jacobian, 0)
+        lost += jnp.where(new, weights @ (own**2 - carried**2) / 2, 0)
+        taken = taken | new
+    # With the masses after it, M+ (qd+ - qd-) = J^T W (v - J qd-).
+    after = qd + jnp.where(taken, system.accelerations(impulse, law.braked), 0)
+    lost += (qd @ system.momenta(qd) - after @ system.momenta(after)) / 2
+    return after, jnp.where(taken, lost, 0)
+
+
+def _net_efforts(
+    t: Array, q: Array, qd: Array, own: Any, args: Args
+) -> tuple[System, Array]:
+    """Returns the system, and the efforts less the bias, with friction of sliding."""
+    t, q, qd, own, args = constant((t, q, qd, own, args))
+    args = args._replace(modes=args.modes._replace(direction=jnp.sign(qd)))
+    y = whole(tuple(q - args.q0), tuple(qd), own)
+    tau = efforts(t, y, args, schedule_of(t, args))
+    system = system_at(t, q, qd, args)
+    m, net = in_one_loop((system.equations, minus(tau, system.equations.bias)))
+    return system._replace(equations=m), jnp.stack(net)
+
+
+def _after_blows(
+    qd: Array, touched: Array, law: Laws, system: System
+) -> tuple[Array, Array]:
+    """Returns the rates after all blows, and which joints were hit.
+
+    Blow by blow, that of the fastest joint first; what is left after one for each joint
+    is taken at once, without restitution.
+    """
+    joints, moves = jnp.arange(qd.size), ~law.braked
+    outward = lambda qd: constant(jnp.where(moves, touched * qd, 0))
+
+    def blow(state, _):
+        qd, hit = state
+        k = jnp.argmax(outward(qd))
+        one = (joints == k) & (outward(qd) > 0)
+        e = law.restitution[k]
+        column = system.accelerations(one.astype(qd.dtype), law.braked)
+        column = column / jnp.where(one.any(), column[k], 1)
+        flying = jnp.where(one, -e * qd, qd - (1 + e) * column * qd[k])
+        return (jnp.where(one.any(), flying, qd), hit | one), None
+
+    def stop(state, _):
+        qd, caught = state
+        caught = caught | (outward(qd) > 0)
+        return (system.caught(qd, caught | law.braked), caught), None
+
+    none = jnp.zeros(qd.size, bool)
+    (qd, hit), _ = jax.lax.scan(blow, (qd, none), length=qd.size)
+    (qd, caught), _ = jax.lax.scan(stop, (qd, none), length=qd.size)
+    return qd, hit | caught
+
+
+def _settled(
+    qd: Array, touched: Array, law: Laws, system: System, net: Array
+) -> tuple[Array, Array]:
+    """Returns the rates with joints stopped that bounce too low, and times left out.
+
+    What rests already stays at rest. One joint that rests may hold another at its stop,
+    so this is repeated once for each joint. `net`: the efforts less the bias.
+    """
+    e, lowest = law.restitution, jnp.finfo(qd.dtype).eps ** LOW
+
+    def settle(state, _):
+        qd, left_out = state
+        rests = law.braked | ((touched != 0) & (constant(qd) == 0))
+        towards = touched * system.accelerations(net, rests)
+        pulled = (touched * qd < 0) & (towards > 0)
+        towards = jnp.where(pulled, towards, 1)
+        low = pulled & (constant(qd**2) <= 2 * towards * lowest)
+        left_out += jnp.where(low, 2 * jnp.abs(qd) / (towards * (1 - e)), 0)
+        qd = jnp.where(low.any(), system.caught(qd, rests | low), qd)
+        return (qd, left_out), None
+
+    settled, _ = jax.lax.scan(settle, (qd, jnp.zeros_like(qd)), length=qd.size)
+    return settled
+
+
+def _happenings(before: Modes, after: Modes, bounced: Array) -> Array:
+    """Returns what happens to each joint, -1 if nothing."""
+    was, now = before.mode, after.mode
+    at_stop = lambda mode: (mode == LOWER) | (mode == UPPER)
+    cases = {
+        _BOUNCES: bounced,
+        -1: was == now,
+        _STICKS: now == FRICTION,
+        _RESTS: at_stop(now),
+        _BRAKED: now == BRAKE,
+        _SLIPS: was == FRICTION,
+        _LEAVES: at_stop(was),
+        _LET_GO: was == BRAKE,
+    }
+    kinds = [jnp.full(was.shape, kind) for kind in cases]
+    return jnp.select([*cases.values()], kinds, -1)
+
+
+def _recorded(events: Events, t: Array, kind: Array) -> Events:
+    """Returns the events with those of all joints to which something happens."""
+    happens = kind >= 0
+    places = (events.count + jnp.cumsum(happens) - 1) % MOST_EVENTS
+    places = jnp.where(happens, places.astype(int), MOST_EVENTS)  # dropped
+    numbers = jnp.arange(1.0, kind.size + 1)
+    put = lambda rows, new: rows.at[places].set(
+        jnp.broadcast_to(new, kind.shape).astype(rows.dtype), mode="drop"
+    )
+    return Events(
+        put(events.t, t),
+        put(events.joint, numbers),
+        put(events.kind, kind),
+        events.count + jnp.sum(happens),
+    )
+
+
+def in_order(events: Events, valid: Array) -> Events:
+    """Returns the events in the order of time, NaN beyond the last of them.
+
+    Those of invalid inputs are none: they belong to values put in their place.
+    """
+    count = jnp.where(valid, events.count, 0)
+    first = jnp.where(count > MOST_EVENTS, count % MOST_EVENTS, 0).astype(int)
+    none = jnp.arange(MOST_EVENTS) >= count
+    ordered = lambda row: jnp.where(none, jnp.nan, jnp.roll(row, -first))
+    t, joint, kind = map(ordered, (events.t, events.joint, events.kind))
+    return Events(t, joint, kind, count)
