@@ -367,7 +367,7 @@ def damped_links(x):
     target = fj.references.SetPoint([0.3, -0.2])
     forces = (
         fj.PDController(with_first(kp, 20.0), with_first(kd, 3.0), np.inf, target),
-        fj.forces.JointFriction(with_first(level, 0.5), 0.01),
+        fj.forces.JointFriction(with_first(level, 0.5), speed=0.01),
         fj.forces.JointStops(
             [-1, -0.3], [0.1, 1], stiffness=1e3, damping=0.3, smoothing=1e-3
         ),
