@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from ..base.one_loop import in_one_loop
 from ..forces.holders import Brake, HardStops
 from ..forces.payload import Payload
 from ..mechanics.solve import minus
@@ -71,7 +70,7 @@ def resolve(event: Event, y: Any, args: Args) -> tuple[Any, Modes]:
             net = _net_efforts(event.t, q, qd, own, args)
             qd, left_out = _settled(qd, touched, law, *net)
         lost -= energy(qd)
-    net = _net_efforts(event.t, q, qd, own, args)
+    net = _net_efforts(*constant((event.t, q, qd, own, args)))
     modes = at_rest(qd, touched * (qd == 0), args.modes, law, *net, fired[:2])
     slid = law.level * before.direction * (jnp.stack(delta) - before.origin)
     lost += jnp.sum(jnp.where(first, 0, slid))
@@ -117,13 +116,11 @@ def _net_efforts(
     t: Array, q: Array, qd: Array, own: Any, args: Args
 ) -> tuple[System, Array]:
     """Returns the system, and the efforts less the bias, with friction of sliding."""
-    t, q, qd, own, args = constant((t, q, qd, own, args))
     args = args._replace(modes=args.modes._replace(direction=jnp.sign(qd)))
     y = whole(tuple(q - args.q0), tuple(qd), own)
     tau = efforts(t, y, args, schedule_of(t, args))
     system = system_at(t, q, qd, args)
-    m, net = in_one_loop((system.equations, minus(tau, system.equations.bias)))
-    return system._replace(equations=m), jnp.stack(net)
+    return system, jnp.stack(minus(tau, system.equations.bias))
 
 
 def _after_blows(

@@ -212,7 +212,9 @@ def at_rest(
     sum level abs(qdd) over the joints at rest. One joint after the other changes its
     mode, until all agree with their laws (Murty's principal pivoting).
     """
-    qd, touched, law = constant((qd, touched, law))
+    qd, touched, law, system, net = constant((qd, touched, law, system, net))
+    m, efforts = in_one_loop((system.equations, tuple(net)))
+    system, net = system._replace(equations=m), jnp.stack(efforts)
     inertia = jnp.stack([row[0] for row in system.equations.mass])
     rest = (qd == 0) & ((law.static > 0) | (touched != 0) | law.braked)
     held_as = jnp.where(touched < 0, LOWER, jnp.where(touched > 0, UPPER, FRICTION))
