@@ -1,5 +1,7 @@
 """Springs, stops, friction and histories of efforts: closed forms, derivatives."""
 
+import itertools
+
 import diffrax
 import equinox as eqx
 import jax
@@ -95,12 +97,16 @@ def test_deep_in_a_stop_the_spring_is_linear():
 def test_a_rebound_loses_what_the_law_says(mass, stiffness, damping, speed):
     """v dv / (1 + d v) = -k/m p dp: its integral is equal before and after a blow."""
     back, slope = rebound(speed, mass, stiffness, damping)
-    integral = lambda v: v / damping - np.log1p(damping * v) / damping**2
-    lost = lambda back: integral(-back) - integral(speed)
-    expected = brentq(lost, 1e-9, min(speed, (1 - 1e-12) / damping), xtol=1e-14)
+    expected = rebound_by_law(speed, damping)
     np.testing.assert_allclose(back, expected, rtol=1e-8)
     change = lambda v: v / (1 + damping * v)  # of the integral
     np.testing.assert_allclose(slope, change(speed) / -change(-expected), rtol=1e-5)
+
+
+def rebound_by_law(speed, damping):
+    integral = lambda v: v / damping - np.log1p(damping * v) / damping**2
+    lost = lambda back: integral(-back) - integral(speed)
+    return brentq(lost, 1e-9, min(speed, (1 - 1e-12) / damping), xtol=1e-14)
 
 
 @jax.jit
@@ -112,12 +118,35 @@ def rebound(speed, mass, stiffness, damping):
     return -fj.simulate(slide, start, [0, 1.0], (stops,)).qd[-1, 0]
 
 
+@pytest.mark.parametrize("share", [None, 0.03, 1.0, 100.0])
+def test_smoothing_takes_nothing_from_damping(share):
+    """It is so many times the depth of a blow without damping."""
+    values = [0.01, 100.0], [1e2, 1e7], [0.01, 2.0], [0.1, 10.0]
+    blows = np.array([*itertools.product(*values)])
+
+    def rebound(mass, stiffness, damping, speed):
+        depth = speed * jnp.sqrt(mass / stiffness)
+        smoothing = None if share is None else share * depth
+        stops = JointStops(
+            -np.inf, 1.0, stiffness=stiffness, damping=damping, smoothing=smoothing
+        )
+        near = 2 * (depth if share is None else depth + smoothing)
+        slide = eqx.tree_at(lambda arm: arm.mass, SLIDE, mass[None])
+        start = fj.State((1 - near)[None], speed[None])
+        end = 200 * near / speed * (1 + damping * speed)
+        motion = fj.simulate(slide, start, jnp.stack([0 * end, end]), (stops,))
+        return -motion.qd[-1, 0]
+
+    expected = [rebound_by_law(speed, damping) for _, _, damping, speed in blows]
+    found = jax.jit(jax.vmap(rebound))(*blows.T)
+    np.testing.assert_allclose(found, expected, rtol=1e-8)
+
+
 def test_damped_stops_push_by_their_law_and_never_pull():
     options = dict(stiffness=300.0, damping=0.3)
     ends = JointStops([-np.inf, -1.0], [1.0, np.inf], **options)
     rounded = ends.replace(smoothing=0.1)
-    # Where the penetration is rounded off, damping acts by its rate.
-    push = 300 * 0.12**2 / 0.4 * (1 + 0.3 * 0.12 / 0.2 * 3.0)
+    push = 300 * 0.12**2 / 0.4 * (1 + 0.3 * 3.0)
     for stops, depth, rate, expected in (
         (ends, 0.1, -50.0, 0),
         (ends, 0.02, 3.0, 300 * 0.02 * (1 + 0.3 * 3.0)),

@@ -189,19 +189,21 @@ class JointStops(ScalarElement):
 
 def _push(depth, rate, stiffness, damping, width):
     """Force of a stop at a depth, which is negative outside of the stop."""
-    penetration, slope = _penetration(depth, width)
-    damped = 1 + damping * slope * rate
-    return stiffness * penetration * switch(damped, damped, 0, continuous=True)
+    # By the rate of the joint, not of the penetration, which rounding makes slower. So
+    # v dv / (1 + damping v) = -stiffness / mass p dx: the loss does not depend on p.
+    damped = 1 + damping * rate
+    pushing = switch(damped, damped, 0, continuous=True)
+    return stiffness * _penetration(depth, width) * pushing
 
 
 def _penetration(depth, width):
-    """Penetration at a depth, and its derivative where it is not 0."""
+    """Returns the penetration at a depth."""
     if width is None:
         # Not called continuous: derivatives then correct even what the time of the
         # contact, as located, is off by, which matters at stiff stops.
-        return switch(depth, depth, 0), 1
+        return switch(depth, depth, 0)
     near, beyond = _parts(depth, width)
-    return near**2 / (4 * width) + beyond, near / (2 * width)
+    return near**2 / (4 * width) + beyond
 
 
 def _parts(depth, width):
