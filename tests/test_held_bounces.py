@@ -60,3 +60,38 @@ def test_joints_whose_blows_throw_each_other_at_their_stops():
     motion = fj.simulate(arm, start, [0, 1.0], (stops,))
     energy = [sum(fj.energy(arm, motion.q[k], motion.qd[k])) for k in (0, 1)]
     np.testing.assert_allclose(energy[0] - energy[1], motion.taken[1], atol=1e-8)
+
+
+def test_a_cascade_of_blows_is_no_chatter():
+    """Three joints throw each other at their stops a hundred times within 1e-3 s."""
+    arm = fj.Linkage(
+        "RRRRR", length=[0] + [0.4] * 5, com=[[0.2, 0.02]] * 5, mass=[1] * 5,
+        inertia=[0.02] * 5,
+    )  # fmt: skip
+    start = fj.State(
+        [0.4127555772777217, 0.10663577576717986, 0.2294965609839984,
+         0.04362499146542287, 0.4350724237877682],
+        [-0.1019495193972042, -1.9037264540263323, 2.829787525711607,
+         2.38619061070529, 2.7639893155816297],
+    )  # fmt: skip
+    stops = fj.forces.HardStops(
+        [-1.3650253838294104, -0.8621346523419489, -0.8407652751647515,
+         -0.6445447869409455, -0.8397591843599618],
+        [1.1158174343103087, 1.3086982603139599, 0.6632268532491,
+         0.8873668421341108, 0.9412615544639757],
+        restitution=[0.49971664577198616, 0.7169891762068814, 0.2931325634466204,
+                     0.2772967188843861, 0.20989561789761632],
+    )  # fmt: skip
+    motion = fj.simulate(arm, start, [0, 4.0], (stops,))
+    energy = [sum(fj.energy(arm, motion.q[k], motion.qd[k])) for k in (0, 1)]
+    np.testing.assert_allclose(energy[0] - energy[1], motion.taken[1], atol=1e-8)
+
+
+def test_a_mass_comes_to_rest_in_however_long_a_motion():
+    """The last bounces are brief beside the whole time; they are no chatter."""
+    mass = fj.Linkage("P", length=[0, 1], com=[[0, 0]], mass=[1], inertia=[1])
+    floor = fj.forces.HardStops(0.0, np.inf, restitution=0.97)
+    motion = fj.simulate(mass, fj.State([0.1], [0.0]), [0, 1000.0], (floor,))
+    ends = np.sqrt(0.2 / 9.81) * (1 + 2 * 0.97 / 0.03)
+    assert motion.q[-1, 0] == 0 and motion.modes[-1, 0] == 2
+    np.testing.assert_allclose(np.nanmax(motion.events.t), ends, rtol=1e-7)

@@ -9,8 +9,11 @@ from jax import Array
 
 from .dopri8 import constant
 
-# So many landings within this share of the motion's time are chatter.
-_MOST_LANDINGS, _CHATTER = 100, 1e-5
+# So many landings are chatter within a multiple of the distance that rounding keeps
+# them apart: this power of the unit of rounding (3e5 in float64). Chatter soon is as
+# fast as rounding lets it be; joints that bounce to rest, in however long a run, or
+# that throw each other at their stops, are slower.
+_MOST_LANDINGS, _CHATTER = 100, -0.35
 # After so many tries the switching function itself is taken to jump, and the jump is
 # located by halving the step.
 _MOST_TRIES = 6
@@ -122,7 +125,8 @@ class Landing(eqx.Module):
             end, gap, cut = t0, jnp.zeros_like(t0), jnp.array(True)
         target = jnp.where(cut, constant(end), jnp.inf)
         crossing, none = jnp.full_like(target, -jnp.inf), jnp.zeros((), int)
-        since, pace = constant((jnp.asarray(t0), _CHATTER * (t1 - t0)))
+        since = constant(jnp.asarray(t0))
+        pace = self.apart * jnp.finfo(target.dtype).eps ** _CHATTER
         return end, _Landing(
             target, gap, length, crossing, none, none, since, pace, last
         )
