@@ -67,6 +67,9 @@ def test_elements_show_their_numbers():
         f"PDController(kp=[9, 7, 5], kd=3, limit=[4, 2, inf], reference={task})"
     )
     assert "radius=0.75" in repr(task)
+    brake = fj.forces.Brake([2, 3], begin=0.5)
+    assert repr(brake) == "Brake(joints=[2, 3], begin=0.5, end=inf)"
+    assert "joints=bool[2,8]" in repr(jax.tree.map(lambda a: jnp.stack([a] * 2), brake))
     assert repr(fj.Point(2, 0.5)) == "Point(link=2, along=0.5, across=0)"
     seen = []
     jax.jit(lambda pd: seen.append(repr(pd)))(pd)

@@ -182,8 +182,8 @@ class Brake(Holder):
         self.begin, self.end = begin, end  # pyright: ignore[reportAttributeAccessIssue]
 
     def arguments(self) -> dict[str, Any]:
-        numbers = np.flatnonzero(self.joints) + 1
-        return {"joints": numbers, "begin": self.begin, "end": self.end}
+        ends = {"begin": self.begin, "end": self.end}
+        return {"joints": numbers_in(self.joints)} | ends
 
     def conditions(self):
         ends = self.begin, self.end
@@ -219,6 +219,11 @@ def numbered(joints: Any) -> Array:
             f"{shown(joints)}."
         )
     return jax.device_put(np.isin(_NUMBERS, numbers))
+
+
+def numbers_in(joints: Any) -> np.ndarray:
+    """Returns the numbers of the joints that are marked, as `numbered` marks them."""
+    return np.array([number for number, marked in zip(_NUMBERS, joints) if marked])
 
 
 def holders(forces: Forces) -> tuple[Holder, ...]:

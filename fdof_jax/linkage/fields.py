@@ -150,8 +150,12 @@ class Part(Frozen, metaclass=_Fields):
         return reduce(and_, [*own, *fields, *parts], True)
 
     def __repr__(self) -> str:
-        """Shows values on one line; long and traced arrays by their shape."""
-        fields = (f"{name}={_shown(value)}" for name, value in vars(self).items())
+        """Shows arguments on one line; long and traced arrays by their shape."""
+        try:
+            values = self.arguments()
+        except (TypeError, ValueError):  # traced, of a batch, or not told
+            values = vars(self)
+        fields = (f"{name}={_shown(value)}" for name, value in values.items())
         return f"{type(self).__name__}({', '.join(fields)})"
 
     def __check_init__(self):

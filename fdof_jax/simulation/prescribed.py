@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from ..base.checks import place_of
 from ..dynamics import mass_and_bias
 from ..forces.element import Element, Forces, naming
-from ..forces.holders import numbered
+from ..forces.holders import numbered, numbers_in
 from ..forces.payload import Payload
 from ..linkage.fields import Condition, called
 from ..linkage.linkage import Linkage, joints_of, without_fixed
@@ -74,8 +74,7 @@ class PrescribedMotion(Element):
         self.reference = reference
 
     def arguments(self) -> dict[str, Any]:
-        joints = [n for n, moved in zip(_NUMBERS, self.moved) if moved]
-        return {"joints": np.array(joints), "reference": self.reference}
+        return {"joints": numbers_in(self.moved), "reference": self.reference}
 
     def prescribes(self, linkage: Linkage) -> Array:
         """Returns whether each joint of an arm is prescribed; a fixed pair is not."""
