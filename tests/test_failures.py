@@ -96,7 +96,9 @@ def test_a_function_without_derivatives_may_run_out_of_steps():
 def test_branches_that_push_towards_each_other():
     pushed = lambda t, q, qd, linkage: -fj.forces.switch(qd, 10.0, -10.0)
     words = message([0, 1.0], (pushed,))
-    assert "too many switches" in words and "push towards each other" in words
+    assert "too many switches" in words
+    expected = r"forces\[0\] \(function\) chatters .* joint R1 push .*; JointFriction"
+    assert re.search(expected, words)
     assert "ClipStepSizeController" not in words
 
     @jax.jit
@@ -105,3 +107,34 @@ def test_branches_that_push_towards_each_other():
 
     with pytest.raises(Exception, match="too many switches. Elements switch"):
         traced(jnp.ones(1)).block_until_ready()
+
+
+class _Sign(fj.Element):
+    """Pushes joint 2 towards its rest, or towards a line of rest, by a sign."""
+
+    slope: float
+
+    def __call__(self, t, q, qd, linkage):
+        side = fj.forces.switch(qd[1] + self.slope * q[1], 20.0, -20.0)
+        return -jnp.array([0, 1]) * side
+
+
+@pytest.mark.parametrize(
+    "forces, words",
+    [
+        ((fj.JointDamper(0.1), _Sign(0.0)), "JointFriction lets it stick"),
+        # What it chatters about is no friction, or it would stick by what is there.
+        ((fj.JointDamper(0.1), _Sign(1.0)), "let the effort change continuously"),
+        (
+            (fj.forces.JointFriction([9.0, 0.0]), _Sign(0.0)),
+            "let the effort change continuously",
+        ),
+    ],
+)
+def test_what_chatters_is_named_with_its_joint(forces, words):
+    arm, start = fj.scenes.double_pendulum().linkage, fj.State([0.3, 0.1], [0.0, -0.3])
+    with pytest.raises(RuntimeError, match="too many switches") as raised:
+        fj.simulate(arm, start, [0, 2.0], forces)
+    found = str(raised.value)
+    assert "forces[1] (_Sign) chatters" in found and "at joint R2" in found
+    assert words in found

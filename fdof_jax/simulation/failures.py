@@ -11,6 +11,7 @@ import numpy as np
 from jax import Array
 
 from ..forces.element import Element, ForeignElement
+from ..forces.holders import JointFriction
 from ..linkage.linkage import Linkage, joint_names
 from ..steps.derivative_control import linearised
 from .field import (
@@ -18,10 +19,11 @@ from .field import (
     element_effort,
     initial_own,
     initial_states,
+    switching_functions,
     whole,
     with_states,
 )
-from .integrate import Inputs
+from .integrate import Inputs, last_switched
 from .prescribed import formulation
 from .solution import OUTCOMES, Solution
 from .solve import solve
@@ -43,15 +45,64 @@ def cause(inputs: Inputs, keywords: dict[str, Any], solution: Solution) -> str:
                 return f"The effort of forces[{k}] is not finite at the start."
     if outcome in ("out of steps", "tolerance out of reach"):
         return _of_steps(inputs, keywords, solution)
-    return _of_joints(linkage, solution) + OUTCOMES[outcome]
+    words = _of_joints(linkage, solution)
+    if outcome == "too many switches":
+        return words + _of_switches(inputs, keywords)
+    return words + OUTCOMES[outcome]
 
 
 def _of_joints(linkage: Linkage, solution: Solution) -> str:
-    """Names the last joint that was held or let go, if any was."""
+    """Tells what happened last to each joint, within 1e-6 s of the last event."""
     if solution.events is None or not (table := solution.events.table)["joint"].size:
         return ""
-    joint, event = table["joint"][-1], table["event"][-1]
-    return f"Last, joint {joint_names(linkage)[joint - 1]} {event}. "
+    names, times = joint_names(linkage), table["t [s]"]
+    recent = times >= times[-1] - 1e-6
+    last = dict(zip(table["joint"][recent], table["event"][recent]))
+    happened = (f"joint {names[joint - 1]} {event}" for joint, event in last.items())
+    return f"Last, {', '.join(happened)}. "
+
+
+def _of_switches(inputs: Inputs, keywords: dict[str, Any]) -> str:
+    """Names the element and the joint that switch without end, and what helps."""
+    linkage, (q, qd), ts, own0, forces = inputs
+    names, begin = joint_names(linkage), 0
+    switched = np.asarray(eqx.filter_jit(last_switched)(inputs, keywords))
+    own = own0 or initial_states(linkage, forces)
+    for k, element, state in with_states(forces, own):
+
+        def functions(q, qd, element=(k, element), state=state):
+            met = switching_functions(*element, ts[0], q, qd, linkage, state)
+            return np.concatenate([[], *map(np.ravel, met)])
+
+        here = functions(q, qd)
+        end = begin + here.size
+        one, begin = switched[begin:end], end
+        if not one.any():
+            continue
+        by_rate, by_position = (
+            {
+                name
+                for name, change in zip(names, 1e-3 * np.eye(len(names)))
+                if (functions(q + a * change, qd + b * change) != here)[one].any()
+            }
+            for a, b in ((0, 1), (1, 0))
+        )
+        joints = by_rate | by_position
+        place = f" at joint {min(joints)}" if len(joints) == 1 else ""
+        kind = type(getattr(element, "called", element)).__name__
+        rubs = len(by_rate) == 1 and not by_position
+        sticks = any(isinstance(e, JointFriction) and e.holds for e in forces)
+        helps = (
+            "JointFriction lets it stick"
+            if rubs and not sticks
+            else "let the effort change continuously, as by a clipped gain in place of "
+            "a sign"
+        )
+        return (
+            f"forces[{k}] ({kind}) chatters there: two branches of its effort{place} "
+            f"push towards each other; {helps}."
+        )
+    return "Joints are held and let go there without end."
 
 
 def _of_steps(inputs: Inputs, keywords, solution: Solution) -> str:

@@ -200,6 +200,20 @@ def _solve(problem: _Problem, control: _Control, keywords) -> diffrax.Solution:
         )
 
 
+def last_switched(inputs: Inputs, keywords: dict[str, Any]) -> Array:
+    """Returns which switching functions switched where a motion ended, (switch,).
+
+    In the order of the elements; guards of modes are the last ones.
+    """
+    keywords = keywords | {"adjoint": diffrax.ForwardMode()}
+    problem = _prepare(inputs, derivatives=False, padded=False)
+    control = _control(problem, keywords, derivatives=False, tangents=False)
+    ends = _solve(problem, control, keywords).ys
+    assert ends is not None  # because of saveat
+    switching = ends[1][1]
+    return (switching.after != switching.sides)[0]
+
+
 def _read(inputs: Inputs, problem: _Problem, solve: diffrax.Solution) -> Solution:
     """Reads joint states, statistics and the result."""
     linkage, state0, times, *_ = inputs
