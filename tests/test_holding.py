@@ -122,6 +122,18 @@ def test_second_derivatives_through_a_blow():
     np.testing.assert_allclose(twice(height), twice(closed_form), rtol=0, atol=1e-8)
 
 
+@pytest.mark.parametrize(
+    "stiffness, event", [(0.0, "rests on its stop"), (9.0, "is stopped")]
+)
+def test_a_blow_without_restitution_is_no_bounce(stiffness, event):
+    """A spring pulls the slide away from the stop at once, or nothing does."""
+    away = fj.forces.JointSpring(stiffness, rest=-1.0), fj.forces.JointEffort(0.1)
+    start = fj.State([0.0], [9.0])
+    motion = run(SLIDE, start, [0, 0.3], HardStops(-inf, 1.0), *away)
+    assert motion.events.table["event"].tolist() == [event]
+    assert motion.qd[-1, 0] <= 0
+
+
 def test_a_start_outside_of_stops_is_refused():
     stops = HardStops(-1.0, 1.0)
     with pytest.raises(ValueError, match="^state0.q: expected .* between the hard"):

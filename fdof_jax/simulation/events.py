@@ -29,7 +29,9 @@ from .holding import (
 )
 from .solution import HAPPENINGS, Events
 
-_STICKS, _SLIPS, _BOUNCES, _RESTS, _LEAVES, _BRAKED, _LET_GO = range(len(HAPPENINGS))
+_STICKS, _SLIPS, _BOUNCES, _RESTS, _LEAVES, _BRAKED, _LET_GO, _STOPPED = range(
+    len(HAPPENINGS)
+)
 
 
 def resolve(event: Event, y: Any, args: Args) -> tuple[Any, Modes]:
@@ -75,7 +77,7 @@ def resolve(event: Event, y: Any, args: Args) -> tuple[Any, Modes]:
     slid = law.level * before.direction * (jnp.stack(delta) - before.origin)
     lost += jnp.sum(jnp.where(first, 0, slid))
     origin = q - args.q0
-    kind = _happenings(before, modes, hit & (modes.mode == FREE))
+    kind = _happenings(before, modes, hit & (modes.mode == FREE), law)
     at = event.t + event.late + left_out
     events = _recorded(before.events, at, jnp.where(first, -1, kind))
     qd = jnp.where(modes.mode > FREE, 0, qd)
@@ -180,12 +182,16 @@ def _settled(
     return settled
 
 
-def _happenings(before: Modes, after: Modes, bounced: Array) -> Array:
-    """Returns what happens to each joint, -1 if nothing."""
+def _happenings(before: Modes, after: Modes, hit: Array, law: Laws) -> Array:
+    """Returns what happens to each joint, -1 if nothing.
+
+    `hit`: whether it hit a stop that does not hold it.
+    """
     was, now = before.mode, after.mode
     at_stop = lambda mode: (mode == LOWER) | (mode == UPPER)
     cases = {
-        _BOUNCES: bounced,
+        _BOUNCES: hit & (law.restitution > 0),
+        _STOPPED: hit,
         -1: was == now,
         _STICKS: now == FRICTION,
         _RESTS: at_stop(now),

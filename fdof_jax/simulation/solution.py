@@ -33,7 +33,7 @@ MODES = "free", "friction", "lower stop", "upper stop", "brake"
 # What happens to a joint, in the order of its number.
 HAPPENINGS = (
     "sticks", "slips", "bounces", "rests on its stop", "leaves its stop",
-    "is braked", "is let go",
+    "is braked", "is let go", "is stopped",
 )  # fmt: skip
 
 # Slower crossings are near to grazing, where no derivative exists.
