@@ -5,6 +5,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from .held_joints import held_joints_table
 from .joints import joints_table
 from .memory import memory_table
 from .scaling import slope
@@ -218,6 +219,7 @@ def tables(points: dict[str, list[dict]]) -> dict[str, str]:
         "checks": generality,
         "scaling": scaling,
         "joints": joints_table,
+        "held_joints": held_joints_table,
         "memory": memory_table,
         "tuning": tuning,
         "hard_cases": hard_cases,

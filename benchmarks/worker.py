@@ -37,6 +37,7 @@ JOBS = (
     Job("checks", "checks"),
     Job("gradients", "gradients"),
     Job("switches", "switches"),
+    Job("held_joints", "held_joints"),
     Job("compile_times", "compile_times"),
     Job("scaling", "scaling"),
     Job("joints", "joints"),

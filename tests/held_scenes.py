@@ -1,14 +1,27 @@
-"""Random scenes whose joints are held for a while, and their books of energy."""
+"""Random scenes whose joints are held for a while: laws and derivatives.
 
+`python tests/held_scenes.py` looks at 400 of them, and prints what is out of bounds;
+test_holding.py looks at the first ones. Scenes of as many joints share programs.
+"""
+
+import sys
+from functools import partial
 from typing import Any, NamedTuple
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
+from modes import ADJOINT, LOOPS
 
 import fdof_jax as fj
+from fdof_jax.forces import HardStops, JointFriction
+
+NEVER = 9.0  # after the end of all motions [s]
+TS = np.linspace(0, 2, 41)
+DEFAULT, TIGHT = 1e-11, 1e-13  # tolerances
 
 
 class Held(NamedTuple):
@@ -22,23 +35,20 @@ class Held(NamedTuple):
         return tuple(e.at(t) if isinstance(e, inertial) else e for e in self.forces)
 
     def numbers(self):
-        """Returns the numbers of start and elements that are not infinite, and back."""
-        varied = eqx.filter(
-            (self.state0, self.forces),
-            lambda x: eqx.is_inexact_array(x) and bool(np.isfinite(x).all()),
-        )
-        numbers, whole = ravel_pytree(varied)
+        """Returns the numbers of start and elements, and back to a scene."""
+        varied = self.state0, self.forces
+        numbers, whole = ravel_pytree(eqx.filter(varied, eqx.is_inexact_array))
 
         def of_numbers(x):
-            return Held(
-                self.linkage, *eqx.combine(whole(x), (self.state0, self.forces))
-            )
+            return Held(self.linkage, *eqx.combine(whole(x), varied))
 
         return numbers, of_numbers
 
 
 def random_scene(rng, most_joints, moving=False):
     """Returns a chain with a spring and one to four elements that hold its joints.
+
+    The others of the four are there too, but never act.
 
     `moving`: whether all joints move at the start, and so derivatives exist.
     """
@@ -65,21 +75,24 @@ def random_scene(rng, most_joints, moving=False):
     level = rng.uniform(0.05, 3, n)
     ends = np.where(rng.random((2, n)) < 0.5, rng.uniform(1, 1.05, (2, n)), np.inf)
     begin = rng.uniform(0.2, 1)
-    holding = [
-        fj.forces.JointFriction(level, static=level * rng.uniform(1.01, 1.5)),
-        fj.forces.HardStops(-ends[0], ends[1], restitution=rng.uniform(0, 0.8, n)),
-        fj.forces.Brake(int(rng.integers(1, n + 1)), begin, begin + 0.5),
-        fj.forces.Payload(
-            fj.Point(n, 0.2, 0.1), rng.uniform(0.2, 2), 0.1,
-            begin=rng.uniform(0.2, 1), velocity=[0.1, -0.2],
-        ),
-    ]  # fmt: skip
+    static = level * rng.uniform(1.01, 1.5)
+    restitution, braked = rng.uniform(0, 0.8, n), int(rng.integers(1, n + 1))
+    mass, taken = rng.uniform(0.2, 2), rng.uniform(0.2, 1)
     some = rng.random(4) < [0.8, 0.7, 0.4, 0.4]
     some[int(rng.integers(4))] = True
-    spring = fj.forces.JointSpring(rng.uniform(1, 30, n))
-    chosen = (element for element, there in zip(holding, some) if there)
-    state0 = fj.State(*map(jnp.asarray, start))
-    return Held(linkage, state0, (spring, *chosen))
+    rubs, stops, brakes, carries = some
+    begin, taken = begin if brakes else NEVER, taken if carries else NEVER
+    lower, upper = np.where(stops, ends, np.inf)
+    forces = (
+        fj.forces.JointSpring(rng.uniform(1, 30, n)),
+        JointFriction(rubs * level, static=rubs * static),
+        HardStops(-lower, upper, restitution=restitution),
+        fj.forces.Brake(braked, begin, begin + 0.5),
+        fj.forces.Payload(
+            fj.Point(n, 0.2, 0.1), mass, 0.1, begin=taken, velocity=[0.1, -0.2]
+        ),
+    )
+    return Held(linkage, fj.State(*map(jnp.asarray, start)), forces)
 
 
 def books(scene, motion):
@@ -97,6 +110,125 @@ def books(scene, motion):
     total = parts.sum(axis=1) + taken
     for element in scene.forces:
         if isinstance(element, fj.forces.Payload):
-            first = np.searchsorted(motion.ts, element.begin)
-            total[first:] -= total[first] - total[first - 1]
+            later = np.asarray(motion.ts) >= element.begin
+            first = np.argmax(later)
+            total[later] -= total[first] - total[first - 1]
     return total, max(np.abs(parts).max(), np.abs(taken).max(), 1e-3)
+
+
+def law_errors(scene):
+    """Returns the errors of a motion's laws, as parts of their bounds."""
+    motion = fj.simulate(scene.linkage, scene.state0, TS, scene.forces)
+    total, size = books(scene, motion)
+    off = np.abs(total - total[0]) / size
+    held, q = np.asarray(motion.modes) > 0, np.asarray(motion.q)
+    efforts = fj.joint_efforts(scene.linkage, scene.forces, motion)
+    qdd = _accelerations(scene, motion, efforts.total)
+    _, friction, stops, *_ = scene.forces
+    rubbing = np.abs(efforts.elements[1]) - np.where(
+        held, friction.static, friction.level
+    )
+    outside = np.maximum(stops.lower - q, q - stops.upper)
+    return {
+        "energy at the end": off[-1] / 1e-9,
+        # Between ends of steps, states are less exact.
+        "energy on the way": off.max() / 1e-8,
+        "rates of held joints": np.inf if (motion.qd * held != 0).any() else 0.0,
+        "accelerations of held joints": np.abs(qdd * held).max() / 1e-8,
+        "friction above its level": rubbing.max() / 1e-9,
+        "positions beyond stops": outside.max() / 1e-12,
+    }
+
+
+@eqx.filter_jit
+def _accelerations(scene, motion, efforts):
+    """Returns those by forward dynamics under the efforts of all elements."""
+
+    def qdd(t, q, qd, effort):
+        return fj.forward_dynamics(scene.linkage, q, qd, effort, scene.at(t))
+
+    return jax.vmap(qdd)(motion.ts, motion.q, motion.qd, efforts)
+
+
+compiled = partial(eqx.filter_jit, **LOOPS)
+
+
+def _end(x, scene, tolerance, adjoint):
+    """Returns the last state as a function of a scene's numbers, and statistics."""
+    varied = scene.numbers()[1](x)
+    motion = fj.simulate(
+        varied.linkage, varied.state0, np.array([0, 0.7, 1.3]), varied.forces,
+        rtol=tolerance, atol=tolerance, adjoint=adjoint, throw=False,
+    )  # fmt: skip
+    return jnp.concatenate([motion.q[-1], motion.qd[-1]]), motion.stats
+
+
+@compiled
+def _end_of(x, scene):
+    return _end(x, scene, TIGHT, diffrax.ForwardMode())[0]
+
+
+@compiled
+def _forward(x, scene, tolerance):
+    end = partial(_end, scene=scene, tolerance=tolerance, adjoint=diffrax.ForwardMode())
+    return jax.jacfwd(end, has_aux=True)(x)
+
+
+@compiled
+def _reverse(x, scene, tolerance, weights):
+    end = partial(_end, scene=scene, tolerance=tolerance, adjoint=ADJOINT)
+    return jax.grad(lambda x: weights @ end(x)[0])(x)
+
+
+def derivative_errors(scene, rng):
+    """Returns the errors of derivatives as parts of their bounds, and statistics.
+
+    They are compared with extrapolated differences of tight solves, in a direction at
+    random.
+    """
+    numbers, _ = scene.numbers()
+    # Infinite stops stay so, and friction of level 0, which may not become negative.
+    varied = np.isfinite(numbers) & (numbers != 0)
+    direction = np.where(varied, rng.standard_normal(numbers.size), 0)
+    weights = rng.standard_normal(2 * len(scene.linkage.mass))
+
+    def difference(h):
+        ends = (_end_of(numbers + h * x * direction, scene) for x in (1, -1))
+        return np.subtract(*map(np.asarray, ends)) / (2 * h)
+
+    # The better of two: rounding weighs more in the closer one, and some motions have
+    # an event more or less within the wider one.
+    extrapolated = [(4 * difference(h) - difference(2 * h)) / 3 for h in (1e-4, 1e-5)]
+    errors = {}
+    for tolerance, bound in ((DEFAULT, 1e-6), (TIGHT, 1e-8)):
+        found, stats = _forward(numbers, scene, tolerance)
+        found = np.where(varied, found, 0)
+        size = max(1, np.abs(found).max()) * np.sqrt(varied.sum())
+        off = [np.abs(found @ direction - right).max() for right in extrapolated]
+        errors[f"forward at {tolerance:g}"] = min(off) / size / bound
+        back = _reverse(numbers, scene, tolerance, weights)
+        off = np.abs(np.where(varied, back, 0) - weights @ found).max()
+        errors[f"reverse at {tolerance:g}"] = off / size / bound
+    return errors, stats
+
+
+def main():
+    """Looks at 400 scenes and prints errors above their bounds."""
+    fj.configure(x64=True)
+    broken = 0
+    for seed in range(400):
+        rng = np.random.default_rng(seed)
+        errors = law_errors(random_scene(rng, most_joints=5))
+        rng = np.random.default_rng(1000 + seed)
+        moving = random_scene(rng, most_joints=5, moving=True)
+        more, stats = derivative_errors(moving, rng)
+        wrong = {k: float(e) for k, e in (errors | more).items() if not e <= 1}
+        if wrong:
+            broken += 1
+            print(seed, wrong, "slowest crossing", float(stats["slowest_crossing"]))
+    print(f"{broken} of 400 scenes have errors above their bounds")
+    sys.exit(broken > 0)
+
+
+if __name__ == "__main__":
+    main()
