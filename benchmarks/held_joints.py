@@ -238,10 +238,11 @@ def held_joints_table(points: list[dict]) -> str:
             number(p["error"]),
             str(p["steps"]),
             number(p["times"] and 1e3 * p["time_median"] / p["simulated"]),
+            number(p["compile_time"]) if p["solver"] == "fdof_jax" else "-",
         ]
         for p in points
         if p["status"] != "skipped"
     ]
     head = ["", "", "", "settings", "drift [m or rad]", "error [m or rad]", "steps",
-            "ms a simulated s"]  # fmt: skip
+            "ms a simulated s", "compile [s]"]  # fmt: skip
     return table(head, rows)
