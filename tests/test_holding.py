@@ -8,7 +8,7 @@ import numpy as np
 import pandas
 import pytest
 from elements import START, arm
-from held_scenes import derivative_errors, law_errors, random_scene
+from held_scenes import derivative_errors, law_errors
 from modes import LOOPS
 
 import fdof_jax as fj
@@ -310,15 +310,13 @@ def test_what_cannot_go_together_is_refused():
 @pytest.mark.parametrize("seed", range(16))
 def test_laws_of_random_scenes(seed):
     """The books of energy close, held joints stand still, efforts stay in bounds."""
-    errors = law_errors(random_scene(np.random.default_rng(seed), most_joints=5))
+    errors = law_errors(seed)
     assert max(errors.values()) <= 1, errors
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", [37, 142, 243, 336, 350, 373])  # of two joints
 def test_derivatives_in_random_scenes(seed):
     """They equal extrapolated differences of tight solves, and those in reverse."""
-    rng = np.random.default_rng(100 + seed)
-    scene = random_scene(rng, most_joints=3, moving=True)
-    errors, _ = derivative_errors(scene, rng)
+    errors, _ = derivative_errors(seed)
     assert max(errors.values()) <= 1, errors
