@@ -130,7 +130,8 @@ def law_errors(seed):
     rubbing = np.abs(efforts.elements[1]) - np.where(
         held, friction.static, friction.level
     )
-    outside = np.maximum(stops.lower - q, q - stops.upper)
+    lower, upper = np.asarray(stops.lower), np.asarray(stops.upper)
+    outside = np.maximum(lower - q, q - upper)
     return {
         "energy at the end": off[-1] / 1e-9,
         # Between ends of steps, states are less exact.
