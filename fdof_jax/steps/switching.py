@@ -217,18 +217,16 @@ class Located(diffrax.AbstractAdaptiveSolver):
 
         where = terms.term, t0, t1, path, args
         values, checks = _values(*constant(where))
-        margins = sides[None] * values
         # Lengths of steps to a switch say nothing about the pace of the motion.
         share = jnp.finfo(t1.dtype).eps ** _NEAR
         near = jnp.maximum(share * (t1 - t0), switching.near / 2)
         near = jnp.maximum(near, self.apart)
-        sizes = jnp.maximum(earlier, jnp.max(jnp.abs(values), axis=0))
-        until, crossed, missed, unseen, switched, grazing, soon = passage(
-            margins,
-            sides[None] * checks,
+        until, crossed, missed, unseen, switched, grazing, soon, sizes = passage(
+            values,
+            checks,
+            sides,
             begun,
             earlier,
-            sizes,
             near / (t1 - t0),
             t1 - t0 <= jnp.maximum(SHORTEST[t1.dtype], _BRIEF * near),
         )
@@ -247,7 +245,7 @@ class Located(diffrax.AbstractAdaptiveSolver):
             near=near,
             sizes=sizes,
             length=t1 - t0,
-            ahead=jnp.any(switched & (margins[-1] > 0)).astype(t0.dtype),
+            ahead=jnp.any(switched & (sides * values[-1] > 0)).astype(t0.dtype),
             passed=switching.passed + jnp.sum(changed & ~on_zero),
             one_sided=self.one_sided(switching, on_zero, sides, sizes, changed),
             grazing=jnp.maximum(missed, grazed),

@@ -2,6 +2,8 @@
 
 import functools
 import operator
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -9,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from ..base.one_loop import in_one_loop
 from .dopri8 import NODES
 
 # Samples are taken at stages of the method of order 8, for which the integrators have
@@ -23,15 +26,16 @@ CHECKS = np.append(NODES[list(CHECKED)], 0.8)
 _ORDERS = np.arange(len(SHARES))
 _BASIS = np.polynomial.chebyshev.chebvander
 _TERMS = np.linalg.inv(_BASIS(2 * SHARES - 1, _ORDERS[-1]))
-_SLOPE = 2 * _ORDERS**2 @ _TERMS  # at the end, per step
 _BEND = 4 * _ORDERS**2 * (_ORDERS**2 - 1) / 3 @ _TERMS  # second derivative there
 _AT_CHECKS = _BASIS(2 * CHECKS - 1, _ORDERS[-1]) @ _TERMS
+_LENGTHS = np.diff(SHARES)
+_MIDDLES = SHARES[:-1] + _LENGTHS / 2
 _SLOPES = (
     2
     * np.polynomial.chebyshev.chebval(
         2 * SHARES - 1, np.polynomial.chebyshev.chebder(_TERMS)
     ).T
-)  # at the samples
+)  # at the samples, per step
 # Steps end where a switching function has passed its zero by this power of the unit of
 # rounding, times its size, and by this multiple of it. There the side to which the
 # motion goes is known even if it began at rest on the zero.
@@ -41,32 +45,73 @@ _SOON = 0.01  # of a step, for extrapolation
 # A function that turns back within this share of its size nearly touches its zero.
 _MISSED = 0.01
 # Of slopes and second derivatives, in units of rounding.
-_SLOPE_NOISE, _NOISE = (4 * np.abs(weights).sum() for weights in (_SLOPE, _BEND))
+_SLOPE_NOISE, _NOISE = (4 * np.abs(weights).sum() for weights in (_SLOPES[-1], _BEND))
 _ITERATIONS = 6  # of Newton's method within a bracket
 # Elsewhere the error of polynomials is less than so many times what is seen of it. A
 # distance that falls and rises within a step needs 10, wherever it turns.
 _ELSEWHERE = 12
 
 
-def _times(weights: np.ndarray, values: Array) -> Array:
-    """Returns a matrix product, in a batch 5 times as fast as by a sum over an axis.
+class _Margins(NamedTuple):
+    """Switching functions, positive on the side in force, in a step: (n,) each.
 
-    For small ones XLA would call a library.
+    `past` and `slopes` have one for each sample.
     """
-    factors = jnp.asarray(weights, values.dtype)[..., None]
-    rows = jnp.broadcast_to(values, (*factors.shape[:-1], values.shape[-1]))
-    terms = (factors[..., k, :] * rows[..., k, :] for k in range(len(values)))
+
+    past: Sequence[Array]  # from the places where steps end, beyond the zeros
+    slopes: Sequence[Array]  # per step
+    beyond: Array  # how far these places are from the zeros
+    largest: Array  # the largest value on either side
+    unsure: Array  # how far a margin may be from its polynomial between samples
+    bend: Array  # second derivative at the end
+
+
+def _sum(weights: np.ndarray, rows: Sequence[Array]) -> Array:
+    """Returns a weighted sum; over an axis of an array, XLA would call a library."""
+    terms = (float(w) * row for w, row in zip(weights, rows))
     return functools.reduce(operator.add, terms)
 
 
-def _turns(margins: Array, least: Array) -> tuple[Array, Array]:
+def _largest(rows: Sequence[Array]) -> Array:
+    return functools.reduce(jnp.maximum, map(jnp.abs, rows))
+
+
+def _margins(
+    values: Sequence[Array], checks: Sequence[Array], sides: Array, before: Array,
+    brief: Array,
+) -> _Margins:  # fmt: skip
+    """Returns margins by their polynomials through `values`, on these sides.
+
+    The error of polynomials shows in their last terms and at the further samples
+    `checks`. What may be rounding does not count, as shorter steps have it too.
+    """
+    eps, largest = jnp.finfo(before.dtype).eps, _largest(values)
+    rows, checks = ([sides * row for row in part] for part in (values, checks))
+    last = [_sum(row, rows) for row in _TERMS[-2:]]
+    wrong = [check - _sum(row, rows) for check, row in zip(checks, _AT_CHECKS)]
+    rounding = _ROUNDING * eps * (1 + jnp.maximum(before, largest))
+    unsure = _ELSEWHERE * jnp.maximum(_largest([*last, *wrong]) - rounding, 0)
+    beyond = eps**_BEYOND * largest + _ROUNDING * eps
+    return _Margins(
+        past=[row + beyond for row in rows],
+        slopes=[_sum(row, rows) for row in _SLOPES],
+        beyond=beyond,
+        largest=largest,
+        unsure=jnp.where(brief, 0, unsure),
+        bend=_sum(_BEND, rows),
+    )
+
+
+def _turns(margins: _Margins) -> tuple[Array, Array]:
     """Returns where margins turn back to rising between two samples, and their values.
 
     These are the shares of the step and the values of cubics, infinite if there is no
-    such place. `least`: smaller changes are rounding.
+    such place.
     """
-    lengths = jnp.asarray(np.diff(SHARES), margins.dtype)[:, None]
-    slopes, change = _times(_SLOPES, margins), margins[1:] - margins[:-1]
+    past, slopes = margins.past, margins.slopes
+    least = margins.beyond  # smaller changes are rounding
+    lengths = jnp.asarray(_LENGTHS, past.dtype)[:, None]
+    change = past[1:] - past[:-1]
     fall, rise = slopes[:-1] * lengths, slopes[1:] * lengths
     turning = (-fall > least[None]) & (rise > least[None])
     fall, rise = jnp.where(turning, fall, -1), jnp.where(turning, rise, 1)
@@ -74,141 +119,134 @@ def _turns(margins: Array, least: Array) -> tuple[Array, Array]:
     root = jnp.sqrt(mean**2 - fall * rise)
     part = (mean + root - fall) / (rise - fall + 2 * root)
     bend = part * (fall + rise - 2 * change) - mean - fall
-    values = margins[:-1] + part * (fall + part * bend)
-    shares = jnp.asarray(SHARES[:-1], margins.dtype)[:, None] + part * lengths
-    return shares, jnp.where(turning, values, jnp.inf)
-
-
-def _uncertainty(margins: Array, checks: Array, sizes: Array) -> Array:
-    """Returns how far the margins may be from polynomials between samples.
-
-    The error shows in the polynomials' last terms and at the further samples `checks`.
-    What may be rounding does not count, as shorter steps have it too.
-    """
-    last = jnp.abs(_times(_TERMS[-2:], margins))
-    wrong = jnp.abs(checks - _times(_AT_CHECKS, margins))
-    error = jnp.maximum(jnp.max(last, axis=0), jnp.max(wrong, axis=0))
-    rounding = _ROUNDING * jnp.finfo(margins.dtype).eps * (1 + sizes)
-    return _ELSEWHERE * jnp.maximum(error - rounding, 0)
-
-
-def _beyond(margins: Array) -> tuple[Array, Array]:
-    """Returns margins from the places where steps end beyond zeros, and how far."""
-    eps = jnp.finfo(margins.dtype).eps
-    beyond = eps**_BEYOND * jnp.max(jnp.abs(margins), axis=0) + _ROUNDING * eps
-    return margins + beyond[None], beyond
-
-
-def _hiding_place(margins: Array, unsure: Array, begun: Array, near: Array) -> Array:
-    """Returns a share of the step where a margin may pass 0 unseen, or else 1.
-
-    It is in the middle of two samples. `unsure`: see `_uncertainty`; `begun`: which
-    margins begin on their zeros, as after a switch.
-    """
-    # Margins on their zeros at the ends do not turn back within.
-    ending = jnp.abs(margins[-1]) <= -_times(_SLOPE, margins) * near
-    margins, beyond = _beyond(margins)
-    _, lowest = _turns(margins, beyond)  # as in `first_zero`; XLA computes them once
-    inner = margins.at[0].add(jnp.where(begun, jnp.inf, 0))
-    inner = inner.at[-1].add(jnp.where(ending, jnp.inf, 0))
-    lowest = jnp.minimum(lowest, jnp.minimum(inner[:-1], inner[1:]))
-    lowest = jnp.where(unsure[None] > 0, lowest - unsure[None], jnp.inf)
-    lowest = jnp.min(lowest, axis=1, initial=jnp.inf)
-    middles = jnp.asarray((SHARES[1:] + SHARES[:-1]) / 2, margins.dtype)
-    return jnp.where(jnp.min(lowest) < 0, middles[jnp.argmin(lowest)], 1)
+    values = past[:-1] + part * (fall + part * bend)
+    shares = jnp.asarray(SHARES[:-1], past.dtype)[:, None] + part * lengths
+    return in_one_loop((shares, jnp.where(turning, values, jnp.inf)))
 
 
 @eqx.filter_jit
 def passage(
-    margins: Array,
-    checks: Array,
-    begun: Array,
-    before: Array,
-    sizes: Array,
-    near: Array,
-    brief: Array,
-) -> tuple[Array, ...]:
-    """Returns the results of `first_zero`, `_hiding_place` and `at_end`.
+    values: Array, checks: Array, sides: Array, begun: Array, before: Array,
+    near: Array, brief: Array,
+) -> tuple[Array, ...]:  # fmt: skip
+    """Returns where switching functions pass 0 in a step, and which do at its end.
 
-    If all margins stay far from 0, these are (1, False, 0), 1 and (False, 0, 0), and
-    none is evaluated.
+    Margins are their values (sample, n) on the sides in force (n,): positive as long as
+    nothing switches.
 
-    `checks`: the margins at further places of the step; `begun`: which began on their
-    zeros; `before`, `sizes`: the largest sizes in steps before, and with this one;
-    `brief`: whether the step is so short that nothing is looked for in between.
+    - The share of the step where a margin first passes 0, 1 if none does; whether any
+      does; and how near to grazing a margin turned back, 0 if not near.
+    - A share of the step where a margin may pass 0 unseen, in the middle of two
+      samples, or else 1.
+    - Which margins (n,) are near their zeros at the step's end, how they graze, and the
+      share of the step after which another follows soon, or 0.
+    - The largest sizes of the values (n,), also in steps before.
+
+    `checks`: the values at further places of the step; `begun`: which began on their
+    zeros, as after a switch; `before`: the largest sizes in steps before; `near`: a
+    share of the step; `brief`: whether the step is so short that nothing is looked for
+    in between.
     """
-    unsure = jnp.where(brief, 0, _uncertainty(margins, checks, sizes))
-    # Each slope pulls a cubic by at most 4/27 of its length beyond its ends.
-    slopes = jnp.abs(_times(_SLOPES, margins))
-    lengths = jnp.asarray(np.diff(SHARES), margins.dtype)[:, None]
-    pulled = 4 / 27 * jnp.max(lengths * (slopes[:-1] + slopes[1:]), axis=0)
-    least = jnp.maximum(pulled + _MISSED * sizes, _SOON * slopes[-1])
-    far = jnp.all(margins > (least + unsure)[None]) & (near < _SOON)
-    zero = jnp.zeros((), margins.dtype)
-    no = jnp.zeros(margins.shape[1:], bool)
-    return jax.lax.cond(
-        far,
-        lambda: (zero + 1, no.any(), zero, zero + 1, no, zero, zero),
-        lambda: (
-            *first_zero(margins, before, unsure),
-            _hiding_place(margins, unsure, begun, near),
-            *at_end(margins, sizes, near),
-        ),
+    zero, no = jnp.zeros((), values.dtype), jnp.zeros((), bool)
+    if not before.size:
+        return zero + 1, no, zero, zero + 1, before > 0, zero, zero, before
+    brief = jnp.broadcast_to(brief, before.shape)
+    margins = in_one_loop(_margins(tuple(values), tuple(checks), sides, before, brief))
+    margins = margins._replace(
+        past=jnp.stack(margins.past), slopes=jnp.stack(margins.slopes)
+    )
+    turns, lowest = _turns(margins)
+    sizes = jnp.maximum(before, margins.largest)
+    return (
+        *_first_zero(margins, turns, lowest, before),
+        _hiding_place(margins, lowest, begun, near),
+        *_at_end(margins, sides * values[-1], sizes, near),
+        sizes,
     )
 
 
-def first_zero(
-    margins: Array, sizes: Array, unsure: Array
+def _first_zero(
+    margins: _Margins, turns: Array, lowest: Array, before: Array
 ) -> tuple[Array, Array, Array]:
-    """Returns the share of a step where a margin first passes 0, and whether any does.
+    """Returns the first three results of `passage`.
 
-    Also returns how near to grazing a margin turned back, 0 if not near (see `at_end`).
-    `sizes`: the largest size of each margin in steps before; `unsure`: a margin that
-    falls by less between two samples is left to `_hiding_place`.
+    A margin that falls by less than it may be wrong is left to `_hiding_place`.
     """
-    if not margins.size:
-        none = jnp.zeros((), margins.dtype)
-        return none + 1, jnp.array(False), none
-    margins, beyond = _beyond(margins)
+    past, unsure = margins.past, margins.unsure[None]
     # What is on the wrong side from the start on, as after a jump, changes at once,
     # however little is known of the rest of the step.
-    size = jnp.max(jnp.abs(margins), axis=0)
-    far = -margins[0] > jnp.finfo(size.dtype).eps ** _WRONG * size
-    wrong = jnp.any(far & (margins[1] < 0))
-    turns, lowest = _turns(margins, beyond)
-    shares = jnp.asarray(SHARES, margins.dtype)
-    ends = jnp.where(lowest < 0, turns, shares[1:, None])
-    after = jnp.where(lowest < 0, lowest, margins[1:])
-    after = jnp.where(margins[:-1] - after < unsure[None], jnp.inf, after)
-    passed = (after < 0).any(axis=1)
-    index = jnp.argmax(passed)
-    before, after, low = jnp.abs(margins[index]), after[index], shares[index]
-    chord = jnp.where(after < 0, before / (before - after), jnp.inf)
-    guesses = low + chord * (ends[index] - low)
-    first = jnp.argmin(guesses)
-    guess, high = guesses[first], ends[index, first]
-    terms = lambda: _times(_TERMS, margins[:, first, None])[:, 0]
+    least = jnp.finfo(past.dtype).eps ** _WRONG * margins.largest
+    wrong = jnp.any((-past[0] > least) & (past[1] < 0))
+    shares = jnp.asarray(SHARES, past.dtype)[:, None]
+    ends = jnp.where(lowest < 0, turns, shares[1:])
+    after = jnp.where(lowest < 0, lowest, past[1:])
+    passed = (after < 0) & ~(past[:-1] - after < unsure)
+    start = jnp.abs(past[:-1])
+    chord = start / (start - jnp.where(passed, after, -1))
+    guesses = jnp.where(passed, shares[:-1] + chord * (ends - shares[:-1]), jnp.inf)
+    interval = jnp.argmin(jnp.min(guesses, axis=1))
+    number = jnp.argmin(guesses[interval])
+    guess = guesses[interval, number]
+    passes = guess < jnp.inf
     zero = jax.lax.cond(
-        passed.any(),
-        lambda: _zero(terms(), guess, low, high),
-        lambda: jnp.ones_like(low),
+        passes,
+        lambda: _zero(
+            past[:, number], guess, shares[interval, 0], ends[interval, number]
+        ),
+        lambda: jnp.ones_like(guess),
     )
     # A margin that turns back just before its zero counts as if it had gone as far
     # beyond: this is the speed of that crossing.
-    near = jnp.max(jnp.maximum(sizes[None], margins[:-1]) / lowest)
+    near = jnp.max(jnp.maximum(before[None], past[:-1]) / lowest)
     near = jnp.where(near * _MISSED > 1, jnp.sqrt(jnp.maximum(near, 0)), 0)
-    return jnp.where(wrong, 0, zero), passed.any() | wrong, near
+    return jnp.where(wrong, 0, zero), passes | wrong, near
 
 
-def _zero(terms: Array, guess: Array, low: Array, high: Array) -> Array:
-    """Returns the zero of a sum of Chebyshev's polynomials in a bracket, by Newton."""
+def _hiding_place(margins: _Margins, lowest: Array, begun: Array, near: Array) -> Array:
+    """Returns a share of the step where a margin may pass 0 unseen, or else 1."""
+    past, unsure = margins.past, margins.unsure[None]
+    # Margins on their zeros at the ends do not turn back within.
+    ending = jnp.abs(past[-1] - margins.beyond) <= -margins.slopes[-1] * near
+    inner = past.at[0].add(jnp.where(begun, jnp.inf, 0))
+    inner = inner.at[-1].add(jnp.where(ending, jnp.inf, 0))
+    lowest = jnp.minimum(lowest, jnp.minimum(inner[:-1], inner[1:]))
+    lowest = jnp.where(unsure > 0, lowest - unsure, jnp.inf)
+    lowest = jnp.min(lowest, axis=1)
+    middles = jnp.asarray(_MIDDLES, past.dtype)
+    return jnp.where(jnp.min(lowest) < 0, middles[jnp.argmin(lowest)], 1)
+
+
+def _at_end(
+    margins: _Margins, last: Array, sizes: Array, near: Array
+) -> tuple[Array, Array, Array]:
+    """Returns results of `passage` at the step's end; `last`: the margins there."""
+    eps, nearer = jnp.finfo(sizes.dtype).eps, -margins.slopes[-1]
+    # Where the slope is rounding, as in a step of almost no length, the side counts.
+    moves = jnp.abs(nearer) > _SLOPE_NOISE * eps * sizes
+    speed = jnp.where(moves, nearer, 1)
+    left = last / speed
+    switched = jnp.where(moves, (nearer > 0) & (left <= near), last < 0)
+    # A small slope for the step, or a zero after which the margin would soon turn back.
+    # The latter shows in short steps too, where the size is that of the slope.
+    bend = margins.bend - _NOISE * eps * sizes
+    turning = jnp.sqrt(2 * sizes * jnp.maximum(bend, 0))
+    grazing = jnp.maximum(margins.largest, turning) / speed
+    follows = moves & (nearer > 0) & (left > near) & (left < _SOON)
+    soon = jnp.where(follows, left, jnp.inf).min()
+    soon = jnp.where(soon < jnp.inf, soon, 0)
+    return switched, jnp.where(switched & moves, grazing, 0).max(), soon
+
+
+def _zero(past: Array, guess: Array, low: Array, high: Array) -> Array:
+    """Returns the zero of a margin's polynomial in a bracket, by Newton."""
+    terms = [_sum(row, tuple(past)) for row in _TERMS]
 
     def nearer(_, state):
         share, low, high = state
         x = 2 * share - 1
         # Clenshaw's recurrence, and its derivative in x
         b, c, db, dc = (jnp.zeros_like(x),) * 4
-        for term in reversed([terms[order] for order in range(1, len(_ORDERS))]):
+        for term in reversed(terms[1:]):
             b, c, db, dc = 2 * x * b - c + term, b, 2 * (b + x * db) - dc, db
         value, slope = x * b - c + terms[0], 2 * (b + x * db - dc)
         low, high = jnp.where(value > 0, share, low), jnp.where(value > 0, high, share)
@@ -217,27 +255,3 @@ def _zero(terms: Array, guess: Array, low: Array, high: Array) -> Array:
         return jnp.where(inside, new, (low + high) / 2), low, high
 
     return jax.lax.fori_loop(0, _ITERATIONS, nearer, (guess, low, high))[0]
-
-
-def at_end(margins: Array, sizes: Array, near: Array) -> tuple[Array, Array, Array]:
-    """Returns which margins are near their zeros at the step's end, and how they graze.
-
-    Also returns the share of the step after which something else follows soon, or 0.
-    `sizes`: the largest size of each margin, also in steps before. `near`: a share of
-    the step.
-    """
-    nearer = -_times(_SLOPE, margins)
-    # Where the slope is rounding, as in a step of almost no length, the side counts.
-    moves = jnp.abs(nearer) > _SLOPE_NOISE * jnp.finfo(sizes.dtype).eps * sizes
-    speed = jnp.where(moves, nearer, 1)
-    left = margins[-1] / speed
-    switched = jnp.where(moves, (nearer > 0) & (left <= near), margins[-1] < 0)
-    # A small slope for the step, or a zero after which the margin would soon turn back.
-    # The latter shows in short steps too, where the size is that of the slope.
-    bend = _times(_BEND, margins) - _NOISE * jnp.finfo(sizes.dtype).eps * sizes
-    turning = jnp.sqrt(2 * sizes * jnp.maximum(bend, 0))
-    grazing = jnp.maximum(jnp.max(jnp.abs(margins), axis=0), turning) / speed
-    follows = moves & (nearer > 0) & (left > near) & (left < _SOON)
-    soon = jnp.where(follows, left, jnp.inf).min(initial=jnp.inf)
-    soon = jnp.where(soon < jnp.inf, soon, 0)
-    return switched, jnp.where(switched & moves, grazing, 0).max(initial=0), soon
