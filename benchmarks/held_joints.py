@@ -1,4 +1,4 @@
-"""Joints that are held: fdof_jax against MuJoCo's frictionloss and joint limits.
+"""Joints that are held: against MuJoCo's frictionloss and joint limits, and in sweeps.
 
 MuJoCo's constraints are soft. At each step it is tried with several settings, and the
 one of the least error is timed. All have impedances of 0.9999, the most there is, and
@@ -213,7 +213,46 @@ def mujoco_cases(scene: Scene, steps: tuple[float, ...]) -> Iterator[Case]:
         yield min(tried, key=lambda case: worst(case.judge(case.run())))
 
 
+def chain_cases(members: int, level: float) -> list[Case]:
+    """Returns sweeps of chains that come to rest, by friction and by viscous damping.
+
+    Five joints hang from random poses; level and damping are the same numbers.
+    """
+    arm = fj.Linkage(
+        "RRRRR", length=[0, *[1] * 5], com=[[0.5, 0]] * 5, mass=[1] * 5,
+        inertia=[1 / 12] * 5, base_angle=-np.pi / 2,
+    )  # fmt: skip
+    poses = np.random.default_rng(1).uniform(-1, 1, (members, 5))
+    starts, numbers = fj.State(poses, np.zeros_like(poses)), level * np.arange(5, 0, -1)
+
+    def case(name, element):
+        def judge(motions):
+            at_rest = (np.asarray(motions.qd[:, -1]) == 0).all(axis=1)
+            steps = np.asarray(motions.stats["num_steps"])
+            return {
+                "error": None, "steps": int(steps.mean()), "most_steps": steps.max(),
+                "at_rest": at_rest.mean(),
+            }  # fmt: skip
+
+        def run():
+            return fj.sweep(arm, starts, np.linspace(0, 30, 4), (element,))
+
+        return Case(name, level, run, judge, "level")
+
+    return [
+        case("viscous damping", fj.JointDamper(numbers)),
+        case("friction", fj.forces.JointFriction(numbers)),
+    ]
+
+
 def run(quick: bool) -> Iterator[dict]:
+    for level in 1.0, 2.0:
+        members = 64 if quick else 1000
+        yield from measure(
+            PROTOCOL, chain_cases(members, level), budget=1 if quick else 60,
+            ratio_to="viscous damping", equal_error=False, batch=members,
+            problem="five joints to rest, by sweep", simulated=30.0,
+        )  # fmt: skip
     for scene in SCENES:
         cases = [own_case(scene, tolerance) for tolerance in TOLERANCES]
         try:
@@ -227,7 +266,19 @@ def run(quick: bool) -> Iterator[dict]:
 
 
 def held_joints_table(points: list[dict]) -> str:
-    """Returns a table with a row for each scene, engine and setting."""
+    """Returns a table with a row for each scene, engine and setting, and of sweeps."""
+    sweeps = [
+        [
+            p["solver"],
+            f"{p['setting']:g}",
+            f"{100 * p['at_rest']:.0f} %",
+            f"{p['steps']}, {p['most_steps']}",
+            number(p["time_median"]),
+            number(p["ratio"]),
+        ]
+        for p in points
+        if p["kind"] == "level" and p["status"] == "ok"
+    ]
     rows = [
         [
             p["problem"],
@@ -241,8 +292,10 @@ def held_joints_table(points: list[dict]) -> str:
             number(p["compile_time"]) if p["solver"] == "fdof_jax" else "-",
         ]
         for p in points
-        if p["status"] != "skipped"
+        if p["status"] != "skipped" and p["kind"] != "level"
     ]
     head = ["", "", "", "settings", "drift [m or rad]", "error [m or rad]", "steps",
             "ms a simulated s", "compile [s]"]  # fmt: skip
-    return table(head, rows)
+    of_sweeps = ["five joints, 1000 members, 30 s", "times 5, 4, 3, 2, 1 N m (s)",
+                 "at rest", "steps: mean, most", "s", "ratio"]  # fmt: skip
+    return f"{table(head, rows)}\n\n{table(of_sweeps, sweeps)}"

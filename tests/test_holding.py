@@ -315,7 +315,7 @@ def test_laws_of_random_scenes(seed):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [37, 142, 243, 336, 350, 373])  # of two joints
+@pytest.mark.parametrize("seed", [37, 112, 142, 243, 336, 350])  # of two joints
 def test_derivatives_in_random_scenes(seed):
     """They equal extrapolated differences of tight solves, and those in reverse."""
     errors, _ = derivative_errors(seed)
