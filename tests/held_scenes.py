@@ -203,10 +203,10 @@ def derivative_errors(seed):
         ends = (_end_of(numbers + h * x * direction, scene) for x in (1, -1))
         return np.subtract(*map(np.asarray, ends)) / (2 * h)
 
-    # The best of three: rounding weighs more in closer ones, and some motions have an
+    # The best of several: rounding weighs more in closer ones, and some motions have an
     # event more or less within wider ones.
     extrapolated = [
-        (4 * difference(h) - difference(2 * h)) / 3 for h in (1e-4, 1e-5, 3e-6)
+        (4 * difference(h) - difference(2 * h)) / 3 for h in (1e-4, 3e-5, 1e-5, 3e-6)
     ]
     errors = {}
     for tolerance, bound in ((DEFAULT, 1e-6), (TIGHT, 1e-8)):
