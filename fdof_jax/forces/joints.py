@@ -132,14 +132,13 @@ class EffortHistory(ScalarElement):
 class JointStops(ScalarElement):
     """Stops at the ends of the joints' ranges: stiff springs that push one way.
 
-    At a penetration p the force is stiffness * p * (1 + damping * dp/dt), and never
-    less than 0. Steps end where the contact begins and ends. `HardStops` are rigid, and
+    At a penetration p the force is stiffness * p * (1 + damping * rate), and never less
+    than 0; the rate is that of the joint, outwards. Steps end where the contact begins and ends. `HardStops` are rigid, and
     cost no short steps: take these soft ones where the give of a stop matters.
 
     With `smoothing`, p is rounded off to a parabola within so much of the end of the
-    range, on both sides; at the end itself p is a quarter of `smoothing`. Where the
-    whole penetration is no deeper, p and so dp/dt are other than the joint's, and a
-    blow loses less energy.
+    range, on both sides; at the end itself p is a quarter of `smoothing`. The damping
+    acts by the joint's own rate, so that a blow loses as much as without `smoothing`.
 
     **Arguments:** all in joint order, one per joint or one for all.
 

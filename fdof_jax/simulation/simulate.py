@@ -264,9 +264,13 @@ def _raising(solution: Solution, inputs: Inputs) -> Solution:
     fitting = f"{accepted} and that fit the arm"
     messages = [
         "simulate: ts: expected finite, increasing times.",
-        "simulate: state0: expected finite numbers, and those of a prescribed motion.",
+        "simulate: state0: expected finite numbers, between the hard stops, and those "
+        "of a prescribed motion.",
         f"simulate: linkage: {accepted}.",
-        *(f"simulate: forces[{k}]: {fitting}." for k in range(len(inputs.forces))),
+        *(
+            f"simulate: forces[{k}] ({type(element).__name__}): {fitting}."
+            for k, element in enumerate(inputs.forces)
+        ),
     ]
     faults = _faults(inputs)
     failed = solution.result != diffrax.RESULTS.successful
