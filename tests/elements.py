@@ -109,7 +109,7 @@ WITH_INERTIA = {
         HOOK, ELBOW, force=5.0, mass=[1.2, 0.7], com=[0.2, 0.3], inertia=[0.05, 0.03]
     ),
 }
-WITH_INERTIA["payload"] = fj.forces.Payload(TIP, 0.4, 0.05, velocity=[0.1, 0.2])
+WITH_INERTIA["payload"] = fj.forces.Payload(TIP, 0.4, 0.05)
 # Those that hold joints for a while, or take a mass: not for fixed steps
 HOLDING = {
     "sticking friction": fj.forces.JointFriction(

@@ -268,6 +268,10 @@ def test_what_holds_nothing_has_no_modes():
     "make, words",
     [
         (lambda: JointFriction(2.0, static=1.0), "static: expected at least the level"),
+        (
+            lambda: JointFriction([1, 2, 3], static=[1, 2]),
+            r"level, static: expected arrays of one length, got shapes \(3,\), \(2,\)",
+        ),
         (lambda: JointFriction(1, static=2, speed=1), "static: expected none beside"),
         (lambda: HardStops(1.0, -1.0), "lower: expected less than upper"),
         (lambda: HardStops(-1, 1, restitution=1), "restitution: expected less than 1"),
@@ -276,11 +280,23 @@ def test_what_holds_nothing_has_no_modes():
         (lambda: Payload(fj.Point(1), -1), "mass: expected .* at least 0"),
         (lambda: Payload(fj.Point(1), 1, begin=2, end=1), "begin: expected less than"),
         (lambda: Payload(fj.Point(1), 1, velocity=[1]), "velocity: expected two or"),
+        (lambda: Payload(fj.Point(1), 1, velocity=[1, 0]), "velocity: expected zeros"),
+        (lambda: Payload(fj.Point(0), 1), "place: expected a point of a moving link"),
+        (lambda: jax.jit(Brake)(1), "joints: expected known numbers"),
     ],
 )
 def test_malformed_elements_are_refused(make, words):
     with pytest.raises(ValueError, match=f"^{words}"):
         make()
+
+
+def test_blows_at_the_start_are_events():
+    arm = fj.scenes.double_pendulum().linkage
+    motion = run(arm, fj.State([0.3, 0.0], [2.0, 1.0]), [0, 0.1], Brake(1, begin=-1))
+    assert motion.events.table["event"].tolist() == ["is braked"]
+    assert motion.qd[0, 0] == 0 and motion.taken[0] > 0
+    still = run(arm, fj.State([0.3, 0.0], [0.0, 1.0]), [0, 0.1], Brake(1, begin=-1))
+    assert still.events.count == 0
 
 
 def test_what_cannot_go_together_is_refused():

@@ -48,8 +48,8 @@ def joint_reactions(
     """Force and moment of each joint's bearing on the next link, along a motion.
 
     They follow from the balances of Newton and Euler, link by link from the tip. In a
-    joint's free direction, the reaction is the effort of dampers, controllers, drives
-    and armatures. Loads on points act on the links themselves.
+    joint's free direction, the reaction is the effort of dampers, controllers, drives,
+    armatures and what holds the joint. Loads on points act on the links themselves.
 
     **Arguments:** `linkage`, `forces` and `solution` of one `simulate`; of a
     `SampledMotion`, the forces are `(control, *forces)`. A `Scene` may stand for

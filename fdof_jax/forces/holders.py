@@ -14,7 +14,7 @@ from jax import Array
 from jaxtyping import Bool
 from numpy.typing import ArrayLike
 
-from ..base.checks import shown
+from ..base.checks import is_traced, shown
 from ..linkage.fields import Condition, Values, each, field
 from ..linkage.linkage import Linkage, joints_of
 from ..linkage.topology import MOST_PAIRS
@@ -150,7 +150,8 @@ class Brake(Holder):
     """A brake that holds joints between two known times, whatever that takes.
 
     Where it takes hold, a blow stops its joints and changes the rates of the others.
-    One that acts at the start of a motion, or before, holds from the start on.
+    One that acts at the start of a motion, or before, takes hold there: the first
+    rates of the motion are those after its blow.
 
     **Arguments:**
 
@@ -207,6 +208,8 @@ def numbered(joints: Any) -> Array:
 
     Raises ValueError for what are no numbers of joints.
     """
+    if is_traced(joints):
+        raise ValueError("joints: expected known numbers, got traced ones.")
     array = isinstance(joints, Array | np.ndarray)
     given = joints.tolist() if array else joints
     numbers = given if isinstance(given, list | tuple) else (given,)

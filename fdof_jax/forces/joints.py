@@ -133,8 +133,9 @@ class JointStops(ScalarElement):
     """Stops at the ends of the joints' ranges: stiff springs that push one way.
 
     At a penetration p the force is stiffness * p * (1 + damping * rate), and never less
-    than 0; the rate is that of the joint, outwards. Steps end where the contact begins and ends. `HardStops` are rigid, and
-    cost no short steps: take these soft ones where the give of a stop matters.
+    than 0; the rate is that of the joint, outwards. Steps end where the contact begins
+    and ends. `HardStops` are rigid, and cost no short steps: take these soft ones where
+    the give of a stop matters.
 
     With `smoothing`, p is rounded off to a parabola within so much of the end of the
     range, on both sides; at the end itself p is a quarter of `smoothing`. The damping

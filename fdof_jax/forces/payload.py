@@ -56,6 +56,10 @@ class Payload(InertialElement):
     def conditions(self):
         count = len(self.velocity)
         yield Condition(count in (2, 3), "velocity", "two or three numbers", count)
+        moves = self.place.link > 0
+        yield Condition(moves, "place", "a point of a moving link", self.place)
+        used = (self.velocity == 0).all() | (self.begin is not None)
+        yield Condition(used, "velocity", "zeros without begin", self.velocity)
         if self.begin is not None and self.end is not None:
             times = self.begin, self.end
             yield Condition(self.begin < self.end, "begin", "less than end", times)

@@ -167,7 +167,17 @@ class Part(Frozen, metaclass=_Fields):
                 instance(name, vars(self)[name], about["kind"])
         for name, value, rules in _declared(self):
             object.__setattr__(self, name, real_array(name, value, **rules))
-        _refuse("", in_numpy(self).conditions())
+        try:
+            _refuse("", in_numpy(self).conditions())
+        except ValueError as error:
+            if "broadcast" not in str(error):
+                raise
+            sizes = {name: np.shape(value) for name, value, _ in _declared(self)}
+            several = {name: shape for name, shape in sizes.items() if shape != ()}
+            raise ValueError(
+                f"{', '.join(several)}: expected arrays of one length, got shapes "
+                f"{', '.join(map(str, several.values()))}."
+            ) from error
 
 
 def _shown(value: Any) -> str:

@@ -78,9 +78,11 @@ def resolve(event: Event, y: Any, args: Args) -> tuple[Any, Modes]:
     lost += jnp.sum(jnp.where(first, 0, slid))
     origin = q - args.q0
     kind = _happenings(before, modes, hit & (modes.mode == FREE), law)
-    at = event.t + event.late + left_out
-    events = _recorded(before.events, at, jnp.where(first, -1, kind))
     qd = jnp.where(modes.mode > FREE, 0, qd)
+    # Modes in which a motion begins are no events, but blows at the start are.
+    kind = jnp.where(first & (qd == jnp.stack(rates_before)), -1, kind)
+    at = event.t + event.late + left_out
+    events = _recorded(before.events, at, kind)
     modes = modes._replace(origin=origin, taken=before.taken + lost, events=events)
     state = tuple(origin), tuple(qd), *own
     return state, modes

@@ -111,7 +111,7 @@ def _of_steps(inputs: Inputs, keywords, solution: Solution) -> str:
     steps = int(solution.stats["num_steps"])
     covered = float(solution.stats["time_reached"] - ts[0])
     if covered == 0:
-        return "Not one of them met the tolerance."
+        return "No step met the tolerance."
     mean = covered / max(int(solution.stats["num_accepted_steps"]), 1)
     # A little earlier, as rounding may shift the last step.
     share = 1 - 1e3 * float(jnp.finfo(ts.dtype).eps)

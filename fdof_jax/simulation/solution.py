@@ -163,7 +163,8 @@ class Solution(WithOutcome):
     - `modes`: what holds each joint at `ts`, as numbers: 0 nothing, 1 friction, 2 its
       lower stop, 3 its upper stop, 4 a brake. At the very time of an event it may be
       the mode before it or after it.
-    - `taken`: energy that friction, blows and brakes have taken up to `ts` [J].
+    - `taken`: energy that friction, blows, brakes and the catching of payloads have
+      taken up to `ts` [J].
     - `events`: what happened to which joint, and when; its times have derivatives.
 
     >>> import fdof_jax as fj
