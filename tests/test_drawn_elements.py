@@ -128,8 +128,26 @@ def test_the_path_of_a_controller_is_drawn_once_around():
     np.testing.assert_allclose(np.ptp(third, axis=0), [1, 0.4], rtol=1e-3)
 
 
+def test_a_payload_is_drawn_while_it_is_taken():
+    later, now = (fj.forces.Payload(TIP, 0.4, begin=t) for t in (0.5, 0.0))
+    parts = drawn(later, now, fj.forces.Payload(TIP, 0.4))
+    assert "payload 0" not in parts
+    for k in (1, 2):
+        xy = parts[f"payload {k}"].get_xydata()
+        close((xy.min(axis=0) + xy.max(axis=0)) / 2, place(TIP))
+    animation = drawing.animate(ARM, swinging(), forces=(later,), max_frames=3)
+    (ax,) = plt.gcf().axes
+    there = []
+    for frame in range(3):
+        animation._func(frame)  # type: ignore[attr-defined]
+        there.append(np.isfinite(lines(ax)["payload 0"].get_xydata()).all())
+    assert there == [False, True, True]
+    animation._draw_was_started = True  # type: ignore[attr-defined]
+
+
 def test_what_has_no_place_is_not_drawn_and_points_elsewhere_are_refused():
-    assert "damper 0" not in drawn(fj.JointDamper(1.0), lambda *_: 0)
+    hidden = fj.JointDamper(1.0), lambda *_: 0, fj.forces.Brake(1)
+    assert drawn(*hidden, fj.forces.JointFriction(1.0)).keys() == drawn().keys()
     with pytest.raises(ValueError, match="link: expected 0"):
         drawn(fj.Wrench(fj.Point(5), [1, 0]))
 

@@ -74,10 +74,12 @@ def draw_linkage(
     centre is a dot, joined to its link if it lies beside it.
 
     Of the force elements, those with a place are drawn: springs, dampers, cables (which
-    hang if slack), bumpers, cylinders, wrenches as arrows, stops as bars at the ends
-    of a joint's range, and of a controller the path on which it leads the tip, dashed.
-    The longest arrow is that of the greatest force. Thin lines join points beside their
-    link to it, and hatched ground holds points of the ground.
+    hang if slack), bumpers, cylinders, wrenches as arrows, payloads as boxes while they
+    are taken, stops (also `HardStops`) as bars at the ends of a joint's range, and of a
+    controller the path on which it leads the tip, dashed. `Brake` and `JointFriction`
+    have no symbol, nor have dampers and springs of joints. The longest arrow is that of
+    the greatest force. Thin lines join points beside their link to it, and hatched
+    ground holds points of the ground.
 
     **Arguments:** `q`: joint positions [m or rad]; `forces`: elements, drawn as they
     are at time 0; `color`: common colour of all links, by default one per link;

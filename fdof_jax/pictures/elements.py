@@ -69,7 +69,11 @@ def element_lines(
             kind, points = "wrench", [element.point]
             strokes = _arrows(_place(element.point, f), *pushes[k], most, size)
         elif isinstance(element, Payload):
-            kind, strokes = "payload", [_place(element.place, f) + _BOX * size]
+            there = np.broadcast_to(element.there(ts), ts.shape)
+            box = _place(element.place, f) + _BOX * size
+            # What is not taken at any of the times is not drawn.
+            kind, strokes = "payload", [np.where(there[:, None], box, np.nan)]
+            strokes = strokes if there.any() else []
         elif isinstance(element, JointStops | HardStops):
             kind, strokes = "stops", _stops(element, linkage, f, size)
         elif (path := _commanded(given[k])) is not None:
