@@ -8,8 +8,18 @@ import pytest
 from matplotlib.axes import Axes
 from test_drawing import LINKAGE, labels, made_up, make_linkage, swinging, tidy as tidy
 
-from fdof_jax import JointDamper, JointEffort, Solution, plotting, simulate
-from fdof_jax.forces import JointStops
+from fdof_jax import (
+    JointDamper,
+    JointEffort,
+    Linkage,
+    Point,
+    Solution,
+    State,
+    plotting,
+    scenes,
+    simulate,
+)  # fmt: skip
+from fdof_jax.forces import Brake, HardStops, JointFriction, JointStops, Payload
 
 
 def values(ax: Axes) -> list[np.ndarray]:
@@ -121,3 +131,72 @@ def test_energy_stack_balances_with_elements_of_each_kind():
     ax = plotting.energy_stack(arm, forces, solution)
     top, (line,) = tops(ax, solution.ts)["taken out"], values(ax)
     np.testing.assert_allclose(top, line, rtol=1e-5)
+
+
+BALL = Linkage("P", length=[0, 1], com=[[0, 0]], mass=[1], inertia=[1])
+BAR = Linkage("R", length=[0, 1], com=[[0.5, 0]], mass=[1], inertia=[1 / 12])
+ARM = scenes.double_pendulum().linkage
+BOUNCE = HardStops(0.0, np.inf, restitution=0.5)
+TIP = Point(1, along=1)
+TS = np.linspace(0, 2, 401)
+OF_ALL_KINDS = (
+    JointFriction([1.0, 0.5], static=[1.5, 0.8]),
+    HardStops([-2, -1], [2, 1], restitution=0.3),
+    Brake(2, begin=0.9, end=1.2),
+    Payload(Point(2, 0.8), mass=0.5, begin=0.5, end=1.5),
+    JointDamper(0.5),
+)
+
+
+@pytest.mark.parametrize(
+    ("linkage", "start", "forces"),
+    [
+        (BALL, State([1.0], [0.0]), (BOUNCE,)),
+        (BALL, State([1.0], [0.0]), (BOUNCE, JointDamper(1.0))),
+        (BAR, State([0.3], [1.0]), (JointFriction(0.5, static=0.7),)),
+        (BAR, State([0.3], [1.0]), (Brake(1, 0.2, 0.6),)),
+        (BAR, State([0.3], [1.0]), (Brake(1, end=0.6),)),  # a blow at the start
+        (ARM, State([0.3, 0.0], [0, 0]), OF_ALL_KINDS),
+    ],
+    ids=["stop", "stop and damper", "friction", "brake", "braked first", "all"],
+)
+def test_energy_stack_balances_where_joints_are_held(linkage, start, forces):
+    solution = simulate(linkage, start, TS, forces)
+    ax = plotting.energy_stack(linkage, forces, solution)  # a warning would be an error
+    stack, (line,) = tops(ax, TS), values(ax)
+    np.testing.assert_allclose(stack["taken out"], line, rtol=1e-4)
+    taken = np.asarray(solution.taken) - solution.taken[0]
+    out = stack["taken out"] - stack["potential"]
+    if len(forces) == 1:
+        np.testing.assert_allclose(out, taken, atol=1e-9)
+    assert np.all(out >= taken - 1e-9)
+
+
+def test_energy_stack_has_what_payloads_bring_and_take_away():
+    """Also where a sample comes within rounding before one is taken."""
+    times = dict(begin=0.5, end=1.2037)
+    load = Payload(TIP, 1.5, 0.1, velocity=[0.3, 0.2], **times)
+    ts = np.sort(np.append(TS, np.nextafter(0.5, 0)))
+    solution = simulate(BAR, State([0.3], [1.0]), ts, (load,))
+    ax = plotting.energy_stack(BAR, (load,), solution)
+    stack, (line,) = tops(ax, ts), values(ax)
+    np.testing.assert_allclose(stack["taken out"], line, rtol=1e-8)
+    out = stack["taken out"] - stack["potential"]
+    height = lambda q: 1.5 * 9.81 * np.sin(q)
+    brings = 1.5 * (0.3**2 + 0.2**2) / 2 + height(np.interp(0.5, ts, solution.q[:, 0]))
+    last = simulate(BAR, State([0.3], [1.0]), [0, times["end"]], (load,))
+    q, qd = last.q[-1, 0], last.qd[-1, 0]
+    leaves = (1.5 + 0.1) * qd**2 / 2 + height(q)
+    # Below the pivot, what is taken has a negative energy, and also what is let go.
+    assert brings < 0 and leaves < 0
+    np.testing.assert_allclose(out[-1], solution.taken[-1] - brings, rtol=1e-7)
+    np.testing.assert_allclose(line[-1] - line[0], -leaves, rtol=1e-7)
+    # One that is there from the start on, and one that the arm does not let go.
+    for times in (dict(end=1.2), dict(begin=0.5)):
+        forces = (Payload(TIP, 1.5, **times),)
+        solution = simulate(BAR, State([0.3], [1.0]), TS, forces)
+        ax = plotting.energy_stack(BAR, forces, solution)
+        np.testing.assert_allclose(tops(ax, TS)["taken out"], values(ax)[0], rtol=1e-8)
+    forgotten = (load.replace(mass=0.5),)
+    with pytest.warns(UserWarning, match="off by .* expected the forces of the"):
+        plotting.energy_stack(BAR, forgotten, solution)

@@ -45,6 +45,19 @@ def test_motion_profile_shows_absolute_angles_in_degrees_and_slides():
     assert len(only.axes) == 1
 
 
+def test_motion_profile_names_what_is_held_once():
+    solution = swinging()
+    modes = np.zeros(solution.q.shape)
+    modes[5:9, [0, 2]] = 1
+    held = dataclasses.replace(solution, modes=jnp.asarray(modes))
+    angles, slides = plotting.motion_profile(make_linkage("RPR"), held).axes
+    assert labels(angles) == [r"$\theta_1$", r"$\theta_3$", "held"]
+    assert labels(slides) == ["$B_2$"]
+    line, _, thick, *_ = values(angles)
+    np.testing.assert_array_equal(np.flatnonzero(np.isfinite(thick)), range(5, 9))
+    np.testing.assert_array_equal(thick[5:9], line[5:9])
+
+
 def hold(t, linkage):
     return jnp.zeros(3), jnp.zeros(3)
 

@@ -28,6 +28,8 @@ from ..control.drives import PIDController
 from ..control.pd import PDController
 from ..dynamics import energy, link_energies
 from ..forces.element import Forces, InertialElement, elements
+from ..forces.holders import Holder
+from ..forces.payload import Payload
 from ..linkage.linkage import Linkage, joint_names, moving_joints
 from ..references.reference import reference_of
 from ..references.task import TipReference
@@ -69,7 +71,8 @@ def motion_profile(
 
     One panel shows the angles of links on revolute joints from the x axis, not from the
     link before as in `q` [degrees], another the slides of prismatic joints [m]; theta_k
-    and B_k are those of joint k. A thick line marks where something holds a joint.
+    and B_k are those of joint k. A thick line, "held" in the legend, marks where
+    something holds a joint.
     """
     ts, q, _ = reached(linkage, solution)
     g = geometry(linkage, q)
@@ -83,8 +86,6 @@ def motion_profile(
     panels = [("absolute angle [degrees]", angles), ("slide [m]", slides)]
     panels = [panel for panel in panels if panel[1]]
     fig, axes = time_panels(fig, 0.6 + 1.9 * len(panels), ts, panels)
-    for ax in axes:
-        legend(ax)
     if isinstance(solution, Solution) and solution.modes is not None:
         held = np.asarray(solution.modes)[: len(ts)] > 0
         numbered = list(enumerate(g.kinds))
@@ -93,6 +94,10 @@ def motion_profile(
             for line, k in zip(ax.lines, of):
                 values = np.where(held[:, k], line.get_ydata(), np.nan)
                 ax.plot(ts, values, color=line.get_color(), lw=4, alpha=0.5)
+            if held[:, of].any():
+                ax.plot([], [], color=GREY, lw=4, alpha=0.5, label="held")
+    for ax in axes:
+        legend(ax)
     return fig
 
 
@@ -121,11 +126,14 @@ def energy_profile(
 def _powers(linkage: Linkage, forces: Forces, solution: Motion) -> np.ndarray:
     """Power of each element on the arm (element, time) [W].
 
-    Exchange with an element's own potential energy (of a spring) does not count.
+    Exchange with an element's own potential energy (of a spring) does not count, nor
+    does what holders take, which the solution has exactly.
     """
     efforts = joint_efforts(linkage, forces, solution).elements
     powers = jnp.einsum("etj,tj->et", efforts, solution.qd)
     for k, element in enumerate(forces):
+        if isinstance(element, Holder) and element.holds:
+            powers = powers.at[k].set(0)
         # The efforts of an inertial element exclude those of its potential energy.
         if isinstance(element, InertialElement) or element.potential_energy is None:
             continue
@@ -142,7 +150,8 @@ def _works(
     powers = _powers(linkage, forces, solution)[:, : len(ts)]
     signs = (1, -1)
     if not isinstance(solution, SampledMotion):
-        return [_integral(np.maximum(sign * powers, 0), ts) for sign in signs]
+        jumps = _jumps(forces, solution)
+        return [_integral(np.maximum(sign * powers, 0), ts, jumps) for sign in signs]
     # The power of held efforts jumps, but their work is known: in each period that of
     # what acts at its sample, until the next command begins to act, and that of this.
     q, acting = (np.asarray(rows)[: len(ts)] for rows in (solution.q, forces[0].tau))
@@ -158,8 +167,45 @@ def _works(
     ]
 
 
-def _integral(powers: np.ndarray, ts: np.ndarray) -> np.ndarray:
-    return scipy.integrate.cumulative_simpson(powers.sum(axis=0), x=ts, initial=0)
+def _rounding(ts: np.ndarray) -> float:
+    """Time before a jump in which states may already be those after it [s]."""
+    return 8 * np.spacing(np.abs(ts).max())
+
+
+def _jumps(forces: Forces, solution: Motion) -> np.ndarray:
+    """Times at which rates or accelerations, and with them powers, may jump [s]."""
+    payloads = (e for e in forces if isinstance(e, Payload))
+    times = [e.jump_ts for e in payloads if e.jump_ts is not None]
+    if isinstance(solution, Solution) and solution.events is not None:
+        times.append(solution.events.t)
+    return np.concatenate([*times, []])
+
+
+def _integral(powers: np.ndarray, ts: np.ndarray, jumps: ArrayLike = ()) -> np.ndarray:
+    """Integrals up to each time (time,): Simpson's rule from jump to jump."""
+    power, jumps = powers.sum(axis=0), np.sort(jumps) - _rounding(ts)
+    jumps = jumps[(ts[0] < jumps) & (jumps <= ts[-1])]
+    after = np.searchsorted(ts, jumps)  # the first samples after them
+    steps = np.zeros(len(ts) - 1)
+    for piece in np.split(np.arange(len(ts)), np.unique(after)):
+        whole = scipy.integrate.cumulative_simpson(power[piece], x=ts[piece], initial=0)
+        steps[piece[:-1]] = np.diff(whole)
+    for t, k in zip(jumps, after):
+        steps[k - 1] = power[k - 1] * (t - ts[k - 1]) + power[k] * (ts[k] - t)
+    return np.append(0, steps.cumsum())
+
+
+def _brought(forces: Forces, ts: np.ndarray, balance: np.ndarray) -> np.ndarray:
+    """Energies that payloads bring, or take away, since the sample before (time,) [J].
+
+    They are what the balance jumps by where a payload is taken or let go.
+    """
+    changed = np.zeros(len(ts) - 1, bool)
+    for element in forces:
+        if isinstance(element, Payload):
+            there = np.broadcast_to(element.there(ts), ts.shape)
+            changed |= np.diff(there)
+    return np.append(0, np.where(changed, np.diff(balance), 0))
 
 
 def energy_stack(
@@ -174,7 +220,10 @@ def energy_stack(
     the motion and of the integrals of power over its samples (Simpson's rule).
 
     A force element puts energy in while its power is positive, and takes it out while
-    its power is negative. A motor may do both.
+    its power is negative. A motor may do both. What friction, blows, brakes and catches
+    take is that of `solution.taken` since the start. A `Payload` puts in its energies
+    where it is taken, and takes them out where it is let go; heights count from the
+    ground pivot, so that one below it has a negative potential energy.
 
     **Arguments:** `forces`: those of the solution.
 
@@ -185,9 +234,21 @@ def energy_stack(
     ts, q, qd = reached(linkage, solution)
     forces = acting_in(solution, elements("forces", forces))
     put_in, taken_out = _works(linkage, forces, solution, ts)
-    energies = jax.vmap(lambda q, qd: energy(linkage, q, qd, forces))(q, qd)
-    kinetic, potential = map(np.asarray, energies)
+    if isinstance(solution, Solution) and solution.taken is not None:
+        taken = np.asarray(solution.taken)[: len(ts)]
+        taken_out = taken_out + taken - taken[0]
+
+    def energies(t, q, qd):
+        there = [e.at(t) if isinstance(e, InertialElement) else e for e in forces]
+        return energy(linkage, q, qd, tuple(there))
+
+    clock = ts + _rounding(ts)
+    kinetic, potential = map(np.asarray, jax.vmap(energies)(clock, q, qd))
     potential = potential - potential.min()
+    balance = kinetic + potential + taken_out - put_in
+    brought = _brought(forces, clock, balance)
+    put_in = put_in + np.maximum(brought, 0).cumsum()
+    taken_out = taken_out + np.maximum(-brought, 0).cumsum()
     bands = {"kinetic": kinetic, "potential": potential}
     if forces:
         bands["taken out"] = taken_out
