@@ -126,7 +126,11 @@ ACCEPTED = "linkage: expected values that its constructor"
         ("q0", [np.inf, 0, 0], FINITE),
         ("mass", [1, -1, 1], ACCEPTED),
         ("mass", [1, np.nan, 1], ACCEPTED),
-        ("coefficient", [-1, 1, 1], r"forces\[0\]: expected values that its"),
+        (
+            "coefficient",
+            [-1, 1, 1],
+            r"forces\[0\] \(JointDamper\): expected values that its",
+        ),
         ("ts", [0, 1, 2, 50], "max_steps"),
     ],
 )

@@ -89,7 +89,8 @@ def _of_switches(inputs: Inputs, keywords: dict[str, Any]) -> str:
         )
         joints = by_rate | by_position
         place = f" at joint {min(joints)}" if len(joints) == 1 else ""
-        kind = type(getattr(element, "called", element)).__name__
+        foreign = isinstance(element, ForeignElement)
+        kind = type(element.called if foreign else element).__name__
         rubs = len(by_rate) == 1 and not by_position
         sticks = any(isinstance(e, JointFriction) and e.holds for e in forces)
         helps = (

@@ -21,7 +21,7 @@ from .switching import Switching, motion_of
 
 # The relative tolerance of tangents: over that of the motion, its upper limit, and its
 # lower limit in rounding errors.
-_LOOSER, _LOOSEST, _NOISE = 3e3, 1e-5, 64.0
+_LOOSER, _LOOSEST, _NOISE = 2e3, 1e-5, 64.0
 # That of a probe, whatever the motion's: undamped tangents are right to 3e-7 after 1000
 # rad, and those of stops and slides at rest to 1e-6.
 _OF_PROBE = 3e-9
