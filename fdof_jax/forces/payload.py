@@ -5,6 +5,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from ..linkage.fields import Condition, Values, field, of_kind
@@ -70,7 +71,7 @@ class Payload(InertialElement):
         times = [t for t in (self.begin, self.end) if t is not None]
         return jnp.stack(times) if times else None
 
-    def there(self, t: Array) -> Any:
+    def there(self, t: Array | np.ndarray) -> Any:
         """Returns whether it is taken at a time."""
         after = True if self.begin is None else self.begin <= t
         return after & (True if self.end is None else t < self.end)

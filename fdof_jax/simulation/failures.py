@@ -70,8 +70,8 @@ def _of_switches(inputs: Inputs, keywords: dict[str, Any]) -> str:
     own = own0 or initial_states(linkage, forces)
     for k, element, state in with_states(forces, own):
 
-        def functions(q, qd, element=(k, element), state=state):
-            met = switching_functions(*element, ts[0], q, qd, linkage, state)
+        def functions(q, qd, k=k, element=element, state=state):
+            met = switching_functions(k, element, ts[0], q, qd, linkage, state)
             return np.concatenate([[], *map(np.ravel, met)])
 
         here = functions(q, qd)

@@ -263,9 +263,12 @@ def element_effort(
     return _switched_effort(index, element, t, q, qd, linkage, state, None)[:2]
 
 
-def switching_functions(*element_and_state: Any) -> list[Array]:
-    """Returns the switching functions that an element meets, as `element_effort`."""
-    return _switched_effort(*element_and_state, None)[2]
+def switching_functions(
+    index: int, element: Element, t: Array, q: Array, qd: Array, linkage: Linkage,
+    state: Any,
+) -> list[Array]:  # fmt: skip
+    """Returns the switching functions that an element meets."""
+    return _switched_effort(index, element, t, q, qd, linkage, state, None)[2]
 
 
 @eqx.filter_jit  # traced once, not at each use by a solver

@@ -53,13 +53,10 @@ _ELSEWHERE = 12
 
 
 class _Margins(NamedTuple):
-    """Switching functions, positive on the side in force, in a step: (n,) each.
+    """Switching functions, positive on the side in force, in a step: (n,) each."""
 
-    `past` and `slopes` have one for each sample.
-    """
-
-    past: Sequence[Array]  # from the places where steps end, beyond the zeros
-    slopes: Sequence[Array]  # per step
+    past: Array  # (sample, n), from the places where steps end, beyond the zeros
+    slopes: Array  # (sample, n), per step
     beyond: Array  # how far these places are from the zeros
     largest: Array  # the largest value on either side
     unsure: Array  # how far a margin may be from its polynomial between samples
@@ -92,14 +89,11 @@ def _margins(
     rounding = _ROUNDING * eps * (1 + jnp.maximum(before, largest))
     unsure = _ELSEWHERE * jnp.maximum(_largest([*last, *wrong]) - rounding, 0)
     beyond = eps**_BEYOND * largest + _ROUNDING * eps
-    return _Margins(
-        past=[row + beyond for row in rows],
-        slopes=[_sum(row, rows) for row in _SLOPES],
-        beyond=beyond,
-        largest=largest,
-        unsure=jnp.where(brief, 0, unsure),
-        bend=_sum(_BEND, rows),
-    )
+    past = [row + beyond for row in rows]
+    slopes = [_sum(row, rows) for row in _SLOPES]
+    unsure, bend = jnp.where(brief, 0, unsure), _sum(_BEND, rows)
+    past, slopes, *others = in_one_loop((past, slopes, beyond, largest, unsure, bend))
+    return _Margins(jnp.stack(past), jnp.stack(slopes), *others)
 
 
 def _turns(margins: _Margins) -> tuple[Array, Array]:
@@ -151,10 +145,7 @@ def passage(
     if not before.size:
         return zero + 1, no, zero, zero + 1, before > 0, zero, zero, before
     brief = jnp.broadcast_to(brief, before.shape)
-    margins = in_one_loop(_margins(tuple(values), tuple(checks), sides, before, brief))
-    margins = margins._replace(
-        past=jnp.stack(margins.past), slopes=jnp.stack(margins.slopes)
-    )
+    margins = _margins(tuple(values), tuple(checks), sides, before, brief)
     turns, lowest = _turns(margins)
     sizes = jnp.maximum(before, margins.largest)
     return (
