@@ -27,6 +27,7 @@ from ..base.user_warnings import warn
 from ..control.drives import PIDController
 from ..control.pd import PDController
 from ..dynamics import energy, link_energies
+from ..forces.added_inertia import present
 from ..forces.element import Forces, InertialElement, elements
 from ..forces.holders import Holder
 from ..forces.payload import Payload
@@ -242,8 +243,7 @@ def energy_stack(
     taken_out = taken_out + lost
 
     def energies(t, q, qd):
-        there = [e.at(t) if isinstance(e, InertialElement) else e for e in forces]
-        return energy(linkage, q, qd, tuple(there))
+        return energy(linkage, q, qd, present(forces, t))
 
     clock = ts + _rounding(ts)
     kinetic, potential = map(np.asarray, jax.vmap(energies)(clock, q, qd))
