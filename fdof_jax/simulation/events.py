@@ -44,7 +44,7 @@ def resolve(event: Event, y: Any, args: Args) -> tuple[Any, Modes]:
     q, qd = args.q0 + jnp.stack(delta), jnp.stack(rates_before)
     before, law = args.modes, laws(args, event.t)
     first = before.mode < 0
-    fired = jnp.zeros((4, q.size), bool)
+    fired = jnp.zeros((3, q.size), bool)
     fired = fired.at[: len(event.fired)].set(event.fired)
     slides = ~before.held
     # Rates that came to zero; what is at its stop.
@@ -52,8 +52,8 @@ def resolve(event: Event, y: Any, args: Args) -> tuple[Any, Modes]:
     # Also those that are as near as a flight that is left out: otherwise joints whose
     # blows throw each other at their stops would hit them in turn without end.
     near = jnp.finfo(q.dtype).eps ** LOW
-    at_lower = fired[2] | (q <= law.lower + near)
-    at_upper = fired[3] | (q >= law.upper - near)
+    at_lower = fired[1] | (q <= law.lower + near)
+    at_upper = fired[2] | (q >= law.upper - near)
     touched = jnp.where(at_lower, -1.0, jnp.where(at_upper, 1.0, 0.0))
     stop = jnp.where(at_lower, law.lower, jnp.where(at_upper, law.upper, 0))
     q = jnp.where(touched != 0, stop, q)
@@ -73,7 +73,7 @@ def resolve(event: Event, y: Any, args: Args) -> tuple[Any, Modes]:
             qd, left_out = _settled(qd, touched, law, *net)
         lost -= energy(qd)
     net = _net_efforts(*constant((event.t, q, qd, own, args)))
-    modes = at_rest(qd, touched * (qd == 0), args.modes, law, *net, fired[:2])
+    modes = at_rest(qd, touched * (qd == 0), args.modes, law, *net, fired[0])
     slid = law.level * before.direction * (jnp.stack(delta) - before.origin)
     lost += jnp.sum(jnp.where(first, 0, slid))
     origin = q - args.q0

@@ -107,16 +107,18 @@ def unknown_modes(args: Args) -> tuple[Modes, int]:
     none, zero = jnp.zeros(MOST_EVENTS, q0.dtype), jnp.zeros((), q0.dtype)
     events = Events(none, none, none, zero)
     zeros = jnp.zeros_like(q0)
-    return Modes(zeros - 1, zeros, zeros, zero, events), q0.size * (4 if stops else 2)
+    return Modes(zeros - 1, zeros, zeros, zero, events), q0.size * (3 if stops else 1)
 
 
-def box(law: Laws, mode: Array) -> tuple[Array, Array]:
-    """Returns the least and the greatest effort by which joints are held in a mode."""
-    most = jnp.where(mode == BRAKE, jnp.inf, law.static)
-    return (
-        jnp.where(mode == UPPER, -jnp.inf, -most),
-        jnp.where(mode == LOWER, jnp.inf, most),
-    )
+def _reserve(static: Array, mode: Array, effort: Array) -> Array:
+    """Returns by how much efforts may grow before held joints come free [N or N m].
+
+    Friction is symmetric: near both limits this is the distance from the nearer one.
+    """
+    most = jnp.where(static > 0, static, 1)
+    kinds = [mode == FRICTION, mode == LOWER, mode == UPPER]
+    reserves = [(most - effort**2 / most) / 2, static + effort, static - effort]
+    return jnp.select(kinds, reserves, 1)
 
 
 def guarded_switching(
@@ -124,22 +126,17 @@ def guarded_switching(
 ) -> tuple[Array, bool]:
     """Returns the switching functions of all efforts, and after them the guards.
 
-    For each joint that is held: its effort above the least and below the greatest. For
-    the others: the sliding rate, and a number that never is 0. With stops, for each
-    joint that is free: the distances from them.
+    For each joint one that shows whether it stays as it is: held within its limits, or
+    sliding. With stops, for each joint that is free: the distances from them.
     """
     tau, _, added, switches = switched(t, y, args, schedule)
     constants = args.moving().constants
     effort = jnp.stack(holding_efforts(constants, *y[:2], tau, added))
     law, modes = laws(args, t), args.modes
     held, direction = modes.held, modes.direction
-    least, most = box(law, modes.mode)
     rubs = (law.static > 0) & ~held & (direction != 0)
     sliding = jnp.where(rubs, direction * jnp.stack(y[1]), 1)
-    guards = [
-        jnp.where(held, effort - least, sliding),
-        jnp.where(held, most - effort, 1),
-    ]
+    guards = [jnp.where(held, _reserve(law.static, modes.mode, effort), sliding)]
     if any(isinstance(e, HardStops) for e in args.forces):
         delta = jnp.stack(y[0])
         room = delta - (law.lower - args.q0), law.upper - args.q0 - delta
@@ -219,10 +216,13 @@ def at_rest(
     rest = (qd == 0) & ((law.static > 0) | (touched != 0) | law.braked)
     held_as = jnp.where(touched < 0, LOWER, jnp.where(touched > 0, UPPER, FRICTION))
     held_as = jnp.where(law.braked, BRAKE, held_as)
-    least, most = box(law, held_as)
+    most = jnp.where(law.braked, jnp.inf, law.static)
+    least = jnp.where(held_as == UPPER, -jnp.inf, -most)
+    most = jnp.where(held_as == LOWER, jnp.inf, most)
     size = jnp.abs(net) + law.static
-    was_held = before.held
-    forced = jnp.where(was_held & fired[0], 1.0, jnp.where(was_held & fired[1], -1, 0))
+    pulled = system.momenta(system.accelerations(net, before.held, in_one_loop)) - net
+    leaves = [before.mode == LOWER, before.mode == UPPER, before.mode == FRICTION]
+    forced = jnp.select(leaves, [1.0, -1.0, -jnp.sign(pulled)])
     count, joints = qd.size, jnp.arange(qd.size)
 
     def solved(slide):
@@ -247,7 +247,7 @@ def at_rest(
         return slide, tries + 1, *solved(slide)
 
     unsettled = lambda state: (state[2] < 0).any() & (state[1] < 8 * count)
-    start = jnp.where(rest, forced, 0)
+    start = jnp.where(rest & fired, forced, 0)
     slide, *_ = jax.lax.while_loop(unsettled, changed, (start, 0, *solved(start)))
     held = rest & (slide == 0)
     direction = jnp.where(held, 0, jnp.where(rest, slide, jnp.sign(qd)))
@@ -282,7 +282,7 @@ def efforts_of_holders(
     touched = 1.0 * (q >= law.upper - near) - 1.0 * (q <= law.lower + near)
     system = system_at(t, q, qd, args)
     net = tau - jnp.stack(system.equations.bias)
-    none = jnp.zeros((2, q.size), bool)
+    none = jnp.zeros(q.size, bool)
     modes = at_rest(qd, touched * (qd == 0), modes, law, system, net, none)
     starts = -law.level * jnp.where(qd == 0, modes.direction, 0)
     qdd = system.accelerations(net + starts, modes.held)
