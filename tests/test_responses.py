@@ -7,7 +7,7 @@ from helpers import random_linkage
 from test_control import pd_at
 
 import fdof_jax as fj
-from fdof_jax.analysis.responses import step_measures
+from fdof_jax.analysis.measures import step_measures
 
 STEP, DURATION = 1e-4, 3.0
 

@@ -10,6 +10,7 @@ from .linearization import (
     linearize,
 )
 from .loops import Margins, bandwidth, closed_loop, margins, open_loop
+from .measures import Response, response
 from .reactions import inertial_parameters, joint_reactions, regressor
 from .responses import StepAndSine, step_and_sine
 
@@ -17,6 +18,7 @@ __all__ = [
     "bandwidth", "closed_loop", "closed_loop_modes", "equilibrium", "holding_efforts",
     "inertia_ratios", "inertial_parameters", "joint_reactions", "Linearization",
     "linearize", "Margins", "margins", "Modes", "open_loop", "regressor",
+    "Response", "response",
     "step_and_sine", "StepAndSine",
 ]  # fmt: skip
 

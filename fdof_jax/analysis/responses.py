@@ -30,13 +30,12 @@ from ..simulation.simulate import simulate
 from ..simulation.solution import Solution
 from .linearization import holding_efforts
 from .loops import BANDWIDTH, bandwidth, closed_loop, margins, open_loop
+from .measures import SETTLED, step_measures
 from .tracking import relative_demands
 
 # Samples of a response: at least so many, so that most arms share a program, and one
 # for each part of a radian of the fastest mode, between which cubics are exact to 1e-5.
 _LEAST, _MOST, _TURN = 1000, 2**20, 0.25
-BAND = 0.02  # around the final value, in which a response has settled
-_SETTLED = 0.9  # part of the duration before which it has to
 # Frequencies of the sines over the bandwidth of the linearised loop. Small sines pass
 # -3 dB between the two that are added, also beside the narrow peaks of other joints.
 _FREQUENCIES = np.sort([*np.geomspace(0.1, 2.5, 12), 0.98, 1.02])
@@ -239,7 +238,7 @@ def step_and_sine(
         step=heights[moving],
         overshoot=overshoot,
         rise_time=rise_time,
-        settling_time=np.where(settling_time <= _SETTLED * t0, settling_time, np.nan),
+        settling_time=np.where(settling_time <= SETTLED * t0, settling_time, np.nan),
         bandwidth=widths,
         saturated=np.where(np.isnan(overshoot), np.nan, at_limit),
         ts=since,
@@ -258,31 +257,6 @@ def samples_of(duration: float, fastest: float) -> int:
             f"fast as {fastest:.3g} rad/s, got {duration:g} s."
         )
     return max(int(count), _LEAST)
-
-
-def step_measures(
-    ts: np.ndarray, change: np.ndarray, rate: np.ndarray, final: float
-) -> tuple[float, float, float]:
-    """Measures a response and its rate of change by python-control's `step_info`.
-
-    Returns the overshoot as a share of the final change, the rise time (NaN if 90 % is
-    not reached), and the time after which the response is settled (NaN if it is not at
-    the end).
-    """
-    import control
-
-    if not (final and np.isfinite([change, rate]).all()):
-        return np.nan, np.nan, np.nan
-    # `step_info` measures to the nearest sample: within 3e-4 of a time with these.
-    fine = np.union1d(ts, np.geomspace(ts[1] / 100, ts[-1], 2**16))
-    part = scipy.interpolate.CubicHermiteSpline(ts, change, rate)(fine) / final
-    rises = part.max() >= 0.9  # else `step_info` raises IndexError
-    limits = (0.1, 0.9) if rises else (-np.inf, -np.inf)
-    info: Any = control.step_info(
-        part, fine, None, 1.0, SettlingTimeThreshold=BAND, RiseTimeLimits=limits
-    )
-    rise_time = info["RiseTime"] if rises else np.nan
-    return info["Overshoot"] / 100, rise_time, info["SettlingTime"]
 
 
 def _bandwidth(frequency: np.ndarray, gain: np.ndarray, final: float) -> float:

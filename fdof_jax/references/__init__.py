@@ -2,13 +2,14 @@
 
 from .paths import Ellipse, FigureEight, Line, Path, Spline
 from .reference import Reference, reachable
+from .signals import Pulse, Ramp, Step
 from .task import CircleTask, JointMove, SetPoint, TipTask
 from .timing import Laps, Travel, shock_against
 
 __all__ = [
     "CircleTask", "Ellipse", "FigureEight", "JointMove", "Laps", "Line", "Path",
-    "reachable", "Reference", "SetPoint", "shock_against", "Spline", "TipTask",
-    "Travel",
+    "Pulse", "Ramp", "reachable", "Reference", "SetPoint", "shock_against", "Spline",
+    "Step", "TipTask", "Travel",
 ]  # fmt: skip
 
 

@@ -2,10 +2,13 @@
 
 from ..steps.tolerances import scale_tolerances
 from .efforts import Efforts
+from .phases import concatenate
 from .prescribed import PrescribedMotion
 from .sampled import SampledMotion
 
-__all__ = ["Efforts", "PrescribedMotion", "SampledMotion", "scale_tolerances"]
+__all__ = [
+    "concatenate", "Efforts", "PrescribedMotion", "SampledMotion", "scale_tolerances",
+]  # fmt: skip
 
 
 def __dir__() -> list[str]:

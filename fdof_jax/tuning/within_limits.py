@@ -13,7 +13,8 @@ from numpy.typing import ArrayLike
 
 from ..analysis.linearization import checked, equilibrium, loop_matrices
 from ..analysis.loops import margins, open_loop
-from ..analysis.responses import BAND, samples_of, step_measures
+from ..analysis.measures import BAND, step_measures
+from ..analysis.responses import samples_of
 from ..analysis.tracking import demands
 from ..base.checks import instance
 from ..base.known_values import in_numpy

@@ -1,0 +1,202 @@
+"""Measures of the motion under a controller, against its reference."""
+
+from typing import Any
+
+import jax
+import numpy as np
+import scipy
+from jax import Array
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from ..base.checks import instance, is_traced, real_array, refusal
+from ..base.report import Report
+from ..control.drives import Drive, PIDController
+from ..control.pd import PDController
+from ..forces.element import Forces, StatefulElement, elements
+from ..linkage.linkage import (
+    Linkage,
+    check_linkage,
+    joint_names,
+    joints_of,
+    moving_joints,
+)
+from ..references.reference import reference_motion
+from ..simulation.field import element_effort
+from ..simulation.solution import Solution
+
+BAND = 0.02  # around the final value, in which a response has settled
+SETTLED = 0.9  # part of the duration before which it has to
+_STANDS = 1e-9  # changes of a reference that are less are none [m or rad]
+
+
+class Response(Report):
+    """How joints followed the reference of their controller; prints itself.
+
+    Measures of a step are NaN for joints whose reference moves meanwhile, or has been
+    reached from the start.
+
+    - `joints`: names of the moving joints, for instance R1.
+    - `step`: from where the joint was to the final reference (joint,) [m or rad].
+    - `overshoot`: greatest excess over the final value, as a share of the final change
+      (joint,).
+    - `rise_time`: from 10 to 90 % of the final change (joint,) [s].
+    - `settling_time`: after which the joint stays within 2 % of the final change
+      (joint,) [s]; NaN if that is in the last tenth of the time or never.
+    - `steady_error`: of the last position from the reference (joint,) [m or rad].
+    - `largest_error`, `rms_error`: from the reference, over all samples (joint,)
+      [m or rad].
+    - `saturated`: share of the samples at which the actuator is at its limit (joint,).
+    """
+
+    joints: tuple[str, ...]
+    step: Float[np.ndarray, " joint"]
+    overshoot: Float[np.ndarray, " joint"]
+    rise_time: Float[np.ndarray, " joint"]
+    settling_time: Float[np.ndarray, " joint"]
+    steady_error: Float[np.ndarray, " joint"]
+    largest_error: Float[np.ndarray, " joint"]
+    rms_error: Float[np.ndarray, " joint"]
+    saturated: Float[np.ndarray, " joint"]
+
+    def _rows(self) -> list[list[str]]:
+        header = ["", "step", "overshoot", "rise", "settling", "steady error",
+                  "largest error", "rms error", "at limit"]  # fmt: skip
+        length = "[m, rad]"
+        units = ["", length, "[%]", "[s]", "[s]", *[length] * 3, "[% of time]"]
+        columns = (
+            self.step, 100 * self.overshoot, self.rise_time, self.settling_time,
+            self.steady_error, self.largest_error, self.rms_error, 100 * self.saturated,
+        )  # fmt: skip
+        numbers = ([f"{value:.4g}" for value in row] for row in zip(*columns))
+        rows = [[name, *row] for name, row in zip(self.joints, numbers)]
+        return [header, units, *rows]
+
+
+def response(
+    linkage: Linkage, forces: Forces, solution: Solution, *, since: ArrayLike = -np.inf
+) -> Response:
+    """Measures how a motion followed the reference of its controller.
+
+    Between the samples of the motion its cubics are taken, so that times are found more
+    closely than samples lie apart.
+
+    **Arguments:**
+
+    - `linkage`, `solution`: the arm and its motion, with ten samples or more in the
+      fastest swing.
+    - `forces`: those of the solution. One of them is, or is a drive that holds, a
+      `PDController`, `PIDController`, `GravityFeedforward` or `ComputedTorque`.
+    - `since`: the time from which on the motion counts, as that of a step [s]; by
+      default all of it does.
+
+    **Raises:** ValueError for malformed arguments, for a motion that failed, and under
+    JAX's transformations.
+
+    >>> import fdof_jax as fj
+    >>> import numpy as np
+    >>> arm = fj.scenes.double_pendulum().linkage
+    >>> step = fj.references.Step([-1.0, 0.4], [-0.8, 0.4], begin=0.2)
+    >>> pd = fj.control.GravityFeedforward(100.0, 20.0, 30.0, step)
+    >>> start = fj.State([-1.0, 0.4], [0, 0])
+    >>> motion = fj.simulate(arm, start, np.linspace(0, 2, 201), (pd,))
+    >>> found = fj.analysis.response(arm, (pd,), motion, since=0.2)
+    >>> found.joints, found.step.tolist()
+    (('R1', 'R2'), [0.2, 0.0])
+    >>> for share_or_time in (found.overshoot, found.rise_time, found.settling_time):
+    ...     print(f"{share_or_time[0]:.3f}")
+    0.086
+    0.322
+    0.987
+    """
+    check_linkage(linkage)
+    instance("solution", solution, Solution)
+    if is_traced(linkage, forces, solution, since):
+        raise ValueError("solution: expected a computed motion, got a traced one.")
+    controller, efforts = _controller(linkage, elements("forces", forces), solution)
+    ts, last = np.asarray(solution.ts), float(solution.ts[-1])
+    begin = max(float(real_array("since", since, (), finite=False, unit="s")), ts[0])
+    if (rows := ts >= begin).sum() < 2:
+        raise refusal("since", f"a time before the last sample, at {last:g} s", since)
+    if not np.isfinite(solution.q).all():
+        expected = "a motion that reached its end"
+        raise refusal("solution", expected, solution.outcome.tolist())
+    moving, names = moving_joints(linkage), joint_names(linkage)
+    wanted, _ = jax.vmap(lambda t: reference_motion(controller.reference, t, linkage))(
+        ts
+    )
+    wanted, q, qd, efforts = (
+        np.asarray(table)[np.ix_(rows, moving)]
+        for table in (wanted, solution.q, solution.qd, efforts)
+    )
+    error, step = q - wanted, wanted[-1] - q[0]
+    stands = (np.ptp(wanted[1:], axis=0) < _STANDS) & (np.abs(step) > _STANDS)
+    measures = [
+        step_measures(ts[rows] - begin, change, rate, change[-1])
+        if steps else (np.nan, np.nan, np.nan)
+        for change, rate, steps in zip((q - q[0]).T, qd.T, stands)
+    ]  # fmt: skip
+    overshoot, rise_time, settled = np.transpose(measures)
+    limits = np.broadcast_to(controller.limit, joints_of(linkage))[moving]
+    return Response(
+        joints=tuple(names[k] for k in moving),
+        step=step,
+        overshoot=overshoot,
+        rise_time=rise_time,
+        settling_time=np.where(settled <= SETTLED * (last - begin), settled, np.nan),
+        steady_error=error[-1],
+        largest_error=np.abs(error).max(axis=0),
+        rms_error=np.sqrt(np.mean(error**2, axis=0)),
+        saturated=np.mean((np.abs(efforts) >= limits) & (efforts != 0), axis=0),
+    )
+
+
+def _controller(
+    linkage: Linkage, forces: Forces, solution: Solution
+) -> tuple[PDController, Array]:
+    """Returns the controller among elements, and its efforts along a motion.
+
+    It may be the command of a drive, whose states have the command's.
+    """
+    found, states = [], iter(solution.own)
+    for element in forces:
+        state = next(states) if isinstance(element, StatefulElement) else ()
+        while isinstance(element, Drive):
+            element, state = element.command, state.command
+        if isinstance(element, PDController | PIDController):
+            found.append((element, state))
+    if len(found) != 1:
+        expected = "one controller with a reference, or one drive that holds one"
+        raise refusal("forces", expected, forces)
+    ((element, state),) = found
+
+    def effort(t: Array, q: Array, qd: Array, state: Any) -> Array:
+        return element_effort(0, element, t, q, qd, linkage, state)[0]
+
+    efforts = jax.vmap(effort)(solution.ts, solution.q, solution.qd, state)
+    return element.pd if isinstance(element, PIDController) else element, efforts
+
+
+def step_measures(
+    ts: np.ndarray, change: np.ndarray, rate: np.ndarray, final: float
+) -> tuple[float, float, float]:
+    """Measures a response and its rate of change by python-control's `step_info`.
+
+    Returns the overshoot as a share of the final change, the rise time (NaN if 90 % is
+    not reached), and the time after which the response is settled (NaN if it is not at
+    the end).
+    """
+    import control
+
+    if not (final and np.isfinite([change, rate]).all()):
+        return np.nan, np.nan, np.nan
+    # `step_info` measures to the nearest sample: within 3e-4 of a time with these.
+    fine = np.union1d(ts, np.geomspace(ts[1] / 100, ts[-1], 2**16))
+    part = scipy.interpolate.CubicHermiteSpline(ts, change, rate)(fine) / final
+    rises = part.max() >= 0.9  # else `step_info` raises IndexError
+    limits = (0.1, 0.9) if rises else (-np.inf, -np.inf)
+    info: Any = control.step_info(
+        part, fine, None, 1.0, SettlingTimeThreshold=BAND, RiseTimeLimits=limits
+    )
+    rise_time = info["RiseTime"] if rises else np.nan
+    return info["Overshoot"] / 100, rise_time, info["SettlingTime"]

@@ -1,0 +1,126 @@
+"""References for tests of a controller: steps, pulses and ramps of the joints."""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from ..base.checks import JOINT
+from ..linkage.fields import Condition, Values, field
+from ..linkage.linkage import Linkage, joints_of
+from .reference import Reference
+
+
+class Step(Reference):
+    """Positions to hold that change at once, at a known time.
+
+    The reference has no velocity: a derivative gain acts on the arm's own.
+
+    **Arguments:** positions are one per joint, or one for all.
+
+    - `before`, `after`: the positions before the step, and from it on [m or rad].
+    - `begin`: the time of the step [s].
+
+    **Raises:** ValueError for malformed arguments.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.double_pendulum().linkage
+    >>> step = fj.references.Step(0.0, [0.3, -0.1], begin=0.5)
+    >>> [step(t, arm)[0].tolist() for t in (0.4, 0.5)]
+    [[0.0, 0.0], [0.3, -0.1]]
+    """
+
+    before: Values = field(unit="m or rad")
+    after: Values = field(unit="m or rad")
+    begin: Values = field((), unit="s", default=0.0, kw_only=True)
+
+    @property
+    def jump_ts(self) -> Array:
+        """The time of the step [s]."""
+        return self.begin[None]
+
+    def __call__(self, t, linkage):
+        return _standing(jnp.where(t < self.begin, self.before, self.after), linkage)
+
+
+class Pulse(Reference):
+    """Positions to hold, and others between two known times.
+
+    **Arguments:** positions are one per joint, or one for all.
+
+    - `outside`, `inside`: the positions before and after the pulse, and in it
+      [m or rad].
+    - `begin`, `end`: its times, begin < end [s].
+
+    **Raises:** ValueError for malformed arguments.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.double_pendulum().linkage
+    >>> pulse = fj.references.Pulse(0.0, 0.2, begin=1.0, end=1.5)
+    >>> [pulse(t, arm)[0].tolist() for t in (0.9, 1.0, 1.5)]
+    [[0.0, 0.0], [0.2, 0.2], [0.0, 0.0]]
+    """
+
+    outside: Values = field(unit="m or rad")
+    inside: Values = field(unit="m or rad")
+    begin: Values = field((), unit="s", kw_only=True)
+    end: Values = field((), unit="s", kw_only=True)
+
+    def conditions(self):
+        ends = self.begin, self.end
+        yield Condition(self.begin < self.end, "begin", "less than end", ends)
+
+    @property
+    def jump_ts(self) -> Array:
+        """The times at which the pulse begins and ends [s]."""
+        return jnp.stack([self.begin, self.end])
+
+    def __call__(self, t, linkage):
+        within = (self.begin <= t) & (t < self.end)
+        return _standing(jnp.where(within, self.inside, self.outside), linkage)
+
+
+class Ramp(Reference):
+    """Positions given at times: linear in between, constant before and after.
+
+    **Arguments:** `ts`: increasing times, two or more [s]; `q`: the positions at `ts`,
+    (time, joint) [m or rad].
+
+    **Raises:** ValueError for malformed arguments.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.double_pendulum().linkage
+    >>> ramp = fj.references.Ramp([0, 2], [[0.0, 1.0], [0.5, 0.0]])
+    >>> q, qd = ramp(1.0, arm)
+    >>> q.tolist(), qd.tolist()
+    ([0.25, 0.5], [0.25, -0.5])
+    """
+
+    ts: Values = field((None,), unit="s")
+    q: Values = field((None, JOINT), unit="m or rad")
+
+    def conditions(self):
+        times, rows = len(self.ts), len(self.q)
+        rising = (self.ts[1:] > self.ts[:-1]).all() & (times > 1)
+        yield Condition(rising, "ts", "two or more increasing times", (self.ts,))
+        yield Condition(times == rows, "q", f"{times} rows, one per time", (rows,))
+
+    @property
+    def jump_ts(self) -> Array:
+        """The times, at which the velocities jump [s]."""
+        return self.ts
+
+    def __call__(self, t, linkage):
+        after = jnp.searchsorted(self.ts, t, side="right")
+        k = jnp.clip(after, 1, len(self.ts) - 1)
+        rates = (self.q[k] - self.q[k - 1]) / (self.ts[k] - self.ts[k - 1])
+        q = self.q[k - 1] + (t - self.ts[k - 1]) * rates
+        before, behind = after == 0, after == len(self.ts)
+        q = jnp.where(before, self.q[0], jnp.where(behind, self.q[-1], q))
+        return q, jnp.where(before | behind, 0, rates)
+
+
+def _standing(q: Any, linkage: Linkage) -> tuple[Array, np.ndarray]:
+    joints = (joints_of(linkage),)
+    return jnp.broadcast_to(q, joints), np.zeros(joints)

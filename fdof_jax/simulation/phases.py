@@ -1,0 +1,134 @@
+"""Motions that follow each other, joined to one."""
+
+from collections.abc import Sequence
+from functools import reduce
+from itertools import pairwise
+from typing import Any
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from ..base.checks import instance, known, refusal
+from .solution import Events, Solution
+
+_MEETS = 1e-9  # a share of the time, within which two motions meet
+# How statistics of two phases are joined; numbers of steps and switches add up.
+_STATISTICS = {"accuracy": jnp.maximum, "slowest_crossing": jnp.minimum}
+
+
+def concatenate(motions: Sequence[Solution]) -> Solution:
+    """Joins motions that follow each other, the phases of one, on one time axis.
+
+    What acts may differ between them, and so may the numbers of the arm. Where two
+    phases meet, the sample is that of the later one, after any blow at its start.
+
+    **Arguments:** `motions`: one or more, of the same joints and batch; each begins at
+    the time at which the one before ends.
+
+    **Returns:** their `Solution`. Its numbers of steps and switches are sums, and what
+    was `taken` adds up. `own` is () unless elements with the same kinds of states act
+    in all phases. The result is that of the first phase that failed, if any.
+
+    **Raises:** ValueError for malformed arguments, and unless known times meet.
+
+    >>> import fdof_jax as fj
+    >>> import numpy as np
+    >>> arm, start, *_ = fj.scenes.fig5()
+    >>> loaded = (fj.forces.Payload(fj.Point(3, 0.5), 0.2),)
+    >>> first = fj.simulate(arm, start, np.linspace(0, 1, 101), loaded)
+    >>> there = fj.State(first.q[-1], first.qd[-1])
+    >>> second = fj.simulate(arm, there, np.linspace(1, 2, 101))
+    >>> fj.simulation.concatenate([first, second])
+    Solution(motions: 1; times: 201, 0 to 2 s; outcome: successful; steps: 106)
+    """
+    if not isinstance(motions, list | tuple) or not motions:
+        raise refusal("motions", "a list of one or more Solutions", motions)
+    for index, motion in enumerate(motions):
+        instance(f"motions[{index}]", motion, Solution)
+    for index, (before, after) in enumerate(pairwise(motions)):
+        _check_meeting(index, before, after)
+    batch = np.ndim(motions[0].q) - 2
+    events = [m.events for m in motions if m.events is not None]
+    stats, result = reduce(_outcome, [(m.stats, m.result) for m in motions])
+    modes = taken = None
+    if events:
+        zeros = [jnp.zeros_like(m.q) for m in motions]
+        pairs = zip(motions, zeros)
+        modes = _rows([z if m.modes is None else m.modes for m, z in pairs], batch)
+        taken = _totals([m.taken for m in motions], [z[..., 0] for z in zeros])
+    return Solution(
+        ts=_rows([m.ts for m in motions], -1),
+        q=_rows([m.q for m in motions], batch),
+        qd=_rows([m.qd for m in motions], batch),
+        stats=stats,
+        result=result,
+        own=_states([m.own for m in motions], batch),
+        modes=modes,
+        taken=taken,
+        events=reduce(_events, events) if events else None,
+    )
+
+
+def _check_meeting(index: int, before: Solution, after: Solution) -> None:
+    name = f"motions[{index + 1}]"
+    *batch, _, joints = before.q.shape
+    *others, _, more = after.q.shape
+    if (batch, joints) != (others, more):
+        expected = f"{joints} joints and the batch {tuple(batch)}, as before it"
+        raise refusal(name, expected, f"{more} and {tuple(others)}")
+    end, begin = before.ts[..., -1], after.ts[..., 0]
+    if known(end, begin) and not np.allclose(end, begin, _MEETS, _MEETS):
+        expected = f"one that begins where the one before ends, at {np.max(end):g} s"
+        raise refusal(name, expected, f"one that begins at {np.max(begin):g} s")
+
+
+def _rows(pieces: list[Array], axis: int) -> Array:
+    """Joins pieces along the time axis, but for the last row of each but the last."""
+    *first, last = map(jnp.asarray, pieces)
+    first = [jax.lax.slice_in_dim(piece, 0, -1, axis=axis) for piece in first]
+    return jnp.concatenate([*first, last], axis=axis)
+
+
+def _totals(pieces: list[Array | None], zeros: list[Array]) -> Array:
+    totals, before = [], 0.0
+    for piece, zero in zip(pieces, zeros):
+        totals.append((zero if piece is None else piece) + before)
+        before = totals[-1][..., -1:]
+    return _rows(totals, -1)
+
+
+def _states(pieces: list[tuple[Any, ...]], axis: int) -> tuple[Any, ...]:
+    if len({jax.tree.structure(piece) for piece in pieces}) > 1:
+        return ()
+    return jax.tree.map(lambda *rows: _rows([*rows], axis), *pieces)
+
+
+def _outcome(first: Any, second: Any) -> tuple[dict[str, Any], Any]:
+    """Returns statistics and result of two phases, from those of each."""
+    (stats, result), (more, following) = first, second
+    ok = result == diffrax.RESULTS.successful
+
+    def joined(name: str) -> Any:
+        if not (name in stats and name in more):
+            return stats.get(name, more.get(name))
+        if name == "time_reached":
+            return jnp.where(ok, more[name], stats[name])
+        return _STATISTICS.get(name, jnp.add)(stats[name], more[name])
+
+    both = {name: joined(name) for name in stats | more}
+    # RESULTS.where takes no batch.
+    first_failure = lambda a, b: jnp.where(ok, b, a)
+    return both, jax.tree.map(first_failure, result, following)
+
+
+def _events(first: Events, second: Events) -> Events:
+    join = lambda name: jnp.concatenate(
+        [getattr(first, name), getattr(second, name)], -1
+    )
+    t, joint, kind = map(join, ("t", "joint", "kind"))
+    order = jnp.argsort(t, axis=-1)  # NaN comes last
+    ordered = (jnp.take_along_axis(row, order, -1) for row in (t, joint, kind))
+    return Events(*ordered, first.count + second.count)

@@ -1,0 +1,92 @@
+"""Measures of a motion against its reference: closed forms, and what is refused."""
+
+import jax
+import numpy as np
+import pytest
+
+import fdof_jax as fj
+from fdof_jax.references import Ramp, Step
+
+SLIDE = fj.Linkage("P", mass=[1], com=[[0, 0]], inertia=[1], length=[0, 1], gravity=0)
+START = fj.State([0.0], [0.0])
+TS = np.linspace(-0.5, 6, 651)
+STEP = Step(0.0, [0.5])
+W, ZETA = 8.0, 0.3  # of the loop
+PD = fj.PDController(W**2, 2 * ZETA * W, np.inf, STEP)
+
+
+def measured(*forces, since=0.0):
+    return fj.analysis.response(
+        SLIDE, forces, fj.simulate(SLIDE, START, TS, forces), since=since
+    )
+
+
+def test_a_step_of_a_slide_is_that_of_a_second_order_system():
+    found = measured(PD)
+    damped = np.sqrt(1 - ZETA**2)
+    ts = np.linspace(0, 6, 600_001)
+    phase = W * damped * ts
+    swing = np.cos(phase) + ZETA / damped * np.sin(phase)
+    share = 1 - np.exp(-ZETA * W * ts) * swing
+    rise = ts[np.argmax(share >= 0.9)] - ts[np.argmax(share >= 0.1)]
+    settled = ts[np.abs(share - 1) > 0.02].max()
+    overshoot = np.exp(-np.pi * ZETA / damped)
+    measures = found.overshoot, found.rise_time, found.settling_time
+    exact = [overshoot], [rise], [settled]
+    np.testing.assert_allclose(measures, exact, rtol=2e-3)
+    np.testing.assert_allclose(found.step, 0.5)
+    np.testing.assert_allclose(found.largest_error, 0.5)
+    samples = 0.5 * np.interp(TS[TS >= 0], ts, 1 - share)
+    np.testing.assert_allclose(found.rms_error, np.sqrt(np.mean(samples**2)), rtol=1e-5)
+    assert found.saturated == 0 and found.joints == ("P1",)
+
+
+def test_a_load_leaves_a_steady_error():
+    found = measured(PD, fj.JointEffort(3.2))
+    np.testing.assert_allclose(found.steady_error, 3.2 / W**2, atol=2e-4)
+
+
+def test_an_actuator_at_its_limit_counts():
+    # A second at full thrust out, and one back: the demand is far beyond the limit.
+    pd = fj.PDController(1e6, 0.0, 0.5, Step(0.0, [0.5]))
+    found = measured(pd)
+    assert found.saturated > 0.95
+    for kind in (
+        fj.control.FirstOrderLag(pd, 0.01),
+        fj.control.PIDController(1e6, 0.0, 0.0, 0.5, pd.reference),
+        fj.control.FirstOrderLag(
+            fj.control.PIDController(1e6, 0.0, 0.0, 0.5, pd.reference), 0.01
+        ),
+    ):
+        assert measured(kind, fj.JointDamper(0.0)).saturated > 0.9
+
+
+def test_a_reference_that_moves_has_errors_alone():
+    ramp = Ramp([0, 1], [[0.0], [1.0]])
+    found = measured(fj.PDController(W**2, 2 * W, np.inf, ramp))
+    # The error of a critically damped loop is t exp(-W t) while the ramp lasts.
+    np.testing.assert_allclose(found.largest_error, np.exp(-1) / W, rtol=1e-3)
+    assert np.isnan([found.overshoot, found.rise_time, found.settling_time]).all()
+    after = measured(fj.PDController(W**2, 2 * W, np.inf, ramp), since=1.0)
+    assert after.largest_error < np.exp(-1) / W
+
+
+def test_a_report_is_shown():
+    text = str(measured(PD))
+    assert text.count("\n") == 2 and "steady error" in text and "P1" in text
+
+
+def test_what_is_refused():
+    motion = fj.simulate(SLIDE, START, TS, (PD,))
+    response = fj.analysis.response
+    with pytest.raises(ValueError, match="forces: expected one controller"):
+        response(SLIDE, (fj.JointDamper(1.0),), motion)
+    with pytest.raises(ValueError, match="forces: expected one controller"):
+        response(SLIDE, (PD, PD), motion)
+    with pytest.raises(ValueError, match="since: expected a time before .* 6 s"):
+        response(SLIDE, (PD,), motion, since=6.0)
+    with pytest.raises(ValueError, match="solution: expected a computed motion"):
+        jax.jit(lambda motion: response(SLIDE, (PD,), motion).step)(motion)
+    stopped = fj.simulate(SLIDE, START, TS, (PD,), max_steps=3, throw=False)
+    with pytest.raises(ValueError, match="solution: .* reached its end, got .out of"):
+        response(SLIDE, (PD,), stopped)
