@@ -98,6 +98,7 @@ RETURNED_BY = {
     "NextMotion": "next_motion",
     "OptimalMotion": "optimal_efforts",
     "SampledMotion": "simulate_sampled",
+    "Response": "response",
     "Solution": "simulate",
     "StepAndSine": "step_and_sine",
     "TradeOff": "trade_off",

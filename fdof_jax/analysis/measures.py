@@ -126,7 +126,7 @@ def response(
         ts
     )
     wanted, q, qd, efforts = (
-        np.asarray(table)[np.ix_(rows, moving)]
+        np.asarray(table)[rows][:, moving]
         for table in (wanted, solution.q, solution.qd, efforts)
     )
     error, step = q - wanted, wanted[-1] - q[0]
@@ -158,9 +158,11 @@ def _controller(
 
     It may be the command of a drive, whose states have the command's.
     """
-    found, states = [], iter(solution.own)
+    found: list[Any] = []
+    states: Any = iter(solution.own)
     for element in forces:
-        state = next(states) if isinstance(element, StatefulElement) else ()
+        stateful = isinstance(element, StatefulElement)
+        state: Any = next(states) if stateful else ()
         while isinstance(element, Drive):
             element, state = element.command, state.command
         if isinstance(element, PDController | PIDController):

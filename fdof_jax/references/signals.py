@@ -3,7 +3,6 @@
 from typing import Any
 
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 
 from ..base.checks import JOINT
@@ -40,7 +39,7 @@ class Step(Reference):
         """The time of the step [s]."""
         return self.begin[None]
 
-    def __call__(self, t, linkage):
+    def __call__(self, t: Any, linkage):
         return _standing(jnp.where(t < self.begin, self.before, self.after), linkage)
 
 
@@ -76,7 +75,7 @@ class Pulse(Reference):
         """The times at which the pulse begins and ends [s]."""
         return jnp.stack([self.begin, self.end])
 
-    def __call__(self, t, linkage):
+    def __call__(self, t: Any, linkage):
         within = (self.begin <= t) & (t < self.end)
         return _standing(jnp.where(within, self.inside, self.outside), linkage)
 
@@ -111,7 +110,7 @@ class Ramp(Reference):
         """The times, at which the velocities jump [s]."""
         return self.ts
 
-    def __call__(self, t, linkage):
+    def __call__(self, t: Any, linkage):
         after = jnp.searchsorted(self.ts, t, side="right")
         k = jnp.clip(after, 1, len(self.ts) - 1)
         rates = (self.q[k] - self.q[k - 1]) / (self.ts[k] - self.ts[k - 1])
@@ -121,6 +120,6 @@ class Ramp(Reference):
         return q, jnp.where(before | behind, 0, rates)
 
 
-def _standing(q: Any, linkage: Linkage) -> tuple[Array, np.ndarray]:
-    joints = (joints_of(linkage),)
-    return jnp.broadcast_to(q, joints), np.zeros(joints)
+def _standing(q: Array, linkage: Linkage) -> tuple[Array, Array]:
+    q = jnp.broadcast_to(q, joints_of(linkage))
+    return q, jnp.zeros_like(q)

@@ -130,5 +130,6 @@ def _events(first: Events, second: Events) -> Events:
     )
     t, joint, kind = map(join, ("t", "joint", "kind"))
     order = jnp.argsort(t, axis=-1)  # NaN comes last
-    ordered = (jnp.take_along_axis(row, order, -1) for row in (t, joint, kind))
-    return Events(*ordered, first.count + second.count)
+    ordered = lambda row: jnp.take_along_axis(row, order, axis=-1)
+    count = first.count + second.count
+    return Events(ordered(t), ordered(joint), ordered(kind), count)
