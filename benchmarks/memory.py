@@ -25,7 +25,7 @@ TS = np.linspace(0.0, 2.0, 51)
 BLOCK = 8192  # members that compile what more members need
 
 
-def end(motion: fj.Solution) -> jax.Array:
+def end(scene: fj.Scene, motion: fj.Solution) -> jax.Array:
     return motion.q[-1]
 
 

@@ -312,7 +312,11 @@ def test_sweeps_in_a_loop_share_a_program(traces):
     for k in (1.0, 4.0):
         states = fj.State(np.stack([START.q, START.q + 0.1]), START.qd)
         ends = fj.sweep(
-            ARM, states, TS, (drag(k),), reduce=lambda motion, k=k: k * motion.q[-1]
+            ARM,
+            states,
+            TS,
+            (drag(k),),
+            reduce=lambda scene, motion, k=k: k * motion.q[-1],
         )
         one = fj.simulate(ARM, START, TS, (fj.JointDamper(k),))
         np.testing.assert_allclose(ends[0], k * one.q[-1], atol=1e-8)

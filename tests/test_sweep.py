@@ -102,18 +102,35 @@ def test_the_others_do_not_notice_and_a_fast_member_is_right(mixed, swept, clean
 # What is kept of members
 
 
-def end_and_fastest(motion):
+def end_and_fastest(scene, motion):
     fastest, none = jnp.abs(motion.qd).max(0), motion.q[:0]
     return {"end": motion.q[-1], "fastest": fastest, "none": none}, motion.result
 
 
 def test_a_reduction_sees_each_motion(mixed, swept):
     reduced = run(mixed, reduce=end_and_fastest)
-    expected = jax.vmap(end_and_fastest)(swept)
+    expected = jax.vmap(lambda motion: end_and_fastest(None, motion))(swept)
     assert_alike(reduced, expected)
     for a, b in zip(*map(jax.tree.leaves, (reduced, expected))):
         np.testing.assert_allclose(a, b, rtol=1e-8, atol=1e-8)
     assert np.isnan(reduced[0]["end"]).any(axis=1).nonzero()[0].tolist() == FAILED
+
+
+def test_a_reduction_sees_each_member(mixed):
+    def tip_and_work(scene, motion):
+        total = fj.joint_efforts(scene, motion).total
+        return fj.tip_position(scene.linkage, motion.q[-1]), total, scene.state0.q
+
+    linkage, state0, forces = jax.tree.map(lambda leaf: leaf[:2], mixed)
+    tips, efforts, starts = run((linkage, state0, forces), reduce=tip_and_work)
+    np.testing.assert_array_equal(starts, state0.q)
+    for k in range(2):
+        member = jax.tree.map(lambda leaf, k=k: leaf[k], mixed)
+        single = alone(mixed, k)
+        tip = fj.tip_position(member[0], single.q[-1])
+        np.testing.assert_allclose(tips[k], tip, atol=1e-7)
+        wanted = fj.joint_efforts(member[0], member[2], single).total
+        np.testing.assert_allclose(efforts[k], wanted, atol=1e-6)
 
 
 @pytest.mark.parametrize("reduce", [None, end_and_fastest])
@@ -133,7 +150,7 @@ def test_it_works_under_transformations(batch):
     def end(q):
         linkage, state0, forces = batch
         moved = linkage, state0._replace(q=q), forces
-        return run(moved, reduce=lambda motion: motion.q[-1])
+        return run(moved, reduce=lambda scene, motion: motion.q[-1])
 
     assert jax.eval_shape(end, batch[1].q).shape == (42, 3)
 
@@ -149,7 +166,7 @@ def test_traced_values_may_be_out_of_sight(monkeypatch):
     monkeypatch.setattr(sys.modules["fdof_jax.batches.sweep"], "_traced", traced)
 
     def total(w):
-        return w * run(two_links(), reduce=lambda motion: w * motion.q[-1]).sum()
+        return w * run(two_links(), reduce=lambda scene, motion: w * motion.q[-1]).sum()
 
     assert jax.grad(total)(1.0) == 2
     assert jax.vmap(total)(jnp.ones(3)).tolist() == [2, 2, 2]
@@ -209,7 +226,7 @@ def test_a_failed_member_adds_nothing_to_a_gradient_in_a_held_value():
     state0.q[1] = np.nan
 
     def total(w):
-        reduce = lambda motion: w * motion.q[-1]
+        reduce = lambda scene, motion: w * motion.q[-1]
         return jnp.nansum(run((linkage, state0, forces), reduce=reduce))
 
     np.testing.assert_allclose(jax.grad(total)(1.0), total(1.0), rtol=1e-6)
@@ -220,7 +237,7 @@ def test_a_gradient_is_compiled_once():
     linkage, state0, forces = two_links()
     traces = []
 
-    def end(motion):
+    def end(scene, motion):
         traces.append(motion)
         return motion.q[-1]
 

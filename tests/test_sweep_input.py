@@ -82,7 +82,14 @@ REFUSALS = [
     ),
     *(
         ("reduce", dict(reduce=reduce))
-        for reduce in (3, "q", fj.Solution, Unhashable(), lambda motion: (1.0, "q"))
+        for reduce in (
+            3,
+            "q",
+            fj.Solution,
+            Unhashable(),
+            lambda motion: motion.q,
+            lambda scene, motion: (1.0, "q"),
+        )  # fmt: skip
     ),
     *(
         (name, {name: value})

@@ -65,7 +65,7 @@ def solved(monkeypatch):
     return sizes
 
 
-def end(motion):
+def end(scene, motion):
     new, none = jnp.array(True), motion.q[:0]
     return {"end": motion.q[-1], "result": motion.result, "is new": new, "none": none}
 
@@ -251,7 +251,7 @@ def two_links():
     return jax.tree.map(lambda leaf: leaf[:2], single_links())
 
 
-def digest(reduce=lambda motion: motion.q, force=lambda t, q, qd, linkage: q):
+def digest(reduce=lambda scene, motion: motion.q, force=lambda t, q, qd, linkage: q):
     linkage, state0, _ = two_links()
     batch = batch_of(linkage, state0, (force,), None)
     settings = dict(SETTINGS, dt0=1e-3, adjoint=diffrax.RecursiveCheckpointAdjoint())
@@ -268,7 +268,7 @@ def test_it_names_what_functions_compute():
     assert digest(force=times(2.0)) != digest(force=times(3.0))
     two, three = jnp.full(1, 2.0), jnp.full(1, 3.0)
     assert digest(force=times(two)) != digest(force=times(three))
-    assert digest() != digest(lambda motion: motion.q + 1)
+    assert digest() != digest(lambda scene, motion: motion.q + 1)
 
 
 def in_scan(distance):
@@ -282,7 +282,7 @@ def test_arrays_within_compiled_functions_count(jit):
         return jit(lambda q: q - target)
 
     def reduction(target):
-        return lambda motion: distance(target)(motion.q[-1])
+        return lambda scene, motion: distance(target)(motion.q[-1])
 
     def force(target):
         return lambda t, q, qd, linkage: distance(target)(q)
@@ -298,7 +298,7 @@ def test_functions_that_only_python_can_call_are_refused(tmp_path):
     def called(t, q, qd, linkage):
         return jax.pure_callback(np.sin, q, q, vmap_method="sequential")
 
-    def checked(motion):
+    def checked(scene, motion):
         jax.debug.print("{}", motion.q[0])
         return eqx.error_if(motion.q, motion.q > 1, "far")
 

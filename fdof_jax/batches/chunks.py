@@ -23,6 +23,7 @@ from ..dynamics import forward_dynamics
 from ..forces.element import elements
 from ..linkage.topology import real_joints
 from ..simulation.field import element_effort
+from ..simulation.scene import Scene
 from ..simulation.simulate import simulate
 from ..simulation.solution import Solution
 from ..steps.controllers import Abreast, by_square_roots
@@ -45,7 +46,7 @@ class Common(NamedTuple):
     shared: Any  # of a `Batch`
     ts: Array
     settings: dict
-    reduce: Callable[[Solution], Any]
+    reduce: Callable[[Scene, Solution], Any]
 
 
 class Job(NamedTuple):
@@ -93,7 +94,8 @@ def outcome_of(common: Common, moving: Any, abreast: bool = False) -> Outcome:
         limited = Abreast(controller, _AXIS)  # pyright: ignore[reportCallIssue]
         settings = settings | {"stepsize_controller": limited}
     solution = simulate(linkage, state0, common.ts, forces, throw=False, **settings)
-    value = common.reduce(solution)
+    scene = Scene(linkage, state0, forces, common.ts[-1])
+    value = common.reduce(scene, solution)
     _check_value(value)
     results, most = diffrax.RESULTS, settings["max_steps"]
     stopped = solution.result == results.max_steps_reached

@@ -8,6 +8,7 @@ batch of slow members.
 
 import contextlib
 import dataclasses
+import inspect
 import os
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -39,7 +40,7 @@ from ..forces.element import Forces, elements, elements_on
 from ..forces.holders import holders
 from ..linkage.coordinates import State
 from ..linkage.linkage import Linkage
-from ..simulation.scene import accepts_scene
+from ..simulation.scene import Scene, accepts_scene
 from ..simulation.simulate import solve_options
 from ..simulation.solution import Solution
 from ..steps.dopri8 import constant
@@ -60,9 +61,22 @@ _CHUNK = 512  # half as many take 15 % longer on two cores: each call costs 0.5 
 _CHUNK_HELD = 64
 
 
-def _without_times(solution: Solution) -> Solution:
+def _without_times(_: Scene, solution: Solution) -> Solution:
     """Leaves out the output times, which all members have in common."""
     return eqx.tree_at(lambda s: s.ts, solution, None)
+
+
+def _of_member(reduce: Any) -> Any:
+    """Returns `reduce` if it is a function of two arguments, or raises ValueError."""
+    expected = "a function (scene, motion)"
+    function("reduce", reduce, expected)
+    try:
+        inspect.signature(reduce).bind(None, None)
+    except TypeError:
+        raise refusal("reduce", expected, reduce) from None
+    except ValueError:  # a callable that does not tell its arguments
+        pass
+    return reduce
 
 
 @eqx.filter_jit  # under `jax.grad` alone, each call would compile its operations again
@@ -135,7 +149,7 @@ def sweep(
     forces: Forces = (),
     *,
     forces_axes: Any = None,
-    reduce: Callable[[Solution], Any] | None = None,
+    reduce: Callable[[Scene, Solution], Any] | None = None,
     chunk: int | None = None,
     throw: bool = False,
     store: str | os.PathLike | None = None,
@@ -165,9 +179,10 @@ def sweep(
     - `forces`: force elements; `forces_axes`: which of their arrays carry the batch
       axis, as `in_axes` of `jax.vmap`: 0 for all, None (the default) for none, or a
       tuple of these with one entry per element.
-    - `reduce`: a function of one member's `Solution`, for instance
-      `lambda motion: motion.q[-1]`; of each member only the arrays that it returns are
-      kept. Functions of equal code share a compiled program.
+    - `reduce`: a function of one member, as a `Scene` with its own numbers, and of its
+      `Solution`, for instance `lambda scene, motion: motion.q[-1]`, or a loss of
+      `tune`; of each member only the arrays that it returns are kept. Functions of
+      equal code share a compiled program.
     - `chunk`: largest number of members to solve together, per device; None stands for
       512, or 64 where elements hold joints.
     - `throw`: whether to raise an error if any member fails.
@@ -230,7 +245,7 @@ def sweep(
     moving, shared, size = batch
     if forces:
         _check_elements(batch)
-    keep = _without_times if reduce is None else function("reduce", reduce)
+    keep = _without_times if reduce is None else _of_member(reduce)
     common = Common(shared, ts, settings, keep)
     traced = is_transformed()
     if traced and (throw or store is not None):
