@@ -365,3 +365,46 @@ def test_two_writers_of_one_file_do_not_meet(path, monkeypatch):
     for writer in writers:
         writer.join()
     assert [*path.parent.iterdir()] == [path] and fj.load(path) in texts
+
+
+class Policy(fj.Element):
+    """A network as a controller, whose constructor makes its numbers."""
+
+    network: eqx.nn.MLP
+    limit: float
+
+    def __init__(self, seed, limit=3.0, width=8):
+        key = jax.random.key(seed)
+        self.network = eqx.nn.MLP(6, 3, width, 1, jax.nn.tanh, key=key)
+        self.limit = limit
+
+    def __call__(self, t, q, qd, linkage):
+        return self.limit * jnp.tanh(self.network(jnp.concatenate([q, qd])))
+
+
+def test_a_network_goes_through_a_file_by_its_numbers(path):
+    trained, fresh = Policy(1, limit=2.5), Policy(2)
+    fj.save(path, {"policy": trained, "network": trained.network, "gain": 2.0})
+    loaded = fj.load(path, (fresh, fresh.network))
+    same(loaded, {"policy": trained, "network": trained.network, "gain": 2.0})
+    x, other = np.ones(3), loaded["policy"]
+    same(other(0.0, x, x, ARM), trained(0.0, x, x, ARM))
+    scene = SCENE._replace(forces=(trained, Half(1.0)))
+    fj.save(path, scene)
+    same(fj.load(path, (fresh, Half(2.0))), scene)
+
+
+@pytest.mark.parametrize(
+    ("classes", "message"),
+    [
+        ((), r"tree\.Policy: expected load\(path, classes=\(\.\.\., one Policy\)\)"),
+        ((Policy,), r"one Policy\)\) for its numbers, got 'none'"),
+        ((Policy(1), Policy(2)), r"one Policy\)\) for its numbers, got \['Policy', "),
+        ((Policy(1, width=9),), r"numbers of shapes \[\(8, 6\), .* got \[\(9, 6\)"),
+        (3, "classes: expected a tuple of classes, or of modules, got 3"),
+    ],
+)
+def test_a_network_is_loaded_into_one_of_its_kind(path, classes, message):
+    fj.save(path, Policy(1))
+    with pytest.raises(ValueError, match=message):
+        fj.load(path, classes)

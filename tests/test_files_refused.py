@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_files import ARM, OWN, SCENE, Half, Pair, Plain, Push, path as path, stack
+from test_files import ARM, OWN, SCENE, Pair, Plain, Push, path as path, stack
 
 import fdof_jax as fj
 from fdof_jax.steps.looped_dopri8 import LoopedDopri8
@@ -44,7 +44,6 @@ UNSAVED = {
     "motion": (MOTION, "to_xarray .* got Solution"),
     "class within the library": (LoopedDopri8(), "public class, .*LoopedDopri8"),
     "class of a public name": (ALIKE, "another name, .*JointDamper"),
-    "constructor unknown": (Half(1.0), "a method `arguments`.* once"),
     "impossible": (eqx.tree_at(lambda a: a.mass, ARM, -ARM.mass), "mass: .* at least"),
     "partly a batch": (
         eqx.tree_at(lambda a: a.mass, ARM, jnp.ones((9, 3))), "batch .*; mass: .*9, 3",

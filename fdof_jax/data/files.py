@@ -2,6 +2,7 @@
 
 import dataclasses
 import importlib
+import inspect
 import json
 import math
 import os
@@ -9,6 +10,7 @@ import re
 from collections.abc import Sequence
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,7 +23,7 @@ from ..base.whole_files import file_path, whole_file
 from ..linkage.linkage import Linkage
 from ..linkage.topology import letters
 from ..simulation.sampled import Motion
-from ..simulation.scene import stacked
+from ..simulation.scene import is_number, stacked
 
 _PACKAGE = __name__.partition(".")[0]
 # Where classes are looked up. The package comes last, as it warns of names in rooms;
@@ -53,6 +55,8 @@ def save(path: str | os.PathLike, tree: Any) -> None:
     - `{"tuple": [...]}` is a tuple that begins with a number or an array,
       `{"dict": {...}}` a dictionary, and `{"batch": [...]}` the members of an object
       whose arrays all have a further leading axis.
+    - `{"MLP": [[...], ...]}` are the numbers in an `equinox.Module` that is not made
+      from its fields, as a network.
     - At the top, `"value"` names what is no object.
 
     An existing file is replaced when the new one is complete. It keeps its permissions,
@@ -63,9 +67,9 @@ def save(path: str | os.PathLike, tree: Any) -> None:
     - `path`: path of the file, such as "scene.json"; no suffix is added.
     - `tree`: a `Scene`, a `Linkage`, force elements, references, a `TuneResult`, a
       `FitResult`, or tuples and dicts of these and of numbers, texts and arrays.
-      Instances of your own `Element`, `equinox.Module`, dataclass or NamedTuple are
-      saved if their constructor's arguments are fields, or a method `arguments` returns
-      them.
+      Instances of your own `Element`, dataclass or NamedTuple are saved if their
+      constructor's arguments are fields, or a method `arguments` returns them; those of
+      an `equinox.Module` always are, if need be by their numbers alone.
 
     **Raises:** ValueError for what cannot be saved, with its place in the tree: a
     function, a traced value, a `Solution` (use `to_xarray`), an object of another kind.
@@ -93,7 +97,7 @@ def save(path: str | os.PathLike, tree: Any) -> None:
         file.write(text.encode() + b"\n")
 
 
-def load(path: str | os.PathLike, classes: Sequence[type] = ()) -> Any:
+def load(path: str | os.PathLike, classes: Sequence[Any] = ()) -> Any:
     """Loads what `save` or a person wrote to a file.
 
     Objects are made by their constructors, which check their arguments. Nothing else is
@@ -102,7 +106,9 @@ def load(path: str | os.PathLike, classes: Sequence[type] = ()) -> Any:
     **Arguments:**
 
     - `path`: path of the file.
-    - `classes`: a tuple of your own classes that the file names.
+    - `classes`: a tuple of your own classes that the file names. In place of an
+      `equinox.Module` whose numbers alone are in the file, as of a network, give an
+      instance: all else is taken from it.
 
     **Returns:** the tree, on the default device. Numbers are equal to the last bit.
     Arrays have JAX's default dtypes: float64 with double precision, float32 without,
@@ -115,8 +121,8 @@ def load(path: str | os.PathLike, classes: Sequence[type] = ()) -> Any:
     """
     path = file_path("path", path)
     several = isinstance(classes, tuple | list)
-    if not (several and all(isinstance(kind, type) for kind in classes)):
-        raise refusal("classes", "a tuple of classes", classes)
+    if not (several and all(isinstance(k, type | eqx.Module) for k in classes)):
+        raise refusal("classes", "a tuple of classes, or of modules", classes)
     content = path.read_bytes()
     try:
         return _value("tree", _parsed(content), classes)
@@ -210,6 +216,10 @@ def _object(place: str, value: Any) -> dict[str, Any]:
         for keys, leaf in jax.tree_util.tree_leaves_with_path(value):
             if is_traced(leaf):
                 raise refusal(f"{place}{jax.tree_util.keystr(keys)}", _KNOWN, leaf)
+        if _has_other_arguments(value):
+            leaves = jax.tree.leaves(eqx.filter(value, is_number))
+            rows = enumerate(leaves)
+            return {name: [_numbers(f"{place}[{i}]", leaf) for i, leaf in rows]}
         try:
             arguments = getattr(kind, "arguments", Frozen.arguments)(value)
             with without_warning(""):  # which came when it was made
@@ -224,6 +234,15 @@ def _object(place: str, value: Any) -> dict[str, Any]:
     if isinstance(value, Linkage):
         arguments["topology"] = letters(value.ef)
     return {name: {k: _node(f"{place}.{k}", v) for k, v in arguments.items()}}
+
+
+def _has_other_arguments(value: Any) -> bool:
+    """Returns whether a module is not made from its fields, as a network is not."""
+    kind = type(value)
+    told = getattr(kind, "arguments", Frozen.arguments) is not Frozen.arguments
+    if told or not isinstance(value, eqx.Module):
+        return False
+    return not vars(value).keys() >= inspect.signature(kind).parameters.keys()
 
 
 def _members(batch: Any) -> list[Any]:
@@ -300,11 +319,14 @@ def _value(place: str, node: Any, classes: Sequence[type]) -> Any:
     if name in ("tuple", "batch") and isinstance(inner, list):
         items = tuple(at(f"[{i}]", item) for i, item in enumerate(inner))
         return items if name == "tuple" else _batch(place, items)
+    if isinstance(inner, list) and not _public(name):
+        return _with_numbers(f"{place}.{plain(name)}", name, inner, classes)
     if not isinstance(inner, dict):
         raise refusal(f"{place}.{plain(name)}", "named arguments", inner)
     if name == "dict":
         return {key: at(f"[{shown(key)}]", item) for key, item in inner.items()}
-    own = [kind for kind in classes if kind.__name__ == name]
+    types = [kind if isinstance(kind, type) else type(kind) for kind in classes]
+    own = [kind for kind in types if kind.__name__ == name]
     if not (kind := _public(name)) and len(own) != 1:
         expected = "a class of fdof_jax, or one of load(path, classes=(MyElement,))"
         raise refusal(place, expected, name)
@@ -316,6 +338,26 @@ def _value(place: str, node: Any, classes: Sequence[type]) -> Any:
     except _MEANT as error:
         problem = f"the arguments of {name}, got {plain(str(error))}"
         raise ValueError(f"{place}: expected {problem}.") from error
+
+
+def _with_numbers(
+    place: str, name: str, node: list[Any], classes: Sequence[Any]
+) -> Any:
+    """Returns the module of this name among `classes`, with other numbers."""
+    found = [k for k in classes if type(k).__name__ == name]
+    if len(found) != 1:
+        expected = f"load(path, classes=(..., one {plain(name)})) for its numbers"
+        raise refusal(place, expected, [type(k).__name__ for k in found] or "none")
+    old, rest = eqx.partition(found[0], is_number)
+    leaves, structure = jax.tree.flatten(old)
+    new = [_value(f"{place}[{i}]", number, ()) for i, number in enumerate(node)]
+    if (given := [*map(np.shape, leaves)]) != (shapes := [*map(np.shape, new)]):
+        expected = f"numbers of shapes {shapes}, as in the file"
+        raise refusal(place, expected, given)
+    for index, leaf in enumerate(leaves):
+        if eqx.is_array(leaf):
+            new[index] = jnp.asarray(new[index], leaf.dtype)
+    return eqx.combine(structure.unflatten(new), rest)
 
 
 def _batch(place: str, members: tuple[Any, ...]) -> Any:
