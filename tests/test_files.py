@@ -382,6 +382,14 @@ class Policy(fj.Element):
         return self.limit * jnp.tanh(self.network(jnp.concatenate([q, qd])))
 
 
+class Holding(eqx.Module):
+    network: eqx.nn.MLP
+    gain: float
+
+    def __call__(self, t, q, qd, linkage):
+        return self.gain * self.network(jnp.concatenate([q, qd]))
+
+
 def test_a_network_goes_through_a_file_by_its_numbers(path):
     trained, fresh = Policy(1, limit=2.5), Policy(2)
     fj.save(path, {"policy": trained, "network": trained.network, "gain": 2.0})
@@ -389,9 +397,10 @@ def test_a_network_goes_through_a_file_by_its_numbers(path):
     same(loaded, {"policy": trained, "network": trained.network, "gain": 2.0})
     x, other = np.ones(3), loaded["policy"]
     same(other(0.0, x, x, ARM), trained(0.0, x, x, ARM))
-    scene = SCENE._replace(forces=(trained, Half(1.0)))
+    holding = fj.control.FirstOrderLag(Holding(trained.network, 0.5), 0.1)
+    scene = SCENE._replace(forces=(trained, Half(1.0), holding))
     fj.save(path, scene)
-    same(fj.load(path, (fresh, Half(2.0))), scene)
+    same(fj.load(path, (fresh, Half(2.0), Holding(fresh.network, 2.0))), scene)
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 import re
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
@@ -10,10 +11,11 @@ DOCS = Path(__file__).parents[1] / "docs"
 
 
 def run(page):
-    """Runs the Python blocks of a page and returns their names."""
+    """Runs the Python blocks of a page, with JAX's defaults; returns their names."""
     namespace = {}
-    for block in re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL):
-        exec(compile(block, page.name, "exec"), namespace)
+    with jax.numpy_rank_promotion("allow"):
+        for block in re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL):
+            exec(compile(block, page.name, "exec"), namespace)
     return namespace
 
 
@@ -95,3 +97,20 @@ def test_identification():
 def test_hard_cases():
     two = run(DOCS / "hard-cases.md")["two"]
     assert two.outcome.tolist() == ["successful", "not finite"]
+
+
+@pytest.mark.slow
+def test_recipes(tmp_path, monkeypatch):
+    (tmp_path / "docs").symlink_to(DOCS)
+    monkeypatch.chdir(tmp_path)
+    names = run(DOCS / "recipes.md")
+    assert names["response"].settling_time[0] < 1.5
+    assert names["value"] < 0.06
+    assert names["rewards"].shape == (500, 256) and names["done"].sum() >= 512
+    assert names["price"] < 0.15
+    assert names["found"].success and 35 < names["found"].fun < 37
+    np.testing.assert_allclose(names["state"].q, names["upright"], atol=1e-2)
+    assert (names["result"] == names["diffrax"].RESULTS.successful).all()
+    assert names["tuned"].tip_error < 0.02
+    assert names["parameters"].usable
+    np.testing.assert_allclose(names["parameters"].parameters["mass"], 1.4, rtol=2e-3)

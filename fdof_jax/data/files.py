@@ -237,12 +237,19 @@ def _object(place: str, value: Any) -> dict[str, Any]:
 
 
 def _has_other_arguments(value: Any) -> bool:
-    """Returns whether a module is not made from its fields, as a network is not."""
+    """Returns whether a user's module, or one in it, is not made from its fields.
+
+    A network is not, and so neither is an element that holds one.
+    """
     kind = type(value)
     told = getattr(kind, "arguments", Frozen.arguments) is not Frozen.arguments
-    if told or not isinstance(value, eqx.Module):
+    ours = kind.__module__.startswith(f"{_PACKAGE}.")
+    if told or ours or not isinstance(value, eqx.Module):
         return False
-    return not vars(value).keys() >= inspect.signature(kind).parameters.keys()
+    if not vars(value).keys() >= inspect.signature(kind).parameters.keys():
+        return True
+    inner = jax.tree.leaves(vars(value), is_leaf=lambda x: isinstance(x, eqx.Module))
+    return any(map(_has_other_arguments, inner))
 
 
 def _members(batch: Any) -> list[Any]:
