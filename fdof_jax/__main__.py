@@ -60,6 +60,8 @@ def main(arguments: list[str] | None = None) -> None:
         figure.savefig(output / f"{name}.png", dpi=150)
         plt.close(figure)
         print(output / f"{name}.png", flush=True)
+    first = (output / f"{name}.png" for name in _FIRST[options.command])
+    print("Open first:", *first)
 
 
 def _folder(text: str) -> Path:
@@ -74,10 +76,10 @@ def _figures() -> Iterator[tuple[str, Any]]:
     arm, motion = scenes.fig3().linkage, _motion(scenes.fig3())
     axes = drawing.chrono_cyclograph(arm, motion, until=1.5, mass_centers=True)
     yield "fig3", axes.figure
-    yield "fig4", plotting.motion_profile(arm, motion)
+    yield "fig4", plotting.motion_profile(arm, motion, absolute=True)
     arm, motion = scenes.fig5().linkage, _motion(scenes.fig5())
     yield ("fig5", drawing.chrono_cyclograph(arm, motion, until=1.5).figure)
-    yield "fig6-angles", plotting.motion_profile(arm, motion)
+    yield "fig6-angles", plotting.motion_profile(arm, motion, absolute=True)
     yield "fig6-energies", plotting.energy_profile(arm, motion)
     arm, _, (controller,), _ = scenes.fig7()
     motion = _motion(scenes.fig7())
@@ -104,6 +106,7 @@ def _motion(scene: Scene) -> Solution:
 
 
 _COMMANDS = {"figures": _figures, "topologies": _topologies}
+_FIRST = {"figures": ("fig3", "fig7"), "topologies": ("topologies",)}
 
 if __name__ == "__main__":
     main()

@@ -18,7 +18,10 @@ def test_figures(tmp_path, capsys):
     figures = "fig3 fig4 fig5 fig6-angles fig6-energies fig7".split()
     names = [f"{figure}.png" for figure in figures]
     assert pictures(tmp_path) == names
-    assert capsys.readouterr().out.split() == [str(tmp_path / name) for name in names]
+    *printed, last = capsys.readouterr().out.splitlines()
+    assert printed == [str(tmp_path / name) for name in names]
+    first = [str(tmp_path / name) for name in ("fig3.png", "fig7.png")]
+    assert last == " ".join(["Open first:", *first])
 
 
 def test_topologies(tmp_path):

@@ -123,6 +123,19 @@ def test_linkage_options():
     assert drawn["link 1"].get_alpha() == 0.5
 
 
+def test_chrono_cyclograph_writes_times_beside_tips():
+    arm, start, *_ = fj.scenes.fig5()
+    ts = np.linspace(0, 1.5, 151)
+    motion = fj.simulate(arm, start, ts)
+    ax = drawing.chrono_cyclograph(arm, motion)
+    texts = [text for text in ax.texts if text.get_gid() == "time"]
+    assert [text.get_text() for text in texts[:2]] == ["0 s", "1.5 s"]
+    assert 3 <= len(texts) <= 5
+    for text in texts:
+        k = np.abs(ts - float(text.get_text()[:-2])).argmin()
+        np.testing.assert_allclose(text.xy, fj.tip_position(arm, motion.q[k]))
+
+
 def test_chrono_cyclograph_takes_the_nearest_samples():
     linkage, solution = make_linkage("RPR"), swinging()
     ax = drawing.chrono_cyclograph(linkage, solution, every=0.1, until=0.3)

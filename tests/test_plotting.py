@@ -27,15 +27,37 @@ from fdof_jax import drawing, plotting
 TASK = fj.CircleTask([1, 1], 0.5, 2.0, 0.0)
 
 
+def test_motion_profile_shows_joints_by_their_names():
+    fig = plotting.motion_profile(make_linkage("RPR"), swinging(), title="An arm")
+    angles, slides = fig.axes
+    assert angles.get_ylabel() == "angle [degrees]"
+    assert labels(angles) == ["R1", "R3"] and labels(slides) == ["P2"]
+    q = np.asarray(swinging().q)
+    np.testing.assert_allclose(values(angles), np.rad2deg(q[:, [0, 2]].T))
+    assert fig.get_suptitle() == "An arm"
+
+
+def test_motion_profile_shows_references():
+    solution, start = swinging(), np.array([0.1, 0.2, 0.3])
+    step = fj.references.Step(start, start + 0.1, begin=0.5)
+    forces = (fj.control.FirstOrderLag(fj.PDController(9, 1, 1, step), 0.1),)
+    fig = plotting.motion_profile(make_linkage("RPR"), solution, forces=forces)
+    angles, slides = fig.axes
+    assert labels(angles) == ["R1", "R3", "reference"]
+    dashed = [line for line in slides.lines if line.get_linestyle() == "--"]
+    wanted = np.where(np.asarray(solution.ts) < 0.5, 0.2, 0.3)
+    np.testing.assert_allclose(dashed[0].get_ydata(), wanted)
+
+
 def test_motion_profile_shows_absolute_angles_in_degrees_and_slides():
     solution = swinging()
-    fig = plotting.motion_profile(make_linkage("RPR"), solution)
+    fig = plotting.motion_profile(make_linkage("RPR"), solution, absolute=True)
     angles, slides = fig.axes
     assert angles.get_ylabel() == "absolute angle [degrees]"
     assert slides.get_ylabel() == "slide [m]"
     assert slides.get_xlabel() == "time [s]"
     assert labels(angles) == [r"$\theta_1$", r"$\theta_3$"]
-    assert labels(slides) == ["$B_2$"]
+    assert labels(slides) == ["P2"]
     q = np.asarray(solution.q)
     th1, th3 = values(angles)
     np.testing.assert_allclose(th1, np.rad2deg(0.4 + q[:, 0]))
@@ -51,8 +73,8 @@ def test_motion_profile_names_what_is_held_once():
     modes[5:9, [0, 2]] = 1
     held = dataclasses.replace(solution, modes=jnp.asarray(modes))
     angles, slides = plotting.motion_profile(make_linkage("RPR"), held).axes
-    assert labels(angles) == [r"$\theta_1$", r"$\theta_3$", "held"]
-    assert labels(slides) == ["$B_2$"]
+    assert labels(angles) == ["R1", "R3", "held"]
+    assert labels(slides) == ["P2"]
     line, _, thick, *_ = values(angles)
     np.testing.assert_array_equal(np.flatnonzero(np.isfinite(thick)), range(5, 9))
     np.testing.assert_array_equal(thick[5:9], line[5:9])
@@ -77,7 +99,7 @@ def test_effort_profile_has_units_limits_and_saturation(kind):
     solution = dataclasses.replace(made_up(np.linspace(0, 1, 11), q), own=own)
     fig = plotting.effort_profile(make_linkage("RPR"), forces, solution)
     names = [ax.get_ylabel() for ax in fig.axes]
-    assert names == ["$T_1$ [N m]", "$F_2$ [N]", "$T_3$ [N m]"]
+    assert names == ["R1 [N m]", "P2 [N]", "R3 [N m]"]
     dots = [named(ax, f"saturated {k + 1}") for k, ax in enumerate(fig.axes)]
     assert len(dots[0][0].get_xydata()) == 0 and not dots[2]
     np.testing.assert_allclose(dots[1][0].get_ydata(), np.full(5, -300.0))
@@ -86,14 +108,26 @@ def test_effort_profile_has_units_limits_and_saturation(kind):
     assert low < -300 and high > 300
     texts = [note.get_title().get_text() for ax in fig.axes for note in notes(ax)]
     assert texts == ["limit ±1000 N m", "limit ±300 N"]
-    parts = {"total", "controller", "limits", "saturated"}
-    assert set(labels(fig.axes[0])) == parts
+    assert set(labels(fig.axes[0])) == {f"{kind}Controller", "limits", "saturated"}
     # The limits are those of the controller, not of what the damper adds.
     fast = dataclasses.replace(solution, qd=solution.qd + 1)
     fig = plotting.effort_profile(make_linkage("RPR"), forces, fast)
-    total, own = values(fig.axes[1])[:2]
-    np.testing.assert_allclose(total, own - 1)
+    own, damped = values(fig.axes[1])[:2]
+    np.testing.assert_allclose(damped, -1)
     np.testing.assert_array_equal(own[:5], -300)
+    assert labels(fig.axes[0])[:2] == [f"{kind}Controller", "JointDamper"]
+
+
+def test_effort_profile_shows_a_short_start_larger():
+    ts, q = np.linspace(0, 10, 1001), np.zeros((1001, 3))
+    q[:, 1] = np.exp(-5 * ts) * np.cos(30 * ts)
+    solution = made_up(ts, q)
+    forces = (fj.PDController(1e3, 0, 300, hold),)
+    fig = plotting.effort_profile(make_linkage("RPR"), forces, solution)
+    start, whole = np.reshape(fig.axes, (3, 2)).T
+    assert 0.2 < start[1].get_xlim()[1] < 1.5 and whole[1].get_xlim()[1] > 9
+    assert start[1].get_ylim() == whole[1].get_ylim()
+    np.testing.assert_array_equal(values(start[1])[0], values(whole[1])[0])
 
 
 def notes(ax):
@@ -118,13 +152,13 @@ def test_a_legend_takes_as_many_rows_as_it_needs():
     for words in (solutions, {2 * name: s for name, s in solutions.items()}):
         ax = plotting.tracking(LINKAGE, TASK, words)
         assert ax.get_legend().get_window_extent().x1 <= ax.figure.bbox.x1
-        assert len(labels(ax)) == 3
+        assert len(labels(ax)) == 4
 
 
 def test_tracking_and_its_error():
     solutions = {"paper": swinging(), "tuned": swinging(51, 0.5)}
     ax = plotting.tracking(LINKAGE, TASK, solutions)
-    assert labels(ax) == ["commanded", "paper", "tuned"]
+    assert labels(ax) == ["commanded", "paper", "tuned", "start"]
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("x [m]", "y [m]")
     curves = {line.get_label(): np.asarray(line.get_xydata()) for line in ax.lines}
     np.testing.assert_allclose(np.hypot(*(curves["commanded"] - [1, 1]).T), 0.5)
@@ -139,7 +173,7 @@ def test_tracking_and_its_error():
 
     given = plt.subplots()[1]
     ax = plotting.tracking_by_error(LINKAGE, TASK, swinging(), given)
-    assert ax is given and labels(ax) == ["commanded"]
+    assert ax is given and labels(ax) == ["start", "commanded"]
     (path,) = ax.collections
     pieces = np.stack([tips[:-1], tips[1:]], axis=1)
     np.testing.assert_allclose(path.get_segments(), pieces, atol=1e-12)

@@ -114,6 +114,18 @@ class Drive(StatefulElement):
         return effort, DriveState(rate, inner_rate)
 
 
+def controller_in(element: Any) -> PDController | None:
+    """Returns the controller that an element is, or holds as its command, if any.
+
+    Of a `PIDController` that is its PD part, which has the reference and the limits.
+    """
+    while isinstance(element, Drive):
+        element = element.command
+    if isinstance(element, PIDController):
+        return element.pd
+    return element if isinstance(element, PDController) else None
+
+
 class FirstOrderLag(Drive):
     """A drive whose effort follows its command with a first-order lag.
 

@@ -52,6 +52,11 @@ __all__ = [
 ]  # fmt: skip
 
 
+# Configurations with their time: so many, and so far apart, as a share of the picture.
+_MOST_TIMES, _APART = 5, 0.15
+_AHEAD = 13  # of the tip [points]
+
+
 def __dir__() -> list[str]:
     return __all__
 
@@ -111,7 +116,8 @@ def chrono_cyclograph(
 ) -> Axes:
     """Draws configurations at equal time steps, from faint to full, and the tip's path.
 
-    The picture is that of the paper's Figs 3, 5 and 7.
+    The picture is that of the paper's Figs 3, 5 and 7. A few configurations have their
+    time beside the tip.
 
     **Arguments:** `every`: time step [s], at which the nearest samples are drawn;
     `until`: last time, by default the solution's [s]; `mass_centers`: whether to draw
@@ -128,8 +134,26 @@ def chrono_cyclograph(
     indices = np.unique([np.abs(ts - t).argmin() for t in ts[0] + step * steps])
     ax = plane_axes(ax, g.all_points[: indices[-1] + 1])
     draw_motion(ax, g, indices, mass_centers)
+    _write_times(ax, ts, g, indices)
     legend(ax)
     return ax
+
+
+def _write_times(ax: Axes, ts: np.ndarray, g: Geometry, indices: np.ndarray) -> None:
+    """Writes its time beside the tip of a few configurations that are apart."""
+    written: list[complex] = []
+    for i in (indices[0], indices[-1], *indices[1:-1]):
+        if len(written) == _MOST_TIMES:
+            return
+        tip = g.tip[i]
+        if all(abs(tip - other) > _APART * g.extent for other in written):
+            written.append(tip)
+            ahead = _AHEAD * np.exp(1j * g.angle[i, -1])  # of the last link
+            ax.annotate(
+                f"{ts[i]:.3g} s", (tip.real, tip.imag), (ahead.real, ahead.imag),
+                textcoords="offset points", fontsize="x-small", ha="center",
+                va="center", gid="time",
+            )  # fmt: skip
 
 
 def _last(ts: np.ndarray, until: float | None) -> float:

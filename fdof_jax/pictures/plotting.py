@@ -22,12 +22,11 @@ from numpy.typing import ArrayLike
 
 from ..analysis.responses import StepAndSine
 from ..base.checks import instance, real_array, refusal, shown
-from ..control.drives import PIDController
-from ..control.pd import PDController
+from ..control.drives import controller_in
 from ..dynamics import link_energies
-from ..forces.element import Forces, elements
+from ..forces.element import Forces, ForeignElement, elements
 from ..linkage.linkage import Linkage, joint_names, moving_joints
-from ..references.reference import reference_of
+from ..references.reference import reference_motion, reference_of
 from ..references.task import TipReference
 from ..simulation.efforts import joint_efforts
 from ..simulation.sampled import Motion
@@ -57,45 +56,82 @@ __all__ = [
 ]  # fmt: skip
 
 
+# Efforts are shown larger while most of their changes are made, and a little longer, if
+# that is a short part of the time.
+_MOST, _ROOM, _SHORT = 0.85, 1.3, 0.25
+
+
 def __dir__() -> list[str]:
     return __all__
 
 
 def motion_profile(
-    linkage: Linkage, solution: Motion, fig: Figure | None = None
+    linkage: Linkage,
+    solution: Motion,
+    fig: Figure | None = None,
+    *,
+    forces: Forces = (),
+    absolute: bool = False,
+    title: str | None = None,
 ) -> Figure:
-    """Plots the motion of the real joints over time, as in the paper's Figs 4 and 6.
+    """Plots the motion of the joints over time, and the references that they follow.
 
-    One panel shows the angles of links on revolute joints from the x axis, not from the
-    link before as in `q` [degrees], another the slides of prismatic joints [m]; theta_k
-    and B_k are those of joint k. A thick line, "held" in the legend, marks where
-    something holds a joint.
+    One panel shows the angles of revolute joints [degrees], another the slides of
+    prismatic joints [m], by the joints' names. Dashed lines are references. A thick
+    line, "held" in the legend, marks where something holds a joint.
+
+    **Arguments:** `forces`: those of the solution, of which controllers have the
+    references; `absolute`: whether to show the angles of links from the x axis, theta_k
+    that of link k, as in the paper's Figs 4 and 6, instead of those from the link
+    before; `title`: of the figure.
     """
     ts, q, _ = reached(linkage, solution)
-    g = geometry(linkage, q)
-    angles, slides = [], []
-    for k, kind in enumerate(g.kinds, start=1):
-        if kind == "R":
-            degrees = np.rad2deg(g.angle[:, k])
-            angles.append((rf"$\theta_{k}$", degrees, link_color(k)))
-        elif kind == "P":
-            slides.append((f"$B_{k}$", q[:, k - 1], link_color(k)))
-    panels = [("absolute angle [degrees]", angles), ("slide [m]", slides)]
-    panels = [panel for panel in panels if panel[1]]
+    kinds, names = geometry(linkage, q[:1]).kinds, joint_names(linkage)
+    wanted = _references(linkage, forces, ts)
+
+    def shown(q: np.ndarray, k: int) -> np.ndarray:
+        if kinds[k] == "P":
+            return q[:, k]
+        angle = geometry(linkage, q).angle[:, k + 1] if absolute else q[:, k]
+        return np.rad2deg(angle)
+
+    panels, joints = [], []
+    angle = "absolute angle [degrees]" if absolute else "angle [degrees]"
+    for kind, ylabel in (("R", angle), ("P", "slide [m]")):
+        if of_kind := [k for k, one in enumerate(kinds) if one == kind]:
+            theta = absolute and kind == "R"
+            named = [rf"$\theta_{k + 1}$" if theta else names[k] for k in of_kind]
+            curves = [(shown(q, k), link_color(k + 1)) for k in of_kind]
+            panels.append((ylabel, [(n, *curve) for n, curve in zip(named, curves)]))
+            joints.append(of_kind)
     fig, axes = time_panels(fig, 0.6 + 1.9 * len(panels), ts, panels)
+    held = np.zeros(q.shape, bool)
     if isinstance(solution, Solution) and solution.modes is not None:
         held = np.asarray(solution.modes)[: len(ts)] > 0
-        numbered = list(enumerate(g.kinds))
-        joints = ([k for k, kind in numbered if kind == one] for one in "RP")
-        for ax, of in zip(axes, filter(None, joints)):
-            for line, k in zip(ax.lines, of):
-                values = np.where(held[:, k], line.get_ydata(), np.nan)
-                ax.plot(ts, values, color=line.get_color(), lw=4, alpha=0.5)
-            if held[:, of].any():
-                ax.plot([], [], color=GREY, lw=4, alpha=0.5, label="held")
-    for ax in axes:
+    for ax, of_kind in zip(axes, joints):
+        for line, k in zip(ax.lines[:], of_kind):
+            color = line.get_color()
+            for reference in wanted:
+                ax.plot(ts, shown(reference, k), "--", color=color, lw=0.9, zorder=3)
+            values = np.where(held[:, k], line.get_ydata(), np.nan)
+            if held[:, k].any():
+                ax.plot(ts, values, color=color, lw=4, alpha=0.5)
+        if wanted:
+            ax.plot([], [], "--", color=GREY, lw=0.9, label="reference")
+        if held[:, of_kind].any():
+            ax.plot([], [], color=GREY, lw=4, alpha=0.5, label="held")
         legend(ax)
+    if title is not None:
+        fig.suptitle(title)
     return fig
+
+
+def _references(linkage: Linkage, forces: Forces, ts: np.ndarray) -> list[np.ndarray]:
+    """Returns positions (time, n) of the references of all controllers."""
+    found = map(controller_in, elements("forces", forces))
+    references = [controller.reference for controller in found if controller]
+    motion = lambda r: jax.vmap(lambda t: reference_motion(r, t, linkage)[0])(ts)
+    return [np.asarray(motion(reference)) for reference in references]
 
 
 def energy_profile(
@@ -159,57 +195,89 @@ def energy_stack(
 def effort_profile(
     linkage: Linkage, forces: Forces, solution: Motion, fig: Figure | None = None
 ) -> Figure:
-    """Plots joint efforts over time with their limits, a panel per joint [N or N m].
+    """Plots the efforts of each element over time, a panel per joint [N or N m].
 
-    One curve is the total effort, of dampers and springs too. The grey band lies within
-    the finite limits of a `PDController`, `PIDController`, `GravityFeedforward` or
-    `ComputedTorque`; it fills the panel where the efforts stay far from the limits.
-    Where other elements act beside such a controller, a second curve is its own effort.
-    Orange dots mark samples at which the controller is at its limit.
+    The grey band lies within the finite limits of a controller, alone or in a drive;
+    it fills the panel where the efforts stay far from the limits. Orange dots mark
+    samples at which the controller is at its limit. If nearly all changes come soon
+    after the start, panels on the left show that time larger.
 
     **Arguments:** `forces`: those of the solution.
     """
     reached(linkage, solution)
+    forces = elements("forces", forces)
     efforts = joint_efforts(linkage, forces, solution)
     ts, total, parts = (np.asarray(a) for a in (solution.ts, *efforts))
-    limits = [_limits(element, total) for element in elements("forces", forces)]
-    panels, bands, moving = [], [], moving_joints(linkage)
-    for k in moving:
-        symbol, unit = ("T", "N m") if joint_names(linkage)[k][0] == "R" else ("F", "N")
-        own = [(row[k], part[:, k]) for row, part in zip(limits, parts)]
+    moving, joints = moving_joints(linkage), joint_names(linkage)
+    limits = [_limits(element, total) for element in forces]
+    named = [(name, part) for name, part in zip(_names(forces), parts) if part.any()]
+    named = named or [("none", total)]
+    busy = _busy_until(ts, np.stack([part for _, part in named]))
+    columns = 1 if busy is None else 2
+    fig = figure_or_new(fig, [3.5, 6.4][columns - 1], 5.2)
+    table = fig.subplots(
+        len(moving), columns, squeeze=False, sharex="col", sharey="row",
+        width_ratios=[1, 1.4][-columns:],
+    )  # fmt: skip
+    for k, row in zip(moving, table):
+        unit = "N m" if joints[k][0] == "R" else "N"
+        row[0].set_ylabel(f"{joints[k]} [{unit}]")
+        own = [(of[k], part[:, k]) for of, part in zip(limits, parts)]
         own = [(limit, effort) for limit, effort in own if np.isfinite(limit)]
-        curves = [("total", total[:, k], SERIES[0])]
-        if len(parts) > 1:
-            curves += [("controller", effort, SERIES[2]) for _, effort in own]
-        panels.append((f"${symbol}_{k + 1}$ [{unit}]", curves))
-        bands.append((own, unit))
-    fig, axes = time_panels(fig, 5.2, ts, panels)
-    for k, ax, (own, unit) in zip(moving, axes, bands):
-        low, high = ax.get_ylim()  # before the bands, which may be far wider
+        for ax in row:
+            for (name, part), color in zip(named, cycle((SERIES[0], *SERIES[2:]))):
+                ax.plot(ts, part[:, k], color=color, lw=1.2, label=name)
+        low, high = row[-1].get_ylim()  # before the bands, which may be far wider
         for limit, effort in own:
-            ax.axhspan(-limit, limit, color=GREY, alpha=0.15, lw=0, label="limits")
             at = (np.abs(effort) >= limit) & (effort != 0)
-            dots = ax.plot(ts[at], effort[at], ".", color=SERIES[1], zorder=3)
-            dots[0].set(label="saturated", gid=f"saturated {k + 1}")
+            for ax in row:
+                ax.axhspan(-limit, limit, color=GREY, alpha=0.15, lw=0, label="limits")
+                dots = ax.plot(ts[at], effort[at], ".", color=SERIES[1], zorder=3)
+                dots[0].set(label="saturated", gid=f"saturated {k + 1}")
             if at.any():
                 low, high = min(low, -1.1 * limit), max(high, 1.1 * limit)
-        ax.set_ylim(low, high)
+        row[-1].set_ylim(low, high)
         if own:  # as the title of a legend, which moves out of the curves' way
             text = "\n".join(f"limit ±{limit:g} {unit}" for limit, _ in own)
             note = Legend(
-                ax, [], [], title=text, title_fontproperties={"size": "small"},
+                row[-1], [], [], title=text, title_fontproperties={"size": "small"},
                 framealpha=0.7, edgecolor="none", borderaxespad=0.3, borderpad=0.1,
                 loc="best",
             )  # fmt: skip
-            ax.add_artist(note)
-    legend(axes[0], *axes)
+            row[-1].add_artist(note)
+    if busy is not None:
+        table[0, 0].set_xlim(ts[0], busy)
+    for ax in table[-1]:
+        ax.set_xlabel("time [s]")
+    fig.align_ylabels(table[:, 0])
+    legend(table[0, -1], *table.ravel())
     return fig
+
+
+def _names(forces: Forces) -> list[str]:
+    """Returns the names of the elements' classes, of plain functions their own."""
+    kinds = [e.called if isinstance(e, ForeignElement) else type(e) for e in forces]
+    return [getattr(kind, "__name__", type(kind).__name__) for kind in kinds]
+
+
+def _busy_until(ts: np.ndarray, efforts: np.ndarray) -> float | None:
+    """Returns the end of a short time in which nearly all changes are, if there is one.
+
+    `efforts`: (element, time, joint).
+    """
+    moves = np.abs(np.diff(efforts, axis=1))
+    moves = moves / np.maximum(np.ptp(efforts, axis=1, keepdims=True), 1e-300)
+    done = np.nan_to_num(moves).sum(axis=(0, 2)).cumsum()
+    if not done.size or not done[-1]:
+        return None
+    end = ts[0] + _ROOM * (ts[1:][np.searchsorted(done, _MOST * done[-1])] - ts[0])
+    return float(end) if end - ts[0] < _SHORT * (ts[-1] - ts[0]) else None
 
 
 def _limits(element: Any, total: np.ndarray) -> np.ndarray:
     """Limits of a controller's efforts (n,); infinite for other elements."""
-    pd = element.pd if isinstance(element, PIDController) else element
-    limit = pd.limit if isinstance(pd, PDController) else np.inf
+    controller = controller_in(element)
+    limit = np.inf if controller is None else controller.limit
     return np.broadcast_to(np.asarray(limit), total.shape[1])
 
 
@@ -303,6 +371,7 @@ def tracking(
     for (label, path), color in zip(paths.items(), cycle(free)):
         ax.plot(*xy(path), color=color, lw=1.2, label=label)
         ax.plot(*xy(path[:1]), "x", color=color, markersize=5)
+    ax.plot([], [], "x", color=GREY, markersize=5, label="start")
     legend(ax)
     return ax
 
@@ -330,7 +399,8 @@ def tracking_by_error(
     pieces.set_clim(0, error.max())
     ax.add_collection(pieces)
     ax.autoscale_view()
-    ax.plot(*corners[0], "x", color=_DARK_TO_LIGHT(pieces.norm(error[0])), ms=5)
+    color = _DARK_TO_LIGHT(pieces.norm(error[0]))
+    ax.plot(*corners[0], "x", color=color, ms=5, label="start")
     _draw_commanded(ax, commanded)
     # An inset is as high as the axes, which equal scales may shrink.
     bar = ax.inset_axes((1.04, 0, 0.05, 1))
