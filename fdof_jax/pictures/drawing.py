@@ -145,7 +145,7 @@ def _write_times(ax: Axes, ts: np.ndarray, g: Geometry, indices: np.ndarray) -> 
     for i in (indices[0], indices[-1], *indices[1:-1]):
         if len(written) == _MOST_TIMES:
             return
-        tip = g.tip[i]
+        tip = complex(g.tip[i])
         if all(abs(tip - other) > _APART * g.extent for other in written):
             written.append(tip)
             ahead = _AHEAD * np.exp(1j * g.angle[i, -1])  # of the last link
