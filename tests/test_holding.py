@@ -250,6 +250,7 @@ def test_modes_and_topologies_share_one_program_in_a_batch():
     assert [*table.columns] == ["motion", "t [s]", "joint", "event"]
     assert len(table) == mapped.events.count.sum()
     frame = fj.to_pandas(arms[0], alone)
+    np.testing.assert_array_equal(frame["taken [J]"], alone.taken)
     assert set(frame["R3 held by"]) <= {
         "free",
         "friction",

@@ -88,7 +88,7 @@ def to_pandas(linkage: Linkage, solution: Motion) -> "pandas.DataFrame":
 
     There is a column per joint position and velocity, named `R1 [rad]`, `P2 [m/s]` and
     so on; where elements hold joints, `R1 held by` tells by what (`free` if by
-    nothing). The last column is the `outcome` of the row's trajectory. The index is the
+    nothing), and `taken [J]` the energy that they have taken. The last column is the `outcome` of the row's trajectory. The index is the
     time, `time [s]`. For a batch, the levels before it are `batch` (or `batch_1`,
     `batch_2` and so on).
 
@@ -109,6 +109,7 @@ def to_pandas(linkage: Linkage, solution: Motion) -> "pandas.DataFrame":
         for k, name in enumerate(names_and_units(linkage.ef)[0]):
             modes = np.nan_to_num(np.asarray(solution.modes)[..., k].ravel())
             columns[f"{name} held by"] = np.array(MODES)[modes.astype(int)]
+        columns["taken [J]"] = np.asarray(solution.taken).ravel()
     columns["outcome"] = np.repeat(solution.outcome, len(times))
     index = pandas.Index(times, name="time [s]")
     if batch:
