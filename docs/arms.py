@@ -1,6 +1,5 @@
 """Makes arms.gif, the picture at the top of the README: `python docs/arms.py`."""
 
-import dataclasses
 from pathlib import Path
 
 import matplotlib
@@ -18,17 +17,15 @@ from fdof_jax.pictures.elements import COMMANDED
 fj.configure(x64=True)
 ts = np.linspace(0, 5, 501)  # one turn of the circle
 
-# The tuned arm is shown on its second turn, so the animation repeats without a jump.
 scene = fj.tune(fj.scenes.fig7()).scene
-turns = fj.simulate(scene.linkage, scene.state0, np.linspace(0, 10, 1001), scene.forces)
-second = dataclasses.replace(turns, ts=ts, q=turns.q[500:], qd=turns.qd[500:])
+circling = fj.simulate(scene.linkage, scene.state0, ts, scene.forces)
 pendulum = fj.scenes.fig5()
 fall = fj.simulate(pendulum.linkage, pendulum.state0, ts)
 
 figure = plt.figure(figsize=(7.2, 3.7), layout="constrained")
 animation = drawing.animate_grid(
     {
-        "RPR: gains tuned by gradients": (scene.linkage, second),
+        "RPR: gains tuned by gradients": (scene.linkage, circling),
         "RRR: a triple pendulum falls": (pendulum.linkage, fall),
     },
     figure,
