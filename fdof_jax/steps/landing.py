@@ -179,7 +179,10 @@ class Landing(eqx.Module):
         next_t1 = jnp.where(missed, crossing, next_t0 + length)
         next_t1, gap, cut = self._cut(constant(next_t0), next_t1, state.last)
         shortened = crossed | unsure
-        next_t1 = jnp.where(shortened, jnp.where(crossed, until, unseen), next_t1)
+        place = jnp.where(crossed, until, unseen)
+        # What a jump at a known time has switched switches with it, at once.
+        place = jnp.where(place == begin, t0, place)
+        next_t1 = jnp.where(shortened, place, next_t1)
         gap, aims = jnp.where(shortened, 0, gap), (cut | crossed | missed) & ~unsure
         # Time that passes meanwhile tells fast switching from chatter.
         paced = begin - state.since > state.pace
