@@ -129,7 +129,7 @@ def test_chrono_cyclograph_writes_times_beside_tips():
     motion = fj.simulate(arm, start, ts)
     ax = drawing.chrono_cyclograph(arm, motion)
     texts = [text for text in ax.texts if text.get_gid() == "time"]
-    assert [text.get_text() for text in texts[:2]] == ["0 s", "1.5 s"]
+    assert [text.get_text() for text in texts[:2]] == ["1.5 s", "0 s"]
     assert 3 <= len(texts) <= 5
     for text in texts:
         k = np.abs(ts - float(text.get_text()[:-2])).argmin()

@@ -401,15 +401,17 @@ def test_a_network_goes_through_a_file_by_its_numbers(path):
     scene = SCENE._replace(forces=(trained, Half(1.0), holding))
     fj.save(path, scene)
     same(fj.load(path, (fresh, Half(2.0), Holding(fresh.network, 2.0))), scene)
+    both = trained, Policy(3, width=4)  # told apart by their shapes
+    fj.save(path, both)
+    same(fj.load(path, (Policy(4, width=4), fresh)), both)
 
 
 @pytest.mark.parametrize(
     ("classes", "message"),
     [
         ((), r"tree\.Policy: expected load\(path, classes=\(\.\.\., one Policy\)\)"),
-        ((Policy,), r"one Policy\)\) for its numbers, got 'none'"),
-        ((Policy(1), Policy(2)), r"one Policy\)\) for its numbers, got \['Policy', "),
-        ((Policy(1, width=9),), r"numbers of shapes \[\(8, 6\), .* got \[\(9, 6\)"),
+        ((Policy,), r"one Policy\)\) for its numbers, got 'the class'"),
+        ((Policy(1, width=9),), r"numbers of shapes \[\(8, 6\), .* got \[\[\(9, 6\)"),
         (3, "classes: expected a tuple of classes, or of modules, got 3"),
     ],
 )

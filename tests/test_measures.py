@@ -41,6 +41,20 @@ def test_a_step_of_a_slide_is_that_of_a_second_order_system():
     assert found.saturated == 0 and found.joints == ("P1",)
 
 
+def test_a_step_between_samples_counts_from_its_time():
+    pd = PD.replace(reference=Step(0.0, [0.5], begin=0.0037))
+    coarse, fine = (
+        fj.analysis.response(
+            SLIDE, (pd,), fj.simulate(SLIDE, START, np.linspace(-0.5, 6, n), (pd,)),
+            since=0.0037,
+        )
+        for n in (651, 6501)
+    )  # fmt: skip
+    for name in ("step", "overshoot", "rise_time", "settling_time"):
+        one, other = getattr(coarse, name), getattr(fine, name)
+        np.testing.assert_allclose(one, other, rtol=2e-3)
+
+
 def test_a_load_leaves_a_steady_error():
     found = measured(PD, fj.JointEffort(3.2))
     np.testing.assert_allclose(found.steady_error, 3.2 / W**2, atol=2e-4)
@@ -85,6 +99,14 @@ def test_what_is_refused():
         response(SLIDE, (PD, PD), motion)
     with pytest.raises(ValueError, match="since: expected a time before .* 6 s"):
         response(SLIDE, (PD,), motion, since=6.0)
+    with pytest.raises(ValueError, match="solution: expected .* joints"):
+        response(fj.scenes.fig5().linkage, (PD,), motion)
+    batch = jax.tree.map(lambda leaf: np.asarray(leaf)[None], motion)
+    with pytest.raises(ValueError, match="solution: expected the Solution of one sim"):
+        response(SLIDE, (PD,), batch)
+    pid = fj.control.PIDController(1.0, 1.0, 1.0, 1.0, STEP)
+    with pytest.raises(ValueError, match="solution.own: expected the states"):
+        response(SLIDE, (pid,), motion)
     with pytest.raises(ValueError, match="solution: expected a computed motion"):
         jax.jit(lambda motion: response(SLIDE, (PD,), motion).step)(motion)
     stopped = fj.simulate(SLIDE, START, TS, (PD,), max_steps=3, throw=False)

@@ -110,6 +110,7 @@ def test_the_first_failure_is_the_outcome():
             ["first", "first"],
             r"motions\[1\]: .* one before ends, at 0.75 s, got .* 0 s",
         ),
+        (["first", "away"], r"motions\[1\]: .* positions .* got 'a gap of 1 m or rad'"),
         (["first", "other"], r"motions\[1\]: expected 2 joints and the batch \(\)"),
     ],
 )
@@ -119,6 +120,8 @@ def test_what_is_refused(motions, message):
         "first": fj.simulate(ARM, START, TS[:31]),
         "other": fj.simulate(arm, start, TS[30:]),
     }
+    there = fj.State(known["first"].q[-1] + np.array([0, 1]), known["first"].qd[-1])
+    known["away"] = fj.simulate(ARM, there, TS[30:])
     motions = [known.get(one, one) for one in motions]
     with pytest.raises(ValueError, match=message):
         concatenate(motions)

@@ -53,7 +53,7 @@ def test_motion_profile_shows_absolute_angles_in_degrees_and_slides():
     solution = swinging()
     fig = plotting.motion_profile(make_linkage("RPR"), solution, absolute=True)
     angles, slides = fig.axes
-    assert angles.get_ylabel() == "absolute angle [degrees]"
+    assert angles.get_ylabel() == "absolute angle\n[degrees]"
     assert slides.get_ylabel() == "slide [m]"
     assert slides.get_xlabel() == "time [s]"
     assert labels(angles) == [r"$\theta_1$", r"$\theta_3$"]

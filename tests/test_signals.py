@@ -90,6 +90,8 @@ def test_ramps_stand_before_and_after_their_times():
         (lambda r: r.Ramp([0.0], [[1.0]]), "ts: expected two or more increasing"),
         (lambda r: r.Ramp([0, 1], [[1.0]]), "q: expected 2 rows, one per time, got 1"),
         (lambda r: r.Step(0, np.nan), "after: expected"),
+        (lambda r: r.Step([0, 1], [0, 1, 2]), "after: expected as many numbers as be"),
+        (lambda r: r.Pulse([0, 1], [0, 1, 2], begin=0, end=1), "inside: expected as"),
     ],
 )
 def test_what_is_refused(make, message):
@@ -109,3 +111,70 @@ def test_one_program_serves_signals_of_an_arm():
     for q, motion in zip(poses, motions.q):
         alone = fj.simulate(arm, start, [0, 0.5], (with_reference(q),))
         np.testing.assert_allclose(motion, alone.q, atol=1e-8)
+
+
+# Jumps that throw a controller past its limit, at once
+
+
+def saturating(begin, **options):
+    """Returns where a slide is that 10 N have pushed since the step: a closed form."""
+    step = fj.references.Step([0.0], [1.0], begin=begin)
+    pd = fj.PDController([100.0], [0.0], 10.0, step)
+    start = fj.State([0.0], [0.0])
+    return fj.simulate(SLIDE, start, [0, 0.5], (pd,), **options).q[-1, 0]
+
+
+def test_the_time_of_a_jump_past_a_limit_has_derivatives():
+    begins = np.array([0.1, 0.2, 0.3])
+    value, slope = jax.vmap(jax.value_and_grad(saturating))(begins)
+    np.testing.assert_allclose(value, 5 * (0.5 - begins) ** 2)
+    np.testing.assert_allclose(slope, -10 * (0.5 - begins), rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_it_has_them_in_all_modes():
+    forward = lambda b: saturating(b, adjoint=diffrax.ForwardMode())
+    checkpoints = diffrax.RecursiveCheckpointAdjoint(checkpoints=1024)
+    backward = lambda b: saturating(b, adjoint=checkpoints)
+    for f in (jax.jacfwd(forward), jax.grad(backward)):
+        np.testing.assert_allclose(f(0.2), -3, rtol=1e-9)
+    for f in (jax.jacfwd(jax.jacfwd(forward)), jax.hessian(saturating)):
+        np.testing.assert_allclose(f(0.2), 10, rtol=1e-9)
+
+
+def blow(begin):
+    """Returns the end of a slide that a payload slows, so that its motor saturates."""
+    hurry = fj.references.SetPoint(0.0, 1.0)
+    motor = fj.PDController(0.0, 100.0, 1.0, hurry)
+    load = fj.forces.Payload(fj.Point(1, 0.0), mass=1.0, begin=begin)
+    start = fj.State([0.0], [1.0])
+    return fj.simulate(SLIDE, start, [0, 0.5], (motor, load)).q[-1, 0]
+
+
+def stopped(begin):
+    """Returns the end of two bars; a brake's blow saturates the other one's motor."""
+    arm = fj.scenes.double_pendulum().linkage.replace(gravity=0.0)
+    motor = fj.PDController([50.0, 0.0], [5.0, 0.0], [3.0, 0.0], lambda t, arm: (
+        jnp.array([t, 0.0]), jnp.array([1.0, 0.0])
+    ))  # fmt: skip
+    brake = fj.forces.Brake(2, begin=begin)
+    start = fj.State([0.0, 0.5], [1.0, 2.0])
+    return fj.simulate(arm, start, [0, 0.5], (motor, brake)).q[-1, 0]
+
+
+def pulse(end):
+    """Returns the end of a pulse that saturates a controller on both of its sides."""
+    inside = fj.references.Pulse([0.0], [1.0], begin=0.1, end=end)
+    pd = fj.PDController([100.0], [1.0], 10.0, inside)
+    start = fj.State([0.0], [0.0])
+    return fj.simulate(SLIDE, start, [0, 1.0], (pd,)).q[-1, 0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("end", [blow, stopped, pulse])
+def test_what_a_blow_or_a_pulse_saturates_has_derivatives(end):
+    h = 1e-4
+    one, two = (end(0.3 + k * h) - end(0.3 - k * h) for k in (1, 2))
+    np.testing.assert_allclose(
+        jax.grad(end)(0.3), (8 * one - two) / (12 * h), rtol=1e-6
+    )

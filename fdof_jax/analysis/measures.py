@@ -22,7 +22,9 @@ from ..linkage.linkage import (
     moving_joints,
 )
 from ..references.reference import reference_motion
+from ..simulation.efforts import check_own
 from ..simulation.field import element_effort
+from ..simulation.sampled import check_joints
 from ..simulation.solution import Solution
 
 BAND = 0.02  # around the final value, in which a response has settled
@@ -33,8 +35,8 @@ _STANDS = 1e-9  # changes of a reference that are less are none [m or rad]
 class Response(Report):
     """How joints followed the reference of their controller; prints itself.
 
-    Measures of a step are NaN for joints whose reference moves meanwhile, or has been
-    reached from the start.
+    Measures of a step are NaN for joints whose reference moves meanwhile, as with a
+    `Pulse` or a `Ramp`, or has been reached from the start.
 
     - `joints`: names of the moving joints, for instance R1.
     - `step`: from where the joint was to the final reference (joint,) [m or rad].
@@ -83,8 +85,8 @@ def response(
 
     **Arguments:**
 
-    - `linkage`, `solution`: the arm and its motion, with ten samples or more in the
-      fastest swing.
+    - `linkage`, `solution`: the arm and one motion of it by `simulate`, with ten
+      samples or more in the fastest swing.
     - `forces`: those of the solution. One of them is, or is a drive that holds, a
       `PDController`, `PIDController`, `GravityFeedforward` or `ComputedTorque`.
     - `since`: the time from which on the motion counts, as that of a step [s]; by
@@ -113,26 +115,37 @@ def response(
     instance("solution", solution, Solution)
     if is_traced(linkage, forces, solution, since):
         raise ValueError("solution: expected a computed motion, got a traced one.")
-    controller, efforts = _controller(linkage, elements("forces", forces), solution)
+    if np.ndim(solution.q) != 2:
+        expected = "the Solution of one simulate (of a batch, pass one member)"
+        raise refusal("solution", expected, solution)
+    check_joints("solution", solution, linkage)
+    forces = elements("forces", forces)
+    check_own("solution.own", solution.own, forces, linkage, solution.ts.shape)
+    controller, efforts = _controller(linkage, forces, solution)
     ts, last = np.asarray(solution.ts), float(solution.ts[-1])
     begin = max(float(real_array("since", since, (), finite=False, unit="s")), ts[0])
-    if (rows := ts >= begin).sum() < 2:
+    if not begin < last:
         raise refusal("since", f"a time before the last sample, at {last:g} s", since)
     if not np.isfinite(solution.q).all():
         expected = "a motion that reached its end"
         raise refusal("solution", expected, solution.outcome.tolist())
     moving, names = moving_joints(linkage), joint_names(linkage)
-    wanted, _ = jax.vmap(lambda t: reference_motion(controller.reference, t, linkage))(
-        ts
+    q, qd, efforts = (
+        np.asarray(table)[:, moving] for table in (solution.q, solution.qd, efforts)
     )
-    wanted, q, qd, efforts = (
-        np.asarray(table)[rows][:, moving]
-        for table in (wanted, solution.q, solution.qd, efforts)
+    path, efforts = (
+        scipy.interpolate.CubicHermiteSpline(ts, q, qd),
+        efforts[ts >= begin],
     )
+    ts = np.append(begin, ts[ts > begin])
+    q, qd, reference = path(ts), path(ts, 1), controller.reference
+    wanted, _ = jax.vmap(lambda t: reference_motion(reference, t, linkage))(ts)
+    wanted = np.asarray(wanted)[:, moving]
     error, step = q - wanted, wanted[-1] - q[0]
-    stands = (np.ptp(wanted[1:], axis=0) < _STANDS) & (np.abs(step) > _STANDS)
+    still = np.ptp(wanted[1:], axis=0) < _STANDS
+    stands = still & (np.abs(step) > _STANDS)
     measures = [
-        step_measures(ts[rows] - begin, change, rate, change[-1])
+        step_measures(ts - begin, change, rate, change[-1])
         if steps else (np.nan, np.nan, np.nan)
         for change, rate, steps in zip((q - q[0]).T, qd.T, stands)
     ]  # fmt: skip
@@ -140,7 +153,7 @@ def response(
     limits = np.broadcast_to(controller.limit, joints_of(linkage))[moving]
     return Response(
         joints=tuple(names[k] for k in moving),
-        step=step,
+        step=np.where(still, step, np.nan),
         overshoot=overshoot,
         rise_time=rise_time,
         settling_time=np.where(settled <= SETTLED * (last - begin), settled, np.nan),

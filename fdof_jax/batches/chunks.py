@@ -69,6 +69,8 @@ class Outcome(NamedTuple):
 
 def _check_value(value: Any) -> None:
     """Raises ValueError unless a reduction returned arrays of numbers."""
+    if not jax.tree.leaves(value):
+        raise refusal("reduce", "a function that returns arrays", value)
     for leaf in jax.tree.leaves(value):
         if not eqx.is_array_like(leaf):
             raise refusal("reduce", "a function that returns arrays", leaf)

@@ -108,7 +108,7 @@ def load(path: str | os.PathLike, classes: Sequence[Any] = ()) -> Any:
     - `path`: path of the file.
     - `classes`: a tuple of your own classes that the file names. In place of an
       `equinox.Module` whose numbers alone are in the file, as of a network, give an
-      instance: all else is taken from it.
+      instance with numbers of the same shapes: all else is taken from it.
 
     **Returns:** the tree, on the default device. Numbers are equal to the last bit.
     Arrays have JAX's default dtypes: float64 with double precision, float32 without,
@@ -352,15 +352,18 @@ def _with_numbers(
 ) -> Any:
     """Returns the module of this name among `classes`, with other numbers."""
     found = [k for k in classes if type(k).__name__ == name]
-    if len(found) != 1:
+    if not found:
         expected = f"load(path, classes=(..., one {plain(name)})) for its numbers"
-        raise refusal(place, expected, [type(k).__name__ for k in found] or "none")
-    old, rest = eqx.partition(found[0], is_number)
-    leaves, structure = jax.tree.flatten(old)
+        classes = [k for k in classes if isinstance(k, type) and k.__name__ == name]
+        raise refusal(place, expected, "the class" if classes else "none")
     new = [_value(f"{place}[{i}]", number, ()) for i, number in enumerate(node)]
-    if (given := [*map(np.shape, leaves)]) != (shapes := [*map(np.shape, new)]):
-        expected = f"numbers of shapes {shapes}, as in the file"
+    shapes = [*map(np.shape, new)]
+    given = [[*map(np.shape, jax.tree.leaves(eqx.filter(k, is_number)))] for k in found]
+    if shapes not in given:
+        expected = f"a {plain(name)} with numbers of shapes {shapes}, as in the file"
         raise refusal(place, expected, given)
+    old, rest = eqx.partition(found[given.index(shapes)], is_number)
+    leaves, structure = jax.tree.flatten(old)
     for index, leaf in enumerate(leaves):
         if eqx.is_array(leaf):
             new[index] = jnp.asarray(new[index], leaf.dtype)

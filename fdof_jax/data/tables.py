@@ -88,9 +88,9 @@ def to_pandas(linkage: Linkage, solution: Motion) -> "pandas.DataFrame":
 
     There is a column per joint position and velocity, named `R1 [rad]`, `P2 [m/s]` and
     so on; where elements hold joints, `R1 held by` tells by what (`free` if by
-    nothing), and `taken [J]` the energy that they have taken. The last column is the `outcome` of the row's trajectory. The index is the
-    time, `time [s]`. For a batch, the levels before it are `batch` (or `batch_1`,
-    `batch_2` and so on).
+    nothing), and `taken [J]` the energy that they have taken. The last column is the
+    `outcome` of the row's trajectory. The index is the time, `time [s]`. For a batch,
+    the levels before it are `batch` (or `batch_1`, `batch_2` and so on).
 
     **Arguments:** as in `to_xarray`.
 

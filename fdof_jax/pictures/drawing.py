@@ -142,7 +142,8 @@ def chrono_cyclograph(
 def _write_times(ax: Axes, ts: np.ndarray, g: Geometry, indices: np.ndarray) -> None:
     """Writes its time beside the tip of a few configurations that are apart."""
     written: list[complex] = []
-    for i in (indices[0], indices[-1], *indices[1:-1]):
+    ax.margins(0.15, 0.2)  # for the times
+    for i in (indices[-1], *indices[:-1]):
         if len(written) == _MOST_TIMES:
             return
         tip = complex(g.tip[i])

@@ -6,6 +6,7 @@ linkage itself.
 """
 
 from collections.abc import Mapping
+from inspect import isfunction
 from itertools import cycle
 from typing import Any, NamedTuple
 
@@ -29,7 +30,7 @@ from ..linkage.linkage import Linkage, joint_names, moving_joints
 from ..references.reference import reference_motion, reference_of
 from ..references.task import TipReference
 from ..simulation.efforts import joint_efforts
-from ..simulation.sampled import Motion
+from ..simulation.sampled import Motion, SampledMotion
 from ..simulation.solution import Solution
 from .arms import geometry, link_color
 from .axes import (
@@ -56,9 +57,9 @@ __all__ = [
 ]  # fmt: skip
 
 
-# Efforts are shown larger while most of their changes are made, and a little longer, if
-# that is a short part of the time.
-_MOST, _ROOM, _SHORT = 0.85, 1.3, 0.25
+# Efforts are shown larger while most of their changes are made, with some room, if that
+# is a short part of the time, but of many samples.
+_BUSY, _ROOM, _SHORT, _SAMPLES = (0.01, 0.85), 0.15, 0.25, 20
 
 
 def __dir__() -> list[str]:
@@ -96,7 +97,7 @@ def motion_profile(
         return np.rad2deg(angle)
 
     panels, joints = [], []
-    angle = "absolute angle [degrees]" if absolute else "angle [degrees]"
+    angle = "absolute angle\n[degrees]" if absolute else "angle [degrees]"
     for kind, ylabel in (("R", angle), ("P", "slide [m]")):
         if of_kind := [k for k, one in enumerate(kinds) if one == kind]:
             theta = absolute and kind == "R"
@@ -199,8 +200,8 @@ def effort_profile(
 
     The grey band lies within the finite limits of a controller, alone or in a drive;
     it fills the panel where the efforts stay far from the limits. Orange dots mark
-    samples at which the controller is at its limit. If nearly all changes come soon
-    after the start, panels on the left show that time larger.
+    samples at which the controller is at its limit. If nearly all changes come in a
+    short part of the time, panels on the left show it larger.
 
     **Arguments:** `forces`: those of the solution.
     """
@@ -210,11 +211,12 @@ def effort_profile(
     ts, total, parts = (np.asarray(a) for a in (solution.ts, *efforts))
     moving, joints = moving_joints(linkage), joint_names(linkage)
     limits = [_limits(element, total) for element in forces]
+    parts, held = [*parts], isinstance(solution, SampledMotion)
     named = [(name, part) for name, part in zip(_names(forces), parts) if part.any()]
     named = named or [("none", total)]
-    busy = _busy_until(ts, np.stack([part for _, part in named]))
+    busy = _busy(ts, np.stack([part for _, part in named]))
     columns = 1 if busy is None else 2
-    fig = figure_or_new(fig, [3.5, 6.4][columns - 1], 5.2)
+    fig = figure_or_new(fig, [3.5, 6.4][columns - 1], 1.0 + 1.4 * len(moving))
     table = fig.subplots(
         len(moving), columns, squeeze=False, sharex="col", sharey="row",
         width_ratios=[1, 1.4][-columns:],
@@ -226,7 +228,9 @@ def effort_profile(
         own = [(limit, effort) for limit, effort in own if np.isfinite(limit)]
         for ax in row:
             for (name, part), color in zip(named, cycle((SERIES[0], *SERIES[2:]))):
-                ax.plot(ts, part[:, k], color=color, lw=1.2, label=name)
+                (line,) = ax.plot(ts, part[:, k], color=color, lw=1.2, label=name)
+                if held and part is parts[0]:
+                    line.set_drawstyle("steps-post")
         low, high = row[-1].get_ylim()  # before the bands, which may be far wider
         for limit, effort in own:
             at = (np.abs(effort) >= limit) & (effort != 0)
@@ -246,7 +250,7 @@ def effort_profile(
             )  # fmt: skip
             row[-1].add_artist(note)
     if busy is not None:
-        table[0, 0].set_xlim(ts[0], busy)
+        table[0, 0].set_xlim(busy)
     for ax in table[-1]:
         ax.set_xlabel("time [s]")
     fig.align_ylabels(table[:, 0])
@@ -256,12 +260,12 @@ def effort_profile(
 
 def _names(forces: Forces) -> list[str]:
     """Returns the names of the elements' classes, of plain functions their own."""
-    kinds = [e.called if isinstance(e, ForeignElement) else type(e) for e in forces]
-    return [getattr(kind, "__name__", type(kind).__name__) for kind in kinds]
+    called = [e.called if isinstance(e, ForeignElement) else e for e in forces]
+    return [c.__name__ if isfunction(c) else type(c).__name__ for c in called]
 
 
-def _busy_until(ts: np.ndarray, efforts: np.ndarray) -> float | None:
-    """Returns the end of a short time in which nearly all changes are, if there is one.
+def _busy(ts: np.ndarray, efforts: np.ndarray) -> tuple[float, float] | None:
+    """Returns a short part of the time in which nearly all changes are, if any.
 
     `efforts`: (element, time, joint).
     """
@@ -270,8 +274,13 @@ def _busy_until(ts: np.ndarray, efforts: np.ndarray) -> float | None:
     done = np.nan_to_num(moves).sum(axis=(0, 2)).cumsum()
     if not done.size or not done[-1]:
         return None
-    end = ts[0] + _ROOM * (ts[1:][np.searchsorted(done, _MOST * done[-1])] - ts[0])
-    return float(end) if end - ts[0] < _SHORT * (ts[-1] - ts[0]) else None
+    first, last = np.searchsorted(done, np.array(_BUSY) * done[-1])
+    begin, end = ts[first], ts[last + 1]
+    room = _ROOM * (end - begin)
+    long = end - begin + 2 * room > _SHORT * (ts[-1] - ts[0])
+    if long or last - first < _SAMPLES:
+        return None
+    return float(max(begin - room, ts[0])), float(min(end + room, ts[-1]))
 
 
 def _limits(element: Any, total: np.ndarray) -> np.ndarray:

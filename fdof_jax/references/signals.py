@@ -34,6 +34,9 @@ class Step(Reference):
     after: Values = field(unit="m or rad")
     begin: Values = field((), unit="s", default=0.0, kw_only=True)
 
+    def conditions(self):
+        yield _of_one_length(before=self.before, after=self.after)
+
     @property
     def jump_ts(self) -> Array:
         """The time of the step [s]."""
@@ -69,6 +72,7 @@ class Pulse(Reference):
     def conditions(self):
         ends = self.begin, self.end
         yield Condition(self.begin < self.end, "begin", "less than end", ends)
+        yield _of_one_length(outside=self.outside, inside=self.inside)
 
     @property
     def jump_ts(self) -> Array:
@@ -118,6 +122,12 @@ class Ramp(Reference):
         before, behind = after == 0, after == len(self.ts)
         q = jnp.where(before, self.q[0], jnp.where(behind, self.q[-1], q))
         return q, jnp.where(before | behind, 0, rates)
+
+
+def _of_one_length(**positions: Array) -> Condition:
+    (first, other), (one, two) = positions, map(jnp.shape, positions.values())
+    fits = one == two or () in (one, two)
+    return Condition(fits, other, f"as many numbers as {first}", (one, two))
 
 
 def _standing(q: Array, linkage: Linkage) -> tuple[Array, Array]:

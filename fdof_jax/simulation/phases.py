@@ -15,6 +15,7 @@ from ..base.checks import instance, known, refusal
 from .solution import Events, Solution
 
 _MEETS = 1e-9  # a share of the time, within which two motions meet
+_GAP = 1e-5  # positions may be rounded on their way [m or rad]
 # How statistics of two phases are joined; numbers of steps and switches add up.
 _STATISTICS = {"accuracy": jnp.maximum, "slowest_crossing": jnp.minimum}
 
@@ -30,9 +31,11 @@ def concatenate(motions: Sequence[Solution]) -> Solution:
 
     **Returns:** their `Solution`. Its numbers of steps and switches are sums, and what
     was `taken` adds up. `own` is () unless elements with the same kinds of states act
-    in all phases. The result is that of the first phase that failed, if any.
+    in all phases. The result is that of the first phase that failed, if any; rows of
+    those after it stay as they are.
 
-    **Raises:** ValueError for malformed arguments, and unless known times meet.
+    **Raises:** ValueError for malformed arguments, and unless known times and positions
+    meet.
 
     >>> import fdof_jax as fj
     >>> import numpy as np
@@ -83,6 +86,12 @@ def _check_meeting(index: int, before: Solution, after: Solution) -> None:
     if known(end, begin) and not np.allclose(end, begin, _MEETS, _MEETS):
         expected = f"one that begins where the one before ends, at {np.max(end):g} s"
         raise refusal(name, expected, f"one that begins at {np.max(begin):g} s")
+    q, there = before.q[..., -1, :], after.q[..., 0, :]
+    if known(q, there):
+        gap = np.nanmax(np.abs(np.subtract(q, there)), initial=0)  # NaN after a failure
+        if gap > _GAP * (1 + np.nanmax(np.abs(q), initial=0)):
+            expected = "one that begins at the positions at which the one before ends"
+            raise refusal(name, expected, f"a gap of {gap:.3g} m or rad")
 
 
 def _rows(pieces: list[Array], axis: int) -> Array:
@@ -125,11 +134,10 @@ def _outcome(first: Any, second: Any) -> tuple[dict[str, Any], Any]:
 
 
 def _events(first: Events, second: Events) -> Events:
-    join = lambda name: jnp.concatenate(
-        [getattr(first, name), getattr(second, name)], -1
-    )
-    t, joint, kind = map(join, ("t", "joint", "kind"))
+    join = lambda *rows: jnp.concatenate(rows, axis=-1)
+    t = join(first.t, second.t)
     order = jnp.argsort(t, axis=-1)  # NaN comes last
     ordered = lambda row: jnp.take_along_axis(row, order, axis=-1)
+    joint, kind = join(first.joint, second.joint), join(first.kind, second.kind)
     count = first.count + second.count
     return Events(ordered(t), ordered(joint), ordered(kind), count)
