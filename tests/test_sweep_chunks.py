@@ -79,6 +79,15 @@ def test_the_forecast_follows_the_steps(batch, clean):
     assert np.corrcoef(found, steps)[0, 1] > 0.75
 
 
+def test_the_forecast_of_arms_that_friction_stops_is_their_energy():
+    speeds = np.linspace(0, 3, 7)
+    arm, starts = pendulums(speeds)
+    moving, shared, _ = batch_of(arm, starts, (fj.forces.JointFriction(0.5),), None)
+    found = chunks.expected_work(jax.numpy.asarray(TS), moving, shared)
+    inertia = float(fj.mass_matrix(arm, [0.0])[0, 0])
+    np.testing.assert_allclose(found - found[0], inertia * speeds**2 / 2, atol=1e-12)
+
+
 def test_one_forecast_serves_batches_of_all_sizes(monkeypatch):
     traces = []
     original = chunks.forward_dynamics

@@ -19,8 +19,10 @@ from jax.sharding import Mesh, SingleDeviceSharding
 
 from ..base.checks import refusal
 from ..base.configuration import wide_vectors
-from ..dynamics import forward_dynamics
+from ..dynamics import energy, forward_dynamics
+from ..forces.added_inertia import present
 from ..forces.element import elements
+from ..forces.holders import holders
 from ..linkage.topology import real_joints
 from ..simulation.field import element_effort
 from ..simulation.scene import Scene
@@ -179,20 +181,24 @@ def _solve(program: Any, *arguments: Any) -> Any:
 
 @eqx.filter_jit
 def expected_work(ts: Array, moving: Any, shared: Any) -> Array:
-    """Computes for each member a rate [1/s] that grows with its steps.
+    """Computes for each member a number that grows with its steps.
 
     It combines the joints' rates and accelerations, in the mean over the beginning of
-    the motion, which rough steps find.
+    the motion, which rough steps find [1/s]. Where elements hold joints it is the
+    energy [J], because most steps then end at events, and each takes a part of it.
     """
 
     def member(moving):
         linkage, (q, qd), forces = eqx.combine(moving, shared)
+        acting = elements("forces", forces)
+        if holders(acting):
+            return sum(energy(linkage, q, qd, present(acting, ts[0])))
         # Revolute joints cause most of the steps, slides hardly any.
         turning = jnp.stack(real_joints(linkage.ef))
 
         def at(t, q, qd):
             tau = jnp.zeros_like(q)
-            for index, element in enumerate(elements("forces", forces)):
+            for index, element in enumerate(acting):
                 state = element.initial_state(linkage)
                 tau = tau + element_effort(index, element, t, q, qd, linkage, state)[0]
             qdd = forward_dynamics(linkage, q, qd, tau, forces)
