@@ -192,7 +192,8 @@ def expected_work(ts: Array, moving: Any, shared: Any) -> Array:
         linkage, (q, qd), forces = eqx.combine(moving, shared)
         acting = elements("forces", forces)
         if holders(acting):
-            return sum(energy(linkage, q, qd, present(acting, ts[0])))
+            kinetic, potential = energy(linkage, q, qd, present(acting, ts[0]))
+            return kinetic + potential
         # Revolute joints cause most of the steps, slides hardly any.
         turning = jnp.stack(real_joints(linkage.ef))
 

@@ -57,7 +57,7 @@ from .store import Store, in_store, outline
 
 _CHUNK = 512  # half as many take 15 % longer on two cores: each call costs 0.5 ms
 # Steps with joints that are held need more memory, and members more unlike numbers of
-# them: 256 lanes take half as long again.
+# them.
 _CHUNK_HELD = 64
 
 

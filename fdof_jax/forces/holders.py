@@ -155,7 +155,8 @@ class Brake(Holder):
 
     **Arguments:**
 
-    - `joints`: the number of a joint, from 1, or several such numbers.
+    - `joints`: the number of a joint, from 1, or several such numbers; fixed pairs are
+      held in any case.
     - `begin`, `end`: times at which it takes hold and lets go [s]; by default it always
       has, and never does.
 
