@@ -18,8 +18,7 @@ __all__ = [
     "bandwidth", "closed_loop", "closed_loop_modes", "equilibrium", "holding_efforts",
     "inertia_ratios", "inertial_parameters", "joint_reactions", "Linearization",
     "linearize", "Margins", "margins", "Modes", "open_loop", "regressor",
-    "Response", "response",
-    "step_and_sine", "StepAndSine",
+    "Response", "response", "step_and_sine", "StepAndSine",
 ]  # fmt: skip
 
 

@@ -133,10 +133,8 @@ def response(
     q, qd, efforts = (
         np.asarray(table)[:, moving] for table in (solution.q, solution.qd, efforts)
     )
-    path, efforts = (
-        scipy.interpolate.CubicHermiteSpline(ts, q, qd),
-        efforts[ts >= begin],
-    )
+    path = scipy.interpolate.CubicHermiteSpline(ts, q, qd)
+    efforts = efforts[ts >= begin]
     ts = np.append(begin, ts[ts > begin])
     q, qd, reference = path(ts), path(ts, 1), controller.reference
     wanted, _ = jax.vmap(lambda t: reference_motion(reference, t, linkage))(ts)

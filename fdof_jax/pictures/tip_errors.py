@@ -1,0 +1,150 @@
+"""Pictures of the tip's path beside the commanded one, and of its distance from it."""
+
+from collections.abc import Mapping
+from itertools import cycle
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.colors import ListedColormap
+
+from ..base.checks import refusal, shown
+from ..linkage.linkage import Linkage
+from ..references.reference import reference_of
+from ..references.task import TipReference
+from ..simulation.sampled import Motion
+from .arms import geometry
+from .axes import (
+    GREY,
+    SERIES,
+    axes_or_new,
+    filled_mapping,
+    legend,
+    plane_axes,
+    reached,
+    xy,
+)  # fmt: skip
+from .elements import COMMANDED
+
+# Without the lightest colours, which are hard to see on white.
+_DARK_TO_LIGHT = ListedColormap(colormaps["plasma"](np.linspace(0, 0.85, 256)))
+
+
+class _Tip(NamedTuple):
+    """Times [s] and positions x + iy of a tip [m]: (time,)."""
+
+    ts: np.ndarray
+    commanded: np.ndarray
+    path: np.ndarray
+
+
+def _tip(linkage: Any, task: Any, solution: Any, name: str = "solution") -> _Tip:
+    if not callable(task) or (tip := reference_of(task).tip) is None:
+        raise refusal("task", "a CircleTask or a TipTask", task)
+    ts, q, _ = reached(linkage, solution, name)
+    commanded = np.asarray(jax.vmap(tip)(jnp.asarray(ts))) @ [1, 1j]
+    return _Tip(ts, commanded, geometry(linkage, q).tip)
+
+
+def _tips(linkage: Any, task: Any, solutions: Any) -> dict[Any, _Tip]:
+    filled_mapping("solutions", solutions, "Solution")
+    return {
+        label: _tip(linkage, task, solution, f"solutions[{shown(label)}]")
+        for label, solution in solutions.items()
+    }
+
+
+def _draw_commanded(ax: Axes, path: np.ndarray) -> None:
+    """Draws the commanded path dashed above the others, which show in its gaps."""
+    ax.plot(*xy(path), label="commanded", zorder=3, **COMMANDED)
+
+
+def tracking(
+    linkage: Linkage,
+    task: TipReference,
+    solutions: Mapping[str, Motion],
+    ax: Axes | None = None,
+) -> Axes:
+    """Plots paths of the tip with the commanded path, dashed; crosses are the starts.
+
+    Drawn into the axes of `chrono_cyclograph`, it adds the path of the paper's Fig 7,
+    in colours that no link has.
+
+    **Arguments:** `task`: a `CircleTask` or a `TipTask`, whose `tip(t)` is the
+    commanded tip position [m]; `solutions`: one curve per label.
+    """
+    tips = _tips(linkage, task, solutions)
+    longest = max((tip.commanded for tip in tips.values()), key=len)
+    paths = {label: tip.path for label, tip in tips.items()}
+    ax = plane_axes(ax, np.concatenate([longest, *paths.values()]))
+    _draw_commanded(ax, longest)
+    for line in [line for line in ax.lines if line.get_gid() == "tip path"]:
+        drawn = np.asarray(line.get_xydata()) @ [1, 1j]
+        if any(np.array_equal(path[: len(drawn)], drawn) for path in paths.values()):
+            line.remove()  # drawn again below
+    taken = {line.get_color() for line in ax.lines}
+    free = [color for color in SERIES if color not in taken] or SERIES
+    for (label, path), color in zip(paths.items(), cycle(free)):
+        ax.plot(*xy(path), color=color, lw=1.2, label=label)
+        ax.plot(*xy(path[:1]), "x", color=color, markersize=5)
+    ax.plot([], [], "x", color=GREY, markersize=5, label="start")
+    legend(ax)
+    return ax
+
+
+def tracking_by_error(
+    linkage: Linkage, task: TipReference, solution: Motion, ax: Axes | None = None
+) -> Axes:
+    """Plots the path of the tip, coloured by its distance from its set point [mm].
+
+    The dashed line is the commanded path; the cross is the tip's start. Later turns
+    cover earlier ones.
+
+    **Arguments:** `task`: as in `tracking`.
+
+    **Returns:** the axes, with a colour bar beside them.
+    """
+    _, commanded, path = _tip(linkage, task, solution)
+    error = 1000 * np.abs(path - commanded)
+    ax = plane_axes(ax, np.concatenate([commanded, path]), beside=0.8)
+    corners = np.column_stack(xy(path))
+    pieces = LineCollection(
+        list(np.stack([corners[:-1], corners[1:]], axis=1)),
+        array=(error[:-1] + error[1:]) / 2, cmap=_DARK_TO_LIGHT, lw=2, capstyle="round",
+    )  # fmt: skip
+    pieces.set_clim(0, error.max())
+    ax.add_collection(pieces)
+    ax.autoscale_view()
+    color = _DARK_TO_LIGHT(pieces.norm(error[0]))
+    ax.plot(*corners[0], "x", color=color, ms=5, label="start")
+    _draw_commanded(ax, commanded)
+    # An inset is as high as the axes, which equal scales may shrink.
+    bar = ax.inset_axes((1.04, 0, 0.05, 1))
+    ax.figure.colorbar(pieces, cax=bar, label="tip error [mm]")
+    legend(ax)
+    return ax
+
+
+def tracking_error(
+    linkage: Linkage,
+    task: TipReference,
+    solutions: Mapping[str, Motion],
+    ax: Axes | None = None,
+) -> Axes:
+    """Plots the distance of the tip from its set point over time [m].
+
+    **Arguments:** as in `tracking`.
+    """
+    tips = _tips(linkage, task, solutions)
+    ax = axes_or_new(ax, 2.6)
+    for (label, tip), color in zip(tips.items(), cycle(SERIES)):
+        error = np.abs(tip.path - tip.commanded)
+        ax.plot(tip.ts, error, color=color, lw=1.2, label=label)
+    ax.set(xlabel="time [s]", ylabel="tip error [m]")
+    ax.set_ylim(bottom=0)
+    legend(ax)
+    return ax
