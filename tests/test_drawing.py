@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import diffrax
 import equinox as eqx
 import jax.numpy as jnp
 import matplotlib
@@ -37,7 +38,8 @@ def made_up(ts, q, qd=None) -> Solution:
     """Returns a solution without a solve; figures use only times and joint states."""
     q = jnp.asarray(q, dtype=float)
     qd = jnp.zeros_like(q) if qd is None else jnp.asarray(qd, dtype=float)
-    return Solution(jnp.asarray(ts, dtype=float), q, qd, {}, None)  # type: ignore[arg-type]
+    done = diffrax.RESULTS.successful
+    return Solution(jnp.asarray(ts, dtype=float), q, qd, {}, done)
 
 
 def swinging(count=101, end=1.0) -> Solution:

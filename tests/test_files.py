@@ -411,6 +411,7 @@ def test_a_network_goes_through_a_file_by_its_numbers(path):
     [
         ((), r"tree\.Policy: expected load\(path, classes=\(\.\.\., one Policy\)\)"),
         ((Policy,), r"one Policy\)\) for its numbers, got 'the class'"),
+        ((Policy(1), Policy(2)), r"one Policy with numbers of .* got \[\[.*\], \["),
         ((Policy(1, width=9),), r"numbers of shapes \[\(8, 6\), .* got \[\[\(9, 6\)"),
         (3, "classes: expected a tuple of classes, or of modules, got 3"),
     ],

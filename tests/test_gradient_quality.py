@@ -157,6 +157,28 @@ def test_a_report_says_where_gains_have_no_effect():
     assert "P2 is at its limit throughout" in found.warnings[0]
 
 
+def test_a_reference_without_a_tip_is_judged_by_the_joints():
+    arm = fj.scenes.double_pendulum().linkage
+    step = fj.references.Step([-1.5, 0.0], [-1.3, 0.2], begin=0.05)
+    forces = (fj.PDController([60.0, 40.0], [20.0, 10.0], 30.0, step),)
+    scene = fj.Scene(arm, fj.State([-1.5, 0.0], [0, 0]), forces, 0.5)
+    found = fj.tuning.gradient_report(scene)
+    ts = np.linspace(0, 0.5, 1001)
+
+    def loss(logs):
+        gains = jnp.exp(logs)
+        pd = forces[0].replace(kp=gains[0], kd=gains[1])
+        motion = fj.simulate(arm, scene.state0, ts, (pd,), rtol=1e-10, atol=1e-10)
+        wanted = np.where(ts[:, None] < 0.05, step.before, step.after)
+        return jnp.mean(jnp.sum((motion.q - wanted) ** 2, axis=1))
+
+    exact = jax.grad(loss)(jnp.log(jnp.array([[60.0, 40.0], [20.0, 10.0]])))
+    size = np.linalg.norm(exact)
+    assert np.linalg.norm(found.gradient - exact) < 1e-4 * size and found.error < 1e-3
+    assert found.gradient_norm[-1] == pytest.approx(size, rel=1e-3)
+    assert found.horizons[-1] == 0.5
+
+
 class Pulse(fj.Element):
     """A torque from a time on, for a while."""
 

@@ -1,11 +1,14 @@
 """Sliders: the effect of a move, which compiles nothing, and messages on failures."""
 
+from base64 import b64encode
 from io import BytesIO
 
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
+import nbformat
 import numpy as np
 import pytest
+from nbconvert import HTMLExporter
 
 import fdof_jax as fj
 from fdof_jax.pictures.interactive import _moved, sliders
@@ -74,6 +77,17 @@ def test_the_error_is_that_of_a_simulation(box):
     solution = fj.simulate(scene.linkage, scene.state0, ts, scene.forces)
     rms = np.sqrt((np.asarray(fj.tuning.tip_errors(scene, solution)) ** 2).sum())
     assert f"rms {1e3 * rms:.3g} mm" in box.words.value
+
+
+def test_an_exported_notebook_has_a_still_picture():
+    box = sliders({"RRR": CIRCLES["RRR"]})
+    code = nbformat.v4.new_code_cell("")
+    data = box._repr_mimebundle_()
+    code.outputs.append(nbformat.v4.new_output("display_data", data))
+    page, _ = HTMLExporter().from_notebook_node(nbformat.v4.new_notebook(cells=[code]))
+    assert "application/vnd.jupyter.widget-view+json" in data
+    picture = box.children[1].children[0].value
+    assert b64encode(picture).decode() in page
 
 
 def test_nothing_is_compiled_after_the_first_picture(box, monkeypatch):

@@ -85,6 +85,40 @@ def test_a_reference_that_moves_has_errors_alone():
     assert after.largest_error < np.exp(-1) / W
 
 
+def test_sampled_control_is_measured_as_it_acted():
+    # A unit mass under efforts held for 1/8 s, which act a period late.
+    period, limit = 0.125, 0.8
+    pd = fj.PDController(2.0, 2.0, limit, Step(0.0, [0.5], begin=0.375))
+    q, qd, path, held = 0.0, 0.0, [], [0.0]
+    for k in range(200):
+        path.append(q)
+        wanted = 0.5 * (k * period >= 0.375)
+        held.append(np.clip(2 * (wanted - q) - 2 * qd, -limit, limit))
+        q, qd = q + period * qd + period**2 / 2 * held[k], qd + period * held[k]
+    path = np.array([*path, q])
+    lag = fj.control.FirstOrderLag(fj.JointDamper(0.0), 0.1)
+    for forces in ((), (lag,)):
+        motion = fj.simulate_sampled(
+            SLIDE, START, pd, period, 200, forces, delay=period
+        )
+        found = fj.analysis.response(SLIDE, (pd, *forces), motion, since=0.375)
+        np.testing.assert_allclose(found.step, 0.5, atol=1e-12)
+        at = np.abs(held[3:]) == limit
+        np.testing.assert_allclose(found.saturated, at.mean(), atol=1e-12)
+        assert 0 < at.sum() < 20
+        np.testing.assert_allclose(found.steady_error, path[-1] - 0.5, atol=1e-9)
+        error = path[3:] - 0.5
+        np.testing.assert_allclose(found.rms_error, np.sqrt(np.mean(error**2)))
+        within = abs(found.overshoot - (path.max() - 0.5) / 0.5)
+        assert within < 0.01 and found.overshoot > 0
+    # A drive that is sampled: its command has no state of its own in the motion.
+    drive = fj.control.FirstOrderLag(pd, 0.1)
+    motion = fj.simulate_sampled(SLIDE, START, drive, period, 100)
+    assert fj.analysis.response(SLIDE, (drive,), motion, since=0.375).overshoot > 0
+    with pytest.raises(ValueError, match="control, .forces. of a SampledMotion"):
+        fj.analysis.response(SLIDE, (), motion)
+
+
 def test_a_report_is_shown():
     text = str(measured(PD))
     assert text.count("\n") == 2 and "steady error" in text and "P1" in text
@@ -102,7 +136,7 @@ def test_what_is_refused():
     with pytest.raises(ValueError, match="solution: expected .* joints"):
         response(fj.scenes.fig5().linkage, (PD,), motion)
     batch = jax.tree.map(lambda leaf: np.asarray(leaf)[None], motion)
-    with pytest.raises(ValueError, match="solution: expected the Solution of one sim"):
+    with pytest.raises(ValueError, match="solution: expected one motion"):
         response(SLIDE, (PD,), batch)
     pid = fj.control.PIDController(1.0, 1.0, 1.0, 1.0, STEP)
     with pytest.raises(ValueError, match="solution.own: expected the states"):

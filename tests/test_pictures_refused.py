@@ -56,6 +56,8 @@ REFUSED = [
     ("forces", partial(drawing.inertia_ellipses, forces=3), LINKAGE, [Q]),
     ("linkage", plotting.motion_profile, "RRR", SOLUTION),
     ("solution", plotting.motion_profile, LINKAGE, BATCH),
+    ("absolute", partial(plotting.motion_profile, absolute="yes"), *PAIR),
+    ("title", partial(plotting.motion_profile, title=3), *PAIR),
     ("linkage", plotting.energy_profile, None, SOLUTION),
     ("solution", plotting.energy_profile, LINKAGE, NOWHERE),
     ("fig", plotting.energy_profile, *PAIR, 1),

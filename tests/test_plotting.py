@@ -8,7 +8,6 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from chains import random_chain
-from matplotlib.legend import Legend
 from test_drawing import (
     LINKAGE,
     labels,
@@ -45,8 +44,47 @@ def test_motion_profile_shows_references():
     angles, slides = fig.axes
     assert labels(angles) == ["R1", "R3", "reference"]
     dashed = [line for line in slides.lines if line.get_linestyle() == "--"]
-    wanted = np.where(np.asarray(solution.ts) < 0.5, 0.2, 0.3)
-    np.testing.assert_allclose(dashed[0].get_ydata(), wanted)
+    ts, wanted = dashed[0].get_data()
+    np.testing.assert_allclose(wanted, np.where(ts < 0.5, 0.2, 0.3))
+
+
+def test_a_reference_that_jumps_between_samples_is_drawn_upright():
+    step = fj.references.Step([0.0, 1.0, 0.5], [1.0, 1.0, 0.0], begin=0.33)
+    forces = (fj.PDController(1.0, 0.0, 1.0, step),)
+    angles, _ = plotting.motion_profile(
+        make_linkage("RPR"), swinging(5), forces=forces
+    ).axes
+    dashed = [line for line in angles.lines if line.get_linestyle() == "--"][0]
+    ts, wanted = dashed.get_data()
+    moves = np.flatnonzero(np.diff(wanted))
+    assert len(moves) == 1 and ts[moves[0] + 1] == 0.33
+    assert 0 < ts[moves[0] + 1] - ts[moves[0]] < 1e-12
+
+
+def test_a_motion_that_ended_early_says_so_in_every_picture():
+    scene = fj.scenes.fig7()
+    arm, _, forces, _ = scene
+    ts = np.linspace(0, 2, 401)
+    short = fj.simulate(scene, ts, max_steps=60, throw=False)
+    last = ts[np.isfinite(short.q[:, 0])][-1]
+    text = f"ended at {last:.3g} s:\nout of steps"
+    task, finer = forces[0].reference, pytest.warns(UserWarning, match="closer")
+    with finer:
+        stack = plotting.energy_stack(arm, forces, short)
+    over_time = [
+        *plotting.motion_profile(arm, short).axes,
+        plotting.energy_profile(arm, short).axes[0],
+        plotting.effort_profile(arm, forces, short).axes[0],
+        stack,
+    ]
+    for ax in over_time:
+        assert any(text == t.get_text() for t in ax.get_legend().get_texts())
+        (line,) = named(ax, "end")
+        assert line.get_xdata()[0] == last and ax.get_xlim()[1] == 2
+    assert f"a, {text}" in labels(plotting.tracking(arm, task, {"a": short}))
+    assert text in labels(drawing.chrono_cyclograph(arm, short))
+    whole = fj.simulate(scene, ts)
+    assert not named(plotting.motion_profile(arm, whole).axes[0], "end")
 
 
 def test_motion_profile_shows_absolute_angles_in_degrees_and_slides():
@@ -99,15 +137,13 @@ def test_effort_profile_has_units_limits_and_saturation(kind):
     solution = dataclasses.replace(made_up(np.linspace(0, 1, 11), q), own=own)
     fig = plotting.effort_profile(make_linkage("RPR"), forces, solution)
     names = [ax.get_ylabel() for ax in fig.axes]
-    assert names == ["R1 [N m]", "P2 [N]", "R3 [N m]"]
+    assert names == ["R1 [N m]\nlimit ±1000", "P2 [N]\nlimit ±300", "R3 [N m]"]
     dots = [named(ax, f"saturated {k + 1}") for k, ax in enumerate(fig.axes)]
     assert len(dots[0][0].get_xydata()) == 0 and not dots[2]
     np.testing.assert_allclose(dots[1][0].get_ydata(), np.full(5, -300.0))
     assert [len(ax.patches) for ax in fig.axes] == [1, 1, 0]
     low, high = fig.axes[1].get_ylim()
     assert low < -300 and high > 300
-    texts = [note.get_title().get_text() for ax in fig.axes for note in notes(ax)]
-    assert texts == ["limit ±1000 N m", "limit ±300 N"]
     assert set(labels(fig.axes[0])) == {f"{kind}Controller", "limits", "saturated"}
     # The limits are those of the controller, not of what the damper adds.
     fast = dataclasses.replace(solution, qd=solution.qd + 1)
@@ -128,23 +164,6 @@ def test_effort_profile_shows_a_short_start_larger():
     assert 0.2 < start[1].get_xlim()[1] < 1.5 and whole[1].get_xlim()[1] > 9
     assert start[1].get_ylim() == whole[1].get_ylim()
     np.testing.assert_array_equal(values(start[1])[0], values(whole[1])[0])
-
-
-def notes(ax):
-    return [note for note in ax.findobj(Legend) if note is not ax.get_legend()]
-
-
-def test_the_limit_is_written_where_no_curve_is():
-    ts, q = np.linspace(0, 1, 101), np.zeros((101, 3))
-    q[60:, 1] = 0.1  # a negative effort, late
-    q[:, 2] = 0.1 * np.sign(ts - 0.5)
-    solution, forces = made_up(ts, q), (fj.PDController(1e3, 0, 300, hold),)
-    for ax in plotting.effort_profile(LINKAGE, forces, solution).axes:
-        (note,) = notes(ax)
-        place = note.get_window_extent().transformed(ax.transData.inverted())
-        assert not place.count_contains(ax.lines[0].get_xydata())
-    free = plotting.effort_profile(LINKAGE, (), solution)
-    assert not any(np.any(values(ax)) or notes(ax) for ax in free.axes)
 
 
 def test_a_legend_takes_as_many_rows_as_it_needs():

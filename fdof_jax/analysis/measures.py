@@ -9,7 +9,7 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from ..base.checks import instance, is_traced, real_array, refusal
+from ..base.checks import is_traced, real_array, refusal
 from ..base.report import Report
 from ..control.drives import Drive, PIDController
 from ..control.pd import PDController
@@ -24,8 +24,7 @@ from ..linkage.linkage import (
 from ..references.reference import reference_motion
 from ..simulation.efforts import check_own
 from ..simulation.field import element_effort
-from ..simulation.sampled import check_joints
-from ..simulation.solution import Solution
+from ..simulation.sampled import Motion, acting_in, check_joints
 
 BAND = 0.02  # around the final value, in which a response has settled
 SETTLED = 0.9  # part of the duration before which it has to
@@ -76,7 +75,7 @@ class Response(Report):
 
 
 def response(
-    linkage: Linkage, forces: Forces, solution: Solution, *, since: ArrayLike = -np.inf
+    linkage: Linkage, forces: Forces, solution: Motion, *, since: ArrayLike = -np.inf
 ) -> Response:
     """Measures how a motion followed the reference of its controller.
 
@@ -85,10 +84,11 @@ def response(
 
     **Arguments:**
 
-    - `linkage`, `solution`: the arm and one motion of it by `simulate`, with ten
-      samples or more in the fastest swing.
-    - `forces`: those of the solution. One of them is, or is a drive that holds, a
-      `PDController`, `PIDController`, `GravityFeedforward` or `ComputedTorque`.
+    - `linkage`, `solution`: the arm and one motion of it, with ten samples or more in
+      the fastest swing.
+    - `forces`: those of the solution, of a `SampledMotion` `(control, *forces)`. One
+      of them is, or is a drive that holds, a `PDController`, `PIDController`,
+      `GravityFeedforward` or `ComputedTorque`.
     - `since`: the time from which on the motion counts, as that of a step [s]; by
       default all of it does.
 
@@ -112,16 +112,16 @@ def response(
     0.987
     """
     check_linkage(linkage)
-    instance("solution", solution, Solution)
     if is_traced(linkage, forces, solution, since):
         raise ValueError("solution: expected a computed motion, got a traced one.")
-    if np.ndim(solution.q) != 2:
-        expected = "the Solution of one simulate (of a batch, pass one member)"
-        raise refusal("solution", expected, solution)
     check_joints("solution", solution, linkage)
+    if np.ndim(solution.q) != 2:
+        expected = "one motion (of a batch, pass one member)"
+        raise refusal("solution", expected, solution)
     forces = elements("forces", forces)
-    check_own("solution.own", solution.own, forces, linkage, solution.ts.shape)
-    controller, efforts = _controller(linkage, forces, solution)
+    acting = acting_in(solution, forces)
+    check_own("solution.own", solution.own, acting, linkage, solution.ts.shape)
+    controller, efforts = _controller(linkage, forces, acting, solution)
     ts, last = np.asarray(solution.ts), float(solution.ts[-1])
     begin = max(float(real_array("since", since, (), finite=False, unit="s")), ts[0])
     if not begin < last:
@@ -163,28 +163,30 @@ def response(
 
 
 def _controller(
-    linkage: Linkage, forces: Forces, solution: Solution
+    linkage: Linkage, forces: Forces, acting: Forces, solution: Motion
 ) -> tuple[PDController, Array]:
     """Returns the controller among elements, and its efforts along a motion.
 
-    It may be the command of a drive, whose states have the command's.
+    It may be the command of a drive, whose states have the command's. In its place,
+    `acting` has the held efforts of sampled control.
     """
     found: list[Any] = []
     states: Any = iter(solution.own)
-    for element in forces:
-        stateful = isinstance(element, StatefulElement)
-        state: Any = next(states) if stateful else ()
+    for element, acts in zip(forces, acting):
+        state: Any = next(states) if isinstance(acts, StatefulElement) else ()
         while isinstance(element, Drive):
-            element, state = element.command, state.command
+            element = element.command
+            if isinstance(acts, Drive):
+                acts, state = element, state.command
         if isinstance(element, PDController | PIDController):
-            found.append((element, state))
+            found.append((element, acts, state))
     if len(found) != 1:
         expected = "one controller with a reference, or one drive that holds one"
         raise refusal("forces", expected, forces)
-    ((element, state),) = found
+    ((element, acts, state),) = found
 
     def effort(t: Array, q: Array, qd: Array, state: Any) -> Array:
-        return element_effort(0, element, t, q, qd, linkage, state)[0]
+        return element_effort(0, acts, t, q, qd, linkage, state)[0]
 
     efforts = jax.vmap(effort)(solution.ts, solution.q, solution.qd, state)
     return element.pd if isinstance(element, PIDController) else element, efforts

@@ -108,7 +108,8 @@ def load(path: str | os.PathLike, classes: Sequence[Any] = ()) -> Any:
     - `path`: path of the file.
     - `classes`: a tuple of your own classes that the file names. In place of an
       `equinox.Module` whose numbers alone are in the file, as of a network, give an
-      instance with numbers of the same shapes: all else is taken from it.
+      instance with numbers of the same shapes, and only one of its class with these
+      shapes: all else is taken from it.
 
     **Returns:** the tree, on the default device. Numbers are equal to the last bit.
     Arrays have JAX's default dtypes: float64 with double precision, float32 without,
@@ -362,6 +363,10 @@ def _with_numbers(
     if shapes not in given:
         expected = f"a {plain(name)} with numbers of shapes {shapes}, as in the file"
         raise refusal(place, expected, given)
+    if given.count(shapes) > 1:  # their other parts may differ
+        raise refusal(
+            place, f"one {plain(name)} with numbers of shapes {shapes}", given
+        )
     old, rest = eqx.partition(found[given.index(shapes)], is_number)
     leaves, structure = jax.tree.flatten(old)
     for index, leaf in enumerate(leaves):

@@ -34,6 +34,23 @@ def reached(linkage: Any, solution: Any, name: str = "solution") -> list[np.ndar
     return [array[finite] for array in arrays]
 
 
+def ending(solution: Motion) -> str:
+    """Says in a legend when and why a motion ended early; "" if it did not."""
+    finite = np.isfinite(np.asarray(solution.q)).all(axis=1)
+    if finite.all():
+        return ""
+    last = np.asarray(solution.ts)[finite][-1]
+    return f"ended at {last:.3g} s:\n{solution.outcome}"
+
+
+def mark_end(axes: Iterable[Axes], solution: Motion, last: float) -> None:
+    """Marks the last time reached, if a motion ended early, in axes over time."""
+    if text := ending(solution):
+        for ax in axes:
+            ax.axvline(last, color=SERIES[1], ls=":", lw=1.2, label=text, gid="end")
+            ax.set_xlim(right=float(solution.ts[-1]))
+
+
 def filled_mapping(name: str, value: Any, kind: str) -> Mapping:
     """Returns `value` if it is a nonempty dictionary, else raises ValueError."""
     if not isinstance(value, Mapping) or not value:
@@ -122,7 +139,8 @@ _LEGEND: dict[str, Any] = dict(fontsize="small", frameon=False, handlelength=1.2
 def legend(ax: Axes, *others: Axes) -> None:
     """Adds a legend of all labels above the axes, where it hides nothing."""
     entries, figure = _entries((ax, *others)), figure_of(ax)
-    columns = max(1, 48 // (4 + max(map(len, entries))))
+    widest = max(len(line) for label in entries for line in label.splitlines())
+    columns = max(1, 48 // (4 + widest))
     rows = -(-len(entries) // columns)
     while True:
         columns = -(-len(entries) // rows)  # makes rows of even length

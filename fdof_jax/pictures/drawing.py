@@ -35,6 +35,7 @@ from .axes import (
     BLACK,
     GREY,
     SERIES,
+    ending,
     figure_legend,
     figure_of,
     figure_or_new,
@@ -135,6 +136,8 @@ def chrono_cyclograph(
     ax = plane_axes(ax, g.all_points[: indices[-1] + 1])
     draw_motion(ax, g, indices, mass_centers)
     _write_times(ax, ts, g, indices)
+    if text := ending(solution):
+        ax.plot([], [], " ", label=text)
     legend(ax)
     return ax
 

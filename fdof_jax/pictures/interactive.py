@@ -1,5 +1,6 @@
 """Sliders for a notebook, and the picture they redraw."""
 
+from base64 import b64encode
 from collections.abc import Mapping
 from io import BytesIO
 from typing import Any, NamedTuple
@@ -186,7 +187,9 @@ def sliders(scenes: Mapping[str, Scene] | None = None) -> Any:
     **Arguments:** `scenes`: name -> a scene with exactly one PD controller, tracking a
     task with a `tip`; by default `circle_scenes()`, one arm per topology.
 
-    **Returns:** an ipywidgets `Box`, shown if it is the last line of a cell.
+    **Returns:** an ipywidgets `Box`, shown if it is the last line of a cell. Pages that
+    cannot show it, as an exported notebook without the state of its widgets, show the
+    picture as it was.
 
     **Raises:** ImportError without ipywidgets; ValueError for malformed arguments.
     """
@@ -237,5 +240,13 @@ def sliders(scenes: Mapping[str, Scene] | None = None) -> Any:
     of_lengths = widgets.HTML("Lengths of the links, times the scene's:")
     of_gains = widgets.HTML("Gains of the joints, times the scene's:")
     controls = widgets.VBox([arm, of_lengths, *lengths, of_gains, *gains])
+
+    class Sliders(widgets.Box):
+        """The box, with its first picture for pages that cannot show widgets."""
+
+        def _repr_mimebundle_(self, **kwargs: Any) -> dict[str, Any]:
+            still = {"image/png": b64encode(image.value).decode()}
+            return super()._repr_mimebundle_(**kwargs) | still
+
     layout = widgets.Layout(flex_flow="row wrap")
-    return widgets.Box([controls, widgets.VBox([image, words])], layout=layout)
+    return Sliders([controls, widgets.VBox([image, words])], layout=layout)

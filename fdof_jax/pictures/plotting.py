@@ -14,7 +14,6 @@ import jax
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.legend import Legend
 from numpy.typing import ArrayLike
 
 from ..analysis.responses import StepAndSine
@@ -23,7 +22,7 @@ from ..control.drives import controller_in
 from ..dynamics import link_energies
 from ..forces.element import Forces, ForeignElement, elements
 from ..linkage.linkage import Linkage, joint_names, moving_joints
-from ..references.reference import reference_motion
+from ..references.reference import reference_motion, reference_of
 from ..simulation.efforts import joint_efforts
 from ..simulation.sampled import Motion, SampledMotion
 from ..simulation.solution import Solution
@@ -37,6 +36,7 @@ from .axes import (
     figure_or_new,
     filled_mapping,
     legend,
+    mark_end,
     reached,
     time_panels,
 )
@@ -80,6 +80,9 @@ def motion_profile(
     before; `title`: of the figure.
     """
     ts, q, _ = reached(linkage, solution)
+    instance("absolute", absolute, bool)
+    if title is not None:
+        instance("title", title, str)
     kinds, names = geometry(linkage, q[:1]).kinds, joint_names(linkage)
     wanted = _references(linkage, forces, ts)
 
@@ -105,8 +108,8 @@ def motion_profile(
     for ax, of_kind in zip(axes, joints):
         for line, k in zip(ax.lines[:], of_kind):
             color = line.get_color()
-            for reference in wanted:
-                ax.plot(ts, shown(reference, k), "--", color=color, lw=0.9, zorder=3)
+            for times, path in wanted:
+                ax.plot(times, shown(path, k), "--", color=color, lw=0.9, zorder=3)
             values = np.where(held[:, k], line.get_ydata(), np.nan)
             if held[:, k].any():
                 ax.plot(ts, values, color=color, lw=4, alpha=0.5)
@@ -114,18 +117,31 @@ def motion_profile(
             ax.plot([], [], "--", color=GREY, lw=0.9, label="reference")
         if held[:, of_kind].any():
             ax.plot([], [], color=GREY, lw=4, alpha=0.5, label="held")
+    mark_end(axes, solution, ts[-1])
+    for ax in axes:
         legend(ax)
     if title is not None:
         fig.suptitle(title)
     return fig
 
 
-def _references(linkage: Linkage, forces: Forces, ts: np.ndarray) -> list[np.ndarray]:
-    """Returns positions (time, n) of the references of all controllers."""
-    found = map(controller_in, elements("forces", forces))
-    references = [controller.reference for controller in found if controller]
-    motion = lambda r: jax.vmap(lambda t: reference_motion(r, t, linkage)[0])(ts)
-    return [np.asarray(motion(reference)) for reference in references]
+def _references(
+    linkage: Linkage, forces: Forces, ts: np.ndarray
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Returns times and positions (time, n) of the references of all controllers.
+
+    A reference that jumps has times at its jumps and right before them.
+    """
+    paths = []
+    for controller in map(controller_in, elements("forces", forces)):
+        if controller:
+            jumps = reference_of(controller.reference).jump_ts
+            jumps = np.zeros(0) if jumps is None else np.asarray(jumps)
+            jumps = jumps[(ts[0] < jumps) & (jumps <= ts[-1])]
+            times = np.unique(np.concatenate([ts, np.nextafter(jumps, -np.inf), jumps]))
+            at = lambda t, r=controller.reference: reference_motion(r, t, linkage)[0]
+            paths.append((times, np.asarray(jax.vmap(at)(times))))
+    return paths
 
 
 def energy_profile(
@@ -144,7 +160,8 @@ def energy_profile(
         ("potential energy [J]", list(zip(names, potential.T, colors))),
         ("of all links [J]", list(whole)),
     ]
-    fig, (top, _, bottom) = time_panels(fig, 6.0, ts, panels)
+    fig, (top, middle, bottom) = time_panels(fig, 6.0, ts, panels)
+    mark_end((top, middle, bottom), solution, ts[-1])
     legend(top)
     legend(bottom)
     return fig
@@ -182,6 +199,7 @@ def energy_stack(
     label = "start + put in" if driven else "at the start"
     ax.plot(ts, line, "--", color=BLACK, lw=1.2, label=label)
     ax.set(xlabel="time [s]", ylabel="energy [J]", xlim=(ts[0], ts[-1]))
+    mark_end([ax], solution, ts[-1])
     legend(ax)
     return ax
 
@@ -198,7 +216,7 @@ def effort_profile(
 
     **Arguments:** `forces`: those of the solution.
     """
-    reached(linkage, solution)
+    last = reached(linkage, solution)[0][-1]
     forces = elements("forces", forces)
     efforts = joint_efforts(linkage, forces, solution)
     ts, total, parts = (np.asarray(a) for a in (solution.ts, *efforts))
@@ -216,9 +234,10 @@ def effort_profile(
     )  # fmt: skip
     for k, row in zip(moving, table):
         unit = "N m" if joints[k][0] == "R" else "N"
-        row[0].set_ylabel(f"{joints[k]} [{unit}]")
         own = [(of[k], part[:, k]) for of, part in zip(limits, parts)]
         own = [(limit, effort) for limit, effort in own if np.isfinite(limit)]
+        most = "".join(f"\nlimit ±{limit:g}" for limit, _ in own)
+        row[0].set_ylabel(f"{joints[k]} [{unit}]{most}")
         for ax in row:
             for (name, part), color in zip(named, cycle((SERIES[0], *SERIES[2:]))):
                 (line,) = ax.plot(ts, part[:, k], color=color, lw=1.2, label=name)
@@ -234,16 +253,9 @@ def effort_profile(
             if at.any():
                 low, high = min(low, -1.1 * limit), max(high, 1.1 * limit)
         row[-1].set_ylim(low, high)
-        if own:  # as the title of a legend, which moves out of the curves' way
-            text = "\n".join(f"limit ±{limit:g} {unit}" for limit, _ in own)
-            note = Legend(
-                row[-1], [], [], title=text, title_fontproperties={"size": "small"},
-                framealpha=0.7, edgecolor="none", borderaxespad=0.3, borderpad=0.1,
-                loc="best",
-            )  # fmt: skip
-            row[-1].add_artist(note)
     if busy is not None:
         table[0, 0].set_xlim(busy)
+    mark_end(table[:, -1], solution, last)
     for ax in table[-1]:
         ax.set_xlabel("time [s]")
     fig.align_ylabels(table[:, 0])

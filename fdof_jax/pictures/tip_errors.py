@@ -22,6 +22,7 @@ from .axes import (
     GREY,
     SERIES,
     axes_or_new,
+    ending,
     filled_mapping,
     legend,
     plane_axes,
@@ -52,10 +53,12 @@ def _tip(linkage: Any, task: Any, solution: Any, name: str = "solution") -> _Tip
 
 def _tips(linkage: Any, task: Any, solutions: Any) -> dict[Any, _Tip]:
     filled_mapping("solutions", solutions, "Solution")
-    return {
-        label: _tip(linkage, task, solution, f"solutions[{shown(label)}]")
-        for label, solution in solutions.items()
-    }
+    tips = {}
+    for label, solution in solutions.items():
+        tip = _tip(linkage, task, solution, f"solutions[{shown(label)}]")
+        end = ending(solution)
+        tips[f"{label}, {end}" if end else label] = tip
+    return tips
 
 
 def _draw_commanded(ax: Axes, path: np.ndarray) -> None:

@@ -16,6 +16,7 @@ from ..base.configuration import options_of_loops
 from ..base.known_values import in_numpy
 from ..base.report import Report
 from ..linkage.linkage import joint_names
+from ..references.reference import reference_of
 from ..search.lanes import check_motion
 from ..simulation.prescribed import PrescribedMotion
 from ..simulation.scene import Scene, is_number
@@ -24,9 +25,11 @@ from ..simulation.simulate import simulate
 from ..simulation.solution import Solution, remarks_on_derivatives
 from .losses import (
     SAMPLES,
+    Loss,
     bounds_of,
     check_tuned,
     controller_of,
+    joint_errors,
     tip_errors,
     with_log_gains,
 )
@@ -148,11 +151,18 @@ def _scene_at(scene: Scene, tuned: Any, z: Any) -> Scene:
     return _with_times(with_log_gains(scene, logs, tuned), times)
 
 
+def _errors(scene: Scene) -> Loss:
+    """The loss: the tip's error, or that of the joints if nothing leads the tip."""
+    led = reference_of(controller_of(scene).reference).tip is not None
+    return tip_errors if led else joint_errors
+
+
 @eqx.filter_jit(compiler_options=options_of_loops())  # pyright: ignore[reportCallIssue]
 def _tangents(scene: Scene, tuned: Any, z: Any) -> tuple[Sensitivities, Array]:
     """Residuals with their derivatives in `z`, and relative demands."""
     ts = jnp.linspace(0, scene.t1, SAMPLES)
-    found = sensitivities(lambda z: _scene_at(scene, tuned, z), tip_errors, z, ts)
+    loss = _errors(scene)
+    found = sensitivities(lambda z: _scene_at(scene, tuned, z), loss, z, ts)
     controller = controller_of(scene)
     return found, relative_demands(controller, scene.linkage, found.solution)
 
@@ -163,11 +173,11 @@ def _motion(scene: Scene) -> Solution:
 
 
 def _slopes(scene: Scene, tuned: Any, z: np.ndarray, steps: Any) -> np.ndarray:
-    """Derivatives of the mean squared tip error by extrapolated differences."""
+    """Derivatives of the mean squared error by extrapolated differences."""
 
     def loss(z: np.ndarray) -> float:
         trial = _scene_at(scene, tuned, z)
-        return float(np.sum(np.square(tip_errors(trial, _motion(trial)))))
+        return float(np.sum(np.square(_errors(scene)(trial, _motion(trial)))))
 
     rise = lambda h: loss(z + h) - loss(z - h)
     changes = np.diag(steps)
@@ -177,14 +187,15 @@ def _slopes(scene: Scene, tuned: Any, z: np.ndarray, steps: Any) -> np.ndarray:
 def gradient_report(scene: Scene) -> GradientReport:
     """Compares the gradient of the tip error in the PD gains with differences.
 
-    **Arguments:** `scene`: must hold exactly one `PDController`, tracking a task with a
-    `tip`.
+    **Arguments:** `scene`: must hold exactly one `PDController`. If its reference has
+    no `tip`, the errors of joints count in place of that of the tip, as in
+    `joint_errors`.
 
     **Returns:** a `GradientReport`.
 
     **Raises:** ValueError as `tune`.
     """
-    check_tuned("scene", scene)
+    check_tuned("scene", scene, joint_errors)  # which needs no tip
     t1 = float(scene.t1)
     as_array = lambda leaf: jnp.asarray(leaf) if is_number(leaf) else leaf
     scene = jax.tree.map(as_array, scene._replace(t1=t1))
@@ -208,7 +219,9 @@ def gradient_report(scene: Scene) -> GradientReport:
     error = float(np.linalg.norm(gradient - differences) / size) if size > 0 else 0.0
     # The error up to a time is the mean over that time, not over the whole run.
     until = np.linspace(0, SAMPLES - 1, _HORIZONS + 1).astype(int)[1:]
-    norms = np.linalg.norm(along[2 * until + 1], axis=1) * SAMPLES / (until + 1)
+    each = residuals.size // SAMPLES
+    norms = np.linalg.norm(along[each * (until + 1) - 1], axis=1)
+    norms *= SAMPLES / (until + 1)
     few = jax.tree.map(lambda a: a[::10] if np.ndim(a) else a, solution)
     at_limit = np.abs(demands) > 1
     saturated = np.mean(at_limit, axis=0)
