@@ -122,6 +122,12 @@ def test_sampled_control_is_measured_as_it_acted():
 def test_a_report_is_shown():
     text = str(measured(PD))
     assert text.count("\n") == 2 and "steady error" in text and "P1" in text
+    away = str(measured(PD, fj.JointEffort(3.2)))
+    assert "P1 ends 11 % of its step away from the reference" in away
+    still = PD.replace(reference=Step(0.0, [0.0]))
+    assert "P1: no step, as it begins at its reference" in str(measured(still))
+    ramp = PD.replace(reference=Ramp([0, 1], [[0.0], [1.0]]))
+    assert "P1: no step, as its reference moves meanwhile" in str(measured(ramp))
 
 
 def test_what_is_refused():

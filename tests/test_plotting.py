@@ -177,7 +177,7 @@ def test_a_legend_takes_as_many_rows_as_it_needs():
 def test_tracking_and_its_error():
     solutions = {"paper": swinging(), "tuned": swinging(51, 0.5)}
     ax = plotting.tracking(LINKAGE, TASK, solutions)
-    assert labels(ax) == ["commanded", "paper", "tuned", "start"]
+    assert labels(ax) == ["commanded", "paper", "tuned", "begins here"]
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("x [m]", "y [m]")
     curves = {line.get_label(): np.asarray(line.get_xydata()) for line in ax.lines}
     np.testing.assert_allclose(np.hypot(*(curves["commanded"] - [1, 1]).T), 0.5)

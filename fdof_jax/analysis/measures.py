@@ -34,16 +34,18 @@ _STANDS = 1e-9  # changes of a reference that are less are none [m or rad]
 class Response(Report):
     """How joints followed the reference of their controller; prints itself.
 
-    Measures of a step are NaN for joints whose reference moves meanwhile, as with a
-    `Pulse` or a `Ramp`, or has been reached from the start.
+    Measures of a step are those of the field: about the position at the last time, from
+    which a load or friction may keep the reference away (`steady_error`). They are NaN
+    for joints whose reference moves meanwhile, as with a `Pulse` or a `Ramp`, or has
+    been reached from the start.
 
     - `joints`: names of the moving joints, for instance R1.
     - `step`: from where the joint was to the final reference (joint,) [m or rad].
-    - `overshoot`: greatest excess over the final value, as a share of the final change
-      (joint,).
-    - `rise_time`: from 10 to 90 % of the final change (joint,) [s].
-    - `settling_time`: after which the joint stays within 2 % of the final change
-      (joint,) [s]; NaN if that is in the last tenth of the time or never.
+    - `overshoot`: greatest excess over the last position, as a share of the change up
+      to it (joint,).
+    - `rise_time`: from 10 to 90 % of that change (joint,) [s].
+    - `settling_time`: after which the joint stays within 2 % of that change of its last
+      position (joint,) [s]; NaN if that is in the last tenth of the time or never.
     - `steady_error`: of the last position from the reference (joint,) [m or rad].
     - `largest_error`, `rms_error`: from the reference, over all samples (joint,)
       [m or rad].
@@ -65,13 +67,30 @@ class Response(Report):
                   "largest error", "rms error", "at limit"]  # fmt: skip
         length = "[m, rad]"
         units = ["", length, "[%]", "[s]", "[s]", *[length] * 3, "[% of time]"]
+        overshoot = np.round(100 * self.overshoot, 3)
         columns = (
-            self.step, 100 * self.overshoot, self.rise_time, self.settling_time,
+            self.step, overshoot, self.rise_time, self.settling_time,
             self.steady_error, self.largest_error, self.rms_error, 100 * self.saturated,
         )  # fmt: skip
         numbers = ([f"{value:.4g}" for value in row] for row in zip(*columns))
         rows = [[name, *row] for name, row in zip(self.joints, numbers)]
         return [header, units, *rows]
+
+    def _remarks(self) -> list[str]:
+        rows = zip(self.joints, self.step, self.overshoot, self.steady_error)
+        lines = []
+        for name, step, overshoot, error in rows:
+            if np.isnan(step):
+                lines.append(f"{name}: no step, as its reference moves meanwhile")
+            elif np.isnan(overshoot):
+                lines.append(f"{name}: no step, as it begins at its reference")
+            elif abs(error) > BAND * abs(step):
+                share = 100 * abs(error / step)
+                lines.append(
+                    f"{name} ends {share:.2g} % of its step away from the reference; "
+                    "overshoot, rise and settling are those about where it ends"
+                )
+        return lines
 
 
 def response(

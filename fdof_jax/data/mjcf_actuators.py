@@ -170,6 +170,10 @@ def actuators(read: Reader, controls: Any, drop: tuple[str, ...]) -> list[Any]:
         if row.control_range:
             low, high = row.control_range
             words += f"; its range, {low:.4g} to {high:.4g}, is not kept for others"
+        ends = row.lower, row.upper
+        if kinds == "JointEffort" and np.isfinite(ends).any():
+            low, high = ends
+            words += f"; its force range, {low:.4g} to {high:.4g}, holds for it alone"
         read.note(f"actuator {row.name}", words)
     return forces
 

@@ -41,7 +41,8 @@ def to_xarray(linkage: Linkage, solution: Motion) -> "xarray.Dataset":
     joints are named R1, P2 and so on, with the coordinate `unit`; a joint of both kinds
     within a batch is named by its number. Batch axes come first, as `batch` (or
     `batch_1`, `batch_2` and so on). To name an axis and give it values, use
-    `.rename(batch="payload").assign_coords(payload=masses)`.
+    `.rename(batch="payload").assign_coords(payload=masses)`. States of elements and
+    events are not in it: to go on from a motion, save its last state and `own`.
 
     **Arguments:** `linkage`: that of the solution, one or a batch; `solution`: result
     of `simulate`, of a batch of it, or of `sweep`, all at the same times [s]; or a

@@ -108,10 +108,10 @@ class _Picture:
     def __init__(self):
         self._figure = Figure(figsize=(7, 3.2), dpi=100)
         self._canvas = FigureCanvasAgg(self._figure)
-        plane = self._figure.add_axes((0.1, 0.16, 0.43, 0.66))
+        plane = self._figure.add_axes((0.1, 0.16, 0.43, 0.62))
         self._plane = plane_axes(plane, np.zeros(1))
         self._plane.set_aspect("equal", adjustable="datalim")
-        self._time = self._figure.add_axes((0.64, 0.16, 0.34, 0.66))
+        self._time = self._figure.add_axes((0.64, 0.16, 0.34, 0.62))
         self._time.set(xlabel="time [s]", ylabel="tip error [mm]")
         for ax in self._figure.axes:
             ax.locator_params(nbins=5)

@@ -249,7 +249,8 @@ def effort_profile(
             for ax in row:
                 ax.axhspan(-limit, limit, color=GREY, alpha=0.15, lw=0, label="limits")
                 dots = ax.plot(ts[at], effort[at], ".", color=SERIES[1], zorder=3)
-                dots[0].set(label="saturated", gid=f"saturated {k + 1}")
+                name = "saturated" if at.any() else None
+                dots[0].set(label=name, gid=f"saturated {k + 1}")
             if at.any():
                 low, high = min(low, -1.1 * limit), max(high, 1.1 * limit)
         row[-1].set_ylim(low, high)

@@ -94,7 +94,8 @@ def tracking(
     for (label, path), color in zip(paths.items(), cycle(free)):
         ax.plot(*xy(path), color=color, lw=1.2, label=label)
         ax.plot(*xy(path[:1]), "x", color=color, markersize=5)
-    ax.plot([], [], "x", color=GREY, markersize=5, label="start")
+    # Not "start", which a motion may be called.
+    ax.plot([], [], "x", color=GREY, markersize=5, label="begins here")
     legend(ax)
     return ax
 

@@ -43,8 +43,9 @@ class Travel(Part):
     - `duration`: positive [s].
     - `begin`: time at which the travel starts [s]; it rests before.
     - `profile`: "harmonic" (the way is a cosine), "cycloidal" (the acceleration is a
-      sine), "quintic" (no acceleration at both ends) or "trapezoidal" (the velocity is
-      a trapezium, speeding up and slowing down in a quarter of the time each).
+      sine), "quintic" (no acceleration at both ends; the default) or "trapezoidal" (the
+      velocity is a trapezium, speeding up and slowing down in a quarter of the time
+      each).
     - `shock`: share of the way done at constant velocity. The velocity then jumps at
       both ends; see `shock_against`.
 

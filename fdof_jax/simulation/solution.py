@@ -112,6 +112,9 @@ class Events(eqx.Module):
     - `t`: times [s]; `joint`: numbers of joints, from 1; `kind`: places of the words in
       `table`. Each has an entry per event, NaN beyond the last one.
     - `count`: how many there were in all.
+    - `table`: a dictionary of columns, "t [s]", "joint" and "event". The words of the
+      last are sticks, slips, bounces, rests on its stop, leaves its stop, is braked, is
+      let go, is stopped.
     """
 
     t: Float[Array, " event"]

@@ -83,16 +83,19 @@ class GradientReport(Report):
     slowest_crossing: float = np.inf
     times: dict[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
 
-    def _remarks(self) -> list[str]:
-        along = "  ".join(
-            f"{t:.3g} s: {norm:.2g}"
-            for t, norm in zip(self.horizons, self.gradient_norm)
-        )
-        lines = [
-            f"gradient against differences: {self.error:.1e} of its norm "
-            f"{np.linalg.norm(self.gradient):.3g}",
-            f"norm by horizon: {along}",
+    def _verdict(self) -> list[str]:
+        size = np.linalg.norm(self.gradient)
+        return [
+            f"gradient against differences: {self.error:.1e} of its norm {size:.3g}"
         ]
+
+    def _rows(self) -> list[list[str]]:
+        horizons = [f"{t:.3g} s" for t in self.horizons]
+        norms = [f"{norm:.2g}" for norm in self.gradient_norm]
+        return [["up to", *horizons], ["norm of the gradient", *norms]]
+
+    def _remarks(self) -> list[str]:
+        lines = []
         if self.modes is not None:
             frequency, damping = self.modes.frequency, self.modes.damping
             lines.append(

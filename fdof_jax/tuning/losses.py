@@ -50,7 +50,10 @@ def tracked_task(scene: Scene, name: str = "scene") -> Any:
     """The task of a scene's controller; raises ValueError if it has no `tip`."""
     task = controller_of(scene).reference
     if reference_of(task).tip is None:
-        expected = "its controller to track a task with a `tip`, for the tip error"
+        expected = (
+            "its controller to track a task with a `tip`, for the tip error "
+            "(fdof_jax.tuning.joint_errors is a loss for others)"
+        )
         raise refusal(name, expected, task)
     return task
 
@@ -102,7 +105,8 @@ def joint_errors(scene: Scene, solution: Solution) -> Float[Array, " residual"]:
     """Joint errors at the output times, scaled so that their squares sum to the mean.
 
     This is a loss for controllers whose reference has no `tip`. It adds errors of
-    slides [m] and angles [rad] as they are.
+    slides [m] and angles [rad] as they are. A joint without gains, kp and kd 0, is not
+    driven, and does not count.
 
     **Arguments:** `scene`, with exactly one `PDController`; `solution`: its motion.
 
@@ -122,7 +126,8 @@ def joint_errors(scene: Scene, solution: Solution) -> Float[Array, " residual"]:
     reference = controller_of(scene).reference
     commanded = lambda t: reference_motion(reference, t, scene.linkage)[0]
     errors = solution.q - jax.vmap(commanded)(solution.ts)
-    errors = without_fixed(scene.linkage, errors)
+    driven = (gains_of(scene) != 0).any(axis=0)  # fixed pairs are not
+    errors = jnp.where(driven, errors, 0)
     return errors.reshape(-1) / solution.ts.size**0.5
 
 
@@ -192,9 +197,7 @@ class GainBox(NamedTuple):
 
     def at_bound(self, gains: np.ndarray) -> np.ndarray:
         """Returns which of the free gains are held by a bound (2, n)."""
-        # By rounding, exp(log(bound)) may lie just inside the bound.
-        hair = 100 * np.finfo(jnp.result_type(float)).eps
-        held = (gains <= self.lower * (1 + hair)) | (gains >= self.upper * (1 - hair))
+        held = (gains <= self.lower) | (gains >= self.upper)
         return held & (self.lower < self.upper)
 
     def logs(self) -> tuple[np.ndarray, ...]:
@@ -204,6 +207,10 @@ class GainBox(NamedTuple):
     def gains(self, z: np.ndarray) -> np.ndarray:
         """Returns the gains (..., 2, n) of their logarithms (..., 2n)."""
         gains = np.exp(z).reshape(*z.shape[:-1], *self.lower.shape)
+        # exp(log(bound)) is rounded, and so is that of the start.
+        hair = 100 * np.finfo(jnp.result_type(float)).eps
+        for exact in self:
+            gains = np.where(np.abs(gains - exact) <= hair * exact, exact, gains)
         return np.clip(gains, self.lower, self.upper)
 
 
