@@ -142,3 +142,15 @@ def test_the_errors_of_a_fixed_pair_count_nothing():
     motion = fj.simulate(arm, scene.state0, [0.0, 1.0], scene.forces)
     errors = fj.tuning.joint_errors(scene, motion).reshape(2, 2)
     assert (errors[:, 1] == 0).all() and (errors[:, 0] != 0).all()
+
+
+def test_the_errors_of_a_joint_that_nothing_drives_count_nothing():
+    arm = fj.scenes.double_pendulum().linkage
+    pd = fj.PDController([5.0, 0.0], [1.0, 0.0], np.inf, Stand(np.array([0.2, 0.7])))
+    scene = fj.Scene(arm, fj.State(np.zeros(2), np.zeros(2)), (pd,), 1.0)
+    motion = fj.simulate(scene, [0.0, 1.0])
+    errors = fj.tuning.joint_errors(scene, motion).reshape(2, 2)
+    assert (errors[:, 1] == 0).all() and (errors[:, 0] != 0).all()
+    damped = scene._replace(forces=(pd.replace(kd=[1.0, 0.1]),))
+    errors = fj.tuning.joint_errors(damped, motion).reshape(2, 2)
+    assert (errors != 0).all()

@@ -293,3 +293,16 @@ def test_models_of_other_packages_move_as_in_mujoco(package):
         rng = np.random.default_rng(0)
         assert mjcf_oracle.compare(model, read, rng, 10, drop) < 1e-11, name
         assert mjcf_oracle.compare_motion(model, read, 0.5, drop=drop) < 1e-6, name
+
+
+def test_the_account_tells_ranges_that_hold_for_one_control_alone():
+    motor = '<motor joint="a" gear="2" forcerange="-.5 .5" ctrlrange="-9 9"/>'
+    text = f"""<mujoco><worldbody><body><joint name="a" axis="0 -1 0"/>
+    <geom size=".1" pos="1 0 0"/></body></worldbody><actuator>{motor}</actuator>
+    </mujoco>"""
+    model = fj.from_mjcf(text, controls=[5.0])
+    (effort,) = model.forces
+    assert effort.tau.tolist() == [1.0]  # 2 times 0.5
+    words = dict(model.account.lines)["actuator 0"]
+    assert "its range, -9 to 9, is not kept for others" in words
+    assert "its force range, -0.5 to 0.5, is not kept for others" in words

@@ -166,14 +166,13 @@ def actuators(read: Reader, controls: Any, drop: tuple[str, ...]) -> list[Any]:
     for row in rows:
         if len(forces) > 1:
             kinds = "PDController" if row.is_servo else "JointEffort"
-        words = f"{kinds}, at a control of {row.control:.4g}"
+        words, limits = f"{kinds}, at a control of {row.control:.4g}", {}
         if row.control_range:
-            low, high = row.control_range
-            words += f"; its range, {low:.4g} to {high:.4g}, is not kept for others"
-        ends = row.lower, row.upper
-        if kinds == "JointEffort" and np.isfinite(ends).any():
-            low, high = ends
-            words += f"; its force range, {low:.4g} to {high:.4g}, holds for it alone"
+            limits["range"] = row.control_range
+        if kinds == "JointEffort" and np.isfinite([row.lower, row.upper]).any():
+            limits["force range"] = row.lower, row.upper
+        for name, (low, high) in limits.items():
+            words += f"; its {name}, {low:.4g} to {high:.4g}, is not kept for others"
         read.note(f"actuator {row.name}", words)
     return forces
 
