@@ -23,6 +23,7 @@ from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
 from numpy.typing import ArrayLike
 from PIL import Image
 
@@ -145,7 +146,7 @@ def chrono_cyclograph(
 def _write_times(ax: Axes, ts: np.ndarray, g: Geometry, indices: np.ndarray) -> None:
     """Writes its time beside the tip of a few configurations that are apart."""
     written: list[complex] = []
-    ax.margins(0.15, 0.2)  # for the times
+    ax.margins(0.18, 0.2)  # for the times
     for i in (indices[-1], *indices[:-1]):
         if len(written) == _MOST_TIMES:
             return
@@ -155,8 +156,9 @@ def _write_times(ax: Axes, ts: np.ndarray, g: Geometry, indices: np.ndarray) -> 
             ahead = _AHEAD * np.exp(1j * g.angle[i, -1])  # of the last link
             ax.annotate(
                 f"{ts[i]:.3g} s", (tip.real, tip.imag), (ahead.real, ahead.imag),
-                textcoords="offset points", fontsize="x-small", ha="center",
-                va="center", gid="time",
+                textcoords="offset points", fontsize="small", ha="center",
+                va="center", gid="time", zorder=5,
+                path_effects=[withStroke(linewidth=3, foreground="white")],
             )  # fmt: skip
 
 

@@ -209,9 +209,9 @@ def effort_profile(
 ) -> Figure:
     """Plots the efforts of each element over time, a panel per joint [N or N m].
 
-    The grey band lies within the finite limits of a controller, alone or in a drive;
-    it fills the panel where the efforts stay far from the limits. Orange dots mark
-    samples at which the controller is at its limit. If nearly all changes come in a
+    The grey band lies within the finite limits of a controller, alone or in a drive,
+    where the efforts come near them; the label tells them all. Orange dots mark samples
+    at which the controller is at its limit. If nearly all changes come in a
     short part of the time, panels on the left show it larger.
 
     **Arguments:** `forces`: those of the solution.
@@ -247,13 +247,15 @@ def effort_profile(
         for limit, effort in own:
             at = (np.abs(effort) >= limit) & (effort != 0)
             for ax in row:
-                ax.axhspan(-limit, limit, color=GREY, alpha=0.15, lw=0, label="limits")
                 dots = ax.plot(ts[at], effort[at], ".", color=SERIES[1], zorder=3)
                 name = "saturated" if at.any() else None
                 dots[0].set(label=name, gid=f"saturated {k + 1}")
             if at.any():
                 low, high = min(low, -1.1 * limit), max(high, 1.1 * limit)
         row[-1].set_ylim(low, high)
+        for limit in {limit for limit, _ in own if limit < max(-low, high)}:
+            for ax in row:
+                ax.axhspan(-limit, limit, color=GREY, alpha=0.15, lw=0, label="limits")
     if busy is not None:
         table[0, 0].set_xlim(busy)
     mark_end(table[:, -1], solution, last)
