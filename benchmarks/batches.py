@@ -1,197 +1,196 @@
-"""Batches of arms: simulated seconds per wall second at the worst error."""
+"""Batches of arms: simulated seconds per wall second at the worst member's error."""
 
+import multiprocessing
+import os
 from collections.abc import Callable, Iterator
 from functools import partial
+from multiprocessing.connection import Connection
+from typing import Any
 
 import jax
 import numpy as np
 
-from . import contestants as own, one_core, peers, taylor
-from .contestants import Contestant, cases
+from . import contestants as own, peers, taylor
+from .contestants import Contestant, Motion, cases
 from .measure import Skipped, measure, record, skipped
 from .native import Kernel
 from .problems import Problem, fig5_batch, mixed_batch, reference
 
-PROTOCOL = "batches"
 SLOW = 1024  # the largest batch of slow peers
 JUDGED = 16384  # members of a batch on an accelerator whose errors are known
-
 TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11)
-MJ_STEPS = (2e-2, 8e-3, 4e-3, 2e-3, 1e-3, 5e-4)
-C_RK4_STEPS = (2e-2, 8e-3, 4e-3, 2e-3, 1e-3, 5e-4, 2.5e-4)
-C_8_STEPS = (5e-2, 4e-2, 2e-2, 1e-2, 5e-3)
-HEYOKA_TOLERANCES = (1e-3, 1e-6, 1e-9, 1e-12, 1e-15)
+FEW = TOLERANCES[1:]
+STEPS = (8e-3, 4e-3, 2.5e-3)  # of MuJoCo, whose RK4 reaches 1e-6 with the last
+SINGLE = (1e-3, 1e-4, 1e-5, 1e-6)  # tolerances in float32
 
 Row = tuple[str, Callable[[Problem], Contestant], tuple]
 
 
-def _fast(vmap: tuple, sweep: tuple, rk4: tuple, order8: tuple, heyoka: tuple):
-    """Returns contestants for any size, each with its settings."""
-    return [
-        ("fdof_jax", own.fdof_jax, vmap),
-        ("fdof_jax sweep", own.sweep, sweep),
-        ("C RK4", partial(peers.native, method="RK4"), rk4),
-        ("C order 8", partial(peers.native, method="order 8"), order8),
-        ("heyoka", taylor.heyoka, heyoka),
+def contestants(batch: int) -> list[Row]:
+    """Returns contestants and settings for a size; large batches have fewer."""
+    rows: list[Row] = [
+        ("fdof_jax sweep", own.sweep, FEW),
+        ("fdof_jax", own.fdof_jax, FEW),
+        ("heyoka", taylor.heyoka, (1e-5, 1e-7, 1e-9, 1e-11)),
+        (
+            "C order 8",
+            partial(peers.native, method="order 8"),
+            (4e-2, 2e-2, 1e-2, 5e-3),
+        ),
+        ("C RK4", partial(peers.native, method="RK4"), (4e-3, 2e-3, 1e-3, 5e-4)),
     ]
+    if batch <= SLOW:
+        rows += [
+            ("diffrax, scalars", own.diffrax_scalars, FEW),
+            ("diffrax, arrays", own.diffrax_textbook, FEW),
+            ("MuJoCo RK4", peers.mujoco, STEPS),
+        ]
+    return rows
 
 
-def table(batch: int) -> list[Row]:
-    """Returns contestants and settings for a batch size; large batches have fewer."""
-    if batch > 16384:
-        pair = (1e-7, 1e-10)
-        return _fast(pair[:1], pair, (4e-3, 2e-3), (2e-2, 1e-2, 5e-3), (1e-6, 1e-9))
-    if batch > SLOW:
-        return _fast(
-            TOLERANCES,
-            TOLERANCES,
-            (8e-3, 4e-3, 2e-3, 1e-3),
-            C_8_STEPS,
-            HEYOKA_TOLERANCES[:-1],
-        )
-    # Steps below that take minutes at 1024; MuJoCo's RK4 reaches 1e-6 with it.
-    steps = MJ_STEPS if batch < SLOW else (8e-3, 4e-3, 2.5e-3)
-    slow = [
-        ("plain diffrax", own.plain_textbook, TOLERANCES),
-        ("MuJoCo RK4", partial(peers.mujoco, integrator="RK4"), steps),
-    ]
-    if batch == SLOW:
-        slow.append(("MJX RK4", peers.mjx_rk4, steps))
-    every = TOLERANCES, TOLERANCES, C_RK4_STEPS, C_8_STEPS, HEYOKA_TOLERANCES
-    return [*_fast(*every), *slow]
-
-
-def measure_batch(
-    problem: Problem, exact: np.ndarray, contestants: list, budget: float
+def measured(
+    protocol: str, problem: Problem, exact: np.ndarray, rows: list, budget: float
 ) -> Iterator[dict]:
     """Returns all contestants' points on a batch; `exact` may be its first members."""
     prepared = []
-    judged = len(exact)
-    for name, make, settings in contestants:
+    for name, make, settings in rows:
         try:
-            contestant = make(problem)
+            prepared += cases(make(problem), settings, exact)
         except Skipped as reason:
-            yield skipped(PROTOCOL, name, str(reason))
-            continue
-        motion = contestant.motion
-        contestant = contestant._replace(
-            motion=lambda r, motion=motion: first_members(motion(r), judged)
-        )
-        prepared += cases(contestant, settings, exact, problem)
+            yield skipped(protocol, name, str(reason))
     yield from measure(
-        PROTOCOL,
+        protocol,
         prepared,
         budget=budget,
-        ratio_to="fdof_jax",
+        ratio_to="fdof_jax sweep",
         problem=problem.name,
         batch=problem.batch,
         simulated=problem.batch * float(problem.ts[-1] - problem.ts[0]),
-        judged=judged,
     )
-
-
-def first_members(motion: own.Motion, count: int) -> own.Motion:
-    return motion._replace(q=motion.q[:count])
 
 
 def run(quick: bool) -> Iterator[dict]:
-    """Measures all contestants at all sizes, on one core."""
-    sizes = (
-        {1: 10, 16: 10, 64: 20}
-        if quick
-        else {1: 10, 16: 10, 64: 20, 1024: 80, 16384: 30, 131072: 20}
-    )
-    for batch, budget in sizes.items():
+    """Measures all contestants at all sizes, then arms of all kinds, on one core."""
+    sizes = {16: 3, 128: 6, 1024: 30, 16384: 15}
+    for batch, budget in {16: 2, 128: 4}.items() if quick else sizes.items():
         problem = fig5_batch(batch)
-        yield from measure_batch(problem, _exact(problem), table(batch), budget)
+        rows = contestants(batch)
+        yield from measured("batches", problem, exactly(problem), rows, budget)
+    problem = mixed_batch(64 if quick else 1024)
+    rows = [
+        ("fdof_jax sweep", own.sweep, FEW),
+        ("fdof_jax", own.fdof_jax, FEW),
+        ("diffrax, our equations", own.diffrax_reduced, FEW),
+    ]
+    yield from measured("batches", problem, reference(problem), rows, 15)
 
 
 def run_two_cores(quick: bool) -> Iterator[dict]:
-    sizes = {64: 10} if quick else {1024: 25, 16384: 25}
-    for batch, budget in sizes.items():
+    """Measures on two cores, beside one core alone, and with the second one busy."""
+    for batch, budget in ({128: 4} if quick else {1024: 15, 16384: 20}).items():
         problem = fig5_batch(batch)
-        contestants = [row for row in table(batch) if not row[0].startswith("MJX")]
-        contestants.append(("sweep on one core", one_core.sweep, TOLERANCES))
-        yield from measure_batch(problem, reference(problem), contestants, budget)
-
-
-def run_mixed(quick: bool) -> Iterator[dict]:
-    """Measures random arms of all topologies, from random states."""
-    tolerances = (1e-4, 1e-6, 1e-8, 1e-10)
-    rows = [
-        ("fdof_jax", own.fdof_jax, tolerances),
-        ("fdof_jax sweep", own.sweep, tolerances),
-        ("plain diffrax, reduced", own.plain_reduced, tolerances),
-        ("plain diffrax, masked 6x6", own.plain_masked, tolerances[1::2]),
-    ]
-    problem = mixed_batch(64 if quick else 1024)
-    budget = 5 if quick else 60
-    for point in measure_batch(problem, reference(problem), rows, budget):
-        yield {**point, "protocol": "mixed"}
-
-
-def run_float32(quick: bool) -> Iterator[dict]:
-    """Measures the library without x64, against the C kernel in float64."""
-    for batch, budget in ({64: 10} if quick else {1024: 15, 16384: 20}).items():
-        problem = fig5_batch(batch)
-        problem = problem._replace(
-            state0=jax.tree.map(np.float32, problem.state0), ts=np.float32(problem.ts)
-        )
-        try:
-            exact = native_reference(problem)
-        except Skipped as reason:
-            yield skipped(PROTOCOL, "fdof_jax in float32", str(reason))
-            return
-        tolerances = (1e-3, 1e-4, 1e-5, 1e-6)
-        rows = [(n, make, tolerances) for n, make, _ in table(batch)[:2]]
-        yield from measure_batch(problem, exact, rows, budget)
-
-
-def _exact(problem: Problem) -> np.ndarray:
-    """Returns the reference; the library's own takes minutes for large batches."""
-    if problem.batch > 16384:
-        try:
-            return native_reference(problem)
-        except Skipped:
-            pass
-    return reference(problem)
-
-
-def native_reference(problem: Problem) -> np.ndarray:
-    """Returns joint positions at both ends, by C in steps of 2 ms, to about 1e-14."""
-    q, qd = (np.float64(a) for a in problem.state0)
-    kernel = Kernel("order 8", problem.linkage, q, qd)
-    end, _ = kernel.joints(kernel(2e-3, 1000))
-    return np.concatenate([q[:, None], end], axis=1)
+        rows = [
+            row for row in contestants(batch) if row[0] in ("fdof_jax sweep", "heyoka")
+        ]
+        rows.append(("one core", one_core, FEW))
+        exact = exactly(problem)
+        yield from measured("cores", problem, exact, rows, budget)
+        with _busy_core():
+            for point in measured("cores", problem, exact, rows, budget / 2):
+                yield {**point, "problem": "the second core busy"}
 
 
 def run_accelerator(quick: bool) -> Iterator[dict]:
-    """Measures the library and plain diffrax on a GPU, until its memory is full."""
+    """Measures the library and diffrax on a GPU, until its memory is full."""
     if jax.devices()[0].platform == "cpu":
-        yield skipped(PROTOCOL, "GPU", "JAX sees none")
+        yield skipped("gpu", "GPU", "JAX sees none")
         return
+    tolerances = FEW if jax.config.jax_enable_x64 else SINGLE
     batch = 1024
     while batch <= (1024 if quick else 2**26):
         problem = fig5_batch(batch)
         judged = problem._replace(
             state0=jax.tree.map(lambda a: a[:JUDGED], problem.state0)
         )
-        exact = native_reference(judged)
-        tolerances = (1e-5, 1e-7, 1e-9, 1e-11)
-        if not jax.config.jax_enable_x64:
-            tolerances = (1e-3, 1e-4, 1e-5, 1e-6)
-        rows = [(n, make, tolerances) for n, make, _ in table(batch)[:2]]
-        rows.append(("plain diffrax", own.plain_textbook, tolerances))
-        points = list(measure_batch(problem, exact, rows, budget=20))
+        rows = [("fdof_jax sweep", own.sweep, tolerances)]
+        rows += [("fdof_jax", own.fdof_jax, tolerances)]
+        rows += [("diffrax, scalars", own.diffrax_scalars, tolerances)]
+        points = list(measured("gpu", problem, exactly(judged), rows, 20))
         yield from points
         if any("RESOURCE_EXHAUSTED" in (p["reason"] or "") for p in points):
-            yield record(
-                protocol=PROTOCOL,
-                problem=problem.name,
-                solver="GPU",
-                batch=batch,
-                status="failed",
-                reason="the card's memory is full",
-            )
+            reason = "the card's memory is full"
+            yield record(protocol="gpu", solver="GPU", batch=batch, status="failed",
+                         problem=problem.name, reason=reason)  # fmt: skip
             return
         batch *= 8
+
+
+def exactly(problem: Problem) -> np.ndarray:
+    """Returns joint positions at both ends, by C in steps of 2 ms, to about 1e-14."""
+    q, qd = (np.float64(a) for a in problem.state0)
+    try:
+        kernel = Kernel("order 8", problem.linkage, q, qd)
+    except Skipped:
+        return reference(problem)
+    end, _ = kernel.joints(kernel(2e-3, 1000))
+    return np.concatenate([q[:, None], end], axis=1)
+
+
+# JAX has threads for the cores that it finds when it starts, so that one core alone
+# takes a process of its own.
+
+
+def _serve(pipe: Connection, core: int, batch: int) -> None:
+    """Runs a sweep for each tolerance received, and sends its motion if asked."""
+    os.sched_setaffinity(0, {core})
+    import fdof_jax as fj
+
+    fj.configure(x64=True)
+    contestant, result = own.sweep(fig5_batch(batch)), None
+    while True:
+        try:
+            tolerance = pipe.recv()
+        except EOFError:  # the benchmark is done
+            return
+        if tolerance is None:
+            pipe.send(tuple(contestant.motion(result)))
+        else:
+            result = contestant.run(tolerance)
+            pipe.send(None)
+
+
+def one_core(problem: Problem) -> Contestant:
+    """Returns `sweep` of Fig 5's batch on the first core alone."""
+    processes = multiprocessing.get_context("spawn")
+    pipe, other = processes.Pipe()
+    core = min(os.sched_getaffinity(0))
+    process = processes.Process(
+        target=_serve, args=(other, core, problem.batch), daemon=True
+    )
+    process.start()
+    other.close()  # so that a dead process ends `recv`
+
+    def ask(tolerance: float | None):
+        pipe.send(tolerance)
+        return pipe.recv()
+
+    return Contestant("one core", "tolerance", ask, lambda _: Motion(*ask(None)))
+
+
+def _spin(core: int) -> None:
+    os.sched_setaffinity(0, {core})
+    while True:
+        pass
+
+
+class _busy_core:
+    """Keeps the last core busy while it lasts."""
+
+    def __enter__(self) -> None:
+        processes = multiprocessing.get_context("spawn")
+        core = max(os.sched_getaffinity(0))
+        self.process: Any = processes.Process(target=_spin, args=(core,), daemon=True)
+        self.process.start()
+
+    def __exit__(self, *_: Any) -> None:
+        self.process.terminate()

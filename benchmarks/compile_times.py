@@ -1,7 +1,7 @@
-"""Times from the start of a process to its first result, and of compilation.
+"""Processor time from the start of a process to its first result.
 
-Every sample is a process of its own: without `configure`; with it and an empty folder
-for compiled programs; with it and a folder that another process has filled.
+Every sample is a process of its own: without a folder for compiled programs, and with
+one that another process has filled.
 """
 
 import json
@@ -16,15 +16,12 @@ import numpy as np
 from .first_result import CASES
 from .measure import FEWEST, record
 
-PROTOCOL = "compile_times"
-PLAIN, EMPTY, FILLED = "without configure", "empty folder", "filled folder"
-
 
 def _sample(case: str, *folder: str) -> dict[str, float]:
     output = subprocess.run(
         [sys.executable, "-m", "benchmarks.first_result", case, *folder],
-        # The worker has configured itself. Precision is the same for all.
-        env={**os.environ, "JAX_ENABLE_X64": "1", "XLA_FLAGS": ""},
+        # The worker has configured itself.
+        env={**os.environ, "XLA_FLAGS": ""},
         capture_output=True,
         text=True,
         check=False,
@@ -37,29 +34,15 @@ def _sample(case: str, *folder: str) -> dict[str, float]:
 def run(quick: bool) -> Iterator[dict]:
     samples = 1 if quick else FEWEST
     for case in list(CASES)[:1] if quick else CASES:
-        found: dict[str, list] = {PLAIN: [], EMPTY: [], FILLED: []}
-        failure = None
-        try:
-            for _ in range(samples):
-                found[PLAIN].append(_sample(case))
-                with tempfile.TemporaryDirectory() as folder:
-                    found[EMPTY].append(_sample(case, folder))
-                    found[FILLED].append(_sample(case, folder))
-        except RuntimeError as error:
-            failure = str(error)[:200]
-        for how, taken in found.items():
-            fields = {"status": "failed", "reason": failure}
-            if failure is None:
-                times = [sample["first"] for sample in taken]
-                low, median, high = np.percentile(times, [25, 50, 75])
-                calls = [sample["first"] - sample["imported"] for sample in taken]
-                fields = {
-                    "times": times,
-                    "time_min": min(times),
-                    "time_median": median,
-                    "time_quartiles": [low, high],
-                    "first_calls": calls,
-                    "compile_time": np.median(calls),
-                    "again": [sample["again"] for sample in taken],
-                }
-            yield record(protocol=PROTOCOL, problem=case, solver=how, **fields)
+        with tempfile.TemporaryDirectory() as folder:
+            new = [_sample(case) for _ in range(samples)]
+            _sample(case, folder)
+            filled = [_sample(case, folder) for _ in range(samples)]
+        for how, taken in (("new", new), ("programs kept", filled)):
+            yield record(
+                protocol="compile_times", problem=case, solver=how,
+                times=[sample["first"] for sample in taken],
+                time_median=np.median([sample["first"] for sample in taken]),
+                imported=np.median([sample["imported"] for sample in taken]),
+                again=np.median([sample["again"] for sample in taken]),
+            )  # fmt: skip

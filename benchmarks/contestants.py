@@ -16,6 +16,7 @@ import numpy as np
 import fdof_jax as fj
 
 from .measure import Case
+from .pendulums import absolute, accelerations, constants, relative
 from .problems import Problem, controller
 
 MAX_STEPS = 65536
@@ -23,7 +24,7 @@ DT0 = 1e-3  # estimates of the first step fail from exact rest
 
 
 class Motion(NamedTuple):
-    """The result of a run: states at the output times (..., time, 3), and steps."""
+    """The result of a run: states at the output times (..., time, n), and steps."""
 
     q: Any
     qd: Any = None
@@ -43,50 +44,24 @@ class Contestant(NamedTuple):
     motion: Callable[[Any], Motion]
 
 
-@jax.jit
-def energy(linkage: fj.Linkage, q: jax.Array, qd: jax.Array) -> jax.Array:
-    """Returns the total energy at each of several states of one arm [J]."""
-    kinetic, potential = jax.vmap(fj.energy, (None, 0, 0))(linkage, q, qd)
-    return kinetic + potential
-
-
-def _energy_defect(problem: Problem, motion: Motion) -> float | None:
-    """Returns the largest change of energy [J], where only gravity does work."""
-    if problem.forces or problem.batch is not None or motion.qd is None:
-        return None
-    start = fj.energy(problem.linkage, *problem.state0)
-    values = energy(problem.linkage, jnp.asarray(motion.q), jnp.asarray(motion.qd))
-    return float(jnp.max(jnp.abs(values - sum(start))))
-
-
-def cases(
-    contestant: Contestant,
-    settings: tuple,
-    exact: np.ndarray,
-    problem: Problem,
-    until: int | None = None,
-) -> list[Case]:
+def cases(contestant: Contestant, settings: tuple, exact: np.ndarray) -> list[Case]:
     """Returns a case per setting, judged by its worst position error at any time.
 
-    `until` restricts the error to the first output times; `error_end` covers them
-    all.
+    `exact` may be of the first members of a batch.
     """
 
     def judge(result: Any) -> dict:
         motion = contestant.motion(result)
         q = np.asarray(motion.q)
+        q = q[: len(exact)] if exact.ndim == 3 else q
         if q.shape[-2] < exact.shape[-2]:  # its outputs do not include the start
             q = np.concatenate([exact[..., :1, :], q], axis=-2)
-        errors = np.abs(q - exact)
-        return {
-            "error": float(errors[..., :until, :].max()),
-            "error_end": float(errors.max()),
-            "energy_defect": _energy_defect(problem, motion),
-            "steps": None if motion.steps is None else float(np.mean(motion.steps)),
-            "rejected": (
-                None if motion.rejected is None else float(np.mean(motion.rejected))
-            ),
-        }
+        steps, rejected = (
+            None if number is None else float(np.mean(number))
+            for number in (motion.steps, motion.rejected)
+        )
+        error = float(np.abs(q - exact).max())
+        return {"error": error, "steps": steps, "rejected": rejected}
 
     return [
         Case(
@@ -100,7 +75,7 @@ def cases(
     ]
 
 
-def _solution(solution: Any) -> Motion:
+def of_solution(solution: fj.Solution) -> Motion:
     stats = solution.stats
     return Motion(
         solution.q,
@@ -111,22 +86,11 @@ def _solution(solution: Any) -> Motion:
 
 
 @cache  # one compilation for all problems of one form
-def _simulate(
-    solver: diffrax.AbstractSolver | None, axes: tuple | None, fixed: bool, long: bool
-) -> Callable:
-    chosen: dict[str, Any] = {} if solver is None else {"solver": solver}
-    if long:
-        # No limit of steps, and no checkpoints, as no gradient is taken.
-        chosen.update(max_steps=None, adjoint=diffrax.ForwardMode())
-
-    def run(linkage, state0, ts, forces, setting):
-        steps: dict[str, Any] = {"rtol": setting, "atol": setting}
-        if fixed:
-            steps = {"stepsize_controller": diffrax.ConstantStepSize(), "dt0": setting}
-
+def _simulate(axes: tuple | None) -> Callable:
+    def run(linkage, state0, ts, forces, tolerance):
         def member(linkage, state0):
             return fj.simulate(
-                linkage, state0, ts, forces, throw=False, **steps, **chosen
+                linkage, state0, ts, forces, rtol=tolerance, atol=tolerance, throw=False
             )
 
         return _over(member, axes)(linkage, state0)
@@ -144,89 +108,54 @@ def _arguments(problem: Problem) -> tuple:
     )
 
 
-def fdof_jax(
-    problem: Problem,
-    solver: diffrax.AbstractSolver | None = None,
-    fixed: bool = False,
-    long: bool = False,
-) -> Contestant:
-    """Returns `simulate` as a contestant, under `jax.vmap` for a batch.
+def fdof_jax(problem: Problem) -> Contestant:
+    """Returns `simulate` within `jax.jit`, under `jax.vmap` for a batch."""
+    run, arguments = _simulate(problem.axes), _arguments(problem)
+    call = lambda setting: run(*arguments, setting)
+    return Contestant("fdof_jax", "tolerance", call, of_solution)
 
-    `fixed`: the setting is a fixed step; `long`: without a limit of steps.
-    """
-    run, arguments = _simulate(solver, problem.axes, fixed, long), _arguments(problem)
-    name = "fdof_jax" + ("" if solver is None else f" {type(solver).__name__}")
-    return Contestant(
-        name + (", fixed steps" if fixed else ""),
-        "step" if fixed else "tolerance",
-        lambda setting: run(*arguments, setting),
-        _solution,
+
+def called(function: Callable, name: str) -> Callable[[Problem], Contestant]:
+    """Returns `simulate` or `sweep` as a contestant, called as at a prompt."""
+
+    def contestant(problem: Problem) -> Contestant:
+        def run(tolerance: float):
+            return function(
+                problem.linkage, problem.state0, problem.ts, problem.forces,
+                throw=False, rtol=tolerance, atol=tolerance,
+            )  # fmt: skip
+
+        return Contestant(name, "tolerance", run, of_solution)
+
+    return contestant
+
+
+sweep = called(fj.sweep, "fdof_jax sweep")
+plain_call = called(fj.simulate, "fdof_jax, plain call")
+
+
+def _by_diffrax(field: Callable, y0: Any, ts: Any, args: Any, tolerance: Any) -> Any:
+    return diffrax.diffeqsolve(
+        diffrax.ODETerm(field),
+        diffrax.Dopri8(),
+        ts[0],
+        ts[-1],
+        DT0,
+        y0,
+        args,
+        saveat=diffrax.SaveAt(ts=ts),
+        stepsize_controller=controller(tolerance),
+        max_steps=MAX_STEPS,
+        throw=False,
     )
 
 
-def sweep(problem: Problem) -> Contestant:
-    """Returns `sweep` of a batch as a contestant."""
-
-    def run(tolerance: float):
-        return fj.sweep(
-            problem.linkage,
-            problem.state0,
-            problem.ts,
-            problem.forces,
-            throw=False,
-            rtol=tolerance,
-            atol=tolerance,
-        )
-
-    return Contestant("fdof_jax sweep", "tolerance", run, _solution)
-
-
-class Form(NamedTuple):
-    """One way to write the equations: `field(t, y, (linkage, forces))`."""
-
-    name: str
-    field: Callable
-    start: Callable  # (linkage, state0) -> y
-    joints: Callable  # (linkage, y) -> q, qd
-
-
-@cache
-def _plain_solve(form: Form, axes: tuple | None) -> Callable:
-    def run(linkage, state0, ts, forces, tolerance):
-        def member(linkage, state0):
-            solution = diffrax.diffeqsolve(
-                diffrax.ODETerm(form.field),
-                diffrax.Dopri8(),
-                ts[0],
-                ts[-1],
-                DT0,
-                form.start(linkage, state0),
-                (linkage, forces),
-                saveat=diffrax.SaveAt(ts=ts),
-                stepsize_controller=controller(tolerance),
-                max_steps=MAX_STEPS,
-                throw=False,
-            )
-            return Motion(
-                *jax.vmap(form.joints, (None, 0))(linkage, solution.ys),
-                steps=solution.stats["num_accepted_steps"],
-                rejected=solution.stats["num_rejected_steps"],
-            )
-
-        return _over(member, axes)(linkage, state0)
-
-    return jax.jit(run)
-
-
-def _plain(problem: Problem, form: Form) -> Contestant:
-    """Returns Dopri8 on a stacked state, under plain `jax.vmap` for a batch."""
-    run, arguments = _plain_solve(form, problem.axes), _arguments(problem)
-    return Contestant(
-        form.name,
-        "tolerance",
-        lambda tolerance: run(*arguments, tolerance),
-        lambda motion: motion,
-    )
+def _steps(solution: Any) -> dict:
+    stats = solution.stats
+    return {
+        "steps": stats["num_accepted_steps"],
+        "rejected": stats["num_rejected_steps"],
+    }
 
 
 def _textbook_field(t, y, args):
@@ -245,20 +174,6 @@ def _textbook_field(t, y, args):
     return jnp.concatenate([y[3:], jnp.diff(acceleration, prepend=0)])
 
 
-def _masked_field(t, y, args):
-    linkage, _ = args
-    x, xd = y[:6], y[6:]
-    return jnp.concatenate(
-        [xd, fj.paper.masked_accelerations(linkage, x, xd, jnp.zeros(6))]
-    )
-
-
-def _masked_joints(linkage, y):
-    revolute = linkage.ef[1::2] > 0.5
-    q = jnp.where(revolute, jnp.diff(y[1:6:2], prepend=linkage.base_angle), y[0:6:2])
-    return q, jnp.where(revolute, jnp.diff(y[7::2], prepend=0), y[6::2])
-
-
 def _reduced_field(t, y, args):
     linkage, forces = args
     q, qd = y[:3], y[3:]
@@ -266,34 +181,58 @@ def _reduced_field(t, y, args):
     return jnp.concatenate([qd, fj.forward_dynamics(linkage, q, qd, tau)])
 
 
-def _stacked(linkage, state0):
-    return jnp.concatenate([state0.q, state0.qd])
+def _stacked(problem: Problem, field: Callable, name: str) -> Contestant:
+    """Returns Dopri8 on a stacked state, under plain `jax.vmap` for a batch."""
+
+    @jax.jit
+    def run(linkage, state0, ts, forces, tolerance):
+        def member(linkage, state0):
+            y0 = jnp.concatenate([state0.q, state0.qd])
+            solution = _by_diffrax(field, y0, ts, (linkage, forces), tolerance)
+            ys = solution.ys
+            return Motion(ys[:, :3], ys[:, 3:], **_steps(solution))
+
+        return _over(member, problem.axes)(linkage, state0)
+
+    arguments = _arguments(problem)
+    call = lambda tolerance: run(*arguments, tolerance)
+    return Contestant(name, "tolerance", call, lambda motion: motion)
 
 
-def _halves(linkage, y):
-    return y[:3], y[3:]
+def diffrax_textbook(problem: Problem) -> Contestant:
+    """Returns Fig 5's arm as first written: arrays and `jnp.linalg.solve`."""
+    return _stacked(problem, _textbook_field, "diffrax, arrays")
 
 
-textbook_form = Form("plain diffrax", _textbook_field, _stacked, _halves)
-masked_form = Form(
-    "plain diffrax, masked 6x6",
-    _masked_field,
-    lambda linkage, state0: jnp.concatenate(fj.paper.to_chain(linkage, *state0)),
-    _masked_joints,
-)
-reduced_form = Form("plain diffrax, reduced", _reduced_field, _stacked, _halves)
+def diffrax_reduced(problem: Problem) -> Contestant:
+    """Returns the library's own accelerations for diffrax, with its force elements."""
+    return _stacked(problem, _reduced_field, "diffrax, our equations")
 
 
-def plain_textbook(problem: Problem) -> Contestant:
-    """Returns textbook equations of Fig 5's arm, without any part of the library."""
-    return _plain(problem, textbook_form)
+def diffrax_scalars(problem: Problem) -> Contestant:
+    """Returns a pendulum as diffrax's author would advise: scalars, written out."""
+    arm = constants(problem.linkage)
+    n = len(arm.second)
 
+    def field(t, y, args):
+        angle, rate = y[:n], y[n:]
+        found = accelerations(arm, angle, rate, jnp.sin, jnp.cos)
+        return (*rate, *found)
 
-def plain_masked(problem: Problem) -> Contestant:
-    """Returns the published form without forces: 12 states, masked equations."""
-    return _plain(problem, masked_form)
+    @jax.jit
+    def run(y0, tolerance):
+        def member(y0):
+            solution = _by_diffrax(field, tuple(y0), ts, None, tolerance)
+            assert solution.ys is not None
+            return jnp.stack(solution.ys, axis=-1), _steps(solution)
 
+        return _over(member, None if problem.batch is None else 0)(y0)
 
-def plain_reduced(problem: Problem) -> Contestant:
-    """Returns the library's own accelerations, stacked, with its force elements."""
-    return _plain(problem, reduced_form)
+    ts, y0 = jnp.asarray(problem.ts), jnp.asarray(absolute(arm, *problem.state0))
+
+    def motion(result: Any) -> Motion:
+        states, steps = result
+        return Motion(*relative(arm, states), **steps)
+
+    call = lambda tolerance: run(y0, tolerance)
+    return Contestant("diffrax, scalars", "tolerance", call, motion)

@@ -4,8 +4,7 @@
 
 prints seconds as JSON. `imported` and `first` are seconds of CPU from the start of the
 process to the import of the library and to the first result; `again` is the wall time
-of the same call with other numbers. With a folder, `configure` keeps compiled programs
-there.
+of the same call with other numbers. In a folder, `configure` keeps compiled programs.
 """
 
 import json
@@ -13,6 +12,9 @@ import sys
 import time
 from collections.abc import Callable
 
+import diffrax
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 import fdof_jax as fj
@@ -33,50 +35,50 @@ def fig7() -> Callable:
     return _simulate(fj.scenes.fig7())
 
 
-def elements() -> Callable:
-    """Returns PD control along a figure eight, a spring and stops."""
-    linkage = fj.Linkage(
-        "RRR",
-        length=[0, 1, 1, 0.3],
-        com=[[0.5, 0]] * 3,
-        mass=[1] * 3,
-        inertia=[0.1] * 3,
-    )
-    start = fj.State([0.0, 1.0, 0.5], [0, 0, 0])
-    task = fj.TipTask(
-        fj.references.FigureEight([1.1, 0.4], [0.4, 0.2]), fj.references.Laps(2.0)
-    )
-    forces = (
-        fj.PDController(400.0, 40.0, 1000.0, task),
-        fj.SpringDamper(fj.Point(0, 0, 1), fj.Point(2, 0.5), stiffness=50, damping=1),
-        fj.forces.JointStops(-3.0, 3.0),
-    )
-    return _simulate(fj.Scene(linkage, start, forces, 2.0))
-
-
 def sweep() -> Callable:
-    run = fj.sweep
     linkage, state0, forces, _ = fj.scenes.fig5()
     starts = np.asarray(state0.q) + np.linspace(-0.1, 0.1, 256)[:, None]
     members = fj.State(starts, state0.qd)
-    return lambda scale: run(linkage, members, scale * TS, forces)
+    return lambda scale: fj.sweep(linkage, members, scale * TS, forces)
 
 
-def _gradient(mode: str) -> Callable:
+def gradient() -> Callable:
     from . import gradients
 
-    problem = gradients.PROBLEMS[0]
-    run = gradients.compiled(problem, mode)
-    p = gradients.parameters(problem, 1)
-    return lambda scale: run(p, scale * gradients.HORIZON, gradients.TOLERANCE)
+    run = gradients.compiled("forward")
+    p, tolerance = gradients.parameters(1), gradients.TOLERANCE
+    return lambda scale: run(p, scale * gradients.HORIZON, tolerance, np.inf)
 
 
-def gradient_forward() -> Callable:
-    return _gradient("forward")
+def held() -> Callable:
+    """Returns two bars with friction that sticks, stops and a payload."""
+    arm, start, _, _ = fj.scenes.double_pendulum()
+    forces = (
+        fj.forces.JointFriction([1.0, 0.5]),
+        fj.forces.HardStops([-2, -1], [2, 1], restitution=0.3),
+        fj.forces.Payload(fj.Point(2, 1.0), mass=0.5, begin=0.4, end=1.2),
+    )
+    start = fj.State([0.0, 0.5], [0, 0])
+    return _simulate(fj.Scene(arm, start, forces, 2.0))
 
 
-def gradient_reverse() -> Callable:
-    return _gradient("reverse")
+def co_design() -> Callable:
+    """Returns the derivative of a loss in lengths and gains, of motion and efforts."""
+    scene = fj.scenes.two_link_circle()
+    (pd,) = scene.forces
+    forward = diffrax.ForwardMode()
+
+    def loss(log):
+        length = scene.linkage.length * jnp.exp(jnp.append(0, log[:2]))
+        linkage, more = scene.linkage.replace(length=length), jnp.exp(log[2:])
+        control = pd.replace(kp=pd.kp * more[:2], kd=pd.kd * more[2:])
+        now = fj.Scene(linkage, fj.State(*pd.reference(0.0, linkage)), (control,), 2.0)
+        motion = fj.simulate(now, jnp.linspace(0, 2, 101), adjoint=forward)
+        efforts = fj.joint_efforts(now, motion).total
+        return jnp.sum(fj.tuning.tip_errors(now, motion) ** 2) + jnp.mean(efforts**2)
+
+    slope = jax.jit(jax.jacfwd(loss))
+    return lambda scale: slope(0.01 * scale * jnp.ones(6))
 
 
 def tune() -> Callable:
@@ -84,23 +86,20 @@ def tune() -> Callable:
     return lambda scale: run(scene._replace(t1=scale * scene.t1))
 
 
-CASES = {
+CASES: dict[str, Callable] = {
     "Fig 5": fig5,
     "Fig 7": fig7,
-    "three elements": elements,
+    "friction, stops and a payload": held,
     "sweep of 256": sweep,
-    "value and gradient, forward": gradient_forward,
-    "value and gradient, reverse": gradient_reverse,
+    "value and gradient of six gains": gradient,
+    "slope of a co-design loss": co_design,
     "tune Fig 7": tune,
 }
 
 
 def main() -> None:
     case, *folder = sys.argv[1:]
-    if folder:
-        fj.configure(x64=True, cache=folder[0])
-    import jax
-
+    fj.configure(x64=True, cache=folder[0] if folder else False)
     run = CASES[case]()
     imported = time.process_time()
     jax.block_until_ready(run(1.0))

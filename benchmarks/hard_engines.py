@@ -22,7 +22,7 @@ from .taylor import symbolic
 
 MAX_STEPS = 5_000_000  # of adaptive solvers
 MUJOCO_STEPS = (1e-2, 1e-3, 1e-4, 1e-5)
-MUJOCO_MOST = 15_000_000  # steps of one run
+MUJOCO_MOST = 2_000_000  # steps of one run
 
 
 class Refused(Exception):

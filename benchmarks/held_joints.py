@@ -16,7 +16,6 @@ import fdof_jax as fj
 
 from .measure import Case, Skipped, measure, skipped
 from .peers import module
-from .tables import number, table
 
 PROTOCOL = "held_joints"
 GRAVITY, INF = 9.81, np.inf
@@ -249,7 +248,7 @@ def run(quick: bool) -> Iterator[dict]:
     for level in 1.0, 2.0:
         members = 64 if quick else 1000
         yield from measure(
-            PROTOCOL, chain_cases(members, level), budget=1 if quick else 60,
+            PROTOCOL, chain_cases(members, level), budget=1 if quick else 25,
             ratio_to="viscous damping", equal_error=False, batch=members,
             problem="five joints to rest, by sweep", simulated=30.0,
         )  # fmt: skip
@@ -260,42 +259,6 @@ def run(quick: bool) -> Iterator[dict]:
         except Skipped as reason:
             yield skipped(PROTOCOL, "MuJoCo", str(reason))
         yield from measure(
-            PROTOCOL, cases, budget=1 if quick else 30,
+            PROTOCOL, cases, budget=1 if quick else 8,
             problem=scene.name, simulated=scene.end,
         )  # fmt: skip
-
-
-def held_joints_table(points: list[dict]) -> str:
-    """Returns a table with a row for each scene, engine and setting, and of sweeps."""
-    sweeps = [
-        [
-            p["solver"],
-            f"{p['setting']:g}",
-            f"{100 * p['at_rest']:.0f} %",
-            f"{p['steps']}, {p['most_steps']}",
-            number(p["time_median"]),
-            number(p["ratio"]),
-        ]
-        for p in points
-        if p["kind"] == "level" and p["status"] == "ok"
-    ]
-    rows = [
-        [
-            p["problem"],
-            p["solver"],
-            f"{p['kind']} {p['setting']:g}",
-            p.get("how", ""),
-            number(p.get("drift")),
-            number(p["error"]),
-            str(p["steps"]),
-            number(p["times"] and 1e3 * p["time_median"] / p["simulated"]),
-            number(p["compile_time"]) if p["solver"] == "fdof_jax" else "-",
-        ]
-        for p in points
-        if p["status"] != "skipped" and p["kind"] != "level"
-    ]
-    head = ["", "", "", "settings", "drift [m or rad]", "error [m or rad]", "steps",
-            "ms a simulated s", "compile [s]"]  # fmt: skip
-    of_sweeps = ["five joints, 1000 members, 30 s", "times 5, 4, 3, 2, 1 N m (s)",
-                 "at rest", "steps: mean, most", "s", "ratio"]  # fmt: skip
-    return f"{table(head, rows)}\n\n{table(of_sweeps, sweeps)}"

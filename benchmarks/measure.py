@@ -24,7 +24,6 @@ LONG = 1.0  # calls of this length [s] are measured in fewer rounds
 ENDLESS = 30.0  # first calls of this length [s] are not repeated to learn their length
 FEWEST, FEW, MANY = 3, 5, 15  # rounds: under any budget, of long calls, of the rest
 WORST_ERROR = 0.1  # a larger error is a failure, not a result
-TARGETS = (1e-3, 1e-6, 1e-9, 1e-12)
 # The outcomes of a hard case, best first.
 OUTCOMES = ("solved", "refused as asked", "failed by name", "failed silently")
 
@@ -235,7 +234,8 @@ def environment() -> dict:
         "versions": versions,
         "cpu": cpu,
         "load": os.getloadavg()[0],
-        "commit": _git("describe", "--always", "--dirty"),
+        "commit": _commit(),
+        "date": time.strftime("%Y-%m-%d"),
     }
 
 
@@ -244,6 +244,12 @@ def _cpu_models() -> Iterator[str]:
     for line in info.read_text().splitlines() if info.exists() else ():
         if line.startswith("model name"):
             yield line.split(":", 1)[1].strip()
+
+
+def _commit() -> str | None:
+    """Returns the commit; "-dirty" if anything but the results has changed."""
+    changed = _git("status", "--porcelain", "--", ":/", ":!results", ":!README.md")
+    return f"{_git('rev-parse', '--short', 'HEAD')}{'-dirty' if changed else ''}"
 
 
 def _git(*arguments: str) -> str | None:

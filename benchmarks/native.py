@@ -14,6 +14,7 @@ import numpy as np
 import fdof_jax as fj
 
 from .measure import Skipped
+from .pendulums import Constants, absolute, constants, relative
 
 SIMD = 32  # several vectors at a time hide each other's latency
 RK4 = (
@@ -71,19 +72,11 @@ def _library(method: str, lanes: int) -> ctypes.CDLL:
     return library
 
 
-def _arm(linkage: fj.Linkage) -> np.ndarray:
+def _arm(arm: Constants) -> np.ndarray:
     """Returns the fields of the kernel's `Arm`."""
-    (_, b2, b3), (_, a2, a3, _) = linkage.locked.tolist(), linkage.length.tolist()
-    m2, m3, m4 = linkage.mass.tolist()
-    com, inertia = np.asarray(linkage.com), linkage.inertia.tolist()
-    d2, d3 = np.array([a2, b2]), np.array([a3, b3])
-    u4 = m4 * com[2]
-    u3 = m3 * com[1] + m4 * d3
-    u2 = m2 * com[0] + (m3 + m4) * d2
-    k2 = inertia[0] + m2 * com[0] @ com[0] + (m3 + m4) * d2 @ d2
-    k3 = inertia[1] + m3 * com[1] @ com[1] + m4 * d3 @ d3
-    k4 = inertia[2] + m4 * com[2] @ com[2]
-    return np.array([float(linkage.gravity), *d2, *d3, *u2, *u3, *u4, k2, k3, k4])
+    return np.concatenate(
+        [[arm.gravity], arm.step.ravel(), arm.first.ravel(), arm.second]
+    )
 
 
 class Kernel:
@@ -101,15 +94,15 @@ class Kernel:
         qd: np.ndarray,
         threads: int = 1,
     ):
-        if (np.asarray(linkage.ef)[1::2] < 0.5).any():
-            raise Skipped("the kernel knows RRR only")
+        self.constants = constants(linkage)
+        if len(self.constants.second) != 3:
+            raise Skipped("the kernel has three links")
         q, qd = np.atleast_2d(q), np.atleast_2d(qd)
         self.batch, self.lanes = len(q), SIMD if len(q) > 1 else 1
         self.library = _library(method, self.lanes)
-        self.arm, self.base = _arm(linkage), float(linkage.base_angle)
+        self.arm = _arm(self.constants)
         blocks = -(-self.batch // self.lanes)
-        angle = np.cumsum(q, axis=1) + self.base
-        state = np.concatenate([angle, np.cumsum(qd, axis=1)], axis=1)
+        state = absolute(self.constants, q, qd)
         # The last block is filled up with copies of its last member.
         state = np.pad(
             state, ((0, blocks * self.lanes - self.batch), (0, 0)), mode="edge"
@@ -149,9 +142,7 @@ class Kernel:
         """Returns joint positions and rates of saved states: (batch, saves, 3) each."""
         blocks, saves = saved.shape[:2]
         state = saved.transpose(0, 3, 1, 2).reshape(blocks * self.lanes, saves, 6)
-        state = state[: self.batch]
-        q = np.diff(state[..., :3], axis=-1, prepend=self.base)
-        return q, np.diff(state[..., 3:], axis=-1, prepend=0)
+        return relative(self.constants, state[: self.batch])
 
 
 def _pointer(array: np.ndarray) -> ctypes.c_void_p:

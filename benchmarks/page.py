@@ -1,262 +1,329 @@
-"""The tables of the results page, from the JSON lines."""
+"""The claims of the results page, from the JSON lines: sentences, tables, pictures."""
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from pathlib import Path
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
-from .held_joints import held_joints_table
-from .joints import joints_table
-from .memory import memory_table
-from .scaling import slope
-from .tables import (
-    batches,
-    hard_cases,
-    hard_cases_float32,
-    number,
-    on_cores,
-    switches_table,
-    table,
-    trajectory,
-)
-from .targets import targets
+from .measure import OUTCOMES, times_at
 
+Points = list[dict]
+ERRORS = (1e-6, 1e-9)
+CHAIN_ERROR = 1e-8  # of chains of many joints
+OURS = "fdof_jax sweep"
 
-def _listed(points: list[dict], columns: list[tuple[str, str | Callable]]) -> str:
-    """Returns a table with a row per point, of columns (head, key or function)."""
-    rows = [
-        [str(p[cell]) if isinstance(cell, str) else cell(p) for _, cell in columns]
-        for p in points
-    ]
-    return table([head for head, _ in columns], rows)
+# A contestant looks the same in all pictures. Colours are Okabe and Ito's.
+LOOKS = {
+    OURS: ("#D55E00", "o"), "fdof_jax": ("#E69F00", "s"), "heyoka": ("#0072B2", "D"),
+    "C order 8": ("#000000", "^"), "C RK4": ("#999999", "v"),
+    "diffrax, scalars": ("#009E73", "<"), "diffrax, arrays": ("#56B4E9", ">"),
+    "MuJoCo RK4": ("#CC79A7", "P"),
+}  # fmt: skip
 
 
-def _number(key: str, digits: int = 2) -> Callable[[dict], str]:
-    return lambda p: number(p.get(key), digits)
+def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
+    head = list(head)
+    lines = [head, ["---"] * len(head), *(list(row) for row in rows)]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
-def _milliseconds(p: dict) -> str:
-    return number(p["time_median"] and 1e3 * p["time_median"], 3)
+def number(value: float | None, digits: int = 2) -> str:
+    """Formats a number to some digits, with powers of ten only where they help."""
+    if value is None or value != value:
+        return "-"
+    if value == 0 or 1e-2 <= abs(value) < 1e4:
+        return f"{float(f'{value:.{digits}g}'):g}"
+    return f"{value:.{digits - 1}e}".replace("e-0", "e-").replace("e+0", "e")
 
 
-def _quartiles(p: dict) -> str:
-    return " to ".join(number(q, 3) for q in p["ratio_quartiles"] or [None, None])
+def chosen(points: Points, **values: object) -> Points:
+    return [p for p in points if all(p.get(k) == v for k, v in values.items())]
 
 
-_ratio = _number("ratio", 3)
-_FAILED = "failed", lambda p: p["reason"] or ""
-
-_COLUMNS: dict[str, list[tuple[str, str | Callable]]] = {
-    "gradients": [
-        ("parameters", "problem"),
-        ("number", "parameters"),
-        ("batch", "batch"),
-        ("horizon [s]", lambda p: f"{p['horizon']:g}"),
-        ("tolerance", _number("setting")),
-        ("steps up to [s]", _number("longest_step")),
-        ("mode", "gradient_mode"),
-        ("ms", _milliseconds),
-        ("over forward", _ratio),
-        ("quartiles", _quartiles),
-        ("gradient error", _number("error")),
-        ("compile [s]", _number("compile_time")),
-        _FAILED,
-    ],
-    "single_arms": [
-        ("", "problem"),
-        ("", "solver"),
-        ("tolerance", _number("setting")),
-        ("ms", _milliseconds),
-        ("ratio", _ratio),
-        ("quartiles", _quartiles),
-        ("to", lambda p: p["ratio_to"] or ""),
-        ("error", _number("error")),
-        _FAILED,
-    ],
-    "compile_times": [
-        ("", "problem"),
-        ("", "solver"),
-        ("of a process [s]", _number("time_median", 3)),
-        ("of the first call [s]", _number("compile_time", 3)),
-        (
-            "second call [ms]",
-            lambda p: number(1e3 * np.median(p["again"]) if p["times"] else None, 3),
-        ),
-        _FAILED,
-    ],
-    "drift": [
-        ("", "solver"),
-        ("setting", lambda p: f"{p['kind']} {p['setting']:g}" if p["setting"] else ""),
-        ("s", _number("time_median", 3)),
-        ("largest energy error [J]", _number("energy_defect")),
-        _FAILED,
-    ],
-    "lockstep": [
-        ("", "solver"),
-        ("ms", _milliseconds),
-        ("over clean", _ratio),
-        ("quartiles", _quartiles),
-        ("mean steps", _number("steps", 3)),
-        ("most", _number("steps_max", 4)),
-        ("most/mean", _number("waste")),
-        _FAILED,
-    ],
-    "many": [
-        ("scenes", "problem"),
-        ("s", _number("time_median", 3)),
-        ("mean steps", _number("steps", 3)),
-        ("most", "steps_max"),
-        ("successful", "successful"),
-        ("off single motions by", _number("against_singles")),
-        ("memory before [MB]", lambda p: f"{p['memory_before_mb']:.0f}"),
-        ("at most [MB]", lambda p: f"{p['memory_peak_mb']:.0f}"),
-        ("of it results [MB]", lambda p: f"{p['saved_mb']:.0f}"),
-    ],
-}
+def rate(points: Points, error: float) -> float | None:
+    """Returns one contestant's simulated s per s at an error; None if not reached."""
+    walls = times_at(points, error)
+    return None if walls is None else points[0]["simulated"] / float(np.median(walls))
 
 
-def generality(points: list[dict]) -> str:
-    each = lambda p: number(1e9 * p["time_median"] / p["member_steps"], 3)
-    columns = [("problem", "problem"), ("", "solver"), ("ns per member and step", each)]
-    columns += [("ratio", _ratio), ("quartiles", _quartiles)]
-    return _listed([p for p in points if p["times"]], columns)
+def ratio(ours: Points, others: Points, error: float) -> str:
+    """Returns how often as fast as others: median and quartiles of the rounds."""
+    walls = times_at(ours, error), times_at(others, error)
+    if walls[0] is None or walls[1] is None:
+        return "-"
+    count = min(map(len, walls))
+    low, middle, high = np.percentile(walls[1][:count] / walls[0][:count], [25, 50, 75])
+    return f"{number(middle)} ({number(low)} to {number(high)})"
 
 
-def scaling(points: list[dict]) -> str:
+def _solvers(points: Points) -> list[str]:
+    return list(dict.fromkeys(p["solver"] for p in points if p["status"] != "skipped"))
+
+
+def _rates(points: Points, errors: tuple[float, ...], over: str) -> str:
+    """Returns a table of rates, and of how often as fast `over` is."""
     rows = []
-    for series in dict.fromkeys(p["problem"] for p in points):
-        own = [p for p in points if p["problem"] == series and p["times"]]
-        exponent = slope(own)
-        spans = " to ".join(number(p["x"]) for p in (own[0], own[-1])) if own else "-"
-        rows.append(
-            ["1/error" if series == "error" else series, spans, number(exponent)]
-        )
-    return table(["time against", "from", "exponent"], rows)
+    for solver in _solvers(points):
+        own = chosen(points, solver=solver)
+        first = max((p["compile_time"] or 0 for p in own), default=0)
+        cells = [number(rate(own, e)) for e in errors]
+        if solver != over:
+            cells += [ratio(chosen(points, solver=over), own, e) for e in errors]
+        else:
+            cells += ["1"] * len(errors)
+        rows.append([solver, *cells, number(first)])
+    head = [f"at {e:g}" for e in errors] + [f"{over} over it, {e:g}" for e in errors]
+    return table(["simulated s per s", *head, "first call [s]"], rows)
 
 
-def tuning(points: list[dict]) -> str:
-    timed, robust, races = (
-        [p for p in points if p["kind"] == kind] for kind in ("time", "robust", "race")
+def batches(points: Points) -> str:
+    mixed = chosen(points, problem="mixed")
+    same = [p for p in points if p["problem"] == "fig5"]
+    big = max(p["batch"] for p in same)
+    size = 1024 if chosen(same, batch=1024) else big
+    return (
+        f"{size} triple pendulums:\n\n{_rates(chosen(same, batch=size), ERRORS, OURS)}"
+        f"\n\n{mixed[0]['batch']} random arms of all seven kinds:\n\n"
+        f"{_rates(mixed, ERRORS, OURS)}"
     )
-    seconds = _listed(
-        timed,
+
+
+def cores(points: Points) -> str:
+    rows = []
+    for batch in dict.fromkeys(p["batch"] for p in points):
+        for problem in dict.fromkeys(p["problem"] for p in points):
+            own = chosen(points, batch=batch, problem=problem)
+            two = chosen(own, solver=OURS)
+            cells = [
+                ratio(two, chosen(own, solver=other), error)
+                for other in ("one core", "heyoka")
+                for error in ERRORS
+            ]
+            state = "" if problem == "fig5" else f", {problem}"
+            rows.append([f"{batch}{state}", *cells])
+    others = "one core", "heyoka's two threads"
+    head = [f"over {other}, {error:g}" for other in others for error in ERRORS]
+    return table(["members", *head], rows)
+
+
+def joints(points: Points) -> str:
+    rows = []
+    for count in dict.fromkeys(p["joints"] for p in points if "joints" in p):
+        of = chosen(points, joints=count)
+        batch = max(p["batch"] for p in of)
+        row = [str(count), number(of[0]["flops"], 4)]
+        for members in (1, batch):
+            own = chosen(of, batch=members)
+            ours = chosen(own, solver="fdof_jax" if members == 1 else OURS)
+            row.append(number(rate(ours, CHAIN_ERROR)))
+            row += [
+                ratio(ours, chosen(own, solver=other), CHAIN_ERROR).split(" ")[0]
+                for other in ("heyoka", "MuJoCo RK4")
+            ]
+        ours = chosen(of, batch=batch, solver=OURS)
+        row.append(number(max((p["compile_time"] or 0 for p in ours), default=None)))
+        rows.append(row)
+    over = ["over heyoka", "over MuJoCo"]
+    head = ["joints", "flops", "one arm [s per s]", *over, "1024 arms [s per s]", *over]
+    return table([*head, "first call [s]"], rows)
+
+
+def single_arms(points: Points) -> str:
+    short = chosen(points, problem="Fig 7, 10 ms")
+    way = ", ".join(f"{p['solver']} {number(1e3 * p['time_median'])} ms" for p in short)
+    motion = chosen(points, problem="Fig 5, 2 s")
+    return f"{_rates(motion, ERRORS, 'fdof_jax')}\n\n10 ms of Fig 7: {way}."
+
+
+def gradients(points: Points) -> str:
+    rows = [
         [
-            ("", "problem"),
-            # An earlier row compiled what seems to take no time.
-            (
-                "compile [s]",
-                lambda p: number(p["compile_time"]) if p["compile_time"] > 1 else "-",
-            ),
-            ("s", _number("time_median", 3)),
-            ("s per start", lambda p: number(p["time_median"] / p["batch"], 3)),
-            ("starts within 1 % of the best", lambda p: f"{100 * p['near']:.0f} %"),
-        ],
-    )
-    *_, one, every = [p["time_median"] for p in timed]
-    worst = [
-        [p["problem"], p["solver"], *(number(v, 4) for v in p["worst"].values())]
-        for p in robust
-    ]
-    limits = list(races[0]["best"]) if races else []
-    raced = [
-        [p["problem"], p["solver"], *(number(p["best"][limit], 4) for limit in limits)]
-        for p in races
-    ]
-    return "\n\n".join(
-        [
-            seconds,
-            f"Seven topologies with all their starts take {every / one:.0f} times as "
-            "long as one with one start.",
-            "Worst rms tip error [mm] over 64 members, of gains tuned for the nominal "
-            "scene, for 16 other members, and, as a bound, for these 64 themselves:",
-            table(["", "controller", "nominal", "robust", "bound"], worst),
-            "Best rms tip error [mm] after so many seconds, median of the starts:",
-            table(["", "optimiser", *(f"{limit} s" for limit in limits)], raced),
+            str(p["batch"]),
+            p["solver"].removeprefix("fdof_jax, "),
+            number(1e3 * p["time_median"]),
+            number(p["ratio"]),
+            number(p["error"]),
         ]
-    )
-
-
-def sliders(points: list[dict]) -> str:
-    moves = [t for p in points if not p["problem"].startswith("between")
-             for t in p["times"]]  # fmt: skip
-    rows = []
-    for p in [*points, {"problem": "all moves", "times": moves}]:
-        if p["times"]:
-            median, most = (number(1e3 * np.quantile(p["times"], q), 3)
-                            for q in (0.5, 0.95))  # fmt: skip
-            share = f"{100 * np.mean(np.array(p['times']) < 0.1):.1f} %"
-            rows.append([p["problem"], str(len(p["times"])), median, most, share])
-    head = ["", "pictures", "median [ms]", "95 % within [ms]", "under 100 ms"]
-    return table(head, rows)
-
-
-def _machine(points: dict[str, list[dict]]) -> str:
-    """Returns a line per machine and versions, with the jobs and their commits."""
-    jobs: dict[str, dict[str, set[str]]] = {}
-    for name, job in points.items():
-        for point in job:
-            versions = [f"{k} {v}" for k, v in point["versions"].items() if v]
-            commits = jobs.setdefault(", ".join([point["cpu"], *versions]), {})
-            # Uncommitted changes may be results of earlier jobs.
-            commits.setdefault(point["commit"].removesuffix("-dirty"), set()).add(name)
-    lines = []
-    for machine, commits in jobs.items():
-        runs = "; ".join(
-            f"{', '.join(sorted(names))} at commit {commit}"
-            for commit, names in sorted(commits.items(), key=lambda item: -len(item[1]))
-        )
-        lines.append(f"- {machine}: {runs}.")
-    return "\n".join(lines)
-
-
-def tables(points: dict[str, list[dict]]) -> dict[str, str]:
-    """Returns the text of each table that has been measured, by name."""
-    makers = {
-        "batches": batches,
-        "mixed": batches,
-        "trajectory": trajectory,
-        "generality": generality,
-        "checks": generality,
-        "scaling": scaling,
-        "joints": joints_table,
-        "held_joints": held_joints_table,
-        "memory": memory_table,
-        "tuning": tuning,
-        "hard_cases": hard_cases,
-        "hard_cases-float32": hard_cases_float32,
-        "sliders": sliders,
-        "switches": switches_table,
-    }
-    texts = {}
-    for name, own in points.items():
-        if name in _COLUMNS:
-            texts[name] = _listed(own, _COLUMNS[name])
-        elif own:
-            kind = name if name in makers else name.partition("-")[0]
-            texts[name] = makers[kind](own)
-    if points.get("batches") and points.get("batches-two-cores"):
-        texts["batches-cores"] = on_cores(points)
-    if texts:
-        texts = {"targets": reached(points), "machine": _machine(points), **texts}
-    return texts
-
-
-def reached(*measured: dict[str, list[dict]]) -> str:
-    """Returns the table of targets, each with the version of JAX that it is from."""
-    head = ["figure", "measured", "quartiles", "required", "aim for", "JAX"]
-    rows = [
-        [*map(str, row), own[0]["versions"]["jax"]]
-        for points in measured
-        for name, own in points.items()
-        for row in targets({name: own}, number)
+        for p in points
+        if p["status"] == "ok" and p["solver"] != "fdof_jax"
     ]
-    return table(head, rows)
+    return table(["arms", "", "ms", "over the motion", "error of the gradient"], rows)
 
 
-def filled(page: str, texts: dict[str, str]) -> str:
-    """Returns the page with each text between its pair of markers."""
-    for name, text in texts.items():
-        begin, end = f"<!-- begin: {name} -->", f"<!-- end: {name} -->"
-        between = re.compile(re.escape(begin) + ".*?" + re.escape(end), re.DOTALL)
-        page = between.sub(lambda _, t=text, b=begin, e=end: f"{b}\n\n{t}\n\n{e}", page)
+def switches(points: Points) -> str:
+    """Returns the errors of each way over all scenes at the default tolerance."""
+    tolerance = max(p["setting"] for p in points)
+    rows = []
+    for way in _solvers(points):
+        own = chosen(points, solver=way, setting=tolerance)
+        errors = np.concatenate([np.asarray(p["errors"], float) for p in own])
+        wrong = np.mean(~(errors < 1e-6))
+        rows.append([way, str(len(errors)), number(np.median(errors)),
+                     number(np.max(errors)), f"{100 * wrong:.2g} %"])  # fmt: skip
+    return table(["", "scenes", "median error", "largest", "above 1e-6"], rows)
+
+
+def held_joints(points: Points) -> str:
+    sweeps = [
+        f"with {p['setting']:g} times 5, 4, 3, 2, 1 N m, {number(p['ratio'])} times"
+        for p in points
+        if p["solver"] == "friction" and p["status"] == "ok"
+    ]
+    rows = []
+    for scene in dict.fromkeys(p["problem"] for p in points if p["kind"] != "level"):
+        for solver in ("fdof_jax", "MuJoCo"):
+            own = [
+                p for p in chosen(points, problem=scene, solver=solver) if p["times"]
+            ]
+            if not own:
+                continue
+            worst = lambda p: max(p["error"] or 0, p.get("drift") or 0)
+            best = min(own, key=worst)
+            wall = 1e3 * best["time_median"] / best["simulated"]
+            how = f"{best['kind']} {best['setting']:g}"
+            rows.append([scene, solver, how, number(worst(best)), number(wall)])
+    head = ["", "", "at its most exact", "error [m or rad]", "ms a simulated s"]
+    return f"{', '.join(sweeps)}.\n\n{table(head, rows)}"
+
+
+def hard_cases(points: Points) -> str:
+    worst: dict[str, dict[int, str]] = {}
+    for point in points:
+        if point["status"] != "skipped":
+            own = worst.setdefault(point["solver"], {})
+            both = [point["status"], own.get(point["number"], OUTCOMES[0])]
+            own[point["number"]] = max(both, key=OUTCOMES.index)
+    count = len({p["number"] for p in points})
+    rows = [
+        [engine, *(str([*own.values()].count(o)) for o in OUTCOMES),
+         str(count - len(own))]
+        for engine, own in worst.items()
+    ]  # fmt: skip
+    return table(["", *OUTCOMES, "not asked"], rows)
+
+
+def compile_times(points: Points) -> str:
+    rows = []
+    for case in dict.fromkeys(p["problem"] for p in points):
+        new, kept = (
+            chosen(points, problem=case, solver=how)[0]
+            for how in ("new", "programs kept")
+        )
+        call = new["time_median"] - new["imported"]
+        again = number(1e3 * new["again"])
+        first, later = number(new["time_median"]), number(kept["time_median"])
+        rows.append([case, first, number(call), later, again])
+    head = ["", "process [s]", "first call [s]", "process, programs kept [s]"]
+    return table([*head, "second call [ms]"], rows)
+
+
+def gpu(points: Points) -> str:
+    if not any(p["status"] == "ok" for p in points):
+        return "Not measured: no GPU was at hand."
+    rows = [
+        [
+            str(batch),
+            solver,
+            *(number(rate(chosen(own, solver=solver), e)) for e in ERRORS),
+        ]
+        for batch in dict.fromkeys(p["batch"] for p in points)
+        for own in [chosen(points, batch=batch)]
+        for solver in _solvers(own)
+    ]
+    return table(["members", "", *(f"s per s at {e:g}" for e in ERRORS)], rows)
+
+
+CLAIMS: dict[str, Callable[[Points], str]] = {
+    "batches": batches, "cores": cores, "joints": joints, "single_arms": single_arms,
+    "gradients": gradients, "switches": switches, "held_joints": held_joints,
+    "hard_cases": hard_cases, "compile_times": compile_times, "gpu": gpu,
+    "gpu-float32": gpu,
+}  # fmt: skip
+
+
+def machine(points: dict[str, Points]) -> str:
+    """Returns machine, versions and commit; raises ValueError if there are several."""
+    every = [p for rows in points.values() for p in rows]
+    commits = {p["commit"] for p in every}
+    if len(commits) != 1:
+        raise ValueError(
+            f"results: expected those of one commit, got {sorted(map(str, commits))}: "
+            "measure all again (python -m benchmarks)."
+        )
+    one, days = every[0], sorted({p["date"] for p in every})
+    versions = ", ".join(f"{k} {v}" for k, v in one["versions"].items() if v)
+    return f"{one['cpu']}, commit {one['commit']}, {days[0]}; {versions}."
+
+
+def texts(points: dict[str, Points]) -> dict[str, str]:
+    found = {name: CLAIMS[name](rows) for name, rows in points.items() if rows}
+    return found | {"machine": machine(points)}
+
+
+def filled(page: str, new: dict[str, str]) -> str:
+    """Returns the page with texts between their markers."""
+    for name, text in new.items():
+        pattern = rf"(<!-- begin: {name} -->).*?(<!-- end: {name} -->)"
+        page = re.sub(pattern, lambda m, t=text: f"{m[1]}\n\n{t}\n\n{m[2]}", page,
+                      flags=re.DOTALL)  # fmt: skip
     return page
+
+
+# Pictures
+
+
+def _curve(axes: Axes, solver: str, x: list, y: list) -> None:
+    known = [(a, b) for a, b in zip(x, y) if b]
+    if known:
+        color, marker = LOOKS[solver]
+        width = 2 if solver == OURS else 1
+        axes.loglog(
+            *zip(*known), color=color, marker=marker, ms=4, lw=width, label=solver
+        )
+
+
+def pictures(points: dict[str, Points], folder: Path) -> None:
+    same = [p for p in points.get("batches", []) if p["problem"] == "fig5"]
+    sizes = sorted({p["batch"] for p in same if p["times"]})
+    if not sizes:
+        return
+    size = 1024 if 1024 in sizes else sizes[-1]
+    figure = Figure(figsize=(6.3, 4.2), layout="constrained")
+    axes = figure.subplots()
+    for solver in LOOKS:
+        own = [p for p in chosen(same, batch=size, solver=solver) if p["times"]]
+        own.sort(key=lambda p: p["error"])
+        rates = [p["simulated"] / p["time_median"] for p in own]
+        _curve(axes, solver, [p["error"] for p in own], rates)
+    axes.invert_xaxis()
+    axes.set_xlabel(f"worst error of {size} triple pendulums [rad], falling")
+    axes.set_ylabel("simulated s per s on one core")
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=8, ncols=2)
+    figure.savefig(folder / "error.png", dpi=110)
+
+    chains = points.get("joints", [])
+    figure = Figure(figsize=(6.3, 3.6), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    for solver in LOOKS:
+        own = [chosen(same, batch=b, solver=solver) for b in sizes]
+        _curve(left, solver, sizes, [rate(p, ERRORS[0]) if p else None for p in own])
+        counts = range(1, 9)
+        most = max((p["batch"] for p in chains), default=1)
+        own = [chosen(chains, joints=n, batch=most, solver=solver) for n in counts]
+        heights = [rate(p, CHAIN_ERROR) if p else None for p in own]
+        _curve(right, solver, list(counts), heights)
+    left.set(
+        xlabel="members", ylabel="simulated s per s", title="triple pendulums, at 1e-6"
+    )
+    right.set(xlabel="joints", title=f"{most} chains, at {CHAIN_ERROR:g}")
+    right.set_xscale("linear")
+    for axes in (left, right):
+        axes.grid(alpha=0.3)
+        axes.title.set_fontsize(9)
+    handles, labels = left.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=8)
+    figure.savefig(folder / "cost.png", dpi=110)

@@ -1,6 +1,5 @@
 """The problems: single motions and batches, with their reference solutions."""
 
-from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import diffrax
@@ -22,7 +21,6 @@ class Problem(NamedTuple):
     state0: fj.State
     forces: tuple
     ts: np.ndarray
-    topology: str | None = None  # of all members, None where it varies
 
     @property
     def batch(self) -> int | None:
@@ -37,38 +35,9 @@ class Problem(NamedTuple):
         return (0 if self.linkage.ef.ndim > 1 else None), 0
 
 
-def _free(name: str, scene: fj.Scene, topology: str, t1: float) -> Problem:
-    return Problem(
-        name, scene.linkage, scene.state0, (), np.linspace(0, t1, 101), topology
-    )
-
-
 def fig5() -> Problem:
-    return _free("fig5", fj.scenes.fig5(), "RRR", 10.0)
-
-
-def fig7() -> Problem:
-    scene = fj.scenes.fig7()
-    return _free("fig7", scene, "RPR", scene.t1)._replace(forces=scene.forces)
-
-
-def swinging_rpr() -> Problem:
-    """Returns the arm of Fig 7 without its controller, falling from rest."""
-    return _free("rpr-swing", fj.scenes.fig7(), "RPR", 5.0)
-
-
-def weightless_rrp() -> Problem:
-    linkage = fj.Linkage(
-        "RRP",
-        length=[0, 1, 1, 1],
-        com=[[0.5, 0.1], [0.6, 0], [0.3, -0.2]],
-        mass=[2, 1, 1],
-        inertia=[0.2, 0.1, 0.1],
-        locked=[0, 0, 0.5],
-        gravity=0,
-    )
-    state0 = fj.State(np.array([0.3, 0.5, 0.2]), np.array([1.0, -2.0, 0.1]))
-    return _free("rrp-zero-g", fj.Scene(linkage, state0, (), 0.0), "RRP", 10.0)
+    scene = fj.scenes.fig5()
+    return Problem("fig5", scene.linkage, scene.state0, (), np.linspace(0, 2, 21))
 
 
 def random_linkage(topology: str, rng: np.random.Generator) -> fj.Linkage:
@@ -85,30 +54,11 @@ def random_linkage(topology: str, rng: np.random.Generator) -> fj.Linkage:
     )
 
 
-def _random_state(rng: np.random.Generator, shape: tuple) -> fj.State:
-    return fj.State(rng.uniform(-1, 1, shape), rng.uniform(-1, 1, shape))
-
-
-def random_singles(per_topology: int = 3) -> Iterator[Problem]:
-    rng = np.random.default_rng(1)
-    for topology in fj.TOPOLOGIES:
-        for k in range(per_topology):
-            linkage = random_linkage(topology, rng)
-            scene = fj.Scene(linkage, _random_state(rng, (3,)), (), 0.0)
-            yield _free(f"random-{topology}-{k + 1}", scene, topology, 2.0)
-
-
-def fig5_batch(batch: int, half_width: float = 0.5) -> Problem:
+def fig5_batch(batch: int) -> Problem:
     """Returns Fig 5's arm from random angles around level, at rest, for 2 s."""
-    q = np.random.default_rng(0).uniform(-half_width, half_width, (batch, 3))
-    return Problem(
-        "fig5-random-2s",
-        fj.scenes.fig5().linkage,
-        fj.State(q, np.zeros_like(q)),
-        (),
-        np.array([0.0, 2.0]),
-        "RRR",
-    )
+    q = np.random.default_rng(0).uniform(-0.5, 0.5, (batch, 3))
+    start = fj.State(q, np.zeros_like(q))
+    return Problem("fig5", fj.scenes.fig5().linkage, start, (), np.array([0.0, 2.0]))
 
 
 def mixed_batch(batch: int) -> Problem:
@@ -116,8 +66,26 @@ def mixed_batch(batch: int) -> Problem:
     rng = np.random.default_rng(2)
     arms = [random_linkage(t, rng) for t in rng.choice(fj.TOPOLOGIES, batch)]
     linkage = jax.tree.map(lambda *leaves: jnp.stack(leaves), *arms)
-    state0 = _random_state(rng, (batch, 3))
-    return Problem("mixed-random-2s", linkage, state0, (), np.array([0.0, 2.0]))
+    start = fj.State(*rng.uniform(-1, 1, (2, batch, 3)))
+    return Problem("mixed", linkage, start, (), np.array([0.0, 2.0]))
+
+
+def chain(joints: int, batch: int) -> Problem:
+    """Returns chains of equal rods, bent by up to half a radian a joint, for 2 s.
+
+    The rods are as long in all chains, so that their fastest motions are similar.
+    """
+    linkage = fj.Linkage(
+        "R" * joints,
+        length=[0.0] + [1.0] * joints,
+        com=[[0.5, 0.0]] * joints,
+        mass=[1.0] * joints,
+        inertia=[1 / 12] * joints,
+        base_angle=-np.pi / 2,
+    )
+    q = np.random.default_rng(joints).uniform(-0.5, 0.5, (batch, joints))
+    start = fj.State(q, np.zeros_like(q))
+    return Problem(f"{joints} joints", linkage, start, (), np.array([0.0, 2.0]))
 
 
 def controller(tolerance: Any) -> diffrax.PIDController:

@@ -14,41 +14,25 @@ class Job(NamedTuple):
     """A measurement of a process: a function of a module, and a number of cores."""
 
     name: str
-    module: str
+    module: str = ""  # by default of the same name
     function: str = "run"
     cores: int = 1
     x64: bool = True
-    cpu: bool = True
-    asked: bool = False  # whether it runs only when named
+    cpu: bool = True  # others run only when named
 
 
 JOBS = (
-    Job("batches", "batches"),
-    Job("batches-two-cores", "batches", "run_two_cores", cores=2),
-    Job("batches-float32", "batches", "run_float32", x64=False),
-    Job("batches-gpu", "batches", "run_accelerator", cpu=False),
-    Job("batches-gpu-float32", "batches", "run_accelerator", x64=False, cpu=False),
-    Job("mixed", "batches", "run_mixed"),
-    Job("many", "many"),
-    Job("memory", "memory"),
-    Job("trajectory", "trajectory"),
-    Job("single_arms", "single_arms"),
-    Job("generality", "generality"),
-    Job("checks", "checks"),
-    Job("gradients", "gradients"),
-    Job("switches", "switches"),
-    Job("held_joints", "held_joints"),
-    Job("compile_times", "compile_times"),
-    Job("scaling", "scaling"),
-    Job("joints", "joints"),
-    Job("drift", "drift"),
-    Job("lockstep", "lockstep"),
-    Job("tuning", "tuning"),
-    # A quarter of an hour, mainly for outcomes: runs only when named.
-    Job("hard_cases", "hard_cases", asked=True),
-    Job("hard_cases-float32", "hard_cases", "run_float32", x64=False, asked=True),
-    # Needs a browser.
-    Job("sliders", "sliders", cores=2, asked=True),
+    Job("batches"),
+    Job("cores", "batches", "run_two_cores", cores=2),
+    Job("joints"),
+    Job("single_arms"),
+    Job("gradients"),
+    Job("switches"),
+    Job("held_joints"),
+    Job("hard_cases"),
+    Job("compile_times"),
+    Job("gpu", "batches", "run_accelerator", cpu=False),
+    Job("gpu-float32", "batches", "run_accelerator", x64=False, cpu=False),
 )
 
 
@@ -85,9 +69,9 @@ def main() -> None:
     from .measure import skipped
 
     if job.cpu and len(available) < job.cores:
-        points = [skipped(job.module, job.name, f"needs {job.cores} cores")]
+        points = [skipped(job.name, job.name, f"needs {job.cores} cores")]
     else:
-        module = importlib.import_module(f"benchmarks.{job.module}")
+        module = importlib.import_module(f"benchmarks.{job.module or job.name}")
         points = getattr(module, job.function)(options.quick)
     options.output.parent.mkdir(parents=True, exist_ok=True)
     with options.output.open("w") as file:

@@ -2,20 +2,23 @@
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 
-from benchmarks import batches, page, targets
-from benchmarks.circle import make_control, make_reference
+import fdof_jax as fj
+from benchmarks import contestants, page
+from benchmarks.__main__ import load
 from benchmarks.measure import RECORD, Case, envelope, measure, times_at
 from benchmarks.native import Kernel
-from benchmarks.problems import fig7, random_linkage
-from benchmarks.tables import switches_table
+from benchmarks.pendulums import absolute, accelerations, constants, relative
+from benchmarks.problems import chain, random_linkage
 from fdof_jax import State, simulate
 
 ROOT = Path(__file__).parent.parent
@@ -61,16 +64,6 @@ def test_ratios_are_taken_at_equal_error():
     assert points[1]["ratio_to"] == "fast" and points[2]["ratio"] is None
 
 
-def test_what_was_not_measured_of_switches_is_a_dash():
-    point = {"problem": "cable", "setting": 1e-11, "solver": "plain", "batch": 1}
-    point |= {"parameters": 1, "switches": 0.0, "error": 0.13, "steps": 138.0}
-    ways = [point | {"solver": "forward mode", "error": 5e-11, "steps": 55}, point]
-    *_, row = switches_table(ways).split("\n")
-    assert row == "| cable | 1 | 1 | 0 | 5.0e-11 | 55 | 0.13 | 140 | 1.0e-11 |"
-    only = switches_table([*ways, ways[0] | {"problem": "move"}]).split("\n")[-1]
-    assert only == "| move | 1 | 1 | 0 | 5.0e-11 | 55 | - | - | 1.0e-11 |"
-
-
 @pytest.fixture(scope="module")
 def three_motions():
     rng = np.random.default_rng(0)
@@ -95,17 +88,31 @@ def test_the_c_kernel_agrees_with_the_library(method, step, batch, three_motions
     np.testing.assert_allclose(q, exact[:batch], atol=1e-9)
 
 
-def test_the_circle_in_scalars_is_that_of_the_library():
-    problem = fig7()
-    (controller,) = problem.forces
-    reference, control = make_reference(problem), make_control(problem)
-    rng = np.random.default_rng(0)
-    for t in np.linspace(0, 10, 9):
-        q, qd = controller.reference(t, problem.linkage)
-        np.testing.assert_allclose(reference(t), [*q, *qd], rtol=1e-12, atol=1e-12)
-        state = np.concatenate([q, qd]) + rng.uniform(-0.3, 0.3, 6)
-        effort = controller(t, state[:3], state[3:], problem.linkage)
-        np.testing.assert_allclose(control(t, *state), effort, rtol=1e-9, atol=1e-9)
+def test_equations_of_peers_are_those_of_the_library():
+    """They agree to 1e-12 of the accelerations before anything is timed."""
+    rng = np.random.default_rng(1)
+    arms = [random_linkage("RRR", rng), fj.scenes.fig5().linkage]
+    arms.append(chain(5, 1).linkage)
+    for linkage in arms:
+        n = len(linkage.mass)
+        arm, (q, qd) = constants(linkage), rng.uniform(-2, 2, (2, n))
+        exact = np.asarray(fj.forward_dynamics(linkage, q, qd, np.zeros(n)))
+        y = absolute(arm, q, qd)
+        np.testing.assert_allclose(relative(arm, y), [q, qd], atol=1e-14)
+        found = accelerations(arm, y[:n], y[n:], np.sin, np.cos)
+        qdd = np.diff(found, prepend=0)
+        assert np.abs(qdd - exact).max() < 1e-12 * np.abs(exact).max()
+        in_mujoco = mujoco.MjModel.from_xml_string(fj.to_mjcf(linkage))
+        if linkage is not arms[1]:  # whose point masses get a little inertia there
+            data = mujoco.MjData(in_mujoco)
+            data.qpos, data.qvel = q, qd
+            mujoco.mj_forward(in_mujoco, data)
+            assert np.abs(data.qacc - exact).max() < 1e-11 * np.abs(exact).max()
+    linkage = arms[1]  # in arrays
+    q, qd = rng.uniform(-2, 2, (2, 3))
+    exact = np.asarray(fj.forward_dynamics(linkage, q, qd, np.zeros(3)))
+    rates = contestants._textbook_field(0.0, np.append(q, qd), (linkage, ()))
+    assert np.abs(rates[3:] - exact).max() < 1e-12 * np.abs(exact).max()
 
 
 def points_of(folder, name):
@@ -132,26 +139,45 @@ def test_the_number_of_joints_is_measured_end_to_end(tmp_path):
     for point in points:
         assert set(RECORD) <= set(point)
         assert {"job", "versions", "cpu", "cores", "load", "commit"} <= set(point)
-    own = [p for p in points if p["solver"] == "fdof_jax"]
+    own = [p for p in points if p["solver"] in ("fdof_jax", "fdof_jax sweep")]
     assert {p["batch"] for p in own} == {1, 16}
     assert all(p["status"] == "ok" and p["flops"] > 0 for p in own)
     assert min(p["error"] for p in own) < 1e-9
-    assert (tmp_path / "joints.png").stat().st_size > 1000
-    assert "simulated s per s" in page.tables({"joints": points})["joints"]
+    assert "1024 arms [s per s]" in result.stdout
 
 
-def test_tables_go_between_their_markers():
-    points = points_of(ROOT / "benchmarks/results", "generality")
-    texts = page.tables({"generality": points})
-    text = "before\n<!-- begin: generality -->old<!-- end: generality -->\nafter"
-    filled = page.filled(text, texts)
-    assert "EF as arrays" in filled and "old" not in filled
+def test_texts_go_between_their_markers():
+    text = "before\n<!-- begin: gpu -->old<!-- end: gpu -->\nafter"
+    filled = page.filled(text, {"gpu": "new"})
+    assert "new" in filled and "old" not in filled
     assert filled.startswith("before") and filled.endswith("after")
-    assert page.filled(filled, texts) == filled
-    rows = list(targets.targets({"generality": points}, page.number))
-    assert len(rows) == 3 and all(len(row) == 5 for row in rows)
+    assert page.filled(filled, {"gpu": "new"}) == filled
 
 
-@pytest.mark.parametrize("batch", [16, 64, 1024, 16384, 131072])
-def test_batches_of_every_size_have_contestants(batch):
-    assert {"fdof_jax", "heyoka"} <= {name for name, _, _ in batches.table(batch)}
+def test_a_page_is_of_one_commit():
+    point = {"cpu": "one", "date": "today", "versions": {}, "commit": "a"}
+    assert "commit a" in page.machine({"x": [point], "y": [point]})
+    with pytest.raises(ValueError, match="those of one commit"):
+        page.machine({"x": [point], "y": [point | {"commit": "b"}]})
+
+
+def test_ratios_are_those_of_rounds():
+    ours = [{"status": "ok", "error": 1e-9, "times": [1.0, 2.0, 1.0]}]
+    others = [{"status": "ok", "error": 1e-9, "times": [3.0, 8.0, 5.0]}]
+    assert page.ratio(ours, others, 1e-6) == "4 (3.5 to 4.5)"
+    assert page.ratio(ours, others, 1e-12) == "-"
+
+
+def test_the_page_is_that_of_the_results():
+    """Its numbers are drawn from `results`, which are those of one commit."""
+    text = (ROOT / "benchmarks/README.md").read_text()
+    assert page.filled(text, page.texts(load(ROOT / "benchmarks/results"))) == text
+    assert text.count("\n") <= 200
+
+
+def test_other_pages_quote_only_what_the_page_shows():
+    shown = set(re.findall(r"[\d.e-]+", (ROOT / "benchmarks/README.md").read_text()))
+    text = (ROOT / "docs/comparison.md").read_text()
+    speeds = text.split("## How fast")[1].split("\n## ")[0]
+    quoted = re.findall(r"(\d[\d.]*) times", speeds)
+    assert len(quoted) >= 5 and set(quoted) <= shown
