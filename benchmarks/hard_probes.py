@@ -34,7 +34,7 @@ TESTS = {
     26: ("out of steps", "test_bad_members.py", "steps or reached"),
     27: ("junk in unused values", "test_unused_values.py", ""),
     28: ("losses at zero error", "test_derivatives.py", "zero or radius"),
-    29: ("Hessians of a batch", "test_derivatives.py", "hessians"),
+    29: ("Hessians of a batch", "../test_switches.py", "hessians"),
     30: ("malformed input", "test_malformed.py", ""),
 }
 
@@ -48,6 +48,8 @@ def tested(file: str, which: str) -> dict:
         command, cwd=root, capture_output=True, text=True, check=False
     )
     last = done.stdout.strip().split("\n")[-1]
+    if done.returncode not in (0, 1):  # no test of that name, or none that began
+        raise RuntimeError(f"{file}, {which}: {last}")
     return {"status": SILENTLY if done.returncode else SOLVED, "reason": last}
 
 

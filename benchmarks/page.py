@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from .measure import OUTCOMES, times_at
+from .measure import ENDLESS, OUTCOMES, times_at
 
 Points = list[dict]
 ERRORS = (1e-6, 1e-9)
@@ -51,11 +51,12 @@ def rate(points: Points, error: float) -> float | None:
 
 def ratio(ours: Points, others: Points, error: float) -> str:
     """Returns how often as fast as others: median and quartiles of the rounds."""
-    walls = times_at(ours, error), times_at(others, error)
-    if walls[0] is None or walls[1] is None:
+    own, other = times_at(ours, error), times_at(others, error)
+    if own is None or other is None:
         return "-"
-    count = min(map(len, walls))
-    low, middle, high = np.percentile(walls[1][:count] / walls[0][:count], [25, 50, 75])
+    count = min(len(own), len(other))
+    faster = other[:count] / own[:count] * ours[0]["simulated"] / others[0]["simulated"]
+    low, middle, high = np.percentile(faster, [25, 50, 75])
     return f"{number(middle)} ({number(low)} to {number(high)})"
 
 
@@ -123,8 +124,9 @@ def joints(points: Points) -> str:
                 ratio(ours, chosen(own, solver=other), CHAIN_ERROR).split(" ")[0]
                 for other in ("heyoka", "MuJoCo RK4")
             ]
-        ours = chosen(of, batch=batch, solver=OURS)
-        row.append(number(max((p["compile_time"] or 0 for p in ours), default=None)))
+        first = [p["compile_time"] for p in chosen(of, batch=batch, solver=OURS)]
+        # First calls of more than that are not repeated to tell what was compilation.
+        row.append(f"> {ENDLESS:g}" if None in first else number(max(first)))
         rows.append(row)
     over = ["over heyoka", "over MuJoCo"]
     head = ["joints", "flops", "one arm [s per s]", *over, "1024 arms [s per s]", *over]
@@ -168,7 +170,7 @@ def switches(points: Points) -> str:
 
 def held_joints(points: Points) -> str:
     sweeps = [
-        f"with {p['setting']:g} times 5, 4, 3, 2, 1 N m, {number(p['ratio'])} times"
+        f"{number(p['ratio'])} times with {p['setting']:g} x (5, 4, 3, 2, 1) N m"
         for p in points
         if p["solver"] == "friction" and p["status"] == "ok"
     ]

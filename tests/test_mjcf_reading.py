@@ -142,10 +142,9 @@ def test_a_robot_keeps_its_meshes_apart_and_has_named_links(tmp_path):
         + (joint + origin.format(0.3)).format("b", "flange", "fixed")
         + "</robot>"
     )
-    model = mujoco.MjModel.from_xml_path(str(file))
     arm = fj.from_mjcf(file, tip="flange", drop=("contacts",)).linkage
-    equal(arm.mass, model.body_mass[-2:])
-    assert arm.mass[1] > 7 * arm.mass[0]
+    # Boxes of 1000 kg/m^3. MuJoCo 3 mixes up the meshes, so that it is no reference.
+    equal(arm.mass, [1, 8], 1e-6)
     equal(np.hypot(*fj.tip_position(arm, [0, 0])), 0.8)
 
 
