@@ -62,7 +62,6 @@ def measured(
         protocol,
         prepared,
         budget=budget,
-        ratio_to="fdof_jax sweep",
         problem=problem.name,
         batch=problem.batch,
         simulated=problem.batch * float(problem.ts[-1] - problem.ts[0]),

@@ -96,5 +96,5 @@ def run(quick: bool) -> Iterator[dict]:
         ]
         yield from measure(
             "gradients", prepared, budget=1 if quick else 8, ratio_to="fdof_jax",
-            equal_error=False, problem="Fig 7, six gains", batch=batch,
+            problem="Fig 7, six gains", batch=batch,
         )  # fmt: skip

@@ -249,7 +249,7 @@ def run(quick: bool) -> Iterator[dict]:
         members = 64 if quick else 1000
         yield from measure(
             PROTOCOL, chain_cases(members, level), budget=1 if quick else 25,
-            ratio_to="viscous damping", equal_error=False, batch=members,
+            ratio_to="viscous damping", batch=members,
             problem="five joints to rest, by sweep", simulated=30.0,
         )  # fmt: skip
     for scene in SCENES:

@@ -37,7 +37,7 @@ class Case(NamedTuple):
 
     - `run`: does the work once; the timer waits for its result.
     - `judge`: returns what is known of the result: `error`, and possibly
-      `energy_defect`, `steps`, `rejected`, `status`.
+      `steps`, `rejected`, `status`.
     - `fields`: further fields of its record.
     """
 
@@ -58,7 +58,6 @@ RECORD = {
     "steps": None,
     "rejected": None,
     "error": None,
-    "energy_defect": None,
     "time_min": None,
     "time_median": None,
     "time_quartiles": None,
@@ -68,7 +67,6 @@ RECORD = {
     "ratio_to": None,
     "batch": 1,
     "dtype": None,
-    "gradient_mode": None,
     "compile_time": None,
     "status": "ok",
     "reason": None,
@@ -108,7 +106,6 @@ def measure(
     budget: float,
     rounds: int = MANY,
     ratio_to: str | None = None,
-    equal_error: bool = True,
     **fields: Any,
 ) -> list[dict]:
     """Returns records of all cases. Failed cases are not timed.
@@ -116,8 +113,7 @@ def measure(
     **Arguments:**
 
     - `budget`: time after which no round begins, except the first three [s].
-    - `ratio_to`: the solver whose time divides those of the others, in each round: at
-      the case's own error, or with `equal_error` off, its only case.
+    - `ratio_to`: the solver with one case whose time divides all others, in each round.
     - `fields`: fields that all records share.
     """
     points, running = [], []
@@ -164,25 +160,19 @@ def measure(
             point["time_median"] = median
             point["time_quartiles"] = [low, high]
     if ratio_to is not None:
-        _add_ratios(points, ratio_to, equal_error)
+        _add_ratios(points, ratio_to)
     return points
 
 
-def _add_ratios(points: list[dict], ratio_to: str, equal_error: bool) -> None:
+def _add_ratios(points: list[dict], ratio_to: str) -> None:
     baseline = [p for p in points if p["solver"] == ratio_to and p["times"]]
-    for point in points:
-        if not point["times"] or not baseline:
-            continue
-        if equal_error:
-            against = times_at(baseline, point["error"])
-        else:
+    for point in points if baseline else ():
+        if point["times"]:
             against = np.array(baseline[0]["times"])
-        if against is None:
-            continue
-        shared = min(len(against), len(point["times"]))
-        ratio = np.array(point["times"][:shared]) / against[:shared]
-        low, median, high = np.percentile(ratio, [25, 50, 75])
-        point.update(ratio=median, ratio_quartiles=[low, high], ratio_to=ratio_to)
+            shared = min(len(against), len(point["times"]))
+            ratio = np.array(point["times"][:shared]) / against[:shared]
+            low, median, high = np.percentile(ratio, [25, 50, 75])
+            point.update(ratio=median, ratio_quartiles=[low, high], ratio_to=ratio_to)
 
 
 def envelope(errors: Sequence[float], times: Sequence[float], error: float) -> float:

@@ -129,7 +129,8 @@ def joints(points: Points) -> str:
         row.append(f"> {ENDLESS:g}" if None in first else number(max(first)))
         rows.append(row)
     over = ["over heyoka", "over MuJoCo"]
-    head = ["joints", "flops", "one arm [s per s]", *over, "1024 arms [s per s]", *over]
+    many = f"{max(p['batch'] for p in points)} arms [s per s]"
+    head = ["joints", "flops", "one arm [s per s]", *over, many, *over]
     return table([*head, "first call [s]"], rows)
 
 

@@ -33,7 +33,7 @@ def run(quick: bool) -> Iterator[dict]:
         except Skipped as reason:
             yield skipped("single_arms", make.__name__, str(reason))
     yield from measure(
-        "single_arms", prepared, budget=budget, ratio_to="heyoka",
+        "single_arms", prepared, budget=budget,
         problem="Fig 5, 2 s", simulated=2.0,
     )  # fmt: skip
     # A motion so short that what counts is the way to the compiled solve.

@@ -57,11 +57,11 @@ def test_a_failed_run_is_never_a_win():
     assert "no" in failed["reason"]
 
 
-def test_ratios_are_taken_at_equal_error():
-    cases = _case("fast", 1e-3), _case("slow", 1e-3), _case("unreachable", 1e-9)
+def test_ratios_are_taken_to_one_case():
+    cases = _case("fast", 1e-3), _case("slow", 1e-9)
     points = measured(*cases, ratio_to="fast")
     assert points[0]["ratio"] == pytest.approx(1.0)
-    assert points[1]["ratio_to"] == "fast" and points[2]["ratio"] is None
+    assert points[1]["ratio_to"] == "fast" and points[1]["ratio"] > 0
 
 
 @pytest.fixture(scope="module")
@@ -143,7 +143,7 @@ def test_the_number_of_joints_is_measured_end_to_end(tmp_path):
     assert {p["batch"] for p in own} == {1, 16}
     assert all(p["status"] == "ok" and p["flops"] > 0 for p in own)
     assert min(p["error"] for p in own) < 1e-9
-    assert "1024 arms [s per s]" in result.stdout
+    assert "16 arms [s per s]" in result.stdout
 
 
 def test_texts_go_between_their_markers():
