@@ -112,8 +112,9 @@ def test_energy_stack_of_a_free_arm_and_of_what_was_reached():
     solution = eqx.tree_at(lambda s: s.q, solution, solution.q.at[11:].set(jnp.nan))
     with pytest.warns(UserWarning, match="the balance is off by"):  # a made-up motion
         ax = plotting.energy_stack(LINKAGE, (), solution)
-    assert labels(ax) == ["kinetic", "potential", "at the start"]
-    assert ax.get_xlim() == (0, 0.5)
+    end = "ended at 0.5 s:\nsuccessful"
+    assert labels(ax) == ["kinetic", "potential", "at the start", end]
+    assert ax.get_xlim() == (0, 1)
 
 
 @pytest.mark.slow

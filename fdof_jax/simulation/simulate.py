@@ -171,7 +171,7 @@ def simulate(
     - `linkage`, `state0`: the arm, and its joint positions and velocities. A
       `Scene` may stand for linkage, state0 and forces: `simulate(scene, ts)`.
     - `ts`: increasing output times, of shape (time,) [s]. A step ends at the last time.
-      States at the other times are interpolated and may be a hundred times less exact;
+      States between are interpolated and may be hundreds of times less exact;
       `diffrax.ClipStepSizeController` makes steps end at all of `ts`.
     - `forces`: a tuple of force elements `(t, q, qd, linkage) -> tau`.
     - `own0`: initial states of the `StatefulElement`s among the forces, one row of a
