@@ -161,6 +161,33 @@ def test_out_of_reach_is_refused_or_nan(topology, inside, path):
 
 
 @pytest.mark.parametrize("topology", ["RRR", "RRP", "RPR", "PRR"])
+def test_messages_say_how_far_a_tip_is_out_of_reach(topology):
+    """No tip much nearer than that is within reach, and one hardly farther is."""
+    ways = np.exp(1j * np.linspace(0, 2 * np.pi, 128, endpoint=False))
+    far, tried = 0, np.random.default_rng(3).uniform(-4, 4, (8, 2))
+    linkages, _ = samples(topology, 8)
+    for index, tip in enumerate([*tried, *(tried / 10)]):
+        linkage = jax.tree.map(lambda leaf, i=index % SAMPLES: leaf[i], linkages)
+        try:
+            fj.inverse_kinematics(linkage, tip, 0.3)
+        except ValueError as error:
+            distance = float(str(error).split("beyond it by ")[1].split()[0])
+        else:
+            continue
+        far += 1
+        for share, some in (0.99, False), (1.01, True):
+            around = tip + share * distance * np.stack([ways.real, ways.imag], axis=1)
+            assert reach_any(linkage, around) == some
+    assert far > 2
+
+
+@jax.jit
+def reach_any(linkage, tips):
+    found = jax.vmap(lambda tip: fj.inverse_kinematics(linkage, tip, 0.3))(tips)
+    return jnp.isfinite(found).all(axis=1).any()
+
+
+@pytest.mark.parametrize("topology", ["RRR", "RRP", "RPR", "PRR"])
 def test_poses_at_the_edge_of_the_reach_are_within(topology):
     linkages, q = samples(topology, 7)
     q, targets = at_the_edge(topology, linkages, q)
@@ -220,7 +247,8 @@ def test_parallel_slides_reach_no_given_point(topology):
         )
         # The slides of PRP are parallel if the tip keeps the direction of the ground.
         orientation = base_angle + lock if topology == "PRP" else 0.2
-        with pytest.raises(ValueError, match="^tip: expected .* within reach"):
+        said = "^tip: expected .* within reach.*, and two slides that are parallel"
+        with pytest.raises(ValueError, match=said):
             fj.inverse_kinematics(linkage, [0.5, 0.7], orientation)
 
 

@@ -148,11 +148,12 @@ def arm_of(linkage: Linkage, orientation: Array | float | None) -> Arm:
 
 def solve_joints(
     arm: Arm, wrist: Array, bearing: Array, branch: Array
-) -> tuple[Array, Array]:
+) -> tuple[Array, Array, Array]:
     """Computes positions of a linkage (n,) from the wrist x + iy, NaN out of reach.
 
     The second result is a root that is 0 just at the edge of the reach, or beyond it by
-    rounding. Velocities are not finite there.
+    rounding. Velocities are not finite there. The third is how far the wrist is beyond
+    the edge [m]: negative within reach, infinite for two parallel slides.
 
     `bearing` is the direction angle of `wrist`. As an argument it can be continuous
     along a path that winds around the pivot.
@@ -207,6 +208,12 @@ def solve_joints(
     beyond = jnp.minimum(outer, inmost) < -rounding
     product = jnp.maximum(outer, 0) * jnp.maximum(inmost, 0) / 4
     root = branch * jnp.sqrt(jnp.where(beyond, jnp.nan, product))
+    size = jnp.where(two_turning, jnp.sqrt(square), abs(component))
+    missing = jnp.maximum(
+        size - jnp.sqrt(longest),
+        jnp.where(two_turning, abs(length2 - length3) - size, -jnp.inf),
+    )
+    missing = jnp.where(two_slides, jnp.where(parallel, jnp.inf, -jnp.inf), missing)
 
     angle = plane_angle(root, along + jnp.where(two_turning, square2, 0))
     second = jnp.where(whole, bearing - angle, jnp.where(turning2, th3 + angle, th2))
@@ -220,7 +227,16 @@ def solve_joints(
     turned = second - th1, third - second, th4 - third
     slid = slide, jnp.where(framed, -slide, jnp.where(r1, slide, other)), other
     q = [jnp.where(*joint) for joint in zip(arm.revolute, turned, slid)]
-    return arm.placed(jnp.stack(q)), root
+    return arm.placed(jnp.stack(q)), root, missing
+
+
+def beyond(missing: Array) -> str:
+    """Says in messages by how much a point or a path is out of reach."""
+    farthest = np.asarray(missing).max()
+    if not np.isfinite(farthest):
+        return ", and two slides that are parallel"
+    most = "at most " if np.size(missing) > 1 else ""
+    return f", beyond it by {most}{farthest:.3g} m" if farthest > 0 else ", at its edge"
 
 
 def inverse_kinematics(
@@ -263,19 +279,22 @@ def inverse_kinematics(
     if orientation is not None:
         orientation = real_array("orientation", orientation, (), unit="rad")
     check_moving_joints(linkage, orientation is not None)
-    q = _positions(linkage, tip, orientation, sign("branch", branch))
+    q, _, missing = _positions(linkage, tip, orientation, sign("branch", branch))
     if not (is_traced(q) or np.isfinite(q).all()):
         at = "" if orientation is None else f" at orientation {orientation:g} rad"
-        raise ValueError(f"tip: expected a point within reach{at}, got {tip.tolist()}.")
+        raise ValueError(
+            f"tip: expected a point within reach{at}, got {tip.tolist()} m"
+            f"{beyond(missing)}."
+        )
     return q
 
 
 @at_once
 def _positions(
     linkage: Linkage, tip: Array, orientation: Array | None, branch: Array
-) -> Array:
+) -> tuple[Array, Array, Array]:
     arm = arm_of(linkage, orientation)
     wrist = plane_vector(*tip) - arm.base
     bearing = plane_angle(wrist.imag, wrist.real)
     bearing = bearing - 2 * np.pi * whole_turns(bearing)
-    return solve_joints(arm, wrist, bearing, branch)[0]
+    return solve_joints(arm, wrist, bearing, branch)

@@ -18,6 +18,7 @@ from ..linkage.frames import cross, dot, plane_vector, plane_vectors
 from ..linkage.linkage import Linkage, joints_of
 from ..mechanics.inverse_kinematics import (
     arm_of,
+    beyond,
     check_moving_joints,
     plane_angle,
     solve_joints,
@@ -103,6 +104,10 @@ class TipReference(Reference):
         """
 
     def assembly(self, t, linkage):
+        return self.solved(t, linkage)[:2]
+
+    def solved(self, t: Array, linkage: Linkage) -> tuple[Array, Array, Array]:
+        """Joint positions, their root, and by how much the wrist is beyond reach."""
         arm = arm_of(linkage, self.orientation)
         return solve_joints(arm, *self.wrist_seen(t, arm.base), self.branch)
 
@@ -121,7 +126,8 @@ class TipReference(Reference):
             tip = np.round(self.tip(t), 6)
             raise ValueError(
                 f"t: expected a time at which the tip is within {self._reach()}, got "
-                f"{np.asarray(t):g} s, at which it is at {tip.tolist()} m."
+                f"{np.asarray(t):g} s, at which it is at {tip.tolist()} m"
+                f"{self._beyond(linkage, t)}."
             )
         return motion
 
@@ -130,6 +136,15 @@ class TipReference(Reference):
         commanded = self.orientation is not None
         at = f" at orientation {self.orientation:g} rad" if commanded else ""
         return f"the linkage's reach{at} on branch {self.branch:+g}"
+
+    def _beyond(self, linkage: Linkage, times: ArrayLike) -> str:
+        """Says in messages how far the tip is out of reach at the times."""
+        return beyond(_missing(self, linkage, np.atleast_1d(times)))
+
+
+@at_once
+def _missing(reference: TipReference, linkage: Linkage, times: Array) -> Array:
+    return jax.vmap(lambda t: reference.solved(t, linkage)[2])(times)
 
 
 class TipTask(TipReference):
@@ -196,7 +211,8 @@ class TipTask(TipReference):
         if not within.all():
             raise ValueError(
                 f"reference: expected a path within {self._reach()}, got one that "
-                f"leaves it at {times[within.argmin()]:g} s."
+                f"leaves it at {times[within.argmin()]:g} s"
+                f"{self._beyond(linkage, times)}."
             )
         if not ahead:
             raise ValueError(
@@ -329,10 +345,12 @@ class CircleTask(TipReference):
     def check(self, linkage: Linkage, ts: Array) -> None:
         """Raises ValueError if the tip leaves the linkage's reach between the times."""
         check_moving_joints(linkage, oriented=True)
-        if not in_numpy(_within(self, linkage, ts)):
+        times, within = in_numpy(_circle_survey(self, linkage, ts))
+        if not within.all():
             raise ValueError(
                 f"reference: expected a circle within {self._reach()}, got center "
-                f"{self.center.tolist()} and radius {self.radius:g} m."
+                f"{self.center.tolist()} and radius {self.radius:g} m"
+                f"{self._beyond(linkage, times)}."
             )
 
 
@@ -351,8 +369,10 @@ def _circle_tip(circle: CircleTask, t: Array) -> Array:
 
 
 @at_once
-def _within(circle: CircleTask, linkage: Linkage, ts: Array) -> Array:
-    """Returns whether a circle is within reach for one turn, or the run if shorter.
+def _circle_survey(
+    circle: CircleTask, linkage: Linkage, ts: Array
+) -> tuple[Array, Array]:
+    """Returns times of one turn, or the run if shorter, and whether each is in reach.
 
     The reach ends first where the wrist is nearest to or farthest from the base, or
     along a direction that the ground or the last link fixes.
@@ -366,4 +386,4 @@ def _within(circle: CircleTask, linkage: Linkage, ts: Array) -> Array:
     extremes = begin + (lead / (2 * np.pi) * circle.period - begin) % turn
     times = jnp.linspace(begin, jnp.minimum(ts[-1], begin + turn), 257)
     times = jnp.append(times, jnp.minimum(extremes, ts[-1]))
-    return reach(circle, linkage, times).all()
+    return times, reach(circle, linkage, times)
