@@ -22,7 +22,7 @@ circling = fj.simulate(scene.linkage, scene.state0, ts, scene.forces)
 pendulum = fj.scenes.fig5()
 fall = fj.simulate(pendulum.linkage, pendulum.state0, ts)
 
-figure = plt.figure(figsize=(7.2, 3.7), layout="constrained")
+figure = plt.figure(figsize=(7.2, 3.3), layout="constrained")
 animation = drawing.animate_grid(
     {
         "RPR: gains tuned by gradients": (scene.linkage, circling),

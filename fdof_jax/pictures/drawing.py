@@ -274,17 +274,26 @@ def _geometries(motions: Any, forces: Any) -> dict[str, tuple[np.ndarray, Geomet
 def _panels(
     geometries: dict[str, tuple[np.ndarray, Geometry]], fig: Figure | None
 ) -> tuple[Figure, list[Axes]]:
-    """A figure with a grid of axes, one per motion."""
-    columns = min(4, len(geometries))
-    rows = -(-len(geometries) // columns)
-    fig = figure_or_new(fig, 1.3 + 1.75 * columns, 0.4 + 1.9 * rows)
+    """A figure with a grid of axes of the same limits, one per motion."""
+    count = len(geometries)
+    columns = min(4, count)
+    rows = -(-count // columns)
+    points = np.concatenate([g.tip for _, g in geometries.values()])
+    width, height = map(np.ptp, xy(points))
+    high = np.clip(height / max(width, 1e-9), 0.4, 1.6)
+    fig = figure_or_new(fig, 1.3 + 1.75 * columns, 0.6 + (0.5 + 1.5 * high) * rows)
     panels = []
-    for position, (title, (_, g)) in enumerate(geometries.items()):
-        ax = plane_axes(fig.add_subplot(rows, columns, position + 1), g.tip)
-        ax.set_aspect("equal", adjustable="datalim")
+    for position, title in enumerate(geometries):
+        first = panels[0] if panels else None
+        ax = fig.add_subplot(rows, columns, position + 1, sharex=first, sharey=first)
+        plane_axes(ax, points)
         ax.set_title(fill(title, 18), fontsize="medium")  # no wider than its panel
         ax.set(xlabel="", ylabel="")
-        ax.tick_params(labelsize="small")
+        ax.tick_params(
+            labelsize="small",
+            labelbottom=position + columns >= count,
+            labelleft=position % columns == 0,
+        )
         panels.append(ax)
     fig.supxlabel("x [m]", fontsize="medium")
     fig.supylabel("y [m]", fontsize="medium")
@@ -332,7 +341,6 @@ def _animation(
     figure.draw_without_rendering()
     for ax in panels:
         ax.autoscale(False)
-        ax.set_adjustable("box")
     if new:
         figure.draw_without_rendering()  # the layout of the limits just fixed
         figure.set_layout_engine("none")  # a layout per frame takes half the time

@@ -15,7 +15,8 @@ from matplotlib.colors import ListedColormap
 from ..base.checks import refusal, shown
 from ..linkage.linkage import Linkage
 from ..references.reference import reference_of
-from ..references.task import TipReference
+from ..references.task import CircleTask, TipReference
+from ..references.timing import Laps
 from ..simulation.sampled import Motion
 from .arms import geometry
 from .axes import (
@@ -61,8 +62,14 @@ def _tips(linkage: Any, task: Any, solutions: Any) -> dict[Any, _Tip]:
     return tips
 
 
-def _draw_commanded(ax: Axes, path: np.ndarray) -> None:
-    """Draws the commanded path dashed above the others, which show in its gaps."""
+def _draw_commanded(ax: Axes, task: Any, ts: np.ndarray, path: np.ndarray) -> None:
+    """Draws the commanded path dashed above the others, which show in its gaps.
+
+    Dashes of a second turn would fill the gaps of the first.
+    """
+    turning = task if isinstance(task, CircleTask) else getattr(task, "timing", None)
+    if isinstance(turning, CircleTask | Laps):
+        path = path[ts <= ts[0] + abs(turning.period)]
     ax.plot(*xy(path), label="commanded", zorder=3, **COMMANDED)
 
 
@@ -81,10 +88,10 @@ def tracking(
     commanded tip position [m]; `solutions`: one curve per label.
     """
     tips = _tips(linkage, task, solutions)
-    longest = max((tip.commanded for tip in tips.values()), key=len)
+    ts, longest, _ = max(tips.values(), key=lambda tip: len(tip.ts))
     paths = {label: tip.path for label, tip in tips.items()}
     ax = plane_axes(ax, np.concatenate([longest, *paths.values()]))
-    _draw_commanded(ax, longest)
+    _draw_commanded(ax, task, ts, longest)
     for line in [line for line in ax.lines if line.get_gid() == "tip path"]:
         drawn = np.asarray(line.get_xydata()) @ [1, 1j]
         if any(np.array_equal(path[: len(drawn)], drawn) for path in paths.values()):
@@ -112,7 +119,7 @@ def tracking_by_error(
 
     **Returns:** the axes, with a colour bar beside them.
     """
-    _, commanded, path = _tip(linkage, task, solution)
+    ts, commanded, path = _tip(linkage, task, solution)
     error = 1000 * np.abs(path - commanded)
     ax = plane_axes(ax, np.concatenate([commanded, path]), beside=0.8)
     corners = np.column_stack(xy(path))
@@ -125,7 +132,7 @@ def tracking_by_error(
     ax.autoscale_view()
     color = _DARK_TO_LIGHT(pieces.norm(error[0]))
     ax.plot(*corners[0], "x", color=color, ms=5, label="start")
-    _draw_commanded(ax, commanded)
+    _draw_commanded(ax, task, ts, commanded)
     # An inset is as high as the axes, which equal scales may shrink.
     bar = ax.inset_axes((1.04, 0, 0.05, 1))
     ax.figure.colorbar(pieces, cax=bar, label="tip error [mm]")
