@@ -63,6 +63,7 @@ def calls(linkage):
         fj.analysis.regressor: (linkage, q, q, q),
         fj.identification.link_ends: (scene, motion),
         fj.references.reachable: (linkage, TASK, jnp.zeros(5)),
+        fj.references.reach_margin: (linkage, TASK, jnp.zeros(5)),
         fj.references.shock_against: (fj.references.Travel(1.0), 2.0),
         fj.tuning.joint_errors: (scene, motion),
         fj.tuning.tip_errors: (scene, motion),

@@ -187,6 +187,24 @@ def test_known_references_are_checked_within_transformations():
     inside(1.0)
 
 
+def test_margins_of_the_reach_and_their_derivatives():
+    line = fj.references.Line([2.5, 0], [3.5, 0])  # the last link points along it
+    task, ts = fj.TipTask(line, fj.references.Travel(1.0)), [0.0, 0.5, 1.0]
+
+    def margin(length):
+        return fj.references.reach_margin(ARM.replace(length=length), task, ts)
+
+    lengths = jnp.array([0.0, 1.0, 1.2, 0.8])
+    np.testing.assert_allclose(margin(lengths), [0.5, 0, -0.5], atol=1e-15)
+    slopes = jax.jit(jax.jacfwd(margin))(lengths)
+    np.testing.assert_allclose(slopes, np.ones((3, 4)), atol=1e-15)
+    # Two slides reach everywhere, unless they are parallel.
+    for locked, found in ([0, 0.5, 0], np.inf), ([0, 0, 0], -np.inf):
+        slides = ARM.replace(topology="RPP", locked=locked)
+        got = fj.references.reach_margin(slides, task, ts)
+        np.testing.assert_array_equal(got, [found] * 3)
+
+
 def test_only_the_part_of_a_travel_within_the_run_is_checked():
     ring = fj.TipTask(RING, fj.references.Travel(1.0, profile="harmonic"))
     ring.check(ARM, jnp.array([0.0, 0.4]))

@@ -48,6 +48,11 @@ MASKED = np.ma.masked_less([-1, 0, 0], 0)
                 for reference in (None, PATH, STANDING, references.Laps(1.0), NOTHING)
             ],
         ),
+        (
+            "task",
+            references.reach_margin,
+            [(FIG7.linkage, task, TS) for task in (None, PATH, STANDING)],
+        ),
         ("members", tuning.perturbed, [(FIG7, 10**30)]),
         (
             "q",

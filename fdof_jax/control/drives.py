@@ -29,7 +29,7 @@ class PIDController(StatefulElement):
 
     **Arguments:** one value per joint or one for all.
 
-    - `kp`, `kd`, `limit`, `reference`: as in `PDController`.
+    - `kp`, `kd`, `limit`, `reference`: as in `PDController`, which is the field `pd`.
     - `ki`: gains of the integral, not negative; 0 where kp is [N/(m s) or N m/(rad s)].
 
     **Raises:** ValueError for malformed arguments.

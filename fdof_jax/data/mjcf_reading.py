@@ -60,7 +60,8 @@ def from_mjcf(
 ) -> MjcfModel:
     """Reads a planar chain of hinges and slides from a model of MuJoCo (MJCF or URDF).
 
-    The plane is seen from where the first hinge's axis points, with gravity downwards;
+    The plane is seen from where the first hinge's axis points, with gravity downwards,
+    so that x may be -X of the model's world, as the account says;
     gravity across the plane has no effect. `q` equals `qpos`, with the opposite sign at
     hinges that turn the other way. A body with several joints becomes as many links,
     all but the last without mass. What is welded belongs to its link. Chains beside the
@@ -100,6 +101,7 @@ def from_mjcf(
     ... <geom type="capsule" fromto="0 0 0 0 0 -1" size=".1"/></body></worldbody>
     ... <actuator><position joint="j" kp="9" kv="1"/></actuator></mujoco>''')
     >>> print(account)
+    plane       x = -X, y = Z of the model's world
     joint j     R1, a hinge, q = qpos
     tip         the end of the last geom
     joint j     damping 2: JointDamper
@@ -133,6 +135,8 @@ def from_mjcf(
         model.opt.gravity[:] = 0
     linkage, chain, remarks = planar_chain(mujoco, model, tip)
     read = Reader(mujoco, model, chain, leave, note)
+    x, y = _direction(chain.right), _direction(chain.up)
+    note("plane", f"x = {x}, y = {y} of the model's world")
     _note_joints(read, linkage)
     lines += remarks
     forces = [
@@ -144,6 +148,14 @@ def from_mjcf(
     start = _start(read)
     _check_contacts(read, drop)
     return MjcfModel(linkage, start, tuple(forces), Account(lines))
+
+
+def _direction(vector: np.ndarray) -> str:
+    """Names a unit vector: "-X", or its components."""
+    axis = int(np.abs(vector).argmax())
+    if abs(vector[axis]) < 1 - 1e-9:
+        return f"({', '.join(f'{part:.4g}' for part in vector)})"
+    return ("-" if vector[axis] < 0 else "") + "XYZ"[axis]
 
 
 def _note_joints(read: Reader, linkage: Linkage) -> None:

@@ -210,7 +210,7 @@ def solve_joints(
     root = branch * jnp.sqrt(jnp.where(beyond, jnp.nan, product))
     size = jnp.where(two_turning, jnp.sqrt(square), abs(component))
     missing = jnp.maximum(
-        size - jnp.sqrt(longest),
+        size - jnp.sqrt(jnp.where(two_slides, 1, longest)),
         jnp.where(two_turning, abs(length2 - length3) - size, -jnp.inf),
     )
     missing = jnp.where(two_slides, jnp.where(parallel, jnp.inf, -jnp.inf), missing)

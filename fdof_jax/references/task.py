@@ -10,12 +10,12 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from ..base.checks import JOINT, is_traced, real_array
+from ..base.checks import JOINT, instance, is_traced, real_array
 from ..base.known_values import at_once, in_numpy
 from ..base.trigonometry import sincos
 from ..linkage.fields import Condition, Values, called, default, field, of_kind
 from ..linkage.frames import cross, dot, plane_vector, plane_vectors
-from ..linkage.linkage import Linkage, joints_of
+from ..linkage.linkage import Linkage, check_linkage, joints_of
 from ..mechanics.inverse_kinematics import (
     arm_of,
     beyond,
@@ -145,6 +145,31 @@ class TipReference(Reference):
 @at_once
 def _missing(reference: TipReference, linkage: Linkage, times: Array) -> Array:
     return jax.vmap(lambda t: reference.solved(t, linkage)[2])(times)
+
+
+def reach_margin(
+    linkage: Linkage, task: TipReference, ts: ArrayLike
+) -> Float[Array, " time"]:
+    """Computes how far the tip stays within the edge of the reach [m].
+
+    It is negative by the distance from the reach where the tip is out of it; infinite
+    where the reach has no edge, with two slides, and -inf if those are parallel. A
+    search for lengths takes it as a constraint, or puts a price on small margins.
+
+    **Arguments:** `task`: a `CircleTask` or a `TipTask`; `ts`: times (time,) [s].
+
+    **Raises:** ValueError for malformed arguments.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig7().linkage
+    >>> circle = fj.CircleTask(center=[-1, 2], radius=0.75)  # too near the base
+    >>> fj.references.reach_margin(arm, circle, [0.0, 1.875, 2.5]).round(3).tolist()
+    [0.0, -0.336, 0.0]
+    """
+    check_linkage(linkage)
+    instance("task", task, TipReference)
+    check_moving_joints(linkage, task.orientation is not None)
+    return -_missing(task, linkage, real_array("ts", ts, (None,)))
 
 
 class TipTask(TipReference):

@@ -264,8 +264,8 @@ def _raising(solution: Solution, inputs: Inputs) -> Solution:
     fitting = f"{accepted} and that fit the arm"
     messages = [
         "simulate: ts: expected finite, increasing times.",
-        "simulate: state0: expected finite numbers, between the hard stops, and those "
-        "of a prescribed motion.",
+        "simulate: state0: expected finite numbers (those of a task are NaN out of "
+        "reach), between the hard stops, and those of a prescribed motion.",
         f"simulate: linkage: {accepted}.",
         *(
             f"simulate: forces[{k}] ({type(element).__name__}): {fitting}."

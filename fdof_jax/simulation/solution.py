@@ -17,7 +17,8 @@ OUTCOMES = {
     "successful": "",
     "ill-conditioned": "The mass matrix is singular there, or nearly so (see "
     "inertia_ratios).",
-    "not finite": "The accelerations are not finite there.",
+    "not finite": "The accelerations are not finite there, as where a reference is out "
+    "of reach (references.reach_margin says by how much).",
     "out of steps": "All max_steps were taken before the end.",
     "tolerance out of reach": "Not even the shortest step meets the tolerance: "
     "rounding keeps it from that, or an effort jumps there (forces.switch makes steps "
@@ -63,8 +64,8 @@ class WithOutcome(eqx.Module):
         """Outcome of each trajectory in words, an array of the batch's shape.
 
         `"successful"`; `"ill-conditioned"`: the mass matrix is singular or nearly so
-        (see `inertia_ratios`); `"not finite"`: the accelerations are not finite,
-        as those of an impossible linkage, for instance of a negative mass;
+        (see `inertia_ratios`); `"not finite"`: the accelerations are not finite, as
+        those of a negative mass or of a reference out of reach;
         `"out of steps"`; `"tolerance out of reach"`: rounding keeps even the shortest
         step from meeting it; `"too many switches"`: one after the other, as between
         branches that push towards each other; or `"solver failed"`.
