@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
+import xarray
 from chains import random_chain
 from test_drawing import make_linkage
 
@@ -45,6 +46,24 @@ def test_a_motion_has_named_joints_with_units():
     np.testing.assert_array_equal(found.qd.sel(time=1.0), motion.qd[2])
     assert (found.outcome, found.num_steps) == ("successful", 7)
     assert fj.to_xarray(make_linkage("RRR"), motion).qd.units == "rad/s"
+
+
+@pytest.mark.slow
+def test_held_joints_are_told_alike_in_memory_and_in_a_store(tmp_path):
+    arm = fj.Linkage("R", length=[0, 1], com=[[0.5, 0]], mass=[1], inertia=[0.1])
+    friction = jax.vmap(fj.forces.JointFriction)(jnp.array([[1.0], [50.0]]))
+    batch = arm, fj.State([0.0], [0.0]), TS, (friction,)
+    motions = fj.sweep(*batch, forces_axes=0)
+    data = fj.to_xarray(arm, motions).rename(batch="member")
+    fj.sweep(*batch, forces_axes=0, store=tmp_path)
+    with xarray.open_zarr(tmp_path) as there:
+        for name in ("modes", "taken"):
+            assert there[name].dims == data[name].dims
+            assert there[name].attrs == data[name].attrs
+            np.testing.assert_array_equal(there[name], data[name])
+    words = data.modes.flag_meanings.split()
+    assert words == ["free", "friction", "lower_stop", "upper_stop", "brake"]
+    assert data.modes[:, -1, 0].values.tolist() == [0, words.index("friction")]
 
 
 def test_a_batch_has_axes_and_says_what_failed():

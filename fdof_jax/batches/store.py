@@ -26,7 +26,7 @@ from ..base.user_warnings import warn
 from ..base.whole_files import whole_file
 from ..linkage.linkage import Linkage
 from ..linkage.topology import common_unit, names_and_units, rate_unit
-from ..simulation.solution import OUTCOMES, Solution, outcome_numbers
+from ..simulation.solution import MODES, OUTCOMES, Solution, flags, outcome_numbers
 from .batch_axes import Batch
 from .chunks import Common, Job, Outcome, in_chunks, outcome_of
 
@@ -37,10 +37,8 @@ _BYTES = 2**26  # of the results in a block
 _CHUNKS = 16  # at most so many in a block, as blocks are what workers share
 # Members that are not solved yet, by the kind of the numbers
 _FILL = dict(f=np.nan, c=complex(np.nan, np.nan), i=-1, u=0, b=True)
-_FLAGS = {
-    "flag_values": [*range(len(OUTCOMES))],
-    "flag_meanings": " ".join(word.replace(" ", "_") for word in OUTCOMES),
-}
+_OF_SAMPLES = {"q": ["time", "joint"], "taken": ["time"]}  # axes of variables over time
+_OF_SAMPLES |= {"qd": _OF_SAMPLES["q"], "modes": _OF_SAMPLES["q"]}
 
 
 class Variable(NamedTuple):
@@ -81,6 +79,8 @@ def _variables(like: Any, linkage: Linkage) -> list[Variable]:
     labels = {
         "q": {"long_name": "joint position", "units": unit},
         "qd": {"long_name": "joint velocity", "units": rate_unit(unit)},
+        "modes": {"long_name": "what holds the joint"} | flags(MODES),
+        "taken": {"long_name": "energy taken by what holds joints", "units": "J"},
         "num_steps": {"long_name": "number of steps", "units": "1"},
         "time_reached": {"long_name": "time reached", "units": "s"},
     }
@@ -91,11 +91,13 @@ def _variables(like: Any, linkage: Linkage) -> list[Variable]:
         if dtype.kind not in _FILL:
             raise refusal("reduce", "numbers of a type that Zarr has", dtype)
         axes = [f"{name}_{axis + 1}" for axis in range(len(shape))]
-        if of_motion and name in ("q", "qd"):
-            axes = ["time", "joint"]
+        if of_motion and name in _OF_SAMPLES:
+            axes = _OF_SAMPLES[name]
         elif of_motion and name.startswith("own_"):
             axes[0] = "time"
-        attributes = _FLAGS if result else labels.get(name, {}) if of_motion else {}
+        attributes = (
+            flags(OUTCOMES) if result else labels.get(name, {}) if of_motion else {}
+        )
         name = "outcome" if of_motion and result else name
         variables.append(Variable(name, dtype, shape, ["member", *axes], attributes))
     return [*variables, Variable("failed", np.dtype(bool), (), ["member"], {})]

@@ -8,7 +8,7 @@ from ..base.checks import instance, known, optional_package
 from ..linkage.linkage import Linkage
 from ..linkage.topology import common_unit, names_and_units, rate_unit
 from ..simulation.sampled import Motion, check_joints
-from ..simulation.solution import MODES, Solution
+from ..simulation.solution import MODES, Solution, flags
 
 if TYPE_CHECKING:
     import pandas
@@ -37,7 +37,7 @@ def to_xarray(linkage: Linkage, solution: Motion) -> "xarray.Dataset":
     The Dataset holds joint positions `q` and velocities `qd` over `time` and `joint`,
     and the solution's `outcome`, `num_steps` and `time_reached` for each trajectory; a
     `SampledMotion` has `outcome` alone. Where elements hold joints, it also holds the
-    `mode` of each joint, as numbers, and the energy `taken` (see `Solution`). The
+    `modes` of each joint, as numbers, and the energy `taken` (see `Solution`). The
     joints are named R1, P2 and so on, with the coordinate `unit`; a joint of both kinds
     within a batch is named by its number. Batch axes come first, as `batch` (or
     `batch_1`, `batch_2` and so on). To name an axis and give it values, use
@@ -72,8 +72,8 @@ def to_xarray(linkage: Linkage, solution: Motion) -> "xarray.Dataset":
             values, label = solution.stats[name], name.replace("_", " ")
             variables[name] = variable(batch, values, label, unit)
         if solution.modes is not None and solution.taken is not None:
-            label = "what holds the joint: nothing, friction, lower, upper stop, brake"
-            variables["mode"] = variable(rows, solution.modes, label, "1")
+            held = {"long_name": "what holds the joint"} | flags(MODES)
+            variables["modes"] = rows, np.asarray(solution.modes), held
             label = "energy taken by what holds joints"
             variables["taken"] = variable(rows[:-1], solution.taken, label, "J")
     coordinates = {

@@ -1,5 +1,6 @@
 """The results of a simulation: motions, with their outcomes."""
 
+from collections.abc import Iterable
 from typing import Any
 
 import diffrax
@@ -36,6 +37,14 @@ HAPPENINGS = (
     "sticks", "slips", "bounces", "rests on its stop", "leaves its stop",
     "is braked", "is let go", "is stopped",
 )  # fmt: skip
+
+
+def flags(words: Iterable[str]) -> dict[str, Any]:
+    """Attributes of stored numbers that say what each means (CF conventions)."""
+    meanings = [word.replace(" ", "_") for word in words]
+    values = [*range(len(meanings))]
+    return {"flag_values": values, "flag_meanings": " ".join(meanings)}
+
 
 # Slower crossings are near to grazing, where no derivative exists.
 SLOW = 0.01
