@@ -79,7 +79,8 @@ def configure(
     - `cache`: a folder that keeps compiled programs for later processes; True for a
       folder in the user's cache directory, False for no folder. Each kind of processor
       has its own subfolder. Programs are deleted only if
-      `jax_compilation_cache_max_size` is set.
+      `jax_compilation_cache_max_size` is set. JAX keeps none that calls Python, as your
+      `jax.jit` of `simulate` does unless `throw=False`.
 
     **Raises:** ValueError for malformed arguments and for a folder that cannot be
     written. Warns if the option comes too late, because JAX has started.

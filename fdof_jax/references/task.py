@@ -150,11 +150,12 @@ def _missing(reference: TipReference, linkage: Linkage, times: Array) -> Array:
 def reach_margin(
     linkage: Linkage, task: TipReference, ts: ArrayLike
 ) -> Float[Array, " time"]:
-    """Computes how far the tip stays within the edge of the reach [m].
+    """Computes how far the tip is within the edge of the reach [m].
 
-    It is negative by the distance from the reach where the tip is out of it; infinite
-    where the reach has no edge, with two slides, and -inf if those are parallel. A
-    search for lengths takes it as a constraint, or puts a price on small margins.
+    The reach is that of tips at the task's orientation. The margin is negative by the
+    distance from it where the tip is out of reach; infinite where the reach has no
+    edge, with two slides, and -inf if those are parallel. A search for lengths takes it
+    as a constraint.
 
     **Arguments:** `task`: a `CircleTask` or a `TipTask`; `ts`: times (time,) [s].
 

@@ -264,8 +264,10 @@ def _raising(solution: Solution, inputs: Inputs) -> Solution:
     fitting = f"{accepted} and that fit the arm"
     messages = [
         "simulate: ts: expected finite, increasing times.",
-        "simulate: state0: expected finite numbers (those of a task are NaN out of "
-        "reach), between the hard stops, and those of a prescribed motion.",
+        "simulate: state0: expected finite numbers; those of a task are NaN out of "
+        "reach (references.reach_margin says by how much).",
+        "simulate: state0: expected positions between the hard stops, and those of a "
+        "prescribed motion.",
         f"simulate: linkage: {accepted}.",
         *(
             f"simulate: forces[{k}] ({type(element).__name__}): {fitting}."
@@ -290,7 +292,9 @@ def _raising(solution: Solution, inputs: Inputs) -> Solution:
 
 @eqx.filter_jit  # one program, not one for each of its operations
 def _faults(inputs: Inputs) -> Array:
-    return jnp.stack(faults(inputs))
+    times, *others = faults(inputs)
+    start = jnp.stack(inputs.state0)
+    return jnp.stack([times, ~jnp.isfinite(start).all(), *others])
 
 
 def check_own(
