@@ -10,7 +10,7 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from ..base.checks import JOINT, instance, is_traced, real_array
+from ..base.checks import JOINT, is_traced, real_array, refusal
 from ..base.known_values import at_once, in_numpy
 from ..base.trigonometry import sincos
 from ..linkage.fields import Condition, Values, called, default, field, of_kind
@@ -157,7 +157,8 @@ def reach_margin(
     edge, with two slides, and -inf if those are parallel. A search for lengths takes it
     as a constraint.
 
-    **Arguments:** `task`: a `CircleTask` or a `TipTask`; `ts`: times (time,) [s].
+    **Arguments:** `linkage`; `task`: a `CircleTask` or a `TipTask`; `ts`: times (time,)
+    [s].
 
     **Raises:** ValueError for malformed arguments.
 
@@ -168,7 +169,8 @@ def reach_margin(
     [0.0, -0.336, 0.0]
     """
     check_linkage(linkage)
-    instance("task", task, TipReference)
+    if not isinstance(task, TipReference):
+        raise refusal("task", "a CircleTask or a TipTask", task)
     check_moving_joints(linkage, task.orientation is not None)
     return -_missing(task, linkage, real_array("ts", ts, (None,)))
 

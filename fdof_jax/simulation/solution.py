@@ -74,7 +74,8 @@ class WithOutcome(eqx.Module):
 
         `"successful"`; `"ill-conditioned"`: the mass matrix is singular or nearly so
         (see `inertia_ratios`); `"not finite"`: the accelerations are not finite, as
-        those of a negative mass or of a reference out of reach;
+        those of a negative mass or of a reference out of reach (see
+        `references.reach_margin`);
         `"out of steps"`; `"tolerance out of reach"`: rounding keeps even the shortest
         step from meeting it; `"too many switches"`: one after the other, as between
         branches that push towards each other; or `"solver failed"`.
