@@ -15,7 +15,7 @@ from matplotlib.colors import ListedColormap
 from ..base.checks import refusal, shown
 from ..linkage.linkage import Linkage
 from ..references.reference import reference_of
-from ..references.task import CircleTask, TipReference
+from ..references.task import CircleTask, TipReference, TipTask
 from ..references.timing import Laps
 from ..simulation.sampled import Motion
 from .arms import geometry
@@ -67,7 +67,7 @@ def _draw_commanded(ax: Axes, task: Any, ts: np.ndarray, path: np.ndarray) -> No
 
     Dashes of a second turn would fill the gaps of the first.
     """
-    turning = task if isinstance(task, CircleTask) else getattr(task, "timing", None)
+    turning = task.timing if isinstance(task, TipTask) else task
     if isinstance(turning, CircleTask | Laps):
         path = path[ts <= ts[0] + abs(turning.period)]
     ax.plot(*xy(path), label="commanded", zorder=3, **COMMANDED)
