@@ -107,8 +107,10 @@ def test_recipes(tmp_path, monkeypatch):
     assert names["response"].settling_time[0] < 1.5
     assert names["value"] < 0.06
     assert names["rewards"].shape == (500, 256) and names["done"].sum() >= 512
-    assert names["price"] < 0.15
-    assert names["found"].success and 35 < names["found"].fun < 37
+    assert names["found"].success and names["found"].fun < 0.01
+    assert names["room"](names["found"].x).min() > -1e-6
+    assert names["efforts"].shape == (26, 2) and abs(names["efforts"]).max() <= 12
+    assert not names["efforts"][:, 1].any()
     np.testing.assert_allclose(names["state"].q, names["upright"], atol=1e-2)
     assert (names["result"] == names["diffrax"].RESULTS.successful).all()
     assert names["tuned"].tip_error < 0.02
