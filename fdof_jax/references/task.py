@@ -166,7 +166,7 @@ def reach_margin(
     >>> arm = fj.scenes.fig7().linkage
     >>> circle = fj.CircleTask(center=[-1, 2], radius=0.75)  # too near the base
     >>> fj.references.reach_margin(arm, circle, [0.0, 1.875, 2.5]).round(3).tolist()
-    [0.0, -0.336, 0.0]
+    [1.016, -0.336, 0.031]
     """
     check_linkage(linkage)
     if not isinstance(task, TipReference):
