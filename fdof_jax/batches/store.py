@@ -37,8 +37,9 @@ _BYTES = 2**26  # of the results in a block
 _CHUNKS = 16  # at most so many in a block, as blocks are what workers share
 # Members that are not solved yet, by the kind of the numbers
 _FILL = dict(f=np.nan, c=complex(np.nan, np.nan), i=-1, u=0, b=True)
-_OF_SAMPLES = {"q": ["time", "joint"], "taken": ["time"]}  # axes of variables over time
-_OF_SAMPLES |= {"qd": _OF_SAMPLES["q"], "modes": _OF_SAMPLES["q"]}
+_OF_SAMPLES = dict.fromkeys(("q", "qd", "modes"), ["time", "joint"]) | {
+    "taken": ["time"]
+}
 
 
 class Variable(NamedTuple):

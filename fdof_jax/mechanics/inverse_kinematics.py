@@ -233,10 +233,10 @@ def solve_joints(
 def beyond(missing: Array) -> str:
     """Says in messages by how much a point or a path is out of reach."""
     farthest = np.asarray(missing).max()
-    if not np.isfinite(farthest):
+    if farthest == np.inf:
         return ", and two slides that are parallel"
     most = "at most " if np.size(missing) > 1 else ""
-    return f", beyond it by {most}{farthest:.3g} m" if farthest > 0 else ", at its edge"
+    return f", beyond it by {most}{farthest:.3g} m" if farthest > 0 else ""
 
 
 def inverse_kinematics(
