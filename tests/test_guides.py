@@ -112,6 +112,9 @@ def test_recipes(tmp_path, monkeypatch):
     assert 35 < np.mean(names["lift"] ** 2) < 37
     assert names["efforts"].shape == (26, 2) and abs(names["efforts"]).max() <= 12
     assert not names["efforts"][:, 1].any()
+    push = names["fj"].forces.EffortHistory(np.linspace(0, 2.5, 26), names["efforts"])
+    upright = names["fj"].simulate(names["cart"], names["down"], [0, 2.5], (push,))
+    np.testing.assert_allclose(upright.q[-1], [0, np.pi], atol=1e-6)
     np.testing.assert_allclose(names["state"].q, names["upright"], atol=1e-2)
     assert (names["result"] == names["diffrax"].RESULTS.successful).all()
     assert names["tuned"].tip_error < 0.02
