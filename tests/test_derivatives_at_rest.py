@@ -179,7 +179,8 @@ def test_an_arm_that_hangs_in_damping_of_any_strength(mode, gradient):
     # The other elements are taken from an arm in another pose, with no coefficients.
     for damping in (1.0, 10.0, 30.0, 100.0, 1e3, 1e4):
         damper = eqx.tree_at(lambda d: d.coefficient, damper, jnp.array([damping]))
-        scene = hanging, (balance, damper, *others), jnp.array(2.0), jnp.array([1.0, 0])
+        time, weights = jnp.array(2.0, float), jnp.array([1.0, 0])  # no weak type
+        scene = hanging, (balance, damper, *others), time, weights
         wanted, _ = exact(numbers, scene)
         found, _ = gradient[mode](numbers, scene)
         assert error(flat(found), wanted) < 1e-7, damping
@@ -212,7 +213,7 @@ def test_random_arms_at_rest(count, gradient):
         # Rounding errors make unstable arms leave their pose; many steps take minutes.
         if rates.real.max() * time > 5 or np.abs(rates).max() * time > 3e4:
             continue
-        for mode in MODES[1:] if count > 3 else MODES:
+        for mode in MODES[1:]:
             found, steps = gradient[mode](numbers, scene)
             assert error(flat(found), wanted) < 1e-6, (mode, kind, int(steps))
         solved += 1
@@ -223,11 +224,10 @@ def test_second_derivatives_of_an_arm_at_rest():
     rng = np.random.default_rng(5)
     numbers, scene = held_by("damper", rng, "R")
 
-    def effort_at(damping, adjoint):
+    def effort_at(damping):
         damped = eqx.tree_at(lambda s: s[1][1].coefficient, scene, damping)
-        slope = jax.grad if adjoint is DEFAULT else jax.jacfwd
-        first = lambda tau: end((tau, *numbers[1:]), damped, adjoint)[0]
-        return slope(first)(numbers[0])[0]
+        first = lambda tau: end((tau, *numbers[1:]), damped, DEFAULT)[0]
+        return jax.grad(first)(numbers[0])[0]
 
     damping = scene[1][1].coefficient
 
@@ -237,10 +237,8 @@ def test_second_derivatives_of_an_arm_at_rest():
 
     h = 1e-3 * damping
     wide, near = ((wanted(k * h) - wanted(-k * h)) / (2 * k * h) for k in (2, 1))
-    for adjoint in (DEFAULT, FORWARD):
-        mixed = jax.jit(jax.jacfwd(effort_at), static_argnums=1, **LOOPS)
-        found = mixed(damping, adjoint).item()
-        assert found == pytest.approx(((4 * near - wide) / 3).item(), rel=1e-6)
+    found = jax.jit(jax.jacfwd(effort_at), **LOOPS)(damping).item()
+    assert found == pytest.approx(((4 * near - wide) / 3).item(), rel=1e-6)
 
 
 # A slide with drives and a bumper: its motion is a matrix exponential.
@@ -312,10 +310,10 @@ def exact_last_place(x, bumper):
 exact_slope = jax.jit(jax.grad(exact_last_place))
 
 
-@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("mode", MODES[1:])
 def test_a_slide_that_comes_to_rest_and_is_pushed_again(mode):
     """Derivatives in gains, lag, mass, start, push and times."""
-    adjoint = {"tangents": DEFAULT, "adjoint": ADJOINT, "forward": FORWARD}[mode]
+    adjoint = {"adjoint": ADJOINT, "forward": FORWARD}[mode]
     derivative = jax.jacfwd if mode == "forward" else jax.grad
     slope = jax.jit(derivative(lambda *at: last_place(*at, adjoint)), **LOOPS)
     for end in ENDS:

@@ -286,28 +286,38 @@ def test_straight_arms_of_two_joints_reach_their_tip(topology):
         np.testing.assert_allclose(fj.tip_position(chain, found), tip, atol=1e-14)
 
 
-@pytest.mark.parametrize("orientation, wanted", [(0.3, 3), (None, 2)])
-@pytest.mark.parametrize("topology", ["R", "RFP", "RRR", "RRRR", "FRRFPR"])
-def test_chains_of_other_numbers_of_joints_are_refused(topology, orientation, wanted):
-    count = len(topology.replace("F", ""))
-    if count == wanted:
-        return
-    n = len(topology)
+OTHER_NUMBERS = [  # of joints than a tip takes with an orientation, or without one
+    ("R", 0.3), ("RFP", 0.3), ("RRRR", 0.3), ("FRRFPR", 0.3),
+    ("R", None), ("RRR", None), ("RRRR", None), ("FRRFPR", None),
+]  # fmt: skip
+CIRCLE = fj.references.Ellipse([0.5, 0.5], [0.1, 0.1])
+
+
+@pytest.mark.parametrize("topology, orientation", OTHER_NUMBERS)
+def test_chains_of_other_numbers_of_joints_are_refused(topology, orientation):
+    wanted, count = 2 if orientation is None else 3, len(topology.replace("F", ""))
     chain = chains.random_chain(topology, np.random.default_rng(9))
-    words = WORDS.format(wanted, count)
-    with pytest.raises(ValueError, match=words):
+    with pytest.raises(ValueError, match=WORDS.format(wanted, count)):
         fj.inverse_kinematics(chain, [0.5, 0.5], orientation)
-    if n >= wanted:  # what a program does not know ends as NaN
+    if len(topology) >= wanted:  # what a program does not know ends as NaN
         found = jax.jit(fj.inverse_kinematics)(chain, [0.5, 0.5], orientation)
         assert np.isnan(found).all()
-    circle = fj.references.Ellipse([0.5, 0.5], [0.1, 0.1])
-    laps = fj.references.Laps(1.0)
-    tasks = [fj.TipTask(circle, laps, orientation=orientation)]
-    tasks += [fj.CircleTask([0.5, 0.5], 0.1)] * (wanted == 3)
-    for task in tasks:
-        pd = fj.PDController(10.0, 1.0, 50.0, task)
-        with pytest.raises(ValueError, match=words):
-            fj.simulate(chain, fj.State(np.zeros(n), np.zeros(n)), [0, 0.1], (pd,))
+
+
+@pytest.mark.parametrize(
+    "task, topology, wanted",
+    [
+        (fj.TipTask(CIRCLE, fj.references.Laps(1.0), orientation=0.3), "RFP", 3),
+        (fj.TipTask(CIRCLE, fj.references.Laps(1.0), orientation=None), "RRP", 2),
+        (fj.CircleTask([0.5, 0.5], 0.1), "R", 3),
+    ],
+)
+def test_tasks_for_other_numbers_of_joints_are_refused(task, topology, wanted):
+    n, count = len(topology), len(topology.replace("F", ""))
+    chain = chains.random_chain(topology, np.random.default_rng(9))
+    pd = fj.PDController(10.0, 1.0, 50.0, task)
+    with pytest.raises(ValueError, match=WORDS.format(wanted, count)):
+        fj.simulate(chain, fj.State(np.zeros(n), np.zeros(n)), [0, 0.1], (pd,))
 
 
 @pytest.mark.parametrize(

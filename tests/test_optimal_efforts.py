@@ -111,25 +111,20 @@ class Beside(fj.references.Reference):
         return np.ones(2)
 
     def __call__(self, t, linkage):
-        return np.zeros(2), np.zeros(2)
+        return np.zeros(3), np.zeros(3)
 
 
 def test_joints_without_a_limit_or_fixed_have_no_effort_beside_others():
     """The efforts of another element are not those that are sought; one step gives no
     bound, which the scene's own controller, tuned, would beat."""
-    knots = np.linspace(0, 1, 4)
-    other = fj.forces.EffortHistory(knots, np.zeros((4, 2)))
-    motorless = CONTROLLER.replace(limit=[60, 0])
-    scene = SCENE._replace(forces=(other, motorless))
-    fixed = CONTROLLER.replace(limit=[60, np.inf], reference=Beside())
-    bent = SCENE._replace(linkage=SCENE.linkage.replace(topology="RF"), forces=(fixed,))
-    for trial in (scene, bent):
-        found = fj.tuning.optimal_efforts(
-            trial, horizon=HORIZON, knots=KNOTS, max_steps=1
-        )
-        assert found.efforts[:, 0].any() and not found.efforts[:, 1].any()
-        assert not found.converged
-        with pytest.raises(
-            RuntimeError, match="bound: expected a search that has conv"
-        ):
-            found.bound(1.0)
+    arm = fj.Linkage(
+        "RRF", length=[0, 1, 1, 1], com=[[0.5, 0]] * 3, mass=[1] * 3, inertia=[0.1] * 3
+    )
+    other = fj.forces.EffortHistory(np.linspace(0, 1, 4), np.zeros((4, 3)))
+    pd = fj.PDController(100.0, 10.0, [600, 0, np.inf], Beside())  # motorless, fixed
+    scene = fj.Scene(arm, fj.State(np.zeros(3), np.zeros(3)), (other, pd), 1.0)
+    found = fj.tuning.optimal_efforts(scene, horizon=HORIZON, knots=KNOTS, max_steps=1)
+    assert found.efforts[:, 0].any() and not found.efforts[:, 1:].any()
+    assert not found.converged
+    with pytest.raises(RuntimeError, match="bound: expected a search that has conv"):
+        found.bound(1.0)

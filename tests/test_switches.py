@@ -15,7 +15,6 @@ from switching_scenes import BUMPER, CABLE, LIMITED, RODS as ARM, scene
 
 import fdof_jax as fj
 from fdof_jax.forces.switches import Switches
-from fdof_jax.simulation.sensitivities import sensitivities
 from fdof_jax.steps.looped_dopri8 import LoopedDopri8
 
 FORWARD = diffrax.ForwardMode()
@@ -74,20 +73,6 @@ def test_members_of_a_batch_equal_single_motions_which_tell_of_switches():
     assert "num_switches" not in free.stats
 
 
-def test_the_variational_equations_are_those_of_the_motion():
-    found = jax.jit(
-        lambda z: sensitivities(
-            lambda z: scene(z[0], CABLE),
-            lambda scene, solution: solution.q[-1],
-            z,
-            jnp.array([0.0, 0.8]),
-            1e-10,
-        ),
-        **LOOPS,
-    )(jnp.array([0.1]))
-    np.testing.assert_allclose(found.jacobian[:, 0], PUBLISHED[1], atol=1e-6)
-
-
 class Turning(fj.Element):
     """A slide that is pulled back, with marks on its way and on its velocity.
 
@@ -127,28 +112,6 @@ class Pulse(eqx.Module):
     @property
     def jump_ts(self):
         return self.begin + jnp.array([0, self.length])
-
-
-@pytest.mark.slow
-def test_derivatives_in_the_time_of_a_pulse():
-    start = fj.State(jnp.zeros(3), jnp.zeros(3))
-    scene = lambda begin: fj.Scene(ARM, start, (Pulse(begin),), 0.5)
-    # As an array: a plain number would be a constant of the program.
-    end = lambda x: fj.simulate(
-        ARM, start, [0, 0.5], (Pulse(np.asarray(x)),), rtol=1e-12, atol=1e-12
-    ).q[-1]
-    found = jax.jit(
-        lambda z: sensitivities(
-            lambda z: scene(z[0]),
-            lambda scene, solution: solution.q[-1],
-            z,
-            jnp.array([0.0, 0.5]),
-            1e-10,
-        ),
-        **LOOPS,
-    )(jnp.array([0.2]))
-    exact = differences(end, 0.2, 1e-3)
-    np.testing.assert_allclose(found.jacobian[:, 0], exact, atol=1e-6)
 
 
 @pytest.mark.slow
