@@ -205,9 +205,9 @@ def solve_joints(
     # Computed positions of tips are off by less.
     sizes = sum(dot(arm.ends, arm.ends), square2 + square3)
     rounding = 64 * np.finfo(square.dtype).eps * (1 + abs(th4)) * (sizes + square)
-    beyond = jnp.minimum(outer, inmost) < -rounding
+    outside = jnp.minimum(outer, inmost) < -rounding
     product = jnp.maximum(outer, 0) * jnp.maximum(inmost, 0) / 4
-    root = branch * jnp.sqrt(jnp.where(beyond, jnp.nan, product))
+    root = branch * jnp.sqrt(jnp.where(outside, jnp.nan, product))
     size = jnp.where(two_turning, jnp.sqrt(square), abs(component))
     missing = jnp.maximum(
         size - jnp.sqrt(jnp.where(two_slides, 1, longest)),

@@ -37,6 +37,8 @@ HAPPENINGS = (
     "sticks", "slips", "bounces", "rests on its stop", "leaves its stop",
     "is braked", "is let go", "is stopped",
 )  # fmt: skip
+# Slower crossings are near to grazing, where no derivative exists.
+SLOW = 0.01
 
 
 def flags(words: Iterable[str]) -> dict[str, Any]:
@@ -44,10 +46,6 @@ def flags(words: Iterable[str]) -> dict[str, Any]:
     meanings = [word.replace(" ", "_") for word in words]
     values = [*range(len(meanings))]
     return {"flag_values": values, "flag_meanings": " ".join(meanings)}
-
-
-# Slower crossings are near to grazing, where no derivative exists.
-SLOW = 0.01
 
 
 def outcome_numbers(result: diffrax.RESULTS) -> Any:
