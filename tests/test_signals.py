@@ -135,7 +135,8 @@ def saturating(begin, **options):
 
 def test_the_time_of_a_jump_past_a_limit_has_derivatives():
     begins = np.array([0.1, 0.2, 0.3])
-    value, slope = jax.vmap(jax.value_and_grad(saturating))(begins)
+    both = jax.jit(jax.value_and_grad(saturating))
+    value, slope = np.array([both(begin) for begin in begins]).T
     np.testing.assert_allclose(value, 5 * (0.5 - begins) ** 2)
     np.testing.assert_allclose(slope, -10 * (0.5 - begins), rtol=1e-9)
 
