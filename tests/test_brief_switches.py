@@ -89,9 +89,9 @@ def test_no_bumper_is_passed_over():
 def meeting(q, qd, aside, radius, tolerance, max_step):
     """A double pendulum whose tip meets a peg about where it is after 0.4 s."""
     options = dict(solver=LoopedDopri8(), throw=False, max_steps=100_000)
-    options |= dict(rtol=tolerance, atol=tolerance, max_step=max_step)
     start = fj.State(q, qd)
     free = fj.simulate(PENDULUM, start, [0, 0.4], (), **options)
+    options |= dict(rtol=tolerance, atol=tolerance, max_step=max_step)
     place = fj.tip_position(PENDULUM, free.q[-1]) + aside
     peg = fj.SpringDamper(
         fj.Point(0, *place), fj.Point(2, 1.0), stiffness=1e3, damping=2,

@@ -201,7 +201,7 @@ def test_one_joint_at_rest(mode, kind, gradient):
 @pytest.mark.filterwarnings("ignore:prismatic joints")
 @pytest.mark.parametrize("count", [1, 2, 5])
 def test_random_arms_at_rest(count, gradient):
-    """80 scenes of each number of joints, in each mode."""
+    """80 scenes of each number of joints, by the adjoint and in forward mode."""
     rng, solved = np.random.default_rng(count), 0
     while solved < 80:
         kind = rng.choice(["damper", "PD", "friction", "stops"])

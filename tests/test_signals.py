@@ -70,7 +70,7 @@ def test_a_loop_answers_as_closed_forms_say(reference, exact):
     steps = h * np.eye(numbers.size)
     wanted = [(right(numbers + row) - right(numbers - row)) / (2 * h) for row in steps]
     np.testing.assert_allclose(found, np.transpose(wanted), atol=1e-6)
-    if isinstance(reference, fj.references.Ramp):  # whose numbers are of all kinds
+    if isinstance(reference, fj.references.Ramp):  # of several times and places
         back = jax.jit(jax.jacrev(lambda x: places(whole(x))))(numbers)
         np.testing.assert_allclose(back, found, atol=1e-7)
 
