@@ -149,14 +149,22 @@ OF_ALL_KINDS = (
 )
 
 
+def holding(friction=(0.0, 0.0), stop=-np.inf, braked=(9.0, 10.0), damping=0.0):
+    """Returns elements for one joint; those of no effect let all share a program."""
+    return (
+        JointFriction(*friction), HardStops(stop, np.inf, restitution=0.5),
+        Brake(1, *braked), JointDamper(damping),
+    )  # fmt: skip
+
+
 @pytest.mark.parametrize(
     ("linkage", "start", "forces"),
     [
-        (BALL, State([1.0], [0.0]), (BOUNCE,)),
-        (BALL, State([1.0], [0.0]), (BOUNCE, JointDamper(1.0))),
-        (BAR, State([0.3], [1.0]), (JointFriction(0.5, static=0.7),)),
-        (BAR, State([0.3], [1.0]), (Brake(1, 0.2, 0.6),)),
-        (BAR, State([0.3], [1.0]), (Brake(1, end=0.6),)),  # a blow at the start
+        (BALL, State([1.0], [0.0]), holding(stop=0.0)),
+        (BALL, State([1.0], [0.0]), holding(stop=0.0, damping=1.0)),
+        (BAR, State([0.3], [1.0]), holding(friction=(0.5, 0.7))),
+        (BAR, State([0.3], [1.0]), holding(braked=(0.2, 0.6))),
+        (BAR, State([0.3], [1.0]), holding(braked=(0.0, 0.6))),  # a blow at the start
         (ARM, State([0.3, 0.0], [0, 0]), OF_ALL_KINDS),
     ],
     ids=["stop", "stop and damper", "friction", "brake", "braked first", "all"],
@@ -168,7 +176,7 @@ def test_energy_stack_balances_where_joints_are_held(linkage, start, forces):
     np.testing.assert_allclose(stack["taken out"], line, rtol=1e-4)
     taken = np.asarray(solution.taken) - solution.taken[0]
     out = stack["taken out"] - stack["potential"]
-    if len(forces) == 1:
+    if not np.any(forces[-1].coefficient):
         np.testing.assert_allclose(out, taken, atol=1e-9)
     assert np.all(out >= taken - 1e-9)
 

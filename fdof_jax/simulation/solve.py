@@ -17,7 +17,7 @@ from ..forces.added_inertia import inertial
 from ..forces.element import Element, ForeignElement
 from ..steps.controllers import with_pid
 from ..steps.derivative_control import TANGENTS
-from ..steps.tolerances import default_controller
+from ..steps.tolerances import at_tolerances
 from ..steps.unrolled_dopri8 import UnrolledDopri8
 from .integrate import Inputs, integrate
 from .padding import cut, padded
@@ -77,9 +77,11 @@ def _of_any_tolerance(keywords):
     if controller is None:
         if keywords["solver"] is not None:
             return keywords  # which default it gets depends on the solver
-        controller = default_controller()
+        controller = at_tolerances(None, None)
 
     def of_arrays(pid: diffrax.PIDController) -> diffrax.PIDController:
+        if eqx.is_array(pid.rtol) and eqx.is_array(pid.atol):
+            return pid
         dtype = jnp.result_type(float)
         rtol, atol = (np.asarray(t, dtype) for t in (pid.rtol, pid.atol))
         return dataclasses.replace(pid, rtol=rtol, atol=atol)

@@ -216,31 +216,37 @@ def _difference(late: Array, moment: Moment, term: Any) -> Any:
     return jax.lax.cond(is_one, difference, nothing)
 
 
+def _late(arrival: Arrival, change: Any, term: Any) -> tuple[Array, Array]:
+    """Returns `lateness` and how it changes."""
+    return eqx.filter_jvp(lambda a: lateness(a, term=term), (arrival,), (change,))
+
+
 @eqx.filter_custom_jvp
-def gained(late: Array, moment: Moment, *, term: Any, jumping: bool) -> Any:
+def gained(arrival: Arrival, moment: Moment, *, term: Any, jumping: bool) -> Any:
     """Returns how the time of a switch changes the state: 0, with derivatives.
 
-    Where nothing jumps, first derivatives are 0 too; only second ones need derivatives
-    of the rates.
+    Where nothing jumps, first derivatives are 0 too; only second ones need the time of
+    the switch, and derivatives of the rates.
     """
     return jax.tree.map(jnp.zeros_like, moment.y)
 
 
 @gained.def_jvp
 def _(primals, tangents, *, term, jumping):
-    (late, moment), (change, changes) = primals, tangents
-    nothing = gained(late, moment, term=term, jumping=jumping)
-    if change is None:
+    (arrival, moment), (change, _) = primals, tangents
+    nothing = gained(*primals, term=term, jumping=jumping)
+    if not jax.tree.leaves(change):
         return nothing, nothing
-    gain = _gained_twice(late, moment, change, changes, term=term, jumping=jumping)
+    gain = _gained_twice(*primals, *tangents, term=term, jumping=jumping)
     if jumping:
+        late, later = _late(arrival, change, term)
         rates = _difference(late, moment, term)
-        gain = jax.tree.map(lambda rate, more: change * rate + more, rates, gain)
+        gain = jax.tree.map(lambda rate, more: later * rate + more, rates, gain)
     return nothing, gain
 
 
 @eqx.filter_custom_jvp
-def _gained_twice(late, moment, change, changes, *, term, jumping):
+def _gained_twice(arrival, moment, change, changes, *, term, jumping):
     """Second-order part of `gained`: its value is 0; only its derivative matters."""
     return jax.tree.map(jnp.zeros_like, moment.y)
 
@@ -248,18 +254,21 @@ def _gained_twice(late, moment, change, changes, *, term, jumping):
 @_gained_twice.def_jvp
 def _(primals, tangents, *, term, jumping):
     nothing = _gained_twice(*primals, term=term, jumping=jumping)
-    late, moment, *first = primals
-    second = tangents[:2]
-    if second[0] is None:
+    at, first, second = primals[:2], primals[2:], tangents[:2]
+    if not jax.tree.leaves(second[0]):
         return nothing, nothing
 
-    def along(directions):
-        difference = lambda late, moment: _difference(late, moment, term)
-        return eqx.filter_jvp(difference, (late, moment), tuple(directions))[1]
+    def product(late_along, rates_along):
+        """Returns the lateness in one direction times the rates in another."""
+        _, later = _late(at[0], late_along[0], term)
 
-    gain = jax.tree.map(lambda rate: second[0] * rate, along(first))
+        def difference(arrival, moment):
+            return _difference(lateness(arrival, term=term), moment, term)
+
+        _, turned = eqx.filter_jvp(difference, at, rates_along)
+        return jax.tree.map(lambda rate: later * rate, turned)
+
+    gain = product(second, first)
     if not jumping:  # the rates are 0, but their derivatives are not
-        gain = jax.tree.map(
-            lambda sum, rate: sum + first[0] * rate, gain, along(second)
-        )
+        gain = jax.tree.map(jnp.add, gain, product(first, second))
     return nothing, gain

@@ -355,9 +355,8 @@ class Located(diffrax.AbstractAdaptiveSolver):
         for before, after in zip(passed, passed[1:]):
             here = args._replace(sides=before)
             arrival = Arrival(t, y, here, (before != after) & arrived)
-            late = lateness(arrival, term=term)
             moment = Moment(t, y, args, before, after, jnp.array(made_jump))
-            gain = gained(late, moment, term=term, jumping=self.jumping)
+            gain = gained(arrival, moment, term=term, jumping=self.jumping)
             y = jax.tree.map(jnp.add, y, gain)
         return y
 
