@@ -81,14 +81,15 @@ def check_moving_joints(linkage: Linkage, oriented: bool) -> None:
 
     Of traced existence factors, only their number is checked.
     """
-    wanted, n = 2 + oriented, joints_of(linkage)
-    count = n if is_traced(linkage.ef) else int(np.asarray(linkage.ef).sum())
-    if n < wanted or count != wanted and not is_traced(linkage.ef):
+    wanted, n, traced = 2 + oriented, joints_of(linkage), is_traced(linkage.ef)
+    count = n if traced else int(np.asarray(linkage.ef).sum())
+    if n < wanted or count != wanted and not traced:
         also = "" if oriented else " where no orientation is commanded"
+        got = f"{count} pairs of joints" if traced else count
         cure = "; two need orientation=None (of a TipTask)" if count == 2 else ""
         raise ValueError(
             f"linkage: expected {wanted} joints that move{also}, the others fixed, got "
-            f"{count}{cure}."
+            f"{got}{cure}."
         )
 
 

@@ -113,8 +113,8 @@ def plane_axes(ax: Any, points: np.ndarray, *, beside: float = 0.0) -> Axes:
     ax = axes_or_new(ax, 0.9 + np.clip((2.9 - beside) * height / width, 1.6, 3.6))
     ax.update_datalim([low, high])
     ax.set_aspect("equal")
-    wide, high = ax.margins()  # of what is drawn there
-    ax.margins(max(wide, 0.1), max(high, 0.16))  # below, the ground needs room
+    across, up = ax.margins()  # of what is drawn there
+    ax.margins(max(across, 0.1), max(up, 0.16))  # below, the ground needs room
     ax.set(xlabel="x [m]", ylabel="y [m]")
     return ax
 
