@@ -9,6 +9,7 @@ import pytest
 from elements import START, arm
 from held_scenes import derivative_errors, law_errors
 from modes import LOOPS
+from scipy.linalg import expm
 
 import fdof_jax as fj
 from fdof_jax.forces import Brake, HardStops, JointFriction, Payload
@@ -171,6 +172,31 @@ def test_a_brake_that_acts_already_holds_from_the_start(begin):
         energy,
         rtol=1e-9,
     )
+
+
+@pytest.mark.parametrize("lagged", ["the controller", "a force beside it"])
+def test_states_of_drives_go_on_while_a_brake_holds(lagged):
+    """The integral and the lag of a slide, by matrix exponentials."""
+    kp, ki, kd, lag, goal = 40.0, 30.0, 12.0, 0.05, 0.5
+    pid = fj.control.PIDController(kp, ki, kd, inf, fj.references.SetPoint([goal]))
+    within = lagged == "the controller"
+    effort = [-kp, -kd, 1, 0, kp * goal]  # by position, rate, integral, lag and 1
+    behind, whole = (effort, [0, 0, 0, 1, 0]) if within else ([0, 0, 0, 0, 3], effort)
+    moving = np.zeros((5, 5))
+    moving[0, 1], moving[1] = 1, np.add(whole, [0, 0, 0, not within, 0])
+    moving[2, [0, 4]], moving[3] = [-ki, ki * goal], behind
+    moving[3] = (moving[3] - np.eye(5)[3]) / lag
+    held = moving * [[0], [0], [1], [1], [1]]
+    stopped = np.diag([1, 0, 1, 1, 1])
+    end = expm(0.4 * moving) @ [0.2, 0.3, 0, 0, 1]
+    end = expm(0.3 * moving) @ expm(0.1 * held) @ stopped @ end
+    lag_of = fj.control.FirstOrderLag
+    drives = (lag_of(pid, lag),) if within else (pid, lag_of(fj.JointEffort(3.0), lag))
+    motion = run(SLIDE, fj.State([0.2], [0.3]), [0, 0.8], *drives, Brake(1, 0.4, 0.5))
+    own = [leaf[-1, 0] for leaf in jax.tree.leaves(motion.own)]
+    np.testing.assert_allclose(motion.q[-1, 0], end[0], atol=1e-9)
+    np.testing.assert_allclose(motion.qd[-1, 0], end[1], atol=1e-9)
+    np.testing.assert_allclose(np.sort(own), np.sort(end[2:4]), atol=1e-8)
 
 
 def test_a_brake_that_lets_go_at_a_stop_leaves_the_joint_there():

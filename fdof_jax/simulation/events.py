@@ -11,7 +11,7 @@ from ..forces.payload import Payload
 from ..mechanics.solve import minus
 from ..steps.dopri8 import constant
 from ..steps.switch_derivatives import Event
-from .field import Args, efforts, schedule_of, whole
+from .field import Args, efforts, schedule_of
 from .holding import (
     BRAKE,
     FREE,
@@ -121,7 +121,7 @@ def _net_efforts(
 ) -> tuple[System, Array]:
     """Returns the system, and the efforts less the bias, with friction of sliding."""
     args = args._replace(modes=args.modes._replace(direction=jnp.sign(qd)))
-    y = whole(tuple(q - args.q0), tuple(qd), own)
+    y = tuple(q - args.q0), tuple(qd), *own
     tau = efforts(t, y, args, schedule_of(t, args))
     system = system_at(t, q, qd, args)
     return system, jnp.stack(minus(tau, system.equations.bias))
