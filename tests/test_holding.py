@@ -63,6 +63,33 @@ def test_a_sprung_slide_stops_short_and_derivatives_tell_where():
     np.testing.assert_allclose(reverse(numbers), right, atol=1e-8)
 
 
+def test_tiny_arms_stick_slip_and_saturate_as_large_ones():
+    """Efforts of 1e-12 N m, or of 1e12, are found as exactly as those of 1 N m."""
+    ts = np.linspace(0, 1.5, 16)
+
+    def motion(size):
+        bar = BAR.replace(mass=[size], inertia=[size / 12])
+        target = fj.references.Step(-1.3, 0.4, begin=0.2)
+        pd = fj.PDController(60 * size, 8 * size, 8 * size, target)
+        friction = JointFriction(0.8 * size, static=2 * size)
+        return run(bar, fj.State([-1.3], [0.0]), ts, friction, pd)
+
+    wanted = motion(1.0)
+    assert wanted.stats["num_switches"] > 2 and wanted.events.count == 2
+    for size in (1e-12, 1e12):
+        found = motion(size)
+        np.testing.assert_allclose(found.q, wanted.q, atol=1e-9)
+        np.testing.assert_allclose(found.events.t, wanted.events.t, atol=1e-9)
+
+
+def test_a_kink_where_friction_turns_leaves_derivatives_on_both_sides():
+    """The limit of a motor has kinks at rest, where the friction jumps."""
+    pd = fj.PDController(60.0, 2.0, 20.0, fj.references.SetPoint([-0.5]))
+    motor = fj.control.SpeedLimit(pd, 20.0, 15.0)
+    motion = run(BAR, fj.State([0.3], [0.7]), [0, 1.5], motor, JointFriction(0.3))
+    assert motion.stats["num_switches"] > 6 and motion.stats["one_sided"] == 0
+
+
 def test_a_mass_on_a_belt_sticks_and_slips_for_a_hundred_periods():
     """As seen from the belt, the spring's other end moves."""
     pull = lambda t, q, qd, linkage: -100 * (q + 0.1 * t)

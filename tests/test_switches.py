@@ -229,7 +229,7 @@ def test_whether_efforts_jump_is_known_from_the_switches_met():
         with switches.dealt():
             met()
         jumping.append(switches.jumping)
-    assert jumping == [False, True]
+    assert jumping == [[False, False], [True]]
 
 
 def test_switches_of_elements_traced_in_two_threads_stay_apart():

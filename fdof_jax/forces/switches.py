@@ -25,12 +25,12 @@ class Switches:
 
     `sides` (n,): 1 above and -1 below zero, 0 for the function's own sign; None stands
     for zeros.
-    `values`: the switching functions as they were met; `jumping`: whether something
-    jumps with one of them.
+    `values`: the switching functions as they were met; `jumping`: with which of their
+    entries something jumps.
     """
 
     def __init__(self, sides: Array | None):
-        self.sides, self.values, self.jumping, self._count = sides, [], False, 0
+        self.sides, self.values, self.jumping, self._count = sides, [], [], 0
 
     def side_of(self, g: Array, continuous: bool) -> Array:
         if self._transformation != transformation():
@@ -40,7 +40,7 @@ class Switches:
                 "`switch` and `clip` take whole arrays."
             )
         self.values.append(g)
-        self.jumping |= not continuous
+        self.jumping += [not continuous] * g.size
         if self.sides is None:
             return g
         # Larger than any function that changes sign, so that the side decides the sign.
@@ -52,10 +52,10 @@ class Switches:
         begin, self._count = self._count, self._count + count
         return slice(begin, self._count)
 
-    def add(self, values: list[Array], jumping: bool) -> None:
+    def add(self, values: list[Array], jumping: list[bool]) -> None:
         """Adds switches that were met elsewhere, with the sides of `rest`."""
         self.values += values
-        self.jumping |= jumping
+        self.jumping += jumping
         self._next(sum(g.size for g in values))
 
     def rest(self) -> Any:
@@ -120,5 +120,8 @@ def clip(x: ArrayLike, low: ArrayLike, high: ArrayLike) -> Array:
     [-1.0, 0.5, 2.0]
     """
     x, low, high = jnp.broadcast_arrays(*map(jnp.asarray, (x, low, high)))
-    within = switch(x - high, high, x, continuous=True)
-    return switch(low - x, low, within, continuous=True)
+    width = high - low
+    # Switching functions of any unit must not be tiny.
+    unit = jnp.where((width > 0) & (width < jnp.inf), width, 1)
+    within = switch((x - high) / unit, high, x, continuous=True)
+    return switch((low - x) / unit, low, within, continuous=True)

@@ -170,10 +170,10 @@ def _effort(t: Any, y: Any, args: Args, schedule: tuple[Any, ...]) -> tuple[Any,
 
 def switching(
     t: Array, y: Any, args: Args, schedule: tuple[Any, ...]
-) -> tuple[Array, bool]:
-    """Returns the switching functions of all efforts, and whether anything jumps."""
+) -> tuple[Array, tuple[bool, ...]]:
+    """Returns the switching functions of all efforts, and which of them jump."""
     *_, switches = _effort(t, y, args, schedule)
-    return switches.all_values(args.q0.dtype), switches.jumping
+    return switches.all_values(args.q0.dtype), tuple(switches.jumping)
 
 
 def efforts(t: Any, y: Any, args: Args, schedule: tuple[Any, ...]) -> Scalars:
@@ -281,7 +281,7 @@ def _switched_effort(
     linkage: Linkage,
     state: Any,
     sides: Array | None,
-) -> tuple[Array, Any, list[Array], bool]:
+) -> tuple[Array, Any, list[Array], list[bool]]:
     """Returns what `element_effort` does, and the switching functions met."""
     switches = Switches(sides)
     expected = (

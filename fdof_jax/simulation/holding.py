@@ -110,20 +110,22 @@ def unknown_modes(args: Args) -> tuple[Modes, int]:
     return Modes(zeros - 1, zeros, zeros, zero, events), q0.size * (3 if stops else 1)
 
 
-def _reserve(static: Array, mode: Array, effort: Array) -> Array:
-    """Returns by how much efforts may grow before held joints come free [N or N m].
+def _reserve(static: Array, mode: Array, effort: Array, inertia: Array) -> Array:
+    """Returns by how much efforts may grow before held joints come free.
 
-    Friction is symmetric: near both limits this is the distance from the nearer one.
+    Friction is symmetric: near both limits this is the distance from the nearer one, as
+    a share of the limit. That of a stop is per inertia [m/s^2 or rad/s^2]. Either is of
+    much the same size in large machines and in tiny ones.
     """
     most = jnp.where(static > 0, static, 1)
     kinds = [mode == FRICTION, mode == LOWER, mode == UPPER]
-    reserves = [(most - effort**2 / most) / 2, static + effort, static - effort]
-    return jnp.select(kinds, reserves, 1)
+    pushes = [(static + effort) / inertia, (static - effort) / inertia]
+    return jnp.select(kinds, [(1 - (effort / most) ** 2) / 2, *pushes], 1)
 
 
 def guarded_switching(
     t: Array, y: Any, args: Args, schedule: tuple[Any, ...]
-) -> tuple[Array, bool]:
+) -> tuple[Array, tuple[bool, ...]]:
     """Returns the switching functions of all efforts, and after them the guards.
 
     For each joint one that shows whether it stays as it is: held within its limits, or
@@ -136,12 +138,18 @@ def guarded_switching(
     held, direction = modes.held, modes.direction
     rubs = (law.static > 0) & ~held & (direction != 0)
     sliding = jnp.where(rubs, direction * jnp.stack(y[1]), 1)
-    guards = [jnp.where(held, _reserve(law.static, modes.mode, effort), sliding)]
+    c = args.constants
+    inertia = jnp.where(*map(jnp.stack, (c.revolute, c.second, c.beyond)))
+    inertia = jnp.where(inertia > 0, inertia, 1)
+    reserve = _reserve(law.static, modes.mode, effort, inertia)
+    guards = [jnp.where(held, reserve, sliding)]
     if any(isinstance(e, HardStops) for e in args.forces):
         delta = jnp.stack(y[0])
         room = delta - (law.lower - args.q0), law.upper - args.q0 - delta
         guards += [jnp.where(held, 1, _STOPS_IN * distance) for distance in room]
-    return jnp.concatenate([switches.all_values(args.q0.dtype), *guards]), True
+    values = jnp.concatenate([switches.all_values(args.q0.dtype), *guards])
+    jumping = *switches.jumping, *[True] * (values.size - len(switches.jumping))
+    return values, jumping
 
 
 class System(NamedTuple):

@@ -120,7 +120,7 @@ class _LocatedRows(Located):
         return count > 0 or jumps is not None
 
     def shifted(self, term, t, y, args, switching, made_jump):
-        if not (self.jumping or self.jumps is not None):
+        if not (any(self.jumping) or self.jumps is not None):
             return y
         (rows,), time = y, switching.until
         before, after = switching.sides, args.sides
@@ -145,7 +145,7 @@ class _LocatedRows(Located):
                 known_time = distance[index] <= 2 * self.apart
                 late = jnp.where(known_time, self.slopes[index], late)
             gain = jnp.outer(late, rates[0] - rates[1])
-            if self.jumping:
+            if any(self.jumping):
                 places = jnp.stack([jnp.argmax(first), jnp.argmax(others)])
                 before_it = args._replace(sides=before)
                 values = lambda t, row, z: term.switches(

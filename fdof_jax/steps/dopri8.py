@@ -49,7 +49,7 @@ class ScheduledTerm(diffrax.ODETerm):
     `health(t, y, args)` holds the loss of accuracy in the rates of each joint, at least
     1, or 0 where the equations are singular. `watched_field` returns the rates and
     their health, NaN if they are not finite.
-    `switching` returns the switching functions (n,), and whether anything jumps.
+    `switching` returns the switching functions (n,), and with which something jumps.
 
     Where joints are held for a while, `args.modes` says which. `unknown_modes(args)`
     returns the modes before the start, and how many of the last switching functions
@@ -61,14 +61,14 @@ class ScheduledTerm(diffrax.ODETerm):
     schedule: Callable[[Any, Any], PyTree] = eqx.field(static=True)
     health: Callable[..., Health] = eqx.field(static=True)
     watched_field: Callable[..., tuple[PyTree, Health]] = eqx.field(static=True)
-    switching: Callable[..., tuple[Array, bool]] = eqx.field(static=True)
+    switching: Callable[..., tuple[Array, tuple[bool, ...]]] = eqx.field(static=True)
     unknown_modes: Callable | None = eqx.field(static=True, default=None)
     resolve: Callable | None = eqx.field(static=True, default=None)
 
     def vf(self, t, y, args):
         return self.vector_field(t, y, args, self.schedule(t, args))
 
-    def switches(self, t, y, args) -> tuple[Array, bool]:
+    def switches(self, t, y, args) -> tuple[Array, tuple[bool, ...]]:
         return self.switching(t, y, args, self.schedule(t, args))
 
 

@@ -92,7 +92,7 @@ def motion_of(y: Any) -> Any:
 
 
 def located(
-    locate: Callable[[Any, bool, Array, int], "Located"],
+    locate: Callable[[Any, tuple[bool, ...], Array, int], "Located"],
     solver: Any,
     term: Any,
     ts: Array,
@@ -130,7 +130,7 @@ def located(
             length=none,
             ahead=none,
             passed=none,
-            one_sided=none if jumping else None,
+            one_sided=none if any(jumping) else None,
             grazing=none,
             grazing_here=none,
             modes=modes,
@@ -158,7 +158,7 @@ class Located(diffrax.AbstractAdaptiveSolver):
     """
 
     solver: Any
-    jumping: bool = eqx.field(static=True)  # whether efforts do, at a switch
+    jumping: tuple[bool, ...] = eqx.field(static=True)  # whether efforts do, (switch,)
     apart: Array  # see `rounding`
     guards: int = eqx.field(static=True)  # switching functions that guard modes
     derivatives: bool = eqx.field(static=True)
@@ -272,9 +272,10 @@ class Located(diffrax.AbstractAdaptiveSolver):
         """Returns `Switching.one_sided` at the end of a step."""
         if switching.one_sided is None:
             return None
-        at_once = on_zero & (sizes > 0) & (sides != 0)
+        jumping = np.array(self.jumping)
+        at_once = jumping & on_zero & (sizes > 0) & (sides != 0)
         at_once = jnp.any(at_once[: sides.size - self.guards])
-        together = (jnp.sum(changed) > 1) & (switching.grazing_here > 0)
+        together = (jnp.sum(changed & jumping) > 1) & (switching.grazing_here > 0)
         return jnp.maximum(switching.one_sided, at_once) + together
 
     def resolved(
@@ -345,7 +346,8 @@ class Located(diffrax.AbstractAdaptiveSolver):
             return y
         before, after = switching.sides, switching.after
         passed = [before, after]
-        if self.jumping and before.size > 1:  # kinks change second derivatives alone
+        # Kinks change second derivatives alone.
+        if any(self.jumping) and before.size > 1:
             passed.insert(1, jnp.where(first_of(after != before), after, before))
         # A known time may be here too, just before the zeros or just after them.
         t = jnp.where(switching.ahead > 0, t, switching.until)
@@ -356,7 +358,7 @@ class Located(diffrax.AbstractAdaptiveSolver):
             here = args._replace(sides=before)
             arrival = Arrival(t, y, here, (before != after) & arrived)
             moment = Moment(t, y, args, before, after, jnp.array(made_jump))
-            gain = gained(arrival, moment, term=term, jumping=self.jumping)
+            gain = gained(arrival, moment, term=term, jumping=any(self.jumping))
             y = jax.tree.map(jnp.add, y, gain)
         return y
 
