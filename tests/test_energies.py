@@ -18,6 +18,7 @@ from fdof_jax import (
     plotting,
     scenes,
     simulate,
+    simulate_sampled,
 )  # fmt: skip
 from fdof_jax.forces import Brake, HardStops, JointFriction, JointStops, Payload
 
@@ -179,6 +180,20 @@ def test_energy_stack_balances_where_joints_are_held(linkage, start, forces):
     if not np.any(forces[-1].coefficient):
         np.testing.assert_allclose(out, taken, atol=1e-9)
     assert np.all(out >= taken - 1e-9)
+
+
+def test_energy_stack_of_sampled_control_has_what_holders_take():
+    """As much as beside the same efforts, all 0, without a clock."""
+    forces = JointFriction(1.0), Brake(1, 0.25, 0.5), HardStops(-0.5, 2)
+    effort, start = JointEffort([0.0]), State([0.4], [0.3])
+    motion = simulate_sampled(BAR, start, effort, 0.05, 30, forces)
+    whole = simulate(BAR, start, motion.ts, forces)
+    assert whole.events.count == 3  # it brakes, falls and hits its stop
+    np.testing.assert_allclose(motion.taken, whole.taken, atol=1e-9)
+    ax = plotting.energy_stack(BAR, (effort, *forces), motion)
+    np.testing.assert_allclose(
+        tops(ax, motion.ts)["taken out"], values(ax)[0], rtol=1e-6
+    )
 
 
 def test_energy_stack_has_what_payloads_bring_and_take_away():

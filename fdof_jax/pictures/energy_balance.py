@@ -39,7 +39,7 @@ def energy_balance(linkage: Linkage, forces: Forces, solution: Motion) -> Balanc
     forces = acting_in(solution, elements("forces", forces))
     put_in, taken_out = _works(linkage, forces, solution, ts)
     exchanged, lost = put_in + taken_out, np.zeros(len(ts))
-    if isinstance(solution, Solution) and solution.taken is not None:
+    if solution.taken is not None:
         taken = np.asarray(solution.taken)[: len(ts)]
         lost = taken - taken[0]
     taken_out = taken_out + lost

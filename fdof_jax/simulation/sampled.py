@@ -105,6 +105,8 @@ class SampledMotion(WithOutcome):
       to act (samples, n); None if commands begin to act at samples only.
     - `acting`: efforts that act at `ts`, or begin to act there (samples + 1, n)
       [N or N m]. None without a delay, where these are `tau` and, at the end, its last.
+    - `taken`: energy that what holds joints has taken up to `ts`, as in a `Solution`
+      (samples + 1,) [J]; None if nothing holds any.
 
     Pictures, tables, `joint_efforts` and `joint_reactions` take it as they take a
     `Solution`. Its `forces` are there `(control, *forces)`, the controller first. The
@@ -120,6 +122,7 @@ class SampledMotion(WithOutcome):
     delay: Float[Array, ""] | float = 0.0
     q_begin: Float[Array, "sample joint"] | None = None
     acting: Float[Array, "time joint"] | None = None
+    taken: Float[Array, " time"] | None = None
 
 
 Motion = Solution | SampledMotion
@@ -323,7 +326,9 @@ def _motion(
         q_begin = None
         if rest is not None:
             q_begin = jnp.where(within, *solution.q[1:])
-        return (last, memory, under_way, arrives, result), (starts, tau, q_begin)
+        taken = None if solution.taken is None else solution.taken[jnp.array([0, -1])]
+        found = starts, tau, q_begin, taken
+        return (last, memory, under_way, arrives, result), found
 
     own0 = initial_states(linkage, forces), control.initial_state(linkage)
     own0, memory0 = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), own0)
@@ -332,7 +337,7 @@ def _motion(
     if rest is not None:
         held = jnp.where(delay >= 0, held, jnp.nan)
     start = jax.tree.map(jnp.asarray, state0), own0
-    (last, *_, result), (starts, tau, q_begin) = jax.lax.scan(
+    (last, *_, result), (starts, tau, q_begin, taken) = jax.lax.scan(
         one,
         (start, memory0, under_way, held, diffrax.RESULTS.successful),
         (jnp.arange(len(times) - 1), times[:-1], times[1:], keys),
@@ -344,4 +349,8 @@ def _motion(
         commands = jnp.concatenate([jnp.zeros((most + 1, held.size)), tau, tau[-1:]])
         first = most + 1 - whole - within
         acting = jax.lax.dynamic_slice_in_dim(commands, first, len(times))
-    return SampledMotion(times, q, qd, tau, result, own, delay, q_begin, acting)
+    if taken is not None:
+        # Each period counts from 0, and its start may bring a blow.
+        at_start, in_period = jnp.append(taken, jnp.zeros((1, 2)), axis=0).T
+        taken = jnp.cumsum(in_period) - in_period + at_start
+    return SampledMotion(times, q, qd, tau, result, own, delay, q_begin, acting, taken)
