@@ -32,14 +32,14 @@ class Switches:
     def __init__(self, sides: Array | None):
         self.sides, self.values, self.jumping, self._count = sides, [], [], 0
 
-    def side_of(self, g: Array, continuous: bool) -> Array:
+    def side_of(self, g: Array, continuous: bool, unit: ArrayLike) -> Array:
         if self._transformation != transformation():
             raise ValueError(
                 "switch: expected a call outside of functions that JAX transforms, as "
                 "by jax.jit or jax.vmap, because steps end at the zeros of g. Both "
                 "`switch` and `clip` take whole arrays."
             )
-        self.values.append(g)
+        self.values.append(g / unit)
         self.jumping += [not continuous] * g.size
         if self.sides is None:
             return g
@@ -103,9 +103,15 @@ def switch(
     >>> Drag()(0.0, jnp.array([1.0, -1, 1]), jnp.ones(3), arm).tolist()
     [-0.1, -20.0, -0.1]
     """
-    g = jnp.asarray(g)
+    return _chosen(jnp.asarray(g), above, below, continuous)
+
+
+def _chosen(
+    g: Array, above: ArrayLike, below: ArrayLike, continuous: bool, unit: ArrayLike = 1
+) -> Array:
+    """As `switch`, of a function that may be tiny, but not in this unit."""
     switches = _DEALING.get()
-    side = g if switches is None else switches.side_of(g, continuous)
+    side = g if switches is None else switches.side_of(g, continuous, unit)
     return jnp.where(side > 0, above, below)
 
 
@@ -121,7 +127,6 @@ def clip(x: ArrayLike, low: ArrayLike, high: ArrayLike) -> Array:
     """
     x, low, high = jnp.broadcast_arrays(*map(jnp.asarray, (x, low, high)))
     width = high - low
-    # Switching functions of any unit must not be tiny.
     unit = jnp.where((width > 0) & (width < jnp.inf), width, 1)
-    within = switch((x - high) / unit, high, x, continuous=True)
-    return switch((low - x) / unit, low, within, continuous=True)
+    within = _chosen(x - high, high, x, True, unit)
+    return _chosen(low - x, low, within, True, unit)
