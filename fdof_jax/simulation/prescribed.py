@@ -177,7 +177,7 @@ def _motion(args: Args) -> PrescribedMotion:
     return motion
 
 
-def _hybrid_switching(t, y, args, schedule) -> tuple[Array, bool]:
+def _hybrid_switching(t, y, args, schedule) -> tuple[Array, tuple[bool, ...]]:
     q, qd = _hybrid_joints(args, t, y)
     return switching(t, (tuple(q - args.q0), tuple(qd), *y[2:]), args, schedule)
 

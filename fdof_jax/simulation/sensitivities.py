@@ -56,7 +56,7 @@ class _Term(diffrax.ODETerm):
     Their state is (row,) or (rows,): a motion, and below it its derivatives.
     """
 
-    switches: Callable[..., tuple[Array, bool]] = eqx.field(static=True)
+    switches: Callable[..., tuple[Array, tuple[bool, ...]]] = eqx.field(static=True)
     unknown_modes: Callable | None = eqx.field(static=True)
     resolve: Callable | None = eqx.field(static=True)
 
