@@ -130,7 +130,7 @@ def _check_elements(linkage: Linkage, acting: tuple[Any, ...]) -> None:
                     "no damping of a cable or a bumper, which MuJoCo does not have"
                 )
         elif type(element) in (*_IN_JOINTS, PDController) and _count(acting, name) > 1:
-            expected = f"only one {name}, as a joint of MuJoCo has"
+            expected, name = f"one {name}, as a joint of MuJoCo has", "several"
         elif type(element) in _ACTUATORS:
             others = [e for e in acting if e is not element and type(e) in _ACTUATORS]
             limits, _ = _limits_and_acts(element, linkage)
