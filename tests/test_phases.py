@@ -65,6 +65,21 @@ def test_what_acts_may_differ():
     assert len(fj.to_pandas(ARM, back)) == len(TS)
 
 
+@pytest.mark.parametrize("away", [-3, -1, 0, 1, 2, 3, 9])
+def test_a_payload_is_taken_once_where_phases_meet(away):
+    """In units of rounding from there."""
+    bar = fj.Linkage(
+        "R", length=[0, 1], com=[[0.5, 0]], mass=[1], inertia=[1 / 12], gravity=0
+    )
+    begin = 0.3 + away * np.spacing(0.3)
+    load = fj.forces.Payload(fj.Point(1, along=1), 1.5, begin=begin)
+    first = fj.simulate(bar, fj.State([0.0], [2.0]), [0, 0.3], (load,))
+    there = fj.State(first.q[-1], first.qd[-1])
+    motion = concatenate([first, fj.simulate(bar, there, [0.3, 1.0], (load,))])
+    np.testing.assert_allclose(motion.qd[-1], 4 / 11, rtol=1e-9)
+    np.testing.assert_allclose(motion.taken[-1], 6 / 11, rtol=1e-9)
+
+
 def test_a_batch_of_two_phases():
     starts = [fj.State(q, [0.0, 0.0]) for q in ([0.3, -0.2], [0.1, 0.2])]
     motions = [in_phases((STOPS,), start=start) for start in starts]

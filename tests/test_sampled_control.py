@@ -100,10 +100,22 @@ def sampled(delay, gains):
     return np.array(rows), x[0]
 
 
+class Idle(fj.Element):
+    """No effort, at which steps end all the same."""
+
+    jump_ts: fj.Values = fj.field((), unit="s")
+
+    def __call__(self, t, q, qd, linkage):
+        return jnp.zeros_like(q)
+
+
 def delayed(delay, gains):
     feedback = lambda t, q, qd, linkage: -gains[0] * q - gains[1] * qd
     start = fj.State(jnp.ones(1), jnp.zeros(1))
-    motion = fj.simulate_sampled(DISC, start, feedback, 0.1, 60, delay=delay)
+    # Beside another element with a known time, whose clock is another (see
+    # `clocks_apart`).
+    arguments = DISC, start, feedback, 0.1, 60, (Idle(0.35),)
+    motion = fj.simulate_sampled(*arguments, delay=delay)
     return motion.q[-1, 0], motion
 
 

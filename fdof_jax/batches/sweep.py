@@ -55,7 +55,7 @@ from .chunks import (
 )
 from .store import Store, in_store, outline
 
-_CHUNK = 512  # half as many take 15 % longer on two cores: each call costs 0.5 ms
+_CHUNK = 256  # twice as many take up to a third longer, as vectors leave the caches
 # Steps with joints that are held need more memory, and members more unlike numbers of
 # them.
 _CHUNK_HELD = 64
@@ -184,7 +184,7 @@ def sweep(
       `tune`; of each member only the arrays that it returns are kept. Functions of
       equal code share a compiled program.
     - `chunk`: largest number of members to solve together, per device; None stands for
-      512, or 64 where elements hold joints.
+      256, or 64 where elements hold joints.
     - `throw`: whether to raise an error if any member fails.
     - `store`: a folder for the results, which are not held in memory: a Zarr group for
       `xarray.open_zarr`, written in blocks of members (`fdof_jax[data]` brings zarr). A

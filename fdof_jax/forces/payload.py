@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ..linkage.fields import Condition, Values, field, of_kind
+from ..linkage.fields import Condition, Values, field, has_come, of_kind
 from ..linkage.frames import scalar_frames
 from .element import InertialElement
 from .points import Load, Point
@@ -73,8 +73,8 @@ class Payload(InertialElement):
 
     def there(self, t: Array | np.ndarray) -> Any:
         """Returns whether it is taken at a time."""
-        after = True if self.begin is None else self.begin <= t
-        return after & (True if self.end is None else t < self.end)
+        taken = True if self.begin is None else has_come(self.begin, t)
+        return taken & (True if self.end is None else ~has_come(self.end, t))
 
     def at(self, t: Array) -> "Payload":
         """Returns the payload at a time, without mass where it is not taken."""

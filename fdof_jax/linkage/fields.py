@@ -303,6 +303,14 @@ def jumps_of(*parts: Part) -> Array | None:
     return jnp.concatenate([jnp.ravel(t) for t in times]) if times else None
 
 
+def has_come(time: Any, t: Any) -> Any:
+    """Returns whether a known time has come at `t`, or is later by rounding alone.
+
+    A run that ends at `t` and one that begins there agree on it.
+    """
+    return time - 2 * jnp.finfo(time.dtype).eps * abs(time) <= t
+
+
 def optional(name: str, absent: Any = None) -> Any:
     """Returns an attribute of a `Foreign` that its callable may have."""
     return property(lambda self: getattr(self.called, name, absent))

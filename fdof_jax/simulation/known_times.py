@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 from jax import Array
 
-from ..forces.element import Element
+from ..forces.element import Element, Forces
 from ..linkage.fields import jumps_of
 from ..steps.landing import rounding
 from .field import Args
@@ -33,6 +33,15 @@ def clocks_apart(args: Args, ts: Array) -> Args:
     for rank, (_, place) in enumerate(places):
         ahead[place] = rank
     return args._replace(ahead=unit * jnp.array(ahead, unit.dtype))
+
+
+def clear_of_start(forces: Forces, ts: Array) -> Array:
+    """Returns the time after a start [s] at which another element's jump counts.
+
+    The clock of that element is ahead of those of `forces`.
+    """
+    timed = sum(element.jump_ts is not None for element in forces)
+    return (1 + _APART * timed) * rounding(ts)
 
 
 def known_times(

@@ -26,6 +26,7 @@ from ..linkage.coordinates import State, real_state
 from ..linkage.linkage import Linkage, check_linkage, joints_of, without_fixed
 from ..steps.looped_dopri8 import LoopedDopri8
 from .field import has_states, initial_states
+from .known_times import clear_of_start
 from .simulate import check_elements, simulate
 from .solution import Solution, WithOutcome
 
@@ -287,8 +288,7 @@ def _motion(
     if rest is not None:
         # Beside both ends of a period, as output times have to increase, and a jump at
         # the very start of a solve has no derivative.
-        latest = jnp.maximum(abs(times[0]), abs(times[-1]))
-        edge = 4 * jnp.finfo(times.dtype).eps * latest
+        edge = clear_of_start(forces, times)
         within = rest > edge
         rest += jax.lax.stop_gradient(jnp.clip(rest, edge, period - edge) - rest)
 

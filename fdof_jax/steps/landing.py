@@ -7,6 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jax import Array
 
+from ..linkage.fields import has_come
 from .dopri8 import constant
 
 # So many landings are chatter within a multiple of the distance that rounding keeps
@@ -40,8 +41,10 @@ def end_of_run(ts: Array, jumps: Array | None) -> Array:
     end = ts[-1]
     if jumps is None:
         return end
-    apart = rounding(ts)
-    there = (jumps >= _last(end) - apart) & (jumps <= end + apart)
+    apart, last = rounding(ts), _last(end)
+    # Steps land on what comes before `last`, and go on after it.
+    belongs = has_come(jumps, end) | (jumps < last + apart)
+    there = (jumps >= last - apart) & belongs
     return end + jnp.where(jnp.any(constant(there)), 64 * apart, 0)
 
 
