@@ -205,6 +205,17 @@ def test_margins_of_the_reach_and_their_derivatives():
         got = fj.references.reach_margin(slides, task, ts)
         np.testing.assert_array_equal(got, [found] * 3)
 
+    def at(center):
+        """Where two joints have their first one, no direction is better than another."""
+        arm = fj.scenes.double_pendulum().linkage.replace(length=[0.0, 1.0, 0.6])
+        point = fj.references.Ellipse(center, [0, 0])
+        lap = fj.references.Laps(period=1.0)
+        task = fj.TipTask(point, lap, orientation=None)
+        return fj.references.reach_margin(arm, task, [0.0])[0]
+
+    assert at(jnp.zeros(2)) == pytest.approx(-0.4)
+    np.testing.assert_array_equal(jax.grad(at)(jnp.zeros(2)), 0)
+
 
 def test_only_the_part_of_a_travel_within_the_run_is_checked():
     ring = fj.TipTask(RING, fj.references.Travel(1.0, profile="harmonic"))

@@ -34,8 +34,8 @@ class FitResult(Report):
     The first line printed is a verdict: whether a fault is known.
 
     - `parameters`: values by name, in the unit of each, as in `start`.
-    - `standard_errors`: standard errors by name; infinite for parameters that the
-      motion does not determine.
+    - `standard_errors`: standard errors by name, as without bounds; infinite for
+      parameters that the motion does not determine.
     - `names`: name of each number in order, for instance `damping` or `mass[0]`.
     - `covariance`: covariance of the numbers in that order (n, n): the variance of the
       noise times the inverse of the Gauss-Newton matrix. Infinite between parameters of

@@ -209,7 +209,7 @@ def solve_joints(
     outside = jnp.minimum(outer, inmost) < -rounding
     product = jnp.maximum(outer, 0) * jnp.maximum(inmost, 0) / 4
     root = branch * jnp.sqrt(jnp.where(outside, jnp.nan, product))
-    size = jnp.where(two_turning, jnp.sqrt(square), abs(component))
+    size = jnp.where(two_turning, length_of(wrist), abs(component))
     missing = jnp.maximum(
         size - jnp.sqrt(jnp.where(two_slides, 1, longest)),
         jnp.where(two_turning, abs(length2 - length3) - size, -jnp.inf),
