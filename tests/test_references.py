@@ -206,7 +206,7 @@ def test_margins_of_the_reach_and_their_derivatives():
         np.testing.assert_array_equal(got, [found] * 3)
 
     def at(center):
-        """Where two joints have their first one, no direction is better than another."""
+        """The margin at a point, for an arm whose first joint is at the origin."""
         arm = fj.scenes.double_pendulum().linkage.replace(length=[0.0, 1.0, 0.6])
         point = fj.references.Ellipse(center, [0, 0])
         lap = fj.references.Laps(period=1.0)
