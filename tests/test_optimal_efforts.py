@@ -11,8 +11,12 @@ from fdof_jax.tuning import optimal_motion
 
 # The same for all tests, so that they share programs.
 HORIZON, KNOTS = 0.5, 26
-SCENE = scenes.two_link_circle()  # of two joints, whose programs compile faster
-CONTROLLER = SCENE.forces[0]
+# Of two joints, whose programs compile faster, beside an element whose efforts are not
+# those that are sought.
+OTHER = fj.forces.EffortHistory([0.0, 1.0], np.zeros((2, 2)))
+CIRCLE = scenes.two_link_circle()
+CONTROLLER = CIRCLE.forces[0]
+SCENE = CIRCLE._replace(forces=(OTHER, CONTROLLER))
 
 
 def rms_tip_error(scene, task):
@@ -36,10 +40,10 @@ def test_no_controller_with_these_limits_does_better(best):
     # Both guesses lead to the same result.
     np.testing.assert_allclose(best.guess_errors, best.tip_error, rtol=1e-3)
     assert rms_tip_error(best.scene, task) == pytest.approx(best.tip_error, rel=2e-3)
-    own = rms_tip_error(SCENE, task)
+    own = rms_tip_error(CIRCLE, task)
     assert best.controller_error == pytest.approx(own, rel=2e-3)
     torque = fj.control.ComputedTorque(100.0, 20.0, limit, task, None)
-    known = rms_tip_error(SCENE._replace(forces=(torque,)), task)
+    known = rms_tip_error(CIRCLE._replace(forces=(torque,)), task)
     assert best.tip_error < 0.6 * min(known, own)
     assert best.bound(2.0) == pytest.approx(best.tip_error / 2)
     with pytest.raises(ValueError, match="t1: expected"):
@@ -91,7 +95,7 @@ def two_slides():
     task = fj.TipTask(point, fj.references.Laps(period=2.0), orientation=None)
     controller = fj.PDController(100.0, 10.0, [120.0, 80.0], task)
     state0 = fj.State(start, np.zeros(2))
-    return fj.Scene(linkage, state0, (controller,), 1.0)
+    return fj.Scene(linkage, state0, (OTHER, controller), 1.0)
 
 
 def test_slides_are_controlled_as_fuller_found():
@@ -104,27 +108,25 @@ def test_slides_are_controlled_as_fuller_found():
     assert least < found.tip_error < 1.01 * least
 
 
-class Beside(fj.references.Reference):
-    """A tip position that an arm with one joint need not reach."""
-
-    def tip(self, t):
-        return np.ones(2)
-
-    def __call__(self, t, linkage):
-        return np.zeros(3), np.zeros(3)
-
-
-def test_joints_without_a_limit_or_fixed_have_no_effort_beside_others():
-    """The efforts of another element are not those that are sought; one step gives no
-    bound, which the scene's own controller, tuned, would beat."""
-    arm = fj.Linkage(
-        "RRF", length=[0, 1, 1, 1], com=[[0.5, 0]] * 3, mass=[1] * 3, inertia=[0.1] * 3
-    )
-    other = fj.forces.EffortHistory(np.linspace(0, 1, 4), np.zeros((4, 3)))
-    pd = fj.PDController(100.0, 10.0, [600, 0, np.inf], Beside())  # motorless, fixed
-    scene = fj.Scene(arm, fj.State(np.zeros(3), np.zeros(3)), (other, pd), 1.0)
-    found = fj.tuning.optimal_efforts(scene, horizon=HORIZON, knots=KNOTS, max_steps=1)
-    assert found.efforts[:, 0].any() and not found.efforts[:, 1:].any()
+def test_joints_without_a_limit_or_fixed_have_no_effort():
+    """One step gives no bound, which the scene's own controller, tuned, would beat."""
+    task = CONTROLLER.reference
+    motorless = CONTROLLER.replace(limit=[600.0, 0.0])
+    found = fj.tuning.optimal_efforts(
+        SCENE._replace(forces=(OTHER, motorless)),
+        horizon=HORIZON, knots=KNOTS, max_steps=1,
+    )  # fmt: skip
+    assert found.efforts[:, 0].any() and not found.efforts[:, 1].any()
     assert not found.converged
     with pytest.raises(RuntimeError, match="bound: expected a search that has conv"):
         found.bound(1.0)
+    # About the first joint, with the second one fixed; it need not be reached.
+    circle = task.replace(path=fj.references.Ellipse([0.0, 0.0], [2.0, 2.0]))
+    fixed = CONTROLLER.replace(limit=[600.0, np.inf], reference=circle)
+    scene = SCENE._replace(
+        linkage=SCENE.linkage.replace(topology="RF", locked=[0.0, 0.0]),
+        state0=fj.State(np.zeros(2), np.zeros(2)),
+        forces=(OTHER, fixed),
+    )
+    found = fj.tuning.optimal_efforts(scene, horizon=HORIZON, knots=KNOTS, max_steps=1)
+    assert found.efforts[:, 0].any() and not found.efforts[:, 1].any()
