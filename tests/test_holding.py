@@ -81,6 +81,16 @@ def test_tiny_arms_stick_slip_and_saturate_as_large_ones():
         np.testing.assert_allclose(found.q, wanted.q, atol=1e-9)
         np.testing.assert_allclose(found.events.t, wanted.events.t, atol=1e-9)
 
+    def way(size):
+        target = fj.references.Step(0.0, 0.4 * size, begin=0.2)
+        pd = fj.PDController(60.0, 8.0, 8 * size, target)
+        friction = JointFriction(0.8 * size, static=2 * size)
+        tolerances = dict(rtol=1e-11, atol=1e-11 * size)
+        return run(SLIDE, REST, ts, friction, pd, **tolerances).q / size
+
+    # Rates of friction have no unit of their own.
+    np.testing.assert_allclose(way(1e-6), way(1.0), atol=1e-7)
+
 
 def test_a_kink_where_friction_turns_leaves_derivatives_on_both_sides():
     """The limit of a motor has kinks at rest, where the friction jumps."""
