@@ -325,13 +325,13 @@ def in_chunks(
     # are written faster, and then take their own order in more memory.
     place = np.argsort(order) if on_device else np.arange(size)
     done, results, structure, waiting = 0, [], None, order
-    progress = meter.init()
+    progress, advance = meter.init(), meter.step  # looked up at each use it is slow
     while len(waiting):
         late = []
         for members, outcome in _outcomes(job, waiting, lanes):
             late.append(members[np.asarray(outcome.stopped)[: len(members)]])
             done += len(members) - len(late[-1])
-            progress = meter.step(progress, np.asarray(done / size))
+            progress = advance(progress, np.asarray(done / size))
             values, structure = jax.tree.flatten(outcome)
             if not results:
                 if done == size == lanes:  # a single chunk, in order
