@@ -9,6 +9,7 @@ import re
 import stat
 import struct
 import threading
+import traceback
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -420,3 +421,29 @@ def test_a_network_is_loaded_into_one_of_its_kind(path, classes, message):
     fj.save(path, Policy(1))
     with pytest.raises(ValueError, match=message):
         fj.load(path, classes)
+
+
+class Positive(eqx.Module):
+    number: float
+
+    def __check_init__(self):
+        if self.number <= 0:
+            raise ValueError("must be positive")
+
+
+def test_a_class_may_be_given_twice_and_says_what_it_refuses(path):
+    fj.save(path, Positive(2.0))
+    assert fj.load(path, (Positive, Positive)).number == 2
+    path.write_text(path.read_text().replace("2.0", "-2.0"))
+    with pytest.raises(ValueError, match="json: tree: must be positive") as caught:
+        fj.load(path, (Positive,))
+    assert "__check_init__" in [entry.name for entry in _chain(caught.value)]
+
+
+def _chain(error):
+    """Returns the calls in which an error and its causes came."""
+    entries = []
+    while error is not None:
+        entries += traceback.extract_tb(error.__traceback__)
+        error = error.__cause__
+    return entries

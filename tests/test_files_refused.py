@@ -31,7 +31,7 @@ UNSAVED = {
     "class": (Push, "class .*Push"),
     "object": (object(), "object"),
     "bytes": (b"abc", "b'abc'"),
-    "keys": ({1: 2}, r"dicts by text, .* got \{1: 2\}"),
+    "keys": ({1: 2}, r"dicts with text keys, .* got \{1: 2\}"),
     "the text of a number": ("inf", "'inf'"),
     "complex": (np.array([1j]), "real numbers"),
     "objects": (np.array([None]), "real numbers"),

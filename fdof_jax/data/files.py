@@ -124,14 +124,13 @@ def load(path: str | os.PathLike, classes: Sequence[Any] = ()) -> Any:
     several = isinstance(classes, tuple | list)
     if not (several and all(isinstance(k, type | eqx.Module) for k in classes)):
         raise refusal("classes", "a tuple of classes, or of modules", classes)
-    content = path.read_bytes()
+    content, file = path.read_bytes(), plain(str(path))
     try:
         return _value("tree", _parsed(content), classes)
     except RecursionError:
-        problem = "expected less nesting."
+        raise ValueError(f"{file}: expected less nesting.") from None
     except ValueError as error:
-        problem = str(error)
-    raise ValueError(f"{plain(str(path))}: {problem}")
+        raise ValueError(f"{file}: {error}") from error
 
 
 def _public(name: str) -> Any:
@@ -181,7 +180,7 @@ def _node(place: str, value: Any) -> Any:
         expected = "no motion: to_xarray makes a Dataset of it, which to_netcdf saves"
         raise refusal(place, expected, value)
     if not _is_record(kind):
-        expected = "numbers, arrays, texts, or tuples, dicts by text, objects of such"
+        expected = "numbers, arrays, texts, tuples, dicts with text keys, or objects"
         if callable(value):
             expected += "; an equinox.Module with a __call__ in place of a function"
         raise refusal(place, expected, value)
@@ -334,15 +333,17 @@ def _value(place: str, node: Any, classes: Sequence[type]) -> Any:
     if name == "dict":
         return {key: at(f"[{shown(key)}]", item) for key, item in inner.items()}
     types = [kind if isinstance(kind, type) else type(kind) for kind in classes]
-    own = [kind for kind in types if kind.__name__ == name]
-    if not (kind := _public(name)) and len(own) != 1:
+    own = {kind for kind in types if kind.__name__ == name}
+    maker = _public(name) or (own.pop() if len(own) == 1 else None)
+    if maker is None:
         expected = "a class of fdof_jax, or one of load(path, classes=(MyElement,))"
         raise refusal(place, expected, name)
     arguments = {key: at(f".{plain(key)}", item) for key, item in inner.items()}
     try:
-        return (kind or own[0])(**arguments)
-    except ValueError as error:  # whose text begins with the argument
-        raise ValueError(f"{place}.{error}") from error
+        return maker(**arguments)
+    except ValueError as error:
+        names_argument = re.match(r"[a-z]\w*[:,.[]", str(error))
+        raise ValueError(f"{place}{'.' if names_argument else ': '}{error}") from error
     except _MEANT as error:
         problem = f"the arguments of {name}, got {plain(str(error))}"
         raise ValueError(f"{place}: expected {problem}.") from error
