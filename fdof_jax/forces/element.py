@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from .points import Load
 
 Forces = tuple[Any, ...]  # elements, or callables (t, q, qd, linkage) -> tau
+OwnStates = tuple[PyTree, ...]  # of `StatefulElement`s, in the order of the forces
 
 
 class Element(Part):
