@@ -212,7 +212,7 @@ def _linearized(
     forces: tuple[Element, ...],
     q: Array,
     qd: Array,
-    t: Any,
+    t: Array,
     tau: Array,
 ) -> Linearization:
     """Linearises the equations under the forces and the efforts `tau`."""
@@ -241,10 +241,12 @@ def _each_linearized(
     return jax.lax.map(at, rows)
 
 
-def _with_references(element: Element, changed: Callable[[Any], Any]) -> Element:
+def _with_references(
+    element: Element, changed: Callable[[Callable], Callable]
+) -> Element:
     """Returns an element with its references changed, also those of commands."""
 
-    def of(part: Any) -> Any:
+    def of(part: object) -> object:
         if isinstance(part, PDController):  # whose reference may be a plain function
             return eqx.tree_at(lambda pd: pd.reference, part, changed(part.reference))
         return changed(part) if isinstance(part, Reference) else part

@@ -1,5 +1,6 @@
 """Loops of a controller about a configuration, as systems of python-control."""
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -28,7 +29,7 @@ BANDWIDTH = 10 ** (-3 / 20)  # -3 dB
 def open_loop(
     linkage: Linkage,
     q: ArrayLike,
-    controller: Any,
+    controller: Callable,
     joint: int,
     forces: Forces = (),
     t: ArrayLike = 0.0,
@@ -68,7 +69,7 @@ def open_loop(
 def closed_loop(
     linkage: Linkage,
     q: ArrayLike,
-    controller: Any,
+    controller: Callable,
     joint: int,
     forces: Forces = (),
     t: ArrayLike = 0.0,
@@ -100,8 +101,9 @@ def closed_loop(
 
 
 def _loops(
-    linkage: Linkage, q: Any, controller: Any, joint: int, forces: Forces, t: Any
-) -> tuple[Any, Any]:
+    linkage: Linkage, q: ArrayLike, controller: Callable, joint: int, forces: Forces,
+    t: ArrayLike,
+) -> tuple[Any, Any]:  # fmt: skip
     import control
 
     check_linkage(linkage)
@@ -224,7 +226,7 @@ def bandwidth(response: "control.StateSpace") -> float:
     return unit * min(_crossings(_slower(response, unit) / level), default=np.inf)
 
 
-def _unit(system: Any) -> float:
+def _unit(system: "control.StateSpace") -> float:
     """Returns the geometric mean of the magnitudes of a system's poles [rad/s]."""
     rates = np.abs(system.poles())
     return float(np.exp(np.log(rates[rates > 0]).mean()))
@@ -241,7 +243,7 @@ def _slower(system: Any, unit: float) -> Any:
     return control.ss(system.A / unit, system.B / unit, system.C, system.D)
 
 
-def _crossings(system: Any) -> list[float]:
+def _crossings(system: "control.StateSpace") -> list[float]:
     """Returns the frequencies above 0 at which the magnitude is 1, in order."""
     import control
 

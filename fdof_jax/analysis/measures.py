@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import scipy
 from jax import Array
-from jaxtyping import Float
+from jaxtyping import Float, PyTree
 from numpy.typing import ArrayLike
 
 from ..base.checks import is_traced, real_array, refusal
@@ -189,10 +189,10 @@ def _controller(
     It may be the command of a drive, whose states have the command's. In its place,
     `acting` has the held efforts of sampled control.
     """
-    found: list[Any] = []
-    states: Any = iter(solution.own)
+    found = []
+    states = iter(solution.own)
     for element, acts in zip(forces, acting):
-        state: Any = next(states) if isinstance(acts, StatefulElement) else ()
+        state: PyTree = next(states) if isinstance(acts, StatefulElement) else ()
         while isinstance(element, Drive):
             element = element.command
             if isinstance(acts, Drive):
@@ -204,7 +204,7 @@ def _controller(
         raise refusal("forces", expected, forces)
     ((element, acts, state),) = found
 
-    def effort(t: Array, q: Array, qd: Array, state: Any) -> Array:
+    def effort(t: Array, q: Array, qd: Array, state: PyTree) -> Array:
         return element_effort(0, acts, t, q, qd, linkage, state)[0]
 
     efforts = jax.vmap(effort)(solution.ts, solution.q, solution.qd, state)

@@ -1,7 +1,5 @@
 """Bearing reactions, and the inertial parameters in which efforts are linear."""
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -21,7 +19,7 @@ from ..simulation.scene import accepts_scene
 
 
 def _loads(
-    linkage: Linkage, forces: Forces, t: Any, q: Array, qd: Array, qdd: Array
+    linkage: Linkage, forces: Forces, t: Array, q: Array, qd: Array, qdd: Array
 ) -> tuple[Array, Array]:
     """Forces on the ground and the links, and moments about the ground pivot."""
     parts = frames(linkage, q)

@@ -1,5 +1,6 @@
 """Tests of a controller on its arm: steps and sines of the reference, per joint."""
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -15,7 +16,14 @@ from ..base.checks import is_traced, real_array, refusal
 from ..base.report import Report
 from ..control.drives import Drive
 from ..control.pd import PDController
-from ..forces.element import Element, Forces, StatefulElement, elements_on, of_full_size
+from ..forces.element import (
+    Element,
+    Forces,
+    OwnStates,
+    StatefulElement,
+    elements_on,
+    of_full_size,
+)
 from ..linkage.coordinates import State
 from ..linkage.fields import Values, field
 from ..linkage.linkage import (
@@ -59,7 +67,7 @@ class Probe(Reference):
         return self.center + self.amplitude * jnp.sin(angle), rate * jnp.cos(angle)
 
 
-def _commanding(element: Any) -> Any:
+def _commanding(element: object) -> Any:
     """Returns the PD controller that an element is or holds as its command, or None."""
     while isinstance(element, Drive):
         element = element.command
@@ -113,7 +121,7 @@ class StepAndSine(Report):
 def step_and_sine(
     linkage: Linkage,
     q: ArrayLike,
-    controller: Any,
+    controller: Callable,
     forces: Forces = (),
     *,
     step: ArrayLike,
@@ -172,16 +180,20 @@ def step_and_sine(
     names, moving = joint_names(linkage), moving_joints(linkage)
     heights, t0, still = np.asarray(step), float(duration), np.zeros(n)
 
-    def with_probe(center: Any, amplitude: Any = still, frequency: Any = 1) -> Element:
+    def with_probe(
+        center: ArrayLike, amplitude: ArrayLike = still, frequency: float = 1
+    ) -> Element:
         """Returns the controller with a probe for its reference."""
         probe = Probe(center, amplitude, frequency)
         return eqx.tree_at(lambda part: _commanding(part).reference, element, probe)
 
-    def motion(acting: Element, start: State, own: Any, ts: np.ndarray) -> Solution:
+    def motion(
+        acting: Element, start: State, own: OwnStates | None, ts: np.ndarray
+    ) -> Solution:
         keywords: Any = dict(own0=own, throw=False, max_steps=_STEPS)
         return simulate(linkage, start, ts, (acting, *forces), **keywords)
 
-    def responses_at(here: Any) -> tuple[list[Any], np.ndarray]:
+    def responses_at(here: ArrayLike) -> tuple[list[Any], np.ndarray]:
         calls = ((linkage, here, with_probe(q), k + 1, forces) for k in moving)
         loops = [closed_loop(*call) for call in calls]
         return loops, np.array(list(map(bandwidth, loops)))

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from ..control.pd import PDController
 from ..linkage.linkage import Linkage, without_fixed
 from ..mechanics.kinematics import tip_position
-from ..references.task import CircleTask
+from ..references.task import TipReference
 from ..simulation.solution import Solution
 
 
@@ -38,7 +38,7 @@ def relative_demands(
 
 @eqx.filter_jit
 def tip_deviation(
-    linkage: Linkage, task: CircleTask, solution: Solution
+    linkage: Linkage, task: TipReference, solution: Solution
 ) -> Float[Array, "time 2"]:
     """Vectors from the commanded to the actual tip along a motion [m].
 

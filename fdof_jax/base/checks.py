@@ -7,6 +7,7 @@ by `jax.jit`, `jax.vmap` or `jax.grad` is not known yet.
 import importlib
 import inspect
 from collections.abc import Callable, Sequence
+from types import ModuleType
 from typing import Any
 
 import equinox as eqx
@@ -15,6 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.core import Tracer, eval_context
+from jaxtyping import PyTree
+from numpy.typing import ArrayLike
 
 try:
     from jax.extend.core import get_opaque_trace_state
@@ -27,12 +30,12 @@ from .user_warnings import warn
 JOINT = "joint"
 
 
-def is_traced(*trees: Any) -> bool:
+def is_traced(*trees: PyTree) -> bool:
     """Returns whether a JAX transformation traces any leaf of `trees`."""
     return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(trees))
 
 
-def transformation() -> Any:
+def transformation() -> object:
     """Returns what tells the running JAX transformation from others and from none."""
     return get_opaque_trace_state(convention="nnx")
 
@@ -47,13 +50,13 @@ def is_transformed() -> bool:
     return transformation() != outside
 
 
-def known(*trees: Any) -> bool:
+def known(*trees: PyTree) -> bool:
     """Returns whether all leaves are concrete numbers."""
     numbers = all(map(eqx.is_array_like, jax.tree.leaves(trees)))
     return numbers and not is_traced(*trees)
 
 
-def concrete(value: Any) -> np.ndarray | None:
+def concrete(value: ArrayLike) -> np.ndarray | None:
     """Returns `value` as a NumPy array, or None while it is traced."""
     return None if is_traced(value) else np.asarray(value)
 
@@ -71,17 +74,17 @@ def plain(text: str) -> str:
     )
 
 
-def shown(value: Any) -> str:
+def shown(value: object) -> str:
     """Returns how messages show a value that was given."""
     return plain(repr(value))
 
 
-def refusal(name: str, expected: str, got: Any) -> ValueError:
+def refusal(name: str, expected: str, got: object) -> ValueError:
     """Returns the error to raise for a malformed argument."""
     return ValueError(f"{name}: expected {expected}, got {shown(got)}.")
 
 
-def numpy_array(value: Any) -> np.ndarray:
+def numpy_array(value: object) -> np.ndarray:
     """Returns a value as NumPy's array; a masked one, whose mask this drops, raises."""
     if isinstance(value, np.ma.MaskedArray):
         raise TypeError("masked arrays are not supported")
@@ -90,7 +93,7 @@ def numpy_array(value: Any) -> np.ndarray:
 
 def real_array(
     name: str,
-    value: Any,
+    value: object,
     shape: tuple[int | str | None, ...],
     *,
     minimum: float | None = None,
@@ -150,9 +153,9 @@ def real_array(
             raise refuse(text.removesuffix("."))  # 1.0 is shown as "1."
         if unit == "rad":
             radians(name, kept)
-        ready = isinstance(value, Array) and value.dtype == kept.dtype
-        if ready and fits and not value.weak_type:
-            return value
+        if fits and isinstance(value, Array) and value.dtype == kept.dtype:
+            if not value.weak_type:
+                return value
         array = kept
     # NumPy broadcasts concrete values without compiling a program.
     if not fits and JOINT not in shape:
@@ -171,7 +174,7 @@ def radians(name: str, angles: np.ndarray) -> None:
         )
 
 
-def single_precision(name: str, tree: Any) -> None:
+def single_precision(name: str, tree: PyTree) -> None:
     """Warns of arrays in single precision while JAX has double precision."""
     arrays = filter(eqx.is_array, jax.tree.leaves(tree))
     short = any(leaf.dtype == jnp.float32 for leaf in arrays)
@@ -191,19 +194,19 @@ def increasing(name: str, times: Array) -> None:
         raise refusal(name, "increasing times", values.tolist()[:20])
 
 
-def place_of(item: Any, items: Sequence[Any]) -> int:
+def place_of(item: object, items: Sequence[object]) -> int:
     """Returns the index of the very object `item`; arrays need not compare equal."""
     return [other is item for other in items].index(True)
 
 
-def function(name: str, value: Any, expected: str = "a callable") -> Any:
+def function(name: str, value: object, expected: str = "a callable") -> Callable:
     """Returns `value` if it is callable and no class, or raises ValueError."""
     if callable(value) and not isinstance(value, type):
         return value
     raise refusal(name, expected, value)
 
 
-def hashable(name: str, functions: Any) -> None:
+def hashable(name: str, functions: PyTree) -> None:
     """Raises ValueError if a function, or what one holds beside arrays, has no hash."""
     for leaf in jax.tree.leaves(functions):
         if eqx.is_array_like(leaf):
@@ -215,7 +218,7 @@ def hashable(name: str, functions: Any) -> None:
             raise refusal(name, expected, leaf) from None
 
 
-def instance(name: str, value: Any, kind: type) -> None:
+def instance(name: str, value: object, kind: type) -> None:
     """Raises ValueError unless `value` is an instance of `kind`."""
     if not isinstance(value, kind):
         article = "an" if kind.__name__[0] in "AEIO" else "a"
@@ -231,7 +234,7 @@ def whole_number(name: str, value: Any, minimum: int, most: int | None = None) -
     return int(value)
 
 
-def one_of(name: str, value: Any, options: Sequence[Any]) -> Any:
+def one_of(name: str, value: object, options: Sequence[Any]) -> Any:
     """Returns `value` if it is among `options`, or raises ValueError."""
     if isinstance(value, str | int | float) and value in options:
         return value
@@ -258,7 +261,7 @@ def keywords_as(
     return allowed | given
 
 
-def sign(name: str, value: Any) -> Array:
+def sign(name: str, value: ArrayLike) -> Array:
     """Returns `value` as an array if it is 1 or -1, or raises ValueError."""
     array = real_array(name, value, ())
     if (given := concrete(array)) is not None and abs(given) != 1:
@@ -266,7 +269,7 @@ def sign(name: str, value: Any) -> Array:
     return array
 
 
-def optional_package(name: str, extra: str) -> Any:
+def optional_package(name: str, extra: str) -> ModuleType:
     """Returns the package, or raises ImportError that names the extra to install."""
     try:
         return importlib.import_module(name)

@@ -113,7 +113,7 @@ def _compile_small_loops_as_kernels() -> None:
     )
 
 
-def _keep_programs(cache: Any) -> None:
+def _keep_programs(cache: bool | str | os.PathLike[str]) -> None:
     folder = None
     if cache is not False:
         place = _user_cache() if cache is True else cache

@@ -17,7 +17,7 @@ class Frozen(eqx.Module):
         # Otherwise that of dataclasses, which does not know constructors.
         cls.__replace__ = cls.replace
 
-    def __setattr__(self, name: str, value: Any) -> None:
+    def __setattr__(self, name: str, value: object) -> None:
         try:
             super().__setattr__(name, value)
         except FrozenInstanceError:

@@ -14,12 +14,13 @@ import inspect
 import types
 from collections import Counter
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from .user_warnings import warn
 
@@ -46,6 +47,9 @@ _DATA = (float, np.floating, int), (float, np.floating)
 _fewer: Counter[types.CodeType] = Counter()
 
 
+_T = TypeVar("_T")
+
+
 class _Unknown(Exception):
     """Raised for a function that reaches what may change unseen."""
 
@@ -70,7 +74,7 @@ class SharedFunction(eqx.Module):
         return returned
 
 
-def sharing_functions(run: Callable[..., Any], **trees: Any) -> Any:
+def sharing_functions(run: Callable[..., _T], **trees: PyTree) -> _T:
     """Returns `run(*trees)`, with plain functions in the trees in their shared form.
 
     The third callable alike that needs a program of its own brings a warning that names
@@ -94,11 +98,11 @@ def sharing_functions(run: Callable[..., Any], **trees: Any) -> Any:
     return result
 
 
-def _is_shared(node: Any) -> bool:
+def _is_shared(node: object) -> bool:
     return isinstance(node, SharedFunction)
 
 
-def _shared(leaf: Any) -> Any:
+def _shared(leaf: object) -> object:
     """Returns a plain function in its shared form if possible; else the leaf itself."""
     if not inspect.isfunction(leaf) or leaf.__closure__ is None and _is_fixed(leaf):
         return leaf
@@ -109,7 +113,9 @@ def _shared(leaf: Any) -> Any:
         return leaf
 
 
-def _parts_of(function: Any, within: tuple[Any, ...] = ()) -> SharedFunction:
+def _parts_of(
+    function: types.FunctionType, within: tuple[types.FunctionType, ...] = ()
+) -> SharedFunction:
     code = function.__code__
     if function.__dict__ or function in within or _fewer[code] >= len(_DATA):
         raise _Unknown
@@ -122,7 +128,7 @@ def _parts_of(function: Any, within: tuple[Any, ...] = ()) -> SharedFunction:
     closure = tuple(cell.cell_contents for cell in function.__closure__ or ())
     numbers, within = _DATA[_fewer[code]], (*within, function)
 
-    def part(leaf: Any) -> Any:
+    def part(leaf: object) -> object:
         if isinstance(leaf, numbers) and not isinstance(leaf, bool):
             # Of Python's numbers an array that leaves the types of others, too.
             return jax.device_put(leaf)
@@ -139,7 +145,7 @@ def _parts_of(function: Any, within: tuple[Any, ...] = ()) -> SharedFunction:
     return SharedFunction(jax.tree.map(part, reach, is_leaf=_out_of_order), code)
 
 
-def _out_of_order(node: Any) -> bool:
+def _out_of_order(node: object) -> bool:
     """Returns whether it is a dict whose values come in another order than JAX's."""
     return isinstance(node, dict) and list(node) != sorted(node)
 
@@ -166,7 +172,7 @@ def _global_names(code: types.CodeType) -> frozenset[str]:
     return frozenset(names)
 
 
-def _is_fixed(value: Any) -> bool:
+def _is_fixed(value: object) -> bool:
     """Returns whether it is a module of a known package, or its function or class."""
     home = None
     if inspect.ismodule(value):
@@ -179,10 +185,10 @@ def _is_fixed(value: Any) -> bool:
 
 
 _keys: set[int] = set()  # of callables, each of which has a program
-_alike: Counter[Any] = Counter()  # the same, by their code or type
+_alike: Counter[types.CodeType | type] = Counter()  # the same, by their code or type
 
 
-def _warn_of_third(trees: dict[str, Any]) -> None:
+def _warn_of_third(trees: dict[str, PyTree]) -> None:
     leaves, _ = jax.tree_util.tree_flatten_with_path(trees, is_leaf=_is_shared)
     for (tree, *path), leaf in leaves:
         compiled = not isinstance(leaf, _CONSTANTS) or isinstance(leaf, _JITTED)
@@ -205,7 +211,7 @@ def _warn_of_third(trees: dict[str, Any]) -> None:
             )
 
 
-def _key(leaf: Any) -> int:
+def _key(leaf: object) -> int:
     """Returns the identity of a callable, which JAX keeps, or that of its parts."""
     if not _is_shared(leaf):
         return id(leaf)

@@ -2,20 +2,20 @@
 
 import functools
 from collections.abc import Callable
-from typing import Any
 
 import equinox as eqx
 import jax
 import numpy as np
 from jax.core import Tracer
+from jaxtyping import PyTree
 
 from .checks import is_traced
 
 
-def in_numpy(tree: Any) -> Any:
+def in_numpy(tree: PyTree) -> PyTree:
     """Returns `tree` with its concrete JAX arrays as NumPy arrays."""
 
-    def converted(leaf: Any) -> Any:
+    def converted(leaf: object) -> object:
         # NumPy has no dtype for random keys.
         numbers = isinstance(leaf, jax.Array) and isinstance(leaf.dtype, np.dtype)
         return np.asarray(leaf) if numbers and not isinstance(leaf, Tracer) else leaf
@@ -32,7 +32,7 @@ def at_once(function: Callable) -> Callable:
     program = eqx.filter_jit(function)
 
     @functools.wraps(function)
-    def run(*arguments: Any) -> Any:
+    def run(*arguments: PyTree) -> PyTree:
         if is_traced(arguments):
             return function(*arguments)
         with jax.ensure_compile_time_eval():

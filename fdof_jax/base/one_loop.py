@@ -4,13 +4,12 @@ XLA on CPU gives each result its own loop over the batch, which computes the res
 common parts anew.
 """
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
+from jaxtyping import PyTree
 
 
-def one_loop_on_cpu(tree: Any) -> Any:
+def one_loop_on_cpu(tree: PyTree) -> PyTree:
     """Returns the same arrays, computed by a single loop over the batch.
 
     Reductions are the only operation of XLA with several results. This reduction takes
@@ -28,7 +27,7 @@ def one_loop_on_cpu(tree: Any) -> Any:
     return jax.tree.unflatten(structure, reduced)
 
 
-def in_one_loop(tree: Any) -> Any:
+def in_one_loop(tree: PyTree) -> PyTree:
     """Returns the same arrays, on CPU by a single loop; it has no derivatives."""
     return jax.lax.platform_dependent(
         tree, cpu=one_loop_on_cpu, default=lambda tree: tree

@@ -16,7 +16,7 @@ from .checks import refusal, shown
 _SCHEME = re.compile("[A-Za-z][A-Za-z0-9+.-]+:/")
 
 
-def local_path(name: str, value: Any, expected: str) -> Path:
+def local_path(name: str, value: object, expected: str) -> Path:
     """Returns the path on this machine that the argument `name` gives; `~` is a home.
 
     Raises ValueError for what is no path, an empty one, and an address.
@@ -43,7 +43,7 @@ def file_path(name: str, value: Any) -> Path:
 
 
 def folder_path(
-    name: str, value: Any, expected: str = "a folder", within: str = ""
+    name: str, value: object, expected: str = "a folder", within: str = ""
 ) -> Path:
     """Returns the folder `within` that of the argument `name`, made if need be."""
     folder = local_path(name, value, expected) / within

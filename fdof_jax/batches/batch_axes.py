@@ -5,11 +5,15 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import numpy as np
+from jax import Array
+from jaxtyping import PyTree
 
 from ..base.checks import instance, shown
 from ..forces.element import Forces
 from ..linkage.coordinates import State
 from ..linkage.linkage import Linkage
+
+ForcesAxes = int | tuple[int | None, ...] | None  # 0 or None, for each element or all
 
 # Dimensions of the arrays of a single linkage and state; one more is a batch axis.
 _RANKS = dict(
@@ -21,17 +25,17 @@ _RANKS = dict(
 class Batch(NamedTuple):
     """Linkage, state and forces of all members."""
 
-    moving: Any  # their arrays with a batch axis, and None for other leaves
-    shared: Any  # their other leaves, and None for these
+    moving: PyTree  # their arrays with a batch axis, and None for other leaves
+    shared: PyTree  # their other leaves, and None for these
     size: int
 
 
-def _name(part: Any, *rest: Any) -> str:
+def _name(part: Any, *rest: object) -> str:
     """Returns the name of a leaf of the inputs from its path."""
     return ("linkage", "state0", "forces")[part.idx] + jax.tree_util.keystr(rest)
 
 
-def _has_axis(path: Any, array: Any, joints: int) -> bool:
+def _has_axis(path: tuple[Any, ...], array: Array | np.ndarray, joints: int) -> bool:
     rank, shape = _RANKS[path[-1].name], array.shape
     fits = array.ndim - rank in (0, 1) and array.dtype.kind in "iuf"
     if not fits or path[-1].name in State._fields and shape[-1] != joints:
@@ -43,13 +47,15 @@ def _has_axis(path: Any, array: Any, joints: int) -> bool:
     return array.ndim > rank
 
 
-def _force_has_axis(axis: Any, part: Any) -> Any:
+def _force_has_axis(axis: int | None, part: PyTree) -> PyTree:
     if axis is not None and (type(axis) is not int or axis != 0):
         raise ValueError
     return jax.tree.map(lambda leaf: axis == 0 and eqx.is_array_like(leaf), part)
 
 
-def batch_of(linkage: Linkage, state0: Any, forces: Forces, forces_axes: Any) -> Batch:
+def batch_of(
+    linkage: Linkage, state0: State, forces: Forces, forces_axes: ForcesAxes
+) -> Batch:
     """Returns the inputs as a batch; raises ValueError if their shapes do not fit."""
     if isinstance(linkage, list | tuple) and linkage:
         raise ValueError(

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.sharding import Mesh, SingleDeviceSharding
+from jaxtyping import PyTree
 
 from ..base.checks import refusal
 from ..base.configuration import wide_vectors
@@ -45,16 +46,16 @@ _NO_MESH = Mesh(np.empty((), object), ())
 class Common(NamedTuple):
     """The arguments that all members of a sweep have in common."""
 
-    shared: Any  # of a `Batch`
+    shared: PyTree  # of a `Batch`
     ts: Array
     settings: dict
-    reduce: Callable[[Scene, Solution], Any]
+    reduce: Callable[[Scene, Solution], PyTree]
 
 
 class Job(NamedTuple):
     """The members that a sweep solves, its devices, and the size of its chunks."""
 
-    moving: Any  # of a `Batch`
+    moving: PyTree  # of a `Batch`
     common: Common
     size: int
     chunk: int
@@ -64,12 +65,12 @@ class Job(NamedTuple):
 class Outcome(NamedTuple):
     """The outcome of a member, or of several with a leading axis."""
 
-    value: Any  # what the reduction returns
+    value: PyTree  # what the reduction returns
     stopped: Array  # because most lanes were long done
     failed: Array
 
 
-def _check_value(value: Any) -> None:
+def _check_value(value: PyTree) -> None:
     """Raises ValueError unless a reduction returned arrays of numbers."""
     if not jax.tree.leaves(value):
         raise refusal("reduce", "a function that returns arrays", value)
@@ -81,7 +82,7 @@ def _check_value(value: Any) -> None:
             raise refusal("reduce", "a function that returns numbers", dtype)
 
 
-def outcome_of(common: Common, moving: Any, abreast: bool = False) -> Outcome:
+def outcome_of(common: Common, moving: PyTree, abreast: bool = False) -> Outcome:
     """Computes the outcome of one member.
 
     If `abreast`, a member is stopped when most lanes are long done.
@@ -132,14 +133,14 @@ class Form(NamedTuple):
         return jax.vmap(member, axis_name=_AXIS)(lanes)
 
 
-def _is_kind(leaf: Any) -> bool:
+def _is_kind(leaf: object) -> bool:
     return isinstance(leaf, jax.ShapeDtypeStruct)
 
 
-def _form_of(job: Job, lanes: int) -> tuple[Form, list[Any]]:
+def _form_of(job: Job, lanes: int) -> tuple[Form, list[Array]]:
     """Returns the form of the program for so many lanes, and the common arrays."""
 
-    def kind(array: Any, shape: tuple[int, ...]) -> jax.ShapeDtypeStruct:
+    def kind(array: Array, shape: tuple[int, ...]) -> jax.ShapeDtypeStruct:
         dtype = jax.dtypes.canonicalize_dtype(array.dtype, allow_extended_dtype=True)
         weak = getattr(array, "weak_type", False)
         return jax.ShapeDtypeStruct(shape, dtype, weak_type=weak)
@@ -153,7 +154,7 @@ def _form_of(job: Job, lanes: int) -> tuple[Form, list[Any]]:
 
 
 @functools.lru_cache(maxsize=64)
-def _jitted(form: Form) -> Any:
+def _jitted(form: Form) -> jax.stages.Wrapped:
     return jax.jit(form.outcomes)  # traced once for all devices
 
 
@@ -172,7 +173,7 @@ def _compiled(program: jax.stages.Lowered) -> jax.stages.Compiled:
     return program.compile(wide_vectors())
 
 
-def _solve(program: Any, *arguments: Any) -> Any:
+def _solve(program: jax.stages.Compiled, *arguments: list) -> Outcome:
     return jax.block_until_ready(program(*arguments))
 
 
@@ -180,7 +181,7 @@ def _solve(program: Any, *arguments: Any) -> Any:
 
 
 @eqx.filter_jit
-def expected_work(ts: Array, moving: Any, shared: Any) -> Array:
+def expected_work(ts: Array, moving: PyTree, shared: PyTree) -> Array:
     """Computes for each member a number that grows with its steps.
 
     It combines the joints' rates and accelerations, in the mean over the beginning of

@@ -8,8 +8,9 @@ import hashlib
 import json
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from types import ModuleType
 from typing import Any, NamedTuple
 
 import diffrax
@@ -19,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.extend.core import ClosedJaxpr, Jaxpr
+from jaxtyping import PyTree
 
 from .. import __version__
 from ..base.checks import optional_package, refusal
@@ -49,14 +51,14 @@ class Variable(NamedTuple):
     dtype: np.dtype
     shape: tuple[int, ...]
     dimensions: list[str]
-    attributes: dict[str, Any]
+    attributes: Mapping[str, object]
 
 
-def _is_result(leaf: Any) -> bool:
+def _is_result(leaf: object) -> bool:
     return isinstance(leaf, diffrax.RESULTS)
 
 
-def _named(value: Any) -> dict[str, Any]:
+def _named(value: PyTree) -> dict[str, PyTree]:
     """Returns the arrays of a member's value by names made of their places."""
     leaves, _ = jax.tree_util.tree_flatten_with_path(value, is_leaf=_is_result)
     named, taken = {}, {"failed"}
@@ -73,7 +75,7 @@ def _named(value: Any) -> dict[str, Any]:
     return named
 
 
-def _variables(like: Any, linkage: Linkage) -> list[Variable]:
+def _variables(like: PyTree, linkage: Linkage) -> list[Variable]:
     """Returns the variables of a store from the shapes of a member's value."""
     of_motion = isinstance(like, Solution)
     unit = common_unit(names_and_units(linkage.ef)[1])
@@ -111,8 +113,9 @@ class Store:
     """
 
     def __init__(
-        self, folder: Path, batch: Batch, ts: Array, like: Any, sweep: str, chunk: int
-    ):
+        self, folder: Path, batch: Batch, ts: Array, like: PyTree, sweep: str,
+        chunk: int,
+    ):  # fmt: skip
         """Writes the metadata of the group, or checks what is there.
 
         Raises ValueError if the folder holds anything but this sweep.
@@ -145,13 +148,14 @@ class Store:
         self.arrays = [group[v.name].with_config(everything) for v in self.variables]
 
     def _empty(
-        self, zarr: Any, attributes: dict, linkage: Linkage, ts: Array, like: Any
-    ) -> dict[str, bytes]:
+        self, zarr: ModuleType, attributes: dict, linkage: Linkage, ts: Array,
+        like: PyTree,
+    ) -> dict[str, bytes]:  # fmt: skip
         """Returns the files of the group without any member, the group's own first."""
         memory = {}
         group = zarr.create_group(zarr.storage.MemoryStore(memory))
 
-        def create(name: str, axes: list[str], labels: dict, **given: Any) -> None:
+        def create(name: str, axes: list[str], labels: Mapping, **given: Any) -> None:
             group.create_array(
                 name,
                 compressors=[zarr.codecs.Crc32cCodec()],
@@ -189,7 +193,7 @@ class Store:
         own = json.loads(files["zarr.json"]) | own
         return files | {"zarr.json": json.dumps(own, indent=1).encode()}
 
-    def _refuse_another(self, attributes: dict[str, Any]) -> None:
+    def _refuse_another(self, attributes: Mapping[str, object]) -> None:
         # In this order, as another worker may be about to write `zarr.json` first.
         endings = ".part", ".partial"  # of files that a killed process leaves
         names = {p.name for p in self.folder.iterdir() if p.suffix not in endings}
@@ -273,7 +277,7 @@ def in_store(
     return failures
 
 
-def _constants(program: ClosedJaxpr | Jaxpr) -> Iterator[Any]:
+def _constants(program: ClosedJaxpr | Jaxpr) -> Iterator[Array]:
     """Yields the arrays that a program holds, and the programs within it.
 
     Raises ValueError if it calls a Python function, which no digest can name.
@@ -295,7 +299,7 @@ def _constants(program: ClosedJaxpr | Jaxpr) -> Iterator[Any]:
                 yield from _constants(leaf)
 
 
-def outline(moving: Any, common: Common) -> tuple[Any, str]:
+def outline(moving: PyTree, common: Common) -> tuple[PyTree, str]:
     """Returns shapes and types of a member's value, and the digest of the sweep.
 
     The digest is of the program and of all arrays, and the same in every process. The

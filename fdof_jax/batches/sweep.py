@@ -10,8 +10,8 @@ import contextlib
 import dataclasses
 import inspect
 import os
-from collections.abc import Callable, Iterator
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, TypeVar
 
 import diffrax
 import equinox as eqx
@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jaxtyping import PyTree
 from numpy.typing import ArrayLike
 
 from ..base.checks import (
@@ -44,7 +45,7 @@ from ..simulation.scene import Scene, accepts_scene
 from ..simulation.simulate import solve_options
 from ..simulation.solution import Solution
 from ..steps.dopri8 import constant
-from .batch_axes import Batch, batch_of
+from .batch_axes import Batch, ForcesAxes, batch_of
 from .chunks import (
     Common,
     Job,
@@ -55,6 +56,7 @@ from .chunks import (
 )
 from .store import Store, in_store, outline
 
+_T = TypeVar("_T")
 _CHUNK = 256  # twice as many take up to a third longer, as vectors leave the caches
 # Steps with joints that are held need more memory, and members more unlike numbers of
 # them.
@@ -66,7 +68,7 @@ def _without_times(_: Scene, solution: Solution) -> Solution:
     return eqx.tree_at(lambda s: s.ts, solution, None)
 
 
-def _of_member(reduce: Any) -> Any:
+def _of_member(reduce: Callable) -> Callable:
     """Returns `reduce` if it is a function of two arguments, or raises ValueError."""
     expected = "a function (scene, motion)"
     function("reduce", reduce, expected)
@@ -80,7 +82,7 @@ def _of_member(reduce: Any) -> Any:
 
 
 @eqx.filter_jit  # under `jax.grad` alone, each call would compile its operations again
-def _traced(moving: Any, common: Common, size: int, chunk: int) -> Any:
+def _traced(moving: PyTree, common: Common, size: int, chunk: int) -> PyTree:
     """Solves a batch under transformations; failed members enter no derivative."""
     order = jnp.argsort(expected_work(*constant((common.ts, moving, common.shared))))
 
@@ -125,7 +127,7 @@ def _check_elements(batch: Batch) -> None:
 
 
 @contextlib.contextmanager
-def _naming_axes(batch: Batch, ts: Array, forces_axes: Any) -> Iterator[None]:
+def _naming_axes(batch: Batch, ts: Array, forces_axes: ForcesAxes) -> Iterator[None]:
     """Names `forces_axes` in errors of elements that do not work for one member."""
     try:
         yield
@@ -148,8 +150,8 @@ def sweep(
     ts: ArrayLike,
     forces: Forces = (),
     *,
-    forces_axes: Any = None,
-    reduce: Callable[[Scene, Solution], Any] | None = None,
+    forces_axes: ForcesAxes = None,
+    reduce: Callable[[Scene, Solution], PyTree] | None = None,
     chunk: int | None = None,
     throw: bool = False,
     store: str | os.PathLike | None = None,
@@ -258,7 +260,7 @@ def sweep(
         group = Store(folder, batch, ts, *outline(moving, common), chunk)
         return in_store(group, range(shard, group.count, of), job, progress_meter)
 
-    def solved(solve: Callable[[Job], Any]) -> Any:
+    def solved(solve: Callable[[Job], _T]) -> _T:
         def run(forces, reduce):
             own = Common((*shared[:2], forces), ts, settings, reduce)
             return solve(Job(moving, own, size, chunk, devices))
@@ -266,8 +268,8 @@ def sweep(
         with devices_outside_mesh() as devices:
             return sharing_functions(run, forces=shared[2], reduce=keep)
 
-    value: Any = None
-    failures: Any = []
+    value: PyTree = None
+    failures: Sequence[int] | np.ndarray = []
     with _naming_axes(batch, ts, forces_axes):
         if traced:
             value = _traced(moving, common, size, chunk)

@@ -5,6 +5,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from ..base.checks import JOINT
 from ..forces.element import StatefulElement
@@ -12,7 +13,7 @@ from ..forces.switches import clip, switch
 from ..linkage.fields import Condition, Part, Values, field, value_of
 
 
-def _apart(name: str, lower: Any, upper: Any) -> Iterator[Condition]:
+def _apart(name: str, lower: Array | None, upper: Array | None) -> Iterator[Condition]:
     if lower is not None and upper is not None:
         yield Condition((lower < upper).all(), name, "less than upper", (lower, upper))
 
@@ -139,7 +140,7 @@ class Actuators(StatefulElement):
         return _within(efforts, self.effort_lower, self.effort_upper), rate
 
 
-def _within(values: Any, lower: Any, upper: Any) -> Any:
+def _within(values: Array, lower: Array | None, upper: Array | None) -> Array:
     """Clips to the limits that there are."""
     if lower is None and upper is None:
         return values

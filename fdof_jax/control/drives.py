@@ -5,11 +5,13 @@ efforts, or voltages for a motor.
 """
 
 from abc import abstractmethod
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jaxtyping import PyTree
 from numpy.typing import ArrayLike
 
 from ..base.checks import is_traced, real_array
@@ -53,7 +55,7 @@ class PIDController(StatefulElement):
         ki: ArrayLike,
         kd: ArrayLike,
         limit: ArrayLike,
-        reference: Any,
+        reference: Callable,
     ):
         self.pd = PDController(kp, kd, limit, reference)
         self.ki = ki
@@ -81,21 +83,21 @@ class PIDController(StatefulElement):
 class DriveState(NamedTuple):
     """State of a drive: its `own` and its `command`'s state, () where there is none."""
 
-    own: Any
-    command: Any
+    own: PyTree
+    command: PyTree
 
 
 class Drive(StatefulElement):
     """A drive: a subclass implements `respond`, and `initial` if it has a state."""
 
-    command: Any = called("a force element, a PDController for instance")
+    command: Callable = called("a force element, a PDController for instance")
 
-    def initial(self, linkage: Linkage) -> Any:
+    def initial(self, linkage: Linkage) -> PyTree:
         """The drive's own state at the start."""
         return ()
 
     @abstractmethod
-    def respond(self, command: Array, qd: Array, own: Any) -> tuple[Array, Any]:
+    def respond(self, command: Array, qd: Array, own: PyTree) -> tuple[Array, PyTree]:
         """The efforts (n,) and the rate of the drive's own state."""
 
     def initial_state(self, linkage):
@@ -114,7 +116,7 @@ class Drive(StatefulElement):
         return effort, DriveState(rate, inner_rate)
 
 
-def controller_in(element: Any) -> PDController | None:
+def controller_in(element: object) -> PDController | None:
     """Returns the controller that an element is, or holds as its command, if any.
 
     Of a `PIDController` that is its PD part, which has the reference and the limits.

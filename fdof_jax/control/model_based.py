@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ..base.checks import real_array
-from ..linkage.fields import Condition
+from ..linkage.fields import Condition, Truth
 from ..linkage.frames import scalar_frames
 from ..linkage.linkage import Linkage, check_linkage, possible
 from ..mechanics.equations import Scalars, link_constants
@@ -42,7 +42,7 @@ class ModelBased(PDController):
         super().check(linkage, ts)
         ModelBased.__check_init__(self)
 
-    def possible(self) -> Array:
+    def possible(self) -> Truth:
         own = super().possible()
         return own if self.model is None else own & possible(self.model)
 
@@ -79,7 +79,7 @@ class GravityFeedforward(ModelBased):
         return tuple(a + b for a, b in zip(errors, held))
 
 
-def _held(linkage: Linkage, q: Scalars) -> tuple[Array, ...]:
+def _held(linkage: Linkage, q: Scalars | Array) -> Scalars:
     """The efforts that hold the arm at rest against gravity, in joint order."""
     start, direction, *_, revolute = scalar_frames(linkage, q)
     # The mass beyond a joint, and its first moment in x about the ground pivot.

@@ -1,5 +1,6 @@
 """PD control of the joints with limited efforts, as in Fig 7, and gains for it."""
 
+from collections.abc import Sequence
 from functools import partial
 from typing import Any, ClassVar
 
@@ -14,6 +15,7 @@ from ..forces.element import Forces, ScalarElement
 from ..forces.switches import clip
 from ..linkage.fields import Values, called, each, field
 from ..linkage.linkage import Linkage, joints_of, without_fixed
+from ..mechanics.equations import Scalars
 from ..references.reference import EXPECTED, reference_motion
 
 
@@ -51,7 +53,7 @@ class PDController(ScalarElement):
     # Units of (kp, kd) by the kind of joint.
     gain_units: ClassVar = {"R": ("N m/rad", "N m s/rad"), "P": ("N/m", "N s/m")}
 
-    def schedule(self, t: Array, linkage: Linkage) -> tuple[Any, ...]:
+    def schedule(self, t: Array, linkage: Linkage) -> Scalars:
         """The reference motion (q_ref, qd_ref), independent of the state."""
         return reference_motion(self.reference, t, linkage)
 
@@ -64,8 +66,12 @@ class PDController(ScalarElement):
         )
 
     def unlimited(
-        self, scheduled: Any, q: Any, qd: Any, linkage: Linkage
-    ) -> tuple[Array, ...]:
+        self,
+        scheduled: Sequence[Array],
+        q: Scalars | Array,
+        qd: Scalars | Array,
+        linkage: Linkage,
+    ) -> Scalars:
         """The efforts before clipping; a subclass adds to them."""
         return tuple(
             kp * (position - q) + kd * (velocity - qd)

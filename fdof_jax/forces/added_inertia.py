@@ -2,7 +2,6 @@
 
 from functools import reduce
 from operator import add
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -23,12 +22,12 @@ def present(forces: Forces, t: Array) -> Forces:
     return tuple(e.at(t) if isinstance(e, InertialElement) else e for e in forces)
 
 
-def inertial_on(linkage: Linkage, forces: Any) -> tuple[InertialElement, ...]:
+def inertial_on(linkage: Linkage, forces: Forces) -> tuple[InertialElement, ...]:
     """Checks the tuple of elements and returns those that move masses."""
     return inertial(elements_on(linkage, forces))
 
 
-def energetic_on(linkage: Linkage, forces: Any) -> tuple[Element, ...]:
+def energetic_on(linkage: Linkage, forces: Forces) -> tuple[Element, ...]:
     """Checks the tuple of elements and returns those with energy, springs included."""
     parts = elements_on(linkage, forces)
     return tuple(e for e in parts if e.potential_energy is not None)
@@ -62,7 +61,7 @@ def _weights(element: InertialElement, linkage: Linkage, coordinates: Array) -> 
 
 def added_inertia(
     linkage: Linkage, forces: Forces, q: Array, qd: Array
-) -> tuple[Upper | None, Any]:
+) -> tuple[Upper | None, Array | int]:
     """Computes what elements add to the mass matrix and the bias (n,), or (None, 0).
 
     M = J^T W J and bias = J^T W (dJ/dt) qd + dV/dq, where J is the derivative of the

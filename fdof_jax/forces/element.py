@@ -6,21 +6,26 @@ library, `elements` adapts other callables, such as plain functions.
 
 import inspect
 from abc import abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import Array
+from jaxtyping import PyTree
 
 from ..base.checks import shown
 from ..linkage.fields import Foreign, Part, check_joints, default, optional, sized
 from ..linkage.linkage import Linkage, joints_of
 from ..mechanics.equations import Scalars
 
+if TYPE_CHECKING:
+    from .points import Load
+
 Forces = tuple[Any, ...]  # elements, or callables (t, q, qd, linkage) -> tau
+OwnStates = tuple[PyTree, ...]  # of `StatefulElement`s, in the order of the forces
 
 
 class Element(Part):
@@ -56,28 +61,28 @@ class Element(Part):
     """
 
     @abstractmethod
-    def __call__(self, t: Array, q: Array, qd: Array, linkage: Linkage) -> Any:
+    def __call__(self, t: Array, q: Array, qd: Array, linkage: Linkage) -> Array:
         """Computes the efforts, (n,) [N or N m]."""
 
     potential_energy = default(lambda self: None)
 
-    def schedule(self, t: Array, linkage: Linkage) -> Any:
+    def schedule(self, t: Array, linkage: Linkage) -> PyTree:
         """Computes what depends on time alone, for all stages of a step at once."""
         return ()
 
-    def initial_state(self, linkage: Linkage) -> Any:
+    def initial_state(self, linkage: Linkage) -> PyTree:
         """Returns the state at the start: an array or a pytree of arrays."""
         return ()
 
     def act(
-        self, t: Array, q: Array, qd: Array, linkage: Linkage, state: Any
-    ) -> tuple[Any, Any]:
+        self, t: Array, q: Array, qd: Array, linkage: Linkage, state: PyTree
+    ) -> tuple[Array, PyTree]:
         """Returns the efforts (n,) [N or N m] and the rate of the state."""
         return self(t, q, qd, linkage), ()
 
     def loads_on_points(
         self, t: Array, q: Array, qd: Array, qdd: Array, linkage: Linkage
-    ) -> tuple[Any, ...] | None:
+    ) -> tuple["Load", ...] | None:
         """Returns the `Load`s that bearings carry; None: `joint_reactions` raises."""
         return ()
 
@@ -87,7 +92,7 @@ class ForeignElement(Foreign, Element):
 
     potential_energy = optional("potential_energy")
 
-    def opened(self, *arguments: Any) -> Element:
+    def opened(self, *arguments: PyTree) -> Element:
         """Returns it with the closure of a plain function as leaves, at arguments."""
         if not inspect.isfunction(self.called):
             return self
@@ -96,18 +101,18 @@ class ForeignElement(Foreign, Element):
 
 
 class _Opened(ForeignElement):
-    closed: Any
+    closed: Callable
 
     def __call__(self, *arguments: Any) -> Any:
         return self.closed(*arguments)
 
 
-def element_of(value: Any) -> Element:
+def element_of(value: Callable) -> Element:
     """Returns a callable as an element."""
     return value if isinstance(value, Element) else ForeignElement(value)
 
 
-def elements(name: str, forces: Any) -> tuple[Element, ...]:
+def elements(name: str, forces: Forces) -> tuple[Element, ...]:
     """Returns a tuple of callables as elements, or raises ValueError."""
     if isinstance(forces, tuple) and all(
         callable(item) and not isinstance(item, type) for item in forces
@@ -119,7 +124,7 @@ def elements(name: str, forces: Any) -> tuple[Element, ...]:
     )
 
 
-def elements_on(linkage: Linkage, forces: Any) -> tuple[Element, ...]:
+def elements_on(linkage: Linkage, forces: Forces) -> tuple[Element, ...]:
     """Returns forces as elements, or raises ValueError for values of other chains."""
     found = elements("forces", forces)
     for index, element in enumerate(found):
@@ -173,7 +178,7 @@ class ScalarElement(Element):
 
     @abstractmethod
     def respond(
-        self, scheduled: Any, q: Scalars, qd: Scalars, linkage: Linkage
+        self, scheduled: PyTree, q: Scalars, qd: Scalars, linkage: Linkage
     ) -> tuple[Array, ...]:
         """Computes the efforts [N or N m] from the result of `schedule`."""
 
@@ -190,13 +195,13 @@ class StatefulElement(Element):
     """
 
     @abstractmethod
-    def initial_state(self, linkage: Linkage) -> Any:
+    def initial_state(self, linkage: Linkage) -> PyTree:
         """Returns the state at the start: an array or a pytree of arrays."""
 
     @abstractmethod
     def __call__(  # pyright: ignore[reportIncompatibleMethodOverride]
-        self, t: Array, q: Array, qd: Array, linkage: Linkage, state: Any
-    ) -> tuple[Array, Any]:
+        self, t: Array, q: Array, qd: Array, linkage: Linkage, state: PyTree
+    ) -> tuple[Array, PyTree]:
         """Returns the efforts (n,) [N or N m] and the rate of the state."""
 
     def act(self, t, q, qd, linkage, state):
@@ -233,7 +238,7 @@ class InertialElement(Element):
 
     def loads(
         self, t: Array, q: Array, qd: Array, qdd: Array, linkage: Linkage
-    ) -> tuple[Any, ...] | None:
+    ) -> tuple["Load", ...] | None:
         """Returns the `Load`s of the masses on points, for `joint_reactions` alone."""
         return None
 

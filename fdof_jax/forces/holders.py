@@ -225,7 +225,7 @@ def numbered(joints: Any) -> Array:
     return jax.device_put(np.isin(_NUMBERS, numbers))
 
 
-def numbers_in(joints: Any) -> np.ndarray:
+def numbers_in(joints: Array) -> np.ndarray:
     """Returns the numbers of the joints that are marked, as `numbered` marks them."""
     return np.array([number for number, marked in zip(_NUMBERS, joints) if marked])
 

@@ -1,14 +1,12 @@
 """Masses that an arm takes and lets go."""
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ..linkage.fields import Condition, Values, field, has_come, of_kind
+from ..linkage.fields import Condition, Truth, Values, field, has_come, of_kind
 from ..linkage.frames import scalar_frames
 from .element import InertialElement
 from .points import Load, Point
@@ -71,7 +69,7 @@ class Payload(InertialElement):
         times = [t for t in (self.begin, self.end) if t is not None]
         return jnp.stack(times) if times else None
 
-    def there(self, t: Array | np.ndarray) -> Any:
+    def there(self, t: Array | np.ndarray) -> Truth:
         """Returns whether it is taken at a time."""
         taken = True if self.begin is None else has_come(self.begin, t)
         return taken & (True if self.end is None else ~has_come(self.end, t))

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jaxtyping import Complex, Float, Int
+from jaxtyping import Complex, Float, Int, PyTree
 from numpy.typing import ArrayLike
 
 from ..base.checks import instance, is_traced, refusal, shown, whole_number
@@ -43,7 +43,7 @@ def pick(link: Array, choices: list[Array]) -> Array:
     return chosen
 
 
-def _link(link: Any) -> Array:
+def _link(link: int | Array) -> Array:
     if isinstance(link, Array) and not is_traced(link) and link.shape == ():
         link = link.item()  # of another point, by `replace`
     if whole_number("link", link, 0) > MOST_PAIRS:
@@ -73,7 +73,7 @@ class Point(Part):
     [1.0, 0.5]
     """
 
-    link: Any = eqx.field(converter=_link)
+    link: Array = eqx.field(converter=_link)
     along: Values = field((), unit="m", default=0.0)
     across: Values = field((), unit="m", default=0.0)
 
@@ -104,7 +104,7 @@ class Load(NamedTuple):
 
     point: Point
     force: Any
-    moment: Any = 0.0
+    moment: Array | float = 0.0
 
     def vector(self) -> Array:
         """Returns the force x + iy [N]."""
@@ -125,7 +125,7 @@ class Load(NamedTuple):
 
 
 def work(
-    frames: Frames, place: Array, force: Array, moment: Any = 0.0
+    frames: Frames, place: Array, force: Array, moment: Array | float = 0.0
 ) -> tuple[Array, ...]:
     """Power of a load beyond all joints, per unit of each joint's rate."""
     rows = zip(frames.revolute, frames.start[1:], frames.direction)
@@ -152,7 +152,7 @@ class PointElement(ScalarElement):
     """
 
     @abstractmethod
-    def loads(self, scheduled: Any, frames: Frames, qd: Scalars) -> tuple[Load, ...]:
+    def loads(self, scheduled: PyTree, frames: Frames, qd: Scalars) -> tuple[Load, ...]:
         """Returns the loads on points [N and N m], given the result of `schedule`."""
 
     def respond(self, scheduled, q, qd, linkage):
@@ -198,7 +198,7 @@ class LineElement(Between, PointElement):
     """A force element that pulls two points together along the line that joins them."""
 
     @abstractmethod
-    def pull(self, scheduled: Any, length: Array, rate: Array) -> Array:
+    def pull(self, scheduled: PyTree, length: Array, rate: Array) -> Array:
         """Returns tension / length [N/m], given the length [m] and its rate [m/s]."""
 
     def _pull(self, scheduled, frames, qd) -> tuple[Array, tuple[Array, ...], Array]:
@@ -319,7 +319,7 @@ class Tension(LineElement):
         return self.tension * self.length(linkage, q)
 
 
-def _flag(follows: Any) -> Array:
+def _flag(follows: bool | Array) -> Array:
     if isinstance(follows, Array) and follows.dtype == bool:
         return follows  # of another wrench, by `replace`
     instance("follows", follows, bool)

@@ -8,11 +8,10 @@ where a switching function changes its sign.
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from typing import Any
 
 import jax.numpy as jnp
 from jax import Array
-from jax.typing import ArrayLike
+from jax.typing import ArrayLike, DTypeLike
 
 from ..base.checks import transformation
 
@@ -58,10 +57,10 @@ class Switches:
         self.jumping += jumping
         self._next(sum(g.size for g in values))
 
-    def rest(self) -> Any:
+    def rest(self) -> Array | None:
         return None if self.sides is None else self.sides[self._count :]
 
-    def all_values(self, dtype: Any) -> Array:
+    def all_values(self, dtype: DTypeLike) -> Array:
         """Returns all switching functions met, (n,)."""
         found = [jnp.ravel(g).astype(dtype) for g in self.values]
         return jnp.concatenate(found) if found else jnp.zeros(0, dtype)

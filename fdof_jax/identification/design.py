@@ -1,7 +1,7 @@
 """Design of experiments: the motion to record next."""
 
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +18,8 @@ from ..simulation.sensitivities import sensitivities
 from ..simulation.simulate import simulate
 from ..simulation.solution import Solution
 from .problems import (
+    Bounds,
+    Named,
     Observe,
     SceneAt,
     Unknowns,
@@ -48,8 +50,8 @@ class NextMotion(Report):
     - `message`: why the search stopped.
     """
 
-    motion: dict[str, Any]
-    standard_errors: dict[str, Any]
+    motion: Named
+    standard_errors: Named
     improvement: float
     message: str
 
@@ -80,9 +82,9 @@ class _Design(NamedTuple):
     within: Callable[[Scene, Solution], Array] | None
     motion: Unknowns
     parameters: Unknowns
-    information: Any
-    ts: Any
-    noise: Any
+    information: Array | np.ndarray
+    ts: Array
+    noise: Array | np.ndarray
 
 
 def _lane(z: Array, design: _Design) -> Evaluation:
@@ -122,12 +124,12 @@ def next_motion(
     ts: ArrayLike,
     *,
     noise: ArrayLike,
-    bounds: Mapping[str, Any],
+    bounds: Bounds,
     within: Callable[[Scene, Solution], Array] | None = None,
     observe: Observe = link_ends,
     scale: Mapping[str, ArrayLike] | None = None,
     max_steps: int = 1000,
-    report: Callable[[str], Any] | None = None,
+    report: Callable[[str], object] | None = None,
 ) -> NextMotion:
     """Computes the motion that cuts the largest standard error of a fit most.
 
@@ -204,7 +206,7 @@ def next_motion(
     )
 
 
-def _refused(scene: Scene, ts: Array, within: Any) -> str:
+def _refused(scene: Scene, ts: Array, within: Callable | None) -> str:
     """Says why a search cannot begin with a motion."""
     check_motion("experiment(...)(...)", scene, ts)
     solution = simulate(scene.linkage, scene.state0, ts, scene.forces)

@@ -10,6 +10,7 @@ from ..base.checks import keywords_as, refusal
 from ..search.bounded import Evaluation, Run, minimise
 from ..search.lanes import Lanes, check_motion
 from .problems import (
+    Bounds,
     Observe,
     Problem,
     SceneAt,
@@ -21,6 +22,8 @@ from .problems import (
     unknowns_of,
 )
 from .result import FitResult, fit_result
+
+Recordings = tuple[SceneAt | Sequence[SceneAt], ArrayLike]  # of scenes
 
 # A search stops when the loss falls by less than this part. One standard error of a
 # parameter changes the loss by about one part in the number of readings, far more.
@@ -71,7 +74,9 @@ def _longer_and_longer(
     return minimise(until(1), z, low, high, enough=_ENOUGH, **keywords)
 
 
-def _unseen(validate: Any, shape: tuple[int, ...], *settings: Any) -> list[Problem]:
+def _unseen(
+    validate: Recordings | None, shape: tuple[int, ...], *settings: Any
+) -> list[Problem]:
     """Checks the argument `validate` of `fit`: recordings of the given shape."""
     if validate is None:
         return []
@@ -88,17 +93,17 @@ def _unseen(validate: Any, shape: tuple[int, ...], *settings: Any) -> list[Probl
 
 
 def _search(
-    scene_at: Any,
-    observed: Any,
-    start: Any,
-    ts: Any,
+    scene_at: SceneAt | Sequence[SceneAt],
+    observed: ArrayLike,
+    start: Mapping[str, ArrayLike],
+    ts: ArrayLike,
     together: bool,
     *,
-    observe: Any,
-    noise: Any,
-    validate: Any,
-    bounds: Any,
-    scale: Any,
+    observe: Observe,
+    noise: ArrayLike | None,
+    validate: Recordings | None,
+    bounds: Bounds | None,
+    scale: Mapping[str, ArrayLike] | None,
     **search: Any,
 ) -> list[FitResult]:
     """Fits all recordings `together` in one result, or returns one result for each.
@@ -143,11 +148,11 @@ def fit(
     *,
     observe: Observe = link_ends,
     noise: ArrayLike | None = None,
-    validate: tuple[SceneAt | Sequence[SceneAt], ArrayLike] | None = None,
-    bounds: Mapping[str, Any] | None = None,
-    scale: Mapping[str, Any] | None = None,
+    validate: Recordings | None = None,
+    bounds: Bounds | None = None,
+    scale: Mapping[str, ArrayLike] | None = None,
     max_steps: int = 50,
-    report: Callable[[str], Any] | None = None,
+    report: Callable[[str], object] | None = None,
 ) -> FitResult:
     """Fits parameters of a scene to recordings of its motion, by least squares.
 

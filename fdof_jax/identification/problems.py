@@ -1,7 +1,7 @@
 """Problems of fitting: named unknowns, recordings of motions, and their misfit."""
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jaxtyping import Float
+from numpy.typing import ArrayLike
 
 from ..base.checks import function, instance, real_array, refusal, shown
 from ..mechanics.kinematics import joint_positions, tip_position
@@ -19,6 +20,8 @@ from ..simulation.scene import Scene, stacked
 from ..simulation.sensitivities import sensitivities
 from ..simulation.solution import Solution
 
+Named = dict[str, Any]  # parameters by name, as numbers or arrays
+Bounds = Mapping[str, Sequence[ArrayLike]]  # (least, greatest) by name
 SceneAt = Callable[[dict[str, Array]], Scene]
 Observe = Callable[[Scene, Solution], Array]
 # Names and shapes of parameters, in pairs: JAX would sort a dict.
@@ -49,7 +52,7 @@ class Unknowns(NamedTuple):
             for index in np.ndindex(shape)
         )
 
-    def at(self, z: Any) -> dict[str, Any]:
+    def at(self, z: Array | np.ndarray) -> Named:
         """Returns the parameters by name."""
         return named(self.shapes, self.scale * z)
 
@@ -63,7 +66,7 @@ class Unknowns(NamedTuple):
             yield np.tile(numbers / self.scale, (runs, 1))
 
 
-def named(shapes: Shapes, numbers: Any) -> dict[str, Any]:
+def named(shapes: Shapes, numbers: Array | np.ndarray) -> Named:
     """Splits all numbers (n,) into arrays by name."""
     arrays, place = {}, 0
     for name, shape in shapes:
@@ -73,12 +76,17 @@ def named(shapes: Shapes, numbers: Any) -> dict[str, Any]:
     return arrays
 
 
-def unknowns_of(start: Any, bounds: Any, scale: Any) -> Unknowns:
+def unknowns_of(
+    start: Mapping[str, ArrayLike],
+    bounds: Bounds | None,
+    scale: Mapping[str, ArrayLike] | None,
+) -> Unknowns:
     """Checks and completes the arguments `start`, `bounds` and `scale` of `fit`."""
     if not isinstance(start, Mapping) or not start:
         expected = "a dict of named parameters to find, for instance {'mass': 2.0}"
         raise refusal("start", expected, start)
-    bounds, scale = ({} if given is None else given for given in (bounds, scale))
+    bounds = {} if bounds is None else bounds
+    scale = {} if scale is None else scale
     for argument, given in (("bounds", bounds), ("scale", scale)):
         if not isinstance(given, Mapping) or not set(given) <= set(start):
             names = shown(list(start))
@@ -148,9 +156,9 @@ class Problem(NamedTuple):
     scene_at: SceneAt
     observe: Observe
     unknowns: Unknowns
-    ts: Any
-    observed: Any
-    weight: Any
+    ts: Array
+    observed: Array
+    weight: Array
 
 
 def lane(z: Array, problem: Problem) -> Evaluation:
@@ -184,7 +192,7 @@ def lane(z: Array, problem: Problem) -> Evaluation:
     )
 
 
-def _successive(weight: Any) -> Any:
+def _successive(weight: Array) -> Array:
     """Returns where a reading and the next one are both there."""
     return (weight[1:] > 0) & (weight[:-1] > 0)
 
@@ -200,7 +208,7 @@ def _check_scene_at(name: str, scene_at: SceneAt, parameters: dict[str, Array]) 
     check_scene(f"{name}(...)", scene)
 
 
-def check_times(ts: Any) -> Array:
+def check_times(ts: ArrayLike) -> Array:
     ts = real_array("ts", ts, (None,))
     if ts.size < 2 or not (np.diff(ts) > 0).all():
         raise refusal("ts", "increasing times, two at least", ts.tolist()[:20])
@@ -209,12 +217,12 @@ def check_times(ts: Any) -> Array:
 
 def problems_of(
     names: tuple[str, str],
-    scene_at: Any,
-    observed: Any,
+    scene_at: Any,  # SceneAt, or a sequence of these
+    observed: ArrayLike,
     unknowns: Unknowns,
     ts: Array,
     observe: Observe,
-    noise: Any,
+    noise: ArrayLike,
 ) -> list[Problem]:
     """Checks a scene and its recording, or lists of both, arguments of given names."""
     try:

@@ -1,7 +1,5 @@
 """Results of identification: parameters, their errors, and undetermined directions."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,7 +8,7 @@ from jaxtyping import Float
 
 from ..base.report import Report
 from ..search.bounded import Evaluation, Run, held_at_bounds
-from .problems import Problem, Unknowns, named
+from .problems import Named, Problem, Unknowns, named
 
 # A combination is weak if its standard error exceeds this part of its size.
 _WEAK = 1.0
@@ -63,8 +61,8 @@ class FitResult(Report):
       The noise is the same as for `held_out`.
     """
 
-    parameters: dict[str, Any]
-    standard_errors: dict[str, Any]
+    parameters: Named
+    standard_errors: Named
     names: tuple[str, ...]
     covariance: Float[np.ndarray, "n n"]
     weak: tuple[str, ...]

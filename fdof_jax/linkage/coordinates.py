@@ -1,6 +1,6 @@
 """States of an arm in joint coordinates."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from numpy.typing import ArrayLike
 
@@ -26,7 +26,7 @@ class State(NamedTuple):
     qd: ArrayLike
 
 
-def real_state(name: str, value: Any, linkage: Linkage) -> State:
+def real_state(name: str, value: State, linkage: Linkage) -> State:
     """Returns `value` as a state of the linkage's joints, or raises ValueError."""
     try:
         q, qd = value

@@ -6,10 +6,10 @@ constructors. Where values are traced, `possible` reports them to the program.
 """
 
 import dataclasses
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sized
 from functools import reduce
 from operator import and_
-from typing import Any, NamedTuple, dataclass_transform
+from typing import Any, NamedTuple, TypeVar, dataclass_transform
 
 import equinox as eqx
 import jax
@@ -32,12 +32,16 @@ from ..base.known_values import in_numpy
 from .linkage import Linkage, joints_of, short
 from .topology import check_angles
 
+Rules = dict[str, Any]  # of a declared array: keywords of `real_array`
+Truth = Array | np.ndarray | np.bool_ | bool  # also of traced values
+_Part = TypeVar("_Part", bound="Part")
+
 
 class Values:
     """The type of a declared array, which is given as any numbers."""
 
-    def __get__(self, part: Any, owner: Any = None) -> Array: ...
-    def __set__(self, part: Any, value: ArrayLike) -> None: ...
+    def __get__(self, part: object, owner: type | None = None) -> Array: ...
+    def __set__(self, part: object, value: ArrayLike) -> None: ...
 
 
 def field(
@@ -93,7 +97,7 @@ class default:
     def __init__(self, compute: Callable[[Any], Any]):
         self.compute = compute
 
-    def __get__(self, part: Any, owner: Any = None) -> Any:
+    def __get__(self, part: object, owner: type | None = None) -> Any:
         if part is None:
             raise AttributeError("found in instances only: it is no default of a field")
         return self.compute(part)
@@ -107,10 +111,10 @@ class Condition(NamedTuple):
       shows, or a tuple of several.
     """
 
-    holds: Any
+    holds: Truth
     name: str
     expected: str
-    got: Any
+    got: object
 
 
 @dataclass_transform(field_specifiers=(eqx.field, field, called, of_kind))
@@ -136,13 +140,13 @@ class Part(Frozen, metaclass=_Fields):
         for _, part in _within(self):
             part.check(linkage, ts)
 
-    def fits(self, linkage: Linkage, ts: Array) -> Any:
+    def fits(self, linkage: Linkage, ts: Array) -> Truth:
         """Returns whether an arm and times would be accepted; also if traced."""
         own = [_all(condition.holds) for condition in self.conditions_on(linkage)]
         parts = [part.fits(linkage, ts) for _, part in _within(self)]
         return reduce(and_, [*own, *parts], True)
 
-    def possible(self) -> Any:
+    def possible(self) -> Truth:
         """Returns whether the constructor would accept the values; also if traced."""
         own = [_all(condition.holds) for condition in self.conditions()]
         fields = [_bounded(value, rules) for _, value, rules in _declared(self)]
@@ -180,7 +184,7 @@ class Part(Frozen, metaclass=_Fields):
             ) from error
 
 
-def _shown(value: Any) -> str:
+def _shown(value: object) -> str:
     if not isinstance(value, jax.Array | np.ndarray):
         return repr(value)
     numbers = isinstance(value.dtype, np.dtype)  # not random keys
@@ -206,11 +210,11 @@ def _refuse(place: str, conditions: Iterable[Condition]) -> None:
             raise ValueError(f"{place}{name}: expected {expected}, got {text}.")
 
 
-def _all(holds: Any) -> Any:
+def _all(holds: Truth) -> Truth:
     return jnp.all(holds) if is_traced(holds) else np.all(holds)
 
 
-def _declared(part: Part) -> Iterator[tuple[str, Any, dict[str, Any]]]:
+def _declared(part: Part) -> Iterator[tuple[str, Any, Rules]]:
     """Yields names, values and rules of the declared arrays."""
     for declared in dataclasses.fields(part):
         value, about = vars(part)[declared.name], declared.metadata
@@ -220,7 +224,7 @@ def _declared(part: Part) -> Iterator[tuple[str, Any, dict[str, Any]]]:
             yield declared.name, value, about["rules"]
 
 
-def _bounded(value: Any, rules: dict[str, Any]) -> Any:
+def _bounded(value: Array, rules: Rules) -> Array:
     holds = abs(value) < np.inf if rules["finite"] else value == value
     if rules["minimum"] is not None:
         holds = holds & (value >= rules["minimum"])
@@ -229,14 +233,16 @@ def _bounded(value: Any, rules: dict[str, Any]) -> Any:
     return holds.all()
 
 
-def each(values: Array, joints: Any) -> tuple[Array, ...]:
+def each(values: Array, joints: Sized) -> tuple[Array, ...]:
     """Returns declared values of joints as scalars, one for each of `joints`."""
     return tuple(values) if jnp.ndim(values) else (values,) * len(joints)
 
 
-def sized(part: Any, joints: int) -> Any:
+def sized(part: _Part, joints: int) -> _Part:
     """Returns the part with an entry per joint where it has one number for all."""
-    changes = {name: sized(inner, joints) for name, inner in _within(part)}
+    changes: dict[str, Part | Array] = {
+        name: sized(inner, joints) for name, inner in _within(part)
+    }
     for name, value, rules in _declared(part):
         if rules["shape"] == (JOINT,) and jnp.ndim(value) == 0:
             changes[name] = (
@@ -276,7 +282,7 @@ def check_joints(place: str, part: Part, linkage: Linkage) -> None:
         check_joints(f"{place}{name}.", inner, linkage)
 
 
-def value_of(part: Part, name: str, *arguments: Any) -> Array:
+def value_of(part: Part, name: str, *arguments: Array) -> Array:
     """Returns a declared array, or what the function in its place returns."""
     value = vars(part)[name]
     if not callable(value):
@@ -303,7 +309,7 @@ def jumps_of(*parts: Part) -> Array | None:
     return jnp.concatenate([jnp.ravel(t) for t in times]) if times else None
 
 
-def has_come(time: Any, t: Any) -> Any:
+def has_come(time: Array, t: Array | np.ndarray) -> Array:
     """Returns whether a known time has come at `t`, or is later by rounding alone.
 
     A run that ends at `t` and one that begins there agree on it.
@@ -311,7 +317,7 @@ def has_come(time: Any, t: Any) -> Any:
     return time - 2 * jnp.finfo(time.dtype).eps * abs(time) <= t
 
 
-def optional(name: str, absent: Any = None) -> Any:
+def optional(name: str, absent: object = None) -> Any:
     """Returns an attribute of a `Foreign` that its callable may have."""
     return property(lambda self: getattr(self.called, name, absent))
 
@@ -319,7 +325,7 @@ def optional(name: str, absent: Any = None) -> Any:
 class Foreign(Part):
     """A callable that is no part; it may have some of a part's attributes."""
 
-    called: Any
+    called: Callable
 
     jump_ts = optional("jump_ts")
     check = optional("check", lambda linkage, ts: None)

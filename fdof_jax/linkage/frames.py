@@ -5,7 +5,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 from jax.lax import complex as plane_vector
+from numpy.typing import ArrayLike
 
 from ..base.known_values import in_numpy
 from ..base.trigonometry import sincos
@@ -18,28 +20,28 @@ if TYPE_CHECKING:
 # by th, a product with i by 90 degrees.
 
 
-def plane_vectors(points: Any) -> Any:
+def plane_vectors(points: Array) -> Array:
     """Returns x + iy of points (..., 2)."""
     return plane_vector(points[..., 0], points[..., 1])
 
 
-def unit_vector(angle: Any) -> Any:
+def unit_vector(angle: Array) -> Array:
     """Returns exp(i angle)."""
     sin, cos = sincos(angle)
     return plane_vector(cos, sin)
 
 
-def dot(a: Any, b: Any) -> Any:
+def dot(a: Array, b: Array) -> Array:
     """Computes the dot product of two vectors of the plane."""
     return a.real * b.real + a.imag * b.imag
 
 
-def cross(a: Any, b: Any) -> Any:
+def cross(a: Array, b: Array) -> Array:
     """Computes the cross product of two vectors of the plane."""
     return a.real * b.imag - a.imag * b.real
 
 
-def length_of(vector: Any) -> Any:
+def length_of(vector: Array) -> Array:
     """Length of a vector; 0 with derivative 0 for the zero vector, NaN for NaN."""
     square = dot(vector, vector)
     meet = square == 0
@@ -70,7 +72,7 @@ class Frames(NamedTuple):
         return self.start[..., 1:] + offset * self.direction[..., 1:]
 
 
-def frames(linkage: "Linkage", q: Any) -> Frames:
+def frames(linkage: "Linkage", q: Array) -> Frames:
     """Computes the frames at joint positions (n,), 0 at fixed pairs."""
     revolute = jnp.stack(real_joints(linkage.ef))
     slide = jnp.where(revolute, linkage.locked, q)
@@ -82,7 +84,7 @@ def frames(linkage: "Linkage", q: Any) -> Frames:
     return Frames(jnp.append(0, jnp.cumsum(steps)), direction, angle, slide, revolute)
 
 
-def known_frames(linkage: "Linkage", q: Any) -> Frames:
+def known_frames(linkage: "Linkage", q: ArrayLike) -> Frames:
     """Computes frames in NumPy at known positions (..., n), 0 at fixed pairs."""
     *shape, n = np.shape(q)
     count = int(np.prod(shape))
@@ -93,11 +95,11 @@ def known_frames(linkage: "Linkage", q: Any) -> Frames:
 
 
 @jax.jit
-def _frames_of_each(linkage: "Linkage", q: Any) -> Frames:
+def _frames_of_each(linkage: "Linkage", q: Array) -> Frames:
     return jax.vmap(frames, (None, 0))(linkage, q)
 
 
-def scalar_frames(linkage: "Linkage", q: tuple) -> Frames:
+def scalar_frames(linkage: "Linkage", q: tuple[Array, ...] | Array) -> Frames:
     """Computes the frames as lists of scalars, which fuse with the equations of motion.
 
     A sweep with a spring takes 1.3 times as long with the arrays of `frames`.

@@ -147,7 +147,7 @@ def joints_of(linkage: Linkage) -> int:
     return jnp.size(linkage.ef) // 2
 
 
-def per_joint(name: str, values: Any, linkage: Linkage) -> Array:
+def per_joint(name: str, values: ArrayLike, linkage: Linkage) -> Array:
     """Returns values as an array with one per joint (n,), or raises ValueError."""
     n = joints_of(linkage)
     if isinstance(values, jax.Array | np.ndarray) and values.ndim > 1:
@@ -161,7 +161,7 @@ def per_joint(name: str, values: Any, linkage: Linkage) -> Array:
     return array
 
 
-def without_fixed(linkage: Linkage, values: Any) -> Any:
+def without_fixed(linkage: Linkage, values: Array | np.ndarray) -> Array:
     """Returns values of the joints (..., joint), 0 at fixed pairs."""
     return jnp.where(jnp.stack(fixed_pairs(linkage.ef)), 0, values)
 
@@ -170,7 +170,7 @@ _T = TypeVar("_T")
 
 
 def compiled(
-    *joint_values: str, **doors: tuple[int, ...] | Callable[[Linkage, Any], Any]
+    *joint_values: str, **doors: tuple[int, ...] | Callable[[Linkage, Any], object]
 ) -> Callable[[Callable[..., _T]], Callable[..., _T]]:
     """Decorates a function of a linkage and arrays: checks arguments, then compiles.
 
@@ -214,7 +214,7 @@ def compiled(
     return decorate
 
 
-def check_linkage(linkage: Any) -> None:
+def check_linkage(linkage: object) -> None:
     """Raises ValueError unless the argument is one linkage, not a batch.
 
     Shapes and values are checked again: `equinox.tree_at` bypasses the constructor.

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jaxtyping import Float
+from numpy.typing import ArrayLike
 
 from ..base.checks import instance, is_traced, radians, shown
 
@@ -16,7 +17,7 @@ MOST_PAIRS = 8
 _FACTORS = {"P": (1, 0), "R": (0, 1), "F": (0, 0)}
 
 
-def real_joints(ef: Any) -> tuple[Any, ...]:
+def real_joints(ef: Array | np.ndarray) -> tuple[Array, ...]:
     """Returns whether the real joint of each pair is revolute.
 
     The first axis of `ef` holds the existence factors.
@@ -24,18 +25,18 @@ def real_joints(ef: Any) -> tuple[Any, ...]:
     return tuple(ef[k] > 0.5 for k in range(1, len(ef), 2))
 
 
-def check_angles(name: str, values: Any, ef: Any) -> None:
+def check_angles(name: str, values: ArrayLike, ef: ArrayLike) -> None:
     """Warns of known positions of revolute joints that look like degrees."""
     if not is_traced(ef, values):
         radians(name, np.where(real_joints(np.asarray(ef)), values, 0))
 
 
-def fixed_pairs(ef: Any) -> tuple[Any, ...]:
+def fixed_pairs(ef: Array | np.ndarray) -> tuple[Array, ...]:
     """Returns whether both joints of each pair are fictitious, so that it is fixed."""
     return tuple(ef[k - 1] + ef[k] < 0.5 for k in range(1, len(ef), 2))
 
 
-def letters(ef: Any) -> str:
+def letters(ef: ArrayLike) -> str:
     """Returns known existence factors as a name, such as RPR."""
     pairs = np.asarray(ef).reshape(-1, 2)
     return "".join("R" if turns else "P" if slides else "F" for slides, turns in pairs)
@@ -83,7 +84,7 @@ def pairs_of(topology: Any) -> np.ndarray | None:
 _SIZES = range(2, 2 * MOST_PAIRS + 1, 2)
 
 
-def can_move(pairs: Any) -> Any:
+def can_move(pairs: Array | np.ndarray) -> Array:
     """Returns whether the paper's rule on slides and ours on fixed pairs are met."""
     number = pairs.sum()
     return (number > 0) & ((number <= 2) | (pairs[:, 1].sum() > 0))
@@ -109,7 +110,7 @@ def existence_factors(topology: str) -> Float[Array, " factor"]:
     return jnp.asarray(pairs.ravel(), dtype=float)
 
 
-def names_and_units(ef: Any) -> tuple[list[str], list[str]]:
+def names_and_units(ef: Array | np.ndarray) -> tuple[list[str], list[str]]:
     """Returns names and units of joints; both are neutral if a batch mixes the kinds.
 
     `ef` holds known existence factors, of one arm or of a batch.

@@ -1,6 +1,6 @@
 """Inverse kinematics: joint positions for a commanded tip."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -13,6 +13,7 @@ from ..base.known_values import at_once
 from ..linkage.frames import cross, dot, frames, length_of, plane_vector, unit_vector
 from ..linkage.linkage import Linkage, check_linkage, joints_of
 from ..linkage.topology import fixed_pairs, real_joints
+from .equations import Scalars
 
 
 def plane_angle(y: Array, x: Array) -> Array:
@@ -49,25 +50,25 @@ class Arm(NamedTuple):
     - `valid`: zeros (n,), or NaN if another number of joints moves.
     """
 
-    revolute: tuple[Any, Any, Any]
-    locked: Any
-    links: Any
-    angle: Any
-    direction: Any
-    ends: Any
-    place: Any
-    offset: Any
-    valid: Any
+    revolute: Scalars
+    locked: Array
+    links: Array
+    angle: Array
+    direction: Array
+    ends: Array
+    place: Array | None
+    offset: Array | int
+    valid: Array
 
     @property
-    def base(self) -> Any:
+    def base(self) -> Array:
         """The part of the tip's position that is not the wrist's [m].
 
         The wrist vector goes from the first joint's start to the last link's.
         """
         return self.ends[0] * self.direction[0] + self.ends[1] * self.direction[3]
 
-    def placed(self, q: Any) -> Any:
+    def placed(self, q: Array) -> Array:
         """Returns positions in the linkage (n,), from those of the three joints."""
         if self.place is None:
             return q[: len(self.valid)] + self.valid

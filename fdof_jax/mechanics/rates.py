@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.custom_derivatives import SymbolicZero
+from jaxtyping import PyTree
 
 from .equations import (
     Constants,
@@ -250,8 +251,8 @@ def _change(primals, values, tangents) -> tuple[Scalars, Scalars]:
     return qd_dot, change
 
 
-def _dense(tangents: Any) -> Any:
-    def filled(step: Any) -> Any:
+def _dense(tangents: PyTree) -> PyTree:
+    def filled(step: object) -> object:
         if type(step) is not SymbolicZero:
             return step
         shape: Any = step.shape

@@ -1,6 +1,6 @@
 """References of controllers, and whether an arm can reach them."""
 
-from typing import Any
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -50,7 +50,7 @@ class Reference(Part):
                 "neither."
             )
 
-    def assembly(self, t: Any, linkage: Linkage) -> tuple[Any, Any]:
+    def assembly(self, t: Array, linkage: Linkage) -> tuple[Array, Array | float]:
         """Positions (n,) [m or rad], and a root that is 0 at the edge of the reach."""
         raise NotImplementedError  # found at construction
 
@@ -83,7 +83,7 @@ class ForeignReference(Foreign, Reference):
     period = optional("period")
 
 
-def reference_of(value: Any) -> Reference:
+def reference_of(value: Callable) -> Reference:
     """Returns a callable as a reference, or raises ValueError."""
     if isinstance(value, Reference):
         return value
@@ -92,7 +92,9 @@ def reference_of(value: Any) -> Reference:
     return ForeignReference(function("reference", value, EXPECTED))
 
 
-def reference_motion(reference: Any, t: Array, linkage: Linkage) -> tuple[Array, Array]:
+def reference_motion(
+    reference: Callable, t: Array, linkage: Linkage
+) -> tuple[Array, Array]:
     """Positions and velocities of a reference, checked to be two arrays (n,)."""
     motion = reference(t, linkage)
     if not isinstance(motion, tuple) or len(motion) != 2:
@@ -108,14 +110,16 @@ def reference_motion(reference: Any, t: Array, linkage: Linkage) -> tuple[Array,
 
 
 @at_once
-def reach(reference: Any, linkage: Linkage, times: Array) -> Array:
+def reach(reference: Callable, linkage: Linkage, times: Array) -> Array:
     """Returns whether positions and velocities are finite at each of the times."""
     motion = lambda t: jnp.concatenate(reference_motion(reference, t, linkage))
     # A loop compiles in three quarters of the time of `jax.vmap`.
     return jax.lax.map(lambda t: jnp.isfinite(motion(t)).all(), times)
 
 
-def reachable(linkage: Linkage, reference: Any, ts: ArrayLike) -> Bool[Array, " time"]:
+def reachable(
+    linkage: Linkage, reference: Callable, ts: ArrayLike
+) -> Bool[Array, " time"]:
     """Returns whether a linkage can reach the reference at each time.
 
     A `TipTask` that passes behind the pivot between the first and the last time, so

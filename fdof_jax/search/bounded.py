@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy
+from jaxtyping import PyTree
 
 from ..base.checks import function, whole_number
 
@@ -73,7 +74,7 @@ class LBFGS:
 
         self.optimiser = optax.scale_by_lbfgs()
         self.update = jax.jit(self.optimiser.update)
-        self.state: Any = self.optimiser.init(jnp.asarray(z))
+        self.state: PyTree = self.optimiser.init(jnp.asarray(z))
         self.direction: np.ndarray | None = None
         self.share = 1.0
 
@@ -100,7 +101,11 @@ class LBFGS:
         return self.share > 1e-8
 
 
-METHODS: dict[str, Any] = {"levenberg-marquardt": LevenbergMarquardt, "l-bfgs": LBFGS}
+Method = LevenbergMarquardt | LBFGS
+METHODS: dict[str, type[Method]] = {
+    "levenberg-marquardt": LevenbergMarquardt,
+    "l-bfgs": LBFGS,
+}
 
 
 def box_minimum(
@@ -151,7 +156,7 @@ class Row(NamedTuple):
 class Run:
     """A run: its point `z`, its accepted points `rows`, and its `reason` to stop."""
 
-    def __init__(self, method: Any, enough: float, z, low, high):
+    def __init__(self, method: type[Method], enough: float, z, low, high):
         self.method, self.enough = method(z), enough
         self.z, self.low, self.high = z, low, high
         self.rows: list[Row] = []
@@ -220,7 +225,7 @@ def best_of(runs: list[Run]) -> Run:
     return min(runs, key=lambda run: (run.failed, run.best.loss))
 
 
-def check_search(max_steps: Any, report: Any) -> int:
+def check_search(max_steps: int, report: Callable | None) -> int:
     """Returns `max_steps`; raises ValueError for malformed arguments of a search."""
     if report is not None:
         function("report", report, "a callable or None")
@@ -236,7 +241,7 @@ def minimise(
     method: str,
     max_steps: int,
     enough: float,
-    report: Callable[[str], Any] | None = None,
+    report: Callable[[str], object] | None = None,
     describe: Callable[[list[Run]], str] = str,
 ) -> list[Run]:
     """Minimises a function per run, from (run, n) starts within (run, n) bounds.

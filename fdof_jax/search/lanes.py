@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jaxtyping import PyTree
 from numpy.typing import ArrayLike
 
 from ..base.checks import instance
@@ -28,7 +29,7 @@ _LANES = 8
 Evaluate = Callable[[Array, Any], Evaluation]  # (z, problem) of one lane
 
 
-def check_scene(name: str, scene: Any) -> None:
+def check_scene(name: str, scene: Scene) -> None:
     """Raises ValueError for shapes and kinds with which nothing can be simulated."""
     instance(name, scene, Scene)
     check_linkage(scene.linkage)
@@ -49,7 +50,7 @@ def check_motion(name: str, scene: Scene, ts: ArrayLike) -> None:
         raise ValueError(message) from error
 
 
-def sum_of_squares(found: Sensitivities, **facts: Any) -> Evaluation:
+def sum_of_squares(found: Sensitivities, **facts: Array) -> Evaluation:
     """The sum of squared residuals, its gradient and Gauss-Newton's curvature."""
     value, jacobian, *_ = found
     loss, curvature = jnp.sum(value**2), 2 * jacobian.T @ jacobian
@@ -57,7 +58,9 @@ def sum_of_squares(found: Sensitivities, **facts: Any) -> Evaluation:
 
 
 @eqx.filter_jit(compiler_options=options_of_loops())  # pyright: ignore[reportCallIssue]
-def _evaluate(evaluate: Evaluate, z: Array, moving: Any, shared: Any) -> Evaluation:
+def _evaluate(
+    evaluate: Evaluate, z: Array, moving: PyTree, shared: PyTree
+) -> Evaluation:
     """Evaluates lanes, along the leading axis of `z` and `moving`."""
 
     def lane(z, moving):
@@ -70,7 +73,7 @@ def _evaluate(evaluate: Evaluate, z: Array, moving: Any, shared: Any) -> Evaluat
     return jax.tree.map(lambda a: a[None], one)
 
 
-def _moves(leaf: Any) -> bool:
+def _moves(leaf: object) -> bool:
     """Returns whether an array with leading axes (run, member) differs along them."""
     return isinstance(leaf, np.ndarray) and bool((leaf != leaf[:1, :1]).any())
 
@@ -81,7 +84,7 @@ class Lanes:
     def __init__(
         self,
         evaluate: Evaluate,
-        problems: list[list[Any]],
+        problems: list[list[PyTree]],
         starts: int = 1,
         order: int = 1,
     ):

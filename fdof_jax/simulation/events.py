@@ -1,15 +1,14 @@
 """Events of joints that are held: what jumps there, which modes follow, the record."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 from jax import Array
 
 from ..forces.holders import Brake, HardStops
 from ..forces.payload import Payload
+from ..mechanics.equations import Scalars
 from ..mechanics.solve import minus
-from ..steps.dopri8 import constant
+from ..steps.dopri8 import Integrated, constant
 from ..steps.switch_derivatives import Event
 from .field import Args, efforts, schedule_of
 from .holding import (
@@ -34,7 +33,7 @@ _STICKS, _SLIPS, _BOUNCES, _RESTS, _LEAVES, _BRAKED, _LET_GO, _STOPPED = range(
 )
 
 
-def resolve(event: Event, y: Any, args: Args) -> tuple[Any, Modes]:
+def resolve(event: Event, y: Integrated, args: Args) -> tuple[Integrated, Modes]:
     """Returns the state and the modes after an event, `args.modes` being those before.
 
     In this order: brakes take hold, joints hit their stops, and what then is at rest
@@ -117,7 +116,7 @@ def _taken(
 
 
 def _net_efforts(
-    t: Array, q: Array, qd: Array, own: Any, args: Args
+    t: Array, q: Array, qd: Array, own: list[Scalars], args: Args
 ) -> tuple[System, Array]:
     """Returns the system, and the efforts less the bias, with friction of sliding."""
     args = args._replace(modes=args.modes._replace(direction=jnp.sign(qd)))

@@ -9,8 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jaxtyping import PyTree
 
-from ..forces.element import Element, ForeignElement
+from ..forces.element import Element, ForeignElement, OwnStates
 from ..forces.holders import JointFriction
 from ..linkage.linkage import Linkage, joint_names
 from ..steps.derivative_control import linearised
@@ -142,7 +143,7 @@ def _of_steps(inputs: Inputs, keywords, solution: Solution) -> str:
     )
 
 
-def _fastest_mode(*scene_and_state: Any) -> complex:
+def _fastest_mode(*scene_and_state: PyTree) -> complex:
     """Returns the fastest eigenvalue of the linearised equations [1/s], or 0."""
     try:
         modes = np.linalg.eigvals(_linearised(*scene_and_state))
@@ -153,8 +154,9 @@ def _fastest_mode(*scene_and_state: Any) -> complex:
 
 @eqx.filter_jit
 def _linearised(
-    linkage: Any, forces: tuple[Element, ...], t: Array, q: Array, qd: Array, own: Any
-) -> Array:
+    linkage: Linkage, forces: tuple[Element, ...], t: Array, q: Array, qd: Array,
+    own: OwnStates | None,
+) -> Array:  # fmt: skip
     """Returns the matrix of the linearised equations of first order."""
     args, (term, start_of, _) = args_of(linkage, q, forces), formulation(forces)
     start = whole(*start_of(args, qd), initial_own(args, own))

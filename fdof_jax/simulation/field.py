@@ -10,11 +10,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jaxtyping import PyTree
 
 from ..forces.added_inertia import added_inertia, inertial
 from ..forces.element import (
     Element,
     InertialElement,
+    OwnStates,
     ScalarElement,
     StatefulElement,
     naming,
@@ -31,7 +33,9 @@ from ..mechanics.equations import (
     zeros,
 )
 from ..mechanics.rates import conditioning, rates, rates_and_conditioning
-from ..steps.dopri8 import Health, ScheduledTerm, health_if
+from ..steps.dopri8 import Health, Integrated, ScheduledTerm, health_if
+
+Schedules = tuple[PyTree, ...]  # of all elements, which depend on time alone
 
 # Below this inertia ratio the accelerations have four correct digits at best (float64)
 # or two (float32).
@@ -45,13 +49,13 @@ class Args(NamedTuple):
     forces: tuple[Element, ...]
     sides: Array | None = None  # (switch,) in force, where switches are located
     ahead: Array | None = None  # (element,) by which its clock is ahead, if any [s]
-    modes: Any = None  # those of the joints, where elements hold some (see `Modes`)
+    modes: PyTree = None  # those of the joints, where elements hold some (see `Modes`)
 
-    def clock(self, index: int, t: Any) -> Any:
+    def clock(self, index: int, t: Array) -> Array:
         """Returns the time by an element's clock (see `clocks_apart`)."""
         return t if self.ahead is None else t + self.ahead[index]
 
-    def masses(self, t: Any) -> tuple[InertialElement, ...]:
+    def masses(self, t: Array) -> tuple[InertialElement, ...]:
         """Returns the elements that move masses, as they are at a time."""
         rows = enumerate(self.forces)
         masses = [(k, e) for k, e in rows if isinstance(e, InertialElement)]
@@ -75,7 +79,7 @@ def args_of(linkage: Linkage, q0: Array, forces: tuple[Element, ...]) -> Args:
     return Args(linkage, q0, constants, forces)
 
 
-def schedule_of(t: Array, args: Args) -> tuple[Any, ...]:
+def schedule_of(t: Array, args: Args) -> Schedules:
     """Returns each element's schedule."""
     schedules = []
     for index, element in enumerate(args.forces):
@@ -100,8 +104,8 @@ def has_states(linkage: Linkage, forces: tuple[Element, ...]) -> bool:
 
 
 def with_states(
-    forces: tuple[Element, ...], own: Any
-) -> Iterator[tuple[int, Element, Any]]:
+    forces: tuple[Element, ...], own: OwnStates
+) -> Iterator[tuple[int, Element, PyTree]]:
     """Yields each element with its index and its state, () without one."""
     states = iter(own)
     for index, element in enumerate(forces):
@@ -109,22 +113,22 @@ def with_states(
         yield index, element, state
 
 
-def initial_states(linkage: Linkage, forces: tuple[Element, ...]) -> tuple[Any, ...]:
+def initial_states(linkage: Linkage, forces: tuple[Element, ...]) -> OwnStates:
     return tuple(element.initial_state(linkage) for element in stateful(forces))
 
 
-def initial_own(args: Args, own0: Any = None) -> tuple[Array, ...]:
+def initial_own(args: Args, own0: OwnStates | None = None) -> Scalars:
     """Returns the elements' initial states as scalars: `own0`, or their defaults."""
     own = initial_states(args.linkage, args.forces) if own0 is None else own0
     return _scalars(own, args.q0.dtype)
 
 
-def whole(delta: Any, qd: Any, own: tuple[Array, ...]) -> tuple[Any, ...]:
+def whole(delta: Scalars, qd: Scalars, own: Scalars) -> Integrated:
     """Returns an integrated state, or its rates; diffrax takes no empty tuple in it."""
     return (delta, qd, own) if own else (delta, qd)
 
 
-def own_states(args: Args, y: Any) -> tuple[Any, ...]:
+def own_states(args: Args, y: Integrated) -> OwnStates:
     """Rebuilds the states of the stateful elements from the integrated scalars."""
     left = iter(y[2] if len(y) > 2 else ())
     return jax.tree.map(
@@ -133,12 +137,14 @@ def own_states(args: Args, y: Any) -> tuple[Any, ...]:
     )
 
 
-def _scalars(tree: Any, dtype: Any) -> tuple[Array, ...]:
+def _scalars(tree: PyTree, dtype: np.dtype) -> Scalars:
     leaves = [jnp.asarray(leaf, dtype).ravel() for leaf in jax.tree.leaves(tree)]
     return tuple(jnp.concatenate(leaves)) if leaves else ()
 
 
-def _effort(t: Any, y: Any, args: Args, schedule: tuple[Any, ...]) -> tuple[Any, ...]:
+def _effort(
+    t: Array, y: Integrated, args: Args, schedule: Schedules
+) -> tuple[Scalars, Scalars, Switches]:
     """Returns efforts of the elements, rates of their states, and their switches.
 
     Builds arrays only where an element needs them.
@@ -169,27 +175,27 @@ def _effort(t: Any, y: Any, args: Args, schedule: tuple[Any, ...]) -> tuple[Any,
 
 
 def switching(
-    t: Array, y: Any, args: Args, schedule: tuple[Any, ...]
+    t: Array, y: Integrated, args: Args, schedule: Schedules
 ) -> tuple[Array, tuple[bool, ...]]:
     """Returns the switching functions of all efforts, and which of them jump."""
     *_, switches = _effort(t, y, args, schedule)
     return switches.all_values(args.q0.dtype), tuple(switches.jumping)
 
 
-def efforts(t: Any, y: Any, args: Args, schedule: tuple[Any, ...]) -> Scalars:
+def efforts(t: Array, y: Integrated, args: Args, schedule: Schedules) -> Scalars:
     """Returns the sum of the elements' efforts."""
     return _effort(t, y, args, schedule)[0]
 
 
 def applied(
-    t: Any, y: Any, args: Args, schedule: tuple[Any, ...]
+    t: Array, y: Integrated, args: Args, schedule: Schedules
 ) -> tuple[Scalars, Scalars, Upper | None]:
     """Returns efforts of the elements, rates of their states, and inertia they add."""
     return switched(t, y, args, schedule)[:3]
 
 
 def switched(
-    t: Any, y: Any, args: Args, schedule: tuple[Any, ...]
+    t: Array, y: Integrated, args: Args, schedule: Schedules
 ) -> tuple[Scalars, Scalars, Upper | None, Switches]:
     """Returns what `applied` does, and the switches of the efforts."""
     tau, own_rates, switches = _effort(t, y, args, schedule)
@@ -214,11 +220,11 @@ def health_at(losses: Scalars) -> Health:
     )
 
 
-def health_with(rates: Any, health: Health) -> Health:
+def health_with(rates: PyTree, health: Health) -> Health:
     return health_if(jnp.isfinite(sum(jax.tree.leaves(rates))), health)
 
 
-def vector_field(t, y, args, schedule) -> tuple[Any, ...]:
+def vector_field(t, y, args, schedule) -> Integrated:
     """Rates of joint displacements, of velocities and of the elements' own states."""
     delta, qd, *_ = y
     tau, own_rates, added = applied(t, y, args, schedule)
@@ -226,7 +232,7 @@ def vector_field(t, y, args, schedule) -> tuple[Any, ...]:
     return whole(*rates(constants, delta, qd, tau, added), own_rates)
 
 
-def watched_field(t, y, args, schedule) -> tuple[tuple[Any, ...], Health]:
+def watched_field(t, y, args, schedule) -> tuple[Integrated, Health]:
     """Rates of `vector_field` and their health, which `ScheduledTerm` defines."""
     delta, qd, *_ = y
     tau, own_rates, added = applied(t, y, args, schedule)
@@ -254,8 +260,8 @@ def element_effort(
     q: Array,
     qd: Array,
     linkage: Linkage,
-    state: Any,
-) -> tuple[Array, Any]:
+    state: PyTree,
+) -> tuple[Array, PyTree]:
     """Returns an element's effort and the rate of its state, () without a state.
 
     Raises ValueError unless the effort is a real number for each joint.
@@ -265,7 +271,7 @@ def element_effort(
 
 def switching_functions(
     index: int, element: Element, t: Array, q: Array, qd: Array, linkage: Linkage,
-    state: Any,
+    state: PyTree,
 ) -> list[Array]:  # fmt: skip
     """Returns the switching functions that an element meets."""
     return _switched_effort(index, element, t, q, qd, linkage, state, None)[2]
@@ -279,9 +285,9 @@ def _switched_effort(
     q: Array,
     qd: Array,
     linkage: Linkage,
-    state: Any,
+    state: PyTree,
     sides: Array | None,
-) -> tuple[Array, Any, list[Array], list[bool]]:
+) -> tuple[Array, PyTree, list[Array], list[bool]]:
     """Returns what `element_effort` does, and the switching functions met."""
     switches = Switches(sides)
     expected = (
@@ -308,7 +314,7 @@ def _switched_effort(
     return tau.astype(q.dtype), rate, switches.values, switches.jumping
 
 
-def _shown(tree: Any) -> str:
+def _shown(tree: PyTree) -> str:
     return eqx.tree_pformat(tree)  # arrays by dtype and shape, traced ones too
 
 
@@ -320,13 +326,13 @@ class _Packed(eqx.Module):
     structure: Any = eqx.field(static=True)
     is_flag: tuple[bool, ...] = eqx.field(static=True)
 
-    def scalars(self) -> Any:
+    def scalars(self) -> Constants:
         numbers, flags = iter(self.numbers), iter(self.flags)
         leaves = [next(flags if flag else numbers) for flag in self.is_flag]
         return jax.tree.unflatten(self.structure, leaves)
 
 
-def _packed(scalars: Any) -> _Packed:
+def _packed(scalars: Constants) -> _Packed:
     leaves, structure = jax.tree.flatten(jax.tree.map(jnp.asarray, scalars))
     is_flag = tuple(leaf.dtype == bool for leaf in leaves)
     numbers, flags = (
@@ -337,8 +343,8 @@ def _packed(scalars: Any) -> _Packed:
 
 
 def in_arrays(
-    term: ScheduledTerm, y: Any, args: Args
-) -> tuple[ScheduledTerm, Any, Any]:
+    term: ScheduledTerm, y: Integrated, args: Args
+) -> tuple[ScheduledTerm, Integrated, Args]:
     """Returns term, state and arguments in arrays instead of tuples of scalars.
 
     XLA compiles a kernel for each array that changes in a loop or is computed for it,

@@ -10,7 +10,7 @@ one comes to its zero. There `resolve` (events.py) finds the modes that follow.
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -21,13 +21,14 @@ from ..forces.added_inertia import added_inertia
 from ..forces.element import Forces
 from ..forces.holders import Brake, HardStops, Holder, holders
 from ..forces.payload import Payload
+from ..linkage.fields import Truth
 from ..linkage.linkage import Linkage, joints_of
 from ..linkage.topology import fixed_pairs
-from ..mechanics.equations import Constants, Equations, equations, with_held
+from ..mechanics.equations import Constants, Equations, Upper, equations, with_held
 from ..mechanics.rates import holding_efforts
 from ..mechanics.solve import divided, solver_of, times, with_added
-from ..steps.dopri8 import constant
-from .field import Args, args_of, switched
+from ..steps.dopri8 import Integrated, constant
+from .field import Args, Schedules, args_of, switched
 from .solution import MODES, Events
 
 FREE, FRICTION, LOWER, UPPER, BRAKE = range(len(MODES))
@@ -72,7 +73,7 @@ class Laws(NamedTuple):
     braked: Array
 
 
-def laws(args: Args, t: Any) -> Laws:
+def laws(args: Args, t: Array) -> Laws:
     """Returns the laws of all holders at a time."""
     joints = joints_of(args.linkage)
     fixed = jnp.stack(fixed_pairs(args.linkage.ef))
@@ -124,7 +125,7 @@ def _reserve(static: Array, mode: Array, effort: Array, inertia: Array) -> Array
 
 
 def guarded_switching(
-    t: Array, y: Any, args: Args, schedule: tuple[Any, ...]
+    t: Array, y: Integrated, args: Args, schedule: Schedules
 ) -> tuple[Array, tuple[bool, ...]]:
     """Returns the switching functions of all efforts, and after them the guards.
 
@@ -157,7 +158,7 @@ class System(NamedTuple):
 
     constants: Constants
     equations: Equations
-    added: Any
+    added: Upper | None
 
     def accelerations(
         self, efforts: Array, held: Array, once: Callable = lambda x: x
@@ -187,7 +188,7 @@ def system_at(t: Array, q: Array, qd: Array, args: Args) -> System:
     return System(args.constants, m._replace(bias=bias), added)
 
 
-def within_stops(forces: Forces, q: Array, linkage: Linkage) -> Any:
+def within_stops(forces: Forces, q: Array, linkage: Linkage) -> Truth:
     """Returns whether an arm is within its hard stops, but for rounding.
 
     Fixed pairs have no stops.

@@ -13,12 +13,12 @@ import jax.numpy as jnp
 from jax import Array
 
 from ..base.checks import shown
-from ..forces.element import Element
+from ..forces.element import Element, OwnStates
 from ..forces.joints import EffortHistory
 from ..linkage.linkage import Linkage, possible, without_fixed
-from ..steps.controllers import with_judge
+from ..steps.controllers import Controller, with_judge
 from ..steps.derivative_control import OfLinearised, OfTangents
-from ..steps.dopri8 import ScheduledDopri8, ScheduledTerm, constant
+from ..steps.dopri8 import Integrated, ScheduledDopri8, ScheduledTerm, constant
 from ..steps.landing import end_of_run
 from ..steps.looped_dopri8 import LoopedDopri8
 from ..steps.step_control import StepControl, largest_loss
@@ -32,7 +32,7 @@ from ..steps.switching import (
 from ..steps.tolerances import default_controller
 from ..steps.unchecked import diffeqsolve
 from .events import in_order
-from .field import args_of, in_arrays, initial_own, own_states, whole
+from .field import Args, args_of, in_arrays, initial_own, own_states, whole
 from .holding import Modes, changes, taken_at, within_stops
 from .known_times import clocks_apart, known_times
 from .prescribed import agrees, formulation
@@ -48,7 +48,7 @@ class Inputs(NamedTuple):
     linkage: Linkage
     state0: Any  # a State of arrays
     ts: Array
-    own0: tuple[Any, ...] | None
+    own0: OwnStates | None
     forces: tuple[Element, ...]
 
 
@@ -64,18 +64,18 @@ class _Problem(NamedTuple):
     valid: Array
     ts: Array
     first: tuple[Array, Array]
-    start: Any
+    start: Integrated
     term: ScheduledTerm
-    args: Any
-    joints: Callable[[Any, Any], tuple[Array, Array, Any]]
+    args: Args
+    joints: Callable[[Array, Integrated], tuple[Array, Array, OwnStates]]
 
 
 class _Control(NamedTuple):
     """The start, which may include switches, the solver and the step control."""
 
-    start: Any
-    solver: Any
-    steps: Any
+    start: Integrated
+    solver: diffrax.AbstractSolver
+    steps: Controller
     jumps: Array | None
 
 
@@ -131,7 +131,7 @@ def _control(
     problem: _Problem, keywords, derivatives: bool, tangents: bool
 ) -> _Control:
     """Chooses the steps: what they judge, and where they end."""
-    solver: Any = keywords["solver"] or LoopedDopri8()
+    solver: diffrax.AbstractSolver = keywords["solver"] or LoopedDopri8()
     solver = _differentiable(solver, keywords["adjoint"])
     own_controller = keywords["stepsize_controller"]  # the user's
     steps = own_controller or default_controller()
@@ -258,7 +258,9 @@ def _read(inputs: Inputs, problem: _Problem, solve: diffrax.Solution) -> Solutio
     return eqx.tree_at(where, solution, holding, is_leaf=lambda x: x is None)
 
 
-def _differentiable(solver: Any, adjoint: diffrax.AbstractAdjoint) -> Any:
+def _differentiable(
+    solver: diffrax.AbstractSolver, adjoint: diffrax.AbstractAdjoint
+) -> diffrax.AbstractSolver:
     """Returns the solver with loops that the adjoint can differentiate.
 
     diffrax does this itself, except for a solver inside a wrapper.
@@ -288,7 +290,9 @@ def faults(inputs: Inputs, times: bool = True) -> list[Array]:
     return [~fine for fine in (increasing, start, possible(linkage), *fit)]
 
 
-def _judged(valid: Array, result: Any, q: Array, qd: Array) -> Any:
+def _judged(
+    valid: Array, result: diffrax.RESULTS, q: Array, qd: Array
+) -> diffrax.RESULTS:
     """Returns the result of a solve: not finite for invalid inputs and for NaN."""
     results: Any = diffrax.RESULTS
     # Constant steps, if too long, end in NaN and still report success.

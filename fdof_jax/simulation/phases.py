@@ -12,12 +12,14 @@ import numpy as np
 from jax import Array
 
 from ..base.checks import instance, known, refusal
+from ..forces.element import OwnStates
 from .solution import Events, Solution
 
 _MEETS = 1e-9  # a share of the time, within which two motions meet
 _GAP = 1e-5  # positions may be rounded on their way [m or rad]
 # How statistics of two phases are joined; numbers of steps and switches add up.
 _STATISTICS = {"accuracy": jnp.maximum, "slowest_crossing": jnp.minimum}
+_Outcome = tuple[dict[str, Any], diffrax.RESULTS]  # statistics and result
 
 
 def concatenate(motions: Sequence[Solution]) -> Solution:
@@ -109,13 +111,13 @@ def _totals(pieces: list[Array | None], zeros: list[Array]) -> Array:
     return _rows(totals, -1)
 
 
-def _states(pieces: list[tuple[Any, ...]], axis: int) -> tuple[Any, ...]:
+def _states(pieces: list[OwnStates], axis: int) -> OwnStates:
     if len({jax.tree.structure(piece) for piece in pieces}) > 1:
         return ()
     return jax.tree.map(lambda *rows: _rows([*rows], axis), *pieces)
 
 
-def _outcome(first: Any, second: Any) -> tuple[dict[str, Any], Any]:
+def _outcome(first: _Outcome, second: _Outcome) -> _Outcome:
     """Returns statistics and result of two phases, from those of each."""
     (stats, result), (more, following) = first, second
     ok = result == diffrax.RESULTS.successful

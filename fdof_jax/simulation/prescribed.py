@@ -19,12 +19,12 @@ from ..dynamics import mass_and_bias
 from ..forces.element import Element, Forces, naming
 from ..forces.holders import numbered, numbers_in
 from ..forces.payload import Payload
-from ..linkage.fields import Condition, called
+from ..linkage.fields import Condition, Truth, called
 from ..linkage.linkage import Linkage, joints_of, without_fixed
 from ..linkage.topology import MOST_PAIRS, fixed_pairs
-from ..mechanics.equations import equations, zeros
+from ..mechanics.equations import Scalars, equations, zeros
 from ..references.reference import EXPECTED, reference_motion
-from ..steps.dopri8 import Health, ScheduledTerm
+from ..steps.dopri8 import Health, Integrated, ScheduledTerm
 from .events import resolve
 from .field import (
     Args,
@@ -67,9 +67,9 @@ class PrescribedMotion(Element):
     """
 
     moved: Bool[Array, " number"]
-    reference: Any = called(EXPECTED)
+    reference: Callable = called(EXPECTED)
 
-    def __init__(self, joints: ArrayLike | Sequence[int], reference: Any):
+    def __init__(self, joints: ArrayLike | Sequence[int], reference: Callable):
         self.moved = numbered(joints)
         self.reference = reference
 
@@ -102,7 +102,7 @@ def prescribed(forces: Forces) -> PrescribedMotion | None:
     return motions[0] if motions else None
 
 
-def agrees(forces: Forces, t: Array, q: Array, linkage: Linkage) -> Any:
+def agrees(forces: Forces, t: Array, q: Array, linkage: Linkage) -> Truth:
     """Returns whether prescribed joints are at the reference, to 1 in a million."""
     if (motion := prescribed(forces)) is None:
         return True
@@ -134,8 +134,8 @@ class Formulation(NamedTuple):
     """
 
     term: ScheduledTerm
-    start: Callable[[Args, Array], tuple[Any, Any]]
-    joints: Callable[[Args, Any, Any], tuple[Array, Array]]
+    start: Callable[[Args, Array], tuple[Scalars, Scalars]]
+    joints: Callable[[Args, Array, Integrated], tuple[Array, Array]]
 
 
 def formulation(forces: Forces) -> Formulation:
@@ -153,11 +153,11 @@ def formulation(forces: Forces) -> Formulation:
     return HYBRID
 
 
-def _free_joints(args: Args, t: Any, y: Any) -> tuple[Array, Array]:
+def _free_joints(args: Args, t: Array, y: Integrated) -> tuple[Array, Array]:
     return args.q0 + jnp.stack(y[0]), jnp.stack(y[1])
 
 
-def _hybrid_joints(args: Args, t: Any, y: Any) -> tuple[Array, Array]:
+def _hybrid_joints(args: Args, t: Array, y: Integrated) -> tuple[Array, Array]:
     motion, (q, momenta) = _motion(args), _free_joints(args, t, y)
     position, velocity = motion.at(t, args.linkage)
     q = jnp.where(motion.prescribes(args.linkage), position, q)
@@ -165,7 +165,7 @@ def _hybrid_joints(args: Args, t: Any, y: Any) -> tuple[Array, Array]:
     return q, _split(motion.prescribes(args.linkage), matrix, velocity, momenta)
 
 
-def _hybrid_start(args: Args, qd: Array) -> tuple[Any, Any]:
+def _hybrid_start(args: Args, qd: Array) -> tuple[Scalars, Scalars]:
     matrix, _ = _mass_and_bias(args, args.q0, jnp.zeros_like(args.q0))
     momenta = jnp.where(_motion(args).prescribes(args.linkage), 0, matrix @ qd)
     return zeros(args.q0), tuple(momenta)
@@ -182,7 +182,7 @@ def _hybrid_switching(t, y, args, schedule) -> tuple[Array, tuple[bool, ...]]:
     return switching(t, (tuple(q - args.q0), tuple(qd), *y[2:]), args, schedule)
 
 
-def _hybrid_field(t, y, args, schedule) -> tuple[Any, ...]:
+def _hybrid_field(t, y, args, schedule) -> Integrated:
     """Rates of displacements and momenta, 0 at prescribed joints.
 
     The rate of the momenta is M' qd - bias + tau, where M' is the mass matrix's rate.
@@ -199,7 +199,7 @@ def _hybrid_field(t, y, args, schedule) -> tuple[Any, ...]:
     return whole(tuple(jnp.where(moved, 0, qd)), tuple(driven), own_rates)
 
 
-def _watched_hybrid_field(t, y, args, schedule) -> tuple[tuple[Any, ...], Health]:
+def _watched_hybrid_field(t, y, args, schedule) -> tuple[Integrated, Health]:
     """Rates of `_hybrid_field` and their health, as in `field.watched_field`."""
     rates = _hybrid_field(t, y, args, schedule)
     return rates, health_with(rates, _health(t, y, args))

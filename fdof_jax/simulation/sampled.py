@@ -1,5 +1,6 @@
 """Control in discrete time, with efforts held constant between samples."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import diffrax
@@ -16,6 +17,7 @@ from ..base.functions import sharing_functions
 from ..forces.element import (
     Element,
     Forces,
+    OwnStates,
     ScalarElement,
     element_of,
     elements,
@@ -119,7 +121,7 @@ class SampledMotion(WithOutcome):
     qd: Float[Array, "time joint"]
     tau: Float[Array, "sample joint"]
     result: diffrax.RESULTS
-    own: tuple[Any, ...]
+    own: OwnStates
     delay: Float[Array, ""] | float = 0.0
     q_begin: Float[Array, "sample joint"] | None = None
     acting: Float[Array, "time joint"] | None = None
@@ -146,7 +148,7 @@ def acting_in(motion: Motion, forces: tuple[Element, ...]) -> tuple[Element, ...
     return _Held(motion.ts, acting), *forces[1:]
 
 
-def check_joints(name: str, solution: Any, linkage: Linkage) -> None:
+def check_joints(name: str, solution: object, linkage: Linkage) -> None:
     """Raises ValueError unless it is a motion with the linkage's number of joints."""
     if not isinstance(solution, Motion):
         raise refusal(name, "a Solution or a SampledMotion", solution)
@@ -193,7 +195,7 @@ def _in_periods(delay: Any, period: Any, samples: int) -> _Delay:
 def simulate_sampled(
     linkage: Linkage,
     state0: State,
-    control: Any,
+    control: Callable,
     period: ArrayLike,
     samples: int,
     forces: Forces = (),

@@ -10,6 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jaxtyping import PyTree
+from numpy.typing import ArrayLike
 
 from ..base.checks import instance, shown
 from ..forces.element import Forces, elements, of_full_size
@@ -38,6 +40,7 @@ class Scene(NamedTuple):
     t1: float | Array
 
 
+_Stacked = TypeVar("_Stacked")
 _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result", covariant=True)
 
@@ -66,7 +69,7 @@ def accepts_scene(
     others = [name for name in names if name not in Scene._fields]
 
     @functools.wraps(function)
-    def resolved(*args: Any, **kwargs: Any) -> Any:
+    def resolved(*args: Any, **kwargs: Any) -> _Result:
         if not args or not isinstance(args[0], Scene):
             return function(*args, **kwargs)
         scene, *more = args
@@ -95,7 +98,7 @@ def with_full_size(scene: Scene) -> Scene:
     return scene._replace(forces=of_full_size(scene.linkage, forces))
 
 
-def is_number(leaf: Any) -> bool:
+def is_number(leaf: object) -> bool:
     """Returns whether a leaf of a scene is data: an array or a float.
 
     Python's integers and booleans, such as an element's index, are not data.
@@ -103,19 +106,19 @@ def is_number(leaf: Any) -> bool:
     return eqx.is_array_like(leaf) and not isinstance(leaf, bool | int)
 
 
-def _as_array(leaf: Any) -> np.ndarray:
+def _as_array(leaf: ArrayLike) -> np.ndarray:
     array = np.asarray(leaf)
     floating = array.dtype.kind == "f"
     return array.astype(jnp.result_type(float)) if floating else array
 
 
-def _parts(scene: Any) -> tuple[Any, Any]:
+def _parts(scene: PyTree) -> tuple[PyTree, PyTree]:
     if isinstance(scene, Scene):  # whose end time may be an integer
         scene = scene._replace(t1=np.asarray(scene.t1, float))
     return eqx.partition(scene, is_number)
 
 
-def stacked(scenes: Sequence[Any], name: str = "scenes") -> Any:
+def stacked(scenes: Sequence[_Stacked], name: str = "scenes") -> _Stacked:
     """Stacks scenes of one structure into one, with a leading axis on every array.
 
     **Raises:** ValueError for scenes of different structure.

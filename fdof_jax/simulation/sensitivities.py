@@ -6,13 +6,14 @@ motion. Differentiation through the integrator would take twice as long to compi
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import Array
+from jaxtyping import PyTree
 
 from ..forces.element import elements
 from ..linkage.linkage import without_fixed
@@ -47,7 +48,7 @@ class _Varied(NamedTuple):
 
     z: Array
     sides: Array | None = None
-    modes: Any = None
+    modes: PyTree = None
 
 
 class _Term(diffrax.ODETerm):

@@ -21,7 +21,14 @@ from ..base.checks import (
     whole_number,
 )
 from ..base.known_values import in_numpy
-from ..forces.element import Element, Forces, elements_on, naming, of_full_size
+from ..forces.element import (
+    Element,
+    Forces,
+    OwnStates,
+    elements_on,
+    naming,
+    of_full_size,
+)
 from ..linkage.coordinates import State, real_state
 from ..linkage.fields import check_values
 from ..linkage.linkage import Linkage, check_linkage
@@ -148,7 +155,7 @@ def simulate(
     ts: ArrayLike,
     forces: Forces = (),
     *,
-    own0: tuple[Any, ...] | None = None,
+    own0: OwnStates | None = None,
     solver: diffrax.AbstractSolver | None = None,
     rtol: ArrayLike | None = None,
     atol: ArrayLike | None = None,

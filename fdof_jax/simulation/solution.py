@@ -8,10 +8,12 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jaxtyping import Float
+from jaxtyping import Float, PyTree
+from numpy.typing import ArrayLike
 
 from ..base.checks import is_traced, known
 from ..base.report import html_table
+from ..forces.element import OwnStates
 
 # In the order of `outcome_numbers`: what an outcome means, and what helps.
 OUTCOMES = {
@@ -41,16 +43,16 @@ HAPPENINGS = (
 SLOW = 0.01
 
 
-def flags(words: Iterable[str]) -> dict[str, Any]:
+def flags(words: Iterable[str]) -> dict[str, list[int] | str]:
     """Attributes of stored numbers that say what each means (CF conventions)."""
     meanings = [word.replace(" ", "_") for word in words]
     values = [*range(len(meanings))]
     return {"flag_values": values, "flag_meanings": " ".join(meanings)}
 
 
-def outcome_numbers(result: diffrax.RESULTS) -> Any:
+def outcome_numbers(result: diffrax.RESULTS) -> Array | np.ndarray:
     """Returns the places of results in `OUTCOMES`, by NumPy unless they are traced."""
-    results: Any = diffrax.RESULTS
+    results = diffrax.RESULTS
     ordered = (
         results.successful, results.singular, results.nonfinite,
         results.max_steps_reached, results.dt_min_reached, results.max_steps_rejected,
@@ -192,13 +194,13 @@ class Solution(WithOutcome):
     qd: Float[Array, "time joint"]
     stats: dict[str, Any]
     result: diffrax.RESULTS
-    own: tuple[Any, ...] = ()
+    own: OwnStates = ()
     modes: Float[Array, "time joint"] | None = None
     taken: Float[Array, " time"] | None = None
     events: Events | None = None
 
     @property
-    def states(self) -> tuple[Any, ...]:
+    def states(self) -> tuple[PyTree, ...]:
         """The results that have derivatives in the inputs."""
         return self.q, self.qd, self.own, self.taken, self.events
 
@@ -215,7 +217,7 @@ class Solution(WithOutcome):
         return facts
 
 
-def _span(numbers: Any) -> str:
+def _span(numbers: ArrayLike) -> str:
     least, most = np.min(numbers), np.max(numbers)
     return f"{least}" if least == most else f"{least} to {most}"
 

@@ -9,14 +9,20 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import Array
+from jaxtyping import PyTree
 
-from .dopri8 import constant
+from .dopri8 import Integrated, constant
+
+Controller = diffrax.AbstractStepSizeController
+Judging = diffrax.AbstractAdaptiveStepSizeController  # judges errors of steps
 
 
-def with_pid(change: Callable[[diffrax.PIDController], Any], controller: Any) -> Any:
+def with_pid(
+    change: Callable[[diffrax.PIDController], Controller], controller: Controller
+) -> Controller:
     """Returns a controller with `change` applied to the PID controllers in it."""
 
-    def is_pid(node: Any) -> bool:
+    def is_pid(node: object) -> bool:
         return isinstance(node, diffrax.PIDController)
 
     return jax.tree.map(
@@ -24,10 +30,10 @@ def with_pid(change: Callable[[diffrax.PIDController], Any], controller: Any) ->
     )
 
 
-def with_judge(change: Callable[..., Any], controller: Any) -> Any:
+def with_judge(change: Callable[..., Judging], controller: Judging) -> Judging:
     """Returns a controller with `change` applied to the one that judges errors."""
 
-    def judges(node: Any) -> bool:
+    def judges(node: object) -> bool:
         wrapper = isinstance(node, Abreast | diffrax.ClipStepSizeController)
         adaptive = isinstance(node, diffrax.AbstractAdaptiveStepSizeController)
         return adaptive and not wrapper
@@ -37,7 +43,7 @@ def with_judge(change: Callable[..., Any], controller: Any) -> Any:
     )
 
 
-def by_square_roots(controller: Any) -> Any:
+def by_square_roots(controller: Controller) -> Controller:
     """Returns an equal controller for methods of order 8 that computes no powers.
 
     A step changes by the eighth root of its error. XLA on CPU calls the C library's
@@ -52,7 +58,7 @@ def by_square_roots(controller: Any) -> Any:
         if not (diffrax_rule and plain and used == (0, 1, 0, None)):
             return pid
 
-        def norm(error: Any) -> Array:
+        def norm(error: PyTree) -> Array:
             return jnp.sqrt(jnp.sqrt(jnp.sqrt(pid.norm(error))))
 
         return dataclasses.replace(pid, icoeff=8.0, norm=norm)
@@ -123,7 +129,7 @@ class Scaled(Adaptive):
     `StepControl` scales what it gets.
     """
 
-    controller: Any
+    controller: Judging
     unit: tuple[Array, Array]  # of q and of qd (n,)
 
     def init(self, *arguments):
@@ -133,7 +139,7 @@ class Scaled(Adaptive):
             )
         return super().init(*arguments)
 
-    def scaled(self, state: Any) -> Any:
+    def scaled(self, state: Integrated) -> Integrated:
         """Returns a state in these units; the elements' own states keep theirs."""
         scalars = isinstance(state[0], tuple)
         units: Any = tuple(map(tuple, self.unit)) if scalars else self.unit
@@ -152,7 +158,7 @@ class Abreast(Adaptive):
     `max_steps_reached`, before diffrax's own `max_steps`.
     """
 
-    controller: Any
+    controller: Judging
     axis: str = eqx.field(static=True)
 
     def init(self, *arguments):

@@ -5,7 +5,7 @@ Where the tangents are known, `OfTangents` judges them. Where they are not, beca
 caller differentiates or the adjoint follows, `OfLinearised` judges a probe.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -14,8 +14,17 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.flatten_util import ravel_pytree
+from jaxtyping import PyTree
 
-from .dopri8 import Estimate, ScheduledTerm, constant, lower_triangle
+from .dopri8 import (
+    Arguments,
+    Estimate,
+    Health,
+    Integrated,
+    ScheduledTerm,
+    constant,
+    lower_triangle,
+)
 from .rounding import largest
 from .switching import Switching, motion_of
 
@@ -33,7 +42,7 @@ _LEAST = 30.0
 TANGENTS = "tangents"  # the name of their axis
 
 
-def _noise(health: Any) -> Array:
+def _noise(health: Health) -> Array:
     """Returns the relative rounding error of tangents."""
     loss = constant(jnp.max(jnp.stack(health)))
     return _NOISE * jnp.finfo(loss.dtype).eps * loss
@@ -41,7 +50,7 @@ def _noise(health: Any) -> Array:
 
 @jax.custom_jvp
 def _error_of_tangents(
-    error: Any, ends: Any, integrated: Any, tolerance: Array, noise: Array
+    error: PyTree, ends: PyTree, integrated: PyTree, tolerance: Array, noise: Array
 ) -> Array:
     """Returns the largest error of a tangent over what its tolerance allows.
 
@@ -73,19 +82,19 @@ class Step(NamedTuple):
 
     t0: Array
     t1: Array
-    y0: Any
-    y1: Any
-    args: Any
+    y0: Integrated
+    y1: Integrated
+    args: Arguments
 
 
 class OfTangents(eqx.Module):
     """Judges tangents of the motion; all of them take the same steps."""
 
-    def start(self, y0: Any) -> tuple[()]:
+    def start(self, y0: Integrated) -> tuple[()]:
         return ()
 
     def __call__(
-        self, step: Step, estimate: Estimate, probe: tuple[()], rtol: Any
+        self, step: Step, estimate: Estimate, probe: tuple[()], rtol: Array | float
     ) -> tuple[Array, tuple[()]]:
         """Returns the largest error of a tangent over its tolerance, and no probe.
 
@@ -101,7 +110,7 @@ class OfTangents(eqx.Module):
         return constant(ratio), probe
 
 
-def linearised(term: ScheduledTerm, t: Array, y: Any, args: Any) -> Array:
+def linearised(term: ScheduledTerm, t: Array, y: Integrated, args: Arguments) -> Array:
     """Returns the derivative of the rates in the state's numbers, a square matrix."""
     numbers, state_of = ravel_pytree(y)
     rates = lambda numbers: term.vf(t, state_of(numbers), args)
@@ -119,14 +128,14 @@ class OfLinearised(eqx.Module):
     term: ScheduledTerm
     tableau: diffrax.ButcherTableau = eqx.field(static=True)
 
-    def start(self, y0: Any) -> Array:
+    def start(self, y0: Integrated) -> Array:
         """Returns a new probe."""
         numbers, _ = ravel_pytree(motion_of(y0))
         probe = np.random.default_rng(0).standard_normal(numbers.size)
         return jnp.asarray(probe, numbers.dtype)
 
     def __call__(
-        self, step: Step, estimate: Estimate, probe: Array, rtol: Any
+        self, step: Step, estimate: Estimate, probe: Array, rtol: Array | float
     ) -> tuple[Array, Array]:
         """Returns the error of the probe over its tolerance, and the moved probe."""
         t0, t1, _, y1, args = step

@@ -39,6 +39,10 @@ _INTERPOLATION: Any = diffrax.Dopri8.interpolation_cls
 DENSE = _INTERPOLATION.eval_coeffs  # (stage, power), highest first
 
 
+# Equations have types of their own (`simulation.field.Args`), which steps do not know.
+Integrated = PyTree  # a state: positions, rates, the elements' own, any `Switching`
+Arguments = PyTree  # of the equations: a named tuple with a linkage, q0 and sides
+Term = Any  # a `ScheduledTerm`, or another that has `vf` and `switches`
 Health = tuple[Array, ...]  # one per joint, see `ScheduledTerm`
 
 
@@ -58,7 +62,7 @@ class ScheduledTerm(diffrax.ODETerm):
     """
 
     vector_field: Callable[..., PyTree] = eqx.field(static=True)
-    schedule: Callable[[Any, Any], PyTree] = eqx.field(static=True)
+    schedule: Callable[..., PyTree] = eqx.field(static=True)
     health: Callable[..., Health] = eqx.field(static=True)
     watched_field: Callable[..., tuple[PyTree, Health]] = eqx.field(static=True)
     switching: Callable[..., tuple[Array, tuple[bool, ...]]] = eqx.field(static=True)
@@ -102,12 +106,12 @@ def interpolation_weights(theta: Array) -> Array:
 class DenseOutput(diffrax.AbstractLocalInterpolation):
     """Dense output as in diffrax; a subclass sums the weighted rates."""
 
-    t0: Any  # pyright: ignore[reportIncompatibleVariableOverride]
-    t1: Any  # pyright: ignore[reportIncompatibleVariableOverride]
+    t0: Array  # pyright: ignore[reportIncompatibleVariableOverride]
+    t1: Array  # pyright: ignore[reportIncompatibleVariableOverride]
     y0: PyTree
     step: Array
-    rates: Any
-    scheduled: Any  # what depends on time alone, at all stages
+    rates: PyTree
+    scheduled: PyTree  # what depends on time alone, at all stages
 
     @abstractmethod
     def at(self, theta: Array) -> PyTree:
@@ -143,14 +147,16 @@ class Estimate(NamedTuple):
     health: Health
 
 
-def with_change(error: Any, change: Callable[[PyTree], PyTree]) -> Any:
+def with_change(error: PyTree, change: Callable[[PyTree], PyTree]) -> PyTree:
     """Returns an error, or an `Estimate`, with a change of the error."""
     if isinstance(error, Estimate):
         return error._replace(error=change(error.error))
     return change(error)
 
 
-def verdict(error: PyTree, health: Health, h: Array) -> tuple[Estimate, Any]:
+def verdict(
+    error: PyTree, health: Health, h: Array
+) -> tuple[Estimate, diffrax.RESULTS]:
     """Returns the estimated error of a step, replaced if its health is bad, and result.
 
     The health is NaN for a step that is not finite, and 0 for a singular one. An

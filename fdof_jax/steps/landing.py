@@ -1,6 +1,6 @@
 """Ends of steps at known times and where elements switch."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ..linkage.fields import has_come
-from .dopri8 import constant
+from .dopri8 import Arguments, Integrated, constant
 
 # So many landings are chatter within a multiple of the distance that rounding keeps
 # them apart: this power of the unit of rounding (3e5 in float64). Chatter soon is as
@@ -62,8 +62,8 @@ class NextStep(NamedTuple):
     keep: Array
     t0: Array
     t1: Array
-    jumped: Any
-    result: Any
+    jumped: Array | bool
+    result: diffrax.RESULTS
 
 
 class _Landing(NamedTuple):
@@ -89,11 +89,11 @@ class Landing(eqx.Module):
     apart: Array  # see `rounding`
     switches: bool = eqx.field(static=True)
 
-    def in_force(self, args: Any, y: Any) -> Any:
+    def in_force(self, args: Arguments, y: Integrated) -> Arguments:
         """Returns the arguments with the sides in force at a state."""
         return y[-1].in_force(args) if self.switches else args
 
-    def _seen(self, y: Any, end: Array) -> tuple[Any, ...]:
+    def _seen(self, y: Integrated, end: Array) -> tuple[Array | int, ...]:
         """Returns times and `near` of `Switching`, and whether nothing switches here.
 
         The times are `until`, `unseen` and `soon`.
@@ -135,7 +135,7 @@ class Landing(eqx.Module):
         )
 
     def after(
-        self, t0: Array, t1: Array, y1: Any, planned: NextStep, state: _Landing
+        self, t0: Array, t1: Array, y1: Integrated, planned: NextStep, state: _Landing
     ) -> tuple[NextStep, Array, _Landing]:
         """Returns the next step, and whether the controller resumes its old state.
 
@@ -190,7 +190,7 @@ class Landing(eqx.Module):
         # Time that passes meanwhile tells fast switching from chatter.
         paced = begin - state.since > state.pace
         landings = jnp.where(paced, 0, state.landings + crossed)
-        results: Any = diffrax.RESULTS
+        results = diffrax.RESULTS
         resumes = crossed | landed | unsure
         # After the last step, which may be shorter than others may, none is asked for.
         done = keep & (end >= state.last)

@@ -7,17 +7,18 @@ tolerance, and steps that try reach nothing.
 
 import functools
 from collections.abc import Sequence
-from typing import Any
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import Array
+from jax.typing import ArrayLike
+from jaxtyping import PyTree
 
 from ..linkage.topology import real_joints
-from .controllers import Adaptive
-from .dopri8 import Estimate, Health
+from .controllers import Adaptive, Judging
+from .dopri8 import Arguments, Estimate, Health, Integrated
 
 # Rounding errors of an acceleration, over its size times eps and the loss of accuracy:
 # less for slides, whose inertia is a sum of masses without levers.
@@ -33,13 +34,13 @@ _HELD = 0.43
 def above_rounding(
     control: Adaptive,
     h: Array,
-    y0: Any,
-    y1: Any,
-    args: Any,
+    y0: Integrated,
+    y1: Integrated,
+    args: Arguments,
     estimate: Estimate,
     of_derivatives: Array | None,
-    order: Any,
-) -> Any:
+    order: float | None,
+) -> Integrated:
     """Returns the error of a step of length `h` without what is rounding.
 
     `of_derivatives`: the error of derivatives over their tolerance, which counts too.
@@ -69,7 +70,7 @@ def above_rounding(
     return *motion, *error[2:]
 
 
-def _same_step(controller: Any, order: Any) -> Any:
+def _same_step(controller: Judging, order: ArrayLike | None) -> ArrayLike:
     """Returns the error, over its tolerance, after which the next step is as long."""
     while isinstance(controller, Adaptive):
         controller = controller.controller
@@ -81,13 +82,15 @@ def _same_step(controller: Any, order: Any) -> Any:
     return _HELD if order is None else controller.safety**order
 
 
-def _rounding(revolute: Sequence[Array], health: Health, y0: Any, y1: Any) -> Any:
+def _rounding(
+    revolute: Sequence[Array], health: Health, y0: Integrated, y1: Integrated
+) -> PyTree:
     """Estimates the rounding errors of a step in each velocity or momentum.
 
     A velocity changes by its acceleration, and its direction turns with the links.
     Joints that lose accuracy disturb those that do not.
     """
-    joints: Any = tuple(revolute), health
+    joints: PyTree = tuple(revolute), health
     if eqx.is_array(y0[1]):
         joints = tuple(map(jnp.stack, joints))
     revolute, losses = joints
@@ -103,7 +106,7 @@ def _rounding(revolute: Sequence[Array], health: Health, y0: Any, y1: Any) -> An
     return jax.tree.map(noise, revolute, losses)
 
 
-def largest(tree: Any) -> Array:
+def largest(tree: PyTree) -> Array:
     """Returns the size of the largest number in a tree."""
     sizes = [jnp.max(jnp.abs(leaf)) for leaf in jax.tree.leaves(tree)]
     return functools.reduce(jnp.maximum, sizes)

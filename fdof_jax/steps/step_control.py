@@ -8,12 +8,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import Array
+from jaxtyping import PyTree
 
 from .controllers import Adaptive, Scaled
 from .derivative_control import OfLinearised, OfTangents, Step
 from .dopri8 import (
+    Arguments,
     Estimate,
     Health,
+    Integrated,
     ScheduledTerm,
     constant,
     health_if,
@@ -27,9 +30,9 @@ from .switching import motion_of
 
 
 class _State(NamedTuple):
-    inner: Any  # of diffrax's controller
-    landing: Any
-    probe: Any  # of derivatives
+    inner: PyTree  # of diffrax's controller
+    landing: PyTree  # of `Landing`
+    probe: Array | tuple[()] | None  # of derivatives
     loss: Array  # the largest loss of accuracy in steps so far
 
 
@@ -121,8 +124,9 @@ class StepControl(Adaptive):
         return *step[:4], state, result
 
     def _healthy(
-        self, t0: Any, t1: Any, y0: Any, y1: Any, args: Any, error: Any
-    ) -> tuple[Any, Estimate, Any]:
+        self, t0: Array, t1: Array, y0: Integrated, y1: Integrated, args: Arguments,
+        error: PyTree,
+    ) -> tuple[Integrated, Estimate, diffrax.RESULTS]:  # fmt: skip
         """Returns a finite end, the error and health of a step, and its result."""
         assert self.term is not None
         # Rates that are not finite make the error not finite.
@@ -138,7 +142,7 @@ class StepControl(Adaptive):
         return end, estimate, failure
 
 
-def largest_loss(controller_state: Any) -> Array:
+def largest_loss(controller_state: PyTree) -> Array:
     """Returns the largest loss of accuracy in a solve, from its controllers' state."""
     mine = lambda node: isinstance(node, _State)
     (state,) = filter(mine, jax.tree.leaves(controller_state, is_leaf=mine))

@@ -5,14 +5,16 @@ parameters. At the end of the step to a switch, the state moves on to that time 
 side before, and back on the side after: this changes nothing but derivatives.
 """
 
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import Array
+from jaxtyping import PyTree
 
-from .dopri8 import constant
+from .dopri8 import Arguments, Integrated, Term, constant
 
 
 def first_of(switched: Array) -> Array:
@@ -40,23 +42,23 @@ class Arrival(NamedTuple):
     """The end of a step at which the first function that `switched` is zero."""
 
     t: Array
-    y: Any
-    args: Any
+    y: Integrated
+    args: Arguments
     switched: Array  # none: nothing is zero
 
 
 @eqx.filter_jit  # traced once, not at each use in a solve
-def _value(arrival: Arrival, term: Any) -> Array:
+def _value(arrival: Arrival, term: Term) -> Array:
     t, y, args, switched = arrival
     return term.switches(t, y, args)[0][jnp.argmax(switched)]
 
 
 @eqx.filter_jit
-def _slope(arrival: Arrival, term: Any) -> Array:
+def _slope(arrival: Arrival, term: Term) -> Array:
     return _rate(_value, arrival, term)
 
 
-def _rate(function: Any, arrival: Arrival, term: Any) -> Array:
+def _rate(function: Callable, arrival: Arrival, term: Term) -> Array:
     """Returns the rate of a function of an arrival along the motion.
 
     It is exact, where differences of samples are lost in rounding if steps are short.
@@ -66,7 +68,7 @@ def _rate(function: Any, arrival: Arrival, term: Any) -> Array:
     return jax.jvp(along, (t, y), (jnp.ones_like(t), term.vf(t, y, args)))[1]
 
 
-def _change(function: Any, arrival: Arrival, term: Any, change: Any) -> Array:
+def _change(function: Callable, arrival: Arrival, term: Term, change: PyTree) -> Array:
     """Returns how a function of an arrival changes with it."""
     _, tangent = eqx.filter_jvp(lambda a: function(a, term), (arrival,), (change,))
     return jnp.zeros_like(arrival.t) if tangent is None else tangent
@@ -79,7 +81,7 @@ def _quotient(change: Array, slope: Array) -> Array:
 
 
 @eqx.filter_custom_jvp
-def lateness(arrival: Arrival, *, term: Any) -> Array:
+def lateness(arrival: Arrival, *, term: Term) -> Array:
     """Returns when the function that switched is zero, less the time of arrival.
 
     This is 0, with derivatives of first and second order.
@@ -143,12 +145,12 @@ class Instant(NamedTuple):
     """A time, the state and the arguments of the equations there."""
 
     t: Array
-    y: Any
-    args: Any
+    y: Integrated
+    args: Arguments
 
 
 @eqx.filter_custom_jvp
-def moved_on(late: Array, instant: Instant, *, term: Any) -> Any:
+def moved_on(late: Array, instant: Instant, *, term: Term) -> Integrated:
     """Returns the state a time `late` later, which is 0, with derivatives."""
     return instant.y
 
@@ -168,7 +170,7 @@ def _(primals, tangents, *, term):
     return there, jax.tree.map(moved, start, rates, _filled(turned, rates))
 
 
-def _filled(tangents: Any, values: Any) -> Any:
+def _filled(tangents: PyTree, values: PyTree) -> PyTree:
     """Returns tangents, zeros where equinox leaves None because nothing changes."""
     return jax.tree.map(
         lambda value, tangent: jnp.zeros_like(value) if tangent is None else tangent,
@@ -181,14 +183,14 @@ class Moment(NamedTuple):
     """A switch: time, state, arguments, and the sides before and after it."""
 
     t: Array
-    y: Any
-    args: Any
+    y: Integrated
+    args: Arguments
     before: Array
     after: Array
     is_one: Array
 
 
-def _difference(late: Array, moment: Moment, term: Any) -> Any:
+def _difference(late: Array, moment: Moment, term: Term) -> Integrated:
     """Returns the rates before a switch less those after it.
 
     With derivatives of first order: the state moves on to the time of the switch on the
@@ -216,13 +218,15 @@ def _difference(late: Array, moment: Moment, term: Any) -> Any:
     return jax.lax.cond(is_one, difference, nothing)
 
 
-def _late(arrival: Arrival, change: Any, term: Any) -> tuple[Array, Array]:
+def _late(arrival: Arrival, change: PyTree, term: Term) -> tuple[Array, Array]:
     """Returns `lateness` and how it changes."""
     return eqx.filter_jvp(lambda a: lateness(a, term=term), (arrival,), (change,))
 
 
 @eqx.filter_custom_jvp
-def gained(arrival: Arrival, moment: Moment, *, term: Any, jumping: bool) -> Any:
+def gained(
+    arrival: Arrival, moment: Moment, *, term: Term, jumping: bool
+) -> Integrated:
     """Returns how the time of a switch changes the state: 0, with derivatives.
 
     Where nothing jumps, first derivatives are 0 too; only second ones need the time of

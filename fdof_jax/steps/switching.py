@@ -14,8 +14,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jaxtyping import PyTree
 
-from .dopri8 import SHORTEST, DenseOutput, constant, with_change
+from ..linkage.fields import Truth
+from .dopri8 import (
+    SHORTEST,
+    Arguments,
+    DenseOutput,
+    Integrated,
+    Term,
+    constant,
+    with_change,
+)
 from .landing import Landing, rounding
 from .switch_derivatives import (
     Arrival,
@@ -74,32 +84,32 @@ class Switching(NamedTuple):
     one_sided: Array | None
     grazing: Array
     grazing_here: Array
-    modes: Any = None
+    modes: PyTree = None
 
-    def in_force(self, args: Any) -> Any:
+    def in_force(self, args: Arguments) -> Arguments:
         """Returns the arguments with the sides, and any modes, in force here."""
         return _in_force(args, self.sides, self.modes)
 
 
-def _in_force(args: Any, sides: Array, modes: Any) -> Any:
+def _in_force(args: Arguments, sides: Array, modes: PyTree) -> Arguments:
     args = args._replace(sides=sides)
     return args if modes is None else args._replace(modes=modes)
 
 
-def motion_of(y: Any) -> Any:
+def motion_of(y: Integrated) -> Integrated:
     """Returns a state without that of the switches."""
     return y[:-1] if y is not None and isinstance(y[-1], Switching) else y
 
 
 def located(
-    locate: Callable[[Any, tuple[bool, ...], Array, int], "Located"],
-    solver: Any,
-    term: Any,
+    locate: Callable[[diffrax.AbstractSolver, tuple[bool, ...], Array, int], "Located"],
+    solver: diffrax.AbstractSolver,
+    term: Term,
     ts: Array,
-    y0: Any,
-    args: Any,
-    jumps: Any,
-) -> tuple[Any, Landing | None, Any]:
+    y0: Integrated,
+    args: Arguments,
+    jumps: Array | None,
+) -> tuple[diffrax.AbstractSolver, Landing | None, Integrated]:
     """Returns a solver whose steps see where elements switch, and what ends them there.
 
     Also returns the start for this solver. Without switches and known times `jumps`,
@@ -279,9 +289,9 @@ class Located(diffrax.AbstractAdaptiveSolver):
         return jnp.maximum(switching.one_sided, at_once) + together
 
     def resolved(
-        self, term: Any, t: Array, y: Any, args: Any, switching: Switching,
-        sides: Array, changed: Array, made_jump: Any,
-    ) -> tuple[Any, Any]:  # fmt: skip
+        self, term: Term, t: Array, y: Integrated, args: Arguments,
+        switching: Switching, sides: Array, changed: Array, made_jump: Truth,
+    ) -> tuple[Integrated, PyTree]:  # fmt: skip
         """Returns state and modes at the start of a step, after an event there.
 
         The state moves on to the time of the event in the modes before, and back in
@@ -291,17 +301,21 @@ class Located(diffrax.AbstractAdaptiveSolver):
         return self.if_event(switching, made_jump, lambda: self.after_event(*here), y)
 
     def if_event(
-        self, switching: Switching, made_jump: Any, after_event: Any, y: Any
-    ) -> tuple[Any, Any]:
+        self,
+        switching: Switching,
+        made_jump: Truth,
+        after_event: Callable[[], tuple[Integrated, PyTree]],
+        y: Integrated,
+    ) -> tuple[Integrated, PyTree]:
         """Returns state and modes after an event, or as they are if there is none."""
         start = jnp.any(switching.modes.mode < 0)
         otherwise = lambda: (y, switching.modes)
         return jax.lax.cond(made_jump | start, after_event, otherwise)
 
     def after_event(
-        self, term: Any, t: Array, y: Any, args: Any, switching: Switching,
-        sides: Array, changed: Array, made_jump: Any,
-    ) -> tuple[Any, Any]:  # fmt: skip
+        self, term: Term, t: Array, y: Integrated, args: Arguments,
+        switching: Switching, sides: Array, changed: Array, made_jump: Truth,
+    ) -> tuple[Integrated, PyTree]:  # fmt: skip
         """Returns state and modes after an event at the start of a step."""
         before = switching.in_force(args)
         fired = changed[-self.guards :].reshape(-1, switching.modes.mode.size)
@@ -318,29 +332,29 @@ class Located(diffrax.AbstractAdaptiveSolver):
             there = moved_on(-late, after, term=term)
         return there, modes
 
-    def kept(self, held: Array, y1: Any, y0: Any) -> Any:
+    def kept(self, held: Array, y1: Integrated, y0: Integrated) -> Integrated:
         """Returns the end of a step, positions and rates of held joints as before."""
 
-        def still(new: Any, old: Any) -> Any:
+        def still(new: PyTree, old: PyTree) -> PyTree:
             if eqx.is_array(new):
                 return jnp.where(held, old, new)
             return tuple(jnp.where(*row) for row in zip(held, old, new))
 
         return (*map(still, y1[:2], y0[:2]), *y1[2:])
 
-    def lateness(self, arrival: Arrival, term: Any) -> Array:
+    def lateness(self, arrival: Arrival, term: Term) -> Array:
         """Returns how much later the event is: 0, with derivatives."""
         return lateness(arrival, term=term)
 
     def shifted(
         self,
-        term: Any,
+        term: Term,
         t: Array,
-        y: Any,
-        args: Any,
+        y: Integrated,
+        args: Arguments,
         switching: Switching,
-        made_jump: Any,
-    ) -> Any:
+        made_jump: Truth,
+    ) -> Integrated:
         """Returns the state at the start of a step, changed by a switch there."""
         if not self.derivatives:
             return y
@@ -378,24 +392,28 @@ class LocatedImplicit(Located, diffrax.AbstractImplicitSolver):
 class _WithModes(diffrax.AbstractLocalInterpolation):
     """The path of a step, with the modes in it as the last entry of its states."""
 
-    kind: Any = eqx.field(static=True)
-    t0: Any  # pyright: ignore[reportIncompatibleVariableOverride]
-    t1: Any  # pyright: ignore[reportIncompatibleVariableOverride]
-    path: Any
-    modes: Any
+    kind: Callable[..., diffrax.AbstractLocalInterpolation] = eqx.field(static=True)
+    t0: Array  # pyright: ignore[reportIncompatibleVariableOverride]
+    t1: Array  # pyright: ignore[reportIncompatibleVariableOverride]
+    path: dict[str, PyTree]
+    modes: PyTree
 
     def evaluate(self, t0, t1=None, left=True):
         path = self.kind(t0=self.t0, t1=self.t1, **self.path)
         return *path.evaluate(t0, t1, left), self.modes
 
 
-def _same(modes: Any, others: Any) -> Array:
+def _same(modes: PyTree, others: PyTree) -> Array:
     return (modes.mode == others.mode) & (modes.direction == others.direction)
 
 
 @eqx.filter_jit  # traced once, not at each use in a solve
 def _values(
-    term: Any, t0: Array, t1: Array, path: Any, args: Any
+    term: Term,
+    t0: Array,
+    t1: Array,
+    path: diffrax.AbstractLocalInterpolation,
+    args: Arguments,
 ) -> tuple[Array, Array]:
     """Returns the switching functions at the samples of a step, and at its checks."""
     shares = jnp.asarray([*SHARES, *CHECKS], t0.dtype)

@@ -2,12 +2,13 @@
 
 import dataclasses
 import functools
-from typing import Any
+from typing import Any, TypeVar
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
@@ -16,13 +17,14 @@ from ..base.user_warnings import warn
 from ..linkage.coordinates import State
 from ..linkage.linkage import Linkage, check_linkage, joints_of
 from ..linkage.topology import real_joints
-from .controllers import Scaled, Shortening, with_judge, with_pid
+from .controllers import Controller, Scaled, Shortening, with_judge, with_pid
 
+_T = TypeVar("_T")
 # Rounding keeps float32 from meeting a tighter relative or absolute tolerance.
 _TIGHTEST_SINGLE = 1e-6
 
 
-def of_precision(double: Any, single: Any) -> Any:
+def of_precision(double: _T, single: _T) -> _T:
     """Returns what serves the precision that JAX has now."""
     return double if jnp.result_type(float) == jnp.float64 else single
 
@@ -59,16 +61,18 @@ def at_tolerances(
     return _new_controller(rtol, atol)
 
 
-def _new_controller(rtol: Any, atol: Any) -> diffrax.PIDController:
+def _new_controller(
+    rtol: ArrayLike | None, atol: ArrayLike | None
+) -> diffrax.PIDController:
     return adaptive(_tolerance("rtol", rtol), _tolerance("atol", atol))
 
 
-def _tolerance(name: str, value: Any) -> Array:
+def _tolerance(name: str, value: ArrayLike | None) -> Array:
     """Returns a tolerance as an array, of which new values need no new trace."""
     return _constant(name, _default_tolerance() if value is None else value)
 
 
-def _constant(name: str, value: Any) -> Array:
+def _constant(name: str, value: ArrayLike) -> Array:
     array = real_array(name, value, (), above=0)
     # Else a derivative with respect to it would fail later, without this name.
     traced = is_traced(array)
@@ -77,13 +81,15 @@ def _constant(name: str, value: Any) -> Array:
 
 # Of a sweep of 16 arms, in 1.5 ms, another controller would take 0.15 ms.
 @functools.lru_cache
-def _known_controller(rtol: Any, atol: Any, dtype: Any) -> diffrax.PIDController:
+def _known_controller(
+    rtol: float | None, atol: float | None, dtype: np.dtype
+) -> diffrax.PIDController:
     del dtype  # that of the tolerances, a part of the cache's key
     with jax.ensure_compile_time_eval():  # no tracer is kept
         return _new_controller(rtol, atol)
 
 
-def with_longest(controller: Any, max_step: ArrayLike) -> Any:
+def with_longest(controller: Any, max_step: ArrayLike) -> Controller:
     """Returns the controller with a longest step [s]."""
     longest = _constant("max_step", max_step)
     return with_pid(lambda pid: dataclasses.replace(pid, dtmax=longest), controller)
@@ -107,7 +113,7 @@ def within_reach(
         rtol, atol = met(pid.rtol, "rtol"), met(pid.atol, "atol")
         return dataclasses.replace(pid, rtol=rtol, atol=atol)
 
-    def met(tolerance: Any, name: str) -> Any:
+    def met(tolerance: ArrayLike, name: str) -> ArrayLike:
         value = concrete(tolerance)
         if value is None or value >= _TIGHTEST_SINGLE / 2:
             return tolerance

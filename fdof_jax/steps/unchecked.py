@@ -23,10 +23,10 @@ from .controllers import Adaptive
 
 def diffeqsolve(
     *arguments: Any,
-    dt0: Any,
+    dt0: Array | float | None,
     saveat: diffrax.SaveAt,
     stepsize_controller: diffrax.AbstractStepSizeController,
-    max_steps: Any,
+    max_steps: Any,  # int | Array | None
     **keywords: Any,
 ) -> diffrax.Solution:
     """Calls `diffrax.diffeqsolve` without its checks of `dt0` and of output times.
@@ -92,8 +92,8 @@ class _Framed(diffrax.AbstractStepSizeController):
     """A controller that brings its first step size [s] and greatest number of steps."""
 
     controller: Any
-    dt0: Any
-    most: Any
+    dt0: Array | float | None
+    most: Array | None
 
     def wrap(self, direction):
         inner = self.controller.wrap(direction)

@@ -8,7 +8,7 @@ more of compilation (one core, jax 0.10.2).
 """
 
 from collections.abc import Sequence
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -39,7 +39,7 @@ State = PyTree  # of scalars
 Rates = Sequence[State]  # one per stage
 
 
-def _combine(coefficients: Sequence[Any] | np.ndarray, rates: Rates) -> PyTree:
+def _combine(coefficients: Sequence[Array] | np.ndarray, rates: Rates) -> PyTree:
     """Sums coefficients times rates, without terms that are known to be 0."""
     constants = isinstance(coefficients, np.ndarray)
     terms = [
@@ -95,7 +95,7 @@ class _Step(NamedTuple):
 
 
 @eqx.filter_jit  # traced once, not at each use in a solve
-def _step(term, t0, t1, y0, residue, args, f0) -> tuple[_Step, dict[str, Any]]:
+def _step(term, t0, t1, y0, residue, args, f0) -> tuple[_Step, dict[str, PyTree]]:
     inner, h = term.term, term.contr(t0, t1)  # within a wrapper of diffrax
     times = t0 + (t1 - t0) * jnp.asarray(NODES, t0.dtype)
     schedule = jax.vmap(inner.schedule, in_axes=(0, None))(times, args)

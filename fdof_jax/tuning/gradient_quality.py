@@ -126,7 +126,7 @@ def _times(scene: Scene) -> dict[str, Array]:
     """The single numbers that the scene's elements declare in seconds, by name."""
     times = {}
 
-    def collect(part: Any, place: str) -> None:
+    def collect(part: object, place: str) -> None:
         # The start is bound to a prescribed motion, and would have to change with it.
         if not isinstance(part, eqx.Module) or isinstance(part, PrescribedMotion):
             return
@@ -143,12 +143,12 @@ def _times(scene: Scene) -> dict[str, Array]:
     return times
 
 
-def _with_times(scene: Scene, times: Any) -> Scene:
+def _with_times(scene: Scene, times: Array) -> Scene:
     where = lambda scene: list(_times(scene).values())
     return eqx.tree_at(where, scene, list(times)) if len(times) else scene
 
 
-def _scene_at(scene: Scene, tuned: Any, z: Any) -> Scene:
+def _scene_at(scene: Scene, tuned: Array | np.ndarray, z: Array | np.ndarray) -> Scene:
     """The scene with gains of the logarithms in `z`, which its times follow."""
     logs, times = jnp.split(jnp.asarray(z), [tuned.size])
     return _with_times(with_log_gains(scene, logs, tuned), times)
@@ -175,7 +175,9 @@ def _motion(scene: Scene) -> Solution:
     return simulate(scene, np.linspace(0, float(scene.t1), SAMPLES), throw=False)
 
 
-def _slopes(scene: Scene, tuned: Any, z: np.ndarray, steps: Any) -> np.ndarray:
+def _slopes(
+    scene: Scene, tuned: np.ndarray, z: np.ndarray, steps: np.ndarray
+) -> np.ndarray:
     """Derivatives of the mean squared error by extrapolated differences."""
 
     def loss(z: np.ndarray) -> float:

@@ -9,10 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jaxtyping import Float
+from numpy.typing import ArrayLike
 
 from ..analysis.tracking import relative_demands, tip_deviation
 from ..base.checks import function, instance, is_traced, real_array, refusal
 from ..control.pd import PDController
+from ..forces.element import Element
 from ..linkage.fields import Part, Values, field
 from ..linkage.linkage import without_fixed
 from ..references.reference import reference_motion, reference_of
@@ -39,7 +41,7 @@ def controller_of(scene: Scene) -> PDController:
     return found[0]
 
 
-def with_controller(scene: Scene, element: Any) -> Scene:
+def with_controller(scene: Scene, element: Element) -> Scene:
     """The scene with another force element in place of its controller."""
     controller = controller_of(scene)
     forces = (element if force is controller else force for force in scene.forces)
@@ -58,7 +60,7 @@ def tracked_task(scene: Scene, name: str = "scene") -> Any:
     return task
 
 
-def gains_of(scene: Scene) -> Any:
+def gains_of(scene: Scene) -> Array:
     """kp and kd of a scene's controller (2, n), 0 at fixed pairs."""
     controller = controller_of(scene)
     gains = controller.kp, controller.kd
@@ -72,7 +74,7 @@ def with_gains(scene: Scene, gains: Array) -> Scene:
     return with_controller(scene, changed)
 
 
-def _check_motion(scene: Any, solution: Any) -> None:
+def _check_motion(scene: Scene, solution: Solution) -> None:
     instance("scene", scene, Scene)
     instance("solution", solution, Solution)
     check_joints("solution", solution, scene.linkage)
@@ -214,7 +216,7 @@ class GainBox(NamedTuple):
         return np.clip(gains, self.lower, self.upper)
 
 
-def with_log_gains(scene: Scene, z: Array, tuned: Array) -> Scene:
+def with_log_gains(scene: Scene, z: Array, tuned: Array | np.ndarray) -> Scene:
     """The scene with the gains whose logarithms are `z` (2n,), where `tuned` (2, n)."""
     return with_gains(scene, jnp.where(tuned, jnp.exp(z.reshape(tuned.shape)), 0))
 
@@ -267,7 +269,7 @@ def evaluate_gains(z: Array, problem: tuple[Scene, Loss, Array]) -> Evaluation:
     )
 
 
-def check_tuned(name: str, scene: Any, loss: Any = tip_errors) -> None:
+def check_tuned(name: str, scene: Scene, loss: Loss = tip_errors) -> None:
     """Raises ValueError unless the scene can be tuned by the loss."""
     instance(name, scene, Scene)
     function("loss", loss)
@@ -288,12 +290,14 @@ def check_tuned(name: str, scene: Any, loss: Any = tip_errors) -> None:
             )
 
 
-def bounds_of(scene: Scene, factor: Any, bounds: Any) -> GainBox:
+def bounds_of(
+    scene: Scene, factor: ArrayLike | None, bounds: tuple[ArrayLike, ArrayLike] | None
+) -> GainBox:
     """Checks `factor` and `bounds` of `tune`; gains of 0 stay 0."""
     start = np.asarray(gains_of(scene))
     if bounds is None:
-        factor = real_array("factor", 4.0 if factor is None else factor, (), above=1)
-        return GainBox(start, start / float(factor), start * float(factor))
+        given = real_array("factor", 4.0 if factor is None else factor, (), above=1)
+        return GainBox(start, start / float(given), start * float(given))
     if factor is not None:
         raise refusal("factor", "none beside bounds", factor)
     if not isinstance(bounds, tuple | list | np.ndarray) or len(bounds) != 2:

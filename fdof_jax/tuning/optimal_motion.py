@@ -1,7 +1,6 @@
 """Open-loop efforts that track a task best: a bound for any controller."""
 
 from collections.abc import Callable
-from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -16,6 +15,7 @@ from ..base.report import Report
 from ..control.model_based import ComputedTorque
 from ..forces.joints import EffortHistory
 from ..linkage.linkage import joints_of, without_fixed
+from ..references.task import TipReference
 from ..search.bounded import Evaluation, Run, best_of, minimise
 from ..search.lanes import Lanes, check_motion, sum_of_squares
 from ..simulation.efforts import joint_efforts
@@ -94,7 +94,7 @@ class OptimalMotion(Report):
 
 
 @eqx.filter_jit
-def _deviations(scene: Scene, task: Any, solution: Solution) -> Array:
+def _deviations(scene: Scene, task: TipReference, solution: Solution) -> Array:
     """Tip errors whose squares sum to their mean, by the trapezium rule."""
     gaps = jnp.diff(solution.ts)
     shares = jnp.concatenate([gaps[:1], gaps[1:] + gaps[:-1], gaps[-1:]]) / 2
@@ -140,7 +140,7 @@ def optimal_efforts(
     knots: int = 41,
     effort_rate: ArrayLike = 1e-9,
     max_steps: int = 400,
-    report: Callable[[str], Any] | None = None,
+    report: Callable[[str], object] | None = None,
 ) -> OptimalMotion:
     """Computes the efforts within a controller's limits that track its path best.
 

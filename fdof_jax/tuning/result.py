@@ -71,7 +71,7 @@ class TuneResult(Report):
     message: str
     member_loss: Float[np.ndarray, " member"]
     member_tip_error: Float[np.ndarray, " member"]
-    settings: dict[str, Any]
+    settings: Mapping[str, object]
 
     @property
     def _box(self) -> GainBox:
@@ -246,7 +246,7 @@ def _history(run: Run, box: GainBox) -> History:
 
 
 def result_of(
-    scene: Scene, runs: list[Run], box: GainBox, settings: dict[str, Any]
+    scene: Scene, runs: list[Run], box: GainBox, settings: Mapping[str, object]
 ) -> TuneResult:
     """The result of one scene's runs, taken from the best."""
     run, histories = best_of(runs), [_history(run, box) for run in runs]

@@ -32,7 +32,7 @@ _ENOUGH = 1e-4  # relative decrease of the loss; half of it in the rms error
 _ORDERS = {"mean": 1, "worst": 32}
 
 
-def _members(ensemble: Any, scene: Scene, losses: Sequence[Any]) -> list[Scene]:
+def _members(ensemble: Scene, scene: Scene, losses: Sequence[Loss]) -> list[Scene]:
     """Checks the argument `ensemble` of `tune`, and returns its scenes."""
     alike = lambda s: (joint_names(s.linkage), type(controller_of(s)).__name__)
     members = unstacked("ensemble", ensemble)
@@ -46,7 +46,7 @@ def _members(ensemble: Any, scene: Scene, losses: Sequence[Any]) -> list[Scene]:
 
 
 def _search(
-    scenes: Sequence[Scene], losses: Sequence[Any], *, factor, bounds, ensemble, over,
+    scenes: Sequence[Scene], losses: Sequence[Loss], *, factor, bounds, ensemble, over,
     method, starts, seed, max_steps, report,
 ) -> list[TuneResult]:  # fmt: skip
     """One result per scene and loss; the keywords are those of `tune`."""
@@ -127,7 +127,7 @@ def tune(
     starts: int = 1,
     seed: int = 0,
     max_steps: int = 50,
-    report: Callable[[str], Any] | None = None,
+    report: Callable[[str], object] | None = None,
 ) -> TuneResult:
     """Minimises a scene's loss in the gains of its PD controller, within bounds.
 

@@ -224,7 +224,7 @@ def _search(
     lanes: Lanes,
     box: GainBox,
     max_steps: int,
-    report: Callable[[str], Any] | None,
+    report: Callable[[str], object] | None,
 ) -> tuple[np.ndarray, float, str]:
     """Returns the best log-gains (2n,), their loss, and why the search stopped.
 
@@ -354,7 +354,7 @@ def tune_within(
     factor: ArrayLike | None = None,
     bounds: tuple[ArrayLike, ArrayLike] | None = None,
     max_steps: int = 50,
-    report: Callable[[str], Any] | None = None,
+    report: Callable[[str], object] | None = None,
 ) -> TunedWithin:
     """Minimises a scene's loss in its gains, within limits on how it responds.
 
