@@ -52,7 +52,7 @@ def _longer_and_longer(
     keywords |= dict(method="levenberg-marquardt", describe=squares_so_far)
     z, low, high = unknowns.box(len(rows))
 
-    def until(share: float) -> Lanes:
+    def lanes_until(share: float) -> Lanes:
         """The lanes with weights for readings up to this share of the time only."""
 
         def shortened(problem: Problem) -> Problem:
@@ -62,16 +62,16 @@ def _longer_and_longer(
 
         return Lanes(lane, [[shortened(problem) for problem in row] for row in rows])
 
-    for share, longer in zip(_SHARES, _SHARES[1:]):
-        runs = minimise(until(share), z, low, high, enough=_ENOUGH_EARLY, **keywords)
+    *stages, whole = map(lanes_until, _SHARES)
+    for stage, longer in zip(stages, [*stages[1:], whole]):
+        runs = minimise(stage, z, low, high, enough=_ENOUGH_EARLY, **keywords)
         # Over a short time, noise may lead away from the parameters, or to where one of
         # them has no effect: to a cable that never becomes taut.
-        better, every = until(longer), np.arange(len(rows))
-        found = np.stack([run.z for run in runs])
-        there, here = better(found, every), better(z, every)
+        every, found = np.arange(len(rows)), np.stack([run.z for run in runs])
+        there, here = longer(found, every), longer(z, every)
         gain = (there.loss < here.loss) & ~(_silent(there) & ~_silent(here)).any(axis=1)
         z = np.where(gain[:, None], found, z)
-    return minimise(until(1), z, low, high, enough=_ENOUGH, **keywords)
+    return minimise(whole, z, low, high, enough=_ENOUGH, **keywords)
 
 
 def _unseen(
@@ -123,11 +123,11 @@ def _search(
         )
     runs = _longer_and_longer(rows, unknowns, **search)
     failed = [row for run, row in zip(runs, rows) if run.failed]
-    for problem in failed[0] if failed else ():
-        scene = problem.scene_at(unknowns.at(unknowns.start / unknowns.scale))
-        check_motion("scene_at(...)", scene, problem.ts)
     if failed:
-        expected = "parameters at which the scene can be simulated over ts"
+        for problem in failed[0]:
+            scene = problem.scene_at(unknowns.at(unknowns.start / unknowns.scale))
+            check_motion("scene_at(...)", scene, problem.ts)
+        expected = "parameters at which the motion and its derivatives are finite"
         raise refusal("start", expected, start)
     judged = [None] * len(runs)
     if unseen:
@@ -181,8 +181,8 @@ def fit(
       noise is estimated from the residuals: for standard errors from all of them, for
       the verdict from changes between successive ones, as errors of a model change
       slowly. Readings that can only be right, as of a fixed pair, do not count.
-    - `validate`: (scene_at, observed) of recordings at the same times that the fit must
-      not see, one or a list of them; the result compares their residuals with the
+    - `validate`: (scene_at, observed) of recordings, at the same times, that are kept
+      from the fit, one or a list of them; the result compares their residuals with the
       noise. Best are motions unlike those that are fitted.
     - `bounds`: (least, greatest) of parameters by name.
     - `scale`: sizes of parameters by name; a step changes a parameter by at most two

@@ -16,7 +16,7 @@ from ..base.checks import shown
 from ..forces.element import Element, OwnStates
 from ..forces.joints import EffortHistory
 from ..linkage.linkage import Linkage, possible, without_fixed
-from ..steps.controllers import Controller, with_judge
+from ..steps.controllers import Controller, with_error_control
 from ..steps.derivative_control import OfLinearised, OfTangents
 from ..steps.dopri8 import Integrated, ScheduledDopri8, ScheduledTerm, constant
 from ..steps.landing import end_of_run
@@ -89,9 +89,8 @@ def integrate(
     """Integrates one motion, by default with `LoopedDopri8`.
 
     `derivatives`: whether steps are as short as accurate derivatives need.
+    `padded`: for a plain call; the last time may be repeated.
     `tangents`: whether these are the tangents of this call, along the axis `TANGENTS`.
-    `padded`: for a plain call, which has checked its inputs; the last time may be
-    repeated.
     """
     problem = _prepare(inputs, derivatives, padded)
     control = _control(problem, keywords, derivatives, tangents)
@@ -153,19 +152,20 @@ def _control(
     implicit = isinstance(solver, diffrax.AbstractImplicitSolver)
     kind: Any = LocatedImplicit if implicit else Located
     locate = lambda *settings: kind(*settings, derivatives)
-    seeing, landing, start = located(locate, solver, term, ts, start, args, jumps)
-    scheduled = isinstance(solver, ScheduledDopri8)  # it checks the health itself
-    judge = None
+    wrapped, landing, start = located(locate, solver, term, ts, start, args, jumps)
+    checks_health = isinstance(solver, ScheduledDopri8)
+    of_derivatives = None
     if tangents:
-        judge = OfTangents()
+        of_derivatives = OfTangents()
     # With tolerances of one's own, an implicit solver is for modes too fast to resolve,
     # which a probe would resolve.
     elif derivatives and not (implicit and own_controller is not None):
         has_tableau = isinstance(solver, ScheduledDopri8 | diffrax.AbstractRungeKutta)
         tableau: Any = solver.tableau if has_tableau else diffrax.Heun.tableau
-        judge = OfLinearised(term, tableau)
-    control = lambda steps: StepControl(steps, term, not scheduled, landing, judge)  # pyright: ignore[reportCallIssue]
-    return _Control(start, seeing, with_judge(control, steps), jumps)
+        of_derivatives = OfLinearised(term, tableau)
+    settings = term, not checks_health, landing, of_derivatives
+    control = lambda steps: StepControl(steps, *settings)  # pyright: ignore[reportCallIssue]
+    return _Control(start, wrapped, with_error_control(control, steps), jumps)
 
 
 def _solve(problem: _Problem, control: _Control, keywords) -> diffrax.Solution:
@@ -200,20 +200,6 @@ def _solve(problem: _Problem, control: _Control, keywords) -> diffrax.Solution:
         )
 
 
-def last_switched(inputs: Inputs, keywords: dict[str, Any]) -> Array:
-    """Returns which switching functions switched where a motion ended, (switch,).
-
-    In the order of the elements; guards of modes are the last ones.
-    """
-    keywords = keywords | {"adjoint": diffrax.ForwardMode()}
-    problem = _prepare(inputs, derivatives=False, padded=False)
-    control = _control(problem, keywords, derivatives=False, tangents=False)
-    ends = _solve(problem, control, keywords).ys
-    assert ends is not None  # because of saveat
-    switching = ends[1][1]
-    return (switching.after != switching.sides)[0]
-
-
 def _read(inputs: Inputs, problem: _Problem, solve: diffrax.Solution) -> Solution:
     """Reads joint states, statistics and the result."""
     linkage, state0, times, *_ = inputs
@@ -244,7 +230,7 @@ def _read(inputs: Inputs, problem: _Problem, solve: diffrax.Solution) -> Solutio
         loss = largest_loss(solve.controller_state)
         stats["accuracy"] = jnp.finfo(q.dtype).eps * loss
     stats |= switching_facts(*switches)
-    result = _judged(valid, solve.result, q, qd)
+    result = _result(valid, solve.result, q, qd)
     solution = Solution(times, q, qd, stats, result, jax.tree.map(shown_at, own))
     if not modes:
         return solution
@@ -256,6 +242,20 @@ def _read(inputs: Inputs, problem: _Problem, solve: diffrax.Solution) -> Solutio
     holding = shown_at(mode), shown_at(taken), events
     where = lambda s: (s.modes, s.taken, s.events)
     return eqx.tree_at(where, solution, holding, is_leaf=lambda x: x is None)
+
+
+def last_switched(inputs: Inputs, keywords: dict[str, Any]) -> Array:
+    """Returns which switching functions switched where a motion ended, (switch,).
+
+    In the order of the elements; guards of modes are the last ones.
+    """
+    keywords = keywords | {"adjoint": diffrax.ForwardMode()}
+    problem = _prepare(inputs, derivatives=False, padded=False)
+    control = _control(problem, keywords, derivatives=False, tangents=False)
+    ends = _solve(problem, control, keywords).ys
+    assert ends is not None  # because of saveat
+    switching = ends[1][1]
+    return (switching.after != switching.sides)[0]
 
 
 def _differentiable(
@@ -290,7 +290,7 @@ def faults(inputs: Inputs, times: bool = True) -> list[Array]:
     return [~fine for fine in (increasing, start, possible(linkage), *fit)]
 
 
-def _judged(
+def _result(
     valid: Array, result: diffrax.RESULTS, q: Array, qd: Array
 ) -> diffrax.RESULTS:
     """Returns the result of a solve: not finite for invalid inputs and for NaN."""

@@ -30,7 +30,7 @@ def with_pid(
     )
 
 
-def with_judge(change: Callable[..., Judging], controller: Judging) -> Judging:
+def with_error_control(change: Callable[..., Judging], controller: Judging) -> Judging:
     """Returns a controller with `change` applied to the one that judges errors."""
 
     def judges(node: object) -> bool:

@@ -10,11 +10,12 @@ from jax import Array
 from ..linkage.fields import has_come
 from .dopri8 import Arguments, Integrated, constant
 
-# So many landings are chatter within a multiple of the distance that rounding keeps
-# them apart: this power of the unit of rounding (3e5 in float64). Chatter soon is as
-# fast as rounding lets it be; joints that bounce to rest, in however long a run, or
-# that throw each other at their stops, are slower.
-_MOST_LANDINGS, _CHATTER = 100, -0.35
+# More landings than these within the time `pace` are chatter. It is the distance that
+# rounding keeps them apart, times this power of the unit of rounding (3e5 in float64).
+# Chatter soon lands at that distance; joints that bounce to rest, in however long a
+# run, or that throw each other at their stops, are slower.
+_MOST_LANDINGS = 100
+_PACE = -0.35
 # After so many tries the switching function itself is taken to jump, and the jump is
 # located by halving the step.
 _MOST_TRIES = 6
@@ -129,7 +130,7 @@ class Landing(eqx.Module):
         target = jnp.where(cut, constant(end), jnp.inf)
         crossing, none = jnp.full_like(target, -jnp.inf), jnp.zeros((), int)
         since = constant(jnp.asarray(t0))
-        pace = self.apart * jnp.finfo(target.dtype).eps ** _CHATTER
+        pace = self.apart * jnp.finfo(target.dtype).eps ** _PACE
         return end, _Landing(
             target, gap, length, crossing, none, none, since, pace, last
         )
@@ -177,6 +178,7 @@ class Landing(eqx.Module):
         # The error of a step that was cut short says little about the next one.
         short = (crossed | unsure) & aimed | landed
         length = jnp.where(short, state.resumed, next1 - next0)
+        # With the derivatives of the end, which `end` and `next0` lack.
         next_t0 = jnp.where(keep, t1 + (next0 - end), t0)
         next_t0 = next_t0 + jnp.where(landed, state.gap, 0)
         next_t1 = jnp.where(missed, crossing, next_t0 + length)

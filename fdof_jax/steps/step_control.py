@@ -61,7 +61,7 @@ class StepControl(Adaptive):
     term: ScheduledTerm | None
     watches: bool = eqx.field(static=True)
     landing: Landing | None
-    judge: OfTangents | OfLinearised | None
+    derivatives: OfTangents | OfLinearised | None
 
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):  # pyright: ignore[reportIncompatibleMethodOverride]
         if self.landing is not None:
@@ -70,7 +70,7 @@ class StepControl(Adaptive):
         first, inner = constant(
             self.controller.init(*constant(start), func, error_order)
         )
-        probe = None if self.judge is None else self.judge.start(y0)
+        probe = None if self.derivatives is None else self.derivatives.start(y0)
         loss, landing = jnp.zeros_like(first), None
         if self.landing is not None:
             first, landing = self.landing.start(t0, t1, first)
@@ -79,13 +79,13 @@ class StepControl(Adaptive):
     def adapt_step_size(  # pyright: ignore[reportIncompatibleMethodOverride]
         self, t0, t1, y0, y1, args, y_error, error_order, state
     ):
-        failure = diffrax.RESULTS.successful
+        health_result = diffrax.RESULTS.successful
         if self.term is not None and self.watches:
-            y1, y_error, failure = self._healthy(t0, t1, y0, y1, args, y_error)
+            y1, y_error, health_result = self._healthy(t0, t1, y0, y1, args, y_error)
         ratio, probe = None, None
-        if self.judge is not None:
+        if self.derivatives is not None:
             taken = Step(t0, t1, y0, y1, args)
-            ratio, probe = self.judge(taken, y_error, state.probe, self.rtol)
+            ratio, probe = self.derivatives(taken, y_error, state.probe, self.rtol)
         step: Any = *map(motion_of, (y0, y1)), with_change(y_error, motion_of)
         controller = self.controller
         if isinstance(controller, Scaled):
@@ -113,13 +113,13 @@ class StepControl(Adaptive):
         if_kept = lambda new, old: jax.tree.map(
             lambda new, old: jnp.where(step.keep, new, old), new, old
         )
-        if self.judge is not None:
-            jumped, fresh = jnp.array(step.jumped), self.judge.start(y1)
+        if self.derivatives is not None:
+            jumped, fresh = jnp.array(step.jumped), self.derivatives.start(y1)
             probe = jax.tree.map(lambda a, b: jnp.where(jumped, a, b), fresh, probe)
             probe = if_kept(probe, state.probe)
         loss = if_kept(jnp.maximum(state.loss, loss), state.loss)
-        failed = failure != diffrax.RESULTS.successful
-        result = diffrax.RESULTS.where(failed, failure, step.result)
+        failed = health_result != diffrax.RESULTS.successful
+        result = diffrax.RESULTS.where(failed, health_result, step.result)
         state = _State(inner, landing, probe, loss)
         return *step[:4], state, result
 

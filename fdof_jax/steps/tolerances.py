@@ -17,7 +17,7 @@ from ..base.user_warnings import warn
 from ..linkage.coordinates import State
 from ..linkage.linkage import Linkage, check_linkage, joints_of
 from ..linkage.topology import real_joints
-from .controllers import Controller, Scaled, Shortening, with_judge, with_pid
+from .controllers import Controller, Scaled, Shortening, with_error_control, with_pid
 
 _T = TypeVar("_T")
 # Rounding keeps float32 from meeting a tighter relative or absolute tolerance.
@@ -172,4 +172,4 @@ def scale_tolerances(
         )
         q = jnp.where(jnp.stack(real_joints(linkage.ef)), 1, size)
         qd = q / time
-    return with_judge(lambda judge: Scaled(judge, (q, qd)), controller)  # pyright: ignore[reportCallIssue]
+    return with_error_control(lambda c: Scaled(c, (q, qd)), controller)  # pyright: ignore[reportCallIssue]
