@@ -45,7 +45,7 @@ _NEAR = 0.575
 # A function began on its zero if its values before were below this share of its size,
 # also a power of the unit of rounding.
 _ON_ZERO = 0.625
-# What happens within so many of these distances may be passed over.
+# In a step of so many of these distances at most, something may be passed over.
 _BRIEF = 10
 
 
@@ -64,8 +64,8 @@ class Switching(NamedTuple):
     - `length`: that of the step that ended here [s].
     - `ahead`: 1 if a function that switches here is yet to reach its zero, or else 0.
     - `passed`: number of switches up to here.
-    - `one_sided`: number of places up to here where derivatives may be (see `Located`);
-      None if nothing jumps at switches.
+    - `one_sided`: number of places up to here where derivatives may hold on one side
+      only (see `Located`); None if nothing jumps at switches.
     - `grazing`, `grazing_here`: how near to grazing a crossing came so far, and one
       here; 0 if none (see `at_end`).
     - `modes`: those of the joints (see `ScheduledTerm`), None if elements hold none.
@@ -164,7 +164,8 @@ class Located(diffrax.AbstractAdaptiveSolver):
     """A solver whose steps keep the branches of their start and report a change.
 
     Where efforts jump at a switch, derivatives may differ between the sides of motions
-    that start on the switch, or that meet it together with another.
+    that start on the switch, or that meet it together with another. What `step` calls
+    is another thing for a motion with its derivatives beside it (see `sensitivities`).
     """
 
     solver: Any
@@ -221,7 +222,8 @@ class Located(diffrax.AbstractAdaptiveSolver):
         )
         path = self.solver.interpolation_cls(t0=t0, t1=t1, **dense)
         if self.guards:
-            # What is held does not even catch up with rounding errors of before.
+            # Joints that are held keep their values: what the compensated sum adds of
+            # rounding errors of before would still move them.
             y1 = self.kept(modes.held, y1, y0)
             dense = dict(path=dense, modes=modes)
 
@@ -262,9 +264,9 @@ class Located(diffrax.AbstractAdaptiveSolver):
             grazing_here=grazing,
             modes=modes,
         )
-        still = jax.tree.map(jnp.zeros_like, new)
         if error is not None:  # None: a method without an estimate
-            error = with_change(error, lambda error: (*error, still))
+            none = jax.tree.map(jnp.zeros_like, new)
+            error = with_change(error, lambda error: (*error, none))
         return (*y1, new), error, dense, solver_state, result
 
     def needed(self, count: int, jumps: Array | None) -> bool:
@@ -359,16 +361,16 @@ class Located(diffrax.AbstractAdaptiveSolver):
         if not self.derivatives:
             return y
         before, after = switching.sides, switching.after
-        passed = [before, after]
+        in_turn = [before, after]
         # Kinks change second derivatives alone.
         if any(self.jumping) and before.size > 1:
-            passed.insert(1, jnp.where(first_of(after != before), after, before))
+            in_turn.insert(1, jnp.where(first_of(after != before), after, before))
         # A known time may be here too, just before the zeros or just after them.
         t = jnp.where(switching.ahead > 0, t, switching.until)
-        # In a step of no length nothing comes to its zero: it has jumped, and when that
-        # was is known.
+        # In a step of no length no function comes to its zero gradually: it jumped, at
+        # a known time.
         arrived = made_jump & (switching.length > 0)
-        for before, after in zip(passed, passed[1:]):
+        for before, after in zip(in_turn, in_turn[1:]):
             here = args._replace(sides=before)
             arrival = Arrival(t, y, here, (before != after) & arrived)
             moment = Moment(t, y, args, before, after, jnp.array(made_jump))
