@@ -21,6 +21,8 @@ from .linearization import checked, loop_matrices
 if TYPE_CHECKING:
     import control
 
+Loop = Any  # a `control.StateSpace`, whose own types are too wide
+
 _LARGEST_MARGIN = 1e6  # factors beyond belong to zeros at infinity or poles at rest
 _EXACT = 1e-8  # to this part a peak is known
 BANDWIDTH = 10 ** (-3 / 20)  # -3 dB
@@ -103,7 +105,7 @@ def closed_loop(
 def _loops(
     linkage: Linkage, q: ArrayLike, controller: Callable, joint: int, forces: Forces,
     t: ArrayLike,
-) -> tuple[Any, Any]:  # fmt: skip
+) -> tuple[Loop, Loop]:  # fmt: skip
     import control
 
     check_linkage(linkage)
@@ -183,7 +185,7 @@ def margins(loop: "control.StateSpace") -> Margins:
     import control
 
     instance("loop", loop, control.StateSpace)
-    closed: Any = loop.feedback()
+    closed: Loop = loop.feedback()
     if closed.poles().real.max() >= 0:
         return Margins(*[np.nan] * 5)
     unit = _unit(closed)
@@ -232,7 +234,7 @@ def _unit(system: "control.StateSpace") -> float:
     return float(np.exp(np.log(rates[rates > 0]).mean()))
 
 
-def _slower(system: Any, unit: float) -> Any:
+def _slower(system: Loop, unit: float) -> Loop:
     """Returns a system in units of time in which its poles are around 1.
 
     Polynomials of python-control else overflow: 11 of 58 loops of eight joints with
@@ -251,7 +253,7 @@ def _crossings(system: "control.StateSpace") -> list[float]:
         return control.stability_margins(system, True)[4].tolist()
 
 
-def _modulus_margin(loop: Any) -> float:
+def _modulus_margin(loop: Loop) -> float:
     """Returns the least |1 + L| of a loop that is stable when closed.
 
     Each pass looks between the frequencies at which 1 / |1 + L| passes its largest
@@ -262,7 +264,7 @@ def _modulus_margin(loop: Any) -> float:
     """
     import control
 
-    sensitivity: Any = control.feedback(1, loop)
+    sensitivity: Loop = control.feedback(1, loop)
     size = lambda w: np.abs(sensitivity(1j * w))
     poles = sensitivity.poles()
     tried = np.append(np.abs(poles), np.abs(poles.imag))

@@ -37,7 +37,7 @@ from ..references.reference import Reference
 from ..simulation.simulate import simulate
 from ..simulation.solution import Solution
 from .linearization import holding_efforts
-from .loops import BANDWIDTH, bandwidth, closed_loop, margins, open_loop
+from .loops import BANDWIDTH, Loop, bandwidth, closed_loop, margins, open_loop
 from .measures import SETTLED, step_measures
 from .tracking import relative_demands
 
@@ -193,7 +193,7 @@ def step_and_sine(
         keywords: Any = dict(own0=own, throw=False, max_steps=_STEPS)
         return simulate(linkage, start, ts, (acting, *forces), **keywords)
 
-    def responses_at(here: ArrayLike) -> tuple[list[Any], np.ndarray]:
+    def responses_at(here: ArrayLike) -> tuple[list[Loop], np.ndarray]:
         calls = ((linkage, here, with_probe(q), k + 1, forces) for k in moving)
         loops = [closed_loop(*call) for call in calls]
         return loops, np.array(list(map(bandwidth, loops)))

@@ -26,11 +26,14 @@ from ..forces.element import elements
 from ..forces.holders import holders
 from ..linkage.topology import real_joints
 from ..simulation.field import element_effort
+from ..simulation.integrate import Settings
 from ..simulation.scene import Scene
 from ..simulation.simulate import simulate
 from ..simulation.solution import Solution
 from ..steps.controllers import Abreast, by_square_roots
 from ..steps.tolerances import default_controller
+
+Device = Any  # a `jax.Device`, or None for the default one
 
 # With so few lanes a step takes hardly longer than with one, so that slow members do
 # not pay for another program.
@@ -48,7 +51,7 @@ class Common(NamedTuple):
 
     shared: PyTree  # of a `Batch`
     ts: Array
-    settings: dict
+    settings: Settings
     reduce: Callable[[Scene, Solution], PyTree]
 
 
@@ -59,7 +62,7 @@ class Job(NamedTuple):
     common: Common
     size: int
     chunk: int
-    devices: list[Any]
+    devices: list[Device]
 
 
 class Outcome(NamedTuple):
@@ -159,7 +162,7 @@ def _jitted(form: Form) -> jax.stages.Wrapped:
 
 
 @functools.lru_cache(maxsize=64)
-def _lowered(form: Form, device: Any) -> jax.stages.Lowered:
+def _lowered(form: Form, device: Device) -> jax.stages.Lowered:
     """Traces the program of this form for a device, or for the default one (None)."""
     arguments = list(form.lanes), list(filter(_is_kind, form.leaves))
     if device is not None:
@@ -248,7 +251,7 @@ def _cores() -> int:
 
 
 @contextlib.contextmanager
-def devices_outside_mesh() -> Iterator[list[Any]]:
+def devices_outside_mesh() -> Iterator[list[Device]]:
     """Yields this process's devices, of the mesh that is set or all; None if just one.
 
     Meanwhile no mesh is set: its devices would share each program. Before 0.8.1 JAX

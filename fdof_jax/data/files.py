@@ -14,6 +14,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from .. import __version__
 from ..base.checks import is_traced, numpy_array, plain, refusal, shown
@@ -25,6 +26,8 @@ from ..linkage.topology import letters
 from ..simulation.sampled import Motion
 from ..simulation.scene import is_number, stacked
 
+Json = Any  # numbers, texts, and lists and dicts of such
+Classes = Sequence[type | eqx.Module]  # modules with numbers of the same shapes
 _PACKAGE = __name__.partition(".")[0]
 # Where classes are looked up. The package comes last, as it warns of names in rooms;
 # the states of drives and the histories of tuning are in no room's list.
@@ -40,7 +43,7 @@ _KNOWN = "a known value: save outside of jit, vmap and grad"
 _MEANT = ValueError, TypeError, LookupError, AttributeError, ArithmeticError
 
 
-def save(path: str | os.PathLike, tree: Any) -> None:
+def save(path: str | os.PathLike, tree: PyTree) -> None:
     """Writes scenes, elements, results or numbers to a file of JSON, for `load`.
 
     An object stands by its public name and the arguments of its constructor, so that
@@ -97,7 +100,7 @@ def save(path: str | os.PathLike, tree: Any) -> None:
         file.write(text.encode() + b"\n")
 
 
-def load(path: str | os.PathLike, classes: Sequence[Any] = ()) -> Any:
+def load(path: str | os.PathLike, classes: Classes = ()) -> Any:
     """Loads what `save` or a person wrote to a file.
 
     Objects are made by their constructors, which check their arguments. Nothing else is
@@ -133,7 +136,7 @@ def load(path: str | os.PathLike, classes: Sequence[Any] = ()) -> Any:
         raise ValueError(f"{file}: {error}") from error
 
 
-def _public(name: str) -> Any:
+def _public(name: str) -> type | None:
     """Returns the library's class of that name, if its instances can be saved."""
     for place in (*_PLACES, ""):
         module = importlib.import_module(f"{_PACKAGE}.{place}".rstrip("."))
@@ -149,13 +152,13 @@ def _is_record(kind: type) -> bool:
     return fields and not issubclass(kind, Motion)
 
 
-def _is_number(node: Any) -> bool:
+def _is_number(node: Json) -> bool:
     return (
         isinstance(node, int | float) or isinstance(node, str) and node in _NOT_FINITE
     )
 
 
-def _begins_with_number(items: Any) -> bool:
+def _begins_with_number(items: Json) -> bool:
     while isinstance(items, list) and items:
         items = items[0]
     return _is_number(items)
@@ -164,7 +167,7 @@ def _begins_with_number(items: Any) -> bool:
 # From the tree to JSON
 
 
-def _node(place: str, value: Any) -> Any:
+def _node(place: str, value: PyTree) -> Json:
     kind = type(value)
     if value is None or kind in (bool, int) or kind is str and value not in _NOT_FINITE:
         return value
@@ -187,7 +190,7 @@ def _node(place: str, value: Any) -> Any:
     return _object(place, value)
 
 
-def _numbers(place: str, value: Any) -> Any:
+def _numbers(place: str, value: object) -> Json:
     if is_traced(value):
         raise refusal(place, _KNOWN, value)
     try:
@@ -204,7 +207,7 @@ def _numbers(place: str, value: Any) -> Any:
     return array.tolist()
 
 
-def _object(place: str, value: Any) -> dict[str, Any]:
+def _object(place: str, value: Any) -> dict[str, Json]:
     kind, name = type(value), type(value).__name__
     public = _public(name)
     if public is not kind and (public or kind.__module__.startswith(f"{_PACKAGE}.")):
@@ -236,7 +239,7 @@ def _object(place: str, value: Any) -> dict[str, Any]:
     return {name: {k: _node(f"{place}.{k}", v) for k, v in arguments.items()}}
 
 
-def _has_other_arguments(value: Any) -> bool:
+def _has_other_arguments(value: object) -> bool:
     """Returns whether a user's module, or one in it, is not made from its fields.
 
     A network is not, and so neither is an element that holds one.
@@ -252,7 +255,7 @@ def _has_other_arguments(value: Any) -> bool:
     return any(map(_has_other_arguments, inner))
 
 
-def _members(batch: Any) -> list[Any]:
+def _members(batch: PyTree) -> list[PyTree]:
     """Returns the members of a batch; none unless all leaves have a common axis."""
     leaves, structure = jax.tree.flatten(batch)
     sizes = {np.shape(leaf)[:1] for leaf in leaves}
@@ -262,7 +265,7 @@ def _members(batch: Any) -> list[Any]:
     return [structure.unflatten(jax.device_put(list(row))) for row in rows]
 
 
-def _text(node: Any, indent: str = "", before: str = "") -> str:
+def _text(node: Json, indent: str = "", before: str = "") -> str:
     """Returns JSON in which all that fits into a line stands on one."""
     line = before + json.dumps(node)
     if len(indent + line) < 88 or not isinstance(node, dict | list):
@@ -279,7 +282,7 @@ def _text(node: Any, indent: str = "", before: str = "") -> str:
 # From JSON to the tree
 
 
-def _parsed(content: bytes) -> Any:
+def _parsed(content: bytes) -> Json:
     try:
         file = json.loads(
             content.decode("utf-8-sig"), object_pairs_hook=_unique,
@@ -296,7 +299,7 @@ def _parsed(content: bytes) -> Any:
     return file["value"] if [*file] == ["value"] else file
 
 
-def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def _unique(pairs: list[tuple[str, Json]]) -> dict[str, Json]:
     members = dict(pairs)
     if len(members) < len(pairs):
         names = shown([name for name, _ in pairs])
@@ -310,7 +313,7 @@ def _finite(text: str) -> float:
     return value
 
 
-def _value(place: str, node: Any, classes: Sequence[type]) -> Any:
+def _value(place: str, node: Json, classes: Classes) -> PyTree:
     at = lambda step, inner: _value(f"{place}{step}", inner, classes)
     if isinstance(node, list):
         if _begins_with_number(node):
@@ -349,9 +352,7 @@ def _value(place: str, node: Any, classes: Sequence[type]) -> Any:
         raise ValueError(f"{place}: expected {problem}.") from error
 
 
-def _with_numbers(
-    place: str, name: str, node: list[Any], classes: Sequence[Any]
-) -> Any:
+def _with_numbers(place: str, name: str, node: list[Json], classes: Classes) -> PyTree:
     """Returns the module of this name among `classes`, with other numbers."""
     found = [k for k in classes if type(k).__name__ == name]
     if not found:
@@ -376,12 +377,12 @@ def _with_numbers(
     return eqx.combine(structure.unflatten(new), rest)
 
 
-def _batch(place: str, members: tuple[Any, ...]) -> Any:
+def _batch(place: str, members: tuple[PyTree, ...]) -> PyTree:
     arrays = lambda leaf: jax.device_put(leaf) if isinstance(leaf, np.ndarray) else leaf
     return jax.tree.map(arrays, stacked(members, place))
 
 
-def _array(place: str, node: list[Any]) -> jax.Array:
+def _array(place: str, node: list[Json]) -> jax.Array:
     try:
         numbers = _floats(node)
         dtype = jnp.result_type(_DTYPES[np.asarray(numbers).dtype.kind])
@@ -390,7 +391,7 @@ def _array(place: str, node: list[Any]) -> jax.Array:
         raise refusal(place, "numbers in lists of one length", node) from None
 
 
-def _floats(node: Any) -> Any:
+def _floats(node: Json) -> Json:
     """Returns nested lists of numbers with floats in the place of their names."""
     if isinstance(node, list):
         return [_floats(item) for item in node]

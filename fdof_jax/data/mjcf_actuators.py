@@ -1,16 +1,19 @@
 """Actuators of a MuJoCo model: their laws, and the elements that act alike."""
 
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..base.checks import real_array
 from ..control.actuators import Activation, Actuators
 from ..control.pd import PDController
+from ..forces.element import Element
 from ..forces.joints import JointEffort
 from ..references.task import SetPoint
 from .mjcf_chain import FAR, Reader, name_of, path_of_tendon
+from .mjcf_source import Model
 
 
 class _Affine(NamedTuple):
@@ -83,7 +86,9 @@ def _gear(read: Reader, actuator: int) -> np.ndarray | None:
     return here * model.actuator_gear[actuator, 0]
 
 
-def inertias_of_actuators(read: Reader) -> Iterator[tuple[np.ndarray, Any]]:
+def inertias_of_actuators(
+    read: Reader,
+) -> Iterator[tuple[np.ndarray, tuple[float, float]]]:
     """Yields gears and (damping, armature) of actuators, in newer versions."""
     model = read.model
     if not hasattr(model, "actuator_armature"):
@@ -102,7 +107,9 @@ def inertias_of_actuators(read: Reader) -> Iterator[tuple[np.ndarray, Any]]:
             yield gear, values
 
 
-def actuators(read: Reader, controls: Any, drop: tuple[str, ...]) -> list[Any]:
+def actuators(
+    read: Reader, controls: ArrayLike | None, drop: tuple[str, ...]
+) -> list[Element]:
     """The actuators: PD controllers and efforts where these will do, or `Actuators`."""
     model, chain = read.model, read.chain
     count = len(model.actuator_trntype)
@@ -159,7 +166,7 @@ def actuators(read: Reader, controls: Any, drop: tuple[str, ...]) -> list[Any]:
     upper = np.where(effort_limited, ends.max(axis=1), np.inf)
     if not rows:
         return []
-    forces = _simple(rows, lower, upper)
+    forces: list[Element] | None = _simple(rows, lower, upper)
     if forces is None:
         forces = [_general(rows, lower, upper)]
     kinds = " and ".join(type(force).__name__ for force in forces)
@@ -177,7 +184,7 @@ def actuators(read: Reader, controls: Any, drop: tuple[str, ...]) -> list[Any]:
     return forces
 
 
-def _places(model: Any, actuator: int) -> range:
+def _places(model: Model, actuator: int) -> range:
     """Where the controls of an actuator are; newer versions have several of one."""
     if not hasattr(model, "actuator_ctrladr"):
         return range(actuator, actuator + 1)
@@ -185,7 +192,9 @@ def _places(model: Any, actuator: int) -> range:
     return range(first, first + int(model.actuator_ctrlnum[actuator]))
 
 
-def _law(read: Reader, actuator: int, controls: Any, states: Any) -> _Law | str:
+def _law(
+    read: Reader, actuator: int, controls: np.ndarray, states: np.ndarray
+) -> _Law | str:
     """The law of an actuator, or what it has that `Actuators` do not."""
     model, mujoco = read.model, read.mujoco
     kind = lambda names, value: names(int(value)).name.rpartition("_")[2]
@@ -293,7 +302,9 @@ def _general(rows: list[_Row], lower: np.ndarray, upper: np.ndarray) -> Actuator
     )
 
 
-def _simple(rows: list[_Row], lower: np.ndarray, upper: np.ndarray) -> list[Any] | None:
+def _simple(
+    rows: list[_Row], lower: np.ndarray, upper: np.ndarray
+) -> list[Element] | None:
     """The actuators as efforts and a PD controller, or None where these will not do."""
     for row in rows:
         if np.count_nonzero(row.gear) > 1 or row.state or any(row.gain[1:]):
@@ -308,7 +319,7 @@ def _simple(rows: list[_Row], lower: np.ndarray, upper: np.ndarray) -> list[Any]
         return None
     kp, kd, limit, target, rate, effort = np.array(joints).T
     servos = [row.is_servo for row in rows]
-    forces: list[Any] = []
+    forces: list[Element] = []
     if any(servos):
         forces.append(PDController(kp, kd, limit, SetPoint(target, rate)))
     if not all(servos):

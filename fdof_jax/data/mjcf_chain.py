@@ -1,7 +1,8 @@
 """The planar chain in a MuJoCo model: its joints, its plane, its links and its tip."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from types import ModuleType
+from typing import Any, NamedTuple, SupportsInt
 
 import numpy as np
 
@@ -9,7 +10,9 @@ from ..base.checks import refusal, shown
 from ..base.user_warnings import without_warning
 from ..linkage.linkage import Linkage
 from ..linkage.topology import MOST_PAIRS
+from .mjcf_source import Model
 
+Data = Any  # an `mujoco.MjData`
 _SLIDE, _HINGE = 2, 3  # MuJoCo's mjtJoint
 FAR = 1e9  # stands for infinity where MuJoCo wants a number
 _EXACT = 1e-9  # what is as far out of the plane is taken for rounding
@@ -42,17 +45,17 @@ class Chain(NamedTuple):
     starts: np.ndarray
     turns: np.ndarray
 
-    def plane(self, vector: Any) -> complex:
+    def plane(self, vector: np.ndarray) -> complex:
         """A vector's components to the right and upwards."""
         return complex(vector @ self.right, vector @ self.up)
 
 
-def name_of(model: Any, kind: str, index: Any) -> str:
+def name_of(model: Model, kind: str, index: SupportsInt) -> str:
     """The name of a part, such as a body, or its number."""
     return getattr(model, kind)(int(index)).name or str(int(index))
 
 
-def switched_off(mujoco: Any, model: Any, *names: str) -> bool:
+def switched_off(mujoco: ModuleType, model: Model, *names: str) -> bool:
     """Whether a flag of the model, under one of its names, switches something off."""
     flags = mujoco.mjtDisableBit.__members__  # some only in older or newer versions
     bits = [int(flags[f"mjDSBL_{n}"]) for n in names if f"mjDSBL_{n}" in flags]
@@ -66,8 +69,8 @@ class Reader(NamedTuple):
     kind is to be dropped; `note(part, words)`: a line of the account.
     """
 
-    mujoco: Any
-    model: Any
+    mujoco: ModuleType
+    model: Model
     chain: Chain
     leave: Callable[[str, str, str], None]
     note: Callable[[str, str], None]
@@ -76,14 +79,14 @@ class Reader(NamedTuple):
         return switched_off(self.mujoco, self.model, *names)
 
 
-def path_of_tendon(model: Any, tendon: int) -> slice:
+def path_of_tendon(model: Model, tendon: int) -> slice:
     """Where the parts of a tendon's path are."""
     begin = int(model.tendon_adr[tendon])
     return slice(begin, begin + int(model.tendon_num[tendon]))
 
 
 def planar_chain(
-    mujoco: Any, model: Any, tip: str | None
+    mujoco: ModuleType, model: Model, tip: str | None
 ) -> tuple[Linkage, Chain, list[tuple[str, str]]]:
     """Reads the chain and its masses; also remarks, as pairs of part and words.
 
@@ -124,7 +127,7 @@ def planar_chain(
     )
 
 
-def data_at_start(mujoco: Any, model: Any) -> Any:
+def data_at_start(mujoco: ModuleType, model: Model) -> Data:
     """MuJoCo's data in the first key frame, if there is one, or at qpos0."""
     data = mujoco.MjData(model)
     if model.nkey:
@@ -132,7 +135,7 @@ def data_at_start(mujoco: Any, model: Any) -> Any:
     return data
 
 
-def _named(mujoco: Any, model: Any, name: str) -> tuple[int, str, int] | None:
+def _named(mujoco: ModuleType, model: Model, name: str) -> tuple[int, str, int] | None:
     """The body that a site or a body of this name is on, and which of both it is."""
     site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, name)
     if site >= 0:
@@ -142,7 +145,7 @@ def _named(mujoco: Any, model: Any, name: str) -> tuple[int, str, int] | None:
 
 
 def _joints_of_arm(
-    mujoco: Any, model: Any, tip: str | None
+    mujoco: ModuleType, model: Model, tip: str | None
 ) -> tuple[np.ndarray, np.ndarray, list[tuple[str, str]]]:
     """The joints of the arm, the link of each body, and what is left out beside it."""
     welded, parent = model.body_weldid, model.body_parentid
@@ -243,8 +246,9 @@ def _flatness(
 
 
 def _tip(
-    mujoco: Any, model: Any, data: Any, chain: Chain, start: complex, tip: str | None
-) -> tuple[complex, str]:
+    mujoco: ModuleType, model: Model, data: Data, chain: Chain, start: complex,
+    tip: str | None,
+) -> tuple[complex, str]:  # fmt: skip
     """The place of the tip, and words on what it is."""
     count = len(chain.joints)
     for name in _TIPS if tip is None else (tip,):
@@ -279,8 +283,8 @@ def _tip(
 
 
 def _linkage(
-    model: Any,
-    data: Any,
+    model: Model,
+    data: Data,
     chain: Chain,
     starts: np.ndarray,
     slides: np.ndarray,

@@ -1,10 +1,12 @@
 """Force elements of a MuJoCo model: those of its joints and its tendons."""
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from ..forces.actuators import Armature
+from ..forces.element import Element
 from ..forces.holders import JointFriction
 from ..forces.joints import JointDamper, JointSpring, JointStops
 from ..forces.points import Point, SpringDamper
@@ -16,7 +18,7 @@ from .mjcf_chain import FAR, Reader, data_at_start, name_of, path_of_tendon
 _STOP_DAMPING = 10.0
 
 
-def elements_in_joints(read: Reader, drop: tuple[str, ...]) -> list[Any]:
+def elements_in_joints(read: Reader, drop: tuple[str, ...]) -> list[Element]:
     """Dampers, armatures, springs, stops and friction of the joints."""
     model, chain = read.model, read.chain
     joints, rates = chain.joints, chain.rates
@@ -31,9 +33,11 @@ def elements_in_joints(read: Reader, drop: tuple[str, ...]) -> list[Any]:
             values = getattr(model, array, None)
             if values is not None and np.any(values[index]):
                 read.leave(kind, f"joint {name}", what)
-    forces: list[Any] = []
+    forces: list[Element] = []
 
-    def add(kind: str, values: np.ndarray, words: str, element: Any) -> None:
+    def add(
+        kind: str, values: np.ndarray, words: str, element: Callable[[], Element]
+    ) -> None:
         """Adds an element with values, unless none is there or it is to be dropped."""
         there = np.flatnonzero(values)
         for k in there:
@@ -67,7 +71,7 @@ def elements_in_joints(read: Reader, drop: tuple[str, ...]) -> list[Any]:
     return forces
 
 
-def _stops(read: Reader, limited: np.ndarray, dropped: bool) -> list[Any]:
+def _stops(read: Reader, limited: np.ndarray, dropped: bool) -> list[Element]:
     """Stops in the place of ranges, as stiff as MuJoCo's constraints are at qpos0."""
     model, chain = read.model, read.chain
     ends = np.where(chain.signs[:, None] > 0, 1, -1) * model.jnt_range[chain.joints]
@@ -109,7 +113,7 @@ def _stops(read: Reader, limited: np.ndarray, dropped: bool) -> list[Any]:
 # Tendons
 
 
-def springs_of_tendons(read: Reader, drop: tuple[str, ...]) -> list[Any]:
+def springs_of_tendons(read: Reader, drop: tuple[str, ...]) -> list[Element]:
     """Springs and dampers between two sites."""
     model, forces = read.model, []
     no_limits = read.disabled("LIMIT", "CONSTRAINT")

@@ -1,5 +1,6 @@
 """Import of planar chains from MuJoCo's models: MJCF and URDF."""
 
+from types import ModuleType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,7 +15,7 @@ from ..linkage.linkage import Linkage, joint_names
 from .mjcf_actuators import actuators
 from .mjcf_chain import Reader, data_at_start, name_of, planar_chain, switched_off
 from .mjcf_elements import elements_in_joints, springs_of_tendons
-from .mjcf_source import compiled_model
+from .mjcf_source import Model, compiled_model
 
 KINDS = (
     "actuators", "armature", "contacts", "damping", "equalities", "fluid", "friction",
@@ -260,7 +261,9 @@ def _check_contacts(read: Reader, drop: tuple[str, ...]) -> None:
         )
 
 
-def _may_collide(mujoco: Any, model: Any, links: np.ndarray) -> tuple[int, int] | None:
+def _may_collide(
+    mujoco: ModuleType, model: Model, links: np.ndarray
+) -> tuple[int, int] | None:
     """Two bodies, one of the arm, whose geoms may collide in MuJoCo, if any.
 
     Geoms of bodies that are welded together, or next to each other in the chain, do

@@ -4,17 +4,19 @@ import copy
 import os
 from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 from xml.etree import ElementTree
 
 from ..base.checks import plain, refusal
 
+Model = Any  # an `mujoco.MjModel`, of which type checkers know nothing
 _EXPECTED = "an XML text, the path of a file, an mujoco.MjModel or an mujoco.MjSpec"
 # Parts of a URDF that MuJoCo does not read.
 _UNREAD = "transmission", "gazebo", "ros2_control", "safety_controller"
 
 
-def compiled_model(mujoco: Any, source: Any) -> tuple[Any, list[str]]:
+def compiled_model(mujoco: ModuleType, source: Any) -> tuple[Model, list[str]]:
     """Returns a model of its own, and remarks on what was left out of its source.
 
     A text is read without opening files of the machine; a path finds its own.
@@ -36,7 +38,7 @@ def compiled_model(mujoco: Any, source: Any) -> tuple[Any, list[str]]:
     return _compiled(lambda: mujoco.MjModel.from_xml_path(str(path))), []
 
 
-def _path(source: Any) -> Path:
+def _path(source: object) -> Path:
     if not isinstance(source, str | os.PathLike):
         raise refusal("source", _EXPECTED, source)
     try:
@@ -48,7 +50,7 @@ def _path(source: Any) -> Path:
     raise refusal("source", f"{_EXPECTED}, and the file to be there", str(source))
 
 
-def _compiled(compile_model: Callable[[], Any]) -> Any:
+def _compiled(compile_model: Callable[[], Model]) -> Model:
     try:
         return compile_model()
     except ValueError as error:
@@ -86,8 +88,8 @@ def _check_without_files(root: ElementTree.Element) -> None:
 
 
 def _of_root(
-    mujoco: Any, root: ElementTree.Element, folder: Path | None
-) -> tuple[Any, list[str]]:
+    mujoco: ModuleType, root: ElementTree.Element, folder: Path | None
+) -> tuple[Model, list[str]]:
     """A model; the files that a URDF names in its folder are passed on as bytes."""
     remarks: list[str] = []
     assets: dict[str, bytes] = {}

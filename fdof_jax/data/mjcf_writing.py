@@ -1,18 +1,20 @@
 """Export to MuJoCo's model format (MJCF)."""
 
 from collections import Counter
-from collections.abc import Callable, Iterator
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any, SupportsFloat
 from xml.etree import ElementTree
 
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
+from numpy.typing import ArrayLike
 
 from ..base.checks import is_traced
 from ..control.actuators import Actuators
 from ..control.pd import PDController
 from ..forces.actuators import Armature
-from ..forces.element import Forces, ForeignElement, elements_on
+from ..forces.element import Element, Forces, ForeignElement, elements_on
 from ..forces.holders import HardStops, JointFriction
 from ..forces.joints import JointDamper, JointEffort, JointSpring, JointStops
 from ..forces.points import SpringDamper
@@ -23,6 +25,8 @@ from ..linkage.topology import letters
 from ..simulation.scene import accepts_scene
 from .mjcf_chain import FAR
 
+Node = ElementTree.Element
+Number = SupportsFloat  # also an array of one
 # MuJoCo rejects smaller masses and inertias of moving bodies (its mjMINVAL).
 _SMALLEST = 1e-15
 _IN_JOINTS = JointDamper, Armature, JointSpring, JointStops, HardStops, JointFriction
@@ -115,7 +119,7 @@ def to_mjcf(linkage: Linkage, forces: Forces = (), state0: State | None = None) 
     return ElementTree.tostring(root, encoding="unicode")
 
 
-def _check_elements(linkage: Linkage, acting: tuple[Any, ...]) -> None:
+def _check_elements(linkage: Linkage, acting: tuple[Element, ...]) -> None:
     """Raises ValueError for elements that MuJoCo does not have."""
     for k, element in enumerate(acting):
         name, expected = type(element).__name__, None
@@ -143,7 +147,7 @@ def _check_elements(linkage: Linkage, acting: tuple[Any, ...]) -> None:
             raise ValueError(f"forces[{k}]: expected {expected}, got {name}.")
 
 
-def _count(acting: tuple[Any, ...], name: str) -> int:
+def _count(acting: tuple[Element, ...], name: str) -> int:
     return sum(type(element).__name__ == name for element in acting)
 
 
@@ -161,7 +165,9 @@ def _limits_and_acts(element: Any, linkage: Linkage) -> tuple[np.ndarray, np.nda
     return bounded, none | np.asarray(element.gear).any(axis=0)
 
 
-def _draw(root: Any, bodies: list[Any], kinds: str, length: Any, locked: Any) -> None:
+def _draw(
+    root: Node, bodies: list[Node], kinds: str, length: np.ndarray, locked: np.ndarray
+) -> None:
     """Capsules along the links, and lines along the slides, seen from above.
 
     They neither weigh nor collide.
@@ -188,13 +194,17 @@ def _draw(root: Any, bodies: list[Any], kinds: str, length: Any, locked: Any) ->
             _add_spatial(_tendons(root), line, ends)
 
 
-def _tendons(root: Any) -> Any:
+def _tendons(root: Node) -> Node:
     """The model's list of tendons."""
     tendons = root.find("tendon")
     return ElementTree.SubElement(root, "tendon") if tendons is None else tendons
 
 
-def _add_spatial(tendons: Any, attributes: dict[str, str], ends: Any) -> None:
+def _add_spatial(
+    tendons: Node,
+    attributes: dict[str, str],
+    ends: Iterable[tuple[Node, Number, Number]],
+) -> None:
     """A tendon between two places, (body, along, across) each."""
     tendon = ElementTree.SubElement(tendons, "spatial", attributes)
     for letter, (body, along, across) in zip("ab", ends):
@@ -203,11 +213,11 @@ def _add_spatial(tendons: Any, attributes: dict[str, str], ends: Any) -> None:
         ElementTree.SubElement(tendon, "site", site=name)
 
 
-def _of_joints(acting: tuple[Any, ...], count: int) -> list[dict[str, str]]:
+def _of_joints(acting: tuple[Element, ...], count: int) -> list[dict[str, str]]:
     """Attributes of the joints that stand for elements."""
     joints: list[dict[str, str]] = [{} for _ in range(count)]
 
-    def add(name: str, *columns: Any, where: Any = True) -> None:
+    def add(name: str, *columns: ArrayLike, where: ArrayLike = True) -> None:
         columns = np.broadcast_arrays(*columns, where, np.zeros(count))[:-1]
         for joint, (*values, there) in zip(joints, zip(*columns)):
             if there:
@@ -238,14 +248,18 @@ def _of_joints(acting: tuple[Any, ...], count: int) -> list[dict[str, str]]:
     return joints
 
 
-def _ends(lower: Any, upper: Any, count: int) -> tuple[np.ndarray, np.ndarray]:
+def _ends(
+    lower: Array | None, upper: Array | None, count: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Both ends of ranges, in numbers that MuJoCo takes."""
     low = np.full(count, -np.inf) if lower is None else np.asarray(lower)
     high = np.full(count, np.inf) if upper is None else np.asarray(upper)
     return np.clip(low, -FAR, FAR), np.clip(high, -FAR, FAR)
 
 
-def _add_springs(tendons: Any, bodies: list[Any], springs: dict[int, Any]) -> None:
+def _add_springs(
+    tendons: Node, bodies: list[Node], springs: dict[int, SpringDamper]
+) -> None:
     """Springs between points, as tendons between sites."""
     for k, element in springs.items():
         rest, side = float(element.rest_length), int(element.side or 0)
@@ -259,7 +273,7 @@ def _add_springs(tendons: Any, bodies: list[Any], springs: dict[int, Any]) -> No
 
 
 def _add_actuators(
-    root: Any, linkage: Linkage, kinds: str, acting: tuple[Any, ...]
+    root: Node, linkage: Linkage, kinds: str, acting: tuple[Element, ...]
 ) -> tuple[list[float], list[float]]:
     """Adds actuators; returns their controls and states at time 0."""
     controls: list[float] = []
@@ -269,7 +283,9 @@ def _add_actuators(
     actuators = ElementTree.SubElement(root, "actuator")
     count, names = len(kinds), _counted()
 
-    def add(kind: str, name: str, joint: int, control: Any, **values: Any) -> None:
+    def add(
+        kind: str, name: str, joint: int, control: Number, **values: Number
+    ) -> None:
         own = dict(name=names(name), joint=f"joint{joint + 1}")
         texts = {key: _text(value) for key, value in values.items()}
         ElementTree.SubElement(actuators, kind, own | texts)
@@ -322,7 +338,7 @@ def _counted() -> Callable[[str], str]:
     return unique
 
 
-def _tendon(root: Any, name: str, ratios: dict[Any, Any]) -> str:
+def _tendon(root: Node, name: str, ratios: dict[Any, float]) -> str:
     """Adds a tendon whose length is a sum of joint positions; returns its name."""
     tendon = ElementTree.SubElement(_tendons(root), "fixed", name=name)
     for k, ratio in ratios.items():
@@ -371,10 +387,10 @@ def _general(
         yield gear, attributes, float(control[k]), start
 
 
-def _text(*numbers: Any) -> str:
+def _text(*numbers: Number) -> str:
     return " ".join(repr(float(number)) for number in numbers)
 
 
-def _turn(angle: Any) -> str:
+def _turn(angle: Array | float) -> str:
     """The quaternion of a turn about z."""
     return _text(np.cos(angle / 2), 0, 0, np.sin(angle / 2))

@@ -1,8 +1,9 @@
 """Motions as xarray Datasets and pandas DataFrames (optional packages)."""
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..base.checks import instance, known, optional_package
 from ..linkage.linkage import Linkage
@@ -58,7 +59,7 @@ def to_xarray(linkage: Linkage, solution: Motion) -> "xarray.Dataset":
     names, units = names_and_units(linkage.ef)
     common = common_unit(units)
 
-    def variable(dims: list[str], values: Any, label: str, unit: str) -> tuple:
+    def variable(dims: list[str], values: ArrayLike, label: str, unit: str) -> tuple:
         return dims, np.asarray(values), {"long_name": label, "units": unit}
 
     rows = [*batch, "time", "joint"]

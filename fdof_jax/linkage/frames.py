@@ -16,6 +16,8 @@ from .topology import real_joints
 if TYPE_CHECKING:
     from .linkage import Linkage
 
+Rows = Any  # arrays of JAX or NumPy, or lists of scalars
+
 # Vectors of the plane are complex numbers x + iy. A product with exp(i th) turns them
 # by th, a product with i by 90 degrees.
 
@@ -56,17 +58,17 @@ class Frames(NamedTuple):
     - `revolute`: whether the joint before each moving link is revolute (n,).
     """
 
-    start: Any
-    direction: Any
-    angle: Any
-    slide: Any
-    revolute: Any
+    start: Rows
+    direction: Rows
+    angle: Rows
+    slide: Rows
+    revolute: Rows
 
-    def tip(self, linkage: "Linkage") -> Any:
+    def tip(self, linkage: "Linkage") -> Rows:
         """Returns the end of the last link's vector A [m]."""
         return self.start[..., -1] + linkage.length[-1] * self.direction[..., -1]
 
-    def mass_centers(self, linkage: "Linkage") -> Any:
+    def mass_centers(self, linkage: "Linkage") -> Rows:
         """Returns the mass centres of the moving links (..., n) [m]."""
         offset = plane_vectors(linkage.com)
         return self.start[..., 1:] + offset * self.direction[..., 1:]

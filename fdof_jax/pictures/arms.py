@@ -1,18 +1,20 @@
 """An arm in pictures: where its parts are, and their lines and markers."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.markers import MarkerStyle
 from matplotlib.path import Path
+from matplotlib.typing import ColorType
 
 from ..base.known_values import in_numpy
+from ..forces.element import Forces
 from ..linkage.frames import known_frames
 from ..linkage.linkage import Linkage, check_linkage, without_fixed
 from ..linkage.topology import letters
-from .axes import BLACK, GREY, SERIES, xy
+from .axes import BLACK, GREY, SERIES, Keywords, xy
 from .elements import ELEMENT_STYLES, element_lines, element_marker
 
 
@@ -40,7 +42,7 @@ class Geometry(NamedTuple):
 
 
 def geometry(
-    linkage: Linkage, q: np.ndarray, ts: np.ndarray | None = None, forces: Any = ()
+    linkage: Linkage, q: np.ndarray, ts: np.ndarray | None = None, forces: Forces = ()
 ) -> Geometry:
     """The `Geometry` of a linkage at joint positions (time, n).
 
@@ -93,7 +95,7 @@ _BEARING = Path(
     [1, 2, 2, 79] + [1, 2] * 5,
 )
 
-_STYLES: dict[str, dict[str, Any]] = {
+_STYLES: dict[str, Keywords] = {
     "link": dict(lw=2.2, solid_capstyle="round", solid_joinstyle="round"),
     "rail": dict(lw=0.9),
     "mass": dict(lw=0.6, marker="o", ms=5, mec="white", mew=0.8, markevery=[1]),
@@ -102,7 +104,7 @@ _STYLES: dict[str, dict[str, Any]] = {
     "tip": dict(marker="s", markersize=5),
 } | ELEMENT_STYLES
 # In a legend, where a carriage is level, and a line would not show an element.
-_SYMBOLS: dict[str, dict[str, Any]] = {
+_SYMBOLS: dict[str, Keywords] = {
     "slider": dict(marker=_CARRIAGE) | _STYLES["slider"]
 } | {
     kind: dict(marker=element_marker(kind), markersize=13, mfc="none", mew=style["lw"])
@@ -126,7 +128,7 @@ def draw_arm(
     i: int,
     mass_centers: bool,
     alpha: float = 1.0,
-    color: Any = None,
+    color: ColorType | None = None,
     label: bool = True,
 ) -> dict[str, Line2D]:
     """Draws sample `i` and returns its lines by name; the name is also the `gid`."""

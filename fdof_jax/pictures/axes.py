@@ -5,19 +5,23 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ..base.checks import refusal
-from ..linkage.linkage import check_linkage
+from ..linkage.linkage import Linkage, check_linkage
 from ..simulation.sampled import Motion, check_joints
 
+Keywords = dict[str, Any]  # of functions of matplotlib
 # Okabe and Ito's colours, distinct under the common kinds of colour blindness.
 BLACK, GREY, LIGHT_GREY = "#000000", "#808080", "#BBBBBB"
 SERIES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 
 
-def reached(linkage: Any, solution: Any, name: str = "solution") -> list[np.ndarray]:
+def reached(
+    linkage: Linkage, solution: Motion, name: str = "solution"
+) -> list[np.ndarray]:
     """Arrays `ts`, `q` and `qd` of one solution, up to the last time reached."""
     check_linkage(linkage)
     if not isinstance(solution, Motion) or np.ndim(solution.q) != 2:
@@ -51,14 +55,14 @@ def mark_end(axes: Iterable[Axes], solution: Motion, last: float) -> None:
             ax.set_xlim(right=float(solution.ts[-1]))
 
 
-def filled_mapping(name: str, value: Any, kind: str) -> Mapping:
+def filled_mapping(name: str, value: object, kind: str) -> Mapping:
     """Returns `value` if it is a nonempty dictionary, else raises ValueError."""
     if not isinstance(value, Mapping) or not value:
         raise refusal(name, f"a dictionary, not empty, of label: {kind}", value)
     return value
 
 
-def figure_or_new(fig: Any, width: float, height: float) -> Figure:
+def figure_or_new(fig: Figure | None, width: float, height: float) -> Figure:
     """Returns `fig`, or a new figure of the given size [inches]."""
     if fig is None:
         return plt.figure(figsize=(width, height), layout="constrained")
@@ -67,7 +71,7 @@ def figure_or_new(fig: Any, width: float, height: float) -> Figure:
     return fig
 
 
-def axes_or_new(ax: Any, height: float) -> Axes:
+def axes_or_new(ax: Axes | None, height: float) -> Axes:
     """Returns `ax`, or the axes of a new figure of the given height [inches]."""
     if ax is None:
         return figure_or_new(None, 3.5, height).subplots()
@@ -77,7 +81,7 @@ def axes_or_new(ax: Any, height: float) -> Axes:
 
 
 def time_panels(
-    fig: Any, height: float, ts: np.ndarray, panels: list
+    fig: Figure | None, height: float, ts: np.ndarray, panels: list
 ) -> tuple[Figure, list[Axes]]:
     """Plots panels (y label, [(label, values, colour), ...]) over time, stacked.
 
@@ -125,7 +129,7 @@ def figure_of(ax: Axes) -> Figure:
     return figure
 
 
-def _entries(axes: Iterable[Axes]) -> dict[str, Any]:
+def _entries(axes: Iterable[Axes]) -> dict[str, Artist]:
     """Handles of a legend by label; of equal labels, the last one's."""
     entries = {}
     for ax in axes:
@@ -134,7 +138,7 @@ def _entries(axes: Iterable[Axes]) -> dict[str, Any]:
     return entries
 
 
-_LEGEND: dict[str, Any] = dict(fontsize="small", frameon=False, handlelength=1.2)
+_LEGEND: Keywords = dict(fontsize="small", frameon=False, handlelength=1.2)
 
 
 def legend(ax: Axes, *others: Axes) -> None:

@@ -24,6 +24,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
+from matplotlib.typing import ColorType
 from numpy.typing import ArrayLike
 from PIL import Image
 
@@ -69,7 +70,7 @@ def draw_linkage(
     ax: Axes | None = None,
     *,
     forces: Forces = (),
-    color: Any = None,
+    color: ColorType | None = None,
     alpha: float = 1.0,
     mass_centers: bool = True,
 ) -> Axes:
@@ -252,7 +253,9 @@ def animate_grid(
     return _animation(panels, pairs, times, pause, say, fig is None)
 
 
-def _geometries(motions: Any, forces: Any) -> dict[str, tuple[np.ndarray, Geometry]]:
+def _geometries(
+    motions: Mapping[str, tuple[Linkage, Motion]], forces: Mapping[str, Forces] | None
+) -> dict[str, tuple[np.ndarray, Geometry]]:
     """Times and geometry of each motion, with its force elements, by title."""
     filled_mapping("motions", motions, "(Linkage, Solution)")
     if forces is not None:
@@ -319,7 +322,7 @@ def _animation(
     motions: list[tuple[np.ndarray, Geometry]],
     times: np.ndarray,
     pause: float,
-    say: Callable[..., Any],
+    say: Callable[..., Artist],
     new: bool,
 ) -> FuncAnimation:
     """Animates motions in panels of a `new` or given figure; `say` writes the time."""
@@ -351,13 +354,14 @@ class _MotionAnimation(FuncAnimation):
     """An animation that a notebook plays if it is the last line of a cell."""
 
     def __init__(
-        self, figure: Figure, show: Any, count: int, pause: float, moving: list[Artist]
-    ):
+        self, figure: Figure, show: Callable[[int], Artist], count: int, pause: float,
+        moving: list[Artist],
+    ):  # fmt: skip
         super().__init__(figure, show, count, interval=pause, cache_frame_data=False)  # type: ignore[arg-type]
         self._figure, self._show = figure, show
         self._count, self._pause, self._moving = count, pause, moving
 
-    def save(self, filename: Any, *args: Any, **kwargs: Any) -> None:
+    def save(self, filename: str | Path, *args: Any, **kwargs: Any) -> None:
         """Writes a file, and a progress bar to the standard error output.
 
         By default a GIF is written by pillow, and only what moves is drawn again.
@@ -377,7 +381,9 @@ class _MotionAnimation(FuncAnimation):
             filename, save_all=True, append_images=others, duration=pauses, loop=0
         )
 
-    def _images(self, progress: Any, dpi: float | None) -> Iterator[Image.Image]:
+    def _images(
+        self, progress: Callable[[int, int], object] | None, dpi: float | None
+    ) -> Iterator[Image.Image]:
         """Draws the frames over one picture of what stands still."""
         figure = self._figure
         before, figure.dpi = figure.dpi, dpi or figure.dpi

@@ -1,7 +1,5 @@
 """Force elements in pictures: each is one line through the points of its symbol."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,25 +7,25 @@ from matplotlib.path import Path
 
 from ..base.known_values import in_numpy
 from ..forces.actuators import LinearActuator
-from ..forces.element import elements_on
+from ..forces.element import Element, Forces, elements_on
 from ..forces.holders import HardStops
 from ..forces.joints import JointStops
 from ..forces.payload import Payload
-from ..forces.points import Point, SpringDamper, Tension, Wrench
+from ..forces.points import Between, Point, SpringDamper, Tension, Wrench
 from ..linkage.frames import Frames
 from ..linkage.linkage import Linkage
 from ..linkage.topology import letters
 from ..references.reference import Reference
 from ..references.task import TipTask
-from .axes import BLACK, xy
+from .axes import BLACK, Keywords, xy
 
 # Widths are in sizes of the arm.
 _WIDTH, _ARROW, _HEAD, _ARC = 0.025, 0.3, 0.05, 0.08
 _BOX = _WIDTH * np.array([1 + 1j, -1 + 1j, -1 - 1j, 1 - 1j, 1 + 1j])  # of a payload
 
-COMMANDED: dict[str, Any] = dict(color=BLACK, lw=0.8, ls=(0, (5, 3)))
-_THIN: dict[str, Any] = dict(color=BLACK, lw=0.8)
-ELEMENT_STYLES: dict[str, dict[str, Any]] = {
+COMMANDED: Keywords = dict(color=BLACK, lw=0.8, ls=(0, (5, 3)))
+_THIN: Keywords = dict(color=BLACK, lw=0.8)
+ELEMENT_STYLES: dict[str, Keywords] = {
     **dict.fromkeys(("spring", "damper", "bumper", "cable", "tension"), _THIN),
     "cylinder": dict(color=BLACK, lw=1.0),
     "wrench": dict(color=BLACK, lw=1.6, solid_joinstyle="miter"),
@@ -38,7 +36,7 @@ ELEMENT_STYLES: dict[str, dict[str, Any]] = {
 
 
 def element_lines(
-    linkage: Linkage, forces: Any, f: Frames, ts: np.ndarray, size: float
+    linkage: Linkage, forces: Forces, f: Frames, ts: np.ndarray, size: float
 ) -> dict[str, np.ndarray]:
     """Lines (time, points) of the elements that have a place, as x + iy [m].
 
@@ -89,7 +87,7 @@ def element_lines(
     return lines
 
 
-def _commanded(element: Any) -> np.ndarray | None:
+def _commanded(element: Element) -> np.ndarray | None:
     """The path on which a controller leads the tip, once around, or None."""
     share = jnp.linspace(0, 1, 201)
     is_reference = lambda part: isinstance(part, Reference)
@@ -121,7 +119,7 @@ def _support(point: Point, arm: Linkage, f: Frames, size: float) -> list[np.ndar
     return [np.hstack([foot, place])] if away else []
 
 
-def _ends(element: Any, f: Frames) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _ends(element: Between, f: Frames) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The first end, the distance of the second, and the direction to it (time, 1)."""
     a, b = _place(element.a, f), _place(element.b, f)
     length = np.abs(b - a)
@@ -169,7 +167,9 @@ def element_marker(kind: str) -> Path:
     return Path(np.column_stack(xy(points)), codes)
 
 
-def _between(element: Any, f: Frames, size: float) -> tuple[str, list[np.ndarray]]:
+def _between(
+    element: SpringDamper | Tension, f: Frames, size: float
+) -> tuple[str, list[np.ndarray]]:
     """A spring, a damper or both; a cable, which hangs if slack; a bumper."""
     a, length, unit = _ends(element, f)
     if isinstance(element, Tension):
@@ -215,7 +215,7 @@ def _arrows(
     place: np.ndarray,
     force: np.ndarray,
     moment: np.ndarray,
-    most: list[Any],
+    most: list[float],
     size: float,
 ) -> list[np.ndarray]:
     """A straight arrow for a force, and one around the point for a moment."""

@@ -226,7 +226,7 @@ def sliders(scenes: Mapping[str, Scene] | None = None) -> Any:
     image, words = widgets.Image(format="png"), widgets.HTML()
     pictures = {name: _Picture() for name in options}
 
-    def redraw(change: Any = None) -> None:
+    def redraw(change: object = None) -> None:
         stretch = jnp.array([slider.value for slider in lengths])
         factor = jnp.array([slider.value for slider in gains]).reshape(2, -1)
         moved = _moved(options[arm.value], stretch, factor)

@@ -8,7 +8,6 @@ pictures of the linkage itself.
 from collections.abc import Mapping
 from inspect import isfunction
 from itertools import cycle
-from typing import Any
 
 import jax
 import numpy as np
@@ -20,7 +19,7 @@ from ..analysis.responses import StepAndSine
 from ..base.checks import instance, real_array, refusal, shown
 from ..control.drives import controller_in
 from ..dynamics import link_energies
-from ..forces.element import Forces, ForeignElement, elements
+from ..forces.element import Element, Forces, ForeignElement, elements
 from ..linkage.linkage import Linkage, joint_names, moving_joints
 from ..references.reference import reference_motion, reference_of
 from ..simulation.efforts import joint_efforts
@@ -291,7 +290,7 @@ def _busy(ts: np.ndarray, efforts: np.ndarray) -> tuple[float, float] | None:
     return float(max(begin - room, ts[0])), float(min(end + room, ts[-1]))
 
 
-def _limits(element: Any, total: np.ndarray) -> np.ndarray:
+def _limits(element: Element, total: np.ndarray) -> np.ndarray:
     """Limits of a controller's efforts (n,); infinite for other elements."""
     controller = controller_in(element)
     limit = np.inf if controller is None else controller.limit

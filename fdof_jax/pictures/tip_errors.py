@@ -1,8 +1,8 @@
 """Pictures of the tip's path beside the commanded one, and of its distance from it."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from itertools import cycle
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -44,7 +44,9 @@ class _Tip(NamedTuple):
     path: np.ndarray
 
 
-def _tip(linkage: Any, task: Any, solution: Any, name: str = "solution") -> _Tip:
+def _tip(
+    linkage: Linkage, task: Callable, solution: Motion, name: str = "solution"
+) -> _Tip:
     if not callable(task) or (tip := reference_of(task).tip) is None:
         raise refusal("task", "a CircleTask or a TipTask", task)
     ts, q, _ = reached(linkage, solution, name)
@@ -52,7 +54,9 @@ def _tip(linkage: Any, task: Any, solution: Any, name: str = "solution") -> _Tip
     return _Tip(ts, commanded, geometry(linkage, q).tip)
 
 
-def _tips(linkage: Any, task: Any, solutions: Any) -> dict[Any, _Tip]:
+def _tips(
+    linkage: Linkage, task: Callable, solutions: Mapping[str, Motion]
+) -> dict[str, _Tip]:
     filled_mapping("solutions", solutions, "Solution")
     tips = {}
     for label, solution in solutions.items():
@@ -62,7 +66,7 @@ def _tips(linkage: Any, task: Any, solutions: Any) -> dict[Any, _Tip]:
     return tips
 
 
-def _draw_commanded(ax: Axes, task: Any, ts: np.ndarray, path: np.ndarray) -> None:
+def _draw_commanded(ax: Axes, task: Callable, ts: np.ndarray, path: np.ndarray) -> None:
     """Draws the commanded path dashed above the others, which show in its gaps.
 
     Dashes of a second turn would fill the gaps of the first.

@@ -22,7 +22,9 @@ from .axes import GREY, SERIES, legend, plane_axes, xy
 _REACHED = "#D6EAF5"
 
 
-def _ranges(linkage: Linkage, lower: Any, upper: Any, orientation: Any) -> Ranges:
+def _ranges(
+    linkage: Linkage, lower: ArrayLike, upper: ArrayLike, orientation: ArrayLike | None
+) -> Ranges:
     check_linkage(linkage)
     name, ends = letters(linkage.ef), []
     kinds = np.array([*name])

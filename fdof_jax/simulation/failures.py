@@ -1,7 +1,6 @@
 """Causes of failed motions, in words; looked for only after a failure."""
 
 import inspect
-from typing import Any
 
 import diffrax
 import equinox as eqx
@@ -24,7 +23,7 @@ from .field import (
     whole,
     with_states,
 )
-from .integrate import Inputs, last_switched
+from .integrate import Inputs, Settings, last_switched
 from .prescribed import formulation
 from .solution import OUTCOMES, Solution
 from .solve import solve
@@ -34,7 +33,7 @@ from .solve import solve
 _STABLE = 2.0
 
 
-def cause(inputs: Inputs, keywords: dict[str, Any], solution: Solution) -> str:
+def cause(inputs: Inputs, keywords: Settings, solution: Solution) -> str:
     """Returns what is known about a failed solve, in a sentence."""
     linkage, (q, qd), ts, own0, forces = inputs
     outcome = str(solution.outcome)
@@ -63,7 +62,7 @@ def _of_joints(linkage: Linkage, solution: Solution) -> str:
     return f"Last, {', '.join(happened)}. "
 
 
-def _of_switches(inputs: Inputs, keywords: dict[str, Any]) -> str:
+def _of_switches(inputs: Inputs, keywords: Settings) -> str:
     """Names the element and the joint that switch without end, and what helps."""
     linkage, (q, qd), ts, own0, forces = inputs
     names, begin = joint_names(linkage), 0

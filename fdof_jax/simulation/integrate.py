@@ -38,6 +38,8 @@ from .known_times import clocks_apart, known_times
 from .prescribed import agrees, formulation
 from .solution import Solution
 
+Settings = dict[str, Any]  # keywords of `diffeqsolve`, as `solve_options` checks them
+
 
 class Inputs(NamedTuple):
     """The arguments that determine a motion, as `simulate` gets them.
@@ -81,7 +83,7 @@ class _Control(NamedTuple):
 
 def integrate(
     inputs: Inputs,
-    keywords: dict[str, Any],
+    keywords: Settings,
     derivatives: bool = False,
     padded: bool = False,
     tangents: bool = False,
@@ -244,7 +246,7 @@ def _read(inputs: Inputs, problem: _Problem, solve: diffrax.Solution) -> Solutio
     return eqx.tree_at(where, solution, holding, is_leaf=lambda x: x is None)
 
 
-def last_switched(inputs: Inputs, keywords: dict[str, Any]) -> Array:
+def last_switched(inputs: Inputs, keywords: Settings) -> Array:
     """Returns which switching functions switched where a motion ended, (switch,).
 
     In the order of the elements; guards of modes are the last ones.

@@ -13,13 +13,13 @@ from jax import Array
 
 from ..base.checks import instance, known, refusal
 from ..forces.element import OwnStates
-from .solution import Events, Solution
+from .solution import Events, Solution, Statistics
 
 _MEETS = 1e-9  # a share of the time, within which two motions meet
 _GAP = 1e-5  # positions may be rounded on their way [m or rad]
 # How statistics of two phases are joined; numbers of steps and switches add up.
 _STATISTICS = {"accuracy": jnp.maximum, "slowest_crossing": jnp.minimum}
-_Outcome = tuple[dict[str, Any], diffrax.RESULTS]  # statistics and result
+_Outcome = tuple[Statistics, diffrax.RESULTS]  # statistics and result
 
 
 def concatenate(motions: Sequence[Solution]) -> Solution:

@@ -1,7 +1,5 @@
 """Simulates motions of a linkage: the door, with its checks."""
 
-from typing import Any
-
 import diffrax
 import equinox as eqx
 import jax
@@ -36,7 +34,7 @@ from ..steps.tolerances import at_tolerances, with_longest, within_reach
 from .failures import cause, check_arguments
 from .field import initial_states
 from .holding import within_stops
-from .integrate import Inputs, faults
+from .integrate import Inputs, Settings, faults
 from .prescribed import agrees, prescribed
 from .scene import accepts_scene
 from .solution import OUTCOMES, Solution, outcome_numbers
@@ -55,7 +53,7 @@ def solve_options(
     max_steps: int | None,
     throw: bool,
     progress_meter: diffrax.AbstractProgressMeter,
-) -> dict[str, Any]:
+) -> Settings:
     """Checks `simulate`'s keywords; returns those of diffeqsolve, without `throw`."""
     if dt0 is not None:
         dt0 = real_array("dt0", dt0, (), above=0)  # an array: new values, no new trace

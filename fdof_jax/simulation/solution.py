@@ -15,6 +15,8 @@ from ..base.checks import is_traced, known
 from ..base.report import html_table
 from ..forces.element import OwnStates
 
+Statistics = dict[str, Any]  # arrays by name, and diffrax's `max_steps`
+
 # In the order of `outcome_numbers`: what an outcome means, and what helps.
 OUTCOMES = {
     "successful": "",
@@ -192,7 +194,7 @@ class Solution(WithOutcome):
     ts: Float[Array, " time"]
     q: Float[Array, "time joint"]
     qd: Float[Array, "time joint"]
-    stats: dict[str, Any]
+    stats: Statistics
     result: diffrax.RESULTS
     own: OwnStates = ()
     modes: Float[Array, "time joint"] | None = None
@@ -222,7 +224,7 @@ def _span(numbers: ArrayLike) -> str:
     return f"{least}" if least == most else f"{least} to {most}"
 
 
-def remarks_on_derivatives(stats: dict[str, Any]) -> list[str]:
+def remarks_on_derivatives(stats: Statistics) -> list[str]:
     """Returns what the statistics of one or more motions say about derivatives."""
     words = []
     if np.min(stats.get("slowest_crossing", np.inf)) < SLOW:

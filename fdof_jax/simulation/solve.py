@@ -19,13 +19,13 @@ from ..steps.controllers import with_pid
 from ..steps.derivative_control import TANGENTS
 from ..steps.tolerances import at_tolerances
 from ..steps.unrolled_dopri8 import UnrolledDopri8
-from .integrate import Inputs, integrate
+from .integrate import Inputs, Settings, integrate
 from .padding import cut, padded
 from .prescribed import prescribed
 from .solution import Solution
 
 
-def solve(inputs: Inputs, keywords) -> tuple[Solution, bool | None]:
+def solve(inputs: Inputs, keywords: Settings) -> tuple[Solution, bool | None]:
     """Computes a motion, and whether it succeeded: None within transformations."""
     # JAX traces even constants inside `jax.jit`, where a jitted function of our own
     # would only be traced once more.
@@ -42,7 +42,7 @@ def solve(inputs: Inputs, keywords) -> tuple[Solution, bool | None]:
 
 
 @jax.transfer_guard("allow")  # the padded times are in NumPy
-def _solve_one(inputs: Inputs, keywords) -> tuple[Solution, bool] | None:
+def _solve_one(inputs: Inputs, keywords: Settings) -> tuple[Solution, bool] | None:
     """Computes the motion of one arm from concrete inputs, and whether it succeeded.
 
     Returns None if a force element holds a traced value.

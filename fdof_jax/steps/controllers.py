@@ -142,7 +142,7 @@ class Scaled(Adaptive):
     def scaled(self, state: Integrated) -> Integrated:
         """Returns a state in these units; the elements' own states keep theirs."""
         scalars = isinstance(state[0], tuple)
-        units: Any = tuple(map(tuple, self.unit)) if scalars else self.unit
+        units: PyTree = tuple(map(tuple, self.unit)) if scalars else self.unit
         return (*jax.tree.map(jnp.divide, state[:2], units), *state[2:])
 
 

@@ -303,12 +303,9 @@ class Located(diffrax.AbstractAdaptiveSolver):
         return self.if_event(switching, made_jump, lambda: self.after_event(*here), y)
 
     def if_event(
-        self,
-        switching: Switching,
-        made_jump: Truth,
-        after_event: Callable[[], tuple[Integrated, PyTree]],
-        y: Integrated,
-    ) -> tuple[Integrated, PyTree]:
+        self, switching: Switching, made_jump: Truth,
+        after_event: Callable[[], tuple[Integrated, PyTree]], y: Integrated,
+    ) -> tuple[Integrated, PyTree]:  # fmt: skip
         """Returns state and modes after an event, or as they are if there is none."""
         start = jnp.any(switching.modes.mode < 0)
         otherwise = lambda: (y, switching.modes)
@@ -349,14 +346,9 @@ class Located(diffrax.AbstractAdaptiveSolver):
         return lateness(arrival, term=term)
 
     def shifted(
-        self,
-        term: Term,
-        t: Array,
-        y: Integrated,
-        args: Arguments,
-        switching: Switching,
-        made_jump: Truth,
-    ) -> Integrated:
+        self, term: Term, t: Array, y: Integrated, args: Arguments,
+        switching: Switching, made_jump: Truth,
+    ) -> Integrated:  # fmt: skip
         """Returns the state at the start of a step, changed by a switch there."""
         if not self.derivatives:
             return y
@@ -411,12 +403,9 @@ def _same(modes: PyTree, others: PyTree) -> Array:
 
 @eqx.filter_jit  # traced once, not at each use in a solve
 def _values(
-    term: Term,
-    t0: Array,
-    t1: Array,
-    path: diffrax.AbstractLocalInterpolation,
+    term: Term, t0: Array, t1: Array, path: diffrax.AbstractLocalInterpolation,
     args: Arguments,
-) -> tuple[Array, Array]:
+) -> tuple[Array, Array]:  # fmt: skip
     """Returns the switching functions at the samples of a step, and at its checks."""
     shares = jnp.asarray([*SHARES, *CHECKS], t0.dtype)
     times = t0 + shares * (t1 - t0)

@@ -161,7 +161,9 @@ def _errors(scene: Scene) -> Loss:
 
 
 @eqx.filter_jit(compiler_options=options_of_loops())  # pyright: ignore[reportCallIssue]
-def _tangents(scene: Scene, tuned: Any, z: Any) -> tuple[Sensitivities, Array]:
+def _tangents(
+    scene: Scene, tuned: Array | np.ndarray, z: Any
+) -> tuple[Sensitivities, Array]:
     """Residuals with their derivatives in `z`, and relative demands."""
     ts = jnp.linspace(0, scene.t1, SAMPLES)
     loss = _errors(scene)

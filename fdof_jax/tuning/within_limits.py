@@ -1,7 +1,6 @@
 """Tuning of gains within limits, by SciPy's sequential quadratic programming."""
 
 from collections.abc import Callable, Iterator
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +11,7 @@ from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
 from ..analysis.linearization import checked, equilibrium, loop_matrices
-from ..analysis.loops import margins, open_loop
+from ..analysis.loops import Loop, margins, open_loop
 from ..analysis.measures import BAND, step_measures
 from ..analysis.responses import samples_of
 from ..analysis.tracking import demands
@@ -176,7 +175,7 @@ def measured(scene: Scene, limits: Limits) -> Iterator[tuple[str, str, float, fl
     controller, others = controller_and_others(scene)
     limits = in_numpy(limits)
     linkage, t1, rest = scene.linkage, float(scene.t1), rest_of(scene)
-    loops: dict[int, Any] = {
+    loops: dict[int, Loop] = {
         k: open_loop(linkage, rest, controller, k + 1, others, t1)
         for k in moving_joints(linkage)
     }
