@@ -109,13 +109,10 @@ class Idle(fj.Element):
         return jnp.zeros_like(q)
 
 
-def delayed(delay, gains):
+def delayed(delay, gains, *others):
     feedback = lambda t, q, qd, linkage: -gains[0] * q - gains[1] * qd
     start = fj.State(jnp.ones(1), jnp.zeros(1))
-    # Beside another element with a known time, whose clock is another (see
-    # `clocks_apart`).
-    arguments = DISC, start, feedback, 0.1, 60, (Idle(0.35),)
-    motion = fj.simulate_sampled(*arguments, delay=delay)
+    motion = fj.simulate_sampled(DISC, start, feedback, 0.1, 60, others, delay=delay)
     return motion.q[-1, 0], motion
 
 
@@ -123,7 +120,10 @@ def test_delayed_feedback_follows_its_transition_matrix():
     """For traced delays and gains, some of which are stable, with derivatives."""
     delays = 0.1 * np.array([0, 0.3, 1, 1.5, 2, 3.7, 1e6, -0.1])
     gains = np.array([[8.0, 6.0], [30.0, 12.0]])
-    both = jax.value_and_grad(delayed, (0, 1), has_aux=True)
+    # Beside another element with a known time, whose clock is another (see
+    # `clocks_apart`).
+    beside = lambda delay, gains: delayed(delay, gains, Idle(0.35))
+    both = jax.value_and_grad(beside, (0, 1), has_aux=True)
     pairs = jax.vmap(jax.vmap(both, (None, 0)), (0, None))
     (_, motions), slopes = jax.jit(pairs, **LOOPS)(delays, gains)
     for i, j in np.ndindex(6, 2):
@@ -151,6 +151,8 @@ def test_delayed_feedback_follows_its_transition_matrix():
     np.testing.assert_array_equal(motions.q[6], 1)  # no command arrives
     np.testing.assert_array_equal(motions.acting[6], 0)
     assert np.isnan(motions.q[7, :, -1]).all()  # a delay below 0
+    alone, _ = jax.jit(jax.grad(delayed, has_aux=True), **LOOPS)(delays[2], gains[1])
+    np.testing.assert_allclose(alone, slopes[0][2, 1], rtol=1e-9)
 
 
 def test_no_delay_is_known_within_jit():

@@ -153,9 +153,13 @@ def real_array(
             raise refuse(text.removesuffix("."))  # 1.0 is shown as "1."
         if unit == "rad":
             radians(name, kept)
-        if fits and isinstance(value, Array) and value.dtype == kept.dtype:
-            if not value.weak_type:
-                return value
+        if (
+            isinstance(value, Array)
+            and value.dtype == kept.dtype
+            and fits
+            and not value.weak_type
+        ):
+            return value
         array = kept
     # NumPy broadcasts concrete values without compiling a program.
     if not fits and JOINT not in shape:

@@ -10,8 +10,8 @@ from jax import Array
 from ..linkage.fields import has_come
 from .dopri8 import Arguments, Integrated, constant
 
-# More landings than these within the time `pace` are chatter. It is the distance that
-# rounding keeps them apart, times this power of the unit of rounding (3e5 in float64).
+# More landings than these are chatter, if they come within the distance that rounding
+# keeps two of them apart, times this power of the unit of rounding (3e5 in float64).
 # Chatter soon lands at that distance; joints that bounce to rest, in however long a
 # run, or that throw each other at their stops, are slower.
 _MOST_LANDINGS = 100

@@ -40,7 +40,7 @@ def above_rounding(
     estimate: Estimate,
     of_derivatives: Array | None,
     order: float | None,
-) -> Integrated:
+) -> PyTree:
     """Returns the error of a step of length `h` without what is rounding.
 
     `of_derivatives`: the error of derivatives over their tolerance, which counts too.

@@ -164,8 +164,8 @@ class Located(diffrax.AbstractAdaptiveSolver):
     """A solver whose steps keep the branches of their start and report a change.
 
     Where efforts jump at a switch, derivatives may differ between the sides of motions
-    that start on the switch, or that meet it together with another. What `step` calls
-    is another thing for a motion with its derivatives beside it (see `sensitivities`).
+    that start on the switch, or that meet it together with another. `sensitivities`,
+    which integrates derivatives beside the motion, overrides what `step` calls.
     """
 
     solver: Any
