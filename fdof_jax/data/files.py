@@ -24,7 +24,7 @@ from ..base.whole_files import file_path, whole_file
 from ..linkage.linkage import Linkage
 from ..linkage.topology import letters
 from ..simulation.sampled import Motion
-from ..simulation.scene import is_number, stacked
+from ..simulation.scene import is_number, members, stacked
 
 Json = Any  # numbers, texts, and lists and dicts of such
 Classes = Sequence[type | eqx.Module]  # modules with numbers of the same shapes
@@ -228,12 +228,12 @@ def _object(place: str, value: Any) -> dict[str, Json]:
             with without_warning(""):  # which came when it was made
                 kind(**arguments)  # as `load` does
         except _MEANT as error:
-            if not (members := _members(value)):
+            if not (rows := members(value)):
                 expected = f"a {name} that its constructor accepts, or a batch with a"
                 problem = f"{expected} leading axis on every array; {plain(str(error))}"
                 raise ValueError(f"{place}: expected {problem}") from error
-            rows = enumerate(members)
-            return {"batch": [_object(f"{place}[{i}]", member) for i, member in rows]}
+            one = [_object(f"{place}[{i}]", row) for i, row in enumerate(rows)]
+            return {"batch": one}
     if isinstance(value, Linkage):
         arguments["topology"] = letters(value.ef)
     return {name: {k: _node(f"{place}.{k}", v) for k, v in arguments.items()}}
@@ -253,16 +253,6 @@ def _has_other_arguments(value: object) -> bool:
         return True
     inner = jax.tree.leaves(vars(value), is_leaf=lambda x: isinstance(x, eqx.Module))
     return any(map(_has_other_arguments, inner))
-
-
-def _members(batch: PyTree) -> list[PyTree]:
-    """Returns the members of a batch; none unless all leaves have a common axis."""
-    leaves, structure = jax.tree.flatten(batch)
-    sizes = {np.shape(leaf)[:1] for leaf in leaves}
-    if len(sizes) != 1 or sizes <= {(), (0,)}:
-        return []
-    rows = zip(*map(np.asarray, leaves))
-    return [structure.unflatten(jax.device_put(list(row))) for row in rows]
 
 
 def _text(node: Json, indent: str = "", before: str = "") -> str:

@@ -74,7 +74,7 @@ def _longer_and_longer(
     return minimise(whole, z, low, high, enough=_ENOUGH, **keywords)
 
 
-def _unseen(
+def _held_out(
     validate: Recordings | None, shape: tuple[int, ...], *settings: Any
 ) -> list[Problem]:
     """Checks the argument `validate` of `fit`: recordings of the given shape."""
@@ -113,7 +113,7 @@ def _search(
     unknowns = unknowns_of(start, bounds, scale)
     settings = unknowns, check_times(ts), observe, 1.0 if noise is None else noise
     problems = problems_of(("scene_at", "observed"), scene_at, observed, *settings)
-    unseen = _unseen(validate, problems[0].observed.shape, *settings)
+    held_out = _held_out(validate, problems[0].observed.shape, *settings)
     rows = [problems] if together else [[problem] for problem in problems]
     least = min(sum(int((p.weight > 0).sum()) for p in row) for row in rows)
     if least <= unknowns.start.size:
@@ -129,14 +129,14 @@ def _search(
             check_motion("scene_at(...)", scene, problem.ts)
         expected = "parameters at which the motion and its derivatives are finite"
         raise refusal("start", expected, start)
-    judged = [None] * len(runs)
-    if unseen:
-        lanes = Lanes(lane, [unseen], starts=len(runs))
+    beside = [None] * len(runs)
+    if held_out:
+        lanes = Lanes(lane, [held_out], starts=len(runs))
         found = lanes(np.stack([run.z for run in runs]), np.arange(len(runs)))
-        judged = [found.row(index) for index in range(len(runs))]
+        beside = [found.row(index) for index in range(len(runs))]
     return [
-        fit_result(run, row, unknowns, noise is not None, held_out)
-        for run, row, held_out in zip(runs, rows, judged)
+        fit_result(run, row, unknowns, noise is not None, other)
+        for run, row, other in zip(runs, rows, beside)
     ]
 
 

@@ -191,9 +191,9 @@ def fit_result(
     problems: list[Problem],
     unknowns: Unknowns,
     noise_given: bool,
-    unseen: Evaluation | None,
+    held_out: Evaluation | None,
 ) -> FitResult:
-    """Judges the end of a run, where `unseen` evaluates the held-out recordings."""
+    """Judges the end of a run, where `held_out` evaluates the other recordings."""
     shapes, _, scale, low, high = unknowns
     values = unknowns.numbers(run.z)
     sizes = np.maximum(np.abs(values), scale)
@@ -250,14 +250,14 @@ def fit_result(
     weak = _in_words(unknowns.labels, undetermined, inverse)
     if weak:
         faults.append("the motion does not determine all parameters")
-    held_out = np.zeros(0)
-    if unseen is not None:
-        readings = np.maximum(unseen.facts["readings"], 1)
-        held_out = np.sqrt(unseen.facts["member_loss"] / readings) / usual
+    ratios = np.zeros(0)
+    if held_out is not None:
+        readings = np.maximum(held_out.facts["readings"], 1)
+        ratios = np.sqrt(held_out.facts["member_loss"] / readings) / usual
         deviation = np.sqrt(1 / (2 * readings) + uncertain)
-        if not (held_out <= _KNOWN + _SPREAD * deviation).all():
+        if not (ratios <= _KNOWN + _SPREAD * deviation).all():
             # Their sum of squares grows with the errors of the parameters.
-            normal = len(readings) * unseen.curvature / 2
+            normal = len(readings) * held_out.curvature / 2
             spread = inverse * np.outer(relative, relative)
             excess = np.sum(normal * spread) / readings.sum()
             faults.append(
@@ -276,6 +276,6 @@ def fit_result(
         converged=converged,
         message="; ".join(message),
         history=members * np.array([row.loss for row in run.rows]),
-        held_out=tuple(held_out.tolist()),
+        held_out=tuple(ratios.tolist()),
         faults=tuple(faults),
     )

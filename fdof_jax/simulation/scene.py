@@ -147,15 +147,20 @@ def stacked(scenes: Sequence[_Stacked], name: str = "scenes") -> _Stacked:
 def unstacked(name: str, scenes: Scene) -> list[Scene]:
     """Splits stacked scenes into their members."""
     instance(name, scenes, Scene)
-    arrays, rest = eqx.partition(scenes, is_number)
-    sizes = {np.shape(leaf)[:1] for leaf in jax.tree.leaves(arrays)}
-    if len(sizes) != 1 or sizes <= {(), (0,)}:
+    if not (found := members(scenes)):
         raise ValueError(
             f"{name}: expected scenes stacked along a leading axis of one size (see "
-            f"`stacked`), got axes {shown(sorted(sizes))}."
+            f"`stacked`), got {shown(scenes)}."
         )
+    return found
+
+
+def members(batch: _Stacked) -> list[_Stacked]:
+    """Returns the members of a batch; none unless all numbers have a common axis."""
+    arrays, rest = eqx.partition(batch, is_number)
     leaves, structure = jax.tree.flatten(arrays)
-    return [
-        eqx.combine(jax.tree.unflatten(structure, row), rest)
-        for row in zip(*(np.asarray(leaf) for leaf in leaves))
-    ]
+    sizes = {np.shape(leaf)[:1] for leaf in leaves}
+    if len(sizes) != 1 or sizes <= {(), (0,)}:
+        return []
+    rows = (jax.device_put(list(row)) for row in zip(*map(np.asarray, leaves)))
+    return [eqx.combine(jax.tree.unflatten(structure, row), rest) for row in rows]

@@ -290,14 +290,14 @@ def sensitivities(
     # diffrax leaves infinity at times that it did not reach.
     states = jnp.where(jnp.isinf(raw.ys), jnp.nan, raw.ys)
 
-    def judged(z, rows):
+    def at_times(z, rows):
         scene = scene_at(z)
         q, qd, own = jax.vmap(observed, in_axes=(None, 0, 0))(z, ts, rows)
         solution = Solution(ts, q, qd, raw.stats, raw.result, own)
         return residuals(scene, solution), (scene, solution)
 
     value, change, (scene, solution) = jax.linearize(
-        judged, z, states[:, 0], has_aux=True
+        at_times, z, states[:, 0], has_aux=True
     )
     slopes = jnp.moveaxis(states[:, 1:], 1, 0)
     jacobian = jax.vmap(change, out_axes=1)(directions, slopes)

@@ -79,6 +79,19 @@ class _Landing(NamedTuple):
     last: Array  # see `_last`
 
 
+class _Happened(NamedTuple):
+    """What a step did; see the table of `Landing.after`."""
+
+    keep: Array
+    crossed: Array
+    unsure: Array
+    missed: Array
+    landed: Array
+    short: Array  # whether its length is not what its error asked for
+    crossing: Array  # as in `_Landing`, after it
+    again: Array  # where the same step is to end if it crossed or is unsure
+
+
 class Landing(eqx.Module):
     """Ends of steps at known times and where elements switch.
 
@@ -135,24 +148,10 @@ class Landing(eqx.Module):
             target, gap, length, crossing, none, none, since, pace, last
         )
 
-    def after(
-        self, t0: Array, t1: Array, y1: Integrated, planned: NextStep, state: _Landing
-    ) -> tuple[NextStep, Array, _Landing]:
-        """Returns the next step, and whether the controller resumes its old state.
-
-        `planned`: what the controller would do. A step that it keeps is one of these:
-
-        | step | flag | next step |
-        |---|---|---|
-        | passed a switch | `passed` | the same again, up to the switch |
-        | may have passed one unseen | `unsure` | the same again, up to that place |
-        | ends just before its switch | `stretched` | the same again, up to the switch |
-        | ends well before its switch | `missed` | up to where the switch was passed |
-        | ends at a switch or known time | `landed` | as long as planned before |
-        | any other | | as planned, or up to the next known time |
-        """
-        keep, next0, next1, jumped, result = planned
-        begin, end = constant((t0, t1))
+    def _happened(
+        self, begin: Array, end: Array, y1: Integrated, keep: Array, state: _Landing
+    ) -> _Happened:
+        """Returns what a step did that the controller would keep or not."""
         aimed = end == state.target
         until, unseen, soon, near, idle = constant(self._seen(y1, end))
         allowance = jnp.where(aimed, near, 0)
@@ -172,28 +171,49 @@ class Landing(eqx.Module):
             stretched, soon, jnp.where(hopeless, (begin + end) / 2, until)
         )
         landed, keep = keep & aimed & ~crossed, keep & ~crossed
+        short = (crossed | unsure) & aimed | landed
         crossing = jnp.where(keep & ~missed, -jnp.inf, state.crossing)
         crossing = jnp.where(passed, end, crossing)
-        tries = jnp.where(keep & ~missed, 0, state.tries + crossed)
+        again = jnp.where(crossed, until, unseen)
+        return _Happened(keep, crossed, unsure, missed, landed, short, crossing, again)
+
+    def after(
+        self, t0: Array, t1: Array, y1: Integrated, planned: NextStep, state: _Landing
+    ) -> tuple[NextStep, Array, _Landing]:
+        """Returns the next step, and whether the controller resumes its old state.
+
+        `planned`: what the controller would do. A step that it keeps is one of these:
+
+        | step | flag | next step |
+        |---|---|---|
+        | passed a switch | `crossed` | the same again, up to the switch |
+        | ends just before its switch | `crossed` | the same again, up to the switch |
+        | may have passed one unseen | `unsure` | the same again, up to that place |
+        | ends well before its switch | `missed` | up to where the switch was passed |
+        | ends at a switch or known time | `landed` | as long as planned before |
+        | any other | | as planned, or up to the next known time |
+        """
+        keep, next0, next1, jumped, result = planned
+        begin, end = constant((t0, t1))
+        keep, crossed, unsure, missed, landed, short, crossing, again = self._happened(
+            begin, end, y1, keep, state
+        )
         # The error of a step that was cut short says little about the next one.
-        short = (crossed | unsure) & aimed | landed
         length = jnp.where(short, state.resumed, next1 - next0)
         # With the derivatives of the end, which `end` and `next0` lack.
         next_t0 = jnp.where(keep, t1 + (next0 - end), t0)
         next_t0 = next_t0 + jnp.where(landed, state.gap, 0)
         next_t1 = jnp.where(missed, crossing, next_t0 + length)
         next_t1, gap, cut = self._cut(constant(next_t0), next_t1, state.last)
-        shortened = crossed | unsure
-        place = jnp.where(crossed, until, unseen)
         # What a jump at a known time has switched switches with it, at once.
-        place = jnp.where(place == begin, t0, place)
-        next_t1 = jnp.where(shortened, place, next_t1)
+        shortened, again = crossed | unsure, jnp.where(again == begin, t0, again)
+        next_t1 = jnp.where(shortened, again, next_t1)
         gap, aims = jnp.where(shortened, 0, gap), (cut | crossed | missed) & ~unsure
         # Time that passes meanwhile tells fast switching from chatter.
         paced = begin - state.since > state.pace
         landings = jnp.where(paced, 0, state.landings + crossed)
         results = diffrax.RESULTS
-        resumes = crossed | landed | unsure
+        resumes = shortened | landed
         # After the last step, which may be shorter than others may, none is asked for.
         done = keep & (end >= state.last)
         result = results.where(resumes | done, results.successful, result)
@@ -204,7 +224,7 @@ class Landing(eqx.Module):
             gap=gap,
             resumed=length,
             crossing=crossing,
-            tries=tries,
+            tries=jnp.where(keep & ~missed, 0, state.tries + crossed),
             landings=landings,
             since=jnp.where(paced, begin, state.since),
         )
