@@ -30,9 +30,22 @@ LONGEST = {
     "test_tuning",
     "test_public_callables",
 }
-# Doctests that compile searches.
-SEARCHES = {
+# Doctests that compile much.
+LONG_EXAMPLES = {
+    "fdof_jax.analysis.linearization.closed_loop_modes",
+    "fdof_jax.analysis.linearization.equilibrium",
+    "fdof_jax.analysis.linearization.linearize",
+    "fdof_jax.analysis.loops.closed_loop",
+    "fdof_jax.analysis.loops.margins",
+    "fdof_jax.analysis.measures.response",
+    "fdof_jax.analysis.responses.step_and_sine",
+    "fdof_jax.forces.holders.Brake",
+    "fdof_jax.forces.holders.HardStops",
+    "fdof_jax.forces.holders.JointFriction",
     "fdof_jax.identification.fitting.fit_each",
+    "fdof_jax.simulation.phases.concatenate",
+    "fdof_jax.simulation.sampled.simulate_sampled",
+    "fdof_jax.tuning.losses.joint_errors",
     "fdof_jax.tuning.result.league_table",
     "fdof_jax.tuning.optimal_motion.optimal_efforts",
     "fdof_jax.tuning.tuning.tune_each",
@@ -125,6 +138,6 @@ def pytest_collection_modifyitems(items):
     """Sorts the tests, and marks the hard scenes slow, as most compile much."""
     items.sort(key=lambda item: item.path.stem not in LONGEST)
     for item in items:
-        hard = item.path.parent == HARD and item.path.stem != "test_fuzz"
-        if hard or item.name in SEARCHES:
+        hard = item.path.parent == HARD
+        if hard or item.name in LONG_EXAMPLES:
             item.add_marker(pytest.mark.slow)

@@ -58,6 +58,7 @@ def acting(element, q, qd, linkage):
     return element(0.0, q, qd, linkage)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("topology", fj.TOPOLOGIES)
 def test_the_actuator_s_bodies_by_another_lagrangian(topology):
     linkage, q, qd = motion(topology)
@@ -87,6 +88,7 @@ def test_the_actuator_s_force_may_depend_on_its_length():
     )
 
 
+@pytest.mark.slow
 def test_a_rotor_of_a_direct_drive_turns_as_the_link_beyond():
     linkage, q, qd = motion("RRR")
     rotors, inertia = fj.forces.Rotor([0.3, 0.2, 0.1], 1.0), [0.3, 0.2, 0.1]

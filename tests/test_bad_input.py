@@ -245,6 +245,7 @@ def test_modes_that_the_adjoint_does_not_serve_name_the_cure():
         jax.eval_shape(slope, jnp.zeros(3))
 
 
+@pytest.mark.slow
 def test_one_effort_for_all_joints():
     one, each = fj.JointEffort(1.5), fj.JointEffort([1.5] * 3)
     for effort in (one, each):

@@ -40,6 +40,7 @@ BOUNDS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", BOUNDS)
 def test_motions_equal_the_reference(name):
     arm, start, forces, ts = scene(name)
@@ -50,6 +51,7 @@ def test_motions_equal_the_reference(name):
     assert error.max() <= before
 
 
+@pytest.mark.slow
 def test_the_two_link_arm_on_its_circle_equals_the_reference():
     arm, start, forces, t1 = fj.scenes.two_link_circle()
     wanted = REFERENCE["two-link-circle"]
@@ -61,6 +63,7 @@ def test_the_two_link_arm_on_its_circle_equals_the_reference():
 
 # Forward mode for six pairs; reverse mode, which takes long to compile, for two here
 # and for three, one of them fixed, in `test_gradients_of_a_motion_equal_differences`.
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name, bound, mode",
     [
@@ -131,6 +134,7 @@ def test_gradients_of_a_motion_equal_differences():
     assert slope == pytest.approx((4 * fine - coarse) / 3, rel=1e-8)
 
 
+@pytest.mark.slow
 def test_one_trace_serves_all_chains_of_a_length_and_batches_equal_their_members():
     rng = np.random.default_rng(4)
     names = "RRRR", "RFRP", "FPRF"
@@ -155,6 +159,7 @@ def test_one_trace_serves_all_chains_of_a_length_and_batches_equal_their_members
             np.testing.assert_allclose(a[i], b, rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_what_is_given_at_fixed_pairs_does_not_move_them():
     rng = np.random.default_rng(6)
     chain, n = chains.random_chain("RFPRF", rng), 5

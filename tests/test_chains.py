@@ -47,6 +47,7 @@ def everything(chain, q, qd, tau):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pairs", PAIRS)
 def test_motion_energy_and_kinematics_equal_mujoco(pairs):
     for topology, chain, (q, qd, tau) in cases(pairs):
@@ -133,6 +134,7 @@ def test_a_shorter_chain_is_a_longer_one_with_fixed_pairs():
 
 
 # Those of six pairs are differentiated along motions.
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "topology", ["RP", pytest.param("RFRR", marks=pytest.mark.slow)]
 )
@@ -195,6 +197,7 @@ def test_the_papers_equations_are_for_three_pairs():
         fj.paper.mass_matrix(chain, np.zeros(6))
 
 
+@pytest.mark.slow
 def test_the_papers_equations_hold_with_fixed_pairs():
     """They give the accelerations of the reduced form, and forces that balance (15)."""
     rng = np.random.default_rng(6)

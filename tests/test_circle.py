@@ -65,6 +65,7 @@ def test_the_tip_runs_round_the_circle_at_constant_speed(period):
     np.testing.assert_allclose(task.tip(3 * period), start)
 
 
+@pytest.mark.slow
 @each_topology
 @pytest.mark.parametrize("branch", [1, -1])
 def test_the_reference_puts_the_tip_on_the_circle(topology, branch):
@@ -156,6 +157,7 @@ def reference_derivatives(task, linkage):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "hub, radius",
     [

@@ -24,6 +24,7 @@ def test_figures(tmp_path, capsys):
     assert last == " ".join(["Open first:", *first])
 
 
+@pytest.mark.slow
 def test_topologies(tmp_path):
     main(["--output", str(tmp_path), "topologies"])
     assert pictures(tmp_path) == ["topologies.png"]

@@ -122,6 +122,7 @@ def fed_forward():
     return scene._replace(forces=(controller,))
 
 
+@pytest.mark.slow
 def test_fig_7_with_gravity_held():
     scene = fed_forward()
     (controller,) = scene.forces
@@ -224,6 +225,7 @@ def test_models_are_checked(kind):
 # Gains
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("joint", range(3))
 def test_a_joint_that_moves_alone_has_the_frequency_and_the_damping(joint):
     linkage, q = arm("RRR")

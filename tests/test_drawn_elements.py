@@ -106,6 +106,7 @@ def test_the_bars_of_stops_are_where_joints_touch_them():
     close(across[-2:].mean(axis=0), touch)
 
 
+@pytest.mark.slow
 def test_the_path_of_a_controller_is_drawn_once_around():
     circle = fj.CircleTask()
     line = fj.references.Line([-4, 2], [-3, 2])

@@ -47,6 +47,7 @@ def test_a_lag_is_an_exponential():
     np.testing.assert_array_equal(started.own, np.full(3, 2.0))
 
 
+@pytest.mark.slow
 def test_a_motor_reaches_its_current_and_its_speed():
     motor = fj.control.DCMotor(
         command(12.0), resistance=2.0, inductance=0.5, constant=0.1, gear=3.0
@@ -61,6 +62,7 @@ def test_a_motor_reaches_its_current_and_its_speed():
     np.testing.assert_allclose(found, exact, rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_currents_stay_within_their_limits():
     """Covers many windings and a reversed command; i' = (limit - i) R/L."""
     ts = np.linspace(0, 0.2, 41)
@@ -90,6 +92,7 @@ def test_currents_stay_within_their_limits():
 STATIC = fj.control.DCMotor(command(12.0), resistance=2.0, constant=0.1, gear=3.0)
 
 
+@pytest.mark.slow
 def test_a_motor_without_inductance_runs_up_as_an_exponential():
     decay, top = 0.3**2 / (2 * 2.0), 12 / 0.3  # of an inertia of 2
     ts = np.linspace(0, 100, 11)
@@ -206,6 +209,7 @@ def test_a_state_that_is_not_a_number_is_told():
         fj.simulate(WHEEL, STILL, [0, 1.0], (broken,))
 
 
+@pytest.mark.slow
 def test_states_of_elements_are_swept():
     starts = fj.State(np.linspace(0, 1, 5)[:, None], np.zeros(1))
     solution = fj.sweep(WHEEL, starts, [0, 0.2, 0.4], (LAG,), solver=LoopedDopri8())

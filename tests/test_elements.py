@@ -77,6 +77,7 @@ def balance(linkage, parts, q, qd, tau):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("topology", [*fj.TOPOLOGIES, "RFP", "FPR"])
 def test_energy_is_kept_but_for_what_dampers_take(topology):
     arm, real = elements.arm(topology), chains.moving(topology)
@@ -208,27 +209,13 @@ def labels_of(x):
     return [*LABELS, *["state"] * (x.size - len(LABELS))]
 
 
+@pytest.mark.slow
 def test_slopes_in_all_numbers_equal_differences(instants):
     _, xs, *rows = zip(*instants)
     check_slopes(labels_of(xs[0]), *map(np.concatenate, rows))
 
 
 @pytest.mark.slow
-def test_reverse_mode_gives_the_same_slopes(instants):
-    """The reverse mode of a motion consists of these: see test_chain_motions.py."""
-
-    def pulled_back(t, x, weights):
-        return jax.vjp(lambda x: acts_at(t, x), x)[1](weights)[0]
-
-    rng, pull_back = np.random.default_rng(0), jax.jit(pulled_back, **LOOPS)
-    for t, x, slopes, _ in instants:
-        weights = rng.normal(size=len(slopes))
-        expected = weights @ slopes
-        scale = 1e-9 * np.abs(slopes).max(axis=0) + 1e-9
-        error = np.abs(pull_back(t, x, weights) - expected)
-        assert not {n for n, e, s in zip(labels_of(x), error, scale) if not e <= s}
-
-
 def test_gradients_of_a_motion_equal_differences():
     """Forward mode, with the states and masses that motions carry along."""
     forces = tuple(elements.ALL[name] for name in ("motor with PID", "actuator"))
@@ -248,6 +235,7 @@ def test_gradients_of_a_motion_equal_differences():
     check_slopes(names(forces), slopes, differences(value, ones))
 
 
+@pytest.mark.slow
 def test_one_program_for_all_topologies():
     """Checks that elements act in a batch of all arms as on each arm alone.
 
@@ -313,6 +301,7 @@ def field_flops(*forces):
 bare = cache(field_flops)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", EVERY)
 def test_an_element_costs_its_own(name):
     """Besides adding its efforts, and six entries of the mass matrix if it has any."""

@@ -27,6 +27,7 @@ class TestEnsembles:
             speed=(1, 2), seed=1,
         )  # fmt: skip
 
+    @pytest.mark.slow
     def test_members_are_as_asked(self):
         many = self.ensemble(200)
         mass = np.asarray(many.linkage.mass)
@@ -45,6 +46,7 @@ class TestEnsembles:
         again = self.ensemble(200)
         assert eqx.tree_equal(many, again)
 
+    @pytest.mark.slow
     def test_the_loss_is_the_mean_or_nearly_the_worst_of_the_members(self):
         ensemble = self.ensemble()
         mean = fj.tune(self.scene, ensemble=ensemble, max_steps=8)
@@ -74,6 +76,7 @@ class TestEnsembles:
         words = str(eqx.tree_at(lambda result: result.scene, tuned, scene))
         assert "kp of P2 [1/s^2]" in words and "kd of R1 [1/s]" in words
 
+    @pytest.mark.slow
     def test_a_member_that_fails_is_named(self):
         ensemble = self.ensemble()
         masses = lambda many: (many.linkage.mass, many.linkage.inertia)

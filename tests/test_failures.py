@@ -48,6 +48,7 @@ def test_a_motion_that_cannot_go_on_is_a_result_that_names_its_cause(inputs, wor
         fj.simulate(arm, start, [0, 4.0], forces)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tolerance", [1e-11, 1e-6])
 def test_an_overdamped_arm_needs_an_implicit_solver(tolerance):
     damper, few = fj.JointDamper(3e4), dict(rtol=tolerance, atol=tolerance)
@@ -70,6 +71,7 @@ def test_a_long_motion_needs_more_steps():
     assert needed == pytest.approx(int(motion.stats["num_steps"]), rel=0.1)
 
 
+@pytest.mark.slow
 def test_an_effort_that_feeds_itself_diverges():
     feeds = lambda t, q, qd, linkage: qd**3
     words = message([0, 5.0], (feeds,), fj.State([1.0], [1.0]), max_steps=150)
@@ -79,6 +81,7 @@ def test_an_effort_that_feeds_itself_diverges():
     assert "tolerance out of reach" in words and "grows by a rate of" in words
 
 
+@pytest.mark.slow
 def test_a_function_without_derivatives_may_run_out_of_steps():
     def called(t, q, qd, linkage):
         return jax.pure_callback(lambda q: -np.asarray(q), q, q)
@@ -86,6 +89,7 @@ def test_a_function_without_derivatives_may_run_out_of_steps():
     assert "raise max_steps" in message([0, 9.0], (called,), max_steps=20)
 
 
+@pytest.mark.slow
 def test_branches_that_push_towards_each_other():
     pushed = lambda t, q, qd, linkage: -fj.forces.switch(qd, 10.0, -10.0)
     words = message([0, 1.0], (pushed,))
@@ -112,6 +116,7 @@ class _Sign(fj.Element):
         return -jnp.array([0, 1]) * side
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "forces, words",
     [

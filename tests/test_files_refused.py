@@ -223,6 +223,7 @@ LARGE = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LARGE)
 def test_the_memory_is_bounded_by_the_size(name, path):
     path.write_text(of(f'"value": {LARGE[name]}'))

@@ -91,6 +91,7 @@ def test_tangents_are_those_of_differences(point):
     assert np.linalg.norm(coarse - gradient) < 1e-3 * size
 
 
+@pytest.mark.slow
 def test_nothing_is_nan_at_rest_at_zero_error_or_at_saturation():
     scene, ts = scenes.fig7(), np.linspace(0, 0.3, 1001)
     hold = lambda t, linkage: (jnp.asarray(scene.state0.q), jnp.zeros(3))
@@ -119,6 +120,7 @@ def report():
     return fj.tuning.gradient_report(scenes.fig7()._replace(t1=2.0))
 
 
+@pytest.mark.slow
 def test_the_report_is_what_it_says(report):
     halfway, exact = by_differences(scenes.fig7(), np.linspace(0, 2, 1001))
     size = np.linalg.norm(exact)
@@ -149,6 +151,7 @@ def test_the_report_is_what_it_says(report):
     assert "disagree" not in str(report)
 
 
+@pytest.mark.slow
 def test_a_report_says_where_gains_have_no_effect():
     scene = scenes.fig7()
     weak = scene.forces[0].replace(limit=[1000.0, 1e-6, 400.0])
@@ -157,6 +160,7 @@ def test_a_report_says_where_gains_have_no_effect():
     assert "P2 is at its limit throughout" in found.warnings[0]
 
 
+@pytest.mark.slow
 def test_a_reference_without_a_tip_is_judged_by_the_joints():
     arm = fj.Linkage("R", length=[0, 1], com=[[0.5, 0]], mass=[1], inertia=[1 / 12])
     step = fj.references.Step([-1.5], [-1.3], begin=0.05)

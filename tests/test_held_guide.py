@@ -44,12 +44,6 @@ def test_the_page_shows_what_the_script_prints(held, rows):
 
 
 @pytest.mark.slow
-def test_picture(held, tmp_path):
-    held.picture(tmp_path / "held.png")
-    assert (tmp_path / "held.png").stat().st_size > 10_000
-
-
-@pytest.mark.slow
 def test_examples():
     names = run(PAGE)
     motion = names["motion"]

@@ -7,6 +7,7 @@ import pytest
 import fdof_jax as fj
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("joint", [2, 3])
 def test_an_arm_with_one_of_two_slides_held_keeps_its_energy(joint):
     arm = fj.Linkage(

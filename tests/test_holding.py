@@ -43,6 +43,7 @@ def test_static_friction_holds_what_has_come_to_rest_only():
     assert falling.q[-1, 0] < -0.01
 
 
+@pytest.mark.slow
 def test_a_sprung_slide_stops_short_and_derivatives_tell_where():
     """13 half swings, each shorter by 4 cm: the slide stops at 1 cm."""
     ts, spring = np.linspace(0, 6, 7), fj.forces.JointSpring(100.0)
@@ -63,6 +64,7 @@ def test_a_sprung_slide_stops_short_and_derivatives_tell_where():
     np.testing.assert_allclose(reverse(numbers), right, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_tiny_arms_stick_slip_and_saturate_as_large_ones():
     """Efforts of 1e-12 N m, or of 1e12, are found as exactly as those of 1 N m."""
     ts = np.linspace(0, 1.5, 16)
@@ -92,6 +94,7 @@ def test_tiny_arms_stick_slip_and_saturate_as_large_ones():
     np.testing.assert_allclose(way(1e-6), way(1.0), atol=1e-7)
 
 
+@pytest.mark.slow
 def test_a_kink_where_friction_turns_leaves_derivatives_on_both_sides():
     """The limit of a motor has kinks at rest, where the friction jumps."""
     pd = fj.PDController(60.0, 2.0, 20.0, fj.references.SetPoint([-0.5]))
@@ -100,6 +103,7 @@ def test_a_kink_where_friction_turns_leaves_derivatives_on_both_sides():
     assert motion.stats["num_switches"] > 6 and motion.stats["one_sided"] == 0
 
 
+@pytest.mark.slow
 def test_a_mass_on_a_belt_sticks_and_slips_for_a_hundred_periods():
     """As seen from the belt, the spring's other end moves."""
     pull = lambda t, q, qd, linkage: -100 * (q + 0.1 * t)
@@ -159,6 +163,7 @@ def test_second_derivatives_through_a_blow():
     np.testing.assert_allclose(twice(height), twice(closed_form), rtol=0, atol=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "stiffness, event", [(0.0, "rests on its stop"), (9.0, "is stopped")]
 )
@@ -180,6 +185,7 @@ def test_a_start_outside_of_stops_is_refused():
     assert motion.events.count == 0 and np.isnan(motion.events.t).all()
 
 
+@pytest.mark.slow
 def test_a_fixed_pair_has_no_stops():
     """Its position is 0, which need not lie within a range that others have."""
     start = fj.State([0.7, 0.0], [0.0, 0.0])
@@ -198,6 +204,7 @@ PAIR = fj.Linkage(
 MOVING = fj.State([0.3, 0.8], [1.0, 2.0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("begin", [-1.0, 0.0])
 def test_a_brake_that_acts_already_holds_from_the_start(begin):
     motion = run(PAIR, MOVING, [0, 1.0], Brake(2, begin))
@@ -211,6 +218,7 @@ def test_a_brake_that_acts_already_holds_from_the_start(begin):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lagged", ["the controller", "a force beside it"])
 def test_states_of_drives_go_on_while_a_brake_holds(lagged):
     """The integral and the lag of a slide, by matrix exponentials."""
@@ -236,6 +244,7 @@ def test_states_of_drives_go_on_while_a_brake_holds(lagged):
     np.testing.assert_allclose(np.sort(own), np.sort(end[2:4]), atol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_brake_that_lets_go_at_a_stop_leaves_the_joint_there():
     forces = HardStops(-0.5, 0.5), Brake(1, 1.0, 1.5)
     motion = run(BAR, REST, [0, 0.9, 1.2, 2.0], *forces)
@@ -243,11 +252,13 @@ def test_a_brake_that_lets_go_at_a_stop_leaves_the_joint_there():
     assert motion.q[1:, 0].tolist() == [-0.5] * 3 and motion.events.count == 3
 
 
+@pytest.mark.slow
 def test_a_hinge_that_hits_its_stop_moves_the_other():
     motion = run(PAIR, MOVING, [0, 1e-12], HardStops(-inf, [inf, 0.8], restitution=0.4))
     np.testing.assert_allclose(motion.qd[-1], [1.8076264, -0.8], rtol=1e-7)
 
 
+@pytest.mark.slow
 def test_a_bar_takes_a_mass_at_rest_or_one_that_moves_along():
     bar, start = BAR.replace(gravity=0.0), fj.State([0.0], [2.0])
     along = -2 * np.sin(2.0), 2 * np.cos(2.0)  # of the tip at 1 s
@@ -258,6 +269,7 @@ def test_a_bar_takes_a_mass_at_rest_or_one_that_moves_along():
         np.testing.assert_allclose(motion.taken[-1], taken, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_reactions_count_a_payload_while_it_is_there():
     load = Payload(fj.Point(1, 1.0), 2.0, begin=0.2, end=0.6)
     forces = load, JointFriction(100.0)
@@ -267,6 +279,7 @@ def test_reactions_count_a_payload_while_it_is_there():
     np.testing.assert_allclose(reactions[:, 0], right, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_payload_of_all_time_is_a_link_of_more_mass():
     load = Payload(fj.Point(3, 0.3, 0.05), 0.7)
     heavy = arm("RPR")
@@ -287,6 +300,7 @@ def test_a_payload_of_all_time_is_a_link_of_more_mass():
 # Batches, tables, costs
 
 
+@pytest.mark.slow
 def test_modes_and_topologies_share_one_program_in_a_batch():
     """Members equal single motions."""
     arms = [arm(topology) for topology in ("RRR", "RPR", "PRR", "RPP")]
@@ -320,6 +334,7 @@ def test_modes_and_topologies_share_one_program_in_a_batch():
     }
 
 
+@pytest.mark.slow
 def test_what_holds_nothing_has_no_modes():
     motion = run(BAR, REST, [0, 1.0], JointFriction(1.0, speed=0.1))
     assert motion.modes is motion.taken is motion.events is None
@@ -351,6 +366,7 @@ def test_malformed_elements_are_refused(make, words):
         make()
 
 
+@pytest.mark.slow
 def test_blows_at_the_start_are_events():
     arm = fj.scenes.double_pendulum().linkage
     motion = run(arm, fj.State([0.3, 0.0], [2.0, 1.0]), [0, 0.1], Brake(1, begin=-1))
@@ -384,7 +400,7 @@ def test_what_cannot_go_together_is_refused():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(16))
+@pytest.mark.parametrize("seed", [4, 5, 8, 10, 12, 17, 22, 28])  # of four joints
 def test_laws_of_random_scenes(seed):
     """The books of energy close, held joints stand still, efforts stay in bounds."""
     errors = law_errors(seed)

@@ -56,6 +56,7 @@ def pendulum(angle, rate, acceleration, ts):
     return solve_ivp(field, (0, ts[-1]), [angle, rate], "DOP853", ts, **options).y
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("acceleration", [0.0, 4.0])
 def test_a_pendulum_on_a_cart_that_accelerates(acceleration):
     moving = pushed(0.0, acceleration)
@@ -68,6 +69,7 @@ def test_a_pendulum_on_a_cart_that_accelerates(acceleration):
     np.testing.assert_array_equal(solution.q[:, 2], 0)
 
 
+@pytest.mark.slow
 def test_a_jump_of_the_velocity_is_a_blow():
     """Checks that the pendulum's momentum about its pivot does not change."""
     moving = pushed(0.6)
@@ -109,6 +111,7 @@ def along(linkage, forces, solution, efforts):
     return jax.vmap(at)(solution.ts, solution.q, solution.qd, efforts)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("joints", [1, 2, 3, (1, 2), (1, 2, 3)], ids=str)
 @pytest.mark.parametrize("topology", ["RRR", "RPR", "PRP"])
 def test_efforts_make_the_motion_and_do_its_work(topology, joints):
@@ -128,6 +131,7 @@ def test_efforts_make_the_motion_and_do_its_work(topology, joints):
     np.testing.assert_allclose(energy[-1] - energy[0], work, atol=1e-6 * np.ptp(power))
 
 
+@pytest.mark.slow
 def test_starts_beside_the_reference_and_singular_equations_are_told():
     motion = pushed(0.0)
     starts = fj.State(np.array([[0.0, 0.1, 0], [0.2, 0.1, 0]]), np.zeros((2, 3)))

@@ -160,6 +160,7 @@ def encoders(scene, solution):
 LINK = dict(m=jnp.asarray(3.0), p=jnp.asarray(0.5), J=jnp.asarray(1.1))
 
 
+@pytest.mark.slow
 def test_the_encoder_of_a_fixed_pair_is_no_reading():
     """It is right without noise, and would make the noise of the others seem less."""
     scene_at = FirstLink(fj.existence_factors("RRF"))
@@ -226,6 +227,7 @@ def test_directions_of_any_scale_are_told_from_those_that_vanish():
     assert np.isfinite(inverse).all()
 
 
+@pytest.mark.slow
 def test_recordings_judged_together(noisy):
     """Two motions, in one fit, determine more than one of them does."""
     one = fj.fit(MIXED, FIRST, TS, noisy[0], noise=1e-3)
@@ -275,6 +277,7 @@ def test_a_fit_that_predicts_another_motion_to_its_noise(noise, noisy):
     assert f"held-out residuals {judged.held_out[0]:.3g} times the noise" in str(judged)
 
 
+@pytest.mark.slow
 def test_a_wrong_model_is_told_by_another_motion_alone(noisy):
     """Wrong by 7 % in one inertia, which the other parameters hide from the fit."""
     bounds = dict(inertia=(0.16, 0.2))

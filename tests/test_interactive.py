@@ -56,6 +56,7 @@ def box(all_arms):
     return all_arms
 
 
+@pytest.mark.slow
 def test_every_slider_changes_picture_and_words(box):
     for name in (f"{kind} {k}" for kind in ("link", "kp", "kd") for k in (1, 2, 3)):
         before, words = box.pixels, box.words.value
@@ -79,6 +80,7 @@ def test_the_error_is_that_of_a_simulation(box):
     assert f"rms {1e3 * rms:.3g} mm" in box.words.value
 
 
+@pytest.mark.slow
 def test_an_exported_notebook_has_a_still_picture():
     box = sliders({"RRR": CIRCLES["RRR"]})
     code = nbformat.v4.new_code_cell("")

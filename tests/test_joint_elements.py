@@ -51,6 +51,7 @@ def test_mujoco_has_the_same_springs(topology):
     np.testing.assert_allclose(energy, data.energy[0], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_mass_swings_on_a_spring():
     """One number serves all joints, and the period is 2 pi sqrt(m / k)."""
     ts = np.pi * np.sqrt(2 / 8) * np.arange(4)  # half periods
@@ -62,6 +63,7 @@ def test_a_mass_swings_on_a_spring():
 # Stops
 
 
+@pytest.mark.slow
 def test_a_bounce_keeps_the_energy():
     """The penetration is (d + w)^2 / 4w up to a depth w, and the depth beyond."""
     k, w, end = 300.0, 0.02, 1.0
@@ -80,6 +82,7 @@ def test_a_bounce_keeps_the_energy():
     np.testing.assert_allclose(energy[-1], energy[0], rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_deep_in_a_stop_the_spring_is_linear():
     """A contact lasts half a period of sqrt(k/m)."""
     k, speed = 800.0, 2.0
@@ -91,6 +94,7 @@ def test_deep_in_a_stop_the_spring_is_linear():
     np.testing.assert_allclose(stored(stops, x), [0, speed**2, 0], atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "mass, stiffness, damping, speed",
     [(0.1, 1e6, 0.6, 2.0), (0.01, 1e7, 0.5, 5.0), (2.0, 3e2, 0.3, 3.0)],
@@ -136,6 +140,7 @@ def rebounds(share, mass, stiffness, damping, speed):
     return -motion.qd[-1, 0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [None, 0.03, 1.0, 100.0])
 def test_smoothing_takes_nothing_from_damping(share):
     values = [0.01, 100.0], [1e2, 1e7], [0.01, 2.0], [0.1, 10.0]

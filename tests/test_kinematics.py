@@ -78,6 +78,7 @@ def with_fixed_pairs(moving, rng):
     return "".join(letters)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("moving", [*fj.TOPOLOGIES, "RR", "RP", "PR", "PP"])
 def test_both_branches_reach_the_pose_and_one_is_the_original(moving):
     rng = np.random.default_rng(7)
@@ -104,6 +105,7 @@ def test_both_branches_reach_the_pose_and_one_is_the_original(moving):
     assert np.mean(apart) > 0.7 if moving.count("P") < 2 else not any(apart)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("branch", [1, -1])
 def test_derivatives_of_inverse_kinematics_invert_the_jacobian(branch):
     for topology in fj.TOPOLOGIES:
@@ -114,6 +116,7 @@ def test_derivatives_of_inverse_kinematics_invert_the_jacobian(branch):
         np.testing.assert_allclose(jacobian @ inverse, identity, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_gradients_in_the_linkage_leave_a_fixed_pose_fixed():
     # Stacked topologies: the branches of the other topologies must not leak NaN.
     rng = np.random.default_rng(6)
@@ -293,6 +296,7 @@ OTHER_NUMBERS = [  # of joints than a tip takes with an orientation, or without 
 CIRCLE = fj.references.Ellipse([0.5, 0.5], [0.1, 0.1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("topology, orientation", OTHER_NUMBERS)
 def test_chains_of_other_numbers_of_joints_are_refused(topology, orientation):
     wanted, count = 2 if orientation is None else 3, len(topology.replace("F", ""))
@@ -304,6 +308,7 @@ def test_chains_of_other_numbers_of_joints_are_refused(topology, orientation):
         assert np.isnan(found).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "task, topology, wanted",
     [
@@ -320,6 +325,7 @@ def test_tasks_for_other_numbers_of_joints_are_refused(task, topology, wanted):
         fj.simulate(chain, fj.State(np.zeros(n), np.zeros(n)), [0, 0.1], (pd,))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "topology", ["RR", "RP", "PR", pytest.param("RFP", marks=pytest.mark.slow)]
 )

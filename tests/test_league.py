@@ -46,6 +46,7 @@ def test_all_start_alike():
     assert 0.04 < np.linalg.norm(np.asarray(start) - np.asarray(tips[0])) < 0.06
 
 
+@pytest.mark.slow
 def test_reachable_says_when():
     arm = SCENES["RRR"].linkage
     task = SCENES["RRR"].forces[0].reference.replace(radius=0.75)

@@ -26,6 +26,7 @@ def within(scene, **limits):
     )
 
 
+@pytest.mark.slow
 def test_gains_are_at_the_limits_of_overshoot_and_effort():
     """The mean squared error of a step falls with kp, and is least at a damping ratio
     of 1/2, which overshoots by 16 %."""
@@ -47,6 +48,7 @@ def test_gains_are_at_the_limits_of_overshoot_and_effort():
     np.testing.assert_allclose(found.loss, np.mean((motion.q - 1) ** 2), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_margins_are_met_and_limits_that_do_not_bind_change_nothing():
     few, many = within(step(), effort=12.0), within(step(), effort=12.0, overshoot=0.3)
     np.testing.assert_allclose(few.gains, many.gains, rtol=1e-3)
@@ -60,6 +62,7 @@ def test_margins_are_met_and_limits_that_do_not_bind_change_nothing():
     assert least == pytest.approx(fj.analysis.margins(loop).modulus)
 
 
+@pytest.mark.slow
 def test_settling_times_are_met():
     found = within(step(), effort=12.0, settling_time=1.2)
     assert found.met.all()
@@ -71,6 +74,7 @@ def test_settling_times_are_met():
     assert kd / (2 * np.sqrt(kp * INERTIA)) > 0.7
 
 
+@pytest.mark.slow
 def test_limits_of_a_joint_that_is_faster_than_the_samples_are_measured():
     frequency, ratio = 190.0, 0.3
     kp, kd = frequency**2 * INERTIA, 2 * ratio * frequency * INERTIA
@@ -89,6 +93,7 @@ def test_limits_of_a_joint_that_is_faster_than_the_samples_are_measured():
     np.testing.assert_allclose(settling, settled, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_limits_out_of_reach_are_exceeded_least():
     """In 0.05 s the arm moves by a few percent, at the most that kp may grow to."""
     found = within(step(), settling_time=0.05, effort=12.0)
@@ -106,6 +111,7 @@ def test_limits_out_of_reach_are_exceeded_least():
     assert "<th>effort [N m] of R1</th><td>12</td>" in html
 
 
+@pytest.mark.slow
 def test_the_margins_that_are_tuned_are_those_of_the_loops():
     rng = np.random.default_rng(2)
     linkage, q = random_linkage("RPR", rng), rng.uniform(-1, 1, 3)
@@ -133,6 +139,7 @@ def test_a_response_that_creeps_from_below_has_not_settled():
     assert unsettled[3] == pytest.approx(0.98 - float(motion.q[250, 0]), rel=1e-5)
 
 
+@pytest.mark.slow
 def test_the_errors_of_a_fixed_pair_count_nothing():
     arm = fj.Linkage(
         "RF", length=[0, 1, 1], com=[[0.5, 0]] * 2, mass=[1] * 2, inertia=[0.1] * 2
@@ -144,6 +151,7 @@ def test_the_errors_of_a_fixed_pair_count_nothing():
     assert (errors[:, 1] == 0).all() and (errors[:, 0] != 0).all()
 
 
+@pytest.mark.slow
 def test_the_errors_of_a_joint_that_nothing_drives_count_nothing():
     arm = fj.scenes.double_pendulum().linkage
     pd = fj.PDController([5.0, 0.0], [1.0, 0.0], np.inf, Stand(np.array([0.2, 0.7])))

@@ -63,6 +63,7 @@ def slopes(function, y, h=1e-6):
 # A and B
 
 
+@pytest.mark.slow
 @each_topology
 def test_a_and_b_are_slopes(topology):
     linkage, q, qd, tau = motion(topology)
@@ -81,6 +82,7 @@ def test_a_and_b_are_slopes(topology):
     np.testing.assert_allclose(B, by_u, atol=1e-7 * np.abs(B).max())
 
 
+@pytest.mark.slow
 def test_a_stiff_controller_of_limited_efforts_has_an_equilibrium():
     scene = fj.scenes.fig7()
     controller = scene.forces[0]
@@ -104,6 +106,7 @@ def test_a_stiff_controller_of_limited_efforts_has_an_equilibrium():
 # Equilibria
 
 
+@pytest.mark.slow
 @each_topology
 def test_equilibria_are_where_the_efforts_hold_the_arm(topology):
     linkage, q, *_ = motion(topology)
@@ -127,6 +130,7 @@ def test_forces_carry_their_part_of_the_load(q):
     np.testing.assert_allclose(found, [-1.0], atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share, found", [(0.95, True), (1.05, False)])
 def test_loads_that_nothing_holds_have_no_equilibrium(share, found):
     """A shoulder motor can be too weak or too strong for every posture."""
@@ -140,6 +144,7 @@ def test_loads_that_nothing_holds_have_no_equilibrium(share, found):
 # Modes
 
 
+@pytest.mark.slow
 def test_a_hanging_chain_of_point_masses_swings_as_is_known():
     """Squared frequencies in g/l are the zeros of Laguerre's L3."""
     linkage = fj.scenes.fig5().linkage
@@ -170,6 +175,7 @@ def test_the_modes_of_fig_3_at_rest():
     np.testing.assert_allclose(modes.damping[0, 2], 0.3471 / abs(known[2]), rtol=2e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kd", [0.5, 10.0, 40.0])
 def test_longer_steps_than_the_longest_are_unstable(kd):
     forces = (held(ROD, STILL, [400.0, 300.0, 200.0], [kd] * 3),)
@@ -199,6 +205,7 @@ def test_a_saturated_joint_has_no_gains():
     np.testing.assert_allclose(modes.longest_step, 2.6 / modes.frequency[:, -1])
 
 
+@pytest.mark.slow
 def test_fixed_pairs_have_no_modes():
     linkage = ROD.replace(topology="RFR")
     forces = (held(linkage, STILL, [400.0, 0.0, 200.0], [10.0, 0.0, 6.0]),)

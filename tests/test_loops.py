@@ -67,6 +67,7 @@ def lagged(chain, seed, spread, ratio, lag, base=8.0):
     return linkage, q, fj.control.FirstOrderLag(pd, lag)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("chain, spread, ratio, lag", [
     ("RPR", 7.5, 0.7, 4e-3), ("RRR", 7.5, 0.7, 4e-3), ("RPR", 100.0, 0.7, 1e-4),
 ])  # fmt: skip
@@ -104,6 +105,7 @@ def least_distance(loop):
     return min(least)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed, ratio", [(3, 5e-4), (9, 5e-5)])
 def test_the_modulus_margin_of_a_lightly_damped_loop(seed, ratio):
     """Peaks are narrower than samples of the frequency are apart."""
@@ -174,6 +176,7 @@ def linkage_of_two(topology):
     )  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kp, ki, speed", [
     (80.0, 40.0, False), ([80.0, 0.0], [40.0, 0.0], True),
 ])  # fmt: skip
@@ -253,6 +256,7 @@ FOLLOWERS = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FOLLOWERS)
 def test_the_bandwidth_is_that_of_the_response_to_the_reference(name):
     controller, response = FOLLOWERS[name]
@@ -290,6 +294,7 @@ def test_computed_torque_follows_at_all_frequencies():
     np.testing.assert_allclose(bandwidth(following), bandwidth_of(response), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_joints_follow_while_others_hold():
     """Each of three joints under computed torque moves as if it were alone."""
     linkage, q = arm("RPR")

@@ -21,6 +21,7 @@ def measured(*forces, since=0.0):
     )
 
 
+@pytest.mark.slow
 def test_a_step_of_a_slide_is_that_of_a_second_order_system():
     found = measured(PD)
     damped = np.sqrt(1 - ZETA**2)
@@ -41,6 +42,7 @@ def test_a_step_of_a_slide_is_that_of_a_second_order_system():
     assert found.saturated == 0 and found.joints == ("P1",)
 
 
+@pytest.mark.slow
 def test_a_step_between_samples_counts_from_its_time():
     pd = PD.replace(reference=Step(0.0, [0.5], begin=0.0037))
     coarse, fine = (
@@ -55,11 +57,13 @@ def test_a_step_between_samples_counts_from_its_time():
         np.testing.assert_allclose(one, other, rtol=2e-3)
 
 
+@pytest.mark.slow
 def test_a_load_leaves_a_steady_error():
     found = measured(PD, fj.JointEffort(3.2))
     np.testing.assert_allclose(found.steady_error, 3.2 / W**2, atol=2e-4)
 
 
+@pytest.mark.slow
 def test_an_actuator_at_its_limit_counts():
     # A second at full thrust out, and one back: the demand is far beyond the limit.
     pd = fj.PDController(1e6, 0.0, 0.5, Step(0.0, [0.5]))
@@ -75,6 +79,7 @@ def test_an_actuator_at_its_limit_counts():
         assert measured(kind, fj.JointDamper(0.0)).saturated > 0.9
 
 
+@pytest.mark.slow
 def test_a_reference_that_moves_has_errors_alone():
     ramp = Ramp([0, 1], [[0.0], [1.0]])
     found = measured(fj.PDController(W**2, 2 * W, np.inf, ramp))
@@ -85,6 +90,7 @@ def test_a_reference_that_moves_has_errors_alone():
     assert after.largest_error < np.exp(-1) / W
 
 
+@pytest.mark.slow
 def test_sampled_control_is_measured_as_it_acted():
     # A unit mass under efforts held for 1/8 s, which act a period late.
     period, limit = 0.125, 0.8
@@ -119,6 +125,7 @@ def test_sampled_control_is_measured_as_it_acted():
         fj.analysis.response(SLIDE, (), motion)
 
 
+@pytest.mark.slow
 def test_a_report_is_shown():
     text = str(measured(PD))
     assert text.count("\n") == 2 and "steady error" in text and "P1" in text

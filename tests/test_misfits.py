@@ -100,6 +100,7 @@ def test_states_and_links_of_other_chains_are_refused():
         refused(words, fj.simulate, TWO, REST, TS, (element,))
 
 
+@pytest.mark.slow
 def test_what_elements_return_is_compared_with_the_chain():
     hold = chains.Hold(jnp.zeros(3))
     words = r"forces\[0\]\.reference: expected an array of 2 real numbers for 2 joints"

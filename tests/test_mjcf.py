@@ -191,8 +191,9 @@ def test_what_is_written_is_read(seed):
 
 @pytest.mark.slow
 def test_what_is_written_of_many_arms_is_read():
-    for seed in range(2, 200):
-        back_and_forth(seed, n=1 + seed % 8, servo=seed // 8 % 2)
+    for seed in range(2, 100):
+        n, servo = [(1, 0), (2, 1), (5, 0), (8, 1)][seed % 4]
+        back_and_forth(seed, n, servo)
 
 
 def test_a_scene_is_written_whole():

@@ -70,7 +70,7 @@ def test_models_accelerate_and_move_as_in_mujoco(text, tmp_path):
 @pytest.mark.filterwarnings(NEVER)
 def test_random_models_accelerate_as_in_mujoco():
     rng = np.random.default_rng(0)
-    for _ in range(300):
+    for _ in range(60):
         text, features = random_text(rng)
         model = mujoco.MjModel.from_xml_string(text)
         read = lambda controls, text=text: fj.from_mjcf(text, controls=controls)
@@ -151,6 +151,7 @@ def test_a_robot_keeps_its_meshes_apart_and_has_named_links(tmp_path):
     equal(np.hypot(*fj.tip_position(arm, [0, 0])), 0.8)
 
 
+@pytest.mark.slow
 def test_a_stop_is_about_as_stiff_as_in_mujoco():
     text = """<mujoco><compiler autolimits="true"/><option gravity="0 0 0"/><worldbody>
     <body><joint name="s" type="slide" axis="1 0 0" range="-1 1"

@@ -60,6 +60,7 @@ def relative(found):
     return np.sqrt(np.diag(found.covariance)) / np.abs(values)
 
 
+@pytest.mark.slow
 def test_the_next_fit_has_the_standard_errors_expected(found, chosen):
     assert chosen.improvement > 3
     first, then = Pushed(HANGS["efforts"]), Pushed(chosen.motion["efforts"])
@@ -78,6 +79,7 @@ def test_the_next_fit_has_the_standard_errors_expected(found, chosen):
     assert f"{chosen.motion['efforts'][0, 0]:.4g}" in str(chosen)
 
 
+@pytest.mark.slow
 def test_the_gradient_of_the_largest_standard_error(found, chosen, monkeypatch):
     """By central differences, half way between the first motion and the chosen one."""
     seen = []
@@ -92,6 +94,7 @@ def test_the_gradient_of_the_largest_standard_error(found, chosen, monkeypatch):
     np.testing.assert_allclose(at(z).gradient[0], slopes, rtol=1e-3, atol=least)
 
 
+@pytest.mark.slow
 def test_parameters_that_nothing_has_told_yet(found):
     """An infinite standard error of one number leaves what is known of the others."""
     covariance = found.covariance.copy()
@@ -109,6 +112,7 @@ def test_parameters_that_nothing_has_told_yet(found):
     assert np.isfinite(chosen.standard_errors["mass"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "changes, message",
     [

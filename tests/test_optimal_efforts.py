@@ -32,6 +32,7 @@ def best():
     return fj.tuning.optimal_efforts(SCENE, horizon=HORIZON, knots=KNOTS)
 
 
+@pytest.mark.slow
 def test_no_controller_with_these_limits_does_better(best):
     task, limit = CONTROLLER.reference, np.asarray(CONTROLLER.limit)
     assert best.converged
@@ -51,6 +52,7 @@ def test_no_controller_with_these_limits_does_better(best):
     assert f"{1e3 * best.tip_error:.5g} mm" in str(best)
 
 
+@pytest.mark.slow
 def test_derivatives_against_differences(best):
     limit = np.asarray(CONTROLLER.limit)
     problem = SCENE, best.ts, np.array(1e-9), best.solution.ts

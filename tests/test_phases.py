@@ -26,7 +26,8 @@ def in_phases(forces, others=None, ts=TS, start=START, **options):
     return concatenate([first, second]), first, second
 
 
-@pytest.mark.parametrize("forces", [(), (PID,), (fj.JointDamper(0.3), STOPS)])
+@pytest.mark.slow
+@pytest.mark.parametrize("forces", [(PID,), (fj.JointDamper(0.3), STOPS)])
 def test_two_phases_are_the_whole_motion(forces):
     whole = fj.simulate(ARM, START, TS, forces)
     joined, first, second = in_phases(forces)
@@ -51,6 +52,7 @@ def test_two_phases_are_the_whole_motion(forces):
     )
 
 
+@pytest.mark.slow
 def test_what_acts_may_differ():
     joined, first, second = in_phases((STOPS,), (PID,))
     assert joined.own == () and joined.modes.shape == joined.q.shape
@@ -95,6 +97,7 @@ def test_a_batch_of_two_phases():
         )
 
 
+@pytest.mark.slow
 def test_a_loss_over_phases_has_derivatives():
     def end(damping):
         light = (fj.JointDamper(damping),)
@@ -105,6 +108,7 @@ def test_a_loss_over_phases_has_derivatives():
     np.testing.assert_allclose(found, right, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_the_first_failure_is_the_outcome():
     @jax.jit
     def joined():

@@ -61,6 +61,7 @@ def test_a_reference_that_jumps_between_samples_is_drawn_upright():
     assert 0 < ts[moves[0] + 1] - ts[moves[0]] < 1e-12
 
 
+@pytest.mark.slow
 def test_a_motion_that_ended_early_says_so_in_every_picture():
     scene = fj.scenes.fig7()
     arm, _, forces, _ = scene
@@ -233,6 +234,7 @@ def test_work_precision_is_logarithmic_and_sorted():
     assert labels(ax) == ["a", "b"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("topology", ["R", "RP", "RFPRR"])
 def test_chains_of_any_length_show_all_joints_that_move(topology):
     n, moving = len(topology), len(topology.replace("F", ""))

@@ -54,6 +54,7 @@ def test_a_program_that_raises_nothing_calls_nothing():
     assert "while" in text and "callback" not in text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "options",
     [
@@ -79,6 +80,7 @@ def uncached():
     compilation_cache.reset_cache()
 
 
+@pytest.mark.slow
 def test_a_program_is_exported_and_serialised(uncached):
     compiled = lowered().compile()
     expected = compiled(*ARGUMENTS)
@@ -115,6 +117,7 @@ FINITE = "state0: expected finite numbers"
 ACCEPTED = "linkage: expected values that its constructor"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name, value, words",
     [
@@ -156,6 +159,7 @@ def broken(strength):
     return fj.simulate(ARM, START, TS, (Fragile(strength),), **SHORT).q
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("call", [broken, jax.jit(broken)], ids=["plain", "jit"])
 def test_run_time_checks_of_an_own_element_stay(call):
     with pytest.raises(Exception, match="it broke"):
@@ -177,6 +181,7 @@ def test_a_motion_leaves_later_checks_on():
         decay(2, saveat=diffrax.SaveAt(ts=times))
 
 
+@pytest.mark.slow
 def test_motions_traced_in_threads_leave_checks_on():
     def motion(count):
         times = jnp.linspace(0, 0.1, count)

@@ -101,6 +101,7 @@ def along_pairs(linkage, x, reactions):
     return np.stack([slide, reactions[:, 2]], axis=1).ravel()
 
 
+@pytest.mark.slow
 @each_topology
 def test_free_components_are_efforts_and_others_the_paper_s_constraint_forces(topology):
     linkage, q, qd = motion(topology)
@@ -140,6 +141,7 @@ def test_mujoco_has_the_same_reactions(topology):
         np.testing.assert_allclose(reactions[k], [*force, moment], atol=1e-9 * size)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("topology", [*fj.TOPOLOGIES, "RFR"])
 def test_mujoco_s_rotors_have_the_same_dynamics_and_reactions(topology):
     """Bodies that spin on the links before; the gears give their rates and efforts."""
@@ -181,6 +183,7 @@ def test_mujoco_s_rotors_have_the_same_dynamics_and_reactions(topology):
         np.testing.assert_allclose(reactions[k], [*force, moment], atol=1e-9 * size)
 
 
+@pytest.mark.slow
 @each_topology
 def test_pins_carry_the_actuator(topology):
     """Checks that the loads of its pins give the actuator's terms of the equations."""
@@ -219,6 +222,7 @@ class CarriedTipLoad(TipLoad):
         return (fj.forces.Load(fj.Point(3, 1.0), push),)
 
 
+@pytest.mark.slow
 def test_an_element_of_one_s_own_is_carried_or_refused():
     arm = fj.Linkage(
         "RRR", length=[0, 1, 1, 1], com=[[0.5, 0]] * 3, mass=[1, 1, 1],

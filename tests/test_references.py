@@ -44,6 +44,7 @@ def seen(path, timing, branch, ts):
     return jax.vmap(at)(ts)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("timing", TIMINGS)
 @pytest.mark.parametrize("path", PATHS)
 @pytest.mark.parametrize("branch", [1, -1])
@@ -106,6 +107,7 @@ def test_a_joint_move():
     np.testing.assert_allclose(move.jump_ts, [0, 2])
 
 
+@pytest.mark.slow
 def test_a_path_out_of_reach_is_refused_where_it_is_simulated():
     task = fj.TipTask(fj.references.Line([1, 0], [4, 0]), fj.references.Travel(2.0))
     forces = (fj.PDController(10.0, 1.0, 100.0, task),)
@@ -121,6 +123,7 @@ def test_a_task_without_an_orientation_needs_an_arm_of_two_joints():
         task(0.0, ARM)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("x", [0.3, 0.5])
 def test_a_path_behind_the_pivot_is_refused_where_it_is_simulated(x):
     ring = fj.TipTask(
@@ -150,6 +153,7 @@ def reached(task, ts):
     return fj.references.reachable(ARM, task, ts)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("begin, end", [(0.0, 1.0), (0.0, 400.0), (0.7, 3e4)])
 def test_a_short_travel_is_checked_in_runs_of_any_length(begin, end):
     """So few samples of a run would leave none or two within the second."""
@@ -235,6 +239,7 @@ def test_a_spline_of_many_points_is_checked_between_all():
         task.check(ARM, jnp.array([0.0, 1.0]))
 
 
+@pytest.mark.slow
 def test_a_path_behind_the_pivot_or_left_by_laps_fails_where_it_is_traced():
     """Its joints would jump by a turn, which the motion would follow."""
 
@@ -321,6 +326,7 @@ def followed(arm, circle, ts):
     return jax.vmap(at)(ts)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("topology", [*fj.TOPOLOGIES, "RFRR"])
 def test_a_circle_is_reachable_where_inverse_kinematics_find_the_joints(topology):
     arm = chains.random_chain(topology, np.random.default_rng(0))
@@ -350,6 +356,7 @@ def test_branches_are_plus_or_minus_one_in_numbers_of_any_kind():
         solve(branch)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "returned",
     [None, ZERO, (np.zeros(2), np.zeros(2)), (ZERO, None)] + [(ZERO * 1j, ZERO)],
@@ -366,6 +373,7 @@ def test_references_that_return_no_motion_are_refused(returned):
         element = fj.control.FirstOrderLag(element, 0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("circle", [dict(center=[9, 9]), dict(radius=5.0)], ids=str)
 def test_circles_out_of_reach_are_refused_at_the_door(circle):
     scene = fj.scenes.fig7()
@@ -382,6 +390,7 @@ def test_circles_out_of_reach_are_refused_at_the_door(circle):
         fj.simulate(scene.linkage, scene.state0, [0, 5.0], drives)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "task, words",
     [

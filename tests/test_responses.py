@@ -31,6 +31,7 @@ def small(arm):
     return fj.analysis.step_and_sine(linkage, q, pd, step=STEP, duration=DURATION)
 
 
+@pytest.mark.slow
 def test_small_steps_and_sines_agree_with_python_control(arm, small):
     linkage, q = arm
     pd = controller_of(linkage, q)
@@ -60,6 +61,7 @@ def test_small_steps_and_sines_agree_with_python_control(arm, small):
         assert small.saturated[k] == 0
 
 
+@pytest.mark.slow
 def test_a_joint_that_is_faster_than_a_thousand_samples():
     """A slow joint needs the time; the response of a fast one is over in 30 ms."""
     duration = 12.0
@@ -90,6 +92,7 @@ def test_a_joint_that_is_faster_than_a_thousand_samples():
         fj.analysis.step_and_sine(linkage, q, pd, step=1e-4, duration=1e5)
 
 
+@pytest.mark.slow
 def test_an_arm_that_follows_all_sines_has_no_bandwidth():
     rod = fj.Linkage("R", length=[0, 1], com=[[0.5, 0]], mass=[1], inertia=[0.1])
     stand = pd_at(np.zeros(1), 1, 1).reference
@@ -99,6 +102,7 @@ def test_an_arm_that_follows_all_sines_has_no_bandwidth():
     assert np.isnan(test.bandwidth).all() and (test.overshoot > 0.1).all()
 
 
+@pytest.mark.slow
 def test_weak_actuators_are_slower_and_at_their_limits(arm, small):
     linkage, q = arm
     light = linkage.replace(gravity=0)
@@ -153,6 +157,7 @@ def test_malformed_tests_are_refused(arm):
         fj.plotting.response_profile(pd)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("step", [1e-6, 1e-3])
 def test_responses_start_where_the_arm_rests(step):
     """A soft link sags by 0.4 rad; what it does about there is known in closed form."""

@@ -38,6 +38,7 @@ def ramp(t, q, qd, linkage):
 
 
 # Of no, one, two and three whole periods; 0.3 / 0.1 is 2.9999999999999996.
+@pytest.mark.slow
 @pytest.mark.parametrize("delay", [0.0, 0.03, 0.17, 0.3])
 def test_efforts_are_held_and_come_late(delay):
     motion = fj.simulate_sampled(DISC, STILL, ramp, 0.1, 5, delay=delay)
@@ -56,6 +57,7 @@ def test_efforts_are_held_and_come_late(delay):
     np.testing.assert_allclose(reactions[:, 0, 2], acting, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_efforts_come_late_in_the_pieces_of_a_motion():
     motion = fj.simulate_sampled(RODS, BENT, CONTROL, 0.02, 6, delay=0.03)
     commanded = [CONTROL(*row, RODS) for row in zip(motion.ts, motion.q, motion.qd)]
@@ -116,6 +118,7 @@ def delayed(delay, gains, *others):
     return motion.q[-1, 0], motion
 
 
+@pytest.mark.slow
 def test_delayed_feedback_follows_its_transition_matrix():
     """For traced delays and gains, some of which are stable, with derivatives."""
     delays = 0.1 * np.array([0, 0.3, 1, 1.5, 2, 3.7, 1e6, -0.1])
@@ -163,6 +166,7 @@ def test_no_delay_is_known_within_jit():
     np.testing.assert_allclose(jax.jit(end)(STILL)[-1], 0.105, rtol=1e-7)
 
 
+@pytest.mark.slow
 def test_noise_is_what_the_key_says():
     seen = lambda t, q, qd, linkage: q + 10 * qd
     run = lambda seed: fj.simulate_sampled(
@@ -176,6 +180,7 @@ def test_noise_is_what_the_key_says():
     np.testing.assert_allclose(np.std(first.tau, axis=0), expected, rtol=0.15)
 
 
+@pytest.mark.slow
 def test_a_step_is_a_simulation_under_a_held_effort():
     tau, damper = np.array([1.0, -2.0]), fj.JointDamper(0.3)
     after = fj.step(RODS, BENT, tau, 0.1, (damper,))
@@ -225,6 +230,7 @@ def test_a_digital_pid_controller_and_motors():
     np.testing.assert_allclose(sampled.own[0].own, whole.own[0].own, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_failure_is_named():
     broken = lambda t, q, qd, linkage: jnp.where(t > 0.15, jnp.nan, 0.0) * q
     motion = fj.simulate_sampled(RODS, BENT, broken, 0.1, 4)

@@ -52,6 +52,7 @@ def test_the_work_of_held_efforts_is_exact():
     assert line[-1] == 1.75  # [J] put in
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("delay", [0.03, 0.1, 0.17])
 def test_the_work_of_late_efforts_is_exact(delay):
     noisy = lambda t, q, qd, linkage: 5 * jnp.sin(40 * t + jnp.zeros(1))

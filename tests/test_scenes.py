@@ -18,6 +18,7 @@ MANY = fj.tuning.stacked([SCENE, SCENE._replace(state0=OTHER)])
 MEMBERS = MANY.linkage, MANY.state0, TS, MANY.forces
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "function, whole, parts, options",
     [

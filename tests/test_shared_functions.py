@@ -256,6 +256,7 @@ def drag(k):
     return lambda t, q, qd, linkage: -k * qd
 
 
+@pytest.mark.slow
 def test_motions_in_a_loop_share_a_program(traces):
     counted = traces(solve, "integrate")
     for k in (1.0, 4.0):
@@ -290,6 +291,7 @@ def test_the_number_of_steps_is_data(traces):
     assert not counted
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "steps",
     [
@@ -307,6 +309,7 @@ def test_the_last_allowed_step_may_reach_the_end(steps):
     assert allowed(most - 1).outcome == "out of steps"
 
 
+@pytest.mark.slow
 def test_sweeps_in_a_loop_share_a_program(traces):
     counted, starts = traces(chunks, "simulate"), []
     for k in (1.0, 4.0):
@@ -324,6 +327,7 @@ def test_sweeps_in_a_loop_share_a_program(traces):
     assert starts[0] == starts[1] > 0
 
 
+@pytest.mark.slow
 def test_fits_in_a_loop_share_a_program(traces):
     motion = fj.simulate(ARM, START, TS, (fj.JointDamper(2.0),))
     counted, totals = traces(problems, "sensitivities"), []

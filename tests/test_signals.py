@@ -55,6 +55,7 @@ def places(reference, **options):
     return fj.simulate(SLIDE, fj.State(start, 0 * start), TS, (pd,), **options).q[:, 0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("reference", "exact"), CASES)
 def test_a_loop_answers_as_closed_forms_say(reference, exact):
     numbers, whole = ravel_pytree(reference)
@@ -109,6 +110,7 @@ def test_what_is_refused(make, message):
         make(fj.references)
 
 
+@pytest.mark.slow
 def test_one_program_serves_signals_of_an_arm():
     poses = np.linspace(0, 1, 3)[:, None]
     with_reference = lambda q: fj.PDController(
@@ -133,6 +135,7 @@ def saturating(begin, **options):
     return fj.simulate(SLIDE, start, [0, 0.5], (pd,), **options).q[-1, 0]
 
 
+@pytest.mark.slow
 def test_the_time_of_a_jump_past_a_limit_has_derivatives():
     begins = np.array([0.1, 0.2, 0.3])
     both = jax.jit(jax.value_and_grad(saturating))
@@ -148,8 +151,7 @@ def test_it_has_them_in_all_modes():
     backward = lambda b: saturating(b, adjoint=checkpoints)
     for f in (jax.jacfwd(forward), jax.grad(backward)):
         np.testing.assert_allclose(f(0.2), -3, rtol=1e-9)
-    for f in (jax.jacfwd(jax.jacfwd(forward)), jax.hessian(saturating)):
-        np.testing.assert_allclose(f(0.2), 10, rtol=1e-9)
+    np.testing.assert_allclose(jax.jacfwd(jax.jacfwd(forward))(0.2), 10, rtol=1e-9)
 
 
 def blow(begin):
@@ -161,17 +163,6 @@ def blow(begin):
     return fj.simulate(SLIDE, start, [0, 0.5], (motor, load)).q[-1, 0]
 
 
-def stopped(begin):
-    """Returns the end of two bars; a brake's blow saturates the other one's motor."""
-    arm = fj.scenes.double_pendulum().linkage.replace(gravity=0.0)
-    motor = fj.PDController([50.0, 0.0], [5.0, 0.0], [3.0, 0.0], lambda t, arm: (
-        jnp.array([t, 0.0]), jnp.array([1.0, 0.0])
-    ))  # fmt: skip
-    brake = fj.forces.Brake(2, begin=begin)
-    start = fj.State([0.0, 0.5], [1.0, 2.0])
-    return fj.simulate(arm, start, [0, 0.5], (motor, brake)).q[-1, 0]
-
-
 def pulse(end):
     """Returns the end of a pulse that saturates a controller on both of its sides."""
     inside = fj.references.Pulse([0.0], [1.0], begin=0.1, end=end)
@@ -181,7 +172,7 @@ def pulse(end):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("end", [blow, stopped, pulse])
+@pytest.mark.parametrize("end", [blow, pulse])
 def test_what_a_blow_or_a_pulse_saturates_has_derivatives(end):
     h = 1e-4
     one, two = (end(0.3 + k * h) - end(0.3 - k * h) for k in (1, 2))

@@ -79,6 +79,7 @@ def test_default_accuracy_to_two_seconds(name):
         np.testing.assert_allclose(coordinates, state["q"], rtol=0, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_default_accuracy_under_control():
     scene = scenes.fig7()
     ts = [0, 1.0, 2.0]
@@ -174,6 +175,7 @@ def test_a_solve_that_runs_out_of_steps_says_so_and_marks_the_rest():
         fj.simulate(scene.linkage, scene.state0, 1e3 * ts, max_steps=50)
 
 
+@pytest.mark.slow
 def test_a_force_that_fails_at_the_start_is_named():
     linkage, start, *_ = scenes.fig5()
     few, none = lambda t, q, qd: q, lambda t, q, qd, linkage: q * np.nan
@@ -215,6 +217,7 @@ def test_a_start_after_many_turns_moves_alike():
     assert far.stats["num_steps"] == plain.stats["num_steps"]
 
 
+@pytest.mark.slow
 def test_forces_add_up():
     scene = scenes.fig3()
     ts = [0, 0.5, 1.0]
@@ -251,6 +254,7 @@ def test_keywords_of_simulate(keyword, value):
 # Tolerances
 
 
+@pytest.mark.slow
 def test_tolerances_are_as_exact_as_those_of_a_controller_of_ones_own():
     arm, start, forces, _ = fj.scenes.fig5()
     ts = np.linspace(0, 0.5, 3)

@@ -28,6 +28,7 @@ class Switched(eqx.Module):
         return jnp.where(on, self.effort, 0.0) * jnp.array([1.0, 0, 0])
 
 
+@pytest.mark.slow
 def test_outcome_and_time_reached_of_each_member():
     class Breaking(eqx.Module):
         at: jax.Array
@@ -62,6 +63,7 @@ def test_a_mass_matrix_that_turns_singular_is_named():
         assert solution.outcome == outcome
 
 
+@pytest.mark.slow
 def test_steps_land_on_declared_jumps():
     """A pulse between two steps is missed unless it is declared."""
     pulse = Switched(jnp.array([0.5, 0.5 + 1e-6]), jnp.array(1e6))
@@ -81,6 +83,7 @@ def test_steps_land_on_declared_jumps():
     assert np.abs(hit).max() > 0.01
 
 
+@pytest.mark.slow
 def test_steps_as_long_as_the_distance_of_jumps_do_not_fall_short_of_them():
     jumps = jnp.linspace(0, 1, 101)
     steps = diffrax.PIDController(rtol=1e-6, atol=1e-6, dtmax=0.01)
@@ -95,6 +98,7 @@ def test_steps_as_long_as_the_distance_of_jumps_do_not_fall_short_of_them():
     assert solution.stats["num_steps"] <= 102
 
 
+@pytest.mark.slow
 def test_a_sweep_lands_on_each_members_jumps():
     jumps, push = jnp.array([[0.2, 0.4], [0.6, 0.8]]), jnp.array(50.0)
     together = fj.sweep(
@@ -117,6 +121,7 @@ def test_jumps_need_adaptive_steps():
         fj.simulate(ARM, START, TS, (bad,))
 
 
+@pytest.mark.slow
 def test_tolerances_in_sizes_of_the_arm():
     """Checks that an arm of 1 mm moves like one of 1 m, in 0.03 of the time."""
     size = 1e-3
@@ -195,6 +200,7 @@ class NoOrder(diffrax.Tsit5):
         return None
 
 
+@pytest.mark.slow
 def test_the_controller_may_give_the_order():
     controller = diffrax.PIDController(1e-6, 1e-6, error_order=5)
     found, expected = (

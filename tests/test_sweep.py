@@ -107,6 +107,7 @@ def end_and_fastest(scene, motion):
     return {"end": motion.q[-1], "fastest": fastest, "none": none}, motion.result
 
 
+@pytest.mark.slow
 def test_a_reduction_sees_each_motion(mixed, swept):
     reduced = run(mixed, reduce=end_and_fastest)
     expected = jax.vmap(lambda motion: end_and_fastest(None, motion))(swept)
@@ -116,6 +117,7 @@ def test_a_reduction_sees_each_motion(mixed, swept):
     assert np.isnan(reduced[0]["end"]).any(axis=1).nonzero()[0].tolist() == FAILED
 
 
+@pytest.mark.slow
 def test_a_reduction_sees_each_member(mixed):
     def tip_and_work(scene, motion):
         total = fj.joint_efforts(scene, motion).total
@@ -133,6 +135,7 @@ def test_a_reduction_sees_each_member(mixed):
         np.testing.assert_allclose(efforts[k], wanted, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("reduce", [None, end_and_fastest])
 def test_throw_tells_how_many_failed(mixed, reduce):
     with pytest.raises(RuntimeError, match=r"3 of 42 members failed.* member 3\."):
@@ -146,6 +149,7 @@ def two_links():
     return jax.tree.map(lambda leaf: leaf[:2], single_links())
 
 
+@pytest.mark.slow
 def test_it_works_under_transformations(batch):
     def end(q):
         linkage, state0, forces = batch
@@ -260,6 +264,7 @@ def ramp(t, linkage):
     return jnp.ones(3) * t, jnp.ones(3)
 
 
+@pytest.mark.slow
 def test_arrays_without_the_axis_are_shared():
     """Shared arrays include starting velocities, here whole numbers."""
     linkage = random_linkage("RPR", np.random.default_rng(3))

@@ -49,6 +49,7 @@ def swept(speeds, **keywords):
     return fj.sweep(*pendulums(speeds), TS, **{**SETTINGS, **keywords})
 
 
+@pytest.mark.slow
 def test_small_batches_share_a_program_and_need_no_forecast(solved, monkeypatch):
     monkeypatch.setattr(chunks, "expected_work", None)
     speeds = np.linspace(0, 1, 8)
@@ -63,6 +64,7 @@ def test_small_batches_share_a_program_and_need_no_forecast(solved, monkeypatch)
     assert [len(q) for q, _ in solved] == [8] * 4
 
 
+@pytest.mark.slow
 def test_members_are_sorted_by_their_forecast(solved, monkeypatch):
     monkeypatch.setattr(chunks, "_cores", lambda: 1)
     speeds = 3 * np.array([0.0, 9, 1, 8, 2, 7, 3, 6, 4, 5, 10, 11])
@@ -72,6 +74,7 @@ def test_members_are_sorted_by_their_forecast(solved, monkeypatch):
     assert found == [[8, 9, 10, 11], [4, 5, 6, 7], [0, 1, 2, 3]]
 
 
+@pytest.mark.slow
 def test_the_forecast_follows_the_steps(batch, clean):
     steps = np.asarray(clean.stats["num_steps"])
     moving, shared, _ = batch_of(*batch, 0)
@@ -88,6 +91,7 @@ def test_the_forecast_of_arms_that_friction_stops_is_their_energy():
     np.testing.assert_allclose(found - found[0], inertia * speeds**2 / 2, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_one_forecast_serves_batches_of_all_sizes(monkeypatch):
     traces = []
     original = chunks.forward_dynamics
@@ -118,6 +122,7 @@ def test_starts_of_any_type_are_solved_in_double_precision(kinds):
         np.testing.assert_array_equal(a, b)
 
 
+@pytest.mark.slow
 def test_cores_change_nothing(batch, clean, monkeypatch):
     """Chunks are the same ones, whatever the number of threads that send them."""
     for cores in (1, 3):
@@ -127,6 +132,7 @@ def test_cores_change_nothing(batch, clean, monkeypatch):
             np.testing.assert_array_equal(a, b)
 
 
+@pytest.mark.slow
 def test_a_slow_member_is_stopped_and_solved_alone(solved):
     speeds = np.linspace(0, 1, LANES)
     speeds[20] = 60
@@ -142,6 +148,7 @@ def test_a_slow_member_is_stopped_and_solved_alone(solved):
         np.testing.assert_allclose(motion.q[member], alone.q, rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_members_out_of_steps_are_not_solved_again(solved):
     motion = swept(np.linspace(0, 1, LANES), max_steps=3)
     assert len(solved) == 1

@@ -111,6 +111,7 @@ REFUSALS = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", dict(REFUSALS))
 def test_malformed_arguments_are_refused(name):
     sound = dict(linkage=TWO, state0=STATES, ts=TS, forces=FORCES, forces_axes=0)

@@ -112,6 +112,7 @@ DAMAGES = {
 FILES = ["q/c/2/0/0", "outcome/c/2", "failed/c/2", "qd/zarr.json", "time/c/0"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("damage", DAMAGES)
 def test_damage_is_named_and_solved_again(mixed, stored, undisturbed, solved, damage):
     for name in (*FILES, "zarr.json"):
@@ -153,6 +154,7 @@ def test_a_run_that_ends_early(
     assert len(solved) <= BLOCKS + 1
 
 
+@pytest.mark.slow
 def test_another_sweep_needs_another_folder(mixed, stored, undisturbed):
     linkage, state0, forces = mixed
     moved = linkage, state0._replace(q=state0.q + 1e-9), forces
@@ -193,6 +195,7 @@ def test_what_others_wrote_is_refused_and_kept(mixed, tmp_path):
             assert read(folder) == before
 
 
+@pytest.mark.slow
 def test_only_what_is_asked_for(mixed, swept, tmp_path):
     run(mixed, store=tmp_path, reduce=end)
     with xarray.open_zarr(tmp_path) as data:
@@ -263,6 +266,7 @@ def times(factor):
     return lambda t, q, qd, linkage: factor * q
 
 
+@pytest.mark.slow
 def test_it_names_what_functions_compute():
     assert digest(force=times(2.0)) == digest(force=times(2.0))
     assert digest(force=times(2.0)) != digest(force=times(3.0))
@@ -276,6 +280,7 @@ def in_scan(distance):
     return lambda q: jax.lax.scan(jitted, q, None, length=2)[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("jit", [jax.jit, eqx.filter_jit, in_scan])
 def test_arrays_within_compiled_functions_count(jit):
     def distance(target):

@@ -48,6 +48,7 @@ def differences(function, x, h):
     return (4 * slope(h / 2) - slope(h)) / 3
 
 
+@pytest.mark.slow
 def test_derivatives_are_those_of_tight_differences():
     found, motions = slopes(0.1, 1e-11)
     np.testing.assert_allclose(found[:2], PUBLISHED, atol=1e-6)
@@ -57,6 +58,7 @@ def test_derivatives_are_those_of_tight_differences():
     np.testing.assert_allclose(found[1:], exact, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_members_of_a_batch_equal_single_motions_which_tell_of_switches():
     def fall(case, **options):
         arm, start, (_, spring, _), end = scene(0.1, case)
@@ -87,6 +89,7 @@ class Turning(fj.Element):
         return -10 + slower + fj.forces.switch(q - 0.45 + self.depth, 1e-9, 0.0)
 
 
+@pytest.mark.slow
 def test_what_nearly_grazes_is_seen_beside_another_switch():
     """The velocity passes its mark just before, so that the step is short."""
     slide = fj.Linkage(
@@ -205,6 +208,7 @@ class BangBang(fj.Element):
         return -fj.forces.switch(qd, self.level, -self.level)
 
 
+@pytest.mark.slow
 def test_chatter_is_named_and_spoils_no_other_member():
     start = fj.State(jnp.array([-1.5, 0, 0]), jnp.array([0.5, 0.1, -0.2]))
     motion = lambda level: fj.simulate(
@@ -288,6 +292,7 @@ class Step(fj.references.Reference):
         return jnp.where(t < self.begin, 0, 1.0)[None], jnp.zeros(1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("begin", [0.0, 0.1])
 def test_a_limit_that_a_jump_exceeds_acts_at_once(begin):
     """A slide of 1 kg, at rest until then, is pushed by 5 N for 0.1 s."""

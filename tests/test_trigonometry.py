@@ -31,6 +31,7 @@ def arguments(dtype, rng):
     return np.concatenate([positive, -positive, np.zeros(1, dtype)])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 def test_two_ulp(dtype):
     with mp.workprec(300):

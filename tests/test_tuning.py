@@ -58,6 +58,7 @@ def test_all_starts_agree_and_no_random_gains_do_better():
     assert min(others) > tuned
 
 
+@pytest.mark.slow
 def test_tuning_goes_down_to_a_point_where_only_bounds_hold():
     scene = scenes.fig7()._replace(t1=2.0)
     result = fj.tune(scene)
@@ -75,6 +76,7 @@ def test_tuning_goes_down_to_a_point_where_only_bounds_hold():
     assert result.tip_error == pytest.approx(loss**0.5, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_another_method_descends():
     scene = scenes.fig7()._replace(t1=1.0)
     result = fj.tune(scene, factor=1.2, method="l-bfgs", max_steps=8)
@@ -84,6 +86,7 @@ def test_another_method_descends():
     assert start - result.loss > 0.98 * (start - best)
 
 
+@pytest.mark.slow
 def test_history_report_and_text_say_what_happened_and_a_second_call_compiles_nothing():
     scene, lines = scenes.fig7()._replace(t1=1.0), []
     result = fj.tune(scene, max_steps=2, report=lines.append)
@@ -110,6 +113,7 @@ def test_history_report_and_text_say_what_happened_and_a_second_call_compiles_no
     assert lanes._evaluate._cached._cache_size() == compiled
 
 
+@pytest.mark.slow
 def test_starts_that_fail_are_counted():
     scene = scenes.fig7()._replace(t1=0.2)
     gains = gains_of(scene)
@@ -139,6 +143,7 @@ def test_gains_of_zero_and_fixed_gains_stay_and_are_not_held():
 class TestTracking:
     scene = scenes.fig7()._replace(t1=1.0)
 
+    @pytest.mark.slow
     def test_prices_are_those_of_the_documentation(self):
         scene = self.scene
         solution = fj.simulate(scene, np.linspace(0, 1, 1001))
@@ -153,6 +158,7 @@ class TestTracking:
         residuals = residuals_of(scene, gains_of(scene), loss)
         assert float(residuals @ residuals) == pytest.approx(float(expected), rel=1e-10)
 
+    @pytest.mark.slow
     def test_a_higher_price_buys_less_effort_in_one_program(self):
         front = fj.tuning.trade_off(self.scene, [0.0, 1e-2, 1.0], max_steps=15)
         assert (np.diff(front.effort) < 0).all() and (
@@ -174,6 +180,7 @@ class MeanSquare(eqx.Module):
         return self.factor * jnp.mean(solution.q**2)
 
 
+@pytest.mark.slow
 def test_a_scalar_loss_is_the_loss_itself():
     scene = scenes.fig7()._replace(t1=0.2)
     loss = MeanSquare(jnp.array(1.0))
@@ -233,24 +240,3 @@ def test_own_loss_and_all_kinds_of_elements_beside_the_controller():
     assert result.history.tip_error[0] ** 2 == pytest.approx(found, rel=1e-6)
     assert result.loss < 4 * found
     assert abs(found - calm) > 1e-3 * calm
-
-
-@pytest.mark.slow
-def test_two_links_and_a_fixed_pair_between_them_are_tuned_alike():
-    scene = scenes.two_link_circle()
-    result = fj.tune(scene)
-    first, last = result.histories[0].tip_error[[0, -1]]
-    assert result.converged and last < first / 2
-    assert result.table["joint"] == ["R1", "R2"] * 2
-    assert len(str(result).splitlines()) == 10
-    bent = fj.Linkage(
-        "RFR", length=[0, 0.5, 0.5, 0.8], com=[[0.25, 0], [0.25, 0], [0.4, 0]],
-        mass=[1, 1, 1], inertia=[1 / 48, 1 / 48, 0.8**2 / 12], gravity=0,
-    )  # fmt: skip
-    q = fj.inverse_kinematics(bent, [1.1, 0], None)
-    control = fj.PDController(100, 10, [60, 1, 30], scene.forces[0].reference)
-    bent_scene = fj.Scene(bent, fj.State(q, np.zeros(3)), (control,), scene.t1)
-    same = fj.tune(bent_scene)
-    assert same.tip_error == pytest.approx(result.tip_error, rel=1e-3)
-    np.testing.assert_allclose(same.gains[:, [0, 2]], result.gains, rtol=0.02)
-    assert "F2" in str(same)

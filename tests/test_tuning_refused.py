@@ -110,6 +110,7 @@ CASES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "call, scene, keywords, message",
     [(call, *case) for call, cases in CASES.items() for case in cases],
@@ -124,6 +125,7 @@ def test_tuning_is_not_for_transformations():
         jax.jit(lambda t1: fj.tune(FIG7._replace(t1=t1)).gains)(1.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("value", ["a", None, 1j, (1.0, 2.0, "b")])
 def test_a_loss_that_is_no_number_is_refused(value):
     with pytest.raises(ValueError, match=r"loss\(scene, solution\): expected a"):

@@ -30,6 +30,7 @@ def ends(topology, turn):
     return -0.8 * high, high
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("turn", [np.inf, 1.5])
 @pytest.mark.parametrize("orientation", [None, 0.8])
 @pytest.mark.parametrize("topology", fj.TOPOLOGIES)
@@ -155,6 +156,7 @@ def test_forces_of_an_ellipse_take_the_efforts(topology):
         np.testing.assert_allclose(most, 1 / sizes[-1], rtol=2e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("topology", fj.TOPOLOGIES)
 def test_forces_accelerate_the_tip_to_the_ellipse(topology):
     linkage = make_linkage(topology)

@@ -22,6 +22,7 @@ def scene(arm, q, **changes):
     return Scene(arm, q, **{**usual, **changes})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "kind, cases", {"accelerations": 120, "motions": 100, "arguments": 80}.items()
 )
