@@ -92,6 +92,7 @@ def test_an_exported_notebook_has_a_still_picture():
     assert b64encode(picture).decode() in page
 
 
+@pytest.mark.slow
 def test_nothing_is_compiled_after_the_first_picture(box, monkeypatch):
     monkeypatch.setattr(prescribed, "FREE", None)  # no second trace
     box.move(kp_1=2.0)

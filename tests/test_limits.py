@@ -125,6 +125,7 @@ def test_the_margins_that_are_tuned_are_those_of_the_loops():
     np.testing.assert_allclose(np.minimum(least, 1), exact, rtol=5e-3)
 
 
+@pytest.mark.slow
 def test_a_response_that_creeps_from_below_has_not_settled():
     slow = step(kp=1.0, kd=5.0)
     motion = fj.simulate(slow, np.linspace(0, 4, 1001))

@@ -100,6 +100,7 @@ def two_slides():
     return fj.Scene(linkage, state0, (OTHER, controller), 1.0)
 
 
+@pytest.mark.slow
 def test_slides_are_controlled_as_fuller_found():
     scene = two_slides()
     found = fj.tuning.optimal_efforts(scene, horizon=HORIZON, knots=KNOTS)

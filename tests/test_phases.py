@@ -67,6 +67,7 @@ def test_what_acts_may_differ():
     assert len(fj.to_pandas(ARM, back)) == len(TS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("away", [-3, -1, 0, 1, 2, 3, 9])
 def test_a_payload_is_taken_once_where_phases_meet(away):
     """In units of rounding from there."""
@@ -82,6 +83,7 @@ def test_a_payload_is_taken_once_where_phases_meet(away):
     np.testing.assert_allclose(motion.taken[-1], 6 / 11, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_batch_of_two_phases():
     starts = [fj.State(q, [0.0, 0.0]) for q in ([0.3, -0.2], [0.1, 0.2])]
     motions = [in_phases((STOPS,), start=start) for start in starts]

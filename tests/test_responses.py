@@ -112,6 +112,7 @@ def test_weak_actuators_are_slower_and_at_their_limits(arm, small):
     assert (large.bandwidth < 0.8 * small.bandwidth).all()
 
 
+@pytest.mark.slow
 def test_an_arm_that_does_not_come_to_rest_is_not_settled(arm):
     linkage, q = arm
     undamped = pd_at(q, controller_of(linkage, q).kp, 0)
