@@ -9,6 +9,7 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 import fdof_jax as fj
+from fdof_jax.simulation.sensitivities import sensitivities
 
 SLIDE = fj.Linkage("P", mass=[1], com=[[0, 0]], inertia=[1], length=[0, 1], gravity=0)
 TS = np.linspace(-0.55, 2.0, 26)  # none at a jump, where differences are none
@@ -142,6 +143,32 @@ def test_the_time_of_a_jump_past_a_limit_has_derivatives():
     value, slope = np.array([both(begin) for begin in begins]).T
     np.testing.assert_allclose(value, 5 * (0.5 - begins) ** 2)
     np.testing.assert_allclose(slope, -10 * (0.5 - begins), rtol=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("make", [
+    lambda z: fj.references.Step([0.0], [1.0], begin=z[0]),
+    lambda z: fj.references.Pulse([0.0], [1.0], begin=0.05, end=z[0]),
+])  # fmt: skip
+def test_it_has_them_beside_the_motion(make):
+    """A jump past a limit is a kink that the controller passes at once."""
+    start, ts = fj.State([0.0], [0.0]), jnp.array([0.0, 0.5])
+
+    def scene_at(z):
+        pd = fj.PDController([100.0], [0.0], 10.0, make(z))
+        return fj.Scene(SLIDE, start, (pd,), 0.5)
+
+    def place(z):
+        return fj.simulate(scene_at(z), ts).q[-1, 0]
+
+    beside = jax.jit(
+        lambda z: sensitivities(scene_at, lambda _, motion: motion.q[-1], z, ts)
+    )
+    for time in (0.1, 0.2):
+        h = 1e-5
+        slope = (place(jnp.array([time + h])) - place(jnp.array([time - h]))) / (2 * h)
+        found = beside(jnp.array([time])).jacobian[0, 0]
+        np.testing.assert_allclose(found, slope, rtol=1e-4)
 
 
 @pytest.mark.slow

@@ -146,7 +146,8 @@ class _LocatedRows(Located):
                 known_time = distance[index] <= 2 * self.apart
                 late = jnp.where(known_time, self.slopes[index], late)
             gain = jnp.outer(late, rates[0] - rates[1])
-            if any(self.jumping):
+            # Kinks change derivatives too where a jump at a known time passes them.
+            if before.size:
                 places = jnp.stack([jnp.argmax(first), jnp.argmax(others)])
                 before_it = args._replace(sides=before)
                 values = lambda t, row, z: term.switches(
