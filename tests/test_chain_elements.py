@@ -102,6 +102,13 @@ def follows(arm, q, qd, move):
     return motion.q, motion.qd, fj.joint_efforts(arm, forces, motion).elements
 
 
+def sampled(arm, q, qd, pd):
+    start = fj.State(q, qd)
+    motion = fj.simulate_sampled(arm, start, pd, 0.02, 2, **SHORT)
+    once = fj.step(arm, start, motion.tau[0], 0.02, **SHORT)
+    return motion.q, motion.qd, motion.tau, once.q, once.qd
+
+
 def swept(arm, q, qd, forces):
     starts = fj.State(jnp.stack([q, 1.1 * q]), jnp.stack([qd, qd]))
     return fj.sweep(arm, starts, [0, 0.02], forces, **SHORT).q
@@ -139,6 +146,7 @@ COMPARED = {
     "dynamics": (dynamics, (QDD, TAU, MASSES)),
     "motion": (moves, (SOME,)),
     "linear": (linear, (SOME[1:2], QDD, TAU)),
+    "sampled": (sampled, (WEAK.replace(limit=5.0),)),
     "sweep": (swept, (SOME[1:2],)),
     "demands": (demands, (WEAK,)),
     "equilibrium": (balanced, (PD,)),

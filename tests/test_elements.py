@@ -216,6 +216,22 @@ def test_slopes_in_all_numbers_equal_differences(instants):
 
 
 @pytest.mark.slow
+def test_reverse_mode_gives_the_same_slopes(instants):
+    """The reverse mode of a motion consists of these: see test_chain_motions.py."""
+
+    def pulled_back(t, x, weights):
+        return jax.vjp(lambda x: acts_at(t, x), x)[1](weights)[0]
+
+    rng, pull_back = np.random.default_rng(0), jax.jit(pulled_back, **LOOPS)
+    for t, x, slopes, _ in instants:
+        weights = rng.normal(size=len(slopes))
+        expected = weights @ slopes
+        scale = 1e-9 * np.abs(slopes).max(axis=0) + 1e-9
+        error = np.abs(pull_back(t, x, weights) - expected)
+        assert not {n for n, e, s in zip(labels_of(x), error, scale) if not e <= s}
+
+
+@pytest.mark.slow
 def test_gradients_of_a_motion_equal_differences():
     """Forward mode, with the states and masses that motions carry along."""
     forces = tuple(elements.ALL[name] for name in ("motor with PID", "actuator"))

@@ -164,10 +164,11 @@ def holding(friction=(0.0, 0.0), stop=-np.inf, braked=(9.0, 10.0), damping=0.0):
     ("linkage", "start", "forces"),
     [
         (BALL, State([1.0], [0.0]), holding(stop=0.0, damping=1.0)),
+        (BAR, State([0.3], [1.0]), holding((0.5, 0.7), -0.4, braked=(0.2, 0.6))),
         (BAR, State([0.3], [1.0]), holding(braked=(0.0, 0.6))),  # a blow at the start
         (ARM, State([0.3, 0.0], [0, 0]), OF_ALL_KINDS),
     ],
-    ids=["stop and damper", "braked first", "all"],
+    ids=["stop and damper", "friction, stop and brake", "braked first", "all"],
 )
 def test_energy_stack_balances_where_joints_are_held(linkage, start, forces):
     solution = simulate(linkage, start, TS, forces)

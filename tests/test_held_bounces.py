@@ -47,6 +47,23 @@ def test_two_joints_bounce_to_rest():
 
 
 @pytest.mark.slow
+def test_joints_whose_blows_throw_each_other_at_their_stops():
+    """They hit them in turn, at times that come ever closer to one instant."""
+    arm = fj.Linkage(
+        "RRR", length=[0] + [0.4] * 3, com=[[0.2, 0.02]] * 3, mass=[1] * 3,
+        inertia=[0.02] * 3,
+    )  # fmt: skip
+    start = fj.State([0.1884, -0.1111, -0.3649], [2.6621, -1.8042, 0.073])
+    stops = fj.forces.HardStops(
+        [-0.8464, -1.4442, -0.6227], [0.8494, 1.2355, 1.0909],
+        restitution=[0.432, 0.0574, 0.2778],
+    )  # fmt: skip
+    motion = fj.simulate(arm, start, [0, 1.0], (stops,))
+    energy = [sum(fj.energy(arm, motion.q[k], motion.qd[k])) for k in (0, 1)]
+    np.testing.assert_allclose(energy[0] - energy[1], motion.taken[1], atol=1e-8)
+
+
+@pytest.mark.slow
 def test_a_cascade_of_blows_is_no_chatter():
     """Three joints throw each other at their stops a hundred times within 1e-3 s."""
     arm = fj.Linkage(

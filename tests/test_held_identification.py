@@ -22,7 +22,8 @@ def test_derivatives_beside_the_motion_are_those_through_it():
 
     def scene_at(z):
         brake = fj.forces.Brake(2, z[0], z[1])
-        return fj.Scene(ARM, START, (fj.JointDamper(0.5), brake), 1.0)
+        payload = fj.forces.Payload(fj.Point(2, 0.8), z[2], begin=z[3], end=z[4])
+        return fj.Scene(ARM, START, (fj.JointDamper(0.5), brake, payload), 1.0)
 
     def through(z):
         scene = scene_at(z)
@@ -35,7 +36,7 @@ def test_derivatives_beside_the_motion_are_those_through_it():
         found = sensitivities(scene_at, angles, z, jnp.asarray(TS), tolerance=1e-11)
         return found.residuals, found.jacobian
 
-    z = jnp.array([0.3, 0.6])
+    z = jnp.array([0.3, 0.6, 1.0, 0.4, 0.8])
     motion, slopes = jax.jit(beside, **LOOPS)(z)
     right, exact = jax.jit(jax.jacfwd(through, has_aux=True), **LOOPS)(z)
     np.testing.assert_allclose(motion, exact, atol=1e-9)
@@ -86,3 +87,25 @@ def test_standard_errors_through_all_that_holds():
     errors = ravel_pytree(found.standard_errors)[0]
     np.testing.assert_allclose(errors, right, rtol=1e-4)
     assert (np.abs(numbers - ravel_pytree(truth)[0]) < 4 * errors).all()
+
+
+@pytest.mark.slow
+def test_gains_are_tuned_while_friction_holds_a_joint():
+    """The loss is that of the motion, and gains that are a little less do worse."""
+    move = fj.references.JointMove(START.q, [0.8, 0.6], fj.references.Travel(0.7))
+    control = fj.PDController([200, 100], [20, 10], 100, move)
+    forces = control, fj.forces.JointFriction([4.0, 2.0], [6.0, 3.0])
+    scene = fj.Scene(ARM, START, forces, 1.0)
+    ts = np.linspace(0, scene.t1, 1001)
+
+    def loss(scene):
+        motion = fj.simulate(scene, ts)
+        return float((fj.tuning.joint_errors(scene, motion) ** 2).sum()), motion
+
+    found = fj.tune(scene, loss=fj.tuning.joint_errors)
+    best, motion = loss(found.scene)
+    np.testing.assert_allclose(found.loss, best, rtol=1e-5)
+    assert found.converged and best < 0.5 * loss(scene)[0]
+    assert (motion.modes == 1).any()
+    less = control.replace(kp=0.98 * found.gains[0], kd=0.98 * found.gains[1])
+    assert loss(scene._replace(forces=(less, forces[1])))[0] > best

@@ -408,7 +408,7 @@ def test_laws_of_random_scenes(seed):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [7, 13, 21, 35, 46, 47])  # of one joint
+@pytest.mark.parametrize("seed", [37, 112, 142, 243, 336, 350])  # of two joints
 def test_derivatives_in_random_scenes(seed):
     """They equal extrapolated differences of tight solves, and those in reverse."""
     errors, _ = derivative_errors(seed)

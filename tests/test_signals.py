@@ -178,7 +178,8 @@ def test_it_has_them_in_all_modes():
     backward = lambda b: saturating(b, adjoint=checkpoints)
     for f in (jax.jacfwd(forward), jax.grad(backward)):
         np.testing.assert_allclose(f(0.2), -3, rtol=1e-9)
-    np.testing.assert_allclose(jax.jacfwd(jax.jacfwd(forward))(0.2), 10, rtol=1e-9)
+    for f in (jax.jacfwd(jax.jacfwd(forward)), jax.hessian(saturating)):
+        np.testing.assert_allclose(f(0.2), 10, rtol=1e-9)
 
 
 def blow(begin):
@@ -190,6 +191,17 @@ def blow(begin):
     return fj.simulate(SLIDE, start, [0, 0.5], (motor, load)).q[-1, 0]
 
 
+def stopped(begin):
+    """Returns the end of two bars; a brake's blow saturates the other one's motor."""
+    arm = fj.scenes.double_pendulum().linkage.replace(gravity=0.0)
+    motor = fj.PDController([50.0, 0.0], [5.0, 0.0], [3.0, 0.0], lambda t, arm: (
+        jnp.array([t, 0.0]), jnp.array([1.0, 0.0])
+    ))  # fmt: skip
+    brake = fj.forces.Brake(2, begin=begin)
+    start = fj.State([0.0, 0.5], [1.0, 2.0])
+    return fj.simulate(arm, start, [0, 0.5], (motor, brake)).q[-1, 0]
+
+
 def pulse(end):
     """Returns the end of a pulse that saturates a controller on both of its sides."""
     inside = fj.references.Pulse([0.0], [1.0], begin=0.1, end=end)
@@ -199,7 +211,7 @@ def pulse(end):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("end", [blow, pulse])
+@pytest.mark.parametrize("end", [blow, stopped, pulse])
 def test_what_a_blow_or_a_pulse_saturates_has_derivatives(end):
     h = 1e-4
     one, two = (end(0.3 + k * h) - end(0.3 - k * h) for k in (1, 2))

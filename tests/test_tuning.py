@@ -240,3 +240,24 @@ def test_own_loss_and_all_kinds_of_elements_beside_the_controller():
     assert result.history.tip_error[0] ** 2 == pytest.approx(found, rel=1e-6)
     assert result.loss < 4 * found
     assert abs(found - calm) > 1e-3 * calm
+
+
+@pytest.mark.slow
+def test_two_links_and_a_fixed_pair_between_them_are_tuned_alike():
+    scene = scenes.two_link_circle()
+    result = fj.tune(scene)
+    first, last = result.histories[0].tip_error[[0, -1]]
+    assert result.converged and last < first / 2
+    assert result.table["joint"] == ["R1", "R2"] * 2
+    assert len(str(result).splitlines()) == 10
+    bent = fj.Linkage(
+        "RFR", length=[0, 0.5, 0.5, 0.8], com=[[0.25, 0], [0.25, 0], [0.4, 0]],
+        mass=[1, 1, 1], inertia=[1 / 48, 1 / 48, 0.8**2 / 12], gravity=0,
+    )  # fmt: skip
+    q = fj.inverse_kinematics(bent, [1.1, 0], None)
+    control = fj.PDController(100, 10, [60, 1, 30], scene.forces[0].reference)
+    bent_scene = fj.Scene(bent, fj.State(q, np.zeros(3)), (control,), scene.t1)
+    same = fj.tune(bent_scene)
+    assert same.tip_error == pytest.approx(result.tip_error, rel=1e-3)
+    np.testing.assert_allclose(same.gains[:, [0, 2]], result.gains, rtol=0.02)
+    assert "F2" in str(same)

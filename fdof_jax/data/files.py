@@ -232,8 +232,8 @@ def _object(place: str, value: Any) -> dict[str, Json]:
                 expected = f"a {name} that its constructor accepts, or a batch with a"
                 problem = f"{expected} leading axis on every array; {plain(str(error))}"
                 raise ValueError(f"{place}: expected {problem}") from error
-            one = [_object(f"{place}[{i}]", row) for i, row in enumerate(rows)]
-            return {"batch": one}
+            batch = [_object(f"{place}[{i}]", row) for i, row in enumerate(rows)]
+            return {"batch": batch}
     if isinstance(value, Linkage):
         arguments["topology"] = letters(value.ef)
     return {name: {k: _node(f"{place}.{k}", v) for k, v in arguments.items()}}

@@ -129,14 +129,14 @@ def _search(
             check_motion("scene_at(...)", scene, problem.ts)
         expected = "parameters at which the motion and its derivatives are finite"
         raise refusal("start", expected, start)
-    beside = [None] * len(runs)
+    evaluated = [None] * len(runs)
     if held_out:
         lanes = Lanes(lane, [held_out], starts=len(runs))
         found = lanes(np.stack([run.z for run in runs]), np.arange(len(runs)))
-        beside = [found.row(index) for index in range(len(runs))]
+        evaluated = [found.row(index) for index in range(len(runs))]
     return [
         fit_result(run, row, unknowns, noise is not None, other)
-        for run, row, other in zip(runs, rows, beside)
+        for run, row, other in zip(runs, rows, evaluated)
     ]
 
 

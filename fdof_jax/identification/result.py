@@ -193,7 +193,7 @@ def fit_result(
     noise_given: bool,
     held_out: Evaluation | None,
 ) -> FitResult:
-    """Judges the end of a run, where `held_out` evaluates the other recordings."""
+    """Judges the end of a run, where `held_out` evaluates recordings kept back."""
     shapes, _, scale, low, high = unknowns
     values = unknowns.numbers(run.z)
     sizes = np.maximum(np.abs(values), scale)

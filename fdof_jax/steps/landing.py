@@ -151,7 +151,7 @@ class Landing(eqx.Module):
     def _happened(
         self, begin: Array, end: Array, y1: Integrated, keep: Array, state: _Landing
     ) -> _Happened:
-        """Returns what a step did that the controller would keep or not."""
+        """Returns what a step did; `keep`: whether the controller would keep it."""
         aimed = end == state.target
         until, unseen, soon, near, idle = constant(self._seen(y1, end))
         allowance = jnp.where(aimed, near, 0)
