@@ -1,5 +1,8 @@
 """Steps, pulses and ramps of a reference, against closed forms."""
 
+import functools
+from typing import Any
+
 import diffrax
 import equinox as eqx
 import jax
@@ -128,6 +131,19 @@ def test_one_program_serves_signals_of_an_arm():
 # Jumps that throw a controller past its limit, at once
 
 
+class Push(fj.Element):
+    """3 N from a time on."""
+
+    begin: Any
+
+    @property
+    def jump_ts(self):
+        return jnp.reshape(self.begin, 1)
+
+    def __call__(self, t, q, qd, linkage):
+        return jnp.where(t >= self.begin, jnp.full(1, 3.0), 0.0)
+
+
 def saturating(begin, **options):
     """Returns where a slide is that 10 N have pushed since the step: a closed form."""
     step = fj.references.Step([0.0], [1.0], begin=begin)
@@ -180,6 +196,24 @@ def test_it_has_them_in_all_modes():
         np.testing.assert_allclose(f(0.2), -3, rtol=1e-9)
     for f in (jax.jacfwd(jax.jacfwd(forward)), jax.hessian(saturating)):
         np.testing.assert_allclose(f(0.2), 10, rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_each_of_two_jumps_at_one_time_has_its_own_derivative():
+    """Also where one of them passes a limit at once, whichever is listed first."""
+
+    def place(begins, order):
+        step = fj.references.Step([0.0], [1.0], begin=begins[1])
+        pd = fj.PDController([100.0], [0.0], 10.0, step)
+        forces = (Push(begins[0]), pd)[::order]
+        start = fj.State([0.0], [0.0])
+        return fj.simulate(SLIDE, start, [0, 0.5], forces).q[-1, 0]
+
+    for order in (1, -1):
+        slopes = jax.jit(jax.grad(functools.partial(place, order=order)))
+        for later in (0.0, 2e-15, 1e-12):  # a few units of rounding, and many
+            found = slopes(jnp.array([0.3, 0.3 + later]))
+            np.testing.assert_allclose(found, [-3 * 0.2, -10 * 0.2], rtol=1e-9)
 
 
 def blow(begin):

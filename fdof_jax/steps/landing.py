@@ -155,9 +155,12 @@ class Landing(eqx.Module):
         aimed = end == state.target
         until, unseen, soon, near, idle = constant(self._seen(y1, end))
         allowance = jnp.where(aimed, near, 0)
-        passed = keep & (until < jnp.minimum(end - allowance, state.last))
+        passed = until < jnp.minimum(end - allowance, state.last)
+        # What a jump switches at once switches before the next jump, however near.
+        passed = keep & (passed | (until == begin) & (begin < end))
         tiny = (begin < end) & (end - begin <= _APART * self.apart)
-        passed = passed & ~(aimed & tiny)  # it ends where the switch is
+        to_switch = aimed & (state.gap == 0)
+        passed = passed & ~(to_switch & tiny)  # it ends where the switch is
         # A shorter step sees what may have been passed over.
         unsure = keep & ~passed & (unseen < end)
         keep = keep & ~unsure
