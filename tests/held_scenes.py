@@ -22,7 +22,8 @@ from fdof_jax.forces import HardStops, JointFriction
 
 NEVER = 9.0  # after the end of all motions [s]
 TS = np.linspace(0, 2, 41)
-DEFAULT, TIGHT = 1e-11, 1e-13  # tolerances
+# Tolerances, as arrays: one program serves both.
+DEFAULT, TIGHT = np.array(1e-11), np.array(1e-13)
 
 
 class Held(NamedTuple):
