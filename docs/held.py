@@ -42,16 +42,19 @@ def held_bar() -> Iterator[Row]:
     """A level bar on a pivot, at rest, by friction above and below its load."""
     load = GRAVITY / 2
 
-    def motion(level, ts):
+    @jax.jit
+    @lambda f: jax.jacfwd(f, has_aux=True)  # one program for motions and derivatives
+    def end(level, ts):
         friction = fj.forces.JointFriction(level)
         start = fj.State([0.0], [0.0])
-        return fj.simulate(LEVEL, start, ts, (friction,), adjoint=FORWARD)
+        motion = fj.simulate(LEVEL, start, ts, (friction,), adjoint=FORWARD)
+        return motion.q[-1, 0], motion
 
-    end = lambda level: motion(level, [0, 10.0]).q[-1, 0]
     more, less = "bar, friction 1.5 of its load", "bar, friction 0.9 of its load"
-    yield Row(more, "angle after 10 s [rad]", end(1.5 * load), 0)
-    yield Row(more, "its derivative in the level", jax.jacfwd(end)(1.5 * load), 0)
-    falls = motion(0.9 * load, [0, 1e-5, 3.0])
+    slope, rests = end(1.5 * load, np.array([0, 5.0, 10.0]))
+    yield Row(more, "angle after 10 s [rad]", rests.q[-1, 0], 0)
+    yield Row(more, "its derivative in the level", slope, 0)
+    _, falls = end(0.9 * load, np.array([0, 1e-5, 3.0]))
     yield Row(less, "mode after 1e-5 s", falls.modes[1, 0], 0)
     yield Row(less, "rate after 1e-5 s [rad/s]", falls.qd[1, 0], -1.4715e-5)
     # What gravity gave is what friction took: sin(x) = 0.9 x.
@@ -66,9 +69,13 @@ def slide(level=2.0, x0=0.51, ts=(0.0, 5.0)) -> fj.Solution:
 
 
 def sprung_slide() -> Iterator[Row]:
-    name, motion = "slide, spring and friction", slide()
-    end = lambda level, x0: slide(level, x0).q[-1, 0]
-    in_level, in_x0 = jax.jacfwd(end, argnums=(0, 1))(2.0, 0.51)
+    def end(level, x0):
+        motion = slide(level, x0)
+        return motion.q[-1, 0], motion
+
+    both = jax.jit(jax.jacfwd(end, argnums=(0, 1), has_aux=True))
+    (in_level, in_x0), motion = both(2.0, 0.51)
+    name = "slide, spring and friction"
     yield Row(name, "stops at [m]", motion.q[-1, 0], 0.01)
     yield Row(name, "stops after [s]", motion.events.t[0], 13 * np.pi / 10)
     yield Row(name, "d stop / d level [m/N]", in_level, 0.26)
@@ -102,15 +109,19 @@ def drop(height=1.0, ts=(0.0, 2.0)) -> fj.Solution:
 
 def bouncing_mass() -> Iterator[Row]:
     fall = np.sqrt(2 / GRAVITY)
-    motion = drop(ts=[0, 1.5 * fall, 2.25 * fall, 2.0])
-    rests = lambda height: jnp.nanmax(drop(height).events.t)
+
+    def rests(height):
+        motion = drop(height, [0, 1.5 * fall, 2.25 * fall, 2.0])
+        return jnp.nanmax(motion.events.t), motion
+
+    slope, motion = jax.jit(jax.jacfwd(rests, has_aux=True))(1.0)
     floor = fj.forces.HardStops(0.0, INF, restitution=0.5)
     effort = fj.joint_efforts(RISING, (floor,), motion).elements[0, -1, 0]
     name = "mass on a hard stop, e = 0.5"
     yield Row(name, "first rebound [m]", motion.q[1, 0], 0.25)
     yield Row(name, "second rebound [m]", motion.q[2, 0], 0.0625)
-    yield Row(name, "rests from [s]", rests(1.0), 3 * fall)
-    yield Row(name, "d that / d height [s/m]", jax.jacfwd(rests)(1.0), 1.5 * fall)
+    yield Row(name, "rests from [s]", jnp.nanmax(motion.events.t), 3 * fall)
+    yield Row(name, "d that / d height [s/m]", slope, 1.5 * fall)
     yield Row(name, "effort of the stop [N]", effort, GRAVITY)
 
 

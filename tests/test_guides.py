@@ -67,9 +67,6 @@ def test_tuning(tmp_path, monkeypatch):
     names = run(DOCS / "tuning.md")
     assert names["result"].loss ** 0.5 < 0.07
     assert names["front"].tip_error.shape == (3,)
-    pole = names["best"].solution
-    np.testing.assert_allclose(pole.q[-1], [0, np.pi], atol=0.1)
-    np.testing.assert_allclose(pole.qd[-1], 0, atol=0.4)
 
 
 @pytest.mark.slow
