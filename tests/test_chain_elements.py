@@ -109,11 +109,6 @@ def sampled(arm, q, qd, pd):
     return motion.q, motion.qd, motion.tau, once.q, once.qd
 
 
-def swept(arm, q, qd, forces):
-    starts = fj.State(jnp.stack([q, 1.1 * q]), jnp.stack([qd, qd]))
-    return fj.sweep(arm, starts, [0, 0.02], forces, **SHORT).q
-
-
 def demands(arm, q, qd, pd):
     motion = fj.Solution(jnp.zeros(1), q[None], qd[None], {}, None)
     return relative_demands(pd, arm, motion)
@@ -147,7 +142,6 @@ COMPARED = {
     "motion": (moves, (SOME,)),
     "linear": (linear, (SOME[1:2], QDD, TAU)),
     "sampled": (sampled, (WEAK.replace(limit=5.0),)),
-    "sweep": (swept, (SOME[1:2],)),
     "demands": (demands, (WEAK,)),
     "equilibrium": (balanced, (PD,)),
     "prescribed": (follows, (MOVE,)),
