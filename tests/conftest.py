@@ -21,6 +21,9 @@ HARD = Path(__file__).parent / "hard"
 LONGEST = {
     "test_guides",
     "test_notebooks",
+    "test_holding",
+    "test_derivatives_at_rest",
+    "test_signals",
     "test_gradients",
     "test_switches_at_random",
     "test_forces_guide",

@@ -13,11 +13,6 @@ import pytest
 import fdof_jax as fj
 from fdof_jax.mechanics.kinematics import mass_center_velocities
 
-PAIRS = [
-    pytest.param(n, marks=pytest.mark.slow) if n in (4, 6, 7) else n
-    for n in range(1, 9)
-]
-
 
 def cases(pairs, count=12):
     """Yields topologies of so many pairs, chains, and random q, qd and tau."""
@@ -48,7 +43,7 @@ def everything(chain, q, qd, tau):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("pairs", PAIRS)
+@pytest.mark.parametrize("pairs", [1, 2, 3, 5, 8])
 def test_motion_energy_and_kinematics_equal_mujoco(pairs):
     for topology, chain, (q, qd, tau) in cases(pairs):
         found = jax.tree.map(np.asarray, everything(chain, q, qd, tau))

@@ -70,7 +70,7 @@ def test_models_accelerate_and_move_as_in_mujoco(text, tmp_path):
 @pytest.mark.filterwarnings(NEVER)
 def test_random_models_accelerate_as_in_mujoco():
     rng = np.random.default_rng(0)
-    for _ in range(60):
+    for _ in range(30):
         text, features = random_text(rng)
         model = mujoco.MjModel.from_xml_string(text)
         read = lambda controls, text=text: fj.from_mjcf(text, controls=controls)
