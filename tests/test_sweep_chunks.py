@@ -18,7 +18,7 @@ import fdof_jax as fj
 from fdof_jax.base import configuration
 from fdof_jax.batches import chunks
 from fdof_jax.batches.batch_axes import batch_of
-from fdof_jax.simulation import prescribed
+from fdof_jax.simulation import formulation
 from fdof_jax.steps.dopri8 import ScheduledTerm
 
 LANES = 64  # enough for a slow member to be stopped
@@ -179,14 +179,14 @@ def test_progress_rises_to_one(mixed):
 
 def test_other_values_need_no_new_trace(batch, clean, monkeypatch):
     calls = []
-    field, *others = vars(prescribed.FREE.term).values()
+    field, *others = vars(formulation.DRIVEN.term).values()
 
     def counted(*arguments):
         calls.append(1)
         return field(*arguments)
 
     term = ScheduledTerm(counted, *others)
-    monkeypatch.setattr(prescribed, "FREE", prescribed.FREE._replace(term=term))
+    monkeypatch.setattr(formulation, "DRIVEN", formulation.DRIVEN._replace(term=term))
     linkage, (q, qd), forces = batch
     other = run((linkage, fj.State(q + 0.1, qd), forces))
     assert not calls

@@ -11,9 +11,7 @@ from test_drawing import Q, labels, lines, make_linkage, named, tidy as tidy
 
 import fdof_jax as fj
 from fdof_jax import drawing
-from fdof_jax.analysis.reach import curves, reached_cells
-from fdof_jax.pictures.workspace import _ranges
-
+from fdof_jax.analysis.reach import curves, ranges_of, reached_cells
 JACOBIANS = jax.jit(jax.vmap(fj.tip_jacobian, in_axes=(None, 0)))
 
 
@@ -39,7 +37,7 @@ def test_curves_are_singular_and_hold_all_configurations(topology, orientation, 
     linkage, rows = make_linkage(topology), 2 if orientation is None else 3
     turning = [kind == "R" for kind in topology]
     turns = lambda q: np.where(turning, q, linkage.locked).sum(axis=1)
-    ranges = _ranges(linkage, *ends(topology, turn), orientation)
+    ranges = ranges_of(linkage, *ends(topology, turn), orientation)
     bounds = list(curves(ranges))
     assert len(bounds) > 0
     for q, singular in bounds:

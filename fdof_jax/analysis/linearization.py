@@ -74,7 +74,7 @@ def total_effort(
     total = jnp.zeros_like(q)
     for k, element in enumerate(forces):
         empty = element.initial_state(linkage)
-        total = total + element_effort(k, element, t, q, qd, linkage, empty)[0]
+        total = total + element_effort(k, element, t, q, qd, linkage, empty)
     return total
 
 

@@ -205,7 +205,7 @@ def _controller(
     ((element, acts, state),) = found
 
     def effort(t: Array, q: Array, qd: Array, state: PyTree) -> Array:
-        return element_effort(0, acts, t, q, qd, linkage, state)[0]
+        return element_effort(0, acts, t, q, qd, linkage, state)
 
     efforts = jax.vmap(effort)(solution.ts, solution.q, solution.qd, state)
     return element.pd if isinstance(element, PIDController) else element, efforts

@@ -17,9 +17,13 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 import scipy
+from numpy.typing import ArrayLike
 
+from ..base.checks import real_array
+from ..base.known_values import in_numpy
 from ..linkage.frames import known_frames
-from ..linkage.linkage import Linkage, moving_joints
+from ..linkage.linkage import Linkage, check_linkage, moving_joints
+from ..linkage.topology import check_angles, letters
 
 _SAMPLES, _CELLS, _ROUNDING = 361, 400, 1e-9
 # Regions of fewer cells count as reached: random configurations may miss them.
@@ -73,6 +77,40 @@ class _Body(NamedTuple):
     def along(self) -> complex:
         """The vector that is parallel to the line."""
         return self.slides[0][1] if self.slides else self.vector
+
+
+def ranges_of(
+    linkage: Linkage, lower: ArrayLike, upper: ArrayLike, orientation: ArrayLike | None
+) -> Ranges:
+    """Returns the ranges of an arm's joints; raises ValueError for malformed ones."""
+    check_linkage(linkage)
+    name, ends = letters(linkage.ef), []
+    kinds = np.array([*name])
+    for argument, value in (("lower", lower), ("upper", upper)):
+        end = real_array(
+            argument, value, kinds.shape, finite=False, broadcast=True, unit="m or rad"
+        )
+        check_angles(argument, end, linkage.ef)
+        for k in np.flatnonzero((kinds == "P") & ~np.isfinite(end)):
+            raise ValueError(
+                f"{argument}: expected a finite end of slide P{k + 1} [m], "
+                f"got {end[k]}."
+            )
+        ends.append(np.asarray(end))
+    low, high = ends
+    if not (low < high)[kinds != "F"].all():
+        raise ValueError(
+            f"lower: expected less than upper, got {low.tolist()} and {high.tolist()}."
+        )
+    cases = [kinds == "F", (kinds == "R") & (high - low >= 2 * np.pi)]
+    low, high = np.select(cases, [0, -np.pi], low), np.select(cases, [0, np.pi], high)
+    if orientation is not None:
+        orientation = float(real_array("orientation", orientation, (), unit="rad"))
+        if "R" not in name:
+            raise ValueError(
+                f"orientation: expected None for slides only, got {orientation:g}."
+            )
+    return Ranges(in_numpy(linkage), name, low, high, orientation)
 
 
 def curves(ranges: Ranges) -> Iterator[tuple[np.ndarray, bool]]:

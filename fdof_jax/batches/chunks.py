@@ -205,7 +205,7 @@ def expected_work(ts: Array, moving: PyTree, shared: PyTree) -> Array:
             tau = jnp.zeros_like(q)
             for index, element in enumerate(acting):
                 state = element.initial_state(linkage)
-                tau = tau + element_effort(index, element, t, q, qd, linkage, state)[0]
+                tau = tau + element_effort(index, element, t, q, qd, linkage, state)
             qdd = forward_dynamics(linkage, q, qd, tau, forces)
             rate, acceleration = (jnp.where(turning, a, 0) for a in (qd, qdd))
             norm = jnp.linalg.norm

@@ -110,17 +110,17 @@ def _holding(
 
 
 @jax.custom_jvp
-def holding_efforts(
+def efforts_of_fixed(
     c: Constants, delta: Scalars, qd: Scalars, tau: Scalars, added: Upper | None = None
 ) -> Scalars:
     """Computes what holds the pairs that are fixed in `c`: M qdd + bias - tau."""
     return fused(_holding)(c, delta, qd, tau, added)
 
 
-@holding_efforts.defjvp
+@efforts_of_fixed.defjvp
 def _(primals, tangents):
     _, change = jax.jvp(functools.partial(_holding, divided), primals, tangents)
-    return holding_efforts(*primals), change
+    return efforts_of_fixed(*primals), change
 
 
 @jax.jit

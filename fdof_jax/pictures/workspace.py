@@ -8,51 +8,16 @@ from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
 from numpy.typing import ArrayLike
 
-from ..analysis.reach import Ranges, curves, reached_cells
+from ..analysis.reach import curves, ranges_of, reached_cells
 from ..base.checks import real_array
-from ..base.known_values import in_numpy
 from ..dynamics import mass_matrix
 from ..forces.element import Forces
 from ..linkage.linkage import Linkage, check_linkage, joints_of
-from ..linkage.topology import check_angles, letters
 from ..mechanics.kinematics import tip_jacobian
 from .arms import Geometry, draw_motion, geometry
 from .axes import GREY, SERIES, legend, plane_axes, xy
 
 _REACHED = "#D6EAF5"
-
-
-def _ranges(
-    linkage: Linkage, lower: ArrayLike, upper: ArrayLike, orientation: ArrayLike | None
-) -> Ranges:
-    check_linkage(linkage)
-    name, ends = letters(linkage.ef), []
-    kinds = np.array([*name])
-    for argument, value in (("lower", lower), ("upper", upper)):
-        end = real_array(
-            argument, value, kinds.shape, finite=False, broadcast=True, unit="m or rad"
-        )
-        check_angles(argument, end, linkage.ef)
-        for k in np.flatnonzero((kinds == "P") & ~np.isfinite(end)):
-            raise ValueError(
-                f"{argument}: expected a finite end of slide P{k + 1} [m], "
-                f"got {end[k]}."
-            )
-        ends.append(np.asarray(end))
-    low, high = ends
-    if not (low < high)[kinds != "F"].all():
-        raise ValueError(
-            f"lower: expected less than upper, got {low.tolist()} and {high.tolist()}."
-        )
-    cases = [kinds == "F", (kinds == "R") & (high - low >= 2 * np.pi)]
-    low, high = np.select(cases, [0, -np.pi], low), np.select(cases, [0, np.pi], high)
-    if orientation is not None:
-        orientation = float(real_array("orientation", orientation, (), unit="rad"))
-        if "R" not in name:
-            raise ValueError(
-                f"orientation: expected None for slides only, got {orientation:g}."
-            )
-    return Ranges(in_numpy(linkage), name, low, high, orientation)
 
 
 def workspace(
@@ -81,7 +46,7 @@ def workspace(
     **Raises:** ValueError for malformed arguments, and for an `orientation` at which
     the tip cannot move.
     """
-    ranges = _ranges(linkage, lower, upper, orientation)
+    ranges = ranges_of(linkage, lower, upper, orientation)
     bounds = list(curves(ranges))
     if not bounds:
         raise ValueError(

@@ -86,7 +86,7 @@ def _efforts(
     for index, element, state in with_states(forces, own):
 
         def effort(t, q, qd, state, index=index, element=element):
-            return element_effort(index, element, t, q, qd, linkage, state)[0]
+            return element_effort(index, element, t, q, qd, linkage, state)
 
         efforts.append(jax.vmap(effort)(*motion_rows, state))
     stacked = jnp.stack(efforts) if efforts else jnp.zeros((0, *q.shape))

@@ -23,8 +23,8 @@ from .field import (
     whole,
     with_states,
 )
+from .formulation import formulation
 from .integrate import Inputs, Settings, last_switched
-from .prescribed import formulation
 from .solution import OUTCOMES, Solution
 from .solve import solve
 
@@ -40,7 +40,7 @@ def cause(inputs: Inputs, keywords: Settings, solution: Solution) -> str:
     if outcome == "not finite":
         own = own0 or initial_states(linkage, forces)
         for k, element, state in with_states(forces, own):
-            effort, _ = element_effort(k, element, ts[0], q, qd, linkage, state)
+            effort = element_effort(k, element, ts[0], q, qd, linkage, state)
             if not np.isfinite(effort).all():
                 return f"The effort of forces[{k}] is not finite at the start."
     if outcome in ("out of steps", "tolerance out of reach"):

@@ -261,12 +261,12 @@ def element_effort(
     qd: Array,
     linkage: Linkage,
     state: PyTree,
-) -> tuple[Array, PyTree]:
-    """Returns an element's effort and the rate of its state, () without a state.
+) -> Array:
+    """Returns an element's effort.
 
-    Raises ValueError unless the effort is a real number for each joint.
+    Raises ValueError unless it is a real number for each joint.
     """
-    return _switched_effort(index, element, t, q, qd, linkage, state, None)[:2]
+    return _switched_effort(index, element, t, q, qd, linkage, state, None)[0]
 
 
 def switching_functions(

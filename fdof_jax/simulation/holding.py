@@ -25,7 +25,7 @@ from ..linkage.fields import Truth
 from ..linkage.linkage import Linkage, joints_of
 from ..linkage.topology import fixed_pairs
 from ..mechanics.equations import Constants, Equations, Upper, equations, with_held
-from ..mechanics.rates import holding_efforts
+from ..mechanics.rates import efforts_of_fixed
 from ..mechanics.solve import divided, solver_of, times, with_added
 from ..steps.dopri8 import Integrated, constant
 from .field import Args, Schedules, args_of, switched
@@ -49,6 +49,7 @@ class Modes(NamedTuple):
     - `direction` (n,): of the sliding that friction resists: 1, -1, or 0 if held.
     - `origin` (n,): displacements at which these slides began [m or rad].
     - `taken`: the energy that holders have taken before [J].
+    - `events`: those up to here.
     """
 
     mode: Array
@@ -134,7 +135,7 @@ def guarded_switching(
     """
     tau, _, added, switches = switched(t, y, args, schedule)
     constants = args.moving().constants
-    effort = jnp.stack(holding_efforts(constants, *y[:2], tau, added))
+    effort = jnp.stack(efforts_of_fixed(constants, *y[:2], tau, added))
     law, modes = laws(args, t), args.modes
     held, direction = modes.held, modes.direction
     rubs = (law.static > 0) & ~held & (direction != 0)
@@ -149,8 +150,8 @@ def guarded_switching(
         room = delta - (law.lower - args.q0), law.upper - args.q0 - delta
         guards += [jnp.where(held, 1, _STOPS_IN * distance) for distance in room]
     values = jnp.concatenate([switches.all_values(args.q0.dtype), *guards])
-    jumping = *switches.jumping, *[True] * (values.size - len(switches.jumping))
-    return values, jumping
+    at_guards = [True] * sum(guard.size for guard in guards)  # efforts jump there
+    return values, (*switches.jumping, *at_guards)
 
 
 class System(NamedTuple):

@@ -33,9 +33,10 @@ from ..steps.tolerances import default_controller
 from ..steps.unchecked import diffeqsolve
 from .events import in_order
 from .field import Args, args_of, in_arrays, initial_own, own_states, whole
+from .formulation import formulation
 from .holding import Modes, changes, taken_at, within_stops
 from .known_times import clocks_apart, known_times
-from .prescribed import agrees, formulation
+from .prescribed import agrees
 from .solution import Solution
 
 Settings = dict[str, Any]  # keywords of `diffeqsolve`, as `solve_options` checks them
@@ -92,7 +93,7 @@ def integrate(
 
     `derivatives`: whether steps are as short as accurate derivatives need.
     `padded`: for a plain call; the last time may be repeated.
-    `tangents`: whether these are the tangents of this call, along the axis `TANGENTS`.
+    `tangents`: whether the caller maps over tangents, along the axis `TANGENTS`.
     """
     problem = _prepare(inputs, derivatives, padded)
     control = _control(problem, keywords, derivatives, tangents)
@@ -178,7 +179,8 @@ def _solve(problem: _Problem, control: _Control, keywords) -> diffrax.Solution:
     def row(t, y, args):
         """Returns the state, and the modes if joints are held."""
         last = y[-1].modes if isinstance(y[-1], Switching) else y[-1]
-        return (*y[:size], *last[:4]) if isinstance(last, Modes) else y[:size]
+        held = isinstance(last, Modes)
+        return (*y[:size], last._replace(events=None)) if held else y[:size]
 
     outputs = (
         diffrax.SubSaveAt(ts=ts, fn=row),
@@ -233,17 +235,14 @@ def _read(inputs: Inputs, problem: _Problem, solve: diffrax.Solution) -> Solutio
         stats["accuracy"] = jnp.finfo(q.dtype).eps * loss
     stats |= switching_facts(*switches)
     result = _result(valid, solve.result, q, qd)
-    solution = Solution(times, q, qd, stats, result, jax.tree.map(shown_at, own))
-    if not modes:
-        return solution
-    (last,), (mode, direction, origin, before) = switches, modes
-    events = in_order(jax.tree.map(lambda rows: rows[0], last.modes.events), valid)
-    taken = taken_at(
-        problem.args, ts, Modes(mode, direction, origin, before, events), q
-    )
-    holding = shown_at(mode), shown_at(taken), events
-    where = lambda s: (s.modes, s.taken, s.events)
-    return eqx.tree_at(where, solution, holding, is_leaf=lambda x: x is None)
+    holding: Any = ()  # modes, energy taken, events
+    if modes:
+        (last,), (held,) = switches, modes
+        events = jax.tree.map(lambda rows: rows[0], last.modes.events)
+        taken = taken_at(problem.args, ts, held, q)
+        holding = shown_at(held.mode), shown_at(taken), in_order(events, valid)
+    own = jax.tree.map(shown_at, own)
+    return Solution(times, q, qd, stats, result, own, *holding)
 
 
 def last_switched(inputs: Inputs, keywords: Settings) -> Array:

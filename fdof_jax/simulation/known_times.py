@@ -5,11 +5,11 @@ from jax import Array
 
 from ..forces.element import Element, Forces
 from ..linkage.fields import jumps_of
-from ..steps.landing import rounding
+from ..steps.landing import clearance
 from .field import Args
 from .prescribed import PrescribedMotion
 
-# Units of `rounding`, beyond the distances that steps keep from each time.
+# Units of `clearance`, beyond the distances that steps keep from each time.
 _APART = 8
 
 
@@ -28,7 +28,7 @@ def clocks_apart(args: Args, ts: Array) -> Args:
     )
     if len(places) < 2:
         return args
-    unit = _APART * rounding(ts)
+    unit = _APART * clearance(ts)
     ahead = [0.0] * len(args.forces)
     for rank, (_, place) in enumerate(places):
         ahead[place] = rank
@@ -41,7 +41,7 @@ def clear_of_start(forces: Forces, ts: Array) -> Array:
     The clock of that element is ahead of those of `forces`.
     """
     timed = sum(element.jump_ts is not None for element in forces)
-    return (1 + _APART * timed) * rounding(ts)
+    return (1 + _APART * timed) * clearance(ts)
 
 
 def known_times(

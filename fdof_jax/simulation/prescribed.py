@@ -5,7 +5,7 @@ momenta are continuous where a prescribed velocity jumps.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,27 +18,13 @@ from ..base.checks import place_of
 from ..dynamics import mass_and_bias
 from ..forces.element import Element, Forces, naming
 from ..forces.holders import numbered, numbers_in
-from ..forces.payload import Payload
 from ..linkage.fields import Condition, Truth, called
 from ..linkage.linkage import Linkage, joints_of, without_fixed
 from ..linkage.topology import MOST_PAIRS, fixed_pairs
 from ..mechanics.equations import Scalars, equations, zeros
 from ..references.reference import EXPECTED, reference_motion
-from ..steps.dopri8 import Health, Integrated, ScheduledTerm
-from .events import resolve
-from .field import (
-    Args,
-    applied,
-    health_at,
-    health_of,
-    health_with,
-    schedule_of,
-    switching,
-    vector_field,
-    watched_field,
-    whole,
-)
-from .holding import changes, guarded_switching, unknown_modes
+from ..steps.dopri8 import Health, Integrated
+from .field import Args, applied, health_at, health_with, switching, whole
 
 _NUMBERS = tuple(range(1, MOST_PAIRS + 1))
 
@@ -124,48 +110,16 @@ def _split(moved: Array, matrix: Array, given: Array, right: Array) -> Array:
     return jnp.linalg.solve(free, jnp.where(moved, given, right - matrix @ given))
 
 
-class Formulation(NamedTuple):
-    """The equations of a motion, their start, and the reading of joint states.
-
-    - `term`: the equations.
-    - `start(args, qd)`: displacements, and velocities or momenta, at the start, before
-      any jump there.
-    - `joints(args, t, y)`: joint positions and velocities at an integrated state.
-    """
-
-    term: ScheduledTerm
-    start: Callable[[Args, Array], tuple[Scalars, Scalars]]
-    joints: Callable[[Args, Array, Integrated], tuple[Array, Array]]
-
-
-def formulation(forces: Forces) -> Formulation:
-    """Returns that of velocities or, with a prescribed motion, of momenta."""
-    if prescribed(forces) is None:
-        return HOLDING if changes(forces) else FREE
-    # Momenta would have to jump where a mass is let go, too.
-    timed = any(isinstance(e, Payload) and e.jump_ts is not None for e in forces)
-    if changes(forces) or timed:
-        raise ValueError(
-            "forces: expected no element that holds joints (JointFriction without "
-            "speed, HardStops, Brake), and no Payload with begin or end, beside a "
-            "PrescribedMotion, got both."
-        )
-    return HYBRID
-
-
-def _free_joints(args: Args, t: Array, y: Integrated) -> tuple[Array, Array]:
-    return args.q0 + jnp.stack(y[0]), jnp.stack(y[1])
-
-
-def _hybrid_joints(args: Args, t: Array, y: Integrated) -> tuple[Array, Array]:
-    motion, (q, momenta) = _motion(args), _free_joints(args, t, y)
+def hybrid_joints(args: Args, t: Array, y: Integrated) -> tuple[Array, Array]:
+    motion, (displaced, momenta, *_) = _motion(args), y
+    q, momenta = args.q0 + jnp.stack(displaced), jnp.stack(momenta)
     position, velocity = motion.at(t, args.linkage)
     q = jnp.where(motion.prescribes(args.linkage), position, q)
     matrix, _ = _mass_and_bias(args, q, jnp.zeros_like(q))
     return q, _split(motion.prescribes(args.linkage), matrix, velocity, momenta)
 
 
-def _hybrid_start(args: Args, qd: Array) -> tuple[Scalars, Scalars]:
+def hybrid_start(args: Args, qd: Array) -> tuple[Scalars, Scalars]:
     matrix, _ = _mass_and_bias(args, args.q0, jnp.zeros_like(args.q0))
     momenta = jnp.where(_motion(args).prescribes(args.linkage), 0, matrix @ qd)
     return zeros(args.q0), tuple(momenta)
@@ -173,21 +127,21 @@ def _hybrid_start(args: Args, qd: Array) -> tuple[Scalars, Scalars]:
 
 def _motion(args: Args) -> PrescribedMotion:
     motion = prescribed(args.forces)
-    assert motion is not None  # the functions of `HYBRID` serve no other motions
+    assert motion is not None  # hybrid dynamics are of no other motions
     return motion
 
 
-def _hybrid_switching(t, y, args, schedule) -> tuple[Array, tuple[bool, ...]]:
-    q, qd = _hybrid_joints(args, t, y)
+def hybrid_switching(t, y, args, schedule) -> tuple[Array, tuple[bool, ...]]:
+    q, qd = hybrid_joints(args, t, y)
     return switching(t, (tuple(q - args.q0), tuple(qd), *y[2:]), args, schedule)
 
 
-def _hybrid_field(t, y, args, schedule) -> Integrated:
+def hybrid_field(t, y, args, schedule) -> Integrated:
     """Rates of displacements and momenta, 0 at prescribed joints.
 
     The rate of the momenta is M' qd - bias + tau, where M' is the mass matrix's rate.
     """
-    motion, (q, qd) = _motion(args), _hybrid_joints(args, t, y)
+    motion, (q, qd) = _motion(args), hybrid_joints(args, t, y)
     displaced = tuple(q - args.q0), tuple(qd)
     tau, own_rates, _ = applied(t, (*displaced, *y[2:]), args, schedule)
     # The efforts already include the bias of masses that elements move.
@@ -199,40 +153,20 @@ def _hybrid_field(t, y, args, schedule) -> Integrated:
     return whole(tuple(jnp.where(moved, 0, qd)), tuple(driven), own_rates)
 
 
-def _watched_hybrid_field(t, y, args, schedule) -> tuple[Integrated, Health]:
-    """Rates of `_hybrid_field` and their health, as in `field.watched_field`."""
-    rates = _hybrid_field(t, y, args, schedule)
-    return rates, health_with(rates, _health(t, y, args))
+def watched_hybrid_field(t, y, args, schedule) -> tuple[Integrated, Health]:
+    """Rates of `hybrid_field` and their health, as in `field.watched_field`."""
+    rates = hybrid_field(t, y, args, schedule)
+    return rates, health_with(rates, hybrid_health(t, y, args))
 
 
-def _health(t, y, args) -> Health:
+def hybrid_health(t, y, args) -> Health:
     """Health of the driven joints' equations, as in `field.health_of`."""
-    q, _ = _hybrid_joints(args, t, y)
+    q, _ = hybrid_joints(args, t, y)
     matrix, _ = _mass_and_bias(args, q, jnp.zeros_like(q))
     driven = ~_motion(args).prescribes(args.linkage)
     free = jnp.where(jnp.outer(driven, driven), matrix, jnp.eye(len(q)))
     losses = jnp.diag(free) * jnp.diag(jnp.linalg.inv(free))
     return health_at(tuple(jnp.where(losses > 0, losses, jnp.inf)))
-
-
-FREE = Formulation(
-    ScheduledTerm(vector_field, schedule_of, health_of, watched_field, switching),
-    lambda args, qd: (zeros(args.q0), tuple(qd)),
-    _free_joints,
-)
-HOLDING = FREE._replace(
-    term=ScheduledTerm(
-        vector_field, schedule_of, health_of, watched_field,
-        guarded_switching, unknown_modes, resolve,
-    )
-)  # fmt: skip
-HYBRID = Formulation(
-    ScheduledTerm(
-        _hybrid_field, schedule_of, _health, _watched_hybrid_field, _hybrid_switching
-    ),
-    _hybrid_start,
-    _hybrid_joints,
-)
 
 
 def prescribed_effort(

@@ -24,8 +24,8 @@ from ..steps.switching import Located, located
 from ..steps.tolerances import adaptive, of_precision
 from ..steps.unchecked import diffeqsolve
 from .field import args_of, initial_own, own_states, whole
+from .formulation import formulation
 from .known_times import clocks_apart, known_times
-from .prescribed import formulation
 from .scene import Scene
 from .solution import Solution
 
@@ -108,14 +108,17 @@ class _LocatedRows(Located):
         held = jnp.zeros(new.shape[1], bool).at[: 2 * held.size].set(jnp.tile(held, 2))
         return (jnp.where(held[None], old, new),)
 
-    def known_late(self, time: Array, z: Array) -> Array:
-        """Returns how much later a known time here is: 0, with derivatives in `z`."""
+    def slope_of_known(self, time: Array, z: Array) -> Array:
+        """Returns the derivatives in `z` of a known time here, or 0."""
         if self.jumps is None or self.slopes is None:
-            return jnp.zeros_like(time)
+            return jnp.zeros_like(z)
         distance = jnp.abs(time - self.jumps)
         index = jnp.argmin(distance)
-        late = self.slopes[index] @ (z - jax.lax.stop_gradient(z))
-        return jnp.where(distance[index] <= 2 * self.apart, late, 0)
+        return jnp.where(distance[index] <= 2 * self.apart, self.slopes[index], 0)
+
+    def known_late(self, time: Array, z: Array) -> Array:
+        """Returns how much later a known time here is: 0, with derivatives in `z`."""
+        return self.slope_of_known(time, z) @ (z - jax.lax.stop_gradient(z))
 
     def needed(self, count, jumps):
         return count > 0 or jumps is not None
@@ -139,12 +142,7 @@ class _LocatedRows(Located):
                 lambda t, sides: self.rates(t, rows[0], args._replace(sides=sides))
             )
             rates = rates(times, sides)
-            late = jnp.zeros(args.z.size, rows.dtype)  # the known time
-            if self.jumps is not None and self.slopes is not None:
-                distance = jnp.abs(time - self.jumps)
-                index = jnp.argmin(distance)
-                known_time = distance[index] <= 2 * self.apart
-                late = jnp.where(known_time, self.slopes[index], late)
+            late = self.slope_of_known(time, args.z)
             gain = jnp.outer(late, rates[0] - rates[1])
             # Kinks change derivatives too where a jump at a known time passes them.
             if before.size:

@@ -26,7 +26,7 @@ from .dopri8 import (
     lower_triangle,
 )
 from .rounding import largest
-from .switching import Switching, motion_of
+from .switching import in_force, motion_of
 
 # The relative tolerance of tangents: over that of the motion, its upper limit, and its
 # lower limit in rounding errors.
@@ -139,9 +139,7 @@ class OfLinearised(eqx.Module):
     ) -> tuple[Array, Array]:
         """Returns the error of the probe over its tolerance, and the moved probe."""
         t0, t1, _, y1, args = step
-        if isinstance(y1[-1], Switching):
-            args = y1[-1].in_force(args)
-        at_end = constant((t1, motion_of(y1), args))
+        at_end = constant((t1, motion_of(y1), in_force(args, y1)))
         matrix = constant(t1 - t0) * linearised(self.term, *at_end)
         change, error = self._step(matrix, probe)
         end = probe + change

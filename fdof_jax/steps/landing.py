@@ -8,13 +8,13 @@ import jax.numpy as jnp
 from jax import Array
 
 from ..linkage.fields import has_come
-from .dopri8 import Arguments, Integrated, constant
+from .dopri8 import Integrated, constant
 
-# More landings than these are chatter, if they come within the distance that rounding
+# More crossings than these are chatter, if they come within the distance that rounding
 # keeps two of them apart, times this power of the unit of rounding (3e5 in float64).
-# Chatter soon lands at that distance; joints that bounce to rest, in however long a
+# Chatter soon crosses at that distance; joints that bounce to rest, in however long a
 # run, or that throw each other at their stops, are slower.
-_MOST_LANDINGS = 100
+_MOST_CROSSINGS = 100
 _PACE = -0.35
 # After so many tries the switching function itself is taken to jump, and the jump is
 # located by halving the step.
@@ -22,9 +22,12 @@ _MOST_TRIES = 6
 # A step ends so many units of rounding before a known time, and the next one starts as
 # many after it, so that rounding within steps does not pass it.
 _APART = 4
+# A step that would end so short before a known time, as a share of its length, ends
+# there.
+_JUST_BEFORE = 1e-6
 
 
-def rounding(ts: Array) -> Array:
+def clearance(ts: Array) -> Array:
     """Returns the distance kept from known times in a run over the times `ts`.
 
     It is relative to the largest of them, because one that is 0 has rounding too where
@@ -42,7 +45,7 @@ def end_of_run(ts: Array, jumps: Array | None) -> Array:
     end = ts[-1]
     if jumps is None:
         return end
-    apart, last = rounding(ts), _last(end)
+    apart, last = clearance(ts), _last(end)
     # Steps land on what comes before `last`, and go on after it.
     belongs = has_come(jumps, end) | (jumps < last + apart)
     there = (jumps >= last - apart) & belongs
@@ -73,9 +76,9 @@ class _Landing(NamedTuple):
     resumed: Array  # length of the step after it
     crossing: Array  # end of the last step that passed a switch, -infinity if none
     tries: Array  # to end at the next switch, up to here
-    landings: Array  # since the time `since`
+    crossings: Array  # tries included, since the time `since`
     since: Array
-    pace: Array  # time within which so many landings are chatter
+    pace: Array  # time within which too many crossings are chatter
     last: Array  # see `_last`
 
 
@@ -100,12 +103,8 @@ class Landing(eqx.Module):
     """
 
     jumps: Array | None
-    apart: Array  # see `rounding`
+    apart: Array  # see `clearance`
     switches: bool = eqx.field(static=True)
-
-    def in_force(self, args: Arguments, y: Integrated) -> Arguments:
-        """Returns the arguments with the sides in force at a state."""
-        return y[-1].in_force(args) if self.switches else args
 
     def _seen(self, y: Integrated, end: Array) -> tuple[Array | int, ...]:
         """Returns times and `near` of `Switching`, and whether nothing switches here.
@@ -126,12 +125,11 @@ class Landing(eqx.Module):
         ends = jnp.maximum(jumps - self.apart, t0)
         ends = jnp.where((jumps > t0) & (ends < last), ends, jnp.inf)
         index = jnp.argmin(ends)
-        next_one, jump = ends[index], jumps[index]
-        # A step must not end just before a known time.
-        reached = t1 + 1e-6 * (t1 - t0) >= next_one
+        place, jump = ends[index], jumps[index]
+        reached = t1 + _JUST_BEFORE * (t1 - t0) >= place
         # With the derivatives of the known time.
-        end = self.jumps[index] - (jump - next_one)
-        gap = jnp.where(reached, jump + self.apart - next_one, 0)
+        end = self.jumps[index] - (jump - place)
+        gap = jnp.where(reached, jump + self.apart - place, 0)
         return jnp.where(reached, end, t1), gap, reached
 
     def start(self, t0: Array, t1: Array, end: Array) -> tuple[Array, _Landing]:
@@ -155,30 +153,36 @@ class Landing(eqx.Module):
         aimed = end == state.target
         until, unseen, soon, near, idle = constant(self._seen(y1, end))
         allowance = jnp.where(aimed, near, 0)
-        passed = until < jnp.minimum(end - allowance, state.last)
+        within = until < jnp.minimum(end - allowance, state.last)
         # What a jump switches at once switches before the next jump, however near.
-        passed = keep & (passed | (until == begin) & (begin < end))
+        at_once = (until == begin) & (begin < end)
+        # A tiny step to a switch ends where it is.
         tiny = (begin < end) & (end - begin <= _APART * self.apart)
-        to_switch = aimed & (state.gap == 0)
-        passed = passed & ~(to_switch & tiny)  # it ends where the switch is
+        arrived = aimed & (state.gap == 0) & tiny
+        passed = keep & (within | at_once) & ~arrived
         # A shorter step sees what may have been passed over.
         unsure = keep & ~passed & (unseen < end)
-        keep = keep & ~unsure
         # A step that ends before the switch is stretched to it if that is near, because
         # a tiny second step would tell little of slopes.
-        before = keep & aimed & idle & ~passed & (end < state.crossing)
+        before = keep & ~unsure & ~passed & aimed & idle & (end < state.crossing)
         stretched = before & (end < soon) & (soon < state.crossing)
-        crossed, missed = passed | stretched, before & ~stretched
-        hopeless = state.tries > _MOST_TRIES
-        until = jnp.where(
-            stretched, soon, jnp.where(hopeless, (begin + end) / 2, until)
+        missed = before & ~stretched
+        crossed = passed | stretched
+        kept = keep & ~unsure & ~crossed
+        landed = kept & aimed
+        crossing = jnp.where(kept & ~missed, -jnp.inf, state.crossing)
+        middle, hopeless = (begin + end) / 2, state.tries > _MOST_TRIES
+        again = jnp.where(stretched, soon, jnp.where(hopeless, middle, until))
+        return _Happened(
+            keep=kept,
+            crossed=crossed,
+            unsure=unsure,
+            missed=missed,
+            landed=landed,
+            short=(crossed | unsure) & aimed | landed,
+            crossing=jnp.where(passed, end, crossing),
+            again=jnp.where(crossed, again, unseen),
         )
-        landed, keep = keep & aimed & ~crossed, keep & ~crossed
-        short = (crossed | unsure) & aimed | landed
-        crossing = jnp.where(keep & ~missed, -jnp.inf, state.crossing)
-        crossing = jnp.where(passed, end, crossing)
-        again = jnp.where(crossed, until, unseen)
-        return _Happened(keep, crossed, unsure, missed, landed, short, crossing, again)
 
     def after(
         self, t0: Array, t1: Array, y1: Integrated, planned: NextStep, state: _Landing
@@ -214,13 +218,13 @@ class Landing(eqx.Module):
         gap, aims = jnp.where(shortened, 0, gap), (cut | crossed | missed) & ~unsure
         # Time that passes meanwhile tells fast switching from chatter.
         paced = begin - state.since > state.pace
-        landings = jnp.where(paced, 0, state.landings + crossed)
+        crossings = jnp.where(paced, 0, state.crossings + crossed)
         results = diffrax.RESULTS
         resumes = shortened | landed
         # After the last step, which may be shorter than others may, none is asked for.
         done = keep & (end >= state.last)
         result = results.where(resumes | done, results.successful, result)
-        chatter = (landings > _MOST_LANDINGS) & (result == results.successful)
+        chatter = (crossings > _MOST_CROSSINGS) & (result == results.successful)
         result = results.where(chatter, results.max_steps_rejected, result)
         state = state._replace(
             target=jnp.where(aims, constant(next_t1), jnp.inf),
@@ -228,7 +232,7 @@ class Landing(eqx.Module):
             resumed=length,
             crossing=crossing,
             tries=jnp.where(keep & ~missed, 0, state.tries + crossed),
-            landings=landings,
+            crossings=crossings,
             since=jnp.where(paced, begin, state.since),
         )
         step = NextStep(keep, next_t0, next_t1, landed | jumped, result)

@@ -26,7 +26,7 @@ from .dopri8 import (
 )
 from .landing import Landing, NextStep
 from .rounding import above_rounding
-from .switching import motion_of
+from .switching import in_force, motion_of
 
 
 class _State(NamedTuple):
@@ -64,9 +64,7 @@ class StepControl(Adaptive):
     derivatives: OfTangents | OfLinearised | None
 
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):  # pyright: ignore[reportIncompatibleMethodOverride]
-        if self.landing is not None:
-            args = self.landing.in_force(args, y0)
-        start = terms, t0, t1, motion_of(y0), dt0, args
+        start = terms, t0, t1, motion_of(y0), dt0, in_force(args, y0)
         first, inner = constant(
             self.controller.init(*constant(start), func, error_order)
         )
@@ -79,31 +77,36 @@ class StepControl(Adaptive):
     def adapt_step_size(  # pyright: ignore[reportIncompatibleMethodOverride]
         self, t0, t1, y0, y1, args, y_error, error_order, state
     ):
+        # Is its end singular, or not finite?
         health_result = diffrax.RESULTS.successful
-        if self.term is not None and self.watches:
+        if self.watches:
             y1, y_error, health_result = self._healthy(t0, t1, y0, y1, args, y_error)
+        # Would derivatives be less exact than they may be?
         ratio, probe = None, None
         if self.derivatives is not None:
             taken = Step(t0, t1, y0, y1, args)
             ratio, probe = self.derivatives(taken, y_error, state.probe, self.rtol)
-        step: Any = *map(motion_of, (y0, y1)), with_change(y_error, motion_of)
+        judged: Any = *map(motion_of, (y0, y1)), with_change(y_error, motion_of)
         controller = self.controller
         if isinstance(controller, Scaled):
             scaled, controller = controller.scaled, controller.controller
-            step = *map(scaled, step[:2]), with_change(step[2], scaled)
-        start, end, error = constant(step)
+            judged = *map(scaled, judged[:2]), with_change(judged[2], scaled)
+        start, end, error = constant(judged)
         begin, stop, args = constant((t0, t1, args))
+        # Is its error rounding? How much accuracy did it lose?
         loss = state.loss
         if self.term is not None:
             loss = functools.reduce(jnp.maximum, error.health)
             error = above_rounding(
                 self, stop - begin, start, end, args, error, ratio, error_order
             )
+        # Is the error within the tolerance?
         keep, next0, next1, jumped, inner, result = constant(
             controller.adapt_step_size(
                 begin, stop, start, end, args, error, error_order, state.inner
             )
         )
+        # Did it pass a known time or a switch?
         step, landing = NextStep(keep, next0, next1, jumped, result), None
         if self.landing is not None:
             step, resumes, landing = self.landing.after(t0, t1, y1, step, state.landing)

@@ -26,7 +26,7 @@ from .dopri8 import (
     constant,
     with_change,
 )
-from .landing import Landing, rounding
+from .landing import Landing, clearance
 from .switch_derivatives import (
     Arrival,
     Event,
@@ -67,7 +67,7 @@ class Switching(NamedTuple):
     - `one_sided`: number of places up to here where derivatives may hold on one side
       only (see `Located`); None if nothing jumps at switches.
     - `grazing`, `grazing_here`: how near to grazing a crossing came so far, and one
-      here; 0 if none (see `at_end`).
+      here; 0 if none (see `Passage`).
     - `modes`: those of the joints (see `ScheduledTerm`), None if elements hold none.
     """
 
@@ -96,6 +96,12 @@ def _in_force(args: Arguments, sides: Array, modes: PyTree) -> Arguments:
     return args if modes is None else args._replace(modes=modes)
 
 
+def in_force(args: Arguments, y: Integrated) -> Arguments:
+    """Returns the arguments with what is in force at a state, if it has switches."""
+    last = y[-1] if y else None
+    return last.in_force(args) if isinstance(last, Switching) else args
+
+
 def motion_of(y: Integrated) -> Integrated:
     """Returns a state without that of the switches."""
     return y[:-1] if y is not None and isinstance(y[-1], Switching) else y
@@ -115,7 +121,7 @@ def located(
     Also returns the start for this solver. Without switches and known times `jumps`,
     solver and start stay as they are. `ts`: the times of the run.
     """
-    t0, apart = ts[0], rounding(ts)
+    t0, apart = ts[0], clearance(ts)
     jumps = None if jumps is None else jnp.asarray(jumps, t0.dtype)
     modes, guards = None, 0
     if term.unknown_modes is not None:
@@ -170,7 +176,7 @@ class Located(diffrax.AbstractAdaptiveSolver):
 
     solver: Any
     jumping: tuple[bool, ...] = eqx.field(static=True)  # whether efforts do, (switch,)
-    apart: Array  # see `rounding`
+    apart: Array  # see `clearance`
     guards: int = eqx.field(static=True)  # switching functions that guard modes
     derivatives: bool = eqx.field(static=True)
 
@@ -227,41 +233,35 @@ class Located(diffrax.AbstractAdaptiveSolver):
             y1 = self.kept(modes.held, y1, y0)
             dense = dict(path=dense, modes=modes)
 
-        where = terms.term, t0, t1, path, args
-        values, checks = _values(*constant(where))
         # Lengths of steps to a switch say nothing about the pace of the motion.
         share = jnp.finfo(t1.dtype).eps ** _NEAR
         near = jnp.maximum(share * (t1 - t0), switching.near / 2)
         near = jnp.maximum(near, self.apart)
-        until, crossed, missed, unseen, switched, grazing, soon, sizes = passage(
-            values,
-            checks,
-            sides,
-            begun,
-            earlier,
-            near / (t1 - t0),
-            t1 - t0 <= jnp.maximum(SHORTEST[t1.dtype], _BRIEF * near),
-        )
+        values, checks = _values(*constant((terms.term, t0, t1, path, args)))
+        brief = t1 - t0 <= jnp.maximum(SHORTEST[t1.dtype], _BRIEF * near)
+        place = near / (t1 - t0)
+        passed = passage(values, checks, sides, begun, earlier, place, brief)
         # What began on its zero has left it, in one or more steps.
-        on_zero = switching.sizes <= jnp.finfo(sizes.dtype).eps ** _ON_ZERO * sizes
+        left = jnp.finfo(passed.sizes.dtype).eps ** _ON_ZERO * passed.sizes
+        on_zero = switching.sizes <= left
         # Before the first step, whose length is 0, sides are unknown.
-        after = jnp.where(switched, -sides, sides)
+        after = jnp.where(passed.switched, -sides, sides)
         after = jnp.where(sides == 0, jnp.where(values[-1] > 0, 1.0, -1.0), after)
         grazed = jnp.maximum(switching.grazing, if_jumped(switching.grazing_here, 0))
         new = Switching(
             sides=sides,
             after=after.astype(t0.dtype),
-            until=jnp.where(crossed, t0 + until * (t1 - t0), t1),
-            unseen=jnp.where(unseen < 1, t0 + unseen * (t1 - t0), t1),
-            soon=t1 + soon * (t1 - t0),
+            until=jnp.where(passed.crossed, t0 + passed.until * (t1 - t0), t1),
+            unseen=jnp.where(passed.unseen < 1, t0 + passed.unseen * (t1 - t0), t1),
+            soon=t1 + passed.soon * (t1 - t0),
             near=near,
-            sizes=sizes,
+            sizes=passed.sizes,
             length=t1 - t0,
-            ahead=jnp.any(switched & (sides * values[-1] > 0)).astype(t0.dtype),
+            ahead=jnp.any(passed.switched & (sides * values[-1] > 0)).astype(t0.dtype),
             passed=switching.passed + jnp.sum(changed & ~on_zero),
-            one_sided=self.one_sided(switching, on_zero, sides, sizes, changed),
-            grazing=jnp.maximum(missed, grazed),
-            grazing_here=grazing,
+            one_sided=self.one_sided(switching, on_zero, sides, passed.sizes, changed),
+            grazing=jnp.maximum(passed.missed, grazed),
+            grazing_here=passed.grazing,
             modes=modes,
         )
         if error is not None:  # None: a method without an estimate

@@ -118,37 +118,53 @@ def _turns(margins: _Margins) -> tuple[Array, Array]:
     return in_one_loop((shares, jnp.where(turning, values, jnp.inf)))
 
 
+class Passage(NamedTuple):
+    """Where switching functions pass 0 in a step, and which do at its end.
+
+    - `until`: the share of the step where a margin first passes 0, 1 if none does;
+      `crossed`: whether any does.
+    - `missed`: how near to grazing a margin turned back, 0 if not near.
+    - `unseen`: a share of the step where a margin may pass 0 unseen, in the middle of
+      two samples, or else 1.
+    - `switched` (n,): which margins are near their zeros at the step's end; `grazing`:
+      how they graze.
+    - `soon`: the share of the step after which another follows soon, or 0.
+    - `sizes` (n,): the largest sizes of the values, also in steps before.
+    """
+
+    until: Array
+    crossed: Array
+    missed: Array
+    unseen: Array
+    switched: Array
+    grazing: Array
+    soon: Array
+    sizes: Array
+
+
 @eqx.filter_jit
 def passage(
     values: Array, checks: Array, sides: Array, begun: Array, before: Array,
     near: Array, brief: Array,
-) -> tuple[Array, ...]:  # fmt: skip
+) -> Passage:  # fmt: skip
     """Returns where switching functions pass 0 in a step, and which do at its end.
 
     Margins are their values (sample, n) on the sides in force (n,): positive as long as
     nothing switches.
-
-    - The share of the step where a margin first passes 0, 1 if none does; whether any
-      does; and how near to grazing a margin turned back, 0 if not near.
-    - A share of the step where a margin may pass 0 unseen, in the middle of two
-      samples, or else 1.
-    - Which margins (n,) are near their zeros at the step's end, how they graze, and the
-      share of the step after which another follows soon, or 0.
-    - The largest sizes of the values (n,), also in steps before.
 
     `checks`: the values at further places of the step; `begun`: which began on their
     zeros, as after a switch; `before`: the largest sizes in steps before; `near`: a
     share of the step; `brief`: whether the step is so short that nothing is looked for
     in between.
     """
-    zero, no = jnp.zeros((), values.dtype), jnp.zeros((), bool)
     if not before.size:
-        return zero + 1, no, zero, zero + 1, before > 0, zero, zero, before
+        zero, no = jnp.zeros((), values.dtype), jnp.zeros((), bool)
+        return Passage(zero + 1, no, zero, zero + 1, before > 0, zero, zero, before)
     brief = jnp.broadcast_to(brief, before.shape)
     margins = _margins(tuple(values), tuple(checks), sides, before, brief)
     turns, lowest = _turns(margins)
     sizes = jnp.maximum(before, margins.largest)
-    return (
+    return Passage(
         *_first_zero(margins, turns, lowest, before),
         _hiding_place(margins, lowest, begun, near),
         *_at_end(margins, sides * values[-1], sizes, near),
@@ -159,7 +175,7 @@ def passage(
 def _first_zero(
     margins: _Margins, turns: Array, lowest: Array, before: Array
 ) -> tuple[Array, Array, Array]:
-    """Returns the first three results of `passage`.
+    """Returns the first three parts of the `Passage`.
 
     A margin that falls by less than it may be wrong is left to `_hiding_place`.
     """
@@ -210,7 +226,7 @@ def _hiding_place(margins: _Margins, lowest: Array, begun: Array, near: Array) -
 def _at_end(
     margins: _Margins, last: Array, sizes: Array, near: Array
 ) -> tuple[Array, Array, Array]:
-    """Returns results of `passage` at the step's end; `last`: the margins there."""
+    """Returns what is at the step's end; `last`: the margins there."""
     eps, nearer = jnp.finfo(sizes.dtype).eps, -margins.slopes[-1]
     # Where the slope is rounding, as in a step of almost no length, the side counts.
     moves = jnp.abs(nearer) > _SLOPE_NOISE * eps * sizes
