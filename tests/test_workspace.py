@@ -12,6 +12,7 @@ from test_drawing import Q, labels, lines, make_linkage, named, tidy as tidy
 import fdof_jax as fj
 from fdof_jax import drawing
 from fdof_jax.analysis.reach import curves, ranges_of, reached_cells
+
 JACOBIANS = jax.jit(jax.vmap(fj.tip_jacobian, in_axes=(None, 0)))
 
 
