@@ -1,7 +1,7 @@
 """The equations of one arm of known topology, in plain scalar arithmetic.
 
-numba compiles them, and heyoka takes them as symbols, so no arrays are used. They are
-Kane's method, link by link, and share no line with the library: agreement is evidence.
+heyoka takes them as symbols, so no arrays are used. They are Kane's method, link by
+link, and share no line with the library: agreement is evidence.
 """
 
 from collections.abc import Callable

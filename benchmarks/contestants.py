@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import fdof_jax as fj
+from fdof_jax.base.configuration import wide_vectors
 
 from .measure import Case
 from .pendulums import absolute, accelerations, constants, relative
@@ -21,6 +22,7 @@ from .problems import Problem, controller
 
 MAX_STEPS = 65536
 DT0 = 1e-3  # estimates of the first step fail from exact rest
+CHUNK = 128  # of larger batches diffrax is fastest with so many members at once
 
 
 class Motion(NamedTuple):
@@ -93,13 +95,32 @@ def _simulate(axes: tuple | None) -> Callable:
                 linkage, state0, ts, forces, rtol=tolerance, atol=tolerance, throw=False
             )
 
-        return _over(member, axes)(linkage, state0)
+        return (jax.vmap(member, axes) if axes else member)(linkage, state0)
 
-    return jax.jit(run)
+    return _jitted(run, axes)
 
 
-def _over(member: Callable, axes: tuple | None) -> Callable:
-    return member if axes is None else jax.vmap(member, axes)
+def _jitted(run: Callable, axes: tuple | None) -> Callable:
+    """Compiles a contestant, a batch for wide vectors, as `sweep` is."""
+    return jax.jit(run, compiler_options=wide_vectors() if axes else None)
+
+
+def _in_chunks(member: Callable, problem: Problem) -> Callable:
+    """Returns a function of linkage and state for all members."""
+    axes = problem.axes
+    if axes is None:
+        return member
+    if problem.batch <= CHUNK:
+        return jax.vmap(member, axes)
+
+    def members(linkage, state0):
+        if axes[0] is None:
+            one = lambda state0: member(linkage, state0)
+            return jax.lax.map(one, state0, batch_size=CHUNK)
+        one = lambda both: member(*both)
+        return jax.lax.map(one, (linkage, state0), batch_size=CHUNK)
+
+    return members
 
 
 def _arguments(problem: Problem) -> tuple:
@@ -143,7 +164,9 @@ def _by_diffrax(field: Callable, y0: Any, ts: Any, args: Any, tolerance: Any) ->
         DT0,
         y0,
         args,
-        saveat=diffrax.SaveAt(ts=ts),
+        # Of two times the first is the start, and saves within steps cost more.
+        saveat=diffrax.SaveAt(t1=True) if len(ts) == 2 else diffrax.SaveAt(ts=ts),
+        adjoint=diffrax.ForwardMode(),
         stepsize_controller=controller(tolerance),
         max_steps=MAX_STEPS,
         throw=False,
@@ -182,9 +205,8 @@ def _reduced_field(t, y, args):
 
 
 def _stacked(problem: Problem, field: Callable, name: str) -> Contestant:
-    """Returns Dopri8 on a stacked state, under plain `jax.vmap` for a batch."""
+    """Returns Dopri8 on a stacked state, under `jax.vmap` for a batch."""
 
-    @jax.jit
     def run(linkage, state0, ts, forces, tolerance):
         def member(linkage, state0):
             y0 = jnp.concatenate([state0.q, state0.qd])
@@ -192,10 +214,10 @@ def _stacked(problem: Problem, field: Callable, name: str) -> Contestant:
             ys = solution.ys
             return Motion(ys[:, :3], ys[:, 3:], **_steps(solution))
 
-        return _over(member, problem.axes)(linkage, state0)
+        return _in_chunks(member, problem)(linkage, state0)
 
-    arguments = _arguments(problem)
-    call = lambda tolerance: run(*arguments, tolerance)
+    arguments, compiled = _arguments(problem), _jitted(run, problem.axes)
+    call = lambda tolerance: compiled(*arguments, tolerance)
     return Contestant(name, "tolerance", call, lambda motion: motion)
 
 
@@ -219,14 +241,13 @@ def diffrax_scalars(problem: Problem) -> Contestant:
         found = accelerations(arm, angle, rate, jnp.sin, jnp.cos)
         return (*rate, *found)
 
-    @jax.jit
     def run(y0, tolerance):
-        def member(y0):
+        def member(_, y0):
             solution = _by_diffrax(field, tuple(y0), ts, None, tolerance)
             assert solution.ys is not None
             return jnp.stack(solution.ys, axis=-1), _steps(solution)
 
-        return _over(member, None if problem.batch is None else 0)(y0)
+        return _in_chunks(member, problem)(None, y0)
 
     ts, y0 = jnp.asarray(problem.ts), jnp.asarray(absolute(arm, *problem.state0))
 
@@ -234,5 +255,6 @@ def diffrax_scalars(problem: Problem) -> Contestant:
         states, steps = result
         return Motion(*relative(arm, states), **steps)
 
-    call = lambda tolerance: run(y0, tolerance)
+    compiled = _jitted(run, problem.axes)
+    call = lambda tolerance: compiled(y0, tolerance)
     return Contestant("diffrax, scalars", "tolerance", call, motion)

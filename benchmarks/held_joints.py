@@ -13,9 +13,12 @@ import jax
 import numpy as np
 
 import fdof_jax as fj
+from fdof_jax.forces import HardStops, JointFriction
 
 from .measure import Case, Skipped, measure, skipped
+from .page import NEARLY, worst
 from .peers import module
+from .problems import chain
 
 PROTOCOL = "held_joints"
 GRAVITY, INF = 9.81, np.inf
@@ -92,31 +95,25 @@ def swinging_bar(q: np.ndarray, qd: np.ndarray) -> Errors:
     return abs(highest[0] + np.pi / 2 - np.arccos(1 - 0.6**2)), None
 
 
-def _friction(level: float) -> fj.forces.JointFriction:
-    return fj.forces.JointFriction(level)
-
-
-def _stop(lower: float, restitution: float) -> fj.forces.HardStops:
-    return fj.forces.HardStops(lower, INF, restitution=restitution)
-
-
 LOAD = 1.5 * GRAVITY / 2
 SCENES = (
     Scene(
-        "level bar, friction", BAR, 0.0, 10.0, (_friction(LOAD),), HINGE,
+        "level bar, friction", BAR, 0.0, 10.0, (JointFriction(LOAD),), HINGE,
         f'frictionloss="{LOAD}"', None, held_bar,
     ),
     Scene(
         "sprung slide, friction", SLIDING, 0.51, 10.0,
-        (_friction(2.0), fj.forces.JointSpring(100.0)), GUIDE,
+        (JointFriction(2.0), fj.forces.JointSpring(100.0)), GUIDE,
         'stiffness="100" frictionloss="2"', None, sprung_slide,
     ),
     Scene(
-        "dropped mass, stop", RISING, 1.0, 2.0, (_stop(0.0, 0.5),), GUIDE,
+        "dropped mass, stop", RISING, 1.0, 2.0,
+        (HardStops(0.0, INF, restitution=0.5),), GUIDE,
         'limited="true" range="0 9"', 0.5, dropped_mass,
     ),
     Scene(
-        "swinging bar, stop", BAR, 0.0, 2.0, (_stop(-np.pi / 2, 0.6),), HINGE,
+        "swinging bar, stop", BAR, 0.0, 2.0,
+        (HardStops(-np.pi / 2, INF, restitution=0.6),), HINGE,
         f'limited="true" range="{-np.pi / 2!r} 9"', 0.6, swinging_bar,
     ),
 )  # fmt: skip
@@ -193,14 +190,6 @@ def mujoco_case(scene: Scene, step: float, name: str, option: str, soft: str) ->
     return Case("MuJoCo", step, run, judge, "step", {"how": name})
 
 
-def worst(found: dict) -> float:
-    """Returns the larger of error and drift, none counting below 1e-12.
-
-    Of settings that are as good as exact the first is taken, which is the fastest.
-    """
-    return max(1e-12, *(found[key] or 0.0 for key in ("error", "drift")))
-
-
 def mujoco_cases(scene: Scene, steps: tuple[float, ...]) -> Iterator[Case]:
     """Returns MuJoCo with its defaults, and with the best settings for each step."""
     soft = ""
@@ -209,7 +198,7 @@ def mujoco_cases(scene: Scene, steps: tuple[float, ...]) -> Iterator[Case]:
     yield mujoco_case(scene, DEFAULT_STEP, "defaults", "", soft)
     for step in steps:
         tried = [mujoco_case(scene, step, *how) for how in settings(scene, step)]
-        yield min(tried, key=lambda case: worst(case.judge(case.run())))
+        yield min(tried, key=lambda case: max(NEARLY, worst(case.judge(case.run()))))
 
 
 def chain_cases(members: int, level: float) -> list[Case]:
@@ -217,10 +206,7 @@ def chain_cases(members: int, level: float) -> list[Case]:
 
     Five joints hang from random poses; level and damping are the same numbers.
     """
-    arm = fj.Linkage(
-        "RRRRR", length=[0, *[1] * 5], com=[[0.5, 0]] * 5, mass=[1] * 5,
-        inertia=[1 / 12] * 5, base_angle=-np.pi / 2,
-    )  # fmt: skip
+    arm = chain(5, members).linkage
     poses = np.random.default_rng(1).uniform(-1, 1, (members, 5))
     starts, numbers = fj.State(poses, np.zeros_like(poses)), level * np.arange(5, 0, -1)
 
@@ -240,7 +226,7 @@ def chain_cases(members: int, level: float) -> list[Case]:
 
     return [
         case("viscous damping", fj.JointDamper(numbers)),
-        case("friction", fj.forces.JointFriction(numbers)),
+        case("friction", JointFriction(numbers)),
     ]
 
 

@@ -17,7 +17,8 @@ from .problems import Problem, chain, reference
 
 BATCH = 1024
 MEMBERS = 16  # of a batch for MuJoCo, which runs them in turn
-TOLERANCES, HEYOKA, STEPS = (1e-7, 1e-9), (1e-7, 1e-9), (8e-3, 2e-3, 4e-4)
+TOLERANCES, HEYOKA = (1e-7, 1e-9), (1e-3, 1e-5, 1e-7, 1e-9)
+STEPS = 2e-2, 8e-3, 2e-3, 4e-4
 
 
 def flops(linkage: fj.Linkage) -> float:

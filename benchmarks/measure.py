@@ -208,8 +208,7 @@ def times_at(points: list[dict], error: float) -> np.ndarray | None:
 @cache
 def environment() -> dict:
     """Returns the machine and versions, the same for all records of a process."""
-    names = ("jax", "jaxlib", "diffrax", "numpy", "scipy", "numba", "mujoco",
-             "mujoco-mjx", "heyoka")  # fmt: skip
+    names = "jax", "jaxlib", "diffrax", "numpy", "mujoco", "heyoka"
     versions = {"python": platform.python_version()}
     for name in names:
         try:

@@ -1,8 +1,8 @@
 /* Triple pendulum (RRR) with general mass centres and inertias, by fixed steps.
 
-   The limit that other contestants are compared with: reduced 3x3 equations in absolute
-   angles, polynomial sine and cosine, everything in registers or L1. Compiled once with
-   LANES = 32 (structure of arrays, four AVX-512 vectors) and once with LANES = 1.
+   Reduced 3x3 equations in absolute angles, polynomial sine and cosine, everything in
+   registers or L1. Compiled once with LANES = 32 (structure of arrays, four AVX-512
+   vectors) and once with LANES = 1.
    tableau.h is written by native.py: STAGES, A, B of an explicit Runge-Kutta method. */
 
 #include "tableau.h"

@@ -51,16 +51,12 @@ def _steps(problem: Problem, step: float) -> int:
     return count
 
 
-def mujoco(problem: Problem, integrator: str = "RK4") -> Contestant:
-    """Returns MuJoCo's own rollout in C, with a thread for each core.
-
-    **Arguments:** `integrator`: Euler, implicitfast or RK4.
-    """
+def mujoco(problem: Problem) -> Contestant:
+    """Returns RK4 by MuJoCo's own rollout in C, with a thread for each core."""
     one_free_arm(problem)
     mj, rollout = module("mujoco"), module("mujoco.rollout")
     model = mj.MjModel.from_xml_string(fj.to_mjcf(problem.linkage))
-    kind = f"mjINT_{integrator.upper()}"
-    model.opt.integrator = getattr(mj.mjtIntegrator, kind)
+    model.opt.integrator = mj.mjtIntegrator.mjINT_RK4
     q, qd = (np.atleast_2d(a) for a in problem.state0)
     # Full physics state: time, positions, velocities.
     start = np.concatenate([np.zeros((len(q), 1)), q, qd], axis=1)
@@ -77,7 +73,7 @@ def mujoco(problem: Problem, integrator: str = "RK4") -> Contestant:
     def motion(states: np.ndarray) -> Motion:
         return Motion(*np.split(states[0] if single else states, 2, axis=-1))
 
-    return Contestant(f"MuJoCo {integrator}", "step", run, motion)
+    return Contestant("MuJoCo RK4", "step", run, motion)
 
 
 def native(problem: Problem, method: str) -> Contestant:

@@ -23,8 +23,8 @@ def run(quick: bool) -> Iterator[dict]:
         (own.fdof_jax, TOLERANCES),
         (own.diffrax_scalars, TOLERANCES),
         (own.diffrax_textbook, TOLERANCES),
-        (taylor.heyoka, (1e-7, 1e-9, 1e-12)),
-        (peers.mujoco, (4e-3, 1e-3, 2.5e-4)),
+        (taylor.heyoka, (1e-3, 1e-5, 1e-7, 1e-9, 1e-12)),
+        (peers.mujoco, (1e-2, 5e-3, 1e-3, 2.5e-4)),
     ]
     prepared = []
     for make, settings in rows:

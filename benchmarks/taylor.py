@@ -69,7 +69,9 @@ def heyoka(problem: Problem, compact: bool = False) -> Contestant:
 
     @cache
     def alone(tolerance: float) -> Any:
-        return hy.taylor_adaptive(system, start[:, 0].copy(), **settings(tolerance))
+        return hy.taylor_adaptive(
+            system, start[:, 0].copy(), **settings(tolerance, fast_math=True)
+        )
 
     def run_alone(tolerance: float) -> np.ndarray:
         integrator = alone(tolerance)
@@ -128,6 +130,4 @@ def heyoka(problem: Problem, compact: bool = False) -> Contestant:
                 list(pool.map(blocks, integrators, shares, [ends] * workers))
         return ends
 
-    if start.shape[1] == 1:  # a batch of one
-        return Contestant("heyoka", "tolerance", run_alone, lambda s: motion(s[None]))
     return Contestant("heyoka", "tolerance", run, motion)
