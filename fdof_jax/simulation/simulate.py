@@ -279,11 +279,11 @@ def _raising(solution: Solution, inputs: Inputs) -> Solution:
             for k, element in enumerate(inputs.forces)
         ),
     ]
-    faults = _faults(inputs)
+    found = _faults(inputs)
     failed = solution.result != diffrax.RESULTS.successful
     try:
         raising = eqx.branched_error_if(
-            solution, faults.any(), jnp.argmax(faults), messages
+            solution, found.any(), jnp.argmax(found), messages
         )
         number = outcome_numbers(raising.result)
         words = [f"simulate: {word}. {why}" for word, why in OUTCOMES.items()]

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import diffrax
 import equinox as eqx
@@ -15,32 +15,37 @@ from .dopri8 import Integrated, constant
 
 Controller = diffrax.AbstractStepSizeController
 Judging = diffrax.AbstractAdaptiveStepSizeController  # judges errors of steps
+_C = TypeVar("_C", bound=Controller)
 
 
-def with_pid(
-    change: Callable[[diffrax.PIDController], Controller], controller: Controller
-) -> Controller:
-    """Returns a controller with `change` applied to the PID controllers in it."""
-
-    def is_pid(node: object) -> bool:
-        return isinstance(node, diffrax.PIDController)
-
+def _with(
+    change: Callable[..., Controller],
+    controller: _C,
+    concerns: Callable[[object], bool],
+) -> _C:
+    """Returns a controller with `change` applied to the parts that it `concerns`."""
     return jax.tree.map(
-        lambda node: change(node) if is_pid(node) else node, controller, is_leaf=is_pid
+        lambda node: change(node) if concerns(node) else node,
+        controller,
+        is_leaf=concerns,
     )
 
 
-def with_error_control(change: Callable[..., Judging], controller: Judging) -> Judging:
+def with_pid(
+    change: Callable[[diffrax.PIDController], Controller], controller: _C
+) -> _C:
+    """Returns a controller with `change` applied to the PID controllers in it."""
+    return _with(change, controller, lambda n: isinstance(n, diffrax.PIDController))
+
+
+def with_error_control(change: Callable[..., Controller], controller: _C) -> _C:
     """Returns a controller with `change` applied to the one that judges errors."""
 
     def judges(node: object) -> bool:
         wrapper = isinstance(node, Abreast | diffrax.ClipStepSizeController)
-        adaptive = isinstance(node, diffrax.AbstractAdaptiveStepSizeController)
-        return adaptive and not wrapper
+        return isinstance(node, Judging) and not wrapper
 
-    return jax.tree.map(
-        lambda node: change(node) if judges(node) else node, controller, is_leaf=judges
-    )
+    return _with(change, controller, judges)
 
 
 def by_square_roots(controller: Controller) -> Controller:
@@ -91,7 +96,7 @@ class Shortening(diffrax.PIDController):
         return keep, next_t0, next_t1, *rest, state, result
 
 
-class Adaptive(diffrax.AbstractAdaptiveStepSizeController):
+class Adaptive(Judging):
     """Wrapper of an adaptive controller; implicit solvers read its tolerances.
 
     The arguments of `init` and `adapt_step_size` are those of diffrax.

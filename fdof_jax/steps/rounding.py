@@ -59,11 +59,11 @@ def above_rounding(
         as_long = same_step * jnp.minimum(ratio / _HELD, 1)
         above_noise = ratio / jnp.where(out_of_reach, _NOISE, 1)
         judged_as = tolerance * jnp.where(is_noise, as_long, above_noise)
-        judged = jnp.where(out_of_reach | is_noise, judged_as, error)
+        error = jnp.where(out_of_reach | is_noise, judged_as, error)
         if of_derivatives is None:
-            return judged
+            return error
         # A step that is not finite has no tolerance, and an infinite error.
-        return jnp.fmax(jnp.abs(judged), of_derivatives * tolerance)
+        return jnp.fmax(jnp.abs(error), of_derivatives * tolerance)
 
     # The elements' own states come last; their rates do not lose accuracy.
     motion = jax.tree.map(judged, error[:2], y0[:2], y1[:2], (of_delta, of_qd))
