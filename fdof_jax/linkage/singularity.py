@@ -43,10 +43,10 @@ def _scaled_inertia(linkage: "Linkage", configurations: int) -> np.ndarray:
     linkage = jax.tree.map(lambda a: np.asarray(a, dtype=float), linkage)
     revolute = np.stack(real_joints(linkage.ef))
     sizes = linkage.length, linkage.com, linkage.locked[revolute]
-    reach = sum(np.abs(size).sum() for size in sizes)
+    extent = sum(np.abs(size).sum() for size in sizes)
     n, moves = len(revolute), ~np.stack(fixed_pairs(linkage.ef))
     draws = np.random.default_rng(0).uniform(-1, 1, (configurations, 2, n))
-    q = np.where(revolute, np.pi * draws[:, 0], (reach or 1) * draws[:, 1] * moves)
+    q = np.where(revolute, np.pi * draws[:, 0], (extent or 1) * draws[:, 1] * moves)
     start, along, centre = _frames(linkage, q)
     moved = np.tri(n) * moves  # a joint moves only the links beyond it
     arm = centre[:, :, None] - start[:, None, 1:]
