@@ -49,7 +49,7 @@ def integrated(aside, radius, speed, stiffness, end):
         return [y[1], push * along / distance]
 
     found = solve_ivp(
-        rates, [0, end], [0, speed], "DOP853", max_step=radius / speed / 30,
+        rates, [0, end], [0, speed], "DOP853", max_step=radius / speed / 10,
         rtol=1e-10, atol=1e-11,
     )  # fmt: skip
     return found.y[0, -1]
