@@ -113,10 +113,10 @@ def tuned():
 
 @pytest.fixture(autouse=True, scope="module")
 def few_programs():
-    """Each compiled program takes memory maps, of which Linux has 65,530 a process."""
+    """Compiled programs take memory: about a GB for each 1,500 maps of the process."""
     yield
     maps = Path("/proc/self/maps")
-    if maps.exists() and maps.read_bytes().count(b"\n") > 40_000:
+    if maps.exists() and maps.read_bytes().count(b"\n") > 6_000:
         jax.clear_caches()
 
 

@@ -12,7 +12,7 @@ from nbconvert import HTMLExporter
 
 import fdof_jax as fj
 from fdof_jax.pictures.interactive import _moved, sliders
-from fdof_jax.simulation import prescribed
+from fdof_jax.simulation import formulation
 from fdof_jax.tuning.losses import with_gains
 
 CIRCLES = fj.tuning.circle_scenes()
@@ -94,7 +94,7 @@ def test_an_exported_notebook_has_a_still_picture():
 
 @pytest.mark.slow
 def test_nothing_is_compiled_after_the_first_picture(box, monkeypatch):
-    monkeypatch.setattr(prescribed, "FREE", None)  # no second trace
+    monkeypatch.setattr(formulation, "DRIVEN", None)  # no second trace
     box.move(kp_1=2.0)
     shown = {name: box.move(arm=name, link_1=1.1).tobytes() for name in fj.TOPOLOGIES}
     assert len(set(shown.values())) == 7
