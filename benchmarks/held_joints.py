@@ -15,8 +15,7 @@ import numpy as np
 import fdof_jax as fj
 from fdof_jax.forces import HardStops, JointFriction
 
-from .measure import Case, Skipped, measure, skipped
-from .page import NEARLY, worst
+from .measure import EXACT, Case, Skipped, measure, skipped, worst
 from .peers import module
 from .problems import chain
 
@@ -198,7 +197,7 @@ def mujoco_cases(scene: Scene, steps: tuple[float, ...]) -> Iterator[Case]:
     yield mujoco_case(scene, DEFAULT_STEP, "defaults", "", soft)
     for step in steps:
         tried = [mujoco_case(scene, step, *how) for how in settings(scene, step)]
-        yield min(tried, key=lambda case: max(NEARLY, worst(case.judge(case.run()))))
+        yield min(tried, key=lambda case: max(EXACT, worst(case.judge(case.run()))))
 
 
 def chain_cases(members: int, level: float) -> list[Case]:

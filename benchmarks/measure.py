@@ -24,6 +24,7 @@ LONG = 1.0  # calls of this length [s] are measured in fewer rounds
 ENDLESS = 30.0  # first calls of this length [s] are not repeated to learn their length
 FEWEST, FEW, MANY = 3, 5, 15  # rounds: under any budget, of long calls, of the rest
 WORST_ERROR = 0.1  # a larger error is a failure, not a result
+EXACT = 1e-12  # a smaller error of joints that are held is as good as none [m or rad]
 # The outcomes of a hard case, best first.
 OUTCOMES = ("solved", "refused as asked", "failed by name", "failed silently")
 
@@ -173,6 +174,11 @@ def _add_ratios(points: list[dict], ratio_to: str) -> None:
             ratio = np.array(point["times"][:shared]) / against[:shared]
             low, median, high = np.percentile(ratio, [25, 50, 75])
             point.update(ratio=median, ratio_quartiles=[low, high], ratio_to=ratio_to)
+
+
+def worst(found: dict) -> float:
+    """Returns the larger of error and drift."""
+    return max(found["error"] or 0.0, found.get("drift") or 0.0)
 
 
 def envelope(errors: Sequence[float], times: Sequence[float], error: float) -> float:

@@ -8,11 +8,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from .measure import ENDLESS, OUTCOMES, times_at
+from .measure import ENDLESS, EXACT, OUTCOMES, times_at, worst
 
 Points = list[dict]
 ERRORS = (1e-6, 1e-9)
-NEARLY = 1e-12  # as good as exact, of joints that are held [m or rad]
 CHAIN_ERROR = 1e-8  # of chains of many joints
 OURS = "fdof_jax sweep"
 
@@ -23,11 +22,6 @@ LOOKS = {
     "diffrax, scalars": ("#009E73", "<"), "diffrax, arrays": ("#56B4E9", ">"),
     "MuJoCo RK4": ("#CC79A7", "P"),
 }  # fmt: skip
-
-
-def worst(point: dict) -> float:
-    """Returns the larger of error and drift."""
-    return max(point["error"] or 0.0, point.get("drift") or 0.0)
 
 
 def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
@@ -194,7 +188,7 @@ def held_joints(points: Points) -> str:
             if not own:
                 continue
             # Of settings that are as good as exact the first is the fastest.
-            best = min(own, key=lambda p: max(NEARLY, worst(p)))
+            best = min(own, key=lambda p: max(EXACT, worst(p)))
             wall = 1e3 * best["time_median"] / best["simulated"]
             how = f"{best['kind']} {best['setting']:g}"
             rows.append([scene, solver, how, number(worst(best)), number(wall)])

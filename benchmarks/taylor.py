@@ -3,8 +3,9 @@
 It raises `Skipped` if it is not installed or cannot run the problem. Pendulums are in
 absolute angles, with the linear solve written out, as its users would write them; of
 the vector lengths and `fast_math`, the fastest on this machine is taken for each
-tolerance. `high_accuracy` made no difference to errors here and cost a tenth of the
-time, and its ensembles cost more than a thread for each core with an integrator each.
+tolerance; single arms take `fast_math`. `high_accuracy` made no difference to errors
+here and cost a tenth of the time, and its ensembles cost more than a thread for each
+core with an integrator each.
 """
 
 import math

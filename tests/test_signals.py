@@ -190,13 +190,20 @@ def test_it_has_them_beside_the_motion(make):
 @pytest.mark.slow
 @pytest.mark.parametrize("first", [
     jax.jacfwd(lambda b: saturating(b, adjoint=diffrax.ForwardMode())),
-    jax.grad(lambda b: saturating(b)),
+    jax.grad(saturating),
 ])  # fmt: skip
 def test_it_has_them_in_all_modes(first):
-    """First derivatives in both modes, and second ones over them."""
+    """First derivatives forward and by tangents, and second ones over them."""
     slope = lambda begin: (first(begin),) * 2
     curvature, slope = jax.jit(jax.jacfwd(slope, has_aux=True))(0.2)
     np.testing.assert_allclose([slope, curvature], [-3, 10], rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_the_adjoint_has_them():
+    checkpoints = diffrax.RecursiveCheckpointAdjoint(checkpoints=1024)
+    slope = jax.jit(jax.grad(lambda b: saturating(b, adjoint=checkpoints)))(0.2)
+    np.testing.assert_allclose(slope, -3, rtol=1e-9)
 
 
 @pytest.mark.slow

@@ -98,8 +98,7 @@ def _in_force(args: Arguments, sides: Array, modes: PyTree) -> Arguments:
 
 def in_force(args: Arguments, y: Integrated) -> Arguments:
     """Returns the arguments with what is in force at a state, if it has switches."""
-    last = y[-1] if y else None
-    return last.in_force(args) if isinstance(last, Switching) else args
+    return y[-1].in_force(args) if isinstance(y[-1], Switching) else args
 
 
 def motion_of(y: Integrated) -> Integrated:
