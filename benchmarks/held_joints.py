@@ -7,6 +7,7 @@ never pulls, has the damping that gives the wanted restitution.
 """
 
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -118,11 +119,11 @@ SCENES = (
 )  # fmt: skip
 
 
-def own_case(scene: Scene, tolerance: float) -> Case:
+def own_cases(scene: Scene) -> list[Case]:
     ts = np.linspace(0, scene.end, 201)
 
     @jax.jit
-    def run(start):
+    def run(start, tolerance):
         return fj.simulate(
             scene.linkage, start, ts, scene.forces, rtol=tolerance, atol=tolerance
         )
@@ -132,7 +133,10 @@ def own_case(scene: Scene, tolerance: float) -> Case:
         return {"error": error, "drift": drift, "steps": motion.stats["num_steps"]}
 
     start = fj.State(np.array([scene.start]), np.zeros(1))
-    return Case("fdof_jax", tolerance, lambda: run(start), judge)
+    return [
+        Case("fdof_jax", tolerance, partial(run, start, tolerance), judge)
+        for tolerance in TOLERANCES
+    ]
 
 
 def damping_ratio(restitution: float) -> float:
@@ -238,7 +242,7 @@ def run(quick: bool) -> Iterator[dict]:
             problem="five joints to rest, by sweep", simulated=30.0,
         )  # fmt: skip
     for scene in SCENES:
-        cases = [own_case(scene, tolerance) for tolerance in TOLERANCES]
+        cases = own_cases(scene)
         try:
             cases += mujoco_cases(scene, STEPS[:2] if quick else STEPS)
         except Skipped as reason:
