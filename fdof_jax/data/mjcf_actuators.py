@@ -12,7 +12,7 @@ from ..control.pd import PDController
 from ..forces.element import Element
 from ..forces.joints import JointEffort
 from ..references.task import SetPoint
-from .mjcf_chain import FAR, Reader, name_of, path_of_tendon
+from .mjcf_chain import FAR, Chain, Reader
 from .mjcf_source import Model
 
 
@@ -27,8 +27,8 @@ class _Affine(NamedTuple):
 class _OwnState(NamedTuple):
     """An actuator's state, in the terms of `Activation`."""
 
-    gain: float
-    rate: tuple[float, ...]
+    gain: float = 0.0
+    rate: tuple[float, ...] = (0.0,) * 4
     start: float = 0.0
     lower: float = -np.inf
     upper: float = np.inf
@@ -64,16 +64,16 @@ class _Row(NamedTuple):
         return bool(self.bias.length or self.bias.speed)
 
 
-def _gear(read: Reader, actuator: int) -> np.ndarray | None:
+def _gear(read: Reader, chain: Chain, actuator: int) -> np.ndarray | None:
     """Ratios of an actuator to the joint positions q; None if it acts elsewhere."""
-    model, chain, kinds = read.model, read.chain, read.mujoco.mjtTrn
+    model, kinds = read.model, read.mujoco.mjtTrn
     target = model.actuator_trnid[actuator, 0]
     kind = kinds(int(model.actuator_trntype[actuator]))
     coefficients = np.zeros(model.njnt)
     if kind in (kinds.mjTRN_JOINT, kinds.mjTRN_JOINTINPARENT):
         coefficients[target] = 1
     elif kind == kinds.mjTRN_TENDON:
-        wraps = path_of_tendon(model, target)
+        wraps = read.path_of_tendon(target)
         if (model.wrap_type[wraps] != int(read.mujoco.mjtWrap.mjWRAP_JOINT)).any():
             return None
         np.add.at(coefficients, model.wrap_objid[wraps], model.wrap_prm[wraps])
@@ -87,11 +87,11 @@ def _gear(read: Reader, actuator: int) -> np.ndarray | None:
 
 
 def inertias_of_actuators(
-    read: Reader,
-) -> Iterator[tuple[np.ndarray, tuple[float, float]]]:
-    """Yields gears and (damping, armature) of actuators, in newer versions."""
+    read: Reader, chain: Chain
+) -> Iterator[tuple[np.ndarray, float, float]]:
+    """Yields gears, damping and armature of actuators, in newer versions."""
     model = read.model
-    if not hasattr(model, "actuator_armature"):
+    if "actuators" in read.drop or not hasattr(model, "actuator_armature"):
         return
     for actuator in range(len(model.actuator_trntype)):
         values = model.actuator_damping[actuator], model.actuator_armature[actuator]
@@ -99,20 +99,17 @@ def inertias_of_actuators(
         bent = poly is not None and np.any(poly[actuator])
         if not any(values) and not bent:
             continue
-        name = f"actuator {name_of(model, 'actuator', actuator)}"
-        gear = _gear(read, actuator)
+        name = f"actuator {read.name_of('actuator', actuator)}"
+        gear = _gear(read, chain, actuator)
         if bent or gear is None or np.count_nonzero(gear) > 1:
             read.leave("actuators", name, "damping or armature that joints do not have")
         else:
-            yield gear, values
+            yield gear, *values
 
 
-def actuators(
-    read: Reader, controls: ArrayLike | None, drop: tuple[str, ...]
-) -> list[Element]:
+def actuators(read: Reader, chain: Chain, controls: ArrayLike | None) -> list[Element]:
     """The actuators: PD controllers and efforts where these will do, or `Actuators`."""
-    model, chain = read.model, read.chain
-    count = len(model.actuator_trntype)
+    model = read.model
     if controls is None:
         controls = model.key_ctrl[0] if model.nkey else np.zeros(model.nu)
     controls = np.array(real_array("controls", controls, (model.nu,)))
@@ -122,32 +119,30 @@ def actuators(
     controls = np.where(clamped, np.clip(controls, *ranges.T), controls)
     states = model.key_act[0] if model.nkey else np.zeros(model.na)
     rows = []
-    for actuator in range(count):
-        name = name_of(model, "actuator", actuator)
+    for actuator in range(len(model.actuator_trntype)):
+        name = f"actuator {read.name_of('actuator', actuator)}"
         group = int(model.actuator_group[actuator])
         off = 0 <= group < 31 and model.opt.disableactuator & (1 << group)
         if off or read.disabled("ACTUATION"):
-            read.note(f"actuator {name}", "left out, switched off")
+            read.note(name, "left out, switched off")
             continue
-        if "actuators" in drop:
-            read.note(f"actuator {name}", "left out, as asked")
+        if "actuators" in read.drop:
+            read.note(name, "left out, as asked")
             continue
-        gear = _gear(read, actuator)
+        gear = _gear(read, chain, actuator)
         if gear is None:
             kind = read.mujoco.mjtTrn(int(model.actuator_trntype[actuator]))
             what = f"a transmission ({kind.name[6:].lower()}) beyond the chain's joints"
-            read.leave("actuators", f"actuator {name}", what)
+            read.leave("actuators", name, what)
         elif not gear.any():
-            read.note(
-                f"actuator {name}", "left out, as it acts on nothing of the chain"
-            )
+            read.note(name, "left out, as it acts on nothing of the chain")
         else:
             law = _law(read, actuator, controls, states)
             if isinstance(law, str):
-                read.leave("actuators", f"actuator {name}", law)
+                read.leave("actuators", name, law)
                 continue
             if not any(law.gain) and not any(law.bias) and law.state is None:
-                read.note(f"actuator {name}", "left out, as its gains are 0")
+                read.note(name, "left out, as its gains are 0")
                 continue
             lower, upper = -np.inf, np.inf
             if model.actuator_forcelimited[actuator]:
@@ -166,9 +161,7 @@ def actuators(
     upper = np.where(effort_limited, ends.max(axis=1), np.inf)
     if not rows:
         return []
-    forces: list[Element] | None = _simple(rows, lower, upper)
-    if forces is None:
-        forces = [_general(rows, lower, upper)]
+    forces = _simple(rows, lower, upper) or [_general(rows, lower, upper)]
     kinds = " and ".join(type(force).__name__ for force in forces)
     for row in rows:
         if len(forces) > 1:
@@ -180,7 +173,7 @@ def actuators(
             limits["force range"] = row.lower, row.upper
         for name, (low, high) in limits.items():
             words += f"; its {name}, {low:.4g} to {high:.4g}, is not kept for others"
-        read.note(f"actuator {row.name}", words)
+        read.note(row.name, words)
     return forces
 
 
@@ -205,15 +198,9 @@ def _law(
         return "a plugin"
     if hasattr(model, "actuator_delay") and model.actuator_delay[actuator]:
         return "a delay"
-    dynprm, gainprm, biasprm = (
-        array[actuator].tolist()
-        for array in (
-            model.actuator_dynprm,
-            model.actuator_gainprm,
-            model.actuator_biasprm,
-        )
-    )
-    state = _OwnState(0.0, (0.0,) * 4)
+    numbers = model.actuator_dynprm, model.actuator_gainprm, model.actuator_biasprm
+    dynprm, gainprm, biasprm = (array[actuator].tolist() for array in numbers)
+    state = _OwnState()
     if (place := model.actuator_actadr[actuator]) >= 0:
         state = state._replace(start=float(states[place]))
         if model.actuator_actlimited[actuator]:
@@ -285,8 +272,8 @@ def _general(rows: list[_Row], lower: np.ndarray, upper: np.ndarray) -> Actuator
     finite = lambda values: values if np.isfinite(values).any() else None
     activation = None
     if any(row.state for row in rows):
-        none = _OwnState(0.0, (0.0,) * 4)
-        gain, rate, start, low, high = zip(*(row.state or none for row in rows))
+        states = (row.state or _OwnState() for row in rows)
+        gain, rate, start, low, high = zip(*states)
         ends = finite(np.array(low)), finite(np.array(high))
         activation = Activation(gain, rate, start, *ends)
     return Actuators(

@@ -1,12 +1,12 @@
 """The planar chain in a MuJoCo model: its joints, its plane, its links and its tip."""
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from types import ModuleType
 from typing import Any, NamedTuple, SupportsInt
 
 import numpy as np
 
-from ..base.checks import refusal, shown
+from ..base.checks import plain, refusal, shown
 from ..base.user_warnings import without_warning
 from ..linkage.linkage import Linkage
 from ..linkage.topology import MOST_PAIRS
@@ -50,93 +50,99 @@ class Chain(NamedTuple):
         return complex(vector @ self.right, vector @ self.up)
 
 
-def name_of(model: Model, kind: str, index: SupportsInt) -> str:
-    """The name of a part, such as a body, or its number."""
-    return getattr(model, kind)(int(index)).name or str(int(index))
-
-
-def switched_off(mujoco: ModuleType, model: Model, *names: str) -> bool:
-    """Whether a flag of the model, under one of its names, switches something off."""
-    flags = mujoco.mjtDisableBit.__members__  # some only in older or newer versions
-    bits = [int(flags[f"mjDSBL_{n}"]) for n in names if f"mjDSBL_{n}" in flags]
-    return any(model.opt.disableflags & bit for bit in bits)
-
-
 class Reader(NamedTuple):
-    """What the readers of elements need.
-
-    `leave(kind, part, what)`: notes what is left out, or raises ValueError unless that
-    kind is to be dropped; `note(part, words)`: a line of the account.
-    """
+    """A model, the kinds of its parts to leave out, and the lines of the account."""
 
     mujoco: ModuleType
     model: Model
-    chain: Chain
-    leave: Callable[[str, str, str], None]
-    note: Callable[[str, str], None]
+    drop: Sequence[str]
+    lines: list[tuple[str, str]]
+
+    def name_of(self, kind: str, index: SupportsInt) -> str:
+        """The name of a part, such as a body, or its number."""
+        return getattr(self.model, kind)(int(index)).name or str(int(index))
 
     def disabled(self, *names: str) -> bool:
-        return switched_off(self.mujoco, self.model, *names)
+        """Whether a flag, under one of its names, switches something off."""
+        flags = self.mujoco.mjtDisableBit.__members__  # some in some versions only
+        bits = [int(flags[f"mjDSBL_{n}"]) for n in names if f"mjDSBL_{n}" in flags]
+        return any(self.model.opt.disableflags & bit for bit in bits)
+
+    def data_at_start(self) -> Data:
+        """MuJoCo's data in the first key frame, if there is one, or at qpos0."""
+        data = self.mujoco.MjData(self.model)
+        if self.model.nkey:
+            self.mujoco.mj_resetDataKeyframe(self.model, data, 0)
+        return data
+
+    def path_of_tendon(self, tendon: int) -> slice:
+        """Where the parts of a tendon's path are."""
+        begin = int(self.model.tendon_adr[tendon])
+        return slice(begin, begin + int(self.model.tendon_num[tendon]))
+
+    def note(self, part: str, words: str) -> None:
+        """Adds a line to the account."""
+        self.lines.append((plain(part), plain(words)))
+
+    def leave(self, kind: str, part: str, what: str) -> None:
+        """Notes what is left out; raises ValueError unless `drop` names its kind."""
+        if kind not in self.drop:
+            raise ValueError(
+                f"source: expected a planar chain with elements of this library, got "
+                f"{plain(part)} with {plain(what)}; drop=('{kind}',) leaves it out."
+            )
+        self.note(part, f"{what}: left out, as asked")
 
 
-def path_of_tendon(model: Model, tendon: int) -> slice:
-    """Where the parts of a tendon's path are."""
-    begin = int(model.tendon_adr[tendon])
-    return slice(begin, begin + int(model.tendon_num[tendon]))
-
-
-def planar_chain(
-    mujoco: ModuleType, model: Model, tip: str | None
-) -> tuple[Linkage, Chain, list[tuple[str, str]]]:
-    """Reads the chain and its masses; also remarks, as pairs of part and words.
-
-    Raises ValueError for what is no planar chain.
-    """
-    if tip is not None and _named(mujoco, model, tip) is None:
+def planar_chain(read: Reader, tip: str | None) -> tuple[Linkage, Chain]:
+    """Reads the chain and its masses; raises ValueError for what is no planar chain."""
+    model = read.model
+    if tip is not None and _named(read, tip) is None:
         sites = [model.site(k).name for k in range(model.nsite)]
         bodies = [model.body(k).name for k in range(1, model.nbody)]
         names = shown([name for name in sites + bodies if name])
         raise refusal("tip", f"a site or a body among {names}", tip)
-    if not np.isfinite(model.opt.gravity).all():
-        raise refusal("source", "finite gravity", model.opt.gravity.tolist())
-    joints, links, remarks = _joints_of_arm(mujoco, model, tip)
-    data = data_at_start(mujoco, model)
+    pull = np.zeros(3) if read.disabled("GRAVITY") else model.opt.gravity
+    if not np.isfinite(pull).all():
+        raise refusal("source", "finite gravity", pull.tolist())
+    joints, links = _joints_of_arm(read, tip)
+    data = read.data_at_start()
     places = model.jnt_qposadr[joints]
     data.qpos[places] = 0
-    mujoco.mj_kinematics(model, data)
-    mujoco.mj_comPos(model, data)
+    read.mujoco.mj_kinematics(model, data)
+    read.mujoco.mj_comPos(model, data)
     axes, slides = data.xaxis[joints], model.jnt_type[joints] == _SLIDE
-    names = [name_of(model, "joint", k) for k in joints]
-    right, up, normal, gravity = _plane(axes, slides, model.opt.gravity)
+    names = [read.name_of("joint", k) for k in joints]
+    right, up, normal, gravity = _plane(axes, slides, pull)
     signs = np.where(slides, 1, np.sign(axes @ normal))
-    remarks += _flatness(names, axes, slides, normal)
+    x, y = _direction(right), _direction(up)
+    read.note("plane", f"x = {x}, y = {y} of the model's world")
+    _note_joints(read, names, axes, slides, normal)
     chain = Chain(
         joints, names, places, model.jnt_dofadr[joints], links, signs, right, up,
         normal, gravity, np.zeros(0), np.zeros(0),
     )  # fmt: skip
     starts = [0j]
     for joint, slide in zip(joints, slides):
-        start = starts[-1] if slide else chain.plane(data.xanchor[joint])
-        starts.append(start)
-    place, words = _tip(mujoco, model, data, chain, starts[-1], tip)
-    linkage, turns = _linkage(model, data, chain, np.array(starts), slides, place)
-    return (
-        linkage,
-        chain._replace(starts=np.array(starts), turns=turns),
-        [*remarks, ("tip", words)],
-    )
+        starts.append(starts[-1] if slide else chain.plane(data.xanchor[joint]))
+    chain = chain._replace(starts=np.array(starts))
+    place, words = _tip(read, data, chain, tip)
+    read.note("tip", words)
+    linkage, turns = _linkage(model, data, chain, slides, place)
+    return linkage, chain._replace(turns=turns)
 
 
-def data_at_start(mujoco: ModuleType, model: Model) -> Data:
-    """MuJoCo's data in the first key frame, if there is one, or at qpos0."""
-    data = mujoco.MjData(model)
-    if model.nkey:
-        mujoco.mj_resetDataKeyframe(model, data, 0)
-    return data
+def _direction(vector: np.ndarray) -> str:
+    """Names a unit vector: "-X", or its components."""
+    axis = int(np.abs(vector).argmax())
+    if abs(vector[axis]) < 1 - 1e-9:
+        return f"({', '.join(f'{part:.4g}' for part in vector)})"
+    return ("-" if vector[axis] < 0 else "") + "XYZ"[axis]
 
 
-def _named(mujoco: ModuleType, model: Model, name: str) -> tuple[int, str, int] | None:
+def _named(read: Reader, name: str) -> tuple[int, str, int] | None:
     """The body that a site or a body of this name is on, and which of both it is."""
+    model, mujoco = read.model, read.mujoco
     site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, name)
     if site >= 0:
         return int(model.site_bodyid[site]), "site", site
@@ -144,10 +150,9 @@ def _named(mujoco: ModuleType, model: Model, name: str) -> tuple[int, str, int] 
     return (body, "body", body) if body > 0 else None
 
 
-def _joints_of_arm(
-    mujoco: ModuleType, model: Model, tip: str | None
-) -> tuple[np.ndarray, np.ndarray, list[tuple[str, str]]]:
-    """The joints of the arm, the link of each body, and what is left out beside it."""
+def _joints_of_arm(read: Reader, tip: str | None) -> tuple[np.ndarray, np.ndarray]:
+    """The joints of the arm, and the link of each body; notes chains beside it."""
+    model, name = read.model, lambda body: read.name_of("body", body)
     welded, parent = model.body_weldid, model.body_parentid
     # Bodies that are welded together are one; of each, the one before it that moves.
     moving = {int(body) for body in welded if model.body_dofnum[body]}
@@ -162,11 +167,11 @@ def _joints_of_arm(
         return body
 
     roots = {body: root(body) for body in before}
-    trees = {name: [b for b in before if roots[b] == name] for name in roots.values()}
+    trees = {tree: [b for b in before if roots[b] == tree] for tree in roots.values()}
     if not trees:
         raise ValueError("source: expected a planar chain, got a model without joints.")
     of_joint = np.array([roots[int(welded[b])] for b in model.jnt_bodyid])
-    at = None if tip is None else _named(mujoco, model, tip)
+    at = None if tip is None else _named(read, tip)
     if at is not None:
         chosen = roots.get(int(welded[at[0]]), -1)
         if chosen < 0:
@@ -180,28 +185,25 @@ def _joints_of_arm(
         }
         rank = lambda t: (simple[t], driven.count(t), int((of_joint == t).sum()), -t)
         chosen = max(trees, key=rank)
-    remarks = [
-        (f"chain of body {name_of(model, 'body', tree)}", "left out, beside the arm")
-        for tree in trees
-        if tree != chosen
-    ]
+    for tree in trees:
+        if tree != chosen:
+            read.note(f"chain of body {name(tree)}", "left out, beside the arm")
     joints = np.flatnonzero(of_joint == chosen)
     refuse = lambda what: ValueError(f"source: expected a planar chain, got {what}.")
     for joint in joints:
         if model.jnt_type[joint] not in (_HINGE, _SLIDE):
-            name = name_of(model, "joint", joint)
-            raise refuse(f"joint {name}, which is neither a hinge nor a slide")
+            kind = f"joint {read.name_of('joint', joint)}"
+            raise refuse(f"{kind}, which is neither a hinge nor a slide")
     for body in trees[chosen]:
         following = [other for other in trees[chosen] if before[other] == body]
         if len(following) > 1:
-            both = " and ".join(name_of(model, "body", b) for b in following[:2])
-            name = name_of(model, "body", body)
-            raise refuse(f"branches: bodies {both} both follow body {name}")
+            both = " and ".join(map(name, following[:2]))
+            raise refuse(f"branches: bodies {both} both follow body {name(body)}")
     if len(joints) > MOST_PAIRS:
         raise refuse(f"{len(joints)} joints, above {MOST_PAIRS}")
     last = {int(model.jnt_bodyid[joint]): k + 1 for k, joint in enumerate(joints)}
     links = np.array([last.get(int(b), -1 if int(b) in moving else 0) for b in welded])
-    return joints, links, remarks
+    return joints, links
 
 
 def _plane(
@@ -224,12 +226,15 @@ def _plane(
     return np.cross(up, normal), up, normal, gravity
 
 
-def _flatness(
-    names: list[str], axes: np.ndarray, slides: np.ndarray, normal: np.ndarray
-) -> list[tuple[str, str]]:
-    """Remarks on axes that are nearly right; raises ValueError for others."""
-    remarks = []
-    for name, axis, slide in zip(names, axes, slides):
+def _note_joints(
+    read: Reader, names: list[str], axes: np.ndarray, slides: np.ndarray,
+    normal: np.ndarray,
+) -> None:  # fmt: skip
+    """Notes the joints; raises ValueError for an axis that is off."""
+    for k, (name, axis, slide) in enumerate(zip(names, axes, slides), start=1):
+        kind = f"P{k}, a slide" if slide else f"R{k}, a hinge"
+        minus = "" if slide or axis @ normal > 0 else "-"
+        read.note(f"joint {name}", f"{kind}, q = {minus}qpos")
         along, across = abs(axis @ normal), np.linalg.norm(np.cross(axis, normal))
         angle = np.arctan2(along, across) if slide else np.arctan2(across, along)
         if angle > _FLAT:
@@ -239,20 +244,18 @@ def _flatness(
                 f"{angle:.2g} rad off."
             )
         if angle > _EXACT:
-            remarks.append(
-                (f"joint {name}", f"axis laid into the plane, {angle:.1g} rad off")
-            )
-    return remarks
+            off = f"axis laid into the plane, {angle:.1g} rad off"
+            read.note(f"joint {name}", off)
 
 
 def _tip(
-    mujoco: ModuleType, model: Model, data: Data, chain: Chain, start: complex,
-    tip: str | None,
-) -> tuple[complex, str]:  # fmt: skip
+    read: Reader, data: Data, chain: Chain, tip: str | None
+) -> tuple[complex, str]:
     """The place of the tip, and words on what it is."""
-    count = len(chain.joints)
+    model, kinds = read.model, read.mujoco.mjtGeom
+    count, start = len(chain.joints), complex(chain.starts[-1])
     for name in _TIPS if tip is None else (tip,):
-        if (at := _named(mujoco, model, name)) is None:
+        if (at := _named(read, name)) is None:
             continue
         body, kind, index = at
         if chain.links[body] == count:
@@ -261,19 +264,17 @@ def _tip(
         if tip is not None:
             raise ValueError(
                 "tip: expected a place on the last body that moves or on one welded to "
-                f"it, got one on body {name_of(model, 'body', body)}."
+                f"it, got one on body {read.name_of('body', body)}."
             )
     geoms = np.flatnonzero(chain.links[model.geom_bodyid] == count)
     if geoms.size == 0:
         body = np.flatnonzero(chain.links == count)[-1]
         if body != model.jnt_bodyid[chain.joints[-1]]:
-            return chain.plane(
-                data.xpos[body]
-            ), f"the body {name_of(model, 'body', body)}"
+            name = read.name_of("body", body)
+            return chain.plane(data.xpos[body]), f"the body {name}"
         return start, "the last joint, as there is nothing beyond it"
     geom = geoms[-1]
     center = data.geom_xpos[geom]
-    kinds = mujoco.mjtGeom
     kind = kinds(int(model.geom_type[geom]))
     if kind in (kinds.mjGEOM_CAPSULE, kinds.mjGEOM_CYLINDER):
         reach = model.geom_size[geom, 1] * data.geom_xmat[geom].reshape(3, 3)[:, 2]
@@ -283,30 +284,21 @@ def _tip(
 
 
 def _linkage(
-    model: Model,
-    data: Data,
-    chain: Chain,
-    starts: np.ndarray,
-    slides: np.ndarray,
-    tip: complex,
+    model: Model, data: Data, chain: Chain, slides: np.ndarray, tip: complex
 ) -> tuple[Linkage, np.ndarray]:
     """The linkage with `q` = 0 where the links are, and the angles of its links.
 
     A link before a slide is at right angles to it; all others are parallel to the next
     one, so that positions of hinges are 0 there.
     """
-    turns = [float(np.angle(tip - starts[-1]))]
+    starts, turns = chain.starts, [float(np.angle(tip - chain.starts[-1]))]
     for joint, slide in zip(chain.joints[::-1], slides[::-1]):
         axis = chain.plane(data.xaxis[joint])
         turns.append(float(np.angle(-1j * axis)) if slide else turns[-1])
     turns = np.array(turns[::-1])
     steps = np.diff([*starts, tip]) * np.exp(-1j * turns)
     count = len(chain.joints)
-    offsets, masses, inertias = (
-        np.zeros(count, complex),
-        np.zeros(count),
-        np.zeros(count),
-    )
+    offsets, (masses, inertias) = np.zeros(count, complex), np.zeros((2, count))
     for k in range(count):
         bodies = np.flatnonzero(chain.links == k + 1)  # none between joints of one body
         mass = model.body_mass[bodies]

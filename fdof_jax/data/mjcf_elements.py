@@ -1,6 +1,5 @@
 """Force elements of a MuJoCo model: those of its joints and its tendons."""
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -11,18 +10,16 @@ from ..forces.holders import JointFriction
 from ..forces.joints import JointDamper, JointSpring, JointStops
 from ..forces.points import Point, SpringDamper
 from .mjcf_actuators import inertias_of_actuators
-from .mjcf_chain import FAR, Reader, data_at_start, name_of, path_of_tendon
+from .mjcf_chain import FAR, Chain, Reader
 
 # A stop of MuJoCo is close to plastic; this damping [s/m or s/rad] returns a tenth of
 # the speed of 1 m/s or 1 rad/s.
 _STOP_DAMPING = 10.0
 
 
-def elements_in_joints(read: Reader, drop: tuple[str, ...]) -> list[Element]:
+def elements_in_joints(read: Reader, chain: Chain) -> list[Element]:
     """Dampers, armatures, springs, stops and friction of the joints."""
-    model, chain = read.model, read.chain
-    joints, rates = chain.joints, chain.rates
-    passive = read.disabled("PASSIVE")
+    model, joints, rates = read.model, chain.joints, chain.rates
     for name, joint, rate in zip(chain.names, joints, rates):
         for array, index, kind, what in (
             ("jnt_stiffnesspoly", joint, "springs", "a nonlinear spring"),
@@ -35,46 +32,38 @@ def elements_in_joints(read: Reader, drop: tuple[str, ...]) -> list[Element]:
                 read.leave(kind, f"joint {name}", what)
     forces: list[Element] = []
 
-    def add(
-        kind: str, values: np.ndarray, words: str, element: Callable[[], Element]
-    ) -> None:
-        """Adds an element with values, unless none is there or it is to be dropped."""
-        there = np.flatnonzero(values)
+    def add(kind: str, flags: str, element: type, *values: np.ndarray) -> None:
+        """Adds an element with values, unless all are 0, switched off or dropped."""
+        words = "left out, as asked" if kind in read.drop else element.__name__
+        if words == "JointFriction":
+            words += ", which holds still where MuJoCo's creeps"
+        there = () if read.disabled(*flags.split()) else np.flatnonzero(values[0])
         for k in there:
-            left = "left out, as asked" if kind in drop else words
-            read.note(f"joint {chain.names[k]}", f"{kind} {values[k]:.4g}: {left}")
-        if there.size and kind not in drop:
-            forces.append(element())
+            read.note(f"joint {chain.names[k]}", f"{kind} {values[0][k]:.4g}: {words}")
+        if len(there) and kind not in read.drop:
+            forces.append(element(*values))
 
     damping = np.array(model.dof_damping[rates])
     armature = np.array(model.dof_armature[rates])
-    for gears, added in () if "actuators" in drop else inertias_of_actuators(read):
-        damping += gears**2 * added[0]
-        armature += gears**2 * added[1]
-    if passive or read.disabled("DAMPER"):
-        damping[:] = 0
-    add("damping", damping, "JointDamper", lambda: JointDamper(damping))
-    add("armature", armature, "Armature", lambda: Armature(armature))
-    stiffness = np.array(model.jnt_stiffness[joints])
-    if passive or read.disabled("SPRING"):
-        stiffness[:] = 0
+    for gears, own_damping, own_armature in inertias_of_actuators(read, chain):
+        damping += gears**2 * own_damping
+        armature += gears**2 * own_armature
+    add("damping", "PASSIVE DAMPER", JointDamper, damping)
+    add("armature", "", Armature, armature)
     rest = chain.signs * model.qpos_spring[chain.places]
-    add("springs", stiffness, "JointSpring", lambda: JointSpring(stiffness, rest))
-    friction = np.array(model.dof_frictionloss[rates])
-    if read.disabled("FRICTIONLOSS", "CONSTRAINT"):
-        friction[:] = 0
-    words = "JointFriction, which holds still where MuJoCo's creeps"
-    add("friction", friction, words, lambda: JointFriction(friction))
+    add("springs", "PASSIVE SPRING", JointSpring, model.jnt_stiffness[joints], rest)
+    friction = model.dof_frictionloss[rates]
+    add("friction", "FRICTIONLOSS CONSTRAINT", JointFriction, friction)
     limited = model.jnt_limited[joints].astype(bool)
     if limited.any() and not read.disabled("LIMIT", "CONSTRAINT"):
-        forces += _stops(read, limited, "limits" in drop)
+        forces += _stops(read, chain, limited)
     return forces
 
 
-def _stops(read: Reader, limited: np.ndarray, dropped: bool) -> list[Element]:
+def _stops(read: Reader, chain: Chain, limited: np.ndarray) -> list[Element]:
     """Stops in the place of ranges, as stiff as MuJoCo's constraints are at qpos0."""
-    model, chain = read.model, read.chain
-    ends = np.where(chain.signs[:, None] > 0, 1, -1) * model.jnt_range[chain.joints]
+    model, dropped = read.model, "limits" in read.drop
+    ends = chain.signs[:, None] * model.jnt_range[chain.joints]
     margin = model.jnt_margin[chain.joints]
     # MuJoCo's constraint acts from the margin within the range on.
     lower, upper = ends.min(axis=1) + margin, ends.max(axis=1) - margin
@@ -95,34 +84,27 @@ def _stops(read: Reader, limited: np.ndarray, dropped: bool) -> list[Element]:
         mass = 1 / max(float(model.dof_invweight0[chain.rates[k]]), 1e-15)
         stiffness[k] = max(mass * rate / (1 - impedance), 1e-9)
         if limited[k]:
-            read.note(
-                f"joint {chain.names[k]}",
-                f"range {lower[k]:.4g} to {upper[k]:.4g}: "
-                + (
-                    "left out, as asked"
-                    if dropped
-                    else f"JointStops of {stiffness[k]:.3g} N/m or N m/rad, about as "
-                    "stiff as MuJoCo's soft constraint"
-                ),
-            )
+            words = "left out, as asked"
+            if not dropped:
+                words = f"JointStops of {stiffness[k]:.3g} N/m or N m/rad, about as "
+                words += "stiff as MuJoCo's soft constraint"
+            ends = f"range {lower[k]:.4g} to {upper[k]:.4g}"
+            read.note(f"joint {chain.names[k]}", f"{ends}: {words}")
     if dropped:
         return []
     return [JointStops(lower, upper, stiffness=stiffness, damping=_STOP_DAMPING)]
 
 
-# Tendons
-
-
-def springs_of_tendons(read: Reader, drop: tuple[str, ...]) -> list[Element]:
+def springs_of_tendons(read: Reader, chain: Chain) -> list[Element]:
     """Springs and dampers between two sites."""
     model, forces = read.model, []
     no_limits = read.disabled("LIMIT", "CONSTRAINT")
     for tendon in range(model.ntendon):
-        name = f"tendon {name_of(model, 'tendon', tendon)}"
-        if not (read.chain.links[_bodies_of(read, tendon)] > 0).any():
+        name = f"tendon {read.name_of('tendon', tendon)}"
+        if not (chain.links[_bodies_of(read, tendon)] > 0).any():
             read.note(name, "left out, beside the arm")
             continue
-        if "tendons" in drop:
+        if "tendons" in read.drop:
             read.note(name, "left out, as asked")
             continue
         for array, kind, what in (
@@ -138,23 +120,19 @@ def springs_of_tendons(read: Reader, drop: tuple[str, ...]) -> list[Element]:
             off = kind == "limits" and no_limits
             if values is not None and np.any(values[tendon]) and not off:
                 read.leave(kind, name, what)
-        stiffness, damping = (
-            model.tendon_stiffness[tendon],
-            model.tendon_damping[tendon],
-        )
-        if read.disabled("PASSIVE", "SPRING"):
-            stiffness = 0.0
-        if read.disabled("PASSIVE", "DAMPER"):
-            damping = 0.0
+        stiffness = damping = 0.0
+        if not read.disabled("PASSIVE", "SPRING"):
+            stiffness = float(model.tendon_stiffness[tendon])
+        if not read.disabled("PASSIVE", "DAMPER"):
+            damping = float(model.tendon_damping[tendon])
         if not stiffness and not damping:
             continue
-        points = _ends(read, tendon)
-        if points is None:
-            read.leave("tendons", name, "a spring that is not between two sites of it")
-        else:
+        if points := _ends(read, chain, tendon):
             low, high = map(float, model.tendon_lengthspring[tendon])
-            forces += _springs(points, float(stiffness), float(damping), low, high)
+            forces += _springs(points, stiffness, damping, low, high)
             read.note(name, "SpringDamper")
+        else:
+            read.leave("tendons", name, "a spring that is not between two sites of it")
     return forces
 
 
@@ -182,7 +160,7 @@ def _bodies_of(read: Reader, tendon: int) -> list[int]:
         int(kinds.mjWRAP_SPHERE): model.geom_bodyid,
         int(kinds.mjWRAP_CYLINDER): model.geom_bodyid,
     }
-    path = path_of_tendon(model, tendon)
+    path = read.path_of_tendon(tendon)
     return [
         int(owners[int(kind)][thing])
         for kind, thing in zip(model.wrap_type[path], model.wrap_objid[path])
@@ -190,24 +168,20 @@ def _bodies_of(read: Reader, tendon: int) -> list[int]:
     ]
 
 
-def _ends(read: Reader, tendon: int) -> tuple[Point, Point] | None:
+def _ends(read: Reader, chain: Chain, tendon: int) -> tuple[Point, Point] | None:
     """The points of a tendon between two sites of the arm, in its plane."""
-    model, chain = read.model, read.chain
-    wraps = path_of_tendon(model, tendon)
+    model, wraps = read.model, read.path_of_tendon(tendon)
     sites, kinds = model.wrap_objid[wraps], model.wrap_type[wraps]
     if len(sites) != 2 or (kinds != int(read.mujoco.mjtWrap.mjWRAP_SITE)).any():
         return None
     links = chain.links[model.site_bodyid[sites]]
-    data = data_at_start(read.mujoco, model)
+    data = read.data_at_start()
     data.qpos[chain.places] = 0
     read.mujoco.mj_kinematics(model, data)
     places = data.site_xpos[sites]
     if (links < 0).any() or abs((places[1] - places[0]) @ chain.normal) > 1e-9:
         return None
-    turned = np.exp(-1j * chain.turns[links])
-    local = [
-        (chain.plane(place) - chain.starts[link]) * turn
-        for place, link, turn in zip(places, links, turned)
-    ]
+    local = np.array([*map(chain.plane, places)]) - chain.starts[links]
+    local *= np.exp(-1j * chain.turns[links])
     a, b = (Point(int(link), p.real, p.imag) for link, p in zip(links, local))
     return a, b

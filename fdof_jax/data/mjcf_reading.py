@@ -1,21 +1,20 @@
 """Import of planar chains from MuJoCo's models: MJCF and URDF."""
 
-from types import ModuleType
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..base.checks import optional_package, plain, refusal
+from ..base.checks import optional_package, refusal
 from ..base.report import Report
 from ..base.user_warnings import warn
 from ..forces.element import Forces
 from ..linkage.coordinates import State
-from ..linkage.linkage import Linkage, joint_names
+from ..linkage.linkage import Linkage
 from .mjcf_actuators import actuators
-from .mjcf_chain import Reader, data_at_start, name_of, planar_chain, switched_off
+from .mjcf_chain import Chain, Reader, planar_chain
 from .mjcf_elements import elements_in_joints, springs_of_tendons
-from .mjcf_source import Model, compiled_model
+from .mjcf_source import compiled_model
 
 KINDS = (
     "actuators", "armature", "contacts", "damping", "equalities", "fluid", "friction",
@@ -119,58 +118,24 @@ def from_mjcf(
     if tip is not None and not isinstance(tip, str):
         raise refusal("tip", "the name of a site or a body", tip)
     model, left = compiled_model(mujoco, source)
-    lines: list[tuple[str, str]] = [("source", f"left out: {what}") for what in left]
-
-    def note(part: str, words: str) -> None:
-        lines.append((plain(part), plain(words)))
-
-    def leave(kind: str, part: str, what: str) -> None:
-        if kind not in drop:
-            raise ValueError(
-                f"source: expected a planar chain with elements of this library, got "
-                f"{plain(part)} with {plain(what)}; drop=('{kind}',) leaves it out."
-            )
-        note(part, f"{what}: left out, as asked")
-
-    if switched_off(mujoco, model, "GRAVITY"):
-        model.opt.gravity[:] = 0
-    linkage, chain, remarks = planar_chain(mujoco, model, tip)
-    read = Reader(mujoco, model, chain, leave, note)
-    x, y = _direction(chain.right), _direction(chain.up)
-    note("plane", f"x = {x}, y = {y} of the model's world")
-    _note_joints(read, linkage)
-    lines += remarks
+    read = Reader(mujoco, model, drop, [])
+    for what in left:
+        read.note("source", f"left out: {what}")
+    linkage, chain = planar_chain(read, tip)
     forces = [
-        *elements_in_joints(read, drop),
-        *springs_of_tendons(read, drop),
-        *actuators(read, controls, drop),
+        *elements_in_joints(read, chain),
+        *springs_of_tendons(read, chain),
+        *actuators(read, chain, controls),
     ]
-    _check_rest(read)
-    start = _start(read)
-    _check_contacts(read, drop)
-    return MjcfModel(linkage, start, tuple(forces), Account(lines))
+    _check_rest(read, chain)
+    start = _start(read, chain)
+    _check_contacts(read, chain)
+    return MjcfModel(linkage, start, tuple(forces), Account(read.lines))
 
 
-def _direction(vector: np.ndarray) -> str:
-    """Names a unit vector: "-X", or its components."""
-    axis = int(np.abs(vector).argmax())
-    if abs(vector[axis]) < 1 - 1e-9:
-        return f"({', '.join(f'{part:.4g}' for part in vector)})"
-    return ("-" if vector[axis] < 0 else "") + "XYZ"[axis]
-
-
-def _note_joints(read: Reader, linkage: Linkage) -> None:
-    names = joint_names(linkage)
-    for theirs, ours, sign in zip(read.chain.names, names, read.chain.signs):
-        kind = "a hinge" if ours.startswith("R") else "a slide"
-        minus = "-" if sign < 0 else ""
-        read.note(f"joint {theirs}", f"{ours}, {kind}, q = {minus}qpos")
-
-
-def _start(read: Reader) -> State:
-    model, chain = read.model, read.chain
-    data = data_at_start(read.mujoco, model)
-    frames = [name_of(model, "key", k) for k in range(model.nkey)]
+def _start(read: Reader, chain: Chain) -> State:
+    data = read.data_at_start()
+    frames = [read.name_of("key", k) for k in range(read.model.nkey)]
     words = f"key frame {frames[0]}" if frames else "qpos0, at rest"
     others = f", not {', '.join(frames[1:])}" if frames[1:] else ""
     read.note("start", words + others)
@@ -180,13 +145,13 @@ def _start(read: Reader) -> State:
     return State(chain.signs * q, chain.signs * qd)
 
 
-def _check_rest(read: Reader) -> None:
+def _check_rest(read: Reader, chain: Chain) -> None:
     """Leaves out constraints, compensated gravity and fluids, or raises ValueError."""
-    model, mujoco, chain = read.model, read.mujoco, read.chain
+    model, mujoco = read.model, read.mujoco
     things = mujoco.mjtObj
     if model.neq and not read.disabled("EQUALITY", "CONSTRAINT"):
         for index in range(model.neq):
-            name = f"equality {name_of(model, 'equality', index)}"
+            name = f"equality {read.name_of('equality', index)}"
             kind = mujoco.mjtEq(int(model.eq_type[index]))
             of_bodies = kind in (mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD)
             ends = np.array([model.eq_obj1id[index], model.eq_obj2id[index]])
@@ -201,79 +166,71 @@ def _check_rest(read: Reader) -> None:
                 read.note(name, "left out, beside the arm")
             else:
                 read.leave("equalities", name, "a loop or another constraint")
-    for body in np.flatnonzero(model.body_plugin >= 0):
-        if chain.links[body] > 0:
-            name = f"body {name_of(model, 'body', body)}"
+    for body in np.flatnonzero(chain.links > 0):
+        name = f"body {read.name_of('body', body)}"
+        if model.body_plugin[body] >= 0:
             read.leave("plugins", name, "a plugin")
-    for body in np.flatnonzero(model.body_gravcomp):
-        if chain.links[body] > 0 and chain.gravity > 0:
-            name = f"body {name_of(model, 'body', body)}"
+        if model.body_gravcomp[body] and chain.gravity > 0:
             read.leave("gravcomp", name, "compensated gravity (gravcomp)")
     density, viscosity = float(model.opt.density), float(model.opt.viscosity)
     fluid = f"density {density:g}, viscosity {viscosity:g}"
-    if (density or viscosity) and _drag(read) > _NEGLIGIBLE:
+    if (density or viscosity) and _drag(read, chain) > _NEGLIGIBLE:
         read.leave("fluid", "the model", f"a fluid of {fluid}")
     elif density or viscosity:
         read.note("fluid", f"{fluid}: left out, without effect on the arm")
 
 
-def _drag(read: Reader) -> float:
+def _drag(read: Reader, chain: Chain) -> float:
     """Greatest force of the fluid over that of inertia, at random rates of size 1."""
-    model, mujoco, rates = read.model, read.mujoco, read.chain.rates
-    data, ratios = data_at_start(mujoco, model), [0.0]
-    draw = np.random.default_rng(0)
+    model, rates, ratios = read.model, chain.rates, [0.0]
+    data, draw = read.data_at_start(), np.random.default_rng(0)
     for _ in range(5):
-        data.qpos[read.chain.places] = draw.normal(size=len(rates))
+        data.qpos[chain.places] = draw.normal(size=len(rates))
         data.qvel[rates] = draw.normal(size=len(rates))
-        mujoco.mj_forward(model, data)
+        read.mujoco.mj_forward(model, data)
         others = abs(data.qfrc_bias[rates]).max() + model.dof_M0[rates].max()
         ratios.append(abs(data.qfrc_fluid[rates]).max() / others)
     return max(ratios)
 
 
-def _check_contacts(read: Reader, drop: tuple[str, ...]) -> None:
+def _check_contacts(read: Reader, chain: Chain) -> None:
     """Raises ValueError for bodies that touch at the start, warns of those that may."""
-    model, mujoco, links = read.model, read.mujoco, read.chain.links
+    model, mujoco, links = read.model, read.mujoco, chain.links
     if read.disabled("CONTACT", "CONSTRAINT"):
         return
-    data = data_at_start(mujoco, model)
-    if "contacts" not in drop:
+    data = read.data_at_start()
+    if "contacts" not in read.drop:
         try:
             mujoco.mj_fwdPosition(model, data)
         except mujoco.FatalError as error:  # thousands of contacts
             read.leave("contacts", "the model", str(error))
-    of_geom = links[model.geom_bodyid]
-    name = lambda geom: name_of(model, "body", model.geom_bodyid[geom])
+    name = lambda body: read.name_of("body", body)
     for contact in data.contact[: data.ncon]:
-        a, b = (int(geom) for geom in contact.geom)
-        if min(a, b) >= 0 and contact.dist <= 0 and max(of_geom[a], of_geom[b]) > 0:
+        a, b = model.geom_bodyid[contact.geom]
+        touch = contact.geom.min() >= 0 and contact.dist <= 0
+        if touch and max(links[a], links[b]) > 0:
             read.leave("contacts", f"bodies {name(a)} and {name(b)}", "a contact")
             return
-    pair = _may_collide(mujoco, model, links)
-    if pair is None:
+    if (pair := _may_collide(read, links)) is None:
         return
-    both = " and ".join(name_of(model, "body", body) for body in pair)
+    both = " and ".join(map(name, pair))
     read.note("contacts", f"left out, though bodies {both} may collide")
-    if "contacts" not in drop:
+    if "contacts" not in read.drop:
         warn(
             f"source: contacts are left out, but bodies {both} of this model may "
             "collide; drop=('contacts',) omits this warning."
         )
 
 
-def _may_collide(
-    mujoco: ModuleType, model: Model, links: np.ndarray
-) -> tuple[int, int] | None:
+def _may_collide(read: Reader, links: np.ndarray) -> tuple[int, int] | None:
     """Two bodies, one of the arm, whose geoms may collide in MuJoCo, if any.
 
     Geoms of bodies that are welded together, or next to each other in the chain, do
     not; the moving bodies next to the ground may collide with it.
     """
+    model = read.model
     bodies = model.geom_bodyid
-    pairs = [
-        (int(bodies[a]), int(bodies[b]))
-        for a, b in zip(model.pair_geom1, model.pair_geom2)
-    ]
+    pairs = [*zip(bodies[model.pair_geom1], bodies[model.pair_geom2])]
     welded, before = model.body_weldid, model.body_weldid[model.body_parentid]
     # There may be thousands of geoms, of which few are different.
     owner = bodies if model.nexclude else welded[bodies]
@@ -283,13 +240,9 @@ def _may_collide(
     a, b = np.triu_indices(len(kinds), 1)
     meet = (kinds[a, 1] & kinds[b, 2]) | (kinds[b, 1] & kinds[a, 2])
     u, v = welded[body[a]], welded[body[b]]
-    filtered = not switched_off(mujoco, model, "FILTERPARENT")
     next_to = ((u > 0) & (before[v] == u)) | ((v > 0) & (before[u] == v))
-    next_to &= filtered
+    next_to &= not read.disabled("FILTERPARENT")
     excluded = np.isin((body[a] << 16) + body[b], model.exclude_signature)
-    for k in np.flatnonzero((meet != 0) & (u != v) & ~next_to & ~excluded):
-        pairs.append((int(body[a[k]]), int(body[b[k]])))
-    for pair in pairs:
-        if max(links[list(pair)]) > 0:
-            return pair
-    return None
+    may = (meet != 0) & (u != v) & ~next_to & ~excluded
+    pairs += zip(body[a[may]], body[b[may]])
+    return next((pair for pair in pairs if max(links[[*pair]]) > 0), None)

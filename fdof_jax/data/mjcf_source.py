@@ -8,9 +8,11 @@ from types import ModuleType
 from typing import Any
 from xml.etree import ElementTree
 
-from ..base.checks import plain, refusal
+from ..base.checks import plain, refusal, shown
+from ..base.whole_files import local_path
 
 Model = Any  # an `mujoco.MjModel`, of which type checkers know nothing
+Node = ElementTree.Element
 _EXPECTED = "an XML text, the path of a file, an mujoco.MjModel or an mujoco.MjSpec"
 # Parts of a URDF that MuJoCo does not read.
 _UNREAD = "transmission", "gazebo", "ros2_control", "safety_controller"
@@ -27,27 +29,15 @@ def compiled_model(mujoco: ModuleType, source: Any) -> tuple[Model, list[str]]:
         return _compiled(source.copy().compile), []
     if isinstance(source, str) and "<" in source:
         # What was checked is compiled, not the text: parsers differ in what they skip.
-        root = _root(source)
-        _check_without_files(root)
-        return _of_root(mujoco, root, None)
-    path = _path(source)
+        return _of_root(mujoco, _root(source), None)
+    path = local_path("source", source, _EXPECTED)
+    if not os.path.isfile(path):  # which does not raise for any text
+        raise refusal("source", f"{_EXPECTED}, and the file to be there", str(source))
     if b"<robot" in path.read_bytes():
         root = _root(path.read_bytes())
         if root.tag == "robot":
             return _of_root(mujoco, root, path.parent)
     return _compiled(lambda: mujoco.MjModel.from_xml_path(str(path))), []
-
-
-def _path(source: object) -> Path:
-    if not isinstance(source, str | os.PathLike):
-        raise refusal("source", _EXPECTED, source)
-    try:
-        path = Path(source).expanduser()
-        if path.is_file():
-            return path
-    except (TypeError, ValueError, OSError, RuntimeError):  # such as a null byte
-        pass
-    raise refusal("source", f"{_EXPECTED}, and the file to be there", str(source))
 
 
 def _compiled(compile_model: Callable[[], Model]) -> Model:
@@ -59,7 +49,7 @@ def _compiled(compile_model: Callable[[], Model]) -> Model:
         ) from None
 
 
-def _root(text: str | bytes) -> ElementTree.Element:
+def _root(text: str | bytes) -> Node:
     try:
         return ElementTree.fromstring(text.strip())
     except (ElementTree.ParseError, ValueError) as error:
@@ -67,39 +57,33 @@ def _root(text: str | bytes) -> ElementTree.Element:
         raise ValueError(f"source: expected a model in XML: {reason}.") from None
 
 
-def _files(root: ElementTree.Element) -> list[tuple[ElementTree.Element, str]]:
-    """Elements that name files, and the attributes that do."""
-    return [
-        (part, name)
-        for part in root.iter()
-        for name in part.attrib
-        if name.startswith("file")
-    ]
-
-
-def _check_without_files(root: ElementTree.Element) -> None:
-    if root.tag == "robot":
-        _without_shapes(root)
-    for part, name in _files(root):
-        raise ValueError(
-            "source: expected a text that names no other files, as a text has no "
-            f"folder, got {plain(repr(part.get(name)))}; give the path of the file."
-        )
-
-
 def _of_root(
-    mujoco: ModuleType, root: ElementTree.Element, folder: Path | None
+    mujoco: ModuleType, root: Node, folder: Path | None
 ) -> tuple[Model, list[str]]:
-    """A model; the files that a URDF names in its folder are passed on as bytes."""
+    """A model; the files that a URDF names in its folder are passed on as bytes.
+
+    Without a `folder`, as of a text, no file may be named.
+    """
     remarks: list[str] = []
     assets: dict[str, bytes] = {}
+    meshes = ""
     if root.tag == "robot":
         remarks = _without_shapes(root)
-        compiler = _compiler(root)
+        compiler = child(child(root, "mujoco"), "compiler")
         compiler.attrib.setdefault("fusestatic", "false")  # keeps names of fixed links
         meshes = compiler.attrib.pop("meshdir", "")
-        for part, name in _files(root):
-            file = _found(folder, meshes, part.get(name, ""))
+    for part in root.iter():
+        for name in [name for name in part.attrib if name.startswith("file")]:
+            given = part.attrib[name]
+            if folder is None:
+                raise ValueError(
+                    "source: expected a text that names no other files, as a text has "
+                    f"no folder, got {shown(given)}; give the path of the file."
+                )
+            given = given.removeprefix("package://")
+            inner = folder / meshes
+            places = folder / given, inner / given, inner / Path(given).name
+            file = next(filter(Path.is_file, places), None)
             if file is not None:  # under a name of its own, as folders are left out
                 unique = f"{len(assets)}_{file.name}"
                 assets[unique] = file.read_bytes()
@@ -111,23 +95,13 @@ def _of_root(
     return _compiled(lambda: mujoco.MjModel.from_xml_string(text, assets)), remarks
 
 
-def _compiler(robot: ElementTree.Element) -> ElementTree.Element:
-    """MuJoCo's own settings in a URDF."""
-    own = robot.find("mujoco")
-    own = ElementTree.SubElement(robot, "mujoco") if own is None else own
-    compiler = own.find("compiler")
-    return ElementTree.SubElement(own, "compiler") if compiler is None else compiler
+def child(node: Node, tag: str) -> Node:
+    """The first child with this tag, made if need be."""
+    found = node.find(tag)
+    return ElementTree.SubElement(node, tag) if found is None else found
 
 
-def _found(folder: Path | None, meshes: str, name: str) -> Path | None:
-    if folder is None:
-        return None
-    name = name.removeprefix("package://")
-    places = folder / name, folder / meshes / name, folder / meshes / Path(name).name
-    return next((place for place in places if place.is_file()), None)
-
-
-def _without_shapes(robot: ElementTree.Element) -> list[str]:
+def _without_shapes(robot: Node) -> list[str]:
     """Takes shapes out of a URDF that do not decide its masses; returns remarks."""
     remarks = []
     settings = robot.find("mujoco/compiler")
@@ -149,4 +123,4 @@ def _without_shapes(robot: ElementTree.Element) -> list[str]:
             remarks.append(f"{tag} {name}".strip() + ", which MuJoCo does not read")
     if any("velocity" in limit.attrib for limit in robot.iter("limit")):
         remarks.append("limits of velocities")
-    return list(dict.fromkeys(map(plain, remarks)))
+    return list(dict.fromkeys(remarks))

@@ -1,7 +1,7 @@
 """Export to MuJoCo's model format (MJCF)."""
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any, SupportsFloat
 from xml.etree import ElementTree
 
@@ -20,12 +20,12 @@ from ..forces.joints import JointDamper, JointEffort, JointSpring, JointStops
 from ..forces.points import SpringDamper
 from ..linkage.coordinates import State, real_state
 from ..linkage.fields import value_of
-from ..linkage.linkage import Linkage, check_linkage, joints_of
+from ..linkage.linkage import Linkage, check_linkage, joints_of, moving_joints
 from ..linkage.topology import letters
 from ..simulation.scene import accepts_scene
 from .mjcf_chain import FAR
+from .mjcf_source import Node, child
 
-Node = ElementTree.Element
 Number = SupportsFloat  # also an array of one
 # MuJoCo rejects smaller masses and inertias of moving bodies (its mjMINVAL).
 _SMALLEST = 1e-15
@@ -102,15 +102,13 @@ def to_mjcf(linkage: Linkage, forces: Forces = (), state0: State | None = None) 
         add(bodies[-1], "inertial", dict(pos=_text(*com[k], 0)) | own)
     add(bodies[-1], "site", name="tip", pos=_text(length[-1], 0, 0))
     _draw(root, bodies, kinds, length, locked)
-    springs = {k: e for k, e in enumerate(acting) if isinstance(e, SpringDamper)}
-    if springs:
-        _add_springs(_tendons(root), bodies, springs)
+    _add_springs(root, bodies, acting)
     controls, states = _add_actuators(root, linkage, kinds, acting)
     if controls or state0 is not None:
-        start = State(np.zeros(len(kinds)), np.zeros(len(kinds)))
-        if state0 is not None:
-            start = real_state("state0", state0, linkage)
-        moving = [k for k, kind in enumerate(kinds) if kind != "F"]
+        still = np.zeros(len(kinds))
+        start = State(still, still) if state0 is None else state0
+        start = real_state("state0", start, linkage)
+        moving = moving_joints(linkage)
         qpos, qvel = (_text(*np.asarray(values)[moving]) for values in start)
         frame = dict(name="start", qpos=qpos, qvel=qvel, ctrl=_text(*controls))
         frame |= dict(act=_text(*states)) if states else {}
@@ -121,6 +119,7 @@ def to_mjcf(linkage: Linkage, forces: Forces = (), state0: State | None = None) 
 
 def _check_elements(linkage: Linkage, acting: tuple[Element, ...]) -> None:
     """Raises ValueError for elements that MuJoCo does not have."""
+    counts = Counter(map(type, acting))
     for k, element in enumerate(acting):
         name, expected = type(element).__name__, None
         if type(element) not in _KINDS:  # subclasses compute something else
@@ -130,10 +129,8 @@ def _check_elements(linkage: Linkage, acting: tuple[Element, ...]) -> None:
         elif isinstance(element, SpringDamper):
             element.check(linkage, jnp.zeros(1))
             if element.side and float(element.damping) > 0:
-                expected = (
-                    "no damping of a cable or a bumper, which MuJoCo does not have"
-                )
-        elif type(element) in (*_IN_JOINTS, PDController) and _count(acting, name) > 1:
+                expected = "no damping of a cable or bumper, which MuJoCo does not have"
+        elif counts[type(element)] > 1 and type(element) in (*_IN_JOINTS, PDController):
             expected, name = f"one {name}, as a joint of MuJoCo has", "several"
         elif type(element) in _ACTUATORS:
             others = [e for e in acting if e is not element and type(e) in _ACTUATORS]
@@ -147,10 +144,6 @@ def _check_elements(linkage: Linkage, acting: tuple[Element, ...]) -> None:
             raise ValueError(f"forces[{k}]: expected {expected}, got {name}.")
 
 
-def _count(acting: tuple[Element, ...], name: str) -> int:
-    return sum(type(element).__name__ == name for element in acting)
-
-
 def _limits_and_acts(element: Any, linkage: Linkage) -> tuple[np.ndarray, np.ndarray]:
     """In which joints an element of `_ACTUATORS` limits the effort, and acts, (n,)."""
     none = np.zeros(joints_of(linkage), bool)
@@ -160,9 +153,8 @@ def _limits_and_acts(element: Any, linkage: Linkage) -> tuple[np.ndarray, np.nda
         kp, kd, limit = map(np.asarray, (element.kp, element.kd, element.limit))
         acts = none | ((kp > 0) | (kd > 0)) & (limit > 0)
         return acts & np.isfinite(limit), acts
-    ends = _ends(element.effort_lower, element.effort_upper, len(none))
-    bounded = none | (np.min(np.abs(ends), axis=0) < FAR)
-    return bounded, none | np.asarray(element.gear).any(axis=0)
+    *_, bounded = _ends(element.effort_lower, element.effort_upper, len(none))
+    return none | bounded, none | np.asarray(element.gear).any(axis=0)
 
 
 def _draw(
@@ -191,22 +183,14 @@ def _draw(
         if k < len(kinds) and kinds[k] == "P":
             ends = (bodies[k], end, side), (bodies[k + 1], 0, 0)
             line = dict(name=f"slide{k + 1}", width=_text(size / 3))
-            _add_spatial(_tendons(root), line, ends)
-
-
-def _tendons(root: Node) -> Node:
-    """The model's list of tendons."""
-    tendons = root.find("tendon")
-    return ElementTree.SubElement(root, "tendon") if tendons is None else tendons
+            _add_spatial(root, line, ends)
 
 
 def _add_spatial(
-    tendons: Node,
-    attributes: dict[str, str],
-    ends: Iterable[tuple[Node, Number, Number]],
+    root: Node, attributes: dict[str, str], ends: Iterable[tuple[Node, Number, Number]]
 ) -> None:
     """A tendon between two places, (body, along, across) each."""
-    tendon = ElementTree.SubElement(tendons, "spatial", attributes)
+    tendon = ElementTree.SubElement(child(root, "tendon"), "spatial", attributes)
     for letter, (body, along, across) in zip("ab", ends):
         name = f"{attributes['name']}{letter}"
         ElementTree.SubElement(body, "site", name=name, pos=_text(along, across, 0))
@@ -236,40 +220,40 @@ def _of_joints(acting: tuple[Element, ...], count: int) -> list[dict[str, str]]:
         elif isinstance(element, JointFriction):
             add("frictionloss", element.level)
         elif isinstance(element, JointStops | HardStops):
-            low, high = (np.clip(e, -FAR, FAR) for e in (element.lower, element.upper))
-            add("range", low, high, where=np.minimum(abs(low), abs(high)) < FAR)
+            low, high, bounded = _ends(element.lower, element.upper, count)
+            add("range", low, high, where=bounded)
         elif isinstance(element, PDController):
             limit = np.asarray(element.limit)
             add("actuatorfrcrange", -limit, limit, where=(0 < limit) & (limit < np.inf))
         elif isinstance(element, Actuators):
-            low, high = _ends(element.effort_lower, element.effort_upper, count)
-            bounded = np.minimum(abs(low), abs(high)) < FAR
+            lower, upper = element.effort_lower, element.effort_upper
+            low, high, bounded = _ends(lower, upper, count)
             add("actuatorfrcrange", low, high, where=bounded)
     return joints
 
 
 def _ends(
     lower: Array | None, upper: Array | None, count: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Both ends of ranges, in numbers that MuJoCo takes."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Both ends of ranges, in numbers that MuJoCo takes, and whether one is finite."""
     low = np.full(count, -np.inf) if lower is None else np.asarray(lower)
     high = np.full(count, np.inf) if upper is None else np.asarray(upper)
-    return np.clip(low, -FAR, FAR), np.clip(high, -FAR, FAR)
+    bounded = np.minimum(abs(low), abs(high)) < FAR
+    return np.clip(low, -FAR, FAR), np.clip(high, -FAR, FAR), bounded
 
 
-def _add_springs(
-    tendons: Node, bodies: list[Node], springs: dict[int, SpringDamper]
-) -> None:
+def _add_springs(root: Node, bodies: list[Node], acting: tuple[Element, ...]) -> None:
     """Springs between points, as tendons between sites."""
-    for k, element in springs.items():
+    for k, element in enumerate(acting):
+        if not isinstance(element, SpringDamper):
+            continue
         rest, side = float(element.rest_length), int(element.side or 0)
         ends = {0: (rest, rest), 1: (0.0, rest), -1: (rest, FAR)}[side]  # no force
         attributes = dict(name=f"spring{k}", stiffness=_text(element.stiffness))
         attributes |= dict(damping=_text(element.damping), springlength=_text(*ends))
-        places = [
-            (bodies[int(p.link)], p.along, p.across) for p in (element.a, element.b)
-        ]
-        _add_spatial(tendons, attributes, places)
+        points = element.a, element.b
+        places = [(bodies[int(p.link)], p.along, p.across) for p in points]
+        _add_spatial(root, attributes, places)
 
 
 def _add_actuators(
@@ -281,12 +265,16 @@ def _add_actuators(
     if not any(isinstance(element, _ACTUATORS) for element in acting):
         return controls, states
     actuators = ElementTree.SubElement(root, "actuator")
-    count, names = len(kinds), _counted()
+    count, uses = len(kinds), Counter[str]()
+
+    def unique(name: str) -> str:
+        uses[name] += 1
+        return name if uses[name] == 1 else f"{name}_{uses[name]}"
 
     def add(
         kind: str, name: str, joint: int, control: Number, **values: Number
     ) -> None:
-        own = dict(name=names(name), joint=f"joint{joint + 1}")
+        own = dict(name=unique(name), joint=f"joint{joint + 1}")
         texts = {key: _text(value) for key, value in values.items()}
         ElementTree.SubElement(actuators, kind, own | texts)
         controls.append(float(control))
@@ -311,7 +299,7 @@ def _add_actuators(
         elif isinstance(element, Actuators):
             laws = _general(element, f"forces[{place}]", linkage)
             for number, (gear, attributes, control, start) in enumerate(laws):
-                own = dict(name=names(f"actuator{number + 1}"))
+                own = dict(name=unique(f"actuator{number + 1}"))
                 ratios = {k: gear[k] for k in np.flatnonzero(gear) if kinds[k] != "F"}
                 if not ratios:
                     continue
@@ -319,7 +307,7 @@ def _add_actuators(
                     ((k, ratio),) = ratios.items()
                     own |= dict(joint=f"joint{k + 1}", gear=_text(ratio))
                 else:
-                    name = names(f"gear{number + 1}")
+                    name = unique(f"gear{number + 1}")
                     own |= dict(tendon=_tendon(root, name, ratios))
                 ElementTree.SubElement(actuators, "general", own | attributes)
                 controls.append(control)
@@ -327,20 +315,9 @@ def _add_actuators(
     return controls, states
 
 
-def _counted() -> Callable[[str], str]:
-    """Returns a function that makes names unique."""
-    counts: Counter[str] = Counter()
-
-    def unique(name: str) -> str:
-        counts[name] += 1
-        return name if counts[name] == 1 else f"{name}_{counts[name]}"
-
-    return unique
-
-
 def _tendon(root: Node, name: str, ratios: dict[Any, float]) -> str:
     """Adds a tendon whose length is a sum of joint positions; returns its name."""
-    tendon = ElementTree.SubElement(_tendons(root), "fixed", name=name)
+    tendon = ElementTree.SubElement(child(root, "tendon"), "fixed", name=name)
     for k, ratio in ratios.items():
         own = dict(joint=f"joint{k + 1}", coef=_text(ratio))
         ElementTree.SubElement(tendon, "joint", own)
@@ -353,12 +330,12 @@ def _general(
     """Yields gears, attributes of general actuators, controls and states, if any."""
     gears, gains, bias = map(np.asarray, (element.gear, element.gain, element.bias))
     control = np.asarray(value_of(element, "control", jnp.zeros(())))
-    low, high = _ends(element.lower, element.upper, len(gears))
+    low, high, bounded = _ends(element.lower, element.upper, len(gears))
     own = element.activation
     for k, gear in enumerate(gears):
         gain, law, attributes = gains[k], bias[k].copy(), {}
         start: list[float] = []
-        if np.minimum(abs(low[k]), abs(high[k])) < FAR:
+        if bounded[k]:
             ends = _text(low[k], high[k])
             attributes |= dict(forcelimited="true", forcerange=ends)
         if own is not None and not np.any(np.asarray(own.rate)[k]):
@@ -378,8 +355,8 @@ def _general(
             start = [float(np.asarray(own.start)[k])]
             attributes |= dict(dyntype=kind)
             attributes |= dict(dynprm=_text(time)) if time else {}
-            bottom, top = _ends(own.lower, own.upper, len(gears))
-            if np.minimum(abs(bottom[k]), abs(top[k])) < FAR:
+            bottom, top, within = _ends(own.lower, own.upper, len(gears))
+            if within[k]:
                 ends = _text(bottom[k], top[k])
                 attributes |= dict(actlimited="true", actrange=ends)
         attributes |= dict(gaintype="affine", gainprm=_text(*gain))
