@@ -1,9 +1,7 @@
 """The command line: `fdof-jax` or `python -m fdof_jax`."""
 
 import argparse
-import tempfile
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import matplotlib
@@ -12,6 +10,7 @@ import numpy as np
 
 from . import __version__, scenes
 from .base.configuration import configure
+from .base.whole_files import folder_path
 from .forces.joints import JointDamper
 from .pictures import drawing, plotting
 from .simulation.scene import Scene
@@ -37,7 +36,6 @@ def main(arguments: list[str] | None = None) -> None:
     )
     parser.add_argument(
         "--output",
-        type=_folder,
         metavar="FOLDER",
         default="fdof-output",
         help="where to write the pictures; %(default)s by default",
@@ -46,14 +44,10 @@ def main(arguments: list[str] | None = None) -> None:
     if options.command is None:
         parser.print_help()
         return
-    output = options.output
     try:  # before anything is computed
-        output.mkdir(parents=True, exist_ok=True)
-        tempfile.TemporaryFile(dir=output).close()
-    except OSError as error:
-        parser.error(
-            f"--output: cannot write into {str(output)[:200]!r}: {error.strerror}."
-        )
+        output = folder_path("--output", options.output)
+    except ValueError as error:
+        parser.error(str(error))
     matplotlib.use("agg")  # pictures are written, never shown
     configure(x64=True)
     for name, figure in _COMMANDS[options.command]():
@@ -62,13 +56,6 @@ def main(arguments: list[str] | None = None) -> None:
         print(output / f"{name}.png", flush=True)
     first = (output / f"{name}.png" for name in _FIRST[options.command])
     print("Open first:", *first)
-
-
-def _folder(text: str) -> Path:
-    if "://" in text:  # which `Path` would take for a folder
-        expected = f"expected a folder on this machine, got {text[:200]!r}"
-        raise argparse.ArgumentTypeError(expected)
-    return Path(text)
 
 
 def _figures() -> Iterator[tuple[str, Any]]:

@@ -45,14 +45,15 @@ ANSWERS = [
     ("figures --help", 0, "--output"),
     ("square", 2, "invalid choice: 'square'"),
     ("--output", 2, "expected one argument"),
-    ("figures --output file", 2, "--output: cannot write into 'file': File exists"),
-    ("--output s3://a/b", 2, "--output: expected a folder on this machine, got 's3:"),
-    ("figures --output file/in/it", 2, "cannot write into 'file/in/it': Not a dir"),
+    ("figures --output file", 2, "--output: expected a folder that can be written, "),
+    ("figures --output file", 2, "got 'file': File exists."),
+    ("figures --output s3://a/b", 2, "a folder on this machine, no address, got 's3:"),
+    ("figures --output file/in/it", 2, "got 'file/in/it': Not a directory."),
 ]
 if os.geteuid() != 0:  # root may write everywhere
     ANSWERS += [
-        ("topologies --output sealed", 2, "into 'sealed': Permission denied"),
-        ("topologies --output sealed/in", 2, "into 'sealed/in': Permission denied"),
+        ("topologies --output sealed", 2, "got 'sealed': Permission denied"),
+        ("topologies --output sealed/in", 2, "got 'sealed/in': Permission denied"),
     ]
 
 
