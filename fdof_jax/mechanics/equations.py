@@ -11,6 +11,7 @@ sliding along a direction; at a fixed pair, displacement and rate are zero.
 """
 
 from collections.abc import Callable
+from itertools import accumulate
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -159,32 +160,20 @@ def _in_frame(along: Array, across: Array, e: Vector) -> Vector:
     return along * e[0] - across * e[1], along * e[1] + across * e[0]
 
 
-def _turn(e: Vector, angle: Array) -> Vector:
-    sin, cos = sincos(angle)
-    return _in_frame(cos, sin, e)
-
-
 def _select(condition: Array, u: Vector, v: Vector) -> Vector:
     return jnp.where(condition, u[0], v[0]), jnp.where(condition, u[1], v[1])
-
-
-def _summed(rates: list[Array]) -> list[Array]:
-    """Returns the partial sums."""
-    sums = rates[:1]
-    for rate in rates[1:]:
-        sums.append(sums[-1] + rate)
-    return sums
 
 
 def turns(c: Constants, delta: Scalars) -> Scalars:
     """Computes the angles by which displacements turn the links [rad]."""
     turned = [jnp.where(r, step, 0) for r, step in zip(c.revolute, delta)]
-    return tuple(_summed(turned))
+    return tuple(accumulate(turned))
 
 
 def directions(c: Constants, delta: Scalars) -> Directions:
     """Computes the unit vectors along the links, turned by displacements."""
-    return tuple(map(_turn, c.direction[1:], turns(c, delta)))
+    turned = zip(c.direction[1:], map(sincos, turns(c, delta)))
+    return tuple(_in_frame(cos, sin, e) for e, (sin, cos) in turned)
 
 
 class Equations(NamedTuple):
@@ -210,7 +199,7 @@ def equations(
     e = c.direction[0], *(directions(c, delta) if turned is None else turned)
     slide = [c.slide[k] + jnp.where(r[k], 0, delta[k]) for k in joints]
     step = [_in_frame(c.along[k], slide[k + 1], e[k + 1]) for k in joints[:-1]]
-    w = _summed([jnp.where(r[k], qd[k], 0) for k in joints])
+    w = list(accumulate([jnp.where(r[k], qd[k], 0) for k in joints]))
     w2 = [rate * rate for rate in w]
 
     # While all joints keep their rates: accelerations of the links' starts, from the
