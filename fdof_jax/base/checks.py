@@ -265,14 +265,6 @@ def keywords_as(
     return allowed | given
 
 
-def sign(name: str, value: ArrayLike) -> Array:
-    """Returns `value` as an array if it is 1 or -1, or raises ValueError."""
-    array = real_array(name, value, ())
-    if (given := concrete(array)) is not None and abs(given) != 1:
-        raise refusal(name, "1 or -1", value)
-    return array
-
-
 def optional_package(name: str, extra: str) -> ModuleType:
     """Returns the package, or raises ImportError that names the extra to install."""
     try:

@@ -36,12 +36,6 @@ _WIDE = {"xla_cpu_prefer_vector_width": 512}
 _ONE_GENERATOR = (0, 11)
 
 
-def small_loops_are_kernels() -> bool:
-    """Returns whether XLA compiles the loops of a single arm's motion as one kernel."""
-    by_itself = version.__version_info__ >= _BY_ITSELF
-    return by_itself or _SMALL_LOOPS in os.environ.get("XLA_FLAGS", "")
-
-
 def options_of_loops() -> dict[str, bool]:
     """Returns the compiler options of `jax.jit` for the loops of a few motions."""
     both = version.__version_info__ < _ONE_GENERATOR
@@ -94,12 +88,13 @@ def configure(
         _keep_programs(cache)
     if x64 is not None:
         jax.config.update("jax_enable_x64", x64)
-    if not small_loops_are_kernels():
-        _compile_small_loops_as_kernels()
+    _compile_small_loops_as_kernels()
 
 
 def _compile_small_loops_as_kernels() -> None:
     flags = os.environ.get("XLA_FLAGS", "").strip()
+    if version.__version_info__ >= _BY_ITSELF or _SMALL_LOOPS in flags:
+        return
     if xla_bridge.backends_are_initialized():
         reason = "JAX had started before; call configure before anything is computed"
     elif flags and not flags.startswith("-"):

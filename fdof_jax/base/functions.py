@@ -177,9 +177,7 @@ def _is_fixed(value: object) -> bool:
     home = None
     if inspect.ismodule(value):
         home = value.__name__
-    elif (
-        inspect.isfunction(value) or inspect.isclass(value) or inspect.isbuiltin(value)
-    ):
+    elif isinstance(value, types.FunctionType | types.BuiltinFunctionType | type):
         home = value.__module__  # None of a builtin that is bound to an object
     return home is not None and home.partition(".")[0] in _FIXED
 

@@ -8,7 +8,7 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from ..base.checks import is_traced, real_array, sign
+from ..base.checks import concrete, is_traced, real_array, refusal
 from ..base.known_values import at_once
 from ..linkage.frames import cross, dot, frames, length_of, plane_vector, unit_vector
 from ..linkage.linkage import Linkage, check_linkage, joints_of
@@ -106,9 +106,7 @@ def arm_of(linkage: Linkage, orientation: Array | float | None) -> Arm:
     revolute = jnp.stack(real_joints(linkage.ef))
     slide = jnp.where(revolute, linkage.locked, 0)
     if n == wanted:
-        vector = plane_vector(
-            linkage.length, jnp.concatenate([slide, jnp.zeros_like(slide[:1])])
-        )
+        vector = plane_vector(linkage.length, jnp.append(slide, 0))
         locked, ground, offset, place = linkage.locked, linkage.base_angle, 0, None
     else:
         # Where the chain is with its joints at 0: what is fixed keeps its shape.
@@ -281,7 +279,10 @@ def inverse_kinematics(
     if orientation is not None:
         orientation = real_array("orientation", orientation, (), unit="rad")
     check_moving_joints(linkage, orientation is not None)
-    q, _, missing = _positions(linkage, tip, orientation, sign("branch", branch))
+    side = real_array("branch", branch, ())
+    if (sign := concrete(side)) is not None and abs(sign) != 1:
+        raise refusal("branch", "1 or -1", branch)
+    q, _, missing = _positions(linkage, tip, orientation, side)
     if not (is_traced(q) or np.isfinite(q).all()):
         at = "" if orientation is None else f" at orientation {orientation:g} rad"
         raise ValueError(
