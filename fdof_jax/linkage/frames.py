@@ -68,11 +68,6 @@ class Frames(NamedTuple):
         """Returns the end of the last link's vector A [m]."""
         return self.start[..., -1] + linkage.length[-1] * self.direction[..., -1]
 
-    def mass_centers(self, linkage: "Linkage") -> Rows:
-        """Returns the mass centres of the moving links (..., n) [m]."""
-        offset = plane_vectors(linkage.com)
-        return self.start[..., 1:] + offset * self.direction[..., 1:]
-
 
 def frames(linkage: "Linkage", q: Array) -> Frames:
     """Computes the frames at joint positions (n,), 0 at fixed pairs."""

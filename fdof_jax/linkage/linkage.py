@@ -116,11 +116,9 @@ class Linkage(Frozen):
         """Shows the values of a single linkage, or the shapes of a batch."""
         if np.ndim(self.ef) != 1 or not known(self):
             return super().__repr__()
-        topology = letters(self.ef)
-        values = {name: short(value) for name, value in vars(self).items()}
-        del values["ef"]
-        fields = (f"{name}={value}" for name, value in values.items())
-        return f"Linkage({topology!r}, {', '.join(fields)})"
+        (_, ef), *fields = vars(self).items()
+        others = (f"{name}={short(value)}" for name, value in fields)
+        return f"Linkage({letters(ef)!r}, {', '.join(others)})"
 
 
 def short(value: Array | np.ndarray) -> str:
@@ -237,9 +235,8 @@ def check_linkage(linkage: object) -> None:
     if is_traced(linkage):
         return
     values = jax.tree.map(np.asarray, linkage)
-    if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(values)) or not (
-        possible(values)
-    ):
+    finite = all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(values))
+    if not (finite and possible(values)):
         try:
             linkage.replace()
         except ValueError as error:
@@ -255,9 +252,5 @@ def possible(linkage: Linkage) -> Array:
     """
     pairs = linkage.ef.reshape(-1, 2)
     factors = ((pairs == 0) | (pairs == 1)).all() & (pairs.sum(axis=1) <= 1).all()
-    return (
-        factors
-        & can_move(pairs)
-        & (linkage.mass >= 0).all()
-        & (linkage.inertia >= 0).all()
-    )
+    weights = (linkage.mass >= 0).all() & (linkage.inertia >= 0).all()
+    return factors & can_move(pairs) & weights

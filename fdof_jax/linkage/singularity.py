@@ -27,11 +27,8 @@ def _frames(linkage: "Linkage", q: np.ndarray) -> tuple[np.ndarray, ...]:
     along = np.exp(1j * (linkage.base_angle + turn))
     slide = np.where(revolute, linkage.locked, q)
     start = summed((linkage.length[:-1] + 1j * slide) * along[..., :-1])
-    return (
-        start,
-        along,
-        start[..., 1:] + np.asarray(linkage.com) @ [1, 1j] * along[..., 1:],
-    )
+    centre = start[..., 1:] + np.asarray(linkage.com) @ [1, 1j] * along[..., 1:]
+    return start, along, centre
 
 
 def _scaled_inertia(linkage: "Linkage", configurations: int) -> np.ndarray:
@@ -56,11 +53,8 @@ def _scaled_inertia(linkage: "Linkage", configurations: int) -> np.ndarray:
     # Eigenvalues, because pivots of an elimination lose accuracy near singularity.
     tiny = np.finfo(float).tiny
     scale = np.sqrt(np.maximum(np.diagonal(M, axis1=1, axis2=2), tiny))
-    scaled = M / (scale[:, :, None] * scale[:, None])
-    # The diagonal of ones, at fixed pairs too, leaves the least eigenvalue as it is.
-    diagonal = np.arange(n)
-    scaled[:, diagonal, diagonal] = np.where(moves, scaled[:, diagonal, diagonal], 1)
-    return scaled
+    # Rows of fixed pairs are 0; a 1 leaves the least eigenvalue as it is.
+    return M / (scale[:, :, None] * scale[:, None]) + np.diag(~moves)
 
 
 def check_singularity(linkage: "Linkage") -> None:
@@ -105,9 +99,8 @@ def _warn(linkage: "Linkage", revolute: np.ndarray) -> None:
         arm = np.abs(centre - start[k + 1])
         turning = linkage.inertia + mass * np.where(arm > rounding, arm, 0) ** 2
         if (turning if revolute[k] else mass)[body].sum() == 0:
-            links = f"links {k + 1} to {following}"
-            if following == k + 1:
-                links = f"link {k + 1}"
+            alone = following == k + 1
+            links = f"link {k + 1}" if alone else f"links {k + 1} to {following}"
             warn(
                 f"joint {k + 1} moves no inertia of {links}: the mass matrix may be "
                 "singular in some configurations."

@@ -44,7 +44,8 @@ def mass_centers(linkage: Linkage, q: Float[Array, " joint"]) -> Float[Array, "l
     >>> fj.mass_centers(arm, [0.0, 1.5707963, 0.0]).tolist()
     [[1.0, 0.0], [1.0, 1.0], [1.0, 2.0]]
     """
-    return as_points(frames(linkage, q).mass_centers(linkage))
+    f = frames(linkage, q)
+    return as_points(f.start[1:] + plane_vectors(linkage.com) * f.direction[1:])
 
 
 @compiled("q", "qd")
