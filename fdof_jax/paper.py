@@ -94,11 +94,9 @@ def from_chain(
         held = np.asarray(held)
         scale = np.abs(np.asarray(xd)).max()
         for k in np.flatnonzero(np.abs(held) > 8 * np.finfo(held.dtype).eps * scale):
-            rate = (
-                f"B{k + 1} rate 0"
-                if pairs[k, 1]
-                else (f"th{k + 2} rate equal to th{k + 1} rate" if k else "th2 rate 0")
-            )
+            rate = f"th{k + 2} rate equal to th{k + 1} rate" if k else "th2 rate 0"
+            if pairs[k, 1]:
+                rate = f"B{k + 1} rate 0"
             raise ValueError(
                 f"xd: expected {rate}, because that joint is fictitious, got a "
                 f"difference of {held[k]:g}."
@@ -320,8 +318,10 @@ def masked_accelerations(
     """
     real = linkage.ef > 0.5
     M = mass_matrix(linkage, x)
-    # Right side of (15) without constraint efforts.
-    right = _generalised(jnp.where(real, force, 0)) + bias_force(linkage, x, xd)
+    # Right side of (15) without constraint efforts; torques react on the link before.
+    effort = jnp.where(real, force, 0)
+    effort = effort.at[1:4:2].add(-effort[3::2])
+    right = effort + bias_force(linkage, x, xd)
 
     # The paper prints EF5 for 1 - EF6 and EF3 for 1 - EF4. The same where one joint of
     # each pair is real, they differ at fixed pairs.
@@ -376,9 +376,3 @@ def constraint_forces(
     revolute = jnp.cumsum(effort[::-2])[::-1]  # each revolute joint carries the next
     total = jnp.stack([effort[0::2], revolute], axis=1).reshape(6)
     return jnp.where(linkage.ef > 0.5, 0, total - force)
-
-
-def _generalised(force: Array) -> Array:
-    """Generalised forces of joint efforts; revolute ones react on the link before."""
-    reaction = jnp.concatenate([force[3::2], jnp.zeros_like(force[:1])])
-    return force.at[1::2].add(-reaction)
