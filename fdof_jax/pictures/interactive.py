@@ -85,13 +85,9 @@ def _report(moved: _Moved, error: np.ndarray) -> str:
     else:
         text = f"Tip error: rms {1e3 * np.sqrt(np.mean(error**2)):.3g} mm."
     linkage, controller = moved.scene.linkage, controller_of(moved.scene)
-    columns = (
-        joint_names(linkage),
-        np.asarray(gains_of(moved.scene)).T,
-        linkage.length[1:],
-    )
-    rows = []
-    for k, (joint, gains, length) in enumerate(zip(*columns), start=1):
+    rows, of_joints = [], np.asarray(gains_of(moved.scene)).T
+    parts = zip(joint_names(linkage), of_joints, linkage.length[1:])
+    for k, (joint, gains, length) in enumerate(parts, start=1):
         units = controller.gain_units[joint[0]]
         texts = [f"{float(gain):.4g} {unit}" for gain, unit in zip(gains, units)]
         rows.append((joint, *texts, f"link {k}: {float(length):.3g} m"))
