@@ -14,7 +14,7 @@ from ..base.checks import is_traced
 from ..control.actuators import Actuators
 from ..control.pd import PDController
 from ..forces.actuators import Armature
-from ..forces.element import Element, Forces, ForeignElement, elements_on
+from ..forces.element import Element, Forces, ForeignElement, elements_on, of_full_size
 from ..forces.holders import HardStops, JointFriction
 from ..forces.joints import JointDamper, JointEffort, JointSpring, JointStops
 from ..forces.points import SpringDamper
@@ -76,7 +76,8 @@ def to_mjcf(linkage: Linkage, forces: Forces = (), state0: State | None = None) 
     length, com, locked = map(np.asarray, (linkage.length, linkage.com, linkage.locked))
     mass = np.maximum(linkage.mass, _SMALLEST)
     inertia = np.maximum(linkage.inertia, _SMALLEST)
-    kinds, acting = letters(linkage.ef), elements_on(linkage, forces)
+    kinds = letters(linkage.ef)
+    acting = of_full_size(linkage, elements_on(linkage, forces))
     _check_elements(linkage, acting)
     attributes = _of_joints(acting, len(kinds))
 
@@ -146,15 +147,15 @@ def _check_elements(linkage: Linkage, acting: tuple[Element, ...]) -> None:
 
 def _limits_and_acts(element: Any, linkage: Linkage) -> tuple[np.ndarray, np.ndarray]:
     """In which joints an element of `_ACTUATORS` limits the effort, and acts, (n,)."""
-    none = np.zeros(joints_of(linkage), bool)
+    count = joints_of(linkage)
     if isinstance(element, JointEffort):
-        return none, none | (np.asarray(element.tau) != 0)
+        return np.zeros(count, bool), np.asarray(element.tau) != 0
     if isinstance(element, PDController):
         kp, kd, limit = map(np.asarray, (element.kp, element.kd, element.limit))
-        acts = none | ((kp > 0) | (kd > 0)) & (limit > 0)
+        acts = ((kp > 0) | (kd > 0)) & (limit > 0)
         return acts & np.isfinite(limit), acts
-    *_, bounded = _ends(element.effort_lower, element.effort_upper, len(none))
-    return none | bounded, none | np.asarray(element.gear).any(axis=0)
+    *_, bounded = _ends(element.effort_lower, element.effort_upper, count)
+    return bounded, np.asarray(element.gear).any(axis=0)
 
 
 def _draw(
@@ -202,12 +203,10 @@ def _of_joints(acting: tuple[Element, ...], count: int) -> list[dict[str, str]]:
     joints: list[dict[str, str]] = [{} for _ in range(count)]
 
     def add(name: str, *columns: ArrayLike, where: ArrayLike = True) -> None:
-        columns = np.broadcast_arrays(*columns, where, np.zeros(count))[:-1]
-        for joint, (*values, there) in zip(joints, zip(*columns)):
-            if there:
-                joint[name] = _text(*values)
-                if name.endswith("range"):
-                    joint[name.replace("range", "limited")] = "true"
+        for k in np.flatnonzero(np.broadcast_to(where, count)):
+            joints[k][name] = _text(*(np.asarray(column)[k] for column in columns))
+            if name.endswith("range"):
+                joints[k][name.replace("range", "limited")] = "true"
 
     for element in acting:
         if isinstance(element, JointDamper):
@@ -285,13 +284,12 @@ def _add_actuators(
             for other in acting:
                 if isinstance(other, _ACTUATORS):
                     limited |= _limits_and_acts(other, linkage)[0]
-            for k, tau in enumerate(np.broadcast_to(element.tau, count)):
+            for k, tau in enumerate(np.asarray(element.tau)):
                 if kinds[k] != "F" and not (limited[k] and tau == 0):
                     add("motor", f"effort{k + 1}", k, tau)
         elif isinstance(element, PDController):
             target, velocity = element.schedule(jnp.zeros(()), linkage)
-            gains = element.kp, element.kd, element.limit
-            rows = zip(*np.broadcast_arrays(*gains, np.zeros(count))[:3])
+            rows = zip(*map(np.asarray, (element.kp, element.kd, element.limit)))
             for k, (kp, kd, limit) in enumerate(rows):
                 if kinds[k] != "F" and limit != 0:
                     add("position", f"position{k + 1}", k, target[k], kp=kp)

@@ -7,7 +7,7 @@ from matplotlib.path import Path
 
 from ..base.known_values import in_numpy
 from ..forces.actuators import LinearActuator
-from ..forces.element import Element, Forces, elements_on
+from ..forces.element import Element, Forces, elements_on, of_full_size
 from ..forces.holders import HardStops
 from ..forces.joints import JointStops
 from ..forces.payload import Payload
@@ -44,7 +44,7 @@ def element_lines(
     frames at times `ts` [s]; `size`: its extent [m]. Arrows show forces of all wrenches
     on one scale.
     """
-    given = elements_on(linkage, forces)
+    given = of_full_size(linkage, elements_on(linkage, forces))
     for element in given:
         element.check(linkage, jnp.asarray(ts))
     acting = in_numpy(given)
@@ -243,8 +243,7 @@ def _stops(
 ) -> list[np.ndarray]:
     """Bars at the ends of each joint's range, joined by an arc around a pin."""
     kinds, radius, strokes = letters(linkage.ef), 1.2 * _ARC * size, []
-    ends = np.broadcast_arrays(element.lower, element.upper, np.zeros(len(kinds)))[:2]
-    for k, (kind, low, high) in enumerate(zip(kinds, *ends)):
+    for k, (kind, low, high) in enumerate(zip(kinds, element.lower, element.upper)):
         along, pin = f.direction[:, k : k + 1], f.start[:, k + 1 : k + 2]
         finite = [end for end in (low, high) if np.isfinite(end)]
         if kind == "R":
