@@ -31,8 +31,8 @@ def _frames(linkage: "Linkage", q: np.ndarray) -> tuple[np.ndarray, ...]:
     return start, along, centre
 
 
-def _scaled_inertia(linkage: "Linkage", configurations: int) -> np.ndarray:
-    """Computes mass matrices at random configurations (configurations, n, n).
+def _scaled_inertia(linkage: "Linkage") -> np.ndarray:
+    """Computes mass matrices at five random configurations (5, n, n).
 
     Scaling to a diagonal of ones makes them free of units and sizes; it is 0 where a
     joint moves nothing, and 1 at fixed pairs.
@@ -42,7 +42,7 @@ def _scaled_inertia(linkage: "Linkage", configurations: int) -> np.ndarray:
     sizes = linkage.length, linkage.com, linkage.locked[revolute]
     extent = sum(np.abs(size).sum() for size in sizes)
     n, moves = len(revolute), ~np.stack(fixed_pairs(linkage.ef))
-    draws = np.random.default_rng(0).uniform(-1, 1, (configurations, 2, n))
+    draws = np.random.default_rng(0).uniform(-1, 1, (5, 2, n))
     q = np.where(revolute, np.pi * draws[:, 0], (extent or 1) * draws[:, 1] * moves)
     start, along, centre = _frames(linkage, q)
     moved = np.tri(n) * moves  # a joint moves only the links beyond it
@@ -61,7 +61,7 @@ def check_singularity(linkage: "Linkage") -> None:
     """Rejects linkages that are always singular; warns of those that may become so."""
     revolute = np.stack(real_joints(np.asarray(linkage.ef)))
     names = letters(linkage.ef)
-    scaled = _scaled_inertia(linkage, configurations=5)
+    scaled = _scaled_inertia(linkage)
     for k in reversed(range(len(names))):
         # Of the joints from k outwards, how far from singular they are.
         least, modes = np.linalg.eigh(scaled[:, k:, k:])

@@ -19,7 +19,7 @@ from ..analysis.responses import StepAndSine
 from ..base.checks import instance, real_array, refusal, shown
 from ..control.drives import controller_in
 from ..dynamics import link_energies
-from ..forces.element import Element, Forces, ForeignElement, elements
+from ..forces.element import Forces, ForeignElement, elements, of_full_size
 from ..linkage.linkage import Linkage, joint_names, moving_joints
 from ..references.reference import reference_motion, reference_of
 from ..simulation.efforts import joint_efforts
@@ -220,7 +220,7 @@ def effort_profile(
     efforts = joint_efforts(linkage, forces, solution)
     ts, total, parts = (np.asarray(a) for a in (solution.ts, *efforts))
     moving, joints = moving_joints(linkage), joint_names(linkage)
-    limits = [_limits(element, total) for element in forces]
+    controllers = [controller_in(e) for e in of_full_size(linkage, forces)]
     parts, held = [*parts], isinstance(solution, SampledMotion)
     named = [(name, part) for name, part in zip(_names(forces), parts) if part.any()]
     named = named or [("none", total)]
@@ -233,8 +233,11 @@ def effort_profile(
     )  # fmt: skip
     for k, row in zip(moving, table):
         unit = "N m" if joints[k][0] == "R" else "N"
-        own = [(of[k], part[:, k]) for of, part in zip(limits, parts)]
-        own = [(limit, effort) for limit, effort in own if np.isfinite(limit)]
+        own = [
+            (float(controller.limit[k]), part[:, k])
+            for controller, part in zip(controllers, parts)
+            if controller and np.isfinite(controller.limit[k])
+        ]
         most = "".join(f"\nlimit ±{limit:g}" for limit, _ in own)
         row[0].set_ylabel(f"{joints[k]} [{unit}]{most}")
         for ax in row:
@@ -288,13 +291,6 @@ def _busy(ts: np.ndarray, efforts: np.ndarray) -> tuple[float, float] | None:
     if long or last - first < _SAMPLES:
         return None
     return float(max(begin - room, ts[0])), float(min(end + room, ts[-1]))
-
-
-def _limits(element: Element, total: np.ndarray) -> np.ndarray:
-    """Limits of a controller's efforts (n,); infinite for other elements."""
-    controller = controller_in(element)
-    limit = np.inf if controller is None else controller.limit
-    return np.broadcast_to(np.asarray(limit), total.shape[1])
 
 
 def response_profile(test: StepAndSine, fig: Figure | None = None) -> Figure:
