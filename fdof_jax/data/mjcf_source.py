@@ -33,10 +33,9 @@ def compiled_model(mujoco: ModuleType, source: Any) -> tuple[Model, list[str]]:
     path = local_path("source", source, _EXPECTED)
     if not os.path.isfile(path):  # which does not raise for any text
         raise refusal("source", f"{_EXPECTED}, and the file to be there", str(source))
-    if b"<robot" in path.read_bytes():
-        root = _root(path.read_bytes())
-        if root.tag == "robot":
-            return _of_root(mujoco, root, path.parent)
+    content = path.read_bytes()
+    if b"<robot" in content and (root := _root(content)).tag == "robot":
+        return _of_root(mujoco, root, path.parent)
     return _compiled(lambda: mujoco.MjModel.from_xml_path(str(path))), []
 
 
