@@ -7,8 +7,7 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from ..base.checks import instance, real_array, refusal, whole_number
-from ..control.model_based import ModelBased
-from ..control.pd import PDController
+from ..control.pd import ModelBased, PDController
 from ..linkage.coordinates import State
 from ..linkage.linkage import Linkage, check_linkage
 from ..linkage.topology import TOPOLOGIES

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from ..analysis.tracking import tip_deviation
 from ..base.checks import place_of, real_array, whole_number
 from ..base.report import Report
-from ..control.model_based import ComputedTorque
+from ..control.pd import ComputedTorque
 from ..forces.joints import EffortHistory
 from ..linkage.linkage import joints_of, without_fixed
 from ..references.task import TipReference
