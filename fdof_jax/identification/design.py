@@ -11,8 +11,7 @@ from numpy.typing import ArrayLike
 
 from ..base.checks import function, instance, real_array, refusal, shown
 from ..base.report import Report
-from ..search.bounded import Evaluation, Run, minimise
-from ..search.lanes import Lanes, check_motion, check_scene
+from ..search import Evaluation, Lanes, Run, check_motion, check_scene, minimise
 from ..simulation.scene import Scene
 from ..simulation.sensitivities import sensitivities
 from ..simulation.simulate import simulate

@@ -13,8 +13,7 @@ from numpy.typing import ArrayLike
 
 from ..base.checks import function, instance, real_array, refusal, shown
 from ..mechanics.kinematics import joint_positions, tip_position
-from ..search.bounded import Evaluation
-from ..search.lanes import check_scene, sum_of_squares
+from ..search import Evaluation, check_scene, sum_of_squares
 from ..simulation.sampled import check_joints
 from ..simulation.scene import Scene, stacked
 from ..simulation.sensitivities import sensitivities

@@ -11,13 +11,13 @@ from jax import Array
 from jaxtyping import Bool, Float
 
 from ..analysis.linearization import Modes, closed_loop_modes, depends_on_state_alone
-from ..analysis.tracking import relative_demands
+from ..analysis.measures import relative_demands
 from ..base.configuration import options_of_loops
 from ..base.known_values import in_numpy
 from ..base.report import Report
 from ..linkage.linkage import joint_names
 from ..references.reference import reference_of
-from ..search.lanes import check_motion
+from ..search import check_motion
 from ..simulation.prescribed import PrescribedMotion
 from ..simulation.scene import Scene, is_number
 from ..simulation.sensitivities import Sensitivities, sensitivities

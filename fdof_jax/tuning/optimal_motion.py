@@ -9,15 +9,22 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from ..analysis.tracking import tip_deviation
+from ..analysis.measures import tip_deviation
 from ..base.checks import place_of, real_array, whole_number
 from ..base.report import Report
 from ..control.pd import ComputedTorque
 from ..forces.joints import EffortHistory
 from ..linkage.linkage import joints_of, without_fixed
 from ..references.task import TipReference
-from ..search.bounded import Evaluation, Run, best_of, minimise
-from ..search.lanes import Lanes, check_motion, sum_of_squares
+from ..search import (
+    Evaluation,
+    Lanes,
+    Run,
+    best_of,
+    check_motion,
+    minimise,
+    sum_of_squares,
+)
 from ..simulation.efforts import joint_efforts
 from ..simulation.scene import Scene
 from ..simulation.sensitivities import sensitivities

@@ -12,9 +12,8 @@ from numpy.typing import ArrayLike
 
 from ..analysis.linearization import checked, equilibrium, loop_matrices
 from ..analysis.loops import Loop, margins, open_loop
-from ..analysis.measures import BAND, step_measures
+from ..analysis.measures import BAND, demands, step_measures
 from ..analysis.responses import samples_of
-from ..analysis.tracking import demands
 from ..base.checks import instance
 from ..base.known_values import in_numpy
 from ..base.report import Report
@@ -23,8 +22,7 @@ from ..forces.element import Element
 from ..linkage.fields import Part, Values, check_joints, field, sized
 from ..linkage.linkage import joint_names, joints_of, moving_joints
 from ..references.reference import reference_motion
-from ..search.bounded import Evaluation, check_search
-from ..search.lanes import Lanes, check_motion, sum_of_squares
+from ..search import Evaluation, Lanes, check_motion, check_search, sum_of_squares
 from ..simulation.scene import Scene, with_full_size
 from ..simulation.simulate import simulate
 from ..simulation.solution import Solution
