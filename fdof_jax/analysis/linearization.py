@@ -28,7 +28,7 @@ from ..linkage.linkage import (
 )
 from ..linkage.topology import fixed_pairs
 from ..references.reference import Reference, reference_motion
-from ..simulation.field import element_effort, has_states
+from ..simulation.field import has_states, total_effort
 from ..simulation.prescribed import prescribed
 from ..simulation.sampled import check_joints
 from ..simulation.scene import accepts_scene
@@ -61,21 +61,8 @@ def checked(linkage: Linkage, forces: Forces) -> tuple[Element, ...]:
     acting = elements_on(linkage, forces)
     if depends_on_state_alone(linkage, acting):
         return of_full_size(linkage, acting)
-    raise ValueError(
-        "forces: expected elements without a state of their own and no "
-        f"PrescribedMotion, got {shown(forces)}."
-    )
-
-
-def total_effort(
-    linkage: Linkage, forces: tuple[Element, ...], t: Array, q: Array, qd: Array
-) -> Array:
-    """Computes the sum of the efforts of elements without a state [N or N m]."""
-    total = jnp.zeros_like(q)
-    for k, element in enumerate(forces):
-        empty = element.initial_state(linkage)
-        total = total + element_effort(k, element, t, q, qd, linkage, empty)
-    return total
+    expected = "elements without a state of their own and no PrescribedMotion"
+    raise refusal("forces", expected, forces)
 
 
 def equilibrium(
