@@ -208,7 +208,7 @@ def next_motion(
 def _refused(scene: Scene, ts: Array, within: Callable | None) -> str:
     """Says why a search cannot begin with a motion."""
     check_motion("experiment(...)(...)", scene, ts)
-    solution = simulate(scene.linkage, scene.state0, ts, scene.forces)
+    solution = simulate(scene, ts)
     if within is not None:
         shares = np.asarray(within(scene, solution))
         entry = np.unravel_index(np.argmax(np.abs(shares)), shares.shape)
