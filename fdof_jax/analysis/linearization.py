@@ -13,7 +13,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Complex, Float
 from numpy.typing import ArrayLike
 
-from ..base.checks import instance, is_traced, real_array, shown
+from ..base.checks import instance, is_traced, real_array, refusal
 from ..control.pd import PDController
 from ..dynamics import bias_force, forward_dynamics
 from ..forces.element import Element, Forces, elements_on, of_full_size
@@ -188,9 +188,8 @@ def linearize(
     """
     forces = checked(linkage, forces)
     q, qd = map(jnp.asarray, real_state("state", state, linkage))
-    return _linearized(
-        linkage, forces, q, qd, real_array("t", t, ()), jnp.zeros_like(q)
-    )
+    t = real_array("t", t, ())
+    return _linearized(linkage, forces, q, qd, t, jnp.zeros_like(q))
 
 
 @eqx.filter_jit

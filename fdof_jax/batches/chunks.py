@@ -75,9 +75,7 @@ class Outcome(NamedTuple):
 
 def _check_value(value: PyTree) -> None:
     """Raises ValueError unless a reduction returned arrays of numbers."""
-    if not jax.tree.leaves(value):
-        raise refusal("reduce", "a function that returns arrays", value)
-    for leaf in jax.tree.leaves(value):
+    for leaf in jax.tree.leaves(value) or [value]:
         if not eqx.is_array_like(leaf):
             raise refusal("reduce", "a function that returns arrays", leaf)
         dtype = leaf.dtype if eqx.is_array(leaf) else jnp.result_type(leaf)
