@@ -143,15 +143,12 @@ def _times(scene: Scene) -> dict[str, Array]:
     return times
 
 
-def _with_times(scene: Scene, times: Array) -> Scene:
-    where = lambda scene: list(_times(scene).values())
-    return eqx.tree_at(where, scene, list(times)) if len(times) else scene
-
-
 def _scene_at(scene: Scene, tuned: Array | np.ndarray, z: Array | np.ndarray) -> Scene:
     """The scene with gains of the logarithms in `z`, which its times follow."""
     logs, times = jnp.split(jnp.asarray(z), [tuned.size])
-    return _with_times(with_log_gains(scene, logs, tuned), times)
+    scene = with_log_gains(scene, logs, tuned)
+    where = lambda scene: list(_times(scene).values())
+    return eqx.tree_at(where, scene, list(times)) if len(times) else scene
 
 
 def _errors(scene: Scene) -> Loss:

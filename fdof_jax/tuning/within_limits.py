@@ -179,7 +179,7 @@ def measured(scene: Scene, limits: Limits) -> Iterator[tuple[str, str, float, fl
     }
     poles = next(iter(loops.values())).feedback().poles()
     ts = np.linspace(0, t1, samples_of(t1, np.abs(poles).max()) + 1)
-    motion = simulate(linkage, scene.state0, ts, scene.forces, throw=False)
+    motion = simulate(scene, ts, throw=False)
     shares, speeds, _ = map(np.asarray, step_shares(motion, rest))
     efforts = np.abs(demands(controller, linkage, motion)).max(axis=0)
     for k, loop in loops.items():
@@ -209,11 +209,10 @@ def _lane(z: Array, problem: tuple[Scene, Loss, Array, Limits, bool]) -> Evaluat
 
     found = gain_sensitivities(z, scene, residuals, tuned)
     count = joints_of(scene.linkage) * (3 * _SPANS + with_margins * _BANDS)
-    excesses, own = (
-        found._replace(residuals=found.residuals[rows], jacobian=found.jacobian[rows])
-        for rows in (slice(count), slice(count, None))
-    )
-    return sum_of_squares(own, excess=excesses.residuals, slopes=excesses.jacobian)
+    beyond, errors = jnp.split(found.residuals, [count])
+    slopes, jacobian = jnp.split(found.jacobian, [count])
+    own = found._replace(residuals=errors, jacobian=jacobian)
+    return sum_of_squares(own, excess=beyond, slopes=slopes)
 
 
 def _search(
@@ -399,9 +398,8 @@ def tune_within(
     limits = sized(limits, joints_of(scene.linkage))
     with_margins = bool(np.any(np.asarray(limits.modulus_margin) > 0))
     problem = with_full_size(scene), loss, box.tuned, limits, with_margins
-    z, value, message = _search(
-        scene, Lanes(_lane, [[problem]]), box, max_steps, report
-    )
+    lanes = Lanes(_lane, [[problem]])
+    z, value, message = _search(scene, lanes, box, max_steps, report)
     scene = with_gains(scene, jnp.asarray(box.gains(z)))
     rows = list(measured(scene, limits))
     limit, joint, allowed, reached = zip(*rows) if rows else ((),) * 4
