@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 
-from fdof_jax.search import bounded, lanes
+from fdof_jax import search
 
 
 def test_steps_within_a_box_are_the_least():
@@ -28,14 +28,14 @@ def test_steps_within_a_box_are_the_least():
         where = draw.uniform(size=size)
         low[where < 0.4] = high[where > 0.7] = 0
         high[0] = low[0]  # without room
-        x = bounded.box_minimum(matrix, slope, low, high)
+        x = search.box_minimum(matrix, slope, low, high)
         assert x[0] == low[0] and ((low <= x) & (x <= high)).all()
         rise = (unit * (slope + matrix @ x))[1:] / np.abs(unit * slope).max()
         assert (rise[x[1:] > low[1:]] < 1e-9).all()
         assert (rise[x[1:] < high[1:]] > -1e-9).all()
 
 
-@pytest.mark.parametrize("method", bounded.METHODS)
+@pytest.mark.parametrize("method", search.METHODS)
 def test_minimise_finds_what_scipy_finds_within_bounds(method):
     """Minimises Rosenbrock's function and an exponential fit in boxes that cut them."""
     t = np.linspace(0, 1, 12)
@@ -62,14 +62,14 @@ def test_minimise_finds_what_scipy_finds_within_bounds(method):
         for point, run in zip(z, runs):
             residual, jacobian = (f(point) for f in problems[run % 2])
             found.append(
-                bounded.Evaluation(
+                search.Evaluation(
                     np.sum(residual**2), 2 * jacobian.T @ residual,
                     2 * jacobian.T @ jacobian, {},
                 )
             )  # fmt: skip
         return jax.tree.map(lambda *rows: np.stack(rows), *found)
 
-    runs = bounded.minimise(
+    runs = search.minimise(
         evaluate, starts, low, high, method=method, max_steps=200, enough=1e-12
     )
     for i, run in enumerate(runs):
@@ -85,12 +85,12 @@ def test_minimise_finds_what_scipy_finds_within_bounds(method):
 def test_one_failing_start_does_not_spoil_the_others():
     def evaluate(z, runs):
         loss = np.where(runs == 1, np.nan, np.sum(z**2, axis=1))
-        return bounded.Evaluation(
+        return search.Evaluation(
             loss, 2 * z, np.broadcast_to(2 * np.eye(2), (len(z), 2, 2)), {}
         )
 
     box = np.ones((3, 2))
-    runs = bounded.minimise(
+    runs = search.minimise(
         evaluate, box.copy(), -9 * box, 9 * box, method="levenberg-marquardt",
         max_steps=20, enough=1e-6,
     )  # fmt: skip
@@ -105,9 +105,9 @@ def test_a_start_held_by_all_bounds_has_converged_and_a_flat_one_has_not():
         # Downwards beyond both bounds; flat in the second run.
         slopes = np.where(runs[:, None] == 0, -1.0, 0.0) * np.ones(2)
         loss = 5 + np.sum(slopes * z, axis=1)
-        return bounded.Evaluation(loss, slopes, np.stack([np.eye(2)] * 2), {})
+        return search.Evaluation(loss, slopes, np.stack([np.eye(2)] * 2), {})
 
-    corner, flat = bounded.minimise(
+    corner, flat = search.minimise(
         evaluate, starts, np.zeros((2, 2)), np.ones((2, 2)),
         method="levenberg-marquardt", max_steps=3, enough=1e-4,
     )  # fmt: skip
@@ -123,7 +123,7 @@ def test_power_mean_has_the_derivatives_of_its_own_formula():
     def members(z):
         jacobian = coefficients
         residual = jacobian @ z + np.arange(1, 6)
-        return bounded.Evaluation(
+        return search.Evaluation(
             np.sum(residual**2, -1),
             2 * np.einsum("rmkn,rmk->rmn", jacobian, residual),
             2 * np.einsum("rmki,rmkj->rmij", jacobian, jacobian),
@@ -132,11 +132,11 @@ def test_power_mean_has_the_derivatives_of_its_own_formula():
 
     z, h = rng.normal(size=3), 1e-5
     for order in (1, 32):
-        here = lanes.power_mean(members(z), order)
+        here = search.power_mean(members(z), order)
         loss = members(z).loss[0]
         assert here.loss[0] == pytest.approx(np.mean(loss**order) ** (1 / order))
         sides = [
-            [lanes.power_mean(members(z + s * h * e), order) for s in (1, -1)]
+            [search.power_mean(members(z + s * h * e), order) for s in (1, -1)]
             for e in np.eye(3)
         ]
         slopes = [(a.loss[0] - b.loss[0]) / (2 * h) for a, b in sides]
@@ -144,7 +144,7 @@ def test_power_mean_has_the_derivatives_of_its_own_formula():
         # For linear residuals the Gauss-Newton curvature is the second derivative.
         bends = [(a.gradient[0] - b.gradient[0]) / (2 * h) for a, b in sides]
         np.testing.assert_allclose(here.curvature[0], bends, rtol=1e-5, atol=1e-5)
-    nothing = bounded.Evaluation(
+    nothing = search.Evaluation(
         np.zeros((1, 2)), np.zeros((1, 2, 3)), np.zeros((1, 2, 3, 3)), {}
     )
-    assert all(np.isfinite(a).all() for a in lanes.power_mean(nothing, 32)[:3])
+    assert all(np.isfinite(a).all() for a in search.power_mean(nothing, 32)[:3])

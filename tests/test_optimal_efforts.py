@@ -5,8 +5,8 @@ import pytest
 
 import fdof_jax as fj
 from fdof_jax import scenes
-from fdof_jax.analysis.tracking import tip_deviation
-from fdof_jax.search.lanes import Lanes
+from fdof_jax.analysis.measures import tip_deviation
+from fdof_jax.search import Lanes
 from fdof_jax.tuning import optimal_motion
 
 # The same for all tests, so that they share programs.

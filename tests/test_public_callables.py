@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import fdof_jax as fj
-from fdof_jax.search import lanes
+from fdof_jax import search
 
 ROOMS = (
     fj, fj.analysis, fj.control, fj.data, fj.forces, fj.identification, fj.references,
@@ -81,7 +81,7 @@ def test_values(monkeypatch):
         raise RuntimeError("The value was not refused, and the search begins.")
 
     # Searches take most of the time, and have tests of their own.
-    monkeypatch.setattr(lanes, "_evaluate", accepted)
+    monkeypatch.setattr(search, "_evaluate", accepted)
     assert not unlike_a_refusal(
         (name, parameter, wrong, partial(call, wrong))
         for name, parameter, call in parameters()

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 import fdof_jax as fj
-from fdof_jax import scenes
-from fdof_jax.analysis.tracking import demands
-from fdof_jax.search import lanes
+from fdof_jax import scenes, search
+from fdof_jax.analysis.measures import demands
 from fdof_jax.tuning.losses import (
     bounds_of,
     controller_of,
@@ -106,11 +105,11 @@ def test_history_report_and_text_say_what_happened_and_a_second_call_compiles_no
     beyond = float(np.mean(np.abs(demand) > scene.forces[0].limit[1]))
     assert 0 < history.saturated[0, 1] == pytest.approx(beyond, abs=3e-3)
     assert (history.saturated[0, [0, 2]] == 0).all()
-    compiled = lanes._evaluate._cached._cache_size()
+    compiled = search._evaluate._cached._cache_size()
     task = fj.CircleTask(center=(-3.9, 2.1), radius=0.6)
     trial = with_changes(scene, kp=1.1 * scene.forces[0].kp, reference=task)
     fj.tune(trial._replace(t1=0.9), factor=3.0, max_steps=1, method="l-bfgs")
-    assert lanes._evaluate._cached._cache_size() == compiled
+    assert search._evaluate._cached._cache_size() == compiled
 
 
 @pytest.mark.slow

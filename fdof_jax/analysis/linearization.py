@@ -13,7 +13,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Complex, Float
 from numpy.typing import ArrayLike
 
-from ..base.checks import instance, is_traced, real_array, shown
+from ..base.checks import instance, is_traced, real_array, refusal
 from ..control.pd import PDController
 from ..dynamics import bias_force, forward_dynamics
 from ..forces.element import Element, Forces, elements_on, of_full_size
@@ -28,7 +28,7 @@ from ..linkage.linkage import (
 )
 from ..linkage.topology import fixed_pairs
 from ..references.reference import Reference, reference_motion
-from ..simulation.field import element_effort, has_states
+from ..simulation.field import has_states, total_effort
 from ..simulation.prescribed import prescribed
 from ..simulation.sampled import check_joints
 from ..simulation.scene import accepts_scene
@@ -61,21 +61,8 @@ def checked(linkage: Linkage, forces: Forces) -> tuple[Element, ...]:
     acting = elements_on(linkage, forces)
     if depends_on_state_alone(linkage, acting):
         return of_full_size(linkage, acting)
-    raise ValueError(
-        "forces: expected elements without a state of their own and no "
-        f"PrescribedMotion, got {shown(forces)}."
-    )
-
-
-def total_effort(
-    linkage: Linkage, forces: tuple[Element, ...], t: Array, q: Array, qd: Array
-) -> Array:
-    """Computes the sum of the efforts of elements without a state [N or N m]."""
-    total = jnp.zeros_like(q)
-    for k, element in enumerate(forces):
-        empty = element.initial_state(linkage)
-        total = total + element_effort(k, element, t, q, qd, linkage, empty)
-    return total
+    expected = "elements without a state of their own and no PrescribedMotion"
+    raise refusal("forces", expected, forces)
 
 
 def equilibrium(
@@ -201,9 +188,8 @@ def linearize(
     """
     forces = checked(linkage, forces)
     q, qd = map(jnp.asarray, real_state("state", state, linkage))
-    return _linearized(
-        linkage, forces, q, qd, real_array("t", t, ()), jnp.zeros_like(q)
-    )
+    t = real_array("t", t, ())
+    return _linearized(linkage, forces, q, qd, t, jnp.zeros_like(q))
 
 
 @eqx.filter_jit

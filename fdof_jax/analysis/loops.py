@@ -138,12 +138,9 @@ def _loops(
     through = float(at_joint @ A @ acceleration)
     name = joint_names(linkage)[index]
     column, row = B[:, None], C[None]
-    return (
-        control.ss(A + column @ row, column, row, 0, name=f"loop of {name}"),
-        control.ss(
-            A, position[:, None], at_joint[None], through, name=f"response of {name}"
-        ),
-    )
+    loop = control.ss(A + column @ row, column, row, 0, name=f"loop of {name}")
+    following = A, position[:, None], at_joint[None], through
+    return loop, control.ss(*following, name=f"response of {name}")
 
 
 class Margins(NamedTuple):

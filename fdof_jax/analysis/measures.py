@@ -2,7 +2,9 @@
 
 from typing import Any
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 import scipy
 from jax import Array
@@ -11,20 +13,24 @@ from numpy.typing import ArrayLike
 
 from ..base.checks import is_traced, real_array, refusal
 from ..base.report import Report
-from ..control.drives import Drive, PIDController
+from ..control.drives import Drive, controller_in
 from ..control.pd import PDController
-from ..forces.element import Forces, StatefulElement, elements
+from ..forces.element import Forces, elements
 from ..linkage.linkage import (
     Linkage,
     check_linkage,
     joint_names,
     joints_of,
     moving_joints,
+    without_fixed,
 )
+from ..mechanics.kinematics import tip_position
 from ..references.reference import reference_motion
-from ..simulation.efforts import check_own
-from ..simulation.field import element_effort
+from ..references.task import TipReference
+from ..simulation.field import element_effort, with_states
 from ..simulation.sampled import Motion, acting_in, check_joints
+from ..simulation.simulate import check_own
+from ..simulation.solution import Solution
 
 BAND = 0.02  # around the final value, in which a response has settled
 SETTLED = 0.9  # part of the duration before which it has to
@@ -149,9 +155,8 @@ def response(
         expected = "a motion that reached its end"
         raise refusal("solution", expected, solution.outcome.tolist())
     moving, names = moving_joints(linkage), joint_names(linkage)
-    q, qd, efforts = (
-        np.asarray(table)[:, moving] for table in (solution.q, solution.qd, efforts)
-    )
+    tables = solution.q, solution.qd, efforts
+    q, qd, efforts = (np.asarray(table)[:, moving] for table in tables)
     path = scipy.interpolate.CubicHermiteSpline(ts, q, qd)
     efforts = efforts[ts >= begin]
     ts = np.append(begin, ts[ts > begin])
@@ -190,25 +195,20 @@ def _controller(
     `acting` has the held efforts of sampled control.
     """
     found = []
-    states = iter(solution.own)
-    for element, acts in zip(forces, acting):
-        state: PyTree = next(states) if isinstance(acts, StatefulElement) else ()
-        while isinstance(element, Drive):
-            element = element.command
-            if isinstance(acts, Drive):
-                acts, state = element, state.command
-        if isinstance(element, PDController | PIDController):
-            found.append((element, acts, state))
+    for element, (_, acts, state) in zip(forces, with_states(acting, solution.own)):
+        while isinstance(acts, Drive):
+            acts, state = acts.command, state.command
+        if (controller := controller_in(element)) is not None:
+            found.append((controller, acts, state))
     if len(found) != 1:
         expected = "one controller with a reference, or one drive that holds one"
         raise refusal("forces", expected, forces)
-    ((element, acts, state),) = found
+    ((controller, acts, state),) = found
 
     def effort(t: Array, q: Array, qd: Array, state: PyTree) -> Array:
         return element_effort(0, acts, t, q, qd, linkage, state)
 
-    efforts = jax.vmap(effort)(solution.ts, solution.q, solution.qd, state)
-    return element.pd if isinstance(element, PIDController) else element, efforts
+    return controller, jax.vmap(effort)(solution.ts, solution.q, solution.qd, state)
 
 
 def step_measures(
@@ -234,3 +234,35 @@ def step_measures(
     )
     rise_time = info["RiseTime"] if rises else np.nan
     return info["Overshoot"] / 100, rise_time, info["SettlingTime"]
+
+
+def demands(
+    controller: PDController, linkage: Linkage, solution: Solution
+) -> Float[Array, "time joint"]:
+    """Computes a controller's demands along a motion, 0 at fixed pairs [N or N m]."""
+    along = jax.vmap(controller.demand, in_axes=(0, 0, 0, None))
+    found = along(solution.ts, solution.q, solution.qd, linkage)
+    return without_fixed(linkage, found)
+
+
+@eqx.filter_jit
+def relative_demands(
+    controller: PDController, linkage: Linkage, solution: Solution
+) -> Float[Array, "time joint"]:
+    """The controller's demands over its limits; 0 at fixed pairs and infinite limits.
+
+    Where a limit is 0, a demand other than 0 gives an infinity of its sign.
+    """
+    demanded = demands(controller, linkage, solution)
+    limit = jnp.broadcast_to(controller.limit, demanded.shape)
+    beyond = jnp.where(demanded == 0, 0, jnp.sign(demanded) * jnp.inf)
+    return jnp.where(limit > 0, demanded / jnp.where(limit > 0, limit, 1), beyond)
+
+
+@eqx.filter_jit
+def tip_deviation(
+    linkage: Linkage, task: TipReference, solution: Solution
+) -> Float[Array, "time 2"]:
+    """Vectors from the commanded to the actual tip along a motion [m]."""
+    actual = jax.vmap(tip_position, in_axes=(None, 0))(linkage, solution.q)
+    return actual - jax.vmap(task.tip)(solution.ts)

@@ -152,11 +152,8 @@ def regressor(
         mass, moments, inertia = jnp.split(parameters, [1, 3], axis=1)
         com = moments / mass
         about_center = inertia[:, 0] - mass[:, 0] * jnp.sum(com**2, axis=1)
-        arm = eqx.tree_at(
-            lambda arm: (arm.mass, arm.com, arm.inertia),
-            linkage,
-            (mass[:, 0], com, about_center),
-        )
+        bodies = mass[:, 0], com, about_center
+        arm = eqx.tree_at(lambda arm: (arm.mass, arm.com, arm.inertia), linkage, bodies)
         return inverse_dynamics(arm, q, qd, qdd)
 
     # The efforts are linear in the parameters, so any values serve.

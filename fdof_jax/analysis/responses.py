@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from ..base.checks import is_traced, real_array, refusal
 from ..base.report import Report
-from ..control.drives import Drive
+from ..control.drives import commanding
 from ..control.pd import PDController
 from ..forces.element import (
     Element,
@@ -38,8 +38,7 @@ from ..simulation.simulate import simulate
 from ..simulation.solution import Solution
 from .linearization import holding_efforts
 from .loops import BANDWIDTH, Loop, bandwidth, closed_loop, margins, open_loop
-from .measures import SETTLED, step_measures
-from .tracking import relative_demands
+from .measures import SETTLED, relative_demands, step_measures
 
 # Samples of a response: at least so many, so that most arms share a program, and one
 # for each part of a radian of the fastest mode, between which cubics are exact to 1e-5.
@@ -65,13 +64,6 @@ class Probe(Reference):
     def __call__(self, t: Any, linkage: Linkage) -> tuple[Array, Array]:
         angle, rate = self.frequency * t, self.frequency * self.amplitude
         return self.center + self.amplitude * jnp.sin(angle), rate * jnp.cos(angle)
-
-
-def _commanding(element: object) -> Any:
-    """Returns the PD controller that an element is or holds as its command, or None."""
-    while isinstance(element, Drive):
-        element = element.command
-    return element if isinstance(element, PDController) else None
 
 
 class StepAndSine(Report):
@@ -171,7 +163,7 @@ def step_and_sine(
     n = q.size
     step = real_array("step", step, (n,), above=0, broadcast=True, unit="m or rad")
     duration = real_array("duration", duration, (), above=0, unit="s")
-    if (pd := _commanding(controller)) is None:
+    if not isinstance(pd := commanding(controller), PDController):
         expected = "a PDController, or a drive that holds one"
         raise refusal("controller", expected, controller)
     if is_traced(linkage, controller, forces, q, step, duration):
@@ -185,7 +177,7 @@ def step_and_sine(
     ) -> Element:
         """Returns the controller with a probe for its reference."""
         probe = Probe(center, amplitude, frequency)
-        return eqx.tree_at(lambda part: _commanding(part).reference, element, probe)
+        return eqx.tree_at(lambda part: commanding(part).reference, element, probe)
 
     def motion(
         acting: Element, start: State, own: OwnStates | None, ts: np.ndarray
@@ -230,7 +222,7 @@ def step_and_sine(
         change = np.asarray(run.q[:, k] - run.q[0, k]) / heights[k]
         rate = np.asarray(run.qd[:, k]) / heights[k]
         measures = step_measures(since, change, rate, change[-1])
-        demand = relative_demands(_commanding(acting), linkage, run)[:, k]
+        demand = relative_demands(commanding(acting), linkage, run)[:, k]
         if np.isinf(scale):  # the arm follows all sines
             loop = open_loop(linkage, start.q, with_probe(q), k + 1, forces)
             scale = margins(loop).crossover

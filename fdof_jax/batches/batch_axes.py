@@ -8,7 +8,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import PyTree
 
-from ..base.checks import instance, shown
+from ..base.checks import instance, refusal
 from ..forces.element import Forces
 from ..linkage.coordinates import State
 from ..linkage.linkage import Linkage
@@ -70,15 +70,12 @@ def batch_of(
         _has_axis(path, leaf, joints) for path, leaf in leaves if path[0].idx < 2
     ]
     try:
-        of_forces = jax.tree.map(
-            _force_has_axis, forces_axes, forces, is_leaf=lambda axis: axis is None
-        )
+        none = lambda axis: axis is None
+        of_forces = jax.tree.map(_force_has_axis, forces_axes, forces, is_leaf=none)
         batched += jax.tree.leaves(of_forces)
     except ValueError:
-        raise ValueError(
-            "forces_axes: expected 0, None or a tuple of these with one entry per "
-            f"element, got {shown(forces_axes)}."
-        ) from None
+        expected = "0, None or a tuple of these with one entry per element"
+        raise refusal("forces_axes", expected, forces_axes) from None
     sizes = {
         _name(*path): np.shape(leaf)[:1]
         for (path, leaf), has_axis in zip(leaves, batched)

@@ -25,7 +25,7 @@ from ..forces.added_inertia import present
 from ..forces.element import elements
 from ..forces.holders import holders
 from ..linkage.topology import real_joints
-from ..simulation.field import element_effort
+from ..simulation.field import total_effort
 from ..simulation.integrate import Settings
 from ..simulation.scene import Scene
 from ..simulation.simulate import simulate
@@ -75,9 +75,7 @@ class Outcome(NamedTuple):
 
 def _check_value(value: PyTree) -> None:
     """Raises ValueError unless a reduction returned arrays of numbers."""
-    if not jax.tree.leaves(value):
-        raise refusal("reduce", "a function that returns arrays", value)
-    for leaf in jax.tree.leaves(value):
+    for leaf in jax.tree.leaves(value) or [value]:
         if not eqx.is_array_like(leaf):
             raise refusal("reduce", "a function that returns arrays", leaf)
         dtype = leaf.dtype if eqx.is_array(leaf) else jnp.result_type(leaf)
@@ -202,10 +200,7 @@ def expected_work(ts: Array, moving: PyTree, shared: PyTree) -> Array:
         turning = jnp.stack(real_joints(linkage.ef))
 
         def at(t, q, qd):
-            tau = jnp.zeros_like(q)
-            for index, element in enumerate(acting):
-                state = element.initial_state(linkage)
-                tau = tau + element_effort(index, element, t, q, qd, linkage, state)
+            tau = total_effort(linkage, acting, t, q, qd)
             qdd = forward_dynamics(linkage, q, qd, tau, forces)
             rate, acceleration = (jnp.where(turning, a, 0) for a in (qd, qdd))
             norm = jnp.linalg.norm

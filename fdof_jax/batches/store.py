@@ -98,9 +98,8 @@ def _variables(like: PyTree, linkage: Linkage) -> list[Variable]:
             axes = _OF_SAMPLES[name]
         elif of_motion and name.startswith("own_"):
             axes[0] = "time"
-        attributes = (
-            flags(OUTCOMES) if result else labels.get(name, {}) if of_motion else {}
-        )
+        own = labels.get(name, {}) if of_motion else {}
+        attributes = flags(OUTCOMES) if result else own
         name = "outcome" if of_motion and result else name
         variables.append(Variable(name, dtype, shape, ["member", *axes], attributes))
     return [*variables, Variable("failed", np.dtype(bool), (), ["member"], {})]
@@ -156,13 +155,8 @@ class Store:
         group = zarr.create_group(zarr.storage.MemoryStore(memory))
 
         def create(name: str, axes: list[str], labels: Mapping, **given: Any) -> None:
-            group.create_array(
-                name,
-                compressors=[zarr.codecs.Crc32cCodec()],
-                dimension_names=axes,
-                attributes=labels,
-                **given,
-            )
+            given["compressors"] = [zarr.codecs.Crc32cCodec()]
+            group.create_array(name, dimension_names=axes, attributes=labels, **given)
 
         for v in self.variables:
             create(
@@ -232,9 +226,8 @@ class Store:
         for variable, array in zip(self.variables, self.arrays):
             if not array.size:  # without a file
                 continue
-            file = "/".join(
-                [variable.name, "c", str(block), *"0" * len(variable.shape)]
-            )
+            parts = variable.name, "c", str(block), *"0" * len(variable.shape)
+            file = "/".join(parts)
             try:
                 if not (self.folder / file).exists():
                     raise FileNotFoundError
@@ -283,7 +276,7 @@ def _constants(program: ClosedJaxpr | Jaxpr) -> Iterator[Array]:
     Raises ValueError if it calls a Python function, which no digest can name.
     """
     yield from getattr(program, "consts", ())  # an open Jaxpr has none in JAX 0.10
-    programs = ClosedJaxpr, Jaxpr
+    is_program = lambda leaf: isinstance(leaf, ClosedJaxpr | Jaxpr)
     for operation in program.eqns:
         if operation.primitive.name in ("pure_callback", "io_callback"):
             function = operation.params["callback"].callback_func
@@ -291,11 +284,8 @@ def _constants(program: ClosedJaxpr | Jaxpr) -> Iterator[Array]:
             if not str(getattr(function, "__module__", "")).startswith("equinox."):
                 expected = "a sweep without functions that only Python can call"
                 raise refusal("store", expected, function)
-        leaves = jax.tree.leaves(
-            operation.params, is_leaf=lambda leaf: isinstance(leaf, programs)
-        )
-        for leaf in leaves:
-            if isinstance(leaf, programs):
+        for leaf in jax.tree.leaves(operation.params, is_leaf=is_program):
+            if is_program(leaf):
                 yield from _constants(leaf)
 
 

@@ -212,9 +212,7 @@ def sweep(
     try:
         q, qd = (jnp.asarray(a) if is_traced(a) else numpy_array(a) for a in state0)
     except (TypeError, ValueError):
-        raise ValueError(
-            f"state0: expected a State(q, qd), got {shown(state0)}."
-        ) from None
+        raise refusal("state0", "a State(q, qd)", state0) from None
     ts = real_array("ts", ts, (None,))
     # Other kinds than real numbers are refused by `batch_of`.
     other = lambda a: a.dtype != ts.dtype and a.dtype.kind in "iuf"

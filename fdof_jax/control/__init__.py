@@ -2,8 +2,7 @@
 
 from .actuators import Activation, Actuators
 from .drives import DCMotor, FirstOrderLag, PIDController, SpeedLimit
-from .model_based import ComputedTorque, GravityFeedforward
-from .pd import PDController, gains_from_frequency
+from .pd import ComputedTorque, GravityFeedforward, PDController, gains_from_frequency
 
 __all__ = [
     "Activation", "Actuators", "ComputedTorque", "DCMotor", "FirstOrderLag",

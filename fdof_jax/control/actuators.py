@@ -1,6 +1,5 @@
 """Actuators as simulators and data sheets describe them: affine laws with limits."""
 
-from collections.abc import Iterator
 from typing import Any
 
 import jax.numpy as jnp
@@ -10,12 +9,7 @@ from jax import Array
 from ..base.checks import JOINT
 from ..forces.element import StatefulElement
 from ..forces.switches import clip, switch
-from ..linkage.fields import Condition, Part, Values, field, value_of
-
-
-def _apart(name: str, lower: Array | None, upper: Array | None) -> Iterator[Condition]:
-    if lower is not None and upper is not None:
-        yield Condition((lower < upper).all(), name, "less than upper", (lower, upper))
+from ..linkage.fields import Condition, Part, Values, field, ordered, value_of
 
 
 class Activation(Part):
@@ -45,10 +39,10 @@ class Activation(Part):
     rate: Values = field((None, 4), unit="1/s and others")
     start: Values = field((None,), unit="that of the state")
     lower: Values | None = field(
-        (None,), unit="that of the state", finite=False, optional=True, default=None
+        (None,), unit="that of the state", finite=False, default=None
     )
     upper: Values | None = field(
-        (None,), unit="that of the state", finite=False, optional=True, default=None
+        (None,), unit="that of the state", finite=False, default=None
     )
 
     def conditions(self):
@@ -56,7 +50,7 @@ class Activation(Part):
         sizes = [len(value) for value in values if value is not None]
         alike = len(set(sizes)) == 1
         yield Condition(alike, "gain", "as many actuators in all fields", tuple(sizes))
-        yield from _apart("lower", self.lower, self.upper)
+        yield from ordered(self, "lower", "upper")
 
 
 class Actuators(StatefulElement):
@@ -95,17 +89,13 @@ class Actuators(StatefulElement):
     gain: Values = field((None, 3), unit="N or N m per unit of the control")
     bias: Values = field((None, 3), unit="N or N m")
     control: Any = field((None,), unit="that of the actuator", function=True)
-    lower: Values | None = field(
-        (None,), unit="N or N m", finite=False, optional=True, default=None
-    )
-    upper: Values | None = field(
-        (None,), unit="N or N m", finite=False, optional=True, default=None
-    )
+    lower: Values | None = field((None,), unit="N or N m", finite=False, default=None)
+    upper: Values | None = field((None,), unit="N or N m", finite=False, default=None)
     effort_lower: Values | None = field(
-        (JOINT,), unit="N or N m", finite=False, optional=True, default=None
+        (JOINT,), unit="N or N m", finite=False, default=None
     )
     effort_upper: Values | None = field(
-        (JOINT,), unit="N or N m", finite=False, optional=True, default=None
+        (JOINT,), unit="N or N m", finite=False, default=None
     )
     activation: Activation | None = None
 
@@ -116,8 +106,8 @@ class Actuators(StatefulElement):
         sizes = [len(v) for v in (*values, *fixed, *states) if v is not None]
         alike = len(set(sizes)) == 1
         yield Condition(alike, "gear", "as many actuators in all fields", tuple(sizes))
-        yield from _apart("lower", self.lower, self.upper)
-        yield from _apart("effort_lower", self.effort_lower, self.effort_upper)
+        yield from ordered(self, "lower", "upper")
+        yield from ordered(self, "effort_lower", "effort_upper")
 
     def initial_state(self, linkage):
         """The activations' states at the start, (actuator,); () without."""
@@ -144,8 +134,6 @@ def _within(values: Array, lower: Array | None, upper: Array | None) -> Array:
     """Clips to the limits that there are."""
     if lower is None and upper is None:
         return values
-    low, high = (
-        default if limit is None else limit
-        for limit, default in ((lower, -np.inf), (upper, np.inf))
-    )
+    low = -np.inf if lower is None else lower
+    high = np.inf if upper is None else upper
     return clip(values, low, high)

@@ -163,9 +163,8 @@ class LinearActuator(Between, InertialElement):
 
         The moments about the first pin determine each pin's sideways share.
         """
-        along = lambda q, qd: jax.jvp(
-            lambda q: self.coordinates(q, linkage), (q,), (qd,)
-        )[1]
+        coordinates = lambda q: self.coordinates(q, linkage)
+        along = lambda q, qd: jax.jvp(coordinates, (q,), (qd,))[1]
         _, (x1, y1, x2, y2, turning) = jax.jvp(along, (q, qd), (qd, qdd))
         weight = 1j * linkage.gravity
         cylinder = self.mass[0] * (jax.lax.complex(x1, y1) + weight)

@@ -114,9 +114,8 @@ def element_of(value: Callable) -> Element:
 
 def elements(name: str, forces: Forces) -> tuple[Element, ...]:
     """Returns a tuple of callables as elements, or raises ValueError."""
-    if isinstance(forces, tuple) and all(
-        callable(item) and not isinstance(item, type) for item in forces
-    ):
+    acts = lambda item: callable(item) and not isinstance(item, type)
+    if isinstance(forces, tuple) and all(map(acts, forces)):
         return tuple(map(element_of, forces))
     raise ValueError(
         f"{name}: expected a tuple of callables (t, q, qd, linkage) -> tau, for "

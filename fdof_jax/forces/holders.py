@@ -14,8 +14,8 @@ from jax import Array
 from jaxtyping import Bool
 from numpy.typing import ArrayLike
 
-from ..base.checks import is_traced, shown
-from ..linkage.fields import Condition, Values, each, field
+from ..base.checks import is_traced, refusal
+from ..linkage.fields import Condition, Values, each, field, ordered
 from ..linkage.linkage import Linkage, joints_of
 from ..linkage.topology import MOST_PAIRS
 from .element import Forces, ScalarElement
@@ -77,11 +77,9 @@ class JointFriction(Holder):
     """
 
     level: Values = field(unit="N or N m", minimum=0)
-    static: Values | None = field(
-        unit="N or N m", minimum=0, optional=True, default=None
-    )
+    static: Values | None = field(unit="N or N m", minimum=0, default=None)
     speed: Values | None = field(
-        unit="m/s or rad/s", above=0, optional=True, default=None, kw_only=True
+        unit="m/s or rad/s", above=0, default=None, kw_only=True
     )
 
     @property
@@ -92,10 +90,8 @@ class JointFriction(Holder):
         if self.static is not None:
             alone = self.speed is None
             yield Condition(alone, "static", "none beside speed", self.static)
-            enough = (self.static >= self.level).all()
-            yield Condition(
-                enough, "static", "at least the level", (self.static, self.level)
-            )
+            enough, both = (self.static >= self.level).all(), (self.static, self.level)
+            yield Condition(enough, "static", "at least the level", both)
 
     def levels(self, joints):
         static = self.level if self.static is None else self.static
@@ -140,8 +136,7 @@ class HardStops(Holder):
     restitution: Values = field(unit="1", minimum=0, default=0.0, kw_only=True)
 
     def conditions(self):
-        apart = (self.lower < self.upper).all()
-        yield Condition(apart, "lower", "less than upper", (self.lower, self.upper))
+        yield from ordered(self, "lower", "upper")
         e = self.restitution
         yield Condition((e < 1).all(), "restitution", "less than 1", e)
 
@@ -188,8 +183,7 @@ class Brake(Holder):
         return {"joints": numbers_in(self.joints)} | ends
 
     def conditions(self):
-        ends = self.begin, self.end
-        yield Condition(self.begin < self.end, "begin", "less than end", ends)
+        yield from ordered(self, "begin", "end")
 
     def conditions_on(self, linkage):
         count, last = joints_of(linkage), (self.joints * np.array(_NUMBERS)).max()
@@ -218,10 +212,8 @@ def numbered(joints: Any) -> Array:
         isinstance(n, bool) or not isinstance(n, int) or n not in _NUMBERS
         for n in numbers
     ):
-        raise ValueError(
-            f"joints: expected a number of 1 to {_NUMBERS[-1]}, or several such, got "
-            f"{shown(joints)}."
-        )
+        expected = f"a number of 1 to {_NUMBERS[-1]}, or several such"
+        raise refusal("joints", expected, joints)
     return jax.device_put(np.isin(_NUMBERS, numbers))
 
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ..base.checks import JOINT
-from ..linkage.fields import Condition, Values, each, field
+from ..linkage.fields import Condition, Values, each, field, ordered
 from ..linkage.linkage import Linkage
 from .element import ScalarElement
 from .switches import switch
@@ -110,11 +110,10 @@ class EffortHistory(ScalarElement):
     tau: Values = field((None, JOINT), unit="N or N m")
 
     def conditions(self):
-        times, efforts = len(self.ts), len(self.tau)
+        times, rows = len(self.ts), len(self.tau)
         rising = (self.ts[1:] > self.ts[:-1]).all() & (times > 0)
         yield Condition(rising, "ts", "increasing times", (self.ts,))
-        same = times == efforts
-        yield Condition(same, "tau", f"{times} rows, one per time", (efforts,))
+        yield Condition(times == rows, "tau", f"{times} rows, one per time", (rows,))
 
     @property
     def jump_ts(self) -> Array:
@@ -162,13 +161,11 @@ class JointStops(ScalarElement):
     stiffness: Values = field(unit="N/m or N m/rad", above=0, default=1e4, kw_only=True)
     damping: Values = field(unit="s/m or s/rad", minimum=0, default=0.0, kw_only=True)
     smoothing: Values | None = field(
-        unit="m or rad", above=0, optional=True, default=None, kw_only=True
+        unit="m or rad", above=0, default=None, kw_only=True
     )
 
     def conditions(self):
-        ends = self.lower, self.upper
-        apart = (self.lower < self.upper).all()
-        yield Condition(apart, "lower", "less than upper", ends)
+        yield from ordered(self, "lower", "upper")
 
     def respond(self, scheduled, q, qd, linkage):
         values = self.lower, self.upper, self.stiffness, self.damping
@@ -209,9 +206,8 @@ def _penetration(depth, width):
 def _parts(depth, width):
     """Splits the depth into the parts within the parabola and beyond it."""
     # jnp.clip would multiply the derivative in an infinite end of a range by 0.
-    deep, touching = (
-        switch(depth + a, True, False, continuous=True) for a in (-width, width)
-    )
+    passed = lambda a: switch(depth + a, True, False, continuous=True)
+    deep, touching = passed(-width), passed(width)
     near = jnp.where(deep, 2 * width, jnp.where(touching, depth + width, 0))
     return near, jnp.where(deep, depth - width, 0)
 

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ..linkage.fields import Condition, Truth, Values, field, has_come, of_kind
+from ..linkage.fields import Condition, Truth, Values, field, has_come, of_kind, ordered
 from ..linkage.frames import scalar_frames
 from .element import InertialElement
 from .points import Load, Point
@@ -44,10 +44,8 @@ class Payload(InertialElement):
     place: Point = of_kind(Point)
     mass: Values = field((), unit="kg", minimum=0)
     inertia: Values = field((), unit="kg m^2", minimum=0, default=0.0)
-    begin: Values | None = field(
-        (), unit="s", optional=True, default=None, kw_only=True
-    )
-    end: Values | None = field((), unit="s", optional=True, default=None, kw_only=True)
+    begin: Values | None = field((), unit="s", default=None, kw_only=True)
+    end: Values | None = field((), unit="s", default=None, kw_only=True)
     velocity: Values = field(
         (None,), unit="m/s and rad/s", default=(0.0, 0.0), kw_only=True
     )
@@ -59,9 +57,7 @@ class Payload(InertialElement):
         yield Condition(moves, "place", "a point of a moving link", self.place)
         used = (self.velocity == 0).all() | (self.begin is not None)
         yield Condition(used, "velocity", "zeros without begin", self.velocity)
-        if self.begin is not None and self.end is not None:
-            times = self.begin, self.end
-            yield Condition(self.begin < self.end, "begin", "less than end", times)
+        yield from ordered(self, "begin", "end")
 
     @property
     def jump_ts(self) -> Array | None:
@@ -103,9 +99,8 @@ class Payload(InertialElement):
 
     def loads(self, t, q, qd, qdd, linkage):
         """Returns its weight and inertia as a load on its place."""
-        along = lambda q, qd: jax.jvp(
-            lambda q: self.coordinates(q, linkage), (q,), (qd,)
-        )[1]
+        coordinates = lambda q: self.coordinates(q, linkage)
+        along = lambda q, qd: jax.jvp(coordinates, (q,), (qd,))[1]
         _, (x, y, turning) = jax.jvp(along, (q, qd), (qd, qdd))
         force = -self.mass * (jax.lax.complex(x, y) + 1j * linkage.gravity)
         return (Load(self.place, force, -self.inertia * turning),)

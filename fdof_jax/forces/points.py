@@ -17,7 +17,7 @@ from jax import Array
 from jaxtyping import Complex, Float, Int, PyTree
 from numpy.typing import ArrayLike
 
-from ..base.checks import instance, is_traced, refusal, shown, whole_number
+from ..base.checks import instance, is_traced, refusal, whole_number
 from ..linkage.fields import (
     Condition,
     Part,
@@ -47,10 +47,8 @@ def _link(link: int | Array) -> Array:
     if isinstance(link, Array) and not is_traced(link) and link.shape == ():
         link = link.item()  # of another point, by `replace`
     if whole_number("link", link, 0) > MOST_PAIRS:
-        raise ValueError(
-            f"link: expected 0 (the ground) or a moving link, 1 to {MOST_PAIRS}, got "
-            f"{shown(link)}."
-        )
+        expected = f"0 (the ground) or a moving link, 1 to {MOST_PAIRS}"
+        raise refusal("link", expected, link)
     return jax.device_put(np.array(link))
 
 
@@ -117,11 +115,9 @@ class Load(NamedTuple):
     def efforts(self, frames: Frames) -> tuple[Array, ...]:
         """Computes the joint efforts that do the same work [N or N m]."""
         # A joint moves only the links beyond it.
-        efforts = work(frames, self.point.place(frames), self.vector(), self.moment)
-        return tuple(
-            jnp.where(k < self.point.link, effort, 0)
-            for k, effort in enumerate(efforts)
-        )
+        place, link = self.point.place(frames), self.point.link
+        efforts = work(frames, place, self.vector(), self.moment)
+        return tuple(jnp.where(k < link, x, 0) for k, x in enumerate(efforts))
 
 
 def work(
@@ -181,12 +177,9 @@ class Between(Element):
 
     def slopes(self, frames: Frames, vector: Array) -> tuple[Array, ...]:
         """Derivatives of length^2 / 2 in the joint positions."""
-        works = work(frames, self.a.place(frames), vector)
+        works = enumerate(work(frames, self.a.place(frames), vector))
         beyond = lambda k, point: jnp.where(k < point.link, 1, 0)
-        return tuple(
-            (beyond(k, self.b) - beyond(k, self.a)) * work
-            for k, work in enumerate(works)
-        )
+        return tuple((beyond(k, self.b) - beyond(k, self.a)) * x for k, x in works)
 
 
 def over(length: Array) -> Array:
@@ -358,6 +351,5 @@ class Wrench(PointElement):
     def loads(self, scheduled, frames, qd):
         force, moment = scheduled
         along = pick(self.point.link, frames.direction)
-        return (
-            Load(self.point, jnp.where(self.follows, force * along, force), moment),
-        )
+        force = jnp.where(self.follows, force * along, force)
+        return (Load(self.point, force, moment),)

@@ -11,8 +11,7 @@ from numpy.typing import ArrayLike
 
 from ..base.checks import function, instance, real_array, refusal, shown
 from ..base.report import Report
-from ..search.bounded import Evaluation, Run, minimise
-from ..search.lanes import Lanes, check_motion, check_scene
+from ..search import Evaluation, Lanes, Run, check_motion, check_scene, minimise
 from ..simulation.scene import Scene
 from ..simulation.sensitivities import sensitivities
 from ..simulation.simulate import simulate
@@ -209,7 +208,7 @@ def next_motion(
 def _refused(scene: Scene, ts: Array, within: Callable | None) -> str:
     """Says why a search cannot begin with a motion."""
     check_motion("experiment(...)(...)", scene, ts)
-    solution = simulate(scene.linkage, scene.state0, ts, scene.forces)
+    solution = simulate(scene, ts)
     if within is not None:
         shares = np.asarray(within(scene, solution))
         entry = np.unravel_index(np.argmax(np.abs(shares)), shares.shape)

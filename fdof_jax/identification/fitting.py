@@ -7,8 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..base.checks import keywords_as, refusal
-from ..search.bounded import Evaluation, Run, minimise
-from ..search.lanes import Lanes, check_motion
+from ..search import Evaluation, Lanes, Run, check_motion, minimise
 from .problems import (
     Bounds,
     Observe,

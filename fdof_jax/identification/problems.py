@@ -13,8 +13,7 @@ from numpy.typing import ArrayLike
 
 from ..base.checks import function, instance, real_array, refusal, shown
 from ..mechanics.kinematics import joint_positions, tip_position
-from ..search.bounded import Evaluation
-from ..search.lanes import check_scene, sum_of_squares
+from ..search import Evaluation, check_scene, sum_of_squares
 from ..simulation.sampled import check_joints
 from ..simulation.scene import Scene, stacked
 from ..simulation.sensitivities import sensitivities
@@ -197,17 +196,6 @@ def _successive(weight: Array) -> Array:
     return (weight[1:] > 0) & (weight[:-1] > 0)
 
 
-def _check_scene_at(name: str, scene_at: SceneAt, parameters: dict[str, Array]) -> None:
-    try:
-        scene = scene_at(parameters)
-    except KeyError as error:
-        raise ValueError(
-            f"start: expected a value for {error}, which {name} may use, got "
-            f"{shown(list(parameters))}."
-        ) from error
-    check_scene(f"{name}(...)", scene)
-
-
 def check_times(ts: ArrayLike) -> Array:
     ts = real_array("ts", ts, (None,))
     if ts.size < 2 or not (np.diff(ts) > 0).all():
@@ -258,7 +246,14 @@ def problems_of(
     stacked(scene_at, names[0])  # raises unless all are alike
     first = jax.tree.map(jnp.asarray, named(unknowns.shapes, unknowns.start))
     for each in scene_at:
-        _check_scene_at(names[0], each, first)
+        try:
+            scene = each(first)
+        except KeyError as error:
+            raise ValueError(
+                f"start: expected a value for {error}, which {names[0]} may use, got "
+                f"{shown(list(first))}."
+            ) from error
+        check_scene(f"{names[0]}(...)", scene)
     seen = ~np.isnan(readings)
     rows = zip(scene_at, np.where(seen, readings, 0), np.where(seen, weights, 0))
     return [Problem(scene, observe, unknowns, ts, *row) for scene, *row in rows]

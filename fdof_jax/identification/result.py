@@ -7,7 +7,7 @@ import scipy
 from jaxtyping import Float
 
 from ..base.report import Report
-from ..search.bounded import Evaluation, Run, held_at_bounds
+from ..search import Evaluation, Run, held_at_bounds
 from .problems import Named, Problem, Unknowns, named
 
 # A combination is weak if its standard error exceeds this part of its size.

@@ -68,12 +68,13 @@ def field(
     - `unit`: for messages, for instance "N m s/rad".
     - `minimum`, `above`: bounds; `finite`: whether infinities are refused.
     - `function`: whether a function that returns such an array is accepted;
-      `optional`: whether None is.
+      `optional`: whether None is, as it always is where it is the default.
     - `default`, `kw_only`: as of `dataclasses.field`.
     """
     per_joint = shape is None
     rules = dict(shape=(JOINT,) if per_joint else shape, broadcast=per_joint, unit=unit)
     rules |= dict(minimum=minimum, above=above, finite=finite)
+    optional = optional or default is None
     about = {"rules": rules, "function": function, "optional": optional}
     return dataclasses.field(default=default, kw_only=kw_only, metadata=about)
 
@@ -300,6 +301,13 @@ def _within(part: Part) -> Iterator[tuple[str, Part]]:
             yield name, value
         elif callable(value) and not isinstance(value, type):
             yield name, Foreign(value)
+
+
+def ordered(part: Part, first: str, second: str) -> Iterator[Condition]:
+    """Yields the condition that a field is less than another, if both are given."""
+    low, high = vars(part)[first], vars(part)[second]
+    if low is not None and high is not None:
+        yield Condition((low < high).all(), first, f"less than {second}", (low, high))
 
 
 def jumps_of(*parts: Part) -> Array | None:

@@ -156,9 +156,8 @@ class Spline(Path):
 @at_once
 def _bends(points: Array, closed: bool) -> Array:
     """Solves b[k-1] + 4 b[k] + b[k+1] = 6 d2[k]: slopes of neighbours meet."""
-    right = 6 * (
-        jnp.roll(points, 1, axis=0) - 2 * points + jnp.roll(points, -1, axis=0)
-    )
+    before, after = (jnp.roll(points, k, axis=0) for k in (1, -1))
+    right = 6 * (before - 2 * points + after)
     if not closed:  # no bend at the ends: half of a closed one that turns over
         right = right.at[jnp.array([0, -1])].set(0)
         right = jnp.concatenate([right, -right[-2:0:-1]])

@@ -8,7 +8,7 @@ from jax import Array
 from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
-from ..base.checks import function, known, real_array, refusal, shown
+from ..base.checks import function, known, real_array, refusal
 from ..base.known_values import at_once
 from ..linkage.fields import Foreign, Part, default, optional
 from ..linkage.linkage import Linkage, check_linkage, joints_of
@@ -98,9 +98,7 @@ def reference_motion(
     """Positions and velocities of a reference, checked to be two arrays (n,)."""
     motion = reference(t, linkage)
     if not isinstance(motion, tuple) or len(motion) != 2:
-        raise ValueError(
-            f"reference: expected it to return (q_ref, qd_ref), got {shown(motion)}."
-        )
+        raise refusal("reference", "it to return (q_ref, qd_ref)", motion)
     n = joints_of(linkage)
     q_ref, qd_ref = (
         real_array("reference", part, (n,), broadcast=True, of=f"{n} joints")

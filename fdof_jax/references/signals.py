@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ..base.checks import JOINT
-from ..linkage.fields import Condition, Values, field
+from ..linkage.fields import Condition, Values, field, ordered
 from ..linkage.linkage import Linkage, joints_of
 from .reference import Reference
 
@@ -70,8 +70,7 @@ class Pulse(Reference):
     end: Values = field((), unit="s", kw_only=True)
 
     def conditions(self):
-        ends = self.begin, self.end
-        yield Condition(self.begin < self.end, "begin", "less than end", ends)
+        yield from ordered(self, "begin", "end")
         yield _of_one_length(outside=self.outside, inside=self.inside)
 
     @property

@@ -20,10 +20,9 @@ RAMP = 0.25  # share of its time in which a trapezoidal profile speeds up
 
 def _trapezoidal(x: Array) -> Array:
     scale = 2 * RAMP * (1 - RAMP)
-    cruising = jnp.where(
-        x > 1 - RAMP, 1 - (1 - x) ** 2 / scale, (x - RAMP / 2) / (1 - RAMP)
-    )
-    return jnp.where(x < RAMP, x**2 / scale, cruising)
+    cruising, slowing = (x - RAMP / 2) / (1 - RAMP), 1 - (1 - x) ** 2 / scale
+    later = jnp.where(x > 1 - RAMP, slowing, cruising)
+    return jnp.where(x < RAMP, x**2 / scale, later)
 
 
 # The share of the way as a function of the share of the time, both from 0 to 1.

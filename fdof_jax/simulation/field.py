@@ -253,6 +253,17 @@ def health_of(t, y, args) -> Health:
     return health_at(conditioning(args.moving().constants, delta, added))
 
 
+def total_effort(
+    linkage: Linkage, forces: tuple[Element, ...], t: Array, q: Array, qd: Array
+) -> Array:
+    """Computes the sum of elements' efforts in their initial states [N or N m]."""
+    total = jnp.zeros_like(q)
+    for k, element in enumerate(forces):
+        state = element.initial_state(linkage)
+        total = total + element_effort(k, element, t, q, qd, linkage, state)
+    return total
+
+
 def element_effort(
     index: int,
     element: Element,

@@ -7,8 +7,7 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from ..base.checks import instance, real_array, refusal, whole_number
-from ..control.model_based import ModelBased
-from ..control.pd import PDController
+from ..control.pd import ModelBased, PDController
 from ..linkage.coordinates import State
 from ..linkage.linkage import Linkage, check_linkage
 from ..linkage.topology import TOPOLOGIES
@@ -24,7 +23,6 @@ _MOST = 1_000_000  # they are drawn one after another
 # topology follows the circle away from its singularities.
 _START = np.array([0.0, 1.0, -0.1, -1.0, 0.7, 0.8])
 _BASE = np.pi / 2  # a slide on the ground is level
-_CENTER = [1.99, 0.95]
 # The assembly (of two) that each arm starts in.
 _BRANCH = dict(zip(TOPOLOGIES, (-1, 1, -1, -1, 1, 1, 1)))
 _KP, _KD = {"R": 500.0, "P": 2000.0}, {"R": 50.0, "P": 200.0}
@@ -188,7 +186,7 @@ def circle_scenes() -> dict[str, Scene]:
             base_angle=_BASE,
         )
         task = CircleTask(
-            center=_CENTER,
+            center=[1.99, 0.95],
             radius=0.25,
             period=4.0,
             phase=np.pi / 2,

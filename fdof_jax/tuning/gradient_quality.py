@@ -11,13 +11,13 @@ from jax import Array
 from jaxtyping import Bool, Float
 
 from ..analysis.linearization import Modes, closed_loop_modes, depends_on_state_alone
-from ..analysis.tracking import relative_demands
+from ..analysis.measures import relative_demands
 from ..base.configuration import options_of_loops
 from ..base.known_values import in_numpy
 from ..base.report import Report
 from ..linkage.linkage import joint_names
 from ..references.reference import reference_of
-from ..search.lanes import check_motion
+from ..search import check_motion
 from ..simulation.prescribed import PrescribedMotion
 from ..simulation.scene import Scene, is_number
 from ..simulation.sensitivities import Sensitivities, sensitivities
@@ -143,15 +143,12 @@ def _times(scene: Scene) -> dict[str, Array]:
     return times
 
 
-def _with_times(scene: Scene, times: Array) -> Scene:
-    where = lambda scene: list(_times(scene).values())
-    return eqx.tree_at(where, scene, list(times)) if len(times) else scene
-
-
 def _scene_at(scene: Scene, tuned: Array | np.ndarray, z: Array | np.ndarray) -> Scene:
     """The scene with gains of the logarithms in `z`, which its times follow."""
     logs, times = jnp.split(jnp.asarray(z), [tuned.size])
-    return _with_times(with_log_gains(scene, logs, tuned), times)
+    scene = with_log_gains(scene, logs, tuned)
+    where = lambda scene: list(_times(scene).values())
+    return eqx.tree_at(where, scene, list(times)) if len(times) else scene
 
 
 def _errors(scene: Scene) -> Loss:

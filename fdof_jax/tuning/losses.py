@@ -11,15 +11,14 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from ..analysis.tracking import relative_demands, tip_deviation
+from ..analysis.measures import relative_demands, tip_deviation
 from ..base.checks import function, instance, is_traced, real_array, refusal
 from ..control.pd import PDController
 from ..forces.element import Element
 from ..linkage.fields import Part, Values, field
 from ..linkage.linkage import without_fixed
 from ..references.reference import reference_motion, reference_of
-from ..search.bounded import Evaluation
-from ..search.lanes import check_scene, sum_of_squares
+from ..search import Evaluation, check_scene, sum_of_squares
 from ..simulation.sampled import check_joints
 from ..simulation.scene import Scene
 from ..simulation.sensitivities import Sensitivities, sensitivities

@@ -9,15 +9,22 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from ..analysis.tracking import tip_deviation
+from ..analysis.measures import tip_deviation
 from ..base.checks import place_of, real_array, whole_number
 from ..base.report import Report
-from ..control.model_based import ComputedTorque
+from ..control.pd import ComputedTorque
 from ..forces.joints import EffortHistory
-from ..linkage.linkage import joints_of, without_fixed
+from ..linkage.linkage import without_fixed
 from ..references.task import TipReference
-from ..search.bounded import Evaluation, Run, best_of, minimise
-from ..search.lanes import Lanes, check_motion, sum_of_squares
+from ..search import (
+    Evaluation,
+    Lanes,
+    Run,
+    best_of,
+    check_motion,
+    minimise,
+    sum_of_squares,
+)
 from ..simulation.efforts import joint_efforts
 from ..simulation.scene import Scene
 from ..simulation.sensitivities import sensitivities
@@ -129,8 +136,7 @@ def _lane(z: Array, problem: tuple[Scene, Array, Array, Array]) -> Evaluation:
 
 def _limit_of(scene: Scene) -> Array:
     """Limits of a scene's controller (n,), 0 at fixed pairs."""
-    limit = jnp.broadcast_to(controller_of(scene).limit, joints_of(scene.linkage))
-    return without_fixed(scene.linkage, limit)
+    return without_fixed(scene.linkage, controller_of(scene).limit)
 
 
 def optimal_efforts(
@@ -199,15 +205,12 @@ def optimal_efforts(
     price = real_array("effort_rate", effort_rate, (), minimum=0)
     ts, times = np.linspace(0, end, _SAMPLES), np.linspace(0, end, knots)
 
-    def motion_of(scene: Scene) -> Solution:
-        return simulate(scene.linkage, scene.state0, ts, scene.forces, throw=False)
-
     def error_of(scene: Scene, solution: Solution) -> float:
         return float(np.linalg.norm(_deviations(scene, task, solution)))
 
     torque = ComputedTorque(_BANDWIDTH**2, 2 * _BANDWIDTH, limit, task)
     guides = [scene, with_controller(scene, torque)]
-    motions = [motion_of(guide) for guide in guides]
+    motions = [simulate(guide, ts, throw=False) for guide in guides]
     efforts = np.stack([_efforts_at(times, *pair) for pair in zip(guides, motions)])
     # Efforts without a limit above zero are zero, whatever the unknowns.
     most = np.broadcast_to(np.where(limit > 0, 1.0, 0.0), efforts.shape)
@@ -228,7 +231,7 @@ def optimal_efforts(
     run = best_of(runs)
     efforts = limit * run.z.reshape(knots, -1)
     found = with_controller(scene, EffortHistory(times, efforts))._replace(t1=end)
-    solution = motion_of(found)
+    solution = simulate(found, ts, throw=False)
     return OptimalMotion(
         scene=found,
         ts=times,

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from ..base.checks import known, refusal
 from ..base.report import Report
 from ..linkage.linkage import Linkage, joint_names, moving_joints
-from ..search.bounded import Run, best_of
+from ..search import Run, best_of
 from ..simulation.scene import Scene
 from .losses import GainBox, controller_of, with_gains
 

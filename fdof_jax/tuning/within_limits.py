@@ -12,9 +12,8 @@ from numpy.typing import ArrayLike
 
 from ..analysis.linearization import checked, equilibrium, loop_matrices
 from ..analysis.loops import Loop, margins, open_loop
-from ..analysis.measures import BAND, step_measures
+from ..analysis.measures import BAND, demands, step_measures
 from ..analysis.responses import samples_of
-from ..analysis.tracking import demands
 from ..base.checks import instance
 from ..base.known_values import in_numpy
 from ..base.report import Report
@@ -23,8 +22,7 @@ from ..forces.element import Element
 from ..linkage.fields import Part, Values, check_joints, field, sized
 from ..linkage.linkage import joint_names, joints_of, moving_joints
 from ..references.reference import reference_motion
-from ..search.bounded import Evaluation, check_search
-from ..search.lanes import Lanes, check_motion, sum_of_squares
+from ..search import Evaluation, Lanes, check_motion, check_search, sum_of_squares
 from ..simulation.scene import Scene, with_full_size
 from ..simulation.simulate import simulate
 from ..simulation.solution import Solution
@@ -181,7 +179,7 @@ def measured(scene: Scene, limits: Limits) -> Iterator[tuple[str, str, float, fl
     }
     poles = next(iter(loops.values())).feedback().poles()
     ts = np.linspace(0, t1, samples_of(t1, np.abs(poles).max()) + 1)
-    motion = simulate(linkage, scene.state0, ts, scene.forces, throw=False)
+    motion = simulate(scene, ts, throw=False)
     shares, speeds, _ = map(np.asarray, step_shares(motion, rest))
     efforts = np.abs(demands(controller, linkage, motion)).max(axis=0)
     for k, loop in loops.items():
@@ -211,11 +209,10 @@ def _lane(z: Array, problem: tuple[Scene, Loss, Array, Limits, bool]) -> Evaluat
 
     found = gain_sensitivities(z, scene, residuals, tuned)
     count = joints_of(scene.linkage) * (3 * _SPANS + with_margins * _BANDS)
-    excesses, own = (
-        found._replace(residuals=found.residuals[rows], jacobian=found.jacobian[rows])
-        for rows in (slice(count), slice(count, None))
-    )
-    return sum_of_squares(own, excess=excesses.residuals, slopes=excesses.jacobian)
+    beyond, errors = jnp.split(found.residuals, [count])
+    slopes, jacobian = jnp.split(found.jacobian, [count])
+    own = found._replace(residuals=errors, jacobian=jacobian)
+    return sum_of_squares(own, excess=beyond, slopes=slopes)
 
 
 def _search(
@@ -401,9 +398,8 @@ def tune_within(
     limits = sized(limits, joints_of(scene.linkage))
     with_margins = bool(np.any(np.asarray(limits.modulus_margin) > 0))
     problem = with_full_size(scene), loss, box.tuned, limits, with_margins
-    z, value, message = _search(
-        scene, Lanes(_lane, [[problem]]), box, max_steps, report
-    )
+    lanes = Lanes(_lane, [[problem]])
+    z, value, message = _search(scene, lanes, box, max_steps, report)
     scene = with_gains(scene, jnp.asarray(box.gains(z)))
     rows = list(measured(scene, limits))
     limit, joint, allowed, reached = zip(*rows) if rows else ((),) * 4

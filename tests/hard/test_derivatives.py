@@ -11,7 +11,7 @@ import pytest
 from modes import LOOPS
 
 import fdof_jax as fj
-from fdof_jax.analysis.tracking import tip_deviation
+from fdof_jax.analysis.measures import tip_deviation
 from fdof_jax.base.trigonometry import sincos
 from hard.scenes import arm
 

@@ -1,1 +1,0 @@
-"""Bounded minimisation of many functions at once."""
