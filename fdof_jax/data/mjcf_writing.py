@@ -149,7 +149,7 @@ def _limits_and_acts(element: Any, linkage: Linkage) -> tuple[np.ndarray, np.nda
     """In which joints an element of `_ACTUATORS` limits the effort, and acts, (n,)."""
     count = joints_of(linkage)
     if isinstance(element, JointEffort):
-        return np.zeros(count, bool), np.asarray(element.tau) != 0
+        return np.zeros(count, bool), np.asarray(element.tau, bool)
     if isinstance(element, PDController):
         kp, kd, limit = map(np.asarray, (element.kp, element.kd, element.limit))
         acts = ((kp > 0) | (kd > 0)) & (limit > 0)
