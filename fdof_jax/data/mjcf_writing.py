@@ -155,7 +155,7 @@ def _limits_and_acts(element: Any, linkage: Linkage) -> tuple[np.ndarray, np.nda
         acts = ((kp > 0) | (kd > 0)) & (limit > 0)
         return acts & np.isfinite(limit), acts
     *_, bounded = _ends(element.effort_lower, element.effort_upper, count)
-    return bounded, np.asarray(element.gear).any(axis=0)
+    return bounded, np.any(np.asarray(element.gear), axis=0)
 
 
 def _draw(
