@@ -37,6 +37,20 @@ class Hold(eqx.Module):
         return self.target, jnp.zeros_like(self.target)
 
 
+class Push(fj.Element):
+    """A force on a slide from a time on that it declares."""
+
+    begin: fj.Values = fj.field((), unit="s")
+    force: fj.Values = fj.field((), unit="N")
+
+    def __call__(self, t, q, qd, linkage):
+        return jnp.where(t >= self.begin, self.force, 0.0) * jnp.ones_like(q)
+
+    @property
+    def jump_ts(self):
+        return jnp.reshape(self.begin, (1,))
+
+
 class ReferenceScene(NamedTuple):
     linkage: fj.Linkage
     state0: fj.State

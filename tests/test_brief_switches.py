@@ -170,14 +170,6 @@ def check_turning(*cases):
 
 
 @pytest.mark.slow
-def test_fast_switching_is_no_chatter():
-    check_turning(
-        np.array([4.0, 0]), np.array([0, 100 * np.pi]), np.array([0.1, 1.0]),
-        np.array([5.0, 0]), np.array([2.0, 0.505]),
-    )  # fmt: skip
-
-
-@pytest.mark.slow
 def test_random_fast_switching():
     rng = np.random.default_rng(0)
     angular = np.arange(72) % 2

@@ -17,7 +17,6 @@ import fdof_jax as fj
 
 REFERENCE = json.loads((Path(__file__).parent / "hard/reference.json").read_text())
 FIELDS = "length", "com", "mass", "inertia", "locked", "base_angle", "gravity"
-TS = np.linspace(0, 0.5, 6)
 
 
 def scene(name):
@@ -61,16 +60,13 @@ def test_the_two_link_arm_on_its_circle_equals_the_reference():
     np.testing.assert_allclose(motion.q[-1], wanted["q"][-1], atol=1e-12)
 
 
-# Forward mode for six pairs; reverse mode, which takes long to compile, for two here
-# and for three, one of them fixed, in `test_gradients_of_a_motion_equal_differences`.
+# Forward mode for six pairs, and for three in tests/hard/test_chaos.py; reverse mode,
+# which takes long to compile, for two here and for three, one of them fixed, in
+# `test_gradients_of_a_motion_equal_differences`.
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "name, bound, mode",
-    [
-        ("double-pendulum", 2e-9, "forward"),
-        pytest.param("double-pendulum", 2e-9, "reverse", marks=pytest.mark.slow),
-        pytest.param("six-pairs", 4e-12, "forward", marks=pytest.mark.slow),
-    ],
+    [("double-pendulum", 2e-9, "reverse"), ("six-pairs", 4e-12, "forward")],
 )
 def test_derivatives_of_motions_equal_the_reference(name, bound, mode):
     arm, start, forces, ts = scene(name)
@@ -132,55 +128,3 @@ def test_gradients_of_a_motion_equal_differences():
     h = 1e-3
     coarse, fine = ((shifted(s) - shifted(-s)) / (2 * s) for s in (h, h / 2))
     assert slope == pytest.approx((4 * fine - coarse) / 3, rel=1e-8)
-
-
-@pytest.mark.slow
-def test_one_trace_serves_all_chains_of_a_length_and_batches_equal_their_members():
-    rng = np.random.default_rng(4)
-    names = "RRRR", "RFRP", "FPRF"
-    members = [
-        (
-            chains.random_chain(name, rng),
-            fj.State(*jnp.asarray(rng.normal(size=(2, 4)))),
-        )
-        for name in names
-    ]
-
-    @eqx.debug.assert_max_traces(max_traces=1)
-    def motion(chain, start):
-        return fj.simulate(chain, start, TS, (fj.JointDamper(0.3),), **SHORT)
-
-    single = jax.jit(motion)
-    alone = [single(*member) for member in members]
-    batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *members)
-    together = jax.jit(jax.vmap(motion.__wrapped__))(*batch)
-    for i, solution in enumerate(alone):
-        for a, b in ((together.q, solution.q), (together.qd, solution.qd)):
-            np.testing.assert_allclose(a[i], b, rtol=1e-12, atol=1e-12)
-
-
-@pytest.mark.slow
-def test_what_is_given_at_fixed_pairs_does_not_move_them():
-    rng = np.random.default_rng(6)
-    chain, n = chains.random_chain("RFPRF", rng), 5
-    real = chains.moving("RFPRF")
-    still = lambda values, otherwise: jnp.where(real, values, otherwise)
-    q, qd, tau, gains, target = jnp.asarray(rng.normal(size=(5, n))) ** 2
-
-    @jax.jit
-    def motion(q, qd, tau, gains, target):
-        forces = (
-            fj.PDController(gains, gains, 1 + gains, chains.Hold(target)),
-            fj.JointEffort(tau),
-            fj.JointDamper(gains),
-            fj.forces.Armature(gains),
-        )
-        return fj.simulate(chain, fj.State(q, qd), TS, forces, **SHORT)
-
-    values = q, qd, tau, gains, target
-    zero, seven = (motion(*(still(v, junk) for v in values)) for junk in (0.0, 7.0))
-    for name in ("q", "qd"):
-        found = getattr(seven, name)
-        np.testing.assert_array_equal(found, getattr(zero, name))
-        np.testing.assert_array_equal(found[:, ~real], 0)
-    assert np.abs(seven.q[-1] - seven.q[0])[real].min() > 1e-3

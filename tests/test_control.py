@@ -151,8 +151,11 @@ def test_fig_7_with_gravity_held():
 
 @pytest.mark.slow
 def test_its_gains_are_tuned():
-    scene = fed_forward()._replace(t1=1.0)
-    result = fj.tune(scene, max_steps=3)
+    """Of two joints, whose program compiles faster."""
+    linkage, state0, (pd,), _ = fj.scenes.two_link_circle()
+    held = fj.control.GravityFeedforward(pd.kp, pd.kd, pd.limit, pd.reference)
+    heavy = linkage.replace(gravity=9.81)
+    result = fj.tune(fj.Scene(heavy, state0, (held,), 1.0), max_steps=3)
     assert isinstance(result.scene.forces[0], fj.control.GravityFeedforward)
     assert result.loss < 0.8 * result.history.loss[0]
 

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import Hold
 from modes import ADJOINT, LOOPS
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
@@ -20,13 +21,10 @@ import fdof_jax as fj
 # For `jax.grad`: by tangents in a few numbers, by the adjoint with checkpoints.
 DEFAULT, FORWARD = diffrax.RecursiveCheckpointAdjoint(), diffrax.ForwardMode()
 MODES = "tangents", "adjoint", "forward"
-
-
-class Hold(eqx.Module):
-    target: jax.Array
-
-    def __call__(self, t, linkage):
-        return self.target, jnp.zeros_like(self.target)
+HANGING = fj.Linkage(
+    "R", length=[0, 1], com=[[0.5, 0]], mass=[1], inertia=[1 / 12],
+    base_angle=-np.pi / 2,
+)  # fmt: skip
 
 
 class Pushes(eqx.Module):
@@ -166,10 +164,6 @@ def held_by(kind, rng, topology):
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", MODES)
 def test_an_arm_that_hangs_in_damping_of_any_strength(mode, gradient):
-    hanging = fj.Linkage(
-        "R", length=[0, 1], com=[[0.5, 0]], mass=[1], inertia=[1 / 12],
-        base_angle=-np.pi / 2,
-    )  # fmt: skip
     numbers, (_, (balance, damper, *others), *_) = held_by(
         "nothing", np.random.default_rng(0), "R"
     )
@@ -179,7 +173,7 @@ def test_an_arm_that_hangs_in_damping_of_any_strength(mode, gradient):
     for damping in (1.0, 10.0, 30.0, 100.0, 1e3, 1e4):
         damper = eqx.tree_at(lambda d: d.coefficient, damper, jnp.array([damping]))
         time, weights = jnp.array(2.0, float), jnp.array([1.0, 0])  # no weak type
-        scene = hanging, (balance, damper, *others), time, weights
+        scene = HANGING, (balance, damper, *others), time, weights
         wanted, _ = exact(numbers, scene)
         found, _ = gradient[mode](numbers, scene)
         assert error(flat(found), wanted) < 1e-7, damping
@@ -214,9 +208,9 @@ def test_members_of_a_batch_at_rest(gradient):
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:prismatic joints")
 def test_random_arms_at_rest(gradient):
-    """80 scenes of two joints, by the adjoint and in forward mode."""
+    """24 scenes of two joints, by the adjoint and in forward mode."""
     rng, solved = np.random.default_rng(2), 0
-    while solved < 80:
+    while solved < 24:
         kind = rng.choice(["damper", "PD", "friction", "stops"])
         # An arm of slides alone is refused.
         topology = "R" + rng.choice([*"RRP"])
@@ -396,18 +390,13 @@ def test_links_that_friction_and_a_stop_bring_to_rest():
 @pytest.mark.slow
 def test_an_implicit_method_in_strong_damping():
     """A pendulum that hangs, in dampers that take explicit methods 1e3 to 1e8 steps."""
-    hanging = fj.Linkage(
-        "R", length=[0, 1], com=[[0.5, 0]], mass=[1], inertia=[1 / 12],
-        base_angle=-np.pi / 2,
-    )  # fmt: skip
     settings = dict(solver=diffrax.Kvaerno5(), dt0=1e-6, rtol=1e-9, atol=1e-9)
 
     def last(tau, damping):
         forces = (fj.JointDamper(damping), fj.JointEffort(tau))
         motion = fj.simulate(
-            hanging, fj.State([0.0], [0.0]), [0, 100.0], forces,
-            **settings,
-        )  # fmt: skip
+            HANGING, fj.State([0.0], [0.0]), [0, 100.0], forces, **settings
+        )
         return motion.q[-1, 0], motion.stats["num_steps"]
 
     slope = jax.jit(jax.grad(last, has_aux=True), **LOOPS)

@@ -139,7 +139,6 @@ def test_energy_stack_balances_with_elements_of_each_kind():
 BALL = Linkage("P", length=[0, 1], com=[[0, 0]], mass=[1], inertia=[1])
 BAR = Linkage("R", length=[0, 1], com=[[0.5, 0]], mass=[1], inertia=[1 / 12])
 ARM = scenes.double_pendulum().linkage
-BOUNCE = HardStops(0.0, np.inf, restitution=0.5)
 TIP = Point(1, along=1)
 TS = np.linspace(0, 2, 401)
 OF_ALL_KINDS = (
@@ -233,7 +232,7 @@ def test_energy_stack_has_what_payloads_bring_and_take_away():
 @pytest.mark.slow
 def test_energy_stack_asks_for_closer_samples_where_those_help():
     """A blow explains nothing there: what it took is known."""
-    forces, ts = (BOUNCE, JointDamper(3.0)), np.linspace(0, 2, 13)
+    forces, ts = holding(stop=0.0, damping=3.0), np.linspace(0, 2, 13)
     solution = simulate(BALL, State([1.0], [0.0]), ts, forces)
     with pytest.warns(UserWarning, match=r"and samples closer in time \(try"):
         plotting.energy_stack(BALL, forces, solution)

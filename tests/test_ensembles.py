@@ -20,16 +20,19 @@ def model_based(scene, kind):
 
 class TestEnsembles:
     scene = scenes.fig7()._replace(t1=1.0)
+    # Of two joints, whose programs compile faster.
+    small = scenes.two_link_circle()._replace(t1=1.0)
+    varied = dict(payload=(0, 2), link_error=0.1, seed=1)
 
-    def ensemble(self, members=3):
-        return fj.tuning.perturbed(
-            self.scene, members, payload=(0, 2), link_error=0.1, start_offset=0.3,
-            speed=(1, 2), seed=1,
-        )  # fmt: skip
+    def few(self):
+        return fj.tuning.perturbed(self.small, 3, start_offset=0.05, **self.varied)
 
     @pytest.mark.slow
     def test_members_are_as_asked(self):
-        many = self.ensemble(200)
+        draw = lambda: fj.tuning.perturbed(
+            self.scene, 200, start_offset=0.3, speed=(1, 2), **self.varied
+        )
+        many = draw()
         mass = np.asarray(many.linkage.mass)
         assert mass.shape == (200, 3)
         assert 0.9 <= mass[:, :2].min() < 0.92 and 1.08 < mass[:, :2].max() <= 1.1
@@ -43,14 +46,13 @@ class TestEnsembles:
         # The last link keeps its angle.
         turned = np.sum(np.asarray(many.state0.q)[:, ::2], axis=1)
         np.testing.assert_allclose(turned, self.scene.state0.q[::2].sum(), atol=1e-6)
-        again = self.ensemble(200)
-        assert eqx.tree_equal(many, again)
+        assert eqx.tree_equal(many, draw())
 
     @pytest.mark.slow
     def test_the_loss_is_the_mean_or_nearly_the_worst_of_the_members(self):
-        ensemble = self.ensemble()
-        mean = fj.tune(self.scene, ensemble=ensemble, max_steps=8)
-        worst = fj.tune(self.scene, ensemble=ensemble, over="worst", max_steps=8)
+        ensemble = self.few()
+        mean = fj.tune(self.small, ensemble=ensemble, max_steps=8)
+        worst = fj.tune(self.small, ensemble=ensemble, over="worst", max_steps=8)
         assert mean.loss == pytest.approx(mean.member_loss.mean())
         top = worst.member_loss.max()
         assert top * 3 ** (-1 / 32) <= worst.loss <= top
@@ -78,7 +80,7 @@ class TestEnsembles:
 
     @pytest.mark.slow
     def test_a_member_that_fails_is_named(self):
-        ensemble = self.ensemble()
+        ensemble = self.few()
         masses = lambda many: (many.linkage.mass, many.linkage.inertia)
         none_in_second = np.array([[1.0], [0.0], [1.0]])
         ensemble = eqx.tree_at(
@@ -86,7 +88,7 @@ class TestEnsembles:
         )
         message = r"ensemble\[1\]: expected one that can be simulated"
         with pytest.raises(ValueError, match=message):
-            fj.tune(self.scene, ensemble=ensemble)
+            fj.tune(self.small, ensemble=ensemble)
 
 
 def test_a_payload_is_a_point_mass_at_the_tip():

@@ -129,20 +129,19 @@ def test_both_modes_are_the_tangents_that_tuning_follows(point):
 
 def test_both_modes_of_a_damped_arm_equal_differences():
     """Uses fixed steps; derivatives in masses, damping and start."""
-    arm, (damper,) = scenes.fig3().linkage, scenes.fig3().forces
 
     def end(at, adjoint):
-        mass, coefficient, q = at.reshape(3, 3)
-        linkage = eqx.tree_at(lambda x: x.mass, arm, mass)
-        forces = (eqx.tree_at(lambda d: d.coefficient, damper, coefficient),)
-        start, steps = fj.State(q, jnp.zeros(3)), diffrax.ConstantStepSize()
+        mass, coefficient, q = at.reshape(3, 2)
+        linkage = eqx.tree_at(lambda x: x.mass, RODS, mass)
+        forces = (fj.JointDamper(coefficient),)
+        start, steps = fj.State(q, ZERO), diffrax.ConstantStepSize()
         motion = fj.simulate(
             linkage, start, [0, 0.5], forces,
             stepsize_controller=steps, dt0=1 / 64, adjoint=adjoint,
         )  # fmt: skip
-        return jnp.sum(motion.q[-1] * jnp.array([1.0, -2.0, 0.5]))
+        return jnp.sum(motion.q[-1] * jnp.array([1.0, -2.0]))
 
-    at = jnp.array([5.0, 2.0, 1.0, 20.0, 10.0, 5.0, 0.3, -0.2, 0.5])
+    at = jnp.array([2.0, 1.0, 3.0, 0.5, 0.3, -0.2])
     both = jax.jit(jax.value_and_grad(lambda at: end(at, ADJOINT)), **LOOPS)
     forward = jax.jit(jax.jacfwd(lambda at: end(at, diffrax.ForwardMode())))(at)
     value = lambda change: float(both(at + change)[0])
@@ -190,19 +189,6 @@ def linear_motion(end):
     stiffness = jax.jacfwd(lambda q: fj.forward_dynamics(RODS, q, ZERO, ZERO))(HANGING)
     rates = jnp.block([[jnp.zeros((2, 2)), jnp.eye(2)], [stiffness, jnp.zeros((2, 2))]])
     return jax.scipy.linalg.expm(rates * end, max_squarings=32)[:2, :2]
-
-
-@pytest.mark.slow
-def test_tangents_of_a_hanging_arm_are_controlled():
-    # In the circle's reach, with a controller that does nothing.
-    path = fj.references.Ellipse([1.0, 0.5], [0.2, 0.2])
-    task = eqx.tree_at(lambda task: task.path, CIRCLE, path)
-    idle = fj.PDController(ZERO, ZERO, [np.inf] * 2, task)
-    ts = np.linspace(0, 10.0, 21)
-    problem = RODS, fj.State(HANGING, ZERO), idle, ts, steps(1e-11)
-    (_, slopes), _ = forward(problem, jnp.zeros(8))
-    exact = linear_motion(10.0)
-    assert np.abs(slopes[:, 6:] - exact).max() <= 1e-6 * np.abs(exact).max()
 
 
 @pytest.mark.slow

@@ -201,9 +201,11 @@ def test_friction_stops_a_slide():
     """From 2 dv/dt = -F tanh(v/s) it follows that sinh(v/s) falls exponentially."""
     level, speed, v0 = 4.0, 0.05, 1.5
     ts = np.linspace(0, 1.2, 25)
-    _, v = slides([0, v0], ts, JointFriction(level, speed=speed))
+    friction = JointFriction(level, speed=speed)
+    motion = fj.simulate(SLIDE, fj.State([0.0], [v0]), ts, (friction,))
     exact = speed * np.arcsinh(np.sinh(v0 / speed) * np.exp(-level / 2 * ts / speed))
-    np.testing.assert_allclose(v, exact, rtol=1e-7, atol=1e-10)
+    np.testing.assert_allclose(motion.qd[:, 0], exact, rtol=1e-7, atol=1e-10)
+    assert motion.modes is motion.taken is motion.events is None  # it holds nothing
 
 
 # Histories

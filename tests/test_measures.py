@@ -15,10 +15,10 @@ W, ZETA = 8.0, 0.3  # of the loop
 PD = fj.PDController(W**2, 2 * ZETA * W, np.inf, STEP)
 
 
-def measured(*forces, since=0.0):
-    return fj.analysis.response(
-        SLIDE, forces, fj.simulate(SLIDE, START, TS, forces), since=since
-    )
+def measured(controller, load=0.0, since=0.0):
+    forces = controller, fj.JointEffort(load)  # a load of 0 lets all share a program
+    motion = fj.simulate(SLIDE, START, TS, forces)
+    return fj.analysis.response(SLIDE, forces, motion, since=since)
 
 
 @pytest.mark.slow
@@ -59,7 +59,7 @@ def test_a_step_between_samples_counts_from_its_time():
 
 @pytest.mark.slow
 def test_a_load_leaves_a_steady_error():
-    found = measured(PD, fj.JointEffort(3.2))
+    found = measured(PD, 3.2)
     np.testing.assert_allclose(found.steady_error, 3.2 / W**2, atol=2e-4)
 
 
@@ -76,7 +76,7 @@ def test_an_actuator_at_its_limit_counts():
             fj.control.PIDController(1e6, 0.0, 0.0, 0.5, pd.reference), 0.01
         ),
     ):
-        assert measured(kind, fj.JointDamper(0.0)).saturated > 0.9
+        assert measured(kind).saturated > 0.9
 
 
 @pytest.mark.slow
@@ -129,7 +129,7 @@ def test_sampled_control_is_measured_as_it_acted():
 def test_a_report_is_shown():
     text = str(measured(PD))
     assert text.count("\n") == 2 and "steady error" in text and "P1" in text
-    away = str(measured(PD, fj.JointEffort(3.2)))
+    away = str(measured(PD, 3.2))
     assert "P1 ends 11 % of its step away from the reference" in away
     still = PD.replace(reference=Step(0.0, [0.0]))
     assert "P1: no step, as it begins at its reference" in str(measured(still))
@@ -138,8 +138,8 @@ def test_a_report_is_shown():
 
 
 def test_what_is_refused():
-    motion = fj.simulate(SLIDE, START, TS, (PD,))
-    response = fj.analysis.response
+    forces, response = (PD, fj.JointEffort(0.0)), fj.analysis.response
+    motion = fj.simulate(SLIDE, START, TS, forces)
     with pytest.raises(ValueError, match="forces: expected one controller"):
         response(SLIDE, (fj.JointDamper(1.0),), motion)
     with pytest.raises(ValueError, match="forces: expected one controller"):
@@ -156,6 +156,6 @@ def test_what_is_refused():
         response(SLIDE, (pid,), motion)
     with pytest.raises(ValueError, match="solution: expected a computed motion"):
         jax.jit(lambda motion: response(SLIDE, (PD,), motion).step)(motion)
-    stopped = fj.simulate(SLIDE, START, TS, (PD,), max_steps=3, throw=False)
+    stopped = fj.simulate(SLIDE, START, TS, forces, max_steps=3, throw=False)
     with pytest.raises(ValueError, match="solution: .* reached its end, got .out of"):
         response(SLIDE, (PD,), stopped)

@@ -1,4 +1,4 @@
-"""One trace serves all topologies; batches equal single motions.
+"""One trace serves all topologies, also with fixed pairs; batches equal single motions.
 
 That plain calls share one program among topologies is in test_programs.py.
 """
@@ -20,7 +20,8 @@ START = np.array([0.1, 0.7, 0.3, 1.5, 0.2, 2.2])
 
 
 def linkage_and_state(topology):
-    locked, state = fj.paper.from_chain(topology, START, np.zeros(6), base_angle=0.2)
+    moving = topology.replace("F", "R")
+    locked, state = fj.paper.from_chain(moving, START, np.zeros(6), base_angle=0.2)
     linkage = fj.Linkage(
         topology,
         length=[0.1, 1.0, 0.8, 0.5],
@@ -45,6 +46,7 @@ def circle(linkage, state):
     return fj.PDController([40.0] * 3, [4.0] * 3, [200.0] * 3, task)
 
 
+FIXED = "RFR", "FRP"  # which no circle is for
 FORCES = {
     "no elements": lambda linkage, state: (),
     "PD circle, damper and effort": lambda linkage, state: (
@@ -56,7 +58,8 @@ FORCES = {
 
 
 def members(kind):
-    pairs = [linkage_and_state(topology) for topology in fj.TOPOLOGIES]
+    names = fj.TOPOLOGIES + (FIXED if kind == "no elements" else ())
+    pairs = [linkage_and_state(topology) for topology in names]
     return [(linkage, state, FORCES[kind](linkage, state)) for linkage, state in pairs]
 
 

@@ -11,6 +11,7 @@ ARM = fj.scenes.double_pendulum().linkage
 START = fj.State([0.3, -0.2], [0.5, 0.0])
 TS = np.linspace(0, 2, 81)
 STOPS = fj.forces.HardStops(-1.7, [0.6, 0.4], restitution=0.5)
+BOUNCING = fj.JointDamper(0.3), STOPS
 PID = fj.control.PIDController(30.0, 20.0, 6.0, 25.0, fj.references.SetPoint(0.2))
 
 
@@ -27,7 +28,7 @@ def in_phases(forces, others=None, ts=TS, start=START, **options):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("forces", [(PID,), (fj.JointDamper(0.3), STOPS)])
+@pytest.mark.parametrize("forces", [(PID,), BOUNCING])
 def test_two_phases_are_the_whole_motion(forces):
     whole = fj.simulate(ARM, START, TS, forces)
     joined, first, second = in_phases(forces)
@@ -54,14 +55,14 @@ def test_two_phases_are_the_whole_motion(forces):
 
 @pytest.mark.slow
 def test_what_acts_may_differ():
-    joined, first, second = in_phases((STOPS,), (PID,))
+    joined, first, second = in_phases(BOUNCING, (PID,))
     assert joined.own == () and joined.modes.shape == joined.q.shape
     np.testing.assert_array_equal(joined.modes[30:], 0)
     np.testing.assert_array_equal(joined.taken[30:], first.taken[-1])
-    back, *_ = in_phases((PID,), (STOPS,))
+    back, *_ = in_phases((PID,), BOUNCING)
     np.testing.assert_array_equal(back.taken[:30], 0)
     np.testing.assert_array_equal(back.qd[30], fj.simulate(
-        ARM, fj.State(back.q[30], back.qd[30]), [0, 1.0], (STOPS,)).qd[0]
+        ARM, fj.State(back.q[30], back.qd[30]), [0, 1.0], BOUNCING).qd[0]
     )  # fmt: skip
     fj.plotting.motion_profile(ARM, back)
     assert len(fj.to_pandas(ARM, back)) == len(TS)
@@ -86,7 +87,7 @@ def test_a_payload_is_taken_once_where_phases_meet(away):
 @pytest.mark.slow
 def test_a_batch_of_two_phases():
     starts = [fj.State(q, [0.0, 0.0]) for q in ([0.3, -0.2], [0.1, 0.2])]
-    motions = [in_phases((STOPS,), start=start) for start in starts]
+    motions = [in_phases(BOUNCING, start=start) for start in starts]
     _, *phases = jax.tree.map(lambda *rows: np.stack(rows), *motions)
     joined = concatenate(phases)
     for k, (alone, *_) in enumerate(motions):

@@ -25,18 +25,21 @@ import fdof_jax as fj
 ARM, START, FORCES, _ = fj.scenes.fig5()
 TS = np.linspace(0, 0.1, 4)
 DAMPER = fj.JointDamper(1.0)
+# One link, whose programs compile faster.
+ROD = fj.Linkage("R", length=[0, 1], com=[[0.5, 0]], mass=[1], inertia=[0.1])
+TILTED = fj.State(jnp.array([0.3]), jnp.array([0.5]))
 
 
 # Exported and serialised
 
 
 def states(q0, mass, ts):
-    linkage = eqx.tree_at(lambda arm: arm.mass, ARM, mass)
-    motion = fj.simulate(linkage, fj.State(q0, START.qd), ts, throw=False)
+    linkage = eqx.tree_at(lambda arm: arm.mass, ROD, mass)
+    motion = fj.simulate(linkage, fj.State(q0, TILTED.qd), ts, throw=False)
     return motion.q, motion.qd
 
 
-ARGUMENTS = START.q, ARM.mass, jnp.asarray(TS)
+ARGUMENTS = TILTED.q, ROD.mass, jnp.asarray(TS)
 
 
 @functools.cache
@@ -103,8 +106,8 @@ def raising():
     def ends(q0, ts, mass, coefficient):
         # This solver compiles faster than the default.
         solver = diffrax.Dopri8()
-        start = fj.State(q0, START.qd)
-        arm = eqx.tree_at(lambda a: a.mass, ARM, mass)
+        start = fj.State(q0, TILTED.qd)
+        arm = eqx.tree_at(lambda a: a.mass, ROD, mass)
         damper = eqx.tree_at(lambda d: d.coefficient, DAMPER, coefficient)
         options = dict(solver=solver, max_steps=32)
         return fj.simulate(arm, start, ts, (damper,), **options).q[-1]
@@ -125,20 +128,16 @@ ACCEPTED = "linkage: expected values that its constructor"
         ("ts", [0, 0.1, 0.1, 0.2], INCREASING),
         ("ts", [0, 0.1, np.nan, 0.2], INCREASING),
         ("ts", [0, 0.1, 0.2, np.inf], INCREASING),
-        ("q0", [0, np.nan, 0], FINITE),
-        ("q0", [np.inf, 0, 0], FINITE),
-        ("mass", [1, -1, 1], ACCEPTED),
-        ("mass", [1, np.nan, 1], ACCEPTED),
-        (
-            "coefficient",
-            [-1, 1, 1],
-            r"forces\[0\] \(JointDamper\): expected values that its",
-        ),
+        ("q0", [np.nan], FINITE),
+        ("q0", [np.inf], FINITE),
+        ("mass", [-1], ACCEPTED),
+        ("mass", [np.nan], ACCEPTED),
+        ("coefficient", [-1], r"forces\[0\] \(JointDamper\): expected values that its"),
         ("ts", [0, 1, 2, 50], "max_steps"),
     ],
 )
 def test_failures_under_jit_name_the_argument(name, value, words):
-    sound = dict(q0=START.q, ts=TS, mass=ARM.mass, coefficient=[1, 1, 1])
+    sound = dict(q0=TILTED.q, ts=TS, mass=ROD.mass, coefficient=[1])
     ends = lambda **values: raising()(*(jnp.asarray(v, float) for v in values.values()))
     assert np.isfinite(ends(**sound)).all()
     with pytest.raises(Exception, match=words):

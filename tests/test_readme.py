@@ -1,25 +1,22 @@
 """The README's Python examples run, in order, as written."""
 
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
+from test_guides import DOCS, run
 
-README = Path(__file__).parents[1] / "README.md"
+README = DOCS.parent / "README.md"
 
 
 @pytest.mark.slow
 def test_python_examples(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    blocks = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
-    assert len(blocks) >= 4
-    namespace = {}
-    for block in blocks:
-        exec(compile(block, "README.md", "exec"), namespace)
-    assert np.isfinite(namespace["motions"].q).all()
-    assert namespace["result"].loss ** 0.5 < 0.07
-    assert namespace["found"].converged
+    assert README.read_text().count("```python\n") >= 4
+    names = run(README)
+    assert np.isfinite(names["motions"].q).all()
+    assert names["result"].loss ** 0.5 < 0.07
+    assert names["found"].converged
 
 
 def test_the_first_two_shell_blocks_stand_alone():

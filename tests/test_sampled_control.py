@@ -57,20 +57,6 @@ def test_efforts_are_held_and_come_late(delay):
     np.testing.assert_allclose(reactions[:, 0, 2], acting, rtol=1e-12)
 
 
-@pytest.mark.slow
-def test_efforts_come_late_in_the_pieces_of_a_motion():
-    motion = fj.simulate_sampled(RODS, BENT, CONTROL, 0.02, 6, delay=0.03)
-    commanded = [CONTROL(*row, RODS) for row in zip(motion.ts, motion.q, motion.qd)]
-    np.testing.assert_allclose(motion.tau, commanded[:6], rtol=1e-12)
-    state, late = BENT, [np.zeros(2), np.zeros(2), *commanded]
-    for k in range(6):
-        middle = fj.step(RODS, state, late[k], 0.01)
-        np.testing.assert_allclose(motion.q_begin[k], middle.q, rtol=1e-10)
-        state = fj.step(RODS, middle, late[k + 1], 0.01)
-        reached = motion.q[k + 1], motion.qd[k + 1]
-        np.testing.assert_allclose(reached, state, rtol=1e-9, atol=1e-10)
-
-
 def advance(x, delay, gains):
     """Advances a disc under delayed feedback by a period of 0.1 s, in closed form.
 

@@ -19,6 +19,9 @@ from fdof_jax.simulation import solve
 
 ARM, START, *_ = fj.scenes.fig5()
 TS = np.linspace(0, 0.1, 4)
+# One link, whose programs compile faster.
+ROD = fj.Linkage("R", length=[0, 1], com=[[0.5, 0]], mass=[1], inertia=[0.1])
+TILTED = fj.State(np.array([0.3]), np.array([0.5]))
 
 
 @pytest.fixture
@@ -260,10 +263,10 @@ def drag(k):
 def test_motions_in_a_loop_share_a_program(traces):
     counted = traces(solve, "integrate")
     for k in (1.0, 4.0):
-        found = fj.simulate(ARM, START, TS, (drag(k),))
-        expected = fj.simulate(ARM, START, TS, (fj.JointDamper(k),))
+        found = fj.simulate(ROD, TILTED, TS, (drag(k),))
+        expected = fj.simulate(ROD, TILTED, TS, (fj.JointDamper(k),))
         np.testing.assert_allclose(found.q, expected.q, atol=1e-9)
-        total = fj.joint_efforts(ARM, (drag(k),), found).total
+        total = fj.joint_efforts(ROD, (drag(k),), found).total
         np.testing.assert_allclose(total, -k * found.qd, atol=1e-12)
     assert len(counted) <= 2
 
@@ -300,11 +303,10 @@ def test_the_number_of_steps_is_data(traces):
     ],
 )
 def test_the_last_allowed_step_may_reach_the_end(steps):
-    solver = diffrax.Tsit5()
-    most = int(fj.simulate(ARM, START, TS, solver=solver, **steps).stats["num_steps"])
-    allowed = lambda n: fj.simulate(
-        ARM, START, TS, solver=solver, max_steps=n, throw=False, **steps
+    run = lambda **options: fj.simulate(
+        ROD, TILTED, 10 * TS, solver=diffrax.Tsit5(), throw=False, **steps, **options
     )
+    most, allowed = int(run().stats["num_steps"]), lambda n: run(max_steps=n)
     assert allowed(most).outcome == "successful"
     assert allowed(most - 1).outcome == "out of steps"
 
@@ -313,15 +315,15 @@ def test_the_last_allowed_step_may_reach_the_end(steps):
 def test_sweeps_in_a_loop_share_a_program(traces):
     counted, starts = traces(chunks, "simulate"), []
     for k in (1.0, 4.0):
-        states = fj.State(np.stack([START.q, START.q + 0.1]), START.qd)
+        states = fj.State(np.stack([TILTED.q, TILTED.q + 0.1]), TILTED.qd)
         ends = fj.sweep(
-            ARM,
+            ROD,
             states,
             TS,
             (drag(k),),
             reduce=lambda scene, motion, k=k: k * motion.q[-1],
         )
-        one = fj.simulate(ARM, START, TS, (fj.JointDamper(k),))
+        one = fj.simulate(ROD, TILTED, TS, (fj.JointDamper(k),))
         np.testing.assert_allclose(ends[0], k * one.q[-1], atol=1e-8)
         starts.append(len(counted))
     assert starts[0] == starts[1] > 0
@@ -329,13 +331,13 @@ def test_sweeps_in_a_loop_share_a_program(traces):
 
 @pytest.mark.slow
 def test_fits_in_a_loop_share_a_program(traces):
-    motion = fj.simulate(ARM, START, TS, (fj.JointDamper(2.0),))
+    motion = fj.simulate(ROD, TILTED, TS, (fj.JointDamper(2.0),))
     counted, totals = traces(problems, "sensitivities"), []
     for k in (2.0, 4.0):
 
         def scene_at(parameters, k=k):
             damper = fj.JointDamper(k * parameters["share"])
-            return fj.Scene(ARM, START, (damper,), 0.1)
+            return fj.Scene(ROD, TILTED, (damper,), 0.1)
 
         found = fj.identification.fit(
             scene_at, {"share": 0.8}, TS, motion.q, observe=lambda scene, m: m.q

@@ -1,14 +1,13 @@
 """Steps, pulses and ramps of a reference, against closed forms."""
 
 import functools
-from typing import Any
 
 import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import Push
 from jax.flatten_util import ravel_pytree
 
 import fdof_jax as fj
@@ -114,34 +113,7 @@ def test_what_is_refused(make, message):
         make(fj.references)
 
 
-@pytest.mark.slow
-def test_one_program_serves_signals_of_an_arm():
-    poses = np.linspace(0, 1, 3)[:, None]
-    with_reference = lambda q: fj.PDController(
-        50.0, 10.0, 40.0, fj.references.Step(np.zeros(1), q, begin=0.1)
-    )
-    batch = eqx.filter_vmap(with_reference)(jnp.asarray(poses))
-    start = fj.State(np.zeros(1), np.zeros(1))
-    motions = fj.sweep(SLIDE, start, [0, 0.5], (batch,), forces_axes=0)
-    for q, motion in zip(poses, motions.q):
-        alone = fj.simulate(SLIDE, start, [0, 0.5], (with_reference(q),))
-        np.testing.assert_allclose(motion, alone.q, atol=1e-8)
-
-
 # Jumps that throw a controller past its limit, at once
-
-
-class Push(fj.Element):
-    """3 N from a time on."""
-
-    begin: Any
-
-    @property
-    def jump_ts(self):
-        return jnp.reshape(self.begin, 1)
-
-    def __call__(self, t, q, qd, linkage):
-        return jnp.where(t >= self.begin, jnp.full(1, 3.0), 0.0)
 
 
 def saturating(begin, **options):
@@ -153,25 +125,13 @@ def saturating(begin, **options):
 
 
 @pytest.mark.slow
-def test_the_time_of_a_jump_past_a_limit_has_derivatives():
-    begins = np.array([0.1, 0.2, 0.3])
-    both = jax.jit(jax.value_and_grad(saturating))
-    value, slope = np.array([both(begin) for begin in begins]).T
-    np.testing.assert_allclose(value, 5 * (0.5 - begins) ** 2)
-    np.testing.assert_allclose(slope, -10 * (0.5 - begins), rtol=1e-9)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("make", [
-    lambda z: fj.references.Step([0.0], [1.0], begin=z[0]),
-    lambda z: fj.references.Pulse([0.0], [1.0], begin=0.05, end=z[0]),
-])  # fmt: skip
-def test_it_has_them_beside_the_motion(make):
+def test_the_times_of_jumps_past_a_limit_have_derivatives_beside_the_motion():
     """A jump past a limit is a kink that the controller passes at once."""
     start, ts = fj.State([0.0], [0.0]), jnp.array([0.0, 0.5])
 
     def scene_at(z):
-        pd = fj.PDController([100.0], [0.0], 10.0, make(z))
+        pulse = fj.references.Pulse([0.0], [1.0], begin=z[0], end=z[1])
+        pd = fj.PDController([100.0], [0.0], 10.0, pulse)
         return fj.Scene(SLIDE, start, (pd,), 0.5)
 
     def place(z):
@@ -180,23 +140,35 @@ def test_it_has_them_beside_the_motion(make):
     beside = jax.jit(
         lambda z: sensitivities(scene_at, lambda _, motion: motion.q[-1], z, ts)
     )
-    for time in (0.1, 0.2):
-        h = 1e-5
-        slope = (place(jnp.array([time + h])) - place(jnp.array([time - h]))) / (2 * h)
-        found = beside(jnp.array([time])).jacobian[0, 0]
-        np.testing.assert_allclose(found, slope, rtol=1e-4)
+    for times in ([0.1, 9.0], [0.2, 9.0], [0.05, 0.1], [0.05, 0.2]):
+        z = jnp.array(times)
+        slopes = [(place(z + h) - place(z - h)) / 2e-5 for h in 1e-5 * np.eye(2)]
+        np.testing.assert_allclose(beside(z).jacobian[0], slopes, rtol=1e-4, atol=1e-9)
+
+
+def forward(begin):
+    """Returns the derivative and the value."""
+    twice = lambda begin: (saturating(begin, adjoint=diffrax.ForwardMode()),) * 2
+    return jax.jacfwd(twice, has_aux=True)(begin)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("first", [
-    jax.jacfwd(lambda b: saturating(b, adjoint=diffrax.ForwardMode())),
-    jax.grad(saturating),
+    forward, lambda begin: jax.value_and_grad(saturating)(begin)[::-1],
 ])  # fmt: skip
-def test_it_has_them_in_all_modes(first):
+def test_they_have_them_in_all_modes(first):
     """First derivatives forward and by tangents, and second ones over them."""
-    slope = lambda begin: (first(begin),) * 2
-    curvature, slope = jax.jit(jax.jacfwd(slope, has_aux=True))(0.2)
-    np.testing.assert_allclose([slope, curvature], [-3, 10], rtol=1e-9)
+
+    def twice(begin):
+        found = first(begin)
+        return found[0], found
+
+    both = jax.jit(jax.jacfwd(twice, has_aux=True))
+    for begin in (0.1, 0.2, 0.3):
+        curvature, (slope, value) = both(begin)
+        left = 0.5 - begin
+        np.testing.assert_allclose(value, 5 * left**2)
+        np.testing.assert_allclose([slope, curvature], [-10 * left, 10], rtol=1e-9)
 
 
 @pytest.mark.slow
@@ -213,7 +185,7 @@ def test_each_of_two_jumps_at_one_time_has_its_own_derivative():
     def place(begins, order):
         step = fj.references.Step([0.0], [1.0], begin=begins[1])
         pd = fj.PDController([100.0], [0.0], 10.0, step)
-        forces = (Push(begins[0]), pd)[::order]
+        forces = (Push(begins[0], 3.0), pd)[::order]
         start = fj.State([0.0], [0.0])
         return fj.simulate(SLIDE, start, [0, 0.5], forces).q[-1, 0]
 

@@ -79,18 +79,6 @@ def test_default_accuracy_to_two_seconds(name):
         np.testing.assert_allclose(coordinates, state["q"], rtol=0, atol=1e-8)
 
 
-@pytest.mark.slow
-def test_default_accuracy_under_control():
-    scene = scenes.fig7()
-    ts = [0, 1.0, 2.0]
-    solution = fj.simulate(scene.linkage, scene.state0, ts, scene.forces)
-    tight = diffrax.PIDController(rtol=1e-13, atol=1e-13)
-    exact = fj.simulate(
-        scene.linkage, scene.state0, ts, scene.forces, stepsize_controller=tight
-    )
-    np.testing.assert_allclose(solution.q, exact.q, rtol=0, atol=1e-8)
-
-
 def test_fig7_tracks_its_circle():
     scene = scenes.fig7()
     ts = np.concatenate([[0, 0.5, 2], np.arange(500, 1000) * 0.01])
@@ -107,7 +95,7 @@ def test_fig7_tracks_its_circle():
         [solution.q[2, 0], solution.q[2, 1], solution.q[2].sum()
          - solution.q[2, 1] + np.pi / 2],
         [1.75072080229, 0.790467088356, 1.61872366706],
-        atol=1e-7,
+        atol=1e-8,
     )  # fmt: skip
     efforts = fj.joint_efforts(scene.linkage, scene.forces, solution)
     np.testing.assert_allclose(efforts.total[0], [15.873, -300, -9.921], rtol=1e-4)
@@ -217,19 +205,6 @@ def test_a_start_after_many_turns_moves_alike():
     assert far.stats["num_steps"] == plain.stats["num_steps"]
 
 
-@pytest.mark.slow
-def test_forces_add_up():
-    scene = scenes.fig3()
-    ts = [0, 0.5, 1.0]
-    one = fj.simulate(scene.linkage, scene.state0, ts, (fj.JointDamper(20.0),))
-    split = (fj.JointDamper(15.0), fj.JointEffort([0, 0, 0]), fj.JointDamper(5.0))
-    three = fj.simulate(scene.linkage, scene.state0, ts, split)
-    np.testing.assert_allclose(three.q, one.q, atol=1e-10)
-    efforts = fj.joint_efforts(scene.linkage, split, three)
-    assert efforts.elements.shape == (3, 3, 3)
-    np.testing.assert_allclose(efforts.total, -20 * three.qd, atol=1e-12)
-
-
 @pytest.mark.parametrize(
     ("keyword", "value"),
     [
@@ -252,20 +227,6 @@ def test_keywords_of_simulate(keyword, value):
 
 
 # Tolerances
-
-
-@pytest.mark.slow
-def test_tolerances_are_as_exact_as_those_of_a_controller_of_ones_own():
-    arm, start, forces, _ = fj.scenes.fig5()
-    ts = np.linspace(0, 0.5, 3)
-    by_name = fj.simulate(arm, start, ts, forces, rtol=1e-6, atol=1e-7)
-    pid = diffrax.PIDController(rtol=1e-6, atol=1e-7, dtmin=1e-13, force_dtmin=False)
-    controlled = fj.simulate(arm, start, ts, forces, stepsize_controller=pid)
-    np.testing.assert_allclose(by_name.q, controlled.q, atol=1e-6)
-    default = fj.simulate(arm, start, ts, forces)
-    finer = fj.simulate(arm, start, ts, forces, atol=1e-7)  # rtol as by default
-    steps = [int(m.stats["num_steps"]) for m in (by_name, finer, default)]
-    assert steps == sorted(steps) and steps[0] < steps[-1]
 
 
 @pytest.mark.parametrize(

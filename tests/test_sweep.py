@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from elements import SHORT
+from hard.scenes import Breaking
 from helpers import random_linkage
 from modes import ADJOINT
 from sweep_batch import (
@@ -118,17 +119,17 @@ def test_a_reduction_sees_each_motion(mixed, swept):
 
 
 @pytest.mark.slow
-def test_a_reduction_sees_each_member(mixed):
+def test_a_reduction_sees_each_member():
     def tip_and_work(scene, motion):
         total = fj.joint_efforts(scene, motion).total
         return fj.tip_position(scene.linkage, motion.q[-1]), total, scene.state0.q
 
-    linkage, state0, forces = jax.tree.map(lambda leaf: leaf[:2], mixed)
-    tips, efforts, starts = run((linkage, state0, forces), reduce=tip_and_work)
-    np.testing.assert_array_equal(starts, state0.q)
+    both = two_links()
+    tips, efforts, starts = run(both, reduce=tip_and_work)
+    np.testing.assert_array_equal(starts, both[1].q)
     for k in range(2):
-        member = jax.tree.map(lambda leaf, k=k: leaf[k], mixed)
-        single = alone(mixed, k)
+        member = jax.tree.map(lambda leaf, k=k: leaf[k], both)
+        single = alone(both, k)
         tip = fj.tip_position(member[0], single.q[-1])
         np.testing.assert_allclose(tips[k], tip, atol=1e-7)
         wanted = fj.joint_efforts(member[0], member[2], single).total
@@ -175,15 +176,6 @@ def test_traced_values_may_be_out_of_sight(monkeypatch):
     assert jax.grad(total)(1.0) == 2
     assert jax.vmap(total)(jnp.ones(3)).tolist() == [2, 2, 2]
     assert sizes == [2, 2]
-
-
-class Breaking(eqx.Module):
-    """An effort of zero until a time, and NaN afterwards."""
-
-    at: jax.Array
-
-    def __call__(self, t, q, qd, linkage):
-        return jnp.where(t > self.at, jnp.nan, 0.0) * jnp.ones_like(q)
 
 
 @pytest.mark.slow

@@ -24,7 +24,7 @@ def test_gradients_equal_differences():
         )  # fmt: skip
         return found.q[-1], (found.q[-1], found.stats["num_switches"])
 
-    members = random_members()
+    members = jax.tree.map(lambda row: row[::3], random_members())
     slope = jax.jacfwd(end, has_aux=True)
 
     @partial(jax.jit, **LOOPS)

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import mpmath
 import numpy as np
+from helpers import Hold as Hold
 
 import fdof_jax as fj
 
@@ -43,15 +44,6 @@ class Scene(NamedTuple):
 def arm(topology="RRR", **changes):
     """Returns links of 1 m and 1 kg, unless a scene says otherwise."""
     return fj.Linkage(topology, **(USUAL | changes))
-
-
-class Hold(eqx.Module):
-    """A reference that stands still."""
-
-    target: jax.Array
-
-    def __call__(self, t, linkage):
-        return self.target, jnp.zeros_like(self.target)
 
 
 # Where the controllers of the scenes hold the arm [rad], as in driven_reference.json.
@@ -182,7 +174,7 @@ class Breaking(eqx.Module):
     at: jax.Array
 
     def __call__(self, t, q, qd, linkage):
-        return jnp.where(t > self.at, jnp.nan, 0.0) * jnp.ones(3)
+        return jnp.where(t > self.at, jnp.nan, 0.0) * jnp.ones_like(q)
 
 
 SIZE = 256  # of every batch here: one compilation serves three files

@@ -52,9 +52,10 @@ def test_members_that_fail_harm_no_other():
         mixed.q[NAN_LATER, before], clean.q[NAN_LATER, before], atol=1e-9
     )
     assert np.isnan(mixed.q[NAN_LATER, ~before]).all()
-    assert mixed.stats["time_reached"][NAN_LATER] == pytest.approx(0.32, abs=1e-6)
-    # Neither takes thousands of steps to fail.
-    assert (mixed.stats["num_steps"][BAD[:2]] < 200).all()
+    reached = mixed.stats["time_reached"][BAD[:2]]
+    np.testing.assert_allclose(reached, [0, 0.32], atol=1e-9)
+    # 46 bisections by 5 lead from a millisecond to the shortest step.
+    assert (mixed.stats["num_steps"][BAD[:2]] < 120).all()
     alone = fj.simulate(arm(), fj.State(*(a[FAST] for a in batch(True)[:2])), TS)
     np.testing.assert_allclose(mixed.q[FAST], alone.q, atol=1e-7)
 
