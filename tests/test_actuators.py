@@ -1,7 +1,7 @@
 """Elements with inertia: an independent Lagrangian of the actuator's bodies.
 
 Their energies are tested with those of all elements, in test_elements.py, and the
-armature against MuJoCo's in test_interop.py.
+armature against MuJoCo's in test_mjcf.py.
 """
 
 import equinox as eqx
