@@ -152,7 +152,7 @@ def acts(linkage, forces, t, q, qd, grown):
     args = Args(linkage, q, None, forces)
     own = jnp.stack(initial_own(args))
     y = zeros(q), tuple(qd), tuple(own + grown * jnp.cos(jnp.arange(own.size)))
-    found = applied(t, y, args, schedule_of(t, args))
+    *found, _ = applied(t, y, args, schedule_of(t, args))
     leaves = jax.tree.leaves((found, own))
     return jnp.concatenate([jnp.ravel(leaf) for leaf in leaves])
 

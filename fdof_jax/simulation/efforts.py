@@ -15,11 +15,11 @@ from ..forces.element import Element, Forces, elements_on, of_full_size
 from ..linkage.linkage import Linkage, check_linkage, without_fixed
 from .field import element_effort, with_states
 from .holding import changes, efforts_of_holders
-from .padding import cut, padded
 from .prescribed import prescribed, prescribed_effort
 from .sampled import Motion, acting_in, check_joints
 from .scene import accepts_scene
 from .simulate import check_own
+from .solve import cut, padded
 
 
 class Efforts(NamedTuple):

@@ -121,7 +121,7 @@ def _net_efforts(
     """Returns the system, and the efforts less the bias, with friction of sliding."""
     args = args._replace(modes=args.modes._replace(direction=jnp.sign(qd)))
     y = tuple(q - args.q0), tuple(qd), *own
-    tau = efforts(t, y, args, schedule_of(t, args))
+    tau, *_ = efforts(t, y, args, schedule_of(t, args))
     system = system_at(t, q, qd, args)
     return system, jnp.stack(minus(tau, system.equations.bias))
 

@@ -16,10 +16,10 @@ from ..linkage.linkage import Linkage, joint_names
 from ..steps.derivative_control import linearised
 from .field import (
     args_of,
+    effort_and_switches,
     element_effort,
     initial_own,
     initial_states,
-    switching_functions,
     whole,
     with_states,
 )
@@ -71,7 +71,8 @@ def _of_switches(inputs: Inputs, keywords: Settings) -> str:
     for k, element, state in with_states(forces, own):
 
         def functions(q, qd, k=k, element=element, state=state):
-            met = switching_functions(k, element, ts[0], q, qd, linkage, state)
+            at = ts[0], q, qd, linkage, state
+            *_, met, _ = effort_and_switches(k, element, *at)
             return np.concatenate([[], *map(np.ravel, met)])
 
         here = functions(q, qd)

@@ -89,11 +89,6 @@ def schedule_of(t: Array, args: Args) -> Schedules:
     return tuple(schedules)
 
 
-def stateful(forces: tuple[Element, ...]) -> list[StatefulElement]:
-    """Returns the elements that have a state of their own, which may be empty."""
-    return [element for element in forces if isinstance(element, StatefulElement)]
-
-
 def has_states(linkage: Linkage, forces: tuple[Element, ...]) -> bool:
     """Returns whether there is a number in any element's state; some drives have none.
 
@@ -114,7 +109,9 @@ def with_states(
 
 
 def initial_states(linkage: Linkage, forces: tuple[Element, ...]) -> OwnStates:
-    return tuple(element.initial_state(linkage) for element in stateful(forces))
+    """Returns the first states of elements with a state of their own, maybe empty."""
+    stateful = (e for e in forces if isinstance(e, StatefulElement))
+    return tuple(element.initial_state(linkage) for element in stateful)
 
 
 def initial_own(args: Args, own0: OwnStates | None = None) -> Scalars:
@@ -142,7 +139,7 @@ def _scalars(tree: PyTree, dtype: np.dtype) -> Scalars:
     return tuple(jnp.concatenate(leaves)) if leaves else ()
 
 
-def _effort(
+def efforts(
     t: Array, y: Integrated, args: Args, schedule: Schedules
 ) -> tuple[Scalars, Scalars, Switches]:
     """Returns efforts of the elements, rates of their states, and their switches.
@@ -164,7 +161,7 @@ def _effort(
                 effort = element.respond(scheduled, q, qd, args.linkage)
         else:
             at = args.clock(index, t), *arrays(), args.linkage
-            effort, rate, values, jumping = _switched_effort(
+            effort, rate, values, jumping = effort_and_switches(
                 index, element, *at, state, switches.rest()
             )
             switches.add(values, jumping)
@@ -178,27 +175,15 @@ def switching(
     t: Array, y: Integrated, args: Args, schedule: Schedules
 ) -> tuple[Array, tuple[bool, ...]]:
     """Returns the switching functions of all efforts, and which of them jump."""
-    *_, switches = _effort(t, y, args, schedule)
+    *_, switches = efforts(t, y, args, schedule)
     return switches.all_values(args.q0.dtype), tuple(switches.jumping)
-
-
-def efforts(t: Array, y: Integrated, args: Args, schedule: Schedules) -> Scalars:
-    """Returns the sum of the elements' efforts."""
-    return _effort(t, y, args, schedule)[0]
 
 
 def applied(
     t: Array, y: Integrated, args: Args, schedule: Schedules
-) -> tuple[Scalars, Scalars, Upper | None]:
-    """Returns efforts of the elements, rates of their states, and inertia they add."""
-    return switched(t, y, args, schedule)[:3]
-
-
-def switched(
-    t: Array, y: Integrated, args: Args, schedule: Schedules
 ) -> tuple[Scalars, Scalars, Upper | None, Switches]:
-    """Returns what `applied` does, and the switches of the efforts."""
-    tau, own_rates, switches = _effort(t, y, args, schedule)
+    """Returns efforts, rates of states, inertia that elements add, and switches."""
+    tau, own_rates, switches = efforts(t, y, args, schedule)
     delta, qd, *_ = y
     if not inertial(args.forces):
         return tau, own_rates, None, switches
@@ -227,7 +212,7 @@ def health_with(rates: PyTree, health: Health) -> Health:
 def vector_field(t, y, args, schedule) -> Integrated:
     """Rates of joint displacements, of velocities and of the elements' own states."""
     delta, qd, *_ = y
-    tau, own_rates, added = applied(t, y, args, schedule)
+    tau, own_rates, added, _ = applied(t, y, args, schedule)
     constants = args.moving().constants
     return whole(*rates(constants, delta, qd, tau, added), own_rates)
 
@@ -235,7 +220,7 @@ def vector_field(t, y, args, schedule) -> Integrated:
 def watched_field(t, y, args, schedule) -> tuple[Integrated, Health]:
     """Rates of `vector_field` and their health, which `ScheduledTerm` defines."""
     delta, qd, *_ = y
-    tau, own_rates, added = applied(t, y, args, schedule)
+    tau, own_rates, added, _ = applied(t, y, args, schedule)
     constants = args.moving().constants
     (qd, qdd), losses = rates_and_conditioning(constants, delta, qd, tau, added)
     health = health_with((qdd, own_rates), health_at(losses))
@@ -277,19 +262,11 @@ def element_effort(
 
     Raises ValueError unless it is a real number for each joint.
     """
-    return _switched_effort(index, element, t, q, qd, linkage, state, None)[0]
-
-
-def switching_functions(
-    index: int, element: Element, t: Array, q: Array, qd: Array, linkage: Linkage,
-    state: PyTree,
-) -> list[Array]:  # fmt: skip
-    """Returns the switching functions that an element meets."""
-    return _switched_effort(index, element, t, q, qd, linkage, state, None)[2]
+    return effort_and_switches(index, element, t, q, qd, linkage, state)[0]
 
 
 @eqx.filter_jit  # traced once, not at each use by a solver
-def _switched_effort(
+def effort_and_switches(
     index: int,
     element: Element,
     t: Array,
@@ -297,9 +274,9 @@ def _switched_effort(
     qd: Array,
     linkage: Linkage,
     state: PyTree,
-    sides: Array | None,
+    sides: Array | None = None,
 ) -> tuple[Array, PyTree, list[Array], list[bool]]:
-    """Returns what `element_effort` does, and the switching functions met."""
+    """Returns an element's effort, the rate of its state, and the switches it met."""
     switches = Switches(sides)
     expected = (
         f"forces[{index}]: expected it to return tau, an array of {len(q)} real numbers"
@@ -375,24 +352,22 @@ def _of_arrays(term: ScheduledTerm) -> ScheduledTerm:
 
         return unpacked
 
-    field, watched = map(of_scalars, (term.vector_field, term.watched_field))
+    def first_in_arrays(function: Callable) -> Callable:
+        function = of_scalars(function)
 
-    def watched_field(*at):
-        rates, health = watched(*at)
-        return tuple(map(jnp.stack, rates)), health
+        def stacked(*at):
+            y, other = function(*at)
+            return tuple(map(jnp.stack, y)), other
 
-    def resolve(event, y, args):
-        assert term.resolve is not None
-        args = args._replace(constants=args.constants.scalars())
-        y, modes = term.resolve(event, tuple(map(tuple, y)), args)
-        return tuple(map(jnp.stack, y)), modes
+        return stacked
 
+    field = of_scalars(term.vector_field)
     return ScheduledTerm(
         lambda *at: tuple(map(jnp.stack, field(*at))),
         term.schedule,
         of_scalars(term.health),
-        watched_field,
+        first_in_arrays(term.watched_field),
         of_scalars(term.switching),
         term.unknown_modes,
-        term.resolve and resolve,
+        term.resolve and first_in_arrays(term.resolve),  # of an event, not a time
     )

@@ -28,7 +28,7 @@ from ..mechanics.equations import Constants, Equations, Upper, equations, with_h
 from ..mechanics.rates import efforts_of_fixed
 from ..mechanics.solve import divided, solver_of, times, with_added
 from ..steps.dopri8 import Integrated, constant
-from .field import Args, Schedules, args_of, switched
+from .field import Args, Schedules, applied, args_of
 from .solution import MODES, Events
 
 FREE, FRICTION, LOWER, UPPER, BRAKE = range(len(MODES))
@@ -133,7 +133,7 @@ def guarded_switching(
     For each joint one that shows whether it stays as it is: held within its limits, or
     sliding. With stops, for each joint that is free: the distances from them.
     """
-    tau, _, added, switches = switched(t, y, args, schedule)
+    tau, _, added, switches = applied(t, y, args, schedule)
     constants = args.moving().constants
     effort = jnp.stack(efforts_of_fixed(constants, *y[:2], tau, added))
     law, modes = laws(args, t), args.modes

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from ..base.checks import shown
+from ..base.checks import refusal
 from ..forces.element import Element, OwnStates
 from ..forces.joints import EffortHistory
 from ..linkage.linkage import Linkage, possible, without_fixed
@@ -60,15 +60,15 @@ class _Problem(NamedTuple):
 
     - `valid`: whether the inputs were; otherwise harmless ones replace them.
     - `ts`: output times of the solve; `first`: positions and velocities at the first.
-    - `start`: the integrated state there; `term`, `args`: its equations.
+    - `term`, `start`, `args`: the equations, the integrated state there, and constants.
     - `joints(t, y)`: reads positions, velocities and the elements' own states.
     """
 
     valid: Array
     ts: Array
     first: tuple[Array, Array]
-    start: Integrated
     term: ScheduledTerm
+    start: Integrated
     args: Args
     joints: Callable[[Array, Integrated], tuple[Array, Array, OwnStates]]
 
@@ -110,23 +110,23 @@ def _prepare(inputs: Inputs, derivatives: bool, padded: bool) -> _Problem:
     q0, qd0 = (without_fixed(linkage, jnp.where(wrong_start, 0, a)) for a in state0)
     harmless = 1e-3 * jnp.arange(len(ts), dtype=ts.dtype)
     ts = jnp.where(wrong_times, harmless, ts)
-    arguments = args_of(linkage, q0, forces)
+    args = args_of(linkage, q0, forces)
     if derivatives:
-        arguments = clocks_apart(arguments, ts)
-    own = initial_own(arguments, own0)
+        args = clocks_apart(args, ts)
+    own = initial_own(args, own0)
     finite = jnp.isfinite(jnp.array(own)).all()
     own = tuple(jnp.where(finite, x, 0) for x in own)
     term, start_of, joints_of = formulation(forces)
-    start = whole(*start_of(arguments, qd0), own)
+    start = whole(*start_of(args, qd0), own)
 
     def joints(t, y):
-        return *joints_of(arguments, t, y), own_states(arguments, y)
+        return *joints_of(args, t, y), own_states(args, y)
 
     q, qd, _ = joints(ts[0], start)  # after a blow there, like all that follows
-    args = arguments
+    equations = term, start, args
     if padded and not derivatives:
-        term, start, args = in_arrays(term, start, args)
-    return _Problem(valid & finite, ts, (q, qd), start, term, args, joints)
+        equations = in_arrays(*equations)
+    return _Problem(valid & finite, ts, (q, qd), *equations, joints)
 
 
 def _control(
@@ -137,19 +137,17 @@ def _control(
     solver = _differentiable(solver, keywords["adjoint"])
     own_controller = keywords["stepsize_controller"]  # the user's
     steps = own_controller or default_controller()
-    _, ts, _, start, term, args, _ = problem
+    term, start, args, ts = problem.term, problem.start, problem.args, problem.ts
     if not isinstance(steps, diffrax.AbstractAdaptiveStepSizeController):
+        why = None
         # Fixed steps may pass over the kinks of a history, but over no jump.
         if known_times(args, without=EffortHistory) is not None:
-            raise ValueError(
-                "stepsize_controller: expected an adaptive one, as forces declare "
-                f"times at which they jump (jump_ts), got {shown(steps)}."
-            )
-        if changes(args.forces):
-            raise ValueError(
-                "stepsize_controller: expected an adaptive one, as forces hold joints "
-                f"or take payloads, got {shown(steps)}."
-            )
+            why = "declare times at which they jump (jump_ts)"
+        elif changes(args.forces):
+            why = "hold joints or take payloads"
+        if why is not None:
+            expected = f"an adaptive one, as forces {why}"
+            raise refusal("stepsize_controller", expected, steps)
         return _Control(start, solver, steps, None)
     jumps = known_times(args)
     implicit = isinstance(solver, diffrax.AbstractImplicitSolver)
@@ -218,8 +216,8 @@ def _read(inputs: Inputs, problem: _Problem, solve: diffrax.Solution) -> Solutio
         return jnp.where(jnp.isinf(a) | ~valid, jnp.nan, a)
 
     # diffrax saves the start only with the first step.
-    start = (without_fixed(linkage, value) for value in state0)
-    first = (jnp.where(valid, a, b) for a, b in zip(problem.first, start))
+    given = (without_fixed(linkage, value) for value in state0)
+    first = (jnp.where(valid, a, b) for a, b in zip(problem.first, given))
     if modes:  # after blows at the start
         there = jnp.isfinite(qd[0]) & valid
         first = (jnp.where(there, a[0], b) for a, b in zip((q, qd), first))
@@ -284,11 +282,10 @@ def faults(inputs: Inputs, times: bool = True) -> list[Array]:
     increasing = ((growth > 0) & (growth < jnp.inf)).all() | (not times)
     finite = (jnp.isfinite(state0.q) & jnp.isfinite(state0.qd)).all()
     q0 = jnp.asarray(state0.q)
-    start = finite & agrees(forces, ts[0], q0, linkage)
-    start = start & within_stops(forces, q0, linkage)
+    place = agrees(forces, ts[0], q0, linkage) & within_stops(forces, q0, linkage)
     arm = constant((linkage, ts))
     fit = [jnp.asarray(e.possible() & constant(e).fits(*arm)) for e in forces]
-    return [~fine for fine in (increasing, start, possible(linkage), *fit)]
+    return [~fine for fine in (increasing, finite & place, possible(linkage), *fit)]
 
 
 def _result(

@@ -9,8 +9,9 @@ from ..steps.landing import clearance
 from .field import Args
 from .prescribed import PrescribedMotion
 
-# Units of `clearance`, beyond the distances that steps keep from each time.
-_APART = 8
+# By which a clock is ahead of the one before, in units of `clearance`: beyond the
+# distances that steps keep from each time.
+_AHEAD = 8
 
 
 def clocks_apart(args: Args, ts: Array) -> Args:
@@ -28,7 +29,7 @@ def clocks_apart(args: Args, ts: Array) -> Args:
     )
     if len(places) < 2:
         return args
-    unit = _APART * clearance(ts)
+    unit = _AHEAD * clearance(ts)
     ahead = [0.0] * len(args.forces)
     for rank, (_, place) in enumerate(places):
         ahead[place] = rank
@@ -41,7 +42,7 @@ def clear_of_start(forces: Forces, ts: Array) -> Array:
     The clock of that element is ahead of those of `forces`.
     """
     timed = sum(element.jump_ts is not None for element in forces)
-    return (1 + _APART * timed) * clearance(ts)
+    return (1 + _AHEAD * timed) * clearance(ts)
 
 
 def known_times(

@@ -60,10 +60,8 @@ def concatenate(motions: Sequence[Solution]) -> Solution:
     stats, result = reduce(_outcome, [(m.stats, m.result) for m in motions])
     modes = taken = None
     if events:
-        zeros = [jnp.zeros_like(m.q) for m in motions]
-        pairs = zip(motions, zeros)
-        modes = _rows([z if m.modes is None else m.modes for m, z in pairs], batch)
-        taken = _totals([m.taken for m in motions], [z[..., 0] for z in zeros])
+        modes = _rows([_or_zeros(m.modes, m.q) for m in motions], batch)
+        taken = _totals([_or_zeros(m.taken, m.q[..., 0]) for m in motions])
     return Solution(
         ts=_rows([m.ts for m in motions], -1),
         q=_rows([m.q for m in motions], batch),
@@ -103,10 +101,14 @@ def _rows(pieces: list[Array], axis: int) -> Array:
     return jnp.concatenate([*first, last], axis=axis)
 
 
-def _totals(pieces: list[Array | None], zeros: list[Array]) -> Array:
+def _or_zeros(rows: Array | None, like: Array) -> Array:
+    return jnp.zeros_like(like) if rows is None else rows
+
+
+def _totals(pieces: list[Array]) -> Array:
     totals, before = [], 0.0
-    for piece, zero in zip(pieces, zeros):
-        totals.append((zero if piece is None else piece) + before)
+    for piece in pieces:
+        totals.append(piece + before)
         before = totals[-1][..., -1:]
     return _rows(totals, -1)
 

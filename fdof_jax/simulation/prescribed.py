@@ -14,7 +14,7 @@ from jax import Array
 from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
-from ..base.checks import place_of
+from ..base.checks import place_of, refusal
 from ..dynamics import mass_and_bias
 from ..forces.element import Element, Forces, naming
 from ..forces.holders import numbered, numbers_in
@@ -82,9 +82,7 @@ def prescribed(forces: Forces) -> PrescribedMotion | None:
     """Returns the `PrescribedMotion` among the elements, or None."""
     motions = [e for e in forces if isinstance(e, PrescribedMotion)]
     if len(motions) > 1:
-        raise ValueError(
-            f"forces: expected one PrescribedMotion at most, got {len(motions)}."
-        )
+        raise refusal("forces", "one PrescribedMotion at most", len(motions))
     return motions[0] if motions else None
 
 
@@ -98,37 +96,46 @@ def agrees(forces: Forces, t: Array, q: Array, linkage: Linkage) -> Truth:
     return (near | ~motion.prescribes(linkage)).all()
 
 
-def _mass_and_bias(args: Args, q: Array, qd: Array) -> tuple[Array, Array]:
-    start = args.q0, args.constants
-    return mass_and_bias(args.linkage, args.forces, q, qd, start)
+def _mass_matrix(args: Args, q: Array) -> Array:
+    start, still = (args.q0, args.constants), jnp.zeros_like(q)
+    return mass_and_bias(args.linkage, args.forces, q, still, start)[0]
+
+
+def _of_driven(moved: Array, matrix: Array) -> Array:
+    """Returns the matrix, with the rows and columns of prescribed joints as in 1."""
+    return jnp.where(jnp.outer(~moved, ~moved), matrix, jnp.eye(len(moved)))
 
 
 def _split(moved: Array, matrix: Array, given: Array, right: Array) -> Array:
     """Solves the rows of the driven joints, given those of the prescribed ones."""
-    free = jnp.where(jnp.outer(~moved, ~moved), matrix, jnp.eye(len(moved)))
     given = jnp.where(moved, given, 0)
-    return jnp.linalg.solve(free, jnp.where(moved, given, right - matrix @ given))
+    right = jnp.where(moved, given, right - matrix @ given)
+    return jnp.linalg.solve(_of_driven(moved, matrix), right)
 
 
 def hybrid_joints(args: Args, t: Array, y: Integrated) -> tuple[Array, Array]:
-    motion, (displaced, momenta, *_) = _motion(args), y
+    displaced, momenta, *_ = y
     q, momenta = args.q0 + jnp.stack(displaced), jnp.stack(momenta)
+    moved, motion = _moved(args), _motion(args.forces)
     position, velocity = motion.at(t, args.linkage)
-    q = jnp.where(motion.prescribes(args.linkage), position, q)
-    matrix, _ = _mass_and_bias(args, q, jnp.zeros_like(q))
-    return q, _split(motion.prescribes(args.linkage), matrix, velocity, momenta)
+    q = jnp.where(moved, position, q)
+    return q, _split(moved, _mass_matrix(args, q), velocity, momenta)
 
 
 def hybrid_start(args: Args, qd: Array) -> tuple[Scalars, Scalars]:
-    matrix, _ = _mass_and_bias(args, args.q0, jnp.zeros_like(args.q0))
-    momenta = jnp.where(_motion(args).prescribes(args.linkage), 0, matrix @ qd)
+    momenta = jnp.where(_moved(args), 0, _mass_matrix(args, args.q0) @ qd)
     return zeros(args.q0), tuple(momenta)
 
 
-def _motion(args: Args) -> PrescribedMotion:
-    motion = prescribed(args.forces)
+def _motion(forces: Forces) -> PrescribedMotion:
+    motion = prescribed(forces)
     assert motion is not None  # hybrid dynamics are of no other motions
     return motion
+
+
+def _moved(args: Args) -> Array:
+    """Returns whether each joint is prescribed."""
+    return _motion(args.forces).prescribes(args.linkage)
 
 
 def hybrid_switching(t, y, args, schedule) -> tuple[Array, tuple[bool, ...]]:
@@ -141,15 +148,15 @@ def hybrid_field(t, y, args, schedule) -> Integrated:
 
     The rate of the momenta is M' qd - bias + tau, where M' is the mass matrix's rate.
     """
-    motion, (q, qd) = _motion(args), hybrid_joints(args, t, y)
+    moved, (q, qd) = _moved(args), hybrid_joints(args, t, y)
     displaced = tuple(q - args.q0), tuple(qd)
-    tau, own_rates, _ = applied(t, (*displaced, *y[2:]), args, schedule)
+    tau, own_rates, *_ = applied(t, (*displaced, *y[2:]), args, schedule)
     # The efforts already include the bias of masses that elements move.
     bias = jnp.stack(equations(args.constants, *displaced).bias)
-    momenta = lambda q: _mass_and_bias(args, q, jnp.zeros_like(q))[0] @ qd
+    momenta = lambda q: _mass_matrix(args, q) @ qd
     _, change = jax.jvp(momenta, (q,), (qd,))
-    moved, change = motion.prescribes(args.linkage), change - bias + jnp.stack(tau)
-    driven = jnp.where(moved, 0, without_fixed(args.linkage, change))
+    change = without_fixed(args.linkage, change - bias + jnp.stack(tau))
+    driven = jnp.where(moved, 0, change)
     return whole(tuple(jnp.where(moved, 0, qd)), tuple(driven), own_rates)
 
 
@@ -162,9 +169,7 @@ def watched_hybrid_field(t, y, args, schedule) -> tuple[Integrated, Health]:
 def hybrid_health(t, y, args) -> Health:
     """Health of the driven joints' equations, as in `field.health_of`."""
     q, _ = hybrid_joints(args, t, y)
-    matrix, _ = _mass_and_bias(args, q, jnp.zeros_like(q))
-    driven = ~_motion(args).prescribes(args.linkage)
-    free = jnp.where(jnp.outer(driven, driven), matrix, jnp.eye(len(q)))
+    free = _of_driven(_moved(args), _mass_matrix(args, q))
     losses = jnp.diag(free) * jnp.diag(jnp.linalg.inv(free))
     return health_at(tuple(jnp.where(losses > 0, losses, jnp.inf)))
 
@@ -173,8 +178,7 @@ def prescribed_effort(
     linkage: Linkage, forces: Forces, t: Array, q: Array, qd: Array, tau: Array
 ) -> Float[Array, " joint"]:
     """Computes the effort of the prescribed motion beside other efforts `tau`."""
-    motion = prescribed(forces)
-    assert motion is not None
+    motion = _motion(forces)
     matrix, bias = mass_and_bias(linkage, forces, q, qd)
     velocity = lambda t: motion.at(t, linkage)[1]
     _, demanded = jax.jvp(velocity, (t,), (jnp.ones_like(t),))

@@ -139,9 +139,7 @@ def acting_in(motion: Motion, forces: tuple[Element, ...]) -> tuple[Element, ...
     if isinstance(motion, Solution):
         return forces
     if not forces:
-        raise ValueError(
-            "forces: expected (control, *forces) of a SampledMotion, got ()."
-        )
+        raise refusal("forces", "(control, *forces) of a SampledMotion", forces)
     acting = motion.acting
     if acting is None:
         acting = jnp.concatenate([motion.tau, motion.tau[-1:]])
@@ -251,10 +249,8 @@ def simulate_sampled(
     spread = None
     if noise is not None:
         if not isinstance(noise, tuple | list) or len(noise) != 2:
-            raise ValueError(
-                "noise: expected a pair of standard deviations, of positions and of "
-                f"velocities, got {shown(noise)}."
-            )
+            pair = "a pair of standard deviations, of positions and of velocities"
+            raise refusal("noise", pair, noise)
         spread = State(
             *(
                 real_array(f"noise[{k}]", value, (n,), minimum=0, broadcast=True)
@@ -325,12 +321,10 @@ def _motion(
         last = jax.tree.map(lambda rows: rows[-1], rows)
         good = result == diffrax.RESULTS.successful
         result = diffrax.RESULTS.where(good, solution.result, result)
-        q_begin = None
-        if rest is not None:
-            q_begin = jnp.where(within, *solution.q[1:])
+        q_begin = None if rest is None else jnp.where(within, *solution.q[1:])
         taken = None if solution.taken is None else solution.taken[jnp.array([0, -1])]
-        found = starts, tau, q_begin, taken
-        return (last, memory, under_way, arrives, result), found
+        carry = last, memory, under_way, arrives, result
+        return carry, (starts, tau, q_begin, taken)
 
     own0 = initial_states(linkage, forces), control.initial_state(linkage)
     own0, memory0 = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), own0)

@@ -13,7 +13,7 @@ from jax import Array
 from jaxtyping import PyTree
 from numpy.typing import ArrayLike
 
-from ..base.checks import instance, shown
+from ..base.checks import instance, refusal, shown
 from ..forces.element import Forces, elements, of_full_size
 from ..linkage.coordinates import State
 from ..linkage.linkage import Linkage
@@ -75,10 +75,8 @@ def accepts_scene(
         scene, *more = args
         for name in Scene._fields:
             if name in kwargs:
-                raise ValueError(
-                    f"{name}: expected none beside a Scene, which has its own, got "
-                    f"{shown(kwargs[name])}."
-                )
+                expected = "none beside a Scene, which has its own"
+                raise refusal(name, expected, kwargs[name])
         if len(more) > len(others):
             raise ValueError(
                 f"scene: expected {function.__name__}(scene, {', '.join(others)}), as "
@@ -129,29 +127,25 @@ def stacked(scenes: Sequence[_Stacked], name: str = "scenes") -> _Stacked:
     (2, 3)
     """
     if not isinstance(scenes, list | tuple) or isinstance(scenes, Scene) or not scenes:
-        raise ValueError(f"{name}: expected a list of scenes, got {shown(scenes)}.")
-    first, *others = map(_parts, scenes)
-    for index, other in enumerate(others, start=1):
-        if not eqx.tree_equal(other[1], first[1]) or jax.tree.map(
-            np.shape, other[0]
-        ) != jax.tree.map(np.shape, first[0]):
+        raise refusal(name, "a list of scenes", scenes)
+    numbers, others = zip(*map(_parts, scenes))
+    shapes = [jax.tree.map(np.shape, tree) for tree in numbers]
+    for index, (other, shape) in enumerate(zip(others, shapes)):
+        if not eqx.tree_equal(other, others[0]) or shape != shapes[0]:
             raise ValueError(
                 f"{name}[{index}]: expected one like {name}[0] except for numbers, got "
                 f"{shown(scenes[index])} and {shown(scenes[0])}."
             )
-    rows = [first[0], *(other[0] for other in others)]
-    arrays = jax.tree.map(lambda *a: np.stack([_as_array(x) for x in a]), *rows)
-    return eqx.combine(arrays, first[1])
+    stack = lambda *leaves: np.stack([*map(_as_array, leaves)])
+    return eqx.combine(jax.tree.map(stack, *numbers), others[0])
 
 
 def unstacked(name: str, scenes: Scene) -> list[Scene]:
     """Splits stacked scenes into their members."""
     instance(name, scenes, Scene)
     if not (found := members(scenes)):
-        raise ValueError(
-            f"{name}: expected scenes stacked along a leading axis of one size (see "
-            f"`stacked`), got {shown(scenes)}."
-        )
+        expected = "scenes stacked along a leading axis of one size (see `stacked`)"
+        raise refusal(name, expected, scenes)
     return found
 
 

@@ -65,16 +65,6 @@ class _Term(diffrax.ODETerm):
         return self.vector_field(t, y, args)
 
 
-class _LocatedRow(Located):
-    """Locates events of the motion alone, as a function of the parameters."""
-
-    known_lateness: Callable[[Array, Array], Array]
-
-    def lateness(self, arrival, term):
-        known = self.known_lateness(arrival.t, arrival.args.z)
-        return super().lateness(arrival, term) + known
-
-
 class _LocatedRows(Located):
     """Adds what switches and known times change in the derivatives of the motion."""
 
@@ -83,25 +73,18 @@ class _LocatedRows(Located):
     jumps: Array | None
     slopes: Array | None  # derivatives of the jumps (jump, n)
 
-    def resolved(self, term, t, y, args, switching, sides, changed, made_jump):
-        (rows,) = y
-        one = _LocatedRow(
-            self.solver, self.jumping, self.apart, self.guards, True, self.known_late
-        )  # pyright: ignore[reportCallIssue]
+    def after_event(self, term, t, y, args, switching, sides, changed, made_jump):
+        (rows,), of_motion = y, super().after_event
+        event = switching, sides, changed, made_jump
 
         def of_row(row, z):
-            (row,), modes = one.after_event(
-                self.motion, t, (row,), args._replace(z=z), switching, sides, changed,
-                made_jump,
-            )  # fmt: skip
+            args_at = args._replace(z=z)
+            (row,), modes = of_motion(self.motion, t, (row,), args_at, *event)
             return row, modes
 
-        def after_event():
-            row, along, modes = jax.linearize(of_row, rows[0], args.z, has_aux=True)
-            slopes = jax.vmap(along)(rows[1:], jnp.eye(args.z.size, dtype=rows.dtype))
-            return (jnp.concatenate([row[None], slopes]),), modes
-
-        return self.if_event(switching, made_jump, after_event, y)
+        row, along, modes = jax.linearize(of_row, rows[0], args.z, has_aux=True)
+        slopes = jax.vmap(along)(rows[1:], jnp.eye(args.z.size, dtype=rows.dtype))
+        return (jnp.concatenate([row[None], slopes]),), modes
 
     def kept(self, held, y1, y0):
         ((new,), (old,)) = y1, y0
@@ -116,9 +99,11 @@ class _LocatedRows(Located):
         index = jnp.argmin(distance)
         return jnp.where(distance[index] <= 2 * self.apart, self.slopes[index], 0)
 
-    def known_late(self, time: Array, z: Array) -> Array:
-        """Returns how much later a known time here is: 0, with derivatives in `z`."""
-        return self.slope_of_known(time, z) @ (z - jax.lax.stop_gradient(z))
+    def lateness(self, arrival, term):
+        z = arrival.args.z
+        # 0, with derivatives: a known time here moves with its parameters.
+        known = self.slope_of_known(arrival.t, z) @ (z - jax.lax.stop_gradient(z))
+        return super().lateness(arrival, term) + known
 
     def needed(self, count, jumps):
         return count > 0 or jumps is not None
@@ -206,19 +191,18 @@ def sensitivities(
     start, along = jax.linearize(
         lambda z: jnp.stack(jax.tree.leaves(start_at(z)[1])), z
     )
-    structure = jax.tree.structure(start_at(z)[1])
+    args, y = start_at(z)
+    structure, equations = jax.tree.structure(y), formulation(args.forces)
     directions = jnp.eye(z.size, dtype=z.dtype)
 
     def instant(row, varied):
-        """Returns term, state and arguments of the motion."""
+        """Returns state and arguments of the motion."""
         args, _ = start_at(varied.z)
         args = args._replace(sides=varied.sides, modes=varied.modes)
-        y = jax.tree.unflatten(structure, tuple(row))
-        return formulation(args.forces).term, y, args
+        return jax.tree.unflatten(structure, tuple(row)), args
 
     def rates(t, row, varied):
-        term, *at = instant(row, varied)
-        return jnp.stack(jax.tree.leaves(term.vf(t, *at)))
+        return jnp.stack(jax.tree.leaves(equations.term.vf(t, *instant(row, varied))))
 
     @jax.jit  # traced once, not at each use by the solver
     def field(t, y, varied):
@@ -228,37 +212,32 @@ def sensitivities(
         return (jnp.concatenate([value[None], slopes]),)
 
     def switches_of_row(t, y, varied):
-        term, *at = instant(y[0], varied)
-        return term.switches(t, *at)
+        return equations.term.switches(t, *instant(y[0], varied))
 
     def switches_of(t, y, varied):
         return switches_of_row(t, (y[0][0],), varied)
 
     def unknown_modes(varied):
-        term, _, args = instant(start, varied)
-        assert term.unknown_modes is not None  # of scenes that change modes
-        return term.unknown_modes(args)
+        assert equations.term.unknown_modes is not None  # of scenes that change modes
+        _, args = instant(start, varied)
+        return equations.term.unknown_modes(args)
 
     def resolve(event, y, varied):
-        term, *at = instant(y[0], varied)
-        assert term.resolve is not None
-        state, modes = term.resolve(event, *at)
+        assert equations.term.resolve is not None
+        state, modes = equations.term.resolve(event, *instant(y[0], varied))
         return (jnp.stack(jax.tree.leaves(state)),), modes
 
-    def times_of(z):
-        return known_times(start_at(z)[0])
-
     def observed(z, t, row):
-        args, _ = start_at(z)
-        y = jax.tree.unflatten(structure, tuple(row))
-        return *formulation(args.forces).joints(args, t, y), own_states(args, y)
+        y, args = instant(row, _Varied(z))
+        return *equations.joints(args, t, y), own_states(args, y)
 
     tolerance = of_precision(tolerance, max(tolerance, TOLERANCE))
     controller = adaptive(tolerance, tolerance)
     controller = dataclasses.replace(controller, norm=_largest_rms)
-    jumps, slopes = times_of(z), jax.jacfwd(times_of)(z)
+    jumps = known_times(args)
+    slopes = jax.jacfwd(lambda z: known_times(start_at(z)[0]))(z)
     y0 = (jnp.concatenate([start[None], jax.vmap(along)(directions)]),)
-    changing = formulation(start_at(z)[0].forces).term.resolve is not None
+    changing = equations.term.resolve is not None
     events = (unknown_modes, resolve) if changing else (None, None)
     term = _Term(field, switches_of, *events)  # pyright: ignore[reportArgumentType, reportCallIssue]
     motion = _Term(

@@ -14,6 +14,7 @@ from ..base.checks import (
     is_traced,
     plain,
     real_array,
+    refusal,
     shown,
     single_precision,
     whole_number,
@@ -113,13 +114,13 @@ def elements_at_door(linkage: Linkage, forces: Forces) -> tuple[Element, ...]:
 def check_elements(forces: Forces, linkage: Linkage, ts: Array) -> None:
     """Raises ValueError for known values of elements, and elements that do not fit."""
     for index, element in enumerate(elements_at_door(linkage, forces)):
-        place, values = f"forces[{index}]", in_numpy(element)
+        place = f"forces[{index}]"
         if is_traced(linkage, ts, element):
             continue
         check_values(place, element)  # `equinox.tree_at` bypasses the constructor
         with naming(place):
             element.check(linkage, ts)
-        if not values.possible():
+        if not in_numpy(element).possible():
             raise ValueError(
                 f"{place}: expected values that its constructor accepts, got "
                 f"{plain(eqx.tree_pformat(element, short_arrays=False))}."
@@ -132,18 +133,14 @@ def check_start(
     """Raises ValueError unless known starts agree with references and stops."""
     if is_traced(linkage, state0, ts, forces):
         return
-    if not within_stops(forces, jnp.asarray(state0.q), linkage):
-        raise ValueError(
-            "state0.q: expected positions between the hard stops, got "
-            f"{np.asarray(state0.q).tolist()}."
-        )
+    q = jnp.asarray(state0.q)
+    if not within_stops(forces, q, linkage):
+        raise refusal("state0.q", "positions between the hard stops", q.tolist())
     motion = prescribed(forces)
-    if motion is not None and not agrees(forces, ts[0], jnp.asarray(state0.q), linkage):
+    if motion is not None and not agrees(forces, ts[0], q, linkage):
         begin, _ = motion.at(ts[0], linkage)
-        raise ValueError(
-            f"state0.q: expected {begin.tolist()} at the joints whose motion is "
-            f"prescribed, got {np.asarray(state0.q).tolist()}."
-        )
+        expected = f"{begin.tolist()} at the joints whose motion is prescribed"
+        raise refusal("state0.q", expected, q.tolist())
 
 
 @accepts_scene
@@ -306,13 +303,11 @@ def check_own(
     name, own, forces: tuple[Element, ...], linkage: Linkage, rows: tuple
 ) -> None:
     """Raises ValueError unless `own` holds rows of the stateful elements' states."""
-    expected = jax.eval_shape(lambda: initial_states(linkage, forces))
-    shapes = jax.tree.map(lambda leaf: (*rows, *leaf.shape), expected)
+    states = jax.eval_shape(lambda: initial_states(linkage, forces))
+    shapes = jax.tree.map(lambda leaf: (*rows, *leaf.shape), states)
     own_shapes = jax.tree.map(jnp.shape, own)
     # The shape of a number is (), as the states of no elements are.
-    alike = jax.tree.structure(own) == jax.tree.structure(expected)
+    alike = jax.tree.structure(own) == jax.tree.structure(states)
     if not alike or own_shapes != shapes:
-        raise ValueError(
-            f"{name}: expected the states of the forces' elements, of shapes {shapes}, "
-            f"got {own_shapes}."
-        )
+        expected = f"the states of the forces' elements, of shapes {shapes}"
+        raise refusal(name, expected, own_shapes)

@@ -9,20 +9,24 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.flatten_util import ravel_pytree
+from jaxtyping import PyTree
+from numpy.typing import ArrayLike
 
 from ..base.checks import is_traced
 from ..base.configuration import options_of_loops
 from ..base.functions import sharing_functions
 from ..forces.added_inertia import inertial
-from ..forces.element import Element, ForeignElement
+from ..forces.element import ForeignElement
 from ..steps.controllers import with_pid
 from ..steps.derivative_control import TANGENTS
 from ..steps.tolerances import at_tolerances
 from ..steps.unrolled_dopri8 import UnrolledDopri8
 from .integrate import Inputs, Settings, integrate
-from .padding import cut, padded
 from .prescribed import prescribed
 from .solution import Solution
+
+# All plain calls with at most this many output times share one program.
+_FEWEST_TIMES = 512
 
 
 def solve(inputs: Inputs, keywords: Settings) -> tuple[Solution, bool | None]:
@@ -39,6 +43,28 @@ def solve(inputs: Inputs, keywords: Settings) -> tuple[Solution, bool | None]:
         return _solve(inputs, keywords), None
     one = None if is_traced(inputs, keywords) else _solve_one(inputs, keywords)
     return one or (_solve_compiled(inputs, keywords), None)
+
+
+def padded(rows: PyTree) -> PyTree:
+    """Returns arrays (time, ...) with their last row repeated up to a power of two.
+
+    Few programs then serve all numbers of output times.
+    """
+
+    def longer(row: ArrayLike) -> np.ndarray:
+        array = np.asarray(row)
+        count = len(array)
+        size = max(_FEWEST_TIMES, 1 << (count - 1).bit_length())
+        others = ((0, 0),) * (array.ndim - 1)
+        return np.pad(array, ((0, size - count), *others), mode="edge")
+
+    return jax.tree.map(longer, rows)
+
+
+def cut(rows: PyTree, count: int) -> PyTree:
+    """Returns the first `count` rows of arrays (time, ...)."""
+    # JAX slices and jnp.asarray would compile a program for each new shape.
+    return jax.device_put(jax.tree.map(lambda row: np.asarray(row)[:count], rows))
 
 
 @jax.transfer_guard("allow")  # the padded times are in NumPy
@@ -104,13 +130,6 @@ _without_functions = eqx.filter_jit(
 )
 
 
-def _batch_solver(forces: tuple[Element, ...]) -> diffrax.AbstractSolver:
-    """Returns the fastest solver for large batches."""
-    # Thirteen unrolled copies of these equations would take minutes to compile.
-    many = inertial(forces) or prescribed(forces)
-    return diffrax.Dopri8() if many else UnrolledDopri8()
-
-
 @eqx.filter_custom_vjp
 def _integrate_reversibly(inputs: Inputs, keywords) -> Solution:
     """Integrates a motion that may be differentiated by `jax.grad`.
@@ -119,10 +138,12 @@ def _integrate_reversibly(inputs: Inputs, keywords) -> Solution:
     the backward pass must reproduce the same bits: they serve the plain solve alone.
     """
     # The plain solve needs no loops for reverse mode, which take longer to compile.
-    solver = keywords["solver"] or _batch_solver(inputs.forces)
-    return integrate(
-        inputs, keywords | {"solver": solver, "adjoint": diffrax.ForwardMode()}
-    )
+    keywords = keywords | {"adjoint": diffrax.ForwardMode()}
+    if keywords["solver"] is None:
+        # Thirteen unrolled copies of these equations would take minutes to compile.
+        many = inertial(inputs.forces) or prescribed(inputs.forces)
+        keywords["solver"] = diffrax.Dopri8() if many else UnrolledDopri8()
+    return integrate(inputs, keywords)
 
 
 # Up to so many numbers, tangents cost no more than the adjoint equations (one arm or

@@ -18,6 +18,14 @@ Judging = diffrax.AbstractAdaptiveStepSizeController  # judges errors of steps
 _C = TypeVar("_C", bound=Controller)
 
 
+def giving_up(
+    result: diffrax.RESULTS, spent: Array, reason: diffrax.RESULTS
+) -> diffrax.RESULTS:
+    """Returns the result of a step, or the reason to give up if it has not failed."""
+    ends = spent & (result == diffrax.RESULTS.successful)
+    return diffrax.RESULTS.where(ends, reason, result)
+
+
 def _with(
     change: Callable[..., Controller],
     controller: _C,
@@ -180,6 +188,5 @@ class Abreast(Adaptive):
         most = jax.lax.pmean(behind.astype(float), self.axis) >= _MOST
         typical = jnp.where(most & (typical == 0), count, typical)
         behind_most = (typical > 0) & (count >= _SLACK * typical)
-        spent = behind_most & (result == diffrax.RESULTS.successful)
-        result = diffrax.RESULTS.where(spent, diffrax.RESULTS.max_steps_reached, result)
+        result = giving_up(result, behind_most, diffrax.RESULTS.max_steps_reached)
         return *step, (state, count, typical), result

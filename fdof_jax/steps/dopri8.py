@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jax import Array
+from jax.typing import ArrayLike
 from jaxtyping import PyTree
 
 TABLEAU = diffrax.Dopri8.tableau
@@ -129,6 +130,11 @@ def constant(tree: PyTree) -> PyTree:
     return jtu.tree_map(
         lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, tree
     )
+
+
+def chosen(condition: ArrayLike, ones: PyTree, others: PyTree) -> PyTree:
+    """Returns the numbers of one tree where a condition holds, else of another."""
+    return jtu.tree_map(lambda a, b: jnp.where(condition, a, b), ones, others)
 
 
 def is_singular(health: Health) -> Array:

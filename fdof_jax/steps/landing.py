@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ..linkage.fields import has_come
+from .controllers import giving_up
 from .dopri8 import Integrated, constant
 
 # More crossings than these are chatter, if they come within the distance that rounding
@@ -96,26 +97,11 @@ class _Happened(NamedTuple):
 
 
 class Landing(eqx.Module):
-    """Ends of steps at known times and where elements switch.
-
-    Steps that the controller chooses have constant lengths for derivatives: up to the
-    tolerance, the motion does not depend on where its steps end.
-    """
+    """Ends steps at known times and where elements switch."""
 
     jumps: Array | None
     apart: Array  # see `clearance`
     switches: bool = eqx.field(static=True)
-
-    def _seen(self, y: Integrated, end: Array) -> tuple[Array | int, ...]:
-        """Returns times and `near` of `Switching`, and whether nothing switches here.
-
-        The times are `until`, `unseen` and `soon`.
-        """
-        if not self.switches:
-            return end, end, end, 0, False
-        switching = y[-1]
-        idle = jnp.all(switching.after == switching.sides)
-        return switching.until, switching.unseen, switching.soon, switching.near, idle
 
     def _cut(self, t0: Array, t1: Array, last: Array) -> tuple[Array, Array, Array]:
         """Returns the end of a step, the gap after it, and if it is at a known time."""
@@ -151,7 +137,12 @@ class Landing(eqx.Module):
     ) -> _Happened:
         """Returns what a step did; `keep`: whether the controller would keep it."""
         aimed = end == state.target
-        until, unseen, soon, near, idle = constant(self._seen(y1, end))
+        until, unseen, soon, near, idle = end, end, end, 0, False
+        if self.switches:
+            seen = y1[-1]
+            times = seen.until, seen.unseen, seen.soon, seen.near
+            until, unseen, soon, near = constant(times)
+            idle = jnp.all(seen.after == seen.sides)
         allowance = jnp.where(aimed, near, 0)
         within = until < jnp.minimum(end - allowance, state.last)
         # What a jump switches at once switches before the next jump, however near.
@@ -200,40 +191,45 @@ class Landing(eqx.Module):
         | ends at a switch or known time | `landed` | as long as planned before |
         | any other | | as planned, or up to the next known time |
         """
-        keep, next0, next1, jumped, result = planned
         begin, end = constant((t0, t1))
-        keep, crossed, unsure, missed, landed, short, crossing, again = self._happened(
-            begin, end, y1, keep, state
-        )
+        step = self._happened(begin, end, y1, planned.keep, state)
+        shortened = step.crossed | step.unsure
+        resumes = shortened | step.landed
+
+        # Where does the next step begin? With the derivatives of this one's ends, which
+        # `begin`, `end` and `planned` lack.
+        next_t0 = jnp.where(step.keep, t1 + (planned.t0 - end), t0)
+        next_t0 = next_t0 + jnp.where(step.landed, state.gap, 0)
+
+        # Where is it to end?
         # The error of a step that was cut short says little about the next one.
-        length = jnp.where(short, state.resumed, next1 - next0)
-        # With the derivatives of the end, which `end` and `next0` lack.
-        next_t0 = jnp.where(keep, t1 + (next0 - end), t0)
-        next_t0 = next_t0 + jnp.where(landed, state.gap, 0)
-        next_t1 = jnp.where(missed, crossing, next_t0 + length)
+        length = jnp.where(step.short, state.resumed, planned.t1 - planned.t0)
+        next_t1 = jnp.where(step.missed, step.crossing, next_t0 + length)
         next_t1, gap, cut = self._cut(constant(next_t0), next_t1, state.last)
         # What a jump at a known time has switched switches with it, at once.
-        shortened, again = crossed | unsure, jnp.where(again == begin, t0, again)
+        again = jnp.where(step.again == begin, t0, step.again)
         next_t1 = jnp.where(shortened, again, next_t1)
-        gap, aims = jnp.where(shortened, 0, gap), (cut | crossed | missed) & ~unsure
+        aims = (cut | step.crossed | step.missed) & ~step.unsure
+
+        # Does the solve go on?
         # Time that passes meanwhile tells fast switching from chatter.
         paced = begin - state.since > state.pace
-        crossings = jnp.where(paced, 0, state.crossings + crossed)
+        crossings = jnp.where(paced, 0, state.crossings + step.crossed)
         results = diffrax.RESULTS
-        resumes = shortened | landed
         # After the last step, which may be shorter than others may, none is asked for.
-        done = keep & (end >= state.last)
-        result = results.where(resumes | done, results.successful, result)
-        chatter = (crossings > _MOST_CROSSINGS) & (result == results.successful)
-        result = results.where(chatter, results.max_steps_rejected, result)
+        done = step.keep & (end >= state.last)
+        result = results.where(resumes | done, results.successful, planned.result)
+        chatter = crossings > _MOST_CROSSINGS
+        result = giving_up(result, chatter, results.max_steps_rejected)
+
         state = state._replace(
             target=jnp.where(aims, constant(next_t1), jnp.inf),
-            gap=gap,
+            gap=jnp.where(shortened, 0, gap),
             resumed=length,
-            crossing=crossing,
-            tries=jnp.where(keep & ~missed, 0, state.tries + crossed),
+            crossing=step.crossing,
+            tries=jnp.where(step.keep & ~step.missed, 0, state.tries + step.crossed),
             crossings=crossings,
             since=jnp.where(paced, begin, state.since),
         )
-        step = NextStep(keep, next_t0, next_t1, landed | jumped, result)
-        return step, resumes, state
+        jumped = step.landed | planned.jumped
+        return NextStep(step.keep, next_t0, next_t1, jumped, result), resumes, state

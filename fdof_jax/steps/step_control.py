@@ -18,6 +18,7 @@ from .dopri8 import (
     Health,
     Integrated,
     ScheduledTerm,
+    chosen,
     constant,
     health_if,
     is_singular,
@@ -110,21 +111,14 @@ class StepControl(Adaptive):
         step, landing = NextStep(keep, next0, next1, jumped, result), None
         if self.landing is not None:
             step, resumes, landing = self.landing.after(t0, t1, y1, step, state.landing)
-            inner = jax.tree.map(
-                lambda old, new: jnp.where(resumes, old, new), state.inner, inner
-            )
-        if_kept = lambda new, old: jax.tree.map(
-            lambda new, old: jnp.where(step.keep, new, old), new, old
-        )
+            inner = chosen(resumes, state.inner, inner)
         if self.derivatives is not None:
-            jumped, fresh = jnp.array(step.jumped), self.derivatives.start(y1)
-            probe = jax.tree.map(lambda a, b: jnp.where(jumped, a, b), fresh, probe)
-            probe = if_kept(probe, state.probe)
-        loss = if_kept(jnp.maximum(state.loss, loss), state.loss)
+            probe = chosen(jnp.array(step.jumped), self.derivatives.start(y1), probe)
+            probe = chosen(step.keep, probe, state.probe)
+        loss = jnp.where(step.keep, jnp.maximum(state.loss, loss), state.loss)
         failed = health_result != diffrax.RESULTS.successful
         result = diffrax.RESULTS.where(failed, health_result, step.result)
-        state = _State(inner, landing, probe, loss)
-        return *step[:4], state, result
+        return *step[:4], _State(inner, landing, probe, loss), result
 
     def _healthy(
         self, t0: Array, t1: Array, y0: Integrated, y1: Integrated, args: Arguments,
@@ -135,14 +129,13 @@ class StepControl(Adaptive):
         # Rates that are not finite make the error not finite.
         finite = jnp.isfinite(sum(map(jnp.sum, jax.tree.leaves((y1, error)))))
         # If the end is not finite, the health at the start shows why.
-        end = jax.tree.map(lambda a, b: jnp.where(finite, a, b), y1, y0)
+        end = chosen(finite, y1, y0)
         health: Health = self.term.health(*constant((t1, end, args)))
         health = health_if(finite, health)
         bad = jnp.isnan(sum(health)) | is_singular(health)
         estimate, failure = verdict(error, health, t1 - t0)
         # The error is scaled by the state, which must be finite for that.
-        end = jax.tree.map(lambda a, b: jnp.where(bad, a, b), y0, y1)
-        return end, estimate, failure
+        return chosen(bad, y0, y1), estimate, failure
 
 
 def largest_loss(controller_state: PyTree) -> Array:

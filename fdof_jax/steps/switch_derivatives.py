@@ -180,12 +180,9 @@ def _filled(tangents: PyTree, values: PyTree) -> PyTree:
 
 
 class Moment(NamedTuple):
-    """A switch: time, state, arguments, and the sides before and after it."""
+    """A switch: the arrival there, the sides after it, and whether there is one."""
 
-    t: Array
-    y: Integrated
-    args: Arguments
-    before: Array
+    arrival: Arrival
     after: Array
     is_one: Array
 
@@ -196,8 +193,8 @@ def _difference(late: Array, moment: Moment, term: Term) -> Integrated:
     With derivatives of first order: the state moves on to the time of the switch on the
     side before, and back on the side after, and the rates are those halfway.
     """
-    t, y, args, before, after, is_one = moment
-    both = jnp.stack([before, after])
+    (t, y, args, _), after, is_one = moment
+    both = jnp.stack([args.sides, after])
     rates = jax.vmap(
         lambda time, y, args, sides: term.vf(time, y, args._replace(sides=sides)),
         in_axes=(None, 0, None, 0),
@@ -218,58 +215,57 @@ def _difference(late: Array, moment: Moment, term: Term) -> Integrated:
     return jax.lax.cond(is_one, difference, nothing)
 
 
-def _late(arrival: Arrival, change: PyTree, term: Term) -> tuple[Array, Array]:
+def _late(moment: Moment, change: PyTree, term: Term) -> tuple[Array, Array]:
     """Returns `lateness` and how it changes."""
-    return eqx.filter_jvp(lambda a: lateness(a, term=term), (arrival,), (change,))
+    late = lambda moment: lateness(moment.arrival, term=term)
+    return eqx.filter_jvp(late, (moment,), (change,))
 
 
 @eqx.filter_custom_jvp
-def gained(
-    arrival: Arrival, moment: Moment, *, term: Term, jumping: bool
-) -> Integrated:
+def gained(moment: Moment, *, term: Term, jumping: bool) -> Integrated:
     """Returns how the time of a switch changes the state: 0, with derivatives.
 
     Where nothing jumps, first derivatives are 0 too; only second ones need the time of
     the switch, and derivatives of the rates.
     """
-    return jax.tree.map(jnp.zeros_like, moment.y)
+    return jax.tree.map(jnp.zeros_like, moment.arrival.y)
 
 
 @gained.def_jvp
 def _(primals, tangents, *, term, jumping):
-    (arrival, moment), (change, _) = primals, tangents
-    nothing = gained(*primals, term=term, jumping=jumping)
-    if not jax.tree.leaves(change):
+    (moment,), (change,) = primals, tangents
+    nothing = gained(moment, term=term, jumping=jumping)
+    if not jax.tree.leaves(change.arrival):
         return nothing, nothing
-    gain = _gained_twice(*primals, *tangents, term=term, jumping=jumping)
+    gain = _gained_twice(moment, change, term=term, jumping=jumping)
     if jumping:
-        late, later = _late(arrival, change, term)
+        late, later = _late(moment, change, term)
         rates = _difference(late, moment, term)
         gain = jax.tree.map(lambda rate, more: later * rate + more, rates, gain)
     return nothing, gain
 
 
 @eqx.filter_custom_jvp
-def _gained_twice(arrival, moment, change, changes, *, term, jumping):
+def _gained_twice(moment, change, *, term, jumping):
     """Second-order part of `gained`: its value is 0; only its derivative matters."""
-    return jax.tree.map(jnp.zeros_like, moment.y)
+    return jax.tree.map(jnp.zeros_like, moment.arrival.y)
 
 
 @_gained_twice.def_jvp
 def _(primals, tangents, *, term, jumping):
     nothing = _gained_twice(*primals, term=term, jumping=jumping)
-    at, first, second = primals[:2], primals[2:], tangents[:2]
-    if not jax.tree.leaves(second[0]):
+    (moment, first), (second, _) = primals, tangents
+    if not jax.tree.leaves(second.arrival):
         return nothing, nothing
 
     def product(late_along, rates_along):
         """Returns the lateness in one direction times the rates in another."""
-        _, later = _late(at[0], late_along[0], term)
+        _, later = _late(moment, late_along, term)
 
-        def difference(arrival, moment):
-            return _difference(lateness(arrival, term=term), moment, term)
+        def difference(moment):
+            return _difference(lateness(moment.arrival, term=term), moment, term)
 
-        _, turned = eqx.filter_jvp(difference, at, rates_along)
+        _, turned = eqx.filter_jvp(difference, (moment,), (rates_along,))
         return jax.tree.map(lambda rate: later * rate, turned)
 
     gain = product(second, first)

@@ -88,12 +88,7 @@ class Switching(NamedTuple):
 
     def in_force(self, args: Arguments) -> Arguments:
         """Returns the arguments with the sides, and any modes, in force here."""
-        return _in_force(args, self.sides, self.modes)
-
-
-def _in_force(args: Arguments, sides: Array, modes: PyTree) -> Arguments:
-    args = args._replace(sides=sides)
-    return args if modes is None else args._replace(modes=modes)
+        return args._replace(sides=self.sides, modes=self.modes)
 
 
 def in_force(args: Arguments, y: Integrated) -> Arguments:
@@ -198,30 +193,34 @@ class Located(diffrax.AbstractAdaptiveSolver):
         return self.solver.func(terms, t0, y0, args)
 
     def init(self, terms, t0, t1, y0, args):
-        *y0, switching = y0
-        args = switching.in_force(args)
-        return self.solver.init(terms, t0, t1, tuple(y0), args)
+        return self.solver.init(terms, t0, t1, motion_of(y0), in_force(args, y0))
 
     def step(self, terms, t0: Any, t1: Any, y0, args, solver_state, made_jump):
-        *y0, switching = y0
+        term, h, switching, y0 = terms.term, t1 - t0, y0[-1], y0[:-1]
+        modes, earlier = switching.modes, switching.sizes
         if_jumped = lambda after, before: jnp.where(made_jump, after, before)
         sides = if_jumped(switching.after, switching.sides)
         begun = sides != switching.sides
         changed = begun & (switching.sides != 0)
-        y0, modes, earlier = tuple(y0), switching.modes, switching.sizes
         if self.guards:
             sides = sides.at[-self.guards :].set(1)
-            here = terms.term, t0, y0, args, switching, sides, changed
-            y0, modes = self.resolved(*here, made_jump)
+            unchanged = y0, modes
+            here = term, t0, y0, args, switching, sides, changed, made_jump
+            y0, modes = jax.lax.cond(
+                made_jump | jnp.any(modes.mode < 0),  # or at the very start
+                lambda: self.after_event(*here),
+                lambda: unchanged,
+            )
             # Other modes have other guards.
-            other = changed[-self.guards :].any() | ~_same(modes, switching.modes).all()
+            old = switching.modes
+            same = (modes.mode == old.mode) & (modes.direction == old.direction)
             guards = jnp.arange(sides.size) >= sides.size - self.guards
-            begun = begun | (other & guards)
-            earlier = jnp.where(other & guards, 0, earlier)
-            args = _in_force(args, sides, modes)
+            other = guards & (changed[-self.guards :].any() | ~same.all())
+            begun, earlier = begun | other, jnp.where(other, 0, earlier)
+            args = args._replace(sides=sides, modes=modes)
         else:
             args = args._replace(sides=sides)
-            y0 = self.shifted(terms.term, t0, y0, args, switching, made_jump)
+            y0 = self.shifted(term, t0, y0, args, switching, made_jump)
         y1, error, dense, solver_state, result = self.solver.step(
             terms, t0, t1, y0, args, solver_state, made_jump
         )
@@ -234,12 +233,11 @@ class Located(diffrax.AbstractAdaptiveSolver):
 
         # Lengths of steps to a switch say nothing about the pace of the motion.
         share = jnp.finfo(t1.dtype).eps ** _NEAR
-        near = jnp.maximum(share * (t1 - t0), switching.near / 2)
+        near = jnp.maximum(share * h, switching.near / 2)
         near = jnp.maximum(near, self.apart)
-        values, checks = _values(*constant((terms.term, t0, t1, path, args)))
-        brief = t1 - t0 <= jnp.maximum(SHORTEST[t1.dtype], _BRIEF * near)
-        place = near / (t1 - t0)
-        passed = passage(values, checks, sides, begun, earlier, place, brief)
+        values, checks = _values(*constant((term, t0, t1, path, args)))
+        brief = h <= jnp.maximum(SHORTEST[t1.dtype], _BRIEF * near)
+        passed = passage(values, checks, sides, begun, earlier, near / h, brief)
         # What began on its zero has left it, in one or more steps.
         left = jnp.finfo(passed.sizes.dtype).eps ** _ON_ZERO * passed.sizes
         on_zero = switching.sizes <= left
@@ -250,12 +248,12 @@ class Located(diffrax.AbstractAdaptiveSolver):
         new = Switching(
             sides=sides,
             after=after.astype(t0.dtype),
-            until=jnp.where(passed.crossed, t0 + passed.until * (t1 - t0), t1),
-            unseen=jnp.where(passed.unseen < 1, t0 + passed.unseen * (t1 - t0), t1),
-            soon=t1 + passed.soon * (t1 - t0),
+            until=jnp.where(passed.crossed, t0 + passed.until * h, t1),
+            unseen=jnp.where(passed.unseen < 1, t0 + passed.unseen * h, t1),
+            soon=t1 + passed.soon * h,
             near=near,
             sizes=passed.sizes,
-            length=t1 - t0,
+            length=h,
             ahead=jnp.any(passed.switched & (sides * values[-1] > 0)).astype(t0.dtype),
             passed=switching.passed + jnp.sum(changed & ~on_zero),
             one_sided=self.one_sided(switching, on_zero, sides, passed.sizes, changed),
@@ -289,32 +287,15 @@ class Located(diffrax.AbstractAdaptiveSolver):
         together = (jnp.sum(changed & jumping) > 1) & (switching.grazing_here > 0)
         return jnp.maximum(switching.one_sided, at_once) + together
 
-    def resolved(
-        self, term: Term, t: Array, y: Integrated, args: Arguments,
-        switching: Switching, sides: Array, changed: Array, made_jump: Truth,
-    ) -> tuple[Integrated, PyTree]:  # fmt: skip
-        """Returns state and modes at the start of a step, after an event there.
-
-        The state moves on to the time of the event in the modes before, and back in
-        those after: this changes nothing but derivatives.
-        """
-        here = term, t, y, args, switching, sides, changed, made_jump
-        return self.if_event(switching, made_jump, lambda: self.after_event(*here), y)
-
-    def if_event(
-        self, switching: Switching, made_jump: Truth,
-        after_event: Callable[[], tuple[Integrated, PyTree]], y: Integrated,
-    ) -> tuple[Integrated, PyTree]:  # fmt: skip
-        """Returns state and modes after an event, or as they are if there is none."""
-        start = jnp.any(switching.modes.mode < 0)
-        otherwise = lambda: (y, switching.modes)
-        return jax.lax.cond(made_jump | start, after_event, otherwise)
-
     def after_event(
         self, term: Term, t: Array, y: Integrated, args: Arguments,
         switching: Switching, sides: Array, changed: Array, made_jump: Truth,
     ) -> tuple[Integrated, PyTree]:  # fmt: skip
-        """Returns state and modes after an event at the start of a step."""
+        """Returns state and modes after an event at the start of a step.
+
+        The state moves on to the time of the event in the modes before, and back in
+        those after: this changes nothing but derivatives.
+        """
         before = switching.in_force(args)
         fired = changed[-self.guards :].reshape(-1, switching.modes.mode.size)
         time = jnp.where(switching.ahead > 0, t, switching.until)
@@ -326,7 +307,7 @@ class Located(diffrax.AbstractAdaptiveSolver):
         happens = Event(switching.until, t, fired, late)
         there, modes = term.resolve(happens, there, before._replace(sides=sides))
         if self.derivatives:
-            after = Instant(t + late, there, _in_force(args, sides, modes))
+            after = Instant(t + late, there, args._replace(sides=sides, modes=modes))
             there = moved_on(-late, after, term=term)
         return there, modes
 
@@ -362,10 +343,10 @@ class Located(diffrax.AbstractAdaptiveSolver):
         # a known time.
         arrived = made_jump & (switching.length > 0)
         for before, after in zip(in_turn, in_turn[1:]):
-            here = args._replace(sides=before)
-            arrival = Arrival(t, y, here, (before != after) & arrived)
-            moment = Moment(t, y, args, before, after, jnp.array(made_jump))
-            gain = gained(arrival, moment, term=term, jumping=any(self.jumping))
+            switched = (before != after) & arrived
+            arrival = Arrival(t, y, args._replace(sides=before), switched)
+            moment = Moment(arrival, after, jnp.array(made_jump))
+            gain = gained(moment, term=term, jumping=any(self.jumping))
             y = jax.tree.map(jnp.add, y, gain)
         return y
 
@@ -394,10 +375,6 @@ class _WithModes(diffrax.AbstractLocalInterpolation):
     def evaluate(self, t0, t1=None, left=True):
         path = self.kind(t0=self.t0, t1=self.t1, **self.path)
         return *path.evaluate(t0, t1, left), self.modes
-
-
-def _same(modes: PyTree, others: PyTree) -> Array:
-    return (modes.mode == others.mode) & (modes.direction == others.direction)
 
 
 @eqx.filter_jit  # traced once, not at each use in a solve

@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from .controllers import Adaptive
+from .controllers import Adaptive, Judging, giving_up
 
 
 def diffeqsolve(
@@ -33,8 +33,7 @@ def diffeqsolve(
 
     `max_steps` may also be an array, of which new values need no new program.
     """
-    kind = diffrax.AbstractAdaptiveStepSizeController
-    adaptive = isinstance(stepsize_controller, kind)
+    adaptive = isinstance(stepsize_controller, Judging)
     frame: Any = _FramedAdaptive if adaptive else _Framed
     counted = max_steps is not None and not isinstance(max_steps, int)
     solution = diffrax.diffeqsolve(
@@ -115,9 +114,7 @@ class _Framed(diffrax.AbstractStepSizeController):
         _, start, *_ = step
         count = count + 1
         spent = (count >= self.most) & (start < end)
-        spent = spent & (result == diffrax.RESULTS.successful)
-        reached = diffrax.RESULTS.max_steps_reached
-        result = diffrax.RESULTS.where(spent, reached, result)
+        result = giving_up(result, spent, diffrax.RESULTS.max_steps_reached)
         return *step, (state, count, end), result
 
 

@@ -27,6 +27,7 @@ from .dopri8 import (
     DenseOutput,
     Health,
     ScheduledDopri8,
+    chosen,
     compensated,
     interpolation_weights,
     is_singular,
@@ -54,12 +55,6 @@ def _combine(coefficients: Sequence[Array] | np.ndarray, rates: Rates) -> PyTree
     )
 
 
-def _twice(row: np.ndarray) -> np.ndarray:
-    """Returns the coefficients of accelerations for those of velocities at stages."""
-    coefficients = row @ LOWER
-    return np.where(abs(coefficients) < 1e-14, 0, coefficients)  # up to rounding
-
-
 def _increment(row: np.ndarray, rates: Rates, y0: State, h: Array) -> State:
     """Sums coefficients times rates.
 
@@ -68,7 +63,8 @@ def _increment(row: np.ndarray, rates: Rates, y0: State, h: Array) -> State:
     """
     others = [rate[1:] for rate in rates]
     accelerations = [rate[1] for rate in rates]
-    share, twice = float(row.sum()), _twice(row)
+    share, twice = float(row.sum()), row @ LOWER
+    twice = np.where(abs(twice) < 1e-14, 0, twice)  # but for rounding
     change = jtu.tree_map(lambda v: share * v, y0[1])
     if twice.any():
         change = _moved(change, h, _combine(twice, accelerations))
@@ -146,8 +142,7 @@ class UnrolledDopri8(ScheduledDopri8):
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         start, residue = solver_state
         if made_jump is not False:  # the stored rates are outdated after a jump
-            fresh = self._start(terms, t0, y0, args)
-            start = jtu.tree_map(lambda a, b: jnp.where(made_jump, a, b), fresh, start)
+            start = chosen(made_jump, self._start(terms, t0, y0, args), start)
         f0, health = start
         end, dense_info = _step(terms, t0, t1, y0, residue, args, f0)
         # A singular start makes the end not finite.
