@@ -97,7 +97,11 @@ class _Happened(NamedTuple):
 
 
 class Landing(eqx.Module):
-    """Ends steps at known times and where elements switch."""
+    """Ends steps at known times and where elements switch.
+
+    Steps that the controller chooses have constant lengths for derivatives: up to the
+    tolerance, the motion does not depend on where its steps end.
+    """
 
     jumps: Array | None
     apart: Array  # see `clearance`
