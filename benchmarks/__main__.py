@@ -6,8 +6,10 @@ JSON lines, from which the page is drawn; it takes those of one commit only.
 
 import argparse
 import json
+import os
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 
@@ -48,7 +50,11 @@ def main() -> None:
         command = [sys.executable, "-m", "benchmarks.worker", job.name]
         command.append(str((output / f"{job.name}.jsonl").resolve()))
         command += ["--quick"] * options.quick
-        if subprocess.run(command, cwd=FOLDER.parent, check=False).returncode:
+        with tempfile.TemporaryDirectory() as cache:
+            # heyoka would take its programs from those of an earlier run.
+            env = {**os.environ, "XDG_CACHE_HOME": cache}
+            done = subprocess.run(command, cwd=FOLDER.parent, env=env, check=False)
+        if done.returncode:
             failed.append(job.name)
         print(f"{job.name}: {time.perf_counter() - began:.0f} s", flush=True)
     points = load(output)

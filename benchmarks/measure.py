@@ -20,9 +20,9 @@ import jax
 import numpy as np
 
 SAMPLE = 0.02  # least work per sample [s]
-LONG = 1.0  # calls of this length [s] are measured in fewer rounds
+LONG = 1.0  # calls of this length [s] are measured in the fewest rounds
 ENDLESS = 30.0  # first calls of this length [s] are not repeated to learn their length
-FEWEST, FEW, MANY = 3, 5, 15  # rounds: under any budget, of long calls, of the rest
+FEWEST, MANY = 3, 15  # rounds: of long calls and under any budget, of the rest
 WORST_ERROR = 0.1  # a larger error is a failure, not a result
 EXACT = 1e-12  # a smaller error of joints that are held is as good as none [m or rad]
 # The outcomes of a hard case, best first.
@@ -113,7 +113,7 @@ def measure(
 
     **Arguments:**
 
-    - `budget`: time after which no round begins, except the first three [s].
+    - `budget`: time after the first three rounds after which no other begins [s].
     - `ratio_to`: the solver with one case whose time divides all others, in each round.
     - `fields`: fields that all records share.
     """
@@ -143,10 +143,11 @@ def measure(
             continue
         point["times"] = []
         calls = max(1, math.ceil(SAMPLE / again))
-        running.append((case, point, calls, min(rounds, FEW if again > LONG else MANY)))
-    began = time.perf_counter()
+        running.append((case, point, calls, FEWEST if again > LONG else rounds))
     for done in range(rounds):
-        if done >= FEWEST and time.perf_counter() - began > budget:
+        if done <= FEWEST:
+            began = time.perf_counter()
+        elif time.perf_counter() - began > budget:
             break
         for case, point, calls, most in running:
             if done < most:

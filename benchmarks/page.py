@@ -11,6 +11,10 @@ from matplotlib.figure import Figure
 from .measure import ENDLESS, EXACT, OUTCOMES, times_at, worst
 
 Points = list[dict]
+_MODES = {
+    "fdof_jax": "the motion alone", "fdof_jax, forward mode": "forward mode",
+    "fdof_jax, reverse mode": "reverse mode",
+}  # fmt: skip
 ERRORS = (1e-6, 1e-9)
 CHAIN_ERROR = 1e-8  # of chains of many joints
 OURS = "fdof_jax sweep"
@@ -66,10 +70,9 @@ def _solvers(points: Points) -> list[str]:
 
 def _first_call(points: Points) -> str:
     """Returns how much longer the first call of a program took [s]."""
-    # First calls of more than ENDLESS are not repeated to tell what was compilation. A
-    # run of that length says nothing.
-    short = [p for p in points if p["times"] and p["time_median"] < ENDLESS]
-    known = [p["compile_time"] for p in short]
+    # What takes steps of given lengths is compiled beforehand.
+    known = [p["compile_time"] for p in points if p["times"] and p["kind"] != "step"]
+    # First calls of more than that are not repeated to tell what was compilation.
     return f"> {ENDLESS:g}" if None in known else number(max(known, default=None))
 
 
@@ -84,7 +87,8 @@ def _rates(points: Points, errors: tuple[float, ...], over: str) -> str:
         else:
             cells += ["1"] * len(errors)
         rows.append([solver, *cells, _first_call(own)])
-    head = [f"at {e:g}" for e in errors] + [f"{over} over it, {e:g}" for e in errors]
+    at = [f"at {number(e, 1)}" for e in errors]
+    head = at + [f"{over} is x times as fast, {e}" for e in at]
     return table(["simulated s per s", *head, "first call [s]"], rows)
 
 
@@ -114,7 +118,7 @@ def cores(points: Points) -> str:
             state = "" if problem == "fig5" else f", {problem}"
             rows.append([f"{batch}{state}", *cells])
     others = "one core", "heyoka's two threads"
-    head = [f"over {other}, {error:g}" for other in others for error in ERRORS]
+    head = [f"over {o}, at {number(e, 1)}" for o in others for e in ERRORS]
     return table(["members", *head], rows)
 
 
@@ -134,9 +138,9 @@ def joints(points: Points) -> str:
             ]
         row.append(_first_call(chosen(of, batch=batch, solver=OURS)))
         rows.append(row)
-    over = ["over heyoka", "over MuJoCo"]
-    many = f"{max(p['batch'] for p in points)} arms [s per s]"
-    head = ["joints", "flops", "one arm [s per s]", *over, many, *over]
+    head = ["joints", "flops"]
+    for arms in ("one arm", f"{max(p['batch'] for p in points)} arms"):
+        head += [f"{arms} [s per s]", f"{arms} over heyoka", f"{arms} over MuJoCo"]
     return table([*head, "first call [s]"], rows)
 
 
@@ -151,13 +155,13 @@ def gradients(points: Points) -> str:
     rows = [
         [
             str(p["batch"]),
-            p["solver"].removeprefix("fdof_jax, "),
+            _MODES[p["solver"]],
             number(1e3 * p["time_median"]),
             number(p["ratio"]),
             number(p["error"]),
         ]
         for p in points
-        if p["status"] == "ok" and p["solver"] != "fdof_jax"
+        if p["status"] == "ok"
     ]
     return table(["arms", "", "ms", "over the motion", "error of the gradient"], rows)
 
@@ -177,7 +181,7 @@ def switches(points: Points) -> str:
 
 def held_joints(points: Points) -> str:
     sweeps = [
-        f"{number(p['ratio'])} times with {p['setting']:g} x (5, 4, 3, 2, 1) N m"
+        f"{number(p['ratio'])} times as long with {p['setting']:g} x (5, 4, 3, 2, 1)"
         for p in points
         if p["solver"] == "friction" and p["status"] == "ok"
     ]
@@ -192,7 +196,7 @@ def held_joints(points: Points) -> str:
             # Of settings that are as good as exact the first is the fastest.
             best = min(own, key=lambda p: max(EXACT, worst(p)))
             wall = 1e3 * best["time_median"] / best["simulated"]
-            how = f"{best['kind']} {best['setting']:g}"
+            how = f"{best['kind']} {number(best['setting'], 1)}"
             rows.append([scene, solver, how, number(worst(best)), number(wall)])
     head = ["", "", "at its most exact", "error [m or rad]", "ms a simulated s"]
     return f"{', '.join(sweeps)}.\n\n{table(head, rows)}"
@@ -242,7 +246,7 @@ def gpu(points: Points) -> str:
         for own in [chosen(points, batch=batch)]
         for solver in _solvers(own)
     ]
-    return table(["members", "", *(f"s per s at {e:g}" for e in ERRORS)], rows)
+    return table(["members", "", *(f"s per s at {number(e, 1)}" for e in ERRORS)], rows)
 
 
 CLAIMS: dict[str, Callable[[Points], str]] = {
@@ -329,7 +333,7 @@ def pictures(points: dict[str, Points], folder: Path) -> None:
         heights = [rate(p, CHAIN_ERROR) if p else None for p in own]
         _curve(right, solver, list(counts), heights)
     left.set(xlabel="members", title="triple pendulums, error 1e-6")
-    right.set(xlabel="joints", title=f"{most} chains, error {CHAIN_ERROR:g}")
+    right.set(xlabel="joints", title=f"{most} chains, error {number(CHAIN_ERROR, 1)}")
     right.set_xscale("linear")
     for axes in (left, right):
         axes.set_ylabel("simulated s per s on one core")

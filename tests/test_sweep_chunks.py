@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import diffrax
+import equinox as eqx
 import jax
 import numpy as np
 import pytest
@@ -62,6 +63,26 @@ def test_small_batches_share_a_program_and_need_no_forecast(solved, monkeypatch)
         assert swept(speeds[:size]).q.shape == (size, len(TS), 1)
     assert chunks._compiled.cache_info().misses == before
     assert [len(q) for q, _ in solved] == [8] * 4
+
+
+@pytest.mark.slow
+def test_a_batch_of_one_kind_has_the_equations_of_that_kind_alone(monkeypatch):
+    flops, original = [], chunks._solve
+
+    def recorded(program, *arguments):
+        flops.append(program.cost_analysis()["flops"])
+        return original(program, *arguments)
+
+    monkeypatch.setattr(chunks, "_solve", recorded)
+    scene = fj.scenes.two_link_circle()
+    arm, many = scene.linkage, fj.State(*(np.tile(x, (8, 1)) for x in scene.state0))
+    kinds = eqx.tree_at(lambda arm: arm.ef, arm, np.tile(arm.ef, (8, 1)))
+    one, any_kind = (
+        fj.sweep(linkage, many, TS, scene.forces, **SETTINGS)
+        for linkage in (arm, kinds)
+    )
+    np.testing.assert_allclose(one.q, any_kind.q, atol=1e-12)
+    assert len(flops) == 2 and flops[0] < 0.8 * flops[1], flops
 
 
 @pytest.mark.slow

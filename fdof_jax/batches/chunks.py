@@ -125,7 +125,7 @@ class Form(NamedTuple):
         """Computes the outcomes of all lanes of a chunk."""
         given = iter(arrays)
         leaves = [next(given) if _is_kind(leaf) else leaf for leaf in self.leaves]
-        common = self.common.unflatten(leaves)
+        common = _with_factors(self.common.unflatten(leaves), jnp.asarray)
         abreast = self.lanes[0].shape[0] > _ALL_ALIKE
 
         def member(leaves):
@@ -138,6 +138,19 @@ def _is_kind(leaf: object) -> bool:
     return isinstance(leaf, jax.ShapeDtypeStruct)
 
 
+def _with_factors(common: Common, as_kind: Callable) -> Common:
+    """Returns `common` with existence factors that all members share as another kind.
+
+    As numbers they are part of the program, which leaves out the equations of other
+    joints: a batch of Fig 7 takes half the time, and compiles in three quarters.
+    """
+    linkage, *others = common.shared
+    if linkage.ef is None:
+        return common
+    linkage = eqx.tree_at(lambda arm: arm.ef, linkage, as_kind(linkage.ef))
+    return common._replace(shared=(linkage, *others))
+
+
 def _form_of(job: Job, lanes: int) -> tuple[Form, list[Array]]:
     """Returns the form of the program for so many lanes, and the common arrays."""
 
@@ -148,7 +161,8 @@ def _form_of(job: Job, lanes: int) -> tuple[Form, list[Array]]:
 
     members, structure = jax.tree.flatten(job.moving)
     kinds = tuple(kind(a, (lanes, *a.shape[1:])) for a in members)
-    leaves, others = jax.tree.flatten(job.common)
+    known = _with_factors(job.common, lambda ef: tuple(map(float, ef)))
+    leaves, others = jax.tree.flatten(known)
     arrays = list(filter(eqx.is_array, leaves))
     leaves = tuple(kind(x, x.shape) if eqx.is_array(x) else x for x in leaves)
     return Form(structure, kinds, others, leaves), arrays
