@@ -32,3 +32,18 @@ def in_one_loop(tree: PyTree) -> PyTree:
     return jax.lax.platform_dependent(
         tree, cpu=one_loop_on_cpu, default=lambda tree: tree
     )
+
+
+def entries_in_one_loop(tree: PyTree) -> PyTree:
+    """Returns the same arrays, all entries of vectors computed by a single loop on CPU.
+
+    XLA would compute stacked entries one after the other, and all anew for each.
+    """
+    leaves, structure = jax.tree.flatten(tree)
+    floating = lambda leaf: jnp.issubdtype(leaf.dtype, jnp.floating)
+    places = [k for k, x in enumerate(leaves) if x.ndim == 1 and x.size and floating(x)]
+    if places:
+        entries = in_one_loop([list(leaves[k]) for k in places])
+        for k, row in zip(places, entries):
+            leaves[k] = jnp.stack(row)
+    return jax.tree.unflatten(structure, leaves)

@@ -1,8 +1,8 @@
-"""Sine and cosine from one evaluation, vectorisable by XLA on CPU.
+"""Sine and cosine from one evaluation, and angles, vectorisable by XLA on CPU.
 
-XLA on CPU calls the scalar C library for float64 `sin` and `cos`, which costs more than
-the rest of the equations of motion together. Range reduction and two short polynomials
-in plain arithmetic instead fuse into the surrounding loop.
+XLA on CPU calls the scalar C library for float64 `sin`, `cos` and `atan2`, which cost
+more than the rest of the equations of motion together. Range reduction and short
+polynomials in plain arithmetic instead fuse into the surrounding loop.
 """
 
 import jax
@@ -58,6 +58,29 @@ _COS = {
         2.4547941603820702e-05,
         -0.0013888303033667549,
         0.041666664659490746,
+    ),
+}
+# The same of (atan(r)/r - 1)/z on |r| <= tan(pi/8).
+_ATAN = {
+    np.dtype("float64"): (
+        -0.019176885636589053,
+        0.039231657085083686,
+        -0.050854496960392584,
+        0.05858148904795124,
+        -0.0666451144646022,
+        0.07692183190760651,
+        -0.09090904578121085,
+        0.11111111015256292,
+        -0.14285714284666542,
+        0.1999999999999552,
+        -0.3333333333333333,
+    ),
+    np.dtype("float32"): (
+        -0.06451927998778499,
+        0.10743731427626937,
+        -0.14263955592140723,
+        0.19999540483480294,
+        -0.33333331761167784,
     ),
 }
 # Adding 1.5 * 2**(mantissa bits) to a whole number leaves it in the low bits, which
@@ -128,3 +151,36 @@ def sincos(x: ArrayLike) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
     **Arguments:** `x`: angles [rad], any shape, float32 or float64.
     """
     return _sincos(jnp.asarray(x, dtype=jnp.result_type(float, x)))
+
+
+def _polynomial_angle(y: Array, x: Array) -> Array:
+    longer, shorter = jnp.maximum(abs(x), abs(y)), jnp.minimum(abs(x), abs(y))
+    # Beyond a sixteenth of a turn, the angle is counted from an eighth of a turn.
+    beyond = shorter > np.tan(np.pi / 8) * longer
+    over = jnp.where(beyond, longer + shorter, longer)
+    r = jnp.where(beyond, shorter - longer, shorter) / jnp.where(over == 0, 1, over)
+    z = r * r
+    angle = r + r * (z * _horner(_ATAN[x.dtype], z))
+    angle = jnp.where(beyond, np.pi / 4 + angle, angle)
+    angle = jnp.where(abs(y) > abs(x), np.pi / 2 - angle, angle)
+    angle = jnp.where(x < 0, np.pi - angle, angle)
+    return jnp.where(jnp.signbit(y), -angle, angle)
+
+
+@jax.custom_jvp
+def plane_angle(y: Array, x: Array) -> Array:
+    """Computes atan2 to 2 ulp, with derivative zero instead of NaN at the origin."""
+    finite = lambda y, x: jnp.arctan2(y, jnp.where((x == 0) & (y == 0), 1, x))
+    return jax.lax.platform_dependent(y, x, cpu=_polynomial_angle, default=finite)
+
+
+@plane_angle.defjvp
+def _plane_angle_jvp(primals, tangents):
+    (y, x), (y_dot, x_dot) = primals, tangents
+    # Of vectors of any size, whose squares may underflow.
+    size = jnp.maximum(abs(x), abs(y))
+    size = jnp.where(size == 0, 1, size)
+    across, along = y / size, x / size
+    square = across**2 + along**2
+    rate = (along * y_dot - across * x_dot) / (size * jnp.where(square == 0, 1, square))
+    return plane_angle(y, x), rate

@@ -124,8 +124,9 @@ class Form(NamedTuple):
     def outcomes(self, lanes: list[Array], arrays: list[Array]) -> Outcome:
         """Computes the outcomes of all lanes of a chunk."""
         given = iter(arrays)
-        leaves = [next(given) if _is_kind(leaf) else leaf for leaf in self.leaves]
-        common = _with_factors(self.common.unflatten(leaves), jnp.asarray)
+        value = lambda x: jnp.array(x) if isinstance(x, tuple) else x
+        leaves = [next(given) if _is_kind(x) else value(x) for x in self.leaves]
+        common = self.common.unflatten(leaves)
         abreast = self.lanes[0].shape[0] > _ALL_ALIKE
 
         def member(leaves):
@@ -138,20 +139,6 @@ def _is_kind(leaf: object) -> bool:
     return isinstance(leaf, jax.ShapeDtypeStruct)
 
 
-def _with_factors(common: Common, as_kind: Callable) -> Common:
-    """Returns `common` with existence factors that all members share as another kind.
-
-    As numbers they are part of the program, which leaves out the equations of other
-    joints: 256 arms of Fig 7 take half the time, and compile in three quarters (AMD
-    EPYC, jax 0.12).
-    """
-    linkage, *others = common.shared
-    if linkage.ef is None:
-        return common
-    linkage = eqx.tree_at(lambda arm: arm.ef, linkage, as_kind(linkage.ef))
-    return common._replace(shared=(linkage, *others))
-
-
 def _form_of(job: Job, lanes: int) -> tuple[Form, list[Array]]:
     """Returns the form of the program for so many lanes, and the common arrays."""
 
@@ -162,11 +149,16 @@ def _form_of(job: Job, lanes: int) -> tuple[Form, list[Array]]:
 
     members, structure = jax.tree.flatten(job.moving)
     kinds = tuple(kind(a, (lanes, *a.shape[1:])) for a in members)
-    common = _with_factors(job.common, lambda ef: tuple(map(float, ef)))
-    leaves, others = jax.tree.flatten(common)
+    leaves: list[Any]
+    leaves, others = jax.tree.flatten(job.common)
+    # Existence factors that all members share are part of the program, which leaves out
+    # the equations of other joints: 256 arms of Fig 7 take half the time, and compile
+    # in three quarters (AMD EPYC, jax 0.12).
+    ef = job.common.shared[0].ef
+    leaves = [tuple(x.tolist()) if x is ef else x for x in leaves]
     arrays = list(filter(eqx.is_array, leaves))
-    leaves = tuple(kind(x, x.shape) if eqx.is_array(x) else x for x in leaves)
-    return Form(structure, kinds, others, leaves), arrays
+    given = tuple(kind(x, x.shape) if eqx.is_array(x) else x for x in leaves)
+    return Form(structure, kinds, others, given), arrays
 
 
 @functools.lru_cache(maxsize=64)

@@ -10,16 +10,11 @@ from numpy.typing import ArrayLike
 
 from ..base.checks import concrete, is_traced, real_array, refusal
 from ..base.known_values import at_once
+from ..base.trigonometry import plane_angle
 from ..linkage.frames import cross, dot, frames, length_of, plane_vector, unit_vector
 from ..linkage.linkage import Linkage, check_linkage, joints_of
 from ..linkage.topology import fixed_pairs, real_joints
 from .equations import Scalars
-
-
-def plane_angle(y: Array, x: Array) -> Array:
-    """Computes atan2 with derivative zero instead of NaN at the origin."""
-    origin = (x == 0) & (y == 0)
-    return jnp.arctan2(y, jnp.where(origin, 1, x))
 
 
 def whole_turns(angle: Array) -> Array:

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from ..base.checks import JOINT, is_traced, real_array, refusal
 from ..base.known_values import at_once, in_numpy
-from ..base.trigonometry import sincos
+from ..base.trigonometry import plane_angle, sincos
 from ..linkage.fields import Condition, Values, called, default, field, of_kind
 from ..linkage.frames import cross, dot, plane_vector, plane_vectors
 from ..linkage.linkage import Linkage, check_linkage, joints_of
@@ -20,7 +20,6 @@ from ..mechanics.inverse_kinematics import (
     arm_of,
     beyond,
     check_moving_joints,
-    plane_angle,
     solve_joints,
     whole_turns,
 )

@@ -18,7 +18,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import PyTree
 
-from ..base.one_loop import in_one_loop
+from ..base.one_loop import entries_in_one_loop, in_one_loop
 from .dopri8 import (
     DENSE,
     LOWER,
@@ -94,7 +94,10 @@ class _Step(NamedTuple):
 def _step(term, t0, t1, y0, residue, args, f0) -> tuple[_Step, dict[str, PyTree]]:
     inner, h = term.term, term.contr(t0, t1)  # within a wrapper of diffrax
     times = t0 + (t1 - t0) * jnp.asarray(NODES, t0.dtype)
-    schedule = jax.vmap(inner.schedule, in_axes=(0, None))(times, args)
+    # XLA makes vectors of the lanes, not of all stages of each, only in a loop.
+    schedule = jax.lax.map(
+        lambda t: entries_in_one_loop(inner.schedule(t, args)), times
+    )
     scheduled = lambda stage: jtu.tree_map(lambda leaf: leaf[stage], schedule)
     field, rates = eqx.filter_jit(inner.vector_field), [f0]
     weighted = lambda row: _increment(row, rates, y0, h)

@@ -74,18 +74,17 @@ def _largest(rows: Sequence[Array]) -> Array:
 
 
 def _margins(
-    values: Sequence[Array], checks: Sequence[Array], sides: Array, before: Array,
-    brief: Array,
-) -> _Margins:  # fmt: skip
-    """Returns margins by their polynomials through `values`, on these sides.
+    values: Array, checks: Array, side: Array, before: Array, brief: Array
+) -> _Margins:
+    """Returns the margin of one function by its polynomial through `values`.
 
     The error of polynomials shows in their last terms and at the further samples
     `checks`. What may be rounding does not count, as shorter steps have it too.
     """
-    eps, largest = jnp.finfo(before.dtype).eps, _largest(values)
-    rows, checks = ([sides * row for row in part] for part in (values, checks))
+    eps, largest = jnp.finfo(before.dtype).eps, _largest(tuple(values))
+    rows, others = ([side * value for value in part] for part in (values, checks))
     last = [_sum(row, rows) for row in _TERMS[-2:]]
-    wrong = [check - _sum(row, rows) for check, row in zip(checks, _AT_CHECKS)]
+    wrong = [check - _sum(row, rows) for check, row in zip(others, _AT_CHECKS)]
     rounding = _ROUNDING * eps * (1 + jnp.maximum(before, largest))
     unsure = _ELSEWHERE * jnp.maximum(_largest([*last, *wrong]) - rounding, 0)
     beyond = eps**_BEYOND * largest + _ROUNDING * eps
@@ -160,8 +159,10 @@ def passage(
     if not before.size:
         zero, no = jnp.zeros((), values.dtype), jnp.zeros((), bool)
         return Passage(zero + 1, no, zero, zero + 1, before > 0, zero, zero, before)
-    brief = jnp.broadcast_to(brief, before.shape)
-    margins = _margins(tuple(values), tuple(checks), sides, before, brief)
+    # XLA makes vectors of the lanes of a batch where functions come one by one.
+    one = lambda function: _margins(*function, brief)  # pyright: ignore[reportCallIssue]
+    margins = jax.lax.map(one, (values.T, checks.T, sides, before))
+    margins = margins._replace(past=margins.past.T, slopes=margins.slopes.T)
     turns, lowest = _turns(margins)
     sizes = jnp.maximum(before, margins.largest)
     return Passage(
