@@ -75,6 +75,8 @@ def run(quick: bool) -> Iterator[dict]:
         problem = fig5_batch(batch)
         rows = contestants(batch)
         yield from measured("batches", problem, exactly(problem), rows, budget)
+    case = own.equations_alone(fig5_batch(256))
+    yield from measure("batches", [case], budget=2, problem="equations alone")
     problem = mixed_batch(64 if quick else 1024)
     rows = [
         ("fdof_jax sweep", own.sweep, FEW),
@@ -91,9 +93,10 @@ def run_two_cores(quick: bool) -> Iterator[dict]:
         rows = [
             row for row in contestants(batch) if row[0] in ("fdof_jax sweep", "heyoka")
         ]
-        rows.append(("one core", one_core, FEW))
+        rows.append(("one core", partial(pinned, cores=1), FEW))
         exact = exactly(problem)
-        yield from measured("cores", problem, exact, rows, budget)
+        both: Row = "a process a core", partial(pinned, cores=2), FEW
+        yield from measured("cores", problem, exact, [*rows, both], budget)
         with _busy_core():
             for point in measured("cores", problem, exact, rows, budget / 2):
                 yield {**point, "problem": "the second core busy"}
@@ -139,41 +142,50 @@ def exactly(problem: Problem) -> np.ndarray:
 # takes a process of its own.
 
 
-def _serve(pipe: Connection, core: int, batch: int) -> None:
+def _serve(pipe: Connection, core: int, batch: int, members: slice) -> None:
     """Runs a sweep for each tolerance received, and sends its motion if asked."""
     os.sched_setaffinity(0, {core})
     import fdof_jax as fj
 
     fj.configure(x64=True)
-    contestant, result = own.sweep(fig5_batch(batch)), None
+    problem = fig5_batch(batch)
+    state0 = jax.tree.map(lambda rows: rows[members], problem.state0)
+    contestant, result = own.sweep(problem._replace(state0=state0)), None
     while True:
         try:
             tolerance = pipe.recv()
         except EOFError:  # the benchmark is done
             return
         if tolerance is None:
-            pipe.send(tuple(contestant.motion(result)))
+            pipe.send(tuple(map(np.asarray, contestant.motion(result))))
         else:
             result = contestant.run(tolerance)
             pipe.send(None)
 
 
-def one_core(problem: Problem) -> Contestant:
-    """Returns `sweep` of Fig 5's batch on the first core alone."""
-    processes = multiprocessing.get_context("spawn")
-    pipe, other = processes.Pipe()
-    core = min(os.sched_getaffinity(0))
-    process = processes.Process(
-        target=_serve, args=(other, core, problem.batch), daemon=True
-    )
-    process.start()
-    other.close()  # so that a dead process ends `recv`
+def pinned(problem: Problem, cores: int) -> Contestant:
+    """Returns `sweep` of Fig 5's batch, in a process for each of the first cores."""
+    processes, pipes = multiprocessing.get_context("spawn"), []
+    for share, core in enumerate(sorted(os.sched_getaffinity(0))[:cores]):
+        pipe, other = processes.Pipe()
+        members = slice(share, None, cores)  # which take equally long
+        arguments = other, core, problem.batch, members
+        processes.Process(target=_serve, args=arguments, daemon=True).start()
+        other.close()  # so that a dead process ends `recv`
+        pipes.append(pipe)
 
-    def ask(tolerance: float | None):
-        pipe.send(tolerance)
-        return pipe.recv()
+    def ask(tolerance: float | None) -> list:
+        for pipe in pipes:
+            pipe.send(tolerance)
+        return [pipe.recv() for pipe in pipes]
 
-    return Contestant("one core", "tolerance", ask, lambda _: Motion(*ask(None)))
+    def motion(_: Any) -> Motion:
+        parts = zip(*ask(None))
+        joined = lambda part: np.stack(part, 1).reshape(-1, *part[0].shape[1:])
+        return Motion(*map(joined, parts))
+
+    name = "one core" if cores == 1 else "a process a core"
+    return Contestant(name, "tolerance", ask, motion)
 
 
 def _spin(core: int) -> None:

@@ -15,6 +15,8 @@ import numpy as np
 
 import fdof_jax as fj
 from fdof_jax.base.configuration import wide_vectors
+from fdof_jax.base.one_loop import in_one_loop
+from fdof_jax.base.trigonometry import sincos
 
 from .measure import Case
 from .pendulums import absolute, accelerations, constants, relative
@@ -258,3 +260,20 @@ def diffrax_scalars(problem: Problem) -> Contestant:
     compiled = _jitted(run, problem.axes)
     call = lambda tolerance: compiled(y0, tolerance)
     return Contestant("diffrax, scalars", "tolerance", call, motion)
+
+
+def equations_alone(problem: Problem) -> Case:
+    """Returns evaluations of heyoka's equations, of which XLA makes one loop."""
+    arm, repeats = constants(problem.linkage), 1000
+    n = len(arm.second)
+    sin, cos = (lambda x: sincos(x)[0]), (lambda x: sincos(x)[1])
+
+    def advance(_, y):
+        found = accelerations(arm, y[:n], y[n:], sin, cos)
+        return tuple(a + 1e-9 * b for a, b in zip(y, in_one_loop((*y[n:], *found))))
+
+    repeated = lambda y: jax.lax.fori_loop(0, repeats, advance, y)
+    compiled = jax.jit(repeated, compiler_options=wide_vectors())
+    y0 = tuple(jnp.asarray(absolute(arm, *problem.state0).T))
+    count = {"evaluations": repeats * len(y0[0])}
+    return Case("XLA", None, lambda: compiled(y0), fields=count)

@@ -17,6 +17,7 @@ _MODES = {
 }  # fmt: skip
 ERRORS = (1e-6, 1e-9)
 CHAIN_ERROR = 1e-8  # of chains of many joints
+EVALUATIONS = 13  # of the equations in a step of Dopri8
 OURS = "fdof_jax sweep"
 
 # A contestant looks the same in all pictures. Colours are Okabe and Ito's.
@@ -97,10 +98,28 @@ def batches(points: Points) -> str:
     same = [p for p in points if p["problem"] == "fig5"]
     big = max(p["batch"] for p in same)
     size = 1024 if chosen(same, batch=1024) else big
+    same = chosen(same, batch=size)
+    sizes = f"{size} triple pendulums", f"{mixed[0]['batch']} random arms of all kinds"
     return (
-        f"{size} triple pendulums:\n\n{_rates(chosen(same, batch=size), ERRORS, OURS)}"
-        f"\n\n{mixed[0]['batch']} random arms of all seven kinds:\n\n"
-        f"{_rates(mixed, ERRORS, OURS)}"
+        f"{sizes[0]}:\n\n{_rates(same, ERRORS, OURS)}\n\n{_shares(points, same)}\n\n"
+        f"{sizes[1]}:\n\n{_rates(mixed, ERRORS, OURS)}"
+    )
+
+
+def _shares(points: Points, same: Points) -> str:
+    """Says how much of a sweep's time the least equations would take."""
+    (alone,) = chosen(points, problem="equations alone")
+    each = alone["time_median"] / alone["evaluations"]
+    shares = []
+    for tolerance in (1e-7, 1e-9):
+        (own,) = chosen(same, solver=OURS, setting=tolerance)
+        steps = own["batch"] * (own["steps"] + own["rejected"])
+        share = EVALUATIONS * steps * each / own["time_median"]
+        shares.append(f"{100 * share:.0f} % at a tolerance of {number(tolerance, 1)}")
+    return (
+        "Heyoka's equations alone, with the arm's numbers known, take XLA "
+        f"{number(1e9 * each)} ns for each of the sweep's evaluations: "
+        f"{' and '.join(shares)} of its time."
     )
 
 
@@ -109,14 +128,16 @@ def cores(points: Points) -> str:
     for batch in dict.fromkeys(p["batch"] for p in points):
         for problem in dict.fromkeys(p["problem"] for p in points):
             own = chosen(points, batch=batch, problem=problem)
-            two = chosen(own, solver=OURS)
-            cells = [
-                ratio(two, chosen(own, solver=other), error)
-                for other in ("one core", "heyoka")
-                for error in ERRORS
-            ]
-            state = "" if problem == "fig5" else f", {problem}"
-            rows.append([f"{batch}{state}", *cells])
+            for way in (OURS, "a process a core"):
+                two = chosen(own, solver=way)
+                cells = [
+                    ratio(two, chosen(own, solver=other), error)
+                    for other in ("one core", "heyoka")
+                    for error in ERRORS
+                ]
+                parts = str(batch), problem, way
+                label = ", ".join(x for x in parts if x not in ("fig5", OURS))
+                rows += [[label, *cells]] * bool(two)
     others = "one core", "heyoka's two threads"
     head = [f"over {o}, at {number(e, 1)}" for o in others for e in ERRORS]
     return table(["members", *head], rows)
