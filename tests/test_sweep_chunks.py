@@ -17,7 +17,7 @@ from sweep_batch import CHUNK, SETTINGS, TS, run, single_links, successful
 
 import fdof_jax as fj
 from fdof_jax.base import configuration
-from fdof_jax.batches import chunks
+from fdof_jax.batches import chunks, devices
 from fdof_jax.batches.batch_axes import batch_of
 from fdof_jax.simulation import formulation
 from fdof_jax.steps.dopri8 import ScheduledTerm
@@ -58,10 +58,10 @@ def test_small_batches_share_a_program_and_need_no_forecast(solved, monkeypatch)
     # Times in common are not copied.
     assert successful(motion).all() and motion.ts.strides[0] == 0
     np.testing.assert_array_equal(motion.ts, np.tile(TS, (8, 1)))
-    before = chunks._compiled.cache_info().misses
+    before = devices.compiled.cache_info().misses
     for size in (2, 5, 7):
         assert swept(speeds[:size]).q.shape == (size, len(TS), 1)
-    assert chunks._compiled.cache_info().misses == before
+    assert devices.compiled.cache_info().misses == before
     assert [len(q) for q, _ in solved] == [8] * 4
 
 
@@ -88,7 +88,7 @@ def test_a_batch_of_one_kind_has_the_equations_of_that_kind_alone(monkeypatch):
 
 @pytest.mark.slow
 def test_members_are_sorted_by_their_forecast(solved, monkeypatch):
-    monkeypatch.setattr(chunks, "_cores", lambda: 1)
+    monkeypatch.setattr(devices, "cores", lambda: 1)
     speeds = 3 * np.array([0.0, 9, 1, 8, 2, 7, 3, 6, 4, 5, 10, 11])
     motion = swept(speeds, chunk=4)
     np.testing.assert_array_equal(motion.qd[:, 0, 0], speeds)
@@ -148,7 +148,7 @@ def test_starts_of_any_type_are_solved_in_double_precision(kinds):
 def test_cores_change_nothing(batch, clean, monkeypatch):
     """Chunks are the same ones, whatever the number of threads that send them."""
     for cores in (1, 3):
-        monkeypatch.setattr(chunks, "_cores", lambda cores=cores: cores)
+        monkeypatch.setattr(devices, "cores", lambda cores=cores: cores)
         motion = run(batch)
         for a, b in zip(*map(jax.tree.leaves, (motion, clean))):
             np.testing.assert_array_equal(a, b)

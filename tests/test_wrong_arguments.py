@@ -7,7 +7,7 @@ from sweep_batch import TS, run, successful
 
 import fdof_jax as fj
 from fdof_jax import identification, references, scenes, tuning
-from fdof_jax.batches import chunks
+from fdof_jax.batches import devices
 
 FIG7 = scenes.fig7()
 MOTION = fj.Solution(TS, np.zeros((7, 3)), np.zeros((7, 3)), {}, None)
@@ -90,7 +90,7 @@ def guarded():
 
 def test_under_a_transfer_guard(batch, guarded, monkeypatch):
     linkage, state0, *_ = scenes.fig5()
-    monkeypatch.setattr(chunks, "_cores", lambda: 2)
+    monkeypatch.setattr(devices, "cores", lambda: 2)
     solution = run(batch)
     motion = fj.simulate(linkage, state0, TS)
     with jax.transfer_guard("allow"):

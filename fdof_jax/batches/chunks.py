@@ -1,9 +1,6 @@
 """Solves a batch in chunks of members that take about equally long."""
 
-import contextlib
 import functools
-import os
-import sys
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -15,11 +12,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.sharding import Mesh, SingleDeviceSharding
+from jax.sharding import SingleDeviceSharding
 from jaxtyping import PyTree
 
 from ..base.checks import refusal
-from ..base.configuration import wide_vectors
 from ..dynamics import energy, forward_dynamics
 from ..forces.added_inertia import present
 from ..forces.element import elements
@@ -32,8 +28,7 @@ from ..simulation.simulate import simulate
 from ..simulation.solution import Solution
 from ..steps.controllers import Abreast, by_square_roots
 from ..steps.tolerances import default_controller
-
-Device = Any  # a `jax.Device`, or None for the default one
+from .devices import Device, compiled, copied, of_cores
 
 # With so few lanes a step takes hardly longer than with one, so that slow members do
 # not pay for another program.
@@ -43,7 +38,6 @@ _SMALL = 8  # lanes of the chunks for a few slow members
 _COPIED_AT_ONCE = 2**24  # bytes to a device
 _FORECASTS = 1024  # computed at once
 _STEPS, _ANGLE = 16, 0.3  # of the rough motion in a forecast: number and size
-_NO_MESH = Mesh(np.empty((), object), ())
 
 
 class Common(NamedTuple):
@@ -176,9 +170,17 @@ def _lowered(form: Form, device: Device) -> jax.stages.Lowered:
     return _jitted(form).lower(*arguments)
 
 
-@functools.lru_cache(maxsize=64)
-def _compiled(program: jax.stages.Lowered) -> jax.stages.Compiled:
-    return program.compile(wide_vectors())
+def _programs(form: Form, devices: list[Device]) -> list[jax.stages.Compiled]:
+    """Returns the program of this form for each of the devices."""
+    if len(devices) > 1 and devices[0].client is devices[1].client:
+        # Traces depend on settings that no other thread has.
+        programs = [_lowered(form, device) for device in devices]
+        with ThreadPoolExecutor(len(devices)) as pool:
+            return list(pool.map(compiled, programs))
+    first, *others = devices
+    program = compiled(_lowered(form, first))
+    copy = lambda core: copied(program, core) or compiled(_lowered(form, core))
+    return [program, *map(copy, others)]
 
 
 def _solve(program: jax.stages.Compiled, *arguments: list) -> Outcome:
@@ -245,27 +247,6 @@ def _forecast(job: Job) -> np.ndarray:
 # Chunks
 
 
-def _cores() -> int:
-    """Returns the number of cores that this process may use."""
-    if sys.platform == "linux":
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
-
-
-@contextlib.contextmanager
-def devices_outside_mesh() -> Iterator[list[Device]]:
-    """Yields this process's devices, of the mesh that is set or all; None if just one.
-
-    Meanwhile no mesh is set: its devices would share each program. Before 0.8.1 JAX
-    does not say which is set.
-    """
-    set_mesh = jax.__version_info__ >= (0, 8, 1)
-    mesh = jax.sharding.get_mesh() if set_mesh else _NO_MESH
-    devices = jax.local_devices() if mesh.empty else list(mesh.local_devices)
-    with contextlib.nullcontext() if mesh.empty else jax.set_mesh(_NO_MESH):
-        yield devices if len(devices) > 1 or not mesh.empty else [None]
-
-
 def _lanes(members: int, chunk: int) -> int:
     """Returns the number of lanes for some members: few numbers serve all batches."""
     if members == 1:
@@ -274,15 +255,10 @@ def _lanes(members: int, chunk: int) -> int:
 
 
 def _outcomes(
-    job: Job, members: np.ndarray, lanes: int
+    job: Job, devices: list[Device], members: np.ndarray, lanes: int
 ) -> Iterator[tuple[np.ndarray, Outcome]]:
     """Solves members in chunks; yields members and their outcomes."""
     chunks = [members[i : i + lanes] for i in range(0, len(members), lanes)]
-    devices = job.devices
-    # XLA splits operations among the cores, which gains little for a chunk, and runs in
-    # turn what one thread sends. While it runs, Python may do other things.
-    if len(devices) == 1 and jax.default_backend() == "cpu":
-        devices = devices * _cores()
     devices = devices[: len(chunks)]
     form, arrays = _form_of(job, lanes)
     leaves = jax.tree.leaves(job.moving)
@@ -291,28 +267,30 @@ def _outcomes(
         rows = np.append(members, np.full(lanes - len(members), members[-1]))
         return [leaf[rows] for leaf in leaves]
 
-    # Traces and transfers depend on settings that no other thread has.
-    programs = [_lowered(form, device) for device in devices]
-    if devices == [None]:
-        program = _compiled(programs[0])
+    programs = _programs(form, devices)
+    if len(devices) == 1:
         for some in chunks:
-            yield some, _solve(program, rows_of(some), arrays)
+            own = rows_of(some), arrays
+            if devices != [None]:
+                own = jax.device_put(own, *devices)
+            yield some, _solve(*programs, *own)
         return
-    shared = [jax.device_put(arrays, device) for device in devices]
+    shared: list[list[Array]] = []
     running: deque[tuple[np.ndarray, Future]] = deque()
     with ThreadPoolExecutor(len(devices)) as pool:
-        different = dict.fromkeys(programs)  # cores have one program in common
-        different = dict(zip(different, pool.map(_compiled, different)))
         for number, some in enumerate(chunks):
             worker = number % len(devices)
+            # Transfers depend on settings that no other thread has.
+            if number == worker:
+                shared.append(jax.device_put(arrays, devices[worker]))
             own = jax.device_put(rows_of(some), devices[worker])
-            program = different[programs[worker]]
-            running.append((some, pool.submit(_solve, program, own, shared[worker])))
+            solution = pool.submit(_solve, programs[worker], own, shared[worker])
+            running.append((some, solution))
             if len(running) > 2 * len(devices):
-                some, future = running.popleft()
-                yield some, future.result()
-        for some, future in running:
-            yield some, future.result()
+                some, solution = running.popleft()
+                yield some, solution.result()
+        for some, solution in running:
+            yield some, solution.result()
 
 
 def in_chunks(
@@ -321,8 +299,10 @@ def in_chunks(
     on_device: bool = True,
 ) -> Outcome:
     """Returns the outcomes of all members; unless `on_device`, in NumPy's arrays."""
-    size = job.size
-    lanes = _lanes(-(-size // len(job.devices)), job.chunk)
+    size, devices = job.size, job.devices
+    lanes = _lanes(-(-size // len(devices)), job.chunk)
+    if lanes > _ALL_ALIKE:  # of fewer lanes XLA splits no operation among cores
+        devices = of_cores(devices)
     order = np.arange(size)
     if size > lanes:
         # The longest come first, so that no core waits long for another at the end.
@@ -334,7 +314,7 @@ def in_chunks(
     progress, advance = meter.init(), meter.step  # looked up at each use it is slow
     while len(waiting):
         late = []
-        for members, outcome in _outcomes(job, waiting, lanes):
+        for members, outcome in _outcomes(job, devices, waiting, lanes):
             late.append(members[np.asarray(outcome.stopped)[: len(members)]])
             done += len(members) - len(late[-1])
             progress = advance(progress, np.asarray(done / size))
@@ -342,7 +322,10 @@ def in_chunks(
             if not results:
                 if done == size == lanes:  # a single chunk, in order
                     meter.close(progress)
-                    return outcome
+                    if devices == [None]:
+                        return outcome
+                    whole = jax.tree.map(np.asarray, outcome)
+                    return jax.device_put(whole) if on_device else whole
                 results = [np.empty((size, *v.shape[1:]), v.dtype) for v in values]
             rows = place[members]
             if rows[-1] - rows[0] == len(rows) - 1:  # a slice is faster

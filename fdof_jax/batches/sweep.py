@@ -46,14 +46,8 @@ from ..simulation.simulate import solve_options
 from ..simulation.solution import Solution
 from ..steps.dopri8 import constant
 from .batch_axes import Batch, ForcesAxes, batch_of
-from .chunks import (
-    Common,
-    Job,
-    devices_outside_mesh,
-    expected_work,
-    in_chunks,
-    outcome_of,
-)
+from .chunks import Common, Job, expected_work, in_chunks, outcome_of
+from .devices import devices_outside_mesh
 from .store import Store, in_store, outline
 
 _T = TypeVar("_T")
