@@ -24,6 +24,7 @@ from fdof_jax.steps.dopri8 import ScheduledTerm
 
 LANES = 64  # enough for a slow member to be stopped
 PENDULUM = fj.Linkage("R", length=[0, 1], com=[[0.5, 0]], mass=[1], inertia=[0.1])
+DAMPER = fj.JointDamper(1.0)
 
 
 @pytest.fixture
@@ -152,6 +153,24 @@ def test_cores_change_nothing(batch, clean, monkeypatch):
         motion = run(batch)
         for a, b in zip(*map(jax.tree.leaves, (motion, clean))):
             np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.slow
+def test_a_program_that_calls_python_is_compiled_for_each_core(monkeypatch):
+    """No copy of it can be made."""
+    monkeypatch.setattr(devices, "cores", lambda: 2)
+    before = devices.compiled.cache_info().misses
+    kind = jax.ShapeDtypeStruct((1,), float)
+    call = lambda qd: jax.pure_callback(
+        np.negative, kind, qd, vmap_method="expand_dims"
+    )
+    drag = lambda t, q, qd, linkage: call(qd)
+    linkage, start = pendulums(np.linspace(0, 1, 40))
+    options = dict(forces=(drag,), chunk=20, **SETTINGS)
+    motion = fj.sweep(linkage, start, TS[:2], **options)
+    assert devices.compiled.cache_info().misses == before + 2
+    damped = fj.sweep(linkage, start, TS[:2], **options | dict(forces=(DAMPER,)))
+    np.testing.assert_allclose(motion.q, damped.q, atol=1e-12)
 
 
 @pytest.mark.slow

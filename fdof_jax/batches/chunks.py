@@ -301,7 +301,7 @@ def in_chunks(
     """Returns the outcomes of all members; unless `on_device`, in NumPy's arrays."""
     size, devices = job.size, job.devices
     lanes = _lanes(-(-size // len(devices)), job.chunk)
-    if lanes > _ALL_ALIKE:  # of fewer lanes XLA splits no operation among cores
+    if size > _ALL_ALIKE:  # XLA splits no operation of fewer lanes among cores
         devices = of_cores(devices)
     order = np.arange(size)
     if size > lanes:
