@@ -273,7 +273,7 @@ def _outcomes(
             own = rows_of(some), arrays
             if devices != [None]:
                 own = jax.device_put(own, *devices)
-            yield some, _solve(*programs, *own)
+            yield some, _solve(programs[0], *own)
         return
     shared: list[list[Array]] = []
     running: deque[tuple[np.ndarray, Future]] = deque()
