@@ -76,7 +76,13 @@ def compiled(program: jax.stages.Lowered) -> jax.stages.Compiled:
 
 @functools.lru_cache(maxsize=256)
 def copied(program: jax.stages.Compiled, device: Device) -> jax.stages.Compiled | None:
-    """Returns a program for another CPU device, uncompiled; None if it calls Python."""
+    """Returns a program for another CPU device, uncompiled; None if that cannot be.
+
+    Programs that JAX took from a folder lack parts in copies, and the folder has them
+    for the other device, too. Those that call Python cannot be copied.
+    """
+    if jax.config.jax_compilation_cache_dir:
+        return None
     try:
         copy = serialize_executable.serialize(program)
     except (AttributeError, pickle.PicklingError):
