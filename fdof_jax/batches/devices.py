@@ -81,7 +81,7 @@ def copied(program: jax.stages.Compiled, device: Device) -> jax.stages.Compiled 
     Programs that JAX took from a folder lack parts in copies, and the folder has them
     for the other device, too. Those that call Python cannot be copied.
     """
-    if jax.config.jax_compilation_cache_dir:
+    if jax.config.jax_compilation_cache_dir:  # pyright: ignore[reportAttributeAccessIssue]
         return None
     try:
         copy = serialize_executable.serialize(program)
