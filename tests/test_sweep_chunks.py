@@ -13,6 +13,7 @@ import jax
 import numpy as np
 import pytest
 import xarray
+from jax.experimental.compilation_cache import compilation_cache
 from sweep_batch import CHUNK, SETTINGS, TS, run, single_links, successful
 
 import fdof_jax as fj
@@ -155,9 +156,18 @@ def test_cores_change_nothing(batch, clean, monkeypatch):
             np.testing.assert_array_equal(a, b)
 
 
+@pytest.fixture
+def no_folder():
+    """Has JAX keep no programs in the folder of the tests."""
+    folder = jax.config.jax_compilation_cache_dir
+    fj.configure(cache=False)
+    yield
+    jax.config.update("jax_compilation_cache_dir", folder)
+    compilation_cache.reset_cache()
+
+
 @pytest.mark.slow
-def test_a_program_that_calls_python_is_compiled_for_each_core(monkeypatch):
-    """No copy of it can be made."""
+def test_cores_take_copies_of_a_program_unless_it_calls_python(no_folder, monkeypatch):
     monkeypatch.setattr(devices, "cores", lambda: 2)
     before = devices.compiled.cache_info().misses
     kind = jax.ShapeDtypeStruct((1,), float)
@@ -170,6 +180,7 @@ def test_a_program_that_calls_python_is_compiled_for_each_core(monkeypatch):
     motion = fj.sweep(linkage, start, TS[:2], **options)
     assert devices.compiled.cache_info().misses == before + 2
     damped = fj.sweep(linkage, start, TS[:2], **options | dict(forces=(DAMPER,)))
+    assert devices.compiled.cache_info().misses == before + 3
     np.testing.assert_allclose(motion.q, damped.q, atol=1e-12)
 
 

@@ -1,9 +1,9 @@
 """The devices that solve the chunks of a batch, and their programs.
 
 XLA on CPU splits each operation of a program among threads for all cores. For a chunk
-this gains nothing, because they wait for each other and for whatever else runs: 256
-triple pendulums take 3 ms on one core, and 4 to 12 ms on two. So each core has a client
-of XLA of its own here, with a single thread.
+this gains nothing, because they wait for each other and for whatever else runs
+(`python -m benchmarks --only cores`). So each core has a client of XLA of its own here,
+with a single thread.
 """
 
 import contextlib
