@@ -1,9 +1,16 @@
 """Solves a batch in chunks of members that take about equally long."""
 
+import contextlib
 import functools
 from collections import deque
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    Future,
+    ThreadPoolExecutor,
+    as_completed,
+    wait,
+)
 from typing import Any, NamedTuple
 
 import diffrax
@@ -108,32 +115,29 @@ def outcome_of(common: Common, moving: PyTree, abreast: bool = False) -> Outcome
 
 
 class Form(NamedTuple):
-    """The key of a program: structures, kinds of the arrays, constants."""
+    """The key of a program: a function, structures, kinds of the arrays, constants."""
 
+    function: Callable[[Common, PyTree], PyTree]  # of what all members share, and they
     moving: Any  # structure of what differs between members
     lanes: tuple[jax.ShapeDtypeStruct, ...]  # its arrays
     common: Any  # structure
     leaves: tuple[Any, ...]  # of `common`: kinds of arrays, and constants
 
-    def outcomes(self, lanes: list[Array], arrays: list[Array]) -> Outcome:
-        """Computes the outcomes of all lanes of a chunk."""
+    def values(self, lanes: list[Array], arrays: list[Array]) -> PyTree:
+        """Computes the function's values for all lanes of a chunk."""
         given = iter(arrays)
         value = lambda x: jnp.array(x) if isinstance(x, tuple) else x
         leaves = [next(given) if _is_kind(x) else value(x) for x in self.leaves]
-        common = self.common.unflatten(leaves)
-        abreast = self.lanes[0].shape[0] > _ALL_ALIKE
-
-        def member(leaves):
-            return outcome_of(common, self.moving.unflatten(leaves), abreast)
-
-        return jax.vmap(member, axis_name=_AXIS)(lanes)
+        return self.function(
+            self.common.unflatten(leaves), self.moving.unflatten(lanes)
+        )
 
 
 def _is_kind(leaf: object) -> bool:
     return isinstance(leaf, jax.ShapeDtypeStruct)
 
 
-def _form_of(job: Job, lanes: int) -> tuple[Form, list[Array]]:
+def _form_of(function: Callable, job: Job, lanes: int) -> tuple[Form, list[Array]]:
     """Returns the form of the program for so many lanes, and the common arrays."""
 
     def kind(array: Array, shape: tuple[int, ...]) -> jax.ShapeDtypeStruct:
@@ -152,12 +156,12 @@ def _form_of(job: Job, lanes: int) -> tuple[Form, list[Array]]:
     leaves = [tuple(x.tolist()) if x is ef else x for x in leaves]
     arrays = list(filter(eqx.is_array, leaves))
     given = tuple(kind(x, x.shape) if eqx.is_array(x) else x for x in leaves)
-    return Form(structure, kinds, others, given), arrays
+    return Form(function, structure, kinds, others, given), arrays
 
 
 @functools.lru_cache(maxsize=64)
 def _jitted(form: Form) -> jax.stages.Wrapped:
-    return jax.jit(form.outcomes)  # traced once for all devices
+    return jax.jit(form.values)  # traced once for all devices
 
 
 @functools.lru_cache(maxsize=64)
@@ -183,14 +187,58 @@ def _programs(form: Form, devices: list[Device]) -> list[jax.stages.Compiled]:
     return [program, *map(copy, others)]
 
 
-def _solve(program: jax.stages.Compiled, *arguments: list) -> Outcome:
+def _solve(program: jax.stages.Compiled, *arguments: list) -> PyTree:
     return jax.block_until_ready(program(*arguments))
+
+
+def _in_lanes(
+    function: Callable, job: Job, devices: list[Device], members: np.ndarray, lanes: int
+) -> Iterator[tuple[np.ndarray, PyTree]]:
+    """Yields members of a batch in chunks, as they are done, and their values."""
+    chunks = [members[i : i + lanes] for i in range(0, len(members), lanes)]
+    devices = devices[: len(chunks)]
+    form, arrays = _form_of(function, job, lanes)
+    leaves = jax.tree.leaves(job.moving)
+
+    def rows_of(members: np.ndarray) -> list[np.ndarray]:
+        rows = np.append(members, np.full(lanes - len(members), members[-1]))
+        return [leaf[rows] for leaf in leaves]
+
+    programs = _programs(form, devices)
+    if len(devices) == 1:
+        for some in chunks:
+            own = rows_of(some), arrays
+            if devices != [None]:
+                own = jax.device_put(own, *devices)
+            yield some, _solve(programs[0], *own)
+        return
+    shared: dict[int, list[Array]] = {}
+    running: dict[Future, tuple[int, np.ndarray]] = {}
+    # Each device has a thread, as two that call it wait for each other. It solves one
+    # chunk while the next is there already.
+    free = deque(2 * list(range(len(devices))))
+    with contextlib.ExitStack() as stack:
+        pools = [stack.enter_context(ThreadPoolExecutor(1)) for _ in devices]
+        for some in chunks:
+            if not free:
+                for solved in wait(running, return_when=FIRST_COMPLETED).done:
+                    worker, members = running.pop(solved)
+                    free.append(worker)
+                    yield members, solved.result()
+            worker = free.popleft()
+            # Transfers depend on settings that no other thread has.
+            if worker not in shared:
+                shared[worker] = jax.device_put(arrays, devices[worker])
+            own = jax.device_put(rows_of(some), devices[worker])
+            arguments = programs[worker], own, shared[worker]
+            running[pools[worker].submit(_solve, *arguments)] = worker, some
+        for solved in as_completed(running):
+            yield running[solved][1], solved.result()
 
 
 # Forecasts
 
 
-@eqx.filter_jit
 def expected_work(ts: Array, moving: PyTree, shared: PyTree) -> Array:
     """Computes for each member a number that grows with its steps.
 
@@ -234,14 +282,18 @@ def expected_work(ts: Array, moving: PyTree, shared: PyTree) -> Array:
     return jax.vmap(member)(moving)
 
 
-def _forecast(job: Job) -> np.ndarray:
+def _works(common: Common, moving: PyTree) -> Array:
+    return expected_work(common.ts, moving, common.shared)
+
+
+def _forecast(job: Job, devices: list[Device]) -> np.ndarray:
     """Returns the `expected_work` of all members; one program serves any number."""
-    work = []
-    for first in range(0, job.size, _FORECASTS):
-        rows = np.minimum(np.arange(first, first + _FORECASTS), job.size - 1)
-        some = jax.tree.map(lambda leaf, rows=rows: leaf[rows], job.moving)
-        work.append(expected_work(job.common.ts, some, job.common.shared))
-    return np.concatenate(work)[: job.size]
+    common = job.common._replace(settings={}, reduce=None)  # which make no difference
+    works = np.empty(job.size)
+    everyone, job = np.arange(job.size), job._replace(common=common)
+    for members, found in _in_lanes(_works, job, devices, everyone, _FORECASTS):
+        works[members] = np.asarray(found)[: len(members)]
+    return works
 
 
 # Chunks
@@ -254,43 +306,11 @@ def _lanes(members: int, chunk: int) -> int:
     return min(chunk, max(_SMALL, 1 << (members - 1).bit_length()))
 
 
-def _outcomes(
-    job: Job, devices: list[Device], members: np.ndarray, lanes: int
-) -> Iterator[tuple[np.ndarray, Outcome]]:
-    """Solves members in chunks; yields members and their outcomes."""
-    chunks = [members[i : i + lanes] for i in range(0, len(members), lanes)]
-    devices = devices[: len(chunks)]
-    form, arrays = _form_of(job, lanes)
-    leaves = jax.tree.leaves(job.moving)
-
-    def rows_of(members: np.ndarray) -> list[np.ndarray]:
-        rows = np.append(members, np.full(lanes - len(members), members[-1]))
-        return [leaf[rows] for leaf in leaves]
-
-    programs = _programs(form, devices)
-    if len(devices) == 1:
-        for some in chunks:
-            own = rows_of(some), arrays
-            if devices != [None]:
-                own = jax.device_put(own, *devices)
-            yield some, _solve(programs[0], *own)
-        return
-    shared: list[list[Array]] = []
-    running: deque[tuple[np.ndarray, Future]] = deque()
-    with ThreadPoolExecutor(len(devices)) as pool:
-        for number, some in enumerate(chunks):
-            worker = number % len(devices)
-            # Transfers depend on settings that no other thread has.
-            if number == worker:
-                shared.append(jax.device_put(arrays, devices[worker]))
-            own = jax.device_put(rows_of(some), devices[worker])
-            solution = pool.submit(_solve, programs[worker], own, shared[worker])
-            running.append((some, solution))
-            if len(running) > 2 * len(devices):
-                some, solution = running.popleft()
-                yield some, solution.result()
-        for some, solution in running:
-            yield some, solution.result()
+def _outcomes(common: Common, moving: PyTree) -> Outcome:
+    """Computes the outcomes of all lanes of a chunk."""
+    abreast = jax.tree.leaves(moving)[0].shape[0] > _ALL_ALIKE
+    member = lambda moving: outcome_of(common, moving, abreast)
+    return jax.vmap(member, axis_name=_AXIS)(moving)
 
 
 def in_chunks(
@@ -306,7 +326,7 @@ def in_chunks(
     order = np.arange(size)
     if size > lanes:
         # The longest come first, so that no core waits long for another at the end.
-        order = np.argsort(_forecast(job))[::-1]
+        order = np.argsort(_forecast(job, devices))[::-1]
     # Rows of the members in the results. In the order in which members come, results
     # are written faster, and then take their own order in more memory.
     place = np.argsort(order) if on_device else np.arange(size)
@@ -314,7 +334,7 @@ def in_chunks(
     progress, advance = meter.init(), meter.step  # looked up at each use it is slow
     while len(waiting):
         late = []
-        for members, outcome in _outcomes(job, devices, waiting, lanes):
+        for members, outcome in _in_lanes(_outcomes, job, devices, waiting, lanes):
             late.append(members[np.asarray(outcome.stopped)[: len(members)]])
             done += len(members) - len(late[-1])
             progress = advance(progress, np.asarray(done / size))
