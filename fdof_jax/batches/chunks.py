@@ -1,6 +1,5 @@
 """Solves a batch in chunks of members that take about equally long."""
 
-import contextlib
 import functools
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -23,6 +22,7 @@ from jax.sharding import SingleDeviceSharding
 from jaxtyping import PyTree
 
 from ..base.checks import refusal
+from ..base.known_values import in_numpy
 from ..dynamics import energy, forward_dynamics
 from ..forces.added_inertia import present
 from ..forces.element import elements
@@ -35,7 +35,7 @@ from ..simulation.simulate import simulate
 from ..simulation.solution import Solution
 from ..steps.controllers import Abreast, by_square_roots
 from ..steps.tolerances import default_controller
-from .devices import Device, compiled, copied, of_cores
+from .devices import Device, compiled, copied, in_place, of_cores, solve, thread_of
 
 # With so few lanes a step takes hardly longer than with one, so that slow members do
 # not pay for another program.
@@ -154,7 +154,7 @@ def _form_of(function: Callable, job: Job, lanes: int) -> tuple[Form, list[Array
     # in three quarters (AMD EPYC, jax 0.12).
     ef = job.common.shared[0].ef
     leaves = [tuple(x.tolist()) if x is ef else x for x in leaves]
-    arrays = list(filter(eqx.is_array, leaves))
+    arrays = in_numpy(list(filter(eqx.is_array, leaves)))
     given = tuple(kind(x, x.shape) if eqx.is_array(x) else x for x in leaves)
     return Form(function, structure, kinds, others, given), arrays
 
@@ -187,10 +187,6 @@ def _programs(form: Form, devices: list[Device]) -> list[jax.stages.Compiled]:
     return [program, *map(copy, others)]
 
 
-def _solve(program: jax.stages.Compiled, *arguments: list) -> PyTree:
-    return jax.block_until_ready(program(*arguments))
-
-
 def _in_lanes(
     function: Callable, job: Job, devices: list[Device], members: np.ndarray, lanes: int
 ) -> Iterator[tuple[np.ndarray, PyTree]]:
@@ -205,35 +201,25 @@ def _in_lanes(
         return [leaf[rows] for leaf in leaves]
 
     programs = _programs(form, devices)
-    if len(devices) == 1:
+    if devices == [None]:
         for some in chunks:
-            own = rows_of(some), arrays
-            if devices != [None]:
-                own = jax.device_put(own, *devices)
-            yield some, _solve(programs[0], *own)
+            yield some, solve(programs[0], rows_of(some), arrays)
         return
-    shared: dict[int, list[Array]] = {}
     running: dict[Future, tuple[int, np.ndarray]] = {}
-    # Each device has a thread, as two that call it wait for each other. It solves one
-    # chunk while the next is there already.
+    # A device solves one chunk while its next is there already.
     free = deque(2 * list(range(len(devices))))
-    with contextlib.ExitStack() as stack:
-        pools = [stack.enter_context(ThreadPoolExecutor(1)) for _ in devices]
-        for some in chunks:
-            if not free:
-                for solved in wait(running, return_when=FIRST_COMPLETED).done:
-                    worker, members = running.pop(solved)
-                    free.append(worker)
-                    yield members, solved.result()
-            worker = free.popleft()
-            # Transfers depend on settings that no other thread has.
-            if worker not in shared:
-                shared[worker] = jax.device_put(arrays, devices[worker])
-            own = jax.device_put(rows_of(some), devices[worker])
-            arguments = programs[worker], own, shared[worker]
-            running[pools[worker].submit(_solve, *arguments)] = worker, some
-        for solved in as_completed(running):
-            yield running[solved][1], solved.result()
+    for some in chunks:
+        if not free:
+            for solved in wait(running, return_when=FIRST_COMPLETED).done:
+                number, members = running.pop(solved)
+                free.append(number)
+                yield members, solved.result()
+        number = free.popleft()
+        arguments = in_place((rows_of(some), arrays), devices[number])
+        solved = thread_of(devices[number]).submit(solve, programs[number], *arguments)
+        running[solved] = number, some
+    for solved in as_completed(running):
+        yield running[solved][1], solved.result()
 
 
 # Forecasts

@@ -12,19 +12,23 @@ import os
 import pickle
 import sys
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
 import numpy as np
+from jax import experimental
 from jax._src.lib import xla_client  # pyright: ignore[reportPrivateImportUsage]
 from jax.experimental import serialize_executable
 from jax.sharding import Mesh
+from jaxtyping import PyTree
 
 from ..base.configuration import wide_vectors
 
 Device = Any  # a `jax.Device`, or None for the default one
 
 _NO_MESH = Mesh(np.empty((), object), ())
+_precise = jax.enable_x64 if hasattr(jax, "enable_x64") else experimental.enable_x64
 _THREADS = "NPROC"  # of a client of XLA, which reads it when it starts
 
 
@@ -90,3 +94,28 @@ def copied(program: jax.stages.Compiled, device: Device) -> jax.stages.Compiled 
     return serialize_executable.deserialize_and_load(
         *copy, backend=device.client, execution_devices=[device]
     )
+
+
+@functools.cache
+def thread_of(device: Device) -> ThreadPoolExecutor:
+    """Returns the thread that calls a device's programs.
+
+    Two threads would wait for each other, and a new one for a core.
+    """
+    return ThreadPoolExecutor(1)
+
+
+def in_place(arrays: PyTree, device: Device) -> PyTree:
+    """Returns NumPy's arrays, which a program's call transfers faster, and puts others.
+
+    Transfers apart from the call depend on settings that no other thread has.
+    """
+    put = lambda a: a if isinstance(a, np.ndarray) else jax.device_put(a, device)
+    return jax.tree.map(put, arrays)
+
+
+def solve(program: jax.stages.Compiled, *arguments: PyTree) -> PyTree:
+    """Returns what a program computes, from arrays that its call transfers."""
+    # Another thread may not know of the precision that the program was traced with.
+    with _precise(True), jax.transfer_guard("allow"):
+        return jax.block_until_ready(program(*arguments))
