@@ -1,4 +1,5 @@
 import gc
+import time
 from pathlib import Path
 
 import jax
@@ -54,6 +55,10 @@ LONG_EXAMPLES = {
     "fdof_jax.tuning.tuning.tune_each",
     "fdof_jax.tuning.within_limits.tune_within",
 }
+# A program of so many bytes takes half a second to compile; the quick tests may have so
+# many of them, which take most of their time.
+LARGE, MOST_LARGE = 60_000, 100
+BEGIN = time.time()
 # Scripts that need packages which the tests do not need.
 collect_ignore_glob = ["hard/make_*.py"]
 
@@ -126,10 +131,28 @@ def pytest_configure(config):
         fj.configure(cache=config.cache.mkdir("programs"))
 
 
+def programs(config):
+    """Returns the files of compiled programs that are kept."""
+    if not hasattr(config, "cache"):
+        return []
+    return [*config.cache.mkdir("programs").glob("*/*-cache")]
+
+
+def pytest_sessionfinish(session):
+    """Fails a run of the quick tests that has compiled too many large programs."""
+    config = session.config
+    if hasattr(config, "workerinput") or config.option.markexpr != "not slow":
+        return
+    stats = [path.stat() for path in programs(config)]
+    large = sum(s.st_size > LARGE and s.st_mtime > BEGIN for s in stats)
+    if large > MOST_LARGE:
+        words = f"{large} programs of more than {LARGE} bytes, at most {MOST_LARGE}"
+        config.get_terminal_writer().line(f"\nThe quick tests compiled {words}.")
+        session.exitstatus = pytest.ExitCode.TESTS_FAILED
+
+
 def pytest_report_header(config):
-    kept = hasattr(config, "cache") and any(
-        config.cache.mkdir("programs").glob("*/*-cache")
-    )
+    kept = any(programs(config))
     return f"jax {jax.__version__}, {jax.default_backend()}, float64. " + (
         "Compiled programs of an earlier run are taken from .pytest_cache."
         if kept

@@ -13,6 +13,7 @@ def pictures(folder):
     return sorted(path.name for path in files if path.stat().st_size > 5000)
 
 
+@pytest.mark.slow
 def test_figures(tmp_path, capsys):
     main(["figures", "--output", str(tmp_path)])
     figures = "fig3 fig4 fig5 fig6-angles fig6-energies fig7".split()

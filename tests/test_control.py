@@ -177,6 +177,7 @@ def test_the_effort_is_the_inverse_dynamics_of_what_is_demanded(topology):
         np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_errors_of_an_exact_model_are_linear():
     """d2e/dt2 + kd de/dt + kp e = 0, critically damped, underdamped and overdamped."""
     linkage, ts = small_arm("RPR"), np.linspace(0, 1.5, 4)

@@ -137,6 +137,7 @@ def compiled_solve():
     return jax.jit(jax.vmap(motion)).lower(jnp.zeros((16, 3))).compile().as_text()
 
 
+@pytest.mark.slow
 def test_each_stage_is_one_loop(compiled_solve):
     """Checks that no rate, and no end of a step, is computed more than once.
 

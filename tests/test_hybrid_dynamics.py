@@ -208,6 +208,21 @@ REFUSED = [
 ]
 
 
+class Jerk(fj.references.Reference):
+    """The cart starts at an infinite rate."""
+
+    def __call__(self, t, linkage):
+        along = jnp.array([1.0, 0.0, 0.0])
+        return jnp.sqrt(t) * along, along / (2 * jnp.sqrt(t))
+
+
+@pytest.mark.slow
+def test_a_motion_that_cannot_begin_reaches_no_time():
+    jerk = HOLD.replace(reference=Jerk())
+    motion = fj.simulate(CART, REST, [0, 0.5, 1], (jerk,), throw=False)
+    assert motion.outcome == "not finite" and motion.stats["time_reached"] == 0
+
+
 @pytest.mark.parametrize("message, call", REFUSED)
 def test_malformed_motions_are_refused(message, call):
     with pytest.raises(ValueError, match=f"^{message}"):

@@ -103,6 +103,7 @@ def noisy(clean):
     return clean + 1e-3 * np.random.default_rng(0).normal(size=clean.shape)
 
 
+@pytest.mark.slow
 def test_masses_inertias_offsets_and_damping_are_recovered(seen):
     result = fj.fit(MIXED, FIRST, TS, seen)
     assert result.converged and result.usable and result.rms < 1e-6

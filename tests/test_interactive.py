@@ -103,6 +103,7 @@ def test_nothing_is_compiled_after_the_first_picture(box, monkeypatch):
     assert "link 1: 1.1 m" in box.words.value and "4000 N/m" in box.words.value
 
 
+@pytest.mark.slow
 def test_the_way_of_the_sliders_does_not_matter(box):
     """Checks that axes stored as pixels keep no trace of the previous picture."""
     there = box.move(arm="PRR", link_2=1.3)

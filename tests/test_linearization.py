@@ -273,6 +273,7 @@ def test_modes_are_refused_of_what_is_traced_or_stacked():
         rows = fj.Solution(jnp.zeros(1), q, q, {}, diffrax.RESULTS.successful)
         return fj.analysis.closed_loop_modes(ROD, (), rows).frequency
 
-    for call in jax.jit(of), lambda q: of(q[None]):
-        with pytest.raises(ValueError, match="solution: expected one motion"):
+    stacked = lambda q: of(q[None])
+    for call, words in (jax.jit(of), "known values"), (stacked, "one motion"):
+        with pytest.raises(ValueError, match=f"solution: expected {words}"):
             call(jnp.zeros((1, 3)))

@@ -155,6 +155,7 @@ def test_the_delay_margin_of_a_loop_that_leads():
     np.testing.assert_allclose(lags, (-2 * np.pi / 3, 4 * np.pi / 3), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_closed_loop_is_the_linearised_arm():
     linkage, q = arm("RPR")
     gains = fj.control.gains_from_frequency(linkage, q, 20.0, 0.7)
@@ -278,6 +279,7 @@ def test_the_bandwidth_ends_at_a_narrow_dip():
     assert control.bandwidth(response) > 3 * edge
 
 
+@pytest.mark.slow
 def test_computed_torque_follows_at_all_frequencies():
     """With an error of the model it does not: its inertia is that of its own model."""
     torque = follower(fj.control.ComputedTorque)

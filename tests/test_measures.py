@@ -154,7 +154,7 @@ def test_what_is_refused():
     pid = fj.control.PIDController(1.0, 1.0, 1.0, 1.0, STEP)
     with pytest.raises(ValueError, match="solution.own: expected the states"):
         response(SLIDE, (pid,), motion)
-    with pytest.raises(ValueError, match="solution: expected a computed motion"):
+    with pytest.raises(ValueError, match="solution: expected known values"):
         jax.jit(lambda motion: response(SLIDE, (PD,), motion).step)(motion)
     stopped = fj.simulate(SLIDE, START, TS, forces, max_steps=3, throw=False)
     with pytest.raises(ValueError, match="solution: .* reached its end, got .out of"):

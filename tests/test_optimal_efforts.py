@@ -111,6 +111,7 @@ def test_slides_are_controlled_as_fuller_found():
     assert least < found.tip_error < 1.01 * least
 
 
+@pytest.mark.slow
 def test_joints_without_a_limit_or_fixed_have_no_effort():
     """One step gives no bound, which the scene's own controller, tuned, would beat."""
     task = CONTROLLER.reference

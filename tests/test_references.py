@@ -192,6 +192,7 @@ def test_known_references_are_checked_within_transformations():
 
 
 @pytest.mark.filterwarnings("ignore:prismatic joints 2 and 3")
+@pytest.mark.slow
 def test_margins_of_the_reach_and_their_derivatives():
     line = fj.references.Line([2.5, 0], [3.5, 0])  # the last link points along it
     task, ts = fj.TipTask(line, fj.references.Travel(1.0)), [0.0, 0.5, 1.0]

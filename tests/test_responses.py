@@ -130,6 +130,7 @@ def test_a_response_that_creeps_or_fails_has_no_rise_time():
     assert np.isnan(step_measures(ts, np.full(1001, np.nan), rate, np.nan)).all()
 
 
+@pytest.mark.slow
 def test_a_report_is_shown(small):
     assert str(small).count("\n") == 4 and "overshoot" in str(small)
     assert f"{STEP:.4g}" in str(small) and "<th>P2</th>" in small._repr_html_()

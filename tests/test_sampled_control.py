@@ -23,6 +23,7 @@ TURN = fj.references.JointMove(BENT.q, [0.5, 0.6], fj.references.Travel(1.0))
 CONTROL = fj.PDController([100.0, 50.0], [20.0, 10.0], np.inf, TURN)
 
 
+@pytest.mark.slow
 def test_sampled_control_converges_at_first_order():
     exact = fj.simulate(RODS, BENT, [0, 0.4], (CONTROL,)).q[-1]
     periods = np.array([4e-3, 2e-3, 1e-3, 5e-4])

@@ -125,6 +125,7 @@ def test_starts_that_fail_are_counted():
     assert np.isfinite(result.loss)
 
 
+@pytest.mark.slow
 def test_gains_of_zero_and_fixed_gains_stay_and_are_not_held():
     scene = with_changes(scenes.two_link_circle(), kd=[10.0, 0.0])._replace(t1=0.5)
     gains = gains_of(scene)

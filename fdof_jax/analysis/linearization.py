@@ -13,7 +13,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Complex, Float
 from numpy.typing import ArrayLike
 
-from ..base.checks import instance, is_traced, real_array, refusal
+from ..base.checks import check_known, instance, real_array, refusal
 from ..control.pd import PDController
 from ..dynamics import bias_force, forward_dynamics
 from ..forces.element import Element, Forces, elements_on, of_full_size
@@ -343,11 +343,10 @@ def closed_loop_modes(linkage: Linkage, forces: Forces, solution: Solution) -> M
     """
     forces = checked(linkage, forces)
     instance("solution", solution, Solution)
-    if is_traced(linkage, forces, solution) or solution.q.ndim != 2:
-        raise ValueError(
-            "solution: expected one motion, outside of JAX's transformations, got "
-            f"positions {solution.q}."
-        )
+    check_known("solution", linkage, forces, solution)
+    if solution.q.ndim != 2:
+        expected = "one motion (of a batch, pass one member)"
+        raise refusal("solution", expected, solution)
     check_joints("solution", solution, linkage)
     # Without its statistics: solvers differ in them, and need no program each.
     rows = solution.q, solution.qd, solution.ts

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..base.checks import instance, is_traced, one_of, real_array, refusal
+from ..base.checks import check_known, instance, one_of, real_array, refusal
 from ..forces.element import Forces, elements_on, of_full_size
 from ..linkage.linkage import (
     Linkage,
@@ -119,8 +119,7 @@ def _loops(
     if prescribed((element,)) is not None:
         raise refusal("controller", "one that computes efforts", controller)
     q, t = per_joint("q", q, linkage), real_array("t", t, ())
-    if is_traced(linkage, element, forces, q, t):
-        raise ValueError("q: expected known values, outside of JAX's transformations.")
+    check_known("q", linkage, element, forces, q, t)
     matrices = loop_matrices(linkage, element, forces, q, t)
     A, B, C, F = (np.asarray(matrix, float) for matrix in matrices)
     # Left out are states of fixed pairs, and those of the controller that act on no

@@ -11,7 +11,7 @@ from jax import Array
 from jaxtyping import Float, PyTree
 from numpy.typing import ArrayLike
 
-from ..base.checks import is_traced, real_array, refusal
+from ..base.checks import check_known, real_array, refusal
 from ..base.report import Report
 from ..control.drives import Drive, controller_in
 from ..control.pd import PDController
@@ -137,8 +137,7 @@ def response(
     0.987
     """
     check_linkage(linkage)
-    if is_traced(linkage, forces, solution, since):
-        raise ValueError("solution: expected a computed motion, got a traced one.")
+    check_known("solution", linkage, forces, solution, since)
     check_joints("solution", solution, linkage)
     if np.ndim(solution.q) != 2:
         expected = "one motion (of a batch, pass one member)"

@@ -12,7 +12,7 @@ from jax import Array
 from jaxtyping import Complex, Float
 from numpy.typing import ArrayLike
 
-from ..base.checks import is_traced, real_array, refusal
+from ..base.checks import check_known, real_array, refusal
 from ..base.report import Report
 from ..control.drives import commanding
 from ..control.pd import PDController
@@ -166,8 +166,7 @@ def step_and_sine(
     if not isinstance(pd := commanding(controller), PDController):
         expected = "a PDController, or a drive that holds one"
         raise refusal("controller", expected, controller)
-    if is_traced(linkage, controller, forces, q, step, duration):
-        raise ValueError("q: expected known values, outside of JAX's transformations.")
+    check_known("q", linkage, controller, forces, q, step, duration)
     (element,) = of_full_size(linkage, elements_on(linkage, (controller,)))
     names, moving = joint_names(linkage), moving_joints(linkage)
     heights, t0, still = np.asarray(step), float(duration), np.zeros(n)

@@ -56,6 +56,14 @@ def known(*trees: PyTree) -> bool:
     return numbers and not is_traced(*trees)
 
 
+def check_known(name: str, *trees: PyTree) -> None:
+    """Raises ValueError if a JAX transformation traces any leaf of `trees`."""
+    if is_traced(*trees):
+        raise ValueError(
+            f"{name}: expected known values, outside of JAX's transformations."
+        )
+
+
 def concrete(value: ArrayLike) -> np.ndarray | None:
     """Returns `value` as a NumPy array, or None while it is traced."""
     return None if is_traced(value) else np.asarray(value)

@@ -37,8 +37,8 @@ from ..steps.controllers import Abreast, by_square_roots
 from ..steps.tolerances import default_controller
 from .devices import Device, compiled, copied, in_place, of_cores, solve, thread_of
 
-# With so few lanes a step takes hardly longer than with one, so that slow members do
-# not pay for another program.
+# With at most so many lanes a step takes hardly longer than with one, so that it would
+# not pay to stop slow members and solve them in another program.
 _ALL_ALIKE = 32
 _AXIS = "lane"
 _SMALL = 8  # lanes of the chunks for a few slow members
@@ -92,14 +92,14 @@ def outcome_of(common: Common, moving: PyTree, abreast: bool = False) -> Outcome
     linkage, state0, forces = eqx.combine(moving, common.shared)
     settings = common.settings
     controller = settings["stepsize_controller"] or default_controller()
-    # Members with steps of given lengths take equally many.
+    # With fixed steps all members take equally many.
     adaptive = isinstance(controller, diffrax.AbstractAdaptiveStepSizeController)
     if abreast and adaptive:
         # Other solvers, and estimates of a first step, need the error itself.
         if settings["solver"] is None and settings["dt0"] is not None:
             controller = by_square_roots(controller)
-        limited = Abreast(controller, _AXIS)  # pyright: ignore[reportCallIssue]
-        settings = settings | {"stepsize_controller": limited}
+        together = Abreast(controller, _AXIS)  # pyright: ignore[reportCallIssue]
+        settings = settings | {"stepsize_controller": together}
     solution = simulate(linkage, state0, common.ts, forces, throw=False, **settings)
     scene = Scene(linkage, state0, forces, common.ts[-1])
     value = common.reduce(scene, solution)
@@ -115,9 +115,9 @@ def outcome_of(common: Common, moving: PyTree, abreast: bool = False) -> Outcome
 
 
 class Form(NamedTuple):
-    """The key of a program: a function, structures, kinds of the arrays, constants."""
+    """The key of a program: its function, structures, kinds of arrays, constants."""
 
-    function: Callable[[Common, PyTree], PyTree]  # of what all members share, and they
+    function: Callable[..., PyTree]  # of a `Common` and the members
     moving: Any  # structure of what differs between members
     lanes: tuple[jax.ShapeDtypeStruct, ...]  # its arrays
     common: Any  # structure
@@ -177,7 +177,7 @@ def _lowered(form: Form, device: Device) -> jax.stages.Lowered:
 def _programs(form: Form, devices: list[Device]) -> list[jax.stages.Compiled]:
     """Returns the program of this form for each of the devices."""
     if len(devices) > 1 and devices[0].client is devices[1].client:
-        # Traces depend on settings that no other thread has.
+        # Tracing depends on settings of this thread.
         programs = [_lowered(form, device) for device in devices]
         with ThreadPoolExecutor(len(devices)) as pool:
             return list(pool.map(compiled, programs))
@@ -206,7 +206,7 @@ def _in_lanes(
             yield some, solve(programs[0], rows_of(some), arrays)
         return
     running: dict[Future, tuple[int, np.ndarray]] = {}
-    # A device solves one chunk while its next is there already.
+    # Each device has up to two chunks: one that it solves, and the next.
     free = deque(2 * list(range(len(devices))))
     for some in chunks:
         if not free:
@@ -228,9 +228,9 @@ def _in_lanes(
 def expected_work(ts: Array, moving: PyTree, shared: PyTree) -> Array:
     """Computes for each member a number that grows with its steps.
 
-    It combines the joints' rates and accelerations, in the mean over the beginning of
-    the motion, which rough steps find [1/s]. Where elements hold joints it is the
-    energy [J], because most steps then end at events, and each takes a part of it.
+    It combines the joints' rates and accelerations, averaged over the beginning of the
+    motion, which rough steps approximate [1/s]. Where elements hold joints it is the
+    energy [J], because most steps then end at events, each of which takes some of it.
     """
 
     def member(moving):
@@ -252,7 +252,7 @@ def expected_work(ts: Array, moving: PyTree, shared: PyTree) -> Array:
         def advance(_, now):
             t, q, qd, total, last = now
             qdd, rate = at(t, q, qd)
-            # A motion that these steps lose stays where it was.
+            # If the rough steps diverge, the state stays at its last finite value.
             finite = jnp.isfinite(rate)
             h = jnp.where(finite, step, 0)
             last = jnp.where(finite, rate, last)
@@ -286,7 +286,7 @@ def _forecast(job: Job, devices: list[Device]) -> np.ndarray:
 
 
 def _lanes(members: int, chunk: int) -> int:
-    """Returns the number of lanes for some members: few numbers serve all batches."""
+    """Returns the number of lanes for some members, one of a few for all batches."""
     if members == 1:
         return 1
     return min(chunk, max(_SMALL, 1 << (members - 1).bit_length()))
@@ -313,16 +313,16 @@ def in_chunks(
     if size > lanes:
         # The longest come first, so that no core waits long for another at the end.
         order = np.argsort(_forecast(job, devices))[::-1]
-    # Rows of the members in the results. In the order in which members come, results
-    # are written faster, and then take their own order in more memory.
+    # The row of each member in the results. In the order of the forecasts they are
+    # written faster; their own order, restored at the end, takes more memory.
     place = np.argsort(order) if on_device else np.arange(size)
-    done, results, structure, waiting = 0, [], None, order
+    done, results, structure, remaining = 0, [], None, order
     progress, advance = meter.init(), meter.step  # looked up at each use it is slow
-    while len(waiting):
-        late = []
-        for members, outcome in _in_lanes(_outcomes, job, devices, waiting, lanes):
-            late.append(members[np.asarray(outcome.stopped)[: len(members)]])
-            done += len(members) - len(late[-1])
+    while len(remaining):
+        postponed = []
+        for members, outcome in _in_lanes(_outcomes, job, devices, remaining, lanes):
+            postponed.append(members[np.asarray(outcome.stopped)[: len(members)]])
+            done += len(members) - len(postponed[-1])
             progress = advance(progress, np.asarray(done / size))
             values, structure = jax.tree.flatten(outcome)
             if not results:
@@ -338,9 +338,9 @@ def in_chunks(
                 rows = slice(rows[0], rows[-1] + 1)
             for result, value in zip(results, values):
                 result[rows] = np.asarray(value)[: len(members)]
-        waiting = np.concatenate(late)
-        if 0 < len(waiting) <= lanes // _SMALL:
-            lanes = _lanes(min(len(waiting), _SMALL), job.chunk)
+        remaining = np.concatenate(postponed)
+        if 0 < len(remaining) <= lanes // _SMALL:
+            lanes = _lanes(min(len(remaining), _SMALL), job.chunk)
     meter.close(progress)
     if on_device:
         for index, leaf in enumerate(results):

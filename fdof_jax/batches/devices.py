@@ -1,7 +1,7 @@
 """The devices that solve the chunks of a batch, and their programs.
 
 XLA on CPU splits each operation of a program among threads for all cores. For a chunk
-this gains nothing, because they wait for each other and for whatever else runs
+this gains nothing, because the threads wait for each other and for whatever else runs
 (`python -m benchmarks --only cores`). So each core has a client of XLA of its own here,
 with a single thread.
 """
@@ -17,18 +17,21 @@ from typing import Any
 
 import jax
 import numpy as np
-from jax import experimental
 from jax._src.lib import xla_client  # pyright: ignore[reportPrivateImportUsage]
 from jax.experimental import serialize_executable
 from jax.sharding import Mesh
 from jaxtyping import PyTree
+
+try:
+    from jax import enable_x64
+except ImportError:  # as in JAX 0.6
+    from jax.experimental import enable_x64  # pyright: ignore
 
 from ..base.configuration import wide_vectors
 
 Device = Any  # a `jax.Device`, or None for the default one
 
 _NO_MESH = Mesh(np.empty((), object), ())
-_precise = jax.enable_x64 if hasattr(jax, "enable_x64") else experimental.enable_x64
 _THREADS = "NPROC"  # of a client of XLA, which reads it when it starts
 
 
@@ -61,10 +64,10 @@ def of_cores(devices: list[Device]) -> list[Device]:
 
 @contextlib.contextmanager
 def devices_outside_mesh() -> Iterator[list[Device]]:
-    """Yields this process's devices, of the mesh that is set or all; None if just one.
+    """Yields the devices of the mesh that is set, else all of this process.
 
-    Meanwhile no mesh is set: its devices would share each program. Before 0.8.1 JAX
-    does not say which is set.
+    They are [None], the default device, if there is only one. Meanwhile no mesh is set:
+    its devices would share each program. Before 0.8.1 JAX does not say which is set.
     """
     set_mesh = jax.__version_info__ >= (0, 8, 1)
     mesh = jax.sharding.get_mesh() if set_mesh else _NO_MESH
@@ -82,8 +85,8 @@ def compiled(program: jax.stages.Lowered) -> jax.stages.Compiled:
 def copied(program: jax.stages.Compiled, device: Device) -> jax.stages.Compiled | None:
     """Returns a program for another CPU device, uncompiled; None if that cannot be.
 
-    Programs that JAX took from a folder lack parts in copies, and the folder has them
-    for the other device, too. Those that call Python cannot be copied.
+    Copies of programs that JAX took from a folder lack parts; but then the folder has
+    one for the other device, too. Programs that call Python cannot be copied.
     """
     if jax.config.jax_compilation_cache_dir:  # pyright: ignore[reportAttributeAccessIssue]
         return None
@@ -100,15 +103,15 @@ def copied(program: jax.stages.Compiled, device: Device) -> jax.stages.Compiled 
 def thread_of(device: Device) -> ThreadPoolExecutor:
     """Returns the thread that calls a device's programs.
 
-    Two threads would wait for each other, and a new one for a core.
+    Calls from two threads would wait for each other, and a new thread for a core.
     """
     return ThreadPoolExecutor(1)
 
 
 def in_place(arrays: PyTree, device: Device) -> PyTree:
-    """Returns NumPy's arrays, which a program's call transfers faster, and puts others.
+    """Puts arrays on a device, except NumPy's, which a program's call transfers faster.
 
-    Transfers apart from the call depend on settings that no other thread has.
+    Other transfers depend on settings of this thread.
     """
     put = lambda a: a if isinstance(a, np.ndarray) else jax.device_put(a, device)
     return jax.tree.map(put, arrays)
@@ -117,5 +120,5 @@ def in_place(arrays: PyTree, device: Device) -> PyTree:
 def solve(program: jax.stages.Compiled, *arguments: PyTree) -> PyTree:
     """Returns what a program computes, from arrays that its call transfers."""
     # Another thread may not know of the precision that the program was traced with.
-    with _precise(True), jax.transfer_guard("allow"):
+    with enable_x64(True), jax.transfer_guard("allow"):
         return jax.block_until_ready(program(*arguments))

@@ -27,8 +27,14 @@ from ..base.checks import optional_package, refusal
 from ..base.user_warnings import warn
 from ..base.whole_files import whole_file
 from ..linkage.linkage import Linkage
-from ..linkage.topology import common_unit, names_and_units, rate_unit
-from ..simulation.solution import MODES, OUTCOMES, Solution, flags, outcome_numbers
+from ..linkage.topology import common_unit, names_and_units
+from ..simulation.solution import (
+    OUTCOMES,
+    Solution,
+    attributes_in,
+    flags,
+    outcome_numbers,
+)
 from .batch_axes import Batch
 from .chunks import Common, Job, Outcome, in_chunks, outcome_of
 
@@ -78,15 +84,7 @@ def _named(value: PyTree) -> dict[str, PyTree]:
 def _variables(like: PyTree, linkage: Linkage) -> list[Variable]:
     """Returns the variables of a store from the shapes of a member's value."""
     of_motion = isinstance(like, Solution)
-    unit = common_unit(names_and_units(linkage.ef)[1])
-    labels = {
-        "q": {"long_name": "joint position", "units": unit},
-        "qd": {"long_name": "joint velocity", "units": rate_unit(unit)},
-        "modes": {"long_name": "what holds the joint"} | flags(MODES),
-        "taken": {"long_name": "energy taken by what holds joints", "units": "J"},
-        "num_steps": {"long_name": "number of steps", "units": "1"},
-        "time_reached": {"long_name": "time reached", "units": "s"},
-    }
+    labels = attributes_in(common_unit(names_and_units(linkage.ef)[1]))
     variables = []
     for name, leaf in _named(like).items():
         result = _is_result(leaf)

@@ -10,7 +10,7 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
-from ..base.checks import is_traced
+from ..base.checks import check_known
 from ..control.actuators import Actuators
 from ..control.pd import PDController
 from ..forces.actuators import Armature
@@ -71,8 +71,7 @@ def to_mjcf(linkage: Linkage, forces: Forces = (), state0: State | None = None) 
     (2, 1, 3)
     """
     check_linkage(linkage)
-    if is_traced(linkage, forces):
-        raise ValueError("linkage: expected concrete values, got traced ones.")
+    check_known("linkage", linkage, forces)
     length, com, locked = map(np.asarray, (linkage.length, linkage.com, linkage.locked))
     mass = np.maximum(linkage.mass, _SMALLEST)
     inertia = np.maximum(linkage.inertia, _SMALLEST)

@@ -5,11 +5,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..base.checks import instance, known, optional_package
+from ..base.checks import check_known, instance, optional_package
 from ..linkage.linkage import Linkage
 from ..linkage.topology import common_unit, names_and_units, rate_unit
 from ..simulation.sampled import Motion, check_joints
-from ..simulation.solution import MODES, Solution, flags
+from ..simulation.solution import MODES, Solution, attributes_in
 
 if TYPE_CHECKING:
     import pandas
@@ -20,8 +20,7 @@ def _checked(linkage: Linkage, solution: Motion) -> tuple[np.ndarray, list[str]]
     """The common times of all motions, and names of the batch axes."""
     instance("linkage", linkage, Linkage)
     check_joints("solution", solution, linkage)
-    if not known(solution, linkage):
-        raise ValueError("solution, linkage: expected numbers, got traced values.")
+    check_known("solution", solution, linkage)
     ts = np.asarray(solution.ts).reshape((-1, solution.q.shape[-2]))
     if (ts != ts[0]).any():
         raise ValueError(
@@ -57,26 +56,25 @@ def to_xarray(linkage: Linkage, solution: Motion) -> "xarray.Dataset":
     xarray = optional_package("xarray", "data")
     times, batch = _checked(linkage, solution)
     names, units = names_and_units(linkage.ef)
-    common = common_unit(units)
+    attributes = attributes_in(common_unit(units))
 
     def variable(dims: list[str], values: ArrayLike, label: str, unit: str) -> tuple:
         return dims, np.asarray(values), {"long_name": label, "units": unit}
 
     rows = [*batch, "time", "joint"]
-    variables = {
-        "q": variable(rows, solution.q, "joint position", common),
-        "qd": variable(rows, solution.qd, "joint velocity", rate_unit(common)),
-        "outcome": variable(batch, solution.outcome, "how the trajectory ended", ""),
-    }
+    arrays = {"q": (rows, solution.q), "qd": (rows, solution.qd)}
     if isinstance(solution, Solution):
-        for name, unit in (("num_steps", "1"), ("time_reached", "s")):
-            values, label = solution.stats[name], name.replace("_", " ")
-            variables[name] = variable(batch, values, label, unit)
+        for name in ("num_steps", "time_reached"):
+            arrays[name] = batch, solution.stats[name]
         if solution.modes is not None and solution.taken is not None:
-            held = {"long_name": "what holds the joint"} | flags(MODES)
-            variables["modes"] = rows, np.asarray(solution.modes), held
-            label = "energy taken by what holds joints"
-            variables["taken"] = variable(rows[:-1], solution.taken, label, "J")
+            arrays["modes"] = rows, solution.modes
+            arrays["taken"] = rows[:-1], solution.taken
+    variables = {
+        name: (dims, np.asarray(values), attributes[name])
+        for name, (dims, values) in arrays.items()
+    }
+    ended = "how the trajectory ended"
+    variables["outcome"] = variable(batch, solution.outcome, ended, "")
     coordinates = {
         "time": variable(["time"], times, "time", "s"),
         "joint": variable(["joint"], names, "joint", ""),

@@ -163,9 +163,7 @@ class LinearActuator(Between, InertialElement):
 
         The moments about the first pin determine each pin's sideways share.
         """
-        coordinates = lambda q: self.coordinates(q, linkage)
-        along = lambda q, qd: jax.jvp(coordinates, (q,), (qd,))[1]
-        _, (x1, y1, x2, y2, turning) = jax.jvp(along, (q, qd), (qd, qdd))
+        x1, y1, x2, y2, turning = self.accelerations(q, qd, qdd, linkage)
         weight = 1j * linkage.gravity
         cylinder = self.mass[0] * (jax.lax.complex(x1, y1) + weight)
         piston = self.mass[1] * (jax.lax.complex(x2, y2) + weight)

@@ -227,6 +227,12 @@ class InertialElement(Element):
     def weights(self, linkage: Linkage) -> Array:
         """Returns the masses and inertias of the coordinates, (n,)."""
 
+    def accelerations(self, q: Array, qd: Array, qdd: Array, linkage: Linkage) -> Array:
+        """Computes the second time derivatives of the coordinates, (n,)."""
+        coordinates = lambda q: self.coordinates(q, linkage)
+        along = lambda q, qd: jax.jvp(coordinates, (q,), (qd,))[1]
+        return jax.jvp(along, (q, qd), (qd, qdd))[1]
+
     def potential_energy(self, q: Array, linkage: Linkage) -> Array:
         """Computes the potential energy, () [J]; 0 unless overridden."""
         return jnp.zeros(())

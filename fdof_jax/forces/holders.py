@@ -186,8 +186,7 @@ class Brake(Holder):
         yield from ordered(self, "begin", "end")
 
     def conditions_on(self, linkage):
-        count, last = joints_of(linkage), (self.joints * np.array(_NUMBERS)).max()
-        yield Condition(last <= count, "joints", f"1 to {count}", last)
+        yield among_joints(self.joints, linkage)
 
     @property
     def jump_ts(self) -> Array:
@@ -215,6 +214,12 @@ def numbered(joints: Any) -> Array:
         expected = f"a number of 1 to {_NUMBERS[-1]}, or several such"
         raise refusal("joints", expected, joints)
     return jax.device_put(np.isin(_NUMBERS, numbers))
+
+
+def among_joints(joints: Array, linkage: Linkage) -> Condition:
+    """Returns the condition that an arm has the joints that are marked."""
+    count, last = joints_of(linkage), (joints * np.array(_NUMBERS)).max()
+    return Condition(last <= count, "joints", f"1 to {count}", last)
 
 
 def numbers_in(joints: Array) -> np.ndarray:

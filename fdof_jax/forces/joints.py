@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ..base.checks import JOINT
-from ..linkage.fields import Condition, Values, each, field, ordered
+from ..linkage.fields import Values, each, field, ordered, table_over_times
 from ..linkage.linkage import Linkage
 from .element import ScalarElement
 from .switches import switch
@@ -110,10 +110,7 @@ class EffortHistory(ScalarElement):
     tau: Values = field((None, JOINT), unit="N or N m")
 
     def conditions(self):
-        times, rows = len(self.ts), len(self.tau)
-        rising = (self.ts[1:] > self.ts[:-1]).all() & (times > 0)
-        yield Condition(rising, "ts", "increasing times", (self.ts,))
-        yield Condition(times == rows, "tau", f"{times} rows, one per time", (rows,))
+        yield from table_over_times(self, "tau", 1)
 
     @property
     def jump_ts(self) -> Array:

@@ -99,8 +99,6 @@ class Payload(InertialElement):
 
     def loads(self, t, q, qd, qdd, linkage):
         """Returns its weight and inertia as a load on its place."""
-        coordinates = lambda q: self.coordinates(q, linkage)
-        along = lambda q, qd: jax.jvp(coordinates, (q,), (qd,))[1]
-        _, (x, y, turning) = jax.jvp(along, (q, qd), (qd, qdd))
+        x, y, turning = self.accelerations(q, qd, qdd, linkage)
         force = -self.mass * (jax.lax.complex(x, y) + 1j * linkage.gravity)
         return (Load(self.place, force, -self.inertia * turning),)

@@ -24,8 +24,8 @@ from .result import FitResult, fit_result
 
 Recordings = tuple[SceneAt | Sequence[SceneAt], ArrayLike]  # of scenes
 
-# A search stops when the loss falls by less than this part. One standard error of a
-# parameter changes the loss by about one part in the number of readings, far more.
+# A search stops when the loss falls by less than this part. A change of a parameter by
+# one standard error changes it by one part in the number of readings, which is more.
 _ENOUGH = 1e-8
 # Parts of the recording that are fitted in turn, each starting from the previous
 # result. Over a short time a motion is nearly linear in its parameters; a search over
@@ -164,8 +164,8 @@ def fit(
     **Arguments:**
 
     - `scene_at`: returns the scene for a dict of named parameters (numbers or arrays);
-      the scene's `t1` is ignored. A list of several, Equinox modules that differ in
-      numbers, is fitted together, with one recording each.
+      the scene's `t1` is ignored. Several scenes: a list of Equinox modules that differ
+      only in numbers, fitted together, with a recording each.
     - `start`: first guess of each parameter, in its own SI unit.
     - `ts`: increasing times (time,) [s]. The motion starts at `ts[0]`, in the scene's
       state. For a recording that begins later, keep the time of the start, with NaN
@@ -176,12 +176,12 @@ def fit(
       default `link_ends`, markers (time, 3, 2) at the ends of the moving links [m]; use
       `lambda scene, solution: solution.q` for joint encoders.
     - `noise`: standard deviation of a reading [its unit], one number or an array that
-      broadcasts to a recording. If None, all readings have the same weight, and the
-      noise is estimated from the residuals: for standard errors from all of them, for
-      the verdict from changes between successive ones, as errors of a model change
-      slowly. Readings that can only be right, as of a fixed pair, do not count.
-    - `validate`: (scene_at, observed) of recordings, at the same times, that are kept
-      from the fit, one or a list of them; the result compares their residuals with the
+      broadcasts to a recording. If None, all readings weigh the same, and the noise is
+      estimated: for standard errors from all residuals; for the verdict from changes
+      between successive ones, because errors of a model change slowly. Readings that
+      cannot be wrong, as of a fixed pair, are left out.
+    - `validate`: (scene_at, observed) of recordings that the fit does not see, at the
+      same times, one or a list of them; the result compares their residuals with the
       noise. Best are motions unlike those that are fitted.
     - `bounds`: (least, greatest) of parameters by name.
     - `scale`: sizes of parameters by name; a step changes a parameter by at most two

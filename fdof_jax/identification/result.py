@@ -14,13 +14,13 @@ from .problems import Named, Problem, Unknowns, named
 _WEAK = 1.0
 # The message doubts the scene if the residuals exceed the noise by this factor.
 _DOUBTED = 1.5
-# Held-out residuals exceed the noise if they are greater by this factor, as few know
-# their noise better, and by this many standard deviations of such a comparison.
+# Held-out residuals exceed the noise if they are larger by this factor, as few know
+# their noise better, and by so many standard deviations of the comparison.
 _KNOWN, _SPREAD = 1.1, 3.0
 # Converged: largest change by a further step, in standard errors or in sizes.
 _REMAINING = 0.03
 _REMAINING_PART = 1e-6
-# Noise of simulated readings, at least, as a part of them.
+# Least noise assumed of simulated readings, as a part of them.
 _ACCURACY = 1e-5
 # Part of an undetermined direction above which a parameter belongs to it.
 _SHARED = 1e-6
@@ -32,8 +32,8 @@ class FitResult(Report):
     The first line printed is a verdict: whether a fault is known.
 
     - `parameters`: values by name, in the unit of each, as in `start`.
-    - `standard_errors`: standard errors by name, as without bounds; infinite for
-      parameters that the motion does not determine.
+    - `standard_errors`: standard errors by name, computed as if there were no bounds;
+      infinite for parameters that the motion does not determine.
     - `names`: name of each number in order, for instance `damping` or `mass[0]`.
     - `covariance`: covariance of the numbers in that order (n, n): the variance of the
       noise times the inverse of the Gauss-Newton matrix. Infinite between parameters of
@@ -56,9 +56,9 @@ class FitResult(Report):
       but the estimate by changes between successive residuals.
     - `faults`: reasons not to use the parameters, in words: a search that has not
       converged, combinations that are `weak`, residuals well above the noise, and
-      held-out residuals above it (a tenth and three standard deviations are allowed;
-      the errors of the parameters add to them, by a factor that is named).
-      The noise is the same as for `held_out`.
+      held-out residuals above it. The noise is that of `held_out`. Held-out residuals
+      may exceed it by a tenth and three standard deviations; errors of the parameters
+      add to them, by a factor that is named.
     """
 
     parameters: Named
@@ -107,7 +107,7 @@ class FitResult(Report):
 
 
 def _digits(value: float, error: float) -> int:
-    """Returns how many digits to print; the standard error leaves the last two open."""
+    """Returns how many digits to print: two more than the standard error makes sure."""
     if not (value and 0 < error < np.inf):
         return 5
     return int(np.clip(np.ceil(np.log10(abs(value) / error)) + 2, 3, 10))
@@ -209,12 +209,12 @@ def fit_result(
     variance = 1.0 if noise_given else noise**2
     inverse, undetermined = inverse_and_null_space(normal)
     inverse *= variance
-    # Infinite along undetermined directions. As infinities of both signs must not be
-    # added up, one projection decides the sign.
+    # Entries along undetermined directions are infinite. Infinities of both signs would
+    # add up to NaN, so one projection onto all these directions sets the sign.
     basis, _ = np.linalg.qr(undetermined)
-    shared = basis @ basis.T
-    unlimited = np.copysign(np.inf, shared)
-    covariance = np.where(np.abs(shared) > _SHARED, unlimited, inverse)
+    projection = basis @ basis.T
+    infinities = np.copysign(np.inf, projection)
+    covariance = np.where(np.abs(projection) > _SHARED, infinities, inverse)
     covariance *= np.outer(sizes, sizes)
     free = ~held_at_bounds(values, slope, low, high)
     step = np.zeros_like(slope)

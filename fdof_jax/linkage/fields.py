@@ -310,6 +310,15 @@ def ordered(part: Part, first: str, second: str) -> Iterator[Condition]:
         yield Condition((low < high).all(), first, f"less than {second}", (low, high))
 
 
+def table_over_times(part: Part, name: str, least: int) -> Iterator[Condition]:
+    """Yields the conditions that `ts` increases, and a field has a row per time."""
+    ts, rows = vars(part)["ts"], len(vars(part)[name])
+    rising = (ts[1:] > ts[:-1]).all() & (len(ts) >= least)
+    words = "two or more increasing times" if least == 2 else "increasing times"
+    yield Condition(rising, "ts", words, (ts,))
+    yield Condition(len(ts) == rows, name, f"{len(ts)} rows, one per time", (rows,))
+
+
 def jumps_of(*parts: Part) -> Array | None:
     """Returns all times at which the parts jump, or None."""
     found = [part.jump_ts for part in parts]

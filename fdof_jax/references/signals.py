@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ..base.checks import JOINT
-from ..linkage.fields import Condition, Values, field, ordered
+from ..linkage.fields import Condition, Values, field, ordered, table_over_times
 from ..linkage.linkage import Linkage, joints_of
 from .reference import Reference
 
@@ -103,10 +103,7 @@ class Ramp(Reference):
     q: Values = field((None, JOINT), unit="m or rad")
 
     def conditions(self):
-        times, rows = len(self.ts), len(self.q)
-        rising = (self.ts[1:] > self.ts[:-1]).all() & (times > 1)
-        yield Condition(rising, "ts", "two or more increasing times", (self.ts,))
-        yield Condition(times == rows, "q", f"{times} rows, one per time", (rows,))
+        yield from table_over_times(self, "q", 2)
 
     @property
     def jump_ts(self) -> Array:

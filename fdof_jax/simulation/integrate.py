@@ -58,7 +58,7 @@ class Inputs(NamedTuple):
 class _Problem(NamedTuple):
     """The equations to integrate, their start and output times.
 
-    - `valid`: whether the inputs were; otherwise harmless ones replace them.
+    - `valid`: whether the inputs were; others have stand-ins here.
     - `ts`: output times of the solve; `first`: positions and velocities at the first.
     - `term`, `start`, `args`: the equations, the integrated state there, and constants.
     - `joints(t, y)`: reads positions, velocities and the elements' own states.
@@ -74,7 +74,7 @@ class _Problem(NamedTuple):
 
 
 class _Control(NamedTuple):
-    """The start, which may include switches, the solver and the step control."""
+    """The solver, the step control, and the start, with the state of any switches."""
 
     start: Integrated
     solver: diffrax.AbstractSolver
@@ -91,8 +91,8 @@ def integrate(
 ) -> Solution:
     """Integrates one motion, by default with `LoopedDopri8`.
 
-    `derivatives`: whether steps are as short as accurate derivatives need.
-    `padded`: for a plain call; the last time may be repeated.
+    `derivatives`: whether steps are kept short enough for accurate derivatives.
+    `padded`: whether this is a plain call, whose last time may be repeated.
     `tangents`: whether the caller maps over tangents, along the axis `TANGENTS`.
     """
     problem = _prepare(inputs, derivatives, padded)
@@ -105,11 +105,11 @@ def _prepare(inputs: Inputs, derivatives: bool, padded: bool) -> _Problem:
     linkage, state0, ts, own0, forces = inputs
     wrong_times, wrong_start, *others = faults(inputs, times=not padded)
     valid = ~jnp.stack([wrong_times, wrong_start, *others]).any()
-    # Harmless values replace invalid ones, because derivatives of NaN would spoil those
-    # of arrays that other lanes share.
+    # Stand-ins replace invalid values, because NaN in one lane would spoil derivatives
+    # in arrays that lanes share.
     q0, qd0 = (without_fixed(linkage, jnp.where(wrong_start, 0, a)) for a in state0)
-    harmless = 1e-3 * jnp.arange(len(ts), dtype=ts.dtype)
-    ts = jnp.where(wrong_times, harmless, ts)
+    stand_in = 1e-3 * jnp.arange(len(ts), dtype=ts.dtype)
+    ts = jnp.where(wrong_times, stand_in, ts)
     args = args_of(linkage, q0, forces)
     if derivatives:
         args = clocks_apart(args, ts)
@@ -140,7 +140,7 @@ def _control(
     term, start, args, ts = problem.term, problem.start, problem.args, problem.ts
     if not isinstance(steps, diffrax.AbstractAdaptiveStepSizeController):
         why = None
-        # Fixed steps may pass over the kinks of a history, but over no jump.
+        # Fixed steps may step over the kinks of an `EffortHistory`, but not over jumps.
         if known_times(args, without=EffortHistory) is not None:
             why = "declare times at which they jump (jump_ts)"
         elif changes(args.forces):
@@ -158,8 +158,8 @@ def _control(
     of_derivatives = None
     if tangents:
         of_derivatives = OfTangents()
-    # With tolerances of one's own, an implicit solver is for modes too fast to resolve,
-    # which a probe would resolve.
+    # Whoever sets tolerances for an implicit solver wants modes that are too fast left
+    # unresolved; a probe would make the steps resolve them.
     elif derivatives and not (implicit and own_controller is not None):
         has_tableau = isinstance(solver, ScheduledDopri8 | diffrax.AbstractRungeKutta)
         tableau: Any = solver.tableau if has_tableau else diffrax.Heun.tableau
@@ -177,8 +177,8 @@ def _solve(problem: _Problem, control: _Control, keywords) -> diffrax.Solution:
     def row(t, y, args):
         """Returns the state, and the modes if joints are held."""
         last = y[-1].modes if isinstance(y[-1], Switching) else y[-1]
-        held = isinstance(last, Modes)
-        return (*y[:size], last._replace(events=None)) if held else y[:size]
+        has_modes = isinstance(last, Modes)
+        return (*y[:size], last._replace(events=None)) if has_modes else y[:size]
 
     outputs = (
         diffrax.SubSaveAt(ts=ts, fn=row),
@@ -216,16 +216,16 @@ def _read(inputs: Inputs, problem: _Problem, solve: diffrax.Solution) -> Solutio
         return jnp.where(jnp.isinf(a) | ~valid, jnp.nan, a)
 
     # diffrax saves the start only with the first step.
-    given = (without_fixed(linkage, value) for value in state0)
-    first = (jnp.where(valid, a, b) for a, b in zip(problem.first, given))
+    start = (without_fixed(linkage, value) for value in state0)
+    first = (jnp.where(valid, a, b) for a, b in zip(problem.first, start))
     if modes:  # after blows at the start
-        there = jnp.isfinite(qd[0]) & valid
-        first = (jnp.where(there, a[0], b) for a, b in zip((q, qd), first))
+        after_blow = jnp.isfinite(qd[0]) & valid
+        first = (jnp.where(after_blow, a[0], b) for a, b in zip((q, qd), first))
     q, qd = (shown_at(rows).at[0].set(row) for rows, row in zip((q, qd), first))
     # Constant steps go on when the state is no longer finite.
     reached = jnp.minimum(reached[0], ts[-1])
     not_finite = (ts <= reached) & ~jnp.isfinite(q + qd).all(axis=1)
-    last_finite = ts[jnp.argmax(not_finite) - 1]
+    last_finite = ts[jnp.maximum(jnp.argmax(not_finite) - 1, 0)]
     reached = jnp.where(not_finite.any(), last_finite, reached)
     stats = solve.stats | {"time_reached": jnp.where(valid, reached, times[0])}
     if solve.controller_state is not None:
@@ -235,10 +235,10 @@ def _read(inputs: Inputs, problem: _Problem, solve: diffrax.Solution) -> Solutio
     result = _result(valid, solve.result, q, qd)
     holding: Any = ()  # modes, energy taken, events
     if modes:
-        (last,), (held,) = switches, modes
-        events = jax.tree.map(lambda rows: rows[0], last.modes.events)
-        taken = taken_at(problem.args, ts, held, q)
-        holding = shown_at(held.mode), shown_at(taken), in_order(events, valid)
+        (last,), (rows,) = switches, modes
+        events = jax.tree.map(lambda saved: saved[0], last.modes.events)
+        taken = taken_at(problem.args, ts, rows, q)
+        holding = shown_at(rows.mode), shown_at(taken), in_order(events, valid)
     own = jax.tree.map(shown_at, own)
     return Solution(times, q, qd, stats, result, own, *holding)
 
@@ -274,8 +274,8 @@ def _differentiable(
 def faults(inputs: Inputs, times: bool = True) -> list[Array]:
     """Returns whether times, start, linkage and each element are at fault.
 
-    `times`: whether those are looked at; an array made for a plain call may repeat the
-    last one.
+    `times`: whether those are looked at, too; those of a plain call may repeat the last
+    one.
     """
     linkage, state0, ts, _, forces = inputs
     growth = jnp.diff(ts)

@@ -9,7 +9,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
@@ -17,16 +16,14 @@ from numpy.typing import ArrayLike
 from ..base.checks import place_of, refusal
 from ..dynamics import mass_and_bias
 from ..forces.element import Element, Forces, naming
-from ..forces.holders import numbered, numbers_in
-from ..linkage.fields import Condition, Truth, called
+from ..forces.holders import among_joints, numbered, numbers_in
+from ..linkage.fields import Truth, called
 from ..linkage.linkage import Linkage, joints_of, without_fixed
-from ..linkage.topology import MOST_PAIRS, fixed_pairs
+from ..linkage.topology import fixed_pairs
 from ..mechanics.equations import Scalars, equations, zeros
 from ..references.reference import EXPECTED, reference_motion
 from ..steps.dopri8 import Health, Integrated
 from .field import Args, applied, health_at, health_with, switching, whole
-
-_NUMBERS = tuple(range(1, MOST_PAIRS + 1))
 
 
 class PrescribedMotion(Element):
@@ -71,8 +68,7 @@ class PrescribedMotion(Element):
         return reference_motion(self.reference, t, linkage)
 
     def conditions_on(self, linkage):
-        count, last = joints_of(linkage), (self.moved * np.array(_NUMBERS)).max()
-        yield Condition(last <= count, "joints", f"1 to {count}", last)
+        yield among_joints(self.moved, linkage)
 
     def __call__(self, t: Array, q: Array, qd: Array, linkage: Linkage) -> Array:
         return jnp.zeros_like(q)  # the real efforts depend on all other elements

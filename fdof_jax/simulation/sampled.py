@@ -99,11 +99,10 @@ class SampledMotion(WithOutcome):
     - `ts`: sampling times, including the end (samples + 1,) [s].
     - `q`, `qd`: joint positions and velocities at `ts`; NaN after a failure.
     - `tau`: efforts commanded at each sample (samples, n), 0 at fixed pairs
-      [N or N m]. Each acts from `delay` after its sample until the next one acts.
+      [N or N m]. Each acts from the delay after its sample until the next one acts.
     - `result`: diffrax's result: `successful`, or that of the first failed period.
       `outcome` states it in words.
     - `own`: the states of the forces' `StatefulElement`s at `ts`.
-    - `delay`: time from a sample to the action of its command [s].
     - `q_begin`: joint positions at which, within each period, the next command begins
       to act (samples, n); None if commands begin to act at samples only.
     - `acting`: efforts that act at `ts`, or begin to act there (samples + 1, n)
@@ -122,7 +121,6 @@ class SampledMotion(WithOutcome):
     tau: Float[Array, "sample joint"]
     result: diffrax.RESULTS
     own: OwnStates
-    delay: Float[Array, ""] | float = 0.0
     q_begin: Float[Array, "sample joint"] | None = None
     acting: Float[Array, "time joint"] | None = None
     taken: Float[Array, " time"] | None = None
@@ -349,4 +347,4 @@ def _motion(
         # Each period counts from 0, and its start may bring a blow.
         at_start, in_period = jnp.append(taken, jnp.zeros((1, 2)), axis=0).T
         taken = jnp.cumsum(in_period) - in_period + at_start
-    return SampledMotion(times, q, qd, tau, result, own, delay, q_begin, acting, taken)
+    return SampledMotion(times, q, qd, tau, result, own, q_begin, acting, taken)

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from ..base.checks import is_traced, known
 from ..base.report import html_table
 from ..forces.element import OwnStates
+from ..linkage.topology import rate_unit
 
 Statistics = dict[str, Any]  # arrays by name, and diffrax's `max_steps`
 
@@ -50,6 +51,19 @@ def flags(words: Iterable[str]) -> dict[str, list[int] | str]:
     meanings = [word.replace(" ", "_") for word in words]
     values = [*range(len(meanings))]
     return {"flag_values": values, "flag_meanings": " ".join(meanings)}
+
+
+def attributes_in(unit: str) -> dict[str, dict[str, Any]]:
+    """Returns names and units of a solution's arrays; `unit`: of the joints."""
+    named = lambda name, unit: {"long_name": name, "units": unit}
+    return {
+        "q": named("joint position", unit),
+        "qd": named("joint velocity", rate_unit(unit)),
+        "modes": {"long_name": "what holds the joint"} | flags(MODES),
+        "taken": named("energy taken by what holds joints", "J"),
+        "num_steps": named("number of steps", "1"),
+        "time_reached": named("time reached", "s"),
+    }
 
 
 def outcome_numbers(result: diffrax.RESULTS) -> Array | np.ndarray:

@@ -21,7 +21,7 @@ _C = TypeVar("_C", bound=Controller)
 def giving_up(
     result: diffrax.RESULTS, spent: Array, reason: diffrax.RESULTS
 ) -> diffrax.RESULTS:
-    """Returns the result of a step, or the reason to give up if it has not failed."""
+    """Returns `reason` if `spent`, unless the step has failed by itself."""
     ends = spent & (result == diffrax.RESULTS.successful)
     return diffrax.RESULTS.where(ends, reason, result)
 
@@ -31,7 +31,7 @@ def _with(
     controller: _C,
     concerns: Callable[[object], bool],
 ) -> _C:
-    """Returns a controller with `change` applied to the parts that it `concerns`."""
+    """Returns a controller with `change` applied to every part for which `concerns`."""
     return jax.tree.map(
         lambda node: change(node) if concerns(node) else node,
         controller,
@@ -57,7 +57,7 @@ def with_error_control(change: Callable[..., Controller], controller: _C) -> _C:
 
 
 def by_square_roots(controller: Controller) -> Controller:
-    """Returns an equal controller for methods of order 8 that computes no powers.
+    """Returns a controller for methods of order 8 with the same steps, without powers.
 
     A step changes by the eighth root of its error. XLA on CPU calls the C library's
     `pow` for each lane, but square roots are vectorised: a sweep takes 4 % less time.
@@ -80,7 +80,7 @@ def by_square_roots(controller: Controller) -> Controller:
 
 
 class Shortening(diffrax.PIDController):
-    """An integral controller whose kept steps may make the next one shorter.
+    """An integral controller that may shorten the next step even after one it keeps.
 
     After a step that it keeps, diffrax's controller never takes a shorter one, even if
     the error has come close to the tolerance: the next step is then often rejected. In
@@ -159,15 +159,15 @@ class Scaled(Adaptive):
         return (*jax.tree.map(jnp.divide, state[:2], units), *state[2:])
 
 
-# A lane stops once it has taken `_SLACK` times the steps after which `_MOST` of the
-# lanes were done.
+# A lane stops once it has taken `_SLACK` times as many steps as it had taken when
+# `_MOST` of the lanes were done.
 _SLACK, _MOST = 1.5, 7 / 8
 
 
 class Abreast(Adaptive):
     """A step size controller that gives up when most other lanes are long done.
 
-    It serves a program whose lanes are an axis with a name. Its result is then
+    For programs that are mapped over a named axis. The result is then
     `max_steps_reached`, before diffrax's own `max_steps`.
     """
 
@@ -184,8 +184,8 @@ class Abreast(Adaptive):
         *step, state, result = super().adapt_step_size(*arguments, state)
         count = count + 1
         # The state of a lane that is done stays, so that its count falls behind.
-        behind = count < jax.lax.pmax(count, self.axis)
-        most = jax.lax.pmean(behind.astype(float), self.axis) >= _MOST
+        done = count < jax.lax.pmax(count, self.axis)
+        most = jax.lax.pmean(done.astype(float), self.axis) >= _MOST
         typical = jnp.where(most & (typical == 0), count, typical)
         behind_most = (typical > 0) & (count >= _SLACK * typical)
         result = giving_up(result, behind_most, diffrax.RESULTS.max_steps_reached)

@@ -14,7 +14,6 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jax.tree_util as jtu
 import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
@@ -92,8 +91,8 @@ class ScheduledDopri8(diffrax.AbstractAdaptiveSolver):
 
 def compensated(y0: PyTree, change: PyTree) -> tuple[PyTree, PyTree]:
     """Returns y0 + change and its rounding error, which the next change includes."""
-    y = jtu.tree_map(lambda a, b: a + b, y0, change)
-    return y, jtu.tree_map(lambda a, b, c: c - (b - a), y0, y, change)
+    y = jax.tree.map(lambda a, b: a + b, y0, change)
+    return y, jax.tree.map(lambda a, b, c: c - (b - a), y0, y, change)
 
 
 def interpolation_weights(theta: Array) -> Array:
@@ -127,14 +126,14 @@ class DenseOutput(diffrax.AbstractLocalInterpolation):
 
 def constant(tree: PyTree) -> PyTree:
     """Returns the tree with its arrays constant for derivatives."""
-    return jtu.tree_map(
+    return jax.tree.map(
         lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, tree
     )
 
 
 def chosen(condition: ArrayLike, ones: PyTree, others: PyTree) -> PyTree:
     """Returns the numbers of one tree where a condition holds, else of another."""
-    return jtu.tree_map(lambda a, b: jnp.where(condition, a, b), ones, others)
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), ones, others)
 
 
 def is_singular(health: Health) -> Array:
@@ -175,5 +174,5 @@ def verdict(
     kind = results.where(singular, results.singular, results.nonfinite)
     result = results.where(bad & short, kind, results.successful)
     imposed = jnp.where(short, 0, jnp.inf)
-    error = jtu.tree_map(lambda e: jnp.where(bad, imposed, e), error)
+    error = jax.tree.map(lambda e: jnp.where(bad, imposed, e), error)
     return Estimate(error, tuple(jnp.where(bad, 1, x) for x in health)), result

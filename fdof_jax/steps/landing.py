@@ -11,10 +11,10 @@ from ..linkage.fields import has_come
 from .controllers import giving_up
 from .dopri8 import Integrated, constant
 
-# More crossings than these are chatter, if they come within the distance that rounding
-# keeps two of them apart, times this power of the unit of rounding (3e5 in float64).
-# Chatter soon crosses at that distance; joints that bounce to rest, in however long a
-# run, or that throw each other at their stops, are slower.
+# More than `_MOST_CROSSINGS` are chatter if they come within the least distance between
+# two times, times this power of the unit of rounding (3e5 in float64). Chatter soon
+# crosses at that distance; joints that bounce to rest, in however long a run, or that
+# throw each other at their stops, are slower.
 _MOST_CROSSINGS = 100
 _PACE = -0.35
 # After so many tries the switching function itself is taken to jump, and the jump is
@@ -23,16 +23,15 @@ _MOST_TRIES = 6
 # A step ends so many units of rounding before a known time, and the next one starts as
 # many after it, so that rounding within steps does not pass it.
 _APART = 4
-# A step that would end so short before a known time, as a share of its length, ends
-# there.
+# A step that would end within this share of its length before a known time ends at it.
 _JUST_BEFORE = 1e-6
 
 
 def clearance(ts: Array) -> Array:
     """Returns the distance kept from known times in a run over the times `ts`.
 
-    It is relative to the largest of them, because one that is 0 has rounding too where
-    steps begin at others.
+    It is relative to the largest of them, because even a known time of 0 is subject to
+    rounding where steps begin at other times.
     """
     return _APART * jnp.finfo(ts.dtype).eps * constant(jnp.max(jnp.abs(ts)))
 
@@ -54,7 +53,7 @@ def end_of_run(ts: Array, jumps: Array | None) -> Array:
 
 
 def _last(end: Array) -> Array:
-    """Returns the time after which diffrax may move the end of a step to that of a run.
+    """Returns the time beyond which diffrax may move a step's end to that of the run.
 
     It does so within 100 units of rounding.
     """
@@ -79,7 +78,6 @@ class _Landing(NamedTuple):
     tries: Array  # to end at the next switch, up to here
     crossings: Array  # tries included, since the time `since`
     since: Array
-    pace: Array  # time within which too many crossings are chatter
     last: Array  # see `_last`
 
 
@@ -91,7 +89,7 @@ class _Happened(NamedTuple):
     unsure: Array
     missed: Array
     landed: Array
-    short: Array  # whether its length is not what its error asked for
+    cut_short: Array  # so that its error says little about the next one
     crossing: Array  # as in `_Landing`, after it
     again: Array  # where the same step is to end if it crossed or is unsure
 
@@ -99,7 +97,7 @@ class _Happened(NamedTuple):
 class Landing(eqx.Module):
     """Ends steps at known times and where elements switch.
 
-    Steps that the controller chooses have constant lengths for derivatives: up to the
+    Lengths that the controller chooses are constants in derivatives: up to the
     tolerance, the motion does not depend on where its steps end.
     """
 
@@ -108,7 +106,7 @@ class Landing(eqx.Module):
     switches: bool = eqx.field(static=True)
 
     def _cut(self, t0: Array, t1: Array, last: Array) -> tuple[Array, Array, Array]:
-        """Returns the end of a step, the gap after it, and if it is at a known time."""
+        """Returns a step's end, the gap after it, and whether it is at a known time."""
         if self.jumps is None:
             return t1, jnp.zeros_like(t1), jnp.array(False)
         jumps = constant(self.jumps)
@@ -117,7 +115,7 @@ class Landing(eqx.Module):
         index = jnp.argmin(ends)
         place, jump = ends[index], jumps[index]
         reached = t1 + _JUST_BEFORE * (t1 - t0) >= place
-        # With the derivatives of the known time.
+        # The end keeps the derivatives of the known time.
         end = self.jumps[index] - (jump - place)
         gap = jnp.where(reached, jump + self.apart - place, 0)
         return jnp.where(reached, end, t1), gap, reached
@@ -131,10 +129,8 @@ class Landing(eqx.Module):
         target = jnp.where(cut, constant(end), jnp.inf)
         crossing, none = jnp.full_like(target, -jnp.inf), jnp.zeros((), int)
         since = constant(jnp.asarray(t0))
-        pace = self.apart * jnp.finfo(target.dtype).eps ** _PACE
-        return end, _Landing(
-            target, gap, length, crossing, none, none, since, pace, last
-        )
+        state = target, gap, length, crossing, none, none, since, last
+        return end, _Landing(*state)
 
     def _happened(
         self, begin: Array, end: Array, y1: Integrated, keep: Array, state: _Landing
@@ -149,7 +145,7 @@ class Landing(eqx.Module):
             idle = jnp.all(seen.after == seen.sides)
         allowance = jnp.where(aimed, near, 0)
         within = until < jnp.minimum(end - allowance, state.last)
-        # What a jump switches at once switches before the next jump, however near.
+        # A switch that a jump causes at once comes before the next jump, however near.
         at_once = (until == begin) & (begin < end)
         # A tiny step to a switch ends where it is.
         tiny = (begin < end) & (end - begin <= _APART * self.apart)
@@ -174,7 +170,7 @@ class Landing(eqx.Module):
             unsure=unsure,
             missed=missed,
             landed=landed,
-            short=(crossed | unsure) & aimed | landed,
+            cut_short=(crossed | unsure) & aimed | landed,
             crossing=jnp.where(passed, end, crossing),
             again=jnp.where(crossed, again, unseen),
         )
@@ -200,27 +196,27 @@ class Landing(eqx.Module):
         shortened = step.crossed | step.unsure
         resumes = shortened | step.landed
 
-        # Where does the next step begin? With the derivatives of this one's ends, which
-        # `begin`, `end` and `planned` lack.
+        # Where does the next step begin? It keeps the derivatives of this one's ends,
+        # which `begin`, `end` and `planned` lack.
         next_t0 = jnp.where(step.keep, t1 + (planned.t0 - end), t0)
         next_t0 = next_t0 + jnp.where(step.landed, state.gap, 0)
 
         # Where is it to end?
-        # The error of a step that was cut short says little about the next one.
-        length = jnp.where(step.short, state.resumed, planned.t1 - planned.t0)
+        length = jnp.where(step.cut_short, state.resumed, planned.t1 - planned.t0)
         next_t1 = jnp.where(step.missed, step.crossing, next_t0 + length)
         next_t1, gap, cut = self._cut(constant(next_t0), next_t1, state.last)
-        # What a jump at a known time has switched switches with it, at once.
+        # What a jump at a known time switches, switches at that very time.
         again = jnp.where(step.again == begin, t0, step.again)
         next_t1 = jnp.where(shortened, again, next_t1)
         aims = (cut | step.crossed | step.missed) & ~step.unsure
 
         # Does the solve go on?
         # Time that passes meanwhile tells fast switching from chatter.
-        paced = begin - state.since > state.pace
+        pace = self.apart * jnp.finfo(begin.dtype).eps ** _PACE
+        paced = begin - state.since > pace
         crossings = jnp.where(paced, 0, state.crossings + step.crossed)
         results = diffrax.RESULTS
-        # After the last step, which may be shorter than others may, none is asked for.
+        # The last step may be shorter than the least length; no step follows it.
         done = step.keep & (end >= state.last)
         result = results.where(resumes | done, results.successful, planned.result)
         chatter = crossings > _MOST_CROSSINGS

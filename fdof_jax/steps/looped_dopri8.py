@@ -11,7 +11,6 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jax.tree_util as jtu
 from jax import Array
 from jaxtyping import PyTree
 
@@ -37,7 +36,7 @@ def _weighted(weights: Array, rates: PyTree) -> PyTree:
         # For a matrix product XLA would call a library, which costs more at this size.
         return jnp.sum(weights.reshape(-1, *[1] * (k.ndim - 1)) * k, axis=0)
 
-    return jtu.tree_map(weighted, rates)
+    return jax.tree.map(weighted, rates)
 
 
 # Reverse mode replays steps with the very code that took them: near a saturation,
@@ -56,27 +55,27 @@ def _step(term: Any, t0, t1, y0, residue, args):
     def stage(rates, row):
         index, t, weights = row
         scheduled = inner.schedule(t, args)  # of all stages at once it takes longer
-        y = jtu.tree_map(lambda a, k: a + h * k, y0, _weighted(weights, rates))
+        y = jax.tree.map(lambda a, k: a + h * k, y0, _weighted(weights, rates))
         rate, health = inner.watched_field(t, y, args, scheduled)
-        rates = jtu.tree_map(lambda ks, k: ks.at[index].set(k), rates, rate)
+        rates = jax.tree.map(lambda ks, k: ks.at[index].set(k), rates, rate)
         return rates, (health, scheduled)
 
     # The first rate is that of the last step's end. To evaluate it again costs a
     # fourteenth; to keep it, a second copy of the equations for the first step.
-    rates = jtu.tree_map(lambda y: jnp.zeros((STAGES, *y.shape), y.dtype), y0)
+    rates = jax.tree.map(lambda y: jnp.zeros((STAGES, *y.shape), y.dtype), y0)
     stages = jnp.arange(STAGES), times, lower
     rates, (healths, schedule) = jax.lax.scan(stage, rates, stages)
-    change = jtu.tree_map(lambda k, c: h * k + c, _weighted(lower[-1], rates), residue)
+    change = jax.tree.map(lambda k, c: h * k + c, _weighted(lower[-1], rates), residue)
     y, residue = compensated(y0, change)
     weights = jnp.asarray(TABLEAU.b_error, h.dtype)
-    error = jtu.tree_map(lambda k: h * k, _weighted(weights, rates))
+    error = jax.tree.map(lambda k: h * k, _weighted(weights, rates))
     # diffrax overlooks an infinity beside a NaN and finds no next step size.
-    last = jtu.tree_map(lambda k: k[-1], rates)
-    finite = jnp.isfinite(sum(map(jnp.sum, jtu.tree_leaves((y, last)))))
+    last = jax.tree.map(lambda k: k[-1], rates)
+    finite = jnp.isfinite(sum(map(jnp.sum, jax.tree.leaves((y, last)))))
     # If the end is not finite, the health at the start shows why.
     health = tuple(jnp.where(finite, x[-1], x[0]) for x in healths)
     health = health_if(finite, health)
-    y = jtu.tree_map(lambda a: jnp.where(finite, a, jnp.nan), y)
+    y = jax.tree.map(lambda a: jnp.where(finite, a, jnp.nan), y)
     error, result = verdict(error, constant(health), h)
     dense_info = dict(y0=y0, step=h, rates=rates, scheduled=schedule)
     return y, error, dense_info, constant(residue), result
@@ -85,7 +84,7 @@ def _step(term: Any, t0, t1, y0, residue, args):
 class _Interpolation(DenseOutput):
     def at(self, theta):
         change = _weighted(interpolation_weights(theta), self.rates)
-        return jtu.tree_map(lambda a, k: a + self.step * k, self.y0, change)
+        return jax.tree.map(lambda a, k: a + self.step * k, self.y0, change)
 
 
 class LoopedDopri8(ScheduledDopri8):
@@ -94,7 +93,7 @@ class LoopedDopri8(ScheduledDopri8):
     interpolation_cls: ClassVar = _Interpolation
 
     def init(self, terms, t0, t1, y0, args):
-        return jtu.tree_map(jnp.zeros_like, y0)
+        return jax.tree.map(jnp.zeros_like, y0)
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         del made_jump  # no rate is kept from one step to the next

@@ -45,17 +45,17 @@ class StepControl(Adaptive):
     | question | if so |
     |---|---|
     | Is its end singular, or not finite? | a shorter step; once that is tiny, the end |
-    | Would derivatives be less exact than they may be? | a larger error |
-    | Is its error rounding? | none: shorter steps would have it too |
+    | Would derivatives be less accurate than the tolerance? | a larger error |
+    | Is its error only rounding? | it counts as none: shorter steps have it, too |
     | Is the error within the tolerance? | `controller` keeps or rejects the step |
     | Did it pass a known time or a switch? | a step that ends there (see `Landing`) |
     | How much accuracy did it lose? | recorded, for `Solution.stats` |
 
-    Up to the tolerance, a motion does not depend on where its steps end: the lengths of
-    steps are constant for derivatives, but for ends at known times.
+    Up to the tolerance, a motion does not depend on where its steps end. So lengths of
+    steps are constants in derivatives, except where steps end at known times.
 
-    - `term`: the equations; None if rates are trusted and errors are no rounding.
-    - `watches`: whether the health of the ends is asked here, not by the solver.
+    - `term`: the equations; None if rates are trusted and no error is only rounding.
+    - `watches`: whether the health of the ends is found here, not by the solver.
     """
 
     controller: Any
@@ -82,7 +82,7 @@ class StepControl(Adaptive):
         health_result = diffrax.RESULTS.successful
         if self.watches:
             y1, y_error, health_result = self._healthy(t0, t1, y0, y1, args, y_error)
-        # Would derivatives be less exact than they may be?
+        # Would derivatives be less accurate than the tolerance?
         ratio, probe = None, None
         if self.derivatives is not None:
             taken = Step(t0, t1, y0, y1, args)
@@ -94,7 +94,7 @@ class StepControl(Adaptive):
             judged = *map(scaled, judged[:2]), with_change(judged[2], scaled)
         start, end, error = constant(judged)
         begin, stop, args = constant((t0, t1, args))
-        # Is its error rounding? How much accuracy did it lose?
+        # Is its error only rounding? How much accuracy did it lose?
         loss = state.loss
         if self.term is not None:
             loss = functools.reduce(jnp.maximum, error.health)

@@ -45,7 +45,7 @@ _NEAR = 0.575
 # A function began on its zero if its values before were below this share of its size,
 # also a power of the unit of rounding.
 _ON_ZERO = 0.625
-# In a step of so many of these distances at most, something may be passed over.
+# In steps of at most this many such distances, hidden zeros are not looked for.
 _BRIEF = 10
 
 
@@ -58,15 +58,15 @@ class Switching(NamedTuple):
     - `until`: when the step should have ended; its end if nothing switched before [s].
     - `unseen`: a time before which a switching function may have passed 0 unseen; the
       step's end if none may [s].
-    - `soon`: when a switch follows soon after the end, or else the end [s].
+    - `soon`: the time of a switch that follows soon after the end; else the end [s].
     - `near`: how far from its zero a switching function may switch [s].
     - `sizes` (switch,): the largest values of the switching functions up to here.
     - `length`: that of the step that ended here [s].
-    - `ahead`: 1 if a function that switches here is yet to reach its zero, or else 0.
+    - `ahead`: 1 if a function that switches here has not quite reached its zero, or 0.
     - `passed`: number of switches up to here.
     - `one_sided`: number of places up to here where derivatives may hold on one side
       only (see `Located`); None if nothing jumps at switches.
-    - `grazing`, `grazing_here`: how near to grazing a crossing came so far, and one
+    - `grazing`, `grazing_here`: how nearly the crossings so far grazed, and the one
       here; 0 if none (see `Passage`).
     - `modes`: those of the joints (see `ScheduledTerm`), None if elements hold none.
     """
@@ -110,7 +110,7 @@ def located(
     args: Arguments,
     jumps: Array | None,
 ) -> tuple[diffrax.AbstractSolver, Landing | None, Integrated]:
-    """Returns a solver whose steps see where elements switch, and what ends them there.
+    """Returns a solver that finds switches, and the `Landing` that ends steps at them.
 
     Also returns the start for this solver. Without switches and known times `jumps`,
     solver and start stay as they are. `ts`: the times of the run.
@@ -163,8 +163,8 @@ def switching_facts(*states: Switching) -> dict[str, Array]:
 class Located(diffrax.AbstractAdaptiveSolver):
     """A solver whose steps keep the branches of their start and report a change.
 
-    Where efforts jump at a switch, derivatives may differ between the sides of motions
-    that start on the switch, or that meet it together with another. `sensitivities`,
+    Where efforts jump at a switch, a motion that starts on it, or meets it together
+    with another, may have different derivatives on its two sides. `sensitivities`,
     which integrates derivatives beside the motion, overrides what `step` calls.
     """
 
@@ -226,8 +226,8 @@ class Located(diffrax.AbstractAdaptiveSolver):
         )
         path = self.solver.interpolation_cls(t0=t0, t1=t1, **dense)
         if self.guards:
-            # Joints that are held keep their values: what the compensated sum adds of
-            # rounding errors of before would still move them.
+            # Joints that are held keep their values: rounding errors of earlier steps,
+            # which the compensated sum carries, would still move them.
             y1 = self.kept(modes.held, y1, y0)
             dense = dict(path=dense, modes=modes)
 
@@ -238,7 +238,7 @@ class Located(diffrax.AbstractAdaptiveSolver):
         values, checks = _values(*constant((term, t0, t1, path, args)))
         brief = h <= jnp.maximum(SHORTEST[t1.dtype], _BRIEF * near)
         passed = passage(values, checks, sides, begun, earlier, near / h, brief)
-        # What began on its zero has left it, in one or more steps.
+        # A function that began on its zero has left it, after one or more steps.
         left = jnp.finfo(passed.sizes.dtype).eps ** _ON_ZERO * passed.sizes
         on_zero = switching.sizes <= left
         # Before the first step, whose length is 0, sides are unknown.
@@ -267,7 +267,7 @@ class Located(diffrax.AbstractAdaptiveSolver):
         return (*y1, new), error, dense, solver_state, result
 
     def needed(self, count: int, jumps: Array | None) -> bool:
-        """Returns whether steps are to end at this number of switches."""
+        """Returns whether steps have to end at switches, given how many there are."""
         return count > 0
 
     def one_sided(

@@ -13,7 +13,6 @@ from typing import ClassVar, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jax.tree_util as jtu
 import numpy as np
 from jax import Array
 from jaxtyping import PyTree
@@ -49,7 +48,7 @@ def _combine(coefficients: Sequence[Array] | np.ndarray, rates: Rates) -> PyTree
         if not (constants and c == 0)
     ]
     factors = [c for c, _ in terms]
-    return jtu.tree_map(
+    return jax.tree.map(
         lambda *leaves: sum(c * leaf for c, leaf in zip(factors, leaves)),
         *[rate for _, rate in terms],
     )
@@ -65,14 +64,14 @@ def _increment(row: np.ndarray, rates: Rates, y0: State, h: Array) -> State:
     accelerations = [rate[1] for rate in rates]
     share, twice = float(row.sum()), row @ LOWER
     twice = np.where(abs(twice) < 1e-14, 0, twice)  # but for rounding
-    change = jtu.tree_map(lambda v: share * v, y0[1])
+    change = jax.tree.map(lambda v: share * v, y0[1])
     if twice.any():
         change = _moved(change, h, _combine(twice, accelerations))
     return (change, *_combine(row, others))
 
 
 def _moved(y: State, h: Array, rate: State) -> State:
-    return jtu.tree_map(lambda a, k: a + h * k, y, rate)
+    return jax.tree.map(lambda a, k: a + h * k, y, rate)
 
 
 class _Step(NamedTuple):
@@ -98,17 +97,17 @@ def _step(term, t0, t1, y0, residue, args, f0) -> tuple[_Step, dict[str, PyTree]
     schedule = jax.lax.map(
         lambda t: entries_in_one_loop(inner.schedule(t, args)), times
     )
-    scheduled = lambda stage: jtu.tree_map(lambda leaf: leaf[stage], schedule)
+    scheduled = lambda stage: jax.tree.map(lambda leaf: leaf[stage], schedule)
     field, rates = eqx.filter_jit(inner.vector_field), [f0]
     weighted = lambda row: _increment(row, rates, y0, h)
     for stage, row in enumerate(LOWER[1:-1], 1):
         y = _moved(y0, h, weighted(row))
         rates.append(field(times[stage], y, args, scheduled(stage)))
     y, residue = compensated(y0, _moved(residue, h, weighted(LOWER[-1])))
-    error = jtu.tree_map(lambda k: h * k, weighted(TABLEAU.b_error))
+    error = jax.tree.map(lambda k: h * k, weighted(TABLEAU.b_error))
     # diffrax overlooks an infinity beside a NaN and finds no next step size.
-    poison = 0 * sum(jtu.tree_leaves(y))
-    y = jtu.tree_map(lambda a: a + poison, y)
+    poison = 0 * sum(jax.tree.leaves(y))
+    y = jax.tree.map(lambda a: a + poison, y)
     y, error, residue = in_one_loop((y, error, residue))
     last, health = inner.watched_field(times[-1], y, args, scheduled(-1))
     dense_info = dict(y0=y0, step=h, rates=[*rates, last], scheduled=schedule)
@@ -135,7 +134,7 @@ class UnrolledDopri8(ScheduledDopri8):
     interpolation_cls: ClassVar = _Interpolation
 
     def init(self, terms, t0, t1, y0, args):
-        return self._start(terms, t0, y0, args), jtu.tree_map(jnp.zeros_like, y0)
+        return self._start(terms, t0, y0, args), jax.tree.map(jnp.zeros_like, y0)
 
     def _start(self, terms, t0, y0, args):
         """Returns the rates and their health at the start of a step."""

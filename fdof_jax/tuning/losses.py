@@ -12,7 +12,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from ..analysis.measures import relative_demands, tip_deviation
-from ..base.checks import function, instance, is_traced, real_array, refusal
+from ..base.checks import check_known, function, instance, real_array, refusal
 from ..control.pd import PDController
 from ..forces.element import Element
 from ..linkage.fields import Part, Values, field
@@ -272,9 +272,7 @@ def check_tuned(name: str, scene: Scene, loss: Loss = tip_errors) -> None:
     """Raises ValueError unless the scene can be tuned by the loss."""
     instance(name, scene, Scene)
     function("loss", loss)
-    if is_traced(scene):
-        expected = "known values, as gains are tuned outside of JAX's transformations"
-        raise refusal(name, expected, scene)
+    check_known(name, scene)
     real_array(f"{name}.t1", scene.t1, (), above=0)
     check_scene(name, scene)
     controller = controller_of(scene)

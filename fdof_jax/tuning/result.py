@@ -55,7 +55,7 @@ class TuneResult(Report):
     - `lower`, `upper`: the bounds of kp and kd (2, n).
     - `converged`: whether the run stopped by itself, no actuator was at its limit most
       of the time, and a change of the gains by 1 % would change the loss by less
-      than 1e-4 of it, to first order and within the bounds.
+      than a ten-thousandth, to first order and within the bounds.
     - `message`: why the run stopped, in words, and what to beware of.
     - `member_loss`, `member_tip_error`: loss (member,) and rms tip error (member,) [m]
       of each member of the ensemble with the tuned gains.
@@ -94,7 +94,7 @@ class TuneResult(Report):
 
     @property
     def at_bound(self) -> Bool[np.ndarray, "2 joint"]:
-        """Flags of the gains that a bound holds."""
+        """Whether a bound holds each gain."""
         return self._box.at_bound(self.gains)
 
     @property
@@ -127,16 +127,16 @@ class TuneResult(Report):
     def _rows(self) -> list[list[str]]:
         rows = gain_rows(self.table)
         first, last = self.histories[0], self.history
-        compared = [("loss", first.loss[0], last.loss[-1])]
+        comparisons = [("loss", first.loss[0], last.loss[-1])]
         if np.isfinite(self.tip_error):
             error = first.tip_error[0], last.tip_error[-1]
-            compared.append(("rms tip error [mm]", 1e3 * error[0], 1e3 * error[1]))
+            comparisons.append(("rms tip error [mm]", 1e3 * error[0], 1e3 * error[1]))
         shares = 100 * first.saturated[0], 100 * last.saturated[-1]
         for name, *share in zip(joint_names(self.scene.linkage), *shares):
-            compared.append((f"{name} at its limit [%]", *share))
+            comparisons.append((f"{name} at its limit [%]", *share))
         return rows + [
             [label, f"{before:.5g}", f"{after:.5g}", "", "", ""]
-            for label, before, after in compared
+            for label, before, after in comparisons
         ]
 
     def _remarks(self) -> list[str]:
