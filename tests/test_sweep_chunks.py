@@ -6,6 +6,7 @@ import socket
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import diffrax
 import equinox as eqx
@@ -163,6 +164,28 @@ def single_precision():
     jax.config.update("jax_enable_x64", False)
     yield
     jax.config.update("jax_enable_x64", True)
+
+
+class Mixed(fj.Element):
+    """A damper whose numbers are of any type."""
+
+    coefficient: Any
+    doubled: Any
+
+    def __call__(self, t, q, qd, linkage):
+        return -self.coefficient * (1 + self.doubled) * qd
+
+
+@pytest.mark.slow
+def test_numbers_of_any_type_are_taken_in_single_precision(single_precision):
+    """NumPy's, of which some differ between members."""
+    linkage, starts = pendulums(np.linspace(0, 1, 40))
+    mixed = Mixed(np.linspace(0.5, 1.5, 40), np.int64(1))
+    axes = (Mixed(0, None),)
+    motion = fj.sweep(linkage, starts, TS, (mixed,), forces_axes=axes, chunk=20)
+    alone = fj.sweep(linkage, starts, TS, (fj.JointDamper(2.0),), chunk=40)
+    assert motion.q.dtype == np.float32 and successful(motion).all()
+    np.testing.assert_allclose(motion.q[20], alone.q[20], atol=0.02)
 
 
 def test_cores_compute_in_the_precision_of_one_thread(monkeypatch, single_precision):

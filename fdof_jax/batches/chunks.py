@@ -137,13 +137,20 @@ def _is_kind(leaf: object) -> bool:
     return isinstance(leaf, jax.ShapeDtypeStruct)
 
 
-def _form_of(function: Callable, job: Job, lanes: int) -> tuple[Form, list[Array]]:
-    """Returns the form of the program for so many lanes, and the common arrays."""
+def _form_of(
+    function: Callable, job: Job, lanes: int
+) -> tuple[Form, list[Array], list[Array]]:
+    """Returns the form of the program for so many lanes; members' and common arrays."""
 
     def kind(array: Array, shape: tuple[int, ...]) -> jax.ShapeDtypeStruct:
         dtype = jax.dtypes.canonicalize_dtype(array.dtype, allow_extended_dtype=True)
         weak = getattr(array, "weak_type", False)
         return jax.ShapeDtypeStruct(shape, dtype, weak_type=weak)
+
+    def cast(array: Array, kind: jax.ShapeDtypeStruct) -> Array:
+        """Returns an array in the program's type, to which no call converts it."""
+        array = in_numpy(array)
+        return array if array.dtype == kind.dtype else array.astype(kind.dtype)
 
     members, structure = jax.tree.flatten(job.moving)
     kinds = tuple(kind(a, (lanes, *a.shape[1:])) for a in members)
@@ -154,9 +161,12 @@ def _form_of(function: Callable, job: Job, lanes: int) -> tuple[Form, list[Array
     # in three quarters (AMD EPYC, jax 0.12).
     ef = job.common.shared[0].ef
     leaves = [tuple(x.tolist()) if x is ef else x for x in leaves]
-    arrays = in_numpy(list(filter(eqx.is_array, leaves)))
-    given = tuple(kind(x, x.shape) if eqx.is_array(x) else x for x in leaves)
-    return Form(function, structure, kinds, others, given), arrays
+    common = tuple(kind(x, x.shape) if eqx.is_array(x) else x for x in leaves)
+    return (
+        Form(function, structure, kinds, others, common),
+        [*map(cast, members, kinds)],
+        [cast(x, own) for x, own in zip(leaves, common) if _is_kind(own)],
+    )
 
 
 @functools.lru_cache(maxsize=64)
@@ -193,8 +203,7 @@ def _in_lanes(
     """Yields members of a batch in chunks, as they are done, and their values."""
     chunks = [members[i : i + lanes] for i in range(0, len(members), lanes)]
     devices = devices[: len(chunks)]
-    form, arrays = _form_of(function, job, lanes)
-    leaves = jax.tree.leaves(job.moving)
+    form, leaves, arrays = _form_of(function, job, lanes)
 
     def rows_of(members: np.ndarray) -> list[np.ndarray]:
         rows = np.append(members, np.full(lanes - len(members), members[-1]))
