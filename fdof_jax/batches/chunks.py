@@ -205,7 +205,7 @@ def _in_lanes(
     devices = devices[: len(chunks)]
     form, leaves, arrays = _form_of(function, job, lanes)
 
-    def rows_of(members: np.ndarray) -> list[np.ndarray]:
+    def rows_of(members: np.ndarray) -> list[Array]:
         rows = np.append(members, np.full(lanes - len(members), members[-1]))
         return [leaf[rows] for leaf in leaves]
 
