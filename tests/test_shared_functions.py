@@ -211,6 +211,21 @@ def test_numbers_of_functions_are_right(make):
         assert "Equinox module" in words and warning.filename == __file__
 
 
+def test_it_does_not_matter_where_a_function_stands():
+    traced = []
+
+    @eqx.filter_jit
+    def run(functions):
+        traced.append(functions)
+        return functions[0](jnp.array(2.0))
+
+    here = lambda x: jax.vmap(lambda y: -2 * y)(x[None])[0]
+    (there,) = (lambda x: jax.vmap(lambda y: -2 * y)(x[None])[0],)
+    other = lambda x: jax.vmap(lambda y: -3 * y)(x[None])[0]
+    found = [float(sharing_functions(run, forces=(f,))) for f in (here, there, other)]
+    assert found == [-4, -4, -6] and len(traced) == 2
+
+
 def test_what_functions_change_outside_is_changed():
     run = eqx.filter_jit(lambda functions: functions[0](jnp.array(2.0)))
     calls, last = {"number": 0}, 0

@@ -44,7 +44,7 @@ _OPAQUE_STEPS = {
 # Kinds of numbers that are data. Code that uses them in Python, as lengths or where it
 # decides, is known by fewer of them, at last by none.
 _DATA = (float, np.floating, int), (float, np.floating)
-_fewer: Counter[types.CodeType] = Counter()
+_fewer: Counter["_Code"] = Counter()
 
 
 _T = TypeVar("_T")
@@ -54,17 +54,38 @@ class _Unknown(Exception):
     """Raised for a function that reaches what may change unseen."""
 
 
+class _Code:
+    """The code of a function, equal to such code in any place of the source."""
+
+    def __init__(self, code: types.CodeType):
+        self.code, self.anywhere = code, _anywhere(code)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Code) and self.anywhere == other.anywhere
+
+    def __hash__(self) -> int:
+        return hash(self.anywhere)
+
+
+@functools.lru_cache(maxsize=1024)
+def _anywhere(code: types.CodeType) -> types.CodeType:
+    """Returns code without its lines, which are only for messages."""
+    within = lambda x: _anywhere(x) if isinstance(x, types.CodeType) else x
+    constants = tuple(map(within, code.co_consts))
+    return code.replace(co_firstlineno=1, co_linetable=b"", co_consts=constants)
+
+
 class SharedFunction(eqx.Module):
     """A function in parts; equal but for numbers with all functions of equal code."""
 
     reach: Any  # values of the closure, defaults, keyword defaults, global names
-    code: types.CodeType = eqx.field(static=True)
+    code: _Code = eqx.field(static=True)
 
     def __call__(self, *arguments: Any, **keywords: Any) -> Any:
         closure, defaults, of_keywords, names = self.reach
         cells = tuple(map(types.CellType, closure))
         names = names | {"__builtins__": builtins}
-        function = types.FunctionType(self.code, names, None, defaults, cells)
+        function = types.FunctionType(self.code.code, names, None, defaults, cells)
         function.__kwdefaults__ = of_keywords
         before, structure = jax.tree.flatten(self.reach)
         returned = function(*arguments, **keywords)
@@ -117,7 +138,8 @@ def _parts_of(
     function: types.FunctionType, within: tuple[types.FunctionType, ...] = ()
 ) -> SharedFunction:
     code = function.__code__
-    if function.__dict__ or function in within or _fewer[code] >= len(_DATA):
+    shared = _Code(code)
+    if function.__dict__ or function in within or _fewer[shared] >= len(_DATA):
         raise _Unknown
     among = function.__globals__
     names = {name: among[name] for name in _global_names(code) if name in among}
@@ -126,7 +148,7 @@ def _parts_of(
         if not set(code.co_names) <= {*names, *_OF_NUMPY}:
             raise _Unknown
     closure = tuple(cell.cell_contents for cell in function.__closure__ or ())
-    numbers, within = _DATA[_fewer[code]], (*within, function)
+    numbers, within = _DATA[_fewer[shared]], (*within, function)
 
     def part(leaf: object) -> object:
         if isinstance(leaf, numbers) and not isinstance(leaf, bool):
@@ -142,7 +164,7 @@ def _parts_of(
 
     named = (dict(sorted(d.items())) for d in (function.__kwdefaults__ or {}, names))
     reach = closure, function.__defaults__, *named
-    return SharedFunction(jax.tree.map(part, reach, is_leaf=_out_of_order), code)
+    return SharedFunction(jax.tree.map(part, reach, is_leaf=_out_of_order), shared)
 
 
 def _out_of_order(node: object) -> bool:
@@ -183,7 +205,7 @@ def _is_fixed(value: object) -> bool:
 
 
 _keys: set[int] = set()  # of callables, each of which has a program
-_alike: Counter[types.CodeType | type] = Counter()  # the same, by their code or type
+_alike: Counter[_Code | type] = Counter()  # the same, by their code or type
 
 
 def _warn_of_third(trees: dict[str, PyTree]) -> None:
@@ -194,13 +216,13 @@ def _warn_of_third(trees: dict[str, PyTree]) -> None:
             continue
         _keys.add(key)
         inner = inspect.unwrap(leaf)
-        code = inner.__code__ if inspect.isfunction(inner) else None
+        code = _Code(inner.__code__) if inspect.isfunction(inner) else None
         if isinstance(leaf, SharedFunction):
             code = leaf.code
         _alike[code or type(leaf)] += 1
         if _alike[code or type(leaf)] == 3:
             place = tree.key + jax.tree_util.keystr(tuple(path[:1]))
-            name = code.co_qualname if code else type(leaf).__qualname__
+            name = code.code.co_qualname if code else type(leaf).__qualname__
             warn(
                 f"{place}: expected the same function at each call, got a third one "
                 f"like {name}; each needs a program of its own, compiled in seconds "
