@@ -117,8 +117,8 @@ def _shares(points: Points, same: Points) -> str:
         share = EVALUATIONS * steps * each / own["time_median"]
         shares.append(f"{100 * share:.0f} % at a tolerance of {number(tolerance, 1)}")
     return (
-        "Heyoka's equations alone, with the arm's numbers known, take XLA "
-        f"{number(1e9 * each)} ns for each of the sweep's evaluations: "
+        "Compiled by XLA, heyoka's equations of this one arm take "
+        f"{number(1e9 * each)} ns an evaluation. All evaluations of a sweep would take "
         f"{' and '.join(shares)} of its time."
     )
 
@@ -202,7 +202,7 @@ def switches(points: Points) -> str:
 
 def held_joints(points: Points) -> str:
     sweeps = [
-        f"{number(p['ratio'])} times as long with {p['setting']:g} x (5, 4, 3, 2, 1)"
+        f"{number(p['ratio'])} times as long at {p['setting']:g} x (5, 4, 3, 2, 1)"
         for p in points
         if p["solver"] == "friction" and p["status"] == "ok"
     ]
@@ -220,7 +220,7 @@ def held_joints(points: Points) -> str:
             how = f"{best['kind']} {number(best['setting'], 1)}"
             rows.append([scene, solver, how, number(worst(best)), number(wall)])
     head = ["", "", "at its most exact", "error [m or rad]", "ms a simulated s"]
-    return f"{', '.join(sweeps)}.\n\n{table(head, rows)}"
+    return f"With friction they take {', '.join(sweeps)}.\n\n{table(head, rows)}"
 
 
 def hard_cases(points: Points) -> str:

@@ -62,6 +62,11 @@ def pairs_of(topology: Any) -> np.ndarray | None:
             ef = given.astype(float) if given.dtype.kind in "biuf" else np.empty(0)
         except (TypeError, ValueError):
             ef = np.empty(0)
+        if ef.ndim > 1:
+            raise ValueError(
+                f"{expected}, got shape {ef.shape}. Arms of a batch are made and "
+                "changed one by one, within jax.vmap."
+            )
         if ef.ndim != 1 or ef.size not in _SIZES or not np.isin(ef, (0, 1)).all():
             raise ValueError(f"{expected}, got {shown(topology)}.")
         pairs = ef.reshape(-1, 2)

@@ -186,9 +186,9 @@ class TipTask(TipReference):
 
     - `path`: a `Path`: `Line`, `Ellipse`, `FigureEight`, `Spline` or your own subclass.
     - `timing`: a `Travel` or `Laps`, or any function from time to the share of the way.
-    - `orientation`: the absolute angle of the last link [rad], th4 in the paper; None
-      for an arm of two joints, whose last link turns as it must.
-    - `branch`: assembly of the arm, 1 or -1: see `inverse_kinematics`.
+    - `orientation`: the absolute angle of the last link [rad], th4 in the paper, by
+      default 0; None for an arm of two joints, whose last link turns as it must.
+    - `branch`: assembly of the arm, 1 (default) or -1: see `inverse_kinematics`.
 
     **Raises:** ValueError for malformed arguments. `check`, and so `simulate`, raises
     it for a path out of the linkage's reach, and a call where the tip is out of it.
@@ -319,8 +319,9 @@ class CircleTask(TipReference):
     - `center`: (x, y) [m].
     - `radius`: not negative [m].
     - `period`: time of one turn, counter-clockwise if positive, not zero [s].
-    - `phase`: direction of the starting point as seen from the centre [rad].
-    - `orientation`: th4, the absolute angle of the last link [rad].
+    - `phase`: direction of the starting point as seen from the centre [rad]; pi by
+      default.
+    - `orientation`: th4, the absolute angle of the last link [rad]; pi/2 by default.
     - `branch`: assembly of the arm, 1 or -1: see `inverse_kinematics`.
 
     **Raises:** ValueError for malformed arguments. `check`, and so `simulate`, raises
