@@ -152,9 +152,9 @@ def _control(
     jumps = known_times(args)
     implicit = isinstance(solver, diffrax.AbstractImplicitSolver)
     kind: Any = LocatedImplicit if implicit else Located
-    locate = lambda *settings: kind(*settings, derivatives)
+    locate = lambda *of_run: kind(*of_run, derivatives)
     wrapped, landing, start = located(locate, solver, term, ts, start, args, jumps)
-    checks_health = isinstance(solver, ScheduledDopri8)
+    watches = not isinstance(solver, ScheduledDopri8)  # which finds the health itself
     of_derivatives = None
     if tangents:
         of_derivatives = OfTangents()
@@ -162,9 +162,10 @@ def _control(
     # unresolved; a probe would make the steps resolve them.
     elif derivatives and not (implicit and own_controller is not None):
         has_tableau = isinstance(solver, ScheduledDopri8 | diffrax.AbstractRungeKutta)
+        # Of other solvers derivatives are judged as if they were by Heun's method.
         tableau: Any = solver.tableau if has_tableau else diffrax.Heun.tableau
         of_derivatives = OfLinearised(term, tableau)
-    settings = term, not checks_health, landing, of_derivatives
+    settings = term, watches, landing, of_derivatives
     control = lambda steps: StepControl(steps, *settings)  # pyright: ignore[reportCallIssue]
     return _Control(start, wrapped, with_error_control(control, steps), jumps)
 
