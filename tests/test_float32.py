@@ -106,6 +106,7 @@ def done():
     return run(PROGRAM)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("words", ["holds on 17 scenes", "tuned"])
 def test_single_precision(words, done):
     assert words in done.stdout, done.stderr[-3000:]

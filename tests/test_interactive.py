@@ -116,6 +116,7 @@ def test_the_way_of_the_sliders_does_not_matter(box):
     np.testing.assert_array_equal(box.move(kd_1=1.0), fresh)
 
 
+@pytest.mark.slow
 def test_failures_are_told_and_the_arm_still_drawn(box):
     before = box.pixels
     after = box.move(link_1=0.5, link_2=0.5)
@@ -127,6 +128,7 @@ def test_failures_are_told_and_the_arm_still_drawn(box):
     assert "out of steps" in box.words.value and "Ended at 0" in box.words.value
 
 
+@pytest.mark.slow
 def test_a_slider_starts_on_one_of_its_steps(box):
     """The browser would otherwise move the slider."""
     for name, part in box.parts.items():

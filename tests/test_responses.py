@@ -140,6 +140,7 @@ def test_a_report_is_shown(small):
     assert below.get_xscale() == "log"
 
 
+@pytest.mark.slow
 def test_malformed_tests_are_refused(arm):
     linkage, q = arm
     pd = controller_of(linkage, q)
