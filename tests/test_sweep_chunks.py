@@ -180,12 +180,12 @@ class Mixed(fj.Element):
 def test_numbers_of_any_type_are_taken_in_single_precision(single_precision):
     """NumPy's, of which some differ between members."""
     linkage, starts = pendulums(np.linspace(0, 1, 40))
-    mixed = Mixed(np.linspace(0.5, 1.5, 40), np.int64(1))
+    mixed = Mixed(np.repeat([0.5, 1.0], 20), np.int64(1))
     axes = (Mixed(0, None),)
     motion = fj.sweep(linkage, starts, TS, (mixed,), forces_axes=axes, chunk=20)
     alone = fj.sweep(linkage, starts, TS, (fj.JointDamper(2.0),), chunk=40)
     assert motion.q.dtype == np.float32 and successful(motion).all()
-    np.testing.assert_allclose(motion.q[20], alone.q[20], atol=0.02)
+    np.testing.assert_allclose(motion.q[20:], alone.q[20:], atol=1e-4)
 
 
 def test_cores_compute_in_the_precision_of_one_thread(monkeypatch, single_precision):

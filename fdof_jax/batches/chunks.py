@@ -148,7 +148,7 @@ def _form_of(
         return jax.ShapeDtypeStruct(shape, dtype, weak_type=weak)
 
     def cast(array: Array, kind: jax.ShapeDtypeStruct) -> Array:
-        """Returns an array in the program's type, to which no call converts it."""
+        """Returns an array in the type that the program takes: its call casts none."""
         array = in_numpy(array)
         return array if array.dtype == kind.dtype else array.astype(kind.dtype)
 
@@ -211,24 +211,24 @@ def _in_lanes(
 
     programs = _programs(form, devices)
     if devices == [None]:
-        for some in chunks:
-            yield some, solve(programs[0], rows_of(some), arrays)
+        for chunk in chunks:
+            yield chunk, solve(programs[0], rows_of(chunk), arrays)
         return
     running: dict[Future, tuple[int, np.ndarray]] = {}
     # Each device has up to two chunks: one that it solves, and the next.
     free = deque(2 * list(range(len(devices))))
-    for some in chunks:
+    for chunk in chunks:
         if not free:
-            for solved in wait(running, return_when=FIRST_COMPLETED).done:
-                number, members = running.pop(solved)
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                number, solved = running.pop(future)
                 free.append(number)
-                yield members, solved.result()
+                yield solved, future.result()
         number = free.popleft()
-        arguments = in_place((rows_of(some), arrays), devices[number])
-        solved = thread_of(devices[number]).submit(solve, programs[number], *arguments)
-        running[solved] = number, some
-    for solved in as_completed(running):
-        yield running[solved][1], solved.result()
+        arguments = in_place((rows_of(chunk), arrays), devices[number])
+        future = thread_of(devices[number]).submit(solve, programs[number], *arguments)
+        running[future] = number, chunk
+    for future in as_completed(running):
+        yield running[future][1], future.result()
 
 
 # Forecasts
