@@ -160,7 +160,7 @@ def _linearised(
     """Returns the matrix of the linearised equations of first order."""
     args, (term, start_of, _) = args_of(linkage, q, forces), formulation(forces)
     start = whole(*start_of(args, qd), initial_own(args, own))
-    return linearised(term, t, start, args)
+    return linearised(term, t, start, args, term.schedule(t, args))
 
 
 def check_arguments(forces: tuple[Element, ...]) -> None:

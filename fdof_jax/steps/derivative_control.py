@@ -110,10 +110,13 @@ class OfTangents(eqx.Module):
         return constant(ratio), probe
 
 
-def linearised(term: ScheduledTerm, t: Array, y: Integrated, args: Arguments) -> Array:
+@eqx.filter_jit  # traced once, not at each use in a solve
+def linearised(
+    term: ScheduledTerm, t: Array, y: Integrated, args: Arguments, scheduled: PyTree
+) -> Array:
     """Returns the derivative of the rates in the state's numbers, a square matrix."""
     numbers, state_of = ravel_pytree(y)
-    rates = lambda numbers: term.vf(t, state_of(numbers), args)
+    rates = lambda numbers: term.vector_field(t, state_of(numbers), args, scheduled)
     return jax.jacfwd(lambda numbers: ravel_pytree(rates(numbers))[0])(numbers)
 
 
@@ -139,8 +142,8 @@ class OfLinearised(eqx.Module):
     ) -> tuple[Array, Array]:
         """Returns the error of the probe over its tolerance, and the moved probe."""
         t0, t1, _, y1, args = step
-        at_end = constant((t1, motion_of(y1), in_force(args, y1)))
-        matrix = constant(t1 - t0) * linearised(self.term, *at_end)
+        at_end = t1, motion_of(y1), in_force(args, y1), estimate.scheduled
+        matrix = constant(t1 - t0) * linearised(self.term, *constant(at_end))
         change, error = self._step(matrix, probe)
         end = probe + change
         tolerance = jnp.maximum(_OF_PROBE, _noise(estimate.health))

@@ -35,6 +35,11 @@ def lower_triangle(tableau: diffrax.ButcherTableau) -> np.ndarray:
 
 LOWER = lower_triangle(TABLEAU)  # its last row gives the whole step
 NODES = np.concatenate([[0.0], TABLEAU.c])
+# Shares of a step at which what depends on time alone is computed: at the stages, and
+# in the longest gap between them, where switching functions are checked (see
+# zeros_in_steps.py).
+SCHEDULED = np.append(NODES, 0.8)
+AT_END = STAGES - 1
 _INTERPOLATION: Any = diffrax.Dopri8.interpolation_cls
 DENSE = _INTERPOLATION.eval_coeffs  # (stage, power), highest first
 
@@ -49,7 +54,7 @@ Health = tuple[Array, ...]  # one per joint, see `ScheduledTerm`
 class ScheduledTerm(diffrax.ODETerm):
     """A term whose vector field takes a fourth argument, which depends on time alone.
 
-    `schedule(t, args)` computes this argument, for all stages of a step at once.
+    `schedule(t, args)` computes this argument, at all times of `SCHEDULED` in a step.
     `health(t, y, args)` holds the loss of accuracy in the rates of each joint, at least
     1, or 0 where the equations are singular. `watched_field` returns the rates and
     their health, NaN if they are not finite.
@@ -111,7 +116,7 @@ class DenseOutput(diffrax.AbstractLocalInterpolation):
     y0: PyTree
     step: Array
     rates: PyTree
-    scheduled: PyTree  # what depends on time alone, at all stages
+    scheduled: PyTree  # what depends on time alone, by rows of `SCHEDULED`
 
     @abstractmethod
     def at(self, theta: Array) -> PyTree:
@@ -146,10 +151,11 @@ def health_if(finite: Array, health: Health) -> Health:
 
 
 class Estimate(NamedTuple):
-    """The error of a step and its `Health`, 1 if it is bad, as controllers get them."""
+    """The error of a step as controllers get it, with what is known at its end."""
 
     error: PyTree
-    health: Health
+    health: Health  # 1 if it is bad
+    scheduled: PyTree  # what depends on time alone
 
 
 def with_change(error: PyTree, change: Callable[[PyTree], PyTree]) -> PyTree:
@@ -159,15 +165,14 @@ def with_change(error: PyTree, change: Callable[[PyTree], PyTree]) -> PyTree:
     return change(error)
 
 
-def verdict(
-    error: PyTree, health: Health, h: Array
-) -> tuple[Estimate, diffrax.RESULTS]:
-    """Returns the estimated error of a step, replaced if its health is bad, and result.
+def verdict(estimate: Estimate, h: Array) -> tuple[Estimate, diffrax.RESULTS]:
+    """Returns the estimate of a step, replaced if its health is bad, and the result.
 
     The health is NaN for a step that is not finite, and 0 for a singular one. An
     infinite error rejects the step until it is short. diffrax ignores the results of
     rejected steps, so the short step is accepted, with error 0.
     """
+    error, health, scheduled = estimate
     singular, short = is_singular(health), jnp.abs(h) < SHORTEST[h.dtype]
     bad = singular | jnp.isnan(sum(health))
     results: Any = diffrax.RESULTS
@@ -175,4 +180,5 @@ def verdict(
     result = results.where(bad & short, kind, results.successful)
     imposed = jnp.where(short, 0, jnp.inf)
     error = jax.tree.map(lambda e: jnp.where(bad, imposed, e), error)
-    return Estimate(error, tuple(jnp.where(bad, 1, x) for x in health)), result
+    health = tuple(jnp.where(bad, 1, x) for x in health)
+    return Estimate(error, health, scheduled), result

@@ -15,11 +15,13 @@ from jax import Array
 from jaxtyping import PyTree
 
 from .dopri8 import (
+    AT_END,
     LOWER,
-    NODES,
+    SCHEDULED,
     STAGES,
     TABLEAU,
     DenseOutput,
+    Estimate,
     ScheduledDopri8,
     compensated,
     constant,
@@ -49,22 +51,24 @@ def _step(term: Any, t0, t1, y0, residue, args):
     The solver's state is the rounding error of `y`, which the next step adds (Kahan).
     """
     inner, h = term.term, term.contr(t0, t1)  # within a wrapper of diffrax
-    times = t0 + (t1 - t0) * jnp.asarray(NODES, t0.dtype)
+    times = t0 + (t1 - t0) * jnp.asarray(SCHEDULED, t0.dtype)
+    # In a loop of its own: as a vector, or within the loop of stages, it takes longer.
+    schedule = jax.lax.map(lambda t: inner.schedule(t, args), times)
     lower = jnp.asarray(LOWER, h.dtype)
 
     def stage(rates, row):
-        index, t, weights = row
-        scheduled = inner.schedule(t, args)  # of all stages at once it takes longer
+        index, t, weights, scheduled = row
         y = jax.tree.map(lambda a, k: a + h * k, y0, _weighted(weights, rates))
         rate, health = inner.watched_field(t, y, args, scheduled)
         rates = jax.tree.map(lambda ks, k: ks.at[index].set(k), rates, rate)
-        return rates, (health, scheduled)
+        return rates, health
 
     # The first rate is that of the last step's end. To evaluate it again costs a
     # fourteenth; to keep it, a second copy of the equations for the first step.
     rates = jax.tree.map(lambda y: jnp.zeros((STAGES, *y.shape), y.dtype), y0)
-    stages = jnp.arange(STAGES), times, lower
-    rates, (healths, schedule) = jax.lax.scan(stage, rates, stages)
+    of_stages = jax.tree.map(lambda rows: rows[:STAGES], schedule)
+    rows = jnp.arange(STAGES), times[:STAGES], lower, of_stages
+    rates, healths = jax.lax.scan(stage, rates, rows)
     change = jax.tree.map(lambda k, c: h * k + c, _weighted(lower[-1], rates), residue)
     y, residue = compensated(y0, change)
     weights = jnp.asarray(TABLEAU.b_error, h.dtype)
@@ -76,7 +80,8 @@ def _step(term: Any, t0, t1, y0, residue, args):
     health = tuple(jnp.where(finite, x[-1], x[0]) for x in healths)
     health = health_if(finite, health)
     y = jax.tree.map(lambda a: jnp.where(finite, a, jnp.nan), y)
-    error, result = verdict(error, constant(health), h)
+    scheduled = jax.tree.map(lambda rows: rows[AT_END], schedule)
+    error, result = verdict(Estimate(error, constant(health), scheduled), h)
     dense_info = dict(y0=y0, step=h, rates=rates, scheduled=schedule)
     return y, error, dense_info, constant(residue), result
 

@@ -45,7 +45,7 @@ def above_rounding(
 
     `of_derivatives`: the error of derivatives over their tolerance, which counts too.
     """
-    error, health = estimate
+    error, health, _ = estimate
     same_step = _same_step(control.controller, order)
     of_qd = _rounding(real_joints(args.linkage.ef), health, y0, y1)
     of_delta = jax.tree.map(lambda noise: jnp.abs(h) * noise, of_qd)

@@ -386,13 +386,8 @@ def _values(
     shares = jnp.asarray([*SHARES, *CHECKS], t0.dtype)
     times = t0 + shares * (t1 - t0)
     if isinstance(path, DenseOutput):
-        stages = np.array((*SAMPLED, *CHECKED))
-        last = term.schedule(times[-1], args)
-        scheduled = jax.tree.map(
-            lambda rows, row: jnp.concatenate([rows[stages], row[None]]),
-            path.scheduled,
-            last,
-        )
+        places = np.array((*SAMPLED, *CHECKED))
+        scheduled = jax.tree.map(lambda rows: rows[places], path.scheduled)
         one = lambda row: term.switching(row[1], path.at(row[0]), args, row[2])[0]
         rows = shares, times, scheduled
         values = jax.vmap(one)(rows)

@@ -19,11 +19,13 @@ from jaxtyping import PyTree
 
 from ..base.one_loop import entries_in_one_loop, in_one_loop
 from .dopri8 import (
+    AT_END,
     DENSE,
     LOWER,
-    NODES,
+    SCHEDULED,
     TABLEAU,
     DenseOutput,
+    Estimate,
     Health,
     ScheduledDopri8,
     chosen,
@@ -77,9 +79,9 @@ def _moved(y: State, h: Array, rate: State) -> State:
 class _Step(NamedTuple):
     """The end of a step, the step's error and what the next step needs.
 
-    `rate` and its `health` are those at the end. `residue` is the rounding error of
-    `y`, which the next step adds (Kahan): over 1000 s of Fig 5 in steps of 2.5 ms the
-    energy drifts by 3e-11 J, not 1.5e-10 J.
+    `rate`, its `health` and `scheduled` are those at the end. `residue` is the rounding
+    error of `y`, which the next step adds (Kahan): over 1000 s of Fig 5 in steps of
+    2.5 ms the energy drifts by 3e-11 J, not 1.5e-10 J.
     """
 
     y: State
@@ -87,12 +89,13 @@ class _Step(NamedTuple):
     residue: State
     rate: State
     health: Health
+    scheduled: PyTree
 
 
 @eqx.filter_jit  # traced once, not at each use in a solve
 def _step(term, t0, t1, y0, residue, args, f0) -> tuple[_Step, dict[str, PyTree]]:
     inner, h = term.term, term.contr(t0, t1)  # within a wrapper of diffrax
-    times = t0 + (t1 - t0) * jnp.asarray(NODES, t0.dtype)
+    times = t0 + (t1 - t0) * jnp.asarray(SCHEDULED, t0.dtype)
     # XLA makes vectors of the lanes, not of all stages of each, only in a loop.
     schedule = jax.lax.map(
         lambda t: entries_in_one_loop(inner.schedule(t, args)), times
@@ -109,9 +112,10 @@ def _step(term, t0, t1, y0, residue, args, f0) -> tuple[_Step, dict[str, PyTree]
     poison = 0 * sum(jax.tree.leaves(y))
     y = jax.tree.map(lambda a: a + poison, y)
     y, error, residue = in_one_loop((y, error, residue))
-    last, health = inner.watched_field(times[-1], y, args, scheduled(-1))
+    at_end = scheduled(AT_END)
+    last, health = inner.watched_field(times[AT_END], y, args, at_end)
     dense_info = dict(y0=y0, step=h, rates=[*rates, last], scheduled=schedule)
-    return _Step(y, error, residue, last, health), dense_info
+    return _Step(y, error, residue, last, health, at_end), dense_info
 
 
 class _Interpolation(DenseOutput):
@@ -150,5 +154,6 @@ class UnrolledDopri8(ScheduledDopri8):
         # A singular start makes the end not finite.
         singular = is_singular(health)
         health = tuple(jnp.where(singular, 0, x) for x in end.health)
-        error, result = verdict(end.error, health, dense_info["step"])
+        estimate = Estimate(end.error, health, end.scheduled)
+        error, result = verdict(estimate, dense_info["step"])
         return end.y, error, dense_info, ((end.rate, end.health), end.residue), result
