@@ -3,6 +3,7 @@
 import functools
 import re
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import pytest
@@ -88,6 +89,33 @@ def test_a_model_costs_only_the_controllers_that_have_one():
     assert plain == 36 < held <= 351 and computed <= 850
 
 
+def inner(equation):
+    """Returns the programs in an equation; older versions of JAX do not."""
+    parts = jax.tree.leaves(equation.params)
+    held = [part for part in parts if isinstance(part, Jaxpr | ClosedJaxpr)]
+    return [getattr(part, "jaxpr", part) for part in held]
+
+
+@pytest.mark.parametrize("derivatives", [False, True])
+def test_what_depends_on_time_alone_is_computed_once_a_step(derivatives):
+    """Also where efforts have limits, and where derivatives need short steps."""
+    scene = scenes.fig7()
+
+    def motion(gain):
+        follow = lambda t, linkage: (jnp.sinh(t) * jnp.ones(3), jnp.zeros(3))
+        pd = fj.PDController(gain, 10.0, [100.0, 30.0, 40.0], follow)
+        forward = diffrax.ForwardMode()
+        return fj.simulate(*scene[:2], [0, 1.0], (pd,), adjoint=forward).q
+
+    def count(jaxpr):
+        own = sum(equation.primitive.name == "sinh" for equation in jaxpr.eqns)
+        parts = (part for equation in jaxpr.eqns for part in inner(equation))
+        return own + sum(map(count, parts))
+
+    motion = jax.jacfwd(motion) if derivatives else motion
+    assert count(jax.make_jaxpr(motion)(100.0).jaxpr) == 1
+
+
 def stacked_in_loops(forces):
     """Returns whether the loops of a solve stack or concatenate arrays."""
     linkage = scenes.fig5().linkage
@@ -95,12 +123,6 @@ def stacked_in_loops(forces):
     def motion(q):
         state = fj.State(q, jnp.zeros(3))
         return fj.simulate(linkage, state, [0, 1.0], forces, throw=False).q
-
-    def inner(equation):
-        """Returns the programs in an equation; older versions of JAX do not."""
-        parts = jax.tree.leaves(equation.params)
-        held = [part for part in parts if isinstance(part, Jaxpr | ClosedJaxpr)]
-        return [getattr(part, "jaxpr", part) for part in held]
 
     def found(jaxpr, inside):
         names = {"stack", "concatenate"} if inside else set()

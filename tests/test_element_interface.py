@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -173,6 +174,39 @@ def test_one_time_of_a_jump_needs_no_list():
         args = args_of(ARM, ZERO, (pd, Raised(time)))
         ends.append(known_times(clocks_apart(args, TS)))
     np.testing.assert_array_equal(*ends)
+
+
+class Shifts(fj.forces.element.ScalarElement):
+    """Efforts from a table: which, and whether, are a whole number and a flag."""
+
+    levels: fj.Values = fj.field((None,), unit="N m")
+
+    @property
+    def jump_ts(self):
+        return jnp.array([0.25, 0.5, 0.6, 0.75])
+
+    def schedule(self, t, linkage):
+        return jnp.floor(4 * t).astype(int), t < 0.6
+
+    def respond(self, scheduled, q, qd, linkage):
+        which, on = scheduled
+        effort = self.levels[jnp.minimum(which, 3)]
+        return tuple(jnp.where(~on, 0.0, effort) - rate for rate in qd)
+
+
+def test_a_schedule_of_whole_numbers_and_flags():
+    forward = dict(adjoint=diffrax.ForwardMode())
+    start = fj.State(ZERO, ZERO)
+
+    def ends(levels, **options):
+        return fj.simulate(ARM, start, TS, (Shifts(levels),), **options).q[-1]
+
+    levels = np.array([1.0, -2.0, 3.0, 5.0])
+    slopes = jax.jacfwd(lambda x: ends(x, **forward))(levels)
+    steps = 1e-4 * np.eye(4)
+    differences = [(ends(levels + d) - ends(levels - d)) / 2e-4 for d in steps]
+    np.testing.assert_allclose(slopes, np.transpose(differences), atol=1e-7)
+    assert not slopes[:, 3].any() and (abs(slopes[:, :3]) > 1e-3).all()
 
 
 # Callables of other kinds

@@ -114,7 +114,10 @@ class OfTangents(eqx.Module):
 def linearised(
     term: ScheduledTerm, t: Array, y: Integrated, args: Arguments, scheduled: PyTree
 ) -> Array:
-    """Returns the derivative of the rates in the state's numbers, a square matrix."""
+    """Returns the derivative of the rates in the state's numbers, a square matrix.
+
+    `scheduled`: what depends on time alone, at `t`.
+    """
     numbers, state_of = ravel_pytree(y)
     rates = lambda numbers: term.vector_field(t, state_of(numbers), args, scheduled)
     return jax.jacfwd(lambda numbers: ravel_pytree(rates(numbers))[0])(numbers)
@@ -142,7 +145,10 @@ class OfLinearised(eqx.Module):
     ) -> tuple[Array, Array]:
         """Returns the error of the probe over its tolerance, and the moved probe."""
         t0, t1, _, y1, args = step
-        at_end = t1, motion_of(y1), in_force(args, y1), estimate.scheduled
+        scheduled = estimate.scheduled
+        if scheduled is None:
+            scheduled = self.term.schedule(t1, args)
+        at_end = t1, motion_of(y1), in_force(args, y1), scheduled
         matrix = constant(t1 - t0) * linearised(self.term, *constant(at_end))
         change, error = self._step(matrix, probe)
         end = probe + change

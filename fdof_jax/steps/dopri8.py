@@ -35,11 +35,10 @@ def lower_triangle(tableau: diffrax.ButcherTableau) -> np.ndarray:
 
 LOWER = lower_triangle(TABLEAU)  # its last row gives the whole step
 NODES = np.concatenate([[0.0], TABLEAU.c])
-# Shares of a step at which what depends on time alone is computed: at the stages, and
-# in the longest gap between them, where switching functions are checked (see
-# zeros_in_steps.py).
-SCHEDULED = np.append(NODES, 0.8)
-AT_END = STAGES - 1
+# Shares of a step at which schedules are computed: those of the stages, the last of which
+# is at the end, and one in the longest gap between them, for switching functions.
+SCHEDULE_SHARES = np.append(NODES, 0.8)
+AT_END, IN_GAP = STAGES - 1, STAGES  # rows of a schedule
 _INTERPOLATION: Any = diffrax.Dopri8.interpolation_cls
 DENSE = _INTERPOLATION.eval_coeffs  # (stage, power), highest first
 
@@ -54,7 +53,7 @@ Health = tuple[Array, ...]  # one per joint, see `ScheduledTerm`
 class ScheduledTerm(diffrax.ODETerm):
     """A term whose vector field takes a fourth argument, which depends on time alone.
 
-    `schedule(t, args)` computes this argument, at all times of `SCHEDULED` in a step.
+    `schedule(t, args)` computes this argument, at all `SCHEDULE_SHARES` of a step.
     `health(t, y, args)` holds the loss of accuracy in the rates of each joint, at least
     1, or 0 where the equations are singular. `watched_field` returns the rates and
     their health, NaN if they are not finite.
@@ -116,7 +115,7 @@ class DenseOutput(diffrax.AbstractLocalInterpolation):
     y0: PyTree
     step: Array
     rates: PyTree
-    scheduled: PyTree  # what depends on time alone, by rows of `SCHEDULED`
+    scheduled: PyTree  # what depends on time alone, at `SCHEDULE_SHARES`
 
     @abstractmethod
     def at(self, theta: Array) -> PyTree:
@@ -151,11 +150,25 @@ def health_if(finite: Array, health: Health) -> Health:
 
 
 class Estimate(NamedTuple):
-    """The error of a step as controllers get it, with what is known at its end."""
+    """The error of a step as controllers get it, and what is known of its end.
+
+    - `health`: the `Health` there, 1 if that is bad.
+    - `scheduled`: what depends on time alone there, None where that is not known.
+    """
 
     error: PyTree
-    health: Health  # 1 if it is bad
-    scheduled: PyTree  # what depends on time alone
+    health: Health
+    scheduled: PyTree = None
+
+
+def scheduled_at_end(schedule: PyTree) -> PyTree:
+    """Returns the row of a step's schedule that belongs into its `Estimate`.
+
+    It is None if there are whole numbers or flags, as diffrax makes floats of them.
+    """
+    row = jax.tree.map(lambda rows: rows[AT_END], schedule)
+    floating = all(map(eqx.is_inexact_array, jax.tree.leaves(row)))
+    return row if floating else None
 
 
 def with_change(error: PyTree, change: Callable[[PyTree], PyTree]) -> PyTree:
@@ -166,7 +179,7 @@ def with_change(error: PyTree, change: Callable[[PyTree], PyTree]) -> PyTree:
 
 
 def verdict(estimate: Estimate, h: Array) -> tuple[Estimate, diffrax.RESULTS]:
-    """Returns the estimate of a step, replaced if its health is bad, and the result.
+    """Returns an estimate, its error and health replaced if that is bad, and a result.
 
     The health is NaN for a step that is not finite, and 0 for a singular one. An
     infinite error rejects the step until it is short. diffrax ignores the results of

@@ -133,8 +133,7 @@ class StepControl(Adaptive):
         health: Health = self.term.health(*constant((t1, end, args)))
         health = health_if(finite, health)
         bad = jnp.isnan(sum(health)) | is_singular(health)
-        scheduled = self.term.schedule(t1, args)
-        estimate, failure = verdict(Estimate(error, health, scheduled), t1 - t0)
+        estimate, failure = verdict(Estimate(error, health), t1 - t0)
         # The error is scaled by the state, which must be finite for that.
         return chosen(bad, y0, y1), estimate, failure
 

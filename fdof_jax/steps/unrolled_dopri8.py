@@ -22,7 +22,7 @@ from .dopri8 import (
     AT_END,
     DENSE,
     LOWER,
-    SCHEDULED,
+    SCHEDULE_SHARES,
     TABLEAU,
     DenseOutput,
     Estimate,
@@ -32,6 +32,7 @@ from .dopri8 import (
     compensated,
     interpolation_weights,
     is_singular,
+    scheduled_at_end,
     verdict,
 )
 
@@ -79,9 +80,9 @@ def _moved(y: State, h: Array, rate: State) -> State:
 class _Step(NamedTuple):
     """The end of a step, the step's error and what the next step needs.
 
-    `rate`, its `health` and `scheduled` are those at the end. `residue` is the rounding
-    error of `y`, which the next step adds (Kahan): over 1000 s of Fig 5 in steps of
-    2.5 ms the energy drifts by 3e-11 J, not 1.5e-10 J.
+    `rate` and its `health` are those at the end. `residue` is the rounding error of
+    `y`, which the next step adds (Kahan): over 1000 s of Fig 5 in steps of 2.5 ms the
+    energy drifts by 3e-11 J, not 1.5e-10 J.
     """
 
     y: State
@@ -89,13 +90,12 @@ class _Step(NamedTuple):
     residue: State
     rate: State
     health: Health
-    scheduled: PyTree
 
 
 @eqx.filter_jit  # traced once, not at each use in a solve
 def _step(term, t0, t1, y0, residue, args, f0) -> tuple[_Step, dict[str, PyTree]]:
     inner, h = term.term, term.contr(t0, t1)  # within a wrapper of diffrax
-    times = t0 + (t1 - t0) * jnp.asarray(SCHEDULED, t0.dtype)
+    times = t0 + (t1 - t0) * jnp.asarray(SCHEDULE_SHARES, t0.dtype)
     # XLA makes vectors of the lanes, not of all stages of each, only in a loop.
     schedule = jax.lax.map(
         lambda t: entries_in_one_loop(inner.schedule(t, args)), times
@@ -112,10 +112,9 @@ def _step(term, t0, t1, y0, residue, args, f0) -> tuple[_Step, dict[str, PyTree]
     poison = 0 * sum(jax.tree.leaves(y))
     y = jax.tree.map(lambda a: a + poison, y)
     y, error, residue = in_one_loop((y, error, residue))
-    at_end = scheduled(AT_END)
-    last, health = inner.watched_field(times[AT_END], y, args, at_end)
+    last, health = inner.watched_field(times[AT_END], y, args, scheduled(AT_END))
     dense_info = dict(y0=y0, step=h, rates=[*rates, last], scheduled=schedule)
-    return _Step(y, error, residue, last, health, at_end), dense_info
+    return _Step(y, error, residue, last, health), dense_info
 
 
 class _Interpolation(DenseOutput):
@@ -154,6 +153,7 @@ class UnrolledDopri8(ScheduledDopri8):
         # A singular start makes the end not finite.
         singular = is_singular(health)
         health = tuple(jnp.where(singular, 0, x) for x in end.health)
-        estimate = Estimate(end.error, health, end.scheduled)
+        scheduled = scheduled_at_end(dense_info["scheduled"])
+        estimate = Estimate(end.error, health, scheduled)
         error, result = verdict(estimate, dense_info["step"])
         return end.y, error, dense_info, ((end.rate, end.health), end.residue), result

@@ -12,16 +12,16 @@ import numpy as np
 from jax import Array
 
 from ..base.one_loop import in_one_loop
-from .dopri8 import SCHEDULED
+from .dopri8 import AT_END, IN_GAP, SCHEDULE_SHARES
 
 # Samples are taken at stages of the method of order 8, for which the integrators have
 # evaluated what depends on time alone.
-SAMPLED = 0, 3, 5, 7, 8, 9, 10, 13
-SHARES = SCHEDULED[list(SAMPLED)]  # of the step
+SAMPLED = 0, 3, 5, 7, 8, 9, 10, AT_END
+SHARES = SCHEDULE_SHARES[list(SAMPLED)]  # of the step
 # Between them, further samples show whether the polynomials hold: at two more stages,
 # and within the longest gap.
-CHECKED = 1, 4, 14
-CHECKS = SCHEDULED[list(CHECKED)]
+CHECKED = 1, 4, IN_GAP
+CHECKS = SCHEDULE_SHARES[list(CHECKED)]
 # The polynomials are sums of Chebyshev's, in x from -1 to 1 along the step.
 _ORDERS = np.arange(len(SHARES))
 _BASIS = np.polynomial.chebyshev.chebvander
