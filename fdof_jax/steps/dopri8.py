@@ -35,8 +35,8 @@ def lower_triangle(tableau: diffrax.ButcherTableau) -> np.ndarray:
 
 LOWER = lower_triangle(TABLEAU)  # its last row gives the whole step
 NODES = np.concatenate([[0.0], TABLEAU.c])
-# Shares of a step at which schedules are computed: those of the stages, the last of which
-# is at the end, and one in the longest gap between them, for switching functions.
+# Shares of a step at which schedules are computed: those of the stages, the last one at
+# the end, and one in the longest gap between them, for switching functions.
 SCHEDULE_SHARES = np.append(NODES, 0.8)
 AT_END, IN_GAP = STAGES - 1, STAGES  # rows of a schedule
 _INTERPOLATION: Any = diffrax.Dopri8.interpolation_cls
