@@ -67,7 +67,7 @@ class Element(Part):
     potential_energy = default(lambda self: None)
 
     def schedule(self, t: Array, linkage: Linkage) -> PyTree:
-        """Computes what depends on time alone, for all stages of a step at once."""
+        """Computes what depends on time alone; a step does so before its stages."""
         return ()
 
     def initial_state(self, linkage: Linkage) -> PyTree:

@@ -34,10 +34,9 @@ def lower_triangle(tableau: diffrax.ButcherTableau) -> np.ndarray:
 
 
 LOWER = lower_triangle(TABLEAU)  # its last row gives the whole step
-NODES = np.concatenate([[0.0], TABLEAU.c])
 # Shares of a step at which schedules are computed: those of the stages, the last one at
 # the end, and one in the longest gap between them, for switching functions.
-SCHEDULE_SHARES = np.append(NODES, 0.8)
+SCHEDULE_SHARES = np.concatenate([[0.0], TABLEAU.c, [0.8]])
 AT_END, IN_GAP = STAGES - 1, STAGES  # rows of a schedule
 _INTERPOLATION: Any = diffrax.Dopri8.interpolation_cls
 DENSE = _INTERPOLATION.eval_coeffs  # (stage, power), highest first
@@ -53,7 +52,7 @@ Health = tuple[Array, ...]  # one per joint, see `ScheduledTerm`
 class ScheduledTerm(diffrax.ODETerm):
     """A term whose vector field takes a fourth argument, which depends on time alone.
 
-    `schedule(t, args)` computes this argument, at all `SCHEDULE_SHARES` of a step.
+    `schedule(t, args)` computes this argument, in steps at all `SCHEDULE_SHARES`.
     `health(t, y, args)` holds the loss of accuracy in the rates of each joint, at least
     1, or 0 where the equations are singular. `watched_field` returns the rates and
     their health, NaN if they are not finite.
@@ -162,7 +161,7 @@ class Estimate(NamedTuple):
 
 
 def scheduled_at_end(schedule: PyTree) -> PyTree:
-    """Returns the row of a step's schedule that belongs into its `Estimate`.
+    """Returns the row of a step's schedule for its `Estimate`.
 
     It is None if there are whole numbers or flags, as diffrax makes floats of them.
     """
