@@ -14,6 +14,7 @@ from hard.scenes import Breaking
 from helpers import random_linkage
 from modes import ADJOINT
 from sweep_batch import (
+    CHUNK,
     FAILED,
     FAST,
     NAN_LATER,
@@ -254,6 +255,13 @@ def test_a_gradient_is_compiled_once():
 
 def ramp(t, linkage):
     return jnp.ones(3) * t, jnp.ones(3)
+
+
+def test_a_motion_keeps_its_times_when_their_array_changes(batch):
+    ts = TS.copy()
+    motion = fj.sweep(*batch[:2], ts, batch[2], forces_axes=0, chunk=CHUNK, **SETTINGS)
+    ts[:] = 0
+    np.testing.assert_array_equal(motion.ts[0], TS)
 
 
 @pytest.mark.slow

@@ -99,7 +99,7 @@ def numpy_array(value: object) -> np.ndarray:
     return np.asarray(value)
 
 
-def real_array(
+def real_numbers(
     name: str,
     value: object,
     shape: tuple[int | str | None, ...],
@@ -110,9 +110,10 @@ def real_array(
     broadcast: bool = False,
     unit: str = "",
     of: str = "",
-) -> Array:
+) -> Array | np.ndarray:
     """Returns `value` as an array of the default float dtype and the given shape.
 
+    It is a copy in NumPy, or JAX's if `value` is traced or such an array already.
     `None` in `shape` stands for any length, and JOINT for that of any arm. `broadcast`
     also accepts one number for all entries, and repeats it if the shape is known.
     Raises ValueError for a wrong shape, a type that is not real numbers, NaN,
@@ -150,7 +151,7 @@ def real_array(
     if not fits and not (broadcast and array.ndim == 0):
         raise refuse(f"shape {array.shape}" if array.ndim else shown(value))
     if not traced:
-        kept = np.asarray(array, dtype=jnp.result_type(float))
+        kept = np.array(array, dtype=jnp.result_type(float))
         bad = ~np.isfinite(kept) if finite else np.isnan(kept)
         if minimum is not None:
             bad |= kept < minimum
@@ -169,10 +170,19 @@ def real_array(
         ):
             return value
         array = kept
-    # NumPy broadcasts concrete values without compiling a program.
     if not fits and JOINT not in shape:
         array = (jnp if traced else np).broadcast_to(array, shape)  # type: ignore[arg-type]
-    return jnp.asarray(array, dtype=float)  # else JAX 0.12 compiles for each shape
+    return jnp.asarray(array, dtype=float) if traced else array
+
+
+def real_array(
+    name: str, value: object, shape: tuple[int | str | None, ...], **rules: Any
+) -> Array:
+    """Returns the `real_numbers` as an array of JAX."""
+    numbers = real_numbers(name, value, shape, **rules)
+    if isinstance(numbers, Array):
+        return numbers
+    return jnp.asarray(numbers, dtype=float)  # else JAX 0.12 compiles for each shape
 
 
 def radians(name: str, angles: np.ndarray) -> None:
@@ -197,7 +207,7 @@ def single_precision(name: str, tree: PyTree) -> None:
         )
 
 
-def increasing(name: str, times: Array) -> None:
+def increasing(name: str, times: Array | np.ndarray) -> None:
     """Raises ValueError if there are no times, or if known ones do not increase."""
     if times.size == 0:
         raise ValueError(f"{name}: expected increasing times, at least one, got none.")

@@ -76,19 +76,19 @@ def batch_of(
     except ValueError:
         expected = "0, None or a tuple of these with one entry per element"
         raise refusal("forces_axes", expected, forces_axes) from None
-    sizes = {
-        _name(*path): np.shape(leaf)[:1]
+    axes = [
+        (path, np.shape(leaf)[:1])
         for (path, leaf), has_axis in zip(leaves, batched)
         if has_axis
-    }
-    different = set(sizes.values())
+    ]
+    different = {size for _, size in axes}
     if different == {(0,)}:
         raise ValueError(
             "linkage, state0, forces: expected a batch of at least one member, got 0."
         )
     if len(different) != 1 or different == {()}:
         got = [
-            f"{name}: {size[0] if size else 'no axis'}" for name, size in sizes.items()
+            f"{_name(*path)}: {size[0] if size else 'no axis'}" for path, size in axes
         ]
         unsaid = forces and not (got or jax.tree.leaves(forces_axes))
         hint = " (pass forces_axes=0 if those of `forces` have one)" if unsaid else ""

@@ -2,7 +2,7 @@
 
 import functools
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import (
     FIRST_COMPLETED,
     Future,
@@ -51,7 +51,7 @@ class Common(NamedTuple):
     """The arguments that all members of a sweep have in common."""
 
     shared: PyTree  # of a `Batch`
-    ts: Array
+    ts: Array | np.ndarray
     settings: Settings
     reduce: Callable[[Scene, Solution], PyTree]
 
@@ -133,6 +133,11 @@ class Form(NamedTuple):
         )
 
 
+@functools.lru_cache
+def _kind(shape: tuple[int, ...], dtype: Any, weak: bool) -> jax.ShapeDtypeStruct:
+    return jax.ShapeDtypeStruct(shape, dtype, weak_type=weak)
+
+
 def _is_kind(leaf: object) -> bool:
     return isinstance(leaf, jax.ShapeDtypeStruct)
 
@@ -144,13 +149,12 @@ def _form_of(
 
     def kind(array: Array, shape: tuple[int, ...]) -> jax.ShapeDtypeStruct:
         dtype = jax.dtypes.canonicalize_dtype(array.dtype, allow_extended_dtype=True)
-        weak = getattr(array, "weak_type", False)
-        return jax.ShapeDtypeStruct(shape, dtype, weak_type=weak)
+        return _kind(shape, dtype, getattr(array, "weak_type", False))
 
-    def cast(array: Array, kind: jax.ShapeDtypeStruct) -> Array:
-        """Returns an array in the type that the program takes: its call casts none."""
-        array = in_numpy(array)
-        return array if array.dtype == kind.dtype else array.astype(kind.dtype)
+    def cast(arrays: list[Array], kinds: Sequence[jax.ShapeDtypeStruct]) -> list[Array]:
+        """Returns arrays in the types that the program takes: its call casts none."""
+        pairs = zip(in_numpy(arrays), kinds)
+        return [a if a.dtype == k.dtype else a.astype(k.dtype) for a, k in pairs]
 
     members, structure = jax.tree.flatten(job.moving)
     kinds = tuple(kind(a, (lanes, *a.shape[1:])) for a in members)
@@ -162,10 +166,11 @@ def _form_of(
     ef = job.common.shared[0].ef
     leaves = [tuple(x.tolist()) if x is ef else x for x in leaves]
     common = tuple(kind(x, x.shape) if eqx.is_array(x) else x for x in leaves)
+    arrays = [leaf for leaf, own in zip(leaves, common) if _is_kind(own)]
     return (
         Form(function, structure, kinds, others, common),
-        [*map(cast, members, kinds)],
-        [cast(x, own) for x, own in zip(leaves, common) if _is_kind(own)],
+        cast(members, kinds),
+        cast(arrays, [*filter(_is_kind, common)]),
     )
 
 
@@ -206,13 +211,13 @@ def _in_lanes(
     form, leaves, arrays = _form_of(function, job, lanes)
 
     def rows_of(members: np.ndarray) -> list[Array]:
-        rows = np.append(members, np.full(lanes - len(members), members[-1]))
+        rows = members[np.minimum(np.arange(lanes), len(members) - 1)]
         return [leaf[rows] for leaf in leaves]
 
     programs = _programs(form, devices)
     if devices == [None]:
         for chunk in chunks:
-            yield chunk, solve(programs[0], rows_of(chunk), arrays)
+            yield chunk, jax.block_until_ready(programs[0](rows_of(chunk), arrays))
         return
     running: dict[Future, tuple[int, np.ndarray]] = {}
     # Each device has up to two chunks: one that it solves, and the next.
@@ -234,7 +239,7 @@ def _in_lanes(
 # Forecasts
 
 
-def expected_work(ts: Array, moving: PyTree, shared: PyTree) -> Array:
+def expected_work(ts: Array | np.ndarray, moving: PyTree, shared: PyTree) -> Array:
     """Computes for each member a number that grows with its steps.
 
     It combines the joints' rates and accelerations, averaged over the beginning of the
@@ -309,9 +314,7 @@ def _outcomes(common: Common, moving: PyTree) -> Outcome:
 
 
 def in_chunks(
-    job: Job,
-    meter: diffrax.AbstractProgressMeter = diffrax.NoProgressMeter(),
-    on_device: bool = True,
+    job: Job, meter: diffrax.AbstractProgressMeter | None = None, on_device: bool = True
 ) -> Outcome:
     """Returns the outcomes of all members; unless `on_device`, in NumPy's arrays."""
     size, devices = job.size, job.devices
@@ -326,17 +329,19 @@ def in_chunks(
     # written faster; their own order, restored at the end, takes more memory.
     place = np.argsort(order) if on_device else np.arange(size)
     done, results, structure, remaining = 0, [], None, order
-    progress, advance = meter.init(), meter.step  # looked up at each use it is slow
+    progress = meter.init() if meter else None
     while len(remaining):
         postponed = []
         for members, outcome in _in_lanes(_outcomes, job, devices, remaining, lanes):
             postponed.append(members[np.asarray(outcome.stopped)[: len(members)]])
             done += len(members) - len(postponed[-1])
-            progress = advance(progress, np.asarray(done / size))
+            if meter:
+                progress = meter.step(progress, np.asarray(done / size))
             values, structure = jax.tree.flatten(outcome)
             if not results:
                 if done == size == lanes:  # a single chunk, in order
-                    meter.close(progress)
+                    if meter:
+                        meter.close(progress)
                     if devices == [None]:
                         return outcome
                     whole = jax.tree.map(np.asarray, outcome)
@@ -350,7 +355,8 @@ def in_chunks(
         remaining = np.concatenate(postponed)
         if 0 < len(remaining) <= lanes // _SMALL:
             lanes = _lanes(min(len(remaining), _SMALL), job.chunk)
-    meter.close(progress)
+    if meter:
+        meter.close(progress)
     if on_device:
         for index, leaf in enumerate(results):
             results[index] = leaf[place]

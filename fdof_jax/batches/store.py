@@ -110,8 +110,8 @@ class Store:
     """
 
     def __init__(
-        self, folder: Path, batch: Batch, ts: Array, like: PyTree, sweep: str,
-        chunk: int,
+        self, folder: Path, batch: Batch, ts: Array | np.ndarray, like: PyTree,
+        sweep: str, chunk: int,
     ):  # fmt: skip
         """Writes the metadata of the group, or checks what is there.
 
@@ -145,8 +145,8 @@ class Store:
         self.arrays = [group[v.name].with_config(everything) for v in self.variables]
 
     def _empty(
-        self, zarr: ModuleType, attributes: dict, linkage: Linkage, ts: Array,
-        like: PyTree,
+        self, zarr: ModuleType, attributes: dict, linkage: Linkage,
+        ts: Array | np.ndarray, like: PyTree,
     ) -> dict[str, bytes]:  # fmt: skip
         """Returns the files of the group without any member, the group's own first."""
         memory = {}

@@ -7,7 +7,6 @@ batch of slow members.
 """
 
 import contextlib
-import dataclasses
 import inspect
 import os
 from collections.abc import Callable, Iterator, Sequence
@@ -29,7 +28,7 @@ from ..base.checks import (
     is_traced,
     is_transformed,
     numpy_array,
-    real_array,
+    real_numbers,
     refusal,
     shown,
     whole_number,
@@ -59,7 +58,7 @@ _CHUNK_HELD = 64
 
 def _without_times(_: Scene, solution: Solution) -> Solution:
     """Leaves out the output times, which all members have in common."""
-    return eqx.tree_at(lambda s: s.ts, solution, None)
+    return eqx.tree_at(lambda s: s.ts, solution, solution.ts[:0])
 
 
 def _of_member(reduce: Callable) -> Callable:
@@ -121,7 +120,9 @@ def _check_elements(batch: Batch) -> None:
 
 
 @contextlib.contextmanager
-def _naming_axes(batch: Batch, ts: Array, forces_axes: ForcesAxes) -> Iterator[None]:
+def _naming_axes(
+    batch: Batch, ts: Array | np.ndarray, forces_axes: ForcesAxes
+) -> Iterator[None]:
     """Names `forces_axes` in errors of elements that do not work for one member."""
     try:
         yield
@@ -207,7 +208,7 @@ def sweep(
         q, qd = (jnp.asarray(a) if is_traced(a) else numpy_array(a) for a in state0)
     except (TypeError, ValueError):
         raise refusal("state0", "a State(q, qd)", state0) from None
-    ts = real_array("ts", ts, (None,))
+    ts = real_numbers("ts", ts, (None,))
     # Other kinds than real numbers are refused by `batch_of`.
     other = lambda a: a.dtype != ts.dtype and a.dtype.kind in "iuf"
     state0 = State(*(a.astype(ts.dtype) if other(a) else a for a in (q, qd)))
@@ -254,11 +255,12 @@ def sweep(
 
     def solved(solve: Callable[[Job], _T]) -> _T:
         def run(forces, reduce):
-            own = Common((*shared[:2], forces), ts, settings, reduce)
+            keep = _without_times if reduce is None else reduce
+            own = Common((*shared[:2], forces), ts, settings, keep)
             return solve(Job(moving, own, size, chunk, devices))
 
         with devices_outside_mesh() as devices:
-            return sharing_functions(run, forces=shared[2], reduce=keep)
+            return sharing_functions(run, forces=shared[2], reduce=reduce)
 
     value: PyTree = None
     failures: Sequence[int] | np.ndarray = []
@@ -268,7 +270,10 @@ def sweep(
         elif folder is not None:
             failures = solved(fill)
         else:
-            outcome = solved(lambda job: in_chunks(job, progress_meter))
+            # To look up the methods of any meter takes 0.1 ms.
+            silent = type(progress_meter) is diffrax.NoProgressMeter
+            meter = None if silent else progress_meter
+            outcome = solved(lambda job: in_chunks(job, meter))
             value, failures = outcome.value, np.flatnonzero(outcome.failed)
     if throw and len(failures):
         raise RuntimeError(
@@ -281,4 +286,5 @@ def sweep(
         return value
     # NumPy's view of the common times is no copy of them for each member.
     times = (jnp if traced else np).broadcast_to(ts, (size, *ts.shape))
-    return dataclasses.replace(value, ts=times)
+    (_, *leaves), structure = jax.tree.flatten(value)
+    return structure.unflatten([times, *leaves])  # a new `Solution` takes 0.05 ms more

@@ -14,6 +14,7 @@ from ..base.checks import (
     is_traced,
     plain,
     real_array,
+    real_numbers,
     refusal,
     shown,
     single_precision,
@@ -57,7 +58,8 @@ def solve_options(
 ) -> Settings:
     """Checks `simulate`'s keywords; returns those of diffeqsolve, without `throw`."""
     if dt0 is not None:
-        dt0 = real_array("dt0", dt0, (), above=0)  # an array: new values, no new trace
+        # As an array its value is no part of the program.
+        dt0 = real_numbers("dt0", dt0, (), above=0)
     if max_steps is not None:
         whole_number("max_steps", max_steps, 1, np.iinfo(np.int32).max)
     if isinstance(adjoint, diffrax.BacksolveAdjoint):
