@@ -11,7 +11,7 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from .base.checks import is_traced, real_array
+from .base.checks import concrete, real_array
 from .base.known_values import at_once
 from .base.trigonometry import sincos
 from .linkage.coordinates import State
@@ -89,9 +89,9 @@ def from_chain(
     xd = real_array("xd", xd, (ef.size,))
     base_angle = real_array("base_angle", base_angle, ())
     locked, held, state = _joints_of_chain(jnp.asarray(ef, float), x, xd, base_angle)
-    if pairs is not None and not is_traced(held):
+    held = concrete(held)
+    if pairs is not None and held is not None:
         # Differences of absolute rates carry rounding errors.
-        held = np.asarray(held)
         scale = np.abs(np.asarray(xd)).max()
         for k in np.flatnonzero(np.abs(held) > 8 * np.finfo(held.dtype).eps * scale):
             rate = f"th{k + 2} rate equal to th{k + 1} rate" if k else "th2 rate 0"

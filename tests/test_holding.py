@@ -361,7 +361,7 @@ def test_an_arm_with_one_of_two_slides_held_keeps_its_energy(joint):
         (lambda: Payload(fj.Point(1), 1, velocity=[1]), "velocity: expected two or"),
         (lambda: Payload(fj.Point(1), 1, velocity=[1, 0]), "velocity: expected zeros"),
         (lambda: Payload(fj.Point(0), 1), "place: expected a point of a moving link"),
-        (lambda: jax.jit(Brake)(1), "joints: expected known numbers"),
+        (lambda: jax.jit(Brake)(1), "joints: expected known values"),
     ],
 )
 def test_malformed_elements_are_refused(make, words):

@@ -92,11 +92,14 @@ def refusal(name: str, expected: str, got: object) -> ValueError:
     return ValueError(f"{name}: expected {expected}, got {shown(got)}.")
 
 
-def numpy_array(value: object) -> np.ndarray:
-    """Returns a value as NumPy's array; a masked one, whose mask this drops, raises."""
+def array_of(value: Any) -> Array | np.ndarray:
+    """Returns a value as NumPy's array, or JAX's if it is traced.
+
+    Raises TypeError for a masked one, whose mask this would drop.
+    """
     if isinstance(value, np.ma.MaskedArray):
         raise TypeError("masked arrays are not supported")
-    return np.asarray(value)
+    return jnp.asarray(value) if is_traced(value) else np.asarray(value)
 
 
 def real_numbers(
@@ -140,7 +143,7 @@ def real_numbers(
 
     traced = is_traced(value)
     try:
-        array = jnp.asarray(value) if traced else numpy_array(value)
+        array = array_of(value)
     except Exception as error:  # whatever a value's own conversion raises
         raise refuse(shown(value)) from error
     if array.dtype.kind not in "iuf":

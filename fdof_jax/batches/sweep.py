@@ -22,12 +22,11 @@ from jaxtyping import PyTree
 from numpy.typing import ArrayLike
 
 from ..base.checks import (
+    array_of,
     function,
     hashable,
     increasing,
-    is_traced,
     is_transformed,
-    numpy_array,
     real_numbers,
     refusal,
     shown,
@@ -205,7 +204,7 @@ def sweep(
     # Arrays may be on any devices; chunks of them go to those of the sweep.
     linkage, state0, forces = in_numpy((linkage, state0, forces))
     try:
-        q, qd = (jnp.asarray(a) if is_traced(a) else numpy_array(a) for a in state0)
+        q, qd = map(array_of, state0)
     except (TypeError, ValueError):
         raise refusal("state0", "a State(q, qd)", state0) from None
     ts = real_numbers("ts", ts, (None,))

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import PyTree
 
 from .. import __version__
-from ..base.checks import is_traced, numpy_array, plain, refusal, shown
+from ..base.checks import array_of, is_traced, plain, refusal, shown
 from ..base.frozen import Frozen
 from ..base.user_warnings import without_warning
 from ..base.whole_files import file_path, whole_file
@@ -194,7 +194,7 @@ def _numbers(place: str, value: object) -> Json:
     if is_traced(value):
         raise refusal(place, _KNOWN, value)
     try:
-        array = numpy_array(value)
+        array = np.asarray(array_of(value))
     except (RuntimeError, TypeError) as error:  # deleted, masked, or random keys
         raise refusal(place, "real numbers", error) from error
     if jnp.issubdtype(array.dtype, jnp.floating):  # also bfloat16

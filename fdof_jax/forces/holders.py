@@ -14,7 +14,7 @@ from jax import Array
 from jaxtyping import Bool
 from numpy.typing import ArrayLike
 
-from ..base.checks import is_traced, refusal
+from ..base.checks import check_known, refusal
 from ..linkage.fields import Condition, Values, each, field, ordered
 from ..linkage.linkage import Linkage, joints_of
 from ..linkage.topology import MOST_PAIRS
@@ -202,8 +202,7 @@ def numbered(joints: Any) -> Array:
 
     Raises ValueError for what are no numbers of joints.
     """
-    if is_traced(joints):
-        raise ValueError("joints: expected known numbers, got traced ones.")
+    check_known("joints", joints)
     array = isinstance(joints, Array | np.ndarray)
     given = joints.tolist() if array else joints
     numbers = given if isinstance(given, list | tuple) else (given,)

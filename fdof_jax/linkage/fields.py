@@ -143,13 +143,13 @@ class Part(Frozen, metaclass=_Fields):
 
     def fits(self, linkage: Linkage, ts: Array) -> Truth:
         """Returns whether an arm and times would be accepted; also if traced."""
-        own = [_all(condition.holds) for condition in self.conditions_on(linkage)]
+        own = [np.all(condition.holds) for condition in self.conditions_on(linkage)]
         parts = [part.fits(linkage, ts) for _, part in _within(self)]
         return reduce(and_, [*own, *parts], True)
 
     def possible(self) -> Truth:
         """Returns whether the constructor would accept the values; also if traced."""
-        own = [_all(condition.holds) for condition in self.conditions()]
+        own = [np.all(condition.holds) for condition in self.conditions()]
         fields = [_bounded(value, rules) for _, value, rules in _declared(self)]
         parts = [part.possible() for _, part in _within(self)]
         return reduce(and_, [*own, *fields, *parts], True)
@@ -205,14 +205,10 @@ def check_values(place: str, part: Part) -> None:
 
 def _refuse(place: str, conditions: Iterable[Condition]) -> None:
     for holds, name, expected, got in conditions:
-        if (known := concrete(_all(holds))) is not None and not known:
+        if (known := concrete(holds)) is not None and not known.all():
             parts = got if isinstance(got, tuple) else (got,)
             text = plain(" and ".join(map(str, parts)))
             raise ValueError(f"{place}{name}: expected {expected}, got {text}.")
-
-
-def _all(holds: Truth) -> Truth:
-    return jnp.all(holds) if is_traced(holds) else np.all(holds)
 
 
 def _declared(part: Part) -> Iterator[tuple[str, Any, Rules]]:

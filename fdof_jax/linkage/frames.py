@@ -1,6 +1,6 @@
 """Forward kinematics: where the links start, and along which directions they run."""
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,10 +11,8 @@ from numpy.typing import ArrayLike
 
 from ..base.known_values import in_numpy
 from ..base.trigonometry import sincos
+from .linkage import Linkage
 from .topology import real_joints
-
-if TYPE_CHECKING:
-    from .linkage import Linkage
 
 Rows = Any  # arrays of JAX or NumPy, or lists of scalars
 
@@ -64,12 +62,12 @@ class Frames(NamedTuple):
     slide: Rows
     revolute: Rows
 
-    def tip(self, linkage: "Linkage") -> Rows:
+    def tip(self, linkage: Linkage) -> Rows:
         """Returns the end of the last link's vector A [m]."""
         return self.start[..., -1] + linkage.length[-1] * self.direction[..., -1]
 
 
-def frames(linkage: "Linkage", q: Array) -> Frames:
+def frames(linkage: Linkage, q: Array) -> Frames:
     """Computes the frames at joint positions (n,), 0 at fixed pairs."""
     revolute = jnp.stack(real_joints(linkage.ef))
     slide = jnp.where(revolute, linkage.locked, q)
@@ -81,7 +79,7 @@ def frames(linkage: "Linkage", q: Array) -> Frames:
     return Frames(jnp.append(0, jnp.cumsum(steps)), direction, angle, slide, revolute)
 
 
-def known_frames(linkage: "Linkage", q: ArrayLike) -> Frames:
+def known_frames(linkage: Linkage, q: ArrayLike) -> Frames:
     """Computes frames in NumPy at known positions (..., n), 0 at fixed pairs."""
     *shape, n = np.shape(q)
     count = int(np.prod(shape))
@@ -92,11 +90,11 @@ def known_frames(linkage: "Linkage", q: ArrayLike) -> Frames:
 
 
 @jax.jit
-def _frames_of_each(linkage: "Linkage", q: Array) -> Frames:
+def _frames_of_each(linkage: Linkage, q: Array) -> Frames:
     return jax.vmap(frames, (None, 0))(linkage, q)
 
 
-def scalar_frames(linkage: "Linkage", q: tuple[Array, ...] | Array) -> Frames:
+def scalar_frames(linkage: Linkage, q: tuple[Array, ...] | Array) -> Frames:
     """Computes the frames as lists of scalars, which fuse with the equations of motion.
 
     A sweep with a spring takes 1.3 times as long with the arrays of `frames`.

@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 from ..base.checks import is_traced, known, radians, real_array, shown
 from ..base.frozen import Frozen
 from ..base.functions import sharing_functions
-from .singularity import check_singularity
+from .singularity import Numbers, check_singularity
 from .topology import (
     can_move,
     check_angles,
@@ -103,10 +103,11 @@ class Linkage(Frozen):
         self.locked = real_array("locked", locked, (n,), broadcast=True, of=pairs)
         self.base_angle = real_array("base_angle", base_angle, (), unit="rad")
         self.gravity = real_array("gravity", gravity, ())
-        if not is_traced(list(vars(self).values())):
-            turn = np.where(real_joints(np.asarray(self.ef)), 0, self.locked)
-            radians("locked", turn)
-            check_singularity(self)
+        values = list(vars(self).values())
+        if not is_traced(values):
+            numbers = Numbers(*map(np.asarray, values))
+            radians("locked", np.where(real_joints(numbers.ef), 0, numbers.locked))
+            check_singularity(numbers)
 
     def arguments(self) -> dict[str, Any]:
         fields = dict(vars(self))

@@ -1,21 +1,30 @@
 """Detects mass matrices that are singular, always or in some configurations."""
 
-from typing import TYPE_CHECKING
+from typing import NamedTuple
 
-import jax
 import numpy as np
 
 from ..base.user_warnings import warn
 from .topology import fixed_pairs, letters, real_joints
 
-if TYPE_CHECKING:
-    from .linkage import Linkage
-
 # Below this, eigenvalues of a matrix with a diagonal of ones are rounding errors.
 _SINGULAR = 1e-14
 
 
-def _frames(linkage: "Linkage", q: np.ndarray) -> tuple[np.ndarray, ...]:
+class Numbers(NamedTuple):
+    """The arrays of a linkage, in NumPy."""
+
+    ef: np.ndarray
+    length: np.ndarray
+    com: np.ndarray
+    mass: np.ndarray
+    inertia: np.ndarray
+    locked: np.ndarray
+    base_angle: np.ndarray
+    gravity: np.ndarray
+
+
+def _frames(linkage: Numbers, q: np.ndarray) -> tuple[np.ndarray, ...]:
     """Computes starts and directions of the links, and mass centres, all as x + iy.
 
     Of the plain arrays of a constructor, which compiles nothing, and in double
@@ -27,17 +36,17 @@ def _frames(linkage: "Linkage", q: np.ndarray) -> tuple[np.ndarray, ...]:
     along = np.exp(1j * (linkage.base_angle + turn))
     slide = np.where(revolute, linkage.locked, q)
     start = summed((linkage.length[:-1] + 1j * slide) * along[..., :-1])
-    centre = start[..., 1:] + np.asarray(linkage.com) @ [1, 1j] * along[..., 1:]
+    centre = start[..., 1:] + linkage.com @ [1, 1j] * along[..., 1:]
     return start, along, centre
 
 
-def _scaled_inertia(linkage: "Linkage") -> np.ndarray:
+def _scaled_inertia(linkage: Numbers) -> np.ndarray:
     """Computes mass matrices at five random configurations (5, n, n).
 
     Scaling to a diagonal of ones makes them free of units and sizes; it is 0 where a
     joint moves nothing, and 1 at fixed pairs.
     """
-    linkage = jax.tree.map(lambda a: np.asarray(a, dtype=float), linkage)
+    linkage = Numbers(*(a.astype(float) for a in linkage))
     revolute = np.stack(real_joints(linkage.ef))
     sizes = linkage.length, linkage.com, linkage.locked[revolute]
     extent = sum(np.abs(size).sum() for size in sizes)
@@ -57,9 +66,9 @@ def _scaled_inertia(linkage: "Linkage") -> np.ndarray:
     return M / (scale[:, :, None] * scale[:, None]) + np.diag(~moves)
 
 
-def check_singularity(linkage: "Linkage") -> None:
+def check_singularity(linkage: Numbers) -> None:
     """Rejects linkages that are always singular; warns of those that may become so."""
-    revolute = np.stack(real_joints(np.asarray(linkage.ef)))
+    revolute = np.stack(real_joints(linkage.ef))
     names = letters(linkage.ef)
     scaled = _scaled_inertia(linkage)
     for k in reversed(range(len(names))):
@@ -82,10 +91,10 @@ def check_singularity(linkage: "Linkage") -> None:
                 f"move some inertia of link {k + 1} or of the links beyond it, got "
                 "none in any configuration: its acceleration is undetermined."
             )
-    _warn(jax.tree.map(np.asarray, linkage), revolute)
+    _warn(linkage, revolute)
 
 
-def _warn(linkage: "Linkage", revolute: np.ndarray) -> None:
+def _warn(linkage: Numbers, revolute: np.ndarray) -> None:
     """Warns of joints without inertia of their own and of redundant joints."""
     mass, locked = linkage.mass, linkage.locked
     eps, n = 8 * np.finfo(locked.dtype).eps, len(mass)

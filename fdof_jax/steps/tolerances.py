@@ -165,7 +165,7 @@ def scale_tolerances(
         )
     else:
         size = jnp.sum(jnp.abs(linkage.length)) + jnp.sum(jnp.abs(linkage.com))
-        if not is_traced(size) and size == 0:
+        if concrete(size) == 0:
             raise ValueError("scale: expected one, as the linkage has no size.")
         time = jnp.where(
             linkage.gravity == 0, 1, jnp.sqrt(size / jnp.abs(linkage.gravity))
