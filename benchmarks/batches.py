@@ -1,5 +1,6 @@
 """Batches of arms: simulated seconds per wall second at the worst member's error."""
 
+import contextlib
 import multiprocessing
 import os
 from collections.abc import Callable, Iterator
@@ -28,16 +29,13 @@ Row = tuple[str, Callable[[Problem], Contestant], tuple]
 
 def contestants(batch: int) -> list[Row]:
     """Returns contestants and settings for a size; large batches have fewer."""
+    c = lambda method: partial(peers.native, method=method)
     rows: list[Row] = [
         ("fdof_jax sweep", own.sweep, FEW),
         ("fdof_jax", own.fdof_jax, FEW),
         ("heyoka", taylor.heyoka, (1e-5, 1e-7, 1e-9, 1e-11)),
-        (
-            "C order 8",
-            partial(peers.native, method="order 8"),
-            (4e-2, 2e-2, 1e-2, 5e-3),
-        ),
-        ("C RK4", partial(peers.native, method="RK4"), (4e-3, 2e-3, 1e-3, 5e-4)),
+        ("C order 8", c("order 8"), (4e-2, 2e-2, 1e-2, 5e-3)),
+        ("C RK4", c("RK4"), (4e-3, 2e-3, 1e-3, 5e-4)),
     ]
     if batch <= SLOW:
         rows += [
@@ -194,14 +192,14 @@ def _spin(core: int) -> None:
         pass
 
 
-class _busy_core:
+@contextlib.contextmanager
+def _busy_core() -> Iterator[None]:
     """Keeps the last core busy while it lasts."""
-
-    def __enter__(self) -> None:
-        processes = multiprocessing.get_context("spawn")
-        core = max(os.sched_getaffinity(0))
-        self.process: Any = processes.Process(target=_spin, args=(core,), daemon=True)
-        self.process.start()
-
-    def __exit__(self, *_: Any) -> None:
-        self.process.terminate()
+    start = multiprocessing.get_context("spawn").Process
+    last = max(os.sched_getaffinity(0))
+    process = start(target=_spin, args=(last,), daemon=True)
+    process.start()
+    try:
+        yield
+    finally:
+        process.terminate()

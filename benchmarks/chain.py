@@ -58,14 +58,8 @@ def make_rates(
         w2 = t1 * u1
         w3 = w2 + t2 * u2
         w4 = w3 + t3 * u3
-        c2, s2, c3, s3, c4, s4 = (
-            cos(th2),
-            sin(th2),
-            cos(th3),
-            sin(th3),
-            cos(th4),
-            sin(th4),
-        )
+        c2, c3, c4 = cos(th2), cos(th3), cos(th4)
+        s2, s3, s4 = sin(th2), sin(th3), sin(th4)
         # From each link's start to the next link's (d) and to its mass centre (e).
         d2x, d2y = a2 * c2 - b2 * s2, a2 * s2 + b2 * c2
         d3x, d3y = a3 * c3 - b3 * s3, a3 * s3 + b3 * c3

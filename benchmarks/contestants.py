@@ -4,8 +4,8 @@ A function of a `Problem`, which may hold one motion or a batch, makes each cont
 A contestant runs at a setting: a tolerance or a step.
 """
 
+import functools
 from collections.abc import Callable
-from functools import cache
 from typing import Any, NamedTuple
 
 import diffrax
@@ -67,29 +67,19 @@ def cases(contestant: Contestant, settings: tuple, exact: np.ndarray) -> list[Ca
         error = float(np.abs(q - exact).max())
         return {"error": error, "steps": steps, "rejected": rejected}
 
+    solver, kind, run, _ = contestant
     return [
-        Case(
-            contestant.solver,
-            setting,
-            lambda setting=setting: contestant.run(setting),
-            judge,
-            contestant.kind,
-        )
+        Case(solver, setting, functools.partial(run, setting), judge, kind)
         for setting in settings
     ]
 
 
 def of_solution(solution: fj.Solution) -> Motion:
-    stats = solution.stats
-    return Motion(
-        solution.q,
-        solution.qd,
-        stats.get("num_accepted_steps"),
-        stats.get("num_rejected_steps"),
-    )
+    counts = map(solution.stats.get, ("num_accepted_steps", "num_rejected_steps"))
+    return Motion(solution.q, solution.qd, *counts)
 
 
-@cache  # one compilation for all problems of one form
+@functools.cache  # one compilation for all problems of one form
 def _simulate(axes: tuple | None) -> Callable:
     def run(linkage, state0, ts, forces, tolerance):
         def member(linkage, state0):

@@ -69,12 +69,5 @@ def run(quick: bool) -> Iterator[dict]:
 
 def _record(number: int, name: str, engine: str, bound: Any, found: dict) -> dict:
     print(f"{number} {name}: {engine} {found['status']}", flush=True)
-    return record(
-        protocol=PROTOCOL,
-        problem=name,
-        solver=engine,
-        kind=None,
-        number=number,
-        bound=bound,
-        **found,
-    )
+    fields = {"protocol": PROTOCOL, "problem": name, "solver": engine}
+    return record(number=number, bound=bound, **fields, **found)

@@ -123,11 +123,8 @@ def heyoka(scene: HardScene) -> Callable[[], Run]:
     _motion_only(scene)
     hy = module("heyoka")
     start = np.concatenate(list(map(np.asarray, scene.state0)))
-    integrator = hy.taylor_adaptive(
-        symbolic(hy, scene.linkage, scene.driven),
-        start,
-        tol=max(scene.tolerance, 1e-15),
-    )
+    system = symbolic(hy, scene.linkage, scene.driven)
+    integrator = hy.taylor_adaptive(system, start, tol=max(scene.tolerance, 1e-15))
 
     def run() -> Run:
         integrator.time = float(scene.ts[0])
@@ -158,11 +155,8 @@ def mujoco(scene: HardScene) -> Callable[[], Run]:
     xml = ElementTree.fromstring(fj.to_mjcf(scene.linkage))
     effort, stiffness, target, damping = scene.drive
     for joint, k, rest, d in zip(xml.iter("joint"), stiffness, target, damping):
-        joint.attrib.update(
-            stiffness=repr(float(k)),
-            springref=repr(float(rest)),
-            damping=repr(float(d)),
-        )
+        numbers = zip(("stiffness", "springref", "damping"), (k, rest, d))
+        joint.attrib.update({name: repr(float(value)) for name, value in numbers})
     model = mj.MjModel.from_xml_string(ElementTree.tostring(xml, encoding="unicode"))
     model.opt.integrator = mj.mjtIntegrator.mjINT_RK4
     start = np.concatenate([[0.0], *map(np.asarray, scene.state0)])[None]

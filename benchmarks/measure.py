@@ -50,28 +50,13 @@ class Case(NamedTuple):
     fields: dict = {}
 
 
-RECORD = {
-    "protocol": None,
-    "problem": None,
-    "solver": None,
-    "kind": None,  # of the setting: tolerance or step
-    "setting": None,
-    "steps": None,
-    "rejected": None,
-    "error": None,
-    "time_min": None,
-    "time_median": None,
-    "time_quartiles": None,
-    "times": None,  # one per round
-    "ratio": None,
-    "ratio_quartiles": None,
-    "ratio_to": None,
-    "batch": 1,
-    "dtype": None,
-    "compile_time": None,
-    "status": "ok",
-    "reason": None,
-}
+# `kind` is that of the setting, tolerance or step; `times` has an entry per round.
+_NAMES = (
+    "protocol", "problem", "solver", "kind", "setting", "steps", "rejected", "error",
+    "time_min", "time_median", "time_quartiles", "times", "ratio", "ratio_quartiles",
+    "ratio_to", "dtype", "compile_time", "reason",
+)  # fmt: skip
+RECORD = dict.fromkeys(_NAMES) | {"batch": 1, "status": "ok"}
 
 
 def record(**fields: Any) -> dict:

@@ -46,23 +46,10 @@ def _library(method: str, lanes: int) -> ctypes.CDLL:
     folder = Path(tempfile.mkdtemp(prefix="fdof-native-"))
     (folder / "tableau.h").write_text(header)
     compiled, output = folder / "native.o", folder / "native.so"
-    subprocess.run(
-        [
-            "gcc",
-            "-O3",
-            "-march=native",
-            "-mprefer-vector-width=512",
-            "-ffast-math",
-            "-fPIC",
-            f"-DLANES={lanes}",
-            f"-I{folder}",
-            "-c",
-            str(Path(__file__).with_name("native.c")),
-            "-o",
-            str(compiled),
-        ],
-        check=True,
-    )
+    command = "gcc -O3 -march=native -mprefer-vector-width=512 -ffast-math -fPIC"
+    source = str(Path(__file__).with_name("native.c"))
+    command = [*command.split(), f"-DLANES={lanes}", f"-I{folder}"]
+    subprocess.run([*command, "-c", source, "-o", str(compiled)], check=True)
     # Linked with -ffast-math too, it would flush subnormal numbers to zero in all of
     # the process that loads it.
     subprocess.run(["gcc", "-shared", str(compiled), "-o", str(output)], check=True)

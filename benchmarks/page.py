@@ -174,16 +174,11 @@ def single_arms(points: Points) -> str:
 
 def gradients(points: Points) -> str:
     rows = [
-        [
-            str(p["batch"]),
-            _MODES[p["solver"]],
-            number(1e3 * p["time_median"]),
-            number(p["ratio"]),
-            number(p["error"]),
-        ]
+        [str(p["batch"]), _MODES[p["solver"]],
+         *map(number, (1e3 * p["time_median"], p["ratio"], p["error"]))]
         for p in points
         if p["status"] == "ok"
-    ]
+    ]  # fmt: skip
     return table(["arms", "", "ms", "over the motion", "error of the gradient"], rows)
 
 
@@ -257,16 +252,12 @@ def compile_times(points: Points) -> str:
 def gpu(points: Points) -> str:
     if not any(p["status"] == "ok" for p in points):
         return "Not measured: no GPU was at hand."
-    rows = [
-        [
-            str(batch),
-            solver,
-            *(number(rate(chosen(own, solver=solver), e)) for e in ERRORS),
-        ]
-        for batch in dict.fromkeys(p["batch"] for p in points)
-        for own in [chosen(points, batch=batch)]
-        for solver in _solvers(own)
-    ]
+    rows = []
+    for batch in dict.fromkeys(p["batch"] for p in points):
+        own = chosen(points, batch=batch)
+        for solver in _solvers(own):
+            rates = [rate(chosen(own, solver=solver), e) for e in ERRORS]
+            rows.append([str(batch), solver, *map(number, rates)])
     return table(["members", "", *(f"s per s at {number(e, 1)}" for e in ERRORS)], rows)
 
 

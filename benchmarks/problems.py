@@ -98,39 +98,17 @@ def controller(tolerance: Any) -> diffrax.PIDController:
 
 
 @eqx.filter_jit
-def _reference(linkage, state0, ts, forces, axes):
+def _reference(linkage, state0, forces, ts, axes):
     def member(linkage, state0):
         return fj.simulate(
-            linkage,
-            state0,
-            ts,
-            forces,
-            solver=diffrax.Dopri8(),
+            linkage, state0, ts, forces, solver=diffrax.Dopri8(), max_steps=None,
             stepsize_controller=controller(REFERENCE_TOLERANCE),
-            max_steps=None,
-            adjoint=diffrax.ForwardMode(),
-            throw=False,
-        ).q
+            adjoint=diffrax.ForwardMode(), throw=False,
+        ).q  # fmt: skip
 
     return jax.vmap(member, axes)(linkage, state0) if axes else member(linkage, state0)
 
 
-def reference(problem: Problem, chunk: int = 1024) -> np.ndarray:
+def reference(problem: Problem) -> np.ndarray:
     """Returns joint positions at the output times, at a tolerance of 1e-13."""
-    linkage, state0 = problem.linkage, problem.state0
-    if problem.batch is None:
-        motion = _reference(linkage, state0, problem.ts, problem.forces, None)
-        return np.asarray(motion)
-    parts = []
-    for start in range(0, problem.batch, chunk):
-        members = slice(start, start + chunk)
-        arms = linkage
-        if problem.axes[0] == 0:
-            arms = jax.tree.map(lambda leaf, m=members: leaf[m], linkage)
-        begin = fj.State(state0.q[members], state0.qd[members])
-        parts.append(
-            np.asarray(
-                _reference(arms, begin, problem.ts, problem.forces, problem.axes)
-            )
-        )
-    return np.concatenate(parts)
+    return np.asarray(_reference(*problem[1:], problem.axes))

@@ -24,8 +24,6 @@ Units are SI. `help` of a name says the rest; its room holds more of its kind.
 - **The paper's figures**: scenes.
 """
 
-__version__ = "0.2.0"  # above the imports: rooms read it
-
 import importlib
 from typing import TYPE_CHECKING
 
@@ -44,6 +42,7 @@ from . import (
 from .analysis.linearization import linearize
 from .analysis.reactions import joint_reactions
 from .base.configuration import configure
+from .base.version import __version__ as __version__
 from .batches.sweep import sweep
 from .control.pd import PDController
 from .data.files import load, save

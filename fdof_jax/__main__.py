@@ -8,8 +8,9 @@ import matplotlib
 import matplotlib.pyplot as plt
 import numpy as np
 
-from . import __version__, scenes
+from . import scenes
 from .base.configuration import configure
+from .base.version import __version__
 from .base.whole_files import folder_path
 from .forces.joints import JointDamper
 from .pictures import drawing, plotting

@@ -1,6 +1,7 @@
 """The package as users import it: what the names are, and what their import costs."""
 
 import ast
+import graphlib
 import inspect
 import pickle
 import re
@@ -84,9 +85,22 @@ def test_rooms_import_from_those_below_them_only():
                 continue
             above = module[: len(module) - line.level]
             room = (*above, *(line.module or line.names[0].name).split("."))[0]
-            if room == "__version__":
-                continue
             assert room == module[0] or ROOMS[room] < ROOMS[module[0]], path
+
+
+def test_no_modules_import_each_other():
+    """Not within functions either, nor for their types."""
+    modules, graph = {*FOLDER.rglob("*.py")}, {}
+    for path in modules:
+        for line in ast.walk(ast.parse(path.read_text())):
+            if isinstance(line, ast.ImportFrom) and line.level:
+                parts = line.module.split(".") if line.module else []
+                place = path.parents[line.level - 1].joinpath(*parts)
+                places = place, *(place / name.name for name in line.names)
+                found = {each.with_suffix(".py") for each in places} & modules
+                graph.setdefault(path, set()).update(found)
+    assert sum(map(len, graph.values())) > 500
+    graphlib.TopologicalSorter(graph).prepare()  # raises for a circle
 
 
 def test_no_name_is_hidden_by_a_module():

@@ -22,9 +22,9 @@ from jax import Array
 from jax.extend.core import ClosedJaxpr, Jaxpr
 from jaxtyping import PyTree
 
-from .. import __version__
 from ..base.checks import optional_package, refusal
 from ..base.user_warnings import warn
+from ..base.version import __version__
 from ..base.whole_files import whole_file
 from ..linkage.linkage import Linkage
 from ..linkage.topology import common_unit, names_and_units

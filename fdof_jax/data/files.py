@@ -16,10 +16,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from .. import __version__
 from ..base.checks import array_of, is_traced, plain, refusal, shown
 from ..base.frozen import Frozen
 from ..base.user_warnings import without_warning
+from ..base.version import __version__
 from ..base.whole_files import file_path, whole_file
 from ..linkage.linkage import Linkage
 from ..linkage.topology import letters

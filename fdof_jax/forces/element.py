@@ -8,7 +8,7 @@ import inspect
 from abc import abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -20,9 +20,6 @@ from ..base.checks import shown
 from ..linkage.fields import Foreign, Part, check_joints, default, optional, sized
 from ..linkage.linkage import Linkage, joints_of
 from ..mechanics.equations import Scalars
-
-if TYPE_CHECKING:
-    from .points import Load
 
 Forces = tuple[Any, ...]  # elements, or callables (t, q, qd, linkage) -> tau
 OwnStates = tuple[PyTree, ...]  # of `StatefulElement`s, in the order of the forces
@@ -82,7 +79,7 @@ class Element(Part):
 
     def loads_on_points(
         self, t: Array, q: Array, qd: Array, qdd: Array, linkage: Linkage
-    ) -> tuple["Load", ...] | None:
+    ) -> tuple[PyTree, ...] | None:
         """Returns the `Load`s that bearings carry; None: `joint_reactions` raises."""
         return ()
 
@@ -243,7 +240,7 @@ class InertialElement(Element):
 
     def loads(
         self, t: Array, q: Array, qd: Array, qdd: Array, linkage: Linkage
-    ) -> tuple["Load", ...] | None:
+    ) -> tuple[PyTree, ...] | None:
         """Returns the `Load`s of the masses on points, for `joint_reactions` alone."""
         return None
 
