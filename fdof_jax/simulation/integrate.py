@@ -135,8 +135,8 @@ def _control(
     """Chooses the steps: what they judge, and where they end."""
     solver: diffrax.AbstractSolver = keywords["solver"] or LoopedDopri8()
     solver = _differentiable(solver, keywords["adjoint"])
-    own_controller = keywords["stepsize_controller"]  # the user's
-    steps = own_controller or default_controller()
+    given = keywords["stepsize_controller"]  # by the user
+    steps = given or default_controller()
     term, start, args, ts = problem.term, problem.start, problem.args, problem.ts
     if not isinstance(steps, diffrax.AbstractAdaptiveStepSizeController):
         why = None
@@ -158,9 +158,9 @@ def _control(
     of_derivatives = None
     if tangents:
         of_derivatives = OfTangents()
-    # Whoever sets tolerances for an implicit solver wants modes that are too fast left
-    # unresolved; a probe would make the steps resolve them.
-    elif derivatives and not (implicit and own_controller is not None):
+    # Who sets tolerances of an implicit solver wants very fast motions left unresolved;
+    # a probe would make steps short enough to resolve them.
+    elif derivatives and not (implicit and given is not None):
         has_tableau = isinstance(solver, ScheduledDopri8 | diffrax.AbstractRungeKutta)
         # Of other solvers derivatives are judged as if they were by Heun's method.
         tableau: Any = solver.tableau if has_tableau else diffrax.Heun.tableau
@@ -177,6 +177,7 @@ def _solve(problem: _Problem, control: _Control, keywords) -> diffrax.Solution:
 
     def row(t, y, args):
         """Returns the state, and the modes if joints are held."""
+        # Between the ends of steps a state has the modes alone as its last entry.
         last = y[-1].modes if isinstance(y[-1], Switching) else y[-1]
         has_modes = isinstance(last, Modes)
         return (*y[:size], last._replace(events=None)) if has_modes else y[:size]
@@ -216,13 +217,18 @@ def _read(inputs: Inputs, problem: _Problem, solve: diffrax.Solution) -> Solutio
         """Replaces the infinity that diffrax leaves at times not reached by NaN."""
         return jnp.where(jnp.isinf(a) | ~valid, jnp.nan, a)
 
-    # diffrax saves the start only with the first step.
-    start = (without_fixed(linkage, value) for value in state0)
-    first = (jnp.where(valid, a, b) for a, b in zip(problem.first, start))
-    if modes:  # after blows at the start
-        after_blow = jnp.isfinite(qd[0]) & valid
-        first = (jnp.where(after_blow, a[0], b) for a, b in zip((q, qd), first))
-    q, qd = (shown_at(rows).at[0].set(row) for rows, row in zip((q, qd), first))
+    # diffrax saves the start with the first step only, after any blow there.
+    saved = jnp.isfinite(qd[0]) & valid if modes else None
+
+    def from_start(rows, start, given):
+        """Returns rows whose first one is the start, or what was given if invalid."""
+        first = jnp.where(valid, start, given)
+        if saved is not None:
+            first = jnp.where(saved, rows[0], first)
+        return shown_at(rows).at[0].set(first)
+
+    given = (without_fixed(linkage, value) for value in state0)
+    q, qd = map(from_start, (q, qd), problem.first, given)
     # Constant steps go on when the state is no longer finite.
     reached = jnp.minimum(reached[0], ts[-1])
     not_finite = (ts <= reached) & ~jnp.isfinite(q + qd).all(axis=1)

@@ -1,4 +1,4 @@
-"""Controllers of step size beside those of diffrax, and changes of controllers."""
+"""Step size controllers beyond those of diffrax, and changes of controllers."""
 
 import dataclasses
 from collections.abc import Callable
@@ -31,7 +31,7 @@ def _with(
     controller: _C,
     concerns: Callable[[object], bool],
 ) -> _C:
-    """Returns a controller with `change` applied to every part for which `concerns`."""
+    """Returns a controller with `change` applied to the parts that `concerns` names."""
     return jax.tree.map(
         lambda node: change(node) if concerns(node) else node,
         controller,
@@ -57,7 +57,7 @@ def with_error_control(change: Callable[..., Controller], controller: _C) -> _C:
 
 
 def by_square_roots(controller: Controller) -> Controller:
-    """Returns a controller for methods of order 8 with the same steps, without powers.
+    """Returns a controller that takes the same steps, of order 8, without powers.
 
     A step changes by the eighth root of its error. XLA on CPU calls the C library's
     `pow` for each lane, but square roots are vectorised: a sweep takes 4 % less time.
@@ -183,7 +183,7 @@ class Abreast(Adaptive):
         *arguments, (state, count, typical) = arguments
         *step, state, result = super().adapt_step_size(*arguments, state)
         count = count + 1
-        # The state of a lane that is done stays, so that its count falls behind.
+        # Once a lane is done its state is frozen, so that its count falls behind.
         done = count < jax.lax.pmax(count, self.axis)
         most = jax.lax.pmean(done.astype(float), self.axis) >= _MOST
         typical = jnp.where(most & (typical == 0), count, typical)

@@ -11,10 +11,10 @@ from ..linkage.fields import has_come
 from .controllers import giving_up
 from .dopri8 import Integrated, constant
 
-# More than `_MOST_CROSSINGS` are chatter if they come within the least distance between
-# two times, times this power of the unit of rounding (3e5 in float64). Chatter soon
-# crosses at that distance; joints that bounce to rest, in however long a run, or that
-# throw each other at their stops, are slower.
+# More than `_MOST_CROSSINGS` count as chatter if all come within the least distance
+# between two times, times this power of the unit of rounding (3e5 in float64). Chatter
+# soon crosses at that distance; joints that bounce to rest, in however long a run, or
+# that throw each other at their stops, are slower.
 _MOST_CROSSINGS = 100
 _PACE = -0.35
 # After so many tries the switching function itself is taken to jump, and the jump is
@@ -25,6 +25,10 @@ _MOST_TRIES = 6
 _APART = 4
 # A step that would end within this share of its length before a known time ends at it.
 _JUST_BEFORE = 1e-6
+# diffrax moves the end of a step to that of the run if they are within 100 units of
+# rounding. Twice as many are safe; a run that goes on after a jump at its end is longer
+# by more, by so many clearances.
+_NEAR_END, _LONGER = 200, 64
 
 
 def clearance(ts: Array) -> Array:
@@ -39,8 +43,7 @@ def clearance(ts: Array) -> Array:
 def end_of_run(ts: Array, jumps: Array | None) -> Array:
     """Returns the end of the last step: the last time, or a little later with a jump.
 
-    diffrax moves ends of steps to the end of a run if they are near, so that a step
-    would end on the known time instead of before it.
+    Else diffrax would move the end of the step before the known time onto it.
     """
     end = ts[-1]
     if jumps is None:
@@ -49,15 +52,12 @@ def end_of_run(ts: Array, jumps: Array | None) -> Array:
     # Steps land on what comes before `last`, and go on after it.
     belongs = has_come(jumps, end) | (jumps < last + apart)
     there = (jumps >= last - apart) & belongs
-    return end + jnp.where(jnp.any(constant(there)), 64 * apart, 0)
+    return end + jnp.where(jnp.any(constant(there)), _LONGER * apart, 0)
 
 
 def _last(end: Array) -> Array:
-    """Returns the time beyond which diffrax may move a step's end to that of the run.
-
-    It does so within 100 units of rounding.
-    """
-    return constant(end - 200 * jnp.finfo(end.dtype).eps * jnp.abs(end))
+    """Returns the time after which diffrax may move a step's end to that of the run."""
+    return constant(end - _NEAR_END * jnp.finfo(end.dtype).eps * jnp.abs(end))
 
 
 class NextStep(NamedTuple):
@@ -74,7 +74,7 @@ class _Landing(NamedTuple):
     target: Array  # where this step is to end, infinity if anywhere
     gap: Array  # time left out after it, 0 unless it ends at a known time
     resumed: Array  # length of the step after it
-    crossing: Array  # end of the last step that passed a switch, -infinity if none
+    beyond: Array  # end of the last step that passed a switch, -infinity if none
     tries: Array  # to end at the next switch, up to here
     crossings: Array  # tries included, since the time `since`
     since: Array
@@ -90,7 +90,7 @@ class _Happened(NamedTuple):
     missed: Array
     landed: Array
     cut_short: Array  # so that its error says little about the next one
-    crossing: Array  # as in `_Landing`, after it
+    beyond: Array  # as in `_Landing`, after it
     again: Array  # where the same step is to end if it crossed or is unsure
 
 
@@ -115,7 +115,7 @@ class Landing(eqx.Module):
         index = jnp.argmin(ends)
         place, jump = ends[index], jumps[index]
         reached = t1 + _JUST_BEFORE * (t1 - t0) >= place
-        # The end keeps the derivatives of the known time.
+        # Written this way, the end has the derivatives of the known time.
         end = self.jumps[index] - (jump - place)
         gap = jnp.where(reached, jump + self.apart - place, 0)
         return jnp.where(reached, end, t1), gap, reached
@@ -127,9 +127,9 @@ class Landing(eqx.Module):
         if self.switches:  # a step of no length finds the sides
             end, gap, cut = t0, jnp.zeros_like(t0), jnp.array(True)
         target = jnp.where(cut, constant(end), jnp.inf)
-        crossing, none = jnp.full_like(target, -jnp.inf), jnp.zeros((), int)
+        beyond, none = jnp.full_like(target, -jnp.inf), jnp.zeros((), int)
         since = constant(jnp.asarray(t0))
-        state = target, gap, length, crossing, none, none, since, last
+        state = target, gap, length, beyond, none, none, since, last
         return end, _Landing(*state)
 
     def _happened(
@@ -137,17 +137,22 @@ class Landing(eqx.Module):
     ) -> _Happened:
         """Returns what a step did; `keep`: whether the controller would keep it."""
         aimed = end == state.target
-        until, unseen, soon, near, idle = end, end, end, 0, False
-        if self.switches:
-            seen = y1[-1]
-            times = seen.until, seen.unseen, seen.soon, seen.near
-            until, unseen, soon, near = constant(times)
-            idle = jnp.all(seen.after == seen.sides)
+        if not self.switches:
+            never, landed = jnp.zeros_like(keep), keep & aimed
+            none = never, never, never
+            return _Happened(keep, *none, landed, landed, state.beyond, end)
+        # When the first switch came, when one may have come unseen, when one follows,
+        # and how near to that time a step may end (see `Switching`).
+        seen = y1[-1]
+        until, unseen, soon, near = constant(
+            (seen.until, seen.unseen, seen.soon, seen.near)
+        )
+        nothing_switched = jnp.all(seen.after == seen.sides)
         allowance = jnp.where(aimed, near, 0)
         within = until < jnp.minimum(end - allowance, state.last)
         # A switch that a jump causes at once comes before the next jump, however near.
         at_once = (until == begin) & (begin < end)
-        # A tiny step to a switch ends where it is.
+        # A tiny step that aims at a switch has arrived.
         tiny = (begin < end) & (end - begin <= _APART * self.apart)
         arrived = aimed & (state.gap == 0) & tiny
         passed = keep & (within | at_once) & ~arrived
@@ -155,13 +160,14 @@ class Landing(eqx.Module):
         unsure = keep & ~passed & (unseen < end)
         # A step that ends before the switch is stretched to it if that is near, because
         # a tiny second step would tell little of slopes.
-        before = keep & ~unsure & ~passed & aimed & idle & (end < state.crossing)
-        stretched = before & (end < soon) & (soon < state.crossing)
+        before = keep & ~unsure & ~passed & aimed & nothing_switched
+        before &= end < state.beyond
+        stretched = before & (end < soon) & (soon < state.beyond)
         missed = before & ~stretched
         crossed = passed | stretched
         kept = keep & ~unsure & ~crossed
         landed = kept & aimed
-        crossing = jnp.where(kept & ~missed, -jnp.inf, state.crossing)
+        beyond = jnp.where(kept & ~missed, -jnp.inf, state.beyond)
         middle, hopeless = (begin + end) / 2, state.tries > _MOST_TRIES
         again = jnp.where(stretched, soon, jnp.where(hopeless, middle, until))
         return _Happened(
@@ -171,7 +177,7 @@ class Landing(eqx.Module):
             missed=missed,
             landed=landed,
             cut_short=(crossed | unsure) & aimed | landed,
-            crossing=jnp.where(passed, end, crossing),
+            beyond=jnp.where(passed, end, beyond),
             again=jnp.where(crossed, again, unseen),
         )
 
@@ -203,9 +209,9 @@ class Landing(eqx.Module):
 
         # Where is it to end?
         length = jnp.where(step.cut_short, state.resumed, planned.t1 - planned.t0)
-        next_t1 = jnp.where(step.missed, step.crossing, next_t0 + length)
+        next_t1 = jnp.where(step.missed, step.beyond, next_t0 + length)
         next_t1, gap, cut = self._cut(constant(next_t0), next_t1, state.last)
-        # What a jump at a known time switches, switches at that very time.
+        # What a jump at a known time makes switch, switches at exactly that time.
         again = jnp.where(step.again == begin, t0, step.again)
         next_t1 = jnp.where(shortened, again, next_t1)
         aims = (cut | step.crossed | step.missed) & ~step.unsure
@@ -226,7 +232,7 @@ class Landing(eqx.Module):
             target=jnp.where(aims, constant(next_t1), jnp.inf),
             gap=jnp.where(shortened, 0, gap),
             resumed=length,
-            crossing=step.crossing,
+            beyond=step.beyond,
             tries=jnp.where(step.keep & ~step.missed, 0, state.tries + step.crossed),
             crossings=crossings,
             since=jnp.where(paced, begin, state.since),

@@ -1,4 +1,4 @@
-"""One control of adaptive steps around a controller of diffrax."""
+"""The step controller of integrations, around one of diffrax."""
 
 import functools
 from typing import Any, NamedTuple
@@ -46,7 +46,7 @@ class StepControl(Adaptive):
     |---|---|
     | Is its end singular, or not finite? | a shorter step; once that is tiny, the end |
     | Would derivatives be less accurate than the tolerance? | a larger error |
-    | Is its error only rounding? | it counts as none: shorter steps have it, too |
+    | Is its error only rounding? | it counts as 0: shorter steps have it, too |
     | Is the error within the tolerance? | `controller` keeps or rejects the step |
     | Did it pass a known time or a switch? | a step that ends there (see `Landing`) |
     | How much accuracy did it lose? | recorded, for `Solution.stats` |
@@ -54,8 +54,8 @@ class StepControl(Adaptive):
     Up to the tolerance, a motion does not depend on where its steps end. So lengths of
     steps are constants in derivatives, except where steps end at known times.
 
-    - `term`: the equations; None if rates are trusted and no error is only rounding.
-    - `watches`: whether the health of the ends is found here, not by the solver.
+    - `term`: the equations; None if rates are trusted and no error is mere rounding.
+    - `watches`: whether this controller, not the solver, checks the ends of steps.
     """
 
     controller: Any
@@ -65,10 +65,8 @@ class StepControl(Adaptive):
     derivatives: OfTangents | OfLinearised | None
 
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):  # pyright: ignore[reportIncompatibleMethodOverride]
-        start = terms, t0, t1, motion_of(y0), dt0, in_force(args, y0)
-        first, inner = constant(
-            self.controller.init(*constant(start), func, error_order)
-        )
+        arguments = constant((terms, t0, t1, motion_of(y0), dt0, in_force(args, y0)))
+        first, inner = constant(self.controller.init(*arguments, func, error_order))
         probe = None if self.derivatives is None else self.derivatives.start(y0)
         loss, landing = jnp.zeros_like(first), None
         if self.landing is not None:
@@ -89,22 +87,22 @@ class StepControl(Adaptive):
             ratio, probe = self.derivatives(taken, y_error, state.probe, self.rtol)
         judged: Any = *map(motion_of, (y0, y1)), with_change(y_error, motion_of)
         controller = self.controller
-        if isinstance(controller, Scaled):
+        if isinstance(controller, Scaled):  # rounding is judged in its units, too
             scaled, controller = controller.scaled, controller.controller
             judged = *map(scaled, judged[:2]), with_change(judged[2], scaled)
-        start, end, error = constant(judged)
-        begin, stop, args = constant((t0, t1, args))
+        before, after, error = constant(judged)
+        begin, end, args = constant((t0, t1, args))
         # Is its error only rounding? How much accuracy did it lose?
         loss = state.loss
         if self.term is not None:
-            loss = functools.reduce(jnp.maximum, error.health)
+            loss = functools.reduce(jnp.maximum, error.health, loss)
             error = above_rounding(
-                self, stop - begin, start, end, args, error, ratio, error_order
+                self, end - begin, before, after, args, error, ratio, error_order
             )
         # Is the error within the tolerance?
         keep, next0, next1, jumped, inner, result = constant(
             controller.adapt_step_size(
-                begin, stop, start, end, args, error, error_order, state.inner
+                begin, end, before, after, args, error, error_order, state.inner
             )
         )
         # Did it pass a known time or a switch?
@@ -115,7 +113,7 @@ class StepControl(Adaptive):
         if self.derivatives is not None:
             probe = chosen(jnp.array(step.jumped), self.derivatives.start(y1), probe)
             probe = chosen(step.keep, probe, state.probe)
-        loss = jnp.where(step.keep, jnp.maximum(state.loss, loss), state.loss)
+        loss = jnp.where(step.keep, loss, state.loss)
         failed = health_result != diffrax.RESULTS.successful
         result = diffrax.RESULTS.where(failed, health_result, step.result)
         return *step[:4], _State(inner, landing, probe, loss), result

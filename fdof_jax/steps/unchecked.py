@@ -6,8 +6,8 @@ output times increase and lie within the solve. `simulate` ensures this itself, 
 reports it in its result. Here both arguments reach diffrax in a form that leaves
 nothing to check; checks by a user's own code stay.
 
-Equinox has a switch for all its checks, but one for the whole process. It would also
-switch off those of other threads, and those that JAX has traced once for equal shapes.
+Equinox can switch off its checks for the whole process only: also those of other
+threads, and those in functions that JAX traces meanwhile and then keeps.
 """
 
 from typing import Any
@@ -31,7 +31,7 @@ def diffeqsolve(
 ) -> diffrax.Solution:
     """Calls `diffrax.diffeqsolve` without its checks of `dt0` and of output times.
 
-    `max_steps` may also be an array, of which new values need no new program.
+    `max_steps` may also be an array; new values then need no new program.
     """
     adaptive = isinstance(stepsize_controller, Judging)
     frame: Any = _FramedAdaptive if adaptive else _Framed
@@ -60,7 +60,7 @@ def _output_times(saveat: diffrax.SaveAt) -> list[Array]:
 
 
 class _Times(eqx.Module):
-    """An array of output times of which comparisons as a whole find no fault."""
+    """Output times whose comparisons as a whole are false: diffrax finds no fault."""
 
     values: Array
 
@@ -88,7 +88,7 @@ class _Times(eqx.Module):
 
 
 class _Framed(diffrax.AbstractStepSizeController):
-    """A controller that brings its first step size [s] and greatest number of steps."""
+    """A controller with its own first step size [s] and greatest number of steps."""
 
     controller: Any
     dt0: Array | float | None
