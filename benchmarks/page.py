@@ -77,8 +77,11 @@ def _first_call(points: Points) -> str:
     return f"> {ENDLESS:g}" if None in known else number(max(known, default=None))
 
 
-def _rates(points: Points, errors: tuple[float, ...], over: str) -> str:
-    """Returns a table of rates, and of how often as fast `over` is."""
+def _rates(points: Points, errors: tuple[float, ...], over: str, every: Points) -> str:
+    """Returns a table of rates, and of how often as fast `over` is.
+
+    `every`: points of all sizes, as a solver may compile once for several.
+    """
     rows = []
     for solver in _solvers(points):
         own = chosen(points, solver=solver)
@@ -87,22 +90,23 @@ def _rates(points: Points, errors: tuple[float, ...], over: str) -> str:
             cells += [ratio(chosen(points, solver=over), own, e) for e in errors]
         else:
             cells += ["1"] * len(errors)
-        rows.append([solver, *cells, _first_call(own)])
+        rows.append([solver, *cells, _first_call(chosen(every, solver=solver))])
     at = [f"at {number(e, 1)}" for e in errors]
-    head = at + [f"{over} is x times as fast, {e}" for e in at]
+    head = at + [f"{over} over it, {e}" for e in at]
     return table(["simulated s per s", *head, "first call [s]"], rows)
 
 
 def batches(points: Points) -> str:
     mixed = chosen(points, problem="mixed")
-    same = [p for p in points if p["problem"] == "fig5"]
-    big = max(p["batch"] for p in same)
-    size = 1024 if chosen(same, batch=1024) else big
-    same = chosen(same, batch=size)
+    every = [p for p in points if p["problem"] == "fig5"]
+    big = max(p["batch"] for p in every)
+    size = 1024 if chosen(every, batch=1024) else big
+    same = chosen(every, batch=size)
     sizes = f"{size} triple pendulums", f"{mixed[0]['batch']} random arms of all kinds"
     return (
-        f"{sizes[0]}:\n\n{_rates(same, ERRORS, OURS)}\n\n{_shares(points, same)}\n\n"
-        f"{sizes[1]}:\n\n{_rates(mixed, ERRORS, OURS)}"
+        f"{sizes[0]}:\n\n{_rates(same, ERRORS, OURS, every)}\n\n"
+        f"{_shares(points, same)}\n\n"
+        f"{sizes[1]}:\n\n{_rates(mixed, ERRORS, OURS, mixed)}"
     )
 
 
@@ -115,11 +119,11 @@ def _shares(points: Points, same: Points) -> str:
         (own,) = chosen(same, solver=OURS, setting=tolerance)
         steps = own["batch"] * (own["steps"] + own["rejected"])
         share = EVALUATIONS * steps * each / own["time_median"]
-        shares.append(f"{100 * share:.0f} % at a tolerance of {number(tolerance, 1)}")
+        shares.append(f"{100 * share:.0f} % (at a tolerance of {number(tolerance, 1)})")
     return (
         "Compiled by XLA, heyoka's equations of this one arm take "
-        f"{number(1e9 * each)} ns an evaluation. All evaluations of a sweep would take "
-        f"{' and '.join(shares)} of its time."
+        f"{number(1e9 * each)} ns an evaluation. A sweep that did nothing but evaluate "
+        f"them would still take {' and '.join(shares)} of its time."
     )
 
 
@@ -169,7 +173,7 @@ def single_arms(points: Points) -> str:
     short = chosen(points, problem="Fig 7, 10 ms")
     way = ", ".join(f"{p['solver']} {number(1e3 * p['time_median'])} ms" for p in short)
     motion = chosen(points, problem="Fig 5, 2 s")
-    return f"{_rates(motion, ERRORS, 'fdof_jax')}\n\n10 ms of Fig 7: {way}."
+    return f"{_rates(motion, ERRORS, 'fdof_jax', motion)}\n\n10 ms of Fig 7: {way}."
 
 
 def gradients(points: Points) -> str:
@@ -197,7 +201,7 @@ def switches(points: Points) -> str:
 
 def held_joints(points: Points) -> str:
     sweeps = [
-        f"{number(p['ratio'])} times as long at {p['setting']:g} x (5, 4, 3, 2, 1)"
+        f"{number(p['ratio'])} times as long at {p['setting']:g} x (5, 4, 3, 2, 1) N m"
         for p in points
         if p["solver"] == "friction" and p["status"] == "ok"
     ]
@@ -215,7 +219,7 @@ def held_joints(points: Points) -> str:
             how = f"{best['kind']} {number(best['setting'], 1)}"
             rows.append([scene, solver, how, number(worst(best)), number(wall)])
     head = ["", "", "at its most exact", "error [m or rad]", "ms a simulated s"]
-    return f"With friction they take {', '.join(sweeps)}.\n\n{table(head, rows)}"
+    return f"By friction it takes {', '.join(sweeps)}.\n\n{table(head, rows)}"
 
 
 def hard_cases(points: Points) -> str:
