@@ -35,7 +35,16 @@ from ..simulation.simulate import simulate
 from ..simulation.solution import Solution
 from ..steps.controllers import Abreast, by_square_roots
 from ..steps.tolerances import default_controller
-from .devices import Device, compiled, copied, in_place, of_cores, solve, thread_of
+from .devices import (
+    Device,
+    compiled,
+    copied,
+    in_place,
+    in_thread,
+    of_cores,
+    solve,
+    thread_of,
+)
 
 # With at most so many lanes a step takes hardly longer than with one, so that it would
 # not pay to stop slow members and solve them in another program.
@@ -217,7 +226,7 @@ def _in_lanes(
     programs = _programs(form, devices)
     if devices == [None]:
         for chunk in chunks:
-            yield chunk, jax.block_until_ready(programs[0](rows_of(chunk), arrays))
+            yield chunk, solve(programs[0], rows_of(chunk), arrays)
         return
     running: dict[Future, tuple[int, np.ndarray]] = {}
     # Each device has up to two chunks: one that it solves, and the next.
@@ -230,7 +239,8 @@ def _in_lanes(
                 yield solved, future.result()
         number = free.popleft()
         arguments = in_place((rows_of(chunk), arrays), devices[number])
-        future = thread_of(devices[number]).submit(solve, programs[number], *arguments)
+        thread, program = thread_of(devices[number]), programs[number]
+        future = thread.submit(in_thread, solve, program, *arguments)
         running[future] = number, chunk
     for future in as_completed(running):
         yield running[future][1], future.result()

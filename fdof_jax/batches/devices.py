@@ -11,7 +11,7 @@ import functools
 import os
 import pickle
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -119,6 +119,13 @@ def in_place(arrays: PyTree, device: Device) -> PyTree:
 
 def solve(program: jax.stages.Compiled, *arguments: PyTree) -> PyTree:
     """Returns what a program computes, from arrays that its call transfers."""
-    # Another thread may not know of the precision that the program was traced with.
+    return jax.block_until_ready(program(*arguments))
+
+
+def in_thread(function: Callable[..., PyTree], *arguments: PyTree) -> PyTree:
+    """Calls a function in a thread, which may not know of the caller's settings.
+
+    Among these is the precision that a program was traced with.
+    """
     with enable_x64(True), jax.transfer_guard("allow"):
-        return jax.block_until_ready(program(*arguments))
+        return function(*arguments)

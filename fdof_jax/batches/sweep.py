@@ -56,8 +56,8 @@ _CHUNK_HELD = 64
 
 
 def _without_times(_: Scene, solution: Solution) -> Solution:
-    """Leaves out the output times, which all members have in common."""
-    return eqx.tree_at(lambda s: s.ts, solution, solution.ts[:0])
+    """Leaves out the output times but one, as all members have them in common."""
+    return eqx.tree_at(lambda s: s.ts, solution, solution.ts[:1])
 
 
 def _of_member(reduce: Callable) -> Callable:
