@@ -153,12 +153,13 @@ def two_links():
 
 @pytest.mark.slow
 def test_it_works_under_transformations(batch):
-    def end(q):
+    def swept(q, **keywords):
         linkage, state0, forces = batch
-        moved = linkage, state0._replace(q=q), forces
-        return run(moved, reduce=lambda scene, motion: motion.q[-1])
+        return run((linkage, state0._replace(q=q), forces), **keywords)
 
+    end = lambda q: swept(q, reduce=lambda scene, motion: motion.q[-1])
     assert jax.eval_shape(end, batch[1].q).shape == (42, 3)
+    assert jax.eval_shape(swept, batch[1].q).ts.shape == (42, len(TS))
 
 
 def test_traced_values_may_be_out_of_sight(monkeypatch):

@@ -76,6 +76,7 @@ def test_xarray_opens_it(stored, swept):
         assert (data.q.units, data.qd.units) == ("m or rad", "m/s or rad/s")
         assert (data.time.units, data.time_reached.units) == ("s", "s")
         np.testing.assert_array_equal(data.time, TS)
+        assert "ts" not in data  # as all members have their times in common
         assert data.attrs["versions"]["fdof_jax"] == fj.__version__
         assert np.flatnonzero(data.failed).tolist() == FAILED
         words = np.array(data.outcome.flag_meanings.split())[data.outcome]

@@ -116,7 +116,8 @@ def real_numbers(
 ) -> Array | np.ndarray:
     """Returns `value` as an array of the default float dtype and the given shape.
 
-    It is a copy in NumPy, or JAX's if `value` is traced or such an array already.
+    It is an array of NumPy, none that the caller has; or of JAX, if `value` is traced
+    or is an array of JAX of that dtype and shape already.
     `None` in `shape` stands for any length, and JOINT for that of any arm. `broadcast`
     also accepts one number for all entries, and repeats it if the shape is known.
     Raises ValueError for a wrong shape, a type that is not real numbers, NaN,

@@ -339,18 +339,18 @@ def in_chunks(
     # written faster; their own order, restored at the end, takes more memory.
     place = np.argsort(order) if on_device else np.arange(size)
     done, results, structure, remaining = 0, [], None, order
-    progress = meter.init() if meter else None
+    progress = meter.init() if meter is not None else None
     while len(remaining):
         postponed = []
         for members, outcome in _in_lanes(_outcomes, job, devices, remaining, lanes):
             postponed.append(members[np.asarray(outcome.stopped)[: len(members)]])
             done += len(members) - len(postponed[-1])
-            if meter:
+            if meter is not None:
                 progress = meter.step(progress, np.asarray(done / size))
             values, structure = jax.tree.flatten(outcome)
             if not results:
                 if done == size == lanes:  # a single chunk, in order
-                    if meter:
+                    if meter is not None:
                         meter.close(progress)
                     if devices == [None]:
                         return outcome
@@ -365,7 +365,7 @@ def in_chunks(
         remaining = np.concatenate(postponed)
         if 0 < len(remaining) <= lanes // _SMALL:
             lanes = _lanes(min(len(remaining), _SMALL), job.chunk)
-    if meter:
+    if meter is not None:
         meter.close(progress)
     if on_device:
         for index, leaf in enumerate(results):

@@ -103,8 +103,7 @@ class Linkage(Frozen):
         self.locked = real_array("locked", locked, (n,), broadcast=True, of=pairs)
         self.base_angle = real_array("base_angle", base_angle, (), unit="rad")
         self.gravity = real_array("gravity", gravity, ())
-        values = list(vars(self).values())
-        if not is_traced(values):
+        if not is_traced(values := [getattr(self, name) for name in Numbers._fields]):
             numbers = Numbers(*map(np.asarray, values))
             radians("locked", np.where(real_joints(numbers.ef), 0, numbers.locked))
             check_singularity(numbers)

@@ -31,7 +31,7 @@ def _with(
     controller: _C,
     concerns: Callable[[object], bool],
 ) -> _C:
-    """Returns a controller with `change` applied to the parts that `concerns` names."""
+    """Returns a controller with `change` applied to parts for which `concerns`."""
     return jax.tree.map(
         lambda node: change(node) if concerns(node) else node,
         controller,
@@ -57,7 +57,7 @@ def with_error_control(change: Callable[..., Controller], controller: _C) -> _C:
 
 
 def by_square_roots(controller: Controller) -> Controller:
-    """Returns a controller that takes the same steps, of order 8, without powers.
+    """Returns a controller for methods of order 8: the same steps, without powers.
 
     A step changes by the eighth root of its error. XLA on CPU calls the C library's
     `pow` for each lane, but square roots are vectorised: a sweep takes 4 % less time.
