@@ -103,7 +103,8 @@ class Linkage(Frozen):
         self.locked = real_array("locked", locked, (n,), broadcast=True, of=pairs)
         self.base_angle = real_array("base_angle", base_angle, (), unit="rad")
         self.gravity = real_array("gravity", gravity, ())
-        if not is_traced(values := [getattr(self, name) for name in Numbers._fields]):
+        values = [vars(self)[name] for name in Numbers._fields]
+        if not is_traced(values):
             numbers = Numbers(*map(np.asarray, values))
             radians("locked", np.where(real_joints(numbers.ef), 0, numbers.locked))
             check_singularity(numbers)
