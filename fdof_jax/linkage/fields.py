@@ -143,6 +143,7 @@ class Part(Frozen, metaclass=_Fields):
 
     def fits(self, linkage: Linkage, ts: Array) -> Truth:
         """Returns whether an arm and times would be accepted; also if traced."""
+        # NumPy's `all` of a traced array is the array's own.
         own = [np.all(condition.holds) for condition in self.conditions_on(linkage)]
         parts = [part.fits(linkage, ts) for _, part in _within(self)]
         return reduce(and_, [*own, *parts], True)

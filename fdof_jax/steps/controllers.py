@@ -31,7 +31,7 @@ def _with(
     controller: _C,
     concerns: Callable[[object], bool],
 ) -> _C:
-    """Returns a controller with `change` applied to parts for which `concerns`."""
+    """Returns a controller with `change` applied where `concerns` is true."""
     return jax.tree.map(
         lambda node: change(node) if concerns(node) else node,
         controller,
