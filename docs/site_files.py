@@ -5,7 +5,7 @@ from importlib.resources import files as package_files
 from pathlib import Path
 
 from mkdocs.plugins import event_priority
-from mkdocs.structure.files import File
+from mkdocs.structure.files import File, InclusionLevel
 
 ROOT = Path(__file__).parents[1]
 NOTEBOOKS = ["notebooks/README.md", *sorted(
@@ -28,9 +28,18 @@ def on_files(files, config):
         path.relative_to(ROOT).as_posix()
         for path in ROOT.glob("benchmarks/results/*.png")
     ]
+    sources = [
+        path.relative_to(ROOT).as_posix()
+        for path in ROOT.glob("benchmarks/*")
+        if path.suffix in {".py", ".c"}
+    ]
     mathjax = Path(str(package_files("jupyter_server_mathjax"))) / "static"
     for uri in [*pages, *pictures]:
         files.append(File(uri, str(ROOT), config.site_dir, config.use_directory_urls))
+    for uri in sources:  # which the page of the benchmarks links to
+        file = File(uri, str(ROOT), config.site_dir, config.use_directory_urls)
+        file.inclusion = InclusionLevel.INCLUDED  # although mkdocs.yml leaves out *.py
+        files.append(file)
     for path in mathjax.rglob("*"):
         if path.is_file() and "a11y" not in path.parts:
             uri = f"mathjax/{path.relative_to(mathjax).as_posix()}"
