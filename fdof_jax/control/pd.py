@@ -17,7 +17,7 @@ from ..forces.switches import clip
 from ..linkage.fields import Condition, Truth, Values, called, each, field
 from ..linkage.frames import scalar_frames
 from ..linkage.linkage import Linkage, check_linkage, joints_of, possible, without_fixed
-from ..mechanics.equations import Scalars, link_constants
+from ..mechanics.equations import Scalars, link_constants, where
 from ..mechanics.rates import required_efforts
 from ..references.reference import EXPECTED, reference_motion
 
@@ -208,7 +208,7 @@ class ComputedTorque(ModelBased):
         errors = super().unlimited(motion, q, qd, linkage)
         constants = link_constants(self._believed(linkage), jnp.zeros(len(q)))
         rows = zip(constants.fixed, qdd_ref, errors)
-        demanded = tuple(jnp.where(fixed, 0, a + b) for fixed, a, b in rows)
+        demanded = tuple(where(fixed, jnp.zeros_like(b), a + b) for fixed, a, b in rows)
         return required_efforts(constants, tuple(q), tuple(qd), demanded)
 
 

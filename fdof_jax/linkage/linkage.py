@@ -91,8 +91,12 @@ class Linkage(Frozen):
         gravity: ArrayLike = 9.81,
     ):
         pairs = pairs_of(topology)
-        ef = topology if pairs is None else pairs.ravel()
-        self.ef = jnp.asarray(ef, dtype=float)
+        if pairs is None:
+            self.ef = jnp.asarray(topology, dtype=float)
+        else:
+            # Known within transformations, too: programs then contain these joints.
+            with jax.ensure_compile_time_eval():
+                self.ef = jnp.asarray(pairs.ravel(), dtype=float)
         n = self.ef.size // 2
         links, pairs = f"{n} moving links", f"{n} pairs of joints"
         ground = f"the ground and {links}"

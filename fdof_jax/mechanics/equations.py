@@ -10,14 +10,18 @@ forming them. Per joint, the existence factors select between turning about a po
 sliding along a direction; at a fixed pair, displacement and rate are zero.
 """
 
+import dataclasses
 from collections.abc import Callable
 from itertools import accumulate
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jaxtyping import Float
 
+from ..base.checks import is_traced
 from ..base.trigonometry import sincos
 from ..linkage.linkage import Linkage
 from ..linkage.topology import fixed_pairs, real_joints
@@ -27,6 +31,24 @@ Vector = tuple[Array, Array]
 Directions = tuple[Vector, ...]
 # The upper triangle of a symmetric matrix: row i holds the entries from (i, i) on.
 Upper = tuple[tuple[Array, ...], ...]
+
+
+@jax.tree_util.register_static
+@dataclasses.dataclass(frozen=True)
+class Known:
+    """A condition that is part of a program instead of one of its arrays."""
+
+    holds: bool
+
+
+Condition = Array | Known
+
+
+def where(condition: Condition, a: Any, b: Any) -> Any:
+    """Selects as `jnp.where` does; if the condition is known, nothing is traced."""
+    if isinstance(condition, Known):
+        return a if condition.holds else b
+    return jnp.where(condition, a, b)
 
 
 class Constants(NamedTuple):
@@ -47,8 +69,8 @@ class Constants(NamedTuple):
       it is m3 + m4 sin^2.
     """
 
-    revolute: Scalars
-    fixed: Scalars
+    revolute: tuple[Condition, ...]
+    fixed: tuple[Condition, ...]
     direction: Directions
     slide: Scalars
     gravity: Array
@@ -56,7 +78,7 @@ class Constants(NamedTuple):
     along: Scalars
     moment: tuple[Vector, ...]
     second: Scalars
-    ends_in_slides: Scalars
+    ends_in_slides: tuple[Condition, ...]
     slide_pivot: Scalars
 
 
@@ -90,7 +112,7 @@ def link_constants(
     for k in range(last):
         moment[k] = (moment[k][0] + beyond[k + 1] * along[k], moment[k][1])
         second[k] = second[k] + beyond[k + 1] * along[k] ** 2
-    ends_in_slides, slide_pivot = _pairs_of_slides(revolute, fixed, mass, turned)
+    revolute, fixed, ends_in_slides = _conditions(linkage.ef)
     return Constants(
         revolute=revolute,
         fixed=fixed,
@@ -102,8 +124,28 @@ def link_constants(
         moment=tuple(moment),
         second=tuple(second),
         ends_in_slides=ends_in_slides,
-        slide_pivot=slide_pivot,
+        slide_pivot=_slide_pivots(fixed, mass, turned),
     )
+
+
+def _conditions(ef: Array | np.ndarray) -> tuple[tuple[Condition, ...], ...]:
+    """Returns `revolute`, `fixed` and `ends_in_slides`, known if `ef` is."""
+    known = not is_traced(ef)
+    ef = np.asarray(ef) if known else ef
+    revolute, fixed = real_joints(ef), fixed_pairs(ef)
+    last = len(fixed) - 1
+    slides = [~turns & ~rests for turns, rests in zip(revolute, fixed)]
+    ends = []
+    # Of the pairs beyond: whether none moves; whether one does, a slide.
+    none, one_slide = fixed[last], slides[last]
+    for k in reversed(range(last)):
+        ends.append(one_slide & slides[k])
+        one_slide = fixed[k] & one_slide | none & slides[k]
+        none = none & fixed[k]
+    conditions = revolute, fixed, tuple(ends[::-1])
+    if not known:
+        return conditions
+    return tuple(tuple(Known(bool(holds)) for holds in row) for row in conditions)
 
 
 def with_held(c: Constants, held: Scalars) -> Constants:
@@ -111,33 +153,31 @@ def with_held(c: Constants, held: Scalars) -> Constants:
 
     A slide whose one slide beyond is held has the pivot of a single one.
     """
-    fixed = tuple(pair | own for pair, own in zip(c.fixed, held))
+    either = lambda pair, own: where(pair, jnp.ones_like(own), own)
     ends = list(c.ends_in_slides)
     for k in range(len(ends)):
         for own in held[k + 1 :]:
-            ends[k] = ends[k] & ~own
-    return c._replace(fixed=fixed, ends_in_slides=tuple(ends))
+            ends[k] = where(ends[k], ~own, jnp.zeros_like(own))
+    return c._replace(
+        fixed=tuple(map(either, c.fixed, held)), ends_in_slides=tuple(ends)
+    )
 
 
-def _pairs_of_slides(
-    revolute: Scalars, fixed: Scalars, mass: Scalars, turned: list[Vector]
-) -> tuple[Scalars, Scalars]:
-    """Returns `ends_in_slides` and `slide_pivot` of all pairs but the last."""
+def _slide_pivots(
+    fixed: tuple[Condition, ...], mass: Scalars, turned: list[Vector]
+) -> Scalars:
+    """Returns `slide_pivot` of all pairs but the last."""
     last = len(mass) - 1
-    ends, pivots = [], []
-    # Of the pairs beyond: whether none moves; whether one does, a slide. The mass that
-    # the next one to move carries, the mass before it, and its direction as seen here.
-    none, one_slide = fixed[last], ~revolute[last] & ~fixed[last]
+    pivots = []
+    # The mass that the next pair to move carries, the mass before it, and its direction
+    # as seen here.
     carried, before, turn = mass[last], jnp.zeros_like(mass[last]), turned[last]
     for k in reversed(range(last)):
         turn = _select(fixed[k + 1], _in_frame(*turned[k], turn), turned[k])
-        before = mass[k] + jnp.where(fixed[k + 1], before, 0)
-        ends.append(one_slide & ~revolute[k] & ~fixed[k])
+        before = mass[k] + where(fixed[k + 1], before, 0)
         pivots.append(before + carried * turn[1] ** 2)
-        one_slide = jnp.where(fixed[k], one_slide, none & ~revolute[k])
-        none = none & fixed[k]
-        carried = jnp.where(fixed[k], carried, before + carried)
-    return tuple(ends[::-1]), tuple(pivots[::-1])
+        carried = where(fixed[k], carried, before + carried)
+    return tuple(pivots[::-1])
 
 
 def _cross(u: Vector, v: Vector) -> Array:
@@ -160,13 +200,14 @@ def _in_frame(along: Array, across: Array, e: Vector) -> Vector:
     return along * e[0] - across * e[1], along * e[1] + across * e[0]
 
 
-def _select(condition: Array, u: Vector, v: Vector) -> Vector:
-    return jnp.where(condition, u[0], v[0]), jnp.where(condition, u[1], v[1])
+def _select(condition: Condition, u: Vector, v: Vector) -> Vector:
+    return where(condition, u[0], v[0]), where(condition, u[1], v[1])
 
 
 def turns(c: Constants, delta: Scalars) -> Scalars:
     """Computes the angles by which displacements turn the links [rad]."""
-    turned = [jnp.where(r, step, 0) for r, step in zip(c.revolute, delta)]
+    zero = jnp.zeros_like(delta[0])
+    turned = [where(r, step, zero) for r, step in zip(c.revolute, delta)]
     return tuple(accumulate(turned))
 
 
@@ -194,19 +235,20 @@ def equations(
     enter the moments about a joint as differences, which are products with joint rates.
     """
     r, joints, last = c.revolute, range(len(delta)), len(delta) - 1
+    zero = jnp.zeros_like(delta[0])
     # Joint k turns about the start of its link, or slides across the link before, along
     # i e[k].
     e = c.direction[0], *(directions(c, delta) if turned is None else turned)
-    slide = [c.slide[k] + jnp.where(r[k], 0, delta[k]) for k in joints]
+    slide = [c.slide[k] + where(r[k], zero, delta[k]) for k in joints]
     step = [_in_frame(c.along[k], slide[k + 1], e[k + 1]) for k in joints[:-1]]
-    w = list(accumulate([jnp.where(r[k], qd[k], 0) for k in joints]))
+    w = list(accumulate([where(r[k], qd[k], zero) for k in joints]))
     w2 = [rate * rate for rate in w]
 
     # While all joints keep their rates: accelerations of the links' starts, from the
     # base outwards, upwards by gravity. A joint's rate adds w_k^2 - w_(k-1)^2 to the
     # angular velocity squared, or half of it as the Coriolis acceleration of a slide.
     gained = [None, *(qd[k] * (w[k - 1] + w[k]) for k in joints[1:])]
-    coriolis = [None, *(jnp.where(r[k], 0, gained[k]) for k in joints[1:])]
+    coriolis = [None, *(where(r[k], zero, gained[k]) for k in joints[1:])]
     start = [(jnp.zeros_like(c.gravity), c.gravity)]
 
     def across_start(u: Vector, k: int) -> Array:
@@ -243,14 +285,14 @@ def equations(
         if k > 0:
             lift = lift - w2[k - 1] * slide[k]
         sliding = c.beyond[k] * lift - _cross(e[k], thrown)
-        bias.append(jnp.where(r[k], turning, sliding))
+        bias.append(where(r[k], turning, sliding))
         # Joint k at unit rate: each joint before it takes a share of the momentum.
         momentum = _select(r[k], first, _scale(c.beyond[k], e[k]))
-        angular = jnp.where(r[k], second, _dot(first, e[k]))
-        column = [jnp.where(r[k], second, c.beyond[k])]
+        angular = where(r[k], second, _dot(first, e[k]))
+        column = [where(r[k], second, c.beyond[k])]
         for i in reversed(joints[:k]):
             angular = angular + _dot(step[i], momentum)
-            column.append(jnp.where(r[i], angular, _dot(e[i], momentum)))
+            column.append(where(r[i], angular, _dot(e[i], momentum)))
         rows.append(column[::-1])  # entries (0, k) to (k, k)
     columns = rows[::-1]
     mass = tuple(tuple(columns[j][i] for j in joints[i:]) for i in joints)

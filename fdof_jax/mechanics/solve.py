@@ -10,7 +10,7 @@ import numpy as np
 from jax import Array
 
 from ..base.one_loop import one_loop_on_cpu
-from .equations import Constants, Equations, Scalars, Upper
+from .equations import Constants, Equations, Scalars, Upper, where
 
 Matrix = tuple[Scalars, ...]  # by columns
 
@@ -63,17 +63,17 @@ def solver_of(
     `m` already includes `added`. The diagonal is infinite if a pivot is not positive.
     At fixed pairs x and the diagonal are zero.
     """
-    joints = range(len(m.bias))
+    joints, fixed = range(len(m.bias)), c.fixed
     rest = [list(row) for row in m.mass]  # entry (i, j) is rest[i][j - i]
     pivots, inverse = [], []
     factor: list[Scalars] = []  # row k: L_k0, ..., L_k,k-1
     for k in reversed(joints):
         pivot = rest[k][0]
         if added is None and k < joints[-1]:
-            pivot = jnp.where(c.ends_in_slides[k], c.slide_pivot[k], pivot)
-        pivot = jnp.where(c.fixed[k], 1, pivot)
+            pivot = where(c.ends_in_slides[k], c.slide_pivot[k], pivot)
+        pivot = where(fixed[k], jnp.ones_like(pivot), pivot)
         pivots.append(pivot)
-        inverse.append(jnp.where(c.fixed[k], 0, reciprocal(pivot)))
+        inverse.append(where(fixed[k], jnp.zeros_like(pivot), reciprocal(pivot)))
         column = [rest[i][k - i] for i in joints[:k]]
         factor.append(tuple(entry * inverse[-1] for entry in column))
         for i in joints[:k]:
@@ -108,7 +108,7 @@ def solver_of(
             reduced.append(row)
             terms = (entry * entry * inverse[i] for i, entry in enumerate(row))
             own = functools.reduce(add, terms, inverse[k])
-            diagonal.append(jnp.where(singular & ~c.fixed[k], jnp.inf, own))
+            diagonal.append(where(fixed[k], own, jnp.where(singular, jnp.inf, own)))
         return tuple(diagonal)
 
     return solve, inverse_diagonal

@@ -35,7 +35,7 @@ _STABLE = 2.0
 
 def cause(inputs: Inputs, keywords: Settings, solution: Solution) -> str:
     """Returns what is known about a failed solve, in a sentence."""
-    linkage, (q, qd), ts, own0, forces = inputs
+    linkage, (q, qd), ts, own0, forces, _ = inputs
     outcome = str(solution.outcome)
     if outcome == "not finite":
         own = own0 or initial_states(linkage, forces)
@@ -64,7 +64,7 @@ def _of_joints(linkage: Linkage, solution: Solution) -> str:
 
 def _of_switches(inputs: Inputs, keywords: Settings) -> str:
     """Names the element and the joint that switch without end, and what helps."""
-    linkage, (q, qd), ts, own0, forces = inputs
+    linkage, (q, qd), ts, own0, forces, _ = inputs
     names, begin = joint_names(linkage), 0
     switched = np.asarray(eqx.filter_jit(last_switched)(inputs, keywords))
     own = own0 or initial_states(linkage, forces)
@@ -109,7 +109,7 @@ def _of_switches(inputs: Inputs, keywords: Settings) -> str:
 
 def _of_steps(inputs: Inputs, keywords, solution: Solution) -> str:
     """Compares the steps of a motion with the fastest mode where it stopped."""
-    linkage, _, ts, _, forces = inputs
+    linkage, _, ts, _, forces, _ = inputs
     steps = int(solution.stats["num_steps"])
     covered = float(solution.stats["time_reached"] - ts[0])
     if covered == 0:

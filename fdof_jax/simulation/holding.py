@@ -23,7 +23,7 @@ from ..forces.holders import Brake, HardStops, Holder, holders
 from ..forces.payload import Payload
 from ..linkage.fields import Truth
 from ..linkage.linkage import Linkage, joints_of
-from ..linkage.topology import fixed_pairs
+from ..linkage.topology import fixed_pairs, real_joints
 from ..mechanics.equations import Constants, Equations, Upper, equations, with_held
 from ..mechanics.rates import efforts_of_fixed
 from ..mechanics.solve import divided, solver_of, times, with_added
@@ -141,7 +141,9 @@ def guarded_switching(
     rubs = (law.static > 0) & ~held & (direction != 0)
     sliding = jnp.where(rubs, direction * jnp.stack(y[1]), 1)
     c = args.constants
-    inertia = jnp.where(*map(jnp.stack, (c.revolute, c.second, c.beyond)))
+    inertia = jnp.where(
+        *map(jnp.stack, (real_joints(args.linkage.ef), c.second, c.beyond))
+    )
     inertia = jnp.where(inertia > 0, inertia, 1)
     reserve = _reserve(law.static, modes.mode, effort, inertia)
     guards = [jnp.where(held, reserve, sliding)]

@@ -10,6 +10,7 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from ..base.checks import refusal
@@ -45,7 +46,8 @@ Settings = dict[str, Any]  # keywords of `diffeqsolve`, as `solve_options` check
 class Inputs(NamedTuple):
     """The arguments that determine a motion, as `simulate` gets them.
 
-    `own0`: initial states of the elements, or None for their defaults.
+    - `own0`: initial states of the elements, or None for their defaults.
+    - `known_ef`: existence factors that the program may contain, or None.
     """
 
     linkage: Linkage
@@ -53,6 +55,7 @@ class Inputs(NamedTuple):
     ts: Array
     own0: OwnStates | None
     forces: tuple[Element, ...]
+    known_ef: tuple[float, ...] | None = None
 
 
 class _Problem(NamedTuple):
@@ -102,7 +105,9 @@ def integrate(
 
 def _prepare(inputs: Inputs, derivatives: bool, padded: bool) -> _Problem:
     """States the equations and their start."""
-    linkage, state0, ts, own0, forces = inputs
+    linkage, state0, ts, own0, forces, ef = inputs
+    if ef is not None:  # the equations of other joints are left out
+        linkage = eqx.tree_at(lambda arm: arm.ef, linkage, np.array(ef))
     wrong_times, wrong_start, *others = faults(inputs, times=not padded)
     valid = ~jnp.stack([wrong_times, wrong_start, *others]).any()
     # Stand-ins replace invalid values, because NaN in one lane would spoil derivatives
@@ -284,7 +289,7 @@ def faults(inputs: Inputs, times: bool = True) -> list[Array]:
     `times`: whether those are looked at, too; those of a plain call may repeat the last
     one.
     """
-    linkage, state0, ts, _, forces = inputs
+    linkage, state0, ts, _, forces, _ = inputs
     growth = jnp.diff(ts)
     increasing = ((growth > 0) & (growth < jnp.inf)).all() | (not times)
     finite = (jnp.isfinite(state0.q) & jnp.isfinite(state0.qd)).all()

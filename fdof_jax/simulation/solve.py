@@ -37,9 +37,12 @@ def solve(inputs: Inputs, keywords: Settings) -> tuple[Solution, bool | None]:
         # Within `vmap` even a tracer may hold a NumPy array, which rules of derivatives
         # refuse in JAX 0.10.
         arrays = jax.Array, np.ndarray, np.generic
+        ef = inputs.linkage.ef
+        known = None if is_traced(ef) else tuple(np.asarray(ef).tolist())
         inputs = jax.tree.map(
             lambda x: jax.device_put(x) if isinstance(x, arrays) else x, inputs
         )
+        inputs = inputs._replace(known_ef=known)
         return _solve(inputs, keywords), None
     one = None if is_traced(inputs, keywords) else _solve_one(inputs, keywords)
     return one or (_solve_compiled(inputs, keywords), None)
