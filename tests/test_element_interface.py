@@ -276,8 +276,8 @@ def test_nothing_else_is_asked_for_attributes():
         for path in folder.rglob("*.py")
         if "hasattr(" in path.read_text() or "getattr(" in path.read_text()
     }
-    # These ask arrays, programs, and what JAX and MuJoCo have in some versions alone.
-    others = {"batches/chunks.py", "batches/store.py", "steps/unrolled_dopri8.py"}
+    # These ask arrays, programs, and MuJoCo's models of all versions.
+    others = {"batches/chunks.py", "batches/store.py"}
     others |= {f"data/mjcf_{part}.py" for part in ("actuators", "chain", "elements")}
     assert asking == {"linkage/fields.py", "data/files.py"} | others
 

@@ -36,10 +36,6 @@ from .dopri8 import (
     verdict,
 )
 
-# From JAX 0.12 on, XLA optimises the stages' equations once, and inlines them late. A
-# first sweep then takes 4.4 s instead of 5.4, later ones 2 to 3 % longer (AMD EPYC).
-_INLINE = getattr(jax, "Inline", None)
-_INLINED = {} if _INLINE is None else {"inline": _INLINE.XLA_LATE}
 _USED = [stage for stage, row in enumerate(DENSE) if row.any()]
 
 State = PyTree  # of scalars
@@ -105,7 +101,7 @@ def _step(term, t0, t1, y0, residue, args, f0) -> tuple[_Step, dict[str, PyTree]
         lambda t: entries_in_one_loop(inner.schedule(t, args)), times
     )
     scheduled = lambda stage: jax.tree.map(lambda leaf: leaf[stage], schedule)
-    field, rates = eqx.filter_jit(inner.vector_field, **_INLINED), [f0]
+    field, rates = eqx.filter_jit(inner.vector_field), [f0]
     weighted = lambda row: _increment(row, rates, y0, h)
     for stage, row in enumerate(LOWER[1:-1], 1):
         y = _moved(y0, h, weighted(row))
