@@ -89,26 +89,27 @@ def integrate(
     inputs: Inputs,
     keywords: Settings,
     derivatives: bool = False,
-    padded: bool = False,
+    plain: bool = False,
     tangents: bool = False,
 ) -> Solution:
     """Integrates one motion, by default with `LoopedDopri8`.
 
     `derivatives`: whether steps are kept short enough for accurate derivatives.
-    `padded`: whether this is a plain call, whose last time may be repeated.
+    `plain`: whether this is one motion outside of transformations. Its last time may be
+    repeated.
     `tangents`: whether the caller maps over tangents, along the axis `TANGENTS`.
     """
-    problem = _prepare(inputs, derivatives, padded)
+    problem = _prepare(inputs, derivatives, plain)
     control = _control(problem, keywords, derivatives, tangents)
     return _read(inputs, problem, _solve(problem, control, keywords))
 
 
-def _prepare(inputs: Inputs, derivatives: bool, padded: bool) -> _Problem:
+def _prepare(inputs: Inputs, derivatives: bool, plain: bool) -> _Problem:
     """States the equations and their start."""
     linkage, state0, ts, own0, forces, ef = inputs
     if ef is not None:  # the equations of other joints are left out
         linkage = eqx.tree_at(lambda arm: arm.ef, linkage, np.array(ef))
-    wrong_times, wrong_start, *others = faults(inputs, times=not padded)
+    wrong_times, wrong_start, *others = faults(inputs, times=not plain)
     valid = ~jnp.stack([wrong_times, wrong_start, *others]).any()
     # Stand-ins replace invalid values, because NaN in one lane would spoil derivatives
     # in arrays that lanes share.
@@ -129,7 +130,7 @@ def _prepare(inputs: Inputs, derivatives: bool, padded: bool) -> _Problem:
 
     q, qd, _ = joints(ts[0], start)  # after a blow there, like all that follows
     equations = term, start, args
-    if padded and not derivatives:
+    if plain and not derivatives:
         equations = in_arrays(*equations)
     return _Problem(valid & finite, ts, (q, qd), *equations, joints)
 
@@ -261,7 +262,7 @@ def last_switched(inputs: Inputs, keywords: Settings) -> Array:
     In the order of the elements; guards of modes are the last ones.
     """
     keywords = keywords | {"adjoint": diffrax.ForwardMode()}
-    problem = _prepare(inputs, derivatives=False, padded=False)
+    problem = _prepare(inputs, derivatives=False, plain=False)
     control = _control(problem, keywords, derivatives=False, tangents=False)
     ends = _solve(problem, control, keywords).ys
     assert ends is not None  # because of saveat

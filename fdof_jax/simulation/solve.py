@@ -122,7 +122,7 @@ def _solve_padded(inputs: Inputs, keywords) -> tuple[Solution, Array]:
     # The steps are those of the same call with forward-mode derivatives.
     derivatives = isinstance(keywords["adjoint"], diffrax.ForwardMode)
     keywords = keywords | {"adjoint": diffrax.ForwardMode()}
-    solution = integrate(inputs, keywords, derivatives, padded=True)
+    solution = integrate(inputs, keywords, derivatives, plain=True)
     return solution, solution.result == diffrax.RESULTS.successful
 
 
