@@ -21,7 +21,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
-from ..base.checks import is_traced
+from ..base.checks import concrete
 from ..base.trigonometry import sincos
 from ..linkage.linkage import Linkage
 from ..linkage.topology import fixed_pairs, real_joints
@@ -130,9 +130,9 @@ def link_constants(
 
 def _conditions(ef: Array | np.ndarray) -> tuple[tuple[Condition, ...], ...]:
     """Returns `revolute`, `fixed` and `ends_in_slides`, known if `ef` is."""
-    known = not is_traced(ef)
-    ef = np.asarray(ef) if known else ef
-    revolute, fixed = real_joints(ef), fixed_pairs(ef)
+    known = concrete(ef)
+    factors = ef if known is None else known
+    revolute, fixed = real_joints(factors), fixed_pairs(factors)
     last = len(fixed) - 1
     slides = [~turns & ~rests for turns, rests in zip(revolute, fixed)]
     ends = []
@@ -143,7 +143,7 @@ def _conditions(ef: Array | np.ndarray) -> tuple[tuple[Condition, ...], ...]:
         one_slide = fixed[k] & one_slide | none & slides[k]
         none = none & fixed[k]
     conditions = revolute, fixed, tuple(ends[::-1])
-    if not known:
+    if known is None:
         return conditions
     return tuple(tuple(Known(bool(holds)) for holds in row) for row in conditions)
 

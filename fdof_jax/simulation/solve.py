@@ -12,7 +12,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import PyTree
 from numpy.typing import ArrayLike
 
-from ..base.checks import is_traced
+from ..base.checks import concrete, is_traced
 from ..base.configuration import options_of_loops
 from ..base.functions import sharing_functions
 from ..forces.added_inertia import inertial
@@ -37,12 +37,12 @@ def solve(inputs: Inputs, keywords: Settings) -> tuple[Solution, bool | None]:
         # Within `vmap` even a tracer may hold a NumPy array, which rules of derivatives
         # refuse in JAX 0.10.
         arrays = jax.Array, np.ndarray, np.generic
-        ef = inputs.linkage.ef
-        known = None if is_traced(ef) else tuple(np.asarray(ef).tolist())
+        known = concrete(inputs.linkage.ef)
         inputs = jax.tree.map(
             lambda x: jax.device_put(x) if isinstance(x, arrays) else x, inputs
         )
-        inputs = inputs._replace(known_ef=known)
+        if known is not None:
+            inputs = inputs._replace(known_ef=tuple(known.tolist()))
         return _solve(inputs, keywords), None
     one = None if is_traced(inputs, keywords) else _solve_one(inputs, keywords)
     return one or (_solve_compiled(inputs, keywords), None)
