@@ -4,6 +4,7 @@ import functools
 import re
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import pytest
@@ -12,9 +13,10 @@ from jax.extend.core import ClosedJaxpr, Jaxpr
 
 import fdof_jax as fj
 from fdof_jax import scenes
+from fdof_jax.base.checks import is_traced
 from fdof_jax.mechanics.equations import link_constants, zeros
 from fdof_jax.mechanics.rates import rates
-from fdof_jax.simulation.field import Args, schedule_of, vector_field
+from fdof_jax.simulation.field import Args, _packed, schedule_of, vector_field
 
 
 def cost(kind, function, *arguments):
@@ -30,7 +32,8 @@ transcendentals = functools.partial(cost, "transcendentals")
 def field_arguments(forces):
     linkage = scenes.fig7().linkage
     q = jnp.array([0.3, 2.0, -0.4])
-    args = Args(linkage, q, link_constants(linkage, q), forces)
+    constants = jax.jit(link_constants)(linkage, q)  # of which joints, is not known
+    args = Args(linkage, q, constants, forces)
     return jnp.array(0.1), (zeros(q), tuple(q)), args
 
 
@@ -63,6 +66,34 @@ def test_joints_that_are_known_to_be_absent_cost_nothing():
         flops(rates, c, zeros(q), tuple(q), zeros(q)) for c in (known, asked)
     )
     assert of_known <= 416 < of_any <= 530
+
+
+def test_constants_of_known_joints_have_no_flags():
+    known = link_constants(scenes.fig7().linkage, jnp.zeros(3))
+    packed = _packed(known)
+    assert packed.flags.size == 0 and eqx.tree_equal(packed.scalars(), known)
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+@pytest.mark.filterwarnings("ignore:linkage. expected numbers in double precision")
+def test_elements_see_known_existence_factors_as_those_of_the_arm(dtype):
+    class Looking(fj.forces.StatefulElement):
+        def initial_state(self, linkage):
+            seen.append(linkage.ef)
+            return linkage.ef.at[0].set(0.5)[:1]
+
+        def __call__(self, t, q, qd, linkage, state):
+            return -state * qd, -state
+
+    def motion(mass):
+        one = eqx.tree_at(lambda arm: arm.mass, arm, mass)
+        return fj.simulate(one, state0, [0, 1.0], (Looking(),), throw=False).q
+
+    seen, (arm, state0, *_) = [], scenes.fig5()
+    arm = jax.tree.map(lambda leaf: leaf.astype(dtype), arm)
+    jax.eval_shape(motion, arm.mass)
+    assert {ef.dtype for ef in seen} == {jnp.dtype(dtype)}
+    assert any(not is_traced(ef) for ef in seen)
 
 
 def test_a_program_contains_existence_factors_that_are_known():

@@ -2,12 +2,16 @@
 
 import functools
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jax import Array
 from jax.core import Tracer
 from jaxtyping import PyTree
+from numpy.typing import ArrayLike
 
 from .checks import is_traced
 
@@ -21,6 +25,12 @@ def in_numpy(tree: PyTree) -> PyTree:
         return np.asarray(leaf) if numbers and not isinstance(leaf, Tracer) else leaf
 
     return jax.tree.map(converted, tree)
+
+
+def known_array(values: ArrayLike, dtype: Any = float) -> Array:
+    """Returns an array of JAX that is known within transformations, too."""
+    with jax.ensure_compile_time_eval():
+        return jnp.asarray(values, dtype)
 
 
 def at_once(function: Callable) -> Callable:

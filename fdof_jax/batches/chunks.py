@@ -22,7 +22,7 @@ from jax.sharding import SingleDeviceSharding
 from jaxtyping import PyTree
 
 from ..base.checks import refusal
-from ..base.known_values import in_numpy
+from ..base.known_values import in_numpy, known_array
 from ..dynamics import energy, forward_dynamics
 from ..forces.added_inertia import present
 from ..forces.element import elements
@@ -135,7 +135,7 @@ class Form(NamedTuple):
     def values(self, lanes: list[Array], arrays: list[Array]) -> PyTree:
         """Computes the function's values for all lanes of a chunk."""
         given = iter(arrays)
-        value = lambda x: np.array(x) if isinstance(x, tuple) else x
+        value = lambda x: known_array(x) if isinstance(x, tuple) else x
         leaves = [next(given) if _is_kind(x) else value(x) for x in self.leaves]
         return self.function(
             self.common.unflatten(leaves), self.moving.unflatten(lanes)

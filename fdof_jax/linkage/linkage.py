@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike
 from ..base.checks import is_traced, known, radians, real_array, shown
 from ..base.frozen import Frozen
 from ..base.functions import sharing_functions
+from ..base.known_values import known_array
 from .singularity import Numbers, check_singularity
 from .topology import (
     can_move,
@@ -94,9 +95,7 @@ class Linkage(Frozen):
         if pairs is None:
             self.ef = jnp.asarray(topology, dtype=float)
         else:
-            # Known within transformations, too: programs then contain these joints.
-            with jax.ensure_compile_time_eval():
-                self.ef = jnp.asarray(pairs.ravel(), dtype=float)
+            self.ef = known_array(pairs.ravel())  # programs leave out other joints
         n = self.ef.size // 2
         links, pairs = f"{n} moving links", f"{n} pairs of joints"
         ground = f"the ground and {links}"

@@ -36,25 +36,26 @@ Upper = tuple[tuple[Array, ...], ...]
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class Known:
-    """A condition that is part of a program instead of one of its arrays."""
+    """A flag that is part of a program instead of one of its arrays."""
 
     holds: bool
 
 
-Condition = Array | Known
+Flag = Array | Known
 
 
-def where(condition: Condition, a: Any, b: Any) -> Any:
-    """Selects as `jnp.where` does; if the condition is known, nothing is traced."""
-    if isinstance(condition, Known):
-        return a if condition.holds else b
-    return jnp.where(condition, a, b)
+def where(flag: Flag, a: Any, b: Any) -> Any:
+    """Selects as `jnp.where` does; if the flag is known, `a` or `b` itself."""
+    if isinstance(flag, Known):
+        return a if flag.holds else b
+    return jnp.where(flag, a, b)
 
 
 class Constants(NamedTuple):
     """Scalars of a linkage for the equations, computed once per solve.
 
-    Each tuple has an entry per pair of joints, k, or per link that follows.
+    Each tuple has an entry per pair of joints, k, or per link that follows. Flags are
+    `Known` where a program contains them, and constants with these are other trees.
 
     - `revolute`, `fixed`: whether the pair turns; whether it neither turns nor slides.
     - `direction`: of the ground and of each link at the reference.
@@ -69,8 +70,8 @@ class Constants(NamedTuple):
       it is m3 + m4 sin^2.
     """
 
-    revolute: tuple[Condition, ...]
-    fixed: tuple[Condition, ...]
+    revolute: tuple[Flag, ...]
+    fixed: tuple[Flag, ...]
     direction: Directions
     slide: Scalars
     gravity: Array
@@ -78,7 +79,7 @@ class Constants(NamedTuple):
     along: Scalars
     moment: tuple[Vector, ...]
     second: Scalars
-    ends_in_slides: tuple[Condition, ...]
+    ends_in_slides: tuple[Flag, ...]
     slide_pivot: Scalars
 
 
@@ -92,9 +93,9 @@ def link_constants(
     `sincos` may be one for large angles. Directions are combined instead of angles,
     because the sum of large angles is rounded.
     """
-    revolute, fixed = real_joints(linkage.ef), fixed_pairs(linkage.ef)
-    turns = jnp.stack(revolute)
-    q = jnp.where(jnp.stack(fixed), 0, q)
+    revolute, fixed, ends_in_slides = _flags(linkage.ef)
+    turns = jnp.stack(real_joints(linkage.ef))
+    q = jnp.where(jnp.stack(fixed_pairs(linkage.ef)), 0, q)
     angle = jnp.where(turns, q, linkage.locked)
     sin, cos = sincos(jnp.concatenate([linkage.base_angle[None], angle]))
     ground, *turned = zip(cos, sin)
@@ -112,7 +113,6 @@ def link_constants(
     for k in range(last):
         moment[k] = (moment[k][0] + beyond[k + 1] * along[k], moment[k][1])
         second[k] = second[k] + beyond[k + 1] * along[k] ** 2
-    revolute, fixed, ends_in_slides = _conditions(linkage.ef)
     return Constants(
         revolute=revolute,
         fixed=fixed,
@@ -128,7 +128,7 @@ def link_constants(
     )
 
 
-def _conditions(ef: Array | np.ndarray) -> tuple[tuple[Condition, ...], ...]:
+def _flags(ef: Array | np.ndarray) -> tuple[tuple[Flag, ...], ...]:
     """Returns `revolute`, `fixed` and `ends_in_slides`, known if `ef` is."""
     known = concrete(ef)
     factors = ef if known is None else known
@@ -142,10 +142,10 @@ def _conditions(ef: Array | np.ndarray) -> tuple[tuple[Condition, ...], ...]:
         ends.append(one_slide & slides[k])
         one_slide = fixed[k] & one_slide | none & slides[k]
         none = none & fixed[k]
-    conditions = revolute, fixed, tuple(ends[::-1])
+    flags = revolute, fixed, tuple(ends[::-1])
     if known is None:
-        return conditions
-    return tuple(tuple(Known(bool(holds)) for holds in row) for row in conditions)
+        return flags
+    return tuple(tuple(Known(bool(holds)) for holds in row) for row in flags)
 
 
 def with_held(c: Constants, held: Scalars) -> Constants:
@@ -164,7 +164,7 @@ def with_held(c: Constants, held: Scalars) -> Constants:
 
 
 def _slide_pivots(
-    fixed: tuple[Condition, ...], mass: Scalars, turned: list[Vector]
+    fixed: tuple[Flag, ...], mass: Scalars, turned: list[Vector]
 ) -> Scalars:
     """Returns `slide_pivot` of all pairs but the last."""
     last = len(mass) - 1
@@ -200,8 +200,8 @@ def _in_frame(along: Array, across: Array, e: Vector) -> Vector:
     return along * e[0] - across * e[1], along * e[1] + across * e[0]
 
 
-def _select(condition: Condition, u: Vector, v: Vector) -> Vector:
-    return where(condition, u[0], v[0]), where(condition, u[1], v[1])
+def _select(flag: Flag, u: Vector, v: Vector) -> Vector:
+    return where(flag, u[0], v[0]), where(flag, u[1], v[1])
 
 
 def turns(c: Constants, delta: Scalars) -> Scalars:

@@ -63,7 +63,7 @@ def solver_of(
     `m` already includes `added`. The diagonal is infinite if a pivot is not positive.
     At fixed pairs x and the diagonal are zero.
     """
-    joints, fixed = range(len(m.bias)), c.fixed
+    joints = range(len(m.bias))
     rest = [list(row) for row in m.mass]  # entry (i, j) is rest[i][j - i]
     pivots, inverse = [], []
     factor: list[Scalars] = []  # row k: L_k0, ..., L_k,k-1
@@ -71,9 +71,9 @@ def solver_of(
         pivot = rest[k][0]
         if added is None and k < joints[-1]:
             pivot = where(c.ends_in_slides[k], c.slide_pivot[k], pivot)
-        pivot = where(fixed[k], jnp.ones_like(pivot), pivot)
+        pivot = where(c.fixed[k], jnp.ones_like(pivot), pivot)
         pivots.append(pivot)
-        inverse.append(where(fixed[k], jnp.zeros_like(pivot), reciprocal(pivot)))
+        inverse.append(where(c.fixed[k], jnp.zeros_like(pivot), reciprocal(pivot)))
         column = [rest[i][k - i] for i in joints[:k]]
         factor.append(tuple(entry * inverse[-1] for entry in column))
         for i in joints[:k]:
@@ -108,7 +108,7 @@ def solver_of(
             reduced.append(row)
             terms = (entry * entry * inverse[i] for i, entry in enumerate(row))
             own = functools.reduce(add, terms, inverse[k])
-            diagonal.append(where(fixed[k], own, jnp.where(singular, jnp.inf, own)))
+            diagonal.append(where(c.fixed[k], own, jnp.where(singular, jnp.inf, own)))
         return tuple(diagonal)
 
     return solve, inverse_diagonal

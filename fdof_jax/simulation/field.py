@@ -324,8 +324,9 @@ def _packed(scalars: Constants) -> _Packed:
     leaves, structure = jax.tree.flatten(jax.tree.map(jnp.asarray, scalars))
     is_flag = tuple(leaf.dtype == bool for leaf in leaves)
     numbers, flags = (
-        jnp.stack([leaf for leaf, flag in zip(leaves, is_flag) if flag == kind])
-        for kind in (False, True)
+        # Of known joints there are no flags.
+        jnp.array([leaf for leaf, flag in zip(leaves, is_flag) if flag == kind], dtype)
+        for kind, dtype in ((False, None), (True, bool))
     )
     return _Packed(numbers, flags, structure, is_flag)
 

@@ -10,10 +10,10 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 
 from ..base.checks import refusal
+from ..base.known_values import known_array
 from ..forces.element import Element, OwnStates
 from ..forces.joints import EffortHistory
 from ..linkage.linkage import Linkage, possible, without_fixed
@@ -108,7 +108,8 @@ def _prepare(inputs: Inputs, derivatives: bool, plain: bool) -> _Problem:
     """States the equations and their start."""
     linkage, state0, ts, own0, forces, ef = inputs
     if ef is not None:  # the equations of other joints are left out
-        linkage = eqx.tree_at(lambda arm: arm.ef, linkage, np.array(ef))
+        known = known_array(ef, linkage.ef.dtype)
+        linkage = eqx.tree_at(lambda arm: arm.ef, linkage, known)
     wrong_times, wrong_start, *others = faults(inputs, times=not plain)
     valid = ~jnp.stack([wrong_times, wrong_start, *others]).any()
     # Stand-ins replace invalid values, because NaN in one lane would spoil derivatives

@@ -34,10 +34,10 @@ def solve(inputs: Inputs, keywords: Settings) -> tuple[Solution, bool | None]:
     # JAX traces even constants inside `jax.jit`, where a jitted function of our own
     # would only be traced once more.
     if is_traced(jax.device_put(np.zeros(()))):
+        known = concrete(inputs.linkage.ef)
         # Within `vmap` even a tracer may hold a NumPy array, which rules of derivatives
         # refuse in JAX 0.10.
         arrays = jax.Array, np.ndarray, np.generic
-        known = concrete(inputs.linkage.ef)
         inputs = jax.tree.map(
             lambda x: jax.device_put(x) if isinstance(x, arrays) else x, inputs
         )
