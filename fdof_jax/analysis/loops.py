@@ -1,6 +1,6 @@
 """Loops of a controller about a configuration, as systems of python-control."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -8,13 +8,7 @@ from numpy.typing import ArrayLike
 
 from ..base.checks import check_known, instance, one_of, real_array, refusal
 from ..forces.element import Forces, elements_on, of_full_size
-from ..linkage.linkage import (
-    Linkage,
-    check_linkage,
-    joint_names,
-    moving_joints,
-    per_joint,
-)
+from ..linkage.linkage import Linkage, joint_names, moving_joints, per_joint
 from ..simulation.prescribed import prescribed
 from .linearization import checked, loop_matrices
 
@@ -65,7 +59,7 @@ def open_loop(
     >>> complex(loop(5.278j))  # at 5.278 rad/s, where |L| = 1
     (-0.962-0.273j)
     """
-    return _loops(linkage, q, controller, joint, forces, t)[0]
+    return loops_of(linkage, q, controller, forces, t, [joint])[0][0]
 
 
 def closed_loop(
@@ -99,19 +93,19 @@ def closed_loop(
     >>> fj.analysis.bandwidth(response)
     8.103
     """
-    return _loops(linkage, q, controller, joint, forces, t)[1]
+    return loops_of(linkage, q, controller, forces, t, [joint])[0][1]
 
 
-def _loops(
-    linkage: Linkage, q: ArrayLike, controller: Callable, joint: int, forces: Forces,
-    t: ArrayLike,
-) -> tuple[Loop, Loop]:  # fmt: skip
+def loops_of(
+    linkage: Linkage, q: ArrayLike, controller: Callable, forces: Forces,
+    t: ArrayLike = 0.0, joints: Sequence[int] | None = None,
+) -> list[tuple[Loop, Loop]]:  # fmt: skip
+    """Returns the loops of joints, by default of all, and responses to references."""
     import control
 
-    check_linkage(linkage)
-    n, moving = len(joint_names(linkage)), moving_joints(linkage)
-    index = one_of("joint", joint, [k + 1 for k in moving]) - 1
-    forces = checked(linkage, forces)
+    forces, moving = checked(linkage, forces), moving_joints(linkage)
+    numbers = [k + 1 for k in moving]
+    indices = [one_of("joint", joint, numbers) - 1 for joint in joints or numbers]
     if not callable(controller) or isinstance(controller, type):
         expected = "a force element, a PDController for instance"
         raise refusal("controller", expected, controller)
@@ -125,21 +119,23 @@ def _loops(
     # Left out are states of fixed pairs, and those of the controller that act on no
     # joint, such as an integral of a fixed pair, or that nothing changes.
     paths = np.linalg.matrix_power((A != 0) + np.eye(len(A)), len(A)) > 0
-    joints = [*moving, *(n + k for k in moving)]
-    driven = paths[:, joints].any(axis=1) | (paths @ F.any(axis=(0, 2)))
-    states = np.flatnonzero(paths[joints].any(axis=0) & driven)
-    A, B, C = A[np.ix_(states, states)], B[states, index], C[index, states]
+    both = [*moving, *(q.size + k for k in moving)]  # positions and velocities
+    driven = paths[:, both].any(axis=1) | (paths @ F.any(axis=(0, 2)))
+    states = np.flatnonzero(paths[both].any(axis=0) & driven)
+    A, B, C, F = A[np.ix_(states, states)], B[states], C[:, states], F[:, states]
     # Rates and accelerations of the reference act as s and s^2 times its positions; of
     # s (s I - A)^-1 = I + A (s I - A)^-1 the first part reaches no position at once.
-    position, rate, acceleration = F[:, states, index]
+    position, rate, acceleration = F
     position = position + A @ (rate + A @ acceleration)
-    at_joint = (states == index).astype(float)
-    through = float(at_joint @ A @ acceleration)
-    name = joint_names(linkage)[index]
-    column, row = B[:, None], C[None]
-    loop = control.ss(A + column @ row, column, row, 0, name=f"loop of {name}")
-    following = A, position[:, None], at_joint[None], through
-    return loop, control.ss(*following, name=f"response of {name}")
+    found = []
+    for k in indices:
+        column, row, name = B[:, [k]], C[[k]], joint_names(linkage)[k]
+        loop = control.ss(A + column @ row, column, row, 0, name=f"loop of {name}")
+        at_joint = (states == k).astype(float)[None]
+        through = at_joint @ A @ acceleration[:, [k]]
+        following = A, position[:, [k]], at_joint, through
+        found.append((loop, control.ss(*following, name=f"response of {name}")))
+    return found
 
 
 class Margins(NamedTuple):
@@ -184,8 +180,7 @@ def margins(loop: "control.StateSpace") -> Margins:
     closed: Loop = loop.feedback()
     if closed.poles().real.max() >= 0:
         return Margins(*[np.nan] * 5)
-    unit = _unit(closed)
-    slower = _slower(loop, unit)
+    slower, unit = _slower(loop, closed)
     with np.errstate(all="ignore"):  # infinite at poles
         gains, phases, _, _, crossings, _ = control.stability_margins(slower, True)
     gains = gains[(gains > 1 / _LARGEST_MARGIN) & (gains < _LARGEST_MARGIN)]
@@ -220,25 +215,22 @@ def bandwidth(response: "control.StateSpace") -> float:
         return np.nan
     # `control.bandwidth` looks at 1000 frequencies, and misses dips beside the lightly
     # damped modes of other joints: 20.3 for 6.18 rad/s at a damping ratio of 5e-4.
-    unit = _unit(response)
-    return unit * min(_crossings(_slower(response, unit) / level), default=np.inf)
+    slower, unit = _slower(response, response)
+    return unit * min(_crossings(slower / level), default=np.inf)
 
 
-def _unit(system: "control.StateSpace") -> float:
-    """Returns the geometric mean of the magnitudes of a system's poles [rad/s]."""
-    rates = np.abs(system.poles())
-    return float(np.exp(np.log(rates[rates > 0]).mean()))
+def _slower(system: Loop, closed: Loop) -> tuple[Loop, float]:
+    """Returns a system in units of time in which the closed loop's poles are around 1.
 
-
-def _slower(system: Loop, unit: float) -> Loop:
-    """Returns a system in units of time in which its poles are around 1.
-
+    Also returns the factor: the geometric mean of the poles' magnitudes [rad/s].
     Polynomials of python-control else overflow: 11 of 58 loops of eight joints with
     lags raised `LinAlgError`.
     """
     import control
 
-    return control.ss(system.A / unit, system.B / unit, system.C, system.D)
+    rates = np.abs(closed.poles())
+    unit = float(np.exp(np.log(rates[rates > 0]).mean()))
+    return control.ss(system.A / unit, system.B / unit, system.C, system.D), unit
 
 
 def _crossings(system: "control.StateSpace") -> list[float]:

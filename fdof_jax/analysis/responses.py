@@ -37,7 +37,7 @@ from ..references.reference import Reference
 from ..simulation.simulate import simulate
 from ..simulation.solution import Solution
 from .linearization import holding_efforts
-from .loops import BANDWIDTH, Loop, bandwidth, closed_loop, margins, open_loop
+from .loops import BANDWIDTH, Loop, bandwidth, loops_of, margins
 from .measures import SETTLED, relative_demands, step_measures
 
 # Samples of a response: at least so many, so that most arms share a program, and one
@@ -184,17 +184,17 @@ def step_and_sine(
         keywords: Any = dict(own0=own, throw=False, max_steps=_STEPS)
         return simulate(linkage, start, ts, (acting, *forces), **keywords)
 
-    def responses_at(here: ArrayLike) -> tuple[list[Loop], np.ndarray]:
-        calls = ((linkage, here, with_probe(q), k + 1, forces) for k in moving)
-        loops = [closed_loop(*call) for call in calls]
-        return loops, np.array(list(map(bandwidth, loops)))
+    def loops_at(here: ArrayLike) -> tuple[tuple[Loop, ...], np.ndarray, np.ndarray]:
+        """Returns the joints' loops, the poles when closed, and the bandwidths."""
+        loops, responses = zip(*loops_of(linkage, here, with_probe(q), forces))
+        return loops, responses[0].poles(), np.array(list(map(bandwidth, responses)))
 
-    loops, bandwidths = responses_at(q)
+    loops, poles, bandwidths = loops_at(q)
     if np.isnan(bandwidths).any():
         expected = "one with which each joint follows its reference at q"
         raise refusal("controller", expected, controller)
     start, own = State(q, jnp.asarray(still)), None
-    if (decay := -loops[0].poles().real.max()) > 0:
+    if (decay := -np.real(poles).max()) > 0:
         if isinstance(element, StatefulElement):
             own = (element.initial_state(linkage),)
         # As many times as of most answers, so that one program serves both.
@@ -203,7 +203,7 @@ def step_and_sine(
         if np.isfinite([sag.q[-1], sag.qd[-1]]).all():
             start = State(sag.q[-1], sag.qd[-1])
             own = own and jax.tree.map(lambda rows: rows[-1], sag.own)
-        loops, bandwidths = responses_at(start.q)
+        loops, poles, bandwidths = loops_at(start.q)
     if np.isnan(bandwidths).any():  # at a limit, a controller has no gains
         needed = np.asarray(holding_efforts(linkage, q, forces)).round(6).tolist()
         raise ValueError(
@@ -211,10 +211,10 @@ def step_and_sine(
             f"got {pd.limit.tolist()}; to be held there it needs efforts of {needed} "
             "(`holding_efforts`), and more to be caught as it sags."
         )
-    since = np.linspace(0, t0, samples_of(t0, np.abs(loops[0].poles()).max()))
+    since = np.linspace(0, t0, samples_of(t0, np.abs(poles).max()))
     rows = []
     # One after the other: a batch takes three times as long to compile.
-    for k, scale in zip(moving, bandwidths):
+    for k, loop, scale in zip(moving, loops, bandwidths):
         height = heights * np.eye(n)[k]
         acting = with_probe(q + height)
         run = motion(acting, start, own, since)
@@ -223,7 +223,6 @@ def step_and_sine(
         measures = step_measures(since, change, rate, change[-1])
         demand = relative_demands(commanding(acting), linkage, run)[:, k]
         if np.isinf(scale):  # the arm follows all sines
-            loop = open_loop(linkage, start.q, with_probe(q), k + 1, forces)
             scale = margins(loop).crossover
         frequency, gain = scale * _FREQUENCIES, []
         for w in frequency:

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
 from ..analysis.linearization import checked, equilibrium, loop_matrices
-from ..analysis.loops import Loop, margins, open_loop
+from ..analysis.loops import loops_of, margins
 from ..analysis.measures import BAND, demands, step_measures
 from ..analysis.responses import samples_of
 from ..base.checks import instance
@@ -173,16 +173,13 @@ def measured(scene: Scene, limits: Limits) -> Iterator[tuple[str, str, float, fl
     controller, others = controller_and_others(scene)
     limits = in_numpy(limits)
     linkage, t1, rest = scene.linkage, float(scene.t1), rest_of(scene)
-    loops: dict[int, Loop] = {
-        k: open_loop(linkage, rest, controller, k + 1, others, t1)
-        for k in moving_joints(linkage)
-    }
-    poles = next(iter(loops.values())).feedback().poles()
-    ts = np.linspace(0, t1, samples_of(t1, np.abs(poles).max()) + 1)
+    loops, responses = zip(*loops_of(linkage, rest, controller, others, t1))
+    fastest = np.abs(responses[0].poles()).max()
+    ts = np.linspace(0, t1, samples_of(t1, fastest) + 1)
     motion = simulate(scene, ts, throw=False)
     shares, speeds, _ = map(np.asarray, step_shares(motion, rest))
     efforts = np.abs(demands(controller, linkage, motion)).max(axis=0)
-    for k, loop in loops.items():
+    for k, loop in zip(moving_joints(linkage), loops):
         joint = joint_names(linkage)[k]
         overshoot, _, settled = step_measures(ts, shares[:, k], speeds[:, k], 1.0)
         unit = "N m" if joint[0] == "R" else "N"
