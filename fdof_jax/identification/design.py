@@ -24,7 +24,6 @@ from .problems import (
     Unknowns,
     check_times,
     link_ends,
-    named,
     unknowns_of,
 )
 from .result import FitResult
@@ -91,10 +90,11 @@ def _lane(z: Array, design: _Design) -> Evaluation:
 
     def loss(z):
         scene_at = design.experiment(**design.motion.at(z))
-        shapes, values, sizes, *_ = design.parameters
+        parameters = design.parameters
+        values, sizes = parameters.start, parameters.scale
 
         def changed(change: Array) -> Scene:
-            return scene_at(named(shapes, values + sizes * change))
+            return scene_at(parameters.named(values + sizes * change))
 
         def readings(scene, solution):
             seen = jnp.asarray(design.observe(scene, solution))
@@ -177,7 +177,7 @@ def next_motion(
         raise refusal("bounds", expected, bounds)
     parameters = unknowns_of(found.parameters, None, scale)
     sizes = parameters.scale
-    first = named(motion.shapes, jnp.asarray(motion.start))
+    first = motion.named(jnp.asarray(motion.start))
     scene = experiment(**first)(jax.tree.map(jnp.asarray, found.parameters))
     check_scene("experiment(...)(...)", scene)
     information = _information(found.covariance / np.outer(sizes, sizes))
@@ -198,8 +198,8 @@ def next_motion(
     errors = run.best.facts["errors"][0]
     before = np.sqrt(np.diag(found.covariance)) / sizes
     return NextMotion(
-        motion=named(motion.shapes, motion.numbers(run.z)),
-        standard_errors=named(parameters.shapes, errors * sizes),
+        motion=motion.named(motion.numbers(run.z)),
+        standard_errors=parameters.named(errors * sizes),
         improvement=float(before.max() / errors.max()),
         message=run.reason,
     )

@@ -124,7 +124,7 @@ def _search(
     failed = [row for run, row in zip(runs, rows) if run.failed]
     if failed:
         for problem in failed[0]:
-            scene = problem.scene_at(unknowns.at(unknowns.start / unknowns.scale))
+            scene = problem.scene_at(unknowns.named(unknowns.start))
             check_motion("scene_at(...)", scene, problem.ts)
         expected = "parameters at which the motion and its derivatives are finite"
         raise refusal("start", expected, start)

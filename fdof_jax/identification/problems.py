@@ -23,8 +23,6 @@ Named = dict[str, Any]  # parameters by name, as numbers or arrays
 Bounds = Mapping[str, Sequence[ArrayLike]]  # (least, greatest) by name
 SceneAt = Callable[[dict[str, Array]], Scene]
 Observe = Callable[[Scene, Solution], Array]
-# Names and shapes of parameters, in pairs: JAX would sort a dict.
-Shapes = tuple[tuple[str, tuple[int, ...]], ...]
 
 _TOLERANCE = 1e-7  # of the derivatives
 
@@ -36,7 +34,7 @@ class Unknowns(NamedTuple):
     the shape of each parameter.
     """
 
-    shapes: Shapes
+    shapes: tuple[tuple[str, tuple[int, ...]], ...]  # JAX would sort a dict
     start: np.ndarray
     scale: np.ndarray
     low: np.ndarray
@@ -51,9 +49,18 @@ class Unknowns(NamedTuple):
             for index in np.ndindex(shape)
         )
 
+    def named(self, numbers: Array | np.ndarray) -> Named:
+        """Splits numbers (n,) into arrays by the names of parameters."""
+        arrays, place = {}, 0
+        for name, shape in self.shapes:
+            size = math.prod(shape)
+            arrays[name] = numbers[place : place + size].reshape(shape)[()]
+            place += size
+        return arrays
+
     def at(self, z: Array | np.ndarray) -> Named:
         """Returns the parameters by name."""
-        return named(self.shapes, self.scale * z)
+        return self.named(self.scale * z)
 
     def numbers(self, z: np.ndarray) -> np.ndarray:
         """Returns all numbers, within their bounds in spite of rounding."""
@@ -63,16 +70,6 @@ class Unknowns(NamedTuple):
         """Yields z at the first guess and at both bounds, (run, n) each."""
         for numbers in (self.start, self.low, self.high):
             yield np.tile(numbers / self.scale, (runs, 1))
-
-
-def named(shapes: Shapes, numbers: Array | np.ndarray) -> Named:
-    """Splits all numbers (n,) into arrays by name."""
-    arrays, place = {}, 0
-    for name, shape in shapes:
-        size = math.prod(shape)
-        arrays[name] = numbers[place : place + size].reshape(shape)[()]
-        place += size
-    return arrays
 
 
 def unknowns_of(
@@ -244,7 +241,7 @@ def problems_of(
         function(names[0], each)
     function("observe", observe)
     stacked(scene_at, names[0])  # raises unless all are alike
-    first = jax.tree.map(jnp.asarray, named(unknowns.shapes, unknowns.start))
+    first = jax.tree.map(jnp.asarray, unknowns.named(unknowns.start))
     for each in scene_at:
         try:
             scene = each(first)

@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from ..base.report import Report
 from ..search import Evaluation, Run, held_at_bounds
-from .problems import Named, Problem, Unknowns, named
+from .problems import Named, Problem, Unknowns
 
 # A combination is weak if its standard error exceeds this part of its size.
 _WEAK = 1.0
@@ -194,7 +194,7 @@ def fit_result(
     held_out: Evaluation | None,
 ) -> FitResult:
     """Judges the end of a run, where `held_out` evaluates recordings kept back."""
-    shapes, _, scale, low, high = unknowns
+    _, _, scale, low, high = unknowns
     values = unknowns.numbers(run.z)
     sizes = np.maximum(np.abs(values), scale)
     facts = run.best.facts
@@ -235,7 +235,7 @@ def fit_result(
             f"the residuals are {noise / usual:.3g} times the noise: this scene does "
             "not move as observed with any such parameters"
         )
-    parameters = named(shapes, values)
+    parameters = unknowns.named(values)
     try:
         problems[0].scene_at(jax.tree.map(jnp.asarray, parameters))
     except ValueError as error:
@@ -267,7 +267,7 @@ def fit_result(
             )
     return FitResult(
         parameters=parameters,
-        standard_errors=named(shapes, np.sqrt(np.diag(covariance))),
+        standard_errors=unknowns.named(np.sqrt(np.diag(covariance))),
         names=unknowns.labels,
         covariance=covariance,
         weak=weak,
