@@ -73,46 +73,29 @@ def _longer_and_longer(
     return minimise(whole, z, low, high, enough=_ENOUGH, **keywords)
 
 
-def _held_out(
-    validate: Recordings | None, shape: tuple[int, ...], *settings: Any
-) -> list[Problem]:
-    """Checks the argument `validate` of `fit`: recordings of the given shape."""
-    if validate is None:
-        return []
-    if not isinstance(validate, tuple) or len(validate) != 2:
-        expected = "(scene_at, observed), as for the fit itself"
-        raise refusal("validate", expected, validate)
-    problems = problems_of(("validate[0]", "validate[1]"), *validate, *settings)
-    if problems[0].observed.shape != shape or not all(p.weight.any() for p in problems):
-        raise ValueError(
-            f"validate[1]: expected recordings like `observed`, of shape {shape}, with "
-            f"some readings each, got shape {problems[0].observed.shape}."
-        )
-    return problems
-
-
 def _search(
-    scene_at: SceneAt | Sequence[SceneAt],
-    observed: ArrayLike,
-    start: Mapping[str, ArrayLike],
-    ts: ArrayLike,
-    together: bool,
-    *,
-    observe: Observe,
-    noise: ArrayLike | None,
-    validate: Recordings | None,
-    bounds: Bounds | None,
-    scale: Mapping[str, ArrayLike] | None,
-    **search: Any,
-) -> list[FitResult]:
+    scene_at, observed, start, ts, together: bool, *, observe, noise, validate, bounds,
+    scale, **search: Any,
+) -> list[FitResult]:  # fmt: skip
     """Fits all recordings `together` in one result, or returns one result for each.
 
-    The keywords are those of `fit`.
+    The other arguments are those of `fit`.
     """
     unknowns = unknowns_of(start, bounds, scale)
     settings = unknowns, check_times(ts), observe, 1.0 if noise is None else noise
     problems = problems_of(("scene_at", "observed"), scene_at, observed, *settings)
-    held_out = _held_out(validate, problems[0].observed.shape, *settings)
+    held_out: list[Problem] = []
+    if validate is not None:
+        if not isinstance(validate, tuple) or len(validate) != 2:
+            expected = "(scene_at, observed), as for the fit itself"
+            raise refusal("validate", expected, validate)
+        held_out = problems_of(("validate[0]", "validate[1]"), *validate, *settings)
+        wanted, shape = problems[0].observed.shape, held_out[0].observed.shape
+        if shape != wanted or not all(p.weight.any() for p in held_out):
+            raise ValueError(
+                f"validate[1]: expected recordings like `observed`, of shape {wanted}, "
+                f"with some readings each, got shape {shape}."
+            )
     rows = [problems] if together else [[problem] for problem in problems]
     least = min(sum(int((p.weight > 0).sum()) for p in row) for row in rows)
     if least <= unknowns.start.size:
