@@ -117,11 +117,7 @@ class LBFGS:
         return self.share > 1e-8
 
 
-Method = LevenbergMarquardt | LBFGS
-METHODS: dict[str, type[Method]] = {
-    "levenberg-marquardt": LevenbergMarquardt,
-    "l-bfgs": LBFGS,
-}
+METHODS = {"levenberg-marquardt": LevenbergMarquardt, "l-bfgs": LBFGS}
 
 
 def box_minimum(
@@ -172,8 +168,8 @@ class Row(NamedTuple):
 class Run:
     """A run: its point `z`, its accepted points `rows`, and its `reason` to stop."""
 
-    def __init__(self, method: type[Method], enough: float, z, low, high):
-        self.method, self.enough = method(z), enough
+    def __init__(self, method: str, enough: float, z, low, high):
+        self.method, self.enough = METHODS[method](z), enough
         self.z, self.low, self.high = z, low, high
         self.rows: list[Row] = []
         self.reason = ""  # while it runs
@@ -270,7 +266,7 @@ def minimise(
     """
     max_steps = check_search(max_steps, report)
     began = time.perf_counter()
-    runs = [Run(METHODS[method], enough, *row) for row in zip(start, low, high)]
+    runs = [Run(method, enough, *row) for row in zip(start, low, high)]
     for number in range(max_steps + 1):
         going = [i for i, run in enumerate(runs) if not run.reason]
         if not going:
