@@ -273,16 +273,11 @@ def minimise(
             break
         trials = [runs[i].next() if number else runs[i].z for i in going]
         found = evaluate(np.stack(trials), np.array(going))
-        before = [runs[i].best.loss for i in going] if number else []
         for place, (i, trial) in enumerate(zip(going, trials)):
             runs[i].arrive(trial, found.row(place), began)
         if report is not None:
-            after = [runs[i].best.loss for i in going]
-            falls = [1 - new / old for new, old in zip(after, before) if new < old]
-            news = f"{100 * max(falls):.2g} % less" if falls else "no less"
-            if len(runs) > 1:
-                news += f" in {len(going)} active of {len(runs)} runs"
-            report(f"{number:4d}  {describe(runs)}" + f", {news}" * (number > 0))
+            active = f", {len(going)} of {len(runs)} runs active" * (len(runs) > 1)
+            report(f"{number:4d}  {describe(runs)}{active}")
     for run in runs:
         if not run.reason:
             run.exhausted = True
