@@ -237,12 +237,10 @@ def problems_of(
             "noise: expected one number, or an array that broadcasts to a recording, "
             f"{shape}, got shape {noise.shape}."
         ) from None
-    for each in scene_at:
-        function(names[0], each)
     function("observe", observe)
-    stacked(scene_at, names[0])  # raises unless all are alike
     first = jax.tree.map(jnp.asarray, unknowns.named(unknowns.start))
     for each in scene_at:
+        function(names[0], each)
         try:
             scene = each(first)
         except KeyError as error:
@@ -251,6 +249,7 @@ def problems_of(
                 f"{shown(list(first))}."
             ) from error
         check_scene(f"{names[0]}(...)", scene)
+    stacked(scene_at, names[0])  # raises unless all are alike
     seen = ~np.isnan(readings)
     rows = zip(scene_at, np.where(seen, readings, 0), np.where(seen, weights, 0))
     return [Problem(scene, observe, unknowns, ts, *row) for scene, *row in rows]
