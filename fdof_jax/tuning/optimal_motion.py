@@ -116,7 +116,7 @@ def _lane(z: Array, problem: tuple[Scene, Array, Array, Array]) -> Evaluation:
     """
     scene, knots, price, ts = problem
     task, place = tracked_task(scene), place_of(controller_of(scene), scene.forces)
-    limit = _limit_of(scene)[None]
+    limit = without_fixed(scene.linkage, controller_of(scene).limit)[None]
 
     def scene_at(z):
         efforts = EffortHistory(knots, limit * z.reshape(knots.size, -1))
@@ -132,11 +132,6 @@ def _lane(z: Array, problem: tuple[Scene, Array, Array, Array]) -> Evaluation:
     found = sensitivities(scene_at, residuals, z, ts, _TOLERANCE)
     errors = found.residuals[: 2 * ts.size]
     return sum_of_squares(found, tip_error=jnp.linalg.norm(errors))
-
-
-def _limit_of(scene: Scene) -> Array:
-    """Limits of a scene's controller (n,), 0 at fixed pairs."""
-    return without_fixed(scene.linkage, controller_of(scene).limit)
 
 
 def optimal_efforts(
@@ -190,7 +185,7 @@ def optimal_efforts(
     """
     check_tuned("scene", scene)
     task, t1 = tracked_task(scene), float(scene.t1)
-    limit = np.asarray(_limit_of(scene))
+    limit = np.asarray(without_fixed(scene.linkage, controller_of(scene).limit))
     if not np.isfinite(limit).all():
         raise ValueError(
             "scene: expected finite limits of its controller, as unlimited efforts "
@@ -211,7 +206,10 @@ def optimal_efforts(
     torque = ComputedTorque(_BANDWIDTH**2, 2 * _BANDWIDTH, limit, task)
     guides = [scene, with_controller(scene, torque)]
     motions = [simulate(guide, ts, throw=False) for guide in guides]
-    efforts = np.stack([_efforts_at(times, *pair) for pair in zip(guides, motions)])
+    place = place_of(controller_of(scene), scene.forces)
+    own = [joint_efforts(*pair).elements[place] for pair in zip(guides, motions)]
+    at_knots = lambda values: np.interp(times, ts, values)
+    efforts = np.apply_along_axis(at_knots, 1, np.stack(own))  # (guide, knot, n)
     # Efforts without a limit above zero are zero, whatever the unknowns.
     most = np.broadcast_to(np.where(limit > 0, 1.0, 0.0), efforts.shape)
     start = np.clip(np.nan_to_num(efforts / np.where(limit > 0, limit, 1)), -most, most)
@@ -239,23 +237,13 @@ def optimal_efforts(
         tip_error=error_of(found, solution),
         controller_error=error_of(scene, motions[0]),
         solution=solution,
-        guess_errors=np.array([_tip_error(run) for run in runs]),
+        guess_errors=np.array([run.best.facts["tip_error"][0] for run in runs]),
         converged=run.best.gradient_norm <= _SMALL_GRADIENT * run.best.loss,
         message=run.reason,
     )
 
 
-def _efforts_at(times: np.ndarray, scene: Scene, solution: Solution) -> np.ndarray:
-    """Efforts of a scene's controller along its motion, (time, n)."""
-    place = place_of(controller_of(scene), scene.forces)
-    own = np.asarray(joint_efforts(scene, solution).elements[place])
-    return np.stack([np.interp(times, solution.ts, column) for column in own.T], axis=1)
-
-
-def _tip_error(run: Run) -> float:
-    return float(run.best.facts["tip_error"][0])
-
-
 def _errors_so_far(runs: list[Run]) -> str:
-    errors = ", ".join(f"{1e3 * _tip_error(run):.5g}" for run in runs)
-    return f"rms tip error from each first guess: {errors} mm"
+    errors = (1e3 * run.best.facts["tip_error"][0] for run in runs)
+    words = ", ".join(f"{error:.5g}" for error in errors)
+    return f"rms tip error from each first guess: {words} mm"
