@@ -194,7 +194,19 @@ def next_motion(
         enough=_ENOUGH, report=report, describe=largest_so_far,
     )  # fmt: skip
     if run.failed:
-        raise ValueError(f"start: {_refused(scene, ts, within)}.")
+        check_motion("experiment(...)(...)", scene, ts)
+        if within is not None:
+            shares = np.asarray(within(scene, simulate(scene, ts)))
+            entry = np.unravel_index(np.argmax(np.abs(shares)), shares.shape)
+            if not abs(shares[entry]) < 1:
+                raise ValueError(
+                    "start: expected a motion that stays strictly between -1 and 1 in "
+                    f"`within`, got {shares[entry]:.3g} in entry "
+                    f"{[int(i) for i in entry]}."
+                )
+        raise ValueError(
+            "start: expected a motion with finite readings and derivatives, got others."
+        )
     errors = run.best.facts["errors"][0]
     before = np.sqrt(np.diag(found.covariance)) / sizes
     return NextMotion(
@@ -203,21 +215,6 @@ def next_motion(
         improvement=float(before.max() / errors.max()),
         message=run.reason,
     )
-
-
-def _refused(scene: Scene, ts: Array, within: Callable | None) -> str:
-    """Says why a search cannot begin with a motion."""
-    check_motion("experiment(...)(...)", scene, ts)
-    solution = simulate(scene, ts)
-    if within is not None:
-        shares = np.asarray(within(scene, solution))
-        entry = np.unravel_index(np.argmax(np.abs(shares)), shares.shape)
-        if not abs(shares[entry]) < 1:
-            return (
-                "expected a motion that stays strictly between -1 and 1 in `within`, "
-                f"got {shares[entry]:.3g} in entry {[int(i) for i in entry]}"
-            )
-    return "expected a motion with finite readings and derivatives, got others"
 
 
 def _information(covariance: np.ndarray) -> np.ndarray:

@@ -159,7 +159,7 @@ class Problem(NamedTuple):
 
 def lane(z: Array, problem: Problem) -> Evaluation:
     """Evaluates a recording's weighted sum of squares and its derivatives in `z`."""
-    weight = problem.weight
+    weight, there = problem.weight, problem.weight > 0
 
     def residuals(scene, solution):
         seen = jnp.asarray(problem.observe(scene, solution))
@@ -168,12 +168,13 @@ def lane(z: Array, problem: Problem) -> Evaluation:
                 "observed: expected the shape of what `observe` returns, "
                 f"{seen.shape}, got {problem.observed.shape}."
             )
-        misfit = jnp.where(weight > 0, seen - problem.observed, 0)
+        misfit = jnp.where(there, seen - problem.observed, 0)
         return (weight * misfit).reshape(-1)
 
     scene_at = lambda z: problem.scene_at(problem.unknowns.at(z))
     found = sensitivities(scene_at, residuals, z, problem.ts, _TOLERANCE)
-    unweighted = found.residuals / jnp.where(weight > 0, weight, 1).reshape(-1)
+    unweighted = found.residuals / jnp.where(there, weight, 1).reshape(-1)
+    successive = there[1:] & there[:-1]
     change = jnp.diff(found.residuals.reshape(weight.shape), axis=0)
     # What is always read as it must be, as the encoder of a fixed pair, has no noise.
     misfit = jnp.abs(unweighted.reshape(weight.shape))
@@ -182,15 +183,10 @@ def lane(z: Array, problem: Problem) -> Evaluation:
     return sum_of_squares(
         found,
         squares=jnp.sum(unweighted**2),
-        changes=jnp.sum(jnp.where(_successive(weight), change, 0) ** 2),
-        readings=jnp.sum(noisy & (weight > 0)),
-        pairs=jnp.sum(noisy & _successive(weight)),
+        changes=jnp.sum(jnp.where(successive, change, 0) ** 2),
+        readings=jnp.sum(noisy & there),
+        pairs=jnp.sum(noisy & successive),
     )
-
-
-def _successive(weight: Array) -> Array:
-    """Returns where a reading and the next one are both there."""
-    return (weight[1:] > 0) & (weight[:-1] > 0)
 
 
 def check_times(ts: ArrayLike) -> Array:
