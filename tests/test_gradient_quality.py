@@ -85,8 +85,7 @@ def test_tangents_are_those_of_differences(point):
     assert float(residuals @ residuals) == pytest.approx(value, rel=1e-8)
     # The gradients that tuning uses.
     timed = jax.tree.map(jnp.asarray, scene._replace(t1=3.0))
-    z = np.log(gains_of(timed)).ravel()
-    found, _ = gradient_quality._tangents(timed, np.ones((2, 2), bool), z)
+    found, _ = gradient_quality._tangents(timed, np.zeros(4))
     coarse = 2 * found.jacobian.T @ found.residuals
     assert np.linalg.norm(coarse - gradient) < 1e-3 * size
 

@@ -26,12 +26,12 @@ from ..simulation.solution import Solution, remarks_on_derivatives
 from .losses import (
     SAMPLES,
     Loss,
-    bounds_of,
     check_tuned,
     controller_of,
+    gains_of,
     joint_errors,
     tip_errors,
-    with_log_gains,
+    with_factors,
 )
 
 _HORIZONS = 10
@@ -143,10 +143,10 @@ def _times(scene: Scene) -> dict[str, Array]:
     return times
 
 
-def _scene_at(scene: Scene, tuned: Array | np.ndarray, z: Array | np.ndarray) -> Scene:
-    """The scene with gains of the logarithms in `z`, which its times follow."""
-    logs, times = jnp.split(jnp.asarray(z), [tuned.size])
-    scene = with_log_gains(scene, logs, tuned)
+def _scene_at(scene: Scene, z: Array | np.ndarray) -> Scene:
+    """The scene with gains by factors exp(z); the last of `z` are its times."""
+    logs, times = jnp.split(jnp.asarray(z), [gains_of(scene).size])
+    scene = with_factors(scene, logs)
     where = lambda scene: list(_times(scene).values())
     return eqx.tree_at(where, scene, list(times)) if len(times) else scene
 
@@ -158,13 +158,10 @@ def _errors(scene: Scene) -> Loss:
 
 
 @eqx.filter_jit(compiler_options=options_of_loops())  # pyright: ignore[reportCallIssue]
-def _tangents(
-    scene: Scene, tuned: Array | np.ndarray, z: Any
-) -> tuple[Sensitivities, Array]:
+def _tangents(scene: Scene, z: Any) -> tuple[Sensitivities, Array]:
     """Residuals with their derivatives in `z`, and relative demands."""
     ts = jnp.linspace(0, scene.t1, SAMPLES)
-    loss = _errors(scene)
-    found = sensitivities(lambda z: _scene_at(scene, tuned, z), loss, z, ts)
+    found = sensitivities(lambda z: _scene_at(scene, z), _errors(scene), z, ts)
     controller = controller_of(scene)
     return found, relative_demands(controller, scene.linkage, found.solution)
 
@@ -174,13 +171,11 @@ def _motion(scene: Scene) -> Solution:
     return simulate(scene, np.linspace(0, float(scene.t1), SAMPLES), throw=False)
 
 
-def _slopes(
-    scene: Scene, tuned: np.ndarray, z: np.ndarray, steps: np.ndarray
-) -> np.ndarray:
+def _slopes(scene: Scene, z: np.ndarray, steps: np.ndarray) -> np.ndarray:
     """Derivatives of the mean squared error by extrapolated differences."""
 
     def loss(z: np.ndarray) -> float:
-        trial = _scene_at(scene, tuned, z)
+        trial = _scene_at(scene, z)
         return float(np.sum(np.square(_errors(scene)(trial, _motion(trial)))))
 
     rise = lambda h: loss(z + h) - loss(z - h)
@@ -203,22 +198,22 @@ def gradient_report(scene: Scene) -> GradientReport:
     t1 = float(scene.t1)
     as_array = lambda leaf: jnp.asarray(leaf) if is_number(leaf) else leaf
     scene = jax.tree.map(as_array, scene._replace(t1=t1))
-    box, moments = bounds_of(scene, None, None), _times(scene)
+    gains, moments = gains_of(scene), _times(scene)
     values = np.array(list(moments.values()), float)
-    z, tuned = np.concatenate([box.logs()[0], values]), box.tuned
-    found, demands = in_numpy(_tangents(scene, tuned, z))
+    count, z = gains.size, np.append(np.zeros(gains.size), values)
+    found, demands = in_numpy(_tangents(scene, z))
     residuals, solution = found.residuals, found.solution
     if not np.isfinite(residuals).all():
         check_motion("scene", scene, [0.0, t1])
     # Short parts of the run may be given in times, and are not stepped over.
     steps = np.where(values == 0, np.inf, _STEP * np.abs(values))
-    steps = np.append(np.full(tuned.size, _STEP), np.minimum(steps, _OF_TIME * t1))
-    slopes = _slopes(scene, tuned, z, steps)
+    steps = np.append(np.full(count, _STEP), np.minimum(steps, _OF_TIME * t1))
+    slopes = _slopes(scene, z, steps)
     along = 2 * np.cumsum(residuals[:, None] * found.jacobian, axis=0)
     both = np.stack([along[-1], slopes])
-    gradient, differences = both[:, : tuned.size].reshape(2, *tuned.shape)
-    times = dict(zip(moments, map(tuple, both[:, tuned.size :].T.tolist())))
-    along = along[:, : tuned.size]
+    gradient, differences = both[:, :count].reshape(2, *gains.shape)
+    times = dict(zip(moments, map(tuple, both[:, count:].T.tolist())))
+    along = along[:, :count]
     size = np.linalg.norm(differences)
     error = float(np.linalg.norm(gradient - differences) / size) if size > 0 else 0.0
     # The error up to a time is the mean over that time, not over the whole run.

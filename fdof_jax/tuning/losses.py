@@ -187,11 +187,6 @@ class GainBox(NamedTuple):
     upper: np.ndarray
 
     @property
-    def tuned(self) -> np.ndarray:
-        """Returns which gains are not 0 (2, n): 0 has no logarithm, and stays."""
-        return self.lower > 0
-
-    @property
     def free(self) -> int:
         """Returns how many gains the bounds leave free."""
         return int(np.sum(self.lower < self.upper))
@@ -202,29 +197,30 @@ class GainBox(NamedTuple):
         return held & (self.lower < self.upper)
 
     def logs(self) -> tuple[np.ndarray, ...]:
-        """Returns the logarithms of start and bounds, (2n,) each; 0 for gains of 0."""
-        return tuple(np.log(np.where(self.tuned, gains, 1)).ravel() for gains in self)
+        """Returns logarithms of start and bounds over the start (2n,); 0 for zeros."""
+        of_start = lambda gains: np.where(self.start > 0, gains / self.start, 1)
+        with np.errstate(invalid="ignore"):  # 0 / 0
+            return tuple(np.log(of_start(gains)).ravel() for gains in self)
 
     def gains(self, z: np.ndarray) -> np.ndarray:
-        """Returns the gains (..., 2, n) of their logarithms (..., 2n)."""
-        gains = np.exp(z).reshape(*z.shape[:-1], *self.lower.shape)
-        # exp(log(bound)) is rounded, and so is that of the start.
+        """Returns the gains (..., 2, n) by the factors exp(z) (..., 2n)."""
+        gains = self.start * np.exp(z).reshape(*z.shape[:-1], *self.start.shape)
+        # exp(log(bound)) is rounded.
         hair = 100 * np.finfo(jnp.result_type(float)).eps
-        for exact in self:
-            gains = np.where(np.abs(gains - exact) <= hair * exact, exact, gains)
+        for bound in (self.lower, self.upper):
+            gains = np.where(np.abs(gains - bound) <= hair * bound, bound, gains)
         return np.clip(gains, self.lower, self.upper)
 
 
-def with_log_gains(scene: Scene, z: Array, tuned: Array | np.ndarray) -> Scene:
-    """The scene with the gains whose logarithms are `z` (2n,), where `tuned` (2, n)."""
-    return with_gains(scene, jnp.where(tuned, jnp.exp(z.reshape(tuned.shape)), 0))
+def with_factors(scene: Scene, z: Array) -> Scene:
+    """The scene with its gains by the factors exp(z) (2n,): gains of 0 stay 0."""
+    gains = gains_of(scene)
+    return with_gains(scene, gains * jnp.exp(z).reshape(gains.shape))
 
 
-def gain_sensitivities(
-    z: Array, scene: Scene, loss: Loss, tuned: Array
-) -> Sensitivities:
-    """Residuals of a loss and their derivatives in the log-gains `z` (2n,)."""
-    scene_at = lambda z: with_log_gains(scene, z, tuned)
+def gain_sensitivities(z: Array, scene: Scene, loss: Loss) -> Sensitivities:
+    """Residuals of a loss and their derivatives in the logarithms of factors `z`."""
+    scene_at = lambda z: with_factors(scene, z)
     residuals = lambda scene, solution: residuals_of(loss, scene, solution)
     return sensitivities(scene_at, residuals, z, jnp.linspace(0, scene.t1, SAMPLES))
 
@@ -248,11 +244,8 @@ def unusable_loss() -> ValueError:
     )
 
 
-def evaluate_gains(z: Array, problem: tuple[Scene, Loss, Array]) -> Evaluation:
-    """Evaluates a scene's loss and its derivatives in the log-gains `z`.
-
-    `problem`: the other arguments of `gain_sensitivities`.
-    """
+def evaluate_gains(z: Array, problem: tuple[Scene, Loss]) -> Evaluation:
+    """Evaluates a scene's loss and its derivatives: see `gain_sensitivities`."""
     found = gain_sensitivities(z, *problem)
     scene, solution = found.scene, found.solution
     demands, efforts = _demands_and_efforts(scene, solution)

@@ -20,8 +20,10 @@ from .losses import (
     check_tuned,
     controller_of,
     evaluate_gains,
+    gains_of,
     tip_errors,
     unusable_loss,
+    with_gains,
 )
 from .result import TradeOff, TuneResult, result_of
 
@@ -32,7 +34,7 @@ _ORDERS = {"mean": 1, "worst": 32}
 
 
 def _members(ensemble: Scene, scene: Scene, losses: Sequence[Loss]) -> list[Scene]:
-    """Checks the argument `ensemble` of `tune`, and returns its scenes."""
+    """Checks the argument `ensemble` of `tune`, whose members get the scene's gains."""
     alike = lambda s: (joint_names(s.linkage), type(controller_of(s)).__name__)
     members = unstacked("ensemble", ensemble)
     for i, member in enumerate(members):
@@ -41,7 +43,7 @@ def _members(ensemble: Scene, scene: Scene, losses: Sequence[Loss]) -> list[Scen
         if alike(member) != alike(scene):
             expected = f"joints and a controller like the scene's, {alike(scene)}"
             raise refusal(f"ensemble[{i}]", expected, alike(member))
-    return members
+    return [with_gains(member, gains_of(scene)) for member in members]
 
 
 def _search(
@@ -63,8 +65,8 @@ def _search(
     else:
         members = [_members(ensemble, scenes[0], losses)] * len(losses)
     problems = [
-        [(with_full_size(member), loss, box.tuned) for member in row]
-        for row, loss, box in zip(members, losses, boxes)
+        [(with_full_size(member), loss) for member in row]
+        for row, loss in zip(members, losses)
     ]
     z, low, high = np.repeat([b.logs() for b in boxes], starts, axis=0).swapaxes(0, 1)
     # The first run of each scene starts from its gains, the others at random.

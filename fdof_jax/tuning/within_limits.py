@@ -196,15 +196,15 @@ def measured(scene: Scene, limits: Limits) -> Iterator[tuple[str, str, float, fl
             yield _MARGIN, joint, least, margins(loop).modulus
 
 
-def _lane(z: Array, problem: tuple[Scene, Loss, Array, Limits, bool]) -> Evaluation:
-    """Evaluates a loss and the excess over limits in the log-gains `z` (2n,)."""
-    scene, loss, tuned, limits, with_margins = problem
+def _lane(z: Array, problem: tuple[Scene, Loss, Limits, bool]) -> Evaluation:
+    """Evaluates a loss and the excess over limits for gains by factors exp(z) (2n,)."""
+    scene, loss, limits, with_margins = problem
 
     def residuals(scene, solution):
         beyond = excess(limits, scene, solution, with_margins)
         return jnp.concatenate([beyond, residuals_of(loss, scene, solution)])
 
-    found = gain_sensitivities(z, scene, residuals, tuned)
+    found = gain_sensitivities(z, scene, residuals)
     count = joints_of(scene.linkage) * (3 * _SPANS + with_margins * _BANDS)
     beyond, errors = jnp.split(found.residuals, [count])
     slopes, jacobian = jnp.split(found.jacobian, [count])
@@ -219,9 +219,9 @@ def _search(
     max_steps: int,
     report: Callable[[str], object] | None,
 ) -> tuple[np.ndarray, float, str]:
-    """Returns the best log-gains (2n,), their loss, and why the search stopped.
+    """Returns the best log-factors (2n,), their loss, and why the search stopped.
 
-    Its unknowns are the scaled log-gains between their bounds, and the greatest excess
+    Its unknowns are the scaled logarithms in their bounds, and the greatest excess
     over the limits. As this has a price, limits that cannot be met are exceeded least.
     """
     first, low, high = box.logs()
@@ -394,7 +394,7 @@ def tune_within(
     max_steps = check_search(max_steps, report)
     limits = sized(limits, joints_of(scene.linkage))
     with_margins = bool(np.any(np.asarray(limits.modulus_margin) > 0))
-    problem = with_full_size(scene), loss, box.tuned, limits, with_margins
+    problem = with_full_size(scene), loss, limits, with_margins
     lanes = Lanes(_lane, [[problem]])
     z, value, message = _search(scene, lanes, box, max_steps, report)
     scene = with_gains(scene, jnp.asarray(box.gains(z)))
