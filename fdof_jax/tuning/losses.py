@@ -263,11 +263,10 @@ def evaluate_gains(z: Array, problem: tuple[Scene, Loss]) -> Evaluation:
 
 def check_tuned(name: str, scene: Scene, loss: Loss = tip_errors) -> None:
     """Raises ValueError unless the scene can be tuned by the loss."""
-    instance(name, scene, Scene)
+    check_scene(name, scene)
     function("loss", loss)
     check_known(name, scene)
     real_array(f"{name}.t1", scene.t1, (), above=0)
-    check_scene(name, scene)
     controller = controller_of(scene)
     if isinstance(loss, Tracking) or loss is tip_errors:
         tracked_task(scene, name)
