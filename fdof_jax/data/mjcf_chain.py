@@ -153,56 +153,48 @@ def _named(read: Reader, name: str) -> tuple[int, str, int] | None:
 def _joints_of_arm(read: Reader, tip: str | None) -> tuple[np.ndarray, np.ndarray]:
     """The joints of the arm, and the link of each body; notes chains beside it."""
     model, name = read.model, lambda body: read.name_of("body", body)
-    welded, parent = model.body_weldid, model.body_parentid
-    # Bodies that are welded together are one; of each, the one before it that moves.
-    moving = {int(body) for body in welded if model.body_dofnum[body]}
-    before = {
-        b: int(welded[parent[b]]) if int(welded[parent[b]]) in moving else 0
-        for b in sorted(moving)
-    }
-
-    def root(body: int) -> int:
-        while before.get(body, 0):
-            body = before[body]
-        return body
-
-    roots = {body: root(body) for body in before}
-    trees = {tree: [b for b in before if roots[b] == tree] for tree in roots.values()}
-    if not trees:
+    welded, tree_of = model.body_weldid, model.body_treeid  # -1 of what stands still
+    if model.ntree == 0:
         raise ValueError("source: expected a planar chain, got a model without joints.")
-    of_joint = np.array([roots[int(welded[b])] for b in model.jnt_bodyid])
+    of_joint = tree_of[model.jnt_bodyid]
     at = None if tip is None else _named(read, tip)
     if at is not None:
-        chosen = roots.get(int(welded[at[0]]), -1)
+        chosen = tree_of[at[0]]
         if chosen < 0:
             raise refusal("tip", "a site or a body that moves", tip)
     else:
         moved = model.actuator_trnid[model.actuator_trntype == 0, 0]
-        driven = [int(of_joint[k]) for k in moved]
-        simple = {
-            t: np.isin(model.jnt_type[of_joint == t], (_SLIDE, _HINGE)).all()
-            for t in trees
-        }
-        rank = lambda t: (simple[t], driven.count(t), int((of_joint == t).sum()), -t)
-        chosen = max(trees, key=rank)
-    for tree in trees:
+        driven = of_joint[moved].tolist()
+
+        def rank(tree: int) -> tuple:
+            kinds = model.jnt_type[of_joint == tree]
+            simple = np.isin(kinds, (_SLIDE, _HINGE)).all()
+            return simple, driven.count(tree), len(kinds), -tree
+
+        chosen = max(range(model.ntree), key=rank)
+    for tree in range(model.ntree):
         if tree != chosen:
-            read.note(f"chain of body {name(tree)}", "left out, beside the arm")
+            first = np.argmax(tree_of == tree)
+            read.note(f"chain of body {name(first)}", "left out, beside the arm")
     joints = np.flatnonzero(of_joint == chosen)
     refuse = lambda what: ValueError(f"source: expected a planar chain, got {what}.")
     for joint in joints:
         if model.jnt_type[joint] not in (_HINGE, _SLIDE):
             kind = f"joint {read.name_of('joint', joint)}"
             raise refuse(f"{kind}, which is neither a hinge nor a slide")
-    for body in trees[chosen]:
-        following = [other for other in trees[chosen] if before[other] == body]
+    # Bodies that are welded together are one.
+    bodies = np.unique(welded[tree_of == chosen])
+    before = welded[model.body_parentid[bodies]]
+    for body in bodies:
+        following = bodies[before == body]
         if len(following) > 1:
             both = " and ".join(map(name, following[:2]))
             raise refuse(f"branches: bodies {both} both follow body {name(body)}")
     if len(joints) > MOST_PAIRS:
         raise refuse(f"{len(joints)} joints, above {MOST_PAIRS}")
-    last = {int(model.jnt_bodyid[joint]): k + 1 for k, joint in enumerate(joints)}
-    links = np.array([last.get(int(b), -1 if int(b) in moving else 0) for b in welded])
+    links = np.where(tree_of < 0, 0, -1)
+    for k, body in enumerate(model.jnt_bodyid[joints], start=1):
+        links[welded == body] = k  # of several joints of a body, the last one
     return joints, links
 
 
