@@ -114,7 +114,7 @@ def test_motion_profile_names_what_is_held_once():
     angles, slides = plotting.motion_profile(make_linkage("RPR"), held).axes
     assert labels(angles) == ["R1", "R3", "held"]
     assert labels(slides) == ["P2"]
-    line, _, thick, *_ = values(angles)
+    line, thick, *_ = values(angles)
     np.testing.assert_array_equal(np.flatnonzero(np.isfinite(thick)), range(5, 9))
     np.testing.assert_array_equal(thick[5:9], line[5:9])
 

@@ -1,6 +1,6 @@
 """Colours, figures, axes, legends and argument checks shared by all pictures."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -81,17 +81,12 @@ def axes_or_new(ax: Axes | None, height: float) -> Axes:
 
 
 def time_panels(
-    fig: Figure | None, height: float, ts: np.ndarray, panels: list
+    fig: Figure | None, height: float, ylabels: Sequence[str]
 ) -> tuple[Figure, list[Axes]]:
-    """Plots panels (y label, [(label, values, colour), ...]) over time, stacked.
-
-    A new figure has the given `height` [inches].
-    """
+    """Stacks axes over time; a new figure has the given `height` [inches]."""
     fig = figure_or_new(fig, 3.5, height)
-    axes = list(fig.subplots(len(panels), squeeze=False, sharex=True)[:, 0])
-    for ax, (ylabel, curves) in zip(axes, panels):
-        for label, values, color in curves:
-            ax.plot(ts, values, color=color, lw=1.2, label=label)
+    axes = list(fig.subplots(len(ylabels), squeeze=False, sharex=True)[:, 0])
+    for ax, ylabel in zip(axes, ylabels):
         ax.set_ylabel(ylabel)
     axes[-1].set_xlabel("time [s]")
     fig.align_ylabels(axes)

@@ -21,6 +21,7 @@ from ..control.drives import controller_in
 from ..dynamics import link_energies
 from ..forces.element import Forces, ForeignElement, elements, of_full_size
 from ..linkage.linkage import Linkage, joint_names, moving_joints
+from ..linkage.topology import letters
 from ..references.reference import reference_motion, reference_of
 from ..simulation.efforts import joint_efforts
 from ..simulation.sampled import Motion, SampledMotion
@@ -82,8 +83,11 @@ def motion_profile(
     instance("absolute", absolute, bool)
     if title is not None:
         instance("title", title, str)
-    kinds, names = geometry(linkage, q[:1]).kinds, joint_names(linkage)
+    kinds, names = letters(linkage.ef), joint_names(linkage)
     wanted = _references(linkage, forces, ts)
+    held = np.zeros(q.shape, bool)
+    if isinstance(solution, Solution) and solution.modes is not None:
+        held = np.asarray(solution.modes)[: len(ts)] > 0
 
     def shown(q: np.ndarray, k: int) -> np.ndarray:
         if kinds[k] == "P":
@@ -91,30 +95,24 @@ def motion_profile(
         angle = geometry(linkage, q).angle[:, k + 1] if absolute else q[:, k]
         return np.rad2deg(angle)
 
-    panels, joints = [], []
     angle = "absolute angle\n[degrees]" if absolute else "angle [degrees]"
-    for kind, ylabel in (("R", angle), ("P", "slide [m]")):
-        if of_kind := [k for k, one in enumerate(kinds) if one == kind]:
-            theta = absolute and kind == "R"
-            named = [rf"$\theta_{k + 1}$" if theta else names[k] for k in of_kind]
-            curves = [(shown(q, k), link_color(k + 1)) for k in of_kind]
-            panels.append((ylabel, [(n, *curve) for n, curve in zip(named, curves)]))
-            joints.append(of_kind)
-    fig, axes = time_panels(fig, 0.6 + 1.9 * len(panels), ts, panels)
-    held = np.zeros(q.shape, bool)
-    if isinstance(solution, Solution) and solution.modes is not None:
-        held = np.asarray(solution.modes)[: len(ts)] > 0
-    for ax, of_kind in zip(axes, joints):
-        for line, k in zip(ax.lines[:], of_kind):
-            color = line.get_color()
+    ylabels = {"R": angle, "P": "slide [m]"}
+    panels = {kind: label for kind, label in ylabels.items() if kind in kinds}
+    fig, axes = time_panels(fig, 0.6 + 1.9 * len(panels), [*panels.values()])
+    for ax, kind in zip(axes, panels):
+        joints = [k for k, one in enumerate(kinds) if one == kind]
+        for k in joints:
+            label = rf"$\theta_{k + 1}$" if absolute and kind == "R" else names[k]
+            color, curve = link_color(k + 1), shown(q, k)
+            ax.plot(ts, curve, color=color, lw=1.2, label=label)
             for times, path in wanted:
                 ax.plot(times, shown(path, k), "--", color=color, lw=0.9, zorder=3)
-            values = np.where(held[:, k], line.get_ydata(), np.nan)
             if held[:, k].any():
+                values = np.where(held[:, k], curve, np.nan)
                 ax.plot(ts, values, color=color, lw=4, alpha=0.5)
         if wanted:
             ax.plot([], [], "--", color=GREY, lw=0.9, label="reference")
-        if held[:, of_kind].any():
+        if held[:, joints].any():
             ax.plot([], [], color=GREY, lw=4, alpha=0.5, label="held")
     mark_end(axes, solution, ts[-1])
     for ax in axes:
@@ -150,19 +148,18 @@ def energy_profile(
     ts, q, qd = reached(linkage, solution)
     energies = jax.vmap(lambda q, qd: link_energies(linkage, q, qd))(q, qd)
     kinetic, potential = map(np.asarray, energies)
-    links = range(1, kinetic.shape[1] + 1)
-    names, colors = [f"link {k}" for k in links], [link_color(k) for k in links]
+    quantities = "kinetic energy", "potential energy", "of all links"
+    fig, axes = time_panels(fig, 6.0, [f"{name} [J]" for name in quantities])
+    for ax, of_links in zip(axes, (kinetic, potential)):
+        for k, values in enumerate(of_links.T, start=1):
+            ax.plot(ts, values, color=link_color(k), lw=1.2, label=f"link {k}")
     sums = kinetic.sum(axis=1), potential.sum(axis=1), (kinetic + potential).sum(axis=1)
-    whole = zip(("kinetic", "potential", "total"), sums, (*SERIES[3:5], BLACK))
-    panels = [
-        ("kinetic energy [J]", list(zip(names, kinetic.T, colors))),
-        ("potential energy [J]", list(zip(names, potential.T, colors))),
-        ("of all links [J]", list(whole)),
-    ]
-    fig, (top, middle, bottom) = time_panels(fig, 6.0, ts, panels)
-    mark_end((top, middle, bottom), solution, ts[-1])
-    legend(top)
-    legend(bottom)
+    names = "kinetic", "potential", "total"
+    for values, label, color in zip(sums, names, (*SERIES[3:5], BLACK)):
+        axes[2].plot(ts, values, color=color, lw=1.2, label=label)
+    mark_end(axes, solution, ts[-1])
+    legend(axes[0])
+    legend(axes[2])
     return fig
 
 
