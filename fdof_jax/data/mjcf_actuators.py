@@ -12,7 +12,7 @@ from ..control.pd import PDController
 from ..forces.element import Element
 from ..forces.joints import JointEffort
 from ..references.task import SetPoint
-from .mjcf_chain import FAR, Chain, Reader
+from .mjcf_chain import Chain, Reader
 from .mjcf_source import Model
 
 
@@ -51,7 +51,7 @@ class _Row(NamedTuple):
     gain: _Affine
     bias: _Affine
     state: _OwnState | None
-    control_range: tuple[float, float] | None = None
+    control_range: np.ndarray | None
 
     @property
     def joint(self) -> int:
@@ -144,21 +144,11 @@ def actuators(read: Reader, chain: Chain, controls: ArrayLike | None) -> list[El
             if not any(law.gain) and not any(law.bias) and law.state is None:
                 read.note(name, "left out, as its gains are 0")
                 continue
-            lower, upper = -np.inf, np.inf
-            if model.actuator_forcelimited[actuator]:
-                lower, upper = map(float, model.actuator_forcerange[actuator])
-                lower = lower if lower > -FAR else -np.inf
-                upper = upper if upper < FAR else np.inf
+            ends = map(float, read.bounds("actuator_force", actuator))
             place = _places(model, actuator)[0]
-            control = float(controls[place])
-            row = _Row(name, gear, control, lower, upper, *law)
-            if clamped[place]:
-                row = row._replace(control_range=tuple(map(float, ranges[place])))
-            rows.append(row)
-    effort_limited = model.jnt_actfrclimited[chain.joints].astype(bool)
-    ends = model.jnt_actfrcrange[chain.joints] * chain.signs[:, None]
-    lower = np.where(effort_limited, ends.min(axis=1), -np.inf)
-    upper = np.where(effort_limited, ends.max(axis=1), np.inf)
+            within = ranges[place] if clamped[place] else None
+            rows.append(_Row(name, gear, controls[place], *ends, *law, within))
+    lower, upper = read.bounds("jnt_actfrc", chain.joints, chain.signs)
     if not rows:
         return []
     forces = _simple(rows, lower, upper) or [_general(rows, lower, upper)]
@@ -167,7 +157,7 @@ def actuators(read: Reader, chain: Chain, controls: ArrayLike | None) -> list[El
         if len(forces) > 1:
             kinds = "PDController" if row.is_servo else "JointEffort"
         words, limits = f"{kinds}, at a control of {row.control:.4g}", {}
-        if row.control_range:
+        if row.control_range is not None:
             limits["range"] = row.control_range
         if kinds == "JointEffort" and np.isfinite([row.lower, row.upper]).any():
             limits["force range"] = row.lower, row.upper
@@ -202,10 +192,8 @@ def _law(
     dynprm, gainprm, biasprm = (array[actuator].tolist() for array in numbers)
     state = _OwnState()
     if (place := model.actuator_actadr[actuator]) >= 0:
-        state = state._replace(start=float(states[place]))
-        if model.actuator_actlimited[actuator]:
-            lower, upper = map(float, model.actuator_actrange[actuator])
-            state = state._replace(lower=lower, upper=upper)
+        lower, upper = map(float, read.bounds("actuator_act", actuator))
+        state = state._replace(start=float(states[place]), lower=lower, upper=upper)
     if gain_kind == "DCMOTOR":
         return _dc_motor(dynprm, gainprm, biasprm, state)
     bias = _Affine(*biasprm[:3]) if bias_kind == "AFFINE" else _Affine()

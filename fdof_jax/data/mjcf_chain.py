@@ -5,6 +5,7 @@ from types import ModuleType
 from typing import Any, NamedTuple, SupportsInt
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..base.checks import plain, refusal, shown
 from ..base.user_warnings import without_warning
@@ -79,6 +80,19 @@ class Reader(NamedTuple):
         """Where the parts of a tendon's path are."""
         begin = int(self.model.tendon_adr[tendon])
         return slice(begin, begin + int(self.model.tendon_num[tendon]))
+
+    def bounds(
+        self, kind: str, index: int | np.ndarray, signs: ArrayLike = 1
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Both ends of ranges, infinite where there is none, as at a `FAR` number.
+
+        `kind`: before the names of the arrays, as jnt_ of jnt_range; `signs`: of q.
+        """
+        limited = np.asarray(getattr(self.model, f"{kind}limited")[index], bool)
+        ends = signs * getattr(self.model, f"{kind}range")[index].T
+        low, high = np.sort(ends, axis=0)
+        low = np.where(limited & (low > -FAR), low, -np.inf)
+        return low, np.where(limited & (high < FAR), high, np.inf)
 
     def note(self, part: str, words: str) -> None:
         """Adds a line to the account."""

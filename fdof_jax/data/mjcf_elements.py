@@ -63,12 +63,10 @@ def elements_in_joints(read: Reader, chain: Chain) -> list[Element]:
 def _stops(read: Reader, chain: Chain, limited: np.ndarray) -> list[Element]:
     """Stops in the place of ranges, as stiff as MuJoCo's constraints are at qpos0."""
     model, dropped = read.model, "limits" in read.drop
-    ends = chain.signs[:, None] * model.jnt_range[chain.joints]
-    margin = model.jnt_margin[chain.joints]
+    low, high = read.bounds("jnt_", chain.joints, chain.signs)
     # MuJoCo's constraint acts from the margin within the range on.
-    lower, upper = ends.min(axis=1) + margin, ends.max(axis=1) - margin
-    lower = np.where(limited & (lower > -FAR), lower, -np.inf)
-    upper = np.where(limited & (upper < FAR), upper, np.inf)
+    margin = model.jnt_margin[chain.joints]
+    lower, upper = low + margin, high - margin
     stiffness = np.ones(len(limited))
     for k, joint in enumerate(chain.joints):
         # What a constraint with the reference (time, damping ratio), or (-stiffness,
