@@ -260,9 +260,6 @@ def _add_actuators(
     """Adds actuators; returns their controls and states at time 0."""
     controls: list[float] = []
     states: list[float] = []
-    if not any(isinstance(element, _ACTUATORS) for element in acting):
-        return controls, states
-    actuators = ElementTree.SubElement(root, "actuator")
     count, uses = len(kinds), Counter[str]()
 
     def unique(name: str) -> str:
@@ -274,7 +271,7 @@ def _add_actuators(
     ) -> None:
         own = dict(name=unique(name), joint=f"joint{joint + 1}")
         texts = {key: _text(value) for key, value in values.items()}
-        ElementTree.SubElement(actuators, kind, own | texts)
+        ElementTree.SubElement(child(root, "actuator"), kind, own | texts)
         controls.append(float(control))
 
     for place, element in enumerate(acting):
@@ -306,7 +303,8 @@ def _add_actuators(
                 else:
                     name = unique(f"gear{number + 1}")
                     own |= dict(tendon=_tendon(root, name, ratios))
-                ElementTree.SubElement(actuators, "general", own | attributes)
+                own |= attributes
+                ElementTree.SubElement(child(root, "actuator"), "general", own)
                 controls.append(control)
                 states += start
     return controls, states
