@@ -53,16 +53,6 @@ class _Row(NamedTuple):
     state: _OwnState | None
     control_range: np.ndarray | None
 
-    @property
-    def joint(self) -> int:
-        """The joint that it acts on most."""
-        return int(np.argmax(abs(self.gear)))
-
-    @property
-    def is_servo(self) -> bool:
-        """Whether it pushes by itself against a position or a velocity."""
-        return bool(self.bias.length or self.bias.speed)
-
 
 def _gear(read: Reader, chain: Chain, actuator: int) -> np.ndarray | None:
     """Ratios of an actuator to the joint positions q; None if it acts elsewhere."""
@@ -155,7 +145,7 @@ def actuators(read: Reader, chain: Chain, controls: ArrayLike | None) -> list[El
     kinds = " and ".join(type(force).__name__ for force in forces)
     for row in rows:
         if len(forces) > 1:
-            kinds = "PDController" if row.is_servo else "JointEffort"
+            kinds = "PDController" if any(row.bias[1:]) else "JointEffort"
         words, limits = f"{kinds}, at a control of {row.control:.4g}", {}
         if row.control_range is not None:
             limits["range"] = row.control_range
@@ -255,8 +245,11 @@ def _dc_motor(
     return _Law(_Affine(), _Affine(), state._replace(gain=constant, rate=rate))
 
 
+def _column(rows: list[_Row], name: str) -> np.ndarray:
+    return np.array([getattr(row, name) for row in rows])
+
+
 def _general(rows: list[_Row], lower: np.ndarray, upper: np.ndarray) -> Actuators:
-    column = lambda name: np.array([getattr(row, name) for row in rows])
     finite = lambda values: values if np.isfinite(values).any() else None
     activation = None
     if any(row.state for row in rows):
@@ -265,12 +258,12 @@ def _general(rows: list[_Row], lower: np.ndarray, upper: np.ndarray) -> Actuator
         ends = finite(np.array(low)), finite(np.array(high))
         activation = Activation(gain, rate, start, *ends)
     return Actuators(
-        gear=column("gear"),
-        gain=column("gain"),
-        bias=column("bias"),
-        control=column("control"),
-        lower=finite(column("lower")),
-        upper=finite(column("upper")),
+        gear=_column(rows, "gear"),
+        gain=_column(rows, "gain"),
+        bias=_column(rows, "bias"),
+        control=_column(rows, "control"),
+        lower=finite(_column(rows, "lower")),
+        upper=finite(_column(rows, "upper")),
         effort_lower=finite(lower),
         effort_upper=finite(upper),
         activation=activation,
@@ -280,51 +273,41 @@ def _general(rows: list[_Row], lower: np.ndarray, upper: np.ndarray) -> Actuator
 def _simple(
     rows: list[_Row], lower: np.ndarray, upper: np.ndarray
 ) -> list[Element] | None:
-    """The actuators as efforts and a PD controller, or None where these will not do."""
-    for row in rows:
-        if np.count_nonzero(row.gear) > 1 or row.state or any(row.gain[1:]):
-            return None
-    if (lower != -upper).any():
-        return None
-    joints = [
-        _of_joint([row for row in rows if row.joint == k], most)
-        for k, most in enumerate(upper)
-    ]
-    if None in joints:
-        return None
-    kp, kd, limit, target, rate, effort = np.array(joints).T
-    servos = [row.is_servo for row in rows]
-    forces: list[Element] = []
-    if any(servos):
-        forces.append(PDController(kp, kd, limit, SetPoint(target, rate)))
-    if not all(servos):
-        forces.append(JointEffort(effort))
-    return forces
+    """The actuators as efforts and a PD controller, or None where these will not do.
 
-
-def _of_joint(rows: list[_Row], most: float) -> tuple[float, ...] | None:
-    """kp, kd, limit, position, velocity and effort of the actuators on a joint.
-
-    `most`: the limit of their sum. None if they are more than a PD controller and a
-    motor that no limit couples.
+    `lower`, `upper`: limits of the sum on each joint, which couple its actuators.
     """
-    ratio = lambda row: float(row.gear[row.joint])
-    push = lambda row: row.gain.constant * row.control + row.bias.constant
-    servos = [row for row in rows if row.is_servo]
-    motors = [row for row in rows if not row.is_servo]
-    effort = sum(ratio(r) * np.clip(push(r), r.lower, r.upper) for r in motors)
-    if not servos:
-        return 0.0, 0.0, np.inf, 0.0, 0.0, np.clip(effort, -most, most)
-    bounded = [row for row in servos if np.isfinite([row.lower, row.upper]).any()]
-    if bounded and (len(servos) > 1 or bounded[0].lower != -bounded[0].upper):
+    columns = "gear", "gain", "bias", "control", "lower", "upper"
+    gear, gain, bias, control, low, high = (_column(rows, name) for name in columns)
+    on, servo = gear != 0, bias[:, 1:].any(axis=1)
+    bounded = servo & np.isfinite([low, high]).any(axis=0)
+    servos, motors, bounds = (on[who].sum(axis=0) for who in (servo, ~servo, bounded))
+    coupled = (bounds > 0) & (servos > 1) | (servos * motors > 0) & np.isfinite(upper)
+    if (
+        any(row.state for row in rows)
+        or gain[:, 1:].any()
+        or (on.sum(axis=1) > 1).any()
+        or coupled.any()
+        or (lower != -upper).any()
+        or (low != -high)[bounded].any()
+    ):
         return None
-    if motors and np.isfinite(most):
+    push = gain[:, 0] * control + bias[:, 0]
+    at_place = servo & (bias[:, 1] != 0)
+    at_rate = servo & ~at_place
+    kp, kd = 0 - bias[:, 1:].T @ gear**2  # never -0
+    place, rate = (gear[who].T @ push[who] for who in (at_place, at_rate))
+    if (kp < 0).any() or (kd < 0).any() or place[kp == 0].any() or rate[kd == 0].any():
         return None
-    kp = -sum(ratio(row) ** 2 * row.bias.length for row in servos)
-    kd = -sum(ratio(row) ** 2 * row.bias.speed for row in servos)
-    at = sum(ratio(row) * push(row) for row in servos if row.bias.length)
-    speed = sum(ratio(row) * push(row) for row in servos if not row.bias.length)
-    if min(kp, kd) < 0 or (at and not kp) or (speed and not kd):
-        return None
-    limit = min(most, *(abs(ratio(row)) * row.upper for row in bounded), np.inf)
-    return kp, kd, limit, at / kp if kp else 0.0, speed / kd if kd else 0.0, effort
+    effort = gear[~servo].T @ np.clip(push, low, high)[~servo]
+    ratio = abs(gear[bounded])
+    own = np.where(ratio > 0, ratio * high[bounded, None], np.inf)
+    most = np.minimum(upper, own.min(axis=0, initial=np.inf))
+    limit = np.where(servos > 0, most, np.inf)
+    forces: list[Element] = []
+    if servo.any():
+        target, speed = place / np.where(kp > 0, kp, 1), rate / np.where(kd > 0, kd, 1)
+        forces.append(PDController(kp, kd, limit, SetPoint(target, speed)))
+    if not servo.all():
+        forces.append(JointEffort(np.clip(effort, -upper, upper)))
+    return forces
