@@ -12,7 +12,7 @@ from matplotlib.typing import ColorType
 from ..base.known_values import in_numpy
 from ..forces.element import Forces
 from ..linkage.frames import known_frames
-from ..linkage.linkage import Linkage, check_linkage, without_fixed
+from ..linkage.linkage import Linkage, without_fixed
 from ..linkage.topology import letters
 from .axes import BLACK, GREY, SERIES, Keywords, xy
 from .elements import ELEMENT_STYLES, element_lines, element_marker
@@ -48,7 +48,6 @@ def geometry(
 
     With the times `ts` [s], the force elements that have a place are behind the arm.
     """
-    check_linkage(linkage)
     arm = in_numpy(linkage)
     kinds = letters(arm.ef)
     f = known_frames(arm, without_fixed(arm, q))
