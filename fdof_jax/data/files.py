@@ -318,7 +318,10 @@ def _value(place: str, node: Json, classes: Classes) -> PyTree:
     [(name, inner)] = node.items()
     if name in ("tuple", "batch") and isinstance(inner, list):
         items = tuple(at(f"[{i}]", item) for i, item in enumerate(inner))
-        return items if name == "tuple" else _batch(place, items)
+        if name == "tuple":
+            return items
+        to_jax = lambda x: jax.device_put(x) if isinstance(x, np.ndarray) else x
+        return jax.tree.map(to_jax, stacked(items, place))
     if isinstance(inner, list) and not _public(name):
         return _with_numbers(f"{place}.{plain(name)}", name, inner, classes)
     if not isinstance(inner, dict):
@@ -361,11 +364,6 @@ def _with_numbers(place: str, name: str, node: list[Json], classes: Classes) -> 
         if eqx.is_array(leaf):
             new[index] = jnp.asarray(new[index], leaf.dtype)
     return eqx.combine(structure.unflatten(new), rest)
-
-
-def _batch(place: str, members: tuple[PyTree, ...]) -> PyTree:
-    arrays = lambda leaf: jax.device_put(leaf) if isinstance(leaf, np.ndarray) else leaf
-    return jax.tree.map(arrays, stacked(members, place))
 
 
 def _array(place: str, node: list[Json]) -> jax.Array:
