@@ -147,41 +147,26 @@ def compare(model, read: Any, rng, states=20, drop=()):
     return float(max(errors))
 
 
-def compare_tips(model, read, site, rng, states=5):
-    """Returns the greatest error of a site's distances between random states [m]."""
-    arm, data, mine = arm_of(model), at_start(model), read(None)
-    tips, ours = [], []
-    for _ in range(states):
-        data.qpos[arm.qpos] = random_places(model, arm, rng)
-        mujoco.mj_kinematics(model, data)
-        tips.append(data.site(site).xpos.copy())
-        ours.append(fj.tip_position(mine.linkage, arm.sign * data.qpos[arm.qpos]))
-    apart = [np.linalg.norm(np.diff(places, axis=0), axis=1) for places in (tips, ours)]
-    return float(np.abs(np.subtract(*apart)).max())
-
-
-def motion_of(model, ts, step, controls=None):
+def motion_of(model, ts, step):
     """Returns the arm's positions, in its sense, at times after the first."""
     model, arm = copy.copy(model), arm_of(model)
     model.opt.integrator, model.opt.timestep = mujoco.mjtIntegrator.mjINT_RK4, step
     data, places = at_start(model), []
-    if controls is not None:
-        data.ctrl[:] = controls
     for _ in ts[1:]:
         mujoco.mj_step(model, data, round((ts[1] - ts[0]) / step))
         places.append(arm.sign * data.qpos[arm.qpos])
     return np.array(places)
 
 
-def compare_motion(model, read, seconds=1.0, controls=None, drop=()):
+def compare_motion(model, read, seconds=1.0, drop=()):
     """Returns the greatest error of positions, |q - qpos| / (1 + max|qpos|).
 
-    MuJoCo moves by RK4 with steps of 0.1 ms, with the controls of the key frame or 0
-    unless others are given. Its stateful actuators are of the first order in the step,
-    so that positions are extrapolated from these steps and their halves.
+    MuJoCo moves by RK4 with steps of 0.1 ms, with the controls of the key frame or 0.
+    Its stateful actuators are of the first order in the step, so that positions are
+    extrapolated from these steps and their halves.
     """
-    model, mine, ts = dropped(model, drop), read(controls), np.linspace(0, seconds, 11)
-    coarse, fine = (motion_of(model, ts, step, controls) for step in (1e-4, 5e-5))
+    model, mine, ts = dropped(model, drop), read(None), np.linspace(0, seconds, 11)
+    coarse, fine = (motion_of(model, ts, step) for step in (1e-4, 5e-5))
     expected = 2 * fine - coarse
     scene = fj.Scene(mine.linkage, mine.state0, exact(mine.forces), seconds)
     q = np.asarray(fj.simulate(scene, ts, rtol=1e-10, atol=1e-11).q)[1:]
