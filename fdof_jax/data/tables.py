@@ -3,7 +3,6 @@
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from ..base.checks import check_known, instance, optional_package
 from ..linkage.linkage import Linkage
@@ -56,11 +55,13 @@ def to_xarray(linkage: Linkage, solution: Motion) -> "xarray.Dataset":
     xarray = optional_package("xarray", "data")
     times, batch = _checked(linkage, solution)
     names, units = names_and_units(linkage.ef)
-    attributes = attributes_in(common_unit(units))
-
-    def variable(dims: list[str], values: ArrayLike, label: str, unit: str) -> tuple:
-        return dims, np.asarray(values), {"long_name": label, "units": unit}
-
+    named = lambda label, unit="": {"long_name": label, "units": unit}
+    labels = attributes_in(common_unit(units)) | {
+        "outcome": named("how the trajectory ended"),
+        "time": named("time", "s"),
+        "joint": named("joint"),
+        "unit": named("unit of the joint's position"),
+    }
     rows = [*batch, "time", "joint"]
     arrays = {"q": (rows, solution.q), "qd": (rows, solution.qd)}
     if isinstance(solution, Solution):
@@ -69,18 +70,14 @@ def to_xarray(linkage: Linkage, solution: Motion) -> "xarray.Dataset":
         if solution.modes is not None and solution.taken is not None:
             arrays["modes"] = rows, solution.modes
             arrays["taken"] = rows[:-1], solution.taken
+    arrays["outcome"] = batch, solution.outcome
+    arrays |= {"time": (["time"], times), "joint": (["joint"], names)}
+    arrays["unit"] = ["joint"], units
     variables = {
-        name: (dims, np.asarray(values), attributes[name])
+        name: (dims, np.asarray(values), labels[name])
         for name, (dims, values) in arrays.items()
     }
-    ended = "how the trajectory ended"
-    variables["outcome"] = variable(batch, solution.outcome, ended, "")
-    coordinates = {
-        "time": variable(["time"], times, "time", "s"),
-        "joint": variable(["joint"], names, "joint", ""),
-        "unit": variable(["joint"], units, "unit of the joint's position", ""),
-    }
-    return xarray.Dataset(variables, coordinates)
+    return xarray.Dataset(variables).set_coords("unit")
 
 
 def to_pandas(linkage: Linkage, solution: Motion) -> "pandas.DataFrame":
