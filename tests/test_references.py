@@ -107,33 +107,11 @@ def test_a_joint_move():
     np.testing.assert_allclose(move.jump_ts, [0, 2])
 
 
-@pytest.mark.slow
-def test_a_path_out_of_reach_is_refused_where_it_is_simulated():
-    task = fj.TipTask(fj.references.Line([1, 0], [4, 0]), fj.references.Travel(2.0))
-    forces = (fj.PDController(10.0, 1.0, 100.0, task),)
-    start = fj.State(np.zeros(3), np.zeros(3))
-    with pytest.raises(ValueError, match="reference: expected a path within"):
-        fj.simulate(ARM, start, [0, 2], forces)
-
-
 def test_a_task_without_an_orientation_needs_an_arm_of_two_joints():
     line = fj.references.Line([1, 0], [1, 1])
     task = fj.TipTask(line, fj.references.Travel(2.0), orientation=None)
     with pytest.raises(ValueError, match="linkage: expected 2 joints .* got 3"):
         task(0.0, ARM)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("x", [0.3, 0.5])
-def test_a_path_behind_the_pivot_is_refused_where_it_is_simulated(x):
-    ring = fj.TipTask(
-        fj.references.Ellipse([x, 0], [1.2, 1.2]), fj.references.Laps(2.0)
-    )
-    forces = (fj.PDController(10.0, 1.0, 100.0, ring),)
-    start = fj.State(np.zeros(3), np.zeros(3))
-    with pytest.raises(ValueError, match="reference: expected a path that does not"):
-        fj.simulate(ARM, start, [0, 2], forces)
-    assert not fj.references.reachable(ARM, ring, [0.0, 0.4, 2.0]).any()
 
 
 RING = fj.references.Ellipse([0.5, 0], [1.2, 1.2])  # round the pivot

@@ -1,7 +1,6 @@
 """Profiles of point-to-point motions, and the shock against residual vibration."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -93,11 +92,6 @@ def test_malformed_travels_are_refused():
         fj.references.Laps(0.0)
     with pytest.raises(ValueError, match="travel: expected a Travel"):
         fj.references.shock_against(1.0, 1.0)
-
-
-def test_laps_go_on():
-    laps = fj.references.Laps(4.0, phase=0.25)
-    assert laps(jnp.array(10.0)) == 2.75
 
 
 @pytest.mark.parametrize("profile", PROFILES)
