@@ -111,11 +111,6 @@ class Reader(NamedTuple):
 def planar_chain(read: Reader, tip: str | None) -> tuple[Linkage, Chain]:
     """Reads the chain and its masses; raises ValueError for what is no planar chain."""
     model = read.model
-    if tip is not None and _named(read, tip) is None:
-        sites = [model.site(k).name for k in range(model.nsite)]
-        bodies = [model.body(k).name for k in range(1, model.nbody)]
-        names = shown([name for name in sites + bodies if name])
-        raise refusal("tip", f"a site or a body among {names}", tip)
     pull = np.zeros(3) if read.disabled("GRAVITY") else model.opt.gravity
     if not np.isfinite(pull).all():
         raise refusal("source", "finite gravity", pull.tolist())
@@ -171,8 +166,12 @@ def _joints_of_arm(read: Reader, tip: str | None) -> tuple[np.ndarray, np.ndarra
     if model.ntree == 0:
         raise ValueError("source: expected a planar chain, got a model without joints.")
     of_joint = tree_of[model.jnt_bodyid]
-    at = None if tip is None else _named(read, tip)
-    if at is not None:
+    if tip is not None:
+        if (at := _named(read, tip)) is None:
+            sites = [model.site(k).name for k in range(model.nsite)]
+            bodies = [model.body(k).name for k in range(1, model.nbody)]
+            names = shown([each for each in sites + bodies if each])
+            raise refusal("tip", f"a site or a body among {names}", tip)
         chosen = tree_of[at[0]]
         if chosen < 0:
             raise refusal("tip", "a site or a body that moves", tip)
