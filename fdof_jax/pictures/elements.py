@@ -11,7 +11,7 @@ from ..forces.element import Element, Forces, elements_on, of_full_size
 from ..forces.holders import HardStops
 from ..forces.joints import JointStops
 from ..forces.payload import Payload
-from ..forces.points import Between, Point, SpringDamper, Tension, Wrench
+from ..forces.points import Point, SpringDamper, Tension, Wrench
 from ..linkage.frames import Frames
 from ..linkage.linkage import Linkage
 from ..linkage.topology import letters
@@ -59,10 +59,9 @@ def element_lines(
     lines = {}
     for k, element in enumerate(acting):
         kind, strokes, points = "", [], []
-        if isinstance(element, SpringDamper | Tension):
+        if isinstance(element, SpringDamper | Tension | LinearActuator):
             kind, strokes = _between(element, f, size)
-        elif isinstance(element, LinearActuator):
-            kind, strokes = "cylinder", _cylinder(element, f, size)
+            points = [element.a, element.b]
         elif isinstance(element, Wrench):
             kind, points = "wrench", [element.point]
             strokes = _arrows(_place(element.point, f), *pushes[k], most, size)
@@ -76,8 +75,6 @@ def element_lines(
             kind, strokes = "stops", _stops(element, linkage, f, size)
         elif (path := _commanded(given[k])) is not None:
             kind, strokes = "commanded", [np.tile(path, (len(ts), 1))]
-        if isinstance(element, SpringDamper | Tension | LinearActuator):
-            points = [element.a, element.b]
         if strokes:
             for point in points:
                 strokes += _support(point, linkage, f, size)
@@ -117,13 +114,6 @@ def _support(point: Point, arm: Linkage, f: Frames, size: float) -> list[np.ndar
     foot = (f.start[:, link] + along * f.direction[:, link])[:, None]
     away = np.abs(foot - place).max() > _WIDTH * size
     return [np.hstack([foot, place])] if away else []
-
-
-def _ends(element: Between, f: Frames) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The first end, the distance of the second, and the direction to it (time, 1)."""
-    a, b = _place(element.a, f), _place(element.b, f)
-    length = np.abs(b - a)
-    return a, length, (b - a) / np.where(length > 0, length, 1)
 
 
 # Symbols between (0, 0) and (1, 0); widths in units of `_WIDTH`.
@@ -168,12 +158,21 @@ def element_marker(kind: str) -> Path:
 
 
 def _between(
-    element: SpringDamper | Tension, f: Frames, size: float
+    element: SpringDamper | Tension | LinearActuator, f: Frames, size: float
 ) -> tuple[str, list[np.ndarray]]:
-    """A spring, a damper or both; a cable, which hangs if slack; a bumper."""
-    a, length, unit = _ends(element, f)
+    """A spring, a damper or both; a cable, which hangs if slack; a bumper; a cylinder.
+
+    A tension is a straight line.
+    """
+    a, b, width = _place(element.a, f), _place(element.b, f), _WIDTH * size
+    length = np.abs(b - a)
+    unit = (b - a) / np.where(length > 0, length, 1)
     if isinstance(element, Tension):
-        return "tension", [a + unit * length * np.array([0, 1])]
+        return "tension", [np.hstack([a, b])]
+    if isinstance(element, LinearActuator):  # of constant length, with a piston's rod
+        body, half = min(0.95 * length.min(), 0.6 * length.mean()), 0.8j * width
+        outline = np.array([0, half, body + half, body - half, -half, 0])
+        return "cylinder", [a + unit * outline, np.hstack([a + unit * body, b])]
     rest = element.rest_length
     if element.side == 1:
         u = np.linspace(0, 1, 21)
@@ -187,19 +186,8 @@ def _between(
     if element.side == -1:  # as long as it is at rest, with a plate at its free end
         length, kind = np.minimum(length, rest), "bumper"
         symbol = [*symbol, np.array([1 + 1.5j, 1 - 1.5j])]
-    width = _WIDTH * size
     place = lambda s: a + unit * (length * np.real(s) + 1j * width * np.imag(s))
     return kind, [place(s) for s in symbol]
-
-
-def _cylinder(element: LinearActuator, f: Frames, size: float) -> list[np.ndarray]:
-    """A cylinder of constant length, and the rod of its piston."""
-    a, length, unit = _ends(element, f)
-    body, half = min(0.95 * length.min(), 0.6 * length.mean()), 0.8 * _WIDTH * size
-    outline = np.array([0, 0, body, body, 0, 0]) + 1j * half * np.array(
-        [0, 1, 1, -1, -1, 0]
-    )
-    return [a + unit * outline, a + unit * np.hstack([0 * length + body, length])]
 
 
 def _push(
