@@ -17,7 +17,6 @@ from ..forces.payload import Payload
 from ..linkage.linkage import Linkage
 from ..simulation.efforts import joint_efforts
 from ..simulation.sampled import Motion, SampledMotion, acting_in
-from ..simulation.solution import Solution
 from .axes import reached
 
 
@@ -105,7 +104,12 @@ def _works(
     powers = _powers(linkage, forces, solution)[:, : len(ts)]
     signs = (1, -1)
     if not isinstance(solution, SampledMotion):
-        jumps = _jumps(forces, solution)
+        # Where rates or accelerations, and with them powers, may jump [s].
+        payloads = (e for e in forces if isinstance(e, Payload))
+        times = [e.jump_ts for e in payloads if e.jump_ts is not None]
+        if solution.events is not None:
+            times.append(solution.events.t)
+        jumps = np.concatenate([*times, []])
         return [_integral(np.maximum(sign * powers, 0), ts, jumps) for sign in signs]
     # The power of held efforts jumps, but their work is known: in each period that of
     # what acts at its sample, until the next command begins to act, and that of this.
@@ -125,15 +129,6 @@ def _works(
 def _rounding(ts: np.ndarray) -> float:
     """Time before a jump in which states may already be those after it [s]."""
     return 8 * np.spacing(np.abs(ts).max())
-
-
-def _jumps(forces: Forces, solution: Motion) -> np.ndarray:
-    """Times at which rates or accelerations, and with them powers, may jump [s]."""
-    payloads = (e for e in forces if isinstance(e, Payload))
-    times = [e.jump_ts for e in payloads if e.jump_ts is not None]
-    if isinstance(solution, Solution) and solution.events is not None:
-        times.append(solution.events.t)
-    return np.concatenate([*times, []])
 
 
 def _integral(powers: np.ndarray, ts: np.ndarray, jumps: ArrayLike = ()) -> np.ndarray:
