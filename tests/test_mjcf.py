@@ -224,10 +224,10 @@ def test_limits_of_one_joint_leave_others_free():
     """A limited joint beside a motor; gains of 0; both come back."""
     arm = random_linkage("RRR", np.random.default_rng(0))
     point = fj.references.SetPoint([0.1, 0.2, 0.3])
-    pd = fj.PDController([5.0, 0, 0], [0, 2.0, 0], [3, 2, np.inf], point)
+    pd = fj.PDController([5.0, 0, 0], [0, 2.0, 0], [3, 2, 1], point)
     again = fj.from_mjcf(fj.to_mjcf(arm, (pd, fj.JointEffort([0, 0, 4.0]))))
     servo, motor = again.forces
-    equal((servo.kp, servo.kd, servo.limit), (pd.kp, pd.kd, pd.limit))
+    equal((servo.kp, servo.kd, servo.limit), (pd.kp, pd.kd, [3, 2, np.inf]))
     equal(motor.tau, [0, 0, 4])
     with pytest.raises(ValueError, match="forces.0.: expected no limit of efforts"):
         fj.to_mjcf(arm, (pd, fj.JointEffort(1.0)))

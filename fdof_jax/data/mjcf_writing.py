@@ -78,7 +78,7 @@ def to_mjcf(linkage: Linkage, forces: Forces = (), state0: State | None = None) 
     kinds = letters(linkage.ef)
     acting = of_full_size(linkage, elements_on(linkage, forces))
     _check_elements(linkage, acting)
-    attributes = _of_joints(acting, len(kinds))
+    attributes = _of_joints(acting, linkage)
 
     add = ElementTree.SubElement
     root = ElementTree.Element("mujoco", model="linkage")
@@ -197,8 +197,9 @@ def _add_spatial(
         ElementTree.SubElement(tendon, "site", site=name)
 
 
-def _of_joints(acting: tuple[Element, ...], count: int) -> list[dict[str, str]]:
+def _of_joints(acting: tuple[Element, ...], linkage: Linkage) -> list[dict[str, str]]:
     """Attributes of the joints that stand for elements."""
+    count = joints_of(linkage)
     joints: list[dict[str, str]] = [{} for _ in range(count)]
 
     def add(name: str, *columns: ArrayLike, where: ArrayLike = True) -> None:
@@ -221,8 +222,9 @@ def _of_joints(acting: tuple[Element, ...], count: int) -> list[dict[str, str]]:
             low, high, bounded = _ends(element.lower, element.upper, count)
             add("range", low, high, where=bounded)
         elif isinstance(element, PDController):
-            limit = np.asarray(element.limit)
-            add("actuatorfrcrange", -limit, limit, where=(0 < limit) & (limit < np.inf))
+            bounded, _ = _limits_and_acts(element, linkage)
+            limit = element.limit
+            add("actuatorfrcrange", -limit, limit, where=bounded)
         elif isinstance(element, Actuators):
             lower, upper = element.effort_lower, element.effort_upper
             low, high, bounded = _ends(lower, upper, count)
