@@ -85,8 +85,7 @@ def inertias_of_actuators(
         return
     for actuator in range(len(model.actuator_trntype)):
         values = model.actuator_damping[actuator], model.actuator_armature[actuator]
-        poly = getattr(model, "actuator_dampingpoly", None)
-        bent = poly is not None and np.any(poly[actuator])
+        bent = read.has("actuator_dampingpoly", actuator)
         if not any(values) and not bent:
             continue
         name = f"actuator {read.name_of('actuator', actuator)}"
@@ -176,7 +175,7 @@ def _law(
     bias_kind = kind(mujoco.mjtBias, model.actuator_biastype[actuator])
     if model.actuator_plugin[actuator] >= 0:
         return "a plugin"
-    if hasattr(model, "actuator_delay") and model.actuator_delay[actuator]:
+    if read.has("actuator_delay", actuator):
         return "a delay"
     numbers = model.actuator_dynprm, model.actuator_gainprm, model.actuator_biasprm
     dynprm, gainprm, biasprm = (array[actuator].tolist() for array in numbers)

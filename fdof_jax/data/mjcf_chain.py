@@ -63,6 +63,10 @@ class Reader(NamedTuple):
         """The name of a part, such as a body, or its number."""
         return getattr(self.model, kind)(int(index)).name or str(int(index))
 
+    def has(self, array: str, index: int) -> np.bool_ | bool:
+        """Whether numbers are not 0 in an array, which older versions may not have."""
+        return hasattr(self.model, array) and np.any(getattr(self.model, array)[index])
+
     def disabled(self, *names: str) -> bool:
         """Whether a flag, under one of its names, switches something off."""
         flags = self.mujoco.mjtDisableBit.__members__  # some in some versions only

@@ -26,9 +26,7 @@ def elements_in_joints(read: Reader, chain: Chain) -> list[Element]:
             ("jnt_springyield", joint, "springs", "a spring that yields"),
             ("dof_dampingpoly", rate, "damping", "nonlinear damping"),
         ):
-            # The arrays are absent from older versions of MuJoCo.
-            values = getattr(model, array, None)
-            if values is not None and np.any(values[index]):
+            if read.has(array, index):
                 read.leave(kind, f"joint {name}", what)
     forces: list[Element] = []
 
@@ -114,9 +112,8 @@ def springs_of_tendons(read: Reader, chain: Chain) -> list[Element]:
             ("tendon_springyield", "tendons", "a spring that yields"),
             ("tendon_dampingpoly", "tendons", "nonlinear damping"),
         ):
-            values = getattr(model, array, None)
             off = kind == "limits" and no_limits
-            if values is not None and np.any(values[tendon]) and not off:
+            if read.has(array, tendon) and not off:
                 read.leave(kind, name, what)
         stiffness = damping = 0.0
         if not read.disabled("PASSIVE", "SPRING"):
