@@ -133,10 +133,11 @@ def actuators(read: Reader, chain: Chain, controls: ArrayLike | None) -> list[El
             if not any(law.gain) and not any(law.bias) and law.state is None:
                 read.note(name, "left out, as its gains are 0")
                 continue
-            ends = map(float, read.bounds("actuator_force", actuator))
+            lower, upper = map(float, read.bounds("actuator_force", actuator))
             place = _places(model, actuator)[0]
             within = ranges[place] if clamped[place] else None
-            rows.append(_Row(name, gear, controls[place], *ends, *law, within))
+            control = float(controls[place])
+            rows.append(_Row(name, gear, control, lower, upper, *law, within))
     lower, upper = read.bounds("jnt_actfrc", chain.joints, chain.signs)
     if not rows:
         return []

@@ -3,6 +3,7 @@
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..base.checks import check_known, instance, optional_package
 from ..linkage.linkage import Linkage
@@ -63,6 +64,7 @@ def to_xarray(linkage: Linkage, solution: Motion) -> "xarray.Dataset":
         "unit": named("unit of the joint's position"),
     }
     rows = [*batch, "time", "joint"]
+    arrays: dict[str, tuple[list[str], ArrayLike]]
     arrays = {"q": (rows, solution.q), "qd": (rows, solution.qd)}
     if isinstance(solution, Solution):
         for name in ("num_steps", "time_reached"):
