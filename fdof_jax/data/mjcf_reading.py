@@ -149,7 +149,7 @@ def _check_rest(read: Reader, chain: Chain) -> None:
     """Leaves out constraints, compensated gravity and fluids, or raises ValueError."""
     model, mujoco = read.model, read.mujoco
     things = mujoco.mjtObj
-    if model.neq and not read.disabled("EQUALITY", "CONSTRAINT"):
+    if not read.disabled("EQUALITY", "CONSTRAINT"):
         for index in range(model.neq):
             name = f"equality {read.name_of('equality', index)}"
             kind = mujoco.mjtEq(int(model.eq_type[index]))
@@ -210,7 +210,6 @@ def _check_contacts(read: Reader, chain: Chain) -> None:
         touch = contact.geom.min() >= 0 and contact.dist <= 0
         if touch and max(links[a], links[b]) > 0:
             read.leave("contacts", f"bodies {name(a)} and {name(b)}", "a contact")
-            return
     if (pair := _may_collide(read, links)) is None:
         return
     both = " and ".join(map(name, pair))
