@@ -156,12 +156,7 @@ def real_numbers(
         raise refuse(f"shape {array.shape}" if array.ndim else shown(value))
     if not traced:
         kept = np.array(array, dtype=jnp.result_type(float))
-        bad = ~np.isfinite(kept) if finite else np.isnan(kept)
-        if minimum is not None:
-            bad |= kept < minimum
-        if above is not None:
-            bad |= kept <= above
-        if bad.any():
+        if not within_bounds(kept, minimum=minimum, above=above, finite=finite):
             text = plain(np.array2string(np.asarray(array), threshold=20))
             raise refuse(text.removesuffix("."))  # 1.0 is shown as "1."
         if unit == "rad":
@@ -177,6 +172,18 @@ def real_numbers(
     if not fits and JOINT not in shape:
         array = (jnp if traced else np).broadcast_to(array, shape)  # type: ignore[arg-type]
     return jnp.asarray(array, dtype=float) if traced else array
+
+
+def within_bounds(
+    values: Any, minimum: float | None, above: float | None, finite: bool, **_: Any
+) -> Array:
+    """Returns whether numbers fulfil the rules on values, also if they are traced."""
+    holds = abs(values) < np.inf if finite else values == values
+    if minimum is not None:
+        holds = holds & (values >= minimum)
+    if above is not None:
+        holds = holds & (values > above)
+    return holds.all()
 
 
 def real_array(

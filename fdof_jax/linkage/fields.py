@@ -26,6 +26,7 @@ from ..base.checks import (
     is_traced,
     plain,
     real_array,
+    within_bounds,
 )
 from ..base.frozen import Frozen
 from ..base.known_values import in_numpy
@@ -151,7 +152,7 @@ class Part(Frozen, metaclass=_Fields):
     def possible(self) -> Truth:
         """Returns whether the constructor would accept the values; also if traced."""
         own = [np.all(condition.holds) for condition in self.conditions()]
-        fields = [_bounded(value, rules) for _, value, rules in _declared(self)]
+        fields = [within_bounds(value, **rules) for _, value, rules in _declared(self)]
         parts = [part.possible() for _, part in _within(self)]
         return reduce(and_, [*own, *fields, *parts], True)
 
@@ -220,15 +221,6 @@ def _declared(part: Part) -> Iterator[tuple[str, Any, Rules]]:
             continue
         if not (about["function"] and callable(value)):
             yield declared.name, value, about["rules"]
-
-
-def _bounded(value: Array, rules: Rules) -> Array:
-    holds = abs(value) < np.inf if rules["finite"] else value == value
-    if rules["minimum"] is not None:
-        holds = holds & (value >= rules["minimum"])
-    if rules["above"] is not None:
-        holds = holds & (value > rules["above"])
-    return holds.all()
 
 
 def each(values: Array, joints: Sized) -> tuple[Array, ...]:
