@@ -100,11 +100,16 @@ def test_members_are_sorted_by_their_forecast(solved, monkeypatch):
     assert found == [[8, 9, 10, 11], [4, 5, 6, 7], [0, 1, 2, 3]]
 
 
+def forecast(moving, shared):
+    common = chunks.Common(shared, jax.numpy.asarray(TS), {}, None)
+    return chunks.expected_work(common, moving)
+
+
 @pytest.mark.slow
 def test_the_forecast_follows_the_steps(batch, clean):
     steps = np.asarray(clean.stats["num_steps"])
     moving, shared, _ = batch_of(*batch, 0)
-    found = chunks.expected_work(jax.numpy.asarray(TS), moving, shared)
+    found = forecast(moving, shared)
     assert np.corrcoef(found, steps)[0, 1] > 0.75
 
 
@@ -112,7 +117,7 @@ def test_the_forecast_of_arms_that_friction_stops_is_their_energy():
     speeds = np.linspace(0, 3, 7)
     arm, starts = pendulums(speeds)
     moving, shared, _ = batch_of(arm, starts, (fj.forces.JointFriction(0.5),), None)
-    found = chunks.expected_work(jax.numpy.asarray(TS), moving, shared)
+    found = forecast(moving, shared)
     inertia = float(fj.mass_matrix(arm, [0.0])[0, 0])
     np.testing.assert_allclose(found - found[0], inertia * speeds**2 / 2, atol=1e-12)
 

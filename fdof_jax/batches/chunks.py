@@ -249,16 +249,17 @@ def _in_lanes(
 # Forecasts
 
 
-def expected_work(ts: Array | np.ndarray, moving: PyTree, shared: PyTree) -> Array:
+def expected_work(common: Common, moving: PyTree) -> Array:
     """Computes for each member a number that grows with its steps.
 
     It combines the joints' rates and accelerations, averaged over the beginning of the
     motion, which rough steps approximate [1/s]. Where elements hold joints it is the
     energy [J], because most steps then end at events, each of which takes some of it.
     """
+    ts = common.ts
 
     def member(moving):
-        linkage, (q, qd), forces = eqx.combine(moving, shared)
+        linkage, (q, qd), forces = eqx.combine(moving, common.shared)
         acting = elements("forces", forces)
         if holders(acting):
             kinetic, potential = energy(linkage, q, qd, present(acting, ts[0]))
@@ -292,16 +293,12 @@ def expected_work(ts: Array | np.ndarray, moving: PyTree, shared: PyTree) -> Arr
     return jax.vmap(member)(moving)
 
 
-def _works(common: Common, moving: PyTree) -> Array:
-    return expected_work(common.ts, moving, common.shared)
-
-
 def _forecast(job: Job, devices: list[Device]) -> np.ndarray:
     """Returns the `expected_work` of all members; one program serves any number."""
     common = job.common._replace(settings={}, reduce=None)  # which make no difference
     works = np.empty(job.size)
     everyone, job = np.arange(job.size), job._replace(common=common)
-    for members, found in _in_lanes(_works, job, devices, everyone, _FORECASTS):
+    for members, found in _in_lanes(expected_work, job, devices, everyone, _FORECASTS):
         works[members] = np.asarray(found)[: len(members)]
     return works
 

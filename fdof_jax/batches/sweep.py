@@ -17,7 +17,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
 from jaxtyping import PyTree
 from numpy.typing import ArrayLike
 
@@ -76,7 +75,7 @@ def _of_member(reduce: Callable) -> Callable:
 @eqx.filter_jit  # under `jax.grad` alone, each call would compile its operations again
 def _traced(moving: PyTree, common: Common, size: int, chunk: int) -> PyTree:
     """Solves a batch under transformations; failed members enter no derivative."""
-    order = jnp.argsort(expected_work(*constant((common.ts, moving, common.shared))))
+    order = jnp.argsort(expected_work(*constant((common, moving))))
 
     def solved(moving, shared):
         members = common._replace(shared=shared)
@@ -120,14 +119,14 @@ def _check_elements(batch: Batch) -> None:
 
 @contextlib.contextmanager
 def _naming_axes(
-    batch: Batch, ts: Array | np.ndarray, forces_axes: ForcesAxes
+    common: Common, moving: PyTree, forces_axes: ForcesAxes
 ) -> Iterator[None]:
     """Names `forces_axes` in errors of elements that do not work for one member."""
     try:
         yield
     except TypeError:
         try:
-            eqx.filter_eval_shape(expected_work, ts, *batch[:2])
+            eqx.filter_eval_shape(expected_work, common, moving)
         except TypeError as error:
             raise TypeError(
                 "forces, forces_axes: expected force elements that work for one "
@@ -263,7 +262,7 @@ def sweep(
 
     value: PyTree = None
     failures: Sequence[int] | np.ndarray = []
-    with _naming_axes(batch, ts, forces_axes):
+    with _naming_axes(common, moving, forces_axes):
         if traced:
             value = _traced(moving, common, size, chunk)
         elif folder is not None:
