@@ -22,7 +22,7 @@ import fdof_jax as fj
 from fdof_jax.base.whole_files import folder_path
 from fdof_jax.batches import store
 from fdof_jax.batches.batch_axes import batch_of
-from fdof_jax.batches.chunks import Common
+from fdof_jax.batches.chunks import Common, Job
 
 BLOCKS, BLOCK = 6, 7  # members
 
@@ -172,6 +172,11 @@ def test_another_sweep_needs_another_folder(mixed, stored, undisturbed):
     assert read(stored) == undisturbed
 
 
+def job_of(members):
+    moving, shared, size = batch_of(*members, 0)
+    return Job(moving, Common(shared, jnp.asarray(TS), {}, end), size, 8, [])
+
+
 def test_what_others_wrote_is_refused_and_kept(mixed, tmp_path):
     data = xarray.Dataset({"q": ("member", np.arange(5.0))})
     contents = {
@@ -181,18 +186,17 @@ def test_what_others_wrote_is_refused_and_kept(mixed, tmp_path):
         "notes": lambda folder: (folder / "notes.txt").write_text("mine"),
         "killed": lambda folder: (folder / "zarr.1.partial").write_text("{"),
     }
-    batch, like = batch_of(*mixed, 0), {"q": np.zeros(3)}
+    arguments = job_of(mixed), {"q": np.zeros(3)}, "digest"
     for name, write in contents.items():
         folder = tmp_path / name
         folder.mkdir()
         write(folder)
         before = read(folder)
-        arguments = folder, batch, jnp.asarray(TS), like, "digest", 8
         if name == "killed":
-            store.Store(*arguments)
+            store.Store(folder, *arguments)
         else:
             with pytest.raises(ValueError, match="^store: expected a new folder or"):
-                store.Store(*arguments)
+                store.Store(folder, *arguments)
             assert read(folder) == before
 
 
@@ -210,10 +214,10 @@ def test_only_what_is_asked_for(mixed, swept, tmp_path):
 
 
 def test_names_of_parts_differ_in_letters(mixed, tmp_path):
-    batch, q = batch_of(*mixed, 0), np.zeros(3)
+    q = np.zeros(3)
     for like in ({"a b": q, "a.b": q}, {"a": q, "A": q}, {"Failed": q}):
         with pytest.raises(ValueError, match="^reduce: expected .*name"):
-            store.Store(tmp_path, batch, jnp.asarray(TS), like, "digest", 8)
+            store.Store(tmp_path, job_of(mixed), like, "digest")
 
 
 def test_zarr_is_asked_for(mixed, tmp_path, monkeypatch):

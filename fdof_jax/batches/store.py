@@ -35,7 +35,6 @@ from ..simulation.solution import (
     flags,
     outcome_numbers,
 )
-from .batch_axes import Batch
 from .chunks import Common, Job, Outcome, in_chunks, outcome_of
 
 VERSIONS = {"fdof_jax": __version__} | {
@@ -109,27 +108,24 @@ class Store:
     No two blocks share a file. The file of `failed` ends a block: it comes last.
     """
 
-    def __init__(
-        self, folder: Path, batch: Batch, ts: Array | np.ndarray, like: PyTree,
-        sweep: str, chunk: int,
-    ):  # fmt: skip
+    def __init__(self, folder: Path, job: Job, like: PyTree, sweep: str):
         """Writes the metadata of the group, or checks what is there.
 
         Raises ValueError if the folder holds anything but this sweep.
         """
         zarr = optional_package("zarr", "data")
-        self.folder, self.size = folder, batch.size
-        linkage = eqx.combine(batch.moving[0], batch.shared[0])
+        self.folder, self.size = folder, job.size
+        linkage = eqx.combine(job.moving[0], job.common.shared[0])
         self.variables = _variables(like, linkage)
         each = sum(v.dtype.itemsize * math.prod(v.shape) for v in self.variables)
-        most = chunk * min(_CHUNKS, max(1, _BYTES // (chunk * each)))
+        most = job.chunk * min(_CHUNKS, max(1, _BYTES // (job.chunk * each)))
         # Nearly equal blocks are solved by the same programs.
         self.block = -(-self.size // -(-self.size // most))
         self.count = -(-self.size // self.block)
         versions = VERSIONS | {"zarr": zarr.__version__}
-        attributes = {"versions": versions, "sweep": sweep, "chunk": chunk}
+        attributes = {"versions": versions, "sweep": sweep, "chunk": job.chunk}
         self._refuse_another(attributes)
-        files = self._empty(zarr, attributes, linkage, ts, like)
+        files = self._empty(zarr, attributes, linkage, job.common.ts, like)
         for name, data in files.items():
             path = folder / name
             if path.exists():

@@ -248,7 +248,7 @@ def sweep(
     folder: Any = None if store is None else folder_path("store", store)
 
     def fill(job: Job) -> list[int]:
-        group = Store(folder, batch, ts, *outline(moving, common), chunk)
+        group = Store(folder, job, *outline(moving, common))
         return in_store(group, range(shard, group.count, of), job, progress_meter)
 
     def solved(solve: Callable[[Job], _T]) -> _T:
