@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from ..base.checks import check_known, instance, real_array, refusal
 from ..control.pd import PDController
 from ..dynamics import bias_force, forward_dynamics
-from ..forces.element import Element, Forces, elements_on, of_full_size
+from ..forces.element import Element, Forces, elements_on
 from ..linkage.coordinates import State, real_state
 from ..linkage.linkage import (
     Linkage,
@@ -60,7 +60,7 @@ def checked(linkage: Linkage, forces: Forces) -> tuple[Element, ...]:
     check_linkage(linkage)
     acting = elements_on(linkage, forces)
     if depends_on_state_alone(linkage, acting):
-        return of_full_size(linkage, acting)
+        return acting
     expected = "elements without a state of their own and no PrescribedMotion"
     raise refusal("forces", expected, forces)
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..base.checks import check_known, instance, one_of, real_array, refusal
-from ..forces.element import Forces, elements_on, of_full_size
+from ..forces.element import Forces, elements_on
 from ..linkage.linkage import Linkage, joint_names, moving_joints, per_joint
 from ..simulation.prescribed import prescribed
 from .linearization import checked, loop_matrices
@@ -109,7 +109,7 @@ def loops_of(
     if not callable(controller) or isinstance(controller, type):
         expected = "a force element, a PDController for instance"
         raise refusal("controller", expected, controller)
-    (element,) = of_full_size(linkage, elements_on(linkage, (controller,)))
+    (element,) = elements_on(linkage, (controller,))
     if prescribed((element,)) is not None:
         raise refusal("controller", "one that computes efforts", controller)
     q, t = per_joint("q", q, linkage), real_array("t", t, ())

@@ -16,14 +16,7 @@ from ..base.checks import check_known, real_array, refusal
 from ..base.report import Report
 from ..control.drives import commanding
 from ..control.pd import PDController
-from ..forces.element import (
-    Element,
-    Forces,
-    OwnStates,
-    StatefulElement,
-    elements_on,
-    of_full_size,
-)
+from ..forces.element import Element, Forces, OwnStates, StatefulElement, elements_on
 from ..linkage.coordinates import State
 from ..linkage.fields import Values, field
 from ..linkage.linkage import (
@@ -167,7 +160,7 @@ def step_and_sine(
         expected = "a PDController, or a drive that holds one"
         raise refusal("controller", expected, controller)
     check_known("q", linkage, controller, forces, q, step, duration)
-    (element,) = of_full_size(linkage, elements_on(linkage, (controller,)))
+    (element,) = elements_on(linkage, (controller,))
     names, moving = joint_names(linkage), moving_joints(linkage)
     heights, t0, still = np.asarray(step), float(duration), np.zeros(n)
 

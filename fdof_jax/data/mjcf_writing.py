@@ -14,7 +14,7 @@ from ..base.checks import check_known
 from ..control.actuators import Actuators
 from ..control.pd import PDController
 from ..forces.actuators import Armature
-from ..forces.element import Element, Forces, ForeignElement, elements_on, of_full_size
+from ..forces.element import Element, Forces, ForeignElement, elements_on
 from ..forces.holders import HardStops, JointFriction
 from ..forces.joints import JointDamper, JointEffort, JointSpring, JointStops
 from ..forces.points import SpringDamper
@@ -76,7 +76,7 @@ def to_mjcf(linkage: Linkage, forces: Forces = (), state0: State | None = None) 
     mass = np.maximum(linkage.mass, _SMALLEST)
     inertia = np.maximum(linkage.inertia, _SMALLEST)
     kinds = letters(linkage.ef)
-    acting = of_full_size(linkage, elements_on(linkage, forces))
+    acting = elements_on(linkage, forces)
     _check_elements(linkage, acting)
     attributes = _of_joints(acting, linkage)
 

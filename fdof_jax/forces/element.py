@@ -121,19 +121,15 @@ def elements(name: str, forces: Forces) -> tuple[Element, ...]:
 
 
 def elements_on(linkage: Linkage, forces: Forces) -> tuple[Element, ...]:
-    """Returns forces as elements, or raises ValueError for values of other chains."""
+    """Returns forces as elements, with an entry per joint where one is for all joints.
+
+    Programs then do not depend on how the numbers were given. Raises ValueError for
+    values of other chains.
+    """
     found = elements("forces", forces)
     for index, element in enumerate(found):
         check_joints(f"forces[{index}].", element, linkage)
-    return found
-
-
-def of_full_size(linkage: Linkage, forces: tuple[Element, ...]) -> tuple[Element, ...]:
-    """Returns elements with an entry per joint where they have one number for all.
-
-    Programs then do not depend on how the numbers were given.
-    """
-    return tuple(sized(element, joints_of(linkage)) for element in forces)
+    return tuple(sized(element, joints_of(linkage)) for element in found)
 
 
 # What JAX raises where traced values meet NumPy, or decide in Python.

@@ -7,7 +7,7 @@ from matplotlib.path import Path
 
 from ..base.known_values import in_numpy
 from ..forces.actuators import LinearActuator
-from ..forces.element import Element, Forces, elements_on, of_full_size
+from ..forces.element import Element, Forces, elements_on
 from ..forces.holders import HardStops
 from ..forces.joints import JointStops
 from ..forces.payload import Payload
@@ -44,7 +44,7 @@ def element_lines(
     frames at times `ts` [s]; `size`: its extent [m]. Arrows show forces of all wrenches
     on one scale.
     """
-    given = of_full_size(linkage, elements_on(linkage, forces))
+    given = elements_on(linkage, forces)
     for element in given:
         element.check(linkage, jnp.asarray(ts))
     acting = in_numpy(given)

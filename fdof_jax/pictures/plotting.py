@@ -19,7 +19,7 @@ from ..analysis.responses import StepAndSine
 from ..base.checks import instance, real_array, refusal, shown
 from ..control.drives import controller_in
 from ..dynamics import link_energies
-from ..forces.element import Forces, ForeignElement, elements, of_full_size
+from ..forces.element import Forces, ForeignElement, elements, elements_on
 from ..linkage.linkage import Linkage, joint_names, moving_joints
 from ..linkage.topology import letters
 from ..references.reference import reference_motion, reference_of
@@ -213,11 +213,11 @@ def effort_profile(
     **Arguments:** `forces`: those of the solution.
     """
     last = reached(linkage, solution)[0][-1]
-    forces = elements("forces", forces)
     efforts = joint_efforts(linkage, forces, solution)
+    forces = elements_on(linkage, forces)
     ts, total, parts = (np.asarray(a) for a in (solution.ts, *efforts))
     moving, joints = moving_joints(linkage), joint_names(linkage)
-    controllers = [controller_in(e) for e in of_full_size(linkage, forces)]
+    controllers = [controller_in(element) for element in forces]
     parts, held = [*parts], isinstance(solution, SampledMotion)
     named = [(name, part) for name, part in zip(_names(forces), parts) if part.any()]
     named = named or [("none", total)]

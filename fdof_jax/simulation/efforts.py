@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from ..base.checks import is_traced, place_of
 from ..base.functions import sharing_functions
-from ..forces.element import Element, Forces, elements_on, of_full_size
+from ..forces.element import Element, Forces, elements_on
 from ..linkage.linkage import Linkage, check_linkage, without_fixed
 from .field import element_effort, with_states
 from .holding import changes, efforts_of_holders
@@ -65,7 +65,6 @@ def joint_efforts(linkage: Linkage, forces: Forces, solution: Motion) -> Efforts
         )
     forces = acting_in(solution, forces)
     check_own("solution.own", solution.own, forces, linkage, solution.ts.shape)
-    forces = of_full_size(linkage, forces)
     rows = solution.ts, solution.q, solution.qd, solution.own
     if not is_traced(linkage, forces, rows):
         run = lambda forces: _efforts(linkage, forces, *padded(rows))

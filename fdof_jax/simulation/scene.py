@@ -14,7 +14,7 @@ from jaxtyping import PyTree
 from numpy.typing import ArrayLike
 
 from ..base.checks import instance, refusal, shown
-from ..forces.element import Forces, elements, of_full_size
+from ..forces.element import Forces, elements_on
 from ..linkage.coordinates import State
 from ..linkage.linkage import Linkage
 
@@ -92,8 +92,7 @@ def accepts_scene(
 
 def with_full_size(scene: Scene) -> Scene:
     """Returns the scene with forces of full size."""
-    forces = elements("forces", scene.forces)
-    return scene._replace(forces=of_full_size(scene.linkage, forces))
+    return scene._replace(forces=elements_on(scene.linkage, scene.forces))
 
 
 def is_number(leaf: object) -> bool:

@@ -21,14 +21,7 @@ from ..base.checks import (
     whole_number,
 )
 from ..base.known_values import in_numpy
-from ..forces.element import (
-    Element,
-    Forces,
-    OwnStates,
-    elements_on,
-    naming,
-    of_full_size,
-)
+from ..forces.element import Element, Forces, OwnStates, elements_on, naming
 from ..linkage.coordinates import State, real_state
 from ..linkage.fields import check_values
 from ..linkage.linkage import Linkage, check_linkage
@@ -99,7 +92,7 @@ def solve_options(
 
 
 def elements_at_door(linkage: Linkage, forces: Forces) -> tuple[Element, ...]:
-    """Returns forces as elements of full size; their values are not looked at.
+    """Returns forces as elements; their values are not looked at.
 
     Raises ValueError for other shapes and kinds, and warns of single precision.
     """
@@ -110,7 +103,7 @@ def elements_at_door(linkage: Linkage, forces: Forces) -> tuple[Element, ...]:
             shape = (None,) if np.ndim(jumps) else ()
             real_array(f"{place}.jump_ts", jumps, shape, finite=False)
         single_precision(place, element)
-    return of_full_size(linkage, adapted)
+    return adapted
 
 
 def check_elements(forces: Forces, linkage: Linkage, ts: Array) -> None:
