@@ -1,18 +1,16 @@
 """Tolerances of steps: defaults, limits and units."""
 
 import dataclasses
-import functools
 from typing import Any, TypeVar
 
 import diffrax
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
-from ..base.checks import concrete, instance, is_traced, real_array
+from ..base.checks import concrete, instance, is_traced, real_array, real_numbers
 from ..base.user_warnings import warn
 from ..linkage.coordinates import State
 from ..linkage.linkage import Linkage, check_linkage, joints_of
@@ -38,7 +36,7 @@ def _shortest_step() -> float:
     return of_precision(1e-13, 1e-8)
 
 
-def adaptive(rtol: float | Array, atol: float | Array) -> diffrax.PIDController:
+def adaptive(rtol: ArrayLike, atol: ArrayLike) -> diffrax.PIDController:
     """Returns a controller with a relative and an absolute tolerance."""
     shortest = _shortest_step()
     # In float32 the rounding errors of stiff forces, which nothing estimates, are not
@@ -56,42 +54,23 @@ def at_tolerances(
     rtol: ArrayLike | None, atol: ArrayLike | None
 ) -> diffrax.PIDController:
     """Returns the default controller with other tolerances; None keeps one."""
-    if isinstance(rtol, float | None) and isinstance(atol, float | None):
-        return _known_controller(rtol, atol, jnp.result_type(float))
-    return _new_controller(rtol, atol)
+    default = _default_tolerance()
+    rtol = _number("rtol", default if rtol is None else rtol)
+    atol = _number("atol", default if atol is None else atol)
+    return adaptive(rtol, atol)
 
 
-def _new_controller(
-    rtol: ArrayLike | None, atol: ArrayLike | None
-) -> diffrax.PIDController:
-    return adaptive(_tolerance("rtol", rtol), _tolerance("atol", atol))
-
-
-def _tolerance(name: str, value: ArrayLike | None) -> Array:
-    """Returns a tolerance as an array, of which new values need no new trace."""
-    return _constant(name, _default_tolerance() if value is None else value)
-
-
-def _constant(name: str, value: ArrayLike) -> Array:
-    array = real_array(name, value, (), above=0)
+def _number(name: str, value: ArrayLike) -> Array | np.ndarray:
+    """Returns a positive number as an array, of which new values need no new trace."""
+    number = real_numbers(name, value, (), above=0)
     # Else a derivative with respect to it would fail later, without this name.
-    traced = is_traced(array)
-    return eqx.internal.nondifferentiable(array, name=name) if traced else array
-
-
-# Of a sweep of 16 arms, in 1.0 ms, another controller would take 0.15 ms.
-@functools.lru_cache
-def _known_controller(
-    rtol: float | None, atol: float | None, dtype: np.dtype
-) -> diffrax.PIDController:
-    del dtype  # that of the tolerances, a part of the cache's key
-    with jax.ensure_compile_time_eval():  # no tracer is kept
-        return _new_controller(rtol, atol)
+    traced = is_traced(number)
+    return eqx.internal.nondifferentiable(number, name=name) if traced else number
 
 
 def with_longest(controller: Any, max_step: ArrayLike) -> Controller:
     """Returns the controller with a longest step [s]."""
-    longest = _constant("max_step", max_step)
+    longest = _number("max_step", max_step)
     return with_pid(lambda pid: dataclasses.replace(pid, dtmax=longest), controller)
 
 
