@@ -9,7 +9,6 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import Array
@@ -17,6 +16,7 @@ from jaxtyping import PyTree
 
 from ..forces.element import elements
 from ..linkage.linkage import without_fixed
+from ..steps.dopri8 import ScheduledTerm
 from ..steps.landing import end_of_run
 from ..steps.step_control import StepControl
 from ..steps.switch_derivatives import first_of
@@ -51,25 +51,10 @@ class _Varied(NamedTuple):
     modes: PyTree = None
 
 
-class _Term(diffrax.ODETerm):
-    """The equations of a motion, or of one and its derivatives (see `ScheduledTerm`).
-
-    Their state is (row,) or (rows,): a motion, and below it its derivatives.
-    """
-
-    switches: Callable[..., tuple[Array, tuple[bool, ...]]] = eqx.field(static=True)
-    unknown_modes: Callable | None = eqx.field(static=True)
-    resolve: Callable | None = eqx.field(static=True)
-
-    def vf(self, t, y, args):
-        return self.vector_field(t, y, args)
-
-
 class _LocatedRows(Located):
     """Adds what switches and known times change in the derivatives of the motion."""
 
-    motion: _Term  # of the motion alone
-    rates: Callable[..., Array] = eqx.field(static=True)  # (t, row, varied)
+    motion: ScheduledTerm  # of the motion alone
     jumps: Array | None
     slopes: Array | None  # derivatives of the jumps (jump, n)
 
@@ -123,18 +108,17 @@ class _LocatedRows(Located):
             when, beside = jnp.where(ahead, t, time), jnp.where(ahead, before, after)
             times = jnp.stack([time, t, when, when, when])
             sides = jnp.stack([beside, beside, before, between, after])
-            rates = jax.vmap(
-                lambda t, sides: self.rates(t, rows[0], args._replace(sides=sides))
-            )
-            rates = rates(times, sides)
+            row = (rows[0],)
+            field = lambda t, sides: self.motion.vf(t, row, args._replace(sides=sides))
+            (rates,) = jax.vmap(field)(times, sides)
             late = self.slope_of_known(time, args.z)
             gain = jnp.outer(late, rates[0] - rates[1])
             # Kinks change derivatives too where a jump at a known time passes them.
             if before.size:
                 places = jnp.stack([jnp.argmax(first), jnp.argmax(others)])
                 before_it = args._replace(sides=before)
-                values = lambda t, row, z: term.switches(
-                    t, (row[None],), before_it._replace(z=z)
+                values = lambda t, row, z: self.motion.switches(
+                    t, (row,), before_it._replace(z=z)
                 )[0][places]
                 _, change = jax.linearize(values, when, rows[0], args.z)
                 slopes = change(jnp.ones_like(t), rates[2], jnp.zeros_like(args.z))
@@ -205,17 +189,17 @@ def sensitivities(
         return jnp.stack(jax.tree.leaves(equations.term.vf(t, *instant(row, varied))))
 
     @jax.jit  # traced once, not at each use by the solver
-    def field(t, y, varied):
+    def field(t, y, varied, _):
         state, at = y[0], lambda row, z: rates(t, row, varied._replace(z=z))
         value, along = jax.linearize(at, state[0], varied.z)
         slopes = jax.vmap(along)(state[1:], directions)
         return (jnp.concatenate([value[None], slopes]),)
 
-    def switches_of_row(t, y, varied):
+    def switches_of_row(t, y, varied, _):
         return equations.term.switches(t, *instant(y[0], varied))
 
-    def switches_of(t, y, varied):
-        return switches_of_row(t, (y[0][0],), varied)
+    def switches_of(t, y, varied, schedule):
+        return switches_of_row(t, (y[0][0],), varied, schedule)
 
     def unknown_modes(varied):
         assert equations.term.unknown_modes is not None  # of scenes that change modes
@@ -239,11 +223,15 @@ def sensitivities(
     y0 = (jnp.concatenate([start[None], jax.vmap(along)(directions)]),)
     changing = equations.term.resolve is not None
     events = (unknown_modes, resolve) if changing else (None, None)
-    term = _Term(field, switches_of, *events)  # pyright: ignore[reportArgumentType, reportCallIssue]
-    motion = _Term(
-        lambda t, y, varied: (rates(t, y[0], varied),), switches_of_row, *events
-    )  # pyright: ignore[reportArgumentType, reportCallIssue]
-    of_rows = True, motion, rates, jumps, slopes
+
+    def term_of(field, switching):
+        """Returns a term without schedule and health, for which nothing asks here."""
+        without = lambda t, varied: (), None, None
+        return ScheduledTerm(field, *without, switching, *events)  # pyright: ignore[reportCallIssue, reportArgumentType]
+
+    term = term_of(field, switches_of)
+    motion = term_of(lambda t, y, varied, _: (rates(t, y[0], varied),), switches_of_row)
+    of_rows = True, motion, jumps, slopes
     locate = lambda *settings: _LocatedRows(*settings, *of_rows)  # pyright: ignore[reportCallIssue]
     # A method of few stages, because much of the work lies outside of them; as a loop
     # that `next_motion` can differentiate again.

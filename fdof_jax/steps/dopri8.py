@@ -45,7 +45,7 @@ DENSE = _INTERPOLATION.eval_coeffs  # (stage, power), highest first
 # Equations have types of their own (`simulation.field.Args`), which steps do not know.
 Integrated = PyTree  # a state: positions, rates, the elements' own, any `Switching`
 Arguments = PyTree  # of the equations: a named tuple with a linkage, q0 and sides
-Term = Any  # a `ScheduledTerm`, or another that has `vf` and `switches`
+Term = Any  # a `ScheduledTerm`
 Health = tuple[Array, ...]  # one per joint, see `ScheduledTerm`
 
 
