@@ -13,7 +13,7 @@ from elements import ALL, HOLDING, PD, Hold, arm
 import fdof_jax as fj
 from fdof_jax.forces.element import elements
 from fdof_jax.simulation.field import args_of, element_effort
-from fdof_jax.simulation.known_times import clocks_apart, known_times
+from fdof_jax.simulation.formulation import clocks_apart, known_times
 from fdof_jax.simulation.simulate import check_elements
 
 ARM, TS, ZERO = arm("RRR"), jnp.array([0.0, 1.0]), jnp.zeros(3)

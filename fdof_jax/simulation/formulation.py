@@ -1,4 +1,4 @@
-"""The formulation of a motion: its equations, their start and how states are read."""
+"""The formulation of a motion: equations, start, reading of states, known times."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -8,8 +8,10 @@ from jax import Array
 
 from ..forces.element import Forces
 from ..forces.payload import Payload
+from ..linkage.fields import jumps_of
 from ..mechanics.equations import Scalars, zeros
 from ..steps.dopri8 import Integrated, ScheduledTerm
+from ..steps.landing import clearance
 from .events import resolve
 from .field import Args, health_of, schedule_of, switching, vector_field, watched_field
 from .holding import changes, guarded_switching, unknown_modes
@@ -22,6 +24,11 @@ from .prescribed import (
     prescribed,
     watched_hybrid_field,
 )
+
+# By which a clock is ahead of the one before, in units of `clearance`: beyond the
+# distances that steps keep from each time.
+_AHEAD = 8
+
 
 
 class Formulation(NamedTuple):
@@ -75,3 +82,42 @@ HYBRID = Formulation(
     hybrid_start,
     hybrid_joints,
 )
+
+def clocks_apart(args: Args, ts: Array) -> Args:
+    """Returns the arguments with clocks by which no two elements jump at once.
+
+    If times coincided, one step would end at all of them, and derivatives would
+    attribute the jumps of all elements to one of them. Each clock is ahead of the one
+    before by some units of rounding.
+    """
+    # A prescribed motion also gives positions, and comes first: it keeps the time.
+    motion = prescribed(args.forces)
+    places = sorted(
+        (element is not motion, place)
+        for place, element in enumerate(args.forces)
+        if element.jump_ts is not None
+    )
+    if len(places) < 2:
+        return args
+    unit = _AHEAD * clearance(ts)
+    ahead = [0.0] * len(args.forces)
+    for rank, (_, place) in enumerate(places):
+        ahead[place] = rank
+    return args._replace(ahead=unit * jnp.array(ahead, unit.dtype))
+
+
+def clear_of_start(forces: Forces, ts: Array) -> Array:
+    """Returns the time after a start [s] at which another element's jump counts.
+
+    The clock of that element is ahead of those of `forces`.
+    """
+    timed = sum(element.jump_ts is not None for element in forces)
+    return (1 + _AHEAD * timed) * clearance(ts)
+
+
+def known_times(args: Args) -> Array | None:
+    """Returns the times [s] at which elements jump by their clocks, or None."""
+    if args.ahead is None:
+        return jumps_of(*args.forces)
+    times = [(e.jump_ts, args.ahead[k]) for k, e in enumerate(args.forces)]
+    return jnp.concatenate([jnp.ravel(t) - by for t, by in times if t is not None])

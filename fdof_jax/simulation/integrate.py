@@ -34,9 +34,8 @@ from ..steps.tolerances import default_controller
 from ..steps.unchecked import diffeqsolve
 from .events import in_order
 from .field import Args, args_of, in_arrays, initial_own, own_states, whole
-from .formulation import formulation
+from .formulation import clocks_apart, formulation, known_times
 from .holding import Modes, changes, taken_at, within_stops
-from .known_times import clocks_apart, known_times
 from .prescribed import agrees
 from .solution import Solution
 
@@ -148,7 +147,8 @@ def _control(
     if not isinstance(steps, diffrax.AbstractAdaptiveStepSizeController):
         why = None
         # Fixed steps may step over the kinks of an `EffortHistory`, but not over jumps.
-        if known_times(args, without=EffortHistory) is not None:
+        jumping = (e for e in args.forces if not isinstance(e, EffortHistory))
+        if any(e.jump_ts is not None for e in jumping):
             why = "declare times at which they jump (jump_ts)"
         elif changes(args.forces):
             why = "hold joints or take payloads"

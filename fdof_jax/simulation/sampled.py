@@ -28,7 +28,7 @@ from ..linkage.coordinates import State, real_state
 from ..linkage.linkage import Linkage, check_linkage, joints_of, without_fixed
 from ..steps.looped_dopri8 import LoopedDopri8
 from .field import has_states, initial_states
-from .known_times import clear_of_start
+from .formulation import clear_of_start
 from .simulate import check_elements, simulate
 from .solution import Solution, WithOutcome
 

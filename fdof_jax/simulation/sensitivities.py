@@ -24,8 +24,7 @@ from ..steps.switching import Located, located
 from ..steps.tolerances import adaptive, of_precision
 from ..steps.unchecked import diffeqsolve
 from .field import args_of, initial_own, own_states, whole
-from .formulation import formulation
-from .known_times import clocks_apart, known_times
+from .formulation import clocks_apart, formulation, known_times
 from .scene import Scene
 from .solution import Solution
 
