@@ -33,8 +33,7 @@ from ..simulation.integrate import Settings
 from ..simulation.scene import Scene
 from ..simulation.simulate import simulate
 from ..simulation.solution import Solution
-from ..steps.controllers import Abreast, by_square_roots
-from ..steps.tolerances import default_controller
+from ..steps.controllers import Abreast, by_square_roots, default_controller
 from .devices import (
     Device,
     compiled,

@@ -1,6 +1,6 @@
 """Motion in time: the equations that are integrated, and what is read from them."""
 
-from ..steps.tolerances import scale_tolerances
+from ..steps.controllers import scale_tolerances
 from .efforts import Efforts
 from .phases import concatenate
 from .prescribed import PrescribedMotion

@@ -17,7 +17,7 @@ from ..base.known_values import known_array
 from ..forces.element import Element, OwnStates
 from ..forces.joints import EffortHistory
 from ..linkage.linkage import Linkage, possible, without_fixed
-from ..steps.controllers import Controller, with_error_control
+from ..steps.controllers import Controller, default_controller, with_error_control
 from ..steps.derivative_control import OfLinearised, OfTangents
 from ..steps.dopri8 import Integrated, ScheduledDopri8, ScheduledTerm, constant
 from ..steps.landing import end_of_run
@@ -30,7 +30,6 @@ from ..steps.switching import (
     located,
     switching_facts,
 )
-from ..steps.tolerances import default_controller
 from ..steps.unchecked import diffeqsolve
 from .events import in_order
 from .field import Args, args_of, in_arrays, initial_own, own_states, whole

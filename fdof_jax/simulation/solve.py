@@ -17,9 +17,8 @@ from ..base.configuration import options_of_loops
 from ..base.functions import sharing_functions
 from ..forces.added_inertia import inertial
 from ..forces.element import ForeignElement
-from ..steps.controllers import with_pid
+from ..steps.controllers import at_tolerances, with_pid
 from ..steps.derivative_control import TANGENTS
-from ..steps.tolerances import at_tolerances
 from ..steps.unrolled_dopri8 import UnrolledDopri8
 from .integrate import Inputs, Settings, integrate
 from .prescribed import prescribed
