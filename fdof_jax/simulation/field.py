@@ -68,10 +68,6 @@ class Args(NamedTuple):
         held = tuple(self.modes.held)
         return self._replace(constants=with_held(self.constants, held))
 
-    def sliding(self, qd: Scalars) -> Scalars:
-        """Returns the directions in which joints slide; by default those of rates."""
-        return qd if self.modes is None else tuple(self.modes.direction)
-
 
 def args_of(linkage: Linkage, q0: Array, forces: tuple[Element, ...]) -> Args:
     # XLA's own sine and cosine, once per solve, as start angles may be large.
@@ -153,7 +149,7 @@ def efforts(
     elements = with_states(args.forces, own_states(args, y))
     for (index, element, state), scheduled in zip(elements, schedule):
         if isinstance(element, Holder) and element.holds:
-            sliding = args.sliding(qd)
+            sliding = qd if args.modes is None else tuple(args.modes.direction)
             effort = element.respond(scheduled, delta, sliding, args.linkage)
         elif isinstance(element, ScalarElement):
             q = tuple(a + b for a, b in zip(args.q0, delta))
