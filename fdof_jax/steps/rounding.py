@@ -17,7 +17,7 @@ from jax.typing import ArrayLike
 from jaxtyping import PyTree
 
 from ..linkage.topology import real_joints
-from .controllers import Adaptive, Judging
+from .controllers import Judging
 from .dopri8 import Arguments, Estimate, Health, Integrated
 
 # Rounding errors of an acceleration, over its size times eps and the loss of accuracy:
@@ -32,7 +32,7 @@ _HELD = 0.43
 
 
 def above_rounding(
-    control: Adaptive,
+    control: Judging,
     h: Array,
     y0: Integrated,
     y1: Integrated,
@@ -46,7 +46,7 @@ def above_rounding(
     `of_derivatives`: the error of derivatives over their tolerance, which counts too.
     """
     error, health, _ = estimate
-    same_step = _same_step(control.controller, order)
+    same_step = _same_step(control, order)
     of_qd = _rounding(real_joints(args.linkage.ef), health, y0, y1)
     of_delta = jax.tree.map(lambda noise: jnp.abs(h) * noise, of_qd)
 
@@ -72,8 +72,6 @@ def above_rounding(
 
 def _same_step(controller: Judging, order: ArrayLike | None) -> ArrayLike:
     """Returns the error, over its tolerance, after which the next step is as long."""
-    while isinstance(controller, Adaptive):
-        controller = controller.controller
     if not isinstance(controller, diffrax.PIDController):
         return _HELD  # what a method of order 8 has with diffrax's safety factor
     if controller.error_order is not None:

@@ -97,7 +97,7 @@ class StepControl(Adaptive):
         if self.term is not None:
             loss = functools.reduce(jnp.maximum, error.health, loss)
             error = above_rounding(
-                self, end - begin, before, after, args, error, ratio, error_order
+                controller, end - begin, before, after, args, error, ratio, error_order
             )
         # Is the error within the tolerance?
         keep, next0, next1, jumped, inner, result = constant(
