@@ -245,7 +245,11 @@ def _read(inputs: Inputs, problem: _Problem, solve: diffrax.Solution) -> Solutio
         loss = largest_loss(solve.controller_state)
         stats["accuracy"] = jnp.finfo(q.dtype).eps * loss
     stats |= switching_facts(*switches)
-    result = _result(valid, solve.result, q, qd)
+    results: Any = diffrax.RESULTS
+    # Constant steps, if too long, end in NaN and still report success.
+    finite = (jnp.isfinite(q[-1]) & jnp.isfinite(qd[-1])).all()
+    finite = finite | (solve.result != results.successful)
+    result = results.where(valid & finite, solve.result, results.nonfinite)
     holding: Any = ()  # modes, energy taken, events
     if modes:
         (last,), (rows,) = switches, modes
@@ -299,14 +303,3 @@ def faults(inputs: Inputs, times: bool = True) -> list[Array]:
     arm = constant((linkage, ts))
     fit = [jnp.asarray(e.possible() & constant(e).fits(*arm)) for e in forces]
     return [~fine for fine in (increasing, finite & place, possible(linkage), *fit)]
-
-
-def _result(
-    valid: Array, result: diffrax.RESULTS, q: Array, qd: Array
-) -> diffrax.RESULTS:
-    """Returns the result of a solve: not finite for invalid inputs and for NaN."""
-    results: Any = diffrax.RESULTS
-    # Constant steps, if too long, end in NaN and still report success.
-    finite = (jnp.isfinite(q[-1]) & jnp.isfinite(qd[-1])).all()
-    finite = finite | (result != results.successful)
-    return results.where(valid & finite, result, results.nonfinite)
