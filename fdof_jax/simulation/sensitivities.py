@@ -6,7 +6,7 @@ motion. Differentiation through the integrator would take twice as long to compi
 
 import dataclasses
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import diffrax
 import jax
@@ -56,6 +56,7 @@ class _LocatedRows(Located):
     motion: ScheduledTerm  # of the motion alone
     jumps: Array | None
     slopes: Array | None  # derivatives of the jumps (jump, n)
+    at_known_times: ClassVar = True
 
     def after_event(self, term, t, y, args, switching, sides, changed, made_jump):
         (rows,), of_motion = y, super().after_event
@@ -88,9 +89,6 @@ class _LocatedRows(Located):
         # 0, with derivatives: a known time here moves with its parameters.
         known = self.slope_of_known(arrival.t, z) @ (z - jax.lax.stop_gradient(z))
         return super().lateness(arrival, term) + known
-
-    def needed(self, count, jumps):
-        return count > 0 or jumps is not None
 
     def shifted(self, term, t, y, args, switching, made_jump):
         if not (any(self.jumping) or self.jumps is not None):

@@ -6,7 +6,7 @@ smooth. A step over the zero of a switching function is replaced by one that end
 
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -86,14 +86,12 @@ class Switching(NamedTuple):
     grazing_here: Array
     modes: PyTree = None
 
-    def in_force(self, args: Arguments) -> Arguments:
-        """Returns the arguments with the sides, and any modes, in force here."""
-        return args._replace(sides=self.sides, modes=self.modes)
-
 
 def in_force(args: Arguments, y: Integrated) -> Arguments:
     """Returns the arguments with what is in force at a state, if it has switches."""
-    return y[-1].in_force(args) if isinstance(y[-1], Switching) else args
+    if not isinstance(switching := y[-1], Switching):
+        return args
+    return args._replace(sides=switching.sides, modes=switching.modes)
 
 
 def motion_of(y: Integrated) -> Integrated:
@@ -123,7 +121,7 @@ def located(
         args = args._replace(modes=modes)
     functions, jumping = eqx.filter_eval_shape(term.switches, t0, y0, args)
     locating = locate(solver, jumping, apart, guards)
-    switches = locating.needed(functions.size, jumps)
+    switches = functions.size > 0 or locating.at_known_times and jumps is not None
     if jumps is None and not switches:
         return solver, None, y0
     if switches:
@@ -173,6 +171,7 @@ class Located(diffrax.AbstractAdaptiveSolver):
     apart: Array  # see `clearance`
     guards: int = eqx.field(static=True)  # switching functions that guard modes
     derivatives: bool = eqx.field(static=True)
+    at_known_times: ClassVar = False  # whether steps also end at these as at switches
 
     @property
     def term_structure(self):  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -266,10 +265,6 @@ class Located(diffrax.AbstractAdaptiveSolver):
             error = with_change(error, lambda error: (*error, none))
         return (*y1, new), error, dense, solver_state, result
 
-    def needed(self, count: int, jumps: Array | None) -> bool:
-        """Returns whether steps have to end at switches, given how many there are."""
-        return count > 0
-
     def one_sided(
         self,
         switching: Switching,
@@ -296,7 +291,7 @@ class Located(diffrax.AbstractAdaptiveSolver):
         The state moves on to the time of the event in the modes before, and back in
         those after: this changes nothing but derivatives.
         """
-        before = switching.in_force(args)
+        before = args._replace(sides=switching.sides, modes=switching.modes)
         fired = changed[-self.guards :].reshape(-1, switching.modes.mode.size)
         time = jnp.where(switching.ahead > 0, t, switching.until)
         late, there = jnp.zeros_like(t), y
