@@ -30,7 +30,6 @@ from .prescribed import (
 _AHEAD = 8
 
 
-
 class Formulation(NamedTuple):
     """The equations of a motion, their start, and the reading of joint states.
 
@@ -82,6 +81,7 @@ HYBRID = Formulation(
     hybrid_start,
     hybrid_joints,
 )
+
 
 def clocks_apart(args: Args, ts: Array) -> Args:
     """Returns the arguments with clocks by which no two elements jump at once.

@@ -16,12 +16,12 @@ from jaxtyping import PyTree
 
 from ..forces.element import elements
 from ..linkage.linkage import without_fixed
+from ..steps.controllers import adaptive, of_precision
 from ..steps.dopri8 import ScheduledTerm
 from ..steps.landing import end_of_run
 from ..steps.step_control import StepControl
 from ..steps.switch_derivatives import first_of
 from ..steps.switching import Located, located
-from ..steps.controllers import adaptive, of_precision
 from ..steps.unchecked import diffeqsolve
 from .field import args_of, initial_own, own_states, whole
 from .formulation import clocks_apart, formulation, known_times

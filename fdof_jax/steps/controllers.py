@@ -1,6 +1,7 @@
-"""Step size controllers: those beyond diffrax's, defaults, and changes of controllers."""
+"""Step size controllers: own ones, the default, tolerances, and changes of any."""
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any, TypeVar
 
@@ -207,22 +208,24 @@ def of_precision(double: _T, single: _T) -> _T:
     return double if jnp.result_type(float) == jnp.float64 else single
 
 
-def _default_tolerance() -> float:
-    return of_precision(1e-11, 1e-5)
-
-
 def _shortest_step() -> float:
     """Returns the step that ends solves that rounding keeps from their tolerance."""
     return of_precision(1e-13, 1e-8)
 
 
-def adaptive(rtol: ArrayLike, atol: ArrayLike) -> diffrax.PIDController:
+def adaptive(
+    rtol: float | Array | np.ndarray, atol: float | Array | np.ndarray
+) -> diffrax.PIDController:
     """Returns a controller with a relative and an absolute tolerance."""
     shortest = _shortest_step()
     # In float32 the rounding errors of stiff forces, which nothing estimates, are not
     # far below usual tolerances; to shorten steps after them would be to chase them.
     kind = of_precision(Shortening, diffrax.PIDController)
     return kind(rtol, atol, dtmin=shortest, force_dtmin=False)
+
+
+def _default_tolerance() -> float:
+    return of_precision(1e-11, 1e-5)
 
 
 def default_controller() -> diffrax.PIDController:
@@ -234,10 +237,24 @@ def at_tolerances(
     rtol: ArrayLike | None, atol: ArrayLike | None
 ) -> diffrax.PIDController:
     """Returns the default controller with other tolerances; None keeps one."""
+    known = isinstance(rtol, float | None) and isinstance(atol, float | None)
+    make = _at_known_tolerances if known else _at_tolerances
+    return make(rtol, atol, jnp.result_type(float))
+
+
+def _at_tolerances(
+    rtol: ArrayLike | None, atol: ArrayLike | None, dtype: np.dtype
+) -> diffrax.PIDController:
+    del dtype  # that of the tolerances, a part of the cache's key
     default = _default_tolerance()
-    rtol = _number("rtol", default if rtol is None else rtol)
-    atol = _number("atol", default if atol is None else atol)
-    return adaptive(rtol, atol)
+    return adaptive(
+        _number("rtol", default if rtol is None else rtol),
+        _number("atol", default if atol is None else atol),
+    )
+
+
+# Of a sweep of 16 arms, in 1.0 ms, another controller would take 0.15 ms.
+_at_known_tolerances: Any = functools.lru_cache(_at_tolerances)
 
 
 def _number(name: str, value: ArrayLike) -> Array | np.ndarray:
