@@ -23,9 +23,9 @@ from .dopri8 import (
     Integrated,
     ScheduledTerm,
     constant,
+    largest,
     lower_triangle,
 )
-from .rounding import largest
 from .switching import in_force, motion_of
 
 # The relative tolerance of tangents: over that of the motion, its upper limit, and its

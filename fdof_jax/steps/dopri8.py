@@ -139,6 +139,12 @@ def chosen(condition: ArrayLike, ones: PyTree, others: PyTree) -> PyTree:
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), ones, others)
 
 
+def largest(tree: PyTree) -> Array:
+    """Returns the size of the largest number in a tree."""
+    sizes = [jnp.max(jnp.abs(leaf)) for leaf in jax.tree.leaves(tree)]
+    return functools.reduce(jnp.maximum, sizes)
+
+
 def is_singular(health: Health) -> Array:
     return functools.reduce(operator.or_, (x == 0 for x in health))
 
