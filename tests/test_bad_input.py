@@ -109,7 +109,22 @@ MALFORMED = {
     "extra axis": lambda shape: np.ones((1, *shape)),
     "too long": lambda shape: np.ones((*shape[:-1], 7)),
     "ragged": lambda shape: [[1.0], [1.0, 2.0]],
+    "masked": lambda shape: np.ma.masked_array(np.ones(shape), True),
+    "no array": lambda shape: Hostile(),
+    "dates": lambda shape: np.full(shape, np.datetime64("2020-01-01")),
+    "bytes": lambda shape: b"abc",
+    "a key": lambda shape: jax.random.key(0),
+    "a class": lambda shape: float,
+    "records": lambda shape: np.zeros(shape, [("a", float), ("b", int)]),
+    "empty": lambda shape: np.zeros((*shape, 0)),
 }
+
+
+class Hostile:
+    """An object that raises when it is converted to an array."""
+
+    def __array__(self, *args, **keywords):
+        raise RuntimeError("no array")
 
 
 def with_entry(shape, entry):
@@ -139,6 +154,13 @@ def test_negative_values_are_refused(argument):
     name, shape, call = ARRAYS[argument]
     refused(name, call, with_entry(shape, -1e-9))
     call(with_entry(shape, 1e-9))
+
+
+@pytest.mark.parametrize("kind", [np.float16, np.float32, ">f8", np.int8, np.uint64])
+def test_real_numbers_of_any_type_are_taken(kind):
+    for function, good in CALLS:
+        for name in good.keys() - {"linkage", "topology", "ts"}:
+            function(**good | {name: np.asarray(good[name]).astype(kind)})
 
 
 # Topologies

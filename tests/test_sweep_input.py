@@ -5,6 +5,7 @@ import functools
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from sweep_batch import SETTINGS, TS, members
@@ -102,6 +103,8 @@ REFUSALS = [
             "of": [0, 1.5, True, None],
             "stepsize_controller": ["PID", 1e-6],
             "max_steps": [0, -1, 1.5, "1"],
+            "dt0": [jnp.array(-1), 0.0, np.ma.masked_array([1.0, 2.0], [0, 1])],
+            "solver": ["dopri", np.array("")],
         }.items()
         for value in values
     ),

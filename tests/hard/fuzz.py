@@ -1,7 +1,7 @@
-"""Random arms, states and arguments: no silent errors, hangs or crashes.
+"""Random arms and states: no silent errors, hangs or crashes.
 
-`python -m tests.hard.fuzz --cases 10000` draws cases of three kinds and prints their
-outcomes; `test_fuzz.py` runs 300 in pytest.
+`python -m tests.hard.fuzz --cases 10000` draws cases of two kinds and prints their
+outcomes; `test_fuzz.py` runs 220 in pytest.
 
 A case ends with a named outcome or raises `Failure`. Ill-conditioned arms are judged by
 the effect of rounding alone. The oracle computes the bounds at the case, from the sizes
@@ -15,30 +15,19 @@ import re
 import sys
 import time
 import warnings
-from collections.abc import Callable
 from typing import Any
 
 import hypothesis
-import hypothesis.strategies as st
 
 import fdof_jax as fj
 
 from .fuzz_accelerations import check_accelerations
-from .fuzz_motions import check_motion, check_sample, check_sweep
+from .fuzz_motions import check_motion
 from .fuzz_report import Failure, Report, table
 from .random_scenes import scenes
 
-fj.configure(x64=True)  # before the next import makes arrays
-from .garbage import cases as wrong_arguments, check_argument  # noqa: E402
-
 SLOWEST = 20.0  # [s] of the processor, compilation included: more counts as a hang
-
-
-KINDS: dict[str, tuple[st.SearchStrategy, Callable[[Any, Report], str], float]] = {
-    "accelerations": (scenes(), check_accelerations, 0.5),
-    "motions": (scenes(), check_motion, 0.3),
-    "arguments": (wrong_arguments(), check_argument, 0.2),
-}
+KINDS = {"accelerations": check_accelerations, "motions": check_motion}
 
 
 def check(kind: str, case: Any, report: Report) -> None:
@@ -47,7 +36,7 @@ def check(kind: str, case: Any, report: Report) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # arms that may be singular somewhere
         try:
-            outcome = KINDS[kind][1](case, report)
+            outcome = KINDS[kind](case, report)
         except Failure:
             raise
         except Exception as error:
@@ -79,7 +68,7 @@ def run(kind: str, cases: int, report: Report, *, seed: int | None = None) -> No
         derandomize=seed is None,
         phases=phases + [hypothesis.Phase.shrink] * (seed is None),
         suppress_health_check=list(hypothesis.HealthCheck),
-    )(hypothesis.given(KINDS[kind][0])(one))
+    )(hypothesis.given(scenes())(one))
     if seed is not None:
         drawn = hypothesis.seed(seed)(drawn)
     drawn()
@@ -90,18 +79,13 @@ def main() -> int:
     parser.add_argument("--cases", type=int, default=10_000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--kind", choices=KINDS, help="only these")
-    parser.add_argument("--sample", type=int, default=None, help="states checked")
     arguments = parser.parse_args()
+    fj.configure(x64=True)
     # A hang in compiled code cannot be interrupted, but it can be shown.
     faulthandler.dump_traceback_later(7200, exit=True)
     report = Report()
-    for kind, (_, _, share) in KINDS.items():
-        if arguments.kind in (None, kind):
-            cases = int(share * arguments.cases)
-            run(kind, cases, report, seed=arguments.seed)
-    sample = arguments.sample
-    check_sample(report, arguments.cases // 200 if sample is None else sample)
-    check_sweep(report)
+    for kind in [arguments.kind] if arguments.kind else KINDS:
+        run(kind, arguments.cases // 2, report, seed=arguments.seed)
     print(table(report))
     kinds = collections.defaultdict(list)
     for kind, failure, case in report.failures:

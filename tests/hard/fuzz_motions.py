@@ -1,12 +1,9 @@
-"""Motions of random arms: ends, energies, states at 30 digits, and sweeps."""
+"""Motions of random arms: named ends, and energies."""
 
 import math
-import random
-import warnings
 from typing import Any
 
 import diffrax
-import jax
 import numpy as np
 
 import fdof_jax as fj
@@ -51,7 +48,6 @@ def check_motion(scene: Scene, report: Report) -> str:
     name = result_name(solution.result)
     q, qd = np.asarray(solution.q), np.asarray(solution.qd)
     steps = int(solution.stats["num_steps"])
-    report.motions.append((scene, ts, name, q, qd))
     finite = np.isfinite(np.concatenate([q, qd], axis=1)).all(axis=1)
     # No motion needs so many first steps, from 1 ms down by factors of five.
     if steps > 100 and not int(solution.stats["num_accepted_steps"]):
@@ -126,113 +122,3 @@ def _check_energy(scene: Scene, ts, q, qd, end, steps: int, report: Report) -> N
                 f"energy changes by {gain:.3g} J at {ts[k]}, bound {allowed:.3g} J, "
                 f"{steps} steps"
             )
-
-
-def check_state(scene: Scene, ts, q, qd, report: Report) -> str:
-    """Compares states with a run at 30 digits, to the effect of small changes.
-
-    States interpolated between steps, all but the end, may also be wrong by
-    `INTERPOLATED` times the tolerance. Two more runs start as far off as the
-    tolerance allows, with parameters wrong in their last digits, all with random
-    signs.
-    """
-
-    def states(arm, q, qd):
-        rows = oracle.motion(arm, q, qd, scene.tau, scene.damping, ts.tolist())
-        return [[oracle.mp.mpf(x) for x in row] for row in rows]
-
-    rng = random.Random(0)
-
-    def off(values, share, floor=0.0):
-        return tuple(v + rng.choice([-1, 1]) * share * (floor + abs(v)) for v in values)
-
-    try:
-        exact = states(scene.arm, scene.q, scene.qd)
-        bound = np.zeros((len(ts), 6))
-        for _ in range(2):
-            arm = scene.arm
-            other = states(
-                arm._replace(
-                    length=off(arm.length, ROUNDINGS * EPS),
-                    com=tuple(off(pair, ROUNDINGS * EPS) for pair in arm.com),
-                    mass=off(arm.mass, ROUNDINGS * EPS),
-                    inertia=off(arm.inertia, ROUNDINGS * EPS),
-                    locked=off(arm.locked, EPS),
-                    base_angle=off([arm.base_angle], EPS)[0],
-                ),
-                [
-                    oracle.mp.mpf(a) + b
-                    for a, b in zip(scene.q, off((0,) * 3, TOLERANCE, 1))
-                ],
-                off(scene.qd, TOLERANCE, 1.0),
-            )
-            bound += [
-                [float(abs(a - b)) for a, b in zip(*rows)] for rows in zip(exact, other)
-            ]
-    except oracle.MotionTooLong:
-        return "state: reference too long"
-    size = TOLERANCE * (1 + np.abs(np.array(exact, dtype=float)))
-    size[1:-1] *= INTERPOLATED
-    bound = 10 * (np.maximum.accumulate(bound) + size)
-    got = np.concatenate([q, qd], axis=1)
-    error = np.array(
-        [
-            [float(abs(oracle.mp.mpf(float(a)) - b)) for a, b in zip(*rows)]
-            for rows in zip(got, exact)
-        ]
-    )
-    report.note("state / bound", (error / bound).max(), scene)
-    if (error > bound).any():
-        raise Failure(f"states wrong by {error.max(0)}, bound {bound.max(0)}")
-    return "state: right"
-
-
-def check_sample(report: Report, sample: int) -> None:
-    """Compares states of the first motions that are short enough with the reference."""
-    for scene, ts, name, q, qd in report.motions:
-        if sample == 0:
-            break
-        if name != "successful" or scene.pace > 3:
-            continue
-        sample -= 1
-        try:
-            outcome = check_state(scene, ts, q, qd, report)
-        except Failure as failure:
-            outcome = "FAILED"
-            report.failures.append(("motions", failure, scene))
-        report.outcomes["motions", outcome] += 1
-
-
-def check_sweep(report: Report) -> None:
-    """Checks that one `sweep` of the same arms equals each arm alone."""
-    found = [scene for scene, *_ in report.motions]
-    if not found:
-        return
-
-    def stack(items):
-        return jax.tree.map(lambda *leaves: np.stack(leaves), *items)
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        members = [
-            (linkage_of(s.arm), fj.State(np.array(s.q), np.array(s.qd)), forces_of(s))
-            for s in found
-        ]
-    ts = np.linspace(0, 0.01, 5)
-    settings = dict(max_steps=MAX_STEPS, throw=False)
-    linkages, states, forces = map(stack, zip(*members))
-    together = fj.sweep(linkages, states, ts, forces, forces_axes=0, **settings)
-    rows = np.concatenate([together.q, together.qd], axis=2)
-    for k, (linkage, state, force) in enumerate(members):
-        alone = fj.simulate(linkage, state, ts, force, **settings)
-        name = jax.tree.map(lambda leaf, k=k: leaf[k], together.result)
-        names = result_name(alone.result), result_name(name)
-        row = np.concatenate([alone.q, alone.qd], axis=1)
-        outcome = f"sweep: {names[1]}, as alone"
-        if names[0] != names[1]:
-            # Rounding differs between the two programs, and so may the last step.
-            outcome = f"sweep: {names[1]}, alone {names[0]}"
-        elif names[0] == "successful":
-            difference = np.abs(rows[k] - row) / (1 + np.abs(row))
-            report.note("sweep / alone", difference.max(), found[k])
-        report.outcomes["motions", outcome] += 1

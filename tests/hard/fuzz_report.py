@@ -18,7 +18,6 @@ class Report:
     )
     worst: dict = dataclasses.field(default_factory=dict)
     failures: list = dataclasses.field(default_factory=list)
-    motions: list = dataclasses.field(default_factory=list)
 
     def note(self, what: str, value: float, case: Any) -> None:
         if value > self.worst.get(what, (0.0, None))[0]:

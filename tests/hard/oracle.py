@@ -1,4 +1,4 @@
-"""Accelerations and motions of an arm at many digits, independent of the library.
+"""Accelerations and energies of an arm at many digits, independent of the library.
 
 The paper's equations are not used. The mass centres' velocities are written as a
 Jacobian of the joint rates, which gives M = sum m J^T J + I w w^T. The other terms come
@@ -200,71 +200,3 @@ def energy(arm: Arm, q, qd, digits: int = 30):
         M, _, potential = equations(arm, *chain(arm, q, qd))
         kinetic = sum(M[i][j] * qd[i] * qd[j] for i in range(3) for j in range(3)) / 2
         return kinetic + potential
-
-
-class MotionTooLong(Exception):
-    """Raised if the reference run would take too many steps."""
-
-
-def motion(arm: Arm, q, qd, effort, damping, times, digits=30, most_steps=40):
-    """Returns states (q, qd) at `times`, by extrapolation of the midpoint rule.
-
-    `effort` and `damping` are three numbers each: tau = effort - damping * qd.
-    Local errors are 1e-18 of the motion, seven digits better than the library's
-    own.
-    """
-    tolerance = mp.mpf(10) ** -18
-
-    def rates(y):
-        position, velocity = y[:3], y[3:]
-        M, bias, _ = equations(arm, *chain(arm, position, velocity))
-        D, L, _ = _factors(M)
-        if L is None:
-            raise MotionTooLong
-        tau = [f - c * v for f, c, v in zip(effort, damping, velocity)]
-        return [*velocity, *_solve(D, L, [t - b for t, b in zip(tau, bias)])]
-
-    def midpoints(y, first, step, count):
-        h = step / count
-        before, now = y, [a + h * b for a, b in zip(y, first)]
-        for _ in range(count - 1):
-            slope = rates(now)
-            before, now = now, [a + 2 * h * b for a, b in zip(before, slope)]
-        slope = rates(now)
-        return [(a + b + h * c) / 2 for a, b, c in zip(before, now, slope)]
-
-    counts = [2, 4, 6, 8, 10, 12, 14, 16, 18]
-    with mpmath.workdps(digits):
-        effort, damping = [list(map(mp.mpf, a)) for a in (effort, damping)]
-        y = [mp.mpf(a) for a in (*q, *qd)]
-        t, states, steps = mp.mpf(times[0]), [y], 0
-        step = mp.mpf(times[-1]) - t
-        for target in map(mp.mpf, times[1:]):
-            while t < target:
-                h = min(step, target - t)
-                first = rates(y)
-                table, good = [], False
-                for j, count in enumerate(counts):
-                    row = [midpoints(y, first, h, count)]
-                    for k in range(j):
-                        ratio = (mp.mpf(count) / counts[j - k - 1]) ** 2 - 1
-                        row.append(
-                            [a + (a - b) / ratio for a, b in zip(row[k], table[k])]
-                        )
-                    error = max(
-                        abs(a - b) / (1 + abs(a)) for a, b in zip(row[-1], row[-2])
-                    ) if j else mp.inf  # fmt: skip
-                    table, good = row, error < tolerance
-                    if good or (j == 4 and error > mp.mpf("1e-3")):
-                        break
-                steps += 1
-                if steps > most_steps:
-                    raise MotionTooLong
-                if not good:
-                    step = h / 3
-                    continue
-                t, y = (target if h == target - t else t + h), table[-1]
-                # Few rows were enough: a longer step is cheaper.
-                step = max(step, h * (2 if j < 6 else 1))
-            states.append(y)
-        return states

@@ -1,15 +1,11 @@
-"""The fuzzer on 300 cases, always the same; and cases found by longer runs."""
+"""The fuzzer on 220 cases, always the same; and cases found by longer runs."""
 
 import math
 
-import jax.numpy as jnp
-import numpy as np
 import pytest
 
 from hard import fuzz
-from hard.fuzz_motions import check_sample
 from hard.fuzz_report import Report
-from hard.garbage import Case, Hostile
 from hard.oracle import Arm
 from hard.random_scenes import Scene
 
@@ -23,13 +19,10 @@ def scene(arm, q, **changes):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "kind, cases", {"accelerations": 120, "motions": 100, "arguments": 80}.items()
-)
+@pytest.mark.parametrize("kind, cases", [("accelerations", 120), ("motions", 100)])
 def test_whatever_is_drawn_has_a_named_outcome(kind, cases):
     report = Report()
     fuzz.run(kind, cases, report)
-    check_sample(report, 2)
     assert not report.failures
     assert report.outcomes.total() >= cases
 
@@ -142,14 +135,6 @@ FOUND = {
             damping=(0.0, 0.0, 1e6),
         ),
     ),
-    "sweep dt0 negative": ("arguments", Case("sweep dt0", jnp.array(-1))),
-    "sweep dt0 zero": ("arguments", Case("sweep dt0", np.array(0.0))),
-    "sweep dt0 masked": (
-        "arguments",
-        Case("sweep dt0", np.ma.masked_array([1.0, 2.0], [0, 1])),
-    ),
-    "sweep solver": ("arguments", Case("sweep solver", np.array(""))),
-    "no array": ("arguments", Case("PDController kd", Hostile())),
 }
 
 
