@@ -17,10 +17,11 @@ from pathlib import Path
 
 import heyoka as hy
 import numpy as np
-from make_reference import PARAMETERS, lagrange, motion
-from reference_scenes import USUAL, heavy_tip
+from make_reference import PARAMETERS, PATH, lagrange, motion
 from scipy.integrate import solve_ivp
 
+# Links of 1 m and 1 kg: those of the heavy tips with another tip.
+USUAL = json.loads(PATH.read_text())["heavy-tip-1e3"] | dict(mass=[1.0] * 3, t1=5.0)
 TARGET = [-0.4, 0.2, 0.3]  # what the controllers hold [rad]
 STIFFNESSES = [1e4, 1e6, 1e8]
 real = np.longdouble
@@ -147,7 +148,7 @@ def free(changes):
 
 
 def main():
-    made = {"heavy-tip-1e9": free(heavy_tip(1e9))}
+    made = {"heavy-tip-1e9": free(dict(mass=[1.0, 1.0, 1e9], t1=2.0))}
     made["swing"] = free(dict(q0=[-1.2707963267948966, 0.0, 0.0], t1=10.0))
     made["saturated"] = saturated()
     made["stepping"] = stepping()

@@ -1,6 +1,7 @@
-"""Makes reference.json: the hard scenes that are not in tests/reference.json.
+"""Computes the motions that reference.json holds beside the parameters of its scenes.
 
-Needs heyoka (the extra `benchmark`) and about a minute on one core:
+A scene is added there, by its parameters alone. Needs heyoka (the extra `benchmark`) and
+about a minute on one core:
 
     python tests/hard/make_reference.py
 
@@ -15,9 +16,9 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-from reference_scenes import SCENES, USUAL
 from two_links_on_a_circle import on_circle
 
+PATH = Path(__file__).with_name("reference.json")
 TIMES = 21  # outputs of each scene, the start among them
 # Derivatives of q at the end in these arguments.
 DERIVATIVES = {
@@ -179,20 +180,18 @@ def agreed(compute, *arguments):
 
 
 def main():
-    made = {}
-    for name, changes in SCENES.items():
+    scenes = json.loads(PATH.read_text())
+    for name, scene in scenes.items():
         print(name, flush=True)
-        scene = USUAL | changes
         states = agreed(motion, scene)
         q, qd = np.split(states, 2, axis=1)
-        made[name] = scene | dict(q=q.tolist())
+        scene["q"] = q.tolist()
         if name in ACCELERATIONS:
             qdd = agreed(accelerations, scene, states)
-            made[name] |= dict(qd=qd.tolist(), qdd=qdd.tolist())
+            scene |= dict(qd=qd.tolist(), qdd=qdd.tolist())
         for argument in DERIVATIVES.get(name, ()):
-            made[name][f"dq_d{argument}"] = agreed(derivative, scene, argument).tolist()
-    text = json.dumps(made, indent=1)
-    Path(__file__).with_name("reference.json").write_text(text + "\n")
+            scene[f"dq_d{argument}"] = agreed(derivative, scene, argument).tolist()
+    PATH.write_text(json.dumps(scenes, indent=1) + "\n")
 
 
 if __name__ == "__main__":
