@@ -120,3 +120,10 @@ def random_linkage(topology, rng):
         base_angle=rng.uniform(-3, 3),
         gravity=rng.uniform(0, 10),
     )
+
+
+def random_motion(topology, rows=2, seed=0):
+    """Returns a random linkage, positions and velocities, and further rows (n,)."""
+    rng = np.random.default_rng(seed)
+    linkage = random_linkage(topology, rng)
+    return linkage, *rng.uniform(-1, 1, (rows, len(topology)))

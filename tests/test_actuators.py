@@ -7,7 +7,7 @@ armature against MuJoCo's in test_mjcf.py.
 import equinox as eqx
 import numpy as np
 import pytest
-from helpers import random_linkage
+from helpers import random_motion
 
 import fdof_jax as fj
 
@@ -15,11 +15,6 @@ PINS = fj.Point(0, -0.6, -0.8), fj.Point(2, 0.4, 0.3)
 ACTUATOR = fj.LinearActuator(
     *PINS, force=5.0, mass=[1.2, 0.7], com=[0.2, 0.3], inertia=[0.05, 0.03]
 )
-
-
-def motion(topology, seed=0):
-    rng = np.random.default_rng(seed)
-    return random_linkage(topology, rng), *rng.uniform(-1, 1, (2, 3))
 
 
 def pins(linkage, q):
@@ -61,7 +56,7 @@ def acting(element, q, qd, linkage):
 @pytest.mark.slow
 @pytest.mark.parametrize("topology", fj.TOPOLOGIES)
 def test_the_actuator_s_bodies_by_another_lagrangian(topology):
-    linkage, q, qd = motion(topology)
+    linkage, q, qd = random_motion(topology)
     qdd = np.array([0.3, -0.7, 1.1])
     bare = fj.inverse_dynamics(linkage, q, qd, qdd)
     full = fj.inverse_dynamics(linkage, q, qd, qdd, (ACTUATOR,))
@@ -72,7 +67,7 @@ def test_the_actuator_s_bodies_by_another_lagrangian(topology):
 
 @pytest.mark.parametrize("topology", fj.TOPOLOGIES)
 def test_the_actuator_s_force_does_its_power(topology):
-    linkage, q, qd = motion(topology)
+    linkage, q, qd = random_motion(topology)
     a, b = (np.array(pins(linkage, q + h * qd)) for h in (1e-6, -1e-6))
     rate = (abs(a[1] - a[0]) - abs(b[1] - b[0])) / 2e-6
     power = np.asarray(acting(ACTUATOR, q, qd, linkage)) @ qd
@@ -80,7 +75,7 @@ def test_the_actuator_s_force_does_its_power(topology):
 
 
 def test_the_actuator_s_force_may_depend_on_its_length():
-    linkage, q, qd = motion("RRR")
+    linkage, q, qd = random_motion("RRR")
     spring = fj.LinearActuator(*PINS, force=lambda t, length, rate: -30 * length - rate)
     same = fj.SpringDamper(*PINS, stiffness=30.0, damping=1.0)
     np.testing.assert_allclose(
@@ -90,7 +85,7 @@ def test_the_actuator_s_force_may_depend_on_its_length():
 
 @pytest.mark.slow
 def test_a_rotor_of_a_direct_drive_turns_as_the_link_beyond():
-    linkage, q, qd = motion("RRR")
+    linkage, q, qd = random_motion("RRR")
     rotors, inertia = fj.forces.Rotor([0.3, 0.2, 0.1], 1.0), [0.3, 0.2, 0.1]
     heavy = linkage.replace(inertia=linkage.inertia + np.array(inertia))
     for of, *at in ((fj.mass_matrix, q), (fj.bias_force, q, qd), (fj.energy, q, qd)):
@@ -100,7 +95,7 @@ def test_a_rotor_of_a_direct_drive_turns_as_the_link_beyond():
 
 def test_a_rotor_of_a_high_ratio_is_an_armature():
     """The coupling of the joints is 1 / gear of the armature's own."""
-    linkage, q, _ = motion("RPR")
+    linkage, q, _ = random_motion("RPR")
     matrix = lambda element: fj.mass_matrix(linkage, q, (element,))
     own = np.array([0.3, 0.2, 0.4])
     for gear in (5.0, 50.0):

@@ -3,7 +3,6 @@
 import itertools
 
 import chains
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -129,34 +128,6 @@ def test_a_shorter_chain_is_a_longer_one_with_fixed_pairs():
     np.testing.assert_allclose(
         ratios(longer, padded[0])[1:4], ratios(short, q), rtol=1e-12
     )
-
-
-@pytest.mark.slow
-def test_derivatives_equal_differences():
-    """Those of three and of six pairs are in other files."""
-    topology, n, rng = "RFRP", 4, np.random.default_rng(3)
-    chain = chains.random_chain(topology, rng)
-    q, qd, tau = jnp.asarray(rng.normal(size=(3, n)))
-    weights = rng.normal(size=n)
-
-    def value(chain, q, qd, tau):
-        return fj.forward_dynamics(chain, q, qd, tau) @ weights
-
-    arguments = chain, q, qd, tau
-    direction = jax.tree.map(lambda a: jnp.asarray(rng.normal(size=a.shape)), arguments)
-    direction = eqx.tree_at(lambda d: d[0].ef, direction, jnp.zeros(2 * n))
-    _, slope = jax.jvp(value, arguments, direction)
-    gradient = jax.grad(value, argnums=(0, 1, 2, 3))(*arguments)
-    products = jax.tree.map(lambda a, b: jnp.sum(a * b), gradient, direction)
-    assert float(sum(jax.tree.leaves(products))) == pytest.approx(float(slope), 1e-11)
-
-    def shifted(step):
-        moved = jax.tree.map(lambda a, b: a + step * b, arguments, direction)
-        return float(value(*moved))
-
-    h = 1e-3
-    coarse, fine = ((shifted(s) - shifted(-s)) / (2 * s) for s in (h, h / 2))
-    assert float(slope) == pytest.approx((4 * fine - coarse) / 3, rel=1e-7)
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")  # the first slide has no inertia

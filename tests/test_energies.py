@@ -126,7 +126,7 @@ def test_energy_stack_balances_with_elements_of_each_kind():
     That each element's power is what its energy loses is tested in test_elements.py.
     """
     arm, start = elements.arm("RPR"), elements.START
-    kinds = "history", "spring", "cable", "stops", "wrench", "motor", "armature"
+    kinds = "history", "spring", "motor", "armature"
     forces = tuple(elements.ALL[kind] for kind in (*kinds, "actuator"))
     ts = np.linspace(0, 0.075, 501)
     # One step per sample.
@@ -141,31 +141,43 @@ BAR = Linkage("R", length=[0, 1], com=[[0.5, 0]], mass=[1], inertia=[1 / 12])
 ARM = scenes.double_pendulum().linkage
 TIP = Point(1, along=1)
 TS = np.linspace(0, 2, 401)
-OF_ALL_KINDS = (
-    JointFriction([1.0, 0.5], static=[1.5, 0.8]),
-    HardStops([-2, -1], [2, 1], restitution=0.3),
-    Brake(2, begin=0.9, end=1.2),
-    Payload(Point(2, 0.8), mass=0.5, begin=0.5, end=1.5),
-    JointDamper(0.5),
-)
 
 
-def holding(friction=(0.0, 0.0), stop=-np.inf, braked=(9.0, 10.0), damping=0.0):
-    """Returns elements for one joint; those of no effect let all share a program."""
+def holding(
+    level=0.0, static=0.0, lower=-np.inf, upper=np.inf, brake=Brake(1, 9, 10),
+    taken=(9.0, 10.0), damping=0.0,
+):  # fmt: skip
+    """Returns elements for two joints; those of no effect let all share a program."""
+    both = lambda value: np.broadcast_to(value, 2).astype(float)
     return (
-        JointFriction(*friction), HardStops(stop, np.inf, restitution=0.5),
-        Brake(1, *braked), JointDamper(damping),
+        JointFriction(both(level), both(static)),
+        HardStops(both(lower), both(upper), restitution=0.5), brake,
+        Payload(Point(2, 0.8), 0.5, begin=taken[0], end=taken[1]), JointDamper(damping),
     )  # fmt: skip
+
+
+def with_fixed(link: Linkage, start: State) -> tuple[Linkage, State]:
+    """Returns the link with a fixed one of no mass at its end."""
+    more = dict(length=[0, 1, 0], com=[*link.com, [0, 0]], mass=[1, 0])
+    kinds = "RF" if link is BAR else "PF"
+    arm = link.replace(topology=kinds, inertia=[*link.inertia, 0], locked=0.0, **more)
+    return arm, State(*(np.append(row, 0.0) for row in start))
+
+
+FALLING, TURNING = State([1.0], [0.0]), State([0.3], [1.0])
+OF_ALL_KINDS = holding(
+    [1.0, 0.5], [1.5, 0.8], [-2, -1], [2, 1], Brake(2, 0.9, 1.2), (0.5, 1.5), 0.5
+)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("linkage", "start", "forces"),
     [
-        (BALL, State([1.0], [0.0]), holding(stop=0.0, damping=1.0)),
-        (BAR, State([0.3], [1.0]), holding((0.5, 0.7), -0.4, braked=(0.2, 0.6))),
-        (BAR, State([0.3], [1.0]), holding(braked=(0.0, 0.6))),  # a blow at the start
-        (ARM, State([0.3, 0.0], [0, 0]), OF_ALL_KINDS),
+        (*with_fixed(BALL, FALLING), holding(lower=0.0, damping=1.0)),
+        (*with_fixed(BAR, TURNING), holding(0.5, 0.7, -0.4, brake=Brake(1, 0.2, 0.6))),
+        (*with_fixed(BAR, TURNING), holding(brake=Brake(1, 0.0, 0.6))),  # a blow at 0
+        (ARM, State(np.array([0.3, 0.0]), np.zeros(2)), OF_ALL_KINDS),
     ],
     ids=["stop and damper", "friction, stop and brake", "braked first", "all"],
 )
@@ -232,7 +244,8 @@ def test_energy_stack_has_what_payloads_bring_and_take_away():
 @pytest.mark.slow
 def test_energy_stack_asks_for_closer_samples_where_those_help():
     """A blow explains nothing there: what it took is known."""
-    forces, ts = holding(stop=0.0, damping=3.0), np.linspace(0, 2, 13)
-    solution = simulate(BALL, State([1.0], [0.0]), ts, forces)
+    arm, start = with_fixed(BALL, FALLING)
+    forces = holding(lower=0.0, damping=3.0)
+    solution = simulate(arm, start, np.linspace(0, 2, 13), forces)
     with pytest.warns(UserWarning, match=r"and samples closer in time \(try"):
-        plotting.energy_stack(BALL, forces, solution)
+        plotting.energy_stack(arm, forces, solution)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from chains import Hold
-from helpers import random_linkage
+from helpers import random_motion
 from modes import LOOPS
 from test_reactions import ACTUATOR
 
@@ -20,11 +20,6 @@ STILL = np.zeros(3)
 ROD = fj.Linkage(
     "RRR", length=[0, 1, 1, 1], com=[[0.5, 0]] * 3, mass=[1] * 3, inertia=[1 / 12] * 3
 )
-
-
-def motion(topology):
-    rng = np.random.default_rng(0)
-    return random_linkage(topology, rng), *rng.uniform(-1, 1, (3, 3))
 
 
 def modes_at(linkage, forces, *states, ts=0.0):
@@ -66,7 +61,7 @@ def slopes(function, y, h=1e-6):
 @pytest.mark.slow
 @each_topology
 def test_a_and_b_are_slopes(topology):
-    linkage, q, qd, tau = motion(topology)
+    linkage, q, qd, tau = random_motion(topology, 3)
     forces = fj.JointDamper(0.3), fj.JointEffort(tau), fj.forces.Armature(0.2)
     A, B = fj.linearize(linkage, fj.State(q, qd), forces)
 
@@ -109,7 +104,7 @@ def test_a_stiff_controller_of_limited_efforts_has_an_equilibrium():
 @pytest.mark.slow
 @each_topology
 def test_equilibria_are_where_the_efforts_hold_the_arm(topology):
-    linkage, q, *_ = motion(topology)
+    linkage, q, *_ = random_motion(topology, 3)
     tau = fj.analysis.holding_efforts(linkage, q, (ACTUATOR,))  # and its masses
     tau = tau + ACTUATOR(0.0, q, STILL, linkage)
     qdd = fj.forward_dynamics(linkage, q, STILL, tau, (ACTUATOR,))
@@ -223,7 +218,7 @@ def test_fixed_pairs_have_no_modes():
 
 @each_topology
 def test_the_regressor_times_the_parameters_is_the_inverse_dynamics(topology):
-    linkage, q, qd, qdd = motion(topology)
+    linkage, q, qd, qdd = random_motion(topology, 3)
     matrix = fj.analysis.regressor(linkage, q, qd, qdd)
     tau = jnp.einsum("jlp,lp->j", matrix, fj.analysis.inertial_parameters(linkage))
     exact = fj.inverse_dynamics(linkage, q, qd, qdd)
@@ -237,7 +232,7 @@ def test_nine_combinations_of_the_parameters_of_an_rpr_arm_are_identified():
     first's, as both turn together. The third link's mass adds to the second's, to
     which it is hinged.
     """
-    linkage, *_ = motion("RPR")
+    linkage, *_ = random_motion("RPR", 3)
     samples = np.random.default_rng(1).uniform(-2, 2, (3, 40, 3))
     stacked = jax.vmap(lambda *row: fj.analysis.regressor(linkage, *row))(*samples)
     matrix = np.asarray(stacked).reshape(120, 12)

@@ -9,16 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import random_linkage
+from helpers import random_linkage, random_motion
 
 import fdof_jax as fj
 
 A, B = fj.Point(0, 0.3, -0.4), fj.Point(3, 0.5, 0.2)
-
-
-def motion(topology, seed=0):
-    rng = np.random.default_rng(seed)
-    return random_linkage(topology, rng), *rng.uniform(-1, 1, (2, 3))
 
 
 # A force and a moment that rise, to those of the test at 0.5 s.
@@ -45,7 +40,7 @@ def length_and_rate(element, q, qd, linkage):
 @pytest.mark.parametrize("topology", fj.TOPOLOGIES)
 @pytest.mark.parametrize("link", range(4))
 def test_a_point_lies_where_the_links_are(topology, link):
-    linkage, q, _ = motion(topology)
+    linkage, q, _ = random_motion(topology)
     point = fj.Point(link, 0.3, -0.2)
     x, _ = fj.paper.to_chain(linkage, q, np.zeros(3))
     angle = [linkage.base_angle, *x[1::2]][link]
@@ -58,7 +53,7 @@ def test_a_point_lies_where_the_links_are(topology, link):
 @pytest.mark.parametrize("topology", fj.TOPOLOGIES)
 @pytest.mark.parametrize("follows", [False, True])
 def test_a_wrench_does_the_power_of_force_and_moment(topology, follows):
-    linkage, q, qd = motion(topology)
+    linkage, q, qd = random_motion(topology)
     tip = fj.Point(3, linkage.length[3])
     wrench = fj.Wrench(tip, [3.0, -2.0], 1.5, follows=follows)
     force = np.array([3.0, -2.0])
@@ -101,7 +96,7 @@ def test_a_pulse_that_says_when_is_not_stepped_over():
 
 @pytest.mark.parametrize("side, sign", [("cable", 1), ("bumper", -1)])
 def test_one_sided_springs(side, sign):
-    linkage, q, qd = motion("RRR")
+    linkage, q, qd = random_motion("RRR")
     length, _ = length_and_rate(fj.SpringDamper(A, B), q, qd, linkage)
     for shift in (-0.1, 0.1):
         options = dict(stiffness=30.0, damping=0.1, rest_length=length - shift)

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 from chains import moving
-from helpers import random_linkage
+from helpers import random_motion
 
 import fdof_jax as fj
 from fdof_jax.linkage.frames import frames
@@ -24,11 +24,6 @@ ACTUATOR = fj.LinearActuator(
 )  # fmt: skip
 JOINTS = fj.JointDamper(0.5), fj.JointEffort([1.0, -2.0, 0.7])
 each_topology = pytest.mark.parametrize("topology", fj.TOPOLOGIES)
-
-
-def motion(topology):
-    rng = np.random.default_rng(0)
-    return random_linkage(topology, rng), *rng.uniform(-1, 1, (2, 3))
 
 
 def instant(linkage, q, qd, forces):
@@ -64,7 +59,7 @@ def cross(a, b):
 @each_topology
 def test_each_link_is_in_balance(topology):
     """Checks for each link that bearings, loads and weight sum to m a and I alpha."""
-    linkage, q, qd = motion(topology)
+    linkage, q, qd = random_motion(topology)
     forces = SPRING, ACROSS, PUSH, *JOINTS
     reactions, qdd = instant(linkage, q, qd, forces)
     accelerations = second(lambda q: fj.mass_centers(linkage, q), q, qd, qdd)
@@ -104,7 +99,7 @@ def along_pairs(linkage, x, reactions):
 @pytest.mark.slow
 @each_topology
 def test_free_components_are_efforts_and_others_the_paper_s_constraint_forces(topology):
-    linkage, q, qd = motion(topology)
+    linkage, q, qd = random_motion(topology)
     real = np.asarray(linkage.ef) > 0.5
     effort = sum(e(0.0, q, qd, linkage) for e in JOINTS)
     x, xd = fj.paper.to_chain(linkage, q, qd)
@@ -123,7 +118,7 @@ def test_free_components_are_efforts_and_others_the_paper_s_constraint_forces(to
 
 @each_topology
 def test_mujoco_has_the_same_reactions(topology):
-    linkage, q, qd = motion(topology)
+    linkage, q, qd = random_motion(topology)
     reactions, _ = instant(linkage, q, qd, JOINTS)
     model = mujoco.MjModel.from_xml_string(fj.to_mjcf(linkage))
     data = mujoco.MjData(model)
@@ -145,7 +140,7 @@ def test_mujoco_has_the_same_reactions(topology):
 @pytest.mark.parametrize("topology", [*fj.TOPOLOGIES, "RFR"])
 def test_mujoco_s_rotors_have_the_same_dynamics_and_reactions(topology):
     """Bodies that spin on the links before; the gears give their rates and efforts."""
-    linkage, q, qd = motion(topology)
+    linkage, q, qd = random_motion(topology)
     real = moving(topology)
     q, qd = np.where(real, q, 0), np.where(real, qd, 0)
     inertia, gear = np.array([0.3, 0.2, 0.4]), np.array([2.0, -1.5, 3.0])
@@ -187,7 +182,7 @@ def test_mujoco_s_rotors_have_the_same_dynamics_and_reactions(topology):
 @each_topology
 def test_pins_carry_the_actuator(topology):
     """Checks that the loads of its pins give the actuator's terms of the equations."""
-    linkage, q, qd = motion(topology)
+    linkage, q, qd = random_motion(topology)
     tau = fj.JointEffort([1.0, -2.0, 0.7])(0.0, q, qd, linkage)
     total = tau + ACTUATOR(0.0, q, qd, linkage)
     qdd = fj.forward_dynamics(linkage, q, qd, total, (ACTUATOR,))

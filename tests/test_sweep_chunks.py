@@ -79,7 +79,7 @@ def test_a_batch_of_one_kind_has_the_equations_of_that_kind_alone(monkeypatch):
         return original(program, *arguments)
 
     monkeypatch.setattr(chunks, "solve", recorded)
-    scene = fj.scenes.two_link_circle()
+    scene = fj.scenes.double_pendulum()
     arm, many = scene.linkage, fj.State(*(np.tile(x, (8, 1)) for x in scene.state0))
     kinds = eqx.tree_at(lambda arm: arm.ef, arm, np.tile(arm.ef, (8, 1)))
     one, any_kind = (

@@ -60,18 +60,11 @@ def test_derivatives_are_those_of_tight_differences():
 
 
 @pytest.mark.slow
-def test_members_of_a_batch_equal_single_motions_which_tell_of_switches():
-    def fall(case, **options):
-        arm, start, (_, spring, _), end = scene(0.1, case)
-        return fj.simulate(
-            arm, start, jnp.array([0.0, 1.0]) * end, (spring,), **options
-        )
-
-    alone = fall(CABLE)
-    many = jax.jit(jax.vmap(lambda case: fall(case, solver=LoopedDopri8())))(CASES)
-    np.testing.assert_allclose(many.q[1, -1], alone.q[-1], atol=1e-9)
-    assert alone.stats["num_switches"] == 2
-    assert 0.1 < alone.stats["slowest_crossing"] < 10
+def test_a_motion_tells_of_its_switches():
+    arm, start, (_, spring, _), end = scene(0.1, CABLE)
+    fall = fj.simulate(arm, start, jnp.array([0.0, 1.0]) * end, (spring,))
+    assert fall.stats["num_switches"] == 2
+    assert 0.1 < fall.stats["slowest_crossing"] < 10
     free = fj.simulate(ARM, fj.State(jnp.zeros(3), jnp.zeros(3)), [0, 0.1])
     assert "num_switches" not in free.stats
 

@@ -82,20 +82,17 @@ def test_derivatives_of_a_heavy_tip():
     np.testing.assert_allclose(slope, exact, rtol=1e-5)
 
 
-@pytest.mark.parametrize("name, bound", {"1e-6": 1e-6, "1e-9": 1e-8}.items())
-def test_light_tip(name, bound):
-    """One fast light body must not disturb two slow heavy ones."""
-    scene = hard.load(f"light-tip-{name}")
-    assert hard.error(hard.simulate(scene, hard.TIGHT), scene) <= bound
-
-
-@pytest.mark.parametrize("name, bound", {"1e-6": 1.1e-5, "1e-9": 1.1e-8}.items())
-def test_light_tip_leaves_a_two_link_chain(name, bound):
+@pytest.mark.parametrize(
+    "name, bound, moved", [("1e-6", 1e-6, 1.1e-5), ("1e-9", 1e-8, 1.1e-8)]
+)
+def test_light_tip(name, bound, moved):
     """One fast light body must not disturb two slow heavy ones.
 
     Its own weight moves them by 1.082e-5 and 1.082e-8 rad, in computations with 60
     digits.
     """
-    motion = hard.simulate(hard.load(f"light-tip-{name}"), hard.TIGHT)
+    scene = hard.load(f"light-tip-{name}")
+    motion = hard.simulate(scene, hard.TIGHT)
+    assert hard.error(motion, scene) <= bound
     two_links = np.array(hard.REFERENCE["two-links"]["q"])
-    assert np.abs(motion.q[:, :2] - two_links).max() <= bound
+    assert np.abs(motion.q[:, :2] - two_links).max() <= moved
