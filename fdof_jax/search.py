@@ -23,8 +23,8 @@ from .base.functions import sharing_functions
 from .forces.element import elements
 from .linkage.coordinates import real_state
 from .linkage.linkage import check_linkage
+from .simulation.jacobian import Sensitivities
 from .simulation.scene import Scene, stacked
-from .simulation.sensitivities import Sensitivities
 from .simulation.simulate import elements_at_door, simulate
 
 # Greatest change of an unknown in a step: a factor of 7 if unknowns are logarithms.

@@ -8,7 +8,7 @@ import pytest
 from helpers import Push
 
 import fdof_jax as fj
-from fdof_jax.simulation.sensitivities import sensitivities
+from fdof_jax.simulation.jacobian import jacobian_of
 from fdof_jax.steps.zeros_in_steps import CHECKS, SHARES, passage
 
 SLIDE = fj.Linkage(
@@ -44,7 +44,7 @@ def slopes_in_times():
         return jnp.stack([found.q[-1, 0], found.qd[-1, 0]]), found.stats
 
     def beside(x):
-        return sensitivities(
+        return jacobian_of(
             lambda x: fj.Scene(SLIDE, rest, pushes(x), 1.0),
             lambda scene, motion: jnp.stack([motion.q[-1, 0], motion.qd[-1, 0]]),
             x, x[:2], 1e-9,
@@ -103,7 +103,7 @@ def both_ways(start, places):
         found = fj.simulate(SLIDE, state, ts, (Marks(places),), adjoint=FORWARD)
         return found.q[-1, 0], found.stats
 
-    varied = sensitivities(
+    varied = jacobian_of(
         lambda places: fj.Scene(SLIDE, state, (Marks(places),), 0.8),
         lambda scene, solution: solution.q[-1],
         places, ts, 1e-9,

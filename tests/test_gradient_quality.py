@@ -9,7 +9,7 @@ from modes import LOOPS
 
 import fdof_jax as fj
 from fdof_jax import scenes
-from fdof_jax.simulation.sensitivities import sensitivities
+from fdof_jax.simulation.jacobian import jacobian_of
 from fdof_jax.tuning import gradient_quality
 from fdof_jax.tuning.losses import gains_of, tip_errors, with_gains
 
@@ -52,7 +52,7 @@ def scaled(scene, z):
 def tangents(scene, tolerance, ts):
     at = lambda z: scaled(scene, z)
     zero = jnp.zeros(gains_of(scene).size)
-    found = sensitivities(at, tip_errors, zero, ts, tolerance)
+    found = jacobian_of(at, tip_errors, zero, ts, tolerance)
     gradient = 2 * found.jacobian.T @ found.residuals
     return found.residuals, found.jacobian, gradient
 

@@ -11,7 +11,7 @@ from helpers import Push
 from jax.flatten_util import ravel_pytree
 
 import fdof_jax as fj
-from fdof_jax.simulation.sensitivities import sensitivities
+from fdof_jax.simulation.jacobian import jacobian_of
 
 SLIDE = fj.Linkage("P", mass=[1], com=[[0, 0]], inertia=[1], length=[0, 1], gravity=0)
 TS = np.linspace(-0.55, 2.0, 26)  # none at a jump, where differences are none
@@ -138,7 +138,7 @@ def test_the_times_of_jumps_past_a_limit_have_derivatives_beside_the_motion():
         return fj.simulate(scene_at(z), ts).q[-1, 0]
 
     beside = jax.jit(
-        lambda z: sensitivities(scene_at, lambda _, motion: motion.q[-1], z, ts)
+        lambda z: jacobian_of(scene_at, lambda _, motion: motion.q[-1], z, ts)
     )
     for times in ([0.1, 9.0], [0.2, 9.0], [0.05, 0.1], [0.05, 0.2]):
         z = jnp.array(times)

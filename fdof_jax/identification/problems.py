@@ -14,9 +14,9 @@ from numpy.typing import ArrayLike
 from ..base.checks import function, instance, real_array, refusal, shown
 from ..mechanics.kinematics import joint_positions, tip_position
 from ..search import Evaluation, check_scene, sum_of_squares
+from ..simulation.jacobian import jacobian_of
 from ..simulation.sampled import check_joints
 from ..simulation.scene import Scene, stacked
-from ..simulation.sensitivities import sensitivities
 from ..simulation.solution import Solution
 
 Named = dict[str, Any]  # parameters by name, as numbers or arrays
@@ -172,7 +172,7 @@ def lane(z: Array, problem: Problem) -> Evaluation:
         return (weight * misfit).reshape(-1)
 
     scene_at = lambda z: problem.scene_at(problem.unknowns.at(z))
-    found = sensitivities(scene_at, residuals, z, problem.ts, _TOLERANCE)
+    found = jacobian_of(scene_at, residuals, z, problem.ts, _TOLERANCE)
     unweighted = found.residuals / jnp.where(there, weight, 1).reshape(-1)
     successive = there[1:] & there[:-1]
     change = jnp.diff(found.residuals.reshape(weight.shape), axis=0)

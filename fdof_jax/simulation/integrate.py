@@ -23,13 +23,7 @@ from ..steps.dopri8 import Integrated, ScheduledDopri8, ScheduledTerm, constant
 from ..steps.landing import end_of_run
 from ..steps.looped_dopri8 import LoopedDopri8
 from ..steps.step_control import StepControl, largest_loss
-from ..steps.switching import (
-    Located,
-    LocatedImplicit,
-    Switching,
-    located,
-    switching_facts,
-)
+from ..steps.switching import Switching, located, switching_facts
 from ..steps.unchecked import diffeqsolve
 from .events import in_order
 from .field import Args, args_of, in_arrays, initial_own, own_states, whole
@@ -88,21 +82,22 @@ def integrate(
     keywords: Settings,
     derivatives: bool = False,
     plain: bool = False,
-    tangents: bool = False,
+    tangents: OfTangents | None = None,
 ) -> Solution:
     """Integrates one motion, by default with `LoopedDopri8`.
 
     `derivatives`: whether steps are kept short enough for accurate derivatives.
     `plain`: whether this is one motion outside of transformations. Its last time may be
     repeated.
-    `tangents`: whether the caller maps over tangents, along the axis `TANGENTS`.
+    `tangents`: judges tangents over which the caller maps, along the axis `TANGENTS`.
     """
-    problem = _prepare(inputs, derivatives, plain)
+    arrays = plain and not derivatives or bool(tangents and tangents.tolerance)
+    problem = _prepare(inputs, derivatives, plain, arrays)
     control = _control(problem, keywords, derivatives, tangents)
     return _read(inputs, problem, _solve(problem, control, keywords))
 
 
-def _prepare(inputs: Inputs, derivatives: bool, plain: bool) -> _Problem:
+def _prepare(inputs: Inputs, derivatives: bool, plain: bool, arrays: bool) -> _Problem:
     """States the equations and their start."""
     linkage, state0, ts, own0, forces, ef = inputs
     if ef is not None:  # the equations of other joints are left out
@@ -129,13 +124,13 @@ def _prepare(inputs: Inputs, derivatives: bool, plain: bool) -> _Problem:
 
     q, qd, _ = joints(ts[0], start)  # after a blow there, like all that follows
     equations = term, start, args
-    if plain and not derivatives:
+    if arrays:
         equations = in_arrays(*equations)
     return _Problem(valid & finite, ts, (q, qd), *equations, joints)
 
 
 def _control(
-    problem: _Problem, keywords, derivatives: bool, tangents: bool
+    problem: _Problem, keywords, derivatives: bool, tangents: OfTangents | None
 ) -> _Control:
     """Chooses the steps: what they judge, and where they end."""
     solver: diffrax.AbstractSolver = keywords["solver"] or LoopedDopri8()
@@ -157,16 +152,13 @@ def _control(
         return _Control(start, solver, steps, None)
     jumps = known_times(args)
     implicit = isinstance(solver, diffrax.AbstractImplicitSolver)
-    kind: Any = LocatedImplicit if implicit else Located
-    locate = lambda *of_run: kind(*of_run, derivatives)
-    wrapped, landing, start = located(locate, solver, term, ts, start, args, jumps)
+    of_run = ts, start, args, jumps
+    wrapped, landing, start = located(solver, term, *of_run, derivatives)
     watches = not isinstance(solver, ScheduledDopri8)  # which finds the health itself
-    of_derivatives = None
-    if tangents:
-        of_derivatives = OfTangents()
+    of_derivatives = tangents
     # Who sets tolerances of an implicit solver wants very fast motions left unresolved;
     # a probe would make steps short enough to resolve them.
-    elif derivatives and not (implicit and given is not None):
+    if derivatives and not tangents and not (implicit and given is not None):
         has_tableau = isinstance(solver, ScheduledDopri8 | diffrax.AbstractRungeKutta)
         # Of other solvers derivatives are judged as if they were by Heun's method.
         tableau: Any = solver.tableau if has_tableau else diffrax.Heun.tableau
@@ -281,6 +273,8 @@ def _differentiable(
 
     diffrax does this itself, except for a solver inside a wrapper.
     """
+    if isinstance(solver, LoopedDopri8):
+        return LoopedDopri8(replayed=not isinstance(adjoint, diffrax.ForwardMode))
     kinds = {diffrax.ForwardMode: "lax", diffrax.DirectAdjoint: "bounded"}
     kind = kinds.get(type(adjoint))
     if kind is None or not isinstance(solver, diffrax.AbstractRungeKutta):

@@ -18,9 +18,10 @@ from ..base.functions import sharing_functions
 from ..forces.added_inertia import inertial
 from ..forces.element import ForeignElement
 from ..steps.controllers import at_tolerances, with_pid
-from ..steps.derivative_control import TANGENTS
+from ..steps.derivative_control import OfTangents
 from ..steps.unrolled_dopri8 import UnrolledDopri8
 from .integrate import Inputs, Settings, integrate
+from .jacobian import along_each
 from .prescribed import prescribed
 from .solution import Solution
 
@@ -167,17 +168,12 @@ def _few(moving, adjoint) -> bool:
 def _with_tangents(motion, moving):
     """Returns what `motion` returns and the states' tangents in each number."""
     start, whole = ravel_pytree(moving)
-
-    def along(direction):
-        shifted = lambda numbers: motion(whole(numbers))
-        return jax.jvp(shifted, (start,), (direction,), has_aux=True)
-
     # Along changes of each number by itself, tangents have the size of the motion.
     # What may be a rounding error says nothing about the size of changes.
     tiny = jnp.abs(start) < jnp.finfo(start.dtype).eps ** 0.5
     sizes = jnp.where(tiny, 1, jnp.abs(start))
-    each = jax.vmap(along, out_axes=(None, 0, None), axis_name=TANGENTS)
-    states, tangents, solution = each(jnp.diag(sizes))
+    shifted = lambda numbers: motion(whole(numbers))
+    states, tangents, solution = along_each(shifted, start, jnp.diag(sizes))
     by_size = lambda rows: rows / sizes.reshape(-1, *[1] * (rows.ndim - 1))
     tangents = jax.tree.map(by_size, tangents)
     return states, tangents, solution
@@ -190,9 +186,11 @@ def _integrate_reversibly_fwd(perturbed, inputs, keywords):
     if few:
         keywords = keywords | {"adjoint": diffrax.ForwardMode()}
 
+    judge = OfTangents() if few else None
+
     def motion(moving):
         inputs = eqx.combine(moving, fixed)
-        solution = integrate(inputs, keywords, derivatives=True, tangents=few)
+        solution = integrate(inputs, keywords, derivatives=True, tangents=judge)
         return solution.states, solution
 
     if few:

@@ -38,7 +38,7 @@ _GROWN = 1e3  # size of a probe that is replaced by a new one, of size 1
 # A tangent below this part of the largest one is judged as if it were as large.
 _WEAK = 0.1
 # No tangent has a tolerance of more than so many times that of one which is large.
-_LEAST = 30.0
+_LEAST, _ANY = 30.0, 1e9
 TANGENTS = "tangents"  # the name of their axis
 
 
@@ -50,24 +50,25 @@ def _noise(health: Health) -> Array:
 
 @jax.custom_jvp
 def _error_of_tangents(
-    error: PyTree, ends: PyTree, integrated: PyTree, tolerance: Array, noise: Array
-) -> Array:
+    error: PyTree, ends: PyTree, integrated: PyTree, tolerance: Array, noise: Array,
+    least: Array,
+) -> Array:  # fmt: skip
     """Returns the largest error of a tangent over what its tolerance allows.
 
     Without tangents this is 0. They must be those along one axis, `TANGENTS`.
     `ends`, `integrated`: the state at both ends of a step, with positions and, as it is
-    integrated, with displacements.
+    integrated, with displacements. `least`: see `_LEAST`.
     """
     return jnp.zeros_like(tolerance)
 
 
 @_error_of_tangents.defjvp
 def _(primals, tangents):
-    _, _, motion, tolerance, noise = primals
+    _, _, motion, tolerance, noise, least = primals
     error, own, integrated = constant(tuple(map(largest, tangents[:3])))
     size = jnp.maximum(own, _WEAK * jax.lax.pmax(own, TANGENTS))
     # A tangent far smaller than the largest is exact, too.
-    allowed = tolerance * jnp.minimum(size, _LEAST * own)
+    allowed = tolerance * jnp.minimum(size, least * own)
     # Terms of a tangent may cancel, and leave rounding errors of the motion.
     allowed += noise * (largest(motion) + integrated)
     ratio = jnp.where(allowed > 0, error / allowed, 0)
@@ -88,7 +89,13 @@ class Step(NamedTuple):
 
 
 class OfTangents(eqx.Module):
-    """Judges tangents of the motion; all of them take the same steps."""
+    """Judges tangents of the motion; all of them take the same steps.
+
+    `tolerance`: relative to the largest tangent. None: each has a tolerance of its own,
+    which follows from that of the motion.
+    """
+
+    tolerance: float | None = None
 
     def start(self, y0: Integrated) -> tuple[()]:
         return ()
@@ -101,12 +108,15 @@ class OfTangents(eqx.Module):
         `rtol`: the relative tolerance of the motion.
         """
         noise = _noise(estimate.health)
-        tolerance = jnp.minimum(_LOOSER * rtol, _LOOSEST)
+        tolerance, least = self.tolerance, _ANY
+        if tolerance is None:
+            tolerance, least = jnp.minimum(_LOOSER * rtol, _LOOSEST), _LEAST
         tolerance = constant(jnp.maximum(tolerance, noise))
         error, *integrated = map(motion_of, (estimate.error, step.y0, step.y1))
         # Tangents of displacements lack that of the start.
         ends = [(step.args.q0 + jnp.stack(q), *others) for q, *others in integrated]
-        ratio = _error_of_tangents(error, ends, integrated, tolerance, noise)
+        of_motion = error, ends, integrated
+        ratio = _error_of_tangents(*of_motion, tolerance, noise, least)
         return constant(ratio), probe
 
 

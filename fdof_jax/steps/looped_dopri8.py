@@ -41,11 +41,7 @@ def _weighted(weights: Array, rates: PyTree) -> PyTree:
     return jax.tree.map(weighted, rates)
 
 
-# Reverse mode replays steps with the very code that took them: near a saturation,
-# different rounding leads to different steps and to a wrong gradient.
-@eqx.filter_jit  # traced once, not at each use in a solve
-@eqx.filter_checkpoint
-def _step(term: Any, t0, t1, y0, residue, args):
+def _one_step(term: Any, t0, t1, y0, residue, args):
     """Takes a step; returns what `diffrax.AbstractSolver.step` does.
 
     The solver's state is the rounding error of `y`, which the next step adds (Kahan).
@@ -88,6 +84,12 @@ def _step(term: Any, t0, t1, y0, residue, args):
     return y, error, dense_info, constant(residue), result
 
 
+_step = eqx.filter_jit(_one_step)  # traced once, not at each use in a solve
+# Reverse mode replays steps with the very code that took them: near a saturation,
+# different rounding leads to different steps and to a wrong gradient.
+_replayed_step = eqx.filter_jit(eqx.filter_checkpoint(_one_step))
+
+
 class _Interpolation(DenseOutput):
     def at(self, theta):
         change = _weighted(interpolation_weights(theta), self.rates)
@@ -95,8 +97,12 @@ class _Interpolation(DenseOutput):
 
 
 class LoopedDopri8(ScheduledDopri8):
-    """The method of `diffrax.Dopri8` up to rounding, for a single arm."""
+    """The method of `diffrax.Dopri8` up to rounding, for a single arm.
 
+    `replayed`: whether reverse mode may replay its steps, which takes longer to trace.
+    """
+
+    replayed: bool = eqx.field(static=True, default=True)
     interpolation_cls: ClassVar = _Interpolation
 
     def init(self, terms, t0, t1, y0, args):
@@ -104,4 +110,5 @@ class LoopedDopri8(ScheduledDopri8):
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         del made_jump  # no rate is kept from one step to the next
-        return _step(terms, t0, t1, y0, solver_state, args)
+        step = _replayed_step if self.replayed else _step
+        return step(terms, t0, t1, y0, solver_state, args)

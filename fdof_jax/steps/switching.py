@@ -6,7 +6,7 @@ smooth. A step over the zero of a switching function is replaced by one that end
 
 import functools
 from collections.abc import Callable
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -27,16 +27,7 @@ from .dopri8 import (
     with_change,
 )
 from .landing import Landing, clearance
-from .switch_derivatives import (
-    Arrival,
-    Event,
-    Instant,
-    Moment,
-    first_of,
-    gained,
-    lateness,
-    moved_on,
-)
+from .switch_derivatives import Event, gained, gained_at_kink, lateness, moved
 from .zeros_in_steps import CHECKED, CHECKS, SAMPLED, SHARES, passage
 
 # A function whose zero is this close to the end of a step switches there: a share of
@@ -100,18 +91,18 @@ def motion_of(y: Integrated) -> Integrated:
 
 
 def located(
-    locate: Callable[[diffrax.AbstractSolver, tuple[bool, ...], Array, int], "Located"],
     solver: diffrax.AbstractSolver,
     term: Term,
     ts: Array,
     y0: Integrated,
     args: Arguments,
     jumps: Array | None,
+    derivatives: bool,
 ) -> tuple[diffrax.AbstractSolver, Landing | None, Integrated]:
     """Returns a solver that finds switches, and the `Landing` that ends steps at them.
 
-    Also returns the start for this solver. Without switches and known times `jumps`,
-    solver and start stay as they are. `ts`: the times of the run.
+    Also returns the start for this solver. Without switches solver and start stay as
+    they are. `ts`: the times of the run; `jumps`: known times.
     """
     t0, apart = ts[0], clearance(ts)
     jumps = None if jumps is None else jnp.asarray(jumps, t0.dtype)
@@ -120,8 +111,7 @@ def located(
         modes, guards = term.unknown_modes(args)
         args = args._replace(modes=modes)
     functions, jumping = eqx.filter_eval_shape(term.switches, t0, y0, args)
-    locating = locate(solver, jumping, apart, guards)
-    switches = functions.size > 0 or locating.at_known_times and jumps is not None
+    switches = functions.size > 0
     if jumps is None and not switches:
         return solver, None, y0
     if switches:
@@ -143,7 +133,10 @@ def located(
             grazing_here=none,
             modes=modes,
         )
-        solver, y0 = locating, (*y0, at_start)
+        implicit = isinstance(solver, diffrax.AbstractImplicitSolver)
+        kind: Any = LocatedImplicit if implicit else Located
+        solver = kind(solver, jumping, apart, guards, derivatives)
+        y0 = *y0, at_start
     return solver, Landing(jumps, apart, switches), y0
 
 
@@ -162,8 +155,7 @@ class Located(diffrax.AbstractAdaptiveSolver):
     """A solver whose steps keep the branches of their start and report a change.
 
     Where efforts jump at a switch, a motion that starts on it, or meets it together
-    with another, may have different derivatives on its two sides. `sensitivities`,
-    which integrates derivatives beside the motion, overrides what `step` calls.
+    with another, may have different derivatives on its two sides.
     """
 
     solver: Any
@@ -171,7 +163,6 @@ class Located(diffrax.AbstractAdaptiveSolver):
     apart: Array  # see `clearance`
     guards: int = eqx.field(static=True)  # switching functions that guard modes
     derivatives: bool = eqx.field(static=True)
-    at_known_times: ClassVar = False  # whether steps also end at these as at switches
 
     @property
     def term_structure(self):  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -297,13 +288,17 @@ class Located(diffrax.AbstractAdaptiveSolver):
         late, there = jnp.zeros_like(t), y
         if self.derivatives:
             arrived = changed & made_jump & (switching.length > 0)
-            late = self.lateness(Arrival(time, y, before, arrived), term)
-            there = moved_on(late, Instant(time, y, before), term=term)
+            late = jax.lax.cond(
+                jnp.any(arrived),
+                lambda: lateness(time, y, before, jnp.argmax(arrived), term),
+                lambda: jnp.zeros_like(t),
+            )
+            there = moved(late, time, y, before, term)
         happens = Event(switching.until, t, fired, late)
         there, modes = term.resolve(happens, there, before._replace(sides=sides))
         if self.derivatives:
-            after = Instant(t + late, there, args._replace(sides=sides, modes=modes))
-            there = moved_on(-late, after, term=term)
+            after = args._replace(sides=sides, modes=modes)
+            there = moved(-late, t + late, there, after, term)
         return there, modes
 
     def kept(self, held: Array, y1: Integrated, y0: Integrated) -> Integrated:
@@ -316,10 +311,6 @@ class Located(diffrax.AbstractAdaptiveSolver):
 
         return (*map(still, y1[:2], y0[:2]), *y1[2:])
 
-    def lateness(self, arrival: Arrival, term: Term) -> Array:
-        """Returns how much later the event is: 0, with derivatives."""
-        return lateness(arrival, term=term)
-
     def shifted(
         self, term: Term, t: Array, y: Integrated, args: Arguments,
         switching: Switching, made_jump: Truth,
@@ -331,17 +322,17 @@ class Located(diffrax.AbstractAdaptiveSolver):
         in_turn = [before, after]
         # Kinks change second derivatives alone.
         if any(self.jumping) and before.size > 1:
-            in_turn.insert(1, jnp.where(first_of(after != before), after, before))
+            first = (before != after) & (jnp.cumsum(before != after) == 1)
+            in_turn.insert(1, jnp.where(first, after, before))
         # A known time may be here too, just before the zeros or just after them.
         t = jnp.where(switching.ahead > 0, t, switching.until)
         # In a step of no length no function comes to its zero gradually: it jumped, at
         # a known time.
         arrived = made_jump & (switching.length > 0)
+        gain_of = gained if any(self.jumping) else gained_at_kink
         for before, after in zip(in_turn, in_turn[1:]):
-            switched = (before != after) & arrived
-            arrival = Arrival(t, y, args._replace(sides=before), switched)
-            moment = Moment(arrival, after, jnp.array(made_jump))
-            gain = gained(moment, term=term, jumping=any(self.jumping))
+            own, then = (args._replace(sides=sides) for sides in (before, after))
+            gain = gain_of(t, y, own, then, (before != after) & arrived, term=term)
             y = jax.tree.map(jnp.add, y, gain)
         return y
 

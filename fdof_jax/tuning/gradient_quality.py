@@ -18,9 +18,9 @@ from ..base.report import Report
 from ..linkage.linkage import joint_names
 from ..references.reference import reference_of
 from ..search import check_motion
+from ..simulation.jacobian import Sensitivities, jacobian_of
 from ..simulation.prescribed import PrescribedMotion
 from ..simulation.scene import Scene, is_number
-from ..simulation.sensitivities import Sensitivities, sensitivities
 from ..simulation.simulate import simulate
 from ..simulation.solution import Solution, remarks_on_derivatives
 from .losses import (
@@ -161,7 +161,7 @@ def _errors(scene: Scene) -> Loss:
 def _tangents(scene: Scene, z: Any) -> tuple[Sensitivities, Array]:
     """Residuals with their derivatives in `z`, and relative demands."""
     ts = jnp.linspace(0, scene.t1, SAMPLES)
-    found = sensitivities(lambda z: _scene_at(scene, z), _errors(scene), z, ts)
+    found = jacobian_of(lambda z: _scene_at(scene, z), _errors(scene), z, ts)
     controller = controller_of(scene)
     return found, relative_demands(controller, scene.linkage, found.solution)
 

@@ -19,9 +19,9 @@ from ..linkage.fields import Part, Values, field
 from ..linkage.linkage import without_fixed
 from ..references.reference import reference_motion, reference_of
 from ..search import Evaluation, check_scene, sum_of_squares
+from ..simulation.jacobian import Sensitivities, jacobian_of
 from ..simulation.sampled import check_joints
 from ..simulation.scene import Scene
-from ..simulation.sensitivities import Sensitivities, sensitivities
 from ..simulation.solution import Solution
 
 SAMPLES = 1001
@@ -218,11 +218,11 @@ def with_factors(scene: Scene, z: Array) -> Scene:
     return with_gains(scene, gains * jnp.exp(z).reshape(gains.shape))
 
 
-def gain_sensitivities(z: Array, scene: Scene, loss: Loss) -> Sensitivities:
+def gain_jacobian(z: Array, scene: Scene, loss: Loss) -> Sensitivities:
     """Residuals of a loss and their derivatives in the logarithms of factors `z`."""
     scene_at = lambda z: with_factors(scene, z)
     residuals = lambda scene, solution: residuals_of(loss, scene, solution)
-    return sensitivities(scene_at, residuals, z, jnp.linspace(0, scene.t1, SAMPLES))
+    return jacobian_of(scene_at, residuals, z, jnp.linspace(0, scene.t1, SAMPLES))
 
 
 def residuals_of(loss: Loss, scene: Scene, solution: Solution) -> Array:
@@ -245,8 +245,8 @@ def unusable_loss() -> ValueError:
 
 
 def evaluate_gains(z: Array, problem: tuple[Scene, Loss]) -> Evaluation:
-    """Evaluates a scene's loss and its derivatives: see `gain_sensitivities`."""
-    found = gain_sensitivities(z, *problem)
+    """Evaluates a scene's loss and its derivatives: see `gain_jacobian`."""
+    found = gain_jacobian(z, *problem)
     scene, solution = found.scene, found.solution
     demands, efforts = _demands_and_efforts(scene, solution)
     square_error = jnp.full((), jnp.nan)

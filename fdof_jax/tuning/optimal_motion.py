@@ -26,8 +26,8 @@ from ..search import (
     sum_of_squares,
 )
 from ..simulation.efforts import joint_efforts
+from ..simulation.jacobian import jacobian_of
 from ..simulation.scene import Scene
-from ..simulation.sensitivities import sensitivities
 from ..simulation.simulate import simulate
 from ..simulation.solution import Solution
 from .losses import check_tuned, controller_of, tracked_task, with_controller
@@ -129,7 +129,7 @@ def _lane(z: Array, problem: tuple[Scene, Array, Array, Array]) -> Evaluation:
         changes = jnp.sqrt(price / gaps) * jnp.diff(efforts, axis=0)
         return jnp.concatenate([errors, changes.reshape(-1)])
 
-    found = sensitivities(scene_at, residuals, z, ts, _TOLERANCE)
+    found = jacobian_of(scene_at, residuals, z, ts, _TOLERANCE)
     errors = found.residuals[: 2 * ts.size]
     return sum_of_squares(found, tip_error=jnp.linalg.norm(errors))
 

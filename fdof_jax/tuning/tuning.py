@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike
 from ..base.checks import keywords_as, one_of, real_array, refusal, whole_number
 from ..linkage.linkage import joint_names
 from ..search import METHODS, Lanes, Row, Run, best_of, check_motion, minimise
+from ..simulation.jacobian import TOLERANCE
 from ..simulation.scene import Scene, stacked, unstacked, with_full_size
-from ..simulation.sensitivities import TOLERANCE
 from .losses import (
     SAMPLES,
     Loss,

@@ -32,7 +32,7 @@ from .losses import (
     bounds_of,
     check_tuned,
     controller_of,
-    gain_sensitivities,
+    gain_jacobian,
     gains_of,
     residuals_of,
     tip_errors,
@@ -204,7 +204,7 @@ def _lane(z: Array, problem: tuple[Scene, Loss, Limits, bool]) -> Evaluation:
         beyond = excess(limits, scene, solution, with_margins)
         return jnp.concatenate([beyond, residuals_of(loss, scene, solution)])
 
-    found = gain_sensitivities(z, scene, residuals)
+    found = gain_jacobian(z, scene, residuals)
     count = joints_of(scene.linkage) * (3 * _SPANS + with_margins * _BANDS)
     beyond, errors = jnp.split(found.residuals, [count])
     slopes, jacobian = jnp.split(found.jacobian, [count])
