@@ -66,8 +66,8 @@ def test_pickles_and_import_errors():
 ROOMS = {
     "base": 0, "linkage": 1, "paper": 2, "mechanics": 2, "forces": 3, "dynamics": 4,
     "references": 4, "control": 5, "steps": 6, "simulation": 7, "batches": 8,
-    "analysis": 8, "search": 9, "tuning": 10, "identification": 10, "pictures": 11,
-    "data": 11, "scenes": 12, "__main__": 14, "__init__": 13,
+    "analysis": 8, "search": 9, "tuning": 10, "identification": 10, "scenes": 11,
+    "pictures": 12, "data": 12, "__main__": 14, "__init__": 13,
 }  # fmt: skip
 
 

@@ -12,7 +12,7 @@ from fdof_jax import scenes, tuning
 from fdof_jax.tuning.losses import tip_errors
 
 FIG7, TWO, FIG5 = scenes.fig7(), scenes.two_link_circle(), scenes.fig5()
-RRR = tuning.circle_scenes()["RRR"]
+RRR = scenes.circle_scenes()["RRR"]
 ONES, PRICED = np.ones((2, 3)), tuning.Tracking(effort=1.0)
 LAG = fj.control.FirstOrderLag(fj.JointEffort([0.0]), 0.1)
 STILL = fj.PDController(1, 1, 1, lambda t, arm: (jnp.zeros(3), jnp.zeros(3)))
@@ -54,6 +54,7 @@ CASES = {
         (FIG7, dict(loss=3), "loss"),
         (FIG7, dict(loss=tuning.Tracking), "loss: expected a callable"),
         (FREE, dict(loss=PRICED), "loss: expected finite limits"),
+        (FIG7, dict(loss=PRICED, ensemble=MIXED), "loss: expected finite limits"),
         (NO_FORCE, dict(loss=PRICED), "loss: expected finite limits"),
         (FIG7, dict(bounds=(1, 2, 3)), "bounds"),
         (FIG7, dict(bounds=(ONES, np.ones((2, 2)))), "bounds"),
@@ -68,15 +69,11 @@ CASES = {
         (FIG7._replace(linkage=None), {}, "linkage"),
         (FIG7._replace(forces=FIG7.forces[0]), {}, r"scene\.forces"),
     ],
-    tuning.trade_off: [
-        (FIG7, dict(prices=[]), "prices"),
-        (FIG7, dict(prices=[0.0, 0.1], ensemble=MIXED), "loss: expected finite limits"),
-    ],
-    tuning.tune_each: [
+    tuning.stacked: [
         (RRR, {}, "scenes: expected a list"),
+        ([FIG7, FIG5], {}, r"scenes\[1\]: expected one like"),
         ([RRR, DAMPED], {}, r"scenes\[1\]: expected one like scenes\[0\]"),
     ],
-    tuning.stacked: [([FIG7, FIG5], {}, r"scenes\[1\]: expected one like")],
     tuning.perturbed: [
         (HELD, dict(members=2, start_offset=100.0), "start_offset: expected one with"),
         (HELD, dict(members=2, speed=(1, 2)), "speed: .* without a `period`"),
@@ -130,12 +127,3 @@ def test_tuning_is_not_for_transformations():
 def test_a_loss_that_is_no_number_is_refused(value):
     with pytest.raises(ValueError, match=r"loss\(scene, solution\): expected a"):
         fj.tune(FIG7, loss=lambda scene, solution: value)
-
-
-def test_keywords_of_tune_are_those_of_its_relatives():
-    with pytest.raises(TypeError, match="step: expected a keyword among factor, "):
-        tuning.tune_each([FIG7], step=3)
-    with pytest.raises(TypeError, match="ensemble: expected a keyword"):
-        tuning.tune_each([FIG7], ensemble=FIG7)
-    with pytest.raises(TypeError, match="loss: expected a keyword"):
-        tuning.trade_off(FIG7, [0.0], loss=tip_errors)
