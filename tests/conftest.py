@@ -50,7 +50,6 @@ LONG_EXAMPLES = {
     "fdof_jax.simulation.phases.concatenate",
     "fdof_jax.simulation.sampled.simulate_sampled",
     "fdof_jax.tuning.losses.joint_errors",
-    "fdof_jax.tuning.optimal_motion.optimal_efforts",
     "fdof_jax.tuning.within_limits.tune_within",
 }
 # A program of so many bytes takes half a second to compile; the quick tests may have so

@@ -95,7 +95,6 @@ RETURNED_BY = {
     "Margins": "margins",
     "Modes": "closed_loop_modes",
     "NextMotion": "next_motion",
-    "OptimalMotion": "optimal_efforts",
     "SampledMotion": "simulate_sampled",
     "Response": "response",
     "Solution": "simulate",

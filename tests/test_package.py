@@ -156,6 +156,6 @@ def test_versions_agree_wherever_they_are_written():
 
 def test_messages_show_values_through_one_function():
     """It keeps them short and free of control codes."""
-    allowed = {"__init__.py", "linkage.py", "optimal_motion.py"}
+    allowed = {"__init__.py", "linkage.py"}
     showing = {path.name for path in FOLDER.rglob("*.py") if "!r}" in path.read_text()}
     assert showing == allowed

@@ -11,7 +11,7 @@ import fdof_jax as fj
 from fdof_jax import scenes, tuning
 from fdof_jax.tuning.losses import tip_errors
 
-FIG7, TWO, FIG5 = scenes.fig7(), scenes.two_link_circle(), scenes.fig5()
+FIG7, FIG5 = scenes.fig7(), scenes.fig5()
 RRR = scenes.circle_scenes()["RRR"]
 ONES, PRICED = np.ones((2, 3)), tuning.Tracking(effort=1.0)
 LAG = fj.control.FirstOrderLag(fj.JointEffort([0.0]), 0.1)
@@ -80,19 +80,6 @@ CASES = {
         (FIG7, dict(members=2, speed=(2.0, 0.0)), "speed"),
         (FIG7, dict(members=2, payload=(2.0, 0.0)), "payload: expected the least bef"),
         (FIG7, dict(members=2, link_error=1.5), "link_error: expected less than 1"),
-    ],
-    tuning.optimal_efforts: [
-        (5, {}, "scene: expected a Scene"),
-        (FIG5, {}, "scene: expected exactly one PDController"),
-        (with_limit(TWO, np.inf), {}, "scene: expected finite limits"),
-        (HELD, {}, "scene: expected its controller to track a task with a `tip`"),
-        (TWO, dict(horizon=0), "horizon: expected"),
-        (TWO, dict(horizon=5), "horizon: expected at most"),
-        (TWO, dict(knots=1), "knots: expected"),
-        (TWO, dict(knots=20.0), "knots: expected"),
-        (TWO, dict(effort_rate=-1), "effort_rate: expected"),
-        (TWO, dict(max_steps=0), "max_steps: expected"),
-        (TWO, dict(report=3), "report: expected"),
     ],
     tuning.tune_within: [(step(), dict(limits=0.1), "limits: expected a Limits")],
     within: [
