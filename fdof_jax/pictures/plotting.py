@@ -5,7 +5,6 @@ the cost of accuracy. Arguments and results are as in `drawing`, which holds the
 pictures of the linkage itself.
 """
 
-from collections.abc import Mapping
 from inspect import isfunction
 from itertools import cycle
 
@@ -13,10 +12,9 @@ import jax
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import ArrayLike
 
 from ..analysis.responses import StepAndSine
-from ..base.checks import instance, real_array, refusal, shown
+from ..base.checks import instance
 from ..control.drives import controller_in
 from ..dynamics import link_energies
 from ..forces.element import Forces, ForeignElement, elements, elements_on
@@ -34,7 +32,6 @@ from .axes import (
     SERIES,
     axes_or_new,
     figure_or_new,
-    filled_mapping,
     legend,
     mark_end,
     reached,
@@ -46,7 +43,7 @@ from .tip_errors import tracking, tracking_by_error, tracking_error
 __all__ = [
     "effort_profile", "energy_profile", "energy_stack",
     "motion_profile", "response_profile", "tracking", "tracking_by_error",
-    "tracking_error", "work_precision",
+    "tracking_error",
 ]  # fmt: skip
 
 
@@ -317,36 +314,3 @@ def response_profile(test: StepAndSine, fig: Figure | None = None) -> Figure:
     below.grid(which="both", lw=0.3)
     legend(above, below)
     return fig
-
-
-def work_precision(
-    measured: Mapping[str, tuple[ArrayLike, ArrayLike]], ax: Axes | None = None
-) -> Axes:
-    """Plots times over errors, both on logarithmic axes: the cost of accuracy.
-
-    The unit of the errors is yours; the axis is labelled "error".
-
-    **Arguments:** `measured`: label -> (errors, times [s]), equally many, all above 0,
-    in any order.
-    """
-    curves = {}
-    for label, pair in filled_mapping("measured", measured, "(errors, times)").items():
-        name = f"measured[{shown(label)}]"
-        if not isinstance(pair, tuple) or len(pair) != 2:
-            raise refusal(name, "(errors, times)", pair)
-        rows = (real_array(name, row, (None,), above=0) for row in pair)
-        errors, times = map(np.asarray, rows)
-        if len(errors) != len(times):
-            got = f"{len(errors)} errors and {len(times)} times"
-            raise ValueError(f"{name}: expected as many errors as times, got {got}.")
-        order = np.argsort(errors)
-        curves[label] = errors[order], times[order]
-    ax = axes_or_new(ax, 2.8)
-    for (label, curve), color, marker in zip(
-        curves.items(), cycle(SERIES), cycle("osD^v<")
-    ):
-        ax.loglog(*curve, lw=1.2, ms=4, label=label, color=color, marker=marker)
-    ax.set(xlabel="error", ylabel="time [s]")
-    ax.grid(which="major", lw=0.4, color=LIGHT_GREY)
-    legend(ax)
-    return ax
