@@ -47,7 +47,6 @@ LONG_EXAMPLES = {
     "fdof_jax.forces.holders.HardStops",
     "fdof_jax.forces.holders.JointFriction",
     "fdof_jax.identification.fitting.fit_each",
-    "fdof_jax.simulation.phases.concatenate",
     "fdof_jax.simulation.sampled.simulate_sampled",
     "fdof_jax.tuning.losses.joint_errors",
     "fdof_jax.tuning.within_limits.tune_within",

@@ -2,12 +2,11 @@
 
 from ..steps.controllers import scale_tolerances
 from .efforts import Efforts
-from .phases import concatenate
 from .prescribed import PrescribedMotion
 from .sampled import SampledMotion
 
 __all__ = [
-    "concatenate", "Efforts", "PrescribedMotion", "SampledMotion", "scale_tolerances",
+    "Efforts", "PrescribedMotion", "SampledMotion", "scale_tolerances",
 ]  # fmt: skip
 
 
