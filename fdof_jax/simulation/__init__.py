@@ -1,12 +1,11 @@
 """Motion in time: the equations that are integrated, and what is read from them."""
 
-from ..steps.controllers import scale_tolerances
 from .efforts import Efforts
 from .prescribed import PrescribedMotion
 from .sampled import SampledMotion
 
 __all__ = [
-    "Efforts", "PrescribedMotion", "SampledMotion", "scale_tolerances",
+    "Efforts", "PrescribedMotion", "SampledMotion",
 ]  # fmt: skip
 
 
