@@ -95,7 +95,6 @@ RETURNED_BY = {
     "Margins": "margins",
     "Modes": "closed_loop_modes",
     "NextMotion": "next_motion",
-    "SampledMotion": "simulate_sampled",
     "Response": "response",
     "Solution": "simulate",
     "StepAndSine": "step_and_sine",

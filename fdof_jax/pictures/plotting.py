@@ -22,7 +22,6 @@ from ..linkage.linkage import Linkage, joint_names, moving_joints
 from ..linkage.topology import letters
 from ..references.reference import reference_motion, reference_of
 from ..simulation.efforts import joint_efforts
-from ..simulation.sampled import Motion, SampledMotion
 from ..simulation.solution import Solution
 from .arms import geometry, link_color
 from .axes import (
@@ -58,7 +57,7 @@ def __dir__() -> list[str]:
 
 def motion_profile(
     linkage: Linkage,
-    solution: Motion,
+    solution: Solution,
     fig: Figure | None = None,
     *,
     forces: Forces = (),
@@ -83,7 +82,7 @@ def motion_profile(
     kinds, names = letters(linkage.ef), joint_names(linkage)
     wanted = _references(linkage, forces, ts)
     held = np.zeros(q.shape, bool)
-    if isinstance(solution, Solution) and solution.modes is not None:
+    if solution.modes is not None:
         held = np.asarray(solution.modes)[: len(ts)] > 0
 
     def shown(q: np.ndarray, k: int) -> np.ndarray:
@@ -139,7 +138,7 @@ def _references(
 
 
 def energy_profile(
-    linkage: Linkage, solution: Motion, fig: Figure | None = None
+    linkage: Linkage, solution: Solution, fig: Figure | None = None
 ) -> Figure:
     """Plots kinetic and potential energy of each link and of all over time [J]."""
     ts, q, qd = reached(linkage, solution)
@@ -161,7 +160,7 @@ def energy_profile(
 
 
 def energy_stack(
-    linkage: Linkage, forces: Forces, solution: Motion, ax: Axes | None = None
+    linkage: Linkage, forces: Forces, solution: Solution, ax: Axes | None = None
 ) -> Axes:
     """Plots the energy balance over time, stacked [J].
 
@@ -198,7 +197,7 @@ def energy_stack(
 
 
 def effort_profile(
-    linkage: Linkage, forces: Forces, solution: Motion, fig: Figure | None = None
+    linkage: Linkage, forces: Forces, solution: Solution, fig: Figure | None = None
 ) -> Figure:
     """Plots the efforts of each element over time, a panel per joint [N or N m].
 
@@ -215,7 +214,7 @@ def effort_profile(
     ts, total, parts = (np.asarray(a) for a in (solution.ts, *efforts))
     moving, joints = moving_joints(linkage), joint_names(linkage)
     controllers = [controller_in(element) for element in forces]
-    parts, held = [*parts], isinstance(solution, SampledMotion)
+    parts, held = [*parts], solution.acting is not None
     named = [(name, part) for name, part in zip(_names(forces), parts) if part.any()]
     named = named or [("none", total)]
     busy = _busy(ts, np.stack([part for _, part in named]))

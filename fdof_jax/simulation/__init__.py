@@ -2,10 +2,9 @@
 
 from .efforts import Efforts
 from .prescribed import PrescribedMotion
-from .sampled import SampledMotion
 
 __all__ = [
-    "Efforts", "PrescribedMotion", "SampledMotion",
+    "Efforts", "PrescribedMotion",
 ]  # fmt: skip
 
 
