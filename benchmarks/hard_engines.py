@@ -47,8 +47,6 @@ def fdof_jax(scene: HardScene) -> Callable[[], Run]:
             controller = fj.PDController(stiffness, damping, np.inf, held)
             forces = (controller, fj.JointEffort(effort))
     steps: Any = diffrax.PIDController(rtol=scene.tolerance, atol=scene.tolerance)
-    if scene.scaled:
-        steps = fj.simulation.scale_tolerances(scene.linkage, steps)
     if scene.derivative:
         steps = None  # the default, which bounds the error of derivatives too
     keywords: dict[str, Any] = dict(

@@ -32,7 +32,6 @@ class HardScene(NamedTuple):
     - `stiff`: whether an implicit solver is recommended.
     - `first_step`: the first step of adaptive solvers [s]; None: they estimate it.
     - `most_steps`: the most steps that an adaptive solver may take.
-    - `scaled`: whether tolerances are in sizes of the arm.
     - `may_refuse`: whether the report "ill-conditioned" is as good as a solution.
     - `derivative`: whether the derivative of q at the end in q at the start, (3, 3), is
       judged instead of the motion.
@@ -50,7 +49,6 @@ class HardScene(NamedTuple):
     stiff: bool = False
     first_step: float | None = 1e-3
     most_steps: float = np.inf
-    scaled: bool = False
     may_refuse: bool = False
     derivative: bool = False
 
@@ -124,7 +122,7 @@ def _scaled(name: str, size: float, mass: float, usual: np.ndarray) -> HardScene
     ts = np.linspace(0, 5, 11) * np.sqrt(size)
     return HardScene(
         21, name, linkage, hard.START, ts, _error(usual), 1e-7, tolerance=1e-11,
-        first_step=1e-3 * np.sqrt(size), scaled=True,
+        first_step=1e-3 * np.sqrt(size),
     )  # fmt: skip
 
 

@@ -17,7 +17,6 @@ from .pictures import drawing, plotting
 from .simulation.scene import Scene
 from .simulation.simulate import simulate
 from .simulation.solution import Solution
-from .tuning.ensembles import circle_scenes
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -79,7 +78,7 @@ def _figures() -> Iterator[tuple[str, Any]]:
 def _topologies() -> Iterator[tuple[str, Any]]:
     """Draws the fall of one arm in all seven topologies, simulated by one program."""
     motions = {}
-    for topology, scene in circle_scenes().items():
+    for topology, scene in scenes.circle_scenes().items():
         # Slides, damped more, do not fall out of sight.
         damper = JointDamper([{"R": 1.0, "P": 30.0}[joint] for joint in topology])
         motion = _motion(scene._replace(forces=(damper,), t1=2.0))

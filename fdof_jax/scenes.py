@@ -1,4 +1,4 @@
-"""Examples as data: the paper's three, each value from its figure, and chains."""
+"""Examples as data: the paper's three, each value from its figure, and others."""
 
 import numpy as np
 
@@ -6,12 +6,21 @@ from .control.pd import PDController
 from .forces.joints import JointDamper
 from .linkage.coordinates import State
 from .linkage.linkage import Linkage
+from .linkage.topology import TOPOLOGIES
 from .mechanics.inverse_kinematics import inverse_kinematics
 from .paper import from_chain
 from .references.paths import Ellipse
 from .references.task import CircleTask, TipTask
 from .references.timing import Laps
 from .simulation.scene import Scene as Scene
+
+# Of `circle_scenes`, the common start in chain coordinates B1, th2, B2, th3, B3, th4.
+# From here every topology follows the circle away from its singularities.
+_START = np.array([0.0, 1.0, -0.1, -1.0, 0.7, 0.8])
+_BASE = np.pi / 2  # a slide on the ground is level
+# The assembly (of two) that each arm starts in.
+_BRANCH = dict(zip(TOPOLOGIES, (-1, 1, -1, -1, 1, 1, 1)))
+_KP, _KD = {"R": 500.0, "P": 2000.0}, {"R": 50.0, "P": 200.0}
 
 
 def fig3() -> Scene:
@@ -169,3 +178,44 @@ def five_links() -> Scene:
         inertia=[0.25 / 12] * 5,
     )
     return Scene(linkage, State([-0.5, 0.3, 0.2, -0.4, 0.6], np.zeros(5)), (), 10.0)
+
+
+def circle_scenes() -> dict[str, Scene]:
+    """The same circle for an arm of each topology, under PD control and gravity.
+
+    All arms have links of 1 m, 0.8 m and 0.5 m with masses of 2 kg, 1.5 kg and 1 kg.
+    They start at rest in the same configuration, with their tip 5 cm inside the circle
+    of 0.25 m radius, and keep the angle of their last link. Only the choice of the real
+    joint of each pair differs. All joints of a kind have the same gains and limits
+    (150 N m or N).
+
+    >>> import fdof_jax as fj
+    >>> scenes = fj.scenes.circle_scenes()
+    >>> starts = [fj.tip_position(s.linkage, s.state0.q) for s in scenes.values()]
+    >>> starts[0].tolist(), starts[-1].tolist()  # the same for all
+    ([1.994, 1.151], [1.994, 1.151])
+    """
+    scenes = {}
+    for topology in TOPOLOGIES:
+        locked, state0 = from_chain(topology, _START, np.zeros(6), base_angle=_BASE)
+        linkage = Linkage(
+            topology,
+            length=[0.3, 1.0, 0.8, 0.5],
+            com=[[0.5, 0], [0.4, 0], [0.25, 0]],
+            mass=[2, 1.5, 1],
+            inertia=[0.2, 0.1, 0.05],
+            locked=locked,
+            base_angle=_BASE,
+        )
+        task = CircleTask(
+            center=[1.99, 0.95],
+            radius=0.25,
+            period=4.0,
+            phase=np.pi / 2,
+            orientation=_START[5],
+            branch=_BRANCH[topology],
+        )
+        kp, kd = ([of[kind] for kind in topology] for of in (_KP, _KD))
+        controller = PDController(kp, kd, 150.0, task)
+        scenes[topology] = Scene(linkage, state0, (controller,), 4.0)
+    return scenes

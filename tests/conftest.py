@@ -47,12 +47,8 @@ LONG_EXAMPLES = {
     "fdof_jax.forces.holders.HardStops",
     "fdof_jax.forces.holders.JointFriction",
     "fdof_jax.identification.fitting.fit_each",
-    "fdof_jax.simulation.phases.concatenate",
     "fdof_jax.simulation.sampled.simulate_sampled",
     "fdof_jax.tuning.losses.joint_errors",
-    "fdof_jax.tuning.result.league_table",
-    "fdof_jax.tuning.optimal_motion.optimal_efforts",
-    "fdof_jax.tuning.tuning.tune_each",
     "fdof_jax.tuning.within_limits.tune_within",
 }
 # A program of so many bytes takes half a second to compile; the quick tests may have so

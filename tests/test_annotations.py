@@ -64,7 +64,6 @@ def calls(linkage):
         fj.identification.link_ends: (scene, motion),
         fj.references.reachable: (linkage, TASK, jnp.zeros(5)),
         fj.references.reach_margin: (linkage, TASK, jnp.zeros(5)),
-        fj.references.shock_against: (fj.references.Travel(1.0), 2.0),
         fj.tuning.joint_errors: (scene, motion),
         fj.tuning.tip_errors: (scene, motion),
     }

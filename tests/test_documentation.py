@@ -22,8 +22,7 @@ PUBLIC = {
 # Names whose arguments or results carry no unit.
 UNITLESS = {
     "existence_factors", "to_mjcf", "fig3", "fig5", "fig7", "load", "save", "stacked",
-    "tune_each", "gradient_report", "league_table", "circle_scenes", "configure",
-    "Condition", "Values", "field",
+    "gradient_report", "circle_scenes", "configure", "Condition", "Values", "field",
 }  # fmt: skip
 # Names that implement something printed in the paper.
 SOURCES = {
@@ -96,12 +95,9 @@ RETURNED_BY = {
     "Margins": "margins",
     "Modes": "closed_loop_modes",
     "NextMotion": "next_motion",
-    "OptimalMotion": "optimal_efforts",
-    "SampledMotion": "simulate_sampled",
     "Response": "response",
     "Solution": "simulate",
     "StepAndSine": "step_and_sine",
-    "TradeOff": "trade_off",
     "TuneResult": "tune",
     "TunedWithin": "tune_within",
 }
@@ -145,7 +141,7 @@ def test_names_in_guides_become_links():
     guide = SimpleNamespace(file=SimpleNamespace(src_uri="gains.md"))
     for code, name in [
         ("tune", "tune"),
-        ("fj.tuning.tune_each(scenes)", "tuning.tune_each"),
+        ("fj.tuning.perturbed(scene, 3)", "tuning.perturbed"),
         ("mass_matrix", "mass_matrix"),
         ("paper.mass_matrix", "paper.mass_matrix"),
         ("fj.tuning.tune", "tune"),

@@ -275,8 +275,7 @@ FIT = fj.FitResult(
 
 
 def test_results(path, tuned):
-    trade = fj.tuning.TradeOff(*np.ones((3, 1)), [tuned])
-    for result in (tuned, FIT, trade, {"PPR": tuned, "fit": FIT}):
+    for result in (tuned, FIT, {"PPR": tuned, "fit": FIT}):
         fj.save(path, result)
         loaded = fj.load(path)
         assert type(loaded) is type(result)

@@ -168,7 +168,7 @@ def test_what_cannot_be_loaded(path):
     refused(path, r"tree\[1\]\.radius: expected .* at least 0")
 
 
-OTHERS = """os.system os:system subprocess.Popen eval object Solution SampledMotion Args
+OTHERS = """os.system os:system subprocess.Popen eval object Solution Args
 Frozen Values Any Array fdof_jax drawing forces.JointDamper __class__ History.__class__
 LoopedDopri8 Unheard jointdamper""".split()
 

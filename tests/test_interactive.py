@@ -15,7 +15,7 @@ from fdof_jax.pictures.interactive import _moved, sliders
 from fdof_jax.simulation import formulation
 from fdof_jax.tuning.losses import with_gains
 
-CIRCLES = fj.tuning.circle_scenes()
+CIRCLES = fj.scenes.circle_scenes()
 CONTROLLER = CIRCLES["RRR"].forces[0]
 STIFF = with_gains(CIRCLES["RRR"], np.full((2, 3), 1e9))
 

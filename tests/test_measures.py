@@ -121,7 +121,7 @@ def test_sampled_control_is_measured_as_it_acted():
     drive = fj.control.FirstOrderLag(pd, 0.1)
     motion = fj.simulate_sampled(SLIDE, START, drive, period, 100)
     assert fj.analysis.response(SLIDE, (drive,), motion, since=0.375).overshoot > 0
-    with pytest.raises(ValueError, match="control, .forces. of a SampledMotion"):
+    with pytest.raises(ValueError, match="control, .forces. of a sampled motion"):
         fj.analysis.response(SLIDE, (), motion)
 
 

@@ -20,7 +20,7 @@ SLIDE, TASK, PUSH = make_linkage("RPR"), fj.CircleTask(), fj.JointDamper(1.0)
 FREE, CIRCLE = fj.scenes.fig5(), fj.scenes.fig7()
 UNTIED = fj.PDController(1, 1, 1, lambda t, linkage: None)
 OF_SCENE, OF_MOTION = r"scenes\['a'\]", r"motions\['a'\]"
-OF_SOLUTION, OF_MEASURED = r"solutions\['a'\]", r"measured\['a'\]"
+OF_SOLUTION = r"solutions\['a'\]"
 
 # The argument's name, the function, and what it is given
 REFUSED = [
@@ -71,10 +71,6 @@ REFUSED = [
     ("solutions", plotting.tracking_error, LINKAGE, TASK, SOLUTION),
     ("task", plotting.tracking_by_error, LINKAGE, None, SOLUTION),
     ("solution", plotting.tracking_by_error, LINKAGE, TASK, BATCH),
-    ("measured", plotting.work_precision, {}),
-    (OF_MEASURED, plotting.work_precision, {"a": [1, 2]}),
-    (OF_MEASURED, plotting.work_precision, {"a": ([1, 2], [1])}),
-    (OF_MEASURED, plotting.work_precision, {"a": ([0], [1])}),
     ("scenes", interactive.sliders, {}),
     ("scenes", interactive.sliders, CIRCLE),
     (OF_SCENE, interactive.sliders, {"a": 3}),

@@ -221,19 +221,6 @@ def test_tracking_in_the_picture_of_an_arm_has_colours_of_its_own():
     assert path.get_color() == same.get_color()
 
 
-def test_work_precision_is_logarithmic_and_sorted():
-    measured = {"a": ([1e-3, 1e-9, 1e-6], [1.0, 3.0, 2.0]), "b": ([1e-4], [0.5])}
-    ax = plotting.work_precision(measured)
-    assert (ax.get_xscale(), ax.get_yscale()) == ("log", "log")
-    assert (ax.get_xlabel(), ax.get_ylabel()) == ("error", "time [s]")
-    first, second = ax.lines
-    assert first.get_xydata().tolist() == [[1e-9, 3.0], [1e-6, 2.0], [1e-3, 1.0]]
-    assert second.get_xydata().tolist() == [[1e-4, 0.5]]
-    assert first.get_marker() != second.get_marker()
-    assert first.get_color() != second.get_color()
-    assert labels(ax) == ["a", "b"]
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("topology", ["R", "RP", "RFPRR"])
 def test_chains_of_any_length_show_all_joints_that_move(topology):

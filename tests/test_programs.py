@@ -222,7 +222,7 @@ arm, start, forces, _ = fj.scenes.fig7()
 (pd,) = forces
 more = eqx.tree_at(lambda pd: (pd.kp, pd.kd), pd, (pd.kp * 2, pd.kd * 2))
 heavy = eqx.tree_at(lambda arm: arm.mass, arm, arm.mass * 2)
-scenes = fj.tuning.circle_scenes().values()
+scenes = fj.scenes.circle_scenes().values()
 def steps(tolerance):
     control = diffrax.PIDController(rtol=tolerance, atol=tolerance)
     return dict(stepsize_controller=control)

@@ -22,8 +22,7 @@ ROOMS = (
 )  # fmt: skip
 # JAX raises the last one for integers that no array holds.
 MEANT = ValueError, TypeError, ImportError, RuntimeError, OverflowError
-# It changes the whole process; the search takes what is not refused for a long time.
-LEFT_OUT = {"configure", "optimal_efforts"}
+LEFT_OUT = {"configure"}  # it changes the whole process
 FIG7, TS, ROWS = fj.scenes.fig7(), np.linspace(0, 1, 5), np.zeros((5, 3))
 STATS = {"num_steps": np.array(3), "time_reached": np.array(1.0)}
 MOTION = fj.Solution(TS, ROWS, ROWS, STATS, diffrax.RESULTS.successful)

@@ -14,12 +14,14 @@ from fdof_jax import drawing, plotting
 TAU = np.array([[4.0], [-8.0], [2.0], [6.0]])  # of an inertia of 2 kg m^2
 
 
-def disc_motion() -> fj.simulation.SampledMotion:
+def disc_motion() -> fj.Solution:
     """Returns the exact motion of a disc from rest under the held efforts."""
     ts, qdd = np.linspace(0, 2, 5), TAU / 2
     qd = np.append([[0.0]], np.cumsum(qdd / 2, axis=0), axis=0)
     q = np.append([[0.0]], np.cumsum((qd[1:] + qd[:-1]) / 4, axis=0), axis=0)
-    return fj.simulation.SampledMotion(ts, q, qd, TAU, diffrax.RESULTS.successful, ())
+    acting = np.append(TAU, TAU[-1:], axis=0)
+    result = diffrax.RESULTS.successful
+    return fj.Solution(ts, q, qd, {}, result, tau=TAU, acting=acting)
 
 
 CONTROL = fj.PDController(0.0, 0.0, 8.0, lambda t, linkage: (t[None], t[None]))
@@ -75,5 +77,5 @@ def test_tables_take_it():
 
 
 def test_it_is_told_in_a_line():
-    expected = "SampledMotion(motions: 1; times: 5, 0 to 2 s; outcome: successful)"
+    expected = "Solution(motions: 1; times: 5, 0 to 2 s; outcome: successful)"
     assert repr(disc_motion()) == expected

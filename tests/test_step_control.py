@@ -1,10 +1,13 @@
-"""Conditions that stop a solve, times where steps end, and units of tolerances."""
+"""Conditions that stop a solve, times where steps end, and norms of errors."""
+
+from functools import partial
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix
 import pytest
 
 import fdof_jax as fj
@@ -83,29 +86,40 @@ def test_jumps_need_adaptive_steps():
         fj.simulate(ARM, START, TS, (bad,))
 
 
-def test_a_scale_of_ones_changes_nothing():
-    ones = fj.State([1, 1, 1], [1, 1, 1])
-    scaled = fj.simulation.scale_tolerances(ARM, scale=ones)
-    solutions = [
-        fj.simulate(ARM, START, TS, stepsize_controller=c) for c in (None, scaled)
-    ]
-    assert solutions[0].stats["num_steps"] == solutions[1].stats["num_steps"]
+def strict(error):
+    """Returns a norm a hundred times as large as diffrax's own."""
+    q, qd, *own = error
+    return 100 * optimistix.rms_norm((jnp.stack(q), jnp.stack(qd), own))
 
 
-@pytest.mark.parametrize(
-    "arguments, message",
-    [
-        ((ARM, diffrax.ConstantStepSize()), "controller: expected"),
-        (("RRR",), "linkage: expected"),
-        ((ARM, None, fj.State([1, 0, 1], [1, 1, 1])), "scale.q: expected"),
-        ((ARM, None, fj.State([1, 1, 1], [1, 1])), "scale.qd: expected"),
-        ((ARM, None, 3.0), "scale: expected"),
-    ],
-)
-def test_bad_scales_are_refused(arguments, message):
-    linkage, controller, scale = (*arguments, None, None)[:3]
-    with pytest.raises(ValueError, match=message):
-        fj.simulation.scale_tolerances(linkage, controller, scale=scale)
+PID = fj.control.PIDController(9.0, 5.0, 1.0, 4.0, fj.references.SetPoint(0.2))
+STOPS = fj.forces.HardStops(-1.7, 0.4, restitution=0.5)
+
+
+@pytest.mark.parametrize("forces", [(), (PID,), (STOPS,)])
+def test_a_norm_of_the_user_s_own_judges_errors(forces):
+    """Here it makes the tolerances a hundredth of what they are."""
+    tight = diffrax.PIDController(rtol=1e-9, atol=1e-9)
+    loose = diffrax.PIDController(rtol=1e-7, atol=1e-7)
+    own = diffrax.PIDController(rtol=1e-7, atol=1e-7, norm=strict)
+    counts = []
+    for steps in (tight, own, loose):
+        motion = fj.simulate(ROD, SWUNG, TS, forces, stepsize_controller=steps)
+        counts.append(int(motion.stats["num_steps"]))
+    assert counts[0] == counts[1] > counts[2]
+
+
+def test_derivatives_through_bounces_under_a_norm_of_one_s_own():
+    def end(speed, **options):
+        start = fj.State(SWUNG.q, speed)
+        return fj.simulate(ROD, start, TS, (STOPS,), **options).q[-1, 0]
+
+    own = diffrax.PIDController(rtol=1e-8, atol=1e-8, norm=strict)
+    judged = dict(stepsize_controller=own), dict(rtol=1e-12, atol=1e-12)
+    found, right = (jax.grad(partial(end, **one))(jnp.array([1.0])) for one in judged)
+    np.testing.assert_allclose(found, right, atol=1e-7)
+    forward = partial(end, adjoint=diffrax.ForwardMode(), **judged[0])
+    np.testing.assert_allclose(jax.jacfwd(forward)(jnp.array([1.0])), right, atol=1e-7)
 
 
 @pytest.mark.parametrize("kind", [diffrax.PIDController, Shortening])

@@ -60,13 +60,14 @@ def test_a_shock_is_a_jump_of_the_velocity_at_both_ends():
     np.testing.assert_allclose(travel.jump_ts, [1, 3])
 
 
-@pytest.mark.parametrize("profile", PROFILES)
 @pytest.mark.parametrize("frequency", [2.0, 7.0])
-def test_the_shock_takes_the_load_s_frequency_out(profile, frequency):
+def test_the_shock_takes_the_load_s_frequency_out(frequency):
     """A load on a spring follows x'' + w^2 x = -a; its integral is in closed form."""
-    plain = fj.references.Travel(1.5, profile=profile)
-    shock = float(fj.references.shock_against(plain, frequency))
-    shocked = fj.references.Travel(1.5, profile=profile, shock=shock)
+    plain = fj.references.Travel(1.5, profile="harmonic")
+    turn = frequency * 1.5
+    content = np.cos(turn / 2) / (1 - (turn / np.pi) ** 2)
+    shock = content / (content - np.sin(turn / 2) / (turn / 2))
+    shocked = plain.replace(shock=shock)
     times = (np.arange(200_000) + 0.5) * 1.5 / 200_000
     residual = [
         abs(np.mean(np.asarray(rates(times, t)) * np.exp(1j * frequency * times)))
@@ -80,18 +81,8 @@ def test_malformed_travels_are_refused():
         fj.references.Travel(0.0)
     with pytest.raises(ValueError, match="profile: expected one of"):
         fj.references.Travel(1.0, profile="linear")
-    with pytest.raises(ValueError, match="frequency: expected .* above 0"):
-        fj.references.shock_against(fj.references.Travel(1.0), -1.0)
-    with pytest.raises(ValueError, match="frequency: expected at most 250 rad"):
-        fj.references.shock_against(fj.references.Travel(1.0), 300.0)
-    traced = jax.jit(
-        lambda w: fj.references.shock_against(fj.references.Travel(1.0), w)
-    )
-    assert np.isnan(traced(300.0)) and np.isfinite(traced(200.0))
     with pytest.raises(ValueError, match="period: expected not zero"):
         fj.references.Laps(0.0)
-    with pytest.raises(ValueError, match="travel: expected a Travel"):
-        fj.references.shock_against(1.0, 1.0)
 
 
 @pytest.mark.parametrize("profile", PROFILES)

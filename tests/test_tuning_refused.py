@@ -11,8 +11,8 @@ import fdof_jax as fj
 from fdof_jax import scenes, tuning
 from fdof_jax.tuning.losses import tip_errors
 
-FIG7, TWO, FIG5 = scenes.fig7(), scenes.two_link_circle(), scenes.fig5()
-RRR = tuning.circle_scenes()["RRR"]
+FIG7, FIG5 = scenes.fig7(), scenes.fig5()
+RRR = scenes.circle_scenes()["RRR"]
 ONES, PRICED = np.ones((2, 3)), tuning.Tracking(effort=1.0)
 LAG = fj.control.FirstOrderLag(fj.JointEffort([0.0]), 0.1)
 STILL = fj.PDController(1, 1, 1, lambda t, arm: (jnp.zeros(3), jnp.zeros(3)))
@@ -54,6 +54,7 @@ CASES = {
         (FIG7, dict(loss=3), "loss"),
         (FIG7, dict(loss=tuning.Tracking), "loss: expected a callable"),
         (FREE, dict(loss=PRICED), "loss: expected finite limits"),
+        (FIG7, dict(loss=PRICED, ensemble=MIXED), "loss: expected finite limits"),
         (NO_FORCE, dict(loss=PRICED), "loss: expected finite limits"),
         (FIG7, dict(bounds=(1, 2, 3)), "bounds"),
         (FIG7, dict(bounds=(ONES, np.ones((2, 2)))), "bounds"),
@@ -68,34 +69,17 @@ CASES = {
         (FIG7._replace(linkage=None), {}, "linkage"),
         (FIG7._replace(forces=FIG7.forces[0]), {}, r"scene\.forces"),
     ],
-    tuning.trade_off: [
-        (FIG7, dict(prices=[]), "prices"),
-        (FIG7, dict(prices=[0.0, 0.1], ensemble=MIXED), "loss: expected finite limits"),
-    ],
-    tuning.tune_each: [
+    tuning.stacked: [
         (RRR, {}, "scenes: expected a list"),
+        ([FIG7, FIG5], {}, r"scenes\[1\]: expected one like"),
         ([RRR, DAMPED], {}, r"scenes\[1\]: expected one like scenes\[0\]"),
     ],
-    tuning.stacked: [([FIG7, FIG5], {}, r"scenes\[1\]: expected one like")],
     tuning.perturbed: [
         (HELD, dict(members=2, start_offset=100.0), "start_offset: expected one with"),
         (HELD, dict(members=2, speed=(1, 2)), "speed: .* without a `period`"),
         (FIG7, dict(members=2, speed=(2.0, 0.0)), "speed"),
         (FIG7, dict(members=2, payload=(2.0, 0.0)), "payload: expected the least bef"),
         (FIG7, dict(members=2, link_error=1.5), "link_error: expected less than 1"),
-    ],
-    tuning.optimal_efforts: [
-        (5, {}, "scene: expected a Scene"),
-        (FIG5, {}, "scene: expected exactly one PDController"),
-        (with_limit(TWO, np.inf), {}, "scene: expected finite limits"),
-        (HELD, {}, "scene: expected its controller to track a task with a `tip`"),
-        (TWO, dict(horizon=0), "horizon: expected"),
-        (TWO, dict(horizon=5), "horizon: expected at most"),
-        (TWO, dict(knots=1), "knots: expected"),
-        (TWO, dict(knots=20.0), "knots: expected"),
-        (TWO, dict(effort_rate=-1), "effort_rate: expected"),
-        (TWO, dict(max_steps=0), "max_steps: expected"),
-        (TWO, dict(report=3), "report: expected"),
     ],
     tuning.tune_within: [(step(), dict(limits=0.1), "limits: expected a Limits")],
     within: [
@@ -130,12 +114,3 @@ def test_tuning_is_not_for_transformations():
 def test_a_loss_that_is_no_number_is_refused(value):
     with pytest.raises(ValueError, match=r"loss\(scene, solution\): expected a"):
         fj.tune(FIG7, loss=lambda scene, solution: value)
-
-
-def test_keywords_of_tune_are_those_of_its_relatives():
-    with pytest.raises(TypeError, match="step: expected a keyword among factor, "):
-        tuning.tune_each([FIG7], step=3)
-    with pytest.raises(TypeError, match="ensemble: expected a keyword"):
-        tuning.tune_each([FIG7], ensemble=FIG7)
-    with pytest.raises(TypeError, match="loss: expected a keyword"):
-        tuning.trade_off(FIG7, [0.0], loss=tip_errors)

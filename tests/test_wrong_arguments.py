@@ -39,7 +39,6 @@ MASKED = np.ma.masked_less([-1, 0, 0], 0)
         ),
         # Errors of a tip need a task.
         ("scene", tuning.tip_errors, [(FIG7._replace(forces=(STANDING,)), MOTION)]),
-        ("results", tuning.league_table, [(r,) for r in (None, {}, [1], {"R": FIG7})]),
         (
             "reference",
             references.reachable,

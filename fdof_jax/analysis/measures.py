@@ -28,7 +28,7 @@ from ..mechanics.kinematics import tip_position
 from ..references.reference import reference_motion
 from ..references.task import TipReference
 from ..simulation.field import element_effort, with_states
-from ..simulation.sampled import Motion, acting_in, check_joints
+from ..simulation.sampled import acting_in, check_joints
 from ..simulation.simulate import check_own
 from ..simulation.solution import Solution
 
@@ -100,7 +100,7 @@ class Response(Report):
 
 
 def response(
-    linkage: Linkage, forces: Forces, solution: Motion, *, since: ArrayLike = -np.inf
+    linkage: Linkage, forces: Forces, solution: Solution, *, since: ArrayLike = -np.inf
 ) -> Response:
     """Measures how a motion followed the reference of its controller.
 
@@ -111,7 +111,7 @@ def response(
 
     - `linkage`, `solution`: the arm and one motion of it, with ten samples or more in
       the fastest swing.
-    - `forces`: those of the solution, of a `SampledMotion` `(control, *forces)`. One
+    - `forces`: those of the solution, of `simulate_sampled` `(control, *forces)`. One
       of them is, or is a drive that holds, a `PDController`, `PIDController`,
       `GravityFeedforward` or `ComputedTorque`.
     - `since`: the time from which on the motion counts, as that of a step [s]; by
@@ -186,7 +186,7 @@ def response(
 
 
 def _controller(
-    linkage: Linkage, forces: Forces, acting: Forces, solution: Motion
+    linkage: Linkage, forces: Forces, acting: Forces, solution: Solution
 ) -> tuple[PDController, Array]:
     """Returns the controller among elements, and its efforts along a motion.
 

@@ -14,8 +14,9 @@ from ..linkage.frames import cross, frames, plane_vectors
 from ..linkage.linkage import Linkage, check_linkage, compiled
 from ..mechanics.kinematics import joint_positions, mass_center_velocities, mass_centers
 from ..simulation.efforts import joint_efforts
-from ..simulation.sampled import Motion, acting_in
+from ..simulation.sampled import acting_in
 from ..simulation.scene import accepts_scene
+from ..simulation.solution import Solution
 
 
 def _loads(
@@ -41,7 +42,7 @@ def _loads(
 
 @accepts_scene
 def joint_reactions(
-    linkage: Linkage, forces: Forces, solution: Motion
+    linkage: Linkage, forces: Forces, solution: Solution
 ) -> Float[Array, "time joint 3"]:
     """Force and moment of each joint's bearing on the next link, along a motion.
 
@@ -49,8 +50,8 @@ def joint_reactions(
     joint's free direction, the reaction is the effort of dampers, controllers, drives,
     armatures and what holds the joint. Loads on points act on the links themselves.
 
-    **Arguments:** `linkage`, `forces` and `solution` of one `simulate`; of a
-    `SampledMotion`, the forces are `(control, *forces)`. A `Scene` may stand for
+    **Arguments:** `linkage`, `forces` and `solution` of one `simulate`; of
+    `simulate_sampled`, the forces are `(control, *forces)`. A `Scene` may stand for
     linkage and forces: `joint_reactions(scene, solution)`.
 
     **Returns:** force (x, y) [N] and moment [N m] on the moving link, at its

@@ -274,17 +274,15 @@ def one_of(name: str, value: object, options: Sequence[Any]) -> Any:
     raise refusal(name, f"one of {tuple(options)}", value)
 
 
-def keywords_as(
-    function: Callable, given: dict[str, Any], without: Sequence[str] = ()
-) -> dict[str, Any]:
+def keywords_as(function: Callable, given: dict[str, Any]) -> dict[str, Any]:
     """Returns a function's keyword-only arguments: those given, else the defaults.
 
-    Arguments named in `without` are left out. Raises TypeError for any other keyword.
+    Raises TypeError for any other keyword.
     """
     allowed = {
         name: parameter.default
         for name, parameter in inspect.signature(function).parameters.items()
-        if parameter.kind is parameter.KEYWORD_ONLY and name not in without
+        if parameter.kind is parameter.KEYWORD_ONLY
     }
     for name in given:
         if name not in allowed:

@@ -23,8 +23,8 @@ from ..base.version import __version__
 from ..base.whole_files import file_path, whole_file
 from ..linkage.linkage import Linkage
 from ..linkage.topology import letters
-from ..simulation.sampled import Motion
 from ..simulation.scene import is_number, members, stacked
+from ..simulation.solution import Solution
 
 Json = Any  # numbers, texts, and lists and dicts of such
 Classes = Sequence[type | eqx.Module]  # modules with numbers of the same shapes
@@ -149,7 +149,7 @@ def _public(name: str) -> type | None:
 
 def _is_record(kind: type) -> bool:
     fields = dataclasses.is_dataclass(kind) or hasattr(kind, "_asdict")
-    return fields and not issubclass(kind, Motion)
+    return fields and not issubclass(kind, Solution)
 
 
 def _is_number(node: Json) -> bool:
@@ -179,7 +179,7 @@ def _node(place: str, value: PyTree) -> Json:
         return {"dict": items}
     if kind is float or isinstance(value, jax.Array | np.ndarray | np.generic):
         return _numbers(place, value)
-    if isinstance(value, Motion):
+    if isinstance(value, Solution):
         expected = "no motion: to_xarray makes a Dataset of it, which to_netcdf saves"
         raise refusal(place, expected, value)
     if not _is_record(kind):

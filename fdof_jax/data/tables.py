@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from ..base.checks import check_known, instance, optional_package
 from ..linkage.linkage import Linkage
 from ..linkage.topology import common_unit, names_and_units, rate_unit
-from ..simulation.sampled import Motion, check_joints
+from ..simulation.sampled import check_joints
 from ..simulation.solution import MODES, Solution, attributes_in
 
 if TYPE_CHECKING:
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     import xarray
 
 
-def _checked(linkage: Linkage, solution: Motion) -> tuple[np.ndarray, list[str]]:
+def _checked(linkage: Linkage, solution: Solution) -> tuple[np.ndarray, list[str]]:
     """The common times of all motions, and names of the batch axes."""
     instance("linkage", linkage, Linkage)
     check_joints("solution", solution, linkage)
@@ -31,22 +31,22 @@ def _checked(linkage: Linkage, solution: Motion) -> tuple[np.ndarray, list[str]]
     return ts[0], batch
 
 
-def to_xarray(linkage: Linkage, solution: Motion) -> "xarray.Dataset":
+def to_xarray(linkage: Linkage, solution: Solution) -> "xarray.Dataset":
     """Converts a solution to an xarray Dataset, with names and units.
 
     The Dataset holds joint positions `q` and velocities `qd` over `time` and `joint`,
-    and the solution's `outcome`, `num_steps` and `time_reached` for each trajectory; a
-    `SampledMotion` has `outcome` alone. Where elements hold joints, it also holds the
-    `modes` of each joint, as numbers, and the energy `taken` (see `Solution`). The
-    joints are named R1, P2 and so on, with the coordinate `unit`; a joint of both kinds
-    within a batch is named by its number. Batch axes come first, as `batch` (or
-    `batch_1`, `batch_2` and so on). To name an axis and give it values, use
+    and the solution's `outcome`, `num_steps` and `time_reached` for each trajectory; of
+    `simulate_sampled` it holds the `outcome` alone. Where elements hold joints, it also
+    holds the `modes` of each joint, as numbers, and the energy `taken` (see
+    `Solution`). The joints are named R1, P2 and so on, with the coordinate `unit`; a
+    joint of both kinds within a batch is named by its number. Batch axes come first, as
+    `batch` (or `batch_1`, `batch_2` and so on). To name an axis and give it values, use
     `.rename(batch="payload").assign_coords(payload=masses)`. States of elements and
     events are not in it: to go on from a motion, save its last state and `own`.
 
     **Arguments:** `linkage`: that of the solution, one or a batch; `solution`: result
-    of `simulate`, of a batch of it, or of `sweep`, all at the same times [s]; or a
-    `SampledMotion`.
+    of `simulate` or `simulate_sampled`, of a batch of it, or of `sweep`, all at the
+    same times [s].
 
     **Returns:** the Dataset; the attributes `units` of its variables are SI.
 
@@ -66,12 +66,12 @@ def to_xarray(linkage: Linkage, solution: Motion) -> "xarray.Dataset":
     rows = [*batch, "time", "joint"]
     arrays: dict[str, tuple[list[str], ArrayLike]]
     arrays = {"q": (rows, solution.q), "qd": (rows, solution.qd)}
-    if isinstance(solution, Solution):
-        for name in ("num_steps", "time_reached"):
+    for name in ("num_steps", "time_reached"):
+        if name in solution.stats:
             arrays[name] = batch, solution.stats[name]
-        if solution.modes is not None and solution.taken is not None:
-            arrays["modes"] = rows, solution.modes
-            arrays["taken"] = rows[:-1], solution.taken
+    if solution.modes is not None and solution.taken is not None:
+        arrays["modes"] = rows, solution.modes
+        arrays["taken"] = rows[:-1], solution.taken
     arrays["outcome"] = batch, solution.outcome
     arrays |= {"time": (["time"], times), "joint": (["joint"], names)}
     arrays["unit"] = ["joint"], units
@@ -82,7 +82,7 @@ def to_xarray(linkage: Linkage, solution: Motion) -> "xarray.Dataset":
     return xarray.Dataset(variables).set_coords("unit")
 
 
-def to_pandas(linkage: Linkage, solution: Motion) -> "pandas.DataFrame":
+def to_pandas(linkage: Linkage, solution: Solution) -> "pandas.DataFrame":
     """Converts a solution to a pandas DataFrame with a row per time.
 
     There is a column per joint position and velocity, named `R1 [rad]`, `P2 [m/s]` and
@@ -104,7 +104,7 @@ def to_pandas(linkage: Linkage, solution: Motion) -> "pandas.DataFrame":
     for values, unit_of in ((solution.q, str), (solution.qd, rate_unit)):
         for k, (name, unit) in enumerate(zip(*names_and_units(linkage.ef))):
             columns[f"{name} [{unit_of(unit)}]"] = np.asarray(values)[..., k].ravel()
-    if isinstance(solution, Solution) and solution.modes is not None:
+    if solution.modes is not None:
         for k, name in enumerate(names_and_units(linkage.ef)[0]):
             modes = np.nan_to_num(np.asarray(solution.modes)[..., k].ravel())
             columns[f"{name} held by"] = np.array(MODES)[modes.astype(int)]

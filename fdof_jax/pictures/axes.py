@@ -11,7 +11,8 @@ from matplotlib.figure import Figure
 
 from ..base.checks import refusal
 from ..linkage.linkage import Linkage, check_linkage
-from ..simulation.sampled import Motion, check_joints
+from ..simulation.sampled import check_joints
+from ..simulation.solution import Solution
 
 Keywords = dict[str, Any]  # of functions of matplotlib
 # Okabe and Ito's colours, distinct under the common kinds of colour blindness.
@@ -20,15 +21,12 @@ SERIES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 
 
 def reached(
-    linkage: Linkage, solution: Motion, name: str = "solution"
+    linkage: Linkage, solution: Solution, name: str = "solution"
 ) -> list[np.ndarray]:
     """Arrays `ts`, `q` and `qd` of one solution, up to the last time reached."""
     check_linkage(linkage)
-    if not isinstance(solution, Motion) or np.ndim(solution.q) != 2:
-        expected = (
-            "the Solution of one simulate, or a SampledMotion (of a batch, pass one "
-            "member)"
-        )
+    if not isinstance(solution, Solution) or np.ndim(solution.q) != 2:
+        expected = "the Solution of one motion (of a batch, pass one member)"
         raise refusal(name, expected, solution)
     check_joints(name, solution, linkage)
     arrays = [np.asarray(a) for a in (solution.ts, solution.q, solution.qd)]
@@ -38,7 +36,7 @@ def reached(
     return [array[finite] for array in arrays]
 
 
-def ending(solution: Motion) -> str:
+def ending(solution: Solution) -> str:
     """Says in a legend when and why a motion ended early; "" if it did not."""
     finite = np.isfinite(np.asarray(solution.q)).all(axis=1)
     if finite.all():
@@ -47,7 +45,7 @@ def ending(solution: Motion) -> str:
     return f"ended at {last:.3g} s:\n{solution.outcome}"
 
 
-def mark_end(axes: Iterable[Axes], solution: Motion, last: float) -> None:
+def mark_end(axes: Iterable[Axes], solution: Solution, last: float) -> None:
     """Marks the last time reached, if a motion ended early, in axes over time."""
     if text := ending(solution):
         for ax in axes:

@@ -3,8 +3,8 @@
 Every function draws into the given axes (`ax`) or figure (`fig`), or into a new one,
 and returns it: pictures of one panel take and return axes, those of several a figure;
 `animate` and `animate_grid` return an animation. Nothing is shown or
-saved, and no global setting changes. A `solution` is that of one `simulate`, or a
-`SampledMotion`, whose forces are `(control, *forces)`; of a failed one, the samples
+saved, and no global setting changes. A `solution` is that of one `simulate`, or of one
+`simulate_sampled`, whose forces are `(control, *forces)`; of a failed one, the samples
 reached are drawn. Link 0 is the ground, links 1, 2, ... move.
 Malformed arguments raise ValueError. Curves over time are in `plotting`.
 """
@@ -31,7 +31,7 @@ from PIL import Image
 from ..base.checks import real_array, refusal, shown, whole_number
 from ..forces.element import Forces
 from ..linkage.linkage import Linkage, check_linkage, per_joint
-from ..simulation.sampled import Motion
+from ..simulation.solution import Solution
 from .arms import Geometry, draw_arm, draw_ground, draw_motion, geometry
 from .axes import (
     BLACK,
@@ -110,7 +110,7 @@ def draw_linkage(
 
 def chrono_cyclograph(
     linkage: Linkage,
-    solution: Motion,
+    solution: Solution,
     ax: Axes | None = None,
     *,
     every: float = 0.1,
@@ -171,7 +171,7 @@ def _last(ts: np.ndarray, until: float | None) -> float:
 
 
 def topology_grid(
-    motions: Mapping[str, tuple[Linkage, Motion]],
+    motions: Mapping[str, tuple[Linkage, Solution]],
     fig: Figure | None = None,
     *,
     forces: Mapping[str, Forces] | None = None,
@@ -195,7 +195,7 @@ def topology_grid(
 
 def animate(
     linkage: Linkage,
-    solution: Motion,
+    solution: Solution,
     ax: Axes | None = None,
     *,
     forces: Forces = (),
@@ -230,7 +230,7 @@ def animate(
 
 
 def animate_grid(
-    motions: Mapping[str, tuple[Linkage, Motion]],
+    motions: Mapping[str, tuple[Linkage, Solution]],
     fig: Figure | None = None,
     *,
     forces: Mapping[str, Forces] | None = None,
@@ -254,7 +254,7 @@ def animate_grid(
 
 
 def _geometries(
-    motions: Mapping[str, tuple[Linkage, Motion]], forces: Mapping[str, Forces] | None
+    motions: Mapping[str, tuple[Linkage, Solution]], forces: Mapping[str, Forces] | None
 ) -> dict[str, tuple[np.ndarray, Geometry]]:
     """Times and geometry of each motion, with its force elements, by title."""
     filled_mapping("motions", motions, "(Linkage, Solution)")

@@ -16,7 +16,8 @@ from ..forces.holders import Holder
 from ..forces.payload import Payload
 from ..linkage.linkage import Linkage
 from ..simulation.efforts import joint_efforts
-from ..simulation.sampled import Motion, SampledMotion, acting_in
+from ..simulation.sampled import acting_in
+from ..simulation.solution import Solution
 from .axes import reached
 
 
@@ -32,7 +33,7 @@ class Balance(NamedTuple):
     line: np.ndarray
 
 
-def energy_balance(linkage: Linkage, forces: Forces, solution: Motion) -> Balance:
+def energy_balance(linkage: Linkage, forces: Forces, solution: Solution) -> Balance:
     """Returns the energy balance of a motion; warns if it does not close."""
     ts, q, qd = reached(linkage, solution)
     forces = acting_in(solution, elements("forces", forces))
@@ -77,7 +78,7 @@ def energy_balance(linkage: Linkage, forces: Forces, solution: Motion) -> Balanc
     return Balance(ts, bands, line)
 
 
-def _powers(linkage: Linkage, forces: Forces, solution: Motion) -> np.ndarray:
+def _powers(linkage: Linkage, forces: Forces, solution: Solution) -> np.ndarray:
     """Power of each element on the arm (element, time) [W].
 
     Exchange with an element's own potential energy (of a spring) does not count, nor
@@ -98,12 +99,12 @@ def _powers(linkage: Linkage, forces: Forces, solution: Motion) -> np.ndarray:
 
 
 def _works(
-    linkage: Linkage, forces: Forces, solution: Motion, ts: np.ndarray
+    linkage: Linkage, forces: Forces, solution: Solution, ts: np.ndarray
 ) -> list[np.ndarray]:
     """Energies put in and taken out by the elements up to each of `ts` (time,) [J]."""
     powers = _powers(linkage, forces, solution)[:, : len(ts)]
     signs = (1, -1)
-    if not isinstance(solution, SampledMotion):
+    if solution.acting is None:
         # Where rates or accelerations, and with them powers, may jump [s].
         payloads = (e for e in forces if isinstance(e, Payload))
         times = [e.jump_ts for e in payloads if e.jump_ts is not None]

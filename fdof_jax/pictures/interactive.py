@@ -18,11 +18,11 @@ from ..base.checks import instance, optional_package, refusal, shown
 from ..base.report import html_table
 from ..linkage.linkage import joint_names, joints_of
 from ..references.reference import reference_of
+from ..scenes import circle_scenes
 from ..simulation.scene import Scene
 from ..simulation.simulate import simulate
 from ..simulation.solution import Solution
 from ..steps.looped_dopri8 import LoopedDopri8
-from ..tuning.ensembles import circle_scenes
 from ..tuning.losses import controller_of, gains_of, with_gains
 from .arms import draw_motion, geometry
 from .axes import SERIES, filled_mapping, legend, plane_axes, reached, xy
@@ -181,7 +181,7 @@ def sliders(scenes: Mapping[str, Scene] | None = None) -> Any:
     as all topologies do, share the program. Motions are accurate to some 1e-5 m or rad.
 
     **Arguments:** `scenes`: name -> a scene with exactly one PD controller, tracking a
-    task with a `tip`; by default `circle_scenes()`, one arm per topology.
+    task with a `tip`; by default `scenes.circle_scenes()`, one arm per topology.
 
     **Returns:** an ipywidgets `Box`, shown if it is the last line of a cell. Pages that
     cannot show it, as an exported notebook without the state of its widgets, show the

@@ -5,7 +5,6 @@ the cost of accuracy. Arguments and results are as in `drawing`, which holds the
 pictures of the linkage itself.
 """
 
-from collections.abc import Mapping
 from inspect import isfunction
 from itertools import cycle
 
@@ -13,10 +12,9 @@ import jax
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import ArrayLike
 
 from ..analysis.responses import StepAndSine
-from ..base.checks import instance, real_array, refusal, shown
+from ..base.checks import instance
 from ..control.drives import controller_in
 from ..dynamics import link_energies
 from ..forces.element import Forces, ForeignElement, elements, elements_on
@@ -24,7 +22,6 @@ from ..linkage.linkage import Linkage, joint_names, moving_joints
 from ..linkage.topology import letters
 from ..references.reference import reference_motion, reference_of
 from ..simulation.efforts import joint_efforts
-from ..simulation.sampled import Motion, SampledMotion
 from ..simulation.solution import Solution
 from .arms import geometry, link_color
 from .axes import (
@@ -34,7 +31,6 @@ from .axes import (
     SERIES,
     axes_or_new,
     figure_or_new,
-    filled_mapping,
     legend,
     mark_end,
     reached,
@@ -46,7 +42,7 @@ from .tip_errors import tracking, tracking_by_error, tracking_error
 __all__ = [
     "effort_profile", "energy_profile", "energy_stack",
     "motion_profile", "response_profile", "tracking", "tracking_by_error",
-    "tracking_error", "work_precision",
+    "tracking_error",
 ]  # fmt: skip
 
 
@@ -61,7 +57,7 @@ def __dir__() -> list[str]:
 
 def motion_profile(
     linkage: Linkage,
-    solution: Motion,
+    solution: Solution,
     fig: Figure | None = None,
     *,
     forces: Forces = (),
@@ -86,7 +82,7 @@ def motion_profile(
     kinds, names = letters(linkage.ef), joint_names(linkage)
     wanted = _references(linkage, forces, ts)
     held = np.zeros(q.shape, bool)
-    if isinstance(solution, Solution) and solution.modes is not None:
+    if solution.modes is not None:
         held = np.asarray(solution.modes)[: len(ts)] > 0
 
     def shown(q: np.ndarray, k: int) -> np.ndarray:
@@ -142,7 +138,7 @@ def _references(
 
 
 def energy_profile(
-    linkage: Linkage, solution: Motion, fig: Figure | None = None
+    linkage: Linkage, solution: Solution, fig: Figure | None = None
 ) -> Figure:
     """Plots kinetic and potential energy of each link and of all over time [J]."""
     ts, q, qd = reached(linkage, solution)
@@ -164,7 +160,7 @@ def energy_profile(
 
 
 def energy_stack(
-    linkage: Linkage, forces: Forces, solution: Motion, ax: Axes | None = None
+    linkage: Linkage, forces: Forces, solution: Solution, ax: Axes | None = None
 ) -> Axes:
     """Plots the energy balance over time, stacked [J].
 
@@ -201,7 +197,7 @@ def energy_stack(
 
 
 def effort_profile(
-    linkage: Linkage, forces: Forces, solution: Motion, fig: Figure | None = None
+    linkage: Linkage, forces: Forces, solution: Solution, fig: Figure | None = None
 ) -> Figure:
     """Plots the efforts of each element over time, a panel per joint [N or N m].
 
@@ -218,7 +214,7 @@ def effort_profile(
     ts, total, parts = (np.asarray(a) for a in (solution.ts, *efforts))
     moving, joints = moving_joints(linkage), joint_names(linkage)
     controllers = [controller_in(element) for element in forces]
-    parts, held = [*parts], isinstance(solution, SampledMotion)
+    parts, held = [*parts], solution.acting is not None
     named = [(name, part) for name, part in zip(_names(forces), parts) if part.any()]
     named = named or [("none", total)]
     busy = _busy(ts, np.stack([part for _, part in named]))
@@ -317,36 +313,3 @@ def response_profile(test: StepAndSine, fig: Figure | None = None) -> Figure:
     below.grid(which="both", lw=0.3)
     legend(above, below)
     return fig
-
-
-def work_precision(
-    measured: Mapping[str, tuple[ArrayLike, ArrayLike]], ax: Axes | None = None
-) -> Axes:
-    """Plots times over errors, both on logarithmic axes: the cost of accuracy.
-
-    The unit of the errors is yours; the axis is labelled "error".
-
-    **Arguments:** `measured`: label -> (errors, times [s]), equally many, all above 0,
-    in any order.
-    """
-    curves = {}
-    for label, pair in filled_mapping("measured", measured, "(errors, times)").items():
-        name = f"measured[{shown(label)}]"
-        if not isinstance(pair, tuple) or len(pair) != 2:
-            raise refusal(name, "(errors, times)", pair)
-        rows = (real_array(name, row, (None,), above=0) for row in pair)
-        errors, times = map(np.asarray, rows)
-        if len(errors) != len(times):
-            got = f"{len(errors)} errors and {len(times)} times"
-            raise ValueError(f"{name}: expected as many errors as times, got {got}.")
-        order = np.argsort(errors)
-        curves[label] = errors[order], times[order]
-    ax = axes_or_new(ax, 2.8)
-    for (label, curve), color, marker in zip(
-        curves.items(), cycle(SERIES), cycle("osD^v<")
-    ):
-        ax.loglog(*curve, lw=1.2, ms=4, label=label, color=color, marker=marker)
-    ax.set(xlabel="error", ylabel="time [s]")
-    ax.grid(which="major", lw=0.4, color=LIGHT_GREY)
-    legend(ax)
-    return ax

@@ -17,7 +17,7 @@ from ..linkage.linkage import Linkage
 from ..references.reference import reference_of
 from ..references.task import CircleTask, TipReference, TipTask
 from ..references.timing import Laps
-from ..simulation.sampled import Motion
+from ..simulation.solution import Solution
 from .arms import geometry
 from .axes import (
     GREY,
@@ -45,7 +45,7 @@ class _Tip(NamedTuple):
 
 
 def _tip(
-    linkage: Linkage, task: Callable, solution: Motion, name: str = "solution"
+    linkage: Linkage, task: Callable, solution: Solution, name: str = "solution"
 ) -> _Tip:
     if not callable(task) or (tip := reference_of(task).tip) is None:
         raise refusal("task", "a CircleTask or a TipTask", task)
@@ -55,7 +55,7 @@ def _tip(
 
 
 def _tips(
-    linkage: Linkage, task: Callable, solutions: Mapping[str, Motion]
+    linkage: Linkage, task: Callable, solutions: Mapping[str, Solution]
 ) -> dict[str, _Tip]:
     filled_mapping("solutions", solutions, "Solution")
     tips = {}
@@ -80,7 +80,7 @@ def _draw_commanded(ax: Axes, task: Callable, ts: np.ndarray, path: np.ndarray) 
 def tracking(
     linkage: Linkage,
     task: TipReference,
-    solutions: Mapping[str, Motion],
+    solutions: Mapping[str, Solution],
     ax: Axes | None = None,
 ) -> Axes:
     """Plots paths of the tip with the commanded path, dashed; crosses are the starts.
@@ -112,7 +112,7 @@ def tracking(
 
 
 def tracking_by_error(
-    linkage: Linkage, task: TipReference, solution: Motion, ax: Axes | None = None
+    linkage: Linkage, task: TipReference, solution: Solution, ax: Axes | None = None
 ) -> Axes:
     """Plots the path of the tip, coloured by its distance from its set point [mm].
 
@@ -147,7 +147,7 @@ def tracking_by_error(
 def tracking_error(
     linkage: Linkage,
     task: TipReference,
-    solutions: Mapping[str, Motion],
+    solutions: Mapping[str, Solution],
     ax: Axes | None = None,
 ) -> Axes:
     """Plots the distance of the tip from its set point over time [m].

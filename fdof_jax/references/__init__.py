@@ -4,12 +4,12 @@ from .paths import Ellipse, FigureEight, Line, Path, Spline
 from .reference import Reference, reachable
 from .signals import Pulse, Ramp, Step
 from .task import CircleTask, JointMove, SetPoint, TipTask, reach_margin
-from .timing import Laps, Travel, shock_against
+from .timing import Laps, Travel
 
 __all__ = [
     "CircleTask", "Ellipse", "FigureEight", "JointMove", "Laps", "Line", "Path",
     "Pulse", "Ramp", "reach_margin", "reachable", "Reference", "SetPoint",
-    "shock_against", "Spline", "Step", "TipTask", "Travel",
+    "Spline", "Step", "TipTask", "Travel",
 ]  # fmt: skip
 
 

@@ -7,13 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jaxtyping import Float
-from numpy.typing import ArrayLike
 
-from ..base.checks import concrete, instance, one_of, real_array
+from ..base.checks import one_of
 from ..linkage.fields import Condition, Part, Values, field
 
-_MOST_TURN = 250  # [rad], as far as 48 nodes per piece resolve
 _PASSES = 3
 RAMP = 0.25  # share of its time in which a trapezoidal profile speeds up
 
@@ -46,7 +43,7 @@ class Travel(Part):
       velocity is a trapezium, speeding up and slowing down in a quarter of the time
       each).
     - `shock`: share of the way done at constant velocity. The velocity then jumps at
-      both ends; see `shock_against`.
+      both ends.
 
     **Raises:** ValueError for malformed arguments.
 
@@ -115,43 +112,3 @@ def times_of_moves(timing: Callable[[Array], Array], times: Array) -> Array:
         way = jnp.append(0, jnp.cumsum(jnp.where(jnp.isfinite(moves), moves, 0)))
         found = jnp.interp(jnp.linspace(0, way[-1], len(times)), way, found)
     return jnp.sort(jnp.concatenate([times, found]))
-
-
-def shock_against(travel: Travel, frequency: ArrayLike) -> Float[Array, ""]:
-    """Computes the shock that leaves a carried load of a natural frequency at rest.
-
-    After the travel, an undamped load (for instance a hanging one) swings as much as
-    its support's acceleration contains its natural frequency. Jumps of the velocity at
-    both ends can make this content zero.
-
-    **Arguments:** `travel`: its `duration` and `profile` are used; `frequency`: natural
-    angular frequency of the load, positive [rad/s].
-
-    **Returns:** the `shock` of a `Travel` that is otherwise the same.
-
-    **Raises:** ValueError for malformed arguments, and if `frequency * duration`
-    exceeds 250 rad (the result is NaN if that product is traced).
-
-    >>> import fdof_jax as fj
-    >>> travel = fj.references.Travel(1.5, profile="harmonic")
-    >>> float(fj.references.shock_against(travel, frequency=8.0))
-    2.934
-    """
-    instance("travel", travel, Travel)
-    frequency = real_array("frequency", frequency, (), above=0)
-    turn = frequency * travel.duration
-    if (angle := concrete(turn)) is not None and angle > _MOST_TURN:
-        raise ValueError(
-            f"frequency: expected at most {_MOST_TURN} rad per travel, got {angle:g}."
-        )
-    # A velocity's content of the frequency is the integral of v(x) cos(turn (x - 1/2)).
-    nodes, weights = np.polynomial.legendre.leggauss(48)
-    ends = np.array([0, RAMP, 1 - RAMP, 1])
-    half = np.diff(ends)[:, None] / 2
-    x = (ends[:-1, None] + half + half * nodes).ravel()
-    weight = (half * weights).ravel()
-    velocity = jax.vmap(jax.grad(PROFILES[travel.profile]))(jnp.asarray(x))
-    of_profile = jnp.sum(weight * velocity * jnp.cos(turn * (x - 0.5)))
-    of_constant = jnp.sinc(turn / (2 * jnp.pi))
-    shock = of_profile / (of_profile - of_constant)
-    return jnp.where(turn <= _MOST_TURN, shock, jnp.nan)

@@ -1,13 +1,10 @@
 """Motion in time: the equations that are integrated, and what is read from them."""
 
-from ..steps.controllers import scale_tolerances
 from .efforts import Efforts
-from .phases import concatenate
 from .prescribed import PrescribedMotion
-from .sampled import SampledMotion
 
 __all__ = [
-    "concatenate", "Efforts", "PrescribedMotion", "SampledMotion", "scale_tolerances",
+    "Efforts", "PrescribedMotion",
 ]  # fmt: skip
 
 

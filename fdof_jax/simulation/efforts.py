@@ -16,9 +16,10 @@ from ..linkage.linkage import Linkage, check_linkage, without_fixed
 from .field import element_effort, with_states
 from .holding import changes, efforts_of_holders
 from .prescribed import prescribed, prescribed_effort
-from .sampled import Motion, acting_in, check_joints
+from .sampled import acting_in, check_joints
 from .scene import accepts_scene
 from .simulate import check_own
+from .solution import Solution
 from .solve import cut, padded
 
 
@@ -35,11 +36,11 @@ class Efforts(NamedTuple):
 
 
 @accepts_scene
-def joint_efforts(linkage: Linkage, forces: Forces, solution: Motion) -> Efforts:
+def joint_efforts(linkage: Linkage, forces: Forces, solution: Solution) -> Efforts:
     """Computes the joint efforts of the force elements along a motion.
 
-    **Arguments:** the linkage, the forces and the solution of one `simulate`; of a
-    `SampledMotion`, the forces are `(control, *forces)`. A `Scene` may stand for
+    **Arguments:** the linkage, the forces and the solution of one `simulate`; of
+    `simulate_sampled`, the forces are `(control, *forces)`. A `Scene` may stand for
     linkage and forces: `joint_efforts(scene, solution)`.
 
     **Returns:** `Efforts(total, elements)` [N or N m], of shapes (time, n) and

@@ -17,7 +17,6 @@ from ..base.functions import sharing_functions
 from ..forces.element import (
     Element,
     Forces,
-    OwnStates,
     ScalarElement,
     element_of,
     elements,
@@ -30,7 +29,7 @@ from ..steps.looped_dopri8 import LoopedDopri8
 from .field import has_states, initial_states
 from .formulation import clear_of_start
 from .simulate import check_elements, simulate
-from .solution import Solution, WithOutcome
+from .solution import Solution
 
 
 class _Held(ScalarElement):
@@ -93,61 +92,22 @@ def step(
     return State(solution.q[-1], solution.qd[-1])
 
 
-class SampledMotion(WithOutcome):
-    """A motion under sampled control.
-
-    - `ts`: sampling times, including the end (samples + 1,) [s].
-    - `q`, `qd`: joint positions and velocities at `ts`; NaN after a failure.
-    - `tau`: efforts commanded at each sample (samples, n), 0 at fixed pairs
-      [N or N m]. Each acts from the delay after its sample until the next one acts.
-    - `result`: diffrax's result: `successful`, or that of the first failed period.
-      `outcome` states it in words.
-    - `own`: the states of the forces' `StatefulElement`s at `ts`.
-    - `q_begin`: joint positions at which, within each period, the next command begins
-      to act (samples, n); None if commands begin to act at samples only.
-    - `acting`: efforts that act at `ts`, or begin to act there (samples + 1, n)
-      [N or N m]. None without a delay, where these are `tau` and, at the end, its last.
-    - `taken`: energy that what holds joints has taken up to `ts`, as in a `Solution`
-      (samples + 1,) [J]; None if nothing holds any.
-
-    Pictures, tables, `joint_efforts` and `joint_reactions` take it as they take a
-    `Solution`. Its `forces` are there `(control, *forces)`, the controller first. The
-    controller's efforts are those that act, 0 before the first command has arrived.
-    """
-
-    ts: Float[Array, " time"]
-    q: Float[Array, "time joint"]
-    qd: Float[Array, "time joint"]
-    tau: Float[Array, "sample joint"]
-    result: diffrax.RESULTS
-    own: OwnStates
-    q_begin: Float[Array, "sample joint"] | None = None
-    acting: Float[Array, "time joint"] | None = None
-    taken: Float[Array, " time"] | None = None
-
-
-Motion = Solution | SampledMotion
-
-
-def acting_in(motion: Motion, forces: tuple[Element, ...]) -> tuple[Element, ...]:
+def acting_in(motion: Solution, forces: tuple[Element, ...]) -> tuple[Element, ...]:
     """Returns the elements that acted: held efforts in the place of a sampled control.
 
-    Raises ValueError if a `SampledMotion` comes without its control.
+    Raises ValueError if a motion under sampled control comes without its control.
     """
-    if isinstance(motion, Solution):
+    if motion.acting is None:
         return forces
     if not forces:
-        raise refusal("forces", "(control, *forces) of a SampledMotion", forces)
-    acting = motion.acting
-    if acting is None:
-        acting = jnp.concatenate([motion.tau, motion.tau[-1:]])
-    return _Held(motion.ts, acting), *forces[1:]
+        raise refusal("forces", "(control, *forces) of a sampled motion", forces)
+    return _Held(motion.ts, motion.acting), *forces[1:]
 
 
 def check_joints(name: str, solution: object, linkage: Linkage) -> None:
     """Raises ValueError unless it is a motion with the linkage's number of joints."""
-    if not isinstance(solution, Motion):
-        raise refusal(name, "a Solution or a SampledMotion", solution)
+    if not isinstance(solution, Solution):
+        raise refusal(name, "a Solution", solution)
     count = jnp.shape(linkage.ef)[-1] // 2  # of a batch too
     if jnp.shape(solution.q)[-1] != count:
         raise ValueError(
@@ -201,7 +161,7 @@ def simulate_sampled(
     noise: tuple[ArrayLike, ArrayLike] | None = None,
     key: Array | None = None,
     **options: Any,
-) -> SampledMotion:
+) -> Solution:
     """Computes a motion under a controller that samples once per period.
 
     **Arguments:**
@@ -222,7 +182,10 @@ def simulate_sampled(
       or one for all), with a `jax.random` `key`.
     - `options`: keywords of `simulate`.
 
-    **Returns:** a `SampledMotion`.
+    **Returns:** a `Solution` at the sampling times, the end included, with `tau`.
+    Pictures, tables, `joint_efforts` and `joint_reactions` take `(control, *forces)` as
+    its `forces`, the controller first. The controller's efforts are then those that
+    act, 0 before the first command has arrived.
 
     **Raises:** ValueError for malformed arguments.
 
@@ -276,7 +239,7 @@ def simulate_sampled(
 @eqx.filter_jit  # not traced anew at each call
 def _motion(
     linkage, state0, control, times, forces, late, spread, keys, options
-) -> SampledMotion:
+) -> Solution:
     """Simulates period by period; the noise's `spread` may be None."""
 
     delay, whole, rest, most = late
@@ -338,7 +301,7 @@ def _motion(
     )
     rows = lambda starts, last: jnp.concatenate([starts, last[None]])
     (q, qd), own = jax.tree.map(rows, starts, last)
-    acting = None
+    acting = jnp.concatenate([tau, tau[-1:]])
     if rest is not None or whole > 0:
         commands = jnp.concatenate([jnp.zeros((most + 1, held.size)), tau, tau[-1:]])
         first = most + 1 - whole - within
@@ -347,4 +310,7 @@ def _motion(
         # Each period counts from 0, and its start may bring a blow.
         at_start, in_period = jnp.append(taken, jnp.zeros((1, 2)), axis=0).T
         taken = jnp.cumsum(in_period) - in_period + at_start
-    return SampledMotion(times, q, qd, tau, result, own, q_begin, acting, taken)
+    return Solution(
+        times, q, qd, {}, result, own,
+        taken=taken, tau=tau, acting=acting, q_begin=q_begin,
+    )  # fmt: skip

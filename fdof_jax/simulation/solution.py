@@ -78,61 +78,6 @@ def outcome_numbers(result: diffrax.RESULTS) -> Array | np.ndarray:
     return xp.select(cases, [*range(len(cases))], default=len(cases))
 
 
-class WithOutcome(eqx.Module):
-    """Base of `Solution` and `SampledMotion`: their outcome, and a summary.
-
-    Their fields are declared there alone, because the order is that of arguments.
-    """
-
-    @property
-    def outcome(self: Any) -> np.ndarray:
-        """Outcome of each trajectory in words, an array of the batch's shape.
-
-        `"successful"`; `"ill-conditioned"`: the mass matrix is singular or nearly so
-        (see `inertia_ratios`); `"not finite"`: the accelerations are not finite, as
-        those of a negative mass or of a reference out of reach (see
-        `references.reach_margin`);
-        `"out of steps"`; `"tolerance out of reach"`: rounding keeps even the shortest
-        step from meeting it; `"too many switches"`: one after the other, as between
-        branches that push towards each other; or `"solver failed"`.
-
-        Raises ValueError under transformations, where words do not exist.
-        """
-        if is_traced(self.result):
-            raise ValueError(
-                "outcome: expected a computed motion, got one that JAX traces; there, "
-                "compare `result`: motion.result == diffrax.RESULTS.successful."
-            )
-        return np.asarray(np.array([*OUTCOMES])[outcome_numbers(self.result)])
-
-    def __repr__(self) -> str:
-        """Summarises the motion in words; traced values show only their shape."""
-        facts = "; ".join(f"{name}: {value}" for name, value in self._facts().items())
-        return f"{type(self).__name__}({facts})" if facts else super().__repr__()
-
-    def _repr_html_(self) -> str | None:
-        facts = self._facts()
-        return html_table(facts.items()) if facts else None
-
-    def _facts(self: Any) -> dict[str, str]:
-        """Returns the known facts; none if the leaves are not arrays of a motion."""
-        if len(np.shape(self.q)) < 2:
-            return {}
-        *batch, count, _ = self.q.shape
-        motions = " x ".join(map(str, batch)) if batch else "1"
-        facts = {"motions": motions, "times": f"{count}"}
-        result = isinstance(self.result, diffrax.RESULTS)
-        if not result or not known(self.ts, self.result):
-            return facts
-        ts = np.asarray(self.ts)
-        facts["times"] += f", {ts.min():g} to {ts.max():g} s"
-        outcomes = zip(*np.unique(self.outcome, return_counts=True))
-        facts["outcome"] = ", ".join(
-            f"{number} {word}" if batch else word for word, number in outcomes
-        )
-        return facts
-
-
 class Events(eqx.Module):
     """The last 64 events of joints that elements hold: to which, when and what.
 
@@ -163,7 +108,7 @@ class Events(eqx.Module):
         return dict(zip(("motion",), batch)) | columns
 
 
-class Solution(WithOutcome):
+class Solution(eqx.Module):
     """A simulated motion, with its statistics and outcome.
 
     - `ts`: output times [s].
@@ -197,6 +142,15 @@ class Solution(WithOutcome):
       taken up to `ts` [J].
     - `events`: what happened to which joint, and when; its times have derivatives.
 
+    After `simulate_sampled`, else None (there `stats` is empty, and `modes` and
+    `events` are None):
+
+    - `tau`: efforts commanded at each sample (samples, n), 0 at fixed pairs
+      [N or N m]. Each acts from the delay after its sample until the next one acts.
+    - `acting`: efforts that act at `ts`, or begin to act there [N or N m].
+    - `q_begin`: joint positions at which, within each period, the next command begins
+      to act (samples, n); None if commands begin to act at samples only.
+
     >>> import fdof_jax as fj
     >>> import numpy as np
     >>> arm, start, *_ = fj.scenes.fig5()
@@ -214,15 +168,62 @@ class Solution(WithOutcome):
     modes: Float[Array, "time joint"] | None = None
     taken: Float[Array, " time"] | None = None
     events: Events | None = None
+    tau: Float[Array, "sample joint"] | None = None
+    acting: Float[Array, "time joint"] | None = None
+    q_begin: Float[Array, "sample joint"] | None = None
 
     @property
     def states(self) -> tuple[PyTree, ...]:
         """The results that have derivatives in the inputs."""
         return self.q, self.qd, self.own, self.taken, self.events
 
+    @property
+    def outcome(self) -> np.ndarray:
+        """Outcome of each trajectory in words, an array of the batch's shape.
+
+        `"successful"`; `"ill-conditioned"`: the mass matrix is singular or nearly so
+        (see `inertia_ratios`); `"not finite"`: the accelerations are not finite, as
+        those of a negative mass or of a reference out of reach (see
+        `references.reach_margin`);
+        `"out of steps"`; `"tolerance out of reach"`: rounding keeps even the shortest
+        step from meeting it; `"too many switches"`: one after the other, as between
+        branches that push towards each other; or `"solver failed"`.
+
+        Raises ValueError under transformations, where words do not exist.
+        """
+        if is_traced(self.result):
+            raise ValueError(
+                "outcome: expected a computed motion, got one that JAX traces; there, "
+                "compare `result`: motion.result == diffrax.RESULTS.successful."
+            )
+        return np.asarray(np.array([*OUTCOMES])[outcome_numbers(self.result)])
+
+    def __repr__(self) -> str:
+        """Summarises the motion in words; traced values show only their shape."""
+        facts = "; ".join(f"{name}: {value}" for name, value in self._facts().items())
+        return f"{type(self).__name__}({facts})" if facts else super().__repr__()
+
+    def _repr_html_(self) -> str | None:
+        facts = self._facts()
+        return html_table(facts.items()) if facts else None
+
     def _facts(self) -> dict[str, str]:
-        facts = super()._facts()
-        if "outcome" not in facts or not known(self.stats):
+        """Returns the known facts; none if the leaves are not arrays of a motion."""
+        if len(np.shape(self.q)) < 2:
+            return {}
+        *batch, count, _ = self.q.shape
+        motions = " x ".join(map(str, batch)) if batch else "1"
+        facts = {"motions": motions, "times": f"{count}"}
+        result = isinstance(self.result, diffrax.RESULTS)
+        if not result or not known(self.ts, self.result):
+            return facts
+        ts = np.asarray(self.ts)
+        facts["times"] += f", {ts.min():g} to {ts.max():g} s"
+        outcomes = zip(*np.unique(self.outcome, return_counts=True))
+        facts["outcome"] = ", ".join(
+            f"{number} {word}" if batch else word for word, number in outcomes
+        )
+        if not known(self.stats):
             return facts
         if "num_steps" in self.stats:
             facts["steps"] = _span(self.stats["num_steps"])

@@ -1,7 +1,6 @@
 """Step size controllers: own ones, the default, tolerances, and changes of any."""
 
 import dataclasses
-import functools
 from collections.abc import Callable
 from typing import Any, TypeVar
 
@@ -14,12 +13,9 @@ from jax import Array
 from jaxtyping import PyTree
 from numpy.typing import ArrayLike
 
-from ..base.checks import concrete, instance, is_traced, real_array, real_numbers
+from ..base.checks import concrete, is_traced, real_numbers
 from ..base.user_warnings import warn
-from ..linkage.coordinates import State
-from ..linkage.linkage import Linkage, check_linkage, joints_of
-from ..linkage.topology import real_joints
-from .dopri8 import Integrated, constant
+from .dopri8 import constant
 
 Controller = diffrax.AbstractStepSizeController
 Judging = diffrax.AbstractAdaptiveStepSizeController  # judges errors of steps
@@ -147,29 +143,6 @@ class Adaptive(Judging):
         return self.controller.norm
 
 
-class Scaled(Adaptive):
-    """A controller that measures each coordinate in a unit of its own.
-
-    `StepControl` scales what it gets.
-    """
-
-    controller: Judging
-    unit: tuple[Array, Array]  # of q and of qd (n,)
-
-    def init(self, *arguments):
-        if arguments[4] is None:
-            raise ValueError(
-                "dt0: expected a first step [s] with scaled tolerances, got None."
-            )
-        return super().init(*arguments)
-
-    def scaled(self, state: Integrated) -> Integrated:
-        """Returns a state in these units; the elements' own states keep theirs."""
-        scalars = isinstance(state[0], tuple)
-        units: PyTree = tuple(map(tuple, self.unit)) if scalars else self.unit
-        return (*jax.tree.map(jnp.divide, state[:2], units), *state[2:])
-
-
 # A lane stops once it has taken `_SLACK` times as many steps as it had taken when
 # `_MOST` of the lanes were done.
 _SLACK, _MOST = 1.5, 7 / 8
@@ -237,24 +210,11 @@ def at_tolerances(
     rtol: ArrayLike | None, atol: ArrayLike | None
 ) -> diffrax.PIDController:
     """Returns the default controller with other tolerances; None keeps one."""
-    known = isinstance(rtol, float | None) and isinstance(atol, float | None)
-    make = _at_known_tolerances if known else _at_tolerances
-    return make(rtol, atol, jnp.result_type(float))
-
-
-def _at_tolerances(
-    rtol: ArrayLike | None, atol: ArrayLike | None, dtype: np.dtype
-) -> diffrax.PIDController:
-    del dtype  # that of the tolerances, a part of the cache's key
     default = _default_tolerance()
     return adaptive(
         _number("rtol", default if rtol is None else rtol),
         _number("atol", default if atol is None else atol),
     )
-
-
-# Of a sweep of 16 arms, in 1.0 ms, another controller would take 0.15 ms.
-_at_known_tolerances: Any = functools.lru_cache(_at_tolerances)
 
 
 def _number(name: str, value: ArrayLike) -> Array | np.ndarray:
@@ -274,76 +234,19 @@ def with_longest(controller: Any, max_step: ArrayLike) -> Controller:
 def within_reach(controller: Controller) -> Controller:
     """Returns the controller with a shortest step, which ends solves that are stuck.
 
-    In float32, tolerances that cannot be met are raised, with a warning.
+    In float32, warns of tolerances that cannot be met.
     """
-    x64 = jnp.result_type(float) == jnp.float64
 
-    def with_limits(pid: diffrax.PIDController) -> diffrax.PIDController:
-        if pid.dtmin is None:
-            shortest = _shortest_step()
-            pid = dataclasses.replace(pid, dtmin=shortest, force_dtmin=False)
-        if x64:
+    def with_shortest(pid: diffrax.PIDController) -> diffrax.PIDController:
+        for name in ("rtol", "atol"):
+            value = concrete(getattr(pid, name))
+            if value is not None and value < of_precision(0, _TIGHTEST_SINGLE / 2):
+                warn(
+                    f"stepsize_controller: {name}={value:g} cannot be met in float32; "
+                    "fj.configure(x64=True) allows more."
+                )
+        if pid.dtmin is not None:
             return pid
-        rtol, atol = met(pid.rtol, "rtol"), met(pid.atol, "atol")
-        return dataclasses.replace(pid, rtol=rtol, atol=atol)
+        return dataclasses.replace(pid, dtmin=_shortest_step(), force_dtmin=False)
 
-    def met(tolerance: ArrayLike, name: str) -> ArrayLike:
-        value = concrete(tolerance)
-        if value is None or value >= _TIGHTEST_SINGLE / 2:
-            return tolerance
-        warn(
-            f"stepsize_controller: {name}={value:g} cannot be met in float32, "
-            f"{_TIGHTEST_SINGLE:g} is used; fj.configure(x64=True) allows more."
-        )
-        return _TIGHTEST_SINGLE
-
-    return with_pid(with_limits, controller)
-
-
-def scale_tolerances(
-    linkage: Linkage,
-    controller: diffrax.AbstractAdaptiveStepSizeController | None = None,
-    *,
-    scale: State | None = None,
-) -> diffrax.AbstractAdaptiveStepSizeController:
-    """Returns a controller whose absolute tolerance scales with the linkage.
-
-    By default an absolute tolerance of 1e-11 is in metres, radians and their rates. For
-    an arm of millimetres or kilometres, pass the result as `stepsize_controller`. Its
-    unit of slides is the size L of the arm [m], its unit of time is sqrt(L/g) [s], and
-    angles stay in radians.
-
-    **Arguments:**
-
-    - `controller`: the controller to scale; by default that of `simulate`.
-    - `scale`: other units per coordinate, a State of two positive arrays (n,)
-      [m or rad, m/s or rad/s].
-
-    **Raises:** ValueError for a controller that is not adaptive, a scale that is not
-    positive, or a linkage of no size without `scale`.
-
-    >>> import fdof_jax as fj
-    >>> arm = fj.scenes.fig5().linkage
-    >>> controller = fj.simulation.scale_tolerances(arm)
-    >>> [float(unit) for unit in controller.unit[1]]  # of rates: 1 / sqrt(L/g) [1/s]
-    [1.279, 1.279, 1.279]
-    """
-    check_linkage(linkage)
-    controller = default_controller() if controller is None else controller
-    instance("controller", controller, diffrax.AbstractAdaptiveStepSizeController)
-    if scale is not None:
-        instance("scale", scale, State)
-        q, qd = (
-            real_array(f"scale.{name}", value, (joints_of(linkage),), above=0)
-            for name, value in zip(State._fields, scale)
-        )
-    else:
-        size = jnp.sum(jnp.abs(linkage.length)) + jnp.sum(jnp.abs(linkage.com))
-        if concrete(size) == 0:
-            raise ValueError("scale: expected one, as the linkage has no size.")
-        time = jnp.where(
-            linkage.gravity == 0, 1, jnp.sqrt(size / jnp.abs(linkage.gravity))
-        )
-        q = jnp.where(jnp.stack(real_joints(linkage.ef)), 1, size)
-        qd = q / time
-    return with_error_control(lambda c: Scaled(c, (q, qd)), controller)  # pyright: ignore[reportCallIssue]
+    return with_pid(with_shortest, controller)

@@ -18,7 +18,7 @@ from jax.typing import ArrayLike
 from jaxtyping import PyTree
 
 from ..linkage.topology import real_joints
-from .controllers import Adaptive, Judging, Scaled
+from .controllers import Adaptive, Judging
 from .derivative_control import OfLinearised, OfTangents, Step
 from .dopri8 import (
     Arguments,
@@ -105,9 +105,6 @@ class StepControl(Adaptive):
             ratio, probe = self.derivatives(taken, y_error, state.probe, self.rtol)
         judged: Any = *map(motion_of, (y0, y1)), with_change(y_error, motion_of)
         controller = self.controller
-        if isinstance(controller, Scaled):  # rounding is judged in its units, too
-            scaled, controller = controller.scaled, controller.controller
-            judged = *map(scaled, judged[:2]), with_change(judged[2], scaled)
         before, after, error = constant(judged)
         begin, end, args = constant((t0, t1, args))
         # Is its error only rounding? How much accuracy did it lose?

@@ -1,4 +1,4 @@
-"""Scenes to tune: variations of one, stacked, and one circle for all topologies."""
+"""Ensembles of scenes to tune: random variations of one, stacked."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -7,25 +7,15 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from ..base.checks import instance, real_array, refusal, whole_number
-from ..control.pd import ModelBased, PDController
+from ..control.pd import ModelBased
 from ..linkage.coordinates import State
 from ..linkage.linkage import Linkage, check_linkage
-from ..linkage.topology import TOPOLOGIES
 from ..mechanics.kinematics import tip_jacobian, tip_position
-from ..paper import from_chain
 from ..references.reference import reference_of
-from ..references.task import CircleTask
 from ..simulation.scene import Scene, stacked
 from .losses import controller_of, with_controller
 
 _MOST = 1_000_000  # they are drawn one after another
-# The common start in chain coordinates B1, th2, B2, th3, B3, th4. From here every
-# topology follows the circle away from its singularities.
-_START = np.array([0.0, 1.0, -0.1, -1.0, 0.7, 0.8])
-_BASE = np.pi / 2  # a slide on the ground is level
-# The assembly (of two) that each arm starts in.
-_BRANCH = dict(zip(TOPOLOGIES, (-1, 1, -1, -1, 1, 1, 1)))
-_KP, _KD = {"R": 500.0, "P": 2000.0}, {"R": 50.0, "P": 200.0}
 
 
 def _bodies(linkage: Linkage) -> tuple[Array, Array, Array]:
@@ -156,44 +146,3 @@ def _range(name: str, value: ArrayLike, minimum: float) -> tuple[float, float]:
             f"{greatest:g}."
         )
     return least, greatest
-
-
-def circle_scenes() -> dict[str, Scene]:
-    """The same circle for an arm of each topology, under PD control and gravity.
-
-    All arms have links of 1 m, 0.8 m and 0.5 m with masses of 2 kg, 1.5 kg and 1 kg.
-    They start at rest in the same configuration, with their tip 5 cm inside the circle
-    of 0.25 m radius, and keep the angle of their last link. Only the choice of the real
-    joint of each pair differs. All joints of a kind have the same gains and limits
-    (150 N m or N).
-
-    >>> import fdof_jax as fj
-    >>> scenes = fj.tuning.circle_scenes()
-    >>> starts = [fj.tip_position(s.linkage, s.state0.q) for s in scenes.values()]
-    >>> starts[0].tolist(), starts[-1].tolist()  # the same for all
-    ([1.994, 1.151], [1.994, 1.151])
-    """
-    found = {}
-    for topology in TOPOLOGIES:
-        locked, state0 = from_chain(topology, _START, np.zeros(6), base_angle=_BASE)
-        linkage = Linkage(
-            topology,
-            length=[0.3, 1.0, 0.8, 0.5],
-            com=[[0.5, 0], [0.4, 0], [0.25, 0]],
-            mass=[2, 1.5, 1],
-            inertia=[0.2, 0.1, 0.05],
-            locked=locked,
-            base_angle=_BASE,
-        )
-        task = CircleTask(
-            center=[1.99, 0.95],
-            radius=0.25,
-            period=4.0,
-            phase=np.pi / 2,
-            orientation=_START[5],
-            branch=_BRANCH[topology],
-        )
-        kp, kd = ([of[kind] for kind in topology] for of in (_KP, _KD))
-        controller = PDController(kp, kd, 150.0, task)
-        found[topology] = Scene(linkage, state0, (controller,), 4.0)
-    return found

@@ -1,4 +1,4 @@
-"""Results of gain tuning, and their tables."""
+"""Results of gain tuning."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ..base.checks import known, refusal
+from ..base.checks import known
 from ..base.report import Report
 from ..linkage.linkage import Linkage, joint_names, moving_joints
 from ..search import Run, best_of
@@ -177,30 +177,6 @@ class TuneResult(Report):
         )
 
 
-class TradeOff(Report):
-    """The least tip errors for given efforts: one tuning run per price of effort.
-
-    - `prices`: prices of effort, see `Tracking` (price,) [m^2].
-    - `tip_error`: rms tip error (price,) [m].
-    - `effort`: root mean square of the efforts over their limits (price,).
-    - `results`: the `TuneResult` of each price.
-    """
-
-    prices: Float[np.ndarray, " price"]
-    tip_error: Float[np.ndarray, " price"]
-    effort: Float[np.ndarray, " price"]
-    results: list[TuneResult]
-
-    def _rows(self) -> list[list[str]]:
-        rows = [["price [m^2]", "tip error [mm]", "effort [%]", ""]]
-        columns = self.prices, self.tip_error, self.effort, self.results
-        for price, error, effort, result in zip(*columns):
-            mark = "" if result.converged else "not converged"
-            numbers = f"{price:.3g}", f"{1e3 * error:.4g}", f"{1e2 * effort:.4g}"
-            rows.append([*numbers, mark])
-        return rows
-
-
 def gain_rows(table: dict[str, list]) -> list[list[str]]:
     """Returns a header and a row per gain of a `TuneResult.table`."""
     rows = [["", "start", "tuned", "least", "greatest", ""]]
@@ -284,39 +260,3 @@ def _message(scene: Scene, run: Run, history: History, box: GainBox) -> str:
                 "gains have hardly any effect"
             )
     return "; ".join(parts)
-
-
-def league_table(results: Mapping[str, TuneResult]) -> str:
-    """A table of tip errors and efforts before and after tuning, best first.
-
-    **Arguments:** `results`: by name, for instance those of `tune_each`.
-
-    **Raises:** ValueError for malformed arguments.
-
-    >>> import fdof_jax as fj
-    >>> scenes = fj.tuning.circle_scenes()
-    >>> pair = {name: scenes[name]._replace(t1=1.0) for name in ("PPR", "RRR")}
-    >>> print(fj.tuning.league_table(fj.tuning.tune_each(pair, max_steps=2)))
-           rms tip error [mm]     effort [% of limit]        gains
-               start       tuned       start       tuned at bounds
-    PPR         15.2       7.671       6.762       14.51       2/6
-    RRR        147.9       29.32          13       13.15       6/6
-    """
-    held = isinstance(results, Mapping) and len(results) > 0
-    if not held or not all(isinstance(r, TuneResult) for r in results.values()):
-        raise refusal("results", "a TuneResult for each name", results)
-    rows = [
-        f"{'':4}{'rms tip error [mm]':^24}{'effort [% of limit]':^24}{'gains':>10}",
-        f"{'':4}" + 2 * f"{'start':>12}{'tuned':>12}" + f"{'at bounds':>10}",
-    ]
-    for name, result in sorted(results.items(), key=lambda item: item[1].tip_error):
-        first = result.histories[0]
-        effort = _mean_effort(result.scene.linkage, first.effort[0]), result.effort
-        error = first.tip_error[0], result.tip_error
-        cells = *(1e3 * e for e in error), *(1e2 * e for e in effort)
-        rows.append(
-            f"{name:4}"
-            + "".join(f"{cell:12.4g}" for cell in cells)
-            + f"{result.at_bound.sum():8d}/{result.tuned_gains}"
-        )
-    return "\n".join(rows)

@@ -1,21 +1,19 @@
 """Tuning of PD gains by gradients through the simulation."""
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable
 
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..base.checks import keywords_as, one_of, real_array, refusal, whole_number
+from ..base.checks import one_of, refusal, whole_number
 from ..linkage.linkage import joint_names
 from ..search import METHODS, Lanes, Row, Run, best_of, check_motion, minimise
 from ..simulation.jacobian import TOLERANCE
-from ..simulation.scene import Scene, stacked, unstacked, with_full_size
+from ..simulation.scene import Scene, unstacked, with_full_size
 from .losses import (
     SAMPLES,
     Loss,
-    Tracking,
     bounds_of,
     check_tuned,
     controller_of,
@@ -25,7 +23,7 @@ from .losses import (
     unusable_loss,
     with_gains,
 )
-from .result import TradeOff, TuneResult, result_of
+from .result import TuneResult, result_of
 
 _ENOUGH = 1e-4  # relative decrease of the loss; half of it in the rms error
 # The worst of an ensemble is smoothed to a power mean of this order. With n members it
@@ -33,65 +31,16 @@ _ENOUGH = 1e-4  # relative decrease of the loss; half of it in the rms error
 _ORDERS = {"mean": 1, "worst": 32}
 
 
-def _members(ensemble: Scene, scene: Scene, losses: Sequence[Loss]) -> list[Scene]:
+def _members(ensemble: Scene, scene: Scene, loss: Loss) -> list[Scene]:
     """Checks the argument `ensemble` of `tune`, whose members get the scene's gains."""
     alike = lambda s: (joint_names(s.linkage), type(controller_of(s)).__name__)
     members = unstacked("ensemble", ensemble)
     for i, member in enumerate(members):
-        for loss in losses:
-            check_tuned(f"ensemble[{i}]", member, loss)
+        check_tuned(f"ensemble[{i}]", member, loss)
         if alike(member) != alike(scene):
             expected = f"joints and a controller like the scene's, {alike(scene)}"
             raise refusal(f"ensemble[{i}]", expected, alike(member))
     return [with_gains(member, gains_of(scene)) for member in members]
-
-
-def _search(
-    scenes: Sequence[Scene], losses: Sequence[Loss], *, factor, bounds, ensemble, over,
-    method, starts, seed, max_steps, report,
-) -> list[TuneResult]:  # fmt: skip
-    """One result per scene and loss; the keywords are those of `tune`."""
-    one_of("method", method, tuple(METHODS))
-    one_of("over", over, tuple(_ORDERS))
-    if over == "worst" and ensemble is None:
-        raise ValueError("over: expected an ensemble to take the worst of, got none.")
-    starts = whole_number("starts", starts, 1, np.iinfo(np.int32).max)
-    draw = np.random.default_rng(whole_number("seed", seed, 0))
-    for scene, loss in zip(scenes, losses):
-        check_tuned("scene", scene, loss)
-    boxes = [bounds_of(scene, factor, bounds) for scene in scenes]
-    if ensemble is None:
-        members = [[scene] for scene in scenes]
-    else:
-        members = [_members(ensemble, scenes[0], losses)] * len(losses)
-    problems = [
-        [(with_full_size(member), loss) for member in row]
-        for row, loss in zip(members, losses)
-    ]
-    z, low, high = np.repeat([b.logs() for b in boxes], starts, axis=0).swapaxes(0, 1)
-    # The first run of each scene starts from its gains, the others at random.
-    random = np.arange(len(z)) % starts > 0
-    z[random] = draw.uniform(low[random], high[random])
-    runs = minimise(
-        Lanes(evaluate_gains, problems, starts, _ORDERS[over]), z, low, high,
-        method=method, max_steps=max_steps, enough=_ENOUGH, report=report,
-        describe=_best_so_far,
-    )  # fmt: skip
-    settings = dict(
-        method=method,
-        over=over if ensemble is not None else "one scene",
-        solver="Tsit5",
-        tolerance=TOLERANCE,
-        samples=SAMPLES,
-        dtype=str(jnp.result_type(float)),
-    )
-    results = []
-    for i, (scene, box) in enumerate(zip(scenes, boxes)):
-        mine = runs[i * starts : (i + 1) * starts]
-        if all(run.failed for run in mine):
-            raise _failure(members[i], mine[0].rows[0], ensemble is not None)
-        results.append(result_of(scene, mine, box, settings))
-    return results
 
 
 def _failure(members: list[Scene], first: Row, ensemble: bool) -> ValueError:
@@ -135,8 +84,8 @@ def tune(
     The unknowns are the logarithms of kp and kd; gains of zero stay zero. Derivatives
     are integrated beside the motion at a tolerance of 1e-5. Their relative error is
     about 1e-6, and some 1e-4 where actuators are at their limits for long;
-    `gradient_report` measures it. A second call with other numbers or another method
-    compiles nothing; a call with a loss function of other code does.
+    `gradient_report` measures it. A second call with other numbers, another topology or
+    another method compiles nothing; a call with a loss function of other code does.
 
     **Arguments:**
 
@@ -167,61 +116,32 @@ def tune(
     **Raises:** ValueError for malformed arguments, and if the scene cannot be simulated
     from its start.
     """
-    return _search(
-        [scene], [loss], factor=factor, bounds=bounds, ensemble=ensemble, over=over,
-        method=method, starts=starts, seed=seed, max_steps=max_steps, report=report,
-    )[0]  # fmt: skip
-
-
-def tune_each(
-    scenes: Mapping[str, Scene] | Sequence[Scene],
-    *,
-    loss: Loss = tip_errors,
-    **keywords: Any,
-) -> Any:
-    """Tunes several scenes of one structure in one compiled program.
-
-    The topologies may differ.
-
-    **Arguments:** `scenes`: a list, or a dict by name as `circle_scenes` returns. The
-    other arguments are those of `tune` without `ensemble` and `over`.
-
-    **Returns:** a list of `TuneResult`s, or a dict by the same names.
-
-    **Raises:** ValueError as `tune`, and for scenes of different structure; TypeError
-    for unknown keywords.
-
-    >>> import fdof_jax as fj
-    >>> scenes = fj.tuning.circle_scenes()
-    >>> pair = {name: scenes[name]._replace(t1=1.0) for name in ("PPR", "RRR")}
-    >>> results = fj.tuning.tune_each(pair, max_steps=2)
-    >>> {name: result.tip_error for name, result in results.items()}  # [m]
-    {'PPR': 0.0077, 'RRR': 0.0293}
-    """
-    if isinstance(scenes, Mapping):
-        results = tune_each(list(scenes.values()), loss=loss, **keywords)
-        return dict(zip(scenes, results))
-    keywords = keywords_as(tune, keywords, without=("loss", "ensemble", "over"))
-    stacked(scenes)  # raises unless the scenes are alike
-    losses = [loss] * len(scenes)
-    return _search(scenes, losses, ensemble=None, over="mean", **keywords)
-
-
-def trade_off(scene: Scene, prices: ArrayLike, **keywords: Any) -> TradeOff:
-    """Tunes a scene for each price of effort, in one compiled program.
-
-    **Arguments:** `scene`; `prices`: prices of effort (price,), see `Tracking` [m^2].
-    The other arguments are those of `tune` without `loss`.
-
-    **Returns:** a `TradeOff`, in the order of the prices.
-
-    **Raises:** ValueError as `tune`; TypeError for unknown keywords.
-    """
-    keywords = keywords_as(tune, keywords, without=("loss",))
-    prices = np.asarray(real_array("prices", prices, (None,), minimum=0))
-    if prices.size == 0:
-        raise ValueError("prices: expected at least one, got none.")
-    losses = [Tracking(effort=price) for price in prices]
-    results = _search([scene] * len(prices), losses, **keywords)
-    error, effort = np.array([(r.tip_error, r.effort) for r in results]).T
-    return TradeOff(prices, error, effort, results)
+    one_of("method", method, tuple(METHODS))
+    one_of("over", over, tuple(_ORDERS))
+    if over == "worst" and ensemble is None:
+        raise ValueError("over: expected an ensemble to take the worst of, got none.")
+    starts = whole_number("starts", starts, 1, np.iinfo(np.int32).max)
+    draw = np.random.default_rng(whole_number("seed", seed, 0))
+    check_tuned("scene", scene, loss)
+    box = bounds_of(scene, factor, bounds)
+    members = [scene] if ensemble is None else _members(ensemble, scene, loss)
+    problem = [(with_full_size(member), loss) for member in members]
+    z, low, high = np.repeat([box.logs()], starts, axis=0).swapaxes(0, 1)
+    # The first run starts from the scene's gains, the others at random.
+    z[1:] = draw.uniform(low[1:], high[1:])
+    runs = minimise(
+        Lanes(evaluate_gains, [problem], starts, _ORDERS[over]), z, low, high,
+        method=method, max_steps=max_steps, enough=_ENOUGH, report=report,
+        describe=_best_so_far,
+    )  # fmt: skip
+    if all(run.failed for run in runs):
+        raise _failure(members, runs[0].rows[0], ensemble is not None)
+    settings = dict(
+        method=method,
+        over=over if ensemble is not None else "one scene",
+        solver="Tsit5",
+        tolerance=TOLERANCE,
+        samples=SAMPLES,
+        dtype=str(jnp.result_type(float)),
+    )
+    return result_of(scene, runs, box, settings)

@@ -1,7 +1,10 @@
 """Scenes 21 and 22: sizes other than a metre, other units, and many turns."""
 
+import diffrax
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
+import optimistix
 import pytest
 
 import fdof_jax as fj
@@ -11,9 +14,17 @@ TS = np.linspace(0, 5, 11)
 
 
 @eqx.filter_jit
-def scaled_motion(linkage, state0, ts, dt0):
-    steps = fj.simulation.scale_tolerances(linkage)
-    return fj.simulate(linkage, state0, ts, stepsize_controller=steps, dt0=dt0)
+def in_units(linkage, state0, ts, unit_q, unit_qd):
+    """Returns a motion whose errors are measured in a unit per coordinate."""
+
+    def norm(error):
+        q, qd, *own = error
+        return optimistix.rms_norm(
+            (jnp.stack(q) / unit_q, jnp.stack(qd) / unit_qd, own)
+        )
+
+    steps = diffrax.PIDController(rtol=1e-11, atol=1e-11, norm=norm)
+    return fj.simulate(linkage, state0, ts, stepsize_controller=steps)
 
 
 def scaled(topology, size, mass, gravity=9.81):
@@ -34,7 +45,8 @@ def scaled(topology, size, mass, gravity=9.81):
 def test_sizes_and_units_do_not_matter(topology):
     """An absolute tolerance of 1e-11 m depends on the size of the arm.
 
-    It is 1e-8 of an arm of 1 mm, and near rounding for one of 1 km.
+    It is 1e-8 of an arm of 1 mm, and near rounding for one of 1 km. The defaults serve
+    both, and so do units per coordinate.
     """
     worlds = {
         "1 mm": scaled(topology, 1e-3, 1e-3),
@@ -44,10 +56,14 @@ def test_sizes_and_units_do_not_matter(topology):
     usual = fj.simulate(arm(topology), START, TS)
     for name, (linkage, unit, time) in worlds.items():
         start = fj.State(START.q * unit, START.qd)
-        motion = scaled_motion(linkage, start, TS * time, 1e-3 * time)
-        assert np.abs(motion.q / unit[None] - usual.q).max() <= 1e-7, name
-        steps = motion.stats["num_steps"] / usual.stats["num_steps"]
-        assert 0.5 < steps < 2, name
+        motions = (
+            fj.simulate(linkage, start, TS * time),
+            in_units(linkage, start, TS * time, unit, unit / time),
+        )
+        for motion in motions:
+            assert np.abs(motion.q / unit[None] - usual.q).max() <= 5e-10, name
+            steps = motion.stats["num_steps"] / usual.stats["num_steps"]
+            assert 0.5 < steps < 2, name
 
 
 @pytest.mark.parametrize("joints", [[1, 0, 0], [1, 1, 1]], ids=["first", "all"])
