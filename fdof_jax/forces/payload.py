@@ -1,13 +1,12 @@
 """Masses that an arm takes and lets go."""
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from ..linkage.fields import Condition, Truth, Values, field, has_come, of_kind, ordered
-from ..linkage.frames import scalar_frames
+from ..linkage.frames import plane_vector, scalar_frames
 from .element import InertialElement
 from .points import Load, Point
 
@@ -105,5 +104,5 @@ class Payload(InertialElement):
     def loads(self, t, q, qd, qdd, linkage):
         """Returns its weight and inertia as a load on its place."""
         x, y, turning = self.accelerations(q, qd, qdd, linkage)
-        force = -self.mass * (jax.lax.complex(x, y) + 1j * linkage.gravity)
+        force = -self.mass * (plane_vector(x, y) + 1j * linkage.gravity)
         return (Load(self.place, force, -self.inertia * turning),)
