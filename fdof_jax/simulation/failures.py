@@ -155,10 +155,12 @@ def _of_steep_efforts(inputs: Inputs) -> str:
         return ""
     own = own0 or initial_states(linkage, forces)
     for k, element, state in with_states(forces, own):
-        effort = lambda q: element_effort(k, element, ts[0], q, qd, linkage, state)
-        here = np.asarray(effort(q))
-        beside = [effort(q + step) - here for step in _NEAR * np.eye(q.size)]
-        if np.abs(beside).max() > 0.1 * np.abs(here).max():
+        places = [q, *(q + step for step in _NEAR * np.eye(q.size))]
+        here, *beside = (
+            np.asarray(element_effort(k, element, ts[0], at, qd, linkage, state))
+            for at in places
+        )
+        if np.abs(np.array(beside) - here).max() > 0.1 * np.abs(here).max():
             return f" The effort of forces[{k}] changes too fast.{singular}"
     return ""
 
@@ -172,8 +174,8 @@ def _of_singular_arm(linkage: Linkage, q: Array) -> str:
         return ""
     return (
         " The tip's Jacobian J is singular there, or nearly (condition number "
-        f"{condition:.2g}), as of an arm that is straight or folded: what inverts J has "
-        "no bound; a damped inverse, J^T (J J^T + c I)^-1, has one."
+        f"{condition:.2g}), as of an arm that is straight or folded: what inverts J "
+        "has no bound; a damped inverse, J^T (J J^T + c I)^-1, has one."
     )
 
 
