@@ -6,6 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from test_drawing import make_linkage
 from test_tables import solution
 
@@ -31,6 +32,19 @@ def test_a_solution_is_told_in_a_line_and_in_a_table():
     assert cells(batch._repr_html_()) == rows
     assert repr(batch) == f"Solution({'; '.join(map(': '.join, rows))})"
     assert "motions: 3 x 2;" in repr(solution(3, 2))
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+def test_a_motion_says_what_its_positions_resolve(kind):
+    tolerance = {np.float32: 1e-5, np.float64: 1e-11}[kind]
+    for largest in 1.0, 1e2, 1e3, 1e5, 6.6e6, np.nan:
+        q = np.full((5, 3), 0.1, kind)
+        q[2, 1], q[3] = -largest, np.nan
+        told = repr(eqx.tree_at(lambda motion: motion.q, solution(), q))
+        change = np.nextafter(kind(largest), kind(np.inf)) - kind(largest)
+        words = f"positions: up to {largest:.2g} m or rad, resolved to {change:.2g} in "
+        assert (words in told) == (change > tolerance and np.isfinite(largest))
+        assert ("resolved" in told) == (words in told)
 
 
 def test_displays_read_no_traced_values():

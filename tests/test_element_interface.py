@@ -176,6 +176,68 @@ def test_one_time_of_a_jump_needs_no_list():
     np.testing.assert_array_equal(*ends)
 
 
+class Pushes(fj.Element):
+    """A force between times that a list holds, which no field declares."""
+
+    jump_ts: list | tuple | np.ndarray
+
+    def __call__(self, t, q, qd, linkage):
+        begin, end = self.jump_ts
+        return jnp.where((t >= begin) & (t < end), 2.0, 0.0) * jnp.ones_like(q)
+
+
+def pushing(jump_ts):
+    def push(t, q, qd, linkage):
+        begin, end = 0.3, 0.7
+        return jnp.where((t >= begin) & (t < end), 2.0, 0.0) * jnp.ones_like(q)
+
+    push.jump_ts = jump_ts
+    return push
+
+
+def led(jump_ts):
+    def stand(t, linkage):
+        return jnp.ones(1), jnp.zeros(1)
+
+    stand.jump_ts = jump_ts
+    return fj.PDController(1.0, 1.0, 1.0, stand)
+
+
+SLIDE = fj.Linkage(
+    "P", length=[0, 1], com=[[0, 0]], mass=[1], inertia=[1], base_angle=np.pi / 2
+)
+PUSHED = Pushes, pushing, led
+
+
+@pytest.mark.parametrize("make", PUSHED)
+@pytest.mark.parametrize("kind", [list, tuple, np.array])
+def test_times_of_jumps_may_be_a_list(make, kind):
+    forces = elements("forces", (make(kind([0.3, 0.7])),))
+    check_elements(forces, SLIDE, TS)
+    found = known_times(clocks_apart(args_of(SLIDE, ZERO[:1], forces), TS))
+    np.testing.assert_array_equal(found, [0.3, 0.7])
+
+
+@pytest.mark.parametrize("make", PUSHED)
+@pytest.mark.parametrize("value", ["x", [0.3, None], [[0.3], [0.7, 1]], [np.nan], [1j]])
+def test_other_times_of_jumps_are_refused(make, value):
+    name = "reference.jump_ts" if make is led else "jump_ts"
+    words = rf"(?s)^forces\[1\]\.{name}: expected .*real number.*\[s\], got "
+    with pytest.raises(ValueError, match=words):
+        fj.simulate(
+            SLIDE, fj.State([0.0], [0.0]), TS, (fj.JointDamper(0.0), make(value))
+        )
+
+
+@pytest.mark.parametrize("make", PUSHED[:2])
+def test_steps_end_at_times_in_a_list(make):
+    still = fj.State([0.0], [0.0])
+    motion = fj.simulate(SLIDE, still, TS, (make([0.3, 0.7]),))
+    # 2 N on 1 kg for 0.4 s, then 0.3 s at 0.8 m/s
+    np.testing.assert_allclose(motion.q[-1], 0.16 + 0.24, rtol=1e-13)
+    assert motion.stats["num_rejected_steps"] == 0
+
+
 class Shifts(fj.forces.element.ScalarElement):
     """Efforts from a table: which, and whether, are a whole number and a flag."""
 

@@ -136,3 +136,31 @@ def test_what_chatters_is_named_with_its_joint(forces, words):
     found = str(raised.value)
     assert "forces[1] (_Sign) chatters" in found and "at joint R2" in found
     assert words in found
+
+
+def test_an_arm_that_is_singular_under_task_space_control_is_named():
+    arm, target = fj.scenes.double_pendulum().linkage, np.array([1.2, 0.5])
+
+    def pulled(t, q, qd, linkage, inverse):
+        J = fj.tip_jacobian(linkage, q)[:2]
+        away = target - fj.tip_position(linkage, q)
+        return inverse(J) @ (100 * away - 20 * J @ qd)
+
+    def inverting(t, q, qd, linkage):
+        return pulled(t, q, qd, linkage, jnp.linalg.inv)
+
+    def damped(t, q, qd, linkage):
+        near = lambda J: J.T @ jnp.linalg.inv(J @ J.T + 1e-2 * jnp.eye(2))
+        return pulled(t, q, qd, linkage, near)
+
+    start = fj.State([0.3, 1e-9], [0, 0])
+    with pytest.raises(RuntimeError) as raised:
+        fj.simulate(arm, start, [0, 0.1], (fj.JointDamper(0.1), inverting))
+    J = np.asarray(fj.tip_jacobian(arm, start.q))[:2]
+    words = rf"forces\[1\] .* J is singular .*number {np.linalg.cond(J):.2g}\b.* damped"
+    assert re.search(words.replace("+", r"\+"), str(raised.value))
+    # As it says, a damped inverse helps; what is straight for no reason is not named.
+    assert fj.simulate(arm, start, [0, 0.1], (damped,)).outcome == "successful"
+    with pytest.raises(RuntimeError) as raised:
+        fj.simulate(arm, start, [0, 20.0], (damped,), dt0=10.0, max_steps=1)
+    assert str(raised.value).endswith("No step met the tolerance.")

@@ -401,3 +401,24 @@ def test_malformed_batches():
         fj.identification.fit_each(MIXED, FIRST, TS, 3.0)
     with pytest.raises(TypeError, match="tolerance: expected a keyword among observe,"):
         fj.identification.fit_each(MIXED, FIRST, TS, SEEN[None], tolerance=1e-3)
+
+
+def test_angles_that_wrap_are_named():
+    """A rotor that slows down: q = (1 - exp(-d t)) 8 / d, as encoders read it."""
+    rotor = fj.Linkage("R", length=[0, 1], com=[[0, 0]], mass=[1], inertia=[1])
+
+    def slowing(p):
+        start = fj.State([0.0], [8.0])
+        return fj.Scene(rotor, start, (fj.JointDamper(p["damping"]),), 2.0)
+
+    angle = (1 - np.exp(-0.5 * TS)) * 8 / 0.5
+    wrapped = (angle + np.pi) % (2 * np.pi) - np.pi
+    remarks = []
+    for readings in (wrapped, np.unwrap(wrapped)):
+        found = fj.fit(
+            slowing, {"damping": 0.4}, TS, readings[:, None],
+            observe=lambda scene, solution: solution.q,
+        )  # fmt: skip
+        remarks.append((found.usable, "numpy.unwrap" in str(found)))
+    assert remarks == [(False, True), (True, False)]
+    np.testing.assert_allclose(found.parameters["damping"], 0.5, rtol=1e-6)

@@ -16,7 +16,9 @@ from numpy.typing import ArrayLike
 from ..base.checks import check_known, instance, real_array, refusal
 from ..control.pd import PDController
 from ..dynamics import bias_force, forward_dynamics
+from ..forces.added_inertia import present
 from ..forces.element import Element, Forces, elements_on
+from ..forces.holders import check_free, holders
 from ..linkage.coordinates import State, real_state
 from ..linkage.linkage import (
     Linkage,
@@ -51,14 +53,17 @@ class Linearization(NamedTuple):
 
 
 def depends_on_state_alone(linkage: Linkage, forces: tuple[Element, ...]) -> bool:
-    """Returns whether no element has a state of its own or prescribes a motion."""
-    return not has_states(linkage, forces) and prescribed(forces) is None
+    """Returns whether no element has a state, holds joints or prescribes a motion."""
+    unknown = has_states(linkage, forces) or prescribed(forces) is not None
+    return not (unknown or holders(forces))
 
 
 def checked(linkage: Linkage, forces: Forces) -> tuple[Element, ...]:
-    """Returns the forces as elements, which may have no state."""
+    """Returns the forces as elements, which may have no state and hold no joints."""
     check_linkage(linkage)
     acting = elements_on(linkage, forces)
+    for index, element in enumerate(acting):
+        check_free(f"forces[{index}]", element)
     if depends_on_state_alone(linkage, acting):
         return acting
     expected = "elements without a state of their own and no PrescribedMotion"
@@ -80,7 +85,8 @@ def equilibrium(
     instance from a guess at which actuators are at their limits. The equilibrium need
     not be stable: see `linearize`.
 
-    **Raises:** ValueError for malformed arguments.
+    **Raises:** ValueError for malformed arguments, and elements that hold joints: a
+    joint that friction holds rests at many positions.
 
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig5().linkage
@@ -130,7 +136,8 @@ def _lacking(
     """Efforts that the arm needs beside the forces to stay at rest."""
     q, still = without_fixed(linkage, q), jnp.zeros_like(q)
     acting = total_effort(linkage, forces, t, q, still)
-    return without_fixed(linkage, bias_force(linkage, q, still, forces) - acting)
+    bias = bias_force(linkage, q, still, present(forces, t))
+    return without_fixed(linkage, bias - acting)
 
 
 def holding_efforts(
@@ -206,7 +213,8 @@ def _linearized(
     def rates(y):
         q, qd, tau = (without_fixed(linkage, part) for part in jnp.split(y, 3))
         tau = tau + total_effort(linkage, forces, t, q, qd)
-        return jnp.concatenate([qd, forward_dynamics(linkage, q, qd, tau, forces)])
+        qdd = forward_dynamics(linkage, q, qd, tau, present(forces, t))
+        return jnp.concatenate([qd, qdd])
 
     slopes = jax.jacfwd(rates)(jnp.concatenate([q, qd, tau]))
     return Linearization(*jnp.split(slopes, [2 * q.size], axis=1))

@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike
 
 from ..base.checks import check_known, instance, one_of, real_array, refusal
 from ..forces.element import Forces, elements_on
+from ..forces.holders import check_free
 from ..linkage.linkage import Linkage, joint_names, moving_joints, per_joint
 from ..simulation.prescribed import prescribed
 from .linearization import checked, loop_matrices
@@ -110,6 +111,7 @@ def loops_of(
         expected = "a force element, a PDController for instance"
         raise refusal("controller", expected, controller)
     (element,) = elements_on(linkage, (controller,))
+    check_free("controller", element)
     if prescribed((element,)) is not None:
         raise refusal("controller", "one that computes efforts", controller)
     q, t = per_joint("q", q, linkage), real_array("t", t, ())

@@ -70,6 +70,7 @@ def joint_reactions(
     forces = elements("forces", forces)
     efforts = joint_efforts(linkage, forces, solution)
     rows = solution.ts, solution.q, solution.qd, efforts.total
+    rows = tuple(jnp.asarray(row, float) for row in rows)  # some may be in float32
     return _reactions(linkage, acting_in(solution, forces), rows)
 
 

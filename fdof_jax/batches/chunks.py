@@ -268,7 +268,7 @@ def expected_work(common: Common, moving: PyTree) -> Array:
 
         def at(t, q, qd):
             tau = total_effort(linkage, acting, t, q, qd)
-            qdd = forward_dynamics(linkage, q, qd, tau, forces)
+            qdd = forward_dynamics(linkage, q, qd, tau, present(acting, t))
             rate, acceleration = (jnp.where(turning, a, 0) for a in (qd, qdd))
             norm = jnp.linalg.norm
             return qdd, norm(rate) + jnp.sqrt(norm(acceleration))

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ..linkage.fields import Values, field, value_of
-from ..linkage.frames import cross, dot, length_of, scalar_frames
+from ..linkage.frames import cross, dot, length_of, plane_vector, scalar_frames
 from ..linkage.linkage import Linkage, joints_of
 from ..linkage.topology import fixed_pairs, real_joints
 from .element import InertialElement
@@ -165,8 +165,8 @@ class LinearActuator(Between, InertialElement):
         """
         x1, y1, x2, y2, turning = self.accelerations(q, qd, qdd, linkage)
         weight = 1j * linkage.gravity
-        cylinder = self.mass[0] * (jax.lax.complex(x1, y1) + weight)
-        piston = self.mass[1] * (jax.lax.complex(x2, y2) + weight)
+        cylinder = self.mass[0] * (plane_vector(x1, y1) + weight)
+        piston = self.mass[1] * (plane_vector(x2, y2) + weight)
         vector, rate = jax.jvp(lambda q: self._bodies(linkage, q)[2], (q,), (qd,))
         length = length_of(vector)
         unit = vector / length

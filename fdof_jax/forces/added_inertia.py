@@ -7,9 +7,11 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from ..base.checks import refusal
 from ..linkage.linkage import Linkage
 from ..mechanics.equations import Upper
 from .element import Element, Forces, InertialElement, elements_on
+from .payload import Payload
 
 
 def inertial(forces: Forces) -> tuple[InertialElement, ...]:
@@ -22,14 +24,24 @@ def present(forces: Forces, t: Array) -> Forces:
     return tuple(e.at(t) if isinstance(e, InertialElement) else e for e in forces)
 
 
+def _without_times(linkage: Linkage, forces: Forces) -> tuple[Element, ...]:
+    """Returns forces as elements; raises ValueError for masses that come or go."""
+    found = elements_on(linkage, forces)
+    for index, element in enumerate(found):
+        if isinstance(element, Payload) and element.jump_ts is not None:
+            expected = "a payload at one time (payload.at(t)), as no time is given here"
+            raise refusal(f"forces[{index}]", expected, element)
+    return found
+
+
 def inertial_on(linkage: Linkage, forces: Forces) -> tuple[InertialElement, ...]:
     """Checks the tuple of elements and returns those that move masses."""
-    return inertial(elements_on(linkage, forces))
+    return inertial(_without_times(linkage, forces))
 
 
 def energetic_on(linkage: Linkage, forces: Forces) -> tuple[Element, ...]:
     """Checks the tuple of elements and returns those with energy, springs included."""
-    parts = elements_on(linkage, forces)
+    parts = _without_times(linkage, forces)
     return tuple(e for e in parts if e.potential_energy is not None)
 
 

@@ -37,8 +37,9 @@ class Element(Part):
 
     - `conditions`: conditions on values, beside the bounds that `field` declares;
       `conditions_on(linkage)`: those on the arm's joints.
-    - `jump_ts`: times at which the efforts jump; steps end there [s]. By default they
-      are those of its fields: of a reference, or of a function of time.
+    - `jump_ts`: a time at which the efforts jump, or a list of such times; steps end
+      there [s]. By default they are those of its fields: of a reference, or of a
+      function of time.
     - `check(linkage, ts)`: raises ValueError if the element does not fit the arm;
       `simulate` calls it for words after a motion that failed.
     - `potential_energy(q, linkage)`: energy that it stores, () [J]; by default None.

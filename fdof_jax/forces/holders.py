@@ -232,3 +232,15 @@ def holders(forces: Forces) -> tuple[Holder, ...]:
     if sum(isinstance(e, HardStops) for e in found) > 1:
         raise ValueError("forces: expected one HardStops at most, got several.")
     return found
+
+
+def check_free(name: str, element: object) -> None:
+    """Raises ValueError for an element that holds joints, where all must be free."""
+    if isinstance(element, Holder) and element.holds:
+        raise refusal(
+            name,
+            "no element that holds joints, as only motions have modes; without it "
+            "they are free, a fixed pair (F) holds one, and JointStops and "
+            "JointFriction with a speed can stay",
+            element,
+        )

@@ -1,13 +1,12 @@
 """Masses that an arm takes and lets go."""
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from ..linkage.fields import Condition, Truth, Values, field, has_come, of_kind, ordered
-from ..linkage.frames import scalar_frames
+from ..linkage.frames import plane_vector, scalar_frames
 from .element import InertialElement
 from .points import Load, Point
 
@@ -17,8 +16,8 @@ class Payload(InertialElement):
 
     Where it is taken, a blow changes the rates of all joints: the momenta of arm and
     body before are those of both together after. Where it is let go, rates do not jump.
-    Functions of one instant, such as `mass_matrix` and `energy`, count it as taken;
-    `at(t)` is the payload at a time.
+    Functions without a time, such as `mass_matrix` and `energy`, do not know whether it
+    is taken: give them `at(t)`, the payload at a time.
 
     **Arguments:**
 
@@ -76,7 +75,12 @@ class Payload(InertialElement):
             return self
         there = self.there(t)
         scaled = jnp.where(there, self.mass, 0), jnp.where(there, self.inertia, 0)
-        return eqx.tree_at(lambda p: (p.mass, p.inertia), self, scaled)
+        return eqx.tree_at(
+            lambda p: (p.mass, p.inertia, p.begin, p.end, p.velocity),
+            self,
+            (*scaled, None, None, jnp.zeros_like(self.velocity)),
+            is_leaf=lambda leaf: leaf is None,
+        )
 
     def coordinates(self, q, linkage):
         frames = scalar_frames(linkage, tuple(q))
@@ -100,5 +104,5 @@ class Payload(InertialElement):
     def loads(self, t, q, qd, qdd, linkage):
         """Returns its weight and inertia as a load on its place."""
         x, y, turning = self.accelerations(q, qd, qdd, linkage)
-        force = -self.mass * (jax.lax.complex(x, y) + 1j * linkage.gravity)
+        force = -self.mass * (plane_vector(x, y) + 1j * linkage.gravity)
         return (Load(self.place, force, -self.inertia * turning),)

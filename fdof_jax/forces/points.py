@@ -27,7 +27,7 @@ from ..linkage.fields import (
     of_kind,
     value_of,
 )
-from ..linkage.frames import Frames, cross, length_of, scalar_frames
+from ..linkage.frames import Frames, cross, length_of, plane_vector, scalar_frames
 from ..linkage.linkage import Linkage, joints_of, per_joint, without_fixed
 from ..linkage.topology import MOST_PAIRS
 from ..mechanics.equations import Scalars
@@ -89,7 +89,7 @@ class Point(Part):
 
     def place(self, frames: Frames) -> Complex[Array, ""]:
         """Computes the point's position x + iy [m]."""
-        offset = jax.lax.complex(self.along, self.across)
+        offset = plane_vector(self.along, self.across)
         start, direction = (pick(self.link, rows) for rows in frames[:2])
         return start + offset * direction
 
@@ -110,7 +110,7 @@ class Load(NamedTuple):
             x, y = self.force
         except TypeError:  # complex, as in the library's own loads
             return self.force
-        return jax.lax.complex(*(jnp.asarray(part, float) for part in (x, y)))
+        return plane_vector(*(jnp.asarray(part, float) for part in (x, y)))
 
     def efforts(self, frames: Frames) -> tuple[Array, ...]:
         """Computes the joint efforts that do the same work [N or N m]."""
@@ -346,7 +346,7 @@ class Wrench(PointElement):
     def schedule(self, t, linkage):
         """Returns the force and the moment at a time."""
         force, moment = value_of(self, "force", t), value_of(self, "moment", t)
-        return jax.lax.complex(force[0], force[1]), moment
+        return plane_vector(force[0], force[1]), moment
 
     def loads(self, scheduled, frames, qd):
         force, moment = scheduled

@@ -22,6 +22,8 @@ _REMAINING = 0.03
 _REMAINING_PART = 1e-6
 # Least noise assumed of simulated readings, as a part of them.
 _ACCURACY = 1e-5
+# Readings that change by 2 pi to within so much are angles that wrap [rad].
+_NEAR_A_TURN = 1.0
 # Part of an undetermined direction above which a parameter belongs to it.
 _SHARED = 1e-6
 
@@ -186,6 +188,14 @@ def _noise_by_changes(run: Run, problems: list[Problem]) -> tuple[float, float]:
     return max(np.sqrt(facts["changes"] / (2 * pairs)), least), 0.75 / pairs
 
 
+def _wraps(problem: Problem) -> bool:
+    """Returns whether successive readings jump by a turn, as angles that wrap."""
+    there = problem.weight > 0
+    jumps = np.abs(np.diff(problem.observed, axis=0))
+    near = np.abs(jumps - 2 * np.pi) < _NEAR_A_TURN
+    return bool((near & there[1:] & there[:-1]).any())
+
+
 def fit_result(
     run: Run,
     problems: list[Problem],
@@ -265,6 +275,11 @@ def fit_result(
                 f"({np.sqrt(1 + excess / usual**2):.3g} times the noise is expected "
                 "from the standard errors alone)"
             )
+    if faults and any(map(_wraps, problems)):
+        message.append(
+            "readings jump by about 2 pi, as angles that wrap, while joints turn on: "
+            "numpy.unwrap(observed, axis=0) joins them"
+        )
     return FitResult(
         parameters=parameters,
         standard_errors=unknowns.named(np.sqrt(np.diag(covariance))),

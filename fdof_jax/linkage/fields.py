@@ -135,7 +135,7 @@ class Part(Frozen, metaclass=_Fields):
         """Yields conditions on the arm's joints; parts within have their own."""
         return ()
 
-    jump_ts = default(lambda self: jumps_of(*(part for _, part in _within(self))))
+    jump_ts = default(lambda self: jumps_of(dict(_within(self))))
 
     def check(self, linkage: Linkage, ts: Array) -> None:
         """Raises ValueError unless it fits the arm and the times, all known."""
@@ -308,11 +308,23 @@ def table_over_times(part: Part, name: str, least: int) -> Iterator[Condition]:
     yield Condition(len(ts) == rows, name, f"{len(ts)} rows, one per time", (rows,))
 
 
-def jumps_of(*parts: Part) -> Array | None:
-    """Returns all times at which the parts jump, or None."""
-    found = [part.jump_ts for part in parts]
+def jumps_at(name: str, part: Part) -> Array | None:
+    """Returns the times at which a part jumps, one or several (time,) [s], or None.
+
+    Raises ValueError unless they are real numbers.
+    """
+    if (jumps := part.jump_ts) is None:
+        return None
+    several = isinstance(jumps, list | tuple) or np.ndim(jumps)
+    shape, rules = (None,) if several else (), dict(finite=False, unit="s")
+    return jnp.ravel(real_array(f"{name}.jump_ts", jumps, shape, **rules))
+
+
+def jumps_of(parts: dict[str, Part]) -> Array | None:
+    """Returns all times at which parts jump, by their names, or None."""
+    found = [jumps_at(name, part) for name, part in parts.items()]
     times = [jumps for jumps in found if jumps is not None]
-    return jnp.concatenate([jnp.ravel(t) for t in times]) if times else None
+    return jnp.concatenate(times) if times else None
 
 
 def has_come(time: Array, t: Array | np.ndarray) -> Array:

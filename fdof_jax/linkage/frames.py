@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.lax import complex as plane_vector
 from numpy.typing import ArrayLike
 
 from ..base.known_values import in_numpy
@@ -18,6 +17,11 @@ Rows = Any  # arrays of JAX or NumPy, or lists of scalars
 
 # Vectors of the plane are complex numbers x + iy. A product with exp(i th) turns them
 # by th, a product with i by 90 degrees.
+
+
+def plane_vector(x: Array, y: Array) -> Array:
+    """Returns x + iy, in the wider precision of the two."""
+    return jax.lax.complex(*(part.astype(jnp.result_type(x, y)) for part in (x, y)))
 
 
 def plane_vectors(points: Array) -> Array:

@@ -18,6 +18,7 @@ from ..base.checks import instance
 from ..control.drives import controller_in
 from ..dynamics import link_energies
 from ..forces.element import Forces, ForeignElement, elements, elements_on
+from ..linkage.fields import jumps_at
 from ..linkage.linkage import Linkage, joint_names, moving_joints
 from ..linkage.topology import letters
 from ..references.reference import reference_motion, reference_of
@@ -128,7 +129,7 @@ def _references(
     paths = []
     for controller in map(controller_in, elements("forces", forces)):
         if controller:
-            jumps = reference_of(controller.reference).jump_ts
+            jumps = jumps_at("reference", reference_of(controller.reference))
             jumps = np.zeros(0) if jumps is None else np.asarray(jumps)
             jumps = jumps[(ts[0] < jumps) & (jumps <= ts[-1])]
             times = np.unique(np.concatenate([ts, np.nextafter(jumps, -np.inf), jumps]))

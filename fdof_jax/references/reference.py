@@ -25,7 +25,8 @@ class Reference(Part):
 
     - `assembly(t, linkage)`: positions, and a root that is 0 at the edge of the reach.
       The velocities are the exact rates of the positions.
-    - `jump_ts`: times at which the motion jumps; steps end there [s].
+    - `jump_ts`: a time at which the motion jumps, or a list of such times; steps end
+      there [s].
     - `check(linkage, ts)`: raises ValueError if the arm cannot follow.
     - `tip(t)`: the commanded position of the tip (2,) [m]; by default None.
     - `period`: the time of one turn [s]; by default None.

@@ -12,7 +12,8 @@ from jaxtyping import PyTree
 
 from ..forces.element import Element, ForeignElement, OwnStates
 from ..forces.holders import JointFriction
-from ..linkage.linkage import Linkage, joint_names
+from ..linkage.linkage import Linkage, joint_names, moving_joints
+from ..mechanics.kinematics import tip_jacobian
 from ..steps.derivative_control import linearised
 from .field import (
     args_of,
@@ -31,6 +32,9 @@ from .solve import solve
 # An explicit method of order 8 is stable for steps up to some 3 to 6 times the time
 # scale of a mode. Where accuracy decides, steps are shorter than twice that.
 _STABLE = 2.0
+# Beyond this condition number of the tip's Jacobian, an effort that inverts it is named
+# if it changes by a tenth of itself within so many m or rad.
+_NEARLY_SINGULAR, _NEAR = 1e6, 1e-6
 
 
 def cause(inputs: Inputs, keywords: Settings, solution: Solution) -> str:
@@ -42,7 +46,8 @@ def cause(inputs: Inputs, keywords: Settings, solution: Solution) -> str:
         for k, element, state in with_states(forces, own):
             effort = element_effort(k, element, ts[0], q, qd, linkage, state)
             if not np.isfinite(effort).all():
-                return f"The effort of forces[{k}] is not finite at the start."
+                found = f"The effort of forces[{k}] is not finite at the start."
+                return found + _of_singular_arm(linkage, q)
     if outcome in ("out of steps", "tolerance out of reach"):
         return _of_steps(inputs, keywords, solution)
     words = _of_joints(linkage, solution)
@@ -113,7 +118,7 @@ def _of_steps(inputs: Inputs, keywords, solution: Solution) -> str:
     steps = int(solution.stats["num_steps"])
     covered = float(solution.stats["time_reached"] - ts[0])
     if covered == 0:
-        return "No step met the tolerance."
+        return "No step met the tolerance." + _of_steep_efforts(inputs)
     mean = covered / max(int(solution.stats["num_accepted_steps"]), 1)
     # A little earlier, as rounding may shift the last step.
     share = 1 - 1e3 * float(jnp.finfo(ts.dtype).eps)
@@ -140,6 +145,37 @@ def _of_steps(inputs: Inputs, keywords, solution: Solution) -> str:
     return (
         f"At {mean:.2g} s a step, the whole time takes some {needed:,.0f} steps: "
         "raise max_steps, or loosen the tolerance (rtol, atol)."
+    )
+
+
+def _of_steep_efforts(inputs: Inputs) -> str:
+    """Names the element whose effort a singular arm makes grow at the start."""
+    linkage, (q, qd), ts, own0, forces, _ = inputs
+    if not (singular := _of_singular_arm(linkage, q)):
+        return ""
+    own = own0 or initial_states(linkage, forces)
+    for k, element, state in with_states(forces, own):
+        places = [q, *(q + step for step in _NEAR * np.eye(q.size))]
+        here, *beside = (
+            np.asarray(element_effort(k, element, ts[0], at, qd, linkage, state))
+            for at in places
+        )
+        if np.abs(np.array(beside) - here).max() > 0.1 * np.abs(here).max():
+            return f" The effort of forces[{k}] changes too fast.{singular}"
+    return ""
+
+
+def _of_singular_arm(linkage: Linkage, q: Array) -> str:
+    """Returns a sentence if the tip's Jacobian is nearly singular, else nothing."""
+    moving = moving_joints(linkage)
+    jacobian = np.asarray(tip_jacobian(linkage, q))[: len(moving), moving]
+    condition = np.linalg.cond(jacobian)
+    if len(moving) < 2 or not condition > _NEARLY_SINGULAR:
+        return ""
+    return (
+        " The tip's Jacobian J is singular there, or nearly (condition number "
+        f"{condition:.2g}), as of an arm that is straight or folded: what inverts J "
+        "has no bound; a damped inverse, J^T (J J^T + c I)^-1, has one."
     )
 
 

@@ -8,7 +8,7 @@ from jax import Array
 
 from ..forces.element import Forces
 from ..forces.payload import Payload
-from ..linkage.fields import jumps_of
+from ..linkage.fields import jumps_at
 from ..mechanics.equations import Scalars, zeros
 from ..steps.dopri8 import Integrated, ScheduledTerm
 from ..steps.landing import clearance
@@ -117,7 +117,7 @@ def clear_of_start(forces: Forces, ts: Array) -> Array:
 
 def known_times(args: Args) -> Array | None:
     """Returns the times [s] at which elements jump by their clocks, or None."""
-    if args.ahead is None:
-        return jumps_of(*args.forces)
-    times = [(e.jump_ts, args.ahead[k]) for k, e in enumerate(args.forces)]
-    return jnp.concatenate([jnp.ravel(t) - by for t, by in times if t is not None])
+    times = [jumps_at(f"forces[{k}]", e) for k, e in enumerate(args.forces)]
+    ahead = [0] * len(times) if args.ahead is None else args.ahead
+    times = [t - by for t, by in zip(times, ahead) if t is not None]
+    return jnp.concatenate(times) if times else None

@@ -23,7 +23,7 @@ from ..base.checks import (
 from ..base.known_values import in_numpy
 from ..forces.element import Element, Forces, OwnStates, elements_on, naming
 from ..linkage.coordinates import State, real_state
-from ..linkage.fields import check_values
+from ..linkage.fields import check_values, jumps_at
 from ..linkage.linkage import Linkage, check_linkage
 from ..steps.controllers import at_tolerances, with_longest, within_reach
 from .failures import cause, check_arguments
@@ -99,9 +99,8 @@ def elements_at_door(linkage: Linkage, forces: Forces) -> tuple[Element, ...]:
     adapted = elements_on(linkage, forces)
     for index, element in enumerate(adapted):
         place = f"forces[{index}]"
-        if (jumps := in_numpy(element).jump_ts) is not None:
-            shape = (None,) if np.ndim(jumps) else ()
-            real_array(f"{place}.jump_ts", jumps, shape, finite=False)
+        with naming(place):
+            jumps_at(place, in_numpy(element))
         single_precision(place, element)
     return adapted
 

@@ -15,6 +15,7 @@ from ..base.checks import is_traced, known
 from ..base.report import html_table
 from ..forces.element import OwnStates
 from ..linkage.topology import rate_unit
+from ..steps.controllers import SINGLE_TOLERANCE, TOLERANCE
 
 Statistics = dict[str, Any]  # arrays by name, and diffrax's `max_steps`
 
@@ -113,6 +114,8 @@ class Solution(eqx.Module):
 
     - `ts`: output times [s].
     - `q`, `qd`: joint positions [m or rad] and velocities at `ts`; NaN after a failure.
+      Printed, a motion says if its positions are so large that their digits end before
+      the default tolerance, as angles that grow without end.
     - `stats`: diffrax's statistics, `num_steps` among them; `time_reached` [s]; and,
       with adaptive steps, `accuracy`: the rounding unit, 2.2e-16 in float64, over the
       least of the `inertia_ratios` at the steps. It tells how many digits the equations
@@ -231,12 +234,23 @@ class Solution(eqx.Module):
             facts["switches"] = _span(self.stats["num_switches"])
         if remarks := remarks_on_derivatives(self.stats):
             facts["derivatives"] = ", ".join(remarks)
+        if known(self.q) and (remark := _remark_on_resolution(np.asarray(self.q))):
+            facts["positions"] = remark
         return facts
 
 
 def _span(numbers: ArrayLike) -> str:
     least, most = np.min(numbers), np.max(numbers)
     return f"{least}" if least == most else f"{least} to {most}"
+
+
+def _remark_on_resolution(q: np.ndarray) -> str | None:
+    """Returns how far positions are resolved, if less than the default tolerance."""
+    largest = np.max(np.abs(q), initial=0, where=np.isfinite(q))
+    step = np.spacing(largest)
+    if step <= (TOLERANCE if q.dtype == np.float64 else SINGLE_TOLERANCE):
+        return None
+    return f"up to {largest:.2g} m or rad, resolved to {step:.2g} in {q.dtype}"
 
 
 def remarks_on_derivatives(stats: Statistics) -> list[str]:

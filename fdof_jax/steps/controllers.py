@@ -21,6 +21,8 @@ Controller = diffrax.AbstractStepSizeController
 Judging = diffrax.AbstractAdaptiveStepSizeController  # judges errors of steps
 _C = TypeVar("_C", bound=Controller)
 _T = TypeVar("_T")
+# Default tolerances in float64 and float32, relative and absolute.
+TOLERANCE, SINGLE_TOLERANCE = 1e-11, 1e-5
 # Rounding keeps float32 from meeting a tighter relative or absolute tolerance.
 _TIGHTEST_SINGLE = 1e-6
 
@@ -198,7 +200,7 @@ def adaptive(
 
 
 def _default_tolerance() -> float:
-    return of_precision(1e-11, 1e-5)
+    return of_precision(TOLERANCE, SINGLE_TOLERANCE)
 
 
 def default_controller() -> diffrax.PIDController:

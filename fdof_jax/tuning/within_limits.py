@@ -123,9 +123,9 @@ def _largest(values: Array, blocks: int) -> Array:
 
 def controller_and_others(scene: Scene) -> tuple[PDController, tuple[Element, ...]]:
     """Returns the controller of a scene and its other forces."""
-    controller = controller_of(scene)
-    others = tuple(force for force in scene.forces if force is not controller)
-    return controller, checked(scene.linkage, others)
+    controller, acting = controller_of(scene), checked(scene.linkage, scene.forces)
+    rows = zip(acting, scene.forces)
+    return controller, tuple(e for e, force in rows if force is not controller)
 
 
 def rest_of(scene: Scene) -> Array:
