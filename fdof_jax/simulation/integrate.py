@@ -91,13 +91,16 @@ def integrate(
     repeated.
     `tangents`: judges tangents over which the caller maps, along the axis `TANGENTS`.
     """
-    arrays = plain and not derivatives or bool(tangents and tangents.tolerance)
-    problem = _prepare(inputs, derivatives, plain, arrays)
+    problem = _prepare(inputs, derivatives, plain)
+    # Loops of few motions compile and run faster in arrays.
+    if plain and not derivatives or tangents and tangents.tolerance:
+        term, start, args = in_arrays(problem.term, problem.start, problem.args)
+        problem = problem._replace(term=term, start=start, args=args)
     control = _control(problem, keywords, derivatives, tangents)
     return _read(inputs, problem, _solve(problem, control, keywords))
 
 
-def _prepare(inputs: Inputs, derivatives: bool, plain: bool, arrays: bool) -> _Problem:
+def _prepare(inputs: Inputs, derivatives: bool, plain: bool) -> _Problem:
     """States the equations and their start."""
     linkage, state0, ts, own0, forces, ef = inputs
     if ef is not None:  # the equations of other joints are left out
@@ -123,10 +126,7 @@ def _prepare(inputs: Inputs, derivatives: bool, plain: bool, arrays: bool) -> _P
         return *joints_of(args, t, y), own_states(args, y)
 
     q, qd, _ = joints(ts[0], start)  # after a blow there, like all that follows
-    equations = term, start, args
-    if arrays:
-        equations = in_arrays(*equations)
-    return _Problem(valid & finite, ts, (q, qd), *equations, joints)
+    return _Problem(valid & finite, ts, (q, qd), term, start, args, joints)
 
 
 def _control(
@@ -259,7 +259,7 @@ def last_switched(inputs: Inputs, keywords: Settings) -> Array:
     """
     keywords = keywords | {"adjoint": diffrax.ForwardMode()}
     problem = _prepare(inputs, derivatives=False, plain=False)
-    control = _control(problem, keywords, derivatives=False, tangents=False)
+    control = _control(problem, keywords, derivatives=False, tangents=None)
     ends = _solve(problem, control, keywords).ys
     assert ends is not None  # because of saveat
     switching = ends[1][1]
