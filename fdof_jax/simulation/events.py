@@ -18,6 +18,7 @@ from .holding import (
     LOW,
     LOWER,
     MOST_EVENTS,
+    STILL,
     UPPER,
     Laws,
     Modes,
@@ -62,6 +63,9 @@ def resolve(event: Event, y: Integrated, args: Args) -> tuple[Integrated, Modes]
     q, qd = args.q0 + jnp.stack(delta), jnp.stack(rates_before)
     q = jnp.where(touched != 0, stop, q)
     qd = jnp.where(fired[0] & slides, 0, qd)  # came to zero
+    may_rest = (law.static > 0) | (touched != 0)
+    still = jnp.full_like(q, STILL * jnp.finfo(q.dtype).eps)
+    qd = start = _stilled(qd, may_rest, still)
 
     lost, hit, left_out = jnp.zeros_like(event.t), jnp.zeros(q.size, bool), 0.0
     if kinds & {Brake, HardStops, Payload}:
@@ -70,11 +74,14 @@ def resolve(event: Event, y: Integrated, args: Args) -> tuple[Integrated, Modes]
             qd, lost = _taken(event, q, qd, first, args, law, system)
         energy = lambda qd: qd @ system.momenta(qd) / 2
         lost += energy(qd)
+        still = system.still(start, qd)
         qd = system.caught(qd, law.braked)
         if HardStops in kinds:
             qd, hit = _after_blows(qd, touched, law, system)
+            qd = _stilled(qd, may_rest, still)
             net = _net_efforts(event.t, q, qd, own, args)
             qd, left_out = _settled(qd, touched, law, *net)
+        qd = _stilled(qd, may_rest, still)
         lost -= energy(qd)
     net = _net_efforts(*constant((event.t, q, qd, own, args)))
     modes = at_rest(qd, touched * (qd == 0), args.modes, law, *net, fired[0])
@@ -84,7 +91,7 @@ def resolve(event: Event, y: Integrated, args: Args) -> tuple[Integrated, Modes]
     kind = _happenings(before, modes, hit & (modes.mode == FREE), law)
     qd = jnp.where(modes.mode > FREE, 0, qd)
     # Modes in which a motion begins are no events, but blows at the start are.
-    kind = jnp.where(first & (qd == jnp.stack(rates_before)), -1, kind)
+    kind = jnp.where(first & (qd == start), -1, kind)
     at = event.t + event.late + left_out - late
     events = _recorded(before.events, at, kind)
     modes = modes._replace(origin=origin, taken=before.taken + lost, events=events)
@@ -92,6 +99,16 @@ def resolve(event: Event, y: Integrated, args: Args) -> tuple[Integrated, Modes]
     if HardStops in kinds:
         state = _moved(state, late, _rates(event.t, state, args._replace(modes=modes)))
     return state, modes
+
+
+def _stilled(qd: Array, joints: Array, still: Array) -> Array:
+    """Returns rates, 0 at those of the joints where they count as zero.
+
+    Rounding errors would free what friction or a stop holds. What then slides off keeps
+    the derivatives of its rate.
+    """
+    rests = joints & (jnp.abs(constant(qd)) <= constant(still))
+    return jnp.where(rests, qd - constant(qd), qd)
 
 
 def _at_the_blow(
