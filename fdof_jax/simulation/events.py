@@ -214,9 +214,11 @@ def _settled(
     """Returns the rates with joints stopped that bounce too low, and times left out.
 
     What rests already stays at rest. One joint that rests may hold another at its stop,
-    so this is repeated once for each joint. `net`: the efforts less the bias.
+    so this is repeated once for each joint. Elastic joints would never rest: no time is
+    left out. `net`: the efforts less the bias.
     """
-    e, lowest = law.restitution, jnp.finfo(qd.dtype).eps ** LOW
+    lowest, elastic = jnp.finfo(qd.dtype).eps ** LOW, law.restitution == 1
+    loses = jnp.where(elastic, 1, 1 - law.restitution)  # of its rate, at each bounce
 
     def settle(state, _):
         qd, left_out = state
@@ -225,7 +227,7 @@ def _settled(
         pulled = (touched * qd < 0) & (towards > 0)
         towards = jnp.where(pulled, towards, 1)
         low = pulled & (constant(qd**2) <= 2 * towards * lowest)
-        left_out += jnp.where(low, 2 * jnp.abs(qd) / (towards * (1 - e)), 0)
+        left_out += jnp.where(low & ~elastic, 2 * jnp.abs(qd) / (towards * loses), 0)
         qd = jnp.where(low.any(), system.caught(qd, rests | low), qd)
         return (qd, left_out), None
 
