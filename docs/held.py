@@ -22,7 +22,7 @@ SLIDING = fj.Linkage("P", gravity=0, **SLIDE)
 LEVEL = fj.Linkage("R", **BAR)
 WEIGHTLESS = fj.Linkage("R", gravity=0, **BAR)
 TWO = fj.Linkage("RR", gravity=0, **BARS)
-JUST = 1e-12  # after an event [s]
+JUST = 1e-10  # after an event, for steps end a little later or earlier [s]
 
 
 class Row(NamedTuple):

@@ -239,3 +239,21 @@ def test_a_longest_step_sees_what_is_brief():
                 rtol=1e-6, atol=1e-6
             ),
         )  # fmt: skip
+
+
+@pytest.mark.slow
+def test_where_a_step_ends_is_measured_by_the_motion():
+    """A step that is tried over a cushion's edge may go on for 50 km.
+
+    The edge, at 0, was passed by parts of these, and each passage added energy.
+    """
+
+    def cushion(t, q, qd, linkage):
+        return fj.forces.switch(q, 0.0, 2 * 9.81)
+
+    ball = SLIDE.replace(gravity=9.81, base_angle=0.0)
+    period = 4 * np.sqrt(2 * 10 / 9.81)
+    start = fj.State([10.0], [0.0])
+    motion = fj.simulate(ball, start, np.arange(21) * period, (cushion,))
+    np.testing.assert_allclose(motion.q[:, 0], 10, rtol=5e-9)
+    assert motion.stats["num_switches"] == 40

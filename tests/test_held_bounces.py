@@ -1,11 +1,84 @@
 """Joints that bounce together come to rest, and energy is accounted for."""
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from modes import LOOPS
 
 import fdof_jax as fj
+
+GRAVITY = 9.81
+BALL = fj.Linkage("P", length=[0, 1], com=[[0, 0]], mass=[1], inertia=[1])
+
+
+def hits(height, restitution, count):
+    """Returns the times at which a ball hits the floor, in closed form."""
+    flights = restitution ** jnp.arange(1, count)
+    fall = jnp.sqrt(2 * height / GRAVITY)
+    return fall * (1 + 2 * jnp.concatenate([jnp.zeros(1), jnp.cumsum(flights)]))
+
+
+def dropped(height, restitution, ts, **options):
+    floor = fj.forces.HardStops(0.0, np.inf, restitution=restitution)
+    start = fj.State(jnp.stack([height]), jnp.zeros(1))
+    return fj.simulate(BALL, start, ts, (floor,), **options)
+
+
+@pytest.mark.parametrize("restitution", [1.0, 1 - 1e-12, 0.9])
+def test_thirty_bounces_take_what_restitution_tells(restitution):
+    """A step that is tried from a bounce on may reach a kilometre below the floor."""
+    expected = np.asarray(hits(10.0, restitution, 30))
+    between = expected + 0.3 * expected[0] * restitution ** np.arange(1, 31)
+    motion = dropped(jnp.array(10.0), restitution, [0, *between])
+    np.testing.assert_allclose(motion.events.t[:30], expected, rtol=0, atol=1e-10)
+    energy = motion.qd[1:, 0] ** 2 / 2 + GRAVITY * motion.q[1:, 0]
+    left = 10 * GRAVITY * restitution ** (2 * np.arange(1, 31))
+    np.testing.assert_allclose(energy, left, rtol=1e-11)
+    np.testing.assert_allclose(motion.taken[1:], 10 * GRAVITY - left, atol=1e-9)
+    assert motion.events.count == 30
+
+
+@pytest.mark.slow
+def test_derivatives_through_a_hundred_bounces():
+    """In the height and the restitution, forward and reverse."""
+
+    def end(numbers, t, **options):
+        motion = dropped(*numbers, jnp.stack([jnp.zeros_like(t), t]), **options)
+        return jnp.concatenate([motion.q[-1], motion.qd[-1]])
+
+    def closed_form(numbers, t, count):
+        height, restitution = numbers
+        since = t - hits(height, restitution, count)[-1]
+        rate = restitution**count * jnp.sqrt(2 * height * GRAVITY)
+        return jnp.stack(
+            [rate * since - GRAVITY * since**2 / 2, rate - GRAVITY * since]
+        )
+
+    weights = jnp.array([0.3, 0.7])
+    forward = jax.jacfwd(lambda x, t: end(x, t, adjoint=diffrax.ForwardMode()))
+    both = forward, jax.grad(lambda x, t: weights @ end(x, t))
+    forward, reverse = (jax.jit(slope, **LOOPS) for slope in both)
+    for count in (21, 105):
+        for restitution in (1.0, 0.99):
+            numbers = jnp.array([10.0, restitution])
+            last, before = hits(*numbers, count + 1)[jnp.array([-1, -2])]
+            t = 0.7 * before + 0.3 * last
+            slopes = jax.jacfwd(closed_form)(numbers, t, count)
+            np.testing.assert_allclose(forward(numbers, t), slopes, rtol=1e-9)
+            found = reverse(numbers, t)
+            np.testing.assert_allclose(found, weights @ slopes, rtol=1e-9)
+
+
+def test_an_elastic_ball_that_is_laid_down_or_drops_by_nothing_rests():
+    for height in (0.0, 1e-12):
+        motion = dropped(jnp.array(height), 1.0, [0, 0.5, 1.0])
+        assert motion.q[1:, 0].tolist() == [0, 0] and motion.modes[1:, 0].tolist() == [
+            2,
+            2,
+        ]
+        assert motion.events.count <= 1 and not (motion.events.t > 1e-6).any()
 
 
 def arms(count, rng):

@@ -353,7 +353,7 @@ def test_an_arm_with_one_of_two_slides_held_keeps_its_energy(joint):
         ),
         (lambda: JointFriction(1, static=2, speed=1), "static: expected none beside"),
         (lambda: HardStops(1.0, -1.0), "lower: expected less than upper"),
-        (lambda: HardStops(-1, 1, restitution=1), "restitution: expected less than 1"),
+        (lambda: HardStops(-1, 1, restitution=1.1), "restitution: expected at most 1"),
         (lambda: Brake(0), "joints: expected a number of 1 to 8"),
         (lambda: Brake(1, 2.0, 1.0), "begin: expected less than end"),
         (lambda: Payload(fj.Point(1), -1), "mass: expected .* at least 0"),

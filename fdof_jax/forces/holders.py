@@ -119,7 +119,7 @@ class HardStops(Holder):
     **Arguments:** all in joint order, one per joint or one for all.
 
     - `lower`, `upper`: ends of the range [m or rad]; may be infinite.
-    - `restitution`: at least 0 and less than 1; by default blows take all of the rate.
+    - `restitution`: from 0 to 1, elastic; by default blows take all of the rate.
 
     **Raises:** ValueError for malformed arguments, and unless lower < upper.
 
@@ -138,7 +138,7 @@ class HardStops(Holder):
     def conditions(self):
         yield from ordered(self, "lower", "upper")
         e = self.restitution
-        yield Condition((e < 1).all(), "restitution", "less than 1", e)
+        yield Condition((e <= 1).all(), "restitution", "at most 1", e)
 
 
 class Brake(Holder):

@@ -10,7 +10,7 @@ from ..mechanics.equations import Scalars
 from ..mechanics.solve import minus
 from ..steps.dopri8 import Integrated, constant
 from ..steps.switch_derivatives import Event
-from .field import Args, efforts, schedule_of
+from .field import Args, efforts, schedule_of, vector_field
 from .holding import (
     BRAKE,
     FREE,
@@ -18,6 +18,7 @@ from .holding import (
     LOW,
     LOWER,
     MOST_EVENTS,
+    STILL,
     UPPER,
     Laws,
     Modes,
@@ -39,25 +40,33 @@ def resolve(event: Event, y: Integrated, args: Args) -> tuple[Integrated, Modes]
     In this order: brakes take hold, joints hit their stops, and what then is at rest
     is held or begins to slide.
     """
-    delta, rates_before, *own = y
-    q, qd = args.q0 + jnp.stack(delta), jnp.stack(rates_before)
+    kinds = {kind for e in args.forces for kind in type(e).__mro__}
+    q = args.q0 + jnp.stack(y[0])
     before, law = args.modes, laws(args, event.t)
     first = before.mode < 0
     fired = jnp.zeros((3, q.size), bool)
     fired = fired.at[: len(event.fired)].set(event.fired)
     slides = ~before.held
-    # Rates that came to zero; what is at its stop.
-    qd = jnp.where(fired[0] & slides, 0, qd)
-    # Also those that are as near as a flight that is left out: otherwise joints whose
-    # blows throw each other at their stops would hit them in turn without end.
+    # What is at its stop. Also those that are as near as a flight that is left out:
+    # otherwise joints whose blows throw each other at their stops would hit them in
+    # turn without end.
     near = jnp.finfo(q.dtype).eps ** LOW
     at_lower = fired[1] | (q <= law.lower + near)
     at_upper = fired[2] | (q >= law.upper - near)
     touched = jnp.where(at_lower, -1.0, jnp.where(at_upper, 1.0, 0.0))
     stop = jnp.where(at_lower, law.lower, jnp.where(at_upper, law.upper, 0))
+    late = jnp.zeros_like(event.t)
+    if HardStops in kinds:
+        hits = fired[1] | fired[2]
+        y, late = _at_the_blow(event.before, y, hits, stop, args)
+    delta, rates_before, *own = y
+    q, qd = args.q0 + jnp.stack(delta), jnp.stack(rates_before)
     q = jnp.where(touched != 0, stop, q)
+    qd = jnp.where(fired[0] & slides, 0, qd)  # came to zero
+    may_rest = (law.static > 0) | (touched != 0)
+    still = jnp.full_like(q, STILL * jnp.finfo(q.dtype).eps)
+    qd = start = _stilled(qd, may_rest, still)
 
-    kinds = {kind for e in args.forces for kind in type(e).__mro__}
     lost, hit, left_out = jnp.zeros_like(event.t), jnp.zeros(q.size, bool), 0.0
     if kinds & {Brake, HardStops, Payload}:
         system = system_at(event.t, q, jnp.zeros_like(q), args)
@@ -65,11 +74,14 @@ def resolve(event: Event, y: Integrated, args: Args) -> tuple[Integrated, Modes]
             qd, lost = _taken(event, q, qd, first, args, law, system)
         energy = lambda qd: qd @ system.momenta(qd) / 2
         lost += energy(qd)
+        still = system.still(start, qd)
         qd = system.caught(qd, law.braked)
         if HardStops in kinds:
             qd, hit = _after_blows(qd, touched, law, system)
+            qd = _stilled(qd, may_rest, still)
             net = _net_efforts(event.t, q, qd, own, args)
             qd, left_out = _settled(qd, touched, law, *net)
+        qd = _stilled(qd, may_rest, still)
         lost -= energy(qd)
     net = _net_efforts(*constant((event.t, q, qd, own, args)))
     modes = at_rest(qd, touched * (qd == 0), args.modes, law, *net, fired[0])
@@ -79,12 +91,50 @@ def resolve(event: Event, y: Integrated, args: Args) -> tuple[Integrated, Modes]
     kind = _happenings(before, modes, hit & (modes.mode == FREE), law)
     qd = jnp.where(modes.mode > FREE, 0, qd)
     # Modes in which a motion begins are no events, but blows at the start are.
-    kind = jnp.where(first & (qd == jnp.stack(rates_before)), -1, kind)
-    at = event.t + event.late + left_out
+    kind = jnp.where(first & (qd == start), -1, kind)
+    at = event.t + event.late + left_out - late
     events = _recorded(before.events, at, kind)
     modes = modes._replace(origin=origin, taken=before.taken + lost, events=events)
     state = tuple(origin), tuple(qd), *own
+    if HardStops in kinds:
+        state = _moved(state, late, _rates(event.t, state, args._replace(modes=modes)))
     return state, modes
+
+
+def _stilled(qd: Array, joints: Array, still: Array) -> Array:
+    """Returns rates, 0 at those of the joints where they count as zero.
+
+    Rounding errors would free what friction or a stop holds. What then slides off keeps
+    the derivatives of its rate.
+    """
+    rests = joints & (jnp.abs(constant(qd)) <= constant(still))
+    return jnp.where(rests, qd - constant(qd), qd)
+
+
+def _at_the_blow(
+    t: Array, y: Integrated, hits: Array, stop: Array, args: Args
+) -> tuple[Integrated, Array]:
+    """Returns the state as the first joint hits its stop, and how long ago it did.
+
+    Steps end a little beyond zeros, or before. If only positions were put onto stops,
+    each blow would add or take energy.
+    """
+    rates = _rates(t, y, args)
+    q, qd, qdd = args.q0 + jnp.stack(y[0]), jnp.stack(y[1]), jnp.stack(rates[1])
+    hits = hits & (qd != 0)
+    since = jnp.where(hits, (q - stop) / jnp.where(hits, qd, 1), 0)
+    # A joint that would turn round in this time hardly comes to its stop.
+    since = jnp.where(jnp.abs(since * qdd) < jnp.abs(qd), since, 0)
+    late = since[jnp.argmax(jnp.abs(since))]
+    return _moved(y, -late, rates), late
+
+
+def _rates(t: Array, y: Integrated, args: Args) -> Integrated:
+    return vector_field(t, y, args, schedule_of(t, args))
+
+
+def _moved(y: Integrated, time: Array, rates: Integrated) -> Integrated:
+    return jax.tree.map(lambda y, rate: y + time * rate, y, rates)
 
 
 def _taken(
@@ -164,9 +214,11 @@ def _settled(
     """Returns the rates with joints stopped that bounce too low, and times left out.
 
     What rests already stays at rest. One joint that rests may hold another at its stop,
-    so this is repeated once for each joint. `net`: the efforts less the bias.
+    so this is repeated once for each joint. Elastic joints would never rest: no time is
+    left out. `net`: the efforts less the bias.
     """
-    e, lowest = law.restitution, jnp.finfo(qd.dtype).eps ** LOW
+    lowest, elastic = jnp.finfo(qd.dtype).eps ** LOW, law.restitution == 1
+    loses = jnp.where(elastic, 1, 1 - law.restitution)  # of its rate, at each bounce
 
     def settle(state, _):
         qd, left_out = state
@@ -175,7 +227,7 @@ def _settled(
         pulled = (touched * qd < 0) & (towards > 0)
         towards = jnp.where(pulled, towards, 1)
         low = pulled & (constant(qd**2) <= 2 * towards * lowest)
-        left_out += jnp.where(low, 2 * jnp.abs(qd) / (towards * (1 - e)), 0)
+        left_out += jnp.where(low & ~elastic, 2 * jnp.abs(qd) / (towards * loses), 0)
         qd = jnp.where(low.any(), system.caught(qd, rests | low), qd)
         return (qd, left_out), None
 

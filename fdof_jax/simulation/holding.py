@@ -38,6 +38,9 @@ LOW = 0.7
 # Distances from stops are in this part of a metre or rad, so that the distance by which
 # steps end beyond zeros is short even for a joint that bounces slowly.
 _STOPS_IN = 100
+# Rates of so many units of rounding count as zero [m/s or rad/s]; after a blow also as
+# many of the rate that a joint would have with all kinetic energy.
+STILL = 500
 # What was found at its limit is held only if it needs this much less, as a share.
 _SURE = 1e-7
 
@@ -174,6 +177,20 @@ class System(NamedTuple):
     def momenta(self, qd: Array) -> Array:
         return jnp.stack(times(self.equations.mass, tuple(qd)))
 
+    def still(self, *rates: Array) -> Array:
+        """Returns up to which rates count as zero after a blow, (n,)."""
+        energies = jnp.stack([qd @ self.momenta(qd) for qd in rates])
+        inertia = jnp.where(self.inertia > 0, self.inertia, jnp.inf)
+        return (
+            STILL
+            * jnp.finfo(rates[0].dtype).eps
+            * (1 + jnp.sqrt(jnp.max(energies) / inertia))
+        )
+
+    @property
+    def inertia(self) -> Array:
+        return jnp.stack([row[0] for row in self.equations.mass])
+
     def caught(self, qd: Array, held: Array) -> Array:
         """Returns the rates after a blow that stops joints.
 
@@ -224,7 +241,7 @@ def at_rest(
     qd, touched, law, system, net = constant((qd, touched, law, system, net))
     m, efforts = in_one_loop((system.equations, tuple(net)))
     system, net = system._replace(equations=m), jnp.stack(efforts)
-    inertia = jnp.stack([row[0] for row in system.equations.mass])
+    inertia = system.inertia
     rest = (qd == 0) & ((law.static > 0) | (touched != 0) | law.braked)
     held_as = jnp.where(touched < 0, LOWER, jnp.where(touched > 0, UPPER, FRICTION))
     held_as = jnp.where(law.braked, BRAKE, held_as)

@@ -37,8 +37,8 @@ _SLOPES = (
     ).T
 )  # at the samples, per step
 # Steps end where a switching function has passed its zero by this power of the unit of
-# rounding, times its size, and by this multiple of it. There the side to which the
-# motion goes is known even if it began at rest on the zero.
+# rounding, times its size up to there, and by this multiple of it. There the side to
+# which the motion goes is known even if it began at rest on the zero.
 _BEYOND, _ROUNDING = 0.75, 500
 _WRONG = 0.375  # power of it, over a size: so far from zero no step has ended
 _SOON = 0.01  # of a step, for extrapolation
@@ -87,12 +87,31 @@ def _margins(
     wrong = [check - _sum(row, rows) for check, row in zip(others, _AT_CHECKS)]
     rounding = _ROUNDING * eps * (1 + jnp.maximum(before, largest))
     unsure = _ELSEWHERE * jnp.maximum(_largest([*last, *wrong]) - rounding, 0)
-    beyond = eps**_BEYOND * largest + _ROUNDING * eps
-    past = [row + beyond for row in rows]
     slopes = [_sum(row, rows) for row in _SLOPES]
+    size = _size_of_motion(rows, slopes[0], largest)
+    beyond = eps**_BEYOND * size + _ROUNDING * eps
+    past = [row + beyond for row in rows]
     unsure, bend = jnp.where(brief, 0, unsure), _sum(_BEND, rows)
     past, slopes, *others = in_one_loop((past, slopes, beyond, largest, unsure, bend))
     return _Margins(jnp.stack(past), jnp.stack(slopes), *others)
+
+
+def _size_of_motion(rows: Sequence[Array], slope: Array, largest: Array) -> Array:
+    """Returns the size of a margin up to its zero.
+
+    A step that is tried may go far beyond it, to where the motion never comes. Before
+    the second sample a parabola tells, from the `slope` at the start. A margin that is
+    on its zero and does not rise has no size but `largest`.
+    """
+    rise = jnp.maximum(slope * float(SHARES[1]), 0)
+    over = (rise > 0) & (rows[1] < 0)
+    top = jnp.where(over, rise**2 / (4 * jnp.where(over, rise - rows[1], 1)), 0)
+    size, within = jnp.maximum(rows[0], top), jnp.ones_like(over)
+    for row in rows[1:]:
+        within &= row > 0
+        size = jnp.where(within, jnp.maximum(size, row), size)
+    on_zero = size <= jnp.finfo(largest.dtype).eps ** _WRONG * largest
+    return jnp.where(on_zero, largest, size)
 
 
 def _turns(margins: _Margins) -> tuple[Array, Array]:
@@ -196,11 +215,18 @@ def _first_zero(
     number = jnp.argmin(guesses[interval])
     guess = guesses[interval, number]
     passes = guess < jnp.inf
+    low, high = shares[interval, 0], ends[interval, number]
+    # The chord of a margin that rises at first, as after a bounce, says little.
+    start, length = past[interval, number], high - low
+    rise = margins.slopes[interval, number] * length
+    bend = after[interval, number] - start - rise
+    arched = (rise > 0) & (bend < 0)
+    root = jnp.sqrt(jnp.maximum(rise**2 - 4 * bend * start, 0))
+    parabola = low - (rise + root) / (2 * jnp.where(arched, bend, 1)) * length
+    guess = jnp.where(arched, parabola, guess)
     zero = jax.lax.cond(
         passes,
-        lambda: _zero(
-            past[:, number], guess, shares[interval, 0], ends[interval, number]
-        ),
+        lambda: _zero(past[:, number], guess, low, high),
         lambda: jnp.ones_like(guess),
     )
     # A margin that turns back just before its zero counts as if it had gone as far
