@@ -1,0 +1,276 @@
+"""Faults that tests must notice: each is put into a copy of the package.
+
+    python tests/mutants.py [NAME ...] [--frozen FILE]
+
+prints for each fault whether what must notice it does. All checks must pass without a
+fault first. Those with the name of a group of `benchmarks.frozen` compare it with FILE,
+which is written from the unchanged package if it is not given.
+"""
+
+import argparse
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import NamedTuple
+
+ROOT = Path(__file__).parent.parent
+COPIED = "fdof_jax", "tests", "benchmarks", "pyproject.toml"
+
+
+class Mutant(NamedTuple):
+    """A text of a file, found once, what takes its place, and what must notice.
+
+    - `check`: a test, or a group of `benchmarks.frozen`.
+    """
+
+    file: str
+    old: str
+    new: str
+    check: str
+
+
+AT_ONCE, BRIEF = "tests/test_events_at_once.py", "tests/test_brief_switches.py"
+SWITCHES, HOLDING = "tests/test_switches.py", "tests/test_holding.py"
+KINKS = f"{SWITCHES}::test_kinks_of_high_gains_are_exact_in_derivatives"
+BOUNCES = f"{HOLDING}::test_a_mass_bounces_to_rest_at_a_known_time"
+PULSE = "tests/hard/test_jumps.py::test_a_pulse_of_a_microsecond"
+
+MUTANTS = {
+    # Steps that end at switches and known times
+    "no retry over a switch": Mutant(
+        "steps/landing.py",
+        "passed = keep & (within | at_once) & ~arrived",
+        "passed = jnp.zeros_like(keep)",
+        KINKS,
+    ),
+    "no retry for a hidden zero": Mutant(
+        "steps/landing.py",
+        "unsure = keep & ~passed & (unseen < end)",
+        "unsure = jnp.zeros_like(keep)",
+        f"{BRIEF}::test_no_bumper_is_passed_over",
+    ),
+    "gap off": Mutant(
+        "steps/landing.py",
+        "gap = jnp.where(reached, jump + self.apart - place, 0)",
+        "gap = jnp.zeros_like(place)",
+        f"{HOLDING}::test_reactions_count_a_payload_while_it_is_there",
+    ),
+    "a known time has no derivative": Mutant(
+        "steps/landing.py",
+        "end = self.jumps[index] - (jump - place)",
+        "end = place",
+        "holding elements",
+    ),
+    "chatter goes on": Mutant(
+        "steps/landing.py",
+        "chatter = crossings > _MOST_CROSSINGS",
+        "chatter = crossings < 0",
+        f"{SWITCHES}::test_chatter_is_named_and_spoils_no_other_member",
+    ),
+    # Zeros
+    "no turn between samples": Mutant(
+        "steps/zeros_in_steps.py",
+        "turning = (-fall > least[None]) & (rise > least[None])",
+        "turning = jnp.zeros_like(fall, bool)",
+        f"{AT_ONCE}::test_zeros_of_cubic_polynomials",
+    ),
+    "polynomials are trusted": Mutant(
+        "steps/zeros_in_steps.py",
+        "_ELSEWHERE = 12",
+        "_ELSEWHERE = 0",
+        f"{BRIEF}::test_no_bumper_is_passed_over",
+    ),
+    "no Newton step in a bracket": Mutant(
+        "steps/zeros_in_steps.py",
+        "_ITERATIONS = 6",
+        "_ITERATIONS = 0",
+        f"{AT_ONCE}::test_zeros_of_cubic_polynomials",
+    ),
+    # What switches
+    "sides stay": Mutant(
+        "steps/switching.py",
+        "after = jnp.where(passed.switched, -sides, sides)",
+        "after = sides",
+        KINKS,
+    ),
+    "grazing is not counted": Mutant(
+        "steps/switching.py",
+        "grazing=jnp.maximum(passed.missed, grazed),",
+        "grazing=passed.missed,",
+        f"{SWITCHES}::test_a_motion_tells_of_its_switches",
+    ),
+    "one-sided places are not counted": Mutant(
+        "steps/switching.py",
+        "return jnp.maximum(switching.one_sided, at_once) + together",
+        "return switching.one_sided",
+        f"{AT_ONCE}"
+        "::test_each_of_coincident_switches_has_its_own_jump_and_is_said_to_coincide",
+    ),
+    "coincident switches are one": Mutant(
+        "steps/switching.py",
+        "if any(self.jumping) and before.size > 1:",
+        "if False:",
+        f"{AT_ONCE}"
+        "::test_each_of_coincident_switches_has_its_own_jump_and_is_said_to_coincide",
+    ),
+    "not moved back after an event": Mutant(
+        "steps/switching.py",
+        "there = moved_on(-late, after, term=term)",
+        "pass",
+        BOUNCES,
+    ),
+    "held joints drift": Mutant(
+        "steps/switching.py",
+        "y1 = self.kept(modes.held, y1, y0)",
+        "pass",
+        f"{HOLDING}::test_an_arm_with_one_of_two_slides_held_keeps_its_energy",
+    ),
+    # Derivatives at switches
+    "wrong sign of the lateness": Mutant(
+        "steps/switch_derivatives.py",
+        "-change / jnp.where(steep, slope, 1)",
+        "change / jnp.where(steep, slope, 1)",
+        "holding elements",
+    ),
+    "one Newton step": Mutant(
+        "steps/switch_derivatives.py",
+        "return nothing, jax.lax.cond(jnp.any(arrival.switched), second, none)",
+        "return nothing, none()",
+        f"{HOLDING}::test_second_derivatives_through_a_blow",
+    ),
+    "moved to first order": Mutant(
+        "steps/switch_derivatives.py",
+        "dy + change * rate + _of_zero(late, turn)",
+        "dy + change * rate",
+        f"{HOLDING}::test_second_derivatives_through_a_blow",
+    ),
+    # Judging steps
+    "probe off": Mutant(
+        "steps/derivative_control.py",
+        "ratio = constant(jnp.where(finite, ratio, 0))",
+        "ratio = jnp.zeros_like(ratio)",
+        "at rest, adjoint",
+    ),
+    "tangents are not judged": Mutant(
+        "steps/derivative_control.py",
+        "ratio = constant(jnp.where(jnp.isnan(ratio), 0, ratio))",
+        "ratio = jnp.zeros_like(ratio)",
+        "at rest, tangents",
+    ),
+    "one tangent is not judged": Mutant(
+        "steps/derivative_control.py",
+        "ratio = jnp.where(allowed > 0, error / allowed, 0)",
+        "judged = (allowed > 0) & (jax.lax.axis_index(TANGENTS) > 0)\n"
+        "    ratio = jnp.where(judged, error / allowed, 0)",
+        "at rest, tangents",
+    ),
+    "noise floor off": Mutant(
+        "steps/step_control.py",
+        "is_noise = error_size < _NOISE * rounding",
+        "is_noise = error_size < 0 * rounding",
+        "tests/hard/test_ill_conditioned.py::test_a_tip_of_a_million_tonnes",
+    ),
+    # Methods
+    "compensation off": Mutant(
+        "steps/dopri8.py",
+        "return y, jax.tree.map(lambda a, b, c: c - (b - a), y0, y, change)",
+        "return y, jax.tree.map(jnp.zeros_like, y)",
+        "tests/hard/test_long_runs.py::test_energy_of_a_small_swing",
+    ),
+    "a stale rate after a jump": Mutant(
+        "steps/unrolled_dopri8.py",
+        "if made_jump is not False:",
+        "if False:",
+        "tests/test_solvers.py"
+        "::test_a_batch_moves_as_its_members_across_jumps_and_saturation",
+    ),
+    # Joints that are held
+    "a blow goes on": Mutant(
+        "simulation/events.py",
+        "flying = jnp.where(one, -e * qd,",
+        "flying = jnp.where(one, e * qd,",
+        BOUNCES,
+    ),
+    "low flights go on": Mutant(
+        "simulation/events.py",
+        "low = pulled & (constant(qd**2) <= 2 * towards * lowest)",
+        "low = jnp.zeros_like(pulled)",
+        BOUNCES,
+    ),
+    "a payload arrives without momentum": Mutant(
+        "simulation/events.py",
+        "impulse += jnp.where(new, weights * (own - carried) @ jacobian, 0)",
+        "impulse += jnp.where(new, weights * own @ jacobian, 0)",
+        "holding elements",
+    ),
+    "static friction is that of sliding": Mutant(
+        "simulation/holding.py",
+        "most = jnp.where(law.braked, jnp.inf, law.static)",
+        "most = jnp.where(law.braked, jnp.inf, law.level)",
+        f"{HOLDING}::test_static_friction_holds_what_has_come_to_rest_only",
+    ),
+}
+
+
+def noticed(check: str, folder: Path, frozen: Path) -> bool:
+    """Returns whether a check fails in a folder."""
+    if "::" in check:
+        command = ["pytest", "-q", "-x", "-n", "0", "-m", "", check]
+    else:
+        command = ["benchmarks.frozen", "compare", str(frozen), check]
+    done = python(folder, *command)
+    failed = "BEYOND" if command[0] != "pytest" else " failed"
+    if done.returncode and failed not in done.stdout:
+        sys.exit(f"{check} broke:\n{done.stdout}\n{done.stderr}")
+    return bool(done.returncode)
+
+
+def python(folder: Path, *command: str) -> subprocess.CompletedProcess:
+    """Runs a module of Python in a folder, with the packages there."""
+    env = os.environ | {"PYTHONPATH": f"{folder}{os.pathsep}{folder / 'tests'}"}
+    command = sys.executable, "-m", *command
+    return subprocess.run(command, cwd=folder, env=env, capture_output=True, text=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument(
+        "names", nargs="*", help=f"by default all: {', '.join(MUTANTS)}"
+    )
+    parser.add_argument("--frozen", type=Path, help="numbers of the unchanged package")
+    options = parser.parse_args()
+    if unknown := set(options.names) - set(MUTANTS):
+        parser.error(f"names: unknown {', '.join(sorted(unknown))}")
+    chosen = {name: MUTANTS[name] for name in options.names or MUTANTS}
+    checks = dict.fromkeys(mutant.check for mutant in chosen.values())
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place)
+        for name in COPIED:
+            copy = shutil.copytree if (ROOT / name).is_dir() else shutil.copy
+            copy(ROOT / name, folder / name)
+        frozen = options.frozen and options.frozen.resolve()
+        groups = [check for check in checks if "::" not in check]
+        if frozen is None and groups:
+            frozen = folder / "frozen.npz"
+            python(folder, "benchmarks.frozen", "write", str(frozen), *groups)
+        if failing := [c for c in checks if noticed(c, folder, frozen)]:
+            sys.exit(f"fail without a fault: {', '.join(failing)}")
+        survived = 0
+        for name, mutant in chosen.items():
+            file = folder / "fdof_jax" / mutant.file
+            text = file.read_text()
+            if text.count(mutant.old) != 1:
+                sys.exit(f"{name}: expected its text once in {mutant.file}")
+            file.write_text(text.replace(mutant.old, mutant.new))
+            died = noticed(mutant.check, folder, frozen)
+            file.write_text(text)
+            survived += not died
+            print(f"{name}: {'died' if died else 'SURVIVED'}", flush=True)
+    sys.exit(f"{survived} survived" if survived else 0)
+
+
+if __name__ == "__main__":
+    main()
