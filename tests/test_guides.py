@@ -104,6 +104,10 @@ def test_recipes(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     names = run(DOCS / "recipes.md")
     assert names["response"].settling_time[0] < 1.5
+    # A turn by 1.5 rad sweeps 1.5 r dr; half the square of the radius r is 1 + cos(q2).
+    cells = np.isfinite(names["counts"]).sum()
+    area = cells * np.diff(names["x"])[0] * np.diff(names["y"])[0]
+    np.testing.assert_allclose(area, 1.5 * (np.cos(0.5) - np.cos(2.5)), rtol=0.05)
     assert names["value"] < 0.06
     assert names["rewards"].shape == (500, 256) and names["done"].sum() >= 512
     assert names["found"].success and names["found"].fun < 0.01

@@ -32,7 +32,6 @@ MOVED = fj.PDController(1.0, 1.0, 1.0, MOVE)
         ("tilt", lambda: fj.references.Ellipse([1, 1], [0.4, 0.2], tilt=45)),
         ("locked", lambda: ARM.replace(locked=[0, 90, 0])),
         ("q", lambda: fj.drawing.draw_linkage(ARM, [0, 2, 90])),
-        ("upper", lambda: fj.drawing.workspace(ARM, [-1, 0, -1], [1, 2, 90])),
         (r"forces\[0\]\.upper", lambda: elements_on(ARM, (STOPS,))),
         (r"forces\[0\]\.reference\.end", lambda: elements_on(ARM, (MOVED,))),
     ],

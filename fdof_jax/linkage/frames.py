@@ -84,13 +84,12 @@ def frames(linkage: Linkage, q: Array) -> Frames:
 
 
 def known_frames(linkage: Linkage, q: ArrayLike) -> Frames:
-    """Computes frames in NumPy at known positions (..., n), 0 at fixed pairs."""
-    *shape, n = np.shape(q)
-    count = int(np.prod(shape))
+    """Computes frames in NumPy at known positions (time, n), 0 at fixed pairs."""
+    count, n = np.shape(q)
     # Powers of two: each number of rows needs a program.
     rows = np.resize(q, (1 << count.bit_length(), n))
-    shaped = lambda leaf: np.reshape(leaf[:count], (*shape, -1))
-    return jax.tree.map(shaped, in_numpy(_frames_of_each(linkage, rows)))
+    found = in_numpy(_frames_of_each(linkage, rows))
+    return jax.tree.map(lambda leaf: leaf[:count], found)
 
 
 @jax.jit

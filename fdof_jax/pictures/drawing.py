@@ -47,11 +47,11 @@ from .axes import (
     reached,
     xy,
 )
-from .workspace import force_ellipses, inertia_ellipses, workspace
+from .ellipses import force_ellipses, inertia_ellipses
 
 __all__ = [
     "BLACK", "GREY", "SERIES", "animate", "animate_grid", "chrono_cyclograph",
-    "draw_linkage", "force_ellipses", "inertia_ellipses", "topology_grid", "workspace",
+    "draw_linkage", "force_ellipses", "inertia_ellipses", "topology_grid",
 ]  # fmt: skip
 
 

@@ -1,88 +1,19 @@
-"""Pictures of a tip's reach, and of its forces and inertia along a path."""
+"""Ellipses of a tip's forces and inertia along a path."""
 
 from typing import Any
 
 import jax
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colors import ListedColormap
 from numpy.typing import ArrayLike
 
-from ..analysis.reach import curves, ranges_of, reached_cells
 from ..base.checks import real_array
 from ..dynamics import mass_matrix
 from ..forces.element import Forces
 from ..linkage.linkage import Linkage, check_linkage, joints_of
 from ..mechanics.kinematics import tip_jacobian
 from .arms import Geometry, draw_motion, geometry
-from .axes import GREY, SERIES, legend, plane_axes, xy
-
-_REACHED = "#D6EAF5"
-
-
-def workspace(
-    linkage: Linkage,
-    lower: ArrayLike = -np.inf,
-    upper: ArrayLike = np.inf,
-    ax: Axes | None = None,
-    *,
-    orientation: ArrayLike | None = None,
-) -> Axes:
-    """Draws where the tip can be, and its singular configurations.
-
-    Where the arm is singular, its joints move the tip along one line only; with an
-    `orientation`, those motions count that keep it. The edge of the reach consists of
-    such points, and of points that are reached while some joint is at an end of its
-    range. Both are curves in closed form. Holes between them that are narrower than a
-    fiftieth of the reach are filled too.
-
-    **Arguments:** `lower`, `upper`: ends of the ranges, in joint order or one for all
-    [m or rad]; those of slides must be finite; revolute joints without turn all the way
-    round. `orientation`: the last link's absolute angle [rad]; by default any. Each
-    joint with ends takes three times as long.
-
-    **Returns:** the axes. The `gid` of the curves is "singular" or "edge".
-
-    **Raises:** ValueError for malformed arguments, and for an `orientation` at which
-    the tip cannot move.
-    """
-    ranges = ranges_of(linkage, lower, upper, orientation)
-    bounds = list(curves(ranges))
-    if not bounds:
-        raise ValueError(
-            "orientation: expected an angle at which the tip can move, got "
-            f"{ranges.orientation:g}."
-        )
-    cells = reached_cells(ranges, [q for q, _ in bounds])
-    ax = plane_axes(ax, cells.corners)
-    (x0, x1), (y0, y1) = xy(cells.corners)
-    ax.imshow(
-        np.ma.masked_equal(cells.reached, False),
-        origin="lower", extent=(x0, x1, y0, y1),
-        cmap=ListedColormap([_REACHED]), interpolation="none", zorder=0,
-    )  # fmt: skip
-    label = "within reach"
-    if ranges.orientation is not None:
-        label = f"{label} at {ranges.orientation:.3g} rad"
-    ax.plot([], [], "s", color=_REACHED, markersize=9, label=label)
-    edge, singular = [], []
-    for q, is_singular in bounds:
-        tips = np.append(ranges.tips(q), np.nan)  # NaN lifts the pen
-        if is_singular:
-            singular.append(tips)
-        else:
-            edge.append(cells.on_edge(tips))
-    for name, label, color, lines in (
-        ("edge", "edge, joint at end", GREY, edge),
-        ("singular", "singular", SERIES[1], singular),
-    ):
-        if lines:
-            points = xy(np.concatenate(lines))
-            ax.plot(*points, color=color, lw=1.4, gid=name, label=label)
-    ax.use_sticky_edges = False  # of the image
-    ax.autoscale_view()
-    legend(ax)
-    return ax
+from .axes import SERIES, legend, plane_axes, xy
 
 
 def force_ellipses(
