@@ -240,8 +240,8 @@ def within_reach(controller: Controller) -> Controller:
     """
 
     def with_shortest(pid: diffrax.PIDController) -> diffrax.PIDController:
-        for name in ("rtol", "atol"):
-            value = concrete(getattr(pid, name))
+        for name, tolerance in {"rtol": pid.rtol, "atol": pid.atol}.items():
+            value = concrete(tolerance)
             if value is not None and value < of_precision(0, _TIGHTEST_SINGLE / 2):
                 warn(
                     f"stepsize_controller: {name}={value:g} cannot be met in float32; "
