@@ -110,7 +110,8 @@ def gained(
 def gained_at_kink(*at: PyTree, term: Term) -> Integrated:
     """Returns `gained` where no rate jumps: its first derivatives are 0, too.
 
-    These are neither computed nor traced.
+    These are neither computed nor traced: in the program of `tune`, they would be two
+    thirds of the lines.
     """
     return jax.tree.map(jnp.zeros_like, at[1])
 
@@ -123,6 +124,7 @@ def _(at, changes, *, term):
 
 @eqx.filter_custom_jvp
 def _first_order(at, changes, *, term):
+    """First derivative along `changes`: only its own derivative matters."""
     return jax.tree.map(jnp.zeros_like, at[1])
 
 
