@@ -227,6 +227,16 @@ def test_a_brake_that_acts_already_holds_from_the_start(begin):
 
 
 @pytest.mark.slow
+def test_a_brake_holds_to_the_last_bit():
+    """The compensated sum carries rounding errors of the steps before."""
+    for begin in np.linspace(0.25, 0.75, 11):
+        motion = run(PAIR, MOVING, np.linspace(0, 1, 41), ANYWHERE, Brake(2, begin))
+        later = motion.ts > begin
+        np.testing.assert_array_equal(motion.qd[later, 1], 0)
+        assert np.ptp(motion.q[later, 1]) == 0
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("lagged", ["the controller", "a force beside it"])
 def test_states_of_drives_go_on_while_a_brake_holds(lagged):
     """The integral and the lag of a slide, by matrix exponentials."""

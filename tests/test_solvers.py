@@ -44,6 +44,18 @@ def test_all_take_the_same_steps():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("solver", [LoopedDopri8(), UnrolledDopri8()])
+def test_a_sum_of_many_steps_loses_no_digit(solver):
+    """A free slide; rounding each of 10,000 sums alone would lose two or three."""
+    slide = fj.Linkage(
+        "P", length=[0, 1], com=[[0, 0]], mass=[1], inertia=[1], gravity=0.0
+    )
+    steps = STEPS | dict(dt0=0.001, max_steps=20_000)
+    motion = fj.simulate(slide, fj.State([0.0], [0.1]), [0, 10], solver=solver, **steps)
+    assert abs(motion.q[-1, 0] - 1) < 1e-15
+
+
+@pytest.mark.slow
 def test_a_batch_moves_as_its_members_across_jumps_and_saturation():
     task = fj.references.JointMove(
         START.q, START.q + 0.3, fj.references.Travel(0.2, begin=0.05)
