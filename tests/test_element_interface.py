@@ -219,6 +219,12 @@ def test_times_of_jumps_may_be_a_list(make, kind):
 
 
 @pytest.mark.parametrize("make", PUSHED)
+def test_an_empty_list_of_times_is_none(make):
+    forces = elements("forces", (make([]),))
+    assert known_times(args_of(SLIDE, ZERO[:1], forces)) is None
+
+
+@pytest.mark.parametrize("make", PUSHED)
 @pytest.mark.parametrize("value", ["x", [0.3, None], [[0.3], [0.7, 1]], [np.nan], [1j]])
 def test_other_times_of_jumps_are_refused(make, value):
     name = "reference.jump_ts" if make is led else "jump_ts"

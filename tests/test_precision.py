@@ -59,11 +59,33 @@ def test_motions_of_arms_in_single_precision():
     short = cast(ARM, np.float32)
     shape = eqx.filter_eval_shape(motion, short, (*FORCES, ALL["motor"]))
     assert shape.q.dtype == np.float64
-    # Its numbers are those of an arm in double precision, to single precision.
-    spring = (ALL["spring"],)
-    found, right = motion(short, spring), motion(cast(short, np.float64), spring)
-    np.testing.assert_allclose(found.q, right.q, rtol=0, atol=1e-6)
+    # Its motion is that of an arm in double precision with the same numbers.
+    spring, wide = (ALL["spring"],), cast(short, np.float64)
+    found, right = motion(short, spring), motion(wide, spring)
+    np.testing.assert_allclose(found.q, right.q, rtol=0, atol=1e-14)
     assert found.outcome == "successful" and found.q.dtype == np.float64
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:.*double precision")
+@pytest.mark.parametrize("mode", ["tangents", "adjoint", "forward"])
+def test_derivatives_of_an_arm_in_single_precision(mode):
+    adjoint = {
+        "tangents": diffrax.RecursiveCheckpointAdjoint(),
+        "adjoint": diffrax.RecursiveCheckpointAdjoint(checkpoints=100),
+        "forward": diffrax.ForwardMode(),
+    }[mode]
+    differentiated = jax.jacfwd if mode == "forward" else jax.grad
+    short = cast(ARM, np.float32)
+
+    def slope(linkage):
+        def end(q):
+            start, spring = fj.State(q, START.qd), (ALL["spring"],)
+            return fj.simulate(linkage, start, TS, spring, adjoint=adjoint).q[-1].sum()
+
+        return differentiated(end)(START.q)
+
+    np.testing.assert_allclose(slope(short), slope(cast(short, np.float64)), atol=1e-9)
 
 
 def test_an_arm_in_single_precision_is_named():

@@ -317,7 +317,8 @@ def jumps_at(name: str, part: Part) -> Array | None:
         return None
     several = isinstance(jumps, list | tuple) or np.ndim(jumps)
     shape, rules = (None,) if several else (), dict(finite=False, unit="s")
-    return jnp.ravel(real_array(f"{name}.jump_ts", jumps, shape, **rules))
+    times = jnp.ravel(real_array(f"{name}.jump_ts", jumps, shape, **rules))
+    return times if times.size else None
 
 
 def jumps_of(parts: dict[str, Part]) -> Array | None:

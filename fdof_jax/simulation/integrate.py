@@ -103,6 +103,8 @@ def integrate(
 def _prepare(inputs: Inputs, derivatives: bool, plain: bool) -> _Problem:
     """States the equations and their start."""
     linkage, state0, ts, own0, forces, ef = inputs
+    # An arm may be of a time before double precision was chosen.
+    linkage = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), linkage)
     if ef is not None:  # the equations of other joints are left out
         known = known_array(ef, linkage.ef.dtype)
         linkage = eqx.tree_at(lambda arm: arm.ef, linkage, known)
