@@ -2,7 +2,6 @@
 
 import functools
 from collections.abc import Callable
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -27,10 +26,10 @@ def in_numpy(tree: PyTree) -> PyTree:
     return jax.tree.map(converted, tree)
 
 
-def known_array(values: ArrayLike, dtype: Any = float) -> Array:
+def known_array(values: ArrayLike) -> Array:
     """Returns an array of JAX that is known within transformations, too."""
     with jax.ensure_compile_time_eval():
-        return jnp.asarray(values, dtype)
+        return jnp.asarray(values, float)
 
 
 def at_once(function: Callable) -> Callable:

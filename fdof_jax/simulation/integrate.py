@@ -106,8 +106,7 @@ def _prepare(inputs: Inputs, derivatives: bool, plain: bool) -> _Problem:
     # An arm may be of a time before double precision was chosen.
     linkage = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), linkage)
     if ef is not None:  # the equations of other joints are left out
-        known = known_array(ef, linkage.ef.dtype)
-        linkage = eqx.tree_at(lambda arm: arm.ef, linkage, known)
+        linkage = eqx.tree_at(lambda arm: arm.ef, linkage, known_array(ef))
     wrong_times, wrong_start, *others = faults(inputs, times=not plain)
     valid = ~jnp.stack([wrong_times, wrong_start, *others]).any()
     # Stand-ins replace invalid values, because NaN in one lane would spoil derivatives
