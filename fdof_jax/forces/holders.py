@@ -240,7 +240,7 @@ def check_free(name: str, element: object) -> None:
         raise refusal(
             name,
             "no element that holds joints, as only motions have modes; without it "
-            "they are free, a fixed pair (F) holds one, and JointStops and "
-            "JointFriction with a speed can stay",
+            "they are free, and a fixed pair (F) holds one; JointStops, and "
+            "JointFriction given a speed, hold none",
             element,
         )

@@ -174,8 +174,9 @@ def _of_singular_arm(linkage: Linkage, q: Array) -> str:
         return ""
     return (
         " The tip's Jacobian J is singular there, or nearly (condition number "
-        f"{condition:.2g}), as of an arm that is straight or folded: what inverts J "
-        "has no bound; a damped inverse, J^T (J J^T + c I)^-1, has one."
+        f"{condition:.2g}), as of an arm that is straight or folded: an effort "
+        "that inverts J has no bound there; one by a damped inverse, "
+        "J^T (J J^T + c I)^-1, has one."
     )
 
 

@@ -37,7 +37,8 @@ _OF_PROBE = 3e-9
 _GROWN = 1e3  # size of a probe that is replaced by a new one, of size 1
 # A tangent below this part of the largest one is judged as if it were as large.
 _WEAK = 0.1
-# No tangent has a tolerance of more than so many times that of one which is large.
+# No tangent has a tolerance of more than so many times that of one which is large; in
+# sums of squares, for instance, it may.
 _LEAST, _ANY = 30.0, 1e9
 TANGENTS = "tangents"  # the name of their axis
 
@@ -91,8 +92,8 @@ class Step(NamedTuple):
 class OfTangents(eqx.Module):
     """Judges tangents of the motion; all of them take the same steps.
 
-    `tolerance`: relative to the largest tangent. None: each has a tolerance of its own,
-    which follows from that of the motion.
+    `tolerance`: relative to the largest tangent, however small others are. None: each
+    has a tolerance of its own, which follows from that of the motion.
     """
 
     tolerance: float | None = None

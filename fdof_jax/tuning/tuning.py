@@ -139,7 +139,7 @@ def tune(
     settings = dict(
         method=method,
         over=over if ensemble is not None else "one scene",
-        solver="Tsit5",
+        solver="Dopri8",
         tolerance=TOLERANCE,
         samples=SAMPLES,
         dtype=str(jnp.result_type(float)),
