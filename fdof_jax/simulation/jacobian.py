@@ -21,8 +21,9 @@ from .scene import Scene
 from .solution import Solution
 
 # Tolerance of each step, and that of its tangents over it. Fig 7's 1001 errors of the
-# tip are then right to 2e-6, and their derivatives in six gains to 8e-7.
-TOLERANCE, _OF_TANGENTS = 1e-5, 100.0
+# tip are then right to 2e-7, and their derivatives in six gains too.
+TOLERANCE, _OF_TANGENTS = 1e-6, 100.0
+_LEAST_SINGLE = 1e-5  # tolerance in float32
 
 
 class Sensitivities(NamedTuple):
@@ -65,7 +66,7 @@ def jacobian_of(
     absolute tolerance of each step in float64. Tangents have 100 times that, relative
     to the largest of them.
     """
-    tolerance = of_precision(tolerance, max(tolerance, TOLERANCE))
+    tolerance = of_precision(tolerance, max(tolerance, _LEAST_SINGLE))
     keywords: dict[str, Any] = dict(
         solver=None,
         stepsize_controller=adaptive(tolerance, tolerance),
