@@ -14,7 +14,7 @@ from jaxtyping import PyTree
 
 from ..forces.element import elements
 from ..linkage.coordinates import State
-from ..steps.controllers import adaptive, of_precision
+from ..steps.controllers import SINGLE_TOLERANCE, adaptive, of_precision
 from ..steps.derivative_control import TANGENTS, OfTangents
 from .integrate import Inputs, integrate
 from .scene import Scene
@@ -23,7 +23,6 @@ from .solution import Solution
 # Tolerance of each step, and that of its tangents over it. Fig 7's 1001 errors of the
 # tip are then right to 2e-7, and their derivatives in six gains too.
 TOLERANCE, _OF_TANGENTS = 1e-6, 100.0
-_LEAST_SINGLE = 1e-5  # tolerance in float32
 
 
 class Sensitivities(NamedTuple):
@@ -66,7 +65,7 @@ def jacobian_of(
     absolute tolerance of each step in float64. Tangents have 100 times that, relative
     to the largest of them.
     """
-    tolerance = of_precision(tolerance, max(tolerance, _LEAST_SINGLE))
+    tolerance = of_precision(tolerance, max(tolerance, SINGLE_TOLERANCE))
     keywords: dict[str, Any] = dict(
         solver=None,
         stepsize_controller=adaptive(tolerance, tolerance),
