@@ -235,6 +235,7 @@ def test_other_times_of_jumps_are_refused(make, value):
         )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", PUSHED[:2])
 def test_steps_end_at_times_in_a_list(make):
     still = fj.State([0.0], [0.0])

@@ -109,6 +109,7 @@ def test_a_norm_of_the_user_s_own_judges_errors(forces):
     assert counts[0] == counts[1] > counts[2]
 
 
+@pytest.mark.slow
 def test_derivatives_through_bounces_under_a_norm_of_one_s_own():
     def end(speed, **options):
         start = fj.State(SWUNG.q, speed)
