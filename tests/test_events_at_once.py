@@ -9,7 +9,7 @@ from helpers import Push
 
 import fdof_jax as fj
 from fdof_jax.simulation.jacobian import jacobian_of
-from fdof_jax.steps.zeros_in_steps import CHECKS, SHARES, passage
+from fdof_jax.steps.zeros import CHECKS, SHARES, passage
 
 SLIDE = fj.Linkage(
     "P", length=[0, 1], com=[[0.5, 0]], mass=[1], inertia=[0.1], gravity=0

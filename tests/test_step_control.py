@@ -11,8 +11,8 @@ import optimistix
 import pytest
 
 import fdof_jax as fj
-from fdof_jax.steps.controllers import Shortening, by_square_roots
 from fdof_jax.steps.looped_dopri8 import LoopedDopri8
+from fdof_jax.steps.tolerances import Shortening, by_square_roots
 
 LINKS = dict(com=[[0.5, 0]] * 3, mass=[1, 1, 1], inertia=[1 / 12] * 3)
 ARM = fj.Linkage("RRR", length=[0, 1, 1, 1], **LINKS)

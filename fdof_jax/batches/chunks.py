@@ -29,11 +29,12 @@ from ..forces.element import elements
 from ..forces.holders import holders
 from ..linkage.topology import real_joints
 from ..simulation.field import total_effort
-from ..simulation.integrate import Settings
+from ..simulation.integrate import Inputs, Settings
 from ..simulation.scene import Scene
-from ..simulation.simulate import simulate
+from ..simulation.simulate import elements_at_door
 from ..simulation.solution import Solution
-from ..steps.controllers import Abreast, by_square_roots, default_controller
+from ..simulation.solve import solve as solve_motion
+from ..steps.tolerances import by_square_roots, default_controller
 from .devices import (
     Device,
     compiled,
@@ -99,16 +100,17 @@ def outcome_of(common: Common, moving: PyTree, abreast: bool = False) -> Outcome
     """
     linkage, state0, forces = eqx.combine(moving, common.shared)
     settings = common.settings
+    settings = settings | {"progress_meter": diffrax.NoProgressMeter()}
     controller = settings["stepsize_controller"] or default_controller()
     # With fixed steps all members take equally many.
-    adaptive = isinstance(controller, diffrax.AbstractAdaptiveStepSizeController)
-    if abreast and adaptive:
+    if abreast and isinstance(controller, diffrax.AbstractAdaptiveStepSizeController):
         # Other solvers, and estimates of a first step, need the error itself.
         if settings["solver"] is None and settings["dt0"] is not None:
             controller = by_square_roots(controller)
-        together = Abreast(controller, _AXIS)  # pyright: ignore[reportCallIssue]
-        settings = settings | {"stepsize_controller": together}
-    solution = simulate(linkage, state0, common.ts, forces, throw=False, **settings)
+        settings |= {"lanes": _AXIS, "stepsize_controller": controller}
+    acting = elements_at_door(linkage, forces)
+    inputs = Inputs(linkage, state0, common.ts, None, acting)
+    solution, _ = solve_motion(inputs, settings)
     scene = Scene(linkage, state0, forces, common.ts[-1])
     value = common.reduce(scene, solution)
     _check_value(value)

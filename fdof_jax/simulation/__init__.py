@@ -1,10 +1,11 @@
 """Motion in time: the equations that are integrated, and what is read from them."""
 
 from .efforts import Efforts
+from .ode_term import ode_term
 from .prescribed import PrescribedMotion
 
 __all__ = [
-    "Efforts", "PrescribedMotion",
+    "Efforts", "PrescribedMotion", "ode_term",
 ]  # fmt: skip
 
 

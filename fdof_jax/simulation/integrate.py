@@ -1,4 +1,4 @@
-"""Integrates the equations of motion with diffrax: free, prescribed, differentiated.
+"""Integrates the equations of motion: free, prescribed, differentiated.
 
 `integrate` is the one way in: it prepares, controls, solves and reads.
 """
@@ -17,18 +17,18 @@ from ..base.known_values import known_array
 from ..forces.element import Element, OwnStates
 from ..forces.joints import EffortHistory
 from ..linkage.linkage import Linkage, possible, without_fixed
-from ..steps.controllers import Controller, default_controller, with_error_control
+from ..steps import loop
 from ..steps.derivative_control import OfLinearised, OfTangents
-from ..steps.dopri8 import Integrated, ScheduledDopri8, ScheduledTerm, constant
-from ..steps.landing import end_of_run
+from ..steps.dopri8 import Integrated, ScheduledDopri8, constant
+from ..steps.events import events_of
+from ..steps.judge import Judge
+from ..steps.landing import Landing, clearance
 from ..steps.looped_dopri8 import LoopedDopri8
-from ..steps.step_control import StepControl, largest_loss
-from ..steps.switching import Switching, located, switching_facts
-from ..steps.unchecked import diffeqsolve
+from ..steps.tolerances import default_controller, error_control_of, with_tolerances
 from .events import in_order
-from .field import Args, args_of, in_arrays, initial_own, own_states, whole
+from .field import args_of, in_arrays, initial_own, own_states, whole
 from .formulation import clocks_apart, formulation, known_times
-from .holding import Modes, changes, taken_at, within_stops
+from .holding import changes, taken_at, within_stops
 from .prescribed import agrees
 from .solution import Solution
 
@@ -50,31 +50,20 @@ class Inputs(NamedTuple):
     known_ef: tuple[float, ...] | None = None
 
 
-class _Problem(NamedTuple):
-    """The equations to integrate, their start and output times.
+class _Motion(NamedTuple):
+    """A motion to compute.
 
     - `valid`: whether the inputs were; others have stand-ins here.
-    - `ts`: output times of the solve; `first`: positions and velocities at the first.
-    - `term`, `start`, `args`: the equations, the integrated state there, and constants.
+    - `first`: positions and velocities at the first time.
+    - `problem`: the equations and their start; `jumps`: known times at which they jump.
     - `joints(t, y)`: reads positions, velocities and the elements' own states.
     """
 
     valid: Array
-    ts: Array
     first: tuple[Array, Array]
-    term: ScheduledTerm
-    start: Integrated
-    args: Args
-    joints: Callable[[Array, Integrated], tuple[Array, Array, OwnStates]]
-
-
-class _Control(NamedTuple):
-    """The solver, the step control, and the start, with the state of any switches."""
-
-    start: Integrated
-    solver: diffrax.AbstractSolver
-    steps: Controller
+    problem: loop.Problem
     jumps: Array | None
+    joints: Callable[[Array, Integrated], tuple[Array, Array, OwnStates]]
 
 
 def integrate(
@@ -91,16 +80,14 @@ def integrate(
     repeated.
     `tangents`: judges tangents over which the caller maps, along the axis `TANGENTS`.
     """
-    problem = _prepare(inputs, derivatives, plain)
-    # Loops of few motions compile and run faster in arrays.
-    if plain and not derivatives or tangents and tangents.tolerance:
-        term, start, args = in_arrays(problem.term, problem.start, problem.args)
-        problem = problem._replace(term=term, start=start, args=args)
-    control = _control(problem, keywords, derivatives, tangents)
-    return _read(inputs, problem, _solve(problem, control, keywords))
+    motion = _prepare(inputs, derivatives, plain, bool(tangents and tangents.tolerance))
+    end = loop.solve(motion.problem, _stepping(motion, keywords, derivatives, tangents))
+    return _read(inputs, motion, end, keywords)
 
 
-def _prepare(inputs: Inputs, derivatives: bool, plain: bool) -> _Problem:
+def _prepare(
+    inputs: Inputs, derivatives: bool, plain: bool, searching: bool = False
+) -> _Motion:
     """States the equations and their start."""
     linkage, state0, ts, own0, forces, ef = inputs
     # An arm may be of a time before double precision was chosen.
@@ -127,97 +114,99 @@ def _prepare(inputs: Inputs, derivatives: bool, plain: bool) -> _Problem:
         return *joints_of(args, t, y), own_states(args, y)
 
     q, qd, _ = joints(ts[0], start)  # after a blow there, like all that follows
-    return _Problem(valid & finite, ts, (q, qd), term, start, args, joints)
-
-
-def _control(
-    problem: _Problem, keywords, derivatives: bool, tangents: OfTangents | None
-) -> _Control:
-    """Chooses the steps: what they judge, and where they end."""
-    solver: diffrax.AbstractSolver = keywords["solver"] or LoopedDopri8()
-    solver = _differentiable(solver, keywords["adjoint"])
-    given = keywords["stepsize_controller"]  # by the user
-    steps = given or default_controller()
-    term, start, args, ts = problem.term, problem.start, problem.args, problem.ts
-    if not isinstance(steps, diffrax.AbstractAdaptiveStepSizeController):
-        why = None
-        # Fixed steps may step over the kinks of an `EffortHistory`, but not over jumps.
-        jumping = (e for e in args.forces if not isinstance(e, EffortHistory))
-        if any(e.jump_ts is not None for e in jumping):
-            why = "declare times at which they jump (jump_ts)"
-        elif changes(args.forces):
-            why = "hold joints or take payloads"
-        if why is not None:
-            expected = f"an adaptive one, as forces {why}"
-            raise refusal("stepsize_controller", expected, steps)
-        return _Control(start, solver, steps, None)
     jumps = known_times(args)
-    implicit = isinstance(solver, diffrax.AbstractImplicitSolver)
-    of_run = ts, start, args, jumps
-    wrapped, landing, start = located(solver, term, *of_run, derivatives)
-    watches = not isinstance(solver, ScheduledDopri8)  # which finds the health itself
-    of_derivatives = tangents
-    # Who sets tolerances of an implicit solver wants very fast motions left unresolved;
-    # a probe would make steps short enough to resolve them.
-    if derivatives and not tangents and not (implicit and given is not None):
-        has_tableau = isinstance(solver, ScheduledDopri8 | diffrax.AbstractRungeKutta)
-        # Of other solvers derivatives are judged as if they were by Heun's method.
-        tableau: Any = solver.tableau if has_tableau else diffrax.Heun.tableau
-        of_derivatives = OfLinearised(term, tableau)
-    settings = term, watches, landing, of_derivatives
-    control = lambda steps: StepControl(steps, *settings)  # pyright: ignore[reportCallIssue]
-    return _Control(start, wrapped, with_error_control(control, steps), jumps)
+    of_problem = term, start, args
+    # Loops of few motions compile and run faster in arrays.
+    if plain and not derivatives or searching:
+        of_problem = in_arrays(*of_problem)
+    problem = loop.Problem(*of_problem, ts)
+    return _Motion(valid & finite, (q, qd), problem, jumps, joints)
 
 
-def _solve(problem: _Problem, control: _Control, keywords) -> diffrax.Solution:
-    """Integrates; also saves the last time that was reached, and the switches there."""
-    ts, size = problem.ts, len(problem.start)
-    adaptive = isinstance(control.steps, diffrax.AbstractAdaptiveStepSizeController)
-
-    def row(t, y, args):
-        """Returns the state, and the modes if joints are held."""
-        # Between the ends of steps a state has the modes alone as its last entry.
-        last = y[-1].modes if isinstance(y[-1], Switching) else y[-1]
-        has_modes = isinstance(last, Modes)
-        return (*y[:size], last._replace(events=None)) if has_modes else y[:size]
-
-    outputs = (
-        diffrax.SubSaveAt(ts=ts, fn=row),
-        diffrax.SubSaveAt(t1=True, fn=lambda t, y, args: (t, *y[size:])),
+def _stepping(
+    motion: _Motion, keywords, derivatives: bool, tangents: OfTangents | None
+) -> loop.Stepping:
+    """Chooses the steps: what judges them, and where they end."""
+    given = keywords["stepsize_controller"]  # by the user
+    controller = given or default_controller()
+    method = _differentiable(keywords["solver"] or LoopedDopri8(), keywords["adjoint"])
+    method = with_tolerances(method, controller)
+    judge = events = landing = None
+    if isinstance(controller, diffrax.AbstractAdaptiveStepSizeController):
+        term, start, args, ts = motion.problem
+        own_tolerance = given is not None
+        of_derivatives = tangents
+        if derivatives and not tangents:
+            of_derivatives = _probe(motion.problem.term, method, own_tolerance)
+        watches = not isinstance(method, ScheduledDopri8)  # which finds it itself
+        control = error_control_of(controller)
+        judge = Judge(control, term, watches, of_derivatives)
+        events = events_of(term, ts, start, args, derivatives)
+        if events is not None or motion.jumps is not None:
+            jumps = motion.jumps
+            jumps = None if jumps is None else jnp.asarray(jumps, ts.dtype)
+            landing = Landing(jumps, clearance(ts), events is not None)
+    else:
+        _check_constant_steps(motion.problem.args.forces, controller)
+    return loop.Stepping(
+        method=method,
+        controller=controller,
+        dt0=keywords["dt0"],
+        judge=judge,
+        events=events,
+        landing=landing,
+        adjoint=keywords["adjoint"],
+        most_steps=keywords["max_steps"],
+        meter=keywords["progress_meter"],
+        lanes=keywords.get("lanes"),  # of sweeps
     )
-    keywords = keywords | {
-        "solver": control.solver,
-        "stepsize_controller": control.steps,
-    }
-    # diffrax computes a few constants while it is traced.
-    with jax.transfer_guard("allow"):
-        return diffeqsolve(
-            problem.term,
-            t0=ts[0],
-            t1=end_of_run(ts, control.jumps),
-            y0=control.start,
-            args=problem.args,
-            saveat=diffrax.SaveAt(subs=outputs, controller_state=adaptive),
-            throw=False,
-            **keywords,
-        )
 
 
-def _read(inputs: Inputs, problem: _Problem, solve: diffrax.Solution) -> Solution:
+def _probe(
+    term: Any, method: diffrax.AbstractSolver, own_tolerance: bool
+) -> OfLinearised | None:
+    """Returns what judges derivatives, None if nothing does.
+
+    Implicit methods with tolerances of the user's are meant to leave fast motions
+    unresolved; the steps of a probe would resolve them.
+    """
+    if own_tolerance and isinstance(method, diffrax.AbstractImplicitSolver):
+        return None
+    has_tableau = isinstance(method, ScheduledDopri8 | diffrax.AbstractRungeKutta)
+    # Of other methods derivatives are judged as if they were by Heun's.
+    tableau: Any = method.tableau if has_tableau else diffrax.Heun.tableau
+    return OfLinearised(term, tableau)
+
+
+def _check_constant_steps(forces: tuple[Element, ...], controller: object) -> None:
+    """Raises ValueError for elements that need adaptive steps."""
+    why = None
+    # Fixed steps may step over the kinks of an `EffortHistory`, but not over jumps.
+    jumping = (e for e in forces if not isinstance(e, EffortHistory))
+    if any(e.jump_ts is not None for e in jumping):
+        why = "declare times at which they jump (jump_ts)"
+    elif changes(forces):
+        why = "hold joints or take payloads"
+    if why is not None:
+        expected = f"an adaptive one, as forces {why}"
+        raise refusal("stepsize_controller", expected, controller)
+
+
+def _read(
+    inputs: Inputs, motion: _Motion, end: loop.Attempt, keywords: Settings
+) -> Solution:
     """Reads joint states, statistics and the result."""
     linkage, state0, times, *_ = inputs
-    valid, ts = problem.valid, problem.ts
-    assert solve.ys is not None  # because of saveat
-    states, (reached, *switches) = solve.ys
-    states, modes = states[: len(problem.start)], states[len(problem.start) :]
-    q, qd, own = jax.vmap(problem.joints)(ts, states)
+    valid, ts = motion.valid, motion.problem.ts
+    states, modes = end.rows
+    q, qd, own = jax.vmap(motion.joints)(ts, states)
 
     def shown_at(a):
-        """Replaces the infinity that diffrax leaves at times not reached by NaN."""
+        """Replaces infinity at times that were not reached by NaN."""
         return jnp.where(jnp.isinf(a) | ~valid, jnp.nan, a)
 
-    # diffrax saves the start with the first step only, after any blow there.
-    saved = jnp.isfinite(qd[0]) & valid if modes else None
+    # The start is saved with the first step, after any blow there.
+    saved = None if modes is None else jnp.isfinite(qd[0]) & valid
 
     def from_start(rows, start, given):
         """Returns rows whose first one is the start, or what was given if invalid."""
@@ -227,28 +216,34 @@ def _read(inputs: Inputs, problem: _Problem, solve: diffrax.Solution) -> Solutio
         return shown_at(rows).at[0].set(first)
 
     given = (without_fixed(linkage, value) for value in state0)
-    q, qd = map(from_start, (q, qd), problem.first, given)
+    q, qd = map(from_start, (q, qd), motion.first, given)
     # Constant steps go on when the state is no longer finite.
-    reached = jnp.minimum(reached[0], ts[-1])
+    reached = jnp.minimum(end.t, ts[-1])
     not_finite = (ts <= reached) & ~jnp.isfinite(q + qd).all(axis=1)
     last_finite = ts[jnp.maximum(jnp.argmax(not_finite) - 1, 0)]
     reached = jnp.where(not_finite.any(), last_finite, reached)
-    stats = solve.stats | {"time_reached": jnp.where(valid, reached, times[0])}
-    if solve.controller_state is not None:
-        loss = largest_loss(solve.controller_state)
-        stats["accuracy"] = jnp.finfo(q.dtype).eps * loss
-    stats |= switching_facts(*switches)
+    stats: dict[str, Any] = {
+        "num_steps": end.steps,
+        "num_accepted_steps": end.accepted,
+        "num_rejected_steps": end.steps - end.accepted,
+        "max_steps": keywords["max_steps"],
+        "time_reached": jnp.where(valid, reached, times[0]),
+    }
+    if end.loss is not None:
+        stats["accuracy"] = jnp.finfo(q.dtype).eps * end.loss
+    if end.switches is not None:
+        stats |= end.switches.facts
     results: Any = diffrax.RESULTS
     # Constant steps, if too long, end in NaN and still report success.
     finite = (jnp.isfinite(q[-1]) & jnp.isfinite(qd[-1])).all()
-    finite = finite | (solve.result != results.successful)
-    result = results.where(valid & finite, solve.result, results.nonfinite)
+    finite = finite | (end.result != results.successful)
+    result = results.where(valid & finite, end.result, results.nonfinite)
     holding: Any = ()  # modes, energy taken, events
-    if modes:
-        (last,), (rows,) = switches, modes
-        events = jax.tree.map(lambda saved: saved[0], last.modes.events)
-        taken = taken_at(problem.args, ts, rows, q)
-        holding = shown_at(rows.mode), shown_at(taken), in_order(events, valid)
+    if modes is not None:
+        assert end.switches is not None  # which guard them
+        taken = taken_at(motion.problem.args, ts, modes, q)
+        events = in_order(end.switches.modes.events, valid)
+        holding = shown_at(modes.mode), shown_at(taken), events
     own = jax.tree.map(shown_at, own)
     return Solution(times, q, qd, stats, result, own, *holding)
 
@@ -259,21 +254,17 @@ def last_switched(inputs: Inputs, keywords: Settings) -> Array:
     In the order of the elements; guards of modes are the last ones.
     """
     keywords = keywords | {"adjoint": diffrax.ForwardMode()}
-    problem = _prepare(inputs, derivatives=False, plain=False)
-    control = _control(problem, keywords, derivatives=False, tangents=None)
-    ends = _solve(problem, control, keywords).ys
-    assert ends is not None  # because of saveat
-    switching = ends[1][1]
-    return (switching.after != switching.sides)[0]
+    motion = _prepare(inputs, derivatives=False, plain=False)
+    stepping = _stepping(motion, keywords, derivatives=False, tangents=None)
+    switches = loop.solve(motion.problem, stepping).switches
+    assert switches is not None  # of which a motion has too many
+    return switches.after != switches.sides
 
 
 def _differentiable(
     solver: diffrax.AbstractSolver, adjoint: diffrax.AbstractAdjoint
 ) -> diffrax.AbstractSolver:
-    """Returns the solver with loops that the adjoint can differentiate.
-
-    diffrax does this itself, except for a solver inside a wrapper.
-    """
+    """Returns the solver with loops that the adjoint can differentiate."""
     if isinstance(solver, LoopedDopri8):
         return LoopedDopri8(replayed=not isinstance(adjoint, diffrax.ForwardMode))
     kinds = {diffrax.ForwardMode: "lax", diffrax.DirectAdjoint: "bounded"}

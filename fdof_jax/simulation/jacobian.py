@@ -14,8 +14,8 @@ from jaxtyping import PyTree
 
 from ..forces.element import elements
 from ..linkage.coordinates import State
-from ..steps.controllers import SINGLE_TOLERANCE, adaptive, of_precision
 from ..steps.derivative_control import TANGENTS, OfTangents
+from ..steps.tolerances import SINGLE_TOLERANCE, adaptive, of_precision
 from .integrate import Inputs, integrate
 from .scene import Scene
 from .solution import Solution
@@ -72,6 +72,7 @@ def jacobian_of(
         dt0=1e-3,
         adjoint=diffrax.ForwardMode(),
         max_steps=65536,
+        progress_meter=diffrax.NoProgressMeter(),
     )
 
     judge = OfTangents(_OF_TANGENTS * tolerance)

@@ -25,7 +25,7 @@ from ..forces.element import Element, Forces, OwnStates, elements_on, naming
 from ..linkage.coordinates import State, real_state
 from ..linkage.fields import check_values, jumps_at
 from ..linkage.linkage import Linkage, check_linkage
-from ..steps.controllers import at_tolerances, with_longest, within_reach
+from ..steps.tolerances import at_tolerances, with_longest, within_reach
 from .failures import cause, check_arguments
 from .field import initial_states
 from .holding import within_stops

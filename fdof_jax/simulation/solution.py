@@ -15,7 +15,7 @@ from ..base.checks import is_traced, known
 from ..base.report import html_table
 from ..forces.element import OwnStates
 from ..linkage.topology import rate_unit
-from ..steps.controllers import SINGLE_TOLERANCE, TOLERANCE
+from ..steps.tolerances import SINGLE_TOLERANCE, TOLERANCE
 
 Statistics = dict[str, Any]  # arrays by name, and diffrax's `max_steps`
 

@@ -17,8 +17,8 @@ from ..base.configuration import options_of_loops
 from ..base.functions import sharing_functions
 from ..forces.added_inertia import inertial
 from ..forces.element import ForeignElement
-from ..steps.controllers import at_tolerances, with_pid
 from ..steps.derivative_control import OfTangents
+from ..steps.tolerances import at_tolerances, with_pid
 from ..steps.unrolled_dopri8 import UnrolledDopri8
 from .integrate import Inputs, Settings, integrate
 from .jacobian import along_each

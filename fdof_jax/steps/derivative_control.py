@@ -26,7 +26,6 @@ from .dopri8 import (
     largest,
     lower_triangle,
 )
-from .switching import in_force, motion_of
 
 # The relative tolerance of tangents: over that of the motion, its upper limit, and its
 # lower limit in rounding errors.
@@ -113,7 +112,7 @@ class OfTangents(eqx.Module):
         if tolerance is None:
             tolerance, least = jnp.minimum(_LOOSER * rtol, _LOOSEST), _LEAST
         tolerance = constant(jnp.maximum(tolerance, noise))
-        error, *integrated = map(motion_of, (estimate.error, step.y0, step.y1))
+        error, *integrated = estimate.error, step.y0, step.y1
         # Tangents of displacements lack that of the start.
         ends = [(step.args.q0 + jnp.stack(q), *others) for q, *others in integrated]
         of_motion = error, ends, integrated
@@ -147,7 +146,7 @@ class OfLinearised(eqx.Module):
 
     def start(self, y0: Integrated) -> Array:
         """Returns a new probe."""
-        numbers, _ = ravel_pytree(motion_of(y0))
+        numbers, _ = ravel_pytree(y0)
         probe = np.random.default_rng(0).standard_normal(numbers.size)
         return jnp.asarray(probe, numbers.dtype)
 
@@ -159,7 +158,7 @@ class OfLinearised(eqx.Module):
         scheduled = estimate.scheduled
         if scheduled is None:
             scheduled = self.term.schedule(t1, args)
-        at_end = t1, motion_of(y1), in_force(args, y1), scheduled
+        at_end = t1, y1, args, scheduled
         matrix = constant(t1 - t0) * linearised(self.term, *constant(at_end))
         change, error = self._step(matrix, probe)
         end = probe + change

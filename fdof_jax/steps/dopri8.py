@@ -43,7 +43,7 @@ DENSE = _INTERPOLATION.eval_coeffs  # (stage, power), highest first
 
 
 # Equations have types of their own (`simulation.field.Args`), which steps do not know.
-Integrated = PyTree  # a state: positions, rates, the elements' own, any `Switching`
+Integrated = PyTree  # a state: positions, rates, the elements' own
 Arguments = PyTree  # of the equations: a named tuple with a linkage, q0 and sides
 Term = Any  # a `ScheduledTerm`
 Health = tuple[Array, ...]  # one per joint, see `ScheduledTerm`
@@ -174,13 +174,6 @@ def scheduled_at_end(schedule: PyTree) -> PyTree:
     row = jax.tree.map(lambda rows: rows[AT_END], schedule)
     floating = all(map(eqx.is_inexact_array, jax.tree.leaves(row)))
     return row if floating else None
-
-
-def with_change(error: PyTree, change: Callable[[PyTree], PyTree]) -> PyTree:
-    """Returns an error, or an `Estimate`, with a change of the error."""
-    if isinstance(error, Estimate):
-        return error._replace(error=change(error.error))
-    return change(error)
 
 
 def verdict(estimate: Estimate, h: Array) -> tuple[Estimate, diffrax.RESULTS]:

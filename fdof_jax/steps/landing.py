@@ -8,8 +8,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ..linkage.fields import has_come
-from .controllers import giving_up
-from .dopri8 import Integrated, constant
+from .dopri8 import constant
 
 # More than `_MOST_CROSSINGS` count as chatter if all come within the least distance
 # between two times, times this power of the unit of rounding (3e5 in float64). Chatter
@@ -25,7 +24,7 @@ _MOST_TRIES = 6
 _APART = 4
 # A step that would end within this share of its length before a known time ends at it.
 _JUST_BEFORE = 1e-6
-# diffrax moves the end of a step to that of the run if they are within 100 units of
+# The loop moves the end of a step to that of the run if they are within 100 units of
 # rounding. Twice as many are safe; a run that goes on after a jump at its end is longer
 # by more, by so many clearances.
 _NEAR_END, _LONGER = 200, 64
@@ -40,24 +39,27 @@ def clearance(ts: Array) -> Array:
     return _APART * jnp.finfo(ts.dtype).eps * constant(jnp.max(jnp.abs(ts)))
 
 
-def end_of_run(ts: Array, jumps: Array | None) -> Array:
-    """Returns the end of the last step: the last time, or a little later with a jump.
-
-    Else diffrax would move the end of the step before the known time onto it.
-    """
-    end = ts[-1]
-    if jumps is None:
-        return end
-    apart, last = clearance(ts), _last(end)
-    # Steps land on what comes before `last`, and go on after it.
-    belongs = has_come(jumps, end) | (jumps < last + apart)
-    there = (jumps >= last - apart) & belongs
-    return end + jnp.where(jnp.any(constant(there)), _LONGER * apart, 0)
-
-
 def _last(end: Array) -> Array:
-    """Returns the time after which diffrax may move a step's end to that of the run."""
+    """Returns the time after which a step's end may be moved to that of the run."""
     return constant(end - _NEAR_END * jnp.finfo(end.dtype).eps * jnp.abs(end))
+
+
+class Found(NamedTuple):
+    """What was found in a step.
+
+    - `until`: when the step should have ended; its end if nothing switched before [s].
+    - `unseen`: a time before which a switching function may have passed 0 unseen; the
+      step's end if none may [s].
+    - `soon`: the time of a switch that follows soon after the end; else the end [s].
+    - `near`: how far from its zero a switching function may switch [s].
+    - `switched`: whether any switches at the end.
+    """
+
+    until: Array
+    unseen: Array
+    soon: Array
+    near: Array
+    switched: Array
 
 
 class NextStep(NamedTuple):
@@ -105,6 +107,22 @@ class Landing(eqx.Module):
     apart: Array  # see `clearance`
     switches: bool = eqx.field(static=True)
 
+    def end_of_run(self, ts: Array) -> Array:
+        """Returns the end of the last step: the last time, or a little later.
+
+        It is later where rates jump at the last time. Else the loop would move the end
+        of the step before that jump onto it.
+        """
+        end = ts[-1]
+        if self.jumps is None:
+            return end
+        last = _last(end)
+        # Steps land on what comes before `last`, and go on after it.
+        belongs = has_come(self.jumps, end) | (self.jumps < last + self.apart)
+        there = (self.jumps >= last - self.apart) & belongs
+        later = jnp.any(constant(there))
+        return end + jnp.where(later, _LONGER * self.apart, 0)
+
     def _cut(self, t0: Array, t1: Array, last: Array) -> tuple[Array, Array, Array]:
         """Returns a step's end, the gap after it, and whether it is at a known time."""
         if self.jumps is None:
@@ -133,21 +151,20 @@ class Landing(eqx.Module):
         return end, _Landing(*state)
 
     def _happened(
-        self, begin: Array, end: Array, y1: Integrated, keep: Array, state: _Landing
+        self,
+        begin: Array,
+        end: Array,
+        found: Found | None,
+        keep: Array,
+        state: _Landing,
     ) -> _Happened:
         """Returns what a step did; `keep`: whether the controller would keep it."""
         aimed = end == state.target
-        if not self.switches:
+        if found is None:
             never, landed = jnp.zeros_like(keep), keep & aimed
             none = never, never, never
             return _Happened(keep, *none, landed, landed, state.beyond, end)
-        # When the first switch came, when one may have come unseen, when one follows,
-        # and how near to that time a step may end (see `Switching`).
-        seen = y1[-1]
-        until, unseen, soon, near = constant(
-            (seen.until, seen.unseen, seen.soon, seen.near)
-        )
-        nothing_switched = jnp.all(seen.after == seen.sides)
+        until, unseen, soon, near, switched = found
         allowance = jnp.where(aimed, near, 0)
         within = until < jnp.minimum(end - allowance, state.last)
         # A switch that a jump causes at once comes before the next jump, however near.
@@ -160,7 +177,7 @@ class Landing(eqx.Module):
         unsure = keep & ~passed & (unseen < end)
         # A step that ends before the switch is stretched to it if that is near, because
         # a tiny second step would tell little of slopes.
-        before = keep & ~unsure & ~passed & aimed & nothing_switched
+        before = keep & ~unsure & ~passed & aimed & ~switched
         before &= end < state.beyond
         stretched = before & (end < soon) & (soon < state.beyond)
         missed = before & ~stretched
@@ -182,8 +199,9 @@ class Landing(eqx.Module):
         )
 
     def after(
-        self, t0: Array, t1: Array, y1: Integrated, planned: NextStep, state: _Landing
-    ) -> tuple[NextStep, Array, _Landing]:
+        self, t0: Array, t1: Array, found: Found | None, planned: NextStep,
+        state: _Landing,
+    ) -> tuple[NextStep, Array, _Landing]:  # fmt: skip
         """Returns the next step, and whether the controller resumes its old state.
 
         `planned`: what the controller would do. A step that it keeps is one of these:
@@ -198,7 +216,7 @@ class Landing(eqx.Module):
         | any other | | as planned, or up to the next known time |
         """
         begin, end = constant((t0, t1))
-        step = self._happened(begin, end, y1, planned.keep, state)
+        step = self._happened(begin, end, found, planned.keep, state)
         shortened = step.crossed | step.unsure
         resumes = shortened | step.landed
 
@@ -225,8 +243,8 @@ class Landing(eqx.Module):
         # The last step may be shorter than the least length; no step follows it.
         done = step.keep & (end >= state.last)
         result = results.where(resumes | done, results.successful, planned.result)
-        chatter = crossings > _MOST_CROSSINGS
-        result = giving_up(result, chatter, results.max_steps_rejected)
+        chatter = (crossings > _MOST_CROSSINGS) & (result == results.successful)
+        result = results.where(chatter, results.max_steps_rejected, result)
 
         state = state._replace(
             target=jnp.where(aims, constant(next_t1), jnp.inf),

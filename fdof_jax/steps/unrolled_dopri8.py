@@ -94,14 +94,12 @@ class _Step(NamedTuple):
 
 @eqx.filter_jit  # traced once, not at each use in a solve
 def _step(term, t0, t1, y0, residue, args, f0) -> tuple[_Step, dict[str, PyTree]]:
-    inner, h = term.term, term.contr(t0, t1)  # within a wrapper of diffrax
+    h = t1 - t0
     times = t0 + (t1 - t0) * jnp.asarray(SCHEDULE_SHARES, t0.dtype)
     # XLA makes vectors of the lanes, not of all stages of each, only in a loop.
-    schedule = jax.lax.map(
-        lambda t: entries_in_one_loop(inner.schedule(t, args)), times
-    )
+    schedule = jax.lax.map(lambda t: entries_in_one_loop(term.schedule(t, args)), times)
     scheduled = lambda stage: jax.tree.map(lambda leaf: leaf[stage], schedule)
-    field, rates = eqx.filter_jit(inner.vector_field), [f0]
+    field, rates = eqx.filter_jit(term.vector_field), [f0]
     weighted = lambda row: _increment(row, rates, y0, h)
     for stage, row in enumerate(LOWER[1:-1], 1):
         y = _moved(y0, h, weighted(row))
@@ -112,7 +110,7 @@ def _step(term, t0, t1, y0, residue, args, f0) -> tuple[_Step, dict[str, PyTree]
     poison = 0 * sum(jax.tree.leaves(y))
     y = jax.tree.map(lambda a: a + poison, y)
     y, error, residue = in_one_loop((y, error, residue))
-    last, health = inner.watched_field(times[AT_END], y, args, scheduled(AT_END))
+    last, health = term.watched_field(times[AT_END], y, args, scheduled(AT_END))
     dense_info = dict(y0=y0, step=h, rates=[*rates, last], scheduled=schedule)
     return _Step(y, error, residue, last, health), dense_info
 
@@ -141,8 +139,7 @@ class UnrolledDopri8(ScheduledDopri8):
 
     def _start(self, terms, t0, y0, args):
         """Returns the rates and their health at the start of a step."""
-        term = terms.term
-        return term.watched_field(t0, y0, args, term.schedule(t0, args))
+        return terms.watched_field(t0, y0, args, terms.schedule(t0, args))
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         start, residue = solver_state

@@ -1,4 +1,4 @@
-"""Step size controllers: own ones, the default, tolerances, and changes of any."""
+"""Tolerances of steps: the default controller, others, and changes of any."""
 
 import dataclasses
 from collections.abc import Callable
@@ -13,26 +13,20 @@ from jax import Array
 from jaxtyping import PyTree
 from numpy.typing import ArrayLike
 
-from ..base.checks import concrete, is_traced, real_numbers
+from ..base.checks import concrete, is_traced, real_numbers, refusal
 from ..base.user_warnings import warn
 from .dopri8 import constant
 
 Controller = diffrax.AbstractStepSizeController
-Judging = diffrax.AbstractAdaptiveStepSizeController  # judges errors of steps
+ErrorControl = diffrax.AbstractAdaptiveStepSizeController
+# What stands for tolerances of implicit methods that are those of the controller.
+_OF_CONTROLLER = diffrax.with_stepsize_controller_tols(diffrax.VeryChord)().rtol
 _C = TypeVar("_C", bound=Controller)
 _T = TypeVar("_T")
 # Default tolerances in float64 and float32, relative and absolute.
 TOLERANCE, SINGLE_TOLERANCE = 1e-11, 1e-5
 # Rounding keeps float32 from meeting a tighter relative or absolute tolerance.
 _TIGHTEST_SINGLE = 1e-6
-
-
-def giving_up(
-    result: diffrax.RESULTS, spent: Array, reason: diffrax.RESULTS
-) -> diffrax.RESULTS:
-    """Returns `reason` if `spent`, unless the step has failed by itself."""
-    ends = spent & (result == diffrax.RESULTS.successful)
-    return diffrax.RESULTS.where(ends, reason, result)
 
 
 def _with(
@@ -55,14 +49,52 @@ def with_pid(
     return _with(change, controller, lambda n: isinstance(n, diffrax.PIDController))
 
 
+def _controls_errors(node: object) -> bool:
+    """Returns whether it is a controller that judges errors, not one around it."""
+    wraps = isinstance(node, diffrax.ClipStepSizeController)
+    return isinstance(node, ErrorControl) and not wraps
+
+
 def with_error_control(change: Callable[..., Controller], controller: _C) -> _C:
     """Returns a controller with `change` applied to the one that judges errors."""
+    return _with(change, controller, _controls_errors)
 
-    def judges(node: object) -> bool:
-        wrapper = isinstance(node, Abreast | diffrax.ClipStepSizeController)
-        return isinstance(node, Judging) and not wrapper
 
-    return _with(change, controller, judges)
+def error_control_of(controller: Controller) -> ErrorControl:
+    """Returns the controller that judges errors: itself, or one within it."""
+    nodes = jax.tree.leaves(controller, is_leaf=_controls_errors)
+    return next(filter(_controls_errors, nodes))
+
+
+def with_tolerances(
+    method: diffrax.AbstractSolver, controller: Controller
+) -> diffrax.AbstractSolver:
+    """Returns a method that solves equations to the tolerances of a controller.
+
+    That is what implicit methods of diffrax do by default. Raises ValueError if there
+    are none.
+    """
+    if not isinstance(method, diffrax.AbstractImplicitSolver):
+        return method
+    names = [
+        name
+        for name in ("rtol", "atol", "norm")
+        if getattr(method.root_finder, name) is _OF_CONTROLLER
+    ]
+    if not names:
+        return method
+    if not isinstance(controller, ErrorControl):
+        raise refusal(
+            "stepsize_controller",
+            "an adaptive one, as the root finder of an implicit solver has no "
+            "tolerances of its own",
+            controller,
+        )
+    return eqx.tree_at(
+        lambda method: [getattr(method.root_finder, name) for name in names],
+        method,
+        [getattr(controller, name) for name in names],
+    )
 
 
 def by_square_roots(controller: Controller) -> Controller:
@@ -111,71 +143,6 @@ class Shortening(diffrax.PIDController):
         shortened = keep & (factor < 1) & (inverse_error != 1)
         next_t1 = jnp.where(shortened, next_t0 + shorter, next_t1)
         return keep, next_t0, next_t1, *rest, state, result
-
-
-class Adaptive(Judging):
-    """Wrapper of an adaptive controller; implicit solvers read its tolerances.
-
-    The arguments of `init` and `adapt_step_size` are those of diffrax.
-    """
-
-    controller: eqx.AbstractVar[Any]
-
-    def wrap(self, direction):
-        inner = self.controller.wrap(direction)
-        return eqx.tree_at(lambda c: c.controller, self, inner)
-
-    def init(self, *arguments):  # pyright: ignore[reportIncompatibleMethodOverride]
-        return self.controller.init(*arguments)
-
-    def adapt_step_size(self, *arguments):  # pyright: ignore[reportIncompatibleMethodOverride]
-        return self.controller.adapt_step_size(*arguments)
-
-    # pyright takes the attributes of the base class for constructor arguments.
-    @property
-    def rtol(self):  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.controller.rtol
-
-    @property
-    def atol(self):  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.controller.atol
-
-    @property
-    def norm(self):  # pyright: ignore[reportIncompatibleMethodOverride]
-        return self.controller.norm
-
-
-# A lane stops once it has taken `_SLACK` times as many steps as it had taken when
-# `_MOST` of the lanes were done.
-_SLACK, _MOST = 1.5, 7 / 8
-
-
-class Abreast(Adaptive):
-    """A step size controller that gives up when most other lanes are long done.
-
-    For programs that are mapped over a named axis. The result is then
-    `max_steps_reached`, before diffrax's own `max_steps`.
-    """
-
-    controller: Judging
-    axis: str = eqx.field(static=True)
-
-    def init(self, *arguments):
-        first, state = super().init(*arguments)
-        none = jnp.zeros((), jnp.int32)
-        return first, (state, none, none)
-
-    def adapt_step_size(self, *arguments):
-        *arguments, (state, count, typical) = arguments
-        *step, state, result = super().adapt_step_size(*arguments, state)
-        count = count + 1
-        # Once a lane is done its state is frozen, so that its count falls behind.
-        done = count < jax.lax.pmax(count, self.axis)
-        most = jax.lax.pmean(done.astype(float), self.axis) >= _MOST
-        typical = jnp.where(most & (typical == 0), count, typical)
-        behind_most = (typical > 0) & (count >= _SLACK * typical)
-        result = giving_up(result, behind_most, diffrax.RESULTS.max_steps_reached)
-        return *step, (state, count, typical), result
 
 
 def of_precision(double: _T, single: _T) -> _T:

@@ -1,4 +1,4 @@
-"""The step controller of integrations, around one of diffrax.
+"""Judges steps: whether they are accurate, and how long the next one may be.
 
 It does not chase rounding errors. Equations that lose accuracy amplify them in the
 rates. The error estimate of a step is then this noise times the step size: no shorter
@@ -7,7 +7,7 @@ step brings it below a tight tolerance, and steps that try reach nothing.
 
 import functools
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import diffrax
 import equinox as eqx
@@ -18,10 +18,8 @@ from jax.typing import ArrayLike
 from jaxtyping import PyTree
 
 from ..linkage.topology import real_joints
-from .controllers import Adaptive, Judging
 from .derivative_control import OfLinearised, OfTangents, Step
 from .dopri8 import (
-    Arguments,
     Estimate,
     Health,
     Integrated,
@@ -32,10 +30,9 @@ from .dopri8 import (
     is_singular,
     largest,
     verdict,
-    with_change,
 )
-from .landing import Landing, NextStep
-from .switching import in_force, motion_of
+from .landing import NextStep
+from .tolerances import ErrorControl
 
 # Rounding errors of an acceleration, over its size times eps and the loss of accuracy:
 # less for slides, whose inertia is a sum of masses without levers.
@@ -48,15 +45,8 @@ _NOISE = 8.0
 _HELD = 0.43
 
 
-class _State(NamedTuple):
-    inner: PyTree  # of diffrax's controller
-    landing: PyTree  # of `Landing`
-    probe: Array | tuple[()] | None  # of derivatives
-    loss: Array  # the largest loss of accuracy in steps so far
-
-
-class StepControl(Adaptive):
-    """Judges the steps of an integration, and ends them where something happens.
+class Judge(eqx.Module):
+    """Judges the steps of a run, by more than their errors.
 
     `controller` is one of diffrax that judges errors. After each step, in this order:
 
@@ -66,79 +56,68 @@ class StepControl(Adaptive):
     | Would derivatives be less accurate than the tolerance? | a larger error |
     | Is its error only rounding? | it counts as 0: shorter steps have it, too |
     | Is the error within the tolerance? | `controller` keeps or rejects the step |
-    | Did it pass a known time or a switch? | a step that ends there (see `Landing`) |
     | How much accuracy did it lose? | recorded, for `Solution.stats` |
 
     Up to the tolerance, a motion does not depend on where its steps end. So lengths of
     steps are constants in derivatives, except where steps end at known times.
 
-    - `term`: the equations; None if rates are trusted and no error is mere rounding.
-    - `watches`: whether this controller, not the solver, checks the ends of steps.
+    - `watches`: whether this judge, not the method, checks the ends of steps.
     """
 
     controller: Any
-    term: ScheduledTerm | None
+    term: ScheduledTerm
     watches: bool = eqx.field(static=True)
-    landing: Landing | None
     derivatives: OfTangents | OfLinearised | None
 
-    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):  # pyright: ignore[reportIncompatibleMethodOverride]
-        arguments = constant((terms, t0, t1, motion_of(y0), dt0, in_force(args, y0)))
-        first, inner = constant(self.controller.init(*arguments, func, error_order))
-        probe = None if self.derivatives is None else self.derivatives.start(y0)
-        loss, landing = jnp.zeros_like(first), None
-        if self.landing is not None:
-            first, landing = self.landing.start(t0, t1, first)
-        return first, _State(inner, landing, probe, loss)
+    def start(self, y0: Integrated) -> Array | tuple[()]:
+        """Returns the probe of derivatives at the start."""
+        return () if self.derivatives is None else self.derivatives.start(y0)
 
-    def adapt_step_size(  # pyright: ignore[reportIncompatibleMethodOverride]
-        self, t0, t1, y0, y1, args, y_error, error_order, state
-    ):
+    def __call__(
+        self, step: Step, error: PyTree, order: float, controller: PyTree,
+        probe: PyTree, loss: Array,
+    ) -> tuple[NextStep, PyTree, PyTree, Array, diffrax.RESULTS]:  # fmt: skip
+        """Returns the next step that the controller plans, and its state.
+
+        Also returns the probe at the end of this one, the largest loss of accuracy up
+        to there, and whether the end is healthy. `controller`, `probe`, `loss`: those
+        before it.
+        """
         # Is its end singular, or not finite?
-        health_result = diffrax.RESULTS.successful
+        health = diffrax.RESULTS.successful
         if self.watches:
-            y1, y_error, health_result = self._healthy(t0, t1, y0, y1, args, y_error)
+            step, error, health = self._healthy(step, error)
         # Would derivatives be less accurate than the tolerance?
-        ratio, probe = None, None
+        ratio = None
         if self.derivatives is not None:
-            taken = Step(t0, t1, y0, y1, args)
-            ratio, probe = self.derivatives(taken, y_error, state.probe, self.rtol)
-        judged: Any = *map(motion_of, (y0, y1)), with_change(y_error, motion_of)
-        controller = self.controller
-        before, after, error = constant(judged)
-        begin, end, args = constant((t0, t1, args))
+            ratio, probe = self.derivatives(step, error, probe, self.controller.rtol)
+        step, error = constant((step, error))
         # Is its error only rounding? How much accuracy did it lose?
-        loss = state.loss
-        if self.term is not None:
-            loss = functools.reduce(jnp.maximum, error.health, loss)
-            error = _above_rounding(
-                controller, end - begin, before, after, args, error, ratio, error_order
-            )
+        loss = functools.reduce(jnp.maximum, error.health, loss)
+        error = _above_rounding(self.controller, step, error, ratio, order)
         # Is the error within the tolerance?
-        keep, next0, next1, jumped, inner, result = constant(
-            controller.adapt_step_size(
-                begin, end, before, after, args, error, error_order, state.inner
-            )
+        *plan, controller, result = constant(
+            self.controller.adapt_step_size(*step, error, order, controller)
         )
-        # Did it pass a known time or a switch?
-        step, landing = NextStep(keep, next0, next1, jumped, result), None
-        if self.landing is not None:
-            step, resumes, landing = self.landing.after(t0, t1, y1, step, state.landing)
-            inner = chosen(resumes, state.inner, inner)
-        if self.derivatives is not None:
-            probe = chosen(jnp.array(step.jumped), self.derivatives.start(y1), probe)
-            probe = chosen(step.keep, probe, state.probe)
-        loss = jnp.where(step.keep, loss, state.loss)
-        failed = health_result != diffrax.RESULTS.successful
-        result = diffrax.RESULTS.where(failed, health_result, step.result)
-        return *step[:4], _State(inner, landing, probe, loss), result
+        return NextStep(*plan, result), controller, probe, loss, health
+
+    def probed(
+        self, step: NextStep, after: PyTree, before: PyTree, y1: Integrated
+    ) -> PyTree:
+        """Returns the probe before the next step: a new one if rates jump there.
+
+        `after`, `before`: the probes at the ends of the step before; `y1`: its end.
+        """
+        if self.derivatives is None:
+            return after
+        new = self.derivatives.start(y1)
+        return chosen(step.keep, chosen(jnp.array(step.jumped), new, after), before)
 
     def _healthy(
-        self, t0: Array, t1: Array, y0: Integrated, y1: Integrated, args: Arguments,
-        error: PyTree,
-    ) -> tuple[Integrated, Estimate, diffrax.RESULTS]:  # fmt: skip
+        self, step: Step, error: PyTree
+    ) -> tuple[Step, Estimate, diffrax.RESULTS]:
         """Returns a finite end, the error and health of a step, and its result."""
-        assert self.term is not None
+        t0, t1, y0, y1, args = step
         # Rates that are not finite make the error not finite.
         finite = jnp.isfinite(sum(map(jnp.sum, jax.tree.leaves((y1, error)))))
         # If the end is not finite, the health at the start shows why.
@@ -148,34 +127,25 @@ class StepControl(Adaptive):
         bad = jnp.isnan(sum(health)) | is_singular(health)
         estimate, failure = verdict(Estimate(error, health), t1 - t0)
         # The error is scaled by the state, which must be finite for that.
-        return chosen(bad, y0, y1), estimate, failure
-
-
-def largest_loss(controller_state: PyTree) -> Array:
-    """Returns the largest loss of accuracy in a solve, from its controllers' state."""
-    mine = lambda node: isinstance(node, _State)
-    (state,) = filter(mine, jax.tree.leaves(controller_state, is_leaf=mine))
-    return state.loss
+        return step._replace(y1=chosen(bad, y0, y1)), estimate, failure
 
 
 def _above_rounding(
-    control: Judging,
-    h: Array,
-    y0: Integrated,
-    y1: Integrated,
-    args: Arguments,
+    control: ErrorControl,
+    step: Step,
     estimate: Estimate,
     of_derivatives: Array | None,
     order: float | None,
 ) -> PyTree:
-    """Returns the error of a step of length `h` without what is rounding.
+    """Returns the error of a step without what is rounding.
 
     `of_derivatives`: the error of derivatives over their tolerance, which counts too.
     """
     error, health, _ = estimate
+    t0, t1, y0, y1, args = step
     same_step = _same_step(control, order)
     of_qd = _rounding(real_joints(args.linkage.ef), health, y0, y1)
-    of_delta = jax.tree.map(lambda noise: jnp.abs(h) * noise, of_qd)
+    of_delta = jax.tree.map(lambda noise: jnp.abs(t1 - t0) * noise, of_qd)
 
     def judged(error: Array, start: Array, end: Array, rounding: Array) -> Array:
         size = jnp.maximum(jnp.abs(start), jnp.abs(end))
@@ -197,7 +167,7 @@ def _above_rounding(
     return *motion, *error[2:]
 
 
-def _same_step(controller: Judging, order: ArrayLike | None) -> ArrayLike:
+def _same_step(controller: ErrorControl, order: ArrayLike | None) -> ArrayLike:
     """Returns the error, over its tolerance, after which the next step is as long."""
     if not isinstance(controller, diffrax.PIDController):
         return _HELD  # what a method of order 8 has with diffrax's safety factor

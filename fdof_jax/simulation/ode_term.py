@@ -1,0 +1,73 @@
+"""A scene as a term of diffrax, for a solve of one's own."""
+
+import diffrax
+import jax.numpy as jnp
+from jax import Array
+
+from ..base.checks import instance
+from ..forces.holders import check_free
+from ..linkage.coordinates import real_state
+from ..linkage.linkage import check_linkage, without_fixed
+from .field import Args, args_of, initial_own, schedule_of, vector_field, whole
+from .prescribed import prescribed
+from .scene import Scene, with_full_size
+
+_Y = tuple[Array, Array, Array]  # positions, velocities, states of elements
+
+
+def ode_term(scene: Scene) -> tuple[diffrax.ODETerm, _Y, Args]:
+    """Returns a scene as the term, start and arguments of a `diffrax.diffeqsolve`.
+
+    `diffrax.diffeqsolve(term, solver, 0, t1, dt0, y0, args)` then has all of diffrax:
+    dense solutions, events that end a solve, other solvers, and noise by a `MultiTerm`
+    (see the recipes). It does not have what `simulate` adds: steps do not end where
+    elements jump or switch, so that derivatives there may be wrong; errors that are
+    mere rounding shorten steps; no result names a singular arm.
+
+    **Arguments:**
+
+    - `scene`: its linkage, start and forces. Elements that hold joints, and a
+      `PrescribedMotion`, are refused.
+
+    **Returns:** `(term, y0, args)`. `term` is a `diffrax.ODETerm` of one function for
+    all scenes, so that scenes of one structure share a program; `y0` is `(q, qd, own)`
+    of shapes (n,), (n,) and those of the elements' own states, with their rates
+    `term.vf(t, y, args)`; `args` holds the linkage and the forces.
+
+    **Raises:** ValueError for malformed scenes.
+
+    >>> import diffrax
+    >>> import fdof_jax as fj
+    >>> term, y0, args = fj.simulation.ode_term(fj.scenes.fig5())
+    >>> control = diffrax.PIDController(rtol=1e-9, atol=1e-9)
+    >>> solve = diffrax.diffeqsolve(
+    ...     term, diffrax.Dopri8(), 0, 1.0, 1e-3, y0, args, stepsize_controller=control)
+    >>> q, qd, own = solve.ys
+    >>> q[-1].tolist()
+    [-1.666, 1.998, -0.629]
+    """
+    instance("scene", scene, Scene)
+    check_linkage(scene.linkage)
+    linkage, state0, forces, _ = with_full_size(scene)
+    start = real_state("scene.state0", state0, linkage)
+    for index, element in enumerate(forces):
+        check_free(f"scene.forces[{index}]", element)
+    if prescribed(forces) is not None:
+        raise ValueError(
+            "scene.forces: expected no PrescribedMotion, whose motion simulate knows."
+        )
+    q, qd = (without_fixed(linkage, value) for value in start)
+    args = args_of(linkage, q, forces)
+    return _TERM, (q, qd, jnp.array(initial_own(args), q.dtype)), args
+
+
+def _rates(t: Array, y: _Y, args: Args) -> _Y:
+    """Returns the rates of positions, velocities and the elements' own states."""
+    q, qd, own = y
+    state = whole(tuple(q - args.q0), tuple(qd), tuple(own))
+    rates = *vector_field(t, state, args, schedule_of(t, args)), ()
+    of_q, of_qd, of_own, *_ = rates
+    return jnp.stack(of_q), jnp.stack(of_qd), jnp.array(of_own, q.dtype)
+
+
+_TERM = diffrax.ODETerm(_rates)

@@ -1,0 +1,325 @@
+"""Where elements switch between the branches of their formulas, and what then jumps.
+
+Within a step the branches are those in force at its start, so the step's equations are
+smooth. A step over the zero of a switching function is replaced by one that ends there.
+"""
+
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import PyTree
+
+from ..linkage.fields import Truth
+from .dopri8 import SHORTEST, Arguments, DenseOutput, Integrated, Term, constant
+from .landing import Found, clearance
+from .switch_derivatives import Event, gained, gained_at_kink, lateness, moved
+from .zeros import CHECKED, CHECKS, SAMPLED, SHARES, passage
+
+# A function whose zero is this close to the end of a step switches there: a share of
+# the step, as a power of the unit of rounding (1e-9 in float64).
+_NEAR = 0.575
+# A function began on its zero if its values before were below this share of its size,
+# also a power of the unit of rounding.
+_ON_ZERO = 0.625
+# In steps of at most this many such distances, hidden zeros are not looked for.
+_BRIEF = 10
+
+
+class Switches(NamedTuple):
+    """The state of the switching functions where a step ended.
+
+    - `sides` (switch,): those in force in this step: 1 above and -1 below zero, and 0
+      before the start.
+    - `after`: those after a switch here.
+    - `until`: when the step should have ended; its end if nothing switched before [s].
+    - `near`: how far from its zero a switching function may switch [s].
+    - `sizes` (switch,): the largest values of the switching functions up to here.
+    - `length`: that of the step [s].
+    - `ahead`: whether a function that switches here has not quite reached its zero.
+    - `passed`: number of switches up to here.
+    - `one_sided`: number of places up to here where derivatives may hold on one side
+      only (see `Events`); None if nothing jumps at switches.
+    - `grazing`, `grazing_here`: how nearly the crossings so far grazed, and the one
+      here; 0 if none (see `Passage`).
+    - `modes`: those of the joints (see `ScheduledTerm`), None if elements hold none.
+    """
+
+    sides: Array
+    after: Array
+    until: Array
+    near: Array
+    sizes: Array
+    length: Array
+    ahead: Array
+    passed: Array
+    one_sided: Array | None
+    grazing: Array
+    grazing_here: Array
+    modes: PyTree
+
+    @property
+    def facts(self) -> dict[str, Array]:
+        """The statistics of a run that ended here."""
+        sided = {} if self.one_sided is None else {"one_sided": self.one_sided}
+        slowest = {"slowest_crossing": 1 / self.grazing}
+        return {"num_switches": self.passed} | sided | slowest
+
+
+class Begun(NamedTuple):
+    """What is in force in a step, and what has changed at its beginning.
+
+    - `sides`, `modes`: those in force.
+    - `changed` (switch,): which functions switched there; `on_zero`: which begin near
+      their zeros, as after a switch.
+    - `sizes`: their largest values before, 0 of functions that are new.
+    - `grazing`: how nearly crossings grazed, the one there included.
+    """
+
+    sides: Array
+    modes: PyTree
+    changed: Array
+    on_zero: Array
+    sizes: Array
+    grazing: Array
+
+
+class Events(eqx.Module):
+    """What happens between the steps of a run.
+
+    Where efforts jump at a switch, a motion that starts on it, or meets it together
+    with another, may have different derivatives on its two sides.
+
+    - `jumping`: whether efforts jump where each function switches; the last `guards`
+      functions guard modes.
+    - `derivatives`: whether states move with the times of events, in derivatives.
+    """
+
+    term: Any
+    args: Arguments
+    apart: Array  # see `clearance`
+    jumping: tuple[bool, ...] = eqx.field(static=True)
+    guards: int = eqx.field(static=True)
+    derivatives: bool = eqx.field(static=True)
+
+    def start(self, t0: Array) -> Switches:
+        """Returns the state before the first step."""
+        modes = self.term.unknown_modes(self.args)[0] if self.guards else None
+        count, none = len(self.jumping), jnp.zeros_like(t0)
+        unknown, no = jnp.zeros(count, t0.dtype), jnp.array(False)
+        known = unknown.at[count - self.guards :].set(1)
+        return Switches(
+            sides=known,
+            after=known,
+            until=t0,
+            near=none,
+            sizes=unknown,
+            length=none,
+            ahead=no,
+            passed=jnp.zeros((), int),
+            one_sided=jnp.zeros((), int) if any(self.jumping) else None,
+            grazing=none,
+            grazing_here=none,
+            modes=modes,
+        )
+
+    # What happens where a step ended?
+
+    def crossed(
+        self, t: Array, y: Integrated, last: Switches, jumped: Truth
+    ) -> tuple[Integrated, Begun]:
+        """Returns the state where a step begins, and what is in force in it.
+
+        `t`, `y`: before what happens there; `jumped`: whether something may.
+        """
+        if_jumped = lambda after, before: jnp.where(jumped, after, before)
+        sides, modes, sizes = if_jumped(last.after, last.sides), last.modes, last.sizes
+        on_zero = sides != last.sides
+        changed = on_zero & (last.sides != 0)
+        if not self.guards:
+            y = self._shifted(t, y, last, jumped)
+        else:
+            sides = sides.at[-self.guards :].set(1)
+            at_start = jnp.any(modes.mode < 0)
+            y, modes = jax.lax.cond(
+                jumped | at_start,
+                lambda: self._after_event(t, y, last, sides, changed, jumped),
+                lambda: (y, modes),
+            )
+            # Other modes have other guards.
+            old = last.modes
+            same = (modes.mode == old.mode) & (modes.direction == old.direction)
+            guards = jnp.arange(sides.size) >= sides.size - self.guards
+            new = guards & (changed[-self.guards :].any() | ~same.all())
+            on_zero, sizes = on_zero | new, jnp.where(new, 0, sizes)
+        grazing = jnp.maximum(last.grazing, if_jumped(last.grazing_here, 0))
+        return y, Begun(sides, modes, changed, on_zero, sizes, grazing)
+
+    def _after_event(
+        self, t: Array, y: Integrated, last: Switches, sides: Array, changed: Array,
+        jumped: Truth,
+    ) -> tuple[Integrated, PyTree]:  # fmt: skip
+        """Returns state and modes after an event.
+
+        The state moves on to the time of the event in the modes before, and back in
+        those after: this changes nothing but derivatives.
+        """
+        before = self.args._replace(sides=last.sides, modes=last.modes)
+        fired = changed[-self.guards :].reshape(-1, last.modes.mode.size)
+        time = jnp.where(last.ahead, t, last.until)
+        late, there = jnp.zeros_like(t), y
+        if self.derivatives:
+            arrived = changed & jumped & (last.length > 0)
+            late = jax.lax.cond(
+                jnp.any(arrived),
+                lambda: lateness(time, y, before, jnp.argmax(arrived), self.term),
+                lambda: jnp.zeros_like(t),
+            )
+            there = moved(late, time, y, before, self.term)
+        event, own = Event(last.until, t, fired, late), before._replace(sides=sides)
+        there, modes = self.term.resolve(event, there, own)
+        if self.derivatives:
+            after = self.args._replace(sides=sides, modes=modes)
+            there = moved(-late, t + late, there, after, self.term)
+        return there, modes
+
+    def _shifted(
+        self, t: Array, y: Integrated, last: Switches, jumped: Truth
+    ) -> Integrated:
+        """Returns the state with the derivatives that a switch brings."""
+        if not self.derivatives:
+            return y
+        before, after = last.sides, last.after
+        in_turn = [before, after]
+        # Kinks change second derivatives alone.
+        if any(self.jumping) and before.size > 1:
+            first = (before != after) & (jnp.cumsum(before != after) == 1)
+            in_turn.insert(1, jnp.where(first, after, before))
+        # A known time may be here too, just before the zeros or just after them.
+        t = jnp.where(last.ahead, t, last.until)
+        # In a step of no length no function comes to its zero gradually: it jumped, at
+        # a known time.
+        arrived = jumped & (last.length > 0)
+        gain_of = gained if any(self.jumping) else gained_at_kink
+        for before, after in zip(in_turn, in_turn[1:]):
+            own, then = (self.args._replace(sides=sides) for sides in (before, after))
+            switched = (before != after) & arrived
+            gain = gain_of(t, y, own, then, switched, term=self.term)
+            y = jax.tree.map(jnp.add, y, gain)
+        return y
+
+    # What happens in a step?
+
+    def kept(self, begun: Begun, y1: Integrated, y0: Integrated) -> Integrated:
+        """Returns the end of a step, positions and rates of held joints as before.
+
+        Rounding errors of earlier steps, which the compensated sum carries, would still
+        move them.
+        """
+        if not self.guards:
+            return y1
+        held = begun.modes.held
+
+        def still(new: PyTree, old: PyTree) -> PyTree:
+            if eqx.is_array(new):
+                return jnp.where(held, old, new)
+            return tuple(jnp.where(*row) for row in zip(held, old, new))
+
+        return (*map(still, y1[:2], y0[:2]), *y1[2:])
+
+    def located(
+        self, t0: Array, t1: Array, path: diffrax.AbstractLocalInterpolation,
+        own: Arguments, begun: Begun, last: Switches,
+    ) -> tuple[Found, Switches]:  # fmt: skip
+        """Returns what a step found, and the state where it ended.
+
+        `own`: the arguments in the step.
+        """
+        sides, h = begun.sides, t1 - t0
+        # Lengths of steps to a switch say nothing about the pace of the motion.
+        share = jnp.finfo(t1.dtype).eps ** _NEAR
+        near = jnp.maximum(jnp.maximum(share * h, last.near / 2), self.apart)
+        values, checks = _values(*constant((self.term, t0, t1, path, own)))
+        brief = h <= jnp.maximum(SHORTEST[t1.dtype], _BRIEF * near)
+        at = values, checks, sides, begun.on_zero, begun.sizes, near / h, brief
+        passed = passage(*at)
+        # A function that began on its zero has left it, after one or more steps.
+        left = jnp.finfo(passed.sizes.dtype).eps ** _ON_ZERO * passed.sizes
+        on_zero = last.sizes <= left
+        # Before the first step, whose length is 0, sides are unknown.
+        after = jnp.where(passed.switched, -sides, sides)
+        after = jnp.where(sides == 0, jnp.where(values[-1] > 0, 1.0, -1.0), after)
+        until = jnp.where(passed.crossed, t0 + passed.until * h, t1)
+        found = Found(
+            until=until,
+            unseen=jnp.where(passed.unseen < 1, t0 + passed.unseen * h, t1),
+            soon=t1 + passed.soon * h,
+            near=near,
+            switched=jnp.any(after != sides),
+        )
+        return constant(found), Switches(
+            sides=sides,
+            after=after.astype(t0.dtype),
+            until=until,
+            near=near,
+            sizes=passed.sizes,
+            length=h,
+            ahead=jnp.any(passed.switched & (sides * values[-1] > 0)),
+            passed=last.passed + jnp.sum(begun.changed & ~on_zero),
+            one_sided=self._one_sided(last, on_zero, begun, passed.sizes),
+            grazing=jnp.maximum(passed.missed, begun.grazing),
+            grazing_here=passed.grazing,
+            modes=begun.modes,
+        )
+
+    def _one_sided(
+        self, last: Switches, on_zero: Array, begun: Begun, sizes: Array
+    ) -> Array | None:
+        """Returns `Switches.one_sided` at the end of a step."""
+        if last.one_sided is None:
+            return None
+        jumping = np.array(self.jumping)
+        at_once = jumping & on_zero & (sizes > 0) & (begun.sides != 0)
+        at_once = jnp.any(at_once[: sizes.size - self.guards])
+        several = jnp.sum(begun.changed & jumping) > 1
+        together = several & (last.grazing_here > 0)
+        return jnp.maximum(last.one_sided, at_once) + together
+
+
+def events_of(
+    term: Term, ts: Array, y0: Integrated, args: Arguments, derivatives: bool
+) -> Events | None:
+    """Returns the events of a run over the times `ts`, None if nothing switches."""
+    guards = 0
+    if term.unknown_modes is not None:
+        modes, guards = term.unknown_modes(args)
+        args = args._replace(modes=modes)
+    functions, jumping = eqx.filter_eval_shape(term.switches, ts[0], y0, args)
+    if not functions.size:
+        return None
+    return Events(term, args, clearance(ts), jumping, guards, derivatives)
+
+
+@eqx.filter_jit  # traced once, not at each use in a solve
+def _values(
+    term: Term, t0: Array, t1: Array, path: diffrax.AbstractLocalInterpolation,
+    args: Arguments,
+) -> tuple[Array, Array]:  # fmt: skip
+    """Returns the switching functions at the samples of a step, and at its checks."""
+    shares = jnp.asarray([*SHARES, *CHECKS], t0.dtype)
+    times = t0 + shares * (t1 - t0)
+    if isinstance(path, DenseOutput):
+        places = np.array((*SAMPLED, *CHECKED))
+        scheduled = jax.tree.map(lambda rows: rows[places], path.scheduled)
+        one = lambda row: term.switching(row[1], path.at(row[0]), args, row[2])[0]
+        rows = shares, times, scheduled
+        values = jax.vmap(one)(rows)
+    else:
+        values = jax.vmap(lambda t: term.switches(t, path.evaluate(t), args)[0])(times)
+    # An infinite limit is never reached.
+    values = jnp.where(jnp.isinf(values), jnp.sign(values), values)
+    return values[: len(SHARES)], values[len(SHARES) :]
