@@ -21,7 +21,7 @@ from ..steps import loop
 from ..steps.derivative_control import OfLinearised, OfTangents
 from ..steps.dopri8 import Integrated, ScheduledDopri8, constant
 from ..steps.events import events_of
-from ..steps.judge import Judge
+from ..steps.judge import Judge, Judged
 from ..steps.landing import Landing, clearance
 from ..steps.looped_dopri8 import LoopedDopri8
 from ..steps.tolerances import default_controller, error_control_of, with_tolerances
@@ -229,8 +229,8 @@ def _read(
         "max_steps": keywords["max_steps"],
         "time_reached": jnp.where(valid, reached, times[0]),
     }
-    if end.loss is not None:
-        stats["accuracy"] = jnp.finfo(q.dtype).eps * end.loss
+    if isinstance(end.judged, Judged):
+        stats["accuracy"] = jnp.finfo(q.dtype).eps * end.judged.loss
     if end.switches is not None:
         stats |= end.switches.facts
     results: Any = diffrax.RESULTS

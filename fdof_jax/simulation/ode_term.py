@@ -1,5 +1,7 @@
 """A scene as a term of diffrax, for a solve of one's own."""
 
+from typing import Any
+
 import diffrax
 import jax.numpy as jnp
 from jax import Array
@@ -56,12 +58,12 @@ def ode_term(scene: Scene) -> tuple[diffrax.ODETerm, _Y, Args]:
         raise ValueError(
             "scene.forces: expected no PrescribedMotion, whose motion simulate knows."
         )
-    q, qd = (without_fixed(linkage, value) for value in start)
+    q, qd = (without_fixed(linkage, jnp.asarray(value)) for value in start)
     args = args_of(linkage, q, forces)
     return _TERM, (q, qd, jnp.array(initial_own(args), q.dtype)), args
 
 
-def _rates(t: Array, y: _Y, args: Args) -> _Y:
+def _rates(t: Any, y: _Y, args: Args) -> _Y:
     """Returns the rates of positions, velocities and the elements' own states."""
     q, qd, own = y
     state = whole(tuple(q - args.q0), tuple(qd), tuple(own))

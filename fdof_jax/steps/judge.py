@@ -7,7 +7,7 @@ step brings it below a tight tolerance, and steps that try reach nothing.
 
 import functools
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -45,6 +45,19 @@ _NOISE = 8.0
 _HELD = 0.43
 
 
+class Judged(NamedTuple):
+    """The state of a judge.
+
+    - `controller`: that of diffrax's controller.
+    - `probe`: of derivatives (see `OfLinearised`).
+    - `loss`: the largest loss of accuracy in steps so far.
+    """
+
+    controller: PyTree
+    probe: PyTree
+    loss: Array
+
+
 class Judge(eqx.Module):
     """Judges the steps of a run, by more than their errors.
 
@@ -69,20 +82,24 @@ class Judge(eqx.Module):
     watches: bool = eqx.field(static=True)
     derivatives: OfTangents | OfLinearised | None
 
-    def start(self, y0: Integrated) -> Array | tuple[()]:
-        """Returns the probe of derivatives at the start."""
-        return () if self.derivatives is None else self.derivatives.start(y0)
+    def start(self, run: tuple) -> tuple[Array, Judged]:
+        """Returns the end of the first step, and the state of the judge.
+
+        `run`: the arguments of a controller's `init`.
+        """
+        _, t0, _, y0, *_ = run
+        end, controller = constant(self.controller.wrap(1).init(*run))
+        probe = () if self.derivatives is None else self.derivatives.start(y0)
+        return end, Judged(controller, probe, jnp.zeros_like(t0))
 
     def __call__(
-        self, step: Step, error: PyTree, order: float, controller: PyTree,
-        probe: PyTree, loss: Array,
-    ) -> tuple[NextStep, PyTree, PyTree, Array, diffrax.RESULTS]:  # fmt: skip
-        """Returns the next step that the controller plans, and its state.
+        self, step: Step, error: PyTree, order: float, before: Judged
+    ) -> tuple[NextStep, Judged, diffrax.RESULTS]:
+        """Returns the step that the controller plans next, and the state after this.
 
-        Also returns the probe at the end of this one, the largest loss of accuracy up
-        to there, and whether the end is healthy. `controller`, `probe`, `loss`: those
-        before it.
+        Also returns whether its end is healthy. `before`: the state before it.
         """
+        controller, probe, loss = before
         # Is its end singular, or not finite?
         health = diffrax.RESULTS.successful
         if self.watches:
@@ -97,21 +114,28 @@ class Judge(eqx.Module):
         error = _above_rounding(self.controller, step, error, ratio, order)
         # Is the error within the tolerance?
         *plan, controller, result = constant(
-            self.controller.adapt_step_size(*step, error, order, controller)
+            self.controller.wrap(1).adapt_step_size(*step, error, order, controller)
         )
-        return NextStep(*plan, result), controller, probe, loss, health
+        return NextStep(*plan, result), Judged(controller, probe, loss), health  # pyright: ignore[reportCallIssue]
 
-    def probed(
-        self, step: NextStep, after: PyTree, before: PyTree, y1: Integrated
-    ) -> PyTree:
-        """Returns the probe before the next step: a new one if rates jump there.
+    def settled(
+        self, after: Judged, before: Judged, step: NextStep, resumes: Array,
+        y1: Integrated,
+    ) -> Judged:  # fmt: skip
+        """Returns the state of the judge before the next step.
 
-        `after`, `before`: the probes at the ends of the step before; `y1`: its end.
+        `after`, `before`: the states at the ends of the step before; `y1`: its end;
+        `resumes`: whether its length says nothing, so that the controller is as before.
         """
-        if self.derivatives is None:
-            return after
-        new = self.derivatives.start(y1)
-        return chosen(step.keep, chosen(jnp.array(step.jumped), new, after), before)
+        controller, probe, loss = after
+        if self.derivatives is not None:
+            new = self.derivatives.start(y1)
+            probe = chosen(jnp.array(step.jumped), new, probe)
+        return Judged(
+            chosen(resumes, before.controller, controller),
+            chosen(step.keep, probe, before.probe),
+            jnp.where(step.keep, loss, before.loss),
+        )
 
     def _healthy(
         self, step: Step, error: PyTree

@@ -16,9 +16,6 @@ from .dopri8 import constant
 # that throw each other at their stops, are slower.
 _MOST_CROSSINGS = 100
 _PACE = -0.35
-# After so many tries the switching function itself is taken to jump, and the jump is
-# located by halving the step.
-_MOST_TRIES = 6
 # A step ends so many units of rounding before a known time, and the next one starts as
 # many after it, so that rounding within steps does not pass it.
 _APART = 4
@@ -76,24 +73,9 @@ class _Landing(NamedTuple):
     target: Array  # where this step is to end, infinity if anywhere
     gap: Array  # time left out after it, 0 unless it ends at a known time
     resumed: Array  # length of the step after it
-    beyond: Array  # end of the last step that passed a switch, -infinity if none
-    tries: Array  # to end at the next switch, up to here
-    crossings: Array  # tries included, since the time `since`
+    crossings: Array  # steps taken again for a switch, since the time `since`
     since: Array
     last: Array  # see `_last`
-
-
-class _Happened(NamedTuple):
-    """What a step did; see the table of `Landing.after`."""
-
-    keep: Array
-    crossed: Array
-    unsure: Array
-    missed: Array
-    landed: Array
-    cut_short: Array  # so that its error says little about the next one
-    beyond: Array  # as in `_Landing`, after it
-    again: Array  # where the same step is to end if it crossed or is unsure
 
 
 class Landing(eqx.Module):
@@ -145,58 +127,38 @@ class Landing(eqx.Module):
         if self.switches:  # a step of no length finds the sides
             end, gap, cut = t0, jnp.zeros_like(t0), jnp.array(True)
         target = jnp.where(cut, constant(end), jnp.inf)
-        beyond, none = jnp.full_like(target, -jnp.inf), jnp.zeros((), int)
-        since = constant(jnp.asarray(t0))
-        state = target, gap, length, beyond, none, none, since, last
-        return end, _Landing(*state)
+        none, since = jnp.zeros((), int), constant(jnp.asarray(t0))
+        return end, _Landing(target, gap, length, none, since, last)
 
-    def _happened(
-        self,
-        begin: Array,
-        end: Array,
-        found: Found | None,
-        keep: Array,
-        state: _Landing,
-    ) -> _Happened:
-        """Returns what a step did; `keep`: whether the controller would keep it."""
-        aimed = end == state.target
+    def _wrong_end(
+        self, begin: Array, end: Array, found: Found | None, state: _Landing
+    ) -> tuple[Array, Array, Array]:
+        """Returns whether a step should end elsewhere, at a switch or not, and where.
+
+        A shorter step sees what this one may have passed over.
+        """
         if found is None:
-            never, landed = jnp.zeros_like(keep), keep & aimed
-            none = never, never, never
-            return _Happened(keep, *none, landed, landed, state.beyond, end)
-        until, unseen, soon, near, switched = found
-        allowance = jnp.where(aimed, near, 0)
-        within = until < jnp.minimum(end - allowance, state.last)
+            no = jnp.zeros((), bool)
+            return no, no, end
+        aimed = end == state.target
+        allowance = jnp.where(aimed, found.near, 0)
+        within = found.until < jnp.minimum(end - allowance, state.last)
         # A switch that a jump causes at once comes before the next jump, however near.
-        at_once = (until == begin) & (begin < end)
+        at_once = (found.until == begin) & (begin < end)
         # A tiny step that aims at a switch has arrived.
         tiny = (begin < end) & (end - begin <= _APART * self.apart)
         arrived = aimed & (state.gap == 0) & tiny
-        passed = keep & (within | at_once) & ~arrived
-        # A shorter step sees what may have been passed over.
-        unsure = keep & ~passed & (unseen < end)
-        # A step that ends before the switch is stretched to it if that is near, because
-        # a tiny second step would tell little of slopes.
-        before = keep & ~unsure & ~passed & aimed & ~switched
-        before &= end < state.beyond
-        stretched = before & (end < soon) & (soon < state.beyond)
-        missed = before & ~stretched
-        crossed = passed | stretched
-        kept = keep & ~unsure & ~crossed
-        landed = kept & aimed
-        beyond = jnp.where(kept & ~missed, -jnp.inf, state.beyond)
-        middle, hopeless = (begin + end) / 2, state.tries > _MOST_TRIES
-        again = jnp.where(stretched, soon, jnp.where(hopeless, middle, until))
-        return _Happened(
-            keep=kept,
-            crossed=crossed,
-            unsure=unsure,
-            missed=missed,
-            landed=landed,
-            cut_short=(crossed | unsure) & aimed | landed,
-            beyond=jnp.where(passed, end, beyond),
-            again=jnp.where(crossed, again, unseen),
+        passed = (within | at_once) & ~arrived
+        unsure = ~passed & (found.unseen < end)
+        # A step that aims at a switch and ends just before it is made longer: a tiny
+        # second step would tell little of slopes.
+        _, _, jumps_before = self._cut(begin, found.soon, state.last)
+        short = aimed & (state.gap == 0) & ~(passed | unsure | found.switched)
+        short &= (found.soon > end) & ~jumps_before
+        again = jnp.where(
+            passed, found.until, jnp.where(short, found.soon, found.unseen)
         )
+        return passed | short, unsure, again
 
     def after(
         self, t0: Array, t1: Array, found: Found | None, planned: NextStep,
@@ -204,56 +166,56 @@ class Landing(eqx.Module):
     ) -> tuple[NextStep, Array, _Landing]:  # fmt: skip
         """Returns the next step, and whether the controller resumes its old state.
 
-        `planned`: what the controller would do. A step that it keeps is one of these:
+        `planned`: what the controller would do. A step is one of these:
 
-        | step | flag | next step |
-        |---|---|---|
-        | passed a switch | `crossed` | the same again, up to the switch |
-        | ends just before its switch | `crossed` | the same again, up to the switch |
-        | may have passed one unseen | `unsure` | the same again, up to that place |
-        | ends well before its switch | `missed` | up to where the switch was passed |
-        | ends at a switch or known time | `landed` | as long as planned before |
-        | any other | | as planned, or up to the next known time |
+        | step | next step |
+        |---|---|
+        | rejected by the controller | as planned |
+        | retried (see `_wrong_end`) | the same again, but to another end |
+        | ends at a switch or known time | as long as planned before |
+        | free | as planned, or up to the next known time |
         """
         begin, end = constant((t0, t1))
-        step = self._happened(begin, end, found, planned.keep, state)
-        shortened = step.crossed | step.unsure
-        resumes = shortened | step.landed
+        to_switch, unsure, again = self._wrong_end(begin, end, found, state)
+        retried = planned.keep & (to_switch | unsure)
+        keep = planned.keep & ~retried
+        aimed = end == state.target
+        landed = keep & aimed
+        resumes = retried | landed
 
         # Where does the next step begin? It keeps the derivatives of this one's ends,
         # which `begin`, `end` and `planned` lack.
-        next_t0 = jnp.where(step.keep, t1 + (planned.t0 - end), t0)
-        next_t0 = next_t0 + jnp.where(step.landed, state.gap, 0)
+        next_t0 = jnp.where(keep, t1 + (planned.t0 - end), t0)
+        next_t0 = next_t0 + jnp.where(landed, state.gap, 0)
 
-        # Where is it to end?
-        length = jnp.where(step.cut_short, state.resumed, planned.t1 - planned.t0)
-        next_t1 = jnp.where(step.missed, step.beyond, next_t0 + length)
-        next_t1, gap, cut = self._cut(constant(next_t0), next_t1, state.last)
+        # Where is it to end? The error of a step that was cut short says little.
+        cut_short = resumes & aimed
+        length = jnp.where(cut_short, state.resumed, planned.t1 - planned.t0)
+        next_t1, gap, cut = self._cut(constant(next_t0), next_t0 + length, state.last)
         # What a jump at a known time makes switch, switches at exactly that time.
-        again = jnp.where(step.again == begin, t0, step.again)
-        next_t1 = jnp.where(shortened, again, next_t1)
-        aims = (cut | step.crossed | step.missed) & ~step.unsure
+        again = jnp.where(again == begin, t0, again)
+        next_t1 = jnp.where(retried, again, next_t1)
+        aims = jnp.where(retried, to_switch, cut)
 
         # Does the solve go on?
         # Time that passes meanwhile tells fast switching from chatter.
         pace = self.apart * jnp.finfo(begin.dtype).eps ** _PACE
         paced = begin - state.since > pace
-        crossings = jnp.where(paced, 0, state.crossings + step.crossed)
+        crossed = retried & to_switch
+        crossings = jnp.where(paced, 0, state.crossings + crossed)
         results = diffrax.RESULTS
         # The last step may be shorter than the least length; no step follows it.
-        done = step.keep & (end >= state.last)
+        done = keep & (end >= state.last)
         result = results.where(resumes | done, results.successful, planned.result)
         chatter = (crossings > _MOST_CROSSINGS) & (result == results.successful)
         result = results.where(chatter, results.max_steps_rejected, result)
 
         state = state._replace(
             target=jnp.where(aims, constant(next_t1), jnp.inf),
-            gap=jnp.where(shortened, 0, gap),
+            gap=jnp.where(retried, 0, gap),
             resumed=length,
-            beyond=step.beyond,
-            tries=jnp.where(step.keep & ~step.missed, 0, state.tries + step.crossed),
             crossings=crossings,
             since=jnp.where(paced, begin, state.since),
         )
-        jumped = step.landed | planned.jumped
-        return NextStep(step.keep, next_t0, next_t1, jumped, result), resumes, state
+        jumped = landed | planned.jumped
+        return NextStep(keep, next_t0, next_t1, jumped, result), resumes, state

@@ -5,7 +5,6 @@ choose their lengths. Between the two stands what `diffeqsolve` has no place for
 end where something happens, and are judged by more than their error.
 """
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import diffrax
@@ -16,10 +15,10 @@ from jax import Array
 from jaxtyping import PyTree
 
 from .dopri8 import Arguments, Integrated, ScheduledTerm, chosen, constant
-from .events import Events, Switches
+from .events import Begun, Events, Switches
 from .judge import Judge, Step
-from .landing import Landing, NextStep
-from .tolerances import Controller, Shortening, error_control_of, with_error_control
+from .landing import Found, Landing, NextStep
+from .tolerances import Controller, Shortening, with_error_control
 
 RESULTS: Any = diffrax.RESULTS
 # A step that would end within so many units of rounding of the end of the run ends
@@ -72,10 +71,8 @@ class Attempt(NamedTuple):
     - `t`, `end`: where the step begins and is to end [s].
     - `y`: the state at `t`, before what happens there; `jumped`: whether something may
       happen, None if it never does.
-    - `method`, `controller`, `wrappers`: states of the method, of the controller that
-      judges errors, and of those around it.
-    - `probe`: of derivatives (see `OfLinearised`); `loss`: the largest loss of accuracy
-      in steps so far.
+    - `method`: state of the method. `judged`: that of `Judge`, or of the controller if
+      steps are constant; `wrappers`: of controllers around the one that judges errors.
     - `landing`, `switches`: states of `Landing` and of `Events`, None without them.
     - `rows`: states at output times, infinite at those to come; `saved`: how many are
       there.
@@ -90,19 +87,37 @@ class Attempt(NamedTuple):
     y: Integrated
     jumped: Array | None
     method: PyTree
-    controller: PyTree
+    judged: Any  # Judged | PyTree
     wrappers: PyTree
-    probe: PyTree
-    loss: Array | None
     landing: PyTree
-    switches: Switches | None
+    switches: Any  # Switches | None
     rows: PyTree
     saved: Array
     meter: PyTree
     steps: Array
     accepted: Array
-    typical: Array | None
+    typical: Any  # Array | None
     result: diffrax.RESULTS
+
+
+class _Taken(NamedTuple):
+    """A step that was taken, whether it is kept or not.
+
+    - `begun`, `args`: what is in force in it. `y1`: the state at its end; `path`: there
+      and between. `error`: its estimate, or an `Estimate`.
+    - `method`, `switches`: states at its end. `failed`: result of the method.
+    - `found`: what happens in it.
+    """
+
+    begun: Begun | None
+    args: Arguments
+    y1: Integrated
+    path: diffrax.AbstractLocalInterpolation
+    error: PyTree
+    method: PyTree
+    failed: diffrax.RESULTS
+    found: Found | None
+    switches: Switches | None
 
 
 class _Planned(diffrax.AbstractStepSizeController):
@@ -125,118 +140,39 @@ def solve(problem: Problem, stepping: Stepping) -> Attempt:
 
     A failure is its `result`.
     """
-    term, _, args, ts = problem
-    method, _, _, judge, events, landing, *_, meter, lanes = stepping
-    controller = stepping.controller.wrap(1)
-    order = method.error_order(term)
+    ts, landing, most = problem.ts, stepping.landing, stepping.most_steps
     last = ts[-1] if landing is None else landing.end_of_run(ts)
-    kind, checkpoints = _kind_of(stepping.adjoint, stepping.most_steps)
+    kind, checkpoints = _kind_of(stepping)
     near_end = last - _NEAR_END * jnp.finfo(ts.dtype).eps * jnp.abs(last)
 
-    def wrapped(planned: tuple) -> Controller:
-        return with_error_control(lambda _: _Planned(planned), controller)
-
     def advance(a: Attempt) -> Attempt:
-        # What happens where the last step ended?
-        y0, own, begun, jumped = a.y, args, None, a.jumped
-        jumped = False if jumped is None else jumped
-        if events is not None:
-            y0, begun = events.crossed(a.t, a.y, a.switches, jumped)
-            own = args._replace(sides=begun.sides, modes=begun.modes)
-
-        # A step
-        y1, error, dense, of_method, failed = method.step(
-            term, a.t, a.end, y0, own, a.method, jumped
-        )
-        error = jax.tree.map(lambda e: jnp.where(jnp.isnan(e), jnp.inf, e), error)
-        path = method.interpolation_cls(t0=a.t, t1=a.end, **dense)
-        found, switches = None, a.switches
-        if events is not None:
-            y1 = events.kept(begun, y1, y0)
-            found, switches = events.located(a.t, a.end, path, own, begun, a.switches)
-
-        # Is it accurate, for the size of the state before? How long is the next one?
-        step, probe, loss = Step(a.t, a.end, a.y, y1, own), a.probe, a.loss
-        arguments = a.t, a.end, a.y, y1, own, error, order
-        if judge is None:
-            plan = controller.adapt_step_size(*arguments, a.controller)
-            *plan, of_controller, result = plan
-            next_step = NextStep(*plan, result)
-        else:
-            next_step, of_controller, probe, loss, result = judge(
-                step, error, order, a.controller, a.probe, a.loss
-            )
-
-        # Where is it to end?
-        of_landing = a.landing
-        if landing is not None:
-            next_step, resumes, of_landing = landing.after(
-                a.t, a.end, found, next_step, a.landing
-            )
-            of_controller = chosen(resumes, a.controller, of_controller)
-        if judge is not None:
-            probe = judge.probed(next_step, probe, a.probe, y1)
-            unhealthy = result != RESULTS.successful
-            next_step = next_step._replace(
-                result=RESULTS.where(unhealthy, result, next_step.result)
-            )
-        of_wrappers = a.wrappers
-        if a.wrappers is not None:
-            plan = *next_step[:4], (), next_step.result
-            *plan, of_wrappers, result = wrapped(plan).adapt_step_size(
-                *arguments, a.wrappers
-            )
-            next_step = NextStep(*plan, result)
-        keep, t, end, jumped, result = next_step
-        t = jnp.minimum(t, last)
-        halfway = jnp.where(keep, last, t + (last - t) / 2)
-        end = jnp.where(end > near_end, halfway, end)
-
-        # Output
-        def waiting(output):
-            saved, _ = output
-            return keep & (saved < len(ts)) & (ts[saved] <= a.end)
-
-        def saving(output):
-            saved, rows = output
-            row = _row(path.evaluate(ts[saved]), begun)
-            put = lambda value, rows: rows.at[saved].set(value)
-            return saved + 1, jax.tree.map(put, row, rows)
-
-        saved, rows = eqx.internal.while_loop(
-            waiting,
-            saving,
-            (a.saved, a.rows),
-            kind=kind,
-            max_steps=len(ts),
-            buffers=lambda output: output[1],
-            checkpoints=len(ts),
-        )
-        failed = RESULTS.where(keep, failed, RESULTS.successful)
-        result = RESULTS.where(failed == RESULTS.successful, result, failed)
+        taken = _taken(problem, stepping, a)
+        step, judged, wrappers, of_landing = _planned(problem, stepping, a, taken)
+        saved, rows = _saved(ts, kind, a, taken, step.keep)
+        t = jnp.minimum(step.t0, last)
+        # A step that is rejected where the run ends must become shorter.
+        at_end = jnp.where(step.keep, last, t + (last - t) / 2)
+        result = RESULTS.where(step.keep, taken.failed, RESULTS.successful)
+        result = RESULTS.where(result == RESULTS.successful, step.result, result)
         steps, typical = a.steps + 1, a.typical
-        if typical is not None:
-            behind, typical = _behind(steps, typical, lanes)
-            gives_up = behind & (result == RESULTS.successful)
-            result = RESULTS.where(gives_up, RESULTS.max_steps_reached, result)
-        progress = constant((t - ts[0]) / (last - ts[0]))
+        if stepping.lanes is not None:
+            result, typical = _together(steps, typical, result, stepping.lanes)
+        kept = lambda after, before: chosen(step.keep, after, before)
         return Attempt(
             t=t,
-            end=end,
-            y=chosen(keep, y1, a.y),
-            jumped=None if a.jumped is None else jnp.where(keep, jumped, a.jumped),
-            method=chosen(keep, of_method, a.method),
-            controller=of_controller,
-            wrappers=of_wrappers,
-            probe=probe,
-            loss=chosen(keep, loss, a.loss),
+            end=jnp.where(step.t1 > near_end, at_end, step.t1),
+            y=kept(taken.y1, a.y),
+            jumped=None if a.jumped is None else kept(step.jumped, a.jumped),
+            method=kept(taken.method, a.method),
+            judged=judged,
+            wrappers=wrappers,
             landing=of_landing,
-            switches=chosen(keep, switches, a.switches),
+            switches=kept(taken.switches, a.switches),
             rows=rows,
             saved=saved,
-            meter=meter.step(a.meter, progress),
+            meter=stepping.meter.step(a.meter, constant((t - ts[0]) / (last - ts[0]))),
             steps=steps,
-            accepted=a.accepted + keep,
+            accepted=a.accepted + step.keep,
             typical=typical,
             result=result,
         )
@@ -244,51 +180,40 @@ def solve(problem: Problem, stepping: Stepping) -> Attempt:
     def unfinished(a: Attempt) -> Array:
         return (a.t < last) & (a.result == RESULTS.successful)
 
-    def going(a: Attempt) -> Array:
-        most = stepping.most_steps
-        return unfinished(a) if most is None else unfinished(a) & (a.steps < most)
-
     end = eqx.internal.while_loop(
-        going,
+        lambda a: unfinished(a) & (True if most is None else a.steps < most),
         advance,
-        _first_attempt(problem, stepping, controller, wrapped, last),
+        _first_attempt(problem, stepping, last),
         kind=kind,
-        max_steps=None if kind == "lax" else stepping.most_steps,
+        max_steps=None if kind == "lax" else most,
         buffers=lambda a: a.rows,
         checkpoints=checkpoints,
     )
-    meter.close(end.meter)
-    spent = RESULTS.where(unfinished(end), RESULTS.max_steps_reached, end.result)
-    return end._replace(result=spent)
+    stepping.meter.close(end.meter)
+    result = RESULTS.where(unfinished(end), RESULTS.max_steps_reached, end.result)
+    return end._replace(result=result)
 
 
-def _first_attempt(
-    problem: Problem, stepping: Stepping, controller: Controller,
-    wrapped: Callable[[tuple], Controller], last: Array,
-) -> Attempt:  # fmt: skip
+def _first_attempt(problem: Problem, stepping: Stepping, last: Array) -> Attempt:
     """Returns the state of the loop before the first step."""
     (term, y0, args, ts), t0 = problem, problem.ts[0]
-    method, _, dt0, judge, events, landing, *_, meter, lanes = stepping
-    switches, jumped = None, None
+    method, controller, dt0, judge, events, landing, *_, meter, lanes = stepping
+    switches = of_landing = wrappers = jumped = None
+    end: Any
     if events is not None:
         switches = events.start(t0)
         args = args._replace(sides=switches.sides, modes=switches.modes)
-    arguments = term, t0, last, y0, dt0, args
-    others = method.func, method.error_order(term)
+    order = method.error_order(term)
+    run: Any = term, t0, last, y0, dt0, args, method.func, order
     if judge is None:
-        judging, probe = controller, ()
+        end, judged = controller.wrap(1).init(*run)
     else:
-        judging, probe = error_control_of(controller), judge.start(y0)
-        arguments = constant(arguments)
-    end, of_controller = judging.init(*arguments, *others)
-    if judge is not None:
-        end, of_controller = constant((end, of_controller))
-    of_landing, of_wrappers = None, None
+        run = constant(run)
+        end, judged = judge.start(run)
     if landing is not None:
         end, of_landing = landing.start(t0, last, end)
-    if judging is not controller:
-        plan = wrapped((end, ()))
-        end, of_wrappers = plan.init(*arguments, *others)
+    if judge is not None and controller is not judge.controller:
+        end, wrappers = _around((end, ()), controller).init(*run)
     if landing is not None or not _never_jumps(controller):
         jumped = jnp.array(False)
     end = jnp.minimum(end, last)
@@ -302,10 +227,8 @@ def _first_attempt(
         y=y0,
         jumped=jumped,
         method=constant(method.init(term, t0, end, y0, args)),
-        controller=of_controller,
-        wrappers=of_wrappers,
-        probe=probe,
-        loss=None if judge is None else jnp.zeros_like(t0),
+        judged=judged,
+        wrappers=wrappers,
         landing=of_landing,
         switches=switches,
         rows=jax.tree.map(rows, _row(y0, switches)),
@@ -318,11 +241,111 @@ def _first_attempt(
     )
 
 
-def _row(y: Integrated, at: Any) -> PyTree:
+def _taken(problem: Problem, stepping: Stepping, a: Attempt) -> _Taken:
+    """Takes a step, after what happens where it begins; returns what happens in it."""
+    term, _, args, _ = problem
+    method, events = stepping.method, stepping.events
+    y0, begun, found, switches = a.y, None, None, None
+    jumped: Any = False if a.jumped is None else a.jumped
+    if events is not None:
+        y0, begun = events.crossed(a.t, a.y, a.switches, jumped)
+        args = args._replace(sides=begun.sides, modes=begun.modes)
+    y1, error, dense, of_method, failed = method.step(
+        term, a.t, a.end, y0, args, a.method, jumped
+    )
+    error = jax.tree.map(lambda e: jnp.where(jnp.isnan(e), jnp.inf, e), error)
+    path = method.interpolation_cls(t0=a.t, t1=a.end, **dense)
+    if events is not None:
+        assert begun is not None
+        y1 = events.kept(begun, y1, y0)
+        found, switches = events.located(a.t, a.end, path, args, begun, a.switches)
+    return _Taken(begun, args, y1, path, error, of_method, failed, found, switches)
+
+
+def _planned(
+    problem: Problem, stepping: Stepping, a: Attempt, taken: _Taken
+) -> tuple[NextStep, Any, PyTree, PyTree]:
+    """Returns the next step, and the states `judged`, `wrappers` and `landing`."""
+    judge, landing, controller = stepping.judge, stepping.landing, stepping.controller
+    order = stepping.method.error_order(problem.term)
+    # Tolerances are those of the state before what happens where the step begins.
+    step = Step(a.t, a.end, a.y, taken.y1, taken.args)
+    if judge is None:
+        *plan, judged, result = controller.wrap(1).adapt_step_size(
+            *step, taken.error, order, a.judged
+        )
+        return NextStep(*plan, result), judged, None, None  # pyright: ignore[reportCallIssue]
+    plan, judged, health = judge(step, taken.error, order, a.judged)
+    of_landing, resumes = None, jnp.array(False)
+    if landing is not None:
+        plan, resumes, of_landing = landing.after(
+            a.t, a.end, taken.found, plan, a.landing
+        )
+    judged = judge.settled(judged, a.judged, plan, resumes, taken.y1)
+    unhealthy = health != RESULTS.successful
+    result = RESULTS.where(unhealthy, health, plan.result)
+    wrappers = None
+    if a.wrappers is not None:
+        around = _around((*plan[:4], (), result), controller)
+        *answer, wrappers, result = around.adapt_step_size(
+            *step, taken.error, order, a.wrappers
+        )
+        plan = NextStep(*answer, result)  # pyright: ignore[reportCallIssue]
+    return plan._replace(result=result), judged, wrappers, of_landing
+
+
+def _around(answer: tuple, controller: Controller) -> Controller:
+    """Returns a controller in which the one that judges errors gives an answer."""
+    return with_error_control(lambda _: _Planned(answer), controller.wrap(1))
+
+
+def _saved(
+    ts: Array, kind: Any, a: Attempt, taken: _Taken, keep: Array
+) -> tuple[Array, PyTree]:
+    """Returns the number of output times so far, and the states there."""
+
+    def waiting(output):
+        saved, _ = output
+        return keep & (saved < len(ts)) & (ts[saved] <= a.end)
+
+    def saving(output):
+        saved, rows = output
+        row = _row(taken.path.evaluate(ts[saved]), taken.begun)
+        put = lambda value, rows: rows.at[saved].set(value)
+        return saved + 1, jax.tree.map(put, row, rows)
+
+    return eqx.internal.while_loop(
+        waiting,
+        saving,
+        (a.saved, a.rows),
+        kind=kind,
+        max_steps=len(ts),
+        buffers=lambda output: output[1],
+        checkpoints=len(ts),
+    )
+
+
+def _row(y: Integrated, at: Begun | Switches | None) -> PyTree:
     """Returns what is saved of a state: itself, and the modes if joints are held."""
     if at is None or at.modes is None:
         return y, None
     return y, at.modes._replace(events=None)
+
+
+def _together(
+    steps: Array, typical: Array, result: diffrax.RESULTS, lanes: str
+) -> tuple[diffrax.RESULTS, Array]:
+    """Returns a result that gives up if most other lanes are long done.
+
+    Also returns how many steps most of them took, 0 as long as they go on.
+    """
+    # Once a lane is done its state is frozen, so that its count falls behind.
+    done = steps < jax.lax.pmax(steps, lanes)
+    most = jax.lax.pmean(done.astype(float), lanes) >= _MOST
+    typical = jnp.where(most & (typical == 0), steps, typical)
+    behind = (typical > 0) & (steps >= _SLACK * typical)
+    gives_up = behind & (result == RESULTS.successful)
+    return RESULTS.where(gives_up, RESULTS.max_steps_reached, result), typical
 
 
 def _never_jumps(controller: Controller) -> bool:
@@ -331,20 +354,12 @@ def _never_jumps(controller: Controller) -> bool:
     return type(controller) in (diffrax.PIDController, Shortening, *fixed)
 
 
-def _behind(steps: Array, typical: Array, lanes: str) -> tuple[Array, Array]:
-    """Returns whether a lane has fallen behind most others, and `Attempt.typical`."""
-    # Once a lane is done its state is frozen, so that its count falls behind.
-    done = steps < jax.lax.pmax(steps, lanes)
-    most = jax.lax.pmean(done.astype(float), lanes) >= _MOST
-    typical = jnp.where(most & (typical == 0), steps, typical)
-    return (typical > 0) & (steps >= _SLACK * typical), typical
-
-
-def _kind_of(adjoint: diffrax.AbstractAdjoint, most_steps: Any) -> tuple[Any, Any]:
+def _kind_of(stepping: Stepping) -> tuple[Any, int | None]:
     """Returns the kind of equinox's loops for an adjoint, and how many checkpoints."""
+    adjoint, bounded = stepping.adjoint, stepping.most_steps is not None
     if isinstance(adjoint, diffrax.RecursiveCheckpointAdjoint):
-        if most_steps is not None or adjoint.checkpoints is not None:
+        if bounded or adjoint.checkpoints is not None:
             return "checkpointed", adjoint.checkpoints
-    elif isinstance(adjoint, diffrax.DirectAdjoint) and most_steps is not None:
+    elif isinstance(adjoint, diffrax.DirectAdjoint) and bounded:
         return "bounded", None
     return "lax", None
