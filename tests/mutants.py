@@ -41,14 +41,14 @@ MUTANTS = {
     # Steps that end at switches and known times
     "no retry over a switch": Mutant(
         "steps/landing.py",
-        "passed = keep & (within | at_once) & ~arrived",
-        "passed = jnp.zeros_like(keep)",
+        "passed = (within | at_once) & ~arrived",
+        "passed = jnp.zeros_like(arrived)",
         KINKS,
     ),
     "no retry for a hidden zero": Mutant(
         "steps/landing.py",
-        "unsure = keep & ~passed & (unseen < end)",
-        "unsure = jnp.zeros_like(keep)",
+        "unsure = ~passed & (found.unseen < end)",
+        "unsure = jnp.zeros_like(passed)",
         f"{BRIEF}::test_no_bumper_is_passed_over",
     ),
     "gap off": Mutant(
