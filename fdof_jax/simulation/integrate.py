@@ -32,6 +32,7 @@ from .holding import changes, taken_at, within_stops
 from .prescribed import agrees
 from .solution import Solution
 
+RESULTS: Any = diffrax.RESULTS
 Settings = dict[str, Any]  # keywords of `diffeqsolve`, as `solve_options` checks them
 
 
@@ -217,11 +218,14 @@ def _read(
 
     given = (without_fixed(linkage, value) for value in state0)
     q, qd = map(from_start, (q, qd), motion.first, given)
-    # Constant steps go on when the state is no longer finite.
-    reached = jnp.minimum(end.t, ts[-1])
-    not_finite = (ts <= reached) & ~jnp.isfinite(q + qd).all(axis=1)
-    last_finite = ts[jnp.maximum(jnp.argmax(not_finite) - 1, 0)]
-    reached = jnp.where(not_finite.any(), last_finite, reached)
+    reached, result = jnp.minimum(end.t, ts[-1]), end.result
+    if not isinstance(end.judged, Judged):
+        # Constant steps go on when the state is no longer finite.
+        lost = (ts <= reached) & ~jnp.isfinite(q + qd).all(axis=1)
+        last_finite = ts[jnp.maximum(jnp.argmax(lost) - 1, 0)]
+        reached = jnp.where(lost.any(), last_finite, reached)
+        went_well = result == RESULTS.successful
+        result = RESULTS.where(went_well & lost.any(), RESULTS.nonfinite, result)
     stats: dict[str, Any] = {
         "num_steps": end.steps,
         "num_accepted_steps": end.accepted,
@@ -233,11 +237,7 @@ def _read(
         stats["accuracy"] = jnp.finfo(q.dtype).eps * end.judged.loss
     if end.switches is not None:
         stats |= end.switches.facts
-    results: Any = diffrax.RESULTS
-    # Constant steps, if too long, end in NaN and still report success.
-    finite = (jnp.isfinite(q[-1]) & jnp.isfinite(qd[-1])).all()
-    finite = finite | (end.result != results.successful)
-    result = results.where(valid & finite, end.result, results.nonfinite)
+    result = RESULTS.where(valid, result, RESULTS.nonfinite)
     holding: Any = ()  # modes, energy taken, events
     if modes is not None:
         assert end.switches is not None  # which guard them

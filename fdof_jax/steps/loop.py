@@ -149,9 +149,8 @@ def solve(problem: Problem, stepping: Stepping) -> Attempt:
         taken = _taken(problem, stepping, a)
         step, judged, wrappers, of_landing = _planned(problem, stepping, a, taken)
         saved, rows = _saved(ts, kind, a, taken, step.keep)
-        t = jnp.minimum(step.t0, last)
-        # A step that is rejected where the run ends must become shorter.
-        at_end = jnp.where(step.keep, last, t + (last - t) / 2)
+        t = step.t0
+        at_end = step.keep & (step.t1 > near_end)
         result = RESULTS.where(step.keep, taken.failed, RESULTS.successful)
         result = RESULTS.where(result == RESULTS.successful, step.result, result)
         steps, typical = a.steps + 1, a.typical
@@ -160,7 +159,7 @@ def solve(problem: Problem, stepping: Stepping) -> Attempt:
         kept = lambda after, before: chosen(step.keep, after, before)
         return Attempt(
             t=t,
-            end=jnp.where(step.t1 > near_end, at_end, step.t1),
+            end=jnp.where(at_end, last, jnp.minimum(step.t1, last)),
             y=kept(taken.y1, a.y),
             jumped=None if a.jumped is None else kept(step.jumped, a.jumped),
             method=kept(taken.method, a.method),
@@ -253,7 +252,6 @@ def _taken(problem: Problem, stepping: Stepping, a: Attempt) -> _Taken:
     y1, error, dense, of_method, failed = method.step(
         term, a.t, a.end, y0, args, a.method, jumped
     )
-    error = jax.tree.map(lambda e: jnp.where(jnp.isnan(e), jnp.inf, e), error)
     path = method.interpolation_cls(t0=a.t, t1=a.end, **dense)
     if events is not None:
         assert begun is not None
