@@ -1,0 +1,120 @@
+"""A scene as a term of diffrax: its motion, its events, and noise on the efforts."""
+
+import diffrax
+import elements
+import jax
+import jax.numpy as jnp
+import lineax
+import numpy as np
+import optimistix
+import pytest
+
+import fdof_jax as fj
+
+CONTROL = diffrax.PIDController(rtol=1e-10, atol=1e-10)
+FREE = elements.PLAIN | elements.WITH_STATE | elements.WITH_INERTIA
+
+
+def end_of(scene, **options):
+    """Returns the state at the end of a scene, by diffrax alone."""
+    term, y0, args = fj.simulation.ode_term(scene)
+    options |= dict(stepsize_controller=CONTROL)
+    run = term, diffrax.Dopri8(), 0, scene.t1, 1e-3, y0, args
+    return jax.tree.map(lambda row: row[-1], diffrax.diffeqsolve(*run, **options).ys)
+
+
+def test_diffrax_moves_all_topologies_as_simulate_does_in_one_program():
+    traces = []
+
+    @jax.jit
+    def end(scene):
+        traces.append(scene)
+        return end_of(scene)
+
+    for topology in fj.TOPOLOGIES:
+        forces = FREE["PD"], FREE["lag"]
+        scene = fj.Scene(elements.arm(topology), elements.START, forces, 0.5)
+        q, qd, own = end(scene)
+        motion = fj.simulate(scene, [0, 0.5])
+        np.testing.assert_allclose(q, motion.q[-1], atol=1e-8)
+        np.testing.assert_allclose(qd, motion.qd[-1], atol=1e-7)
+        np.testing.assert_allclose(own, np.ravel(motion.own[0][-1]), atol=1e-8)
+    assert len(traces) == 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FREE)
+def test_diffrax_moves_each_element_as_simulate_does(name):
+    scene = fj.Scene(elements.arm("RPR"), elements.START, (FREE[name],), 0.3)
+    q, qd, _ = end_of(scene)
+    motion = fj.simulate(scene, [0, 0.3])
+    np.testing.assert_allclose(q, motion.q[-1], atol=1e-8)
+    np.testing.assert_allclose(qd, motion.qd[-1], atol=1e-7)
+
+
+def test_an_event_of_diffrax_ends_a_motion():
+    """A uniform bar falls from level at rest: at the bottom its rate is known."""
+    bar = fj.Linkage("R", length=[0, 1], com=[[0.5, 0]], mass=[1], inertia=[1 / 12])
+    scene = fj.Scene(bar, fj.State([0.0], [0.0]), (), 5.0)
+    term, y0, args = fj.simulation.ode_term(scene)
+    bottom = diffrax.Event(
+        lambda t, y, args, **_: y[0][0] + np.pi / 2, optimistix.Newton(1e-10, 1e-10)
+    )
+    fall = diffrax.diffeqsolve(
+        term, diffrax.Dopri8(), 0, 5.0, 1e-3, y0, args,
+        stepsize_controller=CONTROL, event=bottom,
+    )  # fmt: skip
+    assert fall.result == diffrax.RESULTS.event_occurred
+    np.testing.assert_allclose(fall.ys[1][-1], [-np.sqrt(3 * 9.81)], rtol=1e-6)
+
+
+def test_white_torque_has_the_stationary_variance_of_a_damped_bar():
+    """It is sigma^2 / (2 d k) of a bar with torsional spring k and damping d."""
+    inertia, stiffness, damping, sigma = 1 / 3, 2.0, 0.8, 0.3
+    bar = fj.Linkage(
+        "R", length=[0, 1], com=[[0.5, 0]], mass=[1], inertia=[1 / 12], gravity=0.0
+    )
+    forces = fj.forces.JointSpring(stiffness), fj.JointDamper(damping)
+    scene = fj.Scene(bar, fj.State([0.0], [0.0]), forces, 8.0)
+    drift, y0, args = fj.simulation.ode_term(scene)
+    assert float(fj.mass_matrix(bar, y0[0])[0, 0]) == pytest.approx(inertia)
+
+    def noise(t, y, args):
+        q, qd, own = y
+        rates = jnp.linalg.solve(fj.mass_matrix(bar, q), sigma * jnp.eye(1))
+        columns = jnp.zeros((1, 1)), rates, jnp.zeros((own.size, 1))
+        return lineax.PyTreeLinearOperator(columns, jax.eval_shape(lambda: y))
+
+    def end(key):
+        path = diffrax.VirtualBrownianTree(0.0, 8.0, 5e-3, (1,), key)
+        terms = diffrax.MultiTerm(drift, diffrax.ControlTerm(noise, path))
+        ends = diffrax.diffeqsolve(terms, diffrax.Heun(), 0, 8.0, 0.02, y0, args).ys
+        return ends[0][-1, 0]
+
+    ends = jax.jit(jax.vmap(end))(jax.random.split(jax.random.key(0), 1000))
+    right = sigma**2 / (2 * damping * stiffness)
+    standard_error = right * np.sqrt(2 / len(ends))
+    assert abs(np.var(ends) - right) < 3 * standard_error
+
+
+@pytest.mark.parametrize(
+    "element, word",
+    [
+        (fj.forces.JointFriction(0.4), "no element that holds joints"),
+        (fj.forces.HardStops(-1, 1), "no element that holds joints"),
+        (fj.forces.Brake(2, begin=0.1, end=0.2), "no element that holds joints"),
+        (
+            fj.simulation.PrescribedMotion(1, fj.references.SetPoint(0.3)),
+            "no PrescribedMotion",
+        ),
+    ],
+)
+def test_what_simulate_alone_can_do_is_refused(element, word):
+    scene = fj.Scene(elements.arm("RRR"), elements.START, (element,), 0.5)
+    with pytest.raises(ValueError, match=word):
+        fj.simulation.ode_term(scene)
+
+
+def test_only_a_scene_is_accepted():
+    with pytest.raises(ValueError, match="scene: expected"):
+        fj.simulation.ode_term(elements.arm("RRR"))
