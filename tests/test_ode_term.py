@@ -32,13 +32,14 @@ def test_diffrax_moves_all_topologies_as_simulate_does_in_one_program():
         return end_of(scene)
 
     for topology in fj.TOPOLOGIES:
-        forces = FREE["PD"], FREE["lag"]
+        forces = FREE["PD"], FREE["PID"]
         scene = fj.Scene(elements.arm(topology), elements.START, forces, 0.5)
         q, qd, own = end(scene)
         motion = fj.simulate(scene, [0, 0.5])
         np.testing.assert_allclose(q, motion.q[-1], atol=1e-8)
         np.testing.assert_allclose(qd, motion.qd[-1], atol=1e-7)
-        np.testing.assert_allclose(own, np.ravel(motion.own[0][-1]), atol=1e-8)
+        states = [np.ravel(rows[-1]) for rows in jax.tree.leaves(motion.own)]
+        np.testing.assert_allclose(own, np.concatenate(states), atol=1e-8)
     assert len(traces) == 1
 
 
