@@ -32,9 +32,10 @@ def ode_term(scene: Scene) -> tuple[diffrax.ODETerm, _Y, Args]:
       `PrescribedMotion`, are refused.
 
     **Returns:** `(term, y0, args)`. `term` is a `diffrax.ODETerm` of one function for
-    all scenes, so that scenes of one structure share a program; `y0` is `(q, qd, own)`
-    of shapes (n,), (n,) and those of the elements' own states, with their rates
-    `term.vf(t, y, args)`; `args` holds the linkage and the forces.
+    all scenes, so that scenes of one structure share a program. `y0` is `(q, qd, own)`:
+    positions (n,) [m or rad], velocities (n,), and in one array (m,) the numbers of the
+    elements' own states, in their order. `args` holds the linkage and the forces.
+    `term.vf(t, y, args)` are the rates of `y`.
 
     **Raises:** ValueError for malformed scenes.
 
