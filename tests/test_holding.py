@@ -391,20 +391,11 @@ def test_blows_at_the_start_are_events():
 
 def test_what_cannot_go_together_is_refused():
     fixed = dict(stepsize_controller=diffrax.ConstantStepSize(), dt0=0.01)
-    move = lambda t, linkage: (jnp.zeros(1), jnp.zeros(1))
     for forces, options, words in [
         ((JointFriction(1.0),), fixed, "stepsize_controller: expected an adaptive one"),
         ((HardStops(-1, 1),) * 2, {}, "forces: expected one HardStops"),
         ((Brake(2),), {}, r"forces\[0\].joints: expected 1 to 1"),
-        (
-            (Brake(1), fj.simulation.PrescribedMotion(1, move)), {},
-            "forces: expected no element that holds",
-        ),
-        (
-            (Payload(fj.Point(1), 1, end=1), fj.simulation.PrescribedMotion(1, move)),
-            {}, "forces: expected .* no Payload with begin or end",
-        ),
-    ]:  # fmt: skip
+    ]:
         with pytest.raises(ValueError, match=f"^{words}"):
             run(BAR, REST, [0, 1.0], *forces, **options)
 

@@ -2,6 +2,7 @@
 
 from functools import partial
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -22,6 +23,7 @@ with pytest.warns(UserWarning, match="joints 2 and 3 coincide"):
         mass=[2, 0, MASS], inertia=[1, INERTIA, 0], locked=[0, 0, 0],
         base_angle=-np.pi / 2, gravity=G,
     )  # fmt: skip
+FORWARD = diffrax.ForwardMode()
 ROTOR = MASS * LENGTH**2 + INERTIA
 REST = fj.State(np.zeros(3), np.zeros(3))
 NONE = fj.JointEffort(np.zeros(3))
@@ -227,3 +229,127 @@ def test_a_motion_that_cannot_begin_reaches_no_time():
 def test_malformed_motions_are_refused(message, call):
     with pytest.raises(ValueError, match=f"^{message}"):
         call()
+
+
+# Joints that are held beside it: a load on a table
+
+
+with pytest.warns(UserWarning, match="parallel"):
+    TABLE = fj.Linkage(
+        "PP", length=[0, 0, 0], com=[[0, 0], [0, 0]], mass=[5, 2], inertia=[1, 1],
+        locked=[0, 0], base_angle=0.0, gravity=0.0,
+    )  # fmt: skip
+LOAD = 2.0
+
+
+class Kick(fj.references.Reference):
+    """The table stands still, and moves at a constant rate from a time on."""
+
+    rate: fj.Values = fj.field((), unit="m/s")
+    begin: fj.Values = fj.field((), unit="s")
+
+    @property
+    def jump_ts(self):
+        return self.begin[None]
+
+    def __call__(self, t, linkage):
+        moves, along = t >= self.begin, jnp.array([1.0, 0.0])
+        x = jnp.where(moves, self.rate * (t - self.begin), 0)
+        return x * along, jnp.where(moves, self.rate, 0) * along
+
+
+class Accelerated(Push):
+    def __call__(self, t, linkage):
+        x, rate = super().__call__(t, linkage)
+        return x[:2], rate[:2]
+
+
+def on_table(*forces, reference, joints=1, qd=(0.0, 0.0), ts=(0.0, 1.0, 2.0), **more):
+    moving = fj.simulation.PrescribedMotion(joints, reference)
+    start = fj.State(np.zeros(2), jnp.array([*qd]))
+    return fj.simulate(TABLE, start, np.array(ts), (moving, *forces), **more)
+
+
+def test_friction_takes_a_load_along_or_lets_it_slip():
+    friction = fj.forces.JointFriction([0.0, 3.0])
+    for acceleration, slip in ((1.49, 0.0), (1.6, -0.1)):  # it holds 1.5 m/s^2
+        motion = on_table(friction, reference=Accelerated(0.0, acceleration))
+        ts = motion.ts
+        np.testing.assert_allclose(motion.q[:, 0], acceleration * ts**2 / 2, atol=1e-12)
+        np.testing.assert_allclose(motion.q[:, 1], slip * ts**2 / 2, atol=1e-12)
+        forces = (
+            fj.simulation.PrescribedMotion(1, Accelerated(0.0, acceleration)),
+            friction,
+        )
+        efforts = fj.joint_efforts(TABLE, forces, motion)
+        taken = LOAD * (acceleration + slip)
+        np.testing.assert_allclose(efforts.elements[1, 1, 1], taken, atol=1e-9)
+        np.testing.assert_allclose(
+            efforts.total[1, 0], 5 * acceleration + taken, atol=1e-9
+        )
+
+
+@pytest.mark.slow
+def test_a_kicked_table_slips_under_its_load():
+    """The load slides back by m v^2 / (2 f) from the kick on, for a time m v / f."""
+
+    def end(x, **options):
+        rate, begin, level = x
+        friction = fj.forces.JointFriction(level * jnp.array([0.0, 1.0]))
+        motion = on_table(friction, reference=Kick(rate, begin), **options)
+        return motion.q[-1, 1], motion
+
+    x = jnp.array([0.9, 0.3, 4.0])
+    _, motion = end(x)
+    assert motion.events.table["event"].tolist() == ["slips", "sticks"]
+    np.testing.assert_allclose(motion.events.table["t [s]"], [0.3, 0.75], atol=1e-12)
+    np.testing.assert_allclose(motion.q[1:, 1], -LOAD * 0.9**2 / 8, atol=1e-12)
+    np.testing.assert_allclose(motion.taken[-1], LOAD * 0.9**2 / 2, atol=1e-11)
+    right = -LOAD * np.array([0.9 / 4, 0, -(0.9**2) / (2 * 4**2)])
+    forward = jax.jacfwd(lambda x: end(x, adjoint=FORWARD)[0])(x)
+    np.testing.assert_allclose(forward, right, atol=1e-9)
+    reverse = jax.grad(lambda x: end(x)[0])(x)
+    np.testing.assert_allclose(reverse, right, atol=1e-9)
+    during = partial(end, ts=(0.0, 0.5, 0.6))
+    slides = lambda t: -0.9 * t + 4 * t**2 / (2 * LOAD)  # since the kick
+    np.testing.assert_allclose(during(x)[0], slides(0.3), atol=1e-12)
+    forward = jax.jacfwd(lambda x: during(x, adjoint=FORWARD)[0])(x)
+    np.testing.assert_allclose(
+        forward, [-0.3, 0.9 - 4 * 0.3 / LOAD, 0.045 / LOAD], atol=1e-9
+    )
+
+
+@pytest.mark.slow
+def test_stops_and_brakes_beside_a_kicked_table():
+    kick = Kick(0.9, 0.3)
+    stops = fj.forces.HardStops([-np.inf, -0.18], [np.inf, 1.0], restitution=0.5)
+    motion = on_table(stops, reference=kick)
+    # It comes to the stop 0.2 s after the kick, and bounces off at half the rate.
+    np.testing.assert_allclose(motion.events.table["t [s]"], [0.5], atol=1e-12)
+    bounced = -0.18 + 0.45 * (np.array([1.0, 2.0]) - 0.5)
+    np.testing.assert_allclose(motion.q[1:, 1], bounced, atol=1e-11)
+    # A braked load moves with the table, and is left behind no more than it was.
+    brake = fj.forces.Brake(2, begin=0.2, end=1.5)
+    motion = on_table(brake, reference=kick, qd=(0.0, 0.1))
+    np.testing.assert_allclose(motion.q[:, 1], [0, 0.02, 0.02], atol=1e-12)
+    assert not motion.qd[1:, 1].any()
+    # A payload beside it takes momentum of the load alone.
+    payload = fj.forces.Payload(fj.Point(2), 2.0, begin=0.6)
+    motion = on_table(payload, reference=kick)
+    np.testing.assert_allclose(motion.qd[1:, 1], -0.9, atol=1e-12)
+
+
+def test_stops_and_brakes_of_prescribed_joints_are_refused():
+    for element in (fj.forces.HardStops(-1, 1), fj.forces.Brake(1, begin=0, end=1)):
+        with pytest.raises(ValueError, match="a joint whose motion is prescribed"):
+            on_table(element, reference=Kick(0.9, 0.3))
+
+
+@pytest.mark.slow
+def test_a_jump_of_the_velocity_that_is_not_declared_is_found():
+    class Hidden(Kick):
+        jump_ts = None
+
+    motion = on_table(reference=Hidden(0.9, 0.3))
+    slid = -0.9 * (np.array([1.0, 2.0]) - 0.3)
+    np.testing.assert_allclose(motion.q[1:, 1], slid, atol=1e-9)

@@ -1,7 +1,7 @@
 """Motion in time: the equations that are integrated, and what is read from them."""
 
-from .efforts import Efforts
 from .diffrax_term import ode_term
+from .efforts import Efforts
 from .prescribed import PrescribedMotion
 
 __all__ = [

@@ -90,14 +90,14 @@ def _efforts(
 
         efforts.append(jax.vmap(effort)(*motion_rows, state))
     stacked = jnp.stack(efforts) if efforts else jnp.zeros((0, *q.shape))
+    if changes(forces):
+        held = lambda *row: efforts_of_holders(linkage, forces, *row)
+        total = jnp.sum(stacked, axis=0)
+        stacked += jax.vmap(held, out_axes=1)(*motion_rows, total)
     if (motion := prescribed(forces)) is not None:
         demand = lambda *row: prescribed_effort(linkage, forces, *row)
         demanded = jax.vmap(demand)(*motion_rows, jnp.sum(stacked, axis=0))
         place = place_of(motion, forces)
         stacked = stacked.at[place].set(demanded)
-    if changes(forces):
-        held = lambda *row: efforts_of_holders(linkage, forces, *row)
-        total = jnp.sum(stacked, axis=0)
-        stacked += jax.vmap(held, out_axes=1)(*motion_rows, total)
     stacked = without_fixed(linkage, stacked)
     return Efforts(jnp.sum(stacked, axis=0), stacked)

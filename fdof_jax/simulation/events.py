@@ -10,7 +10,7 @@ from ..mechanics.equations import Scalars
 from ..mechanics.solve import minus
 from ..steps.dopri8 import Integrated, constant
 from ..steps.switch_derivatives import Event
-from .field import Args, efforts, schedule_of, vector_field
+from .field import Args, efforts, schedule_of, vector_field, with_prescribed_rates
 from .holding import (
     BRAKE,
     FREE,
@@ -27,6 +27,7 @@ from .holding import (
     laws,
     system_at,
 )
+from .prescribed import PrescribedMotion
 from .solution import HAPPENINGS, Events
 
 _STICKS, _SLIPS, _BOUNCES, _RESTS, _LEAVES, _BRAKED, _LET_GO, _STOPPED = range(
@@ -41,6 +42,12 @@ def resolve(event: Event, y: Integrated, args: Args) -> tuple[Integrated, Modes]
     is held or begins to slide.
     """
     kinds = {kind for e in args.forces for kind in type(e).__mro__}
+    if PrescribedMotion in kinds:
+        # Impulses move what friction and stops hold.
+        braked = args.modes._replace(
+            mode=jnp.where(laws(args, event.t).braked, BRAKE, FREE)
+        )
+        y = with_prescribed_rates(event.t, y, args._replace(modes=braked))
     q = args.q0 + jnp.stack(y[0])
     before, law = args.modes, laws(args, event.t)
     first = before.mode < 0

@@ -21,10 +21,9 @@ from .field import (
     element_effort,
     initial_own,
     initial_states,
-    whole,
     with_states,
 )
-from .formulation import formulation
+from .formulation import start_of, term_of
 from .integrate import Inputs, Settings, last_switched
 from .solution import OUTCOMES, Solution
 from .solve import solve
@@ -195,8 +194,8 @@ def _linearised(
     own: OwnStates | None,
 ) -> Array:  # fmt: skip
     """Returns the matrix of the linearised equations of first order."""
-    args, (term, start_of, _) = args_of(linkage, q, forces), formulation(forces)
-    start = whole(*start_of(args, qd), initial_own(args, own))
+    args, term = args_of(linkage, q, forces), term_of(forces)
+    start = start_of(args, qd, initial_own(args, own))
     return linearised(term, t, start, args, term.schedule(t, args))
 
 

@@ -1,6 +1,7 @@
 """The vector field of a linkage with force elements, as integrators call it."""
 
 import functools
+import operator
 from collections.abc import Callable, Iterator
 from itertools import islice
 from typing import Any, NamedTuple
@@ -12,6 +13,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import PyTree
 
+from ..base.checks import place_of
 from ..forces.added_inertia import added_inertia, inertial
 from ..forces.element import (
     Element,
@@ -28,12 +30,15 @@ from ..mechanics.equations import (
     Constants,
     Scalars,
     Upper,
+    equations,
     link_constants,
     with_held,
     zeros,
 )
 from ..mechanics.rates import conditioning, rates, rates_and_conditioning
+from ..mechanics.solve import divided, minus, solver_of, times, with_added
 from ..steps.dopri8 import Health, Integrated, ScheduledTerm, health_if
+from .prescribed import prescribed
 
 Schedules = tuple[PyTree, ...]  # of all elements, which depend on time alone
 
@@ -61,12 +66,24 @@ class Args(NamedTuple):
         masses = [(k, e) for k, e in rows if isinstance(e, InertialElement)]
         return tuple(element.at(self.clock(k, t)) for k, element in masses)
 
-    def moving(self) -> "Args":
-        """Returns the arguments with the joints that are held as fixed pairs."""
-        if self.modes is None:
-            return self
-        held = tuple(self.modes.held)
-        return self._replace(constants=with_held(self.constants, held))
+    @property
+    def moved(self) -> Array | None:
+        """Whether each joint's motion is prescribed, None if none is."""
+        motion = prescribed(self.forces)
+        return None if motion is None else motion.prescribes(self.linkage)
+
+    def moving(self, held: Array | None = None) -> Constants:
+        """Returns the constants with joints that are not driven as fixed pairs.
+
+        These are the prescribed ones and those that are held: by default all.
+        """
+        constants, moved = self.constants, self.moved
+        if held is None and self.modes is not None:
+            held = self.modes.held
+        still = [flags for flags in (held, moved) if flags is not None]
+        if not still:
+            return constants
+        return with_held(constants, tuple(functools.reduce(jnp.logical_or, still)))
 
 
 def args_of(linkage: Linkage, q0: Array, forces: tuple[Element, ...]) -> Args:
@@ -135,6 +152,37 @@ def _scalars(tree: PyTree, dtype: np.dtype) -> Scalars:
     return tuple(jnp.concatenate(leaves)) if leaves else ()
 
 
+def followed(
+    y: Integrated, args: Args, schedule: Schedules
+) -> tuple[Integrated, Scalars | None]:
+    """Returns a state with prescribed joints where they are, and accelerations.
+
+    The accelerations are 0 at other joints; they are None if no joint is prescribed.
+    """
+    if (motion := prescribed(args.forces)) is None:
+        return y, None
+    q, qd, qdd = schedule[place_of(motion, args.forces)]
+    moved, (delta, rates, *own) = motion.prescribes(args.linkage), y
+    there = jnp.where(moved, q - args.q0, jnp.stack(delta))
+    rates = jnp.where(moved, qd, jnp.stack(rates))
+    return (tuple(there), tuple(rates), *own), tuple(jnp.where(moved, qdd, 0))
+
+
+def with_prescribed_rates(t: Array, y: Integrated, args: Args) -> Integrated:
+    """Returns a state after the blow of a change of the prescribed velocities.
+
+    M_FF dqd_F = -M_FH dqd_H; joints that are held stay so.
+    """
+    there, _ = followed(y, args, schedule_of(t, args))
+    delta, qd, *own = there
+    change = jnp.stack(qd) - jnp.stack(y[1])
+    added, _ = _added_at(t, delta, qd, args)
+    m = with_added(added, equations(args.constants, delta, qd))
+    solve, _ = solver_of(args.moving(), m, added, divided)
+    others = solve(tuple(-x for x in times(m.mass, tuple(change))))
+    return (delta, tuple(a + b for a, b in zip(qd, others)), *own)
+
+
 def efforts(
     t: Array, y: Integrated, args: Args, schedule: Schedules
 ) -> tuple[Scalars, Scalars, Switches]:
@@ -171,22 +219,50 @@ def switching(
     t: Array, y: Integrated, args: Args, schedule: Schedules
 ) -> tuple[Array, tuple[bool, ...]]:
     """Returns the switching functions of all efforts, and which of them jump."""
+    y, _ = followed(y, args, schedule)
     *_, switches = efforts(t, y, args, schedule)
     return switches.all_values(args.q0.dtype), tuple(switches.jumping)
 
 
-def applied(
-    t: Array, y: Integrated, args: Args, schedule: Schedules
-) -> tuple[Scalars, Scalars, Upper | None, Switches]:
-    """Returns efforts, rates of states, inertia that elements add, and switches."""
+class Applied(NamedTuple):
+    """What drives the joints at a state.
+
+    - `delta`, `qd`: displacements and velocities, prescribed ones as they are.
+    - `tau`: efforts on the joints that are driven, less what prescribed ones take.
+    - `own_rates`: of the elements' states; `added`: inertia of masses that they move.
+    """
+
+    delta: Scalars
+    qd: Scalars
+    tau: Scalars
+    own_rates: Scalars
+    added: Upper | None
+    switches: Switches
+    given: Scalars | None
+
+
+def applied(t: Array, y: Integrated, args: Args, schedule: Schedules) -> Applied:
+    """Returns what drives the joints at a state."""
+    y, given = followed(y, args, schedule)
     tau, own_rates, switches = efforts(t, y, args, schedule)
     delta, qd, *_ = y
+    added, bias = _added_at(t, delta, qd, args)
+    if bias is not None:
+        tau = minus(tau, tuple(bias))
+    if given is not None:
+        m = with_added(added, equations(args.constants, delta, qd))
+        tau = minus(tau, times(m.mass, given))
+    return Applied(delta, qd, tau, own_rates, added, switches, given)
+
+
+def _added_at(
+    t: Array, delta: Scalars, qd: Scalars, args: Args
+) -> tuple[Upper | None, Array | None]:
+    """Returns the inertia that elements add and its bias, None if none does."""
     if not inertial(args.forces):
-        return tau, own_rates, None, switches
-    q, qd = args.q0 + jnp.stack(delta), jnp.stack(qd)
-    added, bias = _added(args.linkage, args.masses(t), q, qd)
-    tau = tuple(a - b for a, b in zip(tau, bias))
-    return tau, own_rates, added, switches
+        return None, None
+    q = args.q0 + jnp.stack(delta)
+    return _added(args.linkage, args.masses(t), q, jnp.stack(qd))
 
 
 _added: Any = eqx.filter_jit(added_inertia)  # traced once, not at each use by a solver
@@ -207,31 +283,34 @@ def health_with(rates: PyTree, health: Health) -> Health:
 
 def vector_field(t, y, args, schedule) -> Integrated:
     """Rates of joint displacements, of velocities and of the elements' own states."""
-    delta, qd, *_ = y
-    tau, own_rates, added, _ = applied(t, y, args, schedule)
-    constants = args.moving().constants
-    return whole(*rates(constants, delta, qd, tau, added), own_rates)
+    at = applied(t, y, args, schedule)
+    qd, qdd = rates(args.moving(), at.delta, at.qd, at.tau, at.added)
+    return whole(qd, _with(at.given, qdd), at.own_rates)
+
+
+def _with(given: Scalars | None, qdd: Scalars) -> Scalars:
+    """Adds the prescribed accelerations to those of the other joints."""
+    return qdd if given is None else tuple(map(operator.add, qdd, given))
 
 
 def watched_field(t, y, args, schedule) -> tuple[Integrated, Health]:
     """Rates of `vector_field` and their health, which `ScheduledTerm` defines."""
-    delta, qd, *_ = y
-    tau, own_rates, added, _ = applied(t, y, args, schedule)
-    constants = args.moving().constants
-    (qd, qdd), losses = rates_and_conditioning(constants, delta, qd, tau, added)
-    health = health_with((qdd, own_rates), health_at(losses))
-    return whole(qd, qdd, own_rates), health
+    at = applied(t, y, args, schedule)
+    (qd, qdd), losses = rates_and_conditioning(
+        args.moving(), at.delta, at.qd, at.tau, at.added
+    )
+    qdd = _with(at.given, qdd)
+    health = health_with((qdd, at.own_rates), health_at(losses))
+    return whole(qd, qdd, at.own_rates), health
 
 
 def health_of(t, y, args) -> Health:
     """Health of the equations at each joint: positive, or 0 where they are singular."""
-    delta, *_ = y
-    added = None
-    if inertial(args.forces):
-        q = args.q0 + jnp.stack(delta)
-        still = jnp.zeros_like(q)
-        added, _ = _added(args.linkage, args.masses(t), q, still)
-    return health_at(conditioning(args.moving().constants, delta, added))
+    if prescribed(args.forces) is not None:
+        y, _ = followed(y, args, schedule_of(t, args))
+    delta, qd, *_ = y
+    added, _ = _added_at(t, delta, tuple(map(jnp.zeros_like, qd)), args)
+    return health_at(conditioning(args.moving(), delta, added))
 
 
 def total_effort(
@@ -358,13 +437,17 @@ def _of_arrays(term: ScheduledTerm) -> ScheduledTerm:
 
         return stacked
 
-    field = of_scalars(term.vector_field)
+    def in_arrays_too(function: Callable) -> Callable:
+        function = of_scalars(function)
+        return lambda *at: tuple(map(jnp.stack, function(*at)))
+
     return ScheduledTerm(
-        lambda *at: tuple(map(jnp.stack, field(*at))),
+        in_arrays_too(term.vector_field),
         term.schedule,
         of_scalars(term.health),
         first_in_arrays(term.watched_field),
         of_scalars(term.switching),
         term.unknown_modes,
         term.resolve and first_in_arrays(term.resolve),  # of an event, not a time
+        term.settle and in_arrays_too(term.settle),
     )

@@ -1,86 +1,68 @@
 """The formulation of a motion: equations, start, reading of states, known times."""
 
-from collections.abc import Callable
-from typing import NamedTuple
+import dataclasses
 
 import jax.numpy as jnp
 from jax import Array
 
 from ..forces.element import Forces
-from ..forces.payload import Payload
 from ..linkage.fields import jumps_at
 from ..mechanics.equations import Scalars, zeros
 from ..steps.dopri8 import Integrated, ScheduledTerm
 from ..steps.landing import clearance
 from .events import resolve
-from .field import Args, health_of, schedule_of, switching, vector_field, watched_field
-from .holding import changes, guarded_switching, unknown_modes
-from .prescribed import (
-    hybrid_field,
-    hybrid_health,
-    hybrid_joints,
-    hybrid_start,
-    hybrid_switching,
-    prescribed,
-    watched_hybrid_field,
+from .field import (
+    Args,
+    health_of,
+    schedule_of,
+    switching,
+    vector_field,
+    watched_field,
+    whole,
+    with_prescribed_rates,
 )
+from .holding import changes, guarded_switching, unknown_modes
+from .prescribed import prescribed
 
 # By which a clock is ahead of the one before, in units of `clearance`: beyond the
 # distances that steps keep from each time.
 _AHEAD = 8
 
 
-class Formulation(NamedTuple):
-    """The equations of a motion, their start, and the reading of joint states.
-
-    - `term`: the equations.
-    - `start(args, qd)`: displacements, and velocities or momenta, at the start, before
-      any jump there.
-    - `joints(args, t, y)`: joint positions and velocities at an integrated state.
-    """
-
-    term: ScheduledTerm
-    start: Callable[[Args, Array], tuple[Scalars, Scalars]]
-    joints: Callable[[Args, Array, Integrated], tuple[Array, Array]]
-
-
-def formulation(forces: Forces) -> Formulation:
-    """Returns that of velocities or, with a prescribed motion, of momenta."""
-    if prescribed(forces) is None:
-        return HOLDING if changes(forces) else DRIVEN
-    # Momenta would have to jump where a mass is let go, too.
-    timed = any(isinstance(e, Payload) and e.jump_ts is not None for e in forces)
-    if changes(forces) or timed:
-        raise ValueError(
-            "forces: expected no element that holds joints (JointFriction without "
-            "speed, HardStops, Brake), and no Payload with begin or end, beside a "
-            "PrescribedMotion, got both."
-        )
-    return HYBRID
-
-
-def _joints(args: Args, t: Array, y: Integrated) -> tuple[Array, Array]:
-    return args.q0 + jnp.stack(y[0]), jnp.stack(y[1])
-
-
-DRIVEN = Formulation(
-    ScheduledTerm(vector_field, schedule_of, health_of, watched_field, switching),
-    lambda args, qd: (zeros(args.q0), tuple(qd)),
-    _joints,
-)
-HOLDING = DRIVEN._replace(
-    term=ScheduledTerm(
-        vector_field, schedule_of, health_of, watched_field,
-        guarded_switching, unknown_modes, resolve,
-    )
+_DRIVEN = ScheduledTerm(vector_field, schedule_of, health_of, watched_field, switching)
+_HOLDING = ScheduledTerm(
+    vector_field, schedule_of, health_of, watched_field,
+    guarded_switching, unknown_modes, resolve,
 )  # fmt: skip
-HYBRID = Formulation(
-    ScheduledTerm(
-        hybrid_field, schedule_of, hybrid_health, watched_hybrid_field, hybrid_switching
-    ),
-    hybrid_start,
-    hybrid_joints,
-)
+# Terms are made once, so that their functions are traced once.
+_TERMS = {
+    (holds, follows): dataclasses.replace(
+        _HOLDING if holds else _DRIVEN,
+        settle=with_prescribed_rates if follows else None,
+    )
+    for holds in (False, True)
+    for follows in (False, True)
+}
+
+
+def term_of(forces: Forces) -> ScheduledTerm:
+    """Returns the equations of a motion."""
+    return _TERMS[changes(forces), prescribed(forces) is not None]
+
+
+def start_of(args: Args, qd: Array, own: Scalars) -> Integrated:
+    """Returns the integrated state at the start, before any jump there."""
+    return whole(zeros(args.q0), tuple(qd), own)
+
+
+def joints_of(args: Args, t: Array, y: Integrated) -> tuple[Array, Array]:
+    """Returns joint positions and velocities at an integrated state."""
+    q, qd = args.q0 + jnp.stack(y[0]), jnp.stack(y[1])
+    if (motion := prescribed(args.forces)) is None:
+        return q, qd
+    moved, at = motion.prescribes(args.linkage), motion.at(t, args.linkage)
+    q, qd = (jnp.where(moved, *pair) for pair in zip(at, (q, qd)))
+    return q, qd
 
 
 def clocks_apart(args: Args, ts: Array) -> Args:

@@ -10,6 +10,7 @@ one comes to its zero. There `resolve` (events.py) finds the modes that follow.
 """
 
 from collections.abc import Callable
+from operator import add
 from typing import NamedTuple
 
 import jax
@@ -29,6 +30,7 @@ from ..mechanics.rates import efforts_of_fixed
 from ..mechanics.solve import divided, solver_of, times, with_added
 from ..steps.dopri8 import Integrated, constant
 from .field import Args, Schedules, applied, args_of
+from .prescribed import prescribed
 from .solution import MODES, Events
 
 FREE, FRICTION, LOWER, UPPER, BRAKE = range(len(MODES))
@@ -81,6 +83,8 @@ def laws(args: Args, t: Array) -> Laws:
     """Returns the laws of all holders at a time."""
     joints = joints_of(args.linkage)
     fixed = jnp.stack(fixed_pairs(args.linkage.ef))
+    if (moved := args.moved) is not None:
+        fixed = fixed | moved
     level, static = jnp.zeros(joints), jnp.zeros(joints)
     lower, upper = jnp.full(joints, -jnp.inf), jnp.full(joints, jnp.inf)
     restitution, braked = jnp.zeros(joints), jnp.zeros(joints, bool)
@@ -136,13 +140,13 @@ def guarded_switching(
     For each joint one that shows whether it stays as it is: held within its limits, or
     sliding. With stops, for each joint that is free: the distances from them.
     """
-    tau, _, added, switches = applied(t, y, args, schedule)
-    constants = args.moving().constants
-    effort = jnp.stack(efforts_of_fixed(constants, *y[:2], tau, added))
+    at = applied(t, y, args, schedule)
+    driven = at.delta, at.qd, at.tau, at.added
+    effort = jnp.stack(efforts_of_fixed(args.moving(), *driven))
     law, modes = laws(args, t), args.modes
     held, direction = modes.held, modes.direction
     rubs = (law.static > 0) & ~held & (direction != 0)
-    sliding = jnp.where(rubs, direction * jnp.stack(y[1]), 1)
+    sliding = jnp.where(rubs, direction * jnp.stack(at.qd), 1)
     c = args.constants
     inertia = jnp.where(
         *map(jnp.stack, (real_joints(args.linkage.ef), c.second, c.beyond))
@@ -151,12 +155,12 @@ def guarded_switching(
     reserve = _reserve(law.static, modes.mode, effort, inertia)
     guards = [jnp.where(held, reserve, sliding)]
     if any(isinstance(e, HardStops) for e in args.forces):
-        delta = jnp.stack(y[0])
+        delta = jnp.stack(at.delta)
         room = delta - (law.lower - args.q0), law.upper - args.q0 - delta
         guards += [jnp.where(held, 1, _STOPS_IN * distance) for distance in room]
-    values = jnp.concatenate([switches.all_values(args.q0.dtype), *guards])
+    values = jnp.concatenate([at.switches.all_values(args.q0.dtype), *guards])
     at_guards = [True] * sum(guard.size for guard in guards)  # efforts jump there
-    return values, (*switches.jumping, *at_guards)
+    return values, (*at.switches.jumping, *at_guards)
 
 
 class System(NamedTuple):
@@ -201,11 +205,18 @@ class System(NamedTuple):
 
 
 def system_at(t: Array, q: Array, qd: Array, args: Args) -> System:
-    """Returns the system at a configuration, with the bias at these rates."""
+    """Returns the system at a configuration, with the bias at these rates.
+
+    Prescribed joints are fixed pairs in it, and what they take is part of the bias.
+    """
     added, more = added_inertia(args.linkage, args.masses(t), q, qd)
     m = with_added(added, equations(args.constants, tuple(q - args.q0), tuple(qd)))
     bias = tuple(jnp.stack(m.bias) + more)
-    return System(args.constants, m._replace(bias=bias), added)
+    if (motion := prescribed(args.forces)) is not None:
+        *_, qdd = motion.schedule(t, args.linkage)
+        given = jnp.where(motion.prescribes(args.linkage), qdd, 0)
+        bias = tuple(map(add, bias, times(m.mass, tuple(given))))
+    return System(args.moving(jnp.zeros(q.size, bool)), m._replace(bias=bias), added)
 
 
 def within_stops(forces: Forces, q: Array, linkage: Linkage) -> Truth:
@@ -220,6 +231,21 @@ def within_stops(forces: Forces, q: Array, linkage: Linkage) -> Truth:
     fixed = jnp.stack(fixed_pairs(linkage.ef))
     inside = [fixed | (q >= e.lower - near) & (q <= e.upper + near) for e in stops]
     return jnp.stack(inside).all()
+
+
+def leaves_prescribed(forces: Forces, linkage: Linkage) -> Truth:
+    """Returns whether no stop and no brake is at a joint whose motion is prescribed."""
+    if (motion := prescribed(forces)) is None:
+        return True
+    moved, alone = motion.prescribes(linkage), jnp.array(True)
+    for element in forces:
+        stopped = jnp.array(False)
+        if isinstance(element, HardStops):
+            stopped = jnp.isfinite(element.lower) | jnp.isfinite(element.upper)
+        elif isinstance(element, Brake):
+            stopped = element.joints[: moved.size]
+        alone &= ~jnp.any(moved & stopped)
+    return alone
 
 
 def changes(forces: Forces) -> bool:

@@ -26,9 +26,9 @@ from ..steps.landing import Landing, clearance
 from ..steps.looped_dopri8 import LoopedDopri8
 from ..steps.tolerances import default_controller, error_control_of, with_tolerances
 from .events import in_order
-from .field import args_of, in_arrays, initial_own, own_states, whole
-from .formulation import clocks_apart, formulation, known_times
-from .holding import changes, taken_at, within_stops
+from .field import args_of, in_arrays, initial_own, own_states
+from .formulation import clocks_apart, joints_of, known_times, start_of, term_of
+from .holding import changes, leaves_prescribed, taken_at, within_stops
 from .prescribed import agrees
 from .solution import Solution
 
@@ -108,13 +108,13 @@ def _prepare(
     own = initial_own(args, own0)
     finite = jnp.isfinite(jnp.array(own)).all()
     own = tuple(jnp.where(finite, x, 0) for x in own)
-    term, start_of, joints_of = formulation(forces)
-    start = whole(*start_of(args, qd0), own)
+    term, start = term_of(forces), start_of(args, qd0, own)
 
     def joints(t, y):
         return *joints_of(args, t, y), own_states(args, y)
 
-    q, qd, _ = joints(ts[0], start)  # after a blow there, like all that follows
+    begin = start if term.settle is None else term.settle(ts[0], start, args)
+    q, qd, _ = joints(ts[0], begin)  # after a blow there, like all that follows
     jumps = known_times(args)
     of_problem = term, start, args
     # Loops of few motions compile and run faster in arrays.
@@ -218,14 +218,14 @@ def _read(
 
     given = (without_fixed(linkage, value) for value in state0)
     q, qd = map(from_start, (q, qd), motion.first, given)
+    # Constant steps go on when the state is no longer finite, and a prescribed motion
+    # may not be finite itself.
     reached, result = jnp.minimum(end.t, ts[-1]), end.result
-    if not isinstance(end.judged, Judged):
-        # Constant steps go on when the state is no longer finite.
-        lost = (ts <= reached) & ~jnp.isfinite(q + qd).all(axis=1)
-        last_finite = ts[jnp.maximum(jnp.argmax(lost) - 1, 0)]
-        reached = jnp.where(lost.any(), last_finite, reached)
-        went_well = result == RESULTS.successful
-        result = RESULTS.where(went_well & lost.any(), RESULTS.nonfinite, result)
+    lost = (ts <= reached) & ~jnp.isfinite(q + qd).all(axis=1)
+    last_finite = ts[jnp.maximum(jnp.argmax(lost) - 1, 0)]
+    reached = jnp.where(lost.any(), last_finite, reached)
+    unsaid = lost[-1] & (result == RESULTS.successful)
+    result = RESULTS.where(valid & ~unsaid, result, RESULTS.nonfinite)
     stats: dict[str, Any] = {
         "num_steps": end.steps,
         "num_accepted_steps": end.accepted,
@@ -237,7 +237,6 @@ def _read(
         stats["accuracy"] = jnp.finfo(q.dtype).eps * end.judged.loss
     if end.switches is not None:
         stats |= end.switches.facts
-    result = RESULTS.where(valid, result, RESULTS.nonfinite)
     holding: Any = ()  # modes, energy taken, events
     if modes is not None:
         assert end.switches is not None  # which guard them
@@ -286,6 +285,7 @@ def faults(inputs: Inputs, times: bool = True) -> list[Array]:
     finite = (jnp.isfinite(state0.q) & jnp.isfinite(state0.qd)).all()
     q0 = jnp.asarray(state0.q)
     place = agrees(forces, ts[0], q0, linkage) & within_stops(forces, q0, linkage)
+    place &= leaves_prescribed(forces, linkage)
     arm = constant((linkage, ts))
     fit = [jnp.asarray(e.possible() & constant(e).fits(*arm)) for e in forces]
     return [~fine for fine in (increasing, finite & place, possible(linkage), *fit)]

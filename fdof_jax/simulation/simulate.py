@@ -28,7 +28,7 @@ from ..linkage.linkage import Linkage, check_linkage
 from ..steps.tolerances import at_tolerances, with_longest, within_reach
 from .failures import cause, check_arguments
 from .field import initial_states
-from .holding import within_stops
+from .holding import leaves_prescribed, within_stops
 from .integrate import Inputs, Settings, faults
 from .prescribed import agrees, prescribed
 from .scene import accepts_scene
@@ -131,6 +131,12 @@ def check_start(
     if not within_stops(forces, q, linkage):
         raise refusal("state0.q", "positions between the hard stops", q.tolist())
     motion = prescribed(forces)
+    if not leaves_prescribed(forces, linkage):
+        raise ValueError(
+            "forces: expected no HardStops and no Brake at a joint whose motion is "
+            "prescribed, which they cannot stop, got some (limits of -inf and inf are "
+            "none)."
+        )
     if motion is not None and not agrees(forces, ts[0], q, linkage):
         begin, _ = motion.at(ts[0], linkage)
         expected = f"{begin.tolist()} at the joints whose motion is prescribed"

@@ -62,6 +62,8 @@ class ScheduledTerm(diffrax.ODETerm):
     returns the modes before the start, and how many of the last switching functions
     guard them: positive while a mode lasts. `resolve(event, y, args)` returns the state
     and the modes after an event.
+
+    `settle(t, y, args)`, if any, returns the state from which a step begins.
     """
 
     vector_field: Callable[..., PyTree] = eqx.field(static=True)
@@ -71,6 +73,7 @@ class ScheduledTerm(diffrax.ODETerm):
     switching: Callable[..., tuple[Array, tuple[bool, ...]]] = eqx.field(static=True)
     unknown_modes: Callable | None = eqx.field(static=True, default=None)
     resolve: Callable | None = eqx.field(static=True, default=None)
+    settle: Callable | None = eqx.field(static=True, default=None)
 
     def vf(self, t, y, args):
         return self.vector_field(t, y, args, self.schedule(t, args))

@@ -249,6 +249,8 @@ def _taken(problem: Problem, stepping: Stepping, a: Attempt) -> _Taken:
     if events is not None:
         y0, begun = events.crossed(a.t, a.y, a.switches, jumped)
         args = args._replace(sides=begun.sides, modes=begun.modes)
+    if term.settle is not None:
+        y0, jumped = term.settle(a.t, y0, args), True
     y1, error, dense, of_method, failed = method.step(
         term, a.t, a.end, y0, args, a.method, jumped
     )
