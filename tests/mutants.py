@@ -34,6 +34,7 @@ class Mutant(NamedTuple):
 
 AT_ONCE, BRIEF = "tests/test_events_at_once.py", "tests/test_brief_switches.py"
 SWITCHES, HOLDING = "tests/test_switches.py", "tests/test_holding.py"
+HYBRID = "tests/test_hybrid_dynamics.py"
 KINKS = f"{SWITCHES}::test_kinks_of_high_gains_are_exact_in_derivatives"
 BOUNCES = f"{HOLDING}::test_a_mass_bounces_to_rest_at_a_known_time"
 
@@ -138,7 +139,7 @@ MUTANTS = {
         "steps/switch_derivatives.py",
         "for _ in range(2):",
         "for _ in range(1):",
-        f"{HOLDING}::test_second_derivatives_through_a_blow",
+        "switching, twice",
     ),
     "moved to first order": Mutant(
         "steps/switch_derivatives.py",
@@ -203,6 +204,25 @@ MUTANTS = {
         "impulse += jnp.where(new, weights * (own - carried) @ jacobian, 0)",
         "impulse += jnp.where(new, weights * own @ jacobian, 0)",
         "holding elements",
+    ),
+    # Joints that are prescribed
+    "a prescribed velocity jumps without a blow": Mutant(
+        "steps/loop.py",
+        "y0, jumped = term.settle(a.t, y0, args), True",
+        "pass",
+        f"{HYBRID}::test_a_jump_of_the_velocity_is_a_blow",
+    ),
+    "a prescribed acceleration moves no other joint": Mutant(
+        "simulation/field.py",
+        "        tau = minus(tau, times(m.mass, given))",
+        "        pass",
+        f"{HYBRID}::test_friction_takes_a_load_along_or_lets_it_slip",
+    ),
+    "a held load resists no blow": Mutant(
+        "simulation/events.py",
+        "y = with_prescribed_rates(event.t, y, args._replace(modes=modes))",
+        "pass",
+        f"{HYBRID}::test_a_kicked_table_slips_under_its_load",
     ),
     "static friction is that of sliding": Mutant(
         "simulation/holding.py",
