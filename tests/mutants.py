@@ -220,7 +220,7 @@ MUTANTS = {
     ),
     "a held load resists no blow": Mutant(
         "simulation/events.py",
-        "y = with_prescribed_rates(event.t, y, args._replace(modes=modes))",
+        "y = with_prescribed_rates(event.t, y, args._replace(modes=braked))",
         "pass",
         f"{HYBRID}::test_a_kicked_table_slips_under_its_load",
     ),

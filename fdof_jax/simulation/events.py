@@ -42,14 +42,12 @@ def resolve(event: Event, y: Integrated, args: Args) -> tuple[Integrated, Modes]
     is held or begins to slide.
     """
     kinds = {kind for e in args.forces for kind in type(e).__mro__}
+    before, law = args.modes, laws(args, event.t)
     if PrescribedMotion in kinds:
         # Impulses move what friction and stops hold.
-        braked = args.modes._replace(
-            mode=jnp.where(laws(args, event.t).braked, BRAKE, FREE)
-        )
+        braked = before._replace(mode=jnp.where(law.braked, BRAKE, FREE))
         y = with_prescribed_rates(event.t, y, args._replace(modes=braked))
     q = args.q0 + jnp.stack(y[0])
-    before, law = args.modes, laws(args, event.t)
     first = before.mode < 0
     fired = jnp.zeros((3, q.size), bool)
     fired = fired.at[: len(event.fired)].set(event.fired)
