@@ -222,7 +222,7 @@ BAD = {
         (type(DAMPER),),
         "damper",
     ],
-    "adjoint": [diffrax.BacksolveAdjoint()],
+    "adjoint": [diffrax.BacksolveAdjoint(), diffrax.ImplicitAdjoint()],
     "dt0": [0.0, -1e-3, np.nan, "1e-3"],
 }
 

@@ -164,3 +164,29 @@ def test_an_arm_that_is_singular_under_task_space_control_is_named():
     with pytest.raises(RuntimeError) as raised:
         fj.simulate(arm, start, [0, 20.0], (damped,), dt0=10.0, max_steps=1)
     assert str(raised.value).endswith("No step met the tolerance.")
+
+
+class Careless(diffrax.AbstractAdaptiveStepSizeController):
+    """Keeps all steps, whatever their errors."""
+
+    rtol: float = 1e-6
+    atol: float = 1e-6
+    norm: object = None
+
+    def wrap(self, direction):
+        return self
+
+    def init(self, terms, t0, *arguments):
+        return t0 + 0.125, ()
+
+    def adapt_step_size(self, t0, t1, *arguments):
+        going_on = False, (), diffrax.RESULTS.successful
+        return jnp.array(True), t1, t1 + 0.125, *going_on
+
+
+def test_a_motion_that_is_lost_is_no_success():
+    """Heun's method is unstable here; nobody notices but `simulate`."""
+    damper, times = (fj.JointDamper(200.0),), np.linspace(0, 128, 7)
+    steps = dict(solver=diffrax.Heun(), stepsize_controller=Careless())
+    motion = fj.simulate(PENDULUM, START, times, damper, throw=False, **steps)
+    assert motion.outcome == "not finite" and motion.stats["time_reached"] < 128

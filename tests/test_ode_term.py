@@ -108,6 +108,8 @@ def test_white_torque_has_the_stationary_variance_of_a_damped_bar():
             fj.simulation.PrescribedMotion(1, fj.references.SetPoint(0.3)),
             "no PrescribedMotion",
         ),
+        (fj.forces.Payload(fj.Point(3), 1.0, begin=0.1), "no Payload with a begin"),
+        (lambda t, q, qd, linkage: 0.0, "an array of 3 real numbers"),
     ],
 )
 def test_what_simulate_alone_can_do_is_refused(element, word):

@@ -237,3 +237,27 @@ def test_a_limit_that_a_jump_exceeds_acts_at_once(begin):
         controller = fj.PDController(kp, 0.0, 5.0, step)
         motion = fj.simulate(slide, fj.State([0], [0]), [0, begin + 0.1], (controller,))
         assert abs(motion.q[-1, 0] - 2.5 * 0.1**2) < 1e-12, kp
+
+
+class Late(fj.Element):
+    """Switches with a function that itself jumps, at a time that nothing declares."""
+
+    low: fj.Values = fj.field((), unit="1")
+    at: fj.Values = fj.field((), unit="s")
+
+    def __call__(self, t, q, qd, linkage):
+        side = jnp.where(t > self.at, 1.0, -self.low)
+        return fj.forces.switch(side, 1.0, -1.0) * jnp.ones_like(q)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("low", [0.5, 0.03, 1e-3, 1e-5])
+def test_a_switching_function_may_jump(low):
+    """A free slide is pushed back, and from the jump on forth."""
+    slide = fj.Linkage(
+        "P", length=[0, 1], com=[[0, 0]], mass=[1], inertia=[1], gravity=0.0
+    )
+    at, start = 0.77, fj.State([0.0], [0.0])
+    motion = fj.simulate(slide, start, [0, 1.0], (Late(low, at),))
+    assert motion.stats["num_switches"] == 1
+    np.testing.assert_allclose(motion.qd[-1], [(1 - at) - at], atol=1e-12)

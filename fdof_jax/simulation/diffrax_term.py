@@ -3,6 +3,7 @@
 from typing import Any
 
 import diffrax
+import equinox as eqx
 import jax.numpy as jnp
 from jax import Array
 
@@ -11,6 +12,7 @@ from ..forces.holders import check_free
 from ..linkage.coordinates import real_state
 from ..linkage.linkage import check_linkage, without_fixed
 from .field import Args, args_of, initial_own, schedule_of, vector_field, whole
+from .holding import changes
 from .prescribed import prescribed
 from .scene import Scene, with_full_size
 
@@ -20,16 +22,17 @@ _Y = tuple[Array, Array, Array]  # positions, velocities, states of elements
 def ode_term(scene: Scene) -> tuple[diffrax.ODETerm, _Y, Args]:
     """Returns a scene as the term, start and arguments of a `diffrax.diffeqsolve`.
 
-    `diffrax.diffeqsolve(term, solver, 0, t1, dt0, y0, args)` then has all of diffrax:
-    dense solutions, events that end a solve, other solvers, and noise by a `MultiTerm`
-    (see the recipes). It does not have what `simulate` adds: steps do not end where
-    elements jump or switch, so that derivatives there may be wrong; errors that are
-    mere rounding shorten steps; no result names a singular arm.
+    `diffrax.diffeqsolve(term, solver, 0, t1, dt0, y0, args)` then has what `simulate`
+    has not: dense solutions, events that end a solve, and noise by a `MultiTerm` (see
+    the recipes). It lacks what `simulate` adds: steps do not end where elements jump or
+    switch, so that derivatives there may be wrong; errors that are mere rounding
+    shorten steps; no result names a singular arm.
 
     **Arguments:**
 
-    - `scene`: its linkage, start and forces. Elements that hold joints, and a
-      `PrescribedMotion`, are refused.
+    - `scene`: its linkage, start and forces. Elements that hold joints, a `Payload`
+      that arrives, and a `PrescribedMotion` are refused: only `simulate` knows their
+      blows.
 
     **Returns:** `(term, y0, args)`. `term` is a `diffrax.ODETerm` of one function for
     all scenes, so that scenes of one structure share a program. `y0` is `(q, qd, own)`:
@@ -55,13 +58,16 @@ def ode_term(scene: Scene) -> tuple[diffrax.ODETerm, _Y, Args]:
     start = real_state("scene.state0", state0, linkage)
     for index, element in enumerate(forces):
         check_free(f"scene.forces[{index}]", element)
-    if prescribed(forces) is not None:
+    if prescribed(forces) is not None or changes(forces):
         raise ValueError(
-            "scene.forces: expected no PrescribedMotion, whose motion simulate knows."
+            "scene.forces: expected no PrescribedMotion, and no Payload with a begin, "
+            "as only simulate knows their blows, got one."
         )
     q, qd = (without_fixed(linkage, jnp.asarray(value)) for value in start)
     args = args_of(linkage, q, forces)
-    return _TERM, (q, qd, jnp.array(initial_own(args), q.dtype)), args
+    y0 = q, qd, jnp.array(initial_own(args), q.dtype)
+    eqx.filter_eval_shape(_rates, 0.0, y0, args)  # refuses efforts of other shapes
+    return _TERM, y0, args
 
 
 def _rates(t: Any, y: _Y, args: Args) -> _Y:

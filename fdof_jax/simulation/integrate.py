@@ -33,7 +33,8 @@ from .prescribed import agrees
 from .solution import Solution
 
 RESULTS: Any = diffrax.RESULTS
-Settings = dict[str, Any]  # keywords of `diffeqsolve`, as `solve_options` checks them
+# What `solve_options` returns; sweeps add `lanes` (see `loop.Stepping`).
+Settings = dict[str, Any]
 
 
 class Inputs(NamedTuple):

@@ -25,7 +25,7 @@ from ..forces.element import Element, Forces, OwnStates, elements_on, naming
 from ..linkage.coordinates import State, real_state
 from ..linkage.fields import check_values, jumps_at
 from ..linkage.linkage import Linkage, check_linkage
-from ..steps.tolerances import at_tolerances, with_longest, within_reach
+from ..steps.tolerances import at_tolerances, check_method, with_longest, within_reach
 from .failures import cause, check_arguments
 from .field import initial_states
 from .holding import leaves_prescribed, within_stops
@@ -49,23 +49,30 @@ def solve_options(
     throw: bool,
     progress_meter: diffrax.AbstractProgressMeter,
 ) -> Settings:
-    """Checks `simulate`'s keywords; returns those of diffeqsolve, without `throw`."""
+    """Checks `simulate`'s keywords; returns them without tolerances and `throw`."""
     if dt0 is not None:
         # As an array its value is no part of the program.
         dt0 = real_numbers("dt0", dt0, (), above=0)
     if max_steps is not None:
         whole_number("max_steps", max_steps, 1, np.iinfo(np.int32).max)
-    if isinstance(adjoint, diffrax.BacksolveAdjoint):
-        raise ValueError(
-            "adjoint: expected RecursiveCheckpointAdjoint (reverse mode) or "
-            "ForwardMode, got BacksolveAdjoint, whose gradients are wrong on these "
-            "problems."
+    loops = (
+        diffrax.RecursiveCheckpointAdjoint,
+        diffrax.ForwardMode,
+        diffrax.DirectAdjoint,
+    )
+    if not isinstance(adjoint, loops):
+        expected = "RecursiveCheckpointAdjoint or DirectAdjoint (reverse mode) or "
+        raise refusal(
+            "adjoint",
+            f"{expected}ForwardMode; the gradients of BacksolveAdjoint are wrong on "
+            "these problems, and no other has a meaning for them",
+            adjoint,
         )
-    instance("adjoint", adjoint, diffrax.AbstractAdjoint)
     instance("throw", throw, bool)
     instance("progress_meter", progress_meter, diffrax.AbstractProgressMeter)
     if solver is not None:
         instance("solver", solver, diffrax.AbstractSolver)
+        check_method(solver)
     if not (rtol is atol is max_step is None):
         if stepsize_controller is not None:
             raise ValueError(

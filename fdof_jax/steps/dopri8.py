@@ -170,21 +170,16 @@ class Estimate(NamedTuple):
 
 
 def scheduled_at_end(schedule: PyTree) -> PyTree:
-    """Returns the row of a step's schedule for its `Estimate`.
-
-    It is None if there are whole numbers or flags, as diffrax makes floats of them.
-    """
-    row = jax.tree.map(lambda rows: rows[AT_END], schedule)
-    floating = all(map(eqx.is_inexact_array, jax.tree.leaves(row)))
-    return row if floating else None
+    """Returns the row of a step's schedule for its `Estimate`."""
+    return jax.tree.map(lambda rows: rows[AT_END], schedule)
 
 
 def verdict(estimate: Estimate, h: Array) -> tuple[Estimate, diffrax.RESULTS]:
     """Returns an estimate, its error and health replaced if that is bad, and a result.
 
     The health is NaN for a step that is not finite, and 0 for a singular one. An
-    infinite error rejects the step until it is short. diffrax ignores the results of
-    rejected steps, so the short step is accepted, with error 0.
+    infinite error rejects the step until it is short. Results of rejected steps are
+    ignored, so the short step is accepted, with error 0.
     """
     error, health, scheduled = estimate
     singular, short = is_singular(health), jnp.abs(h) < SHORTEST[h.dtype]

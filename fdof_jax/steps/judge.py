@@ -82,15 +82,14 @@ class Judge(eqx.Module):
     watches: bool = eqx.field(static=True)
     derivatives: OfTangents | OfLinearised | None
 
-    def start(self, run: tuple) -> tuple[Array, Judged]:
+    def start(self, run: tuple, y0: Integrated) -> tuple[Array, Judged]:
         """Returns the end of the first step, and the state of the judge.
 
-        `run`: the arguments of a controller's `init`.
+        `run`: the arguments of a controller's `init`; `y0`: the state at the start.
         """
-        _, t0, _, y0, *_ = run
         end, controller = constant(self.controller.wrap(1).init(*run))
         probe = () if self.derivatives is None else self.derivatives.start(y0)
-        return end, Judged(controller, probe, jnp.zeros_like(t0))
+        return end, Judged(controller, probe, jnp.zeros_like(end))
 
     def __call__(
         self, step: Step, error: PyTree, order: float, before: Judged

@@ -16,15 +16,20 @@ from .dopri8 import constant
 # that throw each other at their stops, are slower.
 _MOST_CROSSINGS = 100
 _PACE = -0.35
+# After so many tries the switching function itself is taken to jump, and the jump is
+# located by halving the step.
+_MOST_TRIES = 6
 # A step ends so many units of rounding before a known time, and the next one starts as
 # many after it, so that rounding within steps does not pass it.
 _APART = 4
 # A step that would end within this share of its length before a known time ends at it.
 _JUST_BEFORE = 1e-6
-# The loop moves the end of a step to that of the run if they are within 100 units of
-# rounding. Twice as many are safe; a run that goes on after a jump at its end is longer
-# by more, by so many clearances.
-_NEAR_END, _LONGER = 200, 64
+# A step that would end within so many units of rounding of the end of the run ends
+# there: dense output of a shorter one would be rounding alone.
+NEAR_END = 100
+# Steps that end where something happens stay away from the end by twice as much. A run
+# that goes on after a jump at its end is longer by more, by so many clearances.
+_LONGER = 64
 
 
 def clearance(ts: Array) -> Array:
@@ -38,7 +43,7 @@ def clearance(ts: Array) -> Array:
 
 def _last(end: Array) -> Array:
     """Returns the time after which a step's end may be moved to that of the run."""
-    return constant(end - _NEAR_END * jnp.finfo(end.dtype).eps * jnp.abs(end))
+    return constant(end - 2 * NEAR_END * jnp.finfo(end.dtype).eps * jnp.abs(end))
 
 
 class Found(NamedTuple):
@@ -73,9 +78,28 @@ class _Landing(NamedTuple):
     target: Array  # where this step is to end, infinity if anywhere
     gap: Array  # time left out after it, 0 unless it ends at a known time
     resumed: Array  # length of the step after it
+    beyond: Array  # end of the last step that passed a switch, -infinity if none
+    tries: Array  # to end at the next switch, up to here
     crossings: Array  # steps taken again for a switch, since the time `since`
     since: Array
     last: Array  # see `_last`
+
+
+class _OtherEnd(NamedTuple):
+    """Why a step should have another end, `again`, if it is accurate.
+
+    - `passed`: it passed a switch, and should end there.
+    - `short`: it aims at one, and ends just before.
+    - `unsure`: a shorter step sees what this one may have passed over.
+    - `missed`: it aims at a switch and ends well before: it is kept, and the next one
+      ends where the switch was passed.
+    """
+
+    passed: Array
+    short: Array
+    unsure: Array
+    missed: Array
+    again: Array
 
 
 class Landing(eqx.Module):
@@ -127,19 +151,17 @@ class Landing(eqx.Module):
         if self.switches:  # a step of no length finds the sides
             end, gap, cut = t0, jnp.zeros_like(t0), jnp.array(True)
         target = jnp.where(cut, constant(end), jnp.inf)
-        none, since = jnp.zeros((), int), constant(jnp.asarray(t0))
-        return end, _Landing(target, gap, length, none, since, last)
+        beyond, none = jnp.full_like(target, -jnp.inf), jnp.zeros((), int)
+        since = constant(jnp.asarray(t0))
+        return end, _Landing(target, gap, length, beyond, none, none, since, last)
 
-    def _wrong_end(
+    def _other_end(
         self, begin: Array, end: Array, found: Found | None, state: _Landing
-    ) -> tuple[Array, Array, Array]:
-        """Returns whether a step should end elsewhere, at a switch or not, and where.
-
-        A shorter step sees what this one may have passed over.
-        """
+    ) -> _OtherEnd:
+        """Returns whether a step should end elsewhere, and where."""
         if found is None:
             no = jnp.zeros((), bool)
-            return no, no, end
+            return _OtherEnd(no, no, no, no, end)
         aimed = end == state.target
         allowance = jnp.where(aimed, found.near, 0)
         within = found.until < jnp.minimum(end - allowance, state.last)
@@ -150,15 +172,13 @@ class Landing(eqx.Module):
         arrived = aimed & (state.gap == 0) & tiny
         passed = (within | at_once) & ~arrived
         unsure = ~passed & (found.unseen < end)
-        # A step that aims at a switch and ends just before it is made longer: a tiny
-        # second step would tell little of slopes.
-        _, _, jumps_before = self._cut(begin, found.soon, state.last)
-        short = aimed & (state.gap == 0) & ~(passed | unsure | found.switched)
-        short &= (found.soon > end) & ~jumps_before
-        again = jnp.where(
-            passed, found.until, jnp.where(short, found.soon, found.unseen)
-        )
-        return passed | short, unsure, again
+        before = aimed & ~(passed | unsure | found.switched) & (end < state.beyond)
+        # A tiny second step would tell little of slopes.
+        short = before & (end < found.soon) & (found.soon < state.beyond)
+        hopeless = state.tries > _MOST_TRIES
+        to_switch = jnp.where(hopeless, begin + (end - begin) / 2, found.until)
+        again = jnp.where(passed, to_switch, jnp.where(short, found.soon, found.unseen))
+        return _OtherEnd(passed, short, unsure, before & ~short, again)
 
     def after(
         self, t0: Array, t1: Array, found: Found | None, planned: NextStep,
@@ -171,15 +191,17 @@ class Landing(eqx.Module):
         | step | next step |
         |---|---|
         | rejected by the controller | as planned |
-        | retried (see `_wrong_end`) | the same again, but to another end |
+        | retried (see `_OtherEnd`) | the same again, but to another end |
+        | ends well before its switch | up to where the switch was passed |
         | ends at a switch or known time | as long as planned before |
         | free | as planned, or up to the next known time |
         """
         begin, end = constant((t0, t1))
-        to_switch, unsure, again = self._wrong_end(begin, end, found, state)
-        retried = planned.keep & (to_switch | unsure)
+        other = self._other_end(begin, end, found, state)
+        crossed = planned.keep & (other.passed | other.short)
+        retried = crossed | (planned.keep & other.unsure)
         keep = planned.keep & ~retried
-        aimed = end == state.target
+        missed, aimed = keep & other.missed, end == state.target
         landed = keep & aimed
         resumes = retried | landed
 
@@ -191,17 +213,17 @@ class Landing(eqx.Module):
         # Where is it to end? The error of a step that was cut short says little.
         cut_short = resumes & aimed
         length = jnp.where(cut_short, state.resumed, planned.t1 - planned.t0)
-        next_t1, gap, cut = self._cut(constant(next_t0), next_t0 + length, state.last)
+        next_t1 = jnp.where(missed, state.beyond, next_t0 + length)
+        next_t1, gap, cut = self._cut(constant(next_t0), next_t1, state.last)
         # What a jump at a known time makes switch, switches at exactly that time.
-        again = jnp.where(again == begin, t0, again)
+        again = jnp.where(other.again == begin, t0, other.again)
         next_t1 = jnp.where(retried, again, next_t1)
-        aims = jnp.where(retried, to_switch, cut)
+        aims = jnp.where(retried, crossed, cut | missed)
 
         # Does the solve go on?
         # Time that passes meanwhile tells fast switching from chatter.
         pace = self.apart * jnp.finfo(begin.dtype).eps ** _PACE
         paced = begin - state.since > pace
-        crossed = retried & to_switch
         crossings = jnp.where(paced, 0, state.crossings + crossed)
         results = diffrax.RESULTS
         # The last step may be shorter than the least length; no step follows it.
@@ -214,6 +236,12 @@ class Landing(eqx.Module):
             target=jnp.where(aims, constant(next_t1), jnp.inf),
             gap=jnp.where(retried, 0, gap),
             resumed=length,
+            beyond=jnp.where(
+                planned.keep & other.passed,
+                end,
+                jnp.where(keep & ~missed, -jnp.inf, state.beyond),
+            ),
+            tries=jnp.where(keep & ~missed, 0, state.tries + crossed),
             crossings=crossings,
             since=jnp.where(paced, begin, state.since),
         )

@@ -14,16 +14,14 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import PyTree
 
+from ..base.checks import refusal
 from .dopri8 import Arguments, Integrated, ScheduledTerm, chosen, constant
 from .events import Begun, Events, Switches
 from .judge import Judge, Step
-from .landing import Found, Landing, NextStep
+from .landing import NEAR_END, Found, Landing, NextStep
 from .tolerances import Controller, Shortening, with_error_control
 
 RESULTS: Any = diffrax.RESULTS
-# A step that would end within so many units of rounding of the end of the run ends
-# there: dense output of a shorter one would be rounding alone.
-_NEAR_END = 100
 # A lane stops once it has taken `_SLACK` times as many steps as it had taken when
 # `_MOST` of the lanes were done.
 _SLACK, _MOST = 1.5, 7 / 8
@@ -32,7 +30,7 @@ _SLACK, _MOST = 1.5, 7 / 8
 class Problem(NamedTuple):
     """An initial value problem.
 
-    - `ts`: output times, the first and the last one of the run.
+    - `ts`: output times; the run is from the first to the last.
     """
 
     term: ScheduledTerm
@@ -46,8 +44,8 @@ class Stepping(NamedTuple):
 
     - `method`, `controller`: those of diffrax. `dt0`: length of the first step, or None
       for the controller's estimate.
-    - `judge`, `events`, `landing`: None for constant steps; the last two also if
-      nothing happens in the run.
+    - `judge`, `events`, `landing`: None if the controller judges no errors (it is not
+      adaptive in diffrax's sense); the last two also if nothing happens in the run.
     - `adjoint`: which derivatives the loops can have.
     - `lanes`: the axis of a batch in which a lane gives up when most others are long
       done, or None.
@@ -71,8 +69,8 @@ class Attempt(NamedTuple):
     - `t`, `end`: where the step begins and is to end [s].
     - `y`: the state at `t`, before what happens there; `jumped`: whether something may
       happen, None if it never does.
-    - `method`: state of the method. `judged`: that of `Judge`, or of the controller if
-      steps are constant; `wrappers`: of controllers around the one that judges errors.
+    - `method`: state of the method. `judged`: that of `Judge`, or without one of the
+      controller; `wrappers`: of controllers around the one that judges errors.
     - `landing`, `switches`: states of `Landing` and of `Events`, None without them.
     - `rows`: states at output times, infinite at those to come; `saved`: how many are
       there.
@@ -120,7 +118,7 @@ class _Taken(NamedTuple):
     switches: Switches | None
 
 
-class _Planned(diffrax.AbstractStepSizeController):
+class _Answering(diffrax.AbstractStepSizeController):
     """Stands for a controller within others, which change the answer that it gives."""
 
     answer: Any
@@ -143,7 +141,7 @@ def solve(problem: Problem, stepping: Stepping) -> Attempt:
     ts, landing, most = problem.ts, stepping.landing, stepping.most_steps
     last = ts[-1] if landing is None else landing.end_of_run(ts)
     kind, checkpoints = _kind_of(stepping)
-    near_end = last - _NEAR_END * jnp.finfo(ts.dtype).eps * jnp.abs(last)
+    near_end = last - NEAR_END * jnp.finfo(ts.dtype).eps * jnp.abs(last)
 
     def advance(a: Attempt) -> Attempt:
         taken = _taken(problem, stepping, a)
@@ -188,6 +186,14 @@ def solve(problem: Problem, stepping: Stepping) -> Attempt:
         buffers=lambda a: a.rows,
         checkpoints=checkpoints,
     )
+    if kind == "lax" and not isinstance(stepping.adjoint, diffrax.ForwardMode):
+        end = eqx.internal.nondifferentiable_backward(
+            end,
+            msg="reverse-mode differentiation of simulate needs an upper bound of its "
+            "steps (max_steps) or, with RecursiveCheckpointAdjoint, a number of "
+            "checkpoints.",
+            symbolic=True,
+        )
     stepping.meter.close(end.meter)
     result = RESULTS.where(unfinished(end), RESULTS.max_steps_reached, end.result)
     return end._replace(result=result)
@@ -196,19 +202,20 @@ def solve(problem: Problem, stepping: Stepping) -> Attempt:
 def _first_attempt(problem: Problem, stepping: Stepping, last: Array) -> Attempt:
     """Returns the state of the loop before the first step."""
     (term, y0, args, ts), t0 = problem, problem.ts[0]
-    method, controller, dt0, judge, events, landing, *_, meter, lanes = stepping
+    method, controller, judge = stepping.method, stepping.controller, stepping.judge
+    events, landing = stepping.events, stepping.landing
     switches = of_landing = wrappers = jumped = None
     end: Any
     if events is not None:
         switches = events.start(t0)
         args = args._replace(sides=switches.sides, modes=switches.modes)
     order = method.error_order(term)
-    run: Any = term, t0, last, y0, dt0, args, method.func, order
+    run: Any = term, t0, last, y0, stepping.dt0, args, method.func, order
     if judge is None:
         end, judged = controller.wrap(1).init(*run)
     else:
         run = constant(run)
-        end, judged = judge.start(run)
+        end, judged = judge.start(run, y0)
     if landing is not None:
         end, of_landing = landing.start(t0, last, end)
     if judge is not None and controller is not judge.controller:
@@ -232,10 +239,10 @@ def _first_attempt(problem: Problem, stepping: Stepping, last: Array) -> Attempt
         switches=switches,
         rows=jax.tree.map(rows, _row(y0, switches)),
         saved=none,
-        meter=meter.init(),
+        meter=stepping.meter.init(),
         steps=none,
         accepted=none,
-        typical=None if lanes is None else none,
+        typical=None if stepping.lanes is None else none,
         result=RESULTS.successful,
     )
 
@@ -269,13 +276,21 @@ def _planned(
     judge, landing, controller = stepping.judge, stepping.landing, stepping.controller
     order = stepping.method.error_order(problem.term)
     # Tolerances are those of the state before what happens where the step begins.
-    step = Step(a.t, a.end, a.y, taken.y1, taken.args)
+    step, error = Step(a.t, a.end, a.y, taken.y1, taken.args), taken.error
     if judge is None:
+        error = jax.tree.map(lambda e: jnp.where(jnp.isnan(e), jnp.inf, e), error)
         *plan, judged, result = controller.wrap(1).adapt_step_size(
-            *step, taken.error, order, a.judged
+            *step, error, order, a.judged
         )
         return NextStep(*plan, result), judged, None, None  # pyright: ignore[reportCallIssue]
-    plan, judged, health = judge(step, taken.error, order, a.judged)
+    if error is None:
+        raise refusal(
+            "solver",
+            "one that estimates errors, as steps are adaptive (diffrax.HalfSolver lets "
+            "any do so)",
+            stepping.method,
+        )
+    plan, judged, health = judge(step, error, order, a.judged)
     of_landing, resumes = None, jnp.array(False)
     if landing is not None:
         plan, resumes, of_landing = landing.after(
@@ -288,7 +303,7 @@ def _planned(
     if a.wrappers is not None:
         around = _around((*plan[:4], (), result), controller)
         *answer, wrappers, result = around.adapt_step_size(
-            *step, taken.error, order, a.wrappers
+            *step, error, order, a.wrappers
         )
         plan = NextStep(*answer, result)  # pyright: ignore[reportCallIssue]
     return plan._replace(result=result), judged, wrappers, of_landing
@@ -296,7 +311,7 @@ def _planned(
 
 def _around(answer: tuple, controller: Controller) -> Controller:
     """Returns a controller in which the one that judges errors gives an answer."""
-    return with_error_control(lambda _: _Planned(answer), controller.wrap(1))
+    return with_error_control(lambda _: _Answering(answer), controller.wrap(1))
 
 
 def _saved(

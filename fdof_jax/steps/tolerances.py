@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_origin
 
 import diffrax
 import equinox as eqx
@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from ..base.checks import concrete, is_traced, real_numbers, refusal
 from ..base.user_warnings import warn
-from .dopri8 import constant
+from .dopri8 import ScheduledTerm, constant
 
 Controller = diffrax.AbstractStepSizeController
 ErrorControl = diffrax.AbstractAdaptiveStepSizeController
@@ -64,6 +64,15 @@ def error_control_of(controller: Controller) -> ErrorControl:
     """Returns the controller that judges errors: itself, or one within it."""
     nodes = jax.tree.leaves(controller, is_leaf=_controls_errors)
     return next(filter(_controls_errors, nodes))
+
+
+def check_method(method: diffrax.AbstractSolver) -> None:
+    """Raises ValueError for a method of other equations, such as stochastic ones."""
+    structure = method.term_structure
+    kind = get_origin(structure) or structure
+    if not (isinstance(kind, type) and issubclass(ScheduledTerm, kind)):
+        expected = "one of ordinary differential equations (diffrax.ODETerm)"
+        raise refusal("solver", expected, method)
 
 
 def with_tolerances(

@@ -95,7 +95,7 @@ class _Step(NamedTuple):
 @eqx.filter_jit  # traced once, not at each use in a solve
 def _step(term, t0, t1, y0, residue, args, f0) -> tuple[_Step, dict[str, PyTree]]:
     h = t1 - t0
-    times = t0 + (t1 - t0) * jnp.asarray(SCHEDULE_SHARES, t0.dtype)
+    times = t0 + h * jnp.asarray(SCHEDULE_SHARES, t0.dtype)
     # XLA makes vectors of the lanes, not of all stages of each, only in a loop.
     schedule = jax.lax.map(lambda t: entries_in_one_loop(term.schedule(t, args)), times)
     scheduled = lambda stage: jax.tree.map(lambda leaf: leaf[stage], schedule)
@@ -106,7 +106,7 @@ def _step(term, t0, t1, y0, residue, args, f0) -> tuple[_Step, dict[str, PyTree]
         rates.append(field(times[stage], y, args, scheduled(stage)))
     y, residue = compensated(y0, _moved(residue, h, weighted(LOWER[-1])))
     error = jax.tree.map(lambda k: h * k, weighted(TABLEAU.b_error))
-    # diffrax overlooks an infinity beside a NaN and finds no next step size.
+    # diffrax's controllers overlook an infinity beside a NaN.
     poison = 0 * sum(jax.tree.leaves(y))
     y = jax.tree.map(lambda a: a + poison, y)
     y, error, residue = in_one_loop((y, error, residue))
