@@ -152,8 +152,8 @@ def acts(linkage, forces, t, q, qd, grown):
     args = Args(linkage, q, None, forces)
     own = jnp.stack(initial_own(args))
     y = zeros(q), tuple(qd), tuple(own + grown * jnp.cos(jnp.arange(own.size)))
-    *found, _ = applied(t, y, args, schedule_of(t, args))
-    leaves = jax.tree.leaves((found, own))
+    found = applied(t, y, args, schedule_of(t, args))
+    leaves = jax.tree.leaves((found.tau, found.own_rates, found.added, own))
     return jnp.concatenate([jnp.ravel(leaf) for leaf in leaves])
 
 

@@ -1,5 +1,6 @@
 """Chunks of a sweep, the devices that solve them, and the programs compiled."""
 
+import dataclasses
 import functools
 import os
 import socket
@@ -22,7 +23,6 @@ from fdof_jax.base import configuration
 from fdof_jax.batches import chunks, devices
 from fdof_jax.batches.batch_axes import batch_of
 from fdof_jax.simulation import formulation
-from fdof_jax.steps.dopri8 import ScheduledTerm
 
 LANES = 64  # enough for a slow member to be stopped
 PENDULUM = fj.Linkage("R", length=[0, 1], com=[[0.5, 0]], mass=[1], inertia=[0.1])
@@ -276,14 +276,14 @@ def test_progress_rises_to_one(mixed):
 
 def test_other_values_need_no_new_trace(batch, clean, monkeypatch):
     calls = []
-    field, *others = vars(formulation.DRIVEN.term).values()
+    free = formulation._TERMS[False, False]
 
     def counted(*arguments):
         calls.append(1)
-        return field(*arguments)
+        return free.vector_field(*arguments)
 
-    term = ScheduledTerm(counted, *others)
-    monkeypatch.setattr(formulation, "DRIVEN", formulation.DRIVEN._replace(term=term))
+    term = dataclasses.replace(free, vector_field=counted)
+    monkeypatch.setitem(formulation._TERMS, (False, False), term)
     linkage, (q, qd), forces = batch
     other = run((linkage, fj.State(q + 0.1, qd), forces))
     assert not calls

@@ -103,6 +103,7 @@ class Judge(eqx.Module):
         health = diffrax.RESULTS.successful
         if self.watches:
             step, error, health = self._healthy(step, error)
+        error = error._replace(error=without_nan(error.error))
         # Would derivatives be less accurate than the tolerance?
         ratio = None
         if self.derivatives is not None:
@@ -151,6 +152,15 @@ class Judge(eqx.Module):
         estimate, failure = verdict(Estimate(error, health), t1 - t0)
         # The error is scaled by the state, which must be finite for that.
         return step._replace(y1=chosen(bad, y0, y1)), estimate, failure
+
+
+def without_nan(error: PyTree) -> PyTree:
+    """Returns an error with infinity for what is not a number.
+
+    A step may be so long that stages overflow, though its end is finite; diffrax's
+    controllers would find no next length.
+    """
+    return jax.tree.map(lambda e: jnp.where(jnp.isnan(e), jnp.inf, e), error)
 
 
 def _above_rounding(

@@ -17,7 +17,7 @@ from jaxtyping import PyTree
 from ..base.checks import refusal
 from .dopri8 import Arguments, Integrated, ScheduledTerm, chosen, constant
 from .events import Begun, Events, Switches
-from .judge import Judge, Step
+from .judge import Judge, Step, without_nan
 from .landing import NEAR_END, Found, Landing, NextStep
 from .tolerances import Controller, Shortening, with_error_control
 
@@ -278,7 +278,7 @@ def _planned(
     # Tolerances are those of the state before what happens where the step begins.
     step, error = Step(a.t, a.end, a.y, taken.y1, taken.args), taken.error
     if judge is None:
-        error = jax.tree.map(lambda e: jnp.where(jnp.isnan(e), jnp.inf, e), error)
+        error = without_nan(error)
         *plan, judged, result = controller.wrap(1).adapt_step_size(
             *step, error, order, a.judged
         )
