@@ -192,7 +192,7 @@ def test_motions_traced_in_threads_leave_checks_on():
             decay(size, max_steps=3)
 
     with ThreadPoolExecutor(2) as threads:
-        traced = [threads.submit(motion, count) for count in range(20, 26)]
+        traced = [threads.submit(motion, count) for count in range(20, 44)]
         sizes = itertools.count(3)
         while not all(one.done() for one in traced):
             stopped(next(sizes))

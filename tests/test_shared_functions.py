@@ -328,7 +328,7 @@ def test_the_last_allowed_step_may_reach_the_end(steps):
 
 @pytest.mark.slow
 def test_sweeps_in_a_loop_share_a_program(traces):
-    counted, starts = traces(chunks, "simulate"), []
+    counted, starts = traces(chunks, "solve_motion"), []
     for k in (1.0, 4.0):
         states = fj.State(np.stack([TILTED.q, TILTED.q + 0.1]), TILTED.qd)
         ends = fj.sweep(

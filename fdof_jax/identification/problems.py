@@ -24,7 +24,9 @@ Bounds = Mapping[str, Sequence[ArrayLike]]  # (least, greatest) by name
 SceneAt = Callable[[dict[str, Array]], Scene]
 Observe = Callable[[Scene, Solution], Array]
 
-_TOLERANCE = 1e-7  # of the derivatives
+# Of the steps. A short motion tells little of a parameter: an error of 1e-7 in it may
+# be one of 1e-5 in the parameter.
+_TOLERANCE = 1e-9
 
 
 class Unknowns(NamedTuple):
