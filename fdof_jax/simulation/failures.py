@@ -24,6 +24,7 @@ from .field import (
     with_states,
 )
 from .formulation import start_of, term_of
+from .holding import changes
 from .integrate import Inputs, Settings, last_switched
 from .solution import OUTCOMES, Solution
 from .solve import solve
@@ -108,7 +109,9 @@ def _of_switches(inputs: Inputs, keywords: Settings) -> str:
             f"forces[{k}] ({kind}) chatters there: two branches of its effort{place} "
             f"push towards each other; {helps}."
         )
-    return "Joints are held and let go there without end."
+    holds = changes(forces)
+    what = "Joints are held and let go" if holds else "Elements switch"
+    return f"{what} there without end."
 
 
 def _of_steps(inputs: Inputs, keywords, solution: Solution) -> str:
