@@ -138,6 +138,7 @@ def test_what_chatters_is_named_with_its_joint(forces, words):
     assert words in found
 
 
+@pytest.mark.slow
 def test_an_arm_that_is_singular_under_task_space_control_is_named():
     arm, target = fj.scenes.double_pendulum().linkage, np.array([1.2, 0.5])
 

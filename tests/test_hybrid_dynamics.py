@@ -270,6 +270,7 @@ def on_table(*forces, reference, joints=1, qd=(0.0, 0.0), ts=(0.0, 1.0, 2.0), **
     return fj.simulate(TABLE, start, np.array(ts), (moving, *forces), **more)
 
 
+@pytest.mark.slow
 def test_friction_takes_a_load_along_or_lets_it_slip():
     friction = fj.forces.JointFriction([0.0, 3.0])
     for acceleration, slip in ((1.49, 0.0), (1.6, -0.1)):  # it holds 1.5 m/s^2

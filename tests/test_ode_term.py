@@ -53,6 +53,7 @@ def test_diffrax_moves_each_element_as_simulate_does(name):
     np.testing.assert_allclose(qd, motion.qd[-1], atol=1e-7)
 
 
+@pytest.mark.slow
 def test_an_event_of_diffrax_ends_a_motion():
     """A uniform bar falls from level at rest: at the bottom its rate is known."""
     bar = fj.Linkage("R", length=[0, 1], com=[[0.5, 0]], mass=[1], inertia=[1 / 12])
@@ -69,6 +70,7 @@ def test_an_event_of_diffrax_ends_a_motion():
     np.testing.assert_allclose(fall.ys[1][-1], [-np.sqrt(3 * 9.81)], rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_white_torque_has_the_stationary_variance_of_a_damped_bar():
     """It is sigma^2 / (2 d k) of a bar with torsional spring k and damping d."""
     inertia, stiffness, damping, sigma = 1 / 3, 2.0, 0.8, 0.3
