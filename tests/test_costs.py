@@ -16,7 +16,8 @@ from fdof_jax import scenes
 from fdof_jax.base.checks import is_traced
 from fdof_jax.mechanics.equations import link_constants, zeros
 from fdof_jax.mechanics.rates import rates
-from fdof_jax.simulation.field import Args, _packed, schedule_of, vector_field
+from fdof_jax.simulation.arrays import _packed
+from fdof_jax.simulation.field import Args, schedule_of, vector_field
 
 
 def cost(kind, function, *arguments):

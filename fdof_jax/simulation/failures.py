@@ -11,7 +11,7 @@ from jax import Array
 from jaxtyping import PyTree
 
 from ..forces.element import Element, ForeignElement, OwnStates
-from ..forces.holders import JointFriction
+from ..forces.holders import JointFriction, holders
 from ..linkage.linkage import Linkage, joint_names, moving_joints
 from ..mechanics.kinematics import tip_jacobian
 from ..steps.derivative_control import linearised
@@ -24,7 +24,6 @@ from .field import (
     with_states,
 )
 from .formulation import start_of, term_of
-from .holding import changes
 from .integrate import Inputs, Settings, last_switched
 from .solution import OUTCOMES, Solution
 from .solve import solve
@@ -109,8 +108,7 @@ def _of_switches(inputs: Inputs, keywords: Settings) -> str:
             f"forces[{k}] ({kind}) chatters there: two branches of its effort{place} "
             f"push towards each other; {helps}."
         )
-    holds = changes(forces)
-    what = "Joints are held and let go" if holds else "Elements switch"
+    what = "Joints are held and let go" if holders(forces) else "Elements switch"
     return f"{what} there without end."
 
 

@@ -55,7 +55,7 @@ def start_of(args: Args, qd: Array, own: Scalars) -> Integrated:
     return whole(zeros(args.q0), tuple(qd), own)
 
 
-def joints_of(args: Args, t: Array, y: Integrated) -> tuple[Array, Array]:
+def joints_at(args: Args, t: Array, y: Integrated) -> tuple[Array, Array]:
     """Returns joint positions and velocities at an integrated state."""
     q, qd = args.q0 + jnp.stack(y[0]), jnp.stack(y[1])
     if (motion := prescribed(args.forces)) is None:

@@ -25,9 +25,10 @@ from ..steps.judge import Judge, Judged
 from ..steps.landing import Landing, clearance
 from ..steps.looped_dopri8 import LoopedDopri8
 from ..steps.tolerances import default_controller, error_control_of, with_tolerances
+from .arrays import in_arrays
 from .events import in_order
-from .field import args_of, in_arrays, initial_own, own_states
-from .formulation import clocks_apart, joints_of, known_times, start_of, term_of
+from .field import args_of, initial_own, own_states
+from .formulation import clocks_apart, joints_at, known_times, start_of, term_of
 from .holding import changes, leaves_prescribed, taken_at, within_stops
 from .prescribed import agrees
 from .solution import Solution
@@ -112,7 +113,7 @@ def _prepare(
     term, start = term_of(forces), start_of(args, qd0, own)
 
     def joints(t, y):
-        return *joints_of(args, t, y), own_states(args, y)
+        return *joints_at(args, t, y), own_states(args, y)
 
     begin = start if term.settle is None else term.settle(ts[0], start, args)
     q, qd, _ = joints(ts[0], begin)  # after a blow there, like all that follows
