@@ -68,7 +68,7 @@ class Args(NamedTuple):
 
     @property
     def moved(self) -> Array | None:
-        """Whether each joint's motion is prescribed, None if none is."""
+        """The joints whose motion is prescribed, as flags (n,); None if there are none."""
         motion = prescribed(self.forces)
         return None if motion is None else motion.prescribes(self.linkage)
 
