@@ -68,7 +68,7 @@ class Args(NamedTuple):
 
     @property
     def moved(self) -> Array | None:
-        """The joints whose motion is prescribed, as flags (n,); None if there are none."""
+        """Flags (n,) of the joints whose motion is prescribed; None without any."""
         motion = prescribed(self.forces)
         return None if motion is None else motion.prescribes(self.linkage)
 
