@@ -36,6 +36,7 @@ AT_ONCE, BRIEF = "tests/test_events_at_once.py", "tests/test_brief_switches.py"
 SWITCHES, HOLDING = "tests/test_switches.py", "tests/test_holding.py"
 HYBRID = "tests/test_hybrid_dynamics.py"
 KINKS = f"{SWITCHES}::test_kinks_of_high_gains_are_exact_in_derivatives"
+SAMPLED = "tests/test_sampled_control.py"
 BOUNCES = f"{HOLDING}::test_a_mass_bounces_to_rest_at_a_known_time"
 
 MUTANTS = {
@@ -229,6 +230,25 @@ MUTANTS = {
         "most = jnp.where(law.braked, jnp.inf, law.static)",
         "most = jnp.where(law.braked, jnp.inf, law.level)",
         f"{HOLDING}::test_static_friction_holds_what_has_come_to_rest_only",
+    ),
+    # Controllers on a clock
+    "modes after efforts of before": Mutant(
+        "steps/loop.py",
+        "    args = args._replace(sampled=a.sampled)\n",
+        "",
+        f"{SAMPLED}::test_joints_are_held_between_samples",
+    ),
+    "samples before arrivals": Mutant(
+        "simulation/sampled.py",
+        "acting = *forces, *arrivals, sampler",
+        "acting = *arrivals, *forces, sampler",
+        f"{SAMPLED}::test_delayed_feedback_follows_its_transition_matrix",
+    ),
+    "no command under way is late": Mutant(
+        "simulation/sampling.py",
+        "acting = under_way[(k - self.late) % len(under_way)]",
+        "acting = tau",
+        f"{SAMPLED}::test_efforts_are_held_and_come_late",
     ),
 }
 

@@ -50,7 +50,8 @@ def test_efforts_are_held_and_come_late(delay):
     late = np.concatenate([np.zeros(whole + 1), commanded, commanded[-1:]])
     before, after = late[:5], late[1:6]  # what acts first and last in each period
     gained = ((10 - part) * after + part * before) / 200
-    np.testing.assert_allclose(motion.qd[1:, 0], np.cumsum(gained), rtol=1e-7)
+    gains = np.cumsum(gained)
+    np.testing.assert_allclose(motion.qd[1:, 0], gains, rtol=1e-7, atol=1e-15)
     acting = late[:6] if part else late[1:7]  # at the end the last command acts
     efforts = fj.joint_efforts(DISC, (ramp,), motion).elements[0]
     np.testing.assert_allclose(efforts[:, 0], acting, rtol=1e-12)
@@ -222,7 +223,7 @@ def test_a_failure_is_named():
     broken = lambda t, q, qd, linkage: jnp.where(t > 0.15, jnp.nan, 0.0) * q
     motion = fj.simulate_sampled(RODS, BENT, broken, 0.1, 4)
     assert motion.result == diffrax.RESULTS.nonfinite
-    assert np.isfinite(motion.q[:3]).all() and np.isnan(motion.q[3:]).all()
+    assert np.isfinite(motion.q[:2]).all() and np.isnan(motion.q[2:]).all()
 
 
 LAG = fj.control.FirstOrderLag(fj.JointEffort(np.ones(2)), 0.1)
@@ -247,3 +248,65 @@ def test_malformed_arguments_are_refused(name):
         call, right = fj.step, dict(linkage=RODS, state=BENT, tau=np.zeros(2), dt=0.1)
     with pytest.raises(ValueError, match=f"^{name}"):
         call(**right | values)
+
+
+LIMITS = fj.forces.HardStops([-0.6, 0.28], [-0.42, 0.5], restitution=0.5)
+RUBS = fj.forces.JointFriction(0.5, 0.8)
+
+
+def _end(parts):
+    """Returns the last state, an effort, a position at its change, energy taken."""
+    q0, gain, level, period, delay = parts
+    start = fj.State(BENT.q + q0 * np.array([1, 0]), BENT.qd)
+    forces = RUBS.replace(level=level, static=level + 0.3), LIMITS
+    control = CONTROL.replace(kp=gain * CONTROL.kp)
+    motion = fj.simulate_sampled(
+        RODS, start, control, period, 24, forces, delay=delay,
+        adjoint=diffrax.ForwardMode(),
+    )  # fmt: skip
+    last = motion.q[-1], motion.qd[-1], motion.tau[20], motion.q_begin[20]
+    return jnp.concatenate([*last, motion.taken[-1:], motion.events.t[:2]])
+
+
+@pytest.mark.slow
+def test_joints_are_held_between_samples():
+    """Stops, friction, samples and arrivals in one motion, with all derivatives."""
+    parts = jnp.array([0.0, 1.0, 0.5, 0.02, 0.007])
+    end, slopes = jax.jit(lambda x: (_end(x), jax.jacfwd(_end)(x)), **LOOPS)(parts)
+    plain = jax.jit(_end, **LOOPS)
+    np.testing.assert_allclose(plain(parts), end, atol=1e-9)
+    steps = np.array([1e-6, 1e-6, 1e-6, 1e-7, 1e-7])
+    changes = [plain(parts + h) - plain(parts - h) for h in np.diag(steps)]
+    errors = np.abs(slopes - np.transpose(changes) / (2 * steps)).max(axis=0)
+    assert (errors < 1e-6 * np.abs(slopes).max(axis=0)).all()
+
+
+@pytest.mark.slow
+def test_commands_have_gradients():
+    """In reverse mode, through few numbers and through many."""
+
+    def commanded(kp, many):
+        control = CONTROL.replace(kp=kp * CONTROL.kp)
+        others = (fj.JointEffort(many[0]), fj.JointDamper(many[1]))
+        motion = fj.simulate_sampled(
+            RODS, BENT, control, 0.02, 8, others, delay=0.013, **STEPS
+        )
+        return jnp.sum(motion.tau[5] + motion.acting[6] + motion.q_begin[7])
+
+    many = jnp.full((2, 2), 0.1)
+    value = jax.jit(commanded, **LOOPS)
+    slope = jax.jit(jax.grad(commanded), **LOOPS)(1.0, many)
+    difference = (value(1 + 1e-5, many) - value(1 - 1e-5, many)) / 2e-5
+    np.testing.assert_allclose(slope, difference, rtol=1e-7)
+    adjoint = dict(adjoint=diffrax.RecursiveCheckpointAdjoint(checkpoints=16))
+
+    def end(kp):
+        control = CONTROL.replace(kp=kp * CONTROL.kp)
+        options = dict(delay=0.013, **STEPS, **adjoint)
+        motion = fj.simulate_sampled(RODS, BENT, control, 0.02, 8, **options)
+        return jnp.sum(motion.tau[5] + motion.q_begin[7])
+
+    slope = jax.jit(jax.grad(end), **LOOPS)(1.0)
+    value = jax.jit(end, **LOOPS)
+    difference = (value(1 + 1e-5) - value(1 - 1e-5)) / 2e-5
+    np.testing.assert_allclose(slope, difference, rtol=1e-7)

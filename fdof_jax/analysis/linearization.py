@@ -32,9 +32,8 @@ from ..linkage.topology import fixed_pairs
 from ..references.reference import Reference, reference_motion
 from ..simulation.field import has_states, total_effort
 from ..simulation.prescribed import prescribed
-from ..simulation.sampled import check_joints
 from ..simulation.scene import accepts_scene
-from ..simulation.solution import Solution
+from ..simulation.solution import Solution, check_joints
 
 # Explicit Runge-Kutta methods of order 4 in 4 stages damp every damped mode if the step
 # size times |eigenvalue| is below this (2.8 for undamped and overdamped modes).

@@ -27,10 +27,10 @@ from ..linkage.linkage import (
 from ..mechanics.kinematics import tip_position
 from ..references.reference import reference_motion
 from ..references.task import TipReference
+from ..simulation.efforts import acting_in
 from ..simulation.field import element_effort, with_states
-from ..simulation.sampled import acting_in, check_joints
 from ..simulation.simulate import check_own
-from ..simulation.solution import Solution
+from ..simulation.solution import Solution, check_joints
 
 BAND = 0.02  # around the final value, in which a response has settled
 SETTLED = 0.9  # part of the duration before which it has to

@@ -13,8 +13,7 @@ from ..forces.element import Forces, elements
 from ..linkage.frames import cross, frames, plane_vectors
 from ..linkage.linkage import Linkage, check_linkage, compiled
 from ..mechanics.kinematics import joint_positions, mass_center_velocities, mass_centers
-from ..simulation.efforts import joint_efforts
-from ..simulation.sampled import acting_in
+from ..simulation.efforts import acting_in, joint_efforts
 from ..simulation.scene import accepts_scene
 from ..simulation.solution import Solution
 

@@ -8,8 +8,7 @@ from numpy.typing import ArrayLike
 from ..base.checks import check_known, instance, optional_package
 from ..linkage.linkage import Linkage
 from ..linkage.topology import common_unit, names_and_units, rate_unit
-from ..simulation.sampled import check_joints
-from ..simulation.solution import MODES, Solution, attributes_in
+from ..simulation.solution import MODES, Solution, attributes_in, check_joints
 
 if TYPE_CHECKING:
     import pandas

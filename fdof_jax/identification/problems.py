@@ -15,9 +15,8 @@ from ..base.checks import function, instance, real_array, refusal, shown
 from ..mechanics.kinematics import joint_positions, tip_position
 from ..search import Evaluation, check_scene, sum_of_squares
 from ..simulation.jacobian import jacobian_of
-from ..simulation.sampled import check_joints
 from ..simulation.scene import Scene, stacked
-from ..simulation.solution import Solution
+from ..simulation.solution import Solution, check_joints
 
 Named = dict[str, Any]  # parameters by name, as numbers or arrays
 Bounds = Mapping[str, Sequence[ArrayLike]]  # (least, greatest) by name

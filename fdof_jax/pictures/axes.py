@@ -11,8 +11,7 @@ from matplotlib.figure import Figure
 
 from ..base.checks import refusal
 from ..linkage.linkage import Linkage, check_linkage
-from ..simulation.sampled import check_joints
-from ..simulation.solution import Solution
+from ..simulation.solution import Solution, check_joints
 
 Keywords = dict[str, Any]  # of functions of matplotlib
 # Okabe and Ito's colours, distinct under the common kinds of colour blindness.

@@ -15,8 +15,7 @@ from ..forces.element import Forces, InertialElement, elements
 from ..forces.holders import Holder
 from ..forces.payload import Payload
 from ..linkage.linkage import Linkage
-from ..simulation.efforts import joint_efforts
-from ..simulation.sampled import acting_in
+from ..simulation.efforts import acting_in, joint_efforts
 from ..simulation.solution import Solution
 from .axes import reached
 

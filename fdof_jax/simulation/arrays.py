@@ -83,4 +83,5 @@ def _of_arrays(term: ScheduledTerm) -> ScheduledTerm:
         term.unknown_modes,
         term.resolve and first_in_arrays(term.resolve),  # of an event, not a time
         term.settle and in_arrays_too(term.settle),
+        term.sample and of_scalars(term.sample),
     )

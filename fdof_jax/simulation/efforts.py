@@ -9,17 +9,16 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
-from ..base.checks import is_traced, place_of
+from ..base.checks import is_traced, place_of, refusal
 from ..base.functions import sharing_functions
-from ..forces.element import Element, Forces, elements_on
+from ..forces.element import Element, Forces, ScalarElement, elements_on
 from ..linkage.linkage import Linkage, check_linkage, without_fixed
 from .field import element_effort, with_states
 from .holding import changes, efforts_of_holders
 from .prescribed import prescribed, prescribed_effort
-from .sampled import acting_in, check_joints
 from .scene import accepts_scene
 from .simulate import check_own
-from .solution import Solution
+from .solution import Solution, check_joints
 from .solve import cut, padded
 
 
@@ -33,6 +32,32 @@ class Efforts(NamedTuple):
 
     total: Float[Array, "time joint"]
     elements: Float[Array, "element time joint"]
+
+
+class _Held(ScalarElement):
+    """Efforts of a motion under sampled control: each holds until the next one."""
+
+    begin: Float[Array, " sample"]
+    tau: Float[Array, "sample joint"]
+
+    def schedule(self, t, linkage):
+        count = jnp.searchsorted(self.begin, t, side="right", method="scan_unrolled")
+        return tuple(jnp.where(count > 0, self.tau[count - 1], 0))
+
+    def respond(self, scheduled, q, qd, linkage):
+        return scheduled
+
+
+def acting_in(motion: Solution, forces: tuple[Element, ...]) -> tuple[Element, ...]:
+    """Returns the elements that acted: held efforts in the place of a sampled control.
+
+    Raises ValueError if a motion under sampled control comes without its control.
+    """
+    if motion.acting is None:
+        return forces
+    if not forces:
+        raise refusal("forces", "(control, *forces) of a sampled motion", forces)
+    return _Held(motion.ts, motion.acting), *forces[1:]
 
 
 @accepts_scene

@@ -39,6 +39,7 @@ from ..mechanics.rates import conditioning, rates, rates_and_conditioning
 from ..mechanics.solve import divided, minus, solver_of, times, with_added
 from ..steps.dopri8 import Health, Integrated, health_if
 from .prescribed import prescribed
+from .sampling import Sampler, unsampled
 
 Schedules = tuple[PyTree, ...]  # of all elements, which depend on time alone
 
@@ -55,6 +56,7 @@ class Args(NamedTuple):
     sides: Array | None = None  # (switch,) in force, where switches are located
     ahead: Array | None = None  # (element,) by which its clock is ahead, if any [s]
     modes: PyTree = None  # those of the joints, where elements hold some (see `Modes`)
+    sampled: PyTree = None  # what a controller has sampled, if any (see `Sampled`)
 
     def clock(self, index: int, t: Array) -> Array:
         """Returns the time by an element's clock (see `clocks_apart`)."""
@@ -89,7 +91,7 @@ class Args(NamedTuple):
 def args_of(linkage: Linkage, q0: Array, forces: tuple[Element, ...]) -> Args:
     # XLA's own sine and cosine, once per solve, as start angles may be large.
     constants = link_constants(linkage, q0, lambda x: (jnp.sin(x), jnp.cos(x)))
-    return Args(linkage, q0, constants, forces)
+    return Args(linkage, q0, constants, forces, sampled=unsampled(forces, linkage))
 
 
 def schedule_of(t: Array, args: Args) -> Schedules:
@@ -199,6 +201,8 @@ def efforts(
         if isinstance(element, Holder) and element.holds:
             sliding = qd if args.modes is None else tuple(args.modes.direction)
             effort = element.respond(scheduled, delta, sliding, args.linkage)
+        elif isinstance(element, Sampler):
+            effort = tuple(args.sampled.acting)
         elif isinstance(element, ScalarElement):
             q = tuple(a + b for a, b in zip(args.q0, delta))
             with switches.dealt():

@@ -1,15 +1,16 @@
 """The formulation of a motion: equations, start, reading of states, known times."""
 
 import dataclasses
+import functools
 
 import jax.numpy as jnp
 from jax import Array
 
 from ..forces.element import Forces
-from ..linkage.fields import jumps_at
+from ..linkage.fields import Truth, jumps_at
 from ..mechanics.equations import Scalars, zeros
 from ..steps.dopri8 import Integrated, ScheduledTerm
-from ..steps.landing import clearance
+from ..steps.landing import Clock, clearance
 from .events import resolve
 from .field import (
     Args,
@@ -23,6 +24,7 @@ from .field import (
 )
 from .holding import changes, guarded_switching, unknown_modes
 from .prescribed import prescribed
+from .sampling import Recurring, Sampled, after_samples, sampler_of
 
 # By which a clock is ahead of the one before, in units of `clearance`: beyond the
 # distances that steps keep from each time.
@@ -34,20 +36,30 @@ _HOLDING = ScheduledTerm(
     vector_field, schedule_of, health_of, watched_field,
     guarded_switching, unknown_modes, resolve,
 )  # fmt: skip
-# Terms are made once, so that their functions are traced once.
-_TERMS = {
-    (holds, follows): dataclasses.replace(
-        _HOLDING if holds else _DRIVEN,
-        settle=with_prescribed_rates if follows else None,
-    )
-    for holds in (False, True)
-    for follows in (False, True)
-}
 
 
 def term_of(forces: Forces) -> ScheduledTerm:
     """Returns the equations of a motion."""
-    return _TERMS[changes(forces), prescribed(forces) is not None]
+    follows, samples = prescribed(forces) is not None, sampler_of(forces) is not None
+    return _term(changes(forces), follows, samples)
+
+
+@functools.cache  # so that the functions of a term are traced once
+def _term(holds: bool, follows: bool, samples: bool) -> ScheduledTerm:
+    return dataclasses.replace(
+        _HOLDING if holds else _DRIVEN,
+        settle=with_prescribed_rates if follows else None,
+        sample=_after_samples if samples else None,
+    )
+
+
+def _after_samples(t: Array, y: Integrated, args: Args) -> tuple[Sampled, Truth]:
+    """Returns `Args.sampled` where a step begins, and whether it changed there."""
+    sampler, last = sampler_of(args.forces), len(args.forces) - 1
+    assert sampler is not None
+    clocks = args.clock(last - 1, t), args.clock(last, t)
+    at = *joints_at(args, t, y), args.linkage
+    return after_samples(sampler, clocks, *at, args.sampled)
 
 
 def start_of(args: Args, qd: Array, own: Scalars) -> Integrated:
@@ -77,7 +89,7 @@ def clocks_apart(args: Args, ts: Array) -> Args:
     places = sorted(
         (element is not motion, place)
         for place, element in enumerate(args.forces)
-        if element.jump_ts is not None
+        if isinstance(element, Recurring) or element.jump_ts is not None
     )
     if len(places) < 2:
         return args
@@ -97,9 +109,17 @@ def clear_of_start(forces: Forces, ts: Array) -> Array:
     return (1 + _AHEAD * timed) * clearance(ts)
 
 
-def known_times(args: Args) -> Array | None:
-    """Returns the times [s] at which elements jump by their clocks, or None."""
-    times = [jumps_at(f"forces[{k}]", e) for k, e in enumerate(args.forces)]
-    ahead = [0] * len(times) if args.ahead is None else args.ahead
-    times = [t - by for t, by in zip(times, ahead) if t is not None]
-    return jnp.concatenate(times) if times else None
+def known_times(args: Args) -> tuple[Array | None, tuple[Clock, ...]]:
+    """Returns the times [s] at which elements jump by their clocks, and these clocks.
+
+    The times are None if there are none.
+    """
+    times, clocks = [], []
+    for index, element in enumerate(args.forces):
+        ahead = 0 if args.ahead is None else args.ahead[index]
+        if isinstance(element, Recurring):
+            clock = element.clock
+            clocks.append(clock._replace(first=clock.first - ahead))
+        elif (jumps := jumps_at(f"forces[{index}]", element)) is not None:
+            times.append(jumps - ahead)
+    return jnp.concatenate(times) if times else None, tuple(clocks)

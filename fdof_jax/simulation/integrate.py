@@ -22,7 +22,7 @@ from ..steps.derivative_control import OfLinearised, OfTangents
 from ..steps.dopri8 import Integrated, ScheduledDopri8, constant
 from ..steps.events import events_of
 from ..steps.judge import Judge, Judged
-from ..steps.landing import Landing, clearance
+from ..steps.landing import Clock, Landing, clearance
 from ..steps.looped_dopri8 import LoopedDopri8
 from ..steps.tolerances import default_controller, error_control_of, with_tolerances
 from .arrays import in_arrays
@@ -31,6 +31,7 @@ from .field import args_of, initial_own, own_states
 from .formulation import clocks_apart, joints_at, known_times, start_of, term_of
 from .holding import changes, leaves_prescribed, taken_at, within_stops
 from .prescribed import agrees
+from .sampling import sampler_of
 from .solution import Solution
 
 RESULTS: Any = diffrax.RESULTS
@@ -58,7 +59,8 @@ class _Motion(NamedTuple):
 
     - `valid`: whether the inputs were; others have stand-ins here.
     - `first`: positions and velocities at the first time.
-    - `problem`: the equations and their start; `jumps`: known times at which they jump.
+    - `problem`: the equations and their start; `jumps`, `clocks`: known times at which
+      they jump.
     - `joints(t, y)`: reads positions, velocities and the elements' own states.
     """
 
@@ -66,6 +68,7 @@ class _Motion(NamedTuple):
     first: tuple[Array, Array]
     problem: loop.Problem
     jumps: Array | None
+    clocks: tuple[Clock, ...]
     joints: Callable[[Array, Integrated], tuple[Array, Array, OwnStates]]
 
 
@@ -117,13 +120,13 @@ def _prepare(
 
     begin = start if term.settle is None else term.settle(ts[0], start, args)
     q, qd, _ = joints(ts[0], begin)  # after a blow there, like all that follows
-    jumps = known_times(args)
+    known = known_times(args)
     of_problem = term, start, args
     # Loops of few motions compile and run faster in arrays.
     if plain and not derivatives or searching:
         of_problem = in_arrays(*of_problem)
     problem = loop.Problem(*of_problem, ts)
-    return _Motion(valid & finite, (q, qd), problem, jumps, joints)
+    return _Motion(valid & finite, (q, qd), problem, *known, joints)
 
 
 def _stepping(
@@ -135,22 +138,23 @@ def _stepping(
     method = _differentiable(keywords["solver"] or LoopedDopri8(), keywords["adjoint"])
     method = with_tolerances(method, controller)
     judge = events = landing = None
+    term, start, args, ts = motion.problem
     if isinstance(controller, diffrax.AbstractAdaptiveStepSizeController):
-        term, start, args, ts = motion.problem
         own_tolerance = given is not None
         of_derivatives = tangents
         if derivatives and not tangents:
-            of_derivatives = _probe(motion.problem.term, method, own_tolerance)
+            of_derivatives = _probe(term, method, own_tolerance)
         watches = not isinstance(method, ScheduledDopri8)  # which finds it itself
         control = error_control_of(controller)
         judge = Judge(control, term, watches, of_derivatives)
         events = events_of(term, ts, start, args, derivatives)
-        if events is not None or motion.jumps is not None:
-            jumps = motion.jumps
-            jumps = None if jumps is None else jnp.asarray(jumps, ts.dtype)
-            landing = Landing(jumps, clearance(ts), events is not None)
+        lands = events is not None or motion.jumps is not None
     else:
-        _check_constant_steps(motion.problem.args.forces, controller)
+        lands = False
+        _check_constant_steps(args.forces, controller)
+    if lands or motion.clocks:
+        jumps = None if motion.jumps is None else jnp.asarray(motion.jumps, ts.dtype)
+        landing = Landing(jumps, motion.clocks, clearance(ts), events is not None)
     return loop.Stepping(
         method=method,
         controller=controller,
@@ -190,6 +194,8 @@ def _check_constant_steps(forces: tuple[Element, ...], controller: object) -> No
         why = "declare times at which they jump (jump_ts)"
     elif changes(forces):
         why = "hold joints or take payloads"
+    elif sampler_of(forces) and not isinstance(controller, diffrax.ConstantStepSize):
+        why = "are sampled (or a ConstantStepSize)"
     if why is not None:
         expected = f"an adaptive one, as forces {why}"
         raise refusal("stepsize_controller", expected, controller)
@@ -201,7 +207,7 @@ def _read(
     """Reads joint states, statistics and the result."""
     linkage, state0, times, *_ = inputs
     valid, ts = motion.valid, motion.problem.ts
-    states, modes = end.rows
+    states, modes, sampled = end.rows
     q, qd, own = jax.vmap(motion.joints)(ts, states)
 
     def shown_at(a):
@@ -246,7 +252,11 @@ def _read(
         events = in_order(end.switches.modes.events, valid)
         holding = shown_at(modes.mode), shown_at(taken), events
     own = jax.tree.map(shown_at, own)
-    return Solution(times, q, qd, stats, result, own, *holding)
+    of_samples = {}  # commands, and positions where they begin to act
+    if sampled is not None:
+        command, q_begin = jax.tree.map(shown_at, (sampled.command, sampled.q_begin))
+        of_samples = dict(tau=command, q_begin=q_begin)
+    return Solution(times, q, qd, stats, result, own, *holding, **of_samples)
 
 
 def last_switched(inputs: Inputs, keywords: Settings) -> Array:

@@ -11,9 +11,10 @@ from jax import Array
 from jaxtyping import Float, PyTree
 from numpy.typing import ArrayLike
 
-from ..base.checks import is_traced, known
+from ..base.checks import is_traced, known, refusal
 from ..base.report import html_table
 from ..forces.element import OwnStates
+from ..linkage.linkage import Linkage
 from ..linkage.topology import rate_unit
 from ..steps.tolerances import SINGLE_TOLERANCE, TOLERANCE
 
@@ -145,8 +146,7 @@ class Solution(eqx.Module):
       taken up to `ts` [J].
     - `events`: what happened to which joint, and when; its times have derivatives.
 
-    After `simulate_sampled`, else None (there `stats` is empty, and `modes` and
-    `events` are None):
+    After `simulate_sampled`, else None:
 
     - `tau`: efforts commanded at each sample (samples, n), 0 at fixed pairs
       [N or N m]. Each acts from the delay after its sample until the next one acts.
@@ -178,7 +178,8 @@ class Solution(eqx.Module):
     @property
     def states(self) -> tuple[PyTree, ...]:
         """The results that have derivatives in the inputs."""
-        return self.q, self.qd, self.own, self.taken, self.events
+        joints = self.q, self.qd, self.own, self.taken, self.events
+        return *joints, self.tau, self.q_begin
 
     @property
     def outcome(self) -> np.ndarray:
@@ -237,6 +238,18 @@ class Solution(eqx.Module):
         if known(self.q) and (remark := _remark_on_resolution(np.asarray(self.q))):
             facts["positions"] = remark
         return facts
+
+
+def check_joints(name: str, solution: object, linkage: Linkage) -> None:
+    """Raises ValueError unless it is a motion with the linkage's number of joints."""
+    if not isinstance(solution, Solution):
+        raise refusal(name, "a Solution", solution)
+    count = jnp.shape(linkage.ef)[-1] // 2  # of a batch too
+    if jnp.shape(solution.q)[-1] != count:
+        raise ValueError(
+            f"{name}: expected a motion of {count} joints, as the linkage has, got "
+            f"positions of shape {jnp.shape(solution.q)}."
+        )
 
 
 def _span(numbers: ArrayLike) -> str:

@@ -93,10 +93,11 @@ def _solve_one(inputs: Inputs, keywords: Settings) -> tuple[Solution, bool] | No
     solution, succeeded = sharing_functions(run, forces=inputs.forces)
     if solution is None or is_traced(solution):
         return None
-    rows = solution.q, solution.qd, solution.own, solution.modes, solution.taken
-    q, qd, own, modes, taken = cut(rows, len(ts))
-    stats, result = solution.stats | {"max_steps": most}, solution.result
-    solution = Solution(ts, q, qd, stats, result, own, modes, taken, solution.events)
+    # What has a row for each time.
+    names = "q", "qd", "own", "modes", "taken", "tau", "q_begin"
+    rows = cut({name: getattr(solution, name) for name in names}, len(ts))
+    stats = solution.stats | {"max_steps": most}
+    solution = dataclasses.replace(solution, ts=ts, stats=stats, **rows)
     return solution, bool(succeeded)
 
 
@@ -224,9 +225,11 @@ def _integrate_reversibly_bwd(residuals, cotangent, perturbed, inputs, keywords)
 def _opened(inputs: Inputs) -> Inputs:
     """Returns the inputs, with the closures of plain functions as leaves."""
     arguments = inputs.ts[0], *inputs.state0, inputs.linkage
-    forces = tuple(
-        element.opened(*arguments) if isinstance(element, ForeignElement) else element
-        for element in inputs.forces
+    foreign = lambda node: isinstance(node, ForeignElement)
+    forces = jax.tree.map(
+        lambda node: node.opened(*arguments) if foreign(node) else node,
+        inputs.forces,
+        is_leaf=foreign,
     )
     return inputs._replace(forces=forces)
 

@@ -63,6 +63,9 @@ class ScheduledTerm(diffrax.ODETerm):
     guard them: positive while a mode lasts. `resolve(event, y, args)` returns the state
     and the modes after an event.
 
+    Between samples of a controller, `args.sampled` holds what it has sampled. Where a
+    step begins, `sample(t, y, args)`, if any, returns it anew, and whether it changed.
+
     `settle(t, y, args)`, if any, returns the state from which a step begins.
     """
 
@@ -74,6 +77,7 @@ class ScheduledTerm(diffrax.ODETerm):
     unknown_modes: Callable | None = eqx.field(static=True, default=None)
     resolve: Callable | None = eqx.field(static=True, default=None)
     settle: Callable | None = eqx.field(static=True, default=None)
+    sample: Callable | None = eqx.field(static=True, default=None)
 
     def vf(self, t, y, args):
         return self.vector_field(t, y, args, self.schedule(t, args))

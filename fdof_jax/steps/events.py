@@ -100,15 +100,14 @@ class Events(eqx.Module):
     """
 
     term: Any
-    args: Arguments
     apart: Array  # see `clearance`
     jumping: tuple[bool, ...] = eqx.field(static=True)
     guards: int = eqx.field(static=True)
     derivatives: bool = eqx.field(static=True)
 
-    def start(self, t0: Array) -> Switches:
+    def start(self, t0: Array, args: Arguments) -> Switches:
         """Returns the state before the first step."""
-        modes = self.term.unknown_modes(self.args)[0] if self.guards else None
+        modes = self.term.unknown_modes(args)[0] if self.guards else None
         count, none = len(self.jumping), jnp.zeros_like(t0)
         unknown, no = jnp.zeros(count, t0.dtype), jnp.array(False)
         known = unknown.at[count - self.guards :].set(1)
@@ -130,24 +129,25 @@ class Events(eqx.Module):
     # What happens where a step ended?
 
     def crossed(
-        self, t: Array, y: Integrated, last: Switches, jumped: Truth
+        self, t: Array, y: Integrated, args: Arguments, last: Switches, jumped: Truth
     ) -> tuple[Integrated, Begun]:
         """Returns the state where a step begins, and what is in force in it.
 
-        `t`, `y`: before what happens there; `jumped`: whether something may.
+        `t`, `y`: before what happens there; `jumped`: whether something may. `args`: of
+        all but sides and modes.
         """
         if_jumped = lambda after, before: jnp.where(jumped, after, before)
         sides, modes, sizes = if_jumped(last.after, last.sides), last.modes, last.sizes
         on_zero = sides != last.sides
         changed = on_zero & (last.sides != 0)
         if not self.guards:
-            y = self._shifted(t, y, last, jumped)
+            y = self._shifted(t, y, args, last, jumped)
         else:
             sides = sides.at[-self.guards :].set(1)
             at_start = jnp.any(modes.mode < 0)
             y, modes = jax.lax.cond(
                 jumped | at_start,
-                lambda: self._after_event(t, y, last, sides, changed, jumped),
+                lambda: self._after_event(t, y, args, last, sides, changed, jumped),
                 lambda: (y, modes),
             )
             # Other modes have other guards.
@@ -160,15 +160,15 @@ class Events(eqx.Module):
         return y, Begun(sides, modes, changed, on_zero, sizes, grazing)
 
     def _after_event(
-        self, t: Array, y: Integrated, last: Switches, sides: Array, changed: Array,
-        jumped: Truth,
+        self, t: Array, y: Integrated, args: Arguments, last: Switches, sides: Array,
+        changed: Array, jumped: Truth,
     ) -> tuple[Integrated, PyTree]:  # fmt: skip
         """Returns state and modes after an event.
 
         The state moves on to the time of the event in the modes before, and back in
         those after: this changes nothing but derivatives.
         """
-        before = self.args._replace(sides=last.sides, modes=last.modes)
+        before = args._replace(sides=last.sides, modes=last.modes)
         fired = changed[-self.guards :].reshape(-1, last.modes.mode.size)
         time = jnp.where(last.ahead, t, last.until)
         late, there = jnp.zeros_like(t), y
@@ -183,12 +183,12 @@ class Events(eqx.Module):
         event, own = Event(last.until, t, fired, late), before._replace(sides=sides)
         there, modes = self.term.resolve(event, there, own)
         if self.derivatives:
-            after = self.args._replace(sides=sides, modes=modes)
+            after = args._replace(sides=sides, modes=modes)
             there = moved(-late, t + late, there, after, self.term)
         return there, modes
 
     def _shifted(
-        self, t: Array, y: Integrated, last: Switches, jumped: Truth
+        self, t: Array, y: Integrated, args: Arguments, last: Switches, jumped: Truth
     ) -> Integrated:
         """Returns the state with the derivatives that a switch brings."""
         if not self.derivatives:
@@ -206,7 +206,7 @@ class Events(eqx.Module):
         arrived = jumped & (last.length > 0)
         gain_of = gained if any(self.jumping) else gained_at_kink
         for before, after in zip(in_turn, in_turn[1:]):
-            own, then = (self.args._replace(sides=sides) for sides in (before, after))
+            own, then = (args._replace(sides=sides) for sides in (before, after))
             switched = (before != after) & arrived
             gain = gain_of(t, y, own, then, switched, term=self.term)
             y = jax.tree.map(jnp.add, y, gain)
@@ -301,7 +301,7 @@ def events_of(
     functions, jumping = eqx.filter_eval_shape(term.switches, ts[0], y0, args)
     if not functions.size:
         return None
-    return Events(term, args, clearance(ts), jumping, guards, derivatives)
+    return Events(term, clearance(ts), jumping, guards, derivatives)
 
 
 @eqx.filter_jit  # traced once, not at each use in a solve

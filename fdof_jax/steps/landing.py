@@ -46,6 +46,23 @@ def _last(end: Array) -> Array:
     return constant(end - 2 * NEAR_END * jnp.finfo(end.dtype).eps * jnp.abs(end))
 
 
+class Clock(NamedTuple):
+    """Known times that recur: `first` + k `period` for k from 0 to `number` - 1 [s]."""
+
+    first: Array
+    period: Array
+    number: Array
+
+    def at(self, k: Array) -> Array:
+        return self.first + k * self.period
+
+    def near(self, t: Array) -> Array:
+        """Returns a few of the times, the next one after `t` among them."""
+        now, first, period = constant((t, self.first, self.period))
+        k = jnp.maximum(jnp.floor((now - first) / period), 0) + jnp.arange(3)
+        return jnp.where(k < self.number, self.at(k), -jnp.inf)
+
+
 class Found(NamedTuple):
     """What was found in a step.
 
@@ -110,8 +127,15 @@ class Landing(eqx.Module):
     """
 
     jumps: Array | None
+    clocks: tuple[Clock, ...]
     apart: Array  # see `clearance`
     switches: bool = eqx.field(static=True)
+
+    def _known(self, t: Array) -> Array | None:
+        """Returns known times, the next one after `t` among them; None without any."""
+        times = [clock.near(t) for clock in self.clocks]
+        times += [] if self.jumps is None else [self.jumps]
+        return jnp.concatenate(times) if times else None
 
     def end_of_run(self, ts: Array) -> Array:
         """Returns the end of the last step: the last time, or a little later.
@@ -120,27 +144,27 @@ class Landing(eqx.Module):
         of the step before that jump onto it.
         """
         end = ts[-1]
-        if self.jumps is None:
-            return end
         last = _last(end)
+        if (jumps := self._known(last)) is None:
+            return end
         # Steps land on what comes before `last`, and go on after it.
-        belongs = has_come(self.jumps, end) | (self.jumps < last + self.apart)
-        there = (self.jumps >= last - self.apart) & belongs
+        belongs = has_come(jumps, end) | (jumps < last + self.apart)
+        there = (jumps >= last - self.apart) & belongs
         later = jnp.any(constant(there))
         return end + jnp.where(later, _LONGER * self.apart, 0)
 
     def _cut(self, t0: Array, t1: Array, last: Array) -> tuple[Array, Array, Array]:
         """Returns a step's end, the gap after it, and whether it is at a known time."""
-        if self.jumps is None:
+        if (known := self._known(t0)) is None:
             return t1, jnp.zeros_like(t1), jnp.array(False)
-        jumps = constant(self.jumps)
+        jumps = constant(known)
         ends = jnp.maximum(jumps - self.apart, t0)
         ends = jnp.where((jumps > t0) & (ends < last), ends, jnp.inf)
         index = jnp.argmin(ends)
         place, jump = ends[index], jumps[index]
         reached = t1 + _JUST_BEFORE * (t1 - t0) >= place
         # Written this way, the end has the derivatives of the known time.
-        end = self.jumps[index] - (jump - place)
+        end = known[index] - (jump - place)
         gap = jnp.where(reached, jump + self.apart - place, 0)
         return jnp.where(reached, end, t1), gap, reached
 

@@ -16,7 +16,7 @@ from jaxtyping import PyTree
 
 from ..base.checks import refusal
 from .dopri8 import Arguments, Integrated, ScheduledTerm, chosen, constant
-from .events import Begun, Events, Switches
+from .events import Events, Switches
 from .judge import Judge, Step, without_nan
 from .landing import NEAR_END, Found, Landing, NextStep
 from .tolerances import Controller, Shortening, with_error_control
@@ -72,6 +72,7 @@ class Attempt(NamedTuple):
     - `method`: state of the method. `judged`: that of `Judge`, or without one of the
       controller; `wrappers`: of controllers around the one that judges errors.
     - `landing`, `switches`: states of `Landing` and of `Events`, None without them.
+    - `sampled`: what a controller has sampled (see `ScheduledTerm`), None without one.
     - `rows`: states at output times, infinite at those to come; `saved`: how many are
       there.
     - `meter`: state of the progress meter.
@@ -89,6 +90,7 @@ class Attempt(NamedTuple):
     wrappers: PyTree
     landing: PyTree
     switches: Any  # Switches | None
+    sampled: PyTree
     rows: PyTree
     saved: Array
     meter: PyTree
@@ -101,13 +103,12 @@ class Attempt(NamedTuple):
 class _Taken(NamedTuple):
     """A step that was taken, whether it is kept or not.
 
-    - `begun`, `args`: what is in force in it. `y1`: the state at its end; `path`: there
-      and between. `error`: its estimate, or an `Estimate`.
+    - `args`: what is in force in it. `y1`: the state at its end; `path`: there and
+      between. `error`: its estimate, or an `Estimate`.
     - `method`, `switches`: states at its end. `failed`: result of the method.
     - `found`: what happens in it.
     """
 
-    begun: Begun | None
     args: Arguments
     y1: Integrated
     path: diffrax.AbstractLocalInterpolation
@@ -165,6 +166,7 @@ def solve(problem: Problem, stepping: Stepping) -> Attempt:
             wrappers=wrappers,
             landing=of_landing,
             switches=kept(taken.switches, a.switches),
+            sampled=kept(taken.args.sampled, a.sampled),
             rows=rows,
             saved=saved,
             meter=stepping.meter.step(a.meter, constant((t - ts[0]) / (last - ts[0]))),
@@ -207,7 +209,7 @@ def _first_attempt(problem: Problem, stepping: Stepping, last: Array) -> Attempt
     switches = of_landing = wrappers = jumped = None
     end: Any
     if events is not None:
-        switches = events.start(t0)
+        switches = events.start(t0, args)
         args = args._replace(sides=switches.sides, modes=switches.modes)
     order = method.error_order(term)
     run: Any = term, t0, last, y0, stepping.dt0, args, method.func, order
@@ -237,7 +239,8 @@ def _first_attempt(problem: Problem, stepping: Stepping, last: Array) -> Attempt
         wrappers=wrappers,
         landing=of_landing,
         switches=switches,
-        rows=jax.tree.map(rows, _row(y0, switches)),
+        sampled=args.sampled,
+        rows=jax.tree.map(rows, _row(y0, args)),
         saved=none,
         meter=stepping.meter.init(),
         steps=none,
@@ -253,9 +256,13 @@ def _taken(problem: Problem, stepping: Stepping, a: Attempt) -> _Taken:
     method, events = stepping.method, stepping.events
     y0, begun, found, switches = a.y, None, None, None
     jumped: Any = False if a.jumped is None else a.jumped
+    args = args._replace(sampled=a.sampled)
     if events is not None:
-        y0, begun = events.crossed(a.t, a.y, a.switches, jumped)
+        y0, begun = events.crossed(a.t, a.y, args, a.switches, jumped)
         args = args._replace(sides=begun.sides, modes=begun.modes)
+    if term.sample is not None:
+        sampled, changed = term.sample(a.t, y0, args)
+        args, jumped = args._replace(sampled=sampled), jumped | changed
     if term.settle is not None:
         y0, jumped = term.settle(a.t, y0, args), True
     y1, error, dense, of_method, failed = method.step(
@@ -266,7 +273,7 @@ def _taken(problem: Problem, stepping: Stepping, a: Attempt) -> _Taken:
         assert begun is not None
         y1 = events.kept(begun, y1, y0)
         found, switches = events.located(a.t, a.end, path, args, begun, a.switches)
-    return _Taken(begun, args, y1, path, error, of_method, failed, found, switches)
+    return _Taken(args, y1, path, error, of_method, failed, found, switches)
 
 
 def _planned(
@@ -274,6 +281,7 @@ def _planned(
 ) -> tuple[NextStep, Any, PyTree, PyTree]:
     """Returns the next step, and the states `judged`, `wrappers` and `landing`."""
     judge, landing, controller = stepping.judge, stepping.landing, stepping.controller
+    of_landing, resumes = None, jnp.array(False)
     order = stepping.method.error_order(problem.term)
     # Tolerances are those of the state before what happens where the step begins.
     step, error = Step(a.t, a.end, a.y, taken.y1, taken.args), taken.error
@@ -282,7 +290,10 @@ def _planned(
         *plan, judged, result = controller.wrap(1).adapt_step_size(
             *step, error, order, a.judged
         )
-        return NextStep(*plan, result), judged, None, None  # pyright: ignore[reportCallIssue]
+        plan = NextStep(*plan, result)  # pyright: ignore[reportCallIssue]
+        if landing is not None:
+            plan, _, of_landing = landing.after(a.t, a.end, None, plan, a.landing)
+        return plan, judged, None, of_landing
     if error is None:
         raise refusal(
             "solver",
@@ -291,7 +302,6 @@ def _planned(
             stepping.method,
         )
     plan, judged, health = judge(step, error, order, a.judged)
-    of_landing, resumes = None, jnp.array(False)
     if landing is not None:
         plan, resumes, of_landing = landing.after(
             a.t, a.end, taken.found, plan, a.landing
@@ -325,7 +335,7 @@ def _saved(
 
     def saving(output):
         saved, rows = output
-        row = _row(taken.path.evaluate(ts[saved]), taken.begun)
+        row = _row(taken.path.evaluate(ts[saved]), taken.args)
         put = lambda value, rows: rows.at[saved].set(value)
         return saved + 1, jax.tree.map(put, row, rows)
 
@@ -340,11 +350,13 @@ def _saved(
     )
 
 
-def _row(y: Integrated, at: Begun | Switches | None) -> PyTree:
-    """Returns what is saved of a state: itself, and the modes if joints are held."""
-    if at is None or at.modes is None:
-        return y, None
-    return y, at.modes._replace(events=None)
+def _row(y: Integrated, args: Arguments) -> PyTree:
+    """Returns what is saved of a state: itself, modes if joints are held, samples."""
+    modes, sampled = args.modes, args.sampled
+    modes = None if modes is None else modes._replace(events=None)
+    if sampled is not None:
+        sampled = sampled._replace(memory=None, under_way=None)
+    return y, modes, sampled
 
 
 def _together(

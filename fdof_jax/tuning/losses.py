@@ -20,9 +20,8 @@ from ..linkage.linkage import without_fixed
 from ..references.reference import reference_motion, reference_of
 from ..search import Evaluation, check_scene, sum_of_squares
 from ..simulation.jacobian import Sensitivities, jacobian_of
-from ..simulation.sampled import check_joints
 from ..simulation.scene import Scene
-from ..simulation.solution import Solution
+from ..simulation.solution import Solution, check_joints
 
 SAMPLES = 1001
 Loss = Callable[[Scene, Solution], Array]

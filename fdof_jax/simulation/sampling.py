@@ -1,0 +1,155 @@
+"""Samples of a controller in discrete time, and what acts between them."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float, PyTree
+
+from ..base.checks import real_array
+from ..forces.element import Element, Forces
+from ..linkage.fields import Truth, has_come
+from ..linkage.linkage import Linkage, joints_of, without_fixed
+from ..steps.landing import Clock
+
+
+class Sampled(NamedTuple):
+    """What is constant between the samples of a controller.
+
+    - `taken`: number of samples up to here.
+    - `memory`: the controller's own state.
+    - `command` (n,): the last one; `acting` (n,): the one that acts [N or N m].
+    - `under_way` (command, n): the last ones in a ring, None if each acts at once.
+    - `arrived`: how many began to act between samples, and `q_begin` (n,): the joint
+      positions where the last one did; None if they act at samples only.
+    """
+
+    taken: Array
+    memory: PyTree
+    command: Array
+    acting: Array
+    under_way: Array | None
+    arrived: Array | None
+    q_begin: Array | None
+
+
+class Recurring(Element):
+    """An element without efforts of its own, at whose times steps end."""
+
+    clock: Clock
+
+    @property
+    def jump_ts(self) -> None:
+        """None: its clock says when, and a controller's own times do not matter."""
+
+    def __call__(self, t: Array, q: Array, qd: Array, linkage: Linkage) -> Array:
+        return jnp.zeros_like(q)
+
+
+class Arrivals(Recurring):
+    """When commands begin to act, if not at samples."""
+
+
+class Sampler(Recurring):
+    """A controller that samples once per period, as an element.
+
+    Its efforts are those of `Args.sampled`.
+
+    - `control`: the controller. `clock`: that of the samples.
+    - `noise`: what is added to the measured state, a row per sample; or None.
+    - `late`: how many periods a command comes late; at most `most`.
+    - `rest`: how long beyond these [s]; the element before is then `Arrivals`. None if
+      commands begin to act at samples.
+    """
+
+    control: Element
+    noise: tuple[Array, Array] | None  # of positions, of velocities
+    rest: Float[Array, ""] | None
+    late: Array | int
+    most: int = eqx.field(static=True)
+
+    def unsampled(self, linkage: Linkage) -> Sampled:
+        """Returns what holds before the first sample."""
+        memory = self.control.initial_state(linkage)
+        none, tau = jnp.zeros((), int), jnp.zeros(joints_of(linkage))
+        before = Sampled(
+            taken=none,
+            memory=jax.tree.map(lambda leaf: jnp.asarray(leaf, float), memory),
+            command=tau,
+            acting=tau,
+            under_way=jnp.zeros((self.most + 1, tau.size)) if self.most else None,
+            arrived=None,
+            q_begin=None,
+        )
+        if self.rest is None:
+            return before
+        acting = jnp.where(self.rest >= 0, tau, jnp.nan)
+        return before._replace(acting=acting, arrived=none, q_begin=tau)
+
+    def sampled(
+        self, q: Array, qd: Array, linkage: Linkage, before: Sampled
+    ) -> Sampled:
+        """Returns what holds after a sample."""
+        k, under_way = before.taken, before.under_way
+        if self.noise is not None:
+            q, qd = (value + rows[k] for value, rows in zip((q, qd), self.noise))
+        at = self.clock.at(k), q, qd, linkage, before.memory
+        tau, rates = self.control.act(*at)
+        tau = without_fixed(linkage, real_array("control", tau, q.shape))
+        acting = tau
+        if under_way is not None:
+            under_way = under_way.at[k % len(under_way)].set(tau)
+            acting = under_way[(k - self.late) % len(under_way)]
+        euler = lambda memory, rate: memory + self.clock.period * rate
+        return before._replace(
+            taken=k + 1,
+            memory=jax.tree.map(euler, before.memory, rates),
+            command=tau,
+            acting=acting if before.arrived is None else before.acting,
+            under_way=under_way,
+        )
+
+    def arriving(self, q: Array, before: Sampled) -> Sampled:
+        """Returns what holds after a command begins to act."""
+        assert before.arrived is not None
+        tau = before.command
+        if before.under_way is not None:
+            tau = before.under_way[(before.arrived - self.late) % len(before.under_way)]
+        return before._replace(acting=tau, arrived=before.arrived + 1, q_begin=q)
+
+
+def sampler_of(forces: Forces) -> Sampler | None:
+    """Returns the controller in discrete time, which comes last, or None."""
+    last = forces[-1] if forces else None
+    return last if isinstance(last, Sampler) else None
+
+
+def unsampled(forces: Forces, linkage: Linkage) -> Sampled | None:
+    """Returns what holds before the first sample, None without a controller."""
+    sampler = sampler_of(forces)
+    return None if sampler is None else sampler.unsampled(linkage)
+
+
+def after_samples(
+    sampler: Sampler, clocks: tuple[Array, Array], q: Array, qd: Array,
+    linkage: Linkage, before: Sampled,
+) -> tuple[Sampled, Truth]:  # fmt: skip
+    """Returns what holds after what happens at a time, and whether anything does.
+
+    `clocks`: the time by those of arrivals and of samples.
+    """
+    of_arrivals, of_samples = clocks
+    clock: Any = sampler.clock
+    time = clock.at(before.taken)
+    due = (before.taken < clock.number) & has_come(time, of_samples)
+    after = jax.lax.cond(
+        due, lambda: sampler.sampled(q, qd, linkage, before), lambda: before
+    )
+    if before.arrived is None:
+        return after, due
+    time = clock.at(before.arrived) + sampler.rest
+    comes = (before.arrived < after.taken) & has_come(time, of_arrivals)
+    after = jax.lax.cond(comes, lambda: sampler.arriving(q, after), lambda: after)
+    return after, due | comes
