@@ -146,6 +146,7 @@ def test_delayed_feedback_follows_its_transition_matrix():
     np.testing.assert_allclose(alone, slopes[0][2, 1], rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_no_delay_is_known_within_jit():
     """Constant steps cannot end where a late effort starts to act."""
     steps = diffrax.ConstantStepSize()

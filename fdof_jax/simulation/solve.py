@@ -1,6 +1,8 @@
 """Solves a motion: of one arm at a prompt, in a batch, with derivatives."""
 
 import dataclasses
+import functools
+from typing import Any
 
 import diffrax
 import equinox as eqx
@@ -95,7 +97,7 @@ def _solve_one(inputs: Inputs, keywords: Settings) -> tuple[Solution, bool] | No
         return None
     # What has a row for each time.
     names = "q", "qd", "own", "modes", "taken", "tau", "q_begin"
-    rows = cut({name: getattr(solution, name) for name in names}, len(ts))
+    rows = cut({name: vars(solution)[name] for name in names}, len(ts))
     stats = solution.stats | {"max_steps": most}
     solution = dataclasses.replace(solution, ts=ts, stats=stats, **rows)
     return solution, bool(succeeded)
@@ -104,19 +106,24 @@ def _solve_one(inputs: Inputs, keywords: Settings) -> tuple[Solution, bool] | No
 def _of_any_tolerance(keywords):
     """Returns the keywords with tolerances as arrays, which programs do not contain."""
     controller = keywords["stepsize_controller"]
-    if controller is None:
-        if keywords["solver"] is not None:
-            return keywords  # which default it gets depends on the solver
-        controller = at_tolerances(None, None)
+    dtype = jnp.result_type(float)
+    if controller is not None:
+        controller = with_pid(lambda pid: _in_arrays(pid, dtype), controller)
+    elif keywords["solver"] is None:  # else which default it gets depends on it
+        controller = _default_in_arrays(dtype)
+    return keywords | {"stepsize_controller": controller}
 
-    def of_arrays(pid: diffrax.PIDController) -> diffrax.PIDController:
-        if eqx.is_array(pid.rtol) and eqx.is_array(pid.atol):
-            return pid
-        dtype = jnp.result_type(float)
-        rtol, atol = (np.asarray(t, dtype) for t in (pid.rtol, pid.atol))
-        return dataclasses.replace(pid, rtol=rtol, atol=atol)
 
-    return keywords | {"stepsize_controller": with_pid(of_arrays, controller)}
+def _in_arrays(pid: diffrax.PIDController, dtype: np.dtype) -> diffrax.PIDController:
+    if eqx.is_array(pid.rtol) and eqx.is_array(pid.atol):
+        return pid
+    rtol, atol = (np.asarray(t, dtype) for t in (pid.rtol, pid.atol))
+    return dataclasses.replace(pid, rtol=rtol, atol=atol)
+
+
+@functools.cache
+def _default_in_arrays(dtype: np.dtype) -> Any:
+    return with_pid(lambda pid: _in_arrays(pid, dtype), at_tolerances(None, None))
 
 
 def _solve_padded(inputs: Inputs, keywords) -> tuple[Solution, Array]:
