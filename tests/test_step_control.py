@@ -12,7 +12,7 @@ import pytest
 
 import fdof_jax as fj
 from fdof_jax.steps.looped_dopri8 import LoopedDopri8
-from fdof_jax.steps.tolerances import Shortening, by_square_roots
+from fdof_jax.steps.tolerances import EagerController, by_square_roots
 
 LINKS = dict(com=[[0.5, 0]] * 3, mass=[1, 1, 1], inertia=[1 / 12] * 3)
 ARM = fj.Linkage("RRR", length=[0, 1, 1, 1], **LINKS)
@@ -126,7 +126,7 @@ def test_derivatives_through_bounces_under_a_norm_of_one_s_own():
     np.testing.assert_allclose(jax.jacfwd(forward)(jnp.array([1.0])), right, atol=1e-7)
 
 
-@pytest.mark.parametrize("kind", [diffrax.PIDController, Shortening])
+@pytest.mark.parametrize("kind", [diffrax.PIDController, EagerController])
 def test_square_roots_instead_of_powers_change_no_step(kind):
     pid = kind(1e-9, 1e-9, dtmin=1e-13, force_dtmin=False)
     rooted, y = by_square_roots(pid), jnp.array([0.3, 2.0])
@@ -188,14 +188,16 @@ def test_a_kept_step_near_the_tolerance_shortens_the_next():
 
     for error in (0.4, 0.6):
         assert after(diffrax.PIDController, error) == (True, 1)
-        keep, length = after(Shortening, error)
+        keep, length = after(EagerController, error)
         assert keep
         np.testing.assert_allclose(length, 0.8 * error ** (-1 / 8), rtol=1e-13)
-    assert after(Shortening, 0.9)[0]
-    np.testing.assert_allclose(after(Shortening, 0.9)[1], 0.85)  # the shortest step
+    assert after(EagerController, 0.9)[0]
+    np.testing.assert_allclose(
+        after(EagerController, 0.9)[1], 0.85
+    )  # the shortest step
     for error in (0.0, 1e-6, 0.1, 1.1, 1e3, np.nan):
         for found, expected in zip(
-            *(after(k, error) for k in (Shortening, diffrax.PIDController))
+            *(after(k, error) for k in (EagerController, diffrax.PIDController))
         ):
             np.testing.assert_allclose(found, expected, rtol=1e-13)
 

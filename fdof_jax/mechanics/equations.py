@@ -60,7 +60,7 @@ class Constants(NamedTuple):
     - `revolute`, `fixed`: whether the pair turns; whether it neither turns nor slides.
     - `direction`: of the ground and of each link at the reference.
     - `slide`: B_k at the reference [m].
-    - `beyond`: mass of the link and of all links beyond [kg].
+    - `carried`: mass of the link and of all links beyond [kg].
     - `along`: from the link's start along it to the next slide [m]; none for the last.
     - `moment`: first moment along and across the link [kg m], with the mass beyond it
       at the end of `along`; `second`: second moment about the link's start [kg m^2].
@@ -75,7 +75,7 @@ class Constants(NamedTuple):
     direction: Directions
     slide: Scalars
     gravity: Array
-    beyond: Scalars
+    carried: Scalars
     along: Scalars
     moment: tuple[Vector, ...]
     second: Scalars
@@ -104,22 +104,22 @@ def link_constants(
         direction.append(_in_frame(*turn, direction[-1]))
     last = len(turned) - 1
     along, mass = tuple(linkage.length[1:-1]), tuple(linkage.mass)
-    beyond = list(mass)
+    carried = list(mass)
     for k in reversed(range(last)):
-        beyond[k] = beyond[k] + beyond[k + 1]
+        carried[k] = carried[k] + carried[k + 1]
     (*moment,) = zip(*(linkage.mass[:, None] * linkage.com).T)
     own = linkage.inertia + linkage.mass * jnp.sum(linkage.com**2, axis=1)
     (*second,) = own
     for k in range(last):
-        moment[k] = (moment[k][0] + beyond[k + 1] * along[k], moment[k][1])
-        second[k] = second[k] + beyond[k + 1] * along[k] ** 2
+        moment[k] = (moment[k][0] + carried[k + 1] * along[k], moment[k][1])
+        second[k] = second[k] + carried[k + 1] * along[k] ** 2
     return Constants(
         revolute=revolute,
         fixed=fixed,
         direction=tuple(direction),
         slide=tuple(jnp.where(turns, linkage.locked, q)),
         gravity=linkage.gravity,
-        beyond=tuple(beyond),
+        carried=tuple(carried),
         along=along,
         moment=tuple(moment),
         second=tuple(second),
@@ -268,7 +268,7 @@ def equations(
     rows, bias = [], []
     for k in reversed(joints):
         if k < last:
-            mass_slide = c.beyond[k + 1] * slide[k + 1]
+            mass_slide = c.carried[k + 1] * slide[k + 1]
             more = _scale(gained[k + 1], momentum)
             force = more if force is None else _add(force, more)
             bent = _cross(step[k], force) + coriolis[k + 1] * _cross(first, e[k + 1])
@@ -284,12 +284,12 @@ def equations(
         lift = across_start(e[k], max(k - 1, 0))
         if k > 0:
             lift = lift - w2[k - 1] * slide[k]
-        sliding = c.beyond[k] * lift - _cross(e[k], thrown)
+        sliding = c.carried[k] * lift - _cross(e[k], thrown)
         bias.append(where(r[k], turning, sliding))
         # Joint k at unit rate: each joint before it takes a share of the momentum.
-        momentum = _select(r[k], first, _scale(c.beyond[k], e[k]))
+        momentum = _select(r[k], first, _scale(c.carried[k], e[k]))
         angular = where(r[k], second, _dot(first, e[k]))
-        column = [where(r[k], second, c.beyond[k])]
+        column = [where(r[k], second, c.carried[k])]
         for i in reversed(joints[:k]):
             angular = angular + _dot(step[i], momentum)
             column.append(where(r[i], angular, _dot(e[i], momentum)))

@@ -54,13 +54,13 @@ class Args(NamedTuple):
     constants: Constants
     forces: tuple[Element, ...]
     sides: Array | None = None  # (switch,) in force, where switches are located
-    ahead: Array | None = None  # (element,) by which its clock is ahead, if any [s]
+    lead: Array | None = None  # (element,) by which its clock leads, if any [s]
     modes: PyTree = None  # those of the joints, where elements hold some (see `Modes`)
-    sampled: PyTree = None  # what a controller has sampled, if any (see `Sampled`)
+    sampled: PyTree = None  # what a controller has sampled, if any (see `SampleState`)
 
     def clock(self, index: int, t: Array) -> Array:
         """Returns the time by an element's clock (see `clocks_apart`)."""
-        return t if self.ahead is None else t + self.ahead[index]
+        return t if self.lead is None else t + self.lead[index]
 
     def masses(self, t: Array) -> tuple[InertialElement, ...]:
         """Returns the elements that move masses, as they are at a time."""
@@ -228,7 +228,7 @@ def switching(
     return switches.all_values(args.q0.dtype), tuple(switches.jumping)
 
 
-class Applied(NamedTuple):
+class Drive(NamedTuple):
     """What drives the joints at a state.
 
     - `delta`, `qd`: displacements and velocities, prescribed ones as they are.
@@ -245,7 +245,7 @@ class Applied(NamedTuple):
     given: Scalars | None
 
 
-def applied(t: Array, y: Integrated, args: Args, schedule: Schedules) -> Applied:
+def applied(t: Array, y: Integrated, args: Args, schedule: Schedules) -> Drive:
     """Returns what drives the joints at a state."""
     y, given = followed(y, args, schedule)
     tau, own_rates, switches = efforts(t, y, args, schedule)
@@ -256,7 +256,7 @@ def applied(t: Array, y: Integrated, args: Args, schedule: Schedules) -> Applied
     if given is not None:
         m = with_added(added, equations(args.constants, delta, qd))
         tau = minus(tau, times(m.mass, given))
-    return Applied(delta, qd, tau, own_rates, added, switches, given)
+    return Drive(delta, qd, tau, own_rates, added, switches, given)
 
 
 def _added_at(

@@ -24,11 +24,11 @@ from .field import (
 )
 from .holding import changes, guarded_switching, unknown_modes
 from .prescribed import prescribed
-from .sampling import Recurring, Sampled, after_samples, sampler_of
+from .sampling import ClockElement, SampleState, after_samples, sampler_of
 
 # By which a clock is ahead of the one before, in units of `clearance`: beyond the
 # distances that steps keep from each time.
-_AHEAD = 8
+_LEAD = 8
 
 
 _DRIVEN = ScheduledTerm(vector_field, schedule_of, health_of, watched_field, switching)
@@ -53,7 +53,7 @@ def _term(holds: bool, follows: bool, samples: bool) -> ScheduledTerm:
     )
 
 
-def _after_samples(t: Array, y: Integrated, args: Args) -> tuple[Sampled, Truth]:
+def _after_samples(t: Array, y: Integrated, args: Args) -> tuple[SampleState, Truth]:
     """Returns `Args.sampled` where a step begins, and whether it changed there."""
     sampler, last = sampler_of(args.forces), len(args.forces) - 1
     assert sampler is not None
@@ -89,15 +89,15 @@ def clocks_apart(args: Args, ts: Array) -> Args:
     places = sorted(
         (element is not motion, place)
         for place, element in enumerate(args.forces)
-        if isinstance(element, Recurring) or element.jump_ts is not None
+        if isinstance(element, ClockElement) or element.jump_ts is not None
     )
     if len(places) < 2:
         return args
-    unit = _AHEAD * clearance(ts)
-    ahead = [0.0] * len(args.forces)
+    unit = _LEAD * clearance(ts)
+    lead = [0.0] * len(args.forces)
     for rank, (_, place) in enumerate(places):
-        ahead[place] = rank
-    return args._replace(ahead=unit * jnp.array(ahead, unit.dtype))
+        lead[place] = rank
+    return args._replace(lead=unit * jnp.array(lead, unit.dtype))
 
 
 def clear_of_start(forces: Forces, ts: Array) -> Array:
@@ -106,7 +106,7 @@ def clear_of_start(forces: Forces, ts: Array) -> Array:
     The clock of that element is ahead of those of `forces`.
     """
     timed = sum(element.jump_ts is not None for element in forces)
-    return (1 + _AHEAD * timed) * clearance(ts)
+    return (1 + _LEAD * timed) * clearance(ts)
 
 
 def known_times(args: Args) -> tuple[Array | None, tuple[Clock, ...]]:
@@ -116,10 +116,10 @@ def known_times(args: Args) -> tuple[Array | None, tuple[Clock, ...]]:
     """
     times, clocks = [], []
     for index, element in enumerate(args.forces):
-        ahead = 0 if args.ahead is None else args.ahead[index]
-        if isinstance(element, Recurring):
+        lead = 0 if args.lead is None else args.lead[index]
+        if isinstance(element, ClockElement):
             clock = element.clock
-            clocks.append(clock._replace(first=clock.first - ahead))
+            clocks.append(clock._replace(first=clock.first - lead))
         elif (jumps := jumps_at(f"forces[{index}]", element)) is not None:
-            times.append(jumps - ahead)
+            times.append(jumps - lead)
     return jnp.concatenate(times) if times else None, tuple(clocks)

@@ -149,7 +149,7 @@ def guarded_switching(
     sliding = jnp.where(rubs, direction * jnp.stack(at.qd), 1)
     c = args.constants
     inertia = jnp.where(
-        *map(jnp.stack, (real_joints(args.linkage.ef), c.second, c.beyond))
+        *map(jnp.stack, (real_joints(args.linkage.ef), c.second, c.carried))
     )
     inertia = jnp.where(inertia > 0, inertia, 1)
     reserve = _reserve(law.static, modes.mode, effort, inertia)

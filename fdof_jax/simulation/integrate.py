@@ -18,10 +18,10 @@ from ..forces.element import Element, OwnStates
 from ..forces.joints import EffortHistory
 from ..linkage.linkage import Linkage, possible, without_fixed
 from ..steps import loop
-from ..steps.derivative_control import OfLinearised, OfTangents
+from ..steps.derivative_control import ProbeJudge, TangentJudge
 from ..steps.dopri8 import Integrated, ScheduledDopri8, constant
 from ..steps.events import events_of
-from ..steps.judge import Judge, Judged
+from ..steps.judge import Judge, JudgeState
 from ..steps.landing import Clock, Landing, clearance
 from ..steps.looped_dopri8 import LoopedDopri8
 from ..steps.tolerances import default_controller, error_control_of, with_tolerances
@@ -35,7 +35,7 @@ from .sampling import sampler_of
 from .solution import Solution
 
 RESULTS: Any = diffrax.RESULTS
-# What `solve_options` returns; sweeps add `lanes` (see `loop.Stepping`).
+# What `solve_options` returns; sweeps add `lanes` (see `loop.Scheme`).
 Settings = dict[str, Any]
 
 
@@ -77,7 +77,7 @@ def integrate(
     keywords: Settings,
     derivatives: bool = False,
     plain: bool = False,
-    tangents: OfTangents | None = None,
+    tangents: TangentJudge | None = None,
 ) -> Solution:
     """Integrates one motion, by default with `LoopedDopri8`.
 
@@ -87,7 +87,7 @@ def integrate(
     `tangents`: judges tangents over which the caller maps, along the axis `TANGENTS`.
     """
     motion = _prepare(inputs, derivatives, plain, bool(tangents and tangents.tolerance))
-    end = loop.solve(motion.problem, _stepping(motion, keywords, derivatives, tangents))
+    end = loop.solve(motion.problem, _scheme(motion, keywords, derivatives, tangents))
     return _read(inputs, motion, end, keywords)
 
 
@@ -129,9 +129,9 @@ def _prepare(
     return _Motion(valid & finite, (q, qd), problem, *known, joints)
 
 
-def _stepping(
-    motion: _Motion, keywords, derivatives: bool, tangents: OfTangents | None
-) -> loop.Stepping:
+def _scheme(
+    motion: _Motion, keywords, derivatives: bool, tangents: TangentJudge | None
+) -> loop.Scheme:
     """Chooses the steps: what judges them, and where they end."""
     given = keywords["stepsize_controller"]  # by the user
     controller = given or default_controller()
@@ -155,7 +155,7 @@ def _stepping(
     if lands or motion.clocks:
         jumps = None if motion.jumps is None else jnp.asarray(motion.jumps, ts.dtype)
         landing = Landing(jumps, motion.clocks, clearance(ts), events is not None)
-    return loop.Stepping(
+    return loop.Scheme(
         method=method,
         controller=controller,
         dt0=keywords["dt0"],
@@ -171,7 +171,7 @@ def _stepping(
 
 def _probe(
     term: Any, method: diffrax.AbstractSolver, own_tolerance: bool
-) -> OfLinearised | None:
+) -> ProbeJudge | None:
     """Returns what judges derivatives, None if nothing does.
 
     Implicit methods with tolerances of the user's are meant to leave fast motions
@@ -182,7 +182,7 @@ def _probe(
     has_tableau = isinstance(method, ScheduledDopri8 | diffrax.AbstractRungeKutta)
     # Of other methods derivatives are judged as if they were by Heun's.
     tableau: Any = method.tableau if has_tableau else diffrax.Heun.tableau
-    return OfLinearised(term, tableau)
+    return ProbeJudge(term, tableau)
 
 
 def _check_constant_steps(forces: tuple[Element, ...], controller: object) -> None:
@@ -241,7 +241,7 @@ def _read(
         "max_steps": keywords["max_steps"],
         "time_reached": jnp.where(valid, reached, times[0]),
     }
-    if isinstance(end.judged, Judged):
+    if isinstance(end.judged, JudgeState):
         stats["accuracy"] = jnp.finfo(q.dtype).eps * end.judged.loss
     if end.switches is not None:
         stats |= end.switches.facts
@@ -266,8 +266,8 @@ def last_switched(inputs: Inputs, keywords: Settings) -> Array:
     """
     keywords = keywords | {"adjoint": diffrax.ForwardMode()}
     motion = _prepare(inputs, derivatives=False, plain=False)
-    stepping = _stepping(motion, keywords, derivatives=False, tangents=None)
-    switches = loop.solve(motion.problem, stepping).switches
+    scheme = _scheme(motion, keywords, derivatives=False, tangents=None)
+    switches = loop.solve(motion.problem, scheme).switches
     assert switches is not None  # of which a motion has too many
     return switches.after != switches.sides
 

@@ -14,7 +14,7 @@ from jaxtyping import PyTree
 
 from ..forces.element import elements
 from ..linkage.coordinates import State
-from ..steps.derivative_control import TANGENTS, OfTangents
+from ..steps.derivative_control import TANGENTS, TangentJudge
 from ..steps.tolerances import SINGLE_TOLERANCE, adaptive, of_precision
 from .integrate import Inputs, integrate
 from .scene import Scene
@@ -75,7 +75,7 @@ def jacobian_of(
         progress_meter=diffrax.NoProgressMeter(),
     )
 
-    judge = OfTangents(_OF_TANGENTS * tolerance)
+    judge = TangentJudge(_OF_TANGENTS * tolerance)
 
     def at(z):
         scene = scene_at(z)

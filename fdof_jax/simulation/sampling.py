@@ -15,7 +15,7 @@ from ..linkage.linkage import Linkage, joints_of, without_fixed
 from ..steps.landing import Clock
 
 
-class Sampled(NamedTuple):
+class SampleState(NamedTuple):
     """What is constant between the samples of a controller.
 
     - `taken`: number of samples up to here.
@@ -35,7 +35,7 @@ class Sampled(NamedTuple):
     q_begin: Array | None
 
 
-class Recurring(Element):
+class ClockElement(Element):
     """An element without efforts of its own, at whose times steps end."""
 
     clock: Clock
@@ -48,11 +48,11 @@ class Recurring(Element):
         return jnp.zeros_like(q)
 
 
-class Arrivals(Recurring):
+class Arrivals(ClockElement):
     """When commands begin to act, if not at samples."""
 
 
-class Sampler(Recurring):
+class Sampler(ClockElement):
     """A controller that samples once per period, as an element.
 
     Its efforts are those of `Args.sampled`.
@@ -70,11 +70,11 @@ class Sampler(Recurring):
     late: Array | int
     most: int = eqx.field(static=True)
 
-    def unsampled(self, linkage: Linkage) -> Sampled:
+    def unsampled(self, linkage: Linkage) -> SampleState:
         """Returns what holds before the first sample."""
         memory = self.control.initial_state(linkage)
         none, tau = jnp.zeros((), int), jnp.zeros(joints_of(linkage))
-        before = Sampled(
+        before = SampleState(
             taken=none,
             memory=jax.tree.map(lambda leaf: jnp.asarray(leaf, float), memory),
             command=tau,
@@ -89,8 +89,8 @@ class Sampler(Recurring):
         return before._replace(acting=acting, arrived=none, q_begin=tau)
 
     def sampled(
-        self, q: Array, qd: Array, linkage: Linkage, before: Sampled
-    ) -> Sampled:
+        self, q: Array, qd: Array, linkage: Linkage, before: SampleState
+    ) -> SampleState:
         """Returns what holds after a sample."""
         k, under_way = before.taken, before.under_way
         if self.noise is not None:
@@ -111,7 +111,7 @@ class Sampler(Recurring):
             under_way=under_way,
         )
 
-    def arriving(self, q: Array, before: Sampled) -> Sampled:
+    def arriving(self, q: Array, before: SampleState) -> SampleState:
         """Returns what holds after a command begins to act."""
         assert before.arrived is not None
         tau = before.command
@@ -126,7 +126,7 @@ def sampler_of(forces: Forces) -> Sampler | None:
     return last if isinstance(last, Sampler) else None
 
 
-def unsampled(forces: Forces, linkage: Linkage) -> Sampled | None:
+def unsampled(forces: Forces, linkage: Linkage) -> SampleState | None:
     """Returns what holds before the first sample, None without a controller."""
     sampler = sampler_of(forces)
     return None if sampler is None else sampler.unsampled(linkage)
@@ -134,8 +134,8 @@ def unsampled(forces: Forces, linkage: Linkage) -> Sampled | None:
 
 def after_samples(
     sampler: Sampler, clocks: tuple[Array, Array], q: Array, qd: Array,
-    linkage: Linkage, before: Sampled,
-) -> tuple[Sampled, Truth]:  # fmt: skip
+    linkage: Linkage, before: SampleState,
+) -> tuple[SampleState, Truth]:  # fmt: skip
     """Returns what holds after what happens at a time, and whether anything does.
 
     `clocks`: the time by those of arrivals and of samples.

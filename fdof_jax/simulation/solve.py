@@ -19,7 +19,7 @@ from ..base.configuration import options_of_loops
 from ..base.functions import sharing_functions
 from ..forces.added_inertia import inertial
 from ..forces.element import ForeignElement
-from ..steps.derivative_control import OfTangents
+from ..steps.derivative_control import TangentJudge
 from ..steps.tolerances import at_tolerances, with_pid
 from ..steps.unrolled_dopri8 import UnrolledDopri8
 from .integrate import Inputs, Settings, integrate
@@ -194,7 +194,7 @@ def _integrate_reversibly_fwd(perturbed, inputs, keywords):
     if few:
         keywords = keywords | {"adjoint": diffrax.ForwardMode()}
 
-    judge = OfTangents() if few else None
+    judge = TangentJudge() if few else None
 
     def motion(moving):
         inputs = eqx.combine(moving, fixed)

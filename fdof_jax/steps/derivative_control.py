@@ -1,8 +1,8 @@
 """Step control of derivatives: their errors count beside those of the motion.
 
 A motion that rests has no error, however long a step is, but its derivatives have one.
-Where the tangents are known, `OfTangents` judges them. Where they are not, because the
-caller differentiates or the adjoint follows, `OfLinearised` judges a probe.
+Where the tangents are known, `TangentJudge` judges them. Where they are not, because
+the caller differentiates or the adjoint follows, `ProbeJudge` judges a probe.
 """
 
 from typing import NamedTuple
@@ -78,7 +78,7 @@ def _(primals, tangents):
     return ratio, jnp.zeros_like(ratio)
 
 
-class Step(NamedTuple):
+class StepEnds(NamedTuple):
     """A step, with the integrated state at both ends and the arguments in it."""
 
     t0: Array
@@ -88,7 +88,7 @@ class Step(NamedTuple):
     args: Arguments
 
 
-class OfTangents(eqx.Module):
+class TangentJudge(eqx.Module):
     """Judges tangents of the motion; all of them take the same steps.
 
     `tolerance`: relative to the largest tangent, however small others are. None: each
@@ -101,7 +101,7 @@ class OfTangents(eqx.Module):
         return ()
 
     def __call__(
-        self, step: Step, estimate: Estimate, probe: tuple[()], rtol: Array | float
+        self, step: StepEnds, estimate: Estimate, probe: tuple[()], rtol: Array | float
     ) -> tuple[Array, tuple[()]]:
         """Returns the largest error of a tangent over its tolerance, and no probe.
 
@@ -133,7 +133,7 @@ def linearised(
     return jax.jacfwd(lambda numbers: ravel_pytree(rates(numbers))[0])(numbers)
 
 
-class OfLinearised(eqx.Module):
+class ProbeJudge(eqx.Module):
     """Judges a step by what it does to the linearised motion.
 
     A probe stands for all tangents. It moves like a tangent, with the linearisation at
@@ -151,7 +151,7 @@ class OfLinearised(eqx.Module):
         return jnp.asarray(probe, numbers.dtype)
 
     def __call__(
-        self, step: Step, estimate: Estimate, probe: Array, rtol: Array | float
+        self, step: StepEnds, estimate: Estimate, probe: Array, rtol: Array | float
     ) -> tuple[Array, Array]:
         """Returns the error of the probe over its tolerance, and the moved probe."""
         t0, t1, _, y1, args = step

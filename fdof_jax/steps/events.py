@@ -40,7 +40,7 @@ class Switches(NamedTuple):
     - `near`: how far from its zero a switching function may switch [s].
     - `sizes` (switch,): the largest values of the switching functions up to here.
     - `length`: that of the step [s].
-    - `ahead`: whether a function that switches here has not quite reached its zero.
+    - `early`: whether a function that switches here has not quite reached its zero.
     - `passed`: number of switches up to here.
     - `one_sided`: number of places up to here where derivatives may hold on one side
       only (see `Events`); None if nothing jumps at switches.
@@ -55,7 +55,7 @@ class Switches(NamedTuple):
     near: Array
     sizes: Array
     length: Array
-    ahead: Array
+    early: Array
     passed: Array
     one_sided: Array | None
     grazing: Array
@@ -70,7 +70,7 @@ class Switches(NamedTuple):
         return {"num_switches": self.passed} | sided | slowest
 
 
-class Begun(NamedTuple):
+class Regime(NamedTuple):
     """What is in force in a step, and what has changed at its beginning.
 
     - `sides`, `modes`: those in force.
@@ -118,7 +118,7 @@ class Events(eqx.Module):
             near=none,
             sizes=unknown,
             length=none,
-            ahead=no,
+            early=no,
             passed=jnp.zeros((), int),
             one_sided=jnp.zeros((), int) if any(self.jumping) else None,
             grazing=none,
@@ -130,7 +130,7 @@ class Events(eqx.Module):
 
     def crossed(
         self, t: Array, y: Integrated, args: Arguments, last: Switches, jumped: Truth
-    ) -> tuple[Integrated, Begun]:
+    ) -> tuple[Integrated, Regime]:
         """Returns the state where a step begins, and what is in force in it.
 
         `t`, `y`: before what happens there; `jumped`: whether something may. `args`: of
@@ -157,7 +157,7 @@ class Events(eqx.Module):
             new = guards & (changed[-self.guards :].any() | ~same.all())
             on_zero, sizes = on_zero | new, jnp.where(new, 0, sizes)
         grazing = jnp.maximum(last.grazing, if_jumped(last.grazing_here, 0))
-        return y, Begun(sides, modes, changed, on_zero, sizes, grazing)
+        return y, Regime(sides, modes, changed, on_zero, sizes, grazing)
 
     def _after_event(
         self, t: Array, y: Integrated, args: Arguments, last: Switches, sides: Array,
@@ -170,7 +170,7 @@ class Events(eqx.Module):
         """
         before = args._replace(sides=last.sides, modes=last.modes)
         fired = changed[-self.guards :].reshape(-1, last.modes.mode.size)
-        time = jnp.where(last.ahead, t, last.until)
+        time = jnp.where(last.early, t, last.until)
         late, there = jnp.zeros_like(t), y
         if self.derivatives:
             arrived = changed & jumped & (last.length > 0)
@@ -200,7 +200,7 @@ class Events(eqx.Module):
             first = (before != after) & (jnp.cumsum(before != after) == 1)
             in_turn.insert(1, jnp.where(first, after, before))
         # A known time may be here too, just before the zeros or just after them.
-        t = jnp.where(last.ahead, t, last.until)
+        t = jnp.where(last.early, t, last.until)
         # In a step of no length no function comes to its zero gradually: it jumped, at
         # a known time.
         arrived = jumped & (last.length > 0)
@@ -214,7 +214,7 @@ class Events(eqx.Module):
 
     # What happens in a step?
 
-    def kept(self, begun: Begun, y1: Integrated, y0: Integrated) -> Integrated:
+    def kept(self, regime: Regime, y1: Integrated, y0: Integrated) -> Integrated:
         """Returns the end of a step, positions and rates of held joints as before.
 
         Rounding errors of earlier steps, which the compensated sum carries, would still
@@ -222,7 +222,7 @@ class Events(eqx.Module):
         """
         if not self.guards:
             return y1
-        held = begun.modes.held
+        held = regime.modes.held
 
         def still(new: PyTree, old: PyTree) -> PyTree:
             if eqx.is_array(new):
@@ -233,19 +233,19 @@ class Events(eqx.Module):
 
     def located(
         self, t0: Array, t1: Array, path: diffrax.AbstractLocalInterpolation,
-        own: Arguments, begun: Begun, last: Switches,
+        own: Arguments, regime: Regime, last: Switches,
     ) -> tuple[Found, Switches]:  # fmt: skip
         """Returns what a step found, and the state where it ended.
 
         `own`: the arguments in the step.
         """
-        sides, h = begun.sides, t1 - t0
+        sides, h = regime.sides, t1 - t0
         # Lengths of steps to a switch say nothing about the pace of the motion.
         share = jnp.finfo(t1.dtype).eps ** _NEAR
         near = jnp.maximum(jnp.maximum(share * h, last.near / 2), self.apart)
         values, checks = _values(*constant((self.term, t0, t1, path, own)))
         brief = h <= jnp.maximum(SHORTEST[t1.dtype], _BRIEF * near)
-        at = values, checks, sides, begun.on_zero, begun.sizes, near / h, brief
+        at = values, checks, sides, regime.on_zero, regime.sizes, near / h, brief
         passed = passage(*at)
         # A function that began on its zero has left it, after one or more steps.
         left = jnp.finfo(passed.sizes.dtype).eps ** _ON_ZERO * passed.sizes
@@ -268,24 +268,24 @@ class Events(eqx.Module):
             near=near,
             sizes=passed.sizes,
             length=h,
-            ahead=jnp.any(passed.switched & (sides * values[-1] > 0)),
-            passed=last.passed + jnp.sum(begun.changed & ~on_zero),
-            one_sided=self._one_sided(last, on_zero, begun, passed.sizes),
-            grazing=jnp.maximum(passed.missed, begun.grazing),
+            early=jnp.any(passed.switched & (sides * values[-1] > 0)),
+            passed=last.passed + jnp.sum(regime.changed & ~on_zero),
+            one_sided=self._one_sided(last, on_zero, regime, passed.sizes),
+            grazing=jnp.maximum(passed.missed, regime.grazing),
             grazing_here=passed.grazing,
-            modes=begun.modes,
+            modes=regime.modes,
         )
 
     def _one_sided(
-        self, last: Switches, on_zero: Array, begun: Begun, sizes: Array
+        self, last: Switches, on_zero: Array, regime: Regime, sizes: Array
     ) -> Array | None:
         """Returns `Switches.one_sided` at the end of a step."""
         if last.one_sided is None:
             return None
         jumping = np.array(self.jumping)
-        at_once = jumping & on_zero & (sizes > 0) & (begun.sides != 0)
+        at_once = jumping & on_zero & (sizes > 0) & (regime.sides != 0)
         at_once = jnp.any(at_once[: sizes.size - self.guards])
-        several = jnp.sum(begun.changed & jumping) > 1
+        several = jnp.sum(regime.changed & jumping) > 1
         together = several & (last.grazing_here > 0)
         return jnp.maximum(last.one_sided, at_once) + together
 

@@ -18,7 +18,7 @@ from jax.typing import ArrayLike
 from jaxtyping import PyTree
 
 from ..linkage.topology import real_joints
-from .derivative_control import OfLinearised, OfTangents, Step
+from .derivative_control import ProbeJudge, StepEnds, TangentJudge
 from .dopri8 import (
     Estimate,
     Health,
@@ -45,11 +45,11 @@ _NOISE = 8.0
 _HELD = 0.43
 
 
-class Judged(NamedTuple):
+class JudgeState(NamedTuple):
     """The state of a judge.
 
     - `controller`: that of diffrax's controller.
-    - `probe`: of derivatives (see `OfLinearised`).
+    - `probe`: of derivatives (see `ProbeJudge`).
     - `loss`: the largest loss of accuracy in steps so far.
     """
 
@@ -80,20 +80,20 @@ class Judge(eqx.Module):
     controller: Any
     term: ScheduledTerm
     watches: bool = eqx.field(static=True)
-    derivatives: OfTangents | OfLinearised | None
+    derivatives: TangentJudge | ProbeJudge | None
 
-    def start(self, run: tuple, y0: Integrated) -> tuple[Array, Judged]:
+    def start(self, run: tuple, y0: Integrated) -> tuple[Array, JudgeState]:
         """Returns the end of the first step, and the state of the judge.
 
         `run`: the arguments of a controller's `init`; `y0`: the state at the start.
         """
         end, controller = constant(self.controller.wrap(1).init(*run))
         probe = () if self.derivatives is None else self.derivatives.start(y0)
-        return end, Judged(controller, probe, jnp.zeros_like(end))
+        return end, JudgeState(controller, probe, jnp.zeros_like(end))
 
     def __call__(
-        self, step: Step, error: PyTree, order: float, before: Judged
-    ) -> tuple[NextStep, Judged, diffrax.RESULTS]:
+        self, step: StepEnds, error: PyTree, order: float, before: JudgeState
+    ) -> tuple[NextStep, JudgeState, diffrax.RESULTS]:
         """Returns the step that the controller plans next, and the state after this.
 
         Also returns whether its end is healthy. `before`: the state before it.
@@ -116,12 +116,12 @@ class Judge(eqx.Module):
         *plan, controller, result = constant(
             self.controller.wrap(1).adapt_step_size(*step, error, order, controller)
         )
-        return NextStep(*plan, result), Judged(controller, probe, loss), health  # pyright: ignore[reportCallIssue]
+        return NextStep(*plan, result), JudgeState(controller, probe, loss), health  # pyright: ignore[reportCallIssue]
 
     def settled(
-        self, after: Judged, before: Judged, step: NextStep, resumes: Array,
+        self, after: JudgeState, before: JudgeState, step: NextStep, resumes: Array,
         y1: Integrated,
-    ) -> Judged:  # fmt: skip
+    ) -> JudgeState:  # fmt: skip
         """Returns the state of the judge before the next step.
 
         `after`, `before`: the states at the ends of the step before; `y1`: its end;
@@ -131,15 +131,15 @@ class Judge(eqx.Module):
         if self.derivatives is not None:
             new = self.derivatives.start(y1)
             probe = chosen(jnp.array(step.jumped), new, probe)
-        return Judged(
+        return JudgeState(
             chosen(resumes, before.controller, controller),
             chosen(step.keep, probe, before.probe),
             jnp.where(step.keep, loss, before.loss),
         )
 
     def _healthy(
-        self, step: Step, error: PyTree
-    ) -> tuple[Step, Estimate, diffrax.RESULTS]:
+        self, step: StepEnds, error: PyTree
+    ) -> tuple[StepEnds, Estimate, diffrax.RESULTS]:
         """Returns a finite end, the error and health of a step, and its result."""
         t0, t1, y0, y1, args = step
         # Rates that are not finite make the error not finite.
@@ -165,7 +165,7 @@ def without_nan(error: PyTree) -> PyTree:
 
 def _above_rounding(
     control: ErrorControl,
-    step: Step,
+    step: StepEnds,
     estimate: Estimate,
     of_derivatives: Array | None,
     order: float | None,

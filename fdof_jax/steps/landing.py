@@ -91,11 +91,11 @@ class NextStep(NamedTuple):
     result: diffrax.RESULTS
 
 
-class _Landing(NamedTuple):
+class LandingState(NamedTuple):
     target: Array  # where this step is to end, infinity if anywhere
     gap: Array  # time left out after it, 0 unless it ends at a known time
     resumed: Array  # length of the step after it
-    beyond: Array  # end of the last step that passed a switch, -infinity if none
+    overshot: Array  # end of the last step that passed a switch, -infinity if none
     tries: Array  # to end at the next switch, up to here
     crossings: Array  # steps taken again for a switch, since the time `since`
     since: Array
@@ -168,19 +168,19 @@ class Landing(eqx.Module):
         gap = jnp.where(reached, jump + self.apart - place, 0)
         return jnp.where(reached, end, t1), gap, reached
 
-    def start(self, t0: Array, t1: Array, end: Array) -> tuple[Array, _Landing]:
+    def start(self, t0: Array, t1: Array, end: Array) -> tuple[Array, LandingState]:
         """Returns the end of the first step, where the controller ends it at `end`."""
         length, last = end - constant(t0), _last(t1)
         end, gap, cut = self._cut(constant(t0), t0 + length, last)
         if self.switches:  # a step of no length finds the sides
             end, gap, cut = t0, jnp.zeros_like(t0), jnp.array(True)
         target = jnp.where(cut, constant(end), jnp.inf)
-        beyond, none = jnp.full_like(target, -jnp.inf), jnp.zeros((), int)
+        overshot, none = jnp.full_like(target, -jnp.inf), jnp.zeros((), int)
         since = constant(jnp.asarray(t0))
-        return end, _Landing(target, gap, length, beyond, none, none, since, last)
+        return end, LandingState(target, gap, length, overshot, none, none, since, last)
 
     def _other_end(
-        self, begin: Array, end: Array, found: Found | None, state: _Landing
+        self, begin: Array, end: Array, found: Found | None, state: LandingState
     ) -> _OtherEnd:
         """Returns whether a step should end elsewhere, and where."""
         if found is None:
@@ -196,9 +196,9 @@ class Landing(eqx.Module):
         arrived = aimed & (state.gap == 0) & tiny
         passed = (within | at_once) & ~arrived
         unsure = ~passed & (found.unseen < end)
-        before = aimed & ~(passed | unsure | found.switched) & (end < state.beyond)
+        before = aimed & ~(passed | unsure | found.switched) & (end < state.overshot)
         # A tiny second step would tell little of slopes.
-        short = before & (end < found.soon) & (found.soon < state.beyond)
+        short = before & (end < found.soon) & (found.soon < state.overshot)
         hopeless = state.tries > _MOST_TRIES
         to_switch = jnp.where(hopeless, begin + (end - begin) / 2, found.until)
         again = jnp.where(passed, to_switch, jnp.where(short, found.soon, found.unseen))
@@ -206,8 +206,8 @@ class Landing(eqx.Module):
 
     def after(
         self, t0: Array, t1: Array, found: Found | None, planned: NextStep,
-        state: _Landing,
-    ) -> tuple[NextStep, Array, _Landing]:  # fmt: skip
+        state: LandingState,
+    ) -> tuple[NextStep, Array, LandingState]:  # fmt: skip
         """Returns the next step, and whether the controller resumes its old state.
 
         `planned`: what the controller would do. A step is one of these:
@@ -237,7 +237,7 @@ class Landing(eqx.Module):
         # Where is it to end? The error of a step that was cut short says little.
         cut_short = resumes & aimed
         length = jnp.where(cut_short, state.resumed, planned.t1 - planned.t0)
-        next_t1 = jnp.where(missed, state.beyond, next_t0 + length)
+        next_t1 = jnp.where(missed, state.overshot, next_t0 + length)
         next_t1, gap, cut = self._cut(constant(next_t0), next_t1, state.last)
         # What a jump at a known time makes switch, switches at exactly that time.
         again = jnp.where(other.again == begin, t0, other.again)
@@ -260,10 +260,10 @@ class Landing(eqx.Module):
             target=jnp.where(aims, constant(next_t1), jnp.inf),
             gap=jnp.where(retried, 0, gap),
             resumed=length,
-            beyond=jnp.where(
+            overshot=jnp.where(
                 planned.keep & other.passed,
                 end,
-                jnp.where(keep & ~missed, -jnp.inf, state.beyond),
+                jnp.where(keep & ~missed, -jnp.inf, state.overshot),
             ),
             tries=jnp.where(keep & ~missed, 0, state.tries + crossed),
             crossings=crossings,

@@ -1,6 +1,6 @@
 """The loop of an integration: steps of diffrax's methods, taken by hand.
 
-diffrax documents this way of stepping: its methods take the steps, and its controllers
+diffrax documents this way of scheme: its methods take the steps, and its controllers
 choose their lengths. Between the two stands what `diffeqsolve` has no place for: steps
 end where something happens, and are judged by more than their error.
 """
@@ -17,9 +17,9 @@ from jaxtyping import PyTree
 from ..base.checks import refusal
 from .dopri8 import Arguments, Integrated, ScheduledTerm, chosen, constant
 from .events import Events, Switches
-from .judge import Judge, Step, without_nan
+from .judge import Judge, StepEnds, without_nan
 from .landing import NEAR_END, Found, Landing, NextStep
-from .tolerances import Controller, Shortening, with_error_control
+from .tolerances import Controller, EagerController, with_error_control
 
 RESULTS: Any = diffrax.RESULTS
 # A lane stops once it has taken `_SLACK` times as many steps as it had taken when
@@ -39,7 +39,7 @@ class Problem(NamedTuple):
     ts: Array
 
 
-class Stepping(NamedTuple):
+class Scheme(NamedTuple):
     """How steps are taken.
 
     - `method`, `controller`: those of diffrax. `dt0`: length of the first step, or None
@@ -77,7 +77,7 @@ class Attempt(NamedTuple):
       there.
     - `meter`: state of the progress meter.
     - `steps`, `accepted`: numbers of steps tried and kept; `typical`: how many steps
-      most lanes took (see `Stepping.lanes`).
+      most lanes took (see `Scheme.lanes`).
     - `result`: the first failure, if any.
     """
 
@@ -86,7 +86,7 @@ class Attempt(NamedTuple):
     y: Integrated
     jumped: Array | None
     method: PyTree
-    judged: Any  # Judged | PyTree
+    judged: Any  # JudgeState | PyTree
     wrappers: PyTree
     landing: PyTree
     switches: Any  # Switches | None
@@ -100,7 +100,7 @@ class Attempt(NamedTuple):
     result: diffrax.RESULTS
 
 
-class _Taken(NamedTuple):
+class _StepResult(NamedTuple):
     """A step that was taken, whether it is kept or not.
 
     - `args`: what is in force in it. `y1`: the state at its end; `path`: there and
@@ -119,7 +119,7 @@ class _Taken(NamedTuple):
     switches: Switches | None
 
 
-class _Answering(diffrax.AbstractStepSizeController):
+class _FixedAnswer(diffrax.AbstractStepSizeController):
     """Stands for a controller within others, which change the answer that it gives."""
 
     answer: Any
@@ -134,27 +134,29 @@ class _Answering(diffrax.AbstractStepSizeController):
         return self.answer
 
 
-def solve(problem: Problem, stepping: Stepping) -> Attempt:
+def solve(problem: Problem, scheme: Scheme) -> Attempt:
     """Integrates a problem; returns the state of the loop at its end.
 
     A failure is its `result`.
     """
-    ts, landing, most = problem.ts, stepping.landing, stepping.most_steps
+    ts, landing, most = problem.ts, scheme.landing, scheme.most_steps
     last = ts[-1] if landing is None else landing.end_of_run(ts)
-    kind, checkpoints = _kind_of(stepping)
+    kind, checkpoints = _kind_of(scheme)
+    # Times add up with rounding, which might leave a step of an ulp at the end.
     near_end = last - NEAR_END * jnp.finfo(ts.dtype).eps * jnp.abs(last)
 
     def advance(a: Attempt) -> Attempt:
-        taken = _taken(problem, stepping, a)
-        step, judged, wrappers, of_landing = _planned(problem, stepping, a, taken)
+        taken = _taken(problem, scheme, a)
+        step, judged, wrappers, of_landing = _planned(problem, scheme, a, taken)
         saved, rows = _saved(ts, kind, a, taken, step.keep)
         t = step.t0
         at_end = step.keep & (step.t1 > near_end)
+        # A method may fail in a step that is too long; only one that is kept counts.
         result = RESULTS.where(step.keep, taken.failed, RESULTS.successful)
         result = RESULTS.where(result == RESULTS.successful, step.result, result)
         steps, typical = a.steps + 1, a.typical
-        if stepping.lanes is not None:
-            result, typical = _together(steps, typical, result, stepping.lanes)
+        if scheme.lanes is not None:
+            result, typical = _together(steps, typical, result, scheme.lanes)
         kept = lambda after, before: chosen(step.keep, after, before)
         return Attempt(
             t=t,
@@ -169,7 +171,7 @@ def solve(problem: Problem, stepping: Stepping) -> Attempt:
             sampled=kept(taken.args.sampled, a.sampled),
             rows=rows,
             saved=saved,
-            meter=stepping.meter.step(a.meter, constant((t - ts[0]) / (last - ts[0]))),
+            meter=scheme.meter.step(a.meter, constant((t - ts[0]) / (last - ts[0]))),
             steps=steps,
             accepted=a.accepted + step.keep,
             typical=typical,
@@ -182,13 +184,16 @@ def solve(problem: Problem, stepping: Stepping) -> Attempt:
     end = eqx.internal.while_loop(
         lambda a: unfinished(a) & (True if most is None else a.steps < most),
         advance,
-        _first_attempt(problem, stepping, last),
+        _first_attempt(problem, scheme, last),
         kind=kind,
+        # As data `most` may change without a new program; other kinds need it to know
+        # how much memory the backward pass takes.
         max_steps=None if kind == "lax" else most,
+        # Rows are written once and not read: a backward pass need not store them.
         buffers=lambda a: a.rows,
         checkpoints=checkpoints,
     )
-    if kind == "lax" and not isinstance(stepping.adjoint, diffrax.ForwardMode):
+    if kind == "lax" and not isinstance(scheme.adjoint, diffrax.ForwardMode):
         end = eqx.internal.nondifferentiable_backward(
             end,
             msg="reverse-mode differentiation of simulate needs an upper bound of its "
@@ -196,26 +201,27 @@ def solve(problem: Problem, stepping: Stepping) -> Attempt:
             "checkpoints.",
             symbolic=True,
         )
-    stepping.meter.close(end.meter)
+    scheme.meter.close(end.meter)
     result = RESULTS.where(unfinished(end), RESULTS.max_steps_reached, end.result)
     return end._replace(result=result)
 
 
-def _first_attempt(problem: Problem, stepping: Stepping, last: Array) -> Attempt:
+def _first_attempt(problem: Problem, scheme: Scheme, last: Array) -> Attempt:
     """Returns the state of the loop before the first step."""
     (term, y0, args, ts), t0 = problem, problem.ts[0]
-    method, controller, judge = stepping.method, stepping.controller, stepping.judge
-    events, landing = stepping.events, stepping.landing
+    method, controller, judge = scheme.method, scheme.controller, scheme.judge
+    events, landing = scheme.events, scheme.landing
     switches = of_landing = wrappers = jumped = None
     end: Any
     if events is not None:
         switches = events.start(t0, args)
         args = args._replace(sides=switches.sides, modes=switches.modes)
     order = method.error_order(term)
-    run: Any = term, t0, last, y0, stepping.dt0, args, method.func, order
+    run: Any = term, t0, last, y0, scheme.dt0, args, method.func, order
     if judge is None:
         end, judged = controller.wrap(1).init(*run)
     else:
+        # Up to the tolerance, a motion does not depend on the lengths of its steps.
         run = constant(run)
         end, judged = judge.start(run, y0)
     if landing is not None:
@@ -234,6 +240,7 @@ def _first_attempt(problem: Problem, stepping: Stepping, last: Array) -> Attempt
         end=end,
         y=y0,
         jumped=jumped,
+        # Methods begin with zeros, or with a guess.
         method=constant(method.init(term, t0, end, y0, args)),
         judged=judged,
         wrappers=wrappers,
@@ -242,49 +249,53 @@ def _first_attempt(problem: Problem, stepping: Stepping, last: Array) -> Attempt
         sampled=args.sampled,
         rows=jax.tree.map(rows, _row(y0, args)),
         saved=none,
-        meter=stepping.meter.init(),
+        meter=scheme.meter.init(),
         steps=none,
         accepted=none,
-        typical=None if stepping.lanes is None else none,
+        typical=None if scheme.lanes is None else none,
         result=RESULTS.successful,
     )
 
 
-def _taken(problem: Problem, stepping: Stepping, a: Attempt) -> _Taken:
+def _taken(problem: Problem, scheme: Scheme, a: Attempt) -> _StepResult:
     """Takes a step, after what happens where it begins; returns what happens in it."""
     term, _, args, _ = problem
-    method, events = stepping.method, stepping.events
-    y0, begun, found, switches = a.y, None, None, None
+    method, events = scheme.method, scheme.events
+    y0, regime, found, switches = a.y, None, None, None
     jumped: Any = False if a.jumped is None else a.jumped
     args = args._replace(sampled=a.sampled)
     if events is not None:
-        y0, begun = events.crossed(a.t, a.y, args, a.switches, jumped)
-        args = args._replace(sides=begun.sides, modes=begun.modes)
+        y0, regime = events.crossed(a.t, a.y, args, a.switches, jumped)
+        args = args._replace(sides=regime.sides, modes=regime.modes)
+    # A controller measures what is left of a blow, and what it commands moves no joint
+    # at once; so prescribed joints may come last.
     if term.sample is not None:
         sampled, changed = term.sample(a.t, y0, args)
         args, jumped = args._replace(sampled=sampled), jumped | changed
     if term.settle is not None:
-        y0, jumped = term.settle(a.t, y0, args), True
+        y0, jumped = term.settle(a.t, y0, args), True  # rates of before are out of date
     y1, error, dense, of_method, failed = method.step(
         term, a.t, a.end, y0, args, a.method, jumped
     )
     path = method.interpolation_cls(t0=a.t, t1=a.end, **dense)
     if events is not None:
-        assert begun is not None
-        y1 = events.kept(begun, y1, y0)
-        found, switches = events.located(a.t, a.end, path, args, begun, a.switches)
-    return _Taken(args, y1, path, error, of_method, failed, found, switches)
+        assert regime is not None
+        y1 = events.kept(regime, y1, y0)
+        # Looked for in a step that its error may reject, too: whether it is kept is
+        # known later, and a batch computes both anyway.
+        found, switches = events.located(a.t, a.end, path, args, regime, a.switches)
+    return _StepResult(args, y1, path, error, of_method, failed, found, switches)
 
 
 def _planned(
-    problem: Problem, stepping: Stepping, a: Attempt, taken: _Taken
+    problem: Problem, scheme: Scheme, a: Attempt, taken: _StepResult
 ) -> tuple[NextStep, Any, PyTree, PyTree]:
     """Returns the next step, and the states `judged`, `wrappers` and `landing`."""
-    judge, landing, controller = stepping.judge, stepping.landing, stepping.controller
+    judge, landing, controller = scheme.judge, scheme.landing, scheme.controller
     of_landing, resumes = None, jnp.array(False)
-    order = stepping.method.error_order(problem.term)
+    order = scheme.method.error_order(problem.term)
     # Tolerances are those of the state before what happens where the step begins.
-    step, error = Step(a.t, a.end, a.y, taken.y1, taken.args), taken.error
+    step, error = StepEnds(a.t, a.end, a.y, taken.y1, taken.args), taken.error
     if judge is None:
         error = without_nan(error)
         *plan, judged, result = controller.wrap(1).adapt_step_size(
@@ -299,7 +310,7 @@ def _planned(
             "solver",
             "one that estimates errors, as steps are adaptive (diffrax.HalfSolver lets "
             "any do so)",
-            stepping.method,
+            scheme.method,
         )
     plan, judged, health = judge(step, error, order, a.judged)
     if landing is not None:
@@ -321,11 +332,11 @@ def _planned(
 
 def _around(answer: tuple, controller: Controller) -> Controller:
     """Returns a controller in which the one that judges errors gives an answer."""
-    return with_error_control(lambda _: _Answering(answer), controller.wrap(1))
+    return with_error_control(lambda _: _FixedAnswer(answer), controller.wrap(1))
 
 
 def _saved(
-    ts: Array, kind: Any, a: Attempt, taken: _Taken, keep: Array
+    ts: Array, kind: Any, a: Attempt, taken: _StepResult, keep: Array
 ) -> tuple[Array, PyTree]:
     """Returns the number of output times so far, and the states there."""
 
@@ -378,12 +389,12 @@ def _together(
 def _never_jumps(controller: Controller) -> bool:
     """Returns whether a controller never says that rates jump after a step."""
     fixed = diffrax.ConstantStepSize, diffrax.StepTo
-    return type(controller) in (diffrax.PIDController, Shortening, *fixed)
+    return type(controller) in (diffrax.PIDController, EagerController, *fixed)
 
 
-def _kind_of(stepping: Stepping) -> tuple[Any, int | None]:
+def _kind_of(scheme: Scheme) -> tuple[Any, int | None]:
     """Returns the kind of equinox's loops for an adjoint, and how many checkpoints."""
-    adjoint, bounded = stepping.adjoint, stepping.most_steps is not None
+    adjoint, bounded = scheme.adjoint, scheme.most_steps is not None
     if isinstance(adjoint, diffrax.RecursiveCheckpointAdjoint):
         if bounded or adjoint.checkpoints is not None:
             return "checkpointed", adjoint.checkpoints

@@ -117,7 +117,7 @@ def by_square_roots(controller: Controller) -> Controller:
         used = pid.pcoeff, pid.icoeff, pid.dcoeff, pid.error_order
         plain = all(isinstance(number, int | float | None) for number in used)
         # Subclasses of a user may have another formula.
-        diffrax_rule = type(pid) in (diffrax.PIDController, Shortening)
+        diffrax_rule = type(pid) in (diffrax.PIDController, EagerController)
         if not (diffrax_rule and plain and used == (0, 1, 0, None)):
             return pid
 
@@ -129,7 +129,7 @@ def by_square_roots(controller: Controller) -> Controller:
     return with_pid(without_powers, controller)
 
 
-class Shortening(diffrax.PIDController):
+class EagerController(diffrax.PIDController):
     """An integral controller that may shorten the next step even after one it keeps.
 
     After a step that it keeps, diffrax's controller never takes a shorter one, even if
@@ -171,7 +171,7 @@ def adaptive(
     shortest = _shortest_step()
     # In float32 the rounding errors of stiff forces, which nothing estimates, are not
     # far below usual tolerances; to shorten steps after them would be to chase them.
-    kind = of_precision(Shortening, diffrax.PIDController)
+    kind = of_precision(EagerController, diffrax.PIDController)
     return kind(rtol, atol, dtmin=shortest, force_dtmin=False)
 
 

@@ -77,8 +77,8 @@ def _moved(y: State, h: Array, rate: State) -> State:
     return jax.tree.map(lambda a, k: a + h * k, y, rate)
 
 
-class _Step(NamedTuple):
-    """The end of a step, the step's error and what the next step needs.
+class _End(NamedTuple):
+    """The end of a step, with its error and what the next step needs.
 
     `rate` and its `health` are those at the end. `residue` is the rounding error of
     `y`, which the next step adds (Kahan): over 1000 s of Fig 5 in steps of 2.5 ms the
@@ -93,7 +93,7 @@ class _Step(NamedTuple):
 
 
 @eqx.filter_jit  # traced once, not at each use in a solve
-def _step(term, t0, t1, y0, residue, args, f0) -> tuple[_Step, dict[str, PyTree]]:
+def _step(term, t0, t1, y0, residue, args, f0) -> tuple[_End, dict[str, PyTree]]:
     h = t1 - t0
     times = t0 + h * jnp.asarray(SCHEDULE_SHARES, t0.dtype)
     # XLA makes vectors of the lanes, not of all stages of each, only in a loop.
@@ -112,7 +112,7 @@ def _step(term, t0, t1, y0, residue, args, f0) -> tuple[_Step, dict[str, PyTree]
     y, error, residue = in_one_loop((y, error, residue))
     last, health = term.watched_field(times[AT_END], y, args, scheduled(AT_END))
     dense_info = dict(y0=y0, step=h, rates=[*rates, last], scheduled=schedule)
-    return _Step(y, error, residue, last, health), dense_info
+    return _End(y, error, residue, last, health), dense_info
 
 
 class _Interpolation(DenseOutput):

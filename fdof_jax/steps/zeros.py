@@ -39,7 +39,7 @@ _SLOPES = (
 # Steps end where a switching function has passed its zero by this power of the unit of
 # rounding, times its size up to there, and by this multiple of it. There the side to
 # which the motion goes is known even if it began at rest on the zero.
-_BEYOND, _ROUNDING = 0.75, 500
+_OFFSET, _ROUNDING = 0.75, 500
 _WRONG = 0.375  # power of it, over a size: so far from zero no step has ended
 _SOON = 0.01  # of a step, for extrapolation
 # A function that turns back within this share of its size nearly touches its zero.
@@ -52,12 +52,12 @@ _ITERATIONS = 6  # of Newton's method within a bracket
 _ELSEWHERE = 12
 
 
-class _Margins(NamedTuple):
+class _Margin(NamedTuple):
     """Switching functions, positive on the side in force, in a step: (n,) each."""
 
     past: Array  # (sample, n), from the places where steps end, beyond the zeros
     slopes: Array  # (sample, n), per step
-    beyond: Array  # how far these places are from the zeros
+    offset: Array  # how far these places are from the zeros
     largest: Array  # the largest value on either side
     unsure: Array  # how far a margin may be from its polynomial between samples
     bend: Array  # second derivative at the end
@@ -75,7 +75,7 @@ def _largest(rows: Sequence[Array]) -> Array:
 
 def _margins(
     values: Array, checks: Array, side: Array, before: Array, brief: Array
-) -> _Margins:
+) -> _Margin:
     """Returns the margin of one function by its polynomial through `values`.
 
     The error of polynomials shows in their last terms and at the further samples
@@ -89,11 +89,11 @@ def _margins(
     unsure = _ELSEWHERE * jnp.maximum(_largest([*last, *wrong]) - rounding, 0)
     slopes = [_sum(row, rows) for row in _SLOPES]
     size = _size_of_motion(rows, slopes[0], largest)
-    beyond = eps**_BEYOND * size + _ROUNDING * eps
-    past = [row + beyond for row in rows]
+    offset = eps**_OFFSET * size + _ROUNDING * eps
+    past = [row + offset for row in rows]
     unsure, bend = jnp.where(brief, 0, unsure), _sum(_BEND, rows)
-    past, slopes, *others = in_one_loop((past, slopes, beyond, largest, unsure, bend))
-    return _Margins(jnp.stack(past), jnp.stack(slopes), *others)
+    past, slopes, *others = in_one_loop((past, slopes, offset, largest, unsure, bend))
+    return _Margin(jnp.stack(past), jnp.stack(slopes), *others)
 
 
 def _size_of_motion(rows: Sequence[Array], slope: Array, largest: Array) -> Array:
@@ -114,14 +114,14 @@ def _size_of_motion(rows: Sequence[Array], slope: Array, largest: Array) -> Arra
     return jnp.where(on_zero, largest, size)
 
 
-def _turns(margins: _Margins) -> tuple[Array, Array]:
+def _turns(margins: _Margin) -> tuple[Array, Array]:
     """Returns where margins turn back to rising between two samples, and their values.
 
     These are the shares of the step and the values of cubics, infinite if there is no
     such place.
     """
     past, slopes = margins.past, margins.slopes
-    least = margins.beyond  # smaller changes are rounding
+    least = margins.offset  # smaller changes are rounding
     lengths = jnp.asarray(_LENGTHS, past.dtype)[:, None]
     change = past[1:] - past[:-1]
     fall, rise = slopes[:-1] * lengths, slopes[1:] * lengths
@@ -193,7 +193,7 @@ def passage(
 
 
 def _first_zero(
-    margins: _Margins, turns: Array, lowest: Array, before: Array
+    margins: _Margin, turns: Array, lowest: Array, before: Array
 ) -> tuple[Array, Array, Array]:
     """Returns the first three parts of the `Passage`.
 
@@ -236,11 +236,11 @@ def _first_zero(
     return jnp.where(wrong, 0, zero), passes | wrong, near
 
 
-def _hiding_place(margins: _Margins, lowest: Array, begun: Array, near: Array) -> Array:
+def _hiding_place(margins: _Margin, lowest: Array, begun: Array, near: Array) -> Array:
     """Returns a share of the step where a margin may pass 0 unseen, or else 1."""
     past, unsure = margins.past, margins.unsure[None]
     # Margins on their zeros at the ends do not turn back within.
-    ending = jnp.abs(past[-1] - margins.beyond) <= -margins.slopes[-1] * near
+    ending = jnp.abs(past[-1] - margins.offset) <= -margins.slopes[-1] * near
     inner = past.at[0].add(jnp.where(begun, jnp.inf, 0))
     inner = inner.at[-1].add(jnp.where(ending, jnp.inf, 0))
     lowest = jnp.minimum(lowest, jnp.minimum(inner[:-1], inner[1:]))
@@ -251,7 +251,7 @@ def _hiding_place(margins: _Margins, lowest: Array, begun: Array, near: Array) -
 
 
 def _at_end(
-    margins: _Margins, last: Array, sizes: Array, near: Array
+    margins: _Margin, last: Array, sizes: Array, near: Array
 ) -> tuple[Array, Array, Array]:
     """Returns what is at the step's end; `last`: the margins there."""
     eps, nearer = jnp.finfo(sizes.dtype).eps, -margins.slopes[-1]
