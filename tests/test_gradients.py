@@ -12,7 +12,7 @@ from test_gradient_quality import POINTS, tangents, tracked
 
 import fdof_jax as fj
 from fdof_jax import scenes
-from fdof_jax.analysis.measures import tip_deviation
+from fdof_jax.tuning.losses import tip_deviation
 
 TS = np.linspace(0, 1.0, 21)
 ZERO = jnp.zeros(2)

@@ -24,9 +24,7 @@ from ..linkage.linkage import (
     moving_joints,
     without_fixed,
 )
-from ..mechanics.kinematics import tip_position
 from ..references.reference import reference_motion
-from ..references.task import TipReference
 from ..simulation.efforts import acting_in
 from ..simulation.field import element_effort, with_states
 from ..simulation.simulate import check_own
@@ -256,12 +254,3 @@ def relative_demands(
     limit = jnp.broadcast_to(controller.limit, demanded.shape)
     beyond = jnp.where(demanded == 0, 0, jnp.sign(demanded) * jnp.inf)
     return jnp.where(limit > 0, demanded / jnp.where(limit > 0, limit, 1), beyond)
-
-
-@eqx.filter_jit
-def tip_deviation(
-    linkage: Linkage, task: TipReference, solution: Solution
-) -> Float[Array, "time 2"]:
-    """Vectors from the commanded to the actual tip along a motion [m]."""
-    actual = jax.vmap(tip_position, in_axes=(None, 0))(linkage, solution.q)
-    return actual - jax.vmap(task.tip)(solution.ts)

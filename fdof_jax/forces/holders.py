@@ -7,20 +7,17 @@ an element here holds is held by one too, for as long as the element's law allow
 from collections.abc import Sequence
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jaxtyping import Bool
 from numpy.typing import ArrayLike
 
-from ..base.checks import check_known, refusal
+from ..base.checks import refusal
 from ..linkage.fields import Condition, Values, each, field, ordered
+from ..linkage.joint_numbers import among_joints, numbered, numbers_in
 from ..linkage.linkage import Linkage, joints_of
-from ..linkage.topology import MOST_PAIRS
 from .element import Forces, ScalarElement
-
-_NUMBERS = tuple(range(1, MOST_PAIRS + 1))
 
 
 class Holder(ScalarElement):
@@ -195,35 +192,6 @@ class Brake(Holder):
 
     def braking(self, t, linkage):
         return self.joints[: joints_of(linkage)] & (self.begin <= t) & (t < self.end)
-
-
-def numbered(joints: Any) -> Array:
-    """Returns whether each number of a joint is among those given.
-
-    Raises ValueError for what are no numbers of joints.
-    """
-    check_known("joints", joints)
-    array = isinstance(joints, Array | np.ndarray)
-    given = joints.tolist() if array else joints
-    numbers = given if isinstance(given, list | tuple) else (given,)
-    if not numbers or any(
-        isinstance(n, bool) or not isinstance(n, int) or n not in _NUMBERS
-        for n in numbers
-    ):
-        expected = f"a number of 1 to {_NUMBERS[-1]}, or several such"
-        raise refusal("joints", expected, joints)
-    return jax.device_put(np.isin(_NUMBERS, numbers))
-
-
-def among_joints(joints: Array, linkage: Linkage) -> Condition:
-    """Returns the condition that an arm has the joints that are marked."""
-    count, last = joints_of(linkage), (joints * np.array(_NUMBERS)).max()
-    return Condition(last <= count, "joints", f"1 to {count}", last)
-
-
-def numbers_in(joints: Array) -> np.ndarray:
-    """Returns the numbers of the joints that are marked, as `numbered` marks them."""
-    return np.array([number for number, marked in zip(_NUMBERS, joints) if marked])
 
 
 def holders(forces: Forces) -> tuple[Holder, ...]:

@@ -21,8 +21,8 @@ from numpy.typing import ArrayLike
 from ..base.checks import place_of, refusal
 from ..dynamics import mass_and_bias
 from ..forces.element import Element, Forces, naming
-from ..forces.holders import among_joints, numbered, numbers_in
 from ..linkage.fields import Truth, called
+from ..linkage.joint_numbers import among_joints, numbered, numbers_in
 from ..linkage.linkage import Linkage, joints_of
 from ..linkage.topology import fixed_pairs
 from ..references.reference import EXPECTED, reference_motion

@@ -11,13 +11,15 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from ..analysis.measures import relative_demands, tip_deviation
+from ..analysis.measures import relative_demands
 from ..base.checks import check_known, function, instance, real_array, refusal
 from ..control.pd import PDController
 from ..forces.element import Element
 from ..linkage.fields import Part, Values, field
-from ..linkage.linkage import without_fixed
+from ..linkage.linkage import Linkage, without_fixed
+from ..mechanics.kinematics import tip_position
 from ..references.reference import reference_motion, reference_of
+from ..references.task import TipReference
 from ..search import Evaluation, check_scene, sum_of_squares
 from ..simulation.jacobian import Sensitivities, jacobian_of
 from ..simulation.scene import Scene
@@ -99,6 +101,15 @@ def tip_errors(scene: Scene, solution: Solution) -> Float[Array, " residual"]:
     _check_motion(scene, solution)
     deviation = tip_deviation(scene.linkage, tracked_task(scene), solution)
     return deviation.reshape(-1) / solution.ts.size**0.5
+
+
+@eqx.filter_jit
+def tip_deviation(
+    linkage: Linkage, task: TipReference, solution: Solution
+) -> Float[Array, "time 2"]:
+    """Vectors from the commanded to the actual tip along a motion [m]."""
+    actual = jax.vmap(tip_position, in_axes=(None, 0))(linkage, solution.q)
+    return actual - jax.vmap(task.tip)(solution.ts)
 
 
 def joint_errors(scene: Scene, solution: Solution) -> Float[Array, " residual"]:

@@ -11,8 +11,8 @@ import pytest
 from modes import LOOPS
 
 import fdof_jax as fj
-from fdof_jax.analysis.measures import tip_deviation
 from fdof_jax.base.trigonometry import sincos
+from fdof_jax.tuning.losses import tip_deviation
 from hard.scenes import arm
 
 STILL = np.zeros(3)
