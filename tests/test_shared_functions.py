@@ -72,6 +72,20 @@ def nested(k):
     return lambda x: jax.vmap(lambda y: -k * y)(x[None])[0]
 
 
+def with_sum(k):
+    def force(x):
+        total = 0.0
+
+        def add(y):
+            nonlocal total
+            total += y
+
+        add(-k * x)
+        return total
+
+    return force
+
+
 def of_global(k):
     global RATE
     RATE = k
@@ -176,7 +190,7 @@ def partial(k):
 
 SHARED = [
     damping, by_default, with_array, with_helper, nested, of_global, of_arm,
-    of_whole_number, with_length,
+    of_whole_number, with_length, with_sum,
 ]  # fmt: skip
 OWN = [
     beyond_64_bits, by_failure, by_kind, by_name, by_range, by_type, chosen, counting,

@@ -12,8 +12,9 @@ import dis
 import functools
 import inspect
 import types
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 import equinox as eqx
@@ -29,14 +30,14 @@ _FIXED = {
     "builtins", "cmath", "diffrax", "equinox", "fdof_jax", "functools", "itertools",
     "jax", "jaxlib", "math", "numpy", "operator", "optimistix", "scipy",
 }  # fmt: skip
-_JITTED = type(jax.jit(lambda: None))
-_CONSTANTS = bool | int | str | bytes | np.dtype | np.ufunc | jnp.ufunc | _JITTED
+_CONSTANTS = bool | int | str | bytes | np.dtype | np.ufunc | jnp.ufunc
+_AS_IT_IS = _CONSTANTS | jax.Array | type(jax.jit(lambda: None))
 _OF_NUMPY = {"pi", "inf", "nan", "e", "newaxis"}
 # What these do depends on more than the names in the code.
 _OPAQUE = {"eval", "exec", "globals", "locals", "vars", "super"}
 # These, text made of values and what catches errors tell a number from an array.
 _OPAQUE |= {"format", "getattr", "hasattr", "isinstance", "repr", "str", "type"}
-_OPAQUE_STEPS = {
+_OPAQUE |= {
     "STORE_GLOBAL", "DELETE_GLOBAL", "IMPORT_NAME", "MATCH_CLASS", "FORMAT_VALUE",
     "FORMAT_SIMPLE", "FORMAT_WITH_SPEC", "PUSH_EXC_INFO",
 }  # fmt: skip
@@ -46,7 +47,6 @@ _OPAQUE_STEPS = {
 _DATA = (float, np.floating, int), (float, np.floating)
 _fewer: Counter["_Code"] = Counter()
 
-
 _T = TypeVar("_T")
 
 
@@ -54,17 +54,12 @@ class _Unknown(Exception):
     """Raised for a function that reaches what may change unseen."""
 
 
+@dataclass(frozen=True)
 class _Code:
     """The code of a function, equal to such code in any place of the source."""
 
-    def __init__(self, code: types.CodeType):
-        self.code, self.anywhere = code, _anywhere(code)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Code) and self.anywhere == other.anywhere
-
-    def __hash__(self) -> int:
-        return hash(self.anywhere)
+    code: types.CodeType = field(compare=False)
+    anywhere: types.CodeType
 
 
 @functools.lru_cache(maxsize=1024)
@@ -73,6 +68,10 @@ def _anywhere(code: types.CodeType) -> types.CodeType:
     within = lambda x: _anywhere(x) if isinstance(x, types.CodeType) else x
     constants = tuple(map(within, code.co_consts))
     return code.replace(co_firstlineno=1, co_linetable=b"", co_consts=constants)
+
+
+def _code_of(function: types.FunctionType) -> _Code:
+    return _Code(function.__code__, _anywhere(function.__code__))
 
 
 class SharedFunction(eqx.Module):
@@ -84,14 +83,15 @@ class SharedFunction(eqx.Module):
     def __call__(self, *arguments: Any, **keywords: Any) -> Any:
         closure, defaults, of_keywords, names = self.reach
         cells = tuple(map(types.CellType, closure))
-        names = names | {"__builtins__": builtins}
-        function = types.FunctionType(self.code.code, names, None, defaults, cells)
+        within = names | {"__builtins__": builtins}
+        function = types.FunctionType(self.code.code, within, None, defaults, cells)
         function.__kwdefaults__ = of_keywords
         before, structure = jax.tree.flatten(self.reach)
         returned = function(*arguments, **keywords)
-        after, now = jax.tree.flatten(self.reach)
+        closure = tuple(cell.cell_contents for cell in cells)
+        after, now = jax.tree.flatten((closure, defaults, of_keywords, names))
         if now != structure or any(a is not b for a, b in zip(after, before)):
-            raise TypeError("it changes a list or a dict outside, here a copy")
+            raise TypeError("it changes a value outside, here a copy")
         return returned
 
 
@@ -106,11 +106,11 @@ def sharing_functions(run: Callable[..., _T], **trees: PyTree) -> _T:
     while True:
         # Of a dict, JAX would return the values in the order of its keys.
         shared = {name: jax.tree.map(_shared, tree) for name, tree in trees.items()}
-        nodes = jax.tree.leaves(shared, is_leaf=_is_shared)
         try:
             result = run(*shared.values())
             break
         except (TypeError, ValueError, AttributeError, IndexError):
+            nodes = jax.tree.leaves(shared, is_leaf=_is_shared)
             codes = {node.code for node in nodes if _is_shared(node)}
             if not codes:
                 raise
@@ -137,34 +137,32 @@ def _shared(leaf: object) -> object:
 def _parts_of(
     function: types.FunctionType, within: tuple[types.FunctionType, ...] = ()
 ) -> SharedFunction:
-    code = function.__code__
-    shared = _Code(code)
-    if function.__dict__ or function in within or _fewer[shared] >= len(_DATA):
+    code, among = _code_of(function), function.__globals__
+    if function.__dict__ or function in within or _fewer[code] >= len(_DATA):
         raise _Unknown
-    among = function.__globals__
-    names = {name: among[name] for name in _global_names(code) if name in among}
+    read = _global_names(code.code)
+    names = {name: among[name] for name in sorted(read) if name in among}
     # NumPy's functions may take an array for no number, or draw random ones.
     if any(value is np for value in names.values()):
-        if not set(code.co_names) <= {*names, *_OF_NUMPY}:
+        if not set(code.code.co_names) <= {*names, *_OF_NUMPY}:
             raise _Unknown
     closure = tuple(cell.cell_contents for cell in function.__closure__ or ())
-    numbers, within = _DATA[_fewer[shared]], (*within, function)
+    of_keywords = dict(sorted((function.__kwdefaults__ or {}).items()))
+    numbers, within = _DATA[_fewer[code]], (*within, function)
 
     def part(leaf: object) -> object:
         if isinstance(leaf, numbers) and not isinstance(leaf, bool):
             # Of Python's numbers an array that leaves the types of others, too.
             return jax.device_put(leaf)
-        if isinstance(leaf, jax.Array) or type(leaf) is np.ndarray:
-            return leaf
-        if isinstance(leaf, _CONSTANTS) or _is_fixed(leaf):
+        array = type(leaf) is np.ndarray
+        if array or isinstance(leaf, _AS_IT_IS) or _is_fixed(leaf):
             return leaf
         if inspect.isfunction(leaf):
             return _parts_of(leaf, within)
         raise _Unknown
 
-    named = (dict(sorted(d.items())) for d in (function.__kwdefaults__ or {}, names))
-    reach = closure, function.__defaults__, *named
-    return SharedFunction(jax.tree.map(part, reach, is_leaf=_out_of_order), shared)
+    reach = closure, function.__defaults__, of_keywords, names
+    return SharedFunction(jax.tree.map(part, reach, is_leaf=_out_of_order), code)
 
 
 def _out_of_order(node: object) -> bool:
@@ -176,22 +174,14 @@ def _out_of_order(node: object) -> bool:
 def _global_names(code: types.CodeType) -> frozenset[str]:
     """Returns the global names that code reads.
 
-    Raises _Unknown if it writes names outside, or may tell a number from an array.
+    Raises _Unknown if it writes some, or may tell a number from an array.
     """
-    names = set()
-    for instruction in dis.get_instructions(code):
-        if instruction.opname in _OPAQUE_STEPS:
-            raise _Unknown
-        if instruction.opname in ("STORE_DEREF", "DELETE_DEREF"):
-            if instruction.argval in code.co_freevars:
-                raise _Unknown
-        if instruction.opname in ("LOAD_GLOBAL", "LOAD_NAME"):
-            names.add(instruction.argval)
-        if isinstance(instruction.argval, types.CodeType):
-            names |= _global_names(instruction.argval)
-    if names & _OPAQUE:
+    steps = [(step.opname, step.argval) for step in dis.get_instructions(code)]
+    names = {name for step, name in steps if step in ("LOAD_GLOBAL", "LOAD_NAME")}
+    if not _OPAQUE.isdisjoint(names.union(step for step, _ in steps)):
         raise _Unknown
-    return frozenset(names)
+    inner = [x for x in code.co_consts if isinstance(x, types.CodeType)]
+    return frozenset(names.union(*map(_global_names, inner)))
 
 
 def _is_fixed(value: object) -> bool:
@@ -204,23 +194,24 @@ def _is_fixed(value: object) -> bool:
     return home is not None and home.partition(".")[0] in _FIXED
 
 
-_keys: set[int] = set()  # of callables, each of which has a program
-_alike: Counter[_Code | type] = Counter()  # the same, by their code or type
+# Of callables that have programs of their own, by their code or type.
+_alike: defaultdict[_Code | type, set[int]] = defaultdict(set)
 
 
 def _warn_of_third(trees: dict[str, PyTree]) -> None:
     leaves, _ = jax.tree_util.tree_flatten_with_path(trees, is_leaf=_is_shared)
     for (tree, *path), leaf in leaves:
-        compiled = not isinstance(leaf, _CONSTANTS) or isinstance(leaf, _JITTED)
-        if not (callable(leaf) and compiled) or (key := _key(leaf)) in _keys:
+        if not callable(leaf) or isinstance(leaf, _CONSTANTS):
             continue
-        _keys.add(key)
         inner = inspect.unwrap(leaf)
-        code = _Code(inner.__code__) if inspect.isfunction(inner) else None
+        code = _code_of(inner) if inspect.isfunction(inner) else None
         if isinstance(leaf, SharedFunction):
             code = leaf.code
-        _alike[code or type(leaf)] += 1
-        if _alike[code or type(leaf)] == 3:
+        # JAX keeps a callable and so its hash, which by default is its address.
+        parts, structure = jax.tree.flatten(leaf)
+        key = hash((structure, *(x for x in parts if not eqx.is_array(x))))
+        alike = _alike[code or type(leaf)]
+        if key not in alike and len(alike) == 2:
             place = tree.key + jax.tree_util.keystr(tuple(path[:1]))
             name = code.code.co_qualname if code else type(leaf).__qualname__
             warn(
@@ -229,11 +220,4 @@ def _warn_of_third(trees: dict[str, PyTree]) -> None:
                 "and tens of megabytes. Define it once, outside of loops, or as an "
                 "Equinox module (an Element), whose arrays are data."
             )
-
-
-def _key(leaf: object) -> int:
-    """Returns the identity of a callable, which JAX keeps, or that of its parts."""
-    if not _is_shared(leaf):
-        return id(leaf)
-    leaves, structure = jax.tree.flatten(leaf)
-    return hash((structure, *(x for x in leaves if not eqx.is_array(x))))
+        alike.add(key)
