@@ -33,13 +33,13 @@ _FIXED = {
 _CONSTANTS = bool | int | str | bytes | np.dtype | np.ufunc | jnp.ufunc
 _AS_IT_IS = _CONSTANTS | jax.Array | type(jax.jit(lambda: None))
 _OF_NUMPY = {"pi", "inf", "nan", "e", "newaxis"}
-# What these do depends on more than the names in the code.
-_OPAQUE = {"eval", "exec", "globals", "locals", "vars", "super"}
-# These, text made of values and what catches errors tell a number from an array.
-_OPAQUE |= {"format", "getattr", "hasattr", "isinstance", "repr", "str", "type"}
-_OPAQUE |= {
-    "STORE_GLOBAL", "DELETE_GLOBAL", "IMPORT_NAME", "MATCH_CLASS", "FORMAT_VALUE",
-    "FORMAT_SIMPLE", "FORMAT_WITH_SPEC", "PUSH_EXC_INFO",
+_OPAQUE = {
+    # What these do depends on more than the names in the code.
+    "eval", "exec", "globals", "locals", "vars", "super",
+    "STORE_GLOBAL", "DELETE_GLOBAL", "IMPORT_NAME",
+    # These, text made of values and what catches errors tell a number from an array.
+    "format", "getattr", "hasattr", "isinstance", "repr", "str", "type", "MATCH_CLASS",
+    "FORMAT_VALUE", "FORMAT_SIMPLE", "FORMAT_WITH_SPEC", "PUSH_EXC_INFO",
 }  # fmt: skip
 
 # Kinds of numbers that are data. Code that uses them in Python, as lengths or where it
@@ -48,10 +48,6 @@ _DATA = (float, np.floating, int), (float, np.floating)
 _fewer: Counter["_Code"] = Counter()
 
 _T = TypeVar("_T")
-
-
-class _Unknown(Exception):
-    """Raised for a function that reaches what may change unseen."""
 
 
 @dataclass(frozen=True)
@@ -129,23 +125,24 @@ def _shared(leaf: object) -> object:
         return leaf
     try:
         return _parts_of(leaf)
-    # Such as an empty cell, keys without an order, or an integer of more than 64 bits.
-    except (_Unknown, TypeError, ValueError, OverflowError):
+    # Also an empty cell, keys without an order, or an integer of more than 64 bits.
+    except (TypeError, ValueError, OverflowError):
         return leaf
 
 
 def _parts_of(
     function: types.FunctionType, within: tuple[types.FunctionType, ...] = ()
 ) -> SharedFunction:
+    """Returns a function in its shared form, or raises an error that says why not."""
     code, among = _code_of(function), function.__globals__
     if function.__dict__ or function in within or _fewer[code] >= len(_DATA):
-        raise _Unknown
+        raise TypeError("it has attributes, calls itself, or uses numbers in Python")
     read = _global_names(code.code)
     names = {name: among[name] for name in sorted(read) if name in among}
     # NumPy's functions may take an array for no number, or draw random ones.
     if any(value is np for value in names.values()):
         if not set(code.code.co_names) <= {*names, *_OF_NUMPY}:
-            raise _Unknown
+            raise TypeError("it calls NumPy")
     closure = tuple(cell.cell_contents for cell in function.__closure__ or ())
     of_keywords = dict(sorted((function.__kwdefaults__ or {}).items()))
     numbers, within = _DATA[_fewer[code]], (*within, function)
@@ -159,7 +156,7 @@ def _parts_of(
             return leaf
         if inspect.isfunction(leaf):
             return _parts_of(leaf, within)
-        raise _Unknown
+        raise TypeError("it reaches what may change unseen")
 
     reach = closure, function.__defaults__, of_keywords, names
     return SharedFunction(jax.tree.map(part, reach, is_leaf=_out_of_order), code)
@@ -172,26 +169,21 @@ def _out_of_order(node: object) -> bool:
 
 @functools.lru_cache(maxsize=1024)
 def _global_names(code: types.CodeType) -> frozenset[str]:
-    """Returns the global names that code reads.
-
-    Raises _Unknown if it writes some, or may tell a number from an array.
-    """
+    """Returns the global names that code reads, or raises TypeError."""
     steps = [(step.opname, step.argval) for step in dis.get_instructions(code)]
     names = {name for step, name in steps if step in ("LOAD_GLOBAL", "LOAD_NAME")}
     if not _OPAQUE.isdisjoint(names.union(step for step, _ in steps)):
-        raise _Unknown
+        raise TypeError("it may write such names, or tell a number from an array")
     inner = [x for x in code.co_consts if isinstance(x, types.CodeType)]
     return frozenset(names.union(*map(_global_names, inner)))
 
 
 def _is_fixed(value: object) -> bool:
     """Returns whether it is a module of a known package, or its function or class."""
-    home = None
-    if inspect.ismodule(value):
-        home = value.__name__
-    elif isinstance(value, types.FunctionType | types.BuiltinFunctionType | type):
-        home = value.__module__  # None of a builtin that is bound to an object
-    return home is not None and home.partition(".")[0] in _FIXED
+    name = value.__name__ if inspect.ismodule(value) else None
+    if isinstance(value, types.FunctionType | types.BuiltinFunctionType | type):
+        name = value.__module__  # None of a builtin that is bound to an object
+    return name is not None and name.partition(".")[0] in _FIXED
 
 
 # Of callables that have programs of their own, by their code or type.
