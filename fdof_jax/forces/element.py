@@ -158,7 +158,7 @@ def naming(place: str) -> Iterator[None]:
     except ValueError as error:
         name, colon, _ = str(error).partition(": ")
         first, *_ = name.split(".")
-        if colon and first.isidentifier() and first not in ("linkage", "ts"):
+        if colon and first.isidentifier() and first not in ("linkage", "ts", "until"):
             raise ValueError(f"{place}.{error}") from error
         raise
 

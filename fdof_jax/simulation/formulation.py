@@ -6,6 +6,7 @@ import functools
 import jax.numpy as jnp
 from jax import Array
 
+from ..base.checks import place_of
 from ..forces.element import Forces
 from ..linkage.fields import Truth, jumps_at
 from ..mechanics.equations import Scalars, zeros
@@ -55,9 +56,10 @@ def _term(holds: bool, follows: bool, samples: bool) -> ScheduledTerm:
 
 def _after_samples(t: Array, y: Integrated, args: Args) -> tuple[SampleState, Truth]:
     """Returns `Args.sampled` where a step begins, and whether it changed there."""
-    sampler, last = sampler_of(args.forces), len(args.forces) - 1
+    sampler = sampler_of(args.forces)
     assert sampler is not None
-    clocks = args.clock(last - 1, t), args.clock(last, t)
+    place = place_of(sampler, args.forces)
+    clocks = args.clock(place - 1, t), args.clock(place, t)
     at = *joints_at(args, t, y), args.linkage
     return after_samples(sampler, clocks, *at, args.sampled)
 

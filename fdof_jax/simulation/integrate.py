@@ -3,6 +3,7 @@
 `integrate` is the one way in: it prepares, controls, solves and reads.
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -26,6 +27,7 @@ from ..steps.landing import Clock, Landing, clearance
 from ..steps.looped_dopri8 import LoopedDopri8
 from ..steps.tolerances import default_controller, error_control_of, with_tolerances
 from .arrays import in_arrays
+from .conditions import End, conditions_in
 from .events import in_order
 from .field import args_of, initial_own, own_states
 from .formulation import clocks_apart, joints_at, known_times, start_of, term_of
@@ -87,8 +89,12 @@ def integrate(
     `tangents`: judges tangents over which the caller maps, along the axis `TANGENTS`.
     """
     motion = _prepare(inputs, derivatives, plain, bool(tangents and tangents.tolerance))
-    end = loop.solve(motion.problem, _scheme(motion, keywords, derivatives, tangents))
-    return _read(inputs, motion, end, keywords)
+    scheme = _scheme(motion, keywords, derivatives, tangents)
+    end = loop.solve(motion.problem, scheme)
+    solution = _read(inputs, motion, end, keywords)
+    if not conditions_in(inputs.forces):
+        return solution
+    return _with_end(solution, motion, scheme.events, end)
 
 
 def _prepare(
@@ -147,7 +153,8 @@ def _scheme(
         watches = not isinstance(method, ScheduledDopri8)  # which finds it itself
         control = error_control_of(controller)
         judge = Judge(control, term, watches, of_derivatives)
-        events = events_of(term, ts, start, args, derivatives)
+        ends = tuple(condition.direction for condition in conditions_in(args.forces))
+        events = events_of(term, ts, start, args, ends, derivatives)
         lands = events is not None or motion.jumps is not None
     else:
         lands = False
@@ -192,6 +199,8 @@ def _check_constant_steps(forces: tuple[Element, ...], controller: object) -> No
     jumping = (e for e in forces if not isinstance(e, EffortHistory))
     if any(e.jump_ts is not None for e in jumping):
         why = "declare times at which they jump (jump_ts)"
+    elif conditions_in(forces):
+        why = "come with a condition that ends the motion (until)"
     elif changes(forces):
         why = "hold joints or take payloads"
     elif sampler_of(forces) and not isinstance(controller, diffrax.ConstantStepSize):
@@ -257,6 +266,21 @@ def _read(
         command, q_begin = jax.tree.map(shown_at, (sampled.command, sampled.q_begin))
         of_samples = dict(tau=command, q_begin=q_begin)
     return Solution(times, q, qd, stats, result, own, *holding, **of_samples)
+
+
+def _with_end(
+    solution: Solution, motion: _Motion, events: Any, end: loop.Attempt
+) -> Solution:
+    """Returns a solution with its end: where a condition was met, or its last row."""
+    switches: Any = end.switches
+    args = motion.problem.args._replace(sampled=end.sampled)
+    t, y = events.at_end(end.t, end.y, args, switches)
+    q, qd, _ = motion.joints(t, y)
+    ended = (switches.ended >= 0) & motion.valid
+    last = solution.ts[-1], solution.q[-1], solution.qd[-1]
+    at = (jnp.where(ended, *pair) for pair in zip((t, q, qd), last))
+    found = End(*at, jnp.where(ended, switches.ended, -1))
+    return dataclasses.replace(solution, end=found)
 
 
 def last_switched(inputs: Inputs, keywords: Settings) -> Array:

@@ -121,9 +121,9 @@ class Sampler(ClockElement):
 
 
 def sampler_of(forces: Forces) -> Sampler | None:
-    """Returns the controller in discrete time, which comes last, or None."""
-    last = forces[-1] if forces else None
-    return last if isinstance(last, Sampler) else None
+    """Returns the controller in discrete time, or None."""
+    found = [element for element in forces if isinstance(element, Sampler)]
+    return found[0] if found else None
 
 
 def unsampled(forces: Forces, linkage: Linkage) -> SampleState | None:

@@ -1,5 +1,7 @@
 """Simulates motions of a linkage: the door, with its checks."""
 
+from collections.abc import Callable, Sequence
+
 import diffrax
 import equinox as eqx
 import jax
@@ -26,6 +28,7 @@ from ..linkage.coordinates import State, real_state
 from ..linkage.fields import check_values, jumps_at
 from ..linkage.linkage import Linkage, check_linkage
 from ..steps.tolerances import at_tolerances, check_method, with_longest, within_reach
+from .conditions import conditions
 from .failures import cause, check_arguments
 from .field import initial_states
 from .holding import leaves_prescribed, within_stops
@@ -157,6 +160,7 @@ def simulate(
     ts: ArrayLike,
     forces: Forces = (),
     *,
+    until: Callable | Sequence[Callable] | None = None,
     own0: OwnStates | None = None,
     solver: diffrax.AbstractSolver | None = None,
     rtol: ArrayLike | None = None,
@@ -183,6 +187,9 @@ def simulate(
       States between are interpolated and may be hundreds of times less exact;
       `diffrax.ClipStepSizeController` makes steps end at all of `ts`.
     - `forces`: a tuple of force elements `(t, q, qd, linkage) -> tau`.
+    - `until`: what ends the motion before `ts[-1]`: a function `(t, q, qd, linkage) ->
+      number`, where it passes 0; a `simulation.Until`, which tells the direction; or
+      several in a tuple. Steps end there exactly, and `Solution.end` has derivatives.
     - `own0`: initial states of the `StatefulElement`s among the forces, one row of a
       `Solution.own`; by default each element's `initial_state`.
     - `rtol`, `atol`: relative and absolute tolerance of a step, by default 1e-11 in
@@ -233,7 +240,7 @@ def simulate(
     prescribed(forces)  # refuses several
     if own0 is not None:
         check_own("own0", own0, forces, linkage, ())
-    inputs = Inputs(linkage, state0, ts, own0, forces)
+    inputs = Inputs(linkage, state0, ts, own0, (*forces, *conditions(until)))
     try:
         solution, succeeded = solve(inputs, keywords)
         if succeeded is None:

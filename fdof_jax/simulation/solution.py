@@ -17,6 +17,7 @@ from ..forces.element import OwnStates
 from ..linkage.linkage import Linkage
 from ..linkage.topology import rate_unit
 from ..steps.tolerances import SINGLE_TOLERANCE, TOLERANCE
+from .conditions import End
 
 Statistics = dict[str, Any]  # arrays by name, and diffrax's `max_steps`
 
@@ -146,6 +147,9 @@ class Solution(eqx.Module):
       taken up to `ts` [J].
     - `events`: what happened to which joint, and when; its times have derivatives.
 
+    - `end`: with `until`, where the motion ended (see `simulation.End`), else None;
+      `ended` says whether a condition was met. Rows after the end are NaN.
+
     After `simulate_sampled`, else None:
 
     - `tau`: efforts commanded at each sample (samples, n), 0 at fixed pairs
@@ -174,18 +178,28 @@ class Solution(eqx.Module):
     tau: Float[Array, "sample joint"] | None = None
     acting: Float[Array, "time joint"] | None = None
     q_begin: Float[Array, "sample joint"] | None = None
+    end: End | None = None
 
     @property
     def states(self) -> tuple[PyTree, ...]:
         """The results that have derivatives in the inputs."""
         joints = self.q, self.qd, self.own, self.taken, self.events
-        return *joints, self.tau, self.q_begin
+        end = None if self.end is None else self.end[:-1]
+        return *joints, self.tau, self.q_begin, end
+
+    @property
+    def ended(self) -> Array:
+        """Whether a condition of `until` ended the motion, () or one per trajectory."""
+        if self.end is None:
+            return jnp.zeros(jnp.shape(self.q)[:-2], bool)
+        return self.end.condition >= 0
 
     @property
     def outcome(self) -> np.ndarray:
         """Outcome of each trajectory in words, an array of the batch's shape.
 
-        `"successful"`; `"ill-conditioned"`: the mass matrix is singular or nearly so
+        `"successful"`; `"ended"`: so, too, by a condition of `until`;
+        `"ill-conditioned"`: the mass matrix is singular or nearly so
         (see `inertia_ratios`); `"not finite"`: the accelerations are not finite, as
         those of a negative mass or of a reference out of reach (see
         `references.reach_margin`);
@@ -200,7 +214,8 @@ class Solution(eqx.Module):
                 "outcome: expected a computed motion, got one that JAX traces; there, "
                 "compare `result`: motion.result == diffrax.RESULTS.successful."
             )
-        return np.asarray(np.array([*OUTCOMES])[outcome_numbers(self.result)])
+        words = np.asarray(np.array([*OUTCOMES])[outcome_numbers(self.result)])
+        return words if self.end is None else np.where(self.ended, "ended", words)
 
     def __repr__(self) -> str:
         """Summarises the motion in words; traced values show only their shape."""

@@ -26,6 +26,8 @@ _NEAR = 0.575
 # A function began on its zero if its values before were below this share of its size,
 # also a power of the unit of rounding.
 _ON_ZERO = 0.625
+# Of Newton's steps to the end of a run: right to rounding, with second derivatives.
+_NEWTON = 3
 # In steps of at most this many such distances, hidden zeros are not looked for.
 _BRIEF = 10
 
@@ -47,6 +49,7 @@ class Switches(NamedTuple):
     - `grazing`, `grazing_here`: how nearly the crossings so far grazed, and the one
       here; 0 if none (see `Passage`).
     - `modes`: those of the joints (see `ScheduledTerm`), None if elements hold none.
+    - `ended`: which condition ended the run here, -1 if none did; None without any.
     """
 
     sides: Array
@@ -61,6 +64,7 @@ class Switches(NamedTuple):
     grazing: Array
     grazing_here: Array
     modes: PyTree
+    ended: Array | None
 
     @property
     def facts(self) -> dict[str, Array]:
@@ -96,6 +100,8 @@ class Events(eqx.Module):
 
     - `jumping`: whether efforts jump where each function switches; the last `guards`
       functions guard modes.
+    - `ends`: of the functions just before them, which end the run: in which direction
+      each does, 0 for both.
     - `derivatives`: whether states move with the times of events, in derivatives.
     """
 
@@ -103,6 +109,7 @@ class Events(eqx.Module):
     apart: Array  # see `clearance`
     jumping: tuple[bool, ...] = eqx.field(static=True)
     guards: int = eqx.field(static=True)
+    ends: tuple[int, ...] = eqx.field(static=True)
     derivatives: bool = eqx.field(static=True)
 
     def start(self, t0: Array, args: Arguments) -> Switches:
@@ -124,6 +131,7 @@ class Events(eqx.Module):
             grazing=none,
             grazing_here=none,
             modes=modes,
+            ended=jnp.array(-1) if self.ends else None,
         )
 
     # What happens where a step ended?
@@ -274,7 +282,48 @@ class Events(eqx.Module):
             grazing=jnp.maximum(passed.missed, regime.grazing),
             grazing_here=passed.grazing,
             modes=regime.modes,
+            ended=self._ended(passed.switched & ~on_zero, after),
         )
+
+    def _ended(self, passed: Array, after: Array) -> Array | None:
+        """Returns which condition ends the run in a step, see `Switches.ended`.
+
+        `passed`: which functions passed a zero on which they had not begun; `after`:
+        their sides then.
+        """
+        if not self.ends:
+            return None
+        own = slice(after.size - self.guards - len(self.ends), after.size - self.guards)
+        wanted = np.array(self.ends)
+        met = passed[own] & ((wanted == 0) | (wanted == after[own]))
+        return jnp.where(met.any(), jnp.argmax(met), -1)
+
+    def at_end(
+        self, t: Array, y: Integrated, args: Arguments, last: Switches
+    ) -> tuple[Array, Integrated]:
+        """Returns time and state at the zero of the condition that ended a run.
+
+        `t`, `y`: where the last step ended, close to it. Without such a condition, the
+        same.
+        """
+        args = args._replace(sides=last.sides, modes=last.modes)
+        assert last.ended is not None
+        ended = last.ended >= 0
+        which = last.sides.size - self.guards - len(self.ends) + last.ended
+
+        def later(time: Array) -> tuple[Array, Integrated]:
+            middle = _along(y, time / 2, self.term.vf(t, y, args))
+            rates = self.term.vf(t + time / 2, middle, args)
+            return t + time, _along(y, time, rates)
+
+        function = lambda time: self.term.switches(*later(time), args)[0][which]
+        time = jnp.zeros_like(t)
+        for _ in range(_NEWTON):
+            value, slope = jax.jvp(function, (time,), (jnp.ones_like(t),))
+            steep = ended & (slope != 0)
+            change = jnp.where(steep, value / jnp.where(steep, slope, 1), 0)
+            time = time - change
+        return later(time)
 
     def _one_sided(
         self, last: Switches, on_zero: Array, regime: Regime, sizes: Array
@@ -290,9 +339,14 @@ class Events(eqx.Module):
         return jnp.maximum(last.one_sided, at_once) + together
 
 
+def _along(y: Integrated, time: Array, rates: Integrated) -> Integrated:
+    return jax.tree.map(lambda a, rate: a + time * rate, y, rates)
+
+
 def events_of(
-    term: Term, ts: Array, y0: Integrated, args: Arguments, derivatives: bool
-) -> Events | None:
+    term: Term, ts: Array, y0: Integrated, args: Arguments, ends: tuple[int, ...],
+    derivatives: bool,
+) -> Events | None:  # fmt: skip
     """Returns the events of a run over the times `ts`, None if nothing switches."""
     guards = 0
     if term.unknown_modes is not None:
@@ -301,7 +355,7 @@ def events_of(
     functions, jumping = eqx.filter_eval_shape(term.switches, ts[0], y0, args)
     if not functions.size:
         return None
-    return Events(term, clearance(ts), jumping, guards, derivatives)
+    return Events(term, clearance(ts), jumping, guards, ends, derivatives)
 
 
 @eqx.filter_jit  # traced once, not at each use in a solve

@@ -179,7 +179,10 @@ def solve(problem: Problem, scheme: Scheme) -> Attempt:
         )
 
     def unfinished(a: Attempt) -> Array:
-        return (a.t < last) & (a.result == RESULTS.successful)
+        goes_on = (a.t < last) & (a.result == RESULTS.successful)
+        if a.switches is None or a.switches.ended is None:
+            return goes_on
+        return goes_on & (a.switches.ended < 0)
 
     end = eqx.internal.while_loop(
         lambda a: unfinished(a) & (True if most is None else a.steps < most),

@@ -1,0 +1,97 @@
+"""Conditions that end a motion."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float, Int
+
+from ..base.checks import function, refusal
+from ..forces.element import Element, Forces, element_of
+from ..forces.switches import switch
+from ..linkage.linkage import Linkage
+
+_EXPECTED = "a function (t, q, qd, linkage) that returns a number"
+
+
+class Until(Element):
+    """Ends a motion where a function of its state passes 0.
+
+    For `simulate(..., until=...)`. A motion that starts on the zero does not end there.
+
+    **Arguments:**
+
+    - `g`: `(t, q, qd, linkage) -> number`, smooth near its zeros, in any unit in which
+      it is not tiny.
+    - `direction`: 1 if the motion ends only where `g` rises through 0, -1 only where it
+      falls, 0 in both cases.
+
+    **Raises:** ValueError for malformed arguments.
+
+    >>> import fdof_jax as fj
+    >>> arm, start, *_ = fj.scenes.fig5()
+    >>> lowest = fj.simulation.Until(lambda t, q, qd, linkage: qd[0], direction=1)
+    >>> motion = fj.simulate(arm, start, [0, 5.0], until=lowest)
+    >>> bool(motion.ended), float(motion.end.t), motion.end.q.tolist()
+    (True, 0.0, [0.0, 0.0, 0.0])
+    """
+
+    condition: Element
+    direction: int
+
+    def __init__(self, g: Callable, direction: int = 0):
+        self.condition = element_of(function("g", g, _EXPECTED))
+        if isinstance(direction, bool) or direction not in (-1, 0, 1):
+            raise refusal("direction", "1, -1 or 0", direction)
+        self.direction = int(direction)
+
+    def arguments(self) -> dict[str, Any]:
+        return {"g": self.condition, "direction": self.direction}
+
+    @property
+    def jump_ts(self) -> None:
+        """None: nothing happens to the motion before it ends."""
+
+    def __call__(self, t: Array, q: Array, qd: Array, linkage: Linkage) -> Array:
+        value: Any = self.condition(t, q, qd, linkage)
+        if jnp.shape(value) != ():
+            raise ValueError(
+                f"until: expected {_EXPECTED}, got one of shape {jnp.shape(value)}."
+            )
+        none = jnp.zeros_like(q)
+        # Its zeros are switches, at which steps end, but nothing depends on the side.
+        return switch(jnp.asarray(value, q.dtype), none, none, continuous=True)
+
+
+class End(NamedTuple):
+    """The end of a motion; with derivatives in everything.
+
+    - `t`: when it was [s]; `q`, `qd` (n,): the joint positions and velocities there
+      [m or rad].
+    - `condition`: the number of the condition that ended it, from 0 in the order of
+      `until`; -1 if none did, and the motion ended at its last time.
+    """
+
+    t: Float[Array, ""]
+    q: Float[Array, " joint"]
+    qd: Float[Array, " joint"]
+    condition: Int[Array, ""]
+
+
+def conditions(until: Any) -> tuple[Until, ...]:
+    """Returns `until` as a tuple of conditions."""
+    if until is None:
+        return ()
+    several = until if isinstance(until, tuple | list) else (until,)
+    if not several:
+        raise refusal("until", f"{_EXPECTED}, an Until, or several such", until)
+    return tuple(
+        one if isinstance(one, Until) else Until(function("until", one, _EXPECTED))
+        for one in several
+    )
+
+
+def conditions_in(forces: Forces) -> tuple[Until, ...]:
+    """Returns the conditions among elements, which come last."""
+    return tuple(element for element in forces if isinstance(element, Until))
