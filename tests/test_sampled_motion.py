@@ -1,12 +1,11 @@
 """A motion under sampled control in pictures, tables and a line of text."""
 
 import diffrax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from test_drawing import lines, tidy as tidy
 from test_energies import tops, values
-from test_sampled_control import DISC, STILL
+from test_sampled_control import DISC
 
 import fdof_jax as fj
 from fdof_jax import drawing, plotting
@@ -52,17 +51,6 @@ def test_the_work_of_held_efforts_is_exact():
     top, (line,) = tops(ax, motion.ts)["taken out"], values(ax)
     np.testing.assert_allclose(top, line, rtol=1e-12)
     assert line[-1] == 1.75  # [J] put in
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("delay", [0.03, 0.1, 0.17])
-def test_the_work_of_late_efforts_is_exact(delay):
-    noisy = lambda t, q, qd, linkage: 5 * jnp.sin(40 * t + jnp.zeros(1))
-    motion = fj.simulate_sampled(DISC, STILL, noisy, 0.1, 5, delay=delay)
-    ax = plotting.energy_stack(DISC, (noisy,), motion)
-    top, (line,) = tops(ax, motion.ts)["taken out"], values(ax)
-    np.testing.assert_allclose(top, line, rtol=1e-12, atol=1e-15)
-    assert line[-1] > 1.2 * motion.qd[-1, 0] ** 2 > 0  # [J], as some is taken out
     # The spring pulls as it did at a sample, and stores nothing.
     spring = fj.SpringDamper(fj.Point(0, 1), fj.Point(1, 0, 1), stiffness=9.0)
     ax = plotting.energy_stack(DISC, (spring,), disc_motion())
