@@ -108,6 +108,18 @@ def test_recipes(tmp_path, monkeypatch):
     cells = np.isfinite(names["counts"]).sum()
     area = cells * np.diff(names["x"])[0] * np.diff(names["y"])[0]
     np.testing.assert_allclose(area, 1.5 * (np.cos(0.5) - np.cos(2.5)), rtol=0.05)
+    # Forces of the one ellipse take shares of the limits with a sum of squares of 1.
+    fj, J = names["fj"], names["J"]
+    efforts = J.T @ names["strong"] / names["limit"][:, None]
+    np.testing.assert_allclose(np.linalg.norm(efforts, axis=0), 1)
+    # Forces of a newton accelerate the tip to the other.
+    floats = names["arm"].replace(gravity=0)
+    moved = [
+        J @ fj.forward_dynamics(floats, [0.4, 1.2], [0, 0], J.T @ push)
+        for push in np.eye(2)
+    ]
+    pushes = np.linalg.solve(np.transpose(moved), names["easy"])
+    np.testing.assert_allclose(np.linalg.norm(pushes, axis=0), 1)
     assert names["value"] < 0.06
     assert names["rewards"].shape == (500, 256) and names["done"].sum() >= 512
     assert names["found"].success and names["found"].fun < 0.01
@@ -128,7 +140,7 @@ def test_recipes(tmp_path, monkeypatch):
     shaken = names["shaken"].ys[0][-1] - fallen.q[-1]
     assert 1e-3 < np.abs(shaken).max() < 3
     assert names["tuned"].tip_error < 0.02
-    fj, motor = names["fj"], names["motor"]
+    motor = names["motor"]
     start = fj.State([-1.5, 0], [0, 0])
     whole = fj.simulate(names["arm"], start, [0.0, 1.0, 2.0], (motor,))
     np.testing.assert_allclose(names["whole"].q[100::100], whole.q[1:], atol=1e-9)

@@ -48,9 +48,6 @@ TIMELESS = {
     fj.control.gains_from_frequency: lambda forces: fj.control.gains_from_frequency(
         BAR, Q, 5.0, 0.7, forces
     ),
-    drawing.inertia_ellipses: lambda forces: drawing.inertia_ellipses(
-        BAR, [Q], forces=forces
-    ),
 }
 # These compute a motion or take one with its times, draw, or write.
 OTHERS = {

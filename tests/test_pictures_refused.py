@@ -15,7 +15,7 @@ from fdof_jax import drawing, interactive, plotting
 
 BATCH = made_up(SOLUTION.ts, jnp.stack([SOLUTION.q] * 2))
 NOWHERE = made_up(SOLUTION.ts, SOLUTION.q * jnp.nan)
-PAIR, PAIRS, Q = (LINKAGE, SOLUTION), {"a": (LINKAGE, SOLUTION)}, np.ones(3)
+PAIR, PAIRS = (LINKAGE, SOLUTION), {"a": (LINKAGE, SOLUTION)}
 SLIDE, TASK, PUSH = make_linkage("RPR"), fj.CircleTask(), fj.JointDamper(1.0)
 FREE, CIRCLE = fj.scenes.fig5(), fj.scenes.fig7()
 UNTIED = fj.PDController(1, 1, 1, lambda t, linkage: None)
@@ -43,12 +43,6 @@ REFUSED = [
     ("forces", partial(drawing.topology_grid, forces={"b": ()}), PAIRS),
     ("motions", drawing.animate_grid, {}),
     ("fps", partial(drawing.animate_grid, fps=-1), PAIRS),
-    ("linkage", drawing.force_ellipses, "RRR", [Q], 1.0),
-    ("ax", partial(drawing.force_ellipses, ax=3), LINKAGE, [Q], 1.0),
-    ("limit", drawing.force_ellipses, LINKAGE, [Q], 0.0),
-    ("q", drawing.force_ellipses, LINKAGE, Q, 1.0),
-    ("q", drawing.inertia_ellipses, LINKAGE, np.zeros((0, 3))),
-    ("forces", partial(drawing.inertia_ellipses, forces=3), LINKAGE, [Q]),
     ("linkage", plotting.motion_profile, "RRR", SOLUTION),
     ("solution", plotting.motion_profile, LINKAGE, BATCH),
     ("absolute", partial(plotting.motion_profile, absolute="yes"), *PAIR),

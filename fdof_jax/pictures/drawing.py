@@ -47,11 +47,10 @@ from .axes import (
     reached,
     xy,
 )
-from .ellipses import force_ellipses, inertia_ellipses
 
 __all__ = [
     "BLACK", "GREY", "SERIES", "animate", "animate_grid", "chrono_cyclograph",
-    "draw_linkage", "force_ellipses", "inertia_ellipses", "topology_grid",
+    "draw_linkage", "topology_grid",
 ]  # fmt: skip
 
 
