@@ -19,7 +19,7 @@ Units are SI. `help` of a name says the rest; its room holds more of its kind.
 - **Afterwards**, room `analysis`: joint_efforts, joint_reactions, linearize.
 - **Gains**, room `tuning`: tune, TuneResult. **Parameters from recordings**, room
   `identification`: fit, FitResult.
-- **Pictures**: drawing, plotting, interactive. **Files and tables**, room `data`: save,
+- **Pictures**: drawing, plotting. **Files and tables**, room `data`: save,
   load, to_pandas, to_xarray, to_mjcf, from_mjcf.
 - **The paper's figures**: scenes.
 """
@@ -84,12 +84,12 @@ from .tuning.result import TuneResult
 from .tuning.tuning import tune
 
 if TYPE_CHECKING:
-    from .pictures import drawing, interactive, plotting
+    from .pictures import drawing, plotting
 
 __all__ = [
     "analysis", "bias_force", "CircleTask", "configure", "control", "data", "drawing",
     "Element", "energy", "existence_factors", "field", "fit", "FitResult", "forces",
-    "forward_dynamics", "from_mjcf", "identification", "interactive",
+    "forward_dynamics", "from_mjcf", "identification",
     "inverse_dynamics", "inverse_kinematics", "joint_efforts", "joint_positions",
     "joint_reactions", "JointDamper", "JointEffort", "LinearActuator", "linearize",
     "link_energies", "Linkage", "load", "mass_centers", "mass_matrix", "paper",
@@ -108,6 +108,6 @@ if not TYPE_CHECKING:  # a checker of types would then accept any name
 
     def __getattr__(name):
         # Pictures are imported on first use, as they need matplotlib.
-        if name in ("drawing", "interactive", "plotting"):
+        if name in ("drawing", "plotting"):
             return importlib.import_module(f".pictures.{name}", __name__)
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -72,7 +72,6 @@ NAMES = [
         for name, value in inspect.getmembers(fj.scenes, inspect.isfunction)
         if value.__module__ == fj.scenes.__name__
     ),
-    "interactive.sliders",
     *(
         f"{module.__name__.split('.')[-1]}.{name}"
         for module in (drawing, plotting)
@@ -120,7 +119,7 @@ def test_every_name_has_an_example():
         short = name.split(".")[-1]
         maker = RETURNED_BY.get(short, short)
         assert re.search(
-            rf"\b(fj(\.[a-z]+)?|scenes|drawing|plotting|interactive)\.{maker}\b", ran
+            rf"\b(fj(\.[a-z]+)?|scenes|drawing|plotting)\.{maker}\b", ran
         ), name
         if short in RETURNED_BY:
             returned = inspect.signature(PUBLIC[maker]).return_annotation

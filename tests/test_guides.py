@@ -120,6 +120,7 @@ def test_recipes(tmp_path, monkeypatch):
     ]
     pushes = np.linalg.solve(np.transpose(moved), names["easy"])
     np.testing.assert_allclose(np.linalg.norm(pushes, axis=0), 1)
+    names["show"](length=0.5)  # errors within `interact` are only printed
     assert names["value"] < 0.06
     assert names["rewards"].shape == (500, 256) and names["done"].sum() >= 512
     assert names["found"].success and names["found"].fun < 0.01

@@ -124,7 +124,7 @@ def test_the_import_takes_what_simulation_needs():
     assert "diffrax" in modules
     # JAX and diffrax import none of these themselves.
     assert not modules & {
-        "control", "ipywidgets", "matplotlib", "mujoco", "optax", "pandas",
+        "control", "matplotlib", "mujoco", "optax", "pandas",
         "scipy.interpolate", "scipy.linalg", "scipy.optimize", "xarray", "zarr",
     }  # fmt: skip
     assert "matplotlib" in imported("import fdof_jax as fj; fj.plotting")

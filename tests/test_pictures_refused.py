@@ -1,25 +1,20 @@
 """Malformed arguments of pictures are named, and no figure is left open."""
 
-import importlib
-import sys
 from functools import partial
 
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
-import numpy as np
 import pytest
-from test_drawing import LINKAGE, SOLUTION, made_up, make_linkage
+from test_drawing import LINKAGE, SOLUTION, made_up
 
 import fdof_jax as fj
-from fdof_jax import drawing, interactive, plotting
+from fdof_jax import drawing, plotting
 
 BATCH = made_up(SOLUTION.ts, jnp.stack([SOLUTION.q] * 2))
 NOWHERE = made_up(SOLUTION.ts, SOLUTION.q * jnp.nan)
 PAIR, PAIRS = (LINKAGE, SOLUTION), {"a": (LINKAGE, SOLUTION)}
-SLIDE, TASK, PUSH = make_linkage("RPR"), fj.CircleTask(), fj.JointDamper(1.0)
-FREE, CIRCLE = fj.scenes.fig5(), fj.scenes.fig7()
-UNTIED = fj.PDController(1, 1, 1, lambda t, linkage: None)
-OF_SCENE, OF_MOTION = r"scenes\['a'\]", r"motions\['a'\]"
+TASK, PUSH = fj.CircleTask(), fj.JointDamper(1.0)
+OF_MOTION = r"motions\['a'\]"
 OF_SOLUTION = r"solutions\['a'\]"
 
 # The argument's name, the function, and what it is given
@@ -60,11 +55,6 @@ REFUSED = [
     ("solutions", plotting.tracking_error, LINKAGE, TASK, SOLUTION),
     ("task", plotting.tracking_by_error, LINKAGE, None, SOLUTION),
     ("solution", plotting.tracking_by_error, LINKAGE, TASK, BATCH),
-    ("scenes", interactive.sliders, {}),
-    ("scenes", interactive.sliders, CIRCLE),
-    (OF_SCENE, interactive.sliders, {"a": 3}),
-    ("scene", interactive.sliders, {"a": FREE}),
-    (OF_SCENE, interactive.sliders, {"a": CIRCLE._replace(forces=(UNTIED,))}),
 ]
 
 
@@ -74,11 +64,3 @@ def test_malformed_arguments_are_named():
         with pytest.raises(ValueError, match=f"^{name}: expected"):
             function(*given)
         assert not plt.get_fignums()
-
-
-def test_without_ipywidgets_the_extra_is_named(monkeypatch):
-    monkeypatch.setitem(sys.modules, "ipywidgets", None)
-    monkeypatch.delitem(sys.modules, interactive.__name__)
-    again = importlib.import_module(interactive.__name__)  # imports it on use alone
-    with pytest.raises(ImportError, match=r"fdof_jax\[notebook\]"):
-        again.sliders()

@@ -1,1 +1,1 @@
-"""Pictures, animations and sliders, by matplotlib."""
+"""Pictures and animations, by matplotlib."""
