@@ -30,7 +30,6 @@ from typing import TYPE_CHECKING
 from . import (
     analysis,
     control,
-    data,
     forces,
     identification,
     paper,
@@ -45,10 +44,6 @@ from .base.configuration import configure
 from .base.version import __version__ as __version__
 from .batches.sweep import sweep
 from .control.pd import PDController
-from .data.files import load, save
-from .data.mjcf_reading import from_mjcf
-from .data.mjcf_writing import to_mjcf
-from .data.tables import to_pandas, to_xarray
 from .dynamics import (
     bias_force,
     energy,
@@ -85,6 +80,10 @@ from .tuning.tuning import tune
 
 if TYPE_CHECKING:
     from .pictures import drawing, plotting
+
+# Last, as `mjcf` imports names from above.
+from . import data
+from .data import from_mjcf, load, save, to_mjcf, to_pandas, to_xarray
 
 __all__ = [
     "analysis", "bias_force", "CircleTask", "configure", "control", "data", "drawing",

@@ -503,7 +503,7 @@ def nested(count, inside=""):
 
 LEAF = '<body pos="0 0 .2"><joint axis="0 1 0"/><geom size=".03" contype="0"/></body>'
 NEITHER = "neither a hinge nor a slide"
-refuse("nine joints", "9 joints, above 8", nested(9))
+refuse("nine joints", "1 to 8 letters", nested(9))
 refuse("ball joint", NEITHER, nested(1, LEAF.replace('axis="0 1 0"',
     'type="ball"')))
 refuse("free base", NEITHER, mjcf(

@@ -23,6 +23,7 @@ PUBLIC = {
 UNITLESS = {
     "existence_factors", "to_mjcf", "fig3", "fig5", "fig7", "load", "save", "stacked",
     "gradient_report", "circle_scenes", "configure", "Condition", "Values", "field",
+    "accepts_scene",
 }  # fmt: skip
 # Names that implement something printed in the paper.
 SOURCES = {

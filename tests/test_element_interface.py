@@ -347,7 +347,7 @@ def test_nothing_else_is_asked_for_attributes():
     }
     # These ask arrays, programs, root finders, and MuJoCo's models of all versions.
     others = {"batches/chunks.py", "batches/store.py", "steps/tolerances.py"}
-    others |= {"data/mjcf_actuators.py", "data/mjcf_chain.py"}
+    others |= {"mjcf/actuators.py", "mjcf/chain.py"}
     assert asking == {"linkage/fields.py", "data/files.py"} | others
 
 

@@ -55,6 +55,7 @@ OTHERS = {
     fj.joint_reactions, analysis.response, plotting.effort_profile,
     plotting.energy_stack, plotting.motion_profile, drawing.animate,
     drawing.animate_grid, drawing.draw_linkage, drawing.topology_grid, fj.to_mjcf,
+    fj.forces.elements_on,
 }  # fmt: skip
 
 

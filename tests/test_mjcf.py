@@ -120,7 +120,7 @@ def test_what_mujoco_does_not_have_is_refused_by_name():
             fj.to_mjcf(linkage, (fj.JointDamper(1.0), force))
     with pytest.raises(ValueError, match="linkage"):
         fj.to_mjcf(jax.tree.map(lambda a: np.stack([a, a]), linkage))
-    with pytest.raises(ValueError, match="linkage: expected known values"):
+    with pytest.raises(ValueError, match="linkage: expected one Linkage, and known"):
         jax.jit(fj.to_mjcf)(linkage)
 
 

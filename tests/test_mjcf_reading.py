@@ -218,7 +218,7 @@ def test_what_is_no_planar_chain_is_refused_by_name(tmp_path):
         "drop: expected kinds among": dict(drop=("wheels",)),
         "tip: expected a site or a body among": dict(tip="nose"),
         "drop: expected a tuple": dict(drop=None),
-        "controls: expected an array of 0": dict(controls=[1]),
+        r"controls: .*finite numbers of shape \(0,\)": dict(controls=[1]),
     }.items():
         with pytest.raises(ValueError, match=name):
             fj.from_mjcf(CART_POLE, **keywords)

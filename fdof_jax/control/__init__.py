@@ -1,6 +1,6 @@
 """Controllers, feedforward and drives."""
 
-from .actuators import Activation, Actuators
+from ..mjcf.law import Activation, Actuators
 from .drives import DCMotor, FirstOrderLag, PIDController, SpeedLimit
 from .pd import ComputedTorque, GravityFeedforward, PDController, gains_from_frequency
 

@@ -1,8 +1,8 @@
 """Tables of motions, files of pytrees, and export to other engines."""
 
+from ..mjcf.reading import MjcfModel, from_mjcf
+from ..mjcf.writing import to_mjcf
 from .files import load, save
-from .mjcf_reading import MjcfModel, from_mjcf
-from .mjcf_writing import to_mjcf
 from .tables import to_pandas, to_xarray
 
 __all__ = [

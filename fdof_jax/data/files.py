@@ -22,7 +22,6 @@ from ..base.user_warnings import without_warning
 from ..base.version import __version__
 from ..base.whole_files import file_path, whole_file
 from ..linkage.linkage import Linkage
-from ..linkage.topology import letters
 from ..simulation.scene import is_number, members, stacked
 from ..simulation.solution import Solution
 
@@ -235,7 +234,7 @@ def _object(place: str, value: Any) -> dict[str, Json]:
             batch = [_object(f"{place}[{i}]", row) for i, row in enumerate(rows)]
             return {"batch": batch}
     if isinstance(value, Linkage):
-        arguments["topology"] = letters(value.ef)
+        arguments["topology"] = value.topology
     return {name: {k: _node(f"{place}.{k}", v) for k, v in arguments.items()}}
 
 

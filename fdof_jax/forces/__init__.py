@@ -1,8 +1,8 @@
 """Force elements: joint efforts, springs, dampers, stops, actuators."""
 
-from ..linkage.fields import Condition, Values, field
+from ..linkage.fields import Condition, Part, Values, field
 from .actuators import Armature, LinearActuator, Rotor
-from .element import Element, InertialElement, StatefulElement
+from .element import Element, InertialElement, StatefulElement, elements_on
 from .holders import Brake, HardStops, JointFriction
 from .joints import EffortHistory, JointDamper, JointEffort, JointSpring, JointStops
 from .payload import Payload
@@ -10,11 +10,11 @@ from .points import Load, Point, PointElement, SpringDamper, Tension, Wrench
 from .switches import clip, switch
 
 __all__ = [
-    "Armature", "Brake", "clip", "Condition", "EffortHistory", "Element", "field",
-    "HardStops", "InertialElement", "JointDamper", "JointEffort", "JointFriction",
-    "JointSpring", "JointStops", "LinearActuator", "Load", "Payload", "Point",
-    "PointElement", "Rotor", "SpringDamper", "StatefulElement", "switch", "Tension",
-    "Values", "Wrench",
+    "Armature", "Brake", "clip", "Condition", "EffortHistory", "Element", "elements_on",
+    "field", "HardStops", "InertialElement", "JointDamper", "JointEffort",
+    "JointFriction", "JointSpring", "JointStops", "LinearActuator", "Load", "Part",
+    "Payload", "Point", "PointElement", "Rotor", "SpringDamper", "StatefulElement",
+    "switch", "Tension", "Values", "Wrench",
 ]  # fmt: skip
 
 

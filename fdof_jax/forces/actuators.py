@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from ..linkage.fields import Values, field, value_of
+from ..linkage.fields import Values, field
 from ..linkage.frames import cross, dot, length_of, plane_vector, scalar_frames
 from ..linkage.linkage import Linkage, joints_of
 from ..linkage.topology import fixed_pairs, real_joints
@@ -154,7 +154,7 @@ class LinearActuator(Between, InertialElement):
         vector = self.vector(frames)
         length = length_of(vector)
         slopes = jnp.stack(self.slopes(frames, vector)) * over(length)
-        return value_of(self, "force", t, length, slopes @ qd) * slopes
+        return self.value_of("force", t, length, slopes @ qd) * slopes
 
     def loads(
         self, t: Array, q: Array, qd: Array, qdd: Array, linkage: Linkage
@@ -175,7 +175,7 @@ class LinearActuator(Between, InertialElement):
             + self.com[0] * cross(unit, cylinder)
             + (length - self.com[1]) * cross(unit, piston)
         )
-        push = value_of(self, "force", t, length, dot(unit, rate))
+        push = self.value_of("force", t, length, dot(unit, rate))
         held = dot(unit, piston) - push
         on_b = (held + 1j * about_a / length) * unit  # by the link on the piston
         on_a = cylinder + piston - on_b

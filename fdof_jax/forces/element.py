@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import PyTree
 
-from ..base.checks import shown
+from ..base.checks import instance, shown
 from ..linkage.fields import Foreign, Part, check_joints, default, optional, sized
 from ..linkage.linkage import Linkage, joints_of
 from ..mechanics.equations import Scalars
@@ -124,9 +124,17 @@ def elements(name: str, forces: Forces) -> tuple[Element, ...]:
 def elements_on(linkage: Linkage, forces: Forces) -> tuple[Element, ...]:
     """Returns forces as elements, with an entry per joint where one is for all joints.
 
-    Programs then do not depend on how the numbers were given. Raises ValueError for
-    values of other chains.
+    Programs then do not depend on how the numbers were given.
+
+    **Raises:** ValueError for what is no tuple of callables, and for values of other
+    chains.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig7().linkage
+    >>> fj.forces.elements_on(arm, (fj.JointDamper(2.0),))  # [N s/m or N m s/rad]
+    (JointDamper(coefficient=[2, 2, 2]),)
     """
+    instance("linkage", linkage, Linkage)
     found = elements("forces", forces)
     for index, element in enumerate(found):
         check_joints(f"forces[{index}].", element, linkage)

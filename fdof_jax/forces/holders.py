@@ -14,7 +14,7 @@ from jaxtyping import Bool
 from numpy.typing import ArrayLike
 
 from ..base.checks import refusal
-from ..linkage.fields import Condition, Values, each, field, ordered
+from ..linkage.fields import Condition, Values, each, field
 from ..linkage.joint_numbers import among_joints, numbered, numbers_in
 from ..linkage.linkage import Linkage, joints_of
 from .element import Forces, ScalarElement
@@ -133,7 +133,7 @@ class HardStops(Holder):
     restitution: Values = field(unit="1", minimum=0, default=0.0, kw_only=True)
 
     def conditions(self):
-        yield from ordered(self, "lower", "upper")
+        yield from self.ordered("lower", "upper")
         e = self.restitution
         yield Condition((e <= 1).all(), "restitution", "at most 1", e)
 
@@ -180,7 +180,7 @@ class Brake(Holder):
         return {"joints": numbers_in(self.joints)} | ends
 
     def conditions(self):
-        yield from ordered(self, "begin", "end")
+        yield from self.ordered("begin", "end")
 
     def conditions_on(self, linkage):
         yield among_joints(self.joints, linkage)

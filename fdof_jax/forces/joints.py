@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ..base.checks import JOINT
-from ..linkage.fields import Values, each, field, ordered, table_over_times
+from ..linkage.fields import Values, each, field, table_over_times
 from ..linkage.linkage import Linkage
 from .element import ScalarElement
 from .switches import switch
@@ -162,7 +162,7 @@ class JointStops(ScalarElement):
     )
 
     def conditions(self):
-        yield from ordered(self, "lower", "upper")
+        yield from self.ordered("lower", "upper")
 
     def respond(self, scheduled, q, qd, linkage):
         values = self.lower, self.upper, self.stiffness, self.damping

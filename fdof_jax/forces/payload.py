@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ..linkage.fields import Condition, Truth, Values, field, has_come, of_kind, ordered
+from ..linkage.fields import Condition, Truth, Values, field, has_come, of_kind
 from ..linkage.frames import plane_vector, scalar_frames
 from .element import InertialElement
 from .points import Load, Point
@@ -56,7 +56,7 @@ class Payload(InertialElement):
         yield Condition(moves, "place", "a point of a moving link", self.place)
         used = (self.velocity == 0).all() | (self.begin is not None)
         yield Condition(used, "velocity", "zeros without begin", self.velocity)
-        yield from ordered(self, "begin", "end")
+        yield from self.ordered("begin", "end")
 
     @property
     def jump_ts(self) -> Array | None:

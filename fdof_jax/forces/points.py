@@ -18,15 +18,7 @@ from jaxtyping import Complex, Float, Int, PyTree
 from numpy.typing import ArrayLike
 
 from ..base.checks import instance, is_traced, refusal, whole_number
-from ..linkage.fields import (
-    Condition,
-    Part,
-    Values,
-    check_joints,
-    field,
-    of_kind,
-    value_of,
-)
+from ..linkage.fields import Condition, Part, Values, check_joints, field, of_kind
 from ..linkage.frames import Frames, cross, length_of, plane_vector, scalar_frames
 from ..linkage.linkage import Linkage, joints_of, per_joint, without_fixed
 from ..linkage.topology import MOST_PAIRS
@@ -345,7 +337,7 @@ class Wrench(PointElement):
 
     def schedule(self, t, linkage):
         """Returns the force and the moment at a time."""
-        force, moment = value_of(self, "force", t), value_of(self, "moment", t)
+        force, moment = self.value_of("force", t), self.value_of("moment", t)
         return plane_vector(force[0], force[1]), moment
 
     def loads(self, scheduled, frames, qd):

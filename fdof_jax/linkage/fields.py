@@ -65,7 +65,7 @@ def field(
     **Arguments:**
 
     - `shape`: by default one number per joint, or one for all (then `each` repeats it);
-      `None` within it stands for any length, `JOINT` for the number of joints.
+      `None` within it stands for any length, "joint" for the number of joints.
     - `unit`: for messages, for instance "N m s/rad".
     - `minimum`, `above`: bounds; `finite`: whether infinities are refused.
     - `function`: whether a function that returns such an array is accepted;
@@ -125,7 +125,23 @@ class _Fields(type(eqx.Module)):
 
 
 class Part(Frozen, metaclass=_Fields):
-    """A pytree with declared arrays, conditions on them, and times of jumps."""
+    """A pytree with declared arrays, conditions on them, and times of jumps.
+
+    Elements and references are parts, and may have further ones as fields.
+
+    - `ordered(first, second)`: yields the condition that a field is less than another.
+    - `value_of(name, *arguments)`: a field, or what the function in its place returns.
+
+    >>> import fdof_jax as fj
+    >>> class Range(fj.forces.Part):
+    ...     lower: fj.Values = fj.field(unit="rad")
+    ...     upper: fj.Values = fj.field(unit="rad")
+    ...     def conditions(self):
+    ...         yield from self.ordered("lower", "upper")
+    >>> Range(1, -1)  # [rad]
+    Traceback (most recent call last):
+    ValueError: lower: expected less than upper, got 1.0 and -1.0.
+    """
 
     def conditions(self) -> Iterable[Condition]:
         """Yields conditions beside the bounds of fields; also of traced values."""
@@ -136,6 +152,21 @@ class Part(Frozen, metaclass=_Fields):
         return ()
 
     jump_ts = default(lambda self: jumps_of(dict(_within(self))))
+
+    def ordered(self, first: str, second: str) -> Iterator[Condition]:
+        """Yields the condition that a field is less than another, if both are given."""
+        low, high = vars(self)[first], vars(self)[second]
+        if low is not None and high is not None:
+            expected = f"less than {second}"
+            yield Condition((low < high).all(), first, expected, (low, high))
+
+    def value_of(self, name: str, *arguments: Array) -> Array:
+        """Returns a declared array, or what the function in its place returns."""
+        value = vars(self)[name]
+        if not callable(value):
+            return value
+        rules = type(self).__dataclass_fields__[name].metadata["rules"]
+        return real_array(name, value(*arguments), **rules)
 
     def check(self, linkage: Linkage, ts: Array) -> None:
         """Raises ValueError unless it fits the arm and the times, all known."""
@@ -272,15 +303,6 @@ def check_joints(place: str, part: Part, linkage: Linkage) -> None:
         check_joints(f"{place}{name}.", inner, linkage)
 
 
-def value_of(part: Part, name: str, *arguments: Array) -> Array:
-    """Returns a declared array, or what the function in its place returns."""
-    value = vars(part)[name]
-    if not callable(value):
-        return value
-    rules = type(part).__dataclass_fields__[name].metadata["rules"]
-    return real_array(name, value(*arguments), **rules)
-
-
 def _within(part: Part) -> Iterator[tuple[str, Part]]:
     """Yields the fields that are parts, or are called."""
     if isinstance(part, Foreign):  # its attributes say all
@@ -290,13 +312,6 @@ def _within(part: Part) -> Iterator[tuple[str, Part]]:
             yield name, value
         elif callable(value) and not isinstance(value, type):
             yield name, Foreign(value)
-
-
-def ordered(part: Part, first: str, second: str) -> Iterator[Condition]:
-    """Yields the condition that a field is less than another, if both are given."""
-    low, high = vars(part)[first], vars(part)[second]
-    if low is not None and high is not None:
-        yield Condition((low < high).all(), first, f"less than {second}", (low, high))
 
 
 def table_over_times(part: Part, name: str, least: int) -> Iterator[Condition]:

@@ -48,7 +48,8 @@ class Linkage(Frozen):
     **Arguments:**
 
     - `topology`: a letter per pair: R (revolute), P (prismatic) or F (fixed), such as
-      "RPR"; or two existence factors per pair. Stored as `ef` (2n,).
+      "RPR"; or two existence factors per pair. Stored as `ef` (2n,); the attribute
+      `topology` has the letters.
     - `length`: A1, A2, ... of the ground and the moving links (n + 1,) [m].
     - `com`: (p, q) of each moving link (n, 2) [m].
     - `mass`: masses of the moving links (n,) [kg].
@@ -116,13 +117,18 @@ class Linkage(Frozen):
         fields = dict(vars(self))
         return {"topology": fields.pop("ef")} | fields
 
+    @property
+    def topology(self) -> str:
+        """The letters of a single linkage with a known topology, such as RPR."""
+        return letters(self.ef)
+
     def __repr__(self) -> str:
         """Shows the values of a single linkage, or the shapes of a batch."""
         if np.ndim(self.ef) != 1 or not known(self):
             return super().__repr__()
-        (_, ef), *fields = vars(self).items()
+        _, *fields = vars(self).items()
         others = (f"{name}={short(value)}" for name, value in fields)
-        return f"Linkage({letters(ef)!r}, {', '.join(others)})"
+        return f"Linkage({self.topology!r}, {', '.join(others)})"
 
 
 def short(value: Array | np.ndarray) -> str:
@@ -136,12 +142,12 @@ def short(value: Array | np.ndarray) -> str:
 
 def joint_names(linkage: Linkage) -> list[str]:
     """Returns the names of the joints in order, for instance R1, P2, F3."""
-    return [f"{kind}{k + 1}" for k, kind in enumerate(letters(linkage.ef))]
+    return [f"{kind}{k + 1}" for k, kind in enumerate(linkage.topology)]
 
 
 def moving_joints(linkage: Linkage) -> list[int]:
     """Returns the places of the joints that are not fixed, from 0."""
-    return [k for k, kind in enumerate(letters(linkage.ef)) if kind != "F"]
+    return [k for k, kind in enumerate(linkage.topology) if kind != "F"]
 
 
 def joints_of(linkage: Linkage) -> int:

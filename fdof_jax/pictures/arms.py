@@ -13,7 +13,6 @@ from ..base.known_values import in_numpy
 from ..forces.element import Forces
 from ..linkage.frames import known_frames
 from ..linkage.linkage import Linkage, without_fixed
-from ..linkage.topology import letters
 from .axes import BLACK, GREY, SERIES, Keywords, xy
 from .elements import ELEMENT_STYLES, element_lines, element_marker
 
@@ -49,7 +48,7 @@ def geometry(
     With the times `ts` [s], the force elements that have a place are behind the arm.
     """
     arm = in_numpy(linkage)
-    kinds = letters(arm.ef)
+    kinds = arm.topology
     f = known_frames(arm, without_fixed(arm, q))
     start, direction = f.start, f.direction
     end = start + arm.length * direction

@@ -14,7 +14,6 @@ from ..forces.payload import Payload
 from ..forces.points import Point, SpringDamper, Tension, Wrench
 from ..linkage.frames import Frames
 from ..linkage.linkage import Linkage
-from ..linkage.topology import letters
 from ..references.reference import Reference
 from ..references.task import TipTask
 from .axes import BLACK, Keywords, xy
@@ -230,7 +229,7 @@ def _stops(
     element: JointStops | HardStops, linkage: Linkage, f: Frames, size: float
 ) -> list[np.ndarray]:
     """Bars at the ends of each joint's range, joined by an arc around a pin."""
-    kinds, radius, strokes = letters(linkage.ef), 1.2 * _ARC * size, []
+    kinds, radius, strokes = linkage.topology, 1.2 * _ARC * size, []
     for k, (kind, low, high) in enumerate(zip(kinds, element.lower, element.upper)):
         along, pin = f.direction[:, k : k + 1], f.start[:, k + 1 : k + 2]
         finite = [end for end in (low, high) if np.isfinite(end)]

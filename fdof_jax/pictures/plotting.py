@@ -20,7 +20,6 @@ from ..dynamics import link_energies
 from ..forces.element import Forces, ForeignElement, elements, elements_on
 from ..linkage.fields import jumps_at
 from ..linkage.linkage import Linkage, joint_names, moving_joints
-from ..linkage.topology import letters
 from ..references.reference import reference_motion, reference_of
 from ..simulation.efforts import joint_efforts
 from ..simulation.solution import Solution
@@ -80,7 +79,7 @@ def motion_profile(
     instance("absolute", absolute, bool)
     if title is not None:
         instance("title", title, str)
-    kinds, names = letters(linkage.ef), joint_names(linkage)
+    kinds, names = linkage.topology, joint_names(linkage)
     wanted = _references(linkage, forces, ts)
     held = np.zeros(q.shape, bool)
     if solution.modes is not None:

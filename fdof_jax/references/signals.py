@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ..base.checks import JOINT
-from ..linkage.fields import Condition, Values, field, ordered, table_over_times
+from ..linkage.fields import Condition, Values, field, table_over_times
 from ..linkage.linkage import Linkage, joints_of
 from .reference import Reference
 
@@ -70,7 +70,7 @@ class Pulse(Reference):
     end: Values = field((), unit="s", kw_only=True)
 
     def conditions(self):
-        yield from ordered(self, "begin", "end")
+        yield from self.ordered("begin", "end")
         yield _of_one_length(outside=self.outside, inside=self.inside)
 
     @property

@@ -4,9 +4,10 @@ from .conditions import End, Until
 from .diffrax_term import ode_term
 from .efforts import Efforts
 from .prescribed import PrescribedMotion
+from .scene import accepts_scene
 
 __all__ = [
-    "Efforts", "End", "PrescribedMotion", "Until", "ode_term",
+    "accepts_scene", "Efforts", "End", "ode_term", "PrescribedMotion", "Until",
 ]  # fmt: skip
 
 

@@ -62,7 +62,15 @@ def accepts_scene(
 ) -> OfScene[_Arguments, _Result]:
     """Decorates a function to accept a `Scene` in place of the arguments it holds.
 
-    Other arguments follow in their order; a `state` is by default the scene's start.
+    These are `linkage`, `state0` (or `state`), `forces` and `t1`. Others follow in
+    their order.
+
+    >>> import fdof_jax as fj
+    >>> @fj.simulation.accepts_scene
+    ... def mass(linkage, forces):
+    ...     return float(linkage.mass.sum())
+    >>> mass(fj.scenes.double_pendulum())  # [kg]
+    2.0
     """
     parameters = inspect.signature(function).parameters.values()
     names = [p.name for p in parameters if p.kind is p.POSITIONAL_OR_KEYWORD]

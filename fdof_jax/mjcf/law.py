@@ -6,10 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ..base.checks import JOINT
-from ..forces.element import StatefulElement
-from ..forces.switches import clip, switch
-from ..linkage.fields import Condition, Part, Values, field, ordered, value_of
+from ..forces import Condition, Part, StatefulElement, Values, clip, field, switch
 
 
 class Activation(Part):
@@ -50,7 +47,7 @@ class Activation(Part):
         sizes = [len(value) for value in values if value is not None]
         alike = len(set(sizes)) == 1
         yield Condition(alike, "gain", "as many actuators in all fields", tuple(sizes))
-        yield from ordered(self, "lower", "upper")
+        yield from self.ordered("lower", "upper")
 
 
 class Actuators(StatefulElement):
@@ -85,17 +82,17 @@ class Actuators(StatefulElement):
     [0.0, 3.0]
     """
 
-    gear: Values = field((None, JOINT), unit="1, m or 1/m")
+    gear: Values = field((None, "joint"), unit="1, m or 1/m")
     gain: Values = field((None, 3), unit="N or N m per unit of the control")
     bias: Values = field((None, 3), unit="N or N m")
     control: Any = field((None,), unit="that of the actuator", function=True)
     lower: Values | None = field((None,), unit="N or N m", finite=False, default=None)
     upper: Values | None = field((None,), unit="N or N m", finite=False, default=None)
     effort_lower: Values | None = field(
-        (JOINT,), unit="N or N m", finite=False, default=None
+        ("joint",), unit="N or N m", finite=False, default=None
     )
     effort_upper: Values | None = field(
-        (JOINT,), unit="N or N m", finite=False, default=None
+        ("joint",), unit="N or N m", finite=False, default=None
     )
     activation: Activation | None = None
 
@@ -106,8 +103,8 @@ class Actuators(StatefulElement):
         sizes = [len(v) for v in (*values, *fixed, *states) if v is not None]
         alike = len(set(sizes)) == 1
         yield Condition(alike, "gear", "as many actuators in all fields", tuple(sizes))
-        yield from ordered(self, "lower", "upper")
-        yield from ordered(self, "effort_lower", "effort_upper")
+        yield from self.ordered("lower", "upper")
+        yield from self.ordered("effort_lower", "effort_upper")
 
     def initial_state(self, linkage):
         """The activations' states at the start, (actuator,); () without."""
@@ -115,7 +112,7 @@ class Actuators(StatefulElement):
 
     def __call__(self, t, q, qd, linkage, state):
         length, speed = (self.gear @ jnp.asarray(values) for values in (q, qd))
-        control = value_of(self, "control", t)
+        control = self.value_of("control", t)
         affine = lambda rows: rows[:, 0] + rows[:, 1] * length + rows[:, 2] * speed
         force, rate = affine(self.gain) * control + affine(self.bias), ()
         if (own := self.activation) is not None:

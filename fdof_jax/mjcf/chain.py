@@ -1,5 +1,6 @@
 """The planar chain in a MuJoCo model: its joints, its plane, its links and its tip."""
 
+import warnings
 from collections.abc import Sequence
 from types import ModuleType
 from typing import Any, NamedTuple, SupportsInt
@@ -7,11 +8,9 @@ from typing import Any, NamedTuple, SupportsInt
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..base.checks import plain, refusal, shown
-from ..base.user_warnings import without_warning
-from ..linkage.linkage import Linkage
-from ..linkage.topology import MOST_PAIRS
-from .mjcf_source import Model
+from .. import Linkage
+from .checks import plain, refusal
+from .source import Model
 
 Data = Any  # an `mujoco.MjData`
 _SLIDE, _HINGE = 2, 3  # MuJoCo's mjtJoint
@@ -174,7 +173,7 @@ def _joints_of_arm(read: Reader, tip: str | None) -> tuple[np.ndarray, np.ndarra
         if (at := _named(read, tip)) is None:
             sites = [model.site(k).name for k in range(model.nsite)]
             bodies = [model.body(k).name for k in range(1, model.nbody)]
-            names = shown([each for each in sites + bodies if each])
+            names = plain(str([each for each in sites + bodies if each]))
             raise refusal("tip", f"a site or a body among {names}", tip)
         chosen = tree_of[at[0]]
         if chosen < 0:
@@ -207,8 +206,6 @@ def _joints_of_arm(read: Reader, tip: str | None) -> tuple[np.ndarray, np.ndarra
         if len(following) > 1:
             both = " and ".join(map(name, following[:2]))
             raise refuse(f"branches: bodies {both} both follow body {name(body)}")
-    if len(joints) > MOST_PAIRS:
-        raise refuse(f"{len(joints)} joints, above {MOST_PAIRS}")
     links = np.where(tree_of < 0, 0, -1)
     for k, body in enumerate(model.jnt_bodyid[joints], start=1):
         links[welded == body] = k  # of several joints of a body, the last one
@@ -322,7 +319,8 @@ def _linkage(
         inertias[k] = inertia + mass @ np.abs(places - center) ** 2
         offsets[k] = (center - starts[k + 1]) * np.exp(-1j * turns[k + 1])
     try:
-        with without_warning("moves no inertia of link"):
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", ".*moves no inertia of link")
             linkage = Linkage(
                 "".join("P" if slide else "R" for slide in slides),
                 length=steps.real,
@@ -334,5 +332,5 @@ def _linkage(
                 gravity=chain.gravity,
             )
     except ValueError as error:
-        raise ValueError(f"source: {error}") from error
+        raise ValueError(f"source: expected a planar chain; {error}") from error
     return linkage, turns

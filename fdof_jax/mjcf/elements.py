@@ -4,13 +4,10 @@ from typing import Any
 
 import numpy as np
 
-from ..forces.actuators import Armature
-from ..forces.element import Element
-from ..forces.holders import JointFriction
-from ..forces.joints import JointDamper, JointSpring, JointStops
-from ..forces.points import Point, SpringDamper
-from .mjcf_actuators import inertias_of_actuators
-from .mjcf_chain import FAR, Chain, Reader
+from .. import Element, JointDamper, Point, SpringDamper
+from ..forces import Armature, JointFriction, JointSpring, JointStops
+from .actuators import inertias_of_actuators
+from .chain import FAR, Chain, Reader
 
 # A stop of MuJoCo is close to plastic; this damping [s/m or s/rad] returns a tenth of
 # the speed of 1 m/s or 1 rad/s.

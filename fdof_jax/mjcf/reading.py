@@ -1,20 +1,19 @@
 """Import of planar chains from MuJoCo's models: MJCF and URDF."""
 
+import importlib
+import warnings
+from html import escape
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..base.checks import optional_package, refusal
-from ..base.report import Report
-from ..base.user_warnings import warn
-from ..forces.element import Forces
-from ..linkage.coordinates import State
-from ..linkage.linkage import Linkage
-from .mjcf_actuators import actuators
-from .mjcf_chain import Chain, Reader, planar_chain
-from .mjcf_elements import elements_in_joints, springs_of_tendons
-from .mjcf_source import compiled_model
+from .. import Element, Linkage, State
+from .actuators import actuators
+from .chain import Chain, Reader, planar_chain
+from .checks import refusal
+from .elements import elements_in_joints, springs_of_tendons
+from .source import compiled_model
 
 KINDS = (
     "actuators", "armature", "contacts", "damping", "equalities", "fluid", "friction",
@@ -25,7 +24,7 @@ KINDS = (
 _NEGLIGIBLE = 1e-9
 
 
-class Account(Report):
+class Account(NamedTuple):
     """What `from_mjcf` made of each part of a model: a table that prints itself.
 
     - `lines`: pairs of a part of the model, and of what it became or why it was left
@@ -34,8 +33,12 @@ class Account(Report):
 
     lines: list[tuple[str, str]]
 
-    def _rows(self) -> list[list[str]]:
-        return [["", ""], *map(list, self.lines)]
+    def __str__(self) -> str:
+        width = max(len(part) for part, _ in self.lines)
+        return "\n".join(f"{part:{width}}  {words}" for part, words in self.lines)
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{escape(str(self))}</pre>"
 
 
 class MjcfModel(NamedTuple):
@@ -47,7 +50,7 @@ class MjcfModel(NamedTuple):
 
     linkage: Linkage
     state0: State
-    forces: Forces
+    forces: tuple[Element, ...]
     account: Account
 
 
@@ -108,7 +111,12 @@ def from_mjcf(
     actuator 0  PDController, at a control of 0
     start       qpos0, at rest
     """
-    mujoco = optional_package("mujoco", "test")
+    try:
+        mujoco = importlib.import_module("mujoco")
+    except ImportError as error:
+        raise ImportError(
+            "mujoco is not installed: pip install 'fdof_jax[test]' installs it."
+        ) from error
     drop = (drop,) if isinstance(drop, str) else drop
     if not isinstance(drop, tuple | list):
         raise refusal("drop", f"a tuple of kinds among {KINDS}", drop)
@@ -215,9 +223,10 @@ def _check_contacts(read: Reader, chain: Chain) -> None:
     both = " and ".join(map(name, pair))
     read.note("contacts", f"left out, though bodies {both} may collide")
     if "contacts" not in read.drop:
-        warn(
+        warnings.warn(
             f"source: contacts are left out, but bodies {both} of this model may "
-            "collide; drop=('contacts',) omits this warning."
+            "collide; drop=('contacts',) omits this warning.",
+            stacklevel=3,
         )
 
 

@@ -5,26 +5,35 @@ from collections.abc import Iterable, Iterator
 from typing import Any, SupportsFloat
 from xml.etree import ElementTree
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.core import Tracer
 from numpy.typing import ArrayLike
 
-from ..base.checks import check_known
-from ..control.actuators import Actuators
-from ..control.pd import PDController
-from ..forces.actuators import Armature
-from ..forces.element import Element, Forces, ForeignElement, elements_on
-from ..forces.holders import HardStops, JointFriction
-from ..forces.joints import JointDamper, JointEffort, JointSpring, JointStops
-from ..forces.points import SpringDamper
-from ..linkage.coordinates import State, real_state
-from ..linkage.fields import value_of
-from ..linkage.linkage import Linkage, check_linkage, joints_of, moving_joints
-from ..linkage.topology import letters
-from ..simulation.scene import accepts_scene
-from .mjcf_chain import FAR
-from .mjcf_source import Node, child
+from .. import (
+    Element,
+    JointDamper,
+    JointEffort,
+    Linkage,
+    PDController,
+    SpringDamper,
+    State,
+)
+from ..forces import (
+    Armature,
+    HardStops,
+    JointFriction,
+    JointSpring,
+    JointStops,
+    elements_on,
+)
+from ..simulation import accepts_scene
+from .chain import FAR
+from .checks import real_numbers, refusal
+from .law import Actuators
+from .source import Node, child
 
 Number = SupportsFloat  # also an array of one
 # MuJoCo rejects smaller masses and inertias of moving bodies (its mjMINVAL).
@@ -37,7 +46,9 @@ _COLOURS = "0.2 0.4 0.7 1", "0.8 0.5 0.2 1"  # of links in turn
 
 
 @accepts_scene
-def to_mjcf(linkage: Linkage, forces: Forces = (), state0: State | None = None) -> str:
+def to_mjcf(
+    linkage: Linkage, forces: tuple[Any, ...] = (), state0: State | None = None
+) -> str:
     """Exports a linkage and its force elements, or a scene, as a MuJoCo model (MJCF).
 
     Joints `joint1`, `joint2`, ... are hinges about z and slides in the plane z = 0,
@@ -70,14 +81,16 @@ def to_mjcf(linkage: Linkage, forces: Forces = (), state0: State | None = None) 
     >>> text.count('type="hinge"'), text.count('type="slide"'), text.count("damping")
     (2, 1, 3)
     """
-    check_linkage(linkage)
-    check_known("linkage", linkage, forces)
+    leaves = jax.tree.leaves((linkage, forces))
+    traced = any(isinstance(leaf, Tracer) for leaf in leaves)
+    if traced or not isinstance(linkage, Linkage) or np.ndim(linkage.ef) != 1:
+        raise refusal("linkage", "one Linkage, and known values", linkage)
     length, com, locked = map(np.asarray, (linkage.length, linkage.com, linkage.locked))
     mass = np.maximum(linkage.mass, _SMALLEST)
     inertia = np.maximum(linkage.inertia, _SMALLEST)
-    kinds = letters(linkage.ef)
+    kinds = linkage.topology
     acting = elements_on(linkage, forces)
-    _check_elements(linkage, acting)
+    _check_elements(linkage, forces, acting)
     attributes = _of_joints(acting, linkage)
 
     add = ElementTree.SubElement
@@ -105,11 +118,10 @@ def to_mjcf(linkage: Linkage, forces: Forces = (), state0: State | None = None) 
     _add_springs(root, bodies, acting)
     controls, states = _add_actuators(root, linkage, kinds, acting)
     if controls or state0 is not None:
-        still = np.zeros(len(kinds))
-        start = State(still, still) if state0 is None else state0
-        start = real_state("state0", start, linkage)
-        moving = moving_joints(linkage)
-        qpos, qvel = (_text(*np.asarray(values)[moving]) for values in start)
+        start = np.zeros((2, len(kinds)))
+        if state0 is not None:
+            start = real_numbers("state0", state0, start.shape)
+        qpos, qvel = (_text(*row) for row in start[:, np.array(list(kinds)) != "F"])
         frame = dict(name="start", qpos=qpos, qvel=qvel, ctrl=_text(*controls))
         frame |= dict(act=_text(*states)) if states else {}
         add(add(root, "keyframe"), "key", frame)
@@ -117,15 +129,15 @@ def to_mjcf(linkage: Linkage, forces: Forces = (), state0: State | None = None) 
     return ElementTree.tostring(root, encoding="unicode")
 
 
-def _check_elements(linkage: Linkage, acting: tuple[Element, ...]) -> None:
+def _check_elements(
+    linkage: Linkage, forces: tuple[Any, ...], acting: tuple[Element, ...]
+) -> None:
     """Raises ValueError for elements that MuJoCo does not have."""
     counts = Counter(map(type, acting))
     for k, element in enumerate(acting):
-        name, expected = type(element).__name__, None
+        name, expected = type(forces[k]).__name__, None
         if type(element) not in _KINDS:  # subclasses compute something else
             expected = "one of " + ", ".join(kind.__name__ for kind in _KINDS)
-            if isinstance(element, ForeignElement):
-                name = type(element.called).__name__
         elif isinstance(element, SpringDamper):
             element.check(linkage, jnp.zeros(1))
             if element.side and float(element.damping) > 0:
@@ -146,7 +158,7 @@ def _check_elements(linkage: Linkage, acting: tuple[Element, ...]) -> None:
 
 def _limits_and_acts(element: Any, linkage: Linkage) -> tuple[np.ndarray, np.ndarray]:
     """In which joints an element of `_ACTUATORS` limits the effort, and acts, (n,)."""
-    count = joints_of(linkage)
+    count = len(linkage.mass)
     if isinstance(element, JointEffort):
         return np.zeros(count, bool), np.asarray(element.tau, bool)
     if isinstance(element, PDController):
@@ -199,7 +211,7 @@ def _add_spatial(
 
 def _of_joints(acting: tuple[Element, ...], linkage: Linkage) -> list[dict[str, str]]:
     """Attributes of the joints that stand for elements."""
-    count = joints_of(linkage)
+    count = len(linkage.mass)
     joints: list[dict[str, str]] = [{} for _ in range(count)]
 
     def add(name: str, *columns: ArrayLike, where: ArrayLike = True) -> None:
@@ -326,7 +338,7 @@ def _general(
 ) -> Iterator[tuple[np.ndarray, dict[str, str], float, list[float]]]:
     """Yields gears, attributes of general actuators, controls and states, if any."""
     gears, gains, bias = map(np.asarray, (element.gear, element.gain, element.bias))
-    control = np.asarray(value_of(element, "control", jnp.zeros(())))
+    control = np.asarray(element.value_of("control", jnp.zeros(())))
     low, high, bounded = _ends(element.lower, element.upper, len(gears))
     own = element.activation
     for k, gear in enumerate(gears):

@@ -6,14 +6,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..base.checks import real_array
-from ..control.actuators import Activation, Actuators
-from ..control.pd import PDController
-from ..forces.element import Element
-from ..forces.joints import JointEffort
-from ..references.task import SetPoint
-from .mjcf_chain import Chain, Reader
-from .mjcf_source import Model
+from .. import Element, JointEffort, PDController
+from ..references import SetPoint
+from .chain import Chain, Reader
+from .checks import real_numbers
+from .law import Activation, Actuators
+from .source import Model
 
 
 class _Affine(NamedTuple):
@@ -101,7 +99,7 @@ def actuators(read: Reader, chain: Chain, controls: ArrayLike | None) -> list[El
     model = read.model
     if controls is None:
         controls = model.key_ctrl[0] if model.nkey else np.zeros(model.nu)
-    controls = np.array(real_array("controls", controls, (model.nu,)))
+    controls = real_numbers("controls", controls, (model.nu,))
     clamped = np.asarray(model.actuator_ctrllimited).astype(bool).ravel()
     clamped &= not read.disabled("CLAMPCTRL")
     ranges = np.asarray(model.actuator_ctrlrange).reshape(-1, 2)

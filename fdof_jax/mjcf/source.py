@@ -8,8 +8,7 @@ from types import ModuleType
 from typing import Any
 from xml.etree import ElementTree
 
-from ..base.checks import plain, refusal, shown
-from ..base.whole_files import local_path
+from .checks import plain, refusal
 
 Model = Any  # an `mujoco.MjModel`, of which type checkers know nothing
 Node = ElementTree.Element
@@ -30,9 +29,11 @@ def compiled_model(mujoco: ModuleType, source: Any) -> tuple[Model, list[str]]:
     if isinstance(source, str) and "<" in source:
         # What was checked is compiled, not the text: parsers differ in what they skip.
         return _of_root(mujoco, _root(source), None)
-    path = local_path("source", source, _EXPECTED)
-    if not os.path.isfile(path):  # which does not raise for any text
-        raise refusal("source", f"{_EXPECTED}, and the file to be there", str(source))
+    path = None
+    if isinstance(source, str | os.PathLike):
+        path = Path(os.path.expanduser(source))
+    if path is None or not os.path.isfile(path):  # which does not raise for any text
+        raise refusal("source", f"{_EXPECTED}, and the file to be there", source)
     content = path.read_bytes()
     if b"<robot" in content and (root := _root(content)).tag == "robot":
         return _of_root(mujoco, root, path.parent)
@@ -75,9 +76,11 @@ def _of_root(
         for name in [name for name in part.attrib if name.startswith("file")]:
             given = part.attrib[name]
             if folder is None:
-                raise ValueError(
-                    "source: expected a text that names no other files, as a text has "
-                    f"no folder, got {shown(given)}; give the path of the file."
+                raise refusal(
+                    "source",
+                    "the path of the file, as a text has no folder and names no other "
+                    "files",
+                    given,
                 )
             given = given.removeprefix("package://")
             inner = folder / meshes

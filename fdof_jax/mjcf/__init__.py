@@ -1,0 +1,1 @@
+"""Models of MuJoCo: read, written, and the law of its actuators."""

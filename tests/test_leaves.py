@@ -1,0 +1,54 @@
+"""Leaves import the library as a user does, and no more than their names are shown."""
+
+import ast
+from pathlib import Path
+
+import pytest
+from test_package import FOLDER, LEAVES, NAMESPACES
+
+PUBLIC = {Path(room.__file__): room for room in NAMESPACES}
+
+
+def imports(path):
+    """Yields the file, or the folder, of each import of the library, and its names."""
+    for line in ast.walk(ast.parse(path.read_text())):
+        if isinstance(line, ast.Import):
+            assert not any(n.name.startswith("fdof_jax") for n in line.names), path
+        elif isinstance(line, ast.ImportFrom):
+            module = line.module or ""
+            assert not module.startswith("fdof_jax"), path
+            if line.level:
+                place = path.parents[line.level - 1].joinpath(*module.split("."))
+                yield place, [name.name for name in line.names]
+
+
+def leaf_of(place):
+    first = (*place.relative_to(FOLDER).parts, "")[0]
+    return first if first in LEAVES else None
+
+
+@pytest.mark.parametrize("leaf", LEAVES)
+def test_a_leaf_imports_public_names_alone(leaf):
+    files = [*(FOLDER / leaf).rglob("*.py")]
+    assert files
+    for path in files:
+        for place, names in imports(path):
+            if leaf_of(place) == leaf:
+                continue
+            file = place / "__init__.py" if place.is_dir() else place.with_suffix(".py")
+            assert file in PUBLIC, (path, file)
+            assert {*names} <= {*PUBLIC[file].__all__}, (path, names)
+
+
+@pytest.mark.parametrize("leaf", LEAVES)
+def test_rooms_only_show_names_of_a_leaf(leaf):
+    shown = set()
+    for path in FOLDER.rglob("*.py"):
+        if leaf_of(path) == leaf:
+            continue
+        for place, names in imports(path):
+            if leaf_of(place) == leaf:
+                assert path.name == "__init__.py", (path, place)
+                assert {*names} <= {*PUBLIC[path].__all__}, (path, names)
+                shown |= {*names}
+    assert shown
