@@ -17,10 +17,8 @@ from ..analysis.responses import StepAndSine
 from ..base.checks import instance
 from ..control.drives import controller_in
 from ..dynamics import link_energies
-from ..forces.element import Forces, ForeignElement, elements, elements_on
-from ..linkage.fields import jumps_at
+from ..forces.element import Forces, elements, elements_on
 from ..linkage.linkage import Linkage, joint_names, moving_joints
-from ..references.reference import reference_motion, reference_of
 from ..simulation.efforts import joint_efforts
 from ..simulation.solution import Solution
 from .arms import geometry, link_color
@@ -128,11 +126,11 @@ def _references(
     paths = []
     for controller in map(controller_in, elements("forces", forces)):
         if controller:
-            jumps = jumps_at("reference", reference_of(controller.reference))
-            jumps = np.zeros(0) if jumps is None else np.asarray(jumps)
+            jumps = controller.jump_ts
+            jumps = np.zeros(0) if jumps is None else np.ravel(jumps)
             jumps = jumps[(ts[0] < jumps) & (jumps <= ts[-1])]
             times = np.unique(np.concatenate([ts, np.nextafter(jumps, -np.inf), jumps]))
-            at = lambda t, r=controller.reference: reference_motion(r, t, linkage)[0]
+            at = lambda t, of=controller: of.schedule(t, linkage)[0]
             paths.append((times, np.asarray(jax.vmap(at)(times))))
     return paths
 
@@ -207,10 +205,9 @@ def effort_profile(
     """
     last = reached(linkage, solution)[0][-1]
     efforts = joint_efforts(linkage, forces, solution)
-    forces = elements_on(linkage, forces)
     ts, total, parts = (np.asarray(a) for a in (solution.ts, *efforts))
     moving, joints = moving_joints(linkage), joint_names(linkage)
-    controllers = [controller_in(element) for element in forces]
+    controllers = [controller_in(element) for element in elements_on(linkage, forces)]
     parts, held = [*parts], solution.acting is not None
     named = [(name, part) for name, part in zip(_names(forces), parts) if part.any()]
     named = named or [("none", total)]
@@ -260,8 +257,7 @@ def effort_profile(
 
 def _names(forces: Forces) -> list[str]:
     """Returns the names of the elements' classes, of plain functions their own."""
-    called = [e.called if isinstance(e, ForeignElement) else e for e in forces]
-    return [c.__name__ if isfunction(c) else type(c).__name__ for c in called]
+    return [f.__name__ if isfunction(f) else type(f).__name__ for f in forces]
 
 
 def _busy(ts: np.ndarray, efforts: np.ndarray) -> tuple[float, float] | None:
