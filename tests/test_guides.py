@@ -3,6 +3,7 @@
 import re
 from pathlib import Path
 
+import equinox as eqx
 import jax
 import numpy as np
 import pytest
@@ -122,6 +123,8 @@ def test_recipes(tmp_path, monkeypatch):
     np.testing.assert_allclose(np.linalg.norm(pushes, axis=0), 1)
     names["show"](length=0.5)  # errors within `interact` are only printed
     assert names["value"] < 0.06
+    for read, written in (("kept", "policy"), ("again", "scenes")):
+        assert eqx.tree_equal(names[read], names[written])
     assert names["rewards"].shape == (500, 256) and names["done"].sum() >= 512
     assert names["found"].success and names["found"].fun < 0.01
     assert names["room"](names["found"].x).min() > -1e-6

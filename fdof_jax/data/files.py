@@ -2,7 +2,6 @@
 
 import dataclasses
 import importlib
-import inspect
 import json
 import math
 import os
@@ -10,7 +9,6 @@ import re
 from collections.abc import Sequence
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -22,11 +20,10 @@ from ..base.user_warnings import without_warning
 from ..base.version import __version__
 from ..base.whole_files import file_path, whole_file
 from ..linkage.linkage import Linkage
-from ..simulation.scene import is_number, members, stacked
 from ..simulation.solution import Solution
 
 Json = Any  # numbers, texts, and lists and dicts of such
-Classes = Sequence[type | eqx.Module]  # modules with numbers of the same shapes
+Classes = Sequence[type]
 _PACKAGE = __name__.partition(".")[0]
 # Where classes are looked up. The package comes last, as it warns of names in rooms;
 # the states of drives and the histories of tuning are in no room's list.
@@ -54,11 +51,8 @@ def save(path: str | os.PathLike, tree: PyTree) -> None:
     - An argument with a default may be absent.
     - A list that begins with a number is an array; `"inf"`, `"-inf"` and `"nan"` are
       numbers. Any other list is a tuple.
-    - `{"tuple": [...]}` is a tuple that begins with a number or an array,
-      `{"dict": {...}}` a dictionary, and `{"batch": [...]}` the members of an object
-      whose arrays all have a further leading axis.
-    - `{"MLP": [[...], ...]}` are the numbers in an `equinox.Module` that is not made
-      from its fields, as a network.
+    - `{"tuple": [...]}` is a tuple that begins with a number or an array, and
+      `{"dict": {...}}` a dictionary.
     - At the top, `"value"` names what is no object.
 
     An existing file is replaced when the new one is complete. It keeps its permissions,
@@ -69,13 +63,14 @@ def save(path: str | os.PathLike, tree: PyTree) -> None:
     - `path`: path of the file, such as "scene.json"; no suffix is added.
     - `tree`: a `Scene`, a `Linkage`, force elements, references, a `TuneResult`, a
       `FitResult`, or tuples and dicts of these and of numbers, texts and arrays.
-      Instances of your own `Element`, dataclass or NamedTuple are saved if their
-      constructor's arguments are fields, or a method `arguments` returns them; those of
-      an `equinox.Module` always are, if need be by their numbers alone.
+      Instances of your own `Element`, `equinox.Module`, dataclass or NamedTuple are
+      saved if their constructor's arguments are fields, or a method `arguments` returns
+      them.
 
     **Raises:** ValueError for what cannot be saved, with its place in the tree: a
-    function, a traced value, a `Solution` (use `to_xarray`), an object of another kind.
-    No file is then written, and an existing one is unchanged.
+    function, a traced value, a `Solution` (use `to_xarray`), a network or a batch (use
+    `equinox.tree_serialise_leaves`), an object of another kind. No file is then
+    written, and an existing one is unchanged.
 
     >>> import fdof_jax as fj
     >>> import os, tempfile
@@ -108,10 +103,7 @@ def load(path: str | os.PathLike, classes: Classes = ()) -> Any:
     **Arguments:**
 
     - `path`: path of the file.
-    - `classes`: a tuple of your own classes that the file names. In place of an
-      `equinox.Module` whose numbers alone are in the file, as of a network, give an
-      instance with numbers of the same shapes, and only one of its class with these
-      shapes: all else is taken from it.
+    - `classes`: a tuple of your own classes that the file names.
 
     **Returns:** the tree, on the default device. Numbers are equal to the last bit.
     Arrays have JAX's default dtypes: float64 with double precision, float32 without,
@@ -124,8 +116,8 @@ def load(path: str | os.PathLike, classes: Classes = ()) -> Any:
     """
     path = file_path("path", path)
     several = isinstance(classes, tuple | list)
-    if not (several and all(isinstance(k, type | eqx.Module) for k in classes)):
-        raise refusal("classes", "a tuple of classes, or of modules", classes)
+    if not (several and all(isinstance(kind, type) for kind in classes)):
+        raise refusal("classes", "a tuple of classes", classes)
     content, file = path.read_bytes(), plain(str(path))
     try:
         return _value("tree", _parsed(content), classes)
@@ -218,40 +210,18 @@ def _object(place: str, value: Any) -> dict[str, Json]:
         for keys, leaf in jax.tree_util.tree_leaves_with_path(value):
             if is_traced(leaf):
                 raise refusal(f"{place}{jax.tree_util.keystr(keys)}", _KNOWN, leaf)
-        if _has_other_arguments(value):
-            leaves = jax.tree.leaves(eqx.filter(value, is_number))
-            rows = enumerate(leaves)
-            return {name: [_numbers(f"{place}[{i}]", leaf) for i, leaf in rows]}
         try:
             arguments = getattr(kind, "arguments", Frozen.arguments)(value)
             with without_warning(""):  # which came when it was made
                 kind(**arguments)  # as `load` does
         except _MEANT as error:
-            if not (rows := members(value)):
-                expected = f"a {name} that its constructor accepts, or a batch with a"
-                problem = f"{expected} leading axis on every array; {plain(str(error))}"
-                raise ValueError(f"{place}: expected {problem}") from error
-            batch = [_object(f"{place}[{i}]", row) for i, row in enumerate(rows)]
-            return {"batch": batch}
+            expected = f"a {name} that its constructor makes again"
+            other = "equinox.tree_serialise_leaves writes networks and batches"
+            problem = f"{expected} ({other}); {plain(str(error))}"
+            raise ValueError(f"{place}: expected {problem}") from error
     if isinstance(value, Linkage):
         arguments["topology"] = value.topology
     return {name: {k: _node(f"{place}.{k}", v) for k, v in arguments.items()}}
-
-
-def _has_other_arguments(value: object) -> bool:
-    """Returns whether a user's module, or one in it, is not made from its fields.
-
-    A network is not, and so neither is an element that holds one.
-    """
-    kind = type(value)
-    told = getattr(kind, "arguments", Frozen.arguments) is not Frozen.arguments
-    ours = kind.__module__.startswith(f"{_PACKAGE}.")
-    if told or ours or not isinstance(value, eqx.Module):
-        return False
-    if not vars(value).keys() >= inspect.signature(kind).parameters.keys():
-        return True
-    inner = jax.tree.leaves(vars(value), is_leaf=lambda x: isinstance(x, eqx.Module))
-    return any(map(_has_other_arguments, inner))
 
 
 def _text(node: Json, indent: str = "", before: str = "") -> str:
@@ -315,20 +285,13 @@ def _value(place: str, node: Json, classes: Classes) -> PyTree:
     if len(node) != 1:
         raise refusal(place, "an object by its name alone", list(node)[:20])
     [(name, inner)] = node.items()
-    if name in ("tuple", "batch") and isinstance(inner, list):
-        items = tuple(at(f"[{i}]", item) for i, item in enumerate(inner))
-        if name == "tuple":
-            return items
-        to_jax = lambda x: jax.device_put(x) if isinstance(x, np.ndarray) else x
-        return jax.tree.map(to_jax, stacked(items, place))
-    if isinstance(inner, list) and not _public(name):
-        return _with_numbers(f"{place}.{plain(name)}", name, inner, classes)
+    if name == "tuple" and isinstance(inner, list):
+        return tuple(at(f"[{i}]", item) for i, item in enumerate(inner))
     if not isinstance(inner, dict):
         raise refusal(f"{place}.{plain(name)}", "named arguments", inner)
     if name == "dict":
         return {key: at(f"[{shown(key)}]", item) for key, item in inner.items()}
-    types = [kind if isinstance(kind, type) else type(kind) for kind in classes]
-    own = {kind for kind in types if kind.__name__ == name}
+    own = {kind for kind in classes if kind.__name__ == name}
     maker = _public(name) or (own.pop() if len(own) == 1 else None)
     if maker is None:
         expected = "a class of fdof_jax, or one of load(path, classes=(MyElement,))"
@@ -342,27 +305,6 @@ def _value(place: str, node: Json, classes: Classes) -> PyTree:
     except _MEANT as error:
         problem = f"the arguments of {name}, got {plain(str(error))}"
         raise ValueError(f"{place}: expected {problem}.") from error
-
-
-def _with_numbers(place: str, name: str, node: list[Json], classes: Classes) -> PyTree:
-    """Returns the module of this name among `classes`, with other numbers."""
-    found = [k for k in classes if type(k).__name__ == name]
-    if not found:
-        expected = f"load(path, classes=(..., one {plain(name)})) for its numbers"
-        classes = [k for k in classes if isinstance(k, type) and k.__name__ == name]
-        raise refusal(place, expected, "the class" if classes else "none")
-    new = [_value(f"{place}[{i}]", number, ()) for i, number in enumerate(node)]
-    shapes = [*map(np.shape, new)]
-    given = [[*map(np.shape, jax.tree.leaves(eqx.filter(k, is_number)))] for k in found]
-    if given.count(shapes) != 1:  # of several, the other parts may differ
-        expected = f"one {plain(name)} with numbers of shapes {shapes}, as in the file"
-        raise refusal(place, expected, given)
-    old, rest = eqx.partition(found[given.index(shapes)], is_number)
-    leaves, structure = jax.tree.flatten(old)
-    for index, leaf in enumerate(leaves):
-        if eqx.is_array(leaf):
-            new[index] = jnp.asarray(new[index], leaf.dtype)
-    return eqx.combine(structure.unflatten(new), rest)
 
 
 def _array(place: str, node: list[Json]) -> jax.Array:

@@ -150,18 +150,11 @@ def stacked(scenes: Sequence[_Stacked], name: str = "scenes") -> _Stacked:
 def unstacked(name: str, scenes: Scene) -> list[Scene]:
     """Splits stacked scenes into their members."""
     instance(name, scenes, Scene)
-    if not (found := members(scenes)):
-        expected = "scenes stacked along a leading axis of one size (see `stacked`)"
-        raise refusal(name, expected, scenes)
-    return found
-
-
-def members(batch: _Stacked) -> list[_Stacked]:
-    """Returns the members of a batch; none unless all numbers have a common axis."""
-    arrays, rest = eqx.partition(batch, is_number)
+    arrays, rest = eqx.partition(scenes, is_number)
     leaves, structure = jax.tree.flatten(arrays)
     sizes = {np.shape(leaf)[:1] for leaf in leaves}
     if len(sizes) != 1 or sizes <= {(), (0,)}:
-        return []
+        expected = "scenes stacked along a leading axis of one size (see `stacked`)"
+        raise refusal(name, expected, scenes)
     rows = (jax.device_put(list(row)) for row in zip(*map(np.asarray, leaves)))
     return [eqx.combine(jax.tree.unflatten(structure, row), rest) for row in rows]
