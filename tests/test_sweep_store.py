@@ -131,7 +131,29 @@ def test_files_that_are_missing(mixed, stored, undisturbed, solved):
         run(mixed, store=stored)
     (stored / "failed/c/3").unlink()  # as of a block that was not finished
     run(mixed, store=stored)
-    assert len(solved) == 2 and read(stored) == undisturbed
+    (stored / "digests/1").unlink()
+    with pytest.warns(RuntimeWarning, match="block 1: digests/1"):
+        run(mixed, store=stored)
+    assert len(solved) == 3 and read(stored) == undisturbed
+
+
+@pytest.mark.parametrize("name", ["q/c/{}/0/0", "failed/c/{}"])
+def test_files_that_changed_places(mixed, stored, undisturbed, solved, name):
+    files = [name.format(block) for block in (0, 4)]
+    for file, other in zip(files, reversed(files)):
+        (stored / file).write_bytes(undisturbed[other])
+    with pytest.warns(RuntimeWarning, match="block [04]: digests/[04]"):
+        run(mixed, store=stored)
+    assert solved == [BLOCK] * 2 and read(stored) == undisturbed
+
+
+@pytest.mark.parametrize("name", ["q/c/2/0/0", "failed/c/2", "qd/zarr.json"])
+def test_a_folder_in_the_place_of_a_file(mixed, stored, solved, name):
+    (stored / name).unlink()
+    (stored / name).mkdir()
+    with pytest.raises(ValueError, match=f"^store: expected a file .* folder .*{name}"):
+        run(mixed, store=stored)
+    assert not solved
 
 
 @pytest.mark.parametrize("written", [0, 1, 12, 20, 30, 50])
@@ -183,8 +205,10 @@ def test_what_others_wrote_is_refused_and_kept(mixed, tmp_path):
         "three": lambda folder: data.to_zarr(folder, zarr_format=3, consolidated=False),
         "two": lambda folder: data.to_zarr(folder, zarr_format=2),
         "list": lambda folder: (folder / "zarr.json").write_text("[]"),
+        "folder": lambda folder: (folder / "zarr.json").mkdir(),
         "notes": lambda folder: (folder / "notes.txt").write_text("mine"),
         "killed": lambda folder: (folder / "zarr.1.partial").write_text("{"),
+        "damaged": lambda folder: (folder / "zarr.json").write_text("[" * 100_000),
     }
     arguments = job_of(mixed), {"q": np.zeros(3)}, "digest"
     for name, write in contents.items():
@@ -194,8 +218,11 @@ def test_what_others_wrote_is_refused_and_kept(mixed, tmp_path):
         before = read(folder)
         if name == "killed":
             store.Store(folder, *arguments)
+        elif name == "damaged":
+            with pytest.warns(RuntimeWarning, match=f"in {folder / 'zarr.json'}"):
+                store.Store(folder, *arguments)
         else:
-            with pytest.raises(ValueError, match="^store: expected a new folder or"):
+            with pytest.raises(ValueError, match="^store: expected a (new|file)"):
                 store.Store(folder, *arguments)
             assert read(folder) == before
 

@@ -1,7 +1,8 @@
 """Keeps the results of a sweep in a folder, a Zarr group, block by block of members.
 
 zarr-python writes each file under another name and then renames it, so that a process
-that is killed leaves no file in part; a checksum ends each file of numbers.
+that is killed leaves no file in part; a checksum ends each file of numbers, and a
+digest per block tells its members from those of others.
 """
 
 import hashlib
@@ -105,7 +106,8 @@ def _variables(like: PyTree, linkage: Linkage) -> list[Variable]:
 class Store:
     """A folder that is a Zarr group, whose chunks along members are blocks.
 
-    No two blocks share a file. The file of `failed` ends a block: it comes last.
+    No two blocks share a file. The file of `failed` ends a block: it comes last, after
+    the block's digest.
     """
 
     def __init__(self, folder: Path, job: Job, like: PyTree, sweep: str):
@@ -128,7 +130,7 @@ class Store:
         files = self._empty(zarr, attributes, linkage, job.common.ts, like)
         for name, data in files.items():
             path = folder / name
-            if path.exists():
+            if self._holds(name):
                 if path.read_bytes() == data:
                     continue
                 self._warn(f"in {path} the metadata of this sweep", "written again")
@@ -187,12 +189,12 @@ class Store:
         names = {p.name for p in self.folder.iterdir() if p.suffix not in endings}
         path = self.folder / "zarr.json"
         what = f"holds {min(names)}" if names else ""
-        if path.exists():
+        if self._holds("zarr.json"):
             try:
                 there = json.loads(path.read_bytes())["attributes"]
                 others = [key for key in attributes if there[key] != attributes[key]]
                 what = f"has another {', '.join(others)}" if others else ""
-            except ValueError:
+            except (ValueError, RecursionError):
                 what = ""  # damaged
             except (LookupError, TypeError):
                 what = "holds a Zarr group from elsewhere"
@@ -214,34 +216,59 @@ class Store:
 
         Damaged files are reported by a warning.
         """
-        if not (self.folder / f"failed/c/{block}").exists():
+        if not self._holds(f"failed/c/{block}"):
             return None
-        damage, failed = [], None
+        damage, values = [], []
         for variable, array in zip(self.variables, self.arrays):
             if not array.size:  # without a file
                 continue
             parts = variable.name, "c", str(block), *"0" * len(variable.shape)
             file = "/".join(parts)
+            there = self._holds(file)
             try:
-                if not (self.folder / file).exists():
+                if not there:
                     raise FileNotFoundError
-                failed = array.blocks[block]  # at last the flags of that name
+                values.append(array.blocks[block])
             except (ValueError, FileNotFoundError):  # ValueError: another checksum
                 damage.append(file)
+        file = f"digests/{block}"
+        written = (self.folder / file).read_bytes() if self._holds(file) else b""
+        if not damage and written != self._digest(block, values):
+            damage.append(file)
         if damage:
             what = f"in {self.folder} the results of block {block}: {', '.join(damage)}"
             self._warn(what, "solved again")
             return None
-        return failed
+        return values[-1]
+
+    def _digest(self, block: int, values: list[np.ndarray]) -> bytes:
+        """Returns a text that names members and their values."""
+        digest = hashlib.sha256(repr(self.members(block)).encode())
+        for rows in values:
+            digest.update(np.ravel(rows))
+        return digest.hexdigest().encode()
+
+    def _holds(self, file: str) -> bool:
+        """Returns whether a file is there; raises ValueError for a folder instead."""
+        if (path := self.folder / file).is_dir():
+            raise ValueError(f"store: expected a file or none, got the folder {path}.")
+        return path.is_file()
 
     def write(self, block: int, outcome: Outcome) -> None:
         values = [
             outcome_numbers(leaf).astype("int8") if _is_result(leaf) else leaf
             for leaf in jax.tree.leaves(outcome.value, is_leaf=_is_result)
         ]
-        for array, rows in zip(self.arrays, [*values, outcome.failed], strict=True):
-            if array.size:
-                array.blocks[block] = np.asarray(rows)
+        rows = [*values, outcome.failed]
+        filled = [
+            (a, np.asarray(r, a.dtype)) for a, r in zip(self.arrays, rows) if a.size
+        ]
+        path = self.folder / f"digests/{block}"
+        path.parent.mkdir(exist_ok=True)
+        with whole_file(path) as file:
+            file.write(self._digest(block, [values for _, values in filled]))
+        for array, values in filled:
+            array.blocks[block] = values
 
 
 def in_store(
