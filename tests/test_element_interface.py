@@ -380,6 +380,7 @@ EIGHT = fj.references.FigureEight([1.6, 0.4], [0.5, 0.3])
     "part",
     [
         *(ALL | HOLDING).values(),
+        fj.Point(1, 0.5),
         fj.CircleTask(),
         fj.TipTask(EIGHT, fj.references.Laps(period=4.0)),
         fj.references.Spline([[0, 0], [1, 1], [2, 0]], closed=True),
@@ -389,6 +390,8 @@ EIGHT = fj.references.FigureEight([1.6, 0.4], [0.5, 0.3])
 )
 def test_a_copy_is_equal_in_values_and_structure(part):
     assert eqx.tree_equal(part.replace(), part, typematch=True)
+    in_numpy = jax.tree.map(jax.device_get, part)
+    assert eqx.tree_equal(in_numpy.replace(), part)
 
 
 def test_a_copy_has_other_numbers_of_an_element():

@@ -6,6 +6,7 @@ by `jax.jit`, `jax.vmap` or `jax.grad` is not known yet.
 
 import importlib
 import inspect
+import operator
 from collections.abc import Callable, Sequence
 from types import ModuleType
 from typing import Any
@@ -259,12 +260,18 @@ def instance(name: str, value: object, kind: type) -> None:
 
 
 def whole_number(name: str, value: Any, minimum: int, most: int | None = None) -> int:
-    """Returns `value` if it is an integer from `minimum` to `most`, not a bool."""
-    whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
-    if not whole or value < minimum or (most is not None and value > most):
+    """Returns an integer from `minimum` to `most`, also one in an array without axes.
+
+    Raises ValueError for all else, bools too.
+    """
+    try:
+        number = None if isinstance(value, bool) else operator.index(value)
+    except Exception:  # whatever a value's own conversion raises
+        number = None
+    if number is None or number < minimum or (most is not None and number > most):
         upper = "" if most is None else f" and at most {most:,}"
         raise refusal(name, f"a whole number of at least {minimum}{upper}", value)
-    return int(value)
+    return number
 
 
 def one_of(name: str, value: object, options: Sequence[Any]) -> Any:

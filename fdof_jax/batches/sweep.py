@@ -216,8 +216,8 @@ def sweep(
     hashable("reduce", reduce)
     most = _CHUNK_HELD if holders(forces) else _CHUNK
     chunk = most if chunk is None else whole_number("chunk", chunk, 1)
-    whole_number("of", of, 1)
-    if whole_number("shard", shard, 0) >= of:
+    of, shard = whole_number("of", of, 1), whole_number("shard", shard, 0)
+    if shard >= of:
         raise refusal("shard", f"a whole number below of={of}", shard)
     if store is None and of > 1:
         raise refusal("store", "a folder, as of is given", store)

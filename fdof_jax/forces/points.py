@@ -17,7 +17,7 @@ from jax import Array
 from jaxtyping import Complex, Float, Int, PyTree
 from numpy.typing import ArrayLike
 
-from ..base.checks import instance, is_traced, refusal, whole_number
+from ..base.checks import instance, refusal, whole_number
 from ..linkage.fields import Condition, Part, Values, check_joints, field, of_kind
 from ..linkage.frames import Frames, cross, length_of, plane_vector, scalar_frames
 from ..linkage.linkage import Linkage, joints_of, per_joint, without_fixed
@@ -36,12 +36,11 @@ def pick(link: Array, choices: list[Array]) -> Array:
 
 
 def _link(link: int | Array) -> Array:
-    if isinstance(link, Array) and not is_traced(link) and link.shape == ():
-        link = link.item()  # of another point, by `replace`
-    if whole_number("link", link, 0) > MOST_PAIRS:
+    number = whole_number("link", link, 0)  # also of another point, by `replace`
+    if number > MOST_PAIRS:
         expected = f"0 (the ground) or a moving link, 1 to {MOST_PAIRS}"
         raise refusal("link", expected, link)
-    return jax.device_put(np.array(link))
+    return jax.device_put(np.array(number))
 
 
 class Point(Part):
@@ -304,11 +303,11 @@ class Tension(LineElement):
         return self.tension * self.length(linkage, q)
 
 
-def _flag(follows: bool | Array) -> Array:
-    if isinstance(follows, Array) and follows.dtype == bool:
-        return follows  # of another wrench, by `replace`
-    instance("follows", follows, bool)
-    return jax.device_put(np.array(follows))
+def _flag(follows: bool | Array | np.ndarray) -> Array:
+    # An array comes from another wrench, by `replace`.
+    if not isinstance(follows, Array | np.ndarray) or follows.dtype != bool:
+        instance("follows", follows, bool)
+    return follows if isinstance(follows, Array) else jax.device_put(np.array(follows))
 
 
 class Wrench(PointElement):

@@ -182,11 +182,11 @@ def topology_grid(
     elements to draw, as in `draw_linkage`; `configurations`: number for each, evenly
     spaced in samples from the first (faint) to the last.
     """
-    whole_number("configurations", configurations, 2)
+    count = whole_number("configurations", configurations, 2, np.iinfo(np.int32).max)
     geometries = _geometries(motions, forces)
     fig, panels = _panels(geometries, fig)
     for ax, (ts, g) in zip(panels, geometries.values()):
-        indices = np.linspace(0, len(ts) - 1, configurations).round().astype(int)
+        indices = np.linspace(0, len(ts) - 1, count).round().astype(int)
         draw_motion(ax, g, np.unique(indices), mass_centers=False)
     figure_legend(fig)
     return fig

@@ -161,7 +161,7 @@ def simulate_sampled(
     control = element_of(function("control", control, expected))
     every = real_array("period", period, (), above=0)
     t0 = real_array("t0", t0, ())
-    whole_number("samples", samples, 1)
+    samples = whole_number("samples", samples, 1, np.iinfo(np.int32).max)
     real_array("delay", delay, (), minimum=0)
     if (noise is None) != (key is None):
         raise ValueError("noise, key: expected both or none of them, got one.")

@@ -57,7 +57,8 @@ def solve_options(
         # As an array its value is no part of the program.
         dt0 = real_numbers("dt0", dt0, (), above=0)
     if max_steps is not None:
-        whole_number("max_steps", max_steps, 1, np.iinfo(np.int32).max)
+        most = np.iinfo(np.int32).max
+        max_steps = whole_number("max_steps", max_steps, 1, most)
     loops = (
         diffrax.RecursiveCheckpointAdjoint,
         diffrax.ForwardMode,
