@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import fdof_jax as fj
+from fdof_jax import drawing
 
 
 def make(topology="RRR", **changes):
@@ -114,14 +115,22 @@ MALFORMED = {
     "dates": lambda shape: np.full(shape, np.datetime64("2020-01-01")),
     "bytes": lambda shape: b"abc",
     "a key": lambda shape: jax.random.key(0),
+    "deleted": lambda shape: DELETED,
     "a class": lambda shape: float,
     "records": lambda shape: np.zeros(shape, [("a", float), ("b", int)]),
     "empty": lambda shape: np.zeros((*shape, 0)),
 }
 
 
+DELETED = jnp.ones(3) + 1
+DELETED.delete()
+
+
 class Hostile:
-    """An object that raises when it is converted to an array."""
+    """An object that raises when it is converted to an array or shown."""
+
+    def __repr__(self):
+        raise RuntimeError("no text")
 
     def __array__(self, *args, **keywords):
         raise RuntimeError("no array")
@@ -285,6 +294,42 @@ def test_a_batch_is_hinted_at_only_where_one_may_be_meant(coefficient, batch):
     ) as raised:
         simulate(forces=(damper,))
     assert ("forces_axes" in str(raised.value)) == batch
+
+
+# What is of another type is told by its type, if not by its text
+
+
+ACTUATOR = dict(gear=[[1, 0, 0]], gain=[[8, 0, 0]], bias=[[0, -8, -2]], control=[0.5])
+OTHER_TYPES = [
+    ("activation", lambda value: fj.control.Actuators(**ACTUATOR, activation=value)),
+    ("joints", fj.forces.Brake),
+    ("samples", lambda v: fj.simulate_sampled(LINKAGE, STATE, DAMPER, 0.01, v)),
+    ("force", lambda value: fj.Wrench(fj.Point(1), value)),
+    ("point", fj.Wrench),
+    ("link", fj.Point),
+    ("follows", lambda value: fj.Wrench(fj.Point(1), follows=value)),
+    ("mass_centers", lambda v: drawing.draw_linkage(LINKAGE, ZERO, mass_centers=v)),
+    (
+        "mass_centers",
+        lambda v: drawing.chrono_cyclograph(LINKAGE, SOLUTION, mass_centers=v),
+    ),
+    (
+        "configurations",
+        lambda v: drawing.topology_grid({"a": (LINKAGE, SOLUTION)}, configurations=v),
+    ),
+    ("linkage", lambda value: simulate(value)),
+    ("loss", lambda value: fj.tune(fj.scenes.fig7(), loss=value)),
+]
+
+
+@pytest.mark.parametrize("name, call", OTHER_TYPES)
+def test_other_types_are_refused(name, call):
+    key, huge = jax.random.key(0), 10**400
+    classes = fj.control.Activation, fj.Point, fj.Linkage, fj.tuning.Tracking
+    for value in (key, huge, 10**5000, DELETED, Hostile(), *classes):
+        refused(name, call, value)
+    with pytest.raises(ValueError, match="got a value of type ArrayImpl"):
+        call(DELETED)
 
 
 # Messages are short

@@ -6,6 +6,7 @@ by `jax.jit`, `jax.vmap` or `jax.grad` is not known yet.
 
 import importlib
 import inspect
+import itertools
 import operator
 from collections.abc import Callable, Sequence
 from types import ModuleType
@@ -84,8 +85,23 @@ def plain(text: str) -> str:
 
 
 def shown(value: object) -> str:
-    """Returns how messages show a value that was given."""
-    return plain(repr(value))
+    """Returns how messages show a value that was given; its type, if that fails."""
+    try:
+        return plain(repr(_beginning(value)))
+    except Exception:  # whatever a value's own text raises, as a deleted array's does
+        return f"a value of type {plain(type(value).__name__)}"
+
+
+def _beginning(value: Any) -> Any:
+    """Returns what messages may show of it: the text of a million numbers is slow."""
+    if isinstance(value, tuple):  # also a NamedTuple
+        return tuple.__new__(type(value), map(_beginning, value[:_MOST_SHOWN]))
+    if type(value) is list:
+        return [*map(_beginning, value[:_MOST_SHOWN])]
+    if type(value) is dict:
+        items = itertools.islice(value.items(), _MOST_SHOWN)
+        return {key: _beginning(item) for key, item in items}
+    return value[:_MOST_SHOWN] if type(value) in (str, bytes) else value
 
 
 def refusal(name: str, expected: str, got: object) -> ValueError:

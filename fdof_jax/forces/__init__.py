@@ -1,6 +1,6 @@
 """Force elements: joint efforts, springs, dampers, stops, actuators."""
 
-from ..linkage.fields import Condition, Part, Values, field
+from ..linkage.fields import Condition, Part, Values, field, of_kind
 from .actuators import Armature, LinearActuator, Rotor
 from .element import Element, InertialElement, StatefulElement, elements_on
 from .holders import Brake, HardStops, JointFriction
@@ -12,9 +12,9 @@ from .switches import clip, switch
 __all__ = [
     "Armature", "Brake", "clip", "Condition", "EffortHistory", "Element", "elements_on",
     "field", "HardStops", "InertialElement", "JointDamper", "JointEffort",
-    "JointFriction", "JointSpring", "JointStops", "LinearActuator", "Load", "Part",
-    "Payload", "Point", "PointElement", "Rotor", "SpringDamper", "StatefulElement",
-    "switch", "Tension", "Values", "Wrench",
+    "JointFriction", "JointSpring", "JointStops", "LinearActuator", "Load", "of_kind",
+    "Part", "Payload", "Point", "PointElement", "Rotor", "SpringDamper",
+    "StatefulElement", "switch", "Tension", "Values", "Wrench",
 ]  # fmt: skip
 
 

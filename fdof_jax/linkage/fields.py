@@ -85,9 +85,21 @@ def called(expected: str) -> Any:
     return dataclasses.field(metadata={"called": expected})
 
 
-def of_kind(kind: type) -> Any:
-    """Declares a field that is an instance of a class."""
-    return dataclasses.field(metadata={"kind": kind})
+def of_kind(kind: type, default: Any = dataclasses.MISSING) -> Any:
+    """Declares a field of an element: an instance of a class, or None if by default.
+
+    The constructor raises ValueError for anything else.
+
+    >>> import fdof_jax as fj
+    >>> class Pad(fj.Element):
+    ...     at: fj.forces.Point = fj.forces.of_kind(fj.forces.Point)
+    ...     def __call__(self, t, q, qd, linkage):
+    ...         return 0 * q
+    >>> Pad("tip")
+    Traceback (most recent call last):
+    ValueError: at: expected a Point, got 'tip'.
+    """
+    return dataclasses.field(default=default, metadata={"kind": kind})
 
 
 class default:
@@ -199,10 +211,11 @@ class Part(Frozen, metaclass=_Fields):
     def __check_init__(self):
         for declared in dataclasses.fields(self):
             name, about = declared.name, declared.metadata
+            value = vars(self)[name]
             if "called" in about:
-                function(name, vars(self)[name], about["called"])
-            if "kind" in about:
-                instance(name, vars(self)[name], about["kind"])
+                function(name, value, about["called"])
+            if "kind" in about and (value is not None or declared.default is not None):
+                instance(name, value, about["kind"])
         for name, value, rules in _declared(self):
             object.__setattr__(self, name, real_array(name, value, **rules))
         try:
@@ -250,7 +263,8 @@ def _declared(part: Part) -> Iterator[tuple[str, Any, Rules]]:
         value, about = vars(part)[declared.name], declared.metadata
         if "rules" not in about or value is None and about["optional"]:
             continue
-        if not (about["function"] and callable(value)):
+        called = callable(value) and not isinstance(value, type)
+        if not (about["function"] and called):
             yield declared.name, value, about["rules"]
 
 

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 from jax import Array
 
-from ..base.checks import check_known, refusal
+from ..base.checks import array_of, check_known, refusal
 from .fields import Condition
 from .linkage import Linkage, joints_of
 from .topology import MOST_PAIRS
@@ -21,7 +21,10 @@ def numbered(joints: Any) -> Array:
     """
     check_known("joints", joints)
     array = isinstance(joints, Array | np.ndarray)
-    given = joints.tolist() if array else joints
+    try:
+        given = array_of(joints).tolist() if array else joints
+    except (RuntimeError, TypeError):  # deleted, masked, or random keys
+        given = None
     numbers = given if isinstance(given, list | tuple) else (given,)
     if not numbers or any(
         isinstance(n, bool) or not isinstance(n, int) or n not in _NUMBERS

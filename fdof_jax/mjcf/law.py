@@ -6,7 +6,16 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ..forces import Condition, Part, StatefulElement, Values, clip, field, switch
+from ..forces import (
+    Condition,
+    Part,
+    StatefulElement,
+    Values,
+    clip,
+    field,
+    of_kind,
+    switch,
+)
 
 
 class Activation(Part):
@@ -94,7 +103,7 @@ class Actuators(StatefulElement):
     effort_upper: Values | None = field(
         ("joint",), unit="N or N m", finite=False, default=None
     )
-    activation: Activation | None = None
+    activation: Activation | None = of_kind(Activation, default=None)
 
     def conditions(self):
         fixed = () if callable(self.control) else (self.control,)

@@ -28,7 +28,7 @@ from matplotlib.typing import ColorType
 from numpy.typing import ArrayLike
 from PIL import Image
 
-from ..base.checks import real_array, refusal, shown, whole_number
+from ..base.checks import instance, real_array, refusal, shown, whole_number
 from ..forces.element import Forces
 from ..linkage.linkage import Linkage, check_linkage, per_joint
 from ..simulation.solution import Solution
@@ -97,6 +97,7 @@ def draw_linkage(
     index: "spring 0", "cylinder 1". New axes have a legend of the parts above them.
     """
     check_linkage(linkage)
+    instance("mass_centers", mass_centers, bool)
     q = np.asarray(per_joint("q", q, linkage))[None]
     g = geometry(linkage, q, np.zeros(1), forces)
     panel = plane_axes(ax, g.all_points)
@@ -128,6 +129,7 @@ def chrono_cyclograph(
     **Raises:** ValueError for malformed arguments and for an `until` before the start.
     """
     ts, q, _ = reached(linkage, solution)
+    instance("mass_centers", mass_centers, bool)
     g = geometry(linkage, q)
     step = float(real_array("every", every, (), above=0))
     last = _last(ts, until)
