@@ -376,3 +376,16 @@ def test_messages_repeat_little_of_what_was_given(call, kind):
     words = str(raised.value)
     assert len(words) < 600
     assert all(letter.isprintable() for letter in words)
+
+
+@pytest.mark.parametrize("hold", [list, tuple, lambda x: [fj.State(x, x)]])
+def test_little_is_formatted(hold):
+    formatted = []
+
+    class Noted:
+        def __repr__(self):
+            formatted.append(self)
+            return "Noted"
+
+    refused("point", fj.Wrench, hold([Noted() for _ in range(100_000)]))
+    assert 0 < len(formatted) <= 400

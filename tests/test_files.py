@@ -189,6 +189,15 @@ def test_trees(name, path):
     assert os.listdir(path.parent) == [path.name]
 
 
+def test_the_deepest_tree(path):
+    tree = ("x",)
+    for _ in range(99):
+        tree = (tree,)
+    saved_and_loaded(path, tree)
+    with pytest.raises(ValueError, match="^tree: expected at most 100 levels"):
+        fj.save(path, (tree,))
+
+
 def test_states_of_any_shape(path):
     rows = jnp.arange(12.0).reshape(2, 2, 3) / 7
     scene = fj.Scene(ARM, fj.State(rows, rows), (fj.JointEffort(1.0),), 1.0)
@@ -201,7 +210,8 @@ arrays = st.builds(
     st.sampled_from([float, int, bool]),
 )
 trees = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats() | arrays
+    st.none() | st.booleans() | st.floats() | arrays
+    | st.integers(-(2**63), 2**64 - 1)
     | st.text().filter(lambda text: text not in ("inf", "-inf", "nan")),
     lambda inner: (
         st.lists(inner, max_size=3).map(tuple)
@@ -289,6 +299,12 @@ def test_a_replaced_file_keeps_permissions_and_links(path):
         assert link.is_symlink() and fj.load(path) == fj.load(f"{link}") == mode
         assert stat.S_IMODE(path.stat().st_mode) == mode
     assert sorted(os.listdir(path.parent)) == ["link.json", "tree.json"]
+
+
+@pytest.mark.parametrize("name", ["x" * 255, "\U0001f600" * 63])
+def test_the_longest_names(name, tmp_path):
+    fj.save(tmp_path / name, 3)
+    assert fj.load(tmp_path / name) == 3 and os.listdir(tmp_path) == [name]
 
 
 def test_a_home(tmp_path, monkeypatch):

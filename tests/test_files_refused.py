@@ -1,6 +1,7 @@
 """Files of JSON: what cannot be saved or loaded is refused by name and place."""
 
 import contextlib
+import dataclasses
 import os
 import sys
 import tracemalloc
@@ -24,6 +25,10 @@ deleted.delete()
 TS = np.linspace(0, 1, 3)
 MOTION = fj.Solution(TS, np.ones((3, 3)), np.ones((3, 3)), {}, None)
 ALIKE = type("JointDamper", (eqx.Module,), {})()
+WORDS = [
+    dataclasses.make_dataclass(name, ["a"], namespace={"__module__": "own"})(1.0)
+    for name in ("fdof_jax", "value", "tuple", "dict")
+]
 NETWORK = eqx.nn.MLP(6, 3, 8, 1, key=jax.random.key(0))
 UNSAVED = {
     "lambda": (lambda t, linkage: (t, t), "equinox.Module .* got <function"),
@@ -45,6 +50,9 @@ UNSAVED = {
     "motion": (MOTION, "to_xarray .* got Solution"),
     "class within the library": (LoopedDopri8(), "public class, .*LoopedDopri8"),
     "class of a public name": (ALIKE, "another name, .*JointDamper"),
+    **{f"class {type(w).__name__}": (w, "of another name") for w in WORDS},
+    "whole": (2**64, "at most 64 bits, got 18446744073709551616"),
+    "long": (-(10**5000), "at most 64 bits, got a value of type int"),
     "impossible": (eqx.tree_at(lambda a: a.mass, ARM, -ARM.mass), "mass: .* at least"),
     "network": (NETWORK, "equinox.tree_serialise_leaves .*dtype, key"),
     "batch": (
@@ -149,7 +157,9 @@ UNREADABLE = {
     of('"value": [[1, 2], [3]]'): "tree: expected numbers in lists of one length",
     of('"value": [1, "x"]'): r"tree: expected numbers .*got \[1, 'x'\]",
     of('"value": [1, null]'): r"tree: expected numbers .*got \[1, None\]",
-    of(f'"value": [1, {2**70}]'): "tree: expected numbers",
+    of(f'"value": [1, {2**70}]'): "tree: expected numbers .* 64 bits",
+    of(f'"value": [{2**63}, -1]'): "tree: expected numbers .* 64 bits",
+    of(f'"value": [{2**63}, 0.5]'): "tree: expected numbers .* 64 bits",
     of('"value": ["x", [1, {"Scene": {}}]]'): rf"{AT}: expected numbers",
     of(f'"value": {"[" * 99}1{"]" * 99}'): "tree: expected numbers",
 }

@@ -67,7 +67,8 @@ def whole_file(path: Path) -> Iterator[BinaryIO]:
     OSError names `path`.
     """
     target = Path(os.path.realpath(path))
-    unfinished = target.with_name(f"{target.name}.{secrets.token_hex(4)}.part")
+    # Names have at most 255 bytes, of which a letter takes up to four.
+    unfinished = target.with_name(f"{target.name[:50]}.{secrets.token_hex(4)}.part")
     try:
         with unfinished.open("xb") as file:
             with contextlib.suppress(FileNotFoundError):

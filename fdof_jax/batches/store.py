@@ -245,7 +245,7 @@ class Store:
         """Returns a text that names members and their values."""
         digest = hashlib.sha256(repr(self.members(block)).encode())
         for rows in values:
-            digest.update(np.ravel(rows))
+            digest.update(np.ravel(rows).data)
         return digest.hexdigest().encode()
 
     def _holds(self, file: str) -> bool:

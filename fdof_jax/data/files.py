@@ -32,6 +32,8 @@ _PLACES = (
     "control.drives tuning.result".split()
 )
 _NOT_FINITE = {"inf": math.inf, "-inf": -math.inf, "nan": math.nan}
+_WORDS = _PACKAGE, "value", "tuple", "dict"  # names in files that are of no class
+_DEEPEST = 100  # levels of lists and objects; loading them must not exhaust the stack
 _DTYPES = {"b": bool, "i": int, "u": np.uint64, "f": float}
 _KNOWN = "a known value: save outside of jit, vmap and grad"
 # What constructors raise for arguments of another kind. Errors of a device or of memory
@@ -84,9 +86,12 @@ def save(path: str | os.PathLike, tree: PyTree) -> None:
     path = file_path("path", path)
     try:
         node = _node("tree", tree)
+        if _depth(node) > _DEEPEST:
+            raise RecursionError
     except RecursionError:
         raise ValueError(
-            "tree: expected one without itself in it, got one nested without end."
+            f"tree: expected at most {_DEEPEST} levels of lists and objects in the "
+            "file, got more, or some without end."
         ) from None
     version = {_PACKAGE: ".".join(__version__.split(".")[:2])}
     text = _text(version | (node if isinstance(node, dict) else {"value": node}))
@@ -160,7 +165,11 @@ def _begins_with_number(items: Json) -> bool:
 
 def _node(place: str, value: PyTree) -> Json:
     kind = type(value)
-    if value is None or kind in (bool, int) or kind is str and value not in _NOT_FINITE:
+    if value is None or kind is bool or kind is str and value not in _NOT_FINITE:
+        return value
+    if kind is int:
+        if not -(2**63) <= value < 2**64:
+            raise refusal(place, "a whole number of at most 64 bits", value)
         return value
     if kind in (list, tuple):
         items = [_node(f"{place}[{i}]", item) for i, item in enumerate(value)]
@@ -201,7 +210,8 @@ def _numbers(place: str, value: object) -> Json:
 def _object(place: str, value: Any) -> dict[str, Json]:
     kind, name = type(value), type(value).__name__
     public = _public(name)
-    if public is not kind and (public or kind.__module__.startswith(f"{_PACKAGE}.")):
+    ours = public or name in _WORDS or kind.__module__.startswith(f"{_PACKAGE}.")
+    if public is not kind and ours:
         expected = "an object of a public class, or of your own of another name"
         raise refusal(place, expected, kind)
     if isinstance(value, tuple):
@@ -222,6 +232,13 @@ def _object(place: str, value: Any) -> dict[str, Json]:
     if isinstance(value, Linkage):
         arguments["topology"] = value.topology
     return {name: {k: _node(f"{place}.{k}", v) for k, v in arguments.items()}}
+
+
+def _depth(node: Json) -> int:
+    if not isinstance(node, dict | list):
+        return 0
+    inner = node.values() if isinstance(node, dict) else node
+    return 1 + max(map(_depth, inner), default=0)
 
 
 def _text(node: Json, indent: str = "", before: str = "") -> str:
@@ -310,10 +327,17 @@ def _value(place: str, node: Json, classes: Classes) -> PyTree:
 def _array(place: str, node: list[Json]) -> jax.Array:
     try:
         numbers = _floats(node)
-        dtype = jnp.result_type(_DTYPES[np.asarray(numbers).dtype.kind])
+        array = np.asarray(numbers)
+        # NumPy makes floats of whole numbers that no type of 64 bits has in common.
+        if array.dtype.kind == "f":
+            large = np.asarray(numbers, object)[np.abs(array) >= 2**63]
+            if any(isinstance(number, int) for number in large):
+                raise ValueError
+        dtype = jnp.result_type(_DTYPES[array.dtype.kind])
         return jax.device_put(np.asarray(numbers, dtype))
     except (ValueError, LookupError, OverflowError):
-        raise refusal(place, "numbers in lists of one length", node) from None
+        expected = "numbers in lists of one length, whole ones of 64 bits at most"
+        raise refusal(place, expected, node) from None
 
 
 def _floats(node: Json) -> Json:

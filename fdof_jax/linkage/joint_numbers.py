@@ -20,9 +20,10 @@ def numbered(joints: Any) -> Array:
     Raises ValueError for what are no numbers of joints.
     """
     check_known("joints", joints)
-    array = isinstance(joints, Array | np.ndarray)
+    given: Any = joints
     try:
-        given = array_of(joints).tolist() if array else joints
+        if isinstance(joints, Array | np.ndarray):
+            given = array_of(joints).tolist()
     except (RuntimeError, TypeError):  # deleted, masked, or random keys
         given = None
     numbers = given if isinstance(given, list | tuple) else (given,)
