@@ -318,6 +318,8 @@ OTHER_TYPES = [
         lambda v: drawing.topology_grid({"a": (LINKAGE, SOLUTION)}, configurations=v),
     ),
     ("linkage", lambda value: simulate(value)),
+    ("state0", lambda value: simulate(state0=value)),
+    ("topology", make),
     ("loss", lambda value: fj.tune(fj.scenes.fig7(), loss=value)),
 ]
 

@@ -30,7 +30,7 @@ def real_state(name: str, value: State, linkage: Linkage) -> State:
     """Returns `value` as a state of the linkage's joints, or raises ValueError."""
     try:
         q, qd = value
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, RuntimeError):  # RuntimeError: a deleted array
         raise ValueError(
             f"{name}: expected a State(q, qd), got {shown(value)}."
         ) from None

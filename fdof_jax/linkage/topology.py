@@ -60,7 +60,7 @@ def pairs_of(topology: Any) -> np.ndarray | None:
         try:
             given = np.asarray(topology)
             ef = given.astype(float) if given.dtype.kind in "biuf" else np.empty(0)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, RuntimeError):  # RuntimeError: a deleted array
             ef = np.empty(0)
         if ef.ndim > 1:
             raise ValueError(
