@@ -22,8 +22,8 @@ PUBLIC = {
 # Names whose arguments or results carry no unit.
 UNITLESS = {
     "existence_factors", "to_mjcf", "fig3", "fig5", "fig7", "load", "save", "stacked",
-    "gradient_report", "circle_scenes", "configure", "Condition", "Values", "field",
-    "accepts_scene",
+    "circle_scenes", "configure", "Condition", "Values", "field", "accepts_scene",
+    "of_kind",
 }  # fmt: skip
 # Names that implement something printed in the paper.
 SOURCES = {
@@ -88,7 +88,6 @@ NAMES = [
 # Classes of results: the function that returns each.
 RETURNED_BY = {
     "FitResult": "fit",
-    "GradientReport": "gradient_report",
     "Efforts": "joint_efforts",
     "Linearization": "linearize",
     "MjcfModel": "from_mjcf",

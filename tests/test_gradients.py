@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from elements import SHORT
 from modes import ADJOINT, LOOPS
-from test_gradient_quality import POINTS, tangents, tracked
+from test_tangents import POINTS, tangents, tracked
 
 import fdof_jax as fj
 from fdof_jax import scenes

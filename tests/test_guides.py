@@ -128,6 +128,7 @@ def test_recipes(tmp_path, monkeypatch):
     assert names["rewards"].shape == (500, 256) and names["done"].sum() >= 512
     assert names["found"].success and names["found"].fun < 0.01
     assert names["room"](names["found"].x).min() > -1e-6
+    np.testing.assert_allclose(names["slope"], names["difference"], rtol=1e-6)
     assert 35 < np.mean(names["lift"] ** 2) < 37
     assert names["efforts"].shape == (26, 2) and abs(names["efforts"]).max() <= 12
     assert not names["efforts"][:, 1].any()

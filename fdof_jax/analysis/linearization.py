@@ -18,7 +18,7 @@ from ..control.pd import PDController
 from ..dynamics import bias_force, forward_dynamics
 from ..forces.added_inertia import present
 from ..forces.element import Element, Forces, elements_on
-from ..forces.holders import check_free, holders
+from ..forces.holders import check_free
 from ..linkage.coordinates import State, real_state
 from ..linkage.linkage import (
     Linkage,
@@ -51,22 +51,16 @@ class Linearization(NamedTuple):
     B: Float[Array, "state joint"]
 
 
-def depends_on_state_alone(linkage: Linkage, forces: tuple[Element, ...]) -> bool:
-    """Returns whether no element has a state, holds joints or prescribes a motion."""
-    unknown = has_states(linkage, forces) or prescribed(forces) is not None
-    return not (unknown or holders(forces))
-
-
 def checked(linkage: Linkage, forces: Forces) -> tuple[Element, ...]:
     """Returns the forces as elements, which may have no state and hold no joints."""
     check_linkage(linkage)
     acting = elements_on(linkage, forces)
     for index, element in enumerate(acting):
         check_free(f"forces[{index}]", element)
-    if depends_on_state_alone(linkage, acting):
-        return acting
-    expected = "elements without a state of their own and no PrescribedMotion"
-    raise refusal("forces", expected, forces)
+    if has_states(linkage, acting) or prescribed(acting) is not None:
+        expected = "elements without a state of their own and no PrescribedMotion"
+        raise refusal("forces", expected, forces)
+    return acting
 
 
 def equilibrium(

@@ -248,7 +248,7 @@ class Solution(eqx.Module):
             facts["steps"] = _span(self.stats["num_steps"])
         if np.max(self.stats.get("num_switches", 0)) > 0:
             facts["switches"] = _span(self.stats["num_switches"])
-        if remarks := remarks_on_derivatives(self.stats):
+        if remarks := _remarks_on_derivatives(self.stats):
             facts["derivatives"] = ", ".join(remarks)
         if known(self.q) and (remark := _remark_on_resolution(np.asarray(self.q))):
             facts["positions"] = remark
@@ -281,7 +281,7 @@ def _remark_on_resolution(q: np.ndarray) -> str | None:
     return f"up to {largest:.2g} m or rad, resolved to {step:.2g} in {q.dtype}"
 
 
-def remarks_on_derivatives(stats: Statistics) -> list[str]:
+def _remarks_on_derivatives(stats: Statistics) -> list[str]:
     """Returns what the statistics of one or more motions say about derivatives."""
     words = []
     if np.min(stats.get("slowest_crossing", np.inf)) < SLOW:

@@ -1,15 +1,14 @@
-"""Gain tuning by gradients, and checks of the gradients."""
+"""Gain tuning by gradients."""
 
 from ..simulation.scene import stacked
 from .ensembles import perturbed, with_payload
-from .gradient_quality import GradientReport, gradient_report
 from .losses import Tracking, joint_errors, tip_errors
 from .result import TuneResult
 from .tuning import tune
 from .within_limits import Limits, TunedWithin, tune_within
 
 __all__ = [
-    "gradient_report", "GradientReport", "joint_errors", "Limits", "perturbed",
+    "joint_errors", "Limits", "perturbed",
     "stacked", "tip_errors", "Tracking", "tune", "tune_within", "TunedWithin",
     "TuneResult", "with_payload",
 ]  # fmt: skip

@@ -222,15 +222,10 @@ class GainBox(NamedTuple):
         return np.clip(gains, self.lower, self.upper)
 
 
-def with_factors(scene: Scene, z: Array) -> Scene:
-    """The scene with its gains by the factors exp(z) (2n,): gains of 0 stay 0."""
-    gains = gains_of(scene)
-    return with_gains(scene, gains * jnp.exp(z).reshape(gains.shape))
-
-
 def gain_jacobian(z: Array, scene: Scene, loss: Loss) -> Sensitivities:
     """Residuals of a loss and their derivatives in the logarithms of factors `z`."""
-    scene_at = lambda z: with_factors(scene, z)
+    gains = gains_of(scene)
+    scene_at = lambda z: with_gains(scene, gains * jnp.exp(z).reshape(gains.shape))
     residuals = lambda scene, solution: residuals_of(loss, scene, solution)
     return jacobian_of(scene_at, residuals, z, jnp.linspace(0, scene.t1, SAMPLES))
 
@@ -271,7 +266,7 @@ def evaluate_gains(z: Array, problem: tuple[Scene, Loss]) -> Evaluation:
     )
 
 
-def check_tuned(name: str, scene: Scene, loss: Loss = tip_errors) -> None:
+def check_tuned(name: str, scene: Scene, loss: Loss) -> None:
     """Raises ValueError unless the scene can be tuned by the loss."""
     check_scene(name, scene)
     function("loss", loss)

@@ -83,9 +83,9 @@ def tune(
 
     The unknowns are the logarithms of kp and kd; gains of zero stay zero. Derivatives
     are tangents of the motion, whose steps have a tolerance of 1e-6. Their relative
-    error is about 1e-6, and some 1e-4 where actuators are at their limits for long;
-    `gradient_report` measures it. A second call with other numbers, another topology or
-    another method compiles nothing; a call with a loss function of other code does.
+    error is about 1e-6, and some 1e-4 where actuators are at their limits for long. A
+    second call with other numbers, another topology or another method compiles nothing;
+    a call with a loss function of other code does.
 
     **Arguments:**
 
