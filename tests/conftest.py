@@ -42,7 +42,6 @@ LONG_EXAMPLES = {
     "fdof_jax.analysis.loops.closed_loop",
     "fdof_jax.analysis.loops.margins",
     "fdof_jax.analysis.measures.response",
-    "fdof_jax.analysis.responses.step_and_sine",
     "fdof_jax.forces.holders.Brake",
     "fdof_jax.forces.holders.HardStops",
     "fdof_jax.forces.holders.JointFriction",

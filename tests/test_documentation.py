@@ -96,7 +96,6 @@ RETURNED_BY = {
     "NextMotion": "next_motion",
     "Response": "response",
     "Solution": "simulate",
-    "StepAndSine": "step_and_sine",
     "TuneResult": "tune",
     "TunedWithin": "tune_within",
 }

@@ -77,7 +77,6 @@ def test_gains(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     names = run(DOCS / "gains.md")
     assert np.isfinite(names["fj"].analysis.margins(names["slower"])).all()
-    assert names["large"].bandwidth[0] < 0.6 * names["small"].bandwidth[0]
     assert names["found"].met.shape == (12,) and names["found"].met.all()
 
 
@@ -105,6 +104,7 @@ def test_recipes(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     names = run(DOCS / "recipes.md")
     assert names["response"].settling_time[0] < 1.5
+    assert (names["loop"].poles().real < 0).all()
     # A turn by 1.5 rad sweeps 1.5 r dr; half the square of the radius r is 1 + cos(q2).
     cells = np.isfinite(names["counts"]).sum()
     area = cells * np.diff(names["x"])[0] * np.diff(names["y"])[0]

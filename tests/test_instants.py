@@ -32,9 +32,6 @@ FREE = {
     ),
     analysis.open_loop: lambda forces: analysis.open_loop(BAR, Q, PD, 1, forces),
     analysis.closed_loop: lambda forces: analysis.closed_loop(BAR, Q, PD, 1, forces),
-    analysis.step_and_sine: lambda forces: analysis.step_and_sine(
-        BAR, Q, PD, forces, step=0.1, duration=1.0
-    ),
 }
 # These are given no time: they refuse masses that come or go. What holds joints has no
 # mass and no energy, and its efforts are the caller's.

@@ -67,7 +67,8 @@ def test_settling_times_are_met():
     found = within(step(), effort=12.0, settling_time=1.2)
     assert found.met.all()
     (pd,) = found.scene.forces
-    test = fj.analysis.step_and_sine(FREE, [0.3], pd, step=1.0, duration=4.0)
+    motion = fj.simulate(found.scene, np.linspace(0, 4, 1001))
+    test = fj.analysis.response(FREE, (pd,), motion)
     assert found.reached[0] == pytest.approx(test.settling_time[0], abs=0.01)
     # Within 2 % after 1.2 s by less overshoot than is best for the error.
     kp, kd = found.gains[:, 0]
@@ -91,6 +92,8 @@ def test_limits_of_a_joint_that_is_faster_than_the_samples_are_measured():
     away = np.exp(-ratio * frequency * ts) * np.sin(angle) / damped
     settled = ts[np.abs(away) > 0.02].max()
     np.testing.assert_allclose(settling, settled, rtol=1e-3)
+    with pytest.raises(ValueError, match=r"scene\.t1: expected at most .* rad/s, got"):
+        list(measured(step(kp, kd)._replace(t1=1e5), limits))
 
 
 @pytest.mark.slow

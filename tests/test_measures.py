@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 import fdof_jax as fj
+from fdof_jax.analysis.measures import step_measures
 from fdof_jax.references import Ramp, Step
 
 SLIDE = fj.Linkage("P", mass=[1], com=[[0, 0]], inertia=[1], length=[0, 1], gravity=0)
@@ -55,6 +56,16 @@ def test_a_step_between_samples_counts_from_its_time():
     for name in ("step", "overshoot", "rise_time", "settling_time"):
         one, other = getattr(coarse, name), getattr(fine, name)
         np.testing.assert_allclose(one, other, rtol=2e-3)
+
+
+def test_a_response_that_creeps_or_fails_has_no_rise_time():
+    ts = np.linspace(0, 2, 1001)
+    change, rate = 1 - np.exp(-ts), np.exp(-ts)  # 0.86 at the end
+    assert str(step_measures(ts, change, rate, 1.0)) == str((0.0, np.nan, np.nan))
+    rise = step_measures(ts, change, rate, change[-1])[1]
+    part = lambda share: -np.log1p(-share * change[-1])
+    np.testing.assert_allclose(rise, part(0.9) - part(0.1), rtol=1e-3)
+    assert np.isnan(step_measures(ts, np.full(1001, np.nan), rate, np.nan)).all()
 
 
 @pytest.mark.slow

@@ -238,16 +238,3 @@ def test_chains_of_any_length_show_all_joints_that_move(topology):
     for ax in (still, film._fig.axes[0]):  # type: ignore[attr-defined]
         points = np.concatenate([line.get_xydata() for line in ax.lines])
         assert np.nanmin(np.linalg.norm(points - tip, axis=1)) < 1e-9
-
-
-def test_a_response_is_shown_in_decibels():
-    ts, one = np.linspace(0, 1, 11), np.ones(1)
-    test = fj.analysis.StepAndSine(
-        joints=("P2",), step=one, overshoot=one, rise_time=one, settling_time=one,
-        bandwidth=10 * one, saturated=one, ts=ts, response=1 - np.exp(-5 * ts)[None],
-        frequency=np.array([[1.0, 10.0, 100.0]]), gain=np.array([[1, 0.1j, 0.01]]),
-    )  # fmt: skip
-    above, below = plotting.response_profile(test).axes
-    np.testing.assert_array_equal(above.lines[1].get_xydata().T, [ts, test.response[0]])
-    level, bandwidth, _ = (line.get_xydata().tolist() for line in below.lines)
-    assert level == [[1, 0], [10, -20], [100, -40]] and bandwidth == [[10, -20]]

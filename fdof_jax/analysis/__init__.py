@@ -12,13 +12,12 @@ from .linearization import (
 from .loops import Margins, bandwidth, closed_loop, margins, open_loop
 from .measures import Response, response
 from .reactions import inertial_parameters, joint_reactions, regressor
-from .responses import StepAndSine, step_and_sine
 
 __all__ = [
     "bandwidth", "closed_loop", "closed_loop_modes", "equilibrium", "holding_efforts",
     "inertia_ratios", "inertial_parameters", "joint_reactions", "Linearization",
     "linearize", "Margins", "margins", "Modes", "open_loop", "regressor",
-    "Response", "response", "step_and_sine", "StepAndSine",
+    "Response", "response",
 ]  # fmt: skip
 
 

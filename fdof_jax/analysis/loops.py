@@ -20,7 +20,7 @@ Loop = Any  # a `control.StateSpace`, whose own types are too wide
 
 _LARGEST_MARGIN = 1e6  # factors beyond belong to zeros at infinity or poles at rest
 _EXACT = 1e-8  # to this part a peak is known
-BANDWIDTH = 10 ** (-3 / 20)  # -3 dB
+_BANDWIDTH = 10 ** (-3 / 20)  # -3 dB
 
 
 def open_loop(
@@ -212,7 +212,7 @@ def bandwidth(response: "control.StateSpace") -> float:
     import control
 
     instance("response", response, control.StateSpace)
-    level = BANDWIDTH * float(np.abs(response.dcgain()))
+    level = _BANDWIDTH * float(np.abs(response.dcgain()))
     if not 0 < level < np.inf:
         return np.nan
     # `control.bandwidth` looks at 1000 frequencies, and misses dips beside the lightly

@@ -31,7 +31,7 @@ from ..simulation.simulate import check_own
 from ..simulation.solution import Solution, check_joints
 
 BAND = 0.02  # around the final value, in which a response has settled
-SETTLED = 0.9  # part of the duration before which it has to
+_SETTLED = 0.9  # part of the duration before which it has to
 _STANDS = 1e-9  # changes of a reference that are less are none [m or rad]
 
 
@@ -175,7 +175,7 @@ def response(
         step=np.where(still, step, np.nan),
         overshoot=overshoot,
         rise_time=rise_time,
-        settling_time=np.where(settled <= SETTLED * (last - begin), settled, np.nan),
+        settling_time=np.where(settled <= _SETTLED * (last - begin), settled, np.nan),
         steady_error=error[-1],
         largest_error=np.abs(error).max(axis=0),
         rms_error=np.sqrt(np.mean(error**2, axis=0)),

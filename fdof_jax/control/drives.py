@@ -116,22 +116,16 @@ class Drive(StatefulElement):
         return effort, DriveState(rate, inner_rate)
 
 
-def commanding(element: Any) -> Any:
-    """Returns the element that decides: the innermost command of a drive, or itself."""
-    while isinstance(element, Drive):
-        element = element.command
-    return element
-
-
 def controller_in(element: object) -> PDController | None:
     """Returns the controller that an element is, or holds as its command, if any.
 
     Of a `PIDController` that is its PD part, which has the reference and the limits.
     """
-    decides = commanding(element)
-    if isinstance(decides, PIDController):
-        return decides.pd
-    return decides if isinstance(decides, PDController) else None
+    while isinstance(element, Drive):
+        element = element.command
+    if isinstance(element, PIDController):
+        return element.pd
+    return element if isinstance(element, PDController) else None
 
 
 class FirstOrderLag(Drive):

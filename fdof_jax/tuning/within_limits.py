@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike
 from ..analysis.linearization import checked, equilibrium, loop_matrices
 from ..analysis.loops import loops_of, margins
 from ..analysis.measures import BAND, demands, step_measures
-from ..analysis.responses import samples_of
 from ..base.checks import instance
 from ..base.known_values import in_numpy
 from ..base.report import Report
@@ -56,6 +55,10 @@ _ENOUGH = 1e-6  # relative decrease of the loss at which the search ends
 # The unknowns are scaled to equal curvatures of the loss, at least this share of it.
 _FLAT = 1e-2
 _FAILED = 1e6  # loss and excess where the simulation fails
+# Samples of the motion that is measured: at least so many, so that most scenes share a
+# program, and one for each part of a radian of the fastest mode, between which cubics
+# are exact to 1e-5.
+_LEAST, _MOST, _TURN = 1000, 2**20, 0.25
 
 
 class Limits(Part):
@@ -175,7 +178,7 @@ def measured(scene: Scene, limits: Limits) -> Iterator[tuple[str, str, float, fl
     linkage, t1, rest = scene.linkage, float(scene.t1), rest_of(scene)
     loops, responses = zip(*loops_of(linkage, rest, controller, others, t1))
     fastest = np.abs(responses[0].poles()).max()
-    ts = np.linspace(0, t1, samples_of(t1, fastest) + 1)
+    ts = np.linspace(0, t1, _samples_of(t1, fastest) + 1)
     motion = simulate(scene, ts, throw=False)
     shares, speeds, _ = map(np.asarray, step_shares(motion, rest))
     efforts = np.abs(demands(controller, linkage, motion)).max(axis=0)
@@ -194,6 +197,17 @@ def measured(scene: Scene, limits: Limits) -> Iterator[tuple[str, str, float, fl
         if limits.modulus_margin[k] > 0:
             least = float(limits.modulus_margin[k])
             yield _MARGIN, joint, least, margins(loop).modulus
+
+
+def _samples_of(t1: float, fastest: float) -> int:
+    """Returns how many samples resolve the fastest mode [rad/s] up to `t1`."""
+    count = t1 * fastest / _TURN
+    if not count < _MOST:
+        raise ValueError(
+            f"scene.t1: expected at most {_MOST * _TURN / fastest:.3g} s for modes as "
+            f"fast as {fastest:.3g} rad/s, got {t1:g} s."
+        )
+    return max(int(count), _LEAST)
 
 
 def _lane(z: Array, problem: tuple[Scene, Loss, Limits, bool]) -> Evaluation:
