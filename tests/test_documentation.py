@@ -139,7 +139,7 @@ def test_names_in_guides_become_links():
     guide = SimpleNamespace(file=SimpleNamespace(src_uri="gains.md"))
     for code, name in [
         ("tune", "tune"),
-        ("fj.tuning.perturbed(scene, 3)", "tuning.perturbed"),
+        ("fj.tuning.stacked([scene])", "tuning.stacked"),
         ("mass_matrix", "mass_matrix"),
         ("paper.mass_matrix", "paper.mass_matrix"),
         ("fj.tuning.tune", "tune"),

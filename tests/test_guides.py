@@ -138,6 +138,7 @@ def test_recipes(tmp_path, monkeypatch):
     assert 0.0220 < (2 * names["best"].cost) ** 0.5 < 0.0226  # the controller: 0.0501
     np.testing.assert_allclose(names["state"].q, names["upright"], atol=1e-2)
     assert (names["result"] == names["diffrax"].RESULTS.successful).all()
+    assert names["robust"].member_loss.max() ** 0.5 < 0.025
     fallen = names["fj"].simulate(names["falls"], [0, 1.234, 3.0])
     np.testing.assert_allclose(names["between"], fallen.q[1], atol=1e-6)
     last = names["fj"].tip_position(names["arm"], names["ended"].ys[0][-1])

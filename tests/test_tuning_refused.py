@@ -15,8 +15,7 @@ FIG7, FIG5 = scenes.fig7(), scenes.fig5()
 RRR = scenes.circle_scenes()["RRR"]
 ONES, PRICED = np.ones((2, 3)), tuning.Tracking(effort=1.0)
 LAG = fj.control.FirstOrderLag(fj.JointEffort([0.0]), 0.1)
-STILL = fj.PDController(1, 1, 1, lambda t, arm: (jnp.zeros(3), jnp.zeros(3)))
-WEAK, HELD = step(limit=0.1), FIG5._replace(forces=(STILL,))
+WEAK = step(limit=0.1)
 PUSHED = WEAK._replace(forces=(*WEAK.forces, fj.JointEffort([1.0])))
 LATE = WEAK._replace(forces=(*WEAK.forces, LAG))
 DAMPED = RRR._replace(forces=(*RRR.forces, fj.JointDamper(1.0)))
@@ -73,13 +72,6 @@ CASES = {
         (RRR, {}, "scenes: expected a list"),
         ([FIG7, FIG5], {}, r"scenes\[1\]: expected one like"),
         ([RRR, DAMPED], {}, r"scenes\[1\]: expected one like scenes\[0\]"),
-    ],
-    tuning.perturbed: [
-        (HELD, dict(members=2, start_offset=100.0), "start_offset: expected one with"),
-        (HELD, dict(members=2, speed=(1, 2)), "speed: .* without a `period`"),
-        (FIG7, dict(members=2, speed=(2.0, 0.0)), "speed"),
-        (FIG7, dict(members=2, payload=(2.0, 0.0)), "payload: expected the least bef"),
-        (FIG7, dict(members=2, link_error=1.5), "link_error: expected less than 1"),
     ],
     tuning.tune_within: [(step(), dict(limits=0.1), "limits: expected a Limits")],
     within: [

@@ -52,7 +52,6 @@ MASKED = np.ma.masked_less([-1, 0, 0], 0)
             references.reach_margin,
             [(FIG7.linkage, task, TS) for task in (None, PATH, STANDING)],
         ),
-        ("members", tuning.perturbed, [(FIG7, 10**30)]),
         (
             "q",
             HOLDING,

@@ -97,9 +97,9 @@ def tune(
       minimised; a scalar, never negative, is minimised itself, which gives
       Levenberg-Marquardt little to go by. By default `tip_errors`: the mean squared tip
       error at 1001 equally spaced times in [0, t1]. `Tracking` puts a price on effort.
-    - `ensemble`: scenes like `scene`, stacked along a leading axis (`stacked`,
-      `perturbed`). The loss is then that of the ensemble with common gains, which
-      start from those of `scene`.
+    - `ensemble`: scenes like `scene`, stacked along a leading axis (`stacked`). The
+      loss is then that of the ensemble with common gains, which start from those of
+      `scene`.
     - `over`: "mean", the mean loss of the ensemble, or "worst", its worst as a power
       mean of order 32.
     - `method`: "levenberg-marquardt", or "l-bfgs" by optax.
