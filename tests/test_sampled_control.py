@@ -63,7 +63,7 @@ def advance(x, delay, gains):
     """Advances a disc under delayed feedback by a period of 0.1 s, in closed form.
 
     The state `x` is its position, velocity, and commands under way, the newest first.
-    Returns it with the effort at the start and the position at the change of effort.
+    Returns it with the effort at the start.
     """
     whole = int(delay / 0.1 + 1e-9)
     commands = [-gains @ x[:2], *x[2:]]
@@ -71,21 +71,21 @@ def advance(x, delay, gains):
     if part < 1e-9:
         last = new
     q, qd = x[0] + part * x[1] + part**2 * last / 4, x[1] + part * last / 2
-    begin, rest = q, 0.1 - part
+    rest = 0.1 - part
     q, qd = q + rest * qd + rest**2 * new / 4, qd + rest * new / 2
     after = np.array([q, qd, *commands[: whole + 1]])
-    return after, last, begin if part > 1e-9 else q
+    return after, last
 
 
 def sampled(delay, gains):
     """Returns rows of 60 samples, and the last position.
 
-    Rows are position, velocity, effort, position at its change, and command.
+    Rows are position, velocity, effort and command.
     """
     x, rows = np.array([1, *np.zeros(2 + int(delay / 0.1 + 1e-9))]), []
     for _ in range(60):
-        after, *others = advance(x, delay, gains)
-        rows.append([*x[:2], *others, after[2]])
+        after, effort = advance(x, delay, gains)
+        rows.append([*x[:2], effort, after[2]])
         x = after
     return np.array(rows), x[0]
 
@@ -122,9 +122,8 @@ def test_delayed_feedback_follows_its_transition_matrix():
         one = lambda leaf, i=i, j=j: leaf[i, j]
         motion, of_delay, of_gains = jax.tree.map(one, (motions, *slopes))
         rows, _ = sampled(delay, gain)
-        found = motion.q[:-1], motion.qd[:-1], motion.acting[:-1], motion.q_begin
-        size = np.abs(rows).max()
-        found = np.concatenate([*found, motion.tau], axis=1)
+        found = motion.q[:-1], motion.qd[:-1], motion.acting[:-1], motion.tau
+        size, found = np.abs(rows).max(), np.concatenate(found, axis=1)
         np.testing.assert_allclose(found, rows, atol=1e-9 * size, rtol=0)
         # The matrix has a column for each state and command under way.
         units = np.eye(len(advance(np.zeros(9), delay, gain)[0]))
@@ -256,7 +255,7 @@ RUBS = fj.forces.JointFriction(0.5, 0.8)
 
 
 def _end(parts):
-    """Returns the last state, an effort, a position at its change, energy taken."""
+    """Returns the last state, a command, energy taken, and times of two events."""
     q0, gain, level, period, delay = parts
     start = fj.State(BENT.q + q0 * np.array([1, 0]), BENT.qd)
     forces = RUBS.replace(level=level, static=level + 0.3), LIMITS
@@ -265,7 +264,7 @@ def _end(parts):
         RODS, start, control, period, 24, forces, delay=delay,
         adjoint=diffrax.ForwardMode(),
     )  # fmt: skip
-    last = motion.q[-1], motion.qd[-1], motion.tau[20], motion.q_begin[20]
+    last = motion.q[-1], motion.qd[-1], motion.tau[20]
     return jnp.concatenate([*last, motion.taken[-1:], motion.events.t[:2]])
 
 
@@ -292,7 +291,7 @@ def test_commands_have_gradients():
         motion = fj.simulate_sampled(
             RODS, BENT, control, 0.02, 8, others, delay=0.013, **STEPS
         )
-        return jnp.sum(motion.tau[5] + motion.acting[6] + motion.q_begin[7])
+        return jnp.sum(motion.tau[5] + motion.acting[7])
 
     many = jnp.full((2, 2), 0.1)
     value = jax.jit(commanded, **LOOPS)
@@ -305,7 +304,7 @@ def test_commands_have_gradients():
         control = CONTROL.replace(kp=kp * CONTROL.kp)
         options = dict(delay=0.013, **STEPS, **adjoint)
         motion = fj.simulate_sampled(RODS, BENT, control, 0.02, 8, **options)
-        return jnp.sum(motion.tau[5] + motion.q_begin[7])
+        return jnp.sum(motion.tau[5] + motion.q[7])
 
     slope = jax.jit(jax.grad(end), **LOOPS)(1.0)
     value = jax.jit(end, **LOOPS)

@@ -261,11 +261,8 @@ def _read(
         events = in_order(end.switches.modes.events, valid)
         holding = shown_at(modes.mode), shown_at(taken), events
     own = jax.tree.map(shown_at, own)
-    of_samples = {}  # commands, and positions where they begin to act
-    if sampled is not None:
-        command, q_begin = jax.tree.map(shown_at, (sampled.command, sampled.q_begin))
-        of_samples = dict(tau=command, q_begin=q_begin)
-    return Solution(times, q, qd, stats, result, own, *holding, **of_samples)
+    tau = None if sampled is None else shown_at(sampled.command)
+    return Solution(times, q, qd, stats, result, own, *holding, tau=tau)
 
 
 def _with_end(
@@ -277,9 +274,12 @@ def _with_end(
     t, y = events.at_end(end.t, end.y, args, switches)
     q, qd, _ = motion.joints(t, y)
     ended = (switches.ended >= 0) & motion.valid
-    last = solution.ts[-1], solution.q[-1], solution.qd[-1]
-    at = (jnp.where(ended, *pair) for pair in zip((t, q, qd), last))
-    found = End(*at, jnp.where(ended, switches.ended, -1))
+    found = End(
+        t=jnp.where(ended, t, solution.ts[-1]),
+        q=jnp.where(ended, q, solution.q[-1]),
+        qd=jnp.where(ended, qd, solution.qd[-1]),
+        condition=jnp.where(ended, switches.ended, -1),
+    )
     return dataclasses.replace(solution, end=found)
 
 

@@ -195,11 +195,9 @@ def simulate_sampled(
     acting = *forces, *arrivals, sampler
     motion = simulate(linkage, state0, times, acting, **options)
     assert motion.tau is not None
-    tau, q_begin = motion.tau[:-1], motion.q_begin
-    if q_begin is not None:
-        q_begin = jnp.where(within, q_begin[1:], motion.q[1:])
+    tau = motion.tau[:-1]
     none = jnp.zeros((late.most + 1, joints_of(linkage)))
     commands = jnp.concatenate([none, tau, tau[-1:]])
     first = late.most + 1 - late.whole - within
     acting = jax.lax.dynamic_slice_in_dim(commands, first, len(times))
-    return dataclasses.replace(motion, tau=tau, acting=acting, q_begin=q_begin)
+    return dataclasses.replace(motion, tau=tau, acting=acting)

@@ -22,8 +22,7 @@ class SampleState(NamedTuple):
     - `memory`: the controller's own state.
     - `command` (n,): the last one; `acting` (n,): the one that acts [N or N m].
     - `under_way` (command, n): the last ones in a ring, None if each acts at once.
-    - `arrived`: how many began to act between samples, and `q_begin` (n,): the joint
-      positions where the last one did; None if they act at samples only.
+    - `arrived`: how many began to act between samples; None if they act at samples.
     """
 
     taken: Array
@@ -32,7 +31,6 @@ class SampleState(NamedTuple):
     acting: Array
     under_way: Array | None
     arrived: Array | None
-    q_begin: Array | None
 
 
 class ClockElement(Element):
@@ -81,12 +79,11 @@ class Sampler(ClockElement):
             acting=tau,
             under_way=jnp.zeros((self.most + 1, tau.size)) if self.most else None,
             arrived=None,
-            q_begin=None,
         )
         if self.rest is None:
             return before
         acting = jnp.where(self.rest >= 0, tau, jnp.nan)
-        return before._replace(acting=acting, arrived=none, q_begin=tau)
+        return before._replace(acting=acting, arrived=none)
 
     def sampled(
         self, q: Array, qd: Array, linkage: Linkage, before: SampleState
@@ -111,13 +108,13 @@ class Sampler(ClockElement):
             under_way=under_way,
         )
 
-    def arriving(self, q: Array, before: SampleState) -> SampleState:
+    def arriving(self, before: SampleState) -> SampleState:
         """Returns what holds after a command begins to act."""
         assert before.arrived is not None
         tau = before.command
         if before.under_way is not None:
             tau = before.under_way[(before.arrived - self.late) % len(before.under_way)]
-        return before._replace(acting=tau, arrived=before.arrived + 1, q_begin=q)
+        return before._replace(acting=tau, arrived=before.arrived + 1)
 
 
 def sampler_of(forces: Forces) -> Sampler | None:
@@ -151,5 +148,5 @@ def after_samples(
         return after, due
     time = clock.at(before.arrived) + sampler.rest
     comes = (before.arrived < after.taken) & has_come(time, of_arrivals)
-    after = jax.lax.cond(comes, lambda: sampler.arriving(q, after), lambda: after)
+    after = jax.lax.cond(comes, lambda: sampler.arriving(after), lambda: after)
     return after, due | comes

@@ -155,8 +155,6 @@ class Solution(eqx.Module):
     - `tau`: efforts commanded at each sample (samples, n), 0 at fixed pairs
       [N or N m]. Each acts from the delay after its sample until the next one acts.
     - `acting`: efforts that act at `ts`, or begin to act there [N or N m].
-    - `q_begin`: joint positions at which, within each period, the next command begins
-      to act (samples, n); None if commands begin to act at samples only.
 
     >>> import fdof_jax as fj
     >>> import numpy as np
@@ -177,7 +175,6 @@ class Solution(eqx.Module):
     events: Events | None = None
     tau: Float[Array, "sample joint"] | None = None
     acting: Float[Array, "time joint"] | None = None
-    q_begin: Float[Array, "sample joint"] | None = None
     end: End | None = None
 
     @property
@@ -185,7 +182,7 @@ class Solution(eqx.Module):
         """The results that have derivatives in the inputs."""
         joints = self.q, self.qd, self.own, self.taken, self.events
         end = None if self.end is None else self.end[:-1]
-        return *joints, self.tau, self.q_begin, end
+        return *joints, self.tau, end
 
     @property
     def ended(self) -> Array:

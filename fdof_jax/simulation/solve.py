@@ -96,7 +96,7 @@ def _solve_one(inputs: Inputs, keywords: Settings) -> tuple[Solution, bool] | No
     if solution is None or is_traced(solution):
         return None
     # What has a row for each time.
-    names = "q", "qd", "own", "modes", "taken", "tau", "q_begin"
+    names = "q", "qd", "own", "modes", "taken", "tau"
     rows = cut({name: vars(solution)[name] for name in names}, len(ts))
     stats = solution.stats | {"max_steps": most}
     solution = dataclasses.replace(solution, ts=ts, stats=stats, **rows)
