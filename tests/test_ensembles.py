@@ -16,7 +16,7 @@ class TestEnsembles:
 
     def few(self):
         arm, draw = self.small.linkage, np.random.default_rng(1)
-        masses = arm.mass * draw.uniform(0.8, 2, (3, 2))
+        masses = np.asarray(arm.mass) * draw.uniform(0.8, 2, (3, 2))
         arms = (arm.replace(mass=mass) for mass in masses)
         return fj.tuning.stacked([self.small._replace(linkage=arm) for arm in arms])
 

@@ -16,8 +16,8 @@ from .reactions import inertial_parameters, joint_reactions, regressor
 __all__ = [
     "bandwidth", "closed_loop", "closed_loop_modes", "equilibrium", "holding_efforts",
     "inertia_ratios", "inertial_parameters", "joint_reactions", "Linearization",
-    "linearize", "Margins", "margins", "Modes", "open_loop", "regressor",
-    "Response", "response",
+    "linearize", "Margins", "margins", "Modes", "open_loop", "regressor", "Response",
+    "response",
 ]  # fmt: skip
 
 

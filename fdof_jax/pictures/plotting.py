@@ -37,9 +37,8 @@ from .energy_balance import energy_balance
 from .tip_errors import tracking, tracking_by_error, tracking_error
 
 __all__ = [
-    "effort_profile", "energy_profile", "energy_stack",
-    "motion_profile", "tracking", "tracking_by_error",
-    "tracking_error",
+    "effort_profile", "energy_profile", "energy_stack", "motion_profile", "tracking",
+    "tracking_by_error", "tracking_error",
 ]  # fmt: skip
 
 

@@ -7,9 +7,8 @@ from .tuning import tune
 from .within_limits import Limits, TunedWithin, tune_within
 
 __all__ = [
-    "joint_errors", "Limits",
-    "stacked", "tip_errors", "Tracking", "tune", "tune_within", "TunedWithin",
-    "TuneResult",
+    "joint_errors", "Limits", "stacked", "tip_errors", "Tracking", "tune",
+    "tune_within", "TunedWithin", "TuneResult",
 ]  # fmt: skip
 
 
