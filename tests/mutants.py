@@ -244,6 +244,18 @@ MUTANTS = {
         "acting = *arrivals, *forces, sampler",
         f"{SAMPLED}::test_delayed_feedback_follows_its_transition_matrix",
     ),
+    "a gap stops the motion": Mutant(
+        "steps/loop.py",
+        "jnp.where(gap > 0, gap * rate, 0)",
+        "0 * rate",
+        f"{SAMPLED}::test_no_time_is_left_out_at_samples",
+    ),
+    "samples before blows": Mutant(
+        "simulation/formulation.py",
+        "lead[place] = rank - len(clocks)",
+        "lead[place] = rank + len(others)",
+        f"{SAMPLED}::test_a_sample_sees_what_a_blow_leaves",
+    ),
     "no command under way is late": Mutant(
         "simulation/sampling.py",
         "acting = under_way[(k - self.late) % len(under_way)]",

@@ -92,6 +92,7 @@ def test_energy_stack_keeps_its_top_where_energy_is_only_taken_out():
     assert 2**2 / 1.5 < worse < 2**2 * 1.5
 
 
+@pytest.mark.slow
 def test_energy_stack_rises_by_what_is_put_in():
     forces, solution = lifted(20.0)
     ax = plotting.energy_stack(LIFT, forces, solution)
@@ -104,6 +105,7 @@ def test_energy_stack_rises_by_what_is_put_in():
     np.testing.assert_allclose(line[-1] - line[0], put_in, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_energy_stack_of_a_free_arm_and_of_what_was_reached():
     solution = swinging(21)
     solution = eqx.tree_at(lambda s: s.q, solution, solution.q.at[11:].set(jnp.nan))

@@ -155,6 +155,47 @@ def test_no_delay_is_known_within_jit():
 
 
 @pytest.mark.slow
+def test_constant_steps_begin_anew_at_samples_and_arrivals():
+    def run(ad):
+        options = dict(delay=0.013, **STEPS) | ad
+        return fj.simulate_sampled(RODS, BENT, CONTROL, 0.025, 4, **options)
+
+    plain = run({})
+    assert plain.stats["num_steps"] == 4 * (2 + 2)  # 10, 3, 10 and 2 ms
+    other = jax.jit(lambda: run(dict(adjoint=diffrax.ForwardMode())), **LOOPS)()
+    np.testing.assert_allclose(other.q, plain.q, atol=1e-12)
+
+
+@pytest.mark.slow
+def test_a_sample_sees_what_a_blow_leaves():
+    """A load is caught at a sample: the same with and without derivatives."""
+    load = fj.forces.Payload(fj.Point(1, along=0), 1.0, 2.0, begin=0.25)  # I doubles
+
+    def commands(gain, **options):
+        brakes = lambda t, q, qd, linkage: -gain * qd
+        start = fj.State([1.0], [0.2])
+        motion = fj.simulate_sampled(DISC, start, brakes, 0.125, 4, (load,), **options)
+        return motion.tau[:, 0]
+
+    expected = [-0.4, -0.35, -0.153125, -0.1435546875]
+    np.testing.assert_allclose(commands(2.0), expected, rtol=1e-9)
+    forward = lambda gain: commands(gain, adjoint=diffrax.ForwardMode())
+    value, slope = jax.jit(lambda x: jax.jvp(forward, (x,), (1.0,)), **LOOPS)(2.0)
+    np.testing.assert_allclose(value, expected, rtol=1e-9)
+    difference = (commands(2 + 1e-5) - commands(2 - 1e-5)) / 2e-5
+    np.testing.assert_allclose(slope, difference, rtol=1e-7)
+
+
+@pytest.mark.slow
+def test_no_time_is_left_out_at_samples():
+    """Far from the time 0, where 32 units of rounding are 7e-6 of a period."""
+    idle = lambda t, q, qd, linkage: jnp.zeros(1)
+    start, t0 = fj.State([0.0], [1.0]), 1e9
+    motion = fj.simulate_sampled(DISC, start, idle, 0.02, 500, t0=t0, delay=0.005)
+    np.testing.assert_allclose(motion.q[-1], motion.ts[-1] - t0, rtol=1e-9)
+
+
+@pytest.mark.slow
 def test_noise_is_what_the_key_says():
     seen = lambda t, q, qd, linkage: q + 10 * qd
     run = lambda seed: fj.simulate_sampled(

@@ -18,7 +18,9 @@ _EXPECTED = "a function (t, q, qd, linkage) that returns a number"
 class Until(Element):
     """Ends a motion where a function of its state passes 0.
 
-    For `simulate(..., until=...)`. A motion that starts on the zero does not end there.
+    `simulate(..., until=g)` adds one to the forces. In a `Scene`, a sweep, a fit or a
+    search of gains it stands among them. It has no efforts. A motion that starts on the
+    zero does not end there.
 
     **Arguments:**
 
@@ -31,10 +33,10 @@ class Until(Element):
 
     >>> import fdof_jax as fj
     >>> arm, start, *_ = fj.scenes.fig5()
-    >>> lowest = fj.simulation.Until(lambda t, q, qd, linkage: qd[0], direction=1)
-    >>> motion = fj.simulate(arm, start, [0, 5.0], until=lowest)
-    >>> bool(motion.ended), float(motion.end.t), motion.end.q.tolist()
-    (True, 0.0, [0.0, 0.0, 0.0])
+    >>> turns = fj.simulation.Until(lambda t, q, qd, linkage: qd[0], direction=1)
+    >>> motion = fj.simulate(arm, start, [0, 5.0], until=turns)
+    >>> bool(motion.ended), float(motion.end.t)
+    (True, 0.0)
     """
 
     condition: Element
@@ -71,6 +73,13 @@ class End(NamedTuple):
       [m or rad].
     - `condition`: the number of the condition that ended it, from 0 in the order of
       `until`; -1 if none did, and the motion ended at its last time.
+
+    >>> import fdof_jax as fj
+    >>> arm, start, *_ = fj.scenes.fig5()
+    >>> level = lambda t, q, qd, linkage: fj.tip_position(linkage, q)[1]
+    >>> end = fj.simulate(arm, start, [0, 5.0], until=level).end
+    >>> float(end.t), end.q.tolist(), int(end.condition)
+    (0.0, [0.0, 0.0, 0.0], 0)
     """
 
     t: Float[Array, ""]
@@ -93,5 +102,11 @@ def conditions(until: Any) -> tuple[Until, ...]:
 
 
 def conditions_in(forces: Forces) -> tuple[Until, ...]:
-    """Returns the conditions among elements, which come last."""
+    """Returns the conditions among elements."""
     return tuple(element for element in forces if isinstance(element, Until))
+
+
+def conditions_last(forces: Forces) -> Forces:
+    """Returns the elements in their order, but conditions after the others."""
+    others = (element for element in forces if not isinstance(element, Until))
+    return (*others, *conditions_in(forces))

@@ -27,7 +27,7 @@ from .holding import changes, guarded_switching, unknown_modes
 from .prescribed import prescribed
 from .sampling import ClockElement, SampleState, after_samples, sampler_of
 
-# By which a clock is ahead of the one before, in units of `clearance`: beyond the
+# By which a clock is ahead of the next one, in units of `clearance`: beyond the
 # distances that steps keep from each time.
 _LEAD = 8
 
@@ -84,31 +84,27 @@ def clocks_apart(args: Args, ts: Array) -> Args:
 
     If times coincided, one step would end at all of them, and derivatives would
     attribute the jumps of all elements to one of them. Each clock is ahead of the one
-    before by some units of rounding.
+    before by some units of rounding. Those of a controller are behind all others: it
+    measures what is left of a blow, and its commands arrive after its samples.
     """
     # A prescribed motion also gives positions, and comes first: it keeps the time.
     motion = prescribed(args.forces)
-    places = sorted(
+    elements = [*enumerate(args.forces)]
+    others = sorted(
         (element is not motion, place)
-        for place, element in enumerate(args.forces)
-        if isinstance(element, ClockElement) or element.jump_ts is not None
+        for place, element in elements
+        if element.jump_ts is not None
     )
-    if len(places) < 2:
+    clocks = [k for k, element in elements if isinstance(element, ClockElement)]
+    if len(others) + len(clocks) < 2:
         return args
     unit = _LEAD * clearance(ts)
-    lead = [0.0] * len(args.forces)
-    for rank, (_, place) in enumerate(places):
+    lead = [0.0] * len(elements)
+    for rank, (_, place) in enumerate(others):
         lead[place] = rank
+    for rank, place in enumerate(clocks):
+        lead[place] = rank - len(clocks)
     return args._replace(lead=unit * jnp.array(lead, unit.dtype))
-
-
-def clear_of_start(forces: Forces, ts: Array) -> Array:
-    """Returns the time after a start [s] at which another element's jump counts.
-
-    The clock of that element is ahead of those of `forces`.
-    """
-    timed = sum(element.jump_ts is not None for element in forces)
-    return (1 + _LEAD * timed) * clearance(ts)
 
 
 def known_times(args: Args) -> tuple[Array | None, tuple[Clock, ...]]:

@@ -27,7 +27,7 @@ from ..steps.landing import Clock, Landing, clearance
 from ..steps.looped_dopri8 import LoopedDopri8
 from ..steps.tolerances import default_controller, error_control_of, with_tolerances
 from .arrays import in_arrays
-from .conditions import End, conditions_in
+from .conditions import End, conditions_in, conditions_last
 from .events import in_order
 from .field import args_of, initial_own, own_states
 from .formulation import clocks_apart, joints_at, known_times, start_of, term_of
@@ -113,6 +113,7 @@ def _prepare(
     q0, qd0 = (without_fixed(linkage, jnp.where(wrong_start, 0, a)) for a in state0)
     stand_in = 1e-3 * jnp.arange(len(ts), dtype=ts.dtype)
     ts = jnp.where(wrong_times, stand_in, ts)
+    forces = conditions_last(forces)  # so that their switches are known
     args = args_of(linkage, q0, forces)
     if derivatives:
         args = clocks_apart(args, ts)
@@ -262,6 +263,9 @@ def _read(
         holding = shown_at(modes.mode), shown_at(taken), events
     own = jax.tree.map(shown_at, own)
     tau = None if sampled is None else shown_at(sampled.command)
+    if tau is not None and motion.problem.args.lead is not None:
+        # By a clock that is behind, rows are saved before the samples at their times.
+        tau = jnp.append(tau[1:], tau[-1:], axis=0)
     return Solution(times, q, qd, stats, result, own, *holding, tau=tau)
 
 

@@ -15,9 +15,8 @@ from ..forces.element import Forces, element_of, elements, elements_on
 from ..forces.joints import JointEffort
 from ..linkage.coordinates import State, real_state
 from ..linkage.linkage import Linkage, check_linkage, joints_of
-from ..steps.landing import Clock
+from ..steps.landing import Clock, clearance
 from .field import has_states
-from .formulation import clear_of_start
 from .sampling import Arrivals, Sampler
 from .simulate import check_elements, simulate
 from .solution import Solution
@@ -89,6 +88,7 @@ def _in_periods(delay: Any, period: Any, samples: int) -> _Delay:
     most = samples + 1  # then no command arrives, as with all longer delays
     whole = xp.minimum(whole, most).astype(int)
     if traced:
+        rest -= jax.lax.stop_gradient(jnp.minimum(rest, 0))  # of rounding
         return _Delay(whole, jnp.where(delay >= 0, rest, jnp.nan), most)
     rest = jnp.asarray(rest, float) if rest > rounding else None
     return _Delay(int(whole), rest, int(whole))
@@ -184,11 +184,7 @@ def simulate_sampled(
     added = None if spread is None else _noise(spread, key, samples)
     rest, arrivals, within = late.rest, (), False
     if rest is not None:
-        # A jump at the very start of a solve has no derivative.
-        edge = clear_of_start(forces, times)
-        within = rest > edge
-        clear = rest + jax.lax.stop_gradient(jnp.maximum(edge - rest, 0))
-        rest = jnp.where(rest >= 0, clear, rest)
+        within = rest > clearance(times)
         arrivals = (Arrivals(clock._replace(first=t0 + rest)),)
     sampler = Sampler(clock, control, added, rest, late.whole, late.most)
     options = dict(throw=False, max_steps=65536 + 64 * samples) | options

@@ -190,7 +190,7 @@ def simulate(
     - `forces`: a tuple of force elements `(t, q, qd, linkage) -> tau`.
     - `until`: what ends the motion before `ts[-1]`: a function `(t, q, qd, linkage) ->
       number`, where it passes 0; a `simulation.Until`, which tells the direction; or
-      several in a tuple. Steps end there exactly, and `Solution.end` has derivatives.
+      several in a tuple. `Solution.end` is exact and has derivatives.
     - `own0`: initial states of the `StatefulElement`s among the forces, one row of a
       `Solution.own`; by default each element's `initial_state`.
     - `rtol`, `atol`: relative and absolute tolerance of a step, by default 1e-11 in

@@ -123,6 +123,11 @@ class DenseOutput(diffrax.AbstractLocalInterpolation):
     rates: PyTree
     scheduled: PyTree  # what depends on time alone, at `SCHEDULE_SHARES`
 
+    @property
+    @abstractmethod
+    def rate_at_end(self) -> PyTree:
+        """The rates at the end of the step."""
+
     @abstractmethod
     def at(self, theta: Array) -> PyTree:
         """Returns the state at a fraction `theta` of the step."""

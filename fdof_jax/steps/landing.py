@@ -131,6 +131,11 @@ class Landing(eqx.Module):
     apart: Array  # see `clearance`
     switches: bool = eqx.field(static=True)
 
+    @property
+    def timed(self) -> bool:
+        """Whether there are known times."""
+        return self.jumps is not None or bool(self.clocks)
+
     def _known(self, t: Array) -> Array | None:
         """Returns known times, the next one after `t` among them; None without any."""
         times = [clock.near(t) for clock in self.clocks]

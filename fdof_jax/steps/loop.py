@@ -15,7 +15,7 @@ from jax import Array
 from jaxtyping import PyTree
 
 from ..base.checks import refusal
-from .dopri8 import Arguments, Integrated, ScheduledTerm, chosen, constant
+from .dopri8 import Arguments, DenseOutput, Integrated, ScheduledTerm, chosen, constant
 from .events import Events, Switches
 from .judge import Judge, StepEnds, without_nan
 from .landing import NEAR_END, Found, Landing, NextStep
@@ -161,7 +161,7 @@ def solve(problem: Problem, scheme: Scheme) -> Attempt:
         return Attempt(
             t=t,
             end=jnp.where(at_end, last, jnp.minimum(step.t1, last)),
-            y=kept(taken.y1, a.y),
+            y=kept(_after_gap(problem.term, scheme, a, taken, step), a.y),
             jumped=None if a.jumped is None else kept(step.jumped, a.jumped),
             method=kept(taken.method, a.method),
             judged=judged,
@@ -270,13 +270,13 @@ def _taken(problem: Problem, scheme: Scheme, a: Attempt) -> _StepResult:
     if events is not None:
         y0, regime = events.crossed(a.t, a.y, args, a.switches, jumped)
         args = args._replace(sides=regime.sides, modes=regime.modes)
-    # A controller measures what is left of a blow, and what it commands moves no joint
-    # at once; so prescribed joints may come last.
+    if term.settle is not None:
+        y0, jumped = term.settle(a.t, y0, args), True  # rates of before are out of date
+    # A controller measures what is left of all blows; its commands move no joint at
+    # once.
     if term.sample is not None:
         sampled, changed = term.sample(a.t, y0, args)
         args, jumped = args._replace(sampled=sampled), jumped | changed
-    if term.settle is not None:
-        y0, jumped = term.settle(a.t, y0, args), True  # rates of before are out of date
     y1, error, dense, of_method, failed = method.step(
         term, a.t, a.end, y0, args, a.method, jumped
     )
@@ -306,6 +306,8 @@ def _planned(
         )
         plan = NextStep(*plan, result)  # pyright: ignore[reportCallIssue]
         if landing is not None:
+            # The controller's own grid knows nothing of ends at known times.
+            plan = plan._replace(t1=plan.t0 + scheme.dt0)
             plan, _, of_landing = landing.after(a.t, a.end, None, plan, a.landing)
         return plan, judged, None, of_landing
     if error is None:
@@ -331,6 +333,26 @@ def _planned(
         )
         plan = NextStep(*answer, result)  # pyright: ignore[reportCallIssue]
     return plan._replace(result=result), judged, wrappers, of_landing
+
+
+def _after_gap(
+    term: ScheduledTerm, scheme: Scheme, a: Attempt, taken: _StepResult, step: NextStep
+) -> Integrated:
+    """Returns the state where the next step begins, before what happens there.
+
+    Steps leave out the very times at which something happens. The motion goes on
+    meanwhile: of many known times, what is left out would add up.
+    """
+    landing = scheme.landing
+    if landing is None or not landing.timed:
+        return taken.y1
+    path, gap = taken.path, constant(step.t0 - a.end)
+    if isinstance(path, DenseOutput):
+        rates = path.rate_at_end
+    else:
+        rates = term.vf(a.end, taken.y1, taken.args)
+    over = lambda y, rate: y + jnp.where(gap > 0, gap * rate, 0)
+    return jax.tree.map(over, taken.y1, rates)
 
 
 def _around(answer: tuple, controller: Controller) -> Controller:

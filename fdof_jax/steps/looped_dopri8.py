@@ -91,6 +91,10 @@ _replayed_step = eqx.filter_jit(eqx.filter_checkpoint(_one_step))
 
 
 class _Interpolation(DenseOutput):
+    @property
+    def rate_at_end(self):
+        return jax.tree.map(lambda k: k[-1], self.rates)
+
     def at(self, theta):
         change = _weighted(interpolation_weights(theta), self.rates)
         return jax.tree.map(lambda a, k: a + self.step * k, self.y0, change)

@@ -116,6 +116,10 @@ def _step(term, t0, t1, y0, residue, args, f0) -> tuple[_End, dict[str, PyTree]]
 
 
 class _Interpolation(DenseOutput):
+    @property
+    def rate_at_end(self):
+        return self.rates[-1]
+
     @eqx.filter_jit
     def at(self, theta):
         weights = interpolation_weights(theta)
