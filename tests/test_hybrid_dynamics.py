@@ -134,6 +134,16 @@ def test_efforts_make_the_motion_and_do_its_work(topology, joints):
 
 
 @pytest.mark.slow
+def test_the_motor_moves_a_payload_while_it_is_there():
+    forces = pushed(0.0, 2.0, (1, 2, 3)), fj.forces.Payload(fj.Point(1), 3.0, end=0.35)
+    ts = np.linspace(0, 1, 11)
+    motion = fj.simulate(CART, REST, ts, forces)
+    effort = fj.joint_efforts(CART, forces, motion).elements[0, :, 0]
+    moved = 2 + MASS + np.where(ts < 0.35, 3, 0)
+    np.testing.assert_allclose(effort, 2 * moved, rtol=1e-12)
+
+
+@pytest.mark.slow
 def test_starts_beside_the_reference_and_singular_equations_are_told():
     motion = pushed(0.0)
     starts = fj.State(np.array([[0.0, 0.1, 0], [0.2, 0.1, 0]]), np.zeros((2, 3)))

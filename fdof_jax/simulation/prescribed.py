@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike
 
 from ..base.checks import place_of, refusal
 from ..dynamics import mass_and_bias
+from ..forces.added_inertia import present
 from ..forces.element import Element, Forces, naming
 from ..linkage.fields import Truth, called
 from ..linkage.joint_numbers import among_joints, numbered, numbers_in
@@ -109,7 +110,7 @@ def prescribed_effort(
     """Computes the effort of the prescribed motion beside other efforts `tau`."""
     motion = prescribed(forces)
     assert motion is not None
-    matrix, bias = mass_and_bias(linkage, forces, q, qd)
+    matrix, bias = mass_and_bias(linkage, present(forces, t), q, qd)
     moved, (*_, qdd) = motion.prescribes(linkage), motion.schedule(t, linkage)
     given = jnp.where(moved, qdd, 0)
     free = jnp.where(jnp.outer(~moved, ~moved), matrix, jnp.eye(len(moved)))
