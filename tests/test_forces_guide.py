@@ -11,6 +11,9 @@ def test_examples():
     assert names["reactions"].shape == (101, 3, 3)
     assert names["torque"].shape == (101, 3)
     assert np.isfinite(names["effort"]).all()
+    half, q = names["TipLoad"](mass=1), names["emptied"].q[25]
+    expected = names["fj"].mass_matrix(names["arm"], q, (half,))
+    np.testing.assert_allclose(names["inertia"], expected, rtol=1e-12)
     assert 0 < names["share"][0] < 0.5 and not names["share"][1:].any()
     for motion in ("motion", "sampled", "after"):
         assert np.isfinite(names[motion].q).all()

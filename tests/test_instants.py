@@ -33,8 +33,8 @@ FREE = {
     analysis.open_loop: lambda forces: analysis.open_loop(BAR, Q, PD, 1, forces),
     analysis.closed_loop: lambda forces: analysis.closed_loop(BAR, Q, PD, 1, forces),
 }
-# These are given no time: they refuse masses that come or go. What holds joints has no
-# mass and no energy, and its efforts are the caller's.
+# These are given no time: they refuse masses that depend on it. What holds joints has
+# no mass and no energy, and its efforts are the caller's.
 TIMELESS = {
     fj.forward_dynamics: lambda forces: fj.forward_dynamics(BAR, Q, [1], [0], forces),
     fj.inverse_dynamics: lambda forces: fj.inverse_dynamics(BAR, Q, [1], [0], forces),
@@ -88,11 +88,17 @@ def test_loops_and_limits_of_held_joints_are_refused(element):
         )
 
 
+class Leaking(fj.forces.Payload):
+    def at(self, t):
+        return fj.forces.Payload(self.place, self.mass - t)
+
+
 @pytest.mark.parametrize("function", TIMELESS, ids=lambda of: of.__name__)
-def test_masses_that_come_or_go_need_a_time(function):
-    for times in dict(begin=0.5), dict(end=0.5):
-        load = fj.forces.Payload(fj.Point(1, 1.0), 2.0, **times)
-        with pytest.raises(ValueError, match=r"^forces\[1\]: expected a payload at on"):
+def test_masses_that_depend_on_time_need_one(function):
+    place, kind = fj.Point(1, 1.0), fj.forces.Payload
+    loads = kind(place, 2.0, begin=0.5), kind(place, 2.0, end=0.5), Leaking(place, 2.0)
+    for load in loads:
+        with pytest.raises(ValueError, match=r"^forces\[1\]: expected masses of one t"):
             TIMELESS[function]((fj.JointDamper(1.0), load))
 
 

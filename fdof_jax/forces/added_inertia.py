@@ -5,13 +5,15 @@ from operator import add
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from ..base.checks import refusal
 from ..linkage.linkage import Linkage
 from ..mechanics.equations import Upper
 from .element import Element, Forces, InertialElement, elements_on
-from .payload import Payload
+
+_ANY = np.zeros(())  # a time: masses that never change are the same at all
 
 
 def inertial(forces: Forces) -> tuple[InertialElement, ...]:
@@ -25,11 +27,11 @@ def present(forces: Forces, t: Array) -> Forces:
 
 
 def _without_times(linkage: Linkage, forces: Forces) -> tuple[Element, ...]:
-    """Returns forces as elements; raises ValueError for masses that come or go."""
+    """Returns forces as elements; raises ValueError for masses that depend on time."""
     found = elements_on(linkage, forces)
     for index, element in enumerate(found):
-        if isinstance(element, Payload) and element.jump_ts is not None:
-            expected = "a payload at one time (payload.at(t)), as no time is given here"
+        if isinstance(element, InertialElement) and element.at(_ANY) is not element:
+            expected = "masses of one time, its `at(t)`, as no time is given here"
             raise refusal(f"forces[{index}]", expected, element)
     return found
 

@@ -13,6 +13,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jaxtyping import PyTree
 
@@ -214,11 +215,19 @@ class InertialElement(Element):
 
     Its kinetic energy is the sum of weight * (d coordinate/dt)^2 / 2 [J]. For a body,
     the coordinates of the mass centre have the mass as weight, and the angle has the
-    inertia. A subclass implements `coordinates` and `weights`. `at(t)` returns the
-    element at a time; masses that come and go have none there while they are away.
+    inertia. A subclass implements `coordinates` and `weights`, and `at` if its masses
+    depend on time.
+
+    Mass leaves, or comes, with the velocity of the body, as from a leaking bucket: the
+    equation of motion is M(t) qdd + bias = tau, without a term dM/dt. Only a `Payload`
+    comes with a velocity of its own.
     """
 
-    def at(self, t: Array) -> "InertialElement":
+    def at(self, t: Array | np.ndarray) -> "InertialElement":
+        """Returns the element at a time; itself, if its masses never change.
+
+        Else an element whose masses never change, with those of this time.
+        """
         return self
 
     @abstractmethod

@@ -69,7 +69,7 @@ class Payload(InertialElement):
         taken = True if self.begin is None else has_come(self.begin, t)
         return taken & (True if self.end is None else ~has_come(self.end, t))
 
-    def at(self, t: Array) -> "Payload":
+    def at(self, t: Array | np.ndarray) -> "Payload":
         """Returns the payload at a time, without mass where it is not taken."""
         if self.jump_ts is None:
             return self

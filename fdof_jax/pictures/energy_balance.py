@@ -7,7 +7,6 @@ from ..dynamics import energy
 from ..forces.added_inertia import present
 from ..forces.element import Forces, InertialElement, elements
 from ..forces.holders import Holder
-from ..forces.payload import Payload
 from ..linkage.linkage import Linkage
 from ..simulation.efforts import acting_in, joint_efforts
 from ..simulation.solution import Solution
@@ -32,8 +31,9 @@ def energy_balance(
     efforts = np.asarray(joint_efforts(linkage, forces, solution).elements)
     changes, changed = [], np.zeros(len(ts) - 1, bool)  # from sample to sample [J]
     for k, (element, tau) in enumerate(zip(forces, efforts)):
-        if isinstance(element, Payload):
-            changed |= np.diff(np.broadcast_to(element.there(ts), ts.shape))
+        if isinstance(element, InertialElement):
+            weights = jax.vmap(lambda t, of=element: of.at(t).weights(linkage))(ts)
+            changed |= np.diff(weights, axis=0).any(axis=1)
         if isinstance(element, Holder) and element.holds:
             continue  # `solution.taken` has what it takes, exactly
         tau = np.nan_to_num(tau[: len(ts)])  # a command that ends a motion is NaN
@@ -47,7 +47,7 @@ def energy_balance(
         changes.append(work)
     if solution.taken is not None:
         changes.append(-np.diff(solution.taken[: len(ts)]))
-    # Where a payload comes or goes, what else would be missing is its energy.
+    # Where masses come or go, what else would be missing is their energy.
     missing = np.diff(kinetic + potential) - sum(changes)
     changes.append(np.where(changed, missing, 0))
 

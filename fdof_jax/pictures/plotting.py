@@ -170,9 +170,9 @@ def energy_stack(
 
     A force element puts energy in while its power is positive, and takes it out while
     its power is negative. A motor may do both. What friction, blows, brakes and catches
-    take is that of `solution.taken` since the start. A `Payload` puts in its energies
-    where it is taken, and takes them out where it is let go; heights count from the
-    ground pivot, so that one below it has a negative potential energy.
+    take is that of `solution.taken` since the start. Masses put in their energies where
+    they come, and take them out where they go, as a `Payload` that is let go; heights
+    count from the ground pivot, so that one below it has a negative potential energy.
 
     **Arguments:** `forces`: those of the solution.
     """

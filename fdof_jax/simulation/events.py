@@ -159,7 +159,8 @@ def _taken(
         )
         new = after & ~before & ~first.any()
         coordinates = lambda q, e=element: e.coordinates(q, args.linkage)
-        jacobian, weights = jax.jacfwd(coordinates)(q), element.weights(args.linkage)
+        jacobian = jax.jacfwd(coordinates)(q)
+        weights = element.at(args.clock(index, event.t)).weights(args.linkage)
         own, carried = element.arriving, jacobian @ qd
         impulse += jnp.where(new, weights * (own - carried) @ jacobian, 0)
         lost += jnp.where(new, weights @ (own**2 - carried**2) / 2, 0)
