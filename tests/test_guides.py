@@ -59,6 +59,7 @@ def test_switches():
     names = run(DOCS / "switches.md")
     assert names["found"].stats["num_switches"] >= 1
     assert names["wet"].stats["num_switches"] >= 1
+    np.testing.assert_allclose(names["kept"], 0.8783656, rtol=1e-6)
     assert np.isfinite(names["slope"]).all()
 
 

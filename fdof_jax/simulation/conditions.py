@@ -36,7 +36,7 @@ class Until(Element):
     >>> turns = fj.simulation.Until(lambda t, q, qd, linkage: qd[0], direction=1)
     >>> motion = fj.simulate(arm, start, [0, 5.0], until=turns)
     >>> bool(motion.ended), float(motion.end.t)
-    (True, 0.0)
+    (True, 1.705)
     """
 
     condition: Element
@@ -76,10 +76,10 @@ class End(NamedTuple):
 
     >>> import fdof_jax as fj
     >>> arm, start, *_ = fj.scenes.fig5()
-    >>> level = lambda t, q, qd, linkage: fj.tip_position(linkage, q)[1]
-    >>> end = fj.simulate(arm, start, [0, 5.0], until=level).end
+    >>> below = lambda t, q, qd, linkage: fj.tip_position(linkage, q)[1] + 2
+    >>> end = fj.simulate(arm, start, [0, 5.0], until=below).end
     >>> float(end.t), end.q.tolist(), int(end.condition)
-    (0.0, [0.0, 0.0, 0.0], 0)
+    (0.642, [-1.135, 0.2, 0.642], 0)
     """
 
     t: Float[Array, ""]

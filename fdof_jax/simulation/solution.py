@@ -147,8 +147,10 @@ class Solution(eqx.Module):
       taken up to `ts` [J].
     - `events`: what happened to which joint, and when; its times have derivatives.
 
-    - `end`: with `until`, where the motion ended (see `simulation.End`), else None;
-      `ended` says whether a condition was met. Rows after the end are NaN.
+    - `end`: with `until`, else None: where the motion ended, `end.t`, `end.q` and
+      `end.qd`, and the number of the condition that was met first, `end.condition`; -1
+      if none was, and the end is the last row. `ended` says whether one was. Rows after
+      the end are NaN.
 
     After `simulate_sampled`, else None:
 
