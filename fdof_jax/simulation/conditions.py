@@ -24,8 +24,9 @@ class Until(Element):
 
     **Arguments:**
 
-    - `g`: `(t, q, qd, linkage) -> number`, smooth near its zeros, in any unit in which
-      it is not tiny.
+    - `g`: `(t, q, qd, linkage) -> number`, of the time [s], joint positions and
+      velocities (n,) [m or rad], smooth near its zeros, in any unit in which it is not
+      tiny.
     - `direction`: 1 if the motion ends only where `g` rises through 0, -1 only where it
       falls, 0 in both cases.
 

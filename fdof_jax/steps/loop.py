@@ -307,7 +307,8 @@ def _planned(
         plan = NextStep(*plan, result)  # pyright: ignore[reportCallIssue]
         if landing is not None:
             # The controller's own grid knows nothing of ends at known times.
-            plan = plan._replace(t1=plan.t0 + scheme.dt0)
+            dt0: Any = scheme.dt0
+            plan = plan._replace(t1=plan.t0 + dt0)
             plan, _, of_landing = landing.after(a.t, a.end, None, plan, a.landing)
         return plan, judged, None, of_landing
     if error is None:
