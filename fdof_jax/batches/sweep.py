@@ -33,6 +33,7 @@ from ..base.checks import (
 )
 from ..base.functions import sharing_functions
 from ..base.known_values import in_numpy
+from ..base.trees import constant
 from ..base.whole_files import folder_path
 from ..forces.element import Forces, elements, elements_on
 from ..forces.holders import holders
@@ -41,7 +42,6 @@ from ..linkage.linkage import Linkage
 from ..simulation.scene import Scene, accepts_scene
 from ..simulation.simulate import solve_options
 from ..simulation.solution import Solution
-from ..steps.dopri8 import constant
 from .batch_axes import Batch, ForcesAxes, batch_of
 from .chunks import Common, Job, expected_work, in_chunks, outcome_of
 from .devices import devices_outside_mesh

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ..mechanics.equations import Constants
-from ..steps.dopri8 import Integrated, ScheduledTerm
+from ..steps.term import Integrated, ScheduledTerm
 from .field import Args
 
 

@@ -4,12 +4,13 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from ..base.trees import constant
 from ..forces.holders import Brake, HardStops
 from ..forces.payload import Payload
 from ..mechanics.equations import Scalars
 from ..mechanics.solve import minus
-from ..steps.dopri8 import Integrated, constant
 from ..steps.switch_derivatives import Event
+from ..steps.term import Integrated
 from .field import Args, efforts, schedule_of, vector_field, with_prescribed_rates
 from .holding import (
     BRAKE,

@@ -37,7 +37,7 @@ from ..mechanics.equations import (
 )
 from ..mechanics.rates import conditioning, rates, rates_and_conditioning
 from ..mechanics.solve import divided, minus, solver_of, times, with_added
-from ..steps.dopri8 import Health, Integrated, health_if
+from ..steps.term import Health, Integrated, health_if
 from .prescribed import prescribed
 from .sampling import Sampler, unsampled
 

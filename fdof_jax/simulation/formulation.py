@@ -10,8 +10,8 @@ from ..base.checks import place_of
 from ..forces.element import Forces
 from ..linkage.fields import Truth, jumps_at
 from ..mechanics.equations import Scalars, zeros
-from ..steps.dopri8 import Integrated, ScheduledTerm
 from ..steps.landing import Clock, clearance
+from ..steps.term import Integrated, ScheduledTerm
 from .events import resolve
 from .field import (
     Args,

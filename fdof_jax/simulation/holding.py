@@ -18,6 +18,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ..base.one_loop import in_one_loop
+from ..base.trees import constant
 from ..forces.added_inertia import added_inertia
 from ..forces.element import Forces
 from ..forces.holders import Brake, HardStops, Holder, holders
@@ -28,7 +29,7 @@ from ..linkage.topology import fixed_pairs, real_joints
 from ..mechanics.equations import Constants, Equations, Upper, equations, with_held
 from ..mechanics.rates import efforts_of_fixed
 from ..mechanics.solve import divided, solver_of, times, with_added
-from ..steps.dopri8 import Integrated, constant
+from ..steps.term import Integrated
 from .field import Args, Schedules, applied, args_of
 from .prescribed import prescribed
 from .solution import MODES, Events

@@ -15,16 +15,18 @@ from jax import Array
 
 from ..base.checks import refusal
 from ..base.known_values import known_array
+from ..base.trees import constant
 from ..forces.element import Element, OwnStates
 from ..forces.joints import EffortHistory
 from ..linkage.linkage import Linkage, possible, without_fixed
 from ..steps import loop
 from ..steps.derivative_control import ProbeJudge, TangentJudge
-from ..steps.dopri8 import Integrated, ScheduledDopri8, constant
+from ..steps.dopri8 import ScheduledDopri8
 from ..steps.events import events_of
 from ..steps.judge import Judge, JudgeState
 from ..steps.landing import Clock, Landing, clearance
 from ..steps.looped_dopri8 import LoopedDopri8
+from ..steps.term import Integrated
 from ..steps.tolerances import default_controller, error_control_of, with_tolerances
 from .arrays import in_arrays
 from .conditions import End, conditions_in, conditions_last

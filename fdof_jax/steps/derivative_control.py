@@ -16,16 +16,9 @@ from jax import Array
 from jax.flatten_util import ravel_pytree
 from jaxtyping import PyTree
 
-from .dopri8 import (
-    Arguments,
-    Estimate,
-    Health,
-    Integrated,
-    ScheduledTerm,
-    constant,
-    largest,
-    lower_triangle,
-)
+from ..base.trees import constant, largest
+from .dopri8 import Estimate, lower_triangle
+from .term import Arguments, Health, Integrated, ScheduledTerm
 
 # The relative tolerance of tangents: over that of the motion, its upper limit, and its
 # lower limit in rounding errors.

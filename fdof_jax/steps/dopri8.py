@@ -4,20 +4,17 @@
 agree with `diffrax.Dopri8` up to rounding.
 """
 
-import functools
-import operator
 from abc import abstractmethod
-from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
 
 import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.typing import ArrayLike
 from jaxtyping import PyTree
+
+from .term import Health, ScheduledTerm, is_singular
 
 TABLEAU = diffrax.Dopri8.tableau
 STAGES = len(TABLEAU.b_sol)
@@ -40,50 +37,6 @@ SCHEDULE_SHARES = np.concatenate([[0.0], TABLEAU.c, [0.8]])
 AT_END, IN_GAP = STAGES - 1, STAGES  # rows of a schedule
 _INTERPOLATION: Any = diffrax.Dopri8.interpolation_cls
 DENSE = _INTERPOLATION.eval_coeffs  # (stage, power), highest first
-
-
-# Equations have types of their own (`simulation.field.Args`), which steps do not know.
-Integrated = PyTree  # a state: positions, rates, the elements' own
-Arguments = PyTree  # of the equations: a named tuple with a linkage, q0 and sides
-Term = Any  # a `ScheduledTerm`
-Health = tuple[Array, ...]  # one per joint, see `ScheduledTerm`
-
-
-class ScheduledTerm(diffrax.ODETerm):
-    """A term whose vector field takes a fourth argument, which depends on time alone.
-
-    `schedule(t, args)` computes this argument, in steps at all `SCHEDULE_SHARES`.
-    `health(t, y, args)` holds the loss of accuracy in the rates of each joint, at least
-    1, or 0 where the equations are singular. `watched_field` returns the rates and
-    their health, NaN if they are not finite.
-    `switching` returns the switching functions (n,), and with which something jumps.
-
-    Where joints are held for a while, `args.modes` says which. `unknown_modes(args)`
-    returns the modes before the start, and how many of the last switching functions
-    guard them: positive while a mode lasts. `resolve(event, y, args)` returns the state
-    and the modes after an event.
-
-    Between samples of a controller, `args.sampled` holds what it has sampled. Where a
-    step begins, `sample(t, y, args)`, if any, returns it anew, and whether it changed.
-
-    `settle(t, y, args)`, if any, returns the state from which a step begins.
-    """
-
-    vector_field: Callable[..., PyTree] = eqx.field(static=True)
-    schedule: Callable[..., PyTree] = eqx.field(static=True)
-    health: Callable[..., Health] = eqx.field(static=True)
-    watched_field: Callable[..., tuple[PyTree, Health]] = eqx.field(static=True)
-    switching: Callable[..., tuple[Array, tuple[bool, ...]]] = eqx.field(static=True)
-    unknown_modes: Callable | None = eqx.field(static=True, default=None)
-    resolve: Callable | None = eqx.field(static=True, default=None)
-    settle: Callable | None = eqx.field(static=True, default=None)
-    sample: Callable | None = eqx.field(static=True, default=None)
-
-    def vf(self, t, y, args):
-        return self.vector_field(t, y, args, self.schedule(t, args))
-
-    def switches(self, t, y, args) -> tuple[Array, tuple[bool, ...]]:
-        return self.switching(t, y, args, self.schedule(t, args))
 
 
 class ScheduledDopri8(diffrax.AbstractAdaptiveSolver):
@@ -137,33 +90,6 @@ class DenseOutput(diffrax.AbstractLocalInterpolation):
         length = self.t1 - self.t0
         safe = jnp.where(length == 0, 1, length)
         return self.at(jnp.where(length == 0, 0, (t0 - self.t0) / safe))
-
-
-def constant(tree: PyTree) -> PyTree:
-    """Returns the tree with its arrays constant for derivatives."""
-    return jax.tree.map(
-        lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, tree
-    )
-
-
-def chosen(condition: ArrayLike, ones: PyTree, others: PyTree) -> PyTree:
-    """Returns the numbers of one tree where a condition holds, else of another."""
-    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), ones, others)
-
-
-def largest(tree: PyTree) -> Array:
-    """Returns the size of the largest number in a tree."""
-    sizes = [jnp.max(jnp.abs(leaf)) for leaf in jax.tree.leaves(tree)]
-    return functools.reduce(jnp.maximum, sizes)
-
-
-def is_singular(health: Health) -> Array:
-    return functools.reduce(operator.or_, (x == 0 for x in health))
-
-
-def health_if(finite: Array, health: Health) -> Health:
-    """Returns the health, NaN where rates are not finite unless they are singular."""
-    return tuple(jnp.where(finite | (x == 0), x, jnp.nan) for x in health)
 
 
 class Estimate(NamedTuple):

@@ -14,10 +14,12 @@ import numpy as np
 from jax import Array
 from jaxtyping import PyTree
 
+from ..base.trees import constant
 from ..linkage.fields import Truth
-from .dopri8 import SHORTEST, Arguments, DenseOutput, Integrated, Term, constant
+from .dopri8 import SHORTEST, DenseOutput
 from .landing import Found, clearance
 from .switch_derivatives import Event, gained, gained_at_kink, lateness, moved
+from .term import Arguments, Integrated, Term
 from .zeros import CHECKED, CHECKS, SAMPLED, SHARES, passage
 
 # A function whose zero is this close to the end of a step switches there: a share of

@@ -17,21 +17,12 @@ from jax import Array
 from jax.typing import ArrayLike
 from jaxtyping import PyTree
 
+from ..base.trees import chosen, constant, largest
 from ..linkage.topology import real_joints
 from .derivative_control import ProbeJudge, StepEnds, TangentJudge
-from .dopri8 import (
-    Estimate,
-    Health,
-    Integrated,
-    ScheduledTerm,
-    chosen,
-    constant,
-    health_if,
-    is_singular,
-    largest,
-    verdict,
-)
+from .dopri8 import Estimate, verdict
 from .landing import NextStep
+from .term import Health, Integrated, ScheduledTerm, health_if, is_singular
 from .tolerances import ErrorControl
 
 # Rounding errors of an acceleration, over its size times eps and the loss of accuracy:

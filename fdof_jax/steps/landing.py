@@ -7,8 +7,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jax import Array
 
+from ..base.trees import constant
 from ..linkage.fields import has_come
-from .dopri8 import constant
 
 # More than `_MOST_CROSSINGS` count as chatter if all come within the least distance
 # between two times, times this power of the unit of rounding (3e5 in float64). Chatter

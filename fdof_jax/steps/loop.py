@@ -15,10 +15,12 @@ from jax import Array
 from jaxtyping import PyTree
 
 from ..base.checks import refusal
-from .dopri8 import Arguments, DenseOutput, Integrated, ScheduledTerm, chosen, constant
+from ..base.trees import chosen, constant
+from .dopri8 import DenseOutput
 from .events import Events, Switches
 from .judge import Judge, StepEnds, without_nan
 from .landing import NEAR_END, Found, Landing, NextStep
+from .term import Arguments, Integrated, ScheduledTerm
 from .tolerances import Controller, EagerController, with_error_control
 
 RESULTS: Any = diffrax.RESULTS

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import PyTree
 
+from ..base.trees import constant
 from .dopri8 import (
     LOWER,
     SCHEDULE_SHARES,
@@ -23,12 +24,11 @@ from .dopri8 import (
     Estimate,
     ScheduledDopri8,
     compensated,
-    constant,
-    health_if,
     interpolation_weights,
     scheduled_at_end,
     verdict,
 )
+from .term import health_if
 
 
 def _weighted(weights: Array, rates: PyTree) -> PyTree:

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import PyTree
 
-from .dopri8 import Arguments, Integrated, Term
+from .term import Arguments, Integrated, Term
 
 
 class Event(NamedTuple):

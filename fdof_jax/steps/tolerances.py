@@ -14,8 +14,9 @@ from jaxtyping import PyTree
 from numpy.typing import ArrayLike
 
 from ..base.checks import concrete, is_traced, real_numbers, refusal
+from ..base.trees import constant
 from ..base.user_warnings import warn
-from .dopri8 import ScheduledTerm, constant
+from .term import ScheduledTerm
 
 Controller = diffrax.AbstractStepSizeController
 ErrorControl = diffrax.AbstractAdaptiveStepSizeController

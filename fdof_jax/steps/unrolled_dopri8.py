@@ -18,6 +18,7 @@ from jax import Array
 from jaxtyping import PyTree
 
 from ..base.one_loop import entries_in_one_loop, in_one_loop
+from ..base.trees import chosen
 from .dopri8 import (
     AT_END,
     DENSE,
@@ -26,15 +27,13 @@ from .dopri8 import (
     TABLEAU,
     DenseOutput,
     Estimate,
-    Health,
     ScheduledDopri8,
-    chosen,
     compensated,
     interpolation_weights,
-    is_singular,
     scheduled_at_end,
     verdict,
 )
+from .term import Health, is_singular
 
 _USED = [stage for stage, row in enumerate(DENSE) if row.any()]
 

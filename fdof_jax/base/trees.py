@@ -1,0 +1,28 @@
+"""Trees of arrays: constant for derivatives, chosen, and how large they are."""
+
+import functools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jax.typing import ArrayLike
+from jaxtyping import PyTree
+
+
+def constant(tree: PyTree) -> PyTree:
+    """Returns the tree with its arrays constant for derivatives."""
+    return jax.tree.map(
+        lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, tree
+    )
+
+
+def chosen(condition: ArrayLike, ones: PyTree, others: PyTree) -> PyTree:
+    """Returns the numbers of one tree where a condition holds, else of another."""
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), ones, others)
+
+
+def largest(tree: PyTree) -> Array:
+    """Returns the size of the largest number in a tree."""
+    sizes = [jnp.max(jnp.abs(leaf)) for leaf in jax.tree.leaves(tree)]
+    return functools.reduce(jnp.maximum, sizes)
