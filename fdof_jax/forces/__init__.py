@@ -7,13 +7,14 @@ from .holders import Brake, HardStops, JointFriction
 from .joints import EffortHistory, JointDamper, JointEffort, JointSpring, JointStops
 from .payload import Payload
 from .points import Load, Point, PointElement, SpringDamper, Tension, Wrench
+from .reset import Reset
 from .switches import clip, switch
 
 __all__ = [
     "Armature", "Brake", "clip", "Condition", "EffortHistory", "Element", "elements_on",
     "field", "HardStops", "InertialElement", "JointDamper", "JointEffort",
     "JointFriction", "JointSpring", "JointStops", "LinearActuator", "Load", "of_kind",
-    "Part", "Payload", "Point", "PointElement", "Rotor", "SpringDamper",
+    "Part", "Payload", "Point", "PointElement", "Reset", "Rotor", "SpringDamper",
     "StatefulElement", "switch", "Tension", "Values", "Wrench",
 ]  # fmt: skip
 

@@ -3,13 +3,12 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float, Int
 
-from ..base.checks import function, refusal
+from ..base.checks import function, one_of, refusal
 from ..forces.element import Element, Forces, element_of
-from ..forces.switches import switch
+from ..forces.reset import Reset, condition, resets_in
 from ..linkage.linkage import Linkage
 
 _EXPECTED = "a function (t, q, qd, linkage) that returns a number"
@@ -45,9 +44,7 @@ class Until(Element):
 
     def __init__(self, g: Callable, direction: int = 0):
         self.condition = element_of(function("g", g, _EXPECTED))
-        if isinstance(direction, bool) or direction not in (-1, 0, 1):
-            raise refusal("direction", "1, -1 or 0", direction)
-        self.direction = int(direction)
+        self.direction = one_of("direction", direction, (-1, 0, 1))
 
     def arguments(self) -> dict[str, Any]:
         return {"g": self.condition, "direction": self.direction}
@@ -57,14 +54,8 @@ class Until(Element):
         """None: nothing happens to the motion before it ends."""
 
     def __call__(self, t: Array, q: Array, qd: Array, linkage: Linkage) -> Array:
-        value: Any = self.condition(t, q, qd, linkage)
-        if jnp.shape(value) != ():
-            raise ValueError(
-                f"until: expected {_EXPECTED}, got one of shape {jnp.shape(value)}."
-            )
-        none = jnp.zeros_like(q)
-        # Its zeros are switches, at which steps end, but nothing depends on the side.
-        return switch(jnp.asarray(value, q.dtype), none, none, continuous=True)
+        value = self.condition(t, q, qd, linkage)
+        return condition(value, f"until: expected {_EXPECTED}", q)
 
 
 class End(NamedTuple):
@@ -108,6 +99,7 @@ def conditions_in(forces: Forces) -> tuple[Until, ...]:
 
 
 def conditions_last(forces: Forces) -> Forces:
-    """Returns the elements in their order, but conditions after the others."""
-    others = (element for element in forces if not isinstance(element, Until))
-    return (*others, *conditions_in(forces))
+    """Returns elements in their order, but those with conditions after the others."""
+    kinds = Reset, Until
+    others = (element for element in forces if not isinstance(element, kinds))
+    return (*others, *resets_in(forces), *conditions_in(forces))

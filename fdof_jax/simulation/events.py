@@ -5,8 +5,11 @@ import jax.numpy as jnp
 from jax import Array
 
 from ..base.trees import constant
+from ..dynamics import energy
 from ..forces.holders import Brake, HardStops
 from ..forces.payload import Payload
+from ..forces.reset import Reset, resets_in
+from ..linkage.linkage import without_fixed
 from ..mechanics.equations import Scalars
 from ..mechanics.solve import minus
 from ..steps.switch_derivatives import Event
@@ -31,7 +34,7 @@ from .holding import (
 from .prescribed import PrescribedMotion
 from .solution import HAPPENINGS, Events
 
-_STICKS, _SLIPS, _BOUNCES, _RESTS, _LEAVES, _BRAKED, _LET_GO, _STOPPED = range(
+_STICKS, _SLIPS, _BOUNCES, _RESTS, _LEAVES, _BRAKED, _LET_GO, _STOPPED, _RESET = range(
     len(HAPPENINGS)
 )
 
@@ -44,6 +47,11 @@ def resolve(event: Event, y: Integrated, args: Args) -> tuple[Integrated, Modes]
     """
     kinds = {kind for e in args.forces for kind in type(e).__mro__}
     before, law = args.modes, laws(args, event.t)
+    energy_taken = jnp.zeros_like(event.t)
+    if resets := resets_in(args.forces):
+        for element, met in zip(resets, event.resets):
+            y, more = _after_reset(element, met, event, y, args)
+            energy_taken += more
     if PrescribedMotion in kinds:
         # Impulses move what friction and stops hold.
         braked = before._replace(mode=jnp.where(law.braked, BRAKE, FREE))
@@ -73,11 +81,12 @@ def resolve(event: Event, y: Integrated, args: Args) -> tuple[Integrated, Modes]
     still = jnp.full_like(q, STILL * jnp.finfo(q.dtype).eps)
     qd = start = _stilled(qd, may_rest, still)
 
-    lost, hit, left_out = jnp.zeros_like(event.t), jnp.zeros(q.size, bool), 0.0
+    lost, hit, left_out = energy_taken, jnp.zeros(q.size, bool), 0.0
     if kinds & {Brake, HardStops, Payload}:
         system = system_at(event.t, q, jnp.zeros_like(q), args)
         if Payload in kinds:
-            qd, lost = _taken(event, q, qd, first, args, law, system)
+            qd, more = _taken(event, q, qd, first, args, law, system)
+            lost += more
         energy = lambda qd: qd @ system.momenta(qd) / 2
         lost += energy(qd)
         still = system.still(start, qd)
@@ -99,7 +108,11 @@ def resolve(event: Event, y: Integrated, args: Args) -> tuple[Integrated, Modes]
     # Modes in which a motion begins are no events, but blows at the start are.
     kind = jnp.where(first & (qd == start), -1, kind)
     at = event.t + event.late + left_out - late
-    events = _recorded(before.events, at, kind)
+    events = before.events
+    if resets:
+        reset = jnp.where(event.resets.any(), _RESET, -1)[None]
+        events = _recorded(events, event.t + event.late, reset, first=0)
+    events = _recorded(events, at, kind)
     modes = modes._replace(origin=origin, taken=before.taken + lost, events=events)
     state = tuple(origin), tuple(qd), *own
     if HardStops in kinds:
@@ -264,12 +277,47 @@ def _happenings(before: Modes, after: Modes, hit: Array, law: Laws) -> Array:
     return jnp.select([*cases.values()], kinds, -1)
 
 
-def _recorded(events: Events, t: Array, kind: Array) -> Events:
-    """Returns the events with those of all joints to which something happens."""
+def _after_reset(
+    element: Reset, met: Array, event: Event, y: Integrated, args: Args
+) -> tuple[Integrated, Array]:
+    """Returns the state after a reset, if it is met, and the energy that it takes.
+
+    The step ended close to the zero of its condition: the state moves there and back.
+    """
+
+    def there(y):
+        arm, t = args.linkage, event.t
+        rates = _rates(t, y, args)
+
+        def value(late):
+            delta, qd, *_ = _moved(y, late, rates)
+            q = args.q0 + jnp.stack(delta)
+            return element.when(t + late, q, jnp.stack(qd), arm)
+
+        none = jnp.zeros_like(t)
+        g, slope = jax.jvp(value, (none,), (jnp.ones_like(t),))
+        late = constant(jnp.where(slope != 0, -g / jnp.where(slope != 0, slope, 1), 0))
+        delta, qd, *own = _moved(y, late, rates)
+        before = args.q0 + jnp.stack(delta), jnp.stack(qd)
+        after = element.state_after(t + late, *before, arm)
+        q, qd = (without_fixed(arm, value) for value in after)
+        masses = args.masses(t)
+        energies = (sum(energy(arm, *state, masses)) for state in (before, (q, qd)))
+        new = tuple(q - args.q0), tuple(qd), *own
+        return _moved(new, -late, _rates(t, new, args)), jnp.subtract(*energies)
+
+    return jax.lax.cond(met, there, lambda y: (y, jnp.zeros_like(event.t)), y)
+
+
+def _recorded(events: Events, t: Array, kind: Array, first: int = 1) -> Events:
+    """Returns the events with those of all joints to which something happens.
+
+    `first`: the number of the first of these joints.
+    """
     happens = kind >= 0
     places = (events.count + jnp.cumsum(happens) - 1) % MOST_EVENTS
     places = jnp.where(happens, places.astype(int), MOST_EVENTS)  # dropped
-    numbers = jnp.arange(1.0, kind.size + 1)
+    numbers = first + jnp.arange(kind.size, dtype=float)
     put = lambda rows, new: rows.at[places].set(
         jnp.broadcast_to(new, kind.shape).astype(rows.dtype), mode="drop"
     )

@@ -23,6 +23,7 @@ from ..forces.added_inertia import added_inertia
 from ..forces.element import Forces
 from ..forces.holders import Brake, HardStops, Holder, holders
 from ..forces.payload import Payload
+from ..forces.reset import resets_in
 from ..linkage.fields import Truth
 from ..linkage.linkage import Linkage, joints_of
 from ..linkage.topology import fixed_pairs, real_joints
@@ -250,9 +251,9 @@ def leaves_prescribed(forces: Forces, linkage: Linkage) -> Truth:
 
 
 def changes(forces: Forces) -> bool:
-    """Returns whether elements hold joints or take masses, so that rates may jump."""
+    """Returns whether elements hold joints, take masses or reset the state."""
     taking = (isinstance(e, Payload) and e.begin is not None for e in forces)
-    return bool(holders(forces)) or any(taking)
+    return bool(holders(forces) or resets_in(forces)) or any(taking)
 
 
 def at_rest(

@@ -18,6 +18,7 @@ from ..base.known_values import known_array
 from ..base.trees import constant
 from ..forces.element import Element, OwnStates
 from ..forces.joints import EffortHistory
+from ..forces.reset import resets_in
 from ..linkage.linkage import Linkage, possible, without_fixed
 from ..steps import loop
 from ..steps.derivative_control import ProbeJudge, TangentJudge
@@ -156,8 +157,10 @@ def _scheme(
         watches = not isinstance(method, ScheduledDopri8)  # which finds it itself
         control = error_control_of(controller)
         judge = Judge(control, term, watches, of_derivatives)
-        ends = tuple(condition.direction for condition in conditions_in(args.forces))
-        events = events_of(term, ts, start, args, ends, derivatives)
+        directions = lambda kind: tuple(one.direction for one in kind)
+        resets = directions(resets_in(args.forces))
+        ends = directions(conditions_in(args.forces))
+        events = events_of(term, ts, start, args, (resets, ends), derivatives)
         lands = events is not None or motion.jumps is not None
     else:
         lands = False

@@ -43,7 +43,7 @@ MODES = "free", "friction", "lower stop", "upper stop", "brake"
 # What happens to a joint, in the order of its number.
 HAPPENINGS = (
     "sticks", "slips", "bounces", "rests on its stop", "leaves its stop",
-    "is braked", "is let go", "is stopped",
+    "is braked", "is let go", "is stopped", "is reset",
 )  # fmt: skip
 # Slower crossings are near to grazing, where no derivative exists.
 SLOW = 0.01

@@ -103,7 +103,7 @@ class Events(eqx.Module):
     - `jumping`: whether efforts jump where each function switches; the last `guards`
       functions guard modes.
     - `ends`: of the functions just before them, which end the run: in which direction
-      each does, 0 for both.
+      each does, 0 for both. `resets`: the same of those before, which reset the state.
     - `derivatives`: whether states move with the times of events, in derivatives.
     """
 
@@ -111,6 +111,7 @@ class Events(eqx.Module):
     apart: Array  # see `clearance`
     jumping: tuple[bool, ...] = eqx.field(static=True)
     guards: int = eqx.field(static=True)
+    resets: tuple[int, ...] = eqx.field(static=True)
     ends: tuple[int, ...] = eqx.field(static=True)
     derivatives: bool = eqx.field(static=True)
 
@@ -155,10 +156,10 @@ class Events(eqx.Module):
         else:
             sides = sides.at[-self.guards :].set(1)
             at_start = jnp.any(modes.mode < 0)
-            y, modes = jax.lax.cond(
+            y, modes, sides = jax.lax.cond(
                 jumped | at_start,
                 lambda: self._after_event(t, y, args, last, sides, changed, jumped),
-                lambda: (y, modes),
+                lambda: (y, modes, sides),
             )
             # Other modes have other guards.
             old = last.modes
@@ -172,8 +173,8 @@ class Events(eqx.Module):
     def _after_event(
         self, t: Array, y: Integrated, args: Arguments, last: Switches, sides: Array,
         changed: Array, jumped: Truth,
-    ) -> tuple[Integrated, PyTree]:  # fmt: skip
-        """Returns state and modes after an event.
+    ) -> tuple[Integrated, PyTree, Array]:  # fmt: skip
+        """Returns state, modes and sides after an event.
 
         The state moves on to the time of the event in the modes before, and back in
         those after: this changes nothing but derivatives.
@@ -190,12 +191,46 @@ class Events(eqx.Module):
                 lambda: jnp.zeros_like(t),
             )
             there = moved(late, time, y, before, self.term)
-        event, own = Event(last.until, t, fired, late), before._replace(sides=sides)
+        own = before._replace(sides=sides)
+        resets = self._met(self.resets, len(self.ends), changed & jumped, sides)
+        event = Event(last.until, t, fired, late, resets)
         there, modes = self.term.resolve(event, there, own)
-        if self.derivatives:
+        after = args._replace(sides=sides, modes=modes)
+        if self.resets:
+            sides = self._sides_after(t, there, after, resets, last)
             after = args._replace(sides=sides, modes=modes)
+        if self.derivatives:
             there = moved(-late, t + late, there, after, self.term)
-        return there, modes
+        return there, modes, sides
+
+    def _places(self, count: int, later: int) -> slice:
+        """Returns the places of `count` functions before `later` ones and guards."""
+        last = len(self.jumping) - self.guards - later
+        return slice(last - count, last)
+
+    def _met(
+        self, directions: tuple[int, ...], later: int, passed: Array, after: Array
+    ) -> Array:
+        """Returns which conditions are met, (condition,).
+
+        `passed`: which functions passed a zero; `after`: all sides then.
+        """
+        own, wanted = self._places(len(directions), later), np.array(directions)
+        return passed[own] & ((wanted == 0) | (wanted == after[own]))
+
+    def _sides_after(
+        self, t: Array, y: Integrated, args: Arguments, resets: Array, last: Switches
+    ) -> Array:
+        """Returns the sides after resets: of a function that is 0, where it goes."""
+        own = self._places(len(self.resets), len(self.ends))
+        rates = self.term.vf(t, y, args)
+        function = lambda t, y: self.term.switches(t, y, args)[0][own]
+        along = jnp.ones_like(t), rates
+        values, slopes = constant(jax.jvp(function, (t, y), along))
+        on_zero = jnp.abs(values) <= jnp.finfo(t.dtype).eps ** 0.5 * last.sizes[own]
+        above = jnp.where(on_zero, slopes, values) > 0
+        side = jnp.where(above, 1.0, -1.0).astype(args.sides.dtype)
+        return args.sides.at[own].set(jnp.where(resets, side, args.sides[own]))
 
     def _shifted(
         self, t: Array, y: Integrated, args: Arguments, last: Switches, jumped: Truth
@@ -295,9 +330,7 @@ class Events(eqx.Module):
         """
         if not self.ends:
             return None
-        own = slice(after.size - self.guards - len(self.ends), after.size - self.guards)
-        wanted = np.array(self.ends)
-        met = passed[own] & ((wanted == 0) | (wanted == after[own]))
+        met = self._met(self.ends, 0, passed, after)
         return jnp.where(met.any(), jnp.argmax(met), -1)
 
     def at_end(
@@ -311,7 +344,7 @@ class Events(eqx.Module):
         args = args._replace(sides=last.sides, modes=last.modes)
         assert last.ended is not None
         ended = last.ended >= 0
-        which = last.sides.size - self.guards - len(self.ends) + last.ended
+        which = self._places(len(self.ends), 0).start + last.ended
 
         def later(time: Array) -> tuple[Array, Integrated]:
             middle = _along(y, time / 2, self.term.vf(t, y, args))
@@ -346,10 +379,13 @@ def _along(y: Integrated, time: Array, rates: Integrated) -> Integrated:
 
 
 def events_of(
-    term: Term, ts: Array, y0: Integrated, args: Arguments, ends: tuple[int, ...],
-    derivatives: bool,
+    term: Term, ts: Array, y0: Integrated, args: Arguments,
+    conditions: tuple[tuple[int, ...], tuple[int, ...]], derivatives: bool,
 ) -> Events | None:  # fmt: skip
-    """Returns the events of a run over the times `ts`, None if nothing switches."""
+    """Returns the events of a run over the times `ts`, None if nothing switches.
+
+    `conditions`: see `Events.resets` and `Events.ends`.
+    """
     guards = 0
     if term.unknown_modes is not None:
         modes, guards = term.unknown_modes(args)
@@ -357,7 +393,7 @@ def events_of(
     functions, jumping = eqx.filter_eval_shape(term.switches, ts[0], y0, args)
     if not functions.size:
         return None
-    return Events(term, clearance(ts), jumping, guards, ends, derivatives)
+    return Events(term, clearance(ts), jumping, guards, *conditions, derivatives)
 
 
 @eqx.filter_jit  # traced once, not at each use in a solve

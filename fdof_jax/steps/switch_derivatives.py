@@ -23,12 +23,14 @@ class Event(NamedTuple):
     - `before`, `t`: times just before it and just after it [s].
     - `fired` (kind, joint): which guards of modes came to their zeros.
     - `late`: 0, whose derivatives are those of the time of the event less `before`.
+    - `resets` (reset,): which elements reset the state.
     """
 
     before: Array
     t: Array
     fired: Array
     late: Array
+    resets: Array
 
 
 @jax.custom_jvp

@@ -1,0 +1,100 @@
+"""States that jump where a condition is met."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax.numpy as jnp
+from jax import Array
+
+from ..base.checks import function, one_of
+from ..linkage.linkage import Linkage
+from .element import Element, Forces, element_of
+from .switches import switch
+
+_WHEN = "a function (t, q, qd, linkage) that returns a number"
+_THEN = "a function (t, q, qd, linkage) that returns positions and velocities (q, qd)"
+
+
+class Reset(Element):
+    """Replaces the state where a function of it passes 0, as a blow or a new foothold.
+
+    Steps end there exactly, and derivatives of first and second order include the time
+    of the jump, `Solution.events` records it (of joint 0), and `Solution.taken` counts
+    the energy of links and loads that it takes. It has no efforts.
+
+    After the jump `when` may be 0 still: the next one comes when it has left the zero
+    and passes it again. Jumps that follow each other ever faster, as of a ball that
+    comes to rest, take all steps ("out of steps"); `HardStops` hold what rests.
+
+    **Arguments:**
+
+    - `when`: `(t, q, qd, linkage) -> number`, of the time [s], joint positions and
+      velocities (n,) [m or rad], smooth near its zeros, in any unit in which it is not
+      tiny.
+    - `then`: `(t, q, qd, linkage) -> (q, qd)`: the state after the jump; of fixed pairs
+      it is ignored.
+    - `direction`: 1 if it jumps only where `when` rises through 0, -1 only where it
+      falls, 0 in both cases.
+
+    **Raises:** ValueError for malformed arguments.
+
+    >>> import fdof_jax as fj
+    >>> arm, start, *_ = fj.scenes.fig5()
+    >>> kick = fj.forces.Reset(
+    ...     when=lambda t, q, qd, linkage: fj.tip_position(linkage, q)[1] + 2,
+    ...     then=lambda t, q, qd, linkage: (q, 0.5 * qd))
+    >>> motion = fj.simulate(arm, start, [0, 1.0], (kick,))
+    >>> motion.events.table["event"].tolist(), float(motion.taken[-1])  # [J]
+    (['is reset'], 0.0)
+    """
+
+    when: Element
+    then: Element
+    direction: int
+
+    def __init__(self, when: Callable, then: Callable, direction: int = 0):
+        self.when = element_of(function("when", when, _WHEN))
+        self.then = element_of(function("then", then, _THEN))
+        self.direction = one_of("direction", direction, (-1, 0, 1))
+
+    def arguments(self) -> dict[str, Any]:
+        return {"when": self.when, "then": self.then, "direction": self.direction}
+
+    @property
+    def jump_ts(self) -> None:
+        """None: the times are not known before."""
+
+    def __call__(self, t: Array, q: Array, qd: Array, linkage: Linkage) -> Array:
+        return condition(self.when(t, q, qd, linkage), f"when: expected {_WHEN}", q)
+
+    def state_after(
+        self, t: Array, q: Array, qd: Array, linkage: Linkage
+    ) -> tuple[Array, Array]:
+        """Returns the joint positions and velocities after the jump, (n,) each."""
+        answer: Any = self.then(t, q, qd, linkage)
+        pair = isinstance(answer, tuple | list) and len(answer) == 2
+        shapes = [*map(jnp.shape, answer)] if pair else None
+        if shapes != [q.shape, q.shape]:
+            raise ValueError(
+                f"then: expected {_THEN}, of shape {q.shape} each, got "
+                f"{shapes or type(answer).__name__}."
+            )
+        new_q, new_qd = (jnp.asarray(value, q.dtype) for value in answer)
+        return new_q, new_qd
+
+
+def condition(value: Any, expected: str, q: Array) -> Array:
+    """Returns no efforts; the zeros of a number become ends of steps.
+
+    Raises ValueError for what is not one number.
+    """
+    if jnp.shape(value) != ():
+        raise ValueError(f"{expected}, got one of shape {jnp.shape(value)}.")
+    none = jnp.zeros_like(q)
+    # A switch of which nothing depends on the side.
+    return switch(jnp.asarray(value, q.dtype), none, none, continuous=True)
+
+
+def resets_in(forces: Forces) -> tuple[Reset, ...]:
+    """Returns the resets among elements."""
+    return tuple(element for element in forces if isinstance(element, Reset))
