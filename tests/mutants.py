@@ -227,8 +227,8 @@ MUTANTS = {
     ),
     "static friction is that of sliding": Mutant(
         "simulation/holding.py",
-        "most = jnp.where(law.braked, jnp.inf, law.static)",
-        "most = jnp.where(law.braked, jnp.inf, law.level)",
+        "static = jnp.where(law.braked, jnp.inf, law.static)",
+        "static = jnp.where(law.braked, jnp.inf, law.level)",
         f"{HOLDING}::test_static_friction_holds_what_has_come_to_rest_only",
     ),
     # Controllers on a clock

@@ -128,6 +128,7 @@ def real_numbers(
     above: float | None = None,
     finite: bool = True,
     broadcast: bool = False,
+    rows: int | None = None,
     unit: str = "",
     of: str = "",
 ) -> Array | np.ndarray:
@@ -136,7 +137,8 @@ def real_numbers(
     It is an array of NumPy, none that the caller has; or of JAX, if `value` is traced
     or is an array of JAX of that dtype and shape already.
     `None` in `shape` stands for any length, and JOINT for that of any arm. `broadcast`
-    also accepts one number for all entries, and repeats it if the shape is known.
+    also accepts one number for all entries, and repeats it if the shape is known;
+    `rows` also accepts so many rows of that shape.
     Raises ValueError for a wrong shape, a type that is not real numbers, NaN,
     infinities (unless `finite=False`) and entries below `minimum` or not above `above`;
     the message names the `unit`, and what the numbers are `of`.
@@ -156,7 +158,8 @@ def real_numbers(
         if unit:
             expected += f" [{unit}]"
         if broadcast and shape:
-            expected += " (or one number for all)"
+            more = f", or {rows} such rows" if rows else ""
+            expected += f" (or one number for all{more})"
         return ValueError(f"{name}: expected {expected}, got {got}.")
 
     traced = is_traced(value)
@@ -166,8 +169,9 @@ def real_numbers(
         raise refuse(shown(value)) from error
     if array.dtype.kind not in "iuf":
         raise refuse(shown(value))
-    fits = array.ndim == len(shape) and all(
-        want in (None, JOINT, have) for want, have in zip(shape, array.shape)
+    sizes = shape_in_rows(array, rows)
+    fits = len(sizes) == len(shape) and all(
+        want in (None, JOINT, have) for want, have in zip(shape, sizes)
     )
     if not fits and not (broadcast and array.ndim == 0):
         raise refuse(f"shape {array.shape}" if array.ndim else shown(value))
@@ -189,6 +193,12 @@ def real_numbers(
     if not fits and JOINT not in shape:
         array = (jnp if traced else np).broadcast_to(array, shape)  # type: ignore[arg-type]
     return jnp.asarray(array, dtype=float) if traced else array
+
+
+def shape_in_rows(value: Any, rows: int | None) -> tuple[int, ...]:
+    """Returns the shape of an array, or of each of its `rows`, if it has so many."""
+    shape = np.shape(value)
+    return shape[1:] if len(shape) == 2 and shape[0] == rows else shape
 
 
 def within_bounds(

@@ -10,13 +10,14 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jaxtyping import Bool
+from jaxtyping import Bool, PyTree
 from numpy.typing import ArrayLike
 
 from ..base.checks import refusal
 from ..linkage.fields import Condition, Values, each, field
 from ..linkage.joint_numbers import among_joints, numbered, numbers_in
 from ..linkage.linkage import Linkage, joints_of
+from ..mechanics.equations import Scalars
 from .element import Forces, ScalarElement
 
 
@@ -32,15 +33,32 @@ class Holder(ScalarElement):
         return True
 
     def levels(self, joints: int) -> tuple[Array, Array]:
-        """Returns the sliding and the static friction of each joint, (2, n)."""
+        """Returns the sliding and the static friction of the joints (see `toward`)."""
         return jnp.zeros(joints), jnp.zeros(joints)
+
+    def against(
+        self, sliding: Scalars, scheduled: PyTree, q: Scalars, qd: Scalars,
+        linkage: Linkage,
+    ) -> Scalars:  # fmt: skip
+        """Returns the efforts at joints that slide: `sliding` has their signs."""
+        return tuple(jnp.zeros_like(rate) for rate in sliding)
 
     def braking(self, t: Array, linkage: Linkage) -> Array:
         """Returns which joints a brake holds at a time, (n,)."""
         return jnp.zeros(joints_of(linkage), bool)
 
     def respond(self, scheduled, q, qd, linkage):
-        return tuple(jnp.zeros_like(rate) for rate in qd)
+        return self.against(qd, scheduled, q, qd, linkage)
+
+
+def toward(friction: Array, direction: ArrayLike | Scalars) -> Array:
+    """Returns the friction (n,) that resists motions in these directions.
+
+    `friction`: (n,), or (2, n) for motions to positive and to negative positions.
+    """
+    if jnp.ndim(friction) < 2:
+        return friction
+    return jnp.where(jnp.asarray(direction) > 0, *friction)
 
 
 class JointFriction(Holder):
@@ -59,6 +77,10 @@ class JointFriction(Holder):
     - `level`: of sliding friction, not negative [N or N m].
     - `static`: friction up to which a joint at rest is held, at least the level; by
       default equal to it [N or N m].
+
+    Either may also have two rows, (2, n): against motions to positive positions and
+    to negative ones.
+
     - `speed`: positive [m/s or rad/s].
 
     **Raises:** ValueError for malformed arguments, and for `static` beside `speed`.
@@ -73,8 +95,8 @@ class JointFriction(Holder):
     [0.0]
     """
 
-    level: Values = field(unit="N or N m", minimum=0)
-    static: Values | None = field(unit="N or N m", minimum=0, default=None)
+    level: Values = field(unit="N or N m", minimum=0, rows=2)
+    static: Values | None = field(unit="N or N m", minimum=0, rows=2, default=None)
     speed: Values | None = field(
         unit="m/s or rad/s", above=0, default=None, kw_only=True
     )
@@ -91,16 +113,25 @@ class JointFriction(Holder):
             yield Condition(enough, "static", "at least the level", both)
 
     def levels(self, joints):
-        static = self.level if self.static is None else self.static
-        return jnp.broadcast_to(self.level, joints), jnp.broadcast_to(static, joints)
+        level = _of_joints(self.level, joints)
+        return level, level if self.static is None else _of_joints(self.static, joints)
 
-    def respond(self, scheduled, q, qd, linkage):
+    def against(self, sliding, scheduled, q, qd, linkage):
         if self.speed is None:
-            signs = map(jnp.sign, qd)
+            signs = map(jnp.sign, sliding)
         else:
-            rates = zip(each(self.speed, qd), qd)
+            rates = zip(each(self.speed, sliding), sliding)
             signs = (jnp.tanh(rate / speed) for speed, rate in rates)
-        return tuple(-x * sign for x, sign in zip(each(self.level, qd), signs))
+        levels = each(toward(self.level, sliding), sliding)
+        return tuple(-x * sign for x, sign in zip(levels, signs))
+
+
+def _of_joints(friction: Array, joints: int) -> Array:
+    """Returns friction with an entry per joint, (n,) or (2, n)."""
+    if jnp.ndim(friction) < 2:
+        return jnp.broadcast_to(friction, joints)
+    # Not 0 in one direction alone: else the modes would not tell the other one.
+    return friction + jnp.finfo(friction.dtype).eps ** 2
 
 
 class HardStops(Holder):

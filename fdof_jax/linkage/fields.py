@@ -26,6 +26,7 @@ from ..base.checks import (
     is_traced,
     plain,
     real_array,
+    shape_in_rows,
     within_bounds,
 )
 from ..base.frozen import Frozen
@@ -54,6 +55,7 @@ def field(
     finite: bool = True,
     function: bool = False,
     optional: bool = False,
+    rows: int | None = None,
     default: Any = dataclasses.MISSING,
     kw_only: bool = False,
 ) -> Any:
@@ -70,11 +72,12 @@ def field(
     - `minimum`, `above`: bounds; `finite`: whether infinities are refused.
     - `function`: whether a function that returns such an array is accepted;
       `optional`: whether None is, as it always is where it is the default.
+    - `rows`: of so many rows, each like `shape`, an array is accepted as well.
     - `default`, `kw_only`: as of `dataclasses.field`.
     """
     per_joint = shape is None
     rules = dict(shape=(JOINT,) if per_joint else shape, broadcast=per_joint, unit=unit)
-    rules |= dict(minimum=minimum, above=above, finite=finite)
+    rules |= dict(minimum=minimum, above=above, finite=finite, rows=rows)
     optional = optional or default is None
     about = {"rules": rules, "function": function, "optional": optional}
     return dataclasses.field(default=default, kw_only=kw_only, metadata=about)
@@ -302,7 +305,8 @@ def check_joints(place: str, part: Part, linkage: Linkage) -> None:
     part, linkage = in_numpy((part, linkage))
     count = joints_of(linkage)
     for name, value, rules in _declared(part):
-        for wanted, size in zip(rules["shape"], jnp.shape(value)):
+        sizes = shape_in_rows(value, rules["rows"])
+        for wanted, size in zip(rules["shape"], sizes):
             if wanted == JOINT and size != count:
                 more = jnp.ndim(value) > len(rules["shape"])
                 hint = "; sweep(..., forces_axes=0) takes a batch" if more else ""

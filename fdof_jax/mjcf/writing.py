@@ -142,6 +142,8 @@ def _check_elements(
             element.check(linkage, jnp.zeros(1))
             if element.side and float(element.damping) > 0:
                 expected = "no damping of a cable or bumper, which MuJoCo does not have"
+        elif isinstance(element, JointFriction) and np.ndim(element.level) != 1:
+            expected = "one friction per joint, as MuJoCo has the same both ways"
         elif counts[type(element)] > 1 and type(element) in (*_IN_JOINTS, PDController):
             expected, name = f"one {name}, as a joint of MuJoCo has", "several"
         elif type(element) in _ACTUATORS:

@@ -6,7 +6,7 @@ from jax import Array
 
 from ..base.trees import constant
 from ..dynamics import energy
-from ..forces.holders import Brake, HardStops
+from ..forces.holders import Brake, HardStops, toward
 from ..forces.payload import Payload
 from ..forces.reset import Reset, resets_in
 from ..linkage.linkage import without_fixed
@@ -77,7 +77,7 @@ def resolve(event: Event, y: Integrated, args: Args) -> tuple[Integrated, Modes]
     q, qd = args.q0 + jnp.stack(delta), jnp.stack(rates_before)
     q = jnp.where(touched != 0, stop, q)
     qd = jnp.where(fired[0] & slides, 0, qd)  # came to zero
-    may_rest = (law.static > 0) | (touched != 0)
+    may_rest = law.rubs | (touched != 0)
     still = jnp.full_like(q, STILL * jnp.finfo(q.dtype).eps)
     qd = start = _stilled(qd, may_rest, still)
 
@@ -100,7 +100,8 @@ def resolve(event: Event, y: Integrated, args: Args) -> tuple[Integrated, Modes]
         lost -= energy(qd)
     net = _net_efforts(*constant((event.t, q, qd, own, args)))
     modes = at_rest(qd, touched * (qd == 0), args.modes, law, *net, fired[0])
-    slid = law.level * before.direction * (jnp.stack(delta) - before.origin)
+    slid = before.direction * (jnp.stack(delta) - before.origin)
+    slid = toward(law.level, before.direction) * slid
     lost += jnp.sum(jnp.where(first, 0, slid))
     origin = q - args.q0
     kind = _happenings(before, modes, hit & (modes.mode == FREE), law)

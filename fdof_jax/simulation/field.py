@@ -200,7 +200,7 @@ def efforts(
     for (index, element, state), scheduled in zip(elements, schedule):
         if isinstance(element, Holder) and element.holds:
             sliding = qd if args.modes is None else tuple(args.modes.direction)
-            effort = element.respond(scheduled, delta, sliding, args.linkage)
+            effort = element.against(sliding, scheduled, delta, qd, args.linkage)
         elif isinstance(element, Sampler):
             effort = tuple(args.sampled.acting)
         elif isinstance(element, ScalarElement):

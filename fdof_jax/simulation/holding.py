@@ -21,7 +21,7 @@ from ..base.one_loop import in_one_loop
 from ..base.trees import constant
 from ..forces.added_inertia import added_inertia
 from ..forces.element import Forces
-from ..forces.holders import Brake, HardStops, Holder, holders
+from ..forces.holders import Brake, HardStops, Holder, holders, toward
 from ..forces.payload import Payload
 from ..forces.reset import resets_in
 from ..linkage.fields import Truth
@@ -71,7 +71,7 @@ class Modes(NamedTuple):
 
 
 class Laws(NamedTuple):
-    """The laws of all holders, in joint order: (n,) each."""
+    """The laws of all holders, in joint order: (n,) each; frictions as of `toward`."""
 
     level: Array
     static: Array
@@ -79,6 +79,15 @@ class Laws(NamedTuple):
     upper: Array
     restitution: Array
     braked: Array
+
+    @property
+    def rubs(self) -> Array:
+        return toward(self.static, 1) > 0
+
+
+def _sum(friction: Array, more: Array) -> Array:
+    """Returns the sum of frictions, of which either may have two rows."""
+    return jnp.add(*jnp.broadcast_arrays(friction, more))
 
 
 def laws(args: Args, t: Array) -> Laws:
@@ -94,7 +103,7 @@ def laws(args: Args, t: Array) -> Laws:
         if not (isinstance(element, Holder) and element.holds):
             continue
         more, most = element.levels(joints)
-        level, static = level + more, static + most
+        level, static = _sum(level, more), _sum(static, most)
         braked = braked | element.braking(args.clock(index, t), args.linkage)
         if isinstance(element, HardStops):
             whole_size = lambda x: jnp.broadcast_to(x, joints)
@@ -124,14 +133,17 @@ def unknown_modes(args: Args) -> tuple[Modes, int]:
 def _reserve(static: Array, mode: Array, effort: Array, inertia: Array) -> Array:
     """Returns by how much efforts may grow before held joints come free.
 
-    Friction is symmetric: near both limits this is the distance from the nearer one, as
+    Of friction, near both limits, this is the distance from the nearer one, as
     a share of the limit. That of a stop is per inertia [m/s^2 or rad/s^2]. Either is of
     much the same size in large machines and in tiny ones.
     """
-    most = jnp.where(static > 0, static, 1)
+    ahead, behind = toward(static, 1), toward(static, -1)
+    mean = (ahead + behind) / 2
+    mean = jnp.where(mean > 0, mean, 1)
     kinds = [mode == FRICTION, mode == LOWER, mode == UPPER]
-    pushes = [(static + effort) / inertia, (static - effort) / inertia]
-    return jnp.select(kinds, [(1 - (effort / most) ** 2) / 2, *pushes], 1)
+    rubs = (ahead + effort) / mean * ((behind - effort) / mean) / 2
+    pushes = [(ahead + effort) / inertia, (behind - effort) / inertia]
+    return jnp.select(kinds, [rubs, *pushes], 1)
 
 
 def guarded_switching(
@@ -147,7 +159,7 @@ def guarded_switching(
     effort = jnp.stack(efforts_of_fixed(args.moving(), *driven))
     law, modes = laws(args, t), args.modes
     held, direction = modes.held, modes.direction
-    rubs = (law.static > 0) & ~held & (direction != 0)
+    rubs = law.rubs & ~held & (direction != 0)
     sliding = jnp.where(rubs, direction * jnp.stack(at.qd), 1)
     c = args.constants
     inertia = jnp.where(
@@ -270,13 +282,13 @@ def at_rest(
     m, efforts = in_one_loop((system.equations, tuple(net)))
     system, net = system._replace(equations=m), jnp.stack(efforts)
     inertia = system.inertia
-    rest = (qd == 0) & ((law.static > 0) | (touched != 0) | law.braked)
+    rest = (qd == 0) & (law.rubs | (touched != 0) | law.braked)
     held_as = jnp.where(touched < 0, LOWER, jnp.where(touched > 0, UPPER, FRICTION))
     held_as = jnp.where(law.braked, BRAKE, held_as)
-    most = jnp.where(law.braked, jnp.inf, law.static)
-    least = jnp.where(held_as == UPPER, -jnp.inf, -most)
-    most = jnp.where(held_as == LOWER, jnp.inf, most)
-    size = jnp.abs(net) + law.static
+    static = jnp.where(law.braked, jnp.inf, law.static)
+    least = jnp.where(held_as == UPPER, -jnp.inf, -toward(static, 1))
+    most = jnp.where(held_as == LOWER, jnp.inf, toward(static, -1))
+    size = jnp.abs(net) + toward(law.static, net)
     pulled = system.momenta(system.accelerations(net, before.held, in_one_loop)) - net
     leaves = [before.mode == LOWER, before.mode == UPPER, before.mode == FRICTION]
     forced = jnp.select(leaves, [1.0, -1.0, -jnp.sign(pulled)])
@@ -284,7 +296,8 @@ def at_rest(
 
     def solved(slide):
         held = rest & (slide == 0)
-        qdd = system.accelerations(net - law.level * slide, held, in_one_loop)
+        rubbing = toward(law.level, slide) * slide
+        qdd = system.accelerations(net - rubbing, held, in_one_loop)
         effort = jnp.where(held, system.momenta(qdd) - net, 0)
         low, high = (effort - least) / size, (most - effort) / size
         # A joint that slides must not accelerate the other way.
@@ -310,7 +323,7 @@ def at_rest(
     direction = jnp.where(held, 0, jnp.where(rest, slide, jnp.sign(qd)))
     return before._replace(
         mode=jnp.where(held, held_as, FREE).astype(qd.dtype),
-        direction=jnp.where(law.static > 0, direction, 0),
+        direction=jnp.where(law.rubs, direction, 0),
     )
 
 
@@ -319,7 +332,7 @@ def taken_at(args: Args, ts: Array, modes: Modes, q: Array) -> Array:
 
     def taken(t, direction, origin, before, q):
         slide = direction * (q - args.q0 - origin)
-        return before + jnp.sum(laws(args, t).level * slide)
+        return before + jnp.sum(toward(laws(args, t).level, direction) * slide)
 
     rows = modes.direction, modes.origin, modes.taken
     return jax.vmap(taken)(ts, *rows, q)
@@ -341,7 +354,8 @@ def efforts_of_holders(
     net = tau - jnp.stack(system.equations.bias)
     none = jnp.zeros(q.size, bool)
     modes = at_rest(qd, touched * (qd == 0), modes, law, system, net, none)
-    starts = -law.level * jnp.where(qd == 0, modes.direction, 0)
+    slide = jnp.where(qd == 0, modes.direction, 0)
+    starts = -toward(law.level, slide) * slide
     qdd = system.accelerations(net + starts, modes.held)
     c = jnp.where(modes.held, system.momenta(qdd) - net, 0)
     mode = modes.mode
@@ -357,7 +371,7 @@ def efforts_of_holders(
             share, braked = jnp.where(braked & holds, c, 0), braked & ~holds
         elif isinstance(element, Holder) and element.holds:
             _, static = element.levels(q.size)
-            part = static / jnp.where(law.static > 0, law.static, 1)
-            share = part * rubs
+            static, most = toward(static, -rubs), toward(law.static, -rubs)
+            share = static / jnp.where(law.rubs, most, 1) * rubs
         rows.append(share)
     return jnp.stack(rows)
