@@ -206,6 +206,19 @@ def test_energy_stack_of_sampled_control_has_what_holders_take():
     )
 
 
+def test_energy_stack_integrates_friction_whose_level_is_a_function():
+    """The motion does not count what it takes; a level of numbers is counted."""
+    friction = JointFriction(lambda t, q, qd, linkage: 2.0), JointFriction(1.0)
+    ts = np.linspace(0, 0.5, 501)
+    solution = simulate(BAR, State([0.3], [1.0]), ts, friction)
+    taken = 3 * np.abs(np.diff(solution.q[:, 0])).sum()
+    np.testing.assert_allclose(solution.taken[-1], taken / 3, rtol=1e-4)
+    ax = plotting.energy_stack(BAR, friction, solution)
+    stack = tops(ax, ts)
+    out = stack["taken out"] - stack["potential"]
+    np.testing.assert_allclose(out[-1], taken, rtol=1e-4)
+
+
 @pytest.mark.slow
 def test_energy_stack_has_what_payloads_bring_and_take_away():
     times = dict(begin=0.5, end=1.2037)

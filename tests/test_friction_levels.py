@@ -1,11 +1,17 @@
 """Dry friction whose level depends on the direction and on the state."""
 
+from functools import partial
+
+import diffrax
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from modes import LOOPS
+from scipy.integrate import solve_ivp
 
 import fdof_jax as fj
-from fdof_jax.forces import JointFriction
+from fdof_jax.forces import JointFriction, stribeck
 
 SLOPE = 0.3  # rad, of the block's slide
 BLOCK = fj.Linkage(
@@ -72,3 +78,122 @@ def test_friction_in_one_direction_alone_lets_the_other_one_go():
 def test_malformed_levels_are_refused(make, words):
     with pytest.raises(ValueError, match=f"^{words}"):
         make()
+
+
+# Levels that are functions
+
+STIFFNESS, PACE = 100.0, 0.1  # N/m, m/s
+FRICTION = np.array([2.0, 3.0, 0.05])  # coulomb [N], static [N], speed [m/s]
+REST, TS = fj.State([0.0], [0.0]), np.linspace(0, 2.4, 9)
+TIGHT = dict(rtol=1e-12, atol=1e-12)
+
+
+def drag(t, q, qd, linkage):
+    return STIFFNESS * (PACE * t - q)
+
+
+def dragged(numbers, *forces, **options):
+    friction = JointFriction(stribeck(*numbers))
+    return fj.simulate(SLIDE, REST, TS, (friction, drag, *forces), **options)
+
+
+def scipy_times(coulomb, static, speed, end):
+    """Returns the times at which the dragged slide slips and sticks, in turn."""
+
+    def rates(t, y):
+        fall = (static - coulomb) * np.exp(-((y[1] / speed) ** 2))
+        return y[1], STIFFNESS * (PACE * t - y[0]) - coulomb - fall
+
+    rests = lambda t, y: y[1]
+    rests.terminal, rests.direction = True, -1
+    x, times = 0.0, []
+    while (slips := (x + static / STIFFNESS) / PACE) < end:
+        found = solve_ivp(
+            rates, (slips, slips + 2), (x, 0.0), "DOP853", events=rests,
+            rtol=1e-12, atol=1e-14, first_step=1e-6,
+        )  # fmt: skip
+        x = found.y_events[0][0][0]
+        times += [slips, found.t_events[0][0]]
+    return np.array(times)
+
+
+def test_a_dragged_slide_sticks_and_slips_as_scipy_has_it():
+    motion = dragged(FRICTION, **TIGHT)
+    times = scipy_times(*FRICTION, TS[-1])
+    assert motion.events.count == len(times) == 6
+    np.testing.assert_allclose(motion.events.t[:6], times, rtol=0, atol=1e-8)
+    assert (np.asarray(motion.taken) < 1e-20).all()  # functions are not counted
+
+    coulomb, static, speed = FRICTION
+
+    def falls(t, q, qd, linkage):
+        missing = (static - coulomb) * (1 - jnp.exp(-((qd / speed) ** 2)))
+        return missing * jnp.sign(qd)
+
+    forces = JointFriction(static), drag, falls
+    other = fj.simulate(SLIDE, REST, TS, forces, **TIGHT)
+    np.testing.assert_allclose(motion.q, other.q, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(motion.events.t[:6], other.events.t[:6], atol=1e-10)
+
+
+@pytest.mark.slow
+def test_derivatives_of_stick_slip():
+    """In both modes they equal differences; in the first times of each kind, too."""
+
+    def result(numbers, **options):
+        motion = dragged(numbers, **options, **TIGHT)
+        return jnp.append(motion.events.t[:2], motion.q[-1, 0])
+
+    steps = 1e-5 * FRICTION * np.eye(3)
+    near = [result(FRICTION + sign * step) for step in steps for sign in (1, -1)]
+    wanted = np.stack(near).reshape(3, 2, 3)
+    wanted = (wanted[:, 0] - wanted[:, 1]).T / (2e-5 * FRICTION)
+    forward = partial(result, adjoint=diffrax.ForwardMode())
+    numbers = jnp.asarray(FRICTION)
+    found = jax.jit(jax.jacfwd(forward), **LOOPS)(numbers)
+    np.testing.assert_allclose(found, wanted, rtol=1e-6, atol=1e-7)
+    found = jax.jit(jax.jacrev(result), **LOOPS)(numbers)
+    np.testing.assert_allclose(found, wanted, rtol=1e-6, atol=1e-7)
+
+
+def test_a_clutch_stops_a_slide_by_a_friction_over_time():
+    """Of 4 t newtons: 1 kg at 1 m/s, from 0.5 m, stops after sqrt(1/2) s."""
+    clutch = lambda t, q, qd, linkage: 4 * t
+    motion = fj.simulate(
+        SLIDE, fj.State([0.5], [1.0]), [0, 0.5, 2.0], (JointFriction(clutch),)
+    )
+    time = np.sqrt(0.5)
+    q = [0.5, 1 - 2 / 3 * 0.5**3, 0.5 + 2 / 3 * time]
+    np.testing.assert_allclose(motion.q[:, 0], q, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(motion.events.t[0], time, rtol=0, atol=1e-9)
+    assert motion.modes[-1, 0] == 1
+
+
+def test_friction_of_a_function_is_written_to_files(tmp_path):
+    friction = JointFriction(stribeck([2.0], 3.0, 0.1), static=[[4.0], [5.0]])
+    fj.save(tmp_path / "friction.json", friction)
+    assert repr(fj.load(tmp_path / "friction.json")) == repr(friction)
+
+
+@pytest.mark.parametrize(
+    "value, words",
+    [
+        (np.ones(2), "level: expected it to return numbers for 1 joints"),
+        (np.ones((3, 1)), "level: expected an array of n .* got shape"),
+        ("much", "level: expected an array of n"),
+    ],
+)
+def test_malformed_values_of_functions_are_refused(value, words):
+    friction = JointFriction(lambda t, q, qd, linkage: value)
+    with pytest.raises(ValueError, match=rf"^forces\[0\].{words}"):
+        fj.simulate(SLIDE, REST, TS, (friction,))
+
+
+def test_malformed_numbers_of_stribeck_are_refused():
+    for numbers, name in [
+        ((-1, 1, 1), "coulomb"),
+        ((1, -1, 1), "static"),
+        ((1, 1, 0), "speed"),
+    ]:
+        with pytest.raises(ValueError, match=f"^{name}: expected"):
+            stribeck(*numbers)

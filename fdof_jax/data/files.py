@@ -136,8 +136,7 @@ def _public(name: str) -> type | None:
     """Returns the library's class of that name, if its instances can be saved."""
     for place in (*_PLACES, ""):
         module = importlib.import_module(f"{_PACKAGE}.{place}".rstrip("."))
-        # Other names than those of classes might import the pictures.
-        kind = getattr(module, name, None) if re.match(r"[A-Z]\w*$", name) else None
+        kind = vars(module).get(name)  # `getattr` might import the pictures
         if isinstance(kind, type) and kind.__module__.startswith(f"{_PACKAGE}."):
             return kind if _is_record(kind) else None
     return None

@@ -3,7 +3,7 @@
 from ..linkage.fields import Condition, Part, Values, field, of_kind
 from .actuators import Armature, LinearActuator, Rotor
 from .element import Element, InertialElement, StatefulElement, elements_on
-from .holders import Brake, HardStops, JointFriction
+from .holders import Brake, HardStops, JointFriction, stribeck
 from .joints import EffortHistory, JointDamper, JointEffort, JointSpring, JointStops
 from .payload import Payload
 from .points import Load, Point, PointElement, SpringDamper, Tension, Wrench
@@ -15,7 +15,7 @@ __all__ = [
     "field", "HardStops", "InertialElement", "JointDamper", "JointEffort",
     "JointFriction", "JointSpring", "JointStops", "LinearActuator", "Load", "of_kind",
     "Part", "Payload", "Point", "PointElement", "Reset", "Rotor", "SpringDamper",
-    "StatefulElement", "switch", "Tension", "Values", "Wrench",
+    "StatefulElement", "stribeck", "switch", "Tension", "Values", "Wrench",
 ]  # fmt: skip
 
 

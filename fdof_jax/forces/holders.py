@@ -14,7 +14,7 @@ from jaxtyping import Bool, PyTree
 from numpy.typing import ArrayLike
 
 from ..base.checks import refusal
-from ..linkage.fields import Condition, Values, each, field
+from ..linkage.fields import Condition, Part, Values, each, field
 from ..linkage.joint_numbers import among_joints, numbered, numbers_in
 from ..linkage.linkage import Linkage, joints_of
 from ..mechanics.equations import Scalars
@@ -32,8 +32,16 @@ class Holder(ScalarElement):
         """True if joints stand still exactly by its law."""
         return True
 
-    def levels(self, joints: int) -> tuple[Array, Array]:
-        """Returns the sliding and the static friction of the joints (see `toward`)."""
+    @property
+    def counted(self) -> bool:
+        """True if `Solution.taken` has all that it takes."""
+        return self.holds
+
+    def levels(self, joints: int, *at: Any) -> tuple[Array, Array]:
+        """Returns the sliding and the static friction of the joints (see `toward`).
+
+        `at`: t, q, qd, linkage. Without them, functions of these count as almost 0.
+        """
         return jnp.zeros(joints), jnp.zeros(joints)
 
     def against(
@@ -79,7 +87,10 @@ class JointFriction(Holder):
       default equal to it [N or N m].
 
     Either may also have two rows, (2, n): against motions to positive positions and
-    to negative ones.
+    to negative ones. Or it is a function `(t, q, qd, linkage)` that returns such
+    numbers, smooth in each direction and positive, for instance `stribeck`; at times at
+    which it jumps it has an attribute `jump_ts`. What joints at rest take is its value
+    at qd = 0, and `Solution.taken` does not count a level that is a function.
 
     - `speed`: positive [m/s or rad/s].
 
@@ -95,8 +106,8 @@ class JointFriction(Holder):
     [0.0]
     """
 
-    level: Values = field(unit="N or N m", minimum=0, rows=2)
-    static: Values | None = field(unit="N or N m", minimum=0, rows=2, default=None)
+    level: Any = field(unit="N or N m", minimum=0, rows=2, function=True)
+    static: Any = field(unit="N or N m", minimum=0, rows=2, function=True, default=None)
     speed: Values | None = field(
         unit="m/s or rad/s", above=0, default=None, kw_only=True
     )
@@ -105,16 +116,47 @@ class JointFriction(Holder):
     def holds(self):
         return self.speed is None
 
+    @property
+    def counted(self):
+        return self.holds and not callable(self.level)
+
     def conditions(self):
         if self.static is not None:
             alone = self.speed is None
             yield Condition(alone, "static", "none beside speed", self.static)
-            enough, both = (self.static >= self.level).all(), (self.static, self.level)
-            yield Condition(enough, "static", "at least the level", both)
+            both = self.static, self.level
+            if not any(map(callable, both)):
+                enough = (self.static >= self.level).all()
+                yield Condition(enough, "static", "at least the level", both)
 
-    def levels(self, joints):
-        level = _of_joints(self.level, joints)
-        return level, level if self.static is None else _of_joints(self.static, joints)
+    def schedule(self, t, linkage):
+        return t if callable(self.level) else ()
+
+    def levels(self, joints, *at):
+        level = self._of_joints("level", joints, at)
+        if self.static is None:
+            return level, level
+        return level, self._of_joints("static", joints, at)
+
+    def _of_joints(self, name: str, joints: int, at: tuple[Any, ...]) -> Array:
+        """Returns friction with an entry per joint, (n,) or (2, n)."""
+        friction = vars(self)[name]
+        varies = callable(friction)
+        if varies and not at:
+            friction = jnp.zeros(())
+        elif varies:
+            t, q, qd, linkage = at
+            state = jnp.asarray(q), jnp.asarray(qd)
+            friction = self.value_of(name, t, *state, linkage)
+            if jnp.ndim(friction) and friction.shape[-1] != joints:
+                expected = f"it to return numbers for {joints} joints"
+                raise refusal(name, expected, friction)
+        if jnp.ndim(friction) < 2:
+            friction = jnp.broadcast_to(friction, joints)
+            if not varies:
+                return friction
+        # Never 0, as the modes tell directions only where there may be friction.
+        return friction + jnp.finfo(friction.dtype).eps ** 2
 
     def against(self, sliding, scheduled, q, qd, linkage):
         if self.speed is None:
@@ -122,16 +164,38 @@ class JointFriction(Holder):
         else:
             rates = zip(each(self.speed, sliding), sliding)
             signs = (jnp.tanh(rate / speed) for speed, rate in rates)
-        levels = each(toward(self.level, sliding), sliding)
+        level = self._of_joints("level", len(sliding), (scheduled, q, qd, linkage))
+        levels = toward(level, sliding)
         return tuple(-x * sign for x, sign in zip(levels, signs))
 
 
-def _of_joints(friction: Array, joints: int) -> Array:
-    """Returns friction with an entry per joint, (n,) or (2, n)."""
-    if jnp.ndim(friction) < 2:
-        return jnp.broadcast_to(friction, joints)
-    # Not 0 in one direction alone: else the modes would not tell the other one.
-    return friction + jnp.finfo(friction.dtype).eps ** 2
+class stribeck(Part):  # named as the function that it is
+    """Friction that falls from static to sliding friction as a joint moves faster.
+
+    A `level` of `JointFriction`: coulomb + (static - coulomb) exp(-(qd / speed)^2).
+
+    **Arguments:** one per joint or one for all.
+
+    - `coulomb`, `static`: friction of fast slides and at rest, not negative [N or N m].
+    - `speed`: at which most of the difference is gone, positive [m/s or rad/s].
+
+    **Raises:** ValueError for malformed arguments.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.double_pendulum().linkage
+    >>> level = fj.forces.stribeck(1.0, static=1.5, speed=0.1)
+    >>> level(0.0, [0, 0], np.array([0.0, 9.0]), arm).tolist()
+    [1.5, 1.0]
+    >>> friction = fj.forces.JointFriction(level)  # needs no static friction beside it
+    """
+
+    coulomb: Values = field(unit="N or N m", minimum=0)
+    static: Values = field(unit="N or N m", minimum=0)
+    speed: Values = field(unit="m/s or rad/s", above=0)
+
+    def __call__(self, t: Array, q: Array, qd: Array, linkage: Linkage) -> Array:
+        peak = jnp.exp(-jnp.square(qd / self.speed))
+        return self.coulomb + (self.static - self.coulomb) * peak
 
 
 class HardStops(Holder):

@@ -34,8 +34,8 @@ def energy_balance(
         if isinstance(element, InertialElement):
             weights = jax.vmap(lambda t, of=element: of.at(t).weights(linkage))(ts)
             changed |= np.diff(weights, axis=0).any(axis=1)
-        if isinstance(element, Holder) and element.holds:
-            continue  # `solution.taken` has what it takes, exactly
+        if isinstance(element, Holder) and element.counted:
+            continue  # `solution.taken` has it, exactly
         tau = np.nan_to_num(tau[: len(ts)])  # a command that ends a motion is NaN
         held = solution.acting is not None and k == 0  # until the next sample
         effort = tau[:-1] if held else (tau[1:] + tau[:-1]) / 2

@@ -99,7 +99,8 @@ def resolve(event: Event, y: Integrated, args: Args) -> tuple[Integrated, Modes]
         qd = _stilled(qd, may_rest, still)
         lost -= energy(qd)
     net = _net_efforts(*constant((event.t, q, qd, own, args)))
-    modes = at_rest(qd, touched * (qd == 0), args.modes, law, *net, fired[0])
+    at_qd = laws(args, event.t, q, qd)
+    modes = at_rest(qd, touched * (qd == 0), args.modes, at_qd, *net, fired[0])
     slid = before.direction * (jnp.stack(delta) - before.origin)
     slid = toward(law.level, before.direction) * slid
     lost += jnp.sum(jnp.where(first, 0, slid))

@@ -200,7 +200,9 @@ def efforts(
     for (index, element, state), scheduled in zip(elements, schedule):
         if isinstance(element, Holder) and element.holds:
             sliding = qd if args.modes is None else tuple(args.modes.direction)
-            effort = element.against(sliding, scheduled, delta, qd, args.linkage)
+            q = tuple(a + b for a, b in zip(args.q0, delta))
+            with naming(f"forces[{index}]"):
+                effort = element.against(sliding, scheduled, q, qd, args.linkage)
         elif isinstance(element, Sampler):
             effort = tuple(args.sampled.acting)
         elif isinstance(element, ScalarElement):

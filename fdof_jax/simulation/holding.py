@@ -90,8 +90,11 @@ def _sum(friction: Array, more: Array) -> Array:
     return jnp.add(*jnp.broadcast_arrays(friction, more))
 
 
-def laws(args: Args, t: Array) -> Laws:
-    """Returns the laws of all holders at a time."""
+def laws(args: Args, t: Array, *state: Array) -> Laws:
+    """Returns the laws of all holders at a time and at positions and rates.
+
+    Without these, friction that depends on them counts as almost 0.
+    """
     joints = joints_of(args.linkage)
     fixed = jnp.stack(fixed_pairs(args.linkage.ef))
     if (moved := args.moved) is not None:
@@ -102,9 +105,10 @@ def laws(args: Args, t: Array) -> Laws:
     for index, element in enumerate(args.forces):
         if not (isinstance(element, Holder) and element.holds):
             continue
-        more, most = element.levels(joints)
+        at = args.clock(index, t), *state, args.linkage
+        more, most = element.levels(joints, *(at if state else ()))
         level, static = _sum(level, more), _sum(static, most)
-        braked = braked | element.braking(args.clock(index, t), args.linkage)
+        braked = braked | element.braking(at[0], args.linkage)
         if isinstance(element, HardStops):
             whole_size = lambda x: jnp.broadcast_to(x, joints)
             ends = element.lower, element.upper, element.restitution
@@ -157,10 +161,11 @@ def guarded_switching(
     at = applied(t, y, args, schedule)
     driven = at.delta, at.qd, at.tau, at.added
     effort = jnp.stack(efforts_of_fixed(args.moving(), *driven))
-    law, modes = laws(args, t), args.modes
+    delta, qd = jnp.stack(at.delta), jnp.stack(at.qd)
+    law, modes = laws(args, t, args.q0 + delta, qd), args.modes
     held, direction = modes.held, modes.direction
     rubs = law.rubs & ~held & (direction != 0)
-    sliding = jnp.where(rubs, direction * jnp.stack(at.qd), 1)
+    sliding = jnp.where(rubs, direction * qd, 1)
     c = args.constants
     inertia = jnp.where(
         *map(jnp.stack, (real_joints(args.linkage.ef), c.second, c.carried))
@@ -169,7 +174,6 @@ def guarded_switching(
     reserve = _reserve(law.static, modes.mode, effort, inertia)
     guards = [jnp.where(held, reserve, sliding)]
     if any(isinstance(e, HardStops) for e in args.forces):
-        delta = jnp.stack(at.delta)
         room = delta - (law.lower - args.q0), law.upper - args.q0 - delta
         guards += [jnp.where(held, 1, _STOPS_IN * distance) for distance in room]
     values = jnp.concatenate([at.switches.all_values(args.q0.dtype), *guards])
@@ -348,7 +352,7 @@ def efforts_of_holders(
     """
     args = args_of(linkage, q, forces)
     modes, _ = unknown_modes(args)
-    law, near = laws(args, t), jnp.sqrt(jnp.finfo(q.dtype).eps)
+    law, near = laws(args, t, q, qd), jnp.sqrt(jnp.finfo(q.dtype).eps)
     touched = 1.0 * (q >= law.upper - near) - 1.0 * (q <= law.lower + near)
     system = system_at(t, q, qd, args)
     net = tau - jnp.stack(system.equations.bias)
@@ -370,7 +374,8 @@ def efforts_of_holders(
             holds = element.braking(args.clock(index, t), linkage)
             share, braked = jnp.where(braked & holds, c, 0), braked & ~holds
         elif isinstance(element, Holder) and element.holds:
-            _, static = element.levels(q.size)
+            at = args.clock(index, t), q, qd, linkage
+            _, static = element.levels(q.size, *at)
             static, most = toward(static, -rubs), toward(law.static, -rubs)
             share = static / jnp.where(law.rubs, most, 1) * rubs
         rows.append(share)

@@ -144,7 +144,7 @@ class Solution(eqx.Module):
       lower stop, 3 its upper stop, 4 a brake. At the very time of an event it may be
       the mode before it or after it.
     - `taken`: energy that friction, blows, brakes and the catching of payloads have
-      taken up to `ts` [J].
+      taken up to `ts` [J]; not that of a friction whose level is a function.
     - `events`: what happened to which joint, and when; its times have derivatives.
 
     - `end`: with `until`, else None: where the motion ended, `end.t`, `end.q` and
