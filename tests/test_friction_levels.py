@@ -73,6 +73,10 @@ def test_friction_in_one_direction_alone_lets_the_other_one_go():
             lambda: fj.to_mjcf(SLIDE, (JointFriction([[1], [2]]),)),
             r"forces\[0\]: expected one friction per joint, .* got JointFriction",
         ),
+        (
+            lambda: fj.to_mjcf(SLIDE, (JointFriction(stribeck(1, 2, 3)),)),
+            r"forces\[0\]: expected one friction per joint, .* got JointFriction",
+        ),
     ],
 )
 def test_malformed_levels_are_refused(make, words):

@@ -85,14 +85,13 @@ class JointFriction(Holder):
     - `level`: of sliding friction, not negative [N or N m].
     - `static`: friction up to which a joint at rest is held, at least the level; by
       default equal to it [N or N m].
-
-    Either may also have two rows, (2, n): against motions to positive positions and
-    to negative ones. Or it is a function `(t, q, qd, linkage)` that returns such
-    numbers, smooth in each direction and positive, for instance `stribeck`; at times at
-    which it jumps it has an attribute `jump_ts`. What joints at rest take is its value
-    at qd = 0, and `Solution.taken` does not count a level that is a function.
-
     - `speed`: positive [m/s or rad/s].
+
+    `level` and `static` may also have two rows, (2, n): against motions to positive
+    positions and to negative ones. Or they are functions `(t, q, qd, linkage)` that
+    return such numbers, positive and smooth in each direction, for instance `stribeck`;
+    times at which one jumps are its attribute `jump_ts`. Joints at rest are held by the
+    value at qd = 0. `Solution.taken` does not count a level that is a function.
 
     **Raises:** ValueError for malformed arguments, and for `static` beside `speed`.
 
@@ -182,6 +181,7 @@ class stribeck(Part):  # named as the function that it is
     **Raises:** ValueError for malformed arguments.
 
     >>> import fdof_jax as fj
+    >>> import numpy as np
     >>> arm = fj.scenes.double_pendulum().linkage
     >>> level = fj.forces.stribeck(1.0, static=1.5, speed=0.1)
     >>> level(0.0, [0, 0], np.array([0.0, 9.0]), arm).tolist()
