@@ -60,6 +60,7 @@ def test_switches():
     assert names["found"].stats["num_switches"] >= 1
     assert names["wet"].stats["num_switches"] >= 1
     np.testing.assert_allclose(names["kept"], 0.8783656, rtol=1e-6)
+    np.testing.assert_allclose(names["multiplier"], np.cos(0.6) ** 2, rtol=1e-8)
     assert np.isfinite(names["slope"]).all()
 
 

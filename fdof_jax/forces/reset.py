@@ -77,7 +77,7 @@ class Reset(Element):
         if shapes != [q.shape, q.shape]:
             raise ValueError(
                 f"then: expected {_THEN}, of shape {q.shape} each, got "
-                f"{shapes or type(answer).__name__}."
+                f"{shapes or 'no pair'}."
             )
         new_q, new_qd = (jnp.asarray(value, q.dtype) for value in answer)
         return new_q, new_qd

@@ -4,8 +4,10 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from ..base.checks import place_of
 from ..base.trees import constant
 from ..dynamics import energy
+from ..forces.element import naming
 from ..forces.holders import Brake, HardStops, toward
 from ..forces.payload import Payload
 from ..forces.reset import Reset, resets_in
@@ -287,8 +289,10 @@ def _after_reset(
     The step ended close to the zero of its condition: the state moves there and back.
     """
 
+    arm, t = args.linkage, event.t + event.late
+    name = f"forces[{place_of(element, args.forces)}]"
+
     def there(y):
-        arm, t = args.linkage, event.t
         rates = _rates(t, y, args)
 
         def value(late):
@@ -301,7 +305,8 @@ def _after_reset(
         late = constant(jnp.where(slope != 0, -g / jnp.where(slope != 0, slope, 1), 0))
         delta, qd, *own = _moved(y, late, rates)
         before = args.q0 + jnp.stack(delta), jnp.stack(qd)
-        after = element.state_after(t + late, *before, arm)
+        with naming(name):
+            after = element.state_after(t + late, *before, arm)
         q, qd = (without_fixed(arm, value) for value in after)
         masses = args.masses(t)
         energies = (sum(energy(arm, *state, masses)) for state in (before, (q, qd)))

@@ -1,0 +1,159 @@
+"""States that jump: closed forms, HardStops as the same law, derivatives, refusals."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from modes import LOOPS
+from scipy.integrate import solve_ivp
+from test_conditions import BAR, FORWARD, HANGS, MASS, height
+
+import fdof_jax as fj
+from fdof_jax.forces import HardStops, Reset
+
+
+def bounce(restitution):
+    return Reset(height, lambda t, q, qd, linkage: (q, -restitution * qd), -1)
+
+
+@pytest.mark.slow
+def test_a_ball_that_is_reset_bounces_as_on_a_stop():
+    """Also from a corner of the state, and beside friction that holds another joint."""
+    ts = np.linspace(0, 3, 13)
+    start = fj.State([1.0], [0.0])
+    found = fj.simulate(MASS, start, ts, (bounce(0.8),))
+    stop = HardStops(0, np.inf, restitution=0.8)
+    expected = fj.simulate(MASS, start, ts, (stop,))
+    np.testing.assert_allclose(found.q, expected.q, atol=1e-12)
+    np.testing.assert_allclose(found.qd, expected.qd, atol=1e-12)
+    np.testing.assert_allclose(found.taken, expected.taken, atol=1e-12)
+    table = found.events.table
+    assert table["event"].tolist() == ["is reset"] * 6 and not table["joint"].any()
+    np.testing.assert_allclose(table["t [s]"], expected.events.table["t [s]"])
+
+
+def test_thirty_elastic_jumps_keep_the_energy():
+    """And their times, which are multiples of that of the first fall."""
+    fall = np.sqrt(2 * 10 / 9.81)
+    ts = [0, 61.5 * fall]
+    motion = fj.simulate(MASS, fj.State([10.0], [0.0]), ts, (bounce(1.0),))
+    times = motion.events.table["t [s]"]
+    np.testing.assert_allclose(times, fall * (1 + 2 * np.arange(31)), rtol=1e-10)
+    np.testing.assert_allclose(motion.taken[-1], 0, atol=1e-9)
+
+
+def after_jumps(x, **options):
+    """Returns a state after jumps of position and velocity, all in its numbers."""
+    q0, gravity, kept, lift, level = x
+    when = lambda t, q, qd, linkage: q[0] - level
+    then = lambda t, q, qd, linkage: (q + lift, -kept * qd + 0.1 * t)
+    arm, start = MASS.replace(gravity=gravity), fj.State(q0[None], jnp.zeros(1))
+    forces = (Reset(when, then, -1), fj.JointDamper(0.2))
+    motion = fj.simulate(arm, start, [0, 1.7], forces, **options)
+    return jnp.stack([motion.q[-1, 0], motion.qd[-1, 0], motion.events.t[1]])
+
+
+@pytest.mark.slow
+def test_derivatives_include_the_times_of_jumps():
+    x = jnp.array([1.0, 9.81, 0.7, 0.05, 0.1])
+    value = jax.jit(after_jumps, **LOOPS)
+    steps = 1e-5 * np.eye(5)
+    difference = [(value(x + h) - value(x - h)) / 2e-5 for h in steps]
+    forward = jax.jacfwd(lambda x: after_jumps(x, **FORWARD))
+    for slopes in (jax.jit(forward, **LOOPS), jax.jit(jax.jacrev(after_jumps))):
+        np.testing.assert_allclose(slopes(x), np.transpose(difference), atol=1e-7)
+    curve = jax.jit(jax.jacfwd(lambda q0: forward(x.at[0].set(q0))), **LOOPS)
+    of = jax.jit(lambda q0: forward(x.at[0].set(q0)), **LOOPS)
+    difference = (of(1 + 1e-4) - of(1 - 1e-4)) / 2e-4
+    np.testing.assert_allclose(curve(1.0), difference, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.slow
+def test_a_rimless_wheel_has_the_multiplier_of_its_return_map():
+    """A spoke of 1 m with all mass at the hub; each foot leaves cos(2 a) of its speed.
+
+    So is its square, whose changes on the way do not depend on it, cos(2 a)^2.
+    """
+    half, slope, gravity = 0.3, 0.08, 9.81
+    spoke = fj.Linkage(
+        "R", length=[0, 1], com=[[1, 0]], mass=[1], inertia=[0], gravity=gravity
+    )
+    last = np.pi / 2 - slope - half  # where the next foot comes down
+    kept = np.cos(2 * half)
+    foot = Reset(
+        lambda t, q, qd, linkage: q[0] - last,
+        lambda t, q, qd, linkage: (q + 2 * half, kept * qd),
+        direction=-1,
+    )
+    middle = np.pi / 2 - slope
+    done = fj.simulation.Until(lambda t, q, qd, linkage: q[0] - middle, -1)
+
+    def from_middle(speed):
+        """From one passage of the middle to the next, with a foot in between."""
+        start = fj.State(jnp.array([middle]), speed[None])
+        ends = fj.simulate(spoke, start, [0, 9.0], (foot,), until=done, **FORWARD)
+        return ends.end.qd[0]
+
+    down = 2 * gravity * (np.sin(middle) - np.sin(last))
+    up = 2 * gravity * (np.sin(middle) - np.sin(last + 2 * half))
+    rest = -np.sqrt((kept**2 * down - up) / (1 - kept**2))
+    value, slope_of = jax.jit(
+        lambda w: jax.jvp(from_middle, (w,), (jnp.ones_like(w),)), **LOOPS
+    )(rest)
+    np.testing.assert_allclose(value, rest, rtol=1e-9)
+    np.testing.assert_allclose(slope_of, kept**2, rtol=1e-8)
+
+
+@pytest.mark.slow
+def test_a_pendulum_that_is_kicked_is_that_of_scipy():
+    kick = Reset(
+        lambda t, q, qd, linkage: q[0] - HANGS,
+        lambda t, q, qd, linkage: (q, qd + 0.2 * jnp.sign(qd)),
+    )
+    rates = lambda t, y: [y[1], -1.5 * 9.81 * np.cos(y[0]) - 3 * 0.1 * y[1]]
+    passes = lambda t, y: y[0] - HANGS
+    passes.terminal = True
+    t, y = 0.0, np.array([-0.6, 0.0])
+    tolerances = dict(rtol=1e-12, atol=1e-12, method="DOP853")
+    while t < 6:
+        found = solve_ivp(rates, (t, 6), y, events=passes, **tolerances)
+        t, y = found.t[-1], found.y[:, -1]
+        if found.status == 1:
+            y[1] += 0.2 * np.sign(y[1])
+            y[0] += 1e-9 * np.sign(y[1])  # off the zero
+    forces = (kick, fj.JointDamper(0.1))
+    motion = fj.simulate(BAR, fj.State([-0.6], [0.0]), [0, 6.0], forces)
+    np.testing.assert_allclose([motion.q[-1, 0], motion.qd[-1, 0]], y, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_members_of_a_batch_jump_by_themselves():
+    speeds = jnp.array([0.0, 30.0, jnp.nan])
+    start = fj.State(jnp.ones((3, 1)), speeds[:, None])
+    forces = (bounce(0.5),)
+    one = lambda start: fj.simulate(MASS, start, [0, 1.0], forces, throw=False)
+    motions = jax.jit(jax.vmap(one), **LOOPS)(start)
+    assert motions.outcome.tolist() == ["successful", "successful", "not finite"]
+    assert motions.events.count.tolist() == [2, 0, 0]
+    alone = fj.simulate(MASS, fj.State([1.0], [0.0]), [0, 1.0], forces)
+    np.testing.assert_allclose(motions.q[0], alone.q, atol=1e-12)
+
+
+def test_what_is_refused():
+    start, same = fj.State([1.0], [0.0]), lambda t, q, qd, linkage: (q, qd)
+
+    def run(*arguments, **options):
+        forces = (Reset(*arguments),)
+        return fj.simulate(MASS, start, [0, 1.0], forces, **options)
+
+    with pytest.raises(ValueError, match=r"^forces\[0\].when: expected .* shape \(1,"):
+        run(lambda t, q, qd, linkage: q, same)
+    with pytest.raises(ValueError, match=r"^forces\[0\].then: .*, got no pair"):
+        run(height, lambda t, q, qd, linkage: q)
+    with pytest.raises(ValueError, match="^when: expected a function"):
+        Reset(3, same)
+    with pytest.raises(ValueError, match="^direction: expected one of"):
+        Reset(height, same, 2)
+    with pytest.raises(ValueError, match="stepsize_controller: expected an adaptive"):
+        run(height, same, stepsize_controller=diffrax.ConstantStepSize())
