@@ -89,6 +89,7 @@ def left_in(t):
     return 3 - 2 * t
 
 
+@pytest.mark.slow
 def test_a_leaking_pendulum_moves_as_scipy_has_it():
     def rates(t, y):
         q, qd = y
@@ -102,6 +103,7 @@ def test_a_leaking_pendulum_moves_as_scipy_has_it():
     np.testing.assert_allclose(motion.qd[:, 0], expected[1], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_functions_of_an_instant_have_the_mass_of_its_time():
     t, q, qd = 0.4, jnp.array([0.7]), jnp.array([1.3])
     now, mass = (BUCKET.at(t),), left_in(0.4)
@@ -118,6 +120,7 @@ def test_functions_of_an_instant_have_the_mass_of_its_time():
     np.testing.assert_allclose(fj.inverse_dynamics(BAR, q, qd, qdd, now), [2.0])
 
 
+@pytest.mark.slow
 def test_bearings_carry_the_mass_of_the_time():
     motion = swing()
     q, qd, mass = motion.q[:, 0], motion.qd[:, 0], left_in(TS)
@@ -167,6 +170,7 @@ def test_a_bucket_that_is_taken_has_the_mass_of_that_time():
 # Programs
 
 
+@pytest.mark.slow
 def test_another_leak_compiles_nothing():
     traces, counts = [], []
 

@@ -49,6 +49,7 @@ def test_a_block_comes_down_a_slope_by_the_friction_of_that_direction():
     np.testing.assert_allclose(motion.q[-1, 0], (weight - 1) / 2, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_friction_in_one_direction_alone_lets_the_other_one_go():
     pull = lambda t, q, qd, linkage: jnp.maximum(t - 0.5, 0) * jnp.ones(1)
     free, held = JointFriction([[0.0], [3.0]]), JointFriction([[3.0], [0.0]])
@@ -121,6 +122,7 @@ def scipy_times(coulomb, static, speed, end):
     return np.array(times)
 
 
+@pytest.mark.slow
 def test_a_dragged_slide_sticks_and_slips_as_scipy_has_it():
     motion = dragged(FRICTION, **TIGHT)
     times = scipy_times(*FRICTION, TS[-1])
@@ -160,6 +162,7 @@ def test_derivatives_of_stick_slip():
     np.testing.assert_allclose(found, wanted, rtol=1e-6, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_a_clutch_stops_a_slide_by_a_friction_over_time():
     """Of 4 t newtons: 1 kg at 1 m/s, from 0.5 m, stops after sqrt(1/2) s."""
     clutch = lambda t, q, qd, linkage: 4 * t

@@ -33,6 +33,7 @@ def test_a_ball_that_is_reset_bounces_as_on_a_stop():
     np.testing.assert_allclose(table["t [s]"], expected.events.table["t [s]"])
 
 
+@pytest.mark.slow
 def test_thirty_elastic_jumps_keep_the_energy():
     """And their times, which are multiples of that of the first fall."""
     fall = np.sqrt(2 * 10 / 9.81)

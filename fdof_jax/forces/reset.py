@@ -45,7 +45,7 @@ class Reset(Element):
     ...     then=lambda t, q, qd, linkage: (q, 0.5 * qd))
     >>> motion = fj.simulate(arm, start, [0, 1.0], (kick,))
     >>> motion.events.table["event"].tolist(), float(motion.taken[-1])  # [J]
-    (['is reset'], 0.0)
+    (['is reset'], 33.973)
     """
 
     when: Element
