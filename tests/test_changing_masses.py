@@ -49,6 +49,7 @@ def lift(leak, ts=TS, **options):
     return fj.simulate(SLIDE, fj.State([0.0], [0.0]), ts, forces, **options)
 
 
+@pytest.mark.slow
 def test_a_leaking_slide_has_the_closed_form():
     motion = lift(2.0)
     q, qd = lifted(2.0)

@@ -56,6 +56,7 @@ def test_a_fall_ends_on_the_floor():
     np.testing.assert_allclose(second(x[:3]), twice(fallen)(x[:3]), atol=1e-10)
 
 
+@pytest.mark.slow
 def test_rows_after_the_end_are_not_there():
     motion = fj.simulate(MASS, fj.State([10.0], [1.0]), [0, 1, 2.0], until=height)
     assert bool(motion.ended) and motion.outcome == "ended"

@@ -25,6 +25,7 @@ BLOCK = fj.Linkage(
 SLIDE = BLOCK.replace(gravity=0.0)
 
 
+@pytest.mark.slow
 def test_a_block_comes_down_a_slope_by_the_friction_of_that_direction():
     """It goes up against 4 N, turns, and comes down against 1 N; rows are 4, 1."""
     v, (up, down) = 2.0, (4.0, 1.0)
