@@ -84,4 +84,4 @@ def test_twenty_kills_at_random_moments(tmp_path, monkeypatch):
     assert len(undisturbed) > 2 * BLOCKS
     assert {name: found[name] for name in undisturbed} == undisturbed
     others = found.keys() - undisturbed.keys()
-    assert all(name.endswith(".partial") for name in others)
+    assert all(name.endswith((".partial", ".part")) for name in others)
