@@ -175,6 +175,7 @@ def test_the_integral_adds_to_pd_control_and_is_drained_by_what_is_clipped(ki, l
         np.testing.assert_allclose(rate, ki * (hold.target - q - drained), atol=1e-12)
 
 
+@pytest.mark.slow
 def test_drives_in_a_row():
     """A PID controller's torque passes a lag and a speed limit, all with states."""
     pid = fj.control.PIDController(8.0, 2.0, 6.0, 10.0, Hold(jnp.array([1.0])))
@@ -187,6 +188,7 @@ def test_drives_in_a_row():
     np.testing.assert_allclose(motion.q[-1], 1, atol=1e-2)
 
 
+@pytest.mark.slow
 def test_a_motion_goes_on_from_its_states():
     whole = fj.simulate(WHEEL, STILL, [0, 0.5, 1.0], (LAG,))
     half = fj.State(whole.q[1], whole.qd[1])

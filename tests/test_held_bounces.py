@@ -71,6 +71,7 @@ def test_derivatives_through_a_hundred_bounces():
             np.testing.assert_allclose(found, weights @ slopes, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_an_elastic_ball_that_is_laid_down_or_drops_by_nothing_rests():
     for height in (0.0, 1e-12):
         motion = dropped(jnp.array(height), 1.0, [0, 0.5, 1.0])
@@ -163,6 +164,7 @@ def test_a_cascade_of_blows_is_no_chatter(topology):
     assert motion.events.count > 20
 
 
+@pytest.mark.slow
 def test_a_mass_comes_to_rest_in_however_long_a_motion():
     """The last bounces are brief beside the whole time; they are no chatter."""
     mass = fj.Linkage("P", length=[0, 1], com=[[0, 0]], mass=[1], inertia=[1])

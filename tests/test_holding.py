@@ -37,6 +37,7 @@ def test_friction_above_the_load_holds_to_the_last_bit():
     assert motion.events.count == 0
 
 
+@pytest.mark.slow
 def test_static_friction_holds_what_has_come_to_rest_only():
     """It is above the load, which sliding friction is not: at rest the bar stays."""
     friction = JointFriction(0.9 * LOAD, static=1.1 * LOAD)

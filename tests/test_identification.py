@@ -334,6 +334,7 @@ def test_residuals_of_a_wrong_model_exceed_the_noise(noise, noisy):
     assert found.rms == pytest.approx(found.noise * (noise or 1), rel=0.01)
 
 
+@pytest.mark.slow
 def test_hardly_told_combinations_are_named():
     """Checks that the message names each combination and its uncertainty."""
     words = fit_result._in_words(

@@ -213,6 +213,7 @@ def test_few_steps_are_rejected():
     assert 8 * own["num_rejected_steps"] > own["num_steps"]
 
 
+@pytest.mark.slow
 def test_tolerances_are_as_exact_as_those_of_a_controller_of_ones_own():
     """By the programs of the test before."""
     arm, start, forces, _ = fj.scenes.fig5()
