@@ -19,7 +19,7 @@ def bounce(restitution):
 
 @pytest.mark.slow
 def test_a_ball_that_is_reset_bounces_as_on_a_stop():
-    """Also from a corner of the state, and beside friction that holds another joint."""
+    """The two have the same law, and the same energy taken."""
     ts = np.linspace(0, 3, 13)
     start = fj.State([1.0], [0.0])
     found = fj.simulate(MASS, start, ts, (bounce(0.8),))

@@ -9,6 +9,7 @@ from elements import SHORT as STEPS
 from modes import LOOPS
 
 import fdof_jax as fj
+from fdof_jax.simulation.sampled import _in_periods
 
 # I qdd = tau.
 DISC = fj.Linkage(
@@ -351,3 +352,13 @@ def test_commands_have_gradients():
     value = jax.jit(end, **LOOPS)
     difference = (value(1 + 1e-5) - value(1 - 1e-5)) / 2e-5
     np.testing.assert_allclose(slope, difference, rtol=1e-7)
+
+
+@pytest.mark.parametrize("precision", [np.float32, np.float64])
+def test_a_delay_of_whole_periods_is_known_in_either_precision(precision):
+    """0.3 / 0.1 is less than 3 by a rounding error of the precision."""
+    with jax.enable_x64(precision == np.float64):
+        late = _in_periods(0.3, jnp.asarray(0.1), 5)
+        rest = _in_periods(0.17, jnp.asarray(0.1), 5).rest
+    assert (late.whole, late.rest, late.most) == (3, None, 3)
+    assert rest.dtype == precision

@@ -59,7 +59,7 @@ class Until(Element):
 
 
 class End(NamedTuple):
-    """The end of a motion; with derivatives in everything.
+    """The end of a motion, with first and second derivatives.
 
     - `t`: when it was [s]; `q`, `qd` (n,): the joint positions and velocities there
       [m or rad].

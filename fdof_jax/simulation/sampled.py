@@ -82,7 +82,7 @@ def _in_periods(delay: Any, period: Any, samples: int) -> _Delay:
     traced = is_traced(delay, period)
     xp: Any = jnp if traced else np
     delay, period = xp.asarray(delay, float), xp.asarray(period, float)
-    rounding = 4 * float(jnp.finfo(float).eps) * delay
+    rounding = 4 * float(jnp.finfo(jnp.result_type(float)).eps) * delay
     whole = xp.floor((delay + rounding) / period)  # 2.9999999999999996 is 3
     rest = delay - whole * period
     most = samples + 1  # then no command arrives, as with all longer delays

@@ -16,7 +16,7 @@ from ..steps.landing import Clock
 
 
 class SampleState(NamedTuple):
-    """What is constant between the samples of a controller.
+    """The state of a controller between its samples.
 
     - `taken`: number of samples up to here.
     - `memory`: the controller's own state.

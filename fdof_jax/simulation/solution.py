@@ -188,7 +188,7 @@ class Solution(eqx.Module):
 
     @property
     def ended(self) -> Array:
-        """Whether a condition of `until` ended the motion, () or one per trajectory."""
+        """True where a condition of `until` ended the motion, one per trajectory."""
         if self.end is None:
             return jnp.zeros(jnp.shape(self.q)[:-2], bool)
         return self.end.condition >= 0

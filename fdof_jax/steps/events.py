@@ -77,7 +77,7 @@ class Switches(NamedTuple):
 
 
 class Regime(NamedTuple):
-    """What is in force in a step, and what has changed at its beginning.
+    """The branches and modes in a step, and what has changed at its beginning.
 
     - `sides`, `modes`: those in force.
     - `changed` (switch,): which functions switched there; `on_zero`: which begin near

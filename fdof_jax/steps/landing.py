@@ -64,7 +64,7 @@ class Clock(NamedTuple):
 
 
 class Found(NamedTuple):
-    """What was found in a step.
+    """Findings in a step: where it should end.
 
     - `until`: when the step should have ended; its end if nothing switched before [s].
     - `unseen`: a time before which a switching function may have passed 0 unseen; the
@@ -133,7 +133,7 @@ class Landing(eqx.Module):
 
     @property
     def timed(self) -> bool:
-        """Whether there are known times."""
+        """True if there are known times."""
         return self.jumps is not None or bool(self.clocks)
 
     def _known(self, t: Array) -> Array | None:

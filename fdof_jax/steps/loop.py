@@ -42,7 +42,7 @@ class Problem(NamedTuple):
 
 
 class Scheme(NamedTuple):
-    """How steps are taken.
+    """The numerical scheme: method, control and ends of steps.
 
     - `method`, `controller`: those of diffrax. `dt0`: length of the first step, or None
       for the controller's estimate.
