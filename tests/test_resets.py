@@ -141,6 +141,21 @@ def test_members_of_a_batch_jump_by_themselves():
     np.testing.assert_allclose(motions.q[0], alone.q, atol=1e-12)
 
 
+@pytest.mark.slow
+def test_jumps_that_follow_each_other_ever_faster_are_named():
+    """Of a ball that comes to rest, after a time that its restitution gives."""
+    switches = lambda t, q, qd, linkage: fj.forces.switch(q[0] - 0.9, 0 * q, 0 * q)
+    scene = MASS, fj.State([1.0], [0.0]), [0, 10.0], (bounce(0.8), switches)
+    motion = fj.simulate(*scene, throw=False)
+    assert motion.outcome == "too many switches"
+    rests = np.sqrt(2 / 9.81) * (1 + 0.8) / (1 - 0.8)
+    np.testing.assert_allclose(motion.stats["time_reached"], rests, rtol=1e-5)
+    with pytest.raises(
+        RuntimeError, match=r"the state is reset\. forces\[0\] \(Reset\)"
+    ):
+        fj.simulate(*scene)
+
+
 def test_what_is_refused():
     start, same = fj.State([1.0], [0.0]), lambda t, q, qd, linkage: (q, qd)
 

@@ -23,8 +23,9 @@ class Reset(Element):
     the energy of links and loads that it takes. It has no efforts.
 
     After the jump `when` may be 0 still: the next one comes when it has left the zero
-    and passes it again. Jumps that follow each other ever faster, as of a ball that
-    comes to rest, take all steps ("out of steps"); `HardStops` hold what rests.
+    and passes it again. Jumps that follow each other ever faster, as those of a ball
+    that comes to rest, end the motion ("too many switches"); `HardStops` hold what
+    rests.
 
     **Arguments:**
 

@@ -10,11 +10,14 @@ import numpy as np
 from jax import Array
 from jaxtyping import PyTree
 
+from ..base.checks import place_of
 from ..forces.element import Element, ForeignElement, OwnStates
 from ..forces.holders import JointFriction, holders
+from ..forces.reset import Reset
 from ..linkage.linkage import Linkage, joint_names, moving_joints
 from ..mechanics.kinematics import tip_jacobian
 from ..steps.derivative_control import linearised
+from .conditions import conditions_last
 from .field import (
     args_of,
     effort_and_switches,
@@ -62,7 +65,8 @@ def _of_joints(linkage: Linkage, solution: Solution) -> str:
     names, times = joint_names(linkage), table["t [s]"]
     recent = times >= times[-1] - 1e-6
     last = dict(zip(table["joint"][recent], table["event"][recent]))
-    happened = (f"joint {names[joint - 1]} {event}" for joint, event in last.items())
+    whose = lambda joint: f"joint {names[joint - 1]}" if joint else "the state"
+    happened = (f"{whose(joint)} {event}" for joint, event in last.items())
     return f"Last, {', '.join(happened)}. "
 
 
@@ -72,7 +76,9 @@ def _of_switches(inputs: Inputs, keywords: Settings) -> str:
     names, begin = joint_names(linkage), 0
     switched = np.asarray(eqx.filter_jit(last_switched)(inputs, keywords))
     own = own0 or initial_states(linkage, forces)
-    for k, element, state in with_states(forces, own):
+    by_place = {k: (e, state) for k, e, state in with_states(forces, own)}
+    for k in (place_of(e, forces) for e in conditions_last(forces)):
+        element, state = by_place[k]
 
         def functions(q, qd, k=k, element=element, state=state):
             at = ts[0], q, qd, linkage, state
@@ -84,6 +90,11 @@ def _of_switches(inputs: Inputs, keywords: Settings) -> str:
         one, begin = switched[begin:end], end
         if not one.any():
             continue
+        if isinstance(element, Reset):
+            return (
+                f"forces[{k}] (Reset) resets the state ever faster there, as that of a "
+                "ball which comes to rest: HardStops hold what rests."
+            )
         by_rate, by_position = (
             {
                 name

@@ -305,6 +305,7 @@ class Events(eqx.Module):
             soon=t1 + passed.soon * h,
             near=near,
             switched=jnp.any(after != sides),
+            resets=self._resetting(passed.switched, after),
         )
         return constant(found), Switches(
             sides=sides,
@@ -321,6 +322,11 @@ class Events(eqx.Module):
             modes=regime.modes,
             ended=self._ended(passed.switched & ~on_zero, after),
         )
+
+    def _resetting(self, passed: Array, after: Array) -> Array | None:
+        if not self.resets:
+            return None
+        return self._met(self.resets, len(self.ends), passed, after).any()
 
     def _ended(self, passed: Array, after: Array) -> Array | None:
         """Returns which condition ends the run in a step, see `Switches.ended`.

@@ -1,6 +1,6 @@
 """Ends of steps at known times and where elements switch."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -13,9 +13,11 @@ from ..linkage.fields import has_come
 # More than `_MOST_CROSSINGS` count as chatter if all come within the least distance
 # between two times, times this power of the unit of rounding (3e5 in float64). Chatter
 # soon crosses at that distance; joints that bounce to rest, in however long a run, or
-# that throw each other at their stops, are slower.
+# that throw each other at their stops, are slower. Nothing stops what resets ever
+# faster, so that more of them follow each other in a longer time: in a run of one
+# second 1e-4 s.
 _MOST_CROSSINGS = 100
-_PACE = -0.35
+_PACE, _RESET_PACE = -0.35, -0.7
 # After so many tries the switching function itself is taken to jump, and the jump is
 # located by halving the step.
 _MOST_TRIES = 6
@@ -71,7 +73,8 @@ class Found(NamedTuple):
       step's end if none may [s].
     - `soon`: the time of a switch that follows soon after the end; else the end [s].
     - `near`: how far from its zero a switching function may switch [s].
-    - `switched`: whether any switches at the end.
+    - `switched`: whether any switches at the end; `resets`: whether one of them resets
+      the state, None if none can.
     """
 
     until: Array
@@ -79,6 +82,7 @@ class Found(NamedTuple):
     soon: Array
     near: Array
     switched: Array
+    resets: Array | None
 
 
 class NextStep(NamedTuple):
@@ -251,8 +255,11 @@ class Landing(eqx.Module):
 
         # Does the solve go on?
         # Time that passes meanwhile tells fast switching from chatter.
-        pace = self.apart * jnp.finfo(begin.dtype).eps ** _PACE
-        paced = begin - state.since > pace
+        power: Any = _PACE
+        if found is not None and found.resets is not None:
+            power = jnp.where(found.resets, _RESET_PACE, _PACE)
+        pace = self.apart * jnp.finfo(begin.dtype).eps ** power
+        paced = crossed & (begin - state.since > pace)
         crossings = jnp.where(paced, 0, state.crossings + crossed)
         results = diffrax.RESULTS
         # The last step may be shorter than the least length; no step follows it.
